@@ -1,0 +1,69 @@
+"""What every test shares: the variant, the data, the seeds, a folder for pictures, and a clean Dr.Jit afterwards."""
+
+from __future__ import annotations
+
+import gc
+import os
+import re
+import shutil
+from pathlib import Path
+
+import mitsuba as mi
+import pytest
+
+import mivol  # noqa: F401  (registers the plugins and chooses the LLVM library)
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Options of the suite."""
+    parser.addoption("--variant", default="llvm_ad_rgb", help="the Mitsuba variant of the fixture variant_rgb")
+    parser.addoption("--seeds", type=int, default=1, help="how many seeds each test that asks for one is run with")
+    parser.addoption("--artefacts", type=Path, default=ROOT / "runs" / "tests", help="where tests leave pictures")
+
+
+def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
+    """A test with an argument ``seed`` runs once for each of ``--seeds`` seeds."""
+    if "seed" in metafunc.fixturenames:
+        metafunc.parametrize("seed", range(metafunc.config.getoption("--seeds")))
+
+
+@pytest.fixture
+def variant_rgb(request: pytest.FixtureRequest) -> str:
+    """An rgb variant with derivatives is active; its name."""
+    name = request.config.getoption("--variant")
+    mi.set_variant(name)
+    return name
+
+
+@pytest.fixture(scope="session")
+def data_dir() -> Path:
+    """The folder of real data: ``MIVOL_DATA``, else ``../shared/data`` beside the checkout."""
+    folder = Path(os.environ.get("MIVOL_DATA", ROOT.parent / "shared" / "data"))
+    if not folder.is_dir():
+        pytest.skip(f"real data not found at {folder}: set MIVOL_DATA to the folder that holds it")
+    return folder
+
+
+@pytest.fixture
+def artefacts(request: pytest.FixtureRequest) -> Path:
+    """An empty folder of this test's own that outlives the run, for pictures to look at."""
+    folder = request.config.getoption("--artefacts") / re.sub(r"[^\w.=-]+", "_", request.node.nodeid)
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    return folder
+
+
+@pytest.fixture(autouse=True)
+def _clean_jit():
+    """Give memory back to the system and forget recorded kernels, so that no test sees another's."""
+    yield
+    if mi.variant() is None or mi.variant().startswith("scalar"):
+        return
+    import drjit as dr
+
+    gc.collect()
+    dr.sync_thread()
+    dr.kernel_history_clear()
+    dr.flush_malloc_cache()
