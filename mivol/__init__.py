@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import importlib
+import warnings
 
-import mitsuba as mi
+from . import llvm
 
-from . import plugins
-from .errors import MivolError
+llvm.ensure()
+
+import mitsuba as mi  # noqa: E402  (Dr.Jit loads LLVM as soon as it is imported)
+
+from . import plugins  # noqa: E402
+from .errors import MivolError  # noqa: E402
 
 __all__ = ["MivolError", "__version__"]
 
@@ -15,7 +20,13 @@ __version__ = "0.1.0"
 
 
 def _on_variant_change(old: str | None, new: str) -> None:
+    llvm.check_backend(new)
     importlib.reload(plugins)
 
 
 mi.detail.add_variant_callback(_on_variant_change)
+
+try:
+    llvm.check_backend()
+except llvm.LlvmError as error:
+    warnings.warn(f"{error}", RuntimeWarning, stacklevel=2)
