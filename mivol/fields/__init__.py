@@ -1,0 +1,1 @@
+"""What is where: extinction, albedo and emission as functions of position."""
