@@ -268,5 +268,5 @@ def fixes() -> list[str]:
     if better and _origin == BY_USER:
         lines.append(f"unset {VARIABLE}: mivol then chooses {better[0].path}")
     if any("libatomic" in why for why in _unloadable.values()):
-        lines.append("sudo apt install libatomic1    (dnf: libatomic) the library above lacks nothing but libatomic.so.1")
+        lines.append("sudo apt install libatomic1 (dnf: libatomic): the library found lacks nothing but libatomic.so.1")
     return lines + [f"{command:<52}{note}" for command, note in _INSTALL]

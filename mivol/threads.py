@@ -44,8 +44,8 @@ def check_one_thread() -> None:
     if _owner is not caller:
         raise MivolError(
             f"thread {caller.name!r} wants to use Dr.Jit, but thread {_owner.name!r} of this process does already, and "
-            f"two of them lose gradients silently: hand the work to {_owner.name!r} (a queue of NumPy arrays), or use a "
-            "second process."
+            f"two of them lose gradients silently: hand the work to {_owner.name!r} (a queue of NumPy arrays), or to a "
+            "process of its own."
         )
 
 
