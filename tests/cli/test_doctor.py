@@ -1,0 +1,52 @@
+"""`mivol doctor` says whether a render works, and its exit code agrees."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from mivol import doctor, llvm
+
+OLD = Path("/usr/lib/x86_64-linux-gnu/libLLVM-15.so.1")
+
+
+def test_report_of_this_machine(capsys: pytest.CaptureFixture[str]) -> None:
+    """The suite runs here, so a render works here."""
+    assert doctor.main([]) == 0
+    said = capsys.readouterr().out
+    for subject in ("mivol", "Python", "Mitsuba", "LLVM", "CUDA", "llvm_ad_rgb", "cores", "memory", "kernel cache"):
+        assert subject in said
+    assert "A render works here" in said
+
+
+def test_no_variant_works(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr(llvm, "version", lambda: None)
+    monkeypatch.setattr(doctor, "_TRIAL", "import sys; sys.exit('mivol trial: it is broken')")
+    assert doctor.main([]) == 1
+    said = capsys.readouterr().out
+    assert "FAULT llvm_ad_rgb   it is broken" in said
+    assert "pip install" in said
+    assert "does not work here" in said
+
+
+def test_trial_that_kills_its_process_is_survived(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(doctor, "_TRIAL", "import os; os.abort()")
+    found = doctor._try("llvm_ad_rgb")
+    assert found.state == doctor.FAULT
+    assert "SIGABRT" in found.value
+
+
+@pytest.mark.skipif(not OLD.exists(), reason=f"{OLD} is not here to be tried")
+def test_trial_finds_out_llvm_15(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The kernel of the trial is one that LLVM 15 dies of, when nothing guards it."""
+    monkeypatch.setenv(llvm.VARIABLE, str(OLD))
+    monkeypatch.setattr(doctor, "_TRIAL", doctor._TRIAL.replace("import mivol\n", ""))
+    assert "SIGABRT" in doctor._try("llvm_ad_rgb").value
+
+
+def test_an_unsupported_mitsuba_is_a_fault(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(doctor.importlib.metadata, "version", lambda name: "3.8.0")
+    findings = doctor._versions()
+    assert [f.subject for f in findings if f.state == doctor.FAULT] == ["Mitsuba"]
+    assert not doctor.render_works([*findings, doctor.Finding("llvm_ad_rgb", doctor.OK, "works")])

@@ -1,0 +1,104 @@
+"""What is public says what it is: names exist, functions have types and a docstring, dependencies are declared."""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import re
+import sys
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGE = ROOT / "mivol"
+MODULES = sorted(PACKAGE.rglob("*.py"))
+Function = ast.FunctionDef | ast.AsyncFunctionDef
+
+
+def name_of(path: Path) -> str:
+    """The dotted name of a module."""
+    return ".".join(["mivol", *path.relative_to(PACKAGE).with_suffix("").parts]).removesuffix(".__init__")
+
+
+def public(tree: ast.Module) -> Iterator[ast.ClassDef | Function]:
+    """Public classes and functions at the top of a module, and the public methods of those classes."""
+    for node in tree.body:
+        if isinstance(node, ast.ClassDef | Function) and not node.name.startswith("_"):
+            yield node
+            if isinstance(node, ast.ClassDef):
+                yield from (n for n in node.body if isinstance(n, Function) and not n.name.startswith("_"))
+
+
+def untyped(function: Function) -> list[str]:
+    """Parameters, and the result, that have no annotation."""
+    spec = function.args
+    args = [*spec.posonlyargs, *spec.args, *spec.kwonlyargs, *filter(None, (spec.vararg, spec.kwarg))]
+    missing = [arg.arg for arg in args if arg.annotation is None and arg.arg not in ("self", "cls")]
+    return missing + ([] if function.returns is not None else ["return"])
+
+
+def said_in(room: Path) -> set[str]:
+    """Names of the methods that some class in a folder documents: a protocol says it once for all that follow it."""
+    trees = [ast.parse(path.read_text()) for path in room.glob("*.py")]
+    classes = [node for tree in trees for node in tree.body if isinstance(node, ast.ClassDef)]
+    return {n.name for node in classes for n in node.body if isinstance(n, Function) and ast.get_docstring(n)}
+
+
+@pytest.mark.parametrize("path", MODULES, ids=name_of)
+def test_docstrings_and_types(path: Path) -> None:
+    """Methods of the Mitsuba shells are excused: their names and arguments are Mitsuba's."""
+    said = said_in(path.parent)
+    tree = ast.parse(path.read_text(), str(path))
+    assert ast.get_docstring(tree) or not tree.body, f"{path} has no docstring"
+    shell = path.parent.name == "plugins"
+    faults = []
+    for node in public(tree):
+        if shell and not isinstance(node, ast.ClassDef):
+            continue
+        if not ast.get_docstring(node) and not (node not in tree.body and node.name in said):
+            faults.append(f"line {node.lineno}: {node.name} has no docstring")
+        if isinstance(node, Function) and (missing := untyped(node)):
+            faults.append(f"line {node.lineno}: {node.name} has no type for {', '.join(missing)}")
+    assert faults == []
+
+
+@pytest.mark.parametrize("path", [p for p in MODULES if p.parent.name != "plugins"], ids=name_of)
+def test_all_is_true(path: Path) -> None:
+    module = importlib.import_module(name_of(path))
+    names = getattr(module, "__all__", [])
+    assert [name for name in names if not hasattr(module, name)] == []
+    assert len(names) == len(set(names))
+
+
+def test_third_party_imports_are_declared() -> None:
+    """Whoever installs the wheel gets what the modules import; torch is the user's own."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    declared = {re.match(r"[A-Za-z0-9_-]+", line)[0].lower() for line in project["dependencies"]}
+    declared |= {"drjit"}  # by mitsuba, which pins it
+    imported = set()
+    for path in MODULES:
+        for node in ast.walk(ast.parse(path.read_text(), str(path))):
+            if isinstance(node, ast.Import):
+                imported |= {alias.name.split(".")[0] for alias in node.names}
+            elif isinstance(node, ast.ImportFrom) and not node.level:
+                imported.add((node.module or "").split(".")[0])
+    unknown = {name.lower() for name in imported} - set(sys.stdlib_module_names) - declared - {"mivol", "torch"}
+    assert unknown == set()
+
+
+def test_entry_points_exist() -> None:
+    """Mitsuba 3.10 imports the module named in the group ``mitsuba``; pip makes a command of each script."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    importlib.import_module(project["entry-points"]["mitsuba"]["mivol"])
+    module, function = project["scripts"]["mivol"].split(":")
+    assert callable(getattr(importlib.import_module(module), function))
+
+
+def test_faults_are_seen() -> None:
+    """The check itself, on a function that it must refuse."""
+    tree = ast.parse("def f(a, b: int, *, c): ...\nclass A:\n    def g(self) -> None: ...\n    def _h(self): ...\n")
+    assert [node.name for node in public(tree)] == ["f", "A", "g"]
+    assert [untyped(node) for node in public(tree) if isinstance(node, Function)] == [["a", "c", "return"], []]
