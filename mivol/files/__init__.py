@@ -1,0 +1,47 @@
+"""What lies on disk: volumes, projections, images; read, checked against their headers, written whole.
+
+Needs no Mitsuba. Grids are float32 (Z, Y, X, C) at voxel centres over the unit cube, placed by ``to_world``.
+"""
+
+from __future__ import annotations
+
+from mivol.files.atomic import whole_file, write_whole, write_whole_bytes, write_whole_text
+from mivol.files.exr import layers, read_exr, write_exr
+from mivol.files.formats import FORMATS, FRAMES, WRITERS, read_volume, write_volume
+from mivol.files.hdf5 import ProjectionData, read_projections
+from mivol.files.png import encode_srgb, write_png
+from mivol.files.slices import read_slices
+from mivol.files.volume import (
+    VolumeData,
+    check_frame,
+    check_volume,
+    frame_from_box,
+    frame_from_steps,
+    in_space,
+)
+
+__all__ = [
+    "FORMATS",
+    "FRAMES",
+    "WRITERS",
+    "ProjectionData",
+    "VolumeData",
+    "check_frame",
+    "check_volume",
+    "encode_srgb",
+    "frame_from_box",
+    "frame_from_steps",
+    "in_space",
+    "layers",
+    "read_exr",
+    "read_projections",
+    "read_slices",
+    "read_volume",
+    "whole_file",
+    "write_exr",
+    "write_png",
+    "write_volume",
+    "write_whole",
+    "write_whole_bytes",
+    "write_whole_text",
+]

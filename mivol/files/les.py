@@ -1,0 +1,66 @@
+"""Clouds of large-eddy simulations as text: i, j, k, liquid water content [g/m^3], effective radius [um] of wet cells.
+
+Conventions. Lines: a comment; nx, ny, nz; dx, dy [km]; nz altitudes [km], which must be evenly spaced; the names of
+the columns; then one line per cell with indices from 0. Cells that are not listed are dry. World lengths are metres.
+Water drops much larger than the wavelength have the extinction 1.5 lwc / r_e [1/m] (water of 1 g/cm^3, efficiency 2).
+
+Reference: Matheou and Chung 2014 (the simulation); the file format is AT3D's.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from mivol.files import source
+from mivol.files.source import choose, refusal
+from mivol.files.volume import VolumeData, as_values, frame_from_steps
+
+COLUMNS = "x,y,z,lwc,reff"
+
+#: Unevenness of the altitudes [of their mean step] that rounding to 1 m leaves at steps of 40 m.
+UNEVEN = 0.03
+
+
+def is_les(head: bytes) -> bool:
+    """Whether the first lines name the columns."""
+    return COLUMNS.encode() in head.replace(b" ", b"")
+
+
+def read_les(path: Path, dataset: str | None = None) -> VolumeData:
+    """Read ``extinction`` [1/m] (the default), ``lwc`` [g/m^3] or ``reff`` [um] on the dense grid.
+
+    Raises:
+        MivolError: a header that is not understood, cells outside the grid, altitudes that are not evenly spaced,
+            water of no radius.
+    """
+    lines = [line.partition("#")[0].strip() for line in source.read_bytes(path).decode("ascii", "replace").splitlines()]
+    lines = [line for line in lines if line]
+    if len(lines) < 4 or lines[3].replace(" ", "") != COLUMNS:
+        raise refusal(path, "another header", f"sizes, spacings, altitudes and '{COLUMNS}'", "correct the file")
+    size = [int(number) for number in source.numbers(lines[0], 3, path)]
+    dx, dy = source.numbers(lines[1], 2, path)
+    altitudes = source.numbers(lines[2], size[2], path)
+    dz = np.diff(altitudes)
+    if size[2] > 1 and np.ptp(dz) > UNEVEN * dz.mean():
+        raise refusal(path, "altitudes of uneven steps", "an even grid", "resample the file first")
+    cells = source.numbers(",".join(lines[4:]), 5 * (len(lines) - 4), path).reshape(-1, 5)
+    index = cells[:, :3].astype(int)
+    if (index < 0).any() or (index >= size).any():
+        raise refusal(path, f"the cell {index[(index >= size).any(1)][:1].tolist()}", f"within {size}", "correct it")
+    fields = {"extinction": _extinction(cells, path), "lwc": cells[:, 3], "reff": cells[:, 4]}
+    name = choose(path, dataset or "extinction", list(fields))
+    grid = np.zeros(size[::-1])
+    grid[index[:, 2], index[:, 1], index[:, 0]] = fields[name]
+    spacing = 1e3 * np.array([dx, dy, dz.mean() if size[2] > 1 else dx])
+    to_world = frame_from_steps(size, np.diag(spacing), (0.0, 0.0, 1e3 * altitudes[0]))
+    meta = {"path": str(path), "format": "les", "dtype": "text", "space": None, "dataset": name, "unit": "m"}
+    return VolumeData(as_values(grid, path), to_world, meta)
+
+
+def _extinction(cells: np.ndarray, path: Path) -> np.ndarray:
+    water, radius = cells[:, 3], cells[:, 4]
+    if ((radius <= 0) & (water > 0)).any():
+        raise refusal(path, "water of effective radius 0", "a radius above 0 where there is water", "correct the file")
+    return np.divide(1.5 * water, radius, out=np.zeros_like(water), where=radius > 0)

@@ -1,0 +1,150 @@
+"""MetaImage (``.mhd`` with its data file, ``.mha`` in one): ``Key = Value`` lines, then the numbers, x fastest.
+
+Conventions. ``Offset`` is the centre of the first voxel; row a of ``TransformMatrix`` is the direction of axis a (as
+ITK reads it); the physical frame is LPS, ITK's. Channels are the fastest index.
+
+Reference: MetaIO documentation, itk.org/Wiki/ITK/MetaIO/Documentation.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from mivol.files import source
+from mivol.files.source import no_dataset, refusal
+from mivol.files.volume import VolumeData, as_values, frame_from_steps
+
+TYPES: dict[str, str] = {
+    "MET_CHAR": "i1",
+    "MET_UCHAR": "u1",
+    "MET_SHORT": "i2",
+    "MET_USHORT": "u2",
+    "MET_INT": "i4",
+    "MET_UINT": "u4",
+    "MET_LONG": "i4",
+    "MET_ULONG": "u4",
+    "MET_LONG_LONG": "i8",
+    "MET_ULONG_LONG": "u8",
+    "MET_FLOAT": "f4",
+    "MET_DOUBLE": "f8",
+}
+
+TRUTH = {"true": True, "t": True, "1": True, "yes": True, "false": False, "f": False, "0": False, "no": False}
+
+
+def read_metaimage(path: Path, dataset: str | None = None) -> VolumeData:
+    """Read ``.mhd`` or ``.mha`` (raw, zlib or ascii; local, one data file, a list or a pattern of slices).
+
+    Raises:
+        MivolError: a key missing or not understood, or sizes that do not fit the data.
+    """
+    no_dataset(path, dataset)
+    keys, local = _header(source.read_bytes(path), path)
+    size = [int(number) for number in _floats(keys, path, "DimSize")]
+    if _floats(keys, path, "NDims") != [3.0] or len(size) != 3 or min(size) < 1:
+        raise refusal(
+            path, f"NDims {keys['NDims']} and DimSize {keys['DimSize']}", "3 sizes above 0", "convert it to 3D"
+        )
+    channels = int(_floats(keys, path, "ElementNumberOfChannels", default=[1.0])[0])
+    dtype = _dtype(keys, path)
+    stored = _stored(keys, local, dtype, size[0] * size[1] * size[2] * channels, path)
+    values = as_values(stored.reshape(*size[::-1], channels), path)
+    meta = {"path": str(path), "format": "metaimage", "dtype": str(dtype), "space": "LPS", "header": keys}
+    return VolumeData(values, frame_from_steps(size, *_place(keys, path)), meta)
+
+
+def _header(data: bytes, path: Path) -> tuple[dict[str, str], bytes]:
+    """Keys, and the bytes after ``ElementDataFile`` (the names of a list, or the local data)."""
+    keys: dict[str, str] = {}
+    rest = data
+    while rest:
+        line, _, rest = rest.partition(b"\n")
+        text = line.decode("utf-8", errors="replace").strip()
+        key, equals, value = text.partition("=")
+        if not equals:
+            if text:
+                raise refusal(path, f"the header line {text[:60]!r}", "'Key = Value'", "correct the header")
+            continue
+        keys[key.strip()] = value.strip()
+        if key.strip() == "ElementDataFile":
+            return keys, rest
+    raise refusal(path, "no key ElementDataFile", "one at the end of the header", "add it or copy the file again")
+
+
+def _floats(keys: dict[str, str], path: Path, *names: str, default: list[float] | None = None) -> list[float]:
+    """The numbers under the first of ``names`` that is there."""
+    for name in names:
+        if name in keys:
+            try:
+                return [float(word) for word in keys[name].split()]
+            except ValueError as error:
+                raise refusal(path, f"'{name} = {keys[name]}'", "numbers", "correct the header") from error
+    if default is None:
+        raise refusal(path, f"no key {names[0]}", "one in the MetaImage header", f"add '{names[0]} = ...'")
+    return default
+
+
+def _truth(keys: dict[str, str], path: Path, *names: str) -> bool:
+    for name in names:
+        if name in keys:
+            if keys[name].lower() not in TRUTH:
+                raise refusal(path, f"'{name} = {keys[name]}'", "True or False", "correct the header")
+            return TRUTH[keys[name].lower()]
+    return False
+
+
+def _dtype(keys: dict[str, str], path: Path) -> np.dtype:
+    name = keys.get("ElementType", "").upper()
+    if name not in TYPES:
+        raise refusal(path, f"ElementType '{name}'", f"one of {', '.join(TYPES)}", "convert it to MET_FLOAT first")
+    big = _truth(keys, path, "BinaryDataByteOrderMSB", "ElementByteOrderMSB")
+    return np.dtype(TYPES[name]).newbyteorder(">" if big else "<")
+
+
+def _stored(keys: dict[str, str], local: bytes, dtype: np.dtype, count: int, path: Path) -> np.ndarray:
+    name = keys["ElementDataFile"]
+    if name.upper() == "LOCAL":
+        return _unpack(local, keys, dtype, count, path)
+    files = _data_files(name, local, path)
+    if count % len(files):
+        raise refusal(path, f"{len(files)} data files", f"a divisor of {count} numbers", "correct the list")
+    return np.concatenate([_unpack(source.read_bytes(f), keys, dtype, count // len(files), f) for f in files])
+
+
+def _data_files(name: str, local: bytes, path: Path) -> list[Path]:
+    words = name.split()
+    if words and words[0].upper() == "LIST":
+        names = [line.strip() for line in local.decode("utf-8", errors="replace").splitlines() if line.strip()]
+    elif len(words) == 4 and "%" in words[0]:
+        try:
+            first, last, step = (int(word) for word in words[1:])
+            names = [words[0] % number for number in range(first, last + 1, step)]
+        except (ValueError, TypeError) as error:
+            raise refusal(path, f"'ElementDataFile = {name}'", "pattern, first, last, step", "correct it") from error
+    else:
+        names = [name]
+    if not names or not names[0]:
+        raise refusal(path, "no data file in ElementDataFile", "LOCAL or a name", "correct the header")
+    return [path.parent / name for name in names]
+
+
+def _unpack(data: bytes, keys: dict[str, str], dtype: np.dtype, count: int, path: Path) -> np.ndarray:
+    skip = int(_floats(keys, path, "HeaderSize", default=[0.0])[0])
+    if "BinaryData" in keys and not _truth(keys, path, "BinaryData"):
+        return source.numbers(data, count, path)
+    if _truth(keys, path, "CompressedData"):
+        data = source.inflate(data[max(skip, 0) :], "zlib", count * dtype.itemsize, path)
+        skip = 0
+    return source.elements(data, dtype, count, path, offset=len(data) - count * dtype.itemsize if skip < 0 else skip)
+
+
+def _place(keys: dict[str, str], path: Path) -> tuple[np.ndarray, np.ndarray]:
+    spacing = _floats(keys, path, "ElementSpacing", "ElementSize", default=[1.0] * 3)
+    origin = _floats(keys, path, "Offset", "Position", "Origin", default=[0.0] * 3)
+    rows = _floats(keys, path, "TransformMatrix", "Orientation", "Rotation", default=np.eye(3).ravel().tolist())
+    for name, numbers, count in (("spacing", spacing, 3), ("offset", origin, 3), ("matrix", rows, 9)):
+        if len(numbers) != count:
+            raise refusal(path, f"{len(numbers)} numbers for the {name}", f"{count}", "correct the header")
+    return np.array(rows).reshape(3, 3).T * spacing, np.array(origin)

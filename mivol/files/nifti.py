@@ -1,0 +1,190 @@
+"""NIfTI-1 and NIfTI-2 in one file (``.nii``, ``.nii.gz``): a binary header, then the numbers, x fastest.
+
+Conventions. The world frame is RAS (x to the right, y forwards, z up). The place is the sform where its code is above
+0, else the qform (quaternion, pixdim, qfac), else the bare voxel sizes. Stored numbers are scaled by ``scl_slope`` and
+``scl_inter`` unless the slope is 0. One axis beyond the third may be longer than 1: it becomes the channels.
+
+Reference: nifti.nimh.nih.gov, nifti1.h and nifti2.h.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from mivol.files import source
+from mivol.files.source import no_dataset, refusal
+from mivol.files.volume import VolumeData, as_values, frame_from_steps
+
+TYPES: dict[int, str] = {
+    2: "u1",
+    4: "i2",
+    8: "i4",
+    16: "f4",
+    64: "f8",
+    256: "i1",
+    512: "u2",
+    768: "u4",
+    1024: "i8",
+    1280: "u8",
+    128: "3u1",
+}
+
+UNITS: dict[int, str] = {0: "unknown", 1: "m", 2: "mm", 3: "um"}
+
+
+class Layout(NamedTuple):
+    """Where the fields of a header stand: (struct code, byte offset)."""
+
+    size: int
+    magic: tuple[bytes, int]
+    dim: tuple[str, int]
+    datatype: tuple[str, int]
+    pixdim: tuple[str, int]
+    vox_offset: tuple[str, int]
+    scale: tuple[str, int]
+    units: tuple[str, int]
+    codes: tuple[str, int]
+    quaternion: tuple[str, int]
+    srow: tuple[str, int]
+
+
+LAYOUTS: dict[int, Layout] = {
+    348: Layout(
+        size=348,
+        magic=(b"n+1\0", 344),
+        dim=("8h", 40),
+        datatype=("h", 70),
+        pixdim=("8f", 76),
+        vox_offset=("f", 108),
+        scale=("2f", 112),
+        units=("B", 123),
+        codes=("2h", 252),
+        quaternion=("6f", 256),
+        srow=("12f", 280),
+    ),
+    540: Layout(
+        size=540,
+        magic=(b"n+2\0", 4),
+        dim=("8q", 16),
+        datatype=("h", 12),
+        pixdim=("8d", 104),
+        vox_offset=("q", 168),
+        scale=("2d", 176),
+        units=("i", 500),
+        codes=("2i", 344),
+        quaternion=("6d", 352),
+        srow=("12d", 400),
+    ),
+}
+
+
+def is_nifti(head: bytes) -> bool:
+    """Whether the first bytes are a NIfTI header of either version and byte order."""
+    return _layout(head) is not None
+
+
+def is_nifti_gz(head: bytes) -> bool:
+    """Whether the first bytes are gzip around a NIfTI header."""
+    return head[:2] == b"\x1f\x8b" and is_nifti(_peek(head))
+
+
+def read_nifti(path: Path, dataset: str | None = None) -> VolumeData:
+    """Read a single-file NIfTI.
+
+    Raises:
+        MivolError: truncated, a type that is not a real number, several time steps, no usable place.
+    """
+    no_dataset(path, dataset)
+    data = source.read_bytes(path)
+    packed = data[:2] == b"\x1f\x8b"
+    head = _peek(data) if packed else data
+    layout, order = _layout(head)
+
+    def field(name: str) -> tuple:
+        code, offset = getattr(layout, name)
+        return struct.unpack_from(order + code, head, offset)
+
+    dim, pixdim = field("dim"), np.array(field("pixdim"), np.float64)
+    size, extra = _sizes(dim, path)
+    dtype, parts = _dtype(field("datatype")[0], order, path)
+    count, offset = int(np.prod(size, dtype=object)) * extra * parts, int(field("vox_offset")[0])
+    if packed:
+        data = source.inflate(data, "gzip", offset + count * dtype.itemsize, path)
+    stored = source.elements(data, dtype, count, path, offset=max(offset, layout.size))
+    grid = stored.reshape(extra, *size[::-1], parts).transpose(1, 2, 3, 0, 4).reshape(*size[::-1], extra * parts)
+    slope, intercept = field("scale")
+    if np.isfinite(slope) and slope != 0 and (slope, intercept) != (1, 0) and parts == 1:
+        grid = grid * np.float64(slope) + (intercept if np.isfinite(intercept) else 0.0)
+    steps, origin, form = _place(field("codes"), field("quaternion"), field("srow"), pixdim)
+    meta = {
+        "path": str(path),
+        "format": "nifti",
+        "dtype": str(dtype),
+        "space": "RAS",
+        "place": form,
+        "unit": UNITS.get(field("units")[0] & 7, "unknown"),
+    }
+    return VolumeData(as_values(grid, path), frame_from_steps(size, steps, origin), meta)
+
+
+def _peek(data: bytes) -> bytes:
+    try:
+        return zlib.decompressobj(zlib.MAX_WBITS | 16).decompress(data, 544)
+    except zlib.error:
+        return b""
+
+
+def _layout(head: bytes) -> tuple[Layout, str] | None:
+    for order in "<>":
+        layout = LAYOUTS.get(struct.unpack_from(order + "i", head)[0]) if len(head) >= 4 else None
+        if layout and len(head) >= layout.size and head[layout.magic[1] :].startswith(layout.magic[0]):
+            return layout, order
+    return None
+
+
+def _sizes(dim: tuple[int, ...], path: Path) -> tuple[list[int], int]:
+    """Voxels along x, y, z, and the product of the further axes, of which one may be longer than 1."""
+    rank = dim[0]
+    sizes = [int(number) for number in dim[1 : rank + 1]] if 1 <= rank <= 7 else []
+    sizes += [1] * (3 - len(sizes))
+    if rank not in range(1, 8) or min(sizes) < 1 or sum(number > 1 for number in sizes[3:]) > 1:
+        raise refusal(path, f"dim {list(dim)}", "3 sizes above 0 and at most one further axis", "extract one volume")
+    return sizes[:3], int(np.prod(sizes[3:], dtype=object)) if len(sizes) > 3 else 1
+
+
+def _dtype(code: int, order: str, path: Path) -> tuple[np.dtype, int]:
+    if code not in TYPES:
+        raise refusal(
+            path, f"datatype {code}", f"a real one ({', '.join(map(str, TYPES))})", "convert it to float32 first"
+        )
+    return (np.dtype("u1"), 3) if TYPES[code] == "3u1" else (np.dtype(order + TYPES[code]), 1)
+
+
+def _place(
+    codes: tuple[int, int], quaternion: tuple[float, ...], srow: tuple[float, ...], pixdim: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, str]:
+    """Steps (3, 3), the first voxel's centre (3,), and which form they come from."""
+    if codes[1] > 0:
+        affine = np.array(srow, np.float64).reshape(3, 4)
+        return affine[:, :3], affine[:, 3], "sform"
+    if codes[0] > 0:
+        spacing = pixdim[1:4] * (1, 1, -1 if pixdim[0] < 0 else 1)
+        return rotation(*quaternion[:3]) * spacing, np.array(quaternion[3:], np.float64), "qform"
+    return np.diag(pixdim[1:4]), np.zeros(3), "pixdim"
+
+
+def rotation(b: float, c: float, d: float) -> np.ndarray:
+    """The rotation (3, 3) of the unit quaternion (a, b, c, d) with a >= 0 left out, as NIfTI stores it."""
+    a = np.sqrt(max(0.0, 1 - (b * b + c * c + d * d)))
+    return np.array(
+        [
+            [a * a + b * b - c * c - d * d, 2 * (b * c - a * d), 2 * (b * d + a * c)],
+            [2 * (b * c + a * d), a * a + c * c - b * b - d * d, 2 * (c * d - a * b)],
+            [2 * (b * d - a * c), 2 * (c * d + a * b), a * a + d * d - b * b - c * c],
+        ]
+    )

@@ -1,0 +1,293 @@
+"""NRRD: a header of ``field: value`` lines, then the numbers, the first axis fastest; or the numbers in other files.
+
+Conventions. Axes with a vector in ``space directions`` (else with ``domain`` or ``space`` in ``kinds``, else all of
+three) are x, y, z in the order of the file; one more axis, wherever it stands, is the channel. ``space origin`` is the
+centre of the first voxel. Line skip comes before decompression, byte skip after it; byte skip -1 takes the end of a raw
+file. The frame is kept as the file says (``meta["space"]`` "LPS" or "RAS" where it names one).
+
+Reference: the format's definition, "Definition of NRRD File Format", teem.sourceforge.net/nrrd/format.html.
+"""
+
+from __future__ import annotations
+
+import gzip
+import re
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+
+from mivol.files import source
+from mivol.files.source import no_dataset, refusal
+from mivol.files.volume import VolumeData, as_values, frame_from_steps
+
+MAGIC = b"NRRD000"
+
+
+def _names(dtype: str, *names: str) -> dict[str, str]:
+    return dict.fromkeys(names, dtype)
+
+
+#: name in the header -> NumPy type without byte order.
+TYPES: dict[str, str] = {
+    **_names("i1", "signed char", "int8", "int8_t"),
+    **_names("u1", "uchar", "unsigned char", "uint8", "uint8_t"),
+    **_names("i2", "short", "short int", "signed short", "signed short int", "int16", "int16_t"),
+    **_names("u2", "ushort", "unsigned short", "unsigned short int", "uint16", "uint16_t"),
+    **_names("i4", "int", "signed int", "int32", "int32_t"),
+    **_names("u4", "uint", "unsigned int", "uint32", "uint32_t"),
+    **_names("i8", "longlong", "long long", "long long int", "signed long long", "signed long long int"),
+    **_names("i8", "int64", "int64_t"),
+    **_names("u8", "ulonglong", "unsigned long long", "unsigned long long int", "uint64", "uint64_t"),
+    **_names("f4", "float"),
+    **_names("f8", "double"),
+}
+
+#: name in the header -> how the bytes are packed.
+ENCODINGS: dict[str, str] = {
+    "raw": "raw",
+    "gz": "gzip",
+    "gzip": "gzip",
+    "bz2": "bzip2",
+    "bzip2": "bzip2",
+    "txt": "ascii",
+    "text": "ascii",
+    "ascii": "ascii",
+}
+
+SPACES: dict[str, str] = {
+    "left-posterior-superior": "LPS",
+    "lps": "LPS",
+    "right-anterior-superior": "RAS",
+    "ras": "RAS",
+    "left-anterior-superior": "LAS",
+    "las": "LAS",
+}
+
+SPACE_NAMES: dict[str, str] = {name: long for long, name in SPACES.items() if "-" in long}
+
+#: spellings of a field without its blank.
+ALIASES: dict[str, str] = {
+    "datafile": "data file",
+    "lineskip": "line skip",
+    "byteskip": "byte skip",
+    "axismins": "axis mins",
+    "axismaxs": "axis maxs",
+    "centerings": "centers",
+}
+
+
+def read_nrrd(path: Path, dataset: str | None = None) -> VolumeData:
+    """Read ``.nrrd`` or ``.nhdr`` (raw, gzip, bzip2 or ascii; attached or detached).
+
+    Raises:
+        MivolError: a field missing or not understood, sizes that do not fit the data, axes that cannot be told apart.
+    """
+    no_dataset(path, dataset)
+    fields, comments, attached = _header(source.read_bytes(path), path)
+    sizes = _integers(fields, "sizes", path)
+    if len(sizes) != _integers(fields, "dimension", path)[0] or min(sizes) < 1:
+        raise refusal(path, f"sizes {sizes}", f"{fields['dimension']} sizes above 0", "correct the header")
+    dtype = _dtype(fields, path)
+    stored = _stored(fields, comments, attached, dtype, int(np.prod(sizes, dtype=object)), path)
+    spatial, channel = _axes(fields, sizes, path)
+    grid = stored.reshape(sizes[::-1]).transpose([len(sizes) - 1 - axis for axis in (*spatial[::-1], *channel)])
+    size = [sizes[axis] for axis in spatial]
+    steps, origin = _place(fields, spatial, size, path)
+    meta = {
+        "path": str(path),
+        "format": "nrrd",
+        "dtype": str(dtype),
+        "space": SPACES.get(fields.get("space", "").lower()),
+        "header": fields,
+    }
+    return VolumeData(as_values(grid, path), frame_from_steps(size, steps, origin), meta)
+
+
+def write_nrrd(file: BinaryIO, values: np.ndarray, to_world: np.ndarray, metadata: dict[str, Any]) -> None:
+    """Write an attached, gzip-compressed float32 NRRD; ``metadata`` becomes ``key:=value`` lines of strings."""
+    nz, ny, nx, channels = values.shape
+    steps = to_world[:3, :3] / (nx, ny, nz)
+    origin = to_world[:3, 3] + steps.sum(axis=1) / 2
+    directions = [_vector(step) for step in steps.T]
+    space = metadata.get("space")
+    lines = [
+        "NRRD0004",
+        "type: float",
+        f"dimension: {3 + (channels > 1)}",
+        f"space: {SPACE_NAMES[space]}" if space in SPACE_NAMES else "space dimension: 3",
+        "sizes: " + " ".join(map(str, ([channels] if channels > 1 else []) + [nx, ny, nz])),
+        "space directions: " + " ".join((["none"] if channels > 1 else []) + directions),
+        "kinds: " + " ".join((["vector"] if channels > 1 else []) + ["domain"] * 3),
+        "endian: little",
+        "encoding: gzip",
+        f"space origin: {_vector(origin)}",
+    ]
+    for key, value in metadata.items():
+        if key != "space":
+            escaped = str(value).replace("\\", "\\\\").replace("\n", "\\n")
+            lines.append(f"{key}:={escaped}")
+    file.write(("\n".join(lines) + "\n\n").encode("utf-8"))
+    file.write(gzip.compress(np.ascontiguousarray(values, "<f4").tobytes(), 6, mtime=0))
+
+
+def _vector(numbers: np.ndarray) -> str:
+    return "(" + ",".join(repr(float(number)) for number in numbers) + ")"
+
+
+def _header(data: bytes, path: Path) -> tuple[dict[str, str], list[str], bytes]:
+    """Fields (names in lower case), the lines after ``data file: LIST``, and the bytes after the blank line."""
+    end = re.search(rb"\r?\n\r?\n", data)
+    head, attached = (data[: end.start()], data[end.end() :]) if end else (data, b"")
+    lines = head.decode("utf-8", errors="replace").splitlines()
+    fields: dict[str, str] = {}
+    for number, line in enumerate(lines[1:], start=1):
+        if line.startswith("#") or not line.strip():
+            continue
+        match = re.match(r"([^:]+):(=| ?)(.*)", line)
+        if not match:
+            raise refusal(path, f"the header line {line[:60]!r}", "'field: value'", "correct the header")
+        name, kind, value = match.groups()
+        name = name.strip() if kind == "=" else name.strip().lower()
+        if kind != "=":
+            fields[ALIASES.get(name, name)] = value.strip()
+            if ALIASES.get(name, name) == "data file" and value.strip().upper().startswith("LIST"):
+                return fields, lines[number + 1 :], b""
+    return fields, [], attached
+
+
+def _field(fields: dict[str, str], name: str, path: Path) -> str:
+    if name not in fields:
+        raise refusal(path, f"no field '{name}'", "one in the NRRD header", f"add '{name}: ...' to the header")
+    return fields[name]
+
+
+def _integers(fields: dict[str, str], name: str, path: Path) -> list[int]:
+    text = _field(fields, name, path)
+    try:
+        return [int(word) for word in text.split()] or [0]
+    except ValueError as error:
+        raise refusal(path, f"'{name}: {text}'", "whole numbers", "correct the header") from error
+
+
+def _floats(text: str, name: str, path: Path) -> list[float]:
+    try:
+        return [float(word) for word in text.replace(",", " ").split()]
+    except ValueError as error:
+        raise refusal(path, f"'{name}: {text}'", "numbers", "correct the header") from error
+
+
+def _dtype(fields: dict[str, str], path: Path) -> np.dtype:
+    name = _field(fields, "type", path).lower()
+    if name not in TYPES:
+        raise refusal(path, f"the type '{name}'", "an integer or float type", "convert it to float first")
+    dtype = np.dtype(TYPES[name])
+    if dtype.itemsize == 1 or _packing(fields, path) == "ascii":
+        return dtype
+    endian = _field(fields, "endian", path).lower()
+    if endian not in ("little", "big"):
+        raise refusal(path, f"'endian: {endian}'", "little or big", "correct the header")
+    return dtype.newbyteorder("<" if endian == "little" else ">")
+
+
+def _packing(fields: dict[str, str], path: Path) -> str:
+    name = _field(fields, "encoding", path).lower()
+    if name not in ENCODINGS:
+        raise refusal(path, f"the encoding '{name}'", "raw, gzip, bzip2 or ascii", "convert it to raw first")
+    return ENCODINGS[name]
+
+
+def _stored(
+    fields: dict[str, str], listed: list[str], attached: bytes, dtype: np.dtype, count: int, path: Path
+) -> np.ndarray:
+    if "data file" not in fields:
+        return _unpack(attached, fields, dtype, count, path)
+    files = _data_files(fields["data file"], listed, path)
+    if count % len(files):
+        raise refusal(path, f"{len(files)} data files", f"a divisor of {count} numbers", "correct the list")
+    parts = [_unpack(source.read_bytes(name), fields, dtype, count // len(files), name) for name in files]
+    return np.concatenate(parts)
+
+
+def _data_files(value: str, listed: list[str], path: Path) -> list[Path]:
+    words = value.split()
+    if words and words[0].upper() == "LIST":
+        names = [line.strip() for line in listed if line.strip()]
+    elif len(words) in (4, 5) and "%" in words[0]:
+        try:
+            first, last, step = (int(word) for word in words[1:4])
+            names = [words[0] % number for number in range(first, last + (1 if step > 0 else -1), step)]
+        except (ValueError, TypeError) as error:
+            raise refusal(path, f"'data file: {value}'", "pattern, first, last, step", "correct the header") from error
+    else:
+        names = [value]
+    if not names:
+        raise refusal(path, "an empty list of data files", "at least one", "correct the header")
+    return [path.parent / name for name in names]
+
+
+def _unpack(data: bytes, fields: dict[str, str], dtype: np.dtype, count: int, path: Path) -> np.ndarray:
+    line_skip = _integers(fields, "line skip", path)[0] if "line skip" in fields else 0
+    byte_skip = _integers(fields, "byte skip", path)[0] if "byte skip" in fields else 0
+    for _ in range(line_skip):
+        data = data.partition(b"\n")[2]
+    packing = _packing(fields, path)
+    if packing == "ascii":
+        return source.numbers(data[max(byte_skip, 0) :], count, path)
+    promised = count * dtype.itemsize
+    if packing != "raw":
+        data = source.inflate(data, packing, max(byte_skip, 0) + promised, path)
+    return source.elements(data, dtype, count, path, offset=len(data) - promised if byte_skip < 0 else byte_skip)
+
+
+def _axes(fields: dict[str, str], sizes: list[int], path: Path) -> tuple[list[int], list[int]]:
+    """Numbers of the spatial axes (x, y, z) and of the channel axis (at most one)."""
+    if "space directions" in fields:
+        spatial = [axis for axis, vector in enumerate(_vectors(fields, path)) if vector is not None]
+    elif "kinds" in fields:
+        kinds = fields["kinds"].lower().split()
+        spatial = [axis for axis, kind in enumerate(kinds) if kind in ("domain", "space", "???", "none")]
+    else:
+        spatial = list(range(len(sizes)))
+    channel = [axis for axis in range(len(sizes)) if axis not in spatial]
+    if len(spatial) != 3 or len(channel) > 1 or max(spatial) >= len(sizes):
+        raise refusal(
+            path,
+            f"{len(sizes)} axes of which {len(spatial)} are spatial",
+            "3 spatial axes and at most one of channels",
+            "say which with 'kinds' or 'space directions'",
+        )
+    return spatial, channel
+
+
+def _vectors(fields: dict[str, str], path: Path) -> list[list[float] | None]:
+    text = fields["space directions"]
+    found = re.findall(r"none|\(([^)]*)\)", text)
+    return [_floats(inner, "space directions", path) if inner else None for inner in found]
+
+
+def _place(fields: dict[str, str], spatial: list[int], size: list[int], path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Steps (3, 3) and the first voxel's centre (3,)."""
+    if "space directions" in fields:
+        vectors = [vector for vector in _vectors(fields, path) if vector is not None]
+        origin = _floats(fields.get("space origin", "(0,0,0)").strip("() "), "space origin", path)
+        if any(len(vector) != 3 for vector in (*vectors, origin)):
+            raise refusal(path, f"'space directions: {fields['space directions']}'", "3-vectors", "correct the header")
+        return np.array(vectors).T, np.array(origin)
+    spacing = _per_axis(fields, "spacings", spatial, 1.0, path)
+    low = _per_axis(fields, "axis mins", spatial, np.nan, path)
+    if "spacings" not in fields and "axis maxs" in fields:
+        spacing = (_per_axis(fields, "axis maxs", spatial, np.nan, path) - low) / size
+    if "space origin" in fields:
+        return np.diag(spacing), np.array(_floats(fields["space origin"].strip("() "), "space origin", path))
+    return np.diag(spacing), np.where(np.isnan(low), 0.0, low + spacing / 2)
+
+
+def _per_axis(fields: dict[str, str], name: str, spatial: list[int], default: float, path: Path) -> np.ndarray:
+    if name not in fields:
+        return np.full(3, default)
+    values = _floats(fields[name], name, path)
+    if len(values) <= max(spatial):
+        raise refusal(path, f"'{name}: {fields[name]}'", "one number per axis", "correct the header")
+    chosen = np.array([values[axis] for axis in spatial])
+    return np.where(np.isnan(chosen), default, chosen)

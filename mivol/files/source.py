@@ -1,0 +1,189 @@
+"""The bytes of a file, and what they must add up to.
+
+Every reader takes its bytes from here, so that a missing, empty, truncated or damaged file is refused in the same words
+everywhere: what was found, what was expected, the way out.
+
+Here: :func:`refusal` (the sentence), :func:`existing_file`, :func:`read_bytes`, :func:`elements` (bytes -> array),
+:func:`numbers` (text -> array), :func:`inflate` (bounded decompression),
+:func:`choose` and :func:`no_dataset` (which array of a file).
+"""
+
+from __future__ import annotations
+
+import bz2
+import difflib
+import lzma
+import os
+import warnings
+import zlib
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from mivol.errors import MivolError
+
+#: codec name -> constructor of a decompressor with ``decompress(data, max_length)``, ``eof`` and ``unused_data``.
+CODECS: dict[str, Callable[[], object]] = {
+    "zlib": lambda: zlib.decompressobj(zlib.MAX_WBITS),
+    "gzip": lambda: zlib.decompressobj(zlib.MAX_WBITS | 16),
+    "bzip2": bz2.BZ2Decompressor,
+    "lzma": lzma.LZMADecompressor,
+}
+
+
+def refusal(subject: object, found: str, expected: str, way_out: str) -> MivolError:
+    """The one sentence that refuses an input (``subject``: file or parameter): found, expected, the way out."""
+    return MivolError(f"{subject}: found {found}, expected {expected}; {way_out}.")
+
+
+def existing_file(path: str | os.PathLike) -> Path:
+    """The path, if it names a file that holds at least one byte.
+
+    Raises:
+        MivolError: nothing is there (the nearest name in the folder is offered), a folder is there, or an empty file.
+    """
+    path = Path(path)
+    if path.is_dir():
+        raise refusal(path, "a folder", "a file", "name a file in it (a stack of raw slices is read by read_slices)")
+    if not path.is_file():
+        raise refusal(path, "nothing there", "an existing file", _nearest(path))
+    if path.stat().st_size == 0:
+        raise refusal(path, "an empty file", "data", "copy or write it again")
+    return path
+
+
+def read_bytes(path: str | os.PathLike) -> bytes:
+    """All bytes of an existing, non-empty file.
+
+    Raises:
+        MivolError: as :func:`existing_file`, or the file may not be read.
+    """
+    path = existing_file(path)
+    try:
+        return path.read_bytes()
+    except PermissionError as error:
+        raise refusal(path, "no permission to read it", "a readable file", "change its permissions") from error
+
+
+def elements(data: bytes, dtype: np.dtype | str, count: int, path: object, *, offset: int = 0) -> np.ndarray:
+    """The ``count`` numbers that fill ``data`` from byte ``offset`` to its end, exactly.
+
+    Args:
+        data: the bytes of the file or of one decompressed block.
+        dtype: NumPy type with its byte order.
+        count: how many numbers the header promises.
+        path: named in the refusal.
+        offset: first byte of the numbers.
+
+    Returns:
+        A read-only view (count,) of ``data``.
+
+    Raises:
+        MivolError: fewer or more bytes than promised.
+    """
+    dtype = np.dtype(dtype)
+    held, promised = len(data) - offset, count * dtype.itemsize
+    if held != promised:
+        fault = "truncated" if held < promised else "longer than its header says"
+        raise refusal(
+            path,
+            f"{max(held, 0)} bytes of voxel data",
+            f"{promised} ({count} numbers of {dtype.itemsize} bytes, from the header)",
+            f"the file is {fault}: copy it again or correct the header",
+        )
+    return np.frombuffer(data, dtype, count, offset)
+
+
+def numbers(text: bytes | str, count: int, path: object) -> np.ndarray:
+    """The ``count`` numbers written in ``text``, separated by white space or commas, as float64 (count,).
+
+    Raises:
+        MivolError: something that is not a number, or another count.
+    """
+    if isinstance(text, bytes):
+        text = text.decode("ascii", errors="replace")
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            values = np.fromstring(text.replace(",", " "), dtype=np.float64, sep=" ")
+    except (ValueError, DeprecationWarning) as error:
+        raise refusal(path, "text that is not a number among the values", "numbers only", "write it again") from error
+    if values.size != count:
+        fault = "truncated" if values.size < count else "longer than its header says"
+        raise refusal(
+            path, f"{values.size} numbers", f"{count} (from the header)", f"the file is {fault}: write it again"
+        )
+    return values
+
+
+def inflate(data: bytes, codec: str, limit: int, path: object) -> bytes:
+    """Decompress all of ``data``, never to more than ``limit`` bytes (the header's promise bounds the memory).
+
+    Concatenated streams (several gzip members) are joined; zero padding after the last one is skipped.
+
+    Args:
+        data: compressed bytes.
+        codec: a key of :data:`CODECS`.
+        limit: the most bytes that the header allows.
+        path: named in the refusal.
+
+    Raises:
+        MivolError: damaged, truncated, or longer than ``limit``.
+    """
+    pieces, total, rest = [], 0, data
+    while rest:
+        stream = CODECS[codec]()
+        try:
+            piece = stream.decompress(rest, limit + 1 - total)
+        except (zlib.error, OSError, EOFError, lzma.LZMAError) as error:
+            raise refusal(path, f"damaged {codec} data ({error})", "a sound stream", "copy the file again") from error
+        pieces.append(piece)
+        total += len(piece)
+        if total > limit:
+            raise refusal(
+                path,
+                f"more than {limit} bytes after decompression",
+                f"at most {limit} (from the header)",
+                "correct the header",
+            )
+        if not stream.eof:
+            raise refusal(path, f"a {codec} stream that breaks off", "its end", "the file is truncated: copy it again")
+        rest = stream.unused_data.lstrip(b"\0")
+    return b"".join(pieces)
+
+
+def choose(path: object, dataset: str | None, names: Sequence[str]) -> str:
+    """Which of several arrays to read: the one asked for, or the only one.
+
+    Raises:
+        MivolError: the name is not there (the nearest is offered), or none was given where there are several.
+    """
+    listed = ", ".join(map(repr, names)) or "none"
+    if dataset is None:
+        if len(names) == 1:
+            return names[0]
+        raise refusal(path, f"{len(names)} arrays ({listed})", "one", "name the one you want with dataset=")
+    if dataset not in names:
+        near = difflib.get_close_matches(dataset, names, 1)
+        way_out = f"did you mean {near[0]!r}" if near else "choose one of those"
+        raise refusal(path, f"no array {dataset!r} (there: {listed})", "an array of that name", way_out)
+    return dataset
+
+
+def no_dataset(path: object, dataset: str | None) -> None:
+    """Refuse a dataset name where the format holds one unnamed array.
+
+    Raises:
+        MivolError: ``dataset`` is not None.
+    """
+    if dataset is not None:
+        raise refusal(path, f"dataset={dataset!r} for a file with one unnamed array", "no dataset", "leave it out")
+
+
+def _nearest(path: Path) -> str:
+    if not path.parent.is_dir():
+        return f"the folder {path.parent} does not exist either"
+    names = (entry.name for entry in path.parent.iterdir())
+    near = difflib.get_close_matches(path.name, names, 1)
+    return f"did you mean {near[0]}" if near else "check the spelling and the folder"

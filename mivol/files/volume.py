@@ -1,0 +1,246 @@
+"""A grid of numbers at voxel centres, and the affine map that says where in the world its unit cube lies.
+
+Conventions. ``values`` is float32, C-contiguous, (Z, Y, X, C): x is the fastest spatial axis. Voxel (i, j, k) of the
+x, y, z axes has its centre at ((i + .5)/Nx, (j + .5)/Ny, (k + .5)/Nz) in local coordinates; ``to_world`` (4, 4)
+float64 takes local (x, y, z, 1) to the file's own physical frame, columns first. ``origin`` is the world position of
+the *centre* of voxel (0, 0, 0), as in NRRD, MetaImage, NIfTI and VTK, so the unit cube begins half a voxel before it.
+
+Here: :class:`VolumeData`, frames (:func:`frame_from_steps`, :func:`frame_from_box`, :func:`check_frame`,
+:func:`in_space`), values (:func:`as_values`, :func:`check_volume`).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from mivol.files.source import refusal
+
+#: Sides of a box below this are not normal float32 numbers, so their reciprocal overflows.
+SMALLEST_SIDE = float(np.finfo(np.float32).tiny)
+
+#: |det| of the three sides over the product of their lengths; below 16 float32 roundings the box is flat in float32.
+FLATTEST = 16 * float(np.finfo(np.float32).eps)
+
+#: Names of medical frames -> the sign of their x, y, z axes against right-anterior-superior.
+SPACES: dict[str, tuple[int, int, int]] = {"RAS": (1, 1, 1), "LPS": (-1, -1, 1), "LAS": (-1, 1, 1)}
+
+
+@dataclasses.dataclass(frozen=True)
+class VolumeData:
+    """A volume as it was read: numbers, place, and where they came from.
+
+    Attributes:
+        values: float32 (Z, Y, X, C), C-contiguous; negative and non-finite numbers are kept (see check_volume).
+        to_world: float64 (4, 4), unit cube to the file's physical frame.
+        meta: ``path``, ``format``, ``dtype`` (on disk), ``space`` ("RAS", "LPS" or None) and the format's own facts.
+    """
+
+    values: np.ndarray
+    to_world: np.ndarray
+    meta: dict[str, Any] = dataclasses.field(default_factory=dict)
+
+    @property
+    def size(self) -> np.ndarray:
+        """Voxels along x, y, z: int (3,)."""
+        return np.array(self.values.shape[2::-1])
+
+    @property
+    def steps(self) -> np.ndarray:
+        """World vector from a voxel's centre to its neighbour's, one column per axis x, y, z: float64 (3, 3)."""
+        return self.to_world[:3, :3] / self.size
+
+    @property
+    def spacing(self) -> np.ndarray:
+        """Distance between neighbouring voxel centres along x, y, z [length of the file]: float64 (3,)."""
+        return np.linalg.norm(self.steps, axis=0)
+
+    @property
+    def origin(self) -> np.ndarray:
+        """World position of the centre of voxel (0, 0, 0): float64 (3,)."""
+        return self.to_world[:3, 3] + self.steps.sum(axis=1) / 2
+
+
+def frame_from_steps(size: Sequence[int], steps: np.ndarray, origin: Sequence[float]) -> np.ndarray:
+    """The unit cube's affine map from voxel steps and the first voxel's centre.
+
+    Args:
+        size: voxels along x, y, z.
+        steps: (3, 3), column a is the world vector from a voxel to the next along axis a (direction times spacing).
+        origin: world position (3,) of the centre of voxel (0, 0, 0).
+
+    Returns:
+        float64 (4, 4); voxel centre (i + .5)/N goes to origin + steps @ (i, j, k).
+    """
+    steps = np.asarray(steps, np.float64)
+    to_world = np.eye(4)
+    to_world[:3, :3] = steps * np.asarray(size, np.float64)
+    to_world[:3, 3] = np.asarray(origin, np.float64) - steps.sum(axis=1) / 2
+    return to_world
+
+
+def frame_from_box(low: Sequence[float], high: Sequence[float]) -> np.ndarray:
+    """The affine map (4, 4) of the unit cube onto the axis-aligned box from corner ``low`` to corner ``high``."""
+    low, high = np.asarray(low, np.float64), np.asarray(high, np.float64)
+    to_world = np.diag([*(high - low), 1.0])
+    to_world[:3, 3] = low
+    return to_world
+
+
+def check_frame(to_world: np.ndarray, name: object) -> None:
+    """Refuse an affine map that flattens the unit cube.
+
+    Args:
+        to_world: (4, 4).
+        name: file or parameter, named in the refusal.
+
+    Raises:
+        MivolError: wrong shape, a number that is not finite, a last row other than (0, 0, 0, 1), a side shorter than
+            any normal float32 number, or three sides in one plane (det 0 to float32 accuracy).
+    """
+    to_world = np.asarray(to_world, np.float64)
+    if to_world.shape != (4, 4) or not np.array_equal(to_world[3], (0, 0, 0, 1)):
+        raise refusal(
+            name, f"a transform of shape {to_world.shape}", "an affine 4x4 matrix", "its last row must be 0 0 0 1"
+        )
+    if not np.isfinite(to_world).all():
+        raise refusal(name, "a transform with NaN or Inf", "finite numbers", "correct the header or pass to_world")
+    sides = np.linalg.norm(to_world[:3, :3], axis=0)
+    if sides.min() < SMALLEST_SIDE:
+        listed = " x ".join(f"{side:.4g}" for side in sides)
+        raise refusal(
+            name,
+            f"a degenerate box ({listed})",
+            "three sides above 0",
+            'correct its bounds or spacing, or read it on the unit cube with frame="unit"',
+        )
+    if abs(np.linalg.det(to_world[:3, :3] / sides)) < FLATTEST:
+        raise refusal(
+            name,
+            "a transform with determinant 0",
+            "three independent axes",
+            'correct its axes, or read it on the unit cube with frame="unit"',
+        )
+
+
+def in_space(volume: VolumeData, space: str) -> VolumeData:
+    """The same volume with its world frame renamed: NIfTI counts x to the right and y forwards (RAS), NRRD of medical
+    origin and MetaImage to the left and backwards (LPS).
+
+    Args:
+        volume: its ``meta["space"]`` must be a key of :data:`SPACES`.
+        space: a key of :data:`SPACES`.
+
+    Raises:
+        MivolError: a frame that is not known.
+    """
+    found = volume.meta.get("space")
+    for name in (found, space):
+        if name not in SPACES:
+            raise refusal(
+                volume.meta.get("path", "volume"),
+                f"the frame {name!r}",
+                f"one of {', '.join(SPACES)}",
+                "set to_world by hand",
+            )
+    signs = np.array(SPACES[found]) * np.array(SPACES[space])
+    return dataclasses.replace(
+        volume, to_world=np.diag([*signs, 1.0]) @ volume.to_world, meta={**volume.meta, "space": space}
+    )
+
+
+def as_values(array: np.ndarray, path: object) -> np.ndarray:
+    """An array (Z, Y, X) or (Z, Y, X, C) of any real type as float32 (Z, Y, X, C), C-contiguous.
+
+    Integers above 2^24 are rounded to the nearest float32.
+
+    Raises:
+        MivolError: another rank, an empty axis, numbers that are not real, or finite numbers beyond float32.
+    """
+    array = np.asarray(array)
+    if array.dtype.kind not in "biuf":
+        raise refusal(path, f"numbers of type {array.dtype}", "real numbers", "convert them to float32 first")
+    if array.ndim not in (3, 4):
+        raise refusal(
+            path,
+            f"an array of shape {array.shape}",
+            "(Z, Y, X) or (Z, Y, X, C)",
+            "reshape it or choose one time step first",
+        )
+    if array.size == 0:
+        raise refusal(path, f"an empty array of shape {array.shape}", "at least one voxel", "write it again")
+    if array.ndim == 3:
+        array = array[..., None]
+    with np.errstate(over="ignore"):
+        values = np.ascontiguousarray(array, dtype=np.float32)
+    if array.dtype.kind == "f" and array.dtype.itemsize > 4:
+        lost = np.isinf(values) & np.isfinite(array)
+        if lost.any():
+            index = tuple(int(i) for i in np.argwhere(lost)[0])
+            raise refusal(
+                path,
+                f"{array[index]:.4g} at voxel {_voxel(index)}",
+                "numbers within float32 (3.4e38)",
+                "rescale the data",
+            )
+    return values
+
+
+def check_volume(
+    values: np.ndarray, *, name: str, channels: Sequence[int] = (1, 3), minimum: float | None = 0.0
+) -> None:
+    """Refuse a grid that cannot be a coefficient of a medium; the first bad voxel is named by its index.
+
+    Args:
+        values: (Z, Y, X, C).
+        name: parameter or file, named in the refusal.
+        channels: channel counts that are allowed.
+        minimum: smallest value allowed; None allows every finite number.
+
+    Raises:
+        MivolError: wrong rank, channel count, an empty axis, numbers that are not real, NaN, Inf, or a value below
+            ``minimum``.
+    """
+    values = np.asarray(values)
+    if values.ndim != 4:
+        raise refusal(
+            name,
+            f"an array of rank {values.ndim} and shape {values.shape}",
+            "rank 4 (Z, Y, X, C)",
+            "add the missing axis with values[..., None] or drop the surplus one",
+        )
+    if values.size == 0:
+        raise refusal(name, f"an empty grid of shape {values.shape}", "at least one voxel", "check how it was made")
+    if values.shape[3] not in channels:
+        raise refusal(
+            name,
+            f"{values.shape[3]} channels",
+            " or ".join(map(str, channels)),
+            "choose channels with values[..., :1] or values[..., :3]",
+        )
+    if values.dtype.kind not in "biuf":
+        raise refusal(name, f"numbers of type {values.dtype}", "real numbers", "convert them to float32")
+    low, high = values.min(), values.max()
+    if np.isfinite(low) and np.isfinite(high) and (minimum is None or low >= minimum):
+        return
+    bad = ~np.isfinite(values)
+    if minimum is not None:
+        bad |= values < minimum
+    index = tuple(int(i) for i in np.unravel_index(np.argmax(bad), values.shape))
+    expected = "finite numbers" if minimum is None else f"finite numbers of at least {minimum:g}"
+    count = int(bad.sum())
+    more = f" and {count - 1} more bad values" if count > 1 else ""
+    raise refusal(
+        name,
+        f"{values[index]:g} at voxel {_voxel(index)}{more}",
+        expected,
+        "repair them (for instance with numpy.clip or numpy.nan_to_num) or choose another array",
+    )
+
+
+def _voxel(index: Sequence[int]) -> str:
+    z, y, x, channel = index
+    return f"(z={z}, y={y}, x={x}, channel={channel})"

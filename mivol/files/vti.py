@@ -1,0 +1,240 @@
+"""VTK's XML image (``.vti``): arrays on a regular grid, x fastest after the component; text, base64 or raw bytes.
+
+Conventions. ``Origin`` is the point of index (0, 0, 0), so the first point of the piece is ``Direction`` times spacing
+times the extent's beginning away from it. Point arrays give voxel centres; cell arrays have one element fewer along
+each axis and their centres lie half a step in. A block begins with its length (``header_type``), a compressed one with
+block count, block size, size of the last block and the packed sizes.
+
+Reference: VTK file formats, docs.vtk.org, "XML file formats".
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import re
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from mivol.files import source
+from mivol.files.source import choose, refusal
+from mivol.files.volume import VolumeData, as_values, frame_from_steps
+
+TYPES: dict[str, str] = {
+    "Int8": "i1",
+    "UInt8": "u1",
+    "Int16": "i2",
+    "UInt16": "u2",
+    "Int32": "i4",
+    "UInt32": "u4",
+    "Int64": "i8",
+    "UInt64": "u8",
+    "Float32": "f4",
+    "Float64": "f8",
+}
+
+COMPRESSORS: dict[str, str] = {"vtkZLibDataCompressor": "zlib", "vtkLZMADataCompressor": "lzma"}
+
+ORDERS: dict[str, str] = {"LittleEndian": "<", "BigEndian": ">"}
+
+#: take(n) -> the next n bytes of a block, after decoding.
+Take = Callable[[int], bytes]
+
+
+def read_vti(path: Path, dataset: str | None = None) -> VolumeData:
+    """Read one array of a ``.vti``: ``dataset``, else the active scalars, else the only one.
+
+    Raises:
+        MivolError: not image data, several pieces, a compressor or type that is not known, sizes that do not fit.
+    """
+    root, appended, encoding = _document(source.read_bytes(path), path)
+    image = root.find("ImageData")
+    if root.tag != "VTKFile" or root.get("type") != "ImageData" or image is None:
+        raise refusal(path, f"VTK data of type {root.get('type')}", "ImageData", "convert it to an image first")
+    pieces = image.findall("Piece")
+    if len(pieces) != 1:
+        raise refusal(path, f"{len(pieces)} pieces", "one", "write the file again in one piece")
+    extent = np.array(_numbers(pieces[0].get("Extent") or image.get("WholeExtent"), 6, path), int).reshape(3, 2)
+    node, is_cell = _array(pieces[0], dataset, path)
+    size = (extent[:, 1] - extent[:, 0] + (0 if is_cell else 1)).tolist()
+    if min(size) < 1:
+        raise refusal(path, f"the extent {extent.ravel().tolist()}", "at least one voxel", "write the file again")
+    channels = int(_numbers(node.get("NumberOfComponents", "1"), 1, path)[0])
+    stored = _decode(node, root, appended, encoding, size[0] * size[1] * size[2] * channels, path)
+    steps, origin = _place(image, extent[:, 0] + (0.5 if is_cell else 0.0), path)
+    meta = {
+        "path": str(path),
+        "format": "vti",
+        "dtype": str(stored.dtype),
+        "space": None,
+        "dataset": node.get("Name"),
+        "centering": "cell" if is_cell else "point",
+    }
+    values = as_values(stored.reshape(*size[::-1], channels), path)
+    return VolumeData(values, frame_from_steps(size, steps, origin), meta)
+
+
+def _document(data: bytes, path: Path) -> tuple[ElementTree.Element, bytes, str]:
+    """The XML without its appended data (raw bytes are no XML), that data after its underscore, and its encoding."""
+    appended, encoding = b"", "raw"
+    tag = re.search(rb"<AppendedData([^>]*)>\s*_", data)
+    if tag:
+        attribute = re.search(rb"encoding\s*=\s*[\"'](\w+)[\"']", tag.group(1))
+        encoding = attribute.group(1).decode() if attribute else "raw"
+        appended, data = data[tag.end() :], data[: tag.start()] + b"</VTKFile>"
+    try:
+        return ElementTree.fromstring(data), appended, encoding
+    except ElementTree.ParseError as error:
+        raise refusal(
+            path, f"broken XML ({error})", "a whole VTKFile element", "the file is truncated: copy it again"
+        ) from error
+
+
+def _array(piece: ElementTree.Element, dataset: str | None, path: Path) -> tuple[ElementTree.Element, bool]:
+    """The array's element, and whether it lives on cells."""
+    found: dict[str, tuple[ElementTree.Element, bool]] = {}
+    active = None
+    for kind in ("PointData", "CellData"):
+        for group in piece.findall(kind):
+            active = active or group.get("Scalars")
+            for node in group.findall("DataArray"):
+                found.setdefault(node.get("Name", ""), (node, kind == "CellData"))
+    return found[choose(path, active if dataset is None and active in found else dataset, list(found))]
+
+
+def _numbers(text: str | None, count: int, path: Path) -> list[float]:
+    try:
+        values = [float(word) for word in (text or "").split()]
+    except ValueError:
+        values = []
+    if len(values) != count:
+        raise refusal(path, f"the attribute {text!r}", f"{count} numbers", "write the file again")
+    return values
+
+
+def _place(image: ElementTree.Element, first: np.ndarray, path: Path) -> tuple[np.ndarray, np.ndarray]:
+    spacing = _numbers(image.get("Spacing", "1 1 1"), 3, path)
+    origin = _numbers(image.get("Origin", "0 0 0"), 3, path)
+    direction = np.array(_numbers(image.get("Direction", "1 0 0 0 1 0 0 0 1"), 9, path)).reshape(3, 3)
+    steps = direction * spacing
+    return steps, np.array(origin) + steps @ first
+
+
+def _decode(
+    node: ElementTree.Element, root: ElementTree.Element, appended: bytes, encoding: str, count: int, path: Path
+) -> np.ndarray:
+    order = ORDERS.get(root.get("byte_order", "LittleEndian"))
+    if node.get("type") not in TYPES or order is None:
+        raise refusal(
+            path,
+            f"type {node.get('type')} in byte order {root.get('byte_order')}",
+            "a number type, little or big endian",
+            "write the file again with Float32",
+        )
+    dtype = np.dtype(TYPES[node.get("type")]).newbyteorder(order)
+    kind = node.get("format")
+    if kind == "ascii":
+        return source.numbers(node.text or "", count, path).astype(dtype)
+    if kind == "binary":
+        stream, coded = (node.text or "").strip().encode(), "base64"
+    elif kind == "appended":
+        stream, coded = appended[int(_numbers(node.get("offset"), 1, path)[0]) :], encoding
+    else:
+        raise refusal(path, f"the format {kind!r}", "ascii, binary or appended", "write the file again")
+    if coded not in STREAMS:
+        raise refusal(path, f"the encoding {coded!r}", " or ".join(STREAMS), "write the file again")
+    word = np.dtype({"UInt32": "u4", "UInt64": "u8"}.get(root.get("header_type", "UInt32"), "u4")).newbyteorder(order)
+    block = _block(STREAMS[coded](stream, path), word, root.get("compressor"), count * dtype.itemsize, path)
+    return source.elements(block, dtype, count, path)
+
+
+def _block(parts: Callable[[], Take], word: np.dtype, compressor: str | None, promised: int, path: Path) -> bytes:
+    """The bytes of one array; ``parts()`` begins a new run of coded bytes (base64 ends a run with padding)."""
+    take = parts()
+
+    def words(n: int) -> list[int]:
+        return np.frombuffer(take(n * word.itemsize), word).tolist()
+
+    if not compressor:
+        (length,) = words(1)
+        if length != promised:
+            raise refusal(path, f"a block of {length} bytes", f"{promised} (from the extent)", "write the file again")
+        return take(length)
+    if compressor not in COMPRESSORS:
+        raise refusal(path, f"the compressor {compressor}", " or ".join(COMPRESSORS), "write it again with zlib")
+    blocks, size, last = words(3)
+    if not blocks:
+        return b""
+    if (blocks - 1) * size + (last or size) != promised:
+        raise refusal(
+            path,
+            f"{blocks} blocks of {size} bytes with {last} in the last",
+            f"{promised} bytes (from the extent)",
+            "write the file again",
+        )
+    packed = words(blocks)
+    take = parts()
+    codec = COMPRESSORS[compressor]
+    return b"".join(source.inflate(take(length), codec, size, path) for length in packed)
+
+
+def _broken(path: Path) -> Exception:
+    return refusal(path, "a block that breaks off", "all its bytes", "the file is truncated: copy it again")
+
+
+def _raw(stream: bytes, path: Path) -> Callable[[], Take]:
+    position = 0
+
+    def take(count: int) -> bytes:
+        nonlocal position
+        if position + count > len(stream):
+            raise _broken(path)
+        position += count
+        return stream[position - count : position]
+
+    return lambda: take
+
+
+def _base64(stream: bytes, path: Path) -> Callable[[], Take]:
+    """Runs of base64: each begins on a new group of four characters after the padding of the one before.
+
+    VTK codes the length and the bytes of an uncompressed block in one run and the header of a compressed one in a run
+    of its own; other writers pad the length as well, and then the bytes follow the padding.
+    """
+    position, held = 0, b""
+
+    def decode(characters: int) -> bytes:
+        nonlocal position
+        chunk = stream[position : position + characters]
+        position += len(chunk)
+        try:
+            return base64.b64decode(chunk, validate=True)
+        except (binascii.Error, ValueError) as error:
+            raise refusal(path, "characters that are not base64", "base64 data", "copy the file again") from error
+
+    def take(count: int) -> bytes:
+        nonlocal held
+        pieces, missing = [held], count - len(held)
+        if missing > 0:
+            piece = decode(-(-missing // 3) * 4)
+            pieces.append(piece)
+            missing -= len(piece)
+        data = b"".join(pieces)
+        if missing > 0:
+            raise _broken(path)
+        held = data[count:]
+        return data[:count]
+
+    def begin() -> Take:
+        nonlocal held
+        held = b""
+        return take
+
+    return begin
+
+
+#: how bytes are coded -> constructor of the source of runs.
+STREAMS: dict[str, Callable[[bytes, Path], Callable[[], Take]]] = {"raw": _raw, "base64": _base64}
