@@ -1,0 +1,1 @@
+"""How light travels: exact segments through fields. No Mitsuba class is defined here."""

@@ -1,0 +1,223 @@
+r"""Exact optical depth of a ray through a grid, with its tangent and its transpose.
+
+.. math:: \tau = \int_{t_0}^{t_1} \sigma(o + t\,\omega)\,dt = (A \sigma)_{ray}
+
+Along a line a trilinear function is a cubic in each cell, so two Gauss points a cell integrate it exactly; the sum over
+the cells is linear in the values at the nodes, and ``A``, its tangent (``A`` again) and its transpose are visitors of one
+walk.
+
+Conventions. Optical depth is returned, never transmittance: exp(-tau) is 0 in float32 beyond 103, tau is not.
+
+References: Amanatides & Woo 1987 (the walk); Abramowitz & Stegun 25.4.30 (Gauss points); matched adjoints: De Man & Basu
+2004.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import drjit as dr
+import mitsuba as mi
+
+from mivol.errors import MivolError
+from mivol.transport.lattice import Cell, Lattice, Nodes, Segment, box_nodes, clip, walk
+
+__all__ = ["Gradient", "backproject_segment", "integrate_segment", "integrate_tau"]
+
+GAUSS = 0.5 - math.sqrt(3) / 6
+"""First of the two Gauss points on [0, 1]; the other is its mirror image. Exact for cubics."""
+
+PACKED_LIMIT = 4 << 30
+"""Most bytes that a packed gradient may take; a larger grid adds to its nodes one by one."""
+
+
+def integrate_tau(
+    lattice: Lattice,
+    o: mi.Point3f,
+    d: mi.Vector3f,
+    t_max: mi.Float = math.inf,
+    active: mi.Bool = True,
+) -> mi.Float | mi.Color3f:
+    """Integrate a grid along rays: optical depth where the grid is an extinction.
+
+    Args:
+        lattice: values [1/length] of 1 or 3 channels, and their place. Derivatives (reverse and forward) reach
+            ``lattice.values``; outside its box the grid is vacuum.
+        o, d: world rays, |d| = 1; they and ``t_max`` carry no derivatives.
+        t_max: where to stop [length]; may be infinite.
+        active: lanes to integrate; the others return 0.
+
+    Returns:
+        tau [1]: ``Float`` for one channel, ``Color3f`` for three.
+
+    Raises:
+        MivolError: another number of channels, or rays with gradients enabled.
+
+    Bias: none but rounding, |error| <= 2e-6 int (sigma + h |grad sigma|) dt, h the size of a voxel.
+    Cost: 4 reads a cell and channel forwards, one packed write of 8 a cell and channel in reverse.
+
+    Example:
+        >>> tau = integrate_tau(Lattice(mi.TensorXf(sigma_t), to_world), ray.o, ray.d)
+    """
+    if lattice.channels not in (1, 3):
+        raise MivolError(f"a grid of {lattice.channels} channels was given; an optical depth has 1 (grey) or 3 (rgb).")
+    if dr.grad_enabled(o, d, t_max):
+        raise MivolError("rays with gradients were given; optical depth is differentiable in the grid only: detach the rays.")
+    segment = clip(lattice, o, d, 0, t_max)
+    tau = dr.custom(_OpticalDepth, lattice.values.array, lattice, segment, mi.Bool(active))
+    return tau[0] if lattice.channels == 1 else mi.Color3f(*tau)
+
+
+def integrate_segment(lattice: Lattice, values: mi.Float, segment: Segment, active: mi.Bool = True) -> list[mi.Float]:
+    """Integrate node values along a segment: a row of ``A`` for each lane.
+
+    Args:
+        lattice: where the grid lies, and which blocks are empty.
+        values: flat node values (the lattice's own, or a tangent of them).
+        segment: from :func:`mivol.transport.lattice.clip`.
+        active: lanes to integrate; the others return 0.
+
+    Returns:
+        The integral for each channel.
+
+    Bias, cost: as :func:`integrate_tau`. Derivatives are not tracked here.
+    """
+
+    def visit(tau: list[mi.Float], cell: Cell, on: mi.Bool) -> list[mi.Float]:
+        a, b = gauss_points(cell)
+        half = dr.select(on, 0.5 * cell.dt, 0)
+        return [dr.fma(half, interpolate(c, a) + interpolate(c, b), t) for t, c in zip(tau, cell.corners[0], strict=True)]
+
+    zero = [mi.Float(0) for _ in range(lattice.channels)]
+    return walk(lattice, segment, visit, zero, [Nodes(values, lattice.channels)], active)
+
+
+@dataclass
+class Gradient:
+    """What the transpose adds to: the derivative of a scalar with respect to the nodes of a grid.
+
+    On the CPU a cell adds its 8 corners as one packet to a buffer of its own, one copy a thread and no atomics; they
+    are folded to the nodes once, at the end (5 times faster than adding 8 numbers to the nodes). Where that buffer is
+    too large, or on a GPU, the corners are added to the nodes as they come.
+    """
+
+    buffer: mi.Float
+    res: tuple[int, int, int]
+    channels: int
+    packed: bool
+
+    @classmethod
+    def zeros(cls, lattice: Lattice) -> Gradient:
+        """A gradient of zero for the nodes of ``lattice``."""
+        z, y, x = lattice.res
+        cells = (z + 1) * (y + 1) * (x + 1) * lattice.channels
+        on_cpu = dr.backend_v(mi.Float) == dr.JitBackend.LLVM
+        packed = on_cpu and gradient_bytes(lattice.res, lattice.channels) <= PACKED_LIMIT
+        buffer = dr.zeros(mi.Float, 8 * cells if packed else z * y * x * lattice.channels)
+        return cls(buffer, lattice.res, lattice.channels, packed)
+
+    def add(self, channel: int, cell: Cell, corners: list[mi.Float], active: mi.Bool) -> None:
+        """Add 8 values, in the order of the grid's own axes, to the corners of a cell."""
+        _, y, x = self.res
+        if self.packed:
+            index = ((cell.lower.z + 1) * (y + 1) + cell.lower.y + 1) * (x + 1) + cell.lower.x + 1
+            index = mi.UInt32(index) * self.channels + channel
+            dr.scatter_add(self.buffer, mi.ArrayXf(corners), index, active, mode=dr.ReduceMode.Expand)
+            return
+        upward = dr.full(dr.mask_t(mi.Vector3f), True)
+        for node, value in zip(box_nodes(cell.lower, upward, self.res), corners, strict=True):
+            dr.scatter_add(self.buffer, value, node * self.channels + channel, active)
+
+    def fold(self) -> mi.Float:
+        """The derivative at each node (flat, channels fastest)."""
+        if not self.packed:
+            return self.buffer
+        z, y, x = self.res
+        entry = dr.arange(mi.UInt32, z * y * x * self.channels)
+        node, channel = entry // self.channels, entry % self.channels
+        i, j, k = node % x, (node // x) % y, node // (x * y)
+        total = mi.Float(0)
+        for q in range(8):
+            # Corner q belongs to the cell whose number, one more than its lower node, is lower by the bits of q.
+            a, b, c = i + 1 - (q & 1), j + 1 - (q >> 1 & 1), k + 1 - (q >> 2)
+            cell = (c * (y + 1) + b) * (x + 1) + a
+            total += dr.gather(mi.Float, self.buffer, (cell * self.channels + channel) * 8 + q)
+        return total
+
+
+def gradient_bytes(res: tuple[int, int, int], channels: int) -> int:
+    """Bytes that a packed gradient takes: its buffer and one copy a thread."""
+    z, y, x = res
+    return 32 * (z + 1) * (y + 1) * (x + 1) * channels * (1 + dr.thread_count())
+
+
+def backproject_segment(
+    lattice: Lattice, target: Gradient, weight: list[mi.Float], segment: Segment, active: mi.Bool = True
+) -> None:
+    """Add ``weight`` times the row of ``A`` of each lane to a gradient: the transpose ``A^T``.
+
+    Args:
+        lattice: where the grid lies. Its bounds are not used: an empty voxel has a derivative too.
+        target: what receives the sums.
+        weight: d loss / d tau of each lane, one entry a channel.
+        segment: from :func:`mivol.transport.lattice.clip`.
+        active: lanes to project back.
+
+    Cost: one packed write of 8 a cell and channel.
+    """
+
+    def visit(state: None, cell: Cell, on: mi.Bool) -> None:
+        a, b = (weights(_natural(p, cell, lattice.res)) for p in gauss_points(cell))
+        row = [0.5 * cell.dt * (wa + wb) for wa, wb in zip(a, b, strict=True)]
+        for channel, w in enumerate(weight):
+            target.add(channel, cell, [w * r for r in row], on)
+        return state
+
+    walk(replace(lattice, bounds=None), segment, visit, None, (), active)
+
+
+def gauss_points(cell: Cell) -> tuple[mi.Vector3f, mi.Vector3f]:
+    """The two Gauss points of a cell's stretch, as fractions from its near planes."""
+    return dr.fma(cell.step, GAUSS, cell.frac), dr.fma(cell.step, 1 - GAUSS, cell.frac)
+
+
+def interpolate(corners: list[mi.Float], frac: mi.Vector3f) -> mi.Float:
+    """The trilinear value at a point of a cell; bits 0, 1, 2 of the corner are x, y, z."""
+    x = [dr.lerp(corners[q], corners[q + 1], frac.x) for q in (0, 2, 4, 6)]
+    y = [dr.lerp(x[0], x[1], frac.y), dr.lerp(x[2], x[3], frac.y)]
+    return dr.lerp(y[0], y[1], frac.z)
+
+
+def weights(frac: mi.Vector3f) -> list[mi.Float]:
+    """The 8 trilinear weights at a point of a cell: the transpose of :func:`interpolate`."""
+    x, y, z = (1 - frac.x, frac.x), (1 - frac.y, frac.y), (1 - frac.z, frac.z)
+    return [c * b * a for c in z for b in y for a in x]
+
+
+def _natural(frac: mi.Vector3f, cell: Cell, res: tuple[int, int, int]) -> mi.Vector3f:
+    """Fractions along the grid's own axes; in the outer half voxel all weight goes to the node that exists."""
+    z, y, x = res
+    frac = dr.select(cell.ahead, frac, 1 - frac)
+    return dr.select(cell.lower < 0, 1, dr.select(cell.lower >= mi.Vector3i(x - 1, y - 1, z - 1), 0, frac))
+
+
+class _OpticalDepth(dr.CustomOp):
+    """tau = A values, with its tangent and its transpose."""
+
+    def eval(self, values: mi.Float, lattice: Lattice, segment: Segment, active: mi.Bool) -> list[mi.Float]:
+        self.lattice, self.segment, self.active = lattice, segment, active
+        return integrate_segment(lattice, dr.detach(values), segment, active)
+
+    def forward(self) -> None:
+        # The tangent is not zero where the values are: no block is empty for it.
+        dense = replace(self.lattice, bounds=None)
+        self.set_grad_out(integrate_segment(dense, self.grad_in("values"), self.segment, self.active))
+
+    def backward(self) -> None:
+        target = Gradient.zeros(self.lattice)
+        backproject_segment(self.lattice, target, list(self.grad_out()), self.segment, self.active)
+        self.set_grad_in("values", target.fold())
+
+    def name(self) -> str:
+        return "optical depth"
