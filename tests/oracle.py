@@ -30,8 +30,8 @@ def grid_shape(values: np.ndarray) -> tuple[int, int, int]:
 
 
 def with_channels(values: np.ndarray) -> np.ndarray:
-    """The grid as float64 (Z, Y, X, C)."""
-    values = np.asarray(values, dtype=np.float64)
+    """The grid as (Z, Y, X, C), of its own type: what is read of it becomes float64."""
+    values = np.asarray(values)
     return values[..., None] if values.ndim == 3 else values
 
 
@@ -185,7 +185,7 @@ def tau_quadrature(
     values: np.ndarray, to_world: np.ndarray, o: np.ndarray, d: np.ndarray, t0: float, t1: float, n: int = 1 << 18
 ) -> np.ndarray:
     """The twin's own judge: n midpoints, SciPy's interpolation, an inside test at each point. Error O(1/n), (C,)."""
-    values = with_channels(values)
+    values = with_channels(values).astype(np.float64)
     t = t0 + (np.arange(n) + 0.5) * (t1 - t0) / n
     u, du = to_unit_cube(to_world, o, d)
     points = u + t[:, None] * du

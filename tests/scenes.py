@@ -1,0 +1,121 @@
+"""Rays, grids and small scenes that the tests share; what they should show is in tests/oracle.py."""
+
+from __future__ import annotations
+
+import math
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+# -- Frames and rays -------------------------------------------------------------------------------------------------
+
+
+def rotation(axis: np.ndarray, angle: float) -> np.ndarray:
+    """Rodrigues' rotation (3, 3) about an axis of any length."""
+    k = np.asarray(axis, dtype=np.float64) / np.linalg.norm(axis)
+    cross = np.cross(np.eye(3), k)
+    return np.eye(3) + math.sin(angle) * -cross + (1 - math.cos(angle)) * cross @ cross
+
+
+def affine(linear: np.ndarray, shift: np.ndarray = (0.0, 0.0, 0.0)) -> np.ndarray:
+    """A 4x4 matrix from a 3x3 one and a shift."""
+    matrix = np.eye(4)
+    matrix[:3, :3] = linear
+    matrix[:3, 3] = shift
+    return matrix
+
+
+def centred(linear: np.ndarray, centre: np.ndarray = (0.0, 0.0, 0.0)) -> np.ndarray:
+    """The unit cube moved so that its middle lies at the origin, mapped by `linear`, then moved to `centre`."""
+    return affine(linear, np.asarray(centre) - np.asarray(linear) @ np.full(3, 0.5))
+
+
+FRAMES = {
+    "unit": np.eye(4),
+    "two_units": centred(2 * np.eye(3)),
+    "stretched": centred(np.diag([0.5, 3.0, 1.2]), (0.2, -1, 4)),
+    "rotated": centred(rotation([1, 2, 3], 0.7), (1, 0, 0)),
+    "sheared": centred(np.array([[1, 0.4, -0.3], [0, 1.5, 0.6], [0.1, 0, 0.8]])),
+    "mirrored": centred(np.diag([-1.0, 1, 1]) @ rotation([0, 1, 1], 0.3), (0, 2, 0)),
+}
+"""Places a grid may be put in, by name."""
+
+
+def as_float32(x: np.ndarray) -> np.ndarray:
+    """The float64 array that a float32 lane holds: both sides of a comparison see the same ray."""
+    return np.asarray(x, dtype=np.float32).astype(np.float64)
+
+
+def random_rays(rng: np.random.Generator, to_world: np.ndarray, n: int, away: float = 3.0) -> tuple[np.ndarray, ...]:
+    """Rays (n, 3) through random points of the box, origins up to `away` box diagonals back along the ray."""
+    size = np.linalg.norm(to_world[:3, :3] @ np.ones(3))
+    inside = rng.uniform(-0.02, 1.02, (n, 3)) @ to_world[:3, :3].T + to_world[:3, 3]
+    d = rng.normal(size=(n, 3))
+    d = as_float32(d / np.linalg.norm(d, axis=1, keepdims=True))
+    return as_float32(inside - d * rng.uniform(0, away, (n, 1)) * size), d
+
+
+# -- The fast path, on NumPy arrays ----------------------------------------------------------------------------------
+
+
+def tensor(values: np.ndarray) -> mi.TensorXf:
+    """A grid (Z, Y, X) or (Z, Y, X, C) as a float32 tensor (Z, Y, X, C)."""
+    values = np.asarray(values, dtype=np.float32)
+    return mi.TensorXf(np.ascontiguousarray(values[..., None] if values.ndim == 3 else values))
+
+
+def to_lanes(o: np.ndarray, d: np.ndarray) -> tuple[mi.Point3f, mi.Vector3f]:
+    """Rays (n, 3) as Dr.Jit lanes."""
+    columns = [np.ascontiguousarray(np.atleast_2d(x).T, dtype=np.float32) for x in (o, d)]
+    return mi.Point3f(columns[0]), mi.Vector3f(columns[1])
+
+
+def from_lanes(tau: object) -> np.ndarray:
+    """An optical depth, Float or Color3f, as (n, C)."""
+    array = np.asarray(tau)
+    return array[:, None] if array.ndim == 1 else array.T
+
+
+def make_lattice(values: np.ndarray | mi.TensorXf, to_world: np.ndarray, skip: bool = False) -> object:
+    """A lattice of the fast path, with or without the bounds that let it skip empty blocks."""
+    from mivol.transport.lattice import Lattice, block_bounds
+
+    values = values if isinstance(values, mi.TensorXf) else tensor(values)
+    return Lattice(values, to_world, block_bounds(values) if skip else None)
+
+
+def tau_fast(
+    values: np.ndarray,
+    to_world: np.ndarray,
+    o: np.ndarray,
+    d: np.ndarray,
+    t_max: float | np.ndarray = math.inf,
+    skip: bool = False,
+) -> np.ndarray:
+    """Optical depth (n, C) of rays (n, 3) by the code under test."""
+    from mivol.transport.optical_depth import integrate_tau
+
+    o, d = np.broadcast_arrays(np.atleast_2d(o), np.atleast_2d(d))
+    ends = mi.Float(np.broadcast_to(np.float32(t_max), len(o)).copy())
+    return from_lanes(integrate_tau(make_lattice(values, to_world, skip), *to_lanes(o, d), ends, mi.Bool(True)))
+
+
+def tau_and_row(
+    shape: tuple[int, ...],
+    to_world: np.ndarray,
+    o: np.ndarray,
+    d: np.ndarray,
+    t_max: float = math.inf,
+    skip: bool = False,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Optical depth through a grid of ones, and the sum over rays of its gradient (Z, Y, X), by the code under test."""
+    from mivol.transport.optical_depth import integrate_tau
+
+    o, d = np.broadcast_arrays(np.atleast_2d(o), np.atleast_2d(d))
+    values = tensor(np.ones(shape))
+    dr.enable_grad(values)
+    ends = mi.Float(np.broadcast_to(np.float32(t_max), len(o)).copy())
+    tau = integrate_tau(make_lattice(values, to_world, skip), *to_lanes(o, d), ends, mi.Bool(True))
+    dr.backward(dr.sum(tau))
+    return np.asarray(dr.detach(tau)), np.asarray(dr.grad(values))[..., 0]
