@@ -1,0 +1,1 @@
+"""Change the field until it explains what was seen."""

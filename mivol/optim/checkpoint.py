@@ -1,0 +1,63 @@
+"""A run on disk, from which it continues as if it had not stopped.
+
+Conventions. One ``.npz`` file, written whole: the arrays of ``Run.pack`` and one JSON text, ``about``, with the next
+iteration, the history and the fingerprint (every setting that changes the result, and the scene's hash, by dotted key).
+A file of another fingerprint is refused. No pickles.
+"""
+
+from __future__ import annotations
+
+import json
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mivol.errors import MivolError
+from mivol.files.atomic import write_whole
+
+ABOUT = "about"
+
+
+def write(path: Path, arrays: dict[str, np.ndarray], about: dict[str, Any]) -> None:
+    """Write a checkpoint, never half.
+
+    Raises:
+        MivolError: the disk is full, or the like.
+    """
+    text = np.array(json.dumps(about))
+    write_whole(path, lambda file: np.savez(file, **{ABOUT: text}, **arrays))
+
+
+def read(path: Path, fingerprint: dict[str, Any]) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """Arrays and ``about`` of a checkpoint of this very run.
+
+    Raises:
+        MivolError: there is none, it is no checkpoint, or it is one of another scene or other settings.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays = {name: file[name] for name in file.files}
+        about = json.loads(str(arrays.pop(ABOUT)))
+    except FileNotFoundError:
+        raise MivolError(f"found no checkpoint {path} to resume from: run without --resume first.") from None
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        raise MivolError(f"{path} is not a whole checkpoint of mivol ({error}): run without --resume.") from error
+    check_same(path, about["fingerprint"], fingerprint)
+    return arrays, about
+
+
+def check_same(path: Path, there: dict[str, Any], here: dict[str, Any]) -> None:
+    """Refuse a checkpoint of another run, naming the first setting that differs.
+
+    Raises:
+        MivolError: with both values.
+    """
+    here = json.loads(json.dumps(here))
+    for key in sorted({*there, *here}):
+        if there.get(key) != here.get(key):
+            raise MivolError(
+                f"{path} belongs to another run: {key} is {there.get(key)!r} there and {here.get(key)!r} here; "
+                "restore the setting, or run without --resume."
+            )

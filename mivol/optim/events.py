@@ -1,0 +1,107 @@
+"""What happens to a fit besides its steps: refine the grid, write a checkpoint, measure the error.
+
+Conventions. An event is asked before each iteration whether it is ``due`` and, if so, applied; what it says goes into
+the log. Events of one iteration are applied in the order given, checkpoints first. EVENTS lists them.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mivol.errors import MivolError
+from mivol.optim.strategy import Strategy, of, table
+
+if TYPE_CHECKING:
+    from mivol.optim.loop import Fit
+
+
+def upsample(field: mi.TensorXf, shape: tuple[int, int, int]) -> mi.TensorXf:
+    r"""A field on a grid of another resolution, with the same total mass and no new extremum but by the mass's factor.
+
+    Linear interpolation of the voxel centres with clamped borders (weights >= 0: no overshoot), then all values times
+    one factor per channel. The mass of a trilinear field with clamped borders is the mean of its voxels times the
+    volume of its box, exactly: each voxel's hat, with its border half, integrates to one cell.
+
+    Args:
+        field: (Z, Y, X, C), finite.
+        shape: the new (Z, Y, X).
+
+    Returns:
+        (*shape, C). The mass of each channel is that of ``field`` to float32 rounding; where linear interpolation
+        leaves no mass at all (a checkerboard of both signs), the interpolation itself.
+    """
+    fine = np.asarray(dr.resample(field, (*shape, field.shape[3]), filter="linear"), dtype=np.float64)
+    mass = np.asarray(field, dtype=np.float64).mean(axis=(0, 1, 2))
+    found = fine.mean(axis=(0, 1, 2))
+    factor = np.divide(mass, found, out=np.ones_like(mass), where=np.abs(found) > 1e-12 * np.abs(fine).max(initial=0.0))
+    return mi.TensorXf((fine * factor).astype(np.float32))
+
+
+class Event(Strategy, tag="event"):
+    """Something that happens between iterations."""
+
+    def due(self, iteration: int) -> bool:
+        """Whether it happens before this iteration."""
+        raise NotImplementedError
+
+    def apply(self, fit: Fit) -> str:
+        """Let it happen; a sentence for the log."""
+        raise NotImplementedError
+
+
+class Upsample(Event, tag="upsample"):
+    """Refine every grid: coarse first, since large structures converge there in few cheap steps."""
+
+    at: Annotated[tuple[int, ...], of("iteration", "before which iterations")]
+    factor: Annotated[int, of("1", "new voxels per old one and axis", ge=2, le=8)] = 2
+
+    def due(self, iteration: int) -> bool:
+        return iteration in self.at
+
+    def apply(self, fit: Fit) -> str:
+        shapes = [self._refine(fit, p) for p in fit.problem.parameters if fit.run.reals[p.name].ndim == 4]
+        if not shapes:
+            raise MivolError("upsample found no grid among the parameters: take the event out.")
+        return "refined to " + ", ".join(" x ".join(str(n) for n in shape) for shape in shapes)
+
+    def _refine(self, fit: Fit, parameter: object) -> tuple[int, int, int]:
+        value = parameter.from_reals(fit.run.reals[parameter.name])
+        shape = tuple(n * self.factor for n in value.shape[:3])
+        fit.run.replace(parameter.name, parameter.project(parameter.to_reals(upsample(dr.detach(value), shape))))
+        return shape
+
+
+class Checkpoint(Event, tag="checkpoint"):
+    """Write everything that the next iteration depends on."""
+
+    every: Annotated[int, of("iteration", "how often", ge=1)] = 10
+
+    def due(self, iteration: int) -> bool:
+        return iteration > 0 and iteration % self.every == 0
+
+    def apply(self, fit: Fit) -> str:
+        return fit.save()
+
+
+class Evaluate(Event, tag="evaluate"):
+    """Measure what the fit does not minimise: held-out views, error of the volume."""
+
+    every: Annotated[int, of("iteration", "how often", ge=1)] = 10
+
+    def due(self, iteration: int) -> bool:
+        return iteration % self.every == 0
+
+    def apply(self, fit: Fit) -> str:
+        return fit.evaluate()
+
+
+EVENTS = table(Upsample, Checkpoint, Evaluate)
+
+
+def in_order(events: tuple[Event, ...]) -> list[Event]:
+    """Checkpoints first, so that they hold the state before the others."""
+    return sorted(events, key=lambda event: not isinstance(event, Checkpoint))

@@ -1,0 +1,123 @@
+"""How far an image is from what was measured: one number per pixel and channel, averaged.
+
+Conventions. Images are tensors (height, width, channels) of radiance; the residual is ``image - reference``. A loss is
+the mean of its penalty over pixels and channels, so that it does not change with the size of the sensor. Penalties are
+differentiable through Dr.Jit in ``image`` and take their weights from ``reference`` only. LOSSES lists them.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import drjit as dr
+import mitsuba as mi
+
+from mivol.errors import MivolError
+from mivol.optim.strategy import Strategy, of, table
+
+
+class Loss(Strategy, tag="loss"):
+    """A penalty per pixel and channel."""
+
+    def penalty(self, image: mi.TensorXf, reference: mi.TensorXf) -> mi.TensorXf:
+        """Penalty of each pixel and channel, same shape as ``image``."""
+        raise NotImplementedError
+
+    def weight(self, reference: mi.TensorXf) -> mi.TensorXf:
+        """W of the form 1/2 W (I - I_ref)^2, for Gauss-Newton; only quadratic losses have one.
+
+        Raises:
+            MivolError: the loss is not quadratic in the image.
+        """
+        raise MivolError(
+            f'gauss_newton needs a loss that is quadratic in the image, found "{self.label()}": '
+            'choose "l2" or "relative_l2", or another optimiser.'
+        )
+
+    def __call__(self, image: mi.TensorXf, reference: mi.TensorXf) -> mi.Float:
+        """Mean penalty.
+
+        Raises:
+            MivolError: the shapes differ.
+        """
+        if image.shape != reference.shape:
+            raise MivolError(
+                f"the image has shape {tuple(image.shape)} and its reference {tuple(reference.shape)}: "
+                "render or crop the reference to the size of its sensor."
+            )
+        return dr.mean(self.penalty(image, reference).array)
+
+
+class L1(Loss, tag="l1"):
+    """|r|: the median of noisy references; robust against outliers."""
+
+    def penalty(self, image, reference):
+        return dr.abs(image - reference)
+
+
+class L2(Loss, tag="l2"):
+    """r^2: the mean of noisy references; maximum likelihood for equal Gaussian noise."""
+
+    def penalty(self, image, reference):
+        return dr.square(image - reference)
+
+    def weight(self, reference):
+        return dr.full(mi.TensorXf, 2.0, reference.shape)
+
+
+class RelativeL2(Loss, tag="relative_l2"):
+    """r^2 / (I_ref^2 + floor^2): dark and bright pixels count alike.
+
+    The noise of the reference enters the weight, which favours pixels that came out too dark: keep ``floor`` above the
+    noise. Source: Lehtinen et al. 2018, Noise2Noise, section 3.3 (there with the prediction in the denominator, held
+    fixed, which a line search does not allow).
+    """
+
+    floor: Annotated[float, of("radiance", "pixels darker than this count as if they were this bright", gt=0)] = 1e-2
+
+    def penalty(self, image, reference):
+        return dr.square(image - reference) / (dr.square(reference) + self.floor**2)
+
+    def weight(self, reference):
+        return 2.0 / (dr.square(reference) + self.floor**2)
+
+
+class Huber(Loss, tag="huber"):
+    """r^2 / 2 where |r| <= delta, delta (|r| - delta / 2) beyond: quadratic inside the noise, linear outside it.
+
+    Source: Huber 1964, Annals of Mathematical Statistics 35(1).
+    """
+
+    delta: Annotated[float, of("radiance", "residual at which the parabola goes over into a line", gt=0)] = 0.1
+
+    def penalty(self, image, reference):
+        size = dr.abs(image - reference)
+        return dr.select(size <= self.delta, 0.5 * dr.square(size), self.delta * (size - 0.5 * self.delta))
+
+
+def log_radiance(radiance: mi.TensorXf, floor: float) -> mi.TensorXf:
+    """log(radiance), continued below ``floor`` by its tangent.
+
+    The tangent keeps value and slope finite for radiance that underflowed to 0 or that noise made negative, and keeps
+    the slope (1 / floor) that leads back; the function is monotone and once continuously differentiable.
+    """
+    return dr.log(dr.maximum(radiance, floor)) + dr.minimum(radiance - floor, 0.0) / floor
+
+
+class Log(Loss, tag="log"):
+    """w (log I - log I_ref)^2: linear in the optical depth of a pencil ray, whatever its transmittance.
+
+    The weight w = I_ref^2 / (I_ref^2 + floor^2) is the delta method's (the variance of log I_ref is var(I) / I^2) for
+    constant noise of ``floor``: saturated pixels count for nothing, and so do negative ones. Pixels brighter than the
+    light are negative optical depths, and are kept. Source: Elbakri and Fessler 2002, IEEE TMI 21(2).
+    """
+
+    floor: Annotated[float, of("radiance", "noise of a pixel; below it the log goes on as its tangent", gt=0)] = 1e-3
+
+    def penalty(self, image, reference):
+        seen = dr.square(dr.maximum(reference, 0.0))
+        weight = seen / (seen + self.floor**2)
+        return weight * dr.square(log_radiance(image, self.floor) - log_radiance(reference, self.floor))
+
+
+LOSSES = table(L1, L2, RelativeL2, Huber, Log)

@@ -1,0 +1,412 @@
+r"""How to walk downhill: Adam, L-BFGS, and Gauss-Newton on pixel means.
+
+Conventions. An optimiser is a strategy (settings only); :meth:`Optimiser.begin` gives a :class:`Run`, which owns the
+reals. ``Run.step`` either completes or, when a safe point stops it, leaves the run as it was. ``pack`` and ``unpack``
+hold everything that the next step depends on, so that a restored run continues to the last bit. OPTIMISERS lists them.
+
+A filtered pixel averages transmittance, not optical depth, so that absorption is linear only along a pencil ray
+(-log of a pixel mean is not the mean of -log): Gauss-Newton therefore linearises the pixel mean itself,
+
+.. math:: (J^T W J + R'' + \mu D)\, p = -(J^T W r + R'), \qquad u \leftarrow P(u + \alpha p),
+
+with J v and J^T w from forward and reverse mode of the integrator, D = diag(J^T W J 1) and conjugate gradients inside.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Annotated
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mivol.optim.problem import PRIMAL, Problem, seed_of
+from mivol.optim.strategy import Strategy, of, table
+
+Reals = dict[str, mi.TensorXf]
+
+
+class Run:
+    """An optimiser at work.
+
+    Attributes:
+        problem: what is minimised.
+        reals: where the walk stands.
+        finished: why there is nothing left to gain, or "".
+    """
+
+    finished = ""
+
+    def __init__(self, problem: Problem) -> None:
+        self.problem = problem
+        self.reals: Reals = problem.start()
+
+    def step(self, iteration: int, factor: float) -> float:
+        """One iteration with the learning rate times ``factor``; the loss before it."""
+        raise NotImplementedError
+
+    def pack(self) -> dict[str, np.ndarray]:
+        """Everything that the next step depends on, as arrays."""
+        return {f"reals/{name}": np.array(value) for name, value in self.reals.items()}
+
+    def unpack(self, arrays: dict[str, np.ndarray]) -> None:
+        """Continue from what :meth:`pack` gave."""
+        self.reals = {p.name: mi.TensorXf(arrays[f"reals/{p.name}"]) for p in self.problem.parameters}
+
+    def replace(self, name: str, reals: mi.TensorXf) -> None:
+        """Give a parameter another value, of another shape perhaps: what was learnt about its old one is dropped."""
+        self.reals = {**self.reals, name: reals}
+
+
+class Optimiser(Strategy, tag="optimiser"):
+    """Settings of a walk."""
+
+    def begin(self, problem: Problem) -> Run:
+        """Start from the values that the scene holds."""
+        raise NotImplementedError
+
+
+# -- Adam ---------------------------------------------------------------------------------------------------------
+
+
+class Adam(Optimiser, tag="adam"):
+    """Mitsuba's Adam (``mi.ad.Adam``), with each parameter's own learning rate and projection.
+
+    ``epsilon`` is taken relative to the largest gradient of the first step: behind dense matter gradients vanish, and
+    an absolute 1e-8 would have Adam walk at full pace on rounding noise. Source: Kingma and Ba 2015, Algorithm 1.
+    """
+
+    beta_1: Annotated[float, of("1", "memory of the gradient", ge=0, lt=1)] = 0.9
+    beta_2: Annotated[float, of("1", "memory of its square", ge=0, lt=1)] = 0.999
+    epsilon: Annotated[float, of("largest gradient", "gradients well below this hardly move anything", gt=0)] = 1e-6
+    views: Annotated[int, of("view", "views per iteration, drawn without replacement; 0 takes all", ge=0)] = 0
+
+    def begin(self, problem: Problem) -> Run:
+        return AdamRun(self, problem)
+
+
+class AdamRun(Run):
+    """State: the reals, Adam's two moments and step count, and the gradient scale of the first step."""
+
+    def __init__(self, settings: Adam, problem: Problem) -> None:
+        super().__init__(problem)
+        self.settings = settings
+        self.scale = 0.0
+        self.adam = mi.ad.Adam(lr=1.0, beta_1=settings.beta_1, beta_2=settings.beta_2, epsilon=settings.epsilon)
+        self.adam.update(self.reals)
+
+    def step(self, iteration: int, factor: float) -> float:
+        chosen = views_of(iteration, len(self.problem.views), self.settings.views, self.problem.seed)
+        loss, gradients = self.problem.loss_and_gradient(self.reals, iteration, chosen)
+        self.scale = self.scale or max(float(dr.max(dr.abs(g.array))[0]) for g in gradients.values()) or 1.0
+        for p in self.problem.parameters:
+            self.adam.set_learning_rate({p.name: p.lr * factor})
+            dr.set_grad(self.adam[p.name], gradients[p.name] / self.scale)
+        self.adam.step()
+        for p in self.problem.parameters:
+            self.adam[p.name] = p.project(self.adam[p.name])
+        self.reals = {name: dr.detach(value) for name, value in self.adam.items()}
+        return loss
+
+    def pack(self) -> dict[str, np.ndarray]:
+        arrays = super().pack() | {"scale": np.array(self.scale)}
+        for name, (_, _, _, (count, first, second, _)) in self.adam.state.items():
+            moments = {"count": count, "first": first, "second": second}
+            arrays |= {f"{kind}/{name}": np.array(value) for kind, value in moments.items()}
+        return arrays
+
+    def unpack(self, arrays: dict[str, np.ndarray]) -> None:
+        super().unpack(arrays)
+        self.scale = float(arrays["scale"])
+        for name, value in self.reals.items():
+            self.adam[name] = value
+            kept, promoted, rate, _ = self.adam.state[name]
+            moments = (mi.Float(arrays[f"{kind}/{name}"]) for kind in ("first", "second"))
+            self.adam.state[name] = kept, promoted, rate, (mi.UInt32(arrays[f"count/{name}"]), *moments, None)
+
+    def replace(self, name: str, reals: mi.TensorXf) -> None:
+        super().replace(name, reals)
+        self.adam[name] = reals
+        self.adam.reset(name)
+        self.scale = 0.0
+
+
+def views_of(iteration: int, n_views: int, per_iteration: int, seed: int) -> list[int]:
+    """The views of an iteration: a fresh order per epoch, each view once in it; a function of its arguments only."""
+    if per_iteration == 0 or per_iteration >= n_views:
+        return list(range(n_views))
+    drawn = range(iteration * per_iteration, (iteration + 1) * per_iteration)
+    orders = {k: np.random.default_rng([seed, k, n_views]).permutation(n_views) for k in {i // n_views for i in drawn}}
+    return [int(orders[i // n_views][i % n_views]) for i in drawn]
+
+
+# -- Vectors ------------------------------------------------------------------------------------------------------
+
+
+class Packing:
+    """All reals as one float64 vector, each parameter in units of its learning rate, and back."""
+
+    def __init__(self, problem: Problem, reals: Reals) -> None:
+        self.parts = [(p.name, p.lr, tuple(reals[p.name].shape)) for p in problem.parameters]
+        self.low = self._repeat([p.bounds()[0] / p.lr for p in problem.parameters])
+        self.high = self._repeat([p.bounds()[1] / p.lr for p in problem.parameters])
+
+    def _repeat(self, ends: list[float]) -> np.ndarray:
+        return np.concatenate([np.full(int(np.prod(s)), e) for e, (_, _, s) in zip(ends, self.parts, strict=True)])
+
+    def vector(self, tensors: Reals, power: int = -1) -> np.ndarray:
+        """Tensors -> vector; ``power`` -1 for points, +1 for gradients."""
+        flat = [np.asarray(tensors[name]).ravel().astype(np.float64) * lr**power for name, lr, _ in self.parts]
+        return np.concatenate(flat)
+
+    def tensors(self, vector: np.ndarray, power: int = 1) -> Reals:
+        """Vector -> tensors; ``power`` +1 for points, -1 for gradients."""
+        parts, start = {}, 0
+        for name, lr, shape in self.parts:
+            size = int(np.prod(shape))
+            part = vector[start : start + size] * lr**power
+            parts[name] = mi.TensorXf(part.astype(np.float32).reshape(shape))
+            start += size
+        return parts
+
+    def project(self, x: np.ndarray) -> np.ndarray:
+        """The nearest point inside the bounds."""
+        return np.clip(x, self.low, self.high)
+
+    def free(self, x: np.ndarray, g: np.ndarray) -> np.ndarray:
+        """False where a bound is met and the gradient presses against it (Bertsekas 1982, Eq. 32)."""
+        return ~(((x <= self.low) & (g > 0.0)) | ((x >= self.high) & (g < 0.0)))
+
+
+def search(
+    value: Callable[[np.ndarray], float], packing: Packing, x: np.ndarray, f: float, g: np.ndarray, p: np.ndarray
+) -> tuple[np.ndarray, float]:
+    """Armijo's rule along the projected path P(x + alpha p), alpha = 1, 1/2, 1/4, ... 2^-9.
+
+    Returns:
+        The first point with f(new) <= f + 1e-4 g.(new - x), and alpha; (x, 0) where none has it.
+
+    References: Bertsekas 1982, SIAM J. Control Optim. 20(2), Eq. 37.
+    """
+    for halving in range(10):
+        alpha = 0.5**halving
+        new = packing.project(x + alpha * p)
+        if value(new) <= f + 1e-4 * float(g @ (new - x)):
+            return new, alpha
+    return x, 0.0
+
+
+# -- L-BFGS -------------------------------------------------------------------------------------------------------
+
+
+class Lbfgs(Optimiser, tag="lbfgs"):
+    """Limited-memory BFGS on the free variables, with a projected line search and the same samples in every iteration.
+
+    SciPy's L-BFGS-B keeps its memory between iterations where no checkpoint can reach it; hence these forty lines.
+    Source: Nocedal and Wright 2006, Algorithm 7.4 (two loops); bounds: Bertsekas 1982.
+    """
+
+    memory: Annotated[int, of("pair", "steps remembered", ge=1, le=100)] = 10
+
+    def begin(self, problem: Problem) -> Run:
+        return LbfgsRun(self, problem)
+
+
+class LbfgsRun(Run):
+    """State: the reals, and the pairs (step, change of gradient)."""
+
+    def __init__(self, settings: Lbfgs, problem: Problem) -> None:
+        super().__init__(problem)
+        self.settings = settings
+        self.steps: list[np.ndarray] = []
+        self.changes: list[np.ndarray] = []
+        self.last: tuple[np.ndarray, np.ndarray] | None = None
+
+    def step(self, iteration: int, factor: float) -> float:
+        packing = Packing(self.problem, self.reals)
+        loss, gradients = self.problem.loss_and_gradient(self.reals, 0)
+        x, g = packing.vector(self.reals), packing.vector(gradients, 1)
+        steps, changes = self._remember(x, g)
+        free = packing.free(x, g)
+        p = -two_loops(g * free, [s * free for s in steps], [y * free for y in changes]) * factor
+        if not g @ p < 0.0:
+            p = -g * free / max(np.abs(g * free).max(), 1e-300)
+        new, alpha = search(lambda z: self.problem.loss_value(packing.tensors(z), 0), packing, x, loss, g, p)
+        if alpha == 0.0 or not p.any():
+            # The remembered curvature misled the search: forget it once, and give up where it is not to blame.
+            self.finished = "" if steps else "no step lowers the loss"
+            steps, changes, x, g = [], [], None, None
+        self.steps, self.changes, self.last = steps, changes, None if x is None else (x, g)
+        self.reals = packing.tensors(new)
+        return loss
+
+    def _remember(self, x: np.ndarray, g: np.ndarray) -> tuple[list[np.ndarray], list[np.ndarray]]:
+        """The pairs with the newest one, if its curvature is positive beyond rounding."""
+        if self.last is None:
+            return self.steps, self.changes
+        s, y = x - self.last[0], g - self.last[1]
+        if not s @ y > 1e-10 * np.linalg.norm(s) * np.linalg.norm(y):
+            return self.steps, self.changes
+        keep = self.settings.memory
+        return [*self.steps, s][-keep:], [*self.changes, y][-keep:]
+
+    def pack(self) -> dict[str, np.ndarray]:
+        arrays = super().pack() | {"pairs": np.array([self.steps, self.changes])}
+        return arrays if self.last is None else arrays | {"last": np.array(self.last)}
+
+    def unpack(self, arrays: dict[str, np.ndarray]) -> None:
+        super().unpack(arrays)
+        self.steps, self.changes = (list(half) for half in arrays["pairs"])
+        self.last = tuple(arrays["last"]) if "last" in arrays else None
+
+    def replace(self, name: str, reals: mi.TensorXf) -> None:
+        super().replace(name, reals)
+        self.steps, self.changes, self.last = [], [], None
+
+
+def two_loops(g: np.ndarray, steps: list[np.ndarray], changes: list[np.ndarray]) -> np.ndarray:
+    """H g for the limited-memory inverse Hessian H; without pairs, g scaled so that its largest entry is 1."""
+    pairs = [(s, y, 1.0 / (s @ y)) for s, y in zip(steps, changes, strict=True) if s @ y > 0.0]
+    if not pairs:
+        return g / max(np.abs(g).max(), 1e-300)
+    q, weights = g.copy(), []
+    for s, y, rho in reversed(pairs):
+        weights.append(rho * (s @ q))
+        q -= weights[-1] * y
+    s, y, _ = pairs[-1]
+    q *= (s @ y) / (y @ y)
+    for (s, y, rho), weight in zip(pairs, reversed(weights), strict=True):
+        q += s * (weight - rho * (y @ q))
+    return q
+
+
+# -- Gauss-Newton -------------------------------------------------------------------------------------------------
+
+
+class GaussNewton(Optimiser, tag="gauss_newton"):
+    """Gauss-Newton on pixel means, conjugate gradients inside, Levenberg-Marquardt damping, projection onto the bounds.
+
+    Source: Nocedal and Wright 2006, sections 10.3 and 7.1; D is the separable surrogate of Erdogan and Fessler 1999,
+    Eq. 21, exact for media that only absorb, whose J has one sign.
+    """
+
+    inner: Annotated[int, of("iteration", "conjugate-gradient steps per linearisation", ge=1)] = 6
+    damping: Annotated[float, of("1", "first mu, relative to D", ge=0)] = 1e-3
+
+    def begin(self, problem: Problem) -> Run:
+        return GaussNewtonRun(self, problem)
+
+
+class GaussNewtonRun(Run):
+    """State: the reals and the damping. Image, J and J^T use one set of samples, the same in every iteration."""
+
+    def __init__(self, settings: GaussNewton, problem: Problem) -> None:
+        super().__init__(problem)
+        self.settings = settings
+        self.damping = settings.damping
+        self.weights = [problem.loss.weight(view.reference) for view in problem.views]
+
+    def step(self, iteration: int, factor: float) -> float:
+        packing = Packing(self.problem, self.reals)
+        linear = Linearised(self.problem, self.reals, self.weights, packing)
+        x, g = packing.vector(self.reals), linear.gradient
+        free = packing.free(x, g)
+        diagonal = np.abs(linear.curvature(np.ones_like(x)))
+        # A voxel that no ray meets has no curvature and no gradient: the floor keeps it where it is, not at 0 / 0.
+        diagonal = np.maximum(diagonal, 1e-6 * diagonal.max() + 1e-300)
+        p = conjugate_gradients(
+            lambda v: free * (linear.curvature(free * v) + self.damping * diagonal * v),
+            -g * free, diagonal, self.settings.inner,
+        )  # fmt: skip
+        new, alpha = search(lambda z: self.problem.loss_value(packing.tensors(z), 0), packing, x, linear.loss, g, factor * p)
+        self.damping = self.damping / 3.0 if alpha == 1.0 else max(4.0 * self.damping, 1e-6)
+        self.finished = "no step lowers the loss" if self.damping > 1e6 or not p.any() else ""
+        self.reals = packing.tensors(new)
+        return linear.loss
+
+    def pack(self) -> dict[str, np.ndarray]:
+        return super().pack() | {"damping": np.array(self.damping)}
+
+    def unpack(self, arrays: dict[str, np.ndarray]) -> None:
+        super().unpack(arrays)
+        self.damping = float(arrays["damping"])
+
+
+class Linearised:
+    """The problem around one point: loss, gradient, and products with J^T W J + R''.
+
+    Attributes:
+        loss: f(u).
+        gradient: by the vector of ``packing``.
+    """
+
+    def __init__(self, problem: Problem, reals: Reals, weights: list[mi.TensorXf], packing: Packing) -> None:
+        self.problem, self.reals, self.weights, self.packing = problem, reals, weights, packing
+        self.seeds = [seed_of(problem.seed, 0, index, PRIMAL) for index in range(len(problem.views))]
+        self.slopes = {p.name: slope(p, reals[p.name]) for p in problem.parameters}
+        problem.set(reals)
+        self.loss = 0.0
+        for index, seed in enumerate(self.seeds):
+            value, adjoint = problem.adjoint(index, problem.image(index, 0), len(self.seeds))
+            self.loss += value
+            problem.pull_back(index, adjoint, seed)
+        energy, gradients = problem.through_priors_and_maps(reals, problem.gradients())
+        self.loss += energy
+        self.gradient = packing.vector(gradients, 1)
+
+    def curvature(self, v: np.ndarray) -> np.ndarray:
+        """(J^T W J + R'') v."""
+        direction = {k: t * self.slopes[k] for k, t in self.packing.tensors(v).items()}
+        images = self._push_forward(direction)
+        self.problem.set(self.reals)
+        for index, (seed, image) in enumerate(zip(self.seeds, images, strict=True)):
+            scale = 1.0 / (len(images) * len(image.array))
+            self.problem.pull_back(index, self.weights[index] * image * scale, seed)
+        product = self.problem.gradients()
+        for p in self.problem.parameters:
+            value = dr.detach(p.from_reals(self.reals[p.name]))
+            for prior in p.priors:
+                product[p.name] += prior.curvature(value, direction[p.name], p.spacing(value.shape))
+        return self.packing.vector({k: t * self.slopes[k] for k, t in product.items()}, 1)
+
+    def _push_forward(self, direction: Reals) -> list[mi.TensorXf]:
+        self.problem.set(self.reals)
+        return [self.problem.push_forward(index, direction, seed) for index, seed in enumerate(self.seeds)]
+
+
+def slope(parameter: object, u: mi.TensorXf) -> mi.TensorXf:
+    """dx/du of a parameter's map, entry by entry."""
+    u = mi.TensorXf(dr.detach(u))
+    dr.enable_grad(u)
+    dr.backward(dr.sum(parameter.from_reals(u).array))
+    return dr.grad(u)
+
+
+def conjugate_gradients(
+    apply: Callable[[np.ndarray], np.ndarray], b: np.ndarray, diagonal: np.ndarray, iterations: int
+) -> np.ndarray:
+    """x with A x = b for A >= 0, Jacobi-preconditioned, from 0; stops early where the residual is rounding.
+
+    References: Hestenes and Stiefel 1952; Nocedal and Wright 2006, Algorithm 5.3.
+    """
+    x, r = np.zeros_like(b), b.copy()
+    z = r / diagonal
+    d, rz = z.copy(), float(r @ z)
+    stop = 1e-12 * rz
+    for _ in range(iterations):
+        if rz <= stop:
+            break
+        image = apply(d)
+        bend = float(d @ image)
+        if bend <= 0.0:
+            break
+        x += rz / bend * d
+        r -= rz / bend * image
+        z = r / diagonal
+        rz, before = float(r @ z), rz
+        d = z + rz / before * d
+    return x
+
+
+OPTIMISERS = table(Adam, Lbfgs, GaussNewton)

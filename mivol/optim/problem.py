@@ -1,0 +1,251 @@
+r"""The fit as a function: real numbers in, loss and derivatives out, through any Mitsuba integrator.
+
+.. math:: f(u) = \frac{1}{V}\sum_v \mathrm{loss}(I_v(x(u)), I_v^{ref}) + \sum_k \mathrm{energy}_k(x(u))
+
+Conventions. ``u`` are the reals of each :class:`~mivol.optim.parameters.Parameter`, ``x`` the scene's values. An image
+is the mean of passes of at most ``samples_per_pass`` samples: the adjoint of the loss is taken at the whole image, then
+carried back pass by pass, so that non-linear losses do not depend on the split. Seeds are a function of (seed,
+iteration, view, pass, purpose) only. Between passes ``safe_point`` is called; nothing that outlives the call has
+changed until it returns.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mivol.errors import MivolError
+from mivol.optim.losses import L2, Loss
+from mivol.optim.parameters import Parameter, as_tensor, find, like
+
+PRIMAL, ADJOINT = 0, 1
+
+
+@dataclass(frozen=True)
+class View:
+    """A sensor and what it saw.
+
+    Attributes:
+        name: for messages and file names.
+        sensor: any Mitsuba sensor.
+        reference: (height, width, channels), radiance.
+    """
+
+    name: str
+    sensor: mi.Sensor
+    reference: mi.TensorXf
+
+
+def seed_of(*key: int) -> int:
+    """A 32-bit seed from integers: SeedSequence mixes them, so that neighbours share nothing."""
+    return int(np.random.SeedSequence(key).generate_state(1)[0])
+
+
+def check_views(views: Sequence[View]) -> None:
+    """Refuse views that cannot be compared with an image.
+
+    Raises:
+        MivolError: no views, sizes that differ, a reference of another size than its sensor, or not finite.
+    """
+    if not views:
+        raise MivolError("found no views to fit: give at least one sensor with a reference.")
+    first = tuple(views[0].sensor.film().crop_size())
+    for view in views:
+        width, height = (int(n) for n in view.sensor.film().crop_size())
+        if (width, height) != first:
+            raise MivolError(
+                f'view "{view.name}" is {width} x {height} pixels and view "{views[0].name}" {first[0]} x {first[1]}: '
+                "give all views one size."
+            )
+        if view.reference.ndim != 3 or tuple(view.reference.shape[:2]) != (height, width):
+            raise MivolError(
+                f'the reference of view "{view.name}" has shape {tuple(view.reference.shape)}, its sensor '
+                f"{width} x {height} pixels: give references of the sensor's size."
+            )
+        bad = np.argwhere(~np.isfinite(np.asarray(view.reference)))
+        if len(bad):
+            raise MivolError(
+                f'the reference of view "{view.name}" is not finite at pixel (row {bad[0][0]}, column {bad[0][1]}): '
+                "mask or repair it."
+            )
+
+
+@dataclass
+class Problem:
+    """A scene, what was seen of it, and what is being looked for.
+
+    Attributes:
+        scene: any Mitsuba scene.
+        views: all of one size.
+        parameters: what is looked for.
+        integrator: differentiable; None takes the scene's own.
+        loss: one of LOSSES.
+        spp: samples per pixel of an image, and of its derivative.
+        samples_per_pass: most samples in one kernel.
+        seed: root of all random numbers.
+        safe_point: called between kernels.
+    """
+
+    scene: mi.Scene
+    views: Sequence[View]
+    parameters: Sequence[Parameter]
+    integrator: mi.Integrator | None = None
+    loss: Loss = field(default_factory=L2)
+    spp: int = 16
+    samples_per_pass: int = 1 << 20
+    seed: int = 0
+    safe_point: Callable[[], None] = lambda: None
+
+    def __post_init__(self) -> None:
+        check_views(self.views)
+        if not self.parameters:
+            raise MivolError("found no parameter to look for: name at least one key of mi.traverse(scene).")
+        self.integrator = self.integrator or self.scene.integrator()
+        self.params = mi.traverse(self.scene)
+        for parameter in self.parameters:
+            find(parameter.name, self.params)
+        self.params.keep([parameter.name for parameter in self.parameters])
+
+    # -- Values ---------------------------------------------------------------------------------------------------
+
+    def values(self) -> dict[str, mi.TensorXf]:
+        """What the scene holds now, by parameter."""
+        return {p.name: dr.detach(as_tensor(self.params[p.name])) for p in self.parameters}
+
+    def gradients(self) -> dict[str, mi.TensorXf]:
+        """What has been carried back to the scene since :meth:`set`, by parameter."""
+        return {p.name: dr.detach(as_tensor(dr.grad(self.params[p.name]))) for p in self.parameters}
+
+    def start(self) -> dict[str, mi.TensorXf]:
+        """The reals of what the scene holds now.
+
+        Raises:
+            MivolError: the scene's values lie outside the domain of their parameter.
+        """
+        return {p.name: p.to_reals(value) for p, value in zip(self.parameters, self.values().values(), strict=True)}
+
+    def set(self, reals: dict[str, mi.TensorXf]) -> None:
+        """Put x(u) into the scene, ready to receive gradients."""
+        for p in self.parameters:
+            value = like(dr.detach(p.from_reals(reals[p.name])), self.params[p.name])
+            dr.make_opaque(value)
+            dr.enable_grad(value)
+            self.params[p.name] = value
+        self.params.update()
+
+    # -- Images ---------------------------------------------------------------------------------------------------
+
+    def passes(self, sensor: mi.Sensor) -> list[int]:
+        """Samples per pixel of each pass; they sum to ``spp`` and hardly differ."""
+        pixels = math.prod(int(n) for n in sensor.film().crop_size())
+        most = max(self.samples_per_pass // pixels, 1)
+        n = math.ceil(self.spp / most)
+        return [self.spp // n + (i < self.spp % n) for i in range(n)]
+
+    def image(self, index: int, iteration: int) -> mi.TensorXf:
+        """Mean image of view ``index``, detached."""
+        return self.render(self.views[index].sensor, seed_of(self.seed, iteration, index, PRIMAL))
+
+    def render(self, sensor: mi.Sensor, seed: int) -> mi.TensorXf:
+        """Mean image of a sensor over all passes, detached."""
+        total = None
+        for number, spp in enumerate(self.passes(sensor)):
+            with dr.suspend_grad():
+                image = self.integrator.render(self.scene, sensor, seed=seed_of(seed, number), spp=spp)
+                total = image * spp if total is None else total + image * spp
+            self._finish(total)
+        return total / self.spp
+
+    def pull_back(self, index: int, adjoint: mi.TensorXf, seed: int) -> None:
+        """Add J^T adjoint of view ``index`` to the gradients of the scene's parameters."""
+        sensor = self.views[index].sensor
+        for number, spp in enumerate(self.passes(sensor)):
+            self.integrator.render_backward(
+                self.scene, self.params, adjoint * (spp / self.spp), sensor, seed_of(seed, number), spp
+            )
+            self._finish(self.gradients())
+
+    def push_forward(self, index: int, tangents: dict[str, mi.TensorXf], seed: int) -> mi.TensorXf:
+        """J v of view ``index``, for a direction v of the scene's parameters."""
+        sensor = self.views[index].sensor
+        total = None
+        for number, spp in enumerate(self.passes(sensor)):
+            self._set_tangents(tangents)
+            image = self.integrator.render_forward(self.scene, self.params, sensor, seed_of(seed, number), spp)
+            total = dr.detach(image) * spp if total is None else total + dr.detach(image) * spp
+            self._finish(total)
+        return total / self.spp
+
+    def _set_tangents(self, tangents: dict[str, mi.TensorXf]) -> None:
+        """Once per render: some integrators use the tangents up."""
+        for p in self.parameters:
+            value = self.params[p.name]
+            dr.set_grad(value, like(tangents[p.name], value))
+
+    def _finish(self, arrays: object) -> None:
+        dr.eval(arrays)
+        dr.sync_thread()
+        self.safe_point()
+
+    # -- Loss and gradient ----------------------------------------------------------------------------------------
+
+    def loss_and_gradient(
+        self, reals: dict[str, mi.TensorXf], iteration: int, chosen: Sequence[int] | None = None
+    ) -> tuple[float, dict[str, mi.TensorXf]]:
+        """f(u) and its gradient, over the ``chosen`` views (all of them by default).
+
+        The seeds of image and derivative differ: an estimate of d(I^2) = 2 I dI from one set of samples is biased.
+        Noise: of the integrator; none for media that only absorb, beyond the pixel filter's.
+        """
+        chosen = range(len(self.views)) if chosen is None else chosen
+        self.set(reals)
+        total = 0.0
+        for index in chosen:
+            value, adjoint = self.adjoint(index, self.image(index, iteration), len(chosen))
+            total += value
+            self.pull_back(index, adjoint, seed_of(self.seed, iteration, index, ADJOINT))
+        energy, gradients = self.through_priors_and_maps(reals, self.gradients())
+        return total + energy, gradients
+
+    def loss_value(self, reals: dict[str, mi.TensorXf], iteration: int) -> float:
+        """f(u), without derivatives."""
+        self.set(reals)
+        return self.mean_loss(iteration) + self.energy(reals)
+
+    def mean_loss(self, iteration: int) -> float:
+        """Mean loss over all views, of what the scene holds now."""
+        losses = [self.loss(self.image(i, iteration), view.reference)[0] for i, view in enumerate(self.views)]
+        return math.fsum(losses) / len(losses)
+
+    def adjoint(self, index: int, image: mi.TensorXf, n_views: int) -> tuple[float, mi.TensorXf]:
+        """The loss of one view, divided by the number of views, and its derivative by the image."""
+        image = dr.detach(image)
+        dr.enable_grad(image)
+        value = self.loss(image, self.views[index].reference) / n_views
+        dr.backward(value)
+        return float(value[0]), dr.detach(dr.grad(image))
+
+    def energy(self, reals: dict[str, mi.TensorXf]) -> float:
+        """Sum of all weighted prior energies."""
+        return math.fsum(float(p.energy(p.from_reals(dr.detach(reals[p.name])))[0]) for p in self.parameters)
+
+    def through_priors_and_maps(
+        self, reals: dict[str, mi.TensorXf], gradients: dict[str, mi.TensorXf]
+    ) -> tuple[float, dict[str, mi.TensorXf]]:
+        """Prior energy, and the gradients by the reals for given gradients by the values."""
+        total, by_reals = 0.0, {}
+        for p in self.parameters:
+            u = mi.TensorXf(dr.detach(reals[p.name]))
+            dr.enable_grad(u)
+            value = p.from_reals(u)
+            energy = p.energy(value)
+            total += float(dr.detach(energy)[0])
+            dr.backward(energy + dr.sum(value.array * gradients[p.name].array))
+            by_reals[p.name] = dr.grad(u)
+        dr.eval(by_reals)
+        return total, by_reals
