@@ -10,8 +10,8 @@ import pytest
 
 PACKAGE = Path(__file__).resolve().parents[1] / "mivol"
 ORDER = [
-    *("errors", "threads", "machine", "llvm", "numerics", "space", "files", "fields", "transport", "tomography", "scene"),
-    *("plugins", "optim", "validate", "report", "config", "doctor", "cli"),
+    *("errors", "threads", "machine", "llvm", "numerics", "space", "files", "fields", "transport", "tomography"),
+    *("scene", "plugins", "optim", "validate", "report", "config", "doctor", "cli", "__main__"),
 ]
 STARTS_THREADS = {"threading", "multiprocessing", "subprocess", "concurrent", "_thread", "asyncio"}
 STARTS_NOTHING = {
@@ -81,5 +81,5 @@ def test_only_plugins_define_classes_with_mitsuba_bases() -> None:
 
 def test_wrong_arrows_are_seen() -> None:
     """The check itself, on imports that it must refuse."""
-    names = [("mivol.cli.main", 1), ("mivol.plugins.volumes", 2), ("mivol.space.Box", 3), ("numpy", 4), ("mivol.new", 5)]
+    names = [("mivol.cli.main", 1), ("mivol.plugins.media", 2), ("mivol.space.Box", 3), ("numpy", 4), ("mivol.new", 5)]
     assert [message[:7] for message in wrong_arrows("fields", names)] == ["line 1:", "line 2:", "line 5:"]

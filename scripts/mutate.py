@@ -1,0 +1,157 @@
+"""Are the tests able to fail?  Break one line at a time in a copy of the checkout, and demand that the named test goes red.
+
+Each entry of tests/mutations/*.toml names a file, a text that occurs in it once, the text to put in its place, and a
+test. The test must pass on the untouched copy and fail on the broken one; a crash or a hang of the broken one counts as
+failing, an import that breaks does not.
+
+    scripts/mutate.py                        all of them
+    scripts/mutate.py --sample 12 --seed 7   twelve, drawn by the seed
+    scripts/mutate.py --only '*lattice*'     those whose file, test or list matches
+"""
+
+from __future__ import annotations
+
+import argparse
+import fnmatch
+import os
+import random
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+import tomllib
+from dataclasses import dataclass
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+LEFT_OUT = (".git", ".venv", "runs", "__pycache__", ".pytest_cache", ".ruff_cache", ".hypothesis", "dist", "build")
+PYTEST_FAILED = 1
+
+
+@dataclass(frozen=True)
+class Mutation:
+    """One line to break and the test that must notice."""
+
+    area: str
+    file: str
+    find: str
+    replace: str
+    test: str
+
+    def __str__(self) -> str:
+        return f"{self.file}: {_short(self.find)} -> {_short(self.replace)}"
+
+
+def _short(text: str) -> str:
+    line = " ".join(text.split())
+    return repr(line if len(line) <= 48 else line[:45] + "...")
+
+
+def load_entries(root: Path = ROOT) -> list[Mutation]:
+    """All entries of a checkout, in the order of the files.
+
+    Raises:
+        ValueError: an entry has a missing or an unknown key.
+    """
+    entries = []
+    for path in sorted((root / "tests" / "mutations").glob("*.toml")):
+        for number, fields in enumerate(tomllib.loads(path.read_text()).get("mutation", []), 1):
+            if set(fields) != {"file", "find", "replace", "test"}:
+                raise ValueError(f"{path}: entry {number} has the keys {sorted(fields)}, not file, find, replace, test.")
+            entries.append(Mutation(path.stem, **fields))
+    return entries
+
+
+def broken(entry: Mutation, root: Path) -> str:
+    """The text of the entry's file with the mutation in it.
+
+    Raises:
+        ValueError: the text to find does not occur exactly once.
+    """
+    text = (root / entry.file).read_text()
+    if text.count(entry.find) != 1:
+        raise ValueError(f"{entry.file} contains {entry.find!r} {text.count(entry.find)} times; once is needed.")
+    return text.replace(entry.find, entry.replace)
+
+
+def run_test(copy: Path, test: str, limit: float) -> tuple[int | None, str]:
+    """Run one test in the copy; its exit code (None where it did not end in time) and its output."""
+    env = dict(os.environ, PYTHONPATH=str(copy), PYTHONDONTWRITEBYTECODE="1")
+    env.setdefault("MIVOL_DATA", str(ROOT.parent / "shared" / "data"))
+    command = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", "-m", "slow or not slow", test]
+    try:
+        done = subprocess.run(
+            command, cwd=copy, env=env, capture_output=True, text=True, errors="replace", timeout=limit, check=False
+        )
+    except subprocess.TimeoutExpired:
+        return None, ""
+    return done.returncode, done.stdout + done.stderr
+
+
+def verdict(code: int | None, output: str) -> tuple[bool, str]:
+    """Whether the broken copy was noticed, and in one word how."""
+    if code is None:
+        return True, "red (hangs)"
+    if code < 0:
+        return True, f"red (signal {-code})"
+    if code == PYTEST_FAILED and " failed" in output:
+        return True, "red"
+    return False, "STILL GREEN" if code == 0 else f"DID NOT RUN (pytest ended with {code})"
+
+
+def judge(copy: Path, entry: Mutation, seen: dict[str, str], limit: float) -> tuple[bool, str]:
+    """Break the copy, run the test, mend the copy."""
+    if entry.test not in seen:
+        code, output = run_test(copy, entry.test, limit)
+        passed = re.search(r"\b\d+ passed", output)
+        skipped = re.search(r"\b\d+ skipped", output)
+        seen[entry.test] = "green" if code == 0 and passed else "skipped" if code == 0 and skipped else f"red\n{output}"
+    if seen[entry.test] == "skipped":
+        return True, "skipped here"
+    if seen[entry.test] != "green":
+        return False, f"RED BEFORE THE MUTATION {seen[entry.test]}"
+    file = copy / entry.file
+    whole = file.read_text()
+    file.write_text(broken(entry, copy))
+    try:
+        return verdict(*run_test(copy, entry.test, limit))
+    finally:
+        file.write_text(whole)
+
+
+def choose(entries: list[Mutation], only: str, sample: int | None, seed: int) -> list[Mutation]:
+    """The entries asked for."""
+    chosen = [e for e in entries if any(fnmatch.fnmatch(name, only) for name in (e.file, e.test, e.area))]
+    if sample is None or sample >= len(chosen):
+        return chosen
+    return sorted(random.Random(seed).sample(chosen, sample), key=entries.index)
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Judge the chosen entries; 0 where each was noticed."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--only", default="*", metavar="GLOB", help="entries whose file, test or list matches")
+    parser.add_argument("--sample", type=int, metavar="N", help="a random choice of so many")
+    parser.add_argument("--seed", type=int, default=0, metavar="S", help="of the random choice")
+    parser.add_argument("--limit", type=float, default=300, metavar="SECONDS", help="time that one test may take")
+    args = parser.parse_args(argv)
+    chosen = choose(load_entries(), args.only, args.sample, args.seed)
+    if not chosen:
+        parser.error(f"no entry of tests/mutations matches {args.only!r}")
+    missed, seen = 0, {}
+    with tempfile.TemporaryDirectory(prefix="mivol-mutate-") as folder:
+        copy = Path(folder) / "checkout"
+        shutil.copytree(ROOT, copy, ignore=shutil.ignore_patterns(*LEFT_OUT), symlinks=True)
+        for entry in chosen:
+            start = time.perf_counter()
+            noticed, how = judge(copy, entry, seen, args.limit)
+            missed += not noticed
+            print(f"{how:<14}{time.perf_counter() - start:6.1f} s  {entry}  [{entry.test}]", flush=True)
+    print(f"{len(chosen) - missed} of {len(chosen)} mutations noticed")
+    return 1 if missed else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
