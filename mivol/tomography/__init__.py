@@ -1,0 +1,1 @@
+"""Line integrals measured from many sides: geometries, the matched projector pair, phantoms, and real projections."""

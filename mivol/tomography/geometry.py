@@ -1,0 +1,278 @@
+"""Where the rays of a scanner run: parallel beam, circular cone beam, and free lists of pencil rays.
+
+Conventions. The object stands still and the scanner turns about the z axis through the world's origin. At angle
+``theta`` the beam runs along ``w = (-sin theta, cos theta, 0)`` and the detector's columns along
+``u = (cos theta, sin theta, 0)``, its rows along ``v = z``: a pixel right of the axis sees ``u . x > 0``, so a parallel
+projection is the Radon transform ``s = x cos(theta) + y sin(theta)``. Row 0 is the lowest row (smallest z) and column
+0 the smallest u, as voxel 0 is the lowest along each axis of a grid. All lengths (distances, pitches, offsets,
+voxels) are in one unit that the user chooses, and reconstructed values are per that unit; all angles are radians.
+Rays go through pixel centres and are float64.
+
+References: Kak & Slaney, Principles of Computerized Tomographic Imaging (1988), chapter 3.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+
+from mivol.errors import MivolError
+
+
+class Geometry(Protocol):
+    """What a projector asks of a scanner.
+
+    ``shape`` is (views, rows, columns) of its projections. ``whole_lines`` says that a ray is the whole straight line
+    through ``o`` (parallel light), where it is otherwise the half line that starts at ``o``.
+    """
+
+    shape: tuple[int, int, int]
+    whole_lines: bool
+
+    def rays(self, views: Sequence[int] | np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]: ...
+
+
+@dataclass(frozen=True)
+class VoxelGrid:
+    """Where the voxels lie: an axis-aligned box of ``shape`` voxels.
+
+    Args:
+        shape: (Z, Y, X) numbers of voxels.
+        voxel_size: edge of a voxel [length], one number or (x, y, z).
+        centre: world position (x, y, z) of the box's middle [length].
+    """
+
+    shape: tuple[int, int, int]
+    voxel_size: float | tuple[float, float, float] = 1.0
+    centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        shape = tuple(int(n) for n in np.atleast_1d(self.shape))
+        if len(shape) != 3 or min(shape) < 1:
+            raise MivolError(f"Found a grid shape {self.shape}, expected three counts (Z, Y, X), each at least 1.")
+        size = np.broadcast_to(np.asarray(self.voxel_size, float), (3,))
+        if not (np.isfinite(size).all() and (size > 0).all()):
+            raise MivolError(f"Found a voxel size {self.voxel_size}, expected positive lengths: one, or (x, y, z).")
+        centre = np.asarray(self.centre, float)
+        if centre.shape != (3,) or not np.isfinite(centre).all():
+            raise MivolError(f"Found a grid centre {self.centre}, expected a finite position (x, y, z).")
+        object.__setattr__(self, "shape", shape)
+        object.__setattr__(self, "voxel_size", tuple(map(float, size)))
+        object.__setattr__(self, "centre", tuple(map(float, centre)))
+
+    @property
+    def size(self) -> int:
+        """Number of voxels."""
+        return int(np.prod(self.shape))
+
+    @property
+    def extent(self) -> np.ndarray:
+        """Edges (x, y, z) of the box [length]."""
+        return np.asarray(self.voxel_size) * np.asarray(self.shape[::-1])
+
+    @property
+    def radius(self) -> float:
+        """Radius of the sphere around the box [length]."""
+        return float(np.linalg.norm(self.extent) / 2)
+
+    @property
+    def to_world(self) -> np.ndarray:
+        """4x4 float64 matrix from the unit cube to the box."""
+        matrix = np.diag([*self.extent, 1.0])
+        matrix[:3, 3] = np.asarray(self.centre) - self.extent / 2
+        return matrix
+
+    def axis(self, name: str) -> np.ndarray:
+        """World coordinates [length] of the voxel centres along ``"x"``, ``"y"`` or ``"z"``."""
+        i = "xyz".index(name)
+        n = self.shape[2 - i]
+        return self.centre[i] + (np.arange(n) - (n - 1) / 2) * self.voxel_size[i]
+
+
+@dataclass(frozen=True, eq=False)
+class PencilRays:
+    """A free list of half lines, each ray a view of its own.
+
+    Args:
+        o: (N, 3) starting points [length].
+        d: (N, 3) directions of any positive length; they are normalised.
+    """
+
+    o: np.ndarray
+    d: np.ndarray
+    whole_lines: bool = field(default=False, init=False)
+
+    def __post_init__(self) -> None:
+        o, d = np.array(self.o, float), np.array(self.d, float)
+        if o.ndim != 2 or o.shape[1] != 3 or o.shape != d.shape or len(o) == 0:
+            raise MivolError(f"Found rays of shapes {o.shape} and {d.shape}, expected two equal arrays (N, 3), N at least 1.")
+        norm = np.linalg.norm(d, axis=1)
+        bad = np.flatnonzero(~(np.isfinite(o).all(1) & np.isfinite(norm) & (norm > 0)))
+        if len(bad):
+            raise MivolError(
+                f"Found an unusable ray at index {bad[0]}, expected finite origins and directions that are not zero."
+            )
+        object.__setattr__(self, "o", _frozen(o))
+        object.__setattr__(self, "d", _frozen(d / norm[:, None]))
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """(N, 1, 1)."""
+        return len(self.o), 1, 1
+
+    def rays(self, views: Sequence[int] | np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """Origins and unit directions, each (views, 1, 1, 3) float64."""
+        index = _view_index(views, len(self.o))
+        return self.o[index][:, None, None], self.d[index][:, None, None]
+
+
+@dataclass(frozen=True, eq=False)
+class ParallelBeam:
+    """Parallel light and a flat detector that turn together about the z axis.
+
+    Args:
+        angles: view angles [rad].
+        detector: (rows, columns).
+        pitch: distance of pixel centres [length], one number or (along v, along u).
+        axis_offset: where the rotation axis falls on the detector, measured from the middle of the detector along +u
+            [length]. An axis found at column ``c`` (pixel centres are whole numbers) means ``(c - (columns - 1) / 2)
+            * pitch``.
+        detector_offset: shift of the detector's middle (along v, along u) [length]; along u it undoes ``axis_offset``.
+    """
+
+    angles: np.ndarray
+    detector: tuple[int, int]
+    pitch: float | tuple[float, float] = 1.0
+    axis_offset: float = 0.0
+    detector_offset: tuple[float, float] = (0.0, 0.0)
+    whole_lines: bool = field(default=True, init=False)
+
+    def __post_init__(self) -> None:
+        _freeze_detector(self)
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """(views, rows, columns)."""
+        return len(self.angles), *self.detector
+
+    def rays(self, views: Sequence[int] | np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """Points of the lines nearest the rotation axis, and unit directions, each (views, rows, cols, 3) float64."""
+        u, w = _frame(self.angles[_view_index(views, len(self.angles))])
+        v_of_row, u_of_col = _pixel_centres(self)
+        o = np.zeros((len(u), *self.detector, 3))
+        o += u_of_col[:, None] * u[:, None, None, :]
+        o[..., 2] = v_of_row[:, None]
+        return o, np.broadcast_to(w[:, None, None, :], o.shape)
+
+
+@dataclass(frozen=True, eq=False)
+class ConeBeam:
+    """A point source and a flat detector on circles about the z axis.
+
+    Args:
+        angles: view angles [rad].
+        detector: (rows, columns).
+        source_to_axis: distance from the source to the rotation axis, along the central ray [length].
+        source_to_detector: distance from the source to the detector's plane [length].
+        pitch: distance of pixel centres on the detector [length], one number or (along v, along u).
+        axis_offset: distance of the rotation axis from the central ray along +u, in the axis' plane (not magnified)
+            [length].
+        detector_offset: shift of the detector's middle from the central ray (along v, along u) [length].
+    """
+
+    angles: np.ndarray
+    detector: tuple[int, int]
+    source_to_axis: float
+    source_to_detector: float
+    pitch: float | tuple[float, float] = 1.0
+    axis_offset: float = 0.0
+    detector_offset: tuple[float, float] = (0.0, 0.0)
+    whole_lines: bool = field(default=False, init=False)
+
+    def __post_init__(self) -> None:
+        if not 0 < self.source_to_axis < np.inf or not 0 < self.source_to_detector < np.inf:
+            raise MivolError(
+                f"Found {self.source_to_axis} from source to axis and {self.source_to_detector} from source to "
+                "detector, expected positive lengths."
+            )
+        _freeze_detector(self)
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """(views, rows, columns)."""
+        return len(self.angles), *self.detector
+
+    def rays(self, views: Sequence[int] | np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """The source, and unit directions towards the pixel centres, each (views, rows, cols, 3) float64."""
+        u, w = _frame(self.angles[_view_index(views, len(self.angles))])
+        v_of_row, u_of_col = _pixel_centres(self)
+        source = -self.axis_offset * u - self.source_to_axis * w
+        d = np.zeros((len(u), *self.detector, 3))
+        d += (u_of_col + self.axis_offset)[:, None] * u[:, None, None, :] + self.source_to_detector * w[:, None, None, :]
+        d[..., 2] = v_of_row[:, None]
+        d /= np.linalg.norm(d, axis=-1, keepdims=True)
+        return np.broadcast_to(source[:, None, None, :], d.shape), d
+
+
+def cone_beam_of_tigre(n: int = 256, n_views: int = 100) -> tuple[ConeBeam, VoxelGrid]:
+    """The cone beam of TIGRE's own algorithm tests ("configuration 1"), at any resolution.
+
+    A cube of 256 mm, source to axis 1000 mm, source to detector 1536 mm, a square detector of 409.6 mm, full circle
+    with the last view on top of the first. Lengths are mm.
+
+    Args:
+        n: voxels along an edge, and pixels along a detector's edge (256 in TIGRE).
+        n_views: number of views (100 in TIGRE).
+
+    References: CERN/TIGRE at e702473, Python/tests/generate_configurations.py and geometry_default.py.
+    """
+    angles = np.linspace(0.0, 2 * np.pi, n_views)
+    beam = ConeBeam(angles, (n, n), source_to_axis=1000.0, source_to_detector=1536.0, pitch=409.6 / n)
+    return beam, VoxelGrid((n, n, n), voxel_size=256.0 / n)
+
+
+def _freeze_detector(beam: ParallelBeam | ConeBeam) -> None:
+    angles = np.array(beam.angles, float).reshape(-1)
+    if len(angles) == 0 or not np.isfinite(angles).all():
+        raise MivolError(f"Found {len(angles)} view angles, expected at least one, all finite, in radians.")
+    detector = tuple(int(n) for n in np.atleast_1d(beam.detector))
+    if len(detector) != 2 or min(detector) < 1:
+        raise MivolError(f"Found a detector of {beam.detector} pixels, expected (rows, columns), each at least 1.")
+    pitch = np.broadcast_to(np.asarray(beam.pitch, float), (2,))
+    if not (np.isfinite(pitch).all() and (pitch > 0).all()):
+        raise MivolError(f"Found a pixel pitch {beam.pitch}, expected positive lengths: one, or (along v, along u).")
+    offsets = np.array([beam.axis_offset, *beam.detector_offset], float)
+    if offsets.shape != (3,) or not np.isfinite(offsets).all():
+        raise MivolError(f"Found offsets {offsets.tolist()} of axis and detector (v, u), expected three finite lengths.")
+    object.__setattr__(beam, "angles", _frozen(angles))
+    object.__setattr__(beam, "detector", detector)
+    object.__setattr__(beam, "pitch", tuple(map(float, pitch)))
+
+
+def _view_index(views: Sequence[int] | np.ndarray | None, n_views: int) -> np.ndarray:
+    index = np.arange(n_views) if views is None else np.atleast_1d(np.asarray(views, int))
+    wrong = index[(index < 0) | (index >= n_views)]
+    if len(wrong):
+        raise MivolError(f"Found view {wrong[0]}, expected views from 0 to {n_views - 1}.")
+    return index
+
+
+def _frame(angles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    c, s, zero = np.cos(angles), np.sin(angles), np.zeros_like(angles)
+    return np.stack([c, s, zero], -1), np.stack([-s, c, zero], -1)
+
+
+def _pixel_centres(beam: ParallelBeam | ConeBeam) -> tuple[np.ndarray, np.ndarray]:
+    """(v of each row, u of each column) in the frame whose origin is the rotation axis [length]."""
+    (rows, cols), (pitch_v, pitch_u), (shift_v, shift_u) = beam.detector, beam.pitch, beam.detector_offset
+    v = (np.arange(rows) - (rows - 1) / 2) * pitch_v + shift_v
+    u = (np.arange(cols) - (cols - 1) / 2) * pitch_u + shift_u - beam.axis_offset
+    return v, u
+
+
+def _frozen(a: np.ndarray) -> np.ndarray:
+    a.setflags(write=False)
+    return a

@@ -1,0 +1,252 @@
+"""The system matrix of a scan and its exact transpose, never formed: ``A @ x`` are line integrals, ``A.T @ y`` goes back.
+
+Conventions. x is a grid (Z, Y, X) [1/length] of the trilinear model (values at voxel centres, clamped borders, nothing
+outside the box), y are projections (views, rows, cols), no unit. Either may be flat; the answer has the form of the
+question. Both are float32 and both operators are the very sums that :mod:`mivol.transport.optical_depth` defines, so the
+pair is matched: ``<A x, y> = <x, A.T y>`` to rounding.
+
+Rays are set up in float64: their origins are moved to the edge of a sphere around the grid and measured from its
+centre, so a source or an object far from the world's origin costs no accuracy. They are given to the kernels as
+arrays; a subset of views, another pass or another geometry compiles nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mivol.errors import MivolError
+from mivol.threads import check_one_thread
+from mivol.tomography.geometry import Geometry, VoxelGrid
+from mivol.transport.lattice import Lattice, block_bounds, clip
+from mivol.transport.optical_depth import Gradient, backproject_segment, integrate_segment
+
+if TYPE_CHECKING:
+    import scipy.sparse.linalg
+    import torch
+
+PASS_CELLS = 1 << 29
+"""Most cells that the rays of one kernel may cross: about a second on two cores, so that Ctrl-C is heard."""
+
+CACHE_BYTES = 1 << 30
+"""Rays (24 bytes each) are kept between calls up to this size, and set up anew in each call beyond it."""
+
+
+class Projector:
+    """Line integrals of a grid along the rays of a scan, and their transpose.
+
+    Args:
+        geometry: a ParallelBeam, ConeBeam, PencilRays, or anything with ``shape``, ``whole_lines`` and ``rays(views)``.
+        grid: where the voxels lie, in the geometry's unit of length.
+        views: the views that take part, in this order; all by default.
+
+    Attributes:
+        shape: (rays, voxels). dtype: float32. n_views: number of views. projection_shape: (views, rows, cols).
+        T: the transpose, with ``@``, ``shape`` and ``T``.
+
+    Cost: one walk through the grid per ray; memory 24 bytes a ray up to CACHE_BYTES, besides x and y.
+
+    Example:
+        >>> A = Projector(ParallelBeam(angles, (1, 640)), VoxelGrid((1, 640, 640)))
+        >>> y = A @ x
+        >>> gradient = A.T @ (y - measured)
+    """
+
+    dtype = np.dtype(np.float32)
+
+    def __init__(self, geometry: Geometry, grid: VoxelGrid, views: Sequence[int] | np.ndarray | None = None) -> None:
+        if mi.variant() is None or mi.variant().startswith("scalar"):
+            raise MivolError(
+                f"Found the variant {mi.variant()}, expected one that compiles: call mi.set_variant('llvm_ad_rgb') or "
+                "'cuda_ad_rgb' first."
+            )
+        check_one_thread()
+        self.geometry, self.grid = geometry, grid
+        self.views = np.arange(geometry.shape[0]) if views is None else np.atleast_1d(np.asarray(views, int))
+        if len(self.views) == 0 or self.views.min() < 0 or self.views.max() >= geometry.shape[0]:
+            raise MivolError(f"Found views {self.views.tolist()[:5]}, expected some from 0 to {geometry.shape[0] - 1}.")
+        self.n_views = len(self.views)
+        self.projection_shape = (self.n_views, *geometry.shape[1:])
+        self.shape = (int(np.prod(self.projection_shape)), grid.size)
+        # The grid's centre is the origin of the rays that the kernels see.
+        self._to_world = VoxelGrid(grid.shape, grid.voxel_size).to_world
+        self._cache: list[tuple[int, mi.Point3f, mi.Vector3f]] | None = None
+
+    def __repr__(self) -> str:
+        return f"Projector({type(self.geometry).__name__} {self.projection_shape}, grid {self.grid.shape})"
+
+    def __matmul__(self, x: np.ndarray) -> np.ndarray:
+        """Line integrals of ``x``: (Z, Y, X) gives (views, rows, cols), (voxels,) gives (rays,)."""
+        x, flat = _as_array(x, self.grid.shape, "voxels")
+        y = np.array(self._project(mi.Float(x)))
+        return y if flat else y.reshape(self.projection_shape)
+
+    @property
+    def T(self) -> Transpose:
+        """The transpose: ``A.T @ y``."""
+        return Transpose(self)
+
+    def subset(self, views: Sequence[int] | np.ndarray) -> Projector:
+        """The rows of some views, counted among this projector's own. Compiles nothing."""
+        return Projector(self.geometry, self.grid, self.views[np.asarray(views, int)])
+
+    @cached_property
+    def column_sums(self) -> np.ndarray:
+        """``A.T @ 1``, (Z, Y, X): how much each voxel is seen [length]."""
+        return self.T @ np.ones(self.projection_shape, np.float32)
+
+    def as_linear_operator(self) -> scipy.sparse.linalg.LinearOperator:
+        """The pair as SciPy knows it, for ``lsqr``, ``lsmr``, ``cg``, ``eigsh`` and others."""
+        from scipy.sparse.linalg import LinearOperator
+
+        return LinearOperator(
+            self.shape,
+            matvec=lambda x: self @ np.reshape(x, -1),
+            rmatvec=lambda y: self.T @ np.reshape(y, -1),
+            dtype=self.dtype,
+        )
+
+    def integrate(self, values: mi.TensorXf) -> mi.TensorXf:
+        """``A @ values`` on Dr.Jit tensors, differentiable in forward and reverse mode.
+
+        Args:
+            values: (Z, Y, X).
+
+        Returns:
+            (views, rows, cols).
+        """
+        if tuple(values.shape) != self.grid.shape:
+            raise MivolError(f"Found a tensor of shape {tuple(values.shape)}, expected the grid's {self.grid.shape}.")
+        return mi.TensorXf(dr.custom(_Projection, values.array, self), self.projection_shape)
+
+    def to_torch(self) -> Callable[[torch.Tensor], torch.Tensor]:
+        """The projector as a differentiable PyTorch function from (Z, Y, X) to (views, rows, cols), through ``dr.wrap``.
+
+        Raises: MivolError: PyTorch is not installed.
+
+        Example:
+            >>> project = A.to_torch()
+            >>> ((project(x) - y) ** 2).sum().backward()
+        """
+        try:
+            import torch  # noqa: F401
+        except ImportError:
+            raise MivolError("Found no PyTorch, expected it for to_torch: pip install torch.") from None
+
+        @dr.wrap(source="torch", target="drjit")
+        def project(x: mi.TensorXf) -> mi.TensorXf:
+            return self.integrate(x)
+
+        return project
+
+    # -- Passes over the rays ---------------------------------------------------------------------------------------------
+
+    def _project(self, values: mi.Float) -> mi.Float:
+        """``A values``, flat."""
+        check_one_thread()
+        lattice = self._lattice(values, with_bounds=True)
+        y = dr.zeros(mi.Float, self.shape[0])
+        for start, o, d in self._passes():
+            tau = integrate_segment(lattice, values, clip(lattice, o, d, 0, dr.inf))[0]
+            dr.scatter(y, tau, dr.arange(mi.UInt32, dr.width(o)) + dr.opaque(mi.UInt32, start))
+            dr.eval(y)
+            dr.sync_thread()
+        return y
+
+    def _backproject(self, y: mi.Float) -> mi.Float:
+        """``A^T y``, flat; the passes are added up in float64."""
+        check_one_thread()
+        lattice = self._lattice(dr.zeros(mi.Float, self.grid.size), with_bounds=False)
+        total = dr.zeros(mi.Float64, self.grid.size)
+        for start, o, d in self._passes():
+            weight = dr.gather(mi.Float, y, dr.arange(mi.UInt32, dr.width(o)) + dr.opaque(mi.UInt32, start))
+            target = Gradient.zeros(lattice)
+            backproject_segment(lattice, target, [weight], clip(lattice, o, d, 0, dr.inf))
+            total += mi.Float64(target.fold())
+            dr.eval(total)
+            dr.sync_thread()
+        return mi.Float(total)
+
+    def _lattice(self, values: mi.Float, with_bounds: bool) -> Lattice:
+        tensor = mi.TensorXf(values, (*self.grid.shape, 1))
+        return Lattice(tensor, self._to_world, block_bounds(tensor) if with_bounds else None)
+
+    def _passes(self) -> Iterator[tuple[int, mi.Point3f, mi.Vector3f]]:
+        """(index of the first ray, origins, directions), pass by pass."""
+        if self._cache is not None:
+            yield from self._cache
+            return
+        kept = []
+        for part in self._set_up_passes():
+            kept.append(part)
+            yield part
+        if 24 * self.shape[0] <= CACHE_BYTES:
+            self._cache = kept
+
+    def _set_up_passes(self) -> Iterator[tuple[int, mi.Point3f, mi.Vector3f]]:
+        per_view = int(np.prod(self.projection_shape[1:]))
+        budget = max(1, PASS_CELLS // (sum(self.grid.shape) + 3))
+        views_at_once = max(1, budget // per_view)
+        for first in range(0, self.n_views, views_at_once):
+            o, d = self._rays(self.views[first : first + views_at_once])
+            for start in range(0, len(o), budget):
+                part = slice(start, start + budget)
+                yield first * per_view + start, mi.Point3f(o[part].T), mi.Vector3f(d[part].T)
+
+    def _rays(self, views: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Rays (N, 3) that start on the sphere around the grid, from the grid's centre."""
+        o, d = (np.reshape(a, (-1, 3)) for a in self.geometry.rays(views))
+        o = o - np.asarray(self.grid.centre)
+        to_sphere = -np.einsum("ij,ij->i", o, d) - self.grid.radius
+        if not self.geometry.whole_lines:
+            to_sphere = np.maximum(to_sphere, 0.0)
+        return (o + to_sphere[:, None] * d).astype(np.float32), d.astype(np.float32)
+
+
+class Transpose:
+    """The transpose of a :class:`Projector`."""
+
+    dtype = Projector.dtype
+
+    def __init__(self, projector: Projector) -> None:
+        self.T = projector
+        self.shape = projector.shape[::-1]
+
+    def __matmul__(self, y: np.ndarray) -> np.ndarray:
+        """Back-projection of ``y``: (views, rows, cols) gives (Z, Y, X), (rays,) gives (voxels,)."""
+        y, flat = _as_array(y, self.T.projection_shape, "rays")
+        x = np.array(self.T._backproject(mi.Float(y)))
+        return x if flat else x.reshape(self.T.grid.shape)
+
+
+class _Projection(dr.CustomOp):
+    """y = A x, with its tangent and its transpose, in passes."""
+
+    def eval(self, values: mi.Float, projector: Projector) -> mi.Float:
+        self.projector = projector
+        return projector._project(dr.detach(values))
+
+    def forward(self) -> None:
+        self.set_grad_out(self.projector._project(self.grad_in("values")))
+
+    def backward(self) -> None:
+        self.set_grad_in("values", self.projector._backproject(self.grad_out()))
+
+    def name(self) -> str:
+        return "projection"
+
+
+def _as_array(a: np.ndarray, shape: tuple[int, ...], what: str) -> tuple[np.ndarray, bool]:
+    """(flat float32 array, whether it was flat)."""
+    a = np.asarray(a)
+    flat = a.shape == (int(np.prod(shape)),)
+    if not flat and a.shape != shape:
+        raise MivolError(f"Found an array of shape {a.shape}, expected {shape} or flat, one number for each of the {what}.")
+    if np.iscomplexobj(a):
+        raise MivolError("Found complex numbers, expected real ones: project the real and the imaginary part apart.")
+    return np.ascontiguousarray(a, np.float32).reshape(-1), flat
