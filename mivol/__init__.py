@@ -9,7 +9,10 @@ from . import llvm
 
 llvm.ensure()
 
-import mitsuba as mi  # noqa: E402  (Dr.Jit loads LLVM as soon as it is imported)
+try:
+    import mitsuba as mi  # Dr.Jit loads LLVM as soon as it is imported
+except (ImportError, NameError) as error:  # a NameError is how Dr.Jit 1.5 reports that its own library does not load
+    raise ImportError(llvm.missing_system_library() or f"Mitsuba cannot be imported: {error}") from error
 
 from . import plugins  # noqa: E402
 from .errors import MivolError  # noqa: E402

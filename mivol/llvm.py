@@ -31,6 +31,7 @@ __all__ = [
     "find_libraries",
     "fixes",
     "loaded_path",
+    "missing_system_library",
     "origin",
     "probe",
     "rank",
@@ -52,7 +53,7 @@ _unloadable: dict[Path, str] = {}
 
 
 _INSTALL = (
-    ('pip install "karellen-llvm-core>=19,<24"', "Linux x86-64, no root; needs the system's libatomic.so.1"),
+    ('pip install "karellen-llvm-core>=19,<24"', "Linux x86-64, no root needed"),
     ("sudo apt install libllvm19", "Debian 12 or newer, Ubuntu 24.04 or newer"),
     ("sudo dnf install llvm-libs", "Fedora, RHEL 9"),
     ("brew install llvm", "macOS"),
@@ -183,6 +184,21 @@ class _VariantGuard(importlib.abc.MetaPathFinder):
             check_backend(name.removeprefix("mitsuba."))
 
 
+def missing_system_library() -> str | None:
+    """What to do where the system lacks the one library that Dr.Jit's wheel needs and slim images leave out."""
+    if sys.platform != "linux":
+        return None
+    try:
+        ctypes.CDLL("libatomic.so.1")
+    except OSError as error:
+        return (
+            f"Dr.Jit cannot be loaded because this system lacks libatomic.so.1 ({error}): sudo apt install libatomic1, or "
+            "sudo dnf install libatomic; without root: apt-get download libatomic1 && dpkg-deb -x libatomic1_*.deb ~/libatomic "
+            "&& export LD_LIBRARY_PATH=~/libatomic/usr/lib/x86_64-linux-gnu"
+        )
+    return None
+
+
 def version() -> tuple[int, int, int] | None:
     """The version of the LLVM library that Dr.Jit has loaded, None where it has none."""
     import drjit as dr
@@ -267,6 +283,4 @@ def fixes() -> list[str]:
         lines.append(f"import mivol before mitsuba and drjit: it then chooses {better[0].path}")
     if better and _origin == BY_USER:
         lines.append(f"unset {VARIABLE}: mivol then chooses {better[0].path}")
-    if any("libatomic" in why for why in _unloadable.values()):
-        lines.append("sudo apt install libatomic1 (dnf: libatomic): the library found lacks nothing but libatomic.so.1")
     return lines + [f"{command:<52}{note}" for command, note in _INSTALL]

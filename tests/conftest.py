@@ -8,10 +8,11 @@ import re
 import shutil
 from pathlib import Path
 
+import mivol  # noqa: F401  (before Mitsuba: it chooses the LLVM library)
+
+# isort: split
 import mitsuba as mi
 import pytest
-
-import mivol  # noqa: F401  (registers the plugins and chooses the LLVM library)
 
 ROOT = Path(__file__).resolve().parents[1]
 

@@ -24,12 +24,14 @@ for name in ("scalar_rgb", "llvm_ad_rgb", "llvm_ad_mono", "llvm_ad_rgb"):
 """
 
 
-def child(code: str, llvm_path: str | None = None) -> tuple[int, str, str]:
+def child(code: str, llvm_path: str | None = None, library_path: Path | None = None) -> tuple[int, str, str]:
     """Run code with ``DRJIT_LIBLLVM_PATH`` as given (unset by default), and this checkout first on the path."""
     env = {key: value for key, value in os.environ.items() if key != llvm.VARIABLE}
     env["PYTHONPATH"] = str(Path(mivol.__file__).parents[1])
     if llvm_path is not None:
         env[llvm.VARIABLE] = llvm_path
+    if library_path is not None:
+        env["LD_LIBRARY_PATH"] = str(library_path)
     done = threads.run_child(code, env=env)
     return done.returncode, done.stdout.strip(), done.stderr
 
@@ -141,14 +143,23 @@ def test_loaded_first_names_the_cure(monkeypatch: pytest.MonkeyPatch) -> None:
         llvm.check_backend("llvm_ad_mono")
 
 
-def test_lack_of_libatomic_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
-    why = "libatomic.so.1: cannot open shared object file: No such file or directory"
+def test_library_that_does_not_load_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(llvm, "version", lambda: None)
     monkeypatch.setattr(llvm, "_origin", llvm.BY_DRJIT)
-    monkeypatch.setattr(llvm, "_unloadable", {Path("/venv/lib/libLLVM.so.23.1"): why})
-    with pytest.raises(llvm.LlvmError, match="apt install libatomic1") as refusal:
+    monkeypatch.setattr(llvm, "_unloadable", {Path("/venv/lib/libLLVM.so.23.1"): "invalid ELF header"})
+    with pytest.raises(llvm.LlvmError, match=r"/venv/lib/libLLVM\.so\.23\.1 does not load \(invalid ELF header\)"):
         llvm.check_backend("llvm_ad_rgb")
-    assert f"/venv/lib/libLLVM.so.23.1 does not load ({why})" in str(refusal.value)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="Dr.Jit needs libatomic on Linux")
+def test_lack_of_libatomic_is_said(tmp_path: Path) -> None:
+    """A system without it, imitated by a broken one found first: Mitsuba cannot be imported, and mivol says why."""
+    (tmp_path / "libatomic.so.1").touch()
+    code, _, err = child("import mivol", library_path=tmp_path)
+    assert code == 1
+    assert "ImportError: Dr.Jit cannot be loaded because this system lacks libatomic.so.1" in err.splitlines()[-1]
+    assert "apt install libatomic1" in err
+    assert llvm.missing_system_library() is None
 
 
 def test_variants_without_llvm_pass(monkeypatch: pytest.MonkeyPatch) -> None:
