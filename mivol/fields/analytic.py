@@ -1,9 +1,9 @@
 r"""Fields whose optical depth along a ray is known on paper.
 
 Conventions. Positions and distances are in world units, float64 NumPy throughout. A ray is ``o + t d`` with ``d`` of
-any length but zero; ``t0`` and ``t1`` count lengths of ``d`` (distances when ``|d| = 1``); the optical depth integrates over
-the world length, so it does not change when ``d`` is rescaled. ``o`` and ``d`` have shape ``(..., 3)``,
-``t0`` and ``t1`` shape ``(...)``; all broadcast. ``t1 <= t0`` gives 0.
+any length but zero; ``t0`` and ``t1`` count lengths of ``d`` (distances when ``|d| = 1``); the optical depth integrates
+over the world length, so it does not change when ``d`` is rescaled. ``o`` and ``d`` have shape ``(..., 3)``, ``t0`` and
+``t1`` shape ``(...)``; all broadcast. ``t1 <= t0`` gives 0.
 
 Here: ``Constant``, ``Trilinear`` (``ramp``), ``Ellipsoid`` (``sphere``), ``Slab``, ``GaussianBlob``,
 ``ExponentialAtmosphere``, and two ways to combine them: ``Within`` (a field inside a parallelepiped; ``box``), ``Sum``.

@@ -1,0 +1,212 @@
+"""Where the methods come from: one table from a key to the full reference.
+
+Conventions. A key is ``author_year`` or the name of a program. Every entry was compared with the publisher's page, the
+project's own citation file or several independent bibliographies; a DOI stands only where it was seen there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from difflib import get_close_matches
+from typing import NamedTuple
+
+from mivol.errors import MivolError
+
+__all__ = ["CITATIONS", "Citation", "citations"]
+
+
+class Citation(NamedTuple):
+    """One reference: ``authors`` (year). ``title``. ``where``; ``link`` is a DOI, an arXiv page or a home page."""
+
+    authors: str
+    year: int
+    title: str
+    where: str
+    link: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.authors} ({self.year}). {self.title}. {self.where}." + (f" {self.link}" if self.link else "")
+
+
+CITATIONS: dict[str, Citation] = {
+    "mitsuba3": Citation(
+        "W. Jakob, S. Speierer, N. Roussel, M. Nimier-David, D. Vicini, T. Zeltner, B. Nicolet, M. Crespo, V. Leroy, Z. Zhang",
+        2022,
+        "Mitsuba 3 renderer",
+        "Software",
+        "https://mitsuba-renderer.org",
+    ),
+    "drjit": Citation(
+        "W. Jakob, S. Speierer, N. Roussel, D. Vicini",
+        2022,
+        "Dr.Jit: a just-in-time compiler for differentiable rendering",
+        "ACM Transactions on Graphics 41(4)",
+        "https://doi.org/10.1145/3528223.3530099",
+    ),
+    "amanatides_1987": Citation(
+        "J. Amanatides, A. Woo",
+        1987,
+        "A fast voxel traversal algorithm for ray tracing",
+        "Eurographics 1987, Technical Papers",
+        "https://doi.org/10.2312/egtp.19871000",
+    ),
+    "max_1995": Citation(
+        "N. Max",
+        1995,
+        "Optical models for direct volume rendering",
+        "IEEE Transactions on Visualization and Computer Graphics 1(2), 99-108",
+    ),
+    "novak_2014": Citation(
+        "J. Novák, A. Selle, W. Jarosz",
+        2014,
+        "Residual ratio tracking for estimating attenuation in participating media",
+        "ACM Transactions on Graphics 33(6), 179",
+    ),
+    "novak_2018": Citation(
+        "J. Novák, I. Georgiev, J. Hanika, W. Jarosz",
+        2018,
+        "Monte Carlo methods for volumetric light transport simulation",
+        "Computer Graphics Forum 37(2), 551-576",
+        "https://doi.org/10.1111/cgf.13383",
+    ),
+    "vicini_2021": Citation(
+        "D. Vicini, S. Speierer, W. Jakob",
+        2021,
+        "Path replay backpropagation: differentiating light paths using constant memory and linear time",
+        "ACM Transactions on Graphics 40(4), 108",
+        "https://doi.org/10.1145/3450626.3459804",
+    ),
+    "kettunen_2021": Citation(
+        "M. Kettunen, E. d'Eon, J. Pantaleoni, J. Novák",
+        2021,
+        "An unbiased ray-marching transmittance estimator",
+        "ACM Transactions on Graphics 40(4), 137",
+        "https://doi.org/10.1145/3450626.3459937",
+    ),
+    "condor_2025": Citation(
+        "J. Condor, S. Speierer, L. Bode, A. Božič, S. Green, P. Didyk, A. Jarabo",
+        2025,
+        "Don't splat your Gaussians: volumetric ray-traced primitives for modeling and rendering scattering and emissive media",
+        "ACM Transactions on Graphics 44(1)",
+        "https://doi.org/10.1145/3711853",
+    ),
+    "kak_1988": Citation("A. C. Kak, M. Slaney", 1988, "Principles of computerized tomographic imaging", "IEEE Press"),
+    "gilbert_1972": Citation(
+        "P. Gilbert",
+        1972,
+        "Iterative methods for the three-dimensional reconstruction of an object from projections",
+        "Journal of Theoretical Biology 36(1), 105-117",
+    ),
+    "andersen_1984": Citation(
+        "A. H. Andersen, A. C. Kak",
+        1984,
+        "Simultaneous algebraic reconstruction technique (SART): a superior implementation of the ART algorithm",
+        "Ultrasonic Imaging 6(1), 81-94",
+        "https://doi.org/10.1016/0161-7346(84)90008-7",
+    ),
+    "nuyts_1998": Citation(
+        "J. Nuyts, B. De Man, P. Dupont, M. Defrise, P. Suetens, L. Mortelmans",
+        1998,
+        "Iterative reconstruction for helical CT: a simulation study",
+        "Physics in Medicine and Biology 43, 729-737",
+    ),
+    "erdogan_1999": Citation(
+        "H. Erdoğan, J. A. Fessler",
+        1999,
+        "Ordered subsets algorithms for transmission tomography",
+        "Physics in Medicine and Biology 44(11), 2835-2851",
+    ),
+    "vo_2014": Citation(
+        "N. T. Vo, M. Drakopoulos, R. C. Atwood, C. Reinhard",
+        2014,
+        "Reliable method for calculating the center of rotation in parallel-beam tomography",
+        "Optics Express 22(16), 19078",
+        "https://doi.org/10.1364/OE.22.019078",
+    ),
+    "hestenes_1952": Citation(
+        "M. R. Hestenes, E. Stiefel",
+        1952,
+        "Methods of conjugate gradients for solving linear systems",
+        "Journal of Research of the National Bureau of Standards 49(6), 409-436",
+        "https://doi.org/10.6028/jres.049.044",
+    ),
+    "liu_1989": Citation(
+        "D. C. Liu, J. Nocedal",
+        1989,
+        "On the limited memory BFGS method for large scale optimization",
+        "Mathematical Programming 45, 503-528",
+    ),
+    "kingma_2015": Citation(
+        "D. P. Kingma, J. Ba",
+        2015,
+        "Adam: a method for stochastic optimization",
+        "International Conference on Learning Representations",
+        "https://arxiv.org/abs/1412.6980",
+    ),
+    "rudin_1992": Citation(
+        "L. I. Rudin, S. Osher, E. Fatemi",
+        1992,
+        "Nonlinear total variation based noise removal algorithms",
+        "Physica D 60(1-4), 259-268",
+        "https://doi.org/10.1016/0167-2789(92)90242-F",
+    ),
+    "huber_1964": Citation(
+        "P. J. Huber",
+        1964,
+        "Robust estimation of a location parameter",
+        "Annals of Mathematical Statistics 35(1), 73-101",
+        "https://doi.org/10.1214/aoms/1177703732",
+    ),
+    "shepp_1974": Citation(
+        "L. A. Shepp, B. F. Logan",
+        1974,
+        "The Fourier reconstruction of a head section",
+        "IEEE Transactions on Nuclear Science 21(3), 21-43",
+        "https://doi.org/10.1109/TNS.1974.6499235",
+    ),
+    "tigre": Citation(
+        "A. Biguri, M. Dosanjh, S. Hancock, M. Soleimani",
+        2016,
+        "TIGRE: a MATLAB-GPU toolbox for CBCT image reconstruction",
+        "Biomedical Physics & Engineering Express 2(5), 055010",
+        "https://doi.org/10.1088/2057-1976/2/5/055010",
+    ),
+    "leap": Citation(
+        "H. Kim, K. Champley",
+        2023,
+        "Differentiable forward projector for X-ray computed tomography",
+        "ICML workshop; arXiv",
+        "https://arxiv.org/abs/2307.05801",
+    ),
+    "astra": Citation(
+        "W. van Aarle, W. J. Palenstijn, J. Cant, E. Janssens, F. Bleichrodt, A. Dabravolski, J. De Beenhouwer, "
+        "K. J. Batenburg, J. Sijbers",
+        2016,
+        "Fast and flexible X-ray tomography using the ASTRA Toolbox",
+        "Optics Express 24(22), 25129-25147",
+        "https://doi.org/10.1364/OE.24.025129",
+    ),
+    "tomobank": Citation(
+        "F. De Carlo, D. Gürsoy, D. J. Ching, K. J. Batenburg, W. Ludwig, L. Mancini, F. Marone, R. Mokso, D. M. Pelt, "
+        "J. Sijbers, M. Rivers",
+        2018,
+        "TomoBank: a tomographic data repository for computational x-ray science",
+        "Measurement Science and Technology 29(3), 034004",
+        "https://doi.org/10.1088/1361-6501/aa9c19",
+    ),
+}
+
+
+def citations(keys: Iterable[str]) -> list[Citation]:
+    """References for ``keys``, in the order of their first mention, each once.
+
+    Raises:
+        MivolError: a key is not in the table; the nearest one is offered.
+    """
+    found = []
+    for key in dict.fromkeys(keys):
+        if key not in CITATIONS:
+            near = get_close_matches(key, CITATIONS, n=1, cutoff=0.5) or sorted(CITATIONS)
+            raise MivolError(f'no citation has the key "{key}"; use {", ".join(near)}.')
+        found.append(CITATIONS[key])
+    return found

@@ -1,0 +1,385 @@
+"""Figures that are read, not admired: one style, units on every axis, colours that survive colour blindness.
+
+Conventions. A ``plot_*`` function returns a matplotlib figure; :func:`save` writes it (.svg or .png, whole or not at
+all). Nothing here touches pyplot's global state. Series take the colours of Okabe and Ito in order. An
+:func:`inline_svg` follows the light or dark theme of the page it stands in: its colours are the page's CSS variables.
+"""
+
+from __future__ import annotations
+
+import io
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.axis import Axis
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.ticker import LogFormatterSciNotation, LogLocator, MaxNLocator, NullFormatter
+from numpy.typing import ArrayLike, NDArray
+
+from mivol.errors import MivolError
+from mivol.files import write_whole
+from mivol.report import show
+from mivol.report.record import QUANTITIES, Quantity
+
+__all__ = [
+    "SERIES",
+    "STYLE",
+    "Series",
+    "inline_svg",
+    "plot_curve",
+    "plot_error_against_time",
+    "plot_image_row",
+    "plot_slices",
+    "ratio_at_equal_error",
+    "save",
+]
+
+INK, FAINT, GRID = "#1b1f24", "#5b6470", "#d5d9df"
+SERIES = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
+MARKERS = ("o", "s", "^", "D", "v", "P")
+CSS = {INK: "var(--ink)", FAINT: "var(--faint)", GRID: "var(--rule)"} | {
+    colour: f"var(--series-{i})" for i, colour in enumerate(SERIES)
+}
+STYLE = {
+    "figure.dpi": 100,
+    "savefig.dpi": 160,
+    "figure.constrained_layout.use": True,
+    "font.family": "sans-serif",
+    "font.sans-serif": ["DejaVu Sans"],
+    "font.size": 10,
+    "axes.titlesize": 10.5,
+    "axes.titleweight": "bold",
+    "axes.titlelocation": "left",
+    "axes.titlepad": 9,
+    "axes.labelsize": 10,
+    "axes.labelcolor": FAINT,
+    "axes.edgecolor": FAINT,
+    "axes.linewidth": 0.8,
+    "axes.titlecolor": INK,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.color": GRID,
+    "grid.linewidth": 0.7,
+    "xtick.color": FAINT,
+    "ytick.color": FAINT,
+    "xtick.labelsize": 9,
+    "ytick.labelsize": 9,
+    "xtick.major.size": 3,
+    "ytick.major.size": 3,
+    "xtick.minor.size": 0,
+    "ytick.minor.size": 0,
+    "lines.linewidth": 1.8,
+    "lines.markersize": 5,
+    "text.color": INK,
+    "legend.frameon": False,
+    "legend.fontsize": 9,
+    "axes.prop_cycle": mpl.cycler(color=SERIES),
+    "image.interpolation": "nearest",
+    "svg.fonttype": "none",
+    "svg.hashsalt": "mivol",
+}
+
+
+def _figure(width: float, height: float) -> Figure:
+    """An empty figure of that many inches with a canvas of its own; call inside ``mpl.rc_context(STYLE)``."""
+    figure = Figure(figsize=(width, height))
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def save(figure: Figure, path: str | Path) -> Path:
+    """Write a figure as .svg or .png, whole or not at all.
+
+    Raises:
+        MivolError: another suffix.
+    """
+    path = Path(path)
+    if path.suffix not in (".svg", ".png"):
+        raise MivolError(f'a figure cannot be written as "{path.name}"; name it .svg or .png.')
+    metadata = {"Date": None} if path.suffix == ".svg" else {"Software": None}
+    with mpl.rc_context(STYLE):
+        write_whole(path, lambda file: figure.savefig(file, format=path.suffix[1:], metadata=metadata))
+    return path
+
+
+def inline_svg(figure: Figure, label: str) -> str:
+    """The figure as an ``<svg>`` element: themed by the page's CSS variables, ``label`` is read to who cannot see it."""
+    buffer = io.StringIO()
+    with mpl.rc_context(STYLE | {"svg.hashsalt": label}):
+        figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None})
+    svg = buffer.getvalue()
+    svg = re.sub(r"<metadata>.*?</metadata>", "", svg[svg.index("<svg") :], flags=re.DOTALL)
+    used = set(re.findall(r'(?:href="|url\()#([^")]+)', svg))
+    svg = re.sub(r' id="([^"]+)"', lambda found: found[0] if found[1] in used else "", svg)
+    head, body = svg.split(">", 1)
+    head = re.sub(r'\s(?:width|height|version|xmlns(?::xlink)?)="[^"]*"', "", head).replace("\n", " ")
+    for colour, variable in CSS.items():
+        body = body.replace(colour, variable)
+    body = re.sub(r"font: (bold )?([\d.]+px)[^;\"]*", lambda f: f"font-size: {f[2]}" + "; font-weight: 600" * bool(f[1]), body)
+    return f'{head} role="img" aria-label="{_escape(label)}">{body.strip()}'
+
+
+def _escape(text: str) -> str:
+    return text.replace("&", "&amp;").replace('"', "&quot;").replace("<", "&lt;")
+
+
+def plot_curve(rows: Sequence[dict], name: str, *, against: str = "iteration") -> Figure:
+    """One quantity of ``metrics.jsonl`` against iterations or seconds, its last value written at its end.
+
+    Args:
+        rows: rows of :func:`mivol.report.record.read_metrics`; those without a number are left out.
+        name: which number.
+        against: ``iteration`` or ``seconds``.
+
+    Raises:
+        MivolError: no row has that number.
+    """
+    points = [(row[against], row[name]) for row in rows if row.get(name) is not None and row.get(against) is not None]
+    if not points:
+        raise MivolError(f'no row of the metrics has "{name}"; draw one of those that were recorded.')
+    x, y = np.array(points, float).T
+    quantity = QUANTITIES.get(name, Quantity(name.replace("_", " ")))
+    with mpl.rc_context(STYLE):
+        figure = _figure(4.4, 2.75)
+        axes = figure.subplots()
+        axes.plot(x, y, color=SERIES[0], marker="o" if len(x) <= 30 else None, markersize=3.5, clip_on=False)
+        axes.set_title(quantity.label + (f" [{quantity.unit}]" if quantity.unit else ""))
+        axes.set_xlabel("time [s]" if against == "seconds" else "iteration")
+        if quantity.log and (y > 0).all():
+            _log_axis(axes.yaxis, y)
+        axes.xaxis.set_major_locator(MaxNLocator(6, integer=against == "iteration"))
+        end = {"ha": "left", "va": "center", "color": SERIES[0], "weight": "bold", "fontsize": 9.5}
+        axes.annotate(f"{y[-1]:.3g}", (x[-1], y[-1]), (6, 0), textcoords="offset points", **end)
+        axes.margins(x=0.02, y=0.12)
+    return figure
+
+
+def _log_axis(axis: Axis, values: NDArray) -> None:
+    """A log axis with enough labels: decades where there are two or more, else 1-2-5 steps in plain numbers."""
+    getattr(axis.axes, f"set_{axis.axis_name}scale")("log")
+    wide = values.max() >= 100 * values.min()
+    axis.set_major_locator(LogLocator(subs=(1.0,) if wide else (1.0, 2.0, 5.0)))
+    axis.set_minor_formatter(NullFormatter())
+    axis.set_major_formatter(LogFormatterSciNotation() if wide else (lambda value, _: f"{value:.3g}"))
+
+
+def plot_slices(
+    reconstruction: NDArray,
+    truth: NDArray | None = None,
+    *,
+    size: tuple[float, float, float] | None = None,
+    quantity: str = "sigma_t",
+    unit: str = "1/length",
+) -> Figure:
+    """Three orthogonal slices of a volume; with a truth of the same shape also the truth and the difference.
+
+    Args:
+        reconstruction: (Z, Y, X[, C]).
+        truth: the same shape, or None.
+        size: world lengths of the box along x, y, z.
+        quantity: name of the values.
+        unit: their unit.
+
+    Raises:
+        MivolError: shapes that differ.
+    """
+    rows = {"reconstruction": show.slices(reconstruction, size)}
+    if truth is not None:
+        if np.shape(truth) != np.shape(reconstruction):
+            raise MivolError(
+                f"truth {np.shape(truth)} and reconstruction {np.shape(reconstruction)} differ in shape; "
+                "resample one to the other."
+            )
+        rows = {"truth": show.slices(truth, size)} | rows
+        rows["difference"] = show.slices(np.asarray(reconstruction, float) - np.asarray(truth, float), size)
+    values = show.scale_of(*next(iter(rows.values())).images.values(), kind="grey")
+    signed = show.signed_scale(*rows["difference"].images.values()) if truth is not None else None
+    with mpl.rc_context(STYLE):
+        figure = _figure(7.2, 2.5 * len(rows) + 0.3)
+        grid = figure.subplots(len(rows), 3, squeeze=False)
+        for line, (name, cut) in zip(grid, rows.items(), strict=True):
+            scale = signed if name == "difference" else values
+            for axes, plane in zip(line, cut.images, strict=True):
+                _picture(axes, show.pixels(cut.images[plane], scale), cut.aspect[plane])
+                axes.set_xlabel(f"{plane[0]} →  at {cut.where[plane]}", labelpad=2)
+                axes.set_ylabel(f"{plane[1]} →", labelpad=2)
+            line[0].set_title(name)
+            _bar(figure, line, scale, f"{quantity} [{unit}]")
+    return figure
+
+
+def plot_image_row(reference: NDArray, render: NDArray, standard_error: NDArray | None = None, *, unit: str = "") -> Figure:
+    """Reference, render, signed difference, and the z-image where the standard error of the reference is known.
+
+    Args:
+        reference: (height, width[, C]).
+        render: the same shape.
+        standard_error: the same shape, above 0; z = difference / standard_error.
+        unit: of the values.
+    """
+    difference = np.asarray(render, float) - np.asarray(reference, float)
+    values = show.scale_of(reference)
+    panels = [
+        ("reference", reference, values),
+        ("render", render, values),
+        ("render - reference", difference, show.signed_scale(difference)),
+    ]
+    if standard_error is not None:
+        panels.append(("z", difference / standard_error, show.Scale("signed", -4.0, 4.0)))
+    with mpl.rc_context(STYLE):
+        figure = _figure(2.6 * len(panels), 2.9)
+        for axes, (name, image, scale) in zip(figure.subplots(1, len(panels)), panels, strict=True):
+            _picture(axes, show.pixels(image, scale), image.shape[1] / image.shape[0])
+            axes.set_title(name)
+            _bar(figure, [axes], scale, "difference / standard error" if name == "z" else unit, below=True)
+    return figure
+
+
+def _picture(axes: Axes, rgb: NDArray[np.uint8], aspect: float) -> None:
+    axes.imshow(rgb, aspect=rgb.shape[1] / rgb.shape[0] / aspect)
+    axes.set(xticks=[], yticks=[])
+    axes.grid(False)
+    axes.spines[:].set(visible=True, color=GRID)
+
+
+def _bar(figure: Figure, axes: Sequence[Axes], scale: show.Scale, label: str, below: bool = False) -> None:
+    if scale.kind == "colour":
+        return
+    mappable = mpl.cm.ScalarMappable(
+        mpl.colors.Normalize(scale.low, scale.high), show.SIGNED if scale.kind == "signed" else "gray"
+    )
+    bar = figure.colorbar(
+        mappable, ax=list(axes), location="bottom" if below else "right", fraction=0.05, pad=0.03, aspect=24, label=label
+    )
+    bar.outline.set_visible(False)
+    bar.locator = MaxNLocator(4)
+    bar.update_ticks()
+
+
+class Series(NamedTuple):
+    """Errors that a method reached after so many seconds; one point where it has no choice but to be that exact."""
+
+    name: str
+    seconds: ArrayLike
+    error: ArrayLike
+
+
+def ratio_at_equal_error(fast: Series, slow: Series) -> tuple[float, float, float] | None:
+    """How much sooner ``fast`` is as exact as ``slow`` ever gets.
+
+    Returns:
+        (error, seconds of ``fast``, seconds of ``slow``) at the smallest error of ``slow``, with the time of ``fast``
+        interpolated between its points in log-log, never extrapolated: where ``fast`` starts below that error its first
+        time counts, so the ratio is a lower bound. None where ``fast`` never gets there.
+    """
+    at = int(np.argmin(slow.error))
+    error, seconds = float(np.asarray(slow.error)[at]), float(np.asarray(slow.seconds)[at])
+    t, e = (np.asarray(v, float)[np.argsort(fast.seconds)] for v in (fast.seconds, fast.error))
+    below = np.flatnonzero(e <= error)
+    if below.size == 0:
+        return None
+    first = below[0]
+    if first == 0:
+        return error, float(t[0]), seconds
+    share = np.log(e[first - 1] / error) / np.log(e[first - 1] / e[first])
+    return error, float(t[first - 1] * (t[first] / t[first - 1]) ** share), seconds
+
+
+def plot_error_against_time(
+    series: Sequence[Series],
+    path: str | Path | None = None,
+    *,
+    error: str = "relative RMS error",
+    title: str = "",
+    time: str = "time [s], warm",
+) -> Figure:
+    """Error against time of several methods, log-log; the first is compared with each of the others.
+
+    Args:
+        series: methods, the one to be judged first; seconds and errors above 0.
+        path: written there (.svg, .png) if given.
+        error: what the vertical axis is.
+        title: the question that the figure answers.
+        time: what the horizontal axis is.
+
+    Returns:
+        The figure. An arrow marks how many times sooner the first method has the best error of the other that comes
+        closest; the legend gives the ratio for each (:func:`ratio_at_equal_error`).
+
+    Raises:
+        MivolError: no series, or times or errors that are not finite and above 0.
+    """
+    _check_series(series)
+    with mpl.rc_context(STYLE):
+        figure = _figure(7.2, 4.4)
+        axes = figure.subplots()
+        ratios = {s.name: ratio_at_equal_error(series[0], s) for s in series[1:]}
+        for i, s in enumerate(series):
+            order = np.argsort(s.seconds)
+            axes.plot(
+                np.asarray(s.seconds)[order],
+                np.asarray(s.error)[order],
+                marker=MARKERS[i % len(MARKERS)],
+                color=SERIES[i % len(SERIES)],
+                label=_legend(s.name, ratios.get(s.name)),
+                zorder=3 + (i == 0),
+                linewidth=2.4 if i == 0 else 1.5,
+                markeredgecolor="white",
+                markeredgewidth=0.7,
+                markersize=6.5 if len(order) <= 12 else 4,
+            )
+        axes.set(xlabel=time, ylabel=error, title=title)
+        _log_axis(axes.xaxis, np.concatenate([np.ravel(s.seconds) for s in series]))
+        _log_axis(axes.yaxis, np.concatenate([np.ravel(s.error) for s in series]))
+        _arrow(axes, [ratio for ratio in ratios.values() if ratio])
+        axes.margins(0.06, 0.08)
+        axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), labelspacing=0.9, handlelength=1.6)
+    if path is not None:
+        save(figure, path)
+    return figure
+
+
+def _legend(name: str, ratio: tuple[float, float, float] | None) -> str:
+    return f"{name}\n{_times(ratio)} the time" if ratio else name
+
+
+def _times(ratio: tuple[float, float, float]) -> str:
+    return f"{ratio[2] / ratio[1]:,.3g} ×" if ratio[2] < 1000 * ratio[1] else f"{ratio[2] / ratio[1]:,.0f} ×"
+
+
+def _arrow(axes: Axes, ratios: Sequence[tuple[float, float, float]]) -> None:
+    if not ratios:
+        return
+    error, ours, theirs = min(ratios, key=lambda ratio: ratio[0])
+    axes.annotate(
+        "",
+        (ours, error),
+        (theirs, error),
+        arrowprops={"arrowstyle": "<->", "color": INK, "shrinkA": 5, "shrinkB": 5, "linewidth": 1.1},
+    )
+    axes.annotate(
+        _times((error, ours, theirs)),
+        (np.sqrt(ours * theirs), error),
+        (0, 4),
+        textcoords="offset points",
+        ha="center",
+        va="bottom",
+        weight="bold",
+    )
+
+
+def _check_series(series: Sequence[Series]) -> None:
+    if not series:
+        raise MivolError("there is no series to draw; give at least one method with its times and errors.")
+    for s in series:
+        both = np.array([np.ravel(s.seconds), np.ravel(s.error)], float)
+        if both.size == 0 or not (np.isfinite(both) & (both > 0)).all():
+            raise MivolError(f'"{s.name}" has a time or an error that is not finite and above 0; leave them out.')

@@ -1,0 +1,133 @@
+"""Numbers as pixels: every picture of a kind on one scale, and the scale said beside it.
+
+Conventions. Images are (height, width[, 1 or 3]) of linear values, row 0 at the top; pixels are uint8 (height, width,
+3). A :class:`Scale` is shared by all pictures that are meant to be compared. Radiance in three channels is shown in sRGB;
+everything in one channel is grey, linear in the value; differences are blue below zero, white at zero, red above.
+Pixels that are not finite are magenta.
+"""
+
+from __future__ import annotations
+
+import base64
+import io
+from typing import NamedTuple
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.image import imsave
+from numpy.typing import NDArray
+
+from mivol.errors import MivolError
+from mivol.files import encode_srgb
+
+__all__ = ["SIGNED", "Scale", "Slices", "data_uri", "pixels", "scale_of", "signed_scale", "slices"]
+
+SIGNED = "RdBu_r"
+BROKEN = (255, 0, 255)
+PLANES = {"xy": 0, "xz": 1, "yz": 2}
+
+
+class Scale(NamedTuple):
+    """Values shown as black (or full blue) and white (or full red); ``kind`` is grey, colour or signed."""
+
+    kind: str
+    low: float
+    high: float
+
+
+def scale_of(*images: NDArray, low: float | None = 0.0, kind: str | None = None, percentile: float = 99.8) -> Scale:
+    """One scale for several images: from ``low`` (their smallest value if None) to their given percentile.
+
+    The percentile, and not the maximum, so that one firefly does not turn the rest black.
+    """
+    values = np.concatenate([image[np.isfinite(image)].ravel() for image in images])
+    if values.size == 0:
+        return Scale(kind or "grey", 0.0, 1.0)
+    bottom = float(values.min()) if low is None else min(low, float(np.percentile(values, 100 - percentile)))
+    top = float(np.percentile(values, percentile))
+    kind = kind or ("colour" if any(_channels(image) == 3 for image in images) else "grey")
+    return Scale(kind, bottom, top if top > bottom else bottom + 1.0)
+
+
+def signed_scale(*images: NDArray, percentile: float = 99.8) -> Scale:
+    """One symmetric scale for several differences."""
+    values = np.concatenate([np.abs(image[np.isfinite(image)]).ravel() for image in images])
+    limit = float(np.percentile(values, percentile)) if values.size else 0.0
+    return Scale("signed", -limit if limit else -1.0, limit or 1.0)
+
+
+def pixels(image: NDArray, scale: Scale) -> NDArray[np.uint8]:
+    """The image in 8 bits on ``scale``.
+
+    Raises:
+        MivolError: not (height, width), (height, width, 1) or (height, width, 3).
+    """
+    values = np.asarray(image, np.float64)
+    if values.ndim not in (2, 3) or _channels(values) not in (1, 3):
+        raise MivolError(f"an image has shape {values.shape}; give (height, width) or (height, width, 1 or 3).")
+    values = values.reshape(*values.shape[:2], -1)
+    if scale.kind == "signed":
+        values = values.mean(axis=2, keepdims=True)
+    broken = ~np.isfinite(values).all(axis=2)
+    unit = np.clip((np.where(np.isfinite(values), values, 0.0) - scale.low) / (scale.high - scale.low), 0.0, 1.0)
+    rgb = _KINDS[scale.kind](unit)
+    rgb[broken] = BROKEN
+    return rgb
+
+
+def _grey(unit: NDArray) -> NDArray[np.uint8]:
+    return np.repeat(np.round(255 * unit.mean(axis=2, keepdims=True)).astype(np.uint8), 3, axis=2)
+
+
+def _colour(unit: NDArray) -> NDArray[np.uint8]:
+    return np.broadcast_to(np.round(255 * encode_srgb(unit)).astype(np.uint8), (*unit.shape[:2], 3)).copy()
+
+
+def _signed(unit: NDArray) -> NDArray[np.uint8]:
+    return mpl.colormaps[SIGNED](unit[..., 0], bytes=True)[..., :3].copy()
+
+
+_KINDS = {"grey": _grey, "colour": _colour, "signed": _signed}
+
+
+def _channels(image: NDArray) -> int:
+    return 1 if image.ndim == 2 else image.shape[2]
+
+
+def data_uri(rgb: NDArray[np.uint8]) -> str:
+    """The pixels as a PNG inside a ``data:`` address."""
+    buffer = io.BytesIO()
+    imsave(buffer, rgb, format="png", metadata={"Software": None}, pil_kwargs={"optimize": True})
+    return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode("ascii")
+
+
+class Slices(NamedTuple):
+    """The middle slices of a grid by plane, first axis to the right, second upwards; ``where`` says which."""
+
+    images: dict[str, NDArray]
+    where: dict[str, str]
+    aspect: dict[str, float]
+
+
+def slices(grid: NDArray, size: tuple[float, float, float] | None = None) -> Slices:
+    """The three orthogonal slices through the middle of a grid.
+
+    Args:
+        grid: (Z, Y, X[, C]).
+        size: world lengths of the box along x, y, z; None: voxels are cubes.
+
+    Returns:
+        Slices ``xy``, ``xz``, ``yz`` with the second axis upwards, and width over height of each in the world.
+
+    Raises:
+        MivolError: the grid's rank is not 3 or 4.
+    """
+    grid = np.asarray(grid)
+    if grid.ndim not in (3, 4):
+        raise MivolError(f"a volume has shape {grid.shape}; give (Z, Y, X) or (Z, Y, X, C).")
+    x, y, z = size or tuple(float(n) for n in grid.shape[2::-1])
+    middle = [n // 2 for n in grid.shape[:3]]
+    images = {plane: np.take(grid, middle[axis], axis=axis)[::-1] for plane, axis in PLANES.items()}
+    missing = dict(zip(PLANES, "zyx", strict=True))
+    where = {p: f"{missing[p]} = {middle[axis] + 1} of {grid.shape[axis]}" for p, axis in PLANES.items()}
+    return Slices(images, where, {"xy": x / y, "xz": x / z, "yz": y / z})

@@ -1,0 +1,338 @@
+"""The record of a run and its page: complete, self-contained, right way up, and nothing in them that tells on the user.
+
+Rationale: the page is what colleagues see; a picture upside down, a difference of the wrong sign or a number from another
+formula would mislead them all. So pictures are decoded again and compared with values known on paper.
+"""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+import platform
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+from cli.run_folder import write_run
+from matplotlib.image import imread
+
+from mivol.errors import MivolError
+from mivol.files import write_exr
+from mivol.report import figures, show
+from mivol.report.cite import CITATIONS, citations
+from mivol.report.page import headline, write_page
+from mivol.report.record import (
+    Choice,
+    Image,
+    RunRecord,
+    Volume,
+    append_metrics,
+    read_metrics,
+    read_record,
+    rewind_metrics,
+    write_record,
+)
+
+VOID = {"meta", "link", "img", "br", "hr", "input", "path", "use"}
+
+
+class Page(HTMLParser):
+    """Tags, attributes and text of a page; a tag that is closed in the wrong place is an error."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.tags: list[tuple[str, dict[str, str]]] = []
+        self.open: list[str] = []
+        self.words: list[str] = []
+        self.feed(text)
+        assert self.open == []
+
+    def handle_starttag(self, tag, attributes):
+        self.tags.append((tag, dict(attributes)))
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag, attributes):
+        self.tags.append((tag, dict(attributes)))
+
+    def handle_endtag(self, tag):
+        if tag not in VOID:
+            assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        if not {"style", "svg"} & set(self.open):
+            self.words.append(data)
+
+    @property
+    def text(self) -> str:
+        return " ".join(" ".join(self.words).split())
+
+    def pictures(self) -> list[tuple[str, np.ndarray]]:
+        found = [attributes for tag, attributes in self.tags if tag == "img"]
+        return [(a["alt"], decode(a["src"])) for a in found]
+
+
+def decode(uri: str) -> np.ndarray:
+    head, data = uri.split(",")
+    assert head == "data:image/png;base64"
+    return np.round(255 * imread(io.BytesIO(base64.b64decode(data)), format="png")[..., :3]).astype(int)
+
+
+@pytest.fixture(scope="module")
+def run_folder(tmp_path_factory) -> Path:
+    return write_run(tmp_path_factory.mktemp("run"))
+
+
+@pytest.fixture(scope="module")
+def page(run_folder) -> Page:
+    return Page(write_page(run_folder).read_text(encoding="utf-8"))
+
+
+def one_view(folder: Path, reference: np.ndarray, render: np.ndarray, **fields) -> Page:
+    """The page of a run with one held-out view."""
+    images = []
+    for role, values in (("reference", reference), ("render", render)):
+        write_exr(folder / f"{role}.exr", {"Y" if values.ndim == 2 else "": values})
+        images.append(Image(path=f"{role}.exr", role=role, view="one", held_out=True))
+    write_record(RunRecord.new("One view", images=images, **fields), folder)
+    return Page(write_page(folder).read_text(encoding="utf-8"))
+
+
+def test_page_loads_nothing(run_folder, page):
+    """No script, no outside address anywhere but in links that a reader may follow."""
+    assert not {"script", "iframe", "object", "embed", "link", "base"} & {tag for tag, _ in page.tags}
+    for tag, attributes in page.tags:
+        for name in ("src", "srcset", "href", "xlink:href", "poster", "data", "action"):
+            if name in attributes and tag != "a":
+                assert attributes[name].startswith(("data:", "#")), (tag, name)
+    text = (run_folder / "report.html").read_text(encoding="utf-8")
+    assert "@import" not in text
+    assert all(target.startswith("#") for target in re.findall(r"url\(\s*['\"]?([^)'\"]*)", text))
+
+
+def test_page_shows_all_that_the_record_names(run_folder, page):
+    names = [name for name, _ in page.pictures()]
+    assert names.count("Reference") == names.count("Render") == names.count("z-image") == 2
+    assert names.count("Truth") == names.count("Reconstruction") == names.count("Difference") == 3
+    record = read_record(run_folder)
+    for line in record.plan:
+        assert line.choice in page.text and line.reason in page.text
+    for name in (*record.timings, *record.versions, *record.seeds, *record.notes):
+        assert name in page.text
+    for source in citations(record.citations):
+        assert source.title in page.text
+    assert "[views]" in page.text and "held_out = 2" in page.text
+    assert [tag for tag, _ in page.tags].count("svg") == 2
+
+
+def test_page_has_unique_ids_and_named_pictures(page):
+    ids = [attributes["id"] for _, attributes in page.tags if "id" in attributes]
+    assert len(ids) == len(set(ids))
+    assert all(attributes.get("alt") for tag, attributes in page.tags if tag == "img")
+    assert all(attributes.get("aria-label") for tag, attributes in page.tags if tag == "svg")
+    anchors = {attributes["href"][1:] for tag, attributes in page.tags if tag == "a" and attributes["href"][0] == "#"}
+    assert anchors <= set(ids)
+
+
+def test_page_is_the_same_for_the_same_folder(run_folder):
+    first = write_page(run_folder).read_bytes()
+    assert write_page(run_folder).read_bytes() == first
+
+
+def test_numbers_of_a_view_on_paper(tmp_path):
+    """Reference 1, render 0.9: PSNR 10 log10(1/0.01) = 20 dB, nRMSE 0.1; float32 errs by 1e-7, the text has 3 digits."""
+    found = one_view(tmp_path, np.ones((4, 6)), np.full((4, 6), 0.9), status="finished")
+    assert "PSNR 20.0 dB" in found.text and "nRMSE 0.1" in found.text
+    assert "to 20.0 dB PSNR" in found.text.replace("\u00a0", " ")
+
+
+def test_difference_is_render_minus_reference(tmp_path):
+    reference, render = np.full((5, 7), 0.5), np.full((5, 7), 0.5)
+    render[1, 2], render[3, 6] = 0.75, 0.25
+    picture = dict(one_view(tmp_path, reference, render).pictures())["Render − reference"]
+    assert picture.shape == (5, 7, 3)
+    assert picture[1, 2, 0] > picture[1, 2, 2] + 50
+    assert picture[3, 6, 2] > picture[3, 6, 0] + 50
+    # The middle of 256 entries lies between two of them, so white is grey to one step of the map.
+    assert np.ptp(picture[0, 0]) <= 4
+
+
+def test_images_are_the_right_way_up_and_share_their_scale(tmp_path):
+    reference = np.linspace(0, 2, 12).reshape(3, 4)
+    pictures = dict(one_view(tmp_path, reference, reference / 2).pictures())
+    # White is the 99.8th percentile of 12 values, 1.996: half a grey level below 2.
+    np.testing.assert_allclose(pictures["Reference"][..., 0], np.minimum(255 * reference / 1.996, 255), atol=0.51)
+    np.testing.assert_allclose(pictures["Render"][..., 1], 255 * reference / 3.992, atol=0.51)
+
+
+def test_radiance_in_colour_is_coded_as_srgb(tmp_path):
+    """Linear 0.5 of white is 187.5 in sRGB; channels keep their order."""
+    reference = np.zeros((2, 2, 3))
+    reference[0, 0], reference[0, 1], reference[1, 0] = 1.0, (0.5, 0, 0), (0, 0, 1.0)
+    picture = dict(one_view(tmp_path, reference, reference * 0.99).pictures())["Reference"]
+    # The percentile of 12 values of which 4 are 1 is 1.
+    assert picture[0, 0].tolist() == [255, 255, 255]
+    assert picture[0, 1].tolist() == [188, 0, 0]
+    assert picture[1, 0].tolist() == [0, 0, 255]
+
+
+def test_slices_point_up_and_right():
+    """Voxel (x 3, y 1, z 2) of (4, 3, 5) voxels lies in each middle slice where its coordinates say."""
+    grid = np.zeros((5, 3, 4))
+    grid[2, 1, 3] = 1
+    cut = show.slices(grid)
+    assert np.argwhere(cut.images["xy"]).tolist() == [[1, 3]]
+    assert cut.images["xz"].shape == (5, 4) and np.argwhere(cut.images["xz"]).tolist() == [[2, 3]]
+    assert cut.where == {"xy": "z = 3 of 5", "xz": "y = 2 of 3", "yz": "x = 3 of 4"}
+    low = np.zeros((5, 3, 4))
+    low[0, 1, 2] = 1
+    assert np.argwhere(show.slices(low).images["yz"]).tolist() == [[4, 1]]
+    assert show.slices(grid, (2.0, 1.0, 4.0)).aspect == {"xy": 2.0, "xz": 0.5, "yz": 0.25}
+
+
+def test_pixels_that_are_not_finite_are_seen():
+    image = np.array([[0.0, np.nan], [1.0, np.inf]])
+    rgb = show.pixels(image, show.scale_of(image))
+    assert rgb[0, 1].tolist() == rgb[1, 1].tolist() == [255, 0, 255]
+    assert rgb[0, 0].tolist() == [0, 0, 0] and rgb[1, 0].tolist() == [255, 255, 255]
+
+
+def test_text_of_a_run_cannot_become_markup(tmp_path):
+    plan = [Choice(choice="<img src=x onerror=alert(1)>", reason="a < b & c")]
+    write_record(RunRecord.new("<script>alert(1)</script>", plan=plan, config={"a": "</pre><b>"}), tmp_path)
+    found = Page(write_page(tmp_path).read_text(encoding="utf-8"))
+    assert "script" not in {tag for tag, _ in found.tags}
+    assert not any("onerror" in attributes for _, attributes in found.tags)
+    assert "<script>alert(1)</script>" in found.text and "</pre><b>" in found.text
+    assert "a < b & c" in found.text
+
+
+@pytest.mark.parametrize("status", ["running", "stopped"])
+def test_page_of_a_run_that_has_nothing_yet(tmp_path, status):
+    write_record(RunRecord.new("Nothing yet", status=status), tmp_path)
+    found = Page(write_page(tmp_path).read_text(encoding="utf-8"))
+    assert "Nothing yet" in found.text and found.pictures() == []
+    assert {"running": "Still running", "stopped": "Stopped"}[status] in found.text
+
+
+def test_a_killed_runs_last_line_is_left_out_and_a_resumed_one_says_nothing_twice(tmp_path):
+    for iteration in range(1, 5):
+        append_metrics(tmp_path, iteration, 0.1 * iteration, loss=1 / iteration, nrmse=np.nan)
+    with (tmp_path / "metrics.jsonl").open("a") as file:
+        file.write('{"iteration": 5, "sec')
+    assert [row["iteration"] for row in read_metrics(tmp_path)] == [1, 2, 3, 4]
+    assert read_metrics(tmp_path)[1] == {"iteration": 2, "seconds": 0.2, "loss": 0.5, "nrmse": None}
+    rewind_metrics(tmp_path, 2)
+    append_metrics(tmp_path, 3, 0.3, loss=0.25)
+    assert [row["loss"] for row in read_metrics(tmp_path)] == [1.0, 0.5, 0.25]
+
+
+def test_record_comes_back_and_tells_nothing_of_the_machine(tmp_path):
+    record = RunRecord.new(
+        "A run",
+        command="mivol optimize /home/ada/work/fit.toml --out=/scratch/ada/run",
+        config={"scene": "/home/ada/work/scene.xml", "files": ["~/data/tooth.h5", "rel/a.exr"], "unit": "1/length"},
+        notes=["read C:\\Users\\ada\\tooth.h5 at 3 W/(m^2 sr)"],
+        results={"nrmse": np.inf, "views": 3},
+        volumes=[Volume(path="volumes/a.npz", role="reconstruction", size=(1.0, 2.0, 3.0))],
+    )
+    write_record(record, tmp_path)
+    text = (tmp_path / "run.json").read_text(encoding="utf-8")
+    for secret in ("ada", "home", "scratch", "Users", platform.node() or "no name", str(tmp_path)):
+        assert secret not in text
+    back = read_record(tmp_path)
+    assert back.command == "mivol optimize fit.toml --out=run"
+    assert back.config == {"scene": "scene.xml", "files": ["tooth.h5", "rel/a.exr"], "unit": "1/length"}
+    assert back.notes == ["read tooth.h5 at 3 W/(m^2 sr)"]
+    assert back.results == {"nrmse": None, "views": 3} and back.volumes == record.volumes
+    assert back.machine == record.machine and back.started.endswith("Z")
+
+
+def test_headline_says_what_is_known():
+    record = RunRecord.new("A run", status="finished", timings={"a": 30.0, "b": 11.0}, results={"nrmse": 0.0341})
+    cores = f"{record.machine.cores} core" + "s" * (record.machine.cores > 1)
+    said = f"Reconstructed in 41 s on {cores}: held-out views to 40.0 dB PSNR, the volume to an nRMSE of 0.0341."
+    assert headline(record, [39.0, 41.0]) == said
+    record.status, record.results = "stopped", {}
+    assert headline(record) == f"Stopped in 41 s on {cores}."
+
+
+@pytest.mark.parametrize(
+    ("spoil", "says"),
+    [
+        (lambda folder: (folder / "images/view_9_render.exr").unlink(), 'names "images/view_9_render.exr", which is not'),
+        (lambda folder: (folder / "volumes/truth.npz").unlink(), 'names "volumes/truth.npz", which is not'),
+        (lambda folder: (folder / "run.json").unlink(), "no run.json"),
+        (lambda folder: (folder / "run.json").write_text('{"title": 1'), "not the record of a run"),
+        (lambda folder: edit(folder, plann=[]), "plann"),
+        (lambda folder: edit(folder, status="done"), "done"),
+        (lambda folder: edit(folder, citations=["mitsuba_3"]), "use mitsuba3"),
+        (lambda folder: edit(folder, volumes=[{"path": "../a.npz", "role": "truth"}]), "inside the run folder"),
+        (lambda folder: (folder / "metrics.jsonl").write_text("nonsense\n"), "metrics.jsonl has a line"),
+        (lambda folder: write_exr(folder / "images/view_9_render.exr", {"Y": np.ones((3, 4))}), "differ in size"),
+        (lambda folder: write_exr(folder / "images/view_9_render.exr", dict.fromkeys("AB", np.ones((16, 16)))), "layers"),
+    ],
+)
+def test_refusals(tmp_path, spoil, says):
+    """One sentence each, and no half-written page."""
+    folder = write_run(tmp_path, n=6, size=16, fitted=8, held_out=1, steps=2)
+    spoil(folder)
+    with pytest.raises(MivolError, match=re.escape(says)) as refused:
+        write_page(folder)
+    assert "\n" not in str(refused.value)
+    assert not list(folder.glob("*report.html*"))
+
+
+def edit(folder: Path, **fields) -> None:
+    path = folder / "run.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | fields))
+
+
+def test_citations_are_complete_and_come_once_each():
+    for key, source in CITATIONS.items():
+        assert source.authors and source.title and source.where and 1700 < source.year < 2100, key
+        assert source.link == "" or source.link.startswith("https://"), key
+    assert [source.year for source in citations(["novak_2018", "kak_1988", "novak_2018"])] == [2018, 1988]
+    with pytest.raises(MivolError, match="use kingma_2015"):
+        citations(["kingma_2014"])
+
+
+def test_ratio_at_equal_error_on_paper():
+    """Error 1/t against 1/sqrt(t): at the slow one's last error 0.1 (t = 100) the fast one needs t = 10, ten times less."""
+    t = np.array([1.0, 4.0, 25.0, 100.0])
+    slow, fast = figures.Series("slow", t, t**-0.5), figures.Series("fast", t, 1 / t)
+    # A power law is a straight line in log-log, so the interpolation is exact but for rounding.
+    assert figures.ratio_at_equal_error(fast, slow) == pytest.approx((0.1, 10.0, 100.0), rel=1e-14)
+    assert figures.ratio_at_equal_error(slow, fast) is None
+    exact = figures.Series("exact", [2.0], [1e-7])
+    assert figures.ratio_at_equal_error(exact, slow) == (0.1, 2.0, 100.0)
+
+
+def test_figures_are_written_whole_or_refused(tmp_path, artefacts):
+    t = np.array([1.0, 4.0, 16.0])
+    series = [figures.Series("exact", [0.5], [1e-6]), figures.Series("sampled", t, t**-0.5)]
+    for suffix in ("png", "svg"):
+        path = artefacts / f"error.{suffix}"
+        figures.plot_error_against_time(series, path, title="Optical depth")
+        assert path.stat().st_size > 2000
+    assert "32 ×" in (artefacts / "error.svg").read_text()
+    with pytest.raises(MivolError, match="name it .svg or .png"):
+        figures.plot_error_against_time(series, tmp_path / "error.pdf")
+    with pytest.raises(MivolError, match='"exact" has a time or an error'):
+        figures.plot_error_against_time([figures.Series("exact", [0.5], [0.0])])
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_slices_and_rows_as_figures(artefacts):
+    rng = np.random.default_rng(5)
+    truth = rng.random((6, 8, 10))
+    figures.save(figures.plot_slices(truth + 0.1, truth, size=(1, 0.8, 0.6)), artefacts / "slices.png")
+    image = rng.random((8, 8, 3))
+    figures.save(figures.plot_image_row(image, image + 0.1, np.full_like(image, 0.05)), artefacts / "row.png")
+    with pytest.raises(MivolError, match="differ in shape"):
+        figures.plot_slices(truth, truth[1:])
+    with pytest.raises(MivolError, match='no row of the metrics has "psnr"'):
+        figures.plot_curve([{"iteration": 1.0, "loss": 1.0}], "psnr")
