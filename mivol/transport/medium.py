@@ -1,0 +1,197 @@
+r"""What a ray meets: media as sums of fields, each in its place, behind one view for our plugins and for stock ones.
+
+.. math:: \sigma_t(x) = s \sum_k f_k(x)
+
+with a scale s and parts f_k that are a grid or a constant (``sigma_t`` alone, or ``sigma_a`` and ``sigma_s``). Optical depth
+is linear in each of them, so it is integrated part by part: a homogeneous medium stores no grid and two grids need not
+share a resolution.
+
+Conventions. A grid is vacuum outside its own box. A constant fills the boundary of its medium, except under a stock
+``heterogeneous``, which clips it to the unit cube of its ``constvolume``. Values are read from the very arrays that
+``mi.traverse`` hands out, with their gradients.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, field
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mivol.errors import MivolError
+from mivol.transport.lattice import Lattice
+
+__all__ = ["Box", "MediumView", "Part", "box_of_cube", "view_medium"]
+
+STOCK = {"HomogeneousMedium", "HeterogeneousMedium"}
+
+
+@dataclass
+class Part:
+    """One additive part of an extinction.
+
+    Attributes:
+        name: ``sigma_t``, ``sigma_a`` or ``sigma_s``.
+        constant: its value [1/length], ``Float`` or ``Color3f``; None for a grid.
+        lattice: the grid [1/length]; None for a constant.
+        clipped: box that a constant does not leave, or None.
+    """
+
+    name: str
+    constant: mi.Float | mi.Color3f | None = None
+    lattice: Lattice | None = None
+
+    @property
+    def channels(self) -> int:
+        """1 (grey) or 3 (rgb)."""
+        if self.lattice is not None:
+            return self.lattice.channels
+        return 3 if dr.size_v(self.constant) == 3 else 1
+
+
+@dataclass
+class MediumView:
+    """The extinction of one medium, as transport sees it.
+
+    Attributes:
+        medium: the Mitsuba object.
+        parts: their sum, times ``scale``, is sigma_t.
+        scale: dimensionless factor, differentiable where the plugin makes it so.
+        albedo: what was found under ``albedo`` or the ``sigma_s`` part: arrays whose maximum tells whether it scatters.
+    """
+
+    medium: mi.Medium
+    parts: list[Part]
+    scale: mi.Float
+    albedo: list = field(default_factory=list)
+
+    @property
+    def channels(self) -> int:
+        """1 where every part is grey, 3 where one is rgb."""
+        return max(part.channels for part in self.parts)
+
+    def is_scattering(self) -> bool:
+        """Whether any albedo (or sigma_s) is above 0. Reads the values: not inside ``dr.freeze``."""
+        return any(bool(np.any(np.array(dr.detach(a)) > 0)) for a in self.albedo)
+
+
+@dataclass
+class Box:
+    """A parallelepiped in the world: the unit cube under ``to_world`` (4x4, float64)."""
+
+    to_world: np.ndarray
+
+    def __post_init__(self) -> None:
+        rows = np.linalg.inv(self.to_world)[:3]
+        self.from_world = [[dr.opaque(mi.Float64, float(v)) for v in row] for row in rows]
+
+    def corners(self) -> np.ndarray:
+        """The 8 corners, (8, 3)."""
+        unit = np.array([[x, y, z, 1] for z in (0, 1) for y in (0, 1) for x in (0, 1)], dtype=np.float64)
+        return (unit @ self.to_world.T)[:, :3]
+
+    def matches(self, other: np.ndarray, tolerance: float) -> bool:
+        """Whether another box has the same corners, to ``tolerance`` of its size."""
+        theirs = Box(other).corners()
+        size = np.ptp(theirs, axis=0).max()
+        gaps = np.linalg.norm(self.corners()[:, None] - theirs[None], axis=-1).min(axis=1)
+        return bool(gaps.max() <= tolerance * size)
+
+
+def view_medium(medium: mi.Medium, boundary: Box | None = None) -> MediumView:
+    """View a medium as a sum of fields.
+
+    Args:
+        medium: ``mivol_medium``, ``homogeneous`` or ``heterogeneous`` (over ``gridvolume``, ``constvolume`` or
+            ``mivol_voxels``).
+        boundary: the box that bounds it, if it is one: a stock grid tells its place to 6 digits only, and is put
+            exactly into a boundary that it fills.
+
+    Raises:
+        MivolError: a medium or a volume of another kind.
+    """
+    kind = medium.class_name()
+    params = mi.traverse(medium)
+    if kind not in STOCK and not hasattr(medium, "mivol_parts"):
+        raise MivolError(
+            f"a medium of type {kind} was found; mivol renders mivol_medium, homogeneous and heterogeneous media."
+        )
+    names = [n for n in ("sigma_t", "sigma_a", "sigma_s") if any(k.startswith(n + ".") for k in params.properties)]
+    fills_boundary = kind != "HeterogeneousMedium"
+    parts = [_part(name, params, kind, boundary, fills_boundary) for name in names]
+    albedo = [v for k, v in params if k.startswith("sigma_s." if "sigma_s" in names else "albedo.")]
+    return MediumView(medium, parts, mi.Float(params["scale"]), albedo)
+
+
+def _part(name: str, params: mi.SceneParameters, kind: str, boundary: Box | None, fills_boundary: bool) -> Part:
+    """The part of an extinction under ``name`` among a medium's parameters."""
+    grid, constant = f"{name}.data", f"{name}.value.value"
+    if grid in params.properties:
+        volume = params.properties[grid][2]
+        return Part(name, lattice=Lattice(_tensor(params[grid]), place_of_grid(volume, boundary)))
+    if constant not in params.properties:
+        found = sorted(k for k in params.properties if k.startswith(name + "."))
+        raise MivolError(
+            f"{name} of a {kind} has the parameters {found}; a number, an rgb triple, a constvolume, a gridvolume or "
+            "mivol_voxels is expected."
+        )
+    value = params[constant]
+    if fills_boundary:
+        return Part(name, constant=value)
+    channels = [value[c] for c in range(dr.size_v(value))] if dr.size_v(value) == 3 else [mi.Float(value)]
+    values = mi.TensorXf(dr.ravel(mi.Color3f(*channels)) if len(channels) == 3 else channels[0], (1, 1, 1, len(channels)))
+    return Part(name, lattice=Lattice(values, np.eye(4)))
+
+
+def _tensor(values: mi.TensorXf) -> mi.TensorXf:
+    """Grid values as (Z, Y, X, C)."""
+    return values if len(values.shape) == 4 else mi.TensorXf(values.array, (*values.shape, 1))
+
+
+def place_of_grid(volume: mi.Volume, boundary: Box | None = None) -> np.ndarray:
+    """Find where a grid volume lies: the (4, 4) float64 map of the unit cube to the world.
+
+    A ``mivol_voxels`` knows. Stock ``gridvolume`` keeps its transform to itself: it prints it to 6 digits, and its
+    bounding box exactly (float32). Together they are exact for boxes along the axes; a turned grid is exact where it
+    fills its boundary, and else right to 5e-6 of its size.
+    """
+    if hasattr(volume, "mivol_to_world"):
+        return volume.mivol_to_world
+    text = str(volume)
+    rows = re.search(r"inverse_transpose=\[\[(.*?)\]\]", text, re.S).group(1)
+    place = np.array([[float(v) for v in row.split(",")] for row in re.split(r"\],\s*\[", rows)]).T
+    box = volume.bbox()
+    low, high = np.array(box.min, dtype=np.float64), np.array(box.max, dtype=np.float64)
+    place[:3, :3] *= ((high - low) / np.abs(place[:3, :3]).sum(axis=1))[:, None]
+    place[:3, 3] = (low + high - place[:3, :3].sum(axis=1)) / 2
+    place[3] = (0, 0, 0, 1)
+    if boundary is not None and boundary.matches(place, 1e-5):
+        return _same_axes(boundary.to_world, place)
+    return place
+
+
+def _same_axes(exact: np.ndarray, rough: np.ndarray) -> np.ndarray:
+    """The exact box, its axes and its corner chosen as in the rough one."""
+    edges = exact[:3, :3]
+    share = np.linalg.solve(edges, rough[:3, :3])  # a signed permutation, but for the digits of ``rough``
+    axes = edges @ np.round(share)
+    centre = exact[:3, 3] + edges.sum(axis=1) / 2
+    place = np.eye(4)
+    place[:3, :3], place[:3, 3] = axes, centre - axes.sum(axis=1) / 2
+    return place
+
+
+def box_of_cube(shape: mi.Shape) -> Box:
+    """The box of a ``cube`` shape, from its vertices. Reads them: not inside ``dr.freeze``."""
+    world = _vertices(shape)
+    unit = (_vertices(mi.load_dict({"type": "cube"})) + 1) / 2
+    fit, *_ = np.linalg.lstsq(np.c_[unit, np.ones(len(unit))], world, rcond=None)
+    to_world = np.eye(4)
+    to_world[:3] = fit.T
+    return Box(to_world)
+
+
+def _vertices(shape: mi.Shape) -> np.ndarray:
+    return np.array(mi.traverse(shape)["vertex_positions"], dtype=np.float64).reshape(-1, 3)
