@@ -200,7 +200,7 @@ def plot_slices(
             )
         rows = {"truth": show.slices(truth, size)} | rows
         rows["difference"] = show.slices(np.asarray(reconstruction, float) - np.asarray(truth, float), size)
-    values = show.scale_of(*next(iter(rows.values())).images.values(), kind="grey")
+    values = show.scale_of(*next(iter(rows.values())).images.values())
     signed = show.signed_scale(*rows["difference"].images.values()) if truth is not None else None
     with mpl.rc_context(STYLE):
         figure = _figure(7.2, 2.5 * len(rows) + 0.3)

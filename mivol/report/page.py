@@ -31,7 +31,8 @@ __all__ = ["PAGE", "headline", "write_page"]
 PAGE = "report.html"
 SHOWN_VIEWS = 4
 Z_LIMIT = 4.0
-VERDICTS = {"finished": "Reconstructed", "stopped": "Stopped", "running": "Still running, so far"}
+Z_ODD = 3.0
+VERDICTS = {"finished": "Reconstructed in", "stopped": "Stopped after", "running": "Still running after"}
 
 
 class Picture(NamedTuple):
@@ -104,7 +105,6 @@ def write_page(folder: str | Path) -> Path:
     facts = {
         "record": record,
         "headline": headline(record, [view.psnr for view in groups.rows if view.held_out and view.psnr is not None]),
-        "verdict": VERDICTS[record.status],
         "numbers": _numbers(record, groups.rows, volume),
         "views": groups,
         "shown": SHOWN_VIEWS,
@@ -135,8 +135,8 @@ def headline(record: RunRecord, held_out_psnr: Sequence[float] = ()) -> str:
         found.append(f"the volume to an nRMSE of {record.results['nrmse']:.3g}")
     cores = f"{record.machine.cores} core" + ("s" if record.machine.cores != 1 else "")
     seconds = _seconds(record)
-    when = f" in {_duration(seconds)} on {cores}" if seconds else f" on {cores}"
-    return VERDICTS[record.status] + when + (": " + ", ".join(found) if found else "") + "."
+    when = f"{VERDICTS[record.status]} {_duration(seconds)}" if seconds else VERDICTS[record.status].rpartition(" ")[0]
+    return f"{when} on {cores}" + (": " + ", ".join(found) if found else "") + "."
 
 
 def _environment() -> jinja2.Environment:
@@ -220,19 +220,22 @@ def _check_sizes(view: str, roles: dict[str, NDArray]) -> None:
 
 def _add_differences(roles: dict[str, NDArray]) -> None:
     """Put the difference and the z-image beside a reference and a render of linear values."""
-    reference, render, error = (roles.get(role) for role in ("reference", "render", "standard error"))
-    if reference is None or render is None or "uint8" in (reference.dtype.name, render.dtype.name):
+    if not _are_numbers(roles, "reference", "render"):
         return
-    roles["difference"] = render - reference
-    if error is not None:
+    difference = roles["difference"] = roles["render"] - roles["reference"]
+    if _are_numbers(roles, "standard error"):
         with np.errstate(divide="ignore", invalid="ignore"):
-            z = roles["difference"] / error
-        roles["z"] = np.where(np.isfinite(z), z, 0.0)
+            roles["z"] = np.where(difference == 0, 0.0, difference / roles["standard error"])
+
+
+def _are_numbers(roles: dict[str, NDArray], *names: str) -> bool:
+    """True where all of these are there and hold linear values, not the bytes of a PNG."""
+    return all(name in roles and roles[name].dtype != np.uint8 for name in names)
 
 
 def _scales(views: Iterable[dict[str, NDArray]]) -> dict[str, show.Scale]:
     """Scales by role, each shared by all views: values from the references, differences symmetric, z fixed."""
-    views = [{role: image for role, image in roles.items() if image.dtype.name != "uint8"} for roles in views]
+    views = [{role: image for role, image in roles.items() if _are_numbers(roles, role)} for roles in views]
     shown = [roles.get("reference", roles.get("render")) for roles in views]
     values = [image for image in shown if image is not None]
     differences = [roles["difference"] for roles in views if "difference" in roles]
@@ -251,30 +254,27 @@ PANELS = {"reference": "Reference", "render": "Render", "difference": "Render �
 
 def _view(name: str, images: dict[str, Image], roles: dict[str, NDArray], scales: dict[str, show.Scale]) -> View:
     pictures = [_picture(PANELS[role], roles[role], scales.get(role)) for role in PANELS if role in roles]
-    caption = next((image.caption for image in images.values() if image.caption), "")
-    psnr, words = None, []
-    if "difference" in roles and "reference" in roles:
-        psnr, nrmse = _agreement(roles["reference"], roles["difference"])
-        words += [f"PSNR {psnr:.1f} dB", f"nRMSE {nrmse:.3g}"] if np.isfinite(psnr) else ["identical"]
+    words = [next((image.caption for image in images.values() if image.caption), "")]
+    psnr = None
+    if _are_numbers(roles, "reference", "difference"):
+        psnr, said = _agreement(roles["reference"], roles["difference"])
+        words.append(said)
     if "z" in roles:
-        words.append(f"|z| > 3 in {np.mean(np.abs(roles['z']) > 3):.1%} of the values")
+        words.append(f"|z| > {Z_ODD:g} in {np.mean(np.abs(roles['z']) > Z_ODD):.1%} of the values")
     held_out = any(image.held_out for image in images.values())
-    return View(
-        name,
-        held_out,
-        pictures,
-        psnr if psnr is not None and np.isfinite(psnr) else None,
-        " · ".join([caption] * bool(caption) + words),
-    )
+    return View(name, held_out, pictures, psnr, " · ".join(word for word in words if word))
 
 
-def _agreement(reference: NDArray, difference: NDArray) -> tuple[float, float]:
-    """PSNR [dB] with the reference's largest value as the peak, and RMSE over the reference's own RMS."""
-    mse = float(np.mean(difference**2))
-    power = float(np.mean(reference**2))
-    peak = float(np.max(np.abs(reference)))
-    psnr = 10 * np.log10(peak**2 / mse) if mse > 0 and peak > 0 else np.inf
-    return psnr, float(np.sqrt(mse / power)) if power > 0 else np.inf
+def _agreement(reference: NDArray, difference: NDArray) -> tuple[float | None, str]:
+    """PSNR [dB] with the reference's largest value as the peak, where it is a number, and what to say of the view."""
+    broken = int(np.sum(~np.isfinite(difference)))
+    if broken:
+        return None, f"{broken} of {difference.size} values not finite"
+    mse, power, peak = (float(f(v)) for f, v in ((np.mean, difference**2), (np.mean, reference**2), (np.max, reference)))
+    if mse == 0 or peak <= 0:
+        return None, "identical" if mse == 0 else f"RMSE {np.sqrt(mse):.3g}"
+    psnr = 10 * np.log10(peak**2 / mse)
+    return psnr, f"PSNR {psnr:.1f} dB · nRMSE {np.sqrt(mse / power):.3g}"
 
 
 def _picture(name: str, image: NDArray, scale: show.Scale | None, aspect: float | None = None) -> Picture:
@@ -312,22 +312,28 @@ def _volume(folder: Path, volumes: Sequence[Volume]) -> Cut | None:
     if "reconstruction" not in by_role:
         return None
     data = {role: read_volume(folder / by_role[role].path) for role in ("truth", "reconstruction") if role in by_role}
-    grids = {role: found.values.astype(float) for role, found in data.items()}
     size = by_role["reconstruction"].size or tuple(np.linalg.norm(data["reconstruction"].to_world[:3, :3], axis=0))
-    cuts = {role: show.slices(grid, size) for role, grid in grids.items()}
-    if len(cuts) == 2 and grids["truth"].shape == grids["reconstruction"].shape:
-        cuts["difference"] = show.slices(grids["reconstruction"] - grids["truth"], size)
+    cuts = {role: show.slices(found.values, size) for role, found in data.items()}
+    if len(cuts) == 2 and data["truth"].values.shape == data["reconstruction"].values.shape:
+        truth, found = cuts["truth"].images, cuts["reconstruction"]
+        cuts["difference"] = found._replace(images={p: image - truth[p] for p, image in found.images.items()})
     first = next(iter(cuts.values()))
-    values = show.scale_of(*first.images.values(), kind="grey")
+    values = show.scale_of(*first.images.values())
     scales = {"truth": values, "reconstruction": values}
     if "difference" in cuts:
         scales["difference"] = show.signed_scale(*cuts["difference"].images.values())
-    rows = [_plane(plane, cuts, scales) for plane in first.images]
+    rows = [_plane(plane, cuts, scales) for plane in first.images] if len(cuts) > 1 else [_planes(first, values)]
     described = by_role["reconstruction"]
     bars = [_bar(values, f"{described.quantity} [{described.unit}]" if described.unit else described.quantity)]
     if "difference" in scales:
         bars.append(_bar(scales["difference"], "Reconstruction − truth"))
-    return Cut(grids["reconstruction"].shape[2::-1], rows, bars)
+    return Cut(data["reconstruction"].values.shape[2::-1], rows, bars)
+
+
+def _planes(cut: show.Slices, scale: show.Scale) -> dict[str, Any]:
+    """The three planes of one volume side by side."""
+    pictures = [_picture(f"{p}, {cut.where[p]}", image, scale, cut.aspect[p]) for p, image in cut.images.items()]
+    return {"plane": "", "where": "", "pictures": pictures}
 
 
 def _plane(plane: str, cuts: dict[str, show.Slices], scales: dict[str, show.Scale]) -> dict[str, Any]:
@@ -382,10 +388,10 @@ def _timings(timings: dict[str, float]) -> list[tuple[str, float, float]]:
 
 def _count(number: int) -> tuple[str, str]:
     """A count to three digits, and its prefix."""
-    for size, prefix in ((1e9, "G"), (1e6, "M"), (1e4, "k")):
+    for size, prefix in ((1e9, "G"), (1e6, "M"), (1e3, "k")):
         if number >= size:
-            return f"{number / (1e3 if prefix == 'k' else size):.3g}", prefix
-    return f"{number:,}", ""
+            return f"{number / size:.3g}", prefix
+    return str(number), ""
 
 
 def _times(shape: Sequence[int]) -> str:
@@ -405,7 +411,8 @@ def _duration(seconds: float) -> str:
 
 
 def _toml(config: dict[str, Any], prefix: str = "") -> str:
-    """The configuration as TOML: plain values first, then a table for each group."""
+    """The configuration as TOML: plain values first, then a table for each group; what is not set is left out."""
+    config = {key: value for key, value in config.items() if value is not None}
     plain = [f"{key} = {_value(value)}" for key, value in config.items() if not isinstance(value, dict)]
     parts = ["\n".join(([f"[{prefix}]"] if prefix and plain else []) + plain)] if plain else []
     tables = {key: value for key, value in config.items() if isinstance(value, dict)}
@@ -417,5 +424,5 @@ def _value(value: Any) -> str:
     if isinstance(value, list) and any(isinstance(item, dict) for item in value):
         return "[" + ", ".join(_value(item) for item in value) + "]"
     if isinstance(value, dict):
-        return "{ " + ", ".join(f"{key} = {_value(item)}" for key, item in value.items()) + " }"
-    return json.dumps(value, ensure_ascii=False) if value is not None else '""'
+        return "{ " + ", ".join(f"{key} = {_value(item)}" for key, item in value.items() if item is not None) + " }"
+    return json.dumps(value, ensure_ascii=False)

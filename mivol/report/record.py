@@ -70,6 +70,7 @@ QUANTITIES: dict[str, Quantity] = {
     "seconds": Quantity("Time", "s"),
     "iterations": Quantity("Iterations", log=False),
     "views": Quantity("Views fitted", log=False),
+    "memory": Quantity("Peak memory", "MiB", log=False),
 }
 
 

@@ -20,7 +20,7 @@ from cli.run_folder import write_run
 from matplotlib.image import imread
 
 from mivol.errors import MivolError
-from mivol.files import write_exr
+from mivol.files import write_exr, write_volume
 from mivol.report import figures, show
 from mivol.report.cite import CITATIONS, citations
 from mivol.report.page import headline, write_page
@@ -149,6 +149,14 @@ def test_numbers_of_a_view_on_paper(tmp_path):
     assert "to 20.0 dB PSNR" in found.text.replace("\u00a0", " ")
 
 
+def test_a_broken_render_has_no_psnr(tmp_path):
+    render = np.ones((4, 6))
+    render[1, 2] = np.nan
+    found = one_view(tmp_path, np.ones((4, 6)), render, status="finished")
+    assert "1 of 24 values not finite" in found.text and "PSNR," not in found.text and "identical" not in found.text
+    assert dict(found.pictures())["Render"][1, 2].tolist() == [255, 0, 255]
+
+
 def test_difference_is_render_minus_reference(tmp_path):
     reference, render = np.full((5, 7), 0.5), np.full((5, 7), 0.5)
     render[1, 2], render[3, 6] = 0.75, 0.25
@@ -198,6 +206,28 @@ def test_pixels_that_are_not_finite_are_seen():
     rgb = show.pixels(image, show.scale_of(image))
     assert rgb[0, 1].tolist() == rgb[1, 1].tolist() == [255, 0, 255]
     assert rgb[0, 0].tolist() == [0, 0, 0] and rgb[1, 0].tolist() == [255, 255, 255]
+
+
+def test_layers_of_one_file_and_a_volume_without_truth(tmp_path):
+    """Reference and standard error are layers of one OpenEXR; z = 0.3 / 0.1 = 3, and three quarters of the blue-red map."""
+    layers = {"": np.full((2, 3, 3), 0.5), "error": np.full((2, 3, 3), 0.1)}
+    write_exr(tmp_path / "reference.exr", layers)
+    write_exr(tmp_path / "render.exr", {"": np.full((2, 3, 3), 0.8)})
+    write_volume(tmp_path / "sigma_t.npz", np.ones((2, 3, 4, 1), np.float32), np.diag([4.0, 3.0, 1.0, 1.0]))
+    images = [
+        Image(path="reference.exr", role="reference", view="a"),
+        Image(path="reference.exr", role="standard error", layer="error", view="a"),
+        Image(path="render.exr", role="render", view="a"),
+    ]
+    volumes = [Volume(path="sigma_t.npz", role="reconstruction")]
+    write_record(RunRecord.new("Layers", images=images, volumes=volumes), tmp_path)
+    found = Page(write_page(tmp_path).read_text(encoding="utf-8"))
+    expected = show.pixels(np.array([[3.0]]), show.Scale("signed", -4.0, 4.0))[0, 0]
+    # float32 moves z by 1e-6 of 8, at most one of the map's 256 entries, which are under 5 levels apart.
+    assert np.abs(dict(found.pictures())["z-image"][0, 0] - expected).max() <= 5
+    planes = [attributes for tag, attributes in found.tags if tag == "img" and attributes["alt"].startswith(("xy", "xz"))]
+    assert [attributes["style"] for attributes in planes] == ["aspect-ratio: 1.3333", "aspect-ratio: 4"]
+    assert "voxels, 4 × 3 × 2" in found.text
 
 
 def test_text_of_a_run_cannot_become_markup(tmp_path):
@@ -257,7 +287,9 @@ def test_headline_says_what_is_known():
     said = f"Reconstructed in 41 s on {cores}: held-out views to 40.0 dB PSNR, the volume to an nRMSE of 0.0341."
     assert headline(record, [39.0, 41.0]) == said
     record.status, record.results = "stopped", {}
-    assert headline(record) == f"Stopped in 41 s on {cores}."
+    assert headline(record) == f"Stopped after 41 s on {cores}."
+    record.status, record.timings = "running", {}
+    assert headline(record) == f"Still running on {cores}."
 
 
 @pytest.mark.parametrize(
