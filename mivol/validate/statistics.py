@@ -432,8 +432,13 @@ def psnr(image: np.ndarray, truth: np.ndarray, peak: float | None = None) -> flo
 
     Args:
         peak: the largest value of a signal; by default the truth's.
+
+    Raises:
+        MivolError: the peak is not above 0.
     """
     peak = float(np.max(truth)) if peak is None else peak
+    if not peak > 0:
+        raise MivolError(f"a peak of {peak} leaves no signal to compare the noise with; give the largest value expected.")
     error = _rms(image, truth)
     return float("inf") if error == 0 else float(20 * np.log10(peak / error))
 

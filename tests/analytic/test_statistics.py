@@ -272,6 +272,7 @@ def test_refusals(monkeypatch):
         (lambda: batches_for(0, 1), "a bias of 0"),
         (lambda: smallest_detectable_bias(1.0, power=1), "power = 1"),
         (lambda: nrmse(one, one), "relative_l2"),
+        (lambda: psnr(one, 0 * one), "a peak of 0"),
         (lambda: relative_l2(one, 0 * one), "0 everywhere"),
         (lambda: ssim(one, one), "7 pixel window"),
     ]

@@ -1,0 +1,281 @@
+"""Where Mitsuba 3.9.1 cannot be the judge: the cases in which its ``volpath`` is known to be wrong.
+
+Conventions. A doubt is fatal where the image is wrong, and a remark where it is right but may surprise, or is slightly
+off. Every case was reproduced on the 3.9.1 wheel; tests/conformance/test_reference.py shows each still wrong, so that a
+release that mends one is noticed. Extinction that differs between channels is no doubt here:
+:func:`mivol.validate.reference.render_reference` renders it one channel at a time.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+import mitsuba as mi
+import numpy as np
+
+__all__ = ["CHECKS", "Doubt", "trust"]
+
+# exp(-x) is 0 in float32 (denormals flushed) from 87.3: the density of passing untouched, by which Mitsuba divides.
+DEEPEST = 87.0
+
+# Mitsuba prints transforms to 6 digits, and float32 vertices carry 1e-7 of their size: what lies this little outside the
+# unit cube lies on its face.
+ON_FACE = 1e-4
+
+# Mean cosine of `hg` samples, measured: -0.41 at g = 1e-7, -0.029 at 1e-6; the error falls as 1/g.
+SMALLEST_G = 1e-3
+
+
+@dataclass(frozen=True)
+class Doubt:
+    """One reason not to believe an image of Mitsuba's.
+
+    Attributes:
+        kind: key of ``CHECKS``.
+        sentence: what was found, what Mitsuba makes of it, the way out.
+        fatal: the image would be wrong.
+    """
+
+    kind: str
+    sentence: str
+    fatal: bool = True
+
+
+@dataclass(frozen=True)
+class Boundary:
+    """A shape that holds a medium, and where the medium's extinction is given.
+
+    Attributes:
+        name: of the shape.
+        points: (N, 3) world points whose hull holds the shape: mesh vertices, else the corners of its box.
+        faces: (M, 3) indices of a mesh, else None.
+        to_world: (4, 4) of a shape that is no mesh, else None.
+        to_local: (4, 4) world to unit cube of a stock volume, else None.
+        to_local_inverse: (4, 4) what Mitsuba takes for its inverse, else None.
+        volume: class of the extinction's volume, "" for a constant.
+        majorant: largest extinction [1/length].
+        params: what can be traversed of the medium.
+    """
+
+    name: str
+    points: np.ndarray
+    faces: np.ndarray | None
+    to_world: np.ndarray | None
+    to_local: np.ndarray | None
+    to_local_inverse: np.ndarray | None
+    volume: str
+    majorant: float
+    params: dict[str, object]
+
+    @property
+    def overhangs(self) -> bool:
+        """Whether the shape reaches outside the volume's own box."""
+        if self.to_local is None:
+            return False
+        q = self.points @ self.to_local[:3, :3].T + self.to_local[:3, 3]
+        return bool(np.any(q < -ON_FACE) or np.any(q > 1 + ON_FACE))
+
+    @property
+    def diagonal(self) -> float:
+        """Of the box about the shape: no chord is longer."""
+        return float(np.linalg.norm(np.ptp(self.points, axis=0)))
+
+    def holds(self, p: np.ndarray) -> bool:
+        """Whether a point is inside: by crossings of a ray for a mesh, by the unit ball for a sphere, else by the box."""
+        if self.faces is not None:
+            return _crossings(p, self.points[self.faces]) % 2 == 1
+        return bool(np.all(p > self.points.min(axis=0)) and np.all(p < self.points.max(axis=0))) and self._in_ball(p)
+
+    def _in_ball(self, p: np.ndarray) -> bool:
+        if self.to_world is None:
+            return True
+        local = np.linalg.solve(self.to_world, np.append(p, 1.0))[:3]
+        return bool(local @ local < 1)
+
+
+def trust(scene: mi.Scene, sensors: Sequence[mi.Sensor] | None = None) -> list[Doubt]:
+    """Every reason not to believe what Mitsuba 3.9.1 renders of a scene.
+
+    Args:
+        scene: the scene.
+        sensors: the cameras that will look at it; by default its own.
+    """
+    boundaries = [_boundary(s) for s in scene.shapes() if s.interior_medium() is not None]
+    doubts = [Doubt(kind, *found) for kind, check in CHECKS.items() for b in boundaries for found in check(b)]
+    for sensor in scene.sensors() if sensors is None else sensors:
+        doubts += [Doubt("camera inside", sentence) for sentence in _camera_inside(sensor, boundaries)]
+    return doubts
+
+
+# -- The checks -----------------------------------------------------------------------------------
+
+Found = Iterator[tuple[str, bool]]
+
+
+def _not_finite(b: Boundary) -> Found:
+    if not np.isfinite(b.majorant) or b.majorant < 0:
+        yield (
+            f"the extinction inside {b.name} has {b.majorant} as its largest value; its voxels must be finite and not negative."
+        ), True
+
+
+def _rotated(b: Boundary) -> Found:
+    if b.volume != "GridVolume" or not b.overhangs:
+        return
+    linear = np.abs(b.to_local[:3, :3])
+    if np.any(np.sort(linear, axis=1)[:, :2] > 1e-5 * linear.max(axis=1, keepdims=True)):
+        yield (
+            f"the grid inside {b.name} is rotated or sheared and {b.name} is larger than the grid's own box: Mitsuba fills the "
+            "grid's upright bounding box with clamped values; make the boundary the grid's own box."
+        ), True
+
+
+def _too_deep(b: Boundary) -> Found:
+    depth = b.majorant * b.diagonal
+    if b.overhangs and depth > DEEPEST:
+        yield (
+            f"{b.name} is larger than the box of its grid, and the largest extinction times its diagonal is {depth:.3g}, above "
+            f"{DEEPEST:g}: Mitsuba shows 0 where a ray misses the grid (issue 336); make the boundary the grid's own box."
+        ), True
+
+
+def _constant_box(b: Boundary) -> Found:
+    if b.volume == "ConstVolume" and b.overhangs:
+        yield (
+            f"the heterogeneous medium inside {b.name} has a constant extinction, which Mitsuba puts into the unit cube of the "
+            f"constvolume only, not into all of {b.name}; use the medium homogeneous if all of it was meant."
+        ), False
+
+
+def _mirrored(b: Boundary) -> Found:
+    turned = b.to_world is not None and np.linalg.det(b.to_world[:3, :3]) < 0
+    if b.faces is not None:
+        p, q, r = (b.points[b.faces[:, i]] - b.points.mean(axis=0) for i in range(3))
+        turned = np.einsum("ij,ij->", p, np.cross(q, r)) < 0
+    if turned:
+        yield (
+            f"the normals of {b.name} point inwards (a mirroring to_world?), so that Mitsuba has the medium outside; "
+            "mirror the grid, not the shape."
+        ), True
+
+
+def _wrong_inverse(b: Boundary) -> Found:
+    if b.to_local is None:
+        return
+    # 1e-4: both are printed with 6 digits.
+    product = b.to_local @ b.to_local_inverse
+    if np.abs(product - np.eye(4)).max() > 1e-4 * max(1.0, np.abs(b.to_local).max() * np.abs(b.to_local_inverse).max()):
+        yield (
+            f"the transform of the volume inside {b.name} and Mitsuba's inverse of it do not match (a rotation axis of length "
+            "other than 1?); normalise the axis."
+        ), True
+
+
+def _small_g(b: Boundary) -> Found:
+    g = float(np.ravel(b.params.get("phase_function.g", 0.0))[0])
+    if 0 < abs(g) < SMALLEST_G and not _is_black(b):
+        yield (
+            f"the phase function inside {b.name} is hg with g = {g:.2g}: the mean cosine of Mitsuba's samples is off by about "
+            "3e-8/g; use the isotropic phase function."
+        ), False
+
+
+def _is_black(b: Boundary) -> bool:
+    albedo = [np.asarray(v) for k, v in b.params.items() if k.startswith(("albedo", "sigma_s"))]
+    return bool(albedo) and all(np.all(v == 0) for v in albedo)
+
+
+def _emission(b: Boundary) -> Found:
+    key = next((k for k in b.params if k.startswith("emission")), None)
+    if key is not None and np.any(np.asarray(b.params[key]) != 0):
+        yield f"the medium inside {b.name} emits light, which Mitsuba's integrators do not render; set its emission to 0.", True
+
+
+CHECKS: dict[str, Callable[[Boundary], Found]] = {
+    "not finite": _not_finite,
+    "rotated grid": _rotated,
+    "too deep": _too_deep,
+    "constant box": _constant_box,
+    "mirrored": _mirrored,
+    "wrong inverse": _wrong_inverse,
+    "small g": _small_g,
+    "emission": _emission,
+}
+
+
+def _camera_inside(sensor: mi.Sensor, boundaries: list[Boundary]) -> Iterator[str]:
+    if sensor.get_medium() is not None:
+        return
+    origin = np.array(sensor.world_transform().matrix, dtype=np.float64).reshape(4, 4)[:3, 3]
+    for b in boundaries:
+        if b.holds(origin):
+            yield (
+                f"the camera at {np.round(origin, 4).tolist()} is inside {b.name}, and Mitsuba starts its paths in vacuum; "
+                'give the sensor the medium that it is in (<ref name="medium" .../>).'
+            )
+
+
+# -- Facts of a scene -----------------------------------------------------------------------------
+
+
+def _boundary(shape: mi.Shape) -> Boundary:
+    geometry = mi.traverse(shape)
+    medium = shape.interior_medium()
+    params = mi.traverse(medium)
+    volume = _extinction_volume(params)
+    printed = str(volume) if volume is not None and volume.class_name() in ("GridVolume", "ConstVolume") else ""
+    inverse = _printed(printed, "inverse_transpose")
+    mesh = "vertex_positions" in geometry
+    return Boundary(
+        name=shape.id() or f"the {shape.class_name()}",
+        points=np.array(geometry["vertex_positions"], np.float64).reshape(-1, 3) if mesh else _corners(shape.bbox()),
+        faces=np.array(geometry["faces"]).reshape(-1, 3) if mesh else None,
+        to_world=_matrix(geometry["to_world"]) if shape.shape_type() == mi.ShapeType.Sphere.value else None,
+        to_local=_printed(printed, "matrix"),
+        to_local_inverse=None if inverse is None else inverse.T,
+        volume=volume.class_name() if volume is not None and not medium.is_homogeneous() else "",
+        majorant=0.0 if volume is None else float(params.get("scale", 1.0)) * float(np.max(volume.max())),
+        params={key: params[key] for key in params.keys()},  # noqa: SIM118  (iteration gives pairs)
+    )
+
+
+def _extinction_volume(params: mi.SceneParameters) -> mi.Volume | None:
+    """The volume object behind the medium's ``sigma_t``."""
+    for key, (_, _, node, _) in params.properties.items():
+        while key.startswith("sigma_t") and node is not None:
+            if isinstance(node, mi.Volume):
+                return node
+            node = params.hierarchy[node][0]
+    return None
+
+
+def _printed(text: str, name: str) -> np.ndarray | None:
+    """A matrix from the printed form of a stock volume, the only place where Mitsuba shows it."""
+    found = re.search(rf"to_local = Transform\[.*?\b{name}=(\[\[.*?\]\])", text, re.DOTALL)
+    return np.array(re.findall(r"[-+\w.]+", found[1]), dtype=np.float64).reshape(4, 4) if found else None
+
+
+def _matrix(transform: object) -> np.ndarray:
+    return np.array(transform.matrix, dtype=np.float64).reshape(4, 4)
+
+
+def _corners(box: object) -> np.ndarray:
+    low, high = (np.array(v, np.float64).ravel() for v in (box.min, box.max))
+    return np.where(np.indices((2, 2, 2)).reshape(3, 8).T == 0, low, high)
+
+
+def _crossings(p: np.ndarray, triangles: np.ndarray) -> int:
+    """How many triangles a ray from p meets (Moeller, Trumbore 1997), along a direction that follows no axis."""
+    d = np.array([0.8017837, 0.2672612, 0.5345225])
+    a, e1, e2 = triangles[:, 0], triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
+    h = np.cross(d, e2)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        inverse = 1 / np.einsum("ij,ij->i", e1, h)
+        s = p - a
+        u = np.einsum("ij,ij->i", s, h) * inverse
+        q = np.cross(s, e1)
+        v = q @ d * inverse
+        t = np.einsum("ij,ij->i", q, e2) * inverse
+        return int(np.count_nonzero((u >= 0) & (v >= 0) & (u + v <= 1) & (t > 0)))

@@ -1,0 +1,419 @@
+"""Reference renders: right where an answer is known, refused where Mitsuba is wrong, never lost, never of another scene."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import signal
+from dataclasses import replace
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mivol.errors import MivolError
+from mivol.files.exr import read_exr, write_exr
+from mivol.scene.cameras import Ring
+from mivol.validate import reference
+from mivol.validate.compare import compare
+from mivol.validate.reference import read_reference, render_reference
+from mivol.validate.statistics import assert_same_bounded_mean, assert_same_mean
+from mivol.validate.trust import trust
+
+SIZE = 8
+RGB = np.array([2.0, 6.0, 9.0])
+
+
+def _t() -> mi.ScalarTransform4f:
+    return mi.ScalarTransform4f()
+
+
+def _grid(value, **extra) -> dict:
+    """A heterogeneous absorbing medium of one value, grey or rgb, on 2^3 voxels."""
+    values = np.broadcast_to(np.float32(value), (2, 2, 2, np.size(value)))
+    volume = {"type": "gridvolume", "grid": mi.VolumeGrid(np.ascontiguousarray(values)), **extra}
+    return {"type": "heterogeneous", "sigma_t": volume, "albedo": 0.0}
+
+
+def _scene(medium: dict, boundary=None, **changes) -> dict:
+    """The unit cube before a constant light of 1; parallel rays along z inside its silhouette: T = exp(-sigma) exactly."""
+    film = {"type": "hdrfilm", "width": SIZE, "height": SIZE, "rfilter": {"type": "box"}, "pixel_format": "rgb"}
+    look = _t().look_at([0.5, 0.5, -3], [0.5, 0.5, 0.5], [0, 1, 0]).scale([0.4, 0.4, 1])
+    return {
+        "type": "scene",
+        "sky": {"type": "constant"},
+        "sensor": {"type": "orthographic", "to_world": look, "film": film},
+        "box": {
+            "type": "cube",
+            "to_world": boundary or _t().translate([0.5, 0.5, 0.5]).scale(0.5),
+            "bsdf": {"type": "null"},
+            "interior": medium,
+        },
+        **changes,
+    }
+
+
+def _homogeneous(sigma_t=1.5, **extra) -> dict:
+    return {"type": "homogeneous", "sigma_t": sigma_t, "albedo": 0.0, **extra}
+
+
+def _small(scene, path, **settings) -> reference.ReferenceResult:
+    return render_reference(scene, path, **{"max_depth": 2, "max_spp": 256, "progress": False, **settings})
+
+
+# -- Right where the answer is known ---------------------------------------------------------------
+
+
+@pytest.mark.parametrize("integrator", reference.INTEGRATORS)
+@pytest.mark.parametrize("kind", ["homogeneous", "grid"])
+def test_absorbing_cube(variant_rgb, tmp_path, integrator, kind):
+    """Rationale: the judge is judged where exp(-sigma L) is known. Expected: agreement at 1e-6, by the t-test of its own
+    variance and by Hoeffding's bound, which trusts no variance; and a mean z^2 of 1: the variance is not too large either.
+
+    Catches: variance of a batch for that of the mean (z^2 of 1/32), spp miscounted, batches with one seed.
+    """
+    medium = _homogeneous(1.5) if kind == "homogeneous" else _grid(1.5)
+    found = _small(_scene(medium), tmp_path / "r.exr", max_spp=2048, integrator=integrator)
+    truth = np.full_like(found.mean, np.exp(-1.5))
+    assert (found.batches, found.spp) == (32, 2048)
+    assert_same_mean(found.mean, found.variance, truth, n_a=found.batches, alpha=1e-6)
+    assert_same_bounded_mean(found.mean, found.spp, truth, alpha=1e-6)
+    z2 = (found.mean - truth)[..., 0] ** 2 / found.variance[..., 0]
+    # t^2 of 31 degrees of freedom has mean 31/29 and variance about 2.6; 64 pixels: 1.07 +- 0.2, 5 of them.
+    assert 0.2 < z2.mean() < 2.1
+
+
+def test_rgb_extinction_is_rendered_channel_by_channel(variant_rgb, tmp_path):
+    """sigma_t = (2, 6, 9): each channel is its own grey render, where Mitsuba at once is 14 standard errors off in red.
+
+    Afterwards the scene is as it was.
+    """
+    scene = mi.load_dict(_scene(_grid(RGB)))
+    before = {k: np.array(v) for k, v in mi.traverse(scene) if "sigma_t" in k}
+    found = _small(scene, tmp_path / "r.exr", max_spp=4096)
+    truth = np.broadcast_to(np.exp(-RGB), found.mean.shape)
+    assert_same_bounded_mean(found.mean, found.spp, truth)
+    assert found.identity["channels_alone"]
+    after = {k: np.array(v) for k, v in mi.traverse(scene) if "sigma_t" in k}
+    assert before.keys() == after.keys() and all(np.array_equal(before[k], after[k]) for k in before)
+
+    at_once = np.array(mi.render(scene, integrator=mi.load_dict({"type": "volpath", "max_depth": 2}), spp=4096))
+    red = at_once[..., 0].mean()
+    # A sample's variance is at most that of a 0/1 one, T (1 - T); it is smaller for tracked weights.
+    error = np.sqrt(truth[0, 0, 0] * (1 - truth[0, 0, 0]) / (4096 * SIZE**2))
+    assert abs(found.mean[..., 0].mean() - truth[0, 0, 0]) < 5 * error
+    assert abs(red - truth[0, 0, 0]) > 10 * error, "Mitsuba's heterogeneous is right now: rgb at once need not be refused"
+
+
+@pytest.mark.parametrize("form", ["rgb", "constvolume", "shared by id"])
+def test_every_form_of_rgb_extinction_is_found(variant_rgb, tmp_path, form):
+    """A colour, a constvolume of a colour, a medium that two shapes share."""
+    colour = {"type": "rgb", "value": [0.2, 0.6, 0.9]}
+    if form == "constvolume":
+        colour = {"type": "constvolume", "value": {"type": "rgb", "value": [0.2, 0.6, 0.9]}}
+    scene = _scene(_homogeneous(colour))
+    if form == "shared by id":
+        scene = {"type": "scene", "fog": scene["box"]["interior"], **scene}
+        scene["box"]["interior"] = {"type": "ref", "id": "fog"}
+        far = _t().translate([50, 50, 50])
+        scene["far"] = {"type": "sphere", "to_world": far, "bsdf": {"type": "null"}, "interior": {"type": "ref", "id": "fog"}}
+    found = _small(scene, tmp_path / "r.exr", max_spp=1024)
+    assert found.identity["channels_alone"]
+    assert_same_bounded_mean(found.mean, found.spp, np.broadcast_to(np.exp(-np.array([0.2, 0.6, 0.9])), found.mean.shape))
+
+
+def test_published_reference(variant_rgb, tmp_path, data_dir):
+    """A scene of Mitsuba's own suite against the mean and variance that Mitsuba published for it."""
+    folder = data_dir / "scenes" / "mitsuba-data" / "tests" / "scenes" / "participating_media"
+    found = _small(folder / "test_homo_area_light_volpath.xml", tmp_path / "r.exr", max_depth=6, max_spp=64)
+    theirs, variance = (
+        np.stack([read_exr(folder / "refs" / f"test_homo_area_light_ref_rgb{end}.exr")[0][c] for c in "RGB"], axis=-1)
+        for end in ("", "_var")
+    )
+    assert theirs.shape == found.mean.shape
+    # Tiles of 8 pixels: lit surfaces have bright rare samples. Their file gives the variance of one sample.
+    assert_same_mean(found.mean, variance / found.spp, theirs, tile=8, alpha=1e-6)
+
+
+def test_seeds_are_independent(variant_rgb, tmp_path):
+    """Two seeds: other noise, same mean; the same seed: the same image."""
+    a, b = (_small(_scene(_grid(1.5)), tmp_path / f"{seed}.exr", seed=seed) for seed in (0, 1))
+    assert np.mean(a.mean == b.mean) < 0.5
+    assert_same_mean(a.mean, a.variance, b.mean, b.variance, n_a=32, n_b=32)
+    again = _small(_scene(_grid(1.5)), tmp_path / "again.exr", seed=0)
+    # 1e-6: the threads of one render add float32 samples in no fixed order.
+    np.testing.assert_allclose(again.mean, a.mean, rtol=1e-6, atol=1e-6)
+
+
+# -- Stopping, continuing, fetching ----------------------------------------------------------------
+
+
+def _counted(monkeypatch, stop_at: int | None = None, how=None) -> list[int]:
+    """The numbers of the batches that are rendered from now on; ``how()`` is called during batch ``stop_at``."""
+    rendered, original = [], reference._Setup.batch
+
+    def batch(self, index):
+        rendered.append(index)
+        if index == stop_at:
+            how()
+        return original(self, index)
+
+    monkeypatch.setattr(reference._Setup, "batch", batch)
+    return rendered
+
+
+def _fall_over() -> None:
+    raise MemoryError("killed")
+
+
+@pytest.mark.parametrize("how", [lambda: os.kill(os.getpid(), signal.SIGINT), _fall_over], ids=["ctrl-c", "crash"])
+def test_stopped_and_continued_is_the_same(variant_rgb, tmp_path, monkeypatch, how):
+    """Stopped in batch 7, nothing that was finished is rendered again, and the image is that of a run that never stopped."""
+    scene = _scene(_grid(1.5))
+    whole = _small(scene, tmp_path / "whole.exr")
+    with monkeypatch.context() as patch:
+        first = _counted(patch, stop_at=7, how=how)
+        with pytest.raises((KeyboardInterrupt, MemoryError)):
+            _small(scene, tmp_path / "r.exr")
+    assert not (tmp_path / "r.exr").exists()
+    with monkeypatch.context() as patch:
+        second = _counted(patch)
+        continued = _small(scene, tmp_path / "r.exr")
+    finished = 8 if how is not _fall_over else 7
+    assert first == list(range(8)) and second == list(range(finished, 32))
+    np.testing.assert_allclose(continued.mean, whole.mean, rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(continued.variance, whole.variance, rtol=1e-4, atol=1e-9)
+
+
+def test_fetched_from_disk_and_made_better(variant_rgb, tmp_path, monkeypatch):
+    """Good enough on disk: no batch is rendered. Asked for more: only the missing ones are."""
+    scene, path = _scene(_grid(1.5)), tmp_path / "r.exr"
+    made = _small(scene, path)
+    rendered = _counted(monkeypatch)
+    fetched = _small(scene, path)
+    loose = _small(scene, path, target_se=1.0, max_spp=10**6)
+    assert rendered == [] and loose.reached
+    # float32 on disk: eps/2 = 6e-8.
+    np.testing.assert_allclose(fetched.mean, made.mean, rtol=1e-7)
+    np.testing.assert_allclose(fetched.variance, made.variance, rtol=1e-7)
+    assert replace(fetched, mean=made.mean, variance=made.variance) == made
+    better = _small(scene, path, max_spp=512)
+    assert rendered == list(range(32, 64))
+    assert better.spp == 512 and better.standard_error < 0.9 * made.standard_error
+
+
+@pytest.mark.parametrize("relative", [False, True])
+def test_target(variant_rgb, tmp_path, relative):
+    """Stops once the error is small enough; says so where the samples ran out first."""
+    target = 0.05 if relative else 0.05 * np.exp(-1.5)
+    found = _small(_scene(_grid(1.5)), tmp_path / "r.exr", max_spp=10**5, pass_spp=32, target_se=target, relative=relative)
+    # One sample is 0 or 1: se = sqrt(T (1 - T)/n) = 0.05 T at n = (1/T - 1)/0.0025 = 1393; stopped within a batch or two.
+    assert found.reached
+    assert 1200 < found.spp < 1700
+    assert not _small(_scene(_grid(1.5)), tmp_path / "s.exr", target_se=1e-9).reached
+
+
+def test_file_says_what_it_is(variant_rgb, tmp_path):
+    """Layers and header."""
+    made = _small(_scene(_grid(1.5)), tmp_path / "r.exr")
+    channels, header = read_exr(tmp_path / "r.exr")
+    assert set(channels) == {"R", "G", "B", "variance.R", "variance.G", "variance.B"}
+    said = json.loads(header["mivol_reference"])
+    assert said["identity"]["scene"] == made.identity["scene"] and len(made.identity["scene"]) == 64
+    assert {"integrator", "max_depth", "rr_depth", "seed", "pass_spp", "mitsuba", "drjit", "variant"} <= said["identity"].keys()
+    assert {"batches", "spp", "mivol", "seconds", "doubts"} <= said.keys()
+    assert "volpath (max_depth 2" in made.text and "256 samples" in made.text
+
+
+def test_folder_names_its_files(variant_rgb, tmp_path):
+    """In a folder, other scenes, depths and cameras have files of their own."""
+    scene = _scene(_grid(1.5))
+    cameras = Ring(count=2, width=SIZE, height=SIZE).sensors(mi.load_dict(scene))
+    paths = {
+        _small(scene, tmp_path).path,
+        _small(scene, tmp_path, max_depth=3).path,
+        _small(_scene(_grid(1.6)), tmp_path).path,
+        *(_small(scene, tmp_path, sensor=camera).path for camera in cameras),
+    }
+    assert len(paths) == 5 and all(p.parent == tmp_path for p in paths)
+
+
+# -- Refusals -------------------------------------------------------------------------------------
+
+
+def test_another_scene_is_refused(variant_rgb, tmp_path):
+    """The reference of one scene is not that of another, whether whole or begun, and is not overwritten."""
+    path = tmp_path / "r.exr"
+    made = _small(_scene(_grid(1.5)), path)
+    with pytest.raises(MivolError, match="reference of another scene"):
+        _small(_scene(_grid(1.6)), path)
+    with pytest.raises(MivolError, match="max_depth = 2, not 3"):
+        _small(_scene(_grid(1.5)), path, max_depth=3)
+    with pytest.raises(MivolError, match="reference of another scene"):
+        read_reference(path, "0" * 64)
+    assert read_reference(path, made.identity["scene"]).batches == 32
+    path.unlink()
+    with pytest.raises(MivolError, match="reference of another scene"):
+        _small(_scene(_grid(1.6)), path)
+
+
+def test_refusals(variant_rgb, tmp_path):
+    """One sentence each."""
+    good = _scene(_grid(1.5))
+    xyz = _scene(_grid(1.5))
+    xyz["sensor"] = {**xyz["sensor"], "film": {**xyz["sensor"]["film"], "pixel_format": "xyz"}}
+    (tmp_path / "cut.state.npz").write_bytes(b"PK\x03\x04 half")
+    write_exr(tmp_path / "other.exr", {"": np.zeros((SIZE, SIZE, 3))})
+    cases = [
+        ("under test", good, "r.exr", {"integrator": "mivol"}),
+        ("volpath and volpathmis", good, "r.exr", {"integrator": "prbvolpath"}),
+        ("pixel format", xyz, "r.exr", {}),
+        ("no sensor 3", good, "r.exr", {"sensor": 3}),
+        ("allow 32 or more", good, "r.exr", {"max_spp": 31}),
+        ("allow 320 or more", good, "r.exr", {"pass_spp": 10}),
+        ("OpenEXR", good, "r.png", {}),
+        ("not a whole checkpoint", good, "cut.exr", {}),
+        ("not a reference of mivol's", good, "other.exr", {}),
+    ]
+    for words, scene, name, settings in cases:
+        with pytest.raises(MivolError, match=words):
+            _small(scene, tmp_path / name, **settings)
+
+
+def test_values_that_are_not_finite_are_located(variant_rgb, tmp_path, monkeypatch):
+    """A NaN from Mitsuba never reaches the mean."""
+    original = mi.render
+
+    def poisoned(*args, **kwargs):
+        image = np.array(original(*args, **kwargs))
+        image[2, 3, 1] = np.nan
+        return image
+
+    monkeypatch.setattr(mi, "render", poisoned)
+    with pytest.raises(MivolError, match="nan in row 2, column 3, channel 1 of batch 0"):
+        _small(_scene(_grid(1.5)), tmp_path / "r.exr")
+
+
+# -- Where Mitsuba is wrong ------------------------------------------------------------------------
+
+
+def _rendered(scene: dict, spp: int = 512) -> np.ndarray:
+    image = mi.render(mi.load_dict(scene), integrator=mi.load_dict({"type": "volpath", "max_depth": 2}), spp=spp)
+    return np.array(image)[..., 0]
+
+
+def _upright_column(scene: dict, x: float, y: float) -> dict:
+    """The scene seen along z through one point of the plane, from far outside."""
+    look = _t().look_at([x, y, -20], [x, y, 0], [0, 1, 0]).scale([0.01, 0.01, 1])
+    return {**scene, "sensor": {**scene["sensor"], "to_world": look}}
+
+
+def _wrong_scenes() -> dict[str, tuple[dict, float, float]]:
+    """kind -> (scene, what is right, what Mitsuba 3.9.1 shows)."""
+    big = _t().translate([0.5, 0.5, 0.5]).scale(3)
+    tilted = _t().rotate([0, 0, 1], 45)
+    film = _scene(_grid(1.0))["sensor"]["film"]
+    inside = {"type": "perspective", "fov": 5, "to_world": _t().look_at([0, 0, 0], [0, 0, 1], [0, 1, 0]), "film": film}
+    ball = {"type": "sphere", "bsdf": {"type": "null"}, "interior": _homogeneous(1.0)}
+    mirror = _t().translate([0.5, 0.5, 0.5]).scale([-0.5, 0.5, 0.5])
+    flat = {"type": "heterogeneous", "sigma_t": 1.0, "albedo": 0.0}
+    return {
+        # the ray misses the grid within its large boundary
+        "too deep": (_upright_column(_scene(_grid(30.0), big), 3, 3), 1.0, 0.0),
+        # the corner of the upright box about a cube turned by 45 degrees: vacuum, filled by Mitsuba
+        "rotated grid": (_upright_column(_scene(_grid(1.0, to_world=tilted), big), 0.5, 0.1), 1.0, np.exp(-1.0)),
+        "mirrored": (_scene(_grid(1.0), mirror), np.exp(-1.0), 0.0),
+        "camera inside": (_scene(_grid(1.0), box=ball, sensor=inside), np.exp(-1.0), 1.0),
+        "constant box": (_upright_column(_scene(flat, big), 3, 3), np.exp(-6.0), 1.0),
+    }
+
+
+@pytest.mark.parametrize("kind", ["too deep", "rotated grid", "mirrored", "camera inside", "constant box"])
+def test_hard_03_04_doubt_where_mitsuba_is_wrong(variant_rgb, tmp_path, kind):
+    """Each doubt is raised, alone, and Mitsuba does show the wrong value: a release that mends it turns this red."""
+    scene, right, shown = _wrong_scenes()[kind]
+    doubts = trust(mi.load_dict(scene))
+    assert [d.kind for d in doubts] == [kind]
+    found = _rendered(scene).mean()
+    # 512 samples of 64 pixels of 0/1: standard error at most 0.5/sqrt(32768) = 0.0028; 5 of them.
+    assert found == pytest.approx(shown, abs=0.014)
+    assert abs(found - right) > 0.1
+    if doubts[0].fatal:
+        with pytest.raises(MivolError, match="no reference here"):
+            _small(scene, tmp_path / "r.exr")
+        with pytest.warns(RuntimeWarning, match=re.escape(doubts[0].sentence)):
+            made = _small(scene, tmp_path / "r.exr", accept_doubts=True)
+        assert [d.kind for d in read_reference(made.path).doubts] == [kind]
+        assert "Doubt: " in made.text
+
+
+def test_doubts_that_need_no_render(variant_rgb):
+    """Each alone: an axis that is not normalised, a tiny g, values that are not finite, a mesh with its faces reversed."""
+    phase = {"type": "hg", "g": 1e-5}
+    crooked = _t().translate([0.5, 0.5, 0.5]).rotate([0, 0, 3], 30).translate([-0.5, -0.5, -0.5])
+    small = _t().translate([0.5, 0.5, 0.5]).scale(0.01)
+    cases = {
+        "small g": _scene(_homogeneous(1.0, albedo=0.5, phase=phase)),
+        "not finite": _scene(_grid(np.nan)),
+        "wrong inverse": _scene(_grid(1.0, to_world=crooked), small),
+    }
+    for kind, scene in cases.items():
+        assert [d.kind for d in trust(mi.load_dict(scene))] == [kind]
+
+
+def test_no_doubt_about_good_scenes(variant_rgb):
+    """The boundary is the grid's box, rotated with it or not; a small g in a black medium; a camera that has its medium."""
+    turn = _t().rotate([1, 2, 3] / np.sqrt(14), 40)
+    own = {"type": "ref", "id": "fog"}
+    inside = {**_scene(_grid(1.0))["sensor"], "type": "perspective", "to_world": _t(), "medium": own}
+    ball = {"type": "sphere", "bsdf": {"type": "null"}, "interior": own}
+    corner = {**_scene(_grid(1.0))["sensor"], "type": "perspective", "to_world": _t().translate([0.9, 0.9, 0.9])}
+    good = [
+        _scene(_grid(500.0)),
+        _scene(_grid(1.0, to_world=turn), turn.translate([0.5, 0.5, 0.5]).scale(0.5)),
+        _scene(_grid(1.0), _t().translate([0.5, 0.5, 0.5]).scale(3), sensor=_upright_column(_scene(_grid(1)), 3, 3)["sensor"]),
+        _scene(_homogeneous(1.0, phase={"type": "hg", "g": 1e-5})),
+        {"type": "scene", "fog": _homogeneous(1.0), "a": inside, "b": ball},
+        {"type": "scene", "a": corner, "b": {**ball, "interior": _homogeneous(1.0)}},
+    ]
+    for scene in good:
+        assert trust(mi.load_dict(scene)) == []
+
+
+# -- Comparing ------------------------------------------------------------------------------------
+
+
+def test_compare(variant_rgb, tmp_path):
+    """The exact image agrees; 20 standard errors in one pixel, or half of one in all, do not; the text says which."""
+    found = _small(_scene(_grid(1.5)), tmp_path / "r.exr", max_spp=2048)
+    exact = np.full_like(found.mean, np.exp(-1.5))
+    good = compare(exact, found)
+    assert good.agrees and good.beyond == 0 and "agrees" in good.text
+    assert compare(exact, found.path, content_hash=found.identity["scene"]).agrees
+    spot = exact.copy()
+    spot[2, 5, 1] += 20 * np.sqrt(found.variance[2, 5, 1])
+    wrong = compare(spot, found)
+    assert not wrong.agrees and wrong.worst == (2, 5, 1) and "row 2, column 5, channel 1" in wrong.text
+    shifted = compare(exact + found.standard_error, found)
+    assert not shifted.agrees and shifted.beyond == 0 and shifted.bias.low > 0
+    noisy = compare(spot, found, variance=400 * found.variance)
+    assert noisy.agrees
+
+
+def test_compare_where_nothing_was_seen(variant_rgb, tmp_path):
+    """T = exp(-14) was never seen in 256 samples: with the size of a sample that is no contradiction, without it is."""
+    found = _small(_scene(_grid(14.0)), tmp_path / "r.exr")
+    exact = np.full_like(found.mean, np.exp(-14.0))
+    assert not compare(exact, found).agrees
+    assert compare(exact, found, samples_seen=1.0).agrees
+
+
+def test_compare_refusals(variant_rgb, tmp_path):
+    """Another size, another scene."""
+    found = _small(_scene(_grid(1.5)), tmp_path / "r.exr")
+    with pytest.raises(MivolError, match="cannot be compared"):
+        compare(found.mean[:4], found)
+    for given in (found, found.path):
+        with pytest.raises(MivolError, match="another scene"):
+            compare(found.mean, given, content_hash="0" * 64)
