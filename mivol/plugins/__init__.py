@@ -11,8 +11,8 @@ import sys
 
 import mitsuba as mi
 
-ANY_VARIANT: tuple[str, ...] = ()   # order = dependency order
-JIT_VARIANTS: tuple[str, ...] = ()  # mi.ad.integrators.common does not exist in scalar_*
+ANY_VARIANT: tuple[str, ...] = ()  # order = dependency order
+JIT_VARIANTS = ("integrators",)  # mi.ad.integrators.common does not exist in scalar_*
 
 
 def _register() -> None:

@@ -26,7 +26,7 @@ import numpy as np
 from mivol.errors import MivolError
 from mivol.space import check_affine, lattice_from_world
 
-__all__ = ["BLOCK", "Cell", "Lattice", "Nodes", "Segment", "block_bounds", "box_nodes", "clip", "walk"]
+__all__ = ["BLOCK", "Cell", "Lattice", "Nodes", "Segment", "block_bounds", "box_nodes", "clip", "slab", "walk"]
 
 Mask3 = Any
 """Three masks a lane, ``dr.mask_t(mi.Vector3f)``: Mitsuba has no public name for the type."""
@@ -121,22 +121,10 @@ def clip(lattice: Lattice, o: mi.Point3f, d: mi.Vector3f, t_min: mi.Float, t_max
     Returns:
         The stretch inside the box; ``length`` is 0 where there is none.
     """
-    f64, n = mi.Float64, lattice.res[::-1]
-    o, d = [f64(o[a]) for a in range(3)], [f64(d[a]) for a in range(3)]
-    q, v = [], []
-    t0, t1 = f64(t_min), f64(t_max)
-    for a, row in enumerate(lattice.from_world):
-        q.append(dr.fma(row[0], o[0], dr.fma(row[1], o[1], dr.fma(row[2], o[2], row[3]))))
-        v.append(dr.fma(row[0], d[0], dr.fma(row[1], d[1], row[2] * d[2])))
-        parallel = v[a] == 0
-        inv = 1 / dr.select(parallel, 1, v[a])
-        near, far = (-0.5 - q[a]) * inv, (n[a] - 0.5 - q[a]) * inv
-        # A ray parallel to the faces is in or out for ever: 0 * inf would be NaN. In the plane of a face it is out.
-        inside = (q[a] > -0.5) & (q[a] < n[a] - 0.5)
-        t0 = dr.select(parallel, dr.select(inside, t0, dr.inf), dr.maximum(t0, dr.minimum(near, far)))
-        t1 = dr.select(parallel, t1, dr.minimum(t1, dr.maximum(near, far)))
-    # NaN rays fail the comparison and are empty, as is a direction of length 0 (an infinite stretch).
-    hit = (t1 > t0) & dr.isfinite(t1 - t0)
+    n = lattice.res[::-1]
+    high = tuple(k - 0.5 for k in n)
+    q, v, t0, t1 = slab(lattice.from_world, (-0.5,) * 3, high, o, d, mi.Float64(t_min), mi.Float64(t_max))
+    hit = t1 > t0
     t0 = dr.select(hit, t0, 0)
     cell, frac = mi.Vector3i(), mi.Vector3f()
     for a in range(3):
@@ -145,6 +133,37 @@ def clip(lattice: Lattice, o: mi.Point3f, d: mi.Vector3f, t_min: mi.Float, t_max
         cell[a], frac[a] = mi.Int32(low), mi.Float(entry - low)
     direction = mi.Vector3f(mi.Float(v[0]), mi.Float(v[1]), mi.Float(v[2]))
     return Segment(cell, frac, direction, mi.Float(t0), mi.Float(dr.select(hit, t1 - t0, 0)))
+
+
+def slab(
+    rows: list, low: tuple, high: tuple, o: mi.Point3f, d: mi.Vector3f, t0: mi.Float64, t1: mi.Float64
+) -> tuple[list[mi.Float64], list[mi.Float64], mi.Float64, mi.Float64]:
+    """Cut [t0, t1] of a ray to a box, in float64 (the slab test of Kay & Kajiya 1986).
+
+    Args:
+        rows: (3, 4) map from the world to the box's coordinates.
+        low, high: the box there.
+        o, d: world ray.
+        t0, t1: the stretch asked for [length].
+
+    Returns:
+        The ray's origin and direction in the box's coordinates, and the stretch inside; t1 <= t0 where there is none.
+    """
+    f64 = mi.Float64
+    o, d = [f64(o[a]) for a in range(3)], [f64(d[a]) for a in range(3)]
+    q, v = [], []
+    for a, row in enumerate(rows):
+        q.append(dr.fma(row[0], o[0], dr.fma(row[1], o[1], dr.fma(row[2], o[2], row[3]))))
+        v.append(dr.fma(row[0], d[0], dr.fma(row[1], d[1], row[2] * d[2])))
+        parallel = v[a] == 0
+        inv = 1 / dr.select(parallel, 1, v[a])
+        near, far = (low[a] - q[a]) * inv, (high[a] - q[a]) * inv
+        # A ray parallel to the faces is in or out for ever: 0 * inf would be NaN. In the plane of a face it is out.
+        inside = (q[a] > low[a]) & (q[a] < high[a])
+        t0 = dr.select(parallel, dr.select(inside, t0, dr.inf), dr.maximum(t0, dr.minimum(near, far)))
+        t1 = dr.select(parallel, t1, dr.minimum(t1, dr.maximum(near, far)))
+    # NaN rays fail the comparison and are empty, as is a direction of length 0 (an infinite stretch).
+    return q, v, t0, dr.select((t1 > t0) & dr.isfinite(t1 - t0), t1, t0)
 
 
 def block_bounds(values: mi.TensorXf) -> mi.Float:

@@ -36,7 +36,6 @@ class Part:
         name: ``sigma_t``, ``sigma_a`` or ``sigma_s``.
         constant: its value [1/length], ``Float`` or ``Color3f``; None for a grid.
         lattice: the grid [1/length]; None for a constant.
-        clipped: box that a constant does not leave, or None.
     """
 
     name: str
@@ -91,6 +90,11 @@ class Box:
         """The 8 corners, (8, 3)."""
         unit = np.array([[x, y, z, 1] for z in (0, 1) for y in (0, 1) for x in (0, 1)], dtype=np.float64)
         return (unit @ self.to_world.T)[:, :3]
+
+    def contains(self, other: np.ndarray, tolerance: float) -> bool:
+        """Whether another box lies inside this one, to ``tolerance`` of this one's edges."""
+        local = np.c_[Box(other).corners(), np.ones(8)] @ np.linalg.inv(self.to_world).T
+        return bool((local[:, :3] >= -tolerance).all() and (local[:, :3] <= 1 + tolerance).all())
 
     def matches(self, other: np.ndarray, tolerance: float) -> bool:
         """Whether another box has the same corners, to ``tolerance`` of its size."""

@@ -1,0 +1,67 @@
+"""<integrator type="mivol">: exact images of absorbing volumes, and their derivatives."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import mitsuba as mi
+
+from mivol.scene.session import Session
+from mivol.transport.path import Settings
+
+
+class MivolIntegrator(mi.ad.integrators.common.ADIntegrator):
+    """``<integrator type="mivol">``: volumes rendered by exact optical depth.
+
+    Takes the place of ``prbvolpath`` for media that absorb, over ``mivol_medium``, ``homogeneous`` and ``heterogeneous``.
+
+    Parameters:
+        max_depth: 1: emitters seen through media; 2: surfaces lit directly; -1: no limit. Default 6.
+        rr_depth: depth from which roulette may end a path. Default 5.
+        hide_emitters: do not show emitters to the camera. Default false.
+        aovs: comma list of tau, tau.R, tau.G, tau.B, alpha, depth; appended to the colours in the order named.
+    """
+
+    def __init__(self, props: mi.Properties) -> None:
+        super().__init__(props)
+        depth = -1 if self.max_depth == 0xFFFFFFFF else self.max_depth
+        settings = Settings(depth, self.rr_depth, props.get("hide_emitters", False))
+        self.session = Session(settings, props.get("aovs", ""))
+
+    def aov_names(self) -> list[str]:
+        return list(self.session.aovs)
+
+    def render(
+        self,
+        scene: mi.Scene,
+        sensor: int | mi.Sensor = 0,
+        seed: int = 0,
+        spp: int = 0,
+        develop: bool = True,
+        evaluate: bool = True,
+    ) -> mi.TensorXf:
+        return self.session.render(scene, sensor, seed, spp, develop, evaluate)
+
+    def render_forward(
+        self, scene: mi.Scene, params: Any, sensor: int | mi.Sensor = 0, seed: int = 0, spp: int = 0
+    ) -> mi.TensorXf:
+        return self.session.render_forward(scene, sensor, seed, spp)
+
+    def render_backward(
+        self, scene: mi.Scene, params: Any, grad_in: mi.TensorXf, sensor: int | mi.Sensor = 0, seed: int = 0, spp: int = 0
+    ) -> None:
+        self.session.render_backward(scene, grad_in, sensor, seed, spp)
+
+    def sample(
+        self, scene: mi.Scene, sampler: mi.Sampler, ray: mi.Ray3f, medium: mi.Medium = None, active: mi.Bool = True, **_: Any
+    ) -> tuple[mi.Spectrum, mi.Bool, list[mi.Float]]:
+        return self.session.sample(scene, sampler, ray, active)
+
+    def to_string(self) -> str:
+        return repr(self.session)
+
+    def traverse(self, callback: mi.TraversalCallback) -> None:
+        pass
+
+
+mi.register_integrator("mivol", MivolIntegrator)

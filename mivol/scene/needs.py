@@ -1,0 +1,237 @@
+"""What a scene needs: the facts found in it, before anything is rendered.
+
+Conventions. Facts only; what is done about them is a plan's (:mod:`mivol.scene.plan`). Shapes, boundaries and places are
+found once for each scene; values (is the albedo zero, which blocks are empty) are looked at again whenever an array has
+been replaced, and never while a function is being recorded by ``dr.freeze``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mivol.errors import MivolError
+from mivol.transport.lattice import block_bounds
+from mivol.transport.medium import Box, MediumView, box_of_cube, view_medium
+
+__all__ = ["Boundary", "MediumFacts", "Needs", "find_needs"]
+
+
+@dataclass(frozen=True)
+class Boundary:
+    """One medium behind one shape: the medium, its name in the scene, and the box it fills (None: another shape)."""
+
+    medium: mi.Medium
+    name: str
+    shape: str
+    box: Box | None
+
+
+@dataclass(frozen=True)
+class MediumFacts:
+    """What one medium is made of.
+
+    ``resolutions`` are those of its grids (Z, Y, X), none for a homogeneous medium; ``occupied`` the share of their blocks
+    of cells that hold anything; ``tau_max`` bounds the optical depth through its box [1] (None where it is not bounded by
+    a box); ``unread`` tells that values could not be read, because a function is being recorded.
+    """
+
+    name: str
+    kind: str
+    boundary: str
+    extinction: str
+    resolutions: tuple[tuple[int, int, int], ...]
+    is_scattering: bool
+    phase: str
+    occupied: float
+    tau_max: float | None
+    unread: bool = False
+
+
+@dataclass(frozen=True)
+class Needs:
+    """The facts of a scene that a plan is made from.
+
+    Attributes:
+        variant: the active variant.
+        boundaries: media and where they are.
+        media: what each is made of, in the same order.
+        surfaces: kinds of the shapes that are more than boundaries.
+        is_veiled: some surface lets light through undeviated and is more than a boundary.
+        emitters: kinds.
+        start: medium that the sensor names.
+        camera_inside: the camera may be inside the box around a boundary.
+        parameters: keys whose derivatives are asked for.
+        film_samples: pixels times samples of the sensor asked about.
+    """
+
+    variant: str
+    boundaries: tuple[Boundary, ...]
+    media: tuple[MediumFacts, ...]
+    surfaces: tuple[str, ...]
+    is_veiled: bool
+    emitters: tuple[str, ...]
+    start: mi.Medium | None
+    camera_inside: bool
+    parameters: tuple[str, ...]
+    film_samples: int
+
+
+@dataclass
+class Survey:
+    """What does not change while a scene lives: found once, with what was read of each array."""
+
+    boundaries: tuple[Boundary, ...]
+    surfaces: tuple[str, ...]
+    is_veiled: bool
+    emitters: tuple[str, ...]
+    values: dict = field(default_factory=dict)
+
+
+def find_needs(scene: mi.Scene, sensor: mi.Sensor, survey: Survey | None = None) -> Needs:
+    """Ask a scene what it needs.
+
+    Args:
+        scene: a loaded scene.
+        sensor: the one to render from.
+        survey: an earlier survey of the same scene, to save finding what cannot have changed.
+
+    Raises:
+        MivolError: a variant or a medium that mivol does not render.
+    """
+    check_variant(mi.variant())
+    survey = survey or survey_scene(scene)
+    recording = bool(dr.flag(dr.JitFlag.FreezingScope))
+    media = tuple(_facts(b, survey, recording) for b in survey.boundaries)
+    return Needs(
+        variant=mi.variant(),
+        boundaries=survey.boundaries,
+        media=media,
+        surfaces=survey.surfaces,
+        is_veiled=survey.is_veiled,
+        emitters=survey.emitters,
+        start=sensor.get_medium(),
+        camera_inside=_camera_inside(scene, sensor, survey),
+        parameters=tuple(k for k, v in mi.traverse(scene) if dr.is_diff_v(v) and dr.grad_enabled(v)),
+        film_samples=int(np.prod(sensor.film().crop_size())) * sensor.sampler().sample_count(),
+    )
+
+
+def check_variant(variant: str | None) -> None:
+    """Refuse a variant that mivol does not render in.
+
+    Raises:
+        MivolError: none is set, or a scalar, spectral or polarised one.
+    """
+    wanted = "set a JIT variant in rgb or mono with derivatives, such as mi.set_variant('llvm_ad_rgb')"
+    if variant is None:
+        raise MivolError(f"no Mitsuba variant is set; {wanted}.")
+    for word, what in (("scalar", "a scalar"), ("spectral", "a spectral"), ("polarized", "a polarised")):
+        if word in variant:
+            raise MivolError(f"{what} variant ({variant}) is active, which mivol does not render in; {wanted}.")
+
+
+def survey_scene(scene: mi.Scene) -> Survey:
+    """Find the media, surfaces and emitters of a scene."""
+    boundaries, surfaces, veiled = [], [], False
+    shapes = scene.shapes()
+    for index, shape in enumerate(shapes):
+        if shape.is_medium_transition():
+            boundaries.append(_boundary(shape, index, shapes))
+        if not _is_bare(shape):
+            surfaces.append(shape.class_name())
+            veiled |= mi.has_flag(shape.bsdf().flags(), mi.BSDFFlags.Null)
+    kinds = tuple(e.class_name() for e in scene.emitters())
+    return Survey(tuple(boundaries), tuple(surfaces), bool(veiled), kinds)
+
+
+def _is_bare(shape: mi.Shape) -> bool:
+    """Whether a shape is nothing but a boundary."""
+    bsdf = shape.bsdf()
+    return bsdf is not None and int(bsdf.flags()) & int(mi.BSDFFlags.All) == int(mi.BSDFFlags.Null) and not shape.is_emitter()
+
+
+def _boundary(shape: mi.Shape, index: int, shapes: list[mi.Shape]) -> Boundary:
+    inside, outside = shape.interior_medium(), shape.exterior_medium()
+    name = shape.id() or f"shape {index}"
+    if inside is None:
+        raise MivolError(f"{name} has a medium on its outside only; put the medium inside a shape that bounds it.")
+    alone = all(other is shape or not _overlap(shape, other) for other in shapes if other.is_medium_transition())
+    is_box = shape.class_name() == "Cube" and outside is None and _is_bare(shape) and alone
+    return Boundary(inside, name, shape.class_name(), box_of_cube(shape) if is_box else None)
+
+
+def _overlap(a: mi.Shape, b: mi.Shape) -> bool:
+    """Whether the bounding boxes of two shapes share more than a face."""
+    one, two = a.bbox(), b.bbox()
+    low = np.maximum(np.array(one.min), np.array(two.min))
+    high = np.minimum(np.array(one.max), np.array(two.max))
+    # Neighbours may share a face, whose float32 vertices agree to 1e-6 of their size only.
+    return bool((high - low > 1e-6 * np.maximum(np.abs(high), np.abs(low))).all())
+
+
+def _camera_inside(scene: mi.Scene, sensor: mi.Sensor, survey: Survey) -> bool:
+    """Whether the sensor may lie in the bounding box of a boundary that has to be traced."""
+    if all(b.box is not None for b in survey.boundaries):
+        return False
+    eye = sensor.bbox()
+    boxes = [s.bbox() for s in scene.shapes() if s.is_medium_transition()]
+    # A sensor at infinity has no box of its own: its rays start outside the scene.
+    if not eye.valid():
+        return False
+    return any(bool((np.array(eye.max) >= b.min).all() and (np.array(eye.min) <= b.max).all()) for b in boxes)
+
+
+@dataclass
+class _Read:
+    """What was read of an array, and the array, so that its number cannot be given to another one."""
+
+    array: mi.Float
+    bounds: mi.Float | None
+    occupied: float
+    maximum: float
+
+
+def read_values(values: mi.TensorXf, survey: Survey) -> _Read:
+    """Read a grid's bounds once for each state of its array."""
+    array = dr.detach(values.array)
+    key = array.index
+    if key not in survey.values:
+        bounds = block_bounds(values)
+        survey.values = dict(list(survey.values.items())[-15:])
+        host = np.array(bounds)
+        survey.values[key] = _Read(array, bounds, float((host > 0).mean()), float(host.max(initial=0.0)))
+    return survey.values[key]
+
+
+def _facts(boundary: Boundary, survey: Survey, recording: bool) -> MediumFacts:
+    view = view_medium(boundary.medium, boundary.box)
+    grids = [p.lattice for p in view.parts if p.lattice is not None]
+    phase = boundary.medium.phase_function()
+    common = {
+        "name": boundary.name,
+        "kind": boundary.medium.class_name(),
+        "boundary": "a box" if boundary.box is not None else f"a {boundary.shape}, traced",
+        "extinction": "rgb" if view.channels == 3 else "grey",
+        "resolutions": tuple(g.res for g in grids),
+        "phase": phase.class_name() if phase is not None else "none",
+    }
+    if recording:
+        return MediumFacts(**common, is_scattering=False, occupied=1.0, tau_max=None, unread=True)
+    reads = [read_values(g.values, survey) for g in grids]
+    occupied = min((r.occupied for r in reads), default=1.0)
+    return MediumFacts(**common, is_scattering=view.is_scattering(), occupied=occupied, tau_max=_tau_max(boundary, view, reads))
+
+
+def _tau_max(boundary: Boundary, view: MediumView, reads: list[_Read]) -> float | None:
+    """Bound the optical depth through a medium: its largest extinction times the diagonal of its box."""
+    constants = [float(np.max(np.array(dr.detach(p.constant)))) for p in view.parts if p.constant is not None]
+    if boundary.box is None:
+        return None
+    corners = boundary.box.corners()
+    diagonal = max(np.linalg.norm(corners[i] - corners[7 - i]) for i in range(4))
+    scale = float(np.max(np.array(dr.detach(view.scale))))
+    return scale * (sum(constants) + sum(r.maximum for r in reads)) * float(diagonal)

@@ -1,0 +1,205 @@
+"""What is done about a scene's needs: choices, each with its reason, before anything is rendered.
+
+Conventions. A plan is made of :class:`Choice` only; ``explain`` prints it. What cannot be rendered is refused here, with a
+sentence, before a kernel runs.
+"""
+
+from __future__ import annotations
+
+import difflib
+from dataclasses import dataclass
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+import psutil
+
+from mivol.errors import MivolError
+from mivol.scene.needs import Needs, Survey, find_needs, read_values, survey_scene
+from mivol.transport.medium import view_medium
+from mivol.transport.optical_depth import PACKED_LIMIT, gradient_bytes
+from mivol.transport.path import Settings
+from mivol.transport.world import Body, World
+
+__all__ = ["AOVS", "Choice", "Plan", "build_world", "check_aovs", "explain", "make_plan"]
+
+AOVS = ("tau", "tau.R", "tau.G", "tau.B", "alpha", "depth")
+"""Names that ``aovs`` takes: optical depth (of a channel where the extinction is rgb), opacity, and mean distance."""
+
+SKIP_BELOW = 0.6
+"""Share of occupied blocks below which skipping pays (measured: it costs 8 reads a cell in place of 4)."""
+
+PASS_RAYS = {"llvm": 1 << 22, "cuda": 1 << 25, "metal": 1 << 24}
+"""Most rays of one pass: a second or two of work, so that Ctrl-C is heard."""
+
+
+@dataclass(frozen=True)
+class Choice:
+    """One decision: about what, which, and why."""
+
+    about: str
+    choice: str
+    reason: str
+
+
+@dataclass(frozen=True)
+class Plan:
+    """The choices for a scene.
+
+    ``skips`` tells for each medium whether empty blocks are skipped; ``pass_rays`` how many rays a pass may hold;
+    ``gradient_bytes`` what a gradient step takes beyond the rays.
+    """
+
+    choices: tuple[Choice, ...]
+    skips: tuple[bool, ...]
+    pass_rays: int
+    gradient_bytes: int
+
+
+def make_plan(needs: Needs, settings: Settings) -> Plan:
+    """Choose from the facts.
+
+    Raises:
+        MivolError: what is asked for is not there yet (a medium that scatters, at depth 2 or more), or a gradient step
+            would not fit into memory.
+    """
+    _refuse_scattering(needs, settings)
+    choices = [_transport(needs, settings), _tracing(needs), _channels(needs)]
+    skips = tuple(bool(m.resolutions) and m.occupied < SKIP_BELOW for m in needs.media)
+    choices += [_skipping(m, skip) for m, skip in zip(needs.media, skips, strict=True) if m.resolutions]
+    pass_rays = PASS_RAYS[needs.variant.split("_")[0]]
+    passes = -(-needs.film_samples // pass_rays)
+    choices.append(
+        Choice("passes", f"{passes} of at most {pass_rays} rays", f"{needs.film_samples} samples; a pass ends within seconds")
+    )
+    memory, choice = _gradient(needs)
+    choices.append(choice)
+    return Plan(tuple(choices), skips, pass_rays, memory)
+
+
+def check_aovs(names: str) -> tuple[str, ...]:
+    """Split a comma list of AOVs.
+
+    Raises:
+        MivolError: a name that is not in :data:`AOVS`.
+    """
+    asked = tuple(n.strip() for n in names.split(",") if n.strip())
+    for name in asked:
+        if name not in AOVS:
+            near = difflib.get_close_matches(name, AOVS, 1, 0.0)[0]
+            raise MivolError(f"aovs asks for {name!r}; mivol has {', '.join(AOVS)} (did you mean {near!r}?).")
+    return asked
+
+
+def _refuse_scattering(needs: Needs, settings: Settings) -> None:
+    for medium in needs.media:
+        if medium.is_scattering and settings.max_depth not in (0, 1):
+            raise MivolError(
+                f"the medium in {medium.name} scatters (its albedo is above 0) and max_depth is {settings.max_depth}; mivol "
+                "renders absorption so far: set max_depth to 1 (what is seen through the medium) or the albedo to 0."
+            )
+
+
+def _transport(needs: Needs, settings: Settings) -> Choice:
+    if not needs.media:
+        return Choice("media", "none", "no shape bounds a medium")
+    unread = any(m.unread for m in needs.media)
+    why = "albedo 0" if not any(m.is_scattering for m in needs.media) else "max_depth 1 sees no scattered light"
+    if unread:
+        why = "values cannot be read while dr.freeze records; absorption was promised by max_depth or by an earlier render"
+    what = "exact optical depth; no phase function, no light sampling in media, no albedo look-up"
+    return Choice("media", what, why)
+
+
+def _tracing(needs: Needs) -> Choice:
+    traced = [m.name for m, b in zip(needs.media, needs.boundaries, strict=True) if b.box is None]
+    if needs.surfaces:
+        return Choice("acceleration structure", "traced", f"surfaces may stop a ray: {', '.join(sorted(set(needs.surfaces)))}")
+    if traced:
+        return Choice("acceleration structure", "traced", f"not a box, or not alone in its place: {', '.join(traced)}")
+    return Choice("acceleration structure", "not traced", "every shape is the box of a medium: slab tests in float64")
+
+
+def _channels(needs: Needs) -> Choice:
+    rgb = [m.name for m in needs.media if m.extinction == "rgb"]
+    if rgb:
+        return Choice("channels", "3", f"rgb extinction in {', '.join(rgb)}")
+    return Choice("channels", "1", "every extinction is grey")
+
+
+def _skipping(medium, skip: bool) -> Choice:
+    share = f"{medium.occupied:.0%} of its blocks hold anything"
+    return Choice(f"empty space in {medium.name}", "skipped" if skip else "walked", share)
+
+
+def _gradient(needs: Needs) -> tuple[int, Choice]:
+    memory, ways = 0, set()
+    for medium in needs.media:
+        channels = 3 if medium.extinction == "rgb" else 1
+        for z, y, x in medium.resolutions:
+            packed = gradient_bytes((z, y, x), channels)
+            fits = needs.variant.startswith("llvm") and packed <= PACKED_LIMIT
+            memory += (packed if fits else 0) + 8 * z * y * x * channels
+            ways.add("packed corners, one copy a thread" if fits else "added to the nodes")
+    free = psutil.virtual_memory().available
+    if needs.parameters and needs.variant.startswith("llvm") and memory > free:
+        raise MivolError(
+            f"a gradient step would take {memory / 2**30:.1f} GiB and {free / 2**30:.1f} GiB are free; lower the resolution "
+            "of the grids."
+        )
+    asked = ", ".join(needs.parameters) or "none asked for yet"
+    what = f"{memory / 2**20:.1f} MiB beyond the rays ({'; '.join(sorted(ways)) or 'no grid'})"
+    return memory, Choice("gradient step", what, f"parameters: {asked}")
+
+
+def build_world(needs: Needs, plan: Plan, settings: Settings, survey: Survey) -> World:
+    """Build the media that transport walks through, as planned."""
+    bodies = []
+    for boundary, skip in zip(needs.boundaries, plan.skips, strict=True):
+        view = view_medium(boundary.medium, boundary.box)
+        for part in view.parts:
+            if skip and part.lattice is not None:
+                part.lattice.bounds = read_values(part.lattice.values, survey).bounds
+        bodies.append(Body(view, boundary.box))
+    return World(
+        bodies,
+        has_surfaces=bool(needs.surfaces),
+        scatters=bool(needs.surfaces) and settings.max_depth not in (0, 1),
+        is_veiled=needs.is_veiled,
+        start=needs.start,
+        locates=needs.camera_inside and needs.start is None,
+    )
+
+
+def explain(scene: mi.Scene | str | Path, max_depth: int = 6, sensor: int = 0) -> str:
+    """Say what a scene needs and what will be done about it, before anything is rendered.
+
+    Args:
+        scene: a loaded scene, or the path of its XML.
+        max_depth: of the integrator asked about.
+        sensor: index of the sensor asked about.
+
+    Raises:
+        MivolError: as :func:`make_plan`.
+    """
+    loaded = scene if isinstance(scene, mi.Scene) else mi.load_file(str(scene))
+    needs = find_needs(loaded, loaded.sensors()[sensor], survey_scene(loaded))
+    plan = make_plan(needs, Settings(max_depth=max_depth))
+    lines = ["facts"]
+    for m in needs.media:
+        grids = ", ".join("x".join(map(str, r)) for r in m.resolutions) or "homogeneous"
+        scatters = "scatters" if m.is_scattering else "albedo 0"
+        tau = "" if m.tau_max is None else f", optical depth at most {m.tau_max:.3g}"
+        lines.append(
+            f"  medium    {m.name}: {m.kind} in {m.boundary}, {m.extinction} extinction, {grids}, {scatters}, {m.phase}{tau}"
+        )
+    lines += [
+        f"  surfaces  {', '.join(needs.surfaces) or 'none'}",
+        f"  emitters  {', '.join(needs.emitters) or 'none'}",
+        f"  camera    {'may be inside a medium' if needs.start or needs.camera_inside else 'in no traced boundary'}",
+        f"  variant   {needs.variant}, {dr.thread_count()} threads",
+        "plan",
+    ]
+    width = max(len(c.about) for c in plan.choices)
+    lines += [f"  {c.about:<{width}}  {c.choice}\n  {'':<{width}}    because {c.reason}" for c in plan.choices]
+    return "\n".join(lines)

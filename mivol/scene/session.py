@@ -1,0 +1,139 @@
+"""A render from the question to the image: a scene's needs, the plan, the walk, the film, and the way back.
+
+Conventions. A session belongs to one integrator. It keeps the survey of the scene it saw last and nothing else, so that the
+same integrator may be used on one scene after the other.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from mivol.errors import MivolError
+from mivol.scene.needs import Survey, find_needs, survey_scene
+from mivol.scene.plan import Plan, build_world, check_aovs, make_plan
+from mivol.transport.film import Rays, adjoint_rays, record
+from mivol.transport.path import Settings, walk_path
+from mivol.transport.score import Adjoint, Primal, Tangent
+from mivol.transport.world import World
+
+__all__ = ["Session"]
+
+
+@dataclass
+class _Seen:
+    """A scene and its survey."""
+
+    scene: mi.Scene
+    survey: Survey
+
+
+class Session:
+    """Renders scenes with one set of settings.
+
+    Args:
+        settings: depth, roulette, hidden emitters.
+        aovs: comma list of the names in :data:`mivol.scene.plan.AOVS`.
+
+    Raises:
+        MivolError: an unknown AOV.
+    """
+
+    def __init__(self, settings: Settings, aovs: str = "") -> None:
+        self.settings = settings
+        self.aovs = check_aovs(aovs)
+        self._seen: _Seen | None = None
+
+    def __repr__(self) -> str:
+        s = self.settings
+        return f"mivol[max_depth={s.max_depth}, rr_depth={s.rr_depth}, aovs={','.join(self.aovs)}]"
+
+    def render(
+        self, scene: mi.Scene, sensor: int | mi.Sensor, seed: int, spp: int, develop: bool = True, evaluate: bool = True
+    ) -> mi.TensorXf:
+        """Render an image (height, width, colours + AOVs).
+
+        Raises:
+            MivolError: what the plan refuses, or ``develop`` false.
+        """
+        if not develop:
+            raise MivolError("develop=False was asked for; mivol returns the developed image: leave it at True.")
+        sensor = _sensor(scene, sensor)
+        with dr.suspend_grad():
+            world, plan = self._open(scene, sensor)
+            image = record(sensor, seed, spp, plan.pass_rays, self.aovs, lambda rays: self._primal(scene, world, rays))
+        if evaluate:
+            dr.eval(image)
+        return image
+
+    def render_forward(self, scene: mi.Scene, sensor: int | mi.Sensor, seed: int, spp: int) -> mi.TensorXf:
+        """Render the derivative of an image along the gradients that were set on the parameters."""
+        sensor = _sensor(scene, sensor)
+        with dr.suspend_grad():
+            with dr.resume_grad():
+                world, plan = self._open(scene, sensor)
+                world.start_tangent()
+            return record(sensor, seed, spp, plan.pass_rays, self.aovs, lambda rays: self._tangent(scene, world, rays))
+
+    def render_backward(self, scene: mi.Scene, grad_in: mi.TensorXf, sensor: int | mi.Sensor, seed: int, spp: int) -> None:
+        """Add the derivatives of an image, weighted by ``grad_in``, to the gradients of the parameters.
+
+        Cost: a render and its replay; memory independent of the samples, beyond those of a pass.
+        """
+        sensor = _sensor(scene, sensor)
+        with dr.suspend_grad():
+            with dr.resume_grad():
+                world, plan = self._open(scene, sensor)
+            world.start_gradients()
+            for rays, dL, daovs in adjoint_rays(sensor, seed, spp, plan.pass_rays, self.aovs, grad_in):
+                self._replay(scene, world, rays, dL, daovs)
+                dr.eval()
+            with dr.resume_grad():
+                world.push_gradients()
+
+    def sample(self, scene: mi.Scene, sampler: mi.Sampler, ray: mi.Ray3f, active: mi.Bool) -> tuple:
+        """Radiance along given rays, for integrators that nest this one."""
+        with dr.suspend_grad():
+            world, _ = self._open(scene, scene.sensors()[0])
+            score, valid = walk_path(scene, world, self.settings, sampler, ray, Primal(_black(ray)), active)
+            return score.L, valid, self._aovs(scene, world, ray)
+
+    def _open(self, scene: mi.Scene, sensor: mi.Sensor) -> tuple[World, Plan]:
+        """Ask, plan, and build the media."""
+        if self._seen is None or self._seen.scene is not scene:
+            self._seen = _Seen(scene, survey_scene(scene))
+        survey = self._seen.survey
+        needs = find_needs(scene, sensor, survey)
+        plan = make_plan(needs, self.settings)
+        return build_world(needs, plan, self.settings, survey), plan
+
+    def _primal(self, scene: mi.Scene, world: World, rays: Rays) -> tuple:
+        score, valid = walk_path(scene, world, self.settings, rays.sampler, rays.ray, Primal(_black(rays.ray)))
+        return score.L, valid, self._aovs(scene, world, rays.ray)
+
+    def _tangent(self, scene: mi.Scene, world: World, rays: Rays) -> tuple:
+        black = _black(rays.ray)
+        score, _ = walk_path(scene, world, self.settings, rays.sampler, rays.ray, Tangent(black, black, black))
+        return score.dL, dr.full(mi.Bool, False, dr.width(black)), self._aov_tangents(scene, world, rays.ray)
+
+    def _replay(self, scene: mi.Scene, world: World, rays: Rays, dL: mi.Spectrum, daovs: list[mi.Float]) -> None:
+        again = rays.sampler.clone()
+        score, _ = walk_path(scene, world, self.settings, rays.sampler, rays.ray, Primal(_black(rays.ray)))
+        dr.eval(score.L)
+        walk_path(scene, world, self.settings, again, rays.ray, Adjoint(score.L, dL))
+
+    def _aovs(self, scene: mi.Scene, world: World, ray: mi.Ray3f) -> list[mi.Float]:
+        return []
+
+    def _aov_tangents(self, scene: mi.Scene, world: World, ray: mi.Ray3f) -> list[mi.Float]:
+        return []
+
+
+def _sensor(scene: mi.Scene, sensor: int | mi.Sensor) -> mi.Sensor:
+    return scene.sensors()[sensor] if isinstance(sensor, int) else sensor
+
+
+def _black(ray: mi.Ray3f) -> mi.Spectrum:
+    return dr.zeros(mi.Spectrum, dr.width(ray))

@@ -1,0 +1,209 @@
+r"""From samples to pixels and back: the rays of a sensor, their sums on a film, and the transpose of both.
+
+.. math:: I_p = \frac{\sum_s w_{ps} L_s}{\sum_s w_{ps}}
+
+Conventions. The samples of a render are split into passes of at most ``pass_rays`` rays; a film gathers them all before it
+divides by its weights, so the image does not depend on the split but for the order of sums, and the 2^32 samples of one
+launch are no limit. The samples of a sampler that stratifies stay stratified over all passes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from mivol.errors import MivolError
+
+__all__ = ["Rays", "adjoint_rays", "film_passes", "record"]
+
+
+@dataclass
+class Rays:
+    """The camera rays of one pass.
+
+    Attributes:
+        sampler: what the pass draws its numbers from.
+        ray: world space.
+        weight: the sensor's importance.
+        position: where the sample falls on the film [pixel].
+    """
+
+    sampler: mi.Sampler
+    ray: mi.RayDifferential3f
+    weight: mi.Spectrum
+    position: mi.Point2f
+
+
+Sample = Callable[[Rays], tuple[mi.Spectrum, mi.Bool, list[mi.Float]]]
+"""What rays carry: radiance, whether the film's alpha sees something, and the AOVs."""
+
+
+def film_passes(sensor: mi.Sensor, seed: int, spp: int, pass_rays: int) -> Iterator[Rays]:
+    """Generate the rays of a render, pass by pass.
+
+    Args:
+        sensor: its film, filter, crop and sampler are used as they are.
+        seed: of the sampler.
+        spp: samples a pixel; 0 for the sampler's own count.
+        pass_rays: most rays of a pass.
+
+    Raises:
+        MivolError: one sample a pixel is more than a launch can hold (2^32).
+    """
+    sampler, pixels, per_pass = _prepare(sensor, spp, pass_rays)
+    count = sampler.sample_count() // per_pass
+    sampler.set_samples_per_wavefront(per_pass)
+    sampler.seed(seed, pixels * per_pass)
+    for index in range(count):
+        yield _camera_rays(sensor, sampler, pixels * per_pass, per_pass)
+        if index + 1 < count:
+            sampler.advance()
+            sampler.schedule_state()
+            dr.eval()
+
+
+def count_passes(sensor: mi.Sensor, spp: int, pass_rays: int) -> int:
+    """Number of passes that :func:`film_passes` makes."""
+    sampler, _, per_pass = _prepare(sensor, spp, pass_rays)
+    return sampler.sample_count() // per_pass
+
+
+def _prepare(sensor: mi.Sensor, spp: int, pass_rays: int) -> tuple[mi.Sampler, int, int]:
+    """A sampler of its own, the pixels of the film and the samples of a pixel in one pass."""
+    sampler = sensor.sampler().clone()
+    if spp:
+        sampler.set_sample_count(spp)
+    width, height = _sampled_size(sensor.film())
+    pixels = width * height
+    if pixels > 2**32:
+        raise MivolError(f"a film of {width}x{height} pixels was asked for; a launch holds 2^32: render crops of it.")
+    spp = sampler.sample_count()
+    room = max(1, pass_rays // pixels)
+    return sampler, pixels, max(d for d in range(1, min(room, spp) + 1) if spp % d == 0)
+
+
+def _sampled_size(film: mi.Film) -> tuple[int, int]:
+    """Pixels that are sampled: the crop, and the border that a wide filter may ask for."""
+    border = 2 * film.rfilter().border_size() if film.sample_border() else 0
+    width, height = film.crop_size()
+    return int(width) + border, int(height) + border
+
+
+def _camera_rays(sensor: mi.Sensor, sampler: mi.Sampler, count: int, per_pass: int) -> Rays:
+    film = sensor.film()
+    width, _ = _sampled_size(film)
+    index = dr.arange(mi.UInt32, count) // dr.opaque(mi.UInt32, per_pass)
+    pixel = mi.Vector2i(index % width, index // width)
+    if film.sample_border():
+        pixel -= film.rfilter().border_size()
+    pixel += mi.Vector2i(film.crop_offset())
+    position = mi.Vector2f(pixel) + sampler.next_2d()
+
+    scale = dr.rcp(mi.ScalarVector2f(film.crop_size()))
+    offset = -mi.ScalarVector2f(film.crop_offset()) * scale
+    aperture = sampler.next_2d() if sensor.needs_aperture_sample() else mi.Point2f(0)
+    time = mi.Float(sensor.shutter_open())
+    if sensor.shutter_open_time() > 0:
+        time += sampler.next_1d() * sensor.shutter_open_time()
+    ray, weight = sensor.sample_ray_differential(time, mi.Float(0), dr.fma(position, scale, offset), aperture)
+    # A box filter counts a sample for its pixel, wherever in it the sample fell.
+    return Rays(sampler, ray, weight, mi.Vector2f(pixel) if film.rfilter().is_box_filter() else position)
+
+
+def record(sensor: mi.Sensor, seed: int, spp: int, pass_rays: int, names: list[str], sample: Sample) -> mi.TensorXf:
+    """Render an image: send the rays of all passes, and gather what they carry on the sensor's film.
+
+    Args:
+        sensor, seed, spp, pass_rays: as :func:`film_passes`.
+        names: of the AOVs, in the order in which ``sample`` returns them.
+        sample: what rays carry.
+
+    Returns:
+        (height, width, colours + AOVs).
+    """
+    film = sensor.film()
+    film.prepare(names)
+    for rays in film_passes(sensor, seed, spp, pass_rays):
+        L, valid, aovs = sample(rays)
+        block = _new_block(film, rays)
+        _splat(block, film, rays, L * rays.weight, mi.Float(1), dr.select(valid, mi.Float(1), mi.Float(0)), aovs)
+        film.put_block(block)
+        dr.eval(block.tensor())
+        del L, valid, aovs, rays, block
+    return film.develop()
+
+
+def adjoint_rays(
+    sensor: mi.Sensor, seed: int, spp: int, pass_rays: int, names: list[str], grad_image: mi.TensorXf
+) -> Iterator[tuple[Rays, mi.Spectrum, list[mi.Float]]]:
+    """Send a gradient image back through the film, pass by pass.
+
+    Args:
+        sensor, seed, spp, pass_rays, names: as :func:`record`.
+        grad_image: d loss / d image.
+
+    Yields:
+        The rays of a pass, d loss / d L of each, and d loss / d AOV.
+    """
+    film = sensor.film()
+    several = count_passes(sensor, spp, pass_rays) > 1
+    weights = _weights(sensor, seed, spp, pass_rays, names) if several else None
+    for rays in film_passes(sensor, seed, spp, pass_rays):
+        with dr.resume_grad():
+            n = dr.width(rays.ray)
+            L = dr.full(mi.Spectrum, 1, n)
+            aovs = [dr.ones(mi.Float, n) for _ in names]
+            dr.enable_grad(L, aovs)
+            film.prepare(names)
+            block = _new_block(film, rays)
+            # Over several passes a pixel is divided by the weights of all of them: they come from a block of their own.
+            _splat(block, film, rays, L * rays.weight, mi.Float(0 if several else 1), mi.Float(0), aovs)
+            film.put_block(block)
+            if several:
+                film.put_block(weights)
+            image = film.develop()
+            dr.set_grad(image, grad_image)
+            dr.enqueue(dr.ADMode.Backward, image)
+            dr.traverse(dr.ADMode.Backward)
+            dL, daovs = dr.grad(L), [dr.grad(a) for a in aovs]
+        film.clear()
+        dr.eval(dL, daovs)
+        yield rays, dL, daovs
+
+
+def _weights(sensor: mi.Sensor, seed: int, spp: int, pass_rays: int, names: list[str]) -> mi.ImageBlock:
+    """The filter weights of all passes, and nothing else."""
+    film = sensor.film()
+    film.prepare(names)
+    block = None
+    for rays in film_passes(sensor, seed, spp, pass_rays):
+        block = block or _new_block(film, rays)
+        zero = [mi.Float(0) for _ in names]
+        _splat(block, film, rays, mi.Spectrum(0), mi.Float(1), mi.Float(0), zero)
+        dr.eval(block.tensor())
+    return block
+
+
+def _new_block(film: mi.Film, rays: Rays) -> mi.ImageBlock:
+    block = film.create_block()
+    # Coalescing gathers the samples of a pixel before it adds them: worth it from 4 on (Mitsuba's own rule).
+    block.set_coalesce(block.coalesce() and rays.sampler.sample_count() >= 4)
+    return block
+
+
+def _splat(
+    block: mi.ImageBlock, film: mi.Film, rays: Rays, L: mi.Spectrum, weight: mi.Float, alpha: mi.Float, aovs: list[mi.Float]
+) -> None:
+    """Add samples to a block, in the order of channels of the film."""
+    if mi.has_flag(film.flags(), mi.FilmFlags.Special):
+        count = block.channel_count()
+        block.put(rays.position, film.prepare_sample(L, rays.ray.wavelengths, count, weight=weight, alpha=alpha))
+        return
+    colour = mi.Color3f(L.x) if mi.is_monochromatic else L
+    head = [colour.x, colour.y, colour.z]
+    if mi.has_flag(film.flags(), mi.FilmFlags.Alpha):
+        head.append(alpha)
+    block.put(rays.position, [*head, weight, *aovs])

@@ -1,0 +1,305 @@
+r"""The path of light from a camera through absorbing media, surfaces and lamps.
+
+.. math:: L = \sum_k \beta_k\, e^{-\tau_k} \left( w_k L_e + L_d e^{-\tau_{shadow}} \right)
+
+A path runs in straight stretches from one opaque surface to the next; along a stretch the media only take light away, by
+their exact optical depth. At a surface Mitsuba's own BSDFs and emitters shade it: one emitter sample and one BSDF sample,
+combined by the power heuristic (Veach 1997, Eq. 9.13). Whatever is done with a path (its radiance, its tangent, its
+derivatives) is a score; the walk itself is written once.
+
+Conventions. ``max_depth`` counts as in ``volpath``: 1 is emitters seen through media, 2 adds surfaces lit directly, -1 is no
+limit. Boundaries with a ``null`` BSDF do not count. Media that are bounded by boxes are cut by slab tests; the acceleration
+structure is traced only for surfaces and for boundaries of other shapes.
+
+References: radiative backpropagation by replaying paths: Vicini et al. 2021.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from mivol.transport.lattice import slab
+from mivol.transport.world import Body, World
+
+__all__ = ["Path", "Reach", "Settings", "optical_depth_to", "reach", "transmittance", "walk_path"]
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How long a path may be: ``max_depth`` (-1: no limit), roulette from ``rr_depth`` on, ``hide_emitters``."""
+
+    max_depth: int = 6
+    rr_depth: int = 5
+    hide_emitters: bool = False
+
+
+@dataclass
+class Reach:
+    """Where a stretch ends: at an opaque surface (``si`` valid), or at the distance asked for.
+
+    ``t`` is the length of the stretch, ``medium`` what surrounds its end.
+    """
+
+    si: mi.SurfaceInteraction3f
+    t: mi.Float
+    medium: mi.MediumPtr
+
+
+Visit = Callable[[Any, Body, mi.Float, mi.Float, mi.Bool], Any]
+"""``visit(state, body, t0, t1, active) -> state``: what to do with the stretch [t0, t1] of a ray in one medium."""
+
+
+def reach(
+    scene: mi.Scene, world: World, ray: mi.Ray3f, medium: mi.MediumPtr, visit: Visit, state: Any, active: mi.Bool
+) -> tuple[Reach, Any]:
+    """Carry a ray to the first opaque surface or to ``ray.maxt``, visiting each medium on the way.
+
+    Media in boxes come after the others and in no order: a visitor must be a sum.
+
+    Returns:
+        Where the ray ends, and the last state.
+    """
+    if world.traces:
+        end, state = _trace(scene, world, ray, medium, visit, state, active)
+    else:
+        si = dr.zeros(mi.SurfaceInteraction3f, dr.width(ray))
+        si.wi, si.wavelengths, si.time = -ray.d, ray.wavelengths, ray.time
+        end = Reach(si, mi.Float(ray.maxt), medium)
+    return end, visit_boxes(world, ray, end.t, visit, state, active)
+
+
+def visit_boxes(world: World, ray: mi.Ray3f, t_end: mi.Float, visit: Visit, state: Any, active: mi.Bool) -> Any:
+    """Visit the media in boxes between the ray's origin and ``t_end``."""
+    for body in world.boxed:
+        t0, t1 = mi.Float64(0), mi.Float64(t_end)
+        if body.trims:
+            _, _, t0, t1 = slab(body.box.from_world, (0.0,) * 3, (1.0,) * 3, ray.o, ray.d, t0, t1)
+        state = visit(state, body, t0, t1, active & (t1 > t0))
+    return state
+
+
+@dr.syntax
+def _trace(
+    scene: mi.Scene, world: World, ray: mi.Ray3f, medium: mi.MediumPtr, visit: Visit, state: Any, active: mi.Bool
+) -> tuple[Reach, Any]:
+    """Trace through transparent surfaces to the first opaque one; visit the media whose boundary is traced."""
+    # -- State ------------------------------------------------------------------------------------------------------------
+    onward = mi.Ray3f(ray)  #                        the ray from the last boundary on
+    medium = mi.MediumPtr(medium)  #                 what surrounds its origin
+    t = mi.Float(0)  #                               distance of that origin
+    si = dr.zeros(mi.SurfaceInteraction3f, dr.width(ray))
+    si.wi, si.wavelengths, si.time = -ray.d, ray.wavelengths, ray.time
+    going = mi.Bool(active)
+
+    while dr.hint(going, label="to the next opaque surface"):
+        hit = scene.ray_intersect(onward, mi.RayFlags.All, False, going)
+        found = going & hit.is_valid()
+        # From the world point, not as a sum: each spawned ray starts an epsilon further on.
+        t_hit = dr.select(found, dr.maximum(t, dr.dot(hit.p - ray.o, ray.d)), ray.maxt)
+
+        # -- The medium on this side of the surface fills the stretch ---------------------------------------------------------
+        transition = found & hit.is_medium_transition()
+        medium = dr.select(transition, hit.target_medium(-ray.d), medium)
+        state = _visit_traced(world, medium, visit, state, t, t_hit, going)
+
+        # -- Go on through what is transparent ------------------------------------------------------------------------------
+        clear = found & is_transparent(hit)
+        medium = dr.select(clear & transition, hit.target_medium(ray.d), medium)
+        si = dr.select(going, hit, si)
+        t = dr.select(going, t_hit, t)
+        onward = hit.spawn_ray(ray.d)
+        onward.maxt = ray.maxt - t_hit
+        going &= clear
+    return Reach(si, t, medium), state
+
+
+def _visit_traced(
+    world: World, medium: mi.MediumPtr, visit: Visit, state: Any, t0: mi.Float, t1: mi.Float, active: mi.Bool
+) -> Any:
+    for body in world.traced:
+        state = visit(state, body, t0, t1, active & (medium == mi.MediumPtr(body.view.medium)))
+    return state
+
+
+def is_transparent(si: mi.SurfaceInteraction3f) -> mi.Bool:
+    """Whether a surface is nothing but a boundary: a ``null`` BSDF and no emitter."""
+    lobes = si.bsdf().flags() & mi.UInt32(int(mi.BSDFFlags.All))
+    return (lobes == int(mi.BSDFFlags.Null)) & ~si.shape.is_emitter()
+
+
+def add_optical_depth(ray: mi.Ray3f) -> Visit:
+    """The visitor that sums the optical depth of each channel along ``ray``."""
+
+    def visit(tau: list[mi.Float], body: Body, t0: mi.Float, t1: mi.Float, active: mi.Bool) -> list[mi.Float]:
+        return [t + d for t, d in zip(tau, body.optical_depth(ray, t0, t1, len(tau), active), strict=True)]
+
+    return visit
+
+
+def optical_depth_to(
+    scene: mi.Scene, world: World, ray: mi.Ray3f, medium: mi.MediumPtr, active: mi.Bool
+) -> tuple[Reach, list[mi.Float]]:
+    """Optical depth [1] of each channel to the first opaque surface or ``ray.maxt``, and where that is."""
+    zero = [mi.Float(0) for _ in range(world.channels)]
+    return reach(scene, world, ray, medium, add_optical_depth(ray), zero, active)
+
+
+def transmittance(tau: list[mi.Float]) -> mi.Spectrum:
+    """exp(-tau) of each channel."""
+    return mi.Spectrum(*(dr.exp(-t) for t in tau)) if len(tau) == 3 else mi.Spectrum(dr.exp(-tau[0]))
+
+
+@dataclass
+class Path:
+    """The state of a path.
+
+    ``beta`` is the throughput so far, without the stretch ahead; ``pdf`` and ``delta`` tell how its direction was
+    sampled at ``last`` (for the power heuristic); ``valid`` whether the film's alpha sees something.
+    """
+
+    ray: mi.Ray3f
+    medium: mi.MediumPtr
+    beta: mi.Spectrum
+    eta: mi.Float
+    depth: mi.UInt32
+    last: mi.Interaction3f
+    pdf: mi.Float
+    delta: mi.Bool
+    valid: mi.Bool
+    active: mi.Bool
+    score: Any
+    sampler: mi.Sampler
+
+
+def walk_path(
+    scene: mi.Scene, world: World, settings: Settings, sampler: mi.Sampler, ray: mi.Ray3f, score: Any, active: mi.Bool = True
+) -> tuple[Any, mi.Bool]:
+    """Walk a path from the camera and give what it carries to a score.
+
+    Args:
+        scene: Mitsuba's scene: surfaces and emitters.
+        world: its media.
+        settings: depth, roulette, hidden emitters.
+        sampler: three 2D and two 1D numbers a surface; none where no surface scatters.
+        ray: world space, unit direction.
+        score: :mod:`mivol.transport.score`.
+        active: lanes to walk.
+
+    Returns:
+        The score, and whether the film's alpha sees something.
+
+    Bias: none. Variance: none at depth 1 beyond the pixel's own; emitter and BSDF sampling at surfaces.
+    """
+    limit = settings.max_depth if settings.max_depth >= 0 else 0xFFFFFFFF
+    visible = not settings.hide_emitters and scene.environment() is not None
+    n = dr.width(ray)
+    path = Path(
+        ray=mi.Ray3f(ray.o, ray.d, dr.inf, ray.time, ray.wavelengths),
+        medium=world.medium_at(scene, ray),
+        beta=dr.full(mi.Spectrum, 1, n),
+        eta=dr.full(mi.Float, 1, n),
+        depth=dr.zeros(mi.UInt32, n),
+        last=dr.zeros(mi.Interaction3f, n),
+        pdf=dr.full(mi.Float, 1, n),
+        delta=dr.full(mi.Bool, True, n),
+        valid=dr.full(mi.Bool, visible, n),
+        active=mi.Bool(active) & (limit > 0),
+        score=score,
+        sampler=sampler,
+    )
+    if limit <= 1 and not world.is_veiled:
+        path = _see(scene, world, settings, path)[0]
+        return path.score, path.valid
+    (path,) = dr.while_loop(
+        state=(path,),
+        cond=lambda p: p.active,
+        body=lambda p: (_bounce(scene, world, settings, limit, *_see(scene, world, settings, p)),),
+        label="path",
+    )
+    return path.score, path.valid
+
+
+def _see(scene: mi.Scene, world: World, settings: Settings, path: Path) -> tuple[Path, Reach]:
+    """Go to the next opaque surface and add the emission found there."""
+    end, tau = optical_depth_to(scene, world, path.ray, path.medium, path.active)
+    path.beta *= transmittance(tau)
+    path.score = path.score.stretch(scene, world, path.ray, path.medium, end.t, path.active)
+    path.medium = end.medium
+
+    si = end.si
+    shown = path.active & ~((path.depth == 0) & settings.hide_emitters)
+    emitter = si.emitter(scene, shown)
+    direct = mi.DirectionSample3f(scene, si, path.last)
+    lit = ~path.delta & (emitter != None) if world.scatters else mi.Bool(False)
+    pdf_emitter = scene.pdf_emitter_direction(path.last, direct, lit) if world.scatters else mi.Float(0)
+    w_mis = dr.select(path.delta, 1, power_heuristic(path.pdf, pdf_emitter))
+    with dr.resume_grad(when=path.score.attached):
+        Le = emitter.eval(si, shown)
+        path.score = path.score.add(path.beta * w_mis * Le, shown)
+    path.valid |= path.active & si.is_valid()
+    return path, end
+
+
+def _bounce(scene: mi.Scene, world: World, settings: Settings, limit: int, path: Path, end: Reach) -> Path:
+    """Light the surface, and choose where the path goes on."""
+    si, sampler, score = end.si, path.sampler, path.score
+    on_surface = path.active & si.is_valid()
+    bsdf = si.bsdf(path.ray)
+
+    # -- Light from an emitter, dimmed by the media ---------------------------------------------------------------------------
+    may_scatter = on_surface & (path.depth + 1 < limit)
+    lit = may_scatter & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+    direct, weight = scene.sample_emitter_direction(si, sampler.next_2d(lit), False, lit)
+    lit &= direct.pdf > 0
+    shadow = si.spawn_ray_to(direct.p)
+    # spawn_ray_to measures in units of its own direction; the walk wants a unit direction and a length.
+    length = dr.norm(direct.p - shadow.o)
+    shadow.d, shadow.maxt = dr.normalize(direct.p - shadow.o), length
+    shadow_medium = dr.select(si.is_medium_transition(), si.target_medium(shadow.d), path.medium)
+    stop, tau = optical_depth_to(scene, world, shadow, shadow_medium, lit)
+    # The last 1e-3 of the way is the lamp's own surface (Mitsuba's ShadowEpsilon shortens its rays alike).
+    lit &= ~(stop.si.is_valid() & (stop.t < length * (1 - 1e-3)))
+    wo = si.to_local(direct.d)
+    _, pdf_bsdf = bsdf.eval_pdf(mi.BSDFContext(), si, wo, lit)
+    w_mis = dr.select(direct.delta, 1, power_heuristic(direct.pdf, pdf_bsdf))
+    dim = path.beta * transmittance(tau) * w_mis
+    with dr.resume_grad(when=score.attached):
+        f = bsdf.eval(mi.BSDFContext(), si, wo, lit)
+        source = scene.eval_emitter_direction(si, direct, lit) / direct.pdf if score.attached else weight
+        carried = dim * f * dr.select(direct.pdf > 0, source, 0)
+    score = score.shadow(scene, world, shadow, shadow_medium, length, carried, lit)
+
+    # -- The direction the path takes -----------------------------------------------------------------------------------------
+    u1, u2 = sampler.next_1d(on_surface), sampler.next_2d(on_surface)
+    sample, f_over_pdf = bsdf.sample(mi.BSDFContext(), si, u1, u2, on_surface)
+    through = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Null)
+    on = on_surface & (may_scatter | through) & (sample.pdf > 0)
+    score = score.turn(bsdf, si, sample, f_over_pdf, on & ~through)
+    path.beta *= dr.select(on, f_over_pdf, 0)
+    path.eta *= dr.select(on, sample.eta, 1)
+    path.ray = si.spawn_ray(si.to_world(sample.wo))
+    path.medium = dr.select(on & si.is_medium_transition(), si.target_medium(path.ray.d), path.medium)
+    path.last = dr.select(on & ~through, mi.Interaction3f(si), path.last)
+    path.pdf = dr.select(on & ~through, sample.pdf, path.pdf)
+    path.delta = dr.select(on & ~through, mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta), path.delta)
+    path.depth += dr.select(on & ~through, mi.UInt32(1), mi.UInt32(0))
+
+    # -- Roulette ---------------------------------------------------------------------------------------------------------------
+    q = dr.minimum(dr.max(path.beta) * dr.square(path.eta), 0.95)
+    late = path.depth >= settings.rr_depth
+    survives = ~late | (sampler.next_1d(on) < q)
+    path.beta = dr.select(late, path.beta * dr.rcp(dr.maximum(q, 1e-30)), path.beta)
+    path.active = on & survives & dr.any(path.beta != 0)
+    path.score = score
+    return path
+
+
+def power_heuristic(a: mi.Float, b: mi.Float) -> mi.Float:
+    """Weight of a sample of density ``a`` beside ``b``, exponent 2 (Veach 1997, Eq. 9.13)."""
+    # As a ratio: a^2 overflows float32 for a > 1.8e19.
+    return dr.select(a > 0, dr.rcp(1 + dr.square(b / a)), 0)

@@ -1,0 +1,158 @@
+r"""What is done with a path: its radiance, its tangent, or the derivatives of what it carries.
+
+A path tells its score four things, in this order: a ``stretch`` through media, the light it ``add``s, a ``shadow`` ray
+with what it carries, and a ``turn`` at a surface. Three scores answer:
+
+* ``Primal`` sums the light.
+* ``Adjoint`` replays a path whose radiance ``L`` is known. Extinction dims all that lies ahead, so a stretch has
+  dL/dtau = -L_ahead, and ``L`` counts down as the light is passed: in the end it is 0, to rounding.
+* ``Tangent`` carries the derivative of the optical depth along with the path.
+
+Conventions. ``dL`` is d loss / d L in ``Adjoint`` and dL in ``Tangent``. What is added is already multiplied by everything
+in front of it, so no score divides by a transmittance.
+
+References: Vicini et al. 2021 (replay with a running difference); Nimier-David et al. 2020 (adjoint radiance).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from mivol.transport.path import reach, visit_boxes
+from mivol.transport.world import Body, World
+
+__all__ = ["Adjoint", "Primal", "Tangent"]
+
+
+@dataclass
+class Primal:
+    """Sum the light that a path carries."""
+
+    L: mi.Spectrum
+    attached = False
+
+    def stretch(self, scene, world, ray, medium, t_end, active) -> Primal:
+        """Nothing to do: the throughput is dimmed by the path itself."""
+        return self
+
+    def add(self, value: mi.Spectrum, active: mi.Bool) -> Primal:
+        """Light found at the end of a stretch."""
+        return Primal(self.L + dr.select(active, value, 0))
+
+    def shadow(self, scene, world, ray, medium, length, value: mi.Spectrum, active: mi.Bool) -> Primal:
+        """Light that arrived along a shadow ray."""
+        return self.add(value, active)
+
+    def turn(self, bsdf, si, sample, weight, active) -> Primal:
+        """Nothing to do."""
+        return self
+
+
+@dataclass
+class Adjoint:
+    """Replay a path of known radiance and add its derivatives to the gradients of media and surfaces."""
+
+    L: mi.Spectrum
+    dL: mi.Spectrum
+    attached = True
+
+    def stretch(self, scene, world: World, ray, medium, t_end, active) -> Adjoint:
+        """Everything ahead is dimmed by this stretch: d loss / d tau = -dL L."""
+        _backproject(scene, world, ray, medium, t_end, -self.dL * self.L, active)
+        return self
+
+    def add(self, value: mi.Spectrum, active: mi.Bool) -> Adjoint:
+        """Pass the light by; what made it (an emitter's radiance) gets its own derivative."""
+        if dr.grad_enabled(value):
+            dr.backward_from(dr.select(active, self.dL * value, 0))
+        return Adjoint(self.L - dr.select(active, dr.detach(value), 0), self.dL)
+
+    def shadow(self, scene, world: World, ray, medium, length, value: mi.Spectrum, active: mi.Bool) -> Adjoint:
+        """Light that a shadow ray carried is dimmed by the media along it."""
+        _backproject(scene, world, ray, medium, length, -self.dL * dr.detach(value), active)
+        return self.add(value, active)
+
+    def turn(self, bsdf, si, sample, weight, active) -> Adjoint:
+        """All that lies ahead passes through the BSDF: its parameters get dL L f' / f."""
+        with dr.resume_grad():
+            f = bsdf.eval(mi.BSDFContext(), si, sample.wo, active)
+            if dr.grad_enabled(f):
+                pdf_f = dr.detach(f)
+                ratio = dr.select(pdf_f != 0, f * dr.rcp(dr.select(pdf_f != 0, pdf_f, 1)), 0)
+                dr.backward_from(dr.select(active, self.dL * self.L * ratio, 0))
+        return self
+
+
+@dataclass
+class Tangent:
+    """Carry the derivative of the optical depth along a path, and sum that of its radiance."""
+
+    L: mi.Spectrum
+    dL: mi.Spectrum
+    dtau: mi.Spectrum
+    attached = True
+
+    def stretch(self, scene, world: World, ray, medium, t_end, active) -> Tangent:
+        """The stretch dims what lies ahead by its tangent."""
+        return Tangent(self.L, self.dL, self.dtau + _tangent(scene, world, ray, medium, t_end, active))
+
+    def add(self, value: mi.Spectrum, active: mi.Bool) -> Tangent:
+        """Light found at the end of a stretch, and how it changes."""
+        own = dr.forward_to(value) if dr.grad_enabled(value) else 0
+        seen = dr.detach(value)
+        dL = self.dL + dr.select(active, own - self.dtau * seen, 0)
+        return Tangent(self.L + dr.select(active, seen, 0), dL, self.dtau)
+
+    def shadow(self, scene, world: World, ray, medium, length, value: mi.Spectrum, active: mi.Bool) -> Tangent:
+        """As :meth:`add`, with the tangent of the shadow ray besides."""
+        along = _tangent(scene, world, ray, medium, length, active)
+        passed = self.add(value, active)
+        return Tangent(passed.L, passed.dL - dr.select(active, along * dr.detach(value), 0), self.dtau)
+
+    def turn(self, bsdf, si, sample, weight, active) -> Tangent:
+        """A BSDF that changes scales all that lies ahead: a logarithmic tangent, kept with the media's."""
+        with dr.resume_grad():
+            f = bsdf.eval(mi.BSDFContext(), si, sample.wo, active)
+            if not dr.grad_enabled(f):
+                return self
+            df = dr.forward_to(f)
+        f = dr.detach(f)
+        change = dr.select(active & (f != 0), df * dr.rcp(dr.select(f != 0, f, 1)), 0)
+        return Tangent(self.L, self.dL, self.dtau - change)
+
+
+def _backproject(scene, world: World, ray: mi.Ray3f, medium, t_end: mi.Float, weight: mi.Spectrum, active: mi.Bool) -> None:
+    """Add a weight times a stretch to the gradients of its media."""
+    rows = _channels(weight, world.channels)
+
+    def visit(state: mi.Float, body: Body, t0: mi.Float, t1: mi.Float, on: mi.Bool) -> mi.Float:
+        body.backproject(ray, t0, t1, rows, on)
+        return state
+
+    _again(scene, world, ray, medium, t_end, visit, mi.Float(0), active & dr.any(weight != 0))
+
+
+def _tangent(scene, world: World, ray: mi.Ray3f, medium, t_end: mi.Float, active: mi.Bool) -> mi.Spectrum:
+    """Tangent of the optical depth of a stretch."""
+
+    def visit(tau: list[mi.Float], body: Body, t0: mi.Float, t1: mi.Float, on: mi.Bool) -> list[mi.Float]:
+        return [t + d for t, d in zip(tau, body.tangent(ray, t0, t1, len(tau), on), strict=True)]
+
+    tau = _again(scene, world, ray, medium, t_end, visit, [mi.Float(0) for _ in range(world.channels)], active)
+    return mi.Spectrum(*tau) if len(tau) == 3 else mi.Spectrum(tau[0])
+
+
+def _again(scene, world: World, ray: mi.Ray3f, medium, t_end: mi.Float, visit, state, active: mi.Bool):
+    """Visit the media of a stretch whose end is known; only boundaries that have to be traced are traced again."""
+    if not world.traced:
+        return visit_boxes(world, ray, t_end, visit, state, active)
+    return reach(scene, world, ray, medium, visit, state, active)[1]
+
+
+def _channels(value: mi.Spectrum, channels: int) -> list[mi.Float]:
+    """A spectrum as one number for each channel of the extinction; a grey one gets the sum."""
+    parts = [value[c] for c in range(dr.size_v(value))]
+    return parts if len(parts) == channels else [sum(parts[1:], parts[0])]

@@ -1,0 +1,170 @@
+"""The media of a scene in their boundaries: what a stretch of a ray passes through, forwards and backwards.
+
+Conventions. A body is one medium behind one boundary. Where the boundary is a box it is cut by a slab test in float64;
+elsewhere its stretches are found by tracing. A stretch [t0, t1] is given in world lengths along the camera's own ray, never
+from the last boundary on, so that entry points keep the precision of the walk's set-up.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import drjit as dr
+import mitsuba as mi
+
+from mivol.transport.lattice import clip
+from mivol.transport.medium import Box, MediumView, Part
+from mivol.transport.optical_depth import Gradient, backproject_segment, integrate_segment
+
+__all__ = ["Body", "World"]
+
+
+class Body:
+    """One medium in its boundary.
+
+    Attributes:
+        view: the medium's extinction.
+        box: the boundary, where it is a box; None where it has to be traced.
+        trims: whether the boundary is smaller than what lies in it, so that stretches must be cut to it.
+    """
+
+    def __init__(self, view: MediumView, box: Box | None) -> None:
+        self.view, self.box = view, box
+        self.trims = box is not None and not all(_fits(part, box) for part in view.parts)
+        self.gradients: list[Gradient | mi.Float] = []
+        self.tangents: list[mi.Float] = []
+
+    def optical_depth(self, ray: mi.Ray3f, t0: mi.Float, t1: mi.Float, channels: int, active: mi.Bool) -> list[mi.Float]:
+        """Optical depth [1] of each channel over a stretch."""
+        scale = dr.detach(self.view.scale)
+        return self._sum(ray, t0, t1, channels, active, [scale * dr.detach(_values(p)) for p in self.view.parts], skip=True)
+
+    def tangent(self, ray: mi.Ray3f, t0: mi.Float, t1: mi.Float, channels: int, active: mi.Bool) -> list[mi.Float]:
+        """Derivative of the optical depth along the tangent that :meth:`World.start_tangent` took from the parameters."""
+        return self._sum(ray, t0, t1, channels, active, self.tangents, skip=False)
+
+    def _sum(self, ray, t0, t1, channels: int, active: mi.Bool, values: list, skip: bool) -> list[mi.Float]:
+        total = [mi.Float(0) for _ in range(channels)]
+        for part, value in zip(self.view.parts, values, strict=True):
+            if part.lattice is None:
+                length = _length(t0, t1, active)
+                # A ray that never leaves a medium has infinite length: 0 * inf would be NaN.
+                rows = [dr.select(value[c] != 0, value[c] * length, 0) for c in range(part.channels)]
+            else:
+                lattice = part.lattice if skip else replace(part.lattice, bounds=None)
+                rows = integrate_segment(lattice, value, clip(lattice, ray.o, ray.d, t0, t1), active)
+            total = [t + rows[c % part.channels] for c, t in enumerate(total)]
+        return total
+
+    def backproject(self, ray: mi.Ray3f, t0: mi.Float, t1: mi.Float, weight: list[mi.Float], active: mi.Bool) -> None:
+        """Add ``weight`` (d loss / d tau of each channel) times this stretch to the gradients of the parts."""
+        for part, gradient in zip(self.view.parts, self.gradients, strict=True):
+            w = weight if part.channels == len(weight) else [sum(weight)]
+            if part.lattice is None:
+                length = _length(t0, t1, active)
+                for c in range(part.channels):
+                    dr.scatter_add(gradient, dr.select(w[c] != 0, w[c] * length, 0), mi.UInt32(c), active)
+            else:
+                backproject_segment(part.lattice, gradient, w, clip(part.lattice, ray.o, ray.d, t0, t1), active)
+
+
+class World:
+    """The media of a scene, and what of Mitsuba's scene has to be traced.
+
+    Args:
+        bodies: the media.
+        has_surfaces: some shape is more than the boundary of a medium.
+        scatters: light may turn at a surface (``max_depth`` above 1 and surfaces to turn at).
+        is_veiled: some surface lets part of the light through undeviated, so that a path of depth 1 may pass it.
+        start: the medium that the sensor names, or None.
+        locates: the camera may be inside a boundary that has to be traced, and the sensor names no medium.
+    """
+
+    def __init__(
+        self,
+        bodies: list[Body],
+        has_surfaces: bool,
+        scatters: bool = False,
+        is_veiled: bool = False,
+        start: mi.Medium | None = None,
+        locates: bool = False,
+    ) -> None:
+        self.boxed = [b for b in bodies if b.box is not None]
+        self.traced = [b for b in bodies if b.box is None]
+        self.traces = has_surfaces or bool(self.traced)
+        self.channels = max([b.view.channels for b in bodies], default=1)
+        self.scatters, self.is_veiled, self.start, self.locates = scatters, is_veiled, start, locates
+
+    @property
+    def bodies(self) -> list[Body]:
+        """All media."""
+        return self.boxed + self.traced
+
+    def medium_at(self, scene: mi.Scene, ray: mi.Ray3f) -> mi.MediumPtr:
+        """The medium around the origin of camera rays."""
+        n = dr.width(ray)
+        if self.start is not None:
+            return dr.select(dr.full(mi.Bool, True, n), mi.MediumPtr(self.start), None)
+        if self.locates:
+            return _locate(scene, ray)
+        return dr.zeros(mi.MediumPtr, n)
+
+    def start_gradients(self) -> None:
+        """Begin a reverse pass: gradients of zero for each part."""
+        for body in self.bodies:
+            body.gradients = [
+                Gradient.zeros(p.lattice) if p.lattice is not None else dr.zeros(mi.Float, p.channels) for p in body.view.parts
+            ]
+
+    def push_gradients(self) -> None:
+        """End a reverse pass: hand the gradients of the parts to the parameters behind them."""
+        total = mi.Float(0)
+        for body in self.bodies:
+            for part, gradient in zip(body.view.parts, body.gradients, strict=True):
+                flat = gradient.fold() if part.lattice is not None else gradient
+                dr.eval(flat)
+                # The derivative of this product is the gradient, for the values and for the scale alike.
+                total += dr.sum(dr.ravel(body.view.scale * _values(part)) * flat)
+            body.gradients = []
+        if dr.grad_enabled(total):
+            dr.backward(total)
+
+    def start_tangent(self) -> None:
+        """Begin a forward pass: take the tangent of each part from the parameters."""
+        for body in self.bodies:
+            products = [body.view.scale * _values(p) for p in body.view.parts]
+            dr.forward_to(*products)
+            body.tangents = [dr.detach(dr.grad(p)) for p in products]
+            dr.eval(body.tangents)
+
+
+def _values(part: Part) -> mi.Float | mi.Color3f:
+    """Flat node values of a grid, or a constant."""
+    return part.constant if part.lattice is None else part.lattice.values.array
+
+
+def _length(t0: mi.Float, t1: mi.Float, active: mi.Bool) -> mi.Float:
+    return dr.select(active & (t1 > t0), mi.Float(t1 - t0), 0)
+
+
+def _fits(part: Part, box: Box) -> bool:
+    """Whether a grid lies inside its boundary, to the rounding of the boundary's float32 vertices."""
+    if part.lattice is None:
+        return False
+    return box.contains(part.lattice.to_world, 1e-6)
+
+
+@dr.syntax
+def _locate(scene: mi.Scene, ray: mi.Ray3f) -> mi.MediumPtr:
+    """Find the medium around a point: the near side of the first boundary along a ray, through all else."""
+    probe = mi.Ray3f(ray)
+    medium = dr.zeros(mi.MediumPtr, dr.width(ray))
+    going = dr.full(mi.Bool, True, dr.width(ray))
+    while dr.hint(going, label="the medium around the camera"):
+        si = scene.ray_intersect(probe, mi.RayFlags.All, False, going)
+        found = going & si.is_valid()
+        boundary = found & si.is_medium_transition()
+        medium = dr.select(boundary, si.target_medium(-ray.d), medium)
+        probe = si.spawn_ray(ray.d)
+        going = found & ~boundary
+    return medium
