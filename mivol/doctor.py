@@ -45,14 +45,14 @@ try:
     sensor = {"type": "orthographic", "to_world": mi.ScalarTransform4f().look_at([0, 0, 5], [0, 0, 0], [0, 1, 0])
               @ mi.ScalarTransform4f().scale(0.5), "film": {"type": "hdrfilm", "width": 2, "height": 2}}
     scene = mi.load_dict({"type": "scene", "cube": cube, "sensor": sensor, "light": {"type": "constant"},
-                          "integrator": {"type": "INTEGRATOR", "max_depth": 2}})
+                          "integrator": {"type": "volpath", "max_depth": 2}})
     seen = float(dr.mean(mi.render(scene, spp=1024).array)[0])
     # Delta tracking gives 0 or 1 for each of 4096 samples: 6 standard errors of a Bernoulli mean at exp(-2).
     if abs(seen - math.exp(-2)) > 6 * math.sqrt(math.exp(-2) * (1 - math.exp(-2)) / 4096):
         raise RuntimeError(f"a cube of optical depth 2 lets {seen:.4f} of the light through, not {math.exp(-2):.4f}")
 except Exception as error:
     sys.exit(f"MARKER{error}")
-""".replace("INTEGRATOR", "volpath").replace("MARKER", _MARKER)
+""".replace("MARKER", _MARKER)
 
 
 @dataclass(frozen=True)

@@ -54,7 +54,7 @@ _unloadable: dict[Path, str] = {}
 
 _INSTALL = (
     ('pip install "karellen-llvm-core>=19,<24"', "Linux x86-64, no root needed"),
-    ("sudo apt install libllvm19", "Debian 12 or newer, Ubuntu 24.04 or newer"),
+    ("sudo apt install libllvm19", "Debian 12 and 13, Ubuntu 24.04; else the newest libllvmNN that apt knows"),
     ("sudo dnf install llvm-libs", "Fedora, RHEL 9"),
     ("brew install llvm", "macOS"),
     ("conda install -c conda-forge libllvm20", "into the active conda environment"),

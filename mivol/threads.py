@@ -54,6 +54,8 @@ def run_child(
 ) -> subprocess.CompletedProcess[str]:
     """Run Python code in a fresh interpreter (started anew, never forked) and wait for it.
 
+    The working directory is not on the child's path: a file of the user's that is called like a module does not matter.
+
     Args:
         code: what ``python -c`` is given.
         args: become ``sys.argv[1:]`` there.
@@ -67,7 +69,7 @@ def run_child(
     Raises:
         subprocess.TimeoutExpired: the child did not end within ``timeout``.
     """
-    command = [sys.executable, *(["-I", "-S"] if isolated else []), "-c", code, *args]
+    command = [sys.executable, *(["-I", "-S"] if isolated else ["-P"]), "-c", code, *args]
     return subprocess.run(
         command, capture_output=True, text=True, errors="replace", timeout=timeout, env=env, stdin=subprocess.DEVNULL,
         check=False,

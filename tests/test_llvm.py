@@ -230,6 +230,12 @@ def test_the_next_thread_may_follow_one_that_ended(monkeypatch: pytest.MonkeyPat
     threads.check_one_thread()
 
 
+def test_a_child_does_not_import_from_the_working_directory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "numpy.py").write_text("raise SystemExit('a file of the user was imported')")
+    monkeypatch.chdir(tmp_path)
+    assert threads.run_child("import numpy").returncode == 0
+
+
 def test_a_fork_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(threads, "_pid", os.getpid() - 1)
     with pytest.raises(mivol.MivolError, match="forked"):

@@ -15,7 +15,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "mivol"
 MODULES = sorted(path for path in PACKAGE.rglob("*.py") if path.name != "__main__.py")
-IMPORTED_AS = {"pillow": "pil"}
+IMPORTED_AS = {"pillow": "pil", "scikit-image": "skimage"}
 Function = ast.FunctionDef | ast.AsyncFunctionDef
 
 
@@ -77,7 +77,8 @@ def test_all_is_true(path: Path) -> None:
 def test_third_party_imports_are_declared() -> None:
     """Whoever installs the wheel gets what the modules import; torch is the user's own."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    declared = {re.match(r"[A-Za-z0-9_-]+", line)[0].lower() for line in project["dependencies"]}
+    lines = project["dependencies"] + [line for extra in project["optional-dependencies"].values() for line in extra]
+    declared = {re.match(r"[A-Za-z0-9_-]+", line)[0].lower() for line in lines}
     declared = {IMPORTED_AS.get(name, name) for name in declared} | {"drjit"}  # mitsuba pins drjit itself
     imported = set()
     for path in MODULES:
