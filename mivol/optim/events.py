@@ -1,7 +1,7 @@
 """What happens to a fit besides its steps: refine the grid, write a checkpoint, measure the error.
 
-Conventions. An event is asked before each iteration whether it is ``due`` and, if so, applied; what it says goes into
-the log. Events of one iteration are applied in the order given, checkpoints first. EVENTS lists them.
+Conventions. An event is asked before each iteration whether it is ``due`` and, if so, applied; what it says, if anything,
+goes into the log. Events of one iteration are applied in the order given, checkpoints first. EVENTS lists them.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class Event(Strategy, tag="event"):
         raise NotImplementedError
 
     def apply(self, fit: Fit) -> str:
-        """Let it happen; a sentence for the log."""
+        """Let it happen; what a reader of the report must know, or ""."""
         raise NotImplementedError
 
 
@@ -84,7 +84,8 @@ class Checkpoint(Event, tag="checkpoint"):
         return iteration > 0 and iteration % self.every == 0
 
     def apply(self, fit: Fit) -> str:
-        return fit.save()
+        fit.save()
+        return ""
 
 
 class Evaluate(Event, tag="evaluate"):
@@ -96,7 +97,8 @@ class Evaluate(Event, tag="evaluate"):
         return iteration % self.every == 0
 
     def apply(self, fit: Fit) -> str:
-        return fit.evaluate()
+        fit.evaluate()
+        return ""
 
 
 EVENTS = table(Upsample, Checkpoint, Evaluate)

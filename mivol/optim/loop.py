@@ -62,22 +62,19 @@ class Fit:
         self.problem.set(self.run.reals)
         return self.problem.values()
 
-    def evaluate(self) -> str:
+    def evaluate(self) -> None:
         """Measure now, and remember."""
         if self.measure is None:
-            return "nothing to measure"
+            return
         self.problem.set(self.run.reals)
-        errors = self.measure(self.problem)
-        self.measures.append({"iteration": self.next, "seconds": self.seconds, **errors})
-        return ", ".join(f"{name} {value:.4g}" for name, value in errors.items())
+        self.measures.append({"iteration": self.next, "seconds": self.seconds, **self.measure(self.problem)})
 
-    def save(self) -> str:
-        """Write the checkpoint."""
+    def save(self) -> None:
+        """Write the checkpoint, where there is a place for one."""
         if self.path is None:
-            return "no checkpoint file"
+            return
         keep = ("next", "events_done", "history", "measures", "log", "seconds", "fingerprint")
         checkpoint.write(self.path, self.run.pack(), {name: getattr(self, name) for name in keep})
-        return f"checkpoint before iteration {self.next}"
 
     def restore(self) -> None:
         """Continue from the checkpoint.
@@ -151,7 +148,8 @@ def _iterate(fit: Fit, iterations: int, schedule: Schedule, events: list[Event])
     """The events of an iteration, then its step; nothing counts as done before it is."""
     for number, event in enumerate(events):
         if number >= fit.events_done and event.due(fit.next):
-            fit.log.append(f"iteration {fit.next}: {event.apply(fit)}")
+            said = event.apply(fit)
+            fit.log += [f"iteration {fit.next}: {said}"] if said else []
             fit.events_done = number + 1
     started = time.perf_counter()
     loss = fit.run.step(fit.next, schedule.factor(fit.next, iterations))

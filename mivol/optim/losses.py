@@ -51,17 +51,17 @@ class Loss(Strategy, tag="loss"):
 class L1(Loss, tag="l1"):
     """|r|: the median of noisy references; robust against outliers."""
 
-    def penalty(self, image, reference):
+    def penalty(self, image: mi.TensorXf, reference: mi.TensorXf) -> mi.TensorXf:
         return dr.abs(image - reference)
 
 
 class L2(Loss, tag="l2"):
     """r^2: the mean of noisy references; maximum likelihood for equal Gaussian noise."""
 
-    def penalty(self, image, reference):
+    def penalty(self, image: mi.TensorXf, reference: mi.TensorXf) -> mi.TensorXf:
         return dr.square(image - reference)
 
-    def weight(self, reference):
+    def weight(self, reference: mi.TensorXf) -> mi.TensorXf:
         return dr.full(mi.TensorXf, 2.0, reference.shape)
 
 
@@ -75,10 +75,10 @@ class RelativeL2(Loss, tag="relative_l2"):
 
     floor: Annotated[float, of("radiance", "pixels darker than this count as if they were this bright", gt=0)] = 1e-2
 
-    def penalty(self, image, reference):
+    def penalty(self, image: mi.TensorXf, reference: mi.TensorXf) -> mi.TensorXf:
         return dr.square(image - reference) / (dr.square(reference) + self.floor**2)
 
-    def weight(self, reference):
+    def weight(self, reference: mi.TensorXf) -> mi.TensorXf:
         return 2.0 / (dr.square(reference) + self.floor**2)
 
 
@@ -88,9 +88,11 @@ class Huber(Loss, tag="huber"):
     Source: Huber 1964, Annals of Mathematical Statistics 35(1).
     """
 
+    cites = ("huber_1964",)
+
     delta: Annotated[float, of("radiance", "residual at which the parabola goes over into a line", gt=0)] = 0.1
 
-    def penalty(self, image, reference):
+    def penalty(self, image: mi.TensorXf, reference: mi.TensorXf) -> mi.TensorXf:
         size = dr.abs(image - reference)
         return dr.select(size <= self.delta, 0.5 * dr.square(size), self.delta * (size - 0.5 * self.delta))
 
@@ -114,7 +116,7 @@ class Log(Loss, tag="log"):
 
     floor: Annotated[float, of("radiance", "noise of a pixel; below it the log goes on as its tangent", gt=0)] = 1e-3
 
-    def penalty(self, image, reference):
+    def penalty(self, image: mi.TensorXf, reference: mi.TensorXf) -> mi.TensorXf:
         seen = dr.square(dr.maximum(reference, 0.0))
         weight = seen / (seen + self.floor**2)
         return weight * dr.square(log_radiance(image, self.floor) - log_radiance(reference, self.floor))

@@ -15,7 +15,7 @@ with J v and J^T w from forward and reverse mode of the integrator, D = diag(J^T
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import drjit as dr
 import mitsuba as mi
@@ -24,7 +24,8 @@ import numpy as np
 from mivol.optim.problem import PRIMAL, Problem, seed_of
 from mivol.optim.strategy import Strategy, of, table
 
-Reals = dict[str, mi.TensorXf]
+if TYPE_CHECKING:
+    Reals = dict[str, mi.TensorXf]
 
 
 class Run:
@@ -76,6 +77,8 @@ class Adam(Optimiser, tag="adam"):
     ``epsilon`` is taken relative to the largest gradient of the first step: behind dense matter gradients vanish, and
     an absolute 1e-8 would have Adam walk at full pace on rounding noise. Source: Kingma and Ba 2015, Algorithm 1.
     """
+
+    cites = ("kingma_2015",)
 
     beta_1: Annotated[float, of("1", "memory of the gradient", ge=0, lt=1)] = 0.9
     beta_2: Annotated[float, of("1", "memory of its square", ge=0, lt=1)] = 0.999
@@ -207,6 +210,8 @@ class Lbfgs(Optimiser, tag="lbfgs"):
     Source: Nocedal and Wright 2006, Algorithm 7.4 (two loops); bounds: Bertsekas 1982.
     """
 
+    cites = ("liu_1989",)
+
     memory: Annotated[int, of("pair", "steps remembered", ge=1, le=100)] = 10
 
     def begin(self, problem: Problem) -> Run:
@@ -290,6 +295,8 @@ class GaussNewton(Optimiser, tag="gauss_newton"):
     Source: Nocedal and Wright 2006, sections 10.3 and 7.1; D is the separable surrogate of Erdogan and Fessler 1999,
     Eq. 21, exact for media that only absorb, whose J has one sign.
     """
+
+    cites = ("hestenes_1952", "erdogan_1999")
 
     inner: Annotated[int, of("iteration", "conjugate-gradient steps per linearisation", ge=1)] = 6
     damping: Annotated[float, of("1", "first mu, relative to D", ge=0)] = 1e-3

@@ -7,6 +7,7 @@ optimisers step in the reals and project there, so that no loop asks what kind o
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -217,4 +218,6 @@ def find(name: str, params: mi.SceneParameters) -> str:
     keys = list(params.keys())
     if name not in keys:
         raise MivolError(f'the scene has no parameter "{name}": {nearest(name, keys)}')
+    if re.match(r"object_\d+", name):
+        raise MivolError(f'"{name}" begins with a memory address, which changes from run to run: give the object an id.')
     return name

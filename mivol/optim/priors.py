@@ -100,12 +100,14 @@ class TotalVariation(Prior, tag="tv"):
     1996, SIAM J. Sci. Comput. 17(1).
     """
 
+    cites = ("rudin_1992",)
+
     edge: Annotated[float, of("value/length", "gradients below this are smoothed quadratically", gt=0)] = 1e-2
 
-    def energy(self, x, spacing):
+    def energy(self, x: mi.TensorXf, spacing: Spacing) -> mi.Float:
         return dr.mean(dr.sqrt(squared_gradient(x, spacing) + self.edge**2) - self.edge)
 
-    def quadratic(self, x, v, spacing):
+    def quadratic(self, x: mi.TensorXf, v: mi.TensorXf, spacing: Spacing) -> mi.Float:
         return 0.5 * dr.mean(squared_gradient(v, spacing) * dr.rsqrt(squared_gradient(x, spacing) + self.edge**2))
 
 
@@ -115,15 +117,17 @@ class HuberTotalVariation(Prior, tag="huber_tv"):
     Source: Huber 1964 for the function; Fessler and others use it as "edge-preserving" penalty.
     """
 
+    cites = ("rudin_1992", "huber_1964")
+
     edge: Annotated[float, of("value/length", "gradient at which the parabola goes over into a line", gt=0)] = 1e-1
 
-    def energy(self, x, spacing):
+    def energy(self, x: mi.TensorXf, spacing: Spacing) -> mi.Float:
         g2 = squared_gradient(x, spacing)
         # sqrt has no slope at 0: the branch that uses it never sees less than edge^2.
         line = dr.sqrt(dr.maximum(g2, self.edge**2)) - 0.5 * self.edge
         return dr.mean(dr.select(g2 <= self.edge**2, g2 / (2.0 * self.edge), line))
 
-    def quadratic(self, x, v, spacing):
+    def quadratic(self, x: mi.TensorXf, v: mi.TensorXf, spacing: Spacing) -> mi.Float:
         weight = dr.rsqrt(dr.maximum(squared_gradient(x, spacing), self.edge**2))
         return 0.5 * dr.mean(weight * squared_gradient(v, spacing))
 
@@ -131,10 +135,10 @@ class HuberTotalVariation(Prior, tag="huber_tv"):
 class Laplacian(Prior, tag="laplacian"):
     """1/2 (Laplace x)^2: no wiggles; straight ramps cost nothing."""
 
-    def energy(self, x, spacing):
+    def energy(self, x: mi.TensorXf, spacing: Spacing) -> mi.Float:
         return 0.5 * dr.mean(dr.square(laplacian(x, spacing)))
 
-    def quadratic(self, x, v, spacing):
+    def quadratic(self, x: mi.TensorXf, v: mi.TensorXf, spacing: Spacing) -> mi.Float:
         return 0.5 * dr.mean(dr.square(laplacian(v, spacing)))
 
 
@@ -143,10 +147,10 @@ class Sparse(Prior, tag="l1"):
 
     knee: Annotated[float, of("value", "values below this are pulled to 0 quadratically by Gauss-Newton", gt=0)] = 1e-3
 
-    def energy(self, x, spacing):
+    def energy(self, x: mi.TensorXf, spacing: Spacing) -> mi.Float:
         return dr.mean(dr.abs(x.array))
 
-    def quadratic(self, x, v, spacing):
+    def quadratic(self, x: mi.TensorXf, v: mi.TensorXf, spacing: Spacing) -> mi.Float:
         return 0.5 * dr.mean(dr.square(v.array) / dr.maximum(dr.abs(x.array), self.knee))
 
 
@@ -160,10 +164,10 @@ class Bounds(Prior, tag="bounds"):
         """Signed distance to the interval."""
         return dr.maximum(x.array - self.high, 0.0) + dr.minimum(x.array - self.low, 0.0)
 
-    def energy(self, x, spacing):
+    def energy(self, x: mi.TensorXf, spacing: Spacing) -> mi.Float:
         return 0.5 * dr.mean(dr.square(self.outside(x)))
 
-    def quadratic(self, x, v, spacing):
+    def quadratic(self, x: mi.TensorXf, v: mi.TensorXf, spacing: Spacing) -> mi.Float:
         return 0.5 * dr.mean(dr.select(self.outside(x) != 0.0, dr.square(v.array), 0.0))
 
 

@@ -8,7 +8,7 @@ checks and ``mivol optimize --help`` come. Tables of strategies are plain dicts,
 from __future__ import annotations
 
 import difflib
-from typing import Any, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import msgspec
 
@@ -23,17 +23,14 @@ def of(unit: str, meaning: str, **domain: float) -> msgspec.Meta:
 
 
 class Strategy(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="name"):
-    """Base of all named choices."""
+    """Base of all named choices; ``cites`` are keys of ``mivol.report.cite.CITATIONS``."""
+
+    cites: ClassVar[tuple[str, ...]] = ()
 
     @classmethod
     def label(cls) -> str:
         """The name by which files and command lines ask for this strategy."""
         return cls.__struct_config__.tag
-
-    @classmethod
-    def citation(cls) -> str:
-        """What the docstring says after ``Source:``."""
-        return " ".join((cls.__doc__ or "").partition("Source:")[2].split())
 
 
 def table(*strategies: type[S]) -> dict[str, type[S]]:

@@ -1,0 +1,178 @@
+"""The command ``mivol``: each verb is one call per arrow of the scene's way to an image, a volume or a page.
+
+Conventions. What mivol refuses, a full disk and Ctrl-C become one sentence on the error output and an exit code that is
+not 0; only a mistake of the program itself shows a traceback. Slow imports wait for the verb that needs them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import signal
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import mivol
+from mivol.errors import MivolError
+
+USAGE, STOPPED = 2, 130
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run ``mivol`` with these arguments (by default the process's own).
+
+    Returns:
+        Exit code: 0, 1 for what was refused, 2 for wrong arguments, 130 for Ctrl-C and SIGTERM.
+    """
+    arguments = parser().parse_args(argv)
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        return arguments.verb(arguments) or 0
+    except (MivolError, OSError) as error:
+        print(f"mivol: {' '.join(str(error).split())}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print("mivol: stopped; what was finished is kept.", file=sys.stderr)
+        return STOPPED
+
+
+def parser() -> argparse.ArgumentParser:
+    """All verbs and their flags."""
+    top = argparse.ArgumentParser(prog="mivol", description=mivol.__doc__)
+    top.add_argument("--version", action="version", version=f"mivol {mivol.__version__}")
+    verbs = top.add_subparsers(required=True, metavar="verb")
+    for name, (verb, flags) in VERBS.items():
+        sub = verbs.add_parser(
+            name, help=first_line(verb), description=verb.__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+        )
+        sub.set_defaults(verb=verb)
+        flags(sub)
+    return top
+
+
+def first_line(verb: Callable) -> str:
+    """What a verb does, in a line."""
+    return (verb.__doc__ or "").partition("\n")[0]
+
+
+# -- Flags --------------------------------------------------------------------------------------------------------
+
+
+def scene_flags(sub: argparse.ArgumentParser) -> None:
+    """Mitsuba's own flags for what is loaded."""
+    sub.add_argument("scene", type=Path, help="Mitsuba XML")
+    sub.add_argument("-m", "--mode", default="llvm_ad_rgb", help="variant (default: %(default)s)")
+    sub.add_argument("-D", "--define", action="append", default=[], metavar="name=value", help="fill in $name")
+    sub.add_argument("-a", default="", metavar="path;path", help="more folders to look for files in")
+    sub.add_argument("-t", "--threads", type=int, default=0, help="threads of the CPU back end; 0: all cores")
+    sub.add_argument("-v", "--verbose", action="store_true", help="Mitsuba's own messages")
+
+
+def render_flags(sub: argparse.ArgumentParser) -> None:
+    """Mitsuba's own flags for an image."""
+    scene_flags(sub)
+    sub.add_argument("-s", "--sensor", type=int, default=0, help="number of the sensor")
+    sub.add_argument("-o", "--output", type=Path, help="image (.exr or .png); default: the XML's name with .exr")
+
+
+def reference_flags(sub: argparse.ArgumentParser) -> None:
+    """Flags of a reference."""
+    scene_flags(sub)
+    sub.add_argument("-s", "--sensor", type=int, default=0, help="number of the sensor")
+    sub.add_argument("-o", "--output", type=Path, default=Path("references"), help=".exr, or a folder")
+    sub.add_argument("--max-depth", type=int, required=True, help="longest path; -1 is unlimited")
+    sub.add_argument("--target", type=float, help="RMS standard error of the mean to reach [radiance]")
+    sub.add_argument("--spp", type=int, default=1 << 16, help="most samples per pixel (default: %(default)s)")
+    sub.add_argument("--seed", type=int, default=0, help="root of its random numbers")
+    sub.add_argument("--integrator", default="volpath", help="volpath or volpathmis")
+
+
+def optimize_flags(sub: argparse.ArgumentParser) -> None:
+    """Flags of a fit; the settings of the file come from the schema."""
+    from mivol import config
+
+    sub.epilog = "settings of the file:\n  " + "\n  ".join(line.replace("%", "%%") for line in config.describe())
+    sub.add_argument("experiment", type=Path, help="TOML file")
+    sub.add_argument("--set", action="append", default=[], metavar="key=value", help="override a setting of the file")
+    sub.add_argument("-o", "--output", type=Path, help="run folder")
+    sub.add_argument("--resume", action="store_true", help="continue from the run folder's checkpoint")
+
+
+def report_flags(sub: argparse.ArgumentParser) -> None:
+    """Flags of the page."""
+    sub.add_argument("folder", type=Path, help="run folder")
+
+
+def no_flags(sub: argparse.ArgumentParser) -> None:
+    """None."""
+
+
+# -- Verbs --------------------------------------------------------------------------------------------------------
+
+
+def explain(arguments: argparse.Namespace) -> None:
+    """What a scene needs, and how mivol would render it: facts, choices, reasons. Nothing is rendered."""
+    from mivol.cli.rendering import load
+    from mivol.scene import plan
+
+    print(plan.explain(load(arguments).scene))
+
+
+def render(arguments: argparse.Namespace) -> None:
+    """Render a scene to an image, with the flags of the command ``mitsuba``."""
+    from mivol.cli import rendering
+
+    loaded = rendering.load(arguments)
+    path = arguments.output or arguments.scene.with_suffix(".exr")
+    image, names = rendering.render(loaded.scene, arguments.sensor)
+    rendering.write(path, image, names)
+    print(path)
+
+
+def reference(arguments: argparse.Namespace) -> None:
+    """Render a reference with Mitsuba's own path tracer, with its variance, until it is good enough."""
+    from mivol.cli.rendering import load
+    from mivol.validate.reference import render_reference
+
+    if not arguments.output.suffix:
+        arguments.output.mkdir(parents=True, exist_ok=True)
+    result = render_reference(
+        load(arguments), arguments.output, max_depth=arguments.max_depth, target_se=arguments.target,
+        max_spp=arguments.spp, sensor=arguments.sensor, seed=arguments.seed, integrator=arguments.integrator,
+    )  # fmt: skip
+    print(result.text)
+
+
+def optimize(arguments: argparse.Namespace) -> None:
+    """Reconstruct a volume from its views; everything that comes of it lies in the run folder."""
+    from mivol import config
+    from mivol.cli import experiment
+
+    chosen = config.load(arguments.experiment, arguments.set)
+    folder = arguments.output or Path(chosen.output)
+    page = experiment.run(chosen, arguments.experiment.parent, folder, resume=arguments.resume)
+    print(page)
+
+
+def report(arguments: argparse.Namespace) -> None:
+    """Write the page of a run folder again."""
+    from mivol.report.page import write_page
+
+    print(write_page(arguments.folder))
+
+
+def doctor(arguments: argparse.Namespace) -> int:
+    """Say whether a render would work on this machine, and what to do where not."""
+    from mivol.doctor import main
+
+    return main([])
+
+
+VERBS: dict[str, tuple[Callable, Callable]] = {
+    "explain": (explain, scene_flags),
+    "render": (render, render_flags),
+    "reference": (reference, reference_flags),
+    "optimize": (optimize, optimize_flags),
+    "report": (report, report_flags),
+    "doctor": (doctor, no_flags),
+}

@@ -1,0 +1,415 @@
+"""``mivol optimize``: an experiment from its TOML to its run folder, one call per arrow.
+
+Conventions. A run folder holds ``run.json``, ``metrics.jsonl``, ``checkpoint.npz``, ``references/``, ``views/`` (one
+OpenEXR per view with layers: the render, ``reference`` and ``standard_error``; and PNGs), ``volumes/`` (``.vol`` and
+``.npz``), ``curves/`` and ``report.html``. Every file is written whole. References are cached by what they show, so that
+another fit of the same views renders none.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+
+from mivol import config
+from mivol.cli.progress import Display
+from mivol.cli.rendering import set_threads, set_variant
+from mivol.config import Experiment, Files, Sought
+from mivol.errors import MivolError
+from mivol.fields.procedural import make_procedural
+from mivol.files import frame_from_box, layers, read_exr, read_volume, write_exr, write_png, write_volume
+from mivol.optim.events import upsample
+from mivol.optim.loop import Fit, reconstruct
+from mivol.optim.parameters import Parameter, as_tensor, find, like
+from mivol.optim.problem import Problem, View, seed_of
+from mivol.report import figures
+from mivol.report.page import write_page
+from mivol.report.record import Image, RunRecord, Volume, append_metrics, read_metrics, rewind_metrics, write_record
+from mivol.scene.cameras import find_box
+from mivol.scene.load import LoadedScene, load_scene
+from mivol.threads import check_one_thread
+from mivol.validate.reference import read_reference, render_reference
+from mivol.validate.statistics import nrmse, psnr
+
+CHECKPOINT = "checkpoint.npz"
+
+
+@dataclass
+class Seen:
+    """What was seen of the scene.
+
+    Attributes:
+        fitted: views that the fit sees.
+        held_out: views that it does not.
+        standard_errors: of the references, by view, where known.
+    """
+
+    fitted: list[View] = field(default_factory=list)
+    held_out: list[View] = field(default_factory=list)
+    standard_errors: dict[str, np.ndarray] = field(default_factory=dict)
+
+    def digest(self) -> str:
+        """SHA-256 of all references."""
+        h = hashlib.sha256()
+        for view in (*self.fitted, *self.held_out):
+            h.update(np.ascontiguousarray(view.reference).tobytes())
+        return h.hexdigest()
+
+
+def run(chosen: Experiment, base: Path, folder: Path, *, resume: bool = False) -> Path:
+    """Do an experiment.
+
+    Args:
+        chosen: all settings.
+        base: folder that its paths are relative to.
+        folder: run folder, made where it is not there.
+        resume: continue from its checkpoint.
+
+    Returns:
+        The page.
+
+    Raises:
+        MivolError: whatever is wrong with the settings, the scene, the references or the disk.
+        KeyboardInterrupt: stopped; what is there is kept, and ``resume`` continues.
+    """
+    check_one_thread()
+    set_variant(chosen.variant)
+    set_threads(chosen.threads)
+    folder.mkdir(parents=True, exist_ok=True)
+    record = new_record(chosen)
+    write_record(record, folder)
+    try:
+        with stage(record, "scene"):
+            loaded = load_scene(base / chosen.scene.file, chosen.scene.define)
+            truth = make_truth(chosen, base, loaded.scene)
+        with stage(record, "references"):
+            seen = references(chosen, base, folder, loaded, truth)
+        with stage(record, "fit"):
+            fit = solve(chosen, base, folder, loaded, seen, truth, resume)
+        with stage(record, "images and volumes"):
+            write_outputs(chosen, folder, record, fit, seen, truth)
+    except KeyboardInterrupt:
+        record.status = "stopped"
+        write_record(record, folder)
+        raise
+    record.status = "finished"
+    write_record(record, folder)
+    return write_page(folder)
+
+
+@contextmanager
+def stage(record: RunRecord, name: str) -> Iterator[None]:
+    """Time a part of the run."""
+    start = time.perf_counter()
+    try:
+        yield
+    finally:
+        record.timings[name] = time.perf_counter() - start
+
+
+def new_record(chosen: Experiment) -> RunRecord:
+    """The record of a run that begins."""
+    priors = [prior for sought in chosen.parameter for prior in sought.prior]
+    strategies = [chosen.optimiser, chosen.loss, *priors]
+    sought = ", ".join(sought.key for sought in chosen.parameter)
+    return RunRecord.new(
+        chosen.title,
+        method=f"{chosen.fit.integrator}, {chosen.optimiser.label()} on {chosen.loss.label()}; looked for: {sought}",
+        config=config.resolved(chosen),
+        command="mivol optimize",
+        seeds={"fit": chosen.seed, "references": getattr(chosen.reference, "seed", 0)},
+        citations=["mitsuba3", "drjit", *dict.fromkeys(key for s in strategies for key in s.cites)],
+    )
+
+
+# -- What is known ------------------------------------------------------------------------------------------------
+
+
+def make_truth(chosen: Experiment, base: Path, scene: mi.Scene) -> np.ndarray | None:
+    """The true volume (Z, Y, X, C), where the experiment knows one.
+
+    Raises:
+        MivolError: its key is not in the scene, or its file cannot be read.
+    """
+    if chosen.truth is None:
+        return None
+    find(chosen.truth.key, mi.traverse(scene))
+    if chosen.truth.file:
+        return read_volume(base / chosen.truth.file).values
+    wanted = chosen.truth
+    return make_procedural(wanted.procedural, wanted.shape, wanted.seed, wanted.peak)
+
+
+@contextmanager
+def holding(scene: mi.Scene, key: str, values: np.ndarray) -> Iterator[None]:
+    """The scene with other values of one parameter, for a while."""
+    params = mi.traverse(scene)
+    before = type(params[key])(params[key])
+    put(params, key, values)
+    try:
+        yield
+    finally:
+        params[key] = before
+        params.update()
+
+
+def put(params: mi.SceneParameters, key: str, values: np.ndarray) -> None:
+    """Set a parameter, in the type that the scene gives it."""
+    params[key] = like(mi.TensorXf(np.ascontiguousarray(values, dtype=np.float32)), params[key])
+    params.update()
+
+
+def references(chosen: Experiment, base: Path, folder: Path, loaded: LoadedScene, truth: np.ndarray | None) -> Seen:
+    """What was seen from each view: rendered (or found in the cache), or read from files.
+
+    Raises:
+        MivolError: no views, held-out views that are not there, files that do not fit.
+    """
+    sensors = chosen.views.sensors(loaded.scene)
+    check_held_out(chosen.reference.held_out, len(sensors))
+    if isinstance(chosen.reference, Files):
+        return read_files(chosen.reference, base, loaded, sensors)
+    if truth is None:
+        return render_views(chosen, folder, loaded, sensors)
+    with holding(loaded.scene, chosen.truth.key, truth):
+        return render_views(chosen, folder, load_scene(loaded.scene), sensors)
+
+
+def check_held_out(held_out: Sequence[int], count: int) -> None:
+    """Refuse views to hold out that are not there, and a split that leaves nothing to fit.
+
+    Raises:
+        MivolError: with the number.
+    """
+    wrong = next((i for i in held_out if not 0 <= i < count), None)
+    if wrong is not None:
+        raise MivolError(f"found no view {wrong} to hold out, there are {count}: count from 0 in reference.held_out.")
+    if len(set(held_out)) == count:
+        raise MivolError(f"all {count} views are held out, expected one to fit: shorten reference.held_out.")
+
+
+def render_views(chosen: Experiment, folder: Path, loaded: LoadedScene, sensors: Sequence[Any]) -> Seen:
+    """References by Mitsuba's path tracer."""
+    wanted, cache, seen = chosen.reference, folder / "references", Seen()
+    cache.mkdir(exist_ok=True)
+    for index, sensor in enumerate(sensors):
+        made = render_reference(
+            loaded, cache, max_depth=chosen.fit.max_depth, target_se=wanted.standard_error or None,
+            max_spp=wanted.spp, sensor=sensor, seed=wanted.seed,
+        )  # fmt: skip
+        add_view(seen, index, sensor, made.mean, np.sqrt(made.variance), wanted.held_out)
+    return seen
+
+
+def read_files(wanted: Files, base: Path, loaded: LoadedScene, sensors: Sequence[Any]) -> Seen:
+    """References from OpenEXR files; those that mivol wrote must be of the scene that they are said to be of.
+
+    Raises:
+        MivolError: another number of files than views, or a file of another scene.
+    """
+    if len(wanted.paths) != len(sensors):
+        raise MivolError(f"found {len(wanted.paths)} reference files for {len(sensors)} views: give one for each.")
+    of = load_scene(base / wanted.scene).content_hash if wanted.scene else loaded.content_hash
+    seen = Seen()
+    for index, (name, sensor) in enumerate(zip(wanted.paths, sensors, strict=True)):
+        channels, header = read_exr(base / name)
+        if "mivol_reference" in header:
+            made = read_reference(base / name, of)
+            add_view(seen, index, sensor, made.mean, np.sqrt(made.variance), wanted.held_out)
+        else:
+            add_view(seen, index, sensor, layers(channels)[""][..., :3], None, wanted.held_out)
+    return seen
+
+
+def add_view(seen: Seen, index: int, sensor: Any, mean: np.ndarray, error: np.ndarray | None, held_out: Sequence[int]) -> None:
+    """Sort a view in."""
+    camera = mi.load_dict(dict(sensor)) if isinstance(sensor, dict) else sensor
+    view = View(f"view {index}", camera, mi.TensorXf(np.ascontiguousarray(mean, dtype=np.float32)))
+    (seen.held_out if index in held_out else seen.fitted).append(view)
+    if error is not None:
+        seen.standard_errors[view.name] = error
+
+
+# -- The fit ------------------------------------------------------------------------------------------------------
+
+
+def solve(
+    chosen: Experiment, base: Path, folder: Path, loaded: LoadedScene, seen: Seen, truth: np.ndarray | None,
+    resume: bool,
+) -> Fit:  # fmt: skip
+    """Fit the scene to its views; the metrics grow by a line an iteration."""
+    scene, wanted = loaded.scene, chosen.fit
+    problem = Problem(
+        scene,
+        seen.fitted,
+        [make_start(sought, base, scene) for sought in chosen.parameter],
+        mi.load_dict({"type": wanted.integrator, "max_depth": wanted.max_depth}),
+        chosen.loss,
+        wanted.spp,
+        wanted.samples_per_pass,
+        chosen.seed,
+    )
+    with Display(wanted.iterations) as display:
+
+        def observe(fit: Fit) -> None:
+            if not display.begun:
+                rewind_metrics(folder, fit.next - 2)
+            write_metrics(folder, fit)
+            display(fit)
+
+        fit = reconstruct(
+            problem, chosen.optimiser, wanted.iterations, schedule=chosen.schedule, events=chosen.event,
+            measure=Measure(seen.held_out, truth, chosen), observer=observe, path=folder / CHECKPOINT,
+            fingerprint={"scene": loaded.content_hash, "references": seen.digest(), **config.flat(config.resolved(chosen))},
+            resume=resume,
+        )  # fmt: skip
+    fit.save()
+    append_last(folder, fit)
+    return fit
+
+
+def make_start(sought: Sought, base: Path, scene: mi.Scene) -> Parameter:
+    """Put the start of a parameter into the scene.
+
+    Raises:
+        MivolError: no such parameter, a start outside its domain, a file that cannot be read.
+    """
+    params = mi.traverse(scene)
+    find(sought.key, params)
+    if sought.start_file:
+        put(params, sought.key, read_volume(base / sought.start_file).values)
+    elif sought.start is not None:
+        now = as_tensor(params[sought.key])
+        shape = (*sought.shape, now.shape[3]) if sought.shape else now.shape
+        put(params, sought.key, np.full(shape, sought.start))
+    box = find_box(scene)
+    return Parameter(
+        sought.key, sought.unit, sought.domain, sought.map, sought.lr, tuple(np.diff(box, axis=0)[0, ::-1]), sought.prior
+    )
+
+
+@dataclass(frozen=True)
+class Measure:
+    """What a fit does not minimise: PSNR of held-out views, and the error of the volume where the truth is known."""
+
+    held_out: list[View]
+    truth: np.ndarray | None
+    chosen: Experiment
+
+    def __call__(self, problem: Problem) -> dict[str, float]:
+        errors: dict[str, float] = {}
+        if self.held_out:
+            pairs = [(self.render(problem, view, i), np.asarray(view.reference)) for i, view in enumerate(self.held_out)]
+            errors["held_out_psnr"] = float(np.mean([psnr(image, reference) for image, reference in pairs]))
+        if self.truth is not None and self.chosen.truth.key in problem.values():
+            found = problem.values()[self.chosen.truth.key]
+            if tuple(found.shape) != self.truth.shape:
+                found = upsample(found, self.truth.shape[:3])
+            errors["nrmse"] = nrmse(np.asarray(found), self.truth)
+        return errors
+
+    def render(self, problem: Problem, view: View, index: int) -> np.ndarray:
+        """A view of what the scene holds now."""
+        return np.asarray(problem.render(view.sensor, seed_of(problem.seed, 0, index, 2)))
+
+
+def write_metrics(folder: Path, fit: Fit) -> None:
+    """One line for the iteration that has just ended, with what was measured before it."""
+    last = fit.history[-1]
+    measured = fit.measures[-1] if fit.measures and fit.measures[-1]["iteration"] == last["iteration"] else {}
+    append_metrics(folder, last["iteration"], last["seconds"], loss=last["loss"], **errors_of(measured))
+
+
+def errors_of(measured: dict[str, float]) -> dict[str, float]:
+    """The errors of a record of ``Fit.measures``, without when they were measured."""
+    return {name: value for name, value in measured.items() if name not in ("iteration", "seconds")}
+
+
+def append_last(folder: Path, fit: Fit) -> None:
+    """What was measured after the last iteration."""
+    if fit.measures and fit.measures[-1]["iteration"] == fit.next and len(fit.measures[-1]) > 2:
+        append_metrics(folder, **fit.measures[-1])
+
+
+# -- What came of it ----------------------------------------------------------------------------------------------
+
+
+def write_outputs(chosen: Experiment, folder: Path, record: RunRecord, fit: Fit, seen: Seen, truth: np.ndarray | None) -> None:
+    """Images, volumes, curves, results."""
+    for name in ("views", "volumes", "curves"):
+        (folder / name).mkdir(exist_ok=True)
+    record.notes += fit.log + ([f"stopped early: {fit.run.finished}"] if fit.run.finished else [])
+    for view in (*seen.fitted, *seen.held_out):
+        record.images += write_view(folder, fit.problem, view, seen)
+    for sought in chosen.parameter:
+        record.volumes += write_grid(chosen, folder, sought, fit, truth)
+    write_curves(folder)
+    record.results = {
+        **errors_of((fit.measures or [{}])[-1]),
+        "loss": fit.history[-1]["loss"],
+        "iterations": float(fit.next),
+        "views": float(len(seen.fitted)),
+        "fit_seconds": fit.seconds,
+    }
+
+
+def write_view(folder: Path, problem: Problem, view: View, seen: Seen) -> list[Image]:
+    """One view: the render beside its reference."""
+    stem = f"views/{view.name.replace(' ', '_')}"
+    image = np.asarray(problem.render(view.sensor, seed_of(problem.seed, 0, int(view.name.split()[1]), 3)))
+    reference = np.asarray(view.reference)
+    error = seen.standard_errors.get(view.name)
+    parts = {"render": ("", image), "reference": ("reference", reference)}
+    if error is not None:
+        parts["standard error"] = "standard_error", error
+    write_exr(folder / f"{stem}.exr", {key: plane for part in parts.values() for key, plane in named(*part).items()})
+    write_png(folder / f"{stem}.png", image)
+    write_png(folder / f"{stem}_reference.png", reference)
+    held_out = any(view is other for other in seen.held_out)
+    return [
+        Image(path=f"{stem}.exr", role=role, view=view.name, held_out=held_out, layer=layer)
+        for role, (layer, _) in parts.items()
+    ]
+
+
+def named(layer: str, image: np.ndarray) -> dict[str, np.ndarray]:
+    """Channels of an image (height, width, 1 or 3), as an OpenEXR layer."""
+    if image.shape[2] == 3:
+        return {layer: image}
+    return {f"{layer}.Y".lstrip("."): image[..., 0]}
+
+
+def write_grid(chosen: Experiment, folder: Path, sought: Sought, fit: Fit, truth: np.ndarray | None) -> list[Volume]:
+    """A parameter that is a grid, as .vol and .npz; the truth beside it."""
+    value = np.asarray(fit.values()[sought.key])
+    if value.ndim != 4:
+        return []
+    box = find_box(fit.problem.scene)
+    to_world, size = frame_from_box(*box), tuple(float(edge) for edge in box[1] - box[0])
+    quantity = next((word for word in ("sigma_t", "sigma_a", "sigma_s", "albedo") if word in sought.key), "value")
+    grids = {"reconstruction": value}
+    if truth is not None and chosen.truth.key == sought.key:
+        grids["truth"] = truth
+    found = []
+    for role, grid in grids.items():
+        stem = f"volumes/{sought.key.replace('.', '_')}_{role}"
+        write_volume(folder / f"{stem}.vol", grid, to_world)
+        write_volume(folder / f"{stem}.npz", grid, to_world, metadata={"key": sought.key, "unit": sought.unit})
+        found.append(Volume(path=f"{stem}.npz", role=role, quantity=quantity, unit=sought.unit, size=size))
+    return found
+
+
+def write_curves(folder: Path) -> None:
+    """Each number of the metrics against the iteration, as PNG."""
+    rows = read_metrics(folder)
+    names = {name for row in rows for name, value in row.items() if value is not None} - {"iteration", "seconds"}
+    for name in sorted(names):
+        figures.save(figures.plot_curve(rows, name), folder / "curves" / f"{name}.png")

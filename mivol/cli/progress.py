@@ -1,0 +1,57 @@
+"""How a fit is going, on the terminal: loss, error, time left.
+
+Conventions. Drawn from the fit's own thread between iterations; where the error output is no terminal, one line per
+evaluation.
+"""
+
+from __future__ import annotations
+
+import time
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from mivol.optim.loop import Fit
+from mivol.report.record import QUANTITIES, Quantity
+
+
+def figures(fit: Fit) -> str:
+    """The newest loss and errors, in words."""
+    errors = fit.measures[-1] if fit.measures else {}
+    known = {name: value for name, value in errors.items() if name not in ("iteration", "seconds")}
+    words = [f"{QUANTITIES.get(name, Quantity(name)).label} {value:.4g}" for name, value in known.items()]
+    return ", ".join([f"loss {fit.history[-1]['loss']:.4g}", *words])
+
+
+class Display:
+    """Context manager; called after each iteration. ``begun`` once it has been."""
+
+    def __init__(self, iterations: int) -> None:
+        self.console = Console(stderr=True)
+        columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
+        self.bar = Progress(*columns, console=self.console, auto_refresh=False, disable=not self.console.is_terminal)
+        self.iterations = iterations
+        self.said = 0
+        self.drawn = 0.0
+        self.begun = False
+
+    def __enter__(self) -> Display:
+        self.bar.start()
+        self.task = self.bar.add_task("fit", total=self.iterations)
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.bar.refresh()
+        self.bar.stop()
+
+    def __call__(self, fit: Fit) -> None:
+        """Draw, at most ten times a second."""
+        self.begun = True
+        self.bar.update(self.task, completed=fit.next, description=figures(fit))
+        if self.console.is_terminal:
+            if time.monotonic() - self.drawn > 0.1:
+                self.bar.refresh()
+                self.drawn = time.monotonic()
+        elif len(fit.measures) > self.said:
+            self.console.print(f"iteration {fit.next} of {self.iterations}: {figures(fit)}", soft_wrap=True)
+            self.said = len(fit.measures)

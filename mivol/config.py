@@ -1,0 +1,315 @@
+"""An experiment in TOML: every setting with its unit, domain and meaning on one line.
+
+Conventions. Physics stays in Mitsuba's XML; this file says what is looked for, from which views, and how. Unknown keys
+are errors that offer the nearest valid one; the command line (``--set a.b=c``) overrides the file; paths are relative
+to the TOML file. :func:`resolved` is what ``run.json`` keeps.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+import tomllib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any, get_args, get_origin, get_type_hints
+
+import msgspec
+
+from mivol.errors import MivolError
+from mivol.optim.events import Checkpoint, Evaluate, Upsample
+from mivol.optim.losses import L1, L2, Huber, Log, RelativeL2
+from mivol.optim.optimisers import Adam, GaussNewton, Lbfgs
+from mivol.optim.parameters import MAPS
+from mivol.optim.priors import Bounds, HuberTotalVariation, Laplacian, Sparse, TotalVariation
+from mivol.optim.schedules import Constant, Cosine, Exponential, Step
+from mivol.optim.strategy import nearest, of
+from mivol.scene.cameras import Hemisphere, LookAts, Ring, SceneSensors
+
+INFINITY = math.inf
+
+
+class Section(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A table of the file."""
+
+
+class Scene(Section):
+    """What is rendered."""
+
+    file: Annotated[str, of("path", "Mitsuba XML", min_length=1)]
+    define: Annotated[dict[str, str | int | float | bool], of("1", "values of the XML's $parameters")] = {}
+
+
+class Truth(Section):
+    """What the references show, where it is known: a volume that is put into the scene before they are rendered."""
+
+    key: Annotated[str, of("1", "key of mi.traverse(scene)", min_length=1)]
+    file: Annotated[str, of("path", "volume file; empty: procedural")] = ""
+    procedural: Annotated[str, of("1", "key of mivol.fields.procedural.PROCEDURAL; empty: file")] = ""
+    shape: Annotated[tuple[int, int, int], of("voxel", "(Z, Y, X) of a procedural volume")] = (48, 48, 48)
+    seed: Annotated[int, of("1", "which procedural volume", ge=0)] = 0
+    peak: Annotated[float, of("unit of the field", "largest value of a procedural volume", gt=0)] = 1.0
+
+    def __post_init__(self) -> None:
+        if bool(self.file) == bool(self.procedural):
+            raise ValueError("a truth is either a file or procedural: give one of the two")
+
+
+class Rendered(Section, tag_field="source", tag="render"):
+    """References that Mitsuba's own path tracer renders."""
+
+    spp: Annotated[int, of("sample/pixel", "most samples per pixel and view", ge=1)] = 1024
+    standard_error: Annotated[float, of("radiance", "stop earlier at this RMS error of the mean; 0: never", ge=0)] = 0.0
+    seed: Annotated[int, of("1", "root of the references' random numbers", ge=0)] = 1
+    held_out: Annotated[tuple[int, ...], of("view", "views that are compared but not fitted")] = ()
+
+
+class Files(Section, tag_field="source", tag="files"):
+    """References from OpenEXR files, one per view."""
+
+    paths: Annotated[tuple[str, ...], of("path", "files in the order of the views", min_length=1)]
+    scene: Annotated[str, of("path", "XML that they are references of; empty: the scene's")] = ""
+    held_out: Annotated[tuple[int, ...], of("view", "views that are compared but not fitted")] = ()
+
+
+class Sought(Section):
+    """A parameter that is looked for."""
+
+    key: Annotated[str, of("1", "key of mi.traverse(scene)", min_length=1)]
+    unit: Annotated[str, of("1", "unit of the value, for labels")] = "1/length"
+    domain: Annotated[tuple[float, float], of("unit", "smallest and largest value")] = (0.0, INFINITY)
+    map: Annotated[str, of("1", "what the optimiser moves: key of MAPS")] = "identity"
+    lr: Annotated[float, of("unit", "typical change per step, in the map's reals", gt=0)] = 0.1
+    start: Annotated[float | None, of("unit", "constant start; absent: what the scene holds")] = None
+    start_file: Annotated[str, of("path", "volume to start from; empty: start")] = ""
+    shape: Annotated[tuple[int, int, int] | None, of("voxel", "(Z, Y, X) of a constant start")] = None
+    prior: Annotated[
+        tuple[TotalVariation | HuberTotalVariation | Laplacian | Sparse | Bounds, ...], of("1", "what is known before")
+    ] = ()
+
+    def __post_init__(self) -> None:
+        if self.map not in MAPS:
+            raise ValueError(f'unknown map "{self.map}": {nearest(self.map, list(MAPS))}'.rstrip("."))
+
+
+class Fit(Section):
+    """How long and how finely."""
+
+    iterations: Annotated[int, of("iteration", "at most so many", ge=1)] = 100
+    spp: Annotated[int, of("sample/pixel", "samples of an image and of its derivative", ge=1)] = 16
+    samples_per_pass: Annotated[int, of("sample", "most samples in one kernel: Ctrl-C waits for one", ge=1)] = 1 << 20
+    max_depth: Annotated[int, of("1", "as Mitsuba's volpath; -1 is unlimited", ge=-1)] = 6
+    integrator: Annotated[str, of("1", "Mitsuba integrator that differentiates", min_length=1)] = "mivol"
+
+
+class Experiment(Section):
+    """All of ``fit.toml``."""
+
+    title: Annotated[str, of("1", "heading of the report", min_length=1)]
+    scene: Annotated[Scene, of("1", "what is rendered")]
+    parameter: Annotated[tuple[Sought, ...], of("1", "what is looked for", min_length=1)]
+    views: Annotated[Ring | Hemisphere | LookAts | SceneSensors, of("1", "where it is seen from")] = SceneSensors()
+    reference: Annotated[Rendered | Files, of("1", "what was seen")] = Rendered()
+    truth: Annotated[Truth | None, of("1", "what the references show, where known")] = None
+    fit: Annotated[Fit, of("1", "how long and how finely")] = Fit()
+    optimiser: Annotated[Adam | Lbfgs | GaussNewton, of("1", "how to walk downhill")] = Adam()
+    schedule: Annotated[Constant | Cosine | Step | Exponential, of("1", "factor on the learning rate")] = Constant()
+    loss: Annotated[L1 | L2 | RelativeL2 | Huber | Log, of("1", "distance of image and reference")] = L2()
+    event: Annotated[tuple[Upsample | Checkpoint | Evaluate, ...], of("1", "what happens between iterations")] = (
+        Checkpoint(),
+        Evaluate(),
+    )
+    variant: Annotated[str, of("1", "Mitsuba variant", min_length=1)] = "llvm_ad_rgb"
+    seed: Annotated[int, of("1", "root of the fit's random numbers", ge=0)] = 0
+    threads: Annotated[int, of("thread", "threads of the CPU back end; 0: all cores", ge=0)] = 0
+    output: Annotated[str, of("path", "run folder, relative to where the command runs", min_length=1)] = "runs/fit"
+
+
+#: Settings that change how a run is stored or how fast it is, not what comes out.
+NOT_RESULT = ("output", "threads", "title")
+
+
+def load(path: str | Path, changes: Sequence[str] = ()) -> Experiment:
+    """Read an experiment.
+
+    Args:
+        path: TOML file.
+        changes: ``a.b=c`` from the command line; entries of a list by number, ``parameter.0.lr=0.1``.
+
+    Raises:
+        MivolError: no such file, not TOML, an unknown key, a wrong type, or a value outside its domain.
+    """
+    path = Path(path)
+    try:
+        raw = tomllib.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise MivolError(f"found no file {path}: give the path of an experiment in TOML.") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, IsADirectoryError) as error:
+        raise MivolError(f"{path} is not TOML: {error}.") from None
+    for change in changes:
+        apply_change(raw, change)
+    return from_dict(raw, path.name)
+
+
+def from_dict(raw: dict[str, Any], name: str = "experiment") -> Experiment:
+    """An experiment from plain dicts and lists.
+
+    Raises:
+        MivolError: as :func:`load`; ``name`` begins the sentence.
+    """
+    check_keys(raw, Experiment, "", name)
+    try:
+        return msgspec.convert(raw, Experiment)
+    except msgspec.ValidationError as error:
+        raise MivolError(f"{name}: {sentence(raw, str(error))}") from None
+
+
+def resolved(experiment: Experiment) -> dict[str, Any]:
+    """Every setting, defaults included, as plain dicts and lists."""
+    return msgspec.to_builtins(experiment)
+
+
+def flat(tree: Any, prefix: str = "") -> dict[str, Any]:
+    """The same by dotted key, without what does not change the result."""
+    if isinstance(tree, dict | list | tuple) and len(tree):
+        items = tree.items() if isinstance(tree, dict) else enumerate(tree)
+        found: dict[str, Any] = {}
+        for key, value in items:
+            if prefix or key not in NOT_RESULT:
+                found |= flat(value, f"{prefix}.{key}" if prefix else str(key))
+        return found
+    return {prefix: tree}
+
+
+# -- Command line -------------------------------------------------------------------------------------------------
+
+
+def apply_change(raw: dict[str, Any], change: str) -> None:
+    """Put ``a.b=c`` into ``raw``; c is read as TOML where it is TOML, else as text.
+
+    Raises:
+        MivolError: no "=", or a step into something that has no parts.
+    """
+    dotted, equals, text = change.partition("=")
+    if not equals or not dotted.strip():
+        raise MivolError(f'--set "{change}" is no change: write key.of.setting=value.')
+    try:
+        value = tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        value = text
+    *steps, last = dotted.strip().split(".")
+    place: Any = raw
+    for step in steps:
+        place = place.setdefault(step, {}) if isinstance(place, dict) else _entry(place, step, change)
+    if isinstance(place, dict):
+        place[last] = value
+    else:
+        _entry(place, last, change)
+        place[int(last)] = value
+
+
+def _entry(place: Any, step: str, change: str) -> Any:
+    if not isinstance(place, list) or not step.isdigit() or int(step) >= len(place):
+        raise MivolError(f'--set "{change}": "{step}" is not there to change: entries of a list count from 0.')
+    return place[int(step)]
+
+
+# -- What is wrong, in a sentence ---------------------------------------------------------------------------------
+
+
+def check_keys(raw: Any, kind: Any, where: str, name: str) -> None:
+    """Refuse the first key or strategy that the schema does not know, offering the nearest.
+
+    Raises:
+        MivolError: with the dotted key.
+    """
+    struct = struct_of(kind, raw)
+    if isinstance(raw, list):
+        for number, item in enumerate(raw):
+            check_keys(item, entry_kind(kind), f"{where}.{number}", name)
+    if struct is None or not isinstance(raw, dict):
+        return
+    tag = struct.__struct_config__.tag_field
+    _check_tag(raw, tag, {s.__struct_config__.tag: s for s in structs_in(kind)}, where, name)
+    known = list(struct.__struct_fields__)
+    unknown = next((key for key in raw if key not in known and key != tag), None)
+    if unknown is not None:
+        dotted = f"{where}.{unknown}".lstrip(".")
+        raise MivolError(f'{name}: unknown key "{dotted}": {nearest(unknown, [*known, *([tag] if tag else [])])}')
+    hints = get_type_hints(struct)
+    for key, value in raw.items():
+        if key in hints:
+            check_keys(value, hints[key], f"{where}.{key}".lstrip("."), name)
+
+
+def _check_tag(raw: dict[str, Any], tag: str | None, choices: dict[str, type], where: str, name: str) -> None:
+    if tag and raw.get(tag) not in choices:
+        found = raw.get(tag)
+        what = f'"{where}.{tag}" is missing' if found is None else f'{where}.{tag} = "{found}" is unknown'
+        raise MivolError(f"{name}: {what}: {nearest(str(found), list(choices))}")
+
+
+def structs_in(kind: Any) -> list[type]:
+    """The structs that a value of this type may be."""
+    if get_origin(kind) is tuple or isinstance(kind, str):
+        return []
+    if isinstance(kind, type) and issubclass(kind, msgspec.Struct):
+        return [kind]
+    return [struct for part in get_args(kind) for struct in structs_in(part)]
+
+
+def struct_of(kind: Any, raw: Any) -> type | None:
+    """The struct that ``raw`` asks for by its tag; the first possible one where the tag is missing or unknown."""
+    structs = structs_in(kind)
+    if not structs or not isinstance(raw, dict):
+        return None
+    tag = structs[0].__struct_config__.tag_field
+    return next((s for s in structs if tag and s.__struct_config__.tag == raw.get(tag)), structs[0])
+
+
+def entry_kind(kind: Any) -> Any:
+    """The type of the entries of a list type."""
+    if get_origin(kind) is tuple:
+        return get_args(kind)[0]
+    return next((entry_kind(part) for part in get_args(kind) if get_args(part)), Any)
+
+
+def sentence(raw: Any, message: str) -> str:
+    """msgspec's message as: where = found: expected."""
+    what, _, place = message.partition(" - at `$")
+    steps = re.findall(r"\.(\w+)|\[(\d+|\.\.\.)\]", place.rstrip("`"))
+    dotted = ".".join(word or number for word, number in steps)
+    found = raw
+    for word, number in steps:
+        try:
+            found = found[word] if word else found[int(number)]
+        except (KeyError, IndexError, TypeError, ValueError):
+            found = None
+            break
+    if what.startswith("Object missing required field"):
+        missing = f"{dotted}.{what.split('`')[1]}".lstrip(".")
+        return f'the key "{missing}" is missing: give it.'
+    what = f"{what[0].lower()}{what[1:]}".rstrip(".") + "." * (what[-1] != "?")
+    plain = found is not None and not isinstance(found, dict)
+    return f"{dotted or 'the file'}{f' = {found!r}' if plain else ''}: {what}"
+
+
+def describe(kind: type = Experiment, prefix: str = "") -> list[str]:
+    """One line per setting: key, default, unit, meaning; for ``mivol optimize --help``."""
+    lines = []
+    hints = get_type_hints(kind, include_extras=True)
+    for field in msgspec.structs.fields(kind):
+        hint, key = hints[field.name], f"{prefix}{field.name}"
+        meta = getattr(hint, "__metadata__", (of("1", "one of " + ", ".join(map(str, get_args(hint)))),))[0]
+        structs = structs_in(getattr(hint, "__origin__", hint))
+        if len(structs) == 1 and structs[0].__struct_config__.tag_field is None:
+            lines += describe(structs[0], f"{key}.")
+            continue
+        tags = " | ".join(str(s.__struct_config__.tag) for s in structs)
+        default = "" if field.default is msgspec.NODEFAULT or structs else f" = {field.default!r}"
+        unit = meta.extra["unit"]
+        lines.append(f"{key}{default}{f' [{unit}]' if unit != '1' else ''}: {meta.description}{f' ({tags})' * bool(tags)}")
+        for struct in structs:
+            label = struct.__struct_config__.tag
+            lines += describe(struct, f"{key}[{label}]." if label else f"{key}.")
+    return lines
