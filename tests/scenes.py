@@ -119,3 +119,105 @@ def tau_and_row(
     tau = integrate_tau(make_lattice(values, to_world, skip), *to_lanes(o, d), ends, mi.Bool(True))
     dr.backward(dr.sum(tau))
     return np.asarray(dr.detach(tau)), np.asarray(dr.grad(values))[..., 0]
+
+
+# -- Scenes for mi.load_dict -------------------------------------------------------------------------------------------
+
+
+def transform(to_world: np.ndarray) -> mi.ScalarTransform4f:
+    """A 4x4 array as Mitsuba's transform (float32 in the variants used here)."""
+    return mi.ScalarTransform4f(np.asarray(to_world, dtype=np.float32))
+
+
+def grid_volume(kind: str, values: np.ndarray, to_world: np.ndarray = None) -> dict:
+    """A grid as a `gridvolume` or a `mivol_voxels` in the place `to_world` gives the unit cube."""
+    place = transform(np.eye(4) if to_world is None else to_world)
+    if kind == "gridvolume":
+        values = np.asarray(values, dtype=np.float32)
+        return {"type": "gridvolume", "grid": mi.VolumeGrid(values), "raw": True, "to_world": place}
+    return {"type": "mivol_voxels", "data": tensor(values), "to_world": place}
+
+
+def medium(kind: str, sigma_t: object, albedo: object = 0.0, **more: object) -> dict:
+    """A `homogeneous`, `heterogeneous` or `mivol_medium`."""
+    return {"type": kind, "sigma_t": sigma_t, "albedo": albedo, **more}
+
+
+def box_of(interior: dict, to_world: np.ndarray) -> dict:
+    """The unit cube, placed, as an invisible boundary with a medium inside."""
+    half = affine(0.5 * np.eye(3), np.full(3, 0.5))  # Mitsuba's cube is [-1, 1]^3
+    return {
+        "type": "cube",
+        "to_world": transform(np.asarray(to_world) @ half),
+        "bsdf": {"type": "null"},
+        "interior": interior,
+    }
+
+
+def ball_of(interior: dict, centre: np.ndarray, radius: float) -> dict:
+    """A sphere as an invisible boundary with a medium inside."""
+    return {
+        "type": "sphere",
+        "center": list(map(float, centre)),
+        "radius": float(radius),
+        "bsdf": {"type": "null"},
+        "interior": interior,
+    }
+
+
+def film(width: int, height: int) -> dict:
+    """A float32 film with a box filter: a pixel is the mean of its own rays."""
+    return {
+        "type": "hdrfilm",
+        "width": width,
+        "height": height,
+        "pixel_format": "rgb",
+        "component_format": "float32",
+        "rfilter": {"type": "box"},
+        "sample_border": False,
+    }
+
+
+def camera(origin: np.ndarray, target: np.ndarray, res: int = 12, fov: float = 30.0) -> dict:
+    """A perspective camera."""
+    up = [0.0, 0.0, 1.0] if abs(origin[0] - target[0]) + abs(origin[1] - target[1]) > 1e-6 else [0.0, 1.0, 0.0]
+    return {
+        "type": "perspective",
+        "fov": fov,
+        "to_world": mi.ScalarTransform4f().look_at(origin=list(origin), target=list(target), up=up),
+        "film": film(res, res),
+        "sampler": {"type": "independent"},
+    }
+
+
+def pencil(o: np.ndarray, d: np.ndarray) -> dict:
+    """One ray as a sensor of one pixel: nothing is averaged."""
+    return {
+        "type": "radiancemeter",
+        "origin": list(map(float, o)),
+        "direction": list(map(float, d)),
+        "film": film(1, 1),
+        "sampler": {"type": "independent"},
+    }
+
+
+def sky(radiance: float = 1.0) -> dict:
+    """The same radiance from everywhere."""
+    return {"type": "constant", "radiance": {"type": "uniform", "value": radiance}}
+
+
+def render(scene: mi.Scene, integrator: dict | mi.Integrator, spp: int, seed: int = 0, sensor: int = 0) -> np.ndarray:
+    """Image (H, W, C) of a scene by an integrator."""
+    integrator = mi.load_dict(integrator) if isinstance(integrator, dict) else integrator
+    return np.asarray(mi.render(scene, integrator=integrator, spp=spp, seed=seed, sensor=sensor))
+
+
+def pixel_rays(sensor: mi.Sensor, k: int) -> tuple[np.ndarray, np.ndarray]:
+    """The rays through the middles of k x k parts of each pixel, o and d (H, W, k * k, 3), float64."""
+    w, h = sensor.film().size()
+    y, x, j, i = np.meshgrid(np.arange(h), np.arange(w), np.arange(k), np.arange(k), indexing="ij")
+    u, v = (x + (i + 0.5) / k) / w, (y + (j + 0.5) / k) / h
+    position = mi.Point2f(u.ravel().astype(np.float32), v.ravel().astype(np.float32))
+    ray, _ = sensor.sample_ray(0.0, 0.5, position, mi.Point2f(0.5))
+    shape = (h, w, k * k, 3)
+    return tuple(np.array(x).T.reshape(shape).astype(np.float64) for x in (ray.o + 0 * ray.d, ray.d))

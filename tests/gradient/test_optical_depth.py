@@ -57,8 +57,8 @@ def push(values, tangent, to_world, o, d, t_max=math.inf, skip=False):
 
 def setting(seed, name, channels, n=200):
     rng = np.random.default_rng([seed, channels, *name.encode()])
-    values = rng.uniform(0, 1, (7, 10, 5, channels))
-    values[:, :, 2:] = 0
+    values = rng.uniform(0, 1, (7, 5, 20, channels))
+    values[:, :, 5:] = 0  # two blocks of 8 that a forward walk may skip
     o, d = random_rays(rng, FRAMES[name], n)
     return rng, as_float32(values), FRAMES[name], o, d
 
@@ -190,3 +190,25 @@ def test_hard_42_a_million_rays_into_few_voxels(seed, shape):
         exact = 0.5 * np.array([[(1 - u[:, 1]) @ (1 - u[:, 0]), (1 - u[:, 1]) @ u[:, 0]],
                                 [u[:, 1] @ (1 - u[:, 0]), u[:, 1] @ u[:, 0]]])
         assert np.allclose(row, exact[:, :, None], rtol=1e-5, atol=0)
+
+
+def test_rays_with_gradients_are_refused(seed):
+    _, values, to_world, o, d = setting(seed, "unit", 1, n=4)
+    lattice, (p, w) = make_lattice(values, to_world), to_lanes(o, d)
+    from mivol.transport.optical_depth import integrate_tau
+
+    for attached in (p, w):
+        dr.enable_grad(attached)
+        with pytest.raises(ValueError, match="rays with gradients"):
+            integrate_tau(lattice, p, w)
+        dr.disable_grad(attached)
+    end = mi.Float(1)
+    dr.enable_grad(end)
+    with pytest.raises(ValueError, match="rays with gradients"):
+        integrate_tau(lattice, p, w, end)
+
+
+@pytest.mark.parametrize("channels", [2, 4])
+def test_other_channel_counts_are_refused(channels):
+    with pytest.raises(ValueError, match="channels"):
+        tau_fast(np.ones((2, 2, 2, channels)), np.eye(4), [0, 0, 0], [0, 0, 1])

@@ -130,6 +130,20 @@ def test_hard_10_nearly_axis_aligned(tiny):
             assert np.all(np.abs(fast - straight) <= allowed)
 
 
+def test_hard_10_a_tilt_of_1e_7_counts_from_far_away():
+    # 1e-7 over 1e6 lengths is a tenth of the box: rays that start beside it and hit, or start level with it and miss.
+    rng = np.random.default_rng(40)
+    values = as_float32(rng.uniform(0.5, 1, (4, 6, 5)))
+    for axis in range(3):
+        other = (axis + 1) % 3
+        o, d = np.full((2, 3), 0.4), np.zeros((2, 3))
+        o[:, axis], o[:, other] = -1e6, (-0.05, 0.95)
+        d[:, axis], d[:, other] = 1, 1e-7
+        fast = assert_tau(values, np.eye(4), o, d)
+        assert fast[0] > 0.5
+        assert fast[1] == 0
+
+
 # -- 11, 12: faces, edges, corners ------------------------------------------------------------------------------------
 
 

@@ -1,0 +1,484 @@
+"""Pictures by the integrator `mivol` against closed forms, the float64 twin, and stock Mitsuba.
+
+Pencil rays (a radiancemeter for each) have no footprint, so an absorbing scene has one right answer for each of them;
+cameras are compared by tests whose rate of false alarms is set. Stock Mitsuba is a judge only where it is right.
+"""
+
+from __future__ import annotations
+
+import math
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from oracle import (
+    box_interval,
+    depth_twin,
+    overlap,
+    pixel_means,
+    sphere_interval,
+    tau_scale,
+    tau_twin,
+    to_lattice,
+    trilinear,
+)
+
+from mivol.validate.statistics import assert_same_bounded_mean, assert_same_mean
+from scenes import (
+    FRAMES,
+    affine,
+    as_float32,
+    ball_of,
+    box_of,
+    camera,
+    centred,
+    film,
+    grid_volume,
+    medium,
+    pencil,
+    pixel_rays,
+    render,
+    rotation,
+    sky,
+    transform,
+)
+
+pytestmark = pytest.mark.usefixtures("variant_rgb")
+
+BOUND = 2e-6
+EPS = 2.0**-23
+KINDS = {"stock": ("heterogeneous", "gridvolume"), "own": ("mivol_medium", "mivol_voxels")}
+
+
+def mivol(**more):
+    return {"type": "mivol", **more}
+
+
+def see(parts, o, d, integrator=None, inside=None, spp=1, seed=0):
+    """What an integrator sees along rays (n, 3): one pixel for each ray, (n, channels)."""
+    o, d = np.atleast_2d(o), np.atleast_2d(d)
+    rays = {f"ray{i:03d}": pencil(p, w) for i, (p, w) in enumerate(zip(o, d, strict=True))}
+    sensor = {"type": "batch", **rays, "film": film(len(o), 1), "sampler": {"type": "independent"}}
+    if inside is not None:
+        sensor["medium"] = {"type": "ref", "id": inside}
+    scene = mi.load_dict({"type": "scene", **parts, "sensor": sensor})
+    return render(scene, integrator or mivol(), spp, seed)[0]
+
+
+def random_grid(seed, channels=1, top=4.0):
+    return as_float32(top * np.random.default_rng(seed).uniform(0, 1, (5, 6, 7, channels)) ** 2)
+
+
+def aimed_rays(seed, centre, size, n=12):
+    """Rays from about three sizes away, aimed into a ball around the centre."""
+    rng = np.random.default_rng([seed, 99])
+    o = rng.normal(size=(n, 3))
+    o = as_float32(np.asarray(centre) + 3 * size * o / np.linalg.norm(o, axis=1, keepdims=True))
+    d = np.asarray(centre) + size * rng.uniform(-0.4, 0.4, (n, 3)) - o
+    return o, as_float32(d / np.linalg.norm(d, axis=1, keepdims=True))
+
+
+def unmirrored(to_world):
+    """The same box by a frame of positive determinant: a mirrored boundary shape would turn its inside out."""
+    to_world = np.asarray(to_world)
+    return to_world if np.linalg.det(to_world[:3, :3]) > 0 else to_world @ affine(np.diag([-1.0, 1, 1]), (1, 0, 0))
+
+
+def in_frame(kind, values, to_world, boundary=None):
+    """A grid in its own box (or in another), under a constant sky."""
+    medium_type, volume_type = KINDS[kind]
+    interior = medium(medium_type, grid_volume(volume_type, values, to_world))
+    return {"sky": sky(), "smoke": box_of(interior, unmirrored(to_world) if boundary is None else boundary)}
+
+
+def assert_transmittance(image, tau, scale, channels=3):
+    """exp(-tau), where tau may err by BOUND * scale; a boundary that Mitsuba intersects in float32 by a few EPS."""
+    T = np.broadcast_to(np.exp(-tau), (len(tau), channels))
+    allowed = T * (BOUND * scale + 8 * EPS) + 1e-37
+    assert np.all(np.abs(image[:, :channels] - T) <= allowed), (
+        f"{np.abs(image[:, :channels] - T).max():.2g} off at most, seen {image[:, 0]}, expected {T[:, 0]}"
+    )
+
+
+# -- Closed forms and the twin, ray by ray -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", FRAMES)
+def test_homogeneous_box(name):
+    to_world = as_float32(unmirrored(FRAMES[name]))
+    size = np.linalg.norm(to_world[:3, :3], axis=0).min() / 2
+    o, d = aimed_rays(1, to_world[:3] @ [0.5, 0.5, 0.5, 1], size)
+    parts = {"sky": sky(), "box": box_of(medium("homogeneous", 0.7), to_world)}
+    chord = np.array([np.diff(box_interval(to_world, *ray)) for ray in zip(o, d, strict=True)])
+    # Mitsuba's own intersections bound a homogeneous medium: float32, from three box sizes away.
+    assert_transmittance(see(parts, o, d), 0.7 * chord, 0.7 * (chord + 4 * size))
+
+
+def test_homogeneous_sphere():
+    o, d = aimed_rays(2, [1, 2, 3], 0.5)
+    parts = {"sky": sky(), "ball": ball_of(medium("homogeneous", 2.5), [1, 2, 3], 0.5)}
+    chord = np.array([np.diff(sphere_interval([1, 2, 3], 0.5, *ray)) for ray in zip(o, d, strict=True)])
+    image = see(parts, o, d)
+    assert np.all(np.abs(image[:, :3] - np.exp(-2.5 * chord)) <= 2.5 * 2e-6 + 8 * EPS)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("name", FRAMES)
+def test_grid_in_any_frame(kind, name):
+    to_world, values = as_float32(FRAMES[name]), random_grid(3)
+    o, d = aimed_rays(3, to_world[:3] @ [0.5, 0.5, 0.5, 1], np.linalg.norm(to_world[:3, :3], axis=0).min())
+    image = see(in_frame(kind, values, to_world), o, d)
+    assert_transmittance(image, tau_twin(values, to_world, o, d), tau_scale(values, to_world, o, d))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_rgb_extinction(kind):
+    to_world, values = as_float32(FRAMES["rotated"]), random_grid(4, 3)
+    values[..., 1] *= 1e-4
+    values[..., 2] = 0
+    o, d = aimed_rays(4, to_world[:3] @ [0.5, 0.5, 0.5, 1], 1.0)
+    image = see(in_frame(kind, values, to_world), o, d)
+    assert_transmittance(image, tau_twin(values, to_world, o, d), tau_scale(values, to_world, o, d))
+    # Each channel is its own grey picture.
+    for c in range(3):
+        grey = see(in_frame(kind, values[..., c : c + 1], to_world), o, d)
+        assert np.all(np.abs(grey - image[:, c : c + 1]) <= 4 * EPS)
+
+
+def test_homogeneous_rgb_extinction():
+    sigma_t = [0.2, 0.9, 0.0]
+    o, d = aimed_rays(5, [0, 0, 0], 0.5)
+    to_world = centred(np.eye(3))
+    parts = {"sky": sky(), "box": box_of(medium("homogeneous", {"type": "rgb", "value": sigma_t}), to_world)}
+    chord = np.array([np.diff(box_interval(to_world, *ray)) for ray in zip(o, d, strict=True)])
+    tau = chord * sigma_t
+    assert_transmittance(see(parts, o, d), tau, tau + 2)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_scale_multiplies_the_extinction(kind):
+    values, to_world = random_grid(6), np.eye(4)
+    medium_type, volume_type = KINDS[kind]
+    o, d = aimed_rays(6, [0.5, 0.5, 0.5], 1)
+    interior = medium(medium_type, grid_volume(volume_type, values), scale=2.5)
+    image = see({"sky": sky(), "smoke": box_of(interior, to_world)}, o, d)
+    assert_transmittance(image, 2.5 * tau_twin(values, to_world, o, d), 2.5 * tau_scale(values, to_world, o, d))
+
+
+@pytest.mark.parametrize("kinds", [("stock", "stock"), ("stock", "own"), ("own", "own")])
+def test_several_media_along_a_ray(kinds):
+    frames = [as_float32(centred(rotation([0, 0, 1], 0.3), (0, 0, 2.0 * i))) for i in range(2)]
+    grids = [random_grid(7 + i, top=2.0) for i in range(2)]
+    o = np.array([[0.1, 0.2, -3], [-0.2, 0.1, 6], [0.0, 0, 1.0], [2, 0, 0]])
+    d = np.array([[0.01, -0.02, 1], [0.02, 0.01, -1], [0.1, 0, 1], [-1, 0.1, 0.0]])
+    d = as_float32(d / np.linalg.norm(d, axis=1, keepdims=True))
+    o = as_float32(o)
+    parts = {"ball": ball_of(medium("homogeneous", 0.5), [0, 0, 4], 0.5)}
+    for i, (kind, values, frame) in enumerate(zip(kinds, grids, frames, strict=True)):
+        parts |= {k + (str(i) if k != "sky" else ""): v for k, v in in_frame(kind, values, frame).items()}
+    chord = [np.diff(overlap((0, math.inf), sphere_interval([0, 0, 4], 0.5, *ray))) for ray in zip(o, d, strict=True)]
+    tau = 0.5 * np.array(chord) + sum(tau_twin(v, f, o, d) for v, f in zip(grids, frames, strict=True))
+    scale = 3 + sum(tau_scale(v, f, o, d) for v, f in zip(grids, frames, strict=True))
+    assert_transmittance(see(parts, o, d), tau, scale)
+
+
+def test_many_boundaries_along_a_ray():
+    # More media than a small stack or a small depth would hold; max_depth counts scattering, not boundaries.
+    parts = {"sky": sky()}
+    for i in range(12):
+        parts[f"ball{i:02d}"] = ball_of(medium("homogeneous", 0.1), [0, 0, 3.0 * i], 1.0)
+    image = see(parts, [0, 0, -5], [0, 0, 1], mivol(max_depth=2))
+    assert image[0, 0] == pytest.approx(math.exp(-0.1 * 2 * 12), rel=1e-5)
+
+
+# -- Boundaries that are not the grid's box ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_hard_03_vacuum_between_boundary_and_dense_grid(kind):
+    # Majorant 500 over 10 lengths of empty boundary: 1, where tracking with a global majorant underflows to 0.
+    values = np.full((4, 4, 4, 1), 500.0)
+    parts = in_frame(kind, values, np.eye(4), boundary=centred(10 * np.eye(3)))
+    image = see(parts, [[-9, 3, 3], [0.5, 0.5, -9]], [[1, 0, 0], [0, 0, 1]])
+    assert np.array_equal(image[0, :3], np.ones(3))
+    assert np.array_equal(image[1, :3], np.zeros(3))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("name", FRAMES)
+def test_hard_04_boundary_larger_than_the_grid(kind, name):
+    # Outside its own box a grid is vacuum, even where stock Mitsuba fills a rotated grid's bounding box.
+    to_world, values = as_float32(FRAMES[name]), random_grid(8)
+    middle, size = to_world[:3] @ [0.5, 0.5, 0.5, 1], np.linalg.norm(to_world[:3, :3] @ np.ones(3))
+    boundary = as_float32(centred(3 * size * rotation([1, 0, 1], 0.4), middle))
+    o, d = aimed_rays(8, middle, size)
+    image = see(in_frame(kind, values, to_world, boundary), o, d)
+    assert_transmittance(image, tau_twin(values, to_world, o, d), tau_scale(values, to_world, o, d))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_hard_04_boundary_smaller_than_the_grid(kind):
+    to_world, values = as_float32(FRAMES["rotated"]), random_grid(9)
+    medium_type, volume_type = KINDS[kind]
+    centre = as_float32(to_world[:3] @ [0.5, 0.5, 0.5, 1])
+    interior = medium(medium_type, grid_volume(volume_type, values, to_world))
+    o, d = aimed_rays(9, centre, 0.35)
+    image = see({"sky": sky(), "ball": ball_of(interior, centre, 0.3)}, o, d)
+    spans = [sphere_interval(centre, 0.3, *ray) for ray in zip(o, d, strict=True)]
+    tau = np.array([tau_twin(values, to_world, *ray, *span) for *ray, span in zip(o, d, spans, strict=True)])
+    # The ends are Mitsuba's float32 intersections with a sphere of radius 0.3 from a distance of 1: 1e-6 of sigma each.
+    T = np.exp(-tau)
+    assert np.all(np.abs(image - T) <= T * (2e-6 * values.max() + BOUND * tau_scale(values, to_world, o, d)) + 4 * EPS)
+
+
+# -- Cameras inside, surfaces, lights -------------------------------------------------------------------------------------
+
+
+def test_hard_45_camera_inside_a_sphere():
+    # sigma = 1, R = 1, camera in the middle: e^-1.
+    parts = {"sky": sky(), "ball": {**ball_of({"type": "ref", "id": "fog"}, [0, 0, 0], 1)},
+             "fog": {**medium("homogeneous", 1.0), "id": "fog"}}
+    parts = {"fog": parts.pop("fog"), **parts}
+    image = see(parts, np.zeros((3, 3)), [[0, 0, 1], [0.6, 0.8, 0], [-1, 0, 0]], inside="fog")
+    assert np.all(np.abs(image - math.exp(-1)) <= math.exp(-1) * 16 * EPS)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("sigma", [1.0, 60.0])
+def test_hard_45_camera_inside_a_dense_grid(kind, sigma):
+    values, to_world = sigma * random_grid(10, top=1.0), np.eye(4)
+    medium_type, volume_type = KINDS[kind]
+    fog = {**medium(medium_type, grid_volume(volume_type, values)), "id": "fog"}
+    parts = {"fog": fog, "sky": sky(), "box": box_of({"type": "ref", "id": "fog"}, to_world)}
+    rng = np.random.default_rng(10)
+    o, d = as_float32(rng.uniform(0.1, 0.9, (8, 3))), rng.normal(size=(8, 3))
+    d = as_float32(d / np.linalg.norm(d, axis=1, keepdims=True))
+    image = see(parts, o, d, inside="fog")
+    assert_transmittance(image, tau_twin(values, to_world, o, d), tau_scale(values, to_world, o, d))
+
+
+def wall(height, bsdf=None, **more):
+    """A square of edge 2 in the plane z = height, facing up."""
+    shape = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, height]), **more}
+    return shape if bsdf is None else {**shape, "bsdf": bsdf}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("height", [-2.0, -0.21, 0.13])
+def test_luminous_wall_in_or_behind_the_medium(kind, height):
+    # The wall stops the ray: its own radiance through what lies in front, nothing of what lies behind.
+    to_world, values = as_float32(centred(np.eye(3))), random_grid(11)
+    parts = in_frame(kind, values, to_world)
+    parts["wall"] = wall(height, emitter={"type": "area", "radiance": 2.0})
+    o = as_float32(np.column_stack([np.random.default_rng(11).uniform(-0.3, 0.3, (8, 2)), np.full(8, 3.0)]))
+    d = as_float32(np.tile(np.array([0.04, -0.03, -1]) / np.linalg.norm([0.04, -0.03, -1]), (8, 1)))
+    end = (height - o[:, 2]) / d[:, 2]
+    tau, scale = tau_twin(values, to_world, o, d, 0, end), tau_scale(values, to_world, o, d, 0, end)
+    for depth in (1, 2, -1):
+        image = see(parts, o, d, mivol(max_depth=depth)) / 2
+        # The wall's distance is Mitsuba's, known to a few EPS of 3 lengths.
+        assert_transmittance(image, tau, scale + values.max() * 2)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_surface_in_the_medium_lit_by_a_point_light(kind):
+    # L = rho/pi I cos/r^2 T(light) T(camera), at depth 2; at depth 1 the wall is black.
+    to_world, values = as_float32(centred(2 * np.eye(3))), random_grid(12, top=0.7)
+    rho, power, light, height = 0.6, 5.0, np.array([0.3, -0.2, 1.9]), -0.37
+    parts = in_frame(kind, values, to_world)
+    del parts["sky"]
+    parts["wall"] = wall(height, {"type": "diffuse", "reflectance": {"type": "uniform", "value": rho}})
+    parts["light"] = {"type": "point", "position": list(light), "intensity": power}
+    o = np.column_stack([np.random.default_rng(12).uniform(-0.6, 0.6, (8, 2)), np.full(8, 3.0)])
+    o, d = as_float32(o), as_float32(np.tile(np.array([0.1, 0.05, -1]) / np.linalg.norm([0.1, 0.05, -1]), (8, 1)))
+    end = (height - o[:, 2]) / d[:, 2]
+    x = o + end[:, None] * d
+    r = np.linalg.norm(light - x, axis=1)
+    towards = (light - x) / r[:, None]
+    tau = tau_twin(values, to_world, o, d, 0, end) + tau_twin(values, to_world, x, towards, 0, r)
+    exact = rho / math.pi * power * towards[:, 2:] / r[:, None] ** 2 * np.exp(-tau)
+    image = see(parts, o, d, mivol(max_depth=2))
+    # Float32 geometry: r^2 and the cosine to a few EPS, the shadow ray's start offset by about 1e-4 / 3 of a length.
+    assert np.all(np.abs(image - exact) <= exact * 1e-4 * (1 + values.max()))
+    assert np.array_equal(see(parts, o, d, mivol(max_depth=1)), np.zeros((8, 3)))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_surface_in_the_medium_lit_by_the_sky(kind):
+    # A white wall at the bottom under a constant sky, no closed form: the mean over the picture against stock volpath,
+    # from independent batches, by Student's t.
+    to_world, values = as_float32(centred(2 * np.eye(3))), random_grid(13, 3 if kind == "own" else 1, top=0.7)
+    values[...] = values[..., :1]
+    parts = in_frame(kind, values, to_world)
+    parts["wall"] = wall(-0.37, {"type": "diffuse", "reflectance": {"type": "uniform", "value": 0.8}})
+    scene = mi.load_dict({"type": "scene", **parts, "sensor": camera([0.1, 0.5, 3], [0, 0, -0.4], res=8, fov=20)})
+    batches = 8
+    ours = np.array([render(scene, mivol(max_depth=2), 64, seed) for seed in range(batches)])
+    stock = {"type": "volpath", "max_depth": 2, "rr_depth": 99}
+    theirs = np.array([render(scene, stock, 512, 100 + seed) for seed in range(batches)])
+    means = [x.mean(axis=(1, 2, 3)) for x in (ours, theirs)]
+    a, b = (m.mean() for m in means)
+    var_a, var_b = (m.var(ddof=1) / batches for m in means)
+    assert_same_mean(a, var_a, b, var_b, n_a=batches, n_b=batches, what="lit by the sky")
+
+
+# -- Against stock volpath ---------------------------------------------------------------------------------------------------
+
+
+def framed(parts, centre, distance):
+    """A scene whose camera sees nothing but the box."""
+    target = np.asarray(centre, dtype=float)
+    origin = target + distance * np.array([0.48, -0.8, 0.36])
+    return mi.load_dict({"type": "scene", **parts, "sensor": camera(origin, target, res=10, fov=5)})
+
+
+COMPARED = {
+    "homogeneous": lambda: ({"sky": sky(), "box": box_of(medium("homogeneous", 1.3), centred(np.eye(3)))}, (0, 0, 0)),
+    "stock_grid": lambda: (in_frame("stock", random_grid(14), centred(np.eye(3))), (0, 0, 0)),
+    "stock_grid_rotated": lambda: (in_frame("stock", random_grid(15), as_float32(FRAMES["rotated"])), (1, 0, 0)),
+    "own_medium": lambda: (in_frame("own", random_grid(16), centred(np.eye(3))), (0, 0, 0)),
+    "own_medium_mirrored": lambda: (in_frame("own", random_grid(17), as_float32(FRAMES["mirrored"])), (0, 2, 0)),
+    "own_volume_in_stock_medium": lambda: (
+        {"sky": sky(), "box": box_of(medium("heterogeneous", grid_volume("mivol_voxels", random_grid(18))), np.eye(4))},
+        (0.5, 0.5, 0.5),
+    ),
+    "constvolume": lambda: (
+        {"sky": sky(), "box": box_of(medium("heterogeneous", {"type": "constvolume", "value": 2.0}), np.eye(4))},
+        (0.5, 0.5, 0.5),
+    ),
+}
+
+
+@pytest.mark.parametrize("name", COMPARED)
+def test_same_mean_as_volpath(name):
+    # With albedo 0 and a sky of 1 a path of volpath brings 0 or 1: Hoeffding bounds its mean with no variance to
+    # estimate. The truth it is held against is our picture, whose own noise (the pixel's footprint) is below a tenth.
+    parts, centre = COMPARED[name]()
+    scene = framed(parts, centre, 6)
+    ours, spp = render(scene, mivol(), 256), 512
+    theirs = render(scene, {"type": "volpath", "max_depth": -1, "rr_depth": 10_000}, spp, seed=1)
+    assert 0.02 < ours.mean() < 0.98
+    grey = np.clip(theirs[..., 0], 0, 1)
+    assert_same_bounded_mean(grey, spp, np.clip(ours[..., 0], 0, 1), what=name)
+    # All pixels together: the same test with 100 times the samples.
+    assert_same_bounded_mean(grey.mean(), spp * grey.size, np.clip(ours[..., 0], 0, 1).mean(), what=name + ", mean")
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_pixel_means_of_a_camera(kind):
+    # A pixel averages T, not tau: the twin's mean over 8 x 8 rays of each pixel, whose error is of second order in 1/8.
+    to_world, values = as_float32(centred(np.eye(3))), random_grid(19, top=8.0)
+    scene = framed(in_frame(kind, values, to_world), (0, 0, 0), 6)
+    k, spp = 8, 256
+    o, d = pixel_rays(scene.sensors()[0], k)
+    mean, variance = pixel_means(lambda o, d: np.exp(-tau_twin(values, to_world, o, d)), o, d)
+    image = render(scene, mivol(), spp)
+    assert variance.max() > 1e-6
+    assert_same_mean(image[..., :1], variance / spp, mean, variance / k**4, rounding=1e-6, what="pixel means")
+    assert np.array_equal(image[..., 0], image[..., 1])
+
+
+def test_no_noise_along_pencils():
+    to_world, values = as_float32(FRAMES["rotated"]), random_grid(20)
+    o, d = aimed_rays(20, (1, 0, 0), 1.0, n=4)
+    parts = in_frame("own", values, to_world)
+    one = see(parts, o, d, spp=1, seed=0)
+    # A mean of 16 equal float32 numbers: one rounding of the sum and one of the division by the weight.
+    assert np.all(np.abs(see(parts, o, d, spp=16, seed=5) - one) <= 4 * EPS)
+
+
+# -- AOVs -----------------------------------------------------------------------------------------------------------------
+
+
+def test_hard_01_tau_and_alpha_at_any_optical_depth():
+    # tau never passes through exp: 1e4 is 1e4; alpha = 1 - T to 4 EPS even at 1e-8; T below float32 is 0, not NaN.
+    for power in (-8, -4, 0, 2, 4):
+        values = np.full((3, 3, 3, 1), 10.0**power)
+        for kind in KINDS:
+            parts = in_frame(kind, values, np.eye(4))
+            image = see(parts, [0.5, 0.5, -1], [0, 0, 1], mivol(aovs="tau,alpha"))[0]
+            tau = as_float32(10.0**power)
+            assert image[3] == pytest.approx(tau, rel=8 * EPS)
+            assert image[4] == pytest.approx(-math.expm1(-tau), rel=8 * EPS)
+            assert np.all(np.abs(image[:3] - math.exp(-tau)) <= math.exp(-tau) * (tau + 1) * 8 * EPS)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("walled", [False, True])
+def test_aovs_against_the_twin(kind, walled):
+    to_world, values = as_float32(centred(np.eye(3))), random_grid(21)
+    parts = in_frame(kind, values, to_world)
+    o = as_float32(np.column_stack([np.random.default_rng(21).uniform(-0.3, 0.3, (6, 2)), np.full(6, 2.0)]))
+    d = as_float32(np.tile(np.array([0.04, -0.03, -1]) / np.linalg.norm([0.04, -0.03, -1]), (6, 1)))
+    o[0] = [3, 3, 2]  # misses everything
+    height = -0.13
+    end = (height - o[:, 2]) / d[:, 2] if walled else np.full(6, math.inf)
+    end[0] = math.inf
+    if walled:
+        parts["wall"] = wall(height, {"type": "diffuse"})
+    image = see(parts, o, d, mivol(aovs="depth,tau,alpha", max_depth=1))
+    assert image.shape == (6, 6)
+    tau, scale = tau_twin(values, to_world, o, d, 0, end)[:, 0], tau_scale(values, to_world, o, d, 0, end)[:, 0]
+    assert np.all(np.abs(image[:, 4] - tau) <= BOUND * scale + values.max() * 1e-6)
+    for i in range(6):
+        q, dq = to_lattice(values, to_world, o[i], d[i])
+        t0, t1 = overlap((0, end[i]), box_interval(to_world, o[i], d[i]))
+
+        def sigma(t, q=q, dq=dq, t0=t0, t1=t1):
+            return trilinear(values, q + t[:, None] * dq) * ((t >= t0) & (t <= t1))[:, None]
+
+        alpha, depth = depth_twin(sigma, [t0, t1], None if math.isinf(end[i]) else end[i], n=20_000)
+        assert image[i, 5] == pytest.approx(alpha, abs=BOUND * scale[i] + 4e-6)
+        # A quadrature in the cells may serve for the mean distance: asked to 1e-4 of the chord.
+        assert image[i, 3] == pytest.approx(depth, abs=1e-4 * max(t1 - t0, 1e-3))
+
+
+def test_rgb_tau_has_three_aovs():
+    to_world, values = np.eye(4), random_grid(22, 3)
+    o, d = aimed_rays(22, [0.5, 0.5, 0.5], 1.0, n=4)
+    parts = in_frame("own", values, to_world)
+    image = see(parts, o, d, mivol(aovs="alpha,tau"))
+    tau = tau_twin(values, to_world, o, d)
+    assert image.shape == (4, 7)
+    assert np.all(np.abs(image[:, 4:] - tau) <= BOUND * tau_scale(values, to_world, o, d))
+    alpha = -np.expm1(-tau).mean(axis=1)
+    assert np.all(np.abs(image[:, 3] - alpha) <= BOUND * tau_scale(values, to_world, o, d).max(axis=1) + 4 * EPS)
+
+
+def test_depth_of_a_homogeneous_medium():
+    # 1/sigma - L T/(1 - T), from the entry on.
+    sigma, to_world = 3.0, np.eye(4)
+    parts = {"sky": sky(), "box": box_of(medium("homogeneous", sigma), to_world)}
+    image = see(parts, [0.5, 0.5, -2], [0, 0, 1], mivol(aovs="depth"))
+    T = math.exp(-sigma)
+    assert image[0, 3] == pytest.approx(2 + 1 / sigma - T / (1 - T), rel=1e-5)
+
+
+# -- Refusals ----------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_scattering_is_refused_at_depth_2_and_rendered_at_depth_1(kind):
+    medium_type, volume_type = KINDS[kind]
+    values = random_grid(23)
+    interior = medium(medium_type, grid_volume(volume_type, values), albedo=0.5)
+    parts = {"sky": sky(), "smoke": box_of(interior, np.eye(4))}
+    o, d = aimed_rays(23, [0.5, 0.5, 0.5], 1.0, n=4)
+    image = see(parts, o, d, mivol(max_depth=1))
+    assert_transmittance(image, tau_twin(values, np.eye(4), o, d), tau_scale(values, np.eye(4), o, d))
+    for depth in (2, -1, 6):
+        with pytest.raises(ValueError, match="scatter"):
+            see(parts, o, d, mivol(max_depth=depth))
+
+
+def test_hidden_emitters():
+    to_world, values = np.eye(4), random_grid(24)
+    o, d = aimed_rays(24, [0.5, 0.5, 0.5], 1.0, n=4)
+    parts = in_frame("own", values, to_world)
+    assert np.array_equal(see(parts, o, d, mivol(hide_emitters=True)), np.zeros((4, 3)))
+
+
+def test_rotated_place_is_the_matrix_that_was_given():
+    # The scene's float32 matrix is what the twin was given; a rotation read back is the one that was put in.
+    to_world = as_float32(FRAMES["rotated"])
+    assert np.array_equal(np.array(transform(to_world).matrix, dtype=np.float64), to_world)
