@@ -59,8 +59,7 @@ def whole_file(path: str | os.PathLike) -> Iterator[Path]:
             raise
         found, way_out = DISK_FAULTS[error.errno]
         raise MivolError(
-            f"{path}: found {found} while writing, expected room for the whole file; {way_out} "
-            "(nothing was left half-written)."
+            f"{path}: found {found} while writing, expected room for the whole file; {way_out} (nothing was left half-written)."
         ) from error
     finally:
         with contextlib.suppress(OSError):

@@ -113,7 +113,12 @@ def read_volume(path: str | os.PathLike, dataset: str | None = None, *, frame: s
         head = file.read(HEAD)
     if not kind.recognise(head):
         raise _foreign(path, suffix, head)
-    volume = kind.read(path, dataset)
+    try:
+        volume = kind.read(path, dataset)
+    except MemoryError as error:
+        raise refusal(
+            path, "more voxels than memory holds", "a volume that fits", "crop or coarsen it, or correct its header"
+        ) from error
     to_world = FRAMES[frame](volume)
     check_frame(to_world, path)
     return dataclasses.replace(volume, to_world=to_world, meta={**volume.meta, "frame": frame})
@@ -152,9 +157,7 @@ def _suffix(path: Path, table: Mapping[str, Any]) -> str:
     for suffix in sorted(table, key=len, reverse=True):
         if name.endswith(suffix):
             return suffix
-    raise refusal(
-        path, f"the suffix {path.suffix!r}", f"one of {', '.join(table)}", "convert the file or correct its name"
-    )
+    raise refusal(path, f"the suffix {path.suffix!r}", f"one of {', '.join(table)}", "convert the file or correct its name")
 
 
 def _foreign(path: Path, suffix: str, head: bytes) -> Exception:

@@ -98,9 +98,7 @@ def read_projections(path: str | os.PathLike, group: str = "exchange") -> Projec
     return ProjectionData(projections, flats, darks, angles * ANGLES[unit.lower()], meta)
 
 
-def _check_projections(
-    path: Path, projections: np.ndarray, flats: np.ndarray, darks: np.ndarray, angles: np.ndarray
-) -> None:
+def _check_projections(path: Path, projections: np.ndarray, flats: np.ndarray, darks: np.ndarray, angles: np.ndarray) -> None:
     for name, stack in (("data_white", flats), ("data_dark", darks)):
         if stack.shape[1:] != projections.shape[1:]:
             raise refusal(

@@ -9,6 +9,7 @@ Reference: Matheou and Chung 2014 (the simulation); the file format is AT3D's.
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +22,9 @@ COLUMNS = "x,y,z,lwc,reff"
 
 #: Unevenness of the altitudes [of their mean step] that rounding to 1 m leaves at steps of 40 m.
 UNEVEN = 0.03
+
+#: Cells of a grid; a list of wet cells does not bound it, so a damaged size would ask for any amount of memory.
+LARGEST = 2**30
 
 
 def is_les(head: bytes) -> bool:
@@ -39,13 +43,15 @@ def read_les(path: Path, dataset: str | None = None) -> VolumeData:
     lines = [line for line in lines if line]
     if len(lines) < 4 or lines[3].replace(" ", "") != COLUMNS:
         raise refusal(path, "another header", f"sizes, spacings, altitudes and '{COLUMNS}'", "correct the file")
-    size = [int(number) for number in source.numbers(lines[0], 3, path)]
+    size = source.integers(lines[0].replace(",", " "), 3, path, "nx,ny,nz")
     dx, dy = source.numbers(lines[1], 2, path)
     altitudes = source.numbers(lines[2], size[2], path)
     dz = np.diff(altitudes)
     if size[2] > 1 and np.ptp(dz) > UNEVEN * dz.mean():
         raise refusal(path, "altitudes of uneven steps", "an even grid", "resample the file first")
     cells = source.numbers(",".join(lines[4:]), 5 * (len(lines) - 4), path).reshape(-1, 5)
+    if min(size) < 1 or math.prod(size) > LARGEST:
+        raise refusal(path, f"a grid of {size}", f"1 to {LARGEST} cells", "correct the second line")
     index = cells[:, :3].astype(int)
     if (index < 0).any() or (index >= size).any():
         raise refusal(path, f"the cell {index[(index >= size).any(1)][:1].tolist()}", f"within {size}", "correct it")

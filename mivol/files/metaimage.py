@@ -42,12 +42,12 @@ def read_metaimage(path: Path, dataset: str | None = None) -> VolumeData:
     """
     no_dataset(path, dataset)
     keys, local = _header(source.read_bytes(path), path)
-    size = [int(number) for number in _floats(keys, path, "DimSize")]
-    if _floats(keys, path, "NDims") != [3.0] or len(size) != 3 or min(size) < 1:
-        raise refusal(
-            path, f"NDims {keys['NDims']} and DimSize {keys['DimSize']}", "3 sizes above 0", "convert it to 3D"
-        )
-    channels = int(_floats(keys, path, "ElementNumberOfChannels", default=[1.0])[0])
+    if _integers(keys, path, "NDims", 1) != [3]:
+        raise refusal(path, f"NDims {keys['NDims']}", "3", "convert it to 3D")
+    size = _integers(keys, path, "DimSize", 3)
+    (channels,) = _integers(keys, path, "ElementNumberOfChannels", 1, default="1")
+    if min(*size, channels) < 1:
+        raise refusal(path, f"DimSize {keys['DimSize']} of {channels} channels", "sizes above 0", "correct the header")
     dtype = _dtype(keys, path)
     stored = _stored(keys, local, dtype, size[0] * size[1] * size[2] * channels, path)
     values = as_values(stored.reshape(*size[::-1], channels), path)
@@ -73,17 +73,16 @@ def _header(data: bytes, path: Path) -> tuple[dict[str, str], bytes]:
     raise refusal(path, "no key ElementDataFile", "one at the end of the header", "add it or copy the file again")
 
 
-def _floats(keys: dict[str, str], path: Path, *names: str, default: list[float] | None = None) -> list[float]:
-    """The numbers under the first of ``names`` that is there."""
-    for name in names:
-        if name in keys:
-            try:
-                return [float(word) for word in keys[name].split()]
-            except ValueError as error:
-                raise refusal(path, f"'{name} = {keys[name]}'", "numbers", "correct the header") from error
-    if default is None:
-        raise refusal(path, f"no key {names[0]}", "one in the MetaImage header", f"add '{names[0]} = ...'")
-    return default
+def _integers(keys: dict[str, str], path: Path, name: str, count: int, default: str | None = None) -> list[int]:
+    if name not in keys and default is None:
+        raise refusal(path, f"no key {name}", "one in the MetaImage header", f"add '{name} = ...'")
+    return source.integers(keys.get(name, default), count, path, name)
+
+
+def _floats(keys: dict[str, str], path: Path, names: tuple[str, ...], default: str) -> np.ndarray:
+    """As many numbers as ``default`` has, under the first of ``names`` that is there."""
+    name = next((name for name in names if name in keys), names[0])
+    return source.reals(keys.get(name, default), len(default.split()), path, name)
 
 
 def _truth(keys: dict[str, str], path: Path, *names: str) -> bool:
@@ -131,7 +130,7 @@ def _data_files(name: str, local: bytes, path: Path) -> list[Path]:
 
 
 def _unpack(data: bytes, keys: dict[str, str], dtype: np.dtype, count: int, path: Path) -> np.ndarray:
-    skip = int(_floats(keys, path, "HeaderSize", default=[0.0])[0])
+    (skip,) = _integers(keys, path, "HeaderSize", 1, default="0")
     if "BinaryData" in keys and not _truth(keys, path, "BinaryData"):
         return source.numbers(data, count, path)
     if _truth(keys, path, "CompressedData"):
@@ -141,10 +140,7 @@ def _unpack(data: bytes, keys: dict[str, str], dtype: np.dtype, count: int, path
 
 
 def _place(keys: dict[str, str], path: Path) -> tuple[np.ndarray, np.ndarray]:
-    spacing = _floats(keys, path, "ElementSpacing", "ElementSize", default=[1.0] * 3)
-    origin = _floats(keys, path, "Offset", "Position", "Origin", default=[0.0] * 3)
-    rows = _floats(keys, path, "TransformMatrix", "Orientation", "Rotation", default=np.eye(3).ravel().tolist())
-    for name, numbers, count in (("spacing", spacing, 3), ("offset", origin, 3), ("matrix", rows, 9)):
-        if len(numbers) != count:
-            raise refusal(path, f"{len(numbers)} numbers for the {name}", f"{count}", "correct the header")
-    return np.array(rows).reshape(3, 3).T * spacing, np.array(origin)
+    spacing = _floats(keys, path, ("ElementSpacing", "ElementSize"), "1 1 1")
+    origin = _floats(keys, path, ("Offset", "Position", "Origin"), "0 0 0")
+    rows = _floats(keys, path, ("TransformMatrix", "Orientation", "Rotation"), "1 0 0 0 1 0 0 0 1")
+    return rows.reshape(3, 3).T * spacing, origin

@@ -9,6 +9,7 @@ Reference: nifti.nimh.nih.gov, nifti1.h and nifti2.h.
 
 from __future__ import annotations
 
+import math
 import struct
 import zlib
 from pathlib import Path
@@ -38,49 +39,52 @@ UNITS: dict[int, str] = {0: "unknown", 1: "m", 2: "mm", 3: "um"}
 
 
 class Layout(NamedTuple):
-    """Where the fields of a header stand: (struct code, byte offset)."""
+    """A version's header: its length, its magic bytes and their offset, and name -> (struct code, byte offset)."""
 
     size: int
-    magic: tuple[bytes, int]
-    dim: tuple[str, int]
-    datatype: tuple[str, int]
-    pixdim: tuple[str, int]
-    vox_offset: tuple[str, int]
-    scale: tuple[str, int]
-    units: tuple[str, int]
-    codes: tuple[str, int]
-    quaternion: tuple[str, int]
-    srow: tuple[str, int]
+    magic: bytes
+    magic_at: int
+    fields: dict[str, tuple[str, int]]
 
 
+#: length of the header, which is its first number -> layout.
 LAYOUTS: dict[int, Layout] = {
     348: Layout(
-        size=348,
-        magic=(b"n+1\0", 344),
-        dim=("8h", 40),
-        datatype=("h", 70),
-        pixdim=("8f", 76),
-        vox_offset=("f", 108),
-        scale=("2f", 112),
-        units=("B", 123),
-        codes=("2h", 252),
-        quaternion=("6f", 256),
-        srow=("12f", 280),
+        348,
+        b"n+1\0",
+        344,
+        {
+            "dim": ("8h", 40),
+            "datatype": ("h", 70),
+            "pixdim": ("8f", 76),
+            "vox_offset": ("f", 108),
+            "scale": ("2f", 112),
+            "units": ("B", 123),
+            "codes": ("2h", 252),
+            "quaternion": ("6f", 256),
+            "srow": ("12f", 280),
+        },
     ),
     540: Layout(
-        size=540,
-        magic=(b"n+2\0", 4),
-        dim=("8q", 16),
-        datatype=("h", 12),
-        pixdim=("8d", 104),
-        vox_offset=("q", 168),
-        scale=("2d", 176),
-        units=("i", 500),
-        codes=("2i", 344),
-        quaternion=("6d", 352),
-        srow=("12d", 400),
+        540,
+        b"n+2\0",
+        4,
+        {
+            "dim": ("8q", 16),
+            "datatype": ("h", 12),
+            "pixdim": ("8d", 104),
+            "vox_offset": ("q", 168),
+            "scale": ("2d", 176),
+            "units": ("i", 500),
+            "codes": ("2i", 344),
+            "quaternion": ("6d", 352),
+            "srow": ("12d", 400),
+        },
     ),
 }
+
+#: Extensions between header and data are text; a gigabyte of them is a damaged number.
+LARGEST_OFFSET = 2**30
 
 
 def is_nifti(head: bytes) -> bool:
@@ -101,35 +105,36 @@ def read_nifti(path: Path, dataset: str | None = None) -> VolumeData:
     """
     no_dataset(path, dataset)
     data = source.read_bytes(path)
-    packed = data[:2] == b"\x1f\x8b"
-    head = _peek(data) if packed else data
+    head = _peek(data) if data[:2] == b"\x1f\x8b" else data
     layout, order = _layout(head)
-
-    def field(name: str) -> tuple:
-        code, offset = getattr(layout, name)
-        return struct.unpack_from(order + code, head, offset)
-
-    dim, pixdim = field("dim"), np.array(field("pixdim"), np.float64)
-    size, extra = _sizes(dim, path)
-    dtype, parts = _dtype(field("datatype")[0], order, path)
-    count, offset = int(np.prod(size, dtype=object)) * extra * parts, int(field("vox_offset")[0])
-    if packed:
-        data = source.inflate(data, "gzip", offset + count * dtype.itemsize, path)
-    stored = source.elements(data, dtype, count, path, offset=max(offset, layout.size))
+    fields = {name: struct.unpack_from(order + code, head, at) for name, (code, at) in layout.fields.items()}
+    size, extra = _sizes(fields["dim"], path)
+    dtype, parts = _dtype(fields["datatype"][0], order, path)
+    stored = _stored(data, fields["vox_offset"][0], layout.size, dtype, [parts, *size, extra], path)
     grid = stored.reshape(extra, *size[::-1], parts).transpose(1, 2, 3, 0, 4).reshape(*size[::-1], extra * parts)
-    slope, intercept = field("scale")
+    slope, intercept = fields["scale"]
     if np.isfinite(slope) and slope != 0 and (slope, intercept) != (1, 0) and parts == 1:
         grid = grid * np.float64(slope) + (intercept if np.isfinite(intercept) else 0.0)
-    steps, origin, form = _place(field("codes"), field("quaternion"), field("srow"), pixdim)
+    steps, origin, form = _place(fields)
     meta = {
         "path": str(path),
         "format": "nifti",
         "dtype": str(dtype),
         "space": "RAS",
         "place": form,
-        "unit": UNITS.get(field("units")[0] & 7, "unknown"),
+        "unit": UNITS.get(fields["units"][0] & 7, "unknown"),
     }
     return VolumeData(as_values(grid, path), frame_from_steps(size, steps, origin), meta)
+
+
+def _stored(data: bytes, offset: float, header: int, dtype: np.dtype, shape: list[int], path: Path) -> np.ndarray:
+    """The numbers of ``shape`` (flat), from ``offset`` or the end of the header, whichever is later."""
+    if not 0 <= offset <= LARGEST_OFFSET:
+        raise refusal(path, f"vox_offset {offset}", f"0 to {LARGEST_OFFSET}", "correct the header")
+    first, count = max(int(offset), header), math.prod(shape)
+    if data[:2] == b"\x1f\x8b":
+        data = source.inflate(data, "gzip", first + count * dtype.itemsize, path)
+    return source.elements(data, dtype, count, path, offset=first)
 
 
 def _peek(data: bytes) -> bytes:
@@ -142,7 +147,7 @@ def _peek(data: bytes) -> bytes:
 def _layout(head: bytes) -> tuple[Layout, str] | None:
     for order in "<>":
         layout = LAYOUTS.get(struct.unpack_from(order + "i", head)[0]) if len(head) >= 4 else None
-        if layout and len(head) >= layout.size and head[layout.magic[1] :].startswith(layout.magic[0]):
+        if layout and len(head) >= layout.size and head[layout.magic_at :].startswith(layout.magic):
             return layout, order
     return None
 
@@ -154,27 +159,26 @@ def _sizes(dim: tuple[int, ...], path: Path) -> tuple[list[int], int]:
     sizes += [1] * (3 - len(sizes))
     if rank not in range(1, 8) or min(sizes) < 1 or sum(number > 1 for number in sizes[3:]) > 1:
         raise refusal(path, f"dim {list(dim)}", "3 sizes above 0 and at most one further axis", "extract one volume")
-    return sizes[:3], int(np.prod(sizes[3:], dtype=object)) if len(sizes) > 3 else 1
+    return sizes[:3], math.prod(sizes[3:])
 
 
 def _dtype(code: int, order: str, path: Path) -> tuple[np.dtype, int]:
     if code not in TYPES:
-        raise refusal(
-            path, f"datatype {code}", f"a real one ({', '.join(map(str, TYPES))})", "convert it to float32 first"
-        )
+        raise refusal(path, f"datatype {code}", f"a real one ({', '.join(map(str, TYPES))})", "convert it to float32 first")
     return (np.dtype("u1"), 3) if TYPES[code] == "3u1" else (np.dtype(order + TYPES[code]), 1)
 
 
-def _place(
-    codes: tuple[int, int], quaternion: tuple[float, ...], srow: tuple[float, ...], pixdim: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, str]:
+def _place(fields: dict[str, tuple]) -> tuple[np.ndarray, np.ndarray, str]:
     """Steps (3, 3), the first voxel's centre (3,), and which form they come from."""
-    if codes[1] > 0:
-        affine = np.array(srow, np.float64).reshape(3, 4)
+    pixdim = np.array(fields["pixdim"], np.float64)
+    qform, sform = fields["codes"]
+    if sform > 0:
+        affine = np.array(fields["srow"], np.float64).reshape(3, 4)
         return affine[:, :3], affine[:, 3], "sform"
-    if codes[0] > 0:
+    if qform > 0:
+        *quaternion, x, y, z = fields["quaternion"]
         spacing = pixdim[1:4] * (1, 1, -1 if pixdim[0] < 0 else 1)
-        return rotation(*quaternion[:3]) * spacing, np.array(quaternion[3:], np.float64), "qform"
+        return rotation(*quaternion) * spacing, np.array([x, y, z], np.float64), "qform"
     return np.diag(pixdim[1:4]), np.zeros(3), "pixdim"
 
 

@@ -8,8 +8,8 @@ lies on the unit cube. Pickled objects are never loaded.
 from __future__ import annotations
 
 import json
-import zipfile
-import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -25,14 +25,15 @@ NPZ_MAGIC = b"PK\x03\x04"
 def read_npy(path: Path, dataset: str | None = None) -> VolumeData:
     """Read one array; it lies on the unit cube, for the format says nothing else."""
     no_dataset(path, dataset)
-    array = _load(path)
+    with _loaded(path) as array:
+        pass
     return VolumeData(as_values(array, path), np.eye(4), _meta(path, "npy", array))
 
 
 def read_npz(path: Path, dataset: str | None = None) -> VolumeData:
     """Read one array of an archive: ``dataset``, else ``values``, else the only one of rank 3 or 4."""
-    with _load(path) as archive:
-        arrays = {name: _member(archive, name, path) for name in archive.files}
+    with _loaded(path) as archive:
+        arrays = {name: archive[name] for name in archive.files}
     grids = [name for name, array in arrays.items() if array.ndim in (3, 4)]
     name = choose(path, "values" if dataset is None and "values" in grids else dataset, grids)
     meta = _meta(path, "npz", arrays[name]) | {"dataset": name}
@@ -58,14 +59,14 @@ def write_npy(file: BinaryIO, values: np.ndarray, to_world: np.ndarray, metadata
             "neither (the format has no room)",
             "write .npz or leave them out",
         )
-    np.save(file, values, allow_pickle=False)
+    # numpy.save goes around the file object (ndarray.tofile) and loses the system's reason when the disk is full.
+    np.lib.format.write_array_header_1_0(file, np.lib.format.header_data_from_array_1_0(values))
+    file.write(values.data)
 
 
 def write_npz(file: BinaryIO, values: np.ndarray, to_world: np.ndarray, metadata: dict[str, Any]) -> None:
     """Write ``values``, ``to_world`` and ``metadata`` (JSON), compressed."""
-    np.savez_compressed(
-        file, allow_pickle=False, values=values, to_world=to_world, metadata=np.array(json.dumps(metadata))
-    )
+    np.savez_compressed(file, allow_pickle=False, values=values, to_world=to_world, metadata=np.array(json.dumps(metadata)))
 
 
 def write_npz_stored(file: BinaryIO, values: np.ndarray, to_world: np.ndarray, metadata: dict[str, Any]) -> None:
@@ -73,27 +74,21 @@ def write_npz_stored(file: BinaryIO, values: np.ndarray, to_world: np.ndarray, m
     np.savez(file, allow_pickle=False, values=values, to_world=to_world, metadata=np.array(json.dumps(metadata)))
 
 
-def _load(path: Path) -> Any:
+@contextmanager
+def _loaded(path: Path) -> Iterator[Any]:
+    """What numpy.load gives, while the file is open; any error of its parsers says that the file is damaged."""
     try:
-        return np.load(path, allow_pickle=False)
-    except (ValueError, EOFError, OSError, MemoryError, zipfile.BadZipFile, SyntaxError) as error:
-        raise _damaged(path, error) from error
-
-
-def _member(archive: Any, name: str, path: Path) -> np.ndarray:
-    try:
-        return archive[name]
-    except (ValueError, EOFError, OSError, MemoryError, zipfile.BadZipFile, zlib.error, SyntaxError) as error:
-        raise _damaged(path, error) from error
-
-
-def _damaged(path: Path, error: Exception) -> Exception:
-    reason = " ".join(str(error).split()).rstrip(".")
-    if "pickle" in reason or "Object arrays" in reason:
-        return refusal(path, "Python objects", "numbers", "convert them to float32 and save again")
-    return refusal(
-        path, f"a damaged NumPy file ({reason})", "a whole one", "the file is truncated: copy or write it again"
-    )
+        with path.open("rb") as file:
+            yield np.load(file, allow_pickle=False)
+    except MemoryError:
+        raise
+    except Exception as error:
+        reason = " ".join(str(error).split()).rstrip(".") or type(error).__name__
+        if "allow_pickle=False" in reason:
+            raise refusal(path, "Python objects", "numbers", "convert them to float32 and save again") from error
+        raise refusal(
+            path, f"a damaged NumPy file ({reason})", "a whole one", "the file is truncated: copy or write it again"
+        ) from error
 
 
 def _meta(path: Path, kind: str, array: np.ndarray) -> dict[str, Any]:

@@ -11,6 +11,7 @@ Reference: the format's definition, "Definition of NRRD File Format", teem.sourc
 from __future__ import annotations
 
 import gzip
+import math
 import re
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -85,11 +86,12 @@ def read_nrrd(path: Path, dataset: str | None = None) -> VolumeData:
     """
     no_dataset(path, dataset)
     fields, comments, attached = _header(source.read_bytes(path), path)
-    sizes = _integers(fields, "sizes", path)
-    if len(sizes) != _integers(fields, "dimension", path)[0] or min(sizes) < 1:
+    words = _field(fields, "sizes", path)
+    sizes = source.integers(words, max(len(words.split()), 1), path, "sizes")
+    if [len(sizes)] != source.integers(_field(fields, "dimension", path), 1, path, "dimension") or min(sizes) < 1:
         raise refusal(path, f"sizes {sizes}", f"{fields['dimension']} sizes above 0", "correct the header")
     dtype = _dtype(fields, path)
-    stored = _stored(fields, comments, attached, dtype, int(np.prod(sizes, dtype=object)), path)
+    stored = _stored(fields, comments, attached, dtype, math.prod(sizes), path)
     spatial, channel = _axes(fields, sizes, path)
     grid = stored.reshape(sizes[::-1]).transpose([len(sizes) - 1 - axis for axis in (*spatial[::-1], *channel)])
     size = [sizes[axis] for axis in spatial]
@@ -162,21 +164,6 @@ def _field(fields: dict[str, str], name: str, path: Path) -> str:
     return fields[name]
 
 
-def _integers(fields: dict[str, str], name: str, path: Path) -> list[int]:
-    text = _field(fields, name, path)
-    try:
-        return [int(word) for word in text.split()] or [0]
-    except ValueError as error:
-        raise refusal(path, f"'{name}: {text}'", "whole numbers", "correct the header") from error
-
-
-def _floats(text: str, name: str, path: Path) -> list[float]:
-    try:
-        return [float(word) for word in text.replace(",", " ").split()]
-    except ValueError as error:
-        raise refusal(path, f"'{name}: {text}'", "numbers", "correct the header") from error
-
-
 def _dtype(fields: dict[str, str], path: Path) -> np.dtype:
     name = _field(fields, "type", path).lower()
     if name not in TYPES:
@@ -197,9 +184,7 @@ def _packing(fields: dict[str, str], path: Path) -> str:
     return ENCODINGS[name]
 
 
-def _stored(
-    fields: dict[str, str], listed: list[str], attached: bytes, dtype: np.dtype, count: int, path: Path
-) -> np.ndarray:
+def _stored(fields: dict[str, str], listed: list[str], attached: bytes, dtype: np.dtype, count: int, path: Path) -> np.ndarray:
     if "data file" not in fields:
         return _unpack(attached, fields, dtype, count, path)
     files = _data_files(fields["data file"], listed, path)
@@ -227,8 +212,7 @@ def _data_files(value: str, listed: list[str], path: Path) -> list[Path]:
 
 
 def _unpack(data: bytes, fields: dict[str, str], dtype: np.dtype, count: int, path: Path) -> np.ndarray:
-    line_skip = _integers(fields, "line skip", path)[0] if "line skip" in fields else 0
-    byte_skip = _integers(fields, "byte skip", path)[0] if "byte skip" in fields else 0
+    line_skip, byte_skip = (source.integers(fields.get(name, "0"), 1, path, name)[0] for name in ("line skip", "byte skip"))
     for _ in range(line_skip):
         data = data.partition(b"\n")[2]
     packing = _packing(fields, path)
@@ -260,34 +244,29 @@ def _axes(fields: dict[str, str], sizes: list[int], path: Path) -> tuple[list[in
     return spatial, channel
 
 
-def _vectors(fields: dict[str, str], path: Path) -> list[list[float] | None]:
+def _vectors(fields: dict[str, str], path: Path) -> list[np.ndarray | None]:
     text = fields["space directions"]
     found = re.findall(r"none|\(([^)]*)\)", text)
-    return [_floats(inner, "space directions", path) if inner else None for inner in found]
+    return [source.reals(inner, 3, path, "space directions") if inner else None for inner in found]
 
 
 def _place(fields: dict[str, str], spatial: list[int], size: list[int], path: Path) -> tuple[np.ndarray, np.ndarray]:
     """Steps (3, 3) and the first voxel's centre (3,)."""
+    origin = source.reals(fields.get("space origin", "(0,0,0)").strip("() "), 3, path, "space origin")
     if "space directions" in fields:
-        vectors = [vector for vector in _vectors(fields, path) if vector is not None]
-        origin = _floats(fields.get("space origin", "(0,0,0)").strip("() "), "space origin", path)
-        if any(len(vector) != 3 for vector in (*vectors, origin)):
-            raise refusal(path, f"'space directions: {fields['space directions']}'", "3-vectors", "correct the header")
-        return np.array(vectors).T, np.array(origin)
-    spacing = _per_axis(fields, "spacings", spatial, 1.0, path)
-    low = _per_axis(fields, "axis mins", spatial, np.nan, path)
+        return np.array([vector for vector in _vectors(fields, path) if vector is not None]).T, origin
+    count = max(spatial) + 1
+    spacing = _per_axis(fields, "spacings", spatial, count, 1.0, path)
+    low = _per_axis(fields, "axis mins", spatial, count, np.nan, path)
     if "spacings" not in fields and "axis maxs" in fields:
-        spacing = (_per_axis(fields, "axis maxs", spatial, np.nan, path) - low) / size
-    if "space origin" in fields:
-        return np.diag(spacing), np.array(_floats(fields["space origin"].strip("() "), "space origin", path))
-    return np.diag(spacing), np.where(np.isnan(low), 0.0, low + spacing / 2)
+        spacing = (_per_axis(fields, "axis maxs", spatial, count, np.nan, path) - low) / size
+    if "space origin" not in fields:
+        origin = np.where(np.isnan(low), 0.0, low + spacing / 2)
+    return np.diag(spacing), origin
 
 
-def _per_axis(fields: dict[str, str], name: str, spatial: list[int], default: float, path: Path) -> np.ndarray:
-    if name not in fields:
-        return np.full(3, default)
-    values = _floats(fields[name], name, path)
-    if len(values) <= max(spatial):
-        raise refusal(path, f"'{name}: {fields[name]}'", "one number per axis", "correct the header")
-    chosen = np.array([values[axis] for axis in spatial])
-    return np.where(np.isnan(chosen), default, chosen)
+def _per_axis(fields: dict[str, str], name: str, spatial: list[int], count: int, default: float, path: Path) -> np.ndarray:
+    """The numbers of the spatial axes; ``default`` where the file has none or says NaN."""
+    words = fields.get(name, "").split() or ["nan"] * count
+    values = source.reals(" ".join(words), max(len(words), count), path, name)
+    return np.array([default if np.isnan(values[axis]) else values[axis] for axis in spatial])

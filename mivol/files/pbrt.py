@@ -42,7 +42,7 @@ def read_pbrt(path: Path, dataset: str | None = None) -> VolumeData:
     missing = [name for name in ("nx", "ny", "nz", "p0", "p1", "density") if name not in found]
     if missing:
         raise refusal(path, f"no {', '.join(missing)}", "nx, ny, nz, p0, p1 and density", "add them to the Volume")
-    size = [int(source.numbers(found[name], 1, path)[0]) for name in ("nx", "ny", "nz")]
+    size = [source.integers(found[name], 1, path, name)[0] for name in ("nx", "ny", "nz")]
     if min(size) < 1:
         raise refusal(path, f"sizes {size}", "at least 1 each", "correct nx, ny, nz")
     density = source.numbers(found["density"], size[0] * size[1] * size[2], path)

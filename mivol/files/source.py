@@ -4,8 +4,8 @@ Every reader takes its bytes from here, so that a missing, empty, truncated or d
 everywhere: what was found, what was expected, the way out.
 
 Here: :func:`refusal` (the sentence), :func:`existing_file`, :func:`read_bytes`, :func:`elements` (bytes -> array),
-:func:`numbers` (text -> array), :func:`inflate` (bounded decompression),
-:func:`choose` and :func:`no_dataset` (which array of a file).
+:func:`numbers` (text -> array), :func:`integers` and :func:`reals` (fields of a header), :func:`inflate` (bounded
+decompression), :func:`choose` and :func:`no_dataset` (which array of a file).
 """
 
 from __future__ import annotations
@@ -14,6 +14,9 @@ import bz2
 import difflib
 import lzma
 import os
+import re
+import sys
+import textwrap
 import warnings
 import zlib
 from collections.abc import Callable, Sequence
@@ -22,6 +25,9 @@ from pathlib import Path
 import numpy as np
 
 from mivol.errors import MivolError
+
+#: Characters of what was found that a refusal quotes; line ends in it become blanks.
+LONGEST_QUOTE = 300
 
 #: codec name -> constructor of a decompressor with ``decompress(data, max_length)``, ``eof`` and ``unused_data``.
 CODECS: dict[str, Callable[[], object]] = {
@@ -34,6 +40,7 @@ CODECS: dict[str, Callable[[], object]] = {
 
 def refusal(subject: object, found: str, expected: str, way_out: str) -> MivolError:
     """The one sentence that refuses an input (``subject``: file or parameter): found, expected, the way out."""
+    found = textwrap.shorten(found, LONGEST_QUOTE, placeholder=" ...")
     return MivolError(f"{subject}: found {found}, expected {expected}; {way_out}.")
 
 
@@ -111,10 +118,37 @@ def numbers(text: bytes | str, count: int, path: object) -> np.ndarray:
         raise refusal(path, "text that is not a number among the values", "numbers only", "write it again") from error
     if values.size != count:
         fault = "truncated" if values.size < count else "longer than its header says"
-        raise refusal(
-            path, f"{values.size} numbers", f"{count} (from the header)", f"the file is {fault}: write it again"
-        )
+        raise refusal(path, f"{values.size} numbers", f"{count} (from the header)", f"the file is {fault}: write it again")
     return values
+
+
+def integers(text: str, count: int, path: object, name: str) -> list[int]:
+    """The ``count`` whole numbers in ``text``, separated by white space.
+
+    Args:
+        text: the value of a header's field.
+        count: how many there must be.
+        path: the file, named in the refusal.
+        name: the field, named in the refusal.
+
+    Raises:
+        MivolError: something else, or another count.
+    """
+    words = text.split()
+    if len(words) != count or not all(re.fullmatch(r"[+-]?\d{1,18}", word, re.ASCII) for word in words):
+        raise refusal(path, f"'{name} = {text.strip()}'", f"whole numbers ({count})", "correct the header")
+    return [int(word) for word in words]
+
+
+def reals(text: str, count: int, path: object, name: str) -> np.ndarray:
+    """The ``count`` numbers in ``text``, separated by white space or commas, as float64 (count,).
+
+    As :func:`numbers`, for a field of a header: arguments and refusal as :func:`integers`.
+    """
+    try:
+        return numbers(text, count, path)
+    except MivolError as error:
+        raise refusal(path, f"'{name} = {text.strip()}'", f"numbers ({count})", "correct the header") from error
 
 
 def inflate(data: bytes, codec: str, limit: int, path: object) -> bytes:
@@ -131,6 +165,7 @@ def inflate(data: bytes, codec: str, limit: int, path: object) -> bytes:
     Raises:
         MivolError: damaged, truncated, or longer than ``limit``.
     """
+    limit = min(limit, sys.maxsize - 1)
     pieces, total, rest = [], 0, data
     while rest:
         stream = CODECS[codec]()

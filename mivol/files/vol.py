@@ -47,9 +47,7 @@ def read_vol(path: Path, dataset: str | None = None) -> VolumeData:
             "write it again as float32",
         )
     if min(nx, ny, nz, channels) < 1:
-        raise refusal(
-            path, f"{nx} x {ny} x {nz} voxels of {channels} channels", "at least 1 each", "write the file again"
-        )
+        raise refusal(path, f"{nx} x {ny} x {nz} voxels of {channels} channels", "at least 1 each", "write the file again")
     dtype, factor = ENCODINGS[encoding]
     stored = source.elements(data, dtype, nx * ny * nz * channels, path, offset=HEADER.size)
     values = as_values(stored.reshape(nz, ny, nx, channels), path)
@@ -66,9 +64,7 @@ def write_vol(file: BinaryIO, values: np.ndarray, to_world: np.ndarray, metadata
         MivolError: a rotated, sheared or mirrored ``to_world``, or metadata, which the format has no room for.
     """
     if metadata:
-        raise refusal(
-            "write_volume", "metadata for a .vol file", "none (the format has no room)", "write .npz or leave it out"
-        )
+        raise refusal("write_volume", "metadata for a .vol file", "none (the format has no room)", "write .npz or leave it out")
     sides = np.diagonal(to_world)[:3]
     if np.count_nonzero(to_world[:3, :3] - np.diag(sides)) or sides.min() <= 0:
         raise refusal(

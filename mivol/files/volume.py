@@ -103,9 +103,7 @@ def check_frame(to_world: np.ndarray, name: object) -> None:
     """
     to_world = np.asarray(to_world, np.float64)
     if to_world.shape != (4, 4) or not np.array_equal(to_world[3], (0, 0, 0, 1)):
-        raise refusal(
-            name, f"a transform of shape {to_world.shape}", "an affine 4x4 matrix", "its last row must be 0 0 0 1"
-        )
+        raise refusal(name, f"a transform of shape {to_world.shape}", "an affine 4x4 matrix", "its last row must be 0 0 0 1")
     if not np.isfinite(to_world).all():
         raise refusal(name, "a transform with NaN or Inf", "finite numbers", "correct the header or pass to_world")
     sides = np.linalg.norm(to_world[:3, :3], axis=0)
@@ -147,9 +145,7 @@ def in_space(volume: VolumeData, space: str) -> VolumeData:
                 "set to_world by hand",
             )
     signs = np.array(SPACES[found]) * np.array(SPACES[space])
-    return dataclasses.replace(
-        volume, to_world=np.diag([*signs, 1.0]) @ volume.to_world, meta={**volume.meta, "space": space}
-    )
+    return dataclasses.replace(volume, to_world=np.diag([*signs, 1.0]) @ volume.to_world, meta={**volume.meta, "space": space})
 
 
 def as_values(array: np.ndarray, path: object) -> np.ndarray:
@@ -189,9 +185,7 @@ def as_values(array: np.ndarray, path: object) -> np.ndarray:
     return values
 
 
-def check_volume(
-    values: np.ndarray, *, name: str, channels: Sequence[int] = (1, 3), minimum: float | None = 0.0
-) -> None:
+def check_volume(values: np.ndarray, *, name: str, channels: Sequence[int] = (1, 3), minimum: float | None = 0.0) -> None:
     """Refuse a grid that cannot be a coefficient of a medium; the first bad voxel is named by its index.
 
     Args:

@@ -57,12 +57,15 @@ def read_vti(path: Path, dataset: str | None = None) -> VolumeData:
     pieces = image.findall("Piece")
     if len(pieces) != 1:
         raise refusal(path, f"{len(pieces)} pieces", "one", "write the file again in one piece")
-    extent = np.array(_numbers(pieces[0].get("Extent") or image.get("WholeExtent"), 6, path), int).reshape(3, 2)
+    words = pieces[0].get("Extent") or image.get("WholeExtent", "")
+    extent = np.array(source.integers(words, 6, path, "Extent")).reshape(3, 2)
     node, is_cell = _array(pieces[0], dataset, path)
     size = (extent[:, 1] - extent[:, 0] + (0 if is_cell else 1)).tolist()
     if min(size) < 1:
         raise refusal(path, f"the extent {extent.ravel().tolist()}", "at least one voxel", "write the file again")
-    channels = int(_numbers(node.get("NumberOfComponents", "1"), 1, path)[0])
+    (channels,) = source.integers(node.get("NumberOfComponents", "1"), 1, path, "NumberOfComponents")
+    if channels < 1:
+        raise refusal(path, f"{channels} components", "at least 1", "write the file again")
     stored = _decode(node, root, appended, encoding, size[0] * size[1] * size[2] * channels, path)
     steps, origin = _place(image, extent[:, 0] + (0.5 if is_cell else 0.0), path)
     meta = {
@@ -105,22 +108,12 @@ def _array(piece: ElementTree.Element, dataset: str | None, path: Path) -> tuple
     return found[choose(path, active if dataset is None and active in found else dataset, list(found))]
 
 
-def _numbers(text: str | None, count: int, path: Path) -> list[float]:
-    try:
-        values = [float(word) for word in (text or "").split()]
-    except ValueError:
-        values = []
-    if len(values) != count:
-        raise refusal(path, f"the attribute {text!r}", f"{count} numbers", "write the file again")
-    return values
-
-
 def _place(image: ElementTree.Element, first: np.ndarray, path: Path) -> tuple[np.ndarray, np.ndarray]:
-    spacing = _numbers(image.get("Spacing", "1 1 1"), 3, path)
-    origin = _numbers(image.get("Origin", "0 0 0"), 3, path)
-    direction = np.array(_numbers(image.get("Direction", "1 0 0 0 1 0 0 0 1"), 9, path)).reshape(3, 3)
-    steps = direction * spacing
-    return steps, np.array(origin) + steps @ first
+    spacing = source.reals(image.get("Spacing", "1 1 1"), 3, path, "Spacing")
+    origin = source.reals(image.get("Origin", "0 0 0"), 3, path, "Origin")
+    direction = source.reals(image.get("Direction", "1 0 0 0 1 0 0 0 1"), 9, path, "Direction")
+    steps = direction.reshape(3, 3) * spacing
+    return steps, origin + steps @ first
 
 
 def _decode(
@@ -141,7 +134,8 @@ def _decode(
     if kind == "binary":
         stream, coded = (node.text or "").strip().encode(), "base64"
     elif kind == "appended":
-        stream, coded = appended[int(_numbers(node.get("offset"), 1, path)[0]) :], encoding
+        (offset,) = source.integers(node.get("offset", ""), 1, path, "offset")
+        stream, coded = appended[max(offset, 0) :], encoding
     else:
         raise refusal(path, f"the format {kind!r}", "ascii, binary or appended", "write the file again")
     if coded not in STREAMS:

@@ -9,6 +9,7 @@ Reference: VTK file formats, docs.vtk.org, "Simple legacy formats".
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -74,87 +75,128 @@ class _Cursor:
 
 
 def read_vtk(path: Path, dataset: str | None = None) -> VolumeData:
-    """Read one array of a legacy ``.vtk``: ``dataset``, else the first.
+    """Read one array of a legacy ``.vtk``: ``dataset``, else the only one.
 
     Raises:
         MivolError: another kind of data set, a key missing, a type that is not known, or a truncated array.
     """
     cursor = _Cursor(source.read_bytes(path), path)
+    keys = _head(cursor)
+    points = source.integers(" ".join(keys.get("DIMENSIONS", [])), 3, path, "DIMENSIONS")
+    arrays = _arrays(cursor, points)
+    name = choose(path, dataset, list(arrays))
+    array, is_cell = arrays[name]
+    size = [number - is_cell for number in points]
+    steps = np.diag(_floats(keys, path, "SPACING", "ASPECT_RATIO"))
+    origin = _floats(keys, path, "ORIGIN") + steps.sum(axis=1) * (0.5 if is_cell else 0.0)
+    meta = {
+        "path": str(path),
+        "format": "vtk",
+        "dtype": str(array.dtype),
+        "space": None,
+        "dataset": name,
+        "centering": "cell" if is_cell else "point",
+    }
+    values = as_values(array.reshape(*size[::-1], -1), path)
+    return VolumeData(values, frame_from_steps(size, steps, origin), meta)
+
+
+def _head(cursor: _Cursor) -> dict[str, list[str]]:
+    """The keys before the first section of arrays, at which the cursor stays."""
     cursor.line()
     cursor.at = cursor.data.find(b"\n", cursor.at) + 1
     mode = " ".join(cursor.line()).upper()
     if mode not in ("ASCII", "BINARY"):
-        raise refusal(path, f"the mode {mode[:40]!r}", "ASCII or BINARY in the third line", "write the file again")
+        raise refusal(cursor.path, f"the mode {mode[:40]!r}", "ASCII or BINARY in the third line", "write the file again")
     cursor.binary = mode == "BINARY"
-    keys = _keys(cursor)
-    cells = "CELL_DATA" in keys
-    points = [int(number) for number in _floats(keys, path, "DIMENSIONS")]
-    size = [max(number - 1, 0) for number in points] if cells else points
-    count = size[0] * size[1] * size[2]
-    promised = [int(number) for number in keys["CELL_DATA" if cells else "POINT_DATA"][:1]]
-    if min(size) < 1 or promised != [count]:
-        raise refusal(path, f"{promised} elements for DIMENSIONS {points}", f"{[count]}", "correct the header")
-    arrays = _arrays(cursor, count, dataset)
-    name = choose(path, next(iter(arrays), None) if dataset is None else dataset, list(arrays))
-    steps = np.diag(_floats(keys, path, "SPACING", "ASPECT_RATIO"))
-    origin = np.array(_floats(keys, path, "ORIGIN")) + steps.sum(axis=1) * (0.5 if cells else 0.0)
-    meta = {"path": str(path), "format": "vtk", "dtype": str(arrays[name].dtype), "space": None, "dataset": name}
-    values = as_values(arrays[name].reshape(*size[::-1], -1), path)
-    return VolumeData(values, frame_from_steps(size, steps, origin), meta)
-
-
-def _keys(cursor: _Cursor) -> dict[str, list[str]]:
     keys: dict[str, list[str]] = {}
-    while not {"POINT_DATA", "CELL_DATA"} & keys.keys():
-        words = cursor.line()
-        if not words:
-            raise refusal(
-                cursor.path, "no POINT_DATA or CELL_DATA", "one in the header", "the file is truncated: copy it again"
-            )
+    section = cursor.at
+    while (words := cursor.line()) and words[0].upper() not in SECTIONS:
         keys[words[0].upper()] = words[1:]
-    if [word.upper() for word in keys.get("DATASET", [])] != ["STRUCTURED_POINTS"]:
-        found = " ".join(keys.get("DATASET", ["none"]))
+        section = cursor.at
+    if not words:
+        raise refusal(cursor.path, "no POINT_DATA or CELL_DATA", "one in the header", "the file is truncated: copy it again")
+    cursor.at = section
+    found = " ".join(keys.get("DATASET", ["none"]))
+    if found.upper() != "STRUCTURED_POINTS":
         raise refusal(cursor.path, f"the data set {found}", "STRUCTURED_POINTS", "resample it to an image first")
     return keys
 
 
-def _floats(keys: dict[str, list[str]], path: Path, *names: str) -> list[float]:
-    for name in names:
-        if name in keys:
-            try:
-                values = [float(word) for word in keys[name]]
-            except ValueError:
-                values = []
-            if len(values) != 3:
-                raise refusal(path, f"'{name} {' '.join(keys[name])}'", "3 numbers", "correct the header")
-            return values
-    raise refusal(path, f"no {names[0]}", "one in the header", "correct the header")
+def _floats(keys: dict[str, list[str]], path: Path, *names: str) -> np.ndarray:
+    """The three numbers under the first of ``names`` that is there."""
+    name = next((name for name in names if name in keys), names[0])
+    return source.reals(" ".join(keys.get(name, [])), 3, path, name)
 
 
-def _arrays(cursor: _Cursor, count: int, wanted: str | None) -> dict[str, np.ndarray]:
-    """Arrays by name (flat), up to the wanted one or the first."""
-    arrays: dict[str, np.ndarray] = {}
-    while not arrays or (wanted is not None and wanted not in arrays):
-        words = cursor.line()
-        key = words[0].upper() if words else ""
-        if key == "SCALARS" and len(words) >= 3:
-            table = cursor.at
-            if (cursor.line() or [""])[0].upper() != "LOOKUP_TABLE":
-                cursor.at = table
-            arrays[words[1]] = cursor.take(words[2], count * (int(words[3]) if len(words) > 3 else 1))
-        elif key in ("VECTORS", "NORMALS") and len(words) >= 3:
-            arrays[words[1]] = cursor.take(words[2], count * 3)
-        elif key == "FIELD" and len(words) == 3:
-            for _ in range(int(words[2])):
-                name, components, tuples, kind = (cursor.line() + [""] * 4)[:4]
-                if name.upper() == "METADATA":
-                    cursor.skip_metadata()
-                    name, components, tuples, kind = (cursor.line() + [""] * 4)[:4]
-                if tuples != str(count):
-                    raise refusal(cursor.path, f"{tuples!r} tuples in {name!r}", f"{count}", "correct the header")
-                arrays[name] = cursor.take(kind, count * int(components))
+def _arrays(cursor: _Cursor, points: list[int]) -> dict[str, tuple[np.ndarray, bool]]:
+    """name -> (flat numbers, whether on cells); reading ends at the first word that is not known."""
+    arrays: dict[str, tuple[np.ndarray, bool]] = {}
+    count, is_cell = 0, False
+    while words := cursor.line():
+        key = words[0].upper()
+        if key in SECTIONS:
+            is_cell = SECTIONS[key]
+            size = [number - is_cell for number in points]
+            count = size[0] * size[1] * size[2]
+            if min(size) < 1 or words[1:] != [str(count)]:
+                raise refusal(cursor.path, f"{' '.join(words)} for DIMENSIONS {points}", f"{key} {count}", "correct the header")
         elif key == "METADATA":
             cursor.skip_metadata()
+        elif key in ARRAYS:
+            for name, array in ARRAYS[key](cursor, words, count).items():
+                arrays.setdefault(name, (array, is_cell))
         else:
             break
     return arrays
+
+
+def _scalars(cursor: _Cursor, words: list[str], count: int) -> dict[str, np.ndarray]:
+    name, kind, components = _words(cursor, [*words, "1"][1:4], 3)
+    table = cursor.at
+    if (cursor.line() or [""])[0].upper() != "LOOKUP_TABLE":
+        cursor.at = table
+    return {name: cursor.take(kind, count * _whole(cursor, components))}
+
+
+def _vectors(cursor: _Cursor, words: list[str], count: int) -> dict[str, np.ndarray]:
+    name, kind = _words(cursor, words[1:], 2)
+    return {name: cursor.take(kind, count * 3)}
+
+
+def _field(cursor: _Cursor, words: list[str], count: int) -> dict[str, np.ndarray]:
+    arrays = {}
+    for _ in range(_whole(cursor, words[-1])):
+        line = cursor.line()
+        if line[:1] == ["METADATA"]:
+            cursor.skip_metadata()
+            line = cursor.line()
+        name, components, tuples, kind = _words(cursor, line, 4)
+        if tuples != str(count):
+            raise refusal(cursor.path, f"{tuples} tuples in {name!r}", f"{count}", "correct the header")
+        arrays[name] = cursor.take(kind, count * _whole(cursor, components))
+    return arrays
+
+
+def _words(cursor: _Cursor, words: list[str], count: int) -> list[str]:
+    if len(words) != count:
+        raise refusal(cursor.path, f"the line {' '.join(words)!r}", f"{count} words", "write the file again")
+    return words
+
+
+def _whole(cursor: _Cursor, word: str) -> int:
+    if not word.isdecimal() or int(word) < 1:
+        raise refusal(cursor.path, f"{word!r}", "a whole number above 0", "write the file again")
+    return int(word)
+
+
+#: section of a file -> whether its arrays live on cells.
+SECTIONS: dict[str, bool] = {"POINT_DATA": False, "CELL_DATA": True}
+
+#: first word of an array -> reader(cursor, words of the line, elements) -> name -> flat numbers.
+ARRAYS: dict[str, Callable[[_Cursor, list[str], int], dict[str, np.ndarray]]] = {
+    "SCALARS": _scalars,
+    "VECTORS": _vectors,
+    "NORMALS": _vectors,
+    "FIELD": _field,
+}
