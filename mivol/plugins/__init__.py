@@ -11,15 +11,15 @@ import sys
 
 import mitsuba as mi
 
-ANY_VARIANT: tuple[str, ...] = ()  # order = dependency order
-JIT_VARIANTS = ("integrators",)  # mi.ad.integrators.common does not exist in scalar_*
+MODULES = ("volumes", "media", "integrators")  # order = dependency order
 
 
 def _register() -> None:
-    variant = mi.variant()
-    if variant is None:
+    # Nothing in scalar_*: Mitsuba asks scalar_rgb for a plugin's kind, and a volume registered as a texture (there is no
+    # register_volume) would be one in every variant.
+    if mi.variant() is None or mi.variant().startswith("scalar"):
         return
-    for name in ANY_VARIANT + (() if variant.startswith("scalar") else JIT_VARIANTS):
+    for name in MODULES:
         qualified = f"{__name__}.{name}"
         loaded = sys.modules.get(qualified)
         if loaded:

@@ -15,7 +15,7 @@ import numpy as np
 
 from mivol.errors import MivolError
 from mivol.transport.lattice import block_bounds
-from mivol.transport.medium import Box, MediumView, box_of_cube, view_medium
+from mivol.transport.medium import Box, MediumView, box_of_cube, kind_of, view_medium
 
 __all__ = ["Boundary", "MediumFacts", "Needs", "find_needs"]
 
@@ -213,7 +213,7 @@ def _facts(boundary: Boundary, survey: Survey, recording: bool) -> MediumFacts:
     phase = boundary.medium.phase_function()
     common = {
         "name": boundary.name,
-        "kind": boundary.medium.class_name(),
+        "kind": kind_of(boundary.medium),
         "boundary": "a box" if boundary.box is not None else f"a {boundary.shape}, traced",
         "extinction": "rgb" if view.channels == 3 else "grey",
         "resolutions": tuple(g.res for g in grids),

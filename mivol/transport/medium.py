@@ -25,7 +25,7 @@ from mivol.transport.lattice import Lattice
 
 __all__ = ["Box", "MediumView", "Part", "box_of_cube", "view_medium"]
 
-STOCK = {"HomogeneousMedium", "HeterogeneousMedium"}
+STOCK = ("HomogeneousMedium", "HeterogeneousMedium")
 
 
 @dataclass
@@ -116,9 +116,9 @@ def view_medium(medium: mi.Medium, boundary: Box | None = None) -> MediumView:
     Raises:
         MivolError: a medium or a volume of another kind.
     """
-    kind = medium.class_name()
+    kind = kind_of(medium)
     params = mi.traverse(medium)
-    if kind not in STOCK and not hasattr(medium, "mivol_parts"):
+    if kind not in (*STOCK, "mivol_medium"):
         raise MivolError(
             f"a medium of type {kind} was found; mivol renders mivol_medium, homogeneous and heterogeneous media."
         )
@@ -127,6 +127,11 @@ def view_medium(medium: mi.Medium, boundary: Box | None = None) -> MediumView:
     parts = [_part(name, params, kind, boundary, fills_boundary) for name in names]
     albedo = [v for k, v in params if k.startswith("sigma_s." if "sigma_s" in names else "albedo.")]
     return MediumView(medium, parts, mi.Float(params["scale"]), albedo)
+
+
+def kind_of(medium: mi.Medium) -> str:
+    """Name of a medium's class; ``mivol_medium`` for ours (Mitsuba calls every Python class by its base)."""
+    return "mivol_medium" if hasattr(medium, "coefficients") else medium.class_name()
 
 
 def _part(name: str, params: mi.SceneParameters, kind: str, boundary: Box | None, fills_boundary: bool) -> Part:

@@ -1,0 +1,117 @@
+"""A dense grid of values at voxel centres, trilinear between them, constant in the outer half voxel, vacuum outside.
+
+Conventions. The same model as Mitsuba's ``gridvolume`` (clamped borders), to the last bit: values (Z, Y, X, C) over the unit
+cube, which ``to_world`` places. The tensor that ``mi.traverse`` hands out is the one that is evaluated.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mivol.errors import MivolError
+from mivol.files import check_volume, read_volume
+from mivol.space import check_affine
+
+__all__ = ["Voxels"]
+
+
+class Voxels:
+    """A trilinear grid in the world.
+
+    Args:
+        values: (Z, Y, X, C), 1 or 3 channels, finite and not negative.
+        to_world: (4, 4) affine map of the unit cube to the world.
+        name: what the grid is called in a sentence that refuses it.
+        to_local: the inverse that Mitsuba keeps of ``to_world``, rounded as it rounds; None to invert it here.
+
+    Raises:
+        MivolError: values or a placement that no medium can have; the first bad voxel is named.
+    """
+
+    def __init__(
+        self, values: np.ndarray | mi.TensorXf, to_world: np.ndarray, name: str, to_local: np.ndarray | None = None
+    ) -> None:
+        self.name = name
+        self.to_world = check_affine(to_world, f"to_world of {name}")
+        tensor = values if isinstance(values, mi.TensorXf) else mi.TensorXf(np.ascontiguousarray(values, dtype=np.float32))
+        check_volume(np.array(dr.detach(tensor)), name=name)
+        self.texture = mi.Texture3f(tensor, use_accel=False, migrate=False)
+        to_local = np.linalg.inv(self.to_world) if to_local is None else to_local
+        self.to_local = mi.ScalarAffineTransform4f(mi.ScalarMatrix4f(to_local), mi.ScalarMatrix4f(self.to_world.T))
+
+    @classmethod
+    def from_props(cls, props: mi.Properties) -> Voxels:
+        """Build from plugin parameters: one of ``filename``, ``grid`` or ``data``; ``to_world``; ``use_grid_bbox``."""
+        sources = [k for k in ("filename", "grid", "data") if k in props]
+        name = f"mivol_voxels {props.id()}".strip()
+        if len(sources) != 1:
+            found = " and ".join(sources) or "none of them"
+            raise MivolError(f"{name} was given {found}; give exactly one of filename, grid or data.")
+        given = props.get("to_world", mi.ScalarTransform4f())
+        to_world, to_local = np.array(given.matrix, dtype=np.float64), np.array(given.inverse_transpose, dtype=np.float64).T
+        own_box = props.get("use_grid_bbox", False)
+        values, place = cls._values(props, sources[0], own_box)
+        if "filename" in props:
+            name = f"{name} ({props['filename']})"
+        check_affine(to_world, f"to_world of {name}")
+        return cls(values, to_world @ place, name, np.linalg.inv(place) @ to_local)
+
+    @staticmethod
+    def _values(props: mi.Properties, source: str, own_box: bool) -> tuple[np.ndarray | mi.TensorXf, np.ndarray]:
+        if source == "filename":
+            path = mi.file_resolver().resolve(props["filename"])
+            volume = read_volume(path, frame="file" if own_box else "unit")
+            return volume.values, volume.to_world
+        if own_box and source == "data":
+            raise MivolError("mivol_voxels was given data and use_grid_bbox; a bare tensor has no box: give to_world.")
+        given = props[source]
+        if source == "data":
+            return given, np.eye(4)
+        values = np.array(given)
+        place = np.eye(4)
+        if own_box:
+            low, high = np.array(given.bbox().min), np.array(given.bbox().max)
+            place[:3, :3], place[:3, 3] = np.diag(high - low), low
+        return values.reshape((*values.shape[:3], -1)), place
+
+    @property
+    def channels(self) -> int:
+        """Number of values at each voxel."""
+        return self.texture.tensor().shape[3]
+
+    @property
+    def res(self) -> tuple[int, int, int]:
+        """Resolution (Z, Y, X)."""
+        return tuple(self.texture.tensor().shape[:3])
+
+    def eval(self, p: mi.Point3f, active: mi.Bool = True) -> list[mi.Float]:
+        """Values at world points, one entry a channel; 0 outside the box."""
+        q = mi.AffineTransform4f(self.to_local) @ p
+        inside = mi.Bool(active) & dr.all((q >= 0) & (q <= 1))
+        return [dr.select(inside, v, 0) for v in self.texture.eval(q, inside)]
+
+    def bound(self) -> list[float]:
+        """Largest value of each channel."""
+        values = np.array(dr.detach(self.texture.tensor()))
+        return [float(v) for v in values.reshape(-1, self.channels).max(axis=0)]
+
+    def corners(self) -> np.ndarray:
+        """The 8 corners of the box in the world, (8, 3)."""
+        unit = np.array([[x, y, z, 1] for z in (0, 1) for y in (0, 1) for x in (0, 1)], dtype=np.float64)
+        return (unit @ self.to_world.T)[:, :3]
+
+    def refresh(self) -> None:
+        """Take over values that were replaced from outside.
+
+        Raises:
+            MivolError: the new values are not those of a medium (looked at, unless ``dr.freeze`` is recording).
+        """
+        self.texture.update_inplace()
+        if not dr.flag(dr.JitFlag.FreezingScope):
+            check_volume(np.array(dr.detach(self.texture.tensor())), name=self.name)
+
+    def __repr__(self) -> str:
+        z, y, x = self.res
+        return f"mivol_voxels[{x}x{y}x{z}, {self.channels} channels]"

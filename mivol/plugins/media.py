@@ -1,0 +1,59 @@
+"""<medium type="mivol_medium">: extinction and albedo, or absorption and scattering, each a number, rgb or a grid."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from mivol.scene.coefficients import Coefficients
+
+
+class MivolMedium(mi.Medium):
+    """``<medium type="mivol_medium">``: a participating medium.
+
+    Parameters:
+        sigma_t, albedo: extinction [1/length] and single-scattering albedo (default 0), or
+        sigma_a, sigma_s: absorption and scattering [1/length]; each a float, rgb (above 1 allowed) or a volume.
+        scale: factor on the extinction, differentiable. Default 1.
+        emission: refused while it cannot be rendered.
+        a phase function: default isotropic.
+    """
+
+    def __init__(self, props: mi.Properties) -> None:
+        super().__init__(props)
+        self.coefficients = Coefficients.from_props(props)
+        self.scale = mi.Float(props.get("scale", 1.0))
+        dr.make_opaque(self.scale)
+        self.m_is_homogeneous = self.coefficients.is_homogeneous
+        self.m_has_spectral_extinction = self.coefficients.is_rgb
+        self.refresh()
+
+    def refresh(self) -> None:
+        self.majorant = self.coefficients.bound()
+        dr.make_opaque(self.majorant)
+
+    def intersect_aabb(self, ray: mi.Ray3f) -> tuple[mi.Bool, mi.Float, mi.Float]:
+        return self.coefficients.reach(ray)
+
+    def get_majorant(self, mei: mi.MediumInteraction3f, active: mi.Bool = True) -> mi.Spectrum:
+        return mi.Spectrum(self.scale * self.majorant)
+
+    def get_scattering_coefficients(
+        self, mei: mi.MediumInteraction3f, active: mi.Bool = True
+    ) -> tuple[mi.Spectrum, mi.Spectrum, mi.Spectrum]:
+        return self.coefficients.eval(mei, self.scale, self.majorant, active)
+
+    def traverse(self, callback: mi.TraversalCallback) -> None:
+        callback.put("scale", self.scale, mi.ParamFlags.Differentiable)
+        for name, volume in self.coefficients.volumes.items():
+            callback.put(name, volume, mi.ParamFlags.Differentiable)
+        super().traverse(callback)
+
+    def parameters_changed(self, keys: list[str]) -> None:
+        self.refresh()
+
+    def to_string(self) -> str:
+        return repr(self.coefficients)
+
+
+mi.register_medium("mivol_medium", MivolMedium)

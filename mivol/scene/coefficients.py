@@ -1,0 +1,140 @@
+r"""The coefficients of a medium: extinction and albedo, or absorption and scattering.
+
+.. math:: \sigma_t = \sigma_a + \sigma_s, \qquad \alpha = \sigma_s / \sigma_t, \qquad \sigma_n = \bar\sigma - \sigma_t
+
+Conventions. Coefficients are per world length. Numbers and rgb triples become constant volumes, so that every coefficient
+answers the same questions; a constant fills whatever bounds the medium.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mivol.errors import MivolError
+
+__all__ = ["Coefficients"]
+
+PAIRS = (("sigma_t", "albedo"), ("sigma_a", "sigma_s"))
+
+
+class Coefficients:
+    """The volumes behind the coefficients of one medium.
+
+    Args:
+        volumes: ``sigma_t`` and ``albedo``, or ``sigma_a`` and ``sigma_s``.
+    """
+
+    def __init__(self, volumes: dict[str, mi.Volume]) -> None:
+        self.volumes = volumes
+
+    @classmethod
+    def from_props(cls, props: mi.Properties) -> Coefficients:
+        """Read a medium's coefficients from plugin parameters.
+
+        Raises:
+            MivolError: both pairs, half of a pair, emission, or a negative number.
+        """
+        if "emission" in props:
+            raise MivolError("mivol_medium was given emission, which mivol cannot render yet; take it out.")
+        given = [n for pair in PAIRS for n in pair if n in props]
+        pair = next((p for p in PAIRS if set(given) <= set(p)), None)
+        if pair is None or not given or given == ["albedo"]:
+            raise MivolError(
+                f"mivol_medium was given {' and '.join(given) or 'no coefficient'}; give sigma_t (with albedo, if it scatters) "
+                "or sigma_a and sigma_s."
+            )
+        return cls({name: _volume(props, name) for name in pair})
+
+    @property
+    def extinction(self) -> list[mi.Volume]:
+        """The volumes whose sum is the extinction."""
+        return [v for n, v in self.volumes.items() if n != "albedo"]
+
+    @property
+    def is_homogeneous(self) -> bool:
+        """Whether every coefficient is a constant."""
+        return all(_is_constant(v) for v in self.volumes.values())
+
+    @property
+    def is_rgb(self) -> bool:
+        """Whether the extinction differs between channels."""
+        return any(_channels(v) == 3 for v in self.extinction)
+
+    def bound(self) -> mi.Float:
+        """Largest extinction over space and channels, without the medium's scale."""
+        return mi.Float(sum(_maximum(v) for v in self.extinction))
+
+    def reach(self, ray: mi.Ray3f) -> tuple[mi.Bool, mi.Float, mi.Float]:
+        """Whether and where a ray can meet extinction: in the boxes of the grids, or anywhere where a part is constant."""
+        if any(_is_constant(v) for v in self.extinction):
+            return mi.Bool(True), mi.Float(0), mi.Float(dr.inf)
+        box = mi.ScalarBoundingBox3f()
+        for volume in self.extinction:
+            box.expand(volume.bbox())
+        return mi.BoundingBox3f(box).ray_intersect(ray)
+
+    def eval(
+        self, mei: mi.MediumInteraction3f, scale: mi.Float, majorant: mi.Float, active: mi.Bool
+    ) -> tuple[mi.Spectrum, mi.Spectrum, mi.Spectrum]:
+        """Scattering, null and total coefficients at a point, as Mitsuba's media return them."""
+        first, second = (_eval(v, mei, active) for v in self.volumes.values())
+        sigma_t, sigma_s = (first, first * second) if "sigma_t" in self.volumes else (first + second, second)
+        # The majorant was rounded, and is compared with a sum rounded otherwise: a null coefficient below 0 would be a
+        # negative probability.
+        sigma_n = dr.maximum(scale * (majorant - sigma_t), 0)
+        return scale * sigma_s, sigma_n, scale * sigma_t
+
+    def __repr__(self) -> str:
+        return "mivol_medium[" + ", ".join(f"{n}={v.class_name()}" for n, v in self.volumes.items()) + "]"
+
+
+def _volume(props: mi.Properties, name: str) -> mi.Volume:
+    """One coefficient as a volume: a number, an rgb triple (of any size) or a volume."""
+    value = props.get(name, 0.0)
+    if isinstance(value, mi.Volume):
+        return value
+    if isinstance(value, mi.Texture):
+        return mi.load_dict({"type": "constvolume", "value": value})
+    if isinstance(value, (int, float)):
+        check_coefficient(float(value), name)
+        return mi.load_dict({"type": "constvolume", "value": float(value)})
+    rgb = [float(v) for v in np.array(value).ravel()]
+    for v in rgb:
+        check_coefficient(v, name)
+    return mi.load_dict({"type": "constvolume", "value": {"type": "rgb", "value": rgb}})
+
+
+def check_coefficient(value: float, name: str) -> None:
+    """Refuse a number that no coefficient can be.
+
+    Raises:
+        MivolError: NaN, infinite, negative, or an albedo above 1.
+    """
+    if not np.isfinite(value) or value < 0:
+        raise MivolError(f"{name} is {value}; a finite number of at least 0 is expected.")
+    if name == "albedo" and value > 1:
+        raise MivolError(f"albedo is {value}; the share of light that is scattered lies in [0, 1].")
+
+
+def _is_constant(volume: mi.Volume) -> bool:
+    return volume.class_name() == "ConstVolume"
+
+
+def _constant(volume: mi.Volume) -> mi.Float | mi.Color3f:
+    return mi.traverse(volume)["value.value"]
+
+
+def _channels(volume: mi.Volume) -> int:
+    return dr.size_v(_constant(volume)) if _is_constant(volume) else volume.channel_count()
+
+
+def _maximum(volume: mi.Volume) -> float:
+    return float(np.max(np.array(dr.detach(_constant(volume))))) if _is_constant(volume) else volume.max()
+
+
+def _eval(volume: mi.Volume, it: mi.Interaction3f, active: mi.Bool) -> mi.Spectrum:
+    if _channels(volume) == 3:
+        return volume.eval(it, active)
+    return mi.Spectrum(volume.eval_1(it, active))
