@@ -68,6 +68,9 @@ def test_hemisphere_is_even(variant_rgb):
     np.testing.assert_allclose(np.diff(heights), 2 / 64, rtol=1e-3)
     # The mean of 64 unit vectors: 1/sqrt(64) = 0.125 for a random set; the spiral is 10 times better.
     assert np.linalg.norm(origins.mean(axis=0)) / (4 * RADIUS) < 0.0125
+    # Each of 64 has an area of 4 pi/64, a square of side 0.44: no two are nearer than half of that.
+    apart = np.linalg.norm(origins[:, None] - origins, axis=2)[np.triu_indices(64, 1)] / (4 * RADIUS)
+    assert apart.min() > 0.22
 
 
 def test_look_at_is_mitsubas(variant_rgb):

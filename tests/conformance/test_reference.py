@@ -363,7 +363,10 @@ def test_doubts_that_need_no_render(variant_rgb):
 
 
 def test_no_doubt_about_good_scenes(variant_rgb):
-    """The boundary is the grid's box, rotated with it or not; a small g in a black medium; a camera that has its medium."""
+    """The boundary is the grid's box, rotated with it or not; a small g in a black medium; a camera that has its medium.
+
+    Two cameras are outside, but within the box about a ball, and where a ray to the sky crosses the cube twice.
+    """
     turn = _t().rotate([1, 2, 3] / np.sqrt(14), 40)
     own = {"type": "ref", "id": "fog"}
     inside = {**_scene(_grid(1.0))["sensor"], "type": "perspective", "to_world": _t(), "medium": own}
@@ -376,6 +379,7 @@ def test_no_doubt_about_good_scenes(variant_rgb):
         _scene(_homogeneous(1.0, phase={"type": "hg", "g": 1e-5})),
         {"type": "scene", "fog": _homogeneous(1.0), "a": inside, "b": ball},
         {"type": "scene", "a": corner, "b": {**ball, "interior": _homogeneous(1.0)}},
+        _scene(_grid(1.0), sensor={**corner, "to_world": _t().translate([-1.9, -0.3, -1.1])}),
     ]
     for scene in good:
         assert trust(mi.load_dict(scene)) == []
