@@ -133,6 +133,47 @@ def line_integrals(transmission: Transmission, n_sigma: float = 3.0) -> tuple[np
     return np.where(seen, -np.log(safe), 0.0), np.where(seen, safe**2 / np.where(seen, variance, 1.0), 0.0)
 
 
+# -- Drift of the light ---------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class LightDrift:
+    """How the pattern of the light moved away from the flats: line integrals ``offset + slope time`` of each pixel.
+
+    Flats taken before a scan are out of date at its end: the beam's stripes have moved, and each pixel of every view
+    is too dark or too bright by a factor that changes slowly (stripes in the sinogram, rings in the slice).
+    """
+
+    offset: np.ndarray
+    slope: np.ndarray
+
+    def eval(self, times: np.ndarray) -> np.ndarray:
+        """(views, rows, cols) to add to the line integrals of the object."""
+        return self.offset + np.asarray(times)[:, None, None] * self.slope
+
+
+def fit_light_drift(residual: np.ndarray, weights: np.ndarray, times: np.ndarray) -> LightDrift:
+    """Fit each pixel's offset and slope to what the object does not explain, by weighted least squares.
+
+    In turns with a few iterations of a solver on ``y - drift`` this is block descent on the joint weighted least
+    squares of object and drift.
+
+    Args:
+        residual: (views, rows, cols), ``y - A x``.
+        weights: inverse variances; a pixel with fewer than two weighted views gets no drift.
+        times: (views,) when each was taken, in any unit, best about 0.
+    """
+    t = np.asarray(times, float)[:, None, None]
+    w0, w1, w2 = weights.sum(0), (weights * t).sum(0), (weights * t * t).sum(0)
+    r0, r1 = (weights * residual).sum(0), (weights * residual * t).sum(0)
+    det = w0 * w2 - w1 * w1
+    # Equal times leave det at the rounding of its terms: no slope can be told then.
+    known = det > 1e-9 * w0 * w2
+    det = np.where(known, det, 1.0)
+    offset, slope = (w2 * r0 - w1 * r1) / det, (w0 * r1 - w1 * r0) / det
+    return LightDrift(np.where(known, offset, 0.0), np.where(known, slope, 0.0))
+
+
 # -- Rotation axis --------------------------------------------------------------------------------------------------------
 
 
@@ -293,6 +334,6 @@ def _parabola_minimum(f: Callable[[float], float], centre: float, width: float, 
             f"Found the least misfit at the border of columns {centre - width:.1f} to {centre + width:.1f}, expected it "
             "inside: start nearer, or search wider."
         )
-    a, b, c = np.polyfit(offsets[at - 1 : at + 2], values[at - 1 : at + 2], 2)
+    a, b, c = map(float, np.polyfit(offsets[at - 1 : at + 2], values[at - 1 : at + 2], 2))
     # n a (offset / sigma)^2 rises by the residual's own mean square at one standard deviation.
     return centre - width * b / (2 * a), width * float(np.sqrt((c - b * b / (4 * a)) / (n * a)))

@@ -196,7 +196,8 @@ class Projector:
             o, d = self._rays(self.views[first : first + views_at_once])
             for start in range(0, len(o), budget):
                 part = slice(start, start + budget)
-                yield first * per_view + start, mi.Point3f(o[part].T), mi.Vector3f(d[part].T)
+                origin, direction = ([mi.Float(_aligned(c)) for c in a[part].T] for a in (o, d))
+                yield first * per_view + start, mi.Point3f(*origin), mi.Vector3f(*direction)
 
     def _rays(self, views: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Rays (N, 3) that start on the sphere around the grid, from the grid's centre."""
@@ -239,6 +240,18 @@ class _Projection(dr.CustomOp):
 
     def name(self) -> str:
         return "projection"
+
+
+def _aligned(a: np.ndarray) -> np.ndarray:
+    """A copy at an address that is a multiple of 64.
+
+    Dr.Jit reads NumPy's memory in place, and compiles a kernel anew for each pattern of aligned and unaligned inputs.
+    """
+    buffer = np.empty(a.nbytes + 64, np.uint8)
+    start = -buffer.ctypes.data % 64
+    aligned = buffer[start : start + a.nbytes].view(a.dtype)
+    aligned[:] = a
+    return aligned
 
 
 def _as_array(a: np.ndarray, shape: tuple[int, ...], what: str) -> tuple[np.ndarray, bool]:

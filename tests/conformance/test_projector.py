@@ -1,0 +1,258 @@
+"""The projector pair against its float64 twin, its transpose, and every way in which it can be called."""
+
+from __future__ import annotations
+
+import mitsuba as mi
+import numpy as np
+import oracle_projector
+import pytest
+import scipy.sparse.linalg
+
+from mivol.errors import MivolError
+from mivol.tomography import projector as projector_module
+from mivol.tomography.filtered import filtered_backprojection
+from mivol.tomography.geometry import ConeBeam, ParallelBeam, PencilRays, VoxelGrid
+from mivol.tomography.phantoms import random_ellipsoids
+from mivol.tomography.projector import Projector
+
+pytestmark = pytest.mark.usefixtures("variant_rgb")
+
+GRID = VoxelGrid((5, 7, 6), (0.5, 0.4, 0.6), centre=(0.2, -0.3, 0.1))
+ANGLES = np.array([0.0, 0.4, np.pi / 2, 2.5, 4.0])
+BEAMS = {
+    "parallel": ParallelBeam(ANGLES, (7, 9), (0.5, 0.45), axis_offset=0.13, detector_offset=(0.07, -0.2)),
+    "cone": ConeBeam(ANGLES, (7, 9), 8.0, 13.0, (0.7, 0.8), axis_offset=-0.2, detector_offset=(0.3, 0.1)),
+    "source inside": ConeBeam(ANGLES, (7, 9), 0.5, 3.0, (0.3, 0.4)),
+    "pencil": PencilRays(*np.random.default_rng(0).normal(size=(2, 60, 3))),
+}
+
+
+def numbers(*shape: int, seed: int = 1) -> np.ndarray:
+    return np.random.default_rng(seed).normal(size=shape).astype(np.float32)
+
+
+@pytest.mark.parametrize("name", BEAMS)
+def test_pair_is_its_float64_twin(name):
+    """2e-6 of sum |A| |x| and |A|^T |y|: float32 rounding of about 20 terms and of positions of order 10 voxels."""
+    a, twin = Projector(BEAMS[name], GRID), oracle_projector.system_matrix(BEAMS[name], GRID)
+    x, y = numbers(*GRID.shape), numbers(*a.projection_shape, seed=2)
+    forward, backward = a @ x, a.T @ y
+    assert forward.shape == a.projection_shape == BEAMS[name].shape
+    assert backward.shape == GRID.shape
+    assert np.abs(forward.ravel() - twin @ x.ravel().astype(float)).max() < 2e-6 * (twin @ np.abs(x.ravel())).max()
+    assert np.abs(backward.ravel() - twin.T @ y.ravel().astype(float)).max() < 2e-6 * (twin.T @ np.abs(y.ravel())).max()
+    assert np.abs(forward).max() > 0.1, "the rays hit the grid"
+
+
+@pytest.mark.parametrize("name", BEAMS)
+def test_adjoint_identity(name, seed):
+    """|<A x, y> - <x, A^T y>| <= 1e-6 |A x| |y|: what a matched pair promises (the inner products are float64)."""
+    a = Projector(BEAMS[name], GRID)
+    x, y = numbers(GRID.size, seed=seed), numbers(a.shape[0], seed=seed + 100)
+    ax, aty = (a @ x).astype(float), (a.T @ y).astype(float)
+    assert abs(ax @ y - x @ aty) <= 1e-6 * np.linalg.norm(ax) * np.linalg.norm(y)
+
+
+def test_rows_and_columns_of_a_larger_scan_agree():
+    """A 24^3 grid and 20 views, 1e4 rays: <A x, y> again, now with hundreds of rays in each voxel (hard case 42)."""
+    grid = VoxelGrid((24, 24, 24), 1 / 12)
+    a = Projector(ConeBeam(np.arange(20) * 0.3, (24, 24), 5.0, 8.0, 0.14), grid)
+    x, y = np.abs(numbers(grid.size)), np.abs(numbers(a.shape[0]))
+    ax, aty = (a @ x).astype(float), (a.T @ y).astype(float)
+    assert abs(ax @ y - x @ aty) <= 1e-6 * np.linalg.norm(ax) * np.linalg.norm(y)
+
+
+@pytest.mark.parametrize("name", ["parallel", "cone"])
+def test_projects_what_an_ellipsoid_projects(name):
+    """Rationale: geometry signs end to end, against chords on paper, no code in common with the walk.
+
+    Expected: voxels of size h blur the edges of ellipsoids with axes of 0.05 to 0.35: an error of order h = 0.125, and of
+    half when h is halved.
+    """
+    phantom, errors = random_ellipsoids(3, seed=4), []
+    beam = {
+        "parallel": ParallelBeam(ANGLES, (30, 30), 0.07, axis_offset=0.2),
+        "cone": ConeBeam(ANGLES, (30, 30), 6.0, 9.0, 0.11, axis_offset=0.15, detector_offset=(0.1, 0.2)),
+    }[name]
+    truth = phantom.project(beam)
+    for n in (16, 32):
+        grid = VoxelGrid((n, n, n), 2 / n)
+        errors.append(np.linalg.norm(Projector(beam, grid) @ phantom.voxelise(grid, 4) - truth) / np.linalg.norm(truth))
+    assert errors[0] < 0.3
+    assert errors[1] < 0.6 * errors[0]
+
+
+def test_hard_09_axis_aligned_rays_are_row_sums():
+    """theta = 0 looks along +y, theta = pi / 2 along -x, rays through voxel centres: voxel size times the sum of a row."""
+    grid = VoxelGrid((4, 6, 6), 0.5)
+    x = numbers(*grid.shape)
+    y = Projector(ParallelBeam(np.array([0.0, np.pi / 2]), (4, 6), 0.5), grid) @ x
+    np.testing.assert_allclose(y[0], 0.5 * x.sum(axis=1), atol=1e-5)
+    np.testing.assert_allclose(y[1], 0.5 * x.sum(axis=2), atol=1e-5)
+
+
+def test_hard_15_object_and_source_far_away():
+    """The same scan 1e6 units from the world's origin, and from 1e5 grid sizes away: float64 set-up loses nothing.
+
+    Expected: moving grid and rays together changes each float64 coordinate by 1e6 * 1e-16 only. A far cone is the
+    parallel beam to 1e-5 (angle of the rays).
+    """
+    rays = PencilRays(np.array([[-5.0, 0.3, 0.2], [-5.0, -0.4, 0.6]]), np.array([[1.0, 0.01, -0.02], [1.0, 0.05, 0.0]]))
+    shift = np.array([1e6, -2e6, 5e5])
+    far = PencilRays(rays.o + shift, rays.d)
+    x = numbers(8, 8, 8)
+    near_grid, far_grid = VoxelGrid((8, 8, 8), 0.25), VoxelGrid((8, 8, 8), 0.25, centre=tuple(shift))
+    np.testing.assert_allclose(Projector(far, far_grid) @ x, Projector(rays, near_grid) @ x, atol=2e-6)
+    cone = Projector(ConeBeam(ANGLES, (8, 8), 2e5, 2e5, 0.25), near_grid) @ x
+    np.testing.assert_allclose(cone, Projector(ParallelBeam(ANGLES, (8, 8), 0.25), near_grid) @ x, atol=1e-4)
+
+
+def test_parallel_rays_are_whole_lines_and_cones_are_not():
+    """A grid behind the rotation axis is still seen in parallel light, whatever its distance; not behind a source."""
+    grid = VoxelGrid((2, 2, 2), 1.0, centre=(0.0, -500.0, 0.0))
+    x = np.ones(grid.shape, np.float32)
+    assert Projector(ParallelBeam(np.zeros(1), (1, 1)), grid) @ x == pytest.approx(2.0, rel=1e-6)
+    assert (Projector(ConeBeam(np.zeros(1), (1, 1), 100.0, 200.0), grid) @ x) == 0.0
+
+
+def test_subset_is_the_rows_of_its_views():
+    a = Projector(BEAMS["cone"], GRID)
+    x, y = numbers(*GRID.shape), numbers(2, 7, 9)
+    part = a.subset([3, 1])
+    np.testing.assert_array_equal(part @ x, (a @ x)[[3, 1]])
+    padded = np.zeros(a.projection_shape, np.float32)
+    padded[[3, 1]] = y
+    np.testing.assert_allclose(part.T @ y, a.T @ padded, atol=1e-5)
+    np.testing.assert_array_equal(part.subset([1]) @ x, (a @ x)[[1]])
+
+
+def test_subset_compiles_nothing():
+    """Kernels have no sizes and no geometry in their code: the same ones (by hash) serve any views and another scanner."""
+    import drjit as dr
+
+    def kernels(a: Projector) -> set[str]:
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+            dr.kernel_history_clear()
+            a.T @ (a @ x)
+            return {k["hash"] for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT}
+
+    a, x = Projector(BEAMS["parallel"], GRID), numbers(*GRID.shape)
+    first = kernels(a)
+    assert len(first) >= 3
+    for other in (a.subset([0]), a.subset([1, 4]), Projector(BEAMS["cone"], GRID)):
+        assert kernels(other) == first
+
+
+@pytest.mark.parametrize("cells", [1, 400, 5000])
+def test_passes_change_nothing(monkeypatch, cells):
+    """Ray by ray, views cut in pieces, several views at once: the same numbers; A^T up to the order of its sums."""
+    whole = Projector(BEAMS["cone"], GRID)
+    x, y = numbers(*GRID.shape), numbers(*whole.projection_shape)
+    expected, expected_back = whole @ x, whole.T @ y
+    monkeypatch.setattr(projector_module, "PASS_CELLS", cells)
+    monkeypatch.setattr(projector_module, "CACHE_BYTES", 0)
+    if cells == 1:
+        part = Projector(BEAMS["cone"], GRID).subset([2])
+        np.testing.assert_array_equal(part @ x, expected[[2]])
+        return
+    a = Projector(BEAMS["cone"], GRID)
+    np.testing.assert_array_equal(a @ x, expected)
+    np.testing.assert_allclose(a.T @ y, expected_back, atol=2e-6 * np.abs(expected_back).max())
+
+
+def test_flat_in_flat_out_and_wrong_shapes_are_refused():
+    a = Projector(BEAMS["parallel"], GRID)
+    x = numbers(*GRID.shape)
+    np.testing.assert_array_equal(a @ x.ravel(), (a @ x).ravel())
+    assert a.shape == (5 * 7 * 9, 5 * 7 * 6)
+    assert a.T.shape == a.shape[::-1]
+    assert a.T.T is a
+    with pytest.raises(MivolError, match=r"shape \(6, 7, 5\), expected \(5, 7, 6\)"):
+        a @ x.transpose(2, 1, 0)
+    with pytest.raises(MivolError, match="one number for each of the rays"):
+        a.T @ x
+    with pytest.raises(MivolError, match="complex"):
+        a @ (1j * x)
+
+
+def test_scipy_solves_with_it():
+    """As a LinearOperator under LSQR: the same answer as the twin's matrix, to what float32 projections allow."""
+    phantom, grid = random_ellipsoids(2, seed=1), VoxelGrid((6, 6, 6), 1 / 3)
+    beam = ParallelBeam(np.arange(12) * np.pi / 12, (8, 8), 0.25)
+    operator, twin = Projector(beam, grid).as_linear_operator(), oracle_projector.system_matrix(beam, grid)
+    b = phantom.project(beam).ravel()
+    ours = scipy.sparse.linalg.lsqr(operator, b, iter_lim=8)[0]
+    theirs = scipy.sparse.linalg.lsqr(twin, b, iter_lim=8)[0]
+    np.testing.assert_allclose(ours, theirs, atol=1e-4 * np.abs(theirs).max())
+    assert operator.shape == twin.shape
+
+
+def test_forward_and_reverse_mode_are_the_pair():
+    import drjit as dr
+
+    a = Projector(BEAMS["cone"], GRID)
+    x, tangent, y = numbers(*GRID.shape), numbers(*GRID.shape, seed=3), numbers(*a.projection_shape, seed=4)
+    values = mi.TensorXf(x)
+    dr.enable_grad(values)
+    dr.set_grad(values, mi.TensorXf(tangent))
+    np.testing.assert_array_equal(np.array(dr.forward_to(a.integrate(values))), a @ tangent)
+    values = mi.TensorXf(x)
+    dr.enable_grad(values)
+    dr.backward_from(a.integrate(values) * mi.TensorXf(y))
+    np.testing.assert_allclose(np.array(dr.grad(values)), a.T @ y, atol=1e-5)
+    with pytest.raises(MivolError, match="expected the grid's"):
+        a.integrate(mi.TensorXf(x.ravel(), (7, 5, 6)))
+
+
+def test_torch_differentiates_through_it():
+    torch = pytest.importorskip("torch", reason="PyTorch is not installed: the torch bridge is not tested")
+    a = Projector(BEAMS["parallel"], GRID)
+    x, y = numbers(*GRID.shape), numbers(*a.projection_shape, seed=4)
+    tensor = torch.tensor(x, requires_grad=True)
+    projected = a.to_torch()(tensor)
+    np.testing.assert_array_equal(projected.detach().numpy(), a @ x)
+    (projected * torch.tensor(y)).sum().backward()
+    np.testing.assert_allclose(tensor.grad.numpy(), a.T @ y, atol=1e-5)
+
+
+def test_without_torch_the_bridge_says_so(monkeypatch):
+    import sys
+
+    monkeypatch.setitem(sys.modules, "torch", None)
+    with pytest.raises(MivolError, match="pip install torch"):
+        Projector(BEAMS["parallel"], GRID).to_torch()
+
+
+def test_column_sums_are_what_a_voxel_is_seen():
+    """Sum over voxels of A^T 1 is the sum of all chords: every ray's weights add up to its length in the box."""
+    a = Projector(BEAMS["cone"], GRID)
+    chords = a @ np.ones(GRID.shape, np.float32)
+    assert a.column_sums.sum(dtype=float) == pytest.approx(chords.sum(dtype=float), rel=1e-6)
+
+
+def test_filtered_backprojection_returns_a_disc():
+    """A cylinder of value 2 and radius 20 pixels from 90 views: 2 inside to the ringing of its edge, its mass to 1 %."""
+    n, s = 64, np.arange(64) - 31.5
+    chord = 2 * 2 * np.sqrt(np.maximum(400 - s**2, 0))
+    y = np.broadcast_to(chord, (90, 1, n))
+    a = Projector(ParallelBeam(np.arange(90) * np.pi / 90, (1, n)), VoxelGrid((1, n, n)))
+    x = filtered_backprojection(a, y)[0]
+    radius = np.hypot(s[:, None], s)
+    assert x[radius < 15].mean() == pytest.approx(2.0, rel=5e-3)
+    assert x[radius < 30].sum() == pytest.approx(2 * np.pi * 400, rel=1e-2)
+    assert abs(x[(radius > 23) & (radius < 30)]).mean() < 0.05
+    with pytest.raises(MivolError, match="expected a ParallelBeam"):
+        filtered_backprojection(Projector(BEAMS["cone"], GRID), np.zeros((5, 7, 9)))
+
+
+def test_views_that_are_not_there_are_refused():
+    with pytest.raises(MivolError, match="from 0 to 4"):
+        Projector(BEAMS["cone"], GRID).subset([4]).geometry.rays([5])
+    with pytest.raises(MivolError, match="from 0 to 4"):
+        Projector(BEAMS["cone"], GRID, [-1])
+
+
+def test_scalar_variants_are_refused():
+    mi.set_variant("scalar_rgb")
+    with pytest.raises(MivolError, match="a variant|expected one that compiles"):
+        Projector(BEAMS["cone"], GRID)
