@@ -36,7 +36,7 @@ class MivolMedium(mi.Medium):
         return self.coefficients.reach(ray)
 
     def get_majorant(self, mei: mi.MediumInteraction3f, active: mi.Bool = True) -> mi.Spectrum:
-        return mi.Spectrum(self.scale * self.majorant)
+        return self.scale * self.majorant
 
     def get_scattering_coefficients(
         self, mei: mi.MediumInteraction3f, active: mi.Bool = True

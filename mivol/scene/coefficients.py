@@ -62,9 +62,15 @@ class Coefficients:
         """Whether the extinction differs between channels."""
         return any(_channels(v) == 3 for v in self.extinction)
 
-    def bound(self) -> mi.Float:
-        """Largest extinction over space and channels, without the medium's scale."""
-        return mi.Float(sum(_maximum(v) for v in self.extinction))
+    def bound(self) -> mi.Spectrum:
+        """Largest extinction over space, without the medium's scale.
+
+        Of each channel where it is constant, since Mitsuba samples a homogeneous medium by its majorant alone; of all
+        channels together elsewhere, as stock ``heterogeneous`` has it.
+        """
+        if self.is_homogeneous:
+            return sum((mi.Spectrum(dr.detach(_constant(v))) for v in self.extinction), mi.Spectrum(0))
+        return mi.Spectrum(sum(_maximum(v) for v in self.extinction))
 
     def reach(self, ray: mi.Ray3f) -> tuple[mi.Bool, mi.Float, mi.Float]:
         """Whether and where a ray can meet extinction: in the boxes of the grids, or anywhere where a part is constant."""
@@ -73,10 +79,10 @@ class Coefficients:
         box = mi.ScalarBoundingBox3f()
         for volume in self.extinction:
             box.expand(volume.bbox())
-        return mi.BoundingBox3f(box).ray_intersect(ray)
+        return box.ray_intersect(ray)
 
     def eval(
-        self, mei: mi.MediumInteraction3f, scale: mi.Float, majorant: mi.Float, active: mi.Bool
+        self, mei: mi.MediumInteraction3f, scale: mi.Float, majorant: mi.Spectrum, active: mi.Bool
     ) -> tuple[mi.Spectrum, mi.Spectrum, mi.Spectrum]:
         """Scattering, null and total coefficients at a point, as Mitsuba's media return them."""
         first, second = (_eval(v, mei, active) for v in self.volumes.values())

@@ -289,7 +289,7 @@ def _bounce(scene: mi.Scene, world: World, settings: Settings, limit: int, path:
     path.delta = dr.select(on & ~through, mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta), path.delta)
     path.depth += dr.select(on & ~through, mi.UInt32(1), mi.UInt32(0))
 
-    # -- Roulette ---------------------------------------------------------------------------------------------------------------
+    # -- Roulette ------------------------------------------------------------------------------------------------------
     q = dr.minimum(dr.max(path.beta) * dr.square(path.eta), 0.95)
     late = path.depth >= settings.rr_depth
     survives = ~late | (sampler.next_1d(on) < q)
