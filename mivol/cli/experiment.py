@@ -29,17 +29,20 @@ from mivol.files import frame_from_box, layers, read_exr, read_volume, write_exr
 from mivol.optim.events import upsample
 from mivol.optim.loop import Fit, reconstruct
 from mivol.optim.parameters import Parameter, as_tensor, find, like
-from mivol.optim.problem import Problem, View, seed_of
+from mivol.optim.problem import Problem, seed_of
+from mivol.optim.shots import Shot, View, make_shots
 from mivol.report import figures
 from mivol.report.page import write_page
-from mivol.report.record import Image, RunRecord, Volume, append_metrics, read_metrics, rewind_metrics, write_record
+from mivol.report.record import Choice, Image, RunRecord, Volume, append_metrics, read_metrics, rewind_metrics, write_record
 from mivol.scene.cameras import find_box
 from mivol.scene.load import LoadedScene, load_scene
+from mivol.scene.needs import find_needs, survey_scene
 from mivol.threads import check_one_thread
-from mivol.validate.reference import read_reference, render_reference
+from mivol.validate.reference import ReferenceResult, read_reference, render_reference
 from mivol.validate.statistics import nrmse, psnr
 
 CHECKPOINT = "checkpoint.npz"
+HELD_OUT, FINAL = 2, 3  # purposes of random numbers, beside PRIMAL and ADJOINT
 
 
 @dataclass
@@ -93,7 +96,9 @@ def run(chosen: Experiment, base: Path, folder: Path, *, resume: bool = False) -
         with stage(record, "references"):
             seen = references(chosen, base, folder, loaded, truth)
         with stage(record, "fit"):
-            fit = solve(chosen, base, folder, loaded, seen, truth, resume)
+            problem = pose(chosen, base, loaded, seen)
+            record.plan = choices(chosen, problem)
+            fit = solve(chosen, folder, loaded, problem, seen, truth, resume)
         with stage(record, "images and volumes"):
             write_outputs(chosen, folder, record, fit, seen, truth)
     except KeyboardInterrupt:
@@ -128,6 +133,18 @@ def new_record(chosen: Experiment) -> RunRecord:
         seeds={"fit": chosen.seed, "references": getattr(chosen.reference, "seed", 0)},
         citations=["mitsuba3", "drjit", *dict.fromkeys(key for s in strategies for key in s.cites)],
     )
+
+
+def choices(chosen: Experiment, problem: Problem) -> list[Choice]:
+    """The plan of mivol's integrator for this scene, with its reasons; other integrators have none."""
+    from mivol.scene.plan import make_plan
+    from mivol.transport.path import Settings
+
+    if chosen.fit.integrator != "mivol":
+        return []
+    needs = find_needs(problem.scene, problem.shots[0].sensor, survey_scene(problem.scene))
+    made = make_plan(needs, Settings(max_depth=chosen.fit.max_depth))
+    return [Choice(choice=f"{c.about}: {c.choice}", reason=c.reason) for c in made.choices]
 
 
 # -- What is known ------------------------------------------------------------------------------------------------
@@ -205,8 +222,17 @@ def render_views(chosen: Experiment, folder: Path, loaded: LoadedScene, sensors:
             loaded, cache, max_depth=chosen.fit.max_depth, target_se=wanted.standard_error or None,
             max_spp=wanted.spp, sensor=sensor, seed=wanted.seed,
         )  # fmt: skip
-        add_view(seen, index, sensor, made.mean, np.sqrt(made.variance), wanted.held_out)
+        add_view(seen, index, sensor, made.mean, standard_error(made), wanted.held_out)
     return seen
+
+
+def standard_error(made: ReferenceResult) -> np.ndarray:
+    """Of each pixel's mean, with room for what was never sampled.
+
+    Where n samples of a pixel all saw the light, their variance is 0, but an event of probability 1/n may have been
+    missed: (brightest pixel / n)^2 is added to the variance.
+    """
+    return np.sqrt(made.variance + (made.mean.max() / made.spp) ** 2)
 
 
 def read_files(wanted: Files, base: Path, loaded: LoadedScene, sensors: Sequence[Any]) -> Seen:
@@ -223,7 +249,7 @@ def read_files(wanted: Files, base: Path, loaded: LoadedScene, sensors: Sequence
         channels, header = read_exr(base / name)
         if "mivol_reference" in header:
             made = read_reference(base / name, of)
-            add_view(seen, index, sensor, made.mean, np.sqrt(made.variance), wanted.held_out)
+            add_view(seen, index, sensor, made.mean, standard_error(made), wanted.held_out)
         else:
             add_view(seen, index, sensor, layers(channels)[""][..., :3], None, wanted.held_out)
     return seen
@@ -241,22 +267,29 @@ def add_view(seen: Seen, index: int, sensor: Any, mean: np.ndarray, error: np.nd
 # -- The fit ------------------------------------------------------------------------------------------------------
 
 
-def solve(
-    chosen: Experiment, base: Path, folder: Path, loaded: LoadedScene, seen: Seen, truth: np.ndarray | None,
-    resume: bool,
-) -> Fit:  # fmt: skip
-    """Fit the scene to its views; the metrics grow by a line an iteration."""
-    scene, wanted = loaded.scene, chosen.fit
+def pose(chosen: Experiment, base: Path, loaded: LoadedScene, seen: Seen) -> Problem:
+    """The problem of an experiment, with the scene at its start."""
+    wanted = chosen.fit
     problem = Problem(
-        scene,
+        loaded.scene,
         seen.fitted,
-        [make_start(sought, base, scene) for sought in chosen.parameter],
+        [make_start(sought, base, loaded.scene) for sought in chosen.parameter],
         mi.load_dict({"type": wanted.integrator, "max_depth": wanted.max_depth}),
         chosen.loss,
         wanted.spp,
         wanted.samples_per_pass,
         chosen.seed,
     )
+    problem.set(problem.start())
+    return problem
+
+
+def solve(
+    chosen: Experiment, folder: Path, loaded: LoadedScene, problem: Problem, seen: Seen, truth: np.ndarray | None,
+    resume: bool,
+) -> Fit:  # fmt: skip
+    """Fit the scene to its views; the metrics grow by a line an iteration."""
+    wanted = chosen.fit
     with Display(wanted.iterations) as display:
 
         def observe(fit: Fit) -> None:
@@ -296,29 +329,30 @@ def make_start(sought: Sought, base: Path, scene: mi.Scene) -> Parameter:
     )
 
 
-@dataclass(frozen=True)
 class Measure:
     """What a fit does not minimise: PSNR of held-out views, and the error of the volume where the truth is known."""
 
-    held_out: list[View]
-    truth: np.ndarray | None
-    chosen: Experiment
+    def __init__(self, held_out: list[View], truth: np.ndarray | None, chosen: Experiment) -> None:
+        self.shots = make_shots(held_out, chosen.fit.samples_per_pass) if held_out else []
+        self.truth = truth
+        self.key = chosen.truth.key if chosen.truth else ""
 
     def __call__(self, problem: Problem) -> dict[str, float]:
         errors: dict[str, float] = {}
-        if self.held_out:
-            pairs = [(self.render(problem, view, i), np.asarray(view.reference)) for i, view in enumerate(self.held_out)]
-            errors["held_out_psnr"] = float(np.mean([psnr(image, reference) for image, reference in pairs]))
-        if self.truth is not None and self.chosen.truth.key in problem.values():
-            found = problem.values()[self.chosen.truth.key]
+        if self.shots:
+            errors["held_out_psnr"] = float(np.mean([value for shot in self.shots for value in self.psnr(problem, shot)]))
+        if self.truth is not None and self.key in problem.values():
+            found = problem.values()[self.key]
             if tuple(found.shape) != self.truth.shape:
                 found = upsample(found, self.truth.shape[:3])
             errors["nrmse"] = nrmse(np.asarray(found), self.truth)
         return errors
 
-    def render(self, problem: Problem, view: View, index: int) -> np.ndarray:
-        """A view of what the scene holds now."""
-        return np.asarray(problem.render(view.sensor, seed_of(problem.seed, 0, index, 2)))
+    def psnr(self, problem: Problem, shot: Shot) -> list[float]:
+        """PSNR [dB] of each view of a shot, of what the scene holds now."""
+        image = np.asarray(problem.render(shot.sensor, seed_of(problem.seed, 0, 0, HELD_OUT)))
+        pairs = zip(np.split(image, shot.n_views, 1), np.split(np.asarray(shot.reference), shot.n_views, 1), strict=True)
+        return [psnr(render, reference) for render, reference in pairs]
 
 
 def write_metrics(folder: Path, fit: Fit) -> None:
@@ -364,7 +398,7 @@ def write_outputs(chosen: Experiment, folder: Path, record: RunRecord, fit: Fit,
 def write_view(folder: Path, problem: Problem, view: View, seen: Seen) -> list[Image]:
     """One view: the render beside its reference."""
     stem = f"views/{view.name.replace(' ', '_')}"
-    image = np.asarray(problem.render(view.sensor, seed_of(problem.seed, 0, int(view.name.split()[1]), 3)))
+    image = np.asarray(problem.render(view.sensor, seed_of(problem.seed, 0, int(view.name.split()[1]), FINAL)))
     reference = np.asarray(view.reference)
     error = seen.standard_errors.get(view.name)
     parts = {"render": ("", image), "reference": ("reference", reference)}

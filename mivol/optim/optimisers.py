@@ -21,7 +21,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mivol.optim.problem import PRIMAL, Problem, seed_of
+from mivol.optim.problem import PRIMAL, Problem
 from mivol.optim.strategy import Strategy, of, table
 
 if TYPE_CHECKING:
@@ -100,7 +100,8 @@ class AdamRun(Run):
         self.adam.update(self.reals)
 
     def step(self, iteration: int, factor: float) -> float:
-        chosen = views_of(iteration, len(self.problem.views), self.settings.views, self.problem.seed)
+        n_views, per_iteration = len(self.problem.views), self.settings.views
+        chosen = views_of(iteration, n_views, per_iteration, self.problem.seed) if per_iteration else None
         loss, gradients = self.problem.loss_and_gradient(self.reals, iteration, chosen)
         self.scale = self.scale or max(float(dr.max(dr.abs(g.array))[0]) for g in gradients.values()) or 1.0
         for p in self.problem.parameters:
@@ -137,8 +138,7 @@ class AdamRun(Run):
 
 def views_of(iteration: int, n_views: int, per_iteration: int, seed: int) -> list[int]:
     """The views of an iteration: a fresh order per epoch, each view once in it; a function of its arguments only."""
-    if per_iteration == 0 or per_iteration >= n_views:
-        return list(range(n_views))
+    per_iteration = min(per_iteration, n_views)
     drawn = range(iteration * per_iteration, (iteration + 1) * per_iteration)
     orders = {k: np.random.default_rng([seed, k, n_views]).permutation(n_views) for k in {i // n_views for i in drawn}}
     return [int(orders[i // n_views][i % n_views]) for i in drawn]
@@ -312,7 +312,7 @@ class GaussNewtonRun(Run):
         super().__init__(problem)
         self.settings = settings
         self.damping = settings.damping
-        self.weights = [problem.loss.weight(view.reference) for view in problem.views]
+        self.weights = [problem.loss.weight(shot.reference) for shot in problem.shots]
 
     def step(self, iteration: int, factor: float) -> float:
         packing = Packing(self.problem, self.reals)
@@ -350,14 +350,14 @@ class Linearised:
 
     def __init__(self, problem: Problem, reals: Reals, weights: list[mi.TensorXf], packing: Packing) -> None:
         self.problem, self.reals, self.weights, self.packing = problem, reals, weights, packing
-        self.seeds = [seed_of(problem.seed, 0, index, PRIMAL) for index in range(len(problem.views))]
+        self.seeds = [problem.seed_for(0, index, PRIMAL) for index in range(len(problem.shots))]
         self.slopes = {p.name: slope(p, reals[p.name]) for p in problem.parameters}
         problem.set(reals)
         self.loss = 0.0
-        for index, seed in enumerate(self.seeds):
-            value, adjoint = problem.adjoint(index, problem.image(index, 0), len(self.seeds))
+        for shot, seed in zip(problem.shots, self.seeds, strict=True):
+            value, adjoint = problem.adjoint(shot, problem.render(shot.sensor, seed), len(problem.views))
             self.loss += value
-            problem.pull_back(index, adjoint, seed)
+            problem.pull_back(shot.sensor, adjoint, seed)
         energy, gradients = problem.through_priors_and_maps(reals, problem.gradients())
         self.loss += energy
         self.gradient = packing.vector(gradients, 1)
@@ -367,9 +367,9 @@ class Linearised:
         direction = {k: t * self.slopes[k] for k, t in self.packing.tensors(v).items()}
         images = self._push_forward(direction)
         self.problem.set(self.reals)
-        for index, (seed, image) in enumerate(zip(self.seeds, images, strict=True)):
-            scale = 1.0 / (len(images) * len(image.array))
-            self.problem.pull_back(index, self.weights[index] * image * scale, seed)
+        for shot, weight, seed, image in zip(self.problem.shots, self.weights, self.seeds, images, strict=True):
+            share = shot.n_views / len(self.problem.views) / len(image.array)
+            self.problem.pull_back(shot.sensor, weight * image * share, seed)
         product = self.problem.gradients()
         for p in self.problem.parameters:
             value = dr.detach(p.from_reals(self.reals[p.name]))
@@ -379,7 +379,8 @@ class Linearised:
 
     def _push_forward(self, direction: Reals) -> list[mi.TensorXf]:
         self.problem.set(self.reals)
-        return [self.problem.push_forward(index, direction, seed) for index, seed in enumerate(self.seeds)]
+        pairs = zip(self.problem.shots, self.seeds, strict=True)
+        return [self.problem.push_forward(shot.sensor, direction, seed) for shot, seed in pairs]
 
 
 def slope(parameter: object, u: mi.TensorXf) -> mi.TensorXf:

@@ -5,7 +5,7 @@ r"""The fit as a function: real numbers in, loss and derivatives out, through an
 Conventions. ``u`` are the reals of each :class:`~mivol.optim.parameters.Parameter`, ``x`` the scene's values. An image
 is the mean of passes of at most ``samples_per_pass`` samples: the adjoint of the loss is taken at the whole image, then
 carried back pass by pass, so that non-linear losses do not depend on the split. Seeds are a function of (seed,
-iteration, view, pass, purpose) only. Between passes ``safe_point`` is called; nothing that outlives the call has
+iteration, shot, purpose, pass) only. Between passes ``safe_point`` is called; nothing that outlives the call has
 changed until it returns.
 """
 
@@ -22,57 +22,14 @@ import numpy as np
 from mivol.errors import MivolError
 from mivol.optim.losses import L2, Loss
 from mivol.optim.parameters import Parameter, as_tensor, find, like
+from mivol.optim.shots import Shot, View, check_views, make_shots, pixels, single_shots
 
 PRIMAL, ADJOINT = 0, 1
-
-
-@dataclass(frozen=True)
-class View:
-    """A sensor and what it saw.
-
-    Attributes:
-        name: for messages and file names.
-        sensor: any Mitsuba sensor.
-        reference: (height, width, channels), radiance.
-    """
-
-    name: str
-    sensor: mi.Sensor
-    reference: mi.TensorXf
 
 
 def seed_of(*key: int) -> int:
     """A 32-bit seed from integers: SeedSequence mixes them, so that neighbours share nothing."""
     return int(np.random.SeedSequence(key).generate_state(1)[0])
-
-
-def check_views(views: Sequence[View]) -> None:
-    """Refuse views that cannot be compared with an image.
-
-    Raises:
-        MivolError: no views, sizes that differ, a reference of another size than its sensor, or not finite.
-    """
-    if not views:
-        raise MivolError("found no views to fit: give at least one sensor with a reference.")
-    first = tuple(views[0].sensor.film().crop_size())
-    for view in views:
-        width, height = (int(n) for n in view.sensor.film().crop_size())
-        if (width, height) != first:
-            raise MivolError(
-                f'view "{view.name}" is {width} x {height} pixels and view "{views[0].name}" {first[0]} x {first[1]}: '
-                "give all views one size."
-            )
-        if view.reference.ndim != 3 or tuple(view.reference.shape[:2]) != (height, width):
-            raise MivolError(
-                f'the reference of view "{view.name}" has shape {tuple(view.reference.shape)}, its sensor '
-                f"{width} x {height} pixels: give references of the sensor's size."
-            )
-        bad = np.argwhere(~np.isfinite(np.asarray(view.reference)))
-        if len(bad):
-            raise MivolError(
-                f'the reference of view "{view.name}" is not finite at pixel (row {bad[0][0]}, column {bad[0][1]}): '
-                "mask or repair it."
-            )
 
 
 @dataclass
@@ -110,6 +67,7 @@ class Problem:
         for parameter in self.parameters:
             find(parameter.name, self.params)
         self.params.keep([parameter.name for parameter in self.parameters])
+        self.shots = make_shots(self.views, self.samples_per_pass)
 
     # -- Values ---------------------------------------------------------------------------------------------------
 
@@ -142,14 +100,13 @@ class Problem:
 
     def passes(self, sensor: mi.Sensor) -> list[int]:
         """Samples per pixel of each pass; they sum to ``spp`` and hardly differ."""
-        pixels = math.prod(int(n) for n in sensor.film().crop_size())
-        most = max(self.samples_per_pass // pixels, 1)
+        most = max(self.samples_per_pass // pixels(sensor), 1)
         n = math.ceil(self.spp / most)
         return [self.spp // n + (i < self.spp % n) for i in range(n)]
 
-    def image(self, index: int, iteration: int) -> mi.TensorXf:
-        """Mean image of view ``index``, detached."""
-        return self.render(self.views[index].sensor, seed_of(self.seed, iteration, index, PRIMAL))
+    def seed_for(self, iteration: int, index: int, purpose: int) -> int:
+        """Seed of a shot, given its number."""
+        return seed_of(self.seed, iteration, index, purpose)
 
     def render(self, sensor: mi.Sensor, seed: int) -> mi.TensorXf:
         """Mean image of a sensor over all passes, detached."""
@@ -161,18 +118,16 @@ class Problem:
             self._finish(total)
         return total / self.spp
 
-    def pull_back(self, index: int, adjoint: mi.TensorXf, seed: int) -> None:
-        """Add J^T adjoint of view ``index`` to the gradients of the scene's parameters."""
-        sensor = self.views[index].sensor
+    def pull_back(self, sensor: mi.Sensor, adjoint: mi.TensorXf, seed: int) -> None:
+        """Add J^T adjoint of a sensor's image to the gradients of the scene's parameters."""
         for number, spp in enumerate(self.passes(sensor)):
             self.integrator.render_backward(
                 self.scene, self.params, adjoint * (spp / self.spp), sensor, seed_of(seed, number), spp
             )
             self._finish(self.gradients())
 
-    def push_forward(self, index: int, tangents: dict[str, mi.TensorXf], seed: int) -> mi.TensorXf:
-        """J v of view ``index``, for a direction v of the scene's parameters."""
-        sensor = self.views[index].sensor
+    def push_forward(self, sensor: mi.Sensor, tangents: dict[str, mi.TensorXf], seed: int) -> mi.TensorXf:
+        """J v of a sensor's image, for a direction v of the scene's parameters."""
         total = None
         for number, spp in enumerate(self.passes(sensor)):
             self._set_tangents(tangents)
@@ -202,13 +157,14 @@ class Problem:
         The seeds of image and derivative differ: an estimate of d(I^2) = 2 I dI from one set of samples is biased.
         Noise: of the integrator; none for media that only absorb, beyond the pixel filter's.
         """
-        chosen = range(len(self.views)) if chosen is None else chosen
+        shots = self.shots if chosen is None else single_shots([self.views[index] for index in chosen])
         self.set(reals)
         total = 0.0
-        for index in chosen:
-            value, adjoint = self.adjoint(index, self.image(index, iteration), len(chosen))
+        for index, shot in enumerate(shots):
+            image = self.render(shot.sensor, self.seed_for(iteration, index, PRIMAL))
+            value, adjoint = self.adjoint(shot, image, sum(s.n_views for s in shots))
             total += value
-            self.pull_back(index, adjoint, seed_of(self.seed, iteration, index, ADJOINT))
+            self.pull_back(shot.sensor, adjoint, self.seed_for(iteration, index, ADJOINT))
         energy, gradients = self.through_priors_and_maps(reals, self.gradients())
         return total + energy, gradients
 
@@ -219,14 +175,15 @@ class Problem:
 
     def mean_loss(self, iteration: int) -> float:
         """Mean loss over all views, of what the scene holds now."""
-        losses = [self.loss(self.image(i, iteration), view.reference)[0] for i, view in enumerate(self.views)]
-        return math.fsum(losses) / len(losses)
+        images = (self.render(shot.sensor, self.seed_for(iteration, i, PRIMAL)) for i, shot in enumerate(self.shots))
+        losses = (self.adjoint(shot, image, len(self.views))[0] for shot, image in zip(self.shots, images, strict=True))
+        return math.fsum(losses)
 
-    def adjoint(self, index: int, image: mi.TensorXf, n_views: int) -> tuple[float, mi.TensorXf]:
-        """The loss of one view, divided by the number of views, and its derivative by the image."""
+    def adjoint(self, shot: Shot, image: mi.TensorXf, n_views: int) -> tuple[float, mi.TensorXf]:
+        """A shot's part of the mean loss over ``n_views`` views, and its derivative by the image."""
         image = dr.detach(image)
         dr.enable_grad(image)
-        value = self.loss(image, self.views[index].reference) / n_views
+        value = self.loss(image, shot.reference) * (shot.n_views / n_views)
         dr.backward(value)
         return float(value[0]), dr.detach(dr.grad(image))
 

@@ -1,0 +1,120 @@
+"""Many views, few renders: views of one size side by side in one image.
+
+Conventions. A :class:`View` is a sensor with what it saw, (height, width, channels); a :class:`Shot` is one render, of a
+view or of several side by side (Mitsuba's ``batch`` sensor). Tracing and starting a kernel costs as much for one small
+view as for twenty; only views whose pixels do not reach over their border (box filter) are put side by side.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import mitsuba as mi
+import numpy as np
+
+from mivol.errors import MivolError
+
+
+@dataclass(frozen=True)
+class View:
+    """A sensor and what it saw.
+
+    Attributes:
+        name: for messages and file names.
+        sensor: any Mitsuba sensor.
+        reference: (height, width, channels), radiance.
+    """
+
+    name: str
+    sensor: mi.Sensor
+    reference: mi.TensorXf
+
+
+@dataclass(frozen=True)
+class Shot:
+    """One render.
+
+    Attributes:
+        sensor: of one view, or a batch.
+        reference: (height, n width, channels).
+        n_views: how many views lie side by side.
+    """
+
+    sensor: mi.Sensor
+    reference: mi.TensorXf
+    n_views: int
+
+
+def pixels(sensor: mi.Sensor) -> int:
+    """Pixels of a sensor's image."""
+    return math.prod(int(n) for n in sensor.film().crop_size())
+
+
+def check_views(views: Sequence[View]) -> None:
+    """Refuse views that cannot be compared with an image.
+
+    Raises:
+        MivolError: no views, sizes that differ, a reference of another size than its sensor, or not finite.
+    """
+    if not views:
+        raise MivolError("found no views to fit: give at least one sensor with a reference.")
+    first = tuple(int(n) for n in views[0].sensor.film().crop_size())
+    for view in views:
+        width, height = (int(n) for n in view.sensor.film().crop_size())
+        if (width, height) != first:
+            raise MivolError(
+                f'view "{view.name}" is {width} x {height} pixels and view "{views[0].name}" {first[0]} x {first[1]}: '
+                "give all views one size."
+            )
+        if view.reference.ndim != 3 or tuple(view.reference.shape[:2]) != (height, width):
+            raise MivolError(
+                f'the reference of view "{view.name}" has shape {tuple(view.reference.shape)}, its sensor '
+                f"{width} x {height} pixels: give references of the sensor's size."
+            )
+        bad = np.argwhere(~np.isfinite(np.asarray(view.reference)))
+        if len(bad):
+            raise MivolError(
+                f'the reference of view "{view.name}" is not finite at pixel (row {bad[0][0]}, column {bad[0][1]}): '
+                "mask or repair it."
+            )
+
+
+def single_shots(views: Sequence[View]) -> list[Shot]:
+    """One render for each view."""
+    return [Shot(view.sensor, view.reference, 1) for view in views]
+
+
+def make_shots(views: Sequence[View], most_pixels: int) -> list[Shot]:
+    """As few renders as there can be with at most ``most_pixels`` pixels each, in the order of the views."""
+    together = max(most_pixels // pixels(views[0].sensor), 1)
+    if together == 1 or len(views) == 1 or not all(is_closed(view) for view in views):
+        return single_shots(views)
+    return [side_by_side(views[first : first + together]) for first in range(0, len(views), together)]
+
+
+def is_closed(view: View) -> bool:
+    """Whether a view's samples count for its own pixels only, and its camera stands in no medium."""
+    film = view.sensor.film()
+    whole = all(int(a) == int(b) for a, b in zip(film.crop_size(), film.size(), strict=True))
+    plain = film.class_name() == "HDRFilm" and film.rfilter().is_box_filter()
+    return whole and plain and view.reference.shape[2] in (1, 3) and view.sensor.get_medium() is None
+
+
+def side_by_side(views: Sequence[View]) -> Shot:
+    """One render of several views, from left to right."""
+    height, width, channels = views[0].reference.shape
+    film = {
+        "type": "hdrfilm",
+        "width": width * len(views),
+        "height": height,
+        "pixel_format": "rgb" if channels == 3 else "luminance",
+        "component_format": "float32",
+        "rfilter": {"type": "box"},
+    }
+    sensors = {f"view_{number:04d}": view.sensor for number, view in enumerate(views)}
+    sampler = {"type": "independent"}
+    batch = mi.load_dict({"type": "batch", **sensors, "film": film, "sampler": sampler}, parallel=False)
+    reference = np.concatenate([np.asarray(view.reference) for view in views], axis=1)
+    return Shot(batch, mi.TensorXf(np.ascontiguousarray(reference)), len(views))
