@@ -3,10 +3,16 @@
 from __future__ import annotations
 
 import math
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+import pytest
+
+from mivol.errors import MivolError
 
 # -- Frames and rays -------------------------------------------------------------------------------------------------
 
@@ -221,3 +227,16 @@ def pixel_rays(sensor: mi.Sensor, k: int) -> tuple[np.ndarray, np.ndarray]:
     ray, _ = sensor.sample_ray(0.0, 0.5, position, mi.Point2f(0.5))
     shape = (h, w, k * k, 3)
     return tuple(np.array(x).T.reshape(shape).astype(np.float64) for x in (ray.o + 0 * ray.d, ray.d))
+
+
+@contextmanager
+def refused(match: str) -> Iterator[None]:
+    """A MivolError with this text ends the block, bare or as the cause of what Mitsuba makes of it."""
+    with pytest.raises(Exception) as info:
+        yield
+    error, found = info.value, []
+    while error is not None:
+        found.append(error)
+        error = error.__cause__ or error.__context__
+    refusals = [str(e) for e in found if isinstance(e, MivolError)]
+    assert any(re.search(match, text) for text in refusals), f"{found} holds no refusal about {match!r}"

@@ -7,8 +7,6 @@ cameras are compared by tests whose rate of false alarms is set. Stock Mitsuba i
 from __future__ import annotations
 
 import math
-import re
-from contextlib import contextmanager
 from dataclasses import dataclass
 
 import mitsuba as mi
@@ -26,7 +24,6 @@ from oracle import (
     trilinear,
 )
 
-from mivol.errors import MivolError
 from mivol.validate.statistics import assert_same_bounded_mean, assert_same_mean
 from scenes import (
     FRAMES,
@@ -41,6 +38,7 @@ from scenes import (
     medium,
     pencil,
     pixel_rays,
+    refused,
     render,
     rotation,
     sky,
@@ -77,19 +75,6 @@ def see(parts, o, d, integrator=None, inside=None, spp=1, seed=0):
     scene = mi.load_dict({"type": "scene", **parts, "sensor": sensor})
     o, d = (x[0, :, 0] for x in pixel_rays(scene.sensors()[0], 1))
     return Seen(render(scene, integrator or mivol(), spp, seed)[0], o, d)
-
-
-@contextmanager
-def refused(match):
-    """A MivolError with this text ends the block, bare or as the cause of what Mitsuba makes of it."""
-    with pytest.raises(Exception) as info:
-        yield
-    error, found = info.value, []
-    while error is not None:
-        found.append(error)
-        error = error.__cause__ or error.__context__
-    refusals = [str(e) for e in found if isinstance(e, MivolError)]
-    assert any(re.search(match, text) for text in refusals), f"{found} holds no refusal about {match!r}"
 
 
 def random_grid(seed, channels=1, top=4.0):
