@@ -30,6 +30,12 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
         metafunc.parametrize("seed", range(metafunc.config.getoption("--seeds")))
 
 
+def pytest_collection_finish() -> None:
+    """Take what the imports made out of the garbage collector's sight: with it, each collection lasts 0.2 s."""
+    gc.collect()
+    gc.freeze()
+
+
 @pytest.fixture
 def variant_rgb(request: pytest.FixtureRequest) -> str:
     """An rgb variant with derivatives is active; its name."""

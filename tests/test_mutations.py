@@ -40,7 +40,8 @@ def has_logic(path: Path) -> bool:
 def test_entry_applies(entry: mutate.Mutation) -> None:
     after = mutate.broken(entry, ROOT)
     assert after != (ROOT / entry.file).read_text()
-    ast.parse(after, entry.file)
+    if entry.file.endswith(".py"):
+        ast.parse(after, entry.file)
     path, _, name = entry.test.partition("::")
     functions = [n.name for n in ast.walk(ast.parse((ROOT / path).read_text())) if isinstance(n, ast.FunctionDef)]
     assert name.split("::")[-1].partition("[")[0] in functions
