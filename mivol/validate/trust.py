@@ -15,6 +15,8 @@ from dataclasses import dataclass
 import mitsuba as mi
 import numpy as np
 
+from mivol.transport.medium import kind_of
+
 __all__ = ["CHECKS", "Doubt", "trust"]
 
 # exp(-x) is 0 in float32 (denormals flushed) from 87.3: the density of passing untouched, by which Mitsuba divides.
@@ -52,9 +54,9 @@ class Boundary:
         points: (N, 3) world points whose hull holds the shape: mesh vertices, else the corners of its box.
         faces: (M, 3) indices of a mesh, else None.
         to_world: (4, 4) of a shape that is no mesh, else None.
-        to_local: (4, 4) world to unit cube of a stock volume, else None.
-        to_local_inverse: (4, 4) what Mitsuba takes for its inverse, else None.
-        volume: class of the extinction's volume, "" for a constant.
+        to_local: (4, 4) world to the unit cube of the volume under a stock ``heterogeneous``, else None.
+        to_local_inverse: (4, 4) transpose of what Mitsuba takes for the inverse of a stock volume's, else None.
+        volume: class of the volume under a stock ``heterogeneous``, else "".
         majorant: largest extinction [1/length].
         params: what can be traversed of the medium.
     """
@@ -162,10 +164,10 @@ def _mirrored(b: Boundary) -> Found:
 
 
 def _wrong_inverse(b: Boundary) -> Found:
-    if b.to_local is None:
+    if b.to_local is None or b.to_local_inverse is None:
         return
     # 1e-4: both are printed with 6 digits.
-    product = b.to_local @ b.to_local_inverse
+    product = b.to_local @ b.to_local_inverse.T
     if np.abs(product - np.eye(4)).max() > 1e-4 * max(1.0, np.abs(b.to_local).max() * np.abs(b.to_local_inverse).max()):
         yield (
             f"the transform of the volume inside {b.name} and Mitsuba's inverse of it do not match (a rotation axis of length "
@@ -174,7 +176,7 @@ def _wrong_inverse(b: Boundary) -> Found:
 
 
 def _small_g(b: Boundary) -> Found:
-    g = float(np.ravel(b.params.get("phase_function.g", 0.0))[0])
+    g = _number(b.params.get("phase_function.g", 0.0))
     if 0 < abs(g) < SMALLEST_G and not _is_black(b):
         yield (
             f"the phase function inside {b.name} is hg with g = {g:.2g}: the mean cosine of Mitsuba's samples is off by about "
@@ -222,38 +224,59 @@ def _camera_inside(sensor: mi.Sensor, boundaries: list[Boundary]) -> Iterator[st
 
 def _boundary(shape: mi.Shape) -> Boundary:
     geometry = mi.traverse(shape)
-    medium = shape.interior_medium()
-    params = mi.traverse(medium)
-    volume = _extinction_volume(params)
-    printed = str(volume) if volume is not None and volume.class_name() in ("GridVolume", "ConstVolume") else ""
-    inverse = _printed(printed, "inverse_transpose")
+    params = mi.traverse(shape.interior_medium())
+    volumes = _extinction_volumes(params)
+    stock = next((v for v in volumes if v.class_name() in ("GridVolume", "ConstVolume")), None)
+    kind = kind_of(shape.interior_medium())
     mesh = "vertex_positions" in geometry
     return Boundary(
         name=shape.id() or f"the {shape.class_name()}",
         points=np.array(geometry["vertex_positions"], np.float64).reshape(-1, 3) if mesh else _corners(shape.bbox()),
         faces=np.array(geometry["faces"]).reshape(-1, 3) if mesh else None,
         to_world=_matrix(geometry["to_world"]) if shape.shape_type() == mi.ShapeType.Sphere.value else None,
-        to_local=_printed(printed, "matrix"),
-        to_local_inverse=None if inverse is None else inverse.T,
-        volume=volume.class_name() if volume is not None and not medium.is_homogeneous() else "",
-        majorant=0.0 if volume is None else float(params.get("scale", 1.0)) * float(np.max(volume.max())),
+        to_local=_reach(kind, volumes),
+        to_local_inverse=_printed(stock, "inverse_transpose") if kind == "HeterogeneousMedium" else None,
+        volume=volumes[0].class_name() if kind == "HeterogeneousMedium" else "",
+        majorant=_number(params.get("scale", 1.0)) * sum(float(np.max(v.max())) for v in volumes),
         params={key: params[key] for key in params.keys()},  # noqa: SIM118  (iteration gives pairs)
     )
 
 
-def _extinction_volume(params: mi.SceneParameters) -> mi.Volume | None:
-    """The volume object behind the medium's ``sigma_t``."""
+def _extinction_volumes(params: mi.SceneParameters) -> list[mi.Volume]:
+    """The volumes whose sum is a medium's extinction."""
+    found = {}
     for key, (_, _, node, _) in params.properties.items():
-        while key.startswith("sigma_t") and node is not None:
+        name = key.partition(".")[0]
+        while name in ("sigma_t", "sigma_a", "sigma_s") and name not in found and node is not None:
             if isinstance(node, mi.Volume):
-                return node
+                found[name] = node
             node = params.hierarchy[node][0]
-    return None
+    return list(found.values())
 
 
-def _printed(text: str, name: str) -> np.ndarray | None:
+def _reach(kind: str, volumes: list[mi.Volume]) -> np.ndarray | None:
+    """World to the unit cube of the volume under a stock ``heterogeneous``; None for media that have no such box.
+
+    A ``mivol_medium`` in a boundary larger than its grids is right under stock integrators (seen at depths of 1800), and a
+    turned ``mivol_voxels`` is vacuum outside its own box: its upright box is enough here.
+    """
+    if kind != "HeterogeneousMedium":
+        return None
+    if volumes[0].class_name() in ("GridVolume", "ConstVolume"):
+        return _printed(volumes[0], "matrix")
+    corners = _corners(volumes[0].bbox())
+    box = np.eye(4)
+    box[:3, :3], box[:3, 3] = np.diag(np.ptp(corners, axis=0)), corners.min(axis=0)
+    return np.linalg.inv(box)
+
+
+def _number(value: object) -> float:
+    return float(np.ravel(np.array(value))[0])
+
+
+def _printed(volume: mi.Volume | None, name: str) -> np.ndarray | None:
     """A matrix from the printed form of a stock volume, the only place where Mitsuba shows it."""
-    found = re.search(rf"to_local = Transform\[.*?\b{name}=(\[\[.*?\]\])", text, re.DOTALL)
+    found = re.search(rf"to_local = Transform\[.*?\b{name}=(\[\[.*?\]\])", str(volume), re.DOTALL)
     return np.array(re.findall(r"[-+\w.]+", found[1]), dtype=np.float64).reshape(4, 4) if found else None
 
 

@@ -348,6 +348,30 @@ def test_hard_03_04_doubt_where_mitsuba_is_wrong(variant_rgb, tmp_path, kind):
         assert "Doubt: " in made.text
 
 
+def _voxels(value: float, **extra) -> dict:
+    values = np.broadcast_to(np.float32(value), (2, 2, 2, np.size(value)))
+    return {"type": "mivol_voxels", "data": mi.TensorXf(np.ascontiguousarray(values)), **extra}
+
+
+def test_hard_03_our_own_plugins(variant_rgb):
+    """mivol_voxels under a stock medium is as wrong as gridvolume; mivol_medium is right, and raises no doubt."""
+    big = _t().translate([0.5, 0.5, 0.5]).scale(3)
+    stock = {"type": "heterogeneous", "sigma_t": _voxels(30.0), "albedo": 0.0}
+    ours = {"type": "mivol_medium", "sigma_t": _voxels(30.0)}
+    scenes = [_upright_column(_scene(medium, big), 3, 3) for medium in (stock, ours)]
+    assert [[d.kind for d in trust(mi.load_dict(s))] for s in scenes] == [["too deep"], []]
+    assert [_rendered(s, spp=4).mean() for s in scenes] == [0, 1]
+
+
+@pytest.mark.parametrize("names", [("sigma_t", "albedo"), ("sigma_a", "sigma_s")])
+def test_our_own_medium_channel_by_channel(variant_rgb, tmp_path, names):
+    """Both pairs of coefficients of mivol_medium, over rgb voxels."""
+    medium = {"type": "mivol_medium", names[0]: _voxels(RGB / 4), names[1]: 0.0}
+    found = _small(_scene(medium), tmp_path / "r.exr", max_spp=1024)
+    assert found.identity["channels_alone"]
+    assert_same_bounded_mean(found.mean, found.spp, np.broadcast_to(np.exp(-RGB / 4), found.mean.shape))
+
+
 def test_doubts_that_need_no_render(variant_rgb):
     """Each alone: an axis that is not normalised, a tiny g, values that are not finite, a mesh with its faces reversed."""
     phase = {"type": "hg", "g": 1e-5}
