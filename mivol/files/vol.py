@@ -74,6 +74,14 @@ def write_vol(file: BinaryIO, values: np.ndarray, to_world: np.ndarray, metadata
             "write .npz or .nrrd, or give the transform in the scene",
         )
     low = to_world[:3, 3]
+    box = np.array([low, low + sides], np.float64)
+    if np.abs(box).max() > np.finfo(np.float32).max or (np.diff(box.astype(np.float32), axis=0) <= 0).any():
+        raise refusal(
+            "write_volume",
+            f"a box from {low.tolist()} with sides {sides.tolist()} for a .vol file",
+            "corners that float32 can tell apart",
+            "write .npz or .nrrd, or move the box nearer to the origin",
+        )
     nz, ny, nx, channels = values.shape
-    file.write(HEADER.pack(MAGIC, VERSION, 1, nx, ny, nz, channels, *low, *(low + sides)))
+    file.write(HEADER.pack(MAGIC, VERSION, 1, nx, ny, nz, channels, *box.ravel()))
     file.write(np.ascontiguousarray(values, "<f4").data)

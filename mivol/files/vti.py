@@ -132,7 +132,7 @@ def _decode(
     if kind == "ascii":
         return source.numbers(node.text or "", count, path).astype(dtype)
     if kind == "binary":
-        stream, coded = (node.text or "").strip().encode(), "base64"
+        stream, coded = "".join((node.text or "").split()).encode(), "base64"
     elif kind == "appended":
         (offset,) = source.integers(node.get("offset", ""), 1, path, "offset")
         stream, coded = appended[max(offset, 0) :], encoding
@@ -140,14 +140,16 @@ def _decode(
         raise refusal(path, f"the format {kind!r}", "ascii, binary or appended", "write the file again")
     if coded not in STREAMS:
         raise refusal(path, f"the encoding {coded!r}", " or ".join(STREAMS), "write the file again")
-    word = np.dtype({"UInt32": "u4", "UInt64": "u8"}.get(root.get("header_type", "UInt32"), "u4")).newbyteorder(order)
+    header_type = root.get("header_type", "UInt32")
+    if header_type not in HEADER_TYPES:
+        raise refusal(path, f"the header_type {header_type}", " or ".join(HEADER_TYPES), "write the file again")
+    word = np.dtype(HEADER_TYPES[header_type]).newbyteorder(order)
     block = _block(STREAMS[coded](stream, path), word, root.get("compressor"), count * dtype.itemsize, path)
     return source.elements(block, dtype, count, path)
 
 
-def _block(parts: Callable[[], Take], word: np.dtype, compressor: str | None, promised: int, path: Path) -> bytes:
-    """The bytes of one array; ``parts()`` begins a new run of coded bytes (base64 ends a run with padding)."""
-    take = parts()
+def _block(take: Take, word: np.dtype, compressor: str | None, promised: int, path: Path) -> bytes:
+    """The bytes of one array, after its length or its table of packed blocks."""
 
     def words(n: int) -> list[int]:
         return np.frombuffer(take(n * word.itemsize), word).tolist()
@@ -170,7 +172,6 @@ def _block(parts: Callable[[], Take], word: np.dtype, compressor: str | None, pr
             "write the file again",
         )
     packed = words(blocks)
-    take = parts()
     codec = COMPRESSORS[compressor]
     return b"".join(source.inflate(take(length), codec, size, path) for length in packed)
 
@@ -179,7 +180,7 @@ def _broken(path: Path) -> Exception:
     return refusal(path, "a block that breaks off", "all its bytes", "the file is truncated: copy it again")
 
 
-def _raw(stream: bytes, path: Path) -> Callable[[], Take]:
+def _raw(stream: bytes, path: Path) -> Take:
     position = 0
 
     def take(count: int) -> bytes:
@@ -189,46 +190,37 @@ def _raw(stream: bytes, path: Path) -> Callable[[], Take]:
         position += count
         return stream[position - count : position]
 
-    return lambda: take
+    return take
 
 
-def _base64(stream: bytes, path: Path) -> Callable[[], Take]:
-    """Runs of base64: each begins on a new group of four characters after the padding of the one before.
+def _base64(stream: bytes, path: Path) -> Take:
+    """Bytes of base64 read in whole groups of four characters.
 
-    VTK codes the length and the bytes of an uncompressed block in one run and the header of a compressed one in a run
-    of its own; other writers pad the length as well, and then the bytes follow the padding.
+    VTK codes the length and the bytes of an uncompressed block in one run, the table of a compressed one in a run of its
+    own; other writers pad the length as well. Padding ends a run, and a group that has some yields one or two bytes
+    instead of three: so no byte of a following run is ever read with the one before.
     """
     position, held = 0, b""
 
-    def decode(characters: int) -> bytes:
-        nonlocal position
+    def take(count: int) -> bytes:
+        nonlocal position, held
+        characters = -(-max(count - len(held), 0) // 3) * 4
         chunk = stream[position : position + characters]
-        position += len(chunk)
+        position += characters
         try:
-            return base64.b64decode(chunk, validate=True)
+            data = held + base64.b64decode(chunk, validate=True)
         except (binascii.Error, ValueError) as error:
             raise refusal(path, "characters that are not base64", "base64 data", "copy the file again") from error
-
-    def take(count: int) -> bytes:
-        nonlocal held
-        pieces, missing = [held], count - len(held)
-        if missing > 0:
-            piece = decode(-(-missing // 3) * 4)
-            pieces.append(piece)
-            missing -= len(piece)
-        data = b"".join(pieces)
-        if missing > 0:
+        if len(data) < count:
             raise _broken(path)
         held = data[count:]
         return data[:count]
 
-    def begin() -> Take:
-        nonlocal held
-        held = b""
-        return take
-
-    return begin
+    return take
 
 
-#: how bytes are coded -> constructor of the source of runs.
-STREAMS: dict[str, Callable[[bytes, Path], Callable[[], Take]]] = {"raw": _raw, "base64": _base64}
+#: how bytes are coded -> constructor of the source of bytes.
+STREAMS: dict[str, Callable[[bytes, Path], Take]] = {"raw": _raw, "base64": _base64}
+
+#: type of the lengths before a block.
+HEADER_TYPES: dict[str, str] = {"UInt32": "u4", "UInt64": "u8"}

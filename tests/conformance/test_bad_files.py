@@ -157,6 +157,7 @@ BAD: dict[str, tuple[str, Callable[[], bytes], tuple[str, ...]]] = {
         ("not base64",),
     ),
     "vti type": ("a.vti", lambda: swapped(made.vti(ONE), b'type="Float32"', b'type="String"'), ("type String",)),
+    "vti header type": ("a.vti", lambda: swapped(made.vti(ONE), b"UInt32", b"Int8"), ("header_type Int8", "UInt64")),
     "vti extent": ("a.vti", lambda: made.vti(ONE).replace(b"0 3 0 2 0 1", b"0 3 0 2 0 2"), ("96 bytes", "144")),
     "vti empty": ("a.vti", lambda: made.vti(ONE).replace(b"0 3 0 2 0 1", b"0 3 0 -1 0 0"), ("extent",)),
     "vti other kind": (
@@ -451,6 +452,10 @@ WRITES: dict[str, tuple[Callable[[Path], None], tuple[str, ...]]] = {
     "rotated box": (
         lambda p: files.write_volume(p / "a.vol", ONE, np.eye(4)[[1, 0, 2, 3]]),
         ("rotated", "axis-aligned", ".npz"),
+    ),
+    "far box": (
+        lambda p: files.write_volume(p / "a.vol", ONE, files.frame_from_box((1e9,) * 3, (1e9 + 1,) * 3)),
+        ("float32 can tell apart",),
     ),
     "flat box": (lambda p: files.write_volume(p / "a.npz", ONE, np.diag([1.0, 0, 1, 1])), ("degenerate",)),
     "place in npy": (lambda p: files.write_volume(p / "a.npy", ONE, 2 * np.eye(4) - np.diag([0, 0, 0, 1.0])), (".npz",)),

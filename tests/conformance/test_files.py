@@ -30,6 +30,9 @@ from mivol.errors import MivolError
 #: what the hand-made files with spacing (1.5, 2, 2.5) and first centre (10, 20, 30) must give for 4 x 3 x 2 voxels.
 PLACE = np.array([[6, 0, 0, 9.25], [0, 6, 0, 19], [0, 0, 5, 28.75], [0, 0, 0, 1]])
 
+#: types and byte orders that the hand-made files of binary formats are tried in.
+TYPES = [("u1", "<"), ("i2", ">"), ("i2", "<"), ("u2", "<"), ("f4", ">"), ("f4", "<"), ("f8", ">"), ("f8", "<")]
+
 
 def read(folder: Path, name: str, data: bytes, **options: object) -> files.VolumeData:
     (folder / name).write_bytes(data)
@@ -113,12 +116,12 @@ def test_npz_of_others(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("encoding", ["raw", "gzip", "bzip2", "ascii"])
-@pytest.mark.parametrize(("dtype", "order"), [("u1", "<"), ("i2", ">"), ("u2", "<"), ("f4", ">"), ("f8", "<")])
-def test_nrrd_by_hand(tmp_path: Path, encoding: str, dtype: str, order: str) -> None:
+def test_nrrd_by_hand(tmp_path: Path, encoding: str) -> None:
     values = made.numbered()
-    volume = read(tmp_path, "a.nrrd", made.nrrd(values, dtype=dtype, order=order, encoding=encoding))
-    assert_volume(volume, values)
-    assert volume.meta["space"] == "LPS"
+    for dtype, order in TYPES:
+        volume = read(tmp_path, "a.nrrd", made.nrrd(values, dtype=dtype, order=order, encoding=encoding))
+        assert_volume(volume, values)
+        assert volume.meta["space"] == "LPS"
 
 
 def test_nrrd_channels_first_or_last(tmp_path: Path) -> None:
@@ -174,13 +177,13 @@ def test_nrrd_slices(tmp_path: Path, names: str) -> None:
 # -- MetaImage ------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("dtype", "order"), [("u1", "<"), ("i2", ">"), ("u2", "<"), ("f4", ">"), ("f8", "<")])
 @pytest.mark.parametrize("keys", [{}, {"CompressedData": "True"}, {"BinaryData": "False"}], ids=["raw", "zlib", "text"])
-def test_metaimage_by_hand(tmp_path: Path, dtype: str, order: str, keys: dict[str, str]) -> None:
+def test_metaimage_by_hand(tmp_path: Path, keys: dict[str, str]) -> None:
     values = made.numbered(channels=3)
-    volume = read(tmp_path, "a.mha", made.mha(values, dtype=dtype, order=order, **keys))
-    assert_volume(volume, values)
-    assert volume.meta["space"] == "LPS"
+    for dtype, order in TYPES:
+        volume = read(tmp_path, "a.mha", made.mha(values, dtype=dtype, order=order, **keys))
+        assert_volume(volume, values)
+        assert volume.meta["space"] == "LPS"
 
 
 def test_metaimage_rows_of_the_matrix_are_the_axes(tmp_path: Path) -> None:
@@ -207,16 +210,15 @@ SFORM = [1.5, 0, 0, 10, 0, 2, 0, 20, 0, 0, 2.5, 30]
 
 
 @pytest.mark.parametrize("version", [1, 2])
-@pytest.mark.parametrize(("dtype", "order"), [("u1", "<"), ("i2", ">"), ("u2", "<"), ("f4", ">"), ("f8", "<")])
 @pytest.mark.parametrize("name", ["a.nii", "a.nii.gz"])
 @pytest.mark.parametrize("channels", [1, 3])
-def test_nifti_by_hand(tmp_path: Path, version: int, dtype: str, order: str, name: str, channels: int) -> None:
+def test_nifti_by_hand(tmp_path: Path, version: int, name: str, channels: int) -> None:
     values = made.numbered(channels=channels)
-    data = made.nifti(values, dtype=dtype, order=order, version=version, sform=SFORM)
-    volume = read(tmp_path, name, made.PACK["gzip" if name.endswith("gz") else "raw"](data))
-    assert_volume(volume, values)
-    assert volume.meta["space"] == "RAS"
-    assert volume.meta["unit"] == "mm"
+    for dtype, order in TYPES:
+        data = made.nifti(values, dtype=dtype, order=order, version=version, sform=SFORM)
+        volume = read(tmp_path, name, made.PACK["gzip" if name.endswith("gz") else "raw"](data))
+        assert_volume(volume, values)
+        assert (volume.meta["space"], volume.meta["unit"]) == ("RAS", "mm")
 
 
 def test_nifti_qform_is_a_quaternion(tmp_path: Path) -> None:
@@ -257,14 +259,14 @@ def test_ras_and_lps_agree(tmp_path: Path) -> None:
 # -- VTK ------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("dtype", "order"), [("u1", "<"), ("i2", ">"), ("f4", "<"), ("f8", ">")])
-@pytest.mark.parametrize("header_type", ["UInt32", "UInt64"])
 @pytest.mark.parametrize("compressor", [None, "zlib", "lzma"])
 @pytest.mark.parametrize("mode", ["ascii", "inline", "base64", "raw"])
-def test_vti_by_hand(tmp_path: Path, dtype: str, order: str, header_type: str, compressor: str | None, mode: str) -> None:
+def test_vti_by_hand(tmp_path: Path, compressor: str | None, mode: str) -> None:
     values = made.numbered(channels=3)
-    data = made.vti(values, dtype=dtype, order=order, header_type=header_type, compressor=compressor, mode=mode)
-    assert_volume(read(tmp_path, "a.vti", data), values)
+    for header_type in ("UInt32", "UInt64"):
+        for dtype, order in TYPES:
+            data = made.vti(values, dtype=dtype, order=order, header_type=header_type, compressor=compressor, mode=mode)
+            assert_volume(read(tmp_path, "a.vti", data), values)
 
 
 @pytest.mark.parametrize("header_type", ["UInt32", "UInt64"])
