@@ -108,9 +108,11 @@ class Voxels:
         Raises:
             MivolError: the new values are not those of a medium (looked at, unless ``dr.freeze`` is recording).
         """
+        if dr.flag(dr.JitFlag.FreezingScope):
+            # A recording can neither read values nor rebuild the texture. The tensor has been replaced in place already.
+            return
         self.texture.update_inplace()
-        if not dr.flag(dr.JitFlag.FreezingScope):
-            check_volume(np.array(dr.detach(self.texture.tensor())), name=self.name)
+        check_volume(np.array(dr.detach(self.texture.tensor())), name=self.name)
 
     def __repr__(self) -> str:
         z, y, x = self.res
