@@ -49,6 +49,7 @@ pytestmark = pytest.mark.usefixtures("variant_rgb")
 
 BOUND = 2e-6
 EPS = 2.0**-23
+ODD_FRAMES = ("stretched", "rotated", "sheared", "mirrored")
 KINDS = {"stock": ("heterogeneous", "gridvolume"), "own": ("mivol_medium", "mivol_voxels")}
 
 
@@ -130,7 +131,7 @@ def chords(seen, interval):
 # -- Closed forms and the twin, ray by ray -------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", FRAMES)
+@pytest.mark.parametrize("name", ODD_FRAMES[:2])
 def test_homogeneous_box(name):
     to_world = as_float32(unmirrored(FRAMES[name]))
     size = np.linalg.norm(to_world[:3, :3] @ np.ones(3))
@@ -151,7 +152,7 @@ def test_homogeneous_sphere():
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("name", FRAMES)
+@pytest.mark.parametrize("name", ODD_FRAMES)
 def test_grid_in_any_frame(kind, name):
     to_world, values = as_float32(FRAMES[name]), random_grid(3)
     size = np.linalg.norm(to_world[:3, :3] @ np.ones(3))
@@ -206,14 +207,16 @@ def test_several_media_along_a_ray(kinds):
     assert_transmittance(seen, tau, BOUND * scale + 0.5 * 8e-6)
 
 
-@pytest.mark.parametrize("shape", ["sphere", "cube"])
-def test_many_equal_media_along_a_ray(shape):
+@pytest.mark.parametrize("shapes", ["sphere", "cube", "sphere cube"])
+def test_many_equal_media_along_a_ray(shapes):
     # Mitsuba's loader makes one object of media that are equal: each boundary must still count once. And there are more
     # of them than max_depth: boundaries are not scattering.
+    build = {"sphere": lambda fog, middle: ball_of(fog, middle, 1.0),
+             "cube": lambda fog, middle: box_of(fog, centred(2 * np.eye(3), middle))}
     parts = {"sky": sky()}
     for i in range(12):
-        fog, middle = medium("homogeneous", 0.1), np.array([0, 0, 3.0 * i])
-        parts[f"fog{i:02d}"] = ball_of(fog, middle, 1.0) if shape == "sphere" else box_of(fog, centred(2 * np.eye(3), middle))
+        shape = shapes.split()[i % len(shapes.split())]
+        parts[f"fog{i:02d}"] = build[shape](medium("homogeneous", 0.1), np.array([0, 0, 3.0 * i]))
     seen = see(parts, [0, 0, -5], [0, 0, 1], mivol(max_depth=2))
     # 24 ends at coordinates of up to 34, each known to a few EPS of that.
     assert_transmittance(seen, np.array([[0.1 * 2 * 12]]), 0.1 * 24 * 34 * 4 * EPS)
@@ -247,7 +250,7 @@ def test_hard_03_vacuum_between_boundary_and_dense_grid(kind):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("name", FRAMES)
+@pytest.mark.parametrize("name", ODD_FRAMES[1:])
 def test_hard_04_boundary_larger_than_the_grid(kind, name):
     # Outside its own box a grid is vacuum, even where stock Mitsuba fills a rotated grid's bounding box.
     to_world, values = as_float32(FRAMES[name]), random_grid(8)
@@ -347,23 +350,26 @@ def test_surface_in_the_medium_lit_by_a_point_light(kind):
     assert np.array_equal(see(parts, o, d, mivol(max_depth=1)).image, np.zeros((8, 3)))
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_surface_in_the_medium_lit_by_the_sky(kind):
-    # A white wall at the bottom under a constant sky, no closed form: the mean over the picture against stock volpath,
-    # from independent batches, by Student's t.
+@pytest.mark.parametrize(("kind", "depth"), [("own", 2), ("stock", 3), ("stock", -1)])
+def test_corner_in_the_medium_lit_by_the_sky(kind, depth):
+    # Two white walls that light each other under a constant sky, no closed form: the mean over the picture against stock
+    # volpath at the same depth, from independent batches, by Student's t.
     to_world, values = as_float32(centred(2 * np.eye(3))), random_grid(13, 3 if kind == "own" else 1, top=0.7)
     values[...] = values[..., :1]
     parts = in_frame(kind, values, to_world)
-    parts["wall"] = wall(-0.37, {"type": "diffuse", "reflectance": {"type": "uniform", "value": 0.8}})
-    scene = mi.load_dict({"type": "scene", **parts, "sensor": camera([0.1, 0.5, 3], [0, 0, -0.4], res=8, fov=20)})
+    white = {"type": "diffuse", "reflectance": {"type": "uniform", "value": 0.8}}
+    upright = mi.ScalarTransform4f().translate([-0.4, 0, 0]).rotate([0, 1, 0], 90)
+    parts |= {"floor": wall(-0.37, white), "side": {"type": "rectangle", "to_world": upright, "bsdf": white}}
+    scene = mi.load_dict({"type": "scene", **parts, "sensor": camera([1.5, 0.5, 3], [-0.3, 0, -0.3], res=8, fov=10)})
     batches = 8
-    ours = np.array([render(scene, mivol(max_depth=2), 64, seed) for seed in range(batches)])
-    stock = {"type": "volpath", "max_depth": 2, "rr_depth": 99}
+    ours = np.array([render(scene, mivol(max_depth=depth, rr_depth=99), 64, seed) for seed in range(batches)])
+    stock = {"type": "volpath", "max_depth": depth, "rr_depth": 99}
     theirs = np.array([render(scene, stock, 512, 100 + seed) for seed in range(batches)])
     means = [x.mean(axis=(1, 2, 3)) for x in (ours, theirs)]
     a, b = (m.mean() for m in means)
     var_a, var_b = (m.var(ddof=1) / batches for m in means)
     assert_same_mean(a, var_a, b, var_b, n_a=batches, n_b=batches, what="lit by the sky")
+    assert math.sqrt(var_a + var_b) < 0.01 * b
 
 
 # -- Against stock volpath ---------------------------------------------------------------------------------------------------
@@ -410,10 +416,10 @@ def test_same_mean_as_volpath(name):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_pixel_means_of_a_camera(kind):
-    # A pixel averages T, not tau: the twin's mean over 8 x 8 rays of each pixel, whose error is of second order in 1/8.
+    # A pixel averages T, not tau: the twin's mean over 6 x 6 rays of each pixel, whose error is of second order in 1/6.
     to_world, values = as_float32(centred(np.eye(3))), random_grid(19, top=8.0)
     scene = framed(in_frame(kind, values, to_world), (0, 0, 0), 6)
-    k, spp = 8, 256
+    k, spp = 6, 256
     o, d = pixel_rays(scene.sensors()[0], k)
     mean, variance = pixel_means(lambda o, d: np.exp(-tau_twin(values, to_world, o, d)), o, d)
     image = render(scene, mivol(), spp)
