@@ -223,7 +223,7 @@ def axis_from_reconstructions(y: np.ndarray, weights: np.ndarray, angles: np.nda
     """Refine the axis: the column with which one half of the views predicts the other half best.
 
     Filtered back-projection from every other view, forward projection to the views between, weighted mean squared
-    residual; a parabola through five trial columns, then once more on a fourth of the width. Done twice, the halves
+    residual; a parabola fitted to five trial columns, then once more on a fourth of the width. Done twice, the halves
     changing roles: the estimate is their mean. Its standard deviation is that of the parabola's curvature (the residual
     taken as noise), or half of the two estimates' difference where that is larger.
 
@@ -257,6 +257,9 @@ def axis_from_reconstructions(y: np.ndarray, weights: np.ndarray, angles: np.nda
 def find_axis(y: np.ndarray, weights: np.ndarray, angles: np.ndarray) -> Axis:
     """Find the rotation axis of a parallel-beam scan: by mirror images (else by moments), refined by reconstructions.
 
+    The refined column counts; its uncertainty is at least half of its distance from the rough one, since pixels of
+    finite width and light that drifts move both by more than noise does.
+
     Args:
         y: (views, rows, cols) line integrals.
         weights: inverse variances of ``y``.
@@ -266,7 +269,8 @@ def find_axis(y: np.ndarray, weights: np.ndarray, angles: np.ndarray) -> Axis:
         rough = axis_from_mirrors(y, angles)
     except MivolError:
         rough = axis_from_moments(y, angles)
-    return axis_from_reconstructions(y, weights, angles, rough.column)
+    fine = axis_from_reconstructions(y, weights, angles, rough.column)
+    return replace(fine, uncertainty=max(fine.uncertainty, abs(fine.column - rough.column) / 2))
 
 
 def _opposite_pairs(angles: np.ndarray, n_pairs: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -325,15 +329,13 @@ def _reach(y: np.ndarray, column: float) -> int:
 
 
 def _parabola_minimum(f: Callable[[float], float], centre: float, width: float, n: int) -> tuple[float, float]:
-    """(abscissa, standard deviation) of the least of a parabola through samples of a mean of ``n`` weighted squares."""
+    """(abscissa, standard deviation) of the least of a parabola fitted to a mean of ``n`` weighted squares."""
     offsets = np.linspace(-1.0, 1.0, 5)
-    values = np.array([f(centre + width * o) for o in offsets])
-    at = int(values.argmin())
-    if at in (0, 4):
+    a, b, c = map(float, np.polyfit(offsets, [f(centre + width * o) for o in offsets], 2))
+    if a <= 0 or abs(b) > 2 * a:
         raise MivolError(
-            f"Found the least misfit at the border of columns {centre - width:.1f} to {centre + width:.1f}, expected it "
-            "inside: start nearer, or search wider."
+            f"Found no least misfit between columns {centre - width:.1f} and {centre + width:.1f}, expected one: start "
+            "nearer, or search wider."
         )
-    a, b, c = map(float, np.polyfit(offsets[at - 1 : at + 2], values[at - 1 : at + 2], 2))
     # n a (offset / sigma)^2 rises by the residual's own mean square at one standard deviation.
     return centre - width * b / (2 * a), width * float(np.sqrt((c - b * b / (4 * a)) / (n * a)))
