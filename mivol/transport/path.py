@@ -26,7 +26,7 @@ import mitsuba as mi
 from mivol.transport.lattice import slab
 from mivol.transport.world import Body, World
 
-__all__ = ["Path", "Reach", "Settings", "optical_depth_to", "reach", "transmittance", "walk_path"]
+__all__ = ["Path", "Reach", "Settings", "Visit", "Way", "optical_depth_to", "reach", "transmittance", "walk_path"]
 
 
 @dataclass(frozen=True)
@@ -48,6 +48,15 @@ class Reach:
     si: mi.SurfaceInteraction3f
     t: mi.Float
     medium: mi.MediumPtr
+
+
+@dataclass
+class Way:
+    """A stretch that has been walked: its ray, the medium it began in, and its length."""
+
+    ray: mi.Ray3f
+    medium: mi.MediumPtr
+    length: mi.Float
 
 
 Visit = Callable[[Any, Body, mi.Float, mi.Float, mi.Bool], Any]
@@ -228,7 +237,7 @@ def _see(scene: mi.Scene, world: World, settings: Settings, path: Path) -> tuple
     """Go to the next opaque surface and add the emission found there."""
     end, tau = optical_depth_to(scene, world, path.ray, path.medium, path.active)
     path.beta *= transmittance(tau)
-    path.score = path.score.stretch(scene, world, path.ray, path.medium, end.t, path.active)
+    path.score = path.score.stretch(scene, world, Way(path.ray, path.medium, end.t), path.active)
     path.medium = end.medium
 
     si = end.si
@@ -272,14 +281,14 @@ def _bounce(scene: mi.Scene, world: World, settings: Settings, limit: int, path:
         f = bsdf.eval(mi.BSDFContext(), si, wo, lit)
         source = scene.eval_emitter_direction(si, direct, lit) / direct.pdf if score.attached else weight
         carried = dim * f * dr.select(direct.pdf > 0, source, 0)
-    score = score.shadow(scene, world, shadow, shadow_medium, length, carried, lit)
+    score = score.shadow(scene, world, Way(shadow, shadow_medium, length), carried, lit)
 
     # -- The direction the path takes -----------------------------------------------------------------------------------------
     u1, u2 = sampler.next_1d(on_surface), sampler.next_2d(on_surface)
     sample, f_over_pdf = bsdf.sample(mi.BSDFContext(), si, u1, u2, on_surface)
     through = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Null)
     on = on_surface & (may_scatter | through) & (sample.pdf > 0)
-    score = score.turn(bsdf, si, sample, f_over_pdf, on & ~through)
+    score = score.turn(bsdf, si, sample.wo, on & ~through)
     path.beta *= dr.select(on, f_over_pdf, 0)
     path.eta *= dr.select(on, sample.eta, 1)
     path.ray = si.spawn_ray(si.to_world(sample.wo))

@@ -17,11 +17,12 @@ References: Vicini et al. 2021 (replay with a running difference); Nimier-David 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
-from mivol.transport.path import reach, visit_boxes
+from mivol.transport.path import Visit, Way, reach, visit_boxes
 from mivol.transport.world import Body, World
 
 __all__ = ["Adjoint", "Primal", "Tangent"]
@@ -34,7 +35,7 @@ class Primal:
     L: mi.Spectrum
     attached = False
 
-    def stretch(self, scene, world, ray, medium, t_end, active) -> Primal:
+    def stretch(self, scene: mi.Scene, world: World, way: Way, active: mi.Bool) -> Primal:
         """Nothing to do: the throughput is dimmed by the path itself."""
         return self
 
@@ -42,11 +43,11 @@ class Primal:
         """Light found at the end of a stretch."""
         return Primal(self.L + dr.select(active, value, 0))
 
-    def shadow(self, scene, world, ray, medium, length, value: mi.Spectrum, active: mi.Bool) -> Primal:
+    def shadow(self, scene: mi.Scene, world: World, way: Way, value: mi.Spectrum, active: mi.Bool) -> Primal:
         """Light that arrived along a shadow ray."""
         return self.add(value, active)
 
-    def turn(self, bsdf, si, sample, weight, active) -> Primal:
+    def turn(self, bsdf: mi.BSDFPtr, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool) -> Primal:
         """Nothing to do."""
         return self
 
@@ -59,9 +60,9 @@ class Adjoint:
     dL: mi.Spectrum
     attached = True
 
-    def stretch(self, scene, world: World, ray, medium, t_end, active) -> Adjoint:
+    def stretch(self, scene: mi.Scene, world: World, way: Way, active: mi.Bool) -> Adjoint:
         """Everything ahead is dimmed by this stretch: d loss / d tau = -dL L."""
-        _backproject(scene, world, ray, medium, t_end, -self.dL * self.L, active)
+        _backproject(scene, world, way, -self.dL * self.L, active)
         return self
 
     def add(self, value: mi.Spectrum, active: mi.Bool) -> Adjoint:
@@ -70,15 +71,15 @@ class Adjoint:
             dr.backward_from(dr.select(active, self.dL * value, 0))
         return Adjoint(self.L - dr.select(active, dr.detach(value), 0), self.dL)
 
-    def shadow(self, scene, world: World, ray, medium, length, value: mi.Spectrum, active: mi.Bool) -> Adjoint:
+    def shadow(self, scene: mi.Scene, world: World, way: Way, value: mi.Spectrum, active: mi.Bool) -> Adjoint:
         """Light that a shadow ray carried is dimmed by the media along it."""
-        _backproject(scene, world, ray, medium, length, -self.dL * dr.detach(value), active)
+        _backproject(scene, world, way, -self.dL * dr.detach(value), active)
         return self.add(value, active)
 
-    def turn(self, bsdf, si, sample, weight, active) -> Adjoint:
+    def turn(self, bsdf: mi.BSDFPtr, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool) -> Adjoint:
         """All that lies ahead passes through the BSDF: its parameters get dL L f' / f."""
         with dr.resume_grad():
-            f = bsdf.eval(mi.BSDFContext(), si, sample.wo, active)
+            f = bsdf.eval(mi.BSDFContext(), si, wo, active)
             if dr.grad_enabled(f):
                 pdf_f = dr.detach(f)
                 ratio = dr.select(pdf_f != 0, f * dr.rcp(dr.select(pdf_f != 0, pdf_f, 1)), 0)
@@ -95,9 +96,9 @@ class Tangent:
     dtau: mi.Spectrum
     attached = True
 
-    def stretch(self, scene, world: World, ray, medium, t_end, active) -> Tangent:
+    def stretch(self, scene: mi.Scene, world: World, way: Way, active: mi.Bool) -> Tangent:
         """The stretch dims what lies ahead by its tangent."""
-        return Tangent(self.L, self.dL, self.dtau + _tangent(scene, world, ray, medium, t_end, active))
+        return Tangent(self.L, self.dL, self.dtau + _tangent(scene, world, way, active))
 
     def add(self, value: mi.Spectrum, active: mi.Bool) -> Tangent:
         """Light found at the end of a stretch, and how it changes."""
@@ -106,16 +107,16 @@ class Tangent:
         dL = self.dL + dr.select(active, own - self.dtau * seen, 0)
         return Tangent(self.L + dr.select(active, seen, 0), dL, self.dtau)
 
-    def shadow(self, scene, world: World, ray, medium, length, value: mi.Spectrum, active: mi.Bool) -> Tangent:
+    def shadow(self, scene: mi.Scene, world: World, way: Way, value: mi.Spectrum, active: mi.Bool) -> Tangent:
         """As :meth:`add`, with the tangent of the shadow ray besides."""
-        along = _tangent(scene, world, ray, medium, length, active)
+        along = _tangent(scene, world, way, active)
         passed = self.add(value, active)
         return Tangent(passed.L, passed.dL - dr.select(active, along * dr.detach(value), 0), self.dtau)
 
-    def turn(self, bsdf, si, sample, weight, active) -> Tangent:
+    def turn(self, bsdf: mi.BSDFPtr, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool) -> Tangent:
         """A BSDF that changes scales all that lies ahead: a logarithmic tangent, kept with the media's."""
         with dr.resume_grad():
-            f = bsdf.eval(mi.BSDFContext(), si, sample.wo, active)
+            f = bsdf.eval(mi.BSDFContext(), si, wo, active)
             if not dr.grad_enabled(f):
                 return self
             df = dr.forward_to(f)
@@ -124,32 +125,32 @@ class Tangent:
         return Tangent(self.L, self.dL, self.dtau - change)
 
 
-def _backproject(scene, world: World, ray: mi.Ray3f, medium, t_end: mi.Float, weight: mi.Spectrum, active: mi.Bool) -> None:
+def _backproject(scene: mi.Scene, world: World, way: Way, weight: mi.Spectrum, active: mi.Bool) -> None:
     """Add a weight times a stretch to the gradients of its media."""
     rows = _channels(weight, world.channels)
 
     def visit(state: mi.Float, body: Body, t0: mi.Float, t1: mi.Float, on: mi.Bool) -> mi.Float:
-        body.backproject(ray, t0, t1, rows, on)
+        body.backproject(way.ray, t0, t1, rows, on)
         return state
 
-    _again(scene, world, ray, medium, t_end, visit, mi.Float(0), active & dr.any(weight != 0))
+    _again(scene, world, way, visit, mi.Float(0), active & dr.any(weight != 0))
 
 
-def _tangent(scene, world: World, ray: mi.Ray3f, medium, t_end: mi.Float, active: mi.Bool) -> mi.Spectrum:
+def _tangent(scene: mi.Scene, world: World, way: Way, active: mi.Bool) -> mi.Spectrum:
     """Tangent of the optical depth of a stretch."""
 
     def visit(tau: list[mi.Float], body: Body, t0: mi.Float, t1: mi.Float, on: mi.Bool) -> list[mi.Float]:
-        return [t + d for t, d in zip(tau, body.tangent(ray, t0, t1, len(tau), on), strict=True)]
+        return [t + d for t, d in zip(tau, body.tangent(way.ray, t0, t1, len(tau), on), strict=True)]
 
-    tau = _again(scene, world, ray, medium, t_end, visit, [mi.Float(0) for _ in range(world.channels)], active)
+    tau = _again(scene, world, way, visit, [mi.Float(0) for _ in range(world.channels)], active)
     return mi.Spectrum(*tau) if len(tau) == 3 else mi.Spectrum(tau[0])
 
 
-def _again(scene, world: World, ray: mi.Ray3f, medium, t_end: mi.Float, visit, state, active: mi.Bool):
+def _again(scene: mi.Scene, world: World, way: Way, visit: Visit, state: Any, active: mi.Bool) -> Any:
     """Visit the media of a stretch whose end is known; only boundaries that have to be traced are traced again."""
     if not world.traced:
-        return visit_boxes(world, ray, t_end, visit, state, active)
-    return reach(scene, world, ray, medium, visit, state, active)[1]
+        return visit_boxes(world, way.ray, way.length, visit, state, active)
+    return reach(scene, world, way.ray, way.medium, visit, state, active)[1]
 
 
 def _channels(value: mi.Spectrum, channels: int) -> list[mi.Float]:

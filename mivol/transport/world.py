@@ -36,14 +36,18 @@ class Body:
 
     def optical_depth(self, ray: mi.Ray3f, t0: mi.Float, t1: mi.Float, channels: int, active: mi.Bool) -> list[mi.Float]:
         """Optical depth [1] of each channel over a stretch."""
+        values = [dr.detach(_values(p)) for p in self.view.parts]
         scale = dr.detach(self.view.scale)
-        return self._sum(ray, t0, t1, channels, active, [scale * dr.detach(_values(p)) for p in self.view.parts], skip=True)
+        return [scale * tau for tau in self._sum(ray, t0, t1, channels, active, values, skip=True)]
 
     def tangent(self, ray: mi.Ray3f, t0: mi.Float, t1: mi.Float, channels: int, active: mi.Bool) -> list[mi.Float]:
         """Derivative of the optical depth along the tangent that :meth:`World.start_tangent` took from the parameters."""
         return self._sum(ray, t0, t1, channels, active, self.tangents, skip=False)
 
-    def _sum(self, ray, t0, t1, channels: int, active: mi.Bool, values: list, skip: bool) -> list[mi.Float]:
+    def _sum(
+        self, ray: mi.Ray3f, t0: mi.Float, t1: mi.Float, channels: int, active: mi.Bool, values: list, skip: bool
+    ) -> list[mi.Float]:
+        """Integrate ``values`` in the place of each part."""
         total = [mi.Float(0) for _ in range(channels)]
         for part, value in zip(self.view.parts, values, strict=True):
             if part.lattice is None:
