@@ -168,7 +168,7 @@ def backproject_segment(
     """
 
     def visit(state: None, cell: Cell, on: mi.Bool) -> None:
-        a, b = (weights(_natural(p, cell, lattice.res)) for p in gauss_points(cell))
+        a, b = gauss_weights(cell, lattice.res)
         row = [0.5 * cell.dt * (wa + wb) for wa, wb in zip(a, b, strict=True)]
         for channel, w in enumerate(weight):
             target.add(channel, cell, [w * r for r in row], on)
@@ -180,6 +180,11 @@ def backproject_segment(
 def gauss_points(cell: Cell) -> tuple[mi.Vector3f, mi.Vector3f]:
     """The two Gauss points of a cell's stretch, as fractions from its near planes."""
     return dr.fma(cell.step, GAUSS, cell.frac), dr.fma(cell.step, 1 - GAUSS, cell.frac)
+
+
+def gauss_weights(cell: Cell, res: tuple[int, int, int]) -> tuple[list[mi.Float], list[mi.Float]]:
+    """The 8 trilinear weights at each of the two Gauss points, in the order of the grid's own axes."""
+    return tuple(weights(_natural(p, cell, res)) for p in gauss_points(cell))
 
 
 def interpolate(corners: list[mi.Float], frac: mi.Vector3f) -> mi.Float:

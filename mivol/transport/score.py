@@ -25,7 +25,7 @@ import mitsuba as mi
 from mivol.transport.path import Visit, Way, reach, visit_boxes
 from mivol.transport.world import Body, World
 
-__all__ = ["Adjoint", "Primal", "Tangent"]
+__all__ = ["Adjoint", "Primal", "Tangent", "revisit"]
 
 
 @dataclass
@@ -133,7 +133,7 @@ def _backproject(scene: mi.Scene, world: World, way: Way, weight: mi.Spectrum, a
         body.backproject(way.ray, t0, t1, rows, on)
         return state
 
-    _again(scene, world, way, visit, mi.Float(0), active & dr.any(weight != 0))
+    revisit(scene, world, way, visit, mi.Float(0), active & dr.any(weight != 0))
 
 
 def _tangent(scene: mi.Scene, world: World, way: Way, active: mi.Bool) -> mi.Spectrum:
@@ -142,11 +142,11 @@ def _tangent(scene: mi.Scene, world: World, way: Way, active: mi.Bool) -> mi.Spe
     def visit(tau: list[mi.Float], body: Body, t0: mi.Float, t1: mi.Float, on: mi.Bool) -> list[mi.Float]:
         return [t + d for t, d in zip(tau, body.tangent(way.ray, t0, t1, len(tau), on), strict=True)]
 
-    tau = _again(scene, world, way, visit, [mi.Float(0) for _ in range(world.channels)], active)
+    tau = revisit(scene, world, way, visit, [mi.Float(0) for _ in range(world.channels)], active)
     return mi.Spectrum(*tau) if len(tau) == 3 else mi.Spectrum(tau[0])
 
 
-def _again(scene: mi.Scene, world: World, way: Way, visit: Visit, state: Any, active: mi.Bool) -> Any:
+def revisit(scene: mi.Scene, world: World, way: Way, visit: Visit, state: Any, active: mi.Bool) -> Any:
     """Visit the media of a stretch whose end is known; only boundaries that have to be traced are traced again."""
     if not world.traced:
         return visit_boxes(world, way.ray, way.length, visit, state, active)
