@@ -7,6 +7,7 @@ differentiable through Dr.Jit in ``image`` and take their weights from ``referen
 
 from __future__ import annotations
 
+import math
 from typing import Annotated
 
 import drjit as dr
@@ -103,7 +104,8 @@ def log_radiance(radiance: mi.TensorXf, floor: float) -> mi.TensorXf:
     The tangent keeps value and slope finite for radiance that underflowed to 0 or that noise made negative, and keeps
     the slope (1 / floor) that leads back; the function is monotone and once continuously differentiable.
     """
-    return dr.log(dr.maximum(radiance, floor)) + dr.minimum(radiance - floor, 0.0) / floor
+    tangent = math.log(floor) + (radiance - floor) / floor
+    return dr.select(radiance > floor, dr.log(dr.maximum(radiance, floor)), tangent)
 
 
 class Log(Loss, tag="log"):

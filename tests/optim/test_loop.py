@@ -1,0 +1,322 @@
+"""The loop: each optimiser finds a known optimum, derivatives belong together, randomness is where it is said to be."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from fit_scene import KEY, absorbing_scene, camera, film, frontal, small_problem
+
+from mivol.errors import MivolError
+from mivol.optim.events import Evaluate, Upsample
+from mivol.optim.interrupt import Interrupted, Stop
+from mivol.optim.loop import reconstruct
+from mivol.optim.losses import Huber, Log
+from mivol.optim.optimisers import (
+    OPTIMISERS,
+    Adam,
+    GaussNewton,
+    Lbfgs,
+    Linearised,
+    Packing,
+    conjugate_gradients,
+    two_loops,
+    views_of,
+)
+from mivol.optim.parameters import Parameter
+from mivol.optim.priors import Laplacian, TotalVariation
+from mivol.optim.problem import Problem, seed_of
+from mivol.optim.schedules import Cosine
+from mivol.optim.shots import View, make_shots
+
+EPS = float(np.finfo(np.float32).eps)
+
+#: optimiser -> (settings, iterations, relative error of both optima that it must reach in a two-parameter problem).
+#: Gauss-Newton and L-BFGS converge superlinearly to the float32 noise of the loss (its square root: 3e-4); Adam steps of
+#: lr times the last cosine factors (below 1e-2 of 0.2) end within 1e-2.
+EXACT = {"adam": (Adam(), 80, 1e-2), "lbfgs": (Lbfgs(), 25, 1e-3), "gauss_newton": (GaussNewton(), 12, 1e-3)}
+
+
+def two_cubes(start: float) -> mi.Scene:
+    """Two homogeneous cubes, one behind the left half of the image and one behind the right half."""
+    cubes = {}
+    for name, x in (("left", -1.0), ("right", 1.0)):
+        medium = {"type": "homogeneous", "albedo": 0.0, "sigma_t": {"type": "rgb", "value": start}}
+        place = mi.ScalarTransform4f().translate([x, 0, 0])
+        cubes[name] = {"type": "cube", "to_world": place, "bsdf": {"type": "null"}, "interior": medium}
+    scene = {"type": "scene", "sky": {"type": "constant"}, "integrator": {"type": "mivol"}, **cubes}
+    return mi.load_dict(scene, optimize=False)  # else equal cubes, and their media, become one
+
+
+@pytest.mark.parametrize("name", OPTIMISERS)
+def test_finds_a_known_optimum(variant_rgb, name: str) -> None:
+    """Two unknown extinctions, each seen through a chord of 2: I = exp(-2 sigma), wanted 0.7 and 0.2, from 0.35."""
+    optimiser, iterations, bound = EXACT[name]
+    scene = two_cubes(0.35)
+    keys = [f"{side}.interior_medium.sigma_t.value.value" for side in ("left", "right")]
+    pose = mi.ScalarTransform4f().look_at(origin=[0, 0, 4], target=[0, 0, 0], up=[0, 1, 0]).scale([1.5, 0.8, 1])
+    sensor = mi.load_dict({"type": "orthographic", "to_world": pose, "film": film(4)})
+    # Seen along -z with y up, x grows to the right: the left half of the image shows the cube at x = -1.
+    tau = 2 * np.repeat([[0.7, 0.7, 0.2, 0.2]], 4, axis=0)[..., None].repeat(3, axis=2)
+    view = View("both", sensor, mi.TensorXf(np.exp(-tau).astype(np.float32)))
+    parameters = [Parameter(key, domain=(0.0, 10.0), lr=0.2) for key in keys]
+    fit = reconstruct(Problem(scene, [view], parameters, spp=4), optimiser, iterations, schedule=Cosine())
+    values = [float(np.asarray(fit.values()[key]).ravel()[0]) for key in keys]
+    assert np.allclose(values, [0.7, 0.2], rtol=bound)
+
+
+# -- Derivatives --------------------------------------------------------------------------------------------------
+
+
+def vectors(problem: Problem, seed: int = 0) -> tuple[dict, Packing, np.ndarray, np.ndarray]:
+    reals = problem.start()
+    packing = Packing(problem, reals)
+    v, w = np.random.default_rng(seed).standard_normal((2, len(packing.low)))
+    return reals, packing, v, w
+
+
+def test_gradient_is_that_of_the_loss(variant_rgb) -> None:
+    """Central differences of f along random directions, with fixed samples: h^2 f''' and the rounding of f, eps f / h,
+    balanced at h = 1e-2: 1e-3 of |g| |v| is ample. A TV prior and a softplus map are in between."""
+    parameter = Parameter(KEY, "1", (0.0, np.inf), "softplus", lr=0.1, priors=(TotalVariation(weight=0.01, edge=1.0),))
+    problem = small_problem(parameters=[parameter])
+    reals, packing, v, _ = vectors(problem)
+    linear = Linearised(problem, reals, [problem.loss.weight(s.reference) for s in problem.shots], packing)
+    x, h = packing.vector(reals), 1e-2
+    ends = [problem.loss_value(packing.tensors(x + sign * h * v), 0) for sign in (1, -1)]
+    expected = (ends[0] - ends[1]) / (2 * h)
+    assert abs(linear.gradient @ v - expected) <= 1e-3 * np.linalg.norm(linear.gradient) * np.linalg.norm(v)
+
+
+def test_gauss_newton_product_is_that_of_the_jacobian(variant_rgb) -> None:
+    """<v, J^T W J v> is the weighted square of J v, which differences of images give; and the product is symmetric."""
+    problem = small_problem()
+    reals, packing, v, w = vectors(problem, 1)
+    linear = Linearised(problem, reals, [problem.loss.weight(s.reference) for s in problem.shots], packing)
+    x, h, shot, seed = packing.vector(reals), 1e-2, problem.shots[0], linear.seeds[0]
+    images = []
+    for sign in (1, -1):
+        problem.set(packing.tensors(x + sign * h * v))
+        images.append(np.asarray(problem.render(shot.sensor, seed), dtype=np.float64))
+    jv = (images[0] - images[1]) / (2 * h)
+    product = linear.curvature(v)
+    # Differences err by h^2 and by the rounding of images, eps / h = 1e-5 of each pixel.
+    assert np.isclose(product @ v, 2 * np.mean(jv**2), rtol=2e-3)
+    assert np.isclose(product @ w, linear.curvature(w) @ v, rtol=1e-4, atol=1e-6 * abs(product @ v))
+
+
+def test_priors_enter_the_gauss_newton_product(variant_rgb) -> None:
+    plain = small_problem()
+    reals, packing, v, _ = vectors(plain)
+    prior = Laplacian(weight=0.3)
+    with_prior = small_problem(parameters=[dataclasses.replace(plain.parameters[0], priors=(prior,))])
+    products = []
+    for problem in (plain, with_prior):
+        weights = [problem.loss.weight(s.reference) for s in problem.shots]
+        products.append(Linearised(problem, reals, weights, packing).curvature(v))
+    direction = packing.tensors(v)[KEY]
+    extra = np.asarray(prior.curvature(reals[KEY], direction, (0.25, 0.25, 0.25))).ravel() * 0.1
+    assert np.allclose(products[1] - products[0], extra, atol=1e-4 * np.abs(extra).max())
+
+
+def test_conjugate_gradients_solve(variant_rgb) -> None:
+    """n steps solve an n by n system in exact arithmetic; float64 and a condition number of 1e2 leave 1e-10."""
+    rng = np.random.default_rng(0)
+    q, _ = np.linalg.qr(rng.standard_normal((6, 6)))
+    a = q @ np.diag(np.geomspace(1, 100, 6)) @ q.T
+    b = rng.standard_normal(6)
+    x = conjugate_gradients(lambda d: a @ d, b, np.diag(a).copy(), 12)
+    assert np.allclose(a @ x, b, atol=1e-6 * np.abs(b).max())
+
+
+def test_two_loops_are_the_inverse_hessian(variant_rgb) -> None:
+    """The secant equation H y = s holds exactly for the newest pair, whatever the older ones."""
+    rng = np.random.default_rng(0)
+    a = np.diag(rng.uniform(1, 5, 7))
+    steps = [rng.standard_normal(7) for _ in range(3)]
+    changes = [a @ s for s in steps]
+    assert np.allclose(two_loops(changes[-1], steps, changes), steps[-1], rtol=1e-12)
+
+
+# -- Randomness, passes, shots ------------------------------------------------------------------------------------
+
+
+def test_seeds_are_a_function_of_their_key() -> None:
+    """Same key, same seed; all keys of a small run differ (a collision has probability 2000^2 / 2^33 = 5e-4)."""
+    keys = [(0, i, v, p, n) for i in range(25) for v in range(5) for p in range(4) for n in range(4)]
+    seeds = [seed_of(*key) for key in keys]
+    assert seeds == [seed_of(*key) for key in keys]
+    assert len(set(seeds)) == len(seeds)
+
+
+def test_each_epoch_shows_each_view_once() -> None:
+    drawn = [view for i in range(6) for view in views_of(i, 9, 3, seed=1)]
+    assert sorted(drawn[:9]) == list(range(9))
+    assert sorted(drawn[9:]) == list(range(9))
+    assert drawn[:9] != drawn[9:]
+    assert views_of(4, 9, 3, seed=1) == views_of(4, 9, 3, seed=1)
+    assert views_of(0, 3, 99, seed=1) != [] and sorted(views_of(0, 3, 99, seed=1)) == [0, 1, 2]
+
+
+def test_passes_sum_to_the_samples(variant_rgb) -> None:
+    problem = small_problem(spp=10, samples_per_pass=3 * 64)
+    sensor = problem.views[0].sensor
+    assert sum(problem.passes(sensor)) == 10
+    assert max(problem.passes(sensor)) * 64 <= problem.samples_per_pass
+    assert max(problem.passes(sensor)) - min(problem.passes(sensor)) <= 1
+
+
+def test_a_nonlinear_loss_does_not_see_the_passes(variant_rgb) -> None:
+    """Parallel rays through a constant cube: each sample is exp(-2 sigma), so loss and gradient are known whatever the
+    passes. A loss taken pass by pass would be the same here for any noise-free image; so noise is put in by cameras at
+    the silhouette: there the split may change the image only as much as another seed does."""
+    scene = absorbing_scene(np.full((2, 2, 2, 1), 0.4))
+    wanted = mi.TensorXf(np.full((4, 4, 3), 0.6, "f"))
+    parameter = Parameter(KEY, domain=(0.0, np.inf))
+    for most in (1 << 20, 16):
+        problem = Problem(scene, [View("a", frontal(), wanted)], [parameter], loss=Log(), spp=8, samples_per_pass=most)
+        loss, gradients = problem.loss_and_gradient(problem.start(), 0)
+        r = -0.8 - np.log(0.6)
+        weight = 0.36 / (0.36 + 1e-6)
+        assert np.isclose(loss, weight * r**2, rtol=1e-5)
+        assert np.isclose(np.asarray(gradients[KEY]).sum(), weight * 2 * r * -2.0, rtol=1e-5)
+    coverage = []
+    for most in (1 << 20, 3 * 64):
+        problem = small_problem(spp=4, samples_per_pass=most, loss=Huber(delta=0.02))
+        problem.set(problem.start())
+        coverage.append([problem.mean_loss(i) for i in range(6)])
+    spread = np.std(coverage, axis=1).max()
+    # One pass of 4 samples and 4 passes of one: a mean of losses of single passes would be about 4 times as large.
+    assert abs(np.mean(coverage[0]) - np.mean(coverage[1])) <= 6 * spread / np.sqrt(6)
+
+
+def test_views_side_by_side_are_the_views(variant_rgb) -> None:
+    """One shot of three views: each third is the view, up to the samples' places (all rays of a pixel of the frontal
+    camera are equal, so there exactly)."""
+    truth = np.random.default_rng(0).uniform(0, 2, (1, 1, 1, 1))
+    scene = absorbing_scene(truth)
+    tau = 2 * truth.item()
+    views = [View(str(i), frontal(), mi.TensorXf(np.full((4, 4, 3), i, "f"))) for i in range(3)]
+    (shot,) = make_shots(views, 1 << 20)
+    image = np.asarray(mi.render(scene, sensor=shot.sensor, spp=4))
+    assert image.shape == (4, 12, 3)
+    assert np.allclose(image, np.exp(-tau), rtol=4 * EPS)
+    assert np.array_equal(np.asarray(shot.reference)[:, 4:8], np.ones((4, 4, 3)))
+    assert [s.n_views for s in make_shots(views, 2 * 16)] == [2, 1]
+
+
+def test_cameras_side_by_side_keep_their_order_and_orientation(variant_rgb) -> None:
+    """Random volume, three cameras: batch against single renders. Both estimate pixel means with 64 samples; a pixel's
+    samples span at most the whole range 1, so their means differ by less than 8 / sqrt(64) / 2 of it, and on average by
+    far less than two different views do."""
+    problem = small_problem(spp=64)
+    problem.set(problem.start())
+    (shot,) = problem.shots
+    batch = np.split(np.asarray(problem.render(shot.sensor, 1)), 3, axis=1)
+    single = [np.asarray(problem.render(view.sensor, 2)) for view in problem.views]
+    own = max(np.abs(a - b).mean() for a, b in zip(batch, single, strict=True))
+    other = min(np.abs(batch[i] - single[(i + 1) % 3]).mean() for i in range(3))
+    assert own < 0.01
+    assert other > 0.0
+    assert own < 0.5 * other
+
+
+def test_views_with_wide_filters_are_rendered_one_by_one(variant_rgb) -> None:
+    views = [View(str(i), camera(i, 8, "gaussian"), mi.TensorXf(np.ones((8, 8, 3), "f"))) for i in range(2)]
+    assert [shot.n_views for shot in make_shots(views, 1 << 20)] == [1, 1]
+
+
+# -- The loop -----------------------------------------------------------------------------------------------------
+
+
+def test_coarse_to_fine_keeps_the_image(variant_rgb) -> None:
+    """Refining conserves the mass; the loss right after it stays within a factor of the loss before, far below the
+    start, and the result lies on the fine grid."""
+    problem = small_problem()
+    measured: list[int] = []
+    fit = reconstruct(
+        problem, GaussNewton(), 6, events=(Upsample(at=(4,)), Evaluate(every=2)),
+        measure=lambda p: {"voxels": float(measured.append(1) or np.asarray(p.values()[KEY]).size)},
+    )  # fmt: skip
+    losses = [record["loss"] for record in fit.history]
+    assert fit.values()[KEY].shape == (8, 8, 8, 1)
+    assert losses[4] < 0.2 * losses[0]
+    assert fit.log == ["iteration 4: refined to 8 x 8 x 8"]
+    assert [m["iteration"] for m in fit.measures] == [0, 2, 4, 6]
+    assert len(measured) == 4
+
+
+def test_adam_is_mitsubas_adam(variant_rgb) -> None:
+    """Three steps against mi.ad.Adam by hand on the same gradients. Dividing gradients by a constant changes an Adam
+    step only through epsilon, 1e-6 of the largest gradient here, absolute 1e-8 there."""
+    problem = small_problem()
+    fit = reconstruct(problem, Adam(), 3)
+    again = small_problem()
+    reals = again.start()
+    adam = mi.ad.Adam(lr=0.1, params=reals)
+    for iteration in range(3):
+        _, gradients = again.loss_and_gradient({KEY: adam[KEY]}, iteration)
+        dr.set_grad(adam[KEY], gradients[KEY])
+        adam.step()
+        adam[KEY] = dr.maximum(adam[KEY], 0.0)
+    assert np.allclose(np.asarray(fit.run.reals[KEY]), np.asarray(adam[KEY]), atol=1e-3 * 0.1)
+
+
+def test_bounds_hold(variant_rgb) -> None:
+    for optimiser in (Adam(), Lbfgs(), GaussNewton()):
+        problem = small_problem(parameters=[Parameter(KEY, domain=(0.2, 0.6), lr=0.3)])
+        values = np.asarray(reconstruct(problem, optimiser, 4).values()[KEY])
+        assert values.min() >= np.float32(0.2)
+        assert values.max() <= np.float32(0.6)
+        assert np.ptp(values) > 0.01
+
+
+def test_stop_waits_for_a_safe_point() -> None:
+    import os
+    import signal
+
+    with Stop() as stop:
+        stop.check()
+        os.kill(os.getpid(), signal.SIGTERM)
+        assert stop.asked
+        with pytest.raises(Interrupted):
+            stop.check()
+        with pytest.raises(KeyboardInterrupt):
+            os.kill(os.getpid(), signal.SIGINT)
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def bad_views() -> dict:
+    one = mi.TensorXf(np.ones((8, 8, 3), "f"))
+    nan = np.ones((8, 8, 3), "f")
+    nan[2, 5] = np.nan
+    return {
+        "no views": ([], "no views"),
+        "views of different sizes": (
+            [View("a", camera(0), one), View("b", camera(1, 6), mi.TensorXf(np.ones((6, 6, 3), "f")))],
+            'view "b" is 6 x 6 pixels and view "a" 8 x 8',
+        ),
+        "reference of another size": ([View("a", camera(0), mi.TensorXf(np.ones((6, 8, 3), "f")))], "its sensor 8 x 8"),
+        "reference with NaN": ([View("a", camera(0), mi.TensorXf(nan))], r"row 2, column 5"),
+    }
+
+
+@pytest.mark.parametrize("case", ["no views", "views of different sizes", "reference of another size", "reference with NaN"])
+def test_refused_views(variant_rgb, case: str) -> None:
+    views, sentence = bad_views()[case]
+    with pytest.raises(MivolError, match=sentence):
+        Problem(absorbing_scene(np.ones((2, 2, 2, 1))), views, [Parameter(KEY)])
+
+
+def test_a_loss_that_is_not_finite_stops_the_run(variant_rgb) -> None:
+    problem = small_problem(start=6.0, parameters=[Parameter(KEY, domain=(-np.inf, np.inf), lr=1e4)])
+    with pytest.raises(MivolError, match="lower the learning rate"):
+        reconstruct(problem, Adam(), 4)
+
+
+def test_gauss_newton_refuses_other_losses(variant_rgb) -> None:
+    with pytest.raises(MivolError, match='"l2" or "relative_l2"'):
+        reconstruct(small_problem(loss=Huber()), GaussNewton(), 1)

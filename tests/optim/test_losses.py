@@ -1,0 +1,141 @@
+"""Losses: their values by hand in float64, their slopes, and where they break elsewhere."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mivol.errors import MivolError
+from mivol.optim.losses import L2, LOSSES, Huber, Log, RelativeL2
+from mivol.optim.strategy import choose
+
+EPS = float(np.finfo(np.float32).eps)
+
+
+def log_twin(x: np.ndarray, floor: float) -> np.ndarray:
+    return np.where(x >= floor, np.log(np.maximum(x, floor)), np.log(floor) + (x - floor) / floor)
+
+
+def log_penalty(i: np.ndarray, r: np.ndarray, floor: float = 1e-3) -> np.ndarray:
+    seen = np.maximum(r, 0) ** 2
+    return seen / (seen + floor**2) * (log_twin(i, floor) - log_twin(r, floor)) ** 2
+
+
+def huber_penalty(i: np.ndarray, r: np.ndarray, delta: float = 0.1) -> np.ndarray:
+    size = np.abs(i - r)
+    return np.where(size <= delta, size**2 / 2, delta * (size - delta / 2))
+
+
+TWINS = {
+    "l1": lambda i, r: np.abs(i - r),
+    "l2": lambda i, r: (i - r) ** 2,
+    "relative_l2": lambda i, r: (i - r) ** 2 / (r**2 + 1e-4),
+    "huber": huber_penalty,
+    "log": log_penalty,
+}
+
+
+def images(n: int = 400) -> tuple[np.ndarray, np.ndarray]:
+    """Pairs from far below 0 to far above the light, float32 values in float64."""
+    rng = np.random.default_rng(0)
+    image, reference = rng.normal(0.5, 0.7, (2, n, 1, 3)).astype(np.float32).astype(np.float64)
+    return image, reference
+
+
+def value_and_slope(loss, image: np.ndarray, reference: np.ndarray) -> tuple[float, np.ndarray]:
+    x = mi.TensorXf(image.astype(np.float32))
+    dr.enable_grad(x)
+    value = loss(x, mi.TensorXf(reference.astype(np.float32)))
+    dr.backward(value)
+    return float(value[0]), np.asarray(dr.grad(x))
+
+
+@pytest.mark.parametrize("name", LOSSES)
+def test_value_is_that_of_the_twin(variant_rgb, name: str) -> None:
+    """The residual of two float32 images of size s has absolute error 2 eps s; a square doubles it, a log or a division
+    by floor (1e-3, 1e-2) multiplies it by 1 / floor at most."""
+    image, reference = images()
+    expected = TWINS[name](image, reference)
+    found, _ = value_and_slope(LOSSES[name](), image, reference)
+    assert abs(found - expected.mean()) <= 64 * EPS * np.abs(expected).max()
+
+
+@pytest.mark.parametrize("name", LOSSES)
+def test_slope_is_that_of_the_twin(variant_rgb, name: str) -> None:
+    """Central differences of the float64 twin: h^2 third derivatives (1e-10 times 1e6 for the log) and 1e-16 / h.
+    Pairs closer than 2 h to a kink are left out."""
+    image, reference = images()
+    h, twin = 1e-6, TWINS[name]
+    expected = (twin(image + h, reference) - twin(image - h, reference)) / (2 * h) / image.size
+    _, found = value_and_slope(LOSSES[name](), image, reference)
+    size = np.abs(image - reference)
+    smooth = (size > 1e-4) & (np.abs(size - 0.1) > 1e-4) & (np.abs(image - 1e-3) > 1e-4) & (np.abs(reference) > 1e-2)
+    assert smooth.mean() > 0.9
+    bound = 1e-5 * np.abs(expected) + 1e-5 * np.abs(expected).max()
+    assert np.all(np.abs(found - expected)[smooth] <= bound[smooth])
+
+
+@pytest.mark.parametrize("name", LOSSES)
+def test_zero_where_images_agree(variant_rgb, name: str) -> None:
+    image, _ = images()
+    value, slope = value_and_slope(LOSSES[name](), image, image)
+    assert value == 0.0
+    assert np.all(slope == 0.0)
+
+
+def test_hard_51_huber_negative_residual(variant_rgb) -> None:
+    """A residual of -r costs what +r costs, and its slope is the line's, not the parabola's."""
+    r = np.array([0.05, 0.2, 3.0, 100.0]).reshape(-1, 1, 1)
+    up, slope_up = value_and_slope(Huber(delta=0.1), r, 0 * r)
+    down, slope_down = value_and_slope(Huber(delta=0.1), -r, 0 * r)
+    assert up == down
+    assert np.array_equal(slope_up, -slope_down)
+    # Beyond delta the slope is delta / n exactly, whatever the residual: one rounding of each.
+    assert np.allclose(slope_down[1:] * 4, -0.1, rtol=2 * EPS, atol=0)
+
+
+def test_hard_39_underflow_of_transmittance(variant_rgb) -> None:
+    """exp(-104) is 0 in float32: the log loss stays finite, leads back up, and a saturated reference counts for nothing."""
+    dark, lit = np.zeros((1, 1, 3)), np.full((1, 1, 3), 0.5)
+    value, slope = value_and_slope(Log(floor=1e-3), dark, lit)
+    assert np.isfinite(value)
+    assert np.all(slope < 0)
+    assert np.all(np.isfinite(slope))
+    _, slope = value_and_slope(Log(floor=1e-3), lit, dark)
+    assert np.all(slope == 0)
+    # At a reference of 1e-30 the weight is 1e-54: 0 in float32.
+    value, _ = value_and_slope(Log(floor=1e-3), dark, np.full((1, 1, 3), 1e-30))
+    assert value == 0.0
+
+
+def test_hard_40_pixel_brighter_than_the_light(variant_rgb) -> None:
+    """log(1.3) > 0 is a negative optical depth: finite, kept, and the image is pulled towards it, not to the light."""
+    light, brighter, negative = (np.full((1, 1, 3), value) for value in (1.0, 1.3, -0.02))
+    value, slope = value_and_slope(Log(), light, brighter)
+    assert abs(value - np.log(1.3) ** 2) <= 1e-6 + 4 * EPS  # the weight is 1 - 6e-7
+    assert np.all(slope < 0)
+    value, slope = value_and_slope(Log(), light, negative)
+    assert value == 0.0
+    assert np.all(slope == 0)
+
+
+@pytest.mark.parametrize("loss", [L2(), RelativeL2(floor=0.05)], ids=["l2", "relative_l2"])
+def test_weight_is_the_second_derivative(variant_rgb, loss) -> None:
+    """1/2 W r^2 is the penalty of a quadratic loss, to rounding."""
+    image, reference = images()
+    x, y = (mi.TensorXf(a.astype(np.float32)) for a in (image, reference))
+    quadratic = 0.5 * np.asarray(loss.weight(y)) * np.asarray(x - y) ** 2
+    assert np.allclose(quadratic, np.asarray(loss.penalty(x, y)), rtol=4 * EPS, atol=0)
+
+
+def test_refusals(variant_rgb) -> None:
+    with pytest.raises(MivolError, match="shape"):
+        L2()(mi.TensorXf(np.zeros((2, 2, 3), "f")), mi.TensorXf(np.zeros((2, 3, 3), "f")))
+    with pytest.raises(MivolError, match='found "huber"'):
+        Huber().weight(mi.TensorXf(np.zeros((1, 1, 3), "f")))
+    with pytest.raises(MivolError, match='did you mean "huber"'):
+        choose(LOSSES, "hubert", "loss")
+    with pytest.raises(MivolError, match="> 0.0"):
+        choose(LOSSES, "huber", "loss", delta=-1.0)
