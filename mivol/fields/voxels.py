@@ -62,7 +62,7 @@ class Voxels:
     def _values(props: mi.Properties, source: str, own_box: bool) -> tuple[np.ndarray | mi.TensorXf, np.ndarray]:
         if source == "filename":
             path = mi.file_resolver().resolve(props["filename"])
-            volume = read_volume(path, frame="file" if own_box else "unit")
+            volume = read_volume(str(path), frame="file" if own_box else "unit")
             return volume.values, volume.to_world
         if own_box and source == "data":
             raise MivolError("mivol_voxels was given data and use_grid_bbox; a bare tensor has no box: give to_world.")
@@ -91,6 +91,11 @@ class Voxels:
         q = mi.AffineTransform4f(self.to_local) @ p
         inside = mi.Bool(active) & dr.all((q >= 0) & (q <= 1))
         return [dr.select(inside, v, 0) for v in self.texture.eval(q, inside)]
+
+    def eval_colour(self, p: mi.Point3f, active: mi.Bool = True) -> list[mi.Float]:
+        """As :meth:`eval`; an rgb grid has one channel, its luminance, in a mono variant, as ``gridvolume`` has it."""
+        values = self.eval(p, active)
+        return [mi.luminance(mi.Color3f(*values))] if mi.is_monochromatic and len(values) == 3 else values
 
     def bound(self) -> list[float]:
         """Largest value of each channel."""

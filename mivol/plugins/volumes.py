@@ -27,10 +27,10 @@ class VoxelVolume(mi.Volume):
         return self.field.to_world
 
     def eval(self, it: mi.Interaction3f, active: mi.Bool = True) -> mi.Spectrum:
-        return mi.Spectrum(*self.field.eval(it.p, active))
+        return mi.Spectrum(*self.field.eval_colour(it.p, active))
 
     def eval_1(self, it: mi.Interaction3f, active: mi.Bool = True) -> mi.Float:
-        return self.field.eval(it.p, active)[0]
+        return self.field.eval_colour(it.p, active)[0]
 
     def eval_3(self, it: mi.Interaction3f, active: mi.Bool = True) -> mi.Vector3f:
         return mi.Vector3f(*self.field.eval(it.p, active))

@@ -76,10 +76,10 @@ class Coefficients:
         """Whether and where a ray can meet extinction: in the boxes of the grids, or anywhere where a part is constant."""
         if any(_is_constant(v) for v in self.extinction):
             return mi.Bool(True), mi.Float(0), mi.Float(dr.inf)
-        box = mi.ScalarBoundingBox3f()
-        for volume in self.extinction:
-            box.expand(volume.bbox())
-        return box.ray_intersect(ray)
+        boxes = [volume.bbox() for volume in self.extinction]
+        low = np.min([np.array(b.min) for b in boxes], axis=0).tolist()
+        high = np.max([np.array(b.max) for b in boxes], axis=0).tolist()
+        return mi.BoundingBox3f(mi.Point3f(low), mi.Point3f(high)).ray_intersect(ray)
 
     def eval(
         self, mei: mi.MediumInteraction3f, scale: mi.Float, majorant: mi.Spectrum, active: mi.Bool

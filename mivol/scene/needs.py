@@ -7,7 +7,7 @@ been replaced, and never while a function is being recorded by ``dr.freeze``.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -145,6 +145,9 @@ def survey_scene(scene: mi.Scene) -> Survey:
             surfaces.append(shape.class_name())
             veiled |= mi.has_flag(shape.bsdf().flags(), mi.BSDFFlags.Null)
     kinds = tuple(e.class_name() for e in scene.emitters())
+    # Mitsuba makes one object of equal media: where one boundary has to be traced, all boundaries of that medium are.
+    traced = {b.medium.ptr for b in boundaries if b.box is None}
+    boundaries = [replace(b, box=None) if b.medium.ptr in traced else b for b in boundaries]
     return Survey(tuple(boundaries), tuple(surfaces), bool(veiled), kinds)
 
 

@@ -37,8 +37,8 @@ class Rays:
     position: mi.Point2f
 
 
-Sample = Callable[[Rays], tuple[mi.Spectrum, mi.Bool, list[mi.Float]]]
-"""What rays carry: radiance, whether the film's alpha sees something, and the AOVs."""
+Sample = Callable[[Rays], tuple]
+"""``sample(rays)``: what rays carry: radiance, whether the film's alpha sees something, and the AOVs."""
 
 
 def film_passes(sensor: mi.Sensor, seed: int, spp: int, pass_rays: int) -> Iterator[Rays]:
@@ -53,16 +53,23 @@ def film_passes(sensor: mi.Sensor, seed: int, spp: int, pass_rays: int) -> Itera
     Raises:
         MivolError: one sample a pixel is more than a launch can hold (2^32).
     """
-    sampler, pixels, per_pass = _prepare(sensor, spp, pass_rays)
-    count = sampler.sample_count() // per_pass
-    sampler.set_samples_per_wavefront(per_pass)
-    sampler.seed(seed, pixels * per_pass)
-    for index in range(count):
+    base, pixels, per_pass = _prepare(sensor, spp, pass_rays)
+    base.set_samples_per_wavefront(per_pass)
+    for index in range(base.sample_count() // per_pass):
+        sampler = base.clone()
+        _seed(sampler, seed, index, pixels * per_pass)
         yield _camera_rays(sensor, sampler, pixels * per_pass, per_pass)
-        if index + 1 < count:
-            sampler.advance()
-            sampler.schedule_state()
-            dr.eval()
+
+
+def _seed(sampler: mi.Sampler, seed: int, index: int, count: int) -> None:
+    """Seed a sampler for one pass, whatever the passes before have drawn: a replay may draw less of them."""
+    if sampler.class_name() == "IndependentSampler":
+        sampler.seed(seed if index == 0 else mi.sample_tea_32(mi.UInt32(seed), mi.UInt32(index))[0], count)
+        return
+    # A sampler that stratifies has one permutation for all passes, and goes on in it from pass to pass.
+    sampler.seed(seed, count)
+    for _ in range(index):
+        sampler.advance()
 
 
 def count_passes(sensor: mi.Sensor, spp: int, pass_rays: int) -> int:

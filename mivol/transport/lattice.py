@@ -52,6 +52,8 @@ class Lattice:
     def __post_init__(self) -> None:
         if len(self.values.shape) != 4 or 0 in self.values.shape:
             raise MivolError(f"a grid of shape {tuple(self.values.shape)} was given; (Z, Y, X, channels) is expected.")
+        if np.prod([n + 1 for n in self.values.shape[:3]]) * self.channels >= 2**31:
+            raise MivolError(f"a grid of shape {tuple(self.values.shape)} was given; a walk counts up to 2^31: split it.")
         self.to_world = check_affine(self.to_world)
         # Opaque: two grids placed differently share one kernel.
         rows = lattice_from_world(self.to_world, self.res)

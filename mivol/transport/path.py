@@ -59,7 +59,7 @@ class Way:
     length: mi.Float
 
 
-Visit = Callable[[Any, Body, mi.Float, mi.Float, mi.Bool], Any]
+Visit = Callable[..., Any]
 """``visit(state, body, t0, t1, active) -> state``: what to do with the stretch [t0, t1] of a ray in one medium."""
 
 
@@ -108,8 +108,7 @@ def _trace(
     while dr.hint(going, label="to the next opaque surface"):
         hit = scene.ray_intersect(onward, mi.RayFlags.All, False, going)
         found = going & hit.is_valid()
-        # From the world point, not as a sum: each spawned ray starts an epsilon further on.
-        t_hit = dr.select(found, dr.maximum(t, dr.dot(hit.p - ray.o, ray.d)), ray.maxt)
+        t_hit = dr.select(found, dr.maximum(t, _distance(ray, hit)), ray.maxt)
 
         # -- The medium on this side of the surface fills the stretch ---------------------------------------------------------
         transition = found & hit.is_medium_transition()
@@ -125,6 +124,19 @@ def _trace(
         onward.maxt = ray.maxt - t_hit
         going &= clear
     return Reach(si, t, medium), state
+
+
+def _distance(ray: mi.Ray3f, hit: mi.SurfaceInteraction3f) -> mi.Float:
+    """Distance of a hit along the ray that began at the camera.
+
+    Not the sum of the parts: each spawned ray starts an epsilon (1e-4 of a length) further on and to the side, so the hit
+    lies beside the first ray. The plane of the surface is met by both; at grazing incidence, where that plane says little,
+    the nearest point of the ray does.
+    """
+    slope = dr.dot(hit.n, ray.d)
+    steep = dr.abs(slope) > 1e-2
+    along = hit.p - ray.o
+    return dr.select(steep, dr.dot(along, hit.n) / dr.select(steep, slope, 1), dr.dot(along, ray.d))
 
 
 def _visit_traced(

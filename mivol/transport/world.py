@@ -57,13 +57,14 @@ class Body:
             else:
                 lattice = part.lattice if skip else replace(part.lattice, bounds=None)
                 rows = integrate_segment(lattice, value, clip(lattice, ray.o, ray.d, t0, t1), active)
-            total = [t + rows[c % part.channels] for c, t in enumerate(total)]
+            rows = _grey(rows) if len(rows) > channels else rows
+            total = [t + rows[c % len(rows)] for c, t in enumerate(total)]
         return total
 
     def backproject(self, ray: mi.Ray3f, t0: mi.Float, t1: mi.Float, weight: list[mi.Float], active: mi.Bool) -> None:
         """Add ``weight`` (d loss / d tau of each channel) times this stretch to the gradients of the parts."""
         for part, gradient in zip(self.view.parts, self.gradients, strict=True):
-            w = weight if part.channels == len(weight) else [sum(weight)]
+            w = _for_part(weight, part.channels)
             if part.lattice is None:
                 length = _length(t0, t1, active)
                 for c in range(part.channels):
@@ -94,9 +95,10 @@ class World:
         locates: bool = False,
     ) -> None:
         self.boxed = [b for b in bodies if b.box is not None]
-        self.traced = [b for b in bodies if b.box is None]
+        # A traced stretch is recognised by its medium, which several boundaries may share.
+        self.traced = list({b.view.medium.ptr: b for b in bodies if b.box is None}.values())
         self.traces = has_surfaces or bool(self.traced)
-        self.channels = max([b.view.channels for b in bodies], default=1)
+        self.channels = 1 if mi.is_monochromatic else max([b.view.channels for b in bodies], default=1)
         self.scatters, self.is_veiled, self.start, self.locates = scatters, is_veiled, start, locates
 
     @property
@@ -140,6 +142,22 @@ class World:
             dr.forward_to(*products)
             body.tangents = [dr.detach(dr.grad(p)) for p in products]
             dr.eval(body.tangents)
+
+
+LUMINANCE = (0.212671, 0.715160, 0.072169)
+"""Share of each channel of an rgb field in the one channel of a mono variant (ITU-R BT.709, as in Mitsuba)."""
+
+
+def _grey(rows: list[mi.Float]) -> list[mi.Float]:
+    """Three channels as the one of a mono variant."""
+    return [sum(share * row for share, row in zip(LUMINANCE, rows, strict=True))]
+
+
+def _for_part(weight: list[mi.Float], channels: int) -> list[mi.Float]:
+    """The derivative of each channel of a part: its own, the sum for a grey part, the share in the grey of a mono variant."""
+    if len(weight) == channels:
+        return weight
+    return [sum(weight)] if channels == 1 else [share * weight[0] for share in LUMINANCE]
 
 
 def _values(part: Part) -> mi.Float | mi.Color3f:
