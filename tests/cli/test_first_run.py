@@ -1,0 +1,54 @@
+"""From a checkout with nothing set up to passing tests in one command, which is quiet and quick the second time."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+SET_BY_US = ("DRJIT_LIBLLVM_PATH", "PYTHONPATH", "VIRTUAL_ENV", "PYTHON")
+
+
+@pytest.fixture
+def checkout(tmp_path: Path) -> Path:
+    """A copy without the virtual environment, in a folder whose name has a blank."""
+    copy = tmp_path / "a checkout"
+    shutil.copytree(ROOT, copy, ignore=shutil.ignore_patterns(".git", ".venv", "runs", "__pycache__", ".*_cache"))
+    return copy
+
+
+def run(checkout: Path, *args: str, **extra: str) -> subprocess.CompletedProcess[str]:
+    """Run a command in the checkout as a user would who never heard of this virtual environment."""
+    own = str(Path(sys.prefix) / "bin")
+    path = os.pathsep.join(p for p in os.environ["PATH"].split(os.pathsep) if p != own)
+    env = {key: value for key, value in os.environ.items() if key not in SET_BY_US} | {"PATH": path} | extra
+    return subprocess.run(args, cwd=checkout, env=env, capture_output=True, text=True, check=False)
+
+
+def test_wrong_python_is_refused(checkout: Path) -> None:
+    done = run(checkout, "./scripts/test", PYTHON="/bin/false")
+    assert done.returncode == 1
+    assert done.stderr.strip() == (
+        "mivol: PYTHON=/bin/false is not a Python 3.11, 3.12 or 3.13 that runs: unset it or name another one."
+    )
+
+
+@pytest.mark.slow
+def test_two_runs_of_one_command(checkout: Path) -> None:
+    """Needs the network, or pip's cache. The second run's limit: imports and one test file take 5 s, set-up takes 60."""
+    first = run(checkout, "./scripts/test", "tests/test_layers.py")
+    assert first.returncode == 0, first.stderr + first.stdout
+    assert "setting up .venv" in first.stderr
+    start = time.perf_counter()
+    second = run(checkout, "./scripts/test", "tests/test_layers.py")
+    assert second.returncode == 0
+    assert second.stderr == ""
+    assert time.perf_counter() - start < 30
+    doctor = run(checkout, ".venv/bin/mivol", "doctor")
+    assert doctor.returncode == 0, doctor.stdout
