@@ -1,0 +1,825 @@
+#!/usr/bin/env python3
+"""What does an exact optical depth cost, and how exact is it, beside what else could be used?
+
+    scripts/bench_optical_depth.py                        # under 10 minutes on 2 cores
+    scripts/bench_optical_depth.py --quick                # under a minute, small sizes: are the errors within their bars?
+    scripts/bench_optical_depth.py --only walk,grids      # parts of it
+
+Contestants trace the same rays through the same grid in the same run, in turns: rounds go through all of them, each round
+in another order. A time is the median over the rounds, the fastest one beside it; a ratio of times is the median of the
+ratios within a round. What the first call pays is reported apart: seconds in the compiler, or kernels that were found on
+disk (HOME=$(mktemp -d) hides those). Errors are against a twin in float64 NumPy. Prints JSON; writes
+bench_optical_depth.json and bench_optical_depth.png. Each figure that has a bar is printed beside it.
+
+The smoke of the Mitsuba tutorial and a CT scan are read from MIVOL_DATA (default ../shared/data); where they are missing,
+made-up fields of the same sizes take their place, and the JSON says so.
+"""
+
+from __future__ import annotations
+
+import argparse
+import gc
+import itertools
+import json
+import math
+import os
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import NamedTuple
+
+import mivol  # noqa: F401  (registers the plugins)
+from mivol.fields.procedural import make_procedural
+from mivol.files import read_volume, write_whole_text
+from mivol.report.figures import Series, plot_error_against_time
+from mivol.report.record import describe_machine, versions
+from mivol.transport.lattice import Lattice, block_bounds, clip, walk
+from mivol.transport.optical_depth import Gradient, backproject_segment, integrate_tau
+
+import drjit as dr
+import drjit.dda
+import mitsuba as mi
+import msgspec
+import numpy as np
+
+ROOT = Path(__file__).resolve().parents[1]
+DATA = Path(os.environ.get("MIVOL_DATA", ROOT.parent / "shared" / "data"))
+
+TO_WORLD = np.array([[2, 0, 0, -1], [0, 2, 0, -1], [0, 0, 2, -1], [0, 0, 0, 1]], np.float64)
+"""Every grid fills [-1, 1]^3, as in the tutorial."""
+
+TUTORIAL_SCALE = 40.0
+"""By which the tutorial multiplies its smoke: optical depths up to 65."""
+
+
+@dataclass(frozen=True)
+class Size:
+    """How much work is done. Sides are of square pictures in pixels, so rays are sides squared."""
+
+    name: str = "full"
+    rounds: int = 7
+    walk_side: int = 1024
+    image_side: int = 256
+    image_spp: int = 16
+    exact_pixels: int = 192
+    exact_rays: int = 1024
+    accuracy_res: tuple[int, ...] = (64, 256)
+    memory_sides: tuple[int, ...] = (256, 512, 1024)
+    grid_side: int = 512
+    ct_res: int = 256
+    sparse_res: int = 512
+    peer_rounds: int = 3
+    peer_side: int = 512
+    peer_spp: tuple[int, ...] = (1, 4, 16, 64)
+    volpath_spp: tuple[int, ...] = (1, 4, 16)
+    march_steps: tuple[int, ...] = (16, 32, 64, 128, 256, 512, 1024)
+
+
+FULL = Size()
+QUICK = Size(
+    name="quick",
+    rounds=3,
+    walk_side=256,
+    image_side=64,
+    image_spp=4,
+    exact_pixels=32,
+    exact_rays=256,
+    accuracy_res=(64,),
+    memory_sides=(64, 128, 256),
+    grid_side=128,
+    ct_res=64,
+    sparse_res=128,
+    peer_side=64,
+    peer_spp=(1, 4),
+    volpath_spp=(1, 4),
+    march_steps=(16, 64, 256),
+)
+
+
+# -- Clocks ----------------------------------------------------------------------------------------------------------------
+
+
+@dataclass
+class Timing:
+    """Seconds of the warm calls of one contestant, what its first call was, and what the calls returned."""
+
+    first: dict[str, float]
+    seconds: list[float] = field(default_factory=list)
+    results: list = field(default_factory=list)
+
+    @property
+    def median(self) -> float:
+        """The figure that is quoted [s]."""
+        return float(np.median(self.seconds))
+
+    def report(self, units: float, name: str) -> dict[str, float]:
+        """Median and fastest time, the rate of ``units`` they mean, and the first call."""
+        fastest = min(self.seconds)
+        return {
+            "seconds_median": self.median,
+            "seconds_min": fastest,
+            f"{name}_per_second_median": units / self.median,
+            f"{name}_per_second_best": units / fastest,
+            "first_call": self.first,
+        }
+
+
+Contestant = Callable[[int], object]
+"""Takes the number of the round (a seed), returns Dr.Jit arrays that are still to be evaluated."""
+
+
+def race(contestants: dict[str, Contestant], rounds: int, keep: bool = False) -> dict[str, Timing]:
+    """Time contestants in turns.
+
+    Args:
+        contestants: by name.
+        rounds: calls of each, after a first one that is not counted.
+        keep: keep what each call returned, as NumPy arrays.
+    """
+    timings = {name: Timing(first_call(call)) for name, call in contestants.items()}
+    names = list(contestants)
+    for number in range(1, rounds + 1):
+        for name in names[number % len(names) :] + names[: number % len(names)]:
+            result, seconds = clock(contestants[name], number)
+            timings[name].seconds.append(seconds)
+            if keep:
+                timings[name].results.append(np.array(result))
+            del result
+    return timings
+
+
+def clock(call: Contestant, number: int = 0) -> tuple[object, float]:
+    """A call, evaluated to its end, and its seconds."""
+    start = time.perf_counter()
+    result = call(number)
+    dr.eval(result)
+    dr.sync_thread()
+    return result, time.perf_counter() - start
+
+
+def first_call(call: Contestant) -> dict[str, float]:
+    """Make the first call: seconds in all and in the compiler, kernels compiled, kernels found on disk."""
+    dr.kernel_history_clear()
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        _, seconds = clock(call)
+        kernels = [k for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT]
+    return {
+        "seconds": seconds,
+        "compile_seconds": sum(k["codegen_time"] + k["backend_time"] for k in kernels) / 1e3,
+        "kernels_compiled": sum(not k["cache_hit"] for k in kernels),
+        "kernels_from_disk": sum(k["cache_disk"] for k in kernels),
+    }
+
+
+def ratio_of(slow: Timing, fast: Timing) -> float:
+    """How many times longer one takes than the other: median over the rounds."""
+    return float(np.median(np.array(slow.seconds) / np.array(fast.seconds)))
+
+
+# -- Fields and rays -------------------------------------------------------------------------------------------------------
+
+
+class Field(NamedTuple):
+    """An extinction (Z, Y, X) float32 [1/length] and where it is from."""
+
+    values: np.ndarray
+    origin: str
+
+
+def smoke() -> Field:
+    """The tutorial's smoke at the tutorial's density, or a made-up one of its size."""
+    path = DATA / "volumes_vol" / "tutorials_volume.vol"
+    if path.is_file():
+        return Field(np.float32(TUTORIAL_SCALE) * read_volume(path, frame="unit").values[..., 0], "Mitsuba tutorial, x 40")
+    return made_up((53, 45, 44), peak=1.85 * TUTORIAL_SCALE)
+
+
+def made_up(shape: tuple[int, int, int], peak: float, why: str = "no data folder") -> Field:
+    """Soft blobs and filaments, from the seed 0."""
+    return Field(make_procedural("tangle", shape, 0, peak)[..., 0], f"procedural ({why})")
+
+
+def ct_scan(res: int) -> Field:
+    """The CT of a bonsai, 0 to 2 [1/length], or a made-up field of another size."""
+    path = DATA / "ct_mri" / "bonsai.vti"
+    if res == 256 and path.is_file():
+        values = read_volume(path, frame="unit").values[..., 0]
+        return Field(values * np.float32(2 / values.max()), "bonsai CT")
+    return made_up((res,) * 3, 2.0, "no data folder" if res == 256 else "quick")
+
+
+def threads_in_space(res: int, share: float = 0.01) -> Field:
+    """Thin curved threads that fill ``share`` of the voxels, the rest exactly 0."""
+    rng = np.random.default_rng(0)
+    values = np.zeros((res,) * 3, np.float32)
+    offsets = np.stack(np.meshgrid(*[np.arange(-3, 4)] * 3, indexing="ij"), -1).reshape(-1, 3)
+    stamp = np.maximum(0, 1 - np.sum(offsets**2, axis=1) / 10).astype(np.float32)
+    offsets, stamp = offsets[stamp > 0], stamp[stamp > 0]
+    s = np.linspace(0, 2 * np.pi, 2 * res)[:, None]
+    while np.count_nonzero(values) < share * values.size:
+        a, b, c = rng.uniform(-0.3, 0.3, (3, 3))
+        curve = 0.5 + a * np.cos(s) + b * np.sin(s) + c * np.cos(2 * s) / 2
+        nodes = np.clip(np.rint(curve * res).astype(int)[:, None] + offsets, 0, res - 1)
+        np.maximum.at(values, tuple(nodes.reshape(-1, 3).T), np.tile(stamp, len(curve)))
+    return Field(20 * values, f"made-up threads, {np.count_nonzero(values) / values.size:.1%} of the voxels not 0")
+
+
+@dataclass
+class Work:
+    """The work that contestants share: an extinction in the box, and world rays.
+
+    ``o`` and ``d`` are evaluated, and of float32 like everything that the contestants see.
+    """
+
+    values: np.ndarray
+    o: mi.Point3f
+    d: mi.Vector3f
+
+    def __post_init__(self) -> None:
+        self.tensor = mi.TensorXf(np.ascontiguousarray(self.values[..., None]))
+        self.n = dr.width(self.d)
+
+    def lattice(self, skip: bool = False) -> Lattice:
+        """The grid for mivol's walk, empty blocks skipped or not."""
+        return Lattice(self.tensor, TO_WORLD, block_bounds(self.tensor) if skip else None)
+
+    def tau(self, skip: bool = False) -> Contestant:
+        """The optical depth of each ray by mivol."""
+        lattice = self.lattice(skip)
+        return lambda _: integrate_tau(lattice, self.o, self.d)
+
+    def some(self, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Numbers, origins and directions of rays spread evenly over all: (m,), (m, 3), (m, 3) float64."""
+        index = np.linspace(0, self.n - 1, min(count, self.n)).astype(int)
+        return index, np.array(self.o).T[index].astype(np.float64), np.array(self.d).T[index].astype(np.float64)
+
+
+def perspective(side: int) -> dict:
+    """One of the tutorial's cameras: 4 away, 45 degrees wide, turned by 18 degrees; the smoke's own z is up."""
+    angle = math.radians(18)
+    origin = [4 * math.sin(angle), -4 * math.cos(angle), 0]
+    return {
+        "type": "perspective",
+        "fov": 45,
+        "to_world": mi.ScalarTransform4f().look_at(origin=origin, target=[0, 0, 0], up=[0, 0, 1]),
+        "film": {
+            "type": "hdrfilm",
+            "width": side,
+            "height": side,
+            "component_format": "float32",
+            "rfilter": {"type": "box"},
+            "sample_border": False,
+        },
+        "sampler": {"type": "independent"},
+    }
+
+
+def camera_rays(side: int, pixels: np.ndarray | None = None, k: int = 1) -> tuple[mi.Point3f, mi.Vector3f]:
+    """Rays through the middles of the k x k parts of each pixel, row by row."""
+    pixels = np.arange(side * side) if pixels is None else pixels
+    y, x, j, i = (np.broadcast_to(a, (len(pixels), k, k)) for a in (*_pixel(pixels, side), *_part(k)))
+    at = mi.Point2f(np.float32((x + (i + 0.5) / k).ravel() / side), np.float32((y + (j + 0.5) / k).ravel() / side))
+    ray, _ = mi.load_dict(perspective(side)).sample_ray(0.0, 0.5, at, mi.Point2f(0.5))
+    o, d = mi.Point3f(ray.o) + dr.zeros(mi.Point3f, dr.width(ray.d)), mi.Vector3f(ray.d)
+    dr.eval(o, d)
+    return o, d
+
+
+def _pixel(pixels: np.ndarray, side: int) -> tuple[np.ndarray, np.ndarray]:
+    return (pixels // side)[:, None, None], (pixels % side)[:, None, None]
+
+
+def _part(k: int) -> tuple[np.ndarray, np.ndarray]:
+    return np.arange(k)[None, :, None], np.arange(k)[None, None, :]
+
+
+def shuffled(o: mi.Point3f, d: mi.Vector3f) -> tuple[mi.Point3f, mi.Vector3f]:
+    """The same rays in an order drawn from the seed 0."""
+    order = mi.UInt32(np.random.default_rng(0).permutation(dr.width(d)).astype(np.uint32))
+    o, d = dr.gather(mi.Point3f, o, order), dr.gather(mi.Vector3f, d, order)
+    dr.eval(o, d)
+    return o, d
+
+
+# -- The twin in float64 ---------------------------------------------------------------------------------------------------
+
+
+def exact_tau(values: np.ndarray, o: np.ndarray, d: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Optical depth of rays in float64 NumPy, and the measure of its error.
+
+    All planes through voxel centres that a ray crosses are sorted, and two Gauss points between each pair integrate the
+    cubic that a trilinear field is there.
+
+    Args:
+        values: (Z, Y, X), over ``TO_WORLD``.
+        o, d: (n, 3).
+
+    Returns:
+        int sigma and int (sigma + |grad sigma|), the gradient over one voxel: (n,) each.
+    """
+    size = np.array(values.shape[::-1])
+    chunk = max(1, (1 << 20) // int(size.sum()))
+    parts = [_exact_tau(values, size, o[i : i + chunk], d[i : i + chunk]) for i in range(0, len(o), chunk)]
+    return tuple(np.concatenate(p) for p in zip(*parts, strict=True))
+
+
+def _exact_tau(values: np.ndarray, size: np.ndarray, o: np.ndarray, d: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    inverse = np.linalg.inv(TO_WORLD)
+    q = (o @ inverse[:3, :3].T + inverse[:3, 3]) * size - 0.5
+    v = d @ inverse[:3, :3].T * size
+    with np.errstate(divide="ignore", invalid="ignore"):
+        faces = np.sort(np.stack([(-0.5 - q) / v, (size - 0.5 - q) / v]), axis=0)
+        planes = np.concatenate([(np.arange(n) - q[:, a, None]) / v[:, a, None] for a, n in enumerate(size)], axis=1)
+    t0 = np.maximum(faces[0].max(axis=1), 0)[:, None]
+    t1 = np.maximum(faces[1].min(axis=1)[:, None], t0)
+    t = np.sort(np.concatenate([t0, np.clip(planes, t0, t1), t1], axis=1), axis=1)
+    length = np.diff(t, axis=1)
+    tau, measure = np.zeros((2, len(o)))
+    for g in (0.5 - math.sqrt(3) / 6, 0.5 + math.sqrt(3) / 6):
+        middle = t[:, :-1] + g * length
+        sigma, slope = trilinear(values, q[:, None] + middle[..., None] * v[:, None])
+        tau += 0.5 * np.sum(length * sigma, axis=1)
+        measure += 0.5 * np.sum(length * (np.abs(sigma) + slope), axis=1)
+    return tau, measure
+
+
+def trilinear(values: np.ndarray, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A field and the length of its gradient at lattice points (..., 3), the borders clamped."""
+    low = np.floor(q).astype(int)
+    f = q - low
+    sigma, slope = np.zeros(q.shape[:-1]), np.zeros(q.shape)
+    for bits in itertools.product((0, 1), repeat=3):
+        x, y, z = (np.clip(low[..., a] + bits[a], 0, values.shape[2 - a] - 1) for a in range(3))
+        corner = values[z, y, x].astype(np.float64)
+        w = [f[..., a] if bits[a] else 1 - f[..., a] for a in range(3)]
+        sigma += corner * w[0] * w[1] * w[2]
+        for a in range(3):
+            slope[..., a] += corner * w[a - 1] * w[a - 2] * (1 if bits[a] else -1)
+    return sigma, np.linalg.norm(slope, axis=-1)
+
+
+# -- What else could be used -----------------------------------------------------------------------------------------------
+
+
+def inside_box(o: mi.Point3f, d: mi.Vector3f) -> tuple[mi.Bool, mi.Float, mi.Float]:
+    """Where rays are in the box, as a user of Mitsuba finds it."""
+    hit, t0, t1 = mi.BoundingBox3f(mi.Point3f(-1), mi.Point3f(1)).ray_intersect(mi.Ray3f(o, d))
+    return hit & (t1 > 0), dr.maximum(t0, 0), t1
+
+
+def look_up(texture: mi.Texture3f, o: mi.Point3f, d: mi.Vector3f, t: mi.Float, active: mi.Bool) -> mi.Float:
+    """The extinction at a distance along a ray."""
+    return texture.eval(dr.fma(dr.fma(d, t, o), 0.5, 0.5), active)[0]
+
+
+@dr.syntax
+def march(texture: mi.Texture3f, o: mi.Point3f, d: mi.Vector3f, steps: mi.UInt32) -> mi.Float:
+    """Transmittance by the midpoint rule with equal steps through the box."""
+    active, t0, t1 = inside_box(o, d)
+    dt = (t1 - t0) / mi.Float(steps)
+    tau, i = mi.Float(0), mi.UInt32(0)
+    while active & (i < steps):
+        tau += look_up(texture, o, d, dr.fma(mi.Float(i) + 0.5, dt, t0), active)
+        i += 1
+    return dr.exp(-dr.select(active, tau * dt, 0))
+
+
+@dr.syntax
+def track_ratio(texture: mi.Texture3f, o: mi.Point3f, d: mi.Vector3f, majorant: mi.Float, sampler: mi.Sampler) -> mi.Float:
+    """Transmittance by ratio tracking with one majorant: unbiased."""
+    active, t, t1 = inside_box(o, d)
+    T = mi.Float(1)
+    while active:
+        t -= dr.log(1 - sampler.next_1d(active)) / majorant
+        active &= t < t1
+        T *= dr.select(active, 1 - look_up(texture, o, d, t, active) / majorant, 1)
+        active &= T > 0
+    return T
+
+
+@dr.syntax
+def track_delta(texture: mi.Texture3f, o: mi.Point3f, d: mi.Vector3f, majorant: mi.Float, sampler: mi.Sampler) -> mi.Float:
+    """Transmittance by delta tracking with one majorant, 0 or 1: unbiased."""
+    active, t, t1 = inside_box(o, d)
+    T = mi.Float(1)
+    while active:
+        t -= dr.log(1 - sampler.next_1d(active)) / majorant
+        active &= t < t1
+        absorbed = active & (sampler.next_1d(active) * majorant < look_up(texture, o, d, t, active))
+        T = dr.select(absorbed, 0, T)
+        active &= ~absorbed
+    return T
+
+
+def each_sample(work: Work, spp: int, seed: int, estimate: Callable) -> mi.Float:
+    """Mean of ``spp`` estimates a ray, those of one ray side by side, as a renderer lays them out."""
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(seed, work.n * spp)
+    ray = dr.arange(mi.UInt32, work.n * spp) // dr.opaque(mi.UInt32, spp)
+    o, d = dr.gather(mi.Point3f, work.o, ray), dr.gather(mi.Vector3f, work.d, ray)
+    return dr.block_sum(estimate(o, d, sampler), spp) / spp
+
+
+def by_marching(work: Work, steps: int) -> Contestant:
+    """A transmittance for each ray in ``steps`` equal steps over a Texture3f."""
+    texture = mi.Texture3f(work.tensor, wrap_mode=dr.WrapMode.Clamp)
+    return lambda _: march(texture, work.o, work.d, dr.opaque(mi.UInt32, steps))
+
+
+def by_tracking(work: Work, spp: int, track: Callable) -> Contestant:
+    """A transmittance for each ray from ``spp`` random walks over a Texture3f."""
+    texture = mi.Texture3f(work.tensor, wrap_mode=dr.WrapMode.Clamp)
+    majorant = dr.opaque(mi.Float, float(work.values.max()))
+    return lambda seed: each_sample(work, spp, seed, lambda o, d, sampler: track(texture, o, d, majorant, sampler))
+
+
+def by_volpath(work: Work, spp: int) -> Contestant:
+    """A transmittance for each ray from ``spp`` paths of stock ``volpath`` under a sky of radiance 1."""
+    scene = mi.load_dict(scene_of(work.values, 8))
+    volpath = mi.load_dict({"type": "volpath", "max_depth": 1})
+
+    def paths(o: mi.Point3f, d: mi.Vector3f, sampler: mi.Sampler) -> mi.Float:
+        return volpath.sample(scene, sampler, mi.RayDifferential3f(o, d))[0].x
+
+    return lambda seed: each_sample(work, spp, seed, paths)
+
+
+def by_drjit_dda(work: Work) -> Contestant:
+    """A transmittance for each ray by ``drjit.dda.integrate``.
+
+    Its nodes lie at the corners of its box: the grid is padded by its own edge, the box grows by half a voxel on each
+    side, and rays are cut to the true one.
+    """
+    size = np.array(work.values.shape[::-1])
+    low, high = mi.Vector3f((-1 - 1 / size).tolist()), mi.Vector3f((1 + 1 / size).tolist())
+    padded = mi.TensorXf(np.pad(work.values, 1, mode="edge"))
+
+    def transmittance(_: int) -> mi.Float:
+        hit, t0, t1 = inside_box(work.o, work.d)
+        start = mi.Vector3f(dr.fma(work.d, t0, work.o))
+        return dr.exp(-drjit.dda.integrate(start, work.d, t1 - t0, low, high, padded, active=hit))
+
+    return transmittance
+
+
+def scene_of(values: np.ndarray, side: int) -> dict:
+    """The tutorial's scene with albedo 0, of stock plugins only: a box of smoke under a sky of radiance 1."""
+    to_world = mi.ScalarTransform4f(np.float32(TO_WORLD))
+    grid = {"type": "gridvolume", "grid": mi.VolumeGrid(values[..., None]), "raw": True, "to_world": to_world}
+    return {
+        "type": "scene",
+        "sky": {"type": "constant", "radiance": {"type": "uniform", "value": 1.0}},
+        "box": {
+            "type": "cube",
+            "bsdf": {"type": "null"},
+            "interior": {"type": "heterogeneous", "sigma_t": grid, "albedo": 0.0},
+        },
+        "sensor": perspective(side),
+    }
+
+
+# -- The questions ---------------------------------------------------------------------------------------------------------
+
+
+def measure_walk(size: Size) -> dict:
+    """How many rays a second does the walk take through the tutorial's smoke?"""
+    found = smoke()
+    o, d = camera_rays(size.walk_side)
+    works = {"camera order": Work(found.values, o, d), "random order": Work(found.values, *shuffled(o, d))}
+    timings = race({name: work.tau() for name, work in works.items()}, size.rounds)
+    hits = float(dr.mean(mi.Float(inside_box(o, d)[0])).array[0])
+    figures = {name: t.report(works[name].n, "rays") for name, t in timings.items()}
+    return {"grid": describe(found), "rays": works["camera order"].n, "share_of_rays_in_the_box": hits, **figures}
+
+
+def measure_image(size: Size) -> dict:
+    """Through ``mi.render``: how much sooner than ``volpath`` at the same spp, and at the same error?"""
+    found = smoke()
+    scene = mi.load_dict(scene_of(found.values, size.image_side))
+    integrators = {
+        "mivol": mi.load_dict({"type": "mivol", "max_depth": 1}),
+        "volpath, max_depth 1": mi.load_dict({"type": "volpath", "max_depth": 1}),
+        "volpath, max_depth 6": mi.load_dict({"type": "volpath", "max_depth": 6}),
+    }
+    contestants = {
+        name: lambda seed, i=i: mi.render(scene, integrator=i, spp=size.image_spp, seed=seed) for name, i in integrators.items()
+    }
+    timings = race(contestants, size.rounds, keep=True)
+    pixels = np.random.default_rng(0).choice(size.image_side**2, size.exact_pixels, replace=False)
+    exact, doubt = pixel_means(found.values, size.image_side, pixels)
+    samples = size.image_side**2 * size.image_spp
+    figures = {}
+    for name, t in timings.items():
+        errors = [image[..., 0].ravel()[pixels] - exact for image in t.results]
+        figures[name] = t.report(samples, "paths") | {"rms_error": float(np.sqrt(np.mean(np.square(errors))))}
+    ours = timings["mivol"]
+    for name in ("volpath, max_depth 1", "volpath, max_depth 6"):
+        faster = ratio_of(timings[name], ours)
+        variance = (figures[name]["rms_error"] / figures["mivol"]["rms_error"]) ** 2
+        figures[name] |= {"mivol_is_faster": faster, "mivol_is_faster_at_equal_error": faster * variance}
+    about = {"pixels": size.image_side**2, "spp": size.image_spp, "exact_pixels": len(pixels), "rms_error_of_exact": doubt}
+    return {"grid": describe(found), **about, **figures}
+
+
+def pixel_means(values: np.ndarray, side: int, pixels: np.ndarray, k: int = 12) -> tuple[np.ndarray, float]:
+    """Mean transmittance of pixels by k x k rays of the twin in each, and how far k/2 x k/2 are from that."""
+    means = []
+    for parts in (k, k // 2):
+        o, d = (np.array(x).T.astype(np.float64) for x in camera_rays(side, pixels, parts))
+        means.append(np.exp(-exact_tau(values, o, d)[0]).reshape(len(pixels), -1).mean(axis=1))
+    return means[0], float(np.sqrt(np.mean((means[0] - means[1]) ** 2)))
+
+
+def measure_accuracy(size: Size) -> dict:
+    """How far is tau from the float64 twin, over int (sigma + h |grad sigma|)?"""
+    figures = {}
+    for res in size.accuracy_res:
+        rng = np.random.default_rng(res)
+        fields = {
+            "noise": rng.uniform(0, 4, (res,) * 3).astype(np.float32),
+            "threads": threads_in_space(res).values,
+        }
+        for name, values in fields.items():
+            o, d = rays_across(rng, size.exact_rays)
+            work = Work(values, mi.Point3f(o), mi.Vector3f(d))
+            exact, measure = exact_tau(values, *(x.T.astype(np.float64) for x in (o, d)))
+            hit = measure > 0
+            for skip in (False, True):
+                error = np.abs(np.array(work.tau(skip)(0)) - exact)
+                figures[f"{res}^3 {name}{', empty blocks skipped' if skip else ''}"] = {
+                    "rays": int(hit.sum()),
+                    "largest_error": float(np.max(error[hit] / measure[hit])),
+                    "rms_error": float(np.sqrt(np.mean((error[hit] / measure[hit]) ** 2))),
+                    "error_where_exactly_empty": float(error[~hit].max(initial=0)),
+                }
+    return figures
+
+
+def rays_across(rng: np.random.Generator, n: int) -> tuple[np.ndarray, np.ndarray]:
+    """Rays in all directions through points of the box, (3, n) float32; a few along the axes."""
+    d = rng.normal(size=(3, n))
+    d[:, : n // 8] = np.repeat(np.eye(3), -(-n // 24), axis=1)[:, : n // 8]
+    d /= np.linalg.norm(d, axis=0)
+    return np.float32(rng.uniform(-1, 1, (3, n)) - rng.uniform(2, 8, n) * d), np.float32(d)
+
+
+def measure_reverse(size: Size) -> dict:
+    """What does the transpose cost, over the optical depth itself?"""
+    found = smoke()
+    work = Work(found.values, *camera_rays(size.walk_side))
+    lattice = work.lattice()
+
+    def reverse(_: int) -> mi.Float:
+        target = Gradient.zeros(lattice)
+        backproject_segment(lattice, target, [mi.Float(1)], clip(lattice, work.o, work.d, 0, math.inf))
+        return target.fold()
+
+    scene = mi.load_dict(scene_of(found.values, size.image_side))
+    params, key, integrator = mi.traverse(scene), "box.interior_medium.sigma_t.data", mi.load_dict({"type": "mivol"})
+
+    def render(seed: int) -> mi.TensorXf:
+        return mi.render(scene, params, integrator=integrator, spp=size.image_spp, seed=seed)
+
+    def render_step(seed: int) -> mi.Float:
+        dr.enable_grad(params[key])
+        dr.backward(dr.mean(render(seed)))
+        gradient = dr.grad(params[key])
+        dr.disable_grad(params[key])
+        return gradient
+
+    contestants = {
+        "forward": work.tau(),
+        "reverse": reverse,
+        "gradient step": lambda _: gradient_step(work),
+        "render": render,
+        "gradient step of a render": render_step,
+    }
+    timings = race(contestants, size.rounds)
+    samples = size.image_side**2 * size.image_spp
+    figures = {name: t.report(samples if "render" in name else work.n, "rays") for name, t in timings.items()}
+    pairs = {"reverse": "forward", "gradient step": "forward", "gradient step of a render": "render"}
+    ratios = {f"{slow} over {fast}": ratio_of(timings[slow], timings[fast]) for slow, fast in pairs.items()}
+    return {"grid": describe(found), "rays": work.n, **ratios, **figures}
+
+
+def gradient_step(work: Work) -> mi.Float:
+    """The derivative of a loss, the sum of tau^2, with respect to the grid."""
+    values = mi.TensorXf(work.tensor)
+    dr.enable_grad(values)
+    tau = integrate_tau(Lattice(values, TO_WORLD), work.o, work.d)
+    dr.backward(dr.sum(tau * tau))
+    return dr.grad(values).array
+
+
+def measure_memory(size: Size) -> dict:
+    """How does the memory of a gradient step grow with the rays, and with the cells that they cross?"""
+    figures = {}
+    for res in (16, 64):
+        values = made_up((res,) * 3, 2.0, "any").values
+        rows = []
+        for side in size.memory_sides:
+            work = Work(values, *camera_rays(side))
+            rows.append((work.n, peak_bytes(lambda _, work=work: gradient_step(work))))
+        rays, peak = np.array(rows, float).T
+        slope, start = np.polyfit(rays, peak, 1)
+        figures[f"{res}^3"] = {
+            "rays": rays.astype(int).tolist(),
+            "peak_bytes": peak.astype(int).tolist(),
+            "bytes_per_ray": float(slope),
+            "bytes_without_rays": float(start),
+        }
+    return figures
+
+
+def peak_bytes(step: Contestant) -> int:
+    """Most bytes that Dr.Jit held at once while a step ran, those that its rays already take included."""
+    backend = dr.backend_v(mi.Float)
+    dr.sync_thread()
+    gc.collect()
+    dr.flush_malloc_cache()
+    dr.detail.malloc_clear_statistics()
+    clock(step)
+    return dr.detail.malloc_watermark(backend)
+
+
+def measure_grids(size: Size) -> dict:
+    """Does a walk cost what it crosses, or what the grid holds?"""
+    fields = {"smoke": smoke(), "CT": ct_scan(size.ct_res), "threads": threads_in_space(size.sparse_res)}
+    figures = {}
+    for grid, found in fields.items():
+        o, d = camera_rays(size.grid_side)
+        orders = {"camera order": Work(found.values, o, d), "random order": Work(found.values, *shuffled(o, d))}
+        contestants = {
+            f"{order}, {'empty blocks skipped' if skip else 'every cell'}": work.tau(skip)
+            for order, work in orders.items()
+            for skip in (False, True)
+        }
+        timings = race(contestants, size.rounds)
+        work = orders["camera order"]
+        counts = {skip: count_cells(work.lattice(skip), work) for skip in (False, True)}
+        held = np.array(block_bounds(work.tensor)) > 0
+        figures[grid] = {"grid": describe(found), "rays": work.n, "occupied_blocks": float(held.mean())}
+        for name, t in timings.items():
+            visited, steps = counts["skipped" in name]
+            figures[grid][name] = t.report(work.n, "rays") | {
+                "cells_visited_per_ray": visited,
+                "steps_per_ray": steps,
+                "nanoseconds_per_step": 1e9 * t.median / (work.n * steps),
+            }
+        del orders, contestants, work, timings
+        gc.collect()
+    return figures
+
+
+def count_cells(lattice: Lattice, work: Work) -> tuple[float, float]:
+    """Cells visited a ray, and steps of the walk a ray (a jump over an empty block is a step); rays that miss count too."""
+
+    def visit(state: tuple[mi.UInt32, mi.UInt32], cell: object, on: mi.Bool) -> tuple[mi.UInt32, mi.UInt32]:
+        return state[0] + dr.select(on, mi.UInt32(1), 0), state[1] + 1
+
+    zero = dr.zeros(mi.UInt32, work.n)
+    visited, steps = walk(lattice, clip(lattice, work.o, work.d, 0, math.inf), visit, (zero, mi.UInt32(zero)))
+    return tuple(float(np.array(c, np.float64).mean()) for c in (visited, steps))
+
+
+def measure_peers(size: Size) -> dict:
+    """Error of the transmittance of a ray against time, for all that could be used."""
+    found = smoke()
+    work = Work(found.values, *camera_rays(size.peer_side))
+    tau = work.tau()
+    methods = {
+        "mivol": {"": lambda _: dr.exp(-tau(0))},
+        "volpath": {f"{s} spp": by_volpath(work, s) for s in size.volpath_spp},
+        "ratio tracking": {f"{s} spp": by_tracking(work, s, track_ratio) for s in size.peer_spp},
+        "delta tracking": {f"{s} spp": by_tracking(work, s, track_delta) for s in size.peer_spp},
+        "marching": {f"{n} steps": by_marching(work, n) for n in size.march_steps},
+        "drjit.dda.integrate": {"": by_drjit_dda(work)},
+    }
+    flat = {(method, setting): call for method, settings in methods.items() for setting, call in settings.items()}
+    timings = race(flat, size.peer_rounds, keep=True)
+    index, o, d = work.some(4 * size.exact_rays)
+    exact = np.exp(-exact_tau(found.values, o, d)[0])
+    figures = {"grid": describe(found), "rays": work.n, "exact_rays": len(index)}
+    for (method, setting), t in timings.items():
+        error = np.array([T[index] - exact for T in t.results])
+        errors = {"rms_error": float(np.sqrt(np.mean(error**2))), "mean_error": float(np.mean(error))}
+        figures.setdefault(method, []).append({"setting": setting} | errors | t.report(work.n, "rays"))
+    return figures
+
+
+QUESTIONS = {
+    "walk": measure_walk,
+    "image": measure_image,
+    "accuracy": measure_accuracy,
+    "reverse": measure_reverse,
+    "memory": measure_memory,
+    "grids": measure_grids,
+    "peers": measure_peers,
+}
+
+
+# -- Saying it -------------------------------------------------------------------------------------------------------------
+
+AT_LEAST, AT_MOST = "at least", "at most"
+
+
+class Bar(NamedTuple):
+    """What the project promises of an answer: a figure, and where it has to lie. ``find`` gives None where it is not there."""
+
+    question: str
+    figure: str
+    sense: str
+    bar: float
+    find: Callable[[dict], float | None]
+
+
+def _largest_error(res: int) -> Callable[[dict], float | None]:
+    return lambda a: max((f["largest_error"] for name, f in a.items() if name.startswith(f"{res}^3")), default=None)
+
+
+ERROR = "error of tau over int (sigma + h |grad sigma|)"
+BARS = (
+    Bar("walk", "walk [M rays/s]", AT_LEAST, 15, lambda a: a["camera order"]["rays_per_second_median"] / 1e6),
+    Bar("image", "mi.render, rate over volpath's", AT_LEAST, 20, lambda a: a["volpath, max_depth 1"]["mivol_is_faster"]),
+    Bar("accuracy", f"{ERROR}, 64^3", AT_MOST, 2e-6, _largest_error(64)),
+    Bar("accuracy", f"{ERROR}, 256^3", AT_MOST, 2e-6, _largest_error(256)),
+    Bar("reverse", "reverse pass over forward pass", AT_MOST, 4, lambda a: a["reverse over forward"]),
+    # A ray's own state: o and d, its optical depth, and the derivative of that: 8 float32.
+    Bar("memory", "gradient step [bytes/ray]", AT_MOST, 32, lambda a: max(f["bytes_per_ray"] for f in a.values())),
+)
+
+
+def compare(question: str, answer: dict) -> list[dict]:
+    """The figures of an answer that have a bar, beside it, and said."""
+    rows = []
+    for _, figure, sense, bar, find in (b for b in BARS if b.question == question):
+        value = find(answer)
+        if value is not None:
+            met = value >= bar if sense == AT_LEAST else value <= bar
+            rows.append({"figure": figure, "value": value, "sense": sense, "bar": bar, "met": bool(met)})
+            say(f"  {figure}: {value:.3g}, bar {sense} {bar:g}{'' if met else ': MISSED'}")
+    return rows
+
+
+def describe(found: Field) -> str:
+    """A field in one line, its resolution as X x Y x Z."""
+    return f"{'x'.join(map(str, found.values.shape[::-1]))}, {found.origin}"
+
+
+def draw(peers: dict, path: Path) -> None:
+    """Error against time."""
+    rows = {name: points for name, points in peers.items() if isinstance(points, list)}
+    series = [
+        Series(name, [p["seconds_median"] for p in points], [p["rms_error"] for p in points]) for name, points in rows.items()
+    ]
+    title = f"Transmittance of {peers['rays']:,} rays through the smoke {peers['grid'].split(',')[0]}: error against time"
+    plot_error_against_time(series, path, error="RMS error of T against float64", title=title)
+
+
+def say(text: str) -> None:
+    """To standard error: standard output is for the JSON."""
+    print(text, file=sys.stderr, flush=True)
+
+
+def main() -> None:
+    """Read the command line, ask the questions, print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="small sizes, for CI: its times mean nothing")
+    parser.add_argument("--only", default=",".join(QUESTIONS), help=f"questions to ask, of {','.join(QUESTIONS)}")
+    parser.add_argument("--out", type=Path, default=Path("runs/bench_optical_depth"))
+    parser.add_argument("--variant", default="llvm_ad_rgb")
+    args = parser.parse_args()
+    asked = args.only.split(",")
+    if unknown := set(asked) - set(QUESTIONS):
+        parser.error(f"--only: {', '.join(sorted(unknown))} is not a question; known are {', '.join(QUESTIONS)}")
+    mi.set_variant(args.variant)
+    size = QUICK if args.quick else FULL
+    start, load = time.perf_counter(), os.getloadavg()[0]
+    answers, bars = {}, []
+    for name in asked:
+        say(f"{name}: {QUESTIONS[name].__doc__}")
+        answers[name] = QUESTIONS[name](size)
+        bars += compare(name, answers[name])
+    figures = {
+        "size": size.name,
+        "machine": msgspec.to_builtins(describe_machine()),
+        "versions": versions(),
+        "variant": args.variant,
+        "threads": dr.thread_count(),
+        "load_before_and_after": [load, os.getloadavg()[0]],
+        "seconds": round(time.perf_counter() - start, 1),
+        "bars": bars,
+        **answers,
+    }
+    args.out.mkdir(parents=True, exist_ok=True)
+    if "peers" in answers:
+        draw(answers["peers"], args.out / "bench_optical_depth.png")
+    text = json.dumps(figures, indent=2, allow_nan=False) + "\n"
+    write_whole_text(args.out / "bench_optical_depth.json", text)
+    sys.stdout.write(text)
+
+
+if __name__ == "__main__":
+    main()
