@@ -13,6 +13,7 @@ import mitsuba as mi
 import numpy as np
 
 from mivol.errors import MivolError
+from mivol.transport.lattice import slab
 
 __all__ = ["Coefficients"]
 
@@ -79,7 +80,10 @@ class Coefficients:
         boxes = [volume.bbox() for volume in self.extinction]
         low = np.min([np.array(b.min) for b in boxes], axis=0).tolist()
         high = np.max([np.array(b.max) for b in boxes], axis=0).tolist()
-        return mi.BoundingBox3f(mi.Point3f(low), mi.Point3f(high)).ray_intersect(ray)
+        # Not Mitsuba's own box: its class belongs to the first variant of a process, and refuses the rays of a second one.
+        axes = np.eye(3, 4).tolist()
+        _, _, t0, t1 = slab(axes, low, high, ray.o, ray.d, mi.Float64(0), mi.Float64(ray.maxt))
+        return t1 > t0, mi.Float(t0), mi.Float(t1)
 
     def eval(
         self, mei: mi.MediumInteraction3f, scale: mi.Float, majorant: mi.Spectrum, active: mi.Bool

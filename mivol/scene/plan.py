@@ -16,15 +16,13 @@ import psutil
 
 from mivol.errors import MivolError
 from mivol.scene.needs import Needs, Survey, find_needs, read_values, survey_scene
+from mivol.transport.aovs import AOVS
 from mivol.transport.medium import view_medium
 from mivol.transport.optical_depth import PACKED_LIMIT, gradient_bytes
 from mivol.transport.path import Settings
 from mivol.transport.world import Body, World
 
-__all__ = ["AOVS", "Choice", "Plan", "build_world", "check_aovs", "explain", "make_plan"]
-
-AOVS = ("tau", "tau.R", "tau.G", "tau.B", "alpha", "depth")
-"""Names that ``aovs`` takes: optical depth (of a channel where the extinction is rgb), opacity, and mean distance."""
+__all__ = ["Choice", "Plan", "build_world", "check_aovs", "explain", "make_plan"]
 
 SKIP_BELOW = 0.6
 """Share of occupied blocks below which skipping pays (measured: it costs 8 reads a cell in place of 4)."""
@@ -81,13 +79,15 @@ def check_aovs(names: str) -> tuple[str, ...]:
     """Split a comma list of AOVs.
 
     Raises:
-        MivolError: a name that is not in :data:`AOVS`.
+        MivolError: a name that is not in :data:`mivol.transport.aovs.AOVS`, or one given twice.
     """
     asked = tuple(n.strip() for n in names.split(",") if n.strip())
     for name in asked:
         if name not in AOVS:
             near = difflib.get_close_matches(name, AOVS, 1, 0.0)[0]
             raise MivolError(f"aovs asks for {name!r}; mivol has {', '.join(AOVS)} (did you mean {near!r}?).")
+        if asked.count(name) > 1:
+            raise MivolError(f"aovs asks for {name!r} {asked.count(name)} times; a film has one channel of a name: ask once.")
     return asked
 
 

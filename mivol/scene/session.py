@@ -14,6 +14,7 @@ import mitsuba as mi
 from mivol.errors import MivolError
 from mivol.scene.needs import Survey, find_needs, survey_scene
 from mivol.scene.plan import Plan, build_world, check_aovs, make_plan
+from mivol.transport.aovs import backproject_aovs, integrate_aovs, push_aovs
 from mivol.transport.film import Rays, adjoint_rays, record
 from mivol.transport.path import Settings, walk_path
 from mivol.transport.score import Adjoint, Primal, Tangent
@@ -35,10 +36,10 @@ class Session:
 
     Args:
         settings: depth, roulette, hidden emitters.
-        aovs: comma list of the names in :data:`mivol.scene.plan.AOVS`.
+        aovs: comma list of the names in :data:`mivol.transport.aovs.AOVS`.
 
     Raises:
-        MivolError: an unknown AOV.
+        MivolError: an unknown AOV, or one named twice.
     """
 
     def __init__(self, settings: Settings, aovs: str = "") -> None:
@@ -98,7 +99,7 @@ class Session:
         with dr.suspend_grad():
             world, _ = self._open(scene, scene.sensors()[0])
             score, valid = walk_path(scene, world, self.settings, sampler, ray, Primal(_black(ray)), active)
-            return score.L, valid, self._aovs(scene, world, ray)
+            return score.L, valid, integrate_aovs(scene, world, ray, self.aovs, active)
 
     def _open(self, scene: mi.Scene, sensor: mi.Sensor) -> tuple[World, Plan]:
         """Ask, plan, and build the media."""
@@ -111,24 +112,19 @@ class Session:
 
     def _primal(self, scene: mi.Scene, world: World, rays: Rays) -> tuple:
         score, valid = walk_path(scene, world, self.settings, rays.sampler, rays.ray, Primal(_black(rays.ray)))
-        return score.L, valid, self._aovs(scene, world, rays.ray)
+        return score.L, valid, integrate_aovs(scene, world, rays.ray, self.aovs)
 
     def _tangent(self, scene: mi.Scene, world: World, rays: Rays) -> tuple:
         black = _black(rays.ray)
         score, _ = walk_path(scene, world, self.settings, rays.sampler, rays.ray, Tangent(black, black, black))
-        return score.dL, dr.full(mi.Bool, False, dr.width(black)), self._aov_tangents(scene, world, rays.ray)
+        return score.dL, dr.full(mi.Bool, False, dr.width(black)), push_aovs(scene, world, rays.ray, self.aovs)
 
     def _replay(self, scene: mi.Scene, world: World, rays: Rays, dL: mi.Spectrum, daovs: list[mi.Float]) -> None:
         again = rays.sampler.clone()
         score, _ = walk_path(scene, world, self.settings, rays.sampler, rays.ray, Primal(_black(rays.ray)))
         dr.eval(score.L)
         walk_path(scene, world, self.settings, again, rays.ray, Adjoint(score.L, dL))
-
-    def _aovs(self, scene: mi.Scene, world: World, ray: mi.Ray3f) -> list[mi.Float]:
-        return []
-
-    def _aov_tangents(self, scene: mi.Scene, world: World, ray: mi.Ray3f) -> list[mi.Float]:
-        return []
+        backproject_aovs(scene, world, rays.ray, self.aovs, daovs)
 
 
 def _sensor(scene: mi.Scene, sensor: int | mi.Sensor) -> mi.Sensor:

@@ -168,7 +168,7 @@ def backproject_segment(
     """
 
     def visit(state: None, cell: Cell, on: mi.Bool) -> None:
-        a, b = gauss_weights(cell, lattice.res)
+        a, b = (node_weights(p, cell, lattice.res) for p in gauss_points(cell))
         row = [0.5 * cell.dt * (wa + wb) for wa, wb in zip(a, b, strict=True)]
         for channel, w in enumerate(weight):
             target.add(channel, cell, [w * r for r in row], on)
@@ -182,11 +182,6 @@ def gauss_points(cell: Cell) -> tuple[mi.Vector3f, mi.Vector3f]:
     return dr.fma(cell.step, GAUSS, cell.frac), dr.fma(cell.step, 1 - GAUSS, cell.frac)
 
 
-def gauss_weights(cell: Cell, res: tuple[int, int, int]) -> tuple[list[mi.Float], list[mi.Float]]:
-    """The 8 trilinear weights at each of the two Gauss points, in the order of the grid's own axes."""
-    return tuple(weights(_natural(p, cell, res)) for p in gauss_points(cell))
-
-
 def interpolate(corners: list[mi.Float], frac: mi.Vector3f) -> mi.Float:
     """The trilinear value at a point of a cell; bits 0, 1, 2 of the corner are x, y, z."""
     x = [dr.lerp(corners[q], corners[q + 1], frac.x) for q in (0, 2, 4, 6)]
@@ -198,6 +193,11 @@ def weights(frac: mi.Vector3f) -> list[mi.Float]:
     """The 8 trilinear weights at a point of a cell: the transpose of :func:`interpolate`."""
     x, y, z = (1 - frac.x, frac.x), (1 - frac.y, frac.y), (1 - frac.z, frac.z)
     return [c * b * a for c in z for b in y for a in x]
+
+
+def node_weights(frac: mi.Vector3f, cell: Cell, res: tuple[int, int, int]) -> list[mi.Float]:
+    """The 8 trilinear weights at a point of a cell (from its near planes), in the order of the grid's own axes."""
+    return weights(_natural(frac, cell, res))
 
 
 def _natural(frac: mi.Vector3f, cell: Cell, res: tuple[int, int, int]) -> mi.Vector3f:

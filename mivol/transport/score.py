@@ -67,8 +67,9 @@ class Adjoint:
 
     def add(self, value: mi.Spectrum, active: mi.Bool) -> Adjoint:
         """Pass the light by; what made it (an emitter's radiance) gets its own derivative."""
-        if dr.grad_enabled(value):
-            dr.backward_from(dr.select(active, self.dL * value, 0))
+        with dr.resume_grad():
+            if dr.grad_enabled(value):
+                dr.backward_from(dr.select(active, self.dL * value, 0))
         return Adjoint(self.L - dr.select(active, dr.detach(value), 0), self.dL)
 
     def shadow(self, scene: mi.Scene, world: World, way: Way, value: mi.Spectrum, active: mi.Bool) -> Adjoint:
@@ -102,7 +103,8 @@ class Tangent:
 
     def add(self, value: mi.Spectrum, active: mi.Bool) -> Tangent:
         """Light found at the end of a stretch, and how it changes."""
-        own = dr.forward_to(value) if dr.grad_enabled(value) else 0
+        with dr.resume_grad():
+            own = dr.forward_to(value) if dr.grad_enabled(value) else 0
         seen = dr.detach(value)
         dL = self.dL + dr.select(active, own - self.dtau * seen, 0)
         return Tangent(self.L + dr.select(active, seen, 0), dL, self.dtau)

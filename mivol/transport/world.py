@@ -139,7 +139,9 @@ class World:
         """Begin a forward pass: take the tangent of each part from the parameters."""
         for body in self.bodies:
             products = [body.view.scale * _values(p) for p in body.view.parts]
-            dr.forward_to(*products)
+            asked = [p for p in products if dr.grad_enabled(p)]
+            if asked:
+                dr.forward_to(*asked)
             body.tangents = [dr.detach(dr.grad(p)) for p in products]
             dr.eval(body.tangents)
 

@@ -16,6 +16,7 @@ pytestmark = pytest.mark.usefixtures("variant_rgb")
 GRID = "box.interior_medium.sigma_t.data"
 PLACE = scenes.centred(2 * np.eye(3))
 RED = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.8, 0.3, 0.2]}}
+GREEN = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.2, 0.6, 0.3]}}
 
 
 def values(channels: int = 1) -> np.ndarray:
@@ -39,7 +40,7 @@ def build(channels: int = 1, rfilter: str = "box", crop: bool = False, kind: str
             "bsdf": RED,
             "to_world": turn().translate([0, -1.2, 0]).rotate([1, 0, 0], -90).scale(5),
         }
-        parts["ball"] = {"type": "sphere", "radius": 0.4, "bsdf": RED}
+        parts["ball"] = {"type": "sphere", "radius": 0.4, "bsdf": GREEN}
         parts["lamp"] = {
             "type": "rectangle",
             "to_world": turn().translate([0, 3, 0]).rotate([1, 0, 0], 90),
@@ -137,7 +138,7 @@ def test_reverse_against_finite_differences(name):
     ("key", "depth"),
     [
         ("box.interior_medium.scale", 2),
-        ("lamp.emitter.radiance.value", 1),
+        ("sky.radiance.value", 1),
         ("lamp.emitter.radiance.value", 2),
         ("floor.bsdf.reflectance.value", 2),
         ("floor.bsdf.reflectance.value", 4),
@@ -149,8 +150,8 @@ def test_other_parameters_against_finite_differences(key, depth):
     integrator = mi.load_dict({"type": "mivol", "max_depth": depth, "rr_depth": 100})
     scene = build()
     params = mi.traverse(scene)
-    start = params[key]
-    kind = type(start)
+    kind = type(params[key])
+    start = kind(params[key])  # a copy: the parameter itself is about to change in place
     h = 0.02
 
     def at(x: object) -> np.ndarray:
@@ -213,4 +214,4 @@ def test_replay_counts_down_to_zero():
         left = walk_path(scene, world, settings, sampler, ray, Adjoint(L, dr.zeros(mi.Spectrum, n)))[0].L
     # Five additions and subtractions of float32 numbers of the size of L.
     assert np.abs(np.array(left)).max() <= 1e-6 * np.abs(np.array(L)).max()
-    assert np.array(L).max() > 1
+    assert np.array(L).max() > 0.5
