@@ -1,18 +1,24 @@
 r"""The mean distance at which a ray is stopped, with its tangent and its transpose.
 
-.. math:: N = \int t\,\sigma T\,dt + t_s T_s, \qquad
-          N_{cell} = a\,\alpha + \Delta\,\big(\tau E_1(\tau) + \tfrac{\sqrt 3}{2} \Delta\,(\sigma_2 - \sigma_1)\,(E_1 - E_2)\big)
+.. math:: N = \int t\,\sigma T\,dt + t_s T_s, \quad N_{cell} = a \alpha + \Delta \Big(\int_0^1 e^{-\tau(u)} du - e^{-\tau}\Big)
 
-The mean is N over the opacity. In a cell [a, a + D] the extinction is known at the two Gauss points; N is expanded in the
-slope between them about a cell of the same optical depth without slope, with E_n from :mod:`mivol.numerics`. It is exact for a
-constant extinction at any optical depth, so constants are cells of any length; on a smooth one the error falls as D^4.
-Nothing is divided by a transmittance or by an extinction, so the derivatives are finite everywhere.
+The mean is N over the opacity. In a cell [a, a + D] three Gauss points give the optical depth, and the first and second
+Legendre moments (slope and bend) of the extinction; T = exp(-tau u) exp(B (u - u^2) - G (2 u^3 - 3 u^2 + u)) is expanded in
+these two, to the orders 2 and 1, about a cell of the same optical depth without them:
 
-Conventions. A body is swept from its far end to its near end: what lies behind a cell is known when it is passed, and no sum is
-undone. Distances are counted from ``origin``: with the mean distance itself as origin, the derivative of the mean is that of
-N over the opacity, since N is 0. Rows are numbers for each channel, followed by their tangents where these are asked for.
+.. math:: N_{cell} = a\,\alpha + \Delta \Big(\tau E_1 + B (E_1 - E_2) + \frac{B^2}{2} (E_2 - 2 E_3 + E_4)
+          - G (E_1 - 3 E_2 + 2 E_3)\Big)
 
-References: Max 1995 (the integral, with distance as the source); the reverse sweep is that of any linear recurrence.
+with E_n(tau) from :mod:`mivol.numerics`. It is exact for a thin cell of any (cubic) extinction, and for a constant one at any
+optical depth, so that constants are cells of any length; the error falls as D^6. Nothing is divided by a transmittance or by
+an extinction: derivatives are finite everywhere.
+
+Conventions. A body is swept from its far end to its near end: what lies behind a cell is known when it is passed, and no sum
+is undone. Distances are counted from ``origin``: with the mean distance itself as origin, the derivative of the mean is
+that of N over the opacity, since N is 0. Rows are numbers for each channel, followed by their tangents where these are
+asked for.
+
+References: Max 1995 (the integral, with distance as the source); Abramowitz & Stegun 25.4.30 (Gauss points).
 """
 
 from __future__ import annotations
@@ -28,14 +34,15 @@ from mivol.errors import MivolError
 from mivol.numerics import exp_moments, one_minus_exp
 from mivol.transport.lattice import Cell, Nodes, Segment, clip, slab, walk
 from mivol.transport.medium import Part
-from mivol.transport.optical_depth import gauss_points, gauss_weights, interpolate
+from mivol.transport.optical_depth import interpolate, node_weights
 from mivol.transport.path import Reach, Way, visit_boxes
 from mivol.transport.score import revisit
 from mivol.transport.world import Body, World
 
 __all__ = ["Stop", "backproject_distance", "integrate_distance", "push_distance", "stop_in_cell"]
 
-SQRT3 = math.sqrt(3)
+SPREAD = math.sqrt(15) / 10
+"""Distance of the outer Gauss points from the middle of [0, 1]; with the weights 5/18, 8/18, 5/18 exact to degree 5."""
 
 BLACK = 1000.0
 """Stands for an infinite optical depth: exp(-1000) is 0, and 1000 + x - 1000 is x in float64."""
@@ -43,39 +50,45 @@ BLACK = 1000.0
 
 @dataclass
 class Stop:
-    """What a cell does to a ray that enters it: optical depth, transmittance, N, and its derivatives.
+    """What a cell does to a ray that enters it: optical depth, transmittance, and N.
 
-    ``N1`` and ``N2`` are dN/dsigma at the two Gauss points; dtau/dsigma is ``half`` at both.
+    ``dtau`` and ``dN`` are their derivatives with respect to the extinction at each point that it was given at.
     """
 
     tau: mi.Float
     T: mi.Float
     N: mi.Float
-    half: mi.Float
-    N1: mi.Float
-    N2: mi.Float
+    dtau: list[mi.Float]
+    dN: list[mi.Float]
 
 
-def stop_in_cell(a: mi.Float, dt: mi.Float, sigma1: mi.Float, sigma2: mi.Float) -> Stop:
+def stop_in_cell(a: mi.Float, dt: mi.Float, near: mi.Float, middle: mi.Float, far: mi.Float) -> Stop:
     """Integrate t sigma T over a cell.
 
     Args:
         a: distance of its near end [length].
         dt: its length [length], finite.
-        sigma1, sigma2: extinction [1/length] at its two Gauss points, the nearer one first.
+        near, middle, far: extinction [1/length] at its three Gauss points.
 
-    Bias: none for a constant extinction; of fifth order in dt for a smooth one; where an extinction falls or rises within a
-        cell of large optical depth, at most about a cell.
+    Bias: none for a thin cell or a constant extinction; of seventh order in dt for a smooth one; where an extinction rises
+        or falls within a cell of large optical depth, at most about that cell.
     """
-    half = 0.5 * dt
-    tau = half * (sigma1 + sigma2)
+    sides = near + far
+    tau = dt * dr.fma(sides, 5 / 18, middle * (8 / 18))
+    slope = dt * (math.sqrt(15) / 6) * (far - near)
+    bend = dt * (5 / 9) * dr.fma(middle, -2, sides)
     T = dr.exp(-tau)
-    e0, e1, e2, e3 = exp_moments(tau)
-    slope, bend = SQRT3 * half * (sigma2 - sigma1), e1 - e2
-    N = dr.fma(a, tau * e0, dt * dr.fma(tau, e1, slope * bend))
-    both = dr.fma(a, T, dt * (T - e1 - slope * (e2 - e3)))
-    lean = SQRT3 * dt * bend
-    return Stop(tau, T, N, half, half * (both - lean), half * (both + lean))
+    e0, e1, e2, e3, e4, e5 = exp_moments(tau)
+    by_slope, by_bend = e1 - e2, -(e1 - 3 * e2 + 2 * e3)
+    twice = e2 - 2 * e3 + e4
+    mean = tau * e1 + slope * (by_slope + 0.5 * slope * twice) + bend * by_bend
+    by_tau = T - e1 - slope * (e2 - e3 + 0.5 * slope * (e3 - 2 * e4 + e5)) + bend * (e2 - 3 * e3 + 2 * e4)
+    by_slope += slope * twice
+
+    straight = dt * dr.fma(a, T, dt * by_tau)
+    lean, bow = dt * dt * (math.sqrt(15) / 6) * by_slope, dt * dt * (5 / 9) * by_bend
+    dN = [straight * (5 / 18) - lean + bow, straight * (8 / 18) - 2 * bow, straight * (5 / 18) + lean + bow]
+    return Stop(tau, T, dr.fma(a, tau * e0, dt * mean), [dt * (5 / 18), dt * (8 / 18), dt * (5 / 18)], dN)
 
 
 def _stop_in_constant(a: mi.Float, b: mi.Float, origin: mi.Float, sigma: mi.Float, on: mi.Bool) -> Stop:
@@ -85,21 +98,19 @@ def _stop_in_constant(a: mi.Float, b: mi.Float, origin: mi.Float, sigma: mi.Floa
     """
     on = on & (b > a)
     begin = dr.select(on, a - origin, 0)
-    stop = stop_in_cell(begin, dr.select(on & dr.isfinite(b), b - a, 0), sigma, sigma)
+    stop = stop_in_cell(begin, dr.select(on & dr.isfinite(b), b - a, 0), sigma, sigma, sigma)
     endless = on & ~dr.isfinite(b) & (sigma > 0)
     mean = dr.rcp(dr.select(endless, sigma, 1))
-    slope = -0.5 * dr.square(mean)
     return Stop(
         dr.select(endless, BLACK, stop.tau),
         dr.select(endless, 0, stop.T),
         dr.select(endless, begin + mean, stop.N),
-        stop.half,
-        dr.select(endless, slope, stop.N1),
-        dr.select(endless, slope, stop.N2),
+        [sum(stop.dtau, mi.Float(0))],
+        [dr.select(endless, -dr.square(mean), sum(stop.dN, mi.Float(0)))],
     )
 
 
-# -- One body ----------------------------------------------------------------------------------------------------------------
+# -- One body ----------------------------------------------------------------------------------------------------------
 
 
 @dataclass
@@ -111,7 +122,7 @@ class _Moment:
 
 
 class _Field:
-    """The sum of the parts of a body, for each channel: at points of a cell, and where only its constants are."""
+    """The sum of the parts of a body, for each channel: in a cell of its grids, and where only its constants are."""
 
     def __init__(self, body: Body, values: list, scale: mi.Float) -> None:
         self.channels, self.scale = body.view.channels, scale
@@ -120,9 +131,13 @@ class _Field:
         constants = [_as_channels(v, p.channels) for p, v in pairs if p.lattice is None]
         self.constant = [scale * sum((k[c % len(k)] for k in constants), mi.Float(0)) for c in range(self.channels)]
 
-    def at(self, corners: list, point: mi.Vector3f) -> list[mi.Float]:
-        sums = (sum(interpolate(g[c % len(g)], point) for g in corners) for c in range(self.channels))
-        return [dr.fma(self.scale, s, k) for s, k in zip(sums, self.constant, strict=True)]
+    def along(self, corners: list, cell: Cell) -> list[list[mi.Float]]:
+        """[channel][point] values at the points of a cell."""
+        points = _points(cell)
+        grids = [[[interpolate(g[c % len(g)], p) for g in corners] for p in points] for c in range(self.channels)]
+        return [
+            [dr.fma(self.scale, sum(s, mi.Float(0)), k) for s in sums] for sums, k in zip(grids, self.constant, strict=True)
+        ]
 
 
 def _as_channels(value: mi.Float | mi.Color3f, channels: int) -> list[mi.Float]:
@@ -179,14 +194,12 @@ def _measure(
 
     def add_constant(moment: _Moment, a: mi.Float, b: mi.Float) -> _Moment:
         stops = [_stop_in_constant(a, b, origin, s, active) for s in field.constant]
-        return _put_in_front(moment, stops, [(d, d) for d in change.constant] if tangent else [])
+        return _put_in_front(moment, stops, [[d] for d in change.constant] if tangent else [])
 
     def visit(moment: _Moment, cell: Cell, on: mi.Bool) -> _Moment:
-        far, near = gauss_points(cell)
         corners, changes = cell.corners[: len(field.reads)], cell.corners[len(field.reads) :]
         stops = _stops(field, lay, cell, corners, origin, on)
-        pairs = zip(change.at(changes, near), change.at(changes, far), strict=True) if tangent else []
-        return _put_in_front(moment, stops, list(pairs))
+        return _put_in_front(moment, stops, change.along(changes, cell) if tangent else [])
 
     if has_constants and lay.grid is not None:
         moment = add_constant(moment, lay.leave, lay.t1)
@@ -202,20 +215,24 @@ def _measure(
 
 def _stops(field: _Field, lay: _Lay, cell: Cell, corners: list, origin: mi.Float, on: mi.Bool) -> list[Stop]:
     """What a cell of a sweep does, for each channel."""
-    far, near = gauss_points(cell)
     begin = (lay.leave - origin) - (cell.s + cell.dt)
     dt = dr.select(on, cell.dt, 0)
-    return [stop_in_cell(begin, dt, a, b) for a, b in zip(field.at(corners, near), field.at(corners, far), strict=True)]
+    return [stop_in_cell(begin, dt, *sigma) for sigma in field.along(corners, cell)]
 
 
-def _put_in_front(moment: _Moment, stops: list[Stop], changes: list[tuple[mi.Float, mi.Float]]) -> _Moment:
+def _points(cell: Cell) -> list[mi.Vector3f]:
+    """Three Gauss points of a cell's stretch, the one nearest to the camera first: a sweep meets it last."""
+    return [dr.fma(cell.step, 0.5 + x, cell.frac) for x in (SPREAD, 0, -SPREAD)]
+
+
+def _put_in_front(moment: _Moment, stops: list[Stop], changes: list[list[mi.Float]]) -> _Moment:
     """A cell dims all that has been swept so far, and adds its own."""
     tau = [t + mi.Float64(s.tau) for t, s in zip(moment.tau, stops, strict=False)]
     N = [dr.fma(s.T, n, s.N) for n, s in zip(moment.N, stops, strict=False)]
-    for c, (s, (d1, d2)) in enumerate(zip(stops, changes, strict=False)):
-        dtau, row = s.half * (d1 + d2), len(stops) + c
+    for c, (s, change) in enumerate(zip(stops, changes, strict=False)):
+        dtau, row = _dot(s.dtau, change), len(stops) + c
         tau.append(moment.tau[row] + mi.Float64(dtau))
-        N.append(dr.fma(s.N1, d1, s.N2 * d2) + s.T * (moment.N[row] - dtau * moment.N[c]))
+        N.append(_dot(s.dN, change) + s.T * (moment.N[row] - dtau * moment.N[c]))
     return _Moment(tau, N)
 
 
@@ -257,12 +274,13 @@ def _backproject(
 
     def visit(pull: _Pull, cell: Cell, on: mi.Bool) -> _Pull:
         stops = _stops(field, lay, cell, cell.corners, origin, on)
-        pull, g1, g2 = _pull_through(pull, stops, weight, behind)
-        far, near = gauss_weights(cell, lay.grid.lattice.res)
+        pull, slopes = _pull_through(pull, stops, weight, behind)
+        shares = [node_weights(p, cell, lay.grid.lattice.res) for p in _points(cell)]
+        corners = [[_dot(g, share) for share in zip(*shares, strict=True)] for g in slopes]
         for part, gradient in parts:
             if part.lattice is not None:
-                for c, (a, b) in enumerate(zip(_merge(g1, part), _merge(g2, part), strict=True)):
-                    gradient.add(c, cell, [dr.fma(a, n, b * f) for n, f in zip(near, far, strict=True)], on)
+                for c, values in enumerate(_merge(corners, part)):
+                    gradient.add(c, cell, values, on)
         return pull
 
     if has_constants and lay.grid is not None:
@@ -279,32 +297,39 @@ def _backproject(
 
 def _pull_through(
     pull: _Pull, stops: list[Stop], weight: mi.Float, behind: list[mi.Float]
-) -> tuple[_Pull, list[mi.Float], list[mi.Float]]:
-    """Pass a cell: its derivatives with respect to the extinction at its two points, for each channel of the body."""
+) -> tuple[_Pull, list[list[mi.Float]]]:
+    """Pass a cell: its derivatives with respect to the extinction, [channel of the body][point]."""
     k = len(stops)
     ahead = [a - mi.Float64(stops[c % k].tau) for c, a in enumerate(pull.ahead)]
-    g1, g2 = ([mi.Float(0) for _ in range(k)] for _ in range(2))
+    slopes = [[mi.Float(0) for _ in s.dN] for s in stops]
     for c, a in enumerate(ahead):
-        stop, P = stops[c % k], _transmittance(a)
+        stop, P = stops[c % k], weight * _transmittance(a)
         # More extinction here dims what was swept of this body, and what lies behind the body.
-        dims = dr.fma(P * stop.T, pull.N[c % k], behind[c]) * stop.half
-        g1[c % k] += weight * dr.fma(P, stop.N1, -dims)
-        g2[c % k] += weight * dr.fma(P, stop.N2, -dims)
+        dims = dr.fma(P * stop.T, pull.N[c % k], weight * behind[c])
+        slopes[c % k] = [
+            g + dr.fma(P, dN, -dims * dtau) for g, dN, dtau in zip(slopes[c % k], stop.dN, stop.dtau, strict=True)
+        ]
     N = [dr.fma(s.T, n, s.N) for n, s in zip(pull.N, stops, strict=True)]
-    constant = [k + a + b for k, a, b in zip(pull.constant, g1, g2, strict=True)]
-    return _Pull(N, ahead, constant), g1, g2
+    constant = [sum(g, total) for total, g in zip(pull.constant, slopes, strict=True)]
+    return _Pull(N, ahead, constant), slopes
+
+
+def _dot(a: list[mi.Float], b: list[mi.Float]) -> mi.Float:
+    return sum((x * y for x, y in zip(a, b, strict=True)), mi.Float(0))
 
 
 def _transmittance(tau: mi.Float64) -> mi.Float:
     return dr.exp(-mi.Float(dr.maximum(tau, 0)))
 
 
-def _merge(rows: list[mi.Float], part: Part) -> list[mi.Float]:
-    """Numbers for each channel of a body as numbers for each channel of a part: a grey part gets the sum."""
-    return rows if part.channels == len(rows) else [sum(rows[1:], rows[0])]
+def _merge(rows: list, part: Part) -> list:
+    """What belongs to the channels of a body (numbers, or lists of them) for those of a part: a grey one gets the sum."""
+    if part.channels == len(rows):
+        return rows
+    return [[sum(r[1:], r[0]) for r in zip(*rows, strict=True)] if isinstance(rows[0], list) else sum(rows[1:], rows[0])]
 
 
-# -- All bodies along a ray ------------------------------------------------------------------------------------------------------
+# -- All bodies along a ray --------------------------------------------------------------------------------------------
 
 
 @dataclass
@@ -468,7 +493,7 @@ def _largest(values: list[mi.Float]) -> mi.Float:
     return best
 
 
-# -- The integral, its tangent, its transpose --------------------------------------------------------------------------------------
+# -- The integral, its tangent, its transpose --------------------------------------------------------------------------
 
 
 def integrate_distance(scene: mi.Scene, world: World, way: Way, end: Reach, active: mi.Bool) -> mi.Float:

@@ -1,0 +1,66 @@
+r"""Forms of exp that survive float32: opacity, and the moments of an exponential over a unit interval.
+
+.. math:: E_n(x) = \int_0^1 u^n e^{-x u}\,du, \qquad E_0 = \varphi_1, \qquad x E_0 = 1 - e^{-x}
+
+Conventions. Arguments are Dr.Jit floats. Written as differences these forms lose all digits at small x (1 - exp(-1e-8) is 0
+in float32); there they are sums of positive terms, :math:`E_n = \frac{e^{-x}}{n+1} (1 + \frac{x}{n+2} (1 + \ldots))`.
+Derivatives are not tracked. Bounds hold for x >= 0 and are measured in tests/analytic/test_numerics.py.
+
+References: Abramowitz & Stegun 6.5.29 (the series of the incomplete gamma function); Hochbruck & Ostermann 2010 (phi_1).
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+__all__ = ["exp_moments", "one_minus_exp", "phi1"]
+
+PHI_SERIES_BELOW, PHI_TERMS = 0.5, 8
+"""The term left out is x^8 / 9! <= 1.1e-8."""
+
+MOMENTS = 6
+
+MOMENT_SERIES_BELOW, MOMENT_TERMS = 2.0, 11
+"""The term left out is 2^12 6! / 18! of the first, 5e-10; from 2 on a step of the recurrence loses a factor of 3 at most."""
+
+
+def one_minus_exp(tau: mi.Float) -> mi.Float:
+    """Opacity 1 - exp(-tau) of an optical depth [1].
+
+    Error: at most 4e-7 of it, from the smallest tau to infinity (which gives 1).
+    """
+    return dr.select(dr.abs(tau) < PHI_SERIES_BELOW, tau * _series(tau, 0, PHI_TERMS), 1 - dr.exp(-tau))
+
+
+def phi1(x: mi.Float) -> mi.Float:
+    """(1 - exp(-x)) / x, which is 1 at 0.
+
+    Error: at most 4e-7 of it.
+    """
+    small = dr.abs(x) < PHI_SERIES_BELOW
+    return dr.select(small, _series(x, 0, PHI_TERMS), (1 - dr.exp(-x)) * dr.rcp(dr.select(small, 1, x)))
+
+
+def exp_moments(x: mi.Float) -> list[mi.Float]:
+    """Moments E_0 to E_5 of exp(-x u) over u in [0, 1]; 1/(n + 1) at 0.
+
+    Error: at most 4e-7, 4e-7, 8e-7, 2e-6, 6e-6, 2e-5 of them.
+    """
+    tr = dr.exp(-x)
+    small = dr.abs(x) < MOMENT_SERIES_BELOW
+    inv = dr.rcp(dr.select(small, 1, x))
+    # Below 2 from E_5 down, by sums of positive terms; above from E_0 up, where n E_{n-1} - exp(-x) loses little.
+    down, up = [_series(x, MOMENTS - 1, MOMENT_TERMS)], [(1 - tr) * inv]
+    for n in range(1, MOMENTS):
+        down.insert(0, dr.fma(x, down[0], tr) * (1 / (MOMENTS - n)))
+        up.append((n * up[-1] - tr) * inv)
+    return [dr.select(small, d, u) for d, u in zip(down, up, strict=True)]
+
+
+def _series(x: mi.Float, n: int, terms: int) -> mi.Float:
+    """E_n for small x."""
+    total = dr.ones(type(x), 1)
+    for k in range(n + terms, n + 1, -1):
+        total = dr.fma(total * x, 1 / k, 1)
+    return dr.exp(-x) * total * (1 / (n + 1))
