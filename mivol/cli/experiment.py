@@ -20,7 +20,7 @@ import mitsuba as mi
 import numpy as np
 
 from mivol import config
-from mivol.cli.progress import Display
+from mivol.cli.progress import Display, tracked
 from mivol.cli.rendering import set_threads, set_variant
 from mivol.config import Experiment, Files, Sought
 from mivol.errors import MivolError
@@ -93,10 +93,12 @@ def run(chosen: Experiment, base: Path, folder: Path, *, resume: bool = False) -
         with stage(record, "scene"):
             loaded = load_scene(base / chosen.scene.file, chosen.scene.define)
             truth = make_truth(chosen, base, loaded.scene)
+            integrator = make_integrator(chosen)
+            starts = [make_start(sought, base, loaded.scene) for sought in chosen.parameter]
         with stage(record, "references"):
             seen = references(chosen, base, folder, loaded, truth)
         with stage(record, "fit"):
-            problem = pose(chosen, base, loaded, seen)
+            problem = pose(chosen, loaded.scene, integrator, starts, seen)
             record.plan = choices(chosen, problem)
             fit = solve(chosen, folder, loaded, problem, seen, truth, resume)
         with stage(record, "images and volumes"):
@@ -217,10 +219,10 @@ def render_views(chosen: Experiment, folder: Path, loaded: LoadedScene, sensors:
     """References by Mitsuba's path tracer."""
     wanted, cache, seen = chosen.reference, folder / "references", Seen()
     cache.mkdir(exist_ok=True)
-    for index, sensor in enumerate(sensors):
+    for index, sensor in enumerate(tracked(sensors, "references")):
         made = render_reference(
             loaded, cache, max_depth=chosen.fit.max_depth, target_se=wanted.standard_error or None,
-            max_spp=wanted.spp, sensor=sensor, seed=wanted.seed,
+            max_spp=wanted.spp, sensor=sensor, seed=wanted.seed, progress=False,
         )  # fmt: skip
         add_view(seen, index, sensor, made.mean, standard_error(made), wanted.held_out)
     return seen
@@ -267,19 +269,55 @@ def add_view(seen: Seen, index: int, sensor: Any, mean: np.ndarray, error: np.nd
 # -- The fit ------------------------------------------------------------------------------------------------------
 
 
-def pose(chosen: Experiment, base: Path, loaded: LoadedScene, seen: Seen) -> Problem:
+@dataclass(frozen=True)
+class Start:
+    """A parameter and its first value."""
+
+    parameter: Parameter
+    value: np.ndarray
+
+
+def make_integrator(chosen: Experiment) -> mi.Integrator:
+    """The integrator of the fit.
+
+    Raises:
+        MivolError: Mitsuba has none of that name, or it refuses its settings.
+    """
+    name = chosen.fit.integrator
+    try:
+        return mi.load_dict({"type": name, "max_depth": chosen.fit.max_depth})
+    except RuntimeError as error:
+        reason = " ".join(str(error).split())
+        raise MivolError(f'fit.integrator = "{name}" cannot be loaded ({reason}): "mivol" is the usual one.') from None
+
+
+def make_start(sought: Sought, base: Path, scene: mi.Scene) -> Start:
+    """A parameter and where it starts; the scene is not changed.
+
+    Raises:
+        MivolError: no such parameter, a start outside its domain, a file that cannot be read.
+    """
+    params = mi.traverse(scene)
+    now = as_tensor(params[find(sought.key, params)])
+    value = np.asarray(now)
+    if sought.start_file:
+        value = read_volume(base / sought.start_file).values
+    elif sought.start is not None:
+        shape = (*sought.shape, now.shape[3]) if sought.shape else now.shape
+        value = np.full(shape, sought.start, dtype=np.float32)
+    extent = tuple(float(edge) for edge in np.diff(find_box(scene), axis=0)[0, ::-1])
+    parameter = Parameter(sought.key, sought.unit, sought.domain, sought.map, sought.lr, extent, sought.prior)
+    parameter.to_reals(mi.TensorXf(np.ascontiguousarray(value)))
+    return Start(parameter, value)
+
+
+def pose(chosen: Experiment, scene: mi.Scene, integrator: mi.Integrator, starts: Sequence[Start], seen: Seen) -> Problem:
     """The problem of an experiment, with the scene at its start."""
-    wanted = chosen.fit
-    problem = Problem(
-        loaded.scene,
-        seen.fitted,
-        [make_start(sought, base, loaded.scene) for sought in chosen.parameter],
-        mi.load_dict({"type": wanted.integrator, "max_depth": wanted.max_depth}),
-        chosen.loss,
-        wanted.spp,
-        wanted.samples_per_pass,
-        chosen.seed,
-    )
+    params = mi.traverse(scene)
+    for start in starts:
+        put(params, start.parameter.name, start.value)
+    wanted, parameters = chosen.fit, [start.parameter for start in starts]
+    problem = Problem(scene, seen.fitted, parameters, integrator, chosen.loss, wanted.spp, wanted.samples_per_pass, chosen.seed)
     problem.set(problem.start())
     return problem
 
@@ -307,26 +345,6 @@ def solve(
     fit.save()
     append_last(folder, fit)
     return fit
-
-
-def make_start(sought: Sought, base: Path, scene: mi.Scene) -> Parameter:
-    """Put the start of a parameter into the scene.
-
-    Raises:
-        MivolError: no such parameter, a start outside its domain, a file that cannot be read.
-    """
-    params = mi.traverse(scene)
-    find(sought.key, params)
-    if sought.start_file:
-        put(params, sought.key, read_volume(base / sought.start_file).values)
-    elif sought.start is not None:
-        now = as_tensor(params[sought.key])
-        shape = (*sought.shape, now.shape[3]) if sought.shape else now.shape
-        put(params, sought.key, np.full(shape, sought.start))
-    box = find_box(scene)
-    return Parameter(
-        sought.key, sought.unit, sought.domain, sought.map, sought.lr, tuple(np.diff(box, axis=0)[0, ::-1]), sought.prior
-    )
 
 
 class Measure:

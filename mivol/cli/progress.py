@@ -7,12 +7,16 @@ evaluation.
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator, Sequence
+from typing import TypeVar
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from mivol.optim.loop import Fit
 from mivol.report.record import QUANTITIES, Quantity
+
+T = TypeVar("T")
 
 
 def figures(fit: Fit) -> str:
@@ -21,6 +25,21 @@ def figures(fit: Fit) -> str:
     known = {name: value for name, value in errors.items() if name not in ("iteration", "seconds")}
     words = [f"{QUANTITIES.get(name, Quantity(name)).label} {value:.4g}" for name, value in known.items()]
     return ", ".join([f"loss {fit.history[-1]['loss']:.4g}", *words])
+
+
+def tracked(items: Sequence[T], what: str) -> Iterator[T]:
+    """The items, with a bar of how many are done; one line at the end where there is no terminal."""
+    console, start = Console(stderr=True), time.monotonic()
+    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
+    with Progress(*columns, console=console, auto_refresh=False, disable=not console.is_terminal) as bar:
+        task = bar.add_task(what, total=len(items))
+        for item in items:
+            bar.refresh()
+            yield item
+            bar.advance(task)
+        bar.refresh()
+    if not console.is_terminal:
+        console.print(f"{what}: {len(items)} in {time.monotonic() - start:.1f} s", soft_wrap=True)
 
 
 class Display:

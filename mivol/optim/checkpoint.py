@@ -37,12 +37,12 @@ def read(path: Path, fingerprint: dict[str, Any]) -> tuple[dict[str, np.ndarray]
         MivolError: there is none, it is no checkpoint, or it is one of another scene or other settings.
     """
     try:
-        with np.load(path, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
+            arrays = {name: stored[name] for name in stored.files}
         about = json.loads(str(arrays.pop(ABOUT)))
     except FileNotFoundError:
         raise MivolError(f"found no checkpoint {path} to resume from: run without --resume first.") from None
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+    except (OSError, ValueError, KeyError, EOFError, AttributeError, zipfile.BadZipFile) as error:
         raise MivolError(f"{path} is not a whole checkpoint of mivol ({error}): run without --resume.") from error
     check_same(path, about["fingerprint"], fingerprint)
     return arrays, about

@@ -1,0 +1,143 @@
+"""Experiments in TOML: what they mean, what overrides them, and a sentence for everything that is wrong in one."""
+
+from __future__ import annotations
+
+import copy
+import math
+import tomllib
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from mivol import config
+from mivol.errors import MivolError
+from mivol.optim.optimisers import GaussNewton
+from mivol.optim.priors import TotalVariation
+
+ROOT = Path(__file__).resolve().parents[2]
+SMALLEST = """
+title = "a"
+[scene]
+file = "scene.xml"
+[[parameter]]
+key = "cube.interior_medium.sigma_t.data"
+prior = [{ name = "tv", weight = 0.5 }]
+[views]
+rig = "ring"
+"""
+
+
+def raw() -> dict:
+    return copy.deepcopy(tomllib.loads(SMALLEST))
+
+
+def test_defaults_and_given_values() -> None:
+    found = config.from_dict(raw())
+    assert found.parameter[0].prior == (TotalVariation(weight=0.5),)
+    assert found.parameter[0].domain == (0.0, math.inf)
+    assert found.views.count == 8
+    assert found.fit.integrator == "mivol"
+
+
+def test_resolved_settings_are_an_experiment_again() -> None:
+    found = config.from_dict(raw())
+    again = config.from_dict(config.resolved(found))
+    assert again == found
+
+
+def test_every_setting_says_what_it_is() -> None:
+    """Each line of the help names a setting, and each setting has one; units are said where there are any."""
+    lines = config.describe()
+    assert any(line.startswith("optimiser[adam].beta_1 = 0.9: ") for line in lines)
+    assert any(line.startswith("fit.spp = 16 [sample/pixel]: ") for line in lines)
+    assert all(line.partition(": ")[2].strip() for line in lines)
+
+
+def test_command_line_overrides_the_file(tmp_path: Path) -> None:
+    path = tmp_path / "fit.toml"
+    path.write_text(SMALLEST)
+    changes = ["fit.iterations=7", "parameter.0.lr=0.5", "views.count=3", 'optimiser={name="gauss_newton"}', "title=two words"]
+    found = config.load(path, [*changes, "optimiser.inner=4", "parameter.0.prior.0.weight=2"])
+    assert (found.fit.iterations, found.parameter[0].lr, found.views.count) == (7, 0.5, 3)
+    assert found.optimiser == GaussNewton(inner=4)
+    assert found.title == "two words"
+    assert found.parameter[0].prior[0].weight == 2.0
+
+
+def test_flat_names_everything_that_changes_the_result() -> None:
+    flat = config.flat(config.resolved(config.from_dict(raw())))
+    assert flat["parameter.0.prior.0.weight"] == 0.5
+    assert flat["optimiser.beta_1"] == 0.9
+    assert not {"title", "output", "threads"} & set(flat)
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "scenes").glob("*/*.toml")), ids=lambda p: f"{p.parent.name}/{p.name}")
+def test_shipped_experiments_are_valid(path: Path) -> None:
+    assert (path.parent / config.load(path).scene.file).exists()
+
+
+#: what is wrong -> (changes to the smallest experiment, what the sentence must say)
+WRONG = {
+    "misspelt key": (["titel=x"], 'unknown key "titel": did you mean "title"'),
+    "misspelt key in a section": (["fit.iteratons=3"], 'unknown key "fit.iteratons": did you mean "iterations"'),
+    "misspelt key in a list": (["parameter.0.domian=[0, 1]"], '"parameter.0.domian": did you mean "domain"'),
+    "misspelt key of a strategy": (['loss={name="huber", detla=1}'], '"loss.detla": did you mean "delta"'),
+    "key of another strategy": (['loss={name="l1", delta=1}'], 'unknown key "loss.delta"'),
+    "misspelt strategy": (['optimiser={name="addam"}'], 'optimiser.name = "addam" is unknown: did you mean "adam"'),
+    "misspelt prior": (['parameter.0.prior=[{name="tvv"}]'], 'prior.0.name = "tvv" is unknown: did you mean "tv"'),
+    "strategy without a name": (["schedule={final=0.1}"], '"schedule.name" is missing'),
+    "misspelt rig": (['views.rig="rings"'], 'views.rig = "rings" is unknown: did you mean "ring"'),
+    "misspelt source": (['reference={source="file", paths=["a"]}'], 'did you mean "files"'),
+    "wrong type": (['fit.iterations="many"'], "fit.iterations = 'many': expected `int`"),
+    "section of wrong type": (["scene=3"], "scene = 3: expected `object`"),
+    "table where a list is expected": (['parameter={key="a"}'], "parameter: expected `array`"),
+    "outside its domain": (["fit.spp=0"], "fit.spp = 0: expected `int` >= 1"),
+    "outside an open domain": (["parameter.0.lr=0"], "parameter.0.lr = 0: expected `float` > 0"),
+    "no views": (["views.count=0"], "views.count = 0: expected `int` >= 1"),
+    "no reference files": (['reference={source="files", paths=[]}'], "length >= 1"),
+    "no parameter": (["parameter=[]"], "length >= 1"),
+    "missing key": (["scene={}"], 'the key "scene.file" is missing'),
+    "unknown map": (['parameter.0.map="softpluss"'], 'did you mean "softplus"?'),
+    "truth of two sources": (['truth={key="a", file="b", procedural="tangle"}'], "either a file or procedural"),
+    "a change without a value": (["fit.iterations"], "write key.of.setting=value"),
+    "a change of an entry that is not there": (["parameter.3.lr=1"], '"3" is not there'),
+}
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_wrong_settings(case: str) -> None:
+    """Rationale: configuration that accepts a misspelt key runs with the default and says nothing."""
+    changes, sentence = WRONG[case]
+    settings = raw()
+    with pytest.raises(MivolError) as caught:
+        for change in changes:
+            config.apply_change(settings, change)
+        config.from_dict(settings, "fit.toml")
+    message = str(caught.value)
+    assert sentence in message
+    assert "\n" not in message
+    assert message.endswith((".", "?"))
+
+
+def test_wrong_files(tmp_path: Path) -> None:
+    with pytest.raises(MivolError, match="found no file"):
+        config.load(tmp_path / "none.toml")
+    (tmp_path / "bad.toml").write_text("title = ")
+    with pytest.raises(MivolError, match="is not TOML"):
+        config.load(tmp_path / "bad.toml")
+    (tmp_path / "binary.toml").write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(MivolError, match="is not TOML"):
+        config.load(tmp_path / "binary.toml")
+    with pytest.raises(MivolError, match="is not TOML"):
+        config.load(tmp_path)
+
+
+def test_the_schema_is_strict() -> None:
+    """Every struct that a file can fill refuses unknown fields by itself, too."""
+    seen = [config.Experiment]
+    for struct in seen:
+        assert struct.__struct_config__.forbid_unknown_fields, struct
+        for field in msgspec.structs.fields(struct):
+            seen += [s for s in config.structs_in(getattr(field.type, "__origin__", field.type)) if s not in seen]
+    assert len(seen) > 12

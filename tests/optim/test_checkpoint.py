@@ -1,0 +1,148 @@
+"""A run that was stopped and resumed is the run that was not."""
+
+from __future__ import annotations
+
+import os
+import signal
+from pathlib import Path
+
+import drjit as dr
+import numpy as np
+import pytest
+from fit_scene import KEY, small_problem
+
+from mivol.errors import MivolError
+from mivol.files import atomic
+from mivol.optim import checkpoint
+from mivol.optim.events import Checkpoint, Evaluate, Upsample
+from mivol.optim.interrupt import Interrupted
+from mivol.optim.loop import Fit, reconstruct
+from mivol.optim.optimisers import Adam, GaussNewton, Lbfgs
+
+ITERATIONS = 6
+EVENTS = (Upsample(at=(2,)), Evaluate(every=3))
+CASES = {"adam": Adam(views=2), "lbfgs": Lbfgs(), "gauss_newton": GaussNewton(inner=2)}
+
+
+@pytest.fixture
+def one_thread(variant_rgb):
+    before = dr.thread_count()
+    dr.set_thread_count(1)
+    yield
+    dr.set_thread_count(before)
+
+
+def fit(optimiser, path: Path | None = None, *, stop_after: int = -1, how: int = signal.SIGINT, resume: bool = False) -> Fit:
+    """The same run, stopped by a signal after an iteration where asked for."""
+
+    def observe(at_work: Fit) -> None:
+        if at_work.next == stop_after:
+            os.kill(os.getpid(), how)
+
+    return reconstruct(
+        small_problem(), optimiser, ITERATIONS, events=EVENTS, observer=observe, path=path, resume=resume,
+        measure=lambda problem: {"mean": float(np.asarray(problem.values()[KEY]).mean())}, fingerprint={"a": 1},
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_a_resumed_run_is_bitwise_the_same(one_thread, tmp_path: Path, name: str) -> None:
+    """Rationale: a state that forgets anything (a moment, a pair, a damping, an event) shows in the next step.
+    Expected: with one thread every loss, measure and voxel is equal to the last bit."""
+    path = tmp_path / "checkpoint.npz"
+    whole = fit(CASES[name])
+    for stop_after, how in ((1, signal.SIGINT), (4, signal.SIGTERM)):
+        with pytest.raises(Interrupted):
+            fit(CASES[name], path, stop_after=stop_after, how=how, resume=stop_after > 1)
+    resumed = fit(CASES[name], path, resume=True)
+    assert [r["loss"] for r in resumed.history] == [r["loss"] for r in whole.history]
+    assert [m["mean"] for m in resumed.measures] == [m["mean"] for m in whole.measures]
+    assert resumed.log == whole.log
+    assert np.array_equal(np.asarray(resumed.run.reals[KEY]), np.asarray(whole.run.reals[KEY]))
+
+
+def test_a_resumed_run_is_the_same_with_several_threads(variant_rgb, tmp_path: Path) -> None:
+    """Float sums have no fixed order: 1e-7 per gradient, which Adam's division can turn into 1e-5 of its steps."""
+    path = tmp_path / "checkpoint.npz"
+    whole = fit(Adam())
+    with pytest.raises(Interrupted):
+        fit(Adam(), path, stop_after=3)
+    resumed = fit(Adam(), path, resume=True)
+    assert np.allclose(np.asarray(resumed.run.reals[KEY]), np.asarray(whole.run.reals[KEY]), rtol=1e-5, atol=1e-5)
+
+
+def test_a_signal_in_the_middle_of_an_iteration_loses_nothing(one_thread, tmp_path: Path) -> None:
+    """The signal comes between two renders of iteration 3: that iteration is done again from where it began."""
+    path, whole = tmp_path / "checkpoint.npz", fit(Adam())
+    problem = small_problem()
+    renders = 0
+    kept = problem.render
+
+    def render(*args: object) -> object:
+        nonlocal renders
+        renders += 1
+        if renders == 4:
+            os.kill(os.getpid(), signal.SIGINT)
+        return kept(*args)
+
+    problem.render = render
+    with pytest.raises(Interrupted):
+        reconstruct(problem, Adam(), ITERATIONS, events=EVENTS, path=path, fingerprint={"a": 1})
+    assert renders == 4
+    resumed = fit(Adam(), path, resume=True)
+    assert [r["loss"] for r in resumed.history] == [r["loss"] for r in whole.history]
+    assert np.array_equal(np.asarray(resumed.run.reals[KEY]), np.asarray(whole.run.reals[KEY]))
+
+
+def test_checkpoints_are_written_when_due(variant_rgb, tmp_path: Path) -> None:
+    path = tmp_path / "checkpoint.npz"
+    found = []
+
+    def observe(at_work: Fit) -> None:
+        found.append(checkpoint.read(path, {})[1]["next"] if path.exists() else 0)
+
+    reconstruct(small_problem(), Adam(), 6, events=(Checkpoint(every=2),), observer=observe, path=path)
+    assert found == [0, 0, 2, 2, 4, 4]
+
+
+def written(path: Path, fingerprint: dict) -> Path:
+    checkpoint.write(path, {"reals/x": np.arange(3.0)}, {"fingerprint": fingerprint})
+    return path
+
+
+def test_refused_checkpoints(tmp_path: Path) -> None:
+    """Another scene, another setting, none at all, half a file, a file of something else."""
+    here = {"scene": "abc", "optimiser.lr": 0.1, "domain": [0.0, float("inf")]}
+    path = written(tmp_path / "a.npz", here)
+    assert checkpoint.read(path, here)[0]["reals/x"].tolist() == [0, 1, 2]
+    for change, sentence in (
+        ({"scene": "abd"}, "scene is 'abc' there and 'abd' here"),
+        ({"optimiser.lr": 0.2}, "optimiser.lr is 0.1 there and 0.2 here"),
+        ({"new": 1}, "new is None there and 1 here"),
+    ):
+        with pytest.raises(MivolError, match=sentence):
+            checkpoint.read(path, here | change)
+    with pytest.raises(MivolError, match="without --resume first"):
+        checkpoint.read(tmp_path / "none.npz", here)
+    data = path.read_bytes()
+    for broken in (data[: len(data) // 2], b"", b"no checkpoint at all"):
+        (tmp_path / "b.npz").write_bytes(broken)
+        with pytest.raises(MivolError, match="not a whole checkpoint"):
+            checkpoint.read(tmp_path / "b.npz", here)
+    np.savez(tmp_path / "c.npz", x=1)
+    with pytest.raises(MivolError, match="not a whole checkpoint"):
+        checkpoint.read(tmp_path / "c.npz", here)
+
+
+def test_a_full_disk_leaves_the_last_checkpoint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = written(tmp_path / "a.npz", {"a": 1})
+    before = path.read_bytes()
+
+    def full(path: Path) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(atomic, "_sync", full)
+    with pytest.raises(MivolError, match="no space left"):
+        written(path, {"a": 2})
+    assert path.read_bytes() == before
+    assert [p.name for p in tmp_path.iterdir()] == ["a.npz"]
