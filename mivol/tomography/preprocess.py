@@ -189,9 +189,13 @@ def axis_from_mirrors(y: np.ndarray, angles: np.ndarray, n_pairs: int = 12) -> A
         angles: (views,) [rad].
         n_pairs: how many pairs to use at most.
 
-    Raises: MivolError: no two views are within 5 degrees of half a turn.
+    Raises: MivolError: no two views are within 5 degrees of half a turn, or one of them shows nothing.
     """
     first, second, miss = _opposite_pairs(np.asarray(angles, float), n_pairs)
+    used = np.union1d(first, second)
+    flat = used[np.ptp(y[used], axis=-1).max(axis=-1) <= 0]
+    if len(flat):
+        raise MivolError(f"Found view {flat[0]} without contrast, expected an object in every view.")
     columns = np.array([_mirror_column(y[i], y[j]) for i, j in zip(first, second, strict=True)])
     uneven = np.ptp(miss) > 1e-9
     design = np.stack([np.ones_like(miss), miss], 1) if uneven else np.ones((len(miss), 1))
