@@ -22,6 +22,7 @@ class MivolMedium(mi.Medium):
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
         self.coefficients = Coefficients.from_props(props)
+        self.volumes = self.coefficients.volumes  # dr.freeze finds arrays among a plugin's own attributes only
         self.scale = mi.Float(props.get("scale", 1.0))
         dr.make_opaque(self.scale)
         self.m_is_homogeneous = self.coefficients.is_homogeneous

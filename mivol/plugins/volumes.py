@@ -19,6 +19,7 @@ class VoxelVolume(mi.Volume):
 
     def __init__(self, props: mi.Properties) -> None:
         self.field = Voxels.from_props(props)
+        self.texture = self.field.texture  # dr.freeze finds arrays among a plugin's own attributes only
         props["to_world"] = mi.ScalarTransform4f(self.field.to_world)
         super().__init__(props)
 

@@ -14,6 +14,7 @@ import mitsuba as mi
 import numpy as np
 
 from mivol.errors import MivolError
+from mivol.files import check_volume
 from mivol.transport.lattice import block_bounds
 from mivol.transport.medium import Box, MediumView, box_of_cube, kind_of, view_medium
 
@@ -198,12 +199,18 @@ class _Read:
     maximum: float
 
 
-def read_values(values: mi.TensorXf, survey: Survey) -> _Read:
-    """Read a grid's bounds once for each state of its array."""
+def read_values(values: mi.TensorXf, survey: Survey, name: str) -> _Read:
+    """Read a grid's bounds once for each state of its array.
+
+    Raises:
+        MivolError: NaN, infinite or negative values; the first bad voxel is named.
+    """
     array = dr.detach(values.array)
     key = array.index
     if key not in survey.values:
         bounds = block_bounds(values)
+        if not (dr.all(dr.isfinite(bounds)) and dr.all(array >= 0)):
+            check_volume(np.array(dr.detach(values)), name=name)
         survey.values = dict(list(survey.values.items())[-15:])
         host = np.array(bounds)
         survey.values[key] = _Read(array, bounds, float((host > 0).mean()), float(host.max(initial=0.0)))
@@ -224,7 +231,7 @@ def _facts(boundary: Boundary, survey: Survey, recording: bool) -> MediumFacts:
     }
     if recording:
         return MediumFacts(**common, is_scattering=False, occupied=1.0, tau_max=None, unread=True)
-    reads = [read_values(g.values, survey) for g in grids]
+    reads = [read_values(g.values, survey, boundary.name) for g in grids]
     occupied = min((r.occupied for r in reads), default=1.0)
     return MediumFacts(**common, is_scattering=view.is_scattering(), occupied=occupied, tau_max=_tau_max(boundary, view, reads))
 

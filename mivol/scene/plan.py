@@ -12,9 +12,9 @@ from pathlib import Path
 
 import drjit as dr
 import mitsuba as mi
-import psutil
 
 from mivol.errors import MivolError
+from mivol.machine import available_memory
 from mivol.scene.needs import Needs, Survey, find_needs, read_values, survey_scene
 from mivol.transport.aovs import AOVS
 from mivol.transport.medium import view_medium
@@ -141,8 +141,8 @@ def _gradient(needs: Needs) -> tuple[int, Choice]:
             fits = needs.variant.startswith("llvm") and packed <= PACKED_LIMIT
             memory += (packed if fits else 0) + 8 * z * y * x * channels
             ways.add("packed corners, one copy a thread" if fits else "added to the nodes")
-    free = psutil.virtual_memory().available
-    if needs.parameters and needs.variant.startswith("llvm") and memory > free:
+    free = available_memory()
+    if needs.parameters and needs.variant.startswith("llvm") and free is not None and memory > free:
         raise MivolError(
             f"a gradient step would take {memory / 2**30:.1f} GiB and {free / 2**30:.1f} GiB are free; lower the resolution "
             "of the grids."
@@ -159,7 +159,7 @@ def build_world(needs: Needs, plan: Plan, settings: Settings, survey: Survey) ->
         view = view_medium(boundary.medium, boundary.box)
         for part in view.parts:
             if skip and part.lattice is not None:
-                part.lattice.bounds = read_values(part.lattice.values, survey).bounds
+                part.lattice.bounds = read_values(part.lattice.values, survey, boundary.name).bounds
         bodies.append(Body(view, boundary.box))
     return World(
         bodies,

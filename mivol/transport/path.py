@@ -233,7 +233,8 @@ def walk_path(
         score=score,
         sampler=sampler,
     )
-    if limit <= 1 and not world.is_veiled:
+    # One stretch: nothing turns a path that no surface meets, nor one of depth 1 (unless a surface lets it pass).
+    if not world.has_surfaces or (limit <= 1 and not world.is_veiled):
         path = _see(scene, world, settings, path)[0]
         return path.score, path.valid
     (path,) = dr.while_loop(

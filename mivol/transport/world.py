@@ -97,6 +97,7 @@ class World:
         self.boxed = [b for b in bodies if b.box is not None]
         # A traced stretch is recognised by its medium, which several boundaries may share.
         self.traced = list({b.view.medium.ptr: b for b in bodies if b.box is None}.values())
+        self.has_surfaces = has_surfaces
         self.traces = has_surfaces or bool(self.traced)
         self.channels = 1 if mi.is_monochromatic else max([b.view.channels for b in bodies], default=1)
         self.scatters, self.is_veiled, self.start, self.locates = scatters, is_veiled, start, locates

@@ -6,10 +6,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-import scenes
-from scenes import box_of, camera, grid_volume, medium, sky
 
+import scenes
 from mivol.scene import plan
+from scenes import box_of, camera, grid_volume, medium, sky
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
 
@@ -24,7 +24,9 @@ def values(channels: int = 1) -> np.ndarray:
     return np.random.default_rng(3).uniform(0.2, 2.0, (5, 4, 6, channels)).astype(np.float32)
 
 
-def build(channels: int = 1, rfilter: str = "box", crop: bool = False, kind: str = "mivol_medium", lit: bool = True) -> mi.Scene:
+def build(
+    channels: int = 1, rfilter: str = "box", crop: bool = False, kind: str = "mivol_medium", lit: bool = True
+) -> mi.Scene:
     """A volume with a ball in it over a floor, under a lamp and a sky."""
     volume = "mivol_voxels" if kind == "mivol_medium" else "gridvolume"
     parts = {
@@ -79,13 +81,13 @@ def image(scene: mi.Scene, integrator: mi.Integrator, seed: int, spp: int) -> np
 
 
 CASES = {
-    "depth 1": dict(depth=1),
-    "depth 2": dict(depth=2),
-    "depth 4, wide filter": dict(depth=4, rfilter="gaussian"),
-    "no limit, crop": dict(depth=-1, crop=True),
-    "rgb, depth 2": dict(depth=2, channels=3),
-    "stock, depth 3, crop, wide filter": dict(depth=3, kind="heterogeneous", crop=True, rfilter="gaussian"),
-    "no surface": dict(depth=6, lit=False),
+    "depth 1": {"depth": 1},
+    "depth 2": {"depth": 2},
+    "depth 4, wide filter": {"depth": 4, "rfilter": "gaussian"},
+    "no limit, crop": {"depth": -1, "crop": True},
+    "rgb, depth 2": {"depth": 2, "channels": 3},
+    "stock, depth 3, crop, wide filter": {"depth": 3, "kind": "heterogeneous", "crop": True, "rfilter": "gaussian"},
+    "no surface": {"depth": 6, "lit": False},
 }
 
 
@@ -204,7 +206,8 @@ def test_replay_counts_down_to_zero():
     world = plan.build_world(needs, plan.make_plan(needs, settings), settings, survey)
     sampler = sensor.sampler().clone()
     n = 2000
-    ray, _ = sensor.sample_ray(0, 0, mi.Point2f(np.random.default_rng(0).uniform(size=(2, n)).astype(np.float32)), mi.Point2f(0.5))
+    position = mi.Point2f(np.random.default_rng(0).uniform(size=(2, n)).astype(np.float32))
+    ray, _ = sensor.sample_ray(0, 0, position, mi.Point2f(0.5))
     with dr.suspend_grad():
         sampler.seed(3, n)
         L = walk_path(scene, world, settings, sampler, ray, Primal(dr.zeros(mi.Spectrum, n)))[0].L

@@ -1,0 +1,157 @@
+"""A scene is asked what it needs, and nothing else is computed: what the kernels hold is counted."""
+
+from __future__ import annotations
+
+import re
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+import scenes
+from mivol.scene import plan
+from mivol.scene.needs import find_needs
+from mivol.scene.plan import explain, make_plan
+from mivol.transport.path import Settings
+from scenes import ball_of, box_of, camera, grid_volume, medium, refused, sky
+
+pytestmark = pytest.mark.usefixtures("variant_rgb")
+
+PLACE = scenes.centred(2 * np.eye(3))
+
+
+def values(channels: int = 1) -> np.ndarray:
+    return np.random.default_rng(0).uniform(0.1, 1, (4, 5, 6, channels)).astype(np.float32)
+
+
+def scene_of(*, boundary=box_of, where=(PLACE,), sigma_t=None, albedo=0.0, kind="mivol_medium", **more) -> mi.Scene:
+    sigma_t = grid_volume("mivol_voxels", values(), PLACE) if sigma_t is None else sigma_t
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "box": boundary(medium(kind, sigma_t, albedo), *where),
+            "sky": sky(),
+            "sensor": camera((2.0, 1.5, 3.0), (0.0, 0.0, 0.0), res=8, fov=45.0),
+            **more,
+        }
+    )
+
+
+def kernels(scene: mi.Scene, depth: int = 1) -> str:
+    """The LLVM code of all that a warm render launches."""
+    if not mi.variant().startswith("llvm"):
+        pytest.skip(f"counts instructions of LLVM kernels; the variant is {mi.variant()}")
+    integrator = mi.load_dict({"type": "mivol", "max_depth": depth})
+    dr.eval(mi.render(scene, integrator=integrator, spp=4))
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.kernel_history_clear()
+        dr.eval(mi.render(scene, integrator=integrator, spp=4, seed=1))
+        return "\n".join(k["ir"].getvalue() for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT)
+
+
+def lookups(code: str) -> int:
+    return len(re.findall(r"call <\d+ x \w+> @llvm\.masked\.gather", code))
+
+
+def traced_rays(code: str) -> int:
+    return len(re.findall(r"call void %\w+\(ptr %\w+, ptr %\w+, ptr %\w+_in_ctx", code))
+
+
+def test_grey_field_carries_one_channel():
+    """A homogeneous medium reads no grid; a grey one 8 corners and then 4 a cell; an rgb one three times that."""
+    none = lookups(kernels(scene_of(sigma_t=0.7)))
+    grey = lookups(kernels(scene_of()))
+    rgb = lookups(kernels(scene_of(sigma_t=grid_volume("mivol_voxels", values(3), PLACE))))
+    assert grey - none == 8 + 4
+    assert rgb - none == 3 * (8 + 4)
+
+
+def test_albedo_is_not_looked_up():
+    """An albedo grid costs nothing: at depth 1, and at any depth where it is 0."""
+    plain = lookups(kernels(scene_of()))
+    zero = grid_volume("mivol_voxels", 0 * values(), PLACE)
+    some = grid_volume("mivol_voxels", 0.5 * values(), PLACE)
+    assert lookups(kernels(scene_of(albedo=zero), depth=6)) == plain
+    assert lookups(kernels(scene_of(albedo=some), depth=1)) == plain
+
+
+def test_no_phase_function_and_no_light_sampling():
+    """The kernels of any phase function and depth are the same, to the letter: none is in them."""
+    plain = kernels(scene_of())
+    with_phase = scene_of(kind="heterogeneous", sigma_t=grid_volume("gridvolume", values(), PLACE))
+    peaked = mi.load_dict(
+        {
+            "type": "scene",
+            "box": box_of(
+                medium("heterogeneous", grid_volume("gridvolume", values(), PLACE), phase={"type": "hg", "g": 0.9}), PLACE
+            ),
+            "sky": sky(),
+            "sensor": camera((2.0, 1.5, 3.0), (0.0, 0.0, 0.0), res=8, fov=45.0),
+        }
+    )
+    assert lookups(kernels(peaked, depth=6)) == lookups(kernels(with_phase, depth=1)) == lookups(plain)
+    assert len(kernels(peaked, depth=6).splitlines()) == len(kernels(with_phase, depth=1).splitlines())
+
+
+def test_boxes_trace_no_acceleration_structure():
+    """A box is a slab test; a sphere is traced, and so is a box with a surface beside it."""
+    wall = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, -3])}
+    assert traced_rays(kernels(scene_of())) == 0
+    assert traced_rays(kernels(scene_of(boundary=ball_of, where=((0, 0, 0), 1.0)))) == 1
+    assert traced_rays(kernels(scene_of(wall=wall))) == 1
+
+
+def test_depth_1_shades_no_surface():
+    """What a surface would need (light sampling, its shadow ray) is not in the kernel of depth 1."""
+    scene = scene_of(wall={"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, -3])})
+    assert traced_rays(kernels(scene, depth=1)) == 1
+    assert traced_rays(kernels(scene, depth=2)) == 2
+
+
+def test_explain_gives_a_reason_for_each_choice():
+    text = explain(scene_of(sigma_t=grid_volume("mivol_voxels", values(3), PLACE)))
+    for fact in ("rgb extinction", "4x5x6", "albedo 0", "ConstantBackgroundEmitter", "not traced", "gradient step"):
+        assert fact in text
+    choices = [line for line in text.split("plan\n")[1].splitlines() if "because" not in line]
+    assert text.count("because") == len(choices) >= 5
+
+
+def test_scattering_is_refused_before_anything_is_rendered():
+    scene = scene_of(albedo=0.5)
+    with refused("scatters .* max_depth is 2"):
+        make_plan(find_needs(scene, scene.sensors()[0]), Settings(max_depth=2))
+    make_plan(find_needs(scene, scene.sensors()[0]), Settings(max_depth=1))
+
+
+def test_gradient_step_that_cannot_fit_is_refused(monkeypatch):
+    scene = scene_of()
+    params = mi.traverse(scene)
+    dr.enable_grad(params["box.interior_medium.sigma_t.data"])
+    needs = find_needs(scene, scene.sensors()[0])
+    assert "box.interior_medium.sigma_t.data" in needs.parameters
+    make_plan(needs, Settings(max_depth=1))
+    monkeypatch.setattr(plan, "available_memory", lambda: 1000)
+    if mi.variant().startswith("llvm"):
+        with refused("gradient step would take"):
+            make_plan(needs, Settings(max_depth=1))
+
+
+def test_empty_space_is_skipped_where_it_pays():
+    sparse = np.zeros((40, 40, 40, 1), np.float32)
+    sparse[:8, :8, :8] = 1
+    scene = scene_of(sigma_t=grid_volume("mivol_voxels", sparse, PLACE))
+    needs = find_needs(scene, scene.sensors()[0])
+    assert make_plan(needs, Settings(max_depth=1)).skips == (True,)
+    scene = scene_of()
+    assert make_plan(find_needs(scene, scene.sensors()[0]), Settings(max_depth=1)).skips == (False,)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -1.0])
+def test_hard_27_bad_stock_voxels_are_named(bad):
+    """Stock gridvolume takes them in silence; the voxel is named before a kernel runs."""
+    wrong = values()
+    wrong[1, 2, 3] = bad
+    scene = scene_of(kind="heterogeneous", sigma_t=grid_volume("gridvolume", wrong, PLACE))
+    with refused(r"z=1, y=2, x=3"):
+        make_plan(find_needs(scene, scene.sensors()[0]), Settings(max_depth=1))
