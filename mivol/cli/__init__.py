@@ -29,7 +29,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         return arguments.verb(arguments) or 0
     except (MivolError, OSError) as error:
-        print(f"mivol: {' '.join(str(error).split())}", file=sys.stderr)
+        print(f"mivol: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
         print("mivol: stopped; what was finished is kept.", file=sys.stderr)

@@ -65,7 +65,13 @@ def folder(tmp_path: Path) -> Path:
     (tmp_path / "scene.xml").write_text(SCENE)
     (tmp_path / "fit.toml").write_text(FIT)
     write_volume(tmp_path / "start.vol", np.full((2, 2, 2, 1), 0.25, "f"))
+    for name in "abc":
+        write_exr(tmp_path / f"{name}.exr", {"": np.full((8, 8, 3), 0.7, "f")})
     return tmp_path
+
+
+#: References from files, for tests of what comes after them.
+PHOTOS = ["--set", 'reference={source="files", paths=["a.exr", "b.exr", "c.exr"]}', "--set", "event=[]"]
 
 
 def run(*arguments: object) -> int:
@@ -207,18 +213,17 @@ def test_references_are_cached(variant_rgb, folder: Path, monkeypatch: pytest.Mo
 
 def test_references_from_files(variant_rgb, folder: Path, capsys: pytest.CaptureFixture) -> None:
     """Photographs (no header) are taken as they are; mivol's own must be of this scene."""
-    for name in ("a", "b"):
-        write_exr(folder / f"{name}.exr", {"": np.full((6, 8, 3), 0.7, "f")})
+    write_exr(folder / "a.exr", {"": np.full((6, 8, 3), 0.7, "f")})
     (folder / "other.xml").write_text(SCENE.replace('value="35"', 'value="36"'))
     changes = ["--set", 'views={rig="scene", indices=[0]}', "--set", "event=[]", "--set", "fit.iterations=2"]
     files = ["--set", 'reference={source="files", paths=["a.exr"]}']
     assert run("optimize", folder / "fit.toml", "-o", folder / "run", *changes, *files) == 0
-    assert run("reference", folder / "other.xml", "-o", folder / "c.exr", "--max-depth", 6, "--spp", 32) == 0
+    assert run("reference", folder / "other.xml", "-o", folder / "d.exr", "--max-depth", 6, "--spp", 32) == 0
     capsys.readouterr()
-    wrong = ["--set", 'reference={source="files", paths=["c.exr"]}']
+    wrong = ["--set", 'reference={source="files", paths=["d.exr"]}']
     said = refused(capsys, "optimize", folder / "fit.toml", "-o", folder / "run", *changes, *wrong)
     assert "reference of another scene" in said
-    right = ["--set", 'reference={source="files", paths=["c.exr"], scene="other.xml"}']
+    right = ["--set", 'reference={source="files", paths=["d.exr"], scene="other.xml"}']
     assert run("optimize", folder / "fit.toml", "-o", folder / "run", *changes, *right) == 0
 
 
@@ -254,7 +259,7 @@ def test_views_of_different_sizes(variant_rgb, folder: Path, capsys: pytest.Capt
 
 
 def test_disk_full(variant_rgb, folder: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The disk fills up after the references: one sentence, the references are kept, and a second try ends well."""
+    """The disk fills up at the first checkpoint: one sentence, nothing half-written, and a second try ends well."""
     sync, target = atomic._sync, folder / "run"
 
     def full(path: Path) -> None:
@@ -264,17 +269,16 @@ def test_disk_full(variant_rgb, folder: Path, capsys: pytest.CaptureFixture, mon
 
     with monkeypatch.context() as patch:
         patch.setattr(atomic, "_sync", full)
-        said = refused(capsys, "optimize", folder / "fit.toml", "-o", target)
+        said = refused(capsys, "optimize", folder / "fit.toml", "-o", target, *PHOTOS)
     assert "no space left" in said
     assert not any(name.endswith(".part") for name in files_of(target))
-    assert len(list((target / "references").glob("*.exr"))) == 3
-    assert run("optimize", folder / "fit.toml", "-o", target) == 0
+    assert run("optimize", folder / "fit.toml", "-o", target, *PHOTOS) == 0
 
 
 def test_interrupted_run_is_resumed(variant_rgb, folder: Path) -> None:
     """Rationale: SIGTERM is how clusters stop jobs. Expected: exit code 130, one sentence, a checkpoint, status
     "stopped"; --resume ends with the very metrics of a run that was not stopped (one thread), each row once."""
-    long = ["--set", "fit.iterations=40", "--set", "event=[]"]
+    long = [*PHOTOS, "--set", "fit.iterations=20"]
     assert run("optimize", folder / "fit.toml", "-o", folder / "whole", *long) == 0
     command = [sys.executable, "-m", "mivol", "optimize", str(folder / "fit.toml"), "-o", str(folder / "cut"), *long]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=os.environ) as child:
@@ -293,16 +297,15 @@ def test_interrupted_run_is_resumed(variant_rgb, folder: Path) -> None:
     texts = [(folder / name / "metrics.jsonl").read_text() for name in ("whole", "cut")]
     rows = [[(row["iteration"], row.get("loss")) for row in map(json.loads, text.splitlines())] for text in texts]
     assert rows[0] == rows[1]
-    assert [iteration for iteration, _ in rows[0]] == list(range(41))
+    assert [iteration for iteration, _ in rows[0]] == list(range(21))
     assert json.loads((folder / "cut" / "run.json").read_text())["status"] == "finished"
 
 
 def test_resume_refuses_other_settings(variant_rgb, folder: Path, capsys: pytest.CaptureFixture) -> None:
-    target = folder / "run"
-    assert "without --resume first" in refused(capsys, "optimize", folder / "fit.toml", "-o", target, "--resume")
-    assert run("optimize", folder / "fit.toml", "-o", target, "--set", "fit.iterations=2") == 0
-    flags = ["--resume", "--set", "fit.iterations=2", "--set", "optimiser.beta_1=0.8"]
-    said = refused(capsys, "optimize", folder / "fit.toml", "-o", target, *flags)
+    flags = ["optimize", folder / "fit.toml", "-o", folder / "run", *PHOTOS, "--set", "fit.iterations=2"]
+    assert "without --resume first" in refused(capsys, *flags, "--resume")
+    assert run(*flags) == 0
+    said = refused(capsys, *flags, "--resume", "--set", "optimiser.beta_1=0.8")
     assert "optimiser.beta_1 is 0.9 there and 0.8 here" in said
 
 
@@ -310,7 +313,7 @@ def test_resume_refuses_other_settings(variant_rgb, folder: Path, capsys: pytest
 
 
 def test_report_writes_the_page_again(variant_rgb, folder: Path, capsys: pytest.CaptureFixture) -> None:
-    assert run("optimize", folder / "fit.toml", "-o", folder / "run", "--set", "fit.iterations=1") == 0
+    assert run("optimize", folder / "fit.toml", "-o", folder / "run", *PHOTOS, "--set", "fit.iterations=1") == 0
     page = (folder / "run" / "report.html").read_bytes()
     (folder / "run" / "report.html").unlink()
     assert run("report", folder / "run") == 0
