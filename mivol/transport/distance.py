@@ -164,19 +164,23 @@ class _Lay:
     segment: Segment | None
 
 
+def _check_grids(body: Body) -> None:
+    """Refuse grids that do not share their cells."""
+    grids = [p.lattice for p in body.view.parts if p.lattice is not None]
+    for other in grids[1:]:
+        if other.res != grids[0].res or not np.array_equal(other.to_world, grids[0].to_world):
+            raise MivolError(
+                f"the AOV depth was asked for and a medium sums grids of {grids[0].res} and {other.res} voxels (Z, Y, X); "
+                "give both the same resolution and to_world, or leave depth out of aovs."
+            )
+
+
 def _lay(body: Body, ray: mi.Ray3f, t0: mi.Float, t1: mi.Float) -> _Lay:
     grids = [p for p in body.view.parts if p.lattice is not None]
     start, end = mi.Float(t0), mi.Float(t1)
     if not grids:
         return _Lay(start, end, end, end, None, None)
-    first = grids[0].lattice
-    for other in (p.lattice for p in grids[1:]):
-        if other.res != first.res or not np.array_equal(other.to_world, first.to_world):
-            raise MivolError(
-                f"the AOV depth was asked for and a medium sums grids of {first.res} and {other.res} voxels; give both "
-                "the same resolution and to_world, or leave depth out of aovs."
-            )
-    segment = clip(first, ray.o, -ray.d, -t1, -t0)
+    segment = clip(grids[0].lattice, ray.o, -ray.d, -t1, -t0)
     hit = segment.length > 0
     leave = dr.select(hit, -segment.t0, end)
     return _Lay(start, dr.select(hit, leave - segment.length, end), leave, end, grids[0], segment)
@@ -379,6 +383,8 @@ def _link(
     scene: mi.Scene, world: World, way: Way, end: Reach, origin: mi.Float, active: mi.Bool, tangent: bool, skip: bool
 ) -> _Chain:
     """Measure each body by itself and put them in the order of the ray."""
+    for body in world.bodies:
+        _check_grids(body)
     k, rows = world.channels, world.channels * (2 if tangent else 1)
 
     def visit_box(found: list[_Boxed], body: Body, t0: mi.Float64, t1: mi.Float64, on: mi.Bool) -> list[_Boxed]:
