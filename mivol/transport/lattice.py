@@ -251,7 +251,9 @@ def walk(
     frac = dr.select(ahead, segment.frac, 1 - segment.frac)  #                  position in it, from its near planes
     left = mi.Float(segment.length)  #                                          world length still to go
     lost = mi.Float(0)  #                                                       what its last digit could not hold
-    corners = _read(reads, box_nodes(cell, ahead, lattice.res), active)
+    stride, top = mi.Vector3i(1, x, x * y), mi.Vector3i(x - 1, y - 1, z - 1)
+    near, far = _planes(cell, ahead, lattice.res)  #                            flat offsets of the corners, an axis each
+    corners = _read(reads, _box(near, far), active)
 
     while dr.hint(active, label="lattice walk"):
         # -- Cells to cross at once: one, or what is left of an empty block ---------------------------------------------
@@ -263,12 +265,13 @@ def walk(
             full = dr.gather(mi.Float, lattice.bounds, mi.UInt32(index), active) > 0
             inner = (cell + 1) & (BLOCK - 1)
             span = dr.select(full, 0, dr.select(ahead, BLOCK - 1 - inner, inner))
-            corners = _read(reads, box_nodes(cell, ahead, lattice.res), full)
+            near, far = _planes(cell, ahead, lattice.res)
+            corners = _read(reads, _box(near, far), full)
 
         # -- Distance to the planes ahead, and visit ----------------------------------------------------------------------
         reach = (mi.Vector3f(span) + (1 - frac)) * pace
-        plane = dr.min(reach)
-        dt = dr.minimum(plane, left)
+        plane = _least(_least(reach.x, reach.y), reach.z)
+        dt = _least(plane, left)
         here = Cell(corners, cell, ahead, frac, speed * dt, segment.length - left, dt)
         state = visit(state, here, active & full)
 
@@ -286,13 +289,22 @@ def walk(
 
         # -- Advance: the axis whose plane was reached lands on it, the others move on within the span ---------------------
         there = dr.fma(speed, dt, frac)
-        jump = dr.clip(mi.Vector3i(dr.floor(there)), 0, span)
-        cell = dr.clip(cell + sign * dr.select(through, span + 1, jump), -1, mi.Vector3i(x - 1, y - 1, z - 1))
-        frac = dr.select(through, 0, dr.clip(there - mi.Vector3f(jump), 0, 1))
-        if not skip:
-            front = _far_face(cell, ahead, through, lattice.res)
-            corners = _shift(corners, through, _read(reads, front, active))
+        if skip:
+            jump = dr.clip(mi.Vector3i(dr.floor(there)), 0, span)
+            cell = dr.clip(cell + sign * dr.select(through, span + 1, jump), -1, top)
+            there = dr.maximum(there - mi.Vector3f(jump), 0)
+        else:
+            cell = dr.clip(dr.select(through, cell + sign, cell), -1, top)
+            near = dr.select(through, far, near)
+            far = dr.select(through, dr.clip(far + sign * stride, 0, top * stride), far)
+            corners = _shift(corners, through, _read(reads, _far_face(near, far, through), active))
+        frac = dr.select(through, 0, _least(there, mi.Vector3f(1)))
     return state
+
+
+def _least(a: mi.Float, b: mi.Float) -> mi.Float:
+    """The smaller of two numbers that are not NaN: ``dr.minimum`` would carry a NaN on, at twice the price of this."""
+    return dr.select(a < b, a, b)
 
 
 def _planes(cell: mi.Vector3i, ahead: Mask3, res: tuple[int, int, int]) -> tuple[mi.Vector3i, mi.Vector3i]:
@@ -305,16 +317,18 @@ def _planes(cell: mi.Vector3i, ahead: Mask3, res: tuple[int, int, int]) -> tuple
 
 def box_nodes(cell: mi.Vector3i, ahead: Mask3, res: tuple[int, int, int]) -> list[mi.UInt32]:
     """Flat node indices of the 8 corners of a cell, near and far along ``ahead`` (all true: lower and upper)."""
-    near, far = _planes(cell, ahead, res)
+    return _box(*_planes(cell, ahead, res))
+
+
+def _box(near: mi.Vector3i, far: mi.Vector3i) -> list[mi.UInt32]:
     return [mi.UInt32(k + j + i) for k in (near.z, far.z) for j in (near.y, far.y) for i in (near.x, far.x)]
 
 
-def _far_face(cell: mi.Vector3i, ahead: Mask3, through: Mask3, res: tuple[int, int, int]) -> list[mi.UInt32]:
+def _far_face(near: mi.Vector3i, far: mi.Vector3i, through: Mask3) -> list[mi.UInt32]:
     """Flat node indices of the 4 far corners across the axis ``through``.
 
     In the order of the two other axes, the lower one fastest: (y, z), (x, z) or (x, y).
     """
-    near, far = _planes(cell, ahead, res)
     base = dr.select(through, far, near)
     base = base.x + base.y + base.z
     wide = far - near

@@ -184,9 +184,15 @@ def gauss_points(cell: Cell) -> tuple[mi.Vector3f, mi.Vector3f]:
 
 def interpolate(corners: list[mi.Float], frac: mi.Vector3f) -> mi.Float:
     """The trilinear value at a point of a cell; bits 0, 1, 2 of the corner are x, y, z."""
-    x = [dr.lerp(corners[q], corners[q + 1], frac.x) for q in (0, 2, 4, 6)]
-    y = [dr.lerp(x[0], x[1], frac.y), dr.lerp(x[2], x[3], frac.y)]
-    return dr.lerp(y[0], y[1], frac.z)
+    # a + t (b - a), not a (1 - t) + b t: the differences along x are shared by all points of a cell. It errs by an ulp of the
+    # larger corner, and is exact where the corners are equal.
+    x = [_lerp(corners[q], corners[q + 1], frac.x) for q in (0, 2, 4, 6)]
+    y = [_lerp(x[0], x[1], frac.y), _lerp(x[2], x[3], frac.y)]
+    return _lerp(y[0], y[1], frac.z)
+
+
+def _lerp(a: mi.Float, b: mi.Float, t: mi.Float) -> mi.Float:
+    return dr.fma(t, b - a, a)
 
 
 def weights(frac: mi.Vector3f) -> list[mi.Float]:
