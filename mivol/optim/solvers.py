@@ -180,7 +180,7 @@ def conjugate_gradients(problem: LeastSquares, state: State | None = None, preco
             return
         x, r = x + step[0], r - step[1]
         if problem.nonnegative:
-            x = np.maximum(x, 0)
+            x = np.maximum(x, 0)  # rounding only: the step ends in the domain
         memory = {"residual": r, "direction": direction, "gradient": g, "gz": np.asarray(gz)}
         state = _ls_state(problem, x, state.iteration + 1, r, memory)
         yield state
