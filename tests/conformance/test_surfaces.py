@@ -1,0 +1,114 @@
+"""Surfaces among absorbing media keep the shading that Mitsuba gives them: every kind of lamp and BSDF, against volpath."""
+
+from __future__ import annotations
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+import scenes
+from mivol.validate.statistics import Moments, assert_same_mean
+from scenes import ball_of, box_of, camera, grid_volume, medium, sky
+
+pytestmark = pytest.mark.usefixtures("variant_rgb")
+
+PLACE = scenes.centred(2 * np.eye(3))
+RED = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.8, 0.3, 0.2]}}
+
+
+def turn() -> mi.ScalarTransform4f:
+    return mi.ScalarTransform4f()
+
+
+def room(**more: object) -> dict:
+    """A ball in a volume over a floor; lamps are added."""
+    values = np.random.default_rng(5).uniform(0, 1, (4, 5, 6, 1)).astype(np.float32)
+    return {
+        "type": "scene",
+        "box": box_of(medium("heterogeneous", grid_volume("gridvolume", values, PLACE)), PLACE),
+        "floor": {"type": "rectangle", "bsdf": RED, "to_world": turn().translate([0, -1.2, 0]).rotate([1, 0, 0], -90).scale(5)},
+        "ball": {"type": "sphere", "radius": 0.5, "bsdf": {"type": "diffuse"}},
+        "sensor": camera((2.0, 1.5, 3.0), (0.0, -0.2, 0.0), res=8, fov=40.0),
+        **more,
+    }
+
+
+def lamp(size: float = 1.0) -> dict:
+    return {
+        "type": "rectangle",
+        "to_world": turn().translate([0, 3, 0]).rotate([1, 0, 0], 90).scale(size),
+        "emitter": {"type": "area", "radiance": {"type": "rgb", "value": [4.0, 3.0, 2.0]}},
+    }
+
+
+POINT = {"type": "point", "position": [1.0, 3.0, 1.0], "intensity": 5.0}
+SUN = {"type": "directional", "direction": [0.3, -1.0, -0.2], "irradiance": 2.0}
+SPOT = {"type": "spot", "to_world": {}, "intensity": 9.0, "cutoff_angle": 30.0}
+SHINY = {"type": "roughconductor", "alpha": 0.05}
+MASK = {"type": "mask", "opacity": 0.4, "nested": RED}
+
+
+def rooms() -> dict[str, tuple[dict, int]]:
+    spot = SPOT | {"to_world": turn().look_at([1, 3, 1], [0, 0, 0], [0, 0, 1])}
+    veil = {"type": "rectangle", "bsdf": MASK, "to_world": turn().translate([0, 0, 1.5])}
+    glass = ball_of(medium("homogeneous", 0.7), (0, 0, 0), 0.8) | {"bsdf": {"type": "dielectric"}}
+    fogs = {
+        "one": ball_of(medium("homogeneous", 0.7), (0, 0, 0), 1.0),
+        "two": ball_of(medium("homogeneous", 2.7), (1.5, 0, -1), 0.7),
+    }
+    del_box = {"box": None, "ball": None}
+    return {
+        "sky, depth 2": (room(sky=sky()), 2),
+        "sky, no limit": (room(sky=sky()), -1),
+        "point": (room(lamp=POINT), 2),
+        "sun, depth 3": (room(lamp=SUN), 3),
+        "spot": (room(lamp=spot), 2),
+        "area, depth 1": (room(lamp=lamp(3), sensor=camera((0.0, -1.0, 4.0), (0.0, 1.5, 0.0), res=8, fov=60.0)), 1),
+        "area, depth 4": (room(lamp=lamp()), 4),
+        "glossy under a wide lamp": (room(lamp=lamp(3), floor=room()["floor"] | {"bsdf": SHINY}), 2),
+        "mask, depth 1": (room(sky=sky(), veil=veil), 1),
+        "mask, depth 3": (room(sky=sky(), veil=veil), 3),
+        "two fogs in spheres": (room(sky=sky(), **del_box, **fogs), 2),
+        "glass full of ink": (room(sky=sky(), **del_box, glass=glass), 8),
+    }
+
+
+NAMES = (
+    "sky, depth 2", "sky, no limit", "point", "sun, depth 3", "spot", "area, depth 1", "area, depth 4",
+    "glossy under a wide lamp", "mask, depth 1", "mask, depth 3", "two fogs in spheres", "glass full of ink",
+)  # fmt: skip
+
+
+def batches(scene: mi.Scene, kind: str, depth: int, first: int) -> Moments:
+    integrator = mi.load_dict({"type": kind, "max_depth": depth, "rr_depth": 50})
+    return Moments.of(np.stack([np.array(mi.render(scene, integrator=integrator, spp=96, seed=first + s)) for s in range(10)]))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_surfaces_and_lamps_like_volpath(name):
+    """Means of 10 batches of 96 samples, Student's t over all pixels and channels."""
+    parts, depth = rooms()[name]
+    scene = mi.load_dict({k: v for k, v in parts.items() if v is not None})
+    ours, stock = batches(scene, "mivol", depth, 0), batches(scene, "volpath", depth, 500)
+    # Stock measures media from spawned rays, 1e-4 of a length further on at each boundary: 6e-4 of the radiance (at most 4).
+    assert_same_mean(
+        ours.mean, ours.variance_of_mean, stock.mean, stock.variance_of_mean, n_a=10, n_b=10, rounding=2.4e-3, what=name
+    )
+    assert ours.mean.max() > 1e-3
+
+
+def test_hidden_emitters():
+    """hide_emitters takes the lamp and the sky out of the picture, not their light off the surfaces."""
+    scene = mi.load_dict(room(sky=sky(), lamp=lamp(3), sensor=camera((0.0, 1.5, 6.0), (0.0, 1.5, 0.0), res=8, fov=70.0)))
+    images = {
+        (kind, hide): np.array(
+            mi.render(scene, integrator=mi.load_dict({"type": kind, "max_depth": 2, "hide_emitters": hide}), spp=256)
+        )
+        for kind in ("mivol", "volpath")
+        for hide in (False, True)
+    }
+    for hide in (False, True):
+        ours, stock = images["mivol", hide], images["volpath", hide]
+        # 64 pixels with a standard deviation below 1 of 256 samples each: each mean is known to 0.008.
+        assert abs(ours.mean() - stock.mean()) < 0.05
+    assert images["mivol", False].mean() > images["mivol", True].mean() + 0.2
