@@ -23,6 +23,7 @@ from mivol.optim.optimisers import Adam, GaussNewton, Lbfgs
 from mivol.optim.parameters import MAPS
 from mivol.optim.priors import Bounds, HuberTotalVariation, Laplacian, Sparse, TotalVariation
 from mivol.optim.schedules import Constant, Cosine, Exponential, Step
+from mivol.optim.solvers import SOLVERS
 from mivol.optim.strategy import nearest, of
 from mivol.scene.cameras import Hemisphere, LookAts, Ring, SceneSensors
 
@@ -125,11 +126,103 @@ class Experiment(Section):
     output: Annotated[str, of("path", "run folder, relative to where the command runs", min_length=1)] = "runs/fit"
 
 
+# -- Tomography -------------------------------------------------------------------------------------------------------
+
+
+class Detector(Section, tag_field="beam"):
+    """What both kinds of beam share; the detector's size and the angles come from the data where it is measured."""
+
+    views: Annotated[int, of("view", "number of views, evenly over the arc", ge=1)] = 90
+    arc: Annotated[float, of("degree", "angle covered", gt=0, le=360)] = 180.0
+    detector: Annotated[tuple[int, int], of("pixel", "(rows, columns)")] = (1, 128)
+    pitch: Annotated[float, of("length", "distance of pixel centres", gt=0)] = 1.0
+    axis_offset: Annotated[float, of("length", "rotation axis from the middle, along the columns")] = 0.0
+
+
+class Parallel(Detector, tag="parallel"):
+    """Parallel light."""
+
+
+class Cone(Detector, kw_only=True, tag="cone"):
+    """A point source."""
+
+    source_to_axis: Annotated[float, of("length", "source to rotation axis", gt=0)]
+    source_to_detector: Annotated[float, of("length", "source to detector", gt=0)]
+
+
+class Simulated(Section):
+    """Noise of projections that are computed."""
+
+    photons: Annotated[float, of("quantum/pixel", "of the light without an object; 0: no noise", ge=0)] = 0.0
+    seed: Annotated[int, of("1", "root of the noise", ge=0)] = 1
+
+
+class Ellipsoids(Simulated, tag_field="source", tag="shepp_logan"):
+    """Exact chords through the Shepp-Logan head: no grid takes part in the data."""
+
+    table: Annotated[str, of("1", "kak-slaney, yu-ye-wang or toft-schabel", min_length=1)] = "yu-ye-wang"
+    half_width: Annotated[float, of("length", "half of the head's box", gt=0)] = 1.0
+    scale: Annotated[float, of("1/length", "factor on its values", gt=0)] = 1.0
+
+
+class Known(Simulated, kw_only=True, tag_field="source", tag="volume"):
+    """Projections of a volume file, by the projector that also reconstructs."""
+
+    file: Annotated[str, of("path", "volume of the grid's shape", min_length=1)]
+    scale: Annotated[float, of("1/length", "factor on its values", gt=0)] = 1.0
+
+
+class Measured(Section, tag_field="source", tag="measured"):
+    """A Data Exchange file (HDF5) with flat and dark fields, of a parallel beam."""
+
+    file: Annotated[str, of("path", "HDF5", min_length=1)]
+    group: Annotated[str, of("1", "where data, data_white, data_dark and theta lie")] = "exchange"
+    find_axis: Annotated[bool, of("1", "find the rotation axis; false: axis_offset holds")] = True
+    air: Annotated[int, of("pixel", "columns at either edge that see no object; 0: light does not drift", ge=0)] = 0
+
+
+class Grid(Section):
+    """Where the voxels lie."""
+
+    shape: Annotated[tuple[int, int, int], of("voxel", "(Z, Y, X)")]
+    voxel_size: Annotated[float, of("length", "edge of a voxel", gt=0)] = 1.0
+
+
+class Solve(Section):
+    """How the projections are inverted."""
+
+    name: Annotated[str, of("1", "key of mivol.optim.solvers.SOLVERS", min_length=1)] = "pcg"
+    iterations: Annotated[int, of("iteration", "at most so many", ge=1)] = 20
+    nonnegative: Annotated[bool, of("1", "keep every voxel at or above 0")] = True
+    subsets: Annotated[int, of("1", "subsets of views, for os-sart", ge=1)] = 10
+    tv: Annotated[float, of("1", "strength of the total variation; 0: none", ge=0)] = 0.0
+    delta: Annotated[float, of("1/length^2", "slope below which noise is smoothed", gt=0)] = 1e-3
+
+    def __post_init__(self) -> None:
+        if self.name not in SOLVERS:
+            raise ValueError(f'unknown solver "{self.name}": {nearest(self.name, list(SOLVERS))}'.rstrip("."))
+
+
+class Scan(Section):
+    """All of a TOML file for tomography: it has a table ``[scan]`` in place of ``[scene]``."""
+
+    title: Annotated[str, of("1", "heading of the report", min_length=1)]
+    scan: Annotated[Parallel | Cone, of("1", "beam and detector")]
+    data: Annotated[Ellipsoids | Known | Measured, of("1", "what was seen")]
+    grid: Annotated[Grid, of("1", "where the voxels lie")]
+    solve: Annotated[Solve, of("1", "how it is inverted")] = Solve()
+    held_out_every: Annotated[int, of("view", "every so many is predicted, not fitted; 0: none", ge=0)] = 0
+    checkpoint_every: Annotated[int, of("iteration", "how often", ge=1)] = 5
+    variant: Annotated[str, of("1", "Mitsuba variant", min_length=1)] = "llvm_ad_rgb"
+    threads: Annotated[int, of("thread", "threads of the CPU back end; 0: all cores", ge=0)] = 0
+    output: Annotated[str, of("path", "run folder, relative to where the command runs", min_length=1)] = "runs/scan"
+
+
 #: Settings that change how a run is stored or how fast it is, not what comes out.
-NOT_RESULT = ("output", "threads", "title")
+NOT_RESULT = ("output", "threads", "title", "checkpoint_every")
 
 
-def load(path: str | Path, changes: Sequence[str] = ()) -> Experiment:
+def load(path: str | Path, changes: Sequence[str] = ()) -> Experiment | Scan:
     """Read an experiment.
 
     Args:
@@ -151,20 +244,21 @@ def load(path: str | Path, changes: Sequence[str] = ()) -> Experiment:
     return from_dict(raw, path.name)
 
 
-def from_dict(raw: dict[str, Any], name: str = "experiment") -> Experiment:
-    """An experiment from plain dicts and lists.
+def from_dict(raw: dict[str, Any], name: str = "experiment") -> Experiment | Scan:
+    """An experiment from plain dicts and lists; one with a table ``scan`` is tomography.
 
     Raises:
         MivolError: as :func:`load`; ``name`` begins the sentence.
     """
-    check_keys(raw, Experiment, "", name)
+    kind = Scan if "scan" in raw else Experiment
+    check_keys(raw, kind, "", name)
     try:
-        return msgspec.convert(raw, Experiment)
+        return msgspec.convert(raw, kind)
     except msgspec.ValidationError as error:
         raise MivolError(f"{name}: {sentence(raw, str(error))}") from None
 
 
-def resolved(experiment: Experiment) -> dict[str, Any]:
+def resolved(experiment: Experiment | Scan) -> dict[str, Any]:
     """Every setting, defaults included, as plain dicts and lists."""
     return msgspec.to_builtins(experiment)
 

@@ -91,7 +91,8 @@ def optimize_flags(sub: argparse.ArgumentParser) -> None:
     """Flags of a fit; the settings of the file come from the schema."""
     from mivol import config
 
-    sub.epilog = "settings of the file:\n  " + "\n  ".join(line.replace("%", "%%") for line in config.describe())
+    lines = ["images:", *config.describe(), "", "projections:", *config.describe(config.Scan)]
+    sub.epilog = "settings of the file for " + "\n  ".join(line.replace("%", "%%") for line in lines)
     sub.add_argument("experiment", type=Path, help="TOML file")
     sub.add_argument("--set", action="append", default=[], metavar="key=value", help="override a setting of the file")
     sub.add_argument("-o", "--output", type=Path, help="run folder")
@@ -146,11 +147,12 @@ def reference(arguments: argparse.Namespace) -> None:
 def optimize(arguments: argparse.Namespace) -> None:
     """Reconstruct a volume from its views; everything that comes of it lies in the run folder."""
     from mivol import config
-    from mivol.cli import experiment
+    from mivol.cli import experiment, scan
 
     chosen = config.load(arguments.experiment, arguments.set)
     folder = arguments.output or Path(chosen.output)
-    page = experiment.run(chosen, arguments.experiment.parent, folder, resume=arguments.resume)
+    kind = scan if isinstance(chosen, config.Scan) else experiment
+    page = kind.run(chosen, arguments.experiment.parent, folder, resume=arguments.resume)
     print(page)
 
 

@@ -30,7 +30,7 @@ from mivol.optim.events import upsample
 from mivol.optim.loop import Fit, reconstruct
 from mivol.optim.parameters import Parameter, as_tensor, find, like
 from mivol.optim.problem import Problem, seed_of
-from mivol.optim.shots import Shot, View, make_shots
+from mivol.optim.shots import Shot, View, check_sizes, make_shots
 from mivol.report import figures
 from mivol.report.page import write_page
 from mivol.report.record import Choice, Image, RunRecord, Volume, append_metrics, read_metrics, rewind_metrics, write_record
@@ -193,6 +193,7 @@ def references(chosen: Experiment, base: Path, folder: Path, loaded: LoadedScene
         MivolError: no views, held-out views that are not there, files that do not fit.
     """
     sensors = chosen.views.sensors(loaded.scene)
+    check_sizes({f"view {index}": camera_of(sensor) for index, sensor in enumerate(sensors)})
     check_held_out(chosen.reference.held_out, len(sensors))
     if isinstance(chosen.reference, Files):
         return read_files(chosen.reference, base, loaded, sensors)
@@ -200,6 +201,11 @@ def references(chosen: Experiment, base: Path, folder: Path, loaded: LoadedScene
         return render_views(chosen, folder, loaded, sensors)
     with holding(loaded.scene, chosen.truth.key, truth):
         return render_views(chosen, folder, load_scene(loaded.scene), sensors)
+
+
+def camera_of(sensor: dict | mi.Sensor) -> mi.Sensor:
+    """What a rig gives, as a sensor."""
+    return mi.load_dict(dict(sensor)) if isinstance(sensor, dict) else sensor
 
 
 def check_held_out(held_out: Sequence[int], count: int) -> None:
@@ -259,8 +265,7 @@ def read_files(wanted: Files, base: Path, loaded: LoadedScene, sensors: Sequence
 
 def add_view(seen: Seen, index: int, sensor: Any, mean: np.ndarray, error: np.ndarray | None, held_out: Sequence[int]) -> None:
     """Sort a view in."""
-    camera = mi.load_dict(dict(sensor)) if isinstance(sensor, dict) else sensor
-    view = View(f"view {index}", camera, mi.TensorXf(np.ascontiguousarray(mean, dtype=np.float32)))
+    view = View(f"view {index}", camera_of(sensor), mi.TensorXf(np.ascontiguousarray(mean, dtype=np.float32)))
     (seen.held_out if index in held_out else seen.fitted).append(view)
     if error is not None:
         seen.standard_errors[view.name] = error
@@ -427,16 +432,19 @@ def write_view(folder: Path, problem: Problem, view: View, seen: Seen) -> list[I
     write_png(folder / f"{stem}_reference.png", reference)
     held_out = any(view is other for other in seen.held_out)
     return [
-        Image(path=f"{stem}.exr", role=role, view=view.name, held_out=held_out, layer=layer)
-        for role, (layer, _) in parts.items()
+        Image(path=f"{stem}.exr", role=role, view=view.name, held_out=held_out, layer=layer_of(*part))
+        for role, part in parts.items()
     ]
 
 
 def named(layer: str, image: np.ndarray) -> dict[str, np.ndarray]:
     """Channels of an image (height, width, 1 or 3), as an OpenEXR layer."""
-    if image.shape[2] == 3:
-        return {layer: image}
-    return {f"{layer}.Y".lstrip("."): image[..., 0]}
+    return {layer: image} if image.shape[2] == 3 else {layer_of(layer, image): image[..., 0]}
+
+
+def layer_of(layer: str, image: np.ndarray) -> str:
+    """What a record calls a layer: single channels have a name of their own."""
+    return layer if image.shape[2] == 3 else f"{layer}.Y".lstrip(".")
 
 
 def write_grid(chosen: Experiment, folder: Path, sought: Sought, fit: Fit, truth: np.ndarray | None) -> list[Volume]:

@@ -8,7 +8,7 @@ view as for twenty; only views whose pixels do not reach over their border (box 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import mitsuba as mi
@@ -60,14 +60,9 @@ def check_views(views: Sequence[View]) -> None:
     """
     if not views:
         raise MivolError("found no views to fit: give at least one sensor with a reference.")
-    first = tuple(int(n) for n in views[0].sensor.film().crop_size())
+    check_sizes({view.name: view.sensor for view in views})
     for view in views:
         width, height = (int(n) for n in view.sensor.film().crop_size())
-        if (width, height) != first:
-            raise MivolError(
-                f'view "{view.name}" is {width} x {height} pixels and view "{views[0].name}" {first[0]} x {first[1]}: '
-                "give all views one size."
-            )
         if view.reference.ndim != 3 or tuple(view.reference.shape[:2]) != (height, width):
             raise MivolError(
                 f'the reference of view "{view.name}" has shape {tuple(view.reference.shape)}, its sensor '
@@ -79,6 +74,19 @@ def check_views(views: Sequence[View]) -> None:
                 f'the reference of view "{view.name}" is not finite at pixel (row {bad[0][0]}, column {bad[0][1]}): '
                 "mask or repair it."
             )
+
+
+def check_sizes(sensors: Mapping[str, mi.Sensor]) -> None:
+    """Refuse sensors, by name, whose images differ in size.
+
+    Raises:
+        MivolError: with both sizes.
+    """
+    sizes = {name: " x ".join(str(int(n)) for n in sensor.film().crop_size()) for name, sensor in sensors.items()}
+    (first, size), *others = sizes.items()
+    for name, other in others:
+        if other != size:
+            raise MivolError(f'view "{name}" is {other} pixels and view "{first}" {size}: give all views one size.')
 
 
 def single_shots(views: Sequence[View]) -> list[Shot]:

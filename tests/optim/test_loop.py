@@ -312,9 +312,13 @@ def test_refused_views(variant_rgb, case: str) -> None:
 
 
 def test_a_loss_that_is_not_finite_stops_the_run(variant_rgb) -> None:
-    problem = small_problem(start=6.0, parameters=[Parameter(KEY, domain=(-np.inf, np.inf), lr=1e4)])
-    with pytest.raises(MivolError, match="lower the learning rate"):
+    """And what was found before it is kept."""
+    problem = small_problem()
+    reals, kept = problem.start(), problem.loss_and_gradient
+    problem.loss_and_gradient = lambda r, i, chosen=None: (np.nan if i == 1 else kept(r, i, chosen)[0], kept(r, i, chosen)[1])
+    with pytest.raises(MivolError, match="became nan in iteration 1: lower the learning rate"):
         reconstruct(problem, Adam(), 4)
+    assert not np.array_equal(np.asarray(problem.values()[KEY]), np.asarray(reals[KEY]))
 
 
 def test_gauss_newton_refuses_other_losses(variant_rgb) -> None:
