@@ -305,3 +305,26 @@ def test_hard_27_bad_voxels_are_named(variant, bad):
 def test_hard_49_degenerate_place_is_refused(variant):
     with pytest.raises(Exception, match="degenerate|invert|singular"):
         mi.load_dict(grid_volume("mivol_voxels", grid(), np.diag([1.0, 0, 1, 1])))
+
+
+@pytest.mark.parametrize("bad", [np.nan, -0.5])
+def test_hard_26_27_an_update_with_bad_values_is_refused(variant, bad):
+    """What an optimiser's overshoot leaves behind is named when it is handed in, not when it is rendered."""
+    params = mi.traverse(mi.load_dict(grid_volume("mivol_voxels", grid())))
+    wrong = grid().astype(np.float32)
+    wrong[1, 2, 3] = bad
+    params["data"] = mi.TensorXf(wrong)
+    with refused("z=1, y=2, x=3"):
+        params.update()
+
+
+def test_update_may_change_the_resolution(variant):
+    """Three channels are stored padded: the texture has to be rebuilt."""
+    volume = mi.load_dict(grid_volume("mivol_voxels", grid(channels=3)))
+    params = mi.traverse(volume)
+    params["data"] = mi.TensorXf(np.full((3, 2, 2, 3), 0.7, np.float32))
+    params.update()
+    it = point_interaction(np.random.default_rng(0).uniform(0.1, 0.9, (64, 3)))
+    assert tuple(volume.resolution()) == (2, 2, 3)
+    # A convex combination of equal numbers, rounded.
+    assert np.abs(np.array(volume.eval_3(it)) - 0.7).max() <= 4 * 2.0**-24
