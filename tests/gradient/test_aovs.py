@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from mivol.scene import plan
+from mivol.transport import distance
 from scenes import (
     as_float32,
     ball_of,
@@ -182,6 +183,29 @@ def test_forward_against_finite_differences(name):
     for c, aov in enumerate(NAMES.split(",")):
         error = np.abs(jv[..., c] - difference[..., c])
         assert np.all(error <= 1e-3 * np.abs(difference[..., c]).max() + 5e-5), aov
+
+
+# -- One cell, in float64 -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-3, 0.3, 3.0, 40.0])
+def test_derivatives_of_a_cell(size):
+    # Central differences of the formula itself: of order h^2 = 1e-8 in the scale on which it bends, and the 5e-10 to which
+    # the moments are known, over h.
+    rng = np.random.default_rng([6, int(size * 1000)])
+    a, dt = rng.uniform(-2, 2, 200), rng.uniform(0.1, 1, 200)
+    sigma = size * rng.uniform(0, 1, (3, 200))
+
+    def stop(sigma: np.ndarray) -> distance.Stop:
+        return distance.stop_in_cell(*(mi.Float64(x) for x in (a, dt, *sigma)))
+
+    exact, h = stop(sigma), 1e-4 * (1 + size)
+    for q in range(3):
+        step = h * np.eye(3)[q][:, None]
+        up, down = stop(sigma + step), stop(sigma - step)
+        for slope, f in ((exact.dtau[q], "tau"), (exact.dN[q], "N")):
+            difference = (np.array(getattr(up, f)) - np.array(getattr(down, f))) / (2 * h)
+            assert np.array(slope) == pytest.approx(difference, abs=2e-5 * np.abs(difference).max())
 
 
 # -- One ray along a column of voxels -----------------------------------------------------------------------------------------
