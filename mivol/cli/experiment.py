@@ -11,7 +11,7 @@ from __future__ import annotations
 import hashlib
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -88,8 +88,7 @@ def run(chosen: Experiment, base: Path, folder: Path, *, resume: bool = False) -
     set_threads(chosen.threads)
     folder.mkdir(parents=True, exist_ok=True)
     record = new_record(chosen)
-    write_record(record, folder)
-    try:
+    with recorded(record, folder):
         with stage(record, "scene"):
             loaded = load_scene(base / chosen.scene.file, chosen.scene.define)
             truth = make_truth(chosen, base, loaded.scene)
@@ -103,13 +102,23 @@ def run(chosen: Experiment, base: Path, folder: Path, *, resume: bool = False) -
             fit = solve(chosen, folder, loaded, problem, seen, truth, resume)
         with stage(record, "images and volumes"):
             write_outputs(chosen, folder, record, fit, seen, truth)
-    except KeyboardInterrupt:
+    return write_page(folder)
+
+
+@contextmanager
+def recorded(record: RunRecord, folder: Path) -> Iterator[None]:
+    """Keep ``run.json`` true: "running" at first, "finished" or "stopped" in the end, with what stopped it."""
+    write_record(record, folder)
+    try:
+        yield
+    except BaseException as error:
         record.status = "stopped"
-        write_record(record, folder)
+        record.notes += [f"stopped by: {error}"] if str(error) else []
+        with suppress(MivolError, OSError):
+            write_record(record, folder)
         raise
     record.status = "finished"
     write_record(record, folder)
-    return write_page(folder)
 
 
 @contextmanager
@@ -304,7 +313,8 @@ def make_start(sought: Sought, base: Path, scene: mi.Scene) -> Start:
     """
     params = mi.traverse(scene)
     now = as_tensor(params[find(sought.key, params)])
-    value = np.asarray(now)
+    # A copy: the scene may give the memory behind a view to another tensor when its parameter changes.
+    value = np.array(now)
     if sought.start_file:
         value = read_volume(base / sought.start_file).values
     elif sought.start is not None:
@@ -404,8 +414,8 @@ def write_outputs(chosen: Experiment, folder: Path, record: RunRecord, fit: Fit,
     for name in ("views", "volumes", "curves"):
         (folder / name).mkdir(exist_ok=True)
     record.notes += fit.log + ([f"stopped early: {fit.run.finished}"] if fit.run.finished else [])
-    for view in (*seen.fitted, *seen.held_out):
-        record.images += write_view(folder, fit.problem, view, seen)
+    for number, view in enumerate((*seen.fitted, *seen.held_out)):
+        record.images += write_view(folder, fit.problem, view, seed_of(chosen.seed, 0, number, FINAL), seen)
     for sought in chosen.parameter:
         record.volumes += write_grid(chosen, folder, sought, fit, truth)
     write_curves(folder)
@@ -418,10 +428,10 @@ def write_outputs(chosen: Experiment, folder: Path, record: RunRecord, fit: Fit,
     }
 
 
-def write_view(folder: Path, problem: Problem, view: View, seen: Seen) -> list[Image]:
+def write_view(folder: Path, problem: Problem, view: View, seed: int, seen: Seen) -> list[Image]:
     """One view: the render beside its reference."""
     stem = f"views/{view.name.replace(' ', '_')}"
-    image = np.asarray(problem.render(view.sensor, seed_of(problem.seed, 0, int(view.name.split()[1]), FINAL)))
+    image = np.asarray(problem.render(view.sensor, seed))
     reference = np.asarray(view.reference)
     error = seen.standard_errors.get(view.name)
     parts = {"render": ("", image), "reference": ("reference", reference)}

@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from mivol import config
-from mivol.cli.experiment import CHECKPOINT, stage, write_curves
+from mivol.cli.experiment import CHECKPOINT, recorded, stage, write_curves
 from mivol.cli.progress import tracked
 from mivol.cli.rendering import set_threads, set_variant
 from mivol.config import Cone, Ellipsoids, Known, Measured
@@ -26,7 +26,7 @@ from mivol.files import read_projections, read_volume, write_exr, write_volume
 from mivol.optim import checkpoint
 from mivol.optim.solvers import SOLVERS, LeastSquares, PoissonCounts, SmoothedTV, State
 from mivol.report.page import write_page
-from mivol.report.record import Choice, Image, RunRecord, Volume, append_metrics, rewind_metrics, write_record
+from mivol.report.record import Choice, Image, RunRecord, Volume, append_metrics, rewind_metrics
 from mivol.threads import check_one_thread
 from mivol.tomography.geometry import ConeBeam, Geometry, ParallelBeam, VoxelGrid
 from mivol.tomography.phantoms import shepp_logan
@@ -75,9 +75,8 @@ def run(chosen: config.Scan, base: Path, folder: Path, *, resume: bool = False) 
     set_threads(chosen.threads)
     folder.mkdir(parents=True, exist_ok=True)
     record = new_record(chosen)
-    write_record(record, folder)
     grid = VoxelGrid(chosen.grid.shape, chosen.grid.voxel_size)
-    try:
+    with recorded(record, folder):
         with stage(record, "projections"):
             data = make_data(chosen, base, grid)
             record.notes += [data.note] if data.note else []
@@ -87,12 +86,6 @@ def run(chosen: config.Scan, base: Path, folder: Path, *, resume: bool = False) 
             state = solve(chosen, folder, projector, data, held_out, resume)
         with stage(record, "images and volumes"):
             write_outputs(folder, record, projector, data, held_out, state)
-    except KeyboardInterrupt:
-        record.status = "stopped"
-        write_record(record, folder)
-        raise
-    record.status = "finished"
-    write_record(record, folder)
     return write_page(folder)
 
 

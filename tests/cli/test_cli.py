@@ -16,6 +16,7 @@ import pytest
 from fit_scene import KEY
 
 from mivol.cli import VERBS, main
+from mivol.fields.procedural import make_procedural
 from mivol.files import atomic, read_exr, read_volume, write_exr, write_volume
 
 SCENE = """<scene version="3.0.0">
@@ -227,6 +228,30 @@ def test_references_from_files(variant_rgb, folder: Path, capsys: pytest.Capture
     assert run("optimize", folder / "fit.toml", "-o", folder / "run", *changes, *right) == 0
 
 
+def test_the_fit_does_not_start_at_the_truth(variant_rgb, folder: Path) -> None:
+    """Without a start of its own the fit begins where the scene's file says, whatever the references showed: its first
+    error is that of 0.25 everywhere, and not 0."""
+    text = FIT.replace("start = 0.2\nshape = [3, 3, 3]\n", "").replace("shape = [6, 6, 6]", "shape = [2, 2, 2]")
+    (folder / "fit.toml").write_text(text)
+    assert run("optimize", folder / "fit.toml", "-o", folder / "run", "--set", "fit.iterations=1") == 0
+    truth = read_volume(next((folder / "run" / "volumes").glob("*truth.npz"))).values
+    expected = np.sqrt(np.mean((0.25 - truth) ** 2)) / np.ptp(truth)
+    first = json.loads((folder / "run" / "metrics.jsonl").read_text().splitlines()[0])
+    assert np.isclose(first["nrmse"], expected, rtol=1e-5)
+
+
+def test_procedural_volumes_are_the_same_object_at_every_resolution() -> None:
+    """Fine voxels averaged over coarse ones against coarse voxels: they differ by the curvature inside a voxel only; with
+    two axes exchanged they would differ by the object's own contrast. And another seed is another object."""
+    coarse = make_procedural("tangle", (8, 10, 12), seed=1, peak=2.0)[..., 0]
+    fine = make_procedural("tangle", (24, 30, 36), seed=1, peak=2.0)[..., 0]
+    mean = fine.reshape(8, 3, 10, 3, 12, 3).mean(axis=(1, 3, 5))
+    assert np.corrcoef(mean.ravel(), coarse.ravel())[0, 1] > 0.9
+    assert np.corrcoef(make_procedural("tangle", (8, 10, 12), seed=2, peak=2.0).ravel(), coarse.ravel())[0, 1] < 0.8
+    assert fine.max() <= 2.0
+    assert fine.min() >= 0.0
+
+
 OPTIMIZE_REFUSED = {
     "misspelt key": (["fit.iteratons=3"], 'did you mean "iterations"'),
     "no views": (["views.count=0"], "views.count = 0"),
@@ -271,6 +296,9 @@ def test_disk_full(variant_rgb, folder: Path, capsys: pytest.CaptureFixture, mon
         patch.setattr(atomic, "_sync", full)
         said = refused(capsys, "optimize", folder / "fit.toml", "-o", target, *PHOTOS)
     assert "no space left" in said
+    record = json.loads((target / "run.json").read_text())
+    assert record["status"] == "stopped"
+    assert any("no space left" in note for note in record["notes"])
     assert not any(name.endswith(".part") for name in files_of(target))
     assert run("optimize", folder / "fit.toml", "-o", target, *PHOTOS) == 0
 

@@ -133,12 +133,17 @@ def test_conjugate_gradients_solve(variant_rgb) -> None:
 
 
 def test_two_loops_are_the_inverse_hessian(variant_rgb) -> None:
-    """The secant equation H y = s holds exactly for the newest pair, whatever the older ones."""
+    """The secant equation H y = s holds exactly for the newest pair, whatever the older ones; H is symmetric, and with as
+    many conjugate pairs as dimensions it is the inverse of the Hessian."""
     rng = np.random.default_rng(0)
     a = np.diag(rng.uniform(1, 5, 7))
     steps = [rng.standard_normal(7) for _ in range(3)]
     changes = [a @ s for s in steps]
     assert np.allclose(two_loops(changes[-1], steps, changes), steps[-1], rtol=1e-12)
+    v, w = rng.standard_normal((2, 7))
+    assert np.isclose(two_loops(v, steps, changes) @ w, two_loops(w, steps, changes) @ v, rtol=1e-12)
+    conjugate = list(np.eye(7))
+    assert np.allclose(two_loops(v, conjugate, [a @ s for s in conjugate]), np.linalg.solve(a, v), rtol=1e-12)
 
 
 # -- Randomness, passes, shots ------------------------------------------------------------------------------------
