@@ -105,20 +105,22 @@ def test_find_offers_the_nearest_key(variant_rgb) -> None:
 
 # -- Refining a grid ----------------------------------------------------------------------------------------------
 
-SIZES = st.integers(1, 6)
+SIZES = st.tuples(*[st.integers(1, 6)] * 3)
+NEW_SIZES = st.tuples(*[st.integers(1, 11)] * 3)
 
 
-@settings(max_examples=40, deadline=None)
-@given(SIZES, SIZES, SIZES, st.integers(1, 3), st.integers(0, 1000), st.sampled_from([1, 2, 3, 4]))
-def test_hard_47_upsampling_conserves_mass(z: int, y: int, x: int, channels: int, seed: int, factor: int) -> None:
-    """Rationale: a refined start must absorb as much as the coarse one, or the loss jumps.
+@settings(max_examples=60, deadline=None)
+@given(SIZES, NEW_SIZES, st.integers(1, 3), st.integers(0, 1000))
+def test_hard_47_upsampling_conserves_mass(old: tuple[int, ...], new: tuple[int, ...], channels: int, seed: int) -> None:
+    """Rationale: a refined start must absorb as much as the coarse one, or the loss jumps. Whole factors conserve the
+    mass by themselves, others do not.
     Expected: the mean of each channel is kept to the rounding of float32 values (eps / 2 each, of one sign at worst);
-    nothing is negative (linear, not cubic); a constant stays constant."""
+    nothing is negative (linear, not cubic)."""
     mi.set_variant("llvm_ad_rgb")
     rng = np.random.default_rng(seed)
-    field = rng.uniform(0, 1, (z, y, x, channels)) ** 8 * (rng.uniform(size=(z, y, x, 1)) > 0.5)
-    fine = np.asarray(upsample(mi.TensorXf(field.astype("f")), (factor * z, factor * y, factor * x)))
-    assert fine.shape == (factor * z, factor * y, factor * x, channels)
+    field = rng.uniform(0, 1, (*old, channels)) ** 8 * (rng.uniform(size=(*old, 1)) > 0.5)
+    fine = np.asarray(upsample(mi.TensorXf(field.astype("f")), new))
+    assert fine.shape == (*new, channels)
     before = field.astype("f").astype(np.float64).mean(axis=(0, 1, 2))
     after = fine.astype(np.float64).mean(axis=(0, 1, 2))
     assert np.all(np.abs(after - before) <= EPS * before)
