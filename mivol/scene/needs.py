@@ -59,6 +59,7 @@ class Needs:
     Attributes:
         variant: the active variant.
         boundaries: media and where they are.
+        views: their extinction, in the same order, with its gradients.
         media: what each is made of, in the same order.
         surfaces: kinds of the shapes that are more than boundaries.
         is_veiled: some surface lets light through undeviated and is more than a boundary.
@@ -71,6 +72,7 @@ class Needs:
 
     variant: str
     boundaries: tuple[Boundary, ...]
+    views: tuple[MediumView, ...]
     media: tuple[MediumFacts, ...]
     surfaces: tuple[str, ...]
     is_veiled: bool
@@ -90,6 +92,7 @@ class Survey:
     is_veiled: bool
     emitters: tuple[str, ...]
     values: dict = field(default_factory=dict)
+    places: dict = field(default_factory=dict)
 
 
 def find_needs(scene: mi.Scene, sensor: mi.Sensor, survey: Survey | None = None) -> Needs:
@@ -106,10 +109,12 @@ def find_needs(scene: mi.Scene, sensor: mi.Sensor, survey: Survey | None = None)
     check_variant(mi.variant())
     survey = survey or survey_scene(scene)
     recording = bool(dr.flag(dr.JitFlag.FreezingScope))
-    media = tuple(_facts(b, survey, recording) for b in survey.boundaries)
+    views = tuple(view_medium(b.medium, b.box, survey.places) for b in survey.boundaries)
+    media = tuple(_facts(b, view, survey, recording) for b, view in zip(survey.boundaries, views, strict=True))
     return Needs(
         variant=mi.variant(),
         boundaries=survey.boundaries,
+        views=views,
         media=media,
         surfaces=survey.surfaces,
         is_veiled=survey.is_veiled,
@@ -217,8 +222,7 @@ def read_values(values: mi.TensorXf, survey: Survey, name: str) -> _Read:
     return survey.values[key]
 
 
-def _facts(boundary: Boundary, survey: Survey, recording: bool) -> MediumFacts:
-    view = view_medium(boundary.medium, boundary.box)
+def _facts(boundary: Boundary, view: MediumView, survey: Survey, recording: bool) -> MediumFacts:
     grids = [p.lattice for p in view.parts if p.lattice is not None]
     phase = boundary.medium.phase_function()
     common = {

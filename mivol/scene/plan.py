@@ -17,7 +17,6 @@ from mivol.errors import MivolError
 from mivol.machine import available_memory
 from mivol.scene.needs import Needs, Survey, find_needs, read_values, survey_scene
 from mivol.transport.aovs import AOVS
-from mivol.transport.medium import view_medium
 from mivol.transport.optical_depth import PACKED_LIMIT, gradient_bytes
 from mivol.transport.path import Settings
 from mivol.transport.world import Body, World
@@ -155,8 +154,7 @@ def _gradient(needs: Needs) -> tuple[int, Choice]:
 def build_world(needs: Needs, plan: Plan, settings: Settings, survey: Survey) -> World:
     """Build the media that transport walks through, as planned."""
     bodies = []
-    for boundary, skip in zip(needs.boundaries, plan.skips, strict=True):
-        view = view_medium(boundary.medium, boundary.box)
+    for boundary, view, skip in zip(needs.boundaries, needs.views, plan.skips, strict=True):
         for part in view.parts:
             if skip and part.lattice is not None:
                 part.lattice.bounds = read_values(part.lattice.values, survey, boundary.name).bounds

@@ -466,7 +466,7 @@ def _see(front: list[mi.Float64], N: list[mi.Float], channels: int) -> list[mi.F
 
 def _middle(body: Body, ray: mi.Ray3f, t0: mi.Float64, t1: mi.Float64) -> mi.Float64:
     """The middle of the part of a stretch inside a body's box."""
-    _, _, t0, t1 = slab(body.box.from_world, (0.0,) * 3, (1.0,) * 3, ray.o, ray.d, t0, t1)
+    _, _, t0, t1 = slab(body.rows, (0.0,) * 3, (1.0,) * 3, ray.o, ray.d, t0, t1)
     return _halfway(t0, t1)
 
 

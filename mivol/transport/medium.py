@@ -82,9 +82,12 @@ class Box:
 
     to_world: np.ndarray
 
-    def __post_init__(self) -> None:
-        rows = np.linalg.inv(self.to_world)[:3]
-        self.from_world = [[dr.opaque(mi.Float64, float(v)) for v in row] for row in rows]
+    def rows(self) -> list[list[mi.Float64]]:
+        """The (3, 4) map from the world to the unit cube, as arrays: boxes in other places share one kernel.
+
+        Made anew for each render: an array that is older than a recording of ``dr.freeze`` could not take part in it.
+        """
+        return [[dr.opaque(mi.Float64, float(v)) for v in row] for row in np.linalg.inv(self.to_world)[:3]]
 
     def corners(self) -> np.ndarray:
         """The 8 corners, (8, 3)."""
@@ -104,7 +107,7 @@ class Box:
         return bool(gaps.max() <= tolerance * size)
 
 
-def view_medium(medium: mi.Medium, boundary: Box | None = None) -> MediumView:
+def view_medium(medium: mi.Medium, boundary: Box | None = None, places: dict | None = None) -> MediumView:
     """View a medium as a sum of fields.
 
     Args:
@@ -112,6 +115,7 @@ def view_medium(medium: mi.Medium, boundary: Box | None = None) -> MediumView:
             ``mivol_voxels``).
         boundary: the box that bounds it, if it is one: a stock grid tells its place to 6 digits only, and is put
             exactly into a boundary that it fills.
+        places: where earlier views found the grids of this scene; filled.
 
     Raises:
         MivolError: a medium or a volume of another kind.
@@ -123,8 +127,8 @@ def view_medium(medium: mi.Medium, boundary: Box | None = None) -> MediumView:
             f"a medium of type {kind} was found; mivol renders mivol_medium, homogeneous and heterogeneous media."
         )
     names = [n for n in ("sigma_t", "sigma_a", "sigma_s") if any(k.startswith(n + ".") for k in params.properties)]
-    fills_boundary = kind != "HeterogeneousMedium"
-    parts = [_part(name, params, kind, boundary, fills_boundary) for name in names]
+    places = {} if places is None else places
+    parts = [_part(name, params, kind, boundary, places) for name in names]
     albedo = [v for k, v in params if k.startswith("sigma_s." if "sigma_s" in names else "albedo.")]
     return MediumView(medium, parts, mi.Float(params["scale"]), albedo)
 
@@ -134,12 +138,15 @@ def kind_of(medium: mi.Medium) -> str:
     return "mivol_medium" if hasattr(medium, "coefficients") else medium.class_name()
 
 
-def _part(name: str, params: mi.SceneParameters, kind: str, boundary: Box | None, fills_boundary: bool) -> Part:
+def _part(name: str, params: mi.SceneParameters, kind: str, boundary: Box | None, places: dict) -> Part:
     """The part of an extinction under ``name`` among a medium's parameters."""
     grid, constant = f"{name}.data", f"{name}.value.value"
     if grid in params.properties:
         volume = params.properties[grid][2]
-        return Part(name, lattice=Lattice(_tensor(params[grid]), place_of_grid(volume, boundary)))
+        key = (volume.ptr, None if boundary is None else boundary.to_world.tobytes())
+        if key not in places:
+            places[key] = place_of_grid(volume, boundary)
+        return Part(name, lattice=Lattice(_tensor(params[grid]), places[key]))
     if constant not in params.properties:
         found = sorted(k for k in params.properties if k.startswith(name + "."))
         raise MivolError(
@@ -147,7 +154,7 @@ def _part(name: str, params: mi.SceneParameters, kind: str, boundary: Box | None
             "mivol_voxels is expected."
         )
     value = params[constant]
-    if fills_boundary:
+    if kind != "HeterogeneousMedium":  # a stock heterogeneous fills the box of its constvolume only
         return Part(name, constant=value)
     channels = [value[c] for c in range(dr.size_v(value))] if dr.size_v(value) == 3 else [mi.Float(value)]
     values = mi.TensorXf(dr.ravel(mi.Color3f(*channels)) if len(channels) == 3 else channels[0], (1, 1, 1, len(channels)))

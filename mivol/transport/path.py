@@ -87,7 +87,7 @@ def visit_boxes(world: World, ray: mi.Ray3f, t_end: mi.Float, visit: Visit, stat
     for body in world.boxed:
         t0, t1 = mi.Float64(0), mi.Float64(t_end)
         if body.trims:
-            _, _, t0, t1 = slab(body.box.from_world, (0.0,) * 3, (1.0,) * 3, ray.o, ray.d, t0, t1)
+            _, _, t0, t1 = slab(body.rows, (0.0,) * 3, (1.0,) * 3, ray.o, ray.d, t0, t1)
         state = visit(state, body, t0, t1, active & (t1 > t0))
     return state
 

@@ -31,6 +31,7 @@ class Body:
     def __init__(self, view: MediumView, box: Box | None) -> None:
         self.view, self.box = view, box
         self.trims = box is not None and not all(_fits(part, box) for part in view.parts)
+        self.rows = box.rows() if box is not None else None
         self.gradients: list[Gradient | mi.Float] = []
         self.tangents: list[mi.Float] = []
 
@@ -53,7 +54,9 @@ class Body:
             if part.lattice is None:
                 length = _length(t0, t1, active)
                 # A ray that never leaves a medium has infinite length: 0 * inf would be NaN.
-                rows = [dr.select(value[c] != 0, value[c] * length, 0) for c in range(part.channels)]
+                # (A grey value is taken whole: the index of a Dr.Jit array reads it, and bakes it into the kernel.)
+                each = [value] if part.channels == 1 else [value.x, value.y, value.z]
+                rows = [dr.select(v != 0, v * length, 0) for v in each]
             else:
                 lattice = part.lattice if skip else replace(part.lattice, bounds=None)
                 rows = integrate_segment(lattice, value, clip(lattice, ray.o, ray.d, t0, t1), active)

@@ -92,3 +92,24 @@ def test_gradient_step():
         plain = np.array(step(scene, integrator, params, fresh, mi.UInt32(call)))
         # The order of sums over threads is not fixed: float32 sums of some thousand terms.
         assert np.abs(replayed - plain).max() <= 1e-5 * np.abs(plain).max()
+
+
+def test_constant_that_changes_between_calls():
+    """A homogeneous extinction is an array too: it is neither read nor baked into the recording."""
+    parts = {
+        "type": "scene",
+        "box": box_of(medium("mivol_medium", 0.5), PLACE),
+        "sky": sky(),
+        "sensor": camera((2.0, 1.5, 3.0), (0.0, 0.0, 0.0), res=8, fov=45.0),
+    }
+    scene = mi.load_dict(parts)
+    integrator = mi.load_dict({"type": "mivol"})
+    params = mi.traverse(scene)
+    key = "box.interior_medium.sigma_t.value.value"
+    frozen = dr.freeze(lambda scene, integrator, seed: mi.render(scene, integrator=integrator, spp=4, seed=seed))
+    for call in range(4):
+        params[key] = dr.opaque(mi.Float, 0.25 * (1 + call))
+        params.update()
+        replayed = np.array(frozen(scene, integrator, mi.UInt32(0)))
+        assert np.array_equal(replayed, np.array(mi.render(scene, integrator=integrator, spp=4, seed=0)))
+    assert frozen.n_recordings < 4

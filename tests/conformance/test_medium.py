@@ -1,0 +1,83 @@
+"""Where stock grids lie, and what a view of a medium holds."""
+
+from __future__ import annotations
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mivol.transport.medium import box_of_cube, place_of_grid, view_medium
+from scenes import FRAMES, box_of, grid_volume, medium, refused
+
+pytestmark = pytest.mark.usefixtures("variant_rgb")
+
+VALUES = np.ones((3, 4, 5, 1), np.float32)
+
+
+@pytest.mark.parametrize("frame", FRAMES)
+def test_a_stock_grid_that_fills_its_boundary_is_placed_exactly(frame):
+    """The six digits that a gridvolume prints are replaced by the boundary's vertices (float32)."""
+    place = FRAMES[frame]
+    cube = mi.load_dict(box_of(medium("heterogeneous", grid_volume("gridvolume", VALUES, place)), place))
+    found = view_medium(cube.interior_medium(), box_of_cube(cube)).parts[0].lattice.to_world
+    # Vertices of size 6 at most, rounded to float32 after products of a few terms.
+    assert np.abs(found - place).max() <= 6 * 4 * 2.0**-24
+
+
+@pytest.mark.parametrize("frame", FRAMES)
+def test_a_stock_grid_elsewhere_is_placed_to_six_digits(frame):
+    place = FRAMES[frame]
+    volume = mi.load_dict(grid_volume("gridvolume", VALUES, place))
+    # The promise of place_of_grid: 5e-6 of the size.
+    assert np.abs(place_of_grid(volume) - place).max() <= 5e-6 * np.abs(place).max()
+
+
+def test_our_grid_knows_its_place():
+    place = FRAMES["sheared"]
+    volume = mi.load_dict(grid_volume("mivol_voxels", VALUES, place))
+    assert np.array_equal(place_of_grid(volume), np.float32(place).astype(np.float64))
+
+
+def test_a_medium_that_scatters_says_so():
+    assert view_medium(mi.load_dict(medium("homogeneous", 1.0, 0.5))).is_scattering()
+    assert not view_medium(mi.load_dict(medium("homogeneous", 1.0, 0.0))).is_scattering()
+    both = {"type": "mivol_medium", "sigma_a": 1.0, "sigma_s": grid_volume("mivol_voxels", VALUES)}
+    assert view_medium(mi.load_dict(both)).is_scattering()
+
+
+def test_a_volume_of_another_kind_is_refused():
+    """A medium over something that is neither a number nor a grid."""
+
+    class Odd(mi.Volume):
+        def max(self):
+            return 1.0
+
+        def traverse(self, callback):
+            callback.put("strange", mi.Float(1), mi.ParamFlags.Differentiable)
+
+        def to_string(self):
+            return "Odd"
+
+    mi.register_texture("odd_volume", lambda props: Odd(props))
+    odd = mi.load_dict({"type": "heterogeneous", "sigma_t": {"type": "odd_volume"}, "albedo": 0.0})
+    with refused("strange.*gridvolume"):
+        view_medium(odd)
+
+
+def test_coefficients_of_both_pairs_agree():
+    """sigma_a = 2, sigma_s = 1 is sigma_t = 3 with albedo 1/3, at every scale; the null part is what the bound leaves."""
+    import drjit as dr
+
+    grid = grid_volume("mivol_voxels", np.linspace(0.2, 2.0, 60, dtype=np.float32).reshape(3, 4, 5, 1))
+    parts = {"type": "mivol_medium", "sigma_a": grid, "sigma_s": 1.0, "scale": 0.5}
+    medium_a = mi.load_dict(parts)
+    mei = dr.zeros(mi.MediumInteraction3f, 64)
+    mei.p = mi.Point3f(np.random.default_rng(1).uniform(0.1, 0.9, (3, 64)).astype(np.float32))
+    sigma_s, sigma_n, sigma_t = (np.array(c) for c in medium_a.get_scattering_coefficients(mei))
+    sigma_a = np.array(mi.load_dict(grid).eval_1(mei))
+    majorant = np.array(medium_a.get_majorant(mei))
+    # Products and sums of three float32 numbers below 2.
+    assert np.abs(sigma_t - 0.5 * (sigma_a + 1)).max() <= 8 * 2.0**-24
+    assert np.abs(sigma_s - 0.5).max() <= 2.0**-24
+    assert np.abs(sigma_n + sigma_t - majorant).max() <= 8 * 2.0**-24
+    assert sigma_n.min() >= 0
