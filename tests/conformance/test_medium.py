@@ -14,10 +14,10 @@ pytestmark = pytest.mark.usefixtures("variant_rgb")
 VALUES = np.ones((3, 4, 5, 1), np.float32)
 
 
-@pytest.mark.parametrize("seed", range(6))
-def test_a_stock_grid_that_fills_its_boundary_is_placed_exactly(seed):
+@pytest.mark.parametrize("draw", range(6))
+def test_a_stock_grid_that_fills_its_boundary_is_placed_exactly(draw):
     """The six digits that a gridvolume prints are replaced by the boundary's vertices (float32)."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(draw)
     turned = scenes.rotation(rng.normal(size=3), rng.uniform(0.3, 3)) @ np.diag(rng.uniform(1, 3, 3))
     place = scenes.centred(turned, rng.uniform(1, 3, 3))
     cube = mi.load_dict(box_of(medium("heterogeneous", grid_volume("gridvolume", VALUES, place)), place))
