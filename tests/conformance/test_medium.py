@@ -6,6 +6,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+import scenes
 from mivol.transport.medium import box_of_cube, place_of_grid, view_medium
 from scenes import FRAMES, box_of, grid_volume, medium, refused
 
