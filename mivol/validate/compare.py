@@ -14,7 +14,7 @@ import numpy as np
 
 from mivol.errors import MivolError
 from mivol.validate.reference import ReferenceResult, read_reference
-from mivol.validate.statistics import Bias, bias, psnr, relative_l2, smallest_detectable_bias, z_bound, z_image
+from mivol.validate.statistics import Bias, bias, nrmse, psnr, smallest_detectable_bias, z_bound, z_image
 
 __all__ = ["Comparison", "compare"]
 
@@ -32,7 +32,7 @@ class Comparison:
         bias: mean difference with its confidence interval.
         detectable: median over pixels of the smallest bias that would be found 9 times in 10 [radiance].
         psnr: [dB], peak of the reference; -inf where the reference is black.
-        relative_l2: norm of the difference over the norm of the reference; inf where that is black.
+        nrmse: norm of the difference over the norm of the reference; inf where that is black.
         alpha: chance of a false alarm.
     """
 
@@ -44,7 +44,7 @@ class Comparison:
     bias: Bias
     detectable: float
     psnr: float
-    relative_l2: float
+    nrmse: float
     alpha: float
 
     @property
@@ -61,7 +61,7 @@ class Comparison:
             f"{self.alpha:g} for the whole image), {100 * self.above_three:.2g} % beyond 3 (0.27 % expected), the worst "
             f"{self.z[self.worst]:+.1f} at row {self.worst[0]}, column {self.worst[1]}, channel {self.worst[2]}. The mean "
             f"difference is {self.bias.value:+.2g}, between {self.bias.low:+.2g} and {self.bias.high:+.2g}; in one pixel "
-            f"{self.detectable:.2g} would be found 9 times in 10. PSNR {self.psnr:.1f} dB, relative L2 {self.relative_l2:.2g}."
+            f"{self.detectable:.2g} would be found 9 times in 10. PSNR {self.psnr:.1f} dB, nRMSE {self.nrmse:.2g}."
         )
 
 
@@ -114,6 +114,6 @@ def compare(
         bias=difference,
         detectable=float(np.median(smallest_detectable_bias(variance, var, alpha=alpha / 2, comparisons=z.size))),
         psnr=-np.inf if dark else psnr(image, reference.mean),
-        relative_l2=np.inf if dark else relative_l2(image, reference.mean),
+        nrmse=np.inf if dark else nrmse(image, reference.mean),
         alpha=alpha,
     )
