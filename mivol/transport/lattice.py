@@ -251,7 +251,7 @@ def walk(
     frac = dr.select(ahead, segment.frac, 1 - segment.frac)  #                  position in it, from its near planes
     left = mi.Float(segment.length)  #                                          world length still to go
     lost = mi.Float(0)  #                                                       what its last digit could not hold
-    stride, top = mi.Vector3i(1, x, x * y), mi.Vector3i(x - 1, y - 1, z - 1)
+    stride, top = _strides(lattice.res)
     near, far = _planes(cell, ahead, lattice.res)  #                            flat offsets of the corners, an axis each
     corners = _read(reads, _box(near, far), active)
 
@@ -307,10 +307,15 @@ def _least(a: mi.Float, b: mi.Float) -> mi.Float:
     return dr.select(a < b, a, b)
 
 
+def _strides(res: tuple[int, int, int]) -> tuple[mi.Vector3i, mi.Vector3i]:
+    """Flat distance of neighbouring nodes, and the last node, along each axis."""
+    z, y, x = res
+    return mi.Vector3i(1, x, x * y), mi.Vector3i(x - 1, y - 1, z - 1)
+
+
 def _planes(cell: mi.Vector3i, ahead: Mask3, res: tuple[int, int, int]) -> tuple[mi.Vector3i, mi.Vector3i]:
     """Flat offsets of the near and the far node along each axis, clamped to the grid."""
-    z, y, x = res
-    stride, top = mi.Vector3i(1, x, x * y), mi.Vector3i(x - 1, y - 1, z - 1)
+    stride, top = _strides(res)
     low, high = dr.clip(cell, 0, top) * stride, dr.clip(cell + 1, 0, top) * stride
     return dr.select(ahead, low, high), dr.select(ahead, high, low)
 
