@@ -236,7 +236,7 @@ def walk(
         where blocks are skipped).
     """
     skip = lattice.bounds is not None
-    z, y, x = lattice.res
+    _, y, x = lattice.res
 
     # -- State: the cell is seen along the ray, corner bits 0, 1, 2 are near (0) or far (1) in x, y, z -------------------
     d = segment.d
