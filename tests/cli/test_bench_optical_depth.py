@@ -79,9 +79,9 @@ def test_contestants_compute_the_same(quick: dict) -> None:
     # exact: exp(-tau) tau <= 1/e, and each of at most 150 cells rounds a share of tau by a few EPS
     assert worst["mivol"] <= 4 * 150 * EPS / math.e
     assert worst["drjit.dda.integrate"] <= 4 * 150 * EPS / math.e
-    # 2nd order: a quarter of the step, a sixteenth of the error; 4 allows for steps longer than a cell
+    # 2nd order: a quarter of the step, a sixteenth of the error; 1st order would be a quarter, 8 lies between
     steps = [row["rms_error"] for row in peers["marching"]]
-    assert all(fine <= coarse / 4 for coarse, fine in itertools.pairwise(steps))
+    assert all(fine <= coarse / 8 for coarse, fine in itertools.pairwise(steps))
     for name in ("volpath", "ratio tracking", "delta tracking"):
         for row in peers[name]:
             # unbiased: 5 standard errors are exceeded by chance once in 2e6
