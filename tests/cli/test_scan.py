@@ -38,13 +38,13 @@ def rows_of(folder: Path, to: str = "run") -> list[dict]:
 
 
 def test_a_scan_leaves_a_whole_run_folder(variant_rgb, folder: Path) -> None:
-    """Noise-free chords: the residual falls at every iteration, the volume is found to well below TIGRE's bar of 0.2 even
-    on 12^3 voxels, where edges of the phantom fall inside voxels."""
+    """Noise-free chords: the residual falls at every iteration. Voxels of 1/6 are three times as thick as the skull, whose
+    value is five times the brain's: the volume is found to half of what an empty one misses, no better."""
     assert run(folder) == 0
     rows = rows_of(folder)
     assert [row["iteration"] for row in rows] == [1, 2, 3, 4, 5, 6]
     assert np.all(np.diff([row["residual"] for row in rows]) < 0)
-    assert rows[-1]["nrmse"] < 0.15
+    assert rows[-1]["nrmse"] < 0.5
     record = json.loads((folder / "run" / "run.json").read_text())
     assert record["status"] == "finished"
     assert record["results"]["views"] == 15
@@ -58,11 +58,10 @@ def test_a_scan_leaves_a_whole_run_folder(variant_rgb, folder: Path) -> None:
 
 @pytest.mark.parametrize("solver", ["pcg", "cgls", "sirt", "os-sart", "ml-tr"])
 def test_every_solver_is_reached_by_name(variant_rgb, folder: Path, solver: str) -> None:
-    """And lowers the error of the volume, from that of an empty one (the RMS of the truth over its range)."""
+    """And lowers the error of the volume well below that of an empty one, which is 1."""
     extra = ["--set", "data.photons=1e5"] if solver == "ml-tr" else []
     assert run(folder, "--set", f"solve.name={solver}", "--set", "solve.iterations=3", "--set", "solve.subsets=3", *extra) == 0
-    truth = read_volume(folder / "run" / "volumes" / "truth.npz").values
-    assert rows_of(folder)[-1]["nrmse"] < 0.75 * np.sqrt(np.mean(truth**2)) / np.ptp(truth)
+    assert rows_of(folder)[-1]["nrmse"] < 0.75
 
 
 def test_an_interrupted_scan_is_resumed(variant_rgb, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -79,7 +78,11 @@ def test_an_interrupted_scan_is_resumed(variant_rgb, folder: Path, monkeypatch: 
         patch.setattr(scan, "write_metrics", stop)
         assert run(folder, to="cut") == 130
     assert json.loads((folder / "cut" / "run.json").read_text())["status"] == "stopped"
-    assert run(folder, "--resume", to="cut") == 0
+    continued = []
+    with monkeypatch.context() as patch:
+        patch.setattr(scan, "write_metrics", lambda *a: (continued.append(a[3].iteration), write(*a)))
+        assert run(folder, "--resume", to="cut") == 0
+    assert continued == [4, 5, 6]
     values = [[(row["iteration"], row["loss"], row["nrmse"]) for row in rows_of(folder, to)] for to in ("whole", "cut")]
     assert values[0] == values[1]
     files = [(folder / to / "volumes" / "reconstruction.vol").read_bytes() for to in ("whole", "cut")]
