@@ -37,7 +37,9 @@ from mivol.report.record import Choice, Image, RunRecord, Volume, append_metrics
 from mivol.scene.cameras import find_box
 from mivol.scene.load import LoadedScene, load_scene
 from mivol.scene.needs import find_needs, survey_scene
+from mivol.scene.plan import make_plan
 from mivol.threads import check_one_thread
+from mivol.transport.path import Settings
 from mivol.validate.reference import ReferenceResult, read_reference, render_reference
 from mivol.validate.statistics import nrmse, psnr
 
@@ -148,9 +150,6 @@ def new_record(chosen: Experiment) -> RunRecord:
 
 def choices(chosen: Experiment, problem: Problem) -> list[Choice]:
     """The plan of mivol's integrator for this scene, with its reasons; other integrators have none."""
-    from mivol.scene.plan import make_plan
-    from mivol.transport.path import Settings
-
     if chosen.fit.integrator != "mivol":
         return []
     needs = find_needs(problem.scene, problem.shots[0].sensor, survey_scene(problem.scene))
