@@ -43,13 +43,17 @@ class Lattice:
         values: TensorXf (Z, Y, X, C), at voxel centres.
         to_world: (4, 4) float64, unit cube to world.
         bounds: upper bound of |values| over each block of cells, or None where no block is to be skipped.
+        from_world: (3, 4) map from the world to lattice coordinates, made where it is not given.
     """
 
     values: mi.TensorXf
     to_world: np.ndarray
     bounds: mi.Float | None = None
+    from_world: list[list[mi.Float64]] | None = None
 
     def __post_init__(self) -> None:
+        if self.from_world is not None:
+            return
         if len(self.values.shape) != 4 or 0 in self.values.shape:
             raise MivolError(f"a grid of shape {tuple(self.values.shape)} was given; (Z, Y, X, channels) is expected.")
         if np.prod([n + 1 for n in self.values.shape[:3]]) * self.channels >= 2**31:
@@ -74,13 +78,15 @@ class Lattice:
 class Segment:
     """A ray's stretch inside a box of the lattice: where it enters, and how far it goes.
 
-    ``cell`` and ``frac`` are the entry point (lattice coordinates), ``d`` the lattice distance per world length,
-    ``t0`` the world distance from the ray's origin to the entry, ``length`` the world length inside.
+    ``cell`` and ``frac`` are the entry point (lattice coordinates), ``d`` the lattice distance per world length (and
+    ``d_rest`` what its rounding left over), ``t0`` the world distance from the ray's origin to the entry, ``length`` the
+    world length inside.
     """
 
     cell: mi.Vector3i
     frac: mi.Vector3f
     d: mi.Vector3f
+    d_rest: mi.Vector3f
     t0: mi.Float
     length: mi.Float
 
@@ -134,7 +140,8 @@ def clip(lattice: Lattice, o: mi.Point3f, d: mi.Vector3f, t_min: mi.Float, t_max
         low = dr.floor(entry)
         cell[a], frac[a] = mi.Int32(low), mi.Float(entry - low)
     direction = mi.Vector3f(mi.Float(v[0]), mi.Float(v[1]), mi.Float(v[2]))
-    return Segment(cell, frac, direction, mi.Float(t0), mi.Float(dr.select(hit, t1 - t0, 0)))
+    rest = mi.Vector3f(*(mi.Float(v[a] - mi.Float64(direction[a])) for a in range(3)))
+    return Segment(cell, frac, direction, rest, mi.Float(t0), mi.Float(dr.select(hit, t1 - t0, 0)))
 
 
 def slab(
@@ -235,22 +242,27 @@ def walk(
     Cost: one step per cell or empty block, at most X + Y + Z + 6 of them; 4 reads a step and channel (8 a visited cell
         where blocks are skipped).
     """
-    skip = lattice.bounds is not None
-    _, y, x = lattice.res
+    # Plain names for what the loop needs: it takes part in none of the rest.
+    bounds, length = lattice.bounds, segment.length
+    skip = bounds is not None
+    res = lattice.res
+    blocks_y, blocks_x = _blocks(res[1]), _blocks(res[2])
 
     # -- State: the cell is seen along the ray, corner bits 0, 1, 2 are near (0) or far (1) in x, y, z -------------------
     d = segment.d
     ahead = d > 0
     sign = dr.select(ahead, mi.Vector3i(1), mi.Vector3i(-1))
     speed = dr.abs(d)
+    speed_rest = dr.select(ahead, segment.d_rest, -segment.d_rest)
     # 1e30, not infinity: a ray in a plane has distance 0 to it, and 0 * inf would be NaN.
     pace = dr.select(speed > 1e-30, dr.rcp(speed), 1e30)
 
-    active = mi.Bool(active) & (segment.length > 0)
+    active = mi.Bool(active) & (length > 0)
     cell = mi.Vector3i(segment.cell)  #                                         lower node of the cell
-    frac = dr.select(ahead, segment.frac, 1 - segment.frac)  #                  position in it, from its near planes
-    left = mi.Float(segment.length)  #                                          world length still to go
-    lost = mi.Float(0)  #                                                       what its last digit could not hold
+    entry = dr.select(ahead, segment.frac, 1 - segment.frac)  #                 where the ray enters, from its near planes
+    frac = mi.Vector3f(entry)  #                                                position in the cell, likewise
+    passed = mi.Vector3f(0)  #                                                  planes crossed since
+    s, s_rest = mi.Float(0), mi.Float(0)  #                                     world length walked, and its lost digits
     stride, top = _strides(lattice.res)
     near, far = _planes(cell, ahead, lattice.res)  #                            flat offsets of the corners, an axis each
     corners = _read(reads, _box(near, far), active)
@@ -261,18 +273,19 @@ def walk(
         full = mi.Bool(active)
         if skip:
             block = (cell + 1) >> 3
-            index = (block.z * _blocks(y) + block.y) * _blocks(x) + block.x
-            full = dr.gather(mi.Float, lattice.bounds, mi.UInt32(index), active) > 0
+            index = (block.z * blocks_y + block.y) * blocks_x + block.x
+            full = dr.gather(mi.Float, bounds, mi.UInt32(index), active) > 0
             inner = (cell + 1) & (BLOCK - 1)
             span = dr.select(full, 0, dr.select(ahead, BLOCK - 1 - inner, inner))
-            near, far = _planes(cell, ahead, lattice.res)
+            near, far = _planes(cell, ahead, res)
             corners = _read(reads, _box(near, far), full)
 
         # -- Distance to the planes ahead, and visit ----------------------------------------------------------------------
         reach = (mi.Vector3f(span) + (1 - frac)) * pace
         plane = _least(_least(reach.x, reach.y), reach.z)
+        left = (length - s) - s_rest
         dt = _least(plane, left)
-        here = Cell(corners, cell, ahead, frac, speed * dt, segment.length - left, dt)
+        here = Cell(corners, cell, ahead, frac, speed * dt, s, dt)
         state = visit(state, here, active & full)
 
         # -- Leave through one face: a tie is a step of length 0 through the next ------------------------------------------
@@ -280,31 +293,44 @@ def walk(
         through_y = ~through_x & (reach.y <= plane)
         through_z = ~(through_x | through_y)
         through = dr.mask_t(mi.Vector3f)(through_x, through_y, through_z)
-        # Kahan's sum: plain subtraction lets the end of 256 cells drift by 8e-4 of one.
-        taken = dt + lost
-        rest = left - taken
-        lost = (rest - left) + taken
-        left = rest
-        active &= left > 0
+        s, s_rest = _add(s, s_rest, dt)
+        active &= plane < left
 
-        # -- Advance: the axis whose plane was reached lands on it, the others move on within the span ---------------------
-        there = dr.fma(speed, dt, frac)
+        # -- Advance: one plane further, or as many as an empty block has --------------------------------------------------
         if skip:
-            jump = dr.clip(mi.Vector3i(dr.floor(there)), 0, span)
-            cell = dr.clip(cell + sign * dr.select(through, span + 1, jump), -1, top)
-            there = dr.maximum(there - mi.Vector3f(jump), 0)
+            there = dr.fma(speed, dt, frac)
+            jump = dr.select(through, span + 1, dr.clip(mi.Vector3i(dr.floor(there)), 0, span))
+            passed += mi.Vector3f(jump)
+            cell = dr.clip(cell + sign * jump, -1, top)
         else:
+            passed = dr.select(through, passed + 1, passed)
             cell = dr.clip(dr.select(through, cell + sign, cell), -1, top)
             near = dr.select(through, far, near)
             far = dr.select(through, dr.clip(far + sign * stride, 0, top * stride), far)
             corners = _shift(corners, through, _read(reads, _far_face(near, far, through), active))
-        frac = dr.select(through, 0, _least(there, mi.Vector3f(1)))
+        # Always from the entry, never from the last cell: a rounding of 3e-8 in each step, the same in every one, would
+        # carry a ray 1e-5 of a cell off its course in 256. The first product is as large as the count that is taken from
+        # it, and both are exact; what remains is rounded once.
+        course = dr.fma(speed, s_rest, dr.fma(speed_rest, s, entry))
+        frac = _least(_most(dr.fma(speed, s, -passed) + course, 0), 1)
     return state
+
+
+def _add(total: mi.Float, rest: mi.Float, term: mi.Float) -> tuple[mi.Float, mi.Float]:
+    """A sum and the digits that it loses (Knuth's two-sum): float32 alone lets the end of 256 cells drift by 8e-4 of one."""
+    after = total + term
+    took = after - total
+    return after, rest + ((total - (after - took)) + (term - took))
 
 
 def _least(a: mi.Float, b: mi.Float) -> mi.Float:
     """The smaller of two numbers that are not NaN: ``dr.minimum`` would carry a NaN on, at twice the price of this."""
     return dr.select(a < b, a, b)
+
+
+def _most(a: mi.Float, b: mi.Float) -> mi.Float:
+    """The larger of two numbers that are not NaN."""
+    return dr.select(a > b, a, b)
 
 
 def _strides(res: tuple[int, int, int]) -> tuple[mi.Vector3i, mi.Vector3i]:
