@@ -64,12 +64,16 @@ def artefacts(request: pytest.FixtureRequest) -> Path:
 
 @pytest.fixture(autouse=True)
 def _clean_jit():
-    """Give memory back to the system and forget recorded kernels, so that no test sees another's."""
+    """Give memory back to the system and forget recorded kernels and thread counts, so that no test sees another's."""
+    import drjit as dr
+
+    threads = dr.thread_count()
     yield
     if mi.variant() is None or mi.variant().startswith("scalar"):
         return
-    import drjit as dr
-
+    # With one thread left over, Mitsuba waits for ever for a second one that should read an EXR.
+    if dr.thread_count() != threads:
+        dr.set_thread_count(threads)
     gc.collect()
     dr.sync_thread()
     dr.kernel_history_clear()
