@@ -18,7 +18,7 @@ from mivol.files import check_volume
 from mivol.transport.lattice import block_bounds
 from mivol.transport.medium import Box, MediumView, box_of_cube, kind_of, view_medium
 
-__all__ = ["Boundary", "MediumFacts", "Needs", "find_needs"]
+__all__ = ["Boundary", "MediumFacts", "Needs", "find_needs", "find_sensor"]
 
 
 @dataclass(frozen=True)
@@ -124,6 +124,20 @@ def find_needs(scene: mi.Scene, sensor: mi.Sensor, survey: Survey | None = None)
         parameters=tuple(k for k, v in mi.traverse(scene) if dr.is_diff_v(v) and dr.grad_enabled(v)),
         film_samples=int(np.prod(sensor.film().crop_size())) * sensor.sampler().sample_count(),
     )
+
+
+def find_sensor(scene: mi.Scene, sensor: int | mi.Sensor) -> mi.Sensor:
+    """A sensor of the scene by its number, or the one that is given.
+
+    Raises:
+        MivolError: the scene has none of that number.
+    """
+    if not isinstance(sensor, int):
+        return sensor
+    sensors = scene.sensors()
+    if not 0 <= sensor < len(sensors):
+        raise MivolError(f"sensor {sensor} was asked for and the scene has {len(sensors)}; count from 0, or add a sensor.")
+    return sensors[sensor]
 
 
 def check_variant(variant: str | None) -> None:

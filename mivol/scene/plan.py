@@ -15,7 +15,7 @@ import mitsuba as mi
 
 from mivol.errors import MivolError
 from mivol.machine import available_memory
-from mivol.scene.needs import Needs, Survey, find_needs, read_values, survey_scene
+from mivol.scene.needs import Needs, Survey, find_needs, find_sensor, read_values, survey_scene
 from mivol.transport.aovs import AOVS
 from mivol.transport.optical_depth import PACKED_LIMIT, gradient_bytes
 from mivol.transport.path import Settings
@@ -27,7 +27,10 @@ SKIP_BELOW = 0.6
 """Share of occupied blocks below which skipping pays (measured: it costs 8 reads a cell in place of 4)."""
 
 PASS_RAYS = {"llvm": 1 << 22, "cuda": 1 << 25, "metal": 1 << 24}
-"""Most rays of one pass: a second or two of work, so that Ctrl-C is heard."""
+"""Most rays of one pass, through media without grids or with small ones."""
+
+PASS_STEPS = {"llvm": 1 << 29, "cuda": 1 << 34, "metal": 1 << 32}
+"""Most cells that the rays of one pass may cross: a second or two of work, so that Ctrl-C is heard."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +67,7 @@ def make_plan(needs: Needs, settings: Settings) -> Plan:
     choices = [_transport(needs, settings), _tracing(needs), _channels(needs)]
     skips = tuple(bool(m.resolutions) and m.occupied < SKIP_BELOW for m in needs.media)
     choices += [_skipping(m, skip) for m, skip in zip(needs.media, skips, strict=True) if m.resolutions]
-    pass_rays = PASS_RAYS[needs.variant.split("_")[0]]
+    pass_rays = _pass_rays(needs)
     passes = -(-needs.film_samples // pass_rays)
     choices.append(
         Choice("passes", f"{passes} of at most {pass_rays} rays", f"{needs.film_samples} samples; a pass ends within seconds")
@@ -97,6 +100,13 @@ def _refuse_scattering(needs: Needs, settings: Settings) -> None:
                 f"the medium in {medium.name} scatters (its albedo is above 0) and max_depth is {settings.max_depth}; mivol "
                 "renders absorption so far: set max_depth to 1 (what is seen through the medium) or the albedo to 0."
             )
+
+
+def _pass_rays(needs: Needs) -> int:
+    """How many rays a pass may hold: fewer where each has many cells to cross."""
+    backend = needs.variant.split("_")[0]
+    cells = sum(sum(res) for medium in needs.media for res in medium.resolutions)
+    return min(PASS_RAYS[backend], PASS_STEPS[backend] // max(cells, 1))
 
 
 def _transport(needs: Needs, settings: Settings) -> Choice:
@@ -181,7 +191,7 @@ def explain(scene: mi.Scene | str | Path, max_depth: int = 6, sensor: int = 0) -
         MivolError: as :func:`make_plan`.
     """
     loaded = scene if isinstance(scene, mi.Scene) else mi.load_file(str(scene))
-    needs = find_needs(loaded, loaded.sensors()[sensor], survey_scene(loaded))
+    needs = find_needs(loaded, find_sensor(loaded, sensor), survey_scene(loaded))
     plan = make_plan(needs, Settings(max_depth=max_depth))
     lines = ["facts"]
     for m in needs.media:

@@ -12,7 +12,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mivol.errors import MivolError
-from mivol.scene.needs import Survey, find_needs, survey_scene
+from mivol.scene.needs import Survey, find_needs, find_sensor, survey_scene
 from mivol.scene.plan import Plan, build_world, check_aovs, make_plan
 from mivol.transport.aovs import backproject_aovs, integrate_aovs, push_aovs
 from mivol.transport.film import Rays, adjoint_rays, record
@@ -61,7 +61,7 @@ class Session:
         """
         if not develop:
             raise MivolError("develop=False was asked for; mivol returns the developed image: leave it at True.")
-        sensor = _sensor(scene, sensor)
+        sensor = find_sensor(scene, sensor)
         with dr.suspend_grad():
             world, plan = self._open(scene, sensor)
             image = record(sensor, seed, spp, plan.pass_rays, self.aovs, lambda rays: self._primal(scene, world, rays))
@@ -71,7 +71,7 @@ class Session:
 
     def render_forward(self, scene: mi.Scene, sensor: int | mi.Sensor, seed: int, spp: int) -> mi.TensorXf:
         """Render the derivative of an image along the gradients that were set on the parameters."""
-        sensor = _sensor(scene, sensor)
+        sensor = find_sensor(scene, sensor)
         with dr.suspend_grad():
             with dr.resume_grad():
                 world, plan = self._open(scene, sensor)
@@ -83,7 +83,7 @@ class Session:
 
         Cost: a render and its replay; memory independent of the samples, beyond those of a pass.
         """
-        sensor = _sensor(scene, sensor)
+        sensor = find_sensor(scene, sensor)
         with dr.suspend_grad():
             with dr.resume_grad():
                 world, plan = self._open(scene, sensor)
@@ -97,7 +97,7 @@ class Session:
     def sample(self, scene: mi.Scene, sampler: mi.Sampler, ray: mi.Ray3f, active: mi.Bool) -> tuple:
         """Radiance along given rays, for integrators that nest this one."""
         with dr.suspend_grad():
-            world, _ = self._open(scene, scene.sensors()[0])
+            world, _ = self._open(scene, find_sensor(scene, 0))
             score, valid = walk_path(scene, world, self.settings, sampler, ray, Primal(_black(ray)), active)
             return score.L, valid, integrate_aovs(scene, world, ray, self.aovs, active)
 
@@ -125,10 +125,6 @@ class Session:
         dr.eval(score.L)
         walk_path(scene, world, self.settings, again, rays.ray, Adjoint(score.L, dL))
         backproject_aovs(scene, world, rays.ray, self.aovs, daovs)
-
-
-def _sensor(scene: mi.Scene, sensor: int | mi.Sensor) -> mi.Sensor:
-    return scene.sensors()[sensor] if isinstance(sensor, int) else sensor
 
 
 def _black(ray: mi.Ray3f) -> mi.Spectrum:

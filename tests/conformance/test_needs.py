@@ -117,6 +117,11 @@ def test_explain_gives_a_reason_for_each_choice():
     assert text.count("because") == len(choices) >= 5
 
 
+def test_scene_without_a_sensor():
+    with refused("scene has 0"):
+        explain(mi.load_dict({"type": "scene", "sky": sky()}))
+
+
 def test_scattering_is_refused_before_anything_is_rendered():
     scene = scene_of(albedo=0.5)
     with refused("scatters .* max_depth is 2"):
@@ -155,3 +160,14 @@ def test_hard_27_bad_stock_voxels_are_named(bad):
     scene = scene_of(kind="heterogeneous", sigma_t=grid_volume("gridvolume", wrong, PLACE))
     with refused(r"z=1, y=2, x=3"):
         make_plan(find_needs(scene, scene.sensors()[0]), Settings(max_depth=1))
+
+
+def test_a_pass_is_shorter_where_rays_cross_more_cells():
+    """Ctrl-C is heard between passes: a ray of a long grid counts for more."""
+    long = np.zeros((1, 1, 4000, 1), np.float32)
+    scene = scene_of(sigma_t=grid_volume("mivol_voxels", long, PLACE))
+    few = make_plan(find_needs(scene, scene.sensors()[0]), Settings(max_depth=1)).pass_rays
+    scene = scene_of()
+    many = make_plan(find_needs(scene, scene.sensors()[0]), Settings(max_depth=1)).pass_rays
+    backend = mi.variant().split("_")[0]
+    assert few == plan.PASS_STEPS[backend] // 4002 < many == plan.PASS_RAYS[backend]
