@@ -17,7 +17,7 @@ import numpy as np
 from mivol.errors import MivolError
 from mivol.files import write_exr, write_png
 from mivol.optim.problem import seed_of
-from mivol.scene.load import LoadedScene, load_scene
+from mivol.scene.load import LoadedScene, find_sensor, load_scene
 from mivol.threads import check_one_thread
 
 SAMPLES_PER_PASS = 1 << 21
@@ -80,9 +80,7 @@ def render(scene: mi.Scene, sensor: int) -> tuple[np.ndarray, list[str]]:
     Raises:
         MivolError: no such sensor, or no integrator.
     """
-    if not 0 <= sensor < len(scene.sensors()):
-        raise MivolError(f"found no sensor {sensor}, the scene has {len(scene.sensors())}: count from 0.")
-    integrator, camera = scene.integrator(), scene.sensors()[sensor]
+    integrator, camera = scene.integrator(), find_sensor(scene, sensor)
     if integrator is None:
         raise MivolError("the scene has no integrator: add one to it.")
     spp = camera.sampler().sample_count()

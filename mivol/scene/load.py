@@ -22,7 +22,7 @@ import numpy as np
 
 from mivol.errors import MivolError
 
-__all__ = ["LoadedScene", "SceneSource", "VARIANTS", "check_variant", "content_hash", "load_scene"]
+__all__ = ["LoadedScene", "SceneSource", "VARIANTS", "check_variant", "content_hash", "find_sensor", "load_scene"]
 
 SceneSource = str | os.PathLike | Mapping
 
@@ -74,6 +74,20 @@ def check_variant() -> str:
     if variant not in VARIANTS:
         raise MivolError(f'the variant "{variant}" is active; mivol works in {", ".join(VARIANTS)}.')
     return variant
+
+
+def find_sensor(scene: mi.Scene, sensor: int | mi.Sensor) -> mi.Sensor:
+    """A sensor of the scene by its number, or the one that is given.
+
+    Raises:
+        MivolError: the scene has none of that number.
+    """
+    if not isinstance(sensor, int):
+        return sensor
+    sensors = scene.sensors()
+    if not 0 <= sensor < len(sensors):
+        raise MivolError(f"the scene has no sensor {sensor}, only {len(sensors)} of them; count from 0, or add one.")
+    return sensors[sensor]
 
 
 def load_scene(source: SceneSource | mi.Scene, overrides: Mapping[str, Any] | None = None) -> LoadedScene:

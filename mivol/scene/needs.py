@@ -15,10 +15,11 @@ import numpy as np
 
 from mivol.errors import MivolError
 from mivol.files import check_volume
+from mivol.scene.load import check_variant
 from mivol.transport.lattice import block_bounds
 from mivol.transport.medium import Box, MediumView, box_of_cube, kind_of, view_medium
 
-__all__ = ["Boundary", "MediumFacts", "Needs", "find_needs", "find_sensor"]
+__all__ = ["Boundary", "MediumFacts", "Needs", "find_needs"]
 
 
 @dataclass(frozen=True)
@@ -106,7 +107,7 @@ def find_needs(scene: mi.Scene, sensor: mi.Sensor, survey: Survey | None = None)
     Raises:
         MivolError: a variant or a medium that mivol does not render.
     """
-    check_variant(mi.variant())
+    check_variant()
     survey = survey or survey_scene(scene)
     recording = bool(dr.flag(dr.JitFlag.FreezingScope))
     views = tuple(view_medium(b.medium, b.box, survey.places) for b in survey.boundaries)
@@ -124,34 +125,6 @@ def find_needs(scene: mi.Scene, sensor: mi.Sensor, survey: Survey | None = None)
         parameters=tuple(k for k, v in mi.traverse(scene) if dr.is_diff_v(v) and dr.grad_enabled(v)),
         film_samples=int(np.prod(sensor.film().crop_size())) * sensor.sampler().sample_count(),
     )
-
-
-def find_sensor(scene: mi.Scene, sensor: int | mi.Sensor) -> mi.Sensor:
-    """A sensor of the scene by its number, or the one that is given.
-
-    Raises:
-        MivolError: the scene has none of that number.
-    """
-    if not isinstance(sensor, int):
-        return sensor
-    sensors = scene.sensors()
-    if not 0 <= sensor < len(sensors):
-        raise MivolError(f"sensor {sensor} was asked for and the scene has {len(sensors)}; count from 0, or add a sensor.")
-    return sensors[sensor]
-
-
-def check_variant(variant: str | None) -> None:
-    """Refuse a variant that mivol does not render in.
-
-    Raises:
-        MivolError: none is set, or a scalar, spectral or polarised one.
-    """
-    wanted = "set a JIT variant in rgb or mono with derivatives, such as mi.set_variant('llvm_ad_rgb')"
-    if variant is None:
-        raise MivolError(f"no Mitsuba variant is set; {wanted}.")
-    for word, what in (("scalar", "a scalar"), ("spectral", "a spectral"), ("polarized", "a polarised")):
-        if word in variant:
-            raise MivolError(f"{what} variant ({variant}) is active, which mivol does not render in; {wanted}.")
 
 
 def survey_scene(scene: mi.Scene) -> Survey:

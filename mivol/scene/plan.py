@@ -15,7 +15,8 @@ import mitsuba as mi
 
 from mivol.errors import MivolError
 from mivol.machine import available_memory
-from mivol.scene.needs import Needs, Survey, find_needs, find_sensor, read_values, survey_scene
+from mivol.scene.load import find_sensor
+from mivol.scene.needs import Needs, Survey, find_needs, read_values, survey_scene
 from mivol.transport.aovs import AOVS
 from mivol.transport.optical_depth import PACKED_LIMIT, gradient_bytes
 from mivol.transport.path import Settings

@@ -12,7 +12,8 @@ import drjit as dr
 import mitsuba as mi
 
 from mivol.errors import MivolError
-from mivol.scene.needs import Survey, find_needs, find_sensor, survey_scene
+from mivol.scene.load import find_sensor
+from mivol.scene.needs import Survey, find_needs, survey_scene
 from mivol.scene.plan import Plan, build_world, check_aovs, make_plan
 from mivol.transport.aovs import backproject_aovs, integrate_aovs, push_aovs
 from mivol.transport.film import Rays, adjoint_rays, record

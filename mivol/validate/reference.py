@@ -32,7 +32,7 @@ from mivol.errors import MivolError
 from mivol.files.atomic import write_whole
 from mivol.files.exr import read_exr, write_exr
 from mivol.optim.interrupt import Stop
-from mivol.scene.load import LoadedScene, SceneSource, check_variant, content_hash, load_scene
+from mivol.scene.load import LoadedScene, SceneSource, check_variant, content_hash, find_sensor, load_scene
 from mivol.validate.statistics import Moments
 from mivol.validate.trust import Doubt, trust
 
@@ -282,12 +282,7 @@ class _Setup:
 def _sensor(scene: mi.Scene, sensor: int | dict | mi.Sensor) -> mi.Sensor:
     if isinstance(sensor, Mapping):
         return mi.load_dict(dict(sensor))
-    if not isinstance(sensor, int):
-        return sensor
-    own = scene.sensors()
-    if not 0 <= sensor < len(own):
-        raise MivolError(f"the scene has no sensor {sensor}; it has {len(own)}, numbered from 0.")
-    return own[sensor]
+    return find_sensor(scene, sensor)
 
 
 def _channels(film: mi.Film) -> int:

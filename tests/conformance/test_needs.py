@@ -118,7 +118,7 @@ def test_explain_gives_a_reason_for_each_choice():
 
 
 def test_scene_without_a_sensor():
-    with refused("scene has 0"):
+    with refused("no sensor 0, only 0"):
         explain(mi.load_dict({"type": "scene", "sky": sky()}))
 
 
