@@ -1,0 +1,205 @@
+"""Scenes in which light turns once, the same for the integrators and for the twins, and means of many renders."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import mitsuba as mi
+import numpy as np
+import oracle_scattering as twins
+
+from mivol.validate.statistics import Moments, assert_same_mean
+from scenes import as_float32, box_of, camera, centred, film, grid_volume, medium, pencil, pixel_rays
+
+KINDS = {"stock": ("heterogeneous", "gridvolume"), "own": ("mivol_medium", "mivol_voxels")}
+PLACE = centred(2 * np.eye(3))
+"""The box [-1, 1]^3."""
+
+
+def rough_grid(seed: int, top: float = 2.0, shape: tuple[int, ...] = (5, 4, 6)) -> np.ndarray:
+    """Random values (Z, Y, X, 1) between 0 and `top`, some near 0."""
+    return as_float32(top * np.random.default_rng(seed).uniform(0, 1, (*shape, 1)) ** 2)
+
+
+# -- Means of renders --------------------------------------------------------------------------------------------------
+
+
+def moments(scene: mi.Scene, integrator: dict | mi.Integrator, spp: int, batches: int = 32, first: int = 0) -> Moments:
+    """Mean and variance of an image over independent renders."""
+    integrator = mi.load_dict(integrator) if isinstance(integrator, dict) else integrator
+    seeds = range(first, first + batches)
+    return Moments.of(np.stack([np.array(mi.render(scene, integrator=integrator, spp=spp, seed=s)) for s in seeds]))
+
+
+def mivol(**more: object) -> dict:
+    """Our integrator, at depth 2."""
+    return {"type": "mivol", "max_depth": 2, **more}
+
+
+def volpath(**more: object) -> dict:
+    """The judge, at depth 2."""
+    return {"type": "volpath", "max_depth": 2, "rr_depth": 100, **more}
+
+
+def assert_same_images(
+    scene: mi.Scene,
+    spp: tuple[int, int] = (16, 64),
+    batches: int = 32,
+    tile: int = 4,
+    rounding: float = 0.0,
+    ours: dict | None = None,
+    stock: dict | None = None,
+    channels: int = 3,
+    precision: float = 0.01,
+) -> tuple[Moments, Moments]:
+    """mivol and volpath have the same mean in tiles of `tile` pixels, and over the whole image, at 1e-6 each.
+
+    With 32 batches of each Welch's t has about 60 degrees of freedom: bounds of 6.5 (an image of 48 tiles and channels)
+    and 5.4 standard errors. `precision` is what the standard error of the whole image may be of its mean: a bias of six
+    times that cannot hide.
+    """
+    a = moments(scene, ours or mivol(), spp[0], batches)
+    b = moments(scene, stock or volpath(), spp[1], batches, first=1000)
+    image, judge = (replace(m, mean=m.mean[..., :channels], m2=m.m2[..., :channels]) for m in (a, b))
+    known = {"n_a": batches, "n_b": batches, "rounding": rounding}
+    assert_same_mean(image.mean, image.variance_of_mean, judge.mean, judge.variance_of_mean, tile=tile, what="tiles", **known)
+    return assert_same_whole(image, judge, rounding, precision)
+
+
+def assert_same_whole(image: Moments, judge: Moments, rounding: float = 0.0, precision: float = 0.01) -> tuple:
+    """The mean of each channel over all pixels, at 1e-6."""
+    mean, var = [m.mean.mean(axis=(0, 1)) for m in (image, judge)], []
+    for m in (image, judge):
+        var.append(m.variance_of_mean.sum(axis=(0, 1)) / np.prod(m.mean.shape[:2]) ** 2)
+    assert_same_mean(mean[0], var[0], mean[1], var[1], n_a=image.n, n_b=judge.n, rounding=rounding, what="whole images")
+    error = np.sqrt(sum(var))
+    assert np.all(error <= precision * np.abs(mean[1]) + 1e-12), f"standard error {error} of {mean[1]}"
+    return image, judge
+
+
+# -- Pencils: one ray a pixel, held against a twin -----------------------------------------------------------------------------
+
+
+@dataclass
+class Pencils:
+    """A scene seen along rays (n, 3), one pixel for each."""
+
+    scene: mi.Scene
+    o: np.ndarray
+    d: np.ndarray
+
+    def moments(self, integrator: dict, spp: int, batches: int = 32, first: int = 0) -> Moments:
+        """Of (n, channels)."""
+        m = moments(self.scene, integrator, spp, batches, first)
+        return Moments(m.n, m.mean[0], m.m2[0])
+
+
+def pencils(parts: dict, o: np.ndarray, d: np.ndarray) -> Pencils:
+    """A scene with a pencil along each ray; the rays are those that the sensor sends out, to the last bit."""
+    o, d = np.broadcast_arrays(np.atleast_2d(o), np.atleast_2d(d))
+    rays = {f"ray{i:03d}": pencil(p, w) for i, (p, w) in enumerate(zip(o, d, strict=True))}
+    sensor = {"type": "batch", **rays, "film": film(len(o), 1), "sampler": {"type": "independent"}}
+    scene = mi.load_dict({"type": "scene", **parts, "sensor": sensor})
+    return Pencils(scene, *(x[0, :, 0] for x in pixel_rays(scene.sensors()[0], 1)))
+
+
+def aimed(seed: int, n: int = 8, size: float = 0.8, away: float = 3.0) -> tuple[np.ndarray, np.ndarray]:
+    """Rays from `away` towards points of a cube of half-edge `size` about the origin."""
+    rng = np.random.default_rng([seed, 5])
+    o = rng.normal(size=(n, 3))
+    o = as_float32(away * o / np.linalg.norm(o, axis=1, keepdims=True))
+    d = rng.uniform(-size, size, (n, 3)) - o
+    return o, as_float32(d / np.linalg.norm(d, axis=1, keepdims=True))
+
+
+# -- The same lamp for Mitsuba and for the twins -----------------------------------------------------------------------
+
+
+def point(position: np.ndarray, intensity: float = 3.0) -> tuple[dict, twins.Lamp]:
+    return {"type": "point", "position": list(map(float, position)), "intensity": intensity}, twins.Point(
+        as_float32(position), intensity
+    )
+
+
+def sun(direction: np.ndarray, irradiance: float = 2.0) -> tuple[dict, twins.Lamp]:
+    return {"type": "directional", "direction": list(map(float, direction)), "irradiance": irradiance}, twins.Directional(
+        np.asarray(direction), irradiance
+    )
+
+
+def spot(
+    position: np.ndarray, target: np.ndarray, intensity: float = 3.0, cutoff: float = 30.0, beam: float = 20.0
+) -> tuple[dict, twins.Lamp]:
+    """Angles in degrees."""
+    position, target = np.asarray(position, dtype=np.float64), np.asarray(target, dtype=np.float64)
+    place = mi.ScalarTransform4f().look_at(list(position), list(target), [0.1, 0.9, 0.3])
+    lamp = {"type": "spot", "to_world": place, "intensity": intensity, "cutoff_angle": cutoff, "beam_width": beam}
+    return lamp, twins.Spot(position, intensity, target - position, math.radians(cutoff), math.radians(beam))
+
+
+def phase(name: str, g: float = 0.0) -> tuple[dict, object]:
+    """A stock phase function and its twin."""
+    return {
+        "isotropic": ({"type": "isotropic"}, twins.isotropic),
+        "rayleigh": ({"type": "rayleigh"}, twins.rayleigh),
+        "hg": ({"type": "hg", "g": g}, twins.hg(g)),
+    }[name]
+
+
+def smoke(
+    values: np.ndarray,
+    albedo: float = 0.7,
+    kind: str = "stock",
+    to_world: np.ndarray = PLACE,
+    name: str = "isotropic",
+    g: float = 0.0,
+) -> tuple[dict, twins.Medium]:
+    """A grid in its own box, and its twin."""
+    medium_type, volume_type = KINDS[kind]
+    stock, own = phase(name, g)
+    interior = medium(medium_type, grid_volume(volume_type, values, to_world), albedo, phase=stock)
+    return box_of(interior, to_world), twins.Medium(twins.Grid(values, to_world), albedo, own)
+
+
+def fog(
+    sigma_t: float, albedo: float = 0.7, to_world: np.ndarray = PLACE, name: str = "isotropic", g: float = 0
+) -> tuple[dict, twins.Medium]:
+    """A homogeneous box, and its twin."""
+    stock, own = phase(name, g)
+    interior = medium("homogeneous", sigma_t, albedo, phase=stock)
+    return box_of(interior, to_world), twins.Medium(twins.Box(sigma_t, to_world), albedo, own)
+
+
+def assert_twin(
+    seen: Pencils,
+    media: list,
+    lamps: list,
+    integrator: dict,
+    spp: int,
+    batches: int = 32,
+    background: float = 0.0,
+    rounding: float = 0.0,
+    precision: float = 0.02,
+    quadrature: float = 1e-5,
+    **more: object,
+) -> None:
+    """The mean of renders along pencils is the radiance of the twin, each ray by Student's t, 1e-6 in all.
+
+    `quadrature`: relative error of the twin; `rounding`: absolute error of float32. `precision` is what the median
+    standard error may be of the radiance.
+    """
+    truth = twins.radiance(media, lamps, seen.o, seen.d, background=background, **more)
+    m = seen.moments(integrator, spp, batches)
+    truth = np.broadcast_to(truth, m.mean.shape)
+    allowed = rounding + quadrature * np.abs(truth).max()
+    assert_same_mean(m.mean, m.variance_of_mean, truth, n_a=batches, rounding=allowed, what="rays")
+    error = np.sqrt(m.variance_of_mean[truth > 0.1 * truth.max()]) / truth[truth > 0.1 * truth.max()]
+    assert np.median(error) <= precision, f"a median standard error of {np.median(error):.2g}"
+
+
+def close_up(
+    parts: dict, res: int = 16, fov: float = 40.0, origin: tuple = (1.5, -2.5, 1.2), target: tuple = (0, 0, 0)
+) -> mi.Scene:
+    """A scene seen by one small camera."""
+    return mi.load_dict({"type": "scene", **parts, "sensor": camera(origin, target, res=res, fov=fov)})
