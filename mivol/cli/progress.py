@@ -1,7 +1,7 @@
 """How a fit is going, on the terminal: loss, error, time left.
 
 Conventions. Drawn from the fit's own thread between iterations; where the error output is no terminal, one line per
-evaluation.
+evaluation. What a fit logs (a refined grid, noise in its loss) is printed as it comes.
 """
 
 from __future__ import annotations
@@ -51,6 +51,7 @@ class Display:
         self.bar = Progress(*columns, console=self.console, auto_refresh=False, disable=not self.console.is_terminal)
         self.iterations = iterations
         self.said = 0
+        self.logged = 0
         self.drawn = 0.0
         self.begun = False
 
@@ -64,8 +65,11 @@ class Display:
         self.bar.stop()
 
     def __call__(self, fit: Fit) -> None:
-        """Draw, at most ten times a second."""
+        """Draw, at most ten times a second; what the fit has to say is printed above."""
         self.begun = True
+        for line in fit.log[self.logged :]:
+            self.console.print(line, soft_wrap=True, highlight=False, markup=False)
+        self.logged = len(fit.log)
         self.bar.update(self.task, completed=fit.next, description=figures(fit))
         if self.console.is_terminal:
             if time.monotonic() - self.drawn > 0.1:

@@ -26,6 +26,9 @@ from mivol.optim.problem import Problem
 from mivol.optim.schedules import Constant, Schedule
 from mivol.threads import check_one_thread
 
+KEPT = ("next", "events_done", "history", "measures", "log", "warned", "seconds")
+"""What a checkpoint keeps of a fit beside the run and its fingerprint."""
+
 
 @dataclass
 class Fit:
@@ -38,7 +41,8 @@ class Fit:
         events_done: how many of its events have been applied.
         history: one record (iteration, loss, seconds) per iteration.
         measures: one record (iteration, seconds, ...) per evaluation.
-        log: what the events said.
+        log: what the events said, and what the noise of renders does to the loss, once.
+        warned: whether it has been said.
         seconds: time spent, interruptions not counted.
         measure: what ``evaluate`` calls: errors by name.
         path: the checkpoint.
@@ -52,6 +56,7 @@ class Fit:
     history: list[dict[str, float]] = field(default_factory=list)
     measures: list[dict[str, float]] = field(default_factory=list)
     log: list[str] = field(default_factory=list)
+    warned: bool = False
     seconds: float = 0.0
     measure: Callable[[Problem], dict[str, float]] | None = None
     path: Path | None = None
@@ -73,8 +78,7 @@ class Fit:
         """Write the checkpoint, where there is a place for one."""
         if self.path is None:
             return
-        keep = ("next", "events_done", "history", "measures", "log", "seconds", "fingerprint")
-        checkpoint.write(self.path, self.run.pack(), {name: getattr(self, name) for name in keep})
+        checkpoint.write(self.path, self.run.pack(), {name: getattr(self, name) for name in (*KEPT, "fingerprint")})
 
     def restore(self) -> None:
         """Continue from the checkpoint.
@@ -84,7 +88,7 @@ class Fit:
         """
         arrays, about = checkpoint.read(self.path, self.fingerprint)
         self.run.unpack(arrays)
-        for name in ("next", "events_done", "history", "measures", "log", "seconds"):
+        for name in KEPT:
             setattr(self, name, about[name])
 
 
@@ -156,5 +160,14 @@ def _iterate(fit: Fit, iterations: int, schedule: Schedule, events: list[Event])
     if not math.isfinite(loss):
         raise MivolError(f"the loss became {loss} in iteration {fit.next}: lower the learning rate, or bound the parameters.")
     fit.seconds += time.perf_counter() - started
+    _warn(fit)
     fit.history.append({"iteration": fit.next, "loss": loss, "seconds": fit.seconds})
     fit.next, fit.events_done = fit.next + 1, 0
+
+
+def _warn(fit: Fit) -> None:
+    """Say once how much of the loss is the noise of renders, as soon as that is notable."""
+    said = "" if fit.warned else fit.problem.warning()
+    if said:
+        fit.log.append(f"iteration {fit.next}: {said}")
+        fit.warned = True

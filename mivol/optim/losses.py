@@ -2,13 +2,14 @@
 
 Conventions. Images are tensors (height, width, channels) of radiance; the residual is ``image - reference``. A loss is
 the mean of its penalty over pixels and channels, so that it does not change with the size of the sensor. Penalties are
-differentiable through Dr.Jit in ``image`` and take their weights from ``reference`` only. LOSSES lists them.
+differentiable through Dr.Jit in ``image`` and take their weights from ``reference`` only. LOSSES lists them. The noise of
+a render is part of any of them unless ``pairs`` takes it out (:mod:`mivol.optim.noise`).
 """
 
 from __future__ import annotations
 
 import math
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 import drjit as dr
 import mitsuba as mi
@@ -18,7 +19,15 @@ from mivol.optim.strategy import Strategy, of, table
 
 
 class Loss(Strategy, tag="loss"):
-    """A penalty per pixel and channel."""
+    """A penalty per pixel and channel.
+
+    ``is_squared`` tells that it is W/2 r^2: then pairs take the render's noise out exactly, and its gradient, carried
+    back by samples of its own, has no bias in any case.
+    """
+
+    is_squared: ClassVar[bool] = False
+
+    pairs: Annotated[bool, of("1", "take the noise of renders out of the loss, by two renders of half the samples")] = False
 
     def penalty(self, image: mi.TensorXf, reference: mi.TensorXf) -> mi.TensorXf:
         """Penalty of each pixel and channel, same shape as ``image``."""
@@ -59,6 +68,8 @@ class L1(Loss, tag="l1"):
 class L2(Loss, tag="l2"):
     """r^2: the mean of noisy references; maximum likelihood for equal Gaussian noise."""
 
+    is_squared = True
+
     def penalty(self, image: mi.TensorXf, reference: mi.TensorXf) -> mi.TensorXf:
         return dr.square(image - reference)
 
@@ -73,6 +84,8 @@ class RelativeL2(Loss, tag="relative_l2"):
     noise. Source: Lehtinen et al. 2018, Noise2Noise, section 3.3 (there with the prediction in the denominator, held
     fixed, which a line search does not allow).
     """
+
+    is_squared = True
 
     floor: Annotated[float, of("radiance", "pixels darker than this count as if they were this bright", gt=0)] = 1e-2
 

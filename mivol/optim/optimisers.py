@@ -21,7 +21,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mivol.optim.problem import PRIMAL, Problem
+from mivol.optim.problem import ADJOINT, PRIMAL, Problem
 from mivol.optim.strategy import Strategy, of, table
 
 if TYPE_CHECKING:
@@ -306,7 +306,8 @@ class GaussNewton(Optimiser, tag="gauss_newton"):
 
 
 class GaussNewtonRun(Run):
-    """State: the reals and the damping. Image, J and J^T use one set of samples, the same in every iteration."""
+    """State: the reals and the damping. Image, J and J^T use the same samples in every iteration: one set of them, and
+    another for the gradient where light is sampled."""
 
     def __init__(self, settings: GaussNewton, problem: Problem) -> None:
         super().__init__(problem)
@@ -353,13 +354,14 @@ class Linearised:
         self.seeds = [problem.seed_for(0, index, PRIMAL) for index in range(len(problem.shots))]
         self.slopes = {p.name: slope(p, reals[p.name]) for p in problem.parameters}
         problem.set(reals)
-        self.loss = 0.0
-        for shot, seed in zip(problem.shots, self.seeds, strict=True):
-            value, adjoint = problem.adjoint(shot, problem.render(shot.sensor, seed), len(problem.views))
-            self.loss += value
-            problem.pull_back(shot.sensor, adjoint, seed)
+        compared = []
+        for index, (shot, seed) in enumerate(zip(problem.shots, self.seeds, strict=True)):
+            compared.append(problem.compare(shot, seed, len(problem.views)))
+            # The noise of an image and of a derivative from the same samples is correlated: that would bias J^T W r.
+            own = problem.seed_for(0, index, ADJOINT) if problem.noisy else seed
+            problem.pull_back(shot.sensor, compared[-1].adjoint, own)
         energy, gradients = problem.through_priors_and_maps(reals, problem.gradients())
-        self.loss += energy
+        self.loss = problem.look(compared) + energy
         self.gradient = packing.vector(gradients, 1)
 
     def curvature(self, v: np.ndarray) -> np.ndarray:

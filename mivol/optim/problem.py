@@ -4,9 +4,10 @@ r"""The fit as a function: real numbers in, loss and derivatives out, through an
 
 Conventions. ``u`` are the reals of each :class:`~mivol.optim.parameters.Parameter`, ``x`` the scene's values. An image
 is the mean of passes of at most ``samples_per_pass`` samples: the adjoint of the loss is taken at the whole image, then
-carried back pass by pass, so that non-linear losses do not depend on the split. Seeds are a function of (seed,
-iteration, shot, purpose, pass) only. Between passes ``safe_point`` is called; nothing that outlives the call has
-changed until it returns.
+carried back pass by pass, so that non-linear losses do not depend on the split. Where light is sampled, an image is
+the mean of two renders with seeds of their own, which tell how much of the loss is noise. Seeds are a function of (seed,
+iteration, shot, purpose, half, pass) only. Between passes ``safe_point`` is called; nothing that outlives the call has
+changed until it returns, but ``seen``.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ import numpy as np
 
 from mivol.errors import MivolError
 from mivol.optim.losses import L2, Loss
+from mivol.optim.noise import Compared, compare, halves_of, noise_check, warning
 from mivol.optim.parameters import Parameter, as_tensor, find, like
 from mivol.optim.shots import Shot, View, check_views, make_shots, pixels, single_shots
 
@@ -46,6 +48,8 @@ class Problem:
         samples_per_pass: most samples in one kernel.
         seed: root of all random numbers.
         safe_point: called between kernels.
+        noisy: whether images hold noise of sampled light, with the values that the scene holds now.
+        seen: loss of the views (no priors) and its noise, of the newest gradient.
     """
 
     scene: mi.Scene
@@ -68,6 +72,9 @@ class Problem:
             find(parameter.name, self.params)
         self.params.keep([parameter.name for parameter in self.parameters])
         self.shots = make_shots(self.views, self.samples_per_pass)
+        self.seen = (0.0, 0.0)
+        self._has_noise = noise_check(self.integrator, self.scene)
+        self.noisy = self._has_noise()
 
     # -- Values ---------------------------------------------------------------------------------------------------
 
@@ -95,32 +102,33 @@ class Problem:
             dr.enable_grad(value)
             self.params[p.name] = value
         self.params.update()
+        self.noisy = self._has_noise()
 
     # -- Images ---------------------------------------------------------------------------------------------------
 
-    def passes(self, sensor: mi.Sensor) -> list[int]:
+    def passes(self, sensor: mi.Sensor, spp: int) -> list[int]:
         """Samples per pixel of each pass; they sum to ``spp`` and hardly differ."""
         most = max(self.samples_per_pass // pixels(sensor), 1)
-        n = math.ceil(self.spp / most)
-        return [self.spp // n + (i < self.spp % n) for i in range(n)]
+        n = math.ceil(spp / most)
+        return [spp // n + (i < spp % n) for i in range(n)]
 
     def seed_for(self, iteration: int, index: int, purpose: int) -> int:
         """Seed of a shot, given its number."""
         return seed_of(self.seed, iteration, index, purpose)
 
-    def render(self, sensor: mi.Sensor, seed: int) -> mi.TensorXf:
-        """Mean image of a sensor over all passes, detached."""
-        total = None
-        for number, spp in enumerate(self.passes(sensor)):
+    def render(self, sensor: mi.Sensor, seed: int, spp: int | None = None) -> mi.TensorXf:
+        """Mean image of a sensor over all passes, detached; of the problem's ``spp`` by default."""
+        total, spp = None, spp or self.spp
+        for number, share in enumerate(self.passes(sensor, spp)):
             with dr.suspend_grad():
-                image = self.integrator.render(self.scene, sensor, seed=seed_of(seed, number), spp=spp)
-                total = image * spp if total is None else total + image * spp
+                image = self.integrator.render(self.scene, sensor, seed=seed_of(seed, number), spp=share)
+                total = image * share if total is None else total + image * share
             self._finish(total)
-        return total / self.spp
+        return total / spp
 
     def pull_back(self, sensor: mi.Sensor, adjoint: mi.TensorXf, seed: int) -> None:
         """Add J^T adjoint of a sensor's image to the gradients of the scene's parameters."""
-        for number, spp in enumerate(self.passes(sensor)):
+        for number, spp in enumerate(self.passes(sensor, self.spp)):
             self.integrator.render_backward(
                 self.scene, self.params, adjoint * (spp / self.spp), sensor, seed_of(seed, number), spp
             )
@@ -129,7 +137,7 @@ class Problem:
     def push_forward(self, sensor: mi.Sensor, tangents: dict[str, mi.TensorXf], seed: int) -> mi.TensorXf:
         """J v of a sensor's image, for a direction v of the scene's parameters."""
         total = None
-        for number, spp in enumerate(self.passes(sensor)):
+        for number, spp in enumerate(self.passes(sensor, self.spp)):
             self._set_tangents(tangents)
             image = self.integrator.render_forward(self.scene, self.params, sensor, seed_of(seed, number), spp)
             total = dr.detach(image) * spp if total is None else total + dr.detach(image) * spp
@@ -155,18 +163,17 @@ class Problem:
         """f(u) and its gradient, over the ``chosen`` views (all of them by default).
 
         The seeds of image and derivative differ: an estimate of d(I^2) = 2 I dI from one set of samples is biased.
-        Noise: of the integrator; none for media that only absorb, beyond the pixel filter's.
+        Noise: of the integrator; none for media that only absorb, beyond the pixel filter's. What it does to the loss:
+        :func:`mivol.optim.noise.compare`.
         """
         shots = self.shots if chosen is None else single_shots([self.views[index] for index in chosen])
         self.set(reals)
-        total = 0.0
+        n_views, compared = sum(shot.n_views for shot in shots), []
         for index, shot in enumerate(shots):
-            image = self.render(shot.sensor, self.seed_for(iteration, index, PRIMAL))
-            value, adjoint = self.adjoint(shot, image, sum(s.n_views for s in shots))
-            total += value
-            self.pull_back(shot.sensor, adjoint, self.seed_for(iteration, index, ADJOINT))
+            compared.append(self.compare(shot, self.seed_for(iteration, index, PRIMAL), n_views))
+            self.pull_back(shot.sensor, compared[-1].adjoint, self.seed_for(iteration, index, ADJOINT))
         energy, gradients = self.through_priors_and_maps(reals, self.gradients())
-        return total + energy, gradients
+        return self.look(compared) + energy, gradients
 
     def loss_value(self, reals: dict[str, mi.TensorXf], iteration: int) -> float:
         """f(u), without derivatives."""
@@ -175,17 +182,31 @@ class Problem:
 
     def mean_loss(self, iteration: int) -> float:
         """Mean loss over all views, of what the scene holds now."""
-        images = (self.render(shot.sensor, self.seed_for(iteration, i, PRIMAL)) for i, shot in enumerate(self.shots))
-        losses = (self.adjoint(shot, image, len(self.views))[0] for shot, image in zip(self.shots, images, strict=True))
-        return math.fsum(losses)
+        pairs = enumerate(self.shots)
+        return math.fsum(self.compare(s, self.seed_for(iteration, i, PRIMAL), len(self.views)).loss for i, s in pairs)
 
-    def adjoint(self, shot: Shot, image: mi.TensorXf, n_views: int) -> tuple[float, mi.TensorXf]:
-        """A shot's part of the mean loss over ``n_views`` views, and its derivative by the image."""
-        image = dr.detach(image)
-        dr.enable_grad(image)
-        value = self.loss(image, shot.reference) * (shot.n_views / n_views)
-        dr.backward(value)
-        return float(value[0]), dr.detach(dr.grad(image))
+    def compare(self, shot: Shot, seed: int, n_views: int) -> Compared:
+        """Render a shot; its part of the mean loss over ``n_views`` views.
+
+        Raises:
+            MivolError: the loss takes pairs, the render is noisy and has one sample per pixel.
+        """
+        parts = halves_of(self.spp, self.loss) if self.noisy else (self.spp,)
+        if len(parts) == 1:
+            renders = [self.render(shot.sensor, seed)]
+        else:
+            renders = [self.render(shot.sensor, seed_of(seed, half), spp) for half, spp in enumerate(parts)]
+        return compare(self.loss, renders, [n / self.spp for n in parts], shot.reference, shot.n_views / n_views)
+
+    def look(self, compared: Sequence[Compared]) -> float:
+        """The sum of the losses of some shots, remembered with its noise for :meth:`warning`."""
+        unknown = self.noisy and self.spp == 1
+        self.seen = math.fsum(c.loss for c in compared), math.nan if unknown else math.fsum(c.noise for c in compared)
+        return self.seen[0]
+
+    def warning(self) -> str:
+        """What a reader of the newest loss must know of its noise, or ""."""
+        return warning(self.loss, *self.seen)
 
     def energy(self, reals: dict[str, mi.TensorXf]) -> float:
         """Sum of all weighted prior energies."""

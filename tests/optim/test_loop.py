@@ -169,9 +169,9 @@ def test_each_epoch_shows_each_view_once() -> None:
 def test_passes_sum_to_the_samples(variant_rgb) -> None:
     problem = small_problem(spp=10, samples_per_pass=3 * 64)
     sensor = problem.views[0].sensor
-    assert sum(problem.passes(sensor)) == 10
-    assert max(problem.passes(sensor)) * 64 <= problem.samples_per_pass
-    assert max(problem.passes(sensor)) - min(problem.passes(sensor)) <= 1
+    assert sum(problem.passes(sensor, 10)) == 10
+    assert max(problem.passes(sensor, 10)) * 64 <= problem.samples_per_pass
+    assert max(problem.passes(sensor, 10)) - min(problem.passes(sensor, 10)) <= 1
 
 
 def test_a_nonlinear_loss_does_not_see_the_passes(variant_rgb) -> None:

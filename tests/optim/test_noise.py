@@ -1,0 +1,283 @@
+"""Noise in a loss: visible in the plain one, gone from pairs, measured, said once; and exact renders know nothing of it."""
+
+from __future__ import annotations
+
+import copy
+import math
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from fit_scene import KEY, absorbing_scene, frontal, small_problem
+
+from mivol import config
+from mivol.cli.progress import Display
+from mivol.errors import MivolError
+from mivol.optim.loop import reconstruct
+from mivol.optim.losses import L1, L2, LOSSES, Huber, Log, RelativeL2
+from mivol.optim.noise import compare, halves_of, noise_check, warning
+from mivol.optim.optimisers import Adam, Linearised, Packing
+from mivol.optim.parameters import Parameter
+from mivol.optim.problem import Problem
+from mivol.optim.shots import View
+
+SIGMA, SEEN, SPP = 0.4, 0.6, 8
+T = math.exp(-2 * SIGMA)
+"""Transmittance of the constant cube along the frontal camera's rays; ``SEEN`` is its reference."""
+
+
+def tensor(a: np.ndarray) -> mi.TensorXf:
+    return mi.TensorXf(np.ascontiguousarray(a, dtype=np.float32).reshape(-1, 1, 1))
+
+
+def noisy_halves(n: int, mean: float, s: float, shares: tuple[float, ...], seed: int = 0) -> list[mi.TensorXf]:
+    """Images of n pixels whose weighted mean has Gaussian noise s."""
+    rng = np.random.default_rng(seed)
+    return [tensor(rng.normal(mean, s / math.sqrt(share), n)) for share in shares]
+
+
+# -- The estimator ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("shares", [(0.5, 0.5), (0.6, 0.4)], ids=["equal", "unequal"])
+@pytest.mark.parametrize("name", ["l2", "relative_l2"])
+def test_pairs_take_the_noise_out_of_a_squared_loss(variant_rgb, name: str, shares: tuple[float, ...]) -> None:
+    """W/2 (r^2 + s^2) plainly and W/2 r^2 with pairs; the standard errors are those of the docstring, 6 of them allowed
+    (1e-9 a check). Unequal shares w1 w2 make the variance of b 2 s^4 as well, for b = w1 w2 (I1 - I2)^2."""
+    n, r, s, reference = 40_000, 0.02, 0.05, 0.5
+    halves, seen = noisy_halves(n, reference + r, s, shares), tensor(np.full(n, reference))
+    w = {"l2": 1.0, "relative_l2": 1 / (reference**2 + 1e-4)}[name]
+    plain = compare(LOSSES[name](), halves, shares, seen)
+    pairs = compare(LOSSES[name](pairs=True), halves, shares, seen)
+    error = [w * math.sqrt((4 * r**2 * s**2 + k * s**4) / n) for k in (2, 4)]
+    assert abs(plain.loss - w * (r**2 + s**2)) <= 6 * error[0]
+    assert abs(pairs.loss - w * r**2) <= 6 * error[1]
+    assert w * s**2 > 50 * error[1], "the bias is what is tested for: it must stand out"
+    assert abs(plain.noise - w * s**2) <= 6 * w * math.sqrt(2 * s**4 / n)
+    # Carried back by samples of its own, the plain gradient is unbiased already: 2 W/2 (mean - R) / n, to rounding.
+    expected = 2 * w / n * (sum(np.asarray(h) * share for h, share in zip(halves, shares, strict=True)) - reference)
+    for found in (plain, pairs):
+        assert np.allclose(np.asarray(found.adjoint), expected, rtol=1e-4, atol=1e-6 * np.abs(expected).max())
+
+
+def test_two_halves_give_their_product(variant_rgb) -> None:
+    """f - b = (I1 - R)(I2 - R), pixel by pixel; rounding of squares of size 4."""
+    rng = np.random.default_rng(1)
+    for a, b, r in rng.uniform(-1, 1, (8, 3)):
+        found = compare(L2(pairs=True), [tensor(a), tensor(b)], (0.5, 0.5), tensor(r)).loss
+        assert abs(found - (a - r) * (b - r)) <= 16 * 6e-8 * 4
+
+
+def test_variance_is_as_said(variant_rgb) -> None:
+    """Without a residual 2 s^4 plainly and 4 s^4 with pairs, from 300 images of 64 pixels: a sample variance of 300 nearly
+    normal means errs by sqrt(2 / 300) = 8 %, and 5 of these are allowed."""
+    s, trials, n = 0.1, 300, 64
+    seen = tensor(np.full(n, 0.5))
+    values = []
+    for trial in range(trials):
+        halves = noisy_halves(n, 0.5, s, (0.5, 0.5), trial)
+        values.append([compare(L2(pairs=pairs), halves, (0.5, 0.5), seen).loss for pairs in (False, True)])
+    found = np.var(values, axis=0, ddof=1) * n / s**4
+    assert np.all(np.abs(found / [2, 4] - 1) <= 5 * math.sqrt(2 / trials))
+
+
+def test_pairs_leave_the_next_order_of_a_smooth_loss(variant_rgb) -> None:
+    """log^2(1 + x) = x^2 - x^3 + 11/12 x^4 - 5/6 x^5 + 137/180 x^6 ...: for noise s its mean is s^2 + 2.75 s^4 + 11.4 s^6;
+    halves have the variance 2 s^2, so that 2 f(mean) - f(halves) leaves (2 - 4) 2.75 s^4 + (2 - 8) 11.4 s^6 = -6.2e-4 of
+    1.03e-2 at s = 0.1. The next order is (2 - 16) 68 s^8 = 1e-5, the standard error sqrt(4 s^4 / n)."""
+    n, s, reference = 400_000, 0.1, 0.5
+    halves, seen = noisy_halves(n, reference, s * reference, (0.5, 0.5)), tensor(np.full(n, reference))
+    weight = reference**2 / (reference**2 + 1e-6)
+    plain = compare(Log(), halves, (0.5, 0.5), seen).loss / weight
+    pairs = compare(Log(pairs=True), halves, (0.5, 0.5), seen).loss / weight
+    error = math.sqrt(4 * s**4 / n)
+    assert abs(plain - (s**2 + 2.75 * s**4 + 11.4 * s**6)) <= 6 * error + 70 * s**8
+    assert abs(pairs - (-5.5 * s**4 - 68.5 * s**6)) <= 6 * error + 960 * s**8
+
+
+def test_pairs_at_the_kink_of_l1(variant_rgb) -> None:
+    """E|N(0, s)| = sqrt(2 / pi) s = 0.798 s, and of halves sqrt(2) of that: pairs leave 2 - sqrt(2) = 0.59 of it."""
+    n, s = 100_000, 0.1
+    halves, seen = noisy_halves(n, 0.5, s, (0.5, 0.5)), tensor(np.full(n, 0.5))
+    mean = math.sqrt(2 / math.pi) * s
+    plain, pairs = (compare(L1(pairs=on), halves, (0.5, 0.5), seen).loss for on in (False, True))
+    # |N| has the standard deviation 0.6 s, and three such numbers enter with weights 2, 1/2, 1/2: below 2 s.
+    assert abs(plain - mean) <= 6 * s / math.sqrt(n)
+    assert abs(pairs - (2 - math.sqrt(2)) * mean) <= 6 * 2 * s / math.sqrt(n)
+
+
+@pytest.mark.parametrize("name", LOSSES)
+def test_adjoint_is_the_slope_by_the_mean_image(variant_rgb, name: str) -> None:
+    """Both halves moved by +-h move the loss by the adjoint's sum; differences of float32 values of size 1 with h = 1e-2
+    err by h^2 f'''/6 and by 1e-7 / h = 1e-5. The kinks of |r| (pixels within h of it) are left out by a residual of 0.3."""
+    n, h = 64, 1e-2
+    seen = np.full(n, 0.5)
+    halves = [np.asarray(x).ravel() for x in noisy_halves(n, 0.8, 0.02, (0.5, 0.5))]
+    loss = LOSSES[name](pairs=True)
+    up, down = (compare(loss, [tensor(x + e) for x in halves], (0.5, 0.5), tensor(seen)).loss for e in (h, -h))
+    found = compare(loss, [tensor(x) for x in halves], (0.5, 0.5), tensor(seen))
+    assert np.isclose(np.asarray(found.adjoint).sum(), (up - down) / (2 * h), rtol=1e-3)
+
+
+def test_one_exact_render_has_no_noise(variant_rgb) -> None:
+    image, seen = tensor(np.linspace(0, 1, 9)), tensor(np.full(9, 0.4))
+    plain, pairs = (compare(Huber(pairs=on), [image], (1.0,), seen, weight=0.5) for on in (False, True))
+    assert plain.noise == pairs.noise == 0.0
+    assert plain.loss == pairs.loss == 0.5 * float(Huber()(image, seen)[0])
+
+
+# -- Through Mitsuba ----------------------------------------------------------------------------------------------
+
+
+def cube_problem(integrator: str = "prbvolpath", **settings: object) -> Problem:
+    """A constant cube seen by parallel rays. Delta tracking (``prbvolpath``, albedo 0) sees the sky or nothing: a pixel's
+    mean of n samples has the expectation T and the variance T (1 - T) / n; mivol's is T."""
+    scene = absorbing_scene(np.full((2, 2, 2, 1), SIGMA))
+    view = View("face", frontal(8), mi.TensorXf(np.full((8, 8, 3), SEEN, "f")))
+    tracer = mi.load_dict({"type": integrator, "max_depth": 2})
+    chosen = {"spp": SPP, "integrator": tracer} | settings
+    return Problem(scene, [view], [Parameter(KEY, domain=(0.0, np.inf), lr=1e-3)], **chosen)
+
+
+@pytest.mark.parametrize("pairs", [False, True], ids=["plain", "pairs"])
+def test_the_renderers_noise_in_the_loss(variant_rgb, pairs: bool) -> None:
+    """Rationale: what a fit reports as its loss is the mismatch plus T (1 - T) / n, here as large as the mismatch.
+    Expected: the mean of 60 losses is (T - R)^2 plus that, and with pairs without it, within 5 standard errors of the 60
+    (Student's t, 59 degrees: chance 6e-6)."""
+    problem = cube_problem(loss=L2(pairs=pairs))
+    problem.set(problem.start())
+    losses = [problem.mean_loss(i) for i in range(60)]
+    error = np.std(losses, ddof=1) / math.sqrt(len(losses))
+    bias = T * (1 - T) / SPP
+    assert bias > 20 * error
+    assert abs(np.mean(losses) - (T - SEEN) ** 2 - (0 if pairs else bias)) <= 5 * error
+
+
+def test_the_measured_noise_is_the_variance(variant_rgb) -> None:
+    """Its mean over 60 iterations is T (1 - T) / n within 5 standard errors."""
+    problem = cube_problem()
+    found = []
+    for i in range(60):
+        problem.loss_and_gradient(problem.start(), i)
+        found.append(problem.seen[1])
+    error = np.std(found, ddof=1) / math.sqrt(len(found))
+    assert abs(np.mean(found) - T * (1 - T) / SPP) <= 5 * error
+
+
+def test_exact_renders_do_not_pay(variant_rgb) -> None:
+    """One render a shot, no noise, and pairs change no bit; noisy renders come in two halves of the samples."""
+    for integrator, wanted in (("mivol", [SPP]), ("prbvolpath", [SPP // 2, SPP // 2])):
+        losses = []
+        for pairs in (False, True):
+            problem = cube_problem(integrator, loss=L2(pairs=pairs))
+            samples: list[int] = []
+            problem.integrator = Counting(problem.integrator, samples)
+            losses.append(problem.loss_and_gradient(problem.start(), 0)[0])
+            assert samples == wanted
+            assert (problem.seen[1] == 0.0) == (integrator == "mivol")
+        assert (losses[0] == losses[1]) == (integrator == "mivol")
+    assert halves_of(5, L2()) == (3, 2)
+
+
+class Counting:
+    """An integrator that notes the samples of each primal render."""
+
+    def __init__(self, integrator: mi.Integrator, samples: list[int]) -> None:
+        self.integrator, self.samples = integrator, samples
+
+    def render(self, *args: object, **keywords: int) -> mi.TensorXf:
+        self.samples.append(keywords["spp"])
+        return self.integrator.render(*args, **keywords)
+
+    def __getattr__(self, name: str) -> object:
+        return getattr(self.integrator, name)
+
+
+def test_gauss_newton_carries_noise_back_by_other_samples(variant_rgb) -> None:
+    """Seeds of J^T differ from the image's where there is noise, and are the image's where there is none."""
+    for integrator, same in (("mivol", True), ("prbvolpath", False)):
+        problem = cube_problem(integrator)
+        images, derivatives = [noted(problem, name, place) for name, place in (("compare", 1), ("pull_back", 2))]
+        reals = problem.start()
+        Linearised(problem, reals, [L2().weight(problem.shots[0].reference)], Packing(problem, reals))
+        assert len(images) == 1
+        assert (images == derivatives) == same
+
+
+def noted(problem: Problem, method: str, place: int) -> list[int]:
+    """The seeds, at that place of the arguments, that a method is called with from now on."""
+    seeds, kept = [], getattr(problem, method)
+    setattr(problem, method, lambda *given: seeds.append(given[place]) or kept(*given))
+    return seeds
+
+
+def test_who_is_noisy(variant_rgb) -> None:
+    """Mivol where light may be sampled, with the values of now; every other integrator."""
+    absorbing = absorbing_scene(np.ones((2, 2, 2, 1)))
+    medium = {"type": "homogeneous", "albedo": 0.5, "sigma_t": {"type": "rgb", "value": 0.5}}
+    cube = {"type": "cube", "bsdf": {"type": "null"}, "interior": medium}
+    cloudy = mi.load_dict({"type": "scene", "sky": {"type": "constant"}, "cube": cube})
+    wall = mi.load_dict({"type": "scene", "sky": {"type": "constant"}, "wall": {"type": "sphere"}})
+    deep, seen = (mi.load_dict({"type": "mivol", "max_depth": depth}) for depth in (2, 1))
+    assert not noise_check(deep, absorbing)()
+    assert noise_check(mi.load_dict({"type": "volpath", "max_depth": 2}), absorbing)()
+    assert noise_check(deep, wall)()
+    assert not noise_check(seen, wall)()
+    assert not noise_check(seen, cloudy)()
+    asked = noise_check(deep, cloudy)
+    assert asked()
+    params = mi.traverse(cloudy)
+    (key,) = (name for name in params.properties if "albedo" in name)
+    params[key] = 0.0 * params[key]
+    params.update()
+    assert not asked()
+
+
+# -- What is said -------------------------------------------------------------------------------------------------
+
+
+def test_said_once_with_its_size(variant_rgb, tmp_path: Path, capsys) -> None:
+    """At (T - R)^2 = 0.0227 and T (1 - T) / 8 = 0.031 the noise is 58 % of the loss; the noise of one iteration's estimate
+    (64 pixels, sqrt(2 / 64) = 18 % of 0.031, and as much of the loss) leaves 40 to 75 %."""
+    path = tmp_path / "checkpoint.npz"
+    with Display(3) as display:
+        fit = reconstruct(cube_problem(), Adam(), 3, path=path, observer=display)
+    fit.save()
+    (line,) = fit.log
+    assert line.startswith('iteration 0: the render\'s noise makes up 0.0')
+    share = int(line.partition("%")[0].split()[-1])
+    assert 40 <= share <= 75
+    assert "its gradient is not biased" in line
+    assert "loss.pairs = true" in line
+    assert capsys.readouterr().err.count("loss.pairs = true") == 1
+    assert reconstruct(cube_problem(), Adam(), 5, path=path, resume=True).log == [line]
+
+
+def test_nothing_is_said_of_exact_renders_and_of_pairs(variant_rgb) -> None:
+    assert reconstruct(cube_problem("mivol"), Adam(), 2).log == []
+    assert reconstruct(cube_problem(loss=L2(pairs=True)), Adam(), 2).log == []
+    assert reconstruct(small_problem(loss=L1()), Adam(), 2).log == []
+
+
+def test_a_single_sample_tells_nothing(variant_rgb) -> None:
+    (line,) = reconstruct(cube_problem(spp=1), Adam(), 2).log
+    assert "fit.spp = 1 does not tell how much" in line
+    with pytest.raises(MivolError, match="fit.spp is 1: set fit.spp to 2"):
+        reconstruct(cube_problem(spp=1, loss=L2(pairs=True)), Adam(), 1)
+
+
+def test_the_words(variant_rgb) -> None:
+    assert warning(L2(), 1.0, 0.04) == warning(L2(), 0.0, 0.0) == ""
+    assert "6%" in warning(RelativeL2(), 1.0, 0.06)
+    assert "its gradient is biased too" in warning(Huber(), 1.0, 0.5)
+    assert warning(Huber(pairs=True), 1.0, 0.5) == ""
+
+
+def test_pairs_are_a_setting_of_every_loss() -> None:
+    raw = {"title": "a", "scene": {"file": "s.xml"}, "parameter": [{"key": "k"}]}
+    for name in LOSSES:
+        chosen = config.from_dict(copy.deepcopy(raw) | {"loss": {"name": name, "pairs": True}})
+        assert chosen.loss == LOSSES[name](pairs=True)
+    with pytest.raises(MivolError, match='did you mean "pairs"'):
+        config.from_dict(raw | {"loss": {"name": "l2", "pair": True}})
