@@ -71,8 +71,9 @@ def test_a_resumed_run_is_the_same_with_several_threads(variant_rgb, tmp_path: P
     assert np.allclose(np.asarray(resumed.run.reals[KEY]), np.asarray(whole.run.reals[KEY]), rtol=1e-5, atol=1e-5)
 
 
-def test_a_signal_in_the_middle_of_an_iteration_loses_nothing(one_thread, tmp_path: Path) -> None:
-    """The signal comes between two renders of iteration 3: that iteration is done again from where it began."""
+@pytest.mark.parametrize("iteration", [2, 3], ids=["after an event", "plain"])
+def test_a_signal_in_the_middle_of_an_iteration_loses_nothing(one_thread, tmp_path: Path, iteration: int) -> None:
+    """The signal comes in the render of an iteration: that iteration is done again from where it began, its events not."""
     path, whole = tmp_path / "checkpoint.npz", fit(Adam())
     problem = small_problem()
     renders = 0
@@ -81,14 +82,14 @@ def test_a_signal_in_the_middle_of_an_iteration_loses_nothing(one_thread, tmp_pa
     def render(*args: object) -> object:
         nonlocal renders
         renders += 1
-        if renders == 4:
+        if renders == iteration + 1:
             os.kill(os.getpid(), signal.SIGINT)
         return kept(*args)
 
     problem.render = render
     with pytest.raises(Interrupted):
         reconstruct(problem, Adam(), ITERATIONS, events=EVENTS, path=path, fingerprint={"a": 1})
-    assert renders == 4
+    assert renders == iteration + 1
     resumed = fit(Adam(), path, resume=True)
     assert [r["loss"] for r in resumed.history] == [r["loss"] for r in whole.history]
     assert np.array_equal(np.asarray(resumed.run.reals[KEY]), np.asarray(whole.run.reals[KEY]))

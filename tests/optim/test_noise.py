@@ -245,7 +245,7 @@ def test_said_once_with_its_size(variant_rgb, tmp_path: Path, capsys) -> None:
         fit = reconstruct(cube_problem(), Adam(), 3, path=path, observer=display)
     fit.save()
     (line,) = fit.log
-    assert line.startswith('iteration 0: the render\'s noise makes up 0.0')
+    assert line.startswith("iteration 0: the render's noise makes up 0.0")
     share = int(line.partition("%")[0].split()[-1])
     assert 40 <= share <= 75
     assert "its gradient is not biased" in line
