@@ -1,0 +1,71 @@
+"""What values a phase function's parameter may have: refused where they can be read, projected where they cannot.
+
+Conventions. An optimiser's overshoot is refused with a sentence when the new value is handed in. Inside a recording by
+``dr.freeze``, and behind a volume whose values are not known, nothing can be read: there the value is moved to the nearest
+one that is allowed, and its derivative is 0.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mivol.errors import MivolError
+
+__all__ = ["ASYMMETRY", "COSINE_SQUARED", "DOMAINS", "WEIGHT", "Domain"]
+
+
+@dataclass(frozen=True)
+class Domain:
+    """An interval of float32 numbers.
+
+    Attributes:
+        low, high: the least and the largest number that is allowed.
+        words: the interval in a sentence.
+        way_out: what to do about a value outside it.
+    """
+
+    low: float
+    high: float
+    words: str
+    way_out: str
+
+    def check(self, values: np.ndarray, name: str) -> None:
+        """Refuse values outside.
+
+        Raises:
+            MivolError: NaN, or outside the interval after rounding to float32; the first bad value and its index are named.
+        """
+        values = np.asarray(values, dtype=np.float32)
+        wrong = np.argwhere(~((values >= np.float32(self.low)) & (values <= np.float32(self.high))))
+        if len(wrong) == 0:
+            return
+        first = tuple(int(i) for i in wrong[0])
+        place = "" if values.size == 1 else f" at {first if len(first) > 1 else first[0]}"
+        raise MivolError(f"{name} is {float(values[first]):.9g}{place}; {self.words} is expected: {self.way_out}.")
+
+    def project(self, x: mi.Float) -> mi.Float:
+        """The nearest allowed value, without derivative where it is another one; NaN stays NaN."""
+        # Not dr.minimum and dr.maximum: where x lies on a bound their derivative may be that of the constant.
+        x = dr.select(x < self.low, self.low, x)
+        return x if math.isinf(self.high) else dr.select(x > self.high, self.high, x)
+
+
+NEXT_TO_ONE = 1 - 2.0**-24
+"""The largest float32 below 1."""
+
+LARGEST = float(np.finfo(np.float32).max)
+
+ASYMMETRY = Domain(
+    -NEXT_TO_ONE, NEXT_TO_ONE, "a number above -1 and below 1", "choose one, or clip it after each step, for instance to 0.999"
+)
+COSINE_SQUARED = WEIGHT = Domain(
+    0.0, LARGEST, "a finite number of at least 0", "choose one, or clip it at 0 after each step"
+)
+
+DOMAINS = {"g": ASYMMETRY, "alpha": COSINE_SQUARED, "weight": WEIGHT}
+"""Parameter -> its domain."""

@@ -1,0 +1,42 @@
+r"""A sum of phase functions: each scattering follows one of them, with the chance of its share.
+
+.. math:: p = \sum_k s_k p_k, \qquad s_k = w_k / \sum_j w_j
+
+Conventions. Weights are at least 0 and need not sum to 1; where all of them are 0 (a corner of a grid of weights) the lobes
+have equal shares.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import drjit as dr
+import mitsuba as mi
+
+__all__ = ["choose_lobe", "shares_of"]
+
+
+def shares_of(weights: Sequence[mi.Float]) -> list[mi.Float]:
+    """Weights divided by their sum, with derivatives; equal ones where the sum is 0."""
+    total = sum(weights[1:], weights[0])
+    empty = ~(total > 0) & (total == 0)
+    inv = dr.rcp(dr.select(empty, 1, total))
+    return [dr.select(empty, 1 / len(weights), w * inv) for w in weights]
+
+
+def choose_lobe(shares: Sequence[mi.Float], u: mi.Float) -> tuple[mi.UInt32, mi.Float]:
+    """Pick one lobe with the chance of its share.
+
+    Returns:
+        its number, and where in its interval u lay: uniform in [0, 1) again.
+    """
+    chosen, low, high = mi.UInt32(0), dr.zeros(mi.Float, 1), mi.Float(shares[0])
+    start = mi.Float(0)
+    for k, share in enumerate(shares):
+        # A share of 0 is an empty interval and is never chosen, not even by a u that rounding left above all of them.
+        here = (u >= start) & (share > 0)
+        end = start + share
+        chosen, low, high = dr.select(here, k, chosen), dr.select(here, start, low), dr.select(here, end, high)
+        start = end
+    inside = (u - low) * dr.rcp(dr.select(high > low, high - low, 1))
+    return chosen, dr.clip(inside, 0, 1 - 2.0**-24)

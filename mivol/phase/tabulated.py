@@ -1,0 +1,310 @@
+r"""A phase function given by numbers: linear in the cosine between nodes that lie where they like.
+
+.. math:: p(c) = \frac{f(c)}{2\pi \int_{-1}^1 f\,dc}, \qquad f \text{ linear between } (c_i, f_i)
+
+Conventions. Nodes rise from exactly -1 to exactly 1. :class:`Table` is the checked data, float64 NumPy; :class:`Lookup` is the
+same on Dr.Jit arrays. A node is kept as 1 - c and as 1 + c: nodes of a forward peak 1e-4 wide stay apart in float32.
+
+Source of the inversion inside a segment: the smaller root of the quadratic, written without cancellation as in Press et al.,
+Numerical Recipes, section 5.6.
+"""
+
+from __future__ import annotations
+
+import csv
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mivol.errors import MivolError
+from mivol.phase.turn import INV_TWO_PI, Turn
+
+__all__ = ["Lookup", "Table", "adapt_nodes"]
+
+
+# -- The data ----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Table:
+    """Values of a phase function at cosines, not normalised.
+
+    Attributes:
+        cosines: (n,) rising, from -1 to 1, float64.
+        values: (n,) at least 0, not all 0, float64.
+        name: what the table is called in a sentence that refuses it.
+
+    Raises:
+        MivolError: anything else.
+    """
+
+    cosines: np.ndarray
+    values: np.ndarray
+    name: str = "the phase table"
+
+    def __post_init__(self) -> None:
+        for field in ("cosines", "values"):
+            object.__setattr__(self, field, np.asarray(getattr(self, field), dtype=np.float64).ravel())
+        c = self.cosines
+        if len(c) < 2 or len(c) != len(self.values):
+            raise MivolError(
+                f"{self.name} has {len(c)} cosines and {len(self.values)} values; as many of one as of the other, and at least "
+                "2, are expected."
+            )
+        falls = np.flatnonzero(~(np.diff(c) > 0))
+        if len(falls):
+            i = falls[0]
+            raise MivolError(
+                f"the cosines of {self.name} go from {c[i]:.9g} to {c[i + 1]:.9g} at {i + 1}; they must rise: sort the table "
+                "and take out what occurs twice."
+            )
+        if c[0] != -1 or c[-1] != 1:
+            raise MivolError(
+                f"the cosines of {self.name} go from {c[0]:.9g} to {c[-1]:.9g}; -1 to 1 is expected: add values for straight "
+                "back (-1) and straight on (1)."
+            )
+        check_values(self.values, self.name)
+
+    @classmethod
+    def regular(cls, values: np.ndarray, name: str = "the phase table") -> Table:
+        """Values at equally spaced cosines from -1 to 1, as stock ``tabphase`` takes them."""
+        return cls(np.linspace(-1, 1, np.size(values)), values, name)
+
+    @classmethod
+    def from_csv(cls, path: str | os.PathLike) -> Table:
+        """Read two columns: cosine and value, or angle in degrees and value if the first column is headed ``angle``.
+
+        Lines may come in either order; a heading is optional; lines that start with ``#`` are left out.
+
+        Raises:
+            MivolError: what is not two columns of numbers, or no phase function.
+        """
+        name = f"phase table {os.fspath(path)}"
+        try:
+            with open(path, newline="") as file:  # noqa: PTH123  (a path of any kind)
+                rows = [row for row in csv.reader(file) if row and not row[0].lstrip().startswith("#")]
+        except (OSError, UnicodeDecodeError) as error:
+            raise MivolError(f"{name} cannot be read: {error}.") from error
+        heading = rows.pop(0)[0].strip().lower() if rows and not _is_number(rows[0][0]) else "cos"
+        if heading not in ("cos", "angle"):
+            raise MivolError(f"{name} heads its first column {heading!r}; cos, or angle (in degrees), is expected.")
+        try:
+            first, values = np.array([[float(x) for x in row] for row in rows]).reshape(-1, 2).T
+        except ValueError as error:
+            raise MivolError(f"{name} is not two columns of numbers: {error}.") from error
+        cosines = np.cos(np.radians(first)) if heading == "angle" else first
+        order = np.argsort(cosines, kind="stable")
+        return cls(cosines[order], values[order], name)
+
+    @classmethod
+    def from_moments(cls, moments: np.ndarray, tolerance: float = 1e-3, name: str = "the phase table") -> Table:
+        r"""Sum a Legendre series and put nodes where a straight line misses it.
+
+        .. math:: p(c) = \frac{1}{4\pi} \sum_l (2 l + 1) \chi_l P_l(c), \qquad \chi_l = \int p\,P_l\,d\omega
+
+        Args:
+            moments: chi_0, chi_1, ...; chi_0 is 1, chi_1 the mean cosine.
+            tolerance: how far a line may miss the series halfway between nodes, as a part of its largest value.
+            name: what the table is called in a sentence that refuses it.
+
+        Raises:
+            MivolError: a first moment that is not 1, or a series that is negative somewhere.
+        """
+        moments = np.asarray(moments, dtype=np.float64).ravel()
+        if len(moments) == 0 or not np.isclose(moments[0], 1, rtol=1e-6) or not np.all(np.isfinite(moments)):
+            raise MivolError(f"the Legendre moments of {name} start with {moments[:1]}; finite ones, chi_0 = 1, are expected.")
+        series = np.arange(1, 2 * len(moments), 2) / 2 * moments
+
+        def density(cosines: np.ndarray) -> np.ndarray:
+            return np.polynomial.legendre.legval(cosines, series)
+
+        least = max(33, 4 * len(moments) + 1)  # at least two nodes on each swing of the highest polynomial
+        cosines, values = adapt_nodes(density, tolerance, least, relative_to_peak=True)
+        # A series that touches 0 is rounded below it; one that is truncated goes well below.
+        rounding = len(moments) * 2.0**-50 * values.max()
+        if values.min() < -rounding:
+            where = cosines[values.argmin()]
+            raise MivolError(
+                f"the Legendre series of {name} is {values.min():.3g} at cos = {where:.4f}, where none is below 0; "
+                "give more moments, or a table of values."
+            )
+        return cls(cosines, np.maximum(values, 0), name)
+
+    @property
+    def density(self) -> np.ndarray:
+        """Values divided by their integral over the cosine."""
+        return self.values / np.trapezoid(self.values, self.cosines)
+
+    def moments(self, count: int) -> np.ndarray:
+        """The first Legendre moments chi_l of the piecewise linear function, to rounding."""
+        nodes, weights = np.polynomial.legendre.leggauss(count // 2 + 2)  # exact for degree count + 1 and more
+        c = self.cosines
+        x = (c[:-1, None] + c[1:, None]) / 2 + np.diff(c)[:, None] / 2 * nodes
+        p = np.interp(x, c, self.density) * np.diff(c)[:, None] / 2 * weights
+        return np.array([(p * np.polynomial.legendre.Legendre.basis(k)(x)).sum() for k in range(count)])
+
+    @property
+    def mean_cosine(self) -> float:
+        """The asymmetry parameter g."""
+        return float(self.moments(2)[1])
+
+    def to_dict(self) -> dict[str, str]:
+        """The same as a plugin for ``mi.load_dict``; as text, which keeps cosines near 1 apart."""
+        text = {key: ", ".join(f"{x:.17g}" for x in getattr(self, key)) for key in ("cosines", "values")}
+        return {"type": "mivol_tabulated", **text}
+
+
+def check_values(values: np.ndarray, name: str) -> None:
+    """Refuse values that no phase function has.
+
+    Raises:
+        MivolError: NaN, infinite or negative, or all of them 0.
+    """
+    bad = np.flatnonzero(~(np.isfinite(values) & (values >= 0)))
+    if len(bad):
+        raise MivolError(
+            f"{name} has the value {values[bad[0]]:.9g} at {bad[0]}; finite numbers of at least 0 are expected: clip them "
+            "after each step."
+        )
+    if not np.any(values > 0):
+        raise MivolError(f"{name} is 0 everywhere; at least one value above 0 is expected.")
+
+
+def adapt_nodes(
+    density: Callable[[np.ndarray], np.ndarray], tolerance: float, least: int = 33, relative_to_peak: bool = False
+) -> tuple[np.ndarray, np.ndarray]:
+    """Choose cosines so that straight lines between them follow a function.
+
+    Args:
+        density: function of an array of cosines.
+        tolerance: how far a line may miss it halfway (in angle), as a part of the value there.
+        least: nodes to start with, equally spaced in angle.
+        relative_to_peak: as a part of the largest value instead.
+
+    Returns:
+        cosines (n,) from -1 to 1, and the function there.
+    """
+    angles = np.linspace(np.pi, 0, least)
+    cosines = _cosines(angles)
+    values = density(cosines)
+    todo = np.ones(least - 1, dtype=bool)
+    for _ in range(16):
+        left = np.flatnonzero(todo)
+        if len(left) == 0:
+            break
+        middle = (angles[left] + angles[left + 1]) / 2
+        c = _cosines(middle)
+        f = density(c)
+        line = np.interp(c, cosines, values)
+        miss = np.abs(f - line) > tolerance * (np.abs(values).max() if relative_to_peak else np.abs(f))
+        where = left + 1
+        angles, cosines, values = (np.insert(a, where, b) for a, b in ((angles, middle), (cosines, c), (values, f)))
+        todo = np.zeros(len(angles) - 1, dtype=bool)
+        first = left + np.arange(len(left))
+        todo[first], todo[first + 1] = miss, miss
+    return cosines, values
+
+
+def _cosines(angles: np.ndarray) -> np.ndarray:
+    return np.where(angles == 0, 1, np.where(angles == np.pi, -1, np.cos(angles)))
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+# -- The same on Dr.Jit arrays -----------------------------------------------------------------------------------------
+
+
+@dataclass
+class Lookup:
+    """Where the nodes lie, on Dr.Jit arrays. Values are handed in, so that they can be a parameter.
+
+    Attributes:
+        below_one, above_minus_one: (n,) 1 - c and 1 + c of the nodes.
+        ratio: (n,) (1 + c) / (1 - c), rising from 0 to infinity: what is searched.
+        width: (n - 1,) differences of the cosines.
+    """
+
+    below_one: mi.Float
+    above_minus_one: mi.Float
+    ratio: mi.Float
+    width: mi.Float
+
+    @classmethod
+    def of(cls, table: Table) -> Lookup:
+        """Round a table's nodes."""
+        c = table.cosines
+        with np.errstate(divide="ignore"):
+            ratio = (1 + c) / (1 - c)
+        return cls(*(mi.Float(x.astype(np.float32)) for x in (1 - c, 1 + c, ratio, np.diff(c))))
+
+    def normalise(self, values: mi.Float) -> tuple[mi.Float, mi.Float, mi.Float]:
+        """Projected values (not below 0; all 1 where none is above), their integral and their cumulative distribution.
+
+        Args:
+            values: (n,) as given.
+
+        Returns:
+            values (n,) and integral (1,) with derivatives; cumulative (n,), 0 to 1, without.
+        """
+        values = dr.select(values >= 0, values, 0)
+        values = dr.select(dr.max(dr.detach(values)) > 0, values, 1)
+        i = dr.arange(mi.UInt32, len(self.width))
+        parts = 0.5 * (dr.gather(mi.Float, values, i) + dr.gather(mi.Float, values, i + 1)) * self.width
+        # Summed in float64: a table of 1000 nodes keeps the digits of its narrow segments.
+        sums = dr.cumsum(mi.Float64(dr.detach(parts)))
+        total = dr.gather(mi.Float64, sums, len(self.width) - 1)
+        cumulative = dr.zeros(mi.Float, len(self.ratio))
+        dr.scatter(cumulative, mi.Float(sums / total), i + 1)
+        return values, dr.sum(parts), cumulative
+
+    def eval(self, turn: Turn, values: mi.Float, integral: mi.Float, active: mi.Bool = True) -> mi.Float:
+        """Density [1/sr] at a turn: the first two results of :meth:`normalise` are its values and integral.
+
+        Error: 1e-6 of the larger of the two values around it.
+        """
+        # 1 + c > ratio (1 - c), and not a quotient, which is 0/0 for a turn whose directions are both 0 in idle lanes.
+        below, above = dr.detach(turn.below_one), dr.detach(turn.above_minus_one)
+        n = len(self.width)
+        i = dr.binary_search(0, n, lambda k: dr.gather(mi.Float, self.ratio, k, active) * below < above)
+        i = dr.clip(dr.detach(mi.Int32(i)) - 1, 0, n - 1)
+        part = self._offset(turn, i, active) * dr.rcp(dr.gather(mi.Float, self.width, i, active))
+        part = dr.clip(part, 0, 1)
+        left, right = (dr.gather(mi.Float, values, k, active) for k in (i, i + 1))
+        return INV_TWO_PI * dr.fma(part, right - left, left) * dr.rcp(integral)
+
+    def sample(
+        self, u: mi.Float, values: mi.Float, integral: mi.Float, cumulative: mi.Float, active: mi.Bool = True
+    ) -> Turn:
+        """Draw a turn with density :meth:`eval`, exactly: the distribution of a line is a square root away."""
+        n = len(self.width)
+        i = dr.binary_search(0, n, lambda k: dr.gather(mi.Float, cumulative, k, active) <= u)
+        i = dr.clip(mi.Int32(i) - 1, 0, n - 1)
+        width, left, right = (
+            dr.gather(mi.Float, a, k, active) for a, k in ((self.width, i), (values, i), (values, i + 1))
+        )
+        area = (u - dr.gather(mi.Float, cumulative, i, active)) * integral
+        slope = (right - left) * dr.rcp(width)
+        # 2 area / (left + root), never (root - left) / slope: that is 0/0 on a level segment.
+        root = dr.sqrt(dr.maximum(dr.fma(2 * area, slope, left * left), 0))
+        offset = 2 * area * dr.rcp(dr.select(left + root > 0, left + root, 1))
+        offset = dr.clip(offset, 0, width)
+        return Turn(
+            dr.maximum(dr.gather(mi.Float, self.below_one, i, active) - offset, 0),
+            dr.maximum(dr.gather(mi.Float, self.above_minus_one, i, active) + offset, 0),
+        )
+
+    def _offset(self, turn: Turn, i: mi.Int32, active: mi.Bool) -> mi.Float:
+        """How far the cosine lies above node i, from the nearer end of the scale."""
+        ahead = dr.gather(mi.Float, self.below_one, i, active) - turn.below_one
+        behind = turn.above_minus_one - dr.gather(mi.Float, self.above_minus_one, i, active)
+        return dr.select(turn.below_one < turn.above_minus_one, ahead, behind)

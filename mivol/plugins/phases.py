@@ -1,0 +1,354 @@
+"""<phase type="mivol_hg"> and its kin: phase functions for our media and for stock ones."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mivol.errors import MivolError
+from mivol.phase.domain import DOMAINS
+from mivol.phase.draine import eval_draine, sample_draine
+from mivol.phase.hg import eval_hg, sample_hg
+from mivol.phase.mixture import choose_lobe, shares_of
+from mivol.phase.rayleigh import eval_rayleigh, sample_rayleigh
+from mivol.phase.tabulated import Lookup, Table, check_values
+from mivol.phase.turn import Turn, direction_after, turn_between
+
+VALUES_OF_VOLUMES = ("data", "value.value")
+"""Keys under which Mitsuba's grids and constants, and ours, hold their values."""
+
+ALL_COMPONENTS = 2**32 - 1
+
+
+class TurningPhase(mi.PhaseFunction):
+    """A phase function of the scattering angle alone.
+
+    Samples and densities carry no derivative; the value of ``eval_pdf`` carries those of the parameters and directions.
+    """
+
+    def __init__(self, props: mi.Properties, parameters: Mapping[str, mi.Float | mi.Volume]) -> None:
+        super().__init__(props)
+        self.m_flags = int(mi.PhaseFunctionFlags.Anisotropic)
+        self.kind = props.plugin_name()
+        self.parameters = dict(parameters)  # dr.freeze finds arrays among a plugin's own attributes only
+        self.refresh()
+
+    def refresh(self) -> None:
+        _take_over(self.parameters, self.kind)
+
+    def eval_turn(self, turn: Turn, mei: mi.MediumInteraction3f, active: mi.Bool) -> mi.Float:
+        raise NotImplementedError
+
+    def sample_turn(self, u: mi.Float, mei: mi.MediumInteraction3f, active: mi.Bool) -> Turn:
+        raise NotImplementedError
+
+    def at(self, name: str, mei: mi.MediumInteraction3f, active: mi.Bool) -> mi.Float:
+        return _eval(self.parameters[name], name, mei, active)
+
+    def sample(
+        self,
+        ctx: mi.PhaseFunctionContext,
+        mei: mi.MediumInteraction3f,
+        sample1: mi.Float,
+        sample2: mi.Point2f,
+        active: mi.Bool = True,
+    ) -> tuple[mi.Vector3f, mi.Spectrum, mi.Float]:
+        with dr.suspend_grad():
+            active = mi.Bool(active)
+            turn = self.sample_turn(sample2.x, mei, active)
+            return direction_after(mei.wi, turn, sample2.y), mi.Spectrum(1), self.eval_turn(turn, mei, active)
+
+    def eval_pdf(
+        self, ctx: mi.PhaseFunctionContext, mei: mi.MediumInteraction3f, wo: mi.Vector3f, active: mi.Bool = True
+    ) -> tuple[mi.Spectrum, mi.Float]:
+        value = self.eval_turn(turn_between(mei.wi, wo), mei, mi.Bool(active))
+        return mi.Spectrum(value), dr.detach(value)
+
+    def traverse(self, callback: mi.TraversalCallback) -> None:
+        for name, value in self.parameters.items():
+            callback.put(name, value, mi.ParamFlags.Differentiable)
+
+    def parameters_changed(self, keys: list[str]) -> None:
+        self.refresh()
+
+    def to_string(self) -> str:
+        return f"{self.kind}[" + ", ".join(f"{n}={_brief(v)}" for n, v in self.parameters.items()) + "]"
+
+
+class HenyeyGreenstein(TurningPhase):
+    """``<phase type="mivol_hg">``: the Henyey-Greenstein phase function.
+
+    Parameters:
+        g: mean cosine, -1 < g < 1, a float or a volume. Default 0.8, as stock ``hg`` has it.
+    """
+
+    def __init__(self, props: mi.Properties) -> None:
+        super().__init__(props, {"g": _read(props, "g", 0.8)})
+
+    def eval_turn(self, turn: Turn, mei: mi.MediumInteraction3f, active: mi.Bool) -> mi.Float:
+        return eval_hg(turn, self.at("g", mei, active))
+
+    def sample_turn(self, u: mi.Float, mei: mi.MediumInteraction3f, active: mi.Bool) -> Turn:
+        return sample_hg(u, self.at("g", mei, active))
+
+
+class Rayleigh(TurningPhase):
+    """``<phase type="mivol_rayleigh">``: particles much smaller than the wavelength; no parameters."""
+
+    def __init__(self, props: mi.Properties) -> None:
+        super().__init__(props, {})
+
+    def eval_turn(self, turn: Turn, mei: mi.MediumInteraction3f, active: mi.Bool) -> mi.Float:
+        return eval_rayleigh(turn)
+
+    def sample_turn(self, u: mi.Float, mei: mi.MediumInteraction3f, active: mi.Bool) -> Turn:
+        return sample_rayleigh(u)
+
+
+class Draine(TurningPhase):
+    """``<phase type="mivol_draine">``: Draine's phase function, between Henyey-Greenstein's, Cornette-Shanks' and Rayleigh's.
+
+    Parameters:
+        g: asymmetry, -1 < g < 1, a float or a volume. Default 0.8.
+        alpha: weight of cos^2, at least 0, a float or a volume: 0 is Henyey-Greenstein, 1 (the default) Cornette-Shanks.
+    """
+
+    def __init__(self, props: mi.Properties) -> None:
+        super().__init__(props, {"g": _read(props, "g", 0.8), "alpha": _read(props, "alpha", 1.0)})
+
+    def eval_turn(self, turn: Turn, mei: mi.MediumInteraction3f, active: mi.Bool) -> mi.Float:
+        return eval_draine(turn, self.at("g", mei, active), self.at("alpha", mei, active))
+
+    def sample_turn(self, u: mi.Float, mei: mi.MediumInteraction3f, active: mi.Bool) -> Turn:
+        return sample_draine(u, self.at("g", mei, active), self.at("alpha", mei, active))
+
+
+class Tabulated(TurningPhase):
+    """``<phase type="mivol_tabulated">``: values at cosines, linear in between, normalised.
+
+    Parameters:
+        values: numbers at the cosines, text with commas or a tensor; differentiable. Or
+        moments: Legendre moments chi_0 = 1, chi_1, ...; or
+        filename: a CSV table of two columns, ``cos`` (or ``angle`` in degrees) and value.
+        cosines: where the values stand, rising from -1 (straight back) to 1 (straight on). Default: equally spaced.
+    """
+
+    def __init__(self, props: mi.Properties) -> None:
+        self.table = _read_table(props)
+        self.nodes = Lookup.of(self.table)
+        super().__init__(props, {"values": mi.Float(self.table.values.astype(np.float32))})
+
+    def refresh(self) -> None:
+        values = self.parameters["values"]
+        if dr.width(values) != len(self.table.values):
+            raise MivolError(f"values of {self._name()} became {dr.width(values)}; its {len(self.table.values)} cosines stay.")
+        if not dr.flag(dr.JitFlag.FreezingScope):
+            check_values(np.array(dr.detach(values), dtype=np.float64), f"values of {self._name()}")
+        self.values, self.integral, self.cumulative = self.nodes.normalise(values)
+        dr.make_opaque(self.values, self.integral, self.cumulative)
+
+    def eval_turn(self, turn: Turn, mei: mi.MediumInteraction3f, active: mi.Bool) -> mi.Float:
+        return self.nodes.eval(turn, self.values, self.integral, active)
+
+    def sample_turn(self, u: mi.Float, mei: mi.MediumInteraction3f, active: mi.Bool) -> Turn:
+        return self.nodes.sample(u, self.values, self.integral, self.cumulative, active)
+
+    def _name(self) -> str:
+        return f"mivol_tabulated {self.id()}".strip()
+
+    def to_string(self) -> str:
+        return f"{self.kind}[{len(self.table.values)} nodes]"
+
+
+class Mixture(mi.PhaseFunction):
+    """``<phase type="mivol_mixture">``: a weighted sum of any number of phase functions.
+
+    Parameters:
+        nested phase functions, each with a name, for instance ``haze``.
+        weight_<name>: of each, at least 0, a float or a volume; divided by their sum. Default, for all or none: equal ones.
+    """
+
+    def __init__(self, props: mi.Properties) -> None:
+        super().__init__(props)
+        # Looking at a property counts as using it, and one that nobody uses is an error: only phase functions are looked at.
+        nested = dict(props.objects(False))
+        self.lobes = {name: props[name] for name, part in nested.items() if isinstance(part, mi.PhaseFunction)}
+        self.weights = _read_weights(props, list(self.lobes))
+        flags = 0
+        for lobe in self.lobes.values():
+            flags |= int(lobe.flags())
+        self.m_flags = flags
+        self.refresh()
+
+    def refresh(self) -> None:
+        _take_over(self.weights, "mivol_mixture")
+        numbers = [w for w in self.weights.values() if not isinstance(w, mi.Volume)]
+        if len(numbers) == len(self.weights) and not dr.flag(dr.JitFlag.FreezingScope) and not any(w[0] > 0 for w in numbers):
+            raise MivolError("the weights of mivol_mixture are all 0; at least one above 0 is expected.")
+
+    def shares(self, mei: mi.MediumInteraction3f, active: mi.Bool) -> list[mi.Float]:
+        return shares_of([_eval(w, "weight", mei, active) for w in self.weights.values()])
+
+    def sample(
+        self,
+        ctx: mi.PhaseFunctionContext,
+        mei: mi.MediumInteraction3f,
+        sample1: mi.Float,
+        sample2: mi.Point2f,
+        active: mi.Bool = True,
+    ) -> tuple[mi.Vector3f, mi.Spectrum, mi.Float]:
+        with dr.suspend_grad():
+            active = mi.Bool(active)
+            shares = self.shares(mei, active)
+            if ctx.component != ALL_COMPONENTS:
+                share, lobe, inner = self._component(ctx, shares)
+                wo, weight, pdf = lobe.sample(inner, mei, sample1, sample2, active)
+                return wo, weight * share, pdf * share
+            chosen, inside = choose_lobe(shares, sample1)
+            wo = dr.zeros(mi.Vector3f)
+            for k, lobe in enumerate(self.lobes.values()):
+                here = active & (chosen == k)
+                wo = dr.select(here, lobe.sample(ctx, mei, inside, sample2, here)[0], wo)
+            value, pdf = self._sum(ctx, mei, wo, shares, active)
+            return wo, value * dr.select(pdf > 0, dr.rcp(pdf), 0), pdf
+
+    def eval_pdf(
+        self, ctx: mi.PhaseFunctionContext, mei: mi.MediumInteraction3f, wo: mi.Vector3f, active: mi.Bool = True
+    ) -> tuple[mi.Spectrum, mi.Float]:
+        active = mi.Bool(active)
+        shares = self.shares(mei, active)
+        if ctx.component != ALL_COMPONENTS:
+            share, lobe, inner = self._component(ctx, shares)
+            value, pdf = lobe.eval_pdf(inner, mei, wo, active)
+            return value * share, dr.detach(pdf * share)
+        return self._sum(ctx, mei, wo, shares, active)
+
+    def _sum(
+        self,
+        ctx: mi.PhaseFunctionContext,
+        mei: mi.MediumInteraction3f,
+        wo: mi.Vector3f,
+        shares: list[mi.Float],
+        active: mi.Bool,
+    ) -> tuple[mi.Spectrum, mi.Float]:
+        value, pdf = mi.Spectrum(0), mi.Float(0)
+        for share, lobe in zip(shares, self.lobes.values(), strict=True):
+            value_k, pdf_k = lobe.eval_pdf(ctx, mei, wo, active)
+            value, pdf = value + share * value_k, pdf + dr.detach(share * pdf_k)
+        return value, pdf
+
+    def _component(
+        self, ctx: mi.PhaseFunctionContext, shares: list[mi.Float]
+    ) -> tuple[mi.Float, mi.PhaseFunction, mi.PhaseFunctionContext]:
+        """The lobe that holds one component, its share, and the context that asks it for that component."""
+        index = ctx.component
+        for share, lobe in zip(shares, self.lobes.values(), strict=True):
+            count = lobe.component_count()
+            if index < max(count, 1):
+                inner = mi.PhaseFunctionContext(ctx.sampler, ctx.mode)
+                inner.type_mask = ctx.type_mask
+                inner.component = index if count else ALL_COMPONENTS  # a phase function in Python has none to number
+                return share, lobe, inner
+            index -= max(count, 1)
+        raise MivolError(f"component {ctx.component} of mivol_mixture was asked for, which has fewer.")
+
+    def traverse(self, callback: mi.TraversalCallback) -> None:
+        for name, weight in self.weights.items():
+            callback.put(name, weight, mi.ParamFlags.Differentiable)
+        for name, lobe in self.lobes.items():
+            callback.put(name, lobe, mi.ParamFlags.Differentiable)
+
+    def parameters_changed(self, keys: list[str]) -> None:
+        self.refresh()
+
+    def to_string(self) -> str:
+        return "mivol_mixture[" + ", ".join(f"{n}={lobe}" for n, lobe in self.lobes.items()) + "]"
+
+
+# -- Parameters that are a number or a volume -------------------------------------------------------------------------
+
+
+def _read(props: mi.Properties, name: str, default: float) -> mi.Float | mi.Volume:
+    value = props.get(name, default)
+    if isinstance(value, mi.Volume):
+        return value
+    if isinstance(value, (int, float)):
+        return mi.Float(value)
+    raise MivolError(f"{name} of {props.plugin_name()} is a {type(value).__name__}; a number or a volume is expected.")
+
+
+def _brief(value: mi.Float | mi.Volume) -> str:
+    return value.class_name() if isinstance(value, mi.Volume) else str(dr.detach(value))
+
+
+def _take_over(parameters: dict[str, mi.Float | mi.Volume], owner: str) -> None:
+    """Refuse values that can be read, and make arrays of numbers, which recordings and recompilations do not bake in."""
+    for name, value in parameters.items():
+        if not dr.flag(dr.JitFlag.FreezingScope):
+            for known in _known_values(value):
+                _check_channels(known, f"{name} of {owner}")
+                DOMAINS[name.split("_")[0]].check(np.array(dr.detach(known)), f"{name} of {owner}")
+        if not isinstance(value, mi.Volume):
+            dr.make_opaque(value)
+
+
+def _known_values(value: mi.Float | mi.Volume) -> list[object]:
+    if not isinstance(value, mi.Volume):
+        return [value]
+    params = mi.traverse(value)
+    return [params[key] for key in VALUES_OF_VOLUMES if key in params]
+
+
+def _check_channels(known: mi.Float | mi.Color3f | mi.TensorXf, name: str) -> None:
+    channels = known.shape[3] if dr.is_tensor_v(known) else dr.size_v(known) if dr.depth_v(known) > 1 else 1
+    if channels != 1:
+        raise MivolError(f"{name} has {channels} channels; a phase function has one value for all colours: give a grey volume.")
+
+
+def _eval(value: mi.Float | mi.Volume, name: str, mei: mi.MediumInteraction3f, active: mi.Bool) -> mi.Float:
+    x = value.eval_1(mei, active) if isinstance(value, mi.Volume) else value
+    return DOMAINS[name].project(x)
+
+
+def _read_weights(props: mi.Properties, names: list[str]) -> dict[str, mi.Float | mi.Volume]:
+    if not names:
+        raise MivolError("mivol_mixture was given no phase function; nest at least one.")
+    keys = [f"weight_{n}" for n in names]
+    missing = [k for k in keys if k not in props]
+    if 0 < len(missing) < len(keys):
+        raise MivolError(f"mivol_mixture lacks {', '.join(missing)}; give a weight for each phase function, or for none.")
+    return {k: _read(props, k, 1.0) for k in keys}
+
+
+def _read_table(props: mi.Properties) -> Table:
+    sources = [k for k in ("values", "moments", "filename") if k in props]
+    if len(sources) != 1:
+        found = " and ".join(sources) or "none of them"
+        raise MivolError(f"mivol_tabulated was given {found}; give exactly one of values, moments or filename.")
+    name = f"mivol_tabulated {props.id()}".strip()
+    if sources == ["filename"]:
+        return Table.from_csv(str(mi.file_resolver().resolve(props["filename"])))
+    numbers = _numbers(props, sources[0], name)
+    if sources == ["moments"]:
+        return Table.from_moments(numbers, name=name)
+    return Table(_numbers(props, "cosines", name), numbers, name) if "cosines" in props else Table.regular(numbers, name)
+
+
+def _numbers(props: mi.Properties, key: str, name: str) -> np.ndarray:
+    given = props[key]
+    if not isinstance(given, str):
+        return np.array(given, dtype=np.float64).ravel()
+    try:
+        return np.array([float(x) for x in given.replace(",", " ").split()])
+    except ValueError as error:
+        raise MivolError(f"{key} of {name} is not a list of numbers: {error}.") from error
+
+
+mi.register_phase("mivol_hg", HenyeyGreenstein)
+mi.register_phase("mivol_rayleigh", Rayleigh)
+mi.register_phase("mivol_draine", Draine)
+mi.register_phase("mivol_tabulated", Tabulated)
+mi.register_phase("mivol_mixture", Mixture)
