@@ -18,6 +18,7 @@ from mivol.machine import available_memory
 from mivol.scene.load import find_sensor
 from mivol.scene.needs import Needs, Survey, find_needs, read_values, survey_scene
 from mivol.transport.aovs import AOVS
+from mivol.transport.direct import Lights
 from mivol.transport.optical_depth import PACKED_LIMIT, gradient_bytes
 from mivol.transport.path import Settings
 from mivol.transport.world import Body, World
@@ -96,10 +97,10 @@ def check_aovs(names: str) -> tuple[str, ...]:
 
 def _refuse_scattering(needs: Needs, settings: Settings) -> None:
     for medium in needs.media:
-        if medium.is_scattering and settings.max_depth not in (0, 1):
+        if medium.is_scattering and settings.max_depth not in (0, 1, 2):
             raise MivolError(
                 f"the medium in {medium.name} scatters (its albedo is above 0) and max_depth is {settings.max_depth}; mivol "
-                "renders absorption so far: set max_depth to 1 (what is seen through the medium) or the albedo to 0."
+                "renders one scattering so far: set max_depth to 2, to 1 (what is seen through the medium), or the albedo to 0."
             )
 
 
@@ -162,8 +163,9 @@ def _gradient(needs: Needs) -> tuple[int, Choice]:
     return memory, Choice("gradient step", what, f"parameters: {asked}")
 
 
-def build_world(needs: Needs, plan: Plan, settings: Settings, survey: Survey) -> World:
+def build_world(scene: mi.Scene, needs: Needs, plan: Plan, settings: Settings, survey: Survey) -> World:
     """Build the media that transport walks through, as planned."""
+    lit = settings.max_depth == 2 and any(m.is_scattering for m in needs.media)
     bodies = []
     for boundary, view, skip in zip(needs.boundaries, needs.views, plan.skips, strict=True):
         for part in view.parts:
@@ -177,6 +179,7 @@ def build_world(needs: Needs, plan: Plan, settings: Settings, survey: Survey) ->
         is_veiled=needs.is_veiled,
         start=needs.start,
         locates=needs.camera_inside and needs.start is None,
+        lights=Lights(scene) if lit else None,
     )
 
 

@@ -109,7 +109,7 @@ class Session:
         survey = self._seen.survey
         needs = find_needs(scene, sensor, survey)
         plan = make_plan(needs, self.settings)
-        return build_world(needs, plan, self.settings, survey), plan
+        return build_world(scene, needs, plan, self.settings, survey), plan
 
     def _primal(self, scene: mi.Scene, world: World, rays: Rays) -> tuple:
         score, valid = walk_path(scene, world, self.settings, rays.sampler, rays.ray, Primal(_black(rays.ray)))
@@ -122,7 +122,7 @@ class Session:
 
     def _replay(self, scene: mi.Scene, world: World, rays: Rays, dL: mi.Spectrum, daovs: list[mi.Float]) -> None:
         again = rays.sampler.clone()
-        score, _ = walk_path(scene, world, self.settings, rays.sampler, rays.ray, Primal(_black(rays.ray)))
+        score, _ = walk_path(scene, world, self.settings, rays.sampler, rays.ray, Primal(_black(rays.ray), scatters=False))
         dr.eval(score.L)
         walk_path(scene, world, self.settings, again, rays.ray, Adjoint(score.L, dL))
         backproject_aovs(scene, world, rays.ray, self.aovs, daovs)

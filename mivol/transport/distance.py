@@ -28,13 +28,13 @@ from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
 from mivol.errors import MivolError
 from mivol.numerics import exp_moments, one_minus_exp
-from mivol.transport.lattice import Cell, Nodes, Segment, clip, slab, walk
+from mivol.transport.field import SumField, share_cells
+from mivol.transport.lattice import Cell, Segment, clip, slab, walk
 from mivol.transport.medium import Part
-from mivol.transport.optical_depth import interpolate, node_weights
+from mivol.transport.optical_depth import node_weights
 from mivol.transport.path import Reach, Way, visit_boxes
 from mivol.transport.score import revisit
 from mivol.transport.world import Body, World
@@ -121,32 +121,6 @@ class _Moment:
     N: list[mi.Float]
 
 
-class _Field:
-    """The sum of the parts of a body, for each channel: in a cell of its grids, and where only its constants are."""
-
-    def __init__(self, body: Body, values: list, scale: mi.Float) -> None:
-        self.channels, self.scale = body.view.channels, scale
-        pairs = list(zip(body.view.parts, values, strict=True))
-        self.reads = [Nodes(v, p.channels) for p, v in pairs if p.lattice is not None]
-        constants = [_as_channels(v, p.channels) for p, v in pairs if p.lattice is None]
-        self.constant = [scale * sum((k[c % len(k)] for k in constants), mi.Float(0)) for c in range(self.channels)]
-
-    def along(self, corners: list, cell: Cell) -> list[list[mi.Float]]:
-        """[channel][point] values at the points of a cell."""
-        points = _points(cell)
-        grids = [[[interpolate(g[c % len(g)], p) for g in corners] for p in points] for c in range(self.channels)]
-        return [
-            [dr.fma(self.scale, sum(s, mi.Float(0)), k) for s in sums] for sums, k in zip(grids, self.constant, strict=True)
-        ]
-
-
-def _as_channels(value: mi.Float | mi.Color3f, channels: int) -> list[mi.Float]:
-    return [value.x, value.y, value.z] if channels == 3 else [mi.Float(value)]
-
-
-def _extinction(body: Body) -> _Field:
-    values = [dr.detach(p.constant if p.lattice is None else p.lattice.values.array) for p in body.view.parts]
-    return _Field(body, values, dr.detach(body.view.scale))
 
 
 @dataclass
@@ -168,7 +142,7 @@ def _check_grids(body: Body) -> None:
     """Refuse grids that do not share their cells."""
     grids = [p.lattice for p in body.view.parts if p.lattice is not None]
     for other in grids[1:]:
-        if other.res != grids[0].res or not np.array_equal(other.to_world, grids[0].to_world):
+        if not share_cells(grids[0], other):
             raise MivolError(
                 f"the AOV depth was asked for and a medium sums grids of {grids[0].res} and {other.res} voxels (Z, Y, X); "
                 "give both the same resolution and to_world, or leave depth out of aovs."
@@ -190,8 +164,8 @@ def _measure(
     body: Body, ray: mi.Ray3f, t0: mi.Float, t1: mi.Float, origin: mi.Float, active: mi.Bool, tangent: bool, skip: bool
 ) -> _Moment:
     """Rows of a stretch of a body; empty blocks may be skipped where nothing depends on the order of sums."""
-    field, lay = _extinction(body), _lay(body, ray, t0, t1)
-    change = _Field(body, body.tangents, mi.Float(1)) if tangent else None
+    field, lay = body.extinction(), _lay(body, ray, t0, t1)
+    change = SumField(body.view.parts, body.tangents, mi.Float(1)) if tangent else None
     rows = field.channels * (2 if tangent else 1)
     moment = _Moment([mi.Float64(0) for _ in range(rows)], [mi.Float(0) for _ in range(rows)])
     has_constants = any(p.lattice is None for p in body.view.parts)
@@ -203,7 +177,7 @@ def _measure(
     def visit(moment: _Moment, cell: Cell, on: mi.Bool) -> _Moment:
         corners, changes = cell.corners[: len(field.reads)], cell.corners[len(field.reads) :]
         stops = _stops(field, lay, cell, corners, origin, on)
-        return _put_in_front(moment, stops, change.along(changes, cell) if tangent else [])
+        return _put_in_front(moment, stops, change.along(changes, _points(cell)) if tangent else [])
 
     if has_constants and lay.grid is not None:
         moment = add_constant(moment, lay.leave, lay.t1)
@@ -217,11 +191,11 @@ def _measure(
     return moment
 
 
-def _stops(field: _Field, lay: _Lay, cell: Cell, corners: list, origin: mi.Float, on: mi.Bool) -> list[Stop]:
+def _stops(field: SumField, lay: _Lay, cell: Cell, corners: list, origin: mi.Float, on: mi.Bool) -> list[Stop]:
     """What a cell of a sweep does, for each channel."""
     begin = (lay.leave - origin) - (cell.s + cell.dt)
     dt = dr.select(on, cell.dt, 0)
-    return [stop_in_cell(begin, dt, *sigma) for sigma in field.along(corners, cell)]
+    return [stop_in_cell(begin, dt, *sigma) for sigma in field.along(corners, _points(cell))]
 
 
 def _points(cell: Cell) -> list[mi.Vector3f]:
@@ -266,7 +240,7 @@ def _backproject(
         ahead: optical depth from the camera to the far end of the stretch.
         behind: N of what lies behind the stretch, as the camera sees it.
     """
-    field, lay = _extinction(body), _lay(body, ray, t0, t1)
+    field, lay = body.extinction(), _lay(body, ray, t0, t1)
     zeros = [mi.Float(0) for _ in range(field.channels)]
     pull = _Pull(list(zeros), [mi.Float64(a) for a in ahead], list(zeros))
     parts = list(zip(body.view.parts, body.gradients, strict=True))

@@ -26,7 +26,20 @@ import numpy as np
 from mivol.errors import MivolError
 from mivol.space import check_affine, lattice_from_world
 
-__all__ = ["BLOCK", "Cell", "Lattice", "Nodes", "Segment", "block_bounds", "box_nodes", "clip", "slab", "walk"]
+__all__ = [
+    "BLOCK",
+    "Cell",
+    "Lattice",
+    "Nodes",
+    "Segment",
+    "block_bounds",
+    "box_nodes",
+    "clip",
+    "locate",
+    "read_nodes",
+    "slab",
+    "walk",
+]
 
 Mask3 = Any
 """Three masks a lane, ``dr.mask_t(mi.Vector3f)``: Mitsuba has no public name for the type."""
@@ -142,6 +155,25 @@ def clip(lattice: Lattice, o: mi.Point3f, d: mi.Vector3f, t_min: mi.Float, t_max
     direction = mi.Vector3f(mi.Float(v[0]), mi.Float(v[1]), mi.Float(v[2]))
     rest = mi.Vector3f(*(mi.Float(v[a] - mi.Float64(direction[a])) for a in range(3)))
     return Segment(cell, frac, direction, rest, mi.Float(t0), mi.Float(dr.select(hit, t1 - t0, 0)))
+
+
+def locate(lattice: Lattice, o: mi.Point3f, d: mi.Vector3f, t: mi.Float) -> tuple[mi.Vector3i, mi.Vector3f, mi.Bool]:
+    """Find the cell of a point of a ray, in float64.
+
+    Returns:
+        Its lower node (-1 to N - 1), the fractions from there, and whether the point is in the box.
+    """
+    n, t = lattice.res[::-1], mi.Float64(t)
+    cell, frac, inside = mi.Vector3i(), mi.Vector3f(), mi.Bool(True)
+    p = [dr.fma(t, mi.Float64(d[a]), mi.Float64(o[a])) for a in range(3)]
+    for a, row in enumerate(lattice.from_world):
+        q = dr.fma(row[0], p[0], dr.fma(row[1], p[1], dr.fma(row[2], p[2], row[3])))
+        # A distance that was drawn in the box and rounded may lie 1e-7 of the way outside it.
+        inside &= dr.abs(q - 0.5 * (n[a] - 1)) < 0.5 * n[a] + 1e-3
+        q = dr.clip(q, -0.5, n[a] - 0.5)
+        low = dr.minimum(dr.floor(q), n[a] - 1)
+        cell[a], frac[a] = mi.Int32(low), mi.Float(q - low)
+    return cell, frac, inside
 
 
 def slab(
@@ -265,7 +297,7 @@ def walk(
     s, s_rest = mi.Float(0), mi.Float(0)  #                                     world length walked, and its lost digits
     stride, top = _strides(lattice.res)
     near, far = _planes(cell, ahead, lattice.res)  #                            flat offsets of the corners, an axis each
-    corners = _read(reads, _box(near, far), active)
+    corners = read_nodes(reads, _box(near, far), active)
 
     while dr.hint(active, label="lattice walk"):
         # -- Cells to cross at once: one, or what is left of an empty block ---------------------------------------------
@@ -278,7 +310,7 @@ def walk(
             inner = (cell + 1) & (BLOCK - 1)
             span = dr.select(full, 0, dr.select(ahead, BLOCK - 1 - inner, inner))
             near, far = _planes(cell, ahead, res)
-            corners = _read(reads, _box(near, far), full)
+            corners = read_nodes(reads, _box(near, far), full)
 
         # -- Distance to the planes ahead, and visit ----------------------------------------------------------------------
         reach = (mi.Vector3f(span) + (1 - frac)) * pace
@@ -307,7 +339,7 @@ def walk(
             cell = dr.clip(dr.select(through, cell + sign, cell), -1, top)
             near = dr.select(through, far, near)
             far = dr.select(through, dr.clip(far + sign * stride, 0, top * stride), far)
-            corners = _shift(corners, through, _read(reads, _far_face(near, far, through), active))
+            corners = _shift(corners, through, read_nodes(reads, _far_face(near, far, through), active))
         # Always from the entry, never from the last cell: a rounding of 3e-8 in each step, the same in every one, would
         # carry a ray 1e-5 of a cell off its course in 256. The first product is as large as the count that is taken from
         # it, and both are exact; what remains is rounded once.
@@ -384,7 +416,7 @@ def _along(through: Mask3, x: mi.Float, y: mi.Float, z: mi.Float) -> mi.Float:
     return dr.select(through.x, x, dr.select(through.y, y, z))
 
 
-def _read(reads: Sequence[Nodes], nodes: list[mi.UInt32], active: mi.Bool) -> list:
+def read_nodes(reads: Sequence[Nodes], nodes: list[mi.UInt32], active: mi.Bool) -> list:
     """Read [array][channel][node] values."""
     return [
         [[dr.gather(mi.Float, r.array, n * r.channels + c, active) for n in nodes] for c in range(r.channels)] for r in reads

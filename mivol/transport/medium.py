@@ -59,12 +59,14 @@ class MediumView:
         parts: their sum, times ``scale``, is sigma_t.
         scale: dimensionless factor, differentiable where the plugin makes it so.
         albedo: what was found under ``albedo`` or the ``sigma_s`` part: arrays whose maximum tells whether it scatters.
+        share: the albedo itself, a volume or a constant; None where ``sigma_s`` is a part.
     """
 
     medium: mi.Medium
     parts: list[Part]
     scale: mi.Float
     albedo: list = field(default_factory=list)
+    share: mi.Volume | mi.Float | mi.Color3f | None = None
 
     @property
     def channels(self) -> int:
@@ -130,7 +132,15 @@ def view_medium(medium: mi.Medium, boundary: Box | None = None, places: dict | N
     places = {} if places is None else places
     parts = [_part(name, params, kind, boundary, places) for name in names]
     albedo = [v for k, v in params if k.startswith("sigma_s." if "sigma_s" in names else "albedo.")]
-    return MediumView(medium, parts, mi.Float(params["scale"]), albedo)
+    return MediumView(medium, parts, mi.Float(params["scale"]), albedo, _share(params) if "sigma_s" not in names else None)
+
+
+def _share(params: mi.SceneParameters) -> mi.Volume | mi.Float | mi.Color3f:
+    """The albedo among a medium's parameters: a constant with its gradient, or the volume that knows it."""
+    if "albedo.value.value" in params.properties:
+        return params["albedo.value.value"]
+    key = next(k for k in params.properties if k.startswith("albedo."))
+    return params.properties[key][2]
 
 
 def kind_of(medium: mi.Medium) -> str:

@@ -119,14 +119,18 @@ class Gradient:
 
     def add(self, channel: int, cell: Cell, corners: list[mi.Float], active: mi.Bool) -> None:
         """Add 8 values, in the order of the grid's own axes, to the corners of a cell."""
+        self.add_at(channel, cell.lower, corners, active)
+
+    def add_at(self, channel: int, lower: mi.Vector3i, corners: list[mi.Float], active: mi.Bool) -> None:
+        """As :meth:`add`, for the cell behind the node ``lower``."""
         _, y, x = self.res
         if self.packed:
-            index = ((cell.lower.z + 1) * (y + 1) + cell.lower.y + 1) * (x + 1) + cell.lower.x + 1
+            index = ((lower.z + 1) * (y + 1) + lower.y + 1) * (x + 1) + lower.x + 1
             index = mi.UInt32(index) * self.channels + channel
             dr.scatter_add(self.buffer, mi.ArrayXf(corners), index, active, mode=dr.ReduceMode.Expand)
             return
         upward = dr.full(dr.mask_t(mi.Vector3f), True)
-        for node, value in zip(box_nodes(cell.lower, upward, self.res), corners, strict=True):
+        for node, value in zip(box_nodes(lower, upward, self.res), corners, strict=True):
             dr.scatter_add(self.buffer, value, node * self.channels + channel, active)
 
     def fold(self) -> mi.Float:
@@ -208,9 +212,13 @@ def node_weights(frac: mi.Vector3f, cell: Cell, res: tuple[int, int, int]) -> li
 
 def _natural(frac: mi.Vector3f, cell: Cell, res: tuple[int, int, int]) -> mi.Vector3f:
     """Fractions along the grid's own axes; in the outer half voxel all weight goes to the node that exists."""
+    return upward_frac(dr.select(cell.ahead, frac, 1 - frac), cell.lower, res)
+
+
+def upward_frac(frac: mi.Vector3f, lower: mi.Vector3i, res: tuple[int, int, int]) -> mi.Vector3f:
+    """Fractions from the lower node of a cell, with all weight on the node that exists in the outer half voxel."""
     z, y, x = res
-    frac = dr.select(cell.ahead, frac, 1 - frac)
-    return dr.select(cell.lower < 0, 1, dr.select(cell.lower >= mi.Vector3i(x - 1, y - 1, z - 1), 0, frac))
+    return dr.select(lower < 0, 1, dr.select(lower >= mi.Vector3i(x - 1, y - 1, z - 1), 0, frac))
 
 
 class _OpticalDepth(dr.CustomOp):

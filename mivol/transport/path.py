@@ -26,7 +26,19 @@ import mitsuba as mi
 from mivol.transport.lattice import slab
 from mivol.transport.world import Body, World
 
-__all__ = ["Path", "Reach", "Settings", "Visit", "Way", "optical_depth_to", "reach", "transmittance", "walk_path"]
+__all__ = [
+    "Path",
+    "Reach",
+    "Settings",
+    "Stretch",
+    "Visit",
+    "Way",
+    "optical_depth_to",
+    "reach",
+    "shadow_ray",
+    "transmittance",
+    "walk_path",
+]
 
 
 @dataclass(frozen=True)
@@ -57,6 +69,24 @@ class Way:
     ray: mi.Ray3f
     medium: mi.MediumPtr
     length: mi.Float
+
+
+@dataclass
+class Stretch:
+    """A stretch ahead of a path.
+
+    Attributes:
+        ray, medium: where it begins, and what surrounds its origin.
+        beta: throughput to there.
+        scatters: lanes whose path may turn once more.
+        draw: random numbers for the media to turn it; None where none of them scatters.
+    """
+
+    ray: mi.Ray3f
+    medium: mi.MediumPtr
+    beta: mi.Spectrum
+    scatters: mi.Bool
+    draw: Any
 
 
 Visit = Callable[..., Any]
@@ -206,7 +236,7 @@ def walk_path(
         scene: Mitsuba's scene: surfaces and emitters.
         world: its media.
         settings: depth, roulette, hidden emitters.
-        sampler: three 2D and two 1D numbers a surface; none where no surface scatters.
+        sampler: three 2D and two 1D numbers a surface, three 2D and three 1D ones a stretch through media that scatter.
         ray: world space, unit direction.
         score: :mod:`mivol.transport.score`.
         active: lanes to walk.
@@ -235,22 +265,24 @@ def walk_path(
     )
     # One stretch: nothing turns a path that no surface meets, nor one of depth 1 (unless a surface lets it pass).
     if not world.has_surfaces or (limit <= 1 and not world.is_veiled):
-        path = _see(scene, world, settings, path)[0]
+        path = _see(scene, world, settings, limit, path)[0]
         return path.score, path.valid
     (path,) = dr.while_loop(
         state=(path,),
         cond=lambda p: p.active,
-        body=lambda p: (_bounce(scene, world, settings, limit, *_see(scene, world, settings, p)),),
+        body=lambda p: (_bounce(scene, world, settings, limit, *_see(scene, world, settings, limit, p)),),
         label="path",
     )
     return path.score, path.valid
 
 
-def _see(scene: mi.Scene, world: World, settings: Settings, path: Path) -> tuple[Path, Reach]:
-    """Go to the next opaque surface and add the emission found there."""
-    end, tau = optical_depth_to(scene, world, path.ray, path.medium, path.active)
+def _see(scene: mi.Scene, world: World, settings: Settings, limit: int, path: Path) -> tuple[Path, Reach]:
+    """Go to the next opaque surface and add the emission found there; media that scatter shine on the way."""
+    scatters = path.active & (path.depth + 1 < limit)
+    draw = world.lights.draw(path.sampler, scatters) if world.lights is not None else None
+    stretch = Stretch(path.ray, path.medium, path.beta, scatters, draw)
+    end, tau, path.score = path.score.stretch(scene, world, stretch, path.active)
     path.beta *= transmittance(tau)
-    path.score = path.score.stretch(scene, world, Way(path.ray, path.medium, end.t), path.active)
     path.medium = end.medium
 
     si = end.si
@@ -278,14 +310,10 @@ def _bounce(scene: mi.Scene, world: World, settings: Settings, limit: int, path:
     lit = may_scatter & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
     direct, weight = scene.sample_emitter_direction(si, sampler.next_2d(lit), False, lit)
     lit &= direct.pdf > 0
-    shadow = si.spawn_ray_to(direct.p)
-    # spawn_ray_to measures in units of its own direction; the walk wants a unit direction and a length.
-    length = dr.norm(direct.p - shadow.o)
-    shadow.d, shadow.maxt = dr.normalize(direct.p - shadow.o), length
-    shadow_medium = dr.select(si.is_medium_transition(), si.target_medium(shadow.d), path.medium)
-    stop, tau = optical_depth_to(scene, world, shadow, shadow_medium, lit)
-    # The last 1e-3 of the way is the lamp's own surface (Mitsuba's ShadowEpsilon shortens its rays alike).
-    lit &= ~(stop.si.is_valid() & (stop.t < length * (1 - 1e-3)))
+    start = si.spawn_ray_to(direct.p).o
+    shadow_medium = dr.select(si.is_medium_transition(), si.target_medium(direct.p - start), path.medium)
+    way, clear, tau = shadow_ray(scene, world, start, shadow_medium, direct, lit)
+    lit &= clear
     wo = si.to_local(direct.d)
     _, pdf_bsdf = bsdf.eval_pdf(mi.BSDFContext(), si, wo, lit)
     w_mis = dr.select(direct.delta, 1, power_heuristic(direct.pdf, pdf_bsdf))
@@ -294,7 +322,7 @@ def _bounce(scene: mi.Scene, world: World, settings: Settings, limit: int, path:
         f = bsdf.eval(mi.BSDFContext(), si, wo, lit)
         source = scene.eval_emitter_direction(si, direct, lit) / direct.pdf if score.attached else weight
         carried = dim * f * dr.select(direct.pdf > 0, source, 0)
-    score = score.shadow(scene, world, Way(shadow, shadow_medium, length), carried, lit)
+    score = score.shadow(scene, world, way, carried, lit)
 
     # -- The direction the path takes -----------------------------------------------------------------------------------------
     u1, u2 = sampler.next_1d(on_surface), sampler.next_2d(on_surface)
@@ -319,6 +347,22 @@ def _bounce(scene: mi.Scene, world: World, settings: Settings, limit: int, path:
     path.active = on & survives & dr.any(path.beta != 0)
     path.score = score
     return path
+
+
+def shadow_ray(
+    scene: mi.Scene, world: World, start: mi.Point3f, medium: mi.MediumPtr, direct: mi.DirectionSample3f, active: mi.Bool
+) -> tuple[Way, mi.Bool, list[mi.Float]]:
+    """Go from a point to a point of a lamp.
+
+    Returns:
+        The way, whether no opaque surface stands in it, and its optical depth for each channel.
+    """
+    length = dr.norm(direct.p - start)
+    ray = mi.Ray3f(start, dr.normalize(direct.p - start), length, direct.time, mi.Color0f())
+    stop, tau = optical_depth_to(scene, world, ray, medium, active)
+    # The last 1e-3 of the way is the lamp's own surface (Mitsuba's ShadowEpsilon shortens its rays alike).
+    clear = ~(stop.si.is_valid() & (stop.t < length * (1 - 1e-3)))
+    return Way(ray, medium, length), clear, tau
 
 
 def power_heuristic(a: mi.Float, b: mi.Float) -> mi.Float:

@@ -22,7 +22,8 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from mivol.transport.path import Visit, Way, reach, visit_boxes
+from mivol.transport.path import Reach, Stretch, Visit, Way, optical_depth_to, reach, visit_boxes
+from mivol.transport.scatter import Scattering, albedo, at_event, scatter, sigma_t_at, spectrum
 from mivol.transport.world import Body, World
 
 __all__ = ["Adjoint", "Primal", "Tangent", "revisit"]
@@ -30,18 +31,24 @@ __all__ = ["Adjoint", "Primal", "Tangent", "revisit"]
 
 @dataclass
 class Primal:
-    """Sum the light that a path carries."""
+    """Sum the light that a path carries, with what media scatter into it or (``scatters`` false) without."""
 
     L: mi.Spectrum
+    scatters: bool = True
     attached = False
 
-    def stretch(self, scene: mi.Scene, world: World, way: Way, active: mi.Bool) -> Primal:
-        """Nothing to do: the throughput is dimmed by the path itself."""
-        return self
+    def stretch(
+        self, scene: mi.Scene, world: World, stretch: Stretch, active: mi.Bool
+    ) -> tuple[Reach, list[mi.Float], Primal]:
+        """Go to the end of a stretch; add what its media scatter."""
+        if world.lights is None or not self.scatters:
+            return *optical_depth_to(scene, world, stretch.ray, stretch.medium, active), self
+        end, tau, event = scatter(scene, world, stretch, False, active)
+        return end, tau, self.add(event.sigma_s * event.weight, event.event.on)
 
     def add(self, value: mi.Spectrum, active: mi.Bool) -> Primal:
         """Light found at the end of a stretch."""
-        return Primal(self.L + dr.select(active, value, 0))
+        return Primal(self.L + dr.select(active, value, 0), self.scatters)
 
     def shadow(self, scene: mi.Scene, world: World, way: Way, value: mi.Spectrum, active: mi.Bool) -> Primal:
         """Light that arrived along a shadow ray."""
@@ -60,10 +67,17 @@ class Adjoint:
     dL: mi.Spectrum
     attached = True
 
-    def stretch(self, scene: mi.Scene, world: World, way: Way, active: mi.Bool) -> Adjoint:
-        """Everything ahead is dimmed by this stretch: d loss / d tau = -dL L."""
-        _backproject(scene, world, way, -self.dL * self.L, active)
-        return self
+    def stretch(
+        self, scene: mi.Scene, world: World, stretch: Stretch, active: mi.Bool
+    ) -> tuple[Reach, list[mi.Float], Adjoint]:
+        """Everything ahead is dimmed by this stretch: d loss / d tau = -dL L; what its media scatter is probed apart."""
+        if world.lights is None:
+            end, tau = optical_depth_to(scene, world, stretch.ray, stretch.medium, active)
+        else:
+            end, tau, event = scatter(scene, world, stretch, True, active)
+            _pull_scattering(scene, world, stretch, event, self.dL)
+        _backproject(scene, world, Way(stretch.ray, stretch.medium, end.t), -self.dL * self.L, active)
+        return end, tau, self
 
     def add(self, value: mi.Spectrum, active: mi.Bool) -> Adjoint:
         """Pass the light by; what made it (an emitter's radiance) gets its own derivative."""
@@ -97,9 +111,18 @@ class Tangent:
     dtau: mi.Spectrum
     attached = True
 
-    def stretch(self, scene: mi.Scene, world: World, way: Way, active: mi.Bool) -> Tangent:
-        """The stretch dims what lies ahead by its tangent."""
-        return Tangent(self.L, self.dL, self.dtau + _tangent(scene, world, way, active))
+    def stretch(
+        self, scene: mi.Scene, world: World, stretch: Stretch, active: mi.Bool
+    ) -> tuple[Reach, list[mi.Float], Tangent]:
+        """The stretch dims what lies ahead by its tangent; what its media scatter changes with them."""
+        dL = self.dL
+        if world.lights is None:
+            end, tau = optical_depth_to(scene, world, stretch.ray, stretch.medium, active)
+        else:
+            end, tau, event = scatter(scene, world, stretch, True, active)
+            dL = dL + _push_scattering(scene, world, stretch, event, self.dtau)
+        way = Way(stretch.ray, stretch.medium, end.t)
+        return end, tau, Tangent(self.L, dL, self.dtau + _tangent(scene, world, way, active))
 
     def add(self, value: mi.Spectrum, active: mi.Bool) -> Tangent:
         """Light found at the end of a stretch, and how it changes."""
@@ -125,6 +148,67 @@ class Tangent:
         f = dr.detach(f)
         change = dr.select(active & (f != 0), df * dr.rcp(dr.select(f != 0, f, 1)), 0)
         return Tangent(self.L, self.dL, self.dtau - change)
+
+
+def _pull_scattering(scene: mi.Scene, world: World, stretch: Stretch, event: Scattering, dL: mi.Spectrum) -> None:
+    """Add the derivatives of the light that a stretch scatters: at the point, along the ray to it, along its shadow rays."""
+    ray, point = stretch.ray, event.event
+    for body, on in at_event(world, point):
+        _pull_source(world, body, ray, event, dL * event.weight, on)
+    for arrival in event.arrivals:
+        carried = dL * event.sigma_s * event.gain
+        with dr.resume_grad():
+            if dr.grad_enabled(arrival.value):
+                dr.backward_from(dr.select(arrival.on, carried * arrival.value, 0))
+        _backproject(scene, world, arrival.way, -carried * dr.detach(arrival.value), arrival.on)
+    to_point = mi.Ray3f(ray.o, ray.d, point.t, ray.time, ray.wavelengths)
+    _backproject(scene, world, Way(to_point, stretch.medium, point.t), -dL * event.sigma_s * event.weight, point.on)
+
+
+def _pull_source(
+    world: World, body: Body, ray: mi.Ray3f, event: Scattering, weight: mi.Spectrum, on: mi.Bool
+) -> None:
+    """Derivatives of the scattering coefficient at a point: of its grid, or of extinction and albedo."""
+    t = event.event.t
+    if body.view.share is None:
+        body.deposit(ray, t, _channels(weight, world.channels), on, "sigma_s")
+        return
+    with dr.resume_grad():
+        share = albedo(body, event.mei, on)
+        if dr.grad_enabled(share):
+            dr.backward_from(dr.select(on, weight * sigma_t_at(world, body, ray, event.event, on) * share, 0))
+    body.deposit(ray, t, _channels(weight * dr.detach(share), world.channels), on)
+
+
+def _push_scattering(
+    scene: mi.Scene, world: World, stretch: Stretch, event: Scattering, dtau: mi.Spectrum
+) -> mi.Spectrum:
+    """The tangent of the light that a stretch scatters: the transpose of :func:`_pull_scattering`."""
+    ray, point = stretch.ray, event.event
+    to_point = mi.Ray3f(ray.o, ray.d, point.t, ray.time, ray.wavelengths)
+    dtau = dtau + _tangent(scene, world, Way(to_point, stretch.medium, point.t), point.on)
+    dL = -dtau * event.sigma_s * event.weight
+    for body, on in at_event(world, point):
+        dL += dr.select(on, event.weight * _push_source(world, body, ray, event, on), 0)
+    for arrival in event.arrivals:
+        with dr.resume_grad():
+            own = dr.forward_to(arrival.value) if dr.grad_enabled(arrival.value) else 0
+        seen = dr.detach(arrival.value)
+        along = _tangent(scene, world, arrival.way, arrival.on)
+        dL += dr.select(arrival.on, event.sigma_s * event.gain * (own - along * seen), 0)
+    return dr.select(point.on, dL, 0)
+
+
+def _push_source(world: World, body: Body, ray: mi.Ray3f, event: Scattering, on: mi.Bool) -> mi.Spectrum:
+    """Tangent of the scattering coefficient at a point."""
+    t, k = event.event.t, world.channels
+    if body.view.share is None:
+        return spectrum(body.tangent_at(ray, t, k, on, "sigma_s"))
+    with dr.resume_grad():
+        share = albedo(body, event.mei, on)
+        own = dr.forward_to(share) if dr.grad_enabled(share) else 0
+    sigma_t = sigma_t_at(world, body, ray, event.event, on)
+    return spectrum(body.tangent_at(ray, t, k, on)) * dr.detach(share) + own * sigma_t
 
 
 def _backproject(scene: mi.Scene, world: World, way: Way, weight: mi.Spectrum, active: mi.Bool) -> None:

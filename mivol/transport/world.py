@@ -8,13 +8,18 @@ from the last boundary on, so that entry points keep the precision of the walk's
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import drjit as dr
 import mitsuba as mi
 
-from mivol.transport.lattice import clip
+from mivol.transport.field import SumField, share_cells
+from mivol.transport.lattice import box_nodes, clip, locate
 from mivol.transport.medium import Box, MediumView, Part
-from mivol.transport.optical_depth import Gradient, backproject_segment, integrate_segment
+from mivol.transport.optical_depth import Gradient, backproject_segment, integrate_segment, interpolate, upward_frac, weights
+
+if TYPE_CHECKING:
+    from mivol.transport.direct import Lights
 
 __all__ = ["Body", "World"]
 
@@ -25,6 +30,7 @@ class Body:
     Attributes:
         view: the medium's extinction.
         box: the boundary, where it is a box; None where it has to be traced.
+        flight: the parts that free flights are drawn from in one walk: constants, and grids that share their cells.
         trims: whether the boundary is smaller than what lies in it, so that stretches must be cut to it.
     """
 
@@ -32,25 +38,35 @@ class Body:
         self.view, self.box = view, box
         self.trims = box is not None and not all(_fits(part, box) for part in view.parts)
         self.rows = box.rows() if box is not None else None
+        self.flight = _share_flight(view.parts)
         self.gradients: list[Gradient | mi.Float] = []
         self.tangents: list[mi.Float] = []
 
-    def optical_depth(self, ray: mi.Ray3f, t0: mi.Float, t1: mi.Float, channels: int, active: mi.Bool) -> list[mi.Float]:
-        """Optical depth [1] of each channel over a stretch."""
-        values = [dr.detach(_values(p)) for p in self.view.parts]
+    def extinction(self, parts: list[Part] | None = None) -> SumField:
+        """The sum of parts (all of them, unless told which), which share their cells, without derivatives."""
+        parts = self.view.parts if parts is None else parts
+        return SumField(parts, [dr.detach(_values(p)) for p in parts], dr.detach(self.view.scale))
+
+    def optical_depth(
+        self, ray: mi.Ray3f, t0: mi.Float, t1: mi.Float, channels: int, active: mi.Bool, parts: list[Part] | None = None
+    ) -> list[mi.Float]:
+        """Optical depth [1] of each channel over a stretch, of all parts unless told which."""
+        parts = self.view.parts if parts is None else parts
+        pairs = [(p, dr.detach(_values(p))) for p in parts]
         scale = dr.detach(self.view.scale)
-        return [scale * tau for tau in self._sum(ray, t0, t1, channels, active, values, skip=True)]
+        return [scale * tau for tau in self._sum(ray, t0, t1, channels, active, pairs, skip=True)]
 
     def tangent(self, ray: mi.Ray3f, t0: mi.Float, t1: mi.Float, channels: int, active: mi.Bool) -> list[mi.Float]:
         """Derivative of the optical depth along the tangent that :meth:`World.start_tangent` took from the parameters."""
-        return self._sum(ray, t0, t1, channels, active, self.tangents, skip=False)
+        pairs = list(zip(self.view.parts, self.tangents, strict=True))
+        return self._sum(ray, t0, t1, channels, active, pairs, skip=False)
 
     def _sum(
-        self, ray: mi.Ray3f, t0: mi.Float, t1: mi.Float, channels: int, active: mi.Bool, values: list, skip: bool
+        self, ray: mi.Ray3f, t0: mi.Float, t1: mi.Float, channels: int, active: mi.Bool, pairs: list[tuple], skip: bool
     ) -> list[mi.Float]:
-        """Integrate ``values`` in the place of each part."""
+        """Integrate the values that come with each part in its place."""
         total = [mi.Float(0) for _ in range(channels)]
-        for part, value in zip(self.view.parts, values, strict=True):
+        for part, value in pairs:
             if part.lattice is None:
                 length = _length(t0, t1, active)
                 # A ray that never leaves a medium has infinite length: 0 * inf would be NaN.
@@ -60,8 +76,7 @@ class Body:
             else:
                 lattice = part.lattice if skip else replace(part.lattice, bounds=None)
                 rows = integrate_segment(lattice, value, clip(lattice, ray.o, ray.d, t0, t1), active)
-            rows = _grey(rows) if len(rows) > channels else rows
-            total = [t + rows[c % len(rows)] for c, t in enumerate(total)]
+            total = [t + r for t, r in zip(total, as_rows(rows, channels), strict=True)]
         return total
 
     def backproject(self, ray: mi.Ray3f, t0: mi.Float, t1: mi.Float, weight: list[mi.Float], active: mi.Bool) -> None:
@@ -76,6 +91,48 @@ class Body:
                 backproject_segment(part.lattice, gradient, w, clip(part.lattice, ray.o, ray.d, t0, t1), active)
 
 
+    def extinction_at(self, ray: mi.Ray3f, t: mi.Float, channels: int, active: mi.Bool, name: str = "sigma_") -> list[mi.Float]:
+        """Coefficient [1/length] of each channel at a point of a ray: of all parts, or of those called ``name``."""
+        parts = [p for p in self.view.parts if p.name.startswith(name)]
+        return self._at(ray, t, channels, active, [(p, self.view.scale * _values(p)) for p in parts])
+
+    def tangent_at(self, ray: mi.Ray3f, t: mi.Float, channels: int, active: mi.Bool, name: str = "sigma_") -> list[mi.Float]:
+        """As :meth:`extinction_at`, of the tangent that :meth:`World.start_tangent` took from the parameters."""
+        pairs = [(p, v) for p, v in zip(self.view.parts, self.tangents, strict=True) if p.name.startswith(name)]
+        return self._at(ray, t, channels, active, pairs)
+
+    def _at(self, ray: mi.Ray3f, t: mi.Float, channels: int, active: mi.Bool, pairs: list[tuple]) -> list[mi.Float]:
+        total = [mi.Float(0) for _ in range(channels)]
+        for part, value in pairs:
+            value = dr.detach(value)
+            if part.lattice is None:
+                rows = [value] if part.channels == 1 else [value.x, value.y, value.z]
+            else:
+                cell, frac, inside = locate(part.lattice, ray.o, ray.d, t)
+                nodes, on = box_nodes(cell, _upward(), part.lattice.res), inside & active
+                rows = [
+                    interpolate([dr.gather(mi.Float, value, n * part.channels + c, on) for n in nodes], frac)
+                    for c in range(part.channels)
+                ]
+            total = [a + b for a, b in zip(total, as_rows(rows, channels), strict=True)]
+        return total
+
+    def deposit(self, ray: mi.Ray3f, t: mi.Float, weight: list[mi.Float], active: mi.Bool, name: str = "sigma_") -> None:
+        """Add ``weight`` (d loss / d coefficient of each channel) at a point of a ray: the transpose of :meth:`tangent_at`."""
+        for part, gradient in zip(self.view.parts, self.gradients, strict=True):
+            if not part.name.startswith(name):
+                continue
+            each = _for_part(weight, part.channels)
+            if part.lattice is None:
+                for c, w in enumerate(each):
+                    dr.scatter_add(gradient, dr.select(active, w, 0), mi.UInt32(c), active)
+                continue
+            cell, frac, inside = locate(part.lattice, ray.o, ray.d, t)
+            shares = weights(upward_frac(frac, cell, part.lattice.res))
+            for c, w in enumerate(each):
+                gradient.add_at(c, cell, [w * s for s in shares], inside & active)
+
+
 class World:
     """The media of a scene, and what of Mitsuba's scene has to be traced.
 
@@ -86,6 +143,7 @@ class World:
         is_veiled: some surface lets part of the light through undeviated, so that a path of depth 1 may pass it.
         start: the medium that the sensor names, or None.
         locates: the camera may be inside a boundary that has to be traced, and the sensor names no medium.
+        lights: what lights the media that scatter; None where none does.
     """
 
     def __init__(
@@ -96,6 +154,7 @@ class World:
         is_veiled: bool = False,
         start: mi.Medium | None = None,
         locates: bool = False,
+        lights: Lights | None = None,
     ) -> None:
         self.boxed = [b for b in bodies if b.box is not None]
         # A traced stretch is recognised by its medium, which several boundaries may share.
@@ -104,11 +163,21 @@ class World:
         self.traces = has_surfaces or bool(self.traced)
         self.channels = 1 if mi.is_monochromatic else max([b.view.channels for b in bodies], default=1)
         self.scatters, self.is_veiled, self.start, self.locates = scatters, is_veiled, start, locates
+        self.lights = lights
 
     @property
     def bodies(self) -> list[Body]:
         """All media."""
         return self.boxed + self.traced
+
+    @property
+    def is_single(self) -> bool:
+        """Whether one walk passes all extinction in its order."""
+        return len(self.bodies) == 1 and len(self.bodies[0].flight) == len(self.bodies[0].view.parts)
+
+    def rows(self, values: list[mi.Float]) -> list[mi.Float]:
+        """Numbers of a grey or rgb body, for each channel of the world."""
+        return as_rows(values, self.channels)
 
     def medium_at(self, scene: mi.Scene, ray: mi.Ray3f) -> mi.MediumPtr:
         """The medium around the origin of camera rays."""
@@ -154,6 +223,20 @@ LUMINANCE = (0.212671, 0.715160, 0.072169)
 """Share of each channel of an rgb field in the one channel of a mono variant (ITU-R BT.709, as in Mitsuba)."""
 
 
+def as_rows(values: list[mi.Float], channels: int) -> list[mi.Float]:
+    """The values of a grey or rgb part for each channel of the world."""
+    if len(values) > channels:
+        return _grey(values)
+    return [values[c % len(values)] for c in range(channels)]
+
+
+def _share_flight(parts: list[Part]) -> list[Part]:
+    """The constants, and the grids that share the cells of the one that scatters."""
+    grids = [p for p in parts if p.lattice is not None]
+    lead = next((p for p in grids if p.name == "sigma_s"), grids[0] if grids else None)
+    return [p for p in parts if p.lattice is None or share_cells(p.lattice, lead.lattice)]
+
+
 def _grey(rows: list[mi.Float]) -> list[mi.Float]:
     """Three channels as the one of a mono variant."""
     return [sum(share * row for share, row in zip(LUMINANCE, rows, strict=True))]
@@ -164,6 +247,10 @@ def _for_part(weight: list[mi.Float], channels: int) -> list[mi.Float]:
     if len(weight) == channels:
         return weight
     return [sum(weight)] if channels == 1 else [share * weight[0] for share in LUMINANCE]
+
+
+def _upward() -> mi.Bool:
+    return dr.full(dr.mask_t(mi.Vector3f), True)
 
 
 def _values(part: Part) -> mi.Float | mi.Color3f:

@@ -122,11 +122,13 @@ def test_scene_without_a_sensor():
         explain(mi.load_dict({"type": "scene", "sky": sky()}))
 
 
-def test_scattering_is_refused_before_anything_is_rendered():
+def test_scattering_twice_is_refused_before_anything_is_rendered():
     scene = scene_of(albedo=0.5)
-    with refused("scatters .* max_depth is 2"):
-        make_plan(find_needs(scene, scene.sensors()[0]), Settings(max_depth=2))
-    make_plan(find_needs(scene, scene.sensors()[0]), Settings(max_depth=1))
+    for depth in (3, -1):
+        with refused(f"scatters .* max_depth is {depth}"):
+            make_plan(find_needs(scene, scene.sensors()[0]), Settings(max_depth=depth))
+    for depth in (1, 2):
+        make_plan(find_needs(scene, scene.sensors()[0]), Settings(max_depth=depth))
 
 
 def test_gradient_step_that_cannot_fit_is_refused(monkeypatch):

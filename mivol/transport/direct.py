@@ -1,0 +1,208 @@
+r"""Light that reaches a point of a medium from the lamps, through volumetric shadows, and turns towards the camera.
+
+.. math:: L_s(x, \omega) = \int_{4\pi} f(x, \omega, \omega_i)\, L_e(x, \omega_i)\, e^{-\tau(x, \omega_i)}\,d\omega_i
+
+A lamp is drawn before the distance, so that the distance may be drawn for it; its direction is Mitsuba's. Where a lamp can be
+met by chance, a second direction is drawn from the phase function, and the power heuristic weighs both (Veach 1997, Eq. 9.13);
+light that is the same from everywhere needs the second one only.
+
+Conventions. An arrival is one shadow ray: the light that it brings is already dimmed by the exact optical depth along it and
+turned by the phase function. Surfaces cast shadows; what they reflect is one more scattering and not seen.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mivol.transport.free_flight import Focus
+from mivol.transport.path import Way, optical_depth_to, power_heuristic, shadow_ray, transmittance
+from mivol.transport.world import World
+
+__all__ = ["Arrival", "Draw", "Lights", "arrivals"]
+
+UNIFORM = "ConstantBackgroundEmitter"
+
+
+@dataclass
+class Draw:
+    """The random numbers of one scattering event: which piece, where in it, which lamp, its direction, the phase function's."""
+
+    piece: mi.Float
+    inside: mi.Point2f
+    lamp: mi.Float
+    emitter: mi.Point2f
+    lobe: mi.Float
+    turn: mi.Point2f
+
+
+@dataclass
+class Lamp:
+    """The lamp that was drawn for each lane: the emitter, and where it is as seen from the ray."""
+
+    emitter: mi.EmitterPtr
+    focus: Focus | None
+
+
+class Lights:
+    """The emitters of a scene, and how their light is to be found.
+
+    Args:
+        scene: Mitsuba's scene.
+
+    Attributes:
+        drawn: emitters that directions are drawn towards, all alike: all but a constant background.
+        has_lobes: directions are drawn from the phase function too, since some emitter can be met by chance.
+    """
+
+    def __init__(self, scene: mi.Scene) -> None:
+        emitters = scene.emitters()
+        delta = int(mi.EmitterFlags.Delta)
+        self.drawn = [e for e in emitters if e.class_name() != UNIFORM]
+        self.has_lobes = any(not int(e.flags()) & delta for e in emitters)
+        balls = [_ball(e) for e in self.drawn]
+        self.is_near = any(b is not None for b in balls)
+        self._emitters = [mi.EmitterPtr(e) for e in self.drawn]
+        self._balls = [None if b is None else [dr.opaque(mi.Float, v) for v in b] for b in balls]
+
+    def draw(self, sampler: mi.Sampler, active: mi.Bool) -> Draw:
+        """Draw the numbers of one event."""
+        return Draw(
+            sampler.next_1d(active),
+            sampler.next_2d(active),
+            sampler.next_1d(active),
+            sampler.next_2d(active),
+            sampler.next_1d(active),
+            sampler.next_2d(active),
+        )
+
+    def choose(self, ray: mi.Ray3f, u: mi.Float) -> Lamp:
+        """Draw a lamp, each with the same probability."""
+        n, width = len(self.drawn), dr.width(ray)
+        index = dr.minimum(mi.UInt32(u * n), max(n - 1, 0))
+        emitter = dr.zeros(mi.EmitterPtr, width)
+        centre, radius2, finite = mi.Point3f(0), mi.Float(0), mi.Bool(False)
+        for k, (candidate, ball) in enumerate(zip(self._emitters, self._balls, strict=True)):
+            here = index == k
+            emitter = dr.select(here, candidate, emitter)
+            if ball is not None:
+                x, y, z, r = ball
+                centre = dr.select(here, mi.Point3f(x, y, z), centre)
+                radius2, finite = dr.select(here, dr.square(r), radius2), here | finite
+        return Lamp(emitter, _focus(ray, centre, radius2, finite) if self.is_near else None)
+
+
+def _ball(emitter: mi.Emitter) -> list[float] | None:
+    """Centre and radius of an emitter; None for one at infinity."""
+    box = emitter.get_shape().bbox() if emitter.get_shape() is not None else emitter.bbox()
+    low, high = np.array(box.min, dtype=np.float64), np.array(box.max, dtype=np.float64)
+    if emitter.is_environment() or not np.isfinite([low, high]).all() or (high < low).any():
+        return None
+    return [*((low + high) / 2), float(np.linalg.norm(high - low) / math.sqrt(12))]
+
+
+def _focus(ray: mi.Ray3f, centre: mi.Point3f, radius2: mi.Float, finite: mi.Bool) -> Focus:
+    away = centre - ray.o
+    t0 = dr.dot(away, ray.d)
+    h2 = dr.squared_norm(away - t0 * ray.d)
+    # A ray through a point light sees it at distance 0; 1e-4 of the way there keeps the angle in float32. It is a density.
+    rho = dr.sqrt(h2 + radius2 + 1e-8 * dr.squared_norm(away) + 1e-30)
+    return Focus(t0, dr.select(finite, rho, 1), finite)
+
+
+@dataclass
+class Arrival:
+    """Light that one shadow ray brings: ``value`` is turned and dimmed, per steradian of nothing: it is radiance."""
+
+    way: Way
+    value: mi.Spectrum
+    on: mi.Bool
+
+
+def arrivals(
+    scene: mi.Scene, world: World, mei: mi.MediumInteraction3f, lamp: Lamp, draw: Draw, attached: bool, active: mi.Bool
+) -> list[Arrival]:
+    """Estimate the light that arrives at a point and turns into ``mei.wi``.
+
+    Args:
+        scene, world: surfaces and media.
+        mei: the point; ``medium`` is what surrounds it.
+        lamp: drawn for each lane.
+        draw: random numbers.
+        attached: keep the derivatives of phase function and emitters.
+        active: lanes to light.
+
+    Returns:
+        One or two shadow rays, whose values add up to L_s.
+
+    Bias: none. Variance: that of one direction towards a lamp and one of the phase function.
+    """
+    found = []
+    if world.lights.drawn:
+        found.append(_from_lamp(scene, world, mei, lamp, draw, attached, active))
+    if world.lights.has_lobes:
+        found.append(_from_lobe(scene, world, mei, draw, attached, active))
+    return found
+
+
+def _from_lamp(
+    scene: mi.Scene, world: World, mei: mi.MediumInteraction3f, lamp: Lamp, draw: Draw, attached: bool, active: mi.Bool
+) -> Arrival:
+    """A direction towards the lamp."""
+    lights, phase = world.lights, mei.medium.phase_function()
+    direct, weight = lamp.emitter.sample_direction(mei, draw.emitter, active)
+    on = active & (direct.pdf > 0)
+    way, clear, tau = shadow_ray(scene, world, mi.Point3f(mei.p), mei.medium, direct, on)
+    w_mis = mi.Float(1)
+    if lights.has_lobes:
+        _, pdf_lobe = phase.eval_pdf(_context(), mei, direct.d, on)
+        pdf = direct.pdf / len(lights.drawn)
+        w_mis = dr.select(direct.delta, 1, power_heuristic(pdf, pdf_lobe))
+    dim = transmittance(tau) * (w_mis * len(lights.drawn))
+    with dr.resume_grad(when=attached):
+        f, _ = phase.eval_pdf(_context(), mei, direct.d, on)
+        source = lamp.emitter.eval_direction(mei, direct, on) / direct.pdf if attached else weight
+        value = dim * f * source
+    return Arrival(way, dr.select(on & clear, value, 0), on & clear)
+
+
+def _from_lobe(
+    scene: mi.Scene, world: World, mei: mi.MediumInteraction3f, draw: Draw, attached: bool, active: mi.Bool
+) -> Arrival:
+    """A direction of the phase function."""
+    lights, phase = world.lights, mei.medium.phase_function()
+    wo, weight, pdf = phase.sample(_context(), mei, draw.lobe, draw.turn, active)
+    on = active & (pdf > 0)
+    ray = mi.Ray3f(mei.p, wo, dr.inf, mei.time, mei.wavelengths)
+    end, tau = optical_depth_to(scene, world, ray, mei.medium, on)
+    si = end.si
+    emitter = si.emitter(scene, on)
+    on &= emitter != None
+    w_mis = mi.Float(1)
+    if lights.drawn:
+        direct = mi.DirectionSample3f(scene, si, mei)
+        pdf_lamp = emitter.pdf_direction(mei, direct, on) / len(lights.drawn)
+        w_mis = dr.select(_is_drawn(lights, emitter), power_heuristic(pdf, pdf_lamp), 1)
+    dim = transmittance(tau) * w_mis
+    with dr.resume_grad(when=attached):
+        if attached:
+            f, _ = phase.eval_pdf(_context(), mei, wo, on)
+            weight = f / pdf
+        value = dim * weight * emitter.eval(si, on)
+    return Arrival(Way(ray, mei.medium, end.t), dr.select(on, value, 0), on)
+
+
+def _is_drawn(lights: Lights, emitter: mi.EmitterPtr) -> mi.Bool:
+    """Whether directions are drawn towards an emitter."""
+    found = mi.Bool(False)
+    for candidate in lights._emitters:
+        found |= emitter == candidate
+    return found
+
+
+def _context() -> mi.PhaseFunctionContext:
+    return mi.PhaseFunctionContext(None)
