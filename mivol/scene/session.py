@@ -16,6 +16,7 @@ from mivol.scene.load import find_sensor
 from mivol.scene.needs import Survey, find_needs, survey_scene
 from mivol.scene.plan import Plan, build_world, check_aovs, make_plan
 from mivol.transport.aovs import backproject_aovs, integrate_aovs, push_aovs
+from mivol.transport.control import View, find_control
 from mivol.transport.film import Rays, adjoint_rays, record
 from mivol.transport.path import Settings, walk_path
 from mivol.transport.score import Adjoint, Primal, Tangent
@@ -116,16 +117,24 @@ class Session:
         return score.L, valid, integrate_aovs(scene, world, rays.ray, self.aovs)
 
     def _tangent(self, scene: mi.Scene, world: World, rays: Rays) -> tuple:
+        _take_control(scene, world, rays)
         black = _black(rays.ray)
         score, _ = walk_path(scene, world, self.settings, rays.sampler, rays.ray, Tangent(black, black, black))
         return score.dL, dr.full(mi.Bool, False, dr.width(black)), push_aovs(scene, world, rays.ray, self.aovs)
 
     def _replay(self, scene: mi.Scene, world: World, rays: Rays, dL: mi.Spectrum, daovs: list[mi.Float]) -> None:
+        _take_control(scene, world, rays)
         again = rays.sampler.clone()
         score, _ = walk_path(scene, world, self.settings, rays.sampler, rays.ray, Primal(_black(rays.ray), scatters=False))
         dr.eval(score.L)
         walk_path(scene, world, self.settings, again, rays.ray, Adjoint(score.L, dL))
         backproject_aovs(scene, world, rays.ray, self.aovs, daovs)
+
+
+def _take_control(scene: mi.Scene, world: World, rays: Rays) -> None:
+    """Find the control variate of a derivative, once for all passes."""
+    if world.takes_control and world.control is None:
+        world.control = find_control(scene, world, world.bodies[0], View.of(rays.ray))
 
 
 def _black(ray: mi.Ray3f) -> mi.Spectrum:

@@ -30,7 +30,8 @@ UNIFORM = "ConstantBackgroundEmitter"
 
 @dataclass
 class Draw:
-    """The random numbers of one scattering event: which piece, where in it, which lamp, its direction, the phase function's."""
+    """The random numbers of one scattering event: which piece, where in it, which lamp, its direction, the phase function's,
+    and which of the two is followed back."""
 
     piece: mi.Float
     inside: mi.Point2f
@@ -38,6 +39,7 @@ class Draw:
     emitter: mi.Point2f
     lobe: mi.Float
     turn: mi.Point2f
+    choice: mi.Float
 
 
 @dataclass
@@ -66,7 +68,6 @@ class Lights:
         self.has_lobes = any(not int(e.flags()) & delta for e in emitters)
         balls = [_ball(e) for e in self.drawn]
         self.is_near = any(b is not None for b in balls)
-        self._emitters = [mi.EmitterPtr(e) for e in self.drawn]
         self._balls = [None if b is None else [dr.opaque(mi.Float, v) for v in b] for b in balls]
 
     def draw(self, sampler: mi.Sampler, active: mi.Bool) -> Draw:
@@ -78,6 +79,7 @@ class Lights:
             sampler.next_2d(active),
             sampler.next_1d(active),
             sampler.next_2d(active),
+            sampler.next_1d(active),
         )
 
     def choose(self, ray: mi.Ray3f, u: mi.Float) -> Lamp:
@@ -86,9 +88,9 @@ class Lights:
         index = dr.minimum(mi.UInt32(u * n), max(n - 1, 0))
         emitter = dr.zeros(mi.EmitterPtr, width)
         centre, radius2, finite = mi.Point3f(0), mi.Float(0), mi.Bool(False)
-        for k, (candidate, ball) in enumerate(zip(self._emitters, self._balls, strict=True)):
+        for k, (candidate, ball) in enumerate(zip(self.drawn, self._balls, strict=True)):
             here = index == k
-            emitter = dr.select(here, candidate, emitter)
+            emitter = dr.select(here, mi.EmitterPtr(candidate), emitter)
             if ball is not None:
                 x, y, z, r = ball
                 centre = dr.select(here, mi.Point3f(x, y, z), centre)
@@ -199,8 +201,8 @@ def _from_lobe(
 def _is_drawn(lights: Lights, emitter: mi.EmitterPtr) -> mi.Bool:
     """Whether directions are drawn towards an emitter."""
     found = mi.Bool(False)
-    for candidate in lights._emitters:
-        found |= emitter == candidate
+    for candidate in lights.drawn:
+        found |= emitter == mi.EmitterPtr(candidate)
     return found
 
 

@@ -28,7 +28,7 @@ from mivol.transport.optical_depth import gauss_points
 from mivol.transport.path import Visit
 from mivol.transport.world import Body, World
 
-__all__ = ["Event", "Focus", "Pick", "offer", "place", "start_pick"]
+__all__ = ["Event", "Focus", "Pick", "offer", "place", "start_pick", "taken_light"]
 
 NEWTON_STEPS = 8
 """Each doubles the digits; where the extinction vanishes at an end they are halvings, and 2^-8 of a cell holds no light."""
@@ -190,7 +190,7 @@ def _offer_piece(
     beyond = [dr.exp(-t) for t in ahead]
     weight = mi.Float(0)
     for own, T, T_out in zip(tau, pick.T, beyond, strict=True):
-        weight += _taken(own, T, T_out)
+        weight += taken_light(own, T, T_out)
         if spread is not None:
             weight += 0.5 * spread * dt * (T + T_out)
     if focus is not None:
@@ -216,7 +216,7 @@ def _offer_piece(
     )
 
 
-def _taken(tau: mi.Float, T: mi.Float, T_out: mi.Float) -> mi.Float:
+def taken_light(tau: mi.Float, T: mi.Float, T_out: mi.Float) -> mi.Float:
     """T (1 - exp(-tau)), to 4e-5 of it: a difference where it keeps its digits, a series elsewhere."""
     series = dr.fma(tau, dr.fma(tau, dr.fma(tau, dr.fma(tau, 1 / 120, -1 / 24), 1 / 6), -1 / 2), 1)
     return dr.select(tau < 0.5, T * tau * series, T - T_out)
@@ -234,7 +234,7 @@ class Event:
     """A point of a ray where light may be scattered.
 
     Attributes:
-        t: distance [length].
+        t, begin: distance [length], and that at which its piece begins.
         pdf: density it was drawn from [1/length].
         tau: optical depth [1] in front of it, of each channel, along the bodies in the order of the walk.
         sigma_t: extinction [1/length] there, of each channel.
@@ -243,6 +243,7 @@ class Event:
     """
 
     t: mi.Float
+    begin: mi.Float
     pdf: mi.Float
     tau: list[mi.Float]
     sigma_t: list[mi.Float]
@@ -291,7 +292,7 @@ def place(
     pdf = (pdf + (1 - by_collision) * evenly) * pick.weight / dr.select(on, pick.total, 1)
     t = mi.Float(mi.Float64(pick.begin) + mi.Float64(pick.s) + mi.Float64(x) * mi.Float64(dt))
     on &= (pdf > 0) & dr.isfinite(pdf)
-    return Event(t, dr.select(on, pdf, 1), [f + a for f, a in zip(pick.front, tau, strict=True)], sigma, pick.body, on)
+    return Event(t, begin, dr.select(on, pdf, 1), [f + a for f, a in zip(pick.front, tau, strict=True)], sigma, pick.body, on)
 
 
 def _curve(world: World, ray: mi.Ray3f, pick: Pick, on: mi.Bool) -> list[list[mi.Float]]:

@@ -236,7 +236,7 @@ def walk_path(
         scene: Mitsuba's scene: surfaces and emitters.
         world: its media.
         settings: depth, roulette, hidden emitters.
-        sampler: three 2D and two 1D numbers a surface, three 2D and three 1D ones a stretch through media that scatter.
+        sampler: three 2D and two 1D numbers a surface, three 2D and four 1D ones a stretch through media that scatter.
         ray: world space, unit direction.
         score: :mod:`mivol.transport.score`.
         active: lanes to walk.

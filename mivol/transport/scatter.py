@@ -37,6 +37,7 @@ class Scattering:
         gain: throughput and transmittance to the camera, over the density of the point.
         arrivals: the shadow rays; their values carry derivatives where these are asked for.
         sigma_s: scattering coefficient [1/length] there.
+        chance: a number in [0, 1), for the choice of one of the shadow rays.
     """
 
     event: Event
@@ -44,6 +45,7 @@ class Scattering:
     gain: mi.Spectrum
     arrivals: list[Arrival]
     sigma_s: mi.Spectrum
+    chance: mi.Float
 
     @property
     def weight(self) -> mi.Spectrum:
@@ -79,7 +81,7 @@ def scatter(
         _, tau = optical_depth_to(scene, world, front, stretch.medium, event.on)
     gain = dr.select(event.on, stretch.beta * transmittance(tau) / event.pdf, 0)
     found = arrivals(scene, world, mei, lamp, draw, probes, event.on)
-    return end, pick.tau, Scattering(event, mei, gain, found, _sigma_s(world, ray, event, mei))
+    return end, pick.tau, Scattering(event, mei, gain, found, _sigma_s(world, ray, event, mei), draw.choice)
 
 
 def _interaction(world: World, ray: mi.Ray3f, event: Event) -> mi.MediumInteraction3f:

@@ -22,6 +22,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from mivol.transport.control import Probe, Tracks, sweep
 from mivol.transport.path import Reach, Stretch, Visit, Way, optical_depth_to, reach, visit_boxes
 from mivol.transport.scatter import Scattering, albedo, at_event, scatter, sigma_t_at, spectrum
 from mivol.transport.world import Body, World
@@ -75,7 +76,13 @@ class Adjoint:
             end, tau = optical_depth_to(scene, world, stretch.ray, stretch.medium, active)
         else:
             end, tau, event = scatter(scene, world, stretch, True, active)
-            _pull_scattering(scene, world, stretch, event, self.dL)
+            _pull_arrivals(scene, world, event, self.dL)
+            _pull_albedo(world, stretch.ray, event, self.dL)
+            if world.control is not None:
+                shares = _sums(self.dL * stretch.beta, world.channels, world.control.channels)
+                _sweep(world, stretch, end, tau, event, shares, self.dL * self.L, self.dL, False, active)
+                return end, tau, self
+            _pull_source(scene, world, stretch, event, self.dL)
         _backproject(scene, world, Way(stretch.ray, stretch.medium, end.t), -self.dL * self.L, active)
         return end, tau, self
 
@@ -120,7 +127,14 @@ class Tangent:
             end, tau = optical_depth_to(scene, world, stretch.ray, stretch.medium, active)
         else:
             end, tau, event = scatter(scene, world, stretch, True, active)
-            dL = dL + _push_scattering(scene, world, stretch, event, self.dtau)
+            dL = dL - dr.select(event.event.on, self.dtau * event.sigma_s * event.weight, 0)
+            dL += _push_arrivals(scene, world, event) + _push_albedo(world, stretch.ray, event)
+            if world.control is not None:
+                one, of = mi.Spectrum(1), world.control.channels
+                shares = [[(c % of, b)] for c, b in enumerate(_colours(stretch.beta))]
+                dL += mi.Spectrum(*_sweep(world, stretch, end, tau, event, shares, 0 * one, one, True, active))
+            else:
+                dL += _push_source(scene, world, stretch, event)
         way = Way(stretch.ray, stretch.medium, end.t)
         return end, tau, Tangent(self.L, dL, self.dtau + _tangent(scene, world, way, active))
 
@@ -150,65 +164,139 @@ class Tangent:
         return Tangent(self.L, self.dL, self.dtau - change)
 
 
-def _pull_scattering(scene: mi.Scene, world: World, stretch: Stretch, event: Scattering, dL: mi.Spectrum) -> None:
-    """Add the derivatives of the light that a stretch scatters: at the point, along the ray to it, along its shadow rays."""
-    ray, point = stretch.ray, event.event
-    for body, on in at_event(world, point):
-        _pull_source(world, body, ray, event, dL * event.weight, on)
+def _pull_arrivals(scene: mi.Scene, world: World, event: Scattering, dL: mi.Spectrum) -> None:
+    """Derivatives of the light that arrives: of its lamp and the phase function, and of what dims it on its way.
+
+    Of two shadow rays one is walked back, drawn by what it brings.
+    """
+    carried = dL * event.sigma_s * event.gain
     for arrival in event.arrivals:
-        carried = dL * event.sigma_s * event.gain
         with dr.resume_grad():
             if dr.grad_enabled(arrival.value):
                 dr.backward_from(dr.select(arrival.on, carried * arrival.value, 0))
-        _backproject(scene, world, arrival.way, -carried * dr.detach(arrival.value), arrival.on)
-    to_point = mi.Ray3f(ray.o, ray.d, point.t, ray.time, ray.wavelengths)
-    _backproject(scene, world, Way(to_point, stretch.medium, point.t), -dL * event.sigma_s * event.weight, point.on)
+    way, value, on = _choose(event)
+    _backproject(scene, world, way, -carried * value, on)
 
 
-def _pull_source(
-    world: World, body: Body, ray: mi.Ray3f, event: Scattering, weight: mi.Spectrum, on: mi.Bool
-) -> None:
-    """Derivatives of the scattering coefficient at a point: of its grid, or of extinction and albedo."""
-    t = event.event.t
-    if body.view.share is None:
-        body.deposit(ray, t, _channels(weight, world.channels), on, "sigma_s")
-        return
-    with dr.resume_grad():
-        share = albedo(body, event.mei, on)
-        if dr.grad_enabled(share):
-            dr.backward_from(dr.select(on, weight * sigma_t_at(world, body, ray, event.event, on) * share, 0))
-    body.deposit(ray, t, _channels(weight * dr.detach(share), world.channels), on)
+def _choose(event: Scattering) -> tuple[Way, mi.Spectrum, mi.Bool]:
+    """One of the shadow rays of an event, and what it brings over the probability of drawing it."""
+    first = event.arrivals[0]
+    if len(event.arrivals) == 1:
+        return first.way, dr.detach(first.value), first.on
+    second = event.arrivals[1]
+    values = [dr.detach(a.value) for a in event.arrivals]
+    light = [sum(v[c] for c in range(dr.size_v(v))) for v in values]
+    total = light[0] + light[1]
+    p = dr.select(total > 0, light[0] / dr.select(total > 0, total, 1), 0.5)
+    is_first = event.chance < p
+    way = Way(
+        dr.select(is_first, first.way.ray, second.way.ray),
+        dr.select(is_first, first.way.medium, second.way.medium),
+        dr.select(is_first, first.way.length, second.way.length),
+    )
+    value = dr.select(is_first, values[0] / dr.maximum(p, 1e-20), values[1] / dr.maximum(1 - p, 1e-20))
+    return way, value, dr.select(is_first, first.on, second.on) & (total > 0)
 
 
-def _push_scattering(
-    scene: mi.Scene, world: World, stretch: Stretch, event: Scattering, dtau: mi.Spectrum
-) -> mi.Spectrum:
-    """The tangent of the light that a stretch scatters: the transpose of :func:`_pull_scattering`."""
-    ray, point = stretch.ray, event.event
-    to_point = mi.Ray3f(ray.o, ray.d, point.t, ray.time, ray.wavelengths)
-    dtau = dtau + _tangent(scene, world, Way(to_point, stretch.medium, point.t), point.on)
-    dL = -dtau * event.sigma_s * event.weight
-    for body, on in at_event(world, point):
-        dL += dr.select(on, event.weight * _push_source(world, body, ray, event, on), 0)
+def _pull_albedo(world: World, ray: mi.Ray3f, event: Scattering, dL: mi.Spectrum) -> None:
+    """Derivative of the albedo at the point."""
+    for body, on in at_event(world, event.event):
+        if body.view.share is None:
+            continue
+        with dr.resume_grad():
+            share = albedo(body, event.mei, on)
+            if dr.grad_enabled(share):
+                sigma_t = sigma_t_at(world, body, ray, event.event, on)
+                dr.backward_from(dr.select(on, dL * event.weight * sigma_t * share, 0))
+
+
+def _pull_source(scene: mi.Scene, world: World, stretch: Stretch, event: Scattering, dL: mi.Spectrum) -> None:
+    """Derivatives of the coefficients: at the point, and in front of it."""
+    ray, t = stretch.ray, event.event.t
+    for body, on in at_event(world, event.event):
+        share, name = mi.Spectrum(1), "sigma_s"
+        if body.view.share is not None:
+            share, name = dr.detach(albedo(body, event.mei, on)), "sigma_"
+        body.deposit(ray, t, _channels(dL * event.weight * share, world.channels), on, name)
+    _backproject(scene, world, _way_to(stretch, t), -dL * event.sigma_s * event.weight, event.event.on)
+
+
+def _way_to(stretch: Stretch, t: mi.Float) -> Way:
+    ray = stretch.ray
+    return Way(mi.Ray3f(ray.o, ray.d, t, ray.time, ray.wavelengths), stretch.medium, t)
+
+
+def _sums(weight: mi.Spectrum, channels: int, of_control: int) -> list[list[tuple[int, mi.Float]]]:
+    """What each channel of the control counts in each channel of the extinction, summed over colours."""
+    colours = [weight[c] for c in range(dr.size_v(weight))]
+    if of_control == 1:
+        return [[(0, w)] for w in _channels(weight, channels)]
+    if channels == 1:
+        return [list(enumerate(colours))]
+    return [[(c, w)] for c, w in enumerate(colours)]
+
+
+def _sweep(
+    world: World,
+    stretch: Stretch,
+    end: Reach,
+    tau: list[mi.Float],
+    event: Scattering,
+    shares: list,
+    rest: mi.Spectrum,
+    dL: mi.Spectrum,
+    tangent: bool,
+    active: mi.Bool,
+) -> list[mi.Float]:
+    """Derivatives of a stretch with a control variate: its cells exactly, what is left by the probe."""
+    (body,), point = world.bodies, event.event
+    S = world.control.at_point(body, stretch.ray, point.t, point.on)
+    share = dr.detach(albedo(body, event.mei, point.on))
+    left = dr.select(point.on, event.weight * share - event.gain * spectrum(S), 0)
+    sigma_t = spectrum(point.sigma_t)
+    rows = [_colours(x) if tangent else _channels(x, world.channels) for x in (dL * left, dL * left * sigma_t, rest)]
+    probe = Probe(point.begin, point.t, rows[0], rows[1], point.on)
+    return sweep(world, stretch.ray, end.t, tau, Tracks(shares, rows[2], tangent), probe, active)
+
+
+def _push_arrivals(scene: mi.Scene, world: World, event: Scattering) -> mi.Spectrum:
+    """The tangent of the light that arrives, as the camera sees it: the transpose of :func:`_pull_arrivals`."""
+    carried, dL = event.sigma_s * event.gain, mi.Spectrum(0)
     for arrival in event.arrivals:
         with dr.resume_grad():
-            own = dr.forward_to(arrival.value) if dr.grad_enabled(arrival.value) else 0
-        seen = dr.detach(arrival.value)
-        along = _tangent(scene, world, arrival.way, arrival.on)
-        dL += dr.select(arrival.on, event.sigma_s * event.gain * (own - along * seen), 0)
-    return dr.select(point.on, dL, 0)
+            own = dr.forward_to(arrival.value) if dr.grad_enabled(arrival.value) else mi.Spectrum(0)
+        dL += dr.select(arrival.on, carried * own, 0)
+    way, value, on = _choose(event)
+    return dL - dr.select(on, carried * value * _tangent(scene, world, way, on), 0)
 
 
-def _push_source(world: World, body: Body, ray: mi.Ray3f, event: Scattering, on: mi.Bool) -> mi.Spectrum:
-    """Tangent of the scattering coefficient at a point."""
-    t, k = event.event.t, world.channels
-    if body.view.share is None:
-        return spectrum(body.tangent_at(ray, t, k, on, "sigma_s"))
-    with dr.resume_grad():
-        share = albedo(body, event.mei, on)
-        own = dr.forward_to(share) if dr.grad_enabled(share) else 0
-    sigma_t = sigma_t_at(world, body, ray, event.event, on)
-    return spectrum(body.tangent_at(ray, t, k, on)) * dr.detach(share) + own * sigma_t
+def _push_albedo(world: World, ray: mi.Ray3f, event: Scattering) -> mi.Spectrum:
+    """The tangent of the albedo at the point: the transpose of :func:`_pull_albedo`."""
+    dL = mi.Spectrum(0)
+    for body, on in at_event(world, event.event):
+        if body.view.share is None:
+            continue
+        with dr.resume_grad():
+            share = albedo(body, event.mei, on)
+            own = dr.forward_to(share) if dr.grad_enabled(share) else mi.Spectrum(0)
+        dL += dr.select(on, event.weight * sigma_t_at(world, body, ray, event.event, on) * own, 0)
+    return dL
+
+
+def _push_source(scene: mi.Scene, world: World, stretch: Stretch, event: Scattering) -> mi.Spectrum:
+    """The tangent of the coefficients at the point and in front of it: the transpose of :func:`_pull_source`."""
+    ray, t, k = stretch.ray, event.event.t, world.channels
+    dL = -_tangent(scene, world, _way_to(stretch, t), event.event.on) * event.sigma_s * event.weight
+    for body, on in at_event(world, event.event):
+        share, name = mi.Spectrum(1), "sigma_s"
+        if body.view.share is not None:
+            share, name = dr.detach(albedo(body, event.mei, on)), "sigma_"
+        dL += dr.select(on, event.weight * share * spectrum(body.tangent_at(ray, t, k, on, name)), 0)
+    return dr.select(event.event.on, dL, 0)
+
+
+def _colours(value: mi.Spectrum) -> list[mi.Float]:
+    return [value[c] for c in range(dr.size_v(value))]
 
 
 def _backproject(scene: mi.Scene, world: World, way: Way, weight: mi.Spectrum, active: mi.Bool) -> None:

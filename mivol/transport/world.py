@@ -19,6 +19,7 @@ from mivol.transport.medium import Box, MediumView, Part
 from mivol.transport.optical_depth import Gradient, backproject_segment, integrate_segment, interpolate, upward_frac, weights
 
 if TYPE_CHECKING:
+    from mivol.transport.control import Control
     from mivol.transport.direct import Lights
 
 __all__ = ["Body", "World"]
@@ -117,20 +118,32 @@ class Body:
             total = [a + b for a, b in zip(total, as_rows(rows, channels), strict=True)]
         return total
 
+    def add_to_grid(self, part: Part, lower: mi.Vector3i, terms: list[tuple], active: mi.Bool) -> None:
+        """Add to the gradient of a grid, in one packet for each channel, at the cell behind a node.
+
+        Args:
+            part: the grid.
+            lower: lower node of the cell.
+            terms: (d loss of each channel of the world, 8 weights of the corners) pairs.
+            active: lanes that add.
+        """
+        gradient = next(g for p, g in zip(self.view.parts, self.gradients, strict=True) if p is part)
+        each = [(_for_part(weight, part.channels), corners) for weight, corners in terms]
+        for c in range(part.channels):
+            values = [sum(w[c] * corners[q] for w, corners in each) for q in range(8)]
+            gradient.add_at(c, lower, values, active)
+
     def deposit(self, ray: mi.Ray3f, t: mi.Float, weight: list[mi.Float], active: mi.Bool, name: str = "sigma_") -> None:
         """Add ``weight`` (d loss / d coefficient of each channel) at a point of a ray: the transpose of :meth:`tangent_at`."""
         for part, gradient in zip(self.view.parts, self.gradients, strict=True):
             if not part.name.startswith(name):
                 continue
-            each = _for_part(weight, part.channels)
             if part.lattice is None:
-                for c, w in enumerate(each):
+                for c, w in enumerate(_for_part(weight, part.channels)):
                     dr.scatter_add(gradient, dr.select(active, w, 0), mi.UInt32(c), active)
                 continue
             cell, frac, inside = locate(part.lattice, ray.o, ray.d, t)
-            shares = weights(upward_frac(frac, cell, part.lattice.res))
-            for c, w in enumerate(each):
-                gradient.add_at(c, cell, [w * s for s in shares], inside & active)
+            self.add_to_grid(part, cell, [(weight, weights(upward_frac(frac, cell, part.lattice.res)))], inside & active)
 
 
 class World:
@@ -164,6 +177,14 @@ class World:
         self.channels = 1 if mi.is_monochromatic else max([b.view.channels for b in bodies], default=1)
         self.scatters, self.is_veiled, self.start, self.locates = scatters, is_veiled, start, locates
         self.lights = lights
+        self.control: Control | None = None
+
+    @property
+    def takes_control(self) -> bool:
+        """Whether a control variate for derivatives can be used: one grid in a box that scatters by an albedo."""
+        parts = [p for b in self.bodies for p in b.view.parts]
+        alone = len(parts) == 1 and not self.traced and parts[0].lattice is not None
+        return self.lights is not None and alone and self.bodies[0].view.share is not None
 
     @property
     def bodies(self) -> list[Body]:
