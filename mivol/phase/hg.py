@@ -49,8 +49,9 @@ def sample_hg(u: mi.Float, g: mi.Float) -> Turn:
     """
     back = g < 0
     a = dr.select(back, -g, g)
-    v = dr.select(back, 1 - u, u)
+    # Both u and 1 - u are used as they are: 1 - (1 - u) would not be u.
+    v, w = dr.select(back, 1 - u, u), dr.select(back, u, 1 - u)
     inv = dr.rcp(dr.square(dr.fma(2 * a, v, 1 - a)))
-    below_one = 2 * dr.square(1 - a) * (1 - v) * dr.fma(a, v, 1) * inv
+    below_one = 2 * dr.square(1 - a) * w * dr.fma(a, v, 1) * inv
     above_minus_one = 2 * dr.square(1 + a) * v * dr.fma(a, v, 1 - a) * inv
     return Turn(below_one, above_minus_one).mirrored(back)

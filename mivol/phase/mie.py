@@ -1,9 +1,11 @@
 r"""Phase functions of droplets and dust by Mie's theory, averaged over their sizes.
 
-.. math:: p(\theta) = \frac{\int n(r)\,r^2 Q_{sca}(r)\,p_r(\theta)\,dr}{\int n(r)\,r^2 Q_{sca}(r)\,dr}
+.. math:: p(\theta) \sim \int n(r) \big(|S_1(r, \theta)|^2 + |S_2(r, \theta)|^2\big)\,dr, \qquad
+          S_1 = \sum_n \frac{2 n + 1}{n (n + 1)} (a_n \pi_n + b_n \tau_n), \quad
+          S_2 = \sum_n \frac{2 n + 1}{n (n + 1)} (a_n \tau_n + b_n \pi_n)
 
 Conventions. Lengths in micrometres; unpolarised light; the refractive index is relative to the surroundings and its imaginary
-part, of either sign, absorbs. The theory itself is ``miepython``'s, an optional package.
+part, of either sign, absorbs. The coefficients a_n and b_n are those of ``miepython``, an optional package.
 
 References: Bohren & Huffman, Absorption and Scattering of Light by Small Particles (1983), chapter 4. Size distribution of
 droplets: Hansen & Travis 1974 (Space Science Reviews 16), the gamma distribution by effective radius a and variance b,
@@ -26,8 +28,9 @@ __all__ = ["WATER_INDEX", "aerosol", "water_droplets"]
 WATER_INDEX = 1.333
 """Refractive index of water in the middle of the visible; what it absorbs there does not change the shape."""
 
-RADII = 128
-"""Gauss-Legendre nodes over the radii; the resonances of single droplets are narrower and average out."""
+RADII = 1024
+"""Radii, in equal steps of their logarithm. Resonances of clear droplets are narrower still: for effective radii of 3 to 20
+micrometre they leave 1.5 to 2 % (root mean square over angles), 4 to 9 % at the worst angle, near straight back."""
 
 
 CUT = 1e-7
@@ -53,7 +56,7 @@ def water_droplets(
     Raises:
         MivolError: a size, variance or wavelength that cannot be, or ``miepython`` is not installed.
 
-    Cost: about 0.02 s per micrometre of radius.
+    Cost: 0.3 s and 600 nodes for 3 micrometre, 2.6 s and 3300 nodes for 20.
     """
     _check_positive(effective_radius=effective_radius, wavelength=wavelength, tolerance=tolerance)
     if not 0 < effective_variance < 0.5:
@@ -95,21 +98,35 @@ def _average(
 ) -> Table:
     """The table of spheres with radii between two; ``log_area`` is the logarithm of r^2 n(r), up to a constant."""
     mie = _miepython()
-    nodes, weights = np.polynomial.legendre.leggauss(RADII)
-    radii = np.exp(0.5 * (np.log(high) + np.log(low) + nodes * np.log(high / low)))
+    radii = low * (high / low) ** ((np.arange(RADII) + 0.5) / RADII)
     sizes = 2 * np.pi * radii / wavelength
-    _, q_sca, _, _ = mie.efficiencies_mx(index, sizes)
-    log_share = log_area(radii) + np.log(radii)  # equal steps of log r
-    share = weights * np.exp(log_share - log_share.max()) * q_sca
-    share /= share.sum()
-    kept = share > 1e-7 * share.max()
+    series = [np.atleast_2d(mie.coefficients(complex(index), float(x))) for x in sizes]
+    terms = max(s.shape[1] for s in series)
+    electric, magnetic = np.array([np.pad(s, ((0, 0), (0, terms - s.shape[1]))) for s in series]).transpose(1, 0, 2)
+    n = np.arange(1, terms + 1)
+    # What spheres of one size scatter into an angle is n(r) |S|^2, without r^2; n(r) dr is r n(r) d log r.
+    log_number = log_area(radii) - np.log(radii)
+    number = np.exp(log_number - log_number.max())
+    factor = (2 * n + 1) / (n * (n + 1))
+    electric, magnetic = factor * electric, factor * magnetic
 
     def density(cosines: np.ndarray) -> np.ndarray:
-        parts = (s * mie.i_unpolarized(index, x, cosines, norm="one") for s, x in zip(share[kept], sizes[kept], strict=True))
-        return sum(parts, np.zeros(len(cosines)))
+        pi, tau = _angular(cosines, terms)
+        s1, s2 = electric @ pi + magnetic @ tau, electric @ tau + magnetic @ pi
+        return number @ (np.abs(s1) ** 2 + np.abs(s2) ** 2)
 
     cosines, values = adapt_nodes(density, tolerance, least=65)
-    return Table(cosines, values, "the Mie table")
+    return Table(cosines, values / values.max(), "the Mie table")
+
+
+def _angular(cosines: np.ndarray, terms: int) -> tuple[np.ndarray, np.ndarray]:
+    """The angular functions pi_n and tau_n (terms, n), Bohren & Huffman, section 4.3."""
+    pi, tau = np.empty((2, terms, len(cosines)))
+    before, here = np.zeros(len(cosines)), np.ones(len(cosines))
+    for n in range(1, terms + 1):
+        pi[n - 1], tau[n - 1] = here, n * cosines * here - (n + 1) * before
+        before, here = here, ((2 * n + 1) * cosines * here - (n + 1) * before) / n
+    return pi, tau
 
 
 def _check_positive(**given: float) -> None:

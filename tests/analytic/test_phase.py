@@ -1,0 +1,487 @@
+"""Phase functions against float64 closed forms: values, moments, inversions, tables, mixtures, measured media.
+
+eps is 2^-23. A float32 expression of k roundings is within k eps/2 of its float64 twin, where nothing cancels.
+"""
+
+from __future__ import annotations
+
+import sys
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import oracle_phase as oracle
+import pytest
+
+from mivol.errors import MivolError
+from mivol.phase import mie
+from mivol.phase.domain import ASYMMETRY, NEXT_TO_ONE, WEIGHT
+from mivol.phase.draine import droplets, eval_draine, mean_cosine, sample_draine
+from mivol.phase.hg import eval_hg, sample_hg
+from mivol.phase.measured import ALIASES, NAMES, named_medium
+from mivol.phase.mixture import choose_lobe, shares_of
+from mivol.phase.rayleigh import eval_rayleigh, sample_rayleigh
+from mivol.phase.tabulated import Lookup, Table
+from mivol.phase.turn import Turn, direction_after, turn_between
+
+pytestmark = pytest.mark.usefixtures("variant_rgb")
+
+EPS = 2.0**-23
+SMALL = (1e-7, 1e-5, 1e-3)
+LARGE = (0.2, 0.6, 0.9, 0.99, 0.9999, 0.99999, NEXT_TO_ONE)
+ALL_G = (0.0, *SMALL, *LARGE, *(-g for g in SMALL), *(-g for g in LARGE))
+NEAR = np.geomspace(1e-6, 1, 200)
+ANGLES = np.concatenate([NEAR, np.linspace(1, np.pi - 1, 50), np.pi - NEAR, [0, np.pi]])
+
+
+def f32(x: float) -> float:
+    """The float32 number that a parameter becomes, as float64: both sides see the same g."""
+    return float(np.float32(x))
+
+
+def lanes(*arrays: np.ndarray) -> tuple[mi.Float, ...]:
+    return tuple(mi.Float(np.ascontiguousarray(a, dtype=np.float32)) for a in arrays)
+
+
+def turns() -> tuple[Turn, np.ndarray, np.ndarray]:
+    m, p = oracle.turns(ANGLES)
+    return Turn(*lanes(m, p)), m, p
+
+
+def as64(x: object) -> np.ndarray:
+    return np.array(dr.detach(x), dtype=np.float64)
+
+
+def uniforms(n: int) -> np.ndarray:
+    """Midpoints of n equal parts of [0, 1], in the multiples of 2^-24 that float32 holds there."""
+    return (np.arange(n) + 0.5) / n
+
+
+def cosines_of(turn: Turn) -> np.ndarray:
+    return (as64(turn.above_minus_one) - as64(turn.below_one)) / 2
+
+
+# -- Turns -----------------------------------------------------------------------------------------------------------------
+
+
+def test_turn_between_directions_keeps_small_angles():
+    """An angle of 1e-3 between float32 directions: 1 - cos to a few roundings of itself, where 1 - dot keeps 12 bits."""
+    rng = np.random.default_rng(0)
+    wi = rng.normal(size=(4096, 3))
+    wi /= np.linalg.norm(wi, axis=1, keepdims=True)
+    side = np.cross(wi, rng.normal(size=(4096, 3)))
+    side /= np.linalg.norm(side, axis=1, keepdims=True)
+    for sign in (-1, 1):
+        wo = sign * wi * np.cos(1e-3) + side * np.sin(1e-3)
+        a, b = (x.astype(np.float32).astype(np.float64) for x in (wi, wo))
+        turn = turn_between(mi.Vector3f(a.T), mi.Vector3f(b.T))
+        # A difference of neighbours is exact; three squares, two sums and a product are six roundings.
+        for x, want in ((turn.below_one, ((a + b) ** 2).sum(1) / 2), (turn.above_minus_one, ((a - b) ** 2).sum(1) / 2)):
+            assert np.max(np.abs(as64(x) / want - 1)) <= 3 * EPS
+
+
+def test_direction_after_turns_by_the_angle():
+    """Straight on is -wi, straight back wi, and the sine is right down to 1e-6."""
+    turn, m, p = turns()
+    wi = mi.Vector3f(0.6, 0.0, 0.8)
+    wo = as64(direction_after(wi, turn, mi.Float(0.3))).T
+    # The three products of each component and the frame are a few roundings of 1.
+    assert np.max(np.abs(wo @ [0.6, 0, 0.8] + (p - m) / 2)) <= 4 * EPS
+    # Across the axis the vector is sin times a unit vector with its own roundings, plus those of cos wi.
+    across = np.linalg.norm(wo + ((p - m) / 2)[:, None] * [0.6, 0, 0.8], axis=1)
+    assert np.max(np.abs(across - np.sqrt(m * p))) <= 4 * EPS
+    assert turn.sin[0] == pytest.approx(1e-6, rel=4 * EPS)
+
+
+# -- Values ----------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("g", ALL_G)
+def test_hg_values(g):
+    turn, m, p = turns()
+    got, want = as64(eval_hg(turn, mi.Float(g))), oracle.hg(m, p, f32(g))
+    # 1 - a is exact; D has 3 roundings and enters to the power 3/2, the quotient and root add 4 (a reciprocal of Dr.Jit has 2).
+    assert np.max(np.abs(got / want - 1)) <= 6 * EPS
+
+
+@pytest.mark.parametrize("alpha", [0.0, 0.3, 1.0, 27.0, 1e4])
+@pytest.mark.parametrize("g", [0.0, 1e-7, 0.6, -0.6, 0.99, 0.99999])
+def test_draine_values(g, alpha):
+    turn, m, p = turns()
+    got, want = as64(eval_draine(turn, mi.Float(g), mi.Float(alpha))), oracle.draine(m, p, f32(g), f32(alpha))
+    # As Henyey-Greenstein's, and 1 + alpha c^2 with a rounded c (relative error: that of c^2 at most), over a rounded norm.
+    assert np.max(np.abs(got / want - 1)) <= 10 * EPS
+
+
+def test_draine_has_henyey_greenstein_rayleigh_and_cornette_shanks_as_cases():
+    turn, m, p = turns()
+    c = (p - m) / 2
+    assert np.array_equal(as64(eval_draine(turn, mi.Float(0.7), mi.Float(0))), as64(eval_hg(turn, mi.Float(0.7))))
+    got = as64(eval_draine(turn, mi.Float(0), mi.Float(1)))
+    assert np.max(np.abs(got / as64(eval_rayleigh(turn)) - 1)) <= 4 * EPS
+    g = f32(0.6)
+    shanks = 3 / (8 * np.pi) * (1 - g * g) * (1 + c * c) / ((2 + g * g) * (1 + g * g - 2 * g * c) ** 1.5)
+    assert np.max(np.abs(as64(eval_draine(turn, mi.Float(0.6), mi.Float(1))) / shanks - 1)) <= 10 * EPS
+
+
+def test_rayleigh_values():
+    turn, m, p = turns()
+    assert np.max(np.abs(as64(eval_rayleigh(turn)) / oracle.rayleigh((p - m) / 2) - 1)) <= 3 * EPS
+
+
+def integrals(evaluate, powers: int = 4) -> np.ndarray:
+    """Moments <cos^k>, k = 0 ..., by Gauss-Legendre over the cosine."""
+    c, w = oracle.gauss(400)
+    values = as64(evaluate(Turn(*lanes(1 - c, 1 + c)))) * 2 * np.pi * w
+    return np.array([(values * c**k).sum() for k in range(powers)])
+
+
+@pytest.mark.parametrize("g", [0.0, 1e-7, 1e-3, 0.5, -0.5, 0.9, -0.9])
+def test_moments_of_hg(g):
+    """Normalised, mean cosine g, <cos^2> = (1 + 2 g^2)/3, <cos^3> = (3 g + 2 g^3)/5; physics.md 4.9."""
+    # 400 nodes: the error falls as the ellipse of convergence, (1/g)^800, < 1e-36. Left are the roundings of the values, and
+    # those of the node in the peak, eps/2 of 1 - c = (1 - g), with slope 3/(1 - g)^2.
+    tolerance = 10 * EPS / (1 - abs(g))
+    want = [1, g, (1 + 2 * g * g) / 3, (3 * g + 2 * g**3) / 5]
+    assert np.max(np.abs(integrals(lambda t: eval_hg(t, mi.Float(g))) - want)) <= tolerance
+
+
+def test_legendre_moments_and_backscatter_of_hg():
+    g = 0.7
+    c, w = oracle.gauss(400)
+    values = as64(eval_hg(Turn(*lanes(1 - c, 1 + c)), mi.Float(g))) * 2 * np.pi * w
+    moments = [(values * np.polynomial.legendre.Legendre.basis(k)(c)).sum() for k in range(10)]
+    assert np.max(np.abs(moments - g ** np.arange(10.0))) <= 40 * EPS
+    c, w = (c - 1) / 2, w / 2
+    back = (as64(eval_hg(Turn(*lanes(1 - c, 1 + c)), mi.Float(g))) * 2 * np.pi * w).sum()
+    assert back == pytest.approx((1 - g) / (2 * g) * ((1 + g) / np.sqrt(1 + g * g) - 1), rel=10 * EPS)
+
+
+def test_moments_of_rayleigh_and_draine():
+    assert np.max(np.abs(integrals(eval_rayleigh) - [1, 0, 0.4, 0])) <= 4 * EPS
+    for g, alpha in ((0.0, 1.0), (0.6, 1.0), (-0.6, 27.0), (0.8, 300.0)):
+        got = integrals(lambda t, g=g, a=alpha: eval_draine(t, mi.Float(g), mi.Float(a)), 2)
+        assert np.max(np.abs(got - [1, mean_cosine(g, alpha)])) <= 20 * EPS / (1 - abs(g))
+
+
+# -- Samples ---------------------------------------------------------------------------------------------------------------
+
+U = np.concatenate([[0, 2.0**-24, 1e-6], uniforms(4096), [1 - 1e-6, 1 - 2.0**-24]]).astype(np.float32).astype(np.float64)
+
+
+@pytest.mark.parametrize("g", ALL_G)
+def test_inversion_of_hg(g):
+    """The chance of a smaller cosine than the sample's is u, and that of a larger one 1 - u, both to some roundings."""
+    turn = sample_hg(*lanes(U), mi.Float(g))
+    m, p = as64(turn.below_one), as64(turn.above_minus_one)
+    assert np.all(np.isfinite(m) & np.isfinite(p) & (m >= 0) & (p >= 0))
+    below, above = oracle.hg_below(m, p, f32(g))
+    # m and p are right to 4e-7 of themselves (physics.md 2.7). A chance has the slope 1 (d log / d log) in the one that is
+    # small with it, and at most 1/2 and 1/2 in the other, through q: 8e-7 of the chance.
+    small = U < 0.5
+    assert np.all(np.abs(below[small] - U[small]) <= 8e-7 * U[small])
+    assert np.all(np.abs(above[~small] - (1 - U[~small])) <= 8e-7 * (1 - U[~small]))
+    assert np.max(np.abs(as64(turn.sin) ** 2 - m * p)) <= 2 * EPS
+
+
+@pytest.mark.parametrize("g", [0.0, 1e-7, 0.3, 0.9, 0.99999, -0.3, -0.99])
+@pytest.mark.parametrize("alpha", [0.0, 1.0, 27.0, 1e4, 1e9])
+def test_inversion_of_draine(g, alpha):
+    u = U[::5]
+    turn = sample_draine(*lanes(u), mi.Float(g), mi.Float(alpha))
+    m, p = as64(turn.below_one), as64(turn.above_minus_one)
+    below = oracle.draine_below(m, p, f32(g), f32(alpha))
+    # The polynomial in y has five terms of size up to 5, so u is met to about 10 roundings of 1.
+    assert np.max(np.abs(below - u)) <= 10 * EPS
+
+
+def test_inversion_of_rayleigh():
+    c = cosines_of(sample_rayleigh(*lanes(U)))
+    # F = (c^3 + 3 c + 4)/8 with slope 3/4 at most, and c to 3 roundings of 1.
+    assert np.max(np.abs((c**3 + 3 * c + 4) / 8 - U)) <= 3 * EPS
+
+
+@pytest.mark.parametrize("g", [0.5, -0.8])
+def test_mean_cosine_of_samples(g):
+    n = 2**16
+    # Midpoints of an integrand with second derivative below 2/(1 - g)^2 ... : n^-2 / 24 of it, 1e-9; and roundings of cos.
+    for sample, want in (
+        (sample_hg(*lanes(uniforms(n)), mi.Float(g)), g),
+        (sample_draine(*lanes(uniforms(n)), mi.Float(g), mi.Float(5)), mean_cosine(g, 5.0)),
+        (sample_rayleigh(*lanes(uniforms(n))), 0),
+    ):
+        assert cosines_of(sample).mean() == pytest.approx(want, abs=4 * EPS)
+
+
+# -- Tables ----------------------------------------------------------------------------------------------------------------
+
+COSINES = np.array([-1, -0.93, -0.2, -0.15, 0.4, 0.999, 0.99999, 0.9999999, 1.0])
+VALUES = np.array([0.3, 0.0, 0.0, 1.0, 1.0, 2.0, 40.0, 300.0, 1000.0])
+
+
+def lookup(table: Table) -> tuple[Lookup, mi.Float, mi.Float, mi.Float]:
+    nodes = Lookup.of(table)
+    return nodes, *nodes.normalise(mi.Float(table.values.astype(np.float32)))
+
+
+def test_values_between_irregular_nodes():
+    nodes, values, integral, _ = lookup(Table(COSINES, VALUES))
+    turn, m, p = turns()
+    got = as64(nodes.eval(turn, values, integral))
+    want = np.interp(p - 1, COSINES, VALUES)
+    near = m < 1
+    want[near] = np.interp(-m[near], COSINES - 1, VALUES)  # 1 - c of the peak is not lost
+    total = 2 * np.pi * np.trapezoid(VALUES, COSINES)
+    # The place in a segment is rounded by eps/2 of 1 - c (of 1 + c behind): 1.01 segments at most in the peak, 17 in the narrow
+    # one from -0.2 to -0.15. Values follow by as much of the larger end.
+    after = np.clip(np.searchsorted(COSINES, p - 1), 1, len(COSINES) - 1)
+    larger = np.maximum(VALUES[after - 1], VALUES[after])
+    assert np.all(np.abs(got * total - want) <= 17 * EPS * larger)
+
+
+def test_samples_of_a_table_invert_its_distribution():
+    nodes, values, integral, cumulative = lookup(Table(COSINES, VALUES))
+    turn = nodes.sample(*lanes(U), values, integral, cumulative)
+    m = as64(turn.below_one)
+    assert np.all(m >= 0)
+    assert np.all(np.diff(m) <= 0)
+    # Above each sample: whole segments and a trapezoid, from 1 downwards, so that the peak is judged by its own size.
+    d, f = (1 - COSINES)[::-1], VALUES[::-1] / np.trapezoid(VALUES, COSINES)
+    sums = np.concatenate([[0], np.cumsum((f[1:] + f[:-1]) / 2 * np.diff(d))])
+    i = np.clip(np.searchsorted(d, m, side="right") - 1, 0, len(d) - 2)
+    here = np.interp(m, d, f)
+    above = sums[i] + (f[i] + here) / 2 * (m - d[i])
+    # The cumulative sums are rounded to eps/2 of 1, and so is u's place between two of them; the rest is a few of those.
+    assert np.max(np.abs(above - (1 - U))) <= 4 * EPS
+    # No sample where the function is 0: between -0.93 and -0.2.
+    assert not np.any((m > 1.2001) & (m < 1.9299))
+
+
+def test_table_of_a_stock_size():
+    """Equally spaced values are those of tabphase: (0.5, 1, 1.5) is (2 + c) / (8 pi)."""
+    nodes, values, integral, _ = lookup(Table.regular([0.5, 1.0, 1.5]))
+    turn, m, p = turns()
+    assert np.max(np.abs(as64(nodes.eval(turn, values, integral)) * 8 * np.pi - (2 + (p - m) / 2))) <= 8 * EPS
+
+
+def test_table_from_legendre_moments():
+    """g^n gives Henyey-Greenstein back, and the table's own moments are those that were put in, to its tolerance."""
+    given = 0.6 ** np.arange(40)
+    table = Table.from_moments(given, tolerance=1e-4)
+    c = np.linspace(-1, 1, 301)
+    want = 2 * np.pi * oracle.hg(1 - c, 1 + c, 0.6)
+    # The series is cut at 0.6^40 = 1e-9; lines miss by 1e-4 of the peak halfway in angle, and by little more elsewhere.
+    assert np.max(np.abs(np.interp(c, table.cosines, table.density) - want)) <= 2e-4 * want.max()
+    # A convex function lies below its chords by 2/3 of the largest miss on average: moments move by less than that.
+    assert np.max(np.abs(table.moments(10) - given[:10])) <= 4e-4
+    assert table.mean_cosine == pytest.approx(0.6, abs=2e-4)
+
+
+def test_moments_of_a_table_are_exact():
+    table = Table.regular([0.5, 1.0, 1.5])
+    assert table.moments(3) == pytest.approx([1, 1 / 6, 0], abs=1e-14)
+
+
+def test_table_from_csv(tmp_path):
+    (tmp_path / "angle.csv").write_text("# measured\nangle,value\n0,3\n60,2\n180,1\n")
+    (tmp_path / "cos.csv").write_text("-1,1\n0.5,2\n1,3\n")
+    for name in ("angle.csv", "cos.csv"):
+        table = Table.from_csv(tmp_path / name)
+        assert table.cosines == pytest.approx([-1, 0.5, 1], abs=1e-15)
+        assert list(table.values) == [1, 2, 3]
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("-1,1\n1,2,3\n", "two columns"),
+        ("-1,1\n1,x\n", "two columns"),
+        ("degrees,value\n0,1\n180,1\n", "'degrees'"),
+        ("-1,1\n0.5,1\n", "-1 to 0.5"),
+        ("-1,1\n0,1\n0,2\n1,1\n", "rise"),
+        ("-1,1\n1,-2\n", "-2 at 1"),
+        ("-1,0\n1,0\n", "0 everywhere"),
+        ("-1,1\n1,nan\n", "nan at 1"),
+        ("", "0 cosines"),
+    ],
+)
+def test_bad_tables_are_refused(tmp_path, text, words):
+    (tmp_path / "bad.csv").write_text(text)
+    with pytest.raises(MivolError, match=words):
+        Table.from_csv(tmp_path / "bad.csv")
+
+
+def test_bad_moments_and_files_are_refused(tmp_path):
+    with pytest.raises(MivolError, match="chi_0"):
+        Table.from_moments([0.9, 0.5])
+    with pytest.raises(MivolError, match="cos = -1"):
+        Table.from_moments([1.0, 0.9])
+    with pytest.raises(MivolError, match="cannot be read"):
+        Table.from_csv(tmp_path / "missing.csv")
+
+
+# -- Mixtures --------------------------------------------------------------------------------------------------------------
+
+
+def test_shares_and_choice():
+    shares = shares_of([mi.Float(1), mi.Float(0), mi.Float(3)])
+    assert [float(s[0]) for s in shares] == [0.25, 0, 0.75]
+    chosen, inside = choose_lobe(shares, *lanes([0, 0.1, 0.2499, 0.25, 0.5, 1 - 2.0**-24]))
+    assert list(chosen) == [0, 0, 0, 2, 2, 2]
+    # u / 0.25 is exact; (u - 0.25) / 0.75 has two roundings.
+    assert as64(inside) == pytest.approx([0, 0.4, 0.9996, 0, 1 / 3, 1], abs=2 * EPS)
+    assert np.all(as64(inside) < 1)
+
+
+def test_shares_without_any_weight_are_equal():
+    assert [float(s[0]) for s in shares_of([mi.Float(0), mi.Float(0)])] == [0.5, 0.5]
+
+
+# -- Domains ---------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("bad", [1.0, -1.0, 0.99999999, 2.0, np.nan, np.inf])
+def test_asymmetry_outside_is_refused(bad):
+    with pytest.raises(MivolError, match="above -1 and below 1"):
+        ASYMMETRY.check(np.array([bad]), "g")
+    with pytest.raises(MivolError, match=r"g is .* at 1;"):
+        ASYMMETRY.check(np.array([0.0, bad]), "g")
+
+
+def test_projection_to_the_nearest_allowed_value():
+    x = mi.Float(-3, -NEXT_TO_ONE, 0, 0.5, 1, np.inf)
+    assert list(ASYMMETRY.project(x)) == [-NEXT_TO_ONE, -NEXT_TO_ONE, 0, 0.5, NEXT_TO_ONE, NEXT_TO_ONE]
+    assert list(WEIGHT.project(mi.Float(-1, 0, 5))) == [0, 0, 5]
+    x = mi.Float(0, 2, -2)
+    dr.enable_grad(x)
+    dr.backward(ASYMMETRY.project(x) + WEIGHT.project(x))
+    assert list(dr.grad(x)) == [2, 1, 0]  # on a bound the derivative is that of the parameter; outside it is 0
+
+
+# -- Measured media ----------------------------------------------------------------------------------------------------------
+
+
+def test_named_media_are_the_published_ones():
+    """A few numbers of each table; the scattering coefficients of the second one as printed, from the reduced ones."""
+    sigma_a, sigma_s, g = named_medium("Skim milk")
+    assert (sigma_a, sigma_s, g) == ((0.0014, 0.0025, 0.0142), (0.70, 1.22, 1.90), (0.0, 0.0, 0.0))
+    sigma_a, sigma_s, g = named_medium("lowfat_milk")
+    assert sigma_a == (0.002875, 0.00575, 0.0115)
+    assert g == (0.932, 0.902, 0.859)
+    assert sigma_s == pytest.approx((13.1157, 15.4445, 17.9572), rel=5e-5)  # five digits were printed
+    sigma_a, sigma_s, g = named_medium("red wine")
+    assert sigma_a == (0.11632, 0.25191, 0.29434)
+    assert sigma_s == pytest.approx((0.00081, 0, 0), abs=5e-6)
+    assert named_medium("chicken 1").sigma_a[0] == 0.015
+
+
+def test_every_named_medium_is_physical():
+    for name in (*NAMES, *ALIASES):
+        medium = named_medium(name)
+        assert all(x >= 0 for x in (*medium.sigma_a, *medium.sigma_s))
+        ASYMMETRY.check(np.array(medium.g), name)
+        assert min(medium.g) <= medium.mean_g() <= max(medium.g)
+    assert len(NAMES) == 47
+
+
+def test_unknown_medium_is_refused():
+    with pytest.raises(MivolError, match="lowfat milk"):
+        named_medium("lofat milk")
+
+
+def test_named_medium_as_a_plugin():
+    medium = named_medium("regular milk")
+    rgb = medium.to_dict(mm_per_unit=10.0, dilution=0.1)
+    assert rgb["sigma_a"]["value"] == pytest.approx(medium.sigma_a)
+    grey = medium.to_dict(mm_per_unit=1000.0, channel=2)
+    assert grey["sigma_s"] == pytest.approx(1000 * medium.sigma_s[2])
+    assert grey["phase"] == {"type": "mivol_hg", "g": 0.681}
+    # The mean is weighted by scattering: (18.2052 0.75 + 20.3826 0.714 + 22.3698 0.681) / 60.9576.
+    assert rgb["phase"]["g"] == pytest.approx(0.712641, abs=1e-5)
+    for wrong in ({"mm_per_unit": 0}, {"mm_per_unit": 1, "dilution": 2}, {"mm_per_unit": 1, "channel": 3}):
+        with pytest.raises(MivolError):
+            medium.to_dict(**wrong)
+    for given in (rgb, grey):
+        mi.load_dict(given)
+
+
+def test_droplets_of_jendersie_and_deon():
+    """The fit's mean cosine lies by Mie's for clouds, 0.85 to 0.88; outside its range it is refused."""
+    fit = droplets(20.0)
+    share = fit["weight_draine"]
+    g = (1 - share) * fit["g_hg"] + share * mean_cosine(fit["g_draine"], fit["alpha"])
+    assert 0.85 < g < 0.89
+    with pytest.raises(MivolError, match="5 to 50"):
+        droplets(1.0)
+
+
+# -- Mie -------------------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def twin(monkeypatch):
+    """Mie's theory from the book in place of miepython, which need not be installed."""
+    monkeypatch.setitem(sys.modules, "miepython", oracle.Mie)
+    return oracle.Mie
+
+
+def test_mie_of_small_particles_is_rayleigh(twin, monkeypatch):
+    monkeypatch.setattr(mie, "RADII", 16)
+    table = mie.aerosol(1e-3, 1.05, 1.5, tolerance=1e-4)
+    c = np.linspace(-1, 1, 101)
+    # The next term is of relative size x^2 = (2 pi 1e-3 / 0.55)^2 = 1.3e-4; lines miss by 1e-4.
+    assert np.max(np.abs(np.interp(c, table.cosines, table.density) / (2 * np.pi * oracle.rayleigh(c)) - 1)) <= 5e-4
+
+
+def test_mie_of_one_size_is_the_theory(twin, monkeypatch):
+    """A distribution so narrow that one size remains: values and mean cosine of that sphere."""
+    monkeypatch.setattr(mie, "RADII", 8)
+    table = mie.aerosol(0.5, 1 + 1e-6, 1.5 - 0.01j, tolerance=1e-3)
+    x = 2 * np.pi * 0.5 / 0.55
+    want = 2 * np.pi * twin.i_unpolarized(1.5 - 0.01j, x, table.cosines, norm="one")
+    # Chords lie off by 1e-3, so their integral does by less; sizes differ by 1e-5, times x.
+    assert np.max(np.abs(table.density / want - 1)) <= 2e-3
+    assert table.mean_cosine == pytest.approx(twin.efficiencies_mx(1.5 - 0.01j, np.array([x]))[3][0], abs=1e-3)
+
+
+def test_droplets_of_a_cloud(twin, monkeypatch):
+    """A forward peak, and the mean cosine of the sizes, weighted by what they scatter."""
+    monkeypatch.setattr(mie, "RADII", 200)
+    table = mie.water_droplets(2.0)
+    r = np.linspace(0.05, 8, 200)
+    _, q_sca, _, g = twin.efficiencies_mx(mie.WATER_INDEX, 2 * np.pi * r / 0.55)
+    share = r ** (1 / 0.1 - 1) * np.exp(-r / (2.0 * 0.1)) * q_sca
+    # Both sums step over narrow resonances; 128 radii against 1024 differ by 7e-4, and chords by 3e-4 (measured).
+    assert table.mean_cosine == pytest.approx((share @ g) / share.sum(), abs=3e-3)
+    assert table.density[-1] > 50 * np.interp(0.9, table.cosines, table.density)
+    assert np.diff(table.cosines).min() > 0
+
+
+def test_the_twin_is_miepython():
+    """Where miepython is installed, its coefficients are the twin's."""
+    real = pytest.importorskip("miepython", reason='miepython is not installed: pip install "mivol[mie]"')
+    for index, x in ((1.333 + 0j, 0.1), (1.5 - 0.01j, 10.0), (1.333 + 0j, 114.0)):
+        ours, theirs = oracle.Mie.coefficients(index, x), np.atleast_2d(real.coefficients(index, x))
+        n = min(ours.shape[1], theirs.shape[1])
+        # Upward recurrence in one, downward in the other: 1e-16 grows with the order to about 1e-9 of the largest.
+        assert np.max(np.abs(ours[:, :n] - theirs[:, :n])) <= 1e-8
+
+
+def test_without_miepython_there_is_a_sentence(monkeypatch):
+    monkeypatch.setitem(sys.modules, "miepython", None)
+    with pytest.raises(MivolError, match=r'pip install "mivol\[mie\]"'):
+        mie.water_droplets(5.0)
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda: mie.water_droplets(-1.0),
+        lambda: mie.water_droplets(5.0, effective_variance=0.6),
+        lambda: mie.aerosol(0.1, 0.9, 1.5),
+        lambda: mie.aerosol(0.1, 1.5, 1.5, wavelength=np.nan),
+    ],
+)
+def test_particles_that_cannot_be_are_refused(twin, call):
+    with pytest.raises(MivolError, match="expected"):
+        call()
