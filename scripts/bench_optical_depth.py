@@ -17,41 +17,40 @@ made-up fields of the same sizes take their place, and the JSON says so.
 
 from __future__ import annotations
 
-import argparse
 import gc
 import itertools
-import json
 import math
-import os
-import sys
-import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
-import mivol  # noqa: F401  (registers the plugins)
-from mivol.fields.procedural import make_procedural
-from mivol.files import read_volume, write_whole_text
+from contest import (
+    AT_LEAST,
+    AT_MOST,
+    TO_WORLD,
+    Bench,
+    Contestant,
+    box_of,
+    clock,
+    ct_scan,
+    describe,
+    judge,
+    made_up,
+    perspective,
+    race,
+    ratio_of,
+    smoke,
+    threads_in_space,
+)
 from mivol.report.figures import Series, plot_error_against_time
-from mivol.report.record import describe_machine, versions
 from mivol.transport.lattice import Lattice, block_bounds, clip, walk
 from mivol.transport.optical_depth import Gradient, backproject_segment, integrate_tau
 
 import drjit as dr
 import drjit.dda
 import mitsuba as mi
-import msgspec
 import numpy as np
-
-ROOT = Path(__file__).resolve().parents[1]
-DATA = Path(os.environ.get("MIVOL_DATA", ROOT.parent / "shared" / "data"))
-
-TO_WORLD = np.array([[2, 0, 0, -1], [0, 2, 0, -1], [0, 0, 2, -1], [0, 0, 0, 1]], np.float64)
-"""Every grid fills [-1, 1]^3, as in the tutorial."""
-
-TUTORIAL_SCALE = 40.0
-"""By which the tutorial multiplies its smoke: optical depths up to 65."""
 
 
 @dataclass(frozen=True)
@@ -98,132 +97,7 @@ QUICK = Size(
 )
 
 
-# -- Clocks ----------------------------------------------------------------------------------------------------------------
-
-
-@dataclass
-class Timing:
-    """Seconds of the warm calls of one contestant, what its first call was, and what the calls returned."""
-
-    first: dict[str, float]
-    seconds: list[float] = field(default_factory=list)
-    results: list = field(default_factory=list)
-
-    @property
-    def median(self) -> float:
-        """The figure that is quoted [s]."""
-        return float(np.median(self.seconds))
-
-    def report(self, units: float, name: str) -> dict[str, float]:
-        """Median and fastest time, the rate of ``units`` they mean, and the first call."""
-        fastest = min(self.seconds)
-        return {
-            "seconds_median": self.median,
-            "seconds_min": fastest,
-            f"{name}_per_second_median": units / self.median,
-            f"{name}_per_second_best": units / fastest,
-            "first_call": self.first,
-        }
-
-
-Contestant = Callable[[int], object]
-"""Takes the number of the round (a seed), returns Dr.Jit arrays that are still to be evaluated."""
-
-
-def race(contestants: dict[str, Contestant], rounds: int, keep: bool = False) -> dict[str, Timing]:
-    """Time contestants in turns.
-
-    Args:
-        contestants: by name.
-        rounds: calls of each, after a first one that is not counted.
-        keep: keep what each call returned, as NumPy arrays.
-    """
-    timings = {name: Timing(first_call(call)) for name, call in contestants.items()}
-    names = list(contestants)
-    for number in range(1, rounds + 1):
-        for name in names[number % len(names) :] + names[: number % len(names)]:
-            result, seconds = clock(contestants[name], number)
-            timings[name].seconds.append(seconds)
-            if keep:
-                timings[name].results.append(np.array(result))
-            del result
-    return timings
-
-
-def clock(call: Contestant, number: int = 0) -> tuple[object, float]:
-    """A call, evaluated to its end, and its seconds."""
-    start = time.perf_counter()
-    result = call(number)
-    dr.eval(result)
-    dr.sync_thread()
-    return result, time.perf_counter() - start
-
-
-def first_call(call: Contestant) -> dict[str, float]:
-    """Make the first call: seconds in all and in the compiler, kernels compiled, kernels found on disk."""
-    dr.kernel_history_clear()
-    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
-        _, seconds = clock(call)
-        kernels = [k for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT]
-    return {
-        "seconds": seconds,
-        "compile_seconds": sum(k["codegen_time"] + k["backend_time"] for k in kernels) / 1e3,
-        "kernels_compiled": sum(not k["cache_hit"] for k in kernels),
-        "kernels_from_disk": sum(k["cache_disk"] for k in kernels),
-    }
-
-
-def ratio_of(slow: Timing, fast: Timing) -> float:
-    """How many times longer one takes than the other: median over the rounds."""
-    return float(np.median(np.array(slow.seconds) / np.array(fast.seconds)))
-
-
 # -- Fields and rays -------------------------------------------------------------------------------------------------------
-
-
-class Field(NamedTuple):
-    """An extinction (Z, Y, X) float32 [1/length] and where it is from."""
-
-    values: np.ndarray
-    origin: str
-
-
-def smoke() -> Field:
-    """The tutorial's smoke at the tutorial's density, or a made-up one of its size."""
-    path = DATA / "volumes_vol" / "tutorials_volume.vol"
-    if path.is_file():
-        return Field(np.float32(TUTORIAL_SCALE) * read_volume(path, frame="unit").values[..., 0], "Mitsuba tutorial, x 40")
-    return made_up((53, 45, 44), peak=1.85 * TUTORIAL_SCALE)
-
-
-def made_up(shape: tuple[int, int, int], peak: float, why: str = "no data folder") -> Field:
-    """Soft blobs and filaments, from the seed 0."""
-    return Field(make_procedural("tangle", shape, 0, peak)[..., 0], f"procedural ({why})")
-
-
-def ct_scan(res: int) -> Field:
-    """The CT of a bonsai, 0 to 2 [1/length], or a made-up field of another size."""
-    path = DATA / "ct_mri" / "bonsai.vti"
-    if res == 256 and path.is_file():
-        values = read_volume(path, frame="unit").values[..., 0]
-        return Field(values * np.float32(2 / values.max()), "bonsai CT")
-    return made_up((res,) * 3, 2.0, "no data folder" if res == 256 else "quick")
-
-
-def threads_in_space(res: int, share: float = 0.01) -> Field:
-    """Thin curved threads that fill ``share`` of the voxels, the rest exactly 0."""
-    rng = np.random.default_rng(0)
-    values = np.zeros((res,) * 3, np.float32)
-    offsets = np.stack(np.meshgrid(*[np.arange(-3, 4)] * 3, indexing="ij"), -1).reshape(-1, 3)
-    stamp = np.maximum(0, 1 - np.sum(offsets**2, axis=1) / 10).astype(np.float32)
-    offsets, stamp = offsets[stamp > 0], stamp[stamp > 0]
-    s = np.linspace(0, 2 * np.pi, 2 * res)[:, None]
-    while np.count_nonzero(values) < share * values.size:
-        a, b, c = rng.uniform(-0.3, 0.3, (3, 3))
-        curve = 0.5 + a * np.cos(s) + b * np.sin(s) + c * np.cos(2 * s) / 2
-        nodes = np.clip(np.rint(curve * res).astype(int)[:, None] + offsets, 0, res - 1)
-        np.maximum.at(values, tuple(nodes.reshape(-1, 3).T), np.tile(stamp, len(curve)))
-    return Field(20 * values, f"made-up threads, {np.count_nonzero(values) / values.size:.1%} of the voxels not 0")
 
 
 @dataclass
@@ -254,26 +128,6 @@ class Work:
         """Numbers, origins and directions of rays spread evenly over all: (m,), (m, 3), (m, 3) float64."""
         index = np.linspace(0, self.n - 1, min(count, self.n)).astype(int)
         return index, np.array(self.o).T[index].astype(np.float64), np.array(self.d).T[index].astype(np.float64)
-
-
-def perspective(side: int) -> dict:
-    """One of the tutorial's cameras: 4 away, 45 degrees wide, turned by 18 degrees; the smoke's own z is up."""
-    angle = math.radians(18)
-    origin = [4 * math.sin(angle), -4 * math.cos(angle), 0]
-    return {
-        "type": "perspective",
-        "fov": 45,
-        "to_world": mi.ScalarTransform4f().look_at(origin=origin, target=[0, 0, 0], up=[0, 0, 1]),
-        "film": {
-            "type": "hdrfilm",
-            "width": side,
-            "height": side,
-            "component_format": "float32",
-            "rfilter": {"type": "box"},
-            "sample_border": False,
-        },
-        "sampler": {"type": "independent"},
-    }
 
 
 def camera_rays(side: int, pixels: np.ndarray | None = None, k: int = 1) -> tuple[mi.Point3f, mi.Vector3f]:
@@ -437,7 +291,7 @@ def by_tracking(work: Work, spp: int, track: Callable) -> Contestant:
 
 def by_volpath(work: Work, spp: int) -> Contestant:
     """A transmittance for each ray from ``spp`` paths of stock ``volpath`` under a sky of radiance 1."""
-    scene = mi.load_dict(scene_of(work.values, 8))
+    scene = mi.load_dict(box_of(work.values, 8))
     volpath = mi.load_dict({"type": "volpath", "max_depth": 1})
 
     def paths(o: mi.Point3f, d: mi.Vector3f, sampler: mi.Sampler) -> mi.Float:
@@ -460,22 +314,6 @@ def by_drjit_dda(work: Work, grid: mi.TensorXf) -> mi.Float:
     return drjit.dda.integrate(start, work.d, t1 - t0, low, high, grid, active=hit)
 
 
-def scene_of(values: np.ndarray, side: int) -> dict:
-    """The tutorial's scene with albedo 0, of stock plugins only: a box of smoke under a sky of radiance 1."""
-    to_world = mi.ScalarTransform4f(np.float32(TO_WORLD))
-    grid = {"type": "gridvolume", "grid": mi.VolumeGrid(values[..., None]), "raw": True, "to_world": to_world}
-    return {
-        "type": "scene",
-        "sky": {"type": "constant", "radiance": {"type": "uniform", "value": 1.0}},
-        "box": {
-            "type": "cube",
-            "bsdf": {"type": "null"},
-            "interior": {"type": "heterogeneous", "sigma_t": grid, "albedo": 0.0},
-        },
-        "sensor": perspective(side),
-    }
-
-
 # -- The questions ---------------------------------------------------------------------------------------------------------
 
 
@@ -493,7 +331,7 @@ def measure_walk(size: Size) -> dict:
 def measure_image(size: Size) -> dict:
     """Through ``mi.render``: how much sooner than ``volpath`` at the same spp, and at the same error?"""
     found = smoke()
-    scene = mi.load_dict(scene_of(found.values, size.image_side))
+    scene = mi.load_dict(box_of(found.values, size.image_side))
     integrators = {
         "mivol": mi.load_dict({"type": "mivol", "max_depth": 1}),
         "volpath, max_depth 1": mi.load_dict({"type": "volpath", "max_depth": 1}),
@@ -612,7 +450,7 @@ def gradient_step(values: mi.TensorXf, tau_of: Callable[[mi.TensorXf], mi.Float]
 
 def race_gradient_of_render(size: Size) -> dict:
     """A render by the integrator, and a gradient step through it."""
-    scene, integrator = mi.load_dict(scene_of(smoke().values, size.image_side)), mi.load_dict({"type": "mivol"})
+    scene, integrator = mi.load_dict(box_of(smoke().values, size.image_side)), mi.load_dict({"type": "mivol"})
     params, key = mi.traverse(scene), "box.interior_medium.sigma_t.data"
 
     def render(seed: int) -> mi.TensorXf:
@@ -739,8 +577,6 @@ QUESTIONS = {
 
 # -- Saying it -------------------------------------------------------------------------------------------------------------
 
-AT_LEAST, AT_MOST = "at least", "at most"
-
 
 class Bar(NamedTuple):
     """What the project promises of an answer: a figure, and where it has to lie. ``find`` gives None where it is not there."""
@@ -770,73 +606,23 @@ BARS = (
 
 def compare(question: str, answer: dict) -> list[dict]:
     """The figures of an answer that have a bar, beside it, and said."""
-    rows = []
-    for _, figure, sense, bar, find in (b for b in BARS if b.question == question):
-        value = find(answer)
-        if value is not None:
-            met = value >= bar if sense == AT_LEAST else value <= bar
-            rows.append({"figure": figure, "value": value, "sense": sense, "bar": bar, "met": bool(met)})
-            say(f"  {figure}: {value:.3g}, bar {sense} {bar:g}{'' if met else ': MISSED'}")
-    return rows
+    found = [(b, b.find(answer)) for b in BARS if b.question == question]
+    return [judge(b.figure, value, b.sense, b.bar) for b, value in found if value is not None]
 
 
-def describe(found: Field) -> str:
-    """A field in one line, its resolution as X x Y x Z."""
-    return f"{'x'.join(map(str, found.values.shape[::-1]))}, {found.origin}"
-
-
-def draw(peers: dict, path: Path) -> None:
+def draw(answers: dict, folder: Path) -> None:
     """Error against time."""
+    if (peers := answers.get("peers")) is None:
+        return
     rows = {name: points for name, points in peers.items() if isinstance(points, list)}
     series = [
         Series(name, [p["seconds_median"] for p in points], [p["rms_error"] for p in points]) for name, points in rows.items()
     ]
     title = f"Transmittance of {peers['rays']:,} rays through the smoke {peers['grid'].split(',')[0]}: error against time"
-    plot_error_against_time(series, path, error="RMS error of T against float64", title=title)
+    plot_error_against_time(series, folder / "bench_optical_depth.png", error="RMS error of T against float64", title=title)
 
 
-def say(text: str) -> None:
-    """To standard error: standard output is for the JSON."""
-    print(text, file=sys.stderr, flush=True)
-
-
-def main() -> None:
-    """Read the command line, ask the questions, print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="small sizes, for CI: its times mean nothing")
-    parser.add_argument("--only", default=",".join(QUESTIONS), help=f"questions to ask, of {','.join(QUESTIONS)}")
-    parser.add_argument("--out", type=Path, default=Path("runs/bench_optical_depth"))
-    parser.add_argument("--variant", default="llvm_ad_rgb")
-    args = parser.parse_args()
-    asked = args.only.split(",")
-    if unknown := set(asked) - set(QUESTIONS):
-        parser.error(f"--only: {', '.join(sorted(unknown))} is not a question; known are {', '.join(QUESTIONS)}")
-    mi.set_variant(args.variant)
-    size = QUICK if args.quick else FULL
-    start, load = time.perf_counter(), os.getloadavg()[0]
-    answers, bars = {}, []
-    for name in asked:
-        say(f"{name}: {QUESTIONS[name].__doc__}")
-        answers[name] = QUESTIONS[name](size)
-        bars += compare(name, answers[name])
-    figures = {
-        "size": size.name,
-        "machine": msgspec.to_builtins(describe_machine()),
-        "versions": versions(),
-        "variant": args.variant,
-        "threads": dr.thread_count(),
-        "load_before_and_after": [load, os.getloadavg()[0]],
-        "seconds": round(time.perf_counter() - start, 1),
-        "bars": bars,
-        **answers,
-    }
-    args.out.mkdir(parents=True, exist_ok=True)
-    if "peers" in answers:
-        draw(answers["peers"], args.out / "bench_optical_depth.png")
-    text = json.dumps(figures, indent=2, allow_nan=False) + "\n"
-    write_whole_text(args.out / "bench_optical_depth.json", text)
-    sys.stdout.write(text)
-
+BENCH = Bench("bench_optical_depth", __doc__, QUESTIONS, (FULL, QUICK), compare, draw)
 
 if __name__ == "__main__":
-    main()
+    BENCH.main()
