@@ -1,0 +1,257 @@
+#!/usr/bin/env python3
+"""How much of the light that a medium scatters is missing where it may scatter once only (max_depth 2)?
+
+    scripts/bench_depth.py              # 3 minutes on 2 cores
+    scripts/bench_depth.py --quick      # 20 seconds: fewer lines, three optical depths
+
+A unit cube stands in constant light or in a beam along -z, homogeneous, isotropic or forward-scattering (Henyey and
+Greenstein, g = 0.8). Mitsuba's ``volpath`` with ``hide_emitters`` follows lines that cross it, spread evenly over all
+places and directions, and returns the radiance that was scattered towards the eye: S2 with max_depth 2, S without a limit.
+Printed is what depth 2 leaves out, e = 1 - S2 / S, with its standard error; both see the same random numbers, so that what
+they share cancels. Optical depth is E[tau^2] / E[tau] over the same lines (mivol/scene/depth_two.py says why).
+
+Beside the table, to see where it holds: the smoke of the Mitsuba tutorial (MIVOL_DATA, default ../shared/data) in both
+lights, and the cube below a point light one edge above its top. Prints JSON; writes bench_depth.json and bench_depth.png;
+``--table`` also prints the table as mivol/scene/depth_two.py holds it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import json
+import os
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import mivol  # noqa: F401  (chooses LLVM)
+from mivol.files import read_volume, whole_file, write_whole_text
+from mivol.report.record import describe_machine, versions
+from mivol.scene.depth_two import ALBEDOS, TAUS, depth_two_error, draw_lines, scattering_depth
+from mivol.transport.medium import Box, view_medium
+
+import drjit as dr
+import mitsuba as mi
+import msgspec
+import numpy as np
+
+ROOT = Path(__file__).resolve().parents[1]
+SMOKE = Path(os.environ.get("MIVOL_DATA", ROOT.parent / "shared" / "data")) / "volumes_vol" / "tutorials_volume.vol"
+
+LIGHTS = {
+    "constant": {"type": "constant", "radiance": {"type": "uniform", "value": 1.0}},
+    "collimated": {"type": "directional", "direction": [0, 0, -1], "irradiance": {"type": "uniform", "value": 1.0}},
+    "point": {"type": "point", "position": [0.5, 0.5, 2.0], "intensity": {"type": "uniform", "value": 1.0}},
+}
+PHASES = {"isotropic": {"type": "isotropic"}, "forward": {"type": "hg", "g": 0.8}}
+TABLED = [(light, phase) for light in ("constant", "collimated") for phase in PHASES]
+BESIDE = {"smoke": ("constant", "collimated"), "cube": ("point",)}
+"""Media and lights that are measured beside the table, with isotropic scattering and two albedos."""
+BESIDE_ALBEDOS = (0.5, 0.9)
+
+UNIT = Box(np.eye(4))
+CUBE_DEPTH = 0.8966336
+"""E[l^2] / E[l] of lines through the unit cube, = 8 int prod(1 - u_i) / |u|^2 du / (2 pi) over [0, 1]^3, by quadrature."""
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One measurement: what depth 2 leaves out of the scattered light, and its standard error."""
+
+    medium: str
+    light: str
+    phase: str
+    albedo: float
+    tau: float
+    once: float
+    all: float
+    error: float
+    standard_error: float
+    seconds: float
+
+
+# -- Scenes ---------------------------------------------------------------------------------------------------------------
+
+
+def cube(light: str, phase: str = "isotropic", smoke: np.ndarray | None = None) -> mi.Scene:
+    """The unit cube in that light, with a homogeneous medium of extinction 1 or with the smoke."""
+    medium = {"type": "homogeneous", "sigma_t": 1.0, "albedo": 0.5}
+    if smoke is not None:
+        grid = mi.VolumeGrid(smoke.astype(np.float32))
+        medium |= {"type": "heterogeneous", "sigma_t": {"type": "gridvolume", "grid": grid, "raw": True}}
+    boundary = {
+        "type": "cube",
+        "to_world": mi.ScalarTransform4f().translate(0.5).scale(0.5),
+        "bsdf": {"type": "null"},
+        "interior": {**medium, "phase": PHASES[phase]},
+    }
+    return mi.load_dict({"type": "scene", "light": LIGHTS[light], "cube": boundary})
+
+
+def fill(scene: mi.Scene, albedo: float, scale: float) -> None:
+    """Give the medium an albedo, and its extinction a factor."""
+    params = mi.traverse(scene)
+    for key in params.properties:
+        if key.startswith("cube.interior_medium.albedo."):
+            params[key] = dr.opaque(mi.Float, albedo)
+    params["cube.interior_medium.scale"] = scale
+    params.update()
+
+
+# -- Measurements ----------------------------------------------------------------------------------------------------------
+
+
+def scattered(scene: mi.Scene, max_depth: int, n: int, seed: int) -> np.ndarray:
+    """Scattered radiance along n lines (n,). Roulette starts late: it adds more noise than it saves time."""
+    tracer = mi.load_dict({"type": "volpath", "max_depth": max_depth, "rr_depth": 64, "hide_emitters": True})
+    o, d, _ = draw_lines(UNIT, n, seed)
+    ray = mi.Ray3f(mi.Point3f(np.ascontiguousarray((o - d).T, np.float32)), mi.Vector3f(np.ascontiguousarray(d.T, np.float32)))
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(seed, n)
+    radiance, _, _ = tracer.sample(scene, sampler, mi.RayDifferential3f(ray), None, True)
+    return np.asarray(radiance.x, dtype=np.float64)
+
+
+def left_out(once: np.ndarray, every: np.ndarray) -> tuple[float, float]:
+    """1 - mean(once) / mean(every) of paired samples, and its standard error by the delta method."""
+    ratio = once.mean() / every.mean()
+    return float(1 - ratio), float((once - ratio * every).std() / every.mean() / np.sqrt(len(once)))
+
+
+def measure(scene: mi.Scene, place: tuple[str, str, str], albedo: float, tau: float, depth: float, n: int, seed: int) -> Cell:
+    """One cell; ``place`` is (medium, light, phase), ``depth`` the optical depth of the medium with the factor 1."""
+    start = time.perf_counter()
+    fill(scene, albedo, tau / depth)
+    once, every = (scattered(scene, limit, n, seed) for limit in (2, -1))
+    seconds = round(time.perf_counter() - start, 2)
+    return Cell(*place, albedo, tau, once.mean(), every.mean(), *left_out(once, every), seconds)
+
+
+def measure_table(taus: tuple[float, ...], n: int, seed: int) -> Iterator[Cell]:
+    """The cells of the table."""
+    for light, phase in TABLED:
+        scene = cube(light, phase)
+        for tau in taus:
+            yield from (measure(scene, ("cube", light, phase), a, tau, CUBE_DEPTH, n, seed) for a in ALBEDOS)
+
+
+def measure_beside(taus: tuple[float, ...], n: int, seed: int) -> Iterator[Cell]:
+    """Cells of other media and lights; the smoke only where its file is there."""
+    for medium, lights in BESIDE.items():
+        if medium == "smoke" and not SMOKE.is_file():
+            continue
+        smoke = read_volume(SMOKE).values if medium == "smoke" else None
+        for light in lights:
+            scene = cube(light, smoke=smoke)
+            depth = scattering_depth(view_medium(scene.shapes()[0].interior_medium(), UNIT), UNIT)
+            for tau in taus:
+                yield from (measure(scene, (medium, light, "isotropic"), a, tau, depth, n, seed) for a in BESIDE_ALBEDOS)
+
+
+# -- What is shown ---------------------------------------------------------------------------------------------------------
+
+
+def draw(cells: list[Cell], path: Path) -> None:
+    """Lines of the cube by albedo, marks of what was measured beside it; a panel for each light and phase function."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    fig, panels = plt.subplots(2, 2, figsize=(10, 8), sharex=True, sharey=True, layout="constrained")
+    colours = dict(zip(ALBEDOS, plt.get_cmap("viridis")(np.linspace(0, 0.92, len(ALBEDOS))), strict=True))
+    marks = {("smoke", "constant"): "^", ("smoke", "collimated"): "^", ("cube", "point"): "s"}
+    for axes, (light, phase) in zip(panels.ravel(), TABLED, strict=True):
+        for albedo, colour in colours.items():
+            line = [c for c in cells if (c.medium, c.light, c.phase, c.albedo) == ("cube", light, phase, albedo)]
+            columns = [[getattr(c, name) for c in line] for name in ("tau", "error", "standard_error")]
+            axes.errorbar(*columns[:2], yerr=columns[2], fmt="o-", color=colour, ms=3.5, lw=1.2, label=f"albedo {albedo:g}")
+        for c in cells:
+            if (c.medium, c.light) in marks and (light, phase) == tabled(c):
+                axes.plot(c.tau, c.error, marks[c.medium, c.light], color=colours[c.albedo], mfc="none", ms=8)
+        axes.set(title=f"{light} light, {phase}", xscale="log", ylim=(0, 1))
+        axes.grid(alpha=0.3)
+    axes = panels[0, 0]
+    axes.plot([], [], "^", color="gray", mfc="none", ms=8, label="smoke")
+    axes.plot([], [], "s", color="gray", mfc="none", ms=8, label="cube, point light")
+    axes.legend(fontsize=8)
+    for axes in panels[1]:
+        axes.set_xlabel("optical depth as scattered light sees it")
+    for axes in panels[:, 0]:
+        axes.set_ylabel("scattered light that max_depth 2 leaves out")
+    with whole_file(path) as temporary:
+        fig.savefig(temporary, dpi=110, format="png")
+    plt.close(fig)
+
+
+def tabled(cell: Cell) -> tuple[str, str]:
+    """The table that a cell is compared with: lamps count as collimated."""
+    return "constant" if cell.light == "constant" else "collimated", cell.phase
+
+
+def table_lines(cells: list[Cell]) -> str:
+    """The tables of mivol/scene/depth_two.py."""
+    lines = []
+    for light, phase in TABLED:
+        found = {(c.albedo, c.tau): c.error for c in cells if (c.medium, c.light, c.phase) == ("cube", light, phase)}
+        rows = [", ".join(f"{found[albedo, tau]:.3f}" for tau in TAUS) for albedo in ALBEDOS]
+        lines += [f'    ("{light}", "{phase}"): np.array(', "        [", *(f"            [{row}]," for row in rows)]
+        lines += ["        ]", "    ),"]
+    return "\n".join(lines)
+
+
+def summary(cells: list[Cell]) -> dict[str, object]:
+    """How well the table holds beside what it was made of: measured minus table, the least and the most."""
+    found: dict[str, object] = {"largest_standard_error": round(max(c.standard_error for c in cells), 4)}
+    for medium, lights in BESIDE.items():
+        for light in lights:
+            here = [c for c in cells if (c.medium, c.light) == (medium, light)]
+            gaps = [c.error - depth_two_error(c.albedo, c.tau, *tabled(c)) for c in here]
+            found[f"{medium}, {light} light, minus table"] = [round(end(gaps), 4) for end in (min, max)] if gaps else "no file"
+    return found
+
+
+def say(cell: Cell) -> None:
+    """To standard error: standard output is for the JSON."""
+    place = f"{cell.medium}, {cell.light} light, {cell.phase}, albedo {cell.albedo:g}, tau {cell.tau:g}"
+    print(f"{place}: {cell.error:.4f} +- {cell.standard_error:.4f} in {cell.seconds} s", file=sys.stderr, flush=True)
+
+
+def main() -> None:
+    """Read the command line, measure, print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, default=Path("runs/bench_depth"))
+    parser.add_argument("--lines", type=int, default=1 << 18, help="lines through the medium, each cell (default 262144)")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--quick", action="store_true", help="16384 lines, optical depths 0.1, 1 and 10")
+    parser.add_argument("--table", action="store_true", help="print the module's table, too")
+    parser.add_argument("--variant", default="llvm_ad_rgb")
+    args = parser.parse_args()
+    mi.set_variant(args.variant)
+    taus, n = ((0.1, 1.0, 10.0), 1 << 14) if args.quick else (TAUS, args.lines)
+    start, cells = time.perf_counter(), []
+    for cell in itertools.chain(measure_table(taus, n, args.seed), measure_beside(taus, n // 8, args.seed)):
+        cells.append(cell)
+        say(cell)
+    if args.table:
+        print(table_lines(cells), file=sys.stderr)
+    result = {
+        "question": "1 - S2 / S, the share of the scattered light that max_depth 2 leaves out",
+        "lines": n,
+        "seconds": round(time.perf_counter() - start, 1),
+        "summary": summary(cells),
+        "machine": msgspec.to_builtins(describe_machine()),
+        "versions": versions(),
+        "cells": [asdict(cell) for cell in cells],
+    }
+    args.out.mkdir(parents=True, exist_ok=True)
+    draw(cells, args.out / "bench_depth.png")
+    write_whole_text(args.out / "bench_depth.json", json.dumps(result, indent=1) + "\n")
+    print(json.dumps(result, indent=1))
+
+
+if __name__ == "__main__":
+    main()
