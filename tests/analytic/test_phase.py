@@ -463,8 +463,8 @@ def test_the_twin_is_miepython():
     for index, x in ((1.333 + 0j, 0.1), (1.5 - 0.01j, 10.0), (1.333 + 0j, 114.0)):
         ours, theirs = oracle.Mie.coefficients(index, x), np.atleast_2d(real.coefficients(index, x))
         n = min(ours.shape[1], theirs.shape[1])
-        # Upward recurrence in one, downward in the other: 1e-16 grows with the order to about 1e-9 of the largest.
-        assert np.max(np.abs(ours[:, :n] - theirs[:, :n])) <= 1e-8
+        # Waves turn the other way round in miepython. One of them recurs upwards, which grows 1e-16 to 1e-10 (measured).
+        assert np.max(np.abs(ours[:, :n] - theirs[:, :n].conj())) <= 1e-8
 
 
 def test_without_miepython_there_is_a_sentence(monkeypatch):
