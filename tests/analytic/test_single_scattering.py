@@ -1,0 +1,278 @@
+"""Light that turns once, by the integrator `mivol`, against closed forms and the float64 twin.
+
+Each ray is a pencil without a footprint; its radiance is the mean of 32 independent renders and held against the exact
+one by Student's t, false alarms 1e-6 a test. Where nothing is sampled (no noise at all) what is left is float32 rounding,
+which `rounding` names: 2e-5 of the largest radiance, a few EPS for each of about 50 operations on cells and lamps.
+"""
+
+from __future__ import annotations
+
+import math
+
+import mitsuba as mi
+import numpy as np
+import oracle_scattering as twins
+import pytest
+import scattering_scenes as small
+from scattering_scenes import PLACE, aimed, assert_twin, fog, mivol, moments, pencils, point, rough_grid, smoke, spot, sun
+
+import scenes
+from mivol.validate.statistics import assert_same_mean
+from scenes import affine, as_float32, ball_of, box_of, centred, grid_volume, medium
+
+pytestmark = pytest.mark.usefixtures("variant_rgb")
+
+SPP = 512
+
+
+def check(parts, media, lamps, o, d, spp=SPP, integrator=None, level=2e-5, **more):
+    """Rounding is `level` times the largest radiance."""
+    seen = pencils(parts | {f"lamp{i}": lamp for i, (lamp, _) in enumerate(lamps)}, o, d)
+    known = [twin for _, twin in lamps]
+    background = more.get("background", 0.0)
+    top = twins.radiance(media, known, seen.o, seen.d, background=background).max()
+    assert_twin(seen, media, known, integrator or mivol(), spp, rounding=level * top, **more)
+
+
+# -- Grids and boxes against the twin --------------------------------------------------------------------------------
+
+LAMPS = {
+    "point outside": lambda: [point([1.5, 1, 2.0])],
+    "point inside": lambda: [point([0.3, -0.2, 0.35])],
+    "spot outside": lambda: [spot([1.0, -2, 2.5], [0, 0, 0])],
+    "spot inside": lambda: [spot([0.1, 0.2, -0.6], [0.3, 0, 0.5], cutoff=50, beam=10)],
+    "sun": lambda: [sun([0.3, 0.2, -1.0])],
+    "three": lambda: [point([1.5, 1, 2.0]), spot([1.0, -2, 2.5], [0, 0, 0]), sun([0.3, 0.2, -1.0], 0.3)],
+}
+PHASES = {"isotropic": ("isotropic", 0.0), "hg": ("hg", 0.6), "backward": ("hg", -0.4), "rayleigh": ("rayleigh", 0.0)}
+
+
+@pytest.mark.parametrize("kind", small.KINDS)
+@pytest.mark.parametrize("lamps", LAMPS)
+def test_grid_and_lamps(lamps, kind):
+    box, m = smoke(rough_grid(1), kind=kind, name="hg", g=0.4)
+    check({"smoke": box}, [m], LAMPS[lamps](), *aimed(1))
+
+
+@pytest.mark.parametrize("name", PHASES)
+def test_phase_functions(name):
+    box, m = smoke(rough_grid(2), 0.9, "own", PLACE, *PHASES[name])
+    check({"smoke": box}, [m], LAMPS["three"](), *aimed(2))
+
+
+@pytest.mark.parametrize("lamps", ["point outside", "point inside", "sun"])
+def test_homogeneous_box(lamps):
+    box, m = fog(1.1, 0.8, name="hg", g=-0.3)
+    check({"fog": box}, [m], LAMPS[lamps](), *aimed(3))
+
+
+@pytest.mark.parametrize("name", ["stretched", "rotated", "sheared"])
+def test_frames(name):
+    frame = as_float32(scenes.FRAMES[name])
+    middle = frame[:3] @ [0.5, 0.5, 0.5, 1]
+    size = float(np.linalg.norm(frame[:3, :3] @ np.ones(3))) / 4
+    values = rough_grid(4, 1 / size)
+    box, m = smoke(values, 0.9, "own", frame)
+    o, d = aimed(4, size=0.8)
+    check({"smoke": box}, [m], [point(middle + size * np.array([1.0, 3, 2]))], as_float32(middle + size * o), d)
+
+
+@pytest.mark.parametrize("kind", small.KINDS)
+def test_albedo_grid(kind):
+    """An albedo on another grid than the extinction."""
+    values, albedo = rough_grid(5), rough_grid(6, 1.0, (2, 3, 4))
+    medium_type, volume_type = small.KINDS[kind]
+    interior = medium(medium_type, grid_volume(volume_type, values, PLACE), grid_volume(volume_type, albedo, PLACE))
+    m = twins.Medium(twins.Grid(values, PLACE), twins.trilinear_albedo(albedo, PLACE))
+    check({"smoke": box_of(interior, PLACE)}, [m], LAMPS["point outside"](), *aimed(5))
+
+
+def test_rgb_albedo_and_rgb_extinction():
+    """Three channels, each with an extinction and an albedo of its own."""
+    values = rough_grid(7, 1.0) * np.array([0.2, 1.0, 4.0])
+    albedo = as_float32([0.9, 0.3, 0.6])
+    grid = grid_volume("mivol_voxels", as_float32(values), PLACE)
+    interior = medium("mivol_medium", grid, {"type": "rgb", "value": list(albedo)})
+    m = twins.Medium(twins.Grid(as_float32(values), PLACE), albedo)
+    check({"smoke": box_of(interior, PLACE)}, [m], LAMPS["point outside"](), *aimed(7))
+
+
+def test_rgb_homogeneous():
+    """A homogeneous rgb box: each channel is its own exponential."""
+    sigma = as_float32([0.1, 0.5, 0.9])
+    interior = medium("homogeneous", {"type": "rgb", "value": list(sigma)}, 0.8)
+    m = twins.Medium(twins.Box(sigma, PLACE), 0.8)
+    check({"fog": box_of(interior, PLACE)}, [m], LAMPS["sun"](), *aimed(8))
+
+
+def test_absorption_and_scattering_grids():
+    """sigma_a and sigma_s on grids of different resolution: a medium of albedo 0 and one of albedo 1 in one place."""
+    absorb, scatter = rough_grid(9, 1.0, (2, 3, 4)), rough_grid(10, 1.5)
+    interior = {
+        "type": "mivol_medium",
+        "sigma_a": grid_volume("mivol_voxels", absorb, PLACE),
+        "sigma_s": grid_volume("mivol_voxels", scatter, PLACE),
+        "phase": {"type": "rayleigh"},
+    }
+    media = [twins.Medium(twins.Grid(absorb, PLACE), 0.0), twins.Medium(twins.Grid(scatter, PLACE), 1.0, twins.rayleigh)]
+    check({"smoke": box_of(interior, PLACE)}, media, LAMPS["point outside"](), *aimed(9))
+
+
+def test_two_media_shade_each_other():
+    lower, upper = (as_float32(centred(np.diag([2.0, 2, 1]), (0, 0, z))) for z in (-0.5, 0.5))
+    parts, media = {}, []
+    for i, frame in enumerate((lower, upper)):
+        parts[f"smoke{i}"], m = smoke(rough_grid(11 + i), 0.5 + 0.4 * i, ("stock", "own")[i], frame, *PHASES["hg"])
+        media.append(m)
+    parts["ball"] = ball_of(medium("homogeneous", 0.8, 0.9), (0, 0, 2.0), 0.7)
+    media.append(twins.Medium(twins.Ball(0.8, [0, 0, 2.0], 0.7), 0.9))
+    check(parts, media, [point([0.3, 0.2, 3.5])], *aimed(11, 10, 1.0, 6.0))
+
+
+def test_background_shines_through():
+    """A grid in a constant sky: what is turned and what is left of the background."""
+    box, m = smoke(rough_grid(12), 0.9, name="hg", g=0.7)
+    # 24 x 48 directions see kinks of the shadow depth: 1e-3 of the turned light, measured by refining them.
+    check({"smoke": box}, [m], [({"type": "constant", "radiance": 0.6}, twins.Sky(0.6, 20))], *aimed(12, 3), background=0.6,
+          quadrature=3e-4, order=3)  # fmt: skip
+
+
+# -- Closed forms ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("sigma_s", "sigma_t", "intensity", "t0", "h", "D", "answer"),
+    [
+        (0.5, 0.7, 2.0, 1.3, 0.4, 5.0, 0.14379379536),
+        (1.0, 1.0, 1.0, 0.0, 1.0, 3.0, 0.01537602046),
+        (0.2, 3.0, 1.0, 2.0, 0.1, 4.0, 7.880153424e-4),
+    ],
+)
+def test_point_light_in_fog(sigma_s, sigma_t, intensity, t0, h, D, answer):
+    """A box of length D along the ray, wide across it: light from beside the ray stays inside on its way."""
+    frame = affine(np.diag([D, 400.0, 400.0]), (0, -200, -200))
+    fog = box_of(medium("homogeneous", sigma_t, sigma_s / sigma_t), frame)
+    lamp = point([t0, h, 0.0] if t0 > 0 else [1e-6, h, 0], intensity)[0]
+    seen = pencils({"fog": fog, "lamp": lamp}, [-1, 0, 0], [1, 0, 0])
+    m = seen.moments(mivol(), 8192)
+    # sigma_s/sigma_t and the lamp's place are float32 numbers; a few EPS each.
+    assert_same_mean(m.mean, m.variance_of_mean, np.full((1, 3), answer), n_a=32, rounding=1e-5 * answer, what="fog")
+    assert np.all(np.sqrt(m.variance_of_mean) < 0.01 * answer)
+
+
+@pytest.mark.parametrize("name", ["isotropic", "rayleigh"])
+def test_thin_limit(name):
+    """tau of 1e-4: the closed form without extinction, to that."""
+    frame = affine(np.diag([4.0, 400.0, 400.0]), (0, -200, -200))
+    fog = box_of(medium("homogeneous", 1e-5, 0.5, phase={"type": name}), frame)
+    seen = pencils({"fog": fog, "lamp": point([1.2, 0.3, 0.0], 2.0)[0]}, [-1, 0, 0], [1, 0, 0])
+    m = seen.moments(mivol(), 4096)
+    answer = twins.point_thin(0.5e-5, 2.0, 1.2, 0.3, 4.0, name)
+    assert_same_mean(m.mean, m.variance_of_mean, np.full((1, 3), answer), n_a=32, rounding=1e-4 * answer, what=name)
+    assert np.all(np.sqrt(m.variance_of_mean) < 0.01 * answer)
+
+
+@pytest.mark.parametrize(("mu", "mu0"), [(0.6, 0.9), (0.9, 0.6), (0.7, 0.7), (1.0, 1.0)])
+@pytest.mark.parametrize("kind", ["homogeneous", "grid"])
+def test_collimated_slab(mu, mu0, kind):
+    """Reflected and transmitted light of a slab 400 wide and 1 high, its edges 200 away; mu = mu0 is no special case."""
+    sigma, albedo, g, E0 = 1.7, 0.8, 0.4, 2.0
+    frame = as_float32(affine(np.diag([400.0, 400, 1]), (-200, -200, 0)))
+    build = fog(sigma, albedo, frame, "hg", g) if kind == "homogeneous" else smoke(
+        np.full((3, 2, 2, 1), sigma), albedo, "own", frame, "hg", g
+    )  # fmt: skip
+    travel = np.array([math.sqrt(1 - mu0 * mu0), 0, -mu0])
+    view = np.array([0, math.sqrt(1 - mu * mu), mu])
+    eyes = np.array([view, view * [1, 1, -1]])
+    # A camera that looks straight into the sun's direction is no problem: a directional lamp cannot be seen.
+    seen = pencils({"slab": build[0], "sun": sun(travel, E0)[0]}, np.array([0, 0, 0.5]) + 5 * eyes, -eyes)
+    p = twins.hg(g)
+    answer = [
+        formula(albedo, p(-seen.d[i] @ travel), E0, abs(seen.d[i, 2]), mu0, sigma)
+        for i, formula in enumerate((twins.slab_reflected, twins.slab_transmitted))
+    ]
+    m = seen.moments(mivol(), 2048)
+    truth = np.repeat(np.array(answer)[:, None], 3, axis=1)
+    assert_same_mean(m.mean, m.variance_of_mean, truth, n_a=32, rounding=1e-5 * max(answer), what="slab")
+    assert np.all(np.sqrt(m.variance_of_mean) < 0.01 * truth)
+
+
+@pytest.mark.parametrize("kind", ["homogeneous", "grid"])
+def test_cube_lit_from_above_seen_from_the_side(kind):
+    """alpha p E0 e^{-sigma y} (1 - e^{-sigma D}) at each depth y."""
+    sigma, depths = 2.2, np.array([0.1, 0.45, 0.9])
+    build = fog(sigma, 0.6, np.eye(4)) if kind == "homogeneous" else smoke(np.full((4, 3, 2, 1), sigma), 0.6, "own", np.eye(4))
+    o = np.stack([np.full(3, -2.0), np.full(3, 0.3), 1 - depths], axis=1)
+    seen = pencils({"cube": build[0], "sun": sun([0, 0, -1.0], 3.0)[0]}, o, [1.0, 0, 0])
+    m = seen.moments(mivol(), 2048)
+    truth = [[twins.cube_from_the_side(0.6, 1 / (4 * math.pi), 3.0, sigma, 1 - z, 1.0)] * 3 for z in seen.o[:, 2]]
+    assert_same_mean(m.mean, m.variance_of_mean, np.array(truth), n_a=32, rounding=1e-5 * truth[0][0], what="cube")
+
+
+@pytest.mark.parametrize("sigma", [0.2, 1.3, 8.0])
+def test_ball_in_a_constant_sky(sigma):
+    """By symmetry two nested integrals; the boundary is traced, a few EPS of its coordinates."""
+    parts = {"ball": ball_of(medium("homogeneous", sigma, 0.9), (0, 0, 0), 1.0), "sky": scenes.sky(1.0)}
+    impact = np.array([0.0, 0.4, 0.95])
+    seen = pencils(parts, np.stack([np.full(3, -3.0), impact, np.zeros(3)], axis=1), [1.0, 0, 0])
+    m = seen.moments(mivol(), 2048)
+    truth = np.repeat([[twins.ball_in_sky(0.9, sigma, 1.0, b)] for b in seen.o[:, 1]], 3, axis=1)
+    # Shadow rays leave Mitsuba's sphere at float32 distances; sigma times 1e-5 of a length.
+    assert_same_mean(m.mean, m.variance_of_mean, truth, n_a=32, rounding=1e-5 * max(sigma, 1), what="ball")
+
+
+def test_reciprocity():
+    """The light of a lamp at a that passes b, from all sides, is that of a lamp at b that passes a (fluence).
+
+    Both cameras see the whole box; a pixel weighs what it sees of the sphere, to second order in its size (1e-4).
+    """
+    a, b = np.array([-3.0, 0.3, 0.5]), np.array([1.5, 2.5, 1.0])
+    box, _ = smoke(rough_grid(13), 0.9, "own", name="hg", g=0.5)
+    fluences, errors = [], []
+    for eye, lamp in ((a, b), (b, a)):
+        fov, res = 75.0, 32
+        sensor = scenes.camera(eye, (0, 0, 0), res=res, fov=fov)
+        scene = mi.load_dict({"type": "scene", "smoke": box, "lamp": point(lamp)[0], "sensor": sensor})
+        half = math.tan(math.radians(fov / 2))
+        x = (np.arange(res) + 0.5) / res * 2 * half - half
+        solid = (2 * half / res) ** 2 / (1 + x[:, None] ** 2 + x[None] ** 2) ** 1.5
+        m = moments(scene, mivol(), 32)
+        assert not m.mean[0].any() and not m.mean[-1].any() and not m.mean[:, 0].any(), "the box is not all seen"
+        fluences.append(np.sum(m.mean[..., 0] * solid))
+        errors.append(np.sum(m.variance_of_mean[..., 0] * solid**2))
+    one, two = zip(np.array(fluences)[:, None], np.array(errors)[:, None], strict=True)
+    assert_same_mean(*one, *two, n_a=32, n_b=32, rounding=2e-4 * fluences[0], what="fluences")
+    assert math.sqrt(sum(errors)) < 5e-3 * fluences[0]
+
+
+# -- Laws of scale ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("scale", [1e-3, 1e3])
+def test_the_size_of_the_world(scale):
+    """k times larger, thinner by k, under a directional lamp: the same radiance."""
+    frame = as_float32(centred(2 * scale * np.eye(3)))
+    box, m = smoke(rough_grid(14) / scale, 0.8, "own", frame)
+    o, d = aimed(14)
+    check({"smoke": box}, [m], [sun([0.3, 0.2, -1.0])], as_float32(o * scale), d)
+
+
+def test_radiance_is_linear_in_the_lamps():
+    """Twice the lamp is twice the picture, to the last bit, with the same samples."""
+    box, _ = smoke(rough_grid(15), 0.8)
+    o, d = aimed(15)
+    images = [
+        scenes.render(pencils({"smoke": box, "lamp": point([1.5, 1, 2.0], power)[0]}, o, d).scene, mivol(), 16, seed=3)
+        for power in (1.0, 2.0)
+    ]
+    assert np.array_equal(2 * images[0], images[1])
+    assert images[0].max() > 0
+
+
+def test_where_nothing_is_sampled_twice_is_the_same():
+    """The seed decides all: two renders of one seed are equal to the last bit."""
+    box, _ = smoke(rough_grid(16), 0.8)
+    seen = pencils({"smoke": box, "lamp": point([1.5, 1, 2.0])[0]}, *aimed(16))
+    first, second, other = (scenes.render(seen.scene, mivol(), 16, seed=s) for s in (3, 3, 4))
+    assert np.array_equal(first, second)
+    assert not np.array_equal(first, other)

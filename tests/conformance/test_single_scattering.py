@@ -1,0 +1,377 @@
+"""Light that turns once, seen by cameras: every lamp, phase function and boundary against stock `volpath` at depth 2.
+
+Each comparison is Student's t over tiles of pixels and over the whole image, 32 independent renders of each integrator,
+false alarms 1e-6. Volpath is a judge where it is right (tests/analytic judges where it is not); where the extinction
+differs between channels it renders one channel at a time. Its shadow rays leave each boundary 1e-4 of a length further on
+than they should: `rounding` of 1e-4 of the radiance covers that.
+"""
+
+from __future__ import annotations
+
+import mitsuba as mi
+import numpy as np
+import pytest
+import scattering_scenes as small
+from scattering_scenes import (
+    PLACE,
+    assert_same_images,
+    close_up,
+    fog,
+    mivol,
+    moments,
+    point,
+    rough_grid,
+    smoke,
+    spot,
+    sun,
+    volpath,
+)
+
+import scenes
+from mivol.validate.statistics import Moments
+from scenes import affine, as_float32, ball_of, box_of, centred, grid_volume, medium, refused, rotation, transform
+
+pytestmark = pytest.mark.usefixtures("variant_rgb")
+
+LEAK = 1e-4
+RED = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.8, 0.3, 0.2]}}
+
+
+def turn() -> mi.ScalarTransform4f:
+    return mi.ScalarTransform4f()
+
+
+def same(parts: dict, level: float | None = None, **more: object) -> tuple[Moments, Moments]:
+    """Both integrators show the same; what volpath leaks is counted as a share of the brightest pixel."""
+    scene = close_up(parts)
+    level = float(moments(scene, volpath(), 16, 2).mean.max()) if level is None else level
+    return assert_same_images(scene, rounding=LEAK * level, **more)
+
+
+# -- Lamps -----------------------------------------------------------------------------------------------------------
+
+
+def panorama() -> mi.Bitmap:
+    """A sky of 8 x 16 with a bright spot of 60 in it, one texel of another colour."""
+    sky = np.random.default_rng(3).uniform(0.1, 0.6, (8, 16, 3)).astype(np.float32)
+    sky[2, 5] = (60.0, 50.0, 30.0)
+    return mi.Bitmap(sky)
+
+
+def square(x: float, y: float, z: float, size: float = 0.5, towards: tuple = (0, 0, 0)) -> dict:
+    """A square at a place, facing another."""
+    place = turn().look_at([x, y, z], list(towards), [0.1, 0.9, 0.2])
+    return {"type": "rectangle", "to_world": place.scale([size, size, 1])}
+
+
+def area(x: float, y: float, z: float, radiance: object = 8.0, size: float = 0.5) -> dict:
+    """A luminous square facing the middle."""
+    light = {"type": "rgb", "value": radiance} if isinstance(radiance, list) else radiance
+    return square(x, y, z, size) | {"emitter": {"type": "area", "radiance": light}}
+
+
+def projector() -> dict:
+    picture = np.random.default_rng(4).uniform(0, 2, (4, 6, 3)).astype(np.float32)
+    return {
+        "type": "projector",
+        "irradiance": {"type": "bitmap", "bitmap": mi.Bitmap(picture), "filter_type": "nearest", "raw": True},
+        "to_world": turn().look_at([2.0, -1, 2.5], [0, 0, 0], [0, 0, 1]),
+        "fov": 40,
+        "scale": 5.0,
+    }
+
+
+def textured() -> dict:
+    picture = np.random.default_rng(5).uniform(0, 9, (3, 5, 3)).astype(np.float32)
+    radiance = {"type": "bitmap", "bitmap": mi.Bitmap(picture), "raw": True}
+    return square(0, -0.4, 2.2, 1.0) | {"emitter": {"type": "area", "radiance": radiance}}
+
+
+LAMPS = {
+    "constant": lambda: {"lamp": scenes.sky(0.8)},
+    "envmap": lambda: {"lamp": {"type": "envmap", "bitmap": panorama(), "to_world": turn().rotate([1, 0, 0], 70)}},
+    "sunsky": lambda: {"lamp": {"type": "sunsky", "turbidity": 4.0, "sun_direction": [0.4, 0.3, 0.8], "sun_aperture": 3.0}},
+    "directional": lambda: {"lamp": sun([0.3, 0.5, -1.0])[0]},
+    "point": lambda: {"lamp": point([1.5, -1.2, 1.6])[0]},
+    "spot": lambda: {"lamp": spot([1.0, -2, 2.2], [0, 0, 0])[0]},
+    "projector": lambda: {"lamp": projector()},
+    "area outside": lambda: {"lamp": area(1.5, 0.5, 1.8, [9.0, 6.0, 2.0])},
+    "textured area": lambda: {"lamp": textured()},
+    "area inside": lambda: {"lamp": {"type": "sphere", "radius": 0.25, "center": [0.3, 0.2, 0.1]}
+                            | {"emitter": {"type": "area", "radiance": 4.0}}},
+    "several": lambda: {"a": scenes.sky(0.1), "b": point([1.5, -1.2, 1.6])[0], "c": sun([0, 1, -0.5], 0.5)[0],
+                        "d": area(-1.6, 0.5, 1.5)},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", LAMPS)
+def test_lamps(name):
+    box, _ = smoke(rough_grid(1), name="hg", g=0.4)
+    image, _ = same({"smoke": box, **LAMPS[name]()}, spp=(32, 128))
+    assert image.mean.min() >= 0
+
+
+def test_no_lamp_at_all():
+    """Nothing shines, nothing is seen: exactly."""
+    box, _ = smoke(rough_grid(1))
+    assert not moments(close_up({"smoke": box}), mivol(), 4, 2).mean.any()
+
+
+# -- Phase functions -------------------------------------------------------------------------------------------------
+
+
+def flakes() -> dict:
+    """A grid of microflakes: a random symmetric matrix in each voxel (xx, yy, zz, xy, xz, yz)."""
+    m = np.random.default_rng(6).normal(size=(2, 2, 2, 3, 3))
+    m = np.einsum("...ij,...kj->...ik", m, m) / 6 + 0.1 * np.eye(3)
+    S = np.stack([m[..., 0, 0], m[..., 1, 1], m[..., 2, 2], m[..., 0, 1], m[..., 0, 2], m[..., 1, 2]], axis=-1)
+    return {"type": "sggx", "S": {"type": "gridvolume", "grid": mi.VolumeGrid(S.astype(np.float32)), "raw": True,
+                                  "to_world": transform(PLACE)}}  # fmt: skip
+
+
+PHASES = {
+    "isotropic": lambda: {"type": "isotropic"},
+    "hg forward": lambda: {"type": "hg", "g": 0.85},
+    "hg backward": lambda: {"type": "hg", "g": -0.6},
+    "rayleigh": lambda: {"type": "rayleigh"},
+    "tabphase": lambda: {"type": "tabphase", "values": "0.2, 0.1, 0.5, 0.3, 1.5"},
+    "blendphase": lambda: {"type": "blendphase", "weight": 0.3, "a": {"type": "hg", "g": 0.7}, "b": {"type": "rayleigh"}},
+    "blendphase by a grid": lambda: {
+        "type": "blendphase",
+        "weight": grid_volume("gridvolume", np.random.default_rng(7).uniform(0, 1, (2, 3, 2, 1)), PLACE),
+        "a": {"type": "hg", "g": 0.7},
+        "b": {"type": "hg", "g": -0.3},
+    },
+    "sggx": flakes,
+}
+
+
+@pytest.mark.parametrize("kind", small.KINDS)
+@pytest.mark.parametrize("name", PHASES)
+def test_phase_functions(name, kind):
+    """Under a sky with a bright spot (directions are sampled both ways) and a point light (one direction only)."""
+    if name == "sggx" and kind == "own":
+        pytest.skip("a stock heterogeneous is needed: mivol_medium has no projected areas")
+    medium_type, volume_type = small.KINDS[kind]
+    interior = medium(medium_type, grid_volume(volume_type, rough_grid(2), PLACE), 0.7, phase=PHASES[name]())
+    lamps = LAMPS["envmap"]() | {"bulb": point([1.5, -1.2, 1.6], 1.5)[0]}
+    same({"smoke": box_of(interior, PLACE), **lamps})
+
+
+# -- Boundaries, media, places of the camera -------------------------------------------------------------------------
+
+
+def lit(parts: dict) -> dict:
+    return {**parts, "bulb": point([1.6, -1.3, 1.7])[0], "sky": scenes.sky(0.3)}
+
+
+def grid_in(boundary: dict, kind: str = "stock", to_world: np.ndarray = PLACE, seed: int = 3, **more: object) -> dict:
+    """A boundary around a grid."""
+    medium_type, volume_type = small.KINDS[kind]
+    phase = {"type": "hg", "g": 0.3}
+    albedo = more.pop("albedo", 0.8)
+    interior = medium(medium_type, grid_volume(volume_type, rough_grid(seed), to_world), albedo, phase=phase, **more)
+    return boundary | {"interior": interior}
+
+
+TURNED = as_float32(centred(1.4 * rotation([1, 2, 3], 0.7)))
+BARE = {"bsdf": {"type": "null"}}
+BALL = {"type": "sphere", "radius": 0.9, **BARE}
+
+
+def cube(to_world: np.ndarray) -> dict:
+    return {"type": "cube", "to_world": transform(np.asarray(to_world) @ affine(0.5 * np.eye(3), np.full(3, 0.5))), **BARE}
+
+
+def two_media() -> dict:
+    upper, lower = (centred(np.diag([1.8, 1.8, 0.8]), (0, 0, z)) for z in (0.45, -0.45))
+    box = {"type": "homogeneous", "sigma_t": 0.6, "albedo": 0.9, "phase": {"type": "rayleigh"}}
+    return {"upper": grid_in(cube(upper), to_world=upper), "lower": box_of(box, lower)}
+
+
+def crossing_media() -> dict:
+    """Two balls side by side, one of each kind, that the rays and their shadows cross."""
+    ink = {"type": "homogeneous", "sigma_t": 1.5, "albedo": {"type": "rgb", "value": [0.1, 0.5, 0.9]}}
+    right = centred(1.2 * np.eye(3), (0.6, 0, 0))
+    return {
+        "ink": ball_of(ink, (-0.6, 0, 0), 0.5),
+        "smoke": grid_in({"type": "sphere", "center": [0.6, 0, 0], "radius": 0.6, **BARE}, to_world=right),
+    }
+
+
+def surfaces() -> dict:
+    """A ball in the volume, a floor under it and a screen above: they are lit through it, and they shade it."""
+    return {
+        "smoke": grid_in(cube(PLACE)),
+        "ball": {"type": "sphere", "radius": 0.4, "center": [0.2, -0.1, -0.3], "bsdf": RED},
+        "floor": {"type": "rectangle", "to_world": turn().translate([0, 0, -1.1]).scale(2.5), "bsdf": {"type": "diffuse"}},
+        "screen": square(0.9, -0.6, 1.2, 0.3, (1.6, -1.3, 1.7)) | {"bsdf": {"type": "twosided", "nested": RED}},
+    }
+
+
+def mirrors() -> dict:
+    """At depth 2 a mirror shows lamps and the sky through the volume, not the light that the volume turns."""
+    mirror = {"type": "rectangle", "to_world": turn().translate([0, 0, -0.7]).scale(0.8), "bsdf": {"type": "conductor"}}
+    return {"smoke": grid_in(cube(PLACE)), "mirror": mirror, "lamp": area(-0.5, 2.0, 2.0)}
+
+
+def veil() -> dict:
+    """A mask lets 40 % of the shadow rays through, and of what the camera sees."""
+    bsdf = {"type": "mask", "opacity": 0.6, "nested": {"type": "twosided", "nested": RED}}
+    return {"smoke": grid_in(cube(PLACE)), "veil": square(0.4, -0.3, 0.4, 0.5, (1.6, -1.3, 1.7)) | {"bsdf": bsdf}}
+
+
+PLACES = {
+    "homogeneous box": lambda: {"fog": fog(0.9, name="hg", g=0.3)[0]},
+    "homogeneous ball": lambda: {"fog": ball_of(medium("homogeneous", 1.3, 0.8, phase={"type": "rayleigh"}), (0, 0, 0), 0.9)},
+    "rgb albedo": lambda: {"smoke": grid_in(cube(PLACE), albedo={"type": "rgb", "value": [0.0, 0.5, 1.0]})},
+    "rgb albedo, own": lambda: {"smoke": grid_in(cube(PLACE), "own", albedo={"type": "rgb", "value": [0.0, 0.5, 1.0]})},
+    "albedo grid": lambda: {
+        "smoke": grid_in(cube(PLACE), albedo=grid_volume("gridvolume", rough_grid(9, 1.0, (3, 2, 7)), PLACE))
+    },
+    "albedo grid, own": lambda: {
+        "smoke": grid_in(cube(PLACE), "own", albedo=grid_volume("mivol_voxels", rough_grid(9, 1.0, (3, 2, 7)), PLACE))
+    },
+    "albedo grid in a homogeneous": lambda: {
+        "fog": box_of(medium("homogeneous", 0.8, grid_volume("gridvolume", rough_grid(9, 1.0, (3, 2, 7)), PLACE)), PLACE)
+    },
+    "constvolume": lambda: {"fog": box_of(medium("heterogeneous", {"type": "constvolume", "value": 1.0}, 0.8), np.eye(4))},
+    "scaled": lambda: {"smoke": grid_in(cube(PLACE), scale=2.5)},
+    "scaled, own": lambda: {"smoke": grid_in(cube(PLACE), "own", scale=2.5)},
+    "turned": lambda: {"smoke": grid_in(cube(TURNED), to_world=TURNED)},
+    "turned, own": lambda: {"smoke": grid_in(cube(TURNED), "own", to_world=TURNED)},
+    "ball smaller than its grid": lambda: {"smoke": grid_in(BALL)},
+    "box smaller than its grid": lambda: {"smoke": grid_in(cube(centred(1.3 * rotation([0, 0, 1], 0.4))))},
+    "box larger than its grid": lambda: {"smoke": grid_in(cube(centred(2.2 * np.eye(3))), to_world=centred(1.5 * np.eye(3)))},
+    "ball larger than its grid": lambda: {"smoke": grid_in(BALL, to_world=centred(np.eye(3)))},
+    "two boxes": two_media,
+    "two balls": crossing_media,
+    "surfaces": surfaces,
+    "mirrors": mirrors,
+    "veil": veil,
+}
+
+
+@pytest.mark.parametrize("name", PLACES)
+def test_places(name):
+    same(lit(PLACES[name]()))
+
+
+@pytest.mark.parametrize("shape", ["box", "ball"])
+def test_camera_inside(shape):
+    """The sensor names its medium, as volpath needs it to."""
+    interior = grid_in({}, seed=4)["interior"] | {"id": "fog"}
+    ref = {"type": "ref", "id": "fog"}
+    parts = lit({"fog": interior, "box": box_of(ref, PLACE) if shape == "box" else ball_of(ref, (0, 0, 0), 1.0)})
+    sensor = scenes.camera((0.4, -0.3, 0.2), (-0.5, 0.4, 0), res=16, fov=60.0) | {"medium": ref}
+    scene = mi.load_dict({"type": "scene", **parts, "sensor": sensor})
+    assert_same_images(scene, rounding=LEAK)
+
+
+def test_camera_inside_that_names_no_medium():
+    """Volpath starts in vacuum then; we find the medium: the picture is that of a sensor that names it."""
+    interior = grid_in({}, seed=4)["interior"] | {"id": "fog"}
+    parts = lit({"fog": interior, "box": box_of({"type": "ref", "id": "fog"}, PLACE)})
+    sensor = scenes.camera((0.4, -0.3, 0.2), (-0.5, 0.4, 0), res=8, fov=60.0)
+    names = mi.load_dict({"type": "scene", **parts, "sensor": sensor | {"medium": {"type": "ref", "id": "fog"}}})
+    silent = mi.load_dict({"type": "scene", **parts, "sensor": sensor})
+    small.assert_same_whole(moments(silent, mivol(), 16), moments(names, mivol(), 16, first=500))
+
+
+def test_hidden_emitters():
+    """hide_emitters takes the lamps out of the picture, not their light off the smoke."""
+    parts = {"smoke": smoke(rough_grid(5))[0], "lamp": area(0.0, 2.0, 0.0, size=1.0), "sky": scenes.sky(0.5)}
+    image, _ = same(parts, ours=mivol(hide_emitters=True), stock=volpath(hide_emitters=True))
+    shown = moments(close_up(parts), mivol(), 16, 2)
+    assert shown.mean.max() > 4 > image.mean.max() > 0.01
+
+
+def test_a_medium_that_asks_for_no_emitter_sampling():
+    """sample_emitters = false changes how the sky's light is found, not how much there is."""
+    plain = grid_in(cube(PLACE))
+    quiet = grid_in(cube(PLACE), sample_emitters=False)
+    sky = scenes.sky(0.7)
+    a, b = (moments(close_up({"smoke": p, "sky": sky}), mivol(), 16) for p in (plain, quiet))
+    small.assert_same_whole(a, b)
+    assert_same_images(close_up({"smoke": quiet, "sky": sky}), rounding=LEAK)
+
+
+# -- Extinction in rgb: volpath one channel at a time ----------------------------------------------------------------
+
+
+def channel_by_channel(build, spp: int, batches: int = 32) -> Moments:
+    """Volpath's mean of each channel from a scene of its own, grey: `build(c)` makes it."""
+    alone = [moments(close_up(build(c)), volpath(), spp, batches, first=1000 * (c + 1)) for c in range(3)]
+    mean, m2 = (np.stack([getattr(m, k)[..., c] for c, m in enumerate(alone)], axis=-1) for k in ("mean", "m2"))
+    return Moments(batches, mean, m2)
+
+
+@pytest.mark.parametrize("ratio", [(2.0, 6.0, 9.0), (0.02, 1.0, 0.0)])
+@pytest.mark.parametrize("kind", small.KINDS)
+def test_rgb_extinction(kind, ratio):
+    values = rough_grid(6, 1.0)
+    medium_type, volume_type = small.KINDS[kind]
+    lamps = {"bulb": point([1.6, -1.3, 1.7])[0], "sky": scenes.sky(0.3)}
+
+    def parts(sigma_t):
+        grid = grid_volume(volume_type, as_float32(sigma_t), PLACE)
+        return {"smoke": box_of(medium(medium_type, grid, 0.8, phase={"type": "hg", "g": 0.3}), PLACE), **lamps}
+
+    ours = moments(close_up(parts(values * np.array(ratio))), mivol(), 32)
+    judge = channel_by_channel(lambda c: parts(values * ratio[c]), 32)
+    small.assert_same_mean(
+        ours.mean, ours.variance_of_mean, judge.mean, judge.variance_of_mean, tile=4, n_a=32, n_b=32, rounding=LEAK
+    )
+    small.assert_same_whole(ours, judge, rounding=LEAK)
+
+
+# -- Depth, and what is refused --------------------------------------------------------------------------------------
+
+
+def test_hard_46_depth_2_is_one_turn():
+    """Depth 1 is the background alone; depth 2 adds what turned once, and no more: dense smoke of albedo 1 stays below 1."""
+    box, _ = smoke(rough_grid(7, 12.0), albedo=1.0)
+    scene = close_up({"smoke": box, "sky": scenes.sky(1.0)})
+    one = moments(scene, mivol(max_depth=1), 16).mean
+    two, _ = assert_same_images(scene, rounding=LEAK)
+    deeper = moments(scene, volpath(max_depth=4), 16, 2).mean
+    assert one.mean() + 0.02 < two.mean.mean() < deeper.mean() - 0.02
+
+
+@pytest.mark.parametrize("depth", [3, 6, -1])
+@pytest.mark.parametrize("kind", ["stock", "own", "homogeneous"])
+def test_deeper_than_2_is_refused(kind, depth):
+    box = fog(0.9)[0] if kind == "homogeneous" else smoke(rough_grid(8), kind=kind)[0]
+    scene = close_up({"smoke": box, "sky": scenes.sky(1.0)}, res=2)
+    with refused("scatter.*max_depth"):
+        scenes.render(scene, {"type": "mivol", "max_depth": depth}, 1)
+
+
+def test_a_medium_that_only_absorbs_may_go_deeper():
+    box, _ = smoke(rough_grid(8), albedo=0.0)
+    parts = {"smoke": box, "sky": scenes.sky(1.0), "floor": square(0, 0, -1.5, 3.0) | {"bsdf": RED}}
+    assert_same_images(close_up(parts), ours=mivol(max_depth=5), stock=volpath(max_depth=5), rounding=LEAK)
+
+
+@pytest.mark.parametrize("bsdf", ["dielectric", "roughdielectric"])
+def test_a_refractive_boundary_is_refused_by_name(bsdf):
+    ball = ball_of(medium("homogeneous", 0.9, 0.8), (0, 0, 0), 0.9) | {"id": "tank", "bsdf": {"type": bsdf}}
+    scene = close_up({"tank": ball, "sky": scenes.sky(1.0)}, res=2)
+    with refused("tank.*refract|refract.*tank"):
+        scenes.render(scene, mivol(), 1)
+
+
+# -- Scenes of a stranger --------------------------------------------------------------------------------------------
+
+STRANGERS = (
+    "test_homo_area_light", "test_homo_obj_inside_medium", "test_surf_area_light", "test_hetero_sigmat",
+    "test_hetero_spectral_sigmat_no_scattering", "test_homo_null_envmap",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("name", STRANGERS)
+def test_scenes_of_a_stranger(name, data_dir):
+    """The scenes that Mitsuba tests its own volumetric integrators with, at depth 2."""
+    folder = data_dir / "scenes" / "mitsuba-data" / "tests" / "scenes" / "participating_media"
+    scene = mi.load_file(str(folder / f"{name}_volpath.xml"), res=16)
+    assert_same_images(scene, rounding=1e-3)

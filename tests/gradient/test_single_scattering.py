@@ -1,0 +1,489 @@
+"""Derivatives of light that turns once: every parameter against the float64 twin, forward against reverse, differences.
+
+A gradient is an estimate: its mean over 32 independent backward passes is held against the twin's by Student's t, voxel by
+voxel, false alarms 1e-6 a test. The twin's derivatives are exact, or central differences in float64 (h = 1e-4: truncation
+1e-8 of the value).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import oracle_scattering as twins
+import pytest
+import scattering_scenes as small
+from scattering_scenes import PLACE, Pencils, aimed, fog, mivol, pencils, point, rough_grid, smoke, spot, sun
+
+import scenes
+from mivol.validate.statistics import Moments, assert_same_mean
+from scenes import as_float32, box_of, grid_volume, medium
+
+pytestmark = pytest.mark.usefixtures("variant_rgb")
+
+GRID = "smoke.interior_medium.sigma_t.data"
+MEDIUM = "smoke.interior_medium."
+BATCHES = 32
+
+
+# -- Gradients of renders -----------------------------------------------------------------------------------------------
+
+
+def watched(scene: mi.Scene, key: str, spp: int, seed: int, integrator: mi.Integrator) -> tuple[object, mi.TensorXf]:
+    """A parameter whose derivatives are asked for, and the image by `mi.render`; `seed` is that of the derivatives.
+
+    As an optimiser does it: the scene is given a variable, and stock textures and volumes make copies of that.
+    """
+    params = mi.traverse(scene)
+    variable = type(params[key])(params[key])
+    dr.enable_grad(variable)
+    params[key] = variable
+    params.update()
+    image = mi.render(scene, params, integrator=integrator, spp=1, spp_grad=spp, seed=seed + 10_000, seed_grad=seed)
+    return variable, image
+
+
+def pulled(scene: mi.Scene, key: str, w: np.ndarray, spp: int, seed: int, integrator: mi.Integrator) -> np.ndarray:
+    """J^T w: the derivative of <w, image>."""
+    parameter, image = watched(scene, key, spp, seed, integrator)
+    dr.backward(dr.sum(image * mi.TensorXf(np.asarray(w, dtype=np.float32))))
+    gradient = np.array(dr.grad(parameter), dtype=np.float64)
+    release(scene, key, parameter)
+    return gradient
+
+
+def pushed(scene: mi.Scene, key: str, v: np.ndarray, spp: int, seed: int, integrator: mi.Integrator) -> np.ndarray:
+    """J v: the derivative of the image along v."""
+    parameter, image = watched(scene, key, spp, seed, integrator)
+    kind = type(parameter)
+    dr.set_grad(parameter, kind(np.asarray(v, dtype=np.float32)) if np.ndim(v) else kind(float(v)))
+    dr.enqueue(dr.ADMode.Forward, parameter)
+    dr.traverse(dr.ADMode.Forward)
+    tangent = np.array(dr.grad(image), dtype=np.float64)
+    release(scene, key, parameter)
+    return tangent
+
+
+def release(scene: mi.Scene, key: str, parameter: object) -> None:
+    """No derivatives any more."""
+    params = mi.traverse(scene)
+    params[key] = dr.detach(parameter)
+    params.update()
+
+
+def weights(n: int, seed: int = 1) -> tuple[np.ndarray, np.ndarray]:
+    """A gradient image (1, n, 3), and what each ray weighs where the channels are equal."""
+    w = np.random.default_rng(seed).uniform(0.5, 1.5, (1, n, 3))
+    return w, w[0].sum(axis=1)
+
+
+def gradient_moments(seen: Pencils, key: str, w: np.ndarray, spp: int) -> Moments:
+    integrator = mi.load_dict(mivol())
+    return Moments.of(np.stack([pulled(seen.scene, key, w, spp, seed, integrator) for seed in range(BATCHES)]))
+
+
+def assert_gradient(m: Moments, truth: np.ndarray, what: str, precision: float = 0.02, rounding: float = 2e-5) -> None:
+    """Each entry, and the sum of all weighted by numbers in [0.5, 1.5]; rounding is a share of the largest entry."""
+    truth = np.broadcast_to(truth, m.mean.shape)
+    top = np.abs(truth).max()
+    assert_same_mean(m.mean, m.variance_of_mean, truth, n_a=BATCHES, rounding=rounding * top, what=what)
+    error = np.sqrt(m.variance_of_mean).max()
+    assert error <= precision * top * 5, f"{what}: standard error {error:.2g} of {top:.2g}"
+
+
+def twin_difference(at: Callable[[float], float], x: float, h: float = 1e-4) -> float:
+    return (at(x + h) - at(x - h)) / (2 * h)
+
+
+# -- Density, voxel by voxel ---------------------------------------------------------------------------------------------
+
+DENSITIES = {
+    "empty": lambda: 0.0 * rough_grid(1),
+    "half empty": lambda: rough_grid(1) * (np.arange(6) < 3)[None, None, :, None],
+    "thin": lambda: 1e-3 * rough_grid(1),
+    "flat": lambda: np.full((3, 4, 2, 1), 0.7),
+    "rough": lambda: rough_grid(1),
+    "dense": lambda: rough_grid(1, 12.0),
+}
+LAMPS = {
+    "point": lambda: point([1.5, 1, 2.0]),
+    "point inside": lambda: point([0.3, -0.2, 0.35]),
+    "spot": lambda: spot([1.0, -2, 2.5], [0, 0, 0]),
+    "sun": lambda: sun([0.3, 0.2, -1.0]),
+}
+
+
+def lit_smoke(density: str, lamp: tuple, kind: str = "own", albedo: float = 0.7, n: int = 8) -> tuple[Pencils, twins.Medium]:
+    box, m = smoke(as_float32(DENSITIES[density]()), albedo, kind, PLACE, "hg", 0.4)
+    return pencils({"smoke": box, "lamp": lamp[0]}, *aimed(1, n)), m
+
+
+@pytest.mark.parametrize("density", DENSITIES)
+@pytest.mark.parametrize("kind", small.KINDS)
+def test_density_under_a_point_light(density, kind):
+    """Empty, half empty and flat (density equal to the majorant) are where other estimators are biased."""
+    lamp = LAMPS["point"]()
+    seen, m = lit_smoke(density, lamp, kind)
+    w, rows = weights(8)
+    truth, _ = twins.radiance_gradient(m, [lamp[1]], seen.o, seen.d, rows)
+    assert_gradient(gradient_moments(seen, GRID, w, 256), truth[..., None], density)
+
+
+@pytest.mark.parametrize("density", ["empty", "rough"])
+@pytest.mark.parametrize("name", ["point inside", "spot", "sun"])
+def test_density_under_other_lamps(density, name):
+    lamp = LAMPS[name]()
+    seen, m = lit_smoke(density, lamp)
+    w, rows = weights(8)
+    truth, _ = twins.radiance_gradient(m, [lamp[1]], seen.o, seen.d, rows)
+    assert_gradient(gradient_moments(seen, GRID, w, 256), truth[..., None], name)
+
+
+@pytest.mark.parametrize("albedo", [0.0, 0.6])
+@pytest.mark.parametrize("density", ["empty", "rough"])
+def test_density_under_a_sky(density, albedo):
+    """Turned light against the background that is taken away, of nearly the same size."""
+    box, m = smoke(as_float32(DENSITIES[density]()), albedo, "own", PLACE, "hg", 0.4)
+    seen = pencils({"smoke": box, "sky": scenes.sky(0.7)}, *aimed(1, 3))
+    w, rows = weights(3)
+    truth, _ = twins.radiance_gradient(m, [twins.Sky(0.7, 12)], seen.o, seen.d, rows, background=0.7, order=3)
+    # 12 x 24 directions: 1e-3 of the derivative of the turned light.
+    assert_gradient(gradient_moments(seen, GRID, w, 256), truth[..., None], density, rounding=2e-3 if albedo else 2e-5)
+
+
+@pytest.mark.parametrize("kind", small.KINDS)
+def test_white_smoke_of_no_density_in_a_constant_sky_has_no_gradient(kind):
+    """What turns in is what is turned away: 0 in each sample, to rounding of the two (a few EPS of their size)."""
+    gradients = []
+    for albedo in (0.0, 1.0):
+        box, _ = smoke(as_float32(DENSITIES["empty"]()), albedo, kind, PLACE)
+        seen = pencils({"smoke": box, "sky": scenes.sky(0.7)}, *aimed(1, 8))
+        integrator = mi.load_dict(mivol())
+        gradients.append([pulled(seen.scene, GRID, np.ones((1, 8, 3)), 1, seed, integrator) for seed in range(8)])
+    black, white = (np.abs(g).max() for g in gradients)
+    assert black > 0.1
+    assert white <= 4e-6 * black
+
+
+def test_constvolume_whose_density_is_its_majorant():
+    """The constant extinction of a stock heterogeneous, where prbvolpath is twice too large."""
+    at = np.eye(4)
+    interior = medium("heterogeneous", {"type": "constvolume", "value": 1.2}, 0.7)
+    lamp = point([1.5, 1.2, 2.0])
+    o, d = aimed(2, 4)
+    seen = pencils({"smoke": box_of(interior, at), "lamp": lamp[0]}, as_float32(0.5 * o + 0.5), d)
+    w, rows = weights(4)
+
+    def light(sigma):
+        return rows @ twins.radiance([twins.Medium(twins.Box(sigma, at), 0.7)], [lamp[1]], seen.o, seen.d)[:, 0]
+
+    truth = np.array([twin_difference(light, float(as_float32(1.2)))])
+    assert_gradient(gradient_moments(seen, MEDIUM + "sigma_t.value.value", w, 1024), truth, "constvolume")
+
+
+# -- Every other parameter -------------------------------------------------------------------------------------------------
+
+
+def scalar(parts: dict, key: str, light: Callable[[float, np.ndarray, np.ndarray], np.ndarray], x: float) -> None:
+    """A number's derivative of the sum of weighted pencils against a difference of the twin's `light(x, o, d)` (n, C)."""
+    seen = pencils(parts, *aimed(3, 6))
+    w, rows = weights(6)
+    truth = twin_difference(lambda y: rows @ light(y, seen.o, seen.d)[:, 0], float(as_float32(x)))
+    assert_gradient(sum_moments(seen, key, w, 1024), np.array([truth]), key)
+
+
+def sum_moments(seen: Pencils, key: str, w: np.ndarray, spp: int, v: object = 1.0) -> Moments:
+    """Of the derivative along v: by default all entries of a parameter move together, as the channels of a grey one do."""
+    integrator = mi.load_dict(mivol())
+    return Moments.of(np.stack([[np.sum(v * pulled(seen.scene, key, w, spp, s, integrator))] for s in range(BATCHES)]))
+
+
+LAMP = lambda: point([1.5, 1, 2.0])  # noqa: E731
+
+
+def test_homogeneous_extinction_and_albedo():
+    lamp = LAMP()
+    parts = {"smoke": fog(0.9, 0.7, name="hg", g=0.3)[0], "lamp": lamp[0]}
+
+    def by_sigma(x, o, d):
+        return twins.radiance([twins.Medium(twins.Box(x, PLACE), float(as_float32(0.7)), twins.hg(0.3))], [lamp[1]], o, d)
+
+    def by_albedo(x, o, d):
+        return twins.radiance([twins.Medium(twins.Box(float(as_float32(0.9)), PLACE), x, twins.hg(0.3))], [lamp[1]], o, d)
+
+    scalar(parts, MEDIUM + "sigma_t.value.value", by_sigma, 0.9)
+    scalar(parts, MEDIUM + "albedo.value.value", by_albedo, 0.7)
+
+
+@pytest.mark.parametrize("albedo", [0.0, 0.7, 1.0])
+@pytest.mark.parametrize("kind", small.KINDS)
+def test_albedo(albedo, kind):
+    """At albedo 0 nothing turns, and the derivative is not 0."""
+    lamp, values = LAMP(), rough_grid(2)
+    parts = {"smoke": smoke(values, albedo, kind)[0], "lamp": lamp[0]}
+
+    def light(x, o, d):
+        return twins.radiance([twins.Medium(twins.Grid(values, PLACE), x)], [lamp[1]], o, d)
+
+    scalar(parts, MEDIUM + "albedo.value.value", light, albedo)
+
+
+@pytest.mark.parametrize("kind", small.KINDS)
+@pytest.mark.parametrize("top", [0.0, 1.0])
+def test_albedo_grid(kind, top):
+    """Voxel by voxel: the integral of w_k T sigma L_s; also where the albedo is 0 everywhere."""
+    lamp, values, albedo = LAMP(), rough_grid(3), rough_grid(4, top, (2, 3, 4))
+    medium_type, volume_type = small.KINDS[kind]
+    interior = medium(medium_type, grid_volume(volume_type, values, PLACE), grid_volume(volume_type, albedo, PLACE))
+    seen = pencils({"smoke": box_of(interior, PLACE), "lamp": lamp[0]}, *aimed(3, 6))
+    w, rows = weights(6)
+    m = twins.Medium(twins.Grid(values, PLACE), twins.trilinear_albedo(albedo, PLACE))
+    truth = np.zeros(albedo.shape[:3])
+    for turned in twins.turns([m], [lamp[1]], seen.o, seen.d):
+        sigma = m.field.sigma(turned.x)[:, 0]
+        twins.Grid(albedo, PLACE).weigh(truth, turned.x, rows[turned.ray] * turned.light[:, 0] * sigma)
+    assert_gradient(gradient_moments(seen, MEDIUM + "albedo.data", w, 256), truth[..., None], "albedo")
+
+
+def test_absorption_and_scattering():
+    """sigma_a dims, sigma_s turns and dims; both numbers of one medium."""
+    lamp, a, s = LAMP(), float(as_float32(0.3)), float(as_float32(0.6))
+    interior = {"type": "mivol_medium", "sigma_a": a, "sigma_s": s, "phase": {"type": "rayleigh"}}
+    parts = {"smoke": box_of(interior, PLACE), "lamp": lamp[0]}
+
+    def light(a, s, o, d):
+        media = [twins.Medium(twins.Box(a, PLACE), 0.0), twins.Medium(twins.Box(s, PLACE), 1.0, twins.rayleigh)]
+        return twins.radiance(media, [lamp[1]], o, d)
+
+    scalar(parts, MEDIUM + "sigma_a.value.value", lambda x, o, d: light(x, s, o, d), a)
+    scalar(parts, MEDIUM + "sigma_s.value.value", lambda x, o, d: light(a, x, o, d), s)
+
+
+def test_scattering_grid():
+    """sigma_s on a grid, also where it is 0: what turns is its own, not a share of sigma_t."""
+    lamp = LAMP()
+    absorb, scatter = rough_grid(5, 1.0, (2, 3, 4)), DENSITIES["half empty"]()
+    interior = {
+        "type": "mivol_medium",
+        "sigma_a": grid_volume("mivol_voxels", absorb, PLACE),
+        "sigma_s": grid_volume("mivol_voxels", scatter, PLACE),
+    }
+    seen = pencils({"smoke": box_of(interior, PLACE), "lamp": lamp[0]}, *aimed(3, 4))
+    w, rows = weights(4)
+    v = np.random.default_rng(7).uniform(0.2, 1, scatter.shape)
+
+    def light(x):
+        media = [
+            twins.Medium(twins.Grid(absorb, PLACE), 0.0),
+            twins.Medium(twins.Grid(scatter + x * v, PLACE), 1.0),
+        ]
+        return rows @ twins.radiance(media, [lamp[1]], seen.o, seen.d)[:, 0]
+
+    along = sum_moments(seen, MEDIUM + "sigma_s.data", w, 256, v)
+    assert_gradient(along, np.array([twin_difference(light, 0.0)]), "sigma_s")
+
+
+def test_scale():
+    lamp, values = LAMP(), rough_grid(6)
+    interior = medium("mivol_medium", grid_volume("mivol_voxels", values, PLACE), 0.7, scale=1.5)
+    parts = {"smoke": box_of(interior, PLACE), "lamp": lamp[0]}
+
+    def light(x, o, d):
+        return twins.radiance([twins.Medium(twins.Grid(values, PLACE, x), 0.7)], [lamp[1]], o, d)
+
+    scalar(parts, MEDIUM + "scale", light, 1.5)
+
+
+@pytest.mark.parametrize("g", [-0.6, 0.0, 0.4, 0.9])
+def test_asymmetry_of_the_phase_function(g):
+    """hg.g, also at 0 where it is a maximum of nothing."""
+    lamp, values = LAMP(), rough_grid(7)
+    parts = {"smoke": smoke(values, 0.7, "own", PLACE, "hg", g)[0], "lamp": lamp[0]}
+
+    def light(x, o, d):
+        return twins.radiance([twins.Medium(twins.Grid(values, PLACE), 0.7, twins.hg(x))], [lamp[1]], o, d)
+
+    scalar(parts, MEDIUM + "phase_function.g", light, g)
+
+
+def test_asymmetry_under_a_sky_that_is_not_constant():
+    """Directions are sampled here: the sampling follows g, the estimate of the derivative must not.
+
+    The sky is a point light's light spread by a linear function of the direction: radiance 1 + z.
+    """
+    values, g = rough_grid(7), 0.4
+    rows = 64
+    z = np.cos((np.arange(rows) + 0.5) / rows * np.pi)
+    sky = np.repeat(np.repeat((1 + z)[:, None, None], 2 * rows, axis=1), 3, axis=2).astype(np.float32)
+    up = mi.ScalarTransform4f().rotate([1, 0, 0], 90)  # Mitsuba's panorama has y upwards
+    parts = {
+        "smoke": smoke(values, 0.7, "own", PLACE, "hg", g)[0],
+        "sky": {"type": "envmap", "bitmap": mi.Bitmap(sky), "to_world": up},
+    }
+    lamp = twins.Sky(lambda w: 1 + w[:, 2:], 12)
+    seen = pencils(parts, *aimed(3, 3))
+    w, weight = weights(3)
+
+    def light(x):
+        m = twins.Medium(twins.Grid(values, PLACE), 0.7, twins.hg(x))
+        return weight @ twins.radiance([m], [lamp], seen.o, seen.d, order=3)[:, 0]
+
+    truth = np.array([twin_difference(light, g)])
+    # The panorama's texels are linear in the angle, not in its cosine: 4e-4; 12 x 24 directions: 1e-3.
+    assert_gradient(sum_moments(seen, MEDIUM + "phase_function.g", w, 1024), truth, "g under a sky", rounding=3e-3)
+
+
+def test_weight_of_a_blend():
+    lamp, values = LAMP(), rough_grid(8)
+    blend = {"type": "blendphase", "weight": 0.3, "a": {"type": "hg", "g": 0.7}, "b": {"type": "rayleigh"}}
+    interior = medium("heterogeneous", grid_volume("gridvolume", values, PLACE), 0.7, phase=blend)
+    parts = {"smoke": box_of(interior, PLACE), "lamp": lamp[0]}
+
+    def light(x, o, d):
+        p = lambda c: (1 - x) * twins.hg(0.7)(c) + x * twins.rayleigh(c)  # noqa: E731
+        return twins.radiance([twins.Medium(twins.Grid(values, PLACE), 0.7, p)], [lamp[1]], o, d)
+
+    scalar(parts, MEDIUM + "phase_function.weight.value.value", light, 0.3)
+
+
+# -- Lamps -------------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("name", "key"), [("point", "intensity"), ("spot", "intensity"), ("sun", "irradiance")])
+def test_power_of_a_lamp(name, key):
+    """Linear: the derivative is the picture of a lamp of 1."""
+    lamp = LAMPS[name]()
+    values = rough_grid(9)
+    parts = {"smoke": smoke(values, 0.7)[0], "lamp": lamp[0]}
+    one = {"point": {"intensity": 1.0}, "spot": {"intensity": 1.0}, "sun": {"irradiance": 1.0}}[name]
+    unit = type(lamp[1])(**{**vars(lamp[1]), **one})
+    m = twins.Medium(twins.Grid(values, PLACE), 0.7)
+
+    def light(x, o, d):
+        return x * twins.radiance([m], [unit], o, d)
+
+    scalar(parts, f"lamp.{key}.value", light, 1.0)
+
+
+def test_radiance_of_the_sky():
+    box, m = fog(0.8, 0.7)
+    seen = pencils({"smoke": box, "sky": scenes.sky(0.7)}, *aimed(3, 3))
+    w, rows = weights(3)
+    truth = rows @ twins.radiance([m], [twins.Sky(1.0, 24)], seen.o, seen.d, background=1.0)[:, 0]
+    assert_gradient(sum_moments(seen, "sky.radiance.value", w, 1024), np.array([truth]), "sky", rounding=3e-4)
+
+
+def test_position_of_a_point_light():
+    """Smooth where the light is outside: distance, direction and shadow all move."""
+    values = rough_grid(10)
+    box, m = smoke(values, 0.7, "own", PLACE, "hg", 0.4)
+    lamp = point([1.5, 1, 2.0])
+    seen = pencils({"smoke": box, "lamp": lamp[0]}, *aimed(3, 6))
+    w, rows = weights(6)
+    at = np.array([1.5, 1, 2.0])
+
+    def light(x, axis):
+        place = twins.Point(at + x * np.eye(3)[axis], 3.0)
+        return rows @ twins.radiance([m], [place], seen.o, seen.d, order=10)[:, 0]
+
+    truth = np.array([twin_difference(lambda x, a=a: light(x, a), 0.0) for a in range(3)])
+    assert_gradient(gradient_moments(seen, "lamp.position", w, 1024), truth[:, None], "position", rounding=1e-4)
+
+
+# -- Forward against reverse, and differences ---------------------------------------------------------------------------------
+
+
+def everything(kind: str = "own") -> mi.Scene:
+    """A volume with a ball in it over a floor, under a lamp, a panorama and a bulb."""
+    turn = mi.ScalarTransform4f
+    sky = np.random.default_rng(3).uniform(0.1, 0.6, (8, 16, 3)).astype(np.float32)
+    sky[2, 5] = (20.0, 15.0, 9.0)
+    red = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.8, 0.3, 0.2]}}
+    return small.close_up(
+        {
+            "smoke": smoke(0.2 + rough_grid(11), 0.7, kind, PLACE, "hg", 0.5)[0],
+            "ball": {"type": "sphere", "radius": 0.4, "center": [0.2, 0.1, -0.2], "bsdf": {"type": "diffuse"}},
+            "floor": {"type": "rectangle", "to_world": turn().translate([0, 0, -1.2]).scale(3), "bsdf": red},
+            "sky": {"type": "envmap", "bitmap": mi.Bitmap(sky)},
+            "bulb": point([1.6, -1.3, 1.7])[0],
+            "lamp": {"type": "rectangle", "to_world": turn().translate([0, 0, 2]).rotate([1, 0, 0], 180).scale(0.5)}
+            | {"emitter": {"type": "area", "radiance": 4.0}},
+        },
+        res=8,
+    )
+
+
+KEYS = {
+    "sigma_t.data": MEDIUM + "sigma_t.data",
+    "albedo": MEDIUM + "albedo.value.value",
+    "g": MEDIUM + "phase_function.g",
+    "bulb": "bulb.intensity.value",
+    "lamp": "lamp.emitter.radiance.value",
+    "sky": "sky.data",
+    "floor": "floor.bsdf.reflectance.value",
+    "scale": MEDIUM + "scale",
+}
+
+
+@pytest.mark.parametrize("key", KEYS)
+def test_forward_against_reverse(key):
+    """<J v, w> = <v, J^T w> with the same random numbers: no step size and no noise, to float32 sums (1e-5 of the terms)."""
+    scene, integrator = everything(), mi.load_dict(mivol())
+    start = np.array(mi.traverse(scene)[KEYS[key]])
+    rng = np.random.default_rng(1)
+    v, w = rng.uniform(0.2, 1, start.shape or (1,)), rng.uniform(0.2, 1, (8, 8, 3))
+    jv = pushed(scene, KEYS[key], v if start.ndim else float(v[0]), 8, 5, integrator)
+    jtw = pulled(scene, KEYS[key], w, 8, 5, integrator)
+    assert abs((jv * w).sum() - (jtw * v).sum()) <= 1e-5 * np.abs(jv * w).sum()
+    assert np.abs(jv).max() > 1e-4
+
+
+@pytest.mark.parametrize("kind", small.KINDS)
+@pytest.mark.parametrize("key", ["sigma_t.data", "albedo", "g"])
+def test_against_differences_with_common_random_numbers(key, kind):
+    """The mean over pixels of (far - near)/2h - J v over 32 seeds is 0: by Student's t, each channel.
+
+    h = 0.02: truncation h^2 f'''/6, below 1e-3 of the derivative (optical depths of 5 at most).
+    """
+    scene, integrator = everything(kind), mi.load_dict(mivol())
+    params = mi.traverse(scene)
+    name = KEYS[key]
+    start = np.array(params[name])
+    v = np.random.default_rng(2).uniform(0.2, 1, start.shape) if start.ndim else 1.0
+    kind_of_value, h, spp = type(params[name]), 0.02, 64
+
+    def at(x: np.ndarray, seed: int) -> np.ndarray:
+        params[name] = kind_of_value(x.astype(np.float32)) if np.ndim(x) else kind_of_value(float(x))
+        params.update()
+        return np.array(integrator.render(scene, seed=seed, spp=spp), dtype=np.float64).mean(axis=(0, 1))
+
+    differences = np.array([(at(start + h * v, s) - at(start - h * v, s)) / (2 * h) for s in range(BATCHES)])
+    at(start, 0)
+    jv = np.array([pushed(scene, name, v, spp, s, integrator).mean(axis=(0, 1)) for s in range(BATCHES)])
+    m, level = Moments.of(differences - jv), np.abs(differences.mean(axis=0))
+    assert_same_mean(m.mean, m.variance_of_mean, np.zeros(3), n_a=BATCHES, rounding=1e-3 * level.max(), what=key)
+    assert np.all(np.sqrt(m.variance_of_mean) < 0.03 * level.max())
+
+
+def test_seeds_of_picture_and_gradient_are_independent():
+    """The gradient of a squared loss through mi.render has the mean 2 (L - r) dL: their noise must not be correlated.
+
+    With one seed for both, 2 cov(L, dL) would be added: as large as the mean here, with 1 sample a pixel.
+    """
+    lamp = LAMPS["point inside"]()
+    seen, m = lit_smoke("rough", lamp, n=4)
+    integrator, params = mi.load_dict(mivol()), mi.traverse(seen.scene)
+    L = twins.radiance([m], [lamp[1]], seen.o, seen.d)[:, 0]
+    target, key = 0.9 * L, MEDIUM + "albedo.value.value"
+    truth = np.sum(3 * 2 * (L - target) * L / 0.7)
+    dr.enable_grad(params[key])
+    found = []
+    for seed in range(400):
+        image = mi.render(seen.scene, params, integrator=integrator, spp=1, seed=seed)
+        dr.backward(dr.sum(dr.square(image - mi.TensorXf(np.repeat(target[None, :, None], 3, axis=2).astype(np.float32)))))
+        found.append(np.array(dr.grad(params[key]), dtype=np.float64).reshape(1))
+        dr.set_grad(params[key], 0)
+    m = Moments.of(np.array(found))
+    assert_same_mean(m.mean, m.variance_of_mean, np.array([truth]), n_a=400, what="squared loss")

@@ -1,0 +1,346 @@
+"""Where single scattering breaks: the numbered hard cases, each against a closed form or the float64 twin."""
+
+from __future__ import annotations
+
+import math
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import oracle_scattering as twins
+import pytest
+import scattering_scenes as small
+from scattering_scenes import PLACE, Pencils, aimed, fog, mivol, pencils, point, rough_grid, smoke, sun
+
+import scenes
+from mivol.errors import MivolError
+from mivol.validate.statistics import Moments, assert_same_mean
+from scenes import as_float32, box_of, centred, grid_volume, medium, refused, tensor
+
+pytestmark = pytest.mark.usefixtures("variant_rgb")
+
+GRID = "smoke.interior_medium.sigma_t.data"
+ALBEDO = "smoke.interior_medium.albedo.value.value"
+BATCHES = 32
+EPS = 2.0**-23
+
+
+def gradients(seen: Pencils, key: str, spp: int, batches: int = BATCHES) -> Moments:
+    """Of the derivative of the sum of all pixels and channels."""
+    params, integrator = mi.traverse(seen.scene), mi.load_dict(mivol())
+    dr.enable_grad(params[key])
+    found = []
+    for seed in range(batches):
+        integrator.render_backward(seen.scene, params, mi.TensorXf(np.ones((1, len(seen.o), 3), dtype=np.float32)), seed=seed, spp=spp)
+        found.append(np.array(dr.grad(params[key]), dtype=np.float64).reshape(np.shape(params[key])))
+        dr.set_grad(params[key], 0)
+    dr.disable_grad(params[key])
+    return Moments.of(np.array(found))
+
+
+def set_grid(scene: mi.Scene, values: np.ndarray, key: str = GRID) -> None:
+    params = mi.traverse(scene)
+    params[key] = tensor(values)
+    params.update()
+
+
+def holds_twin(seen: Pencils, m: twins.Medium, lamp: twins.Lamp, spp: int = 1024, level: float = 2e-5, **more: object) -> None:
+    """The twin's radiance within Student's t, and float32 rounding of `level` of the largest."""
+    top = twins.radiance([m], [lamp], seen.o, seen.d).max()
+    small.assert_twin(seen, [m], [lamp], mivol(), spp, rounding=level * top, **more)
+
+
+# -- Density and albedo at the ends of their domains ---------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", small.KINDS)
+@pytest.mark.parametrize("lit", ["point", "sky"])
+def test_hard_21_derivative_of_no_density(lit, kind):
+    """d L / d sigma_k = integral of w_k (albedo L_s - B): not 0, and of either sign."""
+    values, albedo = 0 * rough_grid(1), 0.6
+    lamp = point([1.5, 1, 2.0]) if lit == "point" else ({"type": "constant", "radiance": 0.5}, twins.Sky(0.5, 4))
+    box, m = smoke(values, albedo, kind)
+    seen = pencils({"smoke": box, "lamp": lamp[0]}, *aimed(1, 6))
+    background = 0.5 if lit == "sky" else 0.0
+    truth, _ = twins.radiance_gradient(m, [lamp[1]], seen.o, seen.d, 3.0, background=background)
+    assert np.sign(truth.sum()) == (1 if lit == "point" else -1)
+    found = gradients(seen, GRID, 256)
+    # The sky's 4 x 8 directions are exact where nothing dims them.
+    assert_same_mean(
+        found.mean[..., 0], found.variance_of_mean[..., 0], truth, n_a=BATCHES, rounding=2e-5 * np.abs(truth).max()
+    )
+    error = math.sqrt(found.variance_of_mean.sum())
+    assert error < 0.02 * abs(truth.sum())
+
+
+def test_hard_21_picture_of_no_density():
+    """The background to the last digit, and nothing else; no NaN from 0/0."""
+    box, _ = smoke(0 * rough_grid(1), 1.0)
+    seen = pencils({"smoke": box, "sky": scenes.sky(0.7), "bulb": point([0.1, 0.2, 0.3])[0]}, *aimed(1, 6))
+    assert np.all(np.abs(scenes.render(seen.scene, mivol(), 16) - as_float32(0.7)) <= 4 * EPS)
+
+
+@pytest.mark.parametrize("kind", small.KINDS)
+def test_hard_23_albedo_0(kind):
+    """L = T B without noise; the derivative with respect to the albedo is the integral of T sigma L_s, not 0."""
+    values = rough_grid(2)
+    box, _ = smoke(values, 0.0, kind)
+    lamp = point([1.5, 1, 2.0])
+    seen = pencils({"smoke": box, "lamp": lamp[0], "sky": scenes.sky(0.4)}, *aimed(2, 4))
+    T = np.exp(-twins.Grid(values, PLACE).tau(seen.o, seen.d, np.full(4, np.inf)))
+    image = scenes.render(seen.scene, mivol(), 4)[0]
+    # tau is right to 2e-6 of itself (at most 3).
+    assert np.all(np.abs(image - 0.4 * T) <= 1e-5 * 0.4)
+    lit = twins.Medium(twins.Grid(values, PLACE), 1.0)
+    truth = 3 * twins.radiance([lit], [lamp[1]], seen.o, seen.d).sum()
+    truth += 3 * (twins.radiance([lit], [twins.Sky(0.4, 12)], seen.o, seen.d, order=3).sum())
+    found = gradients(seen, ALBEDO, 512)
+    # 12 x 24 directions of the sky: 1e-3 of its part.
+    mean, var = found.mean.reshape(1, -1).sum(axis=1), found.variance_of_mean.reshape(1, -1).sum(axis=1)
+    assert_same_mean(mean, var, np.array([truth]), n_a=BATCHES, rounding=1e-3 * truth)
+
+
+@pytest.mark.parametrize("kind", small.KINDS)
+@pytest.mark.parametrize("value", [-0.1, 1.2, math.nan])
+def test_hard_25_albedo_outside_its_domain(value, kind):
+    """An optimiser's overshoot is refused with a sentence that names the albedo, not rendered as energy out of nothing."""
+    box, _ = smoke(rough_grid(3), 0.8, kind)
+    seen = pencils({"smoke": box, "lamp": point([1.5, 1, 2.0])[0]}, *aimed(3, 2))
+    params = mi.traverse(seen.scene)
+    with refused("albedo"):
+        params[ALBEDO] = type(params[ALBEDO])(value)
+        params.update()
+        scenes.render(seen.scene, mivol(), 1)
+
+
+@pytest.mark.parametrize("kind", small.KINDS)
+@pytest.mark.parametrize("value", [-0.1, 1.2, math.inf])
+def test_hard_25_albedo_grid_outside_its_domain(value, kind):
+    """One voxel of an albedo grid."""
+    medium_type, volume_type = small.KINDS[kind]
+    albedo = grid_volume(volume_type, np.full((2, 3, 4, 1), 0.5), PLACE)
+    box = box_of(medium(medium_type, grid_volume(volume_type, rough_grid(3), PLACE), albedo), PLACE)
+    seen = pencils({"smoke": box, "lamp": point([1.5, 1, 2.0])[0]}, *aimed(3, 2))
+    bad = np.full((2, 3, 4, 1), 0.5)
+    bad[1, 2, 3] = value
+    with refused("albedo"):
+        set_grid(seen.scene, bad, "smoke.interior_medium.albedo.data")
+        scenes.render(seen.scene, mivol(), 1)
+
+
+@pytest.mark.parametrize("kind", small.KINDS)
+@pytest.mark.parametrize("value", [-0.5, math.nan, math.inf])
+def test_hard_26_negative_density(value, kind):
+    """One voxel below 0 (or not a number) is refused, and named by its indices; after a step back all is well again."""
+    values = rough_grid(4)
+    box, _ = smoke(values, 0.8, kind)
+    seen = pencils({"smoke": box, "lamp": point([1.5, 1, 2.0])[0]}, *aimed(4, 2))
+    before = scenes.render(seen.scene, mivol(), 4, seed=1)
+    bad = values.copy()
+    bad[3, 1, 2] = value
+    with refused(r"z=3, y=1, x=2"):
+        set_grid(seen.scene, bad)
+        scenes.render(seen.scene, mivol(), 4)
+    set_grid(seen.scene, values)
+    assert np.array_equal(scenes.render(seen.scene, mivol(), 4, seed=1), before)
+
+
+# -- Majorants, of which there are none ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", small.KINDS)
+def test_hard_30_density_that_has_grown(kind):
+    """Values that an optimiser has raised tenfold: nothing that was found for the old ones may be used."""
+    values = rough_grid(5, 0.5)
+    box, m = smoke(values, 0.8, kind)
+    lamp = point([1.5, 1, 2.0])
+    seen = pencils({"smoke": box, "lamp": lamp[0]}, *aimed(5, 4))
+    scenes.render(seen.scene, mivol(), 4)
+    grown = as_float32(10 * values)
+    set_grid(seen.scene, grown)
+    holds_twin(seen, twins.Medium(twins.Grid(grown, PLACE), 0.8), lamp[1])
+    # From nothing to something: blocks that were empty are empty no more.
+    set_grid(seen.scene, 0 * values)
+    assert not scenes.render(seen.scene, mivol(), 4).any()
+    set_grid(seen.scene, values)
+    holds_twin(seen, m, lamp[1])
+
+
+@pytest.mark.parametrize("peak", [20.0, 2000.0])
+def test_hard_31_one_dense_voxel(peak):
+    """One voxel 10 or 1000 times denser than the rest, off the rays and between some of them and the lamp: the same law."""
+    values = rough_grid(6)
+    values[-1, -1, -1] = peak
+    box, m = smoke(values, 0.8, "own")
+    lamp = point([1.5, 1, 2.0])
+    holds_twin(pencils({"smoke": box, "lamp": lamp[0]}, *aimed(6, 6)), m, lamp[1], quadrature=1e-4, order=16)
+
+
+def test_hard_31_noise_does_not_follow_the_majorant():
+    """Rays that never come near the dense voxel see what they see without it, to the last digits, with the same noise."""
+    values = rough_grid(6)
+    o = as_float32(np.stack([np.full(4, -3.0), np.linspace(-0.8, 0.0, 4), np.full(4, -0.5)], axis=1))
+    images = []
+    for peak in (1.0, 1000.0):
+        values[-1, -1, -1] = peak
+        box, _ = smoke(values, 0.8, "own")
+        seen = pencils({"smoke": box, "sun": sun([0, 0, 1.0])[0]}, o, [1.0, 0, 0])
+        images.append(scenes.render(seen.scene, mivol(), 16, seed=2))
+    assert np.allclose(*images, rtol=1e-5, atol=0)
+
+
+@pytest.mark.parametrize("ratio", [(1e-3, 1.0, 10.0), (0.0, 1.0, 2.0), (8.0, 8.0, 8e-4)])
+def test_hard_32_channels_of_very_different_extinction(ratio):
+    """Each channel is its own grey picture: at ratios of 1e4, and with a channel that is vacuum."""
+    values = as_float32(rough_grid(7, 1.0) * np.array(ratio))
+    interior = medium("mivol_medium", grid_volume("mivol_voxels", values, PLACE), 0.8, phase={"type": "hg", "g": 0.4})
+    lamp = point([1.5, 1, 2.0])
+    seen = pencils({"smoke": box_of(interior, PLACE), "lamp": lamp[0]}, *aimed(7, 6))
+    m = twins.Medium(twins.Grid(values, PLACE), float(as_float32(0.8)), twins.hg(0.4))
+    truth = twins.radiance([m], [lamp[1]], seen.o, seen.d)
+    found = seen.moments(mivol(), 2048)
+    for c in range(3):
+        top = truth[:, c].max()
+        mean, var = found.mean[:, c], found.variance_of_mean[:, c]
+        assert_same_mean(mean, var, truth[:, c], n_a=BATCHES, rounding=2e-5 * top + 1e-30, what=f"channel {c}")
+        bright = truth[:, c] > 0.1 * top
+        assert np.all(np.sqrt(var[bright]) <= 0.03 * truth[bright, c]), f"channel {c} is lost in noise"
+    assert np.all(found.mean >= 0)
+
+
+# -- Lamps: inside, far away, along the ray ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("h", [1e-3, 0.03, 0.4])
+def test_hard_33_point_light_beside_the_ray(h):
+    """Close to the ray the radiance is as 1/h: equal angles keep the noise where it was."""
+    values = rough_grid(8)
+    box, m = smoke(values, 0.8, "own")
+    lamp = point([0.1, as_float32(0.2 + h), 0.3])
+    seen = pencils({"smoke": box, "lamp": lamp[0]}, as_float32([-3, 0.2, 0.3]), [1.0, 0, 0])
+    # The distance of the lamp from the ray is a difference of float32 numbers of 0.5: 6e-8/h of it.
+    holds_twin(seen, m, lamp[1], level=2e-5 + 1e-7 / h, precision=0.02)
+
+
+@pytest.mark.parametrize("kind", ["grid", "homogeneous"])
+def test_hard_33_point_light_on_the_ray(kind):
+    """The integral diverges there: what is shown must be finite numbers, and its neighbours right."""
+    values = rough_grid(8)
+    box, m = smoke(values, 0.8, "own") if kind == "grid" else fog(0.7, 0.8)
+    lamp = point([0.1, 0.2, 0.3])
+    o = as_float32([[-3, 0.2, 0.3], [-3, 0.5, 0.3]])
+    seen = pencils({"smoke": box, "lamp": lamp[0]}, o, [1.0, 0, 0])
+    image = scenes.render(seen.scene, mivol(), 256)
+    assert np.all(np.isfinite(image))
+    assert image[0, 0, 0] > 5 * image[0, 1, 0] > 0
+    holds_twin(pencils({"smoke": box, "lamp": lamp[0]}, o[1:], [1.0, 0, 0]), m, lamp[1])
+
+
+@pytest.mark.parametrize("where", ["node", "face", "edge", "border"])
+def test_hard_33_point_light_at_a_special_place(where):
+    """On a voxel's centre, on a face and on an edge between cells, on the border of the grid."""
+    values = rough_grid(9, 1.0, (4, 4, 4))
+    step = 0.5  # voxel centres of [-1, 1]^3 in 4: -0.75, -0.25, 0.25, 0.75
+    place = {
+        "node": [0.25, 0.25, -0.25],
+        "face": [0.25, 0.1, 0.0],
+        "edge": [0.25, -0.25, 0.07],
+        "border": [1.0, 0.2, 0.3],
+    }[where]
+    assert (np.array(place[0]) / step * 2) % 1 in (0.0, 0.5)
+    box, m = smoke(values, 0.8, "own")
+    lamp = point(place)
+    holds_twin(pencils({"smoke": box, "lamp": lamp[0]}, *aimed(9, 5)), m, lamp[1], spp=2048)
+
+
+@pytest.mark.parametrize("away", [1e3, 1e5])
+def test_hard_34_point_light_far_away_is_a_sun(away):
+    """Irradiance I / r^2 from one direction, to the parallax 1/r; the angle that a cell fills is not a difference."""
+    values = rough_grid(10)
+    box, m = smoke(values, 0.8, "own", name="hg", g=0.5)
+    towards = np.array([0.48, -0.6, 0.64])
+    lamp = point(away * towards, intensity=2.0 * away**2)
+    seen = pencils({"smoke": box, "lamp": lamp[0]}, *aimed(10, 6))
+    # 2 / r of parallax; a float32 distance to the lamp is good to 1e-7 of it, so directions to that; r^2 to 2e-7.
+    holds_twin(seen, m, twins.Directional(-towards, 2.0), level=2e-5 + 8 / away)
+
+
+@pytest.mark.parametrize("kind", ["grid", "homogeneous"])
+@pytest.mark.parametrize("tilt", [0.0, 1e-6, 1e-3])
+def test_hard_35_light_along_the_camera_ray(tilt, kind):
+    """mu -> mu0 in transmission: alpha p E0 (tau/mu) e^{-tau/mu}, no 0/0 anywhere near it."""
+    sigma = 1.3
+    frame = as_float32(scenes.affine(np.diag([400.0, 400, 1]), (-200, -200, 0)))
+    build = fog(sigma, 0.8, frame) if kind == "homogeneous" else smoke(np.full((3, 2, 2, 1), sigma), 0.8, "own", frame)
+    travel = np.array([math.sin(0.3 + tilt), 0, -math.cos(0.3 + tilt)])
+    d = np.array([math.sin(0.3), 0, -math.cos(0.3)])
+    # The camera looks along the light from above: it sees the light that turned straight back; from below the one that went on.
+    o = np.array([[0, 0, 3.0], [0, 0, -2.0]])
+    seen = pencils({"slab": build[0], "sun": sun(travel, 2.0)[0]}, o, np.array([d, -d]))
+    p, mu, mu0 = 1 / (4 * math.pi), abs(seen.d[0, 2]), abs(travel[2])
+    truth = np.array([[f(0.8, p, 2.0, mu, mu0, sigma)] * 3 for f in (twins.slab_reflected, twins.slab_transmitted)])
+    found = seen.moments(mivol(), 2048)
+    assert_same_mean(found.mean, found.variance_of_mean, truth, n_a=BATCHES, rounding=1e-5 * truth.max())
+
+
+@pytest.mark.parametrize("direction", [[0, 0, -1.0], [0, -1.0, 0], [1.0, 0, 0]])
+def test_hard_36_shadow_rays_along_the_faces_of_cells(direction):
+    """Camera rays in planes between cells, through voxel centres, the light along other such planes: T is continuous."""
+    values = rough_grid(11, 2.0, (4, 4, 4))
+    box, m = smoke(values, 0.8, "own")
+    lamp = sun(direction)
+    # y and z: in a face between cells, in an edge between them, in the grid's middle.
+    o = np.array([[-3, 0.25, 0.1], [-3, 0.25, -0.25], [-3, 0.0, 0.0], [-3, 0.75, 0.999]])
+    seen = pencils({"smoke": box, "sun": lamp[0]}, o, [1.0, 0, 0])
+    holds_twin(seen, m, lamp[1], spp=2048)
+
+
+def test_hard_36_no_light_is_lost_where_shadow_rays_start():
+    """Dense smoke of voxels 1e-3 wide: an offset of Mitsuba's 1e-4 at the start of a shadow ray would show as 10 %."""
+    scale = 2e-3
+    values = as_float32(rough_grid(12, 2.0) / scale)
+    frame = as_float32(centred(scale * np.eye(3)))
+    box, m = smoke(values, 0.8, "own", frame)
+    lamp = sun([0.3, 0.2, -1.0])
+    o, d = aimed(12, 6, 0.8 / 2, 3.0)
+    seen = pencils({"smoke": box, "sun": lamp[0]}, as_float32(o * scale), d)
+    holds_twin(seen, m, lamp[1], spp=2048)
+
+
+# -- Depth ---------------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", ["grid", "homogeneous"])
+def test_hard_46_depth_2_is_one_scattering(kind):
+    """Depth 1: the background through the medium, exactly; depth 2: one scattering more, by its closed form; not two."""
+    sigma, depth = 2.2, 0.4
+    build = fog(sigma, 1.0, np.eye(4)) if kind == "homogeneous" else smoke(np.full((4, 3, 2, 1), sigma), 1.0, "own", np.eye(4))
+    seen = pencils({"cube": build[0], "sun": sun([0, 0, -1.0], 3.0)[0]}, [-2, 0.3, 1 - depth], [1.0, 0, 0])
+    assert not scenes.render(seen.scene, mivol(max_depth=1), 16).any()
+    found = seen.moments(mivol(max_depth=2), 2048)
+    truth = twins.cube_from_the_side(1.0, 1 / (4 * math.pi), 3.0, sigma, 1 - seen.o[0, 2], 1.0)
+    assert_same_mean(found.mean, found.variance_of_mean, np.full((1, 3), truth), n_a=BATCHES, rounding=1e-5 * truth)
+    # What a second scattering would add is 30 % and more at this depth: far outside the noise.
+    assert math.sqrt(found.variance_of_mean.max()) < 0.01 * truth
+
+
+def test_hard_46_surfaces_shine_on_the_medium_only_directly():
+    """A white floor lit by a lamp lights the smoke above it at depth 3, not at 2; an area light does at 2."""
+    box, _ = smoke(rough_grid(13), 0.9)
+    turn, ray = mi.ScalarTransform4f, ([-5, 0.1, 0.2], [1.0, 0, 0])
+    floor = {"type": "rectangle", "to_world": turn().translate([0, 0, -1.2]).scale(3)}
+    white = floor | {"bsdf": {"type": "diffuse"}}
+    # The shade keeps the sun off the smoke but not off the floor around it.
+    shade = {"type": "rectangle", "to_world": turn().translate([0, 0, 1.2]).scale(1.2), "bsdf": {"type": "diffuse"}}
+    dark = pencils({"smoke": box, "floor": white, "shade": shade, "sun": sun([0, 0, -1.0])[0]}, *ray)
+    assert not scenes.render(dark.scene, mivol(), 64).any()
+    lit = pencils({"smoke": box, "floor": floor | {"emitter": {"type": "area", "radiance": 1.0}}}, *ray)
+    assert scenes.render(lit.scene, mivol(), 64).min() > 0.01
+
+
+def test_refusals_are_of_our_kind():
+    """A refusal is a MivolError with one sentence."""
+    box, _ = smoke(rough_grid(14))
+    seen = pencils({"smoke": box, "lamp": point([1.5, 1, 2.0])[0]}, *aimed(14, 1))
+    with pytest.raises(MivolError, match=r"^[^.]*(\.[^ ][^.]*)*\.$"):
+        mi.load_dict(mivol(max_depth=5)).render(seen.scene)
