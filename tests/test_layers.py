@@ -10,7 +10,7 @@ import pytest
 
 PACKAGE = Path(__file__).resolve().parents[1] / "mivol"
 ORDER = [
-    *("errors", "threads", "machine", "llvm", "numerics", "space", "files", "fields", "transport", "tomography"),
+    *("errors", "threads", "machine", "llvm", "numerics", "space", "files", "fields", "phase", "transport", "tomography"),
     *("scene", "plugins", "optim", "validate", "report", "config", "doctor", "cli", "__main__"),
 ]
 STARTS_THREADS = {"threading", "multiprocessing", "subprocess", "concurrent", "_thread", "asyncio"}

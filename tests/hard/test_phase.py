@@ -224,8 +224,9 @@ def test_hard_48_gradient_of_an_image_by_g_at_zero():
     dr.enable_grad(params[key])
     params.update()
     integrator = mi.load_dict({"type": "prbvolpath", "max_depth": 2})
-    image = mi.render(scene, params, integrator=integrator, spp=4096, seed=1, seed_grad=1)
-    dr.backward(dr.mean(image.array))
+    with dr.suspend_grad():
+        image = integrator.render(scene, seed=1, spp=4096)
+    integrator.render_backward(scene, params, dr.full(mi.TensorXf, 1 / 12, image.shape), seed=1, spp=4096)
     gradient, mean = float(dr.grad(params[key])[0]), float(np.array(image).mean())
     # Light travels along (0.6, 0, 0.8), and to the camera within 0.2 degrees of (0, 0, -1): cos = -0.8 to 0.003 * 0.6. The same
     # seed gives L and dL/dg the same paths, so nothing else differs.
