@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """How much of the light that a medium scatters is missing where it may scatter once only (max_depth 2)?
 
-    scripts/bench_depth.py              # 3 minutes on 2 cores
+    scripts/bench_depth.py              # about 4 minutes on 2 cores
     scripts/bench_depth.py --quick      # 20 seconds: fewer lines, three optical depths
 
 A unit cube stands in constant light or in a beam along -z, homogeneous, isotropic or forward-scattering (Henyey and
@@ -10,36 +10,27 @@ places and directions, and returns the radiance that was scattered towards the e
 Printed is what depth 2 leaves out, e = 1 - S2 / S, with its standard error; both see the same random numbers, so that what
 they share cancels. Optical depth is E[tau^2] / E[tau] over the same lines (mivol/scene/depth_two.py says why).
 
-Beside the table, to see where it holds: the smoke of the Mitsuba tutorial (MIVOL_DATA, default ../shared/data) in both
-lights, and the cube below a point light one edge above its top. Prints JSON; writes bench_depth.json and bench_depth.png;
-``--table`` also prints the table as mivol/scene/depth_two.py holds it.
+Beside the table, to see where it holds: the smoke of the Mitsuba tutorial (or a made-up one, and the JSON says so) in both
+lights, and the cube below a point light one edge above its top. Prints JSON, with the table as mivol/scene/depth_two.py
+holds it; writes bench_depth.json and bench_depth.png.
 """
 
 from __future__ import annotations
 
-import argparse
-import itertools
-import json
-import os
-import sys
 import time
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import mivol  # noqa: F401  (chooses LLVM)
-from mivol.files import read_volume, whole_file, write_whole_text
-from mivol.report.record import describe_machine, versions
+from contest import AT_MOST, Bench, describe, judge, say, smoke
+from mivol.files import whole_file
 from mivol.scene.depth_two import ALBEDOS, TAUS, depth_two_error, draw_lines, scattering_depth
 from mivol.transport.medium import Box, view_medium
 
 import drjit as dr
 import mitsuba as mi
-import msgspec
 import numpy as np
-
-ROOT = Path(__file__).resolve().parents[1]
-SMOKE = Path(os.environ.get("MIVOL_DATA", ROOT.parent / "shared" / "data")) / "volumes_vol" / "tutorials_volume.vol"
 
 LIGHTS = {
     "constant": {"type": "constant", "radiance": {"type": "uniform", "value": 1.0}},
@@ -55,6 +46,20 @@ BESIDE_ALBEDOS = (0.5, 0.9)
 UNIT = Box(np.eye(4))
 CUBE_DEPTH = 0.8966336
 """E[l^2] / E[l] of lines through the unit cube, = 8 int prod(1 - u_i) / |u|^2 du / (2 pi) over [0, 1]^3, by quadrature."""
+
+
+@dataclass(frozen=True)
+class Size:
+    """How much is measured; media beside the table get an eighth of the lines."""
+
+    name: str = "full"
+    lines: int = 1 << 18
+    taus: tuple[float, ...] = TAUS
+
+
+FULL = Size()
+QUICK = Size("quick", 1 << 14, (0.1, 1.0, 10.0))
+SEED = 0
 
 
 @dataclass(frozen=True)
@@ -76,11 +81,11 @@ class Cell:
 # -- Scenes ---------------------------------------------------------------------------------------------------------------
 
 
-def cube(light: str, phase: str = "isotropic", smoke: np.ndarray | None = None) -> mi.Scene:
-    """The unit cube in that light, with a homogeneous medium of extinction 1 or with the smoke."""
+def cube(light: str, phase: str = "isotropic", values: np.ndarray | None = None) -> mi.Scene:
+    """The unit cube in that light, with a homogeneous medium of extinction 1 or with a grid (Z, Y, X)."""
     medium = {"type": "homogeneous", "sigma_t": 1.0, "albedo": 0.5}
-    if smoke is not None:
-        grid = mi.VolumeGrid(smoke.astype(np.float32))
+    if values is not None:
+        grid = mi.VolumeGrid(values)
         medium |= {"type": "heterogeneous", "sigma_t": {"type": "gridvolume", "grid": grid, "raw": True}}
     boundary = {
         "type": "cube",
@@ -130,37 +135,61 @@ def measure(scene: mi.Scene, place: tuple[str, str, str], albedo: float, tau: fl
     return Cell(*place, albedo, tau, once.mean(), every.mean(), *left_out(once, every), seconds)
 
 
-def measure_table(taus: tuple[float, ...], n: int, seed: int) -> Iterator[Cell]:
+def measure_table(size: Size) -> Iterator[Cell]:
     """The cells of the table."""
     for light, phase in TABLED:
         scene = cube(light, phase)
-        for tau in taus:
-            yield from (measure(scene, ("cube", light, phase), a, tau, CUBE_DEPTH, n, seed) for a in ALBEDOS)
+        for tau in size.taus:
+            for albedo in ALBEDOS:
+                yield measure(scene, ("cube", light, phase), albedo, tau, CUBE_DEPTH, size.lines, SEED)
 
 
-def measure_beside(taus: tuple[float, ...], n: int, seed: int) -> Iterator[Cell]:
-    """Cells of other media and lights; the smoke only where its file is there."""
+def measure_beside(size: Size) -> Iterator[Cell]:
+    """Cells of other media and lights."""
     for medium, lights in BESIDE.items():
-        if medium == "smoke" and not SMOKE.is_file():
-            continue
-        smoke = read_volume(SMOKE).values if medium == "smoke" else None
+        values = smoke().values if medium == "smoke" else None
         for light in lights:
-            scene = cube(light, smoke=smoke)
+            scene = cube(light, values=values)
             depth = scattering_depth(view_medium(scene.shapes()[0].interior_medium(), UNIT), UNIT)
-            for tau in taus:
-                yield from (measure(scene, (medium, light, "isotropic"), a, tau, depth, n, seed) for a in BESIDE_ALBEDOS)
+            for tau in size.taus:
+                for albedo in BESIDE_ALBEDOS:
+                    yield measure(scene, (medium, light, "isotropic"), albedo, tau, depth, size.lines // 8, SEED)
+
+
+def said(cells: Iterator[Cell]) -> Iterator[Cell]:
+    """Cells, each said as it comes."""
+    for c in cells:
+        place = f"{c.medium}, {c.light} light, {c.phase}, albedo {c.albedo:g}, tau {c.tau:g}"
+        say(f"  {place}: {c.error:.4f} +- {c.standard_error:.4f} in {c.seconds} s")
+        yield c
+
+
+def ask_table(size: Size) -> dict:
+    """What does depth 2 leave out, e = 1 - S2 / S, by light, phase function, albedo and optical depth?"""
+    cells = list(said(measure_table(size)))
+    lines = table_lines(cells) if size.taus == TAUS else []
+    return {"lines": size.lines, "cells": [asdict(c) for c in cells], "as the module holds it": lines}
+
+
+def ask_beside(size: Size) -> dict:
+    """Does the table hold for clumps and for a point light?"""
+    return {"smoke": describe(smoke()), "cells": [asdict(c) for c in said(measure_beside(size))]}
+
+
+QUESTIONS = {"table": ask_table, "beside": ask_beside}
 
 
 # -- What is shown ---------------------------------------------------------------------------------------------------------
 
 
-def draw(cells: list[Cell], path: Path) -> None:
+def draw(answers: dict, folder: Path) -> None:
     """Lines of the cube by albedo, marks of what was measured beside it; a panel for each light and phase function."""
     import matplotlib
 
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
+    cells = [Cell(**c) for answer in answers.values() for c in answer["cells"]]
     fig, panels = plt.subplots(2, 2, figsize=(10, 8), sharex=True, sharey=True, layout="constrained")
     colours = dict(zip(ALBEDOS, plt.get_cmap("viridis")(np.linspace(0, 0.92, len(ALBEDOS))), strict=True))
     marks = {("smoke", "constant"): "^", ("smoke", "collimated"): "^", ("cube", "point"): "s"}
@@ -182,7 +211,7 @@ def draw(cells: list[Cell], path: Path) -> None:
         axes.set_xlabel("optical depth as scattered light sees it")
     for axes in panels[:, 0]:
         axes.set_ylabel("scattered light that max_depth 2 leaves out")
-    with whole_file(path) as temporary:
+    with whole_file(folder / "bench_depth.png") as temporary:
         fig.savefig(temporary, dpi=110, format="png")
     plt.close(fig)
 
@@ -192,66 +221,33 @@ def tabled(cell: Cell) -> tuple[str, str]:
     return "constant" if cell.light == "constant" else "collimated", cell.phase
 
 
-def table_lines(cells: list[Cell]) -> str:
-    """The tables of mivol/scene/depth_two.py."""
+def table_lines(cells: list[Cell]) -> list[str]:
+    """The lines of mivol/scene/depth_two.py that hold the table."""
     lines = []
     for light, phase in TABLED:
-        found = {(c.albedo, c.tau): c.error for c in cells if (c.medium, c.light, c.phase) == ("cube", light, phase)}
+        found = {(c.albedo, c.tau): c.error for c in cells if (c.light, c.phase) == (light, phase)}
         rows = [", ".join(f"{found[albedo, tau]:.3f}" for tau in TAUS) for albedo in ALBEDOS]
         lines += [f'    ("{light}", "{phase}"): np.array(', "        [", *(f"            [{row}]," for row in rows)]
         lines += ["        ]", "    ),"]
-    return "\n".join(lines)
+    return lines
 
 
-def summary(cells: list[Cell]) -> dict[str, object]:
-    """How well the table holds beside what it was made of: measured minus table, the least and the most."""
-    found: dict[str, object] = {"largest_standard_error": round(max(c.standard_error for c in cells), 4)}
-    for medium, lights in BESIDE.items():
-        for light in lights:
-            here = [c for c in cells if (c.medium, c.light) == (medium, light)]
-            gaps = [c.error - depth_two_error(c.albedo, c.tau, *tabled(c)) for c in here]
-            found[f"{medium}, {light} light, minus table"] = [round(end(gaps), 4) for end in (min, max)] if gaps else "no file"
-    return found
+def compare(question: str, answer: dict) -> list[dict]:
+    """How sure the table is, how far mivol's is from what was measured now, and how far other media are from it."""
+    cells = [Cell(**c) for c in answer["cells"]]
+    gaps = [c.error - depth_two_error(c.albedo, c.tau, *tabled(c)) for c in cells]
+    if question == "beside":
+        return [judge("largest distance from the table", max(map(abs, gaps)), AT_MOST, 0.2)]
+    # Half a digit of rounding, and the table's own error: at the lines it was made with, that of this measurement.
+    errors = [(abs(gap) - 5e-4) / c.standard_error for c, gap in zip(cells, gaps, strict=True)]
+    bar = 0.04 * (QUICK.lines / answer["lines"]) ** 0.5
+    return [
+        judge("largest standard error", max(c.standard_error for c in cells), AT_MOST, bar),
+        judge("largest distance from mivol's table [standard errors]", max(errors), AT_MOST, 5.0),
+    ]
 
 
-def say(cell: Cell) -> None:
-    """To standard error: standard output is for the JSON."""
-    place = f"{cell.medium}, {cell.light} light, {cell.phase}, albedo {cell.albedo:g}, tau {cell.tau:g}"
-    print(f"{place}: {cell.error:.4f} +- {cell.standard_error:.4f} in {cell.seconds} s", file=sys.stderr, flush=True)
-
-
-def main() -> None:
-    """Read the command line, measure, print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, default=Path("runs/bench_depth"))
-    parser.add_argument("--lines", type=int, default=1 << 18, help="lines through the medium, each cell (default 262144)")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--quick", action="store_true", help="16384 lines, optical depths 0.1, 1 and 10")
-    parser.add_argument("--table", action="store_true", help="print the module's table, too")
-    parser.add_argument("--variant", default="llvm_ad_rgb")
-    args = parser.parse_args()
-    mi.set_variant(args.variant)
-    taus, n = ((0.1, 1.0, 10.0), 1 << 14) if args.quick else (TAUS, args.lines)
-    start, cells = time.perf_counter(), []
-    for cell in itertools.chain(measure_table(taus, n, args.seed), measure_beside(taus, n // 8, args.seed)):
-        cells.append(cell)
-        say(cell)
-    if args.table:
-        print(table_lines(cells), file=sys.stderr)
-    result = {
-        "question": "1 - S2 / S, the share of the scattered light that max_depth 2 leaves out",
-        "lines": n,
-        "seconds": round(time.perf_counter() - start, 1),
-        "summary": summary(cells),
-        "machine": msgspec.to_builtins(describe_machine()),
-        "versions": versions(),
-        "cells": [asdict(cell) for cell in cells],
-    }
-    args.out.mkdir(parents=True, exist_ok=True)
-    draw(cells, args.out / "bench_depth.png")
-    write_whole_text(args.out / "bench_depth.json", json.dumps(result, indent=1) + "\n")
-    print(json.dumps(result, indent=1))
-
+BENCH = Bench("bench_depth", __doc__, QUESTIONS, (FULL, QUICK), compare, draw)
 
 if __name__ == "__main__":
-    main()
+    BENCH.main()

@@ -40,8 +40,7 @@ class Compared:
 
     Attributes:
         loss: mean penalty; without the render's noise where the loss takes pairs.
-        noise: what the noise adds to the mean penalty of the mean image; 0 for an exact render, nan where a single render
-            does not tell.
+        noise: estimate of what the noise adds to the mean penalty of the mean image; 0 for a single render.
         adjoint: derivative of ``loss`` by the mean image.
     """
 
@@ -63,14 +62,14 @@ def compare(
         weight: factor on loss, noise and adjoint.
 
     Returns:
-        Loss, its noise, and the adjoint, to be carried back by samples that are independent of the renders: then
-        E[J^T adjoint] is the gradient of E[loss] to the order to which ``loss`` itself is unbiased. For a squared loss
-        the adjoint is the same with and without pairs.
+        Loss, its noise, and the adjoint. Carried back by samples that are independent of the renders, J^T adjoint is the
+        gradient of the loss without noise, in the mean and to the order to which ``loss`` is unbiased; for a squared loss
+        exactly, with and without pairs, whose adjoints are the same.
 
     Bias: var(I) f''/2 plainly. With pairs none for "l2" and "relative_l2", of order 1/n^2 for smooth penalties; where |r|
         of "l1" is below the noise s, 0.8 s becomes 0.47 s. The reference's own noise stays.
-    Variance: of a pixel's squared loss with Gaussian noise s^2 and residual r: 4 r^2 s^2 + 2 s^4 plainly, + 4 s^4 with
-        pairs.
+    Variance: of a pixel's squared loss with Gaussian noise s^2 and residual r: 4 r^2 s^2 + 2 s^4 plainly, 4 r^2 s^2 +
+        4 s^4 with pairs.
     Cost: the penalty of three images in place of one; no sample more.
     """
     mean = dr.detach(sum(share * image for share, image in zip(shares, renders, strict=True)))

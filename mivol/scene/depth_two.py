@@ -16,7 +16,7 @@ for in thin matter twice-scattered light goes with the depth from the first coll
 :math:`\tau = 0.8966\,\sigma_t a`. The largest extinction times the diagonal would not do: it is twice that for a
 cube, and 7 times tau for the smoke of Mitsuba's tutorial.
 
-Source: the tables are printed by ``scripts/bench_depth.py --table`` (Mitsuba's ``volpath``, a cube); standard errors are
+Source: the tables are printed by ``scripts/bench_depth.py`` (Mitsuba's ``volpath``, a cube); standard errors are
 below 0.008.
 """
 
@@ -94,8 +94,8 @@ def depth_two_error(albedo: float, tau: float, light: str = "constant", phase: s
         phase: "isotropic" or "forward".
 
     Returns:
-        e, in [0, 1): that of a homogeneous cube. The tutorial's smoke has 0 to 0.1 less (0.51 for 0.61 with albedo 0.9 and
-        tau = 10), a cube below a point light 0.014 less at most. It is a mean over all views; one of them may differ by
+        e, in [0, 1): that of a homogeneous cube. The tutorial's smoke has 0 to 0.15 less (0.51 for 0.61 with albedo 0.9 and
+        tau = 10), a cube below a point light 0.016 less at most. It is a mean over all views; one of them may differ by
         more.
 
     Raises:
