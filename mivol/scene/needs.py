@@ -65,6 +65,7 @@ class Needs:
         surfaces: kinds of the shapes that are more than boundaries.
         is_veiled: some surface lets light through undeviated and is more than a boundary.
         emitters: kinds.
+        refractive: names of the boundaries that bend or blur the light that passes them.
         start: medium that the sensor names.
         camera_inside: the camera may be inside the box around a boundary.
         parameters: keys whose derivatives are asked for.
@@ -78,6 +79,7 @@ class Needs:
     surfaces: tuple[str, ...]
     is_veiled: bool
     emitters: tuple[str, ...]
+    refractive: tuple[str, ...]
     start: mi.Medium | None
     camera_inside: bool
     parameters: tuple[str, ...]
@@ -92,6 +94,7 @@ class Survey:
     surfaces: tuple[str, ...]
     is_veiled: bool
     emitters: tuple[str, ...]
+    refractive: tuple[str, ...]
     values: dict = field(default_factory=dict)
     places: dict = field(default_factory=dict)
 
@@ -120,6 +123,7 @@ def find_needs(scene: mi.Scene, sensor: mi.Sensor, survey: Survey | None = None)
         surfaces=survey.surfaces,
         is_veiled=survey.is_veiled,
         emitters=survey.emitters,
+        refractive=survey.refractive,
         start=sensor.get_medium(),
         camera_inside=_camera_inside(scene, sensor, survey),
         parameters=tuple(k for k, v in mi.traverse(scene) if dr.is_diff_v(v) and dr.grad_enabled(v)),
@@ -129,11 +133,13 @@ def find_needs(scene: mi.Scene, sensor: mi.Sensor, survey: Survey | None = None)
 
 def survey_scene(scene: mi.Scene) -> Survey:
     """Find the media, surfaces and emitters of a scene."""
-    boundaries, surfaces, veiled = [], [], False
+    boundaries, surfaces, refractive, veiled = [], [], [], False
     shapes = scene.shapes()
     for index, shape in enumerate(shapes):
         if shape.is_medium_transition():
             boundaries.append(_boundary(shape, index, shapes))
+            if int(shape.bsdf().flags()) & (int(mi.BSDFFlags.DeltaTransmission) | int(mi.BSDFFlags.GlossyTransmission)):
+                refractive.append(f"{boundaries[-1].name} ({shape.bsdf().class_name()})")
         if not _is_bare(shape):
             surfaces.append(shape.class_name())
             veiled |= mi.has_flag(shape.bsdf().flags(), mi.BSDFFlags.Null)
@@ -141,7 +147,7 @@ def survey_scene(scene: mi.Scene) -> Survey:
     # Mitsuba makes one object of equal media: where one boundary has to be traced, all boundaries of that medium are.
     traced = {b.medium.ptr for b in boundaries if b.box is None}
     boundaries = [replace(b, box=None) if b.medium.ptr in traced else b for b in boundaries]
-    return Survey(tuple(boundaries), tuple(surfaces), bool(veiled), kinds)
+    return Survey(tuple(boundaries), tuple(surfaces), bool(veiled), kinds, tuple(refractive))
 
 
 def _is_bare(shape: mi.Shape) -> bool:

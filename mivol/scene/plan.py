@@ -66,6 +66,7 @@ def make_plan(needs: Needs, settings: Settings) -> Plan:
             would not fit into memory.
     """
     _refuse_scattering(needs, settings)
+    _refuse_refraction(needs, settings)
     choices = [_transport(needs, settings), _tracing(needs), _channels(needs)]
     skips = tuple(bool(m.resolutions) and m.occupied < SKIP_BELOW for m in needs.media)
     choices += [_skipping(m, skip) for m, skip in zip(needs.media, skips, strict=True) if m.resolutions]
@@ -102,6 +103,14 @@ def _refuse_scattering(needs: Needs, settings: Settings) -> None:
                 f"the medium in {medium.name} scatters (its albedo is above 0) and max_depth is {settings.max_depth}; mivol "
                 "renders one scattering so far: set max_depth to 2, to 1 (what is seen through the medium), or the albedo to 0."
             )
+
+
+def _refuse_refraction(needs: Needs, settings: Settings) -> None:
+    if needs.refractive and settings.max_depth == 2 and any(m.is_scattering for m in needs.media):
+        raise MivolError(
+            f"the boundary {needs.refractive[0]} refracts and its scene has a medium that scatters; no straight shadow ray "
+            "reaches a lamp through it: make the boundary's BSDF null, set max_depth to 1, or the albedo to 0."
+        )
 
 
 def _pass_rays(needs: Needs) -> int:

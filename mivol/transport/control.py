@@ -149,6 +149,7 @@ def _light_of_nodes(
     lamp = world.lights.choose(ray, draw.lamp)
     found = arrivals(scene, world, mei, lamp, draw, False, dr.full(mi.Bool, True, dr.width(lane)))
     light = sum((a.value for a in found), mi.Spectrum(0))
+    dr.eval(light)
     rows = []
     for c in range(dr.size_v(light)):
         mean = dr.block_sum(light[c], DIRECTIONS) / DIRECTIONS
@@ -270,7 +271,7 @@ def _pass(
 ) -> list[mi.Float]:
     """All cells: what they dim, and what they send to the camera by S."""
     (part,) = body.view.parts
-    field, control = body.extinction(), world.control
+    field, control = body.extinction(ray), world.control
     lattice = replace(part.lattice, bounds=None)
     segment = clip(lattice, ray.o, -ray.d, -t1, -t0)
     leave = -segment.t0

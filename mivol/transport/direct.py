@@ -168,8 +168,8 @@ def _from_lamp(
     with dr.resume_grad(when=attached):
         f, _ = phase.eval_pdf(_context(), mei, direct.d, on)
         source = lamp.emitter.eval_direction(mei, direct, on) / direct.pdf if attached else weight
-        value = dim * f * source
-    return Arrival(way, dr.select(on & clear, value, 0), on & clear)
+        value = dr.select(on & clear, dim * f * source, 0)
+    return Arrival(way, value, on & clear)
 
 
 def _from_lobe(
@@ -194,8 +194,8 @@ def _from_lobe(
         if attached:
             f, _ = phase.eval_pdf(_context(), mei, wo, on)
             weight = f / pdf
-        value = dim * weight * emitter.eval(si, on)
-    return Arrival(Way(ray, mei.medium, end.t), dr.select(on, value, 0), on)
+        value = dr.select(on, dim * weight * emitter.eval(si, on), 0)
+    return Arrival(Way(ray, mei.medium, end.t), value, on)
 
 
 def _is_drawn(lights: Lights, emitter: mi.EmitterPtr) -> mi.Bool:

@@ -139,7 +139,9 @@ class _Lay:
 
 
 def _check_grids(body: Body) -> None:
-    """Refuse grids that do not share their cells."""
+    """Refuse grids that do not share their cells, and an extinction that depends on the direction."""
+    if body.view.flakes is not None:
+        raise MivolError("the AOV depth was asked for and a medium has the phase function sggx; leave depth out of aovs.")
     grids = [p.lattice for p in body.view.parts if p.lattice is not None]
     for other in grids[1:]:
         if not share_cells(grids[0], other):
@@ -164,7 +166,7 @@ def _measure(
     body: Body, ray: mi.Ray3f, t0: mi.Float, t1: mi.Float, origin: mi.Float, active: mi.Bool, tangent: bool, skip: bool
 ) -> _Moment:
     """Rows of a stretch of a body; empty blocks may be skipped where nothing depends on the order of sums."""
-    field, lay = body.extinction(), _lay(body, ray, t0, t1)
+    field, lay = body.extinction(ray), _lay(body, ray, t0, t1)
     change = SumField(body.view.parts, body.tangents, mi.Float(1)) if tangent else None
     rows = field.channels * (2 if tangent else 1)
     moment = _Moment([mi.Float64(0) for _ in range(rows)], [mi.Float(0) for _ in range(rows)])
@@ -240,7 +242,7 @@ def _backproject(
         ahead: optical depth from the camera to the far end of the stretch.
         behind: N of what lies behind the stretch, as the camera sees it.
     """
-    field, lay = body.extinction(), _lay(body, ray, t0, t1)
+    field, lay = body.extinction(ray), _lay(body, ray, t0, t1)
     zeros = [mi.Float(0) for _ in range(field.channels)]
     pull = _Pull(list(zeros), [mi.Float64(a) for a in ahead], list(zeros))
     parts = list(zip(body.view.parts, body.gradients, strict=True))

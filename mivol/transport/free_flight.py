@@ -140,7 +140,7 @@ def _fly(
     on: mi.Bool,
 ) -> Pick:
     """Offer the pieces of one body, in their order."""
-    field = body.extinction(body.flight)
+    field = body.extinction(ray, body.flight)
     grid = next((p.lattice for p in body.flight if p.lattice is not None), None)
     segment = clip(grid, ray.o, ray.d, t0, t1) if grid is not None else None
     filled = segment.length if segment is not None and not field.has_constants else t1 - t0
@@ -148,7 +148,8 @@ def _fly(
 
     def add_constant(pick: Pick, a: mi.Float, b: mi.Float) -> Pick:
         dt = dr.maximum(b - a, 0)
-        tau = [dr.select(s != 0, s * dt, 0) for s in world.rows(field.constant)]
+        # A ray that misses the medium may be infinitely long.
+        tau = [dr.select(on & (s != 0), s * dt, 0) for s in world.rows(field.constant)]
         return _offer_piece(pick, a, mi.Float(0), dt, tau, focus, spread, on & (dt > 0))
 
     if segment is None:
@@ -307,7 +308,7 @@ def _curve(world: World, ray: mi.Ray3f, pick: Pick, on: mi.Bool) -> list[list[mi
 
 def _values_along(world: World, body: Body, ray: mi.Ray3f, pick: Pick, on: mi.Bool) -> list[list[mi.Float]]:
     """[channel][point] extinction at 0, 1/3, 2/3 and 1 of the piece that was kept, in one body."""
-    field = body.extinction(body.flight)
+    field = body.extinction(ray, body.flight)
     constant = [[c] * 4 for c in field.constant]
     lattice = next((p.lattice for p in body.flight if p.lattice is not None), None)
     if lattice is None:

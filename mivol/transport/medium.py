@@ -60,6 +60,8 @@ class MediumView:
         scale: dimensionless factor, differentiable where the plugin makes it so.
         albedo: what was found under ``albedo`` or the ``sigma_s`` part: arrays whose maximum tells whether it scatters.
         share: the albedo itself, a volume or a constant; None where ``sigma_s`` is a part.
+        flakes: the matrix S (xx, yy, zz, xy, xz, yz) of an ``sggx`` phase function, which makes the extinction depend on the
+            direction: sigma_t sqrt(w^T S w) (Heitz et al. 2015, Eq. 6); None elsewhere.
     """
 
     medium: mi.Medium
@@ -67,6 +69,7 @@ class MediumView:
     scale: mi.Float
     albedo: list = field(default_factory=list)
     share: mi.Volume | mi.Float | mi.Color3f | None = None
+    flakes: list[mi.Float] | None = None
 
     @property
     def channels(self) -> int:
@@ -74,8 +77,8 @@ class MediumView:
         return max(part.channels for part in self.parts)
 
     def is_scattering(self) -> bool:
-        """Whether any albedo (or sigma_s) is above 0. Reads the values: not inside ``dr.freeze``."""
-        return any(bool(np.any(np.array(dr.detach(a)) > 0)) for a in self.albedo)
+        """Whether any albedo (or sigma_s) is above 0 or its derivative is asked for. Reads values: not in ``dr.freeze``."""
+        return any(dr.grad_enabled(a) or bool(np.any(np.array(dr.detach(a)) > 0)) for a in self.albedo)
 
 
 @dataclass
@@ -132,7 +135,30 @@ def view_medium(medium: mi.Medium, boundary: Box | None = None, places: dict | N
     places = {} if places is None else places
     parts = [_part(name, params, kind, boundary, places) for name in names]
     albedo = [v for k, v in params if k.startswith("sigma_s." if "sigma_s" in names else "albedo.")]
-    return MediumView(medium, parts, mi.Float(params["scale"]), albedo, _share(params) if "sigma_s" not in names else None)
+    share = _share(params) if "sigma_s" not in names else None
+    return MediumView(medium, parts, mi.Float(params["scale"]), albedo, share, _flakes(medium))
+
+
+def _flakes(medium: mi.Medium) -> list[mi.Float] | None:
+    """The matrix of the flakes of a medium, if its phase function has them; mivol takes one that is the same everywhere.
+
+    Raises:
+        MivolError: a matrix that varies in space.
+    """
+    phase = medium.phase_function()
+    if phase is None or not int(phase.flags()) & int(mi.PhaseFunctionFlags.Microflake):
+        return None
+    values = dr.detach(next(v for k, v in mi.traverse(phase) if k.startswith("S.")))
+    flat = dr.ravel(values)
+    rows = [dr.gather(mi.Float, flat, mi.UInt32(c)) for c in range(6)]
+    if not dr.flag(dr.JitFlag.FreezingScope):
+        host = np.array(flat).reshape(-1, 6)
+        if not (host == host[0]).all():
+            raise MivolError(
+                f"the sggx phase function of a medium varies over its {len(host)} voxels; an extinction that "
+                "depends on the direction is exact for one S everywhere: give S as a gridvolume of one voxel."
+            )
+    return rows
 
 
 def _share(params: mi.SceneParameters) -> mi.Volume | mi.Float | mi.Color3f:

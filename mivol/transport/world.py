@@ -43,10 +43,18 @@ class Body:
         self.gradients: list[Gradient | mi.Float] = []
         self.tangents: list[mi.Float] = []
 
-    def extinction(self, parts: list[Part] | None = None) -> SumField:
-        """The sum of parts (all of them, unless told which), which share their cells, without derivatives."""
+    def area(self, d: mi.Vector3f) -> mi.Float | float:
+        """Factor on the extinction for light that travels along ``d``: the projected area of flakes, else 1."""
+        if self.view.flakes is None:
+            return 1.0
+        xx, yy, zz, xy, xz, yz = self.view.flakes
+        square = xx * d.x * d.x + yy * d.y * d.y + zz * d.z * d.z + 2 * (xy * d.x * d.y + xz * d.x * d.z + yz * d.y * d.z)
+        return dr.safe_sqrt(square)
+
+    def extinction(self, ray: mi.Ray3f, parts: list[Part] | None = None) -> SumField:
+        """The sum of parts (all of them, unless told which), which share their cells, along a ray, without derivatives."""
         parts = self.view.parts if parts is None else parts
-        return SumField(parts, [dr.detach(_values(p)) for p in parts], dr.detach(self.view.scale))
+        return SumField(parts, [dr.detach(_values(p)) for p in parts], dr.detach(self.view.scale) * self.area(ray.d))
 
     def optical_depth(
         self, ray: mi.Ray3f, t0: mi.Float, t1: mi.Float, channels: int, active: mi.Bool, parts: list[Part] | None = None
@@ -54,13 +62,14 @@ class Body:
         """Optical depth [1] of each channel over a stretch, of all parts unless told which."""
         parts = self.view.parts if parts is None else parts
         pairs = [(p, dr.detach(_values(p))) for p in parts]
-        scale = dr.detach(self.view.scale)
+        scale = dr.detach(self.view.scale) * self.area(ray.d)
         return [scale * tau for tau in self._sum(ray, t0, t1, channels, active, pairs, skip=True)]
 
     def tangent(self, ray: mi.Ray3f, t0: mi.Float, t1: mi.Float, channels: int, active: mi.Bool) -> list[mi.Float]:
         """Derivative of the optical depth along the tangent that :meth:`World.start_tangent` took from the parameters."""
         pairs = list(zip(self.view.parts, self.tangents, strict=True))
-        return self._sum(ray, t0, t1, channels, active, pairs, skip=False)
+        area = self.area(ray.d)
+        return [area * change for change in self._sum(ray, t0, t1, channels, active, pairs, skip=False)]
 
     def _sum(
         self, ray: mi.Ray3f, t0: mi.Float, t1: mi.Float, channels: int, active: mi.Bool, pairs: list[tuple], skip: bool
@@ -82,6 +91,7 @@ class Body:
 
     def backproject(self, ray: mi.Ray3f, t0: mi.Float, t1: mi.Float, weight: list[mi.Float], active: mi.Bool) -> None:
         """Add ``weight`` (d loss / d tau of each channel) times this stretch to the gradients of the parts."""
+        weight = [self.area(ray.d) * w for w in weight]
         for part, gradient in zip(self.view.parts, self.gradients, strict=True):
             w = _for_part(weight, part.channels)
             if part.lattice is None:
@@ -116,7 +126,7 @@ class Body:
                     for c in range(part.channels)
                 ]
             total = [a + b for a, b in zip(total, as_rows(rows, channels), strict=True)]
-        return total
+        return [self.area(ray.d) * t for t in total]
 
     def add_to_grid(self, part: Part, lower: mi.Vector3i, terms: list[tuple], active: mi.Bool) -> None:
         """Add to the gradient of a grid, in one packet for each channel, at the cell behind a node.
@@ -135,6 +145,7 @@ class Body:
 
     def deposit(self, ray: mi.Ray3f, t: mi.Float, weight: list[mi.Float], active: mi.Bool, name: str = "sigma_") -> None:
         """Add ``weight`` (d loss / d coefficient of each channel) at a point of a ray: the transpose of :meth:`tangent_at`."""
+        weight = [self.area(ray.d) * w for w in weight]
         for part, gradient in zip(self.view.parts, self.gradients, strict=True):
             if not part.name.startswith(name):
                 continue
@@ -184,7 +195,12 @@ class World:
         """Whether a control variate for derivatives can be used: one grid in a box that scatters by an albedo."""
         parts = [p for b in self.bodies for p in b.view.parts]
         alone = len(parts) == 1 and not self.traced and parts[0].lattice is not None
-        return self.lights is not None and alone and self.bodies[0].view.share is not None
+        return self.lights is not None and alone and self.bodies[0].view.share is not None and not self.has_flakes
+
+    @property
+    def has_flakes(self) -> bool:
+        """Whether some extinction depends on the direction."""
+        return any(b.view.flakes is not None for b in self.bodies)
 
     @property
     def bodies(self) -> list[Body]:
