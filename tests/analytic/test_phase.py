@@ -333,6 +333,13 @@ def test_shares_and_choice():
     assert np.all(as64(inside) < 1)
 
 
+def test_a_lobe_without_a_share_is_never_chosen():
+    """Not at the ends either: u = 0 before a first one, u = 1 (shares may sum to less, by rounding) after a last one."""
+    for weights, want in (([0, 1, 0], [1, 1, 1]), ([2, 0, 0], [0, 0, 0]), ([0, 0, 3], [2, 2, 2])):
+        chosen, _ = choose_lobe(shares_of([mi.Float(w) for w in weights]), mi.Float(0, 0.5, 1))
+        assert list(chosen) == want
+
+
 def test_shares_without_any_weight_are_equal():
     assert [float(s[0]) for s in shares_of([mi.Float(0), mi.Float(0)])] == [0.5, 0.5]
 

@@ -405,6 +405,23 @@ def test_a_recording_follows_parameters(name):
     assert len(set(means)) == 6
 
 
+def test_a_new_value_needs_no_new_kernel():
+    """Numbers are arrays to the compiler: the second value of a parameter runs the kernel of the first."""
+    mi.set_variant("llvm_ad_rgb")
+    phase = mi.load_dict({"type": "mivol_draine"})
+    params, mei, wo = mi.traverse(phase), interaction(directions(16, 16)), vector(directions(16, 17))
+    dr.eval(mei, wo)
+    hits = []
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+        for g, alpha in ((0.1, 0.5), (0.2, 0.7)):
+            params["g"], params["alpha"] = g, alpha
+            params.update()
+            dr.kernel_history_clear()
+            dr.eval(phase.eval_pdf(mi.PhaseFunctionContext(), mei, wo)[0])
+            hits.append([k["cache_hit"] for k in dr.kernel_history([dr.KernelType.JIT])])
+    assert hits[1] == [True]
+
+
 @pytest.mark.parametrize("name", ["draine", "table", "mixture"])
 def test_gradient_of_a_recording(name):
     """Update, render and reverse pass in one recording, as without one."""
