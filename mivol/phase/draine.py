@@ -51,7 +51,7 @@ def sample_draine(u: mi.Float, g: mi.Float, alpha: mi.Float) -> Turn:
     .. math:: u = v\,\frac{1 + \alpha [1 - (1 + g) y + (1 + g)^2 y^2/3 - g (1 + g) y^3/12]}{1 + \alpha (1 + 2 g^2)/3},
               \qquad \frac{du}{dv} = \frac{1 + \alpha c^2}{1 + \alpha (1 + 2 g^2)/3}.
 
-    Error: 1e-6 of the probability.
+    Error: u is met to 1.2e-6 (10 roundings of 1), for alpha up to 1e9.
     Cost: 16 Newton steps between brackets, without memory access.
     """
     back = g < 0

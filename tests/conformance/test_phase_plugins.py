@@ -166,6 +166,8 @@ def test_xml(variant, tmp_path):
     for kind, inner in scenes.items():
         phase = mi.load_string(f'<phase version="3.0.0" type="{kind}">{inner}</phase>')
         assert kind in str(phase)
+    tensor = mi.load_dict({"type": "mivol_tabulated", "values": mi.TensorXf([0.0, 1.0, 2.0, 1.0]), "cosines": "-1, 0, 0.5, 1"})
+    assert np.array_equal(np.array(mi.traverse(tensor)["values"]), [0, 1, 2, 1])
     # Beside the table: value 1 at 90 degrees, over 2 pi times the integral (3 + 2 1 + 2)/2.
     value, _ = value_and_pdf(
         mi.load_string(f'<phase version="3.0.0" type="mivol_tabulated">{scenes["mivol_tabulated"]}</phase>'),
@@ -218,6 +220,21 @@ def test_switching_variants_in_one_process():
             a, b = directions(64, 5), directions(64, 6)
             got = value_and_pdf(mi.load_dict(given), interaction(a), vector(b))[0]
             assert np.array_equal(reference.setdefault((name, key), got), got)
+
+
+def test_spectral_and_polarised_variants():
+    """What is grey there as well: the same numbers, in each wavelength and on the diagonal."""
+    a, b = directions(16, 18), directions(16, 19)
+    for key, given in PHASES.items():
+        results = []
+        for name in ("llvm_ad_rgb", "llvm_ad_spectral", "llvm_ad_mono_polarized"):
+            mi.set_variant(name)
+            value, pdf = mi.load_dict(given).eval_pdf(mi.PhaseFunctionContext(), interaction(a), vector(b))
+            grey = np.array(value[0][0][0] if mi.is_polarized else value[0])
+            assert np.array_equal(grey, np.array(pdf)), key
+            results.append(grey)
+        assert np.array_equal(results[0], results[1])
+        assert np.array_equal(results[0], results[2])
 
 
 # -- Volumes as parameters ---------------------------------------------------------------------------------------------------
