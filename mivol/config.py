@@ -68,7 +68,7 @@ class Rendered(Section, tag_field="source", tag="render"):
 class Files(Section, tag_field="source", tag="files"):
     """References from OpenEXR files, one per view."""
 
-    paths: Annotated[tuple[str, ...], of("path", "files in the order of the views", min_length=1)]
+    paths: Annotated[tuple[str, ...], of("path", "files in the order of the views, then of those held out", min_length=1)]
     scene: Annotated[str, of("path", "XML that they are references of; empty: the scene's")] = ""
     held_out: Annotated[tuple[int, ...], of("view", "views that are compared but not fitted")] = ()
 
@@ -81,7 +81,9 @@ class Sought(Section):
     domain: Annotated[tuple[float, float], of("unit", "smallest and largest value")] = (0.0, INFINITY)
     map: Annotated[str, of("1", "what the optimiser moves: key of MAPS")] = "identity"
     lr: Annotated[float, of("unit", "typical change per step, in the map's reals", gt=0)] = 0.1
-    start: Annotated[float | None, of("unit", "constant start; absent: what the scene holds")] = None
+    start: Annotated[
+        float | tuple[float, ...] | None, of("unit", "start: one number for all, or each; absent: what the scene holds")
+    ] = None
     start_file: Annotated[str, of("path", "volume to start from; empty: start")] = ""
     shape: Annotated[tuple[int, int, int] | None, of("voxel", "(Z, Y, X) of a constant start")] = None
     prior: Annotated[
@@ -98,6 +100,7 @@ class Fit(Section):
 
     iterations: Annotated[int, of("iteration", "at most so many", ge=1)] = 100
     spp: Annotated[int, of("sample/pixel", "samples of an image and of its derivative", ge=1)] = 16
+    spp_shown: Annotated[int, of("sample/pixel", "samples of images that are compared or kept; 0: as spp", ge=0)] = 0
     samples_per_pass: Annotated[int, of("sample", "most samples in one kernel: Ctrl-C waits for one", ge=1)] = 1 << 20
     max_depth: Annotated[int, of("1", "as Mitsuba's volpath; -1 is unlimited", ge=-1)] = 6
     integrator: Annotated[str, of("1", "Mitsuba integrator that differentiates", min_length=1)] = "mivol"
@@ -110,6 +113,9 @@ class Experiment(Section):
     scene: Annotated[Scene, of("1", "what is rendered")]
     parameter: Annotated[tuple[Sought, ...], of("1", "what is looked for", min_length=1)]
     views: Annotated[Ring | Hemisphere | LookAts | SceneSensors, of("1", "where it is seen from")] = SceneSensors()
+    held_out: Annotated[
+        Ring | Hemisphere | LookAts | SceneSensors | None, of("1", "more views, after the others: compared but not fitted")
+    ] = None
     reference: Annotated[Rendered | Files, of("1", "what was seen")] = Rendered()
     truth: Annotated[Truth | None, of("1", "what the references show, where known")] = None
     fit: Annotated[Fit, of("1", "how long and how finely")] = Fit()

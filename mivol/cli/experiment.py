@@ -200,15 +200,18 @@ def references(chosen: Experiment, base: Path, folder: Path, loaded: LoadedScene
     Raises:
         MivolError: no views, held-out views that are not there, files that do not fit.
     """
-    sensors = chosen.views.sensors(loaded.scene)
-    check_sizes({f"view {index}": camera_of(sensor) for index, sensor in enumerate(sensors)})
+    sensors = list(chosen.views.sensors(loaded.scene))
+    more = list(chosen.held_out.sensors(loaded.scene)) if chosen.held_out is not None else []
     check_held_out(chosen.reference.held_out, len(sensors))
+    held_out = (*chosen.reference.held_out, *range(len(sensors), len(sensors) + len(more)))
+    sensors += more
+    check_sizes({f"view {index}": camera_of(sensor) for index, sensor in enumerate(sensors)})
     if isinstance(chosen.reference, Files):
-        return read_files(chosen.reference, base, loaded, sensors)
+        return read_files(chosen.reference, base, loaded, sensors, held_out)
     if truth is None:
-        return render_views(chosen, folder, loaded, sensors)
+        return render_views(chosen, folder, loaded, sensors, held_out)
     with holding(loaded.scene, chosen.truth.key, truth):
-        return render_views(chosen, folder, load_scene(loaded.scene), sensors)
+        return render_views(chosen, folder, load_scene(loaded.scene), sensors, held_out)
 
 
 def camera_of(sensor: dict | mi.Sensor) -> mi.Sensor:
@@ -229,7 +232,9 @@ def check_held_out(held_out: Sequence[int], count: int) -> None:
         raise MivolError(f"all {count} views are held out, expected one to fit: shorten reference.held_out.")
 
 
-def render_views(chosen: Experiment, folder: Path, loaded: LoadedScene, sensors: Sequence[Any]) -> Seen:
+def render_views(
+    chosen: Experiment, folder: Path, loaded: LoadedScene, sensors: Sequence[Any], held_out: Sequence[int]
+) -> Seen:
     """References by Mitsuba's path tracer."""
     wanted, cache, seen = chosen.reference, folder / "references", Seen()
     cache.mkdir(exist_ok=True)
@@ -238,7 +243,7 @@ def render_views(chosen: Experiment, folder: Path, loaded: LoadedScene, sensors:
             loaded, cache, max_depth=chosen.fit.max_depth, target_se=wanted.standard_error or None,
             max_spp=wanted.spp, sensor=sensor, seed=wanted.seed, progress=False,
         )  # fmt: skip
-        add_view(seen, index, sensor, made.mean, standard_error(made), wanted.held_out)
+        add_view(seen, index, sensor, made.mean, standard_error(made), held_out)
     return seen
 
 
@@ -251,7 +256,9 @@ def standard_error(made: ReferenceResult) -> np.ndarray:
     return np.sqrt(made.variance + (made.mean.max() / made.spp) ** 2)
 
 
-def read_files(wanted: Files, base: Path, loaded: LoadedScene, sensors: Sequence[Any]) -> Seen:
+def read_files(
+    wanted: Files, base: Path, loaded: LoadedScene, sensors: Sequence[Any], held_out: Sequence[int]
+) -> Seen:
     """References from OpenEXR files; those that mivol wrote must be of the scene that they are said to be of.
 
     Raises:
@@ -265,9 +272,9 @@ def read_files(wanted: Files, base: Path, loaded: LoadedScene, sensors: Sequence
         channels, header = read_exr(base / name)
         if "mivol_reference" in header:
             made = read_reference(base / name, of)
-            add_view(seen, index, sensor, made.mean, standard_error(made), wanted.held_out)
+            add_view(seen, index, sensor, made.mean, standard_error(made), held_out)
         else:
-            add_view(seen, index, sensor, layers(channels)[""][..., :3], None, wanted.held_out)
+            add_view(seen, index, sensor, layers(channels)[""][..., :3], None, held_out)
     return seen
 
 
@@ -318,11 +325,23 @@ def make_start(sought: Sought, base: Path, scene: mi.Scene) -> Start:
         value = read_volume(base / sought.start_file).values
     elif sought.start is not None:
         shape = (*sought.shape, now.shape[3]) if sought.shape else now.shape
-        value = np.full(shape, sought.start, dtype=np.float32)
+        value = np.full(shape, start_of(sought, shape), dtype=np.float32)
     extent = tuple(float(edge) for edge in np.diff(find_box(scene), axis=0)[0, ::-1])
     parameter = Parameter(sought.key, sought.unit, sought.domain, sought.map, sought.lr, extent, sought.prior)
     parameter.to_reals(mi.TensorXf(np.ascontiguousarray(value)))
     return Start(parameter, value)
+
+
+def start_of(sought: Sought, shape: Sequence[int]) -> Any:
+    """The start that the experiment gives: one number, or one for each of the last axis.
+
+    Raises:
+        MivolError: another count of numbers.
+    """
+    given = np.size(sought.start)
+    if given not in (1, shape[-1]):
+        raise MivolError(f"{sought.key} starts from {given} numbers and has {shape[-1]}: give one for all, or one for each.")
+    return sought.start
 
 
 def pose(chosen: Experiment, scene: mi.Scene, integrator: mi.Integrator, starts: Sequence[Start], seen: Seen) -> Problem:
@@ -368,6 +387,7 @@ class Measure:
         self.shots = make_shots(held_out, chosen.fit.samples_per_pass) if held_out else []
         self.truth = truth
         self.key = chosen.truth.key if chosen.truth else ""
+        self.spp = chosen.fit.spp_shown or chosen.fit.spp
 
     def __call__(self, problem: Problem) -> dict[str, float]:
         errors: dict[str, float] = {}
@@ -382,7 +402,7 @@ class Measure:
 
     def psnr(self, problem: Problem, shot: Shot) -> list[float]:
         """PSNR [dB] of each view of a shot, of what the scene holds now."""
-        image = np.asarray(problem.render(shot.sensor, seed_of(problem.seed, 0, 0, HELD_OUT)))
+        image = np.asarray(problem.render(shot.sensor, seed_of(problem.seed, 0, 0, HELD_OUT), self.spp))
         pairs = zip(np.split(image, shot.n_views, 1), np.split(np.asarray(shot.reference), shot.n_views, 1), strict=True)
         return [psnr(render, reference) for render, reference in pairs]
 
@@ -414,7 +434,7 @@ def write_outputs(chosen: Experiment, folder: Path, record: RunRecord, fit: Fit,
         (folder / name).mkdir(exist_ok=True)
     record.notes += fit.log + ([f"stopped early: {fit.run.finished}"] if fit.run.finished else [])
     for number, view in enumerate((*seen.fitted, *seen.held_out)):
-        record.images += write_view(folder, fit.problem, view, seed_of(chosen.seed, 0, number, FINAL), seen)
+        record.images += write_view(chosen, folder, fit.problem, view, seed_of(chosen.seed, 0, number, FINAL), seen)
     for sought in chosen.parameter:
         record.volumes += write_grid(chosen, folder, sought, fit, truth)
     write_curves(folder)
@@ -424,13 +444,20 @@ def write_outputs(chosen: Experiment, folder: Path, record: RunRecord, fit: Fit,
         "iterations": float(fit.next),
         "views": float(len(seen.fitted)),
         "fit_seconds": fit.seconds,
+        **numbers_found(fit),
     }
 
 
-def write_view(folder: Path, problem: Problem, view: View, seed: int, seen: Seen) -> list[Image]:
+def numbers_found(fit: Fit) -> dict[str, float]:
+    """What was found for parameters that are no grids: each number by key and place."""
+    values = {name: np.asarray(value).ravel() for name, value in fit.values().items() if value.ndim != 4}
+    return {f"{name}[{i}]": float(x) for name, value in values.items() for i, x in enumerate(value)}
+
+
+def write_view(chosen: Experiment, folder: Path, problem: Problem, view: View, seed: int, seen: Seen) -> list[Image]:
     """One view: the render beside its reference."""
     stem = f"views/{view.name.replace(' ', '_')}"
-    image = np.asarray(problem.render(view.sensor, seed))
+    image = np.asarray(problem.render(view.sensor, seed, chosen.fit.spp_shown or None))
     reference = np.asarray(view.reference)
     error = seen.standard_errors.get(view.name)
     parts = {"render": ("", image), "reference": ("reference", reference)}

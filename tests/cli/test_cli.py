@@ -18,6 +18,7 @@ from fit_scene import KEY
 from mivol.cli import VERBS, main
 from mivol.fields.procedural import PROCEDURAL, make_procedural
 from mivol.files import atomic, read_exr, read_volume, write_exr, write_volume
+from mivol.optim.problem import Problem
 from mivol.validate.statistics import nrmse
 
 SCENE = """<scene version="3.0.0">
@@ -229,6 +230,49 @@ def test_references_from_files(variant_rgb, folder: Path, capsys: pytest.Capture
     assert "reference of another scene" in said
     right = ["--set", 'reference={source="files", paths=["d.exr"], scene="other.xml"}']
     assert run("optimize", folder / "fit.toml", "-o", folder / "run", *changes, *right) == 0
+
+
+def test_views_that_are_held_out_come_after_the_others(variant_rgb, folder: Path) -> None:
+    """A rig of their own: none of its views is fitted, all of them are compared, and their files follow the others'."""
+    (folder / "d.exr").write_bytes((folder / "c.exr").read_bytes())
+    files = 'reference={source="files", paths=["a.exr", "b.exr", "c.exr", "d.exr"], held_out=[0]}'
+    more = 'held_out={rig="ring", count=1, width=8, height=8, elevation=40}'
+    assert run("optimize", folder / "fit.toml", "-o", folder / "run", "--set", files, "--set", more) == 0
+    record = json.loads((folder / "run" / "run.json").read_text())
+    assert {image["view"] for image in record["images"] if image.get("held_out")} == {"view 0", "view 3"}
+    assert {image["view"] for image in record["images"] if not image.get("held_out")} == {"view 1", "view 2"}
+    assert record["results"]["views"] == 2
+
+
+def test_images_that_are_compared_may_have_more_samples(
+    variant_rgb, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Four samples in each image of the fit, 32 in what is compared with held-out views and in what is kept."""
+    asked, render = [], Problem.render
+
+    def listen(self: Problem, sensor: mi.Sensor, seed: int, spp: int | None = None) -> mi.TensorXf:
+        asked.append(spp or self.spp)
+        return render(self, sensor, seed, spp)
+
+    monkeypatch.setattr(Problem, "render", listen)
+    flags = ["--set", "fit.spp=4", "--set", "fit.spp_shown=32", "--set", "fit.iterations=1"]
+    assert run("optimize", folder / "fit.toml", "-o", folder / "run", *flags) == 0
+    # An evaluation, the step, an evaluation, and three views that are kept.
+    assert asked == [32, 4, 32, 32, 32, 32]
+
+
+def test_a_colour_is_looked_for_from_a_start_of_its_own(
+    variant_rgb, folder: Path, capsys: pytest.CaptureFixture
+) -> None:
+    """Each number of what is no grid has its start, and is among the results; steps of 1e-6 leave it there."""
+    coloured = '<emitter type="constant" id="sky"><rgb name="radiance" value="0.9, 0.8, 0.7"/></emitter>'
+    (folder / "scene.xml").write_text(SCENE.replace('<emitter type="constant"/>', coloured))
+    flags = ["optimize", folder / "fit.toml", "-o", folder / "run", "--set", "fit.iterations=1", "--set", "event=[]"]
+    sought = 'parameter=[{key="sky.radiance.value", lr=1e-6, start=[0.5, 0.25, 0.125]}]'
+    assert run(*flags, "--set", sought) == 0
+    results = json.loads((folder / "run" / "run.json").read_text())["results"]
+    assert np.allclose([results[f"sky.radiance.value[{i}]"] for i in range(3)], [0.5, 0.25, 0.125], atol=2e-6)
+    assert "starts from 2 numbers and has 3" in refused(capsys, *flags, "--set", sought.replace(", 0.125", ""))
 
 
 def test_the_fit_does_not_start_at_the_truth(variant_rgb, folder: Path) -> None:
