@@ -99,13 +99,14 @@ class Survey:
     places: dict = field(default_factory=dict)
 
 
-def find_needs(scene: mi.Scene, sensor: mi.Sensor, survey: Survey | None = None) -> Needs:
+def find_needs(scene: mi.Scene, sensor: mi.Sensor, survey: Survey | None = None, spp: int = 0) -> Needs:
     """Ask a scene what it needs.
 
     Args:
         scene: a loaded scene.
         sensor: the one to render from.
         survey: an earlier survey of the same scene, to save finding what cannot have changed.
+        spp: samples a pixel; 0 for the sampler's own count.
 
     Raises:
         MivolError: a variant or a medium that mivol does not render.
@@ -127,7 +128,7 @@ def find_needs(scene: mi.Scene, sensor: mi.Sensor, survey: Survey | None = None)
         start=sensor.get_medium(),
         camera_inside=_camera_inside(scene, sensor, survey),
         parameters=tuple(k for k, v in mi.traverse(scene) if dr.is_diff_v(v) and dr.grad_enabled(v)),
-        film_samples=int(np.prod(sensor.film().crop_size())) * sensor.sampler().sample_count(),
+        film_samples=int(np.prod(sensor.film().crop_size())) * (spp or sensor.sampler().sample_count()),
     )
 
 

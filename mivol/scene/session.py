@@ -18,6 +18,7 @@ from mivol.scene.plan import Plan, build_world, check_aovs, make_plan
 from mivol.transport.aovs import backproject_aovs, integrate_aovs, push_aovs
 from mivol.transport.control import View, find_control
 from mivol.transport.film import Rays, adjoint_rays, record
+from mivol.transport.light_grid import find_shade
 from mivol.transport.path import Settings, walk_path
 from mivol.transport.score import Adjoint, Primal, Tangent
 from mivol.transport.world import World
@@ -65,7 +66,7 @@ class Session:
             raise MivolError("develop=False was asked for; mivol returns the developed image: leave it at True.")
         sensor = find_sensor(scene, sensor)
         with dr.suspend_grad():
-            world, plan = self._open(scene, sensor)
+            world, plan = self._open(scene, sensor, spp)
             image = record(sensor, seed, spp, plan.pass_rays, self.aovs, lambda rays: self._primal(scene, world, rays))
         if evaluate:
             dr.eval(image)
@@ -76,7 +77,7 @@ class Session:
         sensor = find_sensor(scene, sensor)
         with dr.suspend_grad():
             with dr.resume_grad():
-                world, plan = self._open(scene, sensor)
+                world, plan = self._open(scene, sensor, spp)
                 world.start_tangent()
             return record(sensor, seed, spp, plan.pass_rays, self.aovs, lambda rays: self._tangent(scene, world, rays))
 
@@ -88,7 +89,7 @@ class Session:
         sensor = find_sensor(scene, sensor)
         with dr.suspend_grad():
             with dr.resume_grad():
-                world, plan = self._open(scene, sensor)
+                world, plan = self._open(scene, sensor, spp)
             world.start_gradients()
             for rays, dL, daovs in adjoint_rays(sensor, seed, spp, plan.pass_rays, self.aovs, grad_in):
                 self._replay(scene, world, rays, dL, daovs)
@@ -99,18 +100,22 @@ class Session:
     def sample(self, scene: mi.Scene, sampler: mi.Sampler, ray: mi.Ray3f, active: mi.Bool) -> tuple:
         """Radiance along given rays, for integrators that nest this one."""
         with dr.suspend_grad():
-            world, _ = self._open(scene, find_sensor(scene, 0))
+            world, _ = self._open(scene, find_sensor(scene, 0), 1)
             score, valid = walk_path(scene, world, self.settings, sampler, ray, Primal(_black(ray)), active)
             return score.L, valid, integrate_aovs(scene, world, ray, self.aovs, active)
 
-    def _open(self, scene: mi.Scene, sensor: mi.Sensor) -> tuple[World, Plan]:
+    def _open(self, scene: mi.Scene, sensor: mi.Sensor, spp: int) -> tuple[World, Plan]:
         """Ask, plan, and build the media."""
         if self._seen is None or self._seen.scene is not scene:
             self._seen = _Seen(scene, survey_scene(scene))
         survey = self._seen.survey
-        needs = find_needs(scene, sensor, survey)
+        needs = find_needs(scene, sensor, survey, spp)
         plan = make_plan(needs, self.settings)
-        return build_world(scene, needs, plan, self.settings, survey), plan
+        world = build_world(scene, needs, plan, self.settings, survey)
+        if world.lights is not None:
+            with dr.suspend_grad():
+                world.shade = find_shade(scene, world, needs.film_samples)
+        return world, plan
 
     def _primal(self, scene: mi.Scene, world: World, rays: Rays) -> tuple:
         score, valid = walk_path(scene, world, self.settings, rays.sampler, rays.ray, Primal(_black(rays.ray)))

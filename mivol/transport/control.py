@@ -20,7 +20,6 @@ from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
 from mivol.transport.direct import Draw, arrivals
 from mivol.transport.free_flight import taken_light
@@ -115,7 +114,7 @@ def find_control(scene: mi.Scene, world: World, body: Body, view: View) -> Contr
     rows = [interpolate([dr.gather(mi.Float, c, k) for k in corner], frac) for c in coarse]
     if isinstance(body.view.share, mi.Volume):
         u = mi.Vector3f(*(mi.Float(c) / m for c, m in zip(cell[::-1], lattice.res[::-1], strict=True)))
-        share = albedo(body, _at(_place(lattice, u), mi.Vector3f(0, 0, 1)), mi.Bool(True))
+        share = albedo(body, _at(lattice.place(u), mi.Vector3f(0, 0, 1)), mi.Bool(True))
     else:
         share = albedo(body, dr.zeros(mi.MediumInteraction3f), mi.Bool(True))
     rows = _merge_equal([row * dr.detach(share[c]) for c, row in enumerate(rows)])
@@ -136,7 +135,7 @@ def _light_of_nodes(
     node, turn = lane // DIRECTIONS, mi.Float(lane % DIRECTIONS)
     at = [node % x, (node // x) % y, node // (x * y)]
     u = mi.Vector3f(*(mi.Float(a) / (k - 1) for a, k in zip(at, (x, y, z), strict=True)))
-    p = _place(lattice, u)
+    p = lattice.place(u)
     mei = _at(p, view.towards(p))
     mei.medium = dr.select(dr.full(mi.Bool, True, dr.width(lane)), mi.MediumPtr(body.view.medium), None)
     # A lattice of rank 1 (Cranley-Patterson: shifted for each node by its number) over the directions of a node.
@@ -167,13 +166,6 @@ def _merge_equal(rows: list[mi.Float]) -> list[mi.Float]:
 
 def _fraction(x: mi.Float) -> mi.Float:
     return x - dr.floor(x)
-
-
-def _place(lattice: Lattice, u: mi.Vector3f) -> mi.Point3f:
-    """Points of the unit cube in the world."""
-    m = np.float32(lattice.to_world)
-    rows = [[dr.opaque(mi.Float, float(v)) for v in row] for row in m[:3]]
-    return mi.Point3f(*(dr.fma(r[0], u.x, dr.fma(r[1], u.y, dr.fma(r[2], u.z, r[3]))) for r in rows))
 
 
 def _at(p: mi.Point3f, direction: mi.Vector3f) -> mi.MediumInteraction3f:
@@ -219,10 +211,11 @@ class Tracks:
 
 @dataclass
 class _Sweep:
-    """State of a sweep from the far end: light of S behind (as the camera sees it), optical depth ahead, and tangents."""
+    """State of a sweep from the far end: light of S behind (as the camera sees it), what is ahead, and tangents."""
 
     behind: list[mi.Float]
     ahead: list[mi.Float]
+    T: list[mi.Float]
     change: list[mi.Float]
 
 
@@ -282,7 +275,7 @@ def _pass(
         half = dr.select(on, 0.5 * cell.dt, 0)
         own = world.rows([half * (a + b) for a, b in field.along(cell.corners[:1], points)])
         near = [dr.maximum(a - o, 0) for a, o in zip(state.ahead, own, strict=True)]
-        T_out, T_in = [dr.exp(-a) for a in state.ahead], [dr.exp(-n) for n in near]
+        T_out, T_in = state.T, [dr.exp(-n) for n in near]
         taken = [taken_light(o, i, t) for o, i, t in zip(own, T_in, T_out, strict=True)]
         S = control.at(cell.lower, on)
         in_front = leave - (cell.s + 0.5 * cell.dt) < probe.begin
@@ -301,10 +294,10 @@ def _pass(
             a, b = (node_weights(p, cell, lattice.res) for p in points)
             row = [half * (x + y) for x, y in zip(a, b, strict=True)]
             body.add_to_grid(part, cell.lower, [(slopes, row)], on)
-        return _Sweep(behind, near, change)
+        return _Sweep(behind, near, T_in, change)
 
     zero = [dr.zeros(mi.Float, dr.width(ray)) for _ in tracks.shares]
-    state = _Sweep(zero, [mi.Float(t) for t in tau], list(zero))
+    state = _Sweep(zero, [mi.Float(t) for t in tau], [dr.exp(-t) for t in tau], list(zero))
     return walk(lattice, segment, visit, state, reads, active).change
 
 

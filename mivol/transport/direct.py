@@ -19,9 +19,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mivol.transport.free_flight import Focus
+from mivol.transport.free_flight import Focus, Lamp
+from mivol.transport.lamp_motion import tau_by_end
 from mivol.transport.path import Way, optical_depth_to, power_heuristic, shadow_ray, transmittance
-from mivol.transport.world import World
+from mivol.transport.world import World, spectrum
 
 __all__ = ["Arrival", "Draw", "Lights", "arrivals"]
 
@@ -40,14 +41,6 @@ class Draw:
     lobe: mi.Float
     turn: mi.Point2f
     choice: mi.Float
-
-
-@dataclass
-class Lamp:
-    """The lamp that was drawn for each lane: the emitter, and where it is as seen from the ray."""
-
-    emitter: mi.EmitterPtr
-    focus: Focus | None
 
 
 class Lights:
@@ -95,7 +88,7 @@ class Lights:
                 x, y, z, r = ball
                 centre = dr.select(here, mi.Point3f(x, y, z), centre)
                 radius2, finite = dr.select(here, dr.square(r), radius2), here | finite
-        return Lamp(emitter, _focus(ray, centre, radius2, finite) if self.is_near else None)
+        return Lamp(index, emitter, _focus(ray, centre, radius2, finite) if self.is_near else None)
 
 
 def _ball(emitter: mi.Emitter) -> list[float] | None:
@@ -166,10 +159,29 @@ def _from_lamp(
         w_mis = dr.select(direct.delta, 1, power_heuristic(pdf, pdf_lobe))
     dim = transmittance(tau) * (w_mis * len(lights.drawn))
     with dr.resume_grad(when=attached):
-        f, _ = phase.eval_pdf(_context(), mei, direct.d, on)
-        source = lamp.emitter.eval_direction(mei, direct, on) / direct.pdf if attached else weight
+        moved = _follow(lamp, mei, draw, direct, on) if attached else direct
+        f, _ = phase.eval_pdf(_context(), mei, moved.d, on)
+        source = lamp.emitter.eval_direction(mei, moved, on) / direct.pdf if attached else weight
+        if attached and dr.grad_enabled(moved.p):
+            # The factor is 1; its derivative is that of the shadow, whose end moves with the lamp.
+            slopes = tau_by_end(world, way, tau, on & clear)
+            source = source * spectrum([1 - dr.dot(s, moved.p - dr.detach(moved.p)) for s in slopes])
         value = dr.select(on & clear, dim * f * source, 0)
     return Arrival(way, value, on & clear)
+
+
+def _follow(
+    lamp: Lamp, mei: mi.MediumInteraction3f, draw: Draw, direct: mi.DirectionSample3f, on: mi.Bool
+) -> mi.DirectionSample3f:
+    """The direction of a lamp of one position or direction, with the derivative of its place."""
+    moved, _ = lamp.emitter.sample_direction(mei, draw.emitter, on)
+    if not dr.grad_enabled(moved.p):
+        return direct
+    moved.p = dr.select(direct.delta, moved.p, direct.p)
+    moved.d = dr.select(direct.delta, moved.d, direct.d)
+    moved.dist = dr.select(direct.delta, moved.dist, direct.dist)
+    moved.n, moved.uv, moved.pdf = direct.n, direct.uv, direct.pdf
+    return moved
 
 
 def _from_lobe(

@@ -28,7 +28,7 @@ from mivol.transport.optical_depth import gauss_points
 from mivol.transport.path import Visit
 from mivol.transport.world import Body, World
 
-__all__ = ["Event", "Focus", "Pick", "offer", "place", "start_pick", "taken_light"]
+__all__ = ["Event", "Focus", "Lamp", "Pick", "offer", "place", "start_pick", "taken_light"]
 
 NEWTON_STEPS = 8
 """Each doubles the digits; where the extinction vanishes at an end they are halvings, and 2^-8 of a cell holds no light."""
@@ -61,6 +61,15 @@ class Focus:
         """Density of :meth:`sample` at a distance ``t`` from ``a`` [1/length]."""
         r2 = dr.square(self.rho) + dr.square((a - self.t0) + t)
         return self.rho * dr.rcp(r2 * self.angle(a, dt))
+
+
+@dataclass
+class Lamp:
+    """The lamp that was drawn for each lane: its number, the emitter, and where it is (None: all are at infinity)."""
+
+    number: mi.UInt32
+    emitter: mi.EmitterPtr
+    focus: Focus | None
 
 
 @dataclass
@@ -101,13 +110,13 @@ def start_pick(world: World, u: mi.Float, width: int) -> Pick:
     return Pick(tau, T, *zero[:5], front, zero[5], dr.zeros(mi.UInt32, width), dr.zeros(mi.Bool, width), seed)
 
 
-def offer(world: World, ray: mi.Ray3f, focus: Focus | None, kappa: float) -> Visit:
+def offer(world: World, ray: mi.Ray3f, lamp: Lamp, kappa: float) -> Visit:
     """The visitor that sums optical depth and offers every piece of a ray to a :class:`Pick`.
 
     Args:
         world: the media.
         ray: world space, unit direction.
-        focus: the lamp that was chosen for each lane; None where all light comes from infinity.
+        lamp: the lamp that was chosen for each lane.
         kappa: optical depth to add evenly over each body, for probes of derivatives; 0 for an image.
 
     Cost: as an optical depth, with one exponential and one random number a cell (measured: 1.7 times its time).
@@ -115,7 +124,7 @@ def offer(world: World, ray: mi.Ray3f, focus: Focus | None, kappa: float) -> Vis
     numbers = {id(body): index for index, body in enumerate(world.bodies)}
 
     def visit(pick: Pick, body: Body, t0: mi.Float, t1: mi.Float, on: mi.Bool) -> Pick:
-        pick = _fly(world, body, ray, mi.Float(t0), mi.Float(t1), focus, kappa, pick, on)
+        pick = _fly(world, body, ray, mi.Float(t0), mi.Float(t1), lamp, kappa, pick, on)
         pick.body = dr.select(pick.fresh, numbers[id(body)], pick.body)
         pick.fresh = dr.zeros(mi.Bool, dr.width(pick.fresh))
         others = [p for p in body.view.parts if not any(p is q for q in body.flight)]
@@ -134,7 +143,7 @@ def _fly(
     ray: mi.Ray3f,
     t0: mi.Float,
     t1: mi.Float,
-    focus: Focus | None,
+    lamp: Lamp,
     kappa: float,
     pick: Pick,
     on: mi.Bool,
@@ -150,7 +159,7 @@ def _fly(
         dt = dr.maximum(b - a, 0)
         # A ray that misses the medium may be infinitely long.
         tau = [dr.select(on & (s != 0), s * dt, 0) for s in world.rows(field.constant)]
-        return _offer_piece(pick, a, mi.Float(0), dt, tau, focus, spread, on & (dt > 0))
+        return _offer_piece(pick, a, mi.Float(0), dt, tau, lamp.focus, None, spread, on & (dt > 0))
 
     if segment is None:
         pick = add_constant(pick, t0, t1)
@@ -162,7 +171,8 @@ def _fly(
     def visit(pick: Pick, cell: Cell, full: mi.Bool) -> Pick:
         half = dr.select(full, 0.5 * cell.dt, 0)
         tau = world.rows([half * (a + b) for a, b in field.along(cell.corners, list(gauss_points(cell)))])
-        return _offer_piece(pick, segment.t0, cell.s, cell.dt, tau, focus, spread, full)
+        lit = None if world.shade is None else world.shade.at(cell.lower, lamp.number, full)
+        return _offer_piece(pick, segment.t0, cell.s, cell.dt, tau, lamp.focus, lit, spread, full)
 
     if field.has_constants:
         pick = add_constant(pick, t0, dr.select(hit, segment.t0, t1))
@@ -183,6 +193,7 @@ def _offer_piece(
     dt: mi.Float,
     tau: list[mi.Float],
     focus: Focus | None,
+    lit: mi.Float | None,
     spread: mi.Float | None,
     on: mi.Bool,
 ) -> Pick:
@@ -196,6 +207,8 @@ def _offer_piece(
             weight += 0.5 * spread * dt * (T + T_out)
     if focus is not None:
         weight *= focus.mean(begin + s, dt)
+    if lit is not None:
+        weight *= lit
     # A piece of length 0 has a NaN for its mean angle; a weight beyond float32 would be kept for ever.
     weight = dr.select(on & (dt > 0) & (weight < 1e30), weight, 0)
     chance, u = _next(pick.chance)

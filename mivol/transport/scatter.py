@@ -19,7 +19,7 @@ import mitsuba as mi
 from mivol.transport.direct import Arrival, arrivals
 from mivol.transport.free_flight import Event, offer, place, start_pick
 from mivol.transport.path import Reach, Stretch, optical_depth_to, reach, transmittance
-from mivol.transport.world import Body, World
+from mivol.transport.world import Body, World, spectrum
 
 __all__ = ["Scattering", "at_event", "scatter"]
 
@@ -72,7 +72,7 @@ def scatter(
     kappa, draw, ray = KAPPA if probes else 0.0, stretch.draw, stretch.ray
     lamp = world.lights.choose(ray, draw.lamp)
     pick = start_pick(world, draw.piece, dr.width(ray))
-    end, pick = reach(scene, world, ray, stretch.medium, offer(world, ray, lamp.focus, kappa), pick, active)
+    end, pick = reach(scene, world, ray, stretch.medium, offer(world, ray, lamp, kappa), pick, active)
     event = place(world, ray, pick, lamp.focus, kappa, draw.inside, active & stretch.scatters)
     mei = _interaction(world, ray, event)
     tau = event.tau
@@ -109,11 +109,6 @@ def sigma_t_at(world: World, body: Body, ray: mi.Ray3f, event: Event, on: mi.Boo
     """The extinction [1/length] at an event."""
     rows = event.sigma_t if world.is_single else body.extinction_at(ray, event.t, world.channels, on)
     return spectrum(rows)
-
-
-def spectrum(rows: list[mi.Float]) -> mi.Spectrum:
-    """One number for each channel of the world as a spectrum."""
-    return mi.Spectrum(*rows) if len(rows) == 3 else mi.Spectrum(rows[0])
 
 
 def _sigma_s(world: World, ray: mi.Ray3f, event: Event, mei: mi.MediumInteraction3f) -> mi.Spectrum:

@@ -24,8 +24,8 @@ import mitsuba as mi
 
 from mivol.transport.control import Probe, Tracks, sweep
 from mivol.transport.path import Reach, Stretch, Visit, Way, optical_depth_to, reach, visit_boxes
-from mivol.transport.scatter import Scattering, albedo, at_event, scatter, sigma_t_at, spectrum
-from mivol.transport.world import Body, World
+from mivol.transport.scatter import Scattering, albedo, at_event, scatter, sigma_t_at
+from mivol.transport.world import Body, World, spectrum
 
 __all__ = ["Adjoint", "Primal", "Tangent", "revisit"]
 
@@ -79,7 +79,8 @@ class Adjoint:
             _pull_arrivals(scene, world, event, self.dL)
             _pull_albedo(world, stretch.ray, event, self.dL)
             if world.control is not None:
-                shares = _sums(self.dL * stretch.beta, world.channels, world.control.channels)
+                lit = dr.select(stretch.scatters, self.dL * stretch.beta, 0)
+                shares = _sums(lit, world.channels, world.control.channels)
                 _sweep(world, stretch, end, tau, event, shares, self.dL * self.L, self.dL, False, active)
                 return end, tau, self
             _pull_source(scene, world, stretch, event, self.dL)
@@ -131,7 +132,8 @@ class Tangent:
             dL += _push_arrivals(scene, world, event) + _push_albedo(world, stretch.ray, event)
             if world.control is not None:
                 one, of = mi.Spectrum(1), world.control.channels
-                shares = [[(c % of, b)] for c, b in enumerate(_colours(stretch.beta))]
+                lit = dr.select(stretch.scatters, stretch.beta, 0)
+                shares = [[(c % of, b)] for c, b in enumerate(_colours(lit))]
                 dL += mi.Spectrum(*_sweep(world, stretch, end, tau, event, shares, 0 * one, one, True, active))
             else:
                 dL += _push_source(scene, world, stretch, event)

@@ -21,6 +21,7 @@ from mivol.transport.optical_depth import Gradient, backproject_segment, integra
 if TYPE_CHECKING:
     from mivol.transport.control import Control
     from mivol.transport.direct import Lights
+    from mivol.transport.light_grid import Shade
 
 __all__ = ["Body", "World"]
 
@@ -115,18 +116,20 @@ class Body:
     def _at(self, ray: mi.Ray3f, t: mi.Float, channels: int, active: mi.Bool, pairs: list[tuple]) -> list[mi.Float]:
         total = [mi.Float(0) for _ in range(channels)]
         for part, value in pairs:
-            value = dr.detach(value)
-            if part.lattice is None:
-                rows = [value] if part.channels == 1 else [value.x, value.y, value.z]
-            else:
-                cell, frac, inside = locate(part.lattice, ray.o, ray.d, t)
-                nodes, on = box_nodes(cell, _upward(), part.lattice.res), inside & active
-                rows = [
-                    interpolate([dr.gather(mi.Float, value, n * part.channels + c, on) for n in nodes], frac)
-                    for c in range(part.channels)
-                ]
+            rows = self.values_at(part, ray, t, active, dr.detach(value))
             total = [a + b for a, b in zip(total, as_rows(rows, channels), strict=True)]
         return [self.area(ray.d) * t for t in total]
+
+    def values_at(
+        self, part: Part, ray: mi.Ray3f, t: mi.Float, active: mi.Bool, value: mi.Float | mi.Color3f | None = None
+    ) -> list[mi.Float]:
+        """Each channel of a part (or of a tangent of it, ``value``) at a point of a ray, without the medium's scale."""
+        value = dr.detach(_values(part)) if value is None else value
+        if part.lattice is None:
+            return [value] if part.channels == 1 else [value.x, value.y, value.z]
+        cell, frac, inside = locate(part.lattice, ray.o, ray.d, t)
+        nodes, on, n = box_nodes(cell, _upward(), part.lattice.res), inside & active, part.channels
+        return [interpolate([dr.gather(mi.Float, value, k * n + c, on) for k in nodes], frac) for c in range(n)]
 
     def add_to_grid(self, part: Part, lower: mi.Vector3i, terms: list[tuple], active: mi.Bool) -> None:
         """Add to the gradient of a grid, in one packet for each channel, at the cell behind a node.
@@ -189,6 +192,7 @@ class World:
         self.scatters, self.is_veiled, self.start, self.locates = scatters, is_veiled, start, locates
         self.lights = lights
         self.control: Control | None = None
+        self.shade: Shade | None = None
 
     @property
     def takes_control(self) -> bool:
@@ -215,6 +219,11 @@ class World:
     def rows(self, values: list[mi.Float]) -> list[mi.Float]:
         """Numbers of a grey or rgb body, for each channel of the world."""
         return as_rows(values, self.channels)
+
+    def vectors(self, values: list[mi.Vector3f]) -> list[mi.Vector3f]:
+        """Vectors of a grey or rgb body, for each channel of the world."""
+        axes = [self.rows([v[a] for v in values]) for a in range(3)]
+        return [mi.Vector3f(*v) for v in zip(*axes, strict=True)]
 
     def medium_at(self, scene: mi.Scene, ray: mi.Ray3f) -> mi.MediumPtr:
         """The medium around the origin of camera rays."""
@@ -258,6 +267,11 @@ class World:
 
 LUMINANCE = (0.212671, 0.715160, 0.072169)
 """Share of each channel of an rgb field in the one channel of a mono variant (ITU-R BT.709, as in Mitsuba)."""
+
+
+def spectrum(rows: list[mi.Float]) -> mi.Spectrum:
+    """One number for each channel of the world as a spectrum."""
+    return mi.Spectrum(*rows) if len(rows) == 3 else mi.Spectrum(rows[0])
 
 
 def as_rows(values: list[mi.Float], channels: int) -> list[mi.Float]:

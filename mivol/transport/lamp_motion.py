@@ -1,0 +1,137 @@
+r"""How the optical depth of a shadow ray changes as the lamp at its end moves.
+
+.. math:: \frac{\partial \tau}{\partial l} = \frac{\tau}{L}\,\omega + \int_0^L \frac{t}{L} \nabla\sigma\,dt
+          \mp \sum_{faces} \frac{t_f}{L}\,\sigma(t_f) \frac{n}{n \cdot \omega}
+
+for tau from x to l = x + L w: the ray grows, it turns through the field (two Gauss points a cell are exact: t times the
+gradient of a trilinear function is a cubic along a ray), and it enters and leaves a box elsewhere.
+
+Conventions. The upper sign is for a face through which the ray leaves. Media in boxes only: a boundary of another shape is
+found by tracing, which does not tell how its far side lies.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import drjit as dr
+import mitsuba as mi
+
+from mivol.errors import MivolError
+from mivol.transport.lattice import Cell, Lattice, Nodes, Segment, clip, walk
+from mivol.transport.medium import Part
+from mivol.transport.optical_depth import GAUSS, gauss_points
+from mivol.transport.path import Way, visit_boxes
+from mivol.transport.world import Body, World
+
+__all__ = ["tau_by_end"]
+
+
+def tau_by_end(world: World, way: Way, tau: list[mi.Float], active: mi.Bool) -> list[mi.Vector3f]:
+    """Derivative of the optical depth of a shadow ray with respect to its far end.
+
+    Args:
+        world: media, all in boxes.
+        way: the shadow ray; its length is the distance to the lamp.
+        tau: its optical depth, each channel.
+        active: lanes to differentiate.
+
+    Returns:
+        One vector [1/length] for each channel.
+
+    Raises:
+        MivolError: a medium whose boundary has to be traced.
+
+    Cost: one walk of each grid.
+    """
+    if world.traced:
+        raise MivolError(
+            "the derivative of a lamp's place was asked for and a medium has a boundary that is not a box of its own; put the "
+            "medium into a cube that overlaps no other boundary."
+        )
+    d, length = way.ray.d, dr.maximum(way.length, 1e-30)
+
+    def visit(total: list, body: Body, t0: mi.Float64, t1: mi.Float64, on: mi.Bool) -> list:
+        scale = dr.detach(body.view.scale) * body.area(d)
+        for part in body.view.parts:
+            rows = world.vectors([scale * v for v in _by_part(body, part, way, t0, t1, on)])
+            total = [a + b for a, b in zip(total, rows, strict=True)]
+        return total
+
+    zero = [mi.Vector3f(0) for _ in range(world.channels)]
+    turned = visit_boxes(world, way.ray, way.length, visit, zero, active)
+    return [dr.select(active, (d * t + v) / length, 0) for t, v in zip(tau, turned, strict=True)]
+
+
+def _by_part(body: Body, part: Part, way: Way, t0: mi.Float64, t1: mi.Float64, on: mi.Bool) -> list[mi.Vector3f]:
+    """L times the derivative of one part's integral, but for the growth of the ray; one vector a channel."""
+    ray, end = way.ray, mi.Float64(way.length)
+    if part.lattice is None:
+        value = dr.detach(part.constant)
+        each = [value] if part.channels == 1 else [value.x, value.y, value.z]
+        leaving = _face(body.rows, (0.0,) * 3, (1.0,) * 3, ray, t1) if body.box is not None else mi.Vector3f(0)
+        entering = _face(body.rows, (0.0,) * 3, (1.0,) * 3, ray, t0) if body.box is not None else mi.Vector3f(0)
+        shift = dr.select(on & (t0 > 0), entering * mi.Float(t0), 0) - dr.select(on & (t1 < end), leaving * mi.Float(t1), 0)
+        return [v * shift for v in each]
+    lattice = replace(part.lattice, bounds=None)
+    segment = clip(lattice, ray.o, ray.d, t0, t1)
+    a, b = mi.Float64(segment.t0), mi.Float64(segment.t0) + mi.Float64(segment.length)
+    inside = on & (segment.length > 0)
+    vectors = _turn(lattice, part, segment, inside)
+    high = tuple(n - 0.5 for n in lattice.res[::-1])
+    for t, sign, moves in ((b, -1.0, b < end * (1 - 1e-6)), (a, 1.0, a > 0)):
+        here = inside & moves
+        face = _face(lattice.from_world, (-0.5,) * 3, high, ray, t)
+        if body.trims:
+            # The boundary cuts the grid where its own faces are nearer than those of the grid.
+            cut = dr.abs(t - (t1 if sign < 0 else t0)) <= 1e-6 * dr.abs(t)
+            face = dr.select(cut, _face(body.rows, (0.0,) * 3, (1.0,) * 3, ray, t), face)
+        values = body.values_at(part, ray, mi.Float(t), here)
+        vectors = [v + dr.select(here, sign * mi.Float(t) * s * face, 0) for v, s in zip(vectors, values, strict=True)]
+    return vectors
+
+
+def _turn(lattice: Lattice, part: Part, segment: Segment, active: mi.Bool) -> list[mi.Vector3f]:
+    """The integral of t grad(sigma) over a grid, one world vector a channel."""
+    values = dr.detach(part.lattice.values.array)
+
+    def visit(total: list, cell: Cell, on: mi.Bool) -> list:
+        half = dr.select(on, 0.5 * cell.dt, 0)
+        for u, p in zip((GAUSS, 1 - GAUSS), gauss_points(cell), strict=True):
+            t = segment.t0 + cell.s + u * cell.dt
+            slopes = [dr.select(cell.ahead, g, -g) for g in (_slope(c, p) for c in cell.corners[0])]
+            total = [v + (half * t) * g for v, g in zip(total, slopes, strict=True)]
+        return total
+
+    zero = [dr.zeros(mi.Vector3f, dr.width(segment.length)) for _ in range(part.channels)]
+    found = walk(lattice, segment, visit, zero, [Nodes(values, part.channels)], active)
+    rows = [[mi.Float(v) for v in row[:3]] for row in lattice.from_world]
+    return [mi.Vector3f(*(sum(rows[a][k] * g[a] for a in range(3)) for k in range(3))) for g in found]
+
+
+def _slope(c: list[mi.Float], p: mi.Vector3f) -> mi.Vector3f:
+    """The gradient of the trilinear function of 8 corners at a point, in cells."""
+
+    def mix(a: mi.Float, b: mi.Float, t: mi.Float) -> mi.Float:
+        return dr.fma(t, b - a, a)
+
+    dx = mix(mix(c[1] - c[0], c[3] - c[2], p.y), mix(c[5] - c[4], c[7] - c[6], p.y), p.z)
+    x = [mix(c[q], c[q + 1], p.x) for q in (0, 2, 4, 6)]
+    dy = mix(x[1] - x[0], x[3] - x[2], p.z)
+    dz = mix(x[2], x[3], p.y) - mix(x[0], x[1], p.y)
+    return mi.Vector3f(dx, dy, dz)
+
+
+def _face(rows: list, low: tuple, high: tuple, ray: mi.Ray3f, t: mi.Float64) -> mi.Vector3f:
+    """n / (n . w) of the face of a box on which a point of a ray lies."""
+    best, normal = mi.Float64(dr.inf), mi.Vector3f(0)
+    p = [dr.fma(t, mi.Float64(ray.d[a]), mi.Float64(ray.o[a])) for a in range(3)]
+    for row, a, b in zip(rows, low, high, strict=True):
+        q = dr.fma(row[0], p[0], dr.fma(row[1], p[1], dr.fma(row[2], p[2], row[3])))
+        speed = sum(row[k] * mi.Float64(ray.d[k]) for k in range(3))
+        off = dr.minimum(dr.abs(q - a), dr.abs(q - b)) / (b - a)
+        nearer = (off < best) & (speed != 0)
+        inv = dr.rcp(dr.select(speed != 0, speed, 1))
+        normal = dr.select(nearer, mi.Vector3f(*(mi.Float(row[k] * inv) for k in range(3))), normal)
+        best = dr.select(nearer, off, best)
+    return normal
