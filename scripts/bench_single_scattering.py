@@ -8,7 +8,8 @@
 Four kinds of light in five volumes, albedo 0.75, all integrators with ``max_depth`` 2, through ``mi.render``, pictures of
 64 x 64 pixels (point lights: 24 x 24) with a box filter and independent samples. The volumes fill [-1, 1]^3: the smoke of the
 Mitsuba tutorial at its density (x 40); the same upsampled to 256^3, where an exact walk has five times the cells to cross and
-delta tracking nothing more to do; a CT of 256^3; threads in 512^3, 99 % of it empty; a cloud of a large-eddy simulation.
+delta tracking nothing more to do; a CT of 256^3, and threads in 512^3 that leave 99 % of it empty, both with the largest
+extinction of the smoke, so that delta tracking has as many steps to take; a cloud of a large-eddy simulation.
 
 Equal error. The error of an unbiased estimate falls with the root of the time, so variance x time is a number of the method
 alone. Each integrator gets the samples per pixel (a power of two) that take 0.8 s of processor time; then all render in turns,
@@ -37,7 +38,6 @@ from __future__ import annotations
 
 import math
 import sys
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -52,15 +52,20 @@ from contest import (
     Field,
     Timing,
     box_of,
-    clock,
+    constant,
     ct_scan,
     describe,
     judge,
     made_up,
+    plain_ticks,
+    point,
     race,
     ratio_of,
+    samples_for,
     say,
+    scatters_once,
     smoke,
+    sun_and_sky,
     threads_in_space,
 )
 from mivol.files import read_volume
@@ -73,12 +78,10 @@ import mitsuba as mi
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 ALBEDO = 0.75
 OURS = "mivol"
 STOCK = ("volpath", "prbvolpath")
-MOST_SAMPLES = 4096
 FALSE_ALARM = 1e-3
 """Chance that a run in which all means agree is said not to."""
 
@@ -116,31 +119,6 @@ class Light(NamedTuple):
 INSIDE, NEAR = (0.3, -0.5, 0.2), (0.9, -1.3, 1.2)
 
 
-def point(position: tuple[float, float, float]) -> dict:
-    """A point light, and a phase function that knows no direction."""
-    lamp = {"type": "point", "position": list(position), "intensity": {"type": "rgb", "value": [3.0, 2.5, 2.0]}}
-    return {"lamp": lamp, "phase": {"type": "isotropic"}}
-
-
-def sun_and_sky(height: int = 128) -> dict:
-    """An environment map: a sky that brightens upwards, and a sun of 2 degrees' radius that gives a third of the light."""
-    theta, phi = np.meshgrid((np.arange(height) + 0.5) / height * np.pi, np.arange(2 * height) / height * np.pi, indexing="ij")
-    up = np.cos(theta)
-    d = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), up], axis=-1)
-    sky = (0.25 + 0.15 * up)[..., None] * np.array([0.8, 1.0, 1.3])
-    sun = d @ np.array([0.6, 0.48, 0.64]) > math.cos(math.radians(2.0))
-    picture = np.where(sun[..., None], np.array([420.0, 390.0, 330.0]), sky).astype(np.float32)
-    # Mitsuba's maps have y up, the benches z.
-    turned = mi.ScalarTransform4f().rotate([1, 0, 0], 90)
-    lamp = {"type": "envmap", "bitmap": mi.Bitmap(picture), "to_world": turned}
-    return {"lamp": lamp, "phase": {"type": "hg", "g": 0.8}}
-
-
-def constant() -> dict:
-    """Light of radiance 1 from everywhere."""
-    return {"lamp": {"type": "constant"}, "phase": {"type": "isotropic"}}
-
-
 LIGHTS = {
     "constant light": Light(constant, 50),
     "HG 0.8, sun in a sky": Light(sun_and_sky, 30),
@@ -156,10 +134,9 @@ def fine_smoke(size: Size) -> Field:
     return Field(np.array(fine)[..., 0], f"{coarse.origin}, upsampled")
 
 
-def dense_ct(size: Size) -> Field:
-    """A CT of a bonsai with extinctions up to 20 [1/length]."""
-    found = ct_scan(size.fine_res)
-    return Field(10 * found.values, f"{found.origin}, up to 20")
+def as_dense(found: Field) -> Field:
+    """A field with the smoke's largest extinction."""
+    return Field(found.values * np.float32(smoke().values.max() / found.values.max()), f"{found.origin}, as dense as the smoke")
 
 
 def cloud(_: Size) -> Field:
@@ -175,31 +152,13 @@ def cloud(_: Size) -> Field:
 VOLUMES = {
     "smoke": lambda _: smoke(),
     "fine smoke": fine_smoke,
-    "CT": dense_ct,
-    "threads": lambda size: threads_in_space(size.sparse_res),
+    "CT": lambda size: as_dense(ct_scan(size.fine_res)),
+    "threads": lambda size: as_dense(threads_in_space(size.sparse_res)),
     "cloud": cloud,
 }
 
 
 # -- Contests --------------------------------------------------------------------------------------------------------------
-
-
-def integrator(name: str) -> mi.Integrator:
-    """One that scatters once, made anew for each scene: ``prbvolpath`` keeps flags of the first scene it sees."""
-    return mi.load_dict({"type": name, "max_depth": 2, "rr_depth": 64})
-
-
-def samples_for(render: Callable[[int, int], mi.TensorXf], seconds: float) -> int:
-    """Samples per pixel, a power of two, that take so long or less; the seconds are those of all threads."""
-    spp, taken = 4, 0.0
-    clock(lambda seed: render(seed, spp))
-    while True:
-        before = time.process_time()
-        clock(lambda seed, spp=spp: render(seed, spp), spp)
-        taken = time.process_time() - before
-        if taken > seconds / 8 or spp >= MOST_SAMPLES:
-            return int(np.clip(2.0 ** np.floor(np.log2(spp * seconds / taken)), 4, MOST_SAMPLES))
-        spp *= 8
 
 
 def seeing(scene: mi.Scene, light: Light, side: int) -> np.ndarray:
@@ -221,7 +180,7 @@ def contend(values: np.ndarray, light: Light, size: Size, levels: tuple[int, ...
     scene = mi.load_dict(box_of(values, side, ALBEDO, **light.parts()))
     renders, samples = {}, {}
     for number, name in enumerate((OURS, *STOCK)):
-        made = integrator(name)
+        made = scatters_once(name)
 
         def render(seed: int, spp: int, made: mi.Integrator = made, number: int = number) -> mi.TensorXf:
             return mi.render(scene, integrator=made, spp=spp, seed=1000 * number + seed)
@@ -374,13 +333,6 @@ def draw_gains(axes: mpl.axes.Axes, answers: dict, name: str, light: Light) -> N
     axes.set(yticks=rows, yticklabels=list(answers), ylim=(-0.6, len(rows) - 0.4))
     axes.set_xlabel(f"variance x time ({kind} over pixels)")
     plain_ticks(axes.xaxis, "×")
-
-
-def plain_ticks(axis: mpl.axis.Axis, unit: str) -> None:
-    """Few labels, as numbers."""
-    axis.set_major_locator(LogLocator(subs=(1.0, 3.0)))
-    axis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}{unit}"))
-    axis.set_minor_formatter(NullFormatter())
 
 
 BENCH = Bench("bench_single_scattering", __doc__, QUESTIONS, (FULL, QUICK), compare, draw)

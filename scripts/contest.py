@@ -24,9 +24,11 @@ from mivol.files import read_volume, write_whole_text
 from mivol.report.record import describe_machine, versions
 
 import drjit as dr
+import matplotlib as mpl
 import mitsuba as mi
 import msgspec
 import numpy as np
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 ROOT = Path(__file__).resolve().parents[1]
 DATA = Path(os.environ.get("MIVOL_DATA", ROOT.parent / "shared" / "data"))
@@ -36,6 +38,10 @@ TO_WORLD = np.array([[2, 0, 0, -1], [0, 2, 0, -1], [0, 0, 2, -1], [0, 0, 0, 1]],
 
 TUTORIAL_SCALE = 40.0
 """By which the tutorial multiplies its smoke: optical depths up to 65."""
+
+
+MOST_SAMPLES = 4096
+"""Per pixel, of one render."""
 
 
 # -- Clocks ----------------------------------------------------------------------------------------------------------------
@@ -220,6 +226,54 @@ def box_of(values: np.ndarray, side: int, albedo: float = 0.0, **more: dict) -> 
     }
 
 
+def point(position: tuple[float, float, float]) -> dict:
+    """A point light, and a phase function that knows no direction."""
+    lamp = {"type": "point", "position": list(position), "intensity": {"type": "rgb", "value": [3.0, 2.5, 2.0]}}
+    return {"lamp": lamp, "phase": {"type": "isotropic"}}
+
+
+def sun_and_sky(height: int = 128) -> dict:
+    """An environment map: a sky that brightens upwards, and a sun of 2 degrees' radius that gives a third of the light."""
+    theta, phi = np.meshgrid((np.arange(height) + 0.5) / height * np.pi, np.arange(2 * height) / height * np.pi, indexing="ij")
+    up = np.cos(theta)
+    d = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), up], axis=-1)
+    sky = (0.25 + 0.15 * up)[..., None] * np.array([0.8, 1.0, 1.3])
+    sun = d @ np.array([0.6, 0.48, 0.64]) > math.cos(math.radians(2.0))
+    picture = np.where(sun[..., None], np.array([420.0, 390.0, 330.0]), sky).astype(np.float32)
+    # Mitsuba's maps have y up, the benches z.
+    turned = mi.ScalarTransform4f().rotate([1, 0, 0], 90)
+    lamp = {"type": "envmap", "bitmap": mi.Bitmap(picture), "to_world": turned}
+    return {"lamp": lamp, "phase": {"type": "hg", "g": 0.8}}
+
+
+def constant() -> dict:
+    """Light of radiance 1 from everywhere."""
+    return {"lamp": {"type": "constant"}, "phase": {"type": "isotropic"}}
+
+
+def scatters_once(name: str) -> mi.Integrator:
+    """An integrator that scatters once, made anew for each scene: ``prbvolpath`` keeps flags of the first scene it sees."""
+    return mi.load_dict({"type": name, "max_depth": 2, "rr_depth": 64})
+
+
+def samples_for(render: Callable[[int, int], object], seconds: float) -> int:
+    """Samples per pixel, a power of two, that take so long or less.
+
+    Args:
+        render: seed, samples per pixel -> Dr.Jit arrays.
+        seconds: of all threads together.
+    """
+    spp = 4
+    clock(lambda seed: render(seed, spp))
+    while True:
+        before = time.process_time()
+        clock(lambda seed, spp=spp: render(seed, spp), spp)
+        taken = time.process_time() - before
+        if taken > seconds / 8 or spp >= MOST_SAMPLES:
+            return int(np.clip(2.0 ** np.floor(np.log2(spp * seconds / taken)), 4, MOST_SAMPLES))
+        spp *= 8
+
+
 # -- Saying it --------------------------------------------------------------------------------------------------------------
 
 AT_LEAST, AT_MOST = "at least", "at most"
@@ -300,3 +354,10 @@ class Bench(NamedTuple):
         if unknown := set(args.only.split(",")) - set(self.questions):
             parser.error(f"--only: {', '.join(sorted(unknown))} is not a question; known are {', '.join(self.questions)}")
         return args
+
+
+def plain_ticks(axis: mpl.axis.Axis, unit: str) -> None:
+    """Few labels, as numbers."""
+    axis.set_major_locator(LogLocator(subs=(1.0, 3.0)))
+    axis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}{unit}"))
+    axis.set_minor_formatter(NullFormatter())
