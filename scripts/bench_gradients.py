@@ -107,6 +107,7 @@ class Size:
 FULL = Size()
 QUICK = Size(
     name="quick",
+    rounds=5,
     side=12,
     seconds=0.05,
     table_rounds=8,
