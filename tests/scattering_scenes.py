@@ -25,7 +25,7 @@ def rough_grid(seed: int, top: float = 2.0, shape: tuple[int, ...] = (5, 4, 6)) 
 # -- Means of renders --------------------------------------------------------------------------------------------------
 
 
-def moments(scene: mi.Scene, integrator: dict | mi.Integrator, spp: int, batches: int = 32, first: int = 0) -> Moments:
+def moments(scene: mi.Scene, integrator: dict | mi.Integrator, spp: int, batches: int = 16, first: int = 0) -> Moments:
     """Mean and variance of an image over independent renders."""
     integrator = mi.load_dict(integrator) if isinstance(integrator, dict) else integrator
     seeds = range(first, first + batches)
@@ -44,8 +44,8 @@ def volpath(**more: object) -> dict:
 
 def assert_same_images(
     scene: mi.Scene,
-    spp: tuple[int, int] = (16, 64),
-    batches: int = 32,
+    spp: tuple[int, int] = (32, 128),
+    batches: int = 16,
     tile: int = 4,
     rounding: float = 0.0,
     ours: dict | None = None,
@@ -55,8 +55,8 @@ def assert_same_images(
 ) -> tuple[Moments, Moments]:
     """mivol and volpath have the same mean in tiles of `tile` pixels, and over the whole image, at 1e-6 each.
 
-    With 32 batches of each Welch's t has about 60 degrees of freedom: bounds of 6.5 (an image of 48 tiles and channels)
-    and 5.4 standard errors. `precision` is what the standard error of the whole image may be of its mean: a bias of six
+    With 16 batches of each Welch's t has about 30 degrees of freedom: bounds of 7.5 (an image of 48 tiles and channels)
+    and 6 standard errors. `precision` is what the standard error of the whole image may be of its mean: a bias of seven
     times that cannot hide.
     """
     a = moments(scene, ours or mivol(), spp[0], batches)
@@ -89,7 +89,7 @@ class Pencils:
     o: np.ndarray
     d: np.ndarray
 
-    def moments(self, integrator: dict, spp: int, batches: int = 32, first: int = 0) -> Moments:
+    def moments(self, integrator: dict, spp: int, batches: int = 16, first: int = 0) -> Moments:
         """Of (n, channels)."""
         m = moments(self.scene, integrator, spp, batches, first)
         return Moments(m.n, m.mean[0], m.m2[0])
@@ -177,7 +177,7 @@ def assert_twin(
     lamps: list,
     integrator: dict,
     spp: int,
-    batches: int = 32,
+    batches: int = 16,
     background: float = 0.0,
     rounding: float = 0.0,
     precision: float = 0.02,

@@ -207,13 +207,13 @@ JUDGED = {
 
 @pytest.mark.parametrize("name", JUDGED)
 def test_twins_against_volpath(variant_rgb, name):
-    """32 batches of 4096 paths along each of 6 rays; Student's t."""
+    """16 batches of 8192 paths along each of 6 rays; Student's t."""
     (box, m), lamps, background = JUDGED[name]()
     o, d = small.aimed(11, n=6)
     parts = {"smoke": box} | {f"lamp{i}": lamp for i, (lamp, _) in enumerate(lamps)}
     # The sky's 24 x 48 directions leave 1e-4; volpath's spawned rays skip 1e-4 of a length at each boundary.
     small.assert_twin(
-        small.pencils(parts, o, d), [m], [twin for _, twin in lamps], small.volpath(), 4096, background=background,
+        small.pencils(parts, o, d), [m], [twin for _, twin in lamps], small.volpath(), 8192, background=background,
         rounding=2e-5 if not background else 2e-4,
     )  # fmt: skip
 

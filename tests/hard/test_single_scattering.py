@@ -21,7 +21,7 @@ pytestmark = pytest.mark.usefixtures("variant_rgb")
 
 GRID = "smoke.interior_medium.sigma_t.data"
 ALBEDO = "smoke.interior_medium.albedo.value.value"
-BATCHES = 32
+BATCHES = 16
 EPS = 2.0**-23
 
 
@@ -29,9 +29,9 @@ def gradients(seen: Pencils, key: str, spp: int, batches: int = BATCHES) -> Mome
     """Of the derivative of the sum of all pixels and channels."""
     params, integrator = mi.traverse(seen.scene), mi.load_dict(mivol())
     dr.enable_grad(params[key])
-    found = []
+    found, ones = [], mi.TensorXf(np.ones((1, len(seen.o), 3), dtype=np.float32))
     for seed in range(batches):
-        integrator.render_backward(seen.scene, params, mi.TensorXf(np.ones((1, len(seen.o), 3), dtype=np.float32)), seed=seed, spp=spp)
+        integrator.render_backward(seen.scene, params, ones, seed=seed, spp=spp)
         found.append(np.array(dr.grad(params[key]), dtype=np.float64).reshape(np.shape(params[key])))
         dr.set_grad(params[key], 0)
     dr.disable_grad(params[key])
@@ -44,7 +44,7 @@ def set_grid(scene: mi.Scene, values: np.ndarray, key: str = GRID) -> None:
     params.update()
 
 
-def holds_twin(seen: Pencils, m: twins.Medium, lamp: twins.Lamp, spp: int = 1024, level: float = 2e-5, **more: object) -> None:
+def holds_twin(seen: Pencils, m: twins.Medium, lamp: twins.Lamp, spp: int = 2048, level: float = 2e-5, **more: object) -> None:
     """The twin's radiance within Student's t, and float32 rounding of `level` of the largest."""
     top = twins.radiance([m], [lamp], seen.o, seen.d).max()
     small.assert_twin(seen, [m], [lamp], mivol(), spp, rounding=level * top, **more)
@@ -64,7 +64,7 @@ def test_hard_21_derivative_of_no_density(lit, kind):
     background = 0.5 if lit == "sky" else 0.0
     truth, _ = twins.radiance_gradient(m, [lamp[1]], seen.o, seen.d, 3.0, background=background)
     assert np.sign(truth.sum()) == (1 if lit == "point" else -1)
-    found = gradients(seen, GRID, 256)
+    found = gradients(seen, GRID, 512)
     # The sky's 4 x 8 directions are exact where nothing dims them.
     assert_same_mean(
         found.mean[..., 0], found.variance_of_mean[..., 0], truth, n_a=BATCHES, rounding=2e-5 * np.abs(truth).max()
@@ -86,18 +86,18 @@ def test_hard_23_albedo_0(kind):
     values = rough_grid(2)
     box, _ = smoke(values, 0.0, kind)
     lamp = point([1.5, 1, 2.0])
-    seen = pencils({"smoke": box, "lamp": lamp[0], "sky": scenes.sky(0.4)}, *aimed(2, 4))
-    T = np.exp(-twins.Grid(values, PLACE).tau(seen.o, seen.d, np.full(4, np.inf)))
+    seen = pencils({"smoke": box, "lamp": lamp[0], "sky": scenes.sky(0.4)}, *aimed(2, 2))
+    T = np.exp(-twins.Grid(values, PLACE).tau(seen.o, seen.d, np.full(2, np.inf)))
     image = scenes.render(seen.scene, mivol(), 4)[0]
     # tau is right to 2e-6 of itself (at most 3).
     assert np.all(np.abs(image - 0.4 * T) <= 1e-5 * 0.4)
     lit = twins.Medium(twins.Grid(values, PLACE), 1.0)
     truth = 3 * twins.radiance([lit], [lamp[1]], seen.o, seen.d).sum()
-    truth += 3 * (twins.radiance([lit], [twins.Sky(0.4, 12)], seen.o, seen.d, order=3).sum())
-    found = gradients(seen, ALBEDO, 512)
-    # 12 x 24 directions of the sky: 1e-3 of its part.
+    truth += 3 * twins.radiance([lit], [twins.Sky(0.4, 10)], seen.o, seen.d, order=3).sum()
+    found = gradients(seen, ALBEDO, 1024)
+    # 10 x 20 directions of the sky: 2e-3 of its part.
     mean, var = found.mean.reshape(1, -1).sum(axis=1), found.variance_of_mean.reshape(1, -1).sum(axis=1)
-    assert_same_mean(mean, var, np.array([truth]), n_a=BATCHES, rounding=1e-3 * truth)
+    assert_same_mean(mean, var, np.array([truth]), n_a=BATCHES, rounding=2e-3 * truth)
 
 
 @pytest.mark.parametrize("kind", small.KINDS)
@@ -198,7 +198,7 @@ def test_hard_32_channels_of_very_different_extinction(ratio):
     seen = pencils({"smoke": box_of(interior, PLACE), "lamp": lamp[0]}, *aimed(7, 6))
     m = twins.Medium(twins.Grid(values, PLACE), float(as_float32(0.8)), twins.hg(0.4))
     truth = twins.radiance([m], [lamp[1]], seen.o, seen.d)
-    found = seen.moments(mivol(), 2048)
+    found = seen.moments(mivol(), 4096)
     for c in range(3):
         top = truth[:, c].max()
         mean, var = found.mean[:, c], found.variance_of_mean[:, c]
@@ -250,7 +250,7 @@ def test_hard_33_point_light_at_a_special_place(where):
     assert (np.array(place[0]) / step * 2) % 1 in (0.0, 0.5)
     box, m = smoke(values, 0.8, "own")
     lamp = point(place)
-    holds_twin(pencils({"smoke": box, "lamp": lamp[0]}, *aimed(9, 5)), m, lamp[1], spp=2048)
+    holds_twin(pencils({"smoke": box, "lamp": lamp[0]}, *aimed(9, 5)), m, lamp[1], spp=4096)
 
 
 @pytest.mark.parametrize("away", [1e3, 1e5])
@@ -279,7 +279,7 @@ def test_hard_35_light_along_the_camera_ray(tilt, kind):
     seen = pencils({"slab": build[0], "sun": sun(travel, 2.0)[0]}, o, np.array([d, -d]))
     p, mu, mu0 = 1 / (4 * math.pi), abs(seen.d[0, 2]), abs(travel[2])
     truth = np.array([[f(0.8, p, 2.0, mu, mu0, sigma)] * 3 for f in (twins.slab_reflected, twins.slab_transmitted)])
-    found = seen.moments(mivol(), 2048)
+    found = seen.moments(mivol(), 4096)
     assert_same_mean(found.mean, found.variance_of_mean, truth, n_a=BATCHES, rounding=1e-5 * truth.max())
 
 
@@ -292,7 +292,7 @@ def test_hard_36_shadow_rays_along_the_faces_of_cells(direction):
     # y and z: in a face between cells, in an edge between them, in the grid's middle.
     o = np.array([[-3, 0.25, 0.1], [-3, 0.25, -0.25], [-3, 0.0, 0.0], [-3, 0.75, 0.999]])
     seen = pencils({"smoke": box, "sun": lamp[0]}, o, [1.0, 0, 0])
-    holds_twin(seen, m, lamp[1], spp=2048)
+    holds_twin(seen, m, lamp[1], spp=4096)
 
 
 def test_hard_36_no_light_is_lost_where_shadow_rays_start():
@@ -304,7 +304,7 @@ def test_hard_36_no_light_is_lost_where_shadow_rays_start():
     lamp = sun([0.3, 0.2, -1.0])
     o, d = aimed(12, 6, 0.8 / 2, 3.0)
     seen = pencils({"smoke": box, "sun": lamp[0]}, as_float32(o * scale), d)
-    holds_twin(seen, m, lamp[1], spp=2048)
+    holds_twin(seen, m, lamp[1], spp=4096)
 
 
 # -- Depth ---------------------------------------------------------------------------------------------------------------------
@@ -317,7 +317,7 @@ def test_hard_46_depth_2_is_one_scattering(kind):
     build = fog(sigma, 1.0, np.eye(4)) if kind == "homogeneous" else smoke(np.full((4, 3, 2, 1), sigma), 1.0, "own", np.eye(4))
     seen = pencils({"cube": build[0], "sun": sun([0, 0, -1.0], 3.0)[0]}, [-2, 0.3, 1 - depth], [1.0, 0, 0])
     assert not scenes.render(seen.scene, mivol(max_depth=1), 16).any()
-    found = seen.moments(mivol(max_depth=2), 2048)
+    found = seen.moments(mivol(max_depth=2), 4096)
     truth = twins.cube_from_the_side(1.0, 1 / (4 * math.pi), 3.0, sigma, 1 - seen.o[0, 2], 1.0)
     assert_same_mean(found.mean, found.variance_of_mean, np.full((1, 3), truth), n_a=BATCHES, rounding=1e-5 * truth)
     # What a second scattering would add is 30 % and more at this depth: far outside the noise.
