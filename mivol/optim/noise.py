@@ -26,7 +26,7 @@ import mitsuba as mi
 
 from mivol.errors import MivolError
 from mivol.optim.losses import Loss
-from mivol.scene.needs import survey_scene
+from mivol.scene.needs import is_scattering, survey_scene
 from mivol.scene.session import Session
 from mivol.transport.medium import view_medium
 
@@ -114,7 +114,12 @@ def noise_check(integrator: mi.Integrator, scene: mi.Scene) -> Callable[[], bool
     survey = survey_scene(scene)
     if survey.surfaces:
         return lambda: True
-    return lambda: any(view_medium(b.medium, b.box, survey.places).is_scattering() for b in survey.boundaries)
+
+    def scatters() -> bool:
+        views = ((view_medium(b.medium, b.box, survey.places), b.name) for b in survey.boundaries)
+        return any(is_scattering(view, survey, name) for view, name in views)
+
+    return scatters
 
 
 def warning(loss: Loss, value: float, noise: float) -> str:

@@ -27,10 +27,10 @@ import mitsuba as mi
 import numpy as np
 
 from mivol.errors import MivolError
-from mivol.transport.medium import Box, MediumView
+from mivol.transport.medium import Box, MediumView, Part
 from mivol.transport.optical_depth import integrate_tau
 
-__all__ = ["ALBEDOS", "TABLES", "TAUS", "depth_two_error", "draw_lines", "scattering_depth"]
+__all__ = ["ALBEDOS", "TABLES", "TAUS", "depth_two_error", "draw_lines", "mean_albedo", "mean_cosine", "scattering_depth"]
 
 ALBEDOS = (0.2, 0.5, 0.75, 0.9, 0.99, 1.0)
 TAUS = (0.1, 0.3, 1.0, 3.0, 10.0, 30.0)
@@ -179,3 +179,31 @@ def scattering_depth(view: MediumView, box: Box, n: int = 1 << 14) -> float:
         total = total * float(dr.max(view.scale)[0])
     mean = total.mean(axis=0)
     return float(np.divide((total**2).mean(axis=0), mean, out=np.zeros_like(mean), where=mean > 0).max())
+
+
+def mean_albedo(view: MediumView) -> float:
+    """Albedo [1] of a medium, mean over space (of scattering over that of extinction, where given), of its highest channel."""
+    means = [np.asarray(dr.detach(a), np.float64) for a in view.albedo]
+    scattering = max(float(m.reshape(-1, m.shape[-1]).mean(axis=0).max()) if m.ndim == 4 else float(m.max()) for m in means)
+    if view.share is not None:
+        return scattering
+    total = sum(_mean_value(part) for part in view.parts)
+    return scattering / total if total > 0 else 0.0
+
+
+def _mean_value(part: Part) -> float:
+    """Mean of a part over space, of its highest channel."""
+    values = part.constant if part.lattice is None else part.lattice.values
+    host = np.asarray(dr.detach(values), np.float64)
+    return float(host.reshape(-1, part.channels).mean(axis=0).max()) if part.lattice is not None else float(host.max())
+
+
+def mean_cosine(phase: mi.PhaseFunction, n: int = 1 << 12) -> float:
+    """Mean cosine [1] of a phase function by its own samples, to 1 / sqrt(n), in the middle of the world."""
+    mei = dr.zeros(mi.MediumInteraction3f, n)
+    mei.wi = mi.Vector3f(0, 0, 1)
+    mei.sh_frame = mi.Frame3f(mei.wi)
+    k = dr.arange(mi.Float, n)
+    u = mi.Point2f((k + 0.5) / n, k * 0.6180340 - dr.floor(k * 0.6180340))
+    wo, _, _ = phase.sample(mi.PhaseFunctionContext(None), mei, k * 0.7548777 - dr.floor(k * 0.7548777), u)
+    return float(dr.mean(-wo.z)[0])

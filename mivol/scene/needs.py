@@ -16,10 +16,11 @@ import numpy as np
 from mivol.errors import MivolError
 from mivol.files import check_volume
 from mivol.scene.load import check_variant
+from mivol.transport.direct import UNIFORM
 from mivol.transport.lattice import block_bounds
 from mivol.transport.medium import Box, MediumView, box_of_cube, kind_of, view_medium
 
-__all__ = ["Boundary", "MediumFacts", "Needs", "find_needs"]
+__all__ = ["Boundary", "MediumFacts", "Needs", "find_needs", "is_scattering"]
 
 
 @dataclass(frozen=True)
@@ -65,6 +66,7 @@ class Needs:
         surfaces: kinds of the shapes that are more than boundaries.
         is_veiled: some surface lets light through undeviated and is more than a boundary.
         emitters: kinds.
+        lamps: of each emitter: ``uniform`` (the same from everywhere), ``sharp`` (of one position or direction) or ``wide``.
         refractive: names of the boundaries that bend or blur the light that passes them.
         start: medium that the sensor names.
         camera_inside: the camera may be inside the box around a boundary.
@@ -79,6 +81,7 @@ class Needs:
     surfaces: tuple[str, ...]
     is_veiled: bool
     emitters: tuple[str, ...]
+    lamps: tuple[str, ...]
     refractive: tuple[str, ...]
     start: mi.Medium | None
     camera_inside: bool
@@ -94,7 +97,9 @@ class Survey:
     surfaces: tuple[str, ...]
     is_veiled: bool
     emitters: tuple[str, ...]
+    lamps: tuple[str, ...]
     refractive: tuple[str, ...]
+    scatters: dict = field(default_factory=dict)
     values: dict = field(default_factory=dict)
     places: dict = field(default_factory=dict)
 
@@ -124,6 +129,7 @@ def find_needs(scene: mi.Scene, sensor: mi.Sensor, survey: Survey | None = None,
         surfaces=survey.surfaces,
         is_veiled=survey.is_veiled,
         emitters=survey.emitters,
+        lamps=survey.lamps,
         refractive=survey.refractive,
         start=sensor.get_medium(),
         camera_inside=_camera_inside(scene, sensor, survey),
@@ -148,7 +154,14 @@ def survey_scene(scene: mi.Scene) -> Survey:
     # Mitsuba makes one object of equal media: where one boundary has to be traced, all boundaries of that medium are.
     traced = {b.medium.ptr for b in boundaries if b.box is None}
     boundaries = [replace(b, box=None) if b.medium.ptr in traced else b for b in boundaries]
-    return Survey(tuple(boundaries), tuple(surfaces), bool(veiled), kinds, tuple(refractive))
+    lamps = tuple(_lamp(e) for e in scene.emitters())
+    return Survey(tuple(boundaries), tuple(surfaces), bool(veiled), kinds, lamps, tuple(refractive))
+
+
+def _lamp(emitter: mi.Emitter) -> str:
+    if emitter.class_name() == UNIFORM:
+        return "uniform"
+    return "sharp" if int(emitter.flags()) & int(mi.EmitterFlags.Delta) else "wide"
 
 
 def _is_bare(shape: mi.Shape) -> bool:
@@ -216,6 +229,32 @@ def read_values(values: mi.TensorXf, survey: Survey, name: str) -> _Read:
     return survey.values[key]
 
 
+def is_scattering(view: MediumView, survey: Survey, name: str) -> bool:
+    """Whether any albedo (or sigma_s) of a medium is above 0, or its derivative is asked for. Each array is read once.
+
+    Raises:
+        MivolError: an albedo outside [0, 1].
+    """
+    positive = [_is_positive(a, survey, name, view.share is not None) for a in view.albedo]
+    return any(positive)
+
+
+def _is_positive(values: mi.TensorXf, survey: Survey, name: str, is_albedo: bool) -> bool:
+    flat = dr.detach(dr.ravel(values))
+    key = ("albedo", flat.index)
+    if key not in survey.values:
+        low, high = float(dr.min(flat)[0]), float(dr.max(flat)[0])
+        # NaN fails every comparison.
+        if is_albedo and not (low >= 0 and high <= 1 and bool(dr.all(dr.isfinite(flat)))):
+            raise MivolError(
+                f"the albedo of the medium in {name} lies in [{low:.4g}, {high:.4g}] (or is NaN); the share of light that is "
+                "scattered lies in [0, 1]: clip it after each step."
+            )
+        survey.values = dict(list(survey.values.items())[-15:])
+        survey.values[key] = (flat, high > 0)
+    return survey.values[key][1] or dr.grad_enabled(values)
+
+
 def _facts(boundary: Boundary, view: MediumView, survey: Survey, recording: bool) -> MediumFacts:
     grids = [p.lattice for p in view.parts if p.lattice is not None]
     phase = boundary.medium.phase_function()
@@ -225,13 +264,23 @@ def _facts(boundary: Boundary, view: MediumView, survey: Survey, recording: bool
         "boundary": "a box" if boundary.box is not None else f"a {boundary.shape}, traced",
         "extinction": "rgb" if view.channels == 3 else "grey",
         "resolutions": tuple(g.res for g in grids),
-        "phase": phase.class_name() if phase is not None else "none",
+        "phase": _phase_name(phase),
     }
     if recording:
-        return MediumFacts(**common, is_scattering=False, occupied=1.0, tau_max=None, unread=True)
+        # What it was when it was last read; a medium that was never read may scatter.
+        known = survey.scatters.get(boundary.name, True)
+        return MediumFacts(**common, is_scattering=known, occupied=1.0, tau_max=None, unread=True)
     reads = [read_values(g.values, survey, boundary.name) for g in grids]
     occupied = min((r.occupied for r in reads), default=1.0)
-    return MediumFacts(**common, is_scattering=view.is_scattering(), occupied=occupied, tau_max=_tau_max(boundary, view, reads))
+    scatters = survey.scatters[boundary.name] = is_scattering(view, survey, boundary.name)
+    return MediumFacts(**common, is_scattering=scatters, occupied=occupied, tau_max=_tau_max(boundary, view, reads))
+
+
+def _phase_name(phase: mi.PhaseFunction | None) -> str:
+    """The kind of a phase function (Mitsuba calls every Python class by its base)."""
+    if phase is None:
+        return "none"
+    return phase.class_name() if phase.class_name() != "PhaseFunction" else str(phase).partition("[")[0]
 
 
 def _tau_max(boundary: Boundary, view: MediumView, reads: list[_Read]) -> float | None:

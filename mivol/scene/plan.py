@@ -15,6 +15,7 @@ import mitsuba as mi
 
 from mivol.errors import MivolError
 from mivol.machine import available_memory
+from mivol.scene.depth_two import depth_two_error, mean_albedo, mean_cosine, scattering_depth
 from mivol.scene.load import find_sensor
 from mivol.scene.needs import Needs, Survey, find_needs, read_values, survey_scene
 from mivol.transport.aovs import AOVS
@@ -62,12 +63,12 @@ def make_plan(needs: Needs, settings: Settings) -> Plan:
     """Choose from the facts.
 
     Raises:
-        MivolError: what is asked for is not there yet (a medium that scatters, at depth 2 or more), or a gradient step
+        MivolError: what is asked for is not there yet (a medium that scatters, at depth 3 or more), or a gradient step
             would not fit into memory.
     """
     _refuse_scattering(needs, settings)
     _refuse_refraction(needs, settings)
-    choices = [_transport(needs, settings), _tracing(needs), _channels(needs)]
+    choices = [_transport(needs, settings), *_lighting(needs, settings), _tracing(needs), _channels(needs)]
     skips = tuple(bool(m.resolutions) and m.occupied < SKIP_BELOW for m in needs.media)
     choices += [_skipping(m, skip) for m, skip in zip(needs.media, skips, strict=True) if m.resolutions]
     pass_rays = _pass_rays(needs)
@@ -98,7 +99,7 @@ def check_aovs(names: str) -> tuple[str, ...]:
 
 def _refuse_scattering(needs: Needs, settings: Settings) -> None:
     for medium in needs.media:
-        if medium.is_scattering and settings.max_depth not in (0, 1, 2):
+        if medium.is_scattering and not medium.unread and settings.max_depth not in (0, 1, 2):
             raise MivolError(
                 f"the medium in {medium.name} scatters (its albedo is above 0) and max_depth is {settings.max_depth}; mivol "
                 "renders one scattering so far: set max_depth to 2, to 1 (what is seen through the medium), or the albedo to 0."
@@ -120,15 +121,45 @@ def _pass_rays(needs: Needs) -> int:
     return min(PASS_RAYS[backend], PASS_STEPS[backend] // max(cells, 1))
 
 
+def _is_lit(needs: Needs, settings: Settings) -> bool:
+    """Whether media scatter light to the camera."""
+    return settings.max_depth == 2 and any(m.is_scattering for m in needs.media)
+
+
 def _transport(needs: Needs, settings: Settings) -> Choice:
     if not needs.media:
         return Choice("media", "none", "no shape bounds a medium")
-    unread = any(m.unread for m in needs.media)
+    if _is_lit(needs, settings):
+        what = "exact optical depth; one scattering at a distance drawn in proportion to the light it takes, exact shadow rays"
+        return Choice("media", what, "an albedo is above 0 and max_depth is 2")
     why = "albedo 0" if not any(m.is_scattering for m in needs.media) else "max_depth 1 sees no scattered light"
-    if unread:
+    if any(m.unread for m in needs.media):
         why = "values cannot be read while dr.freeze records; absorption was promised by max_depth or by an earlier render"
     what = "exact optical depth; no phase function, no light sampling in media, no albedo look-up"
     return Choice("media", what, why)
+
+
+def _lighting(needs: Needs, settings: Settings) -> list[Choice]:
+    """How scattered light is found."""
+    if not _is_lit(needs, settings):
+        return []
+    drawn = [lamp for lamp in needs.lamps if lamp != "uniform"]
+    met = [lamp for lamp in needs.lamps if lamp != "sharp"]
+    if not needs.lamps:
+        return [Choice("directions", "none", "the scene has no emitter")]
+    if not drawn:
+        choices = [Choice("directions", "one, of the phase function", "light is the same from everywhere")]
+    elif not met:
+        choices = [Choice("directions", f"one, to one of {len(drawn)} lamps", "no lamp can be met by chance")]
+    else:
+        why = f"{len(drawn)} lamps to aim at, {len(met)} that can be met by chance: the power heuristic weighs both"
+        choices = [Choice("directions", "two: to a lamp, and of the phase function", why)]
+    if "sharp" in drawn:
+        alone = len(needs.media) == 1 and len(needs.media[0].resolutions) == 1
+        what = "weighed by optical depth towards the lamps, from blocks of the grid" if alone else "by the camera's own ray"
+        why = "a lamp of one position or direction" + ("" if alone else ", but more than one grid or none")
+        choices.append(Choice("where to scatter", what, why))
+    return choices
 
 
 def _tracing(needs: Needs) -> Choice:
@@ -174,7 +205,6 @@ def _gradient(needs: Needs) -> tuple[int, Choice]:
 
 def build_world(scene: mi.Scene, needs: Needs, plan: Plan, settings: Settings, survey: Survey) -> World:
     """Build the media that transport walks through, as planned."""
-    lit = settings.max_depth == 2 and any(m.is_scattering for m in needs.media)
     bodies = []
     for boundary, view, skip in zip(needs.boundaries, needs.views, plan.skips, strict=True):
         for part in view.parts:
@@ -188,7 +218,7 @@ def build_world(scene: mi.Scene, needs: Needs, plan: Plan, settings: Settings, s
         is_veiled=needs.is_veiled,
         start=needs.start,
         locates=needs.camera_inside and needs.start is None,
-        lights=Lights(scene) if lit else None,
+        lights=Lights(scene) if _is_lit(needs, settings) else None,
     )
 
 
@@ -223,4 +253,23 @@ def explain(scene: mi.Scene | str | Path, max_depth: int = 6, sensor: int = 0) -
     ]
     width = max(len(c.about) for c in plan.choices)
     lines += [f"  {c.about:<{width}}  {c.choice}\n  {'':<{width}}    because {c.reason}" for c in plan.choices]
+    lines += [f"  model     {text}" for text in _depth_two(needs)] if max_depth == 2 else []
     return "\n".join(lines)
+
+
+def _depth_two(needs: Needs) -> list[str]:
+    """What a model of one scattering leaves out of each medium."""
+    lines = []
+    light = "collimated" if "sharp" in needs.lamps else "constant"
+    for facts, boundary, view in zip(needs.media, needs.boundaries, needs.views, strict=True):
+        if not facts.is_scattering or boundary.box is None:
+            continue
+        tau, albedo = scattering_depth(view, boundary.box), mean_albedo(view)
+        phase = "forward" if mean_cosine(boundary.medium.phase_function()) > 0.4 else "isotropic"
+        missing = depth_two_error(min(albedo, 1.0), tau, light, phase)
+        warning = "; depth 2 is a poor model of it" if missing > 0.1 else ""
+        lines.append(
+            f"one scattering leaves out {missing:.0%} of the light that {facts.name} scatters (albedo {albedo:.2f}, optical "
+            f"depth {tau:.2g}, {light} light, {phase} phase){warning}"
+        )
+    return lines

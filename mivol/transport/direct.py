@@ -21,7 +21,7 @@ import numpy as np
 
 from mivol.transport.free_flight import Focus, Lamp
 from mivol.transport.lamp_motion import tau_by_end
-from mivol.transport.path import Way, optical_depth_to, power_heuristic, shadow_ray, transmittance
+from mivol.transport.path import Way, light_through, power_heuristic, shadow_ray
 from mivol.transport.world import World, spectrum
 
 __all__ = ["Arrival", "Draw", "Lights", "arrivals"]
@@ -151,13 +151,13 @@ def _from_lamp(
     lights, phase = world.lights, mei.medium.phase_function()
     direct, weight = lamp.emitter.sample_direction(mei, draw.emitter, active)
     on = active & (direct.pdf > 0)
-    way, clear, tau = shadow_ray(scene, world, mi.Point3f(mei.p), mei.medium, direct, on)
+    way, clear, tau, light = shadow_ray(scene, world, mi.Point3f(mei.p), mei.medium, direct, on)
     w_mis = mi.Float(1)
     if lights.has_lobes:
         _, pdf_lobe = phase.eval_pdf(_context(), mei, direct.d, on)
         pdf = direct.pdf / len(lights.drawn)
         w_mis = dr.select(direct.delta, 1, power_heuristic(pdf, pdf_lobe))
-    dim = transmittance(tau) * (w_mis * len(lights.drawn))
+    dim = light * (w_mis * len(lights.drawn))
     with dr.resume_grad(when=attached):
         moved = _follow(lamp, mei, draw, direct, on) if attached else direct
         f, _ = phase.eval_pdf(_context(), mei, moved.d, on)
@@ -192,7 +192,7 @@ def _from_lobe(
     wo, weight, pdf = phase.sample(_context(), mei, draw.lobe, draw.turn, active)
     on = active & (pdf > 0)
     ray = mi.Ray3f(mei.p, wo, dr.inf, mei.time, mei.wavelengths)
-    end, tau = optical_depth_to(scene, world, ray, mei.medium, on)
+    end, _, light = light_through(scene, world, ray, mei.medium, on)
     si = end.si
     emitter = si.emitter(scene, on)
     on &= emitter != None
@@ -201,13 +201,13 @@ def _from_lobe(
         direct = mi.DirectionSample3f(scene, si, mei)
         pdf_lamp = emitter.pdf_direction(mei, direct, on) / len(lights.drawn)
         w_mis = dr.select(_is_drawn(lights, emitter), power_heuristic(pdf, pdf_lamp), 1)
-    dim = transmittance(tau) * w_mis
+    dim = light * w_mis
     with dr.resume_grad(when=attached):
         if attached:
             f, _ = phase.eval_pdf(_context(), mei, wo, on)
             weight = f / pdf
         value = dr.select(on, dim * weight * emitter.eval(si, on), 0)
-    return Arrival(Way(ray, mei.medium, end.t), value, on)
+    return Arrival(Way(ray, mei.medium, end.t, True), value, on)
 
 
 def _is_drawn(lights: Lights, emitter: mi.EmitterPtr) -> mi.Bool:

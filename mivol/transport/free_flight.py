@@ -25,7 +25,7 @@ import mitsuba as mi
 from mivol.numerics import one_minus_exp
 from mivol.transport.lattice import Cell, box_nodes, clip, read_nodes, walk
 from mivol.transport.optical_depth import gauss_points
-from mivol.transport.path import Visit
+from mivol.transport.path import DARK, Visit
 from mivol.transport.world import Body, World
 
 __all__ = ["Event", "Focus", "Lamp", "Pick", "offer", "place", "start_pick", "taken_light"]
@@ -176,10 +176,19 @@ def _fly(
 
     if field.has_constants:
         pick = add_constant(pick, t0, dr.select(hit, segment.t0, t1))
-    pick = walk(lattice, segment, visit, pick, field.reads, on)
+    # An image takes no light from behind this depth; derivatives are swept back from the far end, and need all of it.
+    until = None if kappa else lambda p: _least_of(p.tau) > DARK
+    pick = walk(lattice, segment, visit, pick, field.reads, on, until)
     if field.has_constants:
         pick = add_constant(pick, dr.select(hit, segment.t0 + segment.length, t1), t1)
     return _note_spread(pick, spread)
+
+
+def _least_of(rows: list[mi.Float]) -> mi.Float:
+    least = rows[0]
+    for row in rows[1:]:
+        least = dr.minimum(least, row)
+    return least
 
 
 def _note_spread(pick: Pick, spread: mi.Float | None) -> Pick:

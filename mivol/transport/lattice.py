@@ -263,6 +263,7 @@ def walk(
     state: Any,
     reads: Sequence[Nodes] = (),
     active: mi.Bool = True,
+    until: Callable[[Any], mi.Bool] | None = None,
 ) -> Any:
     """Visit the cells that a segment crosses, in order, and return the last state.
 
@@ -275,6 +276,7 @@ def walk(
         state: any PyTree of Dr.Jit arrays.
         reads: arrays over the nodes; the visitor finds their corners in ``cell.corners``.
         active: lanes to walk.
+        until: whether a lane has seen enough, told from the state after a cell; None to walk to the end.
 
     Cost: one step per cell or empty block, at most X + Y + Z + 6 of them; 4 reads a step and channel (8 a visited cell
         where blocks are skipped).
@@ -332,6 +334,8 @@ def walk(
         through = dr.mask_t(mi.Vector3f)(through_x, through_y, through_z)
         s, s_rest = _add(s, s_rest, dt)
         active &= plane < left
+        if until is not None:
+            active &= ~until(state)
 
         # -- Advance: one plane further, or as many as an empty block has --------------------------------------------------
         if skip:

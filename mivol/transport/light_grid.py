@@ -19,7 +19,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mivol.transport.lattice import Lattice
-from mivol.transport.path import optical_depth_to
+from mivol.transport.path import light_through
 from mivol.transport.world import Body, World
 
 __all__ = ["Shade", "find_shade"]
@@ -112,5 +112,5 @@ def _look(
     length = dr.norm(direct.p - it.p)
     ray = mi.Ray3f(it.p, dr.normalize(direct.p - it.p), length, mi.Float(0), mi.Color0f())
     medium = dr.select(dr.full(mi.Bool, True, z * y * x), mi.MediumPtr(body.view.medium), None)
-    _, tau = optical_depth_to(scene, world, ray, medium, mi.Bool(True))
+    _, tau, _ = light_through(scene, world, ray, medium, mi.Bool(True))
     return dr.exp(-sum(tau) / len(tau)) + FLOOR

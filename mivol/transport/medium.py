@@ -7,7 +7,7 @@ is linear in each of them, so it is integrated part by part: a homogeneous mediu
 share a resolution.
 
 Conventions. A grid is vacuum outside its own box. A constant fills the boundary of its medium, except under a stock
-``heterogeneous``, which clips it to the unit cube of its ``constvolume``. Values are read from the very arrays that
+``heterogeneous``, which clips it to the box of its ``constvolume``. Values are read from the very arrays that
 ``mi.traverse`` hands out, with their gradients.
 """
 
@@ -58,7 +58,7 @@ class MediumView:
         medium: the Mitsuba object.
         parts: their sum, times ``scale``, is sigma_t.
         scale: dimensionless factor, differentiable where the plugin makes it so.
-        albedo: what was found under ``albedo`` or the ``sigma_s`` part: arrays whose maximum tells whether it scatters.
+        albedo: what was found under ``albedo``, or of the ``sigma_s`` part: arrays whose maximum tells whether it scatters.
         share: the albedo itself, a volume or a constant; None where ``sigma_s`` is a part.
         flakes: the matrix S (xx, yy, zz, xy, xz, yz) of an ``sggx`` phase function, which makes the extinction depend on the
             direction: sigma_t sqrt(w^T S w) (Heitz et al. 2015, Eq. 6); None elsewhere.
@@ -75,10 +75,6 @@ class MediumView:
     def channels(self) -> int:
         """1 where every part is grey, 3 where one is rgb."""
         return max(part.channels for part in self.parts)
-
-    def is_scattering(self) -> bool:
-        """Whether any albedo (or sigma_s) is above 0 or its derivative is asked for. Reads values: not in ``dr.freeze``."""
-        return any(dr.grad_enabled(a) or bool(np.any(np.array(dr.detach(a)) > 0)) for a in self.albedo)
 
 
 @dataclass
@@ -194,7 +190,10 @@ def _part(name: str, params: mi.SceneParameters, kind: str, boundary: Box | None
         return Part(name, constant=value)
     channels = [value[c] for c in range(dr.size_v(value))] if dr.size_v(value) == 3 else [mi.Float(value)]
     values = mi.TensorXf(dr.ravel(mi.Color3f(*channels)) if len(channels) == 3 else channels[0], (1, 1, 1, len(channels)))
-    return Part(name, lattice=Lattice(values, np.eye(4)))
+    volume = params.hierarchy[params.properties[constant][2]][0]
+    if volume.ptr not in places:
+        places[volume.ptr] = place_of_grid(volume)
+    return Part(name, lattice=Lattice(values, places[volume.ptr]))
 
 
 def _tensor(values: mi.TensorXf) -> mi.TensorXf:

@@ -69,7 +69,9 @@ def integrate_tau(
     return tau[0] if lattice.channels == 1 else mi.Color3f(*tau)
 
 
-def integrate_segment(lattice: Lattice, values: mi.Float, segment: Segment, active: mi.Bool = True) -> list[mi.Float]:
+def integrate_segment(
+    lattice: Lattice, values: mi.Float, segment: Segment, active: mi.Bool = True, enough: mi.Float | None = None
+) -> list[mi.Float]:
     """Integrate node values along a segment: a row of ``A`` for each lane.
 
     Args:
@@ -77,6 +79,7 @@ def integrate_segment(lattice: Lattice, values: mi.Float, segment: Segment, acti
         values: flat node values (the lattice's own, or a tangent of them).
         segment: from :func:`mivol.transport.lattice.clip`.
         active: lanes to integrate; the others return 0.
+        enough: stop where every channel has more than this; None to walk to the end.
 
     Returns:
         The integral for each channel.
@@ -90,7 +93,15 @@ def integrate_segment(lattice: Lattice, values: mi.Float, segment: Segment, acti
         return [dr.fma(half, interpolate(c, a) + interpolate(c, b), t) for t, c in zip(tau, cell.corners[0], strict=True)]
 
     zero = [mi.Float(0) for _ in range(lattice.channels)]
-    return walk(lattice, segment, visit, zero, [Nodes(values, lattice.channels)], active)
+
+    def has_enough(tau: list[mi.Float]) -> mi.Bool:
+        least = tau[0]
+        for t in tau[1:]:
+            least = dr.minimum(least, t)
+        return least > enough
+
+    until = None if enough is None else has_enough
+    return walk(lattice, segment, visit, zero, [Nodes(values, lattice.channels)], active, until)
 
 
 @dataclass

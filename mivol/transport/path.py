@@ -27,12 +27,14 @@ from mivol.transport.lattice import slab
 from mivol.transport.world import Body, World
 
 __all__ = [
+    "DARK",
     "Path",
     "Reach",
     "Settings",
     "Stretch",
     "Visit",
     "Way",
+    "light_through",
     "optical_depth_to",
     "reach",
     "shadow_ray",
@@ -54,21 +56,23 @@ class Settings:
 class Reach:
     """Where a stretch ends: at an opaque surface (``si`` valid), or at the distance asked for.
 
-    ``t`` is the length of the stretch, ``medium`` what surrounds its end.
+    ``t`` is the length of the stretch, ``medium`` what surrounds its end, ``veil`` what veils on the way let through.
     """
 
     si: mi.SurfaceInteraction3f
     t: mi.Float
     medium: mi.MediumPtr
+    veil: mi.Spectrum | float
 
 
 @dataclass
 class Way:
-    """A stretch that has been walked: its ray, the medium it began in, and its length."""
+    """A stretch that has been walked: its ray, the medium it began in, its length, and whether it passed veils."""
 
     ray: mi.Ray3f
     medium: mi.MediumPtr
     length: mi.Float
+    unveils: bool = False
 
 
 @dataclass
@@ -94,21 +98,29 @@ Visit = Callable[..., Any]
 
 
 def reach(
-    scene: mi.Scene, world: World, ray: mi.Ray3f, medium: mi.MediumPtr, visit: Visit, state: Any, active: mi.Bool
+    scene: mi.Scene,
+    world: World,
+    ray: mi.Ray3f,
+    medium: mi.MediumPtr,
+    visit: Visit,
+    state: Any,
+    active: mi.Bool,
+    unveils: bool = False,
 ) -> tuple[Reach, Any]:
     """Carry a ray to the first opaque surface or to ``ray.maxt``, visiting each medium on the way.
 
-    Media in boxes come after the others and in no order: a visitor must be a sum.
+    Media in boxes come after the others and in no order: a visitor must be a sum. A ray that ``unveils`` goes on straight
+    through surfaces that let part of the light through undeviated, and says how much.
 
     Returns:
         Where the ray ends, and the last state.
     """
     if world.traces:
-        end, state = _trace(scene, world, ray, medium, visit, state, active)
+        end, state = _trace(scene, world, ray, medium, visit, state, active, unveils and world.is_veiled)
     else:
         si = dr.zeros(mi.SurfaceInteraction3f, dr.width(ray))
         si.wi, si.wavelengths, si.time = -ray.d, ray.wavelengths, ray.time
-        end = Reach(si, mi.Float(ray.maxt), medium)
+        end = Reach(si, mi.Float(ray.maxt), medium, 1.0)
     return end, visit_boxes(world, ray, end.t, visit, state, active)
 
 
@@ -124,7 +136,14 @@ def visit_boxes(world: World, ray: mi.Ray3f, t_end: mi.Float, visit: Visit, stat
 
 @dr.syntax
 def _trace(
-    scene: mi.Scene, world: World, ray: mi.Ray3f, medium: mi.MediumPtr, visit: Visit, state: Any, active: mi.Bool
+    scene: mi.Scene,
+    world: World,
+    ray: mi.Ray3f,
+    medium: mi.MediumPtr,
+    visit: Visit,
+    state: Any,
+    active: mi.Bool,
+    unveils: bool,
 ) -> tuple[Reach, Any]:
     """Trace through transparent surfaces to the first opaque one; visit the media whose boundary is traced."""
     # -- State ------------------------------------------------------------------------------------------------------------
@@ -134,6 +153,7 @@ def _trace(
     si = dr.zeros(mi.SurfaceInteraction3f, dr.width(ray))
     si.wi, si.wavelengths, si.time = -ray.d, ray.wavelengths, ray.time
     going = mi.Bool(active)
+    veil = dr.full(mi.Spectrum, 1, dr.width(ray)) if unveils else 1.0
 
     while dr.hint(going, label="to the next opaque surface"):
         hit = scene.ray_intersect(onward, mi.RayFlags.All, False, going)
@@ -147,13 +167,17 @@ def _trace(
 
         # -- Go on through what is transparent ------------------------------------------------------------------------------
         clear = found & is_transparent(hit)
+        if unveils:
+            thin = found & ~clear & mi.has_flag(hit.bsdf().flags(), mi.BSDFFlags.Null) & ~hit.shape.is_emitter()
+            veil = dr.select(thin, veil * hit.bsdf().eval_null_transmission(hit, thin), veil)
+            clear |= thin & dr.any(veil != 0)
         medium = dr.select(clear & transition, hit.target_medium(ray.d), medium)
         si = dr.select(going, hit, si)
         t = dr.select(going, t_hit, t)
         onward = hit.spawn_ray(ray.d)
         onward.maxt = ray.maxt - t_hit
         going &= clear
-    return Reach(si, t, medium), state
+    return Reach(si, t, medium, veil), state
 
 
 def _distance(ray: mi.Ray3f, hit: mi.SurfaceInteraction3f) -> mi.Float:
@@ -183,11 +207,15 @@ def is_transparent(si: mi.SurfaceInteraction3f) -> mi.Bool:
     return (lobes == int(mi.BSDFFlags.Null)) & ~si.shape.is_emitter()
 
 
-def add_optical_depth(ray: mi.Ray3f) -> Visit:
-    """The visitor that sums the optical depth of each channel along ``ray``."""
+DARK = 30.0
+"""Optical depth from which a shadow ray is dark: 1e-13 of a lamp's light is below the rounding of everything beside it."""
+
+
+def add_optical_depth(ray: mi.Ray3f, enough: float | None = None) -> Visit:
+    """The visitor that sums the optical depth of each channel along ``ray``; in a grid it may stop at ``enough``."""
 
     def visit(tau: list[mi.Float], body: Body, t0: mi.Float, t1: mi.Float, active: mi.Bool) -> list[mi.Float]:
-        return [t + d for t, d in zip(tau, body.optical_depth(ray, t0, t1, len(tau), active), strict=True)]
+        return [t + d for t, d in zip(tau, body.optical_depth(ray, t0, t1, len(tau), active, None, enough), strict=True)]
 
     return visit
 
@@ -198,6 +226,18 @@ def optical_depth_to(
     """Optical depth [1] of each channel to the first opaque surface or ``ray.maxt``, and where that is."""
     zero = [mi.Float(0) for _ in range(world.channels)]
     return reach(scene, world, ray, medium, add_optical_depth(ray), zero, active)
+
+
+def light_through(
+    scene: mi.Scene, world: World, ray: mi.Ray3f, medium: mi.MediumPtr, active: mi.Bool
+) -> tuple[Reach, list[mi.Float], mi.Spectrum]:
+    """Where a ray of light ends, its optical depth for each channel, and the share of it that gets there.
+
+    It passes veils. Optical depth is summed no further than to ``DARK`` in a grid.
+    """
+    zero = [mi.Float(0) for _ in range(world.channels)]
+    end, tau = reach(scene, world, ray, medium, add_optical_depth(ray, DARK), zero, active, unveils=True)
+    return end, tau, transmittance(tau) * end.veil
 
 
 def transmittance(tau: list[mi.Float]) -> mi.Spectrum:
@@ -312,12 +352,12 @@ def _bounce(scene: mi.Scene, world: World, settings: Settings, limit: int, path:
     lit &= direct.pdf > 0
     start = si.spawn_ray_to(direct.p).o
     shadow_medium = dr.select(si.is_medium_transition(), si.target_medium(direct.p - start), path.medium)
-    way, clear, tau = shadow_ray(scene, world, start, shadow_medium, direct, lit)
+    way, clear, _, light = shadow_ray(scene, world, start, shadow_medium, direct, lit)
     lit &= clear
     wo = si.to_local(direct.d)
     _, pdf_bsdf = bsdf.eval_pdf(mi.BSDFContext(), si, wo, lit)
     w_mis = dr.select(direct.delta, 1, power_heuristic(direct.pdf, pdf_bsdf))
-    dim = path.beta * transmittance(tau) * w_mis
+    dim = path.beta * light * w_mis
     with dr.resume_grad(when=score.attached):
         f = bsdf.eval(mi.BSDFContext(), si, wo, lit)
         source = scene.eval_emitter_direction(si, direct, lit) / direct.pdf if score.attached else weight
@@ -351,18 +391,19 @@ def _bounce(scene: mi.Scene, world: World, settings: Settings, limit: int, path:
 
 def shadow_ray(
     scene: mi.Scene, world: World, start: mi.Point3f, medium: mi.MediumPtr, direct: mi.DirectionSample3f, active: mi.Bool
-) -> tuple[Way, mi.Bool, list[mi.Float]]:
+) -> tuple[Way, mi.Bool, list[mi.Float], mi.Spectrum]:
     """Go from a point to a point of a lamp.
 
     Returns:
-        The way, whether no opaque surface stands in it, and its optical depth for each channel.
+        The way, whether no opaque surface stands in it, its optical depth for each channel, and the share of the light that
+        media and veils let through.
     """
     length = dr.norm(direct.p - start)
     ray = mi.Ray3f(start, dr.normalize(direct.p - start), length, direct.time, mi.Color0f())
-    stop, tau = optical_depth_to(scene, world, ray, medium, active)
+    stop, tau, light = light_through(scene, world, ray, medium, active)
     # The last 1e-3 of the way is the lamp's own surface (Mitsuba's ShadowEpsilon shortens its rays alike).
     clear = ~(stop.si.is_valid() & (stop.t < length * (1 - 1e-3)))
-    return Way(ray, medium, length), clear, tau
+    return Way(ray, medium, length, True), clear, tau, light
 
 
 def power_heuristic(a: mi.Float, b: mi.Float) -> mi.Float:

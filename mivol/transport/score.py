@@ -129,7 +129,7 @@ class Tangent:
         else:
             end, tau, event = scatter(scene, world, stretch, True, active)
             dL = dL - dr.select(event.event.on, self.dtau * event.sigma_s * event.weight, 0)
-            dL += _push_arrivals(scene, world, event) + _push_albedo(world, stretch.ray, event)
+            dL += _push_attached(scene, world, stretch.ray, event)
             if world.control is not None:
                 one, of = mi.Spectrum(1), world.control.channels
                 lit = dr.select(stretch.scatters, stretch.beta, 0)
@@ -195,6 +195,7 @@ def _choose(event: Scattering) -> tuple[Way, mi.Spectrum, mi.Bool]:
         dr.select(is_first, first.way.ray, second.way.ray),
         dr.select(is_first, first.way.medium, second.way.medium),
         dr.select(is_first, first.way.length, second.way.length),
+        True,
     )
     value = dr.select(is_first, values[0] / dr.maximum(p, 1e-20), values[1] / dr.maximum(1 - p, 1e-20))
     return way, value, dr.select(is_first, first.on, second.on) & (total > 0)
@@ -261,28 +262,19 @@ def _sweep(
     return sweep(world, stretch.ray, end.t, tau, Tracks(shares, rows[2], tangent), probe, active)
 
 
-def _push_arrivals(scene: mi.Scene, world: World, event: Scattering) -> mi.Spectrum:
-    """The tangent of the light that arrives, as the camera sees it: the transpose of :func:`_pull_arrivals`."""
-    carried, dL = event.sigma_s * event.gain, mi.Spectrum(0)
-    for arrival in event.arrivals:
-        with dr.resume_grad():
-            own = dr.forward_to(arrival.value) if dr.grad_enabled(arrival.value) else mi.Spectrum(0)
-        dL += dr.select(arrival.on, carried * own, 0)
-    way, value, on = _choose(event)
-    return dL - dr.select(on, carried * value * _tangent(scene, world, way, on), 0)
-
-
-def _push_albedo(world: World, ray: mi.Ray3f, event: Scattering) -> mi.Spectrum:
-    """The tangent of the albedo at the point: the transpose of :func:`_pull_albedo`."""
-    dL = mi.Spectrum(0)
-    for body, on in at_event(world, event.event):
-        if body.view.share is None:
-            continue
-        with dr.resume_grad():
-            share = albedo(body, event.mei, on)
-            own = dr.forward_to(share) if dr.grad_enabled(share) else mi.Spectrum(0)
-        dL += dr.select(on, event.weight * sigma_t_at(world, body, ray, event.event, on) * own, 0)
-    return dL
+def _push_attached(scene: mi.Scene, world: World, ray: mi.Ray3f, event: Scattering) -> mi.Spectrum:
+    """The tangent of what lights a point, dims its light and turns it: the transpose of the pulls of arrivals and albedo."""
+    carried = event.sigma_s * event.gain
+    with dr.resume_grad():
+        # One sum: each pass through the graph clears the edges behind it, which the terms share.
+        value = sum((dr.select(a.on, carried * a.value, 0) for a in event.arrivals), mi.Spectrum(0))
+        for body, on in at_event(world, event.event):
+            if body.view.share is not None:
+                sigma_t = sigma_t_at(world, body, ray, event.event, on)
+                value += dr.select(on, event.weight * sigma_t * albedo(body, event.mei, on), 0)
+        dL = dr.forward_to(value) if dr.grad_enabled(value) else mi.Spectrum(0)
+    way, dimmed, on = _choose(event)
+    return dL - dr.select(on, carried * dimmed * _tangent(scene, world, way, on), 0)
 
 
 def _push_source(scene: mi.Scene, world: World, stretch: Stretch, event: Scattering) -> mi.Spectrum:
@@ -326,7 +318,7 @@ def revisit(scene: mi.Scene, world: World, way: Way, visit: Visit, state: Any, a
     """Visit the media of a stretch whose end is known; only boundaries that have to be traced are traced again."""
     if not world.traced:
         return visit_boxes(world, way.ray, way.length, visit, state, active)
-    return reach(scene, world, way.ray, way.medium, visit, state, active)[1]
+    return reach(scene, world, way.ray, way.medium, visit, state, active, way.unveils)[1]
 
 
 def _channels(value: mi.Spectrum, channels: int) -> list[mi.Float]:

@@ -58,22 +58,38 @@ class Body:
         return SumField(parts, [dr.detach(_values(p)) for p in parts], dr.detach(self.view.scale) * self.area(ray.d))
 
     def optical_depth(
-        self, ray: mi.Ray3f, t0: mi.Float, t1: mi.Float, channels: int, active: mi.Bool, parts: list[Part] | None = None
+        self,
+        ray: mi.Ray3f,
+        t0: mi.Float,
+        t1: mi.Float,
+        channels: int,
+        active: mi.Bool,
+        parts: list[Part] | None = None,
+        enough: float | None = None,
     ) -> list[mi.Float]:
-        """Optical depth [1] of each channel over a stretch, of all parts unless told which."""
+        """Optical depth [1] of each channel over a stretch, of all parts unless told which; a grid may stop at ``enough``."""
         parts = self.view.parts if parts is None else parts
         pairs = [(p, dr.detach(_values(p))) for p in parts]
         scale = dr.detach(self.view.scale) * self.area(ray.d)
-        return [scale * tau for tau in self._sum(ray, t0, t1, channels, active, pairs, skip=True)]
+        bound = None if enough is None else enough / scale
+        return [scale * tau for tau in self._sum(ray, t0, t1, channels, active, pairs, True, bound)]
 
     def tangent(self, ray: mi.Ray3f, t0: mi.Float, t1: mi.Float, channels: int, active: mi.Bool) -> list[mi.Float]:
         """Derivative of the optical depth along the tangent that :meth:`World.start_tangent` took from the parameters."""
         pairs = list(zip(self.view.parts, self.tangents, strict=True))
         area = self.area(ray.d)
-        return [area * change for change in self._sum(ray, t0, t1, channels, active, pairs, skip=False)]
+        return [area * change for change in self._sum(ray, t0, t1, channels, active, pairs, False)]
 
     def _sum(
-        self, ray: mi.Ray3f, t0: mi.Float, t1: mi.Float, channels: int, active: mi.Bool, pairs: list[tuple], skip: bool
+        self,
+        ray: mi.Ray3f,
+        t0: mi.Float,
+        t1: mi.Float,
+        channels: int,
+        active: mi.Bool,
+        pairs: list[tuple],
+        skip: bool,
+        enough: mi.Float | None = None,
     ) -> list[mi.Float]:
         """Integrate the values that come with each part in its place."""
         total = [mi.Float(0) for _ in range(channels)]
@@ -86,7 +102,7 @@ class Body:
                 rows = [dr.select(v != 0, v * length, 0) for v in each]
             else:
                 lattice = part.lattice if skip else replace(part.lattice, bounds=None)
-                rows = integrate_segment(lattice, value, clip(lattice, ray.o, ray.d, t0, t1), active)
+                rows = integrate_segment(lattice, value, clip(lattice, ray.o, ray.d, t0, t1), active, enough)
             total = [t + r for t, r in zip(total, as_rows(rows, channels), strict=True)]
         return total
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import scenes
+from mivol.scene.needs import Survey, is_scattering
 from mivol.transport.medium import box_of_cube, place_of_grid, view_medium
 from scenes import FRAMES, box_of, grid_volume, medium, refused
 
@@ -42,11 +43,15 @@ def test_our_grid_knows_its_place():
     assert np.array_equal(place_of_grid(volume), np.float32(place).astype(np.float64))
 
 
+def scatters(description: dict) -> bool:
+    return is_scattering(view_medium(mi.load_dict(description)), Survey((), (), False, (), (), ()), "box")
+
+
 def test_a_medium_that_scatters_says_so():
-    assert view_medium(mi.load_dict(medium("homogeneous", 1.0, 0.5))).is_scattering()
-    assert not view_medium(mi.load_dict(medium("homogeneous", 1.0, 0.0))).is_scattering()
+    assert scatters(medium("homogeneous", 1.0, 0.5))
+    assert not scatters(medium("homogeneous", 1.0, 0.0))
     both = {"type": "mivol_medium", "sigma_a": 1.0, "sigma_s": grid_volume("mivol_voxels", VALUES)}
-    assert view_medium(mi.load_dict(both)).is_scattering()
+    assert scatters(both)
 
 
 def test_a_volume_of_another_kind_is_refused():

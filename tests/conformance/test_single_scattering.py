@@ -8,6 +8,7 @@ than they should: `rounding` of 1e-4 of the radiance covers that.
 
 from __future__ import annotations
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -374,6 +375,51 @@ def test_a_refractive_boundary_is_refused_by_name(bsdf):
     scene = close_up({"tank": ball, "sky": scenes.sky(1.0)}, res=2)
     with refused("tank.*refract|refract.*tank"):
         scenes.render(scene, mivol(), 1)
+
+
+# -- Samplers, recordings, variants --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", ["stratified", "multijitter", "orthogonal", "ldsampler"])
+def test_samplers(kind):
+    """Points that are spread evenly change the noise, not the mean: against independent ones; and there is less noise."""
+    spp = 49 if kind == "orthogonal" else 64
+    parts, found = {"smoke": smoke(rough_grid(1), name="hg", g=0.4)[0], "sky": scenes.sky(0.3)}, {}
+    for sampler in ("independent", kind):
+        sensor = scenes.camera((1.5, -2.5, 1.2), (0, 0, 0), res=8, fov=40.0)
+        sensor["sampler"] = {"type": sampler, "sample_count": spp}
+        found[sampler] = moments(mi.load_dict({"type": "scene", **parts, "sensor": sensor}), mivol(), spp)
+    small.assert_same_whole(found["independent"], found[kind])
+    # A variance of 16 values is known to 35 %; the mean of 64 pixels of them to 5 %: 0.8 is four of these below 1.
+    assert found[kind].variance.mean() < 0.8 * found["independent"].variance.mean()
+
+
+@pytest.mark.parametrize("kind", small.KINDS)
+def test_recordings(kind):
+    """A function recorded by dr.freeze shows what an ordinary render shows, also after values have changed."""
+    parts = {"smoke": smoke(rough_grid(1), kind=kind, name="hg", g=0.4)[0], "bulb": point([1.5, -1.2, 1.6])[0]}
+    scene, integrator = close_up({**parts, "sky": scenes.sky(0.3)}, res=8), mi.load_dict(mivol())
+    params, key = mi.traverse(scene), "smoke.interior_medium.sigma_t.data"
+
+    def shoot(scene: mi.Scene, integrator: mi.Integrator, seed: mi.UInt32) -> mi.TensorXf:
+        return mi.render(scene, integrator=integrator, spp=4, seed=seed)
+
+    frozen = dr.freeze(shoot)
+    for call in range(4):
+        params[key] = scenes.tensor(rough_grid(1) * (1 + 0.5 * call))
+        params.update()
+        image, replayed = (np.array(f(scene, integrator, mi.UInt32(call))) for f in (shoot, frozen))
+        assert np.allclose(replayed, image, rtol=1e-5, atol=1e-7)
+    assert frozen.n_recordings < 4
+
+
+def test_a_mono_variant():
+    """One channel: as volpath in the same variant."""
+    mi.set_variant("llvm_ad_mono")
+    sensor = scenes.camera((1.5, -2.5, 1.2), (0, 0, 0), res=16, fov=40.0)
+    sensor["film"]["pixel_format"] = "luminance"
+    parts = lit({"smoke": grid_in(cube(PLACE), "own")})
+    assert_same_images(mi.load_dict({"type": "scene", **parts, "sensor": sensor}), channels=1, rounding=LEAK)
 
 
 # -- Scenes of a stranger --------------------------------------------------------------------------------------------
