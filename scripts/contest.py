@@ -263,14 +263,19 @@ def samples_for(render: Callable[[int, int], object], seconds: float) -> int:
         render: seed, samples per pixel -> Dr.Jit arrays.
         seconds: of all threads together.
     """
-    spp = 4
-    clock(lambda seed: render(seed, spp))
-    while True:
+
+    def taken(spp: int) -> float:
         before = time.process_time()
-        clock(lambda seed, spp=spp: render(seed, spp), spp)
-        taken = time.process_time() - before
-        if taken > seconds / 8 or spp >= MOST_SAMPLES:
-            return int(np.clip(2.0 ** np.floor(np.log2(spp * seconds / taken)), 4, MOST_SAMPLES))
+        clock(lambda seed: render(seed, spp), spp)
+        return time.process_time() - before
+
+    spp = 4
+    taken(spp)
+    while True:
+        # The smaller of two: the other may have compiled a kernel, or made what is kept for a scene.
+        least = min(taken(spp), taken(spp))
+        if least > seconds / 8 or spp >= MOST_SAMPLES:
+            return int(np.clip(2.0 ** np.floor(np.log2(spp * seconds / least)), 4, MOST_SAMPLES))
         spp *= 8
 
 
