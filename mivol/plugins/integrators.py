@@ -1,4 +1,4 @@
-"""<integrator type="mivol">: exact images of absorbing volumes, and their derivatives."""
+"""<integrator type="mivol">: images of volumes that absorb and scatter once, and their derivatives."""
 
 from __future__ import annotations
 
@@ -11,21 +11,30 @@ from mivol.transport.path import Settings
 
 
 class MivolIntegrator(mi.ad.integrators.common.ADIntegrator):
-    """``<integrator type="mivol">``: volumes rendered by exact optical depth.
+    """``<integrator type="mivol">``: volumes rendered by exact optical depth, and one scattering.
 
-    Takes the place of ``prbvolpath`` for media that absorb, over ``mivol_medium``, ``homogeneous`` and ``heterogeneous``.
+    Takes the place of ``prbvolpath`` over ``mivol_medium``, ``homogeneous`` and ``heterogeneous`` media.
 
     Parameters:
         max_depth: 1: emitters seen through media; 2: surfaces lit directly; -1: no limit. Default 6.
         rr_depth: depth from which roulette may end a path. Default 5.
         hide_emitters: do not show emitters to the camera. Default false.
+        deterministic: scattered light by quadrature along the ray, without noise; for point, spot and directional lights.
+            Derivatives are drawn as ever. Default false.
+        shadows: exact, or grid: with ``deterministic``, looked up in a lattice of optical depths. Default exact.
         aovs: comma list of tau, tau.R, tau.G, tau.B, alpha, depth; appended to the colours in the order named.
     """
 
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
         depth = -1 if self.max_depth == 0xFFFFFFFF else self.max_depth
-        settings = Settings(depth, self.rr_depth, props.get("hide_emitters", False))
+        settings = Settings(
+            depth,
+            self.rr_depth,
+            props.get("hide_emitters", False),
+            props.get("deterministic", False),
+            props.get("shadows", "exact"),
+        )
         self.session = Session(settings, props.get("aovs", ""))
 
     def aov_names(self) -> list[str]:

@@ -20,6 +20,7 @@ from mivol.scene.load import find_sensor
 from mivol.scene.needs import Needs, Survey, find_needs, read_values, survey_scene
 from mivol.transport.aovs import AOVS
 from mivol.transport.direct import Lights
+from mivol.transport.light_grid import find_light_grid, measure_bias
 from mivol.transport.optical_depth import PACKED_LIMIT, gradient_bytes
 from mivol.transport.path import Settings
 from mivol.transport.world import Body, World
@@ -68,6 +69,7 @@ def make_plan(needs: Needs, settings: Settings) -> Plan:
     """
     _refuse_scattering(needs, settings)
     _refuse_refraction(needs, settings)
+    _refuse_quadrature(needs, settings)
     choices = [_transport(needs, settings), *_lighting(needs, settings), _tracing(needs), _channels(needs)]
     skips = tuple(bool(m.resolutions) and m.occupied < SKIP_BELOW for m in needs.media)
     choices += [_skipping(m, skip) for m, skip in zip(needs.media, skips, strict=True) if m.resolutions]
@@ -111,6 +113,27 @@ def _refuse_refraction(needs: Needs, settings: Settings) -> None:
         raise MivolError(
             f"the boundary {needs.refractive[0]} refracts and its scene has a medium that scatters; no straight shadow ray "
             "reaches a lamp through it: make the boundary's BSDF null, set max_depth to 1, or the albedo to 0."
+        )
+
+
+def _refuse_quadrature(needs: Needs, settings: Settings) -> None:
+    if settings.shadows not in ("exact", "grid"):
+        raise MivolError(f"shadows is {settings.shadows!r}; exact or grid is expected.")
+    if settings.shadows == "grid" and not settings.deterministic:
+        raise MivolError("shadows is 'grid' without deterministic, and drawn light has exact shadows: set deterministic too.")
+    if not settings.deterministic or not _is_lit(needs, settings):
+        return
+    other = [kind for kind, lamp in zip(needs.emitters, needs.lamps, strict=True) if lamp != "sharp"]
+    if other:
+        raise MivolError(
+            f"deterministic is set and the scene has a {other[0]}; quadrature is for lamps of one position or direction "
+            "(point, spot, directional): leave deterministic out."
+        )
+    grids = sum(len(m.resolutions) for m in needs.media)
+    if len(needs.media) > 1 or grids > 1 or (settings.shadows == "grid" and grids == 0):
+        raise MivolError(
+            f"deterministic is set and the scene has {len(needs.media)} media with {grids} grids of extinction; quadrature is "
+            "for one medium with one grid (or, with exact shadows, none): leave deterministic out."
         )
 
 
@@ -219,6 +242,7 @@ def build_world(scene: mi.Scene, needs: Needs, plan: Plan, settings: Settings, s
         start=needs.start,
         locates=needs.camera_inside and needs.start is None,
         lights=Lights(scene) if _is_lit(needs, settings) else None,
+        is_deterministic=settings.deterministic,
     )
 
 
@@ -253,8 +277,29 @@ def explain(scene: mi.Scene | str | Path, max_depth: int = 6, sensor: int = 0) -
     ]
     width = max(len(c.about) for c in plan.choices)
     lines += [f"  {c.about:<{width}}  {c.choice}\n  {'':<{width}}    because {c.reason}" for c in plan.choices]
-    lines += [f"  model     {text}" for text in _depth_two(needs)] if max_depth == 2 else []
+    if max_depth == 2:
+        lines += [f"  model     {text}" for text in _depth_two(needs)]
+        lines += [f"  shadows   {text}" for text in _light_grid(loaded, needs, plan)]
     return "\n".join(lines)
+
+
+def _light_grid(scene: mi.Scene, needs: Needs, plan: Plan) -> list[str]:
+    """What a light grid in place of shadow rays would cost, and how wrong it is."""
+    settings = Settings(max_depth=2)
+    grids = [res for m in needs.media for res in m.resolutions]
+    if not _is_lit(needs, settings) or set(needs.lamps) != {"sharp"} or len(needs.media) != 1 or len(grids) != 1:
+        return []
+    with dr.suspend_grad():
+        world = build_world(scene, needs, plan, settings, survey_scene(scene))
+        grid = find_light_grid(scene, world)
+        bias, rms = measure_bias(scene, world, grid)
+    nodes = grid.nodes[0] * grid.nodes[1] * grid.nodes[2]
+    rays = needs.film_samples * sum(grids[0])
+    pays = "pays" if nodes < rays else "does not pay"
+    return [
+        f"exact; with deterministic, a light grid of {nodes} nodes {pays} against about {rays} shadow rays, at a bias of "
+        f"{bias:+.2g} of a lamp's light (rms {rms:.2g}, measured against exact shadows)"
+    ]
 
 
 def _depth_two(needs: Needs) -> list[str]:

@@ -18,7 +18,7 @@ from mivol.scene.plan import Plan, build_world, check_aovs, make_plan
 from mivol.transport.aovs import backproject_aovs, integrate_aovs, push_aovs
 from mivol.transport.control import View, find_control
 from mivol.transport.film import Rays, adjoint_rays, record
-from mivol.transport.light_grid import find_shade
+from mivol.transport.light_grid import find_light_grid, find_shade
 from mivol.transport.path import Settings, walk_path
 from mivol.transport.score import Adjoint, Primal, Tangent
 from mivol.transport.world import World
@@ -115,6 +115,8 @@ class Session:
         if world.lights is not None:
             with dr.suspend_grad():
                 world.shade = find_shade(scene, world, needs.film_samples)
+                if self.settings.shadows == "grid":
+                    world.light_grid = find_light_grid(scene, world)
         return world, plan
 
     def _primal(self, scene: mi.Scene, world: World, rays: Rays) -> tuple:

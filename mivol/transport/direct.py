@@ -24,7 +24,7 @@ from mivol.transport.lamp_motion import tau_by_end
 from mivol.transport.path import Way, light_through, power_heuristic, shadow_ray
 from mivol.transport.world import World, spectrum
 
-__all__ = ["Arrival", "Draw", "Lights", "arrivals"]
+__all__ = ["Arrival", "Draw", "Lights", "arrivals", "focus_on"]
 
 UNIFORM = "ConstantBackgroundEmitter"
 
@@ -63,6 +63,10 @@ class Lights:
         self.is_near = any(b is not None for b in balls)
         self._balls = [None if b is None else [dr.opaque(mi.Float, v) for v in b] for b in balls]
 
+    def ball(self, number: int) -> list[mi.Float] | None:
+        """Centre and radius of a lamp that directions are drawn towards; None for one at infinity."""
+        return self._balls[number]
+
     def draw(self, sampler: mi.Sampler, active: mi.Bool) -> Draw:
         """Draw the numbers of one event."""
         return Draw(
@@ -98,6 +102,14 @@ def _ball(emitter: mi.Emitter) -> list[float] | None:
     if emitter.is_environment() or not np.isfinite([low, high]).all() or (high < low).any():
         return None
     return [*((low + high) / 2), float(np.linalg.norm(high - low) / math.sqrt(12))]
+
+
+def focus_on(ray: mi.Ray3f, ball: list[mi.Float] | None) -> Focus | None:
+    """One lamp as seen from rays; None where it is at infinity."""
+    if ball is None:
+        return None
+    x, y, z, r = ball
+    return _focus(ray, mi.Point3f(x, y, z), dr.square(r), mi.Bool(True))
 
 
 def _focus(ray: mi.Ray3f, centre: mi.Point3f, radius2: mi.Float, finite: mi.Bool) -> Focus:

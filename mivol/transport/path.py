@@ -45,11 +45,17 @@ __all__ = [
 
 @dataclass(frozen=True)
 class Settings:
-    """How long a path may be: ``max_depth`` (-1: no limit), roulette from ``rr_depth`` on, ``hide_emitters``."""
+    """How long a path may be, and how scattered light is found.
+
+    ``max_depth`` (-1: no limit), roulette from ``rr_depth`` on, ``hide_emitters``; ``deterministic``: by quadrature, with
+    ``shadows`` that are ``exact`` or looked up in a ``grid``.
+    """
 
     max_depth: int = 6
     rr_depth: int = 5
     hide_emitters: bool = False
+    deterministic: bool = False
+    shadows: str = "exact"
 
 
 @dataclass

@@ -21,7 +21,7 @@ from mivol.transport.free_flight import Event, offer, place, start_pick
 from mivol.transport.path import Reach, Stretch, optical_depth_to, reach, transmittance
 from mivol.transport.world import Body, World, spectrum
 
-__all__ = ["Scattering", "at_event", "scatter"]
+__all__ = ["Scattering", "albedo", "at_event", "interaction", "scatter", "sigma_t_at"]
 
 KAPPA = 4.0
 """Optical depth that a probe for derivatives adds over a body (measured: flat between 2 and 8)."""
@@ -84,11 +84,19 @@ def scatter(
     return end, pick.tau, Scattering(event, mei, gain, found, _sigma_s(world, ray, event, mei), draw.choice)
 
 
-def _interaction(world: World, ray: mi.Ray3f, event: Event) -> mi.MediumInteraction3f:
+def interaction(ray: mi.Ray3f, t: mi.Float, medium: mi.Medium | None = None) -> mi.MediumInteraction3f:
+    """A point of a ray as Mitsuba's phase functions want it."""
     mei = dr.zeros(mi.MediumInteraction3f, dr.width(ray))
-    mei.t, mei.p, mei.wi = event.t, ray(event.t), -ray.d
+    mei.t, mei.p, mei.wi = t, ray(t), -ray.d
     mei.sh_frame = mi.Frame3f(mei.wi)
     mei.time, mei.wavelengths = ray.time, ray.wavelengths
+    if medium is not None:
+        mei.medium = dr.select(dr.full(mi.Bool, True, dr.width(ray)), mi.MediumPtr(medium), None)
+    return mei
+
+
+def _interaction(world: World, ray: mi.Ray3f, event: Event) -> mi.MediumInteraction3f:
+    mei = interaction(ray, event.t)
     for index, body in enumerate(world.bodies):
         mei.medium = dr.select(event.on & (event.body == index), mi.MediumPtr(body.view.medium), mei.medium)
     return mei

@@ -24,6 +24,7 @@ import mitsuba as mi
 
 from mivol.transport.control import Probe, Tracks, sweep
 from mivol.transport.path import Reach, Stretch, Visit, Way, optical_depth_to, reach, visit_boxes
+from mivol.transport.quadrature import integrate_scattering
 from mivol.transport.scatter import Scattering, albedo, at_event, scatter, sigma_t_at
 from mivol.transport.world import Body, World, spectrum
 
@@ -44,6 +45,9 @@ class Primal:
         """Go to the end of a stretch; add what its media scatter."""
         if world.lights is None or not self.scatters:
             return *optical_depth_to(scene, world, stretch.ray, stretch.medium, active), self
+        if world.is_deterministic:
+            end, tau, light = integrate_scattering(scene, world, stretch, active)
+            return end, tau, self.add(light, active)
         end, tau, event = scatter(scene, world, stretch, False, active)
         return end, tau, self.add(event.sigma_s * event.weight, event.event.on)
 

@@ -21,7 +21,7 @@ from mivol.transport.optical_depth import Gradient, backproject_segment, integra
 if TYPE_CHECKING:
     from mivol.transport.control import Control
     from mivol.transport.direct import Lights
-    from mivol.transport.light_grid import Shade
+    from mivol.transport.light_grid import LightGrid, Shade
 
 __all__ = ["Body", "World"]
 
@@ -187,6 +187,7 @@ class World:
         start: the medium that the sensor names, or None.
         locates: the camera may be inside a boundary that has to be traced, and the sensor names no medium.
         lights: what lights the media that scatter; None where none does.
+        is_deterministic: images of scattered light are made by quadrature; derivatives are still drawn.
     """
 
     def __init__(
@@ -198,6 +199,7 @@ class World:
         start: mi.Medium | None = None,
         locates: bool = False,
         lights: Lights | None = None,
+        is_deterministic: bool = False,
     ) -> None:
         self.boxed = [b for b in bodies if b.box is not None]
         # A traced stretch is recognised by its medium, which several boundaries may share.
@@ -209,6 +211,8 @@ class World:
         self.lights = lights
         self.control: Control | None = None
         self.shade: Shade | None = None
+        self.light_grid: LightGrid | None = None
+        self.is_deterministic = is_deterministic
 
     @property
     def takes_control(self) -> bool:

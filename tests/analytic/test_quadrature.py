@@ -1,0 +1,124 @@
+"""Scattered light by quadrature along pencils: against the float64 twin, without any noise to hide behind.
+
+The rule is exact for smooth light to far below what is allowed; its error is where shadows bend within a piece: tau towards a
+lamp has a kink where the shadow ray begins to cross another cell, or to leave by another face. A piece of optical depth p with
+a kink of its own slope errs by p^2 / 8 of its light: 0.25^2 / 8 = 8e-3; of the pieces of a ray at most half have one.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import oracle_scattering as twins
+import pytest
+from scattering_scenes import aimed, close_up, fog, mivol, pencils, point, rough_grid, smoke, spot, sun
+
+from mivol.scene.needs import find_needs, survey_scene
+from mivol.scene.plan import build_world, explain, make_plan
+from mivol.transport.light_grid import find_light_grid, measure_bias
+from mivol.transport.path import Settings
+from scenes import refused, sky
+
+pytestmark = pytest.mark.usefixtures("variant_rgb")
+
+LAMPS = {
+    "point outside": lambda: [point([1.5, 1, 2.0])],
+    "point inside": lambda: [point([0.3, -0.2, 0.35])],
+    "spot": lambda: [spot([1.0, -2, 2.5], [0, 0, 0], cutoff=60, beam=59)],
+    "sun": lambda: [sun([0.3, 0.2, -1.0])],
+    "two": lambda: [point([1.5, 1, 2.0]), sun([0.3, 0.2, -1.0], 0.3)],
+}
+
+
+def image(seen, **more) -> np.ndarray:
+    return np.array(mi.render(seen.scene, integrator=mi.load_dict(mivol(deterministic=True, **more)), spp=1))[0]
+
+
+def beside(parts: dict, media: list, lamps: list, order: int = 6) -> tuple[np.ndarray, np.ndarray]:
+    seen = pencils(parts | {f"lamp{i}": lamp for i, (lamp, _) in enumerate(lamps)}, *aimed(3))
+    truth = twins.radiance(media, [twin for _, twin in lamps], seen.o, seen.d, order=order)
+    return image(seen), np.broadcast_to(truth, (len(seen.o), 3))
+
+
+@pytest.mark.parametrize("lamps", LAMPS)
+def test_grid(lamps):
+    box, m = smoke(rough_grid(1), name="hg", g=0.4)
+    found, truth = beside({"smoke": box}, [m], LAMPS[lamps]())
+    assert np.abs(found - truth).max() <= 4e-3 * truth.max()
+
+
+@pytest.mark.parametrize("lamps", ["point outside", "sun", "point inside"])
+@pytest.mark.parametrize("sigma_t", [0.1, 2.0, 30.0])
+def test_homogeneous(lamps, sigma_t):
+    box, m = fog(sigma_t)
+    # Sixty optical depths across: the twin's own Gauss rule needs more points than a cell would.
+    found, truth = beside({"fog": box}, [m], LAMPS[lamps](), order=96)
+    # 64 to 256 pieces; the face by which shadows leave changes once or twice along a ray.
+    assert np.abs(found - truth).max() <= 4e-3 * truth.max()
+
+
+def test_two_renders_are_the_same():
+    box, _ = smoke(rough_grid(1))
+    lamp, _ = point([1.5, 1, 2.0])
+    seen = pencils({"smoke": box, "lamp": lamp}, *aimed(3))
+    assert np.array_equal(image(seen), image(seen))
+
+
+def open_world(scene: mi.Scene):
+    survey, settings = survey_scene(scene), Settings(max_depth=2)
+    needs = find_needs(scene, scene.sensors()[0], survey)
+    return build_world(scene, needs, make_plan(needs, settings), settings, survey)
+
+
+def test_light_grid_against_exact_shadows():
+    """tau between nodes is wrong by h^2: two nodes a cell leave a quarter of the error of one node in two cells, or less."""
+    box, _ = smoke(rough_grid(1, shape=(16, 16, 16)))
+    lamp, _ = sun([0.3, 0.2, -1.0])
+    scene = close_up({"smoke": box, "lamp": lamp})
+    world = open_world(scene)
+    with dr.suspend_grad():
+        coarse, fine = (measure_bias(scene, world, find_light_grid(scene, world, cells))[1] for cells in (4, 1))
+    assert 0 < fine < 0.5 * coarse < 0.25
+    exact, looked_up = (
+        np.array(mi.render(scene, integrator=mi.load_dict(mivol(deterministic=True, shadows=s)), spp=16))
+        for s in ("exact", "grid")
+    )
+    # The image is an integral of the same transmittances: it cannot be off by more than some of their rms errors.
+    assert 0 < np.abs(exact - looked_up).mean() <= 4 * fine * exact.mean()
+
+
+def test_explain_measures_the_light_grid():
+    box, _ = smoke(rough_grid(1))
+    lamp, _ = sun([0.3, 0.2, -1.0])
+    text = explain(close_up({"smoke": box, "lamp": lamp}), max_depth=2)
+    assert "light grid" in text and "bias" in text
+
+
+def test_gradients_are_drawn():
+    """A deterministic image has the derivative of the image that is drawn: the same integrator makes it."""
+    box, _ = smoke(rough_grid(1))
+    lamp, _ = point([1.5, 1, 2.0])
+    scene = close_up({"smoke": box, "lamp": lamp})
+    params, grads = mi.traverse(scene), []
+    key = next(k for k in params.keys() if k.endswith("sigma_t.data"))
+    for more in ({}, {"deterministic": True}):
+        dr.enable_grad(params[key])
+        picture = mi.render(scene, params, integrator=mi.load_dict(mivol(**more)), spp=4, seed=1, seed_grad=2)
+        dr.backward(dr.sum(picture, axis=None))
+        grads.append(np.array(dr.grad(params[key])))
+        dr.disable_grad(params[key])
+        params[key] = mi.TensorXf(np.array(params[key]))
+        params.update()
+    # The order of sums over threads is not fixed.
+    assert np.abs(grads[0] - grads[1]).max() <= 1e-5 * np.abs(grads[0]).max()
+
+
+def test_refusals():
+    box, _ = smoke(rough_grid(1))
+    lamp, _ = point([1.5, 1, 2.0])
+    for more, why in (({"deterministic": True}, "ConstantBackground"), ({"shadows": "grid"}, "without deterministic")):
+        with refused(why):
+            mi.render(close_up({"smoke": box, "lamp": lamp, "sky": sky()}), integrator=mi.load_dict(mivol(**more)), spp=1)
+    with refused("exact or grid"):
+        mi.render(close_up({"smoke": box, "lamp": lamp}), integrator=mi.load_dict(mivol(shadows="soft")), spp=1)
