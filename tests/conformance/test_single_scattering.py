@@ -101,6 +101,7 @@ LAMPS = {
     "textured area": lambda: {"lamp": textured()},
     "area inside": lambda: {"lamp": {"type": "sphere", "radius": 0.25, "center": [0.3, 0.2, 0.1]}
                             | {"emitter": {"type": "area", "radiance": 4.0}}},
+    "two that can be met": lambda: {**LAMPS["envmap"](), "wide": area(-1.6, 0.5, 1.5, 3.0, 1.5)},
     "several": lambda: {"a": scenes.sky(0.1), "b": point([1.5, -1.2, 1.6])[0], "c": sun([0, 1, -0.5], 0.5)[0],
                         "d": area(-1.6, 0.5, 1.5)},
 }  # fmt: skip
@@ -163,7 +164,7 @@ def test_phase_functions(name, kind):
 
 
 def lit(parts: dict) -> dict:
-    return {**parts, "bulb": point([1.6, -1.3, 1.7])[0], "sky": scenes.sky(0.3)}
+    return {**parts, "bulb": point([1.6, -1.3, 1.7], 40.0)[0], "sky": scenes.sky(0.1)}
 
 
 def grid_in(boundary: dict, kind: str = "stock", to_world: np.ndarray = PLACE, seed: int = 3, **more: object) -> dict:
