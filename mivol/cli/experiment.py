@@ -256,9 +256,7 @@ def standard_error(made: ReferenceResult) -> np.ndarray:
     return np.sqrt(made.variance + (made.mean.max() / made.spp) ** 2)
 
 
-def read_files(
-    wanted: Files, base: Path, loaded: LoadedScene, sensors: Sequence[Any], held_out: Sequence[int]
-) -> Seen:
+def read_files(wanted: Files, base: Path, loaded: LoadedScene, sensors: Sequence[Any], held_out: Sequence[int]) -> Seen:
     """References from OpenEXR files; those that mivol wrote must be of the scene that they are said to be of.
 
     Raises:
@@ -380,8 +378,15 @@ def solve(
     return fit
 
 
+def numbers(problem: Problem) -> dict[str, float]:
+    """Each number of the parameters that are no grids or images, by key and place, as the scene holds it now."""
+    values = {name: np.asarray(value) for name, value in problem.values().items() if value.ndim == 1}
+    return {f"{name}[{i}]": float(x) for name, value in values.items() for i, x in enumerate(value)}
+
+
 class Measure:
-    """What a fit does not minimise: PSNR of held-out views, and the error of the volume where the truth is known."""
+    """What a fit does not minimise: PSNR of held-out views, the error of the volume where the truth is known, and what is
+    found of parameters that are few numbers."""
 
     def __init__(self, held_out: list[View], truth: np.ndarray | None, chosen: Experiment) -> None:
         self.shots = make_shots(held_out, chosen.fit.samples_per_pass) if held_out else []
@@ -398,7 +403,7 @@ class Measure:
             if tuple(found.shape) != self.truth.shape:
                 found = upsample(found, self.truth.shape[:3])
             errors["nrmse"] = nrmse(np.asarray(found), self.truth)
-        return errors
+        return errors | numbers(problem)
 
     def psnr(self, problem: Problem, shot: Shot) -> list[float]:
         """PSNR [dB] of each view of a shot, of what the scene holds now."""
@@ -444,14 +449,7 @@ def write_outputs(chosen: Experiment, folder: Path, record: RunRecord, fit: Fit,
         "iterations": float(fit.next),
         "views": float(len(seen.fitted)),
         "fit_seconds": fit.seconds,
-        **numbers_found(fit),
     }
-
-
-def numbers_found(fit: Fit) -> dict[str, float]:
-    """What was found for parameters that are no grids: each number by key and place."""
-    values = {name: np.asarray(value).ravel() for name, value in fit.values().items() if value.ndim != 4}
-    return {f"{name}[{i}]": float(x) for name, value in values.items() for i, x in enumerate(value)}
 
 
 def write_view(chosen: Experiment, folder: Path, problem: Problem, view: View, seed: int, seen: Seen) -> list[Image]:

@@ -244,9 +244,7 @@ def test_views_that_are_held_out_come_after_the_others(variant_rgb, folder: Path
     assert record["results"]["views"] == 2
 
 
-def test_images_that_are_compared_may_have_more_samples(
-    variant_rgb, folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_images_that_are_compared_may_have_more_samples(variant_rgb, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Four samples in each image of the fit, 32 in what is compared with held-out views and in what is kept."""
     asked, render = [], Problem.render
 
@@ -261,10 +259,8 @@ def test_images_that_are_compared_may_have_more_samples(
     assert asked == [32, 4, 32, 32, 32, 32]
 
 
-def test_a_colour_is_looked_for_from_a_start_of_its_own(
-    variant_rgb, folder: Path, capsys: pytest.CaptureFixture
-) -> None:
-    """Each number of what is no grid has its start, and is among the results; steps of 1e-6 leave it there."""
+def test_a_colour_is_looked_for_from_a_start_of_its_own(variant_rgb, folder: Path, capsys: pytest.CaptureFixture) -> None:
+    """Each number of what is no grid has its start, and is among the results and curves; steps of 1e-6 leave it there."""
     coloured = '<emitter type="constant" id="sky"><rgb name="radiance" value="0.9, 0.8, 0.7"/></emitter>'
     (folder / "scene.xml").write_text(SCENE.replace('<emitter type="constant"/>', coloured))
     flags = ["optimize", folder / "fit.toml", "-o", folder / "run", "--set", "fit.iterations=1", "--set", "event=[]"]
@@ -272,6 +268,7 @@ def test_a_colour_is_looked_for_from_a_start_of_its_own(
     assert run(*flags, "--set", sought) == 0
     results = json.loads((folder / "run" / "run.json").read_text())["results"]
     assert np.allclose([results[f"sky.radiance.value[{i}]"] for i in range(3)], [0.5, 0.25, 0.125], atol=2e-6)
+    assert "curves/sky.radiance.value[2].png" in files_of(folder / "run")
     assert "starts from 2 numbers and has 3" in refused(capsys, *flags, "--set", sought.replace(", 0.125", ""))
 
 
