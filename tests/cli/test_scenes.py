@@ -74,7 +74,7 @@ def better_than_nothing(results):
 
 
 def nearer_the_lamp(results):
-    """Forty steps of at most 0.1 a coordinate at a falling rate, 2 in all: from 3.0 of the true place to less than a half of it."""
+    """Forty steps of at most 0.1 at a falling rate, 2 in all for each coordinate: from 3.0 of the true place to below half."""
     place = [results[f"lamp.position[{i}]"] for i in range(3)]
     assert np.linalg.norm(np.subtract(place, (1.1, 1.4, -0.6))) < 1.5
 
