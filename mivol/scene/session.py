@@ -19,7 +19,7 @@ from mivol.transport.aovs import backproject_aovs, integrate_aovs, push_aovs
 from mivol.transport.control import View, find_control
 from mivol.transport.film import Rays, adjoint_rays, record
 from mivol.transport.light_grid import find_light_grid, find_shade
-from mivol.transport.path import Settings, walk_path
+from mivol.transport.path import Settings, is_straight, walk_path
 from mivol.transport.score import Adjoint, Primal, Tangent
 from mivol.transport.world import World
 
@@ -131,10 +131,12 @@ class Session:
 
     def _replay(self, scene: mi.Scene, world: World, rays: Rays, dL: mi.Spectrum, daovs: list[mi.Float]) -> None:
         _take_control(scene, world, rays)
-        again = rays.sampler.clone()
-        score, _ = walk_path(scene, world, self.settings, rays.sampler, rays.ray, Primal(_black(rays.ray), scatters=False))
-        dr.eval(score.L)
-        walk_path(scene, world, self.settings, again, rays.ray, Adjoint(score.L, dL))
+        again, L = rays.sampler.clone(), None
+        if not is_straight(world, self.settings):
+            known = Primal(_black(rays.ray), scatters=False)
+            L = walk_path(scene, world, self.settings, rays.sampler, rays.ray, known)[0].L
+            dr.eval(L)
+        walk_path(scene, world, self.settings, again, rays.ray, Adjoint(L, dL))
         backproject_aovs(scene, world, rays.ray, self.aovs, daovs)
 
 

@@ -246,10 +246,13 @@ def taken_light(tau: mi.Float, T: mi.Float, T_out: mi.Float) -> mi.Float:
 
 
 def _next(state: mi.UInt32) -> tuple[mi.UInt32, mi.Float]:
-    """The next state of a permuted congruential generator (RXS-M-XS 32) and its number in [0, 1)."""
+    """The next state of a permuted congruential generator (RXS-M-XS 32) and its number in (0, 1).
+
+    Never 0: a piece of next to no weight would be kept 2^-24 of the time, and count for as much as any other.
+    """
     word = ((state >> ((state >> 28) + 4)) ^ state) * mi.UInt32(277803737)
     word = (word >> 22) ^ word
-    return state * mi.UInt32(747796405) + mi.UInt32(2891336453), mi.Float(word >> 8) * (1 / (1 << 24))
+    return state * mi.UInt32(747796405) + mi.UInt32(2891336453), (mi.Float(word >> 8) + 0.5) * (1 / (1 << 24))
 
 
 @dataclass

@@ -42,6 +42,10 @@ LAMPS = 8
 """Most lamps that are looked at one by one."""
 
 
+INSET = 1e-5
+"""How far inside the box the nodes in its faces look, as a share of it."""
+
+
 @dataclass
 class Shade:
     """Weight of each block of cells for each lamp: flat (blocks in z, y, x; lamps)."""
@@ -165,7 +169,9 @@ def find_light_grid(scene: mi.Scene, world: World, cells: int = 1) -> LightGrid:
     z, y, x = nodes
     index = dr.arange(mi.UInt32, z * y * x)
     at = (index % x, (index // x) % y, index // (x * y))
-    p = lattice.place(mi.Vector3f(*(mi.Float(a) / (m - 1) for a, m in zip(at, (x, y, z), strict=True))))
+    # Just inside: a shadow ray in the plane of a face is outside the box.
+    u = [dr.clip(mi.Float(a) / (m - 1), INSET, 1 - INSET) for a, m in zip(at, (x, y, z), strict=True)]
+    p = lattice.place(mi.Vector3f(*u))
     lamps, k = len(world.lights.drawn), world.channels
     tau = dr.zeros(mi.Float, z * y * x * lamps * k)
     for number, lamp in enumerate(world.lights.drawn):
@@ -192,8 +198,8 @@ def measure_bias(scene: mi.Scene, world: World, grid: LightGrid, points: int = 1
         Mean of T_grid - T_exact, and its root mean square, over points and lamps.
     """
     (body,) = world.bodies
-    k = dr.arange(mi.Float, points)
-    u = [(k + 0.5) / points, k * 0.7548777 - dr.floor(k * 0.7548777), k * 0.5698403 - dr.floor(k * 0.5698403)]
+    k = dr.arange(mi.Float, points) + 0.5
+    u = [k / points, k * 0.7548777 - dr.floor(k * 0.7548777), k * 0.5698403 - dr.floor(k * 0.5698403)]
     p = grid.lattice.place(mi.Vector3f(*u))
     ray = mi.Ray3f(p, mi.Vector3f(0, 0, 1), dr.inf, mi.Float(0), mi.Color0f())
     weight = body.extinction_at(ray, mi.Float(0), 1, mi.Bool(True))[0]

@@ -34,6 +34,7 @@ __all__ = [
     "Stretch",
     "Visit",
     "Way",
+    "is_straight",
     "light_through",
     "optical_depth_to",
     "reach",
@@ -309,8 +310,7 @@ def walk_path(
         score=score,
         sampler=sampler,
     )
-    # One stretch: nothing turns a path that no surface meets, nor one of depth 1 (unless a surface lets it pass).
-    if not world.has_surfaces or (limit <= 1 and not world.is_veiled):
+    if is_straight(world, settings):
         path = _see(scene, world, settings, limit, path)[0]
         return path.score, path.valid
     (path,) = dr.while_loop(
@@ -322,11 +322,17 @@ def walk_path(
     return path.score, path.valid
 
 
+def is_straight(world: World, settings: Settings) -> bool:
+    """Whether paths have one stretch: nothing turns one that no surface meets, nor one of depth 1 that no surface lets pass."""
+    return not world.has_surfaces or (settings.max_depth in (0, 1) and not world.is_veiled)
+
+
 def _see(scene: mi.Scene, world: World, settings: Settings, limit: int, path: Path) -> tuple[Path, Reach]:
     """Go to the next opaque surface and add the emission found there; media that scatter shine on the way."""
     scatters = path.active & (path.depth + 1 < limit)
     draw = world.lights.draw(path.sampler, scatters) if world.lights is not None else None
-    stretch = Stretch(path.ray, path.medium, path.beta, scatters, draw)
+    # A copy: the throughput is dimmed in place below, and a score may look at the stretch again after that.
+    stretch = Stretch(path.ray, path.medium, mi.Spectrum(path.beta), scatters, draw)
     end, tau, path.score = path.score.stretch(scene, world, stretch, path.active)
     path.beta *= transmittance(tau)
     path.medium = end.medium

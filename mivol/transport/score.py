@@ -16,7 +16,9 @@ References: Vicini et al. 2021 (replay with a running difference); Nimier-David 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import drjit as dr
@@ -66,29 +68,32 @@ class Primal:
 
 @dataclass
 class Adjoint:
-    """Replay a path of known radiance and add its derivatives to the gradients of media and surfaces."""
+    """Follow a path again and add its derivatives to the gradients of media and surfaces.
 
-    L: mi.Spectrum
+    ``L`` is the light that it carried from lamps and surfaces, which counts down as it is passed. A path of one stretch need
+    not be known beforehand (``L`` None): all its light is met at the end, and the stretch waits for it (``waiting``).
+    """
+
+    L: mi.Spectrum | None
     dL: mi.Spectrum
+    waiting: Callable[[mi.Spectrum], None] | None = None
     attached = True
 
     def stretch(
         self, scene: mi.Scene, world: World, stretch: Stretch, active: mi.Bool
     ) -> tuple[Reach, list[mi.Float], Adjoint]:
         """Everything ahead is dimmed by this stretch: d loss / d tau = -dL L; what its media scatter is probed apart."""
+        event = None
         if world.lights is None:
             end, tau = optical_depth_to(scene, world, stretch.ray, stretch.medium, active)
         else:
             end, tau, event = scatter(scene, world, stretch, True, active)
             _pull_arrivals(scene, world, event, self.dL)
             _pull_albedo(world, stretch.ray, event, self.dL)
-            if world.control is not None:
-                lit = dr.select(stretch.scatters, self.dL * stretch.beta, 0)
-                shares = _sums(lit, world.channels, world.control.channels)
-                _sweep(world, stretch, end, tau, event, shares, self.dL * self.L, self.dL, False, active)
-                return end, tau, self
-            _pull_source(scene, world, stretch, event, self.dL)
-        _backproject(scene, world, Way(stretch.ray, stretch.medium, end.t), -self.dL * self.L, active)
+        dim = partial(_pull_stretch, scene, world, stretch, end, tau, event, self.dL, active)
+        if self.L is None:
+            return end, tau, Adjoint(None, self.dL, dim)
+        dim(self.L)
         return end, tau, self
 
     def add(self, value: mi.Spectrum, active: mi.Bool) -> Adjoint:
@@ -96,7 +101,13 @@ class Adjoint:
         with dr.resume_grad():
             if dr.grad_enabled(value):
                 dr.backward_from(dr.select(active, self.dL * value, 0))
-        return Adjoint(self.L - dr.select(active, dr.detach(value), 0), self.dL)
+        seen = dr.select(active, dr.detach(value), 0)
+        if self.waiting is not None:
+            # The path may be following derivatives of its lamps here.
+            with dr.suspend_grad():
+                self.waiting(seen)
+            return Adjoint(None, self.dL)
+        return Adjoint(self.L - seen, self.dL)
 
     def shadow(self, scene: mi.Scene, world: World, way: Way, value: mi.Spectrum, active: mi.Bool) -> Adjoint:
         """Light that a shadow ray carried is dimmed by the media along it."""
@@ -168,6 +179,28 @@ class Tangent:
         f = dr.detach(f)
         change = dr.select(active & (f != 0), df * dr.rcp(dr.select(f != 0, f, 1)), 0)
         return Tangent(self.L, self.dL, self.dtau - change)
+
+
+def _pull_stretch(
+    scene: mi.Scene,
+    world: World,
+    stretch: Stretch,
+    end: Reach,
+    tau: list[mi.Float],
+    event: Scattering | None,
+    dL: mi.Spectrum,
+    active: mi.Bool,
+    L: mi.Spectrum,
+) -> None:
+    """Derivatives of the coefficients along a stretch, which dims the light ``L`` behind it and scatters light of its own."""
+    if event is not None and world.control is not None:
+        lit = dr.select(stretch.scatters, dL * stretch.beta, 0)
+        shares = _sums(lit, world.channels, world.control.channels)
+        _sweep(world, stretch, end, tau, event, shares, dL * L, dL, False, active)
+        return
+    if event is not None:
+        _pull_source(scene, world, stretch, event, dL)
+    _backproject(scene, world, Way(stretch.ray, stretch.medium, end.t), -dL * L, active)
 
 
 def _pull_arrivals(scene: mi.Scene, world: World, event: Scattering, dL: mi.Spectrum) -> None:

@@ -203,7 +203,7 @@ def test_replay_counts_down_to_zero():
     settings = Settings(max_depth=5)
     survey = survey_scene(scene)
     needs = find_needs(scene, sensor, survey)
-    world = plan.build_world(needs, plan.make_plan(needs, settings), settings, survey)
+    world = plan.build_world(scene, needs, plan.make_plan(needs, settings), settings, survey)
     sampler = sensor.sampler().clone()
     n = 2000
     position = mi.Point2f(np.random.default_rng(0).uniform(size=(2, n)).astype(np.float32))
