@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass, replace
 
 import mitsuba as mi
 import numpy as np
 import oracle_scattering as twins
+import pytest
 
 from mivol.validate.statistics import Moments, assert_same_mean
 from scenes import as_float32, box_of, camera, centred, film, grid_volume, medium, pencil, pixel_rays
@@ -20,6 +22,12 @@ PLACE = centred(2 * np.eye(3))
 def rough_grid(seed: int, top: float = 2.0, shape: tuple[int, ...] = (5, 4, 6)) -> np.ndarray:
     """Random values (Z, Y, X, 1) between 0 and `top`, some near 0."""
     return as_float32(top * np.random.default_rng(seed).uniform(0, 1, (*shape, 1)) ** 2)
+
+
+def cases(names: Iterable, slow: Collection = ()) -> list:
+    """Parameters of a test, those in `slow` marked so: they say the same of another kind of medium or in another place."""
+    return [pytest.param(*n, marks=pytest.mark.slow if n in slow else ()) if isinstance(n, tuple) else
+            pytest.param(n, marks=pytest.mark.slow if n in slow else ()) for n in names]  # fmt: skip
 
 
 # -- Means of renders --------------------------------------------------------------------------------------------------
