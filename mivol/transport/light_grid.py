@@ -198,9 +198,9 @@ def measure_bias(scene: mi.Scene, world: World, grid: LightGrid, points: int = 1
         Mean of T_grid - T_exact, and its root mean square, over points and lamps.
     """
     (body,) = world.bodies
-    k = dr.arange(mi.Float, points) + 0.5
-    u = [k / points, k * 0.7548777 - dr.floor(k * 0.7548777), k * 0.5698403 - dr.floor(k * 0.5698403)]
-    p = grid.lattice.place(mi.Vector3f(*u))
+    k = mi.Float64(dr.arange(mi.UInt32, points)) + 0.5
+    u = [k / points, k * 0.7548776662 - dr.floor(k * 0.7548776662), k * 0.5698402910 - dr.floor(k * 0.5698402910)]
+    p = grid.lattice.place(mi.Vector3f(*(mi.Float(v) for v in u)))
     ray = mi.Ray3f(p, mi.Vector3f(0, 0, 1), dr.inf, mi.Float(0), mi.Color0f())
     weight = body.extinction_at(ray, mi.Float(0), 1, mi.Bool(True))[0]
     total, first, second = dr.sum(weight), mi.Float(0), mi.Float(0)
