@@ -9,7 +9,8 @@ Four kinds of light in five volumes, albedo 0.75, all integrators with ``max_dep
 64 x 64 pixels (point lights: 24 x 24) with a box filter and independent samples. The volumes fill [-1, 1]^3: the smoke of the
 Mitsuba tutorial at its density (x 40); the same upsampled to 256^3, where an exact walk has five times the cells to cross and
 delta tracking nothing more to do; a CT of 256^3, and threads in 512^3 that leave 99 % of it empty, both with the largest
-extinction of the smoke, so that delta tracking has as many steps to take; a cloud of a large-eddy simulation.
+extinction of the smoke, so that delta tracking has as many steps to take (and with empty outermost voxels: Mitsuba loses a skin
+at a boundary); a cloud of a large-eddy simulation.
 
 Equal error. The error of an unbiased estimate falls with the root of the time, so variance x time is a number of the method
 alone. Each integrator gets the samples per pixel (a power of two) that take 0.8 s of processor time; then all render in turns,
@@ -135,8 +136,13 @@ def fine_smoke(size: Size) -> Field:
 
 
 def as_dense(found: Field) -> Field:
-    """A field with the smoke's largest extinction."""
-    return Field(found.values * np.float32(smoke().values.max() / found.values.max()), f"{found.origin}, as dense as the smoke")
+    """A field with the smoke's largest extinction, its outermost voxels empty.
+
+    Mitsuba starts rays anew (1 + |p|) 9e-5 behind a boundary. A medium that touches it lacks that skin, which holds 2 % of
+    the light at such an extinction (against quadrature in float64, which mivol agrees with).
+    """
+    values = np.pad(found.values[1:-1, 1:-1, 1:-1], 1)
+    return Field(values * np.float32(smoke().values.max() / values.max()), f"{found.origin}, as dense as the smoke")
 
 
 def cloud(_: Size) -> Field:
