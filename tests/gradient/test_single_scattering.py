@@ -199,6 +199,53 @@ def test_constvolume_whose_density_is_its_majorant():
     assert_gradient(gradients(seen, MEDIUM + "sigma_t.value.value", w, 2048), truth, "constvolume", 0.06)
 
 
+# -- Several channels, several media, boundaries that are traced ------------------------------------------------------
+
+
+@pytest.mark.parametrize("lit", ["point", "sky"])
+def test_rgb_extinction(lit):
+    """Each channel has the derivatives of its own grey picture, also where one of them is vacuum."""
+    values = as_float32(rough_grid(14) * np.array([1.0, 0.2, 0.0]))
+    lamp = LAMPS["point"]() if lit == "point" else ({"type": "constant", "radiance": 0.5}, twins.Sky(0.5, 8))
+    interior = medium("mivol_medium", grid_volume("mivol_voxels", values, PLACE), 0.7, phase={"type": "hg", "g": 0.4})
+    seen = pencils({"smoke": box_of(interior, PLACE), "lamp": lamp[0]}, *aimed(5, 3))
+    w, _ = weights(3)
+    found = gradients(seen, GRID, w, 1024)
+    background = 0.5 if lit == "sky" else 0.0
+    for c in range(3):
+        m = twins.Medium(twins.Grid(values[..., c], PLACE), 0.7, twins.hg(0.4))
+        truth, _ = twins.radiance_gradient(m, [lamp[1]], seen.o, seen.d, w[0, :, c], background=background, order=4)
+        # 8 x 16 directions of the sky: 3e-3 of the turned light's derivative.
+        assert_gradient(found[..., c], truth, f"channel {c}", 0.04, rounding=3e-3 if lit == "sky" else 2e-5)
+
+
+def test_two_media():
+    """A grid beside a homogeneous box and a ball: each shades the others; derivatives of the grid and of both constants."""
+    place, beside = as_float32(scenes.centred(np.eye(3), (-0.5, 0, 0))), as_float32(scenes.centred(np.eye(3), (0.51, 0, 0)))
+    values, lamp = rough_grid(15), point([1.5, 1, 2.0])
+    ball = scenes.ball_of(medium("homogeneous", 0.5, 0.6), (0, 0, 1.2), 0.5)
+    parts = {"smoke": smoke(values, 0.7, "own", place)[0], "fog": fog(0.8, 0.9, beside)[0], "ball": ball, "lamp": lamp[0]}
+    seen = pencils(parts, *aimed(6, 5, 0.4))
+    w, rows = weights(5)
+    v = np.random.default_rng(8).uniform(0.2, 1, values.shape)
+
+    def light(x=0.0, fog_sigma=float(as_float32(0.8)), ball_sigma=0.5):
+        media = [
+            twins.Medium(twins.Grid(values + x * v, place), 0.7),
+            twins.Medium(twins.Box(fog_sigma, beside), 0.9),
+            twins.Medium(twins.Ball(ball_sigma, [0, 0, 1.2], 0.5), 0.6),
+        ]
+        return rows @ twins.radiance(media, [lamp[1]], seen.o, seen.d, order=10)[:, 0]
+
+    for key, along, truth in (
+        (GRID, v, twin_difference(lambda x: light(x), 0.0)),
+        ("fog.interior_medium.sigma_t.value.value", 1.0, twin_difference(lambda x: light(fog_sigma=x), float(as_float32(0.8)))),
+        ("ball.interior_medium.sigma_t.value.value", 1.0, twin_difference(lambda x: light(ball_sigma=x), 0.5)),
+    ):
+        # The ball's edges are kinks of the twin's shadows: 1e-3.
+        assert_gradient(sums(seen, key, w, 2048, along), np.array([truth]), key, 0.08, rounding=2e-3)
+
+
 # -- Every other parameter -------------------------------------------------------------------------------------------------
 
 
