@@ -67,7 +67,9 @@ class Session:
         sensor = find_sensor(scene, sensor)
         with dr.suspend_grad():
             world, plan = self._open(scene, sensor, spp)
-            image = record(sensor, seed, spp, plan.pass_rays, self.aovs, lambda rays: self._primal(scene, world, rays))
+            image = record(
+                sensor, seed, spp, plan.pass_rays, self.aovs, lambda rays: self._primal(scene, world, rays), _is_tiled(world)
+            )
         if evaluate:
             dr.eval(image)
         return image
@@ -79,7 +81,9 @@ class Session:
             with dr.resume_grad():
                 world, plan = self._open(scene, sensor, spp)
                 world.start_tangent()
-            return record(sensor, seed, spp, plan.pass_rays, self.aovs, lambda rays: self._tangent(scene, world, rays))
+            return record(
+                sensor, seed, spp, plan.pass_rays, self.aovs, lambda rays: self._tangent(scene, world, rays), _is_tiled(world)
+            )
 
     def render_backward(self, scene: mi.Scene, grad_in: mi.TensorXf, sensor: int | mi.Sensor, seed: int, spp: int) -> None:
         """Add the derivatives of an image, weighted by ``grad_in``, to the gradients of the parameters.
@@ -91,7 +95,9 @@ class Session:
             with dr.resume_grad():
                 world, plan = self._open(scene, sensor, spp)
             world.start_gradients()
-            for rays, dL, daovs in adjoint_rays(sensor, seed, spp, plan.pass_rays, self.aovs, grad_in):
+            for rays, dL, daovs in adjoint_rays(
+                sensor, seed, spp, plan.pass_rays, self.aovs, grad_in, _is_tiled(world)
+            ):
                 self._replay(scene, world, rays, dL, daovs)
                 dr.eval()
             with dr.resume_grad():
@@ -120,13 +126,15 @@ class Session:
         return world, plan
 
     def _primal(self, scene: mi.Scene, world: World, rays: Rays) -> tuple:
-        score, valid = walk_path(scene, world, self.settings, rays.sampler, rays.ray, Primal(_black(rays.ray)))
+        score = Primal(_black(rays.ray))
+        score, valid = walk_path(scene, world, self.settings, rays.sampler, rays.ray, score, strata=rays.strata)
         return score.L, valid, integrate_aovs(scene, world, rays.ray, self.aovs)
 
     def _tangent(self, scene: mi.Scene, world: World, rays: Rays) -> tuple:
         _take_control(scene, world, rays)
         black = _black(rays.ray)
-        score, _ = walk_path(scene, world, self.settings, rays.sampler, rays.ray, Tangent(black, black, black))
+        score = Tangent(black, black, black)
+        score, _ = walk_path(scene, world, self.settings, rays.sampler, rays.ray, score, strata=rays.strata)
         return score.dL, dr.full(mi.Bool, False, dr.width(black)), push_aovs(scene, world, rays.ray, self.aovs)
 
     def _replay(self, scene: mi.Scene, world: World, rays: Rays, dL: mi.Spectrum, daovs: list[mi.Float]) -> None:
@@ -134,10 +142,15 @@ class Session:
         again, L = rays.sampler.clone(), None
         if not is_straight(world, self.settings):
             known = Primal(_black(rays.ray), scatters=False)
-            L = walk_path(scene, world, self.settings, rays.sampler, rays.ray, known)[0].L
+            L = walk_path(scene, world, self.settings, rays.sampler, rays.ray, known, strata=rays.strata)[0].L
             dr.eval(L)
-        walk_path(scene, world, self.settings, again, rays.ray, Adjoint(L, dL))
+        walk_path(scene, world, self.settings, again, rays.ray, Adjoint(L, dL), strata=rays.strata)
         backproject_aovs(scene, world, rays.ray, self.aovs, daovs)
+
+
+def _is_tiled(world: World) -> bool:
+    """Whether lanes should lie in tiles of pixels: where they draw directions of the phase function, or to wide lamps."""
+    return world.lights is not None and world.lights.has_lobes and not world.is_deterministic
 
 
 def _take_control(scene: mi.Scene, world: World, rays: Rays) -> None:

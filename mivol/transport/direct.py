@@ -19,6 +19,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mivol.transport.film import Strata
 from mivol.transport.free_flight import Focus, Lamp
 from mivol.transport.lamp_motion import tau_by_end
 from mivol.transport.path import Way, light_through, power_heuristic, shadow_ray
@@ -67,15 +68,20 @@ class Lights:
         """Centre and radius of a lamp that directions are drawn towards; None for one at infinity."""
         return self._balls[number]
 
-    def draw(self, sampler: mi.Sampler, active: mi.Bool) -> Draw:
-        """Draw the numbers of one event."""
+    def draw(self, sampler: mi.Sampler, active: mi.Bool, strata: Strata | None = None) -> Draw:
+        """Draw the numbers of one event; directions from the strata of a pass, where it has some."""
+
+        def direction() -> mi.Point2f:
+            u = sampler.next_2d(active)
+            return u if strata is None else strata.jitter(u)
+
         return Draw(
             sampler.next_1d(active),
             sampler.next_2d(active),
             sampler.next_1d(active),
-            sampler.next_2d(active),
+            direction(),
             sampler.next_1d(active),
-            sampler.next_2d(active),
+            direction(),
             sampler.next_1d(active),
         )
 

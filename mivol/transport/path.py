@@ -23,6 +23,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from mivol.transport.film import Strata
 from mivol.transport.lattice import slab
 from mivol.transport.world import Body, World
 
@@ -272,10 +273,18 @@ class Path:
     active: mi.Bool
     score: Any
     sampler: mi.Sampler
+    strata: Strata | None
 
 
 def walk_path(
-    scene: mi.Scene, world: World, settings: Settings, sampler: mi.Sampler, ray: mi.Ray3f, score: Any, active: mi.Bool = True
+    scene: mi.Scene,
+    world: World,
+    settings: Settings,
+    sampler: mi.Sampler,
+    ray: mi.Ray3f,
+    score: Any,
+    active: mi.Bool = True,
+    strata: Strata | None = None,
 ) -> tuple[Any, mi.Bool]:
     """Walk a path from the camera and give what it carries to a score.
 
@@ -287,6 +296,7 @@ def walk_path(
         ray: world space, unit direction.
         score: :mod:`mivol.transport.score`.
         active: lanes to walk.
+        strata: parts of the square that directions at media are drawn from.
 
     Returns:
         The score, and whether the film's alpha sees something.
@@ -309,6 +319,7 @@ def walk_path(
         active=mi.Bool(active) & (limit > 0),
         score=score,
         sampler=sampler,
+        strata=strata,
     )
     if is_straight(world, settings):
         path = _see(scene, world, settings, limit, path)[0]
@@ -330,7 +341,7 @@ def is_straight(world: World, settings: Settings) -> bool:
 def _see(scene: mi.Scene, world: World, settings: Settings, limit: int, path: Path) -> tuple[Path, Reach]:
     """Go to the next opaque surface and add the emission found there; media that scatter shine on the way."""
     scatters = path.active & (path.depth + 1 < limit)
-    draw = world.lights.draw(path.sampler, scatters) if world.lights is not None else None
+    draw = world.lights.draw(path.sampler, scatters, path.strata) if world.lights is not None else None
     # A copy: the throughput is dimmed in place below, and a score may look at the stretch again after that.
     stretch = Stretch(path.ray, path.medium, mi.Spectrum(path.beta), scatters, draw)
     end, tau, path.score = path.score.stretch(scene, world, stretch, path.active)
