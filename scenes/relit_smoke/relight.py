@@ -3,8 +3,8 @@
     mivol optimize scenes/white_smoke/fit.toml
     python scenes/relit_smoke/relight.py [--volume runs/white_smoke/volumes/..._reconstruction.vol] [-o runs/relit_smoke]
 
-The reference is the true smoke by Mitsuba's volpath at the same depth; the render is the reconstruction by mivol. The smoke of
-no voxel's contrast (its mean everywhere inside the hull) stands beside them, as what a right hull alone would give.
+The reference is the true smoke by Mitsuba's volpath at the same depth; the render is the reconstruction by mivol. Beside them
+stands the reconstruction's mass spread evenly inside its hull: what the right outline alone would give.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ FOUND = Path("runs/white_smoke/volumes/smoke_interior_medium_sigma_t_data_recons
 
 
 def flat(values: np.ndarray) -> np.ndarray:
-    """The same mass, spread evenly over the voxels above a hundredth of the largest value."""
-    inside = values > 0.01 * values.max()
+    """The same mass, spread evenly over the voxels above a tenth of the largest value."""
+    inside = values > 0.1 * values.max()
     return np.where(inside, values.sum() / inside.sum(), 0.0).astype(np.float32)
 
 

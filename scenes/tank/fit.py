@@ -8,7 +8,8 @@ their noise.
 
 Levenberg-Marquardt on (image - photograph) / s, with one s for each photograph, its RMS noise: weights of single pixels would
 follow their noise, and favour those that came out too dark. The images and their derivatives by u are mivol's, from samples of
-their own. With pixel variances V (of the photographs, in units of s^2) the covariance of u is H^-1 J^T V J H^-1, H = J^T J.
+their own. The covariance of u is H^-1 J^T diag(r^2) J H^-1, H = J^T J, with the residuals r themselves for the noise of both
+(White 1980, Econometrica 48): pixels need not be equally noisy.
 """
 
 from __future__ import annotations
@@ -35,17 +36,12 @@ NAMES = ("sigma_s [1/mm]", "sigma_a [1/mm]", "g")
 
 @dataclass(frozen=True)
 class Photograph:
-    """One image of one channel: (H, W) and the variance of its noise."""
+    """One image of one channel: (H, W) and the RMS of its noise."""
 
     dilution: float
     camera: int
     image: np.ndarray
-    variance: np.ndarray
-
-    @property
-    def noise(self) -> float:
-        """RMS of its standard error."""
-        return float(np.sqrt(self.variance.mean()))
+    noise: float
 
 
 def values(u: np.ndarray) -> np.ndarray:
@@ -63,7 +59,7 @@ def photograph(truth: np.ndarray, dilutions: list[float], channel: int, given: a
                 XML, given.output / "references", max_depth=given.max_depth, max_spp=given.photo_spp, sensor=camera,
                 seed=channel, overrides=known, progress=False,
             )  # fmt: skip
-            found.append(Photograph(c, camera, made.mean[..., 0], made.variance[..., 0]))
+            found.append(Photograph(c, camera, made.mean[..., 0], made.standard_error))
     return found
 
 
@@ -118,8 +114,8 @@ def fit(model: Model, photographs: list[Photograph], u: np.ndarray, iterations: 
         worse = float(better @ better) > float(r @ r)
         damping = 10 * damping if worse else damping / 5
         u = u if worse else new
-    H, V = np.linalg.inv(J.T @ J), np.concatenate([(p.variance / p.noise**2).ravel() for p in photographs])
-    return u, np.sqrt(np.diag(H @ (J.T * V) @ J @ H)), losses
+    inverse = np.linalg.inv(J.T @ J)
+    return u, np.sqrt(np.diag(inverse @ (J.T * np.square(r)) @ J @ inverse)), losses
 
 
 def residual(model: Model, photographs: list[Photograph], u: np.ndarray, seed: int) -> np.ndarray:
