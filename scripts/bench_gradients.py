@@ -1,8 +1,8 @@
 #!/usr/bin/env python3
 """Density gradients of light that scatters once: how exact are they, and how much sooner than those of ``prbvolpath``?
 
-    scripts/bench_gradients.py                        # 4 minutes on 2 cores: all but the tutorial
-    scripts/bench_gradients.py --only tutorial        # 8 minutes, nearly all of them in prbvolpath
+    scripts/bench_gradients.py                        # 4 minutes on 2 idle cores: all but the tutorial
+    scripts/bench_gradients.py --only tutorial        # 5 minutes, nearly all of them in prbvolpath
     scripts/bench_gradients.py --quick                # a minute, small sizes: are our gradients right?
 
 The derivatives are those with respect to the voxels of sigma_t [1/length]; albedo 0.75, ``max_depth`` 2 for all, stock scenes,

@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Light that scatters once: how much sooner does mivol reach an error than Mitsuba's ``volpath`` and ``prbvolpath``?
 
-    scripts/bench_single_scattering.py                    # 6 minutes on 2 cores
+    scripts/bench_single_scattering.py                    # 5 minutes on 2 idle cores
     scripts/bench_single_scattering.py --quick            # half a minute, small sizes: are the means the same?
     scripts/bench_single_scattering.py --only smoke       # one of the volumes
 
