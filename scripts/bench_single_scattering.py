@@ -234,19 +234,27 @@ def gain(slow: Timing, fast: Timing, counts: np.ndarray) -> dict:
         "processor_time": ratio_of(slow, fast, "processor"),
         "variance_x_time_mean_over_pixels": float(a.mean() / b.mean() * time),
         "variance_x_time_median_over_pixels": float(by_pixel * time),
-        **difference(*(Moments.of(np.array(t.results).mean(axis=-1)[:, counts]) for t in (slow, fast))),
+        **difference(*(np.array(t.results).mean(axis=-1)[:, counts] for t in (slow, fast))),
     }
 
 
-def difference(a: Moments, b: Moments) -> dict:
-    """z of the means over pixels, whose samples are their own, and the standard error that it is measured in."""
-    n = a.mean.size
-    va, vb = (float(m.variance_of_mean.sum()) / n**2 for m in (a, b))
+def difference(a: np.ndarray, b: np.ndarray) -> dict:
+    """z of the means of two sets of rounds (rounds, pixels), and the standard error that it is measured in."""
+    va, vb = error_of_mean(a), error_of_mean(b)
     return {
-        "z": float(z_image(b.mean.mean(), vb, a.mean.mean(), va)),
+        "z": float(z_image(b.mean(), vb, a.mean(), va)),
         "z_bound": float(z_bound(FALSE_ALARM, len(VOLUMES) * len(LIGHTS) * len(STOCK))),
-        "relative_standard_error": math.sqrt(va + vb) / float(a.mean.mean()),
+        "relative_standard_error": math.sqrt(va + vb) / float(a.mean()),
     }
+
+
+def error_of_mean(rounds: np.ndarray) -> float:
+    """Variance of the mean over rounds and pixels.
+
+    Pixels with samples of their own tell it well, rounds tell it whatever pixels share (numbers, in a tile): the larger one.
+    """
+    alone = float(Moments.of(rounds).variance_of_mean.sum()) / rounds.shape[1] ** 2
+    return max(alone, float(Moments.of(rounds.mean(axis=1)).variance_of_mean))
 
 
 def ask(volume: str) -> Callable[[Size], dict]:

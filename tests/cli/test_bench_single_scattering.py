@@ -10,8 +10,6 @@ import bench_script
 import numpy as np
 import pytest
 
-from mivol.validate.statistics import Moments
-
 ASKED = ("smoke", "threads")
 
 
@@ -54,9 +52,16 @@ def test_a_bias_of_six_standard_errors_is_seen(bench: ModuleType) -> None:
     """2000 pixels of unit variance, 8 seeds: the mean has the error sqrt(2 / 16000), and the bound is 4.2 of them."""
     rng = np.random.default_rng(3)
     a, b = rng.normal(10, 1, (2, 8, 2000))
-    assert abs(bench.difference(Moments.of(a), Moments.of(b))["z"]) < 4.3
-    found = bench.difference(Moments.of(a), Moments.of(b + 10 * math.sqrt(2 / 16000)))
+    assert abs(bench.difference(a, b)["z"]) < 4.3
+    found = bench.difference(a, b + 10 * math.sqrt(2 / 16000))
     assert found["z"] > found["z_bound"]
+
+
+def test_pixels_that_share_their_noise_are_not_taken_for_many(bench: ModuleType) -> None:
+    """The same number in all pixels of a round: the error is that of 8 numbers, not of 16000."""
+    rng = np.random.default_rng(6)
+    shared = np.repeat(rng.normal(10, 1, (8, 1)), 2000, axis=1)
+    assert bench.error_of_mean(shared) == pytest.approx(np.var(shared[:, 0], ddof=1) / 8)
 
 
 def test_equal_error_weighs_variance_and_time(bench: ModuleType) -> None:
