@@ -107,7 +107,7 @@ LAMPS = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", LAMPS)
+@pytest.mark.parametrize("name", small.cases(LAMPS, ["textured area", "area inside", "two that can be met"]))
 def test_lamps(name):
     box, _ = smoke(rough_grid(1), name="hg", g=0.4)
     image, _ = same({"smoke": box, **LAMPS[name]()}, precision=0.02)
@@ -268,7 +268,7 @@ def test_places(name):
     same(lit(PLACES[name]()))
 
 
-@pytest.mark.parametrize("lamp", small.cases(["bulb", "lamp", "sky"], ["lamp"]))
+@pytest.mark.parametrize("lamp", small.cases(["bulb", "lamp", "sky"], ["lamp", "sky"]))
 def test_shadow_rays_go_on_through_what_is_partly_clear(lamp):
     """A mask dims them by its transparency, as volpath does, towards all kinds of lamps."""
     shine = {"bulb": point([1.6, -1.3, 1.7])[0], "lamp": area(1.6, -1.3, 1.7), "sky": LAMPS["envmap"]()["lamp"]}[lamp]
