@@ -114,6 +114,8 @@ def noise_check(integrator: mi.Integrator, scene: mi.Scene) -> Callable[[], bool
     survey = survey_scene(scene)
     if survey.surfaces:
         return lambda: True
+    if session.settings.deterministic:
+        return lambda: False
 
     def scatters() -> bool:
         views = ((view_medium(b.medium, b.box, survey.places), b.name) for b in survey.boundaries)
