@@ -17,6 +17,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 
@@ -60,6 +61,22 @@ class LoadedScene:
         if self._digest is None:
             raise MivolError(self._obstacle)
         return self._digest
+
+
+@contextmanager
+def two_threads() -> Iterator[None]:
+    """Let Mitsuba read files: it hands an EXR to a second thread of the pool, and waits for ever where there is none.
+
+    That is so in a process pinned to one CPU, and where one thread was asked for.
+    """
+    single = mi.variant().startswith("llvm") and dr.thread_count() == 1
+    if single:
+        dr.set_thread_count(2)
+    try:
+        yield
+    finally:
+        if single:
+            dr.set_thread_count(1)
 
 
 def check_variant() -> str:
@@ -153,11 +170,11 @@ def _load_file(path: Path, overrides: dict[str, str]) -> LoadedScene:
     with _resolving_beside(path):
         state = _parse_file(path, overrides)
         files = tuple(dict.fromkeys([*(Path(str(f)) for f in state.files), *_named_files(state)]))
-        _check_exr_readable(files)
         digest, obstacle = _try_hash(lambda: _hash_state(state))
     try:
         # One thread of a process uses Dr.Jit: not parallel.
-        scene = mi.load_file(str(path), parallel=False, **overrides)
+        with two_threads():
+            scene = mi.load_file(str(path), parallel=False, **overrides)
     except RuntimeError as error:
         raise MivolError(f"{path} cannot be loaded: {_reason(error)}") from error
     return LoadedScene(_check_is_scene(scene, path), path.stem, "file", files, digest, obstacle)
@@ -166,10 +183,10 @@ def _load_file(path: Path, overrides: dict[str, str]) -> LoadedScene:
 def _load_dict(source: dict) -> LoadedScene:
     state = _parse_dict(source)
     files = tuple(dict.fromkeys(_named_files(state)))
-    _check_exr_readable(files)
     digest, obstacle = _try_hash(lambda: _hash_state(state))
     try:
-        scene = mi.load_dict(source, parallel=False)
+        with two_threads():
+            scene = mi.load_dict(source, parallel=False)
     except RuntimeError as error:
         raise MivolError(f"the scene dict cannot be loaded: {_reason(error)}") from error
     return LoadedScene(_check_is_scene(scene, "the dict"), "scene", "dict", files, digest, obstacle)
@@ -180,15 +197,6 @@ def _check_is_scene(thing: Any, origin: Any) -> mi.Scene:
         kind = type(thing).__name__
         raise MivolError(f"{origin} describes a {kind}, not a scene; its outermost element must be a scene.")
     return thing
-
-
-def _check_exr_readable(files: tuple[Path, ...]) -> None:
-    """Mitsuba 3.9.1 waits for ever when it reads an EXR in a process that is pinned to one CPU."""
-    exr = next((f for f in files if f.suffix.lower() == ".exr"), None)
-    if exr is not None and hasattr(os, "sched_getaffinity") and len(os.sched_getaffinity(0)) == 1:
-        raise MivolError(
-            f"the scene reads {exr.name}, which hangs Mitsuba 3.9.1 in a process pinned to one CPU; allow it two."
-        )
 
 
 def _reason(error: Exception) -> str:
