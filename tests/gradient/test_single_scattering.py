@@ -7,6 +7,7 @@ voxel, false alarms 1e-6 a test. The twin's derivatives are exact, or central di
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import drjit as dr
@@ -470,6 +471,45 @@ def test_position_of_a_point_light():
 
     truth = np.array([twin_difference(lambda x, a=a: light(x, a), 0.0) for a in range(3)])
     assert_gradient(gradients(seen, "lamp.position", w, 2048), truth[:, None], "position", rounding=1e-4)
+
+
+TURNED = {
+    "sun": lambda axis: sun(axis),
+    "spot": lambda axis: spot([1.0, -2, 2.5], np.array([1.0, -2, 2.5]) + 3 * axis, cutoff=40, beam=5),
+}
+
+
+@pytest.mark.parametrize("kind", TURNED)
+def test_direction_of_a_lamp(kind):
+    """A sun that turns takes its shadows along; a spot turns its cone only. About an axis across, by an angle [rad]."""
+    box, m = smoke(rough_grid(10), 0.7, "own", PLACE, "hg", 0.4)
+    axis, across = np.array([-0.3, 0.6, -0.74]), np.array([0.8, 0.6, 0.0])
+    axis = axis / np.linalg.norm(axis)
+
+    def turned(x: float) -> np.ndarray:
+        # Rodrigues' formula.
+        c, s = math.cos(x), math.sin(x)
+        return c * axis + s * np.cross(across, axis) + (1 - c) * across * (across @ axis)
+
+    seen = pencils({"smoke": box, "lamp": TURNED[kind](axis)[0]}, *aimed(3, 6))
+    w, rows = weights(6)
+    known = lambda x: rows @ twins.radiance([m], [TURNED[kind](turned(x))[1]], seen.o, seen.d, order=10)[:, 0]  # noqa: E731
+    truth = twin_difference(known, 0.0)
+
+    params, integrator = mi.traverse(seen.scene), mi.load_dict(mivol())
+    placed = params["lamp.to_world"]
+    still, at = mi.AffineTransform4f(placed.matrix), mi.Vector3f(*np.array(placed.matrix)[:3, 3].ravel().tolist())
+    found = []
+    for seed in range(BATCHES):
+        x = mi.Float(0)
+        dr.enable_grad(x)
+        move = mi.AffineTransform4f().translate(at).rotate(across.tolist(), dr.rad2deg(x)).translate(-at)
+        params["lamp.to_world"] = move @ still
+        params.update()
+        image = mi.render(seen.scene, params, integrator=integrator, spp=2048, seed=seed)
+        dr.backward(dr.sum(image * mi.TensorXf(w), axis=None))
+        found.append(dr.grad(x)[0])
+    assert_gradient(np.array(found)[:, None], np.array([truth]), kind, rounding=1e-4)
 
 
 # -- Forward against reverse, and differences ---------------------------------------------------------------------------------
