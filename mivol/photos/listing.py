@@ -1,0 +1,47 @@
+"""What a data set says it has: one entry for each photograph, before any pixel is read."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from mivol.photos.camera import Camera
+
+__all__ = ["Entry", "Listing"]
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A photograph that a data set names.
+
+    Attributes:
+        name: as the data set calls it.
+        file: where it should lie.
+        camera: from its (width, height) in pixels.
+        split: "train", "test" or "val".
+        size: (width, height) that the file of cameras says [pixel]; None: all of the split have one size.
+        mask: where its mask should lie, if it has one.
+    """
+
+    name: str
+    file: Path
+    camera: Callable[[tuple[int, int]], Camera]
+    split: str = "train"
+    size: tuple[int, int] | None = None
+    mask: Path | None = None
+
+
+@dataclass(frozen=True)
+class Listing:
+    """All photographs that a data set names, and the points it knows.
+
+    Attributes:
+        entries: in its order.
+        points: (N, 3) points of a sparse reconstruction [length], or None.
+    """
+
+    entries: list[Entry]
+    points: np.ndarray | None = None
