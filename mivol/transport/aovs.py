@@ -18,8 +18,7 @@ import mitsuba as mi
 
 from mivol.numerics import one_minus_exp
 from mivol.transport.distance import backproject_distance, integrate_distance, push_distance
-from mivol.transport.path import Reach, Way, optical_depth_to
-from mivol.transport.score import revisit
+from mivol.transport.path import Reach, Way, optical_depth_to, revisit
 from mivol.transport.world import Body, World
 
 __all__ = ["AOVS", "backproject_aovs", "integrate_aovs", "push_aovs"]

@@ -3,12 +3,12 @@ r"""What a cell sends towards the ray that enters it, from two points in it: fou
 .. math:: S = \int_0^\Delta \sigma c\, e^{-\tau(t)} dt \approx (1 - e^{-\tau}) \big( f c_1 + (1 - f) c_2 \big), \quad
           f = \frac{\sigma_1 Q}{\sigma_1 Q + \sigma_2}, \quad Q = 1 + x + \tfrac{x^2}{2}, \quad x = \frac{\tau}{\sqrt 3}
 
-with :math:`\tau = \tfrac{\Delta}{2} (\sigma_1 + \sigma_2)`, exact for a cubic. The optical depths in front of the two Gauss points
+with :math:`\tau = \tfrac{\Delta}{2} (\sigma_1 + \sigma_2)`, exact for a cubic. The optical depths in front of the two points
 differ by :math:`\tau / \sqrt 3` in the two-stage Gauss method (Hairer & Wanner 1996, table IV.5.1), so collocation weighs
 the second by :math:`\sigma_2 e^{-x}`. Its weights are scaled to sum to the cell's opacity, so a constant source
-function gives c (1 - T) to rounding at any optical depth; and exp(x) is replaced by Q, which agrees to the order of the method and
-grows with a power: what a cell shows changes by at most about tau when a little extinction appears in front of it, where
-the exponential would make that exp(tau / sqrt 3).
+function gives c (1 - T) to rounding at any optical depth; and exp(x) is replaced by Q, which agrees to the order of the
+method and grows with a power: a little extinction at the first point moves what an opaque cell shows by about tau of itself,
+where the exponential would make that exp(tau / sqrt 3).
 
 A glow j that does not go with the extinction (radiance per length) has the same points,
 

@@ -13,10 +13,8 @@ with E_n(tau) from :mod:`mivol.numerics`. It is exact for a thin cell of any (cu
 optical depth, so that constants are cells of any length; the error falls as D^6. Nothing is divided by a transmittance or by
 an extinction: derivatives are finite everywhere.
 
-Conventions. A body is swept from its far end to its near end: what lies behind a cell is known when it is passed, and no sum
-is undone. Distances are counted from ``origin``: with the mean distance itself as origin, the derivative of the mean is
-that of N over the opacity, since N is 0. Rows are numbers for each channel, followed by their tangents where these are
-asked for.
+Conventions. Distances are counted from ``origin``: with the mean distance itself as origin, the derivative of the mean is
+that of N over the opacity, since N is 0.
 
 References: Max 1995 (the integral, with distance as the source); Abramowitz & Stegun 25.4.30 (Gauss points).
 """
@@ -24,42 +22,24 @@ References: Max 1995 (the integral, with distance as the source); Abramowitz & S
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from typing import ClassVar
 
 import drjit as dr
 import mitsuba as mi
 
-from mivol.errors import MivolError
-from mivol.numerics import exp_moments, one_minus_exp
-from mivol.transport.field import SumField, share_cells
-from mivol.transport.lattice import Cell, Segment, clip, slab, walk
-from mivol.transport.medium import Part
-from mivol.transport.optical_depth import node_weights
-from mivol.transport.path import Reach, Way, visit_boxes
-from mivol.transport.score import revisit
-from mivol.transport.world import Body, World
+from mivol.numerics import exp_moments
+from mivol.transport.chain import Site, Stop, backproject_chain, link_chain
+from mivol.transport.path import Reach, Way
+from mivol.transport.world import World
 
-__all__ = ["Stop", "backproject_distance", "integrate_distance", "push_distance", "stop_in_cell"]
+__all__ = ["backproject_distance", "integrate_distance", "push_distance", "stop_in_cell"]
 
 SPREAD = math.sqrt(15) / 10
 """Distance of the outer Gauss points from the middle of [0, 1]; with the weights 5/18, 8/18, 5/18 exact to degree 5."""
 
 BLACK = 1000.0
 """Stands for an infinite optical depth: exp(-1000) is 0, and 1000 + x - 1000 is x in float64."""
-
-
-@dataclass
-class Stop:
-    """What a cell does to a ray that enters it: optical depth, transmittance, and N.
-
-    ``dtau`` and ``dN`` are their derivatives with respect to the extinction at each point that it was given at.
-    """
-
-    tau: mi.Float
-    T: mi.Float
-    N: mi.Float
-    dtau: list[mi.Float]
-    dN: list[mi.Float]
 
 
 def stop_in_cell(a: mi.Float, dt: mi.Float, near: mi.Float, middle: mi.Float, far: mi.Float) -> Stop:
@@ -91,15 +71,15 @@ def stop_in_cell(a: mi.Float, dt: mi.Float, near: mi.Float, middle: mi.Float, fa
     return Stop(tau, T, dr.fma(a, tau * e0, dt * mean), [dt * (5 / 18), dt * (8 / 18), dt * (5 / 18)], dN)
 
 
-def _stop_in_constant(a: mi.Float, b: mi.Float, origin: mi.Float, sigma: mi.Float, on: mi.Bool) -> Stop:
-    """A stretch [a, b] of constant extinction; ``b`` may be infinite.
+def _stop_in_constant(site: Site, origin: mi.Float, sigma: mi.Float) -> Stop:
+    """A stretch of constant extinction; it may be infinite.
 
     There N = a + 1/sigma; a medium of extinction 0 that never ends has no derivative, and 0 is returned.
     """
-    on = on & (b > a)
-    begin = dr.select(on, a - origin, 0)
-    stop = stop_in_cell(begin, dr.select(on & dr.isfinite(b), b - a, 0), sigma, sigma, sigma)
-    endless = on & ~dr.isfinite(b) & (sigma > 0)
+    begin = dr.select(site.on, site.a - origin, 0)
+    finite = dr.isfinite(site.dt)
+    stop = stop_in_cell(begin, dr.select(finite, site.dt, 0), sigma, sigma, sigma)
+    endless = site.on & ~finite & (sigma > 0)
     mean = dr.rcp(dr.select(endless, sigma, 1))
     return Stop(
         dr.select(endless, BLACK, stop.tau),
@@ -110,372 +90,34 @@ def _stop_in_constant(a: mi.Float, b: mi.Float, origin: mi.Float, sigma: mi.Floa
     )
 
 
-# -- One body ----------------------------------------------------------------------------------------------------------
-
-
 @dataclass
-class _Moment:
-    """Rows of a stretch by itself: optical depth (in float64, since parts of it are taken off again) and N."""
+class _Distance:
+    """The rule of a chain that sums distances, counted from ``origin``; a row for each channel."""
 
-    tau: list[mi.Float64]
-    N: list[mi.Float]
+    rows: int
+    origin: mi.Float
+    points: ClassVar[tuple[float, ...]] = (0.5 - SPREAD, 0.5, 0.5 + SPREAD)
+    asked: ClassVar[str] = "the AOV depth was asked for"
+    way_out: ClassVar[str] = "leave depth out of aovs"
 
+    def cell(self, site: Site, sigma: list[list[mi.Float]]) -> list[Stop]:
+        return [stop_in_cell(site.a - self.origin, site.dt, *row) for row in sigma]
 
+    def constant(self, site: Site, sigma: list[mi.Float]) -> list[Stop]:
+        return [_stop_in_constant(site, self.origin, s) for s in sigma]
 
+    def pull(self, site: Site, weight: list[mi.Float]) -> None:
+        """Nothing but the extinction moves a distance."""
 
-@dataclass
-class _Lay:
-    """A stretch of a ray in a body: up to ``enter`` and from ``leave`` on there are only constants.
+    def push(self, site: Site) -> list[mi.Float]:
+        return [mi.Float(0) for _ in range(self.rows)]
 
-    ``segment`` runs from ``leave`` to ``enter``; it and ``grid`` are None where there is no grid.
-    """
+    def least(self, t1: mi.Float) -> mi.Float:
+        return dr.minimum(t1 - self.origin, 0)
 
-    t0: mi.Float
-    enter: mi.Float
-    leave: mi.Float
-    t1: mi.Float
-    grid: Part | None
-    segment: Segment | None
-
-
-def _check_grids(body: Body) -> None:
-    """Refuse grids that do not share their cells, and an extinction that depends on the direction."""
-    if body.view.flakes is not None:
-        raise MivolError("the AOV depth was asked for and a medium has the phase function sggx; leave depth out of aovs.")
-    grids = [p.lattice for p in body.view.parts if p.lattice is not None]
-    for other in grids[1:]:
-        if not share_cells(grids[0], other):
-            raise MivolError(
-                f"the AOV depth was asked for and a medium sums grids of {grids[0].res} and {other.res} voxels (Z, Y, X); "
-                "give both the same resolution and to_world, or leave depth out of aovs."
-            )
-
-
-def _lay(body: Body, ray: mi.Ray3f, t0: mi.Float, t1: mi.Float) -> _Lay:
-    grids = [p for p in body.view.parts if p.lattice is not None]
-    start, end = mi.Float(t0), mi.Float(t1)
-    if not grids:
-        return _Lay(start, end, end, end, None, None)
-    segment = clip(grids[0].lattice, ray.o, -ray.d, -t1, -t0)
-    hit = segment.length > 0
-    leave = dr.select(hit, -segment.t0, end)
-    return _Lay(start, dr.select(hit, leave - segment.length, end), leave, end, grids[0], segment)
-
-
-def _measure(
-    body: Body, ray: mi.Ray3f, t0: mi.Float, t1: mi.Float, origin: mi.Float, active: mi.Bool, tangent: bool, skip: bool
-) -> _Moment:
-    """Rows of a stretch of a body; empty blocks may be skipped where nothing depends on the order of sums."""
-    field, lay = body.extinction(ray), _lay(body, ray, t0, t1)
-    change = SumField(body.view.parts, body.tangents, mi.Float(1)) if tangent else None
-    rows = field.channels * (2 if tangent else 1)
-    moment = _Moment([mi.Float64(0) for _ in range(rows)], [mi.Float(0) for _ in range(rows)])
-    has_constants = any(p.lattice is None for p in body.view.parts)
-
-    def add_constant(moment: _Moment, a: mi.Float, b: mi.Float) -> _Moment:
-        stops = [_stop_in_constant(a, b, origin, s, active) for s in field.constant]
-        return _put_in_front(moment, stops, [[d] for d in change.constant] if tangent else [])
-
-    def visit(moment: _Moment, cell: Cell, on: mi.Bool) -> _Moment:
-        corners, changes = cell.corners[: len(field.reads)], cell.corners[len(field.reads) :]
-        stops = _stops(field, lay, cell, corners, origin, on)
-        return _put_in_front(moment, stops, change.along(changes, _points(cell)) if tangent else [])
-
-    if has_constants and lay.grid is not None:
-        moment = add_constant(moment, lay.leave, lay.t1)
-    if lay.grid is not None:
-        reads = field.reads + (change.reads if tangent else [])
-        alone = skip and len(field.reads) == 1 and not has_constants
-        lattice = lay.grid.lattice if alone else replace(lay.grid.lattice, bounds=None)
-        moment = walk(lattice, lay.segment, visit, moment, reads, active)
-    if has_constants:
-        moment = add_constant(moment, lay.t0, lay.enter)
-    return moment
-
-
-def _stops(field: SumField, lay: _Lay, cell: Cell, corners: list, origin: mi.Float, on: mi.Bool) -> list[Stop]:
-    """What a cell of a sweep does, for each channel."""
-    begin = (lay.leave - origin) - (cell.s + cell.dt)
-    dt = dr.select(on, cell.dt, 0)
-    return [stop_in_cell(begin, dt, *sigma) for sigma in field.along(corners, _points(cell))]
-
-
-def _points(cell: Cell) -> list[mi.Vector3f]:
-    """Three Gauss points of a cell's stretch, the one nearest to the camera first: a sweep meets it last."""
-    return [dr.fma(cell.step, 0.5 + x, cell.frac) for x in (SPREAD, 0, -SPREAD)]
-
-
-def _put_in_front(moment: _Moment, stops: list[Stop], changes: list[list[mi.Float]]) -> _Moment:
-    """A cell dims all that has been swept so far, and adds its own."""
-    tau = [t + mi.Float64(s.tau) for t, s in zip(moment.tau, stops, strict=False)]
-    N = [dr.fma(s.T, n, s.N) for n, s in zip(moment.N, stops, strict=False)]
-    for c, (s, change) in enumerate(zip(stops, changes, strict=False)):
-        dtau, row = _dot(s.dtau, change), len(stops) + c
-        tau.append(moment.tau[row] + mi.Float64(dtau))
-        N.append(_dot(s.dN, change) + s.T * (moment.N[row] - dtau * moment.N[c]))
-    return _Moment(tau, N)
-
-
-@dataclass
-class _Pull:
-    """State of a reverse sweep: N of what was swept, optical depth still ahead, derivatives of the constants."""
-
-    N: list[mi.Float]
-    ahead: list[mi.Float64]
-    constant: list[mi.Float]
-
-
-def _backproject(
-    body: Body,
-    ray: mi.Ray3f,
-    t0: mi.Float,
-    t1: mi.Float,
-    origin: mi.Float,
-    weight: mi.Float,
-    ahead: list[mi.Float64],
-    behind: list[mi.Float],
-    active: mi.Bool,
-) -> None:
-    """Add ``weight`` dN/dsigma of a stretch, for each channel of the world, to the gradients of a body.
-
-    Args:
-        ahead: optical depth from the camera to the far end of the stretch.
-        behind: N of what lies behind the stretch, as the camera sees it.
-    """
-    field, lay = body.extinction(ray), _lay(body, ray, t0, t1)
-    zeros = [mi.Float(0) for _ in range(field.channels)]
-    pull = _Pull(list(zeros), [mi.Float64(a) for a in ahead], list(zeros))
-    parts = list(zip(body.view.parts, body.gradients, strict=True))
-    has_constants = any(p.lattice is None for p in body.view.parts)
-
-    def add_constant(pull: _Pull, a: mi.Float, b: mi.Float) -> _Pull:
-        stops = [_stop_in_constant(a, b, origin, s, active) for s in field.constant]
-        return _pull_through(pull, stops, weight, behind)[0]
-
-    def visit(pull: _Pull, cell: Cell, on: mi.Bool) -> _Pull:
-        stops = _stops(field, lay, cell, cell.corners, origin, on)
-        pull, slopes = _pull_through(pull, stops, weight, behind)
-        shares = [node_weights(p, cell, lay.grid.lattice.res) for p in _points(cell)]
-        corners = [[_dot(g, share) for share in zip(*shares, strict=True)] for g in slopes]
-        for part, gradient in parts:
-            if part.lattice is not None:
-                for c, values in enumerate(_merge(corners, part)):
-                    gradient.add(c, cell, values, on)
-        return pull
-
-    if has_constants and lay.grid is not None:
-        pull = add_constant(pull, lay.leave, lay.t1)
-    if lay.grid is not None:
-        pull = walk(replace(lay.grid.lattice, bounds=None), lay.segment, visit, pull, field.reads, active)
-    if has_constants:
-        pull = add_constant(pull, lay.t0, lay.enter)
-    for part, gradient in parts:
-        if part.lattice is None:
-            for c, g in enumerate(_merge(pull.constant, part)):
-                dr.scatter_add(gradient, g, mi.UInt32(c), active)
-
-
-def _pull_through(
-    pull: _Pull, stops: list[Stop], weight: mi.Float, behind: list[mi.Float]
-) -> tuple[_Pull, list[list[mi.Float]]]:
-    """Pass a cell: its derivatives with respect to the extinction, [channel of the body][point]."""
-    k = len(stops)
-    ahead = [a - mi.Float64(stops[c % k].tau) for c, a in enumerate(pull.ahead)]
-    slopes = [[mi.Float(0) for _ in s.dN] for s in stops]
-    for c, a in enumerate(ahead):
-        stop, P = stops[c % k], weight * _transmittance(a)
-        # More extinction here dims what was swept of this body, and what lies behind the body.
-        dims = dr.fma(P * stop.T, pull.N[c % k], weight * behind[c])
-        slopes[c % k] = [
-            g + dr.fma(P, dN, -dims * dtau) for g, dN, dtau in zip(slopes[c % k], stop.dN, stop.dtau, strict=True)
-        ]
-    N = [dr.fma(s.T, n, s.N) for n, s in zip(pull.N, stops, strict=True)]
-    constant = [sum(g, total) for total, g in zip(pull.constant, slopes, strict=True)]
-    return _Pull(N, ahead, constant), slopes
-
-
-def _dot(a: list[mi.Float], b: list[mi.Float]) -> mi.Float:
-    return sum((x * y for x, y in zip(a, b, strict=True)), mi.Float(0))
-
-
-def _transmittance(tau: mi.Float64) -> mi.Float:
-    return dr.exp(-mi.Float(dr.maximum(tau, 0)))
-
-
-def _merge(rows: list, part: Part) -> list:
-    """What belongs to the channels of a body (numbers, or lists of them) for those of a part: a grey one gets the sum."""
-    if part.channels == len(rows):
-        return rows
-    return [[sum(r[1:], r[0]) for r in zip(*rows, strict=True)] if isinstance(rows[0], list) else sum(rows[1:], rows[0])]
-
-
-# -- All bodies along a ray --------------------------------------------------------------------------------------------
-
-
-@dataclass
-class _Boxed:
-    """A body in a box as a ray crosses it.
-
-    ``middle`` tells which of two bodies lies in front, since they are disjoint; ``own`` is the body by itself, ``front`` the
-    optical depth in front of it, ``seen`` its N and ``behind`` that of all behind it as the camera sees them.
-    """
-
-    body: Body
-    t0: mi.Float64
-    t1: mi.Float64
-    on: mi.Bool
-    middle: mi.Float64
-    own: _Moment
-    front: list[mi.Float64]
-    seen: list[mi.Float]
-    behind: list[mi.Float]
-
-
-@dataclass
-class _Traced:
-    """What the stretches found by tracing, which come in the order of the ray, leave behind them.
-
-    ``fronts`` and ``behinds`` are what they add to those of each body in a box; ``reach`` is the largest mean distance.
-    """
-
-    tau: list[mi.Float64]
-    N: list[mi.Float]
-    fronts: list[list[mi.Float64]]
-    behinds: list[list[mi.Float]]
-    reach: mi.Float
-
-
-@dataclass
-class _Chain:
-    """All that stops a ray: bodies in boxes, stretches found by tracing, the surface at the end (``last``), and N of all."""
-
-    boxes: list[_Boxed]
-    traced: _Traced
-    last: list[mi.Float]
-    N: list[mi.Float]
-
-
-def _link(
-    scene: mi.Scene, world: World, way: Way, end: Reach, origin: mi.Float, active: mi.Bool, tangent: bool, skip: bool
-) -> _Chain:
-    """Measure each body by itself and put them in the order of the ray."""
-    for body in world.bodies:
-        _check_grids(body)
-    k, rows = world.channels, world.channels * (2 if tangent else 1)
-
-    def visit_box(found: list[_Boxed], body: Body, t0: mi.Float64, t1: mi.Float64, on: mi.Bool) -> list[_Boxed]:
-        own = _spread(_measure(body, way.ray, t0, t1, origin, on, tangent, skip), body, k)
-        middle = _middle(body, way.ray, t0, t1) if len(world.bodies) > 1 else mi.Float64(0)
-        return [*found, _Boxed(body, t0, t1, on, middle, own, _zeros(mi.Float64, rows), [], _zeros(mi.Float, rows))]
-
-    boxes = visit_boxes(world, way.ray, way.length, visit_box, [], active)
-
-    def visit_traced(t: _Traced, body: Body, t0: mi.Float, t1: mi.Float, on: mi.Bool) -> _Traced:
-        if body.box is not None:
-            return t
-        own, middle = _spread(_measure(body, way.ray, t0, t1, origin, on, tangent, skip), body, k), _halfway(t0, t1)
-        seen = _see(_add(t.tau, _tau_in_front(boxes, middle, rows)), own.N, k)
-        opaque = [one_minus_exp(mi.Float(x)) for x in own.tau[:k]]
-        means = [dr.select(a > 0, n / dr.select(a > 0, a, 1), 0) for n, a in zip(own.N, opaque, strict=False)]
-        return _Traced(
-            _add(t.tau, own.tau),
-            _add(t.N, seen),
-            [_add(f, _where(middle < b.middle, own.tau)) for f, b in zip(t.fronts, boxes, strict=True)],
-            [_add(g, _where(middle > b.middle, seen)) for g, b in zip(t.behinds, boxes, strict=True)],
-            dr.maximum(t.reach, _largest(means)),
-        )
-
-    traced = _Traced(
-        _zeros(mi.Float64, rows),
-        _zeros(mi.Float, rows),
-        [_zeros(mi.Float64, rows) for _ in boxes],
-        [_zeros(mi.Float, rows) for _ in boxes],
-        mi.Float(0),
-    )
-    if world.traced:
-        traced = revisit(scene, world, way, visit_traced, traced, active)
-    return _order(boxes, traced, way, end, origin, k, rows)
-
-
-def _order(
-    boxes: list[_Boxed], traced: _Traced, way: Way, end: Reach, origin: mi.Float, channels: int, rows: int
-) -> _Chain:
-    """Find what is in front of and behind each body in a box, and N of the whole ray."""
-    for box, front in zip(boxes, traced.fronts, strict=True):
-        box.front = _add(front, _tau_in_front(boxes, box.middle, rows))
-        box.seen = _see(box.front, box.own.N, channels)
-    total = traced.tau
-    for box in boxes:
-        total = _add(total, box.own.tau)
-    wall = [dr.select(end.si.is_valid(), way.length - origin, 0)] * channels
-    last = _see(total, wall + _zeros(mi.Float, rows - channels), channels)
-    N = _add(traced.N, last)
-    for box, behind in zip(boxes, traced.behinds, strict=True):
-        N = _add(N, box.seen)
-        box.behind = _add(behind, _add(last, _seen_behind(boxes, box.middle, rows)))
-    return _Chain(boxes, traced, last, N)
-
-
-def _tau_in_front(boxes: list[_Boxed], middle: mi.Float64, rows: int) -> list[mi.Float64]:
-    """Optical depth of the bodies in boxes in front of a distance."""
-    total = _zeros(mi.Float64, rows)
-    for box in boxes:
-        total = _add(total, _where(box.middle < middle, box.own.tau))
-    return total
-
-
-def _seen_behind(boxes: list[_Boxed], middle: mi.Float64, rows: int) -> list[mi.Float]:
-    """N, as the camera sees it, of the bodies in boxes behind a distance."""
-    total = _zeros(mi.Float, rows)
-    for box in boxes:
-        total = _add(total, _where(box.middle > middle, box.seen))
-    return total
-
-
-def _see(front: list[mi.Float64], N: list[mi.Float], channels: int) -> list[mi.Float]:
-    """Rows of N behind rows of optical depth."""
-    P = [_transmittance(f) for f in front[:channels]]
-    seen = [p * n for p, n in zip(P, N, strict=False)]
-    changes = zip(P, N, N[channels:], front[channels:], strict=False)
-    return seen + [p * (dn - mi.Float(df) * n) for p, n, dn, df in changes]
-
-
-def _middle(body: Body, ray: mi.Ray3f, t0: mi.Float64, t1: mi.Float64) -> mi.Float64:
-    """The middle of the part of a stretch inside a body's box."""
-    _, _, t0, t1 = slab(body.rows, (0.0,) * 3, (1.0,) * 3, ray.o, ray.d, t0, t1)
-    return _halfway(t0, t1)
-
-
-def _halfway(t0: mi.Float, t1: mi.Float) -> mi.Float64:
-    return 0.5 * (mi.Float64(t0) + mi.Float64(t1))
-
-
-def _spread(moment: _Moment, body: Body, channels: int) -> _Moment:
-    """A grey body's rows for each channel of the world."""
-    times = channels // body.view.channels
-    return _Moment(*([row for row in rows for _ in range(times)] for rows in (moment.tau, moment.N)))
-
-
-def _zeros(kind: type, rows: int) -> list:
-    return [kind(0) for _ in range(rows)]
-
-
-def _add(a: list, b: list) -> list:
-    return [x + y for x, y in zip(a, b, strict=True)]
-
-
-def _where(mask: mi.Bool, rows: list) -> list:
-    return [dr.select(mask, row, 0) for row in rows]
-
-
-def _largest(values: list[mi.Float]) -> mi.Float:
-    best = values[0]
-    for value in values[1:]:
-        best = dr.maximum(best, value)
-    return best
-
-
-# -- The integral, its tangent, its transpose --------------------------------------------------------------------------
+    def end(self, end: Reach) -> list[mi.Float]:
+        """The opaque surface at the end of a ray stops what is left."""
+        return [dr.select(end.si.is_valid(), end.t - self.origin, 0)] * self.rows
 
 
 def integrate_distance(scene: mi.Scene, world: World, way: Way, end: Reach, active: mi.Bool) -> mi.Float:
@@ -496,7 +138,8 @@ def integrate_distance(scene: mi.Scene, world: World, way: Way, end: Reach, acti
 
     Bias: that of :func:`stop_in_cell`. Cost: a walk of each body.
     """
-    return _mean(_link(scene, world, way, end, mi.Float(0), active, tangent=False, skip=True).N)
+    rule = _Distance(world.channels, mi.Float(0))
+    return _mean(link_chain(world, rule, scene, way, rule.end(end), active, skip=True).N)
 
 
 def push_distance(scene: mi.Scene, world: World, way: Way, end: Reach, origin: mi.Float, active: mi.Bool) -> mi.Float:
@@ -506,17 +149,14 @@ def push_distance(scene: mi.Scene, world: World, way: Way, end: Reach, origin: m
         scene, world, way, end, active: as :func:`integrate_distance`.
         origin: the mean distance, so that this over the opacity is the tangent of the mean.
     """
-    return _mean(_link(scene, world, way, end, origin, active, tangent=True, skip=False).N[world.channels :])
+    rule = _Distance(world.channels, origin)
+    return _mean(link_chain(world, rule, scene, way, rule.end(end), active, tangent=True).N[world.channels :])
 
 
 def backproject_distance(
     scene: mi.Scene, world: World, way: Way, end: Reach, origin: mi.Float, weight: mi.Float, active: mi.Bool
 ) -> None:
     """Add ``weight`` (d loss / d N) times the derivative of N to the gradients of the world: the transpose of the tangent.
-
-    What lies behind a cell is summed, never left over by a subtraction, so a voxel behind an optical depth of 50 gets
-    its e^-50. Only between two stretches that were both found by tracing it is what is left over; N being a mean of
-    distances behind a known transmittance, that is clamped to what it can be.
 
     Args:
         scene, world, way, end, active: as :func:`integrate_distance`.
@@ -526,27 +166,9 @@ def backproject_distance(
     Cost: two walks of each body, and one packed write of 8 a cell and channel.
     """
     k = world.channels
-    chain = _link(scene, world, way, end, origin, active, tangent=False, skip=False)
-    w = weight / k
-    for box in chain.boxes:
-        ahead = _add(box.front, box.own.tau)
-        _backproject(box.body, way.ray, box.t0, box.t1, origin, w, ahead, box.behind, box.on)
-
-    def visit(passed: _Moment, body: Body, t0: mi.Float, t1: mi.Float, on: mi.Bool) -> _Moment:
-        if body.box is not None:
-            return passed
-        own, middle = _spread(_measure(body, way.ray, t0, t1, origin, on, False, False), body, k), _halfway(t0, t1)
-        front = _add(passed.tau, _tau_in_front(chain.boxes, middle, k))
-        ahead, N = _add(front, own.tau), _add(passed.N, _see(front, own.N, k))
-        P = [_transmittance(a) for a in ahead]
-        near, far = dr.minimum(t1 - origin, 0), chain.traced.reach
-        rest = [dr.clip(n - m, p * near, p * far) for n, m, p in zip(chain.traced.N, N, P, strict=True)]
-        behind = _add(rest, _add(chain.last, _seen_behind(chain.boxes, middle, k)))
-        _backproject(body, way.ray, t0, t1, origin, w, ahead, behind, on)
-        return _Moment(_add(passed.tau, own.tau), N)
-
-    if world.traced:
-        revisit(scene, world, way, visit, _Moment(_zeros(mi.Float64, k), _zeros(mi.Float, k)), active)
+    rule = _Distance(k, origin)
+    chain = link_chain(world, rule, scene, way, rule.end(end), active)
+    backproject_chain(world, rule, scene, way, chain, [weight / k] * k, [mi.Float(0)] * k, active)
 
 
 def _mean(rows: list[mi.Float]) -> mi.Float:

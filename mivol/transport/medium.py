@@ -77,6 +77,12 @@ class MediumView:
         return max(part.channels for part in self.parts)
 
 
+    @property
+    def guide(self) -> Lattice | None:
+        """The grid whose cells a sweep follows; None where everything is a constant."""
+        return next((p.lattice for p in self.parts if p.lattice is not None), None)
+
+
 @dataclass
 class Box:
     """A parallelepiped in the world: the unit cube under ``to_world`` (4x4, float64)."""

@@ -39,6 +39,7 @@ __all__ = [
     "light_through",
     "optical_depth_to",
     "reach",
+    "revisit",
     "shadow_ray",
     "transmittance",
     "walk_path",
@@ -140,6 +141,13 @@ def visit_boxes(world: World, ray: mi.Ray3f, t_end: mi.Float, visit: Visit, stat
             _, _, t0, t1 = slab(body.rows, (0.0,) * 3, (1.0,) * 3, ray.o, ray.d, t0, t1)
         state = visit(state, body, t0, t1, active & (t1 > t0))
     return state
+
+
+def revisit(scene: mi.Scene, world: World, way: Way, visit: Visit, state: Any, active: mi.Bool) -> Any:
+    """Visit the media of a stretch whose end is known; only boundaries that have to be traced are traced again."""
+    if not world.traced:
+        return visit_boxes(world, way.ray, way.length, visit, state, active)
+    return reach(scene, world, way.ray, way.medium, visit, state, active, way.unveils)[1]
 
 
 @dr.syntax

@@ -19,18 +19,17 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
 from mivol.transport.control import Probe, Tracks, sweep
-from mivol.transport.path import Reach, Stretch, Visit, Way, optical_depth_to, reach, visit_boxes
+from mivol.transport.path import Reach, Stretch, Way, optical_depth_to, revisit
 from mivol.transport.quadrature import integrate_scattering
 from mivol.transport.scatter import Scattering, albedo, at_event, scatter, sigma_t_at
 from mivol.transport.world import Body, World, spectrum
 
-__all__ = ["Adjoint", "Primal", "Tangent", "revisit"]
+__all__ = ["Adjoint", "Primal", "Tangent"]
 
 
 @dataclass
@@ -349,13 +348,6 @@ def _tangent(scene: mi.Scene, world: World, way: Way, active: mi.Bool) -> mi.Spe
 
     tau = revisit(scene, world, way, visit, [mi.Float(0) for _ in range(world.channels)], active)
     return mi.Spectrum(*tau) if len(tau) == 3 else mi.Spectrum(tau[0])
-
-
-def revisit(scene: mi.Scene, world: World, way: Way, visit: Visit, state: Any, active: mi.Bool) -> Any:
-    """Visit the media of a stretch whose end is known; only boundaries that have to be traced are traced again."""
-    if not world.traced:
-        return visit_boxes(world, way.ray, way.length, visit, state, active)
-    return reach(scene, world, way.ray, way.medium, visit, state, active, way.unveils)[1]
 
 
 def _channels(value: mi.Spectrum, channels: int) -> list[mi.Float]:

@@ -162,6 +162,13 @@ class Body:
             values = [sum(w[c] * corners[q] for w, corners in each) for q in range(8)]
             gradient.add_at(c, lower, values, active)
 
+    def add_to_constants(self, weight: list[mi.Float], active: mi.Bool) -> None:
+        """Add ``weight`` (d loss of each channel of the world) to the gradients of the constants."""
+        for part, gradient in zip(self.view.parts, self.gradients, strict=True):
+            if part.lattice is None:
+                for c, w in enumerate(_for_part(weight, part.channels)):
+                    dr.scatter_add(gradient, w, mi.UInt32(c), active)
+
     def deposit(self, ray: mi.Ray3f, t: mi.Float, weight: list[mi.Float], active: mi.Bool, name: str = "sigma_") -> None:
         """Add ``weight`` (d loss / d coefficient of each channel) at a point of a ray: the transpose of :meth:`tangent_at`."""
         weight = [self.area(ray.d) * w for w in weight]
@@ -239,6 +246,10 @@ class World:
     def rows(self, values: list[mi.Float]) -> list[mi.Float]:
         """Numbers of a grey or rgb body, for each channel of the world."""
         return as_rows(values, self.channels)
+
+    def sums(self, rows: list[mi.Float]) -> list[mi.Float]:
+        """The derivative of each channel of the world from that of each colour: a grey one gets the sum."""
+        return rows if len(rows) == self.channels else [sum(rows[1:], rows[0])]
 
     def vectors(self, values: list[mi.Vector3f]) -> list[mi.Vector3f]:
         """Vectors of a grey or rgb body, for each channel of the world."""
