@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
+import struct
 from pathlib import Path
 
 import numpy as np
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
 
 def look_at(origin: np.ndarray, target: np.ndarray = (0.0, 0.0, 0.0), up: np.ndarray = (0.0, 0.0, 1.0)) -> np.ndarray:
@@ -49,3 +51,75 @@ def edit(path: Path, change: object) -> None:
     table = json.loads(path.read_text())
     change(table)
     path.write_text(json.dumps(table))
+
+
+def write_transforms(folder: Path, settings: dict, size: tuple[int, int] = (12, 8), n: int = 4) -> Path:
+    """A set as nerfstudio's or instant-ngp's, without alpha."""
+    (folder / "images").mkdir(parents=True)
+    frames = []
+    for i, pose in enumerate(ring(n)):
+        Image.fromarray(pixels(*size, i, False)).save(folder / "images" / f"{i:04d}.png")
+        frames.append({"file_path": f"images/{i:04d}.png", "transform_matrix": pose.tolist()})
+    table = {"w": float(size[0]), "h": float(size[1]), **settings, "frames": frames}
+    (folder / "transforms.json").write_text(json.dumps(table))
+    return folder
+
+
+MODEL_IDS = {"SIMPLE_PINHOLE": 0, "PINHOLE": 1, "SIMPLE_RADIAL": 2, "RADIAL": 3, "OPENCV": 4, "OPENCV_FISHEYE": 5}
+
+COLMAP_CAMERAS = {
+    "SIMPLE_PINHOLE": (50.0, 31.0, 22.0),
+    "PINHOLE": (50.0, 55.0, 31.0, 22.0),
+    "SIMPLE_RADIAL": (50.0, 31.0, 22.0, 0.07),
+    "RADIAL": (50.0, 31.0, 22.0, 0.07, -0.04),
+    "OPENCV": (50.0, 55.0, 31.0, 22.0, 0.07, -0.04, 0.002, -0.003),
+}
+
+
+def colmap_pose(pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """World to camera with y down and z forward of one of our poses: quaternion (w, x, y, z) and translation."""
+    turned = (pose[:3, :3] @ np.diag([1.0, -1.0, -1.0])).T
+    x, y, z, w = Rotation.from_matrix(turned).as_quat()
+    return np.array([w, x, y, z]), -turned @ pose[:3, 3]
+
+
+def write_colmap(
+    folder: Path, model: str = "OPENCV", encoding: str = "bin", n: int = 4, points: np.ndarray | None = None
+) -> Path:
+    """A sparse model of n views on a ring, 64 x 48 pixels, each with two image points; image numbers run backwards."""
+    (folder / "images").mkdir(parents=True)
+    (folder / "sparse" / "0").mkdir(parents=True)
+    for i in range(n):
+        Image.fromarray(pixels(64, 48, i, False)).save(folder / "images" / f"a view {i}.png")
+    poses = [colmap_pose(pose) for pose in ring(n)]
+    points = np.zeros((0, 3)) if points is None else points
+    write = {"bin": _write_colmap_bin, "txt": _write_colmap_txt}[encoding]
+    write(folder / "sparse" / "0", model, poses, points)
+    return folder
+
+
+def _write_colmap_bin(folder: Path, model: str, poses: list, points: np.ndarray) -> None:
+    parameters = COLMAP_CAMERAS.get(model, (50.0, 50.0, 31.0, 22.0, 0, 0, 0, 0))
+    camera = struct.pack(f"<QiiQQ{len(parameters)}d", 1, 7, MODEL_IDS[model], 64, 48, *parameters)
+    (folder / "cameras.bin").write_bytes(camera)
+    images = struct.pack("<Q", len(poses))
+    for i, (q, t) in reversed(list(enumerate(poses))):
+        images += struct.pack("<I7dI", i + 1, *q, *t, 7) + f"a view {i}.png".encode() + b"\0"
+        images += struct.pack("<Q", 2) + 2 * struct.pack("<ddq", 1.5, 2.5, -1)
+    (folder / "images.bin").write_bytes(images)
+    cloud = struct.pack("<Q", len(points))
+    for i, point in enumerate(points):
+        cloud += struct.pack("<Q3d3BdQ", i, *point, 1, 2, 3, 0.5, 2) + struct.pack("<4i", 1, 0, 2, 1)
+    (folder / "points3D.bin").write_bytes(cloud)
+
+
+def _write_colmap_txt(folder: Path, model: str, poses: list, points: np.ndarray) -> None:
+    parameters = " ".join(map(repr, COLMAP_CAMERAS.get(model, (50.0, 50.0, 31.0, 22.0, 0, 0, 0, 0))))
+    (folder / "cameras.txt").write_text(f"# Camera list\n7 {model} 64 48 {parameters}\n")
+    lines = ["# Image list with two lines of data per image:"]
+    for i, (q, t) in reversed(list(enumerate(poses))):
+        numbers = " ".join(repr(float(v)) for v in [*q, *t])
+        lines += [f"{i + 1} {numbers} 7 a view {i}.png", "1.5 2.5 -1" if i % 2 else ""]
+    (folder / "images.txt").write_text("\n".join(lines) + "\n")
+    rows = [f"{i} {x!r} {y!r} {z!r} 1 2 3 0.5 1 0 2 1" for i, (x, y, z) in enumerate(points.tolist())]
+    (folder / "points3D.txt").write_text("\n".join(["# 3D point list", *rows]) + "\n")

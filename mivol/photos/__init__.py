@@ -9,6 +9,9 @@ from __future__ import annotations
 from mivol.photos.camera import Camera, directions, intrinsics, pixel_centres, project, rays
 from mivol.photos.dataset import BACKGROUNDS, FORMATS, SPLITS, Frame, Photo, Photos, Survey, load_photos, survey_photos
 from mivol.photos.lens import Lens, distort, undistort
+from mivol.photos.rectify import pinhole_of, rectified
+from mivol.photos.silhouette import silhouette_box
+from mivol.photos.transforms import write_transforms
 
 __all__ = [
     "BACKGROUNDS",
@@ -24,9 +27,13 @@ __all__ = [
     "distort",
     "intrinsics",
     "load_photos",
+    "pinhole_of",
     "pixel_centres",
     "project",
     "rays",
+    "rectified",
+    "silhouette_box",
     "survey_photos",
     "undistort",
+    "write_transforms",
 ]

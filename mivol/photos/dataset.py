@@ -20,6 +20,7 @@ from mivol.errors import MivolError
 from mivol.files.source import refusal
 from mivol.photos import region
 from mivol.photos.camera import Camera
+from mivol.photos.colmap import find_model, read_colmap
 from mivol.photos.listing import Entry, Listing
 from mivol.photos.picture import picture_size, read_mask, read_picture, shrink, space_of
 from mivol.photos.transforms import read_blender, read_transforms
@@ -43,6 +44,7 @@ class Format:
 FORMATS: dict[str, Format] = {
     "Blender (NeRF)": Format(lambda path: (path / "transforms_train.json").is_file(), read_blender),
     "transforms.json": Format(lambda path: (path / "transforms.json").is_file() or path.suffix == ".json", read_transforms),
+    "COLMAP": Format(lambda path: find_model(path) is not None, read_colmap),
 }
 
 #: name -> colour for each of n views, (n, 3), from a seed.

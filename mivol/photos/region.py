@@ -13,7 +13,7 @@ import numpy as np
 from mivol.files.source import refusal
 from mivol.photos.camera import Camera, rays
 
-__all__ = ["box_of_points", "check_box", "check_views", "focus_of", "near_far_of", "shared_box"]
+__all__ = ["box_of_points", "check_box", "check_views", "focus_of", "near_far_of", "shared_box", "views_seeing"]
 
 SHARE = 0.9
 """Share of the views that must see a point for it to count."""
@@ -58,7 +58,7 @@ def shared_box(cameras: Sequence[Camera], name: object = "cameras") -> np.ndarra
         points = np.stack(np.meshgrid(*[b + s * (np.arange(CELLS) + 0.5) for b, s in zip(box[0], step, strict=True)]), -1)
         points = points.reshape(-1, 3)
         points = points[np.linalg.norm(points - focus, axis=1) <= reach]
-        seen = points[_counts(cameras, points) >= SHARE * len(cameras)]
+        seen = points[views_seeing(cameras, points) >= SHARE * len(cameras)]
         if len(seen) == 0:
             raise refusal(name, "views that share no region", "cameras that look at one thing", "give its place with box=")
         box = np.array([seen.min(axis=0) - step, seen.max(axis=0) + step])
@@ -112,8 +112,8 @@ def check_views(cameras: Sequence[Camera], box: np.ndarray) -> None:
         )
 
 
-def _counts(cameras: Sequence[Camera], points: np.ndarray) -> np.ndarray:
-    """How many cameras see each of points (N, 3), distortion left out."""
+def views_seeing(cameras: Sequence[Camera], points: np.ndarray) -> np.ndarray:
+    """(N,) how many cameras see each of points (N, 3), distortion left out."""
     count = np.zeros(len(points), int)
     for camera in cameras:
         x, y, depth = camera.K @ np.diag([1.0, -1.0, -1.0]) @ camera.to_world[:3, :3].T @ (points - camera.origin).T

@@ -8,22 +8,30 @@ Settings that only place a scene in another program's unit cube (``aabb_scale``,
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from mivol.files.atomic import write_whole_text
 from mivol.files.source import read_bytes, refusal
 from mivol.photos.camera import Camera, intrinsics
 from mivol.photos.lens import Lens
 from mivol.photos.listing import Entry, Listing
 from mivol.photos.picture import SUFFIXES
 
-__all__ = ["read_blender", "read_transforms"]
+__all__ = ["MODELS", "Settings", "read_blender", "read_transforms", "write_transforms"]
 
 #: files of a Blender data set -> split.
 SPLIT_FILES = {"transforms_train.json": "train", "transforms_val.json": "val", "transforms_test.json": "test"}
+
+#: camera_model -> whether its lens may bend.
+MODELS = {"OPENCV": True, "RADIAL": True, "SIMPLE_RADIAL": True, "PINHOLE": False, "SIMPLE_PINHOLE": False}
+
+#: keys that say, if they are set, that a frame was taken by another kind of camera or while it moved.
+OTHER_CAMERAS = ("is_fisheye", "ftheta_p0", "latlong", "equirectangular", "orthographic", "rolling_shutter")
 
 
 def read_blender(path: Path) -> Listing:
@@ -49,6 +57,32 @@ def read_transforms(path: Path) -> Listing:
     return Listing(_entries(file, "train"))
 
 
+def write_transforms(path: Path, cameras: Mapping[str, Camera], test: Sequence[str] = ()) -> None:
+    """Write cameras as nerfstudio's ``transforms.json``, whole or not at all; read again they are the same.
+
+    Args:
+        path: destination.
+        cameras: by photograph, relative to the folder of ``path``.
+        test: which of the photographs are the test split.
+
+    Raises:
+        MivolError: disk full, no such folder.
+    """
+    frames = [{"file_path": name, **_described(camera)} for name, camera in cameras.items()]
+    table = {"camera_model": "OPENCV", "frames": frames}
+    if test:
+        table |= {"train_filenames": [name for name in cameras if name not in test], "test_filenames": list(test)}
+    write_whole_text(path, json.dumps(table, indent=1))
+
+
+def _described(camera: Camera) -> dict[str, Any]:
+    lens = {key: value for key, value in asdict(camera.distortion).items() if value}
+    (fx, _, cx), (_, fy, cy), _ = camera.K.tolist()
+    w, h = camera.size
+    numbers = {"fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy, "w": w, "h": h}
+    return {**numbers, **lens, "transform_matrix": camera.to_world.tolist()}
+
+
 def _entries(file: Path, split: str) -> list[Entry]:
     try:
         table = json.loads(read_bytes(file))
@@ -65,14 +99,20 @@ def _entry(file: Path, table: Mapping[str, Any], frame: Mapping[str, Any], numbe
     if missing:
         raise refusal(file, f"frame {number} without {missing[0]}", "file_path and transform_matrix", "write it again")
     name = str(frame["file_path"])
-    settings = {**table, **frame}
+    settings = Settings({**table, **frame}, f"{file.name} {name}")
 
     def camera(size: tuple[int, int]) -> Camera:
-        return Camera(
-            _intrinsics(file, settings, size), size, _matrix(file, frame, name), _lens(settings), f"{file.name} {name}"
-        )
+        return Camera(settings.intrinsics(size), size, settings.matrix(), settings.lens(), settings.name)
 
-    return Entry(name, _photograph(file.parent / name), camera, split)
+    mask = settings.values.get("mask_path")
+    return Entry(
+        name,
+        _photograph(file.parent / name),
+        camera,
+        _split_of(name, table) or split,
+        settings.size(),
+        file.parent / mask if mask else None,
+    )
 
 
 def _photograph(path: Path) -> Path:
@@ -83,19 +123,90 @@ def _photograph(path: Path) -> Path:
     return next((file for file in tried if file.is_file()), tried[0])
 
 
-def _matrix(file: Path, frame: Mapping[str, Any], name: str) -> np.ndarray:
-    try:
-        return np.array(frame["transform_matrix"], np.float64)
-    except (ValueError, TypeError) as error:
-        raise refusal(
-            f"{file.name} {name}", "a transform_matrix that is no matrix", "4 rows of 4 numbers", "correct it"
-        ) from error
+def _split_of(name: str, table: Mapping[str, Any]) -> str | None:
+    """The split whose list of the data set names a frame; None where it has no lists."""
+    return next((split for split in ("test", "val", "train") if name in (table.get(f"{split}_filenames") or ())), None)
 
 
-def _intrinsics(file: Path, settings: Mapping[str, Any], size: tuple[int, int]) -> np.ndarray:
-    fx = 0.5 * size[0] / np.tan(0.5 * float(settings["camera_angle_x"]))
-    return intrinsics(fx, fx, size[0] / 2, size[1] / 2)
+@dataclass(frozen=True)
+class Settings:
+    """What holds for one frame: its own keys, then those of the file.
 
+    Attributes:
+        values: by key.
+        name: of the frame, for refusals.
+    """
 
-def _lens(settings: Mapping[str, Any]) -> Lens:
-    return Lens(**{key: float(settings.get(key, 0.0)) for key in Lens.__dataclass_fields__})
+    values: Mapping[str, Any]
+    name: str
+
+    def number(self, key: str, default: float = 0.0) -> float:
+        """The number under a key; ``default`` where it is absent.
+
+        Raises:
+            MivolError: something else stands there.
+        """
+        value = self.values.get(key, default)
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            raise refusal(self.name, f"{key} = {value!r}", "a number", "correct it")
+        return float(value)
+
+    def size(self) -> tuple[int, int] | None:
+        """(width, height), where ``w`` and ``h`` say it.
+
+        Raises:
+            MivolError: not whole.
+        """
+        if "w" not in self.values or "h" not in self.values:
+            return None
+        found = self.number("w"), self.number("h")
+        if not all(n >= 1 and n == int(n) for n in found):
+            raise refusal(self.name, f"w = {found[0]}, h = {found[1]}", "whole numbers of pixels", "correct them")
+        return int(found[0]), int(found[1])
+
+    def intrinsics(self, size: tuple[int, int]) -> np.ndarray:
+        """(3, 3) K. Focal lengths count before angles; the principal point is the middle unless it is said.
+
+        Raises:
+            MivolError: neither a focal length nor an angle.
+        """
+        fx = self._focal("fl_x", "camera_angle_x", size[0])
+        if fx is None:
+            raise refusal(self.name, "no focal length", "fl_x or camera_angle_x", "add it to the file of cameras")
+        fy = self._focal("fl_y", "camera_angle_y", size[1])
+        fy = fx if fy is None else fy
+        return intrinsics(fx, fy, self.number("cx", size[0] / 2), self.number("cy", size[1] / 2))
+
+    def _focal(self, length: str, angle: str, pixels: int) -> float | None:
+        if length in self.values:
+            return self.number(length)
+        if angle not in self.values:
+            return None
+        radians = self.number(angle)
+        if not 0 < radians < np.pi:
+            raise refusal(self.name, f"{angle} = {radians:g}", "an angle between 0 and pi", "give it in radians")
+        return 0.5 * pixels / float(np.tan(radians / 2))
+
+    def lens(self) -> Lens:
+        """The distortion.
+
+        Raises:
+            MivolError: a camera that is not a perspective one with polynomial distortion.
+        """
+        model = self.values.get("camera_model", "OPENCV")
+        other = next((key for key in OTHER_CAMERAS if self.values.get(key)), None)
+        if model not in MODELS or other:
+            found = f"camera_model {model}" if model not in MODELS else f"{other} = {self.values[other]}"
+            raise refusal(self.name, found, f"one of {', '.join(MODELS)}", "undistort the images first")
+        return Lens(**{key: self.number(key) for key in Lens.__dataclass_fields__}) if MODELS[model] else Lens()
+
+    def matrix(self) -> np.ndarray:
+        """``transform_matrix`` as it stands.
+
+        Raises:
+            MivolError: not a matrix of numbers.
+        """
+        try:
+            return np.array(self.values["transform_matrix"], np.float64)
+        except (ValueError, TypeError) as error:
+            raise refusal(self.name, "a transform_matrix that is no matrix", "4 rows of 4 numbers", "correct it") from error

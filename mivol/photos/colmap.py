@@ -1,0 +1,256 @@
+"""Sparse reconstructions of COLMAP: cameras, images and points, in binary and in text.
+
+Conventions. COLMAP stores world to camera, x_c = R(q) x + t, with the quaternion (w, x, y, z) and OpenCV's axes (y down, z
+forward); it counts pixels from the upper left corner, as we do. A lens that a model lacks is a pinhole.
+
+Source: the file formats in COLMAP's documentation ("Output Format") and the parameters of its camera models.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mivol.files.source import read_bytes, reals, refusal
+from mivol.photos.camera import FLIP, Camera, intrinsics
+from mivol.photos.lens import Lens
+from mivol.photos.listing import Entry, Listing
+
+__all__ = ["CAMERA_MODELS", "find_model", "read_colmap", "rotation"]
+
+MODEL_NUMBERS = (
+    *("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "FOV"),
+    *("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "THIN_PRISM_FISHEYE", "RAD_TAN_THIN_PRISM_FISHEYE"),
+)
+
+#: name -> names of its parameters, in their order.
+CAMERA_MODELS: dict[str, tuple[str, ...]] = {
+    "SIMPLE_PINHOLE": ("f", "cx", "cy"),
+    "PINHOLE": ("fx", "fy", "cx", "cy"),
+    "SIMPLE_RADIAL": ("f", "cx", "cy", "k1"),
+    "RADIAL": ("f", "cx", "cy", "k1", "k2"),
+    "OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"),
+}
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """One entry of COLMAP's cameras: (width, height), K and lens."""
+
+    size: tuple[int, int]
+    K: np.ndarray
+    lens: Lens
+
+
+@dataclass(frozen=True)
+class Pose:
+    """One entry of COLMAP's images: its name, camera number, and camera to world in our axes."""
+
+    name: str
+    camera: int
+    to_world: np.ndarray
+
+
+def find_model(path: Path) -> Path | None:
+    """The folder with cameras and images: ``path`` itself, or its ``sparse/0``, ``sparse``, ``colmap/sparse/0``."""
+    for folder in (path, path / "sparse/0", path / "sparse", path / "colmap/sparse/0"):
+        if any((folder / f"cameras{suffix}").is_file() and (folder / f"images{suffix}").is_file() for suffix in READERS):
+            return folder
+    return None
+
+
+def read_colmap(path: Path) -> Listing:
+    """A folder with a sparse model, and photographs in ``images/`` beside ``sparse/``; masks in ``masks/NAME.png``.
+
+    Entries are sorted by name.
+
+    Raises:
+        MivolError: a model without radial or pinhole form, a truncated file, text that is not numbers, an unknown camera.
+    """
+    model = find_model(path)
+    suffix = next(s for s in READERS if (model / f"cameras{s}").is_file() and (model / f"images{s}").is_file())
+    read = READERS[suffix]
+    sensors, poses = read.cameras(model / f"cameras{suffix}"), read.images(model / f"images{suffix}")
+    points_file = model / f"points3D{suffix}"
+    points = read.points(points_file) if points_file.is_file() else None
+    base = next((folder for folder in (path, *model.parents[:2]) if (folder / "images").is_dir()), path)
+    entries = [_entry(base, pose, sensors, model / f"images{suffix}") for pose in sorted(poses, key=lambda pose: pose.name)]
+    return Listing(entries, points)
+
+
+def rotation(q: np.ndarray) -> np.ndarray:
+    """(3, 3) rotation of a unit quaternion (w, x, y, z); of another length l it is l^2 times one."""
+    w, x, y, z = q
+    return np.array(
+        [
+            [w * w + x * x - y * y - z * z, 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), w * w - x * x + y * y - z * z, 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), w * w - x * x - y * y + z * z],
+        ]
+    )
+
+
+def _entry(base: Path, pose: Pose, sensors: dict[int, Sensor], file: Path) -> Entry:
+    if pose.camera not in sensors:
+        raise refusal(file, f"{pose.name} taken by camera {pose.camera}", "a camera of the model", "export the model again")
+    sensor = sensors[pose.camera]
+
+    def camera(size: tuple[int, int]) -> Camera:
+        return Camera(sensor.K, size, pose.to_world, sensor.lens, f"{file.name} {pose.name}")
+
+    mask = base / "masks" / f"{pose.name}.png"
+    return Entry(pose.name, base / "images" / pose.name, camera, "train", sensor.size, mask if mask.is_file() else None)
+
+
+def _sensor(path: Path, model: str, size: tuple[int, int], parameters: tuple[float, ...]) -> Sensor:
+    named = dict(zip(_parameters(path, model), parameters, strict=True))
+    fx, fy = named.get("fx", named.get("f")), named.get("fy", named.get("f"))
+    lens = Lens(**{key: value for key, value in named.items() if key in Lens.__dataclass_fields__})
+    return Sensor(size, intrinsics(fx, fy, named["cx"], named["cy"]), lens)
+
+
+def _parameters(path: Path, model: str) -> tuple[str, ...]:
+    if model not in CAMERA_MODELS:
+        raise refusal(
+            path, f"the camera model {model}", f"one of {', '.join(CAMERA_MODELS)}", "undistort with colmap image_undistorter"
+        )
+    return CAMERA_MODELS[model]
+
+
+def _to_world(q: np.ndarray, t: np.ndarray) -> np.ndarray:
+    pose = np.eye(4)
+    pose[:3, :3] = rotation(np.asarray(q)).T * FLIP
+    pose[:3, 3] = -rotation(np.asarray(q)).T @ t
+    return pose
+
+
+# -- Binary -------------------------------------------------------------------------------------------------------
+
+
+class Fields:
+    """Little-endian fields of a file, one after the other."""
+
+    def __init__(self, path: Path) -> None:
+        self.path, self.data, self.at = path, read_bytes(path), 0
+
+    def take(self, form: str) -> tuple[Any, ...]:
+        """The next fields, by :mod:`struct`.
+
+        Raises:
+            MivolError: the file ends before them.
+        """
+        form = f"<{form}"
+        self.skip(struct.calcsize(form))
+        return struct.unpack_from(form, self.data, self.at - struct.calcsize(form))
+
+    def skip(self, count: int) -> None:
+        """Leave out so many bytes.
+
+        Raises:
+            MivolError: the file ends before.
+        """
+        self.at += count
+        if self.at > len(self.data):
+            raise refusal(self.path, f"{len(self.data)} bytes", f"at least {self.at}", "the file is truncated: copy it again")
+
+    def word(self) -> str:
+        """Text up to the next NUL.
+
+        Raises:
+            MivolError: there is none.
+        """
+        end = self.data.find(b"\0", self.at)
+        if end < 0:
+            raise refusal(self.path, "a name that does not end", "a whole file", "the file is truncated: copy it again")
+        start, self.at = self.at, end + 1
+        return self.data[start:end].decode("utf-8", errors="replace")
+
+
+def _cameras_bin(path: Path) -> dict[int, Sensor]:
+    fields, sensors = Fields(path), {}
+    for _ in range(fields.take("Q")[0]):
+        number, model, width, height = fields.take("iiQQ")
+        name = MODEL_NUMBERS[model] if 0 <= model < len(MODEL_NUMBERS) else f"number {model}"
+        sensors[number] = _sensor(path, name, (width, height), fields.take(f"{len(_parameters(path, name))}d"))
+    return sensors
+
+
+def _images_bin(path: Path) -> list[Pose]:
+    fields, poses = Fields(path), []
+    for _ in range(fields.take("Q")[0]):
+        _, *pose, camera = fields.take("I7dI")
+        poses.append(Pose(fields.word(), camera, _to_world(pose[:4], pose[4:])))
+        fields.skip(24 * fields.take("Q")[0])
+    return poses
+
+
+def _points_bin(path: Path) -> np.ndarray:
+    fields, points = Fields(path), []
+    for _ in range(fields.take("Q")[0]):
+        points.append(fields.take("Q3d3Bd")[1:4])
+        fields.skip(8 * fields.take("Q")[0])
+    return np.array(points).reshape(-1, 3)
+
+
+# -- Text ---------------------------------------------------------------------------------------------------------
+
+
+def _lines(path: Path) -> Iterator[str]:
+    """Lines that are no comment; empty ones stay, since an image without points has one."""
+    text = read_bytes(path).decode("utf-8", errors="replace")
+    return (line.strip() for line in text.splitlines() if not line.lstrip().startswith("#"))
+
+
+def _cameras_txt(path: Path) -> dict[int, Sensor]:
+    sensors = {}
+    for line in filter(None, _lines(path)):
+        number, model, *rest = [*line.split(maxsplit=2), ""][:3]
+        values = reals(rest[0], 2 + len(_parameters(path, model)), path, f"camera {number}")
+        sensors[_whole(number, path)] = _sensor(path, model, (int(values[0]), int(values[1])), tuple(values[2:]))
+    return sensors
+
+
+def _images_txt(path: Path) -> list[Pose]:
+    poses, lines = [], _lines(path)
+    for line in lines:
+        if not line:
+            continue
+        words = line.split(maxsplit=9)
+        if len(words) != 10:
+            raise refusal(path, f"the line '{line}'", "number, quaternion, translation, camera, name", "export it again")
+        pose = reals(" ".join(words[1:8]), 7, path, words[9])
+        poses.append(Pose(words[9], _whole(words[8], path), _to_world(pose[:4], pose[4:])))
+        next(lines, None)
+    return poses
+
+
+def _points_txt(path: Path) -> np.ndarray:
+    rows = [reals(" ".join(line.split()[1:4]), 3, path, f"point {line.split()[0]}") for line in filter(None, _lines(path))]
+    return np.array(rows).reshape(-1, 3)
+
+
+def _whole(word: str, path: Path) -> int:
+    if not word.isdigit():
+        raise refusal(path, f"the number '{word}'", "a whole number", "export the model again")
+    return int(word)
+
+
+@dataclass(frozen=True)
+class Reader:
+    """How one encoding of a model is read."""
+
+    cameras: Callable[[Path], dict[int, Sensor]]
+    images: Callable[[Path], list[Pose]]
+    points: Callable[[Path], np.ndarray]
+
+
+#: suffix -> reader; binary first, as COLMAP does.
+READERS = {
+    ".bin": Reader(_cameras_bin, _images_bin, _points_bin),
+    ".txt": Reader(_cameras_txt, _images_txt, _points_txt),
+}

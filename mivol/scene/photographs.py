@@ -1,0 +1,80 @@
+"""Cameras of photographs as Mitsuba's sensors, and Mitsuba's as cameras.
+
+Conventions. Mitsuba's camera has x to the left in the image, y up and z into the scene; its principal point offset is a
+fraction of the film, positive where the axis meets the image left of (above) the middle. Pixels are square.
+"""
+
+from __future__ import annotations
+
+import math
+
+import mitsuba as mi
+import numpy as np
+
+from mivol.files.source import refusal
+from mivol.photos import Camera, intrinsics
+from mivol.photos.camera import PIXELS_LOST
+
+__all__ = ["camera_of", "sensor_of"]
+
+AXES = np.diag([-1.0, 1.0, -1.0, 1.0])
+"""Mitsuba's camera axes in ours."""
+
+
+def sensor_of(camera: Camera, near_far: tuple[float, float] = (1e-2, 1e4), *, pixel_format: str = "rgb") -> dict:
+    """A perspective sensor with a box filter, for ``mitsuba.load_dict``.
+
+    Args:
+        camera: a pinhole with square pixels (:func:`mivol.photos.rectified` makes one).
+        near_far: clipping distances [length].
+        pixel_format: of the film.
+
+    Raises:
+        MivolError: distortion, or pixels that are not square: Mitsuba has no such camera.
+    """
+    (fx, _, cx), (_, fy, cy), _ = camera.K
+    if camera.distortion or abs(fx / fy - 1) * max(camera.size) / 2 > PIXELS_LOST:
+        found = "a lens with distortion" if camera.distortion else f"focal lengths {fx:.6g} and {fy:.6g}"
+        raise refusal(camera.name, found, "a pinhole with square pixels", "resample it with mivol.photos.rectified")
+    width, height = camera.size
+    return {
+        "type": "perspective",
+        "fov": math.degrees(2 * math.atan(width / 2 / fx)),
+        "fov_axis": "x",
+        "principal_point_offset_x": 0.5 - cx / width,
+        "principal_point_offset_y": 0.5 - cy / height,
+        "near_clip": near_far[0],
+        "far_clip": near_far[1],
+        "to_world": mi.ScalarTransform4f(camera.to_world @ AXES),
+        "film": {
+            "type": "hdrfilm",
+            "width": width,
+            "height": height,
+            "pixel_format": pixel_format,
+            "component_format": "float32",
+            "rfilter": {"type": "box"},
+        },
+        "sampler": {"type": "independent"},
+    }
+
+
+def camera_of(sensor: mi.Sensor, name: str = "sensor") -> Camera:
+    """The camera of a perspective sensor; of a cropped film, that of the crop.
+
+    Raises:
+        MivolError: another kind of sensor.
+    """
+    if sensor.class_name() != "PerspectiveCamera":
+        raise refusal(name, f"a {sensor.class_name()}", "a perspective sensor", "photographs have pinhole cameras")
+    params = mi.traverse(sensor)
+    film = sensor.film()
+    full, crop, size = (np.array(v, float).ravel() for v in (film.size(), film.crop_offset(), film.crop_size()))
+    offset = np.array([_number(params[f"principal_point_offset_{axis}"]) for axis in "xy"])
+    f = full[0] / 2 / math.tan(math.radians(_number(params["x_fov"])) / 2)
+    cx, cy = full * (0.5 - offset) - crop
+    pose = np.array(sensor.world_transform().matrix, np.float64).reshape(4, 4)
+    return Camera(intrinsics(f, f, cx, cy), (int(size[0]), int(size[1])), pose @ AXES, name=name)
+
+
+def _number(value: object) -> float:
+    return float(np.array(value).ravel()[0])
