@@ -15,14 +15,17 @@ class MivolMedium(mi.Medium):
         sigma_t, albedo: extinction [1/length] and single-scattering albedo (default 0), or
         sigma_a, sigma_s: absorption and scattering [1/length]; each a float, rgb (above 1 allowed) or a volume.
         scale: factor on the extinction, differentiable. Default 1.
-        emission: refused while it cannot be rendered.
+        emission: radiance Le that the medium shows where nothing is seen through it (its source function is
+            (1 - albedo) Le), a float, rgb or a volume. Default none.
+        emission_density: radiance per length that does not go with the extinction, likewise. Default none.
         a phase function: default isotropic.
     """
 
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
         self.coefficients = Coefficients.from_props(props)
-        self.volumes = self.coefficients.volumes  # dr.freeze finds arrays among a plugin's own attributes only
+        # dr.freeze finds arrays among a plugin's own attributes only.
+        self.volumes = {**self.coefficients.volumes, **self.coefficients.lights}
         self.scale = mi.Float(props.get("scale", 1.0))
         dr.make_opaque(self.scale)
         self.m_is_homogeneous = self.coefficients.is_homogeneous
@@ -46,7 +49,7 @@ class MivolMedium(mi.Medium):
 
     def traverse(self, callback: mi.TraversalCallback) -> None:
         callback.put("scale", self.scale, mi.ParamFlags.Differentiable)
-        for name, volume in self.coefficients.volumes.items():
+        for name, volume in self.volumes.items():
             callback.put(name, volume, mi.ParamFlags.Differentiable)
         super().traverse(callback)
 

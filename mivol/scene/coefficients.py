@@ -25,20 +25,19 @@ class Coefficients:
 
     Args:
         volumes: ``sigma_t`` and ``albedo``, or ``sigma_a`` and ``sigma_s``.
+        lights: ``emission`` and ``emission_density``, as far as they are given.
     """
 
-    def __init__(self, volumes: dict[str, mi.Volume]) -> None:
-        self.volumes = volumes
+    def __init__(self, volumes: dict[str, mi.Volume], lights: dict[str, mi.Volume]) -> None:
+        self.volumes, self.lights = volumes, lights
 
     @classmethod
     def from_props(cls, props: mi.Properties) -> Coefficients:
         """Read a medium's coefficients from plugin parameters.
 
         Raises:
-            MivolError: both pairs, half of a pair, emission, or a negative number.
+            MivolError: both pairs, half of a pair, or a negative number.
         """
-        if "emission" in props:
-            raise MivolError("mivol_medium was given emission, which mivol cannot render yet; take it out.")
         given = [n for pair in PAIRS for n in pair if n in props]
         pair = next((p for p in PAIRS if set(given) <= set(p)), None)
         if pair is None or not given or given == ["albedo"]:
@@ -46,7 +45,10 @@ class Coefficients:
                 f"mivol_medium was given {' and '.join(given) or 'no coefficient'}; give sigma_t (with albedo, if it scatters) "
                 "or sigma_a and sigma_s."
             )
-        return cls({name: _volume(props, name) for name in pair})
+        return cls(
+            {name: _volume(props, name) for name in pair},
+            {name: _volume(props, name) for name in ("emission", "emission_density") if name in props},
+        )
 
     @property
     def extinction(self) -> list[mi.Volume]:
@@ -88,7 +90,16 @@ class Coefficients:
     def eval(
         self, mei: mi.MediumInteraction3f, scale: mi.Float, majorant: mi.Spectrum, active: mi.Bool
     ) -> tuple[mi.Spectrum, mi.Spectrum, mi.Spectrum]:
-        """Scattering, null and total coefficients at a point, as Mitsuba's media return them."""
+        """Scattering, null and total coefficients at a point, as Mitsuba's media return them.
+
+        Raises:
+            MivolError: the medium emits, and no integrator of Mitsuba's asks for its light.
+        """
+        if self.lights:
+            raise MivolError(
+                f"a mivol_medium with {' and '.join(self.lights)} was given to an integrator of Mitsuba's, which would leave "
+                "that light out; render it with the integrator mivol, or take the emission out."
+            )
         first, second = (_eval(v, mei, active) for v in self.volumes.values())
         sigma_t, sigma_s = (first, first * second) if "sigma_t" in self.volumes else (first + second, second)
         # The majorant was rounded, and is compared with a sum rounded otherwise: a null coefficient below 0 would be a
@@ -97,7 +108,8 @@ class Coefficients:
         return scale * sigma_s, sigma_n, scale * sigma_t
 
     def __repr__(self) -> str:
-        return "mivol_medium[" + ", ".join(f"{n}={v.class_name()}" for n, v in self.volumes.items()) + "]"
+        fields = {**self.volumes, **self.lights}
+        return "mivol_medium[" + ", ".join(f"{n}={v.class_name()}" for n, v in fields.items()) + "]"
 
 
 def _volume(props: mi.Properties, name: str) -> mi.Volume:

@@ -37,9 +37,9 @@ class Boundary:
 class MediumFacts:
     """What one medium is made of.
 
-    ``resolutions`` are those of its grids (Z, Y, X), none for a homogeneous medium; ``occupied`` the share of their blocks
-    of cells that hold anything; ``tau_max`` bounds the optical depth through its box [1] (None where it is not bounded by
-    a box); ``unread`` tells that values could not be read, because a function is being recorded.
+    ``resolutions`` are those of its grids (Z, Y, X), none for a homogeneous medium; ``emits`` tells whether it is a source of
+    light, ``occupied`` which share of their blocks of cells holds anything; ``tau_max`` bounds the optical depth through its
+    box [1] (None where it is not bounded by a box); ``unread``: values could not be read, because a function is being recorded.
     """
 
     name: str
@@ -48,6 +48,7 @@ class MediumFacts:
     extinction: str
     resolutions: tuple[tuple[int, int, int], ...]
     is_scattering: bool
+    emits: bool
     phase: str
     occupied: float
     tau_max: float | None
@@ -265,6 +266,7 @@ def _facts(boundary: Boundary, view: MediumView, survey: Survey, recording: bool
         "extinction": "rgb" if view.channels == 3 else "grey",
         "resolutions": tuple(g.res for g in grids),
         "phase": _phase_name(phase),
+        "emits": view.emits,
     }
     if recording:
         # What it was when it was last read; a medium that was never read may scatter.

@@ -69,8 +69,9 @@ def make_plan(needs: Needs, settings: Settings) -> Plan:
     """
     _refuse_scattering(needs, settings)
     _refuse_refraction(needs, settings)
+    _refuse_emission(needs, settings)
     _refuse_quadrature(needs, settings)
-    choices = [_transport(needs, settings), *_lighting(needs, settings), _tracing(needs), _channels(needs)]
+    choices = [_transport(needs, settings), *_emission(needs), *_lighting(needs, settings), _tracing(needs), _channels(needs)]
     skips = tuple(bool(m.resolutions) and m.occupied < SKIP_BELOW for m in needs.media)
     choices += [_skipping(m, skip) for m, skip in zip(needs.media, skips, strict=True) if m.resolutions]
     pass_rays = _pass_rays(needs)
@@ -113,6 +114,15 @@ def _refuse_refraction(needs: Needs, settings: Settings) -> None:
         raise MivolError(
             f"the boundary {needs.refractive[0]} refracts and its scene has a medium that scatters; no straight shadow ray "
             "reaches a lamp through it: make the boundary's BSDF null, set max_depth to 1, or the albedo to 0."
+        )
+
+
+def _refuse_emission(needs: Needs, settings: Settings) -> None:
+    glowing = [m.name for m in needs.media if m.emits]
+    if glowing and _is_lit(needs, settings):
+        raise MivolError(
+            f"the medium in {glowing[0]} emits and a medium of its scene scatters at max_depth 2; the light of one that is "
+            "scattered by the other is not there yet: set max_depth to 1, or the albedo to 0."
         )
 
 
@@ -160,6 +170,14 @@ def _transport(needs: Needs, settings: Settings) -> Choice:
         why = "values cannot be read while dr.freeze records; absorption was promised by max_depth or by an earlier render"
     what = "exact optical depth; no phase function, no light sampling in media, no albedo look-up"
     return Choice("media", what, why)
+
+
+def _emission(needs: Needs) -> list[Choice]:
+    """How emitted light is summed."""
+    names = [m.name for m in needs.media if m.emits]
+    if not names:
+        return []
+    return [Choice("emission", "two points a cell, swept from the far end", f"{', '.join(names)} emit")]
 
 
 def _lighting(needs: Needs, settings: Settings) -> list[Choice]:

@@ -95,11 +95,13 @@ class Session:
             with dr.resume_grad():
                 world, plan = self._open(scene, sensor, spp)
             world.start_gradients()
-            for rays, dL, daovs in adjoint_rays(
-                sensor, seed, spp, plan.pass_rays, self.aovs, grad_in, _is_tiled(world)
-            ):
-                self._replay(scene, world, rays, dL, daovs)
-                dr.eval()
+            # What is pulled back to a volume waits there for the end: its edge to the parameter can be passed but once.
+            with dr.isolate_grad():
+                for rays, dL, daovs in adjoint_rays(
+                    sensor, seed, spp, plan.pass_rays, self.aovs, grad_in, _is_tiled(world)
+                ):
+                    self._replay(scene, world, rays, dL, daovs)
+                    dr.eval()
             with dr.resume_grad():
                 world.push_gradients()
 

@@ -79,10 +79,10 @@ class Rule(Protocol):
     def constant(self, site: Site, sigma: list[mi.Float]) -> list[Stop]:
         """Each row of a stretch of constant extinction (one derivative)."""
 
-    def pull(self, site: Site, weight: list[mi.Float]) -> None:
-        """Hand ``weight`` (d loss / d N of each row) on to whatever else N depends on."""
+    def pull(self, site: Site, sigma: list[list[mi.Float]], weight: list[mi.Float]) -> None:
+        """Hand ``weight`` (d loss / d N of each row) on to whatever else N depends on; extinction as in :meth:`cell`."""
 
-    def push(self, site: Site) -> list[mi.Float]:
+    def push(self, site: Site, sigma: list[list[mi.Float]]) -> list[mi.Float]:
         """Tangent of N of each row by whatever else it depends on."""
 
     def least(self, t1: mi.Float) -> mi.Float | float:
@@ -143,8 +143,8 @@ class _Stretch:
 
     @property
     def has_constants(self) -> bool:
-        """Whether there is extinction (or light) outside the grid too, so that no block may be skipped."""
-        return any(p.lattice is None for p in self.body.view.parts)
+        """Whether there is something outside the grid too, so that no block may be skipped."""
+        return self.body.view.glow is not None or any(p.lattice is None for p in self.body.view.parts)
 
     @property
     def reads(self) -> list:
@@ -175,14 +175,16 @@ class _Stretch:
         channels = self.world.rows(channels)
         return [channels[r % len(channels)] for r in range(self.rule.rows)]
 
-    def stops(self, cell: Cell, on: mi.Bool) -> list[Stop]:
-        """What a cell does, each row."""
+    def cell(self, cell: Cell, on: mi.Bool) -> tuple[Site, list[list[mi.Float]], list[Stop]]:
+        """A cell, its extinction, and what it does, each row."""
+        site = self.site(cell, on)
         sigma = self.along(self.field, cell.corners[: len(self.field.reads)], cell)
-        return self.rule.cell(self.site(cell, on), sigma)
+        return site, sigma, self.rule.cell(site, sigma)
 
-    def constant_stops(self, a: mi.Float, b: mi.Float) -> list[Stop]:
-        """What a stretch of constants does, each row."""
-        return self.rule.constant(self.outside(a, b), self.rows(self.field.constant))
+    def constant(self, a: mi.Float, b: mi.Float) -> tuple[Site, list[list[mi.Float]], list[Stop]]:
+        """As :meth:`cell`, a stretch of constants."""
+        site, sigma = self.outside(a, b), self.rows(self.field.constant)
+        return site, [[s] * len(self.rule.points) for s in sigma], self.rule.constant(site, sigma)
 
 
 def _open(
@@ -211,18 +213,18 @@ def _measure(stretch: _Stretch, skip: bool) -> _Moment:
     moment = _Moment(_zeros(mi.Float64, rows), _zeros(mi.Float, rows))
 
     def add_constant(moment: _Moment, a: mi.Float, b: mi.Float) -> _Moment:
-        stops = stretch.constant_stops(a, b)
+        site, sigma, stops = stretch.constant(a, b)
         if not tangent:
             return _put_in_front(moment, stops, [], [])
         changes = [[d] for d in stretch.rows(stretch.change.constant)]
-        return _put_in_front(moment, stops, changes, rule.push(stretch.outside(a, b)))
+        return _put_in_front(moment, stops, changes, rule.push(site, sigma))
 
     def visit(moment: _Moment, cell: Cell, on: mi.Bool) -> _Moment:
-        stops = stretch.stops(cell, on)
+        site, sigma, stops = stretch.cell(cell, on)
         if not tangent:
             return _put_in_front(moment, stops, [], [])
         changes = stretch.along(stretch.change, cell.corners[len(stretch.field.reads) :], cell)
-        return _put_in_front(moment, stops, changes, rule.push(stretch.site(cell, on)))
+        return _put_in_front(moment, stops, changes, rule.push(site, sigma))
 
     if stretch.has_constants and lay.lattice is not None:
         moment = add_constant(moment, lay.leave, lay.t1)
@@ -268,15 +270,18 @@ def _backproject(
     rule, lay, body = stretch.rule, stretch.lay, stretch.body
     pull = _Pull(_zeros(mi.Float, rule.rows), [mi.Float64(a) for a in ahead], _zeros(mi.Float, rule.rows))
     grids = [p for p in body.view.parts if p.lattice is not None]
+    outside: list[tuple] = []
 
     def add_constant(pull: _Pull, a: mi.Float, b: mi.Float) -> _Pull:
-        pull, _, weights = _pull_through(pull, stretch.constant_stops(a, b), weight, behind)
-        rule.pull(stretch.outside(a, b), weights)
+        site, sigma, stops = stretch.constant(a, b)
+        pull, _, weights = _pull_through(pull, stops, weight, behind)
+        outside.append((site, sigma, weights))
         return pull
 
     def visit(pull: _Pull, cell: Cell, on: mi.Bool) -> _Pull:
-        pull, slopes, weights = _pull_through(pull, stretch.stops(cell, on), weight, behind)
-        rule.pull(stretch.site(cell, on), weights)
+        site, sigma, stops = stretch.cell(cell, on)
+        pull, slopes, weights = _pull_through(pull, stops, weight, behind)
+        rule.pull(site, sigma, weights)
         corners = [node_weights(p, cell, lay.lattice.res) for p in stretch.points(cell)]
         by_point = [stretch.world.sums([row[p] for row in slopes]) for p in range(len(corners))]
         for part in grids:
@@ -290,6 +295,9 @@ def _backproject(
     if stretch.has_constants:
         pull = add_constant(pull, lay.t0, lay.enter)
         body.add_to_constants(stretch.world.sums(pull.constant), stretch.active)
+    # After the walk: what Dr.Jit pulls back in a loop is lost where the same array was pulled to before it.
+    for site, sigma, weights in outside:
+        rule.pull(site, sigma, weights)
 
 
 def _pull_through(

@@ -51,6 +51,7 @@ class Shares:
         f: the share of the first point.
         half: half the length of the cell.
         lean: what moves the share: d (alpha f) / d sigma_q is ``half * (T f + lean[q])``.
+        per_sigma: the weights over the extinction at their points [length], which stay finite where it is 0.
     """
 
     tau: mi.Float
@@ -59,6 +60,7 @@ class Shares:
     f: mi.Float
     half: mi.Float
     lean: tuple[mi.Float, mi.Float]
+    per_sigma: tuple[mi.Float, mi.Float]
 
     @property
     def weights(self) -> tuple[mi.Float, mi.Float]:
@@ -96,7 +98,7 @@ def share_cell(dt: mi.Float, sigma1: mi.Float, sigma2: mi.Float) -> Shares:
     scale = phi1(tau) * dr.select(some, total * inverse, 1)
     growth = half * (1 / math.sqrt(3)) * (1 + x)  # dq / d sigma, for either point
     lean = (scale * dr.fma(sigma1, growth, q) * (1 - f), -scale * f * (1 - sigma2 * growth / q))
-    return Shares(tau, dr.exp(-tau), one_minus_exp(tau), f, half, lean)
+    return Shares(tau, dr.exp(-tau), one_minus_exp(tau), f, half, lean, (half * scale * q, half * scale))
 
 
 @dataclass

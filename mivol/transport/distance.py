@@ -106,10 +106,10 @@ class _Distance:
     def constant(self, site: Site, sigma: list[mi.Float]) -> list[Stop]:
         return [_stop_in_constant(site, self.origin, s) for s in sigma]
 
-    def pull(self, site: Site, weight: list[mi.Float]) -> None:
+    def pull(self, site: Site, sigma: list[list[mi.Float]], weight: list[mi.Float]) -> None:
         """Nothing but the extinction moves a distance."""
 
-    def push(self, site: Site) -> list[mi.Float]:
+    def push(self, site: Site, sigma: list[list[mi.Float]]) -> list[mi.Float]:
         return [mi.Float(0) for _ in range(self.rows)]
 
     def least(self, t1: mi.Float) -> mi.Float:

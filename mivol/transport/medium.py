@@ -62,6 +62,10 @@ class MediumView:
         share: the albedo itself, a volume or a constant; None where ``sigma_s`` is a part.
         flakes: the matrix S (xx, yy, zz, xy, xz, yz) of an ``sggx`` phase function, which makes the extinction depend on the
             direction: sigma_t sqrt(w^T S w) (Heitz et al. 2015, Eq. 6); None elsewhere.
+        source: the radiance that a medium shows where nothing is seen through it, a volume or a constant; None where it
+            does not emit.
+        glow: radiance per length that does not go with the extinction, likewise.
+        frame: the grid of ``source`` or ``glow``, which a sweep follows where the extinction has none.
     """
 
     medium: mi.Medium
@@ -70,6 +74,14 @@ class MediumView:
     albedo: list = field(default_factory=list)
     share: mi.Volume | mi.Float | mi.Color3f | None = None
     flakes: list[mi.Float] | None = None
+    source: mi.Volume | mi.Float | mi.Color3f | None = None
+    glow: mi.Volume | mi.Float | mi.Color3f | None = None
+    frame: Lattice | None = None
+
+    @property
+    def emits(self) -> bool:
+        """Whether the medium is a source of light."""
+        return self.source is not None or self.glow is not None
 
     @property
     def channels(self) -> int:
@@ -80,7 +92,7 @@ class MediumView:
     @property
     def guide(self) -> Lattice | None:
         """The grid whose cells a sweep follows; None where everything is a constant."""
-        return next((p.lattice for p in self.parts if p.lattice is not None), None)
+        return next((p.lattice for p in self.parts if p.lattice is not None), self.frame)
 
 
 @dataclass
@@ -137,8 +149,10 @@ def view_medium(medium: mi.Medium, boundary: Box | None = None, places: dict | N
     places = {} if places is None else places
     parts = [_part(name, params, kind, boundary, places) for name in names]
     albedo = [v for k, v in params if k.startswith("sigma_s." if "sigma_s" in names else "albedo.")]
-    share = _share(params) if "sigma_s" not in names else None
-    return MediumView(medium, parts, mi.Float(params["scale"]), albedo, share, _flakes(medium))
+    share = _field(params, "albedo") if "sigma_s" not in names else None
+    source, glow = _field(params, "emission"), _field(params, "emission_density")
+    frame = _frame([source, glow], boundary, places)
+    return MediumView(medium, parts, mi.Float(params["scale"]), albedo, share, _flakes(medium), source, glow, frame)
 
 
 def _flakes(medium: mi.Medium) -> list[mi.Float] | None:
@@ -163,12 +177,29 @@ def _flakes(medium: mi.Medium) -> list[mi.Float] | None:
     return rows
 
 
-def _share(params: mi.SceneParameters) -> mi.Volume | mi.Float | mi.Color3f:
-    """The albedo among a medium's parameters: a constant with its gradient, or the volume that knows it."""
-    if "albedo.value.value" in params.properties:
-        return params["albedo.value.value"]
-    key = next(k for k in params.properties if k.startswith("albedo."))
-    return params.properties[key][2]
+def _field(params: mi.SceneParameters, name: str) -> mi.Volume | mi.Float | mi.Color3f | None:
+    """What a medium has under a name: a constant with its gradient, or the volume that knows it; None for nothing."""
+    if f"{name}.value.value" in params.properties:
+        return params[f"{name}.value.value"]
+    key = next((k for k in params.properties if k.startswith(name + ".")), None)
+    return None if key is None else params.properties[key][2]
+
+
+def _frame(fields: list, boundary: Box | None, places: dict) -> Lattice | None:
+    """Where the first of some fields that is a grid has its cells; its values are not looked at."""
+    for volume in fields:
+        if isinstance(volume, mi.Volume) and volume.class_name() != "ConstVolume":
+            x, y, z = (int(n) for n in volume.resolution())
+            return Lattice(dr.zeros(mi.TensorXf, (z, y, x, 1)), _place(volume, boundary, places))
+    return None
+
+
+def _place(volume: mi.Volume, boundary: Box | None, places: dict) -> np.ndarray:
+    """Where a grid lies, found once."""
+    key = (volume.ptr, None if boundary is None else boundary.to_world.tobytes())
+    if key not in places:
+        places[key] = place_of_grid(volume, boundary)
+    return places[key]
 
 
 def kind_of(medium: mi.Medium) -> str:
@@ -180,11 +211,8 @@ def _part(name: str, params: mi.SceneParameters, kind: str, boundary: Box | None
     """The part of an extinction under ``name`` among a medium's parameters."""
     grid, constant = f"{name}.data", f"{name}.value.value"
     if grid in params.properties:
-        volume = params.properties[grid][2]
-        key = (volume.ptr, None if boundary is None else boundary.to_world.tobytes())
-        if key not in places:
-            places[key] = place_of_grid(volume, boundary)
-        return Part(name, lattice=Lattice(_tensor(params[grid]), places[key]))
+        place = _place(params.properties[grid][2], boundary, places)
+        return Part(name, lattice=Lattice(_tensor(params[grid]), place))
     if constant not in params.properties:
         found = sorted(k for k in params.properties if k.startswith(name + "."))
         raise MivolError(

@@ -23,11 +23,13 @@ from functools import partial
 import drjit as dr
 import mitsuba as mi
 
+from mivol.transport.chain import Chain
 from mivol.transport.control import Probe, Tracks, sweep
-from mivol.transport.path import Reach, Stretch, Way, optical_depth_to, revisit
+from mivol.transport.emission import backproject_emission, integrate_emission
+from mivol.transport.path import Reach, Stretch, Way, optical_depth_to, reach, revisit
 from mivol.transport.quadrature import integrate_scattering
 from mivol.transport.scatter import Scattering, albedo, at_event, scatter, sigma_t_at
-from mivol.transport.world import Body, World, spectrum
+from mivol.transport.world import Body, World, by_channel, spectrum, tangent_of
 
 __all__ = ["Adjoint", "Primal", "Tangent"]
 
@@ -44,6 +46,9 @@ class Primal:
         self, scene: mi.Scene, world: World, stretch: Stretch, active: mi.Bool
     ) -> tuple[Reach, list[mi.Float], Primal]:
         """Go to the end of a stretch; add what its media scatter."""
+        if world.emits:
+            end, chain = _emit(scene, world, stretch, active)
+            return end, _tau(world, chain), self.add(stretch.beta * _colours_of(chain.N), active)
         if world.lights is None or not self.scatters:
             return *optical_depth_to(scene, world, stretch.ray, stretch.medium, active), self
         if world.is_deterministic:
@@ -82,18 +87,24 @@ class Adjoint:
         self, scene: mi.Scene, world: World, stretch: Stretch, active: mi.Bool
     ) -> tuple[Reach, list[mi.Float], Adjoint]:
         """Everything ahead is dimmed by this stretch: d loss / d tau = -dL L; what its media scatter is probed apart."""
-        event = None
-        if world.lights is None:
+        event, ahead = None, self.L
+        if world.emits:
+            end, chain = _emit(scene, world, stretch, active)
+            tau, dim = _tau(world, chain), partial(_pull_emission, scene, world, stretch, end, chain, self.dL, active)
+            if ahead is not None:
+                ahead = ahead - dr.select(active, stretch.beta * _colours_of(chain.N), 0)
+        elif world.lights is None:
             end, tau = optical_depth_to(scene, world, stretch.ray, stretch.medium, active)
+            dim = partial(_pull_stretch, scene, world, stretch, end, tau, event, self.dL, active)
         else:
             end, tau, event = scatter(scene, world, stretch, True, active)
             _pull_arrivals(scene, world, event, self.dL)
             _pull_albedo(world, stretch.ray, event, self.dL)
-        dim = partial(_pull_stretch, scene, world, stretch, end, tau, event, self.dL, active)
-        if self.L is None:
+            dim = partial(_pull_stretch, scene, world, stretch, end, tau, event, self.dL, active)
+        if ahead is None:
             return end, tau, Adjoint(None, self.dL, dim)
-        dim(self.L)
-        return end, tau, self
+        dim(ahead)
+        return end, tau, Adjoint(ahead, self.dL)
 
     def add(self, value: mi.Spectrum, active: mi.Bool) -> Adjoint:
         """Pass the light by; what made it (an emitter's radiance) gets its own derivative."""
@@ -138,6 +149,8 @@ class Tangent:
     ) -> tuple[Reach, list[mi.Float], Tangent]:
         """The stretch dims what lies ahead by its tangent; what its media scatter changes with them."""
         dL = self.dL
+        if world.emits:
+            return self._stretch_that_emits(scene, world, stretch, active)
         if world.lights is None:
             end, tau = optical_depth_to(scene, world, stretch.ray, stretch.medium, active)
         else:
@@ -154,10 +167,22 @@ class Tangent:
         way = Way(stretch.ray, stretch.medium, end.t)
         return end, tau, Tangent(self.L, dL, self.dtau + _tangent(scene, world, way, active))
 
+    def _stretch_that_emits(
+        self, scene: mi.Scene, world: World, stretch: Stretch, active: mi.Bool
+    ) -> tuple[Reach, list[mi.Float], Tangent]:
+        """One chain for the light, the optical depth, and the tangents of both."""
+        end, chain = _emit(scene, world, stretch, active, tangent=True)
+        k, c = len(chain.N) // 2, world.channels
+        N, dN = _colours_of(chain.N[:k]), _colours_of(chain.N[k:])
+        dtau = spectrum([mi.Float(t) for t in chain.tau[k : k + c]])
+        L = self.L + dr.select(active, stretch.beta * N, 0)
+        dL = self.dL + dr.select(active, stretch.beta * (dN - self.dtau * N), 0)
+        return end, _tau(world, chain), Tangent(L, dL, self.dtau + dr.select(active, dtau, 0))
+
     def add(self, value: mi.Spectrum, active: mi.Bool) -> Tangent:
         """Light found at the end of a stretch, and how it changes."""
         with dr.resume_grad():
-            own = dr.forward_to(value) if dr.grad_enabled(value) else 0
+            own = tangent_of(value)
         seen = dr.detach(value)
         dL = self.dL + dr.select(active, own - self.dtau * seen, 0)
         return Tangent(self.L + dr.select(active, seen, 0), dL, self.dtau)
@@ -174,10 +199,43 @@ class Tangent:
             f = bsdf.eval(mi.BSDFContext(), si, wo, active)
             if not dr.grad_enabled(f):
                 return self
-            df = dr.forward_to(f)
+            df = tangent_of(f)
         f = dr.detach(f)
         change = dr.select(active & (f != 0), df * dr.rcp(dr.select(f != 0, f, 1)), 0)
         return Tangent(self.L, self.dL, self.dtau - change)
+
+
+def _emit(
+    scene: mi.Scene, world: World, stretch: Stretch, active: mi.Bool, tangent: bool = False
+) -> tuple[Reach, Chain]:
+    """Where a stretch ends, and what its media emit."""
+    end, _ = reach(scene, world, stretch.ray, stretch.medium, lambda state, *_: state, mi.Float(0), active)
+    return end, integrate_emission(scene, world, Way(stretch.ray, stretch.medium, end.t), active, tangent)
+
+
+def _tau(world: World, chain: Chain) -> list[mi.Float]:
+    """Optical depth of a chain, each channel."""
+    return [mi.Float(t) for t in chain.tau[: world.channels]]
+
+
+def _colours_of(rows: list[mi.Float]) -> mi.Spectrum:
+    """Rows of emitted light as a spectrum."""
+    return mi.Spectrum(*rows) if len(rows) > 1 else mi.Spectrum(rows[0])
+
+
+def _pull_emission(
+    scene: mi.Scene,
+    world: World,
+    stretch: Stretch,
+    end: Reach,
+    chain: Chain,
+    dL: mi.Spectrum,
+    active: mi.Bool,
+    L: mi.Spectrum,
+) -> None:
+    """Derivatives of what a stretch emits, and of what it lets through of the light ``L`` behind it."""
+    way = Way(stretch.ray, stretch.medium, end.t)
+    backproject_emission(scene, world, way, chain, dL * stretch.beta, dL * L, active)
 
 
 def _pull_stretch(
@@ -256,7 +314,7 @@ def _pull_source(scene: mi.Scene, world: World, stretch: Stretch, event: Scatter
         share, name = mi.Spectrum(1), "sigma_s"
         if body.view.share is not None:
             share, name = dr.detach(albedo(body, event.mei, on)), "sigma_"
-        body.deposit(ray, t, _channels(dL * event.weight * share, world.channels), on, name)
+        body.deposit(ray, t, by_channel(dL * event.weight * share, world.channels), on, name)
     _backproject(scene, world, _way_to(stretch, t), -dL * event.sigma_s * event.weight, event.event.on)
 
 
@@ -269,7 +327,7 @@ def _sums(weight: mi.Spectrum, channels: int, of_control: int) -> list[list[tupl
     """What each channel of the control counts in each channel of the extinction, summed over colours."""
     colours = [weight[c] for c in range(dr.size_v(weight))]
     if of_control == 1:
-        return [[(0, w)] for w in _channels(weight, channels)]
+        return [[(0, w)] for w in by_channel(weight, channels)]
     if channels == 1:
         return [list(enumerate(colours))]
     return [[(c, w)] for c, w in enumerate(colours)]
@@ -293,7 +351,7 @@ def _sweep(
     share = dr.detach(albedo(body, event.mei, point.on))
     left = dr.select(point.on, event.weight * share - event.gain * spectrum(S), 0)
     sigma_t = spectrum(point.sigma_t)
-    rows = [_colours(x) if tangent else _channels(x, world.channels) for x in (dL * left, dL * left * sigma_t, rest)]
+    rows = [_colours(x) if tangent else by_channel(x, world.channels) for x in (dL * left, dL * left * sigma_t, rest)]
     probe = Probe(point.begin, point.t, rows[0], rows[1], point.on)
     return sweep(world, stretch.ray, end.t, tau, Tracks(shares, rows[2], tangent), probe, active)
 
@@ -308,7 +366,7 @@ def _push_attached(scene: mi.Scene, world: World, ray: mi.Ray3f, event: Scatteri
             if body.view.share is not None:
                 sigma_t = sigma_t_at(world, body, ray, event.event, on)
                 value += dr.select(on, event.weight * sigma_t * albedo(body, event.mei, on), 0)
-        dL = dr.forward_to(value) if dr.grad_enabled(value) else mi.Spectrum(0)
+        dL = tangent_of(value)
     way, dimmed, on = _choose(event)
     return dL - dr.select(on, carried * dimmed * _tangent(scene, world, way, on), 0)
 
@@ -331,7 +389,7 @@ def _colours(value: mi.Spectrum) -> list[mi.Float]:
 
 def _backproject(scene: mi.Scene, world: World, way: Way, weight: mi.Spectrum, active: mi.Bool) -> None:
     """Add a weight times a stretch to the gradients of its media."""
-    rows = _channels(weight, world.channels)
+    rows = by_channel(weight, world.channels)
 
     def visit(state: mi.Float, body: Body, t0: mi.Float, t1: mi.Float, on: mi.Bool) -> mi.Float:
         body.backproject(way.ray, t0, t1, rows, on)
@@ -348,9 +406,3 @@ def _tangent(scene: mi.Scene, world: World, way: Way, active: mi.Bool) -> mi.Spe
 
     tau = revisit(scene, world, way, visit, [mi.Float(0) for _ in range(world.channels)], active)
     return mi.Spectrum(*tau) if len(tau) == 3 else mi.Spectrum(tau[0])
-
-
-def _channels(value: mi.Spectrum, channels: int) -> list[mi.Float]:
-    """A spectrum as one number for each channel of the extinction; a grey one gets the sum."""
-    parts = [value[c] for c in range(dr.size_v(value))]
-    return parts if len(parts) == channels else [sum(parts[1:], parts[0])]

@@ -251,6 +251,11 @@ class World:
         """The derivative of each channel of the world from that of each colour: a grey one gets the sum."""
         return rows if len(rows) == self.channels else [sum(rows[1:], rows[0])]
 
+    @property
+    def emits(self) -> bool:
+        """Whether some medium is a source of light."""
+        return any(b.view.emits for b in self.bodies)
+
     def vectors(self, values: list[mi.Vector3f]) -> list[mi.Vector3f]:
         """Vectors of a grey or rgb body, for each channel of the world."""
         axes = [self.rows([v[a] for v in values]) for a in range(3)]
@@ -294,6 +299,16 @@ class World:
                 dr.forward_to(*asked)
             body.tangents = [dr.detach(dr.grad(p)) for p in products]
             dr.eval(body.tangents)
+            _lead_tangents([body.view.source, body.view.glow, body.view.share])
+
+
+def _lead_tangents(fields: list) -> None:
+    """Bring the tangents of volumes to where they are read: a loop cannot pass the edges of a graph that lie outside of it."""
+    for volume in fields:
+        if isinstance(volume, mi.Volume):
+            value = volume.eval(dr.zeros(mi.Interaction3f))
+            if dr.grad_enabled(value):
+                dr.forward_to(value, flags=dr.ADFlag.ClearEdges)
 
 
 LUMINANCE = (0.212671, 0.715160, 0.072169)
@@ -303,6 +318,20 @@ LUMINANCE = (0.212671, 0.715160, 0.072169)
 def spectrum(rows: list[mi.Float]) -> mi.Spectrum:
     """One number for each channel of the world as a spectrum."""
     return mi.Spectrum(*rows) if len(rows) == 3 else mi.Spectrum(rows[0])
+
+
+def tangent_of(value: mi.Spectrum) -> mi.Spectrum:
+    """The tangent of a value that was computed from parameters; 0 where none of them has one.
+
+    The tangents that it reads are kept: other points and passes read them again.
+    """
+    return dr.forward_to(value, flags=dr.ADFlag.ClearEdges) if dr.grad_enabled(value) else dr.zeros(type(value))
+
+
+def by_channel(value: mi.Spectrum, channels: int) -> list[mi.Float]:
+    """The derivative of each channel of the extinction from that of each colour: a grey one gets the sum."""
+    parts = [value[c] for c in range(dr.size_v(value))]
+    return parts if len(parts) == channels else [sum(parts[1:], parts[0])]
 
 
 def as_rows(values: list[mi.Float], channels: int) -> list[mi.Float]:
