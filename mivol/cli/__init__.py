@@ -58,14 +58,20 @@ def first_line(verb: Callable) -> str:
 # -- Flags --------------------------------------------------------------------------------------------------------
 
 
-def scene_flags(sub: argparse.ArgumentParser) -> None:
+def scene_flags(sub: argparse.ArgumentParser, what: str = "Mitsuba XML") -> None:
     """Mitsuba's own flags for what is loaded."""
-    sub.add_argument("scene", type=Path, help="Mitsuba XML")
+    sub.add_argument("scene", type=Path, help=what)
     sub.add_argument("-m", "--mode", default="llvm_ad_rgb", help="variant (default: %(default)s)")
     sub.add_argument("-D", "--define", action="append", default=[], metavar="name=value", help="fill in $name")
     sub.add_argument("-a", default="", metavar="path;path", help="more folders to look for files in")
     sub.add_argument("-t", "--threads", type=int, default=0, help="threads of the CPU back end; 0: all cores")
     sub.add_argument("-v", "--verbose", action="store_true", help="Mitsuba's own messages")
+
+
+def explain_flags(sub: argparse.ArgumentParser) -> None:
+    """A scene, or a data set with a picture of its cameras."""
+    scene_flags(sub, "Mitsuba XML, or posed photographs: a folder or its transforms.json")
+    sub.add_argument("-o", "--output", type=Path, help="picture of the cameras (.png, .svg); default: NAME-cameras.png")
 
 
 def render_flags(sub: argparse.ArgumentParser) -> None:
@@ -78,13 +84,18 @@ def render_flags(sub: argparse.ArgumentParser) -> None:
 def reference_flags(sub: argparse.ArgumentParser) -> None:
     """Flags of a reference."""
     scene_flags(sub)
-    sub.add_argument("-s", "--sensor", type=int, default=0, help="number of the sensor")
+    sub.add_argument("-s", "--sensor", type=sensor_number, default=0, help='its number, or "all": a set of photographs')
     sub.add_argument("-o", "--output", type=Path, default=Path("references"), help=".exr, or a folder")
     sub.add_argument("--max-depth", type=int, required=True, help="longest path; -1 is unlimited")
     sub.add_argument("--target", type=float, help="RMS standard error of the mean to reach [radiance]")
     sub.add_argument("--spp", type=int, default=1 << 16, help="most samples per pixel (default: %(default)s)")
     sub.add_argument("--seed", type=int, default=0, help="root of its random numbers")
     sub.add_argument("--integrator", default="volpath", help="volpath or volpathmis")
+
+
+def sensor_number(text: str) -> int | str:
+    """The number of a sensor, or "all"."""
+    return text if text == "all" else int(text)
 
 
 def optimize_flags(sub: argparse.ArgumentParser) -> None:
@@ -112,11 +123,34 @@ def no_flags(sub: argparse.ArgumentParser) -> None:
 
 
 def explain(arguments: argparse.Namespace) -> None:
-    """What a scene needs, and how mivol would render it: facts, choices, reasons. Nothing is rendered."""
+    """What a scene needs, and how mivol would render it: facts, choices, reasons. Nothing is rendered.
+
+    Of posed photographs: what there is, what is missing, and a picture of the cameras and the box that they look at.
+    """
+    from mivol.photos import find_format
+
+    kind = explain_photos if arguments.scene.is_dir() or find_format(arguments.scene) else explain_scene
+    kind(arguments)
+
+
+def explain_scene(arguments: argparse.Namespace) -> None:
+    """Facts, choices, reasons."""
     from mivol.cli.rendering import load
     from mivol.scene import plan
 
     print(plan.explain(load(arguments).scene))
+
+
+def explain_photos(arguments: argparse.Namespace) -> None:
+    """Facts and picture of a data set."""
+    from mivol.photos import survey_photos
+    from mivol.report.cameras import plot_cameras
+
+    survey = survey_photos(arguments.scene)
+    path = arguments.output or Path(f"{arguments.scene.resolve().stem}-cameras.png")
+    plot_cameras(survey, path)
+    print(survey.text)
+    print(path)
 
 
 def render(arguments: argparse.Namespace) -> None:
@@ -131,17 +165,25 @@ def render(arguments: argparse.Namespace) -> None:
 
 
 def reference(arguments: argparse.Namespace) -> None:
-    """Render a reference with Mitsuba's own path tracer, with its variance, until it is good enough."""
+    """Render a reference with Mitsuba's own path tracer, with its variance, until it is good enough.
+
+    Of all sensors (-s all) with a file of cameras beside them: photographs that a radiance field is fitted to.
+    """
     from mivol.cli.rendering import load
+    from mivol.validate.photographs import photograph
     from mivol.validate.reference import render_reference
 
-    if not arguments.output.suffix:
-        arguments.output.mkdir(parents=True, exist_ok=True)
-    result = render_reference(
-        load(arguments), arguments.output, max_depth=arguments.max_depth, target_se=arguments.target,
-        max_spp=arguments.spp, sensor=arguments.sensor, seed=arguments.seed, integrator=arguments.integrator,
-    )  # fmt: skip
-    print(result.text)
+    settings = {
+        "max_depth": arguments.max_depth, "target_se": arguments.target, "max_spp": arguments.spp,
+        "seed": arguments.seed, "integrator": arguments.integrator,
+    }  # fmt: skip
+    if arguments.sensor == "all":
+        made = photograph(load(arguments), arguments.output, **settings)
+    else:
+        if not arguments.output.suffix:
+            arguments.output.mkdir(parents=True, exist_ok=True)
+        made = [render_reference(load(arguments), arguments.output, sensor=arguments.sensor, **settings)]
+    print("\n".join(result.text for result in made))
 
 
 def optimize(arguments: argparse.Namespace) -> None:
@@ -171,7 +213,7 @@ def doctor(arguments: argparse.Namespace) -> int:
 
 
 VERBS: dict[str, tuple[Callable, Callable]] = {
-    "explain": (explain, scene_flags),
+    "explain": (explain, explain_flags),
     "render": (render, render_flags),
     "reference": (reference, reference_flags),
     "optimize": (optimize, optimize_flags),

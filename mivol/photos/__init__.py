@@ -7,7 +7,18 @@ sees, :func:`project` where a point lies in the image.
 from __future__ import annotations
 
 from mivol.photos.camera import Camera, directions, intrinsics, pixel_centres, project, rays
-from mivol.photos.dataset import BACKGROUNDS, FORMATS, SPLITS, Frame, Photo, Photos, Survey, load_photos, survey_photos
+from mivol.photos.dataset import (
+    BACKGROUNDS,
+    FORMATS,
+    SPLITS,
+    Frame,
+    Photo,
+    Photos,
+    Survey,
+    find_format,
+    load_photos,
+    survey_photos,
+)
 from mivol.photos.lens import Lens, distort, undistort
 from mivol.photos.rectify import pinhole_of, rectified
 from mivol.photos.silhouette import silhouette_box
@@ -25,6 +36,7 @@ __all__ = [
     "Survey",
     "directions",
     "distort",
+    "find_format",
     "intrinsics",
     "load_photos",
     "pinhole_of",

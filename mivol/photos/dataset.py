@@ -25,7 +25,19 @@ from mivol.photos.listing import Entry, Listing
 from mivol.photos.picture import picture_size, read_mask, read_picture, shrink, space_of
 from mivol.photos.transforms import read_blender, read_transforms
 
-__all__ = ["BACKGROUNDS", "FORMATS", "SPLITS", "Format", "Frame", "Photo", "Photos", "Survey", "load_photos", "survey_photos"]
+__all__ = [
+    "BACKGROUNDS",
+    "FORMATS",
+    "SPLITS",
+    "Format",
+    "Frame",
+    "Photo",
+    "Photos",
+    "Survey",
+    "find_format",
+    "load_photos",
+    "survey_photos",
+]
 
 SPLITS = ("train", "held_out", "val", "test", "all")
 
@@ -257,14 +269,19 @@ def load_photos(
 # -- Choosing -----------------------------------------------------------------------------------------------------
 
 
+def find_format(path: Path) -> str | None:
+    """The key of ``FORMATS`` of a folder or file of cameras; None where it is neither."""
+    return next((name for name, kind in FORMATS.items() if kind.recognise(path)), None)
+
+
 def _read(path: Path) -> tuple[str, Listing]:
     if not path.exists():
         raise refusal(path, "nothing there", "a folder of photographs or a file of cameras", "check the path")
-    for name, kind in FORMATS.items():
-        if kind.recognise(path):
-            return name, kind.read(path)
-    known = ", ".join(FORMATS)
-    raise refusal(path, "no cameras", f"one of {known}", "name the folder that holds the file of cameras")
+    name = find_format(path)
+    if name is None:
+        known = ", ".join(FORMATS)
+        raise refusal(path, "no cameras", f"one of {known}", "name the folder that holds the file of cameras")
+    return name, FORMATS[name].read(path)
 
 
 def _divided(entries: list[Entry], held_out: int | Sequence[str], path: Path) -> list[Entry]:

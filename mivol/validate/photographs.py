@@ -51,6 +51,8 @@ def photograph(
     names = [f"view_{number:03d}.exr" for number in range(len(looks))]
     cameras = {name: camera_of(_sensor(loaded.scene, look), name) for name, look in zip(names, looks, strict=True)}
     folder = Path(folder)
+    if folder.suffix == ".exr":
+        raise MivolError(f"{folder} names one image for {len(looks)} views; name a folder.")
     folder.mkdir(parents=True, exist_ok=True)
     made = [render_reference(loaded, folder / name, sensor=look, **reference) for name, look in zip(names, looks, strict=True)]
     write_transforms(folder / "transforms.json", cameras, [names[number] for number in test])

@@ -1,0 +1,77 @@
+"""``mivol explain`` and ``mivol reference -s all`` on posed photographs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from photo_sets import write_blender, write_colmap
+from PIL import Image
+
+from mivol.cli import main
+from mivol.photos import survey_photos
+from mivol.report.cameras import box_edges, outline, plot_cameras
+
+SCENE = """<scene version="3.0.0">
+    <emitter type="constant"/>
+    <sensor type="perspective"><transform name="to_world"><lookat origin="0, 1, 4" target="0, 0, 0" up="0, 1, 0"/></transform>
+        <film type="hdrfilm"><integer name="width" value="6"/><integer name="height" value="4"/>
+            <string name="pixel_format" value="rgb"/></film></sensor>
+    <sensor type="perspective"><transform name="to_world"><lookat origin="4, 1, 0" target="0, 0, 0" up="0, 1, 0"/></transform>
+        <film type="hdrfilm"><integer name="width" value="6"/><integer name="height" value="4"/>
+            <string name="pixel_format" value="rgb"/></film></sensor>
+</scene>"""
+
+
+def test_explain_says_what_there_is_and_draws_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = write_blender(tmp_path / "set")
+    (folder / "train" / "r_1.png").unlink()
+    picture = tmp_path / "cameras.png"
+    assert main(["explain", str(folder), "-o", str(picture)]) == 0
+    said = capsys.readouterr().out
+    facts = ("Blender (NeRF)", "5 photographs (3 train, 2 test)", "12 x 8 pixels", "focal length 14.19", "box (", "near ")
+    for fact in (*facts, "skipped 1 that are not there: ./train/r_1", str(picture)):
+        assert fact in said
+    with Image.open(picture) as image:
+        assert image.size[0] > 1000
+
+
+def test_explain_names_the_picture_after_the_set(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = write_colmap(tmp_path / "hall", points=np.random.default_rng(0).normal(size=(200, 3)))
+    monkeypatch.chdir(tmp_path)
+    assert main(["explain", str(folder)]) == 0
+    assert Path("hall-cameras.png").is_file()
+
+
+def test_explain_refuses_a_folder_without_cameras(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["explain", str(tmp_path)]) == 1
+    assert "found no cameras, expected one of Blender (NeRF), transforms.json, COLMAP" in capsys.readouterr().err
+
+
+def test_drawn_cameras_lie_in_the_world(tmp_path: Path) -> None:
+    """Every line of a camera begins at it or ends on its field of view, which opens towards what it looks at."""
+    frame = survey_photos(write_blender(tmp_path / "set")).frames[0]
+    edges = outline(frame, 0.5)
+    np.testing.assert_allclose(edges[:4, 0], np.tile(frame.camera.origin, (4, 1)))
+    np.testing.assert_allclose((edges[:4, 1] - frame.camera.origin) @ frame.camera.forward, 0.5)
+    lengths = np.ptp(box_edges(np.array([[0, 0, 0], [1, 2, 3]])), axis=1).sum(axis=1)
+    assert sorted(lengths) == [1] * 4 + [2] * 4 + [3] * 4
+
+
+def test_picture_shows_all_splits(tmp_path: Path, artefacts: Path) -> None:
+    survey = survey_photos(write_blender(tmp_path / "set"), held_out=2)
+    figure = plot_cameras(survey, artefacts / "cameras.png")
+    assert [text.get_text() for text in figure.axes[1].get_legend().get_texts()] == ["train", "held_out", "test", "box"]
+
+
+def test_reference_of_all_sensors_is_a_data_set(variant_rgb: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "scene.xml").write_text(SCENE)
+    output = ["-m", variant_rgb, "-s", "all", "--max-depth", "1", "--spp", "32", "-o"]
+    assert main(["reference", str(tmp_path / "scene.xml"), *output, str(tmp_path / "set")]) == 0
+    assert "view_000.exr" in capsys.readouterr().out
+    survey = survey_photos(tmp_path / "set")
+    assert len(survey.frames) == 2
+    np.testing.assert_allclose(survey.frames[1].camera.origin, [4, 1, 0], atol=1e-6)
+    assert main(["reference", str(tmp_path / "scene.xml"), *output, str(tmp_path / "one.exr")]) == 1
+    assert "name a folder" in capsys.readouterr().err
