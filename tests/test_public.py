@@ -15,7 +15,12 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "mivol"
 MODULES = sorted(path for path in PACKAGE.rglob("*.py") if path.name != "__main__.py")
-IMPORTED_AS = {"pillow": "pil", "scikit-image": "skimage"}
+IMPORTED_AS = {
+    "pillow": "pil",
+    "scikit-image": "skimage",
+    "flip-evaluator": "flip_evaluator",
+    "imageio-ffmpeg": "imageio_ffmpeg",
+}
 Function = ast.FunctionDef | ast.AsyncFunctionDef
 
 

@@ -15,7 +15,6 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
-from mpl_toolkits.mplot3d.art3d import Line3DCollection
 from numpy.typing import NDArray
 
 from mivol.photos import SPLITS, Frame, Survey
@@ -75,6 +74,12 @@ def box_edges(box: NDArray) -> NDArray:
     return np.array(pairs) * (box[1] - box[0]) + box[0]
 
 
+def _pen(edges: NDArray) -> NDArray:
+    """(3, 3 N) one line through edges (N, 2, 3), lifted between them."""
+    lifted = np.full((len(edges), 1, 3), np.nan)
+    return np.concatenate([edges, lifted], axis=1).reshape(-1, 3).T
+
+
 def _by_split(survey: Survey) -> dict[str, list[Frame]]:
     found = {split: [frame for frame in survey.frames if frame.split == split] for split in SPLITS}
     return {split: frames for split, frames in found.items() if frames}
@@ -95,8 +100,8 @@ def _points(survey: Survey) -> NDArray:
 def _draw_side(axes: Axes, survey: Survey, lines: dict[str, NDArray], up: int) -> None:
     order = _order(up)
     for split, edges in lines.items():
-        axes.add_collection3d(Line3DCollection(edges[..., order], colors=_colour(split), linewidths=0.7, alpha=0.8))
-    axes.add_collection3d(Line3DCollection(box_edges(survey.box)[..., order], colors=INK, linewidths=1.3))
+        axes.plot(*_pen(edges)[order], color=_colour(split), linewidth=0.7, alpha=0.8)
+    axes.plot(*_pen(box_edges(survey.box))[order], color=INK, linewidth=1.3)
     axes.scatter(*_points(survey)[:, order].T, s=0.3, color=FAINT, linewidths=0)
     everything = np.concatenate([*(edges.reshape(-1, 3) for edges in lines.values()), survey.box])[:, order]
     low, high = everything.min(axis=0), everything.max(axis=0)
@@ -111,10 +116,8 @@ def _draw_side(axes: Axes, survey: Survey, lines: dict[str, NDArray], up: int) -
 def _draw_plan(axes: Axes, survey: Survey, lines: dict[str, NDArray], up: int) -> None:
     first, second, _ = _order(up)
     for split, edges in lines.items():
-        for number, edge in enumerate(edges[..., [first, second]]):
-            axes.plot(*edge.T, color=_colour(split), linewidth=0.7, alpha=0.8, label=None if number else split)
-    for number, edge in enumerate(box_edges(survey.box)[..., [first, second]]):
-        axes.plot(*edge.T, color=INK, linewidth=1.3, label=None if number else "box")
+        axes.plot(*_pen(edges)[[first, second]], color=_colour(split), linewidth=0.7, alpha=0.8, label=split)
+    axes.plot(*_pen(box_edges(survey.box))[[first, second]], color=INK, linewidth=1.3, label="box")
     axes.scatter(*_points(survey)[:, [first, second]].T, s=0.3, color=FAINT, linewidths=0)
     axes.set_aspect("equal", adjustable="datalim")
     axes.set(title=f"from above ({'xyz'[up]} is up)", xlabel=f"{'xyz'[first]} [length]", ylabel=f"{'xyz'[second]} [length]")

@@ -1,0 +1,153 @@
+"""How good are the views of a radiance field? One written protocol, since each of its choices is worth 0.2 to 6 dB.
+
+Protocol. Render and photograph are compared as a screen shows them: sRGB values, clipped to 0..1 and rounded to 8 bits, over
+the same background, at the size at which they were read. PSNR has the peak 1 and is taken of each image over all pixels and
+channels (those that a mask leaves); **the number for a set is the mean of its images' PSNR**, not the PSNR of the mean error.
+SSIM has the 11 x 11 Gaussian window of Wang et al., FLIP the viewing distance of its authors (67 pixels per degree); smaller is
+better there. Where a mask leaves pixels out, SSIM and FLIP see the photograph in both.
+
+Source: Wang et al. 2004 (IEEE TIP 13); Andersson et al. 2020 (PACM CGIT 3, FLIP). For the choices: the protocol that the
+reruns of the NerfBaselines project follow for NeRF's synthetic scenes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from mivol.errors import MivolError
+from mivol.photos.picture import SPACES
+from mivol.validate.statistics import psnr, ssim
+
+__all__ = ["METRICS", "Quality", "Score", "flip", "judge", "quantised", "score"]
+
+
+@dataclass(frozen=True)
+class Quality:
+    """What the metrics say of one image, by their names in ``METRICS``."""
+
+    name: str
+    values: dict[str, float]
+
+
+@dataclass(frozen=True)
+class Score:
+    """What they say of a set of images: means over images, and each image."""
+
+    images: tuple[Quality, ...]
+
+    @property
+    def values(self) -> dict[str, float]:
+        """Mean over the images, by metric."""
+        return {name: float(np.mean([image.values[name] for image in self.images])) for name in self.images[0].values}
+
+    @property
+    def text(self) -> str:
+        """A line."""
+        means = ", ".join(f"{METRICS[name].label} {value:.{METRICS[name].digits}f}" for name, value in self.values.items())
+        worst = min(self.images, key=lambda image: image.values.get("psnr", np.inf))
+        return f"{len(self.images)} images: {means} (worst PSNR: {worst.name})"
+
+
+@dataclass(frozen=True)
+class Metric:
+    """A distance of two quantised images (H, W, 3): its function, how it is called and to how many digits it is told."""
+
+    measure: Callable[[np.ndarray, np.ndarray], float]
+    label: str
+    digits: int
+
+
+def flip(image: np.ndarray, truth: np.ndarray) -> float:
+    """Mean FLIP of two sRGB images in 0..1 (H, W, 3), at 67 pixels per degree; 0 for equal images.
+
+    Raises:
+        MivolError: flip-evaluator is not installed.
+    """
+    try:
+        from flip_evaluator import evaluate
+    except ImportError:
+        raise MivolError('FLIP needs flip-evaluator, which is not installed; pip install "mivol[metrics]".') from None
+    pair = [np.ascontiguousarray(values, np.float32) for values in (truth, image)]
+    return float(evaluate(*pair, "LDR", applyMagma=False, parameters={})[1])
+
+
+#: name -> metric. PSNR costs nothing, SSIM 0.2 s and FLIP 1 s for an image of 800 x 800 pixels.
+METRICS: dict[str, Metric] = {
+    "psnr": Metric(lambda image, truth: psnr(image, truth, 1.0), "PSNR [dB]", 2),
+    "ssim": Metric(lambda image, truth: ssim(image, truth, 1.0), "SSIM", 4),
+    "flip": Metric(flip, "FLIP", 4),
+}
+
+
+def quantised(image: np.ndarray, space: str = "srgb") -> np.ndarray:
+    """An image as a screen of 8 bits shows it, in sRGB values: multiples of 1/255, float64.
+
+    Args:
+        image: (H, W, 3).
+        space: "srgb" or "linear", what its values are.
+
+    Raises:
+        MivolError: another shape or space, or NaN.
+    """
+    values = np.asarray(image, np.float64)
+    if values.ndim != 3 or values.shape[2] != 3 or values.size == 0:
+        raise MivolError(f"an image of shape {values.shape} cannot be judged; give (height, width, 3).")
+    if (space, "srgb") not in SPACES:
+        raise MivolError(f'the values of an image are "srgb" or "linear", found "{space}"; choose one of those.')
+    if np.isnan(values).any():
+        row, column = (int(i) for i in np.argwhere(np.isnan(values))[0][:2])
+        raise MivolError(f"an image holds NaN at row {row}, column {column}; find its cause.")
+    return np.round(np.clip(SPACES[space, "srgb"](values), 0, 1) * 255) / 255
+
+
+def judge(
+    image: np.ndarray,
+    truth: np.ndarray,
+    *,
+    space: str = "srgb",
+    mask: np.ndarray | None = None,
+    metrics: Sequence[str] = ("psnr",),
+    name: str = "image",
+) -> Quality:
+    """Compare a render with its photograph by the protocol of this module.
+
+    Args:
+        image: (H, W, 3).
+        truth: (H, W, 3).
+        space: what the values of both are.
+        mask: (H, W) bool, False where a pixel does not count; None: all count.
+        metrics: keys of ``METRICS``.
+        name: of the image.
+
+    Raises:
+        MivolError: shapes that differ, an unknown metric, a metric that is not installed, NaN, a mask that leaves nothing.
+    """
+    unknown = next((metric for metric in metrics if metric not in METRICS), None)
+    if unknown is not None:
+        raise MivolError(f'there is no metric "{unknown}"; choose among {", ".join(METRICS)}.')
+    if np.shape(image) != np.shape(truth):
+        raise MivolError(f"{name} has shape {np.shape(image)} and its photograph {np.shape(truth)}; render it at that size.")
+    shown, wanted = quantised(image, space), quantised(truth, space)
+    if mask is None:
+        return Quality(name, {metric: METRICS[metric].measure(shown, wanted) for metric in metrics})
+    if np.shape(mask) != shown.shape[:2] or not np.any(mask):
+        raise MivolError(f"the mask of {name} has shape {np.shape(mask)} or leaves no pixel; give one of {shown.shape[:2]}.")
+    filled = np.where(np.asarray(mask, bool)[..., None], shown, wanted)
+    # The error of the pixels that are left out is 0; PSNR is that of the others.
+    counted = -10 * np.log10(np.size(mask) / np.count_nonzero(mask))
+    return Quality(name, {m: METRICS[m].measure(filled, wanted) + counted * (m == "psnr") for m in metrics})
+
+
+def score(images: Iterable[Quality]) -> Score:
+    """The score of a set of images.
+
+    Raises:
+        MivolError: there is none.
+    """
+    found = tuple(images)
+    if not found:
+        raise MivolError("there is no image to judge; hold some out.")
+    return Score(found)
