@@ -19,6 +19,7 @@ from mivol.photos.dataset import (
     load_photos,
     survey_photos,
 )
+from mivol.photos.journey import between, facing, turntable
 from mivol.photos.lens import Lens, distort, undistort
 from mivol.photos.rectify import pinhole_of, rectified
 from mivol.photos.silhouette import silhouette_box
@@ -34,8 +35,10 @@ __all__ = [
     "Photo",
     "Photos",
     "Survey",
+    "between",
     "directions",
     "distort",
+    "facing",
     "find_format",
     "intrinsics",
     "load_photos",
@@ -46,6 +49,7 @@ __all__ = [
     "rectified",
     "silhouette_box",
     "survey_photos",
+    "turntable",
     "undistort",
     "write_transforms",
 ]
