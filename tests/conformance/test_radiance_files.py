@@ -1,0 +1,129 @@
+"""Radiance fields on disk: ours, svox2's, and what is refused."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mivol.errors import MivolError
+from mivol.fields.spherical import SphericalGrid, degree_of, load_field, save_field
+
+CUBE = np.array([[2.0, 0, 0, -1], [0, 2, 0, -1], [0, 0, 2, -1], [0, 0, 0, 1]])
+
+
+def arrays(res=(3, 4, 5), basis=9):
+    rng = np.random.default_rng(0)
+    return rng.normal(size=res).astype(np.float32), rng.normal(size=(*res, basis, 3)).astype(np.float32)
+
+
+@pytest.mark.parametrize("sparse", [False, True])
+def test_what_was_saved_is_read(variant_rgb: str, tmp_path: Path, sparse: bool) -> None:
+    density, sh = arrays()
+    keep = density > 0 if sparse else None
+    field = SphericalGrid.from_dense(density, sh, CUBE, keep, "softplus" if sparse else "relu", 0.25, not sparse)
+    save_field(tmp_path / "f.npz", field)
+    back = load_field(tmp_path / "f.npz")
+    assert (back.res, back.degree, back.activation, back.offset, back.clamp) == (
+        field.res, 2, field.activation, 0.25, not sparse,
+    )  # fmt: skip
+    assert np.array_equal(back.to_world, CUBE) and np.array_equal(back.listed(), field.listed())
+    for a, b in zip(back.values(), field.values(), strict=True):
+        np.testing.assert_allclose(a, b, rtol=2.0**-11, atol=1e-7)  # the rounding of half floats
+
+
+def test_values_that_half_floats_cannot_hold_stay(variant_rgb: str, tmp_path: Path) -> None:
+    density, sh = arrays()
+    density[0, 0, 0] = 1e6
+    save_field(tmp_path / "f.npz", SphericalGrid.from_dense(density, sh, CUBE))
+    assert np.array_equal(load_field(tmp_path / "f.npz").values()[0], density.reshape(-1))
+
+
+def test_a_checkpoint_of_svox2(variant_rgb: str, tmp_path: Path) -> None:
+    """Axes X Y Z, rows in any order, harmonics by channel, a box by centre and radius."""
+    rng = np.random.default_rng(1)
+    links = -rng.integers(1, 4, (4, 3, 2)).astype(np.int32)
+    links[1, 2, 0], links[3, 0, 1] = 1, 0
+    sh = np.zeros((2, 3, 4), np.float16)
+    sh[1, 0, 0], sh[0, 2, 3] = 1.0, -2.0
+    np.savez(
+        tmp_path / "ckpt.npz",
+        links=links,
+        density_data=np.float32([[7.0], [5.0]]),
+        sh_data=sh.reshape(2, 12),
+        radius=np.float32([1.0, 0.5, 0.25]),
+        center=np.float32([0, 1, 2]),
+        basis_type=1,
+    )
+    field = load_field(tmp_path / "ckpt.npz")
+    assert field.res == (2, 3, 4) and field.degree == 1 and field.rows == 3
+    # Nodes (x, y, z) = (1, 2, 0) and (3, 0, 1): centres of voxels of the box -1..1, 0.5..1.5, 1.75..2.25.
+    p = mi.Point3f([-0.25, 0.75], [1 + 1 / 3, 1 - 1 / 3], [1.875, 2.125])
+    d = mi.Vector3f([0.0, 1.0], [0.0, 0.0], [1.0, 0.0])
+    sigma, colour = field.eval(p, d)
+    np.testing.assert_allclose(sigma, [5, 7], rtol=1e-5)
+    np.testing.assert_allclose(np.array(colour)[0], [0.5 + 0.28209479, 0.5], rtol=1e-5)
+    np.testing.assert_allclose(np.array(colour)[2], [0.5, 0.5 + 2 * 0.48860251], rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"basis_type": np.array(4)}, "basis type"),
+        ({"background_data": np.zeros((1, 4))}, "background"),
+        ({"radius": None}, "radius"),
+        ({"sh_data": np.zeros((1, 11), np.float16)}, "do not fit"),
+    ],
+)
+def test_checkpoints_that_are_refused(variant_rgb: str, tmp_path: Path, change: dict, said: str) -> None:
+    good = {
+        "links": np.zeros((1, 1, 1), np.int32),
+        "density_data": np.ones((1, 1)),
+        "sh_data": np.zeros((1, 12)),
+        "radius": np.ones(3),
+        "center": np.zeros(3),
+    }
+    np.savez(tmp_path / "c.npz", **{k: v for k, v in (good | change).items() if v is not None})
+    with pytest.raises(MivolError, match=said):
+        load_field(tmp_path / "c.npz")
+
+
+def test_files_that_are_refused(variant_rgb: str, tmp_path: Path) -> None:
+    np.savez(tmp_path / "other.npz", a=np.zeros(3))
+    (tmp_path / "torn.npz").write_bytes(b"PK\x03\x04 and no more")
+    for name, said in (("none.npz", "found no file"), ("other.npz", "holds a;"), ("torn.npz", "not a whole")):
+        with pytest.raises(MivolError, match=said):
+            load_field(tmp_path / name)
+    with pytest.raises(MivolError, match="ending in .npz"):
+        save_field(tmp_path / "f.vol", SphericalGrid.from_dense(*arrays(), CUBE))
+
+
+def test_fields_that_are_refused(variant_rgb: str) -> None:
+    density, sh = arrays()
+    bad = density.copy()
+    bad[1, 0, 0] = np.nan
+    for change, said in (
+        ({"density": bad}, "node 20"),
+        ({"sh": sh[..., :5, :]}, "5 harmonics"),
+        ({"sh": sh[:2]}, "are expected"),
+        ({"activation": "none"}, "none may be negative"),
+        ({"activation": "sigmoid"}, "'sigmoid'"),
+        ({"to_world": np.zeros((4, 4))}, "to_world"),
+    ):
+        with pytest.raises(MivolError, match=said):
+            SphericalGrid.from_dense(**({"density": density, "sh": sh, "to_world": CUBE} | change))
+    assert [degree_of(n) for n in (1, 4, 9, 16, 25)] == [0, 1, 2, 3, 4]
+
+
+def test_degrees_and_sparse_copies(variant_rgb: str) -> None:
+    density, sh = arrays(basis=4)
+    field = SphericalGrid.from_dense(density, sh, CUBE)
+    up = field.with_degree(2).values()[1]
+    assert np.array_equal(up[:, :4], sh.reshape(-1, 4, 3)) and (up[:, 4:] == 0).all()
+    assert np.array_equal(field.with_degree(0).values()[1], sh.reshape(-1, 4, 3)[:, :1])
+    sparse = field.sparse(density > 0)
+    back = sparse.to_dense()
+    assert np.array_equal(back[0], np.where(density > 0, density, 0))
+    assert np.array_equal(sparse.sparse(density > 1).listed(), np.flatnonzero(density > 1))
