@@ -198,7 +198,10 @@ class Settings:
         if model not in MODELS or other:
             found = f"camera_model {model}" if model not in MODELS else f"{other} = {self.values[other]}"
             raise refusal(self.name, found, f"one of {', '.join(MODELS)}", "undistort the images first")
-        return Lens(**{key: self.number(key) for key in Lens.__dataclass_fields__}) if MODELS[model] else Lens()
+        lens = Lens(**{key: self.number(key) for key in Lens.__dataclass_fields__})
+        if lens and not MODELS[model]:
+            raise refusal(self.name, f"a {model} with distortion", "OPENCV, or no distortion", "correct camera_model")
+        return lens
 
     def matrix(self) -> np.ndarray:
         """``transform_matrix`` as it stands.

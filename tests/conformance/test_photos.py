@@ -292,6 +292,7 @@ def test_written_cameras_are_read_the_same(tmp_path: Path) -> None:
     [
         ({"camera_model": "OPENCV_FISHEYE"}, "found camera_model OPENCV_FISHEYE, expected one of OPENCV"),
         ({"is_fisheye": True}, "found is_fisheye"),
+        ({"camera_model": "PINHOLE", "k1": 0.1}, "a PINHOLE with distortion"),
         ({"k1": float("nan")}, "distortion"),
         ({"fl_x": "long"}, "fl_x = 'long'"),
         ({"fl_x": 0}, "focal lengths 0"),
@@ -444,6 +445,11 @@ def test_colmap_text_that_is_wrong(tmp_path: Path, file: str, old: str, new: str
     path.write_text(path.read_text().replace(old, new))
     with pytest.raises(MivolError, match=message):
         load_photos(folder)
+
+
+def test_colmap_by_the_folder_of_its_model(tmp_path: Path) -> None:
+    folder = write_colmap(tmp_path / "set")
+    assert len(load_photos(folder / "sparse" / "0").views) == len(load_photos(folder).views) == 4
 
 
 def test_colmap_masks_and_wrong_size(tmp_path: Path) -> None:
