@@ -76,6 +76,7 @@ class SphericalGrid:
         activation: name in ``ACTIVATIONS``.
         offset: added to the sum of the harmonics.
         clamp: whether colours below 0 are shown as 0.
+        links: the row of each node, once :meth:`node_rows` has made it.
     """
 
     res: tuple[int, int, int]
@@ -87,6 +88,7 @@ class SphericalGrid:
     activation: str = "relu"
     offset: float = 0.5
     clamp: bool = True
+    links: mi.UInt32 | None = None
 
     def __post_init__(self) -> None:
         self.to_world = check_affine(self.to_world)
@@ -226,13 +228,14 @@ class SphericalGrid:
         return np.arange(math.prod(self.res)) if self.nodes is None else np.array(self.nodes).astype(np.int64)
 
     def node_rows(self) -> mi.UInt32:
-        """The row of each node of the grid, flat."""
-        every = dr.arange(mi.UInt32, math.prod(self.res))
-        if self.nodes is None:
-            return every
-        rows = dr.full(mi.UInt32, self.rows - 1, math.prod(self.res))
-        dr.scatter(rows, dr.arange(mi.UInt32, self.rows - 1), self.nodes)
-        return rows
+        """The row of each node of the grid, flat; made once (not inside a loop that is being traced)."""
+        if self.links is None:
+            self.links = dr.arange(mi.UInt32, math.prod(self.res))
+            if self.nodes is not None:
+                self.links = dr.full(mi.UInt32, self.rows - 1, math.prod(self.res))
+                dr.scatter(self.links, dr.arange(mi.UInt32, self.rows - 1), self.nodes)
+            dr.eval(self.links)
+        return self.links
 
     # -- Where it lies -----------------------------------------------------------------------------------------------------
 

@@ -16,7 +16,8 @@ class MivolMedium(mi.Medium):
         sigma_a, sigma_s: absorption and scattering [1/length]; each a float, rgb (above 1 allowed) or a volume.
         scale: factor on the extinction, differentiable. Default 1.
         emission: radiance Le that the medium shows where nothing is seen through it (its source function is
-            (1 - albedo) Le), a float, rgb or a volume. Default none.
+            (1 - albedo) Le), a float, rgb or a volume. A ``mivol_sh`` brings its own extinction: give nothing else with it.
+            Default none.
         emission_density: radiance per length that does not go with the extinction, likewise. Default none.
         a phase function: default isotropic.
     """
@@ -48,7 +49,8 @@ class MivolMedium(mi.Medium):
         return self.coefficients.eval(mei, self.scale, self.majorant, active)
 
     def traverse(self, callback: mi.TraversalCallback) -> None:
-        callback.put("scale", self.scale, mi.ParamFlags.Differentiable)
+        if not self.coefficients.is_field:
+            callback.put("scale", self.scale, mi.ParamFlags.Differentiable)
         for name, volume in self.volumes.items():
             callback.put(name, volume, mi.ParamFlags.Differentiable)
         super().traverse(callback)

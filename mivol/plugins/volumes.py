@@ -1,10 +1,13 @@
-"""<volume type="mivol_voxels">: a dense grid, for our media and for stock ones."""
+"""<volume type="mivol_voxels">: a dense grid, for our media and for stock ones; <volume type="mivol_sh">: a radiance field."""
 
 from __future__ import annotations
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mivol.fields.spherical import SphericalGrid
+from mivol.fields.spherical_tensors import dense_density, field_from_props, with_tensors
 from mivol.fields.voxels import Voxels
 
 
@@ -61,5 +64,81 @@ class VoxelVolume(mi.Volume):
         return repr(self.field)
 
 
+class SphericalVolume(mi.Volume):
+    """``<volume type="mivol_sh">``: density, and colour that depends on the direction, as a medium's ``emission``.
+
+    Parameters:
+        filename: a field that ``mivol`` or svox2 wrote (.npz), or
+        density, sh: tensors (Z, Y, X, 1) and (Z, Y, X, basis, 3), 1 to 25 harmonics in the order of ``dr.sh_eval``.
+        to_world: places the unit cube (over the place that a file names, if it names one).
+        activation: none, relu, softplus or exp, of the interpolated density. Default relu, or the file's.
+        offset: added to colours. Default 0.5, or the file's.
+        clamp: show colours below 0 as 0. Default true, or the file's.
+
+    ``density`` and ``sh`` are its parameters; a sparse field has them as (nodes, 1) and (nodes, basis, 3).
+    """
+
+    def __init__(self, props: mi.Properties) -> None:
+        own, self.density, self.sh = field_from_props(props)
+        self.mivol_field: SphericalGrid = own
+        self.refresh()
+        props["to_world"] = mi.ScalarTransform4f(own.to_world)
+        super().__init__(props)
+
+    def refresh(self) -> None:
+        self.mivol_field = with_tensors(self.mivol_field, self.density, self.sh)
+        self.dense = dense_density(self.mivol_field)
+        self.seen = self.state()
+
+    def state(self) -> tuple[int, ...]:
+        """Which arrays the parameters hold, and whether their derivatives are followed."""
+        return tuple(k for t in (self.density, self.sh) for k in (t.array.index, t.array.index_ad))
+
+    @property
+    def mivol_density(self) -> mi.TensorXf:
+        if self.seen != self.state():  # derivatives may be asked for without an update
+            self.refresh()
+        return self.dense
+
+    @property
+    def mivol_to_world(self) -> np.ndarray:
+        return self.mivol_field.to_world
+
+    def eval(self, it: mi.Interaction3f, active: mi.Bool = True) -> mi.Spectrum:
+        colour = self.mivol_field.eval(it.p, -_towards(it), active)[1]
+        return mi.Spectrum(mi.luminance(colour)) if mi.is_monochromatic else mi.Spectrum(colour)
+
+    def eval_1(self, it: mi.Interaction3f, active: mi.Bool = True) -> mi.Float:
+        return self.mivol_field.eval(it.p, -_towards(it), active)[0]
+
+    def eval_3(self, it: mi.Interaction3f, active: mi.Bool = True) -> mi.Vector3f:
+        return mi.Vector3f(self.mivol_field.eval(it.p, -_towards(it), active)[1])
+
+    def resolution(self) -> mi.ScalarVector3i:
+        return mi.ScalarVector3i(self.mivol_field.res[::-1])
+
+    def channel_count(self) -> int:
+        return 3
+
+    def traverse(self, callback: mi.TraversalCallback) -> None:
+        callback.put("density", self.density, mi.ParamFlags.Differentiable)
+        callback.put("sh", self.sh, mi.ParamFlags.Differentiable)
+
+    def parameters_changed(self, keys: list[str]) -> None:
+        self.refresh()
+
+    def to_string(self) -> str:
+        f = self.mivol_field
+        z, y, x = f.res
+        return f"mivol_sh[{x}x{y}x{z}, degree {f.degree}, {f.rows} rows, {f.activation}]"
+
+
+def _towards(it: mi.Interaction3f) -> mi.Vector3f:
+    """The direction to the eye; up where an interaction has none."""
+    wi = getattr(it, "wi", mi.Vector3f(0, 0, 1))
+    return dr.select(dr.squared_norm(wi) > 0, wi, mi.Vector3f(0, 0, 1))
+
+
 # Mitsuba has no register_volume; a volume registered as a texture is found by <volume>. tests/conformance guards this.
 mi.register_texture("mivol_voxels", VoxelVolume)
+mi.register_texture("mivol_sh", SphericalVolume)

@@ -39,6 +39,8 @@ class Coefficients:
             MivolError: both pairs, half of a pair, or a negative number.
         """
         given = [n for pair in PAIRS for n in pair if n in props]
+        if is_radiance_field(props.get("emission", 0.0)):
+            return cls._of_field(props, given)
         pair = next((p for p in PAIRS if set(given) <= set(p)), None)
         if pair is None or not given or given == ["albedo"]:
             raise MivolError(
@@ -49,6 +51,22 @@ class Coefficients:
             {name: _volume(props, name) for name in pair},
             {name: _volume(props, name) for name in ("emission", "emission_density") if name in props},
         )
+
+    @classmethod
+    def _of_field(cls, props: mi.Properties, given: list[str]) -> Coefficients:
+        """A medium that is a radiance field, which has an extinction of its own."""
+        extra = [*given, *(n for n in ("scale", "emission_density") if n in props)]
+        if extra:
+            raise MivolError(
+                f"mivol_medium was given {' and '.join(extra)} beside a mivol_sh, which brings its own extinction; take "
+                f"{'it' if len(extra) == 1 else 'them'} out."
+            )
+        return cls({}, {"emission": props["emission"]})
+
+    @property
+    def is_field(self) -> bool:
+        """Whether the medium is a radiance field."""
+        return not self.volumes
 
     @property
     def extinction(self) -> list[mi.Volume]:
@@ -77,6 +95,7 @@ class Coefficients:
 
     def reach(self, ray: mi.Ray3f) -> tuple[mi.Bool, mi.Float, mi.Float]:
         """Whether and where a ray can meet extinction: in the boxes of the grids, or anywhere where a part is constant."""
+        self._refuse_light()
         if any(_is_constant(v) for v in self.extinction):
             return mi.Bool(True), mi.Float(0), mi.Float(dr.inf)
         boxes = [volume.bbox() for volume in self.extinction]
@@ -95,11 +114,7 @@ class Coefficients:
         Raises:
             MivolError: the medium emits, and no integrator of Mitsuba's asks for its light.
         """
-        if self.lights:
-            raise MivolError(
-                f"a mivol_medium with {' and '.join(self.lights)} was given to an integrator of Mitsuba's, which would leave "
-                "that light out; render it with the integrator mivol, or take the emission out."
-            )
+        self._refuse_light()
         first, second = (_eval(v, mei, active) for v in self.volumes.values())
         sigma_t, sigma_s = (first, first * second) if "sigma_t" in self.volumes else (first + second, second)
         # The majorant was rounded, and is compared with a sum rounded otherwise: a null coefficient below 0 would be a
@@ -107,9 +122,21 @@ class Coefficients:
         sigma_n = dr.maximum(scale * (majorant - sigma_t), 0)
         return scale * sigma_s, sigma_n, scale * sigma_t
 
+    def _refuse_light(self) -> None:
+        if self.lights:
+            raise MivolError(
+                f"a mivol_medium with {' and '.join(self.lights)} was given to an integrator of Mitsuba's, which would leave "
+                "that light out; render it with the integrator mivol, or take the emission out."
+            )
+
     def __repr__(self) -> str:
         fields = {**self.volumes, **self.lights}
         return "mivol_medium[" + ", ".join(f"{n}={v.class_name()}" for n, v in fields.items()) + "]"
+
+
+def is_radiance_field(value: object) -> bool:
+    """Whether a volume is a field of density and colour."""
+    return hasattr(value, "mivol_field")
 
 
 def _volume(props: mi.Properties, name: str) -> mi.Volume:

@@ -18,7 +18,7 @@ from mivol.files import check_volume
 from mivol.scene.load import check_variant
 from mivol.transport.direct import UNIFORM
 from mivol.transport.lattice import block_bounds
-from mivol.transport.medium import Box, MediumView, box_of_cube, kind_of, view_medium
+from mivol.transport.medium import Box, MediumView, Part, box_of_cube, kind_of, view_medium
 
 __all__ = ["Boundary", "MediumFacts", "Needs", "find_needs", "is_scattering"]
 
@@ -212,17 +212,22 @@ class _Read:
     maximum: float
 
 
-def read_values(values: mi.TensorXf, survey: Survey, name: str) -> _Read:
-    """Read a grid's bounds once for each state of its array.
+def read_part(part: Part, survey: Survey, name: str) -> _Read:
+    """Read the bounds of a part of an extinction once for each state of its array.
 
     Raises:
         MivolError: NaN, infinite or negative values; the first bad voxel is named.
     """
+    values, activation = part.lattice.values, part.activation
     array = dr.detach(values.array)
     key = array.index
     if key not in survey.values:
+        if activation is not None:
+            # Nothing is below an empty value; an extinction rises with what is stored.
+            empty = activation.empty_below
+            values = mi.TensorXf(dr.maximum(array, empty) if empty is not None else dr.abs(array) + 1, values.shape)
         bounds = block_bounds(values)
-        if not (dr.all(dr.isfinite(bounds)) and dr.all(array >= 0)):
+        if activation is None and not (dr.all(dr.isfinite(bounds)) and dr.all(array >= 0)):
             check_volume(np.array(dr.detach(values)), name=name)
         survey.values = dict(list(survey.values.items())[-15:])
         host = np.array(bounds)
@@ -272,7 +277,7 @@ def _facts(boundary: Boundary, view: MediumView, survey: Survey, recording: bool
         # What it was when it was last read; a medium that was never read may scatter.
         known = survey.scatters.get(boundary.name, True)
         return MediumFacts(**common, is_scattering=known, occupied=1.0, tau_max=None, unread=True)
-    reads = [read_values(g.values, survey, boundary.name) for g in grids]
+    reads = [read_part(p, survey, boundary.name) for p in view.parts if p.lattice is not None]
     occupied = min((r.occupied for r in reads), default=1.0)
     scatters = survey.scatters[boundary.name] = is_scattering(view, survey, boundary.name)
     return MediumFacts(**common, is_scattering=scatters, occupied=occupied, tau_max=_tau_max(boundary, view, reads))

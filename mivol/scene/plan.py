@@ -17,7 +17,7 @@ from mivol.errors import MivolError
 from mivol.machine import available_memory
 from mivol.scene.depth_two import depth_two_error, mean_albedo, mean_cosine, scattering_depth
 from mivol.scene.load import find_sensor
-from mivol.scene.needs import Needs, Survey, find_needs, read_values, survey_scene
+from mivol.scene.needs import Needs, Survey, find_needs, read_part, survey_scene
 from mivol.transport.aovs import AOVS
 from mivol.transport.direct import Lights
 from mivol.transport.light_grid import find_light_grid, measure_bias
@@ -250,7 +250,7 @@ def build_world(scene: mi.Scene, needs: Needs, plan: Plan, settings: Settings, s
     for boundary, view, skip in zip(needs.boundaries, needs.views, plan.skips, strict=True):
         for part in view.parts:
             if skip and part.lattice is not None:
-                part.lattice.bounds = read_values(part.lattice.values, survey, boundary.name).bounds
+                part.lattice.bounds = read_part(part, survey, boundary.name).bounds
         bodies.append(Body(view, boundary.box))
     return World(
         bodies,

@@ -170,6 +170,12 @@ class _Stretch:
         points = [self.rows([row[p] for row in values]) for p in range(len(self.rule.points))]
         return [list(row) for row in zip(*points, strict=True)]
 
+    def changes(self, cell: Cell) -> list[list[mi.Float]]:
+        """[row][point] tangents of the extinction."""
+        values = self.along(self.change, cell.corners[len(self.field.reads) :], cell)
+        turns = self.field.slopes(cell.corners, self.points(cell))
+        return values if turns is None else [[v * turn for v, turn in zip(row, turns, strict=True)] for row in values]
+
     def rows(self, channels: list[mi.Float]) -> list[mi.Float]:
         """Numbers for each channel of a body, for each row of the rule."""
         channels = self.world.rows(channels)
@@ -191,7 +197,7 @@ def _open(
     world: World, rule: Rule, body: Body, ray: mi.Ray3f, t0: mi.Float, t1: mi.Float, active: mi.Bool, tangent: bool
 ) -> _Stretch:
     field = body.extinction(ray)
-    change = SumField(body.view.parts, body.tangents, mi.Float(1)) if tangent else None
+    change = SumField(body.view.parts, body.tangents, mi.Float(1), linear=True) if tangent else None
     return _Stretch(world, rule, body, ray, _lay(body, ray, t0, t1), field, change, active)
 
 
@@ -223,7 +229,7 @@ def _measure(stretch: _Stretch, skip: bool) -> _Moment:
         site, sigma, stops = stretch.cell(cell, on)
         if not tangent:
             return _put_in_front(moment, stops, [], [])
-        changes = stretch.along(stretch.change, cell.corners[len(stretch.field.reads) :], cell)
+        changes = stretch.changes(cell)
         return _put_in_front(moment, stops, changes, rule.push(site, sigma))
 
     if stretch.has_constants and lay.lattice is not None:
@@ -282,7 +288,11 @@ def _backproject(
         site, sigma, stops = stretch.cell(cell, on)
         pull, slopes, weights = _pull_through(pull, stops, weight, behind)
         rule.pull(site, sigma, weights)
-        corners = [node_weights(p, cell, lay.lattice.res) for p in stretch.points(cell)]
+        points = stretch.points(cell)
+        corners = [node_weights(p, cell, lay.lattice.res) for p in points]
+        turns = stretch.field.slopes(cell.corners, points)
+        if turns is not None:
+            slopes = [[g * turn for g, turn in zip(row, turns, strict=True)] for row in slopes]
         by_point = [stretch.world.sums([row[p] for row in slopes]) for p in range(len(corners))]
         for part in grids:
             body.add_to_grid(part, cell.lower, list(zip(by_point, corners, strict=True)), on)

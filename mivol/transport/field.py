@@ -11,6 +11,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mivol.fields.activation import Activation
 from mivol.transport.lattice import Lattice, Nodes
 from mivol.transport.medium import Part
 from mivol.transport.optical_depth import interpolate
@@ -25,11 +26,13 @@ class SumField:
         parts: grids among them share their cells.
         values: node values or constant of each part.
         scale: factor on the sum.
+        linear: whether the values are changes of the parts', which no activation turns.
     """
 
-    def __init__(self, parts: list[Part], values: list, scale: mi.Float) -> None:
+    def __init__(self, parts: list[Part], values: list, scale: mi.Float, linear: bool = False) -> None:
         self.channels, self.scale = max(p.channels for p in parts), scale
         pairs = list(zip(parts, values, strict=True))
+        self.activations = [None if linear else p.activation for p, _ in pairs if p.lattice is not None]
         self.reads = [Nodes(v, p.channels) for p, v in pairs if p.lattice is not None]
         self.has_constants = len(self.reads) < len(parts)
         constants = [_as_channels(v, p.channels) for p, v in pairs if p.lattice is None]
@@ -37,15 +40,29 @@ class SumField:
 
     def along(self, corners: list, points: list[mi.Vector3f]) -> list[list[mi.Float]]:
         """[channel][point] values at points of a cell (fractions from its near planes), from [read][channel][corner]."""
-        grids = [[[interpolate(g[c % len(g)], p) for g in corners] for p in points] for c in range(self.channels)]
+        pairs = list(zip(corners, self.activations, strict=False))
+        grids = [
+            [[_activate(a, interpolate(g[c % len(g)], p)) for g, a in pairs] for p in points] for c in range(self.channels)
+        ]
         return [
             [dr.fma(self.scale, sum(s, mi.Float(0)), k) for s in sums] for sums, k in zip(grids, self.constant, strict=True)
         ]
 
 
+    def slopes(self, corners: list, points: list[mi.Vector3f]) -> list[mi.Float] | None:
+        """What the activation of a radiance field, which is alone in its medium, makes of a change at each point."""
+        if not any(self.activations):
+            return None
+        return [self.activations[0].value_and_slope(interpolate(corners[0][0], p))[1] for p in points]
+
+
 def share_cells(a: Lattice, b: Lattice) -> bool:
     """Whether two grids have the same resolution and place."""
     return a.res == b.res and np.array_equal(a.to_world, b.to_world)
+
+
+def _activate(activation: Activation | None, value: mi.Float) -> mi.Float:
+    return value if activation is None else activation.value_and_slope(value)[0]
 
 
 def _as_channels(value: mi.Float | mi.Color3f, channels: int) -> list[mi.Float]:

@@ -21,6 +21,7 @@ import mitsuba as mi
 import numpy as np
 
 from mivol.errors import MivolError
+from mivol.fields.activation import Activation
 from mivol.transport.lattice import Lattice
 
 __all__ = ["Box", "MediumView", "Part", "box_of_cube", "view_medium"]
@@ -36,11 +37,13 @@ class Part:
         name: ``sigma_t``, ``sigma_a`` or ``sigma_s``.
         constant: its value [1/length], ``Float`` or ``Color3f``; None for a grid.
         lattice: the grid [1/length]; None for a constant.
+        activation: what makes an extinction of an interpolated value of the grid, in a radiance field; None elsewhere.
     """
 
     name: str
     constant: mi.Float | mi.Color3f | None = None
     lattice: Lattice | None = None
+    activation: Activation | None = None
 
     @property
     def channels(self) -> int:
@@ -151,8 +154,11 @@ def view_medium(medium: mi.Medium, boundary: Box | None = None, places: dict | N
     albedo = [v for k, v in params if k.startswith("sigma_s." if "sigma_s" in names else "albedo.")]
     share = _field(params, "albedo") if "sigma_s" not in names else None
     source, glow = _field(params, "emission"), _field(params, "emission_density")
+    if not parts:
+        parts, share = [_part_of_field(source)], mi.Float(0)
     frame = _frame([source, glow], boundary, places)
-    return MediumView(medium, parts, mi.Float(params["scale"]), albedo, share, _flakes(medium), source, glow, frame)
+    scale = mi.Float(params["scale"]) if "scale" in params.properties else mi.Float(1)
+    return MediumView(medium, parts, scale, albedo, share, _flakes(medium), source, glow, frame)
 
 
 def _flakes(medium: mi.Medium) -> list[mi.Float] | None:
@@ -183,6 +189,12 @@ def _field(params: mi.SceneParameters, name: str) -> mi.Volume | mi.Float | mi.C
         return params[f"{name}.value.value"]
     key = next((k for k in params.properties if k.startswith(name + ".")), None)
     return None if key is None else params.properties[key][2]
+
+
+def _part_of_field(volume: mi.Volume) -> Part:
+    """The extinction of a radiance field, which brings its own."""
+    lattice = Lattice(volume.mivol_density, volume.mivol_to_world)
+    return Part("sigma_t", lattice=lattice, activation=volume.mivol_field.act)
 
 
 def _frame(fields: list, boundary: Box | None, places: dict) -> Lattice | None:

@@ -16,7 +16,16 @@ import mitsuba as mi
 from mivol.transport.field import SumField, share_cells
 from mivol.transport.lattice import box_nodes, clip, locate
 from mivol.transport.medium import Box, MediumView, Part
-from mivol.transport.optical_depth import Gradient, backproject_segment, integrate_segment, interpolate, upward_frac, weights
+from mivol.transport.optical_depth import (
+    Gradient,
+    backproject_activated,
+    backproject_segment,
+    integrate_activated,
+    integrate_segment,
+    interpolate,
+    upward_frac,
+    weights,
+)
 
 if TYPE_CHECKING:
     from mivol.transport.control import Control
@@ -102,7 +111,13 @@ class Body:
                 rows = [dr.select(v != 0, v * length, 0) for v in each]
             else:
                 lattice = part.lattice if skip else replace(part.lattice, bounds=None)
-                rows = integrate_segment(lattice, value, clip(lattice, ray.o, ray.d, t0, t1), active, enough)
+                segment = clip(lattice, ray.o, ray.d, t0, t1)
+                if part.activation is None:
+                    rows = integrate_segment(lattice, value, segment, active, enough)
+                else:
+                    tangent = None if skip else value
+                    values = dr.detach(_values(part))
+                    rows = integrate_activated(lattice, values, part.activation, segment, active, enough, tangent)
             total = [t + r for t, r in zip(total, as_rows(rows, channels), strict=True)]
         return total
 
@@ -115,24 +130,32 @@ class Body:
                 length = _length(t0, t1, active)
                 for c in range(part.channels):
                     dr.scatter_add(gradient, dr.select(w[c] != 0, w[c] * length, 0), mi.UInt32(c), active)
+                continue
+            segment = clip(part.lattice, ray.o, ray.d, t0, t1)
+            if part.activation is None:
+                backproject_segment(part.lattice, gradient, w, segment, active)
             else:
-                backproject_segment(part.lattice, gradient, w, clip(part.lattice, ray.o, ray.d, t0, t1), active)
-
+                values = dr.detach(_values(part))
+                backproject_activated(part.lattice, values, part.activation, gradient, w[0], segment, active)
 
     def extinction_at(self, ray: mi.Ray3f, t: mi.Float, channels: int, active: mi.Bool, name: str = "sigma_") -> list[mi.Float]:
         """Coefficient [1/length] of each channel at a point of a ray: of all parts, or of those called ``name``."""
         parts = [p for p in self.view.parts if p.name.startswith(name)]
-        return self._at(ray, t, channels, active, [(p, self.view.scale * _values(p)) for p in parts])
+        return self._at(ray, t, channels, active, [(p, self.view.scale * _values(p)) for p in parts], activated=True)
 
     def tangent_at(self, ray: mi.Ray3f, t: mi.Float, channels: int, active: mi.Bool, name: str = "sigma_") -> list[mi.Float]:
         """As :meth:`extinction_at`, of the tangent that :meth:`World.start_tangent` took from the parameters."""
         pairs = [(p, v) for p, v in zip(self.view.parts, self.tangents, strict=True) if p.name.startswith(name)]
         return self._at(ray, t, channels, active, pairs)
 
-    def _at(self, ray: mi.Ray3f, t: mi.Float, channels: int, active: mi.Bool, pairs: list[tuple]) -> list[mi.Float]:
+    def _at(
+        self, ray: mi.Ray3f, t: mi.Float, channels: int, active: mi.Bool, pairs: list[tuple], activated: bool = False
+    ) -> list[mi.Float]:
         total = [mi.Float(0) for _ in range(channels)]
         for part, value in pairs:
             rows = self.values_at(part, ray, t, active, dr.detach(value))
+            if activated and part.activation is not None:
+                rows = [part.activation.value_and_slope(row)[0] for row in rows]
             total = [a + b for a, b in zip(total, as_rows(rows, channels), strict=True)]
         return [self.area(ray.d) * t for t in total]
 

@@ -1,0 +1,196 @@
+"""<volume type="mivol_sh">: a radiance field in a scene, with surfaces, derivatives and files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mivol.fields.spherical import SphericalGrid, save_field
+from scenes import box_of, camera, centred, refused, render, rotation, sky, tensor, transform
+
+PLACE = centred(2 * np.eye(3))
+
+KEY = "box.interior_medium.emission"
+
+
+def values(seed: int = 0, res: tuple[int, int, int] = (5, 6, 7), basis: int = 4) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    density = rng.normal(1, 3, (*res, 1)).astype(np.float32)
+    return density, rng.normal(0, 0.3, (*res, basis, 3)).astype(np.float32)
+
+
+def field(place: np.ndarray = PLACE, seed: int = 0, **more: object) -> dict:
+    density, sh = values(seed)
+    volume = {"type": "mivol_sh", "density": tensor(density), "sh": tensor(sh), "to_world": transform(place), **more}
+    return box_of({"type": "mivol_medium", "emission": volume}, place)
+
+
+def scene(volume: dict, integrator: dict | None = None, **more: object) -> mi.Scene:
+    parts = {"sensor": camera([1.5, 1.8, 4], [0, 0, 0], 12, 45), "box": volume, "sky": sky(0.5)}
+    return mi.load_dict({"type": "scene", "integrator": integrator or {"type": "mivol"}, **parts, **more})
+
+
+def image(volume: dict, **more: object) -> np.ndarray:
+    return render(scene(volume, **more), {"type": "mivol"}, 4)
+
+
+def test_parameters_and_their_shapes(variant_rgb: None) -> None:
+    params = mi.traverse(scene(field()))
+    assert tuple(params[f"{KEY}.density"].shape) == (5, 6, 7, 1)
+    assert tuple(params[f"{KEY}.sh"].shape) == (5, 6, 7, 4, 3)
+    assert f"{KEY.rpartition('.')[0]}.scale" not in params
+
+
+def test_a_constant_colour_is_a_constant_source(variant_rgb: None) -> None:
+    """C = c (1 - T) + B T for any density: colour 0.5 + 0.282095 k of degree 0, whatever the activation."""
+    density, sh = values()
+    sh[:] = 0
+    sh[..., 0, :] = [1.0, -0.5, 0.2]
+    colour = 0.5 + 0.28209479 * sh[0, 0, 0, 0]
+    for activation in ("relu", "softplus", "exp"):
+        made = field(density=tensor(density), sh=tensor(sh), activation=activation)
+        shown = render(scene(made), {"type": "mivol", "aovs": "alpha"}, 4)
+        alpha = shown[..., -1:]
+        # Rounding alone: a ray sums some 20 cells, each with 4 roundings of 6e-8.
+        assert np.abs(shown[..., :3] - (colour * alpha + 0.5 * (1 - alpha))).max() < 5e-6
+        assert np.ptp(alpha) > 0.1
+
+
+@pytest.mark.parametrize("activation", ["none", "relu", pytest.param("softplus", marks=pytest.mark.slow), "exp"])
+def test_derivatives_against_differences(activation: str, variant_rgb: None) -> None:
+    """Reverse and forward, of both parameters, against central differences with the same samples, at depth 2 among surfaces."""
+    density, sh = values()
+    if activation == "none":
+        density = np.abs(density) + 0.1
+    ball = {"type": "sphere", "radius": 0.4, "bsdf": {"type": "diffuse"}}
+    made = field(density=tensor(density), sh=tensor(sh), activation=activation)
+    loaded = scene(made, {"type": "mivol", "max_depth": 2}, ball=ball)
+    params, integrator = mi.traverse(loaded), loaded.integrator()
+    rng = np.random.default_rng(3)
+    start = {name: np.array(params[f"{KEY}.{name}"]) for name in ("density", "sh")}
+    steps = {name: rng.normal(size=v.shape).astype(np.float32) for name, v in start.items()}
+    weight = rng.normal(size=(12, 12, 3)).astype(np.float32)
+
+    def put(name: str, t: float, tangent: bool | None = None) -> mi.TensorXf:
+        x = tensor(start[name] + np.float32(t) * steps[name])
+        if tangent is not None:
+            dr.enable_grad(x)
+        if tangent:
+            dr.set_grad(x, tensor(steps[name]))
+        params[f"{KEY}.{name}"] = x
+        return x
+
+    def shown(name: str, t: float) -> np.ndarray:
+        put(name, t)
+        params.update()
+        return np.array(mi.render(loaded, seed=1, spp=4), dtype=np.float64)
+
+    eps = 1e-3
+    expected, size = {}, {}
+    for name in start:
+        change = (shown(name, eps) - shown(name, -eps)) / (2 * eps)
+        expected[name], size[name] = float((change * weight).sum()), float(np.abs(change * weight).sum())
+        put(name, 0)
+
+    attached = {name: put(name, 0, False) for name in start}
+    params.update()
+    integrator.render_backward(loaded, params, tensor(weight), seed=1, spp=4)
+    reverse = {name: float((np.array(dr.grad(x)) * steps[name]).sum()) for name, x in attached.items()}
+    for name in start:
+        # A difference of float32 images: 6e-8 of a radiance near 1, over 2e-3, in each of 432 values, 1e-4 of their sum; and
+        # the cells in which a relu sets in between the two, a share of eps times the slope (0.3 a length in 1e-3): 3e-3.
+        assert abs(reverse[name] - expected[name]) < 4e-3 * size[name]
+
+    for name in start:
+        put(name, 0, True)
+    params.update()
+    forward = float((np.array(integrator.render_forward(loaded, params, seed=1, spp=4)) * weight).sum())
+    # The two modes do the same sums in another order.
+    assert abs(forward - sum(reverse.values())) < 1e-4 * sum(size.values())
+
+
+def test_turning_the_field_turns_its_look(variant_rgb: None) -> None:
+    """A camera that turns with the field sees the same picture: directions are in the field's own frame."""
+    turn = np.eye(4)
+    turn[:3, :3] = rotation([1, 2, 3], 0.8)
+    here = image(field())
+    there = {"sensor": camera(turn[:3, :3] @ [1.5, 1.8, 4], [0, 0, 0], 12, 45)}
+    there["sensor"]["to_world"] = transform(turn) @ camera([1.5, 1.8, 4], [0, 0, 0], 12, 45)["to_world"]
+    turned = image(field(turn @ PLACE), **there)
+    # Entry points round differently: 1e-6 of a voxel, where colours differ by about 1 from voxel to voxel.
+    assert np.abs(turned - here).max() < 2e-4
+    without = image(field(turn @ PLACE))
+    assert np.abs(without - here).max() > 0.05
+
+
+def test_a_surface_hides_what_is_behind_it_and_is_seen_through_the_field(variant_rgb: None) -> None:
+    wall = {
+        "type": "rectangle",
+        "to_world": mi.ScalarTransform4f().look_at([0, 0, 0], [1.5, 1.8, 4], [0, 1, 0]).scale(20),
+        "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0}},
+    }
+    loaded = scene(field(), wall=wall)
+    params = mi.traverse(loaded)
+    x = params[f"{KEY}.density"]
+    dr.enable_grad(x)
+    loaded.integrator().render_backward(loaded, params, dr.ones(mi.TensorXf, (12, 12, 3)), seed=0, spp=4)
+    hidden = np.array(dr.grad(x))[..., 0]
+    # Voxels further than a voxel's diagonal (0.6) behind the plane through the origin cannot be seen.
+    z, y, x = np.meshgrid(*((np.arange(n) + 0.5) / n * 2 - 1 for n in (5, 6, 7)), indexing="ij")
+    depth = (np.stack([x, y, z], -1) @ np.array([1.5, 1.8, 4])) / np.linalg.norm([1.5, 1.8, 4])
+    assert (hidden[depth < -0.7] == 0).all()
+    assert np.abs(hidden[depth > 0.2]).max() > 0
+
+
+def test_a_sparse_field_renders_as_the_dense_one(variant_rgb: None, tmp_path: Path) -> None:
+    """What is stored at all nodes that are not empty gives the same image; half floats move it by their 11 bits."""
+    density, sh = values()
+    density[:, :2], sh[:, :2] = 0, 0
+    keep = np.ones(density.shape[:3], bool)
+    keep[:, :2] = False
+    dense = SphericalGrid.from_dense(density, sh, PLACE)
+    for half, bound in ((False, 1e-6), (True, 5e-3)):
+        save_field(tmp_path / "field.npz", dense.sparse(keep), half=half)
+        volume = {"type": "mivol_sh", "filename": str(tmp_path / "field.npz")}
+        loaded = scene(box_of({"type": "mivol_medium", "emission": volume}, PLACE))
+        assert tuple(mi.traverse(loaded)[f"{KEY}.density"].shape) == (int(keep.sum()), 1)
+        packed = render(loaded, {"type": "mivol"}, 4)
+        whole = image(field(density=tensor(density), sh=tensor(sh)))
+        assert np.abs(packed - whole).max() < bound
+
+
+def test_a_mono_variant_shows_the_luminance(variant_rgb: None) -> None:
+    colours = image(field())
+    mi.set_variant("llvm_ad_mono")
+    grey = image(field())
+    # ITU-R BT.709, each with the rounding of a sum of 20 cells.
+    assert np.abs(grey[..., 0] - colours @ [0.212671, 0.715160, 0.072169]).max() < 1e-5
+
+
+def test_another_degree_may_be_given_later(variant_rgb: None) -> None:
+    loaded = scene(field())
+    params = mi.traverse(loaded)
+    before = render(loaded, {"type": "mivol"}, 4)
+    params[f"{KEY}.sh"] = tensor(np.concatenate([values()[1], np.zeros((5, 6, 7, 5, 3), np.float32)], axis=-2))
+    params.update()
+    assert np.abs(render(loaded, {"type": "mivol"}, 4) - before).max() < 1e-6
+
+
+def test_refusals(variant_rgb: None) -> None:
+    density, sh = values()
+    with pytest.raises(RuntimeError, match="give filename, or density and sh"):
+        mi.load_dict({"type": "mivol_sh", "density": tensor(density)})
+    with pytest.raises(RuntimeError, match="activation 'gelu' was given"):
+        mi.load_dict({"type": "mivol_sh", "density": tensor(density), "sh": tensor(sh), "activation": "gelu"})
+    with pytest.raises(RuntimeError, match="brings its own extinction"):
+        mi.load_dict({"type": "mivol_medium", "sigma_t": 1.0, "emission": field()["interior"]["emission"]})
+    with refused("leave that light out"):
+        render(scene(field()), {"type": "volpath"}, 1)
+    params = mi.traverse(scene(field()))
+    with refused("are expected"):
+        params[f"{KEY}.density"] = tensor(density[1:])
+        params.update()
