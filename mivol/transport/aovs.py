@@ -37,11 +37,6 @@ class _First:
     T: list[mi.Float]
     alpha: list[mi.Float]
 
-    @property
-    def opacity(self) -> mi.Float:
-        """Alpha, mean over channels."""
-        return _weigh(_shares("alpha", len(self.alpha)), self.alpha)
-
 
 def integrate_aovs(
     scene: mi.Scene, world: World, ray: mi.Ray3f, names: tuple[str, ...], active: mi.Bool = True
@@ -67,7 +62,7 @@ def integrate_aovs(
         return []
     first = _go(scene, world, ray, active)
     rows = {"tau": first.tau, "alpha": first.alpha}
-    values = {"depth": _depth(scene, world, first, active)} if "depth" in names else {}
+    values = {"depth": _depth(scene, world, first, active)[0]} if "depth" in names else {}
     return [values[n] if n in values else _weigh(_shares(n, world.channels), rows[_row(n)]) for n in names]
 
 
@@ -87,9 +82,9 @@ def push_aovs(
         rows["tau"] = _push_tau(scene, world, first.way, active)
         rows["alpha"] = [T * d for T, d in zip(first.T, rows["tau"], strict=True)]
     if "depth" in names:
-        depth = _depth(scene, world, first, active)
+        depth, opacity = _depth(scene, world, first, active)
         dN = push_distance(scene, world, first.way, first.end, depth, active)
-        values["depth"] = dN * _inverse(first.opacity)
+        values["depth"] = dN * _inverse(opacity)
     return [values[n] if n in values else _weigh(_shares(n, world.channels), rows[_row(n)]) for n in names]
 
 
@@ -114,8 +109,8 @@ def backproject_aovs(
         _pull_tau(scene, world, first.way, weight, active)
     for name, d in zip(names, daovs, strict=True):
         if name == "depth":
-            depth = _depth(scene, world, first, active)
-            backproject_distance(scene, world, first.way, first.end, depth, d * _inverse(first.opacity), active)
+            depth, opacity = _depth(scene, world, first, active)
+            backproject_distance(scene, world, first.way, first.end, depth, d * _inverse(opacity), active)
 
 
 def _go(scene: mi.Scene, world: World, ray: mi.Ray3f, active: mi.Bool) -> _First:
@@ -129,10 +124,11 @@ def _go(scene: mi.Scene, world: World, ray: mi.Ray3f, active: mi.Bool) -> _First
     return _First(Way(ray, medium, end.t), end, tau, T, alpha)
 
 
-def _depth(scene: mi.Scene, world: World, first: _First, active: mi.Bool) -> mi.Float:
-    N = integrate_distance(scene, world, first.way, first.end, mi.Bool(active))
-    some = first.opacity > 0
-    return dr.select(some, N / dr.select(some, first.opacity, 1), 0)
+def _depth(scene: mi.Scene, world: World, first: _First, active: mi.Bool) -> tuple[mi.Float, mi.Float]:
+    """The mean distance, and the opacity that it is a mean over."""
+    N, opacity = integrate_distance(scene, world, first.way, first.end, mi.Bool(active))
+    some = opacity > 0
+    return dr.select(some, N / dr.select(some, opacity, 1), 0), opacity
 
 
 def _push_tau(scene: mi.Scene, world: World, way: Way, active: mi.Bool) -> list[mi.Float]:

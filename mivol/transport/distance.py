@@ -28,7 +28,7 @@ from typing import ClassVar
 import drjit as dr
 import mitsuba as mi
 
-from mivol.numerics import exp_moments
+from mivol.numerics import exp_moments, one_minus_exp
 from mivol.transport.chain import Site, Stop, backproject_chain, link_chain
 from mivol.transport.path import Reach, Way
 from mivol.transport.world import World
@@ -120,7 +120,7 @@ class _Distance:
         return [dr.select(end.si.is_valid(), end.t - self.origin, 0)] * self.rows
 
 
-def integrate_distance(scene: mi.Scene, world: World, way: Way, end: Reach, active: mi.Bool) -> mi.Float:
+def integrate_distance(scene: mi.Scene, world: World, way: Way, end: Reach, active: mi.Bool) -> tuple[mi.Float, mi.Float]:
     """Integrate the distance at which a ray is stopped, mean over channels.
 
     Args:
@@ -131,7 +131,8 @@ def integrate_distance(scene: mi.Scene, world: World, way: Way, end: Reach, acti
         active: lanes to integrate.
 
     Returns:
-        N [length]: the mean distance times the opacity.
+        N [length], the mean distance times the opacity, and that opacity [1]: of the very optical depth in N, since a
+        radiance field's own depends on where in its cells it is looked at.
 
     Raises:
         MivolError: a medium that sums grids of two resolutions or places.
@@ -139,7 +140,9 @@ def integrate_distance(scene: mi.Scene, world: World, way: Way, end: Reach, acti
     Bias: that of :func:`stop_in_cell`. Cost: a walk of each body.
     """
     rule = _Distance(world.channels, mi.Float(0))
-    return _mean(link_chain(world, rule, scene, way, rule.end(end), active, skip=True).N)
+    chain = link_chain(world, rule, scene, way, rule.end(end), active, skip=True)
+    alpha = [dr.select(end.si.is_valid(), 1, one_minus_exp(mi.Float(t))) for t in chain.tau]
+    return _mean(chain.N), _mean(alpha)
 
 
 def push_distance(scene: mi.Scene, world: World, way: Way, end: Reach, origin: mi.Float, active: mi.Bool) -> mi.Float:
