@@ -296,9 +296,10 @@ class SphericalGrid:
                     row = dr.gather(mi.UInt32, rows, mi.UInt32((k * y + j) * x + i), inside)
                     w = wx * wy * wz
                     sigma = dr.fma(w, dr.gather(mi.Float, self.density, row, inside), sigma)
-                    for b, value in enumerate(basis):
-                        c = [dr.gather(mi.Float, self.harmonics, row * self.width + (3 * b + a), inside) for a in range(3)]
-                        colour = [dr.fma(w * value, v, s) for v, s in zip(c, colour, strict=True)]
+                    held = dr.gather(mi.ArrayXf, self.harmonics, row, inside, shape=(self.width, 1))
+                    for a in range(3):
+                        seen = sum((held[3 * b + a] * value for b, value in enumerate(basis)), mi.Float(0))
+                        colour[a] = dr.fma(w, seen, colour[a])
         if self.clamp:
             colour = [dr.maximum(c, 0) for c in colour]
         extinction, _ = self.act.value_and_slope(sigma)
