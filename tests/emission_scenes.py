@@ -75,10 +75,17 @@ def put(scene: mi.Scene, **values: object) -> mi.SceneParameters:
     params = mi.traverse(scene)
     for name, value in values.items():
         key = find(params, name)
-        kind = type(params[key])
-        params[key] = kind(*map(float, value)) if kind is mi.Color3f else kind(value)
+        params[key] = like(params[key], value)
     params.update()
     return params
+
+
+def like(parameter: object, value: object) -> object:
+    """Numbers as the type of a parameter."""
+    kind, value = type(parameter), np.asarray(value, dtype=np.float32)
+    if kind is mi.Color3f:
+        return kind(*map(float, value.ravel()))
+    return kind(value) if value.ndim else kind(float(value))
 
 
 def find(params: mi.SceneParameters, end: str) -> str:
@@ -113,9 +120,8 @@ def changes(seen: Pencils | mi.Scene, along: dict[str, np.ndarray], spp: int = 1
     params = mi.traverse(scene)
     keys = {find(params, end): v for end, v in along.items()}
     for key, v in keys.items():
-        kind = type(params[key])
         dr.enable_grad(params[key])
-        dr.set_grad(params[key], kind(*map(float, v)) if kind is mi.Color3f else kind(np.asarray(v, np.float32)))
+        dr.set_grad(params[key], like(params[key], v))
         params[key] = params[key]
     params.update()
     integrator = mi.load_dict({"type": "mivol", "max_depth": 1, **more})

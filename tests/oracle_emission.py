@@ -126,8 +126,8 @@ def share(dt: np.ndarray, s1: np.ndarray, s2: np.ndarray) -> tuple[np.ndarray, n
 def glow(dt: np.ndarray, s1: np.ndarray, s2: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Weights of the glow at the two Gauss points: what exp(-tau u + lean u (1 - u)) lets out, and from where."""
     tau, lean = np.asarray(0.5 * dt * (s1 + s2)), np.asarray(0.5 * math.sqrt(3) * dt * (s2 - s1))
-    u, w = np.polynomial.legendre.leggauss(64)
-    ends = np.append(0, np.geomspace(1e-9, 1, 40))
+    u, w = np.polynomial.legendre.leggauss(16)
+    ends = np.append(0, np.geomspace(1e-8, 1, 24))
     u = np.concatenate([a + (b - a) * (u + 1) / 2 for a, b in itertools.pairwise(ends)])
     w = np.concatenate([(b - a) / 2 * w for a, b in itertools.pairwise(ends)])
     fade, bend = np.exp(-tau[..., None] * u) * w, lean[..., None] * u * (1 - u)

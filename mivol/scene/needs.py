@@ -261,6 +261,27 @@ def _is_positive(values: mi.TensorXf, survey: Survey, name: str, is_albedo: bool
     return survey.values[key][1] or dr.grad_enabled(values)
 
 
+def check_light(view: MediumView, survey: Survey, name: str) -> None:
+    """Look at what a medium emits. Each array is read once.
+
+    Raises:
+        MivolError: light that is negative, infinite or NaN.
+    """
+    for values in view.lights:
+        flat = dr.detach(dr.ravel(values))
+        key = ("light", flat.index)
+        if key in survey.values:
+            continue
+        if not bool(dr.all(dr.isfinite(flat) & (flat >= 0))):
+            low, high = float(dr.min(flat)[0]), float(dr.max(flat)[0])
+            raise MivolError(
+                f"the emission of the medium in {name} lies in [{low:.4g}, {high:.4g}] (or is NaN); light is finite and at "
+                "least 0: clip it after each step."
+            )
+        survey.values = dict(list(survey.values.items())[-15:])
+        survey.values[key] = (flat, True)
+
+
 def _facts(boundary: Boundary, view: MediumView, survey: Survey, recording: bool) -> MediumFacts:
     grids = [p.lattice for p in view.parts if p.lattice is not None]
     phase = boundary.medium.phase_function()
@@ -277,6 +298,7 @@ def _facts(boundary: Boundary, view: MediumView, survey: Survey, recording: bool
         # What it was when it was last read; a medium that was never read may scatter.
         known = survey.scatters.get(boundary.name, True)
         return MediumFacts(**common, is_scattering=known, occupied=1.0, tau_max=None, unread=True)
+    check_light(view, survey, boundary.name)
     reads = [read_part(p, survey, boundary.name) for p in view.parts if p.lattice is not None]
     occupied = min((r.occupied for r in reads), default=1.0)
     scatters = survey.scatters[boundary.name] = is_scattering(view, survey, boundary.name)

@@ -20,6 +20,7 @@ from mivol.scene.load import find_sensor
 from mivol.scene.needs import Needs, Survey, find_needs, read_part, survey_scene
 from mivol.transport.aovs import AOVS
 from mivol.transport.direct import Lights
+from mivol.transport.field import share_cells
 from mivol.transport.light_grid import find_light_grid, measure_bias
 from mivol.transport.optical_depth import PACKED_LIMIT, gradient_bytes
 from mivol.transport.path import Settings
@@ -124,6 +125,13 @@ def _refuse_emission(needs: Needs, settings: Settings) -> None:
             f"the medium in {glowing[0]} emits and a medium of its scene scatters at max_depth 2; the light of one that is "
             "scattered by the other is not there yet: set max_depth to 1, or the albedo to 0."
         )
+    for facts, view in zip(needs.media, needs.views, strict=True):
+        if isinstance(view.glow, mi.Volume) and not share_cells(view.guide, view.frame):
+            raise MivolError(
+                f"the emission_density of the medium in {facts.name} has {view.frame.res} voxels (Z, Y, X) and its extinction "
+                f"{view.guide.res}, or they lie in different places; a glow is summed in the cells of the extinction: give "
+                "both the same resolution and to_world."
+            )
 
 
 def _refuse_quadrature(needs: Needs, settings: Settings) -> None:

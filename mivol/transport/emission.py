@@ -220,10 +220,12 @@ def _endless(stop: Stop, endless: mi.Bool, sigma: mi.Float, source: mi.Float, gl
 
 
 def _evaluate(field: mi.Volume | mi.Float | mi.Color3f, site: Site, t: mi.Float) -> mi.Spectrum:
-    """A volume or a constant at a point of a ray, with its derivative."""
+    """A volume or a constant at a point of a ray, with its derivative; 0 outside the box of a grid."""
     if not isinstance(field, mi.Volume):
         return mi.Spectrum(field)
-    return field.eval(interaction(site.ray, t), site.on)
+    there = interaction(site.ray, t)
+    on = site.on & site.body.view.holds(field, there.p)
+    return dr.select(on, field.eval(there, on), 0)
 
 
 def _by_point(pairs: list[tuple[mi.Float, mi.Float]]) -> list[mi.Spectrum]:

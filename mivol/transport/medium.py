@@ -68,7 +68,10 @@ class MediumView:
         source: the radiance that a medium shows where nothing is seen through it, a volume or a constant; None where it
             does not emit.
         glow: radiance per length that does not go with the extinction, likewise.
-        frame: the grid of ``source`` or ``glow``, which a sweep follows where the extinction has none.
+        frame: the grid of ``glow`` or ``source``, which a sweep follows where the extinction has none.
+        lights: the arrays behind ``source`` and ``glow``.
+        rooms: the boxes of stock grids of emission, by the volume's pointer: they repeat their border outside of it, where
+            a grid is to be vacuum.
     """
 
     medium: mi.Medium
@@ -80,6 +83,16 @@ class MediumView:
     source: mi.Volume | mi.Float | mi.Color3f | None = None
     glow: mi.Volume | mi.Float | mi.Color3f | None = None
     frame: Lattice | None = None
+    lights: list = field(default_factory=list)
+    rooms: dict[int, Box] = field(default_factory=dict)
+
+    def holds(self, volume: mi.Volume, p: mi.Point3f) -> mi.Bool:
+        """Whether a point lies in the box of a volume of ``source`` or ``glow`` that does not ask this itself."""
+        if volume.ptr not in self.rooms:
+            return mi.Bool(True)
+        rows = self.rooms[volume.ptr].rows()
+        local = [x * p.x + y * p.y + z * p.z + shift for x, y, z, shift in rows]
+        return (local[0] >= 0) & (local[0] <= 1) & (local[1] >= 0) & (local[1] <= 1) & (local[2] >= 0) & (local[2] <= 1)
 
     @property
     def emits(self) -> bool:
@@ -90,7 +103,6 @@ class MediumView:
     def channels(self) -> int:
         """1 where every part is grey, 3 where one is rgb."""
         return max(part.channels for part in self.parts)
-
 
     @property
     def guide(self) -> Lattice | None:
@@ -154,11 +166,13 @@ def view_medium(medium: mi.Medium, boundary: Box | None = None, places: dict | N
     albedo = [v for k, v in params if k.startswith("sigma_s." if "sigma_s" in names else "albedo.")]
     share = _field(params, "albedo") if "sigma_s" not in names else None
     source, glow = _field(params, "emission"), _field(params, "emission_density")
+    lights = [v for k, v in params if k.startswith("emission")]
     if not parts:
-        parts, share = [_part_of_field(source)], mi.Float(0)
-    frame = _frame([source, glow], boundary, places)
+        parts, share, lights = [_part_of_field(source)], mi.Float(0), []
+    frame = _frame([glow, source], boundary, places)
+    rooms = {v.ptr: Box(_place(v, boundary, places)) for v in (source, glow) if _repeats(v)}
     scale = mi.Float(params["scale"]) if "scale" in params.properties else mi.Float(1)
-    return MediumView(medium, parts, scale, albedo, share, _flakes(medium), source, glow, frame)
+    return MediumView(medium, parts, scale, albedo, share, _flakes(medium), source, glow, frame, lights, rooms)
 
 
 def _flakes(medium: mi.Medium) -> list[mi.Float] | None:
@@ -204,6 +218,11 @@ def _frame(fields: list, boundary: Box | None, places: dict) -> Lattice | None:
             x, y, z = (int(n) for n in volume.resolution())
             return Lattice(dr.zeros(mi.TensorXf, (z, y, x, 1)), _place(volume, boundary, places))
     return None
+
+
+def _repeats(volume: object) -> bool:
+    """Whether a volume has values outside its own box."""
+    return isinstance(volume, mi.Volume) and volume.class_name() != "ConstVolume" and not hasattr(volume, "mivol_to_world")
 
 
 def _place(volume: mi.Volume, boundary: Box | None, places: dict) -> np.ndarray:
