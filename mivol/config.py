@@ -224,11 +224,69 @@ class Scan(Section):
     output: Annotated[str, of("path", "run folder, relative to where the command runs", min_length=1)] = "runs/scan"
 
 
+# -- Photographs --------------------------------------------------------------------------------------------------
+
+
+class Photographs(Section):
+    """Posed photographs."""
+
+    path: Annotated[str, of("path", "folder or file of cameras: Blender, nerfstudio, instant-ngp, COLMAP", min_length=1)]
+    scale: Annotated[float, of("1", "of width and height, by exact means over area", gt=0, le=1)] = 1.0
+    background: Annotated[
+        str | tuple[float, float, float], of("1", "behind images with alpha: white, black or an rgb triple; empty: no alpha")
+    ] = ""
+    held_out: Annotated[int, of("view", "every so many of the training views is compared, not fitted; 0: none", ge=0)] = 8
+    box: Annotated[
+        str | tuple[tuple[float, float, float], tuple[float, float, float]],
+        of("1", "where matter may be: cameras (what they look at), silhouettes (of alpha), or two corners [length]"),
+    ] = "cameras"
+    judged: Annotated[str, of("1", "views to report at the end: held_out, val or test", min_length=1)] = "held_out"
+
+
+class Field(Section):
+    """The radiance field and how it is fitted."""
+
+    preset: Annotated[str, of("1", "resolutions, steps, rates and priors: tiny, cpu or gpu", min_length=1)] = "cpu"
+    longest: Annotated[int | None, of("voxel", "along the longest edge in the end; absent: the preset's", ge=8)] = None
+    degree: Annotated[int | None, of("1", "of the spherical harmonics; absent: the preset's", ge=0, le=4)] = None
+    effort: Annotated[float, of("1", "factor on the preset's steps", gt=0)] = 1.0
+    tv_density: Annotated[float | None, of("1", "total variation of the density; absent: the preset's", ge=0)] = None
+    tv_sh: Annotated[float | None, of("1", "total variation of the colours; absent: the preset's", ge=0)] = None
+    sparsity: Annotated[float | None, of("1", "of the density; absent: the preset's", ge=0)] = None
+    beta: Annotated[float | None, of("1", "asks rays to end in matter or to pass; absent: the preset's", ge=0)] = None
+
+
+class Shown(Section):
+    """What is made of a fitted field."""
+
+    views: Annotated[int, of("view", "judged views that are shown beside their photographs", ge=0)] = 4
+    frames: Annotated[int, of("frame", "of a turntable film; 0: none", ge=0)] = 60
+    every: Annotated[int, of("step", "between two looks at a held-out view", ge=1)] = 250
+    metrics: Annotated[tuple[str, ...], of("1", "of the judged views: psnr, ssim, flip")] = ("psnr", "ssim")
+
+
+class FieldFit(Section):
+    """All of ``fit.toml`` of a radiance field."""
+
+    title: Annotated[str, of("1", "heading of the report", min_length=1)]
+    photos: Annotated[Photographs, of("1", "what was seen")]
+    field: Annotated[Field, of("1", "what is looked for")] = Field()
+    show: Annotated[Shown, of("1", "what is made of it")] = Shown()
+    checkpoint_every: Annotated[int, of("step", "how often", ge=1)] = 500
+    variant: Annotated[str, of("1", "Mitsuba variant", min_length=1)] = "llvm_ad_rgb"
+    seed: Annotated[int, of("1", "root of the fit's random numbers", ge=0)] = 0
+    threads: Annotated[int, of("thread", "threads of the CPU back end; 0: all cores", ge=0)] = 0
+    output: Annotated[str, of("path", "run folder, relative to where the command runs", min_length=1)] = "runs/field"
+
+
+#: Table of the file that tells which experiment it is; without any of them it is one on a scene.
+KINDS: dict[str, type] = {"scan": Scan, "photos": FieldFit}
+
 #: Settings that change how a run is stored or how fast it is, not what comes out.
-NOT_RESULT = ("output", "threads", "title", "checkpoint_every")
+NOT_RESULT = ("output", "threads", "title", "checkpoint_every", "show")
 
 
-def load(path: str | Path, changes: Sequence[str] = ()) -> Experiment | Scan:
+def load(path: str | Path, changes: Sequence[str] = ()) -> Experiment | Scan | FieldFit:
     """Read an experiment.
 
     Args:
@@ -250,13 +308,13 @@ def load(path: str | Path, changes: Sequence[str] = ()) -> Experiment | Scan:
     return from_dict(raw, path.name)
 
 
-def from_dict(raw: dict[str, Any], name: str = "experiment") -> Experiment | Scan:
-    """An experiment from plain dicts and lists; one with a table ``scan`` is tomography.
+def from_dict(raw: dict[str, Any], name: str = "experiment") -> Experiment | Scan | FieldFit:
+    """An experiment from plain dicts and lists; one with a table ``scan`` is tomography, with ``photos`` a radiance field.
 
     Raises:
         MivolError: as :func:`load`; ``name`` begins the sentence.
     """
-    kind = Scan if "scan" in raw else Experiment
+    kind = next((KINDS[table] for table in KINDS if table in raw), Experiment)
     check_keys(raw, kind, "", name)
     try:
         return msgspec.convert(raw, kind)
@@ -264,7 +322,7 @@ def from_dict(raw: dict[str, Any], name: str = "experiment") -> Experiment | Sca
         raise MivolError(f"{name}: {sentence(raw, str(error))}") from None
 
 
-def resolved(experiment: Experiment | Scan) -> dict[str, Any]:
+def resolved(experiment: Experiment | Scan | FieldFit) -> dict[str, Any]:
     """Every setting, defaults included, as plain dicts and lists."""
     return msgspec.to_builtins(experiment)
 

@@ -50,6 +50,20 @@ CITATIONS: dict[str, Citation] = {
         "Eurographics 1987, Technical Papers",
         "https://doi.org/10.2312/egtp.19871000",
     ),
+    "plenoxels_2022": Citation(
+        "S. Fridovich-Keil, A. Yu, M. Tancik, Q. Chen, B. Recht, A. Kanazawa",
+        2022,
+        "Plenoxels: Radiance Fields without Neural Networks",
+        "CVPR",
+        "https://doi.org/10.1109/CVPR52688.2022.00542",
+    ),
+    "relu_fields_2022": Citation(
+        "A. Karnewar, T. Ritschel, O. Wang, N. J. Mitra",
+        2022,
+        "ReLU Fields: The Little Non-linearity That Could",
+        "SIGGRAPH Conference Proceedings",
+        "https://doi.org/10.1145/3528233.3530707",
+    ),
     "max_1995": Citation(
         "N. Max",
         1995,

@@ -8,6 +8,7 @@ have, the page does not show.
 
 from __future__ import annotations
 
+import base64
 import json
 import math
 import re
@@ -111,6 +112,7 @@ def write_page(folder: str | Path) -> Path:
         "volume": volume,
         "curves": _curves(rows),
         "timings": _timings(record.timings),
+        "films": [_film(folder, image) for image in record.images if image.role == "film"],
         "others": [_plain_picture(folder, image) for image in record.images if image.role in ("slice", "picture")],
         "config": _toml(record.config),
         "citations": citations(record.citations),
@@ -172,7 +174,7 @@ def _views(folder: Path, images: Sequence[Image]) -> Gallery:
     """Views that have a reference or a render, held-out ones first, all on the same scales."""
     by_view: dict[str, dict[str, Image]] = {}
     for image in images:
-        if image.role not in ("slice", "picture"):
+        if image.role not in ("slice", "picture", "film"):
             by_view.setdefault(image.view or image.path, {})[image.role] = image
     arrays = {name: {role: _load(folder, image) for role, image in roles.items()} for name, roles in by_view.items()}
     for name, roles in arrays.items():
@@ -285,6 +287,12 @@ def _picture(name: str, image: NDArray, scale: show.Scale | None, aspect: float 
 
 def _plain_picture(folder: Path, image: Image) -> Picture:
     return _picture(image.caption or image.view or Path(image.path).stem, _load(folder, image), None)
+
+
+def _film(folder: Path, image: Image) -> tuple[str, str]:
+    """The caption of a film and the film as an address."""
+    coded = base64.b64encode((folder / image.path).read_bytes()).decode()
+    return image.caption or image.view, f"data:video/mp4;base64,{coded}"
 
 
 def _bar_labels(scales: dict[str, show.Scale], image: Image | None) -> list[tuple[str, str]]:

@@ -67,6 +67,10 @@ QUANTITIES: dict[str, Quantity] = {
     "nrmse": Quantity("nRMSE of the volume"),
     "psnr": Quantity("PSNR of the fitted views", "dB", log=False),
     "held_out_psnr": Quantity("PSNR of the held-out views", "dB", log=False),
+    "ssim": Quantity("SSIM of the held-out views", log=False),
+    "flip": Quantity("FLIP of the held-out views", log=False),
+    "nodes": Quantity("Nodes that are stored", log=False),
+    "bytes": Quantity("Memory of the field", "MiB", log=False),
     "seconds": Quantity("Time", "s"),
     "iterations": Quantity("Iterations", log=False),
     "views": Quantity("Views fitted", log=False),
@@ -86,14 +90,14 @@ class Choice(_Part):
 
 
 class Image(_Part):
-    """An image of the run: ``.exr`` or ``.npy`` of linear values (height, width[, 1 or 3]), ``.png`` shown as it is.
+    """An image of the run: ``.exr``, ``.npy`` of linear values (height, width[, 1 or 3]); ``.png``, ``.mp4`` shown as they are.
 
     Images of one ``view`` belong together: its ``reference`` and ``render`` are shown beside their difference, with a
     z-image (difference over standard error) where the reference's ``standard error`` is there.
     """
 
     path: str
-    role: Literal["reference", "render", "difference", "standard error", "slice", "picture"]
+    role: Literal["reference", "render", "difference", "standard error", "slice", "picture", "film"]
     view: str = ""
     held_out: bool = False
     layer: str = ""
