@@ -38,7 +38,7 @@ DATA = {
 }
 """Which setting names the data beside the project, and which file it is."""
 
-SCRIPTS = {"relit_smoke": "relight.py", "tank": "fit.py", "white_smoke": "views.py"}
+SCRIPTS = {"relit_smoke": "relight.py", "still_life": "photographs.py", "tank": "fit.py", "white_smoke": "views.py"}
 
 
 def test_every_scene_is_here():

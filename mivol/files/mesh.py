@@ -1,0 +1,128 @@
+"""Triangle meshes on disk: Stanford's ``.ply`` (binary, little endian) and Wavefront's ``.obj`` (text).
+
+Conventions. Faces name their corners counterclockwise as seen from outside, from 0 (``.obj`` counts from 1, which the writer
+sees to). Colours are code values 0..1; ``.ply`` holds them in 8 bits, ``.obj`` after the coordinates, where most programs look
+for them though the format's first description has none.
+
+Here: :data:`MESH_WRITERS`, :class:`Mesh`, :func:`write_mesh`, :func:`read_ply`.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+
+from mivol.files import source
+from mivol.files.atomic import write_whole
+from mivol.files.source import refusal
+
+__all__ = ["MESH_WRITERS", "Mesh", "read_ply", "write_mesh"]
+
+PLY_HEAD = "ply\nformat binary_little_endian 1.0\n"
+
+FACE = np.dtype([("count", "u1"), ("corners", "<i4", 3)])
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """Triangles.
+
+    Attributes:
+        points: (V, 3) world [length].
+        faces: (F, 3) whole numbers of points.
+        normals: (V, 3) unit, outwards; None: none.
+        colours: (V, 3) in 0..1; None: none.
+
+    Raises:
+        MivolError: shapes that do not fit together, or a corner that is no point.
+    """
+
+    points: np.ndarray
+    faces: np.ndarray
+    normals: np.ndarray | None = None
+    colours: np.ndarray | None = None
+
+    def __post_init__(self) -> None:
+        per_point = [a for a in (self.points, self.normals, self.colours) if a is not None]
+        shapes = [a.shape for a in (*per_point, self.faces)]
+        if any(a.shape != (len(self.points), 3) for a in per_point) or self.faces.ndim != 2 or self.faces.shape[1] != 3:
+            raise refusal("a mesh", f"arrays of {shapes}", "(V, 3) for each of the points and (F, 3) faces", "reshape them")
+        if self.faces.size and not (self.faces.min() >= 0 and self.faces.max() < len(self.points)):
+            found = f"corners {self.faces.min()} to {self.faces.max()}"
+            raise refusal("a mesh", found, f"numbers of its {len(self.points)} points", "count from 0")
+
+
+def write_mesh(path: str | os.PathLike, mesh: Mesh) -> None:
+    """Write a mesh, whole or not at all; the suffix chooses the format (:data:`MESH_WRITERS`).
+
+    Raises:
+        MivolError: another suffix, disk full.
+    """
+    path = Path(path)
+    if path.suffix.lower() not in MESH_WRITERS:
+        raise refusal(path, f"the suffix {path.suffix!r}", f"one of {', '.join(MESH_WRITERS)}", "correct the name")
+    write_whole(path, lambda file: MESH_WRITERS[path.suffix.lower()](file, mesh))
+
+
+def read_ply(path: str | os.PathLike) -> Mesh:
+    """Read a ``.ply`` that :func:`write_mesh` wrote.
+
+    Raises:
+        MivolError: missing, truncated, or laid out in another way.
+    """
+    data = source.read_bytes(path)
+    head, end, body = data.partition(b"end_header\n")
+    words = [line.split() for line in head.decode("ascii", "replace").splitlines()]
+    counts = {w[1]: int(w[2]) for w in words if len(w) == 3 and w[0] == "element" and w[2].isdigit()}
+    names = tuple(w[2] for w in words if len(w) == 3 and w[0] == "property")
+    kinds = {_point(*kind).names: _point(*kind) for kind in ((n, c) for n in (False, True) for c in (False, True))}
+    if not end or not head.startswith(PLY_HEAD.encode()) or names not in kinds or counts.keys() != {"vertex", "face"}:
+        raise refusal(path, "another layout", "a binary mesh as mivol writes it", "convert it")
+    n, kind = counts["vertex"], kinds[names]
+    points = source.elements(body[: n * kind.itemsize], kind, n, path)
+    faces = source.elements(body[n * kind.itemsize :], FACE, counts["face"], path)
+    held = {"points": "xyz", "normals": ("nx", "ny", "nz"), "colours": ("red", "green", "blue")}
+    arrays = {k: np.stack([points[c] for c in v], axis=1) for k, v in held.items() if v[0] in kind.names}
+    if "colours" in arrays:
+        arrays["colours"] = arrays["colours"] / np.float32(255)
+    return Mesh(faces=faces["corners"].astype(np.int64), **arrays)
+
+
+def _point(normals: bool, colours: bool) -> np.dtype:
+    """What a ``.ply`` holds of a point."""
+    numbers = [*"xyz", *(("nx", "ny", "nz") if normals else ())]
+    return np.dtype([(c, "<f4") for c in numbers] + [(c, "u1") for c in (("red", "green", "blue") if colours else ())])
+
+
+def _write_ply(file: BinaryIO, mesh: Mesh) -> None:
+    points = np.empty(len(mesh.points), _point(mesh.normals is not None, mesh.colours is not None))
+    codes = None if mesh.colours is None else np.rint(np.clip(mesh.colours, 0, 1) * 255)
+    values = [a for a in (mesh.points, mesh.normals, codes) if a is not None]
+    for name, column in zip(points.dtype.names, np.concatenate(values, axis=1).T, strict=True):
+        points[name] = column
+    faces = np.empty(len(mesh.faces), FACE)
+    faces["count"], faces["corners"] = 3, mesh.faces
+    kinds = {name: "uchar" if points.dtype[name] == np.uint8 else "float" for name in points.dtype.names}
+    properties = "".join(f"property {kind} {name}\n" for name, kind in kinds.items())
+    listed = f"element face {len(faces)}\nproperty list uchar int vertex_indices\nend_header\n"
+    file.write(f"{PLY_HEAD}element vertex {len(points)}\n{properties}{listed}".encode())
+    file.write(points.tobytes())
+    file.write(faces.tobytes())
+
+
+def _write_obj(file: BinaryIO, mesh: Mesh) -> None:
+    columns = mesh.points if mesh.colours is None else np.concatenate([mesh.points, np.clip(mesh.colours, 0, 1)], axis=1)
+    np.savetxt(file, columns, fmt="v" + " %.7g" * columns.shape[1])
+    number = np.repeat(mesh.faces + 1, 1 if mesh.normals is None else 2, axis=1)
+    if mesh.normals is not None:
+        np.savetxt(file, mesh.normals, fmt="vn %.5g %.5g %.5g")
+    np.savetxt(file, number, fmt="f %d %d %d" if mesh.normals is None else "f %d//%d %d//%d %d//%d")
+
+
+#: suffix -> writer(file, mesh).
+MESH_WRITERS: dict[str, Callable[[BinaryIO, Mesh], None]] = {".ply": _write_ply, ".obj": _write_obj}

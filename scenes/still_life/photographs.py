@@ -1,0 +1,189 @@
+"""Photographs of a still life that nobody has to download: glossy and matt things on a plinth, rendered by Mitsuba.
+
+    python scenes/still_life/photographs.py [-o runs/still_life/photographs]
+
+Spheres, cubes and a knot, half of them rough metal or varnish, the others matt, under a sky with four soft lights, so that
+highlights wander as the camera moves. Everything follows from one seed. 75 views from above the horizon, spread evenly over it;
+every fifth is held out and so lies between the others. They are PNGs with alpha beside a ``transforms.json``, as any other data
+set is; the sky is no part of them. All that there is fits into ``BOX``.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+
+import mivol  # noqa: F401  (chooses the LLVM library; call it before the first variant)
+from mivol.files import write_png
+from mivol.files.mesh import Mesh, write_mesh
+from mivol.photos import Camera, intrinsics
+from mivol.photos.journey import facing
+from mivol.photos.transforms import write_transforms
+from mivol.scene.photographs import sensor_of
+
+import mitsuba as mi
+import numpy as np
+
+SEED = 20
+BOX = np.array([[-1.0, -1.0, -0.2], [1.0, 1.0, 0.6]])
+"""Low and high corner of all that there is [length]."""
+
+MIDDLE = BOX.mean(axis=0)
+DISTANCE, ANGLE = 3.5, np.radians(38)
+"""Of the cameras from the middle, and their field of view."""
+
+LIGHTS = (
+    (30, 55, 14, (3.0, 2.6, 1.8)),
+    (140, 30, 12, (1.0, 1.7, 3.0)),
+    (235, 50, 16, (2.0, 2.0, 1.7)),
+    (310, 22, 10, (2.7, 1.0, 0.8)),
+)
+"""Azimuth, elevation, width [degree] and radiance of the soft lights."""
+
+EVERY, FIRST = 5, 2
+"""Of the views, every fifth is held out, beginning with the third."""
+
+
+# -- What stands there ----------------------------------------------------------------------------------------------------
+
+
+def metal(colour: Sequence[float], alpha: float) -> dict:
+    """A rough conductor that reflects these shares of the light."""
+    return {"type": "roughconductor", "material": "none", "alpha": alpha, "specular_reflectance": rgb(colour)}
+
+
+def varnish(colour: Sequence[float], alpha: float) -> dict:
+    """A coloured ground under a rough, clear coat."""
+    return {"type": "roughplastic", "alpha": alpha, "nonlinear": True, "diffuse_reflectance": rgb(colour)}
+
+
+def matt(colour: Sequence[float]) -> dict:
+    """Lambert's surface, lit on both sides."""
+    return {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": rgb(colour)}}
+
+
+def rgb(colour: Sequence[float]) -> dict:
+    """A colour for Mitsuba."""
+    return {"type": "rgb", "value": [float(c) for c in colour]}
+
+
+def still_life(tube: Path) -> dict:
+    """The scene without cameras, for ``mitsuba.load_dict``.
+
+    Args:
+        tube: the mesh of :func:`knot`, a ``.ply``.
+    """
+    rng = np.random.default_rng(SEED)
+    place = mi.ScalarTransform4f
+    things: dict = {"type": "scene", "integrator": {"type": "path", "max_depth": 4, "hide_emitters": True}, "sky": sky()}
+    things["knot"] = {
+        "type": "ply", "filename": str(tube), "to_world": place().translate([0, 0, 0.38]).scale(0.36),
+        "bsdf": metal((0.95, 0.72, 0.35), 0.3),
+    }  # fmt: skip
+    things["stand"] = {"type": "cylinder", "p0": [0, 0, -0.2], "p1": [0, 0, 0], "radius": 0.97, "bsdf": matt((0.5, 0.46, 0.42))}
+    things["top"] = {
+        "type": "disk", "to_world": place().scale(0.97),
+        "bsdf": {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": patches(rng)}},
+    }  # fmt: skip
+    looks = [
+        varnish((0.7, 0.08, 0.06), 0.15), matt((0.12, 0.25, 0.65)), metal((0.75, 0.8, 0.85), 0.25),
+        matt((0.85, 0.6, 0.12)), varnish((0.06, 0.4, 0.16), 0.25), metal((0.85, 0.45, 0.35), 0.2),
+    ]  # fmt: skip
+    for number, look in enumerate(looks):
+        azimuth = 360 * (number + rng.uniform(-0.15, 0.15)) / len(looks)
+        size, turn = rng.uniform(0.15, 0.2), rng.uniform(0, 90)
+        shape = ("sphere", "cube")[number // 2 % 2]
+        at = place().rotate([0, 0, 1], azimuth).translate([0.66, 0, size]).rotate([0, 0, 1], turn).scale(size)
+        things[f"{shape}_{number}"] = {"type": shape, "to_world": at, "bsdf": look}
+    return things
+
+
+def sky(size: tuple[int, int] = (128, 256)) -> dict:
+    """A grey sky with soft lights in it, as seen in latitude and longitude; it is no part of the pictures."""
+    rows, columns = size
+    elevation = np.radians(90 - 180 * (np.arange(rows) + 0.5) / rows)[:, None]
+    azimuth = np.radians(360 * (np.arange(columns) + 0.5) / columns)[None, :]
+    light = np.broadcast_to((0.15 + 0.1 * np.sin(elevation))[..., None], (rows, columns, 3)).copy()
+    for around, above, width, colour in LIGHTS:
+        a, e = np.radians(around), np.radians(above)
+        cosine = np.sin(elevation) * np.sin(e) + np.cos(elevation) * np.cos(e) * np.cos(azimuth - a)
+        light += np.exp((cosine - 1) / np.radians(width) ** 2)[..., None] * colour
+    turned = mi.ScalarTransform4f().rotate([1, 0, 0], 90)
+    return {"type": "envmap", "bitmap": mi.Bitmap(light.astype(np.float32)), "to_world": turned}
+
+
+def patches(rng: np.random.Generator, count: int = 9) -> dict:
+    """A cloth of coloured squares."""
+    colours = rng.uniform(0.1, 0.6, (count, count, 3)).astype(np.float32)
+    return {"type": "bitmap", "bitmap": mi.Bitmap(colours), "raw": True, "filter_type": "nearest"}
+
+
+def knot(around: int = 24, along: int = 240) -> Mesh:
+    """A trefoil knot as a tube, in a sphere of radius 1.2 or so."""
+    t = 2 * np.pi * np.arange(along) / along
+    curve = np.stack([np.sin(t) + 2 * np.sin(2 * t), np.cos(t) - 2 * np.cos(2 * t), -np.sin(3 * t)], axis=1) / 3
+    ahead = np.roll(curve, -1, axis=0) - np.roll(curve, 1, axis=0)
+    side = np.cross(ahead, curve)
+    up = np.cross(ahead, side)
+    side, up = (v / np.linalg.norm(v, axis=1, keepdims=True) for v in (side, up))
+    angle = 2 * np.pi * np.arange(around)[:, None] / around
+    points = curve[:, None] + 0.2 * (np.cos(angle) * side[:, None] + np.sin(angle) * up[:, None])
+    here = np.arange(along * around).reshape(along, around)
+    right, ahead = np.roll(here, -1, axis=1), np.roll(here, -1, axis=0)
+    across = np.roll(right, -1, axis=0)
+    faces = np.concatenate([np.stack(f, axis=-1).reshape(-1, 3) for f in ((here, right, across), (here, across, ahead))])
+    return Mesh(points.reshape(-1, 3), faces)
+
+
+# -- Who looks ------------------------------------------------------------------------------------------------------------
+
+
+def cameras(count: int, size: int) -> list[Camera]:
+    """Cameras spread evenly over the sky between 8 and 65 degrees of elevation, a golden angle apart."""
+    f = size / 2 / np.tan(ANGLE / 2)
+    like = Camera(intrinsics(f, f, size / 2, size / 2), (size, size), np.eye(4))
+    height = np.linspace(np.sin(np.radians(8)), np.sin(np.radians(65)), count)
+    azimuth = np.pi * (3 - np.sqrt(5)) * np.arange(count)
+    flat = np.sqrt(1 - height**2)
+    places = MIDDLE + DISTANCE * np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), height], axis=1)
+    return [facing(like, place, MIDDLE, np.array([0, 0, 1]), f"view {n}") for n, place in enumerate(places)]
+
+
+def make(folder: Path, views: int = 75, size: int = 128, spp: int = 64) -> list[str]:
+    """Render the set into ``folder``; the names of its PNGs."""
+    folder.mkdir(parents=True, exist_ok=True)
+    write_mesh(folder / "knot.ply", knot())
+    scene = mi.load_dict(still_life(folder / "knot.ply"))
+    looks = {f"view_{number:03d}.png": look for number, look in enumerate(cameras(views, size))}
+    for number, (name, look) in enumerate(looks.items()):
+        sensor = mi.load_dict(sensor_of(look, pixel_format="rgba") | {"sampler": {"type": "multijitter"}})
+        shown = np.array(mi.render(scene, sensor=sensor, spp=spp, seed=SEED + number))
+        colour, alpha = shown[..., :3], shown[..., 3:]
+        write_png(folder / name, np.concatenate([colour / np.where(alpha > 0, alpha, 1), alpha], axis=2))
+    names = list(looks)
+    write_transforms(folder / "transforms.json", looks, names[FIRST::EVERY])
+    return names
+
+
+def main() -> None:
+    """Render the set and say how well it is known."""
+    given = arguments()
+    mi.set_variant("llvm_ad_rgb")
+    names = make(given.output, given.views, given.size, given.spp)
+    print(f"{len(names)} views, {len(names[FIRST::EVERY])} of them held out, in the box {BOX.tolist()}")
+    print(given.output)
+
+
+def arguments() -> argparse.Namespace:
+    """The command line."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--views", type=int, default=75, help="every fifth is held out")
+    parser.add_argument("--size", type=int, default=128, help="pixels along a side")
+    parser.add_argument("--spp", type=int, default=64, help="samples a pixel")
+    parser.add_argument("-o", "--output", type=Path, default=Path("runs/still_life/photographs"))
+    return parser.parse_args()
+
+
+if __name__ == "__main__":
+    main()
