@@ -140,14 +140,26 @@ def glow(dt: np.ndarray, s1: np.ndarray, s2: np.ndarray) -> tuple[np.ndarray, np
 
 
 def cell_radiance(medium: Medium, o: np.ndarray, d: np.ndarray, background: object = 0.0, end: float = math.inf) -> np.ndarray:
-    """As :func:`radiance`, of one medium, by the rule: cells are those of its extinction's grid, or of its source's."""
-    rays = zip(np.atleast_2d(o), np.atleast_2d(d), strict=True)
-    return np.array([_cell_radiance(medium, Ray(*ray), background, end) for ray in rays])
+    """As :func:`radiance`, of one medium, by the rule: cells are those of its extinction's grid, or of its light's."""
+    return chain_radiance([medium], o, d, background, end)
+
+
+def chain_radiance(
+    media: list[Medium], o: np.ndarray, d: np.ndarray, background: object = 0.0, end: float = math.inf
+) -> np.ndarray:
+    """As :func:`cell_radiance`, of media that do not overlap, in any order: each is the background of what is before it."""
+    found = []
+    for ray in itertools.starmap(Ray, zip(np.atleast_2d(o), np.atleast_2d(d), strict=True)):
+        light = background
+        for medium in sorted(media, key=lambda m, ray=ray: -overlap((0, end), m.interval(ray.o, ray.d))[0]):
+            light = _cell_radiance(medium, ray, light, end)
+        found.append(light)
+    return np.array(found)
 
 
 def _cell_radiance(medium: Medium, ray: Ray, background: object, end: float) -> np.ndarray:
     t0, t1 = overlap((0, end), medium.interval(ray.o, ray.d))
-    guide = next(f for f in medium.fields if isinstance(f, tuple))
+    guide = next((f for f in medium.fields if isinstance(f, tuple)), None)
     edges = _finite(np.concatenate([[t0, t1], ray.breaks(guide, t0, t1)]))
     L, T = np.zeros(3), np.ones(3)
     for a, b in itertools.pairwise(edges):

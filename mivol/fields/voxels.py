@@ -113,10 +113,10 @@ class Voxels:
         Raises:
             MivolError: the new values are not those of a medium (looked at, unless ``dr.freeze`` is recording).
         """
-        if dr.flag(dr.JitFlag.FreezingScope):
-            # A recording can neither read values nor rebuild the texture. The tensor has been replaced in place already.
-            return
         self.texture.update_inplace()
+        if dr.flag(dr.JitFlag.FreezingScope):
+            # A recording cannot read values.
+            return
         check_volume(np.array(dr.detach(self.texture.tensor())), name=self.name)
 
     def __repr__(self) -> str:

@@ -158,6 +158,9 @@ def _volume(props: mi.Properties, name: str) -> mi.Volume:
     if isinstance(value, (int, float)):
         check_coefficient(float(value), name)
         return mi.load_dict({"type": "constvolume", "value": float(value)})
+    if isinstance(value, (str, mi.Object)):
+        found = repr(value) if isinstance(value, str) else f"a {value.class_name()}"
+        raise MivolError(f"{name} is {found}; a number, an rgb triple or a volume is expected.")
     rgb = [float(v) for v in np.array(value).ravel()]
     for v in rgb:
         check_coefficient(v, name)

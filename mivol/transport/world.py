@@ -329,7 +329,10 @@ def _lead_tangents(fields: list) -> None:
     """Bring the tangents of volumes to where they are read: a loop cannot pass the edges of a graph that lie outside of it."""
     for volume in fields:
         if isinstance(volume, mi.Volume):
-            value = volume.eval(dr.zeros(mi.Interaction3f))
+            inside = dr.zeros(mi.Interaction3f)
+            # A point outside of the grid would not read it.
+            inside.p = mi.Point3f(*map(float, volume.bbox().center()))
+            value = volume.eval(inside)
             if dr.grad_enabled(value):
                 dr.forward_to(value, flags=dr.ADFlag.ClearEdges)
 

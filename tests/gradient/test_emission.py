@@ -13,13 +13,14 @@ from emission_scenes import (
     aimed,
     changes,
     colours,
+    directions,
     emitting,
     find,
     gradients,
     interior,
     light,
+    moved,
     pencils,
-    put,
     rough,
 )
 
@@ -63,28 +64,6 @@ CASES = {
     ),
 }
 SLOW = ("stock", "constant extinction, gridded light")
-
-
-def directions(scene: mi.Scene, ends: tuple[str, ...]) -> dict[str, np.ndarray]:
-    """Where each parameter is to move: a positive random direction of a quarter of its size."""
-    params, rng = mi.traverse(scene), np.random.default_rng(7)
-    values = {end: np.array(params[find(params, end)], dtype=np.float64) for end in ends}
-    return {end: 0.25 * v.mean() * rng.uniform(0.2, 1, v.shape) for end, v in values.items()}
-
-
-def moved(scene: mi.Scene, along: dict[str, np.ndarray], look) -> np.ndarray:
-    """The derivative of an image along a direction, by differences of fourth order: h^4 f'''''/30 is below 1e-6 of it, and
-    a float32 image is known to 1e-7, over h."""
-    params, h = mi.traverse(scene), 0.05
-    start = {end: np.array(params[find(params, end)], dtype=np.float64) for end in along}
-
-    def at(k: float) -> np.ndarray:
-        put(scene, **{end: (start[end] + k * h * v).astype(np.float32) for end, v in along.items()})
-        return look()
-
-    found = (8 * (at(1) - at(-1)) - (at(2) - at(-2))) / (12 * h)
-    at(0)
-    return found
 
 
 @pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow if n in SLOW else ()) for n in CASES])
