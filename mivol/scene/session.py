@@ -28,10 +28,17 @@ __all__ = ["Session"]
 
 @dataclass
 class _Seen:
-    """A scene and its survey."""
+    """A scene, known by its shapes and emitters, and its survey.
 
-    scene: mi.Scene
+    Not the scene itself: it may hold the integrator that this session belongs to, and neither would ever be freed.
+    """
+
+    parts: list[mi.Object]
     survey: Survey
+
+    def is_of(self, parts: list[mi.Object]) -> bool:
+        """Whether these are the very same shapes and emitters."""
+        return len(parts) == len(self.parts) and all(a is b for a, b in zip(parts, self.parts, strict=True))
 
 
 class Session:
@@ -114,8 +121,9 @@ class Session:
 
     def _open(self, scene: mi.Scene, sensor: mi.Sensor, spp: int) -> tuple[World, Plan]:
         """Ask, plan, and build the media."""
-        if self._seen is None or self._seen.scene is not scene:
-            self._seen = _Seen(scene, survey_scene(scene))
+        parts = [*scene.shapes(), *scene.emitters()]
+        if self._seen is None or not self._seen.is_of(parts):
+            self._seen = _Seen(parts, survey_scene(scene))
         survey = self._seen.survey
         needs = find_needs(scene, sensor, survey, spp)
         plan = make_plan(needs, self.settings)

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import gc
+import weakref
+
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -151,6 +154,17 @@ def test_many_views_share_their_kernels():
         kernels = [k for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT]
     assert kernels
     assert all(k["cache_hit"] for k in kernels)
+
+
+def test_a_scene_that_holds_its_integrator_is_freed():
+    """The integrator must not hold the scene in turn: Mitsuba counts references, and each call of a medium, a lamp or a BSDF
+    is traced for every one that is left over (fits were 20 times slower after 80 scenes)."""
+    scene = mi.load_dict(parts(sensor_of()) | {"integrator": {"type": "mivol", "max_depth": 2}})
+    mi.render(scene, spp=1)
+    integrator = weakref.ref(scene.integrator())
+    del scene
+    gc.collect()
+    assert integrator() is None
 
 
 def test_one_integrator_on_two_scenes():
