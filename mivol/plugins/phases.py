@@ -281,7 +281,10 @@ def _read(props: mi.Properties, name: str, default: float) -> mi.Float | mi.Volu
 
 
 def _brief(value: mi.Float | mi.Volume) -> str:
-    return value.class_name() if isinstance(value, mi.Volume) else str(dr.detach(value))
+    """A value in words; a recording cannot read numbers."""
+    if isinstance(value, mi.Volume):
+        return value.class_name()
+    return "recorded" if dr.flag(dr.JitFlag.FreezingScope) else str(dr.detach(value))
 
 
 def _take_over(parameters: dict[str, mi.Float | mi.Volume], owner: str) -> None:

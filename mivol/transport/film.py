@@ -136,8 +136,10 @@ def _camera_rays(
         tile, rest = lane // (lanes * dr.opaque(mi.UInt32, per_pass)), lane % (lanes * dr.opaque(mi.UInt32, per_pass))
         sample, inside = rest // lanes, rest % lanes
         pixel = mi.Vector2i(TILE * (tile % tiles) + inside % TILE, TILE * (tile // tiles) + inside // TILE)
-        # Opaque: a seed that is part of a kernel has it compiled anew in every render.
-        turn = mi.sample_tea_32(tile, dr.opaque(mi.UInt32, seed) + 0x9E3779B9)[0]
+        seed = mi.UInt32(seed)
+        # A seed that is part of a kernel has it compiled anew in every render.
+        dr.make_opaque(seed)
+        turn = mi.sample_tea_32(tile, seed + 0x9E3779B9)[0]
         across = max(a for a in range(1, int(per_pass**0.5) + 1) if per_pass % a == 0)
         strata = Strata((sample + turn % per_pass) % per_pass, across, per_pass // across)
     else:

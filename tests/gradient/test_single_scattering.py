@@ -220,6 +220,32 @@ def test_rgb_extinction(lit):
         assert_gradient(found[..., c], truth, f"channel {c}", 0.04, rounding=3e-3 if lit == "sky" else 2e-5)
 
 
+LUMINANCE = np.array([0.212671, 0.715160, 0.072169])
+"""Of linear sRGB, by which Mitsuba makes one number of three in mono variants."""
+
+
+@pytest.mark.parametrize("shares", [[1.0], LUMINANCE], ids=["grey", "rgb"])
+def test_a_mono_variant(shares):
+    """One number a sample: density voxel by voxel, and albedo. An rgb grid counts by its luminance, in derivatives too."""
+    mi.set_variant("llvm_ad_mono")
+    lamp = LAMPS["point"]()
+    tints = np.array([[1.0, 0.4, 1.7]])[:, : len(shares)]
+    values = as_float32(rough_grid(1) * tints)
+    interior = medium("mivol_medium", grid_volume("mivol_voxels", values, PLACE), 0.7, phase={"type": "hg", "g": 0.4})
+    seen = pencils({"smoke": box_of(interior, PLACE), "lamp": lamp[0]}, *aimed(1, 8))
+    w = weights(8)[0][..., :1]
+    m = twins.Medium(twins.Grid((values @ shares)[..., None], PLACE), 0.7, twins.hg(0.4))
+    truth, _ = twins.radiance_gradient(m, [lamp[1]], seen.o, seen.d, w[0, :, 0])
+    # Luminance is known to 1e-6 of itself.
+    assert_gradient(gradients(seen, GRID, w, 512), truth[..., None] * shares, "density")
+
+    def light(x):
+        return w[0, :, 0] @ twins.radiance([twins.Medium(m.field, x, twins.hg(0.4))], [lamp[1]], seen.o, seen.d)[:, 0]
+
+    truth = np.array([twin_difference(light, float(as_float32(0.7)))])
+    assert_gradient(sums(seen, MEDIUM + "albedo.value.value", w, 512), truth, "albedo")
+
+
 def test_two_media():
     """A grid beside a homogeneous box and a ball: each shades the others; derivatives of the grid and of both constants."""
     place, beside = as_float32(scenes.centred(np.eye(3), (-0.5, 0, 0))), as_float32(scenes.centred(np.eye(3), (0.51, 0, 0)))
