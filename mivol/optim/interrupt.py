@@ -1,7 +1,8 @@
 """Ctrl-C and SIGTERM wait for the next safe point, where nothing is half done.
 
 Conventions. The first signal is noted and raised by :meth:`Stop.check` between kernels, before any state has changed;
-the second one acts at once. Kernels are kept to seconds (``samples_per_pass``), and so is the wait.
+the second one acts at once. Kernels are kept to seconds (``samples_per_pass``), and so is the wait. A signal that this
+process was started to ignore (Ctrl-C, for one that a script put into the background) stays ignored.
 """
 
 from __future__ import annotations
@@ -26,7 +27,8 @@ class Stop:
 
     def __enter__(self) -> Stop:
         if threading.current_thread() is threading.main_thread():
-            self._before = {number: signal.signal(number, self._note) for number in self.signals}
+            heard = [number for number in self.signals if signal.getsignal(number) is not signal.SIG_IGN]
+            self._before = {number: signal.signal(number, self._note) for number in heard}
         return self
 
     def __exit__(self, *exception: object) -> None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import os
+import signal
 
 import drjit as dr
 import mitsuba as mi
@@ -279,10 +281,7 @@ def test_bounds_hold(variant_rgb) -> None:
         assert np.ptp(values) > 0.01
 
 
-def test_stop_waits_for_a_safe_point() -> None:
-    import os
-    import signal
-
+def test_stop_waits_for_a_safe_point(ctrl_c) -> None:
     with Stop() as stop:
         stop.check()
         os.kill(os.getpid(), signal.SIGTERM)
@@ -292,6 +291,17 @@ def test_stop_waits_for_a_safe_point() -> None:
         with pytest.raises(KeyboardInterrupt):
             os.kill(os.getpid(), signal.SIGINT)
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_what_was_ignored_stays_ignored(ctrl_c) -> None:
+    """A shell starts what it puts into the background with Ctrl-C ignored: that is meant for the job in front."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    with Stop() as stop:
+        os.kill(os.getpid(), signal.SIGINT)
+        stop.check()
+        os.kill(os.getpid(), signal.SIGTERM)
+        assert stop.asked
+    assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
 
 
 def bad_views() -> dict:
