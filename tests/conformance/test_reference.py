@@ -168,7 +168,7 @@ def _fall_over() -> None:
 
 
 @pytest.mark.parametrize("how", [lambda: os.kill(os.getpid(), signal.SIGINT), _fall_over], ids=["ctrl-c", "crash"])
-def test_stopped_and_continued_is_the_same(variant_rgb, tmp_path, monkeypatch, how):
+def test_stopped_and_continued_is_the_same(variant_rgb, ctrl_c, tmp_path, monkeypatch, how):
     """Stopped in batch 7, nothing that was finished is rendered again, and the image is that of a run that never stopped."""
     scene = _scene(_grid(1.5))
     whole = _small(scene, tmp_path / "whole.exr")
@@ -384,6 +384,44 @@ def test_doubts_that_need_no_render(variant_rgb):
     }
     for kind, scene in cases.items():
         assert [d.kind for d in trust(mi.load_dict(scene))] == [kind]
+
+
+def _fog(values: np.ndarray, **extra) -> dict:
+    """The unit cube filled with a white fog and lit by a sun from the camera; extinction (Z, Y, X)."""
+    volume = {"type": "gridvolume", "grid": mi.VolumeGrid(values.astype(np.float32)[..., None]), **extra}
+    lamp = {"type": "directional", "direction": [0, 0, 1], "irradiance": 1.0}
+    return _scene({"type": "heterogeneous", "sigma_t": volume, "albedo": 1.0}, sky=lamp)
+
+
+def test_a_dense_medium_loses_its_skin(variant_rgb):
+    """Light that turns once in a deep fog comes back as 1/(4 pi) int s exp(-2 s z) dz = 1/(8 pi). A ray that starts a skin of
+    the optical depth x inside keeps exp(-x) of it; both are seen, so a release that mends it turns this red."""
+    scene = _fog(np.full((2, 2, 2), 200.0))
+    (doubt,) = trust(mi.load_dict(scene))
+    assert doubt.kind == "thick skin" and not doubt.fatal
+    # the skin is (1 + max(x, y)) RESTART deep: 1.5 to 1.9 over the film, 2 at a corner of the cube
+    x = np.abs(np.linspace(0.1, 0.9, 101) - 0.5) + 0.5
+    mean = np.exp(-200 * 1500 * 2.0**-24 * (1 + np.maximum(x, x[:, None]))).mean()
+    found = 8 * np.pi * _rendered(scene, spp=8192).mean()
+    # uniform numbers weigh the samples: a standard error of 0.577 / sqrt(524288) = 8e-4; 5 of them
+    assert found == pytest.approx(mean, abs=4e-3)
+    assert mean < 1 - 0.02
+    share = re.search(r"about ([\d.]+)%", doubt.sentence)
+    assert float(share[1]) / 100 == pytest.approx(200 * 2 * 1500 * 2.0**-24, rel=0.05)
+
+
+def test_no_skin_where_it_is_empty_thin_or_black(variant_rgb):
+    """Dense only inside; thin; a boundary far outside the grid's box; black; dense on one face alone is enough."""
+    inside, face = np.zeros((6, 6, 6)), np.zeros((6, 6, 6))
+    inside[2:4, 2:4, 2:4], face[:, :, -1] = 200.0, 200.0
+    wide = _t().translate([0.5, 0.5, 0.5]).scale(0.25).translate([-0.5, -0.5, -0.5])
+    for scene in (_fog(inside), _fog(np.full((2, 2, 2), 5.0)), _fog(np.full((2, 2, 2), 40.0), to_world=wide)):
+        assert trust(mi.load_dict(scene)) == []
+    assert trust(mi.load_dict(_scene(_homogeneous(200.0)))) == []
+    for scene in (_fog(face), _scene(_homogeneous(200.0, albedo=0.5))):
+        assert [d.kind for d in trust(mi.load_dict(scene))] == ["thick skin"]
+    ball = {"type": "sphere", "center": [3, 0, 0], "bsdf": {"type": "null"}, "interior": _homogeneous(50.0, albedo=0.5)}
+    assert [d.kind for d in trust(mi.load_dict(_scene(_homogeneous(1.0), box=ball)))] == ["thick skin"]
 
 
 def test_no_doubt_about_good_scenes(variant_rgb):
