@@ -47,7 +47,15 @@ def test_every_scene_is_here():
     assert sorted(p.relative_to(SCENES).as_posix() for p in SCENES.glob("*/*.py")) == sorted(
         f"{name}/{script}" for name, script in SCRIPTS.items()
     )
-    assert all((SCENES / name / "README.md").is_file() for name in {*TINY, *SCRIPTS})
+    assert {p.parent.name for p in SCENES.glob("*/README.md")} == {*TINY, *SCRIPTS}
+
+
+@pytest.mark.parametrize("name", sorted({*TINY, *SCRIPTS}))
+def test_its_readme_is_five_lines_with_the_command(name):
+    lines = (SCENES / name / "README.md").read_text().splitlines()
+    assert len(lines) == 5
+    assert lines[0].startswith("# ")
+    assert lines[1].startswith(("    mivol optimize scenes/", "    python scenes/"))
 
 
 @pytest.mark.slow
