@@ -6,13 +6,18 @@ import gc
 import os
 import re
 import shutil
+import signal
+from collections.abc import Iterator
 from pathlib import Path
 
 import mivol  # noqa: F401  (before Mitsuba: it chooses the LLVM library)
 
 # isort: split
+import drjit
 import mitsuba as mi
 import pytest
+
+from mivol import machine
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -22,6 +27,13 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--variant", default="llvm_ad_rgb", help="the Mitsuba variant of the fixture variant_rgb")
     parser.addoption("--seeds", type=int, default=1, help="how many seeds each test that asks for one is run with")
     parser.addoption("--artefacts", type=Path, default=ROOT / "runs" / "tests", help="where tests leave pictures")
+
+
+def pytest_configure() -> None:
+    """Workers of pytest-xdist share the cores; a pool's idle thread spins, at the other worker's cost."""
+    workers = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", 1))
+    if workers > 1:
+        drjit.set_thread_count(max(1, machine.cores() // workers))
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
@@ -44,6 +56,12 @@ def variant_rgb(request: pytest.FixtureRequest) -> str:
     return name
 
 
+@pytest.fixture
+def two_threads(variant_rgb: str) -> None:
+    """The pool has two threads at least, as a user's has: both add to one gradient; Mitsuba reads an EXR with the second."""
+    drjit.set_thread_count(max(2, drjit.thread_count()))
+
+
 @pytest.fixture(scope="session")
 def data_dir() -> Path:
     """The folder of real data: ``MIVOL_DATA``, else ``../shared/data`` beside the checkout."""
@@ -51,6 +69,14 @@ def data_dir() -> Path:
     if not folder.is_dir():
         pytest.skip(f"real data not found at {folder}: set MIVOL_DATA to the folder that holds it")
     return folder
+
+
+@pytest.fixture
+def ctrl_c() -> Iterator[None]:
+    """SIGINT is heard, as at a terminal, even where a shell started the tests in the background with it ignored."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
 
 
 @pytest.fixture

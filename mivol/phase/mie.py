@@ -56,7 +56,7 @@ def water_droplets(
     Raises:
         MivolError: a size, variance or wavelength that cannot be, or ``miepython`` is not installed.
 
-    Cost: 0.3 s and 600 nodes for 3 micrometre, 2.6 s and 3300 nodes for 20.
+    Cost: 0.5 s of a processor and 340 nodes for 3 micrometre, 1.6 s and 640 for 10, 2.3 s and 1010 for 20.
     """
     _check_positive(effective_radius=effective_radius, wavelength=wavelength, tolerance=tolerance)
     if not 0 < effective_variance < 0.5:

@@ -438,7 +438,7 @@ def test_exr_round_trip_with_layers_and_header(tmp_path: Path) -> None:
     assert read_header["spp"] == 16
 
 
-def test_exr_is_read_by_mitsuba_and_back(tmp_path: Path, variant_rgb: str) -> None:
+def test_exr_is_read_by_mitsuba_and_back(tmp_path: Path, two_threads: None) -> None:
     import mitsuba as mi
 
     rng = np.random.default_rng(2)

@@ -120,7 +120,7 @@ def test_variants_are_checked():
         mi.set_variant("llvm_ad_rgb")
 
 
-def test_exr_is_read_with_one_thread(tmp_path):
+def test_exr_is_read_with_one_thread(two_threads, tmp_path):
     """Mitsuba 3.9.1 waits for ever for a second thread of the pool (also with taskset); in a child that can be killed."""
     mi.Bitmap(np.ones((4, 8, 3), np.float32)).write(str(tmp_path / "sky.exr"))
     code = """

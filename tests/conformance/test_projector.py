@@ -15,7 +15,7 @@ from mivol.tomography.geometry import ConeBeam, ParallelBeam, PencilRays, VoxelG
 from mivol.tomography.phantoms import random_ellipsoids
 from mivol.tomography.projector import Projector
 
-pytestmark = pytest.mark.usefixtures("variant_rgb")
+pytestmark = pytest.mark.usefixtures("two_threads")
 
 GRID = VoxelGrid((5, 7, 6), (0.5, 0.4, 0.6), centre=(0.2, -0.3, 0.1))
 ANGLES = np.array([0.0, 0.4, np.pi / 2, 2.5, 4.0])

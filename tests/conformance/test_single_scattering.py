@@ -446,9 +446,9 @@ STRANGERS = (
 )  # fmt: skip
 
 
-@pytest.mark.filterwarnings("ignore:the heterogeneous medium inside")
+@pytest.mark.filterwarnings("ignore:the heterogeneous medium inside", "ignore:the medium inside")
 @pytest.mark.parametrize("name", small.cases(STRANGERS, STRANGERS[1:3] + STRANGERS[4:]))
-def test_scenes_of_a_stranger(name, data_dir, tmp_path):
+def test_scenes_of_a_stranger(two_threads, name, data_dir, tmp_path):
     """The scenes that Mitsuba tests its own volumetric integrators with, at depth 2, as the reference tool renders them:
     each channel alone where the extinction is rgb."""
     folder = data_dir / "scenes" / "mitsuba-data" / "tests" / "scenes" / "participating_media"

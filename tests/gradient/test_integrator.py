@@ -11,7 +11,7 @@ import scenes
 from mivol.scene import plan
 from scenes import box_of, camera, grid_volume, medium, sky
 
-pytestmark = pytest.mark.usefixtures("variant_rgb")
+pytestmark = pytest.mark.usefixtures("two_threads")
 
 GRID = "box.interior_medium.sigma_t.data"
 PLACE = scenes.centred(2 * np.eye(3))

@@ -16,7 +16,7 @@ from oracle import tau_gradient_twin
 
 from scenes import FRAMES, as_float32, from_lanes, make_lattice, random_rays, tau_and_row, tau_fast, tensor, to_lanes
 
-pytestmark = pytest.mark.usefixtures("variant_rgb")
+pytestmark = pytest.mark.usefixtures("two_threads")
 
 BOUND = 2e-6
 

@@ -46,7 +46,7 @@ def fit(optimiser, path: Path | None = None, *, stop_after: int = -1, how: int =
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_a_resumed_run_is_bitwise_the_same(one_thread, tmp_path: Path, name: str) -> None:
+def test_a_resumed_run_is_bitwise_the_same(one_thread, ctrl_c, tmp_path: Path, name: str) -> None:
     """Rationale: a state that forgets anything (a moment, a pair, a damping, an event) shows in the next step.
     Expected: with one thread every loss, measure and voxel is equal to the last bit."""
     path = tmp_path / "checkpoint.npz"
@@ -61,7 +61,7 @@ def test_a_resumed_run_is_bitwise_the_same(one_thread, tmp_path: Path, name: str
     assert np.array_equal(np.asarray(resumed.run.reals[KEY]), np.asarray(whole.run.reals[KEY]))
 
 
-def test_a_resumed_run_is_the_same_with_several_threads(variant_rgb, tmp_path: Path) -> None:
+def test_a_resumed_run_is_the_same_with_several_threads(two_threads, ctrl_c, tmp_path: Path) -> None:
     """Float sums have no fixed order: 1e-7 per gradient, which Adam's division can turn into 1e-5 of its steps."""
     path = tmp_path / "checkpoint.npz"
     whole = fit(Adam())
@@ -72,7 +72,7 @@ def test_a_resumed_run_is_the_same_with_several_threads(variant_rgb, tmp_path: P
 
 
 @pytest.mark.parametrize("iteration", [2, 3], ids=["after an event", "plain"])
-def test_a_signal_in_the_middle_of_an_iteration_loses_nothing(one_thread, tmp_path: Path, iteration: int) -> None:
+def test_a_signal_in_the_middle_of_an_iteration_loses_nothing(one_thread, ctrl_c, tmp_path: Path, iteration: int) -> None:
     """The signal comes in the render of an iteration: that iteration is done again from where it began, its events not."""
     path, whole = tmp_path / "checkpoint.npz", fit(Adam())
     problem = small_problem()
