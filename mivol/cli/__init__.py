@@ -115,6 +115,17 @@ def report_flags(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("folder", type=Path, help="run folder")
 
 
+def export_flags(sub: argparse.ArgumentParser) -> None:
+    """Flags of a field that becomes a file of another program."""
+    from mivol.fields.export import EXPORTS
+
+    known = ", ".join(f"{suffix} ({kind.name})" for suffix, kind in EXPORTS.items())
+    sub.add_argument("field", type=Path, help="radiance field (.npz): mivol's, or a checkpoint of svox2")
+    sub.add_argument("output", type=Path, help=f"what to write, by its suffix: {known}")
+    sub.add_argument("--level", type=float, help="extinction of a mesh's surface [1/length]; default: a voxel is half opaque")
+    sub.add_argument("-m", "--mode", default="llvm_ad_rgb", help="variant (default: %(default)s)")
+
+
 def no_flags(sub: argparse.ArgumentParser) -> None:
     """None."""
 
@@ -205,6 +216,16 @@ def report(arguments: argparse.Namespace) -> None:
     print(write_page(arguments.folder))
 
 
+def export(arguments: argparse.Namespace) -> None:
+    """Write a radiance field as a mesh, as volumes, or for another program."""
+    from mivol.cli.rendering import set_variant
+    from mivol.fields.export import export_field
+    from mivol.fields.spherical import load_field
+
+    set_variant(arguments.mode)
+    print("\n".join(str(path) for path in export_field(arguments.output, load_field(arguments.field), arguments.level)))
+
+
 def doctor(arguments: argparse.Namespace) -> int:
     """Say whether a render would work on this machine, and what to do where not."""
     from mivol.doctor import main
@@ -217,6 +238,7 @@ VERBS: dict[str, tuple[Callable, Callable]] = {
     "render": (render, render_flags),
     "reference": (reference, reference_flags),
     "optimize": (optimize, optimize_flags),
+    "export": (export, export_flags),
     "report": (report, report_flags),
     "doctor": (doctor, no_flags),
 }

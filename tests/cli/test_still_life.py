@@ -26,8 +26,8 @@ def still_life() -> ModuleType:
 def test_photographs_of_the_still_life(still_life, variant_rgb, tmp_path):
     """The metal cube's upper face changes with the view, the matt one's does not; each is where the camera says.
 
-    The sky's smooth light on a matt face is known to a tenth or so by 16 samples, which sRGB makes a twentieth of 0.6; the metal shows
-    now a light of 3 and now the sky of 0.2, whose code values lie 0.5 apart.
+    The sky's smooth light on a matt face is known to a tenth or so by 16 samples, which sRGB makes a twentieth of 0.6; the
+    metal shows now a light of 3 and now the sky of 0.2, whose code values lie 0.5 apart.
     """
     names = still_life.make(tmp_path, views=10, size=48, spp=16)
     train, test = (load_photos(tmp_path, split=s, background="black", box=still_life.BOX) for s in ("train", "test"))
