@@ -1,0 +1,94 @@
+"""The storage table: its formulas are the bytes of real fields, in memory and on disk."""
+
+from __future__ import annotations
+
+import json
+import math
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import drjit as dr
+import numpy as np
+import pytest
+from bench_script import SCRIPTS, load
+
+from mivol.fields.spherical import SphericalGrid, save_field
+from mivol.transport.radiance import cells_of
+
+RES = (5, 6, 7)
+
+
+@pytest.fixture(scope="module")
+def storage():
+    return load("storage")
+
+
+def field(degree: int, keep: np.ndarray | None) -> SphericalGrid:
+    """Random numbers; the densities are positive, so that a cell is occupied where a node of it is kept."""
+    rng = np.random.default_rng(degree)
+    sh = rng.normal(size=(*RES, (degree + 1) ** 2, 3))
+    return SphericalGrid.from_dense(rng.random(RES) + 0.1, sh, np.eye(4), keep)
+
+
+def held(*arrays: object) -> int:
+    """Bytes of Dr.Jit arrays of 32-bit numbers."""
+    return sum(4 * dr.width(a) for a in arrays)
+
+
+@pytest.mark.parametrize("sparse", [False, True], ids=["dense", "sparse"])
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_formulas_are_the_bytes(storage, variant_rgb, tmp_path: Path, degree: int, sparse: bool) -> None:
+    keep = np.random.default_rng(9).random(RES) < 0.2
+    made = field(degree, keep if sparse else None)
+    kept = int(keep.sum()) if sparse else math.prod(RES)
+    nodes = [made.nodes] if sparse else []
+    expected = storage.sparse_bytes(kept, degree) if sparse else storage.dense_bytes(kept, degree)
+    assert held(made.density, made.harmonics, *nodes) == made.bytes == expected
+
+    save_field(tmp_path / "field.npz", made)
+    with zipfile.ZipFile(tmp_path / "field.npz") as archive:
+        sizes = {entry.filename: entry.file_size for entry in archive.infolist()}
+    # An .npy has a header of 128 bytes.
+    stored = sum(sizes[f"{name}.npy"] - 128 for name in ("density", "sh", *(["nodes"] if sparse else [])))
+    assert stored == storage.file_bytes(kept, degree, sparse=sparse)
+
+
+@pytest.mark.parametrize("share", [0.02, 0.3, 1.0])
+def test_the_index_is_what_the_walk_reads(storage, variant_rgb, share: float) -> None:
+    keep = np.random.default_rng(1).random(RES) <= share
+    made = field(0, keep)
+    cells = cells_of(made)
+    listed, edges = storage.count_cells(keep)
+    assert (cells.count, dr.width(cells.pairs)) == (listed, 2 * edges)
+    index = held(made.node_rows(), cells.number, cells.edges, cells.pairs)
+    assert index == storage.index_bytes(RES, listed, edges)
+
+
+def test_the_lecture_counts_4_gigabytes(storage) -> None:
+    """1024^3 cells of 4 bytes; degree 2 is 27 numbers a cell in rows of 28, and the density; sparse falls as 1/N."""
+    found = {kind.name: kind for kind in storage.kinds(0.1)}
+    assert found["dense rgba, 8 bits (the lecture's)"].scenes[1024] == (4 * 2**30, 4 * 2**30)
+    assert found["dense SH 2"].per_cell == (4 * 29, 2 * 28)
+    ratio = found["sparse SH 2"].scenes[1024][0] / found["dense SH 2"].scenes[1024][0]
+    assert ratio == pytest.approx(0.1 / 8 * 30 / 29, rel=1e-6)
+    # Hundreds of nodes of 64^3 lie at one distance: a share is met to a thousandth or two.
+    assert storage.shell(0.2).mean() == pytest.approx(0.2, abs=2e-3)
+
+
+def test_what_is_printed(variant_rgb, tmp_path: Path) -> None:
+    """A table, the run's quality in the row of its kind, and JSON with the bytes of its real file."""
+    run = tmp_path / "a_run"
+    run.mkdir()
+    save_field(run / "field.npz", field(2, np.ones(RES, bool)))
+    (run / "run.json").write_text(json.dumps({"title": "A fit", "results": {"held_out_psnr": 29.54}}))
+    command = [sys.executable, str(SCRIPTS / "storage.py"), "--runs", str(run)]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    lines = done.stdout.splitlines()
+    assert all(line.count("|") == 8 for line in lines if line.startswith("|"))
+    judged = {line.split("|")[1].strip(): line.split("|")[7].strip() for line in lines if line.startswith("|")}
+    assert judged["sparse SH 2"] == "29.5 dB at 7^3 (A fit)"
+    assert judged["dense SH 2"] == "not fitted"
+    fitted = json.loads(lines[-1])["fitted"][0]
+    assert (fitted["kept"], fitted["share"], fitted["file"]) == (210, 1.0, (run / "field.npz").stat().st_size)
