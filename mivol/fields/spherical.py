@@ -21,6 +21,7 @@ from __future__ import annotations
 
 import math
 import zipfile
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -253,25 +254,24 @@ class SphericalGrid:
         """The basis for unit directions of travel in the world."""
         return dr.sh_eval(self.turn(d), self.degree)
 
-    def seen_from(self, points: np.ndarray, node: mi.UInt32, view: mi.UInt32) -> list[mi.Float]:
-        """The basis for the directions from world points to nodes.
-
-        Args:
-            points: (V, 3) world.
-            node: flat numbers.
-            view: which point, a lane each.
-        """
+    def viewer(self, points: np.ndarray) -> Callable[[mi.UInt32, mi.UInt32], list[mi.Float]]:
+        """The basis for directions from world points (V, 3) to nodes: a function of flat node numbers and of which point."""
         z, y, x = self.res
         frame = self.own_frame()
         linear = frame @ self.to_world[:3, :3] / np.array([x, y, z], np.float64)
-        # The node's place in the own frame, from that of node (-1/2, -1/2, -1/2), less the point's: a difference in float64.
+        # The corner of the box in the own frame, less the point: a difference in float64.
         start = (frame @ (self.to_world[:3, 3] - np.asarray(points, np.float64)).T).T
-        q = [mi.Float(node % x) + 0.5, mi.Float(node // x % y) + 0.5, mi.Float(node // (x * y)) + 0.5]
-        starts = [dr.gather(mi.Float, mi.Float(np.ascontiguousarray(start[:, a], np.float32)), view) for a in range(3)]
+        starts = mi.Float(np.append(np.float32(start).reshape(-1), np.float32(0)))
         rows = [[dr.opaque(mi.Float, float(v)) for v in row] for row in linear]
-        d = mi.Vector3f(*(_affine(row, q, s) for row, s in zip(rows, starts, strict=True)))
-        length = dr.norm(d)
-        return dr.sh_eval(dr.select(length > 0, d / length, mi.Vector3f(0, 0, 1)), self.degree)
+
+        def basis(node: mi.UInt32, view: mi.UInt32) -> list[mi.Float]:
+            q = [mi.Float(node % x) + 0.5, mi.Float(node // x % y) + 0.5, mi.Float(node // (x * y)) + 0.5]
+            from_point = [dr.gather(mi.Float, starts, view * 3 + a) for a in range(3)]
+            d = mi.Vector3f(*(_affine(row, q, s) for row, s in zip(rows, from_point, strict=True)))
+            length = dr.norm(d)
+            return dr.sh_eval(dr.select(length > 0, d / length, mi.Vector3f(0, 0, 1)), self.degree)
+
+        return basis
 
     def eval(self, p: mi.Point3f, d: mi.Vector3f, active: mi.Bool = True) -> tuple[mi.Float, mi.Color3f]:
         """Extinction and colour at world points, seen along unit world directions; 0 outside the box.

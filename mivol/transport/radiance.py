@@ -207,7 +207,7 @@ def bake(field: SphericalGrid, cells: Cells, points: np.ndarray, view: mi.UInt32
     """
     entry = dr.arange(mi.UInt32, field.rows * len(points))
     row, which = entry % field.rows, entry // field.rows
-    basis = field.seen_from(points, _node(field, row), which)
+    basis = field.viewer(points)(_node(field, row), which)
     values = dr.gather(mi.ArrayXf, field.harmonics, row, shape=(field.width, 1))
     colour = [mi.Float(field.offset)] * 3
     for b, y in enumerate(basis):
@@ -246,19 +246,34 @@ def fold(field: SphericalGrid, cells: Cells, baked: Baked, points: np.ndarray) -
     for end, row in enumerate(_ends(field, cells, entry)):
         _add_packet(nodes, [slope[4 * end + k] for k in range(4)], row, mi.Bool(True))
 
+    return _over_pinholes(field, nodes, points)
+
+
+@dr.syntax
+def _over_pinholes(field: SphericalGrid, nodes: mi.Float, points: np.ndarray) -> tuple[mi.Float, mi.Float]:
+    """Sum what pinholes add to the rows of a field; a loop, so one kernel serves any number of them."""
     row = dr.arange(mi.UInt32, field.rows)
     node = _node(field, row)
-    raw, harmonics = mi.Float(0), [mi.Float(0)] * field.width
-    for v in range(len(points)):
-        packet = dr.gather(mi.ArrayXf, nodes, row + v * field.rows, shape=(4, 1))
-        basis = field.seen_from(points[v : v + 1], node, mi.UInt32(0))
+    seen_from = field.viewer(points)
+    count, rows, width = dr.opaque(mi.UInt32, len(points)), field.rows, field.width
+    packet = mi.ArrayXf([mi.Float(0)] * 4)
+    raw = dr.zeros(mi.Float, rows)
+    harmonics = [dr.zeros(mi.Float, rows) for _ in range(width)]
+    v = mi.UInt32(0)
+    while v < count:
+        packet = dr.gather(mi.ArrayXf, nodes, row + v * rows, shape=(4, 1))
         raw += packet[0]
-        for b, y in enumerate(basis):
-            for k in range(3):
-                harmonics[3 * b + k] = dr.fma(packet[1 + k], y, harmonics[3 * b + k])
-    rows = dr.zeros(mi.Float, field.rows * field.width)
-    dr.scatter(rows, mi.ArrayXf(harmonics), row)
-    return raw, rows
+        harmonics = _spread(harmonics, packet, seen_from(node, v))
+        v += 1
+    total = dr.zeros(mi.Float, rows * width)
+    dr.scatter(total, mi.ArrayXf(harmonics), row)
+    return raw, total
+
+
+def _spread(harmonics: list[mi.Float], packet: mi.ArrayXf, basis: list[mi.Float]) -> list[mi.Float]:
+    """Add a colour's derivative times each harmonic."""
+    more = [dr.fma(packet[1 + k], y, harmonics[3 * b + k]) for b, y in enumerate(basis) for k in range(3)]
+    return more + harmonics[len(more) :]
 
 
 def exact(field: SphericalGrid, rays: Rays, slope: bool = False) -> Exact:
@@ -348,6 +363,22 @@ def look(cells: Cells, source: Source, model: Model, rays: Rays, active: mi.Bool
     state, last, end = march(cells, segment, visit, state, active, lambda s: s[4] > model.depth)
     *light, tau, before, start = state
     return Seen(mi.Color3f(*light[:3]), dr.exp(-tau), light[3], tau, before, start, end, last, segment)
+
+
+def brightest_weights(cells: Cells, source: Source, model: Model, rays: Rays, weight: mi.Float) -> None:
+    """Raise ``weight``, one a listed cell, to the largest share T alpha of a ray that the cell has.
+
+    Cost: as :func:`look`, and one write a visited cell.
+    """
+    segment = clip(cells, rays.o, rays.d, 0, rays.t_max)
+
+    def visit(tau: mi.Float, here: Visit, on: mi.Bool) -> mi.Float:
+        at = _points(cells, source, model, here, on)
+        share = share_cell(here.dt, *at.sigma)
+        dr.scatter_reduce(dr.ReduceOp.Max, weight, dr.exp(-tau) * share.alpha, here.number, on)
+        return dr.select(on, tau + share.tau, tau)
+
+    march(cells, segment, visit, mi.Float(0), mi.Bool(True), lambda tau: tau > model.depth)
 
 
 def _times(segment: Segment, here: Visit) -> tuple[mi.Float, mi.Float]:

@@ -1,0 +1,86 @@
+"""A radiance field on other nodes: finer, or of another box along the same axes.
+
+Conventions. Raw densities and harmonics are linear between the old nodes, constant in the outer half voxel; densities keep
+their sign, so a surface that crosses 0 between two nodes stays there.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mivol.errors import MivolError
+from mivol.fields.spherical import SphericalGrid
+
+__all__ = ["resample_field"]
+
+
+def resample_field(old: SphericalGrid, res: tuple[int, int, int], to_world: np.ndarray, keep: np.ndarray) -> SphericalGrid:
+    """A sparse field of the same values on other nodes.
+
+    Args:
+        old: what is resampled.
+        res, to_world: of the new grid, whose axes are those of the old one.
+        keep: (Z, Y, X) of the old grid, bool; a new node is stored where one of the 8 old ones about it is kept.
+
+    Raises:
+        MivolError: axes that differ.
+    """
+    axes = _Axes.between(old, res, to_world)
+    near = keep[np.ix_(*(axis.nodes.T.reshape(-1) for axis in axes))]
+    z, y, x = res
+    kept = np.flatnonzero(near.reshape(z, 2, y, 2, x, 2).any(axis=(1, 3, 5)))
+    density, harmonics = _interpolated(old, axes, np.unravel_index(kept, res))
+    count = len(kept)
+    flat = dr.full(mi.Float, old.act.vacuum, count + 1)
+    packed = dr.zeros(mi.Float, (count + 1) * old.width)
+    if count:
+        dr.scatter(flat, density, dr.arange(mi.UInt32, count))
+        dr.scatter(packed, mi.ArrayXf(harmonics), dr.arange(mi.UInt32, count))
+    dr.eval(flat, packed)
+    nodes = mi.UInt32(kept.astype(np.uint32))
+    return replace(old, res=tuple(res), to_world=to_world, density=flat, harmonics=packed, nodes=nodes, links=None)
+
+
+class _Axes:
+    """Along one axis, the two old nodes about each new one and their shares, (2, n)."""
+
+    def __init__(self, q: np.ndarray, n: int) -> None:
+        low = np.floor(q)
+        self.nodes = np.clip(np.stack([low, low + 1]).astype(int), 0, n - 1)
+        self.shares = np.stack([1 - (q - low), q - low]).astype(np.float32)
+
+    @classmethod
+    def between(cls, old: SphericalGrid, res: tuple[int, int, int], to_world: np.ndarray) -> list[_Axes]:
+        """For z, y and x."""
+        move = np.linalg.inv(old.to_world) @ to_world
+        if np.abs(move[:3, :3] - np.diag(np.diag(move)[:3])).max() > 1e-6 * np.abs(move[:3, :3]).max():
+            raise MivolError("a grid with other axes was given; a field is resampled along its own: keep its rotation.")
+        made = []
+        for a, (n, m) in enumerate(zip(old.res[::-1], res[::-1], strict=True)):
+            made.append(cls((((np.arange(m) + 0.5) / m) * move[a, a] + move[a, 3]) * n - 0.5, n))
+        return made[::-1]
+
+
+def _interpolated(old: SphericalGrid, axes: list[_Axes], place: tuple) -> tuple[mi.Float, list[mi.Float]]:
+    """Values at new nodes (indices along z, y, x)."""
+    rows = np.array(old.node_rows())
+    density, harmonics = mi.Float(0), [mi.Float(0)] * old.width
+    if len(place[0]) == 0:
+        return density, harmonics
+    for corner in range(8):
+        ends = [
+            (axis.nodes[corner >> k & 1][i], axis.shares[corner >> k & 1][i])
+            for k, (axis, i) in enumerate(zip(axes, place, strict=True))
+        ]
+        node = np.ravel_multi_index([n for n, _ in ends], old.res)
+        weight = mi.Float(math.prod(s for _, s in ends))
+        row = mi.UInt32(rows[node].astype(np.uint32))
+        density = dr.fma(weight, dr.gather(mi.Float, old.density, row), density)
+        values = dr.gather(mi.ArrayXf, old.harmonics, row, shape=(old.width, 1))
+        harmonics = [dr.fma(weight, v, h) for v, h in zip(values, harmonics, strict=True)]
+    return density, harmonics

@@ -1,0 +1,175 @@
+"""How a radiance field is fitted: stages, rates and priors, and the memory that they take.
+
+Conventions. Lengths are the world's; learning rates and priors of the density count in half the longest edge of the box, so
+nothing depends on the unit. ``PRESETS`` lists plans by name.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mivol.errors import MivolError
+from mivol.fields.spherical import basis_size, row_width
+from mivol.machine import available_memory
+from mivol.optim.radiance_views import TILE, Views
+
+__all__ = ["PRESETS", "Plan", "Stage", "bytes_of", "memory_of", "place_grid"]
+
+
+@dataclass(frozen=True)
+class Stage:
+    """Some steps on a grid of one resolution.
+
+    Attributes:
+        longest: nodes along the longest edge of the box; voxels are cubes.
+        steps: how many.
+        shrink: edge of the squares of pixels whose means are looked at: where voxels are larger than pixels, a mean says the
+            same with fewer rays.
+        views, tiles: views a step, and tiles of 4 x 4 pixels of each.
+    """
+
+    longest: int
+    steps: int
+    shrink: int = 1
+    views: int = 8
+    tiles: int = 256
+
+
+@dataclass(frozen=True)
+class Plan:
+    """How a fit goes.
+
+    Attributes:
+        stages: in their order.
+        degree: of the harmonics.
+        density_rate, sh_rate: first learning rates: of the density times half the longest edge [1], of coefficients [radiance].
+        last: factor on both in the last step; they fall exponentially.
+        delay: share of the steps over which the density's rate rises from a hundredth (a quarter of a sine).
+        memory: of the running mean of squared derivatives.
+        tv_density, tv_sh: total variation of the density (times half the longest edge) and of the coefficients.
+        tv_share: share of the rows that a step's total variation looks at.
+        sparsity: of sum log(1 + 2 sigma^2) over the rows.
+        beta: of log T + log(1 - T), which asks rays to end in matter or to pass; mean over the rays.
+        stop: a ray ends at this transmittance; what is left out is at most that share of the brightest colour.
+        keep_weight: a node is kept where some ray gives a cell of it this weight.
+        start: the first density, times half the longest edge.
+        survey: steps after which the map of occupied cells is made anew.
+        random_background: photographs with alpha are seen over another colour each step.
+    """
+
+    stages: tuple[Stage, ...]
+    degree: int = 2
+    density_rate: float = 10.0
+    sh_rate: float = 0.05
+    last: float = 0.02
+    delay: float = 0.0
+    memory: float = 0.95
+    tv_density: float = 0.0
+    tv_sh: float = 1e-6
+    tv_share: float = 1 / 16
+    sparsity: float = 0.0
+    beta: float = 0.0
+    stop: float = 1e-4
+    keep_weight: float = 0.01
+    start: float = 0.1
+    survey: int = 64
+    random_background: bool = False
+
+    @property
+    def steps(self) -> int:
+        """Steps of all stages."""
+        return sum(stage.steps for stage in self.stages)
+
+    def stage_at(self, step: int) -> int:
+        """The number of the stage to which a step belongs."""
+        for number, stage in enumerate(self.stages):
+            step -= stage.steps
+            if step < 0:
+                return number
+        return len(self.stages) - 1
+
+    def rates(self, step: int) -> tuple[float, float]:
+        """Learning rates in a step: of the density times half the longest edge, and of coefficients."""
+        share = step / max(self.steps, 1)
+        rise = 1.0
+        if self.delay > 0:
+            rise = 0.01 + 0.99 * math.sin(math.pi / 2 * min(share / self.delay, 1))
+        return self.density_rate * self.last**share * rise, self.sh_rate * self.last**share
+
+
+PRESETS: dict[str, Plan] = {
+    "tiny": Plan((Stage(24, 100, 4, tiles=32), Stage(48, 200, 2, tiles=64))),
+    "cpu": Plan((Stage(32, 200, 4, tiles=64), Stage(64, 300, 4, tiles=128), Stage(128, 1200, 2, tiles=256))),
+    "gpu": Plan(
+        (
+            Stage(64, 300, 4, 16, 512),
+            Stage(128, 700, 2, 16, 1024),
+            Stage(256, 3000, 1, 16, 2048),
+            Stage(512, 4000, 1, 16, 2048),
+        )
+    ),
+}
+"""``tiny`` takes seconds, ``cpu`` minutes on two cores, ``gpu`` has the resolutions of Plenoxels (256, then 512)."""
+
+
+def place_grid(box: np.ndarray, longest: int) -> tuple[tuple[int, int, int], np.ndarray]:
+    """Resolution (Z, Y, X) and place of a grid of cubic voxels that fills a box (2, 3), and a little more where it must."""
+    edges = box[1] - box[0]
+    h = edges.max() / longest
+    counts = np.maximum(np.ceil(edges / h - 1e-9), 1).astype(int)
+    to_world = np.diag([*(counts * h), 1.0])
+    to_world[:3, 3] = box.mean(axis=0) - counts * h / 2
+    return (int(counts[2]), int(counts[1]), int(counts[0])), to_world
+
+
+FILLED = 0.15
+"""Share of the nodes of a finer stage that are taken to be kept, before it is known: objects fill 0.05 to 0.3 of their box."""
+
+RAY = 256
+"""Bytes a ray: its state and what it saw (128 measured), its target, and what is in flight."""
+
+
+def bytes_of(plan: Plan, stage: Stage, box: np.ndarray, rows: int | None = None) -> int:
+    """Memory of a stage [bytes]: values, derivatives and the optimiser's squares, tables of pinholes, cells, rays.
+
+    Args:
+        plan, stage, box: what is asked for.
+        rows: nodes that are stored; None to estimate them.
+    """
+    nodes = math.prod(place_grid(box, stage.longest)[0])
+    rows = (nodes if stage is plan.stages[0] else int(FILLED * nodes)) if rows is None else rows
+    copies = 2 + (dr.thread_count() if dr.backend_v(mi.Float) == dr.JitBackend.LLVM else 0)
+    a_row = 12 * (1 + row_width(basis_size(plan.degree))) + 12
+    a_row += stage.views * (16 * copies + 1.3 * 32 * copies)
+    return int(rows * a_row + 16 * nodes + stage.views * stage.tiles * TILE**2 * RAY)
+
+
+def memory_of(plan: Plan, box: np.ndarray, views: Views, limit: int | None = None) -> str:
+    """What a fit will take, in a sentence.
+
+    Args:
+        plan, box, views: what is asked for.
+        limit: [bytes]; None for what the machine has left (on a GPU nothing is checked).
+
+    Raises:
+        MivolError: more than there is; the largest resolution that fits is said.
+    """
+    most = views.bytes + max(bytes_of(plan, stage, box) for stage in plan.stages)
+    last = plan.stages[-1]
+    if limit is None and dr.backend_v(mi.Float) == dr.JitBackend.LLVM:
+        limit = available_memory()
+    if limit is not None and most > limit:
+        fitting = [n for n in range(8, last.longest) if views.bytes + bytes_of(plan, replace(last, longest=n), box) <= limit]
+        advice = f"{fitting[-1]} fits" if fitting else "no resolution fits: read the photographs smaller"
+        taken, left = f"{most / 2**30:.1f} GiB", f"{limit / 2**30:.1f}"
+        raise MivolError(f"a fit with {last.longest} nodes along an edge takes about {taken} and {left} are left; {advice}.")
+    first = bytes_of(plan, plan.stages[0], box)
+    return (
+        f"about {most / 2**20:.0f} MiB: photographs {views.bytes / 2**20:.0f}, the first grid {first / 2**20:.0f}, "
+        f"the last {bytes_of(plan, last, box) / 2**20:.0f} if it fills {FILLED:.0%} of its box"
+    )

@@ -1,0 +1,172 @@
+"""Photographs where a fit draws its rays: pixels in memory, in several sizes, and the ray of each.
+
+Conventions. A batch is square tiles of pixels: neighbours cross the same cells, so their reads and writes meet in the cache,
+and a packet of lanes walks as one. Tiles lie anywhere in a view, all places alike. Smaller sizes are exact means over area;
+where voxels are larger than pixels, a small image says the same with fewer rays. Values are those of the photographs (8-bit
+steps), not decoded.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mivol.errors import MivolError
+from mivol.photos import Photo
+from mivol.transport.radiance import Rays
+
+__all__ = ["TILE", "Batch", "Level", "Views"]
+
+TILE = 4
+"""Edge of a tile [pixel]: 16 lanes, a packet of AVX-512."""
+
+
+@dataclass
+class Level:
+    """All views in one size: codes 0..255, [row][column][rgb] or, with alpha, [rgba], one view after the other."""
+
+    codes: mi.UInt8
+    sizes: np.ndarray
+    starts: np.ndarray
+    shrink: int
+
+
+@dataclass
+class Batch:
+    """Rays of pixels: the slot of each ray's view among the chosen ones, and what the photograph shows.
+
+    ``alpha`` is 1 where the photographs have none.
+    """
+
+    rays: Rays
+    slot: mi.UInt32
+    target: mi.Color3f
+    alpha: mi.Float
+
+
+@dataclass
+class Views:
+    """Photographs of pinhole cameras.
+
+    Attributes:
+        origins: (V, 3) pinholes.
+        levels: sizes, by how much they are shrunk: 1, 2, 4 ...
+        channels: 3, or 4 with alpha.
+        background: (3,) what the photographs with alpha lie over.
+    """
+
+    origins: np.ndarray
+    lenses: mi.Float
+    levels: dict[int, Level]
+    channels: int
+    background: np.ndarray
+
+    @classmethod
+    def of(cls, photos: Sequence[Photo], shrinks: Sequence[int] = (1,), with_alpha: bool = False) -> Views:
+        """Take over photographs.
+
+        Args:
+            photos: at least one.
+            shrinks: sizes to keep, 1 for that of the photographs.
+            with_alpha: keep alpha, for backgrounds that change.
+
+        Raises:
+            MivolError: a lens with distortion, or no alpha where it is asked for.
+        """
+        for photo in photos:
+            if photo.camera.distortion:
+                raise MivolError(f"{photo.name} was taken through a lens with distortion; rectify the photographs first.")
+            if with_alpha and photo.alpha is None:
+                raise MivolError(f"{photo.name} has no alpha; its background cannot be replaced: choose none.")
+        lenses = np.array([_lens(photo) for photo in photos], np.float32)
+        levels = {shrink: _level(photos, shrink, with_alpha) for shrink in sorted(set(shrinks))}
+        origins = np.array([photo.camera.origin for photo in photos])
+        return cls(origins, mi.Float(lenses.reshape(-1)), levels, 4 if with_alpha else 3, np.array(photos[0].background))
+
+    @property
+    def bytes(self) -> int:
+        """Memory that the pixels take."""
+        return sum(dr.width(level.codes) for level in self.levels.values())
+
+    def draw(self, shrink: int, views: np.ndarray, tiles: int, rng: np.random.Generator) -> Batch:
+        """Draw tiles of some views: ``tiles`` of each, rays of a view side by side."""
+        level = self.levels[shrink]
+        room = level.sizes[views] - TILE + 1
+        corner = (rng.random((len(views), tiles, 2)) * room[:, None]).astype(np.uint32)
+        # Rays of a view in the order of its rows: neighbours in the image are neighbours in time.
+        order = np.argsort(corner[..., 1] // 32 * 4096 + corner[..., 0], axis=1)
+        corner = np.take_along_axis(corner, order[..., None], axis=1)
+        lane = dr.arange(mi.UInt32, len(views) * tiles * TILE * TILE)
+        tile, within = lane // (TILE * TILE), lane % (TILE * TILE)
+        place = [dr.gather(mi.UInt32, mi.UInt32(np.ascontiguousarray(corner[..., a]).reshape(-1)), tile) for a in range(2)]
+        return self.look_up(shrink, views, tile // tiles, place[0] + within % TILE, place[1] + within // TILE)
+
+    def whole(self, shrink: int, view: int) -> Batch:
+        """All pixels of a view, tile by tile; those of tiles that reach over its edge more than once."""
+        width, height = (int(n) for n in self.levels[shrink].sizes[view])
+        across, down = -(-width // TILE), -(-height // TILE)
+        lane = dr.arange(mi.UInt32, across * down * TILE * TILE)
+        tile, within = lane // (TILE * TILE), lane % (TILE * TILE)
+        column = dr.minimum(tile % across * TILE + within % TILE, width - 1)
+        row = dr.minimum(tile // across * TILE + within // TILE, height - 1)
+        return self.look_up(shrink, np.array([view]), lane * 0, column, row)
+
+    def digest(self) -> str:
+        """A fingerprint of cameras and pixels."""
+        found = hashlib.sha256(np.array(self.lenses).tobytes() + self.background.tobytes())
+        for _, level in sorted(self.levels.items()):
+            found.update(np.array(level.codes).tobytes())
+        return found.hexdigest()[:16]
+
+    def look_up(self, shrink: int, views: np.ndarray, slot: mi.UInt32, column: mi.UInt32, row: mi.UInt32) -> Batch:
+        """The rays through the centres of pixels, and what is there."""
+        level = self.levels[shrink]
+        table = np.stack([views, level.starts[views], level.sizes[views][:, 0]], axis=1).astype(np.uint32)
+        view, start, width = (dr.gather(mi.UInt32, mi.UInt32(np.ascontiguousarray(table[:, k])), slot) for k in range(3))
+        pixel = (start + row * width + column) * self.channels
+        codes = [mi.Float(dr.gather(mi.UInt8, level.codes, pixel + k)) * (1 / 255) for k in range(self.channels)]
+        lens = [dr.gather(mi.Float, self.lenses, view * LENS + k) for k in range(LENS)]
+        x = ((mi.Float(column) + 0.5) * level.shrink - lens[2]) * lens[0]
+        y = (lens[3] - (mi.Float(row) + 0.5) * level.shrink) * lens[1]
+        d = mi.Vector3f(*(dr.fma(lens[4 + 3 * a], x, dr.fma(lens[5 + 3 * a], y, -lens[6 + 3 * a])) for a in range(3)))
+        o = mi.Point3f(lens[13], lens[14], lens[15])
+        alpha = codes[3] if self.channels == 4 else mi.Float(1)
+        return Batch(Rays(o, dr.normalize(d)), slot, mi.Color3f(*codes[:3]), alpha)
+
+
+LENS = 16
+"""Numbers a camera: 1/fx, 1/fy, cx, cy, rotation by rows, origin."""
+
+
+def _lens(photo: Photo) -> list[float]:
+    K, pose = photo.camera.K, photo.camera.to_world
+    return [1 / K[0, 0], 1 / K[1, 1], K[0, 2], K[1, 2], *pose[:3, :3].reshape(-1), *pose[:3, 3]]
+
+
+def _level(photos: Sequence[Photo], shrink: int, with_alpha: bool) -> Level:
+    images = [_shrunk(_pixels(photo, with_alpha), shrink) for photo in photos]
+    sizes = np.array([image.shape[1::-1] for image in images], np.int64)
+    if sizes.min() < TILE:
+        raise MivolError(f"a view of {sizes.min()} pixels an edge was given at 1/{shrink}; {TILE} are needed: shrink less.")
+    counts = sizes.prod(axis=1)
+    if counts.sum() * 4 >= 2**32:
+        raise MivolError(f"{counts.sum()} pixels were given; they are counted up to 2^30: read the photographs smaller.")
+    codes = np.concatenate([np.rint(image * 255).astype(np.uint8).reshape(-1) for image in images])
+    return Level(mi.UInt8(codes), sizes, np.concatenate([[0], np.cumsum(counts)[:-1]]), shrink)
+
+
+def _pixels(photo: Photo, with_alpha: bool) -> np.ndarray:
+    image = np.clip(photo.image, 0, 1)
+    return np.concatenate([image, photo.alpha[..., None]], axis=2) if with_alpha else image
+
+
+def _shrunk(image: np.ndarray, shrink: int) -> np.ndarray:
+    """Means over squares of pixels; rows and columns that fill no square are left out, so that the camera stays the same."""
+    height, width = (n // shrink * shrink for n in image.shape[:2])
+    squares = image[:height, :width].reshape(height // shrink, shrink, width // shrink, shrink, -1)
+    return squares.mean(axis=(1, 3))

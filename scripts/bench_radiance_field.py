@@ -1,0 +1,458 @@
+#!/usr/bin/env python3
+"""How fast are a radiance field's rays and their derivatives, and how much sooner is a fit done, beside Mitsuba's tutorial?
+
+    scripts/bench_radiance_field.py                     # 20 minutes on 2 cores, most of them in the peer
+    scripts/bench_radiance_field.py --only step,memory  # 4 minutes
+    scripts/bench_radiance_field.py --quick             # under two minutes, small sizes: its times mean nothing
+
+The peer is scripts/radiance_peer.py: uniform steps over textures. Fields: a thin shell, a fog that fills the box, and a fitted
+scene (the chair of NeRF's synthetic scenes from MIVOL_DATA, fitted here for a minute; without data, views of a made-up object,
+and the JSON says so). All are 128^3 nodes of harmonics of degree 2 in [-1, 1]^3.
+
+step: forward and backward, the same 65,536 rays for both, in turns; ratios of processor time (which other work on the machine
+moves least), with the clock's beside them. camera: the pixels of one view; pixels: drawn at random from 8 views, as the
+tutorial's loader draws them; any: random origins and directions. The first two share pinholes, so their harmonics are summed
+once a node and pinhole, and that is counted; rays of the third share nothing.
+
+memory: the most that Dr.Jit held during a gradient step, for N and 4 N rays: what a ray costs is its own state.
+
+fit: views rendered of each field over black; both fit 7 of them as the tutorial does (4 stages up to the full resolution, one
+view a step), and the mean PSNR of 4 views between them is followed, the clock stopped while it is measured. Printed is the
+peer's time over ours to the PSNR that the peer ends with.
+"""
+
+from __future__ import annotations
+
+import resource
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import mivol  # noqa: F401  (chooses LLVM)
+from contest import AT_LEAST, AT_MOST, DATA, TO_WORLD, Bench, judge, race, ratio_of, say
+from mivol.fields.spherical import SphericalGrid
+from mivol.files import whole_file
+from mivol.optim.radiance_fit import Plan, RadianceFit, Stage
+from mivol.optim.radiance_views import Views
+from mivol.photos import Camera, Photo, load_photos, pixel_centres, rays, silhouette_box
+from mivol.photos.camera import intrinsics
+from mivol.transport.radiance import Rays, bake, cells_of, exact, fold, look, look_back, model_of
+from radiance_peer import Peer
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+STOP = 1e-4
+"""Transmittance at which our rays end; the peer's end at 0."""
+
+
+@dataclass(frozen=True)
+class Size:
+    """How much is measured."""
+
+    name: str = "full"
+    resolution: int = 128
+    side: int = 256
+    rounds: int = 3
+    steps: int = 105
+    chair_steps: int = 800
+
+
+FULL = Size()
+QUICK = Size("quick", 32, 64, 1, 4, 30)
+BOX = np.array([[-1.0, -1, -1], [1, 1, 1]])
+
+
+# -- Fields and views ---------------------------------------------------------------------------------------------------------
+
+
+def colours(n: int, seed: int = 0) -> np.ndarray:
+    """Smooth harmonics (n, n, n, 9, 3): colours about 0.5, a fifth of them with the direction."""
+    g = (np.arange(n, dtype=np.float32) + 0.5) / n * 2 - 1
+    z, y, x = np.meshgrid(g, g, g, indexing="ij")
+    rng = np.random.default_rng(seed)
+    sh = np.empty((n, n, n, 9, 3), np.float32)
+    for b in range(9):
+        for c in range(3):
+            k, phase = rng.uniform(-4, 4, 3), rng.uniform(0, 6)
+            sh[..., b, c] = (0.8 if b == 0 else 0.15) * np.sin(k[0] * x + k[1] * y + k[2] * z + phase)
+    return sh
+
+
+def shell(size: Size) -> tuple[SphericalGrid, str]:
+    """A sphere of 0.7 whose skin of two voxels is nearly opaque."""
+    n = size.resolution
+    g = (np.arange(n) + 0.5) / n * 2 - 1
+    z, y, x = np.meshgrid(g, g, g, indexing="ij")
+    density = np.clip(2.5 * n * (1 - np.abs(np.sqrt(x * x + y * y + z * z) - 0.7) * n / 2.5), -10, None)
+    keep = density > -10
+    return SphericalGrid.from_dense(density, colours(n), TO_WORLD, keep), "a shell of radius 0.7"
+
+
+def fog(size: Size) -> tuple[SphericalGrid, str]:
+    """A fog that fills the box."""
+    n = size.resolution
+    g = (np.arange(n) + 0.5) / n * 2 - 1
+    z, y, x = np.meshgrid(g, g, g, indexing="ij")
+    return SphericalGrid.from_dense(
+        1 + 0.5 * np.sin(5 * x) * np.sin(4 * y + z), colours(n, 1), TO_WORLD
+    ), "a fog of extinction 1"
+
+
+def fitted(size: Size) -> tuple[SphericalGrid, str]:
+    """The chair, fitted for a minute, or a made-up object's views."""
+    third = size.chair_steps // 4
+    stages = tuple(Stage(size.resolution // k, third * s, k, 8, 128) for k, s in ((4, 1), (2, 1), (1, 2)))
+    path = DATA / "multiview" / "chair"
+    if path.is_dir():
+        photos = load_photos(path, split="train", background="white", scale=0.5)
+        views, box, origin = Views.of(photos.views, (1, 2, 4)), silhouette_box(photos), "NeRF's chair"
+    else:
+        photos = photographed(shell(size)[0], 24, size.side)
+        views, box, origin = Views.of(photos, (1, 2, 4)), BOX, "views of the shell (no data folder)"
+    fit = RadianceFit(views, box, Plan(stages))
+    for number, stage in enumerate(stages):
+        fit.begin(number)
+        for _ in range(stage.steps):
+            fit.advance()
+    # Into the box of the others, dense: the peer has nothing else.
+    density, sh = fit.field.to_dense()
+    density, sh = (_resized(a, size.resolution) for a in (density * fit.unit, sh))
+    keep = density > 0
+    keep |= np.roll(keep, 1, 0) | np.roll(keep, -1, 0) | np.roll(keep, 1, 1) | np.roll(keep, -1, 1)
+    return SphericalGrid.from_dense(density, sh, TO_WORLD, keep), f"{origin}, fitted in {size.chair_steps} steps"
+
+
+def _resized(values: np.ndarray, n: int) -> np.ndarray:
+    """Put an array in the middle of n^3 nodes."""
+    out = np.zeros((n, n, n, *values.shape[3:]), np.float32)
+    low = [(n - s) // 2 for s in values.shape[:3]]
+    out[tuple(slice(a, a + s) for a, s in zip(low, values.shape[:3], strict=True))] = values[:n, :n, :n]
+    return out
+
+
+FIELDS: dict[str, Callable[[Size], tuple[SphericalGrid, str]]] = {"shell": shell, "fog": fog, "fitted": fitted}
+_KEPT: dict[tuple[str, str], tuple[SphericalGrid, str]] = {}
+
+
+def field_of(name: str, size: Size) -> tuple[SphericalGrid, str]:
+    """A field, made once."""
+    if (name, size.name) not in _KEPT:
+        _KEPT[name, size.name] = FIELDS[name](size)
+    return _KEPT[name, size.name]
+
+
+def camera(k: int, of: int, side: int, height: float = 0.9) -> Camera:
+    """Camera k on a ring about the box, looking at its middle."""
+    angle = 2 * np.pi * k / of
+    back = np.array([np.cos(angle), np.sin(angle), 0.0]) * 3 + [0, 0, height]
+    z = back / np.linalg.norm(back)
+    x = np.cross([0, 0, 1], z)
+    x /= np.linalg.norm(x)
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = np.stack([x, np.cross(z, x), z], axis=1), back
+    return Camera(intrinsics(1.2 * side, 1.2 * side, side / 2, side / 2), (side, side), pose, name=f"camera {k}")
+
+
+def ring(side: int, count: int = 7, between: bool = False) -> list[Camera]:
+    """Cameras of a ring, or those half-way between some of them."""
+    return (
+        [camera(k + 0.5, count, side) for k in range(0, count, 2)]
+        if between
+        else [camera(k, count, side) for k in range(count)]
+    )
+
+
+def tiled(side: int) -> np.ndarray:
+    """Pixels of a view (row, column), tile by tile of 4 x 4."""
+    i = np.arange(side * side)
+    tile, within = i // 16, i % 16
+    return np.stack([tile // (side // 4) * 4 + within // 4, tile % (side // 4) * 4 + within % 4], axis=1)
+
+
+def rays_through(one: Camera, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Origins and directions of rays through the centres of pixels (row, column)."""
+    o, d = rays(one, pixel_centres(one.size)[pixels[:, 0], pixels[:, 1]])
+    return np.broadcast_to(o, d.shape), d
+
+
+def rays_of(o: np.ndarray, d: np.ndarray) -> Rays:
+    """Rays on the device."""
+    made = Rays(*(kind(np.ascontiguousarray(np.float32(a.T))) for kind, a in ((mi.Point3f, o), (mi.Vector3f, d))))
+    dr.eval(made.o, made.d)
+    return made
+
+
+def photographed(field: SphericalGrid, count: int, side: int, between: bool = False) -> list[Photo]:
+    """Views of a field over black, from a ring."""
+    return [_photo(field, one) for one in ring(side, count, between)]
+
+
+def _photo(field: SphericalGrid, one: Camera) -> Photo:
+    o, d = rays_through(one, tiled(one.size[0]))
+    cells = cells_of(field)
+    seen = look(cells, bake(field, cells, o[:1], mi.UInt32(0)), model_of(field), rays_of(o, d))
+    image = np.empty((*one.size, 3), np.float32)
+    image[tuple(tiled(one.size[0]).T)] = np.clip(np.array(seen.colour).T, 0, 1)
+    return Photo(one.name, image, None, None, one, np.zeros(3, np.float32))
+
+
+# -- Steps --------------------------------------------------------------------------------------------------------------------
+
+
+@dataclass
+class Task:
+    """Rays of one kind: what they are, their pinholes and which of them each has."""
+
+    rays: Rays
+    pinholes: np.ndarray | None = None
+    view: np.ndarray | None = None
+
+
+def tasks(size: Size) -> dict[str, Task]:
+    """The three kinds of rays."""
+    n = size.side**2
+    rng = np.random.default_rng(0)
+    one = camera(0.3, 7, size.side)
+    found = {"camera": Task(rays_of(*rays_through(one, tiled(size.side))), one.origin[None], np.zeros(n, int))}
+    eight = ring(size.side, 8)
+    view = np.sort(rng.integers(8, size=n))
+    pixels = rng.integers(size.side, size=(n, 2))
+    pairs = [rays_through(c, pixels[view == k]) for k, c in enumerate(eight)]
+    o, d = (np.concatenate(part) for part in zip(*pairs, strict=True))
+    found["pixels"] = Task(rays_of(o, d), np.array([c.origin for c in eight]), view)
+    o = rng.normal(size=(n, 3))
+    o *= 3 / np.linalg.norm(o, axis=1, keepdims=True)
+    d = rng.uniform(-0.7, 0.7, (n, 3)) - o
+    found["any"] = Task(rays_of(o, d / np.linalg.norm(d, axis=1, keepdims=True)))
+    return found
+
+
+def our_step(field: SphericalGrid, task: Task) -> Callable[[int], list[mi.Float]]:
+    """Forward and backward of the squared radiance."""
+    cells, model = cells_of(field), model_of(field, STOP)
+    view = None if task.view is None else mi.UInt32(task.view.astype(np.uint32))
+
+    def step(number: int) -> list[mi.Float]:
+        baked = view is not None
+        source = bake(field, cells, task.pinholes, view, True) if baked else exact(field, task.rays, True)
+        seen = look(cells, source, model, task.rays)
+        dr.eval(seen)
+        look_back(cells, source, model, seen, 2 * seen.colour)
+        return list(fold(field, cells, source, task.pinholes)) if baked else [source.density_slope, source.harmonics_slope]
+
+    return step
+
+
+def peer_of(field: SphericalGrid) -> Peer:
+    """The same field in textures over the unit cube, whose lengths are half of ours."""
+    density, sh = field.to_dense()
+    density, sh = density[..., None] * np.float32(2), sh.reshape(*sh.shape[:3], 27)
+    return Peer(*(mi.TensorXf(np.ascontiguousarray(a)) for a in (density, sh)))
+
+
+def peer_step(peer: Peer, task: Task) -> Callable[[int], list[mi.Float]]:
+    """The same of the peer."""
+    o, d = mi.Point3f((task.rays.o + 1) * 0.5), task.rays.d
+    dr.eval(o)
+
+    def step(number: int) -> list[mi.Float]:
+        L = peer.render(o, d)
+        dr.eval(L)
+        return list(peer.backward(o, d, L, 2 * L))
+
+    return step
+
+
+def ask_step(size: Size) -> dict:
+    """How many rays a second, forward and backward, beside the peer?"""
+    answer = {}
+    for name in FIELDS:
+        field, origin = field_of(name, size)
+        peer = peer_of(field)
+        answer[name] = {"field": origin, "rows": field.rows}
+        for kind, task in tasks(size).items():
+            times = race({"mivol": our_step(field, task), "peer": peer_step(peer, task)}, size.rounds)
+            answer[name][kind] = {
+                "ratio_of_processor_time": ratio_of(times["peer"], times["mivol"], "processor"),
+                "ratio_of_time": ratio_of(times["peer"], times["mivol"]),
+                **{who: t.report(size.side**2, "rays") for who, t in times.items()},
+            }
+            say(f"  {name}, {kind}: {answer[name][kind]['ratio_of_processor_time']:.1f}")
+    return answer
+
+
+# -- Memory -------------------------------------------------------------------------------------------------------------------
+
+
+def ask_memory(size: Size) -> dict:
+    """What does a gradient step hold, and what of it goes with the rays?"""
+    field, _ = field_of("shell", size)
+    peaks = []
+    for side in (size.side, 2 * size.side):
+        task = tasks(replace(size, side=side))["camera"]
+        step = our_step(field, task)
+        for _ in range(2):
+            dr.eval(step(0))
+            dr.sync_thread()
+            dr.flush_malloc_cache()
+            dr.detail.malloc_clear_statistics()
+        dr.eval(step(0))
+        dr.sync_thread()
+        peaks.append(dr.detail.malloc_watermark(dr.backend_v(mi.Float)))
+    rays_more = 3 * size.side**2
+    return {
+        "field_bytes": field.bytes,
+        "peak_bytes": peaks,
+        "bytes_per_ray": (peaks[1] - peaks[0]) / rays_more,
+        "resident_bytes": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024,
+    }
+
+
+# -- Fits ---------------------------------------------------------------------------------------------------------------------
+
+
+class Judge:
+    """Held-out views, and the mean PSNR of renders of them; its time is not counted."""
+
+    def __init__(self, photos: list[Photo]) -> None:
+        self.views = []
+        for photo in photos:
+            side = photo.camera.size[0]
+            o, d = rays_through(photo.camera, tiled(side))
+            self.views.append((rays_of(o, d), photo.image[tuple(tiled(side).T)], o[:1]))
+
+    def __call__(self, render: Callable[[Rays, np.ndarray], np.ndarray]) -> float:
+        errors = [np.mean((np.clip(render(rays, o), 0, 1) - image) ** 2) for rays, image, o in self.views]
+        return float(np.mean([-10 * np.log10(max(e, 1e-10)) for e in errors]))
+
+
+def our_fit(photos: list[Photo], judge_of: Judge, size: Size) -> list[tuple[float, float]]:
+    """(seconds, PSNR) of our fit."""
+    n, steps = size.resolution, size.steps
+    stages = tuple(
+        Stage(n // k, steps * s // 2, 1 if k == 1 else 2, 7, 73 * size.side**2 // 2**16 or 1)
+        for k, s in ((4, 1), (2, 1), (1, 4))
+    )
+    fit = RadianceFit(Views.of(photos, (1, 2)), BOX, Plan(stages))
+
+    def render(rays: Rays, origin: np.ndarray) -> np.ndarray:
+        cells = cells_of(fit.field)
+        seen = look(cells, bake(fit.field, cells, origin, mi.UInt32(0)), model_of(fit.field, STOP), rays)
+        return np.array(seen.colour).T
+
+    curve, spent = [], 0.0
+    for number, stage in enumerate(stages):
+        start = time.perf_counter()
+        fit.begin(number)
+        for step in range(stage.steps):
+            dr.eval(fit.advance())
+            if (step + 1) % max(steps // 8, 1) == 0:
+                dr.sync_thread()
+                spent += time.perf_counter() - start
+                curve.append((spent, judge_of(render)))
+                start = time.perf_counter()
+        dr.sync_thread()
+        spent += time.perf_counter() - start
+    return curve
+
+
+def peer_fit(photos: list[Photo], judge_of: Judge, size: Size) -> list[tuple[float, float]]:
+    """(seconds, PSNR) of the peer's fit."""
+    views = []
+    for photo in photos:
+        o, d = rays_through(photo.camera, tiled(photo.camera.size[0]))
+        ray = rays_of((o + 1) / 2, d)
+        views.append((ray.o, ray.d, mi.Color3f(np.ascontiguousarray(photo.image[tuple(tiled(photo.camera.size[0]).T)].T))))
+    peer, curve, spent = Peer.start(size.resolution // 8), [], 0.0
+
+    def render(rays: Rays, origin: np.ndarray) -> np.ndarray:
+        return np.array(peer.render(mi.Point3f((rays.o + 1) * 0.5), rays.d)).T
+
+    for number in range(4):
+        start = time.perf_counter()
+        for step, _ in enumerate(peer.fit(views, size.steps)):
+            dr.eval(peer.density, peer.harmonics)
+            if (step + 1) % max(size.steps // 3, 1) == 0:
+                dr.sync_thread()
+                spent += time.perf_counter() - start
+                curve.append((spent, judge_of(render)))
+                start = time.perf_counter()
+        if number < 3:
+            peer = peer.refined()
+    return curve
+
+
+def ask_fit(size: Size) -> dict:
+    """How long until held-out views are as good as the peer's?"""
+    answer = {}
+    for name in FIELDS:
+        field, origin = field_of(name, size)
+        photos = photographed(field, 7, size.side)
+        judge_of = Judge(photographed(field, 7, size.side, between=True))
+        ours, theirs = our_fit(photos, judge_of, size), peer_fit(photos, judge_of, size)
+        goal = theirs[-1][1]
+        when = next((t for t, psnr in ours if psnr >= goal), None)
+        ratio = 0.0 if when is None else theirs[-1][0] / when
+        answer[name] = {"field": origin, "peer_psnr": goal, "ours": ours, "peer": theirs, "ratio": ratio}
+        reached = "not reached" if when is None else f"after {when:.1f} s"
+        say(f"  {name}: peer {goal:.2f} dB in {theirs[-1][0]:.0f} s; ours {reached}, ends at {ours[-1][1]:.2f} dB")
+    return answer
+
+
+# -- Saying it ----------------------------------------------------------------------------------------------------------------
+
+
+def compare(question: str, answer: dict) -> list[dict]:
+    """The figures that have a bar."""
+    if question == "memory":
+        return [judge("bytes a ray beyond the grid's", answer["bytes_per_ray"], AT_MOST, 512)]
+    if question == "fit":
+        return [judge(f"{name}: time to the same PSNR", a["ratio"], AT_LEAST, 10) for name, a in answer.items()]
+    bars = {"camera": 8, "pixels": 4, "any": 4}
+    return [
+        judge(f"{name}: {kind} rays, forward and backward", a[kind]["ratio_of_processor_time"], AT_LEAST, bar)
+        for name, a in answer.items()
+        for kind, bar in bars.items()
+    ]
+
+
+def draw(answers: dict, folder: Path) -> None:
+    """Ratios as bars, and the curves of the fits."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    fig, axes = plt.subplots(1, 4, figsize=(18, 4), layout="constrained")
+    if "step" in answers:
+        for k, kind in enumerate(("camera", "pixels", "any")):
+            values = [a[kind]["ratio_of_processor_time"] for a in answers["step"].values()]
+            axes[0].bar(np.arange(len(values)) + 0.25 * k, values, 0.25, label=kind)
+        axes[0].set_xticks(np.arange(len(FIELDS)) + 0.25, list(FIELDS))
+        axes[0].set(ylabel="times the peer's rays a second", title="forward and backward")
+        axes[0].legend()
+    for ax, (name, a) in zip(axes[1:], answers.get("fit", {}).items(), strict=False):
+        for who in ("ours", "peer"):
+            ax.plot(*zip(*a[who], strict=True), "o-", ms=3, label=who)
+        ax.axhline(a["peer_psnr"], color="gray", ls=":")
+        ax.set(xscale="log", xlabel="seconds", ylabel="held-out PSNR [dB]", title=name)
+        ax.legend()
+    with whole_file(folder / "bench_radiance_field.png") as temporary:
+        fig.savefig(temporary, dpi=90, format="png")
+    plt.close(fig)
+
+
+BENCH = Bench(
+    "bench_radiance_field",
+    __doc__,
+    {"step": ask_step, "memory": ask_memory, "fit": ask_fit},
+    (FULL, QUICK),
+    compare,
+    draw,
+)
+
+if __name__ == "__main__":
+    BENCH.main()

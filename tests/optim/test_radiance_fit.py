@@ -1,0 +1,211 @@
+"""The fit of a radiance field: its parts against what is known, and a small fit from its first step to its pictures."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mivol.errors import MivolError
+from mivol.fields.resampling import resample_field
+from mivol.fields.spherical import SphericalGrid
+from mivol.optim.radiance_fit import RadianceFit, render_view
+from mivol.optim.radiance_plan import PRESETS, Plan, Stage, memory_of, place_grid
+from mivol.optim.radiance_priors import add_sparsity, add_variation, next_rows
+from mivol.optim.radiance_views import TILE, Views
+from mivol.photos import Camera, Lens, Photo, pixel_centres, rays
+from mivol.photos.camera import intrinsics
+
+BOX = np.array([[-1.0, -1, -1], [1, 1, 1]])
+CUBE = np.array([[2.0, 0, 0, -1], [0, 2, 0, -1], [0, 0, 2, -1], [0, 0, 0, 1]])
+WHITE = np.ones(3, np.float32)
+
+
+def ball(n: int = 24) -> SphericalGrid:
+    """A sphere of many colours with a sheen that goes with the direction."""
+    g = (np.arange(n) + 0.5) / n * 2 - 1
+    z, y, x = np.meshgrid(g, g, g, indexing="ij")
+    sh = np.zeros((n, n, n, 4, 3))
+    sh[..., 0, :] = np.stack([np.sin(3 * x), np.cos(4 * y), np.sin(3 * z + 1)], axis=-1)
+    sh[..., 2, :] = 0.4
+    return SphericalGrid.from_dense(60 * (0.6 - np.sqrt(x * x + y * y + z * z)), sh, CUBE)
+
+
+def camera(k: float, side: int = 48) -> Camera:
+    back = np.array([np.cos(0.7 * k), np.sin(0.7 * k), 0.9 * np.cos(1.9 * k)]) * 3
+    z = back / np.linalg.norm(back)
+    x = np.cross([0, 0, 1], z)
+    x /= np.linalg.norm(x)
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = np.stack([x, np.cross(z, x), z], axis=1), back
+    return Camera(intrinsics(1.3 * side, 1.3 * side, side / 2, side / 2), (side, side), pose)
+
+
+def photo(field: SphericalGrid, k: float, side: int = 48) -> Photo:
+    seen = render_view(field, camera(k, side), WHITE)
+    return Photo(f"view {k}", np.clip(seen.image, 0, 1), seen.opacity, None, camera(k, side), WHITE)
+
+
+PLAN = Plan((Stage(12, 60, 2, 4, 24), Stage(24, 90, 1, 4, 48)), degree=1)
+
+
+@pytest.fixture(scope="module")
+def photos() -> list[Photo]:
+    mi.set_variant("llvm_ad_rgb")
+    return [photo(ball(), k) for k in range(16)]
+
+
+def error_of(fit: RadianceFit, k: float = 2.5) -> float:
+    return float(np.mean((np.clip(render_view(fit.field, camera(k), WHITE).image, 0, 1) - photo(ball(), k).image) ** 2))
+
+
+def fitted(views: Views, plan: Plan, steps: int | None = None, fit: RadianceFit | None = None) -> RadianceFit:
+    fit = fit or RadianceFit(views, BOX, plan)
+    while fit.step < (plan.steps if steps is None else steps):
+        fit.advance()
+    return fit
+
+
+def test_a_fit_finds_what_it_did_not_see(variant_rgb: str, photos: list[Photo]) -> None:
+    fit = fitted(Views.of(photos, (1, 2)), PLAN)
+    # 0.0032: 25 dB in a view between those it saw. The mean colour of the views alone gives 11 dB.
+    assert error_of(fit) < 0.0032
+    assert fit.field.nodes is not None and fit.field.rows < 0.9 * 24**3
+    seen = render_view(fit.field, camera(2.5), WHITE)
+    middle = seen.depth[22:26, 22:26].mean()
+    distance = np.linalg.norm(camera(2.5).origin) - 0.6
+    # The sphere's near side, within two voxels.
+    assert abs(middle - distance) < 2 * 2 / 24
+    assert np.isnan(seen.depth[0, 0]) and seen.opacity[0, 0] == 0
+
+
+def test_a_fit_that_went_on_equals_one_that_did_not_stop(variant_rgb: str, photos: list[Photo]) -> None:
+    views = Views.of(photos[:6], (1, 2))
+    plan = replace(PLAN, stages=(Stage(8, 10, 2, 3, 8), Stage(16, 10, 1, 3, 8)), tv_density=1e-8)
+    whole = fitted(views, plan, 14)
+    arrays, about = whole.pack()
+    whole = fitted(views, plan, 20, whole)
+    resumed = RadianceFit(views, BOX, plan)
+    resumed.restore(arrays, about)
+    assert resumed.step == 14
+    resumed = fitted(views, plan, 20, resumed)
+    for a, b in zip(whole.field.values(), resumed.field.values(), strict=True):
+        # RMSprop turns the last bits of sums into steps of up to a learning rate where a derivative is nearly 0: most agree.
+        scale = np.abs(a).max()
+        assert np.mean(np.abs(a - b) > 1e-3 * scale) < 0.01
+
+
+def test_backgrounds_that_change_leave_no_white_in_the_air(variant_rgb: str, photos: list[Photo]) -> None:
+    views = Views.of(photos, (1, 2), with_alpha=True)
+    fit = fitted(views, replace(PLAN, random_background=True))
+    assert error_of(fit) < 0.0064
+    # A corner of the view is empty whatever stands behind it.
+    black = render_view(fit.field, camera(2.5), np.zeros(3)).image
+    assert black[:4, :4].max() < 0.05
+
+
+def test_views_know_their_rays_and_pixels(variant_rgb: str, photos: list[Photo]) -> None:
+    views = Views.of(photos[:3], (1, 2))
+    batch = views.draw(1, np.array([0, 2]), 5, np.random.default_rng(0))
+    assert dr.width(batch.slot) == 2 * 5 * TILE**2
+    whole = views.whole(1, 1)
+    _, d = rays(photos[1].camera, pixel_centres((48, 48)))
+    found = np.array(whole.rays.d).T.reshape(12, 12, 4, 4, 3).transpose(0, 2, 1, 3, 4).reshape(48, 48, 3)
+    np.testing.assert_allclose(found, d, atol=3e-7)
+    image = np.array(whole.target).T.reshape(12, 12, 4, 4, 3).transpose(0, 2, 1, 3, 4).reshape(48, 48, 3)
+    np.testing.assert_allclose(image, photos[1].image, atol=0.5 / 255 + 1e-6)
+    half = np.array(views.whole(2, 1).rays.d).T[0]
+    assert np.abs(half - d[0:2, 0:2].mean(axis=(0, 1))).max() < 1e-3
+    assert views.digest() != Views.of(photos[1:4], (1, 2)).digest()
+
+
+def test_a_field_on_finer_nodes_is_the_same_field(variant_rgb: str) -> None:
+    n = 6
+    g = (np.arange(n) + 0.5) / n
+    z, y, x = np.meshgrid(g, g, g, indexing="ij")
+    sh = np.stack([x + 2 * y - z] * 3, axis=-1)[..., None, :]
+    field = SphericalGrid.from_dense(1 - x + y * 3, sh, CUBE)
+    keep = np.ones((n, n, n), bool)
+    keep[:2] = False
+    fine = resample_field(field, (12, 12, 12), CUBE, keep)
+    density, found = fine.to_dense()
+    g = (np.arange(12) + 0.5) / 12
+    z, y, x = np.meshgrid(g, g, g, indexing="ij")
+    inner = np.s_[5:-1, 1:-1, 1:-1]
+    np.testing.assert_allclose(density[inner], (1 - x + 3 * y)[inner], atol=1e-5)
+    np.testing.assert_allclose(found[..., 0, 0][inner], (x + 2 * y - z)[inner], atol=1e-5)
+    # Nodes 0 and 1 are not kept: fine nodes up to 2.5 lie between those only.
+    assert (density[:3] == 0).all() and (density[3:] != 0).any(axis=(1, 2)).all()
+    with pytest.raises(MivolError, match="other axes"):
+        resample_field(field, (12, 12, 12), np.array([[0, -1.0, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]), keep)
+
+
+def test_variation_and_sparsity_are_derivatives(variant_rgb: str) -> None:
+    rng = np.random.default_rng(0)
+    density, sh = rng.normal(size=(4, 5, 6)).astype(np.float32), np.zeros((4, 5, 6, 1, 3))
+    field = SphericalGrid.from_dense(density, sh, CUBE)
+    neighbours = next_rows(field)
+
+    def variation(v: np.ndarray) -> float:
+        steps = [np.diff(v, axis=a, append=np.take(v, [-1], axis=a)) * (6 / 256) for a in (0, 1, 2)]
+        return float(np.sum(np.sqrt(1e-9 + sum(s * s for s in steps))))
+
+    slopes = dr.zeros(mi.Float, density.size)
+    add_variation(field.density, slopes, 1, neighbours, 2.0, 6, 1.0, 7)
+    move = rng.normal(size=density.shape)
+    v = density.astype(np.float64)
+    expected = 2.0 * 0.01 * (variation(v + 1e-6 * move) - variation(v - 1e-6 * move)) / 2e-6
+    assert np.sum(np.array(slopes).reshape(density.shape) * move) == pytest.approx(expected, rel=1e-4)
+
+    slopes = add_sparsity(field.density, dr.zeros(mi.Float, density.size), 3.0, 0.5)
+    cauchy = lambda v: 3.0 * np.sum(np.log(1 + 2 * np.maximum(0.5 * v, 0) ** 2))  # noqa: E731
+    expected = (cauchy(v + 1e-6 * move) - cauchy(v - 1e-6 * move)) / 2e-6
+    assert np.sum(np.array(slopes).reshape(density.shape) * move) == pytest.approx(expected, rel=1e-4)
+
+
+def test_memory_is_counted_first(variant_rgb: str, photos: list[Photo]) -> None:
+    views = Views.of(photos[:2])
+    text = memory_of(PRESETS["cpu"], BOX, views, limit=1 << 40)
+    assert "MiB" in text
+    with pytest.raises(MivolError, match=r"512 nodes along an edge .* (\d+) fits"):
+        memory_of(PRESETS["gpu"], BOX, views, limit=2 << 30)
+    with pytest.raises(MivolError, match="no resolution fits"):
+        memory_of(PRESETS["gpu"], BOX, views, limit=1000)
+
+
+def test_grids_have_cubic_voxels_and_cover_the_box(variant_rgb: str) -> None:
+    box = np.array([[0.0, 1, 2], [1, 1.5, 4]])
+    res, to_world = place_grid(box, 20)
+    assert res == (20, 5, 10)
+    np.testing.assert_allclose(np.diag(to_world)[:3] / res[::-1], 0.1)
+    np.testing.assert_allclose(to_world[:3, 3], box[0], atol=1e-12)
+
+
+def test_fits_that_are_refused(variant_rgb: str, photos: list[Photo]) -> None:
+    views = Views.of(photos[:2])
+    for box, said in ((BOX[::-1], "lower and its upper"), (np.zeros(3), "lower and its upper")):
+        with pytest.raises(MivolError, match=said):
+            RadianceFit(views, box, replace(PLAN, stages=PLAN.stages[1:]))
+    with pytest.raises(MivolError, match="shrunk by 2"):
+        RadianceFit(views, BOX, PLAN)
+    bent = replace(photos[0], camera=replace(photos[0].camera, distortion=Lens(k1=0.1)))
+    with pytest.raises(MivolError, match="rectify"):
+        Views.of([bent])
+    with pytest.raises(MivolError, match="no alpha"):
+        Views.of([replace(photos[0], alpha=None)], with_alpha=True)
+    with pytest.raises(MivolError, match="shrink less"):
+        Views.of(photos[:1], (16,))
+    empty = [replace(p, image=np.ones_like(p.image)) for p in photos[:4]]
+    nothing = RadianceFit(Views.of(empty, (1, 2)), BOX + 50.0, PLAN)
+    with pytest.raises(MivolError, match="no view sees"):
+        fitted(nothing.views, PLAN, fit=nothing)
+
+
+def test_schedules() -> None:
+    plan = replace(PLAN, delay=0.1, last=0.01)
+    assert [plan.stage_at(s) for s in (0, 59, 60, 149, 150)] == [0, 0, 1, 1, 1]
+    assert plan.rates(0) == pytest.approx((0.1, 0.05))
+    assert plan.rates(150) == pytest.approx((0.1, 0.0005))
