@@ -42,7 +42,8 @@ class Cells:
         count: how many cells are listed.
         number: Int32 over the (Z + 1) (Y + 1) (X + 1) cells, x fastest: the place in ``corners``, or minus a distance.
         edges: UInt32, 4 a cell: its edges along x, bits 0, 1 of the edge being y, z.
-        pairs: UInt32, 2 an edge: the rows of its lower and its upper node. Each edge of a listed cell is listed once.
+        pairs: UInt32, 2 an edge: its lower and its upper node, in ``rows``. Each edge of a listed cell is listed once.
+        rows: UInt32, the rows of the nodes of listed cells, each once.
         from_world: (3, 4) map from the world to lattice coordinates.
     """
 
@@ -52,6 +53,7 @@ class Cells:
     number: mi.Int32
     edges: mi.UInt32
     pairs: mi.UInt32
+    rows: mi.UInt32
     from_world: list[list[mi.Float64]]
 
     @classmethod
@@ -90,13 +92,15 @@ class Cells:
         edges, pairs = _edges(listed if count else mi.UInt32(0), rows, res)
         to_world = check_affine(to_world)
         place = [[dr.opaque(mi.Float64, float(v)) for v in row] for row in lattice_from_world(to_world, res)]
-        dr.eval(number, edges, pairs)
-        return cls(res, to_world, count, number, edges, pairs, place)
+        used, pairs = _numbered(pairs, dr.width(rows))
+        dr.eval(number, edges, pairs, used)
+        return cls(res, to_world, count, number, edges, pairs, used, place)
 
     def corners(self, number: mi.UInt32, active: mi.Bool) -> list[mi.UInt32]:
         """The rows of the 8 corners of listed cells, bits 0, 1, 2 of the corner being x, y, z."""
         edges = dr.gather(mi.ArrayXu, self.edges, number, active, shape=(4, 1))
-        return [row for edge in edges for row in dr.gather(mi.ArrayXu, self.pairs, edge, active, shape=(2, 1))]
+        nodes = [node for edge in edges for node in dr.gather(mi.ArrayXu, self.pairs, edge, active, shape=(2, 1))]
+        return [dr.gather(mi.UInt32, self.rows, node, active) for node in nodes]
 
 
 def _edges(listed: mi.UInt32, rows: mi.UInt32, res: tuple[int, int, int]) -> tuple[mi.UInt32, mi.UInt32]:
@@ -117,6 +121,16 @@ def _edges(listed: mi.UInt32, rows: mi.UInt32, res: tuple[int, int, int]) -> tup
         row = dr.gather(mi.UInt32, rows, edge // (x + 1) * x + mi.UInt32(a))
         dr.scatter(pairs, row, dr.arange(mi.UInt32, dr.width(edge)) * 2 + q)
     return edges, pairs
+
+
+def _numbered(rows: mi.UInt32, most: int) -> tuple[mi.UInt32, mi.UInt32]:
+    """The different ones among numbers up to ``most``, ascending, and the place of each among them."""
+    used = dr.zeros(mi.UInt8, most + 1)
+    dr.scatter(used, mi.UInt8(1), rows)
+    different = dr.compress(used > 0)
+    place = dr.zeros(mi.UInt32, most + 1)
+    dr.scatter(place, dr.arange(mi.UInt32, dr.width(different)), different)
+    return different, dr.gather(mi.UInt32, place, rows)
 
 
 def _apart(cell: mi.UInt32, res: tuple[int, int, int]) -> tuple[mi.Int32, mi.Int32, mi.Int32]:

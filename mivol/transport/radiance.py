@@ -205,28 +205,30 @@ def bake(field: SphericalGrid, cells: Cells, points: np.ndarray, view: mi.UInt32
     Bias: O(h^2 / r^2) of the colour for a node at distance r of a pinhole: where trilinear weights meet, the directions to the
         nodes average to that of the ray to first order. Cost: the field read once and 12 numbers a node written, a pinhole.
     """
-    entry = dr.arange(mi.UInt32, field.rows * len(points))
-    row, which = entry % field.rows, entry // field.rows
+    count = dr.width(cells.rows)
+    entry = dr.arange(mi.UInt32, count * len(points))
+    row, which = dr.gather(mi.UInt32, cells.rows, entry % count), entry // count
     basis = field.viewer(points)(_node(field, row), which)
     values = dr.gather(mi.ArrayXf, field.harmonics, row, shape=(field.width, 1))
     colour = [mi.Float(field.offset)] * 3
     for b, y in enumerate(basis):
         colour = [dr.fma(values[3 * b + k], y, c) for k, c in enumerate(colour)]
-    nodes = dr.zeros(mi.Float, 4 * field.rows * len(points))
+    nodes = dr.zeros(mi.Float, 4 * count * len(points))
     dr.scatter(nodes, mi.ArrayXf([dr.gather(mi.Float, field.density, row), *colour]), entry)
 
     edges = dr.width(cells.pairs) // 2
     entry = dr.arange(mi.UInt32, edges * len(points))
     table = dr.zeros(mi.Float, 8 * edges * len(points))
-    ends = [dr.gather(mi.ArrayXf, nodes, row, shape=(4, 1)) for row in _ends(field, cells, entry)]
+    ends = [dr.gather(mi.ArrayXf, nodes, node, shape=(4, 1)) for node in _ends(cells, entry)]
     dr.scatter(table, mi.ArrayXf([*ends[0], *ends[1]]), entry)
     return Baked(table, view, dr.zeros(mi.Float, dr.width(table)) if slope else None)
 
 
-def _ends(field: SphericalGrid, cells: Cells, entry: mi.UInt32) -> list[mi.UInt32]:
+def _ends(cells: Cells, entry: mi.UInt32) -> list[mi.UInt32]:
     """Places in the table of nodes of the ends of each edge in the table of edges."""
     edges = dr.width(cells.pairs) // 2
-    return [row + entry // edges * field.rows for row in dr.gather(mi.ArrayXu, cells.pairs, entry % edges, shape=(2, 1))]
+    first = entry // edges * dr.width(cells.rows)
+    return [first + node for node in dr.gather(mi.ArrayXu, cells.pairs, entry % edges, shape=(2, 1))]
 
 
 def _node(field: SphericalGrid, row: mi.UInt32) -> mi.UInt32:
@@ -242,32 +244,32 @@ def fold(field: SphericalGrid, cells: Cells, baked: Baked, points: np.ndarray) -
     """
     entry = dr.arange(mi.UInt32, dr.width(baked.slope) // 8)
     slope = dr.gather(mi.ArrayXf, baked.slope, entry, shape=(8, 1))
-    nodes = dr.zeros(mi.Float, 4 * field.rows * len(points))
-    for end, row in enumerate(_ends(field, cells, entry)):
-        _add_packet(nodes, [slope[4 * end + k] for k in range(4)], row, mi.Bool(True))
-
-    return _over_pinholes(field, nodes, points)
+    nodes = dr.zeros(mi.Float, 4 * dr.width(cells.rows) * len(points))
+    for end, node in enumerate(_ends(cells, entry)):
+        _add_packet(nodes, [slope[4 * end + k] for k in range(4)], node, mi.Bool(True))
+    return _over_pinholes(field, cells.rows, nodes, points)
 
 
 @dr.syntax
-def _over_pinholes(field: SphericalGrid, nodes: mi.Float, points: np.ndarray) -> tuple[mi.Float, mi.Float]:
+def _over_pinholes(field: SphericalGrid, rows: mi.UInt32, nodes: mi.Float, points: np.ndarray) -> tuple[mi.Float, mi.Float]:
     """Sum what pinholes add to the rows of a field; a loop, so one kernel serves any number of them."""
-    row = dr.arange(mi.UInt32, field.rows)
-    node = _node(field, row)
+    number = dr.arange(mi.UInt32, dr.width(rows))
+    node = _node(field, rows)
     seen_from = field.viewer(points)
-    count, rows, width = dr.opaque(mi.UInt32, len(points)), field.rows, field.width
+    pinholes, count, width = dr.opaque(mi.UInt32, len(points)), dr.width(rows), field.width
     packet = mi.ArrayXf([mi.Float(0)] * 4)
-    raw = dr.zeros(mi.Float, rows)
-    harmonics = [dr.zeros(mi.Float, rows) for _ in range(width)]
+    raw = dr.zeros(mi.Float, count)
+    harmonics = [dr.zeros(mi.Float, count) for _ in range(width)]
     v = mi.UInt32(0)
-    while v < count:
-        packet = dr.gather(mi.ArrayXf, nodes, row + v * rows, shape=(4, 1))
+    while v < pinholes:
+        packet = dr.gather(mi.ArrayXf, nodes, number + v * count, shape=(4, 1))
         raw += packet[0]
         harmonics = _spread(harmonics, packet, seen_from(node, v))
         v += 1
-    total = dr.zeros(mi.Float, rows * width)
-    dr.scatter(total, mi.ArrayXf(harmonics), row)
-    return raw, total
+    density, total = dr.zeros(mi.Float, field.rows), dr.zeros(mi.Float, field.rows * width)
+    dr.scatter(density, raw, rows)
+    dr.scatter(total, mi.ArrayXf(harmonics), rows)
+    return density, total
 
 
 def _spread(harmonics: list[mi.Float], packet: mi.ArrayXf, basis: list[mi.Float]) -> list[mi.Float]:
