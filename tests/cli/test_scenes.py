@@ -38,7 +38,13 @@ DATA = {
 }
 """Which setting names the data beside the project, and which file it is."""
 
-SCRIPTS = {"relit_smoke": "relight.py", "still_life": "photographs.py", "tank": "fit.py", "white_smoke": "views.py"}
+SCRIPTS = {
+    "fire": "render.py",
+    "relit_smoke": "relight.py",
+    "still_life": "photographs.py",
+    "tank": "fit.py",
+    "white_smoke": "views.py",
+}
 
 
 def test_every_scene_is_here():
@@ -108,6 +114,15 @@ def test_tank(tmp_path):
     assert off["green g"] < 0.2
     assert max(off["green sigma_s"], off["green sigma_a"]) < 0.5
     assert (tmp_path / "tank.png").stat().st_size > 10_000
+
+
+@pytest.mark.slow
+def test_fire(tmp_path, data_dir):
+    """A flame of some hundred cd/m2 (a black body of 1318 K has 835) before a dusk of some tens."""
+    said = script("fire", "--size", 48, "--spp", 16, "-o", tmp_path, MIVOL_DATA=str(data_dir))
+    median, most = map(float, re.search(r"luminance ([\d.]+) cd/m2 in the median, ([\d.]+) cd/m2 at most", said).groups())
+    assert 10 < median < 80 and 200 < most < 835
+    assert (tmp_path / "fire.png").stat().st_size > 1000
 
 
 @pytest.mark.slow
