@@ -111,9 +111,16 @@ def gradients(
     integrator = mi.load_dict({"type": "mivol", "max_depth": 1, **more})
     integrator.render_backward(scene, params, mi.TensorXf(np.asarray(weight, np.float32)), seed=seed, spp=spp)
     found = [np.array(dr.grad(params[key]), dtype=np.float64) for key in keys]
+    let_go(params, keys)
+    return found
+
+
+def let_go(params: mi.SceneParameters, keys: list[str]) -> None:
+    """Follow no derivative any more, in what was computed of the parameters neither."""
     for key in keys:
         dr.disable_grad(params[key])
-    return found
+        params[key] = params[key]
+    params.update()
 
 
 def changes(seen: Pencils | mi.Scene, along: dict[str, np.ndarray], spp: int = 1, seed: int = 0, **more: object) -> np.ndarray:
@@ -128,8 +135,7 @@ def changes(seen: Pencils | mi.Scene, along: dict[str, np.ndarray], spp: int = 1
     params.update()
     integrator = mi.load_dict({"type": "mivol", "max_depth": 1, **more})
     image = np.array(integrator.render_forward(scene, params, seed=seed, spp=spp), dtype=np.float64)
-    for key in keys:
-        dr.disable_grad(params[key])
+    let_go(params, keys)
     return image if isinstance(seen, mi.Scene) else image[0]
 
 

@@ -1,4 +1,4 @@
-"""<volume type="mivol_voxels">: a dense grid, for our media and for stock ones; <volume type="mivol_sh">: a radiance field."""
+"""<volume type="mivol_voxels">: a dense grid; "mivol_transfer": one seen through a table; "mivol_sh": a radiance field."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import numpy as np
 
 from mivol.fields.spherical import SphericalGrid
 from mivol.fields.spherical_tensors import dense_density, field_from_props, with_tensors
+from mivol.fields.transfer import Transfer
 from mivol.fields.voxels import Voxels
 
 
@@ -133,6 +134,35 @@ class SphericalVolume(mi.Volume):
         return f"mivol_sh[{x}x{y}x{z}, degree {f.degree}, {f.rows} rows, {f.activation}]"
 
 
+class TransferVolume(VoxelVolume):
+    """``<volume type="mivol_transfer">``: a scalar grid seen through a table, as an extinction or as an emission.
+
+    Parameters:
+        filename or data: the scalar grid, a file or a tensor (Z, Y, X, 1); any finite numbers.
+        table: entries at equal steps of the value, 1 or 3 numbers each: ``0, 0, 2, 10`` or ``0 0 0, 1 0.9 0.7``, or a tensor
+            (n, C). Differentiable, as is the grid (``scalar``).
+        domain: values of the first and the last entry, ``-1000, 2000``. Default: those that the grid has.
+        refine: nodes that stand for a voxel in each direction. Default 1.
+        to_world: places the unit cube.
+    """
+
+    def __init__(self, props: mi.Properties) -> None:
+        self.transfer = Transfer.from_props(props)
+        self.table, self.scalar = self.transfer.table, self.transfer.field
+        self.field = self.transfer.voxels
+        self.texture = self.field.texture
+        props["to_world"] = mi.ScalarTransform4f(self.field.to_world)
+        mi.Volume.__init__(self, props)
+
+    def traverse(self, callback: mi.TraversalCallback) -> None:
+        callback.put("table", self.table, mi.ParamFlags.Differentiable)
+        callback.put("scalar", self.scalar, mi.ParamFlags.Differentiable)
+        callback.put("data", self.texture.tensor(), mi.ParamFlags.NonDifferentiable)
+
+    def parameters_changed(self, keys: list[str]) -> None:
+        self.transfer.refresh()
+
+
 def _towards(it: mi.Interaction3f) -> mi.Vector3f:
     """The direction to the eye; up where an interaction has none."""
     wi = getattr(it, "wi", mi.Vector3f(0, 0, 1))
@@ -142,3 +172,4 @@ def _towards(it: mi.Interaction3f) -> mi.Vector3f:
 # Mitsuba has no register_volume; a volume registered as a texture is found by <volume>. tests/conformance guards this.
 mi.register_texture("mivol_voxels", VoxelVolume)
 mi.register_texture("mivol_sh", SphericalVolume)
+mi.register_texture("mivol_transfer", TransferVolume)

@@ -166,7 +166,7 @@ def view_medium(medium: mi.Medium, boundary: Box | None = None, places: dict | N
     albedo = [v for k, v in params if k.startswith("sigma_s." if "sigma_s" in names else "albedo.")]
     share = _field(params, "albedo") if "sigma_s" not in names else None
     source, glow = _field(params, "emission"), _field(params, "emission_density")
-    lights = [v for k, v in params if k.startswith("emission")]
+    lights = [v for k, v in params if k.startswith("emission") and k.endswith((".data", ".value.value"))]
     if not parts:
         parts, share, lights = [_part_of_field(source)], mi.Float(0), []
     frame = _frame([glow, source], boundary, places)
