@@ -226,7 +226,7 @@ def _nodes_of(field: SphericalGrid, cells: Cells, chosen: mi.Bool) -> np.ndarray
     index = dr.compress(chosen)
     if cells.count and dr.width(index):
         keep = dr.zeros(mi.UInt8, field.rows)
-        for row in cells.corners(index, mi.Bool(True)):
+        for row in cells.node_rows(index, mi.Bool(True)):
             dr.scatter(keep, mi.UInt8(1), row)
         listed = field.listed()
         mask[listed] = np.array(keep)[: len(listed)] > 0

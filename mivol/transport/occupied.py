@@ -41,8 +41,7 @@ class Cells:
         to_world: (4, 4) float64, unit cube to world.
         count: how many cells are listed.
         number: Int32 over the (Z + 1) (Y + 1) (X + 1) cells, x fastest: the place in ``corners``, or minus a distance.
-        edges: UInt32, 4 a cell: its edges along x, bits 0, 1 of the edge being y, z.
-        pairs: UInt32, 2 an edge: its lower and its upper node, in ``rows``. Each edge of a listed cell is listed once.
+        corners: UInt32, 8 a cell: its nodes, in ``rows``; bits 0, 1, 2 of the corner are x, y, z.
         rows: UInt32, the rows of the nodes of listed cells, each once.
         from_world: (3, 4) map from the world to lattice coordinates.
     """
@@ -51,8 +50,7 @@ class Cells:
     to_world: np.ndarray
     count: int
     number: mi.Int32
-    edges: mi.UInt32
-    pairs: mi.UInt32
+    corners: mi.UInt32
     rows: mi.UInt32
     from_world: list[list[mi.Float64]]
 
@@ -89,38 +87,23 @@ class Cells:
             dr.scatter(number, dr.arange(mi.Int32, count), listed)
             number = _with_distances(number, res)
         # Arrays of no length cannot be read, even by no lane: where nothing is listed, a cell that no number leads to.
-        edges, pairs = _edges(listed if count else mi.UInt32(0), rows, res)
+        named = _corner_rows(listed if count else mi.UInt32(0), rows, res)
+        corners = dr.zeros(mi.UInt32, 8 * max(count, 1))
+        for q, row in enumerate(named):
+            dr.scatter(corners, row, dr.arange(mi.UInt32, max(count, 1)) * 8 + q)
         to_world = check_affine(to_world)
         place = [[dr.opaque(mi.Float64, float(v)) for v in row] for row in lattice_from_world(to_world, res)]
-        used, pairs = _numbered(pairs, dr.width(rows))
-        dr.eval(number, edges, pairs, used)
-        return cls(res, to_world, count, number, edges, pairs, used, place)
+        used, corners = _numbered(corners, dr.width(rows))
+        dr.eval(number, corners, used)
+        return cls(res, to_world, count, number, corners, used, place)
 
-    def corners(self, number: mi.UInt32, active: mi.Bool) -> list[mi.UInt32]:
-        """The rows of the 8 corners of listed cells, bits 0, 1, 2 of the corner being x, y, z."""
-        edges = dr.gather(mi.ArrayXu, self.edges, number, active, shape=(4, 1))
-        nodes = [node for edge in edges for node in dr.gather(mi.ArrayXu, self.pairs, edge, active, shape=(2, 1))]
-        return [dr.gather(mi.UInt32, self.rows, node, active) for node in nodes]
+    def nodes(self, number: mi.UInt32, active: mi.Bool) -> list[mi.UInt32]:
+        """The 8 corners of listed cells, in ``rows``."""
+        return list(dr.gather(mi.ArrayXu, self.corners, number, active, shape=(8, 1)))
 
-
-def _edges(listed: mi.UInt32, rows: mi.UInt32, res: tuple[int, int, int]) -> tuple[mi.UInt32, mi.UInt32]:
-    """Edges along x of cells, 4 each, and the rows at the ends of each edge."""
-    z, y, x = res
-    i, j, k = _apart(listed, res)
-    names = [mi.UInt32((c * y + b) * (x + 1) + i) for c in _between(k, z) for b in _between(j, y)]
-    used = dr.zeros(mi.UInt8, z * y * (x + 1))
-    for name in names:
-        dr.scatter(used, mi.UInt8(1), name)
-    edge = dr.compress(used > 0)
-    place = dr.zeros(mi.UInt32, z * y * (x + 1))
-    dr.scatter(place, dr.arange(mi.UInt32, dr.width(edge)), edge)
-    edges, pairs = dr.zeros(mi.UInt32, 4 * dr.width(listed)), dr.zeros(mi.UInt32, 2 * dr.width(edge))
-    for q, name in enumerate(names):
-        dr.scatter(edges, dr.gather(mi.UInt32, place, name), dr.arange(mi.UInt32, dr.width(listed)) * 4 + q)
-    for q, a in enumerate(_between(mi.Int32(edge % (x + 1)), x)):
-        row = dr.gather(mi.UInt32, rows, edge // (x + 1) * x + mi.UInt32(a))
-        dr.scatter(pairs, row, dr.arange(mi.UInt32, dr.width(edge)) * 2 + q)
-    return edges, pairs
+    def node_rows(self, number: mi.UInt32, active: mi.Bool) -> list[mi.UInt32]:
+        """The rows of the 8 corners of listed cells."""
+        return [dr.gather(mi.UInt32, self.rows, node, active) for node in self.nodes(number, active)]
 
 
 def _numbered(rows: mi.UInt32, most: int) -> tuple[mi.UInt32, mi.UInt32]:

@@ -86,11 +86,10 @@ class Source(Protocol):
 
 @dataclass
 class Baked:
-    """Density and the colours that pinholes see, 8 numbers for each edge of a cell and pinhole: 4 packets a cell.
+    """Density and the colours that pinholes see, 4 numbers for each node of a listed cell and pinhole: a packet a corner.
 
     Attributes:
-        table: Float: raw density and rgb (its offset included) of the lower node of an edge, then of the upper one; a block
-            of edges for each pinhole.
+        table: Float: raw density and rgb (its offset included) of a node; a block of nodes for each pinhole.
         view: which block each lane reads.
         slope: the derivative, as ``table``; None where none is asked for.
     """
@@ -100,18 +99,16 @@ class Baked:
     slope: mi.Float | None = None
 
     def read(self, cells: Cells, number: mi.UInt32, on: mi.Bool) -> tuple[list[mi.Float], Callable[[mi.Bool], Colours]]:
-        pairs = [dr.gather(mi.ArrayXf, self.table, e, on, shape=(8, 1)) for e in self._edges(cells, number, on)]
-        values = [[p[k + 4 * end] for p in pairs for end in (0, 1)] for k in range(4)]
-        return values[0], lambda on: values[1:]
+        packets = [dr.gather(mi.ArrayXf, self.table, node, on, shape=(4, 1)) for node in self._nodes(cells, number, on)]
+        return [p[0] for p in packets], lambda on: [[p[k] for p in packets] for k in (1, 2, 3)]
 
     def add(self, cells: Cells, number: mi.UInt32, raw: list[mi.Float], colours: Colours, on: mi.Bool) -> None:
-        values = [raw, *colours]
-        for q, e in enumerate(self._edges(cells, number, on)):
-            _add_packet(self.slope, [values[k][2 * q + end] for end in (0, 1) for k in range(4)], e, on)
+        for q, node in enumerate(self._nodes(cells, number, on)):
+            _add_packet(self.slope, [raw[q], *(colours[k][q] for k in range(3))], node, on)
 
-    def _edges(self, cells: Cells, number: mi.UInt32, on: mi.Bool) -> list[mi.UInt32]:
-        base = self.view * (dr.width(cells.pairs) // 2)
-        return [base + e for e in dr.gather(mi.ArrayXu, cells.edges, number, on, shape=(4, 1))]
+    def _nodes(self, cells: Cells, number: mi.UInt32, on: mi.Bool) -> list[mi.UInt32]:
+        first = self.view * dr.width(cells.rows)
+        return [first + node for node in cells.nodes(number, on)]
 
 
 @dataclass
@@ -139,7 +136,7 @@ class Exact:
         return row_width(len(self.basis))
 
     def read(self, cells: Cells, number: mi.UInt32, on: mi.Bool) -> tuple[list[mi.Float], Callable[[mi.Bool], Colours]]:
-        corners = cells.corners(number, on)
+        corners = cells.node_rows(number, on)
 
         def colours(on: mi.Bool) -> Colours:
             return list(zip(*(self._colour(c, on) for c in corners), strict=True))
@@ -147,17 +144,21 @@ class Exact:
         return [dr.gather(mi.Float, self.density, c, on) for c in corners], colours
 
     def _colour(self, row: mi.UInt32, on: mi.Bool) -> list[mi.Float]:
-        values = dr.gather(mi.ArrayXf, self.harmonics, row, on, shape=(self.width, 1))
-        sums = [mi.Float(self.offset)] * 3
-        for b, y in enumerate(self.basis):
-            sums = [dr.fma(values[3 * b + k], y, s) for k, s in enumerate(sums)]
-        return sums
+        return _summed(dr.gather(mi.ArrayXf, self.harmonics, row, on, shape=(self.width, 1)), self.basis, self.offset)
 
     def add(self, cells: Cells, number: mi.UInt32, raw: list[mi.Float], colours: Colours, on: mi.Bool) -> None:
         rest = [mi.Float(0)] * (self.width - 3 * len(self.basis))
-        for q, c in enumerate(cells.corners(number, on)):
+        for q, c in enumerate(cells.node_rows(number, on)):
             _add_packet(self.density_slope, [raw[q]], c, on)
             _add_packet(self.harmonics_slope, [colours[k][q] * y for y in self.basis for k in range(3)] + rest, c, on)
+
+
+def _summed(row: mi.ArrayXf, basis: list[mi.Float], offset: float) -> list[mi.Float]:
+    """The colour of a row of harmonics, before it is clamped."""
+    colour = [mi.Float(offset)] * 3
+    for b, y in enumerate(basis):
+        colour = [dr.fma(row[3 * b + k], y, c) for k, c in enumerate(colour)]
+    return colour
 
 
 def _add_packet(target: mi.Float, values: Sequence[mi.Float], row: mi.UInt32, on: mi.Bool) -> None:
@@ -205,30 +206,22 @@ def bake(field: SphericalGrid, cells: Cells, points: np.ndarray, view: mi.UInt32
     Bias: O(h^2 / r^2) of the colour for a node at distance r of a pinhole: where trilinear weights meet, the directions to the
         nodes average to that of the ray to first order. Cost: the field read once and 12 numbers a node written, a pinhole.
     """
-    count = dr.width(cells.rows)
-    entry = dr.arange(mi.UInt32, count * len(points))
-    row, which = dr.gather(mi.UInt32, cells.rows, entry % count), entry // count
-    basis = field.viewer(points)(_node(field, row), which)
-    values = dr.gather(mi.ArrayXf, field.harmonics, row, shape=(field.width, 1))
-    colour = [mi.Float(field.offset)] * 3
-    for b, y in enumerate(basis):
-        colour = [dr.fma(values[3 * b + k], y, c) for k, c in enumerate(colour)]
-    nodes = dr.zeros(mi.Float, 4 * count * len(points))
-    dr.scatter(nodes, mi.ArrayXf([dr.gather(mi.Float, field.density, row), *colour]), entry)
-
-    edges = dr.width(cells.pairs) // 2
-    entry = dr.arange(mi.UInt32, edges * len(points))
-    table = dr.zeros(mi.Float, 8 * edges * len(points))
-    ends = [dr.gather(mi.ArrayXf, nodes, node, shape=(4, 1)) for node in _ends(cells, entry)]
-    dr.scatter(table, mi.ArrayXf([*ends[0], *ends[1]]), entry)
+    table = dr.zeros(mi.Float, 4 * dr.width(cells.rows) * len(points))
+    _bake(field, cells.rows, table, points)
     return Baked(table, view, dr.zeros(mi.Float, dr.width(table)) if slope else None)
 
 
-def _ends(cells: Cells, entry: mi.UInt32) -> list[mi.UInt32]:
-    """Places in the table of nodes of the ends of each edge in the table of edges."""
-    edges = dr.width(cells.pairs) // 2
-    first = entry // edges * dr.width(cells.rows)
-    return [first + node for node in dr.gather(mi.ArrayXu, cells.pairs, entry % edges, shape=(2, 1))]
+@dr.syntax
+def _bake(field: SphericalGrid, rows: mi.UInt32, table: mi.Float, points: np.ndarray) -> None:
+    """Fill the blocks of a table; a loop, so a field is read once and one kernel serves any number of pinholes."""
+    number, node, seen_from = dr.arange(mi.UInt32, dr.width(rows)), _node(field, rows), field.viewer(points)
+    pinholes, count = dr.opaque(mi.UInt32, len(points)), dr.width(rows)
+    raw = dr.gather(mi.Float, field.density, rows)
+    values = dr.gather(mi.ArrayXf, field.harmonics, rows, shape=(field.width, 1))
+    v = mi.UInt32(0)
+    while dr.hint(v < pinholes, exclude=[table]):
+        dr.scatter(table, mi.ArrayXf([raw, *_summed(values, seen_from(node, v), field.offset)]), number + v * count)
+        v += 1
 
 
 def _node(field: SphericalGrid, row: mi.UInt32) -> mi.UInt32:
@@ -242,12 +235,7 @@ def fold(field: SphericalGrid, cells: Cells, baked: Baked, points: np.ndarray) -
     Returns:
         Those of ``density`` and of ``harmonics``.
     """
-    entry = dr.arange(mi.UInt32, dr.width(baked.slope) // 8)
-    slope = dr.gather(mi.ArrayXf, baked.slope, entry, shape=(8, 1))
-    nodes = dr.zeros(mi.Float, 4 * dr.width(cells.rows) * len(points))
-    for end, node in enumerate(_ends(cells, entry)):
-        _add_packet(nodes, [slope[4 * end + k] for k in range(4)], node, mi.Bool(True))
-    return _over_pinholes(field, cells.rows, nodes, points)
+    return _over_pinholes(field, cells.rows, baked.slope, points)
 
 
 @dr.syntax
