@@ -157,7 +157,7 @@ class TransferVolume(VoxelVolume):
     def traverse(self, callback: mi.TraversalCallback) -> None:
         callback.put("table", self.table, mi.ParamFlags.Differentiable)
         callback.put("scalar", self.scalar, mi.ParamFlags.Differentiable)
-        callback.put("data", self.texture.tensor(), mi.ParamFlags.NonDifferentiable)
+        callback.put("data", self.texture.tensor(), mi.ParamFlags.Differentiable)  # what the table makes of it
 
     def parameters_changed(self, keys: list[str]) -> None:
         self.transfer.refresh()

@@ -41,6 +41,7 @@ DATA = {
 SCRIPTS = {
     "fire": "render.py",
     "relit_smoke": "relight.py",
+    "scan_view": "tables.py",
     "still_life": "photographs.py",
     "tank": "fit.py",
     "white_smoke": "views.py",
@@ -123,6 +124,14 @@ def test_fire(tmp_path, data_dir):
     median, most = map(float, re.search(r"luminance ([\d.]+) cd/m2 in the median, ([\d.]+) cd/m2 at most", said).groups())
     assert 10 < median < 80 and 200 < most < 835
     assert (tmp_path / "fire.png").stat().st_size > 1000
+
+
+@pytest.mark.slow
+def test_scan_view(tmp_path, data_dir):
+    """Twenty steps of Adam bring the view nearer than the grey ramp that they start from (14 dB)."""
+    said = script("scan_view", "--size", 48, "--spp", 8, "--iterations", 20, "-o", tmp_path, MIVOL_DATA=str(data_dir))
+    assert float(re.search(r"found: ([\d.]+) dB", said).group(1)) > 22
+    assert (tmp_path / "tooth.png").stat().st_size > 500
 
 
 @pytest.mark.slow
