@@ -235,6 +235,9 @@ class Photographs(Section):
     background: Annotated[
         str | tuple[float, float, float], of("1", "behind images with alpha: white, black or an rgb triple; empty: no alpha")
     ] = ""
+    behind: Annotated[
+        tuple[float, float, float], of("1", "colour that images without alpha show where nothing is")
+    ] = (0.0, 0.0, 0.0)
     held_out: Annotated[int, of("view", "every so many of the training views is compared, not fitted; 0: none", ge=0)] = 8
     box: Annotated[
         str | tuple[tuple[float, float, float], tuple[float, float, float]],
@@ -247,13 +250,22 @@ class Field(Section):
     """The radiance field and how it is fitted."""
 
     preset: Annotated[str, of("1", "resolutions, steps, rates and priors: tiny, cpu or gpu", min_length=1)] = "cpu"
-    longest: Annotated[int | None, of("voxel", "along the longest edge in the end; absent: the preset's", ge=8)] = None
-    degree: Annotated[int | None, of("1", "of the spherical harmonics; absent: the preset's", ge=0, le=4)] = None
+    longest: Annotated[int | None, of("voxel", "along the longest edge in the end; absent: the preset's")] = None
+    degree: Annotated[int | None, of("1", "of the spherical harmonics; absent: the preset's")] = None
     effort: Annotated[float, of("1", "factor on the preset's steps", gt=0)] = 1.0
-    tv_density: Annotated[float | None, of("1", "total variation of the density; absent: the preset's", ge=0)] = None
-    tv_sh: Annotated[float | None, of("1", "total variation of the colours; absent: the preset's", ge=0)] = None
-    sparsity: Annotated[float | None, of("1", "of the density; absent: the preset's", ge=0)] = None
-    beta: Annotated[float | None, of("1", "asks rays to end in matter or to pass; absent: the preset's", ge=0)] = None
+    tv_density: Annotated[float | None, of("1", "total variation of the density; absent: the preset's")] = None
+    tv_sh: Annotated[float | None, of("1", "total variation of the colours; absent: the preset's")] = None
+    sparsity: Annotated[float | None, of("1", "of the density; absent: the preset's")] = None
+    beta: Annotated[float | None, of("1", "asks rays to end in matter or to pass; absent: the preset's")] = None
+
+    def __post_init__(self) -> None:
+        if self.degree is not None and not 0 <= self.degree <= 4:
+            raise ValueError(f"degree is {self.degree}: 0 to 4 is expected")
+        if self.longest is not None and self.longest < 8:
+            raise ValueError(f"longest is {self.longest}: at least 8 is expected")
+        for name in ("tv_density", "tv_sh", "sparsity", "beta"):
+            if (getattr(self, name) or 0) < 0:
+                raise ValueError(f"{name} is {getattr(self, name)}: at least 0 is expected")
 
 
 class Shown(Section):

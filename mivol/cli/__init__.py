@@ -103,6 +103,7 @@ def optimize_flags(sub: argparse.ArgumentParser) -> None:
     from mivol import config
 
     lines = ["images:", *config.describe(), "", "projections:", *config.describe(config.Scan)]
+    lines += ["", "photographs:", *config.describe(config.FieldFit)]
     sub.epilog = "settings of the file for " + "\n  ".join(line.replace("%", "%%") for line in lines)
     sub.add_argument("experiment", type=Path, help="TOML file")
     sub.add_argument("--set", action="append", default=[], metavar="key=value", help="override a setting of the file")
@@ -200,11 +201,11 @@ def reference(arguments: argparse.Namespace) -> None:
 def optimize(arguments: argparse.Namespace) -> None:
     """Reconstruct a volume from its views; everything that comes of it lies in the run folder."""
     from mivol import config
-    from mivol.cli import experiment, scan
+    from mivol.cli import experiment, field, scan
 
     chosen = config.load(arguments.experiment, arguments.set)
     folder = arguments.output or Path(chosen.output)
-    kind = scan if isinstance(chosen, config.Scan) else experiment
+    kind = {config.Experiment: experiment, config.Scan: scan, config.FieldFit: field}[type(chosen)]
     page = kind.run(chosen, arguments.experiment.parent, folder, resume=arguments.resume)
     print(page)
 

@@ -105,7 +105,7 @@ def write_page(folder: str | Path) -> Path:
     volume = _volume(folder, record.volumes)
     facts = {
         "record": record,
-        "headline": headline(record, [view.psnr for view in groups.rows if view.held_out and view.psnr is not None]),
+        "headline": headline(record, _held_out_psnr(record, groups.rows)),
         "numbers": _numbers(record, groups.rows, volume),
         "views": groups,
         "shown": SHOWN_VIEWS,
@@ -352,9 +352,17 @@ def _plane(plane: str, cuts: dict[str, show.Slices], scales: dict[str, show.Scal
 # -- Numbers, curves, times, settings -----------------------------------------------------------------------------------
 
 
+def _held_out_psnr(record: RunRecord, views: Sequence[View]) -> list[float]:
+    """PSNR of the views that were not fitted: of those that are shown, or the mean of all that the run has judged itself."""
+    judged = record.results.get("held_out_psnr")
+    if judged is not None:
+        return [judged]
+    return [view.psnr for view in views if view.held_out and view.psnr is not None]
+
+
 def _numbers(record: RunRecord, views: Sequence[View], volume: Cut | None) -> list[tuple[str, str, str]]:
     """Tiles under the headline: value, unit, label."""
-    held_out = [view.psnr for view in views if view.held_out and view.psnr is not None]
+    held_out = _held_out_psnr(record, views)
     seconds, said, tiles = _seconds(record), ("nrmse", "held_out_psnr", "seconds"), []
     if record.results.get("nrmse") is not None:
         tiles.append(_tile("nrmse", record.results["nrmse"]))

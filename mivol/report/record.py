@@ -33,6 +33,7 @@ __all__ = [
     "Machine",
     "Quantity",
     "RunRecord",
+    "Table",
     "Volume",
     "append_metrics",
     "describe_machine",
@@ -119,6 +120,14 @@ class Volume(_Part):
     caption: str = ""
 
 
+class Table(_Part):
+    """A table of the page: what its first row says, then its rows; the first column is text."""
+
+    title: str
+    head: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+
+
 class Machine(_Part):
     """Where it ran, as far as it matters to speed."""
 
@@ -150,6 +159,7 @@ class RunRecord(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
     """Final numbers; names of :data:`QUANTITIES` are printed with their labels and units."""
     images: list[Image] = []
     volumes: list[Volume] = []
+    tables: list[Table] = []
     notes: list[str] = []
     """Sentences that a reader must know: limits, refusals, events."""
     citations: list[str] = []

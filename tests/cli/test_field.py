@@ -1,0 +1,164 @@
+"""``mivol optimize`` on photographs: from a folder of views to a page, stopped and resumed, and what it refuses."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mivol import config
+from mivol.cli import field, main
+from mivol.errors import MivolError
+from mivol.fields.spherical import SphericalGrid, load_field
+from mivol.files import write_png
+from mivol.optim.radiance_fit import PRESETS, render_view
+from mivol.photos import Camera, intrinsics
+from mivol.photos.journey import facing
+from mivol.photos.picture import decode_srgb
+from mivol.photos.transforms import write_transforms
+
+SIZE, VIEWS = 48, 20
+
+
+def ball(res: int = 12) -> SphericalGrid:
+    """A ball of radius 0.6 in the cube from -1 to 1, its colour a ramp along x."""
+    axis = (np.arange(res) + 0.5) / res * 2 - 1
+    z, y, x = np.meshgrid(axis, axis, axis, indexing="ij")
+    density = 60 * (0.6 - np.sqrt(x**2 + y**2 + z**2))
+    sh = np.zeros((res, res, res, 1, 3))
+    sh[..., 0, 0], sh[..., 0, 1] = x, -x
+    place = np.diag([2.0, 2, 2, 1])
+    place[:3, 3] = -1
+    return SphericalGrid.from_dense(density, sh, place)
+
+
+@pytest.fixture(scope="module")
+def photographs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Views of the ball over white, all around it."""
+    import mitsuba as mi
+
+    import mivol.plugins  # noqa: F401
+
+    mi.set_variant("llvm_ad_rgb")
+    folder, truth, cameras = tmp_path_factory.mktemp("photographs"), ball(), {}
+    like = Camera(intrinsics(60, 60, SIZE / 2, SIZE / 2), (SIZE, SIZE), np.eye(4))
+    for n in range(VIEWS):
+        turn, height = 2.4 * n, 2 * (n + 0.5) / VIEWS - 1
+        origin = 3.5 * np.array([*(np.sqrt(1 - height**2) * np.array([np.cos(turn), np.sin(turn)])), height])
+        name = f"view_{n}.png"
+        cameras[name] = facing(like, origin, np.zeros(3), np.array([0, 0, 1.0]), name)
+        image = render_view(truth, cameras[name], np.ones(3)).image
+        write_png(folder / name, decode_srgb(np.clip(image, 0, 1)))
+    write_transforms(folder / "transforms.json", cameras, ["view_3.png", "view_8.png"])
+    return folder
+
+
+def toml(folder: Path, photographs: Path, more: str = "") -> Path:
+    path = folder / "fit.toml"
+    path.write_text(
+        f"""
+        title = "A ball"
+        checkpoint_every = 10
+        [photos]
+        path = "{photographs}"
+        behind = [1, 1, 1]
+        box = [[-1, -1, -1], [1, 1, 1]]
+        held_out = 0
+        judged = "test"
+        [field]
+        preset = "tiny"
+        longest = 26
+        degree = 0
+        effort = 0.5
+        [show]
+        frames = 3
+        views = 1
+        every = 20
+        {more}
+        """
+    )
+    return path
+
+
+def test_photographs_become_a_field_and_a_page(photographs: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    """The field is as good on views that it has not seen as the ball's edge, a pixel wide, lets a grid of 24 be."""
+    path = toml(tmp_path, photographs)
+    assert main(["optimize", str(path), "-o", str(tmp_path / "run")]) == 0
+    assert capsys.readouterr().out.strip().endswith("report.html")
+    record = json.loads((tmp_path / "run/run.json").read_text())
+    # A white picture would have 9 dB, a grey ball 15.
+    assert record["results"]["held_out_psnr"] > 26
+    made = load_field(tmp_path / "run/field.npz")
+    assert made.nodes is not None
+    assert record["results"]["nodes"] == len(made.listed())
+    page = (tmp_path / "run/report.html").read_text()
+    assert f"held-out views to {record['results']['held_out_psnr']:.1f} dB PSNR" in page.replace("\xa0", " ")
+    for text in ("data:video/mp4;base64,", "distance of the first judged view", "What it takes", "view_3.png"):
+        assert text in page
+    rows = [json.loads(line) for line in (tmp_path / "run/metrics.jsonl").read_text().splitlines()]
+    assert rows[-1]["iteration"] == record["results"]["iterations"] == field.make_plan(config.load(path)).steps
+    assert all({"loss", "held_out_psnr"} <= row.keys() for row in rows)
+
+
+def test_a_stopped_fit_goes_on(photographs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ctrl-C in the middle keeps what was done; the resumed fit ends with all steps, and says nothing twice."""
+    path = toml(tmp_path, photographs)
+    whole = field.RadianceFit.advance
+
+    def stops(fit: field.RadianceFit) -> object:
+        if fit.step == 45:
+            raise KeyboardInterrupt
+        return whole(fit)
+
+    monkeypatch.setattr(field.RadianceFit, "advance", stops)
+    assert main(["optimize", str(path), "-o", str(tmp_path / "run")]) == 130
+    monkeypatch.setattr(field.RadianceFit, "advance", whole)
+    started = []
+    monkeypatch.setattr(field.RadianceFit, "advance", lambda fit: started.append(fit.step) or whole(fit))
+    assert main(["optimize", str(path), "-o", str(tmp_path / "run"), "--resume"]) == 0
+    assert started[0] == 45
+    rows = [json.loads(line)["iteration"] for line in (tmp_path / "run/metrics.jsonl").read_text().splitlines()]
+    assert rows == sorted(set(rows))
+    assert main(["optimize", str(path), "-o", str(tmp_path / "run"), "--resume", "--set", "field.degree=1"]) == 1
+
+
+def test_what_the_file_says_overrides_the_preset(tmp_path: Path) -> None:
+    raw = {"title": "x", "photos": {"path": "p"}}
+    assert field.make_plan(config.from_dict(raw)) == PRESETS["cpu"]
+    raw["field"] = {"preset": "cpu", "longest": 40, "degree": 1, "effort": 0.5, "tv_sh": 1e-3}
+    plan = field.make_plan(config.from_dict(raw))
+    assert [stage.longest for stage in plan.stages] == [32, 40]
+    assert plan.stages[0].steps == round(PRESETS["cpu"].stages[0].steps / 2)
+    assert (plan.degree, plan.tv_sh, plan.tv_density) == (1, 1e-3, PRESETS["cpu"].tv_density)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ("field.preset=cpus", 'did you mean "cpu"'),
+        ("field.degree=5", "0 to 4 is expected"),
+        ("field.longest=4", "at least 8"),
+        ("field.tv_sh=-1", "at least 0"),
+        ("photos.box=silhouette", 'did you mean "silhouettes"'),
+        ("photos.path=nowhere", "nowhere"),
+        ("photos.judged=val", "val"),
+        ("photos.backgroud=white", 'did you mean "background"'),
+        ("photos.background=white", "alpha"),
+        ('show.metrics=["pnsr"]', "psnr"),
+    ],
+)
+def test_refusals(photographs: Path, tmp_path: Path, capsys: pytest.CaptureFixture, change: str, said: str) -> None:
+    more = ["--set", "field.effort=0.01"] if "metrics" in change else []
+    assert main(["optimize", str(toml(tmp_path, photographs)), "-o", str(tmp_path / "run"), "--set", change, *more]) == 1
+    refused = capsys.readouterr().err
+    assert said in refused
+    assert refused.splitlines()[-1].startswith("mivol: ")
+
+
+def test_a_box_of_silhouettes_needs_alpha(photographs: Path, tmp_path: Path) -> None:
+    chosen = config.load(toml(tmp_path, photographs), ["photos.box=silhouettes"])
+    photos, _ = field.read_photos(chosen, tmp_path)
+    with pytest.raises(MivolError, match="alpha"):
+        field.make_box(chosen, photos)
