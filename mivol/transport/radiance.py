@@ -90,12 +90,12 @@ class Baked:
 
     Attributes:
         table: Float: raw density and rgb (its offset included) of a node; a block of nodes for each pinhole.
-        view: which block each lane reads.
+        first: where the block of each lane's pinhole begins.
         slope: the derivative, as ``table``; None where none is asked for.
     """
 
     table: mi.Float
-    view: mi.UInt32
+    first: mi.UInt32
     slope: mi.Float | None = None
 
     def read(self, cells: Cells, number: mi.UInt32, on: mi.Bool) -> tuple[list[mi.Float], Callable[[mi.Bool], Colours]]:
@@ -107,8 +107,7 @@ class Baked:
             _add_packet(self.slope, [raw[q], *(colours[k][q] for k in range(3))], node, on)
 
     def _nodes(self, cells: Cells, number: mi.UInt32, on: mi.Bool) -> list[mi.UInt32]:
-        first = self.view * dr.width(cells.rows)
-        return [first + node for node in cells.nodes(number, on)]
+        return [self.first + node for node in cells.nodes(number, on)]
 
 
 @dataclass
@@ -204,24 +203,36 @@ def bake(field: SphericalGrid, cells: Cells, points: np.ndarray, view: mi.UInt32
         slope: whether derivatives will be asked for.
 
     Bias: O(h^2 / r^2) of the colour for a node at distance r of a pinhole: where trilinear weights meet, the directions to the
-        nodes average to that of the ray to first order. Cost: the field read once and 12 numbers a node written, a pinhole.
+        nodes average to that of the ray to first order. Cost: the field read once, and 4 numbers a node and pinhole written.
     """
     table = dr.zeros(mi.Float, 4 * dr.width(cells.rows) * len(points))
     _bake(field, cells.rows, table, points)
-    return Baked(table, view, dr.zeros(mi.Float, dr.width(table)) if slope else None)
+    first = view * _count(cells.rows)
+    return Baked(table, first, dr.zeros(mi.Float, _roomy(dr.width(table))) if slope else None)
 
 
 @dr.syntax
 def _bake(field: SphericalGrid, rows: mi.UInt32, table: mi.Float, points: np.ndarray) -> None:
     """Fill the blocks of a table; a loop, so a field is read once and one kernel serves any number of pinholes."""
     number, node, seen_from = dr.arange(mi.UInt32, dr.width(rows)), _node(field, rows), field.viewer(points)
-    pinholes, count = dr.opaque(mi.UInt32, len(points)), dr.width(rows)
+    pinholes, count = dr.opaque(mi.UInt32, len(points)), _count(rows)
     raw = dr.gather(mi.Float, field.density, rows)
     values = dr.gather(mi.ArrayXf, field.harmonics, rows, shape=(field.width, 1))
     v = mi.UInt32(0)
     while dr.hint(v < pinholes, exclude=[table]):
         dr.scatter(table, mi.ArrayXf([raw, *_summed(values, seen_from(node, v), field.offset)]), number + v * count)
         v += 1
+
+
+def _roomy(size: int) -> int:
+    """At least a size, and one of few: a kernel that adds to an expanded array knows its length, and would be compiled anew."""
+    step = 1 << max(size.bit_length() - 4, 2)
+    return -(-size // step) * step
+
+
+def _count(rows: mi.UInt32) -> mi.UInt32:
+    """How many rows there are, opaque: a fit has another number of them now and then, and keeps its kernels."""
+    return dr.opaque(mi.UInt32, dr.width(rows))
 
 
 def _node(field: SphericalGrid, row: mi.UInt32) -> mi.UInt32:
@@ -244,10 +255,10 @@ def _over_pinholes(field: SphericalGrid, rows: mi.UInt32, nodes: mi.Float, point
     number = dr.arange(mi.UInt32, dr.width(rows))
     node = _node(field, rows)
     seen_from = field.viewer(points)
-    pinholes, count, width = dr.opaque(mi.UInt32, len(points)), dr.width(rows), field.width
+    pinholes, count, width = dr.opaque(mi.UInt32, len(points)), _count(rows), field.width
     packet = mi.ArrayXf([mi.Float(0)] * 4)
-    raw = dr.zeros(mi.Float, count)
-    harmonics = [dr.zeros(mi.Float, count) for _ in range(width)]
+    raw = dr.zeros(mi.Float, dr.width(rows))
+    harmonics = [dr.zeros(mi.Float, dr.width(rows)) for _ in range(width)]
     v = mi.UInt32(0)
     while v < pinholes:
         packet = dr.gather(mi.ArrayXf, nodes, number + v * count, shape=(4, 1))
