@@ -11,15 +11,17 @@ set is; the sky is no part of them. All that there is fits into ``BOX``.
 from __future__ import annotations
 
 import argparse
+import hashlib
 from collections.abc import Sequence
 from pathlib import Path
 
 import mivol  # noqa: F401  (chooses the LLVM library; call it before the first variant)
-from mivol.files import write_png
+from mivol.files import write_png, write_whole_text
 from mivol.files.mesh import Mesh, write_mesh
 from mivol.photos import Camera, intrinsics
 from mivol.photos.journey import facing
 from mivol.photos.transforms import write_transforms
+from mivol.scene.load import content_hash
 from mivol.scene.photographs import sensor_of
 
 import mitsuba as mi
@@ -151,19 +153,33 @@ def cameras(count: int, size: int) -> list[Camera]:
 
 
 def make(folder: Path, views: int = 75, size: int = 128, spp: int = 64) -> list[str]:
-    """Render the set into ``folder``; the names of its PNGs."""
+    """Render the set into ``folder``, or leave what is there if it is the same set; the names of its PNGs."""
     folder.mkdir(parents=True, exist_ok=True)
     write_mesh(folder / "knot.ply", knot())
-    scene = mi.load_dict(still_life(folder / "knot.ply"))
+    things = still_life(folder / "knot.ply")
     looks = {f"view_{number:03d}.png": look for number, look in enumerate(cameras(views, size))}
+    names = list(looks)
+    shows = what_is_shown(things, list(looks.values()), spp)
+    if (folder / "shows.txt").is_file() and (folder / "shows.txt").read_text() == shows:
+        return names
+    (folder / "shows.txt").unlink(missing_ok=True)
+    scene = mi.load_dict(things)
     for number, (name, look) in enumerate(looks.items()):
         sensor = mi.load_dict(sensor_of(look, pixel_format="rgba") | {"sampler": {"type": "multijitter"}})
         shown = np.array(mi.render(scene, sensor=sensor, spp=spp, seed=SEED + number))
         colour, alpha = shown[..., :3], shown[..., 3:]
         write_png(folder / name, np.concatenate([colour / np.where(alpha > 0, alpha, 1), alpha], axis=2))
-    names = list(looks)
     write_transforms(folder / "transforms.json", looks, names[FIRST::EVERY])
+    write_whole_text(folder / "shows.txt", shows)
     return names
+
+
+def what_is_shown(things: dict, looks: Sequence[Camera], spp: int) -> str:
+    """A hash of the scene, the cameras and the samples: other photographs have another."""
+    h = hashlib.sha256(f"{content_hash(things)} {spp} {SEED} {FIRST} {EVERY}".encode())
+    for look in looks:
+        h.update(look.to_world.tobytes() + look.K.tobytes() + bytes(str(look.size), "ascii"))
+    return h.hexdigest()
 
 
 def main() -> None:
