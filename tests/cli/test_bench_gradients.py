@@ -24,6 +24,7 @@ def quick(tmp_path_factory: pytest.TempPathFactory) -> dict:
     return bench_script.quick("bench_gradients", tmp_path_factory.mktemp("bench"), "--only", asked)
 
 
+@pytest.mark.slow
 def test_every_question_is_answered(quick: dict, bench: ModuleType) -> None:
     assert set(bench.QUESTIONS) <= set(quick)
     for light in bench.LIGHTS:
@@ -37,6 +38,7 @@ def test_every_question_is_answered(quick: dict, bench: ModuleType) -> None:
     assert (quick["folder"] / "bench_gradients.png").read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.slow
 def test_the_table_tells_a_biased_estimator_from_ours(quick: dict, bench: ModuleType) -> None:
     """Where the density is 0 free flights never stop, and their derivative is exactly 0; where half of it is empty they
     give that half the sign of their other term alone."""
@@ -50,6 +52,7 @@ def test_the_table_tells_a_biased_estimator_from_ours(quick: dict, bench: Module
     assert quick["estimators"]["constant light"]["density 0"][bench.OURS]["known_to_percent"] < 5
 
 
+@pytest.mark.slow
 def test_references_agree_with_volpath(quick: dict) -> None:
     found = quick["tutorial"]["references"]
     assert abs(found["z_against_volpath"]) <= found["z_bound"]
@@ -61,6 +64,17 @@ def test_differences_are_exact_for_a_parabola(bench: ModuleType) -> None:
     for values, slope in ((np.zeros((2, 2, 2)), 3.0), (np.ones((2, 2, 2)), 5.0)):
         case = bench.Case(values, np.ones((2, 2, 2)), 0.01)
         assert bench.difference(subject, case, 0, 1) == pytest.approx(8 * slope, rel=1e-11)  # 18 / (6 h) roundings of 40
+
+
+def test_refined_until_the_mean_is_known_well_enough(bench: ModuleType) -> None:
+    """Of unit variance about 10: 1 % of the mean needs 100 values; the estimate of the variance is known to 15 % then."""
+    rng = np.random.default_rng(7)
+    numbers, size = [], bench.Size(certain_percent=1.0, certain_seconds=5.0)
+    found = bench.refine(rng.normal(10, 1, 16), lambda k: numbers.append(k) or rng.normal(10, 1), size)
+    assert 60 < len(found) < 160
+    assert numbers == list(range(16, len(found)))
+    assert len(bench.refine(found, None, bench.QUICK)) == len(found)
+    assert len(bench.refine(found, None, bench.Size(certain_percent=0.0, certain_seconds=0.0))) == len(found)
 
 
 def test_the_smoke_stands_as_in_the_tutorial(bench: ModuleType, variant_rgb: str, data_dir) -> None:
