@@ -1,8 +1,9 @@
 """Triangle meshes on disk: Stanford's ``.ply`` (binary, little endian) and Wavefront's ``.obj`` (text).
 
 Conventions. Faces name their corners counterclockwise as seen from outside, from 0 (``.obj`` counts from 1, which the writer
-sees to). Colours are code values 0..1; ``.ply`` holds them in 8 bits, ``.obj`` after the coordinates, where most programs look
-for them though the format's first description has none.
+sees to). Colours are code values 0..1; ``.ply`` holds them in 8 bits, as most programs expect (Mitsuba's ``ply`` takes numbers
+for what they are and warns: divide its ``vertex_color`` by 255 and take the sRGB curve off), ``.obj`` after the coordinates,
+where most programs look for them though the format's first description has none.
 
 Here: :data:`MESH_WRITERS`, :class:`Mesh`, :func:`write_mesh`, :func:`read_ply`.
 """
