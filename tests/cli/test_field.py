@@ -94,7 +94,7 @@ def test_photographs_become_a_field_and_a_page(photographs: Path, tmp_path: Path
     assert made.nodes is not None
     assert record["results"]["nodes"] == len(made.listed())
     page = (tmp_path / "run/report.html").read_text()
-    assert f"held-out views to {record['results']['held_out_psnr']:.1f} dB PSNR" in page.replace("\xa0", " ")
+    assert f"held-out views to {record['results']['held_out_psnr']:.1f} dB PSNR" in page.replace("\u2011", "-").replace("\xa0", " ")
     for text in ("data:video/mp4;base64,", "distance of the first judged view", "What it takes", "view_3.png"):
         assert text in page
     rows = [json.loads(line) for line in (tmp_path / "run/metrics.jsonl").read_text().splitlines()]
