@@ -42,6 +42,9 @@ from mivol.validate.images import judge, score
 FILM_SIZE = 256
 """Longest edge of a film [pixel]."""
 
+SMALLEST = 16
+"""Shortest edge of a photograph that was made smaller [pixel]."""
+
 
 def run(chosen: FieldFit, base: Path, folder: Path, *, resume: bool = False) -> Path:
     """Fit a radiance field; arguments, result and refusals as :func:`mivol.cli.experiment.run`."""
@@ -49,12 +52,13 @@ def run(chosen: FieldFit, base: Path, folder: Path, *, resume: bool = False) -> 
     set_variant(chosen.variant)
     set_threads(chosen.threads)
     folder.mkdir(parents=True, exist_ok=True)
-    plan = make_plan(chosen)
+    asked = make_plan(chosen)
     record = new_record(chosen)
     with recorded(record, folder):
         with stage(record, "photographs"):
             photos, judged = read_photos(chosen, base)
             box = make_box(chosen, photos)
+            plan = shrunk(asked, photos, box)
             views = Views.of([rectified(view) for view in photos.views], [stage.shrink for stage in plan.stages])
             record.plan, record.notes = choices(plan, photos, box, views), notes(photos)
         with stage(record, "fit"):
@@ -83,6 +87,19 @@ def make_plan(chosen: FieldFit) -> Plan:
     if wanted.longest is not None:
         coarser = [stage for stage in stages[:-1] if stage.longest < wanted.longest]
         stages = [*coarser, replace(stages[-1], longest=wanted.longest)]
+    return replace(plan, stages=tuple(stages))
+
+
+def shrunk(plan: Plan, photos: Photos, box: NDArray) -> Plan:
+    """The plan with photographs as small as its grids can tell: pixels of half a voxel, at the middle of the box."""
+    cameras = [view.camera for view in photos.views]
+    pixel = np.median([np.linalg.norm(camera.origin - box.mean(axis=0)) / camera.K[0, 0] for camera in cameras])
+    least = min(min(camera.size) for camera in cameras)
+    stages = []
+    for one in plan.stages:
+        voxel = (box[1] - box[0]).max() / one.longest
+        finest = max(1.0, min(0.5 * voxel / pixel, least / SMALLEST))
+        stages.append(replace(one, shrink=2 ** int(np.log2(finest))))
     return replace(plan, stages=tuple(stages))
 
 
@@ -150,6 +167,10 @@ def choices(plan: Plan, photos: Photos, box: NDArray, views: Views) -> list[Choi
     return [
         Choice(choice=f"{len(photos.views)} photographs, a box of {size}", reason=photos.survey.box_from),
         Choice(choice=f"grids of {resolutions} nodes along the longest edge", reason="coarse first, to find what is empty"),
+        Choice(
+            choice=f"photographs shrunk by {', '.join(str(stage.shrink) for stage in plan.stages)}",
+            reason="a pixel of half a voxel says as much as four smaller ones",
+        ),
         Choice(choice=f"harmonics of degree {plan.degree}", reason=f"{(plan.degree + 1) ** 2} numbers a colour and node"),
         Choice(choice=f"rays end at a transmittance of {plan.stop:g}", reason="what is left out is at most that share"),
         Choice(choice=memory_of(plan, box, views), reason="counted before it is taken"),
