@@ -128,6 +128,7 @@ class Session:
         needs = find_needs(scene, sensor, survey, spp)
         plan = make_plan(needs, self.settings)
         world = build_world(scene, needs, plan, self.settings, survey)
+        world.check_followed()
         if world.lights is not None:
             with dr.suspend_grad():
                 world.shade = find_shade(scene, world, needs.film_samples)

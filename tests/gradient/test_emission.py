@@ -25,7 +25,7 @@ from emission_scenes import (
 )
 
 from mivol.scene import plan
-from scenes import affine, as_float32, box_of, camera, centred, grid_volume
+from scenes import affine, as_float32, box_of, camera, centred, grid_volume, refused
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
 
@@ -85,6 +85,21 @@ def test_every_coefficient(name):
     assert np.abs(jv - total).max() <= 1e-4 * size
     both = sum((found[end] * v).sum() for end, v in along.items())
     assert abs(both - (jv * weight).sum()) <= 2e-6 * sum(np.abs(found[end] * v).sum() for end, v in along.items())
+
+
+@pytest.mark.parametrize("kind", ["mivol_voxels", "gridvolume"])
+def test_a_texture_that_was_not_told_is_not_0(kind):
+    """dr.enable_grad without params.update() leaves a texture without the derivative: refused, where it would be 0."""
+    seen = emitting(grids(3), kind=kind)
+    params, integrator = mi.traverse(seen.scene), mi.load_dict({"type": "mivol", "max_depth": 1})
+    key = find(params, "emission.data")
+    dr.enable_grad(params[key])
+    weight = dr.ones(mi.TensorXf, (1, 12, 3))
+    with refused(r"emission.data was enabled .* call params.update\(\)"):
+        integrator.render_backward(seen.scene, params, weight, seed=0, spp=1)
+    params.update()
+    integrator.render_backward(seen.scene, params, weight, seed=0, spp=1)
+    assert np.abs(np.array(dr.grad(params[key]))).max() > 0
 
 
 # -- Several passes --------------------------------------------------------------------------------------------------------
