@@ -21,7 +21,9 @@ class MivolIntegrator(mi.ad.integrators.common.ADIntegrator):
         hide_emitters: do not show emitters to the camera. Default false.
         deterministic: scattered light by quadrature along the ray, without noise; for point, spot and directional lights.
             Derivatives are drawn as ever. Default false.
-        shadows: exact, or grid: with ``deterministic``, looked up in a lattice of optical depths. Default exact.
+        shadows: exact; estimated: without bias, from a few look-ups, in pictures (gradients walk every cell); grid: with
+            ``deterministic``, looked up in a lattice of optical depths; auto: exact, or estimated where grids are fine. Default
+            auto.
         aovs: comma list of tau, tau.R, tau.G, tau.B, alpha, depth; appended to the colours in the order named.
     """
 
@@ -33,7 +35,7 @@ class MivolIntegrator(mi.ad.integrators.common.ADIntegrator):
             self.rr_depth,
             props.get("hide_emitters", False),
             props.get("deterministic", False),
-            props.get("shadows", "exact"),
+            props.get("shadows", "auto"),
         )
         self.session = Session(settings, props.get("aovs", ""))
 

@@ -19,6 +19,7 @@ from mivol.scene.load import check_variant
 from mivol.transport.direct import UNIFORM
 from mivol.transport.lattice import block_bounds
 from mivol.transport.medium import Box, MediumView, Part, box_of_cube, kind_of, view_medium
+from mivol.transport.tracking import Blocks, find_blocks
 
 __all__ = ["Boundary", "MediumFacts", "Needs", "find_needs", "is_scattering"]
 
@@ -233,6 +234,16 @@ def read_part(part: Part, survey: Survey, name: str) -> _Read:
         host = np.array(bounds)
         survey.values[key] = _Read(array, bounds, float((host > 0).mean()), float(host.max(initial=0.0)))
     return survey.values[key]
+
+
+def read_blocks(part: Part, survey: Survey) -> Blocks:
+    """Read what the blocks of a grid hold, once for each state of its array."""
+    array = dr.detach(part.lattice.values.array)
+    key = ("blocks", array.index)
+    if key not in survey.values:
+        survey.values = dict(list(survey.values.items())[-15:])
+        survey.values[key] = (array, find_blocks(part.lattice.values))
+    return survey.values[key][1]
 
 
 def is_scattering(view: MediumView, survey: Survey, name: str) -> bool:

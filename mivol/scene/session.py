@@ -17,7 +17,7 @@ from mivol.scene.needs import Survey, find_needs, survey_scene
 from mivol.scene.plan import Plan, build_world, check_aovs, make_plan
 from mivol.transport.aovs import backproject_aovs, integrate_aovs, push_aovs
 from mivol.transport.control import View, find_control
-from mivol.transport.film import Rays, adjoint_rays, record
+from mivol.transport.film import PLAIN, SPREAD, TILED, Rays, adjoint_rays, record
 from mivol.transport.light_grid import find_light_grid, find_shade
 from mivol.transport.path import Settings, is_straight, walk_path
 from mivol.transport.score import Adjoint, Primal, Tangent
@@ -75,7 +75,7 @@ class Session:
         with dr.suspend_grad():
             world, plan = self._open(scene, sensor, spp)
             image = record(
-                sensor, seed, spp, plan.pass_rays, self.aovs, lambda rays: self._primal(scene, world, rays), _is_tiled(world)
+                sensor, seed, spp, plan.pass_rays, self.aovs, lambda rays: self._primal(scene, world, rays), _layout(world)
             )
         if evaluate:
             dr.eval(image)
@@ -89,7 +89,7 @@ class Session:
                 world, plan = self._open(scene, sensor, spp)
                 world.start_tangent()
             return record(
-                sensor, seed, spp, plan.pass_rays, self.aovs, lambda rays: self._tangent(scene, world, rays), _is_tiled(world)
+                sensor, seed, spp, plan.pass_rays, self.aovs, lambda rays: self._tangent(scene, world, rays), _layout(world)
             )
 
     def render_backward(self, scene: mi.Scene, grad_in: mi.TensorXf, sensor: int | mi.Sensor, seed: int, spp: int) -> None:
@@ -105,7 +105,7 @@ class Session:
             # What is pulled back to a volume waits there for the end: its edge to the parameter can be passed but once.
             with dr.isolate_grad():
                 for rays, dL, daovs in adjoint_rays(
-                    sensor, seed, spp, plan.pass_rays, self.aovs, grad_in, _is_tiled(world)
+                    sensor, seed, spp, plan.pass_rays, self.aovs, grad_in, _layout(world)
                 ):
                     self._replay(scene, world, rays, dL, daovs)
                     dr.eval()
@@ -159,9 +159,11 @@ class Session:
         backproject_aovs(scene, world, rays.ray, self.aovs, daovs)
 
 
-def _is_tiled(world: World) -> bool:
-    """Whether lanes should lie in tiles of pixels: where they draw directions of the phase function, or to wide lamps."""
-    return world.lights is not None and world.lights.has_lobes and not world.is_deterministic
+def _layout(world: World) -> str:
+    """How the rays of a pass lie: in tiles of pixels where they draw directions of the phase function, or to wide lamps."""
+    if world.lights is None:
+        return PLAIN
+    return TILED if world.lights.has_lobes and not world.is_deterministic else SPREAD
 
 
 def _take_control(scene: mi.Scene, world: World, rays: Rays) -> None:

@@ -13,12 +13,13 @@ turned by the phase function. Surfaces cast shadows; what they reflect is one mo
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mivol.transport.dice import start_dice
 from mivol.transport.film import Strata
 from mivol.transport.free_flight import Focus, Lamp
 from mivol.transport.lamp_motion import tau_by_end
@@ -42,6 +43,36 @@ class Draw:
     lobe: mi.Float
     turn: mi.Point2f
     choice: mi.Float
+    strata: Strata | None = None
+
+    def part(self, number: mi.UInt32, count: int) -> Draw:
+        """The numbers of one of ``count`` events: those of the first, moved on, each in its part of the strata."""
+        if count == 1:
+            return self.aim(self.emitter, self.turn)
+        # Multiples of the generalised golden ratios fill one and two dimensions evenly (Roberts 2018).
+        k, across = mi.Float(number), max(a for a in range(1, int(count**0.5) + 1) if count % a == 0)
+        part = Strata(number, across, count // across)
+
+        def one(u: mi.Float) -> mi.Float:
+            return _wrap(dr.fma(k, 0.6180339887, u))
+
+        def two(u: mi.Point2f) -> mi.Point2f:
+            return mi.Point2f(_wrap(dr.fma(k, 0.7548776662, u.x)), _wrap(dr.fma(k, 0.5698402910, u.y)))
+
+        moved = Draw(
+            self.piece, two(self.inside), self.lamp, self.emitter, one(self.lobe), self.turn, one(self.choice), self.strata
+        )
+        return moved.aim(part.jitter(two(self.emitter)), part.jitter(two(self.turn)))
+
+    def aim(self, emitter: mi.Point2f, turn: mi.Point2f) -> Draw:
+        """The same with other numbers for directions, in their strata."""
+        if self.strata is not None:
+            emitter, turn = self.strata.jitter(emitter), self.strata.jitter(turn)
+        return replace(self, emitter=emitter, turn=turn, strata=None)
+
+
+def _wrap(x: mi.Float) -> mi.Float:
+    return x - dr.floor(x)
 
 
 class Lights:
@@ -69,20 +100,16 @@ class Lights:
         return self._balls[number]
 
     def draw(self, sampler: mi.Sampler, active: mi.Bool, strata: Strata | None = None) -> Draw:
-        """Draw the numbers of one event; directions from the strata of a pass, where it has some."""
-
-        def direction() -> mi.Point2f:
-            u = sampler.next_2d(active)
-            return u if strata is None else strata.jitter(u)
-
+        """Draw the numbers of one event, and note the strata of a pass, where it has some, for directions."""
         return Draw(
             sampler.next_1d(active),
             sampler.next_2d(active),
             sampler.next_1d(active),
-            direction(),
+            sampler.next_2d(active),
             sampler.next_1d(active),
-            direction(),
+            sampler.next_2d(active),
             sampler.next_1d(active),
+            strata,
         )
 
     def choose(self, ray: mi.Ray3f, u: mi.Float) -> Lamp:
@@ -137,7 +164,14 @@ class Arrival:
 
 
 def arrivals(
-    scene: mi.Scene, world: World, mei: mi.MediumInteraction3f, lamp: Lamp, draw: Draw, attached: bool, active: mi.Bool
+    scene: mi.Scene,
+    world: World,
+    mei: mi.MediumInteraction3f,
+    lamp: Lamp,
+    draw: Draw,
+    attached: bool,
+    active: mi.Bool,
+    estimates: bool = False,
 ) -> list[Arrival]:
     """Estimate the light that arrives at a point and turns into ``mei.wi``.
 
@@ -148,6 +182,7 @@ def arrivals(
         draw: random numbers.
         attached: keep the derivatives of phase function and emitters.
         active: lanes to light.
+        estimates: shadows may be estimated, in grids whose blocks are known; otherwise they are exact.
 
     Returns:
         One or two shadow rays, whose values add up to L_s.
@@ -155,21 +190,30 @@ def arrivals(
     Bias: none. Variance: that of one direction towards a lamp and one of the phase function.
     """
     found = []
+    # Where shadows are estimated no ray is followed back: the number that would choose one is free.
+    one, two = (start_dice(draw.choice, dr.width(active), k) if estimates else None for k in range(2))
     if world.lights.drawn:
-        found.append(_from_lamp(scene, world, mei, lamp, draw, attached, active))
+        found.append(_from_lamp(scene, world, mei, lamp, draw, attached, active, one))
     if world.lights.has_lobes:
-        found.append(_from_lobe(scene, world, mei, draw, attached, active))
+        found.append(_from_lobe(scene, world, mei, draw, attached, active, two))
     return found
 
 
 def _from_lamp(
-    scene: mi.Scene, world: World, mei: mi.MediumInteraction3f, lamp: Lamp, draw: Draw, attached: bool, active: mi.Bool
+    scene: mi.Scene,
+    world: World,
+    mei: mi.MediumInteraction3f,
+    lamp: Lamp,
+    draw: Draw,
+    attached: bool,
+    active: mi.Bool,
+    dice: mi.UInt32 | None,
 ) -> Arrival:
     """A direction towards the lamp."""
     lights, phase = world.lights, mei.medium.phase_function()
     direct, weight = lamp.emitter.sample_direction(mei, draw.emitter, active)
     on = active & (direct.pdf > 0)
-    way, clear, tau, light = shadow_ray(scene, world, mi.Point3f(mei.p), mei.medium, direct, on)
+    way, clear, tau, light = shadow_ray(scene, world, mi.Point3f(mei.p), mei.medium, direct, on, dice)
     w_mis = mi.Float(1)
     if lights.has_lobes:
         _, pdf_lobe = phase.eval_pdf(_context(), mei, direct.d, on)
@@ -203,14 +247,20 @@ def _follow(
 
 
 def _from_lobe(
-    scene: mi.Scene, world: World, mei: mi.MediumInteraction3f, draw: Draw, attached: bool, active: mi.Bool
+    scene: mi.Scene,
+    world: World,
+    mei: mi.MediumInteraction3f,
+    draw: Draw,
+    attached: bool,
+    active: mi.Bool,
+    dice: mi.UInt32 | None,
 ) -> Arrival:
     """A direction of the phase function."""
     lights, phase = world.lights, mei.medium.phase_function()
     wo, weight, pdf = phase.sample(_context(), mei, draw.lobe, draw.turn, active)
     on = active & (pdf > 0)
     ray = mi.Ray3f(mei.p, wo, dr.inf, mei.time, mei.wavelengths)
-    end, _, light = light_through(scene, world, ray, mei.medium, on)
+    end, _, light = light_through(scene, world, ray, mei.medium, on, dice)
     si = end.si
     emitter = si.emitter(scene, on)
     on &= emitter != None

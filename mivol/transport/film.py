@@ -19,6 +19,8 @@ from mivol.errors import MivolError
 
 __all__ = ["Rays", "Strata", "adjoint_rays", "film_passes", "record"]
 
+PLAIN, SPREAD, TILED = "plain", "spread", "tiled"
+
 TILE = 4
 """Edge of a tile of pixels: 16 lanes of one packet."""
 
@@ -65,7 +67,7 @@ Sample = Callable[[Rays], tuple]
 """``sample(rays)``: what rays carry: radiance, whether the film's alpha sees something, and the AOVs."""
 
 
-def film_passes(sensor: mi.Sensor, seed: int, spp: int, pass_rays: int, tiled: bool = False) -> Iterator[Rays]:
+def film_passes(sensor: mi.Sensor, seed: int, spp: int, pass_rays: int, layout: str = PLAIN) -> Iterator[Rays]:
     """Generate the rays of a render, pass by pass.
 
     Args:
@@ -73,8 +75,8 @@ def film_passes(sensor: mi.Sensor, seed: int, spp: int, pass_rays: int, tiled: b
         seed: of the sampler.
         spp: samples a pixel; 0 for the sampler's own count.
         pass_rays: most rays of a pass.
-        tiled: put the lanes of a tile of pixels side by side, and stratify their directions (independent samplers only, and
-            films of whole tiles).
+        layout: PLAIN; SPREAD, the samples of a pixel share it out among them; TILED, besides, the lanes of a tile of pixels
+            lie side by side and their directions are stratified (independent samplers only, TILED films of whole tiles only).
 
     Raises:
         MivolError: one sample a pixel is more than a launch can hold (2^32).
@@ -84,7 +86,7 @@ def film_passes(sensor: mi.Sensor, seed: int, spp: int, pass_rays: int, tiled: b
     for index in range(base.sample_count() // per_pass):
         sampler = base.clone()
         _seed(sampler, seed, index, pixels * per_pass)
-        yield _camera_rays(sensor, sampler, pixels * per_pass, per_pass, tiled, seed)
+        yield _camera_rays(sensor, sampler, pixels * per_pass, per_pass, layout, seed)
 
 
 def _seed(sampler: mi.Sampler, seed: int, index: int, count: int) -> None:
@@ -126,29 +128,37 @@ def _sampled_size(film: mi.Film) -> tuple[int, int]:
 
 
 def _camera_rays(
-    sensor: mi.Sensor, sampler: mi.Sampler, count: int, per_pass: int, tiled: bool, seed: int
+    sensor: mi.Sensor, sampler: mi.Sampler, count: int, per_pass: int, layout: str, seed: int
 ) -> Rays:
     film = sensor.film()
     width, height = _sampled_size(film)
     lane, strata = dr.arange(mi.UInt32, count), None
-    if tiled and sampler.class_name() == "IndependentSampler" and width % TILE == 0 and height % TILE == 0:
+    # Opaque: a seed that is part of a kernel has it compiled anew in every render.
+    salt = mi.UInt32(seed)
+    dr.make_opaque(salt)
+    salt += 0x9E3779B9
+    across = max(a for a in range(1, int(per_pass**0.5) + 1) if per_pass % a == 0)
+    shares = layout != PLAIN and sampler.class_name() == "IndependentSampler"
+    if layout == TILED and shares and width % TILE == 0 and height % TILE == 0:
         lanes, tiles = TILE * TILE, width // TILE
         tile, rest = lane // (lanes * dr.opaque(mi.UInt32, per_pass)), lane % (lanes * dr.opaque(mi.UInt32, per_pass))
         sample, inside = rest // lanes, rest % lanes
         pixel = mi.Vector2i(TILE * (tile % tiles) + inside % TILE, TILE * (tile // tiles) + inside // TILE)
-        seed = mi.UInt32(seed)
-        # A seed that is part of a kernel has it compiled anew in every render.
-        dr.make_opaque(seed)
-        turn = mi.sample_tea_32(tile, seed + 0x9E3779B9)[0]
-        across = max(a for a in range(1, int(per_pass**0.5) + 1) if per_pass % a == 0)
+        turn, other = mi.sample_tea_32(tile, salt)
         strata = Strata((sample + turn % per_pass) % per_pass, across, per_pass // across)
     else:
-        index = lane // dr.opaque(mi.UInt32, per_pass)
+        index, sample = lane // dr.opaque(mi.UInt32, per_pass), lane % dr.opaque(mi.UInt32, per_pass)
         pixel = mi.Vector2i(index % width, index // width)
+        _, other = mi.sample_tea_32(index, salt)
     if film.sample_border():
         pixel -= film.rfilter().border_size()
     pixel += mi.Vector2i(film.crop_offset())
-    position = mi.Vector2f(pixel) + sampler.next_2d()
+    u = sampler.next_2d()
+    if shares:
+        # In another order in each tile (or pixel), so that no direction belongs to a part of the pixel.
+        cell = mi.permute_kensler(sample, per_pass, other)
+        u = Strata(cell, across, per_pass // across).jitter(u)
+    position = mi.Vector2f(pixel) + u
 
     scale = dr.rcp(mi.ScalarVector2f(film.crop_size()))
     offset = -mi.ScalarVector2f(film.crop_offset()) * scale
@@ -163,12 +173,12 @@ def _camera_rays(
 
 
 def record(
-    sensor: mi.Sensor, seed: int, spp: int, pass_rays: int, names: list[str], sample: Sample, tiled: bool = False
+    sensor: mi.Sensor, seed: int, spp: int, pass_rays: int, names: list[str], sample: Sample, layout: str = PLAIN
 ) -> mi.TensorXf:
     """Render an image: send the rays of all passes, and gather what they carry on the sensor's film.
 
     Args:
-        sensor, seed, spp, pass_rays, tiled: as :func:`film_passes`.
+        sensor, seed, spp, pass_rays, layout: as :func:`film_passes`.
         names: of the AOVs, in the order in which ``sample`` returns them.
         sample: what rays carry.
 
@@ -177,7 +187,7 @@ def record(
     """
     film = sensor.film()
     film.prepare(names)
-    for rays in film_passes(sensor, seed, spp, pass_rays, tiled):
+    for rays in film_passes(sensor, seed, spp, pass_rays, layout):
         L, valid, aovs = sample(rays)
         block = _new_block(film, rays)
         _splat(block, film, rays, L * rays.weight, mi.Float(1), dr.select(valid, mi.Float(1), mi.Float(0)), aovs)
@@ -194,12 +204,12 @@ def adjoint_rays(
     pass_rays: int,
     names: list[str],
     grad_image: mi.TensorXf,
-    tiled: bool = False,
+    layout: str = PLAIN,
 ) -> Iterator[tuple[Rays, mi.Spectrum, list[mi.Float]]]:
     """Send a gradient image back through the film, pass by pass.
 
     Args:
-        sensor, seed, spp, pass_rays, names, tiled: as :func:`record`.
+        sensor, seed, spp, pass_rays, names, layout: as :func:`record`.
         grad_image: d loss / d image.
 
     Yields:
@@ -207,8 +217,8 @@ def adjoint_rays(
     """
     film = sensor.film()
     several = count_passes(sensor, spp, pass_rays) > 1
-    weights = _weights(sensor, seed, spp, pass_rays, names, tiled) if several else None
-    for rays in film_passes(sensor, seed, spp, pass_rays, tiled):
+    weights = _weights(sensor, seed, spp, pass_rays, names, layout) if several else None
+    for rays in film_passes(sensor, seed, spp, pass_rays, layout):
         with dr.resume_grad():
             n = dr.width(rays.ray)
             L = dr.full(mi.Spectrum, 1, n)
@@ -231,12 +241,12 @@ def adjoint_rays(
         yield rays, dL, daovs
 
 
-def _weights(sensor: mi.Sensor, seed: int, spp: int, pass_rays: int, names: list[str], tiled: bool) -> mi.ImageBlock:
+def _weights(sensor: mi.Sensor, seed: int, spp: int, pass_rays: int, names: list[str], layout: str) -> mi.ImageBlock:
     """The filter weights of all passes, and nothing else."""
     film = sensor.film()
     film.prepare(names)
     block = None
-    for rays in film_passes(sensor, seed, spp, pass_rays, tiled):
+    for rays in film_passes(sensor, seed, spp, pass_rays, layout):
         block = block or _new_block(film, rays)
         zero = [mi.Float(0) for _ in names]
         _splat(block, film, rays, mi.Spectrum(0), mi.Float(1), mi.Float(0), zero)

@@ -12,7 +12,7 @@ Conventions. A probe for derivatives adds ``kappa`` to the extinction: density i
 the derivative is not zero there. ``Focus`` tells where a lamp is as seen from a ray; light from infinity has none.
 
 References: Kulla & Fajardo 2012 (equal angles); Miller et al. 2019 (spectral combination of free paths); Chao 1982 (keeping one
-of a weighted stream); O'Neill 2014 (the generator).
+of a weighted stream).
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mivol.numerics import one_minus_exp
+from mivol.transport.dice import roll, start_dice
 from mivol.transport.lattice import Cell, box_nodes, clip, read_nodes, walk
 from mivol.transport.optical_depth import gauss_points
 from mivol.transport.path import DARK, Visit
@@ -73,13 +74,11 @@ class Lamp:
 
 
 @dataclass
-class Pick:
-    """The piece of a ray that was kept so far, and what has been walked.
+class Kept:
+    """The piece of a ray that was kept so far.
 
     Attributes:
-        tau, T: optical depth [1] and transmittance [1] of each channel, of all that was walked.
-        total: sum of the weights.
-        weight: of the piece that is kept.
+        weight: of the piece.
         begin, s, dt: it starts ``s`` behind ``begin``, a distance along the ray, and is ``dt`` long.
         front: optical depth in front of it.
         spread: extinction [1/length] that a probe adds there.
@@ -88,9 +87,6 @@ class Pick:
         chance: state of the generator.
     """
 
-    tau: list[mi.Float]
-    T: list[mi.Float]
-    total: mi.Float
     weight: mi.Float
     begin: mi.Float
     s: mi.Float
@@ -102,12 +98,39 @@ class Pick:
     chance: mi.UInt32
 
 
-def start_pick(world: World, u: mi.Float, width: int) -> Pick:
-    """Begin with nothing; ``u`` in [0, 1) seeds the generator."""
-    zero = [dr.zeros(mi.Float, width) for _ in range(6)]
-    tau, T, front = [[dr.full(mi.Float, v, width) for _ in range(world.channels)] for v in (0, 1, 0)]
-    seed = mi.UInt32(u * (1 << 24)) * mi.UInt32(0x9E3779B9) + dr.arange(mi.UInt32, width) * mi.UInt32(0x85EBCA6B)
-    return Pick(tau, T, *zero[:5], front, zero[5], dr.zeros(mi.UInt32, width), dr.zeros(mi.Bool, width), seed)
+@dataclass
+class Pick:
+    """What has been walked of a ray, and pieces of it that were kept, each drawn for itself.
+
+    Attributes:
+        tau, T: optical depth [1] and transmittance [1] of each channel, of all that was walked.
+        total: sum of the weights.
+        kept: the pieces.
+    """
+
+    tau: list[mi.Float]
+    T: list[mi.Float]
+    total: mi.Float
+    kept: list[Kept]
+
+    def of(self, number: mi.UInt32) -> Kept:
+        """One of the pieces in each lane."""
+        found = self.kept[0]
+        for k, other in enumerate(self.kept[1:], 1):
+            found = dr.select(number == k, other, found)
+        return found
+
+
+def start_pick(world: World, u: mi.Float, width: int, count: int = 1) -> Pick:
+    """Begin with nothing; ``u`` in [0, 1) seeds the generators of ``count`` pieces."""
+    tau, T = [[dr.full(mi.Float, v, width) for _ in range(world.channels)] for v in (0, 1)]
+    return Pick(tau, T, dr.zeros(mi.Float, width), [_start_kept(world, start_dice(u, width, k), width) for k in range(count)])
+
+
+def _start_kept(world: World, chance: mi.UInt32, width: int) -> Kept:
+    zero = [dr.zeros(mi.Float, width) for _ in range(5)]
+    front = [dr.zeros(mi.Float, width) for _ in range(world.channels)]
+    return Kept(*zero[:4], front, zero[4], dr.zeros(mi.UInt32, width), dr.zeros(mi.Bool, width), chance)
 
 
 def offer(world: World, ray: mi.Ray3f, lamp: Lamp, kappa: float) -> Visit:
@@ -125,8 +148,9 @@ def offer(world: World, ray: mi.Ray3f, lamp: Lamp, kappa: float) -> Visit:
 
     def visit(pick: Pick, body: Body, t0: mi.Float, t1: mi.Float, on: mi.Bool) -> Pick:
         pick = _fly(world, body, ray, mi.Float(t0), mi.Float(t1), lamp, kappa, pick, on)
-        pick.body = dr.select(pick.fresh, numbers[id(body)], pick.body)
-        pick.fresh = dr.zeros(mi.Bool, dr.width(pick.fresh))
+        for kept in pick.kept:
+            kept.body = dr.select(kept.fresh, numbers[id(body)], kept.body)
+            kept.fresh = dr.zeros(mi.Bool, dr.width(kept.fresh))
         others = [p for p in body.view.parts if not any(p is q for q in body.flight)]
         if others:
             rest = body.optical_depth(ray, t0, t1, world.channels, on, others)
@@ -192,7 +216,9 @@ def _least_of(rows: list[mi.Float]) -> mi.Float:
 
 
 def _note_spread(pick: Pick, spread: mi.Float | None) -> Pick:
-    return pick if spread is None else replace(pick, spread=dr.select(pick.fresh, spread, pick.spread))
+    if spread is None:
+        return pick
+    return replace(pick, kept=[replace(k, spread=dr.select(k.fresh, spread, k.spread)) for k in pick.kept])
 
 
 def _offer_piece(
@@ -220,21 +246,25 @@ def _offer_piece(
         weight *= lit
     # A piece of length 0 has a NaN for its mean angle; a weight beyond float32 would be kept for ever.
     weight = dr.select(on & (dt > 0) & (weight < 1e30), weight, 0)
-    chance, u = _next(pick.chance)
     total = pick.total + weight
+    return Pick(ahead, beyond, total, [_keep(old, weight, total, begin, s, dt, pick.tau) for old in pick.kept])
+
+
+def _keep(
+    old: Kept, weight: mi.Float, total: mi.Float, begin: mi.Float, s: mi.Float, dt: mi.Float, tau: list[mi.Float]
+) -> Kept:
+    """The new piece in place of the old one, with the probability of its weight."""
+    chance, (u,) = roll(old.chance, 1)
     keep = u * total < weight
-    return Pick(
-        ahead,
-        beyond,
-        total,
-        dr.select(keep, weight, pick.weight),
-        dr.select(keep, begin, pick.begin),
-        dr.select(keep, s, pick.s),
-        dr.select(keep, dt, pick.dt),
-        [dr.select(keep, t, f) for t, f in zip(pick.tau, pick.front, strict=True)],
-        pick.spread,
-        pick.body,
-        pick.fresh | keep,
+    return Kept(
+        dr.select(keep, weight, old.weight),
+        dr.select(keep, begin, old.begin),
+        dr.select(keep, s, old.s),
+        dr.select(keep, dt, old.dt),
+        [dr.select(keep, t, f) for t, f in zip(tau, old.front, strict=True)],
+        old.spread,
+        old.body,
+        old.fresh | keep,
         chance,
     )
 
@@ -243,16 +273,6 @@ def taken_light(tau: mi.Float, T: mi.Float, T_out: mi.Float) -> mi.Float:
     """T (1 - exp(-tau)), to 4e-5 of it: a difference where it keeps its digits, a series elsewhere."""
     series = dr.fma(tau, dr.fma(tau, dr.fma(tau, dr.fma(tau, 1 / 120, -1 / 24), 1 / 6), -1 / 2), 1)
     return dr.select(tau < 0.5, T * tau * series, T - T_out)
-
-
-def _next(state: mi.UInt32) -> tuple[mi.UInt32, mi.Float]:
-    """The next state of a permuted congruential generator (RXS-M-XS 32) and its number in (0, 1).
-
-    Never 0: a piece of next to no weight would be kept 2^-24 of the time, and count for as much as any other.
-    """
-    word = ((state >> ((state >> 28) + 4)) ^ state) * mi.UInt32(277803737)
-    word = (word >> 22) ^ word
-    return state * mi.UInt32(747796405) + mi.UInt32(2891336453), (mi.Float(word >> 8) + 0.5) * (1 / (1 << 24))
 
 
 @dataclass
@@ -278,13 +298,21 @@ class Event:
 
 
 def place(
-    world: World, ray: mi.Ray3f, pick: Pick, focus: Focus | None, kappa: float, u: mi.Point2f, active: mi.Bool
+    world: World,
+    ray: mi.Ray3f,
+    pick: Kept,
+    total: mi.Float,
+    focus: Focus | None,
+    kappa: float,
+    u: mi.Point2f,
+    active: mi.Bool,
 ) -> Event:
     """Draw a distance in the piece that was kept.
 
     Args:
         world, ray, focus, kappa: as in :func:`offer`.
-        pick: what the walk has kept.
+        pick: a piece that the walk has kept.
+        total: sum of the weights of all pieces.
         u: two numbers in [0, 1).
         active: lanes that may scatter.
     """
@@ -315,13 +343,13 @@ def place(
     evenly = dr.rcp(dt)
     if focus is not None:
         evenly = dr.select(focus.finite, focus.density(begin, dt, x * dt), evenly)
-    pdf = (pdf + (1 - by_collision) * evenly) * pick.weight / dr.select(on, pick.total, 1)
+    pdf = (pdf + (1 - by_collision) * evenly) * pick.weight / dr.select(on, total, 1)
     t = mi.Float(mi.Float64(pick.begin) + mi.Float64(pick.s) + mi.Float64(x) * mi.Float64(dt))
     on &= (pdf > 0) & dr.isfinite(pdf)
     return Event(t, begin, dr.select(on, pdf, 1), [f + a for f, a in zip(pick.front, tau, strict=True)], sigma, pick.body, on)
 
 
-def _curve(world: World, ray: mi.Ray3f, pick: Pick, on: mi.Bool) -> list[list[mi.Float]]:
+def _curve(world: World, ray: mi.Ray3f, pick: Kept, on: mi.Bool) -> list[list[mi.Float]]:
     """The extinction along the piece that was kept, for each channel: the coefficients of a cubic of [0, 1]."""
     values = [[mi.Float(0) for _ in range(4)] for _ in range(world.channels)]
     for index, body in enumerate(world.bodies):
@@ -331,7 +359,7 @@ def _curve(world: World, ray: mi.Ray3f, pick: Pick, on: mi.Bool) -> list[list[mi
     return [_cubic(*v) for v in values]
 
 
-def _values_along(world: World, body: Body, ray: mi.Ray3f, pick: Pick, on: mi.Bool) -> list[list[mi.Float]]:
+def _values_along(world: World, body: Body, ray: mi.Ray3f, pick: Kept, on: mi.Bool) -> list[list[mi.Float]]:
     """[channel][point] extinction at 0, 1/3, 2/3 and 1 of the piece that was kept, in one body."""
     field = body.extinction(ray, body.flight)
     constant = [[c] * 4 for c in field.constant]
@@ -402,7 +430,7 @@ def _invert(curve: list, whole: list[mi.Float], front: list[mi.Float], dt: mi.Fl
 
 def _scramble(u: mi.Point2f) -> mi.Float:
     """A third number in [0, 1) from the bits of two."""
-    return _next(mi.UInt32(u.x * (1 << 24)) * mi.UInt32(0x9E3779B9) + mi.UInt32(u.y * (1 << 24)))[1]
+    return roll(mi.UInt32(u.x * (1 << 24)) * mi.UInt32(0x9E3779B9) + mi.UInt32(u.y * (1 << 24)), 1)[1][0]
 
 
 def _log_share(u: mi.Float, tau: mi.Float) -> mi.Float:

@@ -56,12 +56,14 @@ class Lattice:
         values: TensorXf (Z, Y, X, C), at voxel centres.
         to_world: (4, 4) float64, unit cube to world.
         bounds: upper bound of |values| over each block of cells, or None where no block is to be skipped.
+        blocks: :class:`mivol.transport.tracking.Blocks`, or None where every cell is walked.
         from_world: (3, 4) map from the world to lattice coordinates, made where it is not given.
     """
 
     values: mi.TensorXf
     to_world: np.ndarray
     bounds: mi.Float | None = None
+    blocks: Any = None
     from_world: list[list[mi.Float64]] | None = None
 
     def __post_init__(self) -> None:
@@ -264,6 +266,7 @@ def walk(
     reads: Sequence[Nodes] = (),
     active: mi.Bool = True,
     until: Callable[[Any], mi.Bool] | None = None,
+    halts: bool = False,
 ) -> Any:
     """Visit the cells that a segment crosses, in order, and return the last state.
 
@@ -277,6 +280,8 @@ def walk(
         reads: arrays over the nodes; the visitor finds their corners in ``cell.corners``.
         active: lanes to walk.
         until: whether a lane has seen enough, told from the state after a cell; None to walk to the end.
+        halts: the visitor may stop inside a cell: it returns its state and how far it went, at most ``cell.dt``, and is asked
+            again from there.
 
     Cost: one step per cell or empty block, at most X + Y + Z + 6 of them; 4 reads a step and channel (8 a visited cell
         where blocks are skipped).
@@ -325,15 +330,21 @@ def walk(
         left = (length - s) - s_rest
         dt = _least(plane, left)
         here = Cell(corners, cell, ahead, frac, speed * dt, s, dt)
-        state = visit(state, here, active & full)
+        if halts:
+            state, dt = visit(state, here, active & full)
+        else:
+            state = visit(state, here, active & full)
 
         # -- Leave through one face: a tie is a step of length 0 through the next ------------------------------------------
         through_x = reach.x <= plane
         through_y = ~through_x & (reach.y <= plane)
         through_z = ~(through_x | through_y)
+        if halts:
+            arrives = dt >= plane
+            through_x, through_y, through_z = through_x & arrives, through_y & arrives, through_z & arrives
         through = dr.mask_t(mi.Vector3f)(through_x, through_y, through_z)
         s, s_rest = _add(s, s_rest, dt)
-        active &= plane < left
+        active &= dt < left if halts else plane < left
         if until is not None:
             active &= ~until(state)
 

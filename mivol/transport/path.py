@@ -51,14 +51,15 @@ class Settings:
     """How long a path may be, and how scattered light is found.
 
     ``max_depth`` (-1: no limit), roulette from ``rr_depth`` on, ``hide_emitters``; ``deterministic``: by quadrature, with
-    ``shadows`` that are ``exact`` or looked up in a ``grid``.
+    ``shadows`` that are ``exact`` or looked up in a ``grid``; drawn light has ``exact`` or ``estimated`` shadows, or (``auto``)
+    what the plan chooses.
     """
 
     max_depth: int = 6
     rr_depth: int = 5
     hide_emitters: bool = False
     deterministic: bool = False
-    shadows: str = "exact"
+    shadows: str = "auto"
 
 
 @dataclass
@@ -245,15 +246,31 @@ def optical_depth_to(
 
 
 def light_through(
-    scene: mi.Scene, world: World, ray: mi.Ray3f, medium: mi.MediumPtr, active: mi.Bool
-) -> tuple[Reach, list[mi.Float], mi.Spectrum]:
+    scene: mi.Scene, world: World, ray: mi.Ray3f, medium: mi.MediumPtr, active: mi.Bool, dice: mi.UInt32 | None = None
+) -> tuple[Reach, list[mi.Float] | None, mi.Spectrum]:
     """Where a ray of light ends, its optical depth for each channel, and the share of it that gets there.
 
-    It passes veils. Optical depth is summed no further than to ``DARK`` in a grid.
+    It passes veils. Optical depth is summed no further than to ``DARK`` in a grid. With ``dice`` the share is an unbiased
+    estimate where blocks of grids are known (:mod:`mivol.transport.tracking`), and the optical depth is not told.
     """
+    if dice is not None and world.is_tracked:
+        start = ([mi.Float(1) for _ in range(world.channels)], dice)
+        end, (T, _) = reach(scene, world, ray, medium, _dim(ray), start, active, unveils=True)
+        return end, None, mi.Spectrum(*T) * end.veil if len(T) == 3 else mi.Spectrum(T[0]) * end.veil
     zero = [mi.Float(0) for _ in range(world.channels)]
     end, tau = reach(scene, world, ray, medium, add_optical_depth(ray, DARK), zero, active, unveils=True)
     return end, tau, transmittance(tau) * end.veil
+
+
+def _dim(ray: mi.Ray3f) -> Visit:
+    """The visitor that multiplies transmittances along ``ray``, estimated where blocks are known."""
+
+    def visit(state: tuple, body: Body, t0: mi.Float, t1: mi.Float, active: mi.Bool) -> tuple:
+        T, dice = state
+        own, dice = body.transmittance(ray, t0, t1, len(T), active, dice, DARK)
+        return [a * b for a, b in zip(T, own, strict=True)], dice
+
+    return visit
 
 
 def transmittance(tau: list[mi.Float]) -> mi.Spectrum:
@@ -421,9 +438,15 @@ def _bounce(scene: mi.Scene, world: World, settings: Settings, limit: int, path:
 
 
 def shadow_ray(
-    scene: mi.Scene, world: World, start: mi.Point3f, medium: mi.MediumPtr, direct: mi.DirectionSample3f, active: mi.Bool
-) -> tuple[Way, mi.Bool, list[mi.Float], mi.Spectrum]:
-    """Go from a point to a point of a lamp.
+    scene: mi.Scene,
+    world: World,
+    start: mi.Point3f,
+    medium: mi.MediumPtr,
+    direct: mi.DirectionSample3f,
+    active: mi.Bool,
+    dice: mi.UInt32 | None = None,
+) -> tuple[Way, mi.Bool, list[mi.Float] | None, mi.Spectrum]:
+    """Go from a point to a point of a lamp; ``dice`` as in :func:`light_through`.
 
     Returns:
         The way, whether no opaque surface stands in it, its optical depth for each channel, and the share of the light that
@@ -431,7 +454,7 @@ def shadow_ray(
     """
     length = dr.norm(direct.p - start)
     ray = mi.Ray3f(start, dr.normalize(direct.p - start), length, direct.time, mi.Color0f())
-    stop, tau, light = light_through(scene, world, ray, medium, active)
+    stop, tau, light = light_through(scene, world, ray, medium, active, dice)
     # The last 1e-3 of the way is the lamp's own surface (Mitsuba's ShadowEpsilon shortens its rays alike).
     clear = ~(stop.si.is_valid() & (stop.t < length * (1 - 1e-3)))
     return Way(ray, medium, length, True), clear, tau, light

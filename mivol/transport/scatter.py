@@ -16,12 +16,12 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from mivol.transport.direct import Arrival, arrivals
-from mivol.transport.free_flight import Event, offer, place, start_pick
+from mivol.transport.direct import Arrival, Draw, arrivals
+from mivol.transport.free_flight import Event, Kept, Lamp, Pick, offer, place, start_pick
 from mivol.transport.path import Reach, Stretch, optical_depth_to, reach, transmittance
 from mivol.transport.world import Body, World, spectrum
 
-__all__ = ["Scattering", "albedo", "at_event", "interaction", "scatter", "sigma_t_at"]
+__all__ = ["Scattering", "albedo", "at_event", "interaction", "scatter", "scattered_light", "sigma_t_at"]
 
 KAPPA = 4.0
 """Optical depth that a probe for derivatives adds over a body (measured: flat between 2 and 8)."""
@@ -69,19 +69,74 @@ def scatter(
 
     Bias: none. Cost: one walk of the stretch, one of each shadow ray; where several media lie along a ray, one to the point.
     """
+    end, pick, lamp = _walk(scene, world, stretch, 1, probes, active)
+    draw = stretch.draw.part(mi.UInt32(0), 1)
+    return end, pick.tau, _light_up(scene, world, stretch, pick.kept[0], pick.total, lamp, draw, probes, active)
+
+
+def scattered_light(
+    scene: mi.Scene, world: World, stretch: Stretch, active: mi.Bool
+) -> tuple[Reach, list[mi.Float], mi.Spectrum]:
+    """Walk a stretch to its end, and let it scatter at ``world.events`` points on the way, for a picture.
+
+    Returns:
+        Where the stretch ends, the optical depth of each channel to there, and the light of all points, in the mean.
+
+    Bias: none. Variance: of each point as of :func:`scatter`; they share the lamp. Cost: one walk of the stretch, one of each
+    shadow ray: long stretches pay for several points.
+    """
+    count, draw = world.events, stretch.draw
+    end, pick, lamp = _walk(scene, world, stretch, count, False, active)
+
+    def light_of(number: mi.UInt32) -> mi.Spectrum:
+        kept, numbers = pick.of(number), draw.part(number, count)
+        at = _light_up(scene, world, stretch, kept, pick.total, lamp, numbers, False, active)
+        return dr.select(at.event.on, at.sigma_s * at.weight, 0)
+
+    if count == 1:
+        return end, pick.tau, light_of(mi.UInt32(0))
+    _, light = dr.while_loop(
+        state=(dr.zeros(mi.UInt32, dr.width(stretch.ray)), dr.zeros(mi.Spectrum, dr.width(stretch.ray))),
+        cond=lambda number, light: number < count,
+        body=lambda number, light: (number + 1, light + light_of(number)),
+        label="points that scatter",
+    )
+    return end, pick.tau, light * (1 / count)
+
+
+def _walk(
+    scene: mi.Scene, world: World, stretch: Stretch, count: int, probes: bool, active: mi.Bool
+) -> tuple[Reach, Pick, Lamp]:
+    """Walk a stretch to its end and keep pieces of it, for a lamp that was drawn before."""
     kappa, draw, ray = KAPPA if probes else 0.0, stretch.draw, stretch.ray
     lamp = world.lights.choose(ray, draw.lamp)
-    pick = start_pick(world, draw.piece, dr.width(ray))
+    pick = start_pick(world, draw.piece, dr.width(ray), count)
     end, pick = reach(scene, world, ray, stretch.medium, offer(world, ray, lamp, kappa), pick, active)
-    event = place(world, ray, pick, lamp.focus, kappa, draw.inside, active & stretch.scatters)
+    return end, pick, lamp
+
+
+def _light_up(
+    scene: mi.Scene,
+    world: World,
+    stretch: Stretch,
+    kept: Kept,
+    total: mi.Float,
+    lamp: Lamp,
+    draw: Draw,
+    probes: bool,
+    active: mi.Bool,
+) -> Scattering:
+    """Choose a point in a piece that was kept, and look from there to the lamps."""
+    kappa, ray = KAPPA if probes else 0.0, stretch.ray
+    event = place(world, ray, kept, total, lamp.focus, kappa, draw.inside, active & stretch.scatters)
     mei = _interaction(world, ray, event)
     tau = event.tau
     if not world.is_single:
         front = mi.Ray3f(ray.o, ray.d, event.t, ray.time, ray.wavelengths)
         _, tau = optical_depth_to(scene, world, front, stretch.medium, event.on)
     gain = dr.select(event.on, stretch.beta * transmittance(tau) / event.pdf, 0)
-    found = arrivals(scene, world, mei, lamp, draw, probes, event.on)
-    return end, pick.tau, Scattering(event, mei, gain, found, _sigma_s(world, ray, event, mei), draw.choice)
+    found = arrivals(scene, world, mei, lamp, draw, probes, event.on, estimates=not probes)
+    return Scattering(event, mei, gain, found, _sigma_s(world, ray, event, mei), draw.choice)
 
 
 def interaction(ray: mi.Ray3f, t: mi.Float, medium: mi.Medium | None = None) -> mi.MediumInteraction3f:

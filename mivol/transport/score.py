@@ -28,7 +28,7 @@ from mivol.transport.control import Probe, Tracks, sweep
 from mivol.transport.emission import backproject_emission, integrate_emission
 from mivol.transport.path import Reach, Stretch, Way, optical_depth_to, reach, revisit
 from mivol.transport.quadrature import integrate_scattering
-from mivol.transport.scatter import Scattering, albedo, at_event, scatter, sigma_t_at
+from mivol.transport.scatter import Scattering, albedo, at_event, scatter, scattered_light, sigma_t_at
 from mivol.transport.world import Body, World, by_channel, spectrum, tangent_of
 
 __all__ = ["Adjoint", "Primal", "Tangent"]
@@ -54,8 +54,8 @@ class Primal:
         if world.is_deterministic:
             end, tau, light = integrate_scattering(scene, world, stretch, active)
             return end, tau, self.add(light, active)
-        end, tau, event = scatter(scene, world, stretch, False, active)
-        return end, tau, self.add(event.sigma_s * event.weight, event.event.on)
+        end, tau, light = scattered_light(scene, world, stretch, active)
+        return end, tau, self.add(light, active)
 
     def add(self, value: mi.Spectrum, active: mi.Bool) -> Primal:
         """Light found at the end of a stretch."""

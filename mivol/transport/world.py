@@ -27,6 +27,7 @@ from mivol.transport.optical_depth import (
     upward_frac,
     weights,
 )
+from mivol.transport.tracking import track
 
 if TYPE_CHECKING:
     from mivol.transport.control import Control
@@ -83,6 +84,22 @@ class Body:
         scale = dr.detach(self.view.scale) * self.area(ray.d)
         bound = None if enough is None else enough / scale
         return [scale * tau for tau in self._sum(ray, t0, t1, channels, active, pairs, True, bound)]
+
+    def transmittance(
+        self, ray: mi.Ray3f, t0: mi.Float, t1: mi.Float, channels: int, active: mi.Bool, dice: mi.UInt32, enough: float
+    ) -> tuple[list[mi.Float], mi.UInt32]:
+        """Transmittance [1] of each channel over a stretch, and what is left of the dice.
+
+        Estimated in grids whose blocks are known; exact in all else, which is walked to the optical depth ``enough``.
+        """
+        tracked = [p for p in self.view.parts if p.lattice is not None and p.lattice.blocks is not None]
+        others = [p for p in self.view.parts if not any(p is q for q in tracked)]
+        T = [dr.exp(-t) for t in self.optical_depth(ray, t0, t1, channels, active, others, enough)]
+        scale = dr.detach(self.view.scale) * self.area(ray.d)
+        for part in tracked:
+            own, dice = track(part.lattice, clip(part.lattice, ray.o, ray.d, t0, t1), scale, dice, active)
+            T = [a * b for a, b in zip(T, as_rows(own, channels), strict=True)]
+        return T, dice
 
     def tangent(self, ray: mi.Ray3f, t0: mi.Float, t1: mi.Float, channels: int, active: mi.Bool) -> list[mi.Float]:
         """Derivative of the optical depth along the tangent that :meth:`World.start_tangent` took from the parameters."""
@@ -219,6 +236,7 @@ class World:
         locates: the camera may be inside a boundary that has to be traced, and the sensor names no medium.
         lights: what lights the media that scatter; None where none does.
         is_deterministic: images of scattered light are made by quadrature; derivatives are still drawn.
+        events: points of a camera ray that scatter, in pictures.
     """
 
     def __init__(
@@ -231,6 +249,7 @@ class World:
         locates: bool = False,
         lights: Lights | None = None,
         is_deterministic: bool = False,
+        events: int = 1,
     ) -> None:
         self.boxed = [b for b in bodies if b.box is not None]
         # A traced stretch is recognised by its medium, which several boundaries may share.
@@ -243,7 +262,8 @@ class World:
         self.control: Control | None = None
         self.shade: Shade | None = None
         self.light_grid: LightGrid | None = None
-        self.is_deterministic = is_deterministic
+        self.is_deterministic, self.events = is_deterministic, events
+        self.is_tracked = any(p.lattice is not None and p.lattice.blocks is not None for b in bodies for p in b.view.parts)
 
     @property
     def takes_control(self) -> bool:

@@ -5,12 +5,14 @@ from __future__ import annotations
 import gc
 import weakref
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
 
 import scenes
 from mivol.scene import plan
+from mivol.transport import film
 from mivol.transport.film import count_passes
 from mivol.validate.statistics import Moments, assert_same_mean
 from scenes import box_of, camera, grid_volume, medium, sky
@@ -119,6 +121,33 @@ def test_pixels_are_not_correlated_between_passes(monkeypatch):
     many = moments(scene, integrator, 16, 5000, 64).variance_of_mean.mean()
     # 64 batches over 144 pixels: each variance is known to 2 %; a repeated pass would give a ratio of 1.
     assert 0.8 / 16 < many / one < 1.25 / 16
+
+
+@pytest.mark.parametrize("layout", [film.SPREAD, film.TILED])
+def test_samples_of_a_pixel_share_it_out(layout):
+    """Of 12 samples one lies in each cell of 3 x 4, in an order of its own in each tile or pixel."""
+    # A box filter would count all samples of a pixel at its corner.
+    (rays,) = film.film_passes(mi.load_dict(sensor_of(rfilter="gaussian")), 5, 12, 1 << 20, layout)
+    x, y = (np.array(v) for v in (rays.position.x, rays.position.y))
+    pixel = np.floor(x).astype(int) + 12 * np.floor(y).astype(int)
+    cell = np.floor(x % 1 * 3).astype(int) + 3 * np.floor(y % 1 * 4).astype(int)
+    order = [cell[pixel == p] for p in range(144)]
+    assert all(np.array_equal(np.sort(c), np.arange(12)) for c in order)
+    assert len({tuple(c) for c in order}) == (9 if layout == film.TILED else 144)
+
+
+def test_a_new_seed_compiles_nothing():
+    """A kernel holds no seed: only the first render of a scene is compiled."""
+    smoke = medium("heterogeneous", grid_volume("gridvolume", np.ones((4, 5, 6, 1), np.float32), PLACE), 0.5)
+    scene = mi.load_dict({"type": "scene", "box": box_of(smoke, PLACE), "sky": sky(0.5), "sensor": sensor_of()})
+    integrator, compiled = mi.load_dict({"type": "mivol", "max_depth": 2}), []
+    for seed in (7, 1234, 99):
+        dr.kernel_history_clear()
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+            dr.eval(mi.render(scene, integrator=integrator, spp=8, seed=seed))
+            kernels = [k for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT]
+        compiled.append(sum(not k["cache_hit"] for k in kernels))
+    assert compiled[1:] == [0, 0]
 
 
 def test_batch_sensor():

@@ -1,0 +1,188 @@
+"""Transmittance from a few look-ups: its mean, its variance and what the blocks of a grid hold, against exact walks.
+
+Every estimate lies in [0, 1], so its variance is T (1 - T) at most, whatever its distribution: Bernstein's inequality then
+bounds the error of a mean of R of them by sqrt(2 v q / R) + q / (3 R) but for a chance of 2 exp(-q).
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from scattering_scenes import PLACE, aimed, assert_same_images, close_up, mivol, point, rough_grid, smoke
+
+import scenes
+from mivol.scene.plan import explain
+from mivol.transport import tracking
+from mivol.transport.dice import roll, start_dice
+from mivol.transport.lattice import Lattice, clip
+from mivol.transport.optical_depth import integrate_segment
+from mivol.transport.tracking import find_blocks, track
+from scenes import as_float32, refused
+
+pytestmark = pytest.mark.usefixtures("variant_rgb")
+
+Q = 25.0
+"""2 exp(-25) = 3e-11: a false alarm in one of 1e8 runs of all that is compared here."""
+
+RAYS, REPEATS = 32, 8192
+
+
+def steps(shape: tuple[int, ...], top: float) -> np.ndarray:
+    """0 or ``top``, in cubes of three voxels: every edge is sharp."""
+    z, y, x = np.indices(shape) // 3
+    return as_float32(top * ((x + y + z) % 2))[..., None]
+
+
+def one_dense(shape: tuple[int, ...], top: float) -> np.ndarray:
+    values = np.zeros((*shape, 1), np.float32)
+    values[shape[0] // 2, shape[1] // 2, shape[2] // 2] = top
+    return values
+
+
+FIELDS = {
+    "rough": lambda: rough_grid(1, 4.0, (17, 21, 30)),
+    "edges": lambda: steps((20, 19, 18), 3.0),
+    "empty": lambda: np.zeros((12, 12, 12, 1), np.float32),
+    "one voxel": lambda: np.full((1, 1, 1, 1), 0.7, np.float32),
+    "a sheet of voxels": lambda: rough_grid(2, 2.0, (1, 9, 33)),
+    "one dense voxel": lambda: one_dense((16, 16, 16), 500.0),
+    "tau 1e-3": lambda: rough_grid(3, 1e-3, (12, 10, 9)),
+    "tau 1e3": lambda: rough_grid(4, 2e3, (12, 10, 9)),
+    "rgb": lambda: rough_grid(5, 1.0, (18, 9, 10)) * as_float32([0.2, 2.0, 6.0]),
+}
+
+
+def grid(values: np.ndarray) -> Lattice:
+    lattice = Lattice(mi.TensorXf(np.ascontiguousarray(values)), np.array(PLACE))
+    lattice.blocks = find_blocks(lattice.values)
+    return lattice
+
+
+def estimates(lattice: Lattice, scale: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
+    """[channel, repeat, ray] estimates along random rays, and [channel, ray] exact transmittances in float64."""
+    o, d = (np.tile(v, (REPEATS, 1)).T for v in aimed(7, RAYS))
+    o, d = mi.Point3f(o), mi.Vector3f(d)
+    n, segment = RAYS * REPEATS, clip(lattice, o, d, 0, dr.inf)
+    found, _ = track(lattice, segment, mi.Float(scale), start_dice(mi.Float(0.3), n), mi.Bool(True))
+    exact = integrate_segment(lattice, lattice.values.array, segment)
+    T = [np.exp(-scale * np.array(t, dtype=np.float64)[:RAYS]) for t in exact]
+    return np.array([np.array(f, dtype=np.float64).reshape(REPEATS, RAYS) for f in found]), np.array(T)
+
+
+def bound(variance: np.ndarray, count: int) -> np.ndarray:
+    return np.sqrt(2 * variance * Q / count) + Q / (3 * count)
+
+
+@pytest.mark.parametrize("name", FIELDS)
+def test_hard_01_estimates_have_the_exact_mean(name):
+    """Of each ray, and of all rays together, which tells a bias sqrt(32) times smaller."""
+    found, T = estimates(grid(FIELDS[name]()))
+    assert found.min() >= 0 and found.max() <= 1
+    variance = T * (1 - T)
+    # Exact walks err by 2e-6 of the optical depth, which is T tau <= 0.4 of the transmittance.
+    assert np.all(np.abs(found.mean(axis=1) - T) <= bound(variance, REPEATS) + 1e-6)
+    each = np.abs(found.mean(axis=(1, 2)) - T.mean(axis=1))
+    assert np.all(each <= bound(variance.mean(axis=1), RAYS * REPEATS) + 1e-6)
+
+
+def test_a_scale_counts():
+    found, T = estimates(grid(FIELDS["rough"]()), scale=0.4)
+    assert np.all(np.abs(found.mean(axis=1) - T) <= bound(T * (1 - T), REPEATS) + 1e-6)
+
+
+def test_nothing_is_noisy_where_nothing_varies():
+    """Blocks of one value are known without a look: the estimate is exact, to rounding."""
+    found, T = estimates(grid(np.full((9, 9, 9, 1), 0.5, np.float32)))
+    # 30 steps, each of which rounds an optical depth of 1 by 6e-8.
+    assert np.allclose(found, T[:, None], rtol=5e-6)
+
+
+def test_variance_is_as_derived():
+    """T^2 (exp(int E(c - m)^2 / (kappa (M - m)) dt) - 1) along the x axis, through one block whose values rise along x."""
+    values = np.zeros((7, 7, 7, 1), np.float32)
+    values[..., 0] = 0.1 + 0.15 * np.arange(7)
+    lattice, n = grid(values), 1 << 19
+    o = mi.Point3f(dr.full(mi.Float, -2, n), mi.Float(0), mi.Float(0))
+    segment = clip(lattice, o, mi.Vector3f(1, 0, 0), 0, dr.inf)
+    found, _ = track(lattice, segment, mi.Float(1), start_dice(mi.Float(0.7), n), mi.Bool(True))
+    found = np.array(found[0], dtype=np.float64)
+    f = (np.arange(1000) + 0.5) / 1000
+    low, high = values[0, 0, :-1, 0] - 0.1, values[0, 0, 1:, 0] - 0.1
+    # Two half voxels at the ends, of constant value; 2 / 7 of a length a cell.
+    square = np.mean((1 - f) * low[:, None] ** 2 + f * high[:, None] ** 2, axis=1).sum() + 0.5 * (low[0] ** 2 + high[-1] ** 2)
+    T = np.exp(-values[0, 0, :, 0].sum() * 2 / 7)
+    variance = T**2 * np.expm1(square * 2 / 7 / (tracking.KAPPA * 0.9))
+    assert T > 3 * tracking.FAINT * 0.9
+    # Roulette, and 2^19 samples know a variance to 0.3 %.
+    assert found.var() == pytest.approx(variance, rel=0.03)
+
+
+@pytest.mark.parametrize("shape", [(1, 1, 1), (7, 8, 9), (15, 16, 17), (23, 1, 24)])
+def test_blocks_hold_all_nodes_of_their_cells(shape):
+    values = np.random.default_rng(1).uniform(0, 5, (*shape, 3)).astype(np.float32)
+    blocks = find_blocks(mi.TensorXf(values))
+    edge = 1 << tracking.SHIFT
+    assert blocks.res == tuple(-(-(n + 1) // edge) for n in shape)
+    table = np.array(blocks.table).reshape(*blocks.res, 4)
+    for index in np.ndindex(*blocks.res):
+        nodes = [np.clip(np.arange(edge * b - 1, edge * b + edge), 0, n - 1) for b, n in zip(index, shape, strict=True)]
+        own = values[np.ix_(*nodes)].reshape(-1, 3)
+        assert np.array_equal(table[index][:3], own.min(axis=0))
+        assert table[index][3] == pytest.approx(np.ptp(own, axis=0).max(), rel=2e-6)
+
+
+def test_dice_are_even():
+    """2^16 lanes, 4 numbers each: means of 1/2 and of 1/3, no correlation of neighbours, within 5 standard errors."""
+    _, numbers = roll(start_dice(mi.Float(0.25), 1 << 16), 4)
+    u = np.array([np.array(x, dtype=np.float64) for x in numbers])
+    assert u.min() > 0 and u.max() < 1
+    assert np.all(np.abs(u.mean(axis=1) - 0.5) < 5 * np.sqrt(1 / 12 / 2**16))
+    correlation = np.corrcoef(np.vstack([u, np.roll(u[0], 1)]))
+    assert np.all(np.abs(correlation - np.eye(5)) < 5 / 256)
+
+
+# -- Pictures ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["rough", "rgb"])
+def test_pictures_have_the_same_mean(name):
+    """A sky and a lamp, exact and estimated shadows, within Student's t at 1e-6."""
+    parts = {"smoke": smoke(FIELDS[name]() * 0.5, name="hg", g=0.4)[0], "bulb": point([1.5, -1.2, 1.6])[0]}
+    scene = close_up({**parts, "sky": scenes.sky(0.3)}, res=8)
+    one, other = mivol(shadows="estimated"), mivol(shadows="exact")
+    a, b = assert_same_images(scene, (64, 64), ours=one, stock=other)
+    assert a.variance.mean() > b.variance.mean(), "the estimated shadows were not estimated"
+
+
+def test_gradients_have_exact_shadows():
+    """The same numbers but for the order of sums, whatever shadows pictures have; estimates would move them by per cents."""
+    scene = close_up({"smoke": smoke(rough_grid(1))[0], "sky": scenes.sky(0.3)}, res=4)
+    params, key, found = mi.traverse(scene), "smoke.interior_medium.sigma_t.data", []
+    for shadows in ("exact", "estimated"):
+        dr.enable_grad(params[key])
+        integrator = mi.load_dict(mivol(shadows=shadows))
+        integrator.render_backward(scene, params, mi.TensorXf(np.ones((4, 4, 3), np.float32)), seed=3, spp=4)
+        found.append(np.array(dr.grad(params[key])))
+        dr.disable_grad(params[key])
+    assert np.allclose(*found, rtol=1e-4, atol=1e-6)
+
+
+def test_fine_grids_are_looked_up():
+    """The plan says which shadows are estimated, and why."""
+    lamp, fine = scenes.sky(0.3), np.full((160, 160, 8, 1), 0.1, np.float32)
+    coarse, dense = (explain(close_up({"smoke": smoke(v)[0], "sky": lamp}, res=4), 2) for v in (fine[::8, ::8], fine))
+    assert "shadows of smoke" in coarse and "estimated" not in coarse
+    assert "estimated" in dense and "328 occupied cells" in dense
+    sparse = fine.copy()
+    sparse[8:] = 0
+    assert "estimated" not in explain(close_up({"smoke": smoke(sparse)[0], "sky": lamp}, res=4), 2)
+
+
+def test_words_for_shadows():
+    scene = close_up({"smoke": smoke(rough_grid(1))[0], "sky": scenes.sky(0.3)}, res=4)
+    with refused("auto, exact, estimated or grid"):
+        mi.render(scene, integrator=mi.load_dict(mivol(shadows="soft")), spp=1)
+    with refused("estimates are noise"):
+        mi.render(scene, integrator=mi.load_dict(mivol(shadows="estimated", deterministic=True)), spp=1)
