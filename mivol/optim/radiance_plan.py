@@ -59,7 +59,8 @@ class Plan:
         keep_weight: a node is kept where some ray gives a cell of it this weight.
         start: the first density, times half the longest edge.
         survey: steps after which the map of occupied cells is made anew.
-        random_background: photographs with alpha are seen over another colour each step.
+        random_background: photographs with alpha are seen over another colour each step, so that nothing stands in the air in
+            the background's colour.
     """
 
     stages: tuple[Stage, ...]
@@ -70,7 +71,7 @@ class Plan:
     delay: float = 0.0
     memory: float = 0.95
     tv_density: float = 0.0
-    tv_sh: float = 1e-6
+    tv_sh: float = 0.0
     tv_share: float = 1 / 16
     sparsity: float = 0.0
     beta: float = 0.0
@@ -78,7 +79,7 @@ class Plan:
     keep_weight: float = 0.01
     start: float = 0.1
     survey: int = 64
-    random_background: bool = False
+    random_background: bool = True
 
     @property
     def steps(self) -> int:
@@ -114,7 +115,10 @@ PRESETS: dict[str, Plan] = {
         )
     ),
 }
-"""``tiny`` takes seconds, ``cpu`` minutes on two cores, ``gpu`` has the resolutions of Plenoxels (256, then 512)."""
+"""``tiny`` takes seconds, ``cpu`` minutes on two cores, ``gpu`` has the resolutions of Plenoxels (256, then 512; not measured).
+
+Rates were chosen on views of the chair held out of its training split, at 32^3 and 64^3. Total variation is off: with RMSprop
+it moves rows that no ray touches by whole learning rates; 1e-6 of it on the coefficients cost 0.4 dB at 128^3, 90 views."""
 
 
 def place_grid(box: np.ndarray, longest: int) -> tuple[tuple[int, int, int], np.ndarray]:

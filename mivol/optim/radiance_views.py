@@ -67,17 +67,19 @@ class Views:
     background: np.ndarray
 
     @classmethod
-    def of(cls, photos: Sequence[Photo], shrinks: Sequence[int] = (1,), with_alpha: bool = False) -> Views:
+    def of(cls, photos: Sequence[Photo], shrinks: Sequence[int] = (1,), with_alpha: bool | None = None) -> Views:
         """Take over photographs.
 
         Args:
             photos: at least one.
             shrinks: sizes to keep, 1 for that of the photographs.
-            with_alpha: keep alpha, for backgrounds that change.
+            with_alpha: keep alpha, for backgrounds that change; None: where all photographs have it.
 
         Raises:
             MivolError: a lens with distortion, or no alpha where it is asked for.
         """
+        if with_alpha is None:
+            with_alpha = all(photo.alpha is not None for photo in photos)
         for photo in photos:
             if photo.camera.distortion:
                 raise MivolError(f"{photo.name} was taken through a lens with distortion; rectify the photographs first.")

@@ -49,7 +49,7 @@ def photo(field: SphericalGrid, k: float, side: int = 48) -> Photo:
     return Photo(f"view {k}", np.clip(seen.image, 0, 1), seen.opacity, None, camera(k, side), WHITE)
 
 
-PLAN = Plan((Stage(12, 60, 2, 4, 24), Stage(24, 90, 1, 4, 48)), degree=1)
+PLAN = Plan((Stage(12, 60, 2, 4, 24), Stage(24, 90, 1, 4, 48)), degree=1, random_background=False)
 
 
 @pytest.fixture(scope="module")
