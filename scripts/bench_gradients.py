@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Density gradients of light that scatters once: how exact are they, and how much sooner than those of ``prbvolpath``?
 
-    scripts/bench_gradients.py                        # 4 minutes on 2 idle cores: all but the tutorial
+    scripts/bench_gradients.py                        # about 10 minutes on 2 idle cores: all but the tutorial
     scripts/bench_gradients.py --only tutorial        # 5 minutes, nearly all of them in prbvolpath
     scripts/bench_gradients.py --quick                # a minute, small sizes: are our gradients right?
 
@@ -22,7 +22,7 @@ estimators: bias and variance of both estimators where they differ: density 0, h
 derivative of the picture's mean along a fixed direction in the space of voxels (thin, dense: the density itself; density 0:
 all voxels alike; half empty: the empty half) is compared with finite differences of mivol's pictures with common random
 numbers: central of fourth order, or one-sided of third order where the density is 0. Both the differences and our derivative
-are repeated until their means are known to 0.1 %. The bias is said in standard errors (of both together) and in percent;
+are repeated until their means are known to 0.06 %. The bias is said in standard errors (of both together) and in percent;
 0.5 % (with 3 standard errors to spare) and 3 standard errors are the bars for ours. Variance x time: summed over the voxels
 of that direction, prbvolpath's over ours.
 
@@ -97,8 +97,8 @@ class Size:
     table_seconds: float = 0.4
     table_res: int = 16
     difference_spp: int = 1024
-    certain_percent: float = 0.1
-    certain_seconds: float = 100.0
+    certain_percent: float = 0.06
+    certain_seconds: float = 300.0
     reference_spp: int = 4096
     check_spp: int = 4
     loss_spp: int = 32
