@@ -1,4 +1,4 @@
-"""The walk through the cells of a grid that a ray crosses: the only such loop.
+"""The walk through the cells of a grid that a ray crosses, one after the other.
 
 Conventions. A cell (i, j, k), each index from -1 to N - 1, lies between the nodes i and i + 1; node indices are clamped
 to the grid, so that the outer half voxel is constant and a single voxel needs no special case. A ray is o + t d with t in
