@@ -56,25 +56,24 @@ def file_bytes(kept: int, degree: int, *, sparse: bool) -> int:
     return 2 * kept * (1 + 3 * basis_size(degree)) + 4 * kept * sparse
 
 
-def index_bytes(res: Sequence[int], cells: int, edges: int) -> int:
+def index_bytes(res: Sequence[int], cells: int, rows: int) -> int:
     """What the walk reads beside the values.
 
     Args:
         res: nodes along the axes.
         cells: how many are near a surface.
-        edges: along x, of those cells, each counted once.
+        rows: different rows at their corners.
     """
-    return 4 * math.prod(res) + 4 * math.prod(n + 1 for n in res) + 4 * 4 * cells + 4 * 2 * edges
+    return 4 * math.prod(res) + 4 * math.prod(n + 1 for n in res) + 4 * 8 * cells + 4 * rows
 
 
 def count_cells(keep: np.ndarray) -> tuple[int, int]:
-    """Cells that touch a node of ``keep`` (Z, Y, X), and their edges along x."""
+    """Cells that touch a node of ``keep`` (Z, Y, X), and the rows at their corners: the nodes kept, and the vacuum."""
     beyond = np.pad(keep, 1, mode="edge")
     cells = np.zeros([n + 1 for n in keep.shape], bool)
     for k in range(8):
         cells |= beyond[tuple(slice((k >> a) & 1, n + 1 + ((k >> a) & 1)) for a, n in enumerate(keep.shape))]
-    edges = cells[1:, 1:] | cells[1:, :-1] | cells[:-1, 1:] | cells[:-1, :-1]
-    return int(cells.sum()), int(edges.sum())
+    return int(cells.sum()), int(keep.sum() + (keep.any() and not keep.all()))
 
 
 # -- Table ----------------------------------------------------------------------------------------------------------------
@@ -127,11 +126,11 @@ def kinds(kept: float) -> list[Kind]:
 def index_kind(kept: float) -> Kind:
     """The index, in memory only: counted at MODEL where the surface is as many voxels thick."""
     thin = shell(kept * SIZES[0] / MODEL)
-    listed, edges = (count / thin.sum() for count in count_cells(thin))
+    listed, rows = (count / thin.sum() for count in count_cells(thin))
     scenes = {}
     for n in SIZES:
         near = kept * SIZES[0] / n * n**3
-        scenes[n] = (index_bytes((n, n, n), round(listed * near), round(edges * near)), 0)
+        scenes[n] = (index_bytes((n, n, n), round(listed * near), round(rows * near)), 0)
     return Kind("beside it: the walk's index", (scenes[SIZES[0]][0] / SIZES[0] ** 3, 0), scenes)
 
 

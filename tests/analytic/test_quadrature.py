@@ -132,5 +132,5 @@ def test_refusals():
     for more, why in (({"deterministic": True}, "ConstantBackground"), ({"shadows": "grid"}, "without deterministic")):
         with refused(why):
             mi.render(close_up({"smoke": box, "lamp": lamp, "sky": sky()}), integrator=mi.load_dict(mivol(**more)), spp=1)
-    with refused("exact or grid"):
+    with refused("estimated or grid"):
         mi.render(close_up({"smoke": box, "lamp": lamp}), integrator=mi.load_dict(mivol(shadows="soft")), spp=1)

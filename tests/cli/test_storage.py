@@ -60,10 +60,10 @@ def test_the_index_is_what_the_walk_reads(storage, variant_rgb, share: float) ->
     keep = np.random.default_rng(1).random(RES) <= share
     made = field(0, keep)
     cells = cells_of(made)
-    listed, edges = storage.count_cells(keep)
-    assert (cells.count, dr.width(cells.pairs)) == (listed, 2 * edges)
-    index = held(made.node_rows(), cells.number, cells.edges, cells.pairs)
-    assert index == storage.index_bytes(RES, listed, edges)
+    listed, rows = storage.count_cells(keep)
+    assert (cells.count, dr.width(cells.rows)) == (listed, rows)
+    index = held(made.node_rows(), cells.number, cells.corners, cells.rows)
+    assert index == storage.index_bytes(RES, listed, rows)
 
 
 def test_the_lecture_counts_4_gigabytes(storage) -> None:

@@ -31,6 +31,13 @@ def build(kind: str, floor: bool) -> tuple[mi.Scene, np.ndarray]:
     return mi.load_dict(parts), values
 
 
+def times(values: np.ndarray, factor: float) -> mi.TensorXf:
+    """A grid in memory of Dr.Jit's own: a recording is also one of how NumPy happened to align an array."""
+    grid = mi.TensorXf(values) * factor
+    dr.eval(grid)
+    return grid
+
+
 @pytest.mark.parametrize("depth", [1, 3])
 @pytest.mark.parametrize("floor", [False, True])
 @pytest.mark.parametrize("kind", ["heterogeneous", "mivol_medium"])
@@ -45,8 +52,7 @@ def test_values_that_change_between_calls(kind, floor, depth):
 
     frozen = dr.freeze(shoot)
     for call in range(6):
-        fresh = mi.TensorXf(values * (1 + call))
-        dr.eval(fresh)
+        fresh = times(values, 1 + call)
         params[GRID] = fresh
         params.update()
         replayed = np.array(frozen(scene, integrator, mi.UInt32(call)))
@@ -87,8 +93,7 @@ def test_gradient_step():
     mi.render(scene, integrator=integrator, spp=1)
     frozen = dr.freeze(step)
     for call in range(3):
-        x = mi.TensorXf(values * (1 + call))
-        dr.eval(x)
+        x = times(values, 1 + call)
         replayed = np.array(frozen(scene, integrator, params, x, mi.UInt32(call)))
         fresh = mi.TensorXf(values * (1 + call))
         plain = np.array(step(scene, integrator, params, fresh, mi.UInt32(call)))
@@ -121,7 +126,7 @@ def test_gradient_step_of_scattered_light(lamp):
         return [dr.grad(value) for value in at]
 
     def start(call: int) -> list:
-        at = [mi.TensorXf(values * (1 + call)), mi.Float(0.8 - 0.1 * call), mi.Float(0.3 + 0.1 * call)]
+        at = [times(values, 1 + call), mi.Float(0.8 - 0.1 * call), mi.Float(0.3 + 0.1 * call)]
         dr.make_opaque(at)
         return at
 
