@@ -235,9 +235,11 @@ class Photographs(Section):
     background: Annotated[
         str | tuple[float, float, float], of("1", "behind images with alpha: white, black or an rgb triple; empty: no alpha")
     ] = ""
-    behind: Annotated[
-        tuple[float, float, float], of("1", "colour that images without alpha show where nothing is")
-    ] = (0.0, 0.0, 0.0)
+    behind: Annotated[tuple[float, float, float], of("1", "colour that images without alpha show where nothing is")] = (
+        0.0,
+        0.0,
+        0.0,
+    )
     held_out: Annotated[int, of("view", "every so many of the training views is compared, not fitted; 0: none", ge=0)] = 8
     box: Annotated[
         str | tuple[tuple[float, float, float], tuple[float, float, float]],
@@ -253,9 +255,12 @@ class Field(Section):
     longest: Annotated[int | None, of("voxel", "along the longest edge in the end; absent: the preset's")] = None
     degree: Annotated[int | None, of("1", "of the spherical harmonics; absent: the preset's")] = None
     effort: Annotated[float, of("1", "factor on the preset's steps", gt=0)] = 1.0
-    tv_density: Annotated[float | None, of("1", "total variation of the density; absent: the preset's")] = None
-    tv_sh: Annotated[float | None, of("1", "total variation of the colours; absent: the preset's")] = None
-    sparsity: Annotated[float | None, of("1", "of the density; absent: the preset's")] = None
+    tv_density: Annotated[float | None, of("photograph", "total variation of the density; absent: the preset's")] = None
+    tv_sh: Annotated[float | None, of("photograph", "total variation of the colours; absent: the preset's")] = None
+    sparsity: Annotated[float | None, of("photograph", "of the density; absent: the preset's")] = None
+    matte: Annotated[float | None, of("photograph", "colours that change little with the direction; absent: the preset's")] = (
+        None
+    )
     beta: Annotated[float | None, of("1", "asks rays to end in matter or to pass; absent: the preset's")] = None
 
     def __post_init__(self) -> None:
@@ -263,7 +268,7 @@ class Field(Section):
             raise ValueError(f"degree is {self.degree}: 0 to 4 is expected")
         if self.longest is not None and self.longest < 8:
             raise ValueError(f"longest is {self.longest}: at least 8 is expected")
-        for name in ("tv_density", "tv_sh", "sparsity", "beta"):
+        for name in ("tv_density", "tv_sh", "sparsity", "matte", "beta"):
             if (getattr(self, name) or 0) < 0:
                 raise ValueError(f"{name} is {getattr(self, name)}: at least 0 is expected")
 

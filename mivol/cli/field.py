@@ -81,7 +81,7 @@ def make_plan(chosen: FieldFit) -> Plan:
     if wanted.preset not in PRESETS:
         raise MivolError(f'field.preset = "{wanted.preset}" is unknown: {nearest(wanted.preset, list(PRESETS))}')
     plan = PRESETS[wanted.preset]
-    given = {name: getattr(wanted, name) for name in ("degree", "tv_density", "tv_sh", "sparsity", "beta")}
+    given = {name: getattr(wanted, name) for name in ("degree", "tv_density", "tv_sh", "sparsity", "matte", "beta")}
     plan = replace(plan, **{name: value for name, value in given.items() if value is not None})
     stages = [replace(stage, steps=max(1, round(stage.steps * wanted.effort))) for stage in plan.stages]
     if wanted.longest is not None:
@@ -292,9 +292,7 @@ def write_density(folder: Path, field: SphericalGrid) -> Volume:
     return Volume(path="volumes/density.npz", role="reconstruction", size=size)
 
 
-def write_judged(
-    chosen: FieldFit, folder: Path, record: RunRecord, field: SphericalGrid, judged: Photos
-) -> dict[str, float]:
+def write_judged(chosen: FieldFit, folder: Path, record: RunRecord, field: SphericalGrid, judged: Photos) -> dict[str, float]:
     """Judge all views, and keep some of them beside their photographs, with distance and normals of the first."""
     found = []
     shown = set(np.linspace(0, len(judged.views) - 1, min(chosen.show.views, len(judged.views))).astype(int).tolist())

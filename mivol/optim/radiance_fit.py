@@ -28,7 +28,7 @@ from mivol.errors import MivolError
 from mivol.fields.resampling import resample_field
 from mivol.fields.spherical import SphericalGrid, basis_size, row_width
 from mivol.optim.radiance_plan import PRESETS, Plan, Stage, memory_of, place_grid
-from mivol.optim.radiance_priors import add_sparsity, add_variation, next_rows
+from mivol.optim.radiance_priors import dull, next_rows, smooth, thin_out
 from mivol.optim.radiance_views import Batch, Views
 from mivol.photos import Camera, pixel_centres, rays
 from mivol.transport.occupied import Cells
@@ -129,8 +129,7 @@ class RadianceFit:
         chosen = np.sort(rng.choice(count, min(stage.views, count), replace=False))
         batch = self.views.draw(stage.shrink, chosen, stage.tiles, rng)
         loss, slopes = self._slopes(batch, self.views.origins[chosen], self._background(rng))
-        self._add_priors(slopes, rng)
-        self._update(slopes)
+        self._update(slopes, rng)
         self.step += 1
         return loss
 
@@ -158,34 +157,34 @@ class RadianceFit:
         dr.eval(source.slope)
         return loss, list(fold(self.field, self.cells, source, points))
 
-    def _add_priors(self, slopes: list[mi.Float], rng: np.random.Generator) -> None:
-        plan, field = self.plan, self.field
-        slopes[0] = add_sparsity(field.density, slopes[0], plan.sparsity, self.unit)
-        start, fineness = int(rng.integers(dr.width(self.neighbours[0]))), float(max(field.res))
-        where = self.neighbours, fineness, plan.tv_share, start
-        # The density's variation is that of density times unit: its weight and epsilon count in that.
-        for k, (values, width, weight) in enumerate(
-            ((field.density, 1, plan.tv_density * self.unit), (field.harmonics, field.width, plan.tv_sh))
-        ):
-            add_variation(values, slopes[k], width, where[0], weight, *where[1:])
-
-    def _update(self, slopes: list[mi.Float]) -> None:
-        """RMSprop where there is a derivative; the first one is its own mean."""
+    def _update(self, slopes: list[mi.Float], rng: np.random.Generator) -> None:
+        """RMSprop where there is a derivative, the first one its own mean; then what is believed."""
+        field, memory = self.field, self.plan.memory
+        own = field.rows if field.nodes is None else field.rows - 1  # the last row is the vacuum around
         density, sh = self.plan.rates(self.step)
-        values, memory = [self.field.density, self.field.harmonics], self.plan.memory
+        values = [field.density, field.harmonics]
         for k, rate in enumerate((density / self.unit, sh)):
-            slope = slopes[k]
-            if self.field.nodes is not None:
-                own = (self.field.rows - 1) * (dr.width(slope) // self.field.rows)
-                slope = dr.select(dr.arange(mi.UInt32, dr.width(slope)) < own, slope, 0)
+            mine = dr.arange(mi.UInt32, dr.width(slopes[k])) < own * (dr.width(slopes[k]) // field.rows)
+            slope = dr.select(mine, slopes[k], 0)
             square = dr.square(slope)
             mean = dr.select(self.squares[k] == 0, square, dr.fma(memory, self.squares[k] - square, square))
             touched = mean > 0
             step = dr.opaque(mi.Float, rate) * slope * dr.rsqrt(dr.select(touched, mean, 1))
             self.squares[k] = dr.select(slope == 0, self.squares[k], mean)
             values[k] = dr.select(touched, values[k] - step, values[k])
+        self._believe(values, own, rng)
         dr.eval(values, self.squares)
-        self.field = self.field.with_values(*values)
+        self.field = field.with_values(*values)
+
+    def _believe(self, values: list[mi.Float], rows: int, rng: np.random.Generator) -> None:
+        """Move values towards what is believed: by shares of the learning rate, fewer the more photographs there are."""
+        plan, width = self.plan, self.field.width
+        density, sh = (rate / len(self.views.origins) for rate in plan.rates(self.step))
+        values[0] = thin_out(values[0], density * plan.sparsity, self.unit)
+        values[1] = dull(values[1], width, sh * plan.matte)
+        where = plan.tv_share, int(rng.integers(dr.width(self.neighbours[0]))), rows
+        smooth(values[0], 1, self.neighbours, density * plan.tv_density / self.unit, *where)
+        smooth(values[1], width, self.neighbours, sh * plan.tv_sh, *where)
 
     # -- On disk ------------------------------------------------------------------------------------------------------
 
