@@ -81,7 +81,8 @@ def make_plan(chosen: FieldFit) -> Plan:
     if wanted.preset not in PRESETS:
         raise MivolError(f'field.preset = "{wanted.preset}" is unknown: {nearest(wanted.preset, list(PRESETS))}')
     plan = PRESETS[wanted.preset]
-    given = {name: getattr(wanted, name) for name in ("degree", "tv_density", "tv_sh", "sparsity", "matte", "beta")}
+    names = ("degree", "first_degree", "tv_density", "tv_sh", "sparsity", "matte", "beta")
+    given = {name: getattr(wanted, name) for name in names}
     plan = replace(plan, **{name: value for name, value in given.items() if value is not None})
     stages = [replace(stage, steps=max(1, round(stage.steps * wanted.effort))) for stage in plan.stages]
     if wanted.longest is not None:

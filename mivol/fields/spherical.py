@@ -218,6 +218,8 @@ class SphericalGrid:
 
     def with_degree(self, degree: int) -> SphericalGrid:
         """The same field with harmonics up to another degree: new ones are 0, dropped ones are lost."""
+        if degree == self.degree:
+            return self
         density, sh = self.values()
         rows = np.zeros((len(sh), basis_size(degree), 3), np.float32)
         shared = min(sh.shape[1], rows.shape[1])

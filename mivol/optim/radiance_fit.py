@@ -85,12 +85,12 @@ class RadianceFit:
         """
         res, to_world = place_grid(self.box, self.plan.stages[number].longest)
         if self.field is None:
-            self.field = _fog(res, to_world, self.plan.degree, self.plan.start / self.unit)
+            self.field = _fog(res, to_world, self.plan.degree_at(number), self.plan.start / self.unit)
         else:
             keep = self.seen_nodes()
             if not keep.any():
                 raise MivolError("no view sees anything in the box: check the box, the cameras and the background.")
-            self.field = resample_field(self.field, res, to_world, keep)
+            self.field = resample_field(self.field, res, to_world, keep).with_degree(self.plan.degree_at(number))
         self.stage = number
         self.squares = [dr.zeros(mi.Float, dr.width(a)) for a in (self.field.density, self.field.harmonics)]
         self._survey()
@@ -207,7 +207,7 @@ class RadianceFit:
         res, to_world = place_grid(self.box, self.plan.stages[self.stage].longest)
         nodes = mi.UInt32(arrays["nodes"]) if "nodes" in arrays else None
         values = mi.Float(arrays["density"]), mi.Float(arrays["harmonics"])
-        self.field = SphericalGrid(res, to_world, self.plan.degree, *values, nodes)
+        self.field = SphericalGrid(res, to_world, self.plan.degree_at(self.stage), *values, nodes)
         self.squares = [mi.Float(arrays[f"square_{k}"]) for k in range(2)]
         self._survey()
 

@@ -46,7 +46,8 @@ class Plan:
 
     Attributes:
         stages: in their order.
-        degree: of the harmonics.
+        degree: of the harmonics, in the last stage.
+        first_degree: in the first one; those between climb evenly. None for ``degree`` in all.
         density_rate, sh_rate: first learning rates: of the density times half the longest edge [1], of coefficients [radiance].
         last: factor on both in the last step; they fall exponentially.
         delay: share of the steps over which the density's rate rises from a hundredth (a quarter of a sine).
@@ -68,6 +69,7 @@ class Plan:
 
     stages: tuple[Stage, ...]
     degree: int = 2
+    first_degree: int | None = None
     density_rate: float = 10.0
     sh_rate: float = 0.05
     last: float = 0.02
@@ -97,6 +99,12 @@ class Plan:
             if step < 0:
                 return number
         return len(self.stages) - 1
+
+    def degree_at(self, number: int) -> int:
+        """The degree of the harmonics in a stage."""
+        if self.first_degree is None or len(self.stages) == 1:
+            return self.degree
+        return round(self.first_degree + (self.degree - self.first_degree) * number / (len(self.stages) - 1))
 
     def rates(self, step: int) -> tuple[float, float]:
         """Learning rates in a step: of the density times half the longest edge, and of coefficients."""

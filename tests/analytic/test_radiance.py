@@ -7,53 +7,13 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from oracle_radiance import Twin
+from radiance_rays import CUBE, TO_WORLD, aim, derive, make, rays_of, see
 from scipy.ndimage import distance_transform_cdt
 
 from mivol.fields.activation import ACTIVATIONS
 from mivol.fields.spherical import SphericalGrid
 from mivol.transport.occupied import REACH
-from mivol.transport.radiance import Rays, bake, cells_of, exact, fold, look, look_back, model_of
-
-TO_WORLD = np.array([[2.0, 0.3, 0.0, -1.2], [-0.2, 1.5, 0.1, -0.7], [0.0, 0.1, 2.5, -1.3], [0, 0, 0, 1]])
-"""Rotated a little, sheared and of three lengths."""
-CUBE = np.array([[2.0, 0, 0, -1], [0, 2, 0, -1], [0, 0, 2, -1], [0, 0, 0, 1]])
-
-
-def make(res=(5, 6, 7), basis=4, seed=0, scale=6.0):
-    """A rough field of both signs of density, some colours below 0."""
-    rng = np.random.default_rng(seed)
-    return (rng.normal(0.3, 1, res) * scale).astype(np.float32), rng.normal(0, 0.4, (*res, basis, 3)).astype(np.float32)
-
-
-def aim(count, to_world=TO_WORLD, seed=1):
-    """Rays from around a box through it, in float32 as the kernels get them."""
-    rng = np.random.default_rng(seed)
-    target = rng.uniform(0.1, 0.9, (count, 3)) @ to_world[:3, :3].T + to_world[:3, 3]
-    o = np.float32(rng.normal(size=(count, 3)) * 3)
-    d = target - o
-    return o, np.float32(d / np.linalg.norm(d, axis=1, keepdims=True))
-
-
-def rays_of(o, d) -> Rays:
-    o, d = (np.atleast_2d(np.asarray(a, np.float32)) for a in (o, d))
-    return Rays(mi.Point3f(np.ascontiguousarray(o.T)), mi.Vector3f(np.ascontiguousarray(d.T)))
-
-
-def see(field, o, d, stop=0.0, pinhole=None):
-    rays, cells = rays_of(o, d), cells_of(field)
-    source = exact(field, rays) if pinhole is None else bake(field, cells, np.atleast_2d(pinhole), mi.UInt32(0))
-    seen = look(cells, source, model_of(field, stop), rays)
-    return np.array(seen.colour).T, np.array(seen.T), np.array(seen.distance)
-
-
-def derive(field, o, d, colour, T=0.0, distance=0.0, stop=0.0):
-    """Derivatives of sum(colour . L + T T + distance D) for the raw densities and harmonics of the nodes."""
-    rays, cells = rays_of(o, d), cells_of(field)
-    source, model = exact(field, rays, slope=True), model_of(field, stop)
-    seen = look(cells, source, model, rays)
-    look_back(cells, source, model, seen, mi.Color3f(*colour), T, distance)
-    return field.with_values(source.density_slope, source.harmonics_slope).values()
-
+from mivol.transport.radiance import bake, cells_of, exact, fold, look, look_back, model_of
 
 @pytest.mark.parametrize("activation", ACTIVATIONS)
 def test_agrees_with_the_twin(variant_rgb: str, activation: str) -> None:

@@ -153,6 +153,7 @@ def test_photographs_are_shrunk_to_half_a_voxel(photographs: Path, tmp_path: Pat
         ("field.degree=5", "0 to 4 is expected"),
         ("field.longest=4", "at least 8"),
         ("field.tv_sh=-1", "at least 0"),
+        ("field.first_degree=5", "0 to 4"),
         ("photos.box=silhouette", 'did you mean "silhouettes"'),
         ("photos.path=nowhere", "nowhere"),
         ("photos.judged=val", "val"),

@@ -84,13 +84,13 @@ def test_a_fit_finds_what_it_did_not_see(variant_rgb: str, photos: list[Photo]) 
 
 def test_a_fit_that_went_on_equals_one_that_did_not_stop(variant_rgb: str, photos: list[Photo]) -> None:
     views = Views.of(photos[:6], (1, 2))
-    plan = replace(PLAN, stages=(Stage(8, 10, 2, 3, 8), Stage(16, 10, 1, 3, 8)), tv_density=0.1)
+    plan = replace(PLAN, stages=(Stage(8, 10, 2, 3, 8), Stage(16, 10, 1, 3, 8)), tv_density=0.1, first_degree=0)
     whole = fitted(views, plan, 14)
     arrays, about = whole.pack()
     whole = fitted(views, plan, 20, whole)
     resumed = RadianceFit(views, BOX, plan)
     resumed.restore(arrays, about)
-    assert resumed.step == 14
+    assert resumed.step == 14 and resumed.field.degree == 1
     resumed = fitted(views, plan, 20, resumed)
     for a, b in zip(whole.field.values(), resumed.field.values(), strict=True):
         # RMSprop turns the last bits of sums into steps of up to a learning rate where a derivative is nearly 0: most agree.
@@ -256,3 +256,6 @@ def test_schedules() -> None:
     assert [plan.stage_at(s) for s in (0, 59, 60, 149, 150)] == [0, 0, 1, 1, 1]
     assert plan.rates(0) == pytest.approx((0.1, 0.05))
     assert plan.rates(150) == pytest.approx((0.1, 0.0005))
+    climbing = Plan((Stage(8, 1), Stage(16, 1), Stage(32, 1)), degree=2, first_degree=0)
+    assert [climbing.degree_at(k) for k in range(3)] == [0, 1, 2]
+    assert [replace(climbing, first_degree=None).degree_at(k) for k in range(3)] == [2, 2, 2]
