@@ -15,6 +15,7 @@ from mivol.fields.spherical import SphericalGrid
 from mivol.transport.occupied import REACH
 from mivol.transport.radiance import bake, cells_of, exact, fold, look, look_back, model_of
 
+
 @pytest.mark.parametrize("activation", ACTIVATIONS)
 def test_agrees_with_the_twin(variant_rgb: str, activation: str) -> None:
     density, sh = make()
