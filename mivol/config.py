@@ -254,7 +254,7 @@ class Field(Section):
     preset: Annotated[str, of("1", "resolutions, steps, rates and priors: tiny, cpu or gpu", min_length=1)] = "cpu"
     longest: Annotated[int | None, of("voxel", "along the longest edge in the end; absent: the preset's")] = None
     degree: Annotated[int | None, of("1", "of the spherical harmonics; absent: the preset's")] = None
-    first_degree: Annotated[int | None, of("1", "of the harmonics in the first stage, raised from there; absent: degree")] = None
+    first_degree: Annotated[int | None, of("1", "of the first stage, raised from there; absent: degree")] = None
     effort: Annotated[float, of("1", "factor on the preset's steps", gt=0)] = 1.0
     tv_density: Annotated[float | None, of("photograph", "total variation of the density; absent: the preset's")] = None
     tv_sh: Annotated[float | None, of("photograph", "total variation of the colours; absent: the preset's")] = None
@@ -262,12 +262,15 @@ class Field(Section):
     matte: Annotated[float | None, of("photograph", "colours that change little with the direction; absent: the preset's")] = (
         None
     )
+    sky: Annotated[int | None, of("row", "of a map of what is behind the box, learned with the field; 0: none")] = None
     beta: Annotated[float | None, of("1", "asks rays to end in matter or to pass; absent: the preset's")] = None
 
     def __post_init__(self) -> None:
         for name in ("degree", "first_degree"):
             if not 0 <= (getattr(self, name) or 0) <= 4:
                 raise ValueError(f"{name} is {getattr(self, name)}: 0 to 4 is expected")
+        if self.sky is not None and self.sky != 0 and self.sky < 2:
+            raise ValueError(f"sky is {self.sky}: 0 or at least 2 rows are expected")
         if self.longest is not None and self.longest < 8:
             raise ValueError(f"longest is {self.longest}: at least 8 is expected")
         for name in ("tv_density", "tv_sh", "sparsity", "matte", "beta"):

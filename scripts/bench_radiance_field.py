@@ -16,6 +16,9 @@ once a node and pinhole, and that is counted; rays of the third share nothing.
 
 memory: the most that Dr.Jit held during a gradient step, for N and 4 N rays: what a ray costs is its own state.
 
+locality: fits of 64^3 nodes from 24 views of the fitted scene, with rays of tiles of 4 x 4 pixels (what a fit does) and with as
+many rays of single pixels drawn at random from the same views: time a step, and held-out PSNR after as many steps.
+
 fit: 7 views of 256 x 256 pixels rendered of each field over black. The peer does as the tutorial does: 4 stages of doubling
 resolution up to 128^3, 105 steps each, one view a step. Ours has 3 stages to the same resolution, in the last as many rays a
 step as a view has pixels, from all views, and otherwise what every fit has. The mean PSNR of 4 views between them is followed,
@@ -36,7 +39,7 @@ from contest import AT_LEAST, AT_MOST, DATA, TO_WORLD, Bench, judge, race, ratio
 from mivol.fields.spherical import SphericalGrid
 from mivol.files import whole_file
 from mivol.optim.radiance_fit import Plan, RadianceFit, Stage
-from mivol.optim.radiance_views import Views
+from mivol.optim.radiance_views import TILE, Batch, Views
 from mivol.photos import Camera, Photo, load_photos, pixel_centres, rays, silhouette_box
 from mivol.photos.camera import intrinsics
 from mivol.transport.radiance import Rays, bake, cells_of, exact, fold, look, look_back, model_of
@@ -316,6 +319,49 @@ def ask_memory(size: Size) -> dict:
     }
 
 
+# -- Which rays a step has -----------------------------------------------------------------------------------------------------
+
+
+class Pixels(Views):
+    """Views of which single pixels are drawn, not tiles."""
+
+    def draw(self, shrink: int, views: np.ndarray, tiles: int, rng: np.random.Generator) -> Batch:
+        """As many pixels as the tiles would have, in any order."""
+        width, height = self.levels[shrink].sizes[views[0]]
+        n = len(views) * tiles * TILE**2
+        slot, column, row = (rng.integers(0, most, n).astype(np.uint32) for most in (len(views), width, height))
+        return self.look_up(shrink, views, mi.UInt32(slot), mi.UInt32(column), mi.UInt32(row))
+
+
+def ask_locality(size: Size) -> dict:
+    """What do tiles of neighbouring rays gain and cost, beside pixels drawn one by one?"""
+    field, _ = field_of("fitted", size)
+    n, side = size.fit_resolution // 2, size.fit_side // 2
+    photos = [_photo(field, one) for one in ring(side, 24)]
+    judge_of = Judge([_photo(field, one) for one in ring(side, 24, between=True)[::3]])
+    stages = (Stage(n // 2, size.steps, 2, 8, max(side**2 // 512, 1)), Stage(n, 2 * size.steps, 1, 8, max(side**2 // 128, 1)))
+    answer = {}
+    for name, kind in {"tiles": Views, "pixels": Pixels}.items():
+        views = kind.of(photos, (1, 2))
+        dr.eval(RadianceFit(views, BOX, Plan((replace(stages[-1], steps=2),))).advance())
+        dr.sync_thread()
+        fit, start = RadianceFit(views, BOX, Plan(stages)), time.process_time()
+        for _ in range(fit.plan.steps):
+            dr.eval(fit.advance())
+        dr.sync_thread()
+        seconds = time.process_time() - start
+        psnr = judge_of(lambda rays, origin, fit=fit: seen_of(fit, rays, origin))
+        answer[name] = {"psnr": psnr, "processor_seconds": seconds, "steps": fit.plan.steps}
+        say(f"  {name}: {psnr:.2f} dB, {seconds / fit.plan.steps * 1e3:.1f} ms a step")
+    return answer
+
+
+def seen_of(fit: RadianceFit, rays: Rays, origin: np.ndarray) -> np.ndarray:
+    """What rays from a pinhole see of a fit's field, (n, 3)."""
+    cells = cells_of(fit.field)
+    return np.array(look(cells, bake(fit.field, cells, origin, mi.UInt32(0)), model_of(fit.field, STOP), rays).colour).T
+
+
 # -- Fits ---------------------------------------------------------------------------------------------------------------------
 
 
@@ -350,11 +396,6 @@ def our_fit(photos: list[Photo], judge_of: Judge, size: Size) -> list[tuple[floa
     dr.sync_thread()
     fit = RadianceFit(views, BOX, Plan(stages))
 
-    def render(rays: Rays, origin: np.ndarray) -> np.ndarray:
-        cells = cells_of(fit.field)
-        seen = look(cells, bake(fit.field, cells, origin, mi.UInt32(0)), model_of(fit.field, STOP), rays)
-        return np.array(seen.colour).T
-
     curve, spent = [], 0.0
     for number, stage in enumerate(stages):
         start = time.perf_counter()
@@ -364,7 +405,7 @@ def our_fit(photos: list[Photo], judge_of: Judge, size: Size) -> list[tuple[floa
             if (step + 1) % EVERY == 0:
                 dr.sync_thread()
                 spent += time.perf_counter() - start
-                curve.append((spent, judge_of(render)))
+                curve.append((spent, judge_of(lambda rays, origin: seen_of(fit, rays, origin))))
                 start = time.perf_counter()
         dr.sync_thread()
         spent += time.perf_counter() - start
@@ -424,6 +465,8 @@ def compare(question: str, answer: dict) -> list[dict]:
     """The figures that have a bar."""
     if question == "memory":
         return [judge("bytes a ray beyond the grid's", answer["bytes_per_ray"], AT_MOST, 512)]
+    if question == "locality":
+        return []
     if question == "fit":
         return [judge(f"{name}: time to the same PSNR", a["ratio"], AT_LEAST, 10) for name, a in answer.items()]
     bars = {"camera": 8, "pixels": 4, "any": 4}
@@ -463,7 +506,7 @@ def draw(answers: dict, folder: Path) -> None:
 BENCH = Bench(
     "bench_radiance_field",
     __doc__,
-    {"step": ask_step, "memory": ask_memory, "fit": ask_fit},
+    {"step": ask_step, "memory": ask_memory, "locality": ask_locality, "fit": ask_fit},
     (FULL, QUICK),
     compare,
     draw,

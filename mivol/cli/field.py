@@ -24,13 +24,14 @@ from mivol.cli.progress import tracked
 from mivol.cli.rendering import set_threads, set_variant
 from mivol.config import FieldFit
 from mivol.errors import MivolError
+from mivol.fields.sky import Sky
 from mivol.fields.spherical import SphericalGrid, save_field
-from mivol.files import write_png, write_volume
+from mivol.files import write_exr, write_png, write_volume
 from mivol.optim import checkpoint
 from mivol.optim.radiance_fit import PRESETS, Plan, RadianceFit, Seen, memory_of, render_view
 from mivol.optim.radiance_views import Views
 from mivol.optim.strategy import nearest
-from mivol.photos import Camera, Photos, load_photos, rectified, silhouette_box, turntable
+from mivol.photos import Camera, Photo, Photos, load_photos, rectified, silhouette_box, turntable
 from mivol.photos.picture import decode_srgb
 from mivol.report.depth import depth_pixels, normal_pixels, normals_of_depth
 from mivol.report.page import write_page
@@ -81,7 +82,7 @@ def make_plan(chosen: FieldFit) -> Plan:
     if wanted.preset not in PRESETS:
         raise MivolError(f'field.preset = "{wanted.preset}" is unknown: {nearest(wanted.preset, list(PRESETS))}')
     plan = PRESETS[wanted.preset]
-    names = ("degree", "first_degree", "tv_density", "tv_sh", "sparsity", "matte", "beta")
+    names = ("degree", "first_degree", "tv_density", "tv_sh", "sparsity", "matte", "sky", "beta")
     given = {name: getattr(wanted, name) for name in names}
     plan = replace(plan, **{name: value for name, value in given.items() if value is not None})
     stages = [replace(stage, steps=max(1, round(stage.steps * wanted.effort))) for stage in plan.stages]
@@ -238,8 +239,13 @@ def look(fit: RadianceFit, judged: Photos | None) -> dict[str, float]:
     if judged is None:
         return {}
     photo = judged.views[fit.step % len(judged.views)]
-    seen = render_view(fit.field, photo.camera, photo.background)
+    seen = render_view(fit.field, photo.camera, behind(fit, photo))
     return {"held_out_psnr": judge(seen.image, photo.image, space=judged.space).values["psnr"]}
+
+
+def behind(fit: RadianceFit, photo: Photo) -> NDArray | Sky:
+    """What a photograph shows where nothing is."""
+    return photo.background if fit.sky is None else fit.sky
 
 
 # -- What came of it ----------------------------------------------------------------------------------------------
@@ -252,6 +258,8 @@ def write_outputs(
     for name in ("views", "volumes", "curves", "film"):
         (folder / name).mkdir(exist_ok=True)
     save_field(folder / "field.npz", fit.field)
+    if fit.sky is not None:
+        write_exr(folder / "sky.exr", {"": fit.sky.image()})
     record.tables = [storage(fit.field, folder / "field.npz")]
     record.volumes.append(write_density(folder, fit.field))
     stored = fit.field.rows - (fit.field.nodes is not None)
@@ -262,7 +270,7 @@ def write_outputs(
         "bytes": fit.field.bytes / 2**20,
     }
     if judged is not None:
-        record.results |= write_judged(chosen, folder, record, fit.field, judged)
+        record.results |= write_judged(chosen, folder, record, fit, judged)
     if chosen.show.frames:
         record.images.append(write_film(chosen, folder, fit, photos))
     write_curves(folder)
@@ -293,12 +301,12 @@ def write_density(folder: Path, field: SphericalGrid) -> Volume:
     return Volume(path="volumes/density.npz", role="reconstruction", size=size)
 
 
-def write_judged(chosen: FieldFit, folder: Path, record: RunRecord, field: SphericalGrid, judged: Photos) -> dict[str, float]:
+def write_judged(chosen: FieldFit, folder: Path, record: RunRecord, fit: RadianceFit, judged: Photos) -> dict[str, float]:
     """Judge all views, and keep some of them beside their photographs, with distance and normals of the first."""
     found = []
     shown = set(np.linspace(0, len(judged.views) - 1, min(chosen.show.views, len(judged.views))).astype(int).tolist())
     for number, photo in enumerate(judged.views):
-        seen = render_view(field, photo.camera, photo.background)
+        seen = render_view(fit.field, photo.camera, behind(fit, photo))
         found.append(
             judge(seen.image, photo.image, space=judged.space, mask=photo.mask, metrics=chosen.show.metrics, name=photo.name)
         )
@@ -337,7 +345,7 @@ def write_film(chosen: FieldFit, folder: Path, fit: RadianceFit, photos: Photos)
     """A journey around the box."""
     cameras = [view.camera for view in photos.views]
     path = "film/turntable.mp4"
-    background = photos.views[0].background
+    background = behind(fit, photos.views[0])
 
     def frames() -> Iterator[NDArray[np.uint8]]:
         for camera in turntable(cameras, fit.box, chosen.show.frames):

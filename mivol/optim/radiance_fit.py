@@ -26,6 +26,7 @@ from scipy.ndimage import maximum_filter
 
 from mivol.errors import MivolError
 from mivol.fields.resampling import resample_field
+from mivol.fields.sky import Sky
 from mivol.fields.spherical import SphericalGrid, basis_size, row_width
 from mivol.optim.radiance_plan import PRESETS, Plan, Stage, memory_of, place_grid
 from mivol.optim.radiance_priors import dull, next_rows, smooth, thin_out
@@ -47,6 +48,7 @@ class RadianceFit:
         plan: how the fit goes.
         seed: of the rays.
         field: what was found so far; None before the first step.
+        sky: what was found behind it, where the plan asks for that.
         step: the next step.
         stage: the stage at work.
         seconds: time spent, told by who runs it.
@@ -62,6 +64,7 @@ class RadianceFit:
     plan: Plan
     seed: int = 0
     field: SphericalGrid | None = None
+    sky: Sky | None = None
     step: int = 0
     stage: int = -1
     seconds: float = 0.0
@@ -73,6 +76,11 @@ class RadianceFit:
         absent = {stage.shrink for stage in self.plan.stages} - self.views.levels.keys()
         if absent:
             raise MivolError(f"views shrunk by {min(absent)} are asked for; take them over in that size (Views.of).")
+        if self.plan.sky:
+            if self.views.channels == 4:
+                raise MivolError("a sky was asked for and the photographs have alpha, which says what is behind: sky = 0.")
+            self.sky = Sky.grey(self.plan.sky)
+            self.sky_squares = dr.zeros(mi.Float, dr.width(self.sky.texels))
         self.unit = float((self.box[1] - self.box[0]).max()) / 2
 
     # -- Stages -------------------------------------------------------------------------------------------------------
@@ -129,6 +137,8 @@ class RadianceFit:
         chosen = np.sort(rng.choice(count, min(stage.views, count), replace=False))
         batch = self.views.draw(stage.shrink, chosen, stage.tiles, rng)
         loss, slopes = self._slopes(batch, self.views.origins[chosen], self._background(rng))
+        if self.sky is not None:
+            self._update_sky(slopes.pop())
         self._update(slopes, rng)
         self.step += 1
         return loss
@@ -138,12 +148,14 @@ class RadianceFit:
         return rng.random(3) if random else self.views.background
 
     def _slopes(self, batch: Batch, points: np.ndarray, background: np.ndarray) -> tuple[mi.Float, list[mi.Float]]:
-        """Squared errors, and the derivatives of their mean."""
+        """Squared errors, and the derivatives of their mean: density, harmonics, and the sky's where there is one."""
         source = bake(self.field, self.cells, points, batch.slot, slope=True)
         model, count = model_of(self.field, self.plan.stop), dr.width(batch.slot)
         seen = look(self.cells, source, model, batch.rays)
         behind = mi.Color3f(*(dr.opaque(mi.Float, float(c)) for c in background))
+        behind = behind if self.sky is None else self.sky.seen(batch.rays.d)
         before = mi.Color3f(*(dr.opaque(mi.Float, float(c)) for c in self.views.background))
+        # Where a photograph was transparent, it shows what it is over: put what is behind there instead.
         error = seen.colour + seen.T * behind - batch.target - (1 - batch.alpha) * (behind - before)
         by = error * (2 / (3 * count))
         through = dr.dot(by, behind)
@@ -155,26 +167,36 @@ class RadianceFit:
         dr.eval(seen, by, through, loss)
         look_back(self.cells, source, model, seen, by, through)
         dr.eval(source.slope)
-        return loss, list(fold(self.field, self.cells, source, points))
+        slopes = list(fold(self.field, self.cells, source, points))
+        return loss, slopes if self.sky is None else [*slopes, self.sky.slopes(batch.rays.d, by * seen.T)]
 
     def _update(self, slopes: list[mi.Float], rng: np.random.Generator) -> None:
-        """RMSprop where there is a derivative, the first one its own mean; then what is believed."""
-        field, memory = self.field, self.plan.memory
+        """A step of the field: down its derivatives, then towards what is believed."""
+        field = self.field
         own = field.rows if field.nodes is None else field.rows - 1  # the last row is the vacuum around
         density, sh = self.plan.rates(self.step)
         values = [field.density, field.harmonics]
         for k, rate in enumerate((density / self.unit, sh)):
             mine = dr.arange(mi.UInt32, dr.width(slopes[k])) < own * (dr.width(slopes[k]) // field.rows)
-            slope = dr.select(mine, slopes[k], 0)
-            square = dr.square(slope)
-            mean = dr.select(self.squares[k] == 0, square, dr.fma(memory, self.squares[k] - square, square))
-            touched = mean > 0
-            step = dr.opaque(mi.Float, rate) * slope * dr.rsqrt(dr.select(touched, mean, 1))
-            self.squares[k] = dr.select(slope == 0, self.squares[k], mean)
-            values[k] = dr.select(touched, values[k] - step, values[k])
+            values[k], self.squares[k] = self._descend(values[k], self.squares[k], dr.select(mine, slopes[k], 0), rate)
         self._believe(values, own, rng)
         dr.eval(values, self.squares)
         self.field = field.with_values(*values)
+
+    def _update_sky(self, slope: mi.Float) -> None:
+        plan = self.plan
+        rate = plan.sky_rate * plan.rates(self.step)[1] / plan.sh_rate
+        texels, self.sky_squares = self._descend(self.sky.texels, self.sky_squares, slope, rate)
+        dr.eval(texels, self.sky_squares)
+        self.sky = self.sky.with_texels(texels)
+
+    def _descend(self, values: mi.Float, squares: mi.Float, slope: mi.Float, rate: float) -> tuple[mi.Float, mi.Float]:
+        """RMSprop where there is a derivative, the first one its own mean: values, and means of squares."""
+        square = dr.square(slope)
+        mean = dr.select(squares == 0, square, dr.fma(self.plan.memory, squares - square, square))
+        touched = mean > 0
+        step = dr.opaque(mi.Float, rate) * slope * dr.rsqrt(dr.select(touched, mean, 1))
+        return dr.select(touched, values - step, values), dr.select(slope == 0, squares, mean)
 
     def _believe(self, values: list[mi.Float], rows: int, rng: np.random.Generator) -> None:
         """Move values towards what is believed: by shares of the learning rate, fewer the more photographs there are."""
@@ -196,6 +218,7 @@ class RadianceFit:
         arrays = {"density": self.field.density, "harmonics": self.field.harmonics}
         arrays |= {f"square_{k}": square for k, square in enumerate(self.squares)}
         arrays |= {} if self.field.nodes is None else {"nodes": self.field.nodes}
+        arrays |= {} if self.sky is None else {"sky": self.sky.texels, "sky_squares": self.sky_squares}
         self.cells = cells_of(self.field)
         return {name: np.array(array) for name, array in arrays.items()}, about
 
@@ -209,6 +232,8 @@ class RadianceFit:
         values = mi.Float(arrays["density"]), mi.Float(arrays["harmonics"])
         self.field = SphericalGrid(res, to_world, self.plan.degree_at(self.stage), *values, nodes)
         self.squares = [mi.Float(arrays[f"square_{k}"]) for k in range(2)]
+        if self.sky is not None:
+            self.sky, self.sky_squares = self.sky.with_texels(mi.Float(arrays["sky"])), mi.Float(arrays["sky_squares"])
         self._survey()
 
 
@@ -251,13 +276,13 @@ PASS = 1 << 20
 """Rays of a picture that are followed at once."""
 
 
-def render_view(field: SphericalGrid, camera: Camera, background: np.ndarray, stop: float = 0.0) -> Seen:
+def render_view(field: SphericalGrid, camera: Camera, background: np.ndarray | Sky, stop: float = 0.0) -> Seen:
     """Render what a camera sees.
 
     Args:
         field: what is there.
         camera: with or without distortion.
-        background: (3,) behind the field.
+        background: behind the field: a colour (3,), or a sky.
         stop: a ray ends at this transmittance.
 
     Bias: O(h^4) in a cell, and that of :func:`mivol.transport.radiance.bake`.
@@ -273,15 +298,15 @@ def render_view(field: SphericalGrid, camera: Camera, background: np.ndarray, st
         o = np.broadcast_to(o, d.shape)
         sent = Rays(*(kind(np.ascontiguousarray(np.float32(a.T))) for kind, a in ((mi.Point3f, o), (mi.Vector3f, d))))
         seen = look(cells, source, model, sent)
-        dr.eval(seen.colour, seen.T, seen.distance)
-        found[order[start : start + PASS]] = np.stack(
-            [*np.array(seen.colour), np.array(seen.T), np.array(seen.distance)], axis=1
-        )
+        behind = background.seen(sent.d) if isinstance(background, Sky) else mi.Color3f(*map(float, background))
+        colour = seen.colour + seen.T * behind
+        dr.eval(colour, seen.T, seen.distance)
+        found[order[start : start + PASS]] = np.stack([*np.array(colour), np.array(seen.T), np.array(seen.distance)], axis=1)
     found = found.reshape(height, width, 5)
     opacity = 1 - found[..., 3]
     with np.errstate(invalid="ignore", divide="ignore"):
         depth = np.where(opacity > 0, found[..., 4] / opacity, np.nan)
-    return Seen(found[..., :3] + found[..., 3:4] * np.float32(background), opacity, depth)
+    return Seen(found[..., :3], opacity, depth)
 
 
 def _by_tiles(width: int, height: int) -> np.ndarray:

@@ -63,6 +63,8 @@ class Plan:
         keep_weight: a node is kept where some ray gives a cell of it this weight.
         start: the first density, times half the longest edge.
         survey: steps after which the map of occupied cells is made anew.
+        sky: rows of a map of what is behind the field, learned with it (:mod:`mivol.fields.sky`); 0: the photographs' colour.
+        sky_rate: first learning rate of the sky [radiance]; it must lead, or the field fills the box with what is behind.
         random_background: photographs with alpha are seen over another colour each step, so that nothing stands in the air in
             the background's colour.
     """
@@ -85,6 +87,8 @@ class Plan:
     keep_weight: float = 0.01
     start: float = 0.1
     survey: int = 64
+    sky: int = 0
+    sky_rate: float = 0.1
     random_background: bool = True
 
     @property

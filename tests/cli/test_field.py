@@ -12,7 +12,7 @@ from mivol import config
 from mivol.cli import field, main
 from mivol.errors import MivolError
 from mivol.fields.spherical import SphericalGrid, load_field
-from mivol.files import write_png
+from mivol.files import read_exr, write_png
 from mivol.optim.radiance_fit import PRESETS, Stage, render_view
 from mivol.photos import Camera, intrinsics
 from mivol.photos.journey import facing
@@ -102,6 +102,18 @@ def test_photographs_become_a_field_and_a_page(photographs: Path, tmp_path: Path
     assert all({"loss", "held_out_psnr"} <= row.keys() for row in rows)
 
 
+def test_what_is_behind_is_learned(photographs: Path, tmp_path: Path) -> None:
+    """Views over white, said to be over black: a sky finds the white, and is kept as an image beside the field."""
+    path = toml(tmp_path, photographs)
+    more = ["--set", "photos.behind=[0, 0, 0]", "--set", "field.sky=4"]
+    assert main(["optimize", str(path), "-o", str(tmp_path / "run"), *more]) == 0
+    record = json.loads((tmp_path / "run/run.json").read_text())
+    assert record["results"]["held_out_psnr"] > 22
+    channels, _ = read_exr(tmp_path / "run/sky.exr")
+    # Cameras are all around, so most of the sky was seen; what was not has stayed grey.
+    assert all(np.median(channels[name]) > 0.9 for name in "RGB")
+
+
 def test_a_stopped_fit_goes_on(photographs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Ctrl-C in the middle keeps what was done; the resumed fit ends with all steps, and says nothing twice."""
     path = toml(tmp_path, photographs)
@@ -154,6 +166,7 @@ def test_photographs_are_shrunk_to_half_a_voxel(photographs: Path, tmp_path: Pat
         ("field.longest=4", "at least 8"),
         ("field.tv_sh=-1", "at least 0"),
         ("field.first_degree=5", "0 to 4"),
+        ("field.sky=1", "0 or at least 2"),
         ("photos.box=silhouette", 'did you mean "silhouettes"'),
         ("photos.path=nowhere", "nowhere"),
         ("photos.judged=val", "val"),

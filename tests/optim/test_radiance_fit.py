@@ -11,6 +11,7 @@ import pytest
 
 from mivol.errors import MivolError
 from mivol.fields.resampling import resample_field
+from mivol.fields.sky import Sky
 from mivol.fields.spherical import SphericalGrid
 from mivol.optim.radiance_fit import RadianceFit, render_view
 from mivol.optim.radiance_plan import PRESETS, Plan, Stage, memory_of, place_grid
@@ -105,6 +106,28 @@ def test_backgrounds_that_change_leave_no_white_in_the_air(variant_rgb: str, pho
     # A corner of the view is empty whatever stands behind it.
     black = render_view(fit.field, camera(2.5), np.zeros(3)).image
     assert black[:4, :4].max() < 0.05
+
+
+def test_what_is_behind_is_found_too(variant_rgb: str, photos: list[Photo]) -> None:
+    """A ball under a sky of two colours, photographs without alpha: the sky is found where rays pass the ball."""
+    v, u = np.meshgrid(np.linspace(0, 1, 8), (np.arange(16) + 0.5) / 16, indexing="ij")
+    image = np.stack([0.5 + 0.4 * np.sin(2 * np.pi * u), 0.9 - 0.8 * v, 0.3 + 0 * u], axis=-1)
+    sky = Sky.of_image(image)
+    images = [np.clip(render_view(ball(), p.camera, sky).image, 0, 1) for p in photos]
+    taken = [Photo(p.name, image, None, None, p.camera, WHITE) for p, image in zip(photos, images, strict=True)]
+    fit = fitted(Views.of(taken, (1, 2)), replace(PLAN, sky=8))
+    seen, truth = render_view(fit.field, camera(2.5), fit.sky), render_view(ball(), camera(2.5), sky)
+    # 22 dB between the views; without a sky 16 dB, and the box is full.
+    assert np.mean((np.clip(seen.image, 0, 1) - truth.image) ** 2) < 0.0064
+    assert seen.opacity[truth.opacity < 0.01].mean() < 0.01
+    # A corner of a view that was taken looks past the ball: the sky itself, within 10 steps of a photograph's 255.
+    corner = render_view(fit.field, photos[3].camera, fit.sky).image[:4, :4]
+    assert np.abs(corner - images[3][:4, :4]).mean() < 10 / 255
+    again = RadianceFit(fit.views, BOX, fit.plan)
+    again.restore(*fit.pack())
+    np.testing.assert_array_equal(again.sky.image(), fit.sky.image())
+    with pytest.raises(MivolError, match="alpha, which says what is behind"):
+        RadianceFit(Views.of(photos, (1, 2), with_alpha=True), BOX, fit.plan)
 
 
 def test_views_know_their_rays_and_pixels(variant_rgb: str, photos: list[Photo]) -> None:

@@ -1,0 +1,95 @@
+r"""Light from far away, by direction: what is behind a field.
+
+.. math:: u = \mathrm{atan2}(d_x, -d_z) / 2\pi, \qquad v = \arccos(d_y) / \pi
+
+Conventions. Those of Mitsuba 3.9's ``envmap`` without a ``to_world``, so a sky saved as an image is one there: columns at the
+middle of their share of u, round about; rows at v = j / (rows - 1), from pole to pole. Linear between them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mivol.errors import MivolError
+
+__all__ = ["Sky"]
+
+TEXEL = 4
+"""Numbers a texel: rgb, and one that fills a packet."""
+
+
+@dataclass(frozen=True)
+class Sky:
+    """A map of directions.
+
+    Attributes:
+        rows: from pole to pole; there are twice as many columns. At least 2.
+        texels: Float, rgb and a 0 for each texel, row by row.
+    """
+
+    rows: int
+    texels: mi.Float
+
+    @classmethod
+    def grey(cls, rows: int, value: float = 0.5) -> Sky:
+        """The same in all directions.
+
+        Raises:
+            MivolError: fewer than 2 rows.
+        """
+        if rows < 2:
+            raise MivolError(f"a sky of {rows} rows was asked for; at least 2 are expected, one a pole.")
+        return cls.of_image(np.full((rows, 2 * rows, 3), value))
+
+    @classmethod
+    def of_image(cls, image: np.ndarray) -> Sky:
+        """The sky of an image (n, 2 n, 3)."""
+        texels = np.zeros((*image.shape[:2], TEXEL), np.float32)
+        texels[..., :3] = image
+        return cls(image.shape[0], mi.Float(texels.reshape(-1)))
+
+    def image(self) -> np.ndarray:
+        """(rows, 2 rows, 3) float32."""
+        return np.array(self.texels).reshape(self.rows, 2 * self.rows, TEXEL)[..., :3]
+
+    def with_texels(self, texels: mi.Float) -> Sky:
+        """Another light from the same directions."""
+        return replace(self, texels=texels)
+
+    def _corners(self, d: mi.Vector3f) -> list[tuple[mi.UInt32, mi.Float]]:
+        """The 4 texels about directions, and their shares."""
+        columns = 2 * self.rows
+        wide, high = dr.opaque(mi.Float, columns), dr.opaque(mi.Float, self.rows - 1)
+        u, v = dr.atan2(d.x, -d.z) * dr.inv_two_pi, dr.safe_acos(d.y) * dr.inv_pi
+        x, y = dr.fma(u, wide, -0.5), v * high
+        i, j = dr.floor(x), dr.minimum(dr.floor(y), high - 1)
+        fx, fy = x - i, y - j
+        last = dr.opaque(mi.Int32, columns)
+        left = mi.Int32(i)
+        left = dr.select(left < 0, left + last, left)
+        right = dr.select(left + 1 == last, 0, left + 1)
+        top = mi.Int32(j) * last
+        found = []
+        for row, wy in ((top, 1 - fy), (top + last, fy)):
+            found += [(mi.UInt32(row + left), wy * (1 - fx)), (mi.UInt32(row + right), wy * fx)]
+        return found
+
+    def seen(self, d: mi.Vector3f) -> mi.Color3f:
+        """Radiance from where unit directions point to."""
+        colour = mi.Color3f(0)
+        for texel, share in self._corners(d):
+            packet = dr.gather(mi.ArrayXf, self.texels, texel, shape=(TEXEL, 1))
+            colour += mi.Color3f(packet[0], packet[1], packet[2]) * share
+        return colour
+
+    def slopes(self, d: mi.Vector3f, by: mi.Color3f) -> mi.Float:
+        """Derivatives with respect to ``texels`` of a scalar, from those with respect to what :meth:`seen` gives."""
+        total = dr.zeros(mi.Float, dr.width(self.texels))
+        for texel, share in self._corners(d):
+            packet = mi.ArrayXf([by.x * share, by.y * share, by.z * share, mi.Float(0)])
+            dr.scatter_add(total, packet, texel)
+        return total

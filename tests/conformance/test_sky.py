@@ -1,0 +1,46 @@
+"""A map of directions is Mitsuba's, and its derivatives are its own."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mivol.errors import MivolError
+from mivol.fields.sky import Sky
+
+
+def some(count: int) -> tuple[np.ndarray, mi.Vector3f]:
+    d = np.random.default_rng(0).normal(size=(count, 3))
+    d[:6] = [[0, 1, 0], [0, -1, 0], [0, 0, -1], [-1e-6, 0, -1], [1e-6, 0, -1], [0, 0, 1]]  # the poles, both sides of the seam
+    d = np.float32(d / np.linalg.norm(d, axis=1, keepdims=True))
+    return d, mi.Vector3f(np.ascontiguousarray(d.T))
+
+
+def test_a_sky_is_an_envmap_of_mitsuba(variant_rgb: str) -> None:
+    image = np.float32(np.random.default_rng(1).random((8, 16, 3)))
+    light = mi.load_dict({"type": "envmap", "bitmap": mi.Bitmap(image), "scale": 1.0})
+    _, d = some(2000)
+    si = mi.SurfaceInteraction3f()
+    si.wi = -d
+    # Bilinear weights move by 1e-7 of an angle times 16 columns, and by acos near the poles: sqrt(1e-7) = 3e-4 of a row.
+    np.testing.assert_allclose(np.array(Sky.of_image(image).seen(d)), np.array(light.eval(si)), atol=1e-3)
+    inner = np.abs(np.array(d.y)) < 0.99
+    np.testing.assert_allclose(np.array(Sky.of_image(image).seen(d))[:, inner], np.array(light.eval(si))[:, inner], atol=1e-5)
+
+
+def test_derivatives_of_a_sky(variant_rgb: str) -> None:
+    """Radiance is linear in the texels: <by, J way> = <J^T by, way>, to the rounding of 500 terms."""
+    rng, (_, d) = np.random.default_rng(2), some(500)
+    way = np.float32(rng.normal(size=(5, 10, 3)))
+    by = np.float32(rng.normal(size=(3, 500)))
+    seen = np.array(Sky.of_image(way).seen(d))
+    slopes = Sky.of_image(way).slopes(d, mi.Color3f(by))
+    assert np.vdot(by, seen) == pytest.approx(np.vdot(np.array(slopes).reshape(5, 10, 4)[..., :3], way), rel=1e-4)
+    assert dr.all(dr.gather(mi.Float, slopes, 3 + 4 * dr.arange(mi.UInt32, 50)) == 0)
+
+
+def test_a_sky_of_one_row_is_refused(variant_rgb: str) -> None:
+    with pytest.raises(MivolError, match="1 rows .* at least 2"):
+        Sky.grey(1)
