@@ -27,17 +27,18 @@ def sh_basis(d: np.ndarray, count: int) -> np.ndarray:
     return np.array(all_nine[:count])
 
 
-def shares(dt: float, s1: float, s2: float) -> tuple[float, float]:
-    """Optical depth of a cell and the share of its first point."""
+def shares(dt: np.ndarray, s1: np.ndarray, s2: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Optical depths of cells and the shares of their first points."""
     tau = dt / 2 * (s1 + s2)
     x = tau / ROOT3
     q = 1 + x + x * x / 2 + x**3 / (6 + 3 * x)
-    return tau, s1 * q / (s1 * q + s2) if s1 + s2 > 0 else 0.5
+    both = s1 * q + s2
+    return tau, np.where(both > 0, s1 * q / np.where(both > 0, both, 1), 0.5)
 
 
 ACTIVATIONS = {
     "none": lambda v: v,
-    "relu": lambda v: max(v, 0.0),
+    "relu": lambda v: np.maximum(v, 0.0),
     "softplus": lambda v: np.logaddexp(0.0, v),
     "exp": np.exp,
 }

@@ -4,6 +4,21 @@ Conventions. A medium's density is physical and stays as it is; a radiance field
 with ``relu`` puts a surface where the interpolated value crosses 0, anywhere between two nodes; clamping the nodes instead
 would put it on them. Values are extinctions [1/length]. ``ACTIVATIONS`` lists them.
 
+Quadrature. Along a ray an interpolated density is a cubic in a cell, whose integral two Gauss points know; what an activation
+makes of it is none, and a ReLU bends it where it crosses 0. Relative error (rms) of the light of 150 rays through 16^3 nodes of
+noise, ours / as many midpoints (two a cell), for median optical depths of a voxel's edge from 0.01 to 10 (extinctions vary by
+e; those of relu are normal about 0), and at 0.1 the order in which it falls as cells are cut::
+
+              0.01               0.1                1                  10                 order
+    none      7.2e-05 / 1.9e-03  4.2e-04 / 2.0e-03  5.1e-03 / 7.5e-03  1.8e-02 / 2.1e-02  4.2
+    relu      2.2e-03 / 4.6e-03  2.2e-03 / 4.3e-03  5.0e-03 / 7.6e-03  2.4e-02 / 3.1e-02  2.2
+    softplus  1.9e-04 / 3.4e-03  4.3e-04 / 2.1e-03  5.1e-03 / 7.5e-03  1.8e-02 / 2.1e-02  4.2
+    exp       2.7e-04 / 3.8e-03  4.3e-04 / 2.4e-03  4.7e-03 / 7.1e-03  1.7e-02 / 2.1e-02  4.1
+
+(``pytest -s tests/analytic/test_activation_quadrature.py``). Smooth activations keep the fourth order; a ReLU is of second
+order where a ray crosses its surface. In cells of an optical depth of 1 and more all are alike, for what is seen is a skin
+thinner than a cell.
+
 References: Karnewar et al. 2022 (ReLU fields: interpolate, then clamp); Barron et al. 2021 (softplus, shifted).
 """
 
