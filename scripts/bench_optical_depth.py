@@ -44,7 +44,7 @@ from contest import (
     threads_in_space,
 )
 from mivol.report.figures import Series, plot_error_against_time
-from mivol.transport.lattice import Lattice, block_bounds, clip, walk
+from mivol.transport.lattice import Lattice, block_bounds, clip, find_gaps, walk
 from mivol.transport.optical_depth import Gradient, backproject_segment, integrate_tau
 
 import drjit as dr
@@ -117,7 +117,7 @@ class Work:
 
     def lattice(self, skip: bool = False) -> Lattice:
         """The grid for mivol's walk, empty blocks skipped or not."""
-        return Lattice(self.tensor, TO_WORLD, block_bounds(self.tensor) if skip else None)
+        return Lattice(self.tensor, TO_WORLD, find_gaps(self.tensor) if skip else None)
 
     def tau(self, skip: bool = False) -> Contestant:
         """The optical depth of each ray by mivol."""

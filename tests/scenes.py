@@ -84,11 +84,11 @@ def from_lanes(tau: object) -> np.ndarray:
 
 
 def make_lattice(values: np.ndarray | mi.TensorXf, to_world: np.ndarray, skip: bool = False) -> object:
-    """A lattice of the fast path, with or without the bounds that let it skip empty blocks."""
-    from mivol.transport.lattice import Lattice, block_bounds
+    """A lattice of the fast path, with or without the gaps that let it skip empty blocks."""
+    from mivol.transport.lattice import Lattice, find_gaps
 
     values = values if isinstance(values, mi.TensorXf) else tensor(values)
-    return Lattice(values, to_world, block_bounds(values) if skip else None)
+    return Lattice(values, to_world, find_gaps(values) if skip else None)
 
 
 def tau_fast(

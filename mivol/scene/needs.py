@@ -17,7 +17,7 @@ from mivol.errors import MivolError
 from mivol.files import check_volume
 from mivol.scene.load import check_variant
 from mivol.transport.direct import UNIFORM
-from mivol.transport.lattice import block_bounds
+from mivol.transport.lattice import block_bounds, block_gaps
 from mivol.transport.medium import Box, MediumView, Part, box_of_cube, kind_of, view_medium
 from mivol.transport.tracking import Blocks, find_blocks
 
@@ -234,6 +234,17 @@ def read_part(part: Part, survey: Survey, name: str) -> _Read:
         host = np.array(bounds)
         survey.values[key] = _Read(array, bounds, float((host > 0).mean()), float(host.max(initial=0.0)))
     return survey.values[key]
+
+
+def read_gaps(part: Part, survey: Survey, name: str) -> mi.UInt8:
+    """Measure the gaps between the blocks of a part that hold anything, once for each state of its array."""
+    array = dr.detach(part.lattice.values.array)
+    key = ("gaps", array.index)
+    if key not in survey.values:
+        gaps = block_gaps(read_part(part, survey, name).bounds, part.lattice.res)
+        survey.values = dict(list(survey.values.items())[-15:])
+        survey.values[key] = (array, gaps)
+    return survey.values[key][1]
 
 
 def read_blocks(part: Part, survey: Survey) -> Blocks:

@@ -23,7 +23,7 @@ import numpy as np
 from mivol.errors import MivolError
 from mivol.threads import check_one_thread
 from mivol.tomography.geometry import Geometry, VoxelGrid
-from mivol.transport.lattice import Lattice, block_bounds, clip
+from mivol.transport.lattice import Lattice, clip, find_gaps
 from mivol.transport.optical_depth import Gradient, backproject_segment, integrate_segment
 
 if TYPE_CHECKING:
@@ -153,7 +153,7 @@ class Projector:
     def _project(self, values: mi.Float) -> mi.Float:
         """``A values``, flat."""
         check_one_thread()
-        lattice = self._lattice(values, with_bounds=True)
+        lattice = self._lattice(values, skip=True)
         y = dr.zeros(mi.Float, self.shape[0])
         for start, o, d in self._passes():
             tau = integrate_segment(lattice, values, clip(lattice, o, d, 0, dr.inf))[0]
@@ -165,7 +165,7 @@ class Projector:
     def _backproject(self, y: mi.Float) -> mi.Float:
         """``A^T y``, flat; the passes are added up in float64."""
         check_one_thread()
-        lattice = self._lattice(dr.zeros(mi.Float, self.grid.size), with_bounds=False)
+        lattice = self._lattice(dr.zeros(mi.Float, self.grid.size), skip=False)
         total = dr.zeros(mi.Float64, self.grid.size)
         for start, o, d in self._passes():
             weight = dr.gather(mi.Float, y, dr.arange(mi.UInt32, dr.width(o)) + dr.opaque(mi.UInt32, start))
@@ -176,9 +176,9 @@ class Projector:
             dr.sync_thread()
         return mi.Float(total)
 
-    def _lattice(self, values: mi.Float, with_bounds: bool) -> Lattice:
+    def _lattice(self, values: mi.Float, skip: bool) -> Lattice:
         tensor = mi.TensorXf(values, (*self.grid.shape, 1))
-        return Lattice(tensor, self._to_world, block_bounds(tensor) if with_bounds else None)
+        return Lattice(tensor, self._to_world, find_gaps(tensor) if skip else None)
 
     def _passes(self) -> Iterator[tuple[int, mi.Point3f, mi.Vector3f]]:
         """(index of the first ray, origins, directions), pass by pass."""

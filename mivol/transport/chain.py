@@ -236,7 +236,7 @@ def _measure(stretch: _Stretch, skip: bool) -> _Moment:
         moment = add_constant(moment, lay.leave, lay.t1)
     if lay.lattice is not None:
         alone = skip and len(stretch.field.reads) == 1 and not stretch.has_constants
-        lattice = lay.lattice if alone else replace(lay.lattice, bounds=None)
+        lattice = lay.lattice if alone else replace(lay.lattice, gaps=None)
         moment = walk(lattice, lay.segment, visit, moment, stretch.reads, stretch.active)
     if stretch.has_constants:
         moment = add_constant(moment, lay.t0, lay.enter)
@@ -301,7 +301,7 @@ def _backproject(
     if stretch.has_constants and lay.lattice is not None:
         pull = add_constant(pull, lay.leave, lay.t1)
     if lay.lattice is not None:
-        pull = walk(replace(lay.lattice, bounds=None), lay.segment, visit, pull, stretch.field.reads, stretch.active)
+        pull = walk(replace(lay.lattice, gaps=None), lay.segment, visit, pull, stretch.field.reads, stretch.active)
     if stretch.has_constants:
         pull = add_constant(pull, lay.t0, lay.enter)
         body.add_to_constants(stretch.world.sums(pull.constant), stretch.active)

@@ -265,7 +265,7 @@ def _pass(
     """All cells: what they dim, and what they send to the camera by S."""
     (part,) = body.view.parts
     field, control = body.extinction(ray), world.control
-    lattice = replace(part.lattice, bounds=None)
+    lattice = replace(part.lattice, gaps=None)
     segment = clip(lattice, ray.o, -ray.d, -t1, -t0)
     leave = -segment.t0
     reads = [*field.reads, Nodes(body.tangents[0], part.channels)] if tracks.tangent else field.reads

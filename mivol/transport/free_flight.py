@@ -189,7 +189,7 @@ def _fly(
         pick = add_constant(pick, t0, t1)
         return _note_spread(pick, spread)
     # Where there is no extinction there is no light, but there is a derivative.
-    lattice = replace(grid, bounds=None) if kappa or field.has_constants or len(field.reads) > 1 else grid
+    lattice = replace(grid, gaps=None) if kappa or field.has_constants or len(field.reads) > 1 else grid
     hit = segment.length > 0
 
     def visit(pick: Pick, cell: Cell, full: mi.Bool) -> Pick:

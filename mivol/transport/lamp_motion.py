@@ -73,7 +73,7 @@ def _by_part(body: Body, part: Part, way: Way, t0: mi.Float64, t1: mi.Float64, o
         entering = _face(body.rows, (0.0,) * 3, (1.0,) * 3, ray, t0) if body.box is not None else mi.Vector3f(0)
         shift = dr.select(on & (t0 > 0), entering * mi.Float(t0), 0) - dr.select(on & (t1 < end), leaving * mi.Float(t1), 0)
         return [v * shift for v in each]
-    lattice = replace(part.lattice, bounds=None)
+    lattice = replace(part.lattice, gaps=None)
     segment = clip(lattice, ray.o, ray.d, t0, t1)
     a, b = mi.Float64(segment.t0), mi.Float64(segment.t0) + mi.Float64(segment.length)
     inside = on & (segment.length > 0)

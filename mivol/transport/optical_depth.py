@@ -160,7 +160,7 @@ def backproject_activated(
         target.add(0, cell, [0.5 * cell.dt * weight * r for r in row], on)
         return state
 
-    walk(replace(lattice, bounds=None), segment, visit, None, [Nodes(values)], active)
+    walk(replace(lattice, gaps=None), segment, visit, None, [Nodes(values)], active)
 
 
 @dataclass
@@ -232,7 +232,7 @@ def backproject_segment(
     """Add ``weight`` times the row of ``A`` of each lane to a gradient: the transpose ``A^T``.
 
     Args:
-        lattice: where the grid lies. Its bounds are not used: an empty voxel has a derivative too.
+        lattice: where the grid lies. Its gaps are not used: an empty voxel has a derivative too.
         target: what receives the sums.
         weight: d loss / d tau of each lane, one entry a channel.
         segment: from :func:`mivol.transport.lattice.clip`.
@@ -248,7 +248,7 @@ def backproject_segment(
             target.add(channel, cell, [w * r for r in row], on)
         return state
 
-    walk(replace(lattice, bounds=None), segment, visit, None, (), active)
+    walk(replace(lattice, gaps=None), segment, visit, None, (), active)
 
 
 def gauss_points(cell: Cell) -> tuple[mi.Vector3f, mi.Vector3f]:
@@ -300,7 +300,7 @@ class _OpticalDepth(dr.CustomOp):
 
     def forward(self) -> None:
         # The tangent is not zero where the values are: no block is empty for it.
-        dense = replace(self.lattice, bounds=None)
+        dense = replace(self.lattice, gaps=None)
         self.set_grad_out(integrate_segment(dense, self.grad_in("values"), self.segment, self.active))
 
     def backward(self) -> None:

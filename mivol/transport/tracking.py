@@ -117,7 +117,7 @@ class _Coarse:
     """The blocks as cells of a lattice of their own, for a walk."""
 
     res: tuple[int, int, int]
-    bounds: None = None
+    gaps: None = None
 
 
 @dataclass

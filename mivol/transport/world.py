@@ -128,7 +128,7 @@ class Body:
                 each = [value] if part.channels == 1 else [value.x, value.y, value.z]
                 rows = [dr.select(v != 0, v * length, 0) for v in each]
             else:
-                lattice = part.lattice if skip else replace(part.lattice, bounds=None)
+                lattice = part.lattice if skip else replace(part.lattice, gaps=None)
                 segment = clip(lattice, ray.o, ray.d, t0, t1)
                 if part.activation is None:
                     rows = integrate_segment(lattice, value, segment, active, enough)

@@ -426,6 +426,21 @@ def test_hard_22_half_empty(skip):
     assert assert_tau(values, np.eye(4), o, [0, 0, 1], skip=skip)[0, 0] > 0.01
 
 
+def test_hard_22_gaps_are_the_distances_between_blocks():
+    # Chebyshev distances of integers, by brute force over the blocks that hold anything: equal, not close.
+    from mivol.transport.lattice import BLOCK, REACH, block_bounds, find_gaps
+
+    rng = np.random.default_rng(32)
+    values = np.where(rng.uniform(size=(23, 90, 41)) < 2e-4, 1, 0)
+    gaps = np.array(find_gaps(tensor(values))).reshape(*(-(-(n + 1) // BLOCK) for n in values.shape))
+    held = np.argwhere(np.array(block_bounds(tensor(values))).reshape(gaps.shape) > 0)
+    assert 1 < len(held) < gaps.size / 4
+    away = np.abs(np.indices(gaps.shape).reshape(3, -1).T[:, None] - held).max(axis=2).min(axis=1)
+    assert away.max() > 2
+    np.testing.assert_array_equal(gaps.ravel(), np.minimum(away, REACH))
+    assert np.all(np.array(find_gaps(tensor(np.zeros((9, 9, 9))))) == REACH)
+
+
 @pytest.mark.parametrize("skip", [False, True])
 def test_hard_22_gradient_in_and_out_of_the_shell(skip):
     # d tau / d sigma does not know sigma: the voxels of an empty block have the same row of A as all others.
