@@ -87,7 +87,7 @@ def make_plan(chosen: FieldFit) -> Plan:
     plan = replace(plan, **{name: value for name, value in given.items() if value is not None})
     stages = [replace(stage, steps=max(1, round(stage.steps * wanted.effort))) for stage in plan.stages]
     if wanted.longest is not None:
-        coarser = [stage for stage in stages[:-1] if stage.longest < wanted.longest]
+        coarser = [stage for stage in stages if stage.longest < wanted.longest]
         stages = [*coarser, replace(stages[-1], longest=wanted.longest)]
     return replace(plan, stages=tuple(stages))
 

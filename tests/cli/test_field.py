@@ -142,6 +142,8 @@ def test_what_the_file_says_overrides_the_preset(tmp_path: Path) -> None:
     raw["field"] = {"preset": "cpu", "longest": 40, "degree": 1, "effort": 0.5, "tv_sh": 1e-3}
     plan = field.make_plan(config.from_dict(raw))
     assert [stage.longest for stage in plan.stages] == [32, 40]
+    raw["field"]["longest"] = 200
+    assert [stage.longest for stage in field.make_plan(config.from_dict(raw)).stages] == [32, 64, 128, 200]
     assert plan.stages[0].steps == round(PRESETS["cpu"].stages[0].steps / 2)
     assert (plan.degree, plan.tv_sh, plan.tv_density) == (1, 1e-3, PRESETS["cpu"].tv_density)
 
