@@ -17,7 +17,8 @@ from mivol.errors import MivolError
 from mivol.files import check_volume
 from mivol.scene.load import check_variant
 from mivol.transport.direct import UNIFORM
-from mivol.transport.lattice import block_bounds, block_gaps
+from mivol.transport.lattice import Lattice, block_bounds, block_gaps
+from mivol.transport.light_grid import Coarse, coarsen
 from mivol.transport.medium import Box, MediumView, Part, box_of_cube, kind_of, view_medium
 from mivol.transport.tracking import Blocks, find_blocks
 
@@ -254,6 +255,18 @@ def read_blocks(part: Part, survey: Survey) -> Blocks:
     if key not in survey.values:
         survey.values = dict(list(survey.values.items())[-15:])
         survey.values[key] = (array, find_blocks(part.lattice.values))
+    return survey.values[key][1]
+
+
+def read_coarse(survey: Survey, lattice: Lattice, shift: int, lists: bool) -> Coarse:
+    """Make a grid coarser once for each state of its array and place; anew where a function is being recorded."""
+    array = dr.detach(lattice.values.array)
+    key = ("coarse", array.index, shift, lists, lattice.gaps is None, lattice.to_world.tobytes())
+    if dr.flag(dr.JitFlag.FreezingScope):
+        return coarsen(lattice, shift, lists)
+    if key not in survey.values:
+        survey.values = dict(list(survey.values.items())[-15:])
+        survey.values[key] = (array, coarsen(lattice, shift, lists))
     return survey.values[key][1]
 
 

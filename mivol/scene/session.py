@@ -13,12 +13,12 @@ import mitsuba as mi
 
 from mivol.errors import MivolError
 from mivol.scene.load import find_sensor
-from mivol.scene.needs import Survey, find_needs, survey_scene
+from mivol.scene.needs import Needs, Survey, find_needs, read_coarse, survey_scene
 from mivol.scene.plan import Plan, build_world, check_aovs, make_plan
 from mivol.transport.aovs import backproject_aovs, integrate_aovs, push_aovs
 from mivol.transport.control import View, find_control
 from mivol.transport.film import PLAIN, SPREAD, TILED, Rays, adjoint_rays, record
-from mivol.transport.light_grid import find_light_grid, find_shade
+from mivol.transport.light_grid import Shade, find_light_grid, find_shade
 from mivol.transport.path import Settings, is_straight, walk_path
 from mivol.transport.score import Adjoint, Primal, Tangent
 from mivol.transport.world import World
@@ -73,7 +73,7 @@ class Session:
             raise MivolError("develop=False was asked for; mivol returns the developed image: leave it at True.")
         sensor = find_sensor(scene, sensor)
         with dr.suspend_grad():
-            world, plan = self._open(scene, sensor, spp)
+            world, plan = self._open(scene, sensor, spp, pictures=True)
             image = record(
                 sensor, seed, spp, plan.pass_rays, self.aovs, lambda rays: self._primal(scene, world, rays), _layout(world)
             )
@@ -115,12 +115,12 @@ class Session:
     def sample(self, scene: mi.Scene, sampler: mi.Sampler, ray: mi.Ray3f, active: mi.Bool) -> tuple:
         """Radiance along given rays, for integrators that nest this one."""
         with dr.suspend_grad():
-            world, _ = self._open(scene, find_sensor(scene, 0), 1)
+            world, _ = self._open(scene, find_sensor(scene, 0), 1, pictures=True)
             score, valid = walk_path(scene, world, self.settings, sampler, ray, Primal(_black(ray)), active)
             return score.L, valid, integrate_aovs(scene, world, ray, self.aovs, active)
 
-    def _open(self, scene: mi.Scene, sensor: mi.Sensor, spp: int) -> tuple[World, Plan]:
-        """Ask, plan, and build the media."""
+    def _open(self, scene: mi.Scene, sensor: mi.Sensor, spp: int, pictures: bool = False) -> tuple[World, Plan]:
+        """Ask, plan, and build the media, for pictures or for derivatives."""
         parts = [*scene.shapes(), *scene.emitters()]
         if self._seen is None or not self._seen.is_of(parts):
             self._seen = _Seen(parts, survey_scene(scene))
@@ -131,10 +131,18 @@ class Session:
         world.check_followed()
         if world.lights is not None:
             with dr.suspend_grad():
-                world.shade = find_shade(scene, world, needs.film_samples)
+                world.shade = self._shade(scene, world, needs, plan, pictures)
                 if self.settings.shadows == "grid":
                     world.light_grid = find_light_grid(scene, world)
         return world, plan
+
+    def _shade(self, scene: mi.Scene, world: World, needs: Needs, plan: Plan, pictures: bool) -> Shade | None:
+        """Find where lamps shine; derivatives are not 0 in empty blocks, which only values that were read can tell."""
+        blind = not pictures or any(m.unread for m in needs.media)
+        rays = needs.film_samples * (plan.events if pictures else 1)
+        occupied = None if blind else needs.media[0].occupied
+        survey = self._seen.survey
+        return find_shade(scene, world, rays, occupied, lambda *asked: read_coarse(survey, *asked))
 
     def _primal(self, scene: mi.Scene, world: World, rays: Rays) -> tuple:
         score = Primal(_black(rays.ray))

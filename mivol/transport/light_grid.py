@@ -4,8 +4,8 @@ r"""Optical depth towards lamps on a lattice: which cells of a grid lie in the l
 
 A lamp with one position or one direction lights a medium through its own shadow, which a walk along a camera ray does not
 see. Its optical depth from the middle of each block of cells tells where scattering is worth a look: distances are drawn in
-proportion. Shadow rays stay exact, so nothing is biased; where a block lies across the edge of a shadow the floor ``w_0``
-bounds the weights.
+proportion. It is summed over a grid as coarse as the blocks, and shadow rays stay exact, so nothing is biased; where a block
+lies across the edge of a shadow the floor ``w_0`` bounds the weights.
 
 A finer lattice of the same optical depths can take the place of the shadow rays altogether (:class:`LightGrid`): that is
 biased, and the bias is measured.
@@ -16,24 +16,27 @@ for a step of 2 in optical depth).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import copy
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
-from mivol.transport.lattice import Lattice
+from mivol.transport.lattice import Lattice, find_gaps
 from mivol.transport.optical_depth import interpolate
 from mivol.transport.path import DARK, shadow_ray
 from mivol.transport.world import Body, World, spectrum
 
-__all__ = ["LightGrid", "Shade", "find_light_grid", "find_shade", "measure_bias"]
+__all__ = ["Coarse", "LightGrid", "Shade", "coarsen", "find_light_grid", "find_shade", "measure_bias"]
 
 FLOOR = 0.02
 """Weight of a block in full shadow: a lit point in it counts 50 times at most."""
 
-SHARE = 0.25
-"""Most shadow rays of the lattice, in samples of the image (measured on smoke: blocks of 2 cells take 2.7 times the variance
-off a directional light's image, blocks of 4 nothing)."""
+SHARE = 0.2
+"""Most shadow rays of the lattice, in those of the image (measured: blocks of 2 cells take 2.7 times the variance off a
+directional light's image of smoke, blocks of 4 nothing; blocks of 4 half of a point light's on a CT of 256^3 that 8 leave)."""
 
 COARSEST = 3
 """log2 of the largest block: shadows change from one cell to the next, and larger ones tell nothing."""
@@ -63,18 +66,81 @@ class Shade:
         return dr.gather(mi.Float, self.weights, index, active)
 
 
-def find_shade(scene: mi.Scene, world: World, samples: int) -> Shade | None:
+@dataclass
+class Coarse:
+    """The means of a grid over blocks of voxels, as a grid in the same place.
+
+    Attributes:
+        lattice: voxel i holds the mean of the voxels 2^shift i to 2^shift (i + 1) - 1, along each axis; the last one repeats
+            the border of the grid.
+        held: numbers of the blocks of a :class:`Shade` (z, y, x) that hold anything; None where they were not asked for.
+    """
+
+    lattice: Lattice
+    held: mi.UInt32 | None
+
+
+def coarsen(lattice: Lattice, shift: int, lists: bool) -> Coarse:
+    """Take means over blocks of 2^shift voxels along each axis, and list the blocks that hold anything if ``lists``.
+
+    Cost: 8/7 look-ups a voxel, 8 a block.
+    """
+    c, edge, shape = lattice.channels, 1 << shift, list(lattice.res)
+    flat = dr.detach(lattice.values.array)
+    for axis in (2, 1, 0):
+        inner = int(np.prod(shape[axis + 1 :])) * c
+        flat = _mean_along(flat, shape[axis], inner, edge)
+        shape[axis] = -(-shape[axis] // edge)
+    values = mi.TensorXf(flat, (*shape, c))
+    stretch = np.diag([edge * m / n for m, n in zip(shape[::-1], lattice.res[::-1], strict=True)] + [1.0])
+    gaps = find_gaps(values) if lattice.gaps is not None else None
+    return Coarse(Lattice(values, lattice.to_world @ stretch, gaps), _held(values, lattice.res, shift) if lists else None)
+
+
+def _mean_along(flat: mi.Float, n: int, inner: int, edge: int) -> mi.Float:
+    """Means of ``edge`` neighbours along the middle axis of (outer, n, inner)."""
+    b = -(-n // edge)
+    i = dr.arange(mi.UInt32, dr.width(flat) // n * b)
+    row, first = (i // (inner * b)) * (n * inner) + i % inner, (i // inner) % b * edge
+    total = mi.Float(0)
+    for k in range(edge):
+        total += dr.gather(mi.Float, flat, row + dr.minimum(first + k, n - 1) * inner)
+    total *= 1 / edge
+    dr.eval(total)
+    return total
+
+
+def _held(means: mi.TensorXf, res: tuple[int, int, int], shift: int) -> mi.UInt32:
+    """Blocks one of whose nodes is not 0: they are those of two mean voxels along each axis, or fewer."""
+    c, sizes = means.shape[3], [(n >> shift) + 1 for n in res]
+    i, found = dr.arange(mi.UInt32, sizes[0] * sizes[1] * sizes[2]), mi.Bool(False)
+    block = (i // (sizes[1] * sizes[2]), i // sizes[2] % sizes[1], i % sizes[2])
+    for corner in range(8):
+        z, y, x = (
+            dr.clip(mi.Int32(b) - (corner >> k & 1), 0, n - 1) for k, (b, n) in enumerate(zip(block, means.shape, strict=False))
+        )
+        node = mi.UInt32((z * means.shape[1] + y) * means.shape[2] + x) * c
+        for channel in range(c):
+            found |= dr.gather(mi.Float, means.array, node + channel) > 0
+    return dr.compress(found)
+
+
+def find_shade(
+    scene: mi.Scene, world: World, rays: int, occupied: float | None, take: Callable[[Lattice, int, bool], Coarse]
+) -> Shade | None:
     """Look from the blocks of a grid to the lamps.
 
     Args:
         scene, world: surfaces, lamps and media.
-        samples: of the image; they decide how fine a lattice pays.
+        rays: shadow rays of the image, which decide how fine a lattice pays.
+        occupied: share of the grid's blocks that hold anything, where no light is wanted from the others; None: from all.
+        take: :func:`coarsen`, or what keeps its answers.
 
     Returns:
         The weights; None where no lamp has one position or direction, several bodies or grids lie along a ray, or the image is
         too small for it to pay.
 
-    Cost: one shadow ray a block and lamp.
+    Cost: one shadow ray through the coarse grid a block and lamp.
     """
     lights = world.lights
     grids = [p.lattice for b in world.bodies for p in b.view.parts if p.lattice is not None]
@@ -82,16 +148,23 @@ def find_shade(scene: mi.Scene, world: World, samples: int) -> Shade | None:
     if not world.is_single or len(grids) != 1 or not sharp or len(lights.drawn) > LAMPS:
         return None
     (lattice,), (body,) = grids, world.bodies
-    fits = [shift for shift in range(COARSEST + 1) if _count(lattice, shift) * len(sharp) <= SHARE * samples]
+    # Where a constant lies under the grid no block is empty.
+    lists = occupied is not None and len(body.view.parts) == 1
+    share = (occupied if lists else 1) * len(sharp)
+    fits = [shift for shift in range(COARSEST + 1) if _count(lattice, shift) * share <= SHARE * rays]
     if not fits:
         return None
     shift = fits[0]
     blocks = tuple((n >> shift) + 1 for n in lattice.res)
     n, k = blocks[0] * blocks[1] * blocks[2], len(lights.drawn)
+    coarse = take(lattice, shift, lists)
+    index = coarse.held if lists else dr.arange(mi.UInt32, n)
     weights = dr.full(mi.Float, 1, n * k)
-    for lamp in sharp:
-        seen = _look(scene, world, body, lattice, blocks, shift, lights.drawn[lamp])
-        dr.scatter(weights, seen, dr.arange(mi.UInt32, n) * k + lamp)
+    if dr.width(index):
+        far = _with_grid(world, coarse.lattice)
+        for lamp in sharp:
+            seen = _look(scene, far, lattice, blocks, shift, index, lights.drawn[lamp])
+            dr.scatter(weights, seen, index * k + lamp)
     dr.eval(weights)
     return Shade(weights, blocks, shift, k)
 
@@ -102,19 +175,29 @@ def _count(lattice: Lattice, shift: int) -> int:
     return z * y * x
 
 
+def _with_grid(world: World, lattice: Lattice) -> World:
+    """The media with another grid in the place of theirs."""
+    (body,) = world.bodies
+    parts = [p if p.lattice is None else replace(p, lattice=lattice) for p in body.view.parts]
+    other, bodies = copy.copy(world), [Body(replace(body.view, parts=parts), body.box)]
+    other.boxed, other.traced = (bodies, []) if body.box is not None else ([], bodies)
+    return other
+
+
 def _look(
-    scene: mi.Scene, world: World, body: Body, lattice: Lattice, blocks: tuple, shift: int, lamp: mi.Emitter
+    scene: mi.Scene, world: World, lattice: Lattice, blocks: tuple, shift: int, index: mi.UInt32, lamp: mi.Emitter
 ) -> mi.Float:
-    """Weights of all blocks for one lamp."""
-    z, y, x = blocks
-    index = dr.arange(mi.UInt32, z * y * x)
+    """Weights of blocks for one lamp."""
+    _, y, x = blocks
     at = (index % x, (index // x) % y, index // (x * y))
-    # Block b holds the cells from b 2^shift - 1 on; its middle, as a share of the box, may lie outside in the last one.
+    # Block b holds the cells from b 2^shift - 1 on, of which the outermost are half as wide; its middle, as a share of the box,
+    # may lie outside in the last one.
     half = 0.5 * (1 << shift) - 0.5
     u = [
-        dr.minimum((mi.Float(a) * (1 << shift) + half) / n, 1 - 0.25 / n) for a, n in zip(at, lattice.res[::-1], strict=True)
+        dr.clip((mi.Float(a) * (1 << shift) + half) / n, 0.25 / n, 1 - 0.25 / n)
+        for a, n in zip(at, lattice.res[::-1], strict=True)
     ]
-    tau = _tau_to(scene, world, body, lattice.place(mi.Vector3f(*u)), lamp)
+    tau = _tau_to(scene, world, world.bodies[0], lattice.place(mi.Vector3f(*u)), lamp)
     return dr.exp(-sum(tau) / len(tau)) + FLOOR
 
 
