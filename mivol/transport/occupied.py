@@ -23,13 +23,10 @@ import numpy as np
 
 from mivol.errors import MivolError
 from mivol.space import check_affine, lattice_from_world
-from mivol.transport.lattice import Segment
+from mivol.transport.lattice import REACH, Segment, distances
 from mivol.transport.optical_depth import GAUSS
 
-__all__ = ["REACH", "Cells", "Visit", "march", "reversed_from"]
-
-REACH = 15
-"""Largest distance that a cell knows [cells]: in an empty box of 128^3 a ray takes 10 steps."""
+__all__ = ["Cells", "Visit", "march", "reversed_from"]
 
 
 @dataclass
@@ -85,7 +82,7 @@ class Cells:
         number = dr.full(mi.Int32, -REACH, total)
         if count:
             dr.scatter(number, dr.arange(mi.Int32, count), listed)
-            number = _with_distances(number, res)
+            number = dr.select(number >= 0, number, -mi.Int32(distances(number >= 0, tuple(n + 1 for n in res))))
         # Arrays of no length cannot be read, even by no lane: where nothing is listed, a cell that no number leads to.
         named = _corner_rows(listed if count else mi.UInt32(0), rows, res)
         corners = dr.zeros(mi.UInt32, 8 * max(count, 1))
@@ -132,34 +129,6 @@ def _corner_rows(cell: mi.UInt32, rows: mi.UInt32, res: tuple[int, int, int]) ->
     z, y, x = res
     i, j, k = (_between(a, n) for a, n in zip(_apart(cell, res), (x, y, z), strict=True))
     return [dr.gather(mi.UInt32, rows, mi.UInt32((c * y + b) * x + a)) for c in k for b in j for a in i]
-
-
-def _with_distances(number: mi.Int32, res: tuple[int, int, int]) -> mi.Int32:
-    """Write minus the distance to the nearest occupied cell where there is none, an axis at a time."""
-    z, y, x = (n + 1 for n in res)
-    far = dr.select(number >= 0, mi.UInt8(0), mi.UInt8(REACH))
-    for stride, n in ((1, x), (x, y), (x * y, z)):
-        dr.eval(far)
-        far = _nearest(far, stride, n)
-    return dr.select(number >= 0, number, -mi.Int32(far))
-
-
-@dr.syntax
-def _nearest(far: mi.UInt8, stride: int, n: int) -> mi.UInt8:
-    """The least, over the neighbours along an axis, of the larger of their distance along it and their own ``far``."""
-    here = dr.arange(mi.Int32, dr.width(far))
-    place = here // stride % n
-    best = mi.UInt8(far)
-    k = mi.Int32(1)
-    while k < mi.Int32(best):
-        low = dr.gather(mi.UInt8, far, mi.UInt32(here - k * stride), place >= k)
-        high = dr.gather(mi.UInt8, far, mi.UInt32(here + k * stride), place + k < n)
-        low = dr.select(place >= k, low, mi.UInt8(REACH))
-        high = dr.select(place + k < n, high, mi.UInt8(REACH))
-        nearer = dr.minimum(low, high)
-        best = dr.minimum(best, dr.maximum(nearer, mi.UInt8(k)))
-        k += 1
-    return best
 
 
 @dataclass

@@ -12,7 +12,7 @@ from scipy.ndimage import distance_transform_cdt
 
 from mivol.fields.activation import ACTIVATIONS
 from mivol.fields.spherical import SphericalGrid
-from mivol.transport.occupied import REACH
+from mivol.transport.lattice import REACH
 from mivol.transport.radiance import bake, cells_of, exact, fold, look, look_back, model_of
 
 

@@ -50,8 +50,8 @@ from mivol.optim.radiance_plan import PRESETS, Plan, Stage
 from mivol.optim.radiance_views import TILE, Views
 from mivol.photos import Camera, Photo, pixel_centres, rays
 from mivol.photos.camera import intrinsics
-from mivol.transport.lattice import clip
-from mivol.transport.occupied import REACH, march
+from mivol.transport.lattice import REACH, clip
+from mivol.transport.occupied import march
 from mivol.transport.radiance import bake, cells_of, exact, look, look_back, model_of
 from scenes import box_of, tensor, transform
 
