@@ -37,9 +37,11 @@ __all__ = [
     "block_gaps",
     "box_nodes",
     "clip",
+    "count_blocks",
     "distances",
     "find_gaps",
     "locate",
+    "over_blocks",
     "read_nodes",
     "slab",
     "walk",
@@ -231,18 +233,33 @@ def block_bounds(values: mi.TensorXf) -> mi.Float:
     Returns:
         Flat array over (blocks in z, y, x), ceil((N + 1) / BLOCK) of them along an axis. A block with bound 0 is empty.
 
-    Cost: 9/8 look-ups a voxel.
+    Cost: 5/4 look-ups a voxel along x, fewer along the others.
     """
-    z, y, x, c = values.shape
-    flat = _channel_max(dr.abs(dr.detach(values.array)), c)
-    for outer, n, inner in ((z * y, x, 1), (z, y, _blocks(x)), (1, z, _blocks(y) * _blocks(x))):
-        flat = _block_max(flat, outer, n, inner)
+    flat = _channel_max(dr.abs(dr.detach(values.array)), values.shape[3])
+    return over_blocks(flat, values.shape[:3], SHIFT, dr.maximum, 0)
+
+
+def count_blocks(n: int, shift: int = SHIFT) -> int:
+    """Number of blocks of 2^shift cells along an axis of n voxels (n + 1 cells)."""
+    return -(-(n + 1) >> shift)
+
+
+def over_blocks(
+    flat: mi.Float, res: tuple[int, int, int], shift: int, reduce: Callable[[mi.Float, mi.Float], mi.Float], nothing: float
+) -> mi.Float:
+    """Reduce the nodes that the cells of each block of 2^shift along each axis touch, axis by axis.
+
+    Args:
+        flat: one number a voxel (Z, Y, X).
+        res: (Z, Y, X).
+        shift: log2 of the edge of a block [cells].
+        reduce, nothing: a function of two, associative, and what leaves the other one as it is.
+    """
+    z, y, x = res
+    b_y, b_x = count_blocks(y, shift), count_blocks(x, shift)
+    for outer, n, inner in ((z * y, x, 1), (z, y, b_x), (1, z, b_y * b_x)):
+        flat = _over_axis(flat, outer, n, inner, shift, reduce, nothing)
     return flat
-
-
-def _blocks(n: int) -> int:
-    """Number of blocks along an axis of n voxels (n + 1 cells)."""
-    return -(-(n + 1) // BLOCK)
 
 
 def _channel_max(flat: mi.Float, channels: int) -> mi.Float:
@@ -254,16 +271,25 @@ def _channel_max(flat: mi.Float, channels: int) -> mi.Float:
     return best
 
 
-def _block_max(flat: mi.Float, outer: int, n: int, inner: int) -> mi.Float:
-    """Maximum over the nodes of each block along the middle axis of (outer, n, inner)."""
-    b = _blocks(n)
+def _over_axis(
+    flat: mi.Float,
+    outer: int,
+    n: int,
+    inner: int,
+    shift: int,
+    reduce: Callable[[mi.Float, mi.Float], mi.Float],
+    nothing: float,
+) -> mi.Float:
+    """Reduce the nodes of each block along the middle axis of (outer, n, inner)."""
+    b, edge = count_blocks(n, shift), 1 << shift
     i = dr.arange(mi.UInt32, outer * b * inner)
-    first = mi.Int32((i // inner) % b) * BLOCK - 1  # block b holds the cells 4b - 1 .. 4b + 2, so the nodes 4b - 1 .. 4b + 3
+    # Block b of edge e holds the cells e b - 1 .. e (b + 1) - 2, so the nodes e b - 1 .. e (b + 1) - 1.
+    first = mi.Int32((i // inner) % b) * edge - 1
     row = (i // (inner * b)) * (n * inner) + i % inner
-    best = mi.Float(0)
-    for k in range(BLOCK + 1):
+    best = mi.Float(nothing)
+    for k in range(edge + 1):
         node = mi.UInt32(dr.clip(first + k, 0, n - 1))
-        best = dr.maximum(best, dr.gather(mi.Float, flat, row + node * inner))
+        best = reduce(best, dr.gather(mi.Float, flat, row + node * inner))
     dr.eval(best)
     return best
 
@@ -286,7 +312,7 @@ def block_gaps(bounds: mi.Float, res: tuple[int, int, int]) -> mi.UInt8:
 
     Cost: 6 ``REACH`` look-ups a block at most.
     """
-    return distances(bounds > 0, tuple(_blocks(n) for n in res))
+    return distances(bounds > 0, tuple(count_blocks(n) for n in res))
 
 
 def distances(occupied: mi.Bool, counts: tuple[int, int, int]) -> mi.UInt8:
@@ -354,7 +380,7 @@ def walk(
     gaps, length = lattice.gaps, segment.length
     skip = gaps is not None
     res = lattice.res
-    blocks_y, blocks_x = _blocks(res[1]), _blocks(res[2])
+    blocks_y, blocks_x = count_blocks(res[1]), count_blocks(res[2])
 
     # -- State: the cell is seen along the ray, corner bits 0, 1, 2 are near (0) or far (1) in x, y, z -------------------
     d = segment.d

@@ -22,7 +22,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mivol.transport.dice import roll
-from mivol.transport.lattice import Cell, Lattice, Segment, walk
+from mivol.transport.lattice import Cell, Lattice, Segment, count_blocks, over_blocks, walk
 
 __all__ = ["Blocks", "find_blocks", "track"]
 
@@ -69,47 +69,21 @@ def find_blocks(values: mi.TensorXf) -> Blocks:
     """
     z, y, x, c = values.shape
     flat = dr.detach(values.array)
-    res = tuple(_count(n) for n in (z, y, x))
+    res = tuple(count_blocks(n, SHIFT) for n in (z, y, x))
     rows, ranges = [], []
     for channel in range(c):
         own = dr.gather(mi.Float, flat, dr.arange(mi.UInt32, z * y * x) * c + channel) if c > 1 else flat
-        low, high = _extremes(own, (z, y, x))
+        low = over_blocks(own, (z, y, x), SHIFT, dr.minimum, dr.inf)
+        high = over_blocks(own, (z, y, x), SHIFT, dr.maximum, -dr.inf)
         rows.append(low)
         # Rounding of the differences below must not take a factor out of [0, 1].
         ranges.append((high - low) * (1 + 1e-6))
-    above = ranges[0]
-    for r in ranges[1:]:
-        above = dr.maximum(above, r)
     n = res[0] * res[1] * res[2]
     table = dr.zeros(mi.Float, n * (c + 1))
-    for k, row in enumerate([*rows, above]):
+    for k, row in enumerate([*rows, _most(ranges)]):
         dr.scatter(table, row, dr.arange(mi.UInt32, n) * (c + 1) + k)
     dr.eval(table)
     return Blocks(table, res, c)
-
-
-def _count(n: int) -> int:
-    """Number of blocks along an axis of n voxels (n + 1 cells)."""
-    return -(-(n + 1) >> SHIFT)
-
-
-def _extremes(flat: mi.Float, res: tuple[int, int, int]) -> tuple[mi.Float, mi.Float]:
-    """Least and largest node of each block, axis by axis."""
-    z, y, x = res
-    low = high = flat
-    for outer, n, inner in ((z * y, x, 1), (z, y, _count(x)), (1, z, _count(y) * _count(x))):
-        b = _count(n)
-        i = dr.arange(mi.UInt32, outer * b * inner)
-        first = mi.Int32((i // inner) % b) * (1 << SHIFT) - 1
-        row = (i // (inner * b)) * (n * inner) + i % inner
-        least, most = mi.Float(dr.inf), mi.Float(-dr.inf)
-        for k in range((1 << SHIFT) + 1):
-            node = row + mi.UInt32(dr.clip(first + k, 0, n - 1)) * inner
-            least = dr.minimum(least, dr.gather(mi.Float, low, node))
-            most = dr.maximum(most, dr.gather(mi.Float, high, node))
-        dr.eval(least, most)
-        low, high = least, most
-    return low, high
 
 
 @dataclass
