@@ -7,7 +7,9 @@ been replaced, and never while a function is being recorded by ``dr.freeze``.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -206,12 +208,21 @@ def _camera_inside(scene: mi.Scene, sensor: mi.Sensor, survey: Survey) -> bool:
 
 @dataclass
 class _Read:
-    """What was read of an array, and the array, so that its number cannot be given to another one."""
+    """What was read of an array."""
 
-    array: mi.Float
     bounds: mi.Float | None
     occupied: float
     maximum: float
+
+
+def _once(survey: Survey, kind: tuple, array: mi.Float, make: Callable[[], Any]) -> Any:
+    """Make something once for each state of an array, which is kept so that its number cannot be given to another one."""
+    key = (*kind, array.index)
+    if key not in survey.values:
+        made = make()
+        survey.values = dict(list(survey.values.items())[-15:])
+        survey.values[key] = (array, made)
+    return survey.values[key][1]
 
 
 def read_part(part: Part, survey: Survey, name: str) -> _Read:
@@ -220,10 +231,10 @@ def read_part(part: Part, survey: Survey, name: str) -> _Read:
     Raises:
         MivolError: NaN, infinite or negative values; the first bad voxel is named.
     """
-    values, activation = part.lattice.values, part.activation
-    array = dr.detach(values.array)
-    key = array.index
-    if key not in survey.values:
+    array = dr.detach(part.lattice.values.array)
+
+    def make() -> _Read:
+        values, activation = part.lattice.values, part.activation
         if activation is not None:
             # Nothing is below an empty value; an extinction rises with what is stored.
             empty = activation.empty_below
@@ -231,43 +242,30 @@ def read_part(part: Part, survey: Survey, name: str) -> _Read:
         bounds = block_bounds(values)
         if activation is None and not (dr.all(dr.isfinite(bounds)) and dr.all(array >= 0)):
             check_volume(np.array(dr.detach(values)), name=name)
-        survey.values = dict(list(survey.values.items())[-15:])
         host = np.array(bounds)
-        survey.values[key] = _Read(array, bounds, float((host > 0).mean()), float(host.max(initial=0.0)))
-    return survey.values[key]
+        return _Read(bounds, float((host > 0).mean()), float(host.max(initial=0.0)))
+
+    return _once(survey, ("part",), array, make)
 
 
 def read_gaps(part: Part, survey: Survey, name: str) -> mi.UInt8:
     """Measure the gaps between the blocks of a part that hold anything, once for each state of its array."""
-    array = dr.detach(part.lattice.values.array)
-    key = ("gaps", array.index)
-    if key not in survey.values:
-        gaps = block_gaps(read_part(part, survey, name).bounds, part.lattice.res)
-        survey.values = dict(list(survey.values.items())[-15:])
-        survey.values[key] = (array, gaps)
-    return survey.values[key][1]
+    array, res = dr.detach(part.lattice.values.array), part.lattice.res
+    return _once(survey, ("gaps",), array, lambda: block_gaps(read_part(part, survey, name).bounds, res))
 
 
 def read_blocks(part: Part, survey: Survey) -> Blocks:
     """Read what the blocks of a grid hold, once for each state of its array."""
-    array = dr.detach(part.lattice.values.array)
-    key = ("blocks", array.index)
-    if key not in survey.values:
-        survey.values = dict(list(survey.values.items())[-15:])
-        survey.values[key] = (array, find_blocks(part.lattice.values))
-    return survey.values[key][1]
+    values = part.lattice.values
+    return _once(survey, ("blocks",), dr.detach(values.array), lambda: find_blocks(values))
 
 
 def read_coarse(survey: Survey, lattice: Lattice, shift: int, lists: bool) -> Coarse:
     """Make a grid coarser once for each state of its array and place; anew where a function is being recorded."""
-    array = dr.detach(lattice.values.array)
-    key = ("coarse", array.index, shift, lists, lattice.gaps is None, lattice.to_world.tobytes())
     if dr.flag(dr.JitFlag.FreezingScope):
         return coarsen(lattice, shift, lists)
-    if key not in survey.values:
-        survey.values = dict(list(survey.values.items())[-15:])
-        survey.values[key] = (array, coarsen(lattice, shift, lists))
-    return survey.values[key][1]
+    kind = ("coarse", shift, lists, lattice.gaps is None, lattice.to_world.tobytes())
+    return _once(survey, kind, dr.detach(lattice.values.array), lambda: coarsen(lattice, shift, lists))
 
 
 def is_scattering(view: MediumView, survey: Survey, name: str) -> bool:
@@ -282,8 +280,8 @@ def is_scattering(view: MediumView, survey: Survey, name: str) -> bool:
 
 def _is_positive(values: mi.TensorXf, survey: Survey, name: str, is_albedo: bool) -> bool:
     flat = dr.detach(dr.ravel(values))
-    key = ("albedo", flat.index)
-    if key not in survey.values:
+
+    def make() -> bool:
         low, high = float(dr.min(flat)[0]), float(dr.max(flat)[0])
         # NaN fails every comparison.
         if is_albedo and not (low >= 0 and high <= 1 and bool(dr.all(dr.isfinite(flat)))):
@@ -291,9 +289,9 @@ def _is_positive(values: mi.TensorXf, survey: Survey, name: str, is_albedo: bool
                 f"the albedo of the medium in {name} lies in [{low:.4g}, {high:.4g}] (or is NaN); the share of light that is "
                 "scattered lies in [0, 1]: clip it after each step."
             )
-        survey.values = dict(list(survey.values.items())[-15:])
-        survey.values[key] = (flat, high > 0)
-    return survey.values[key][1] or dr.grad_enabled(values)
+        return high > 0
+
+    return _once(survey, ("albedo",), flat, make) or dr.grad_enabled(values)
 
 
 def check_light(view: MediumView, survey: Survey, name: str) -> None:
@@ -304,17 +302,16 @@ def check_light(view: MediumView, survey: Survey, name: str) -> None:
     """
     for values in view.lights:
         flat = dr.detach(dr.ravel(values))
-        key = ("light", flat.index)
-        if key in survey.values:
-            continue
-        if not bool(dr.all(dr.isfinite(flat) & (flat >= 0))):
-            low, high = float(dr.min(flat)[0]), float(dr.max(flat)[0])
-            raise MivolError(
-                f"the emission of the medium in {name} lies in [{low:.4g}, {high:.4g}] (or is NaN); light is finite and at "
-                "least 0: clip it after each step."
-            )
-        survey.values = dict(list(survey.values.items())[-15:])
-        survey.values[key] = (flat, True)
+        _once(survey, ("light",), flat, lambda flat=flat: _check_emission(flat, name))
+
+
+def _check_emission(flat: mi.Float, name: str) -> None:
+    if not bool(dr.all(dr.isfinite(flat) & (flat >= 0))):
+        low, high = float(dr.min(flat)[0]), float(dr.max(flat)[0])
+        raise MivolError(
+            f"the emission of the medium in {name} lies in [{low:.4g}, {high:.4g}] (or is NaN); light is finite and at "
+            "least 0: clip it after each step."
+        )
 
 
 def _facts(boundary: Boundary, view: MediumView, survey: Survey, recording: bool) -> MediumFacts:
