@@ -72,6 +72,7 @@ def explain_flags(sub: argparse.ArgumentParser) -> None:
     """A scene, or a data set with a picture of its cameras."""
     scene_flags(sub, "Mitsuba XML, or posed photographs: a folder or its transforms.json")
     sub.add_argument("-o", "--output", type=Path, help="picture of the cameras (.png, .svg); default: NAME-cameras.png")
+    sub.add_argument("--max-depth", type=int, help="longest path asked about; default: that of the scene's integrator")
 
 
 def render_flags(sub: argparse.ArgumentParser) -> None:
@@ -150,7 +151,7 @@ def explain_scene(arguments: argparse.Namespace) -> None:
     from mivol.cli.rendering import load
     from mivol.scene import plan
 
-    print(plan.explain(load(arguments).scene))
+    print(plan.explain(load(arguments).scene, arguments.max_depth))
 
 
 def explain_photos(arguments: argparse.Namespace) -> None:

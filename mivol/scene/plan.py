@@ -7,6 +7,7 @@ sentence, before a kernel runs.
 from __future__ import annotations
 
 import difflib
+import re
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -31,6 +32,9 @@ __all__ = ["Choice", "Plan", "build_world", "check_aovs", "explain", "make_plan"
 SKIP_BELOW = 0.45
 """Share of occupied blocks below which skipping pays (it costs 8 reads a cell in place of 4; measured, as fast as
 without: smoke of 48 % 0.9 times, CT of 43 % 1.05 to 1.1 times, smoke of 256^3, 43 %, 1.3 to 1.4 times)."""
+
+UNLIMITED = 0xFFFFFFFF
+"""The depth that Mitsuba's integrators print for -1."""
 
 PASS_RAYS = {"llvm": 1 << 22, "cuda": 1 << 25, "metal": 1 << 24}
 """Most rays of one pass, through media without grids or with small ones."""
@@ -199,7 +203,9 @@ def _transport(needs: Needs, settings: Settings) -> Choice:
     if not needs.media:
         return Choice("media", "none", "no shape bounds a medium")
     if _is_lit(needs, settings):
-        what = "exact optical depth; one scattering at a distance drawn in proportion to the light it takes, exact shadow rays"
+        where = "by quadrature" if settings.deterministic else "at a distance drawn in proportion to the light it takes"
+        shadows = "a light grid for shadows" if settings.shadows == "grid" else "exact shadow rays"
+        what = f"exact optical depth; one scattering {where}, {shadows}"
         return Choice("media", what, "an albedo is above 0 and max_depth is 2")
     why = "albedo 0" if not any(m.is_scattering for m in needs.media) else "max_depth 1 sees no scattered light"
     if any(m.unread for m in needs.media):
@@ -224,6 +230,9 @@ def _lighting(needs: Needs, settings: Settings) -> list[Choice]:
     met = [lamp for lamp in needs.lamps if lamp != "sharp"]
     if not needs.lamps:
         return [Choice("directions", "none", "the scene has no emitter")]
+    if settings.deterministic:
+        where = "at two points of each piece of a cell, from every lamp"
+        return [Choice("where to scatter", where, "deterministic was asked for")]
     if not drawn:
         choices = [Choice("directions", "one, of the phase function", "light is the same from everywhere")]
     elif not met:
@@ -334,12 +343,23 @@ def build_world(scene: mi.Scene, needs: Needs, plan: Plan, settings: Settings, s
     )
 
 
-def explain(scene: mi.Scene | str | Path, max_depth: int = 6, sensor: int = 0) -> str:
+def settings_of(scene: mi.Scene) -> Settings:
+    """What the scene's own integrator is set to: all of it where it is mivol, the depth of others, which they print."""
+    integrator = scene.integrator()
+    session = getattr(integrator, "session", None)
+    if session is not None:
+        return session.settings
+    told = re.search(r"max_depth ?= ?(-?\d+)", str(integrator))
+    depth = Settings().max_depth if told is None else int(told.group(1))
+    return Settings(max_depth=-1 if depth == UNLIMITED else depth)
+
+
+def explain(scene: mi.Scene | str | Path, max_depth: int | None = None, sensor: int = 0) -> str:
     """Say what a scene needs and what will be done about it, before anything is rendered.
 
     Args:
         scene: a loaded scene, or the path of its XML.
-        max_depth: of the integrator asked about.
+        max_depth: of the integrator asked about; None: that of the scene's own integrator, with its other settings.
         sensor: index of the sensor asked about.
 
     Raises:
@@ -347,7 +367,8 @@ def explain(scene: mi.Scene | str | Path, max_depth: int = 6, sensor: int = 0) -
     """
     loaded = scene if isinstance(scene, mi.Scene) else mi.load_file(str(scene))
     needs = find_needs(loaded, find_sensor(loaded, sensor), survey_scene(loaded))
-    plan = make_plan(needs, Settings(max_depth=max_depth))
+    settings = settings_of(loaded) if max_depth is None else Settings(max_depth=max_depth)
+    plan = make_plan(needs, settings)
     lines = ["facts"]
     for m in needs.media:
         grids = ", ".join("x".join(map(str, r)) for r in m.resolutions) or "homogeneous"
@@ -365,15 +386,14 @@ def explain(scene: mi.Scene | str | Path, max_depth: int = 6, sensor: int = 0) -
     ]
     width = max(len(c.about) for c in plan.choices)
     lines += [f"  {c.about:<{width}}  {c.choice}\n  {'':<{width}}    because {c.reason}" for c in plan.choices]
-    if max_depth == 2:
+    if settings.max_depth == 2:
         lines += [f"  model     {text}" for text in _depth_two(needs)]
-        lines += [f"  shadows   {text}" for text in _light_grid(loaded, needs, plan)]
+        lines += [f"  shadows   {text}" for text in _light_grid(loaded, needs, plan, settings)]
     return "\n".join(lines)
 
 
-def _light_grid(scene: mi.Scene, needs: Needs, plan: Plan) -> list[str]:
-    """What a light grid in place of shadow rays would cost, and how wrong it is."""
-    settings = Settings(max_depth=2)
+def _light_grid(scene: mi.Scene, needs: Needs, plan: Plan, settings: Settings) -> list[str]:
+    """What a light grid in place of shadow rays costs, and how wrong it is."""
     grids = [res for m in needs.media for res in m.resolutions]
     if not _is_lit(needs, settings) or set(needs.lamps) != {"sharp"} or len(needs.media) != 1 or len(grids) != 1:
         return []
@@ -384,8 +404,9 @@ def _light_grid(scene: mi.Scene, needs: Needs, plan: Plan) -> list[str]:
     nodes = grid.nodes[0] * grid.nodes[1] * grid.nodes[2]
     rays = needs.film_samples * sum(grids[0])
     pays = "pays" if nodes < rays else "does not pay"
+    offer = "asked for" if settings.shadows == "grid" else "exact; with deterministic"
     return [
-        f"exact; with deterministic, a light grid of {nodes} nodes {pays} against about {rays} shadow rays, at a bias of "
+        f"{offer}, a light grid of {nodes} nodes {pays} against about {rays} shadow rays, at a bias of "
         f"{bias:+.2g} of a lamp's light (rms {rms:.2g}, measured against exact shadows)"
     ]
 

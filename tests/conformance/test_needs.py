@@ -117,6 +117,33 @@ def test_explain_gives_a_reason_for_each_choice():
     assert text.count("because") == len(choices) >= 5
 
 
+@pytest.mark.parametrize(
+    ("integrator", "depth"),
+    [
+        ({"type": "mivol", "max_depth": 2, "deterministic": True, "shadows": "grid"}, 2),
+        ({"type": "mivol", "max_depth": -1}, -1),
+        ({"type": "volpath", "max_depth": 2}, 2),
+        ({"type": "prbvolpath", "max_depth": -1}, -1),
+        ({"type": "moment", "inner": {"type": "volpath", "max_depth": 2}}, 2),
+        ({"type": "aov", "aovs": "d:depth", "inner": {"type": "mivol", "max_depth": 2}}, 2),
+        ({"type": "direct"}, 6),
+    ],
+    ids=lambda x: x["type"] if isinstance(x, dict) else str(x),
+)
+def test_explain_asks_the_scene_how_deep_its_paths_are(integrator, depth):
+    """What scatters is told of at depth 2 and refused beyond, as it would be rendered; an argument says otherwise."""
+    bulb = {"type": "point", "position": [3, 3, 3]}
+    scene = scene_of(albedo=0.5, sigma_t=grid_volume("mivol_voxels", values(1), PLACE), sky=bulb, integrator=integrator)
+    if depth == 2:
+        text = explain(scene)
+        assert ("quadrature, a light grid" in text) == ("deterministic" in integrator)
+        assert "one scattering leaves out" in text
+    else:
+        with refused(f"max_depth is {depth}"):
+            explain(scene)
+    assert "one scattering leaves out" not in explain(scene, max_depth=1)
+
+
 def test_scene_without_a_sensor():
     with refused("no sensor 0, only 0"):
         explain(mi.load_dict({"type": "scene", "sky": sky()}))
