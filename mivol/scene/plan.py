@@ -25,7 +25,7 @@ from mivol.transport.field import share_cells
 from mivol.transport.light_grid import find_light_grid, measure_bias
 from mivol.transport.optical_depth import PACKED_LIMIT, gradient_bytes
 from mivol.transport.path import Settings
-from mivol.transport.world import Body, World
+from mivol.transport.world import Body, World, share_flight
 
 __all__ = ["Choice", "Plan", "build_world", "check_aovs", "explain", "make_plan"]
 
@@ -179,12 +179,24 @@ def _refuse_quadrature(needs: Needs, settings: Settings) -> None:
             f"deterministic is set and the scene has a {other[0]}; quadrature is for lamps of one position or direction "
             "(point, spot, directional): leave deterministic out."
         )
-    grids = sum(len(m.resolutions) for m in needs.media)
-    if len(needs.media) > 1 or grids > 1 or (settings.shadows == "grid" and grids == 0):
+    if len(needs.media) > 1 or not _share_cells(needs):
+        grids = sum(len(m.resolutions) for m in needs.media)
         raise MivolError(
             f"deterministic is set and the scene has {len(needs.media)} media with {grids} grids of extinction; quadrature is "
-            "for one medium with one grid (or, with exact shadows, none): leave deterministic out."
+            "for one medium whose grids share their cells: leave deterministic out."
         )
+    constant = next((part.name for part in needs.views[0].parts if part.lattice is None), None)
+    if settings.shadows == "grid" and constant is not None:
+        raise MivolError(
+            f"shadows is 'grid' and {constant} of the medium in {needs.media[0].name} is a constant, which may fill more than "
+            "the cells that shadows are looked up in: set shadows to exact."
+        )
+
+
+def _share_cells(needs: Needs) -> bool:
+    """Whether one walk passes all of the first medium."""
+    parts = needs.views[0].parts
+    return len(share_flight(parts)) == len(parts)
 
 
 def _pass_rays(needs: Needs) -> int:
@@ -394,15 +406,16 @@ def explain(scene: mi.Scene | str | Path, max_depth: int | None = None, sensor: 
 
 def _light_grid(scene: mi.Scene, needs: Needs, plan: Plan, settings: Settings) -> list[str]:
     """What a light grid in place of shadow rays costs, and how wrong it is."""
-    grids = [res for m in needs.media for res in m.resolutions]
-    if not _is_lit(needs, settings) or set(needs.lamps) != {"sharp"} or len(needs.media) != 1 or len(grids) != 1:
+    if not _is_lit(needs, settings) or set(needs.lamps) != {"sharp"} or len(needs.media) != 1:
+        return []
+    if not _share_cells(needs) or any(part.lattice is None for part in needs.views[0].parts):
         return []
     with dr.suspend_grad():
         world = build_world(scene, needs, plan, settings, survey_scene(scene))
         grid = find_light_grid(scene, world)
         bias, rms = measure_bias(scene, world, grid)
     nodes = grid.nodes[0] * grid.nodes[1] * grid.nodes[2]
-    rays = needs.film_samples * sum(grids[0])
+    rays = needs.film_samples * sum(needs.media[0].resolutions[0])
     pays = "pays" if nodes < rays else "does not pay"
     offer = "asked for" if settings.shadows == "grid" else "exact; with deterministic"
     return [

@@ -8,7 +8,7 @@ two-stage Gauss method (order 4). The factor kappa makes the weights add up to 1
 any optical depth. A cell is cut into pieces of an optical depth of at most ``PIECE``, and of an angle of at most ``TURN`` as
 seen from a lamp near by, evenly in that angle.
 
-Conventions. One body, with one grid or none. Shadows are exact walks, or looked up where the world has a light grid.
+Conventions. One body, whose grids share their cells. Shadows are exact walks, or looked up where the world has a light grid.
 References: Hairer & Wanner 1996, Table 5.1 (the two-stage Gauss method).
 """
 
@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -111,11 +112,15 @@ def _integrate_body(
     def source(t: mi.Float, active: mi.Bool) -> mi.Spectrum:
         return _source(scene, world, body, ray, lamp, number, t, active)
 
+    def add_constant(state: _Sum, a: mi.Float, b: mi.Float) -> _Sum:
+        dt, sigma = dr.select(on, dr.maximum(b - a, 0), 0), world.rows(field.constant)
+        return _pieces(state, a, dt, lambda x: sigma, source, focus, mi.Float(STRETCH), on & (dt > 0))
+
+    t0, t1 = mi.Float(t0), mi.Float(t1)
     if grid is None:
-        start, dt = mi.Float(t0), dr.select(on, mi.Float(t1) - mi.Float(t0), 0)
-        sigma = world.rows(field.constant)
-        return _pieces(state, start, dt, lambda x: sigma, source, focus, mi.Float(STRETCH), on & (dt > 0))
+        return add_constant(state, t0, t1)
     segment = clip(grid, ray.o, ray.d, t0, t1)
+    hit = segment.length > 0
 
     def visit(state: _Sum, cell: Cell, full: mi.Bool) -> _Sum:
         def sigma(x: mi.Float) -> list[mi.Float]:
@@ -124,7 +129,12 @@ def _integrate_body(
         dt = dr.select(full, cell.dt, 0)
         return _pieces(state, segment.t0 + cell.s, dt, sigma, source, focus, mi.Float(1), full & (dt > 0))
 
-    return walk(grid, segment, visit, state, field.reads, on)
+    if not field.has_constants:
+        return walk(grid, segment, visit, state, field.reads, on)
+    state = add_constant(state, t0, dr.select(hit, segment.t0, t1))
+    # Where the grid is empty the constants are not.
+    state = walk(replace(grid, gaps=None), segment, visit, state, field.reads, on)
+    return add_constant(state, dr.select(hit, segment.t0 + segment.length, t1), t1)
 
 
 def _pieces(
@@ -222,7 +232,17 @@ def _source(
         seen = dr.select(clear, seen, 0)
     else:
         seen = world.light_grid.transmittance(mei.p, number, on)
-    return dr.select(on & (direct.pdf > 0), albedo(body, mei, on) * f * weight * seen, 0)
+    return dr.select(on & (direct.pdf > 0), _share(world, body, ray, mei, on) * f * weight * seen, 0)
+
+
+def _share(world: World, body: Body, ray: mi.Ray3f, mei: mi.MediumInteraction3f, on: mi.Bool) -> mi.Spectrum:
+    """The albedo, or sigma_s over the extinction, which the weights of a piece are multiples of; 0 where that is 0."""
+    if body.view.share is not None:
+        return albedo(body, mei, on)
+    scattered, whole = (
+        spectrum(body.extinction_at(ray, mei.t, world.channels, on, name)) for name in ("sigma_s", "sigma_")
+    )
+    return dr.select(whole > 0, scattered / dr.select(whole > 0, whole, 1), 0)
 
 
 def _largest(rows: list[mi.Float]) -> mi.Float:

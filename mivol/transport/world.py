@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from mivol.transport.direct import Lights
     from mivol.transport.light_grid import LightGrid, Shade
 
-__all__ = ["Body", "World"]
+__all__ = ["Body", "World", "share_flight"]
 
 
 class Body:
@@ -51,7 +51,7 @@ class Body:
         self.view, self.box = view, box
         self.trims = box is not None and (view.glow is not None or not all(_fits(part, box) for part in view.parts))
         self.rows = box.rows() if box is not None else None
-        self.flight = _share_flight(view.parts)
+        self.flight = share_flight(view.parts)
         self.gradients: list[Gradient | mi.Float] = []
         self.tangents: list[mi.Float] = []
 
@@ -411,7 +411,7 @@ def as_rows(values: list[mi.Float], channels: int) -> list[mi.Float]:
     return [values[c % len(values)] for c in range(channels)]
 
 
-def _share_flight(parts: list[Part]) -> list[Part]:
+def share_flight(parts: list[Part]) -> list[Part]:
     """The constants, and the grids that share the cells of the one that scatters."""
     grids = [p for p in parts if p.lattice is not None]
     lead = next((p for p in grids if p.name == "sigma_s"), grids[0] if grids else None)

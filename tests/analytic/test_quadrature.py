@@ -12,13 +12,13 @@ import mitsuba as mi
 import numpy as np
 import oracle_scattering as twins
 import pytest
-from scattering_scenes import aimed, close_up, fog, mivol, pencils, point, rough_grid, smoke, spot, sun
+from scattering_scenes import PLACE, aimed, close_up, fog, mivol, pencils, point, rough_grid, smoke, spot, sun
 
 from mivol.scene.needs import find_needs, survey_scene
 from mivol.scene.plan import build_world, explain, make_plan
 from mivol.transport.light_grid import find_light_grid, measure_bias
 from mivol.transport.path import Settings
-from scenes import centred, refused, sky
+from scenes import as_float32, box_of, centred, grid_volume, refused, sky
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
 
@@ -55,6 +55,25 @@ def test_homogeneous(lamps, sigma_t):
     # Sixty optical depths across: the twin's own Gauss rule needs more points than a cell would.
     found, truth = beside({"fog": box}, [m], LAMPS[lamps](), order=96)
     # 64 to 256 pieces; the face by which shadows leave changes once or twice along a ray.
+    assert np.abs(found - truth).max() <= 4e-3 * truth.max()
+
+
+SCATTERERS = {"numbers": (0.4, 0.9), "grids": ("grid", "grid"), "haze": (0.4, "grid"), "soot": ("grid", 0.5)}
+
+
+@pytest.mark.parametrize("name", SCATTERERS)
+def test_absorption_beside_scattering(name):
+    """What turns is sigma_s; a constant fills its box around the grid, too."""
+    kinds = dict(zip(("sigma_a", "sigma_s"), SCATTERERS[name], strict=True))
+    grids = {"sigma_a": rough_grid(4), "sigma_s": rough_grid(5)}
+    inner = centred(1.2 * np.eye(3))
+    volumes = {k: grid_volume("mivol_voxels", grids[k], inner) if v == "grid" else v for k, v in kinds.items()}
+    box = box_of({"type": "mivol_medium", **volumes, "phase": {"type": "isotropic"}}, PLACE)
+    media = [
+        twins.Medium(twins.Grid(grids[k], inner) if v == "grid" else twins.Box(float(as_float32(v)), PLACE), alone)
+        for (k, v), alone in zip(kinds.items(), (0.0, 1.0), strict=True)
+    ]
+    found, truth = beside({"smoke": box}, media, [point([1.5, 1, 2.0])], order=24)
     assert np.abs(found - truth).max() <= 4e-3 * truth.max()
 
 
@@ -132,5 +151,14 @@ def test_refusals():
     for more, why in (({"deterministic": True}, "ConstantBackground"), ({"shadows": "grid"}, "without deterministic")):
         with refused(why):
             mi.render(close_up({"smoke": box, "lamp": lamp, "sky": sky()}), integrator=mi.load_dict(mivol(**more)), spp=1)
+    apart = {"sigma_a": rough_grid(1), "sigma_s": rough_grid(2, shape=(2, 3, 4))}
+    for volumes, more, why in (
+        (apart, {}, "share their cells"),
+        ({"sigma_a": apart["sigma_a"], "sigma_s": 0.4}, {"shadows": "grid"}, "sigma_s of the medium in smoke is a constant"),
+    ):
+        given = {k: v if isinstance(v, float) else grid_volume("mivol_voxels", v, PLACE) for k, v in volumes.items()}
+        scene = close_up({"smoke": box_of({"type": "mivol_medium", **given}, PLACE), "lamp": lamp})
+        with refused(why):
+            mi.render(scene, integrator=mi.load_dict(mivol(deterministic=True, **more)), spp=1)
     with refused("estimated or grid"):
         mi.render(close_up({"smoke": box, "lamp": lamp}), integrator=mi.load_dict(mivol(shadows="soft")), spp=1)
