@@ -29,7 +29,7 @@ from mivol.fields.resampling import resample_field
 from mivol.fields.sky import Sky
 from mivol.fields.spherical import SphericalGrid, basis_size, row_width
 from mivol.optim.radiance_plan import PRESETS, Plan, Stage, memory_of, place_grid
-from mivol.optim.radiance_priors import dull, next_rows, smooth, thin_out
+from mivol.optim.radiance_priors import Neighbours, dull, smooth, thin_out
 from mivol.optim.radiance_views import Batch, Views
 from mivol.photos import Camera, pixel_centres, rays
 from mivol.transport.occupied import Cells
@@ -104,7 +104,7 @@ class RadianceFit:
         self._survey()
 
     def _survey(self) -> None:
-        self.neighbours = next_rows(self.field)
+        self.neighbours = Neighbours.of(self.field)
         self.cells = cells_of(self.field)
 
     def seen_nodes(self) -> np.ndarray:
@@ -179,8 +179,8 @@ class RadianceFit:
         for k, rate in enumerate((density / self.unit, sh)):
             mine = dr.arange(mi.UInt32, dr.width(slopes[k])) < own * (dr.width(slopes[k]) // field.rows)
             values[k], self.squares[k] = self._descend(values[k], self.squares[k], dr.select(mine, slopes[k], 0), rate)
-        self._believe(values, own, rng)
-        dr.eval(values, self.squares)
+        self._believe(values, rng)
+        dr.eval(values)
         self.field = field.with_values(*values)
 
     def _update_sky(self, slope: mi.Float) -> None:
@@ -198,13 +198,15 @@ class RadianceFit:
         step = dr.opaque(mi.Float, rate) * slope * dr.rsqrt(dr.select(touched, mean, 1))
         return dr.select(touched, values - step, values), dr.select(slope == 0, squares, mean)
 
-    def _believe(self, values: list[mi.Float], rows: int, rng: np.random.Generator) -> None:
+    def _believe(self, values: list[mi.Float], rng: np.random.Generator) -> None:
         """Move values towards what is believed: by shares of the learning rate, fewer the more photographs there are."""
         plan, width = self.plan, self.field.width
         density, sh = (rate / len(self.views.origins) for rate in plan.rates(self.step))
         values[0] = thin_out(values[0], density * plan.sparsity, self.unit)
         values[1] = dull(values[1], width, sh * plan.matte)
-        where = plan.tv_share, int(rng.integers(dr.width(self.neighbours[0]))), rows
+        # Evaluated here, or the neighbours that are read next would make the step be taken twice.
+        dr.eval(values, self.squares)
+        where = plan.tv_share, int(rng.integers(dr.width(self.neighbours.after[0])))
         smooth(values[0], 1, self.neighbours, density * plan.tv_density / self.unit, *where)
         smooth(values[1], width, self.neighbours, sh * plan.tv_sh, *where)
 

@@ -165,7 +165,7 @@ def bytes_of(plan: Plan, stage: Stage, box: np.ndarray, rows: int | None = None)
     nodes = math.prod(place_grid(box, stage.longest)[0])
     rows = (nodes if stage is plan.stages[0] else int(FILLED * nodes)) if rows is None else rows
     copies = 2 + (dr.thread_count() if dr.backend_v(mi.Float) == dr.JitBackend.LLVM else 0)
-    a_row = 12 * (1 + row_width(basis_size(plan.degree))) + 12
+    a_row = 12 * (1 + row_width(basis_size(plan.degree))) + 24
     a_row += stage.views * 16 * copies
     return int(rows * a_row + 16 * nodes + stage.views * stage.tiles * TILE**2 * RAY)
 
