@@ -143,26 +143,30 @@ class RadianceFit:
         self.step += 1
         return loss
 
-    def _background(self, rng: np.random.Generator) -> np.ndarray:
+    def _background(self, rng: np.random.Generator) -> np.ndarray | None:
         random = self.plan.random_background and self.views.channels == 4
-        return rng.random(3) if random else self.views.background
+        return rng.random(3) if random else None
 
-    def _slopes(self, batch: Batch, points: np.ndarray, background: np.ndarray) -> tuple[mi.Float, list[mi.Float]]:
-        """Squared errors, and the derivatives of their mean: density, harmonics, and the sky's where there is one."""
+    def _slopes(self, batch: Batch, points: np.ndarray, background: np.ndarray | None) -> tuple[mi.Float, list[mi.Float]]:
+        """Squared errors, and the derivatives of their mean: density, harmonics, and the sky's where there is one.
+
+        ``background`` is put behind all photographs; None: each has its own.
+        """
         source = bake(self.field, self.cells, points, batch.slot, slope=True)
         model, count = model_of(self.field, self.plan.stop), dr.width(batch.slot)
         seen = look(self.cells, source, model, batch.rays)
-        behind = mi.Color3f(*(dr.opaque(mi.Float, float(c)) for c in background))
+        before = batch.before
+        behind = before if background is None else mi.Color3f(*(dr.opaque(mi.Float, float(c)) for c in background))
         behind = behind if self.sky is None else self.sky.seen(batch.rays.d)
-        before = mi.Color3f(*(dr.opaque(mi.Float, float(c)) for c in self.views.background))
         # Where a photograph was transparent, it shows what it is over: put what is behind there instead.
         error = seen.colour + seen.T * behind - batch.target - (1 - batch.alpha) * (behind - before)
+        error *= batch.counted
         by = error * (2 / (3 * count))
         through = dr.dot(by, behind)
         if self.plan.beta > 0:
             # Bounded: at 0 and 1 the prior is satisfied, and its derivative infinite.
             T = dr.clip(seen.T, 0.01, 0.99)
-            through += self.plan.beta / count * (dr.rcp(T) - dr.rcp(1 - T))
+            through += self.plan.beta / count * batch.counted * (dr.rcp(T) - dr.rcp(1 - T))
         loss = dr.squared_norm(error) * (1 / 3)
         dr.eval(seen, by, through, loss)
         look_back(self.cells, source, model, seen, by, through)

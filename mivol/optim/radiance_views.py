@@ -3,7 +3,7 @@
 Conventions. A batch is square tiles of pixels: neighbours cross the same cells, so their reads and writes meet in the cache,
 and a packet of lanes walks as one. Tiles lie anywhere in a view, all places alike. Smaller sizes are exact means over area;
 where voxels are larger than pixels, a small image says the same with fewer rays. Values are those of the photographs (8-bit
-steps), not decoded.
+steps), not decoded. What a mask leaves out has a ray, and counts for nothing.
 """
 
 from __future__ import annotations
@@ -28,9 +28,13 @@ TILE = 4
 
 @dataclass
 class Level:
-    """All views in one size: codes 0..255, [row][column][rgb] or, with alpha, [rgba], one view after the other."""
+    """All views in one size: codes 0..255, [row][column][rgb] or, with alpha, [rgba], one view after the other.
+
+    ``counted`` is 1 or 0 a pixel; None where no photograph has a mask.
+    """
 
     codes: mi.UInt8
+    counted: mi.UInt8 | None
     sizes: np.ndarray
     starts: np.ndarray
     shrink: int
@@ -40,13 +44,16 @@ class Level:
 class Batch:
     """Rays of pixels: the slot of each ray's view among the chosen ones, and what the photograph shows.
 
-    ``alpha`` is 1 where the photographs have none.
+    ``alpha`` is 1 where the photographs have none; ``before`` is the colour that the photograph lies over; ``counted`` is 1,
+    or 0 where a mask leaves the pixel out.
     """
 
     rays: Rays
     slot: mi.UInt32
     target: mi.Color3f
     alpha: mi.Float
+    before: mi.Color3f
+    counted: mi.Float
 
 
 @dataclass
@@ -57,14 +64,12 @@ class Views:
         origins: (V, 3) pinholes.
         levels: sizes, by how much they are shrunk: 1, 2, 4 ...
         channels: 3, or 4 with alpha.
-        background: (3,) what the photographs with alpha lie over.
     """
 
     origins: np.ndarray
     lenses: mi.Float
     levels: dict[int, Level]
     channels: int
-    background: np.ndarray
 
     @classmethod
     def of(cls, photos: Sequence[Photo], shrinks: Sequence[int] = (1,), with_alpha: bool | None = None) -> Views:
@@ -88,12 +93,17 @@ class Views:
         lenses = np.array([_lens(photo) for photo in photos], np.float32)
         levels = {shrink: _level(photos, shrink, with_alpha) for shrink in sorted(set(shrinks))}
         origins = np.array([photo.camera.origin for photo in photos])
-        return cls(origins, mi.Float(lenses.reshape(-1)), levels, 4 if with_alpha else 3, np.array(photos[0].background))
+        return cls(origins, mi.Float(lenses.reshape(-1)), levels, 4 if with_alpha else 3)
 
     @property
     def bytes(self) -> int:
         """Memory that the pixels take."""
-        return sum(dr.width(level.codes) for level in self.levels.values())
+        return sum(dr.width(pixels) for pixels in self._pixels())
+
+    def _pixels(self) -> list[mi.UInt8]:
+        """All that is kept of pixels, in the order of the sizes."""
+        levels = [level for _, level in sorted(self.levels.items())]
+        return [pixels for level in levels for pixels in (level.codes, level.counted) if pixels is not None]
 
     def draw(self, shrink: int, views: np.ndarray, tiles: int, rng: np.random.Generator) -> Batch:
         """Draw tiles of some views: ``tiles`` of each, rays of a view side by side."""
@@ -120,9 +130,9 @@ class Views:
 
     def digest(self) -> str:
         """A fingerprint of cameras and pixels."""
-        found = hashlib.sha256(np.array(self.lenses).tobytes() + self.background.tobytes())
-        for _, level in sorted(self.levels.items()):
-            found.update(np.array(level.codes).tobytes())
+        found = hashlib.sha256(np.array(self.lenses).tobytes())
+        for pixels in self._pixels():
+            found.update(np.array(pixels).tobytes())
         return found.hexdigest()[:16]
 
     def look_up(self, shrink: int, views: np.ndarray, slot: mi.UInt32, column: mi.UInt32, row: mi.UInt32) -> Batch:
@@ -130,24 +140,27 @@ class Views:
         level = self.levels[shrink]
         table = np.stack([views, level.starts[views], level.sizes[views][:, 0]], axis=1).astype(np.uint32)
         view, start, width = (dr.gather(mi.UInt32, mi.UInt32(np.ascontiguousarray(table[:, k])), slot) for k in range(3))
-        pixel = (start + row * width + column) * self.channels
-        codes = [mi.Float(dr.gather(mi.UInt8, level.codes, pixel + k)) * (1 / 255) for k in range(self.channels)]
+        pixel = start + row * width + column
+        codes = [
+            mi.Float(dr.gather(mi.UInt8, level.codes, pixel * self.channels + k)) * (1 / 255) for k in range(self.channels)
+        ]
+        counted = mi.Float(1) if level.counted is None else mi.Float(dr.gather(mi.UInt8, level.counted, pixel))
         lens = [dr.gather(mi.Float, self.lenses, view * LENS + k) for k in range(LENS)]
         x = ((mi.Float(column) + 0.5) * level.shrink - lens[2]) * lens[0]
         y = (lens[3] - (mi.Float(row) + 0.5) * level.shrink) * lens[1]
         d = mi.Vector3f(*(dr.fma(lens[4 + 3 * a], x, dr.fma(lens[5 + 3 * a], y, -lens[6 + 3 * a])) for a in range(3)))
         o = mi.Point3f(lens[13], lens[14], lens[15])
         alpha = codes[3] if self.channels == 4 else mi.Float(1)
-        return Batch(Rays(o, dr.normalize(d)), slot, mi.Color3f(*codes[:3]), alpha)
+        return Batch(Rays(o, dr.normalize(d)), slot, mi.Color3f(*codes[:3]), alpha, mi.Color3f(*lens[16:]), counted)
 
 
-LENS = 16
-"""Numbers a camera: 1/fx, 1/fy, cx, cy, rotation by rows, origin."""
+LENS = 19
+"""Numbers a view: 1/fx, 1/fy, cx, cy, rotation by rows, origin, background."""
 
 
 def _lens(photo: Photo) -> list[float]:
     K, pose = photo.camera.K, photo.camera.to_world
-    return [1 / K[0, 0], 1 / K[1, 1], K[0, 2], K[1, 2], *pose[:3, :3].reshape(-1), *pose[:3, 3]]
+    return [1 / K[0, 0], 1 / K[1, 1], K[0, 2], K[1, 2], *pose[:3, :3].reshape(-1), *pose[:3, 3], *photo.background]
 
 
 def _level(photos: Sequence[Photo], shrink: int, with_alpha: bool) -> Level:
@@ -159,7 +172,15 @@ def _level(photos: Sequence[Photo], shrink: int, with_alpha: bool) -> Level:
     if counts.sum() * 4 >= 2**32:
         raise MivolError(f"{counts.sum()} pixels were given; they are counted up to 2^30: read the photographs smaller.")
     codes = np.concatenate([np.rint(image * 255).astype(np.uint8).reshape(-1) for image in images])
-    return Level(mi.UInt8(codes), sizes, np.concatenate([[0], np.cumsum(counts)[:-1]]), shrink)
+    return Level(mi.UInt8(codes), _counted(photos, shrink), sizes, np.concatenate([[0], np.cumsum(counts)[:-1]]), shrink)
+
+
+def _counted(photos: Sequence[Photo], shrink: int) -> mi.UInt8 | None:
+    """Whether a pixel counts: where all that it is the mean of do."""
+    if all(photo.mask is None for photo in photos):
+        return None
+    masks = [np.ones(photo.image.shape[:2]) if photo.mask is None else photo.mask.astype(float) for photo in photos]
+    return mi.UInt8(np.concatenate([(_shrunk(mask[..., None], shrink) == 1).reshape(-1) for mask in masks]).astype(np.uint8))
 
 
 def _pixels(photo: Photo, with_alpha: bool) -> np.ndarray:

@@ -108,6 +108,52 @@ def test_backgrounds_that_change_leave_no_white_in_the_air(variant_rgb: str, pho
     assert black[:4, :4].max() < 0.05
 
 
+def slopes_of(photos: list[Photo], shrink: int = 2, background: np.ndarray | None = None) -> list[np.ndarray]:
+    """Squared errors and derivatives of the first step of a fog."""
+    fit, chosen = RadianceFit(Views.of(photos, (1, 2)), BOX, PLAN), np.arange(len(photos))
+    fit.begin(0)
+    batch = fit.views.draw(shrink, chosen, 30, np.random.default_rng(3))
+    loss, slopes = fit._slopes(batch, fit.views.origins[chosen], background)
+    return [np.array(a) for a in (loss, *slopes)]
+
+
+def test_what_a_mask_leaves_out_is_not_fitted(variant_rgb: str, photos: list[Photo]) -> None:
+    """Whatever a masked pixel shows, nothing changes; a shrunk one counts where all that it is the mean of do."""
+    rng = np.random.default_rng(8)
+    mask = rng.random((48, 48)) > 0.2
+    painted = [
+        [replace(p, mask=mask, image=np.where(mask[..., None], p.image, rng.random(3))) for p in photos[:3]] for _ in range(2)
+    ]
+    for shrink in (1, 2):
+        first, second = (slopes_of(some, shrink) for some in painted)
+        for a, b in zip(first, second, strict=True):
+            np.testing.assert_allclose(a, b, rtol=0, atol=1e-6 * np.abs(a).max())  # sums in another order
+        whole = Views.of(painted[0], (1, 2)).whole(shrink, 1)
+        tiles = 48 // shrink // TILE
+        counted = np.array(whole.counted).reshape(tiles, tiles, TILE, TILE).transpose(0, 2, 1, 3).reshape(2 * [48 // shrink])
+        np.testing.assert_array_equal(counted, mask.reshape(48 // shrink, shrink, 48 // shrink, shrink).all(axis=(1, 3)))
+        assert np.any(slopes_of(photos[:3], shrink)[0] != first[0])
+    some = [*painted[0][:2], photos[2]]
+    assert Views.of(some).bytes == Views.of(photos[:3]).bytes + 3 * 48 * 48
+    assert Views.of(some).digest() != Views.of([replace(p, mask=None) for p in some]).digest()
+
+
+def test_each_photograph_may_lie_over_its_own_colour(variant_rgb: str, photos: list[Photo]) -> None:
+    """Photographs over three colours have the derivatives of the same over white, whatever is put behind both."""
+    whole = [replace(p, alpha=(p.alpha > 0.5).astype(np.float32)) for p in photos[:3]]
+    colours = np.array([[10, 200, 30], [0, 0, 0], [90, 80, 255]], np.float32) / 255
+
+    def over(photo: Photo, colour: np.ndarray) -> Photo:
+        return replace(photo, image=np.where(photo.alpha[..., None] > 0, photo.image, colour), background=colour)
+
+    white = slopes_of([over(p, WHITE) for p in whole], 1, np.array([0.3, 0.9, 0.1]))
+    other = slopes_of([over(p, c) for p, c in zip(whole, colours, strict=True)], 1, np.array([0.3, 0.9, 0.1]))
+    for a, b in zip(white, other, strict=True):
+        np.testing.assert_allclose(a, b, rtol=0, atol=1e-5 * np.abs(a).max())  # a background added and taken off again
+    kept = Views.of([over(p, c) for p, c in zip(whole, colours, strict=True)], with_alpha=False)
+    np.testing.assert_array_equal(np.array(kept.whole(1, 2).before).T[0], colours[2])
+
+
 def test_what_is_behind_is_found_too(variant_rgb: str, photos: list[Photo]) -> None:
     """A ball under a sky of two colours, photographs without alpha: the sky is found where rays pass the ball."""
     v, u = np.meshgrid(np.linspace(0, 1, 8), (np.arange(16) + 0.5) / 16, indexing="ij")
