@@ -19,6 +19,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mivol.phase.turn import INV_FOUR_PI
 from mivol.transport.dice import start_dice
 from mivol.transport.film import Strata
 from mivol.transport.free_flight import Focus, Lamp
@@ -216,7 +217,7 @@ def _from_lamp(
     way, clear, tau, light = shadow_ray(scene, world, mi.Point3f(mei.p), mei.medium, direct, on, dice)
     w_mis = mi.Float(1)
     if lights.has_lobes:
-        _, pdf_lobe = phase.eval_pdf(_context(), mei, direct.d, on)
+        pdf_lobe = _lobe_pdf(world, phase, mei, direct.d, on)
         pdf = direct.pdf / len(lights.drawn)
         w_mis = dr.select(direct.delta, 1, power_heuristic(pdf, pdf_lobe))
     dim = light * (w_mis * len(lights.drawn))
@@ -257,7 +258,7 @@ def _from_lobe(
 ) -> Arrival:
     """A direction of the phase function."""
     lights, phase = world.lights, mei.medium.phase_function()
-    wo, weight, pdf = phase.sample(_context(), mei, draw.lobe, draw.turn, active)
+    wo, weight, pdf = _sample_lobe(world, phase, mei, draw, active)
     on = active & (pdf > 0)
     ray = mi.Ray3f(mei.p, wo, dr.inf, mei.time, mei.wavelengths)
     end, _, light = light_through(scene, world, ray, mei.medium, on, dice)
@@ -276,6 +277,34 @@ def _from_lobe(
             weight = f / pdf
         value = dr.select(on, dim * weight * emitter.eval(si, on), 0)
     return Arrival(Way(ray, mei.medium, end.t, True), value, on)
+
+
+def _sample_lobe(
+    world: World, phase: mi.PhaseFunctionPtr, mei: mi.MediumInteraction3f, draw: Draw, active: mi.Bool
+) -> tuple[mi.Vector3f, mi.Spectrum, mi.Float]:
+    """A direction, value over density, and density of a phase function; where it has flakes the direction is drawn evenly.
+
+    Mitsuba 3.9.1 draws directions of flakes from another density than ``eval_pdf`` tells (6 % of a picture in a constant sky).
+    """
+    wo, weight, pdf = phase.sample(_context(), mei, draw.lobe, draw.turn, active)
+    if world.has_flakes:
+        even = _has_flakes(phase)
+        wo = dr.select(even, mi.warp.square_to_uniform_sphere(draw.turn), wo)
+        f, _ = phase.eval_pdf(_context(), mei, wo, active & even)
+        weight, pdf = dr.select(even, f / INV_FOUR_PI, weight), dr.select(even, INV_FOUR_PI, pdf)
+    return wo, weight, pdf
+
+
+def _lobe_pdf(
+    world: World, phase: mi.PhaseFunctionPtr, mei: mi.MediumInteraction3f, d: mi.Vector3f, active: mi.Bool
+) -> mi.Float:
+    """Density of :func:`_sample_lobe`."""
+    _, pdf = phase.eval_pdf(_context(), mei, d, active)
+    return dr.select(_has_flakes(phase), INV_FOUR_PI, pdf) if world.has_flakes else pdf
+
+
+def _has_flakes(phase: mi.PhaseFunctionPtr) -> mi.Bool:
+    return (phase.flags() & mi.UInt32(int(mi.PhaseFunctionFlags.Microflake))) != 0
 
 
 def _is_drawn(lights: Lights, emitter: mi.EmitterPtr) -> mi.Bool:

@@ -182,7 +182,8 @@ def _flakes(medium: mi.Medium) -> list[mi.Float] | None:
         MivolError: a matrix that varies in space.
     """
     phase = medium.phase_function()
-    if phase is None or not int(phase.flags()) & int(mi.PhaseFunctionFlags.Microflake):
+    # In a blend or a mixture Mitsuba lets flakes turn light, and the extinction as it is.
+    if phase is None or phase.class_name() != "SGGXPhaseFunction":
         return None
     values = dr.detach(next(v for k, v in mi.traverse(phase) if k.startswith("S.")))
     flat = dr.ravel(values)

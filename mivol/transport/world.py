@@ -274,8 +274,9 @@ class World:
 
     @property
     def has_flakes(self) -> bool:
-        """Whether some extinction depends on the direction."""
-        return any(b.view.flakes is not None for b in self.bodies)
+        """Whether some phase function has flakes among its lobes."""
+        phases = [b.view.medium.phase_function() for b in self.bodies]
+        return any(p is not None and int(p.flags()) & int(mi.PhaseFunctionFlags.Microflake) for p in phases)
 
     @property
     def bodies(self) -> list[Body]:

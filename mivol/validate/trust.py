@@ -195,6 +195,14 @@ def _small_g(b: Boundary) -> Found:
         ), False
 
 
+def _flakes(b: Boundary) -> Found:
+    if any(re.search(r"^phase_function.*\bS\.", key) for key in b.params) and not _is_black(b):
+        yield (
+            f"the phase function inside {b.name} has flakes (sggx), and Mitsuba draws their directions from another density than "
+            "it divides by; light them by lamps of one position or direction, or use another phase function."
+        ), True
+
+
 def _is_black(b: Boundary) -> bool:
     albedo = [np.asarray(v) for k, v in b.params.items() if k.startswith(("albedo", "sigma_s"))]
     return bool(albedo) and all(np.all(v == 0) for v in albedo)
@@ -223,6 +231,7 @@ CHECKS: dict[str, Callable[[Boundary], Found]] = {
     "mirrored": _mirrored,
     "wrong inverse": _wrong_inverse,
     "small g": _small_g,
+    "flakes": _flakes,
     "emission": _emission,
     "thick skin": _thick_skin,
 }

@@ -8,6 +8,7 @@ import re
 import signal
 from dataclasses import replace
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -384,6 +385,32 @@ def test_doubts_that_need_no_render(variant_rgb):
     }
     for kind, scene in cases.items():
         assert [d.kind for d in trust(mi.load_dict(scene))] == [kind]
+
+
+def _flakes() -> dict:
+    """Discs that lie aslant."""
+    S = np.array([0.3, 0.3, 0.8, 0.1, 0.2, 0.0], dtype=np.float32)
+    return {"type": "sggx", "S": {"type": "gridvolume", "grid": mi.VolumeGrid(S.reshape(1, 1, 1, 6))}}
+
+
+@pytest.mark.parametrize("inside", ["alone", "in a blend"])
+def test_flakes_are_drawn_from_another_density_than_is_told(variant_rgb, inside):
+    """Means of the directions of 2^18 samples and of their density: a release that mends it turns this red."""
+    blend = {"type": "blendphase", "weight": 0.5, "a": {"type": "rayleigh"}, "b": _flakes()}
+    scene = mi.load_dict(_scene(_homogeneous(0.5, albedo=0.5, phase=_flakes() if inside == "alone" else blend)))
+    (doubt,) = trust(scene)
+    assert doubt.kind == "flakes" and doubt.fatal
+    assert trust(mi.load_dict(_scene(_homogeneous(0.5, phase=_flakes())))) == []
+    n = 1 << 18
+    rng, ctx, mei = mi.PCG32(n), mi.PhaseFunctionContext(None), dr.zeros(mi.MediumInteraction3f, n)
+    mei.wi = mi.Vector3f(0.6, 0, 0.8)
+    mei.sh_frame = mi.Frame3f(mei.wi)
+    flakes = mi.load_dict(_flakes())
+    drawn, _, _ = flakes.sample(ctx, mei, rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32()))
+    evenly = mi.warp.square_to_uniform_sphere(mi.Point2f(rng.next_float32(), rng.next_float32()))
+    told = 4 * np.pi * np.array(flakes.eval_pdf(ctx, mei, evenly)[1]) * np.array(evenly.x)
+    # standard errors of at most 0.6 / sqrt(2^18) = 1.2e-3 and of a few times that
+    assert abs(np.array(drawn.x).mean() - told.mean()) > 0.1
 
 
 def _fog(values: np.ndarray, **extra) -> dict:
