@@ -26,6 +26,7 @@ from mivol.optim.schedules import Constant, Cosine, Exponential, Step
 from mivol.optim.solvers import SOLVERS
 from mivol.optim.strategy import nearest, of
 from mivol.scene.cameras import Hemisphere, LookAts, Ring, SceneSensors
+from mivol.validate.images import METRICS
 
 INFINITY = math.inf
 
@@ -284,7 +285,12 @@ class Shown(Section):
     views: Annotated[int, of("view", "judged views that are shown beside their photographs", ge=0)] = 4
     frames: Annotated[int, of("frame", "of a turntable film; 0: none", ge=0)] = 60
     every: Annotated[int, of("step", "between two looks at a held-out view", ge=1)] = 250
-    metrics: Annotated[tuple[str, ...], of("1", "of the judged views: psnr, ssim, flip")] = ("psnr", "ssim")
+    metrics: Annotated[tuple[str, ...], of("1", "of the judged views: psnr, ssim, flip", min_length=1)] = ("psnr", "ssim")
+
+    def __post_init__(self) -> None:
+        unknown = next((name for name in self.metrics if name not in METRICS), None)
+        if unknown is not None:
+            raise ValueError(f'unknown metric "{unknown}": {nearest(unknown, list(METRICS))}'.rstrip("."))
 
 
 class FieldFit(Section):

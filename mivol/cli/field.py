@@ -1,7 +1,7 @@
 """``mivol optimize`` on photographs: a radiance field from its TOML to its run folder.
 
 Conventions. The folder is that of :mod:`mivol.cli.experiment`; ``metrics.jsonl`` has ``loss`` (mean squared error of a step's
-rays) and ``held_out_psnr`` of one view now and then; ``field.npz`` is the field, ``film/turntable.mp4`` a journey around it.
+rays) and the metrics of one judged view now and then; ``field.npz`` is the field, ``film/turntable.mp4`` a journey around it.
 The field with the optimiser's state is kept at intervals and where the run is stopped; ``--resume`` goes on from there.
 """
 
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from mivol import config
 from mivol.cli.experiment import CHECKPOINT, recorded, stage, write_curves
-from mivol.cli.progress import tracked
+from mivol.cli.progress import say, tracked
 from mivol.cli.rendering import set_threads, set_variant
 from mivol.config import FieldFit
 from mivol.errors import MivolError
@@ -33,12 +33,13 @@ from mivol.optim.radiance_views import Views
 from mivol.optim.strategy import nearest
 from mivol.photos import Camera, Photo, Photos, load_photos, rectified, silhouette_box, turntable
 from mivol.photos.picture import decode_srgb
+from mivol.photos.region import near_far_of
 from mivol.report.depth import depth_pixels, normal_pixels, normals_of_depth
 from mivol.report.page import write_page
 from mivol.report.record import Choice, Image, RunRecord, Table, Volume, append_metrics, rewind_metrics
 from mivol.report.video import write_video
 from mivol.threads import check_one_thread
-from mivol.validate.images import judge, score
+from mivol.validate.images import Quality, judge, score
 
 FILM_SIZE = 256
 """Longest edge of a film [pixel]."""
@@ -58,12 +59,13 @@ def run(chosen: FieldFit, base: Path, folder: Path, *, resume: bool = False) -> 
     with recorded(record, folder):
         with stage(record, "photographs"):
             photos, judged = read_photos(chosen, base)
-            box = make_box(chosen, photos)
-            plan = shrunk(asked, photos, box)
+            photos = boxed(chosen, photos)
+            plan = shrunk(asked, photos)
             views = Views.of([rectified(view) for view in photos.views], [stage.shrink for stage in plan.stages])
-            record.plan, record.notes = choices(plan, photos, box, views), notes(photos)
+            record.plan, record.notes = choices(plan, photos, views), notes(photos)
+            say([photos.text, *(f"{one.choice}: {one.reason}" for one in record.plan)])
         with stage(record, "fit"):
-            fit = solve(chosen, folder, RadianceFit(views, box, plan, chosen.seed), judged, resume)
+            fit = solve(chosen, folder, RadianceFit(views, photos.box, plan, chosen.seed), judged, resume)
         with stage(record, "images and volumes"):
             write_outputs(chosen, folder, record, fit, photos, judged)
     return write_page(folder)
@@ -86,15 +88,13 @@ def make_plan(chosen: FieldFit) -> Plan:
     given = {name: getattr(wanted, name) for name in names}
     plan = replace(plan, **{name: value for name, value in given.items() if value is not None})
     stages = [replace(stage, steps=max(1, round(stage.steps * wanted.effort))) for stage in plan.stages]
-    if wanted.longest is not None:
-        coarser = [stage for stage in stages if stage.longest < wanted.longest]
-        stages = [*coarser, replace(stages[-1], longest=wanted.longest)]
-    return replace(plan, stages=tuple(stages))
+    plan = replace(plan, stages=tuple(stages))
+    return plan if wanted.longest is None else plan.up_to(wanted.longest)
 
 
-def shrunk(plan: Plan, photos: Photos, box: NDArray) -> Plan:
+def shrunk(plan: Plan, photos: Photos) -> Plan:
     """The plan with photographs as small as its grids can tell: pixels of half a voxel, at the middle of the box."""
-    cameras = [view.camera for view in photos.views]
+    cameras, box = [view.camera for view in photos.views], photos.box
     pixel = np.median([np.linalg.norm(camera.origin - box.mean(axis=0)) / camera.K[0, 0] for camera in cameras])
     least = min(min(camera.size) for camera in cameras)
     stages = []
@@ -109,14 +109,17 @@ def read_photos(chosen: FieldFit, base: Path) -> tuple[Photos, Photos | None]:
     """Photographs to fit, and those to judge by.
 
     Raises:
-        MivolError: as :func:`mivol.photos.load_photos`.
+        MivolError: as :func:`mivol.photos.load_photos`, or neither a box nor one of the words for it.
     """
     wanted = chosen.photos
+    if isinstance(wanted.box, str) and wanted.box not in BOXES:
+        raise MivolError(f'photos.box = "{wanted.box}" is unknown: {nearest(wanted.box, list(BOXES))}')
     settings: dict[str, Any] = {
         "scale": wanted.scale,
         "background": wanted.background or None,
         "held_out": wanted.held_out,
         "space": "srgb",
+        "box": None if isinstance(wanted.box, str) else np.array(wanted.box, np.float64),
     }
     path = base / wanted.path
     photos = _over(load_photos(path, split="train", **settings), wanted.behind)
@@ -133,21 +136,23 @@ def _over(photos: Photos, behind: tuple[float, float, float]) -> Photos:
     return replace(photos, views=tuple(replace(view, background=colour) for view in photos.views))
 
 
-def make_box(chosen: FieldFit, photos: Photos) -> NDArray[np.float64]:
-    """Where matter may be, (2, 3) [length].
+def boxed(chosen: FieldFit, photos: Photos) -> Photos:
+    """The photographs with the box where matter may be.
 
     Raises:
-        MivolError: neither a box nor one of the words for it.
+        MivolError: as :func:`mivol.photos.silhouette_box`.
     """
     wanted = chosen.photos.box
-    if not isinstance(wanted, str):
-        return np.array(wanted, dtype=np.float64)
-    if wanted not in BOXES:
-        raise MivolError(f'photos.box = "{wanted}" is unknown: {nearest(wanted, list(BOXES))}')
-    return BOXES[wanted](photos)
+    return BOXES[wanted](photos) if isinstance(wanted, str) else photos
 
 
-BOXES = {"cameras": lambda photos: photos.box, "silhouettes": silhouette_box}
+def _about_silhouettes(photos: Photos) -> Photos:
+    box = silhouette_box(photos)
+    near_far = near_far_of([view.camera for view in photos.views], box)
+    return replace(photos, survey=replace(photos.survey, box=box, box_from="about what alpha shows", near_far=near_far))
+
+
+BOXES = {"cameras": lambda photos: photos, "silhouettes": _about_silhouettes}
 
 
 def new_record(chosen: FieldFit) -> RunRecord:
@@ -162,8 +167,9 @@ def new_record(chosen: FieldFit) -> RunRecord:
     )
 
 
-def choices(plan: Plan, photos: Photos, box: NDArray, views: Views) -> list[Choice]:
+def choices(plan: Plan, photos: Photos, views: Views) -> list[Choice]:
     """What will be done, and why."""
+    box = photos.box
     resolutions = ", ".join(str(stage.longest) for stage in plan.stages)
     size = " x ".join(f"{edge:.4g}" for edge in box[1] - box[0])
     return [
@@ -211,7 +217,7 @@ def solve(chosen: FieldFit, folder: Path, fit: RadianceFit, judged: Photos | Non
         for loss in tracked(Steps(fit), "steps"):
             fit.seconds = time.perf_counter() - started
             if fit.step % chosen.show.every == 0 or fit.step == fit.plan.steps:
-                append_metrics(folder, fit.step, fit.seconds, loss=loss, **look(fit, judged))
+                append_metrics(folder, fit.step, fit.seconds, loss=loss, **look(chosen, fit, judged))
             if fit.step % chosen.checkpoint_every == 0:
                 keep()
     finally:
@@ -234,13 +240,24 @@ class Steps:
             yield float(dr.mean(self.fit.advance())[0])
 
 
-def look(fit: RadianceFit, judged: Photos | None) -> dict[str, float]:
-    """PSNR of one judged view, another one each time."""
+def look(chosen: FieldFit, fit: RadianceFit, judged: Photos | None) -> dict[str, float]:
+    """How well one judged view is seen, another one each time."""
     if judged is None:
         return {}
-    photo = judged.views[fit.step % len(judged.views)]
+    photo = judged.views[fit.step // chosen.show.every % len(judged.views)]
+    return named(compare(chosen, fit, judged, photo)[1].values)
+
+
+def compare(chosen: FieldFit, fit: RadianceFit, judged: Photos, photo: Photo) -> tuple[Seen, Quality]:
+    """A photograph's view of the field, and how alike they are."""
     seen = render_view(fit.field, photo.camera, behind(fit, photo))
-    return {"held_out_psnr": judge(seen.image, photo.image, space=judged.space).values["psnr"]}
+    asked = {"space": judged.space, "mask": photo.mask, "metrics": chosen.show.metrics, "name": photo.name}
+    return seen, judge(seen.image, photo.image, **asked)
+
+
+def named(values: dict[str, float]) -> dict[str, float]:
+    """Metrics by the names of :data:`mivol.report.record.QUANTITIES`."""
+    return {("held_out_psnr" if name == "psnr" else name): value for name, value in values.items()}
 
 
 def behind(fit: RadianceFit, photo: Photo) -> NDArray | Sky:
@@ -306,16 +323,13 @@ def write_judged(chosen: FieldFit, folder: Path, record: RunRecord, fit: Radianc
     found = []
     shown = set(np.linspace(0, len(judged.views) - 1, min(chosen.show.views, len(judged.views))).astype(int).tolist())
     for number, photo in enumerate(judged.views):
-        seen = render_view(fit.field, photo.camera, behind(fit, photo))
-        found.append(
-            judge(seen.image, photo.image, space=judged.space, mask=photo.mask, metrics=chosen.show.metrics, name=photo.name)
-        )
+        seen, quality = compare(chosen, fit, judged, photo)
+        found.append(quality)
         if number in shown:
             record.images += write_view(folder, photo.name, number, seen.image, photo.image)
         if number == 0:
             record.images += write_geometry(folder, seen, photo.camera, judged.near_far)
-    values = score(found).values
-    return {("held_out_psnr" if name == "psnr" else name): value for name, value in values.items()}
+    return named(score(found).values)
 
 
 def write_view(folder: Path, name: str, number: int, image: NDArray, photograph: NDArray) -> list[Image]:

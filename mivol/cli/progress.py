@@ -42,6 +42,13 @@ def tracked(items: Sequence[T], what: str) -> Iterator[T]:
         console.print(f"{what}: {len(items)} in {time.monotonic() - start:.1f} s", soft_wrap=True)
 
 
+def say(lines: Sequence[str]) -> None:
+    """Print lines where progress is shown."""
+    console = Console(stderr=True)
+    for line in lines:
+        console.print(line, soft_wrap=True, highlight=False, markup=False)
+
+
 class Display:
     """Context manager; called after each iteration. ``begun`` once it has been."""
 

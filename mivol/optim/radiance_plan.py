@@ -96,6 +96,11 @@ class Plan:
         """Steps of all stages."""
         return sum(stage.steps for stage in self.stages)
 
+    def up_to(self, longest: int) -> Plan:
+        """The plan that ends with so many nodes along the longest edge; stages that are coarser stay."""
+        coarser = [stage for stage in self.stages if stage.longest < longest]
+        return replace(self, stages=(*coarser, replace(self.stages[-1], longest=longest)))
+
     def stage_at(self, step: int) -> int:
         """The number of the stage to which a step belongs."""
         for number, stage in enumerate(self.stages):
@@ -180,13 +185,15 @@ def memory_of(plan: Plan, box: np.ndarray, views: Views, limit: int | None = Non
     Raises:
         MivolError: more than there is; the largest resolution that fits is said.
     """
-    most = views.bytes + max(bytes_of(plan, stage, box) for stage in plan.stages)
-    last = plan.stages[-1]
+    def needed(some: Plan) -> int:
+        return views.bytes + max(bytes_of(some, stage, box) for stage in some.stages)
+
+    most, last = needed(plan), plan.stages[-1]
     if limit is None and dr.backend_v(mi.Float) == dr.JitBackend.LLVM:
         limit = available_memory()
     if limit is not None and most > limit:
-        fitting = [n for n in range(8, last.longest) if views.bytes + bytes_of(plan, replace(last, longest=n), box) <= limit]
-        advice = f"{fitting[-1]} fits" if fitting else "no resolution fits: read the photographs smaller"
+        fitting = next((n for n in range(last.longest - 1, 7, -1) if needed(plan.up_to(n)) <= limit), None)
+        advice = f"longest = {fitting} fits" if fitting else "no resolution fits: read the photographs smaller"
         taken, left = f"{most / 2**30:.1f} GiB", f"{limit / 2**30:.1f}"
         raise MivolError(f"a fit with {last.longest} nodes along an edge takes about {taken} and {left} are left; {advice}.")
     first = bytes_of(plan, plan.stages[0], box)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import drjit as dr
@@ -305,10 +306,31 @@ def test_memory_is_counted_first(variant_rgb: str, photos: list[Photo]) -> None:
     views = Views.of(photos[:2])
     text = memory_of(PRESETS["cpu"], BOX, views, limit=1 << 40)
     assert "MiB" in text
-    with pytest.raises(MivolError, match=r"512 nodes along an edge .* (\d+) fits"):
+    with pytest.raises(MivolError, match=r"512 nodes along an edge .* longest = (\d+) fits"):
         memory_of(PRESETS["gpu"], BOX, views, limit=2 << 30)
     with pytest.raises(MivolError, match="no resolution fits"):
         memory_of(PRESETS["gpu"], BOX, views, limit=1000)
+
+
+TOO_LARGE = [("cpu", 32, 40), ("cpu", 128, 20), ("gpu", 64, 200), ("gpu", 300, 500)]
+
+
+@pytest.mark.parametrize(("preset", "longest", "limit"), TOO_LARGE)
+def test_the_resolution_that_is_said_to_fit_fits(
+    variant_rgb: str, photos: list[Photo], preset: str, longest: int, limit: int
+) -> None:
+    """Taken as the next ``longest``, whichever stage then takes the most; one more is refused. Limits in MiB."""
+    views = Views.of(photos[:2])
+
+    def memory(nodes: int) -> str:
+        return memory_of(PRESETS[preset].up_to(nodes), BOX, views, limit=limit << 20)
+
+    with pytest.raises(MivolError) as refused:
+        memory(longest)
+    fits = int(re.search(r"longest = (\d+) fits", str(refused.value)).group(1))
+    assert "about" in memory(fits)
+    with pytest.raises(MivolError, match=f"longest = {fits} fits"):
+        memory(fits + 1)
 
 
 def test_grids_have_cubic_voxels_and_cover_the_box(variant_rgb: str) -> None:
