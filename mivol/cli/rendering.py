@@ -17,7 +17,7 @@ import numpy as np
 from mivol.errors import MivolError
 from mivol.files import write_exr, write_png
 from mivol.optim.problem import seed_of
-from mivol.scene.load import LoadedScene, find_sensor, load_scene
+from mivol.scene.load import LoadedScene, check_variant, find_sensor, load_scene
 from mivol.threads import check_one_thread
 
 SAMPLES_PER_PASS = 1 << 21
@@ -55,11 +55,14 @@ def set_variant(name: str) -> None:
     """Activate a variant.
 
     Raises:
-        MivolError: this Mitsuba has none of that name, or it cannot differentiate and compile.
+        MivolError: this Mitsuba has none of that name, there is no GPU for it, or mivol does not work in it.
     """
     if name not in mi.variants():
         raise MivolError(f'Mitsuba has no variant "{name}": choose among {", ".join(mi.variants())}.')
+    if name.startswith("cuda") and not dr.has_backend(dr.JitBackend.CUDA):
+        raise MivolError(f'the variant "{name}" needs an NVIDIA GPU and its driver, and none was found: choose llvm_ad_rgb.')
     mi.set_variant(name)
+    check_variant()
 
 
 def set_threads(count: int) -> None:

@@ -10,6 +10,7 @@ import sys
 import time
 from pathlib import Path
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -122,6 +123,13 @@ def test_render_in_passes_is_the_mean(variant_rgb, folder: Path, monkeypatch: py
     assert names == ["R", "G", "B", "tau"]
     assert np.isclose(split[3, 4, 0], once[3, 4, 0], rtol=0.02)
     assert not np.array_equal(split, once)
+
+
+def test_a_variant_without_its_gpu_is_refused(
+    variant_rgb, folder: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(dr, "has_backend", lambda backend: False)
+    assert "needs an NVIDIA GPU" in refused(capsys, "render", folder / "scene.xml", "-m", "cuda_ad_rgb")
 
 
 RENDER_REFUSED = {

@@ -213,6 +213,7 @@ def test_each_look_is_at_another_view(photographs: Path, tmp_path: Path, monkeyp
         ("field.sky=1", "0 or at least 2"),
         ("photos.box=silhouette", 'did you mean "silhouettes"'),
         ("photos.path=nowhere", "nowhere"),
+        ("variant=scalar_rgb", "mivol works in llvm_ad_rgb"),
         ("photos.judged=val", "val"),
         ("photos.backgroud=white", 'did you mean "background"'),
         ("photos.background=white", "alpha"),
