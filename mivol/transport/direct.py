@@ -4,7 +4,8 @@ r"""Light that reaches a point of a medium from the lamps, through volumetric sh
 
 A lamp is drawn before the distance, so that the distance may be drawn for it; its direction is Mitsuba's. Where a lamp can be
 met by chance, a second direction is drawn from the phase function, and the power heuristic weighs both (Veach 1997, Eq. 9.13);
-light that is the same from everywhere needs the second one only.
+light that is the same from everywhere needs the second one only. A lamp that lets light pass (a pane) is no end of a ray: it is
+aimed at only.
 
 Conventions. An arrival is one shadow ray: the light that it brings is already dimmed by the exact optical depth along it and
 turned by the phase function. Surfaces cast shadows; what they reflect is one more scattering and not seen.
@@ -84,6 +85,7 @@ class Lights:
 
     Attributes:
         drawn: emitters that directions are drawn towards, all alike: all but a constant background.
+        panes: emitters on surfaces that let light pass undeviated.
         has_lobes: directions are drawn from the phase function too, since some emitter can be met by chance.
     """
 
@@ -91,7 +93,9 @@ class Lights:
         emitters = scene.emitters()
         delta = int(mi.EmitterFlags.Delta)
         self.drawn = [e for e in emitters if e.class_name() != UNIFORM]
-        self.has_lobes = any(not int(e.flags()) & delta for e in emitters)
+        self.panes = [e for e in self.drawn if _is_pane(e)]
+        met = [e for e in emitters if not any(e is pane for pane in self.panes)]
+        self.has_lobes = any(not int(e.flags()) & delta for e in met)
         balls = [_ball(e) for e in self.drawn]
         self.is_near = any(b is not None for b in balls)
         self._balls = [None if b is None else [dr.opaque(mi.Float, v) for v in b] for b in balls]
@@ -127,6 +131,11 @@ class Lights:
                 centre = dr.select(here, mi.Point3f(x, y, z), centre)
                 radius2, finite = dr.select(here, dr.square(r), radius2), here | finite
         return Lamp(index, emitter, _focus(ray, centre, radius2, finite) if self.is_near else None)
+
+
+def _is_pane(emitter: mi.Emitter) -> bool:
+    shape = emitter.get_shape()
+    return shape is not None and mi.has_flag(shape.bsdf().flags(), mi.BSDFFlags.Null)
 
 
 def _ball(emitter: mi.Emitter) -> list[float] | None:
@@ -219,7 +228,7 @@ def _from_lamp(
     if lights.has_lobes:
         pdf_lobe = _lobe_pdf(world, phase, mei, direct.d, on)
         pdf = direct.pdf / len(lights.drawn)
-        w_mis = dr.select(direct.delta, 1, power_heuristic(pdf, pdf_lobe))
+        w_mis = dr.select(direct.delta | _is_among(lights.panes, lamp.emitter), 1, power_heuristic(pdf, pdf_lobe))
     dim = light * (w_mis * len(lights.drawn))
     with dr.resume_grad(when=attached):
         moved = _follow(lamp, mei, draw, direct, on) if attached else direct
@@ -264,12 +273,12 @@ def _from_lobe(
     end, _, light = light_through(scene, world, ray, mei.medium, on, dice)
     si = end.si
     emitter = si.emitter(scene, on)
-    on &= emitter != None
+    on &= (emitter != None) & ~_is_among(lights.panes, emitter)
     w_mis = mi.Float(1)
     if lights.drawn:
         direct = mi.DirectionSample3f(scene, si, mei)
         pdf_lamp = emitter.pdf_direction(mei, direct, on) / len(lights.drawn)
-        w_mis = dr.select(_is_drawn(lights, emitter), power_heuristic(pdf, pdf_lamp), 1)
+        w_mis = dr.select(_is_among(lights.drawn, emitter), power_heuristic(pdf, pdf_lamp), 1)
     dim = light * w_mis
     with dr.resume_grad(when=attached):
         if attached:
@@ -307,10 +316,9 @@ def _has_flakes(phase: mi.PhaseFunctionPtr) -> mi.Bool:
     return (phase.flags() & mi.UInt32(int(mi.PhaseFunctionFlags.Microflake))) != 0
 
 
-def _is_drawn(lights: Lights, emitter: mi.EmitterPtr) -> mi.Bool:
-    """Whether directions are drawn towards an emitter."""
+def _is_among(emitters: list[mi.Emitter], emitter: mi.EmitterPtr) -> mi.Bool:
     found = mi.Bool(False)
-    for candidate in lights.drawn:
+    for candidate in emitters:
         found |= emitter == mi.EmitterPtr(candidate)
     return found
 

@@ -185,7 +185,7 @@ def _trace(
         # -- Go on through what is transparent ------------------------------------------------------------------------------
         clear = found & is_transparent(hit)
         if unveils:
-            thin = found & ~clear & mi.has_flag(hit.bsdf().flags(), mi.BSDFFlags.Null) & ~hit.shape.is_emitter()
+            thin = found & ~clear & mi.has_flag(hit.bsdf().flags(), mi.BSDFFlags.Null) & (t_hit < ray.maxt * OWN_SURFACE)
             veil = dr.select(thin, veil * hit.bsdf().eval_null_transmission(hit, thin), veil)
             clear |= thin & dr.any(veil != 0)
         medium = dr.select(clear & transition, hit.target_medium(ray.d), medium)
@@ -223,6 +223,9 @@ def is_transparent(si: mi.SurfaceInteraction3f) -> mi.Bool:
     lobes = si.bsdf().flags() & mi.UInt32(int(mi.BSDFFlags.All))
     return (lobes == int(mi.BSDFFlags.Null)) & ~si.shape.is_emitter()
 
+
+OWN_SURFACE = 1 - 1e-3
+"""Share of the way to a lamp behind which a shadow ray meets the lamp's own surface (Mitsuba shortens its rays alike)."""
 
 DARK = 30.0
 """Optical depth from which a shadow ray is dark: 1e-13 of a lamp's light is below the rounding of everything beside it."""
@@ -455,8 +458,7 @@ def shadow_ray(
     length = dr.norm(direct.p - start)
     ray = mi.Ray3f(start, dr.normalize(direct.p - start), length, direct.time, mi.Color0f())
     stop, tau, light = light_through(scene, world, ray, medium, active, dice)
-    # The last 1e-3 of the way is the lamp's own surface (Mitsuba's ShadowEpsilon shortens its rays alike).
-    clear = ~(stop.si.is_valid() & (stop.t < length * (1 - 1e-3)))
+    clear = ~(stop.si.is_valid() & (stop.t < length * OWN_SURFACE))
     return Way(ray, medium, length, True), clear, tau, light
 
 

@@ -198,8 +198,8 @@ def _small_g(b: Boundary) -> Found:
 def _flakes(b: Boundary) -> Found:
     if any(re.search(r"^phase_function.*\bS\.", key) for key in b.params) and not _is_black(b):
         yield (
-            f"the phase function inside {b.name} has flakes (sggx), and Mitsuba draws their directions from another density than "
-            "it divides by; light them by lamps of one position or direction, or use another phase function."
+            f"the phase function inside {b.name} has flakes (sggx), and Mitsuba draws their directions from another density "
+            "than it divides by; light them by lamps of one position or direction, or use another phase function."
         ), True
 
 

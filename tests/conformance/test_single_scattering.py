@@ -308,6 +308,19 @@ def test_shadow_rays_go_on_through_what_is_partly_clear(lamp):
     same(veil() | {"shine": shine})
 
 
+@pytest.mark.parametrize("lamp", small.cases(["bulb", "sky"], ["sky"]))
+@pytest.mark.parametrize("kind", ["pane", "boundary"])
+def test_lamps_that_let_light_pass(kind, lamp):
+    """A luminous mask before another lamp, and a boundary that shines itself: what is behind them is seen through them."""
+    shine = {"bulb": {"bulb": point([1.6, -1.3, 1.7], 40.0)[0]}, "sky": LAMPS["envmap"]()}[lamp]
+    light = {"emitter": {"type": "area", "radiance": 5.0}}
+    if kind == "boundary":
+        same({"smoke": grid_in(cube(PLACE)) | light, **shine})
+        return
+    mask = {"type": "mask", "opacity": 0.4, "nested": {"type": "twosided", "nested": RED}}
+    same({"smoke": grid_in(cube(PLACE)), "pane": square(0.8, -0.65, 0.85, 0.6) | light | {"bsdf": mask}, **shine})
+
+
 @pytest.mark.parametrize("shape", small.cases(["box", "ball"], ["box"]))
 def test_camera_inside(shape):
     """The sensor names its medium, as volpath needs it to."""
