@@ -105,6 +105,8 @@ def _entry(file: Path, table: Mapping[str, Any], frame: Mapping[str, Any], numbe
         return Camera(settings.intrinsics(size), size, settings.matrix(), settings.lens(), settings.name)
 
     mask = settings.values.get("mask_path")
+    if not isinstance(mask, str | None):
+        raise refusal(settings.name, f"mask_path = {mask!r}", "the name of a file", "correct it")
     return Entry(
         name,
         _photograph(file.parent / name),
@@ -117,7 +119,7 @@ def _entry(file: Path, table: Mapping[str, Any], frame: Mapping[str, Any], numbe
 
 def _photograph(path: Path) -> Path:
     """The file of a name that may lack its suffix; the first of ``SUFFIXES`` where nothing is there."""
-    if path.suffix.lower() in SUFFIXES:
+    if path.suffix.lower() in SUFFIXES or path.is_file():
         return path
     tried = [path.with_name(path.name + suffix) for suffix in SUFFIXES]
     return next((file for file in tried if file.is_file()), tried[0])

@@ -513,6 +513,7 @@ BAD_FRAMES = {
     "NaN": ("transform_matrix", NAN, "r_1: found a transform that holds NaN"),
     "no matrix": ("transform_matrix", "x", "no matrix"),
     "3 x 4": ("transform_matrix", np.eye(4)[:3].tolist(), r"shape \(3, 4\)"),
+    "mask without a name": ("mask_path", 5, r"r_1: found mask_path = 5, expected the name of a file"),
     "looks away": ("transform_matrix", look_at(np.array([4.0, 0, 0]), np.array([9.0, 0, 0])).tolist(), "away from the box"),
 }
 
@@ -542,6 +543,16 @@ def test_images_and_backgrounds_must_fit(blender: Path, tmp_path: Path) -> None:
         load_photos(plain, background="white")
     with pytest.raises(MivolError, match="image without alpha"):
         load_photos(plain).views[0].over([1, 1, 1])
+
+
+@pytest.mark.parametrize("suffix", ["webp", "tif", "bmp"])
+def test_a_photograph_of_another_suffix_is_not_said_to_be_missing(tmp_path: Path, suffix: str) -> None:
+    folder, image = write_transforms(tmp_path / "set", {"fl_x": 20.0}), pixels(12, 8, 5, alpha=False)
+    Image.fromarray(image).save(folder / f"other.{suffix}", lossless=True)
+    edit(folder / "transforms.json", spoil("file_path", f"other.{suffix}"))
+    read = load_photos(folder)
+    assert not read.skipped
+    np.testing.assert_array_equal(np.round(read.views[1].image * 255), image)
 
 
 def test_a_set_without_images_is_refused(blender: Path) -> None:
