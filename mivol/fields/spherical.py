@@ -40,6 +40,9 @@ MAX_DEGREE = 4
 
 FORMAT = "mivol spherical grid 1"
 
+SMALL = 2.0**-12
+"""Below it the least step of a half float, 2^-24, is more than 2^-12 of the largest value."""
+
 
 def basis_size(degree: int) -> int:
     """Number of harmonics up to a degree."""
@@ -325,7 +328,7 @@ def save_field(path: str | Path, field: SphericalGrid, half: bool = True) -> Non
     Args:
         path: ends in .npz.
         field: what to write.
-        half: as half floats (11 bits); arrays with a value beyond 65504 stay float32 in any case.
+        half: as half floats (11 bits); arrays with a value beyond 65504, or with none beyond 2^-12, stay float32 in any case.
 
     Raises:
         MivolError: another suffix, or the disk's refusal.
@@ -343,7 +346,8 @@ def save_field(path: str | Path, field: SphericalGrid, half: bool = True) -> Non
 
 
 def _narrow(values: np.ndarray, half: bool) -> np.ndarray:
-    return values.astype(np.float16) if half and np.abs(values).max(initial=0.0) <= np.finfo(np.float16).max else values
+    largest = np.abs(values).max(initial=0.0)
+    return values.astype(np.float16) if half and SMALL <= largest <= np.finfo(np.float16).max else values
 
 
 def load_field(path: str | Path) -> SphericalGrid:

@@ -41,6 +41,15 @@ def test_values_that_half_floats_cannot_hold_stay(variant_rgb: str, tmp_path: Pa
     assert np.array_equal(load_field(tmp_path / "f.npz").values()[0], density.reshape(-1))
 
 
+def test_densities_of_large_worlds_keep_their_digits(variant_rgb: str, tmp_path: Path) -> None:
+    """Extinctions go as 1 / length: in a box of 1e9 units half floats would make 0 of them."""
+    density, sh = arrays()
+    for small in (1e-4, 1e-9):
+        save_field(tmp_path / "f.npz", SphericalGrid.from_dense(density * small, sh, CUBE))
+        found, _ = load_field(tmp_path / "f.npz").values()
+        np.testing.assert_allclose(found, small * density.reshape(-1), rtol=1e-6, atol=small * 2**-12)
+
+
 def test_a_checkpoint_of_svox2(variant_rgb: str, tmp_path: Path) -> None:
     """Axes X Y Z, rows in any order, harmonics by channel, a box by centre and radius."""
     rng = np.random.default_rng(1)
