@@ -55,7 +55,7 @@ class Voxels:
         values, place = cls._values(props, sources[0], own_box)
         if "filename" in props:
             name = f"{name} ({props['filename']})"
-        check_affine(to_world, f"to_world of {name}")
+        _check_inverse(check_affine(to_world, f"to_world of {name}"), to_local, f"to_world of {name}")
         return cls(values, to_world @ place, name, np.linalg.inv(place) @ to_local)
 
     @staticmethod
@@ -122,3 +122,14 @@ class Voxels:
     def __repr__(self) -> str:
         z, y, x = self.res
         return f"mivol_voxels[{x}x{y}x{z}, {self.channels} channels]"
+
+
+def _check_inverse(to_world: np.ndarray, to_local: np.ndarray, name: str) -> None:
+    """Refuse a transform that Mitsuba goes back by another way than it came.
+
+    1e-2: a float32 inverse of edges at right angles is right to 1e-6 of them, and one of a box sheared a thousandfold to 1e-3.
+    """
+    edges = np.linalg.norm(to_world[:3, :3], axis=0)
+    back = edges[:, None] * (to_local[:3, :3] @ to_world[:3, :3]) / edges
+    if not np.abs(back - np.eye(3)).max() < 1e-2:
+        raise MivolError(f"{name} and the inverse that Mitsuba keeps of it do not agree; rotate about an axis of length 1.")

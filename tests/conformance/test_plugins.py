@@ -307,6 +307,15 @@ def test_hard_49_degenerate_place_is_refused(variant):
         mi.load_dict(grid_volume("mivol_voxels", grid(), np.diag([1.0, 0, 1, 1])))
 
 
+def test_a_rotation_about_an_axis_of_another_length_is_refused(variant):
+    """Mitsuba takes the axis as it is for the matrix and its transpose for the inverse, which it then is not."""
+    place = mi.ScalarTransform4f().rotate([1, 1, 0], 40)
+    with pytest.raises(Exception, match="rotate about an axis of length 1"):
+        mi.load_dict({"type": "mivol_voxels", "data": tensor(grid()), "to_world": place})
+    long = mi.ScalarTransform4f().translate([1e6, 0, 0]).rotate([0.6, 0.8, 0], 40).scale([1e-3, 1e3, 1])
+    mi.load_dict({"type": "mivol_voxels", "data": tensor(grid()), "to_world": long})
+
+
 @pytest.mark.parametrize("bad", [np.nan, -0.5])
 def test_hard_26_27_an_update_with_bad_values_is_refused(variant, bad):
     """What an optimiser's overshoot leaves behind is named when it is handed in, not when it is rendered."""
