@@ -12,6 +12,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mivol.errors import MivolError
+from mivol.scene.derived import renew, tangents_led
 from mivol.scene.load import find_sensor
 from mivol.scene.needs import Needs, Survey, find_needs, read_coarse, survey_scene
 from mivol.scene.plan import Plan, build_world, check_aovs, make_plan
@@ -84,7 +85,7 @@ class Session:
     def render_forward(self, scene: mi.Scene, sensor: int | mi.Sensor, seed: int, spp: int) -> mi.TensorXf:
         """Render the derivative of an image along the gradients that were set on the parameters."""
         sensor = find_sensor(scene, sensor)
-        with dr.suspend_grad():
+        with dr.suspend_grad(), tangents_led(scene):
             with dr.resume_grad():
                 world, plan = self._open(scene, sensor, spp)
                 world.start_tangent()
@@ -100,6 +101,7 @@ class Session:
         sensor = find_sensor(scene, sensor)
         with dr.suspend_grad():
             with dr.resume_grad():
+                renew(scene)
                 world, plan = self._open(scene, sensor, spp)
             world.start_gradients()
             # What is pulled back to a volume waits there for the end: its edge to the parameter can be passed but once.
@@ -128,7 +130,6 @@ class Session:
         needs = find_needs(scene, sensor, survey, spp)
         plan = make_plan(needs, self.settings)
         world = build_world(scene, needs, plan, self.settings, survey)
-        world.check_followed()
         if world.lights is not None:
             with dr.suspend_grad():
                 world.shade = self._shade(scene, world, needs, plan, pictures)

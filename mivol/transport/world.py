@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING
 import drjit as dr
 import mitsuba as mi
 
-from mivol.errors import MivolError
 from mivol.transport.field import SumField, share_cells
 from mivol.transport.lattice import box_nodes, clip, locate
 from mivol.transport.medium import Box, MediumView, Part
@@ -335,25 +334,6 @@ class World:
         if dr.grad_enabled(total):
             dr.backward(total)
 
-    def check_followed(self) -> None:
-        """Refuse a derivative that was asked for of a volume whose texture was not told: it would be 0.
-
-        Raises:
-            MivolError: a grid of emission or albedo with derivatives that its look-ups do not have.
-        """
-        for body in self.bodies:
-            view = body.view
-            for name, volume in (("emission", view.source), ("emission_density", view.glow), ("albedo", view.share)):
-                if not isinstance(volume, mi.Volume):
-                    continue
-                params = mi.traverse(volume)
-                asked = "data" in params and "table" not in params and dr.grad_enabled(params["data"])
-                if asked and not dr.grad_enabled(_look_inside(volume)):
-                    raise MivolError(
-                        f"the derivative of {name}.data was enabled after its texture had been made, which would give it the "
-                        "derivative 0; call params.update() after dr.enable_grad(params[key])."
-                    )
-
     def start_tangent(self) -> None:
         """Begin a forward pass: take the tangent of each part from the parameters."""
         for body in self.bodies:
@@ -363,23 +343,6 @@ class World:
                 dr.forward_to(*asked)
             body.tangents = [dr.detach(dr.grad(p)) for p in products]
             dr.eval(body.tangents)
-            _lead_tangents([body.view.source, body.view.glow, body.view.share])
-
-
-def _lead_tangents(fields: list) -> None:
-    """Bring the tangents of volumes to where they are read: a loop cannot pass the edges of a graph that lie outside of it."""
-    for volume in fields:
-        if isinstance(volume, mi.Volume):
-            value = _look_inside(volume)
-            if dr.grad_enabled(value):
-                dr.forward_to(value, flags=dr.ADFlag.ClearEdges)
-
-
-def _look_inside(volume: mi.Volume) -> mi.Spectrum:
-    """A volume in the middle of its box: a point outside of a grid would not read it."""
-    inside = dr.zeros(mi.Interaction3f)
-    inside.p = mi.Point3f(*map(float, volume.bbox().center()))
-    return volume.eval(inside)
 
 
 LUMINANCE = (0.212671, 0.715160, 0.072169)

@@ -1,0 +1,93 @@
+"""What plugins make of their parameters: textures and tables that derivatives have to pass.
+
+Conventions. A plugin makes them when it is told of a change, and Dr.Jit passes the edge from a parameter to what was made of it
+once, and not from inside a loop. So a reverse pass lets plugins make them anew before it begins, and a forward pass lets them
+be made of copies of the parameters, whose tangents it brings to where they are read. Extinction is read where it stands.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+__all__ = ["renew", "tangents_led"]
+
+
+@dataclass
+class _Asked:
+    """A parameter whose derivative is asked for: a copy of what stands there, since an update may put other arrays there."""
+
+    params: mi.SceneParameters
+    key: str
+    value: Any
+
+    def make_of(self, value: Any) -> None:
+        """Have everything made of a value."""
+        self.params[self.key] = value
+        self.params.set_dirty(self.key)
+        self.params.update()
+
+    def put_back(self) -> None:
+        """Let the parameter be what it was."""
+        self.params[self.key] = self.value
+
+
+def renew(scene: mi.Scene) -> None:
+    """Have everything made anew of parameters whose derivatives are asked for. Not while a function is being recorded."""
+    for asked in _find_asked(scene):
+        asked.make_of(asked.value)
+        asked.put_back()
+
+
+@contextmanager
+def tangents_led(scene: mi.Scene) -> Iterator[None]:
+    """Everything is made of copies of the parameters, and has its tangent; afterwards it is made of the parameters again."""
+    with dr.resume_grad():
+        found = _find_asked(scene)
+        copies = [dr.detach(asked.value) for asked in found]
+        for asked, copy in zip(found, copies, strict=True):
+            dr.enable_grad(copy)
+            dr.set_grad(copy, dr.grad(asked.value))
+            asked.make_of(copy)
+        if copies:
+            dr.enqueue(dr.ADMode.Forward, copies)
+            dr.traverse(dr.ADMode.Forward, dr.ADFlag.ClearEdges)
+    try:
+        yield
+    finally:
+        with dr.resume_grad():
+            for asked in found:
+                asked.make_of(asked.value)
+                asked.put_back()
+
+
+def _find_asked(scene: mi.Scene) -> list[_Asked]:
+    """Arrays with derivatives, by the plugin that they belong to."""
+    if dr.flag(dr.JitFlag.FreezingScope):
+        return []
+    inside = [shape.interior_medium() for shape in scene.shapes() if shape.interior_medium() is not None]
+    owners = [*scene.emitters(), *(s.bsdf() for s in scene.shapes()), *(o for m in inside for o in _parts_of(m))]
+    found = []
+    for owner in {o.ptr: o for o in owners if o is not None}.values():
+        params = mi.traverse(owner)
+        arrays = [(k, v) for k, v in params if dr.is_array_v(v) and dr.grad_enabled(v) and not _is_made(params, k)]
+        found += [_Asked(params, k, type(v)(v)) for k, v in arrays]
+    return found
+
+
+def _parts_of(medium: mi.Medium) -> list[mi.Object]:
+    """The phase function of a medium, and its volumes but for those whose numbers transport reads where they stand."""
+    known = mi.traverse(medium).properties
+    volumes = {key.partition(".")[0]: node for key, (_, _, node, _) in known.items() if isinstance(node, mi.Volume)}
+    read = [n for n in volumes if n.startswith("sigma_") and f"{n}.table" not in known]
+    return [medium.phase_function(), *(v for n, v in volumes.items() if n not in read)]
+
+
+def _is_made(params: mi.SceneParameters, key: str) -> bool:
+    """Whether a parameter is what a plugin makes of its others: the grid of a ``mivol_transfer``."""
+    return key == "data" and "table" in params
