@@ -32,7 +32,7 @@ from mivol.optim.radiance_fit import PRESETS, Plan, RadianceFit, Seen, memory_of
 from mivol.optim.radiance_views import Views
 from mivol.optim.strategy import nearest
 from mivol.photos import Camera, Photo, Photos, load_photos, rectified, silhouette_box, turntable
-from mivol.photos.picture import decode_srgb
+from mivol.photos.picture import decode_srgb, space_of
 from mivol.photos.region import near_far_of
 from mivol.report.depth import depth_pixels, normal_pixels, normals_of_depth
 from mivol.report.page import write_page
@@ -187,7 +187,9 @@ def choices(plan: Plan, photos: Photos, views: Views) -> list[Choice]:
 
 def notes(photos: Photos) -> list[str]:
     """What a reader must know of the photographs."""
-    found = [f"Colours are the photographs' own {photos.space} values."]
+    found = [f"Colours are {photos.space} code values; in a scene mivol_sh shows them as they are."]
+    if any(space_of(frame.file) == "linear" for frame in photos.survey.frames):
+        found.append("The light of OpenEXR photographs was encoded; what is above 1 counts as 1.")
     if photos.skipped:
         found.append(f"{len(photos.skipped)} photographs are listed and not there: {', '.join(photos.skipped[:5])} ...")
     return found

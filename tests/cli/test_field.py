@@ -14,7 +14,7 @@ from mivol import config
 from mivol.cli import field, main
 from mivol.errors import MivolError
 from mivol.fields.spherical import SphericalGrid, load_field
-from mivol.files import read_exr, write_png
+from mivol.files import read_exr, write_exr, write_png
 from mivol.optim.radiance_fit import PRESETS, Stage, render_view
 from mivol.photos import Camera, intrinsics
 from mivol.photos.journey import facing
@@ -153,6 +153,20 @@ def test_what_the_file_says_overrides_the_preset(tmp_path: Path) -> None:
     assert [stage.longest for stage in field.make_plan(config.from_dict(raw)).stages] == [32, 64, 128, 200]
     assert plan.stages[0].steps == round(PRESETS["cpu"].stages[0].steps / 2)
     assert (plan.degree, plan.tv_sh, plan.tv_density) == (1, 1e-3, PRESETS["cpu"].tv_density)
+
+
+def test_what_was_done_to_linear_photographs_is_said(photographs: Path, tmp_path: Path) -> None:
+    table = json.loads((photographs / "transforms.json").read_text())
+    for frame in table["frames"]:
+        frame["file_path"] = frame["file_path"].replace(".png", ".exr")
+        write_exr(tmp_path / frame["file_path"], {name: np.full((SIZE, SIZE), 2.0, np.float32) for name in "RGB"})
+    (tmp_path / "transforms.json").write_text(json.dumps(table))
+    said = []
+    for folder in (photographs, tmp_path):
+        photos, _ = field.read_photos(config.load(toml(tmp_path, folder)), tmp_path)
+        said.append(" ".join(field.notes(photos)))
+    assert ["OpenEXR" in text for text in said] == [False, True]
+    assert all("srgb code values" in text for text in said)
 
 
 def test_photographs_are_shrunk_to_half_a_voxel(photographs: Path, tmp_path: Path) -> None:
