@@ -16,7 +16,8 @@ class MivolMedium(mi.Medium):
         sigma_a, sigma_s: absorption and scattering [1/length]; each a float, rgb (above 1 allowed) or a volume.
         scale: factor on the extinction, differentiable. Default 1.
         emission: radiance Le that the medium shows where nothing is seen through it (its source function is
-            (1 - albedo) Le), a float, rgb or a volume. A ``mivol_sh`` brings its own extinction: give nothing else with it.
+            (1 - albedo) Le), a float, rgb or a volume; in an extinction that is a grid, of voxels no smaller than its own. A
+            ``mivol_sh`` brings its own extinction: give nothing else with it.
             Default none.
         emission_density: radiance per length that does not go with the extinction, likewise. Default none.
         a phase function: default isotropic.

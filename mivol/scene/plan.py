@@ -13,6 +13,7 @@ from pathlib import Path
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from mivol.errors import MivolError
 from mivol.machine import available_memory
@@ -23,6 +24,7 @@ from mivol.transport.aovs import AOVS
 from mivol.transport.direct import Lights
 from mivol.transport.field import share_cells
 from mivol.transport.light_grid import find_light_grid, measure_bias
+from mivol.transport.medium import MediumView
 from mivol.transport.optical_depth import PACKED_LIMIT, gradient_bytes
 from mivol.transport.path import Settings
 from mivol.transport.world import Body, World, share_flight
@@ -162,6 +164,21 @@ def _refuse_emission(needs: Needs, settings: Settings) -> None:
                 f"{view.guide.res}, or they lie in different places; a glow is summed in the cells of the extinction: give "
                 "both the same resolution and to_world."
             )
+        least = _source_over_cells(view) if isinstance(view.source, mi.Volume) else 1.0
+        if least < 1 - 1e-4:  # the place of a stock grid is known to 5e-6
+            raise MivolError(
+                f"the emission of the medium in {facts.name} varies over lengths of {least:.2g} of its extinction's cells, "
+                "which are looked at in two points; resample the extinction to voxels as small, or give it as a number."
+            )
+
+
+def _source_over_cells(view: MediumView) -> float:
+    """A voxel of the source over the longest edge of a cell that is walked, both as the source counts lengths."""
+    volume, cells = view.source, view.guide
+    place = volume.mivol_to_world if hasattr(volume, "mivol_to_world") else view.rooms[volume.ptr].to_world
+    edges = cells.to_world[:3, :3] / np.array(cells.res[::-1])
+    voxels = np.linalg.solve(place[:3, :3], edges) * np.array(volume.resolution(), dtype=np.float64)[:, None]
+    return 1 / float(np.linalg.norm(voxels, axis=0).max())
 
 
 def _refuse_quadrature(needs: Needs, settings: Settings) -> None:

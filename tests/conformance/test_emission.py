@@ -54,9 +54,9 @@ def test_grids_in_any_frame(kind, frame):
     assert np.abs(light(seen) - twins.cell_radiance(m, seen.o, seen.d, B)).max() <= (2e-5 if kind == "mivol_voxels" else 1e-4)
 
 
-def test_light_on_finer_cells_than_the_extinction():
+def test_light_on_other_cells_than_the_extinction():
     """A source function may have a grid of its own: it is looked up at the points of the extinction's cells."""
-    m = twins.Medium((rough(1, 0, 3), PLACE), (rough(2, 0, 1, 3, (9, 8, 11)), as_float32(centred(1.7 * np.eye(3)))))
+    m = twins.Medium((rough(1, 0, 3), PLACE), (rough(2, 0, 1, 3, (3, 2, 4)), as_float32(centred(1.7 * np.eye(3)))))
     seen = emitting(m)
     assert np.abs(light(seen) - twins.cell_radiance(m, seen.o, seen.d, B)).max() <= 4e-6
 
@@ -288,6 +288,21 @@ def test_glow_in_other_cells_is_refused():
             shoot(picture(interior(twins.Medium(sigma, 0.0, glow))))
     # Where the extinction has no grid, the glow's own cells are walked.
     assert np.isfinite(shoot(picture(interior(twins.Medium(0.5, 0.0, (rough(2, 0, 1, 3), PLACE)))))).all()
+
+
+@pytest.mark.parametrize("kind", ["mivol_voxels", "gridvolume"])
+def test_a_source_that_varies_within_the_cells_is_refused(kind):
+    """Two points of a cell would miss it: 16^3 voxels of noise in an extinction of 2^3 are seen with an error of 8 %."""
+    sigma = (rough(1, 0, 2), PLACE)
+    for source in ((rough(2, 0, 1, 3, (5, 4, 7)), PLACE), (rough(2, 0, 1, 3), as_float32(PLACE @ np.diag([0.5, 0.9, 0.9, 1])))):
+        with refused("the emission of the medium in box varies over lengths of .* of its extinction's cells"):
+            shoot(picture(interior(twins.Medium(sigma, source), kind)))
+    # In a constant extinction it is the light's cells that are walked: the glow's, where there are both.
+    fine, coarse = (rough(2, 0, 1, 3, (9, 4, 6)), PLACE), (rough(3, 0, 1, 3), PLACE)
+    with refused("the emission of the medium in box varies"):
+        shoot(picture(interior(twins.Medium(0.5, fine, coarse), kind)))
+    for m in (twins.Medium(0.5, fine), twins.Medium(0.5, coarse, fine), twins.Medium(sigma, coarse)):
+        assert np.isfinite(shoot(picture(interior(m, kind)))).all()
 
 
 def test_extinctions_in_other_cells_are_refused():
