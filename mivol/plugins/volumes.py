@@ -6,6 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mivol.errors import MivolError
 from mivol.fields.spherical import SphericalGrid
 from mivol.fields.spherical_tensors import dense_density, field_from_props, with_tensors
 from mivol.fields.transfer import Transfer
@@ -114,6 +115,9 @@ class SphericalVolume(mi.Volume):
 
     def eval_3(self, it: mi.Interaction3f, active: mi.Bool = True) -> mi.Vector3f:
         return mi.Vector3f(self.mivol_field.eval(it.p, -_towards(it), active)[1])
+
+    def max(self) -> float:
+        raise MivolError("a mivol_sh was given as an extinction; give it as the emission of a mivol_medium, and nothing else.")
 
     def resolution(self) -> mi.ScalarVector3i:
         return mi.ScalarVector3i(self.mivol_field.res[::-1])

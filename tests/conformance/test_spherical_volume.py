@@ -229,6 +229,9 @@ def test_refusals(variant_rgb: None) -> None:
         mi.load_dict({"type": "mivol_sh", "density": tensor(density), "sh": tensor(sh), "activation": "gelu"})
     with pytest.raises(RuntimeError, match="brings its own extinction"):
         mi.load_dict({"type": "mivol_medium", "sigma_t": 1.0, "emission": field()["interior"]["emission"]})
+    for kind in ("mivol_medium", "heterogeneous"):
+        with pytest.raises(RuntimeError, match="a mivol_sh was given as an extinction; give it as the emission"):
+            mi.load_dict({"type": kind, "sigma_t": field()["interior"]["emission"]})
     assert np.isnan(render(scene(field()), {"type": "volpath"}, 1)).any()
     params = mi.traverse(scene(field()))
     with refused("are expected"):
