@@ -56,7 +56,12 @@ def tau_by_end(world: World, way: Way, tau: list[mi.Float], active: mi.Bool) -> 
         for part in body.view.parts:
             rows = world.vectors([scale * v for v in _by_part(body, part, way, t0, t1, on)])
             total = [a + b for a, b in zip(total, rows, strict=True)]
-        return total
+        if body.view.flakes is None:
+            return total
+        # The area that flakes show turns with the ray, whose direction moves across itself.
+        turn = body.facing(d) * dr.rcp(dr.maximum(dr.square(body.area(d)), 1e-30)) - d
+        own = body.optical_depth(way.ray, mi.Float(t0), mi.Float(t1), world.channels, on)
+        return [a + t * turn for a, t in zip(total, own, strict=True)]
 
     zero = [mi.Vector3f(0) for _ in range(world.channels)]
     turned = visit_boxes(world, way.ray, way.length, visit, zero, active)

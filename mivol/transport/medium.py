@@ -64,7 +64,7 @@ class MediumView:
         albedo: what was found under ``albedo``, or of the ``sigma_s`` part: arrays whose maximum tells whether it scatters.
         share: the albedo itself, a volume or a constant; None where ``sigma_s`` is a part.
         flakes: the matrix S (xx, yy, zz, xy, xz, yz) of an ``sggx`` phase function, which makes the extinction depend on the
-            direction: sigma_t sqrt(w^T S w) (Heitz et al. 2015, Eq. 6); None elsewhere.
+            direction: sigma_t sqrt(w^T S w) (Heitz et al. 2015, Eq. 6), with derivatives; None elsewhere.
         source: the radiance that a medium shows where nothing is seen through it, a volume or a constant; None where it
             does not emit.
         glow: radiance per length that does not go with the extinction, likewise.
@@ -185,11 +185,10 @@ def _flakes(medium: mi.Medium) -> list[mi.Float] | None:
     # In a blend or a mixture Mitsuba lets flakes turn light, and the extinction as it is.
     if phase is None or phase.class_name() != "SGGXPhaseFunction":
         return None
-    values = dr.detach(next(v for k, v in mi.traverse(phase) if k.startswith("S.")))
-    flat = dr.ravel(values)
+    flat = dr.ravel(next(v for k, v in mi.traverse(phase) if k.startswith("S.")))
     rows = [dr.gather(mi.Float, flat, mi.UInt32(c)) for c in range(6)]
     if not dr.flag(dr.JitFlag.FreezingScope):
-        host = np.array(flat).reshape(-1, 6)
+        host = np.array(dr.detach(flat)).reshape(-1, 6)
         if not (host == host[0]).all():
             raise MivolError(
                 f"the sggx phase function of a medium varies over its {len(host)} voxels; an extinction that "

@@ -53,14 +53,38 @@ class Body:
         self.flight = share_flight(view.parts)
         self.gradients: list[Gradient | mi.Float] = []
         self.tangents: list[mi.Float] = []
+        self.flakes_gradient: mi.Float | None = None
+        self.flakes_tangent: list[mi.Float] | None = None
 
     def area(self, d: mi.Vector3f) -> mi.Float | float:
         """Factor on the extinction for light that travels along ``d``: the projected area of flakes, else 1."""
         if self.view.flakes is None:
             return 1.0
-        xx, yy, zz, xy, xz, yz = self.view.flakes
-        square = xx * d.x * d.x + yy * d.y * d.y + zz * d.z * d.z + 2 * (xy * d.x * d.y + xz * d.x * d.z + yz * d.y * d.z)
-        return dr.safe_sqrt(square)
+        return dr.safe_sqrt(dr.dot(d, self.facing(d)))
+
+    def facing(self, d: mi.Vector3f) -> mi.Vector3f:
+        """The matrix of the flakes times a direction: half the gradient of the squared area."""
+        xx, yy, zz, xy, xz, yz = dr.detach(self.view.flakes)
+        return mi.Vector3f(
+            xx * d.x + xy * d.y + xz * d.z, xy * d.x + yy * d.y + yz * d.z, xz * d.x + yz * d.y + zz * d.z
+        )
+
+    def _area_slopes(self, d: mi.Vector3f) -> list[mi.Float]:
+        """Derivative of the logarithm of the area by each number of the matrix: of it, extinction is a multiple."""
+        square = dr.dot(d, self.facing(d))
+        half = dr.select(square > 0, 0.5 * dr.rcp(dr.select(square > 0, square, 1)), 0)
+        twice = 2 * half
+        return [half * d.x * d.x, half * d.y * d.y, half * d.z * d.z, twice * d.x * d.y, twice * d.x * d.z, twice * d.y * d.z]
+
+    def _pull_flakes(self, d: mi.Vector3f, weight: list[mi.Float], amount: list[mi.Float], active: mi.Bool) -> None:
+        """Add ``weight`` (d loss / d amount) to the gradient of the matrix, for amounts in proportion to the area."""
+        change = sum((dr.select(w != 0, w * a, 0) for w, a in zip(weight, amount, strict=True)), mi.Float(0))
+        for k, slope in enumerate(self._area_slopes(d)):
+            dr.scatter_add(self.flakes_gradient, change * slope, mi.UInt32(k), active)
+
+    def _push_flakes(self, d: mi.Vector3f) -> mi.Float:
+        """Tangent of the logarithm of the area."""
+        return sum((s * t for s, t in zip(self._area_slopes(d), self.flakes_tangent, strict=True)), mi.Float(0))
 
     def extinction(self, ray: mi.Ray3f, parts: list[Part] | None = None) -> SumField:
         """The sum of parts (all of them, unless told which), which share their cells, along a ray, without derivatives."""
@@ -104,7 +128,11 @@ class Body:
         """Derivative of the optical depth along the tangent that :meth:`World.start_tangent` took from the parameters."""
         pairs = list(zip(self.view.parts, self.tangents, strict=True))
         area = self.area(ray.d)
-        return [area * change for change in self._sum(ray, t0, t1, channels, active, pairs, False)]
+        rows = [area * change for change in self._sum(ray, t0, t1, channels, active, pairs, False)]
+        if self.flakes_tangent is None:
+            return rows
+        turned = self._push_flakes(ray.d)
+        return [r + t * turned for r, t in zip(rows, self.optical_depth(ray, t0, t1, channels, active), strict=True)]
 
     def _sum(
         self,
@@ -140,6 +168,8 @@ class Body:
 
     def backproject(self, ray: mi.Ray3f, t0: mi.Float, t1: mi.Float, weight: list[mi.Float], active: mi.Bool) -> None:
         """Add ``weight`` (d loss / d tau of each channel) times this stretch to the gradients of the parts."""
+        if self.flakes_gradient is not None:
+            self._pull_flakes(ray.d, weight, self.optical_depth(ray, t0, t1, len(weight), active), active)
         weight = [self.area(ray.d) * w for w in weight]
         for part, gradient in zip(self.view.parts, self.gradients, strict=True):
             w = _for_part(weight, part.channels)
@@ -163,7 +193,11 @@ class Body:
     def tangent_at(self, ray: mi.Ray3f, t: mi.Float, channels: int, active: mi.Bool, name: str = "sigma_") -> list[mi.Float]:
         """As :meth:`extinction_at`, of the tangent that :meth:`World.start_tangent` took from the parameters."""
         pairs = [(p, v) for p, v in zip(self.view.parts, self.tangents, strict=True) if p.name.startswith(name)]
-        return self._at(ray, t, channels, active, pairs)
+        rows = self._at(ray, t, channels, active, pairs)
+        if self.flakes_tangent is None:
+            return rows
+        turned = self._push_flakes(ray.d)
+        return [r + s * turned for r, s in zip(rows, self.extinction_at(ray, t, channels, active, name), strict=True)]
 
     def _at(
         self, ray: mi.Ray3f, t: mi.Float, channels: int, active: mi.Bool, pairs: list[tuple], activated: bool = False
@@ -211,6 +245,8 @@ class Body:
 
     def deposit(self, ray: mi.Ray3f, t: mi.Float, weight: list[mi.Float], active: mi.Bool, name: str = "sigma_") -> None:
         """Add ``weight`` (d loss / d coefficient of each channel) at a point of a ray: the transpose of :meth:`tangent_at`."""
+        if self.flakes_gradient is not None:
+            self._pull_flakes(ray.d, weight, self.extinction_at(ray, t, len(weight), active, name), active)
         weight = [self.area(ray.d) * w for w in weight]
         for part, gradient in zip(self.view.parts, self.gradients, strict=True):
             if not part.name.startswith(name):
@@ -317,6 +353,7 @@ class World:
     def start_gradients(self) -> None:
         """Begin a reverse pass: gradients of zero for each part."""
         for body in self.bodies:
+            body.flakes_gradient = dr.zeros(mi.Float, 6) if _is_followed(body.view.flakes) else None
             body.gradients = [
                 Gradient.zeros(p.lattice) if p.lattice is not None else dr.zeros(mi.Float, p.channels) for p in body.view.parts
             ]
@@ -330,7 +367,10 @@ class World:
                 dr.eval(flat)
                 # The derivative of this product is the gradient, for the values and for the scale alike.
                 total += dr.sum(dr.ravel(body.view.scale * _values(part)) * flat)
-            body.gradients = []
+            if body.flakes_gradient is not None:
+                slopes = (dr.gather(mi.Float, body.flakes_gradient, mi.UInt32(k)) for k in range(6))
+                total += sum(s * g for s, g in zip(body.view.flakes, slopes, strict=True))
+            body.gradients, body.flakes_gradient = [], None
         if dr.grad_enabled(total):
             dr.backward(total)
 
@@ -342,7 +382,15 @@ class World:
             if asked:
                 dr.forward_to(*asked)
             body.tangents = [dr.detach(dr.grad(p)) for p in products]
-            dr.eval(body.tangents)
+            if _is_followed(body.view.flakes):
+                dr.forward_to(body.view.flakes, flags=dr.ADFlag.ClearEdges)
+                body.flakes_tangent = dr.detach(dr.grad(body.view.flakes))
+            dr.eval(body.tangents, body.flakes_tangent)
+
+
+def _is_followed(flakes: list[mi.Float] | None) -> bool:
+    with dr.resume_grad():
+        return flakes is not None and dr.grad_enabled(flakes)
 
 
 LUMINANCE = (0.212671, 0.715160, 0.072169)
