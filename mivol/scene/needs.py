@@ -7,7 +7,7 @@ been replaced, and never while a function is being recorded by ``dr.freeze``.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -27,9 +27,15 @@ from mivol.transport.tracking import Blocks, find_blocks
 __all__ = ["Boundary", "MediumFacts", "Needs", "find_needs", "is_scattering"]
 
 
+AROUND = "space around shapes"
+
+
 @dataclass(frozen=True)
 class Boundary:
-    """One medium behind one shape: the medium, its name in the scene, and the box it fills (None: another shape)."""
+    """One medium and where it is: its name in the scene, the shape that it fills, and its box, if the shape is one.
+
+    A medium that fills no shape of its own (around other shapes, around the camera, in instances) is behind ``AROUND``.
+    """
 
     medium: mi.Medium
     name: str
@@ -96,7 +102,10 @@ class Needs:
 
 @dataclass
 class Survey:
-    """What does not change while a scene lives: found once, with what was read of each array."""
+    """What does not change while shapes stay where they are: found once, with what was read of each array.
+
+    ``marks`` tells where boundaries were: shapes, and what another place would change of them.
+    """
 
     boundaries: tuple[Boundary, ...]
     surfaces: tuple[str, ...]
@@ -104,9 +113,15 @@ class Survey:
     emitters: tuple[str, ...]
     lamps: tuple[str, ...]
     refractive: tuple[str, ...]
+    marks: tuple[tuple[mi.Shape, object], ...] = ()
     scatters: dict = field(default_factory=dict)
     values: dict = field(default_factory=dict)
     places: dict = field(default_factory=dict)
+
+    @property
+    def is_current(self) -> bool:
+        """Whether no boundary has been moved since. What ``dr.freeze`` records stays where it is."""
+        return dr.flag(dr.JitFlag.FreezingScope) or all(_is_at(shape, mark) for shape, mark in self.marks)
 
 
 def find_needs(scene: mi.Scene, sensor: mi.Sensor, survey: Survey | None = None, spp: int = 0) -> Needs:
@@ -124,11 +139,13 @@ def find_needs(scene: mi.Scene, sensor: mi.Sensor, survey: Survey | None = None,
     check_variant()
     survey = survey or survey_scene(scene)
     recording = bool(dr.flag(dr.JitFlag.FreezingScope))
-    views = tuple(view_medium(b.medium, b.box, survey.places) for b in survey.boundaries)
-    media = tuple(_facts(b, view, survey, recording) for b, view in zip(survey.boundaries, views, strict=True))
+    start = [] if sensor.get_medium() is None else [sensor.get_medium()]
+    boundaries = (*survey.boundaries, *_around(start, survey.boundaries))
+    views = tuple(view_medium(b.medium, b.box, survey.places) for b in boundaries)
+    media = tuple(_facts(b, view, survey, recording) for b, view in zip(boundaries, views, strict=True))
     return Needs(
         variant=mi.variant(),
-        boundaries=survey.boundaries,
+        boundaries=boundaries,
         views=views,
         media=media,
         surfaces=survey.surfaces,
@@ -149,18 +166,35 @@ def survey_scene(scene: mi.Scene) -> Survey:
     shapes = scene.shapes()
     for index, shape in enumerate(shapes):
         if shape.is_medium_transition():
-            boundaries.append(_boundary(shape, index, shapes))
+            name = shape.id() or f"shape {index}"
+            if shape.interior_medium() is not None:
+                boundaries.append(_boundary(shape, name, shapes))
             if int(shape.bsdf().flags()) & (int(mi.BSDFFlags.DeltaTransmission) | int(mi.BSDFFlags.GlossyTransmission)):
-                refractive.append(f"{boundaries[-1].name} ({shape.bsdf().class_name()})")
+                refractive.append(f"{name} ({shape.bsdf().class_name()})")
         if not _is_bare(shape):
             surfaces.append(shape.class_name())
-            veiled |= mi.has_flag(shape.bsdf().flags(), mi.BSDFFlags.Null)
+            # What an instance shows has other BSDFs than its own.
+            veiled |= _is_instance(shape) or mi.has_flag(shape.bsdf().flags(), mi.BSDFFlags.Null)
     kinds = tuple(e.class_name() for e in scene.emitters())
     # Mitsuba makes one object of equal media: where one boundary has to be traced, all boundaries of that medium are.
     traced = {b.medium.ptr for b in boundaries if b.box is None}
     boundaries = [replace(b, box=None) if b.medium.ptr in traced else b for b in boundaries]
+    boundaries += _around([o for o in mi.traverse(scene).hierarchy if isinstance(o, mi.Medium)], boundaries)
     lamps = tuple(_lamp(e) for e in scene.emitters())
-    return Survey(tuple(boundaries), tuple(surfaces), bool(veiled), kinds, lamps, tuple(refractive))
+    marks = tuple((s, _mark(s)) for s in shapes if s.is_medium_transition())
+    return Survey(tuple(boundaries), tuple(surfaces), bool(veiled), kinds, lamps, tuple(refractive), marks)
+
+
+def _mark(shape: mi.Shape) -> object:
+    """What another place would change of a shape: the array of a mesh's vertices, else its box."""
+    if shape.is_mesh():
+        return dr.detach(mi.traverse(shape)["vertex_positions"])
+    return [*shape.bbox().min, *shape.bbox().max]
+
+
+def _is_at(shape: mi.Shape, mark: object) -> bool:
+    now = _mark(shape)
+    return now == mark if isinstance(mark, list) else now.index == mark.index
 
 
 def _lamp(emitter: mi.Emitter) -> str:
@@ -175,14 +209,20 @@ def _is_bare(shape: mi.Shape) -> bool:
     return bsdf is not None and int(bsdf.flags()) & int(mi.BSDFFlags.All) == int(mi.BSDFFlags.Null) and not shape.is_emitter()
 
 
-def _boundary(shape: mi.Shape, index: int, shapes: list[mi.Shape]) -> Boundary:
-    inside, outside = shape.interior_medium(), shape.exterior_medium()
-    name = shape.id() or f"shape {index}"
-    if inside is None:
-        raise MivolError(f"{name} has a medium on its outside only; put the medium inside a shape that bounds it.")
+def _is_instance(shape: mi.Shape) -> bool:
+    return shape.class_name() == "Instance"
+
+
+def _boundary(shape: mi.Shape, name: str, shapes: list[mi.Shape]) -> Boundary:
     alone = all(other is shape or not _overlap(shape, other) for other in shapes if other.is_medium_transition())
-    is_box = shape.class_name() == "Cube" and outside is None and _is_bare(shape) and alone
-    return Boundary(inside, name, shape.class_name(), box_of_cube(shape) if is_box else None)
+    is_box = shape.class_name() == "Cube" and shape.exterior_medium() is None and _is_bare(shape) and alone
+    return Boundary(shape.interior_medium(), name, shape.class_name(), box_of_cube(shape) if is_box else None)
+
+
+def _around(media: Iterable[mi.Medium], boundaries: Sequence[Boundary]) -> list[Boundary]:
+    """Those of some media that fill no shape of their own: found on the way, by the surfaces around them."""
+    held = {b.medium.ptr for b in boundaries}
+    return [Boundary(m, m.id() or "a medium without an id", AROUND, None) for m in media if m.ptr not in held]
 
 
 def _overlap(a: mi.Shape, b: mi.Shape) -> bool:
@@ -199,11 +239,12 @@ def _camera_inside(scene: mi.Scene, sensor: mi.Sensor, survey: Survey) -> bool:
     if all(b.box is not None for b in survey.boundaries):
         return False
     eye = sensor.bbox()
-    boxes = [s.bbox() for s in scene.shapes() if s.is_medium_transition()]
-    # A sensor at infinity has no box of its own: its rays start outside the scene.
-    if not eye.valid():
+    boxes = [s.bbox() for s in scene.shapes() if s.is_medium_transition() or _is_instance(s)]
+    # A sensor at infinity has no box of its own: its rays start outside the scene. Walls of a room are flat.
+    if not eye.valid() or not boxes:
         return False
-    return any(bool((np.array(eye.max) >= b.min).all() and (np.array(eye.min) <= b.max).all()) for b in boxes)
+    low, high = np.min([b.min for b in boxes], axis=0), np.max([b.max for b in boxes], axis=0)
+    return bool((np.array(eye.max) >= low).all() and (np.array(eye.min) <= high).all())
 
 
 @dataclass
@@ -320,7 +361,7 @@ def _facts(boundary: Boundary, view: MediumView, survey: Survey, recording: bool
     common = {
         "name": boundary.name,
         "kind": kind_of(boundary.medium),
-        "boundary": "a box" if boundary.box is not None else f"a {boundary.shape}, traced",
+        "boundary": _where(boundary),
         "extinction": "rgb" if view.channels == 3 else "grey",
         "resolutions": tuple(g.res for g in grids),
         "phase": _phase_name(phase),
@@ -335,6 +376,12 @@ def _facts(boundary: Boundary, view: MediumView, survey: Survey, recording: bool
     occupied = min((r.occupied for r in reads), default=1.0)
     scatters = survey.scatters[boundary.name] = is_scattering(view, survey, boundary.name)
     return MediumFacts(**common, is_scattering=scatters, occupied=occupied, tau_max=_tau_max(boundary, view, reads))
+
+
+def _where(boundary: Boundary) -> str:
+    if boundary.box is not None:
+        return "a box"
+    return f"{AROUND}, traced" if boundary.shape == AROUND else f"a {boundary.shape}, traced"
 
 
 def _phase_name(phase: mi.PhaseFunction | None) -> str:

@@ -17,7 +17,7 @@ from mivol.scene.load import find_sensor
 from mivol.scene.needs import Needs, Survey, find_needs, read_coarse, survey_scene
 from mivol.scene.plan import Plan, build_world, check_aovs, make_plan
 from mivol.transport.aovs import backproject_aovs, integrate_aovs, push_aovs
-from mivol.transport.control import View, find_control
+from mivol.transport.control import View, find_control, find_level
 from mivol.transport.film import PLAIN, SPREAD, TILED, Rays, adjoint_rays, record
 from mivol.transport.light_grid import Shade, find_light_grid, find_shade
 from mivol.transport.path import Settings, is_straight, walk_path
@@ -124,7 +124,7 @@ class Session:
     def _open(self, scene: mi.Scene, sensor: mi.Sensor, spp: int, pictures: bool = False) -> tuple[World, Plan]:
         """Ask, plan, and build the media, for pictures or for derivatives."""
         parts = [*scene.shapes(), *scene.emitters()]
-        if self._seen is None or not self._seen.is_of(parts):
+        if self._seen is None or not self._seen.is_of(parts) or not self._seen.survey.is_current:
             self._seen = _Seen(parts, survey_scene(scene))
         survey = self._seen.survey
         needs = find_needs(scene, sensor, survey, spp)
@@ -177,8 +177,10 @@ def _layout(world: World) -> str:
 
 def _take_control(scene: mi.Scene, world: World, rays: Rays) -> None:
     """Find the control variate of a derivative, once for all passes."""
-    if world.takes_control and world.control is None:
-        world.control = find_control(scene, world, world.bodies[0], View.of(rays.ray))
+    if world.takes_control:
+        world.control = world.control or find_control(scene, world, world.bodies[0], View.of(rays.ray))
+    elif world.lights is not None and world.level is None:
+        world.level = find_level(scene, world)
 
 
 def _black(ray: mi.Ray3f) -> mi.Spectrum:

@@ -29,7 +29,7 @@ from mivol.transport.optical_depth import gauss_points
 from mivol.transport.path import DARK, Visit
 from mivol.transport.world import Body, World
 
-__all__ = ["Event", "Focus", "Lamp", "Pick", "offer", "place", "start_pick", "taken_light"]
+__all__ = ["Event", "Focus", "Lamp", "Pick", "lit_length", "offer", "place", "start_pick", "taken_light"]
 
 NEWTON_STEPS = 8
 """Each doubles the digits; where the extinction vanishes at an end they are halvings, and 2^-8 of a cell holds no light."""
@@ -180,10 +180,13 @@ def _fly(
     spread = dr.select(dr.isfinite(filled) & (filled > 0), kappa * _inverse(filled), 0) if kappa else None
 
     def add_constant(pick: Pick, a: mi.Float, b: mi.Float) -> Pick:
-        dt = dr.maximum(b - a, 0)
-        # A ray that misses the medium may be infinitely long.
-        tau = [dr.select(on & (s != 0), s * dt, 0) for s in world.rows(field.constant)]
-        return _offer_piece(pick, a, mi.Float(0), dt, tau, lamp.focus, None, spread, on & (dt > 0))
+        sigma, front = world.rows(field.constant), pick.tau
+        length = dr.select(on, dr.maximum(b - a, 0), 0)
+        dt = lit_length(sigma, length)
+        pick = _offer_piece(pick, a, mi.Float(0), dt, [s * dt for s in sigma], lamp.focus, None, spread, on & (dt > 0))
+        # A length may have no end.
+        tau = [f + dr.select(s > 0, s * length, 0) for f, s in zip(front, sigma, strict=True)]
+        return replace(pick, tau=tau, T=[dr.exp(-t) for t in tau])
 
     if segment is None:
         pick = add_constant(pick, t0, t1)
@@ -206,6 +209,14 @@ def _fly(
     if field.has_constants:
         pick = add_constant(pick, dr.select(hit, segment.t0 + segment.length, t1), t1)
     return _note_spread(pick, spread)
+
+
+def lit_length(sigma: list[mi.Float], length: mi.Float) -> mi.Float:
+    """How far a stretch of constant extinction is worth a look: to the optical depth ``DARK`` of its clearest channel."""
+    least = mi.Float(dr.inf)
+    for s in sigma:
+        least = dr.select(s > 0, dr.minimum(least, s), least)
+    return dr.minimum(length, DARK / least)
 
 
 def _least_of(rows: list[mi.Float]) -> mi.Float:

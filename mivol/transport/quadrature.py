@@ -25,7 +25,7 @@ import mitsuba as mi
 
 from mivol.numerics import phi1
 from mivol.transport.direct import focus_on
-from mivol.transport.free_flight import Focus
+from mivol.transport.free_flight import Focus, lit_length
 from mivol.transport.lattice import Cell, clip, walk
 from mivol.transport.optical_depth import GAUSS
 from mivol.transport.path import Reach, Stretch, reach, shadow_ray
@@ -113,7 +113,8 @@ def _integrate_body(
         return _source(scene, world, body, ray, lamp, number, t, active)
 
     def add_constant(state: _Sum, a: mi.Float, b: mi.Float) -> _Sum:
-        dt, sigma = dr.select(on, dr.maximum(b - a, 0), 0), world.rows(field.constant)
+        sigma = world.rows(field.constant)
+        dt = dr.select(on, lit_length(sigma, dr.maximum(b - a, 0)), 0)
         return _pieces(state, a, dt, lambda x: sigma, source, focus, mi.Float(STRETCH), on & (dt > 0))
 
     t0, t1 = mi.Float(t0), mi.Float(t1)

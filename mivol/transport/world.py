@@ -149,7 +149,7 @@ class Body:
         total = [mi.Float(0) for _ in range(channels)]
         for part, value in pairs:
             if part.lattice is None:
-                length = _length(t0, t1, active)
+                length = _length(t0, t1, active) if skip else _ending(_length(t0, t1, active))
                 # A ray that never leaves a medium has infinite length: 0 * inf would be NaN.
                 # (A grey value is taken whole: the index of a Dr.Jit array reads it, and bakes it into the kernel.)
                 each = [value] if part.channels == 1 else [value.x, value.y, value.z]
@@ -174,7 +174,7 @@ class Body:
         for part, gradient in zip(self.view.parts, self.gradients, strict=True):
             w = _for_part(weight, part.channels)
             if part.lattice is None:
-                length = _length(t0, t1, active)
+                length = _ending(_length(t0, t1, active))
                 for c in range(part.channels):
                     dr.scatter_add(gradient, dr.select(w[c] != 0, w[c] * length, 0), mi.UInt32(c), active)
                 continue
@@ -295,6 +295,7 @@ class World:
         self.scatters, self.is_veiled, self.start, self.locates = scatters, is_veiled, start, locates
         self.lights = lights
         self.control: Control | None = None
+        self.level: mi.Spectrum | None = None
         self.shade: Shade | None = None
         self.light_grid: LightGrid | None = None
         self.is_deterministic, self.events = is_deterministic, events
@@ -453,6 +454,11 @@ def _values(part: Part) -> mi.Float | mi.Color3f:
 
 def _length(t0: mi.Float, t1: mi.Float, active: mi.Bool) -> mi.Float:
     return dr.select(active & (t1 > t0), mi.Float(t1 - t0), 0)
+
+
+def _ending(length: mi.Float) -> mi.Float:
+    """A length for derivatives: a stretch without end lets nothing through, and nothing behind it changes."""
+    return dr.select(length < 1e30, length, 0)
 
 
 def _fits(part: Part, box: Box) -> bool:

@@ -332,6 +332,100 @@ def test_camera_inside(shape):
     assert_same_images(scene, rounding=LEAK)
 
 
+FOG = {"type": "homogeneous", "sigma_t": 0.3, "albedo": 0.7, "phase": {"type": "hg", "g": 0.3}, "id": "fog"}
+
+
+def floor() -> dict:
+    return {"floor": {"type": "rectangle", "to_world": turn().translate([0, 0, -1]).scale(5), "bsdf": RED}}
+
+
+def walls(**more: object) -> dict:
+    """Six walls that face the inside of a room, from -2 to 2."""
+    tilts = [([1, 0, 0], 0), ([1, 0, 0], 180), ([1, 0, 0], 90), ([1, 0, 0], -90), ([0, 1, 0], 90), ([0, 1, 0], -90)]
+    place = [turn().rotate(*tilt).translate([0, 0, -2]).scale(2) for tilt in tilts]
+    return {f"wall{k}": {"type": "rectangle", "to_world": p, "bsdf": {"type": "diffuse"}, **more} for k, p in enumerate(place)}
+
+
+def instances(interior: dict) -> dict:
+    """Two balls of one kind."""
+    places = [turn().translate([0.4, 0, 0]), turn().translate([-0.7, 0.1, 0])]
+    balls = {f"ball{k}": {"type": "instance", "to_world": p, "of": {"type": "ref", "id": "kind"}} for k, p in enumerate(places)}
+    return {"kind": {"type": "shapegroup", "ball": ball_of(interior, (0, 0, 0), 0.5)}, **balls}
+
+
+INSIDE = {
+    "fog without an end": lambda fog: floor(),
+    "fog around a ball": lambda fog: {"ball": ball_of(medium("homogeneous", 2.0, 0.8), (0, 0, 0), 0.6) | {"exterior": fog}},
+    "a room": lambda fog: {**walls(exterior=fog), "ball": {"type": "sphere", "radius": 0.4, "bsdf": RED}},
+}
+
+
+@pytest.mark.parametrize("where", small.cases(INSIDE, ["fog around a ball"]))
+def test_media_that_fill_no_shape_of_their_own(where):
+    """Around the camera, around shapes, and between walls: where no boundary ends a homogeneous medium it has no end."""
+    ref = {"type": "ref", "id": "fog"}
+    parts = {"fog": FOG, **INSIDE[where](ref), "bulb": point([0.3, 0.2, 1.5], 4.0)[0]}
+    sensor = scenes.camera((1.5, -1.2, 1.0), (0, 0, 0), res=16, fov=40.0)
+    scene = mi.load_dict({"type": "scene", **parts, "sensor": sensor | {"medium": ref}})
+    assert_same_images(scene, rounding=LEAK, precision=0.02)
+    if where == "a room":
+        silent = mi.load_dict({"type": "scene", **parts, "sensor": sensor})
+        small.assert_same_whole(moments(silent, mivol(), 32), moments(scene, mivol(), 32, first=500), precision=0.02)
+
+
+@pytest.mark.parametrize("kind", small.cases(["homogeneous", "grid"], ["grid"]))
+def test_media_in_instances(kind):
+    interior = medium("homogeneous", 2.0, 0.8) if kind == "homogeneous" else grid_in({})["interior"]
+    same(lit(instances(interior)))
+
+
+def test_fog_without_an_end_by_quadrature_and_its_derivatives():
+    """The same light as drawn; the derivative of its density, forward and by differences of pictures without noise."""
+    parts = {"fog": FOG, **floor(), "bulb": point([0.3, 0.2, 1.5], 4.0)[0]}
+    sensor = scenes.camera((1.5, -1.2, 1.0), (0, 0, 0), res=6, fov=40.0) | {"medium": {"type": "ref", "id": "fog"}}
+    scene = mi.load_dict({"type": "scene", **parts, "sensor": sensor})
+    params, key = mi.traverse(scene), "fog.sigma_t.value.value"
+    quiet = mi.load_dict(mivol(deterministic=True))
+
+    def picture(sigma: float, spp: int, seed: int = 0) -> float:
+        params[key] = mi.Float(sigma)
+        params.update()
+        return float(np.array(mi.render(scene, integrator=quiet, spp=spp, seed=seed)).mean(dtype=np.float64))
+
+    drawn = moments(scene, mivol(), 512).mean.mean()
+    assert picture(0.3, 64) == pytest.approx(drawn, rel=0.02)  # both know a pixel by some of its rays only
+    slope = np.mean([(picture(0.33, 64, s) - picture(0.27, 64, s)) / 0.06 for s in range(4)])
+    params[key] = mi.Float(0.3)
+    dr.enable_grad(params[key])
+    params.update()
+    found = []
+    for seed in range(16):
+        image = mi.render(scene, params, integrator=mi.load_dict(mivol()), spp=256, seed=seed)
+        dr.set_grad(params[key], 0)
+        dr.backward(dr.mean(image, axis=None))
+        found.append(float(dr.grad(params[key])[0]))
+    # 1 % for the difference's own curvature
+    assert abs(np.mean(found) - slope) < 5 * np.std(found, ddof=1) / 4 + 0.01 * abs(slope)
+    assert np.std(found, ddof=1) / 4 < 0.05 * abs(slope)
+
+
+def test_boundaries_that_are_moved():
+    """An integrator that has rendered a scene sees that its box was moved, turned and taken back; volpath judges."""
+    fog = box_of(medium("homogeneous", 1.0, 0.8), centred(0.5 * np.eye(3), (0, 0, 1.6)))
+    scene = close_up(lit({"smoke": grid_in(cube(PLACE)), "fog": fog}))
+    ours, params = mi.load_dict(mivol()), mi.traverse(scene)
+    first = np.array(mi.render(scene, integrator=ours, spp=16))
+    key = "smoke.vertex_positions"
+    there = np.array(params[key]).reshape(-1, 3)
+    for change in (lambda p: 0.6 * p + [0.2, 0, 0], lambda p: p @ rotation([0, 0, 1], 0.4).T):
+        params[key] = mi.Float(change(there).astype(np.float32).ravel())
+        params.update()
+        assert_same_images(scene, rounding=LEAK, ours=ours)
+    params[key] = mi.Float(there.ravel())
+    params.update()
+    np.testing.assert_array_equal(np.array(mi.render(scene, integrator=ours, spp=16)), first)
+
+
 def test_camera_inside_that_names_no_medium():
     """Volpath starts in vacuum then; we find the medium: the picture is that of a sensor that names it."""
     interior = grid_in({}, seed=4)["interior"] | {"id": "fog"}
