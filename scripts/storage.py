@@ -150,7 +150,10 @@ class Fitted:
 
     @classmethod
     def of(cls, folder: Path) -> Fitted:
-        """Read a run folder."""
+        """Read a run folder; the process ends with a sentence where it holds no fit."""
+        absent = [name for name in ("run.json", "field.npz") if not (folder / name).is_file()]
+        if absent:
+            raise SystemExit(f"{folder} has no {' and no '.join(absent)}; give folders of fits to photographs.")
         record = json.loads((folder / "run.json").read_text(encoding="utf-8"))
         with np.load(folder / "field.npz", allow_pickle=False) as stored:
             res, sh, sparse = stored["res"].tolist(), stored["sh"].shape, "nodes" in stored

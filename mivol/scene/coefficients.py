@@ -39,11 +39,14 @@ class Coefficients:
         """Read a medium's coefficients from plugin parameters.
 
         Raises:
-            MivolError: both pairs, half of a pair, or a negative number.
+            MivolError: both pairs, half of a pair, a negative number, or a radiance field for another thing than the emission.
         """
         given = [n for pair in PAIRS for n in pair if n in props]
         if is_radiance_field(props.get("emission", 0.0)):
             return cls._of_field(props, given)
+        fields = [n for n in (*given, "emission_density") if is_radiance_field(props.get(n, 0.0))]
+        if fields:
+            raise MivolError(f"mivol_medium was given a mivol_sh as {fields[0]}; give it as the emission, and nothing else.")
         pair = next((p for p in PAIRS if set(given) <= set(p)), None)
         if pair is None or not given or given == ["albedo"]:
             raise MivolError(

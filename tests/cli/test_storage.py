@@ -92,3 +92,9 @@ def test_what_is_printed(variant_rgb, tmp_path: Path) -> None:
     assert judged["dense SH 2"] == "not fitted"
     fitted = json.loads(lines[-1])["fitted"][0]
     assert (fitted["kept"], fitted["share"], fitted["file"]) == (210, 1.0, (run / "field.npz").stat().st_size)
+
+
+def test_a_folder_that_holds_no_fit(storage, tmp_path: Path) -> None:
+    (tmp_path / "run.json").write_text("{}")
+    with pytest.raises(SystemExit, match="has no field.npz; give folders of fits to photographs"):
+        storage.Fitted.of(tmp_path)

@@ -230,8 +230,10 @@ def test_refusals(variant_rgb: None) -> None:
     with pytest.raises(RuntimeError, match="brings its own extinction"):
         mi.load_dict({"type": "mivol_medium", "sigma_t": 1.0, "emission": field()["interior"]["emission"]})
     for kind in ("mivol_medium", "heterogeneous"):
-        with pytest.raises(RuntimeError, match="a mivol_sh was given as an extinction; give it as the emission"):
+        with pytest.raises(RuntimeError, match="a mivol_sh (was given as an extinction|as sigma_t); give it as the emission"):
             mi.load_dict({"type": kind, "sigma_t": field()["interior"]["emission"]})
+    with pytest.raises(RuntimeError, match="a mivol_sh as emission_density; give it as the emission"):
+        mi.load_dict({"type": "mivol_medium", "sigma_t": 1.0, "emission_density": field()["interior"]["emission"]})
     assert np.isnan(render(scene(field()), {"type": "volpath"}, 1)).any()
     params = mi.traverse(scene(field()))
     with refused("are expected"):
