@@ -227,11 +227,19 @@ def _around(media: Iterable[mi.Medium], boundaries: Sequence[Boundary]) -> list[
 
 def _overlap(a: mi.Shape, b: mi.Shape) -> bool:
     """Whether the bounding boxes of two shapes share more than a face."""
-    one, two = a.bbox(), b.bbox()
-    low = np.maximum(np.array(one.min), np.array(two.min))
-    high = np.minimum(np.array(one.max), np.array(two.max))
+    one, two = _bounds(a), _bounds(b)
+    low, high = np.maximum(one[0], two[0]), np.minimum(one[1], two[1])
     # Neighbours may share a face, whose float32 vertices agree to 1e-6 of their size only.
     return bool((high - low > 1e-6 * np.maximum(np.abs(high), np.abs(low))).all())
+
+
+def _bounds(shape: mi.Shape) -> tuple[np.ndarray, np.ndarray]:
+    """Lower and upper corner of a shape. Meshes that Mitsuba 3.9.1 has merged have no valid box of their own."""
+    box = shape.bbox()
+    if box.valid():
+        return np.array(box.min), np.array(box.max)
+    points = np.array(mi.traverse(shape)["vertex_positions"]).reshape(-1, 3)
+    return points.min(axis=0), points.max(axis=0)
 
 
 def _camera_inside(scene: mi.Scene, sensor: mi.Sensor, survey: Survey) -> bool:
@@ -239,11 +247,11 @@ def _camera_inside(scene: mi.Scene, sensor: mi.Sensor, survey: Survey) -> bool:
     if all(b.box is not None for b in survey.boundaries):
         return False
     eye = sensor.bbox()
-    boxes = [s.bbox() for s in scene.shapes() if s.is_medium_transition() or _is_instance(s)]
+    boxes = [_bounds(s) for s in scene.shapes() if s.is_medium_transition() or _is_instance(s)]
     # A sensor at infinity has no box of its own: its rays start outside the scene. Walls of a room are flat.
     if not eye.valid() or not boxes:
         return False
-    low, high = np.min([b.min for b in boxes], axis=0), np.max([b.max for b in boxes], axis=0)
+    low, high = np.min([b[0] for b in boxes], axis=0), np.max([b[1] for b in boxes], axis=0)
     return bool((np.array(eye.max) >= low).all() and (np.array(eye.min) <= high).all())
 
 
