@@ -10,6 +10,8 @@ whose variance falls with the square of what is left (measured: 6 times less in 
 Conventions. S is found on a coarse lattice from a few directions a node, towards the middle of the cameras' rays, and spread
 over the cells of the grid; light near a lamp is cut at a few times the mean, since a wrong S costs more than none.
 
+Where the lattice does not serve, S may be one number for all places (:func:`find_level`).
+
 References: Rousselle et al. 2016 (control variates in rendering); the split is for a fixed S the reparameterisation-free
 derivative of the equation of transfer.
 """
@@ -21,7 +23,7 @@ from dataclasses import dataclass, replace
 import drjit as dr
 import mitsuba as mi
 
-from mivol.transport.direct import Draw, arrivals
+from mivol.transport.direct import UNIFORM, Draw, arrivals
 from mivol.transport.free_flight import taken_light
 from mivol.transport.lattice import Cell, Lattice, Nodes, box_nodes, clip, locate, read_nodes, walk
 from mivol.transport.optical_depth import GAUSS, gauss_points, interpolate, node_weights, upward_frac, weights
@@ -29,7 +31,7 @@ from mivol.transport.path import visit_boxes
 from mivol.transport.scatter import albedo
 from mivol.transport.world import Body, World
 
-__all__ = ["Control", "Probe", "View", "find_control", "sweep"]
+__all__ = ["Control", "Probe", "View", "find_control", "find_level", "sweep"]
 
 STEP = 8
 """Cells between the nodes of the coarse lattice."""
@@ -86,6 +88,29 @@ class Control:
         cell, _, inside = locate(body.view.parts[0].lattice, ray.o, ray.d, t)
         S = self.at(cell, inside & active)
         return S * 3 if self.channels == 1 and not mi.is_monochromatic else S
+
+
+def find_level(scene: mi.Scene, world: World) -> mi.Spectrum | None:
+    r"""A source function S [radiance] that is the same everywhere: the mean albedo times what a constant sky sends.
+
+    The exact part of its gradient is the same number all along a ray, :math:`T(D)\,S`, so it needs no lattice and serves media
+    of any number and boundary that have an albedo. None where there is no such medium or no constant sky.
+    """
+    skies = [e for e in scene.emitters() if e.class_name() == UNIFORM]
+    shares = [a for body in world.bodies for a in body.view.albedo]
+    if not skies or any(body.view.share is None for body in world.bodies):
+        return None
+    mean = sum(_mean_of(a) for a in shares) / len(shares)
+    return mean * dr.detach(skies[0].eval(dr.zeros(mi.SurfaceInteraction3f)))
+
+
+def _mean_of(albedo: mi.TensorXf | mi.Float | mi.Color3f) -> mi.Spectrum:
+    """Mean over space of an albedo, or of its volume."""
+    flat = dr.ravel(dr.detach(albedo))
+    n = albedo.shape[-1] if dr.is_tensor_v(albedo) else dr.width(flat)
+    of_each = dr.arange(mi.UInt32, dr.width(flat) // n) * n
+    rows = [dr.mean(dr.gather(mi.Float, flat, of_each + c)) for c in range(n)]
+    return mi.Spectrum(*rows) if len(rows) == 3 and not mi.is_monochromatic else mi.Spectrum(sum(rows) / n)
 
 
 def find_control(scene: mi.Scene, world: World, body: Body, view: View) -> Control:

@@ -23,10 +23,11 @@ from functools import partial
 import drjit as dr
 import mitsuba as mi
 
+from mivol.numerics import phi1
 from mivol.transport.chain import Chain
 from mivol.transport.control import Probe, Tracks, sweep
 from mivol.transport.emission import backproject_emission, integrate_emission
-from mivol.transport.path import Reach, Stretch, Way, optical_depth_to, reach, revisit
+from mivol.transport.path import Reach, Stretch, Way, optical_depth_to, reach, revisit, transmittance
 from mivol.transport.quadrature import integrate_scattering
 from mivol.transport.scatter import Scattering, albedo, at_event, scatter, scattered_light, sigma_t_at
 from mivol.transport.world import Body, World, by_channel, spectrum, tangent_of
@@ -163,9 +164,11 @@ class Tangent:
                 shares = [[(c % of, b)] for c, b in enumerate(_colours(lit))]
                 dL += mi.Spectrum(*_sweep(world, stretch, end, tau, event, shares, 0 * one, one, True, active))
             else:
-                dL += _push_source(scene, world, stretch, event)
-        way = Way(stretch.ray, stretch.medium, end.t)
-        return end, tau, Tangent(self.L, dL, self.dtau + _tangent(scene, world, way, active))
+                dL += _push_source(scene, world, stretch, tau, event)
+        along = _tangent(scene, world, Way(stretch.ray, stretch.medium, end.t), active)
+        if world.lights is not None:
+            dL += _level_behind(world, stretch, tau) * along
+        return end, tau, Tangent(self.L, dL, self.dtau + along)
 
     def _stretch_that_emits(
         self, scene: mi.Scene, world: World, stretch: Stretch, active: mi.Bool
@@ -256,8 +259,9 @@ def _pull_stretch(
         _sweep(world, stretch, end, tau, event, shares, dL * L, dL, False, active)
         return
     if event is not None:
-        _pull_source(scene, world, stretch, event, dL)
-    _backproject(scene, world, Way(stretch.ray, stretch.medium, end.t), -dL * L, active)
+        _pull_source(scene, world, stretch, tau, event, dL)
+    kept = 0 if event is None else _level_behind(world, stretch, tau)
+    _backproject(scene, world, Way(stretch.ray, stretch.medium, end.t), dL * (kept - L), active)
 
 
 def _pull_arrivals(scene: mi.Scene, world: World, event: Scattering, dL: mi.Spectrum) -> None:
@@ -307,15 +311,45 @@ def _pull_albedo(world: World, ray: mi.Ray3f, event: Scattering, dL: mi.Spectrum
                 dr.backward_from(dr.select(on, dL * event.weight * sigma_t * share, 0))
 
 
-def _pull_source(scene: mi.Scene, world: World, stretch: Stretch, event: Scattering, dL: mi.Spectrum) -> None:
+def _pull_source(
+    scene: mi.Scene, world: World, stretch: Stretch, tau: list[mi.Float], event: Scattering, dL: mi.Spectrum
+) -> None:
     """Derivatives of the coefficients: at the point, and in front of it."""
     ray, t = stretch.ray, event.event.t
+    level, lost = _level_at(world, stretch, tau, event)
     for body, on in at_event(world, event.event):
         share, name = mi.Spectrum(1), "sigma_s"
         if body.view.share is not None:
             share, name = dr.detach(albedo(body, event.mei, on)), "sigma_"
-        body.deposit(ray, t, by_channel(dL * event.weight * share, world.channels), on, name)
-    _backproject(scene, world, _way_to(stretch, t), -dL * event.sigma_s * event.weight, event.event.on)
+        body.deposit(ray, t, by_channel(dL * (event.weight * share - level), world.channels), on, name)
+    _backproject(scene, world, _way_to(stretch, t), -dL * (event.sigma_s * event.weight - lost), event.event.on)
+
+
+def _level_of(world: World, tau: list[mi.Float]) -> mi.Spectrum:
+    """The source that is known [radiance], the same all along a ray: less comes through where more is taken.
+
+    Measured: 0.01 to 0.06 of the variance without it in thin media, 0.3 to 0.5 in those of a few optical depths, 0.8 beyond.
+    """
+    return world.level * spectrum([phi1(t) for t in tau])
+
+
+def _level_at(
+    world: World, stretch: Stretch, tau: list[mi.Float], event: Scattering
+) -> tuple[mi.Spectrum, mi.Spectrum]:
+    """What a unit of extinction at the point would send, and what its extinction sends, of the source that is known."""
+    if world.level is None:
+        return mi.Spectrum(0), mi.Spectrum(0)
+    level, sigma_t = event.gain * _level_of(world, tau), mi.Spectrum(0)
+    for body, on in at_event(world, event.event):
+        sigma_t = dr.select(on, sigma_t_at(world, body, stretch.ray, event.event, on), sigma_t)
+    return level, level * sigma_t
+
+
+def _level_behind(world: World, stretch: Stretch, tau: list[mi.Float]) -> mi.Spectrum:
+    """What the source that is known would have sent from behind the stretch: the exact part of its derivative."""
+    if world.level is None:
+        return mi.Spectrum(0)
+    return dr.select(stretch.scatters, stretch.beta * transmittance(tau) * _level_of(world, tau), 0)
 
 
 def _way_to(stretch: Stretch, t: mi.Float) -> Way:
@@ -371,15 +405,18 @@ def _push_attached(scene: mi.Scene, world: World, ray: mi.Ray3f, event: Scatteri
     return dL - dr.select(on, carried * dimmed * _tangent(scene, world, way, on), 0)
 
 
-def _push_source(scene: mi.Scene, world: World, stretch: Stretch, event: Scattering) -> mi.Spectrum:
+def _push_source(
+    scene: mi.Scene, world: World, stretch: Stretch, tau: list[mi.Float], event: Scattering
+) -> mi.Spectrum:
     """The tangent of the coefficients at the point and in front of it: the transpose of :func:`_pull_source`."""
     ray, t, k = stretch.ray, event.event.t, world.channels
-    dL = -_tangent(scene, world, _way_to(stretch, t), event.event.on) * event.sigma_s * event.weight
+    level, lost = _level_at(world, stretch, tau, event)
+    dL = -_tangent(scene, world, _way_to(stretch, t), event.event.on) * (event.sigma_s * event.weight - lost)
     for body, on in at_event(world, event.event):
         share, name = mi.Spectrum(1), "sigma_s"
         if body.view.share is not None:
             share, name = dr.detach(albedo(body, event.mei, on)), "sigma_"
-        dL += dr.select(on, event.weight * share * spectrum(body.tangent_at(ray, t, k, on, name)), 0)
+        dL += dr.select(on, (event.weight * share - level) * spectrum(body.tangent_at(ray, t, k, on, name)), 0)
     return dr.select(event.event.on, dL, 0)
 
 
