@@ -38,12 +38,14 @@ class Part:
         constant: its value [1/length], ``Float`` or ``Color3f``; None for a grid.
         lattice: the grid [1/length]; None for a constant.
         activation: what makes an extinction of an interpolated value of the grid, in a radiance field; None elsewhere.
+        volume: the stock grid that ``lattice`` stands for, which may look its voxels up in another way; None elsewhere.
     """
 
     name: str
     constant: mi.Float | mi.Color3f | None = None
     lattice: Lattice | None = None
     activation: Activation | None = None
+    volume: mi.Volume | None = None
 
     @property
     def channels(self) -> int:
@@ -242,8 +244,9 @@ def _part(name: str, params: mi.SceneParameters, kind: str, boundary: Box | None
     """The part of an extinction under ``name`` among a medium's parameters."""
     grid, constant = f"{name}.data", f"{name}.value.value"
     if grid in params.properties:
-        place = _place(params.properties[grid][2], boundary, places)
-        return Part(name, lattice=Lattice(_tensor(params[grid]), place))
+        volume = params.properties[grid][2]
+        lattice = Lattice(_tensor(params[grid]), _place(volume, boundary, places))
+        return Part(name, lattice=lattice, volume=volume if volume.class_name() == "GridVolume" else None)
     if constant not in params.properties:
         found = sorted(k for k in params.properties if k.startswith(name + "."))
         raise MivolError(
