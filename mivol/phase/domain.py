@@ -16,7 +16,7 @@ import numpy as np
 
 from mivol.errors import MivolError
 
-__all__ = ["ASYMMETRY", "COSINE_SQUARED", "DOMAINS", "WEIGHT", "Domain"]
+__all__ = ["ASYMMETRY", "COSINE_SQUARED", "DOMAINS", "LARGEST", "WEIGHT", "Domain"]
 
 
 @dataclass(frozen=True)
@@ -58,13 +58,14 @@ class Domain:
 NEXT_TO_ONE = 1 - 2.0**-24
 """The largest float32 below 1."""
 
-LARGEST = float(np.finfo(np.float32).max)
+LARGEST = 1e30
+"""Sums of such numbers, and one over them, are float32 numbers still."""
 
 ASYMMETRY = Domain(
     -NEXT_TO_ONE, NEXT_TO_ONE, "a number above -1 and below 1", "choose one, or clip it after each step, for instance to 0.999"
 )
 COSINE_SQUARED = WEIGHT = Domain(
-    0.0, LARGEST, "a finite number of at least 0", "choose one, or clip it at 0 after each step"
+    0.0, LARGEST, "a finite number of at least 0, and at most 1e30,", "choose one, or clip it after each step"
 )
 
 DOMAINS = {"g": ASYMMETRY, "alpha": COSINE_SQUARED, "weight": WEIGHT}

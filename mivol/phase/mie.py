@@ -33,6 +33,9 @@ RADII = 1024
 micrometre they leave 1.5 to 2 % (root mean square over angles), 4 to 9 % at the worst angle, near straight back."""
 
 
+LARGEST_SIZE = 1e4
+"""Largest circumference over the wavelength whose series is summed: in a minute and 1 GiB. Beyond it light goes in rays."""
+
 CUT = 1e-7
 """Share of a distribution that is left out at each end."""
 
@@ -97,10 +100,17 @@ def _average(
     log_area: Callable[[np.ndarray], np.ndarray], low: float, high: float, wavelength: float, index: complex, tolerance: float
 ) -> Table:
     """The table of spheres with radii between two; ``log_area`` is the logarithm of r^2 n(r), up to a constant."""
-    mie = _miepython()
+    mie, index = _miepython(), complex(index)
+    if not (np.isfinite(index) and index.real > 0 and abs(index - 1) > 1e-6):
+        raise MivolError(f"index is {index:g}; one with a real part above 0 is expected, and not 1: nothing would scatter.")
+    if 2 * np.pi * high > LARGEST_SIZE * wavelength:
+        raise MivolError(
+            f"the largest of the particles have a radius of {high:.3g} micrometre; at most {LARGEST_SIZE / 2 / np.pi:.0f} times "
+            f"the wavelength of {wavelength:g} is expected: give smaller radii or a narrower distribution."
+        )
     radii = low * (high / low) ** ((np.arange(RADII) + 0.5) / RADII)
     sizes = 2 * np.pi * radii / wavelength
-    series = [np.atleast_2d(mie.coefficients(complex(index), float(x))) for x in sizes]
+    series = [np.atleast_2d(mie.coefficients(index, float(x))) for x in sizes]
     terms = max(s.shape[1] for s in series)
     electric, magnetic = np.array([np.pad(s, ((0, 0), (0, terms - s.shape[1]))) for s in series]).transpose(1, 0, 2)
     n = np.arange(1, terms + 1)

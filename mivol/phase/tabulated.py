@@ -21,6 +21,7 @@ import mitsuba as mi
 import numpy as np
 
 from mivol.errors import MivolError
+from mivol.phase.domain import LARGEST, WEIGHT
 from mivol.phase.turn import INV_TWO_PI, Turn
 
 __all__ = ["Lookup", "Table", "adapt_nodes"]
@@ -85,10 +86,13 @@ class Table:
         """
         name = f"phase table {os.fspath(path)}"
         try:
-            with open(path, newline="") as file:  # noqa: PTH123  (a path of any kind)
-                rows = [row for row in csv.reader(file) if row and not row[0].lstrip().startswith("#")]
+            with open(path, newline="", encoding="utf-8-sig") as file:  # noqa: PTH123  (a path of any kind)
+                rows = [row for row in csv.reader(file) if "".join(row).strip() and not row[0].lstrip().startswith("#")]
         except (OSError, UnicodeDecodeError) as error:
             raise MivolError(f"{name} cannot be read: {error}.") from error
+        other = next((row for row in rows if len(row) != 2), None)
+        if other is not None:
+            raise MivolError(f"{name} has the line {','.join(other)!r}; two columns, with a comma between them, are expected.")
         heading = rows.pop(0)[0].strip().lower() if rows and not _is_number(rows[0][0]) else "cos"
         if heading not in ("cos", "angle"):
             raise MivolError(f"{name} heads its first column {heading!r}; cos, or angle (in degrees), is expected.")
@@ -96,6 +100,11 @@ class Table:
             first, values = np.array([[float(x) for x in row] for row in rows]).reshape(-1, 2).T
         except ValueError as error:
             raise MivolError(f"{name} is not two columns of numbers: {error}.") from error
+        if heading == "angle" and not np.all((first >= 0) & (first <= 180)):
+            raise MivolError(
+                f"the angles of {name} go from {first.min():.9g} to {first.max():.9g} degrees; 0 (straight on) to 180 "
+                "(straight back) is expected: give each angle once."
+            )
         cosines = np.cos(np.radians(first)) if heading == "angle" else first
         order = np.argsort(cosines, kind="stable")
         return cls(cosines[order], values[order], name)
@@ -162,7 +171,7 @@ def check_values(values: np.ndarray, name: str) -> None:
     """Refuse values that no phase function has.
 
     Raises:
-        MivolError: NaN, infinite or negative, or all of them 0.
+        MivolError: NaN, infinite or negative, all of them 0, or the largest beyond 1e-30 to 1e30.
     """
     bad = np.flatnonzero(~(np.isfinite(values) & (values >= 0)))
     if len(bad):
@@ -170,8 +179,13 @@ def check_values(values: np.ndarray, name: str) -> None:
             f"{name} has the value {values[bad[0]]:.9g} at {bad[0]}; finite numbers of at least 0 are expected: clip them "
             "after each step."
         )
-    if not np.any(values > 0):
+    most = values.max(initial=0)
+    if most == 0:
         raise MivolError(f"{name} is 0 everywhere; at least one value above 0 is expected.")
+    if not 1 / LARGEST <= most <= LARGEST:
+        raise MivolError(
+            f"the largest value of {name} is {most:.3g}; 1e-30 to 1e30 is expected: only their ratios count, divide by it."
+        )
 
 
 def adapt_nodes(
@@ -248,7 +262,7 @@ class Lookup:
         return cls(*(mi.Float(x.astype(np.float32)) for x in (1 - c, 1 + c, ratio, np.diff(c))))
 
     def normalise(self, values: mi.Float) -> tuple[mi.Float, mi.Float, mi.Float]:
-        """Projected values (not below 0; all 1 where none is above), their integral and their cumulative distribution.
+        """Projected values (0 to 1e30; all 1 where none is above 1e-30), their integral and their cumulative distribution.
 
         Args:
             values: (n,) as given.
@@ -256,8 +270,8 @@ class Lookup:
         Returns:
             values (n,) and integral (1,) with derivatives; cumulative (n,), 0 to 1, without.
         """
-        values = dr.select(values >= 0, values, 0)
-        values = dr.select(dr.max(dr.detach(values)) > 0, values, 1)
+        values = WEIGHT.project(values)
+        values = dr.select(dr.max(dr.detach(values)) >= 1 / LARGEST, values, 1)
         i = dr.arange(mi.UInt32, len(self.width))
         parts = 0.5 * (dr.gather(mi.Float, values, i) + dr.gather(mi.Float, values, i + 1)) * self.width
         # Summed in float64: a table of 1000 nodes keeps the digits of its narrow segments.

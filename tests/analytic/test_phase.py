@@ -284,8 +284,9 @@ def test_moments_of_a_table_are_exact():
 
 def test_table_from_csv(tmp_path):
     (tmp_path / "angle.csv").write_text("# measured\nangle,value\n0,3\n60,2\n180,1\n")
-    (tmp_path / "cos.csv").write_text("-1,1\n0.5,2\n1,3\n")
-    for name in ("angle.csv", "cos.csv"):
+    (tmp_path / "cos.csv").write_text("-1,1\n0.5,2\n1,3\n  \n")
+    (tmp_path / "spreadsheet.csv").write_text("cos,value\r\n-1,1\r\n0.5,2\r\n1,3\r\n", encoding="utf-8-sig")
+    for name in ("angle.csv", "cos.csv", "spreadsheet.csv"):
         table = Table.from_csv(tmp_path / name)
         assert table.cosines == pytest.approx([-1, 0.5, 1], abs=1e-15)
         assert list(table.values) == [1, 2, 3]
@@ -294,7 +295,13 @@ def test_table_from_csv(tmp_path):
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("-1,1\n1,2,3\n", "two columns"),
+        ("-1,1\n1,2,3\n", "'1,2,3'; two columns"),
+        ("-1,1,1,2\n", "two columns"),
+        ("angle,value,error\n0,3,180\n90,2,1\n", "'angle,value,error'; two columns"),
+        ("-1;1\n1;2\n", "'-1;1'; two columns"),
+        ("angle,value\n0,3\n90,2\n180,1\n270,2\n", "0 to 270 degrees; 0 .straight on. to 180"),
+        ("-1,3e38\n1,3e38\n", "3e.38; 1e-30 to 1e30"),
+        ("-1,1e-40\n1,0\n", "1e-40; 1e-30 to 1e30"),
         ("-1,1\n1,x\n", "two columns"),
         ("degrees,value\n0,1\n180,1\n", "'degrees'"),
         ("-1,1\n0.5,1\n", "-1 to 0.5"),
@@ -487,6 +494,10 @@ def test_without_miepython_there_is_a_sentence(monkeypatch):
         lambda: mie.water_droplets(5.0, effective_variance=0.6),
         lambda: mie.aerosol(0.1, 0.9, 1.5),
         lambda: mie.aerosol(0.1, 1.5, 1.5, wavelength=np.nan),
+        lambda: mie.aerosol(0.1, 1.5, 1.0),
+        lambda: mie.aerosol(0.1, 1.5, -1.5 - 0.1j),
+        lambda: mie.aerosol(1.0, 5.0, 1.5),
+        lambda: mie.water_droplets(1000.0),
     ],
 )
 def test_particles_that_cannot_be_are_refused(twin, call):
