@@ -91,16 +91,21 @@ class RadianceFit:
         Raises:
             MivolError: nothing is seen.
         """
-        res, to_world = place_grid(self.box, self.plan.stages[number].longest)
+        place, degree = place_grid(self.box, self.plan.stages[number].longest), self.plan.degree_at(number)
         if self.field is None:
-            self.field = _fog(res, to_world, self.plan.degree_at(number), self.plan.start / self.unit)
+            self.field = _fog(*place, degree, self.plan.start / self.unit)
+            self.squares = [dr.zeros(mi.Float, dr.width(a)) for a in (self.field.density, self.field.harmonics)]
         else:
             keep = self.seen_nodes()
             if not keep.any():
                 raise MivolError("no view sees anything in the box: check the box, the cameras and the background.")
-            self.field = resample_field(self.field, res, to_world, keep).with_degree(self.plan.degree_at(number))
+            # Without the squares the first step would move every row by a whole rate: a fog does not come back from that.
+            squares, longest = self.field.with_values(*self.squares), max(self.field.res)
+            self.field, squares = (resample_field(f, *place, keep).with_degree(degree) for f in (self.field, squares))
+            # Derivatives go with the length of a ray in a voxel.
+            shorter = dr.opaque(mi.Float, (longest / max(self.field.res)) ** 2)
+            self.squares = [squares.density * shorter, squares.harmonics * shorter]
         self.stage = number
-        self.squares = [dr.zeros(mi.Float, dr.width(a)) for a in (self.field.density, self.field.harmonics)]
         self._survey()
 
     def _survey(self) -> None:

@@ -84,6 +84,17 @@ def test_a_fit_finds_what_it_did_not_see(variant_rgb: str, photos: list[Photo]) 
     assert np.isnan(seen.depth[0, 0]) and seen.opacity[0, 0] == 0
 
 
+def test_a_finer_stage_goes_on_where_the_last_one_stopped(variant_rgb: str, photos: list[Photo]) -> None:
+    """Its first step knows how large derivatives were: begun anew, it would move all that it touches by a whole rate."""
+    fit = fitted(Views.of(photos, (1, 2)), replace(PLAN, tv_density=0.0), PLAN.stages[0].steps)
+    fit.begin(1)
+    before = np.array(fit.field.density)
+    fit.advance()
+    moved = np.abs(np.array(fit.field.density) - before) * fit.unit
+    # Where no more rays than before cross a voxel, and not all agree, steps are below the rate.
+    assert 0 < np.median(moved[moved > 0]) < 0.5 * fit.plan.rates(PLAN.stages[0].steps)[0]
+
+
 def test_a_fit_that_went_on_equals_one_that_did_not_stop(variant_rgb: str, photos: list[Photo]) -> None:
     views = Views.of(photos[:6], (1, 2))
     plan = replace(PLAN, stages=(Stage(8, 10, 2, 3, 8), Stage(16, 10, 1, 3, 8)), tv_density=0.1, first_degree=0)
