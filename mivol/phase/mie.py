@@ -102,7 +102,7 @@ def _average(
     """The table of spheres with radii between two; ``log_area`` is the logarithm of r^2 n(r), up to a constant."""
     mie, index = _miepython(), complex(index)
     if not (np.isfinite(index) and index.real > 0 and abs(index - 1) > 1e-6):
-        raise MivolError(f"index is {index:g}; one with a real part above 0 is expected, and not 1: nothing would scatter.")
+        raise MivolError(f"index is {index:g}; a real part above 0 is expected, and not 1: nothing would scatter.")
     if 2 * np.pi * high > LARGEST_SIZE * wavelength:
         raise MivolError(
             f"the largest of the particles have a radius of {high:.3g} micrometre; at most {LARGEST_SIZE / 2 / np.pi:.0f} times "
