@@ -219,11 +219,17 @@ def find(name: str, params: mi.SceneParameters) -> str:
     """The key of ``params`` of that name.
 
     Raises:
-        MivolError: there is none (the nearest is offered), or its id is a memory address that changes from run to run.
+        MivolError: there is none (the nearest is offered), its id is a memory address that changes from run to run, or no
+            derivative leads to what it is.
     """
     keys = list(params.keys())
     if name not in keys:
         raise MivolError(f'the scene has no parameter "{name}": {nearest(name, keys)}')
     if re.match(r"object_\d+", name):
         raise MivolError(f'"{name}" begins with a memory address, which changes from run to run: give the object an id.')
+    if not (dr.is_array_v(params[name]) and dr.is_float_v(params[name])):
+        raise MivolError(
+            f'"{name}" is a {type(params[name]).__name__}, and a fit looks for numbers, colours, points and tensors of '
+            "floating point that Dr.Jit holds: choose another parameter."
+        )
     return name

@@ -83,8 +83,21 @@ class Problem:
         return {p.name: dr.detach(as_tensor(self.params[p.name])) for p in self.parameters}
 
     def gradients(self) -> dict[str, mi.TensorXf]:
-        """What has been carried back to the scene since :meth:`set`, by parameter."""
-        return {p.name: dr.detach(as_tensor(dr.grad(self.params[p.name]))) for p in self.parameters}
+        """What has been carried back to the scene since :meth:`set`, by parameter.
+
+        Raises:
+            MivolError: nothing ever is, to one of them.
+        """
+        found = {}
+        for p in self.parameters:
+            gradient = dr.detach(dr.grad(self.params[p.name]))
+            if _is_untouched(gradient):
+                raise MivolError(
+                    f"no derivative leads from the images to {p.name}, which would stay as it is: take it out of the fit, or "
+                    "let the images depend on it (for scattered light set fit.max_depth to 2)."
+                )
+            found[p.name] = as_tensor(gradient)
+        return found
 
     def start(self) -> dict[str, mi.TensorXf]:
         """The reals of what the scene holds now.
@@ -101,7 +114,11 @@ class Problem:
             dr.make_opaque(value)
             dr.enable_grad(value)
             self.params[p.name] = value
+        given = {p.name: type(self.params[p.name])(self.params[p.name]) for p in self.parameters}
         self.params.update()
+        # Mitsuba's envmap puts another array in the place of what it was given.
+        for name, value in given.items():
+            self.params[name] = value
         self.noisy = self._has_noise()
 
     # -- Images ---------------------------------------------------------------------------------------------------
@@ -227,3 +244,9 @@ class Problem:
             by_reals[p.name] = dr.grad(u)
         dr.eval(by_reals)
         return total, by_reals
+
+
+def _is_untouched(gradient: object) -> bool:
+    """Whether a gradient is the 0 that Dr.Jit makes up where none was ever carried to."""
+    rows = [gradient.array] if dr.is_tensor_v(gradient) else gradient if dr.depth_v(gradient) > 1 else [gradient]
+    return all(row.state == dr.VarState.Literal for row in rows)

@@ -93,6 +93,31 @@ def test_gradient_is_that_of_the_loss(variant_rgb) -> None:
     assert abs(linear.gradient @ v - expected) <= 1e-3 * np.linalg.norm(linear.gradient) * np.linalg.norm(v)
 
 
+def test_gradient_of_a_sky(variant_rgb) -> None:
+    """Mitsuba's envmap puts another array in the place of the one it was given: the derivative is that by the given one.
+
+    Differences are exact for a quadratic; but picture and derivative have samples of their own.
+    """
+    texels = np.random.default_rng(1).uniform(0.2, 1, (4, 8, 3)).astype(np.float32)
+    parts = {"sky": {"type": "envmap", "bitmap": mi.Bitmap(texels)}, "ball": {"type": "sphere", "radius": 0.1}}
+    scene = mi.load_dict({"type": "scene", "integrator": {"type": "mivol"}, **parts})
+    views = [View(f"view {i}", camera(i), dr.zeros(mi.TensorXf, (8, 8, 3))) for i in range(2)]
+    problem = Problem(scene, views, [Parameter("sky.data", "1", (0.0, np.inf), lr=0.1)], spp=64)
+    (key, x), h = next(iter(problem.start().items())), 1e-2
+    v = mi.TensorXf(np.random.default_rng(2).uniform(0.5, 1, x.shape).astype(np.float32))
+    ends = [problem.loss_value({key: x + sign * h * v}, 0) for sign in (1, -1)]
+    gradient = problem.loss_and_gradient({key: x}, 0)[1][key]
+    assert dr.sum(gradient * v, axis=None).array[0] == pytest.approx((ends[0] - ends[1]) / (2 * h), rel=0.02)
+
+
+def test_a_parameter_that_nothing_depends_on(variant_rgb) -> None:
+    """An albedo at depth 1 would stay as it is without a word."""
+    problem = small_problem(parameters=[Parameter("cube.interior_medium.albedo.value.value", domain=(0.0, 1.0), lr=0.1)])
+    problem.integrator = mi.load_dict({"type": "mivol", "max_depth": 1})
+    with pytest.raises(MivolError, match="no derivative leads from the images to cube.interior_medium.albedo"):
+        problem.loss_and_gradient(problem.start(), 0)
+
+
 def test_gauss_newton_product_is_that_of_the_jacobian(variant_rgb) -> None:
     """<v, J^T W J v> is the weighted square of J v, which differences of images give; and the product is symmetric."""
     problem = small_problem()
