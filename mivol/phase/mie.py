@@ -105,7 +105,7 @@ def _average(
         raise MivolError(f"index is {index:g}; a real part above 0 is expected, and not 1: nothing would scatter.")
     if 2 * np.pi * high > LARGEST_SIZE * wavelength:
         raise MivolError(
-            f"the largest of the particles have a radius of {high:.3g} micrometre; at most {LARGEST_SIZE / 2 / np.pi:.0f} times "
+            f"the largest particles have a radius of {high:.3g} micrometre; at most {LARGEST_SIZE / 2 / np.pi:.0f} times "
             f"the wavelength of {wavelength:g} is expected: give smaller radii or a narrower distribution."
         )
     radii = low * (high / low) ** ((np.arange(RADII) + 0.5) / RADII)
