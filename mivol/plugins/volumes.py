@@ -151,9 +151,9 @@ class TransferVolume(VoxelVolume):
     """
 
     def __init__(self, props: mi.Properties) -> None:
-        self.transfer = Transfer.from_props(props)
-        self.table, self.scalar = self.transfer.table, self.transfer.field
-        self.field = self.transfer.voxels
+        self.mivol_transfer = Transfer.from_props(props)
+        self.table, self.scalar = self.mivol_transfer.table, self.mivol_transfer.field
+        self.field = self.mivol_transfer.voxels
         self.texture = self.field.texture
         props["to_world"] = mi.ScalarTransform4f(self.field.to_world)
         mi.Volume.__init__(self, props)
@@ -164,7 +164,7 @@ class TransferVolume(VoxelVolume):
         callback.put("data", self.texture.tensor(), mi.ParamFlags.Differentiable)  # what the table makes of it
 
     def parameters_changed(self, keys: list[str]) -> None:
-        self.transfer.refresh()
+        self.mivol_transfer.refresh()
 
 
 def _towards(it: mi.Interaction3f) -> mi.Vector3f:

@@ -415,6 +415,7 @@ def explain(scene: mi.Scene | str | Path, max_depth: int | None = None, sensor: 
     ]
     width = max(len(c.about) for c in plan.choices)
     lines += [f"  {c.about:<{width}}  {c.choice}\n  {'':<{width}}    because {c.reason}" for c in plan.choices]
+    lines += [f"  table     {text}" for text in _tables(needs)]
     if settings.max_depth == 2:
         lines += [f"  model     {text}" for text in _depth_two(needs)]
         lines += [f"  shadows   {text}" for text in _light_grid(loaded, needs, plan, settings)]
@@ -439,6 +440,24 @@ def _light_grid(scene: mi.Scene, needs: Needs, plan: Plan, settings: Settings) -
         f"{offer}, a light grid of {nodes} nodes {pays} against about {rays} shadow rays, at a bias of "
         f"{bias:+.2g} of a lamp's light (rms {rms:.2g}, measured against exact shadows)"
     ]
+
+
+def _tables(needs: Needs) -> list[str]:
+    """What grids that were seen through a table miss of it between their nodes."""
+    lines = []
+    for facts, boundary in zip(needs.media, needs.boundaries, strict=True):
+        volumes = {key.split(".")[0]: entry[2] for key, entry in mi.traverse(boundary.medium).properties.items()}
+        for name, volume in volumes.items():
+            if not hasattr(volume, "mivol_transfer"):
+                continue
+            table = volume.mivol_transfer
+            missed, finer = table.departure(), table.refine + 2
+            advice = f"; refine = {finer} would follow it closer, at {(finer / table.refine) ** 3:.3g} times the memory"
+            lines.append(
+                f"{name} of {facts.name} departs from its table by {missed:.2g} of the largest entry half-way between nodes "
+                f"(rms){advice if missed > 0.02 else ''}"
+            )
+    return lines
 
 
 def _depth_two(needs: Needs) -> list[str]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -9,6 +11,7 @@ from emission_scenes import PLACE, B, aimed, changes, colours, find, gradients, 
 from oracle import box_interval, to_lattice, trilinear
 from scipy.ndimage import gaussian_filter
 
+from mivol.scene.plan import explain
 from scenes import as_float32, box_of, tensor, transform
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
@@ -66,6 +69,20 @@ def test_refinement_converges_to_the_model():
         exact = np.array([truth(values, *ray) for ray in zip(seen.o, seen.d, strict=True)])
         error.append(np.sqrt(np.mean((light(seen) - exact) ** 2)))
     assert error[1] < 0.3 * error[0] and error[2] < 0.3 * error[1] and error[2] < 4e-3, error
+
+
+def test_explain_says_what_a_grid_misses_of_its_table():
+    """As numpy finds it half-way between the scan's nodes; a finer grid misses less."""
+    values = scan()
+    ends = [(values.take(range(n - 1), a).ravel(), values.take(range(1, n), a).ravel()) for a, n in enumerate(values.shape)]
+    low, high = (np.concatenate(side).astype(np.float64) for side in zip(*ends, strict=True))
+    missed = looked_up(OPACITY, (low + high) / 2) - (looked_up(OPACITY, low) + looked_up(OPACITY, high)) / 2
+    told = re.findall(r"(\w+) of box departs from its table by (\S+) of", explain(view(values).scene))
+    assert [name for name, _ in told] == ["sigma_t", "emission"]
+    # Two digits are printed.
+    assert float(told[0][1]) == pytest.approx(np.sqrt(np.mean(missed**2)) / OPACITY.max(), rel=0.06)
+    finer = [float(v) for v in re.findall(r"by (\S+) of the largest", explain(view(values, 5).scene))]
+    assert finer[0] < 0.3 * float(told[0][1]) and "refine = 3 would" in explain(view(values).scene)
 
 
 def test_derivatives_by_table_and_scan():
