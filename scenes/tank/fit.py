@@ -149,10 +149,12 @@ def main() -> None:
         errors[channel] = error * [found[channel, 0], found[channel, 1], 1 - found[channel, 2] ** 2]
         for k, what in enumerate(NAMES):
             x, s, t = found[channel, k], errors[channel, k], truth[channel, k]
-            off = f"off by {abs(x / t - 1):.2%}, {abs(x - t) / s:.1f} s.e."
+            # Milks are published with g = 0.
+            off = f"off by {f'{abs(x / t - 1):.2%}' if t else f'{abs(x):.4f}'}, {abs(x - t) / s:.1f} s.e."
             print(f"{name:5s} {what:15s} {x:9.5f} +- {s:.5f}  truth {t:9.5f}  {off}")
         print(f"{name:5s} squared residual, in noise: {losses[0]:.1f} -> {losses[-1]:.3f} in {given.iterations} iterations")
-    print(f"largest relative error: {np.abs(found / truth - 1).max():.4f}")
+    known = truth != 0
+    print(f"largest relative error: {np.abs(found[known] / truth[known] - 1).max():.4f}")
     figures.save(draw(given, model, photographs, found, errors, truth), given.output / "tank.png")
     print(given.output / "tank.png")
 
@@ -187,7 +189,8 @@ def draw(
             axes.errorbar(x, found[:, k], 2 * errors[:, k], **style)
             axes.set_xticks(x, ("red", "green", "blue"))
             axes.set_title(NAMES[k])
-            axes.set_ylim(0, 1.25 * max(truth[:, k].max(), found[:, k].max()))
+            low, high = found[:, k] - 2 * errors[:, k], found[:, k] + 2 * errors[:, k]
+            axes.set_ylim(1.25 * min(0.0, low.min()), 1.25 * max(truth[:, k].max(), high.max()))
             if k == 0:
                 axes.legend(loc="lower right", facecolor="white", frameon=True)
     return figure

@@ -130,6 +130,14 @@ def test_tank(tmp_path):
 
 
 @pytest.mark.slow
+def test_tank_of_milk(tmp_path):
+    """Published with g = 0, from which nothing is off by a percentage."""
+    tiny = ("--liquid", "skim milk", "--size", 8, "--spp", 8, "--photo-spp", 64, "--dilutions", 0.02, "--iterations", 2)
+    said = script("tank", *tiny, "-o", tmp_path, PYTHONWARNINGS="error::RuntimeWarning")
+    assert len(re.findall(r"^\w+ +g .*off by [\d.]+, ", said, re.MULTILINE)) == 3
+
+
+@pytest.mark.slow
 def test_fire(tmp_path, data_dir):
     """A flame of some hundred cd/m2 (a black body of 1318 K has 835) before a dusk of some tens."""
     said = script("fire", "--size", 48, "--spp", 16, "-o", tmp_path, MIVOL_DATA=str(data_dir))
