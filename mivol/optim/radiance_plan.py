@@ -126,7 +126,7 @@ class Plan:
 
 PRESETS: dict[str, Plan] = {
     "tiny": Plan((Stage(24, 100, 4, tiles=32), Stage(48, 200, 2, tiles=64))),
-    "cpu": Plan((Stage(32, 200, 4, tiles=64), Stage(64, 300, 4, tiles=128), Stage(128, 700, 2, tiles=256))),
+    "cpu": Plan((Stage(32, 200, 4, tiles=64), Stage(64, 300, 4, tiles=128), Stage(128, 1400, 2, tiles=256))),
     "gpu": Plan(
         (
             Stage(64, 300, 4, 16, 512),
