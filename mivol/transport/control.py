@@ -22,8 +22,9 @@ from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
-from mivol.transport.direct import UNIFORM, Draw, arrivals
+from mivol.transport.direct import UNIFORM, Arrival, Draw, arrivals
 from mivol.transport.free_flight import taken_light
 from mivol.transport.lattice import Cell, Lattice, Nodes, box_nodes, clip, locate, read_nodes, walk
 from mivol.transport.optical_depth import GAUSS, gauss_points, interpolate, node_weights, upward_frac, weights
@@ -172,7 +173,8 @@ def _light_of_nodes(
     ray = mi.Ray3f(p, -mei.wi, dr.inf, mi.Float(0), mi.Color0f())
     lamp = world.lights.choose(ray, draw.lamp)
     found = arrivals(scene, world, mei, lamp, draw, False, dr.full(mi.Bool, True, dr.width(lane)))
-    light = sum((a.value for a in found), mi.Spectrum(0))
+    apart = max(float(np.linalg.norm(lattice.to_world[:3, a])) / (k - 1) for a, k in enumerate((x, y, z)))
+    light = sum((_spread(a, apart) for a in found), mi.Spectrum(0))
     dr.eval(light)
     rows = []
     for c in range(dr.size_v(light)):
@@ -180,6 +182,13 @@ def _light_of_nodes(
         rows.append(dr.minimum(mean, CAP * dr.mean(mean)))
     dr.eval(rows)
     return rows
+
+
+def _spread(arrival: Arrival, apart: float) -> mi.Spectrum:
+    """What an arrival brings to a node that stands for all within ``apart`` of it: a lamp that is nearer counts as if it were
+    that far away, and one in the node itself, whose light has no bound, as dark."""
+    value = dr.select(arrival.on, arrival.value, 0)
+    return dr.select(dr.isfinite(value), value * dr.minimum(dr.square(arrival.way.length / apart), 1), 0)
 
 
 def _merge_equal(rows: list[mi.Float]) -> list[mi.Float]:

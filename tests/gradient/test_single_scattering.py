@@ -118,6 +118,7 @@ DENSITIES = {
 LAMPS = {
     "point": lambda: point([1.5, 1, 2.0]),
     "point inside": lambda: point([0.3, -0.2, 0.35]),
+    "point at a corner": lambda: point([1, 1, 1]),
     "spot": lambda: spot([1.0, -2, 2.5], [0, 0, 0]),
     "sun": lambda: sun([0.3, 0.2, -1.0]),
 }
@@ -147,8 +148,8 @@ def test_density_under_a_point_light(density, kind):
 @pytest.mark.parametrize(
     ("density", "name"),
     small.cases(
-        [(d, n) for d in ("empty", "rough") for n in ("point inside", "spot", "sun")],
-        [("empty", "sun"), ("empty", "spot"), ("rough", "spot")],
+        [(d, n) for d in ("empty", "rough") for n in ("point inside", "point at a corner", "spot", "sun")],
+        [("empty", "sun"), ("empty", "spot"), ("rough", "spot"), ("empty", "point at a corner")],
     ),
 )
 def test_density_under_other_lamps(density, name):
