@@ -366,7 +366,7 @@ def build_world(scene: mi.Scene, needs: Needs, plan: Plan, settings: Settings, s
         is_veiled=needs.is_veiled,
         start=needs.start,
         locates=needs.camera_inside and needs.start is None,
-        lights=Lights(scene) if _is_lit(needs, settings) else None,
+        lights=Lights(scene) if needs.lamps and _is_lit(needs, settings) else None,
         is_deterministic=settings.deterministic,
         events=plan.events,
     )

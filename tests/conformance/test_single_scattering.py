@@ -115,9 +115,15 @@ def test_lamps(name):
 
 
 def test_no_lamp_at_all():
-    """Nothing shines, nothing is seen: exactly."""
+    """Nothing shines, nothing is seen: exactly. Nor does anything change it."""
     box, _ = smoke(rough_grid(1))
-    assert not moments(close_up({"smoke": box}), mivol(), 4, 2).mean.any()
+    scene = close_up({"smoke": box})
+    assert not moments(scene, mivol(), 4, 2).mean.any()
+    params = mi.traverse(scene)
+    key = "smoke.interior_medium.sigma_t.data"
+    dr.enable_grad(params[key])
+    dr.backward(dr.mean(mi.render(scene, params, integrator=mi.load_dict(mivol()), spp=4), axis=None))
+    assert not np.any(dr.grad(params[key]))
 
 
 # -- Phase functions -------------------------------------------------------------------------------------------------
