@@ -24,7 +24,7 @@ from mivol.transport.aovs import AOVS
 from mivol.transport.direct import Lights
 from mivol.transport.field import share_cells
 from mivol.transport.light_grid import find_light_grid, measure_bias
-from mivol.transport.medium import MediumView
+from mivol.transport.medium import Box, MediumView
 from mivol.transport.optical_depth import PACKED_LIMIT, gradient_bytes
 from mivol.transport.path import Settings
 from mivol.transport.world import Body, World, share_flight
@@ -417,7 +417,7 @@ def explain(scene: mi.Scene | str | Path, max_depth: int | None = None, sensor: 
     lines += [f"  {c.about:<{width}}  {c.choice}\n  {'':<{width}}    because {c.reason}" for c in plan.choices]
     lines += [f"  table     {text}" for text in _tables(needs)]
     if settings.max_depth == 2:
-        lines += [f"  model     {text}" for text in _depth_two(needs)]
+        lines += [f"  model     {text}" for text in _depth_two(loaded, needs)]
         lines += [f"  shadows   {text}" for text in _light_grid(loaded, needs, plan, settings)]
     return "\n".join(lines)
 
@@ -460,14 +460,15 @@ def _tables(needs: Needs) -> list[str]:
     return lines
 
 
-def _depth_two(needs: Needs) -> list[str]:
+def _depth_two(scene: mi.Scene, needs: Needs) -> list[str]:
     """What a model of one scattering leaves out of each medium."""
     lines = []
     light = "collimated" if "sharp" in needs.lamps else "constant"
     for facts, boundary, view in zip(needs.media, needs.boundaries, needs.views, strict=True):
-        if not facts.is_scattering or boundary.box is None:
+        box, traced = (boundary.box, None) if boundary.box is not None else (_box_around(scene, boundary.medium), scene)
+        if not facts.is_scattering or box is None:
             continue
-        tau, albedo = scattering_depth(view, boundary.box), mean_albedo(view)
+        tau, albedo = scattering_depth(view, box, scene=traced), mean_albedo(view)
         phase = "forward" if mean_cosine(boundary.medium.phase_function()) > 0.4 else "isotropic"
         missing = depth_two_error(min(albedo, 1.0), tau, light, phase)
         warning = "; depth 2 is a poor model of it" if missing > 0.1 else ""
@@ -476,3 +477,16 @@ def _depth_two(needs: Needs) -> list[str]:
             f"depth {tau:.2g}, {light} light, {phase} phase){warning}"
         )
     return lines
+
+
+def _box_around(scene: mi.Scene, medium: mi.Medium) -> Box | None:
+    """A box around all that a medium fills; None where it lies outside of shapes, without an end."""
+    inside = [s.interior_medium() for s in scene.shapes()]
+    boxes = [s.bbox() for s, m in zip(scene.shapes(), inside, strict=True) if m is not None and m.ptr == medium.ptr]
+    if not boxes:
+        return None
+    low, high = np.min([b.min for b in boxes], axis=0), np.max([b.max for b in boxes], axis=0)
+    # Lines begin outside of what they are to enter.
+    room, place = 1e-3 * (high - low).max(), np.eye(4)
+    place[:3, :3], place[:3, 3] = np.diag(high - low + 2 * room), low - room
+    return Box(place)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from pathlib import Path
 from types import ModuleType
 
@@ -10,11 +11,13 @@ import bench_script
 import mitsuba as mi
 import numpy as np
 import pytest
+from scattering_scenes import close_up
 
 from mivol.scene import depth_two
 from mivol.scene.depth_two import ALBEDOS, TABLES, TAUS, depth_two_error, draw_lines, scattering_depth
+from mivol.scene.plan import explain
 from mivol.transport.medium import Box, view_medium
-from scenes import FRAMES, affine, medium, refused, rotation
+from scenes import FRAMES, affine, ball_of, medium, refused, rotation
 
 ROUNDING = 5e-4
 """Of a table of three digits."""
@@ -130,6 +133,15 @@ def test_a_constant_grid_is_a_homogeneous_medium(variant_rgb) -> None:
     walked = scattering_depth(view_of({"type": "mivol_medium", "sigma_t": grid, "albedo": 0.5}), Box(np.eye(4)))
     closed = scattering_depth(view_of(medium("homogeneous", 1.5, 0.5)), Box(np.eye(4)))
     assert walked == pytest.approx(closed, rel=1e-5)
+
+
+def test_depth_of_a_ball(variant_rgb) -> None:
+    """A boundary that is traced: chords have the mean 4R/3 and the mean square 2R^2, so 1.5 sigma R, whatever box is around."""
+    bulb = {"type": "point", "position": [3, 3, 3]}
+    scene = close_up({"ball": ball_of(medium("homogeneous", 2.0, 0.5), (0.1, 0.2, -0.1), 0.7), "bulb": bulb})
+    said = re.search(r"that ball scatters \(albedo 0.50, optical depth ([\d.]+)", explain(scene, max_depth=2))
+    # 2^14 lines, of which half meet the ball: 0.3 %; two digits are said.
+    assert abs(float(said.group(1)) - 1.5 * 2.0 * 0.7) <= 0.06
 
 
 def test_clumps_count_for_what_they_scatter(variant_rgb) -> None:
