@@ -24,9 +24,9 @@ from mivol.phase.turn import INV_FOUR_PI
 from mivol.transport.dice import start_dice
 from mivol.transport.film import Strata
 from mivol.transport.free_flight import Focus, Lamp
-from mivol.transport.lamp_motion import tau_by_end
-from mivol.transport.path import Way, light_through, power_heuristic, shadow_ray
-from mivol.transport.world import World, spectrum
+from mivol.transport.lamp_motion import shadow_of_moving
+from mivol.transport.path import Way, follow_lamp, light_through, power_heuristic, shadow_ray
+from mivol.transport.world import World
 
 __all__ = ["Arrival", "Draw", "Lights", "arrivals", "focus_on"]
 
@@ -231,29 +231,13 @@ def _from_lamp(
         w_mis = dr.select(direct.delta | _is_among(lights.panes, lamp.emitter), 1, power_heuristic(pdf, pdf_lobe))
     dim = light * (w_mis * len(lights.drawn))
     with dr.resume_grad(when=attached):
-        moved = _follow(lamp, mei, draw, direct, on) if attached else direct
+        moved = follow_lamp(lamp.emitter, mei, draw.emitter, direct, on) if attached else direct
         f, _ = phase.eval_pdf(_context(), mei, moved.d, on)
         source = lamp.emitter.eval_direction(mei, moved, on) / direct.pdf if attached else weight
-        if attached and dr.grad_enabled(moved.p):
-            # The factor is 1; its derivative is that of the shadow, whose end moves with the lamp.
-            slopes = tau_by_end(world, way, tau, on & clear)
-            source = source * spectrum([1 - dr.dot(s, moved.p - dr.detach(moved.p)) for s in slopes])
+        if attached:
+            source = source * shadow_of_moving(world, way, tau, moved.p, on & clear)
         value = dr.select(on & clear, dim * f * source, 0)
     return Arrival(way, value, on & clear)
-
-
-def _follow(
-    lamp: Lamp, mei: mi.MediumInteraction3f, draw: Draw, direct: mi.DirectionSample3f, on: mi.Bool
-) -> mi.DirectionSample3f:
-    """The direction of a lamp of one position or direction, with the derivative of its place."""
-    moved, _ = lamp.emitter.sample_direction(mei, draw.emitter, on)
-    if not dr.grad_enabled(moved.p):
-        return direct
-    moved.p = dr.select(direct.delta, moved.p, direct.p)
-    moved.d = dr.select(direct.delta, moved.d, direct.d)
-    moved.dist = dr.select(direct.delta, moved.dist, direct.dist)
-    moved.n, moved.uv, moved.pdf = direct.n, direct.uv, direct.pdf
-    return moved
 
 
 def _from_lobe(

@@ -22,9 +22,9 @@ from mivol.transport.lattice import Cell, Lattice, Nodes, Segment, clip, walk
 from mivol.transport.medium import Part
 from mivol.transport.optical_depth import GAUSS, gauss_points
 from mivol.transport.path import Way, visit_boxes
-from mivol.transport.world import Body, World
+from mivol.transport.world import Body, World, spectrum
 
-__all__ = ["tau_by_end"]
+__all__ = ["shadow_of_moving", "tau_by_end"]
 
 
 def tau_by_end(world: World, way: Way, tau: list[mi.Float], active: mi.Bool) -> list[mi.Vector3f]:
@@ -66,6 +66,14 @@ def tau_by_end(world: World, way: Way, tau: list[mi.Float], active: mi.Bool) -> 
     zero = [mi.Vector3f(0) for _ in range(world.channels)]
     turned = visit_boxes(world, way.ray, way.length, visit, zero, active)
     return [dr.select(active, (d * t + v) / length, 0) for t, v in zip(tau, turned, strict=True)]
+
+
+def shadow_of_moving(world: World, way: Way, tau: list[mi.Float], end: mi.Point3f, active: mi.Bool) -> mi.Spectrum | float:
+    """The number 1, with the derivative of a shadow by the lamp's end of its ray, where that moves."""
+    if not dr.grad_enabled(end):
+        return 1.0
+    moved = end - dr.detach(end)
+    return spectrum([1 - dr.dot(s, moved) for s in tau_by_end(world, way, tau, active)])
 
 
 def _by_part(body: Body, part: Part, way: Way, t0: mi.Float64, t1: mi.Float64, on: mi.Bool) -> list[mi.Vector3f]:

@@ -29,12 +29,14 @@ from mivol.transport.world import Body, World
 
 __all__ = [
     "DARK",
+    "Dimmed",
     "Path",
     "Reach",
     "Settings",
     "Stretch",
     "Visit",
     "Way",
+    "follow_lamp",
     "is_straight",
     "light_through",
     "optical_depth_to",
@@ -83,6 +85,15 @@ class Way:
     medium: mi.MediumPtr
     length: mi.Float
     unveils: bool = False
+
+
+@dataclass
+class Dimmed:
+    """Light that a shadow ray carried: its value, already dimmed by ``tau``, and the lamp's end of the ray, which may move."""
+
+    value: mi.Spectrum
+    tau: list[mi.Float]
+    end: mi.Point3f
 
 
 @dataclass
@@ -399,21 +410,22 @@ def _bounce(scene: mi.Scene, world: World, settings: Settings, limit: int, path:
     # -- Light from an emitter, dimmed by the media ---------------------------------------------------------------------------
     may_scatter = on_surface & (path.depth + 1 < limit)
     lit = may_scatter & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
-    direct, weight = scene.sample_emitter_direction(si, sampler.next_2d(lit), False, lit)
+    u = sampler.next_2d(lit)
+    direct, weight = scene.sample_emitter_direction(si, u, False, lit)
     lit &= direct.pdf > 0
     start = si.spawn_ray_to(direct.p).o
     shadow_medium = dr.select(si.is_medium_transition(), si.target_medium(direct.p - start), path.medium)
-    way, clear, _, light = shadow_ray(scene, world, start, shadow_medium, direct, lit)
+    way, clear, tau, light = shadow_ray(scene, world, start, shadow_medium, direct, lit)
     lit &= clear
-    wo = si.to_local(direct.d)
-    _, pdf_bsdf = bsdf.eval_pdf(mi.BSDFContext(), si, wo, lit)
+    _, pdf_bsdf = bsdf.eval_pdf(mi.BSDFContext(), si, si.to_local(direct.d), lit)
     w_mis = dr.select(direct.delta, 1, power_heuristic(direct.pdf, pdf_bsdf))
     dim = path.beta * light * w_mis
     with dr.resume_grad(when=score.attached):
-        f = bsdf.eval(mi.BSDFContext(), si, wo, lit)
-        source = scene.eval_emitter_direction(si, direct, lit) / direct.pdf if score.attached else weight
+        moved = follow_lamp(direct.emitter, si, u, direct, lit) if score.attached else direct
+        f = bsdf.eval(mi.BSDFContext(), si, si.to_local(moved.d), lit)
+        source = scene.eval_emitter_direction(si, moved, lit) / direct.pdf if score.attached else weight
         carried = dim * f * dr.select(direct.pdf > 0, source, 0)
-    score = score.shadow(scene, world, way, carried, lit)
+    score = score.shadow(scene, world, way, Dimmed(carried, tau, moved.p), lit)
 
     # -- The direction the path takes -----------------------------------------------------------------------------------------
     u1, u2 = sampler.next_1d(on_surface), sampler.next_2d(on_surface)
@@ -438,6 +450,20 @@ def _bounce(scene: mi.Scene, world: World, settings: Settings, limit: int, path:
     path.active = on & survives & dr.any(path.beta != 0)
     path.score = score
     return path
+
+
+def follow_lamp(
+    emitter: mi.EmitterPtr, it: mi.Interaction3f, u: mi.Point2f, direct: mi.DirectionSample3f, active: mi.Bool
+) -> mi.DirectionSample3f:
+    """The direction of a lamp of one position or direction, with the derivative of its place."""
+    moved, _ = emitter.sample_direction(it, u, active)
+    if not dr.grad_enabled(moved.p):
+        return direct
+    moved.p = dr.select(direct.delta, moved.p, direct.p)
+    moved.d = dr.select(direct.delta, moved.d, direct.d)
+    moved.dist = dr.select(direct.delta, moved.dist, direct.dist)
+    moved.n, moved.uv, moved.pdf, moved.emitter = direct.n, direct.uv, direct.pdf, direct.emitter
+    return moved
 
 
 def shadow_ray(

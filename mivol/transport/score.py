@@ -27,7 +27,8 @@ from mivol.numerics import phi1
 from mivol.transport.chain import Chain
 from mivol.transport.control import Probe, Tracks, sweep
 from mivol.transport.emission import backproject_emission, integrate_emission
-from mivol.transport.path import Reach, Stretch, Way, optical_depth_to, reach, revisit, transmittance
+from mivol.transport.lamp_motion import shadow_of_moving
+from mivol.transport.path import Dimmed, Reach, Stretch, Way, optical_depth_to, reach, revisit, transmittance
 from mivol.transport.quadrature import integrate_scattering
 from mivol.transport.scatter import Scattering, albedo, at_event, scatter, scattered_light, sigma_t_at
 from mivol.transport.world import Body, World, by_channel, spectrum, tangent_of
@@ -62,9 +63,9 @@ class Primal:
         """Light found at the end of a stretch."""
         return Primal(self.L + dr.select(active, value, 0), self.scatters)
 
-    def shadow(self, scene: mi.Scene, world: World, way: Way, value: mi.Spectrum, active: mi.Bool) -> Primal:
+    def shadow(self, scene: mi.Scene, world: World, way: Way, light: Dimmed, active: mi.Bool) -> Primal:
         """Light that arrived along a shadow ray."""
-        return self.add(value, active)
+        return self.add(light.value, active)
 
     def turn(self, bsdf: mi.BSDFPtr, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool) -> Primal:
         """Nothing to do."""
@@ -120,10 +121,10 @@ class Adjoint:
             return Adjoint(None, self.dL)
         return Adjoint(self.L - seen, self.dL)
 
-    def shadow(self, scene: mi.Scene, world: World, way: Way, value: mi.Spectrum, active: mi.Bool) -> Adjoint:
+    def shadow(self, scene: mi.Scene, world: World, way: Way, light: Dimmed, active: mi.Bool) -> Adjoint:
         """Light that a shadow ray carried is dimmed by the media along it."""
-        _backproject(scene, world, way, -self.dL * dr.detach(value), active)
-        return self.add(value, active)
+        _backproject(scene, world, way, -self.dL * dr.detach(light.value), active)
+        return self.add(_moving(world, way, light, active), active)
 
     def turn(self, bsdf: mi.BSDFPtr, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool) -> Adjoint:
         """All that lies ahead passes through the BSDF: its parameters get dL L f' / f."""
@@ -190,11 +191,11 @@ class Tangent:
         dL = self.dL + dr.select(active, own - self.dtau * seen, 0)
         return Tangent(self.L + dr.select(active, seen, 0), dL, self.dtau)
 
-    def shadow(self, scene: mi.Scene, world: World, way: Way, value: mi.Spectrum, active: mi.Bool) -> Tangent:
+    def shadow(self, scene: mi.Scene, world: World, way: Way, light: Dimmed, active: mi.Bool) -> Tangent:
         """As :meth:`add`, with the tangent of the shadow ray besides."""
         along = _tangent(scene, world, way, active)
-        passed = self.add(value, active)
-        return Tangent(passed.L, passed.dL - dr.select(active, along * dr.detach(value), 0), self.dtau)
+        passed = self.add(_moving(world, way, light, active), active)
+        return Tangent(passed.L, passed.dL - dr.select(active, along * dr.detach(light.value), 0), self.dtau)
 
     def turn(self, bsdf: mi.BSDFPtr, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool) -> Tangent:
         """A BSDF that changes scales all that lies ahead: a logarithmic tangent, kept with the media's."""
@@ -206,6 +207,12 @@ class Tangent:
         f = dr.detach(f)
         change = dr.select(active & (f != 0), df * dr.rcp(dr.select(f != 0, f, 1)), 0)
         return Tangent(self.L, self.dL, self.dtau - change)
+
+
+def _moving(world: World, way: Way, light: Dimmed, active: mi.Bool) -> mi.Spectrum:
+    """Light of a shadow ray, which changes with its end."""
+    with dr.resume_grad():
+        return light.value * shadow_of_moving(world, way, light.tau, light.end, active)
 
 
 def _emit(

@@ -602,6 +602,40 @@ def test_direction_of_a_lamp(kind):
     assert_gradient(np.array(found)[:, None], np.array([truth]), kind, rounding=1e-4)
 
 
+@pytest.mark.parametrize("depth", [2, 3])
+def test_place_of_a_lamp_over_a_floor(depth):
+    """A floor under haze is lit from elsewhere: its distance, its slope and the haze in between; in each of two bounces.
+
+    No lamp in the plane of a face of the haze: there the light has a kink, for rays close to the face leave by it, or along it.
+    """
+    haze = medium("homogeneous", 0.7, 0.6 if depth == 2 else 0.0)
+    floor = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, -1.5]).scale(3)}
+    wall = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 3, 0]).rotate([1, 0, 0], 90).scale(3)}
+    parts = {"haze": box_of(haze, PLACE), "floor": floor, "wall": wall, "lamp": point([1.6, 1.3, 2.0])[0]}
+    scene = small.close_up(parts, res=8)
+    params, integrator = mi.traverse(scene), mi.load_dict({"type": "mivol", "max_depth": depth})
+    along = mi.Vector3f(0.6, -0.3, 0.5)
+
+    def picture(x: mi.Float, seed: int) -> mi.Float:
+        params["lamp.position"] = mi.Point3f(1.6, 1.3, 2) + x * along
+        params.update()
+        return dr.sum(mi.render(scene, params, integrator=integrator, spp=256, seed=seed, seed_grad=seed + 100), axis=None)
+
+    h, differences, found = 0.02, [], []
+    for seed in range(BATCHES):
+        ends = [float(picture(mi.Float(sign * h), seed).array[0]) for sign in (1, -1)]
+        differences.append((ends[0] - ends[1]) / (2 * h))
+        x = mi.Float(0)
+        dr.enable_grad(x)
+        dr.backward(picture(x, seed))
+        found.append(dr.grad(x)[0])
+    m = Moments.of((np.array(differences) - np.array(found))[:, None])
+    level = abs(np.mean(differences))
+    # Truncation: (h / distance)^2 = 1e-4; the box's edges are kinks of the haze in between.
+    assert_same_mean(m.mean, m.variance_of_mean, np.zeros(1), n_a=BATCHES, rounding=2e-3 * level, what="floor")
+    assert np.sqrt(m.variance_of_mean) < 0.02 * level
+
+
 # -- Forward against reverse, and differences ---------------------------------------------------------------------------------
 
 
