@@ -18,6 +18,7 @@ import numpy as np
 from mivol.errors import MivolError
 from mivol.files import check_volume
 from mivol.scene.load import check_variant
+from mivol.scene.nesting import bounds, nesting_fault, overlap
 from mivol.transport.direct import UNIFORM
 from mivol.transport.lattice import Lattice, block_bounds, block_gaps, box_nodes, locate
 from mivol.transport.light_grid import Coarse, coarsen
@@ -163,9 +164,16 @@ def find_needs(scene: mi.Scene, sensor: mi.Sensor, survey: Survey | None = None,
 
 
 def survey_scene(scene: mi.Scene) -> Survey:
-    """Find the media, surfaces and emitters of a scene."""
+    """Find the media, surfaces and emitters of a scene.
+
+    Raises:
+        MivolError: boundaries that overlap without saying which medium is where.
+    """
     boundaries, surfaces, refractive, veiled = [], [], [], False
     shapes = scene.shapes()
+    fault = None if dr.flag(dr.JitFlag.FreezingScope) else nesting_fault(scene)
+    if fault is not None:
+        raise MivolError(fault)
     for index, shape in enumerate(shapes):
         if shape.is_medium_transition():
             name = shape.id() or f"shape {index}"
@@ -216,7 +224,7 @@ def _is_instance(shape: mi.Shape) -> bool:
 
 
 def _boundary(shape: mi.Shape, name: str, shapes: list[mi.Shape]) -> Boundary:
-    alone = all(other is shape or not _overlap(shape, other) for other in shapes if other.is_medium_transition())
+    alone = all(other is shape or not overlap(shape, other) for other in shapes if other.is_medium_transition())
     is_box = shape.class_name() == "Cube" and shape.exterior_medium() is None and _is_bare(shape) and alone
     return Boundary(shape.interior_medium(), name, shape.class_name(), box_of_cube(shape) if is_box else None)
 
@@ -227,29 +235,12 @@ def _around(media: Iterable[mi.Medium], boundaries: Sequence[Boundary]) -> list[
     return [Boundary(m, m.id() or "a medium without an id", AROUND, None) for m in media if m.ptr not in held]
 
 
-def _overlap(a: mi.Shape, b: mi.Shape) -> bool:
-    """Whether the bounding boxes of two shapes share more than a face."""
-    one, two = _bounds(a), _bounds(b)
-    low, high = np.maximum(one[0], two[0]), np.minimum(one[1], two[1])
-    # Neighbours may share a face, whose float32 vertices agree to 1e-6 of their size only.
-    return bool((high - low > 1e-6 * np.maximum(np.abs(high), np.abs(low))).all())
-
-
-def _bounds(shape: mi.Shape) -> tuple[np.ndarray, np.ndarray]:
-    """Lower and upper corner of a shape. Meshes that Mitsuba 3.9.1 has merged have no valid box of their own."""
-    box = shape.bbox()
-    if box.valid():
-        return np.array(box.min), np.array(box.max)
-    points = np.array(mi.traverse(shape)["vertex_positions"]).reshape(-1, 3)
-    return points.min(axis=0), points.max(axis=0)
-
-
 def _camera_inside(scene: mi.Scene, sensor: mi.Sensor, survey: Survey) -> bool:
     """Whether the sensor may lie in the bounding box of a boundary that has to be traced."""
     if all(b.box is not None for b in survey.boundaries):
         return False
     eye = sensor.bbox()
-    boxes = [_bounds(s) for s in scene.shapes() if s.is_medium_transition() or _is_instance(s)]
+    boxes = [bounds(s) for s in scene.shapes() if s.is_medium_transition() or _is_instance(s)]
     # A sensor at infinity has no box of its own: its rays start outside the scene. Walls of a room are flat.
     if not eye.valid() or not boxes:
         return False
@@ -291,12 +282,12 @@ def read_part(part: Part, survey: Survey, name: str) -> _Read:
             # Nothing is below an empty value; an extinction rises with what is stored.
             empty = activation.empty_below
             values = mi.TensorXf(dr.maximum(array, empty) if empty is not None else dr.abs(array) + 1, values.shape)
-        bounds = block_bounds(values)
-        if activation is None and not (dr.all(dr.isfinite(bounds)) and dr.all(array >= 0)):
+        blocks = block_bounds(values)
+        if activation is None and not (dr.all(dr.isfinite(blocks)) and dr.all(array >= 0)):
             check_volume(np.array(dr.detach(values)), name=name)
-        host = np.array(bounds)
+        host = np.array(blocks)
         _check_look_up(part, survey, name)
-        return _Read(bounds, float((host > 0).mean()), float(host.max(initial=0.0)))
+        return _Read(blocks, float((host > 0).mean()), float(host.max(initial=0.0)))
 
     return _once(survey, ("part",), array, make)
 

@@ -164,17 +164,18 @@ def _refuse_emission(needs: Needs, settings: Settings) -> None:
                 f"{view.guide.res}, or they lie in different places; a glow is summed in the cells of the extinction: give "
                 "both the same resolution and to_world."
             )
-        least = _source_over_cells(view) if isinstance(view.source, mi.Volume) else 1.0
-        if least < 1 - 1e-4:  # the place of a stock grid is known to 5e-6
-            raise MivolError(
-                f"the emission of the medium in {facts.name} varies over lengths of {least:.2g} of its extinction's cells, "
-                "which are looked at in two points; resample the extinction to voxels as small, or give it as a number."
-            )
+        for name, volume in (("emission", view.source), ("albedo", view.share)) if view.source is not None else ():
+            least = _voxel_over_cells(volume, view) if isinstance(volume, mi.Volume) else 1.0
+            if least < 1 - 1e-4:  # the place of a stock grid is known to 5e-6
+                raise MivolError(
+                    f"the {name} of the medium in {facts.name} varies over lengths of {least:.2g} of its extinction's cells, "
+                    "which are looked at in two points; resample the extinction to voxels as small, or give it as a number."
+                )
 
 
-def _source_over_cells(view: MediumView) -> float:
-    """A voxel of the source over the longest edge of a cell that is walked, both as the source counts lengths."""
-    volume, cells = view.source, view.guide
+def _voxel_over_cells(volume: mi.Volume, view: MediumView) -> float:
+    """A voxel of a volume over the longest edge of a cell that is walked, both as the volume counts lengths."""
+    cells = view.guide
     place = volume.mivol_to_world if hasattr(volume, "mivol_to_world") else view.rooms[volume.ptr].to_world
     edges = cells.to_world[:3, :3] / np.array(cells.res[::-1])
     voxels = np.linalg.solve(place[:3, :3], edges) * np.array(volume.resolution(), dtype=np.float64)[:, None]

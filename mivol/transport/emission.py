@@ -166,7 +166,7 @@ class _Emission:
         """(1 - albedo) Le with its derivative, where the medium has an albedo; else Le."""
         view = site.body.view
         Le = _evaluate(view.source, site, t)
-        return Le if view.share is None else (1 - _evaluate(view.share, site, t)) * Le
+        return Le if view.share is None else (1 - _albedo(site, t)) * Le
 
     def _share(self, site: Site, t: mi.Float) -> mi.Spectrum:
         """sigma_a / sigma_t where the medium has both coefficients (1 in a vacuum); else 1."""
@@ -217,6 +217,12 @@ def _endless(stop: Stop, endless: mi.Bool, sigma: mi.Float, source: mi.Float, gl
         [sum(stop.dtau, mi.Float(0))],
         [dr.select(endless, -glow * dr.square(mean), sum(stop.dN, mi.Float(0)))],
     )
+
+
+def _albedo(site: Site, t: mi.Float) -> mi.Spectrum:
+    """The albedo at a point of a ray, with its derivative; a stock grid repeats its border, as where light is scattered."""
+    share = site.body.view.share
+    return share.eval(interaction(site.ray, t), site.on) if isinstance(share, mi.Volume) else mi.Spectrum(share)
 
 
 def _evaluate(field: mi.Volume | mi.Float | mi.Color3f, site: Site, t: mi.Float) -> mi.Spectrum:

@@ -70,10 +70,10 @@ class MediumView:
         source: the radiance that a medium shows where nothing is seen through it, a volume or a constant; None where it
             does not emit.
         glow: radiance per length that does not go with the extinction, likewise.
-        frame: the grid of ``glow`` or ``source``, which a sweep follows where the extinction has none.
+        frame: the grid of ``glow``, ``source`` or ``share``, which a sweep follows where the extinction has none.
         lights: the arrays behind ``source`` and ``glow``.
-        rooms: the boxes of stock grids of emission, by the volume's pointer: they repeat their border outside of it, where
-            a grid is to be vacuum.
+        rooms: the boxes of stock grids of emission and albedo, by the volume's pointer: they repeat their border outside of
+            it, where emission is to be 0.
     """
 
     medium: mi.Medium
@@ -171,8 +171,9 @@ def view_medium(medium: mi.Medium, boundary: Box | None = None, places: dict | N
     lights = [v for k, v in params if k.startswith("emission") and k.endswith((".data", ".value.value"))]
     if not parts:
         parts, share, lights = [_part_of_field(source)], mi.Float(0), []
-    frame = _frame([glow, source], boundary, places)
-    rooms = {v.ptr: Box(_place(v, boundary, places)) for v in (source, glow) if _repeats(v)}
+    light = [f for f in (glow, source, share) if source is not None or glow is not None]
+    frame = _frame(light, boundary, places)
+    rooms = {v.ptr: Box(_place(v, boundary, places)) for v in light if _repeats(v)}
     scale = mi.Float(params["scale"]) if "scale" in params.properties else mi.Float(1)
     return MediumView(medium, parts, scale, albedo, share, _flakes(medium), source, glow, frame, lights, rooms)
 

@@ -11,10 +11,12 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import combinations
 
 import mitsuba as mi
 import numpy as np
 
+from mivol.scene.nesting import nesting_fault
 from mivol.transport.medium import kind_of
 
 __all__ = ["CHECKS", "Doubt", "trust"]
@@ -34,6 +36,9 @@ RESTART = 1500 * 2.0**-24
 
 POINTS = 4096
 """Points of a boundary at which its extinction is looked up."""
+
+TOUCHES = 512
+"""Those of them that are looked at for another boundary."""
 
 # The smallest share of the light that is worth a word: below the noise of most references.
 SMALLEST_SKIN = 2e-3
@@ -66,6 +71,7 @@ class Boundary:
         to_local: (4, 4) world to the unit cube of the volume under a stock ``heterogeneous``, else None.
         to_local_inverse: (4, 4) transpose of what Mitsuba takes for the inverse of a stock volume's, else None.
         volume: class of the volume under a stock ``heterogeneous``, else "".
+        surface: (POINTS, 3) points on the shape, or on its box where it is neither a mesh nor a ball.
         majorant: largest extinction [1/length].
         skin: largest optical depth, along the normal, of what Mitsuba leaps over where a ray enters.
         params: what can be traversed of the medium.
@@ -78,6 +84,7 @@ class Boundary:
     to_local: np.ndarray | None
     to_local_inverse: np.ndarray | None
     volume: str
+    surface: np.ndarray
     majorant: float
     skin: float
     params: dict[str, object]
@@ -117,6 +124,9 @@ def trust(scene: mi.Scene, sensors: Sequence[mi.Sensor] | None = None) -> list[D
     """
     boundaries = [_boundary(s) for s in scene.shapes() if s.interior_medium() is not None]
     doubts = [Doubt(kind, *found) for kind, check in CHECKS.items() for b in boundaries for found in check(b)]
+    doubts += [Doubt("touching", _touching(a, b)) for a, b in combinations(boundaries, 2) if _touch(a, b)]
+    fault = nesting_fault(scene)
+    doubts += [Doubt("overlap", fault)] if fault is not None else []
     for sensor in scene.sensors() if sensors is None else sensors:
         doubts += [Doubt("camera inside", sentence) for sentence in _camera_inside(sensor, boundaries)]
     return doubts
@@ -237,6 +247,28 @@ CHECKS: dict[str, Callable[[Boundary], Found]] = {
 }
 
 
+def _touch(a: Boundary, b: Boundary) -> bool:
+    """Whether part of one's surface lies on the other's: a point that passes the one changes sides of the other as well."""
+    return _lies_on(a, b) or _lies_on(b, a)
+
+
+def _lies_on(a: Boundary, b: Boundary) -> bool:
+    p = a.surface[:TOUCHES]
+    out = p - a.points.mean(axis=0)
+    step = RESTART * (1 + np.abs(p).max(axis=1, keepdims=True)) * out / np.linalg.norm(out, axis=1, keepdims=True)
+    near = np.all((p >= b.points.min(axis=0) - np.abs(step)) & (p <= b.points.max(axis=0) + np.abs(step)), axis=1)
+    changes = sum(b.holds(q + s) != b.holds(q - s) for q, s in zip(p[near], step[near], strict=True))
+    return changes >= 0.01 * len(p)
+
+
+def _touching(a: Boundary, b: Boundary) -> str:
+    return (
+        f"{a.name} and {b.name} touch: Mitsuba starts rays a little behind the surface they leave, and so inside the other "
+        "without having entered its medium, which is then vacuum; leave a gap of a thousandth of the scene, or make one grid "
+        "of both."
+    )
+
+
 def _camera_inside(sensor: mi.Sensor, boundaries: list[Boundary]) -> Iterator[str]:
     if sensor.get_medium() is not None:
         return
@@ -263,6 +295,7 @@ def _boundary(shape: mi.Shape) -> Boundary:
     faces = np.array(geometry["faces"]).reshape(-1, 3) if mesh else None
     to_world = _matrix(geometry["to_world"]) if shape.shape_type() == mi.ShapeType.Sphere.value else None
     to_local, scale = _reach(kind, volumes), _number(params.get("scale", 1.0))
+    surface = _surface(points, faces, to_world)
     return Boundary(
         name=shape.id() or f"the {shape.class_name()}",
         points=points,
@@ -271,14 +304,15 @@ def _boundary(shape: mi.Shape) -> Boundary:
         to_local=to_local,
         to_local_inverse=_printed(stock, "inverse_transpose") if kind == "HeterogeneousMedium" else None,
         volume=volumes[0].class_name() if kind == "HeterogeneousMedium" else "",
+        surface=surface,
         majorant=scale * sum(float(np.max(v.max())) for v in volumes),
-        skin=scale * _skin(_surface(points, faces, to_world), volumes, to_local),
+        skin=scale * _skin(surface + ON_FACE * (points.mean(axis=0) - surface), volumes, to_local),
         params={key: params[key] for key in params.keys()},  # noqa: SIM118  (iteration gives pairs)
     )
 
 
 def _surface(points: np.ndarray, faces: np.ndarray | None, to_world: np.ndarray | None) -> np.ndarray:
-    """Points (N, 3) just inside a boundary: of a mesh, of a ball, else the corners of a box about it."""
+    """Points (N, 3) of a boundary: of a mesh, of a ball, else the corners of a box about it."""
     rng = np.random.default_rng(0)
     if faces is not None:
         share = rng.dirichlet((1, 1, 1), POINTS)
@@ -286,7 +320,7 @@ def _surface(points: np.ndarray, faces: np.ndarray | None, to_world: np.ndarray 
     elif to_world is not None:
         d = rng.normal(size=(POINTS, 3))
         points = d / np.linalg.norm(d, axis=1, keepdims=True) @ to_world[:3, :3].T + to_world[:3, 3]
-    return points + ON_FACE * (points.mean(axis=0) - points)
+    return points
 
 
 def _skin(points: np.ndarray, volumes: list[mi.Volume], to_local: np.ndarray | None) -> float:

@@ -291,6 +291,26 @@ def test_glow_in_other_cells_is_refused():
 
 
 @pytest.mark.parametrize("kind", ["mivol_voxels", "gridvolume"])
+def test_an_albedo_alone_brings_the_cells(kind):
+    """Nothing else is a grid: the same light as through an extinction of the same values on the albedo's own cells."""
+    albedo = (rough(5, 0, 1), PLACE)
+    alone = light(emitting(twins.Medium(0.8, LE, 0.0, albedo), kind=kind))
+    on_cells = light(emitting(twins.Medium((np.full_like(albedo[0], 0.8), PLACE), LE, 0.0, albedo), kind=kind))
+    # Sums of up to 15 cells of at most 0.7 in float32, twice.
+    assert np.abs(alone - on_cells).max() <= 30 * 0.7 * 2.0**-24
+    flat = light(emitting(twins.Medium(0.8, LE, 0.0, float(albedo[0].mean())), kind=kind))
+    assert np.abs(alone - flat).max() > 0.01
+
+
+def test_an_albedo_that_varies_within_the_cells_is_refused():
+    sigma, albedo = (rough(1, 0, 2), PLACE), (rough(2, 0, 1, 1, (5, 8, 6)), PLACE)
+    with refused("the albedo of the medium in box varies over lengths of .* of its extinction's cells"):
+        shoot(picture(interior(twins.Medium(sigma, LE, 0.0, albedo))))
+    # Without emission there is nothing to be looked at.
+    assert np.isfinite(shoot(picture(interior(twins.Medium(sigma, 0.0, 0.0, albedo))))).all()
+
+
+@pytest.mark.parametrize("kind", ["mivol_voxels", "gridvolume"])
 def test_a_source_that_varies_within_the_cells_is_refused(kind):
     """Two points of a cell would miss it: 16^3 voxels of noise in an extinction of 2^3 are seen with an error of 8 %."""
     sigma = (rough(1, 0, 2), PLACE)

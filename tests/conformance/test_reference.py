@@ -319,6 +319,8 @@ def _wrong_scenes() -> dict[str, tuple[dict, float, float]]:
     ball = {"type": "sphere", "bsdf": {"type": "null"}, "interior": _homogeneous(1.0)}
     mirror = _t().translate([0.5, 0.5, 0.5]).scale([-0.5, 0.5, 0.5])
     flat = {"type": "heterogeneous", "sigma_t": 1.0, "albedo": 0.0}
+    behind = {**_scene(_homogeneous(0.5), _t().translate([0.5, 0.5, 1.5]).scale(0.5))["box"], "id": "behind"}
+    within = {**ball, "center": [0.5, 0.5, 0.2], "radius": 0.1, "id": "within"}
     return {
         # the ray misses the grid within its large boundary
         "too deep": (_upright_column(_scene(_grid(30.0), big), 3, 3), 1.0, 0.0),
@@ -326,11 +328,16 @@ def _wrong_scenes() -> dict[str, tuple[dict, float, float]]:
         "rotated grid": (_upright_column(_scene(_grid(1.0, to_world=tilted), big), 0.5, 0.1), 1.0, np.exp(-1.0)),
         "mirrored": (_scene(_grid(1.0), mirror), np.exp(-1.0), 0.0),
         "camera inside": (_scene(_grid(1.0), box=ball, sensor=inside), np.exp(-1.0), 1.0),
+        "touching": (_scene(_homogeneous(1.0), behind=behind), np.exp(-1.5), np.exp(-1.0)),
+        # leaving the ball ends the haze as well
+        "overlap": (_upright_column(_scene(_homogeneous(1.0), ball=within), 0.5, 0.5), np.exp(-1.0), np.exp(-0.3)),
         "constant box": (_upright_column(_scene(flat, big), 3, 3), np.exp(-6.0), 1.0),
     }
 
 
-@pytest.mark.parametrize("kind", ["too deep", "rotated grid", "mirrored", "camera inside", "constant box"])
+@pytest.mark.parametrize(
+    "kind", ["too deep", "rotated grid", "mirrored", "camera inside", "touching", "overlap", "constant box"]
+)
 def test_hard_03_04_doubt_where_mitsuba_is_wrong(variant_rgb, tmp_path, kind):
     """Each doubt is raised, alone, and Mitsuba does show the wrong value: a release that mends it turns this red."""
     scene, right, shown = _wrong_scenes()[kind]
