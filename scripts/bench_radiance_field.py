@@ -36,19 +36,22 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import mivol  # noqa: F401  (chooses LLVM)
-from contest import AT_LEAST, AT_MOST, DATA, TO_WORLD, Bench, judge, race, ratio_of, say
+from contest import AT_LEAST, AT_MOST, DATA, TO_WORLD, Bench, judge, plain_ticks, race, ratio_of, say
 from mivol.fields.spherical import SphericalGrid
-from mivol.files import whole_file
 from mivol.optim.radiance_fit import Plan, RadianceFit, Stage
 from mivol.optim.radiance_views import TILE, Batch, Views
 from mivol.photos import Camera, Photo, load_photos, pixel_centres, rays, silhouette_box
 from mivol.photos.camera import intrinsics
+from mivol.report.figures import MARKERS, SERIES, STYLE, save
 from mivol.transport.radiance import Rays, bake, cells_of, exact, fold, look, look_back, model_of
 from radiance_peer import Peer
 
 import drjit as dr
+import matplotlib as mpl
 import mitsuba as mi
 import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
 
 STOP = 1e-4
 """Transmittance at which our rays end; the peer's end at 0."""
@@ -461,6 +464,9 @@ def ask_fit(size: Size) -> dict:
 
 # -- Saying it ----------------------------------------------------------------------------------------------------------------
 
+STEP_BARS = {"camera": 8, "pixels": 4}
+"""How many times the peer's rays a second there must be, for each order of the rays."""
+
 
 def compare(question: str, answer: dict) -> list[dict]:
     """The figures that have a bar."""
@@ -470,39 +476,67 @@ def compare(question: str, answer: dict) -> list[dict]:
         return []
     if question == "fit":
         return [judge(f"{name}: time to the same PSNR", a["ratio"], AT_LEAST, 10) for name, a in answer.items()]
-    bars = {"camera": 8, "pixels": 4}
     return [
         judge(f"{name}: {kind} rays, forward and backward", a[kind]["ratio_of_processor_time"], AT_LEAST, bar)
         for name, a in answer.items()
-        for kind, bar in bars.items()
+        for kind, bar in STEP_BARS.items()
     ]
 
 
 def draw(answers: dict, folder: Path) -> None:
-    """Ratios as bars, and the curves of the fits."""
-    import matplotlib
+    """A panel for each question that has a picture, and one for each field of the fits."""
+    panels = [(PANELS[question], answer) for question, answer in answers.items() if question in PANELS]
+    panels += [(draw_fit, {name: answer}) for name, answer in answers.get("fit", {}).items()]
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(4.2 * max(len(panels), 1), 3.6))
+        FigureCanvasAgg(figure)
+        for number, (panel, answer) in enumerate(panels, 1):
+            panel(figure.add_subplot(1, len(panels), number), answer)
+    save(figure, folder / "bench_radiance_field.png")
 
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
 
-    fig, axes = plt.subplots(1, 4, figsize=(18, 4), layout="constrained")
-    if "step" in answers:
-        for k, kind in enumerate(("camera", "pixels", "any")):
-            values = [a[kind]["ratio_of_processor_time"] for a in answers["step"].values()]
-            axes[0].bar(np.arange(len(values)) + 0.25 * k, values, 0.25, label=kind)
-        axes[0].set_xticks(np.arange(len(FIELDS)) + 0.25, list(FIELDS))
-        axes[0].set(ylabel="times the peer's rays a second", title="forward and backward")
-        axes[0].legend()
-    for ax, (name, a) in zip(axes[1:], answers.get("fit", {}).items(), strict=False):
-        for who in ("ours", "peer"):
-            ax.plot(*zip(*a[who], strict=True), "o-", ms=3, label=who)
-        ax.axhline(a["peer_psnr"], color="gray", ls=":")
-        ax.set(xscale="log", xlabel="seconds", ylabel="held-out PSNR [dB]", title=name)
-        ax.legend()
-    with whole_file(folder / "bench_radiance_field.png") as temporary:
-        fig.savefig(temporary, dpi=90, format="png")
-    plt.close(fig)
+def draw_step(axes: mpl.axes.Axes, answer: dict) -> None:
+    """How many times the peer's rays a second, for each order of the rays."""
+    rows = np.arange(len(answer))[::-1]
+    for i, kind in enumerate(("camera", "pixels", "any")):
+        ratios = [a[kind]["ratio_of_processor_time"] for a in answer.values()]
+        axes.semilogx(ratios, rows, MARKERS[i], color=SERIES[i], label=f"{kind} rays" if kind != "pixels" else "random pixels")
+        if kind in STEP_BARS:
+            axes.axvline(STEP_BARS[kind], color=SERIES[i], linestyle="--", linewidth=1.2)
+    axes.set(yticks=rows, yticklabels=list(answer), ylim=(-0.6, len(rows) + 0.5))
+    axes.set(title="Rays a second over the peer's", xlabel="forward and backward (lines: the bars)")
+    plain_ticks(axes.xaxis, "×")
+    axes.legend(loc="upper left")
 
+
+def draw_memory(axes: mpl.axes.Axes, answer: dict) -> None:
+    """Peak of a step for two numbers of rays."""
+    axes.bar(("rays", "4 x rays"), np.array(answer["peak_bytes"]) / 2**20, 0.5, color=SERIES[0])
+    axes.axhline(answer["field_bytes"] / 2**20, color=SERIES[1], linestyle="--", linewidth=1.2, label="the field")
+    axes.set(title=f"{answer['bytes_per_ray']:.0f} bytes a ray", ylabel="peak of a step [MiB]")
+    axes.legend()
+
+
+def draw_locality(axes: mpl.axes.Axes, answer: dict) -> None:
+    """What a step takes, and where as many steps end."""
+    for i, (name, a) in enumerate(answer.items()):
+        axes.plot(1e3 * a["processor_seconds"] / a["steps"], a["psnr"], MARKERS[i], color=SERIES[i], label=name)
+    axes.set(title="Tiles and single pixels", xlabel="processor time of a step [ms]", ylabel="held-out PSNR [dB]")
+    axes.margins(0.4)
+    axes.legend()
+
+
+def draw_fit(axes: mpl.axes.Axes, answer: dict) -> None:
+    """Held-out views against time."""
+    ((name, curves),) = answer.items()
+    for i, (who, label) in enumerate((("ours", "mivol"), ("peer", "tutorial's method"))):
+        axes.semilogx(*zip(*curves[who], strict=True), marker=MARKERS[i], markersize=3, color=SERIES[i], label=label)
+    axes.axhline(curves["peer_psnr"], color=SERIES[1], linestyle="--", linewidth=1.2)
+    axes.set(title=f"{name}, 7 views", xlabel="time [s]", ylabel="held-out PSNR [dB]")
+    axes.legend(loc="lower right")
+
+
+PANELS = {"step": draw_step, "memory": draw_memory, "locality": draw_locality}
 
 BENCH = Bench(
     "bench_radiance_field",

@@ -199,7 +199,7 @@ def test_a_ball_under_a_constant_sky(alone):
     interior = medium("mivol_medium", grid_volume("mivol_voxels", 0.2 + rough_grid(1), PLACE), 0.8)
     parts = {"smoke": scenes.ball_of(interior, (0, 0, 0), 1.0), "sky": scenes.sky(0.7)}
     if not alone:
-        parts["fog"] = fog(0.8, 0.3, centred(np.eye(3), (0.8, -0.8, 1.2)))[0]
+        parts["fog"] = fog(0.8, 0.3, centred(np.eye(3), (0.9, -0.9, 1.3)))[0]
     scene, integrator, w = small.close_up(parts, res=8), mi.load_dict(mivol()), np.ones((8, 8, 3))
     params = mi.traverse(scene)
     start, h = np.array(params[GRID]), 0.02
