@@ -35,15 +35,15 @@ class Sky:
     texels: mi.Float
 
     @classmethod
-    def grey(cls, rows: int, value: float = 0.5) -> Sky:
-        """The same in all directions.
+    def even(cls, rows: int, colour: np.ndarray | float) -> Sky:
+        """The same colour in all directions: (3,), or one number for a grey.
 
         Raises:
             MivolError: fewer than 2 rows.
         """
         if rows < 2:
             raise MivolError(f"a sky of {rows} rows was asked for; at least 2 are expected, one a pole.")
-        return cls.of_image(np.full((rows, 2 * rows, 3), value))
+        return cls.of_image(np.broadcast_to(colour, (rows, 2 * rows, 3)))
 
     @classmethod
     def of_image(cls, image: np.ndarray) -> Sky:

@@ -79,7 +79,7 @@ class RadianceFit:
         if self.plan.sky:
             if self.views.channels == 4:
                 raise MivolError("a sky was asked for and the photographs have alpha, which says what is behind: sky = 0.")
-            self.sky = Sky.grey(self.plan.sky)
+            self.sky = Sky.even(self.plan.sky, self.views.median())
             self.sky_squares = dr.zeros(mi.Float, dr.width(self.sky.texels))
         self.unit = float((self.box[1] - self.box[0]).max()) / 2
 

@@ -105,6 +105,13 @@ class Views:
         levels = [level for _, level in sorted(self.levels.items())]
         return [pixels for level in levels for pixels in (level.codes, level.counted) if pixels is not None]
 
+    def median(self) -> np.ndarray:
+        """(3,) the median of each colour over the pixels that count, in the smallest size; grey where none does."""
+        level = self.levels[max(self.levels)]
+        codes = np.array(level.codes).reshape(-1, self.channels)[:, :3]
+        counted = codes if level.counted is None else codes[np.array(level.counted) > 0]
+        return np.median(counted, axis=0) / 255 if len(counted) else np.full(3, 0.5)
+
     def draw(self, shrink: int, views: np.ndarray, tiles: int, rng: np.random.Generator) -> Batch:
         """Draw tiles of some views: ``tiles`` of each, rays of a view side by side."""
         level = self.levels[shrink]

@@ -43,4 +43,4 @@ def test_derivatives_of_a_sky(variant_rgb: str) -> None:
 
 def test_a_sky_of_one_row_is_refused(variant_rgb: str) -> None:
     with pytest.raises(MivolError, match="1 rows .* at least 2"):
-        Sky.grey(1)
+        Sky.even(1, 0.5)

@@ -188,6 +188,19 @@ def test_what_is_behind_is_found_too(variant_rgb: str, photos: list[Photo]) -> N
         RadianceFit(Views.of(photos, (1, 2), with_alpha=True), BOX, fit.plan)
 
 
+def test_a_sky_begins_with_what_most_pixels_show(variant_rgb: str, photos: list[Photo]) -> None:
+    """A dark sky begins dark, or the field would have to be what darkens a grey one; what masks leave out says nothing."""
+    dark = np.array([20, 30, 60], np.float32) / 255
+    images = [np.where(p.alpha[..., None] > 0.5, p.image, dark) for p in photos[:3]]
+    masks = [np.ones(p.alpha.shape, bool) for p in photos[:3]]
+    images[0][:], masks[0][:] = 1, False
+    taken = [Photo(p.name, i, None, m, p.camera, WHITE) for p, i, m in zip(photos, images, masks, strict=False)]
+    fit = RadianceFit(Views.of(taken, (1, 2)), BOX, replace(PLAN, sky=8))
+    np.testing.assert_allclose(fit.sky.image(), np.broadcast_to(dark, (8, 16, 3)), atol=1e-6)
+    blind = [replace(p, mask=np.zeros_like(p.mask)) for p in taken]
+    np.testing.assert_array_equal(Views.of(blind).median(), 0.5)
+
+
 def test_views_know_their_rays_and_pixels(variant_rgb: str, photos: list[Photo]) -> None:
     views = Views.of(photos[:3], (1, 2))
     batch = views.draw(1, np.array([0, 2]), 5, np.random.default_rng(0))
