@@ -25,7 +25,7 @@ from mivol.cli.rendering import set_threads, set_variant
 from mivol.config import Experiment, Files, Sought
 from mivol.errors import MivolError
 from mivol.fields.procedural import make_procedural
-from mivol.files import frame_from_box, layers, read_exr, read_volume, write_exr, write_png, write_volume
+from mivol.files import layers, read_exr, read_volume, write_exr, write_png, write_volume
 from mivol.optim.events import upsample
 from mivol.optim.loop import Fit, reconstruct
 from mivol.optim.parameters import Parameter, as_tensor, find, like
@@ -34,11 +34,11 @@ from mivol.optim.shots import Shot, View, check_sizes, make_shots
 from mivol.report import figures
 from mivol.report.page import write_page
 from mivol.report.record import Choice, Image, RunRecord, Volume, append_metrics, read_metrics, rewind_metrics, write_record
-from mivol.scene.cameras import find_box
 from mivol.scene.load import LoadedScene, load_scene
 from mivol.scene.needs import find_needs, survey_scene
 from mivol.scene.plan import make_plan
 from mivol.threads import check_one_thread
+from mivol.transport.medium import place_of_grid
 from mivol.transport.path import Settings
 from mivol.validate.reference import ReferenceResult, read_reference, render_reference
 from mivol.validate.statistics import nrmse, psnr
@@ -324,10 +324,20 @@ def make_start(sought: Sought, base: Path, scene: mi.Scene) -> Start:
     elif sought.start is not None:
         shape = (*sought.shape, now.shape[3]) if sought.shape else now.shape
         value = np.full(shape, start_of(sought, shape), dtype=np.float32)
-    extent = tuple(float(edge) for edge in np.diff(find_box(scene), axis=0)[0, ::-1])
+    extent = edges_of(place_of(sought.key, scene))[::-1] if value.ndim == 4 else (1.0, 1.0, 1.0)
     parameter = Parameter(sought.key, sought.unit, sought.domain, sought.map, sought.lr, extent, sought.prior)
     parameter.to_reals(mi.TensorXf(np.ascontiguousarray(value)))
     return Start(parameter, value)
+
+
+def place_of(key: str, scene: mi.Scene) -> np.ndarray:
+    """Where the grid of a parameter lies: the (4, 4) map of the unit cube to the world."""
+    return place_of_grid(mi.traverse(scene).properties[key][2])
+
+
+def edges_of(place: np.ndarray) -> tuple[float, float, float]:
+    """Lengths (x, y, z) of the edges of a grid's box."""
+    return tuple(float(edge) for edge in np.linalg.norm(place[:3, :3], axis=0))
 
 
 def start_of(sought: Sought, shape: Sequence[int]) -> Any:
@@ -482,12 +492,15 @@ def layer_of(layer: str, image: np.ndarray) -> str:
 
 
 def write_grid(chosen: Experiment, folder: Path, sought: Sought, fit: Fit, truth: np.ndarray | None) -> list[Volume]:
-    """A parameter that is a grid, as .vol and .npz; the truth beside it."""
+    """A parameter that is a grid, as .npz and .vol where it lies in the scene; the truth beside it.
+
+    A .vol has room for boxes along the axes only: of a turned grid it holds the unit cube, which the scene places.
+    """
     value = np.asarray(fit.values()[sought.key])
     if value.ndim != 4:
         return []
-    box = find_box(fit.problem.scene)
-    to_world, size = frame_from_box(*box), tuple(float(edge) for edge in box[1] - box[0])
+    place = place_of(sought.key, fit.problem.scene)
+    is_along_axes = np.array_equal(place[:3, :3], np.diag(np.abs(np.diagonal(place)[:3])))
     quantity = next((word for word in ("sigma_t", "sigma_a", "sigma_s", "albedo") if word in sought.key), "value")
     grids = {"reconstruction": value}
     if truth is not None and chosen.truth.key == sought.key:
@@ -495,9 +508,9 @@ def write_grid(chosen: Experiment, folder: Path, sought: Sought, fit: Fit, truth
     found = []
     for role, grid in grids.items():
         stem = f"volumes/{sought.key.replace('.', '_')}_{role}"
-        write_volume(folder / f"{stem}.vol", grid, to_world)
-        write_volume(folder / f"{stem}.npz", grid, to_world, metadata={"key": sought.key, "unit": sought.unit})
-        found.append(Volume(path=f"{stem}.npz", role=role, quantity=quantity, unit=sought.unit, size=size))
+        write_volume(folder / f"{stem}.vol", grid, place if is_along_axes else np.eye(4))
+        write_volume(folder / f"{stem}.npz", grid, place, metadata={"key": sought.key, "unit": sought.unit})
+        found.append(Volume(path=f"{stem}.npz", role=role, quantity=quantity, unit=sought.unit, size=edges_of(place)))
     return found
 
 
