@@ -203,9 +203,12 @@ def optimize(arguments: argparse.Namespace) -> None:
     """Reconstruct a volume from its views; everything that comes of it lies in the run folder."""
     from mivol import config
     from mivol.cli import experiment, field, scan
+    from mivol.optim import checkpoint
 
     chosen = config.load(arguments.experiment, arguments.set)
     folder = arguments.output or Path(chosen.output)
+    if arguments.resume:
+        checkpoint.check_settings(folder / experiment.CHECKPOINT, config.flat(config.resolved(chosen)))
     kind = {config.Experiment: experiment, config.Scan: scan, config.FieldFit: field}[type(chosen)]
     page = kind.run(chosen, arguments.experiment.parent, folder, resume=arguments.resume)
     print(page)

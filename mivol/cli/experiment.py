@@ -435,7 +435,8 @@ def errors_of(measured: dict[str, float]) -> dict[str, float]:
 
 
 def append_last(folder: Path, fit: Fit) -> None:
-    """What was measured after the last iteration."""
+    """What was measured after the last iteration, once however often a run that is done is resumed."""
+    rewind_metrics(folder, fit.next - 1)
     if fit.measures and fit.measures[-1]["iteration"] == fit.next and len(fit.measures[-1]) > 2:
         append_metrics(folder, **fit.measures[-1])
 

@@ -19,6 +19,9 @@ from mivol.files.atomic import write_whole
 
 ABOUT = "about"
 
+DIGESTS = ("scene", "references", "photos", "data")
+"""Keys of fingerprints that are no settings: digests of what a run reads."""
+
 
 def write(path: Path, arrays: dict[str, np.ndarray], about: dict[str, Any]) -> None:
     """Write a checkpoint, never half.
@@ -36,6 +39,27 @@ def read(path: Path, fingerprint: dict[str, Any]) -> tuple[dict[str, np.ndarray]
     Raises:
         MivolError: there is none, it is no checkpoint, or it is one of another scene or other settings.
     """
+    arrays, about = _load(path)
+    check_same(path, about["fingerprint"], fingerprint)
+    return arrays, about
+
+
+def check_settings(path: Path, settings: dict[str, Any]) -> None:
+    """Refuse a checkpoint of other settings, before the run reads its data or touches its folder.
+
+    Raises:
+        MivolError: there is none, it is no checkpoint, or it is one of other settings.
+    """
+    there = _load(path)[1]["fingerprint"]
+    check_same(path, {key: value for key, value in there.items() if key not in DIGESTS}, settings)
+
+
+def _load(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """Arrays and ``about`` of a checkpoint.
+
+    Raises:
+        MivolError: there is none, or it is no checkpoint.
+    """
     try:
         with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
             arrays = {name: stored[name] for name in stored.files}
@@ -44,7 +68,6 @@ def read(path: Path, fingerprint: dict[str, Any]) -> tuple[dict[str, np.ndarray]
         raise MivolError(f"found no checkpoint {path} to resume from: run without --resume first.") from None
     except (OSError, ValueError, KeyError, EOFError, AttributeError, zipfile.BadZipFile) as error:
         raise MivolError(f"{path} is not a whole checkpoint of mivol ({error}): run without --resume.") from error
-    check_same(path, about["fingerprint"], fingerprint)
     return arrays, about
 
 

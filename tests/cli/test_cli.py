@@ -425,11 +425,25 @@ def test_interrupted_run_is_resumed(variant_rgb, folder: Path) -> None:
 
 
 def test_resume_refuses_other_settings(variant_rgb, folder: Path, capsys: pytest.CaptureFixture) -> None:
+    """Before anything of the run is touched: its folder is not made, and its record stays that of what was done."""
     flags = ["optimize", folder / "fit.toml", "-o", folder / "run", *PHOTOS, "--set", "fit.iterations=2"]
     assert "without --resume first" in refused(capsys, *flags, "--resume")
+    assert not (folder / "run").exists()
     assert run(*flags) == 0
+    record = (folder / "run" / "run.json").read_text()
     said = refused(capsys, *flags, "--resume", "--set", "optimiser.beta_1=0.8")
     assert "optimiser.beta_1 is 0.9 there and 0.8 here" in said
+    assert "parameter.0.shape.0 is 3 there" in refused(capsys, *flags, "--resume", "--set", f'parameter=[{{key="{KEY}"}}]')
+    assert (folder / "run" / "run.json").read_text() == record
+
+
+def test_a_run_that_is_done_may_be_resumed(variant_rgb, folder: Path) -> None:
+    """There is nothing left to do, and nothing is said twice."""
+    flags = ["optimize", folder / "fit.toml", "-o", folder / "run", *PHOTOS, "--set", "fit.iterations=2"]
+    assert run(*flags) == 0
+    metrics = (folder / "run" / "metrics.jsonl").read_text()
+    assert run(*flags, "--resume") == 0
+    assert (folder / "run" / "metrics.jsonl").read_text() == metrics
 
 
 # -- The command itself -------------------------------------------------------------------------------------------
