@@ -18,7 +18,7 @@ import numpy as np
 from mivol.errors import MivolError
 from mivol.files import check_volume
 from mivol.scene.load import check_variant
-from mivol.scene.nesting import bounds, nesting_fault, overlap
+from mivol.scene.nesting import Room, bounds, nesting_fault, room_of
 from mivol.transport.direct import UNIFORM
 from mivol.transport.lattice import Lattice, block_bounds, block_gaps, box_nodes, locate
 from mivol.transport.light_grid import Coarse, coarsen
@@ -167,18 +167,16 @@ def survey_scene(scene: mi.Scene) -> Survey:
     """Find the media, surfaces and emitters of a scene.
 
     Raises:
-        MivolError: boundaries that overlap without saying which medium is where.
+        MivolError: boundaries that do not agree which medium lies between them.
     """
     boundaries, surfaces, refractive, veiled = [], [], [], False
     shapes = scene.shapes()
-    fault = None if dr.flag(dr.JitFlag.FreezingScope) else nesting_fault(scene)
-    if fault is not None:
-        raise MivolError(fault)
+    rooms = {s.ptr: room_of(s) for s in shapes if s.is_medium_transition()}
     for index, shape in enumerate(shapes):
         if shape.is_medium_transition():
             name = shape.id() or f"shape {index}"
             if shape.interior_medium() is not None:
-                boundaries.append(_boundary(shape, name, shapes))
+                boundaries.append(_boundary(shape, name, rooms))
             if int(shape.bsdf().flags()) & (int(mi.BSDFFlags.DeltaTransmission) | int(mi.BSDFFlags.GlossyTransmission)):
                 refractive.append(f"{name} ({shape.bsdf().class_name()})")
         if not _is_bare(shape):
@@ -189,6 +187,11 @@ def survey_scene(scene: mi.Scene) -> Survey:
     # Mitsuba makes one object of equal media: where one boundary has to be traced, all boundaries of that medium are.
     traced = {b.medium.ptr for b in boundaries if b.box is None}
     boundaries = [replace(b, box=None) if b.medium.ptr in traced else b for b in boundaries]
+    boxed = {b.medium.ptr for b in boundaries if b.box is not None}
+    edges = [s for s in shapes if s.is_medium_transition() and not (s.interior_medium() and s.interior_medium().ptr in boxed)]
+    fault = None if dr.flag(dr.JitFlag.FreezingScope) else nesting_fault(scene, edges)
+    if fault is not None:
+        raise MivolError(fault)
     boundaries += _around([o for o in mi.traverse(scene).hierarchy if isinstance(o, mi.Medium)], boundaries)
     lamps = tuple(_lamp(e) for e in scene.emitters())
     marks = tuple((s, _mark(s)) for s in shapes if s.is_medium_transition())
@@ -223,8 +226,8 @@ def _is_instance(shape: mi.Shape) -> bool:
     return shape.class_name() == "Instance"
 
 
-def _boundary(shape: mi.Shape, name: str, shapes: list[mi.Shape]) -> Boundary:
-    alone = all(other is shape or not overlap(shape, other) for other in shapes if other.is_medium_transition())
+def _boundary(shape: mi.Shape, name: str, rooms: dict[int, Room]) -> Boundary:
+    alone = not any(room.shares(rooms[shape.ptr]) for other, room in rooms.items() if other != shape.ptr)
     is_box = shape.class_name() == "Cube" and shape.exterior_medium() is None and _is_bare(shape) and alone
     return Boundary(shape.interior_medium(), name, shape.class_name(), box_of_cube(shape) if is_box else None)
 

@@ -1,20 +1,27 @@
 """Do the boundaries of media agree about what lies between them?
 
-A ray that entered one boundary is in that one's medium. Where it then enters another one, that one has to say so: by what
-it names as its exterior. Shapes that overlap and name none leave it open which medium is where; stock integrators then go
-by the order of the crossings, and drop the outer medium behind the inner one.
+What a ray enters behind one boundary is what has to be in front of the next one: a boundary says so by what it names as its
+interior and exterior. Shapes that overlap, and shapes whose surfaces coincide, so that a ray meets one of the two only, leave
+it open which medium is where; stock integrators then go by the order of the crossings, and drop the outer medium behind the
+inner one.
 """
 
 from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-__all__ = ["bounds", "nesting_fault", "overlap"]
+from mivol.transport.medium import box_of_cube
+
+__all__ = ["Room", "bounds", "nesting_fault", "room_of"]
 
 RAYS = 512
-"""Rays for each pair of shapes whose boxes overlap, through what the boxes share."""
+"""Rays for each pair of shapes that share space, through what their boxes share."""
 
 CROSSINGS = 16
 """Surfaces that a ray is followed through."""
@@ -25,31 +32,81 @@ MOST_PAIRS = 64
 SHARE = 0.01
 """Share of a pair's rays that must find the fault: single ones graze an edge, and miss where they leave a shape."""
 
+SHARE_OPEN = 0.2
+"""The same where a shape has holes: rays that leave through them seem to be inside still."""
 
-def nesting_fault(scene: mi.Scene) -> str | None:
-    """Find boundaries that overlap without saying which medium is around them.
+ON_FACE = 1e-6
+"""Depth, in sizes, to which neighbours may reach into each other: faces of float32 vertices agree to it."""
+
+UNKNOWN = -1
+"""In place of what Dr.Jit calls a medium by."""
+
+
+@dataclass(frozen=True)
+class Room:
+    """A parallelepiped around a shape: a cube itself, else the upright box.
+
+    Attributes:
+        corners: (8, 3).
+        edges: (3, 3) directions, one a row.
+    """
+
+    corners: np.ndarray
+    edges: np.ndarray
+
+    def shares(self, other: Room, margin: float = -ON_FACE) -> bool:
+        """Whether no plane parts two rooms by less than ``margin`` (in sizes; negative: they may reach into each other)."""
+        across = [np.cross(a, b) for a in self.edges for b in other.edges]
+        across += [np.cross(r.edges[i], r.edges[i - 1]) for r in (self, other) for i in range(3)]
+        axes = np.array([a / n for a in across if (n := np.linalg.norm(a)) > ON_FACE])
+        one, two = axes @ self.corners.T, axes @ other.corners.T
+        gap = np.maximum(one.min(axis=1) - two.max(axis=1), two.min(axis=1) - one.max(axis=1))
+        size = max(np.abs(self.corners).max(), np.abs(other.corners).max())
+        return bool((gap < margin * size).all())
+
+
+def room_of(shape: mi.Shape) -> Room:
+    """The room that a shape is in."""
+    if shape.class_name() == "Cube":
+        box = box_of_cube(shape)
+        edges = box.to_world[:3, :3].T
+        return Room(box.corners(), edges / np.linalg.norm(edges, axis=1, keepdims=True))
+    low, high = bounds(shape)
+    return Room(np.where(np.indices((2, 2, 2)).reshape(3, 8).T == 0, low, high), np.eye(3))
+
+
+def nesting_fault(scene: mi.Scene, traced: Sequence[mi.Shape] = ()) -> str | None:
+    """Find boundaries that do not agree which medium lies between them.
+
+    Args:
+        scene: the scene.
+        traced: boundaries that rays are traced to, so that coinciding surfaces matter; all overlaps do.
 
     Returns:
-        A sentence about two shapes, one of which is entered from inside the other and names no exterior, and the way out;
-        None where all is well.
+        A sentence about two shapes, or pieces of one, and the way out; None where all is well.
 
-    Cost: nothing where no boxes of boundaries overlap; else 512 rays for each pair, up to 64 pairs.
+    Cost: nothing where no boundaries share space and none is a mesh; else 512 rays for each pair, up to 64 pairs.
     """
     shapes = [s for s in scene.shapes() if s.is_medium_transition()]
-    pairs = [(a, b) for i, a in enumerate(shapes) for b in shapes[i + 1 :] if overlap(a, b)][:MOST_PAIRS]
+    pairs = _pairs(shapes, {_number(mi.ShapePtr(s)) for s in traced})
     if not pairs:
         return None
-    found = _entries(scene, _rays(pairs))
-    both = [way for a, b in pairs for way in ((a, b), (b, a))]
-    wrong = (way for way in both if found.count(tuple(_number(mi.ShapePtr(s)) for s in way)) >= SHARE * RAYS)
-    return next((_sentence(*way) for way in wrong), None)
+    closed = {_number(mi.ShapePtr(s)) for s in {t.ptr: t for pair in pairs for t in pair}.values() if _is_closed(s)}
+    found = _disagreements(scene, _rays(scene, pairs), closed)
+    for k, pair in enumerate(pairs):
+        numbers = {_number(mi.ShapePtr(s)) for s in pair}
+        rays = {ray for ray, *shapes in found if ray // RAYS == k and numbers.issuperset(shapes)}
+        if len(rays) >= (SHARE if closed.issuperset(numbers) else SHARE_OPEN) * RAYS:
+            return _sentence(*pair)
+    return None
 
 
-def overlap(a: mi.Shape, b: mi.Shape) -> bool:
-    """Whether the bounding boxes of two shapes share more than a face."""
-    low, high = _shared(a, b)
-    # Neighbours may share a face, whose float32 vertices agree to 1e-6 of their size only.
-    return bool((high - low > 1e-6 * np.maximum(np.abs(high), np.abs(low))).all())
+def _pairs(shapes: list[mi.Shape], traced: set[int]) -> list[tuple[mi.Shape, mi.Shape]]:
+    """Shapes that share space, or touch where it matters; meshes, which may hold several pieces, with themselves."""
+    rooms = [(s, room_of(s), _number(mi.ShapePtr(s)) in traced) for s in shapes]
+    alone = [(s, s) for s in shapes if s.is_mesh() and s.class_name() not in ("Cube", "Rectangle")]
+    close = ((a, b) for a, b in combinations(rooms, 2) if a[1].shares(b[1], ON_FACE if a[2] or b[2] else -ON_FACE))
+    return [*alone, *((a[0], b[0]) for a, b in close)][:MOST_PAIRS]
 
 
 def bounds(shape: mi.Shape) -> tuple[np.ndarray, np.ndarray]:
@@ -61,44 +118,71 @@ def bounds(shape: mi.Shape) -> tuple[np.ndarray, np.ndarray]:
     return points.min(axis=0), points.max(axis=0)
 
 
-def _shared(a: mi.Shape, b: mi.Shape) -> tuple[np.ndarray, np.ndarray]:
-    one, two = bounds(a), bounds(b)
-    return np.maximum(one[0], two[0]), np.minimum(one[1], two[1])
+def _is_closed(shape: mi.Shape) -> bool:
+    """Whether a shape encloses what is inside it: a ball, or a mesh whose every edge is passed once each way."""
+    if not shape.is_mesh():
+        return shape.shape_type() in (mi.ShapeType.Sphere.value, mi.ShapeType.Ellipsoids.value)
+    geometry = mi.traverse(shape)
+    points = np.array(geometry["vertex_positions"]).reshape(-1, 3)
+    faces = np.unique(points, axis=0, return_inverse=True)[1].ravel()[np.array(geometry["faces"]).reshape(-1, 3)]
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    there, back = (np.sort(e[:, 0].astype(np.int64) * len(points) + e[:, 1]) for e in (edges, edges[:, ::-1]))
+    return bool(np.array_equal(there, back))
 
 
-def _rays(pairs: list[tuple[mi.Shape, mi.Shape]]) -> mi.Ray3f:
-    """Rays from around two shapes through the box that their boxes share."""
+def _rays(scene: mi.Scene, pairs: list[tuple[mi.Shape, mi.Shape]]) -> mi.Ray3f:
+    """Rays from outside of all boundaries through the box that the boxes of two shapes share."""
     rng, origins, targets = np.random.default_rng(0), [], []
+    far = 2 * np.linalg.norm(np.ptp([c for s in scene.shapes() if _may_hold(s) for c in bounds(s)], axis=0))
     for a, b in pairs:
-        low, high = _shared(a, b)
-        ends = np.array([*bounds(a), *bounds(b)])
+        one, two = bounds(a), bounds(b)
+        low, high = np.maximum(one[0], two[0]), np.minimum(one[1], two[1])
         d = rng.normal(size=(RAYS, 3))
-        targets.append(rng.uniform(low, high, (RAYS, 3)))
-        origins.append(targets[-1] + d / np.linalg.norm(d, axis=1, keepdims=True) * 2 * np.linalg.norm(np.ptp(ends, axis=0)))
+        targets.append(rng.uniform(np.minimum(low, high), np.maximum(low, high), (RAYS, 3)))
+        origins.append(targets[-1] + d / np.linalg.norm(d, axis=1, keepdims=True) * far)
     o, d = np.concatenate(origins), np.concatenate(targets) - np.concatenate(origins)
     d /= np.linalg.norm(d, axis=1, keepdims=True)
     return mi.Ray3f(mi.Point3f(o.T.astype(np.float32)), mi.Vector3f(d.T.astype(np.float32)))
 
 
-def _entries(scene: mi.Scene, ray: mi.Ray3f) -> list[tuple[int, int]]:
-    """The (shape, shape) of each time that a ray, just inside one, enters another that names no medium around it."""
+def _may_hold(shape: mi.Shape) -> bool:
+    return shape.is_medium_transition() or shape.class_name() == "Instance"
+
+
+def _disagreements(scene: mi.Scene, ray: mi.Ray3f, closed: set[int]) -> list[tuple[int, int, int]]:
+    """The (ray, shape, shape) of each time that the second names another medium than the one the ray is in since the first.
+
+    Between closed shapes every side counts, and a ray that leaves the scene must be in the medium that it came from. Of shapes
+    with holes only entries from inside another one do. What is behind an opaque surface without media is not known.
+    """
     n = dr.width(ray)
-    inside, last, going, found = np.zeros(n, int), np.zeros(n, int), np.ones(n, bool), []
+    inside, outside, last = np.full(n, UNKNOWN), np.full(n, UNKNOWN), np.zeros(n, int)
+    going, sure, found = np.ones(n, bool), np.ones(n, bool), []
     for _ in range(CROSSINGS):
         si = scene.ray_intersect(ray, mi.RayFlags.All, False, mi.Bool(going))
-        going &= np.array(si.is_valid())
+        hit = np.array(si.is_valid()) & going
+        left = going & ~hit & sure & (inside != UNKNOWN) & (inside != outside)
+        found += zip(*(np.stack([np.arange(n), last, last])[:, left]).tolist(), strict=True)
+        going = hit
         if not going.any():
             break
-        shape = np.array(_numbers(si.shape))
+        shape = np.array(_numbers(si.shape)).astype(int)
         crosses = going & np.array(si.is_medium_transition())
-        near, far = (np.array(_numbers(si.target_medium(d))) for d in (-ray.d, ray.d))
-        enters = crosses & np.array(dr.dot(si.n, ray.d) < 0)
-        wrong = enters & (inside != 0) & (near == 0)
-        found += zip(last[wrong].tolist(), shape[wrong].tolist(), strict=True)
-        inside = np.where(crosses, far, inside)
+        near, far = (np.array(_numbers(si.target_medium(d))).astype(int) for d in (-ray.d, ray.d))
+        whole, enters = np.isin(shape, list(closed)), np.array(dr.dot(si.n, ray.d) < 0)
+        wrong = crosses & (inside != UNKNOWN) & (near != inside) & ((sure & whole) | (enters & (inside != 0)))
+        found += zip(*(np.stack([np.arange(n), last, shape])[:, wrong]).tolist(), strict=True)
+        sure &= whole | ~crosses
+        outside = np.where(crosses & (outside == UNKNOWN), near, outside)
+        inside = np.where(crosses, far, np.where(np.array(_is_opaque(si)), UNKNOWN, inside))
         last = np.where(crosses, shape, last)
         ray = si.spawn_ray(ray.d)
     return found
+
+
+def _is_opaque(si: mi.SurfaceInteraction3f) -> mi.Bool:
+    clear = int(mi.BSDFFlags.Null) | int(mi.BSDFFlags.Transmission)
+    return si.is_valid() & ~si.is_medium_transition() & ((si.bsdf().flags() & mi.UInt32(clear)) == 0)
 
 
 def _numbers(pointers: mi.ShapePtr | mi.MediumPtr) -> mi.UInt32:
@@ -110,9 +194,17 @@ def _number(pointer: mi.ShapePtr) -> int:
     return int(_numbers(pointer)[0])
 
 
-def _sentence(outer: mi.Shape, inner: mi.Shape) -> str:
-    one, two = (s.id() or f"a {s.class_name()}" for s in (outer, inner))
+def _sentence(a: mi.Shape, b: mi.Shape) -> str:
+    one, two = (s.id() or f"a {s.class_name()}" for s in (a, b))
+    if a is b:
+        return (
+            f"pieces of {one} overlap, or their surfaces coincide in part (Mitsuba makes one mesh of all with the same medium "
+            "and BSDF), so that it is open where its medium ends: leave a gap of a thousandth of the scene between them, or "
+            "make one surface of them."
+        )
     return (
-        f"{two} is entered from inside {one}, but names no medium as what is around it: give {two} the medium of {one} as its "
-        f'exterior (<ref name="exterior" id="..."/>, beside the interior), or move them apart.'
+        f"{one} and {two} overlap, or parts of their surfaces coincide, and do not agree which medium is where: if one lies "
+        "inside the other, give it the medium of the outer one as its exterior "
+        '(<ref name="exterior" id="..."/>, beside the interior), with a gap of a thousandth of the scene between their '
+        "surfaces; else move them apart."
     )
