@@ -18,7 +18,7 @@ import numpy as np
 from mivol.errors import MivolError
 from mivol.files import check_volume
 from mivol.scene.load import check_variant
-from mivol.scene.nesting import Room, bounds, nesting_fault, room_of
+from mivol.scene.nesting import Room, bounds, extent, nesting_fault, room_of
 from mivol.transport.direct import UNIFORM
 from mivol.transport.lattice import Lattice, block_bounds, block_gaps, box_nodes, locate
 from mivol.transport.light_grid import Coarse, coarsen
@@ -106,7 +106,7 @@ class Needs:
 class Survey:
     """What does not change while shapes stay where they are: found once, with what was read of each array.
 
-    ``marks`` tells where boundaries were: shapes, and what another place would change of them.
+    ``marks`` tells where boundaries were: shapes, and what another place would change of them; ``size`` is that of the scene.
     """
 
     boundaries: tuple[Boundary, ...]
@@ -116,6 +116,7 @@ class Survey:
     lamps: tuple[str, ...]
     refractive: tuple[str, ...]
     marks: tuple[tuple[mi.Shape, object], ...] = ()
+    size: float = 1.0
     looked_up: set = field(default_factory=set)
     scatters: dict = field(default_factory=dict)
     values: dict = field(default_factory=dict)
@@ -195,7 +196,7 @@ def survey_scene(scene: mi.Scene) -> Survey:
     boundaries += _around([o for o in mi.traverse(scene).hierarchy if isinstance(o, mi.Medium)], boundaries)
     lamps = tuple(_lamp(e) for e in scene.emitters())
     marks = tuple((s, _mark(s)) for s in shapes if s.is_medium_transition())
-    return Survey(tuple(boundaries), tuple(surfaces), bool(veiled), kinds, lamps, tuple(refractive), marks)
+    return Survey(tuple(boundaries), tuple(surfaces), bool(veiled), kinds, lamps, tuple(refractive), marks, extent(scene))
 
 
 def _mark(shape: mi.Shape) -> object:

@@ -17,8 +17,9 @@ import mitsuba as mi
 import numpy as np
 
 from mivol.transport.medium import box_of_cube
+from mivol.transport.world import spawn_ray
 
-__all__ = ["Room", "bounds", "nesting_fault", "room_of"]
+__all__ = ["Room", "bounds", "extent", "nesting_fault", "room_of"]
 
 RAYS = 512
 """Rays for each pair of shapes that share space, through what their boxes share."""
@@ -92,7 +93,7 @@ def nesting_fault(scene: mi.Scene, traced: Sequence[mi.Shape] = ()) -> str | Non
     if not pairs:
         return None
     closed = {_number(mi.ShapePtr(s)) for s in {t.ptr: t for pair in pairs for t in pair}.values() if _is_closed(s)}
-    found = _disagreements(scene, _rays(scene, pairs), closed)
+    found = _disagreements(scene, _rays(scene, pairs), closed, extent(scene))
     for k, pair in enumerate(pairs):
         numbers = {_number(mi.ShapePtr(s)) for s in pair}
         rays = {ray for ray, *shapes in found if ray // RAYS == k and numbers.issuperset(shapes)}
@@ -118,6 +119,12 @@ def bounds(shape: mi.Shape) -> tuple[np.ndarray, np.ndarray]:
     return points.min(axis=0), points.max(axis=0)
 
 
+def extent(scene: mi.Scene) -> float:
+    """Diagonal of the box around all shapes [length]; 0 where there are none."""
+    corners = [c for s in scene.shapes() for c in bounds(s)]
+    return float(np.linalg.norm(np.ptp(corners, axis=0))) if corners else 0.0
+
+
 def _is_closed(shape: mi.Shape) -> bool:
     """Whether a shape encloses what is inside it: a ball, or a mesh whose every edge is passed once each way."""
     if not shape.is_mesh():
@@ -133,7 +140,7 @@ def _is_closed(shape: mi.Shape) -> bool:
 def _rays(scene: mi.Scene, pairs: list[tuple[mi.Shape, mi.Shape]]) -> mi.Ray3f:
     """Rays from outside of all boundaries through the box that the boxes of two shapes share."""
     rng, origins, targets = np.random.default_rng(0), [], []
-    far = 2 * np.linalg.norm(np.ptp([c for s in scene.shapes() if _may_hold(s) for c in bounds(s)], axis=0))
+    far = 2 * extent(scene)
     for a, b in pairs:
         one, two = bounds(a), bounds(b)
         low, high = np.maximum(one[0], two[0]), np.minimum(one[1], two[1])
@@ -145,11 +152,7 @@ def _rays(scene: mi.Scene, pairs: list[tuple[mi.Shape, mi.Shape]]) -> mi.Ray3f:
     return mi.Ray3f(mi.Point3f(o.T.astype(np.float32)), mi.Vector3f(d.T.astype(np.float32)))
 
 
-def _may_hold(shape: mi.Shape) -> bool:
-    return shape.is_medium_transition() or shape.class_name() == "Instance"
-
-
-def _disagreements(scene: mi.Scene, ray: mi.Ray3f, closed: set[int]) -> list[tuple[int, int, int]]:
+def _disagreements(scene: mi.Scene, ray: mi.Ray3f, closed: set[int], size: float) -> list[tuple[int, int, int]]:
     """The (ray, shape, shape) of each time that the second names another medium than the one the ray is in since the first.
 
     Between closed shapes every side counts, and a ray that leaves the scene must be in the medium that it came from. Of shapes
@@ -176,7 +179,7 @@ def _disagreements(scene: mi.Scene, ray: mi.Ray3f, closed: set[int]) -> list[tup
         outside = np.where(crosses & (outside == UNKNOWN), near, outside)
         inside = np.where(crosses, far, np.where(np.array(_is_opaque(si)), UNKNOWN, inside))
         last = np.where(crosses, shape, last)
-        ray = si.spawn_ray(ray.d)
+        ray = spawn_ray(si, ray.d, size)
     return found
 
 

@@ -370,6 +370,7 @@ def build_world(scene: mi.Scene, needs: Needs, plan: Plan, settings: Settings, s
         lights=Lights(scene) if needs.lamps and _is_lit(needs, settings) else None,
         is_deterministic=settings.deterministic,
         events=plan.events,
+        size=survey.size,
     )
 
 

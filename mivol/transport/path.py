@@ -25,7 +25,7 @@ import mitsuba as mi
 
 from mivol.transport.film import Strata
 from mivol.transport.lattice import slab
-from mivol.transport.world import Body, World
+from mivol.transport.world import Body, World, spawn_ray
 
 __all__ = [
     "DARK",
@@ -202,7 +202,7 @@ def _trace(
         medium = dr.select(clear & transition, hit.target_medium(ray.d), medium)
         si = dr.select(going, hit, si)
         t = dr.select(going, t_hit, t)
-        onward = hit.spawn_ray(ray.d)
+        onward = spawn_ray(hit, ray.d, world.size)
         onward.maxt = ray.maxt - t_hit
         going &= clear
     return Reach(si, t, medium, veil), state
@@ -413,7 +413,7 @@ def _bounce(scene: mi.Scene, world: World, settings: Settings, limit: int, path:
     u = sampler.next_2d(lit)
     direct, weight = scene.sample_emitter_direction(si, u, False, lit)
     lit &= direct.pdf > 0
-    start = si.spawn_ray_to(direct.p).o
+    start = spawn_ray(si, direct.p - si.p, world.size).o
     shadow_medium = dr.select(si.is_medium_transition(), si.target_medium(direct.p - start), path.medium)
     way, clear, tau, light = shadow_ray(scene, world, start, shadow_medium, direct, lit)
     lit &= clear
@@ -435,7 +435,7 @@ def _bounce(scene: mi.Scene, world: World, settings: Settings, limit: int, path:
     score = score.turn(bsdf, si, sample.wo, on & ~through)
     path.beta *= dr.select(on, f_over_pdf, 0)
     path.eta *= dr.select(on, sample.eta, 1)
-    path.ray = si.spawn_ray(si.to_world(sample.wo))
+    path.ray = spawn_ray(si, si.to_world(sample.wo), world.size)
     path.medium = dr.select(on & si.is_medium_transition(), si.target_medium(path.ray.d), path.medium)
     path.last = dr.select(on & ~through, mi.Interaction3f(si), path.last)
     path.pdf = dr.select(on & ~through, sample.pdf, path.pdf)

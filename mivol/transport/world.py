@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from mivol.transport.direct import Lights
     from mivol.transport.light_grid import LightGrid, Shade
 
-__all__ = ["Body", "World", "share_flight"]
+__all__ = ["Body", "World", "share_flight", "spawn_ray"]
 
 
 class Body:
@@ -272,6 +272,7 @@ class World:
         lights: what lights the media that scatter; None where none does.
         is_deterministic: images of scattered light are made by quadrature; derivatives are still drawn.
         events: points of a camera ray that scatter, in pictures.
+        size: of the scene [length], by which rays start anew behind a surface.
     """
 
     def __init__(
@@ -285,6 +286,7 @@ class World:
         lights: Lights | None = None,
         is_deterministic: bool = False,
         events: int = 1,
+        size: float = 1.0,
     ) -> None:
         self.boxed = [b for b in bodies if b.box is not None]
         # A traced stretch is recognised by its medium, which several boundaries may share.
@@ -299,6 +301,7 @@ class World:
         self.shade: Shade | None = None
         self.light_grid: LightGrid | None = None
         self.is_deterministic, self.events = is_deterministic, events
+        self.size = dr.opaque(mi.Float, size)
         self.is_tracked = any(p.lattice is not None and p.lattice.blocks is not None for b in bodies for p in b.view.parts)
 
     @property
@@ -348,7 +351,7 @@ class World:
         if self.start is not None:
             return dr.select(dr.full(mi.Bool, True, n), mi.MediumPtr(self.start), None)
         if self.locates:
-            return _locate(scene, ray)
+            return _locate(scene, ray, self.size)
         return dr.zeros(mi.MediumPtr, n)
 
     def start_gradients(self) -> None:
@@ -468,8 +471,20 @@ def _fits(part: Part, box: Box) -> bool:
     return box.contains(part.lattice.to_world, 1e-6)
 
 
+def spawn_ray(si: mi.SurfaceInteraction3f, d: mi.Vector3f, size: mi.Float) -> mi.Ray3f:
+    """A ray onward from a surface, which begins a little behind it.
+
+    Mitsuba's own begin 1e-4 of (1 + the largest coordinate) behind it, which passes whole shapes by in scenes that are not much
+    larger than that: here, of a quarter of their ``size``, where that is below 1.
+    """
+    step = (dr.minimum(0.25 * size, 1) + dr.max(dr.abs(si.p))) * mi.math.RayEpsilon
+    ray = si.spawn_ray(d)
+    ray.o = si.p + si.n * dr.mulsign(step, dr.dot(si.n, d))
+    return ray
+
+
 @dr.syntax
-def _locate(scene: mi.Scene, ray: mi.Ray3f) -> mi.MediumPtr:
+def _locate(scene: mi.Scene, ray: mi.Ray3f, size: mi.Float) -> mi.MediumPtr:
     """Find the medium around a point: the near side of the first boundary along a ray, through all else."""
     probe = mi.Ray3f(ray)
     medium = dr.zeros(mi.MediumPtr, dr.width(ray))
@@ -479,6 +494,6 @@ def _locate(scene: mi.Scene, ray: mi.Ray3f) -> mi.MediumPtr:
         found = going & si.is_valid()
         boundary = found & si.is_medium_transition()
         medium = dr.select(boundary, si.target_medium(-ray.d), medium)
-        probe = si.spawn_ray(ray.d)
+        probe = spawn_ray(si, ray.d, size)
         going = found & ~boundary
     return medium

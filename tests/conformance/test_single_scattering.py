@@ -432,6 +432,32 @@ def test_boundaries_that_are_moved():
     np.testing.assert_array_equal(np.array(mi.render(scene, integrator=ours, spp=16)), first)
 
 
+def _world(unit: float) -> dict:
+    """A ball of fog in one of haze above one of wood, in lengths of ``unit``."""
+    place = turn().scale(unit)
+    haze = medium("homogeneous", 0.5 / unit, 0.6)
+    fog_in_it = {"type": "sphere", "to_world": place @ turn().scale(0.3), "bsdf": {"type": "null"}, "exterior": haze}
+    eye = place @ turn().look_at([0.5, 0.4, 1.0], [0, 0, 0], [0, 1, 0]) @ turn().scale(1 / unit)
+    return {
+        "type": "scene",
+        "outer": {"type": "sphere", "to_world": place @ turn().scale(0.4), "bsdf": {"type": "null"}, "interior": haze},
+        "inner": fog_in_it | {"interior": medium("homogeneous", 4.0 / unit, 0.8)},
+        "wood": {"type": "sphere", "to_world": place @ turn().translate([0, -0.6, 0]).scale(0.15)},
+        "sky": {"type": "constant"},
+        "sensor": scenes.camera((0, 0, 1), (0, 0, 0), res=8, fov=60.0) | {"to_world": eye, "near_clip": 1e-2 * unit},
+    }
+
+
+@pytest.mark.parametrize("unit", [2.0**-7, 2.0**-14])
+def test_worlds_of_any_size(unit):
+    """Lengths in another unit: the same image. Mitsuba starts rays 1e-4 behind a surface, whatever the scene's size."""
+    big, small_one = (
+        np.array(mi.render(mi.load_dict(_world(u)), integrator=mi.load_dict(mivol()), spp=64)) for u in (1.0, unit)
+    )
+    # A power of two changes no rounding but that of Mitsuba's own constants (a few float32 eps of each of 64 samples).
+    np.testing.assert_allclose(small_one, big, rtol=1e-4)
+
+
 def test_camera_inside_that_names_no_medium():
     """Volpath starts in vacuum then; we find the medium: the picture is that of a sensor that names it."""
     interior = grid_in({}, seed=4)["interior"] | {"id": "fog"}
