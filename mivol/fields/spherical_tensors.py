@@ -38,7 +38,8 @@ def field_from_props(props: mi.Properties) -> tuple[SphericalGrid, mi.TensorXf, 
         field = SphericalGrid.from_dense(np.array(dr.detach(density)), np.array(dr.detach(sh)), _place(props), **how)
         return field, density, sh
     field = load_field(str(mi.file_resolver().resolve(props["filename"])))
-    field = replace(field, **{n: props[n] for n in ("activation", "offset", "clamp") if n in props})
+    how = {n: props.get(n, getattr(field, n)) for n in ("activation", "offset", "clamp")}
+    field = SphericalGrid.from_rows(field.res, field.to_world, *field.values(), field.nodes, **how)
     if "to_world" in props:
         field = replace(field, to_world=_place(props) @ field.to_world)
     values, coefficients = field.values()

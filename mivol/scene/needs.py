@@ -16,6 +16,7 @@ import mitsuba as mi
 import numpy as np
 
 from mivol.errors import MivolError
+from mivol.fields.activation import Activation
 from mivol.files import check_volume
 from mivol.scene.load import check_variant
 from mivol.scene.nesting import Room, bounds, extent, nesting_fault, room_of
@@ -275,14 +276,16 @@ def read_part(part: Part, survey: Survey, name: str) -> _Read:
     """Read the bounds of a part of an extinction once for each state of its array.
 
     Raises:
-        MivolError: NaN, infinite or negative values; the first bad voxel is named. A stock grid that is looked up otherwise
-            than between voxel centres with clamped borders.
+        MivolError: NaN, infinite or negative values (those of a radiance field may be negative where its activation takes
+            them); the first bad voxel of a grid is named. A stock grid that is looked up otherwise than between voxel centres
+            with clamped borders.
     """
     array = dr.detach(part.lattice.values.array)
 
     def make() -> _Read:
         values, activation = part.lattice.values, part.activation
         if activation is not None:
+            _check_stored(array, activation, name)
             # Nothing is below an empty value; an extinction rises with what is stored.
             empty = activation.empty_below
             values = mi.TensorXf(dr.maximum(array, empty) if empty is not None else dr.abs(array) + 1, values.shape)
@@ -294,6 +297,17 @@ def read_part(part: Part, survey: Survey, name: str) -> _Read:
         return _Read(blocks, float((host > 0).mean()), float(host.max(initial=0.0)))
 
     return _once(survey, ("part",), array, make)
+
+
+def _check_stored(array: mi.Float, activation: Activation, name: str) -> None:
+    """Refuse densities of a radiance field that are none: an activation would make vacuum of them in silence."""
+    if not bool(dr.all(dr.isfinite(array) & (activation.signed | (array >= 0)))):
+        low, high = float(dr.min(array)[0]), float(dr.max(array)[0])
+        expected = "finite numbers" if activation.signed else "finite numbers of at least 0 (without an activation)"
+        raise MivolError(
+            f"the density of the field in {name} lies in [{low:.4g}, {high:.4g}] (or is NaN); {expected} are expected: clip it "
+            "after each step."
+        )
 
 
 PROBES = 2048

@@ -239,3 +239,27 @@ def test_refusals(variant_rgb: None) -> None:
     with refused("are expected"):
         params[f"{KEY}.density"] = tensor(density[1:])
         params.update()
+
+
+@pytest.mark.parametrize(
+    ("activation", "value", "said"),
+    [("none", -1.0, "at least 0"), ("relu", np.nan, "or is NaN"), ("relu", np.inf, "inf"), ("softplus", -np.inf, "-inf")],
+)
+def test_densities_that_are_none_are_refused(variant_rgb: None, activation: str, value: float, said: str) -> None:
+    """Whoever sets them: a ReLU would show NaN as vacuum, and without an activation what is negative has a derivative of 1."""
+    density, _ = values()
+    made = scene(field(density=tensor(np.abs(density)), activation=activation))
+    params = mi.traverse(made)
+    density = np.abs(density)
+    density[1, 1, 1] = value
+    params[f"{KEY}.density"] = tensor(density)
+    params.update()
+    with refused(f"the density of the field in box .*{said}"):
+        render(made, {"type": "mivol"}, 1)
+
+
+def test_a_file_is_checked_for_the_activation_it_is_given(variant_rgb: None, tmp_path: Path) -> None:
+    density, sh = values()
+    save_field(tmp_path / "field.npz", SphericalGrid.from_dense(density - 2 * density.max(), sh, np.eye(4)))
+    with pytest.raises(RuntimeError, match="without an activation none may be negative"):
+        mi.load_dict({"type": "mivol_sh", "filename": str(tmp_path / "field.npz"), "activation": "none"})
