@@ -124,7 +124,8 @@ def export_flags(sub: argparse.ArgumentParser) -> None:
     known = ", ".join(f"{suffix} ({kind.name})" for suffix, kind in EXPORTS.items())
     sub.add_argument("field", type=Path, help="radiance field (.npz): mivol's, or a checkpoint of svox2")
     sub.add_argument("output", type=Path, help=f"what to write, by its suffix: {known}")
-    sub.add_argument("--level", type=float, help="extinction of a mesh's surface [1/length]; default: a voxel is half opaque")
+    default = "where a voxel is half opaque, or half of what thinner matter has"
+    sub.add_argument("--level", type=float, help=f"extinction of a mesh's surface [1/length]; default: {default}")
     sub.add_argument("-m", "--mode", default="llvm_ad_rgb", help="variant (default: %(default)s)")
 
 

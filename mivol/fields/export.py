@@ -46,7 +46,7 @@ def export_field(path: str | os.PathLike, field: SphericalGrid, level: float | N
     Args:
         path: destination.
         field: what to write.
-        level: extinction of a mesh's surface [1/length]; None: :func:`mivol.fields.surface.half_opaque`.
+        level: extinction of a mesh's surface [1/length]; None: :func:`mivol.fields.surface.level_of`.
 
     Returns:
         The files that were written.

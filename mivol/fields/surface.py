@@ -20,7 +20,7 @@ from mivol.errors import MivolError
 from mivol.fields.spherical import SphericalGrid
 from mivol.files.mesh import Mesh
 
-__all__ = ["INVERSES", "half_opaque", "surface_of"]
+__all__ = ["INVERSES", "level_of", "surface_of"]
 
 INVERSES: dict[str, Callable[[float], float]] = {
     "none": lambda sigma: sigma,
@@ -31,10 +31,14 @@ INVERSES: dict[str, Callable[[float], float]] = {
 """Name of an activation -> the stored density of an extinction above 0."""
 
 
-def half_opaque(field: SphericalGrid) -> float:
-    """The extinction [1/length] at which a voxel's longest edge lets half of the light through."""
+def level_of(field: SphericalGrid) -> float:
+    """The extinction [1/length] of a surface: where a voxel's longest edge lets half of the light through, or, in a field that
+    is thinner than that, half of what its matter has (the mean extinction of its nodes, weighted by itself)."""
     edges = np.linalg.norm(field.to_world[:3, :3], axis=0) / field.res[::-1]
-    return math.log(2) / float(edges.max())
+    sigma = np.array(field.act.value_and_slope(mi.Float(field.values()[0]))[0], np.float64)
+    total = sigma.sum()
+    mean = float((sigma * sigma).sum() / total) if total > 0 else math.inf
+    return min(math.log(2) / float(edges.max()), mean / 2)
 
 
 def surface_of(field: SphericalGrid, level: float | None = None) -> Mesh:
@@ -42,7 +46,7 @@ def surface_of(field: SphericalGrid, level: float | None = None) -> Mesh:
 
     Args:
         field: any; a sparse one is laid out in full.
-        level: extinction [1/length]; None: :func:`half_opaque`.
+        level: extinction [1/length]; None: :func:`level_of`.
 
     Returns:
         World coordinates, counterclockwise from outside; normals are means of the triangles around a point.
@@ -57,7 +61,7 @@ def surface_of(field: SphericalGrid, level: float | None = None) -> Mesh:
         from skimage.measure import marching_cubes
     except ImportError:
         raise MivolError('a mesh needs scikit-image, which is not installed; pip install "mivol[metrics]".') from None
-    level = half_opaque(field) if level is None else float(level)
+    level = level_of(field) if level is None else float(level)
     if not 0 < level < math.inf:
         raise MivolError(f"the level {level:g} was given for a surface; an extinction above 0 is expected.")
     density = field.to_dense()[0].transpose(2, 1, 0)

@@ -13,7 +13,7 @@ from mivol.errors import MivolError
 from mivol.fields.activation import ACTIVATIONS
 from mivol.fields.export import EXPORTS, export_field
 from mivol.fields.spherical import SphericalGrid, load_field, save_field
-from mivol.fields.surface import INVERSES, half_opaque, surface_of
+from mivol.fields.surface import INVERSES, level_of, surface_of
 from mivol.files import read_volume
 from mivol.files.mesh import Mesh, read_ply, write_mesh
 from scenes import centred, rotation
@@ -106,8 +106,14 @@ def test_hard_a_field_that_reaches_its_sides_is_closed(variant_rgb: None) -> Non
 
 
 def test_the_level_of_a_mesh(variant_rgb: None) -> None:
-    """Longest edge 0.1: half the light passes it at ln 2 / 0.1; a lower level is a larger ball, by 0.1 for each 1."""
-    assert half_opaque(ball()) == pytest.approx(np.log(2) / 0.1)
+    """Longest edge 0.1: half the light passes it at ln 2 / 0.1, unless matter is thinner: of 2 and 6 in equal parts, half of
+    (4 + 36) / 8. A lower level is a larger ball, by 0.1 for each 1."""
+    block, sh = np.full((10, 10, 10), -1.0), np.zeros((10, 10, 10, 1, 3))
+    block[2:8, 2:8, 2:5], block[2:8, 2:8, 5:8] = 2, 6
+    thin, dense = (SphericalGrid.from_dense(k * block, sh, np.eye(4)) for k in (1, 10))
+    assert level_of(thin) == pytest.approx(2.5)
+    assert level_of(dense) == pytest.approx(np.log(2) / 0.1)
+    assert np.ptp(surface_of(thin).points, axis=0) == pytest.approx([0.4, 0.6, 0.6], abs=0.1)  # where the denser half is
     radius = [np.linalg.norm(surface_of(ball(), level).points, axis=1).mean() for level in (3.0, 5.0)]
     assert radius == pytest.approx([0.7, 0.5], abs=0.005)
     assert set(INVERSES) == set(ACTIVATIONS)
