@@ -16,7 +16,7 @@ from itertools import combinations
 import mitsuba as mi
 import numpy as np
 
-from mivol.scene.nesting import nesting_fault
+from mivol.scene.nesting import bounds, nesting_fault
 from mivol.transport.medium import kind_of
 
 __all__ = ["CHECKS", "Doubt", "trust"]
@@ -33,6 +33,10 @@ SMALLEST_G = 1e-3
 
 # math::RayEpsilon of float32: Mitsuba restarts a ray at p on a surface (1 + max|p|) times this behind it, along the normal.
 RESTART = 1500 * 2.0**-24
+
+# Mitsuba's shadow rays end math::ShadowEpsilon, 10 RayEpsilon, of their length before a lamp: nearer to it than this, times
+# (1 + max|p|), one that starts anew at a boundary reaches behind its surface, and is dark.
+NEAR_LAMP = 0.1
 
 POINTS = 4096
 """Points of a boundary at which its extinction is looked up."""
@@ -127,8 +131,11 @@ def trust(scene: mi.Scene, sensors: Sequence[mi.Sensor] | None = None) -> list[D
     doubts += [Doubt("touching", _touching(a, b)) for a, b in combinations(boundaries, 2) if _touch(a, b)]
     fault = nesting_fault(scene)
     doubts += [Doubt("overlap", fault)] if fault is not None else []
+    lamps = [s for s in scene.shapes() if s.is_emitter()]
+    doubts += [Doubt("near lamp", *found) for lamp in lamps for b in boundaries for found in _near_lamp(lamp, b)]
     for sensor in scene.sensors() if sensors is None else sensors:
         doubts += [Doubt("camera inside", sentence) for sentence in _camera_inside(sensor, boundaries)]
+        doubts += [Doubt("sampler", SAMPLER)] if boundaries and sensor.sampler().class_name() == "LowDiscrepancySampler" else []
     return doubts
 
 
@@ -267,6 +274,27 @@ def _touching(a: Boundary, b: Boundary) -> str:
         "without having entered its medium, which is then vacuum; leave a gap of a thousandth of the scene, or make one grid "
         "of both."
     )
+
+
+SAMPLER = (
+    "the camera's sampler is ldsampler, some of whose dimensions depend on each other (correlations of 0.24): Mitsuba's free "
+    "flights, which draw many numbers a path, are off by percents; use the independent or the multijitter sampler."
+)
+
+
+def _near_lamp(lamp: mi.Shape, b: Boundary) -> Found:
+    near, far = (np.array(v, np.float64) for v in bounds(lamp))
+    low, high = b.points.min(axis=0), b.points.max(axis=0)
+    reach = NEAR_LAMP * (1 + np.abs([near, far, low, high]).max())
+    gap = np.linalg.norm(np.maximum(0, np.maximum(near - high, low - far)))
+    if 0 < gap < reach:
+        whole = float(np.linalg.norm(np.maximum(far, high) - np.minimum(near, low)))
+        yield (
+            f"the lamp {lamp.id() or lamp.class_name()} is {gap:.2g} from {b.name}: Mitsuba's shadow rays that leave a "
+            f"boundary within about {reach:.2g} of a lamp end behind its surface, and are dark; move it away, or make "
+            f"the scene {reach / gap:.0f} times as large.",
+            whole < 2 * reach,
+        )
 
 
 def _camera_inside(sensor: mi.Sensor, boundaries: list[Boundary]) -> Iterator[str]:

@@ -356,6 +356,58 @@ def test_hard_03_04_doubt_where_mitsuba_is_wrong(variant_rgb, tmp_path, kind):
         assert "Doubt: " in made.text
 
 
+def _scattering(**more: object) -> dict:
+    """Rough smoke in the unit cube, and nothing to see but what it scatters."""
+    rough = 12 * np.random.default_rng(5).uniform(0, 1, (3, 2, 4, 1)).astype(np.float32) ** 2
+    smoke = {"type": "heterogeneous", "sigma_t": {"type": "gridvolume", "grid": mi.VolumeGrid(rough)}, "albedo": 0.8}
+    return {k: v for k, v in _scene(smoke).items() if k != "sky"} | more
+
+
+def _lit(scene: dict, kind: str, spp: int = 256) -> np.ndarray:
+    """Means of 12 images."""
+    integrator = mi.load_dict({"type": kind, "max_depth": 2})
+    loaded = mi.load_dict(scene)
+    return np.array([np.array(mi.render(loaded, integrator=integrator, spp=spp, seed=s)).mean() for s in range(12)])
+
+
+def _differ(a: np.ndarray, b: np.ndarray) -> float:
+    """How far two sets of means are apart, in standard errors."""
+    return float(abs(a.mean() - b.mean()) / np.sqrt((a.var(ddof=1) + b.var(ddof=1)) / len(a)))
+
+
+def test_doubt_a_sampler_whose_dimensions_depend_on_each_other(variant_rgb):
+    """Mitsuba's ldsampler: volpath's mean depends on the sampler, mivol's does not."""
+    sun = {"type": "directional", "direction": [0.3, 0.2, 1.0]}
+    scenes = {}
+    for sampler in ("independent", "ldsampler"):
+        scenes[sampler] = _scattering(sun=sun)
+        scenes[sampler]["sensor"] = scenes[sampler]["sensor"] | {"sampler": {"type": sampler}}
+    assert [d.kind for d in trust(mi.load_dict(scenes["ldsampler"])) if d.fatal] == ["sampler"]
+    assert [d.kind for d in trust(mi.load_dict(scenes["independent"])) if d.fatal] == []
+    # 12 means of each: t with 22 degrees of freedom is above 6.5 once in a million.
+    assert _differ(*(_lit(scene, "volpath") for scene in scenes.values())) > 6.5
+    assert _differ(*(_lit(scene, "mivol") for scene in scenes.values())) < 6.5
+
+
+def test_doubt_a_lamp_near_a_boundary(variant_rgb):
+    """In a small scene most light of a lamp with a surface is lost; the same scene in another unit is right."""
+    found = {}
+    for unit in (1.0, 0.01):
+        place = _t().scale(unit)
+        lamp = {"type": "rectangle", "to_world": place @ _t().translate([0.5, 0.5, 1.5]).rotate([1, 0, 0], 180).scale(0.3)}
+        haze = {"type": "homogeneous", "sigma_t": 1.0 / unit, "albedo": 0.8}
+        scene = _scene(haze, place @ _t().translate([0.5, 0.5, 0.5]).scale(0.5), lamp=lamp | {"emitter": {"type": "area"}})
+        look = _t().look_at([0.5 * unit, -3 * unit, 0.5 * unit], [0.5 * unit] * 3, [0, 0, 1]).scale([0.4 * unit, 0.4 * unit, 1])
+        scene["sensor"] = scene["sensor"] | {"to_world": look, "near_clip": 1e-3 * unit}
+        del scene["sky"]
+        found[unit] = [_lit(scene, kind).mean() for kind in ("volpath", "mivol")]
+        assert [d.kind for d in trust(mi.load_dict(scene)) if d.fatal] == ([] if unit == 1 else ["near lamp"])
+    # Standard errors of the means are below 2 %.
+    assert found[1.0][0] == pytest.approx(found[1.0][1], rel=0.1)
+    assert found[0.01][1] == pytest.approx(found[1.0][1], rel=0.01)
+    assert found[0.01][0] < 0.5 * found[0.01][1]
+
+
 def _voxels(value: float, **extra) -> dict:
     values = np.broadcast_to(np.float32(value), (2, 2, 2, np.size(value)))
     return {"type": "mivol_voxels", "data": mi.TensorXf(np.ascontiguousarray(values)), **extra}
