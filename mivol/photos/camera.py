@@ -132,9 +132,14 @@ def _checked_intrinsics(matrix: np.ndarray, size: tuple[int, int], name: str) ->
     K = np.array(matrix, np.float64)
     if min(size) < 1:
         raise refusal(name, f"an image of {size[0]} x {size[1]} pixels", "at least 1 x 1", "correct w and h")
-    if K.shape != (3, 3) or not np.isfinite(K).all() or min(K[0, 0], K[1, 1]) <= 0:
-        focal = f"focal lengths {K[0, 0]:.6g}, {K[1, 1]:.6g}" if K.shape == (3, 3) else f"a matrix {K.shape}"
-        raise refusal(name, focal, "finite numbers above 0 in pixels", "correct its intrinsics")
+    if K.shape != (3, 3):
+        raise refusal(name, f"intrinsics of shape {K.shape}", "3 x 3 numbers", "correct its intrinsics")
+    if not (np.isfinite(K[[0, 1], [0, 1]]).all() and min(K[0, 0], K[1, 1]) > 0):
+        found = f"focal lengths {K[0, 0]:.6g}, {K[1, 1]:.6g}"
+        raise refusal(name, found, "finite numbers above 0 in pixels", "correct its intrinsics")
+    if not np.isfinite(K[:2, 2]).all():
+        found = f"a principal point ({K[0, 2]:.6g}, {K[1, 2]:.6g})"
+        raise refusal(name, found, "finite numbers in pixels", "correct its intrinsics")
     if K[0, 1] or K[1, 0] or not np.array_equal(K[2], (0, 0, 1)):
         raise refusal(name, f"K = {K.tolist()}", "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]", "skew is not supported")
     return K

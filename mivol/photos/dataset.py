@@ -21,7 +21,7 @@ from mivol.files.source import refusal
 from mivol.photos import region
 from mivol.photos.camera import Camera
 from mivol.photos.colmap import find_model, read_colmap
-from mivol.photos.listing import Entry, Listing
+from mivol.photos.listing import UNLISTED, Entry, Listing
 from mivol.photos.picture import picture_size, read_mask, read_picture, shrink, space_of
 from mivol.photos.transforms import read_blender, read_transforms
 
@@ -108,7 +108,7 @@ class Survey:
         sizes = sorted({f"{c.size[0]} x {c.size[1]}" for c in cameras})
         focal = [c.K[0, 0] for c in cameras]
         lens = "with distortion" if any(c.distortion for c in cameras) else "pinhole"
-        counts = ", ".join(f"{n} {split}" for split in SPLITS if (n := sum(f.split == split for f in self.frames)))
+        counts = ", ".join(f"{n} {split}" for split in (*SPLITS, UNLISTED) if (n := sum(f.split == split for f in self.frames)))
         lines = [
             f"{self.path}: {self.format}, {len(cameras)} photographs ({counts}), {', '.join(sizes)} pixels, {lens}",
             f"focal length {_range(focal)} pixels, horizontal field of view {_range([_angle(c) for c in cameras])} degrees",

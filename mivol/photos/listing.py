@@ -10,7 +10,10 @@ import numpy as np
 
 from mivol.photos.camera import Camera
 
-__all__ = ["Entry", "Listing"]
+__all__ = ["UNLISTED", "Entry", "Listing"]
+
+UNLISTED = "in no list"
+"""The split of photographs that a data set's own lists leave out."""
 
 
 @dataclass(frozen=True)
@@ -21,7 +24,7 @@ class Entry:
         name: as the data set calls it.
         file: where it should lie.
         camera: from its (width, height) in pixels.
-        split: "train", "test" or "val".
+        split: "train", "test", "val" or ``UNLISTED``.
         size: (width, height) that the file of cameras says [pixel]; None: all of the split have one size.
         mask: where its mask should lie, if it has one.
     """

@@ -2,12 +2,16 @@
 
 Conventions. ``transform_matrix`` is camera to world with our axes (:mod:`mivol.photos.camera`), ``camera_angle_x`` the full
 horizontal angle [radian]; focal lengths and principal points count pixels from the upper left corner, as COLMAP's do.
-Settings that only place a scene in another program's unit cube (``aabb_scale``, ``scale``, ``offset``) are left alone.
+``train_filenames``, ``val_filenames`` and ``test_filenames`` divide the set; where there is a list to train on, what no list
+names is left alone, as are settings that only place a scene in another program's unit cube (``aabb_scale``, ``scale``,
+``offset``).
 """
 
 from __future__ import annotations
 
+import dataclasses
 import json
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -19,7 +23,7 @@ from mivol.files.atomic import write_whole_text
 from mivol.files.source import read_bytes, refusal
 from mivol.photos.camera import Camera, intrinsics
 from mivol.photos.lens import Lens
-from mivol.photos.listing import Entry, Listing
+from mivol.photos.listing import UNLISTED, Entry, Listing
 from mivol.photos.picture import SUFFIXES
 
 __all__ = ["MODELS", "Settings", "read_blender", "read_transforms", "write_transforms"]
@@ -91,7 +95,30 @@ def _entries(file: Path, split: str) -> list[Entry]:
     frames = table.get("frames") if isinstance(table, dict) else None
     if not isinstance(frames, list) or not frames:
         raise refusal(file, "no list of frames", "a key frames with one entry per photograph", "write it again")
-    return [_entry(file, table, frame, number, split) for number, frame in enumerate(frames)]
+    listed = _listed(file, table)
+    entries = [_entry(file, table, frame, number, split) for number, frame in enumerate(frames)]
+    rest = UNLISTED if "train" in listed.values() else split
+    return [dataclasses.replace(entry, split=listed.get(_place(file, entry.name), rest)) for entry in entries]
+
+
+def _listed(file: Path, table: Mapping[str, Any]) -> dict[str, str]:
+    """Places of photographs -> split, as far as the lists of the data set go; a test view is one whatever else names it.
+
+    Raises:
+        MivolError: something else than names.
+    """
+    found = {}
+    for split in ("train", "val", "test"):
+        names = table.get(f"{split}_filenames") or []
+        if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+            raise refusal(file, f"{split}_filenames = {names!r}", "a list of the names of files", "correct it")
+        found |= {_place(file, name): split for name in names}
+    return found
+
+
+def _place(file: Path, name: str) -> str:
+    """Where a photograph lies, however it is written: ``./a.png`` and ``a.png`` are one."""
+    return os.path.normpath(file.parent.absolute() / name)
 
 
 def _entry(file: Path, table: Mapping[str, Any], frame: Mapping[str, Any], number: int, split: str) -> Entry:
@@ -111,7 +138,7 @@ def _entry(file: Path, table: Mapping[str, Any], frame: Mapping[str, Any], numbe
         name,
         _photograph(file.parent / name),
         camera,
-        _split_of(name, table) or split,
+        split,
         settings.size(),
         file.parent / mask if mask else None,
     )
@@ -123,11 +150,6 @@ def _photograph(path: Path) -> Path:
         return path
     tried = [path.with_name(path.name + suffix) for suffix in SUFFIXES]
     return next((file for file in tried if file.is_file()), tried[0])
-
-
-def _split_of(name: str, table: Mapping[str, Any]) -> str | None:
-    """The split whose list of the data set names a frame; None where it has no lists."""
-    return next((split for split in ("test", "val", "train") if name in (table.get(f"{split}_filenames") or ())), None)
 
 
 @dataclass(frozen=True)

@@ -256,6 +256,16 @@ def test_transforms_with_lists_of_splits(tmp_path: Path) -> None:
     assert len(load_photos(folder).views) == 3
 
 
+@pytest.mark.parametrize("prefix", ["", "./", "../set/"])
+def test_lists_of_splits_are_of_files_however_they_are_written(tmp_path: Path, prefix: str) -> None:
+    """A test view that the list writes otherwise than its frame stays one; views that no list names are not trained on."""
+    names = [f"{prefix}images/{n:04d}.png" for n in (0, 1, 2)]
+    folder = write_transforms(tmp_path / "set", {"fl_x": 20, "train_filenames": names, "test_filenames": names[2:]})
+    assert [view.name for view in load_photos(folder).views] == ["0000.png", "0001.png"]
+    assert [view.name for view in load_photos(folder, split="test").views] == ["0002.png"]
+    assert "4 photographs (2 train, 1 test, 1 in no list)" in survey_photos(folder).text
+
+
 def test_masks_are_black_where_nothing_counts(tmp_path: Path) -> None:
     folder = write_transforms(tmp_path / "set", {"fl_x": 20})
     mask = np.full((8, 12), 255, np.uint8)
@@ -296,6 +306,8 @@ def test_written_cameras_are_read_the_same(tmp_path: Path) -> None:
         ({"k1": float("nan")}, "distortion"),
         ({"fl_x": "long"}, "fl_x = 'long'"),
         ({"fl_x": 0}, "focal lengths 0"),
+        ({"cx": float("nan")}, r"a principal point \(nan, 4\)"),
+        ({"test_filenames": 7}, "test_filenames = 7, expected a list of the names of files"),
         ({"w": 12.5}, "w = 12.5"),
         ({"w": 24, "h": 16}, r"0000.png: found 12 x 8 pixels, expected 24 x 16 pixels as the file of cameras"),
         ({"k1": -3.0}, "a lens whose image folds back"),
