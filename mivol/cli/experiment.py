@@ -28,7 +28,7 @@ from mivol.fields.procedural import make_procedural
 from mivol.files import layers, read_exr, read_volume, write_exr, write_png, write_volume
 from mivol.optim.events import upsample
 from mivol.optim.loop import Fit, reconstruct
-from mivol.optim.parameters import Parameter, as_tensor, find, like
+from mivol.optim.parameters import GRID, Parameter, as_tensor, check_names, find, like
 from mivol.optim.problem import Problem, seed_of
 from mivol.optim.shots import Shot, View, check_sizes, make_shots
 from mivol.report import figures
@@ -95,6 +95,7 @@ def run(chosen: Experiment, base: Path, folder: Path, *, resume: bool = False) -
             loaded = load_scene(base / chosen.scene.file, chosen.scene.define)
             truth = make_truth(chosen, base, loaded.scene)
             integrator = make_integrator(chosen)
+            check_names([sought.key for sought in chosen.parameter])
             starts = [make_start(sought, base, loaded.scene) for sought in chosen.parameter]
         with stage(record, "references"):
             seen = references(chosen, base, folder, loaded, truth)
@@ -319,12 +320,16 @@ def make_start(sought: Sought, base: Path, scene: mi.Scene) -> Start:
     now = as_tensor(params[find(sought.key, params)])
     # A copy: the scene may give the memory behind a view to another tensor when its parameter changes.
     value = np.array(now)
+    if now.ndim < GRID and (sought.shape or sought.start_file):
+        raise MivolError(
+            f"{sought.key} is no grid of voxels but has the shape {now.shape}: give start, and neither shape nor start_file."
+        )
     if sought.start_file:
         value = read_volume(base / sought.start_file).values
     elif sought.start is not None:
         shape = (*sought.shape, now.shape[3]) if sought.shape else now.shape
         value = np.full(shape, start_of(sought, shape), dtype=np.float32)
-    extent = edges_of(place_of(sought.key, scene))[::-1] if value.ndim == 4 else (1.0, 1.0, 1.0)
+    extent = edges_of(place_of(sought.key, scene))[::-1] if value.ndim >= GRID else (1.0, 1.0, 1.0)
     parameter = Parameter(sought.key, sought.unit, sought.domain, sought.map, sought.lr, extent, sought.prior)
     parameter.to_reals(mi.TensorXf(np.ascontiguousarray(value)))
     return Start(parameter, value)
@@ -453,6 +458,7 @@ def write_outputs(chosen: Experiment, folder: Path, record: RunRecord, fit: Fit,
         record.images += write_view(chosen, folder, fit.problem, view, seed_of(chosen.seed, 0, number, FINAL), seen)
     for sought in chosen.parameter:
         record.volumes += write_grid(chosen, folder, sought, fit, truth)
+        record.images += write_image(folder, sought.key, fit)
     write_curves(folder)
     record.results = {
         **errors_of((fit.measures or [{}])[-1]),
@@ -498,7 +504,7 @@ def write_grid(chosen: Experiment, folder: Path, sought: Sought, fit: Fit, truth
     A .vol has room for boxes along the axes only: of a turned grid it holds the unit cube, which the scene places.
     """
     value = np.asarray(fit.values()[sought.key])
-    if value.ndim != 4:
+    if value.ndim != GRID:
         return []
     place = place_of(sought.key, fit.problem.scene)
     is_along_axes = np.array_equal(place[:3, :3], np.diag(np.abs(np.diagonal(place)[:3])))
@@ -513,6 +519,23 @@ def write_grid(chosen: Experiment, folder: Path, sought: Sought, fit: Fit, truth
         write_volume(folder / f"{stem}.npz", grid, place, metadata={"key": sought.key, "unit": sought.unit})
         found.append(Volume(path=f"{stem}.npz", role=role, quantity=quantity, unit=sought.unit, size=edges_of(place)))
     return found
+
+
+def write_image(folder: Path, key: str, fit: Fit) -> list[Image]:
+    """A parameter that is an image (texture, sky), as .exr of linear values and .png.
+
+    Mitsuba's ``envmap`` repeats a column at either side of what it was given, which another ``envmap`` would do again.
+    """
+    value = np.asarray(fit.values()[key])
+    if value.ndim != 3 or value.shape[2] not in (1, 3):
+        return []
+    is_sky = mi.traverse(fit.problem.scene).properties[key][2].class_name() == "EnvironmentMapEmitter"
+    image = value[:, 1:-1] if is_sky else value
+    (folder / "images").mkdir(exist_ok=True)
+    stem = f"images/{key.replace('.', '_')}"
+    write_exr(folder / f"{stem}.exr", named("", image))
+    write_png(folder / f"{stem}.png", image)
+    return [Image(path=f"{stem}.png", role="picture", caption=f"{key} as found, in {stem}.exr")]
 
 
 def write_curves(folder: Path) -> None:

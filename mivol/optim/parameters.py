@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import drjit as dr
@@ -18,6 +18,9 @@ import numpy as np
 from mivol.errors import MivolError
 from mivol.optim.priors import Prior
 from mivol.optim.strategy import nearest
+
+GRID = 4
+"""Axes of a grid (Z, Y, X, C); harmonics of directions have one more."""
 
 
 @dataclass(frozen=True)
@@ -144,9 +147,11 @@ class Parameter:
         """Value -> reals.
 
         Raises:
-            MivolError: a value is not finite, lies outside the domain, or on a bound that the map sends to infinity.
+            MivolError: a value is not finite, lies outside the domain, or on a bound that the map sends to infinity; or a
+                prior that compares neighbours has no grid to look at.
         """
         self.check(np.asarray(value))
+        self.check_priors(value.shape)
         reals = MAPS[self.map].to_reals(value, *self.domain)
         if not np.all(np.isfinite(np.asarray(reals))):
             raise MivolError(
@@ -156,7 +161,9 @@ class Parameter:
         return reals
 
     def spacing(self, shape: tuple[int, ...]) -> tuple[float, float, float]:
-        """Voxel size (z, y, x) [length] of a grid of that shape."""
+        """Voxel size (z, y, x) [length] of a grid of that shape; numbers and images have none, and count as 1 apart."""
+        if len(shape) < GRID:
+            return 1.0, 1.0, 1.0
         return tuple(edge / n for edge, n in zip(self.extent, shape[:3], strict=True))
 
     def energy(self, value: mi.TensorXf) -> mi.Float:
@@ -186,6 +193,19 @@ class Parameter:
             u = dr.maximum(u, low)
         return dr.minimum(u, high) if high < math.inf else u
 
+    def check_priors(self, shape: tuple[int, ...]) -> None:
+        """Refuse a prior that compares neighbours where the parameter is no grid: an image's third axis is its colours.
+
+        Raises:
+            MivolError: with the prior.
+        """
+        prior = next((prior.label() for prior in self.priors if prior.is_spatial), None)
+        if prior is not None and len(shape) < GRID:
+            raise MivolError(
+                f'{self.name} has the shape {tuple(shape)}, and the prior "{prior}" compares neighbours in a grid: '
+                'leave it out, or take "l1" or "bounds".'
+            )
+
     def check(self, value: np.ndarray) -> None:
         """Refuse values that are not finite or lie outside the domain, naming the first one.
 
@@ -213,6 +233,17 @@ def as_tensor(value: object) -> mi.TensorXf:
 def like(tensor: mi.TensorXf, value: object) -> object:
     """The inverse of :func:`as_tensor`, in the type of ``value``."""
     return tensor if isinstance(value, mi.TensorXf) else dr.unravel(type(value), tensor.array)
+
+
+def check_names(names: Sequence[str]) -> None:
+    """Refuse a fit that looks for one parameter twice.
+
+    Raises:
+        MivolError: with its name.
+    """
+    twice = next((name for number, name in enumerate(names) if name in names[:number]), None)
+    if twice is not None:
+        raise MivolError(f"the fit looks for {twice} twice: give it one domain, start and map.")
 
 
 def find(name: str, params: mi.SceneParameters) -> str:

@@ -9,7 +9,7 @@ Gauss-Newton and conjugate gradients need. PRIORS lists them.
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 import drjit as dr
 import mitsuba as mi
@@ -52,7 +52,9 @@ def laplacian(x: mi.TensorXf, spacing: Spacing) -> mi.Float:
 
 
 class Prior(Strategy, tag="prior"):
-    """An energy of a field."""
+    """An energy of a field; ``is_spatial`` tells that it compares neighbours."""
+
+    is_spatial: ClassVar[bool] = True
 
     weight: Annotated[float, of("1", "factor in front of the energy, beside the mean loss", ge=0)] = 1.0
 
@@ -145,6 +147,8 @@ class Laplacian(Prior, tag="laplacian"):
 class Sparse(Prior, tag="l1"):
     """|x|: empty where nothing says otherwise. Its majorising parabola rounds off below ``knee``."""
 
+    is_spatial = False
+
     knee: Annotated[float, of("value", "values below this are pulled to 0 quadratically by Gauss-Newton", gt=0)] = 1e-3
 
     def energy(self, x: mi.TensorXf, spacing: Spacing) -> mi.Float:
@@ -156,6 +160,8 @@ class Sparse(Prior, tag="l1"):
 
 class Bounds(Prior, tag="bounds"):
     """1/2 distance^2 to [low, high]: a soft wall for values that should, but need not, stay inside."""
+
+    is_spatial = False
 
     low: Annotated[float, of("value", "lower wall")] = 0.0
     high: Annotated[float, of("value", "upper wall")] = float("inf")

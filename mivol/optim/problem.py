@@ -23,7 +23,7 @@ import numpy as np
 from mivol.errors import MivolError
 from mivol.optim.losses import L2, Loss
 from mivol.optim.noise import Compared, compare, halves_of, noise_check, warning
-from mivol.optim.parameters import Parameter, as_tensor, find, like
+from mivol.optim.parameters import Parameter, as_tensor, check_names, find, like
 from mivol.optim.shots import Shot, View, check_views, make_shots, pixels, single_shots
 
 PRIMAL, ADJOINT = 0, 1
@@ -70,6 +70,7 @@ class Problem:
         self.params = mi.traverse(self.scene)
         for parameter in self.parameters:
             find(parameter.name, self.params)
+        check_names([parameter.name for parameter in self.parameters])
         self.params.keep([parameter.name for parameter in self.parameters])
         self.shots = make_shots(self.views, self.samples_per_pass)
         self.seen = (0.0, 0.0)

@@ -290,6 +290,25 @@ def test_a_colour_is_looked_for_from_a_start_of_its_own(variant_rgb, folder: Pat
     assert "starts from 2 numbers and has 3" in refused(capsys, *flags, "--set", sought.replace(", 0.125", ""))
 
 
+def test_a_sky_that_was_found_is_an_image(variant_rgb, folder: Path) -> None:
+    """Without the columns that Mitsuba's envmap adds: what is written has the shape of what was given, and is read again to
+    the same parameter. A soft wall is a prior that needs no neighbours."""
+    write_exr(folder / "sky.exr", {"": np.random.default_rng(1).uniform(0.5, 1, (4, 6, 3)).astype(np.float32)})
+    sky = '<emitter type="envmap" id="sky"><string name="filename" value="{}"/></emitter>'
+    (folder / "scene.xml").write_text(SCENE.replace('<emitter type="constant"/>', sky.format("sky.exr")))
+    flags = ["optimize", folder / "fit.toml", "-o", folder / "run", "--set", "fit.iterations=2", "--set", "event=[]"]
+    sought = 'parameter=[{key="sky.data", lr=0.01, prior=[{name="bounds", high=0.9}]}]'
+    assert run(*flags, "--set", sought) == 0
+    with np.load(folder / "run" / "checkpoint.npz") as stored:
+        found = next(stored[name] for name in stored.files if stored[name].shape == (4, 8, 3))
+    planes = read_exr(folder / "run" / "images" / "sky_data.exr")[0]
+    image = np.stack([planes[channel] for channel in "RGB"], axis=-1)
+    assert image.shape == (4, 6, 3)
+    again = mi.load_dict({"type": "envmap", "bitmap": mi.Bitmap(image)})
+    np.testing.assert_allclose(np.array(mi.traverse(again)["data"])[:, 1:-1], found[:, 1:-1], rtol=1e-6)
+    assert "sky.data as found" in (folder / "run" / "report.html").read_text()
+
+
 def test_the_fit_does_not_start_at_the_truth(variant_rgb, folder: Path) -> None:
     """Without a start of its own the fit begins where the scene's file says, whatever the references showed: its first
     error is that of 0.25 everywhere, and not 0."""
@@ -359,6 +378,15 @@ OPTIMIZE_REFUSED = {
     "more views than files": (['reference={source="files", paths=["a.exr"]}'], "1 reference files for 3 views"),
     "unknown integrator": (['fit.integrator="mivoll"'], "mivoll"),
     "unknown variant": (['variant="llvm_rgb"'], 'no variant "llvm_rgb"'),
+    "a parameter twice": ([f'parameter=[{{key="{KEY}"}}, {{key="{KEY}", start=0.1}}]'], "twice"),
+    "voxels of a number": (
+        ['parameter=[{key="cube.interior_medium.albedo.value.value", shape=[3,3,3], start=0.0}]'],
+        "is no grid of voxels",
+    ),
+    "a prior of a number": (
+        ['parameter=[{key="cube.interior_medium.albedo.value.value", prior=[{name="tv"}]}]'],
+        "compares neighbours",
+    ),
 }
 
 
