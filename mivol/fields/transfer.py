@@ -70,7 +70,10 @@ class Transfer:
         values = np.array(dr.detach(field))
         low, high = (float(np.min(values)), float(np.max(values))) if values.size else (0.0, 0.0)
         if "domain" in props:
-            low, high = _numbers(props["domain"], f"the domain of {name}").ravel().tolist()
+            ends = _numbers(props["domain"], f"the domain of {name}").ravel().tolist()
+            if len(ends) != 2:
+                raise MivolError(f"the domain of {name} is {props['domain']}; two numbers in rising order are expected.")
+            low, high = ends
         place = np.array(props.get("to_world", mi.ScalarTransform4f()).matrix, dtype=np.float64)
         return cls(field, table, (low, high), int(props.get("refine", 1)), place, name)
 

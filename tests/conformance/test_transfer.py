@@ -135,6 +135,7 @@ def test_constant_scan_is_a_homogeneous_medium():
         ({"table": "0, -1"}, "not negative"),
         ({"table": "0 1, 1 2"}, "1 or 3 finite numbers"),
         ({"domain": "3, 3"}, "rising order"),
+        ({"domain": "3"}, "MivolError: the domain of mivol_transfer is 3; two numbers"),
         ({"refine": 0}, "at least 1"),
         ({"data": np.full((3, 3, 3), np.nan)}, r"finite numbers are expected"),
         ({"data": np.ones((3, 3, 3, 3))}, r"\(Z, Y, X, 1\)"),
