@@ -248,6 +248,12 @@ class Photographs(Section):
     ] = "cameras"
     judged: Annotated[str, of("1", "views to report at the end: held_out, val or test", min_length=1)] = "held_out"
 
+    def __post_init__(self) -> None:
+        for name in ("background", "behind"):
+            colour = getattr(self, name)
+            if not isinstance(colour, str) and not all(0 <= c <= 1 for c in colour):  # NaN fails every comparison
+                raise ValueError(f"{name} is {list(colour)}: three numbers from 0 to 1 are expected, codes of 8 bits over 255")
+
 
 class Field(Section):
     """The radiance field and how it is fitted."""
@@ -270,13 +276,15 @@ class Field(Section):
         for name in ("degree", "first_degree"):
             if not 0 <= (getattr(self, name) or 0) <= 4:
                 raise ValueError(f"{name} is {getattr(self, name)}: 0 to 4 is expected")
-        if self.sky is not None and self.sky != 0 and self.sky < 2:
-            raise ValueError(f"sky is {self.sky}: 0 or at least 2 rows are expected")
+        if not math.isfinite(self.effort):
+            raise ValueError(f"effort is {self.effort}: a finite number above 0 is expected")
+        if self.sky is not None and self.sky != 0 and not 2 <= self.sky <= 4096:
+            raise ValueError(f"sky is {self.sky}: 0, or 2 to 4096 rows are expected")
         if self.longest is not None and self.longest < 8:
             raise ValueError(f"longest is {self.longest}: at least 8 is expected")
         for name in ("tv_density", "tv_sh", "sparsity", "matte", "beta"):
-            if (getattr(self, name) or 0) < 0:
-                raise ValueError(f"{name} is {getattr(self, name)}: at least 0 is expected")
+            if not 0 <= (getattr(self, name) or 0) < math.inf:  # NaN fails every comparison
+                raise ValueError(f"{name} is {getattr(self, name)}: a finite number of at least 0 is expected")
 
 
 class Shown(Section):
