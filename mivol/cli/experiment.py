@@ -517,7 +517,8 @@ def write_grid(chosen: Experiment, folder: Path, sought: Sought, fit: Fit, truth
         stem = f"volumes/{sought.key.replace('.', '_')}_{role}"
         write_volume(folder / f"{stem}.vol", grid, place if is_along_axes else np.eye(4))
         write_volume(folder / f"{stem}.npz", grid, place, metadata={"key": sought.key, "unit": sought.unit})
-        found.append(Volume(path=f"{stem}.npz", role=role, quantity=quantity, unit=sought.unit, size=edges_of(place)))
+        about = {"quantity": quantity, "unit": sought.unit, "size": edges_of(place), "caption": sought.key}
+        found.append(Volume(path=f"{stem}.npz", role=role, **about))
     return found
 
 

@@ -78,8 +78,9 @@ class Gallery(NamedTuple):
 
 
 class Cut(NamedTuple):
-    """Slices of the volumes, one row a plane, and the voxels of the reconstruction along x, y, z."""
+    """Slices of one quantity's volumes, one row a plane, and the voxels of the reconstruction along x, y, z."""
 
+    title: str
     shape: tuple[int, ...]
     rows: list[dict[str, Any]]
     bars: list[Bar]
@@ -102,14 +103,14 @@ def write_page(folder: str | Path) -> Path:
     record, rows = read_record(folder), read_metrics(folder)
     _check_present(folder, record)
     groups = _views(folder, record.images)
-    volume = _volume(folder, record.volumes)
+    volumes = _volumes(folder, record.volumes)
     facts = {
         "record": record,
         "headline": headline(record, _held_out_psnr(record, groups.rows)),
-        "numbers": _numbers(record, groups.rows, volume),
+        "numbers": _numbers(record, groups.rows, volumes),
         "views": groups,
         "shown": SHOWN_VIEWS,
-        "volume": volume,
+        "volumes": volumes,
         "curves": _curves(rows),
         "timings": _timings(record.timings),
         "films": [_film(folder, image) for image in record.images if image.role == "film"],
@@ -314,11 +315,16 @@ def _bar(scale: show.Scale, label: str) -> Bar:
 # -- Volume -------------------------------------------------------------------------------------------------------------
 
 
-def _volume(folder: Path, volumes: Sequence[Volume]) -> Cut | None:
+def _volumes(folder: Path, volumes: Sequence[Volume]) -> list[Cut]:
+    """Slices of every volume that was reconstructed: those of one caption and quantity belong together."""
+    groups: dict[tuple[str, str], dict[str, Volume]] = {}
+    for volume in volumes:
+        groups.setdefault((volume.caption, volume.quantity), {})[volume.role] = volume
+    return [_cut(folder, group) for group in groups.values() if "reconstruction" in group]
+
+
+def _cut(folder: Path, by_role: dict[str, Volume]) -> Cut:
     """Slices of the truth, the reconstruction and their difference, one row a plane."""
-    by_role = {volume.role: volume for volume in volumes}
-    if "reconstruction" not in by_role:
-        return None
     data = {role: read_volume(folder / by_role[role].path) for role in ("truth", "reconstruction") if role in by_role}
     size = by_role["reconstruction"].size or tuple(np.linalg.norm(data["reconstruction"].to_world[:3, :3], axis=0))
     cuts = {role: show.slices(found.values, size) for role, found in data.items()}
@@ -335,7 +341,7 @@ def _volume(folder: Path, volumes: Sequence[Volume]) -> Cut | None:
     bars = [_bar(values, f"{described.quantity} [{described.unit}]" if described.unit else described.quantity)]
     if "difference" in scales:
         bars.append(_bar(scales["difference"], "Reconstruction − truth"))
-    return Cut(data["reconstruction"].values.shape[2::-1], rows, bars)
+    return Cut(described.caption or described.quantity, data["reconstruction"].values.shape[2::-1], rows, bars)
 
 
 def _planes(cut: show.Slices, scale: show.Scale) -> dict[str, Any]:
@@ -360,7 +366,7 @@ def _held_out_psnr(record: RunRecord, views: Sequence[View]) -> list[float]:
     return [view.psnr for view in views if view.held_out and view.psnr is not None]
 
 
-def _numbers(record: RunRecord, views: Sequence[View], volume: Cut | None) -> list[tuple[str, str, str]]:
+def _numbers(record: RunRecord, views: Sequence[View], volumes: Sequence[Cut]) -> list[tuple[str, str, str]]:
     """Tiles under the headline: value, unit, label."""
     held_out = _held_out_psnr(record, views)
     seconds, said, tiles = _seconds(record), ("nrmse", "held_out_psnr", "seconds"), []
@@ -372,8 +378,8 @@ def _numbers(record: RunRecord, views: Sequence[View], volume: Cut | None) -> li
     if seconds:
         tiles.append((*_duration(seconds).split(" "), "in all"))
     tiles += [_tile(name, value) for name, value in record.results.items() if name not in said]
-    if volume is not None:
-        tiles.append((*_count(math.prod(volume.shape)), f"voxels, {_times(volume.shape)}"))
+    shapes = dict.fromkeys(volume.shape for volume in volumes)
+    tiles += [(*_count(math.prod(shape)), f"voxels, {_times(shape)}") for shape in shapes]
     return tiles
 
 

@@ -230,6 +230,22 @@ def test_layers_of_one_file_and_a_volume_without_truth(tmp_path):
     assert "voxels, 4 × 3 × 2" in found.text
 
 
+def test_each_volume_is_shown_beside_its_own_truth(tmp_path):
+    """Two grids were found and the truth of the first is known: it is no truth of the second, and neither hides the other."""
+    for name, values in {"found": 1.0, "true": 2.0, "albedo": 0.5}.items():
+        write_volume(tmp_path / f"{name}.npz", np.full((2, 2, 2, 1), values, np.float32))
+    volumes = [
+        Volume(path="found.npz", role="reconstruction", caption="a.sigma_t.data"),
+        Volume(path="true.npz", role="truth", caption="a.sigma_t.data"),
+        Volume(path="albedo.npz", role="reconstruction", quantity="albedo", caption="a.albedo.data"),
+    ]
+    write_record(RunRecord.new("Two", volumes=volumes), tmp_path)
+    found = Page(write_page(tmp_path).read_text(encoding="utf-8"))
+    assert "a.sigma_t.data" in found.text and "a.albedo.data" in found.text
+    shown = [attributes["alt"] for tag, attributes in found.tags if tag == "img"]
+    assert [sum(role in alt for alt in shown) for role in ("Truth", "Reconstruction", "xy")] == [3, 3, 1]
+
+
 def test_text_of_a_run_cannot_become_markup(tmp_path):
     plan = [Choice(choice="<img src=x onerror=alert(1)>", reason="a < b & c")]
     write_record(RunRecord.new("<script>alert(1)</script>", plan=plan, config={"a": "</pre><b>"}), tmp_path)
