@@ -180,9 +180,25 @@ def choices(plan: Plan, photos: Photos, views: Views) -> list[Choice]:
             reason="a pixel of half a voxel says as much as four smaller ones",
         ),
         Choice(choice=f"harmonics of degree {plan.degree}", reason=f"{(plan.degree + 1) ** 2} numbers a colour and node"),
+        what_is_behind(plan, photos),
         Choice(choice=f"rays end at a transmittance of {plan.stop:g}", reason="what is left out is at most that share"),
         Choice(choice=memory_of(plan, box, views), reason="counted before it is taken"),
     ]
+
+
+def what_is_behind(plan: Plan, photos: Photos) -> Choice:
+    """What rays see that pass the box; where a colour is only believed, the one that the photographs' edges show is told."""
+    if plan.sky:
+        return Choice(choice=f"a sky of {plan.sky} rows behind the box", reason="field.sky; it is learned with the field")
+    if photos.views[0].alpha is not None:
+        return Choice(choice="nothing behind the box", reason="alpha says what is there")
+    edges = [view.image[at] for view in photos.views for at in (0, -1, (slice(None), 0), (slice(None), -1))]
+    most, believed = (
+        "(" + ", ".join(f"{c:.2g}" for c in colour) + ")"
+        for colour in (np.median(np.concatenate(edges), axis=0), photos.views[0].background)
+    )
+    reason = f"photos.behind; the edges of the photographs show {most} mostly, and field.sky would learn it"
+    return Choice(choice=f"the colour {believed} behind the box", reason=reason)
 
 
 def notes(photos: Photos) -> list[str]:

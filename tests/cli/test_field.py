@@ -92,7 +92,7 @@ def test_photographs_become_a_field_and_a_page(photographs: Path, tmp_path: Path
     printed = capsys.readouterr()
     assert printed.out.strip().endswith("report.html")
     before, _, _ = printed.err.partition("steps: ")
-    for text in ("box (-1, -1, -1) to (1, 1, 1), as given", "near 1.", "MiB: photographs"):
+    for text in ("box (-1, -1, -1) to (1, 1, 1), as given", "behind the box: photos.behind", "near 1.", "MiB: photographs"):
         assert text in before
     record = json.loads((tmp_path / "run/run.json").read_text())
     # A white picture would have 9 dB, a grey ball 15.
@@ -117,7 +117,7 @@ def test_what_is_behind_is_learned(photographs: Path, tmp_path: Path) -> None:
     record = json.loads((tmp_path / "run/run.json").read_text())
     assert record["results"]["held_out_psnr"] > 22
     channels, _ = read_exr(tmp_path / "run/sky.exr")
-    # Cameras are all around, so most of the sky was seen; what was not has stayed grey.
+    # Cameras are all around, so most of the sky was seen; what was not has stayed what most pixels show.
     assert all(np.median(channels[name]) > 0.9 for name in "RGB")
 
 
@@ -166,6 +166,19 @@ def test_what_was_done_to_linear_photographs_is_said(photographs: Path, tmp_path
         said.append(" ".join(field.notes(photos)))
     assert ["OpenEXR" in note for note in said] == [False, True]
     assert all("srgb code values" in note for note in said)
+
+
+def test_what_is_taken_to_be_behind_is_said(photographs: Path, tmp_path: Path) -> None:
+    """The ball fills the middle of each view: its edges are white, whatever colour the file says is behind it."""
+    chosen = config.load(toml(tmp_path, photographs), ["photos.behind=[0, 0.5, 0]"])
+    photos, _ = field.read_photos(chosen, tmp_path)
+    plan = field.make_plan(chosen)
+    said = field.what_is_behind(plan, photos)
+    assert said.choice == "the colour (0, 0.5, 0) behind the box"
+    assert "edges of the photographs show (1, 1, 1) mostly" in said.reason
+    assert "sky of 8 rows" in field.what_is_behind(replace(plan, sky=8), photos).choice
+    clear = replace(photos, views=tuple(replace(v, alpha=np.ones((SIZE, SIZE))) for v in photos.views))
+    assert "alpha" in field.what_is_behind(plan, clear).reason
 
 
 def test_photographs_are_shrunk_to_half_a_voxel(photographs: Path, tmp_path: Path) -> None:
