@@ -97,6 +97,7 @@ def run(chosen: Experiment, base: Path, folder: Path, *, resume: bool = False) -
             integrator = make_integrator(chosen)
             check_names([sought.key for sought in chosen.parameter])
             starts = [make_start(sought, base, loaded.scene) for sought in chosen.parameter]
+            check_truth(chosen)
         with stage(record, "references"):
             seen = references(chosen, base, folder, loaded, truth)
         with stage(record, "fit"):
@@ -174,6 +175,19 @@ def make_truth(chosen: Experiment, base: Path, scene: mi.Scene) -> np.ndarray | 
         return read_volume(base / chosen.truth.file).values
     wanted = chosen.truth
     return make_procedural(wanted.procedural, wanted.shape, wanted.seed, wanted.peak)
+
+
+def check_truth(chosen: Experiment) -> None:
+    """Refuse a truth that nobody looks for: the references would show it and the renders what the scene holds.
+
+    Raises:
+        MivolError: with its key.
+    """
+    if chosen.truth is not None and chosen.truth.key not in [sought.key for sought in chosen.parameter]:
+        raise MivolError(
+            f"truth.key is {chosen.truth.key}, which is no parameter of the fit, so the references would show another volume "
+            "than the renders: look for it too, or put what is known into the scene (scene.define) and take the truth out."
+        )
 
 
 @contextmanager

@@ -49,12 +49,13 @@ SCENE = """<scene version="3.0.0">
     </shape>
 </scene>"""
 
+TRUTH = f'truth = {{ key = "{KEY}", procedural = "tangle", shape = [6, 6, 6], peak = 3.0 }}'
 FIT = f"""title = "tiny"
 scene.file = "scene.xml"
 threads = 1
 reference = {{ source = "render", spp = 64, held_out = [1] }}
 views = {{ rig = "ring", count = 3, width = 8, height = 8 }}
-truth = {{ key = "{KEY}", procedural = "tangle", shape = [6, 6, 6], peak = 3.0 }}
+{TRUTH}
 optimiser = {{ name = "adam" }}
 fit = {{ iterations = 4, spp = 2 }}
 event = [{{ name = "evaluate", every = 2 }}]
@@ -282,6 +283,7 @@ def test_a_colour_is_looked_for_from_a_start_of_its_own(variant_rgb, folder: Pat
     coloured = '<emitter type="constant" id="sky"><rgb name="radiance" value="0.9, 0.8, 0.7"/></emitter>'
     (folder / "scene.xml").write_text(SCENE.replace('<emitter type="constant"/>', coloured))
     flags = ["optimize", folder / "fit.toml", "-o", folder / "run", "--set", "fit.iterations=1", "--set", "event=[]"]
+    (folder / "fit.toml").write_text(FIT.replace(TRUTH, ""))
     sought = 'parameter=[{key="sky.radiance.value", lr=1e-6, start=[0.5, 0.25, 0.125]}]'
     assert run(*flags, "--set", sought) == 0
     results = json.loads((folder / "run" / "run.json").read_text())["results"]
@@ -297,6 +299,7 @@ def test_a_sky_that_was_found_is_an_image(variant_rgb, folder: Path) -> None:
     sky = '<emitter type="envmap" id="sky"><string name="filename" value="{}"/></emitter>'
     (folder / "scene.xml").write_text(SCENE.replace('<emitter type="constant"/>', sky.format("sky.exr")))
     flags = ["optimize", folder / "fit.toml", "-o", folder / "run", "--set", "fit.iterations=2", "--set", "event=[]"]
+    (folder / "fit.toml").write_text(FIT.replace(TRUTH, ""))
     sought = 'parameter=[{key="sky.data", lr=0.01, prior=[{name="bounds", high=0.9}]}]'
     assert run(*flags, "--set", sought) == 0
     with np.load(folder / "run" / "checkpoint.npz") as stored:
@@ -379,6 +382,10 @@ OPTIMIZE_REFUSED = {
     "unknown integrator": (['fit.integrator="mivoll"'], "mivoll"),
     "unknown variant": (['variant="llvm_rgb"'], 'no variant "llvm_rgb"'),
     "a parameter twice": ([f'parameter=[{{key="{KEY}"}}, {{key="{KEY}", start=0.1}}]'], "twice"),
+    "a truth that nobody looks for": (
+        ['parameter=[{key="cube.interior_medium.albedo.value.value", domain=[0, 1]}]'],
+        "which is no parameter of the fit",
+    ),
     "voxels of a number": (
         ['parameter=[{key="cube.interior_medium.albedo.value.value", shape=[3,3,3], start=0.0}]'],
         "is no grid of voxels",
