@@ -21,29 +21,35 @@ class Voxels:
     """A trilinear grid in the world.
 
     Args:
-        values: (Z, Y, X, C), 1 or 3 channels, finite and not negative.
+        values: (Z, Y, X, C), 1 or 3 channels, finite, and not negative unless ``signed``.
         to_world: (4, 4) affine map of the unit cube to the world.
         name: what the grid is called in a sentence that refuses it.
         to_local: the inverse that Mitsuba keeps of ``to_world``, rounded as it rounds; None to invert it here.
+        signed: values may be negative, as the ``g`` of a phase function; whoever reads them as an extinction refuses those.
 
     Raises:
         MivolError: values or a placement that no medium can have; the first bad voxel is named.
     """
 
     def __init__(
-        self, values: np.ndarray | mi.TensorXf, to_world: np.ndarray, name: str, to_local: np.ndarray | None = None
+        self,
+        values: np.ndarray | mi.TensorXf,
+        to_world: np.ndarray,
+        name: str,
+        to_local: np.ndarray | None = None,
+        signed: bool = False,
     ) -> None:
-        self.name = name
+        self.name, self.least = name, None if signed else 0.0
         self.to_world = check_affine(to_world, f"to_world of {name}")
         tensor = values if isinstance(values, mi.TensorXf) else mi.TensorXf(np.ascontiguousarray(values, dtype=np.float32))
-        check_volume(np.array(dr.detach(tensor)), name=name)
+        check_volume(np.array(dr.detach(tensor)), name=name, minimum=self.least)
         self.texture = mi.Texture3f(tensor, use_accel=False, migrate=False)
         to_local = np.linalg.inv(self.to_world) if to_local is None else to_local
         self.to_local = mi.ScalarAffineTransform4f(mi.ScalarMatrix4f(to_local), mi.ScalarMatrix4f(self.to_world.T))
 
     @classmethod
     def from_props(cls, props: mi.Properties) -> Voxels:
-        """Build from plugin parameters: one of ``filename``, ``grid`` or ``data``; ``to_world``; ``use_grid_bbox``."""
+        """Build from plugin parameters: ``filename``, ``grid`` or ``data``; ``to_world``, ``use_grid_bbox``, ``signed``."""
         sources = [k for k in ("filename", "grid", "data") if k in props]
         name = f"mivol_voxels {props.id()}".strip()
         if len(sources) != 1:
@@ -56,7 +62,7 @@ class Voxels:
         if "filename" in props:
             name = f"{name} ({props['filename']})"
         _check_inverse(check_affine(to_world, f"to_world of {name}"), to_local, f"to_world of {name}")
-        return cls(values, to_world @ place, name, np.linalg.inv(place) @ to_local)
+        return cls(values, to_world @ place, name, np.linalg.inv(place) @ to_local, props.get("signed", False))
 
     @staticmethod
     def _values(props: mi.Properties, source: str, own_box: bool) -> tuple[np.ndarray | mi.TensorXf, np.ndarray]:
@@ -117,7 +123,7 @@ class Voxels:
         if dr.flag(dr.JitFlag.FreezingScope):
             # A recording cannot read values.
             return
-        check_volume(np.array(dr.detach(self.texture.tensor())), name=self.name)
+        check_volume(np.array(dr.detach(self.texture.tensor())), name=self.name, minimum=self.least)
 
     def __repr__(self) -> str:
         z, y, x = self.res

@@ -85,6 +85,7 @@ class Needs:
         start: medium that the sensor names.
         camera_inside: the camera may be inside the box around a boundary.
         parameters: keys whose derivatives are asked for.
+        places: those of them that are of shapes and sensors.
         film_samples: pixels times samples of the sensor asked about.
     """
 
@@ -100,6 +101,7 @@ class Needs:
     start: mi.Medium | None
     camera_inside: bool
     parameters: tuple[str, ...]
+    places: tuple[str, ...]
     film_samples: int
 
 
@@ -147,6 +149,8 @@ def find_needs(scene: mi.Scene, sensor: mi.Sensor, survey: Survey | None = None,
     start = [] if sensor.get_medium() is None else [sensor.get_medium()]
     boundaries = (*survey.boundaries, *_around(start, survey.boundaries))
     views = tuple(view_medium(b.medium, b.box, survey.places) for b in boundaries)
+    params = mi.traverse(scene)
+    asked = tuple(k for k, v in params if dr.grad_enabled(v))
     media = tuple(_facts(b, view, survey, recording) for b, view in zip(boundaries, views, strict=True))
     return Needs(
         variant=mi.variant(),
@@ -160,9 +164,17 @@ def find_needs(scene: mi.Scene, sensor: mi.Sensor, survey: Survey | None = None,
         refractive=survey.refractive,
         start=sensor.get_medium(),
         camera_inside=_camera_inside(scene, sensor, survey),
-        parameters=tuple(k for k, v in mi.traverse(scene) if dr.is_diff_v(v) and dr.grad_enabled(v)),
+        parameters=asked,
+        places=tuple(k for k in asked if _is_place(k, params.properties[k][2])),
         film_samples=int(np.prod(sensor.film().crop_size())) * (spp or sensor.sampler().sample_count()),
     )
+
+
+def _is_place(key: str, owner: object) -> bool:
+    """Whether a parameter says where a shape or a sensor is; what is painted on a mesh does not."""
+    name = key.rsplit(".", 1)[-1]
+    painted = name.startswith(("vertex_", "face_")) and name not in ("vertex_positions", "vertex_normals", "vertex_texcoords")
+    return isinstance(owner, mi.Shape | mi.Sensor) and not painted
 
 
 def survey_scene(scene: mi.Scene) -> Survey:

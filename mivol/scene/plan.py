@@ -92,13 +92,14 @@ def make_plan(needs: Needs, settings: Settings) -> Plan:
     """Choose from the facts.
 
     Raises:
-        MivolError: what is asked for is not there yet (a medium that scatters, at depth 3 or more), or a gradient step
-            would not fit into memory.
+        MivolError: what is asked for is not there yet (a medium that scatters, at depth 3 or more; derivatives of shapes),
+            or a gradient step would not fit into memory.
     """
     _refuse_scattering(needs, settings)
     _refuse_refraction(needs, settings)
     _refuse_emission(needs, settings)
     _refuse_quadrature(needs, settings)
+    _refuse_places(needs)
     choices = [_transport(needs, settings), *_emission(needs), *_lighting(needs, settings), _tracing(needs), _channels(needs)]
     skips = tuple(bool(m.resolutions) and m.occupied < SKIP_BELOW for m in needs.media)
     choices += [_skipping(m, skip) for m, skip in zip(needs.media, skips, strict=True) if m.resolutions]
@@ -180,6 +181,14 @@ def _voxel_over_cells(volume: mi.Volume, view: MediumView) -> float:
     edges = cells.to_world[:3, :3] / np.array(cells.res[::-1])
     voxels = np.linalg.solve(place[:3, :3], edges) * np.array(volume.resolution(), dtype=np.float64)[:, None]
     return 1 / float(np.linalg.norm(voxels, axis=0).max())
+
+
+def _refuse_places(needs: Needs) -> None:
+    if needs.places:
+        raise MivolError(
+            f"the derivative of {needs.places[0]} was asked for; mivol has none of shapes, of lamps that have a size, nor of "
+            "cameras: take that of a point, spot or directional light, or finite differences."
+        )
 
 
 def _refuse_quadrature(needs: Needs, settings: Settings) -> None:

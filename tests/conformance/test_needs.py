@@ -207,6 +207,19 @@ def test_gradient_step_that_cannot_fit_is_refused(monkeypatch):
             make_plan(needs, Settings(max_depth=1))
 
 
+@pytest.mark.parametrize("key", ["bulb.to_world", "sensor.to_world", "box.vertex_positions"])
+def test_derivatives_of_places_are_refused(key):
+    """They would be 0 without a word."""
+    bulb = {"type": "sphere", "center": [2, 2, 0], "radius": 0.3, "emitter": {"type": "area"}}
+    scene = scene_of(sigma_t=1.0, bulb=bulb)
+    params = mi.traverse(scene)
+    ask(scene)
+    dr.enable_grad(params[key])
+    params.update()
+    with refused(f"the derivative of {key} was asked for"):
+        make_plan(find_needs(scene, scene.sensors()[0]), Settings(max_depth=1))
+
+
 def test_empty_space_is_skipped_where_it_pays():
     sparse = np.zeros((40, 40, 40, 1), np.float32)
     sparse[:8, :8, :8] = 1

@@ -302,6 +302,23 @@ def test_hard_27_bad_voxels_are_named(variant, bad):
         mi.load_dict(grid_volume("mivol_voxels", values))
 
 
+def test_signed_voxels_are_a_g_and_no_extinction(variant):
+    """Back-scattering voxels; NaN is refused as ever, and so are negative numbers where they would be an extinction."""
+    values = grid()
+    values[3, 1, 4, 0] = -0.9
+    phase = {"type": "mivol_hg", "g": grid_volume("mivol_voxels", np.clip(values, -0.9, 0.9)) | {"signed": True}}
+    params = mi.traverse(mi.load_dict(phase))
+    assert np.array(params["g.data"])[3, 1, 4, 0] == np.float32(-0.9)
+    params["g.data"] = mi.TensorXf(np.full_like(values, np.nan, np.float32))
+    with pytest.raises(Exception, match="z=0, y=0, x=0"):
+        params.update()
+    smoke = box_of({"type": "mivol_medium", "sigma_t": grid_volume("mivol_voxels", values) | {"signed": True}}, np.eye(4))
+    sensor = camera([0.5, 0.4, 4], [0.5, 0.5, 0.5], 4, fov=5)
+    scene = mi.load_dict({"type": "scene", "smoke": smoke, "sky": sky(), "sensor": sensor})
+    with refused("z=3, y=1, x=4"):
+        render(scene, {"type": "mivol"}, 1)
+
+
 def test_hard_49_degenerate_place_is_refused(variant):
     with pytest.raises(Exception, match="degenerate|invert|singular"):
         mi.load_dict(grid_volume("mivol_voxels", grid(), np.diag([1.0, 0, 1, 1])))
