@@ -75,6 +75,7 @@ class Boundary:
         to_local: (4, 4) world to the unit cube of the volume under a stock ``heterogeneous``, else None.
         to_local_inverse: (4, 4) transpose of what Mitsuba takes for the inverse of a stock volume's, else None.
         volume: class of the volume under a stock ``heterogeneous``, else "".
+        grids: (4, 4) world to the unit cube of each stock grid of the extinction.
         surface: (POINTS, 3) points on the shape, or on its box where it is neither a mesh nor a ball.
         majorant: largest extinction [1/length].
         skin: largest optical depth, along the normal, of what Mitsuba leaps over where a ray enters.
@@ -88,6 +89,7 @@ class Boundary:
     to_local: np.ndarray | None
     to_local_inverse: np.ndarray | None
     volume: str
+    grids: tuple[np.ndarray, ...]
     surface: np.ndarray
     majorant: float
     skin: float
@@ -96,9 +98,11 @@ class Boundary:
     @property
     def overhangs(self) -> bool:
         """Whether the shape reaches outside the volume's own box."""
-        if self.to_local is None:
-            return False
-        q = self.points @ self.to_local[:3, :3].T + self.to_local[:3, 3]
+        return self.to_local is not None and self.overhang(self.to_local)
+
+    def overhang(self, to_local: np.ndarray) -> bool:
+        """Whether the shape reaches outside a box that is mapped to the unit cube."""
+        q = self.points @ to_local[:3, :3].T + to_local[:3, 3]
         return bool(np.any(q < -ON_FACE) or np.any(q > 1 + ON_FACE))
 
     @property
@@ -152,10 +156,8 @@ def _not_finite(b: Boundary) -> Found:
 
 
 def _rotated(b: Boundary) -> Found:
-    if b.volume != "GridVolume" or not b.overhangs:
-        return
-    linear = np.abs(b.to_local[:3, :3])
-    if np.any(np.sort(linear, axis=1)[:, :2] > 1e-5 * linear.max(axis=1, keepdims=True)):
+    linear = [np.abs(to_local[:3, :3]) for to_local in b.grids if b.overhang(to_local)]
+    if any(np.any(np.sort(m, axis=1)[:, :2] > 1e-5 * m.max(axis=1, keepdims=True)) for m in linear):
         yield (
             f"the grid inside {b.name} is rotated or sheared and {b.name} is larger than the grid's own box: Mitsuba fills the "
             "grid's upright bounding box with clamped values; make the boundary the grid's own box."
@@ -332,6 +334,7 @@ def _boundary(shape: mi.Shape) -> Boundary:
         to_local=to_local,
         to_local_inverse=_printed(stock, "inverse_transpose") if kind == "HeterogeneousMedium" else None,
         volume=volumes[0].class_name() if kind == "HeterogeneousMedium" else "",
+        grids=tuple(_printed(v, "matrix") for v in volumes if v.class_name() == "GridVolume"),
         surface=surface,
         majorant=scale * sum(float(np.max(v.max())) for v in volumes),
         skin=scale * _skin(surface + ON_FACE * (points.mean(axis=0) - surface), volumes, to_local),
