@@ -73,7 +73,8 @@ class SphericalVolume(mi.Volume):
     Parameters:
         filename: a field that ``mivol`` or svox2 wrote (.npz), or
         density, sh: tensors (Z, Y, X, 1) and (Z, Y, X, basis, 3), 1 to 25 harmonics in the order of ``dr.sh_eval``.
-        to_world: places the unit cube; a field of a file stands where the file says, and is moved from there.
+        to_world: places the unit cube; a field of a file stands where the file says, and is moved from there. Densities are per
+            length of the world: a field made n times as large is n times as opaque, unless they are divided by n.
         activation: none, relu, softplus or exp, of the interpolated density. Default relu, or the file's.
         offset: added to colours. Default 0.5, or the file's.
         clamp: show colours below 0 as 0. Default true, or the file's.

@@ -401,7 +401,7 @@ def _is_positive(values: mi.TensorXf, survey: Survey, name: str, is_albedo: bool
         # NaN fails every comparison.
         if is_albedo and not (low >= 0 and high <= 1 and bool(dr.all(dr.isfinite(flat)))):
             raise MivolError(
-                f"the albedo of the medium in {name} lies in [{low:.4g}, {high:.4g}] (or is NaN); the share of light that is "
+                f"the albedo of the medium in {name} lies in [{low:.9g}, {high:.9g}] (or is NaN); the share of light that is "
                 "scattered lies in [0, 1]: clip it after each step."
             )
         return high > 0

@@ -168,9 +168,11 @@ def _refuse_emission(needs: Needs, settings: Settings) -> None:
         for name, volume in (("emission", view.source), ("albedo", view.share)) if view.source is not None else ():
             least = _voxel_over_cells(volume, view) if isinstance(volume, mi.Volume) else 1.0
             if least < 1 - 1e-4:  # the place of a stock grid is known to 5e-6
+                led = any(p.lattice is not None for p in view.parts)
+                whose, advice = ("extinction", ", or give it as a number") if led else ("emission_density", "")
                 raise MivolError(
-                    f"the {name} of the medium in {facts.name} varies over lengths of {least:.2g} of its extinction's cells, "
-                    "which are looked at in two points; resample the extinction to voxels as small, or give it as a number."
+                    f"the {name} of the medium in {facts.name} varies over lengths of {least:.2g} of its {whose}'s cells, "
+                    f"which are looked at in two points; resample the {whose} to voxels as small{advice}."
                 )
 
 

@@ -172,7 +172,7 @@ def view_medium(medium: mi.Medium, boundary: Box | None = None, places: dict | N
     if not parts:
         parts, share, lights = [_part_of_field(source)], mi.Float(0), []
     light = [f for f in (glow, source, share) if source is not None or glow is not None]
-    frame = _frame(light, boundary, places)
+    frame = _frame(glow, light, boundary, places)
     rooms = {v.ptr: Box(_place(v, boundary, places)) for v in light if _repeats(v)}
     scale = mi.Float(params["scale"]) if "scale" in params.properties else mi.Float(1)
     return MediumView(medium, parts, scale, albedo, share, _flakes(medium), source, glow, frame, lights, rooms)
@@ -214,18 +214,23 @@ def _part_of_field(volume: mi.Volume) -> Part:
     return Part("sigma_t", lattice=lattice, activation=volume.mivol_field.act)
 
 
-def _frame(fields: list, boundary: Box | None, places: dict) -> Lattice | None:
-    """Where the first of some fields that is a grid has its cells; its values are not looked at."""
-    for volume in fields:
-        if isinstance(volume, mi.Volume) and volume.class_name() != "ConstVolume":
-            x, y, z = (int(n) for n in volume.resolution())
-            return Lattice(dr.zeros(mi.TensorXf, (z, y, x, 1)), _place(volume, boundary, places))
-    return None
+def _frame(glow: object, others: list, boundary: Box | None, places: dict) -> Lattice | None:
+    """Where a glow has its cells, else the finest of other fields; None without a grid. Values are not looked at."""
+    grids = [v for v in others if _is_grid(v)]
+    lead = glow if _is_grid(glow) else max(grids, key=lambda v: int(np.prod(v.resolution())), default=None)
+    if lead is None:
+        return None
+    x, y, z = (int(n) for n in lead.resolution())
+    return Lattice(dr.zeros(mi.TensorXf, (z, y, x, 1)), _place(lead, boundary, places))
+
+
+def _is_grid(volume: object) -> bool:
+    return isinstance(volume, mi.Volume) and volume.class_name() != "ConstVolume"
 
 
 def _repeats(volume: object) -> bool:
     """Whether a volume has values outside its own box."""
-    return isinstance(volume, mi.Volume) and volume.class_name() != "ConstVolume" and not hasattr(volume, "mivol_to_world")
+    return _is_grid(volume) and not hasattr(volume, "mivol_to_world")
 
 
 def _place(volume: mi.Volume, boundary: Box | None, places: dict) -> np.ndarray:

@@ -302,6 +302,13 @@ def test_an_albedo_alone_brings_the_cells(kind):
     assert np.abs(alone - flat).max() > 0.01
 
 
+def test_the_finer_of_emission_and_albedo_brings_the_cells():
+    albedo, emission = (rough(5, 0, 1, 1, (5, 8, 6)), PLACE), (rough(6, 0, 1, 3, (5, 4, 3)), PLACE)
+    alone = light(emitting(twins.Medium(0.8, emission, 0.0, albedo)))
+    on_cells = light(emitting(twins.Medium((np.full_like(albedo[0], 0.8), PLACE), emission, 0.0, albedo)))
+    assert np.abs(alone - on_cells).max() <= 30 * 2.0**-24
+
+
 def test_an_albedo_that_varies_within_the_cells_is_refused():
     sigma, albedo = (rough(1, 0, 2), PLACE), (rough(2, 0, 1, 1, (5, 8, 6)), PLACE)
     with refused("the albedo of the medium in box varies over lengths of .* of its extinction's cells"):
@@ -319,7 +326,7 @@ def test_a_source_that_varies_within_the_cells_is_refused(kind):
             shoot(picture(interior(twins.Medium(sigma, source), kind)))
     # In a constant extinction it is the light's cells that are walked: the glow's, where there are both.
     fine, coarse = (rough(2, 0, 1, 3, (9, 4, 6)), PLACE), (rough(3, 0, 1, 3), PLACE)
-    with refused("the emission of the medium in box varies"):
+    with refused("the emission of the medium in box varies over lengths of .* of its emission_density's cells"):
         shoot(picture(interior(twins.Medium(0.5, fine, coarse), kind)))
     for m in (twins.Medium(0.5, fine), twins.Medium(0.5, coarse, fine), twins.Medium(sigma, coarse)):
         assert np.isfinite(shoot(picture(interior(m, kind)))).all()
