@@ -26,6 +26,11 @@ class _Asked:
     key: str
     value: Any
 
+    @property
+    def numbers(self) -> Any:
+        """The array itself, or the matrix of a transform."""
+        return self.value if dr.is_array_v(self.value) else self.value.matrix
+
     def make_of(self, value: Any) -> None:
         """Have everything made of a value."""
         self.params[self.key] = value
@@ -49,11 +54,11 @@ def tangents_led(scene: mi.Scene) -> Iterator[None]:
     """Everything is made of copies of the parameters, and has its tangent; afterwards it is made of the parameters again."""
     with dr.resume_grad():
         found = _find_asked(scene)
-        copies = [dr.detach(asked.value) for asked in found]
+        copies = [dr.detach(asked.numbers) for asked in found]
         for asked, copy in zip(found, copies, strict=True):
             dr.enable_grad(copy)
-            dr.set_grad(copy, dr.grad(asked.value))
-            asked.make_of(copy)
+            dr.set_grad(copy, dr.grad(asked.numbers))
+            asked.make_of(type(asked.value)(copy))
         if copies:
             dr.enqueue(dr.ADMode.Forward, copies)
             dr.traverse(dr.ADMode.Forward, dr.ADFlag.ClearEdges)
@@ -75,8 +80,8 @@ def _find_asked(scene: mi.Scene) -> list[_Asked]:
     found = []
     for owner in {o.ptr: o for o in owners if o is not None}.values():
         params = mi.traverse(owner)
-        arrays = [(k, v) for k, v in params if dr.is_array_v(v) and dr.grad_enabled(v) and not _is_made(params, k)]
-        found += [_Asked(params, k, type(v)(v)) for k, v in arrays]
+        asked = [(k, v) for k, v in params if _is_followed(v) and not _is_made(params, k)]
+        found += [_Asked(params, k, type(v)(v)) for k, v in asked]
     return found
 
 
@@ -86,6 +91,12 @@ def _parts_of(medium: mi.Medium) -> list[mi.Object]:
     volumes = {key.partition(".")[0]: node for key, (_, _, node, _) in known.items() if isinstance(node, mi.Volume)}
     read = [n for n in volumes if n.startswith("sigma_") and f"{n}.table" not in known]
     return [medium.phase_function(), *(v for n, v in volumes.items() if n not in read)]
+
+
+def _is_followed(value: Any) -> bool:
+    """Whether the derivative of an array or of a transform is asked for."""
+    array = value if dr.is_array_v(value) else getattr(value, "matrix", None)
+    return array is not None and dr.is_diff_v(array) and dr.grad_enabled(array)
 
 
 def _is_made(params: mi.SceneParameters, key: str) -> bool:

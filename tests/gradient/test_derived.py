@@ -104,3 +104,26 @@ def test_every_way_of_asking(name):
     for mode in ("backward", "forward to the image", "forward from the parameter"):
         for updates in (True, False):
             assert derivative(parts(), key, mode, updates) == pytest.approx(truth, rel=1e-5), (mode, updates)
+
+
+def test_a_spot_is_carried_forward_as_often_as_back():
+    """A transform is no array: its matrix is led. Each pass follows another number, over a floor that paths turn at."""
+    place = mi.ScalarTransform4f().look_at([1.6, -1.3, 2.5], [0, 0, 0], [0, 0, 1])
+    scene = scene_of(smoke() | {"lamp": {"type": "spot", "to_world": place, "intensity": 5.0, "cutoff_angle": 50}})
+    params, integrator = mi.traverse(scene), mi.load_dict(mivol())
+    key = next(k for k in params.keys() if k.endswith("lamp.to_world"))  # noqa: SIM118  (iteration gives pairs)
+    start, found = params[key], []
+    for mode in ("forward", "backward") * 2:
+        x = mi.Float(0)
+        dr.enable_grad(x)
+        params[key] = type(start)(mi.Transform4f().translate(mi.Vector3f(0.3 * x, 0.1 * x, 0.2 * x)) @ mi.Transform4f(start))
+        params.update()
+        total = dr.sum(mi.render(scene, params, integrator=integrator, spp=8, seed=1, seed_grad=5), axis=None)
+        if mode == "forward":
+            dr.forward(x)
+            found.append(dr.grad(total).array[0])
+        else:
+            dr.backward(total)
+            found.append(dr.grad(x)[0])
+    assert abs(found[0]) > 1e-3
+    assert found == pytest.approx([found[0]] * 4, rel=1e-5)
