@@ -235,7 +235,7 @@ def _from_lamp(
         f, _ = phase.eval_pdf(_context(), mei, moved.d, on)
         source = lamp.emitter.eval_direction(mei, moved, on) / direct.pdf if attached else weight
         if attached:
-            source = source * shadow_of_moving(world, way, tau, moved.p, on & clear)
+            source = source * shadow_of_moving(scene, world, way, tau, moved.p, on & clear)
         value = dr.select(on & clear, dim * f * source, 0)
     return Arrival(way, value, on & clear)
 

@@ -4,10 +4,10 @@ r"""How the optical depth of a shadow ray changes as the lamp at its end moves.
           \mp \sum_{faces} \frac{t_f}{L}\,\sigma(t_f) \frac{n}{n \cdot \omega}
 
 for tau from x to l = x + L w: the ray grows, it turns through the field (two Gauss points a cell are exact: t times the
-gradient of a trilinear function is a cubic along a ray), and it enters and leaves a box elsewhere.
+gradient of a trilinear function is a cubic along a ray), and it enters and leaves boundaries elsewhere.
 
-Conventions. The upper sign is for a face through which the ray leaves. Media in boxes only: a boundary of another shape is
-found by tracing, which does not tell how its far side lies.
+Conventions. The upper sign is for a face through which the ray leaves. The faces of boxes are known; other boundaries are
+traced once more, and each shifts the step from the extinction before it to that behind it.
 """
 
 from __future__ import annotations
@@ -17,21 +17,23 @@ from dataclasses import replace
 import drjit as dr
 import mitsuba as mi
 
-from mivol.errors import MivolError
 from mivol.transport.lattice import Cell, Lattice, Nodes, Segment, clip, walk
 from mivol.transport.medium import Part
 from mivol.transport.optical_depth import GAUSS, gauss_points
-from mivol.transport.path import Way, visit_boxes
-from mivol.transport.world import Body, World, spectrum
+from mivol.transport.path import OWN_SURFACE, Way, distance_along, revisit
+from mivol.transport.world import Body, World, spawn_ray, spectrum
 
 __all__ = ["shadow_of_moving", "tau_by_end"]
 
+ASIDE = 1e-5
+"""How far beside a surface its two sides are looked at, as a share of the distance: ten times its rounding."""
 
-def tau_by_end(world: World, way: Way, tau: list[mi.Float], active: mi.Bool) -> list[mi.Vector3f]:
+
+def tau_by_end(scene: mi.Scene, world: World, way: Way, tau: list[mi.Float], active: mi.Bool) -> list[mi.Vector3f]:
     """Derivative of the optical depth of a shadow ray with respect to its far end.
 
     Args:
-        world: media, all in boxes.
+        scene, world: boundaries and media.
         way: the shadow ray; its length is the distance to the lamp.
         tau: its optical depth, each channel.
         active: lanes to differentiate.
@@ -39,16 +41,8 @@ def tau_by_end(world: World, way: Way, tau: list[mi.Float], active: mi.Bool) -> 
     Returns:
         One vector [1/length] for each channel.
 
-    Raises:
-        MivolError: a medium whose boundary has to be traced.
-
-    Cost: one walk of each grid.
+    Cost: one walk of each grid; where boundaries are traced, two more traces.
     """
-    if world.traced:
-        raise MivolError(
-            "the derivative of a lamp's place was asked for and a medium has a boundary that is not a box of its own; put the "
-            "medium into a cube that overlaps no other boundary."
-        )
     d, length = way.ray.d, dr.maximum(way.length, 1e-30)
 
     def visit(total: list, body: Body, t0: mi.Float64, t1: mi.Float64, on: mi.Bool) -> list:
@@ -64,16 +58,56 @@ def tau_by_end(world: World, way: Way, tau: list[mi.Float], active: mi.Bool) -> 
         return [a + t * turn for a, t in zip(total, own, strict=True)]
 
     zero = [mi.Vector3f(0) for _ in range(world.channels)]
-    turned = visit_boxes(world, way.ray, way.length, visit, zero, active)
+    turned = revisit(scene, world, way, visit, zero, active)
+    if world.traced:
+        turned = [a + b for a, b in zip(turned, _steps(scene, world, way, active), strict=True)]
     return [dr.select(active, (d * t + v) / length, 0) for t, v in zip(tau, turned, strict=True)]
 
 
-def shadow_of_moving(world: World, way: Way, tau: list[mi.Float], end: mi.Point3f, active: mi.Bool) -> mi.Spectrum | float:
+def shadow_of_moving(
+    scene: mi.Scene, world: World, way: Way, tau: list[mi.Float], end: mi.Point3f, active: mi.Bool
+) -> mi.Spectrum | float:
     """The number 1, with the derivative of a shadow by the lamp's end of its ray, where that moves."""
     if not dr.grad_enabled(end):
         return 1.0
     moved = end - dr.detach(end)
-    return spectrum([1 - dr.dot(s, moved) for s in tau_by_end(world, way, tau, active)])
+    with dr.suspend_grad():
+        slopes = tau_by_end(scene, world, way, tau, active)
+    return spectrum([1 - dr.dot(s, moved) for s in slopes])
+
+
+@dr.syntax
+def _steps(scene: mi.Scene, world: World, way: Way, active: mi.Bool) -> list[mi.Vector3f]:
+    """L times the part of the derivative by which boundaries that are traced shift, one vector a channel."""
+    # -- State ------------------------------------------------------------------------------------------------------------
+    ray = way.ray
+    onward = mi.Ray3f(ray)  #                        the ray from the last surface on
+    going = mi.Bool(active)
+    total = [dr.zeros(mi.Vector3f, dr.width(ray)) for _ in range(world.channels)]
+
+    while dr.hint(going, label="boundaries on the way to a lamp"):
+        hit = scene.ray_intersect(onward, mi.RayFlags.All, False, going)
+        t = distance_along(ray, hit)
+        going &= hit.is_valid() & (t < way.length * OWN_SURFACE)
+        crosses = going & hit.is_medium_transition()
+        total = _add_step(total, world, ray, hit, t, crosses)
+        onward = spawn_ray(hit, ray.d, world.size)
+    return total
+
+
+def _add_step(
+    total: list[mi.Vector3f], world: World, ray: mi.Ray3f, hit: mi.SurfaceInteraction3f, t: mi.Float, crosses: mi.Bool
+) -> list[mi.Vector3f]:
+    """Add the step of the extinction at a surface, from a little before it to a little behind it."""
+    slope = dr.dot(hit.n, ray.d)
+    face = mi.Vector3f(hit.n) * dr.rcp(dr.select(slope != 0, slope, 1))
+    for side, to, sign in ((-ray.d, 1 - ASIDE, -1.0), (ray.d, 1 + ASIDE, 1.0)):
+        medium = hit.target_medium(side)
+        for body in world.traced:
+            on = crosses & (slope != 0) & (medium == mi.MediumPtr(body.view.medium))
+            sigma = body.extinction_at(ray, t * to, world.channels, on)
+            total = [v + dr.select(on, sign * t * x * face, 0) for v, x in zip(total, sigma, strict=True)]
+    return total
 
 
 def _by_part(body: Body, part: Part, way: Way, t0: mi.Float64, t1: mi.Float64, on: mi.Bool) -> list[mi.Vector3f]:
@@ -92,7 +126,11 @@ def _by_part(body: Body, part: Part, way: Way, t0: mi.Float64, t1: mi.Float64, o
     inside = on & (segment.length > 0)
     vectors = _turn(lattice, part, segment, inside)
     high = tuple(n - 0.5 for n in lattice.res[::-1])
-    for t, sign, moves in ((b, -1.0, b < end * (1 - 1e-6)), (a, 1.0, a > 0)):
+    leaves, enters = b < end * (1 - 1e-6), a > 0
+    if body.box is None:
+        # Of a grid that is cut by a boundary that is traced, only the own faces.
+        leaves, enters = leaves & (b < t1 * (1 - 2 * ASIDE)), enters & (a > t0 * (1 + 2 * ASIDE))
+    for t, sign, moves in ((b, -1.0, leaves), (a, 1.0, enters)):
         here = inside & moves
         face = _face(lattice.from_world, (-0.5,) * 3, high, ray, t)
         if body.trims:

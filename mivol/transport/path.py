@@ -36,6 +36,7 @@ __all__ = [
     "Stretch",
     "Visit",
     "Way",
+    "distance_along",
     "follow_lamp",
     "is_straight",
     "light_through",
@@ -186,7 +187,7 @@ def _trace(
     while dr.hint(going, label="to the next opaque surface"):
         hit = scene.ray_intersect(onward, mi.RayFlags.All, False, going)
         found = going & hit.is_valid()
-        t_hit = dr.select(found, dr.maximum(t, _distance(ray, hit)), ray.maxt)
+        t_hit = dr.select(found, dr.maximum(t, distance_along(ray, hit)), ray.maxt)
 
         # -- The medium on this side of the surface fills the stretch ---------------------------------------------------------
         transition = found & hit.is_medium_transition()
@@ -208,7 +209,7 @@ def _trace(
     return Reach(si, t, medium, veil), state
 
 
-def _distance(ray: mi.Ray3f, hit: mi.SurfaceInteraction3f) -> mi.Float:
+def distance_along(ray: mi.Ray3f, hit: mi.SurfaceInteraction3f) -> mi.Float:
     """Distance of a hit along the ray that began at the camera.
 
     Not the sum of the parts: each spawned ray starts an epsilon (1e-4 of a length) further on and to the side, so the hit

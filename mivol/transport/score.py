@@ -124,7 +124,7 @@ class Adjoint:
     def shadow(self, scene: mi.Scene, world: World, way: Way, light: Dimmed, active: mi.Bool) -> Adjoint:
         """Light that a shadow ray carried is dimmed by the media along it."""
         _backproject(scene, world, way, -self.dL * dr.detach(light.value), active)
-        return self.add(_moving(world, way, light, active), active)
+        return self.add(_moving(scene, world, way, light, active), active)
 
     def turn(self, bsdf: mi.BSDFPtr, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool) -> Adjoint:
         """All that lies ahead passes through the BSDF: its parameters get dL L f' / f."""
@@ -194,7 +194,7 @@ class Tangent:
     def shadow(self, scene: mi.Scene, world: World, way: Way, light: Dimmed, active: mi.Bool) -> Tangent:
         """As :meth:`add`, with the tangent of the shadow ray besides."""
         along = _tangent(scene, world, way, active)
-        passed = self.add(_moving(world, way, light, active), active)
+        passed = self.add(_moving(scene, world, way, light, active), active)
         return Tangent(passed.L, passed.dL - dr.select(active, along * dr.detach(light.value), 0), self.dtau)
 
     def turn(self, bsdf: mi.BSDFPtr, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool) -> Tangent:
@@ -209,10 +209,10 @@ class Tangent:
         return Tangent(self.L, self.dL, self.dtau - change)
 
 
-def _moving(world: World, way: Way, light: Dimmed, active: mi.Bool) -> mi.Spectrum:
+def _moving(scene: mi.Scene, world: World, way: Way, light: Dimmed, active: mi.Bool) -> mi.Spectrum:
     """Light of a shadow ray, which changes with its end."""
     with dr.resume_grad():
-        return light.value * shadow_of_moving(world, way, light.tau, light.end, active)
+        return light.value * shadow_of_moving(scene, world, way, light.tau, light.end, active)
 
 
 def _emit(
