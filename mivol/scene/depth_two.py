@@ -27,6 +27,7 @@ import mitsuba as mi
 import numpy as np
 
 from mivol.errors import MivolError
+from mivol.scene.nesting import extent
 from mivol.transport.medium import Box, MediumView, Part
 from mivol.transport.optical_depth import integrate_tau
 from mivol.transport.path import optical_depth_to
@@ -194,7 +195,7 @@ def _depths(view: MediumView, o: mi.Point3f, d: mi.Vector3f, length: np.ndarray)
 
 def _traced_depths(scene: mi.Scene, view: MediumView, ray: mi.Ray3f) -> np.ndarray:
     """Optical depth (n, channels) of lines in a boundary of any shape, up to the first opaque surface."""
-    world = World([Body(view, None)], has_surfaces=True)
+    world = World([Body(view, None)], has_surfaces=True, size=extent(scene))
     nowhere = dr.zeros(mi.MediumPtr, dr.width(ray))
     _, tau = optical_depth_to(scene, world, ray, nowhere, dr.full(mi.Bool, True, dr.width(ray)))
     return np.stack([np.array(t, np.float64) for t in tau], axis=-1)

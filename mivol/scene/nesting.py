@@ -93,7 +93,8 @@ def nesting_fault(scene: mi.Scene, traced: Sequence[mi.Shape] = ()) -> str | Non
     if not pairs:
         return None
     closed = {_number(mi.ShapePtr(s)) for s in {t.ptr: t for pair in pairs for t in pair}.values() if _is_closed(s)}
-    found = _disagreements(scene, _rays(scene, pairs), closed, extent(scene))
+    size = extent(scene)
+    found = _disagreements(scene, _rays(pairs, 2 * size), closed, size)
     for k, pair in enumerate(pairs):
         numbers = {_number(mi.ShapePtr(s)) for s in pair}
         rays = {ray for ray, *shapes in found if ray // RAYS == k and numbers.issuperset(shapes)}
@@ -137,10 +138,9 @@ def _is_closed(shape: mi.Shape) -> bool:
     return bool(np.array_equal(there, back))
 
 
-def _rays(scene: mi.Scene, pairs: list[tuple[mi.Shape, mi.Shape]]) -> mi.Ray3f:
-    """Rays from outside of all boundaries through the box that the boxes of two shapes share."""
+def _rays(pairs: list[tuple[mi.Shape, mi.Shape]], far: float) -> mi.Ray3f:
+    """Rays from so far away through the box that the boxes of two shapes share."""
     rng, origins, targets = np.random.default_rng(0), [], []
-    far = 2 * extent(scene)
     for a, b in pairs:
         one, two = bounds(a), bounds(b)
         low, high = np.maximum(one[0], two[0]), np.minimum(one[1], two[1])

@@ -20,6 +20,7 @@ from mivol.machine import available_memory
 from mivol.scene.depth_two import depth_two_error, mean_albedo, mean_cosine, scattering_depth
 from mivol.scene.load import find_sensor
 from mivol.scene.needs import MediumFacts, Needs, Survey, find_needs, read_blocks, read_gaps, survey_scene
+from mivol.scene.nesting import bounds
 from mivol.transport.aovs import AOVS
 from mivol.transport.direct import Lights
 from mivol.transport.field import share_cells
@@ -495,10 +496,10 @@ def _depth_two(scene: mi.Scene, needs: Needs) -> list[str]:
 def _box_around(scene: mi.Scene, medium: mi.Medium) -> Box | None:
     """A box around all that a medium fills; None where it lies outside of shapes, without an end."""
     inside = [s.interior_medium() for s in scene.shapes()]
-    boxes = [s.bbox() for s, m in zip(scene.shapes(), inside, strict=True) if m is not None and m.ptr == medium.ptr]
+    boxes = [bounds(s) for s, m in zip(scene.shapes(), inside, strict=True) if m is not None and m.ptr == medium.ptr]
     if not boxes:
         return None
-    low, high = np.min([b.min for b in boxes], axis=0), np.max([b.max for b in boxes], axis=0)
+    low, high = np.min([b[0] for b in boxes], axis=0), np.max([b[1] for b in boxes], axis=0)
     # Lines begin outside of what they are to enter.
     room, place = 1e-3 * (high - low).max(), np.eye(4)
     place[:3, :3], place[:3, 3] = np.diag(high - low + 2 * room), low - room
