@@ -1,4 +1,10 @@
-"""<phase type="mivol_hg"> and its kin: phase functions for our media and for stock ones."""
+"""<phase type="mivol_hg"> and its kin: phase functions for our media and for stock ones.
+
+Conventions. A phase function of the angle alone is one component; a mixture has those of its lobes. A stock ``blendphase``
+does not see this count: it reads a C++ member that Mitsuba 3.9 gives Python no access to, and numbers no phase function that is
+written in Python. Its renders are right, since no integrator of Mitsuba's asks for a component; whoever does nests the lobes
+in a ``mivol_mixture``.
+"""
 
 from __future__ import annotations
 
@@ -38,6 +44,12 @@ class TurningPhase(mi.PhaseFunction):
 
     def refresh(self) -> None:
         _take_over(self.parameters, self.kind)
+
+    def component_count(self, active: mi.Bool = True) -> int:
+        return 1
+
+    def flags(self, index: int | mi.Bool | None = None, active: mi.Bool = True) -> int:
+        return self.m_flags
 
     def eval_turn(self, turn: Turn, mei: mi.MediumInteraction3f, active: mi.Bool) -> mi.Float:
         raise NotImplementedError
@@ -189,6 +201,16 @@ class Mixture(mi.PhaseFunction):
         if len(numbers) == len(self.weights) and not dr.flag(dr.JitFlag.FreezingScope) and not any(w[0] > 0 for w in numbers):
             raise MivolError("the weights of mivol_mixture are all 0; at least one above 0 is expected.")
 
+    def component_count(self, active: mi.Bool = True) -> int:
+        return sum(_count(lobe) for lobe in self.lobes.values())
+
+    def flags(self, index: int | mi.Bool | None = None, active: mi.Bool = True) -> int:
+        if index is None or isinstance(index, (bool, mi.Bool)):
+            return self.m_flags
+        name, inner = self._find_component(index)
+        lobe = self.lobes[name]
+        return int(lobe.flags() if inner == ALL_COMPONENTS else lobe.flags(inner))
+
     def shares(self, mei: mi.MediumInteraction3f, active: mi.Bool) -> list[mi.Float]:
         return shares_of([_eval(w, "weight", mei, active) for w in self.weights.values()])
 
@@ -244,16 +266,19 @@ class Mixture(mi.PhaseFunction):
         self, ctx: mi.PhaseFunctionContext, shares: list[mi.Float]
     ) -> tuple[mi.Float, mi.PhaseFunction, mi.PhaseFunctionContext]:
         """The lobe that holds one component, its share, and the context that asks it for that component."""
-        index = ctx.component
-        for share, lobe in zip(shares, self.lobes.values(), strict=True):
-            count = lobe.component_count()
-            if index < max(count, 1):
-                inner = mi.PhaseFunctionContext(ctx.sampler, ctx.mode)
-                inner.type_mask = ctx.type_mask
-                inner.component = index if count else ALL_COMPONENTS  # a phase function in Python has none to number
-                return share, lobe, inner
-            index -= max(count, 1)
-        raise MivolError(f"component {ctx.component} of mivol_mixture was asked for, which has fewer.")
+        name, index = self._find_component(ctx.component)
+        inner = mi.PhaseFunctionContext(ctx.sampler, ctx.mode)
+        inner.type_mask, inner.component = ctx.type_mask, index
+        return shares[list(self.lobes).index(name)], self.lobes[name], inner
+
+    def _find_component(self, index: int) -> tuple[str, int]:
+        """The name of the lobe that holds one component, and the number that the lobe itself gives it."""
+        left = index
+        for name, lobe in self.lobes.items():
+            if left < _count(lobe):
+                return name, left if lobe.component_count() else ALL_COMPONENTS
+            left -= _count(lobe)
+        raise MivolError(f"component {index} of mivol_mixture was asked for, which has {self.component_count()}.")
 
     def traverse(self, callback: mi.TraversalCallback) -> None:
         for name, weight in self.weights.items():
@@ -266,6 +291,11 @@ class Mixture(mi.PhaseFunction):
 
     def to_string(self) -> str:
         return "mivol_mixture[" + ", ".join(f"{n}={lobe}" for n, lobe in self.lobes.items()) + "]"
+
+
+def _count(lobe: mi.PhaseFunction) -> int:
+    """Components of a phase function; stock ``rayleigh`` counts none of its own, and is one."""
+    return max(lobe.component_count(), 1)
 
 
 # -- Parameters that are a number or a volume -------------------------------------------------------------------------

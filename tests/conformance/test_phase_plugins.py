@@ -310,6 +310,10 @@ PAIRS = {
         {"type": "mivol_mixture", "a": {"type": "hg", "g": 0.2}, "b": {"type": "rayleigh"}, "weight_a": 0.3, "weight_b": 0.7},
         {"type": "blendphase", "a": {"type": "rayleigh"}, "b": {"type": "hg", "g": 0.2}, "weight": 0.3},
     ),
+    "blend": tuple(
+        {"type": "blendphase", "a": {"type": rayleigh}, "b": {"type": hg, "g": 0.6}, "weight": 0.3}
+        for rayleigh, hg in (("mivol_rayleigh", "mivol_hg"), ("rayleigh", "hg"))
+    ),
 }
 
 
@@ -341,7 +345,39 @@ def test_components_of_a_mixture_are_those_of_a_blend(variant):
         ours.eval_pdf(ctx, mei, wo)
 
 
-@pytest.mark.parametrize("name", ["table", "mixture"])
+@pytest.mark.parametrize(("name", "count"), [("hg", 1), ("rayleigh", 1), ("draine", 1), ("table", 1), ("mixture", 3)])
+def test_components_are_counted(variant, name, count):
+    """One for each lobe, as stock ``hg`` and ``isotropic`` count; each has the flags of its lobe."""
+    phase = mi.load_dict(PHASES[name])
+    assert phase.component_count() == count
+    assert [phase.flags(k) for k in range(count)] == [int(mi.PhaseFunctionFlags.Anisotropic)] * count
+
+
+def test_components_of_nested_mixtures_add_up(variant):
+    """A component within a mixture within a mixture is the share of its lobe of the share of the inner one."""
+    inner = {"type": "mivol_mixture", "c": {"type": "mivol_hg", "g": 0.3}, "d": {"type": "isotropic"}}
+    ours = mi.load_dict({"type": "mivol_mixture", "a": inner, "b": {"type": "mivol_rayleigh"}})
+    assert ours.component_count() == 3
+    turned, even = int(mi.PhaseFunctionFlags.Anisotropic), int(mi.PhaseFunctionFlags.Isotropic)
+    assert [ours.flags(k) for k in range(3)] == [turned, even, turned]
+    assert ours.flags() == ours.flags(True) == turned | even
+    mei, wo, ctx = interaction(directions(64, 15)), vector(directions(64, 16)), mi.PhaseFunctionContext()
+    lobes = ({"type": "mivol_hg", "g": 0.3}, {"type": "isotropic"}, {"type": "mivol_rayleigh"})
+    for k, (lobe, share) in enumerate(zip(lobes, (0.25, 0.25, 0.5), strict=True)):
+        want = mi.load_dict(lobe).eval_pdf(mi.PhaseFunctionContext(), mei, wo)[0]
+        ctx.component = k
+        # Shares are powers of two, and each is a sum and a quotient of exact numbers.
+        assert dr.all(ours.eval_pdf(ctx, mei, wo)[0] == share * want, axis=None)
+
+
+def test_stock_blend_does_not_number_ours(variant):
+    """Mitsuba 3.9 keeps the count that its blend reads from Python. Once it no longer does, ours can be set."""
+    lobes = {"a": {"type": "mivol_hg"}, "b": {"type": "hg"}}
+    assert mi.load_dict({"type": "blendphase", "weight": 0.5, **lobes}).component_count() == 1
+    assert mi.load_dict({"type": "mivol_mixture", **lobes}).component_count() == 2
+
+
+@pytest.mark.parametrize("name", ["table", "mixture", "blend"])
 def test_same_image_as_stock_under_volpath(name):
     """Fog lit by a lamp and a sky, several scatterings: a z-test over the image between stock and ours."""
     mi.set_variant("llvm_ad_rgb")
