@@ -214,8 +214,10 @@ def survey_scene(scene: mi.Scene) -> Survey:
 
 def _mark(shape: mi.Shape) -> object:
     """What another place would change of a shape: the array of a mesh's vertices, else its box."""
-    if shape.is_mesh():
-        return dr.detach(mi.traverse(shape)["vertex_positions"])
+    params = mi.traverse(shape)
+    # A rectangle is a mesh that keeps its vertices to itself.
+    if "vertex_positions" in params:
+        return dr.detach(params["vertex_positions"])
     return [*shape.bbox().min, *shape.bbox().max]
 
 

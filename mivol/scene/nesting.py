@@ -128,9 +128,9 @@ def extent(scene: mi.Scene) -> float:
 
 def _is_closed(shape: mi.Shape) -> bool:
     """Whether a shape encloses what is inside it: a ball, or a mesh whose every edge is passed once each way."""
-    if not shape.is_mesh():
-        return shape.shape_type() in (mi.ShapeType.Sphere.value, mi.ShapeType.Ellipsoids.value)
     geometry = mi.traverse(shape)
+    if "vertex_positions" not in geometry:  # no mesh, or a rectangle, whose vertices Mitsuba does not show
+        return shape.shape_type() in (mi.ShapeType.Sphere.value, mi.ShapeType.Ellipsoids.value)
     points = np.array(geometry["vertex_positions"]).reshape(-1, 3)
     faces = np.unique(points, axis=0, return_inverse=True)[1].ravel()[np.array(geometry["faces"]).reshape(-1, 3)]
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])

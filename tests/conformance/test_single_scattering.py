@@ -379,6 +379,20 @@ def test_media_that_fill_no_shape_of_their_own(where):
         small.assert_same_whole(moments(silent, mivol(), 32), moments(scene, mivol(), 32, first=500), precision=0.02)
 
 
+def test_fog_in_a_room_that_is_open_on_one_side():
+    """Rectangles bound it, one of them a null one; each wall has a BSDF of its own, so that Mitsuba merges none into a mesh."""
+    ref, placed = {"type": "ref", "id": "fog"}, walls(exterior={"type": "ref", "id": "fog"})
+    for k, name in enumerate(placed):
+        placed[name]["bsdf"] = {"type": "diffuse", "reflectance": 0.2 + 0.1 * k}
+    # The second wall is the one at z = 2: the opening, whose normal shows inwards.
+    placed["wall1"]["bsdf"] = {"type": "null"}
+    lamp = square(0, 0.5, -1.9, 0.5, (0, 0.5, 5)) | {"emitter": {"type": "area", "radiance": 5.0}, "exterior": ref}
+    sensor = scenes.camera((0.6, -0.4, 7.0), (0, 0, 0), res=16, fov=40.0)
+    scene = mi.load_dict({"type": "scene", "fog": FOG, **placed, "lamp": lamp, "sensor": sensor})
+    assert {s.class_name() for s in scene.shapes()} == {"Rectangle"}
+    assert_same_images(scene, rounding=5 * LEAK, precision=0.02)  # of the lamp's radiance, the brightest there is
+
+
 @pytest.mark.parametrize("kind", small.cases(["homogeneous", "grid"], ["grid"]))
 def test_media_in_instances(kind):
     interior = medium("homogeneous", 2.0, 0.8) if kind == "homogeneous" else grid_in({})["interior"]
