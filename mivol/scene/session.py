@@ -115,9 +115,12 @@ class Session:
                 world.push_gradients()
 
     def sample(self, scene: mi.Scene, sampler: mi.Sampler, ray: mi.Ray3f, active: mi.Bool) -> tuple:
-        """Radiance along given rays, for integrators that nest this one."""
+        """Radiance along given rays, for integrators that nest this one, which do not tell what sensor the rays come from."""
         with dr.suspend_grad():
             world, _ = self._open(scene, find_sensor(scene, 0), 1, pictures=True)
+            named = [sensor.get_medium() for sensor in scene.sensors()]
+            world.start = named[0] if all(medium is named[0] for medium in named) else None
+            world.locates = bool(world.traced)
             score, valid = walk_path(scene, world, self.settings, sampler, ray, Primal(_black(ray)), active)
             return score.L, valid, integrate_aovs(scene, world, ray, self.aovs, active)
 
