@@ -5,7 +5,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from mivol.scene.coefficients import Coefficients
+from mivol.scene.coefficients import Coefficients, check_constant
 
 
 class MivolMedium(mi.Medium):
@@ -35,6 +35,9 @@ class MivolMedium(mi.Medium):
         self.refresh()
 
     def refresh(self) -> None:
+        if not dr.flag(dr.JitFlag.FreezingScope):
+            self.coefficients.check_constants()
+            check_constant(self.scale, "scale", " of a mivol_medium")
         self.majorant = self.coefficients.bound()
         dr.make_opaque(self.majorant)
 

@@ -79,6 +79,16 @@ class Coefficients:
         """The volumes whose sum is the extinction."""
         return [v for n, v in self.volumes.items() if n != "albedo"]
 
+    def check_constants(self) -> None:
+        """Refuse constants that an update may have brought. Not while ``dr.freeze`` records, which cannot read values.
+
+        Raises:
+            MivolError: NaN, infinite, negative, or an albedo above 1.
+        """
+        for name, volume in {**self.volumes, **self.lights}.items():
+            if _is_constant(volume):
+                check_constant(_constant(volume), name, " of a mivol_medium")
+
     @property
     def is_homogeneous(self) -> bool:
         """Whether every coefficient is a constant."""
@@ -170,16 +180,32 @@ def _volume(props: mi.Properties, name: str) -> mi.Volume:
     return mi.load_dict({"type": "constvolume", "value": {"type": "rgb", "value": rgb}})
 
 
-def check_coefficient(value: float, name: str) -> None:
+def check_coefficient(value: float, name: str, owner: str = "") -> None:
     """Refuse a number that no coefficient can be.
+
+    Args:
+        value: the number.
+        name: ``sigma_t``, ``albedo``, ``scale`` and so on.
+        owner: whose it is, where an optimiser may have moved it: `` of the medium in smoke``.
 
     Raises:
         MivolError: NaN, infinite, negative, or an albedo above 1.
     """
+    way_out = ": clip it after each step" if owner else ""
     if not np.isfinite(value) or value < 0:
-        raise MivolError(f"{name} is {value}; a finite number of at least 0 is expected.")
+        raise MivolError(f"{name}{owner} is {value:.9g}; a finite number of at least 0 is expected{way_out}.")
     if name == "albedo" and value > 1:
-        raise MivolError(f"albedo is {value}; the share of light that is scattered lies in [0, 1].")
+        raise MivolError(f"albedo{owner} is {value:.9g}; the share of light that is scattered lies in [0, 1]{way_out}.")
+
+
+def check_constant(value: float | mi.Float | mi.Color3f, name: str, owner: str) -> None:
+    """Refuse a constant, grey or rgb, that no coefficient can be. Reads it: not while ``dr.freeze`` records.
+
+    Raises:
+        MivolError: as :func:`check_coefficient`.
+    """
+    for number in np.array(dr.detach(value), dtype=np.float64).ravel():
+        check_coefficient(float(number), name, owner)
 
 
 def _is_constant(volume: mi.Volume) -> bool:

@@ -18,6 +18,7 @@ import numpy as np
 from mivol.errors import MivolError
 from mivol.fields.activation import Activation
 from mivol.files import check_volume
+from mivol.scene.coefficients import check_constant
 from mivol.scene.load import check_variant
 from mivol.scene.nesting import Room, bounds, extent, nesting_fault, room_of
 from mivol.transport.direct import UNIFORM
@@ -124,6 +125,7 @@ class Survey:
     scatters: dict = field(default_factory=dict)
     values: dict = field(default_factory=dict)
     places: dict = field(default_factory=dict)
+    numbers: dict = field(default_factory=dict)
 
     @property
     def is_current(self) -> bool:
@@ -411,6 +413,28 @@ def _is_positive(values: mi.TensorXf, survey: Survey, name: str, is_albedo: bool
     return _once(survey, ("albedo",), flat, make) or dr.grad_enabled(values)
 
 
+def check_numbers(view: MediumView, survey: Survey, name: str) -> None:
+    """Look at the constants of an extinction and its scale. Each state of them is read once.
+
+    Raises:
+        MivolError: a number that is NaN, infinite or negative.
+    """
+    for key, given in view.numbers.items():
+        # A copy is kept: what traverse hands out changes in place, and the index of an array that is gone is given to others.
+        value = dr.detach(given)
+        state = _state(value)
+        if survey.numbers.get((view.medium.ptr, key), (None, None))[1] != state:
+            check_constant(value, key, f" of the medium in {name}")
+            survey.numbers[view.medium.ptr, key] = (value, state)
+
+
+def _state(value: float | mi.Float | mi.Color3f) -> float | tuple[int, ...]:
+    """What changes with a number: itself, or the indices of its arrays."""
+    if not dr.is_array_v(value):
+        return value
+    return (value.index,) if dr.depth_v(value) == 1 else tuple(v.index for v in value)
+
+
 def check_light(view: MediumView, survey: Survey, name: str) -> None:
     """Look at what a medium emits. Each array is read once.
 
@@ -447,6 +471,7 @@ def _facts(boundary: Boundary, view: MediumView, survey: Survey, recording: bool
         # What it was when it was last read; a medium that was never read may scatter.
         known = survey.scatters.get(boundary.name, True)
         return MediumFacts(**common, is_scattering=known, occupied=1.0, tau_max=None, unread=True)
+    check_numbers(view, survey, boundary.name)
     check_light(view, survey, boundary.name)
     reads = [read_part(p, survey, boundary.name) for p in view.parts if p.lattice is not None]
     occupied = min((r.occupied for r in reads), default=1.0)

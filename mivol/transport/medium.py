@@ -72,6 +72,7 @@ class MediumView:
         glow: radiance per length that does not go with the extinction, likewise.
         frame: the grid of ``glow``, ``source`` or ``share``, which a sweep follows where the extinction has none.
         lights: the arrays behind ``source`` and ``glow``.
+        numbers: the constants among ``scale`` and the coefficients of the extinction, as ``mi.traverse`` hands them out.
         rooms: the boxes of stock grids of emission and albedo, by the volume's pointer: they repeat their border outside of
             it, where emission is to be 0.
     """
@@ -87,6 +88,7 @@ class MediumView:
     frame: Lattice | None = None
     lights: list = field(default_factory=list)
     rooms: dict[int, Box] = field(default_factory=dict)
+    numbers: dict[str, float | mi.Float | mi.Color3f] = field(default_factory=dict)
 
     def holds(self, volume: mi.Volume, p: mi.Point3f) -> mi.Bool:
         """Whether a point lies in the box of a volume of ``source`` or ``glow`` that does not ask this itself."""
@@ -175,7 +177,8 @@ def view_medium(medium: mi.Medium, boundary: Box | None = None, places: dict | N
     frame = _frame(glow, light, boundary, places)
     rooms = {v.ptr: Box(_place(v, boundary, places)) for v in light if _repeats(v)}
     scale = mi.Float(params["scale"]) if "scale" in params.properties else mi.Float(1)
-    return MediumView(medium, parts, scale, albedo, share, _flakes(medium), source, glow, frame, lights, rooms)
+    numbers = {k.partition(".")[0]: v for k, v in params if k in ("scale", *(f"{n}.value.value" for n in names))}
+    return MediumView(medium, parts, scale, albedo, share, _flakes(medium), source, glow, frame, lights, rooms, numbers)
 
 
 def _flakes(medium: mi.Medium) -> list[mi.Float] | None:
