@@ -163,3 +163,27 @@ def test_constant_that_changes_between_calls():
         replayed = np.array(frozen(scene, integrator, mi.UInt32(0)))
         assert np.array_equal(replayed, np.array(mi.render(scene, integrator=integrator, spp=4, seed=0)))
     assert frozen.n_recordings < 4
+
+
+def test_a_recording_reads_no_numbers(monkeypatch):
+    """What is looked at when a medium is updated, and before an image, is left alone while a function is recorded."""
+    from mivol.plugins import media
+    from mivol.scene import needs
+
+    box = box_of(medium("mivol_medium", 0.5), PLACE)
+    view = camera((2.0, 1.5, 3.0), (0.0, 0.0, 0.0), res=8, fov=45.0)
+    scene = mi.load_dict({"type": "scene", "box": box, "sky": sky(), "sensor": view})
+    integrator, params, read = mi.load_dict({"type": "mivol"}), mi.traverse(scene), []
+    for module in (media, needs):
+        monkeypatch.setattr(module, "check_constant", lambda value, name, owner: read.append(name))
+    monkeypatch.setattr(media.Coefficients, "check_constants", lambda self: read.append("constants"))
+
+    def step(scene: mi.Scene, integrator: mi.Integrator, params: mi.SceneParameters, scale: mi.Float) -> mi.TensorXf:
+        params[SCALE] = scale
+        params.update()
+        return mi.render(scene, params, integrator=integrator, spp=1)
+
+    dr.freeze(step)(scene, integrator, params, dr.opaque(mi.Float, 2.0))
+    assert read == []
+    step(scene, integrator, params, dr.opaque(mi.Float, 3.0))
+    assert read == ["constants", "scale", "scale", "sigma_t"]
