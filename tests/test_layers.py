@@ -11,7 +11,8 @@ import pytest
 PACKAGE = Path(__file__).resolve().parents[1] / "mivol"
 ORDER = [
     *("errors", "threads", "machine", "llvm", "numerics", "space", "files", "photos", "fields", "phase"),
-    *("transport", "tomography", "scene", "plugins", "optim", "validate", "report", "config", "doctor", "cli", "__main__"),
+    *("transport", "tomography", "scene", "plugins", "optim", "validate", "report", "config", "doctor", "experiments"),
+    *("cli", "__main__"),
 ]
 STARTS_THREADS = {"threading", "multiprocessing", "subprocess", "concurrent", "_thread", "asyncio"}
 STARTS_NOTHING = {

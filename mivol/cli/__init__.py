@@ -149,7 +149,7 @@ def explain(arguments: argparse.Namespace) -> None:
 
 def explain_scene(arguments: argparse.Namespace) -> None:
     """Facts, choices, reasons."""
-    from mivol.cli.rendering import load
+    from mivol.cli.loading import load
     from mivol.scene import plan
 
     print(plan.explain(load(arguments).scene, arguments.max_depth))
@@ -169,12 +169,11 @@ def explain_photos(arguments: argparse.Namespace) -> None:
 
 def render(arguments: argparse.Namespace) -> None:
     """Render a scene to an image, with the flags of the command ``mitsuba``."""
-    from mivol.cli import rendering
+    from mivol.cli.loading import load
+    from mivol.experiments.render import render_image, write_image
 
-    loaded = rendering.load(arguments)
     path = arguments.output or arguments.scene.with_suffix(".exr")
-    image, names = rendering.render(loaded.scene, arguments.sensor)
-    rendering.write(path, image, names)
+    write_image(path, *render_image(load(arguments).scene, arguments.sensor))
     print(path)
 
 
@@ -183,7 +182,7 @@ def reference(arguments: argparse.Namespace) -> None:
 
     Of all sensors (-s all) with a file of cameras beside them: photographs that a radiance field is fitted to.
     """
-    from mivol.cli.rendering import load
+    from mivol.cli.loading import load
     from mivol.validate.photographs import photograph
     from mivol.validate.reference import render_reference
 
@@ -203,16 +202,13 @@ def reference(arguments: argparse.Namespace) -> None:
 def optimize(arguments: argparse.Namespace) -> None:
     """Reconstruct a volume from its views; everything that comes of it lies in the run folder."""
     from mivol import config
-    from mivol.cli import experiment, field, scan
-    from mivol.optim import checkpoint
+    from mivol.cli.progress import Terminal
+    from mivol.experiments.runs import run_experiment
+    from mivol.experiments.task import Task
 
     chosen = config.load(arguments.experiment, arguments.set)
     folder = arguments.output or Path(chosen.output)
-    if arguments.resume:
-        checkpoint.check_settings(folder / experiment.CHECKPOINT, config.flat(config.resolved(chosen)))
-    kind = {config.Experiment: experiment, config.Scan: scan, config.FieldFit: field}[type(chosen)]
-    page = kind.run(chosen, arguments.experiment.parent, folder, resume=arguments.resume)
-    print(page)
+    print(run_experiment(Task(chosen, arguments.experiment.parent, folder, arguments.resume, Terminal())))
 
 
 def report(arguments: argparse.Namespace) -> None:
@@ -224,7 +220,7 @@ def report(arguments: argparse.Namespace) -> None:
 
 def export(arguments: argparse.Namespace) -> None:
     """Write a radiance field as a mesh, as volumes, or for another program."""
-    from mivol.cli.rendering import set_variant
+    from mivol.experiments.back_end import set_variant
     from mivol.fields.export import export_field
     from mivol.fields.spherical import load_field
 

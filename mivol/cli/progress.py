@@ -1,6 +1,6 @@
-"""How a fit is going, on the terminal: loss, error, time left.
+"""How a run goes, on the terminal: what it says, how far it is, loss, errors, time left.
 
-Conventions. Drawn from the fit's own thread between iterations; where the error output is no terminal, one line per
+Conventions. Drawn from the run's own thread between iterations; where the error output is no terminal, one line per
 evaluation. What a fit logs (a refined grid, noise in its loss) is printed as it comes.
 """
 
@@ -19,38 +19,42 @@ from mivol.report.record import QUANTITIES, Quantity
 T = TypeVar("T")
 
 
+class Terminal:
+    """A :class:`mivol.experiments.task.Watcher` that prints to the error output."""
+
+    def say(self, lines: Sequence[str]) -> None:
+        """Print lines."""
+        console = Console(stderr=True)
+        for line in lines:
+            console.print(line, soft_wrap=True, highlight=False, markup=False)
+
+    def track(self, items: Sequence[T], what: str) -> Iterator[T]:
+        """The items, with a bar of how many are done; one line at the end where there is no terminal."""
+        console, start = Console(stderr=True), time.monotonic()
+        columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
+        with Progress(*columns, console=console, auto_refresh=False, disable=not console.is_terminal) as bar:
+            task = bar.add_task(what, total=len(items))
+            for item in items:
+                bar.refresh()
+                yield item
+                bar.advance(task)
+            bar.refresh()
+        if not console.is_terminal:
+            console.print(f"{what}: {len(items)} in {time.monotonic() - start:.1f} s", soft_wrap=True)
+
+    def watch(self, iterations: int) -> Display:
+        """A bar of the iterations, with the newest loss and errors."""
+        return Display(iterations)
+
+
 def figures(fit: Fit) -> str:
     """The newest loss and errors, in words."""
-    errors = fit.measures[-1] if fit.measures else {}
-    known = {name: value for name, value in errors.items() if name not in ("iteration", "seconds")}
-    words = [f"{QUANTITIES.get(name, Quantity(name)).label} {value:.4g}" for name, value in known.items()]
+    words = [f"{QUANTITIES.get(name, Quantity(name)).label} {value:.4g}" for name, value in fit.newest_errors().items()]
     return ", ".join([f"loss {fit.history[-1]['loss']:.4g}", *words])
 
 
-def tracked(items: Sequence[T], what: str) -> Iterator[T]:
-    """The items, with a bar of how many are done; one line at the end where there is no terminal."""
-    console, start = Console(stderr=True), time.monotonic()
-    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
-    with Progress(*columns, console=console, auto_refresh=False, disable=not console.is_terminal) as bar:
-        task = bar.add_task(what, total=len(items))
-        for item in items:
-            bar.refresh()
-            yield item
-            bar.advance(task)
-        bar.refresh()
-    if not console.is_terminal:
-        console.print(f"{what}: {len(items)} in {time.monotonic() - start:.1f} s", soft_wrap=True)
-
-
-def say(lines: Sequence[str]) -> None:
-    """Print lines where progress is shown."""
-    console = Console(stderr=True)
-    for line in lines:
-        console.print(line, soft_wrap=True, highlight=False, markup=False)
-
-
 class Display:
-    """Context manager; called after each iteration. ``begun`` once it has been."""
+    """Context manager; called after each iteration."""
 
     def __init__(self, iterations: int) -> None:
         self.console = Console(stderr=True)
@@ -60,7 +64,6 @@ class Display:
         self.said = 0
         self.logged = 0
         self.drawn = 0.0
-        self.begun = False
 
     def __enter__(self) -> Display:
         self.bar.start()
@@ -73,7 +76,6 @@ class Display:
 
     def __call__(self, fit: Fit) -> None:
         """Draw, at most ten times a second; what the fit has to say is printed above."""
-        self.begun = True
         for line in fit.log[self.logged :]:
             self.console.print(line, soft_wrap=True, highlight=False, markup=False)
         self.logged = len(fit.log)

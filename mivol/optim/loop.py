@@ -74,6 +74,11 @@ class Fit:
         self.problem.set(self.run.reals)
         self.measures.append({"iteration": self.next, "seconds": self.seconds, **self.measure(self.problem)})
 
+    def newest_errors(self) -> dict[str, float]:
+        """What was measured last, without when; none before the first evaluation."""
+        newest = self.measures[-1] if self.measures else {}
+        return {name: value for name, value in newest.items() if name not in ("iteration", "seconds")}
+
     def save(self) -> None:
         """Write the checkpoint, where there is a place for one."""
         if self.path is None:

@@ -17,8 +17,9 @@ import pytest
 from fit_scene import KEY
 
 from mivol.cli import VERBS, main
-from mivol.cli.experiment import make_start
 from mivol.config import Sought
+from mivol.experiments import render
+from mivol.experiments.start import make_start
 from mivol.fields.procedural import PROCEDURAL, make_procedural
 from mivol.files import atomic, read_exr, read_volume, write_exr, write_volume
 from mivol.optim.problem import Problem
@@ -117,12 +118,10 @@ def test_render_as_png_and_elsewhere(variant_rgb, folder: Path) -> None:
 
 def test_render_in_passes_is_the_mean(variant_rgb, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Three passes of 3 samples: interior pixels differ from one pass of 9 only by where samples fall, 4 % of tau."""
-    from mivol.cli import rendering
-
     scene = mi.load_file(str(folder / "scene.xml"), spp=9)
-    once, names = rendering.render(scene, 0)
-    monkeypatch.setattr(rendering, "SAMPLES_PER_PASS", 3 * 48)
-    split, _ = rendering.render(scene, 0)
+    once, names = render.render_image(scene, 0)
+    monkeypatch.setattr(render, "SAMPLES_PER_PASS", 3 * 48)
+    split, _ = render.render_image(scene, 0)
     assert names == ["R", "G", "B", "tau"]
     assert np.isclose(split[3, 4, 0], once[3, 4, 0], rtol=0.02)
     assert not np.array_equal(split, once)

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from mivol import config
-from mivol.cli import main, scan
+from mivol.cli import main
 from mivol.errors import MivolError
+from mivol.experiments import projections, scan_fit
 from mivol.files import read_volume, write_volume
 
 SCAN = """title = "tiny head"
@@ -67,7 +68,7 @@ def test_every_solver_is_reached_by_name(variant_rgb, folder: Path, solver: str)
 def test_an_interrupted_scan_is_resumed(variant_rgb, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Ctrl-C after the third iteration, then --resume: every number as if it had not stopped (one thread)."""
     assert run(folder, to="whole") == 0
-    write = scan.write_metrics
+    write = scan_fit.write_metrics
 
     def stop(*arguments: object) -> None:
         write(*arguments)
@@ -75,12 +76,12 @@ def test_an_interrupted_scan_is_resumed(variant_rgb, folder: Path, monkeypatch: 
             raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(scan, "write_metrics", stop)
+        patch.setattr(scan_fit, "write_metrics", stop)
         assert run(folder, to="cut") == 130
     assert json.loads((folder / "cut" / "run.json").read_text())["status"] == "stopped"
     continued = []
     with monkeypatch.context() as patch:
-        patch.setattr(scan, "write_metrics", lambda *a: (continued.append(a[3].iteration), write(*a)))
+        patch.setattr(scan_fit, "write_metrics", lambda *a: (continued.append(a[3].iteration), write(*a)))
         assert run(folder, "--resume", to="cut") == 0
     assert continued == [4, 5, 6]
     values = [[(row["iteration"], row["loss"], row["nrmse"]) for row in rows_of(folder, to)] for to in ("whole", "cut")]
@@ -92,12 +93,12 @@ def test_an_interrupted_scan_is_resumed(variant_rgb, folder: Path, monkeypatch: 
 def test_noise_has_the_variance_that_its_weight_claims(variant_rgb, folder: Path) -> None:
     """z = (y - exact) sqrt(counts) has mean square 1 + O(1/counts); 3528 pixels know it to sqrt(2 / 3528) = 2.4 %."""
     chosen = config.load(folder / "fit.toml", ["data.photons=2e3"])
-    grid = scan.VoxelGrid(chosen.grid.shape, chosen.grid.voxel_size)
-    noisy = scan.make_data(chosen, folder, grid)
-    exact = scan.make_data(config.load(folder / "fit.toml"), folder, grid)
+    grid = projections.VoxelGrid(chosen.grid.shape, chosen.grid.voxel_size)
+    noisy = projections.make_data(chosen, folder, grid)
+    exact = projections.make_data(config.load(folder / "fit.toml"), folder, grid)
     z = (noisy.y - exact.y) * np.sqrt(noisy.weights)
     assert abs(np.mean(z**2) - 1) < 5 * np.sqrt(2 / z.size)
-    dark = scan.add_noise(noisy.geometry, np.full(noisy.y.shape, 50.0), exact.truth, 10.0, 0)
+    dark = projections.add_noise(noisy.geometry, np.full(noisy.y.shape, 50.0), exact.truth, 10.0, 0)
     assert np.all(dark.weights == 0)
     assert np.all(dark.y == 0)
 
@@ -106,10 +107,10 @@ def test_a_known_volume_is_projected_by_the_projector(variant_rgb, folder: Path)
     values = np.random.default_rng(0).uniform(0, 1, (12, 12, 12, 1)).astype("f")
     write_volume(folder / "v.npz", values)
     chosen = config.load(folder / "fit.toml", ['data={source="volume", file="v.npz", scale=2.0}'])
-    grid = scan.VoxelGrid(chosen.grid.shape, chosen.grid.voxel_size)
-    data = scan.make_data(chosen, folder, grid)
+    grid = projections.VoxelGrid(chosen.grid.shape, chosen.grid.voxel_size)
+    data = projections.make_data(chosen, folder, grid)
     assert np.array_equal(data.truth, 2 * values[..., 0])
-    assert np.allclose(data.y, scan.Projector(data.geometry, grid) @ (2 * values[..., 0]))
+    assert np.allclose(data.y, projections.Projector(data.geometry, grid) @ (2 * values[..., 0]))
 
 
 REFUSED = {

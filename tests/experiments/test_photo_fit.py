@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 
 from mivol import config
-from mivol.cli import field, main
+from mivol.cli import main
 from mivol.errors import MivolError
+from mivol.experiments import photo_data, photo_fit, photo_outputs, photo_plan
 from mivol.fields.spherical import SphericalGrid, load_field
 from mivol.files import read_exr, write_exr, write_png
 from mivol.optim.radiance_fit import PRESETS, Stage, render_view
@@ -105,7 +106,7 @@ def test_photographs_become_a_field_and_a_page(photographs: Path, tmp_path: Path
     for text in ("data:video/mp4;base64,", "distance of the first judged view", "What it takes", "view_3.png"):
         assert text in page
     rows = [json.loads(line) for line in (tmp_path / "run/metrics.jsonl").read_text().splitlines()]
-    assert rows[-1]["iteration"] == record["results"]["iterations"] == field.make_plan(config.load(path)).steps
+    assert rows[-1]["iteration"] == record["results"]["iterations"] == photo_plan.make_plan(config.load(path)).steps
     assert all({"loss", "held_out_psnr"} <= row.keys() for row in rows)
 
 
@@ -124,18 +125,18 @@ def test_what_is_behind_is_learned(photographs: Path, tmp_path: Path) -> None:
 def test_a_stopped_fit_goes_on(photographs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Ctrl-C in the middle keeps what was done; the resumed fit ends with all steps, and says nothing twice."""
     path = toml(tmp_path, photographs)
-    whole = field.RadianceFit.advance
+    whole = photo_fit.RadianceFit.advance
 
-    def stops(fit: field.RadianceFit) -> object:
+    def stops(fit: photo_fit.RadianceFit) -> object:
         if fit.step == 45:
             raise KeyboardInterrupt
         return whole(fit)
 
-    monkeypatch.setattr(field.RadianceFit, "advance", stops)
+    monkeypatch.setattr(photo_fit.RadianceFit, "advance", stops)
     assert main(["optimize", str(path), "-o", str(tmp_path / "run")]) == 130
-    monkeypatch.setattr(field.RadianceFit, "advance", whole)
+    monkeypatch.setattr(photo_fit.RadianceFit, "advance", whole)
     started = []
-    monkeypatch.setattr(field.RadianceFit, "advance", lambda fit: started.append(fit.step) or whole(fit))
+    monkeypatch.setattr(photo_fit.RadianceFit, "advance", lambda fit: started.append(fit.step) or whole(fit))
     assert main(["optimize", str(path), "-o", str(tmp_path / "run"), "--resume"]) == 0
     assert started[0] == 45
     rows = [json.loads(line)["iteration"] for line in (tmp_path / "run/metrics.jsonl").read_text().splitlines()]
@@ -145,12 +146,12 @@ def test_a_stopped_fit_goes_on(photographs: Path, tmp_path: Path, monkeypatch: p
 
 def test_what_the_file_says_overrides_the_preset(tmp_path: Path) -> None:
     raw = {"title": "x", "photos": {"path": "p"}}
-    assert field.make_plan(config.from_dict(raw)) == PRESETS["cpu"]
+    assert photo_plan.make_plan(config.from_dict(raw)) == PRESETS["cpu"]
     raw["field"] = {"preset": "cpu", "longest": 40, "degree": 1, "effort": 0.5, "tv_sh": 1e-3}
-    plan = field.make_plan(config.from_dict(raw))
+    plan = photo_plan.make_plan(config.from_dict(raw))
     assert [stage.longest for stage in plan.stages] == [32, 40]
     raw["field"]["longest"] = 200
-    assert [stage.longest for stage in field.make_plan(config.from_dict(raw)).stages] == [32, 64, 128, 200]
+    assert [stage.longest for stage in photo_plan.make_plan(config.from_dict(raw)).stages] == [32, 64, 128, 200]
     assert plan.stages[0].steps == round(PRESETS["cpu"].stages[0].steps / 2)
     assert (plan.degree, plan.tv_sh, plan.tv_density) == (1, 1e-3, PRESETS["cpu"].tv_density)
 
@@ -162,8 +163,8 @@ def test_what_was_done_to_linear_photographs_is_said(photographs: Path, tmp_path
         write_exr(tmp_path / frame["file_path"], {name: np.full((SIZE, SIZE), 2.0, np.float32) for name in "RGB"})
     said = []
     for folder in (photographs, tmp_path):
-        photos, _ = field.read_photos(config.load(toml(tmp_path, folder)), tmp_path)
-        said.append(" ".join(field.notes(photos)))
+        photos, _ = photo_data.read_photos(config.load(toml(tmp_path, folder)), tmp_path)
+        said.append(" ".join(photo_data.notes(photos)))
     assert ["OpenEXR" in note for note in said] == [False, True]
     assert all("srgb code values" in note for note in said)
 
@@ -171,14 +172,14 @@ def test_what_was_done_to_linear_photographs_is_said(photographs: Path, tmp_path
 def test_what_is_taken_to_be_behind_is_said(photographs: Path, tmp_path: Path) -> None:
     """The ball fills the middle of each view: its edges are white, whatever colour the file says is behind it."""
     chosen = config.load(toml(tmp_path, photographs), ["photos.behind=[0, 0.5, 0]"])
-    photos, _ = field.read_photos(chosen, tmp_path)
-    plan = field.make_plan(chosen)
-    said = field.what_is_behind(plan, photos)
+    photos, _ = photo_data.read_photos(chosen, tmp_path)
+    plan = photo_plan.make_plan(chosen)
+    said = photo_plan.what_is_behind(plan, photos)
     assert said.choice == "the colour (0, 0.5, 0) behind the box"
     assert "edges of the photographs show (1, 1, 1) mostly" in said.reason
-    assert "sky of 8 rows" in field.what_is_behind(replace(plan, sky=8), photos).choice
+    assert "sky of 8 rows" in photo_plan.what_is_behind(replace(plan, sky=8), photos).choice
     clear = replace(photos, views=tuple(replace(v, alpha=np.ones((SIZE, SIZE))) for v in photos.views))
-    assert "alpha" in field.what_is_behind(plan, clear).reason
+    assert "alpha" in photo_plan.what_is_behind(plan, clear).reason
 
 
 def test_photographs_are_shrunk_to_half_a_voxel(photographs: Path, tmp_path: Path) -> None:
@@ -187,9 +188,9 @@ def test_photographs_are_shrunk_to_half_a_voxel(photographs: Path, tmp_path: Pat
     Of 48 pixels at least 16 stay, so 4 becomes 2.
     """
     chosen = config.load(toml(tmp_path, photographs))
-    photos, _ = field.read_photos(chosen, tmp_path)
-    plan = field.Plan((Stage(4, 1), Stage(8, 1), Stage(16, 1, shrink=4)))
-    assert [stage.shrink for stage in field.shrunk(plan, photos).stages] == [2, 2, 1]
+    photos, _ = photo_data.read_photos(chosen, tmp_path)
+    plan = photo_plan.Plan((Stage(4, 1), Stage(8, 1), Stage(16, 1, shrink=4)))
+    assert [stage.shrink for stage in photo_plan.shrunk(plan, photos).stages] == [2, 2, 1]
 
 
 def test_cameras_side_by_side_look_at_the_box_that_is_given(photographs: Path, tmp_path: Path) -> None:
@@ -203,28 +204,28 @@ def test_cameras_side_by_side_look_at_the_box_that_is_given(photographs: Path, t
         frame["file_path"] = str(photographs / frame["file_path"])
     (tmp_path / "transforms.json").write_text(json.dumps(table | {"train_filenames": [], "test_filenames": []}))
     path = toml(tmp_path, tmp_path)
-    photos, _ = field.read_photos(config.load(path, ["photos.judged=held_out"]), tmp_path)
+    photos, _ = photo_data.read_photos(config.load(path, ["photos.judged=held_out"]), tmp_path)
     np.testing.assert_array_equal(photos.box, [[-1, -1, -1], [1, 1, 1]])
     for box, said in (("cameras", "look in one direction"), ([[90, 90, 90], [91, 91, 91]], "looking away from the box")):
         with pytest.raises(MivolError, match=said):
-            field.read_photos(config.load(path, ["photos.judged=held_out", f"photos.box={json.dumps(box)}"]), tmp_path)
+            photo_data.read_photos(config.load(path, ["photos.judged=held_out", f"photos.box={json.dumps(box)}"]), tmp_path)
 
 
 def test_each_look_is_at_another_view(photographs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Looks at steps 20, 40, 60, ... of two views: one after the other, by all metrics that are asked for."""
     chosen, names = config.load(toml(tmp_path, photographs), ['show.metrics=["psnr", "ssim"]']), []
-    _, judged = field.read_photos(chosen, tmp_path)
+    _, judged = photo_data.read_photos(chosen, tmp_path)
     mask = np.zeros((SIZE, SIZE), bool)
     mask[:, :7] = True
     kept = replace(judged, views=tuple(replace(view, mask=mask) for view in judged.views))
     nothing = SphericalGrid.from_dense(np.zeros((2, 2, 2)), np.zeros((2, 2, 2, 1, 3)), np.eye(4))
     fit = SimpleNamespace(field=nothing, sky=None)
-    monkeypatch.setattr(field, "judge", lambda *images, **asked: names.append(asked["name"]) or judge(*images, **asked))
+    monkeypatch.setattr(photo_outputs, "judge", lambda *images, **asked: names.append(asked["name"]) or judge(*images, **asked))
     for fit.step in (20, 40, 60):
-        found = field.look(chosen, fit, kept)
+        found = photo_fit.look(chosen, fit, kept)
         assert found.keys() == {"held_out_psnr", "ssim"}
         # The columns that count show nothing but what is behind.
-        assert found["held_out_psnr"] == np.inf > field.look(chosen, fit, judged)["held_out_psnr"]
+        assert found["held_out_psnr"] == np.inf > photo_fit.look(chosen, fit, judged)["held_out_psnr"]
     assert names[::2] == ["view_8.png", "view_3.png", "view_8.png"]
 
 
@@ -262,6 +263,6 @@ def test_refusals(photographs: Path, tmp_path: Path, capsys: pytest.CaptureFixtu
 
 def test_a_box_of_silhouettes_needs_alpha(photographs: Path, tmp_path: Path) -> None:
     chosen = config.load(toml(tmp_path, photographs), ["photos.box=silhouettes"])
-    photos, _ = field.read_photos(chosen, tmp_path)
+    photos, _ = photo_data.read_photos(chosen, tmp_path)
     with pytest.raises(MivolError, match="alpha"):
-        field.boxed(chosen, photos)
+        photo_data.boxed(chosen, photos)

@@ -1,0 +1,48 @@
+"""The Mitsuba variant and the threads that a run works with."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from mivol.errors import MivolError
+from mivol.scene.load import check_variant
+from mivol.threads import check_one_thread
+
+
+def choose_back_end(variant: str, threads: int = 0) -> None:
+    """Activate a variant, with so many threads of the CPU back end; 0 leaves Dr.Jit's choice.
+
+    Raises:
+        MivolError: this Mitsuba has no such variant, there is no GPU for it, mivol does not work in it; a negative number of
+            threads; or another thread of this process uses Dr.Jit.
+    """
+    check_one_thread()
+    set_variant(variant)
+    set_threads(threads)
+
+
+def set_variant(name: str) -> None:
+    """Activate a variant.
+
+    Raises:
+        MivolError: this Mitsuba has none of that name, there is no GPU for it, or mivol does not work in it.
+    """
+    if name not in mi.variants():
+        raise MivolError(f'Mitsuba has no variant "{name}": choose among {", ".join(mi.variants())}.')
+    if name.startswith("cuda") and not dr.has_backend(dr.JitBackend.CUDA):
+        raise MivolError(f'the variant "{name}" needs an NVIDIA GPU and its driver, and none was found: choose llvm_ad_rgb.')
+    mi.set_variant(name)
+    check_variant()
+
+
+def set_threads(count: int) -> None:
+    """Threads of the CPU back end; 0 leaves Dr.Jit's choice.
+
+    Raises:
+        MivolError: a negative number.
+    """
+    if count < 0:
+        raise MivolError(f"found {count} threads, expected 0 (all cores) or more: correct -t.")
+    if count:
+        dr.set_thread_count(count)

@@ -1,0 +1,167 @@
+"""What a fit of photographs leaves in its folder: the field, judged views, distance and normals, a film, curves, results."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mivol.config import FieldFit
+from mivol.experiments.run_folder import RunFolder
+from mivol.experiments.task import Task
+from mivol.fields.sky import Sky
+from mivol.fields.spherical import SphericalGrid, save_field
+from mivol.files import write_exr, write_png, write_volume
+from mivol.optim.radiance_fit import RadianceFit, Seen, render_view
+from mivol.photos import Camera, Photo, Photos, turntable
+from mivol.photos.picture import decode_srgb
+from mivol.report.depth import depth_pixels, normal_pixels, normals_of_depth
+from mivol.report.record import Image, Table, Volume
+from mivol.report.video import write_video
+from mivol.validate.images import Quality, judge, score
+
+FILM_SIZE = 256
+"""Longest edge of a film [pixel]."""
+
+
+@dataclass(frozen=True)
+class PhotoOutputs:
+    """What is written of a fit of photographs.
+
+    Attributes:
+        task: the experiment.
+        run: where it is written, and the record that lists it.
+        fit: the fit, done.
+        photos: what was fitted.
+        judged: what it is judged by; None for nothing.
+    """
+
+    task: Task
+    run: RunFolder
+    fit: RadianceFit
+    photos: Photos
+    judged: Photos | None
+
+    def write(self) -> None:
+        """Write all, and put it and the results on record."""
+        folder, record, field = self.run.path, self.run.record, self.fit.field
+        self.run.make("views", "volumes", "film")
+        save_field(folder / "field.npz", field)
+        if self.fit.sky is not None:
+            write_exr(folder / "sky.exr", {"": self.fit.sky.image()})
+        record.tables = [storage(field, folder / "field.npz")]
+        record.volumes.append(write_density(folder, field))
+        record.results = {
+            "views": float(len(self.photos.views)),
+            "iterations": float(self.fit.step),
+            "nodes": float(field.rows - (field.nodes is not None)),
+            "bytes": field.bytes / 2**20,
+        }
+        if self.judged is not None:
+            record.results |= self.write_judged()
+        if self.task.chosen.show.frames:
+            record.images.append(self.write_film())
+        self.run.write_curves()
+
+    def write_judged(self) -> dict[str, float]:
+        """Judge all views, and keep some of them beside their photographs, with distance and normals of the first."""
+        chosen: FieldFit = self.task.chosen
+        views, found, images = self.judged.views, [], self.run.record.images
+        shown = set(np.linspace(0, len(views) - 1, min(chosen.show.views, len(views))).astype(int).tolist())
+        for number, photo in enumerate(views):
+            seen, quality = compare(chosen, self.fit, self.judged, photo)
+            found.append(quality)
+            if number in shown:
+                images += write_view(self.run.path, photo, number, seen.image)
+            if number == 0:
+                images += write_geometry(self.run.path, seen, photo.camera, self.judged.near_far)
+        return named(score(found).values)
+
+    def write_film(self) -> Image:
+        """A camera path around the box."""
+        cameras, count = [view.camera for view in self.photos.views], self.task.chosen.show.frames
+        path = "film/turntable.mp4"
+        background = behind(self.fit, self.photos.views[0])
+
+        def frames() -> Iterator[NDArray[np.uint8]]:
+            for camera in self.task.watcher.track(turntable(cameras, self.fit.box, count), "frames"):
+                seen = render_view(self.fit.field, _small(camera), background)
+                yield np.round(np.clip(seen.image, 0, 1) * 255).astype(np.uint8)
+
+        write_video(self.run.path / path, frames(), fps=count / 4)
+        return Image(path=path, role="film", caption=f"{count} views around the box")
+
+
+def compare(chosen: FieldFit, fit: RadianceFit, judged: Photos, photo: Photo) -> tuple[Seen, Quality]:
+    """A photograph's view of the field, and how alike they are."""
+    seen = render_view(fit.field, photo.camera, behind(fit, photo))
+    asked = {"space": judged.space, "mask": photo.mask, "metrics": chosen.show.metrics, "name": photo.name}
+    return seen, judge(seen.image, photo.image, **asked)
+
+
+def named(values: dict[str, float]) -> dict[str, float]:
+    """Metrics by the names of :data:`mivol.report.record.QUANTITIES`."""
+    return {("held_out_psnr" if name == "psnr" else name): value for name, value in values.items()}
+
+
+def behind(fit: RadianceFit, photo: Photo) -> NDArray | Sky:
+    """What a photograph shows where nothing is."""
+    return photo.background if fit.sky is None else fit.sky
+
+
+def storage(field: SphericalGrid, path: Path) -> Table:
+    """What the field takes, beside grids of the same box that keep every node."""
+    nodes, kept = math.prod(field.res), len(field.listed())
+    kinds = {
+        "every node: r, g, b and density of 8 bits": 4 * nodes,
+        "every node: four numbers": 16 * nodes,
+        f"every node: harmonics of degree {field.degree}": 4 * nodes * (1 + field.width),
+        "this field, in memory": field.bytes,
+        "this field, its file": path.stat().st_size,
+    }
+    rows = [(name, f"{size / 2**20:.2f} MiB", f"{size / nodes:.3g}") for name, size in kinds.items()]
+    head = (f"{kept} of {nodes} nodes are kept ({kept / nodes:.1%})", "in all", "bytes a node of the box")
+    return Table(title="What it takes", head=head, rows=tuple(rows))
+
+
+def write_density(folder: Path, field: SphericalGrid) -> Volume:
+    """The extinction at the nodes, as a grid that other programs read."""
+    raw, _ = field.to_dense()
+    sigma = np.array(field.act.value_and_slope(type(field.density)(raw.ravel()))[0]).reshape(*field.res, 1)
+    write_volume(folder / "volumes/density.vol", sigma, field.to_world)
+    write_volume(folder / "volumes/density.npz", sigma, field.to_world)
+    size = tuple(float(edge) for edge in np.abs(np.diag(field.to_world)[:3]))
+    return Volume(path="volumes/density.npz", role="reconstruction", size=size)
+
+
+def write_view(folder: Path, photo: Photo, number: int, image: NDArray) -> list[Image]:
+    """A render beside its photograph."""
+    written = []
+    for role, values in {"render": image, "reference": photo.image}.items():
+        path = f"views/{number:03d}_{role}.png"
+        write_png(folder / path, decode_srgb(np.clip(values, 0, 1)))
+        written.append(Image(path=path, role=role, view=photo.name, held_out=True, quantity="sRGB value"))
+    return written
+
+
+def write_geometry(folder: Path, seen: Seen, camera: Camera, near_far: tuple[float, float]) -> list[Image]:
+    """Distance and normals of a view as colours."""
+    pictures = {
+        "distance": depth_pixels(seen.depth, near_far, seen.opacity),
+        "normals": normal_pixels(normals_of_depth(seen.depth, camera), seen.opacity),
+    }
+    written = []
+    for name, pixels in pictures.items():
+        write_png(folder / f"views/{name}.png", decode_srgb(pixels / 255))
+        written.append(Image(path=f"views/{name}.png", role="picture", caption=f"{name} of the first judged view"))
+    return written
+
+
+def _small(camera: Camera) -> Camera:
+    """A camera with at most the pixels of a film."""
+    scale = min(1.0, FILM_SIZE / max(camera.size))
+    return camera.resized(tuple(max(1, round(edge * scale)) for edge in camera.size))

@@ -1,0 +1,83 @@
+"""How photographs will be fitted: the plan of a preset with what the file says otherwise, and its reasons."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from mivol.config import FieldFit
+from mivol.errors import MivolError
+from mivol.optim.radiance_fit import PRESETS, Plan, memory_of
+from mivol.optim.radiance_views import Views
+from mivol.optim.strategy import nearest
+from mivol.photos import Photos
+from mivol.report.record import Choice
+
+SMALLEST = 16
+"""Shortest edge of a photograph that was made smaller [pixel]."""
+
+
+def make_plan(chosen: FieldFit) -> Plan:
+    """The preset with what the file says otherwise.
+
+    Raises:
+        MivolError: an unknown preset.
+    """
+    wanted = chosen.field
+    if wanted.preset not in PRESETS:
+        raise MivolError(f'field.preset = "{wanted.preset}" is unknown: {nearest(wanted.preset, list(PRESETS))}')
+    plan = PRESETS[wanted.preset]
+    names = ("degree", "first_degree", "tv_density", "tv_sh", "sparsity", "matte", "sky", "beta")
+    given = {name: getattr(wanted, name) for name in names}
+    plan = replace(plan, **{name: value for name, value in given.items() if value is not None})
+    stages = [replace(stage, steps=max(1, round(stage.steps * wanted.effort))) for stage in plan.stages]
+    plan = replace(plan, stages=tuple(stages))
+    return plan if wanted.longest is None else plan.up_to(wanted.longest)
+
+
+def shrunk(plan: Plan, photos: Photos) -> Plan:
+    """The plan with photographs as small as its grids can tell: pixels of half a voxel, at the middle of the box."""
+    cameras, box = [view.camera for view in photos.views], photos.box
+    pixel = np.median([np.linalg.norm(camera.origin - box.mean(axis=0)) / camera.K[0, 0] for camera in cameras])
+    least = min(min(camera.size) for camera in cameras)
+    stages = []
+    for one in plan.stages:
+        voxel = (box[1] - box[0]).max() / one.longest
+        finest = max(1.0, min(0.5 * voxel / pixel, least / SMALLEST))
+        stages.append(replace(one, shrink=2 ** int(np.log2(finest))))
+    return replace(plan, stages=tuple(stages))
+
+
+def choices(plan: Plan, photos: Photos, views: Views) -> list[Choice]:
+    """What will be done, and why."""
+    box = photos.box
+    resolutions = ", ".join(str(stage.longest) for stage in plan.stages)
+    size = " x ".join(f"{edge:.4g}" for edge in box[1] - box[0])
+    return [
+        Choice(choice=f"{len(photos.views)} photographs, a box of {size}", reason=photos.survey.box_from),
+        Choice(choice=f"grids of {resolutions} nodes along the longest edge", reason="coarse first, to find what is empty"),
+        Choice(
+            choice=f"photographs shrunk by {', '.join(str(stage.shrink) for stage in plan.stages)}",
+            reason="a pixel of half a voxel says as much as four smaller ones",
+        ),
+        Choice(choice=f"harmonics of degree {plan.degree}", reason=f"{(plan.degree + 1) ** 2} numbers a colour and node"),
+        what_is_behind(plan, photos),
+        Choice(choice=f"rays end at a transmittance of {plan.stop:g}", reason="what is left out is at most that share"),
+        Choice(choice=memory_of(plan, box, views), reason="counted before it is taken"),
+    ]
+
+
+def what_is_behind(plan: Plan, photos: Photos) -> Choice:
+    """What rays see that pass the box; where a colour is only believed, the one that the photographs' edges show is told."""
+    if plan.sky:
+        return Choice(choice=f"a sky of {plan.sky} rows behind the box", reason="field.sky; it is learned with the field")
+    if photos.views[0].alpha is not None:
+        return Choice(choice="nothing behind the box", reason="alpha says what is there")
+    edges = [view.image[at] for view in photos.views for at in (0, -1, (slice(None), 0), (slice(None), -1))]
+    most, believed = (
+        "(" + ", ".join(f"{c:.2g}" for c in colour) + ")"
+        for colour in (np.median(np.concatenate(edges), axis=0), photos.views[0].background)
+    )
+    reason = f"photos.behind; the edges of the photographs show {most} mostly, and field.sky would learn it"
+    return Choice(choice=f"the colour {believed} behind the box", reason=reason)

@@ -1,0 +1,136 @@
+"""What was seen from each view of a scene: rendered by Mitsuba's path tracer, or read from files."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+
+from mivol.config import Experiment, Files
+from mivol.errors import MivolError
+from mivol.experiments.task import Task
+from mivol.experiments.truth import holding
+from mivol.files import layers, read_exr
+from mivol.optim.shots import View, check_sizes
+from mivol.scene.load import LoadedScene, load_scene
+from mivol.validate.reference import ReferenceResult, read_reference, render_reference
+
+
+@dataclass
+class References:
+    """What was seen of a scene.
+
+    Attributes:
+        held_out_numbers: of the views that the fit does not see.
+        fitted: views that the fit sees.
+        held_out: views that it does not.
+        standard_errors: of the references, by view, where known.
+    """
+
+    held_out_numbers: frozenset[int]
+    fitted: list[View] = field(default_factory=list)
+    held_out: list[View] = field(default_factory=list)
+    standard_errors: dict[str, np.ndarray] = field(default_factory=dict)
+
+    def add(self, sensor: dict | mi.Sensor, mean: np.ndarray, error: np.ndarray | None = None) -> None:
+        """Sort the next view in."""
+        index = len(self.fitted) + len(self.held_out)
+        view = View(f"view {index}", camera_of(sensor), mi.TensorXf(np.ascontiguousarray(mean, dtype=np.float32)))
+        (self.held_out if index in self.held_out_numbers else self.fitted).append(view)
+        if error is not None:
+            self.standard_errors[view.name] = error
+
+    def digest(self) -> str:
+        """SHA-256 of all references."""
+        h = hashlib.sha256()
+        for view in (*self.fitted, *self.held_out):
+            h.update(np.ascontiguousarray(view.reference).tobytes())
+        return h.hexdigest()
+
+
+def find_references(task: Task, loaded: LoadedScene, truth: np.ndarray | None) -> References:
+    """What was seen from each view, with the truth in the scene where there is one.
+
+    Raises:
+        MivolError: no views, held-out views that are not there, files that do not fit.
+    """
+    chosen: Experiment = task.chosen
+    sensors = list(chosen.views.sensors(loaded.scene))
+    more = list(chosen.held_out.sensors(loaded.scene)) if chosen.held_out is not None else []
+    check_held_out(chosen.reference.held_out, len(sensors))
+    held_out = (*chosen.reference.held_out, *range(len(sensors), len(sensors) + len(more)))
+    sensors += more
+    check_sizes({f"view {index}": camera_of(sensor) for index, sensor in enumerate(sensors)})
+    seen = References(frozenset(held_out))
+    if isinstance(chosen.reference, Files):
+        read_files(seen, chosen.reference, task.base, loaded, sensors)
+    elif truth is None:
+        render_views(seen, task, loaded, sensors)
+    else:
+        with holding(loaded.scene, chosen.truth.key, truth):
+            render_views(seen, task, load_scene(loaded.scene), sensors)
+    return seen
+
+
+def camera_of(sensor: dict | mi.Sensor) -> mi.Sensor:
+    """What a rig gives, as a sensor."""
+    return mi.load_dict(dict(sensor)) if isinstance(sensor, dict) else sensor
+
+
+def check_held_out(held_out: Sequence[int], count: int) -> None:
+    """Refuse views to hold out that are not there, and a split that leaves nothing to fit.
+
+    Raises:
+        MivolError: with the number.
+    """
+    wrong = next((i for i in held_out if not 0 <= i < count), None)
+    if wrong is not None:
+        raise MivolError(f"found no view {wrong} to hold out, there are {count}: count from 0 in reference.held_out.")
+    if len(set(held_out)) == count:
+        raise MivolError(f"all {count} views are held out, expected one to fit: shorten reference.held_out.")
+
+
+def render_views(seen: References, task: Task, loaded: LoadedScene, sensors: Sequence[Any]) -> None:
+    """References by Mitsuba's path tracer, kept in ``references/`` for other fits of the same views."""
+    chosen, cache = task.chosen, task.folder / "references"
+    cache.mkdir(exist_ok=True)
+    wanted = chosen.reference
+    settings = {
+        "max_depth": chosen.fit.max_depth, "target_se": wanted.standard_error or None, "max_spp": wanted.spp,
+        "seed": wanted.seed, "progress": False,
+    }  # fmt: skip
+    for sensor in task.watcher.track(sensors, "references"):
+        made = render_reference(loaded, cache, sensor=sensor, **settings)
+        seen.add(sensor, made.mean, standard_error(made))
+
+
+def standard_error(made: ReferenceResult) -> np.ndarray:
+    """Of each pixel's mean, with room for what was never sampled.
+
+    Where n samples of a pixel all saw the light, their variance is 0, but an event of probability 1/n may have been
+    missed: (brightest pixel / n)^2 is added to the variance.
+    """
+    return np.sqrt(made.variance + (made.mean.max() / made.spp) ** 2)
+
+
+def read_files(seen: References, wanted: Files, base: Path, loaded: LoadedScene, sensors: Sequence[Any]) -> None:
+    """References from OpenEXR files; those that mivol wrote must be of the scene that they are said to be of.
+
+    Raises:
+        MivolError: another number of files than views, or a file of another scene.
+    """
+    if len(wanted.paths) != len(sensors):
+        raise MivolError(f"found {len(wanted.paths)} reference files for {len(sensors)} views: give one for each.")
+    of = load_scene(base / wanted.scene).content_hash if wanted.scene else loaded.content_hash
+    for name, sensor in zip(wanted.paths, sensors, strict=True):
+        channels, header = read_exr(base / name)
+        if "mivol_reference" in header:
+            made = read_reference(base / name, of)
+            seen.add(sensor, made.mean, standard_error(made))
+        else:
+            seen.add(sensor, layers(channels)[""][..., :3])

@@ -1,0 +1,62 @@
+"""What a reconstruction from projections leaves in its folder: volumes, a sinogram, views held out, curves, results."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from mivol.experiments.projections import Projections
+from mivol.experiments.run_folder import RunFolder
+from mivol.files import write_exr, write_volume
+from mivol.report.record import Image, Volume
+from mivol.tomography.geometry import VoxelGrid
+from mivol.tomography.projector import Projector
+from mivol.validate.statistics import nrmse
+
+
+def write_outputs(run: RunFolder, projector: Projector, data: Projections, held_out: np.ndarray, x: np.ndarray) -> None:
+    """Write volume, sinogram, held-out views and curves, and put them and the results on record.
+
+    Args:
+        run: where it is written; its results have the iterations already.
+        projector: of all views.
+        data: what was measured.
+        held_out: numbers of the views that were not fitted.
+        x: (Z, Y, X), what was found.
+    """
+    run.make("views", "volumes")
+    predicted, record = projector @ x, run.record
+    record.volumes += write_grids(run.path, projector.grid, x, data.truth)
+    middle = data.y.shape[1] // 2
+    record.images += write_pair(run.path, "sinogram", data.y[:, middle], predicted[:, middle], False)
+    if data.y.shape[1] > 1:
+        for view in held_out[:4]:
+            record.images += write_pair(run.path, f"view {view}", data.y[view], predicted[view], True)
+    run.write_curves()
+    record.results["views"] = float(projector.n_views - len(held_out))
+    if data.truth is not None:
+        record.results["nrmse"] = nrmse(x, data.truth)
+    if len(held_out):
+        z = (data.y - predicted)[held_out] * np.sqrt(data.weights[held_out])
+        record.results["held_out_rms_of_residual_over_noise"] = float(np.sqrt(np.mean(z**2)))
+
+
+def write_pair(folder: Path, name: str, measured: np.ndarray, predicted: np.ndarray, held_out: bool) -> list[Image]:
+    """Measured line integrals beside those of the reconstruction, as layers of one file."""
+    path = f"views/{name.replace(' ', '_')}.exr"
+    layers = {"Y": predicted.astype(np.float32), "reference.Y": measured.astype(np.float32)}
+    write_exr(folder / path, layers)
+    roles = {"render": "Y", "reference": "reference.Y"}
+    common = {"path": path, "view": name, "held_out": held_out, "quantity": "line integral"}
+    return [Image(role=role, layer=layer, **common) for role, layer in roles.items()]
+
+
+def write_grids(folder: Path, grid: VoxelGrid, x: np.ndarray, truth: np.ndarray | None) -> list[Volume]:
+    """The reconstruction as .vol and .npz; the truth beside it."""
+    found, size = [], tuple(float(edge) for edge in grid.extent)
+    for role, values in {"reconstruction": x, **({"truth": truth} if truth is not None else {})}.items():
+        write_volume(folder / f"volumes/{role}.vol", values, grid.to_world)
+        write_volume(folder / f"volumes/{role}.npz", values, grid.to_world)
+        found.append(Volume(path=f"volumes/{role}.npz", role=role, size=size))
+    return found

@@ -1,0 +1,197 @@
+"""A scene fitted to images of it: from the settings of an experiment to a run folder, one call per arrow."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+
+from mivol import config
+from mivol.config import Experiment
+from mivol.errors import MivolError
+from mivol.experiments.back_end import choose_back_end
+from mivol.experiments.references import References, find_references
+from mivol.experiments.run_folder import RunFolder
+from mivol.experiments.scene_outputs import SceneOutputs
+from mivol.experiments.start import Start, make_start
+from mivol.experiments.task import Task
+from mivol.experiments.truth import check_truth, make_truth, put
+from mivol.optim.events import upsample
+from mivol.optim.loop import Fit, reconstruct
+from mivol.optim.parameters import check_names
+from mivol.optim.problem import Problem, seed_of
+from mivol.optim.shots import Shot, make_shots
+from mivol.report.page import write_page
+from mivol.report.record import Choice, RunRecord
+from mivol.scene.load import LoadedScene, load_scene
+from mivol.scene.needs import find_needs, survey_scene
+from mivol.scene.plan import make_plan
+from mivol.transport.path import Settings
+from mivol.validate.statistics import nrmse, psnr
+
+HELD_OUT = 2
+"""Purpose of the random numbers of evaluations, beside those of the fit."""
+
+
+def scene_fit(task: Task) -> Path:
+    """Fit a scene to its views.
+
+    References are cached by what they show, so that another fit of the same views renders none.
+
+    Args:
+        task: with an :class:`~mivol.config.Experiment`.
+
+    Returns:
+        The page.
+
+    Raises:
+        MivolError: whatever is wrong with the settings, the scene, the references or the disk.
+        KeyboardInterrupt: stopped; what is there is kept, and ``task.resume`` continues.
+    """
+    chosen: Experiment = task.chosen
+    choose_back_end(chosen.variant, chosen.threads)
+    run = RunFolder(task.folder, new_record(chosen))
+    with run.at_work():
+        with run.stage("scene"):
+            loaded = load_scene(task.base / chosen.scene.file, chosen.scene.define)
+            truth = make_truth(chosen, task.base, loaded.scene)
+            integrator = make_integrator(chosen)
+            check_names([sought.key for sought in chosen.parameter])
+            starts = [make_start(sought, task.base, loaded.scene) for sought in chosen.parameter]
+            check_truth(chosen)
+        with run.stage("references"):
+            seen = find_references(task, loaded, truth)
+        with run.stage("fit"):
+            problem = make_problem(chosen, loaded.scene, integrator, starts, seen)
+            run.record.plan = choices(chosen, problem)
+            fit = solve(task, run, loaded, problem, Measure(chosen, seen, truth))
+        with run.stage("images and volumes"):
+            SceneOutputs(chosen, run, fit, seen, truth).write()
+    return write_page(task.folder)
+
+
+def new_record(chosen: Experiment) -> RunRecord:
+    """The record of a run that begins."""
+    priors = [prior for sought in chosen.parameter for prior in sought.prior]
+    strategies = [chosen.optimiser, chosen.loss, *priors]
+    sought = ", ".join(sought.key for sought in chosen.parameter)
+    return RunRecord.new(
+        chosen.title,
+        method=f"{chosen.fit.integrator}, {chosen.optimiser.label()} on {chosen.loss.label()}; looked for: {sought}",
+        config=config.resolved(chosen),
+        command="mivol optimize",
+        seeds={"fit": chosen.seed, "references": getattr(chosen.reference, "seed", 0)},
+        citations=["mitsuba3", "drjit", *dict.fromkeys(key for s in strategies for key in s.cites)],
+    )
+
+
+def choices(chosen: Experiment, problem: Problem) -> list[Choice]:
+    """The plan of mivol's integrator for this scene, with its reasons; other integrators have none."""
+    if chosen.fit.integrator != "mivol":
+        return []
+    needs = find_needs(problem.scene, problem.shots[0].sensor, survey_scene(problem.scene))
+    made = make_plan(needs, Settings(max_depth=chosen.fit.max_depth))
+    return [Choice(choice=f"{c.about}: {c.choice}", reason=c.reason) for c in made.choices]
+
+
+def make_integrator(chosen: Experiment) -> mi.Integrator:
+    """The integrator of the fit.
+
+    Raises:
+        MivolError: Mitsuba has none of that name, or it refuses its settings.
+    """
+    name = chosen.fit.integrator
+    try:
+        return mi.load_dict({"type": name, "max_depth": chosen.fit.max_depth})
+    except RuntimeError as error:
+        reason = " ".join(str(error).split())
+        raise MivolError(f'fit.integrator = "{name}" cannot be loaded ({reason}): "mivol" is the usual one.') from None
+
+
+def make_problem(
+    chosen: Experiment, scene: mi.Scene, integrator: mi.Integrator, starts: Sequence[Start], seen: References
+) -> Problem:
+    """The problem of an experiment, with the scene at its start."""
+    params = mi.traverse(scene)
+    for start in starts:
+        put(params, start.parameter.name, start.value)
+    wanted, parameters = chosen.fit, [start.parameter for start in starts]
+    problem = Problem(scene, seen.fitted, parameters, integrator, chosen.loss, wanted.spp, wanted.samples_per_pass, chosen.seed)
+    problem.set(problem.start())
+    return problem
+
+
+def solve(task: Task, run: RunFolder, loaded: LoadedScene, problem: Problem, measure: Measure) -> Fit:
+    """Fit the scene to its views; the metrics grow by a line an iteration."""
+    chosen: Experiment = task.chosen
+    settings = config.flat(config.resolved(chosen))
+    with task.watcher.watch(chosen.fit.iterations) as watch:
+        begun = False
+
+        def observe(fit: Fit) -> None:
+            nonlocal begun
+            if not begun:
+                run.rewind(fit.next - 2)
+            begun = True
+            write_metrics(run, fit)
+            watch(fit)
+
+        fit = reconstruct(
+            problem, chosen.optimiser, chosen.fit.iterations, schedule=chosen.schedule, events=chosen.event,
+            measure=measure, observer=observe, path=run.checkpoint,
+            fingerprint={"scene": loaded.content_hash, "references": measure.seen.digest(), **settings},
+            resume=task.resume,
+        )  # fmt: skip
+    fit.save()
+    append_last(run, fit)
+    return fit
+
+
+def write_metrics(run: RunFolder, fit: Fit) -> None:
+    """One line for the iteration that has just ended, with what was measured before it."""
+    last = fit.history[-1]
+    measured = fit.newest_errors() if fit.measures and fit.measures[-1]["iteration"] == last["iteration"] else {}
+    run.append(last["iteration"], last["seconds"], loss=last["loss"], **measured)
+
+
+def append_last(run: RunFolder, fit: Fit) -> None:
+    """What was measured after the last iteration, once however often a run that is done is resumed."""
+    run.rewind(fit.next - 1)
+    if fit.measures and fit.measures[-1]["iteration"] == fit.next and len(fit.measures[-1]) > 2:
+        run.append(**fit.measures[-1])
+
+
+class Measure:
+    """What a fit does not minimise: PSNR of held-out views, the error of the volume where the truth is known, and what is
+    found of parameters that are few numbers."""
+
+    def __init__(self, chosen: Experiment, seen: References, truth: np.ndarray | None) -> None:
+        self.seen, self.truth = seen, truth
+        self.shots = make_shots(seen.held_out, chosen.fit.samples_per_pass) if seen.held_out else []
+        self.key = chosen.truth.key if chosen.truth else ""
+        self.spp = chosen.fit.spp_shown or chosen.fit.spp
+
+    def __call__(self, problem: Problem) -> dict[str, float]:
+        errors: dict[str, float] = {}
+        if self.shots:
+            errors["held_out_psnr"] = float(np.mean([value for shot in self.shots for value in self.psnr(problem, shot)]))
+        if self.truth is not None and self.key in problem.values():
+            found = problem.values()[self.key]
+            if tuple(found.shape) != self.truth.shape:
+                found = upsample(found, self.truth.shape[:3])
+            errors["nrmse"] = nrmse(np.asarray(found), self.truth)
+        return errors | numbers(problem)
+
+    def psnr(self, problem: Problem, shot: Shot) -> list[float]:
+        """PSNR [dB] of each view of a shot, of what the scene holds now."""
+        image = np.asarray(problem.render(shot.sensor, seed_of(problem.seed, 0, 0, HELD_OUT), self.spp))
+        pairs = zip(np.split(image, shot.n_views, 1), np.split(np.asarray(shot.reference), shot.n_views, 1), strict=True)
+        return [psnr(render, reference) for render, reference in pairs]
+
+
+def numbers(problem: Problem) -> dict[str, float]:
+    """Each number of the parameters that are no grids or images, by key and place, as the scene holds it now."""
+    values = {name: np.asarray(value) for name, value in problem.values().items() if value.ndim == 1}
+    return {f"{name}[{i}]": float(x) for name, value in values.items() for i, x in enumerate(value)}

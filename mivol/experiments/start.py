@@ -1,0 +1,72 @@
+"""Where a fit of a scene begins: the first value of each parameter, and the place of its grid."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+
+from mivol.config import Sought
+from mivol.errors import MivolError
+from mivol.files import read_volume
+from mivol.optim.parameters import GRID, Parameter, as_tensor, find
+from mivol.transport.medium import place_of_grid
+
+
+@dataclass(frozen=True)
+class Start:
+    """A parameter and its first value."""
+
+    parameter: Parameter
+    value: np.ndarray
+
+
+def make_start(sought: Sought, base: Path, scene: mi.Scene) -> Start:
+    """A parameter and where it starts; the scene is not changed.
+
+    Raises:
+        MivolError: no such parameter, a start outside its domain, a file that cannot be read.
+    """
+    params = mi.traverse(scene)
+    now = as_tensor(params[find(sought.key, params)])
+    # A copy: the scene may give the memory behind a view to another tensor when its parameter changes.
+    value = np.array(now)
+    if now.ndim < GRID and (sought.shape or sought.start_file):
+        raise MivolError(
+            f"{sought.key} is no grid of voxels but has the shape {now.shape}: give start, and neither shape nor start_file."
+        )
+    if sought.start_file:
+        value = read_volume(base / sought.start_file).values
+    elif sought.start is not None:
+        shape = (*sought.shape, now.shape[3]) if sought.shape else now.shape
+        value = np.full(shape, start_of(sought, shape), dtype=np.float32)
+    extent = edges_of(place_of(sought.key, scene))[::-1] if value.ndim >= GRID else (1.0, 1.0, 1.0)
+    parameter = Parameter(sought.key, sought.unit, sought.domain, sought.map, sought.lr, extent, sought.prior)
+    parameter.to_reals(mi.TensorXf(np.ascontiguousarray(value)))
+    return Start(parameter, value)
+
+
+def start_of(sought: Sought, shape: Sequence[int]) -> Any:
+    """The start that the experiment gives: one number, or one for each of the last axis.
+
+    Raises:
+        MivolError: another count of numbers.
+    """
+    given = np.size(sought.start)
+    if given not in (1, shape[-1]):
+        raise MivolError(f"{sought.key} starts from {given} numbers and has {shape[-1]}: give one for all, or one for each.")
+    return sought.start
+
+
+def place_of(key: str, scene: mi.Scene) -> np.ndarray:
+    """Where the grid of a parameter lies: the (4, 4) map of the unit cube to the world."""
+    return place_of_grid(mi.traverse(scene).properties[key][2])
+
+
+def edges_of(place: np.ndarray) -> tuple[float, float, float]:
+    """Lengths (x, y, z) of the edges of a grid's box."""
+    return tuple(float(edge) for edge in np.linalg.norm(place[:3, :3], axis=0))
