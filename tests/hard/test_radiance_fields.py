@@ -19,7 +19,7 @@ defect    what goes wrong there                               shown by
 13        another field after refinement                      ``optim/test_radiance_fit::test_a_field_on_finer_nodes...``
 14        images of one size, jitter inside pixels            here; ``optim/test_radiance_fit::test_views_know_their...``
 15        nothing to stop, resume, measure or look at         ``optim/test_radiance_fit::test_a_fit_that_went_on...``,
-                                                              ``cli/test_field``
+                                                              ``experiments/test_photo_fit``
 16        a camera inside sees what is behind it              here; ``analytic/test_radiance::test_hard_45_...``
 ========  ==================================================  ==========================================================
 
