@@ -15,6 +15,8 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from mivol.transport.medium import traverse_medium
+
 __all__ = ["renew", "tangents_led"]
 
 
@@ -87,7 +89,7 @@ def _find_asked(scene: mi.Scene) -> list[_Asked]:
 
 def _parts_of(medium: mi.Medium) -> list[mi.Object]:
     """The phase function of a medium, and its volumes but for those whose numbers transport reads where they stand."""
-    known = mi.traverse(medium).properties
+    known = traverse_medium(medium).properties
     volumes = {key.partition(".")[0]: node for key, (_, _, node, _) in known.items() if isinstance(node, mi.Volume)}
     read = [n for n in volumes if n.startswith("sigma_") and f"{n}.table" not in known]
     return [medium.phase_function(), *(v for n, v in volumes.items() if n not in read)]

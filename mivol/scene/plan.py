@@ -25,7 +25,7 @@ from mivol.transport.aovs import AOVS
 from mivol.transport.direct import Lights
 from mivol.transport.field import share_cells
 from mivol.transport.light_grid import find_light_grid, measure_bias
-from mivol.transport.medium import Box, MediumView
+from mivol.transport.medium import Box, MediumView, traverse_medium
 from mivol.transport.optical_depth import PACKED_LIMIT, gradient_bytes
 from mivol.transport.path import Settings
 from mivol.transport.world import Body, World, share_flight
@@ -460,7 +460,7 @@ def _tables(needs: Needs) -> list[str]:
     """What grids that were seen through a table miss of it between their nodes."""
     lines = []
     for facts, boundary in zip(needs.media, needs.boundaries, strict=True):
-        volumes = {key.split(".")[0]: entry[2] for key, entry in mi.traverse(boundary.medium).properties.items()}
+        volumes = {key.split(".")[0]: entry[2] for key, entry in traverse_medium(boundary.medium).properties.items()}
         for name, volume in volumes.items():
             if not hasattr(volume, "mivol_transfer"):
                 continue

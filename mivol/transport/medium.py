@@ -24,7 +24,7 @@ from mivol.errors import MivolError
 from mivol.fields.activation import Activation
 from mivol.transport.lattice import Lattice
 
-__all__ = ["Box", "MediumView", "Part", "box_of_cube", "view_medium"]
+__all__ = ["Box", "MediumView", "Part", "box_of_cube", "children_of", "traverse_medium", "view_medium"]
 
 STOCK = ("HomogeneousMedium", "HeterogeneousMedium")
 
@@ -159,14 +159,14 @@ def view_medium(medium: mi.Medium, boundary: Box | None = None, places: dict | N
         MivolError: a medium or a volume of another kind.
     """
     kind = kind_of(medium)
-    params = mi.traverse(medium)
+    params = traverse_medium(medium)
     if kind not in (*STOCK, "mivol_medium"):
         raise MivolError(
             f"a medium of type {kind} was found; mivol renders mivol_medium, homogeneous and heterogeneous media."
         )
     names = [n for n in ("sigma_t", "sigma_a", "sigma_s") if any(k.startswith(n + ".") for k in params.properties)]
     places = {} if places is None else places
-    parts = [_part(name, params, kind, boundary, places) for name in names]
+    parts = [_part(name, params, children_of(medium)[name], kind, boundary, places) for name in names]
     albedo = [v for k, v in params if k.startswith("sigma_s." if "sigma_s" in names else "albedo.")]
     share = _field(params, "albedo") if "sigma_s" not in names else None
     source, glow = _field(params, "emission"), _field(params, "emission_density")
@@ -249,11 +249,39 @@ def kind_of(medium: mi.Medium) -> str:
     return "mivol_medium" if hasattr(medium, "coefficients") else medium.class_name()
 
 
-def _part(name: str, params: mi.SceneParameters, kind: str, boundary: Box | None, places: dict) -> Part:
+def children_of(medium: mi.Medium) -> dict[str, mi.Object]:
+    """The volumes and the phase function of a medium, by name; one object may stand under several names."""
+    found = {}
+
+    class Children(mi.TraversalCallback):  # in here, since Mitsuba has no such class before a variant is set
+        def put(self, name: str, value: object, flags: int, cpptype: object = None) -> None:
+            if isinstance(value, mi.Object):
+                found[name] = value
+
+    medium.traverse(Children())
+    return found
+
+
+def traverse_medium(medium: mi.Medium) -> mi.SceneParameters:
+    """The parameters of a medium, each coefficient under its own name.
+
+    ``mi.traverse`` visits an object once: a volume that is both ``sigma_t`` and ``albedo`` (by a ``ref``, or because Mitsuba
+    merges equal objects of a scene) it lists under one of the names, and here it is listed under both.
+    """
+    params = mi.traverse(medium)
+    for name, child in children_of(medium).items():
+        own = mi.traverse(child)
+        params.properties |= {f"{name}.{key}": entry for key, entry in own.properties.items()}
+        params.hierarchy |= {node: entry for node, entry in own.hierarchy.items() if node not in params.hierarchy}
+    return params
+
+
+def _part(
+    name: str, params: mi.SceneParameters, volume: mi.Volume, kind: str, boundary: Box | None, places: dict
+) -> Part:
     """The part of an extinction under ``name`` among a medium's parameters."""
     grid, constant = f"{name}.data", f"{name}.value.value"
     if grid in params.properties:
-        volume = params.properties[grid][2]
         lattice = Lattice(_tensor(params[grid]), _place(volume, boundary, places))
         return Part(name, lattice=lattice, volume=volume if volume.class_name() == "GridVolume" else None)
     if constant not in params.properties:
@@ -267,7 +295,6 @@ def _part(name: str, params: mi.SceneParameters, kind: str, boundary: Box | None
         return Part(name, constant=value)
     channels = [value[c] for c in range(dr.size_v(value))] if dr.size_v(value) == 3 else [mi.Float(value)]
     values = mi.TensorXf(dr.ravel(mi.Color3f(*channels)) if len(channels) == 3 else channels[0], (1, 1, 1, len(channels)))
-    volume = params.hierarchy[params.properties[constant][2]][0]
     if volume.ptr not in places:
         places[volume.ptr] = place_of_grid(volume)
     return Part(name, lattice=Lattice(values, places[volume.ptr]))

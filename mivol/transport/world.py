@@ -384,7 +384,8 @@ class World:
             products = [body.view.scale * _values(p) for p in body.view.parts]
             asked = [p for p in products if dr.grad_enabled(p)]
             if asked:
-                dr.forward_to(*asked)
+                # The tangents of the parameters are kept: what else was made of them, such as an albedo, is followed later.
+                dr.forward_to(*asked, flags=dr.ADFlag.ClearEdges)
             body.tangents = [dr.detach(dr.grad(p)) for p in products]
             if _is_followed(body.view.flakes):
                 dr.forward_to(body.view.flakes, flags=dr.ADFlag.ClearEdges)

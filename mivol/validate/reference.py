@@ -33,6 +33,7 @@ from mivol.files.atomic import write_whole
 from mivol.files.exr import read_exr, write_exr
 from mivol.optim.interrupt import Stop
 from mivol.scene.load import LoadedScene, SceneSource, check_variant, content_hash, find_sensor, load_scene
+from mivol.transport.medium import traverse_medium
 from mivol.validate.statistics import Moments
 from mivol.validate.trust import Doubt, trust
 
@@ -337,7 +338,7 @@ def _rgb_extinction(scene: mi.Scene) -> list[_Extinction]:
     for i, medium in enumerate(media):
         if any(medium is other for other in media[:i]):
             continue
-        params = mi.traverse(medium)
+        params = traverse_medium(medium)
         keys = [k for k in params.keys() if k.partition(".")[0] in ("sigma_t", "sigma_a", "sigma_s")]  # noqa: SIM118
         values = {key: _array(params[key]) for key in keys}
         values = {k: v for k, v in values.items() if v.ndim and v.shape[-1] == 3 and np.any(v != v[..., :1])}

@@ -17,7 +17,7 @@ import mitsuba as mi
 import numpy as np
 
 from mivol.scene.nesting import bounds, nesting_fault
-from mivol.transport.medium import kind_of
+from mivol.transport.medium import children_of, kind_of, traverse_medium
 
 __all__ = ["CHECKS", "Doubt", "trust"]
 
@@ -316,8 +316,8 @@ def _camera_inside(sensor: mi.Sensor, boundaries: list[Boundary]) -> Iterator[st
 
 def _boundary(shape: mi.Shape) -> Boundary:
     geometry = mi.traverse(shape)
-    params = mi.traverse(shape.interior_medium())
-    volumes = _extinction_volumes(params)
+    params = traverse_medium(shape.interior_medium())
+    volumes = _extinction_volumes(shape.interior_medium())
     stock = next((v for v in volumes if v.class_name() in ("GridVolume", "ConstVolume")), None)
     kind = kind_of(shape.interior_medium())
     mesh = "vertex_positions" in geometry
@@ -368,16 +368,9 @@ def _skin(points: np.ndarray, volumes: list[mi.Volume], to_local: np.ndarray | N
     return float((sigma * RESTART * (1 + np.abs(points).max(axis=1))).max(initial=0))
 
 
-def _extinction_volumes(params: mi.SceneParameters) -> list[mi.Volume]:
+def _extinction_volumes(medium: mi.Medium) -> list[mi.Volume]:
     """The volumes whose sum is a medium's extinction."""
-    found = {}
-    for key, (_, _, node, _) in params.properties.items():
-        name = key.partition(".")[0]
-        while name in ("sigma_t", "sigma_a", "sigma_s") and name not in found and node is not None:
-            if isinstance(node, mi.Volume):
-                found[name] = node
-            node = params.hierarchy[node][0]
-    return list(found.values())
+    return [v for name, v in children_of(medium).items() if name in ("sigma_t", "sigma_a", "sigma_s")]
 
 
 def _reach(kind: str, volumes: list[mi.Volume]) -> np.ndarray | None:

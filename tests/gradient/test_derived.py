@@ -29,6 +29,11 @@ def smoke(albedo: object = 0.7, sigma_t: dict | None = None, **more: object) -> 
     return {"smoke": box_of(medium("mivol_medium", grid, albedo, **more), PLACE)}
 
 
+def shared(grid: dict) -> dict:
+    both = {"type": "ref", "id": "both"}
+    return {"both": grid, "smoke": box_of(medium("mivol_medium", both, both), PLACE)}
+
+
 def lamp_above(radiance: dict) -> dict:
     place = mi.ScalarTransform4f().translate([0, 0, 2.5]).rotate([1, 0, 0], 180)
     return {"type": "rectangle", "to_world": place, "emitter": {"type": "area", "radiance": radiance}}
@@ -48,6 +53,7 @@ MADE: dict[str, tuple[str, Callable[[], dict]]] = {
     "mivol_tabulated": (INSIDE + "phase_function.values", lambda: smoke(phase={"type": "mivol_tabulated", "values": TABLE})),
     "tabphase": (INSIDE + "phase_function.values", lambda: smoke(phase={"type": "tabphase", "values": TABLE})),
     "albedo": (INSIDE + "albedo.data", lambda: smoke(grid_volume("gridvolume", rough_grid(4, 0.9), PLACE))),
+    "extinction and albedo in one": ("both.data", lambda: shared(grid_volume("mivol_voxels", rough_grid(4, 0.9), PLACE))),
     "transfer": (INSIDE + "sigma_t.table", lambda: smoke(sigma_t=transfer())),
     "sky": ("lamp.data", lambda: smoke() | {"lamp": {"type": "envmap", "bitmap": picture((4, 7, 3))["bitmap"]}}),
     "area": ("lamp.emitter.radiance.data", lambda: smoke() | {"lamp": lamp_above(picture((3, 5, 3)))}),
