@@ -72,11 +72,13 @@ def test_only_threads_starts_threads_and_processes(path: Path) -> None:
 
 
 def test_only_plugins_define_classes_with_mitsuba_bases() -> None:
+    """But for callbacks that ask an object for its parameters: Mitsuba never holds one."""
     found = []
     for path in MODULES:
         for node in ast.walk(ast.parse(path.read_text(), str(path))):
             if isinstance(node, ast.ClassDef) and room_of(path) != "plugins":
-                found += [f"{path.name}: {node.name}" for base in node.bases if ast.unparse(base).startswith("mi.")]
+                bases = {ast.unparse(base) for base in node.bases} - {"mi.TraversalCallback"}
+                found += [f"{path.name}: {node.name}" for base in bases if base.startswith("mi.")]
     assert found == []
 
 
