@@ -25,7 +25,7 @@ class Voxels:
         to_world: (4, 4) affine map of the unit cube to the world.
         name: what the grid is called in a sentence that refuses it.
         to_local: the inverse that Mitsuba keeps of ``to_world``, rounded as it rounds; None to invert it here.
-        signed: values may be negative, as the ``g`` of a phase function; whoever reads them as an extinction refuses those.
+        signed: values may be negative, as the ``g`` of a phase function; whoever reads them as an extinction counts those as 0.
 
     Raises:
         MivolError: values or a placement that no medium can have; the first bad voxel is named.
@@ -39,10 +39,10 @@ class Voxels:
         to_local: np.ndarray | None = None,
         signed: bool = False,
     ) -> None:
-        self.name, self.least = name, None if signed else 0.0
+        self.name = name
         self.to_world = check_affine(to_world, f"to_world of {name}")
         tensor = values if isinstance(values, mi.TensorXf) else mi.TensorXf(np.ascontiguousarray(values, dtype=np.float32))
-        check_volume(np.array(dr.detach(tensor)), name=name, minimum=self.least)
+        check_volume(np.array(dr.detach(tensor)), name=name, minimum=None if signed else 0.0)
         self.texture = mi.Texture3f(tensor, use_accel=False, migrate=False)
         to_local = np.linalg.inv(self.to_world) if to_local is None else to_local
         self.to_local = mi.ScalarAffineTransform4f(mi.ScalarMatrix4f(to_local), mi.ScalarMatrix4f(self.to_world.T))
@@ -116,14 +116,17 @@ class Voxels:
     def refresh(self) -> None:
         """Take over values that were replaced from outside.
 
+        Values below 0 are taken, since steps of optimisers overshoot: an extinction counts them as 0, whoever else reads them
+        refuses those that it cannot use.
+
         Raises:
-            MivolError: the new values are not those of a medium (looked at, unless ``dr.freeze`` is recording).
+            MivolError: NaN or infinite values (looked at, unless ``dr.freeze`` is recording).
         """
         self.texture.update_inplace()
         if dr.flag(dr.JitFlag.FreezingScope):
             # A recording cannot read values.
             return
-        check_volume(np.array(dr.detach(self.texture.tensor())), name=self.name, minimum=self.least)
+        check_volume(np.array(dr.detach(self.texture.tensor())), name=self.name, minimum=None)
 
     def __repr__(self) -> str:
         z, y, x = self.res

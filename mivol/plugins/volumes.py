@@ -20,7 +20,7 @@ class VoxelVolume(mi.Volume):
         filename, grid or data: a file (.vol, .npy, .npz, .nrrd, .mhd, .nii, .vti, ...), a ``mi.VolumeGrid`` or a tensor.
         to_world: places the unit cube.
         use_grid_bbox: place the grid by its file's own box first. Default false.
-        signed: values may be negative, as a ``g``. Default false.
+        signed: values may be given that are negative, as a ``g``. Default false.
     """
 
     def __init__(self, props: mi.Properties) -> None:

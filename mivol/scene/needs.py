@@ -7,6 +7,7 @@ been replaced, and never while a function is being recorded by ``dr.freeze``.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -126,6 +127,7 @@ class Survey:
     values: dict = field(default_factory=dict)
     places: dict = field(default_factory=dict)
     numbers: dict = field(default_factory=dict)
+    warned: set = field(default_factory=set)
 
     @property
     def is_current(self) -> bool:
@@ -271,11 +273,12 @@ def _camera_inside(scene: mi.Scene, sensor: mi.Sensor, survey: Survey) -> bool:
 
 @dataclass
 class _Read:
-    """What was read of an array."""
+    """What was read of an array; ``floored``: its values with 0 for those below it, None where there are none."""
 
     bounds: mi.Float | None
     occupied: float
     maximum: float
+    floored: mi.Float | None = None
 
 
 def _once(survey: Survey, kind: tuple, array: mi.Float, make: Callable[[], Any]) -> Any:
@@ -291,28 +294,59 @@ def _once(survey: Survey, kind: tuple, array: mi.Float, make: Callable[[], Any])
 def read_part(part: Part, survey: Survey, name: str) -> _Read:
     """Read the bounds of a part of an extinction once for each state of its array.
 
+    Voxels below 0, where a step of an optimiser or a filter overshot, count as 0 from here on, and have the derivative that
+    they would have at 0, so that a step may bring them back. The first ones of each grid of a scene are told in a warning.
+
     Raises:
-        MivolError: NaN, infinite or negative values (those of a radiance field may be negative where its activation takes
-            them); the first bad voxel of a grid is named. A stock grid that is looked up otherwise than between voxel centres
+        MivolError: NaN or infinite values (those of a radiance field may be negative only where its activation takes them);
+            the first bad voxel of a grid is named. A stock grid that is looked up otherwise than between voxel centres
             with clamped borders.
     """
     array = dr.detach(part.lattice.values.array)
 
     def make() -> _Read:
-        values, activation = part.lattice.values, part.activation
+        values, activation, floored = part.lattice.values, part.activation, None
         if activation is not None:
             _check_stored(array, activation, name)
             # Nothing is below an empty value; an extinction rises with what is stored.
             empty = activation.empty_below
             values = mi.TensorXf(dr.maximum(array, empty) if empty is not None else dr.abs(array) + 1, values.shape)
+        elif not dr.all((array >= 0) & dr.isfinite(array)):
+            floored = _floor(part, survey, name)
+            values = mi.TensorXf(floored, values.shape)
         blocks = block_bounds(values)
-        if activation is None and not (dr.all(dr.isfinite(blocks)) and dr.all(array >= 0)):
-            check_volume(np.array(dr.detach(values)), name=name)
         host = np.array(blocks)
         _check_look_up(part, survey, name)
-        return _Read(blocks, float((host > 0).mean()), float(host.max(initial=0.0)))
+        return _Read(blocks, float((host > 0).mean()), float(host.max(initial=0.0)), floored)
 
-    return _once(survey, ("part",), array, make)
+    read = _once(survey, ("part",), array, make)
+    if read.floored is not None:
+        values = part.lattice.values
+        # The stock grid is not looked up again: it interpolates the values below 0, these do not.
+        part.lattice.values, part.volume = mi.TensorXf(dr.replace_grad(read.floored, values.array), values.shape), None
+    return read
+
+
+def _floor(part: Part, survey: Survey, name: str) -> mi.Float:
+    """The values of a grid with 0 for those below it; says so once for each grid of a scene.
+
+    Raises:
+        MivolError: NaN or infinite values.
+    """
+    values = np.array(dr.detach(part.lattice.values))
+    check_volume(values, name=name, minimum=None)
+    if (name, part.name) not in survey.warned:
+        survey.warned.add((name, part.name))
+        warnings.warn(
+            f"{int((values < 0).sum())} of {values.size} values of {part.name} of the medium in {name} are below 0, the least "
+            f"{values.min():.3g}: they count as 0, with the derivative at 0; add params[key] = dr.maximum(params[key], 0) "
+            "after each step or filter (this is said once).",
+            RuntimeWarning,
+            stacklevel=2,
+        )
+    floored = dr.maximum(dr.detach(part.lattice.values.array), 0)
+    dr.eval(floored)
+    return floored
 
 
 def _check_stored(array: mi.Float, activation: Activation, name: str) -> None:

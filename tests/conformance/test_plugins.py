@@ -303,7 +303,7 @@ def test_hard_27_bad_voxels_are_named(variant, bad):
 
 
 def test_signed_voxels_are_a_g_and_no_extinction(variant):
-    """Back-scattering voxels; NaN is refused as ever, and so are negative numbers where they would be an extinction."""
+    """Back-scattering voxels; NaN is refused as ever, and negative numbers count as 0 where they would be an extinction."""
     values = grid()
     values[3, 1, 4, 0] = -0.9
     phase = {"type": "mivol_hg", "g": grid_volume("mivol_voxels", np.clip(values, -0.9, 0.9)) | {"signed": True}}
@@ -315,7 +315,7 @@ def test_signed_voxels_are_a_g_and_no_extinction(variant):
     smoke = box_of({"type": "mivol_medium", "sigma_t": grid_volume("mivol_voxels", values) | {"signed": True}}, np.eye(4))
     sensor = camera([0.5, 0.4, 4], [0.5, 0.5, 0.5], 4, fov=5)
     scene = mi.load_dict({"type": "scene", "smoke": smoke, "sky": sky(), "sensor": sensor})
-    with refused("z=3, y=1, x=4"):
+    with pytest.warns(RuntimeWarning, match="1 of .* values of sigma_t .* below 0, the least -0.9"):
         render(scene, {"type": "mivol"}, 1)
 
 
@@ -333,7 +333,7 @@ def test_a_rotation_about_an_axis_of_another_length_is_refused(variant):
     mi.load_dict({"type": "mivol_voxels", "data": tensor(grid()), "to_world": long})
 
 
-@pytest.mark.parametrize("bad", [np.nan, -0.5])
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
 def test_hard_26_27_an_update_with_bad_values_is_refused(variant, bad):
     """What an optimiser's overshoot leaves behind is named when it is handed in, not when it is rendered."""
     params = mi.traverse(mi.load_dict(grid_volume("mivol_voxels", grid())))
