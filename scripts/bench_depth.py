@@ -26,7 +26,8 @@ import mivol  # noqa: F401  (chooses LLVM)
 from contest import AT_MOST, Bench, describe, judge, say, smoke
 from mivol.files import whole_file
 from mivol.scene.depth_two import ALBEDOS, TAUS, depth_two_error, draw_lines, scattering_depth
-from mivol.transport.medium import Box, view_medium
+from mivol.transport.media.box import Box
+from mivol.transport.media.read_medium import view_medium
 
 import drjit as dr
 import mitsuba as mi
@@ -235,11 +236,11 @@ def table_lines(cells: list[Cell]) -> list[str]:
 def compare(question: str, answer: dict) -> list[dict]:
     """How sure the table is, how far mivol's is from what was measured now, and how far other media are from it."""
     cells = [Cell(**c) for c in answer["cells"]]
-    gaps = [c.error - depth_two_error(c.albedo, c.tau, *tabled(c)) for c in cells]
+    empty_distances = [c.error - depth_two_error(c.albedo, c.tau, *tabled(c)) for c in cells]
     if question == "beside":
-        return [judge("largest distance from the table", max(map(abs, gaps)), AT_MOST, 0.2)]
+        return [judge("largest distance from the table", max(map(abs, empty_distances)), AT_MOST, 0.2)]
     # Half a digit of rounding, and the table's own error: at the lines it was made with, that of this measurement.
-    errors = [(abs(gap) - 5e-4) / c.standard_error for c, gap in zip(cells, gaps, strict=True)]
+    errors = [(abs(gap) - 5e-4) / c.standard_error for c, gap in zip(cells, empty_distances, strict=True)]
     bar = 0.04 * (QUICK.lines / answer["lines"]) ** 0.5
     return [
         judge("largest standard error", max(c.standard_error for c in cells), AT_MOST, bar),

@@ -44,8 +44,10 @@ from contest import (
     threads_in_space,
 )
 from mivol.report.figures import Series, plot_error_against_time
-from mivol.transport.lattice import Lattice, block_bounds, clip, find_gaps, walk
-from mivol.transport.optical_depth import Gradient, backproject_segment, integrate_tau
+from mivol.transport.media.grid_integral import Gradient, backproject_segment, integrate_tau
+from mivol.transport.traversal.empty_blocks import block_bounds, find_empty_distances
+from mivol.transport.traversal.grid_walk import walk
+from mivol.transport.traversal.lattice import Lattice, clip
 
 import drjit as dr
 import drjit.dda
@@ -117,7 +119,7 @@ class Work:
 
     def lattice(self, skip: bool = False) -> Lattice:
         """The grid for mivol's walk, empty blocks skipped or not."""
-        return Lattice(self.tensor, TO_WORLD, find_gaps(self.tensor) if skip else None)
+        return Lattice(self.tensor, TO_WORLD, find_empty_distances(self.tensor) if skip else None)
 
     def tau(self, skip: bool = False) -> Contestant:
         """The optical depth of each ray by mivol."""

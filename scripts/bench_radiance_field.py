@@ -43,7 +43,7 @@ from mivol.optim.radiance_views import TILE, Batch, Views
 from mivol.photos import Camera, Photo, load_photos, pixel_centres, rays, silhouette_box
 from mivol.photos.camera import intrinsics
 from mivol.report.figures import MARKERS, SERIES, STYLE, save
-from mivol.transport.radiance import Rays, bake, cells_of, exact, fold, look, look_back, model_of
+from mivol.transport.line_integrals.radiance_field import RayBatch, backward, bake, cells_of, exact, fold, model_of, render
 from radiance_peer import Peer
 
 import drjit as dr
@@ -189,9 +189,9 @@ def rays_through(one: Camera, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarra
     return np.broadcast_to(o, d.shape), d
 
 
-def rays_of(o: np.ndarray, d: np.ndarray) -> Rays:
+def rays_of(o: np.ndarray, d: np.ndarray) -> RayBatch:
     """Rays on the device."""
-    made = Rays(*(kind(np.ascontiguousarray(np.float32(a.T))) for kind, a in ((mi.Point3f, o), (mi.Vector3f, d))))
+    made = RayBatch(*(kind(np.ascontiguousarray(np.float32(a.T))) for kind, a in ((mi.Point3f, o), (mi.Vector3f, d))))
     dr.eval(made.o, made.d)
     return made
 
@@ -204,7 +204,7 @@ def photographed(field: SphericalGrid, count: int, side: int, between: bool = Fa
 def _photo(field: SphericalGrid, one: Camera) -> Photo:
     o, d = rays_through(one, tiled(one.size[0]))
     cells = cells_of(field)
-    seen = look(cells, bake(field, cells, o[:1], mi.UInt32(0)), model_of(field), rays_of(o, d))
+    seen = render(cells, bake(field, cells, o[:1], mi.UInt32(0)), model_of(field), rays_of(o, d))
     image = np.empty((*one.size, 3), np.float32)
     image[tuple(tiled(one.size[0]).T)] = np.clip(np.array(seen.colour).T, 0, 1)
     return Photo(one.name, image, None, None, one, np.zeros(3, np.float32))
@@ -217,7 +217,7 @@ def _photo(field: SphericalGrid, one: Camera) -> Photo:
 class Task:
     """Rays of one kind: what they are, their pinholes and which of them each has."""
 
-    rays: Rays
+    rays: RayBatch
     pinholes: np.ndarray | None = None
     view: np.ndarray | None = None
 
@@ -249,9 +249,9 @@ def our_step(field: SphericalGrid, task: Task) -> Callable[[int], list[mi.Float]
     def step(number: int) -> list[mi.Float]:
         baked = view is not None
         source = bake(field, cells, task.pinholes, view, True) if baked else exact(field, task.rays, True)
-        seen = look(cells, source, model, task.rays)
+        seen = render(cells, source, model, task.rays)
         dr.eval(seen)
-        look_back(cells, source, model, seen, 2 * seen.colour)
+        backward(cells, source, model, seen, 2 * seen.colour)
         return list(fold(field, cells, source, task.pinholes)) if baked else [source.density_slope, source.harmonics_slope]
 
     return step
@@ -360,10 +360,10 @@ def ask_locality(size: Size) -> dict:
     return answer
 
 
-def seen_of(fit: RadianceFit, rays: Rays, origin: np.ndarray) -> np.ndarray:
+def seen_of(fit: RadianceFit, rays: RayBatch, origin: np.ndarray) -> np.ndarray:
     """What rays from a pinhole see of a fit's field, (n, 3)."""
     cells = cells_of(fit.field)
-    return np.array(look(cells, bake(fit.field, cells, origin, mi.UInt32(0)), model_of(fit.field, STOP), rays).colour).T
+    return np.array(render(cells, bake(fit.field, cells, origin, mi.UInt32(0)), model_of(fit.field, STOP), rays).colour).T
 
 
 # -- Fits ---------------------------------------------------------------------------------------------------------------------
@@ -383,7 +383,7 @@ class Judge:
             o, d = rays_through(photo.camera, tiled(side))
             self.views.append((rays_of(o, d), photo.image[tuple(tiled(side).T)], o[:1]))
 
-    def __call__(self, render: Callable[[Rays, np.ndarray], np.ndarray]) -> float:
+    def __call__(self, render: Callable[[RayBatch, np.ndarray], np.ndarray]) -> float:
         errors = [np.mean((np.clip(render(rays, o), 0, 1) - image) ** 2) for rays, image, o in self.views]
         return float(np.mean([-10 * np.log10(max(e, 1e-10)) for e in errors]))
 
@@ -428,7 +428,7 @@ def peer_fit(photos: list[Photo], judge_of: Judge, size: Size) -> list[tuple[flo
     dr.sync_thread()
     peer, curve, spent = Peer.start(size.fit_resolution // 8), [], 0.0
 
-    def render(rays: Rays, origin: np.ndarray) -> np.ndarray:
+    def render(rays: RayBatch, origin: np.ndarray) -> np.ndarray:
         return np.array(peer.render(mi.Point3f((rays.o + 1) * 0.5), rays.d)).T
 
     for number in range(4):

@@ -10,7 +10,8 @@ Memory is float32 as mivol.fields.spherical lays it out: rows filled up to a mul
 3), and for a sparse field the list of its nodes and the row of vacuum. Files are half floats, before they are compressed.
 
 The walk reads an index beside that, whatever is kept: a row for each node, a number for each cell, and for each cell near a
-surface the corners of it (mivol.transport.occupied). It is counted on a ball's surface that keeps as many nodes.
+surface the corners of it (mivol.transport.traversal.occupied_cells). It is counted on a ball's surface that keeps as many
+nodes.
 
 Quality is that of the runs' held-out views (`mivol optimize` on photographs leaves field.npz and run.json), with what their
 fields take in truth. Prints a table in Markdown, then all of it as JSON.

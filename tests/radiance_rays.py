@@ -6,7 +6,16 @@ import mitsuba as mi
 import numpy as np
 
 from mivol.fields.spherical import SphericalGrid
-from mivol.transport.radiance import Rays, Seen, bake, cells_of, exact, look, look_back, model_of
+from mivol.transport.line_integrals.radiance_field import (
+    RayBatch,
+    RenderedRays,
+    backward,
+    bake,
+    cells_of,
+    exact,
+    model_of,
+    render,
+)
 
 TO_WORLD = np.array([[2.0, 0.3, 0.0, -1.2], [-0.2, 1.5, 0.1, -0.7], [0.0, 0.1, 2.5, -1.3], [0, 0, 0, 1]])
 """Rotated a little, sheared and of three lengths."""
@@ -28,15 +37,15 @@ def aim(count, to_world=TO_WORLD, seed=1):
     return o, np.float32(d / np.linalg.norm(d, axis=1, keepdims=True))
 
 
-def rays_of(o, d) -> Rays:
+def rays_of(o, d) -> RayBatch:
     o, d = (np.atleast_2d(np.asarray(a, np.float32)) for a in (o, d))
-    return Rays(mi.Point3f(np.ascontiguousarray(o.T)), mi.Vector3f(np.ascontiguousarray(d.T)))
+    return RayBatch(mi.Point3f(np.ascontiguousarray(o.T)), mi.Vector3f(np.ascontiguousarray(d.T)))
 
 
-def followed(field, o, d, stop=0.0, pinhole=None) -> Seen:
+def followed(field, o, d, stop=0.0, pinhole=None) -> RenderedRays:
     rays, cells = rays_of(o, d), cells_of(field)
     source = exact(field, rays) if pinhole is None else bake(field, cells, np.atleast_2d(pinhole), mi.UInt32(0))
-    return look(cells, source, model_of(field, stop), rays)
+    return render(cells, source, model_of(field, stop), rays)
 
 
 def see(field, o, d, stop=0.0, pinhole=None):
@@ -49,6 +58,6 @@ def derive(field: SphericalGrid, o, d, colour, T=0.0, distance=0.0, stop=0.0):
     """Derivatives of sum(colour . L + T T + distance D) for the raw densities and harmonics of the nodes."""
     rays, cells = rays_of(o, d), cells_of(field)
     source, model = exact(field, rays, slope=True), model_of(field, stop)
-    seen = look(cells, source, model, rays)
-    look_back(cells, source, model, seen, mi.Color3f(*colour), T, distance)
+    seen = render(cells, source, model, rays)
+    backward(cells, source, model, seen, mi.Color3f(*colour), T, distance)
     return field.with_values(source.density_slope, source.harmonics_slope).values()

@@ -85,10 +85,11 @@ def from_lanes(tau: object) -> np.ndarray:
 
 def make_lattice(values: np.ndarray | mi.TensorXf, to_world: np.ndarray, skip: bool = False) -> object:
     """A lattice of the fast path, with or without the gaps that let it skip empty blocks."""
-    from mivol.transport.lattice import Lattice, find_gaps
+    from mivol.transport.traversal.empty_blocks import find_empty_distances
+    from mivol.transport.traversal.lattice import Lattice
 
     values = values if isinstance(values, mi.TensorXf) else tensor(values)
-    return Lattice(values, to_world, find_gaps(values) if skip else None)
+    return Lattice(values, to_world, find_empty_distances(values) if skip else None)
 
 
 def tau_fast(
@@ -100,7 +101,7 @@ def tau_fast(
     skip: bool = False,
 ) -> np.ndarray:
     """Optical depth (n, C) of rays (n, 3) by the code under test."""
-    from mivol.transport.optical_depth import integrate_tau
+    from mivol.transport.media.grid_integral import integrate_tau
 
     o, d = np.broadcast_arrays(np.atleast_2d(o), np.atleast_2d(d))
     ends = mi.Float(np.broadcast_to(np.float32(t_max), len(o)).copy())
@@ -116,7 +117,7 @@ def tau_and_row(
     skip: bool = False,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Optical depth through a grid of ones, and the sum over rays of its gradient (Z, Y, X), by the code under test."""
-    from mivol.transport.optical_depth import integrate_tau
+    from mivol.transport.media.grid_integral import integrate_tau
 
     o, d = np.broadcast_arrays(np.atleast_2d(o), np.atleast_2d(d))
     values = tensor(np.ones(shape))

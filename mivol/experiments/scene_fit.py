@@ -28,7 +28,7 @@ from mivol.report.record import Choice, RunRecord
 from mivol.scene.load import LoadedScene, load_scene
 from mivol.scene.needs import find_needs, survey_scene
 from mivol.scene.plan import make_plan
-from mivol.transport.path import Settings
+from mivol.transport.path.settings import Settings
 from mivol.validate.statistics import nrmse, psnr
 
 HELD_OUT = 2

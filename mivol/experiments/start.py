@@ -14,7 +14,7 @@ from mivol.config import Sought
 from mivol.errors import MivolError
 from mivol.files import read_volume
 from mivol.optim.parameters import GRID, Parameter, as_tensor, find
-from mivol.transport.medium import place_of_grid
+from mivol.transport.media.read_medium import place_of_grid
 
 
 @dataclass(frozen=True)

@@ -281,7 +281,7 @@ class SphericalGrid:
     def eval(self, p: mi.Point3f, d: mi.Vector3f, active: mi.Bool = True) -> tuple[mi.Float, mi.Color3f]:
         """Extinction and colour at world points, seen along unit world directions; 0 outside the box.
 
-        Cost: 8 rows a point. Rays are followed by :mod:`mivol.transport.radiance`, which reads less.
+        Cost: 8 rows a point. Rays are followed by :mod:`mivol.transport.line_integrals.radiance_field`, which reads less.
         """
         z, y, x = self.res
         rows = [[dr.opaque(mi.Float, float(v)) for v in row] for row in lattice_from_world(self.to_world, self.res)]

@@ -28,7 +28,7 @@ from mivol.errors import MivolError
 from mivol.optim.losses import Loss
 from mivol.scene.needs import is_scattering, survey_scene
 from mivol.scene.session import Session
-from mivol.transport.medium import view_medium
+from mivol.transport.media.read_medium import view_medium
 
 NOTABLE = 0.05
 """Share of a loss that may be noise before a fit says so."""

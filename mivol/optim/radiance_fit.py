@@ -32,8 +32,17 @@ from mivol.optim.radiance_plan import PRESETS, Plan, Stage, memory_of, place_gri
 from mivol.optim.radiance_priors import Neighbours, dull, smooth, thin_out
 from mivol.optim.radiance_views import Batch, Views
 from mivol.photos import Camera, pixel_centres, rays
-from mivol.transport.occupied import Cells
-from mivol.transport.radiance import Rays, bake, brightest_weights, cells_of, fold, look, look_back, model_of
+from mivol.transport.line_integrals.radiance_field import (
+    RayBatch,
+    backward,
+    bake,
+    brightest_weights,
+    cells_of,
+    fold,
+    model_of,
+    render,
+)
+from mivol.transport.traversal.occupied_cells import Cells
 
 __all__ = ["PRESETS", "Plan", "RadianceFit", "Seen", "Stage", "memory_of", "render_view"]
 
@@ -159,7 +168,7 @@ class RadianceFit:
         """
         source = bake(self.field, self.cells, points, batch.slot, slope=True)
         model, count = model_of(self.field, self.plan.stop), dr.width(batch.slot)
-        seen = look(self.cells, source, model, batch.rays)
+        seen = render(self.cells, source, model, batch.rays)
         before = batch.before
         behind = before if background is None else mi.Color3f(*(dr.opaque(mi.Float, float(c)) for c in background))
         behind = behind if self.sky is None else self.sky.seen(batch.rays.d)
@@ -174,7 +183,7 @@ class RadianceFit:
             through += self.plan.beta / count * batch.counted * (dr.rcp(T) - dr.rcp(1 - T))
         loss = dr.squared_norm(error) * (1 / 3)
         dr.eval(seen, by, through, loss)
-        look_back(self.cells, source, model, seen, by, through)
+        backward(self.cells, source, model, seen, by, through)
         dr.eval(source.slope)
         slopes = list(fold(self.field, self.cells, source, points))
         return loss, slopes if self.sky is None else [*slopes, self.sky.slopes(batch.rays.d, by * seen.T)]
@@ -296,7 +305,7 @@ def render_view(field: SphericalGrid, camera: Camera, background: np.ndarray | S
         background: behind the field: a colour (3,), or a sky.
         stop: a ray ends at this transmittance.
 
-    Bias: O(h^4) in a cell, and that of :func:`mivol.transport.radiance.bake`.
+    Bias: O(h^4) in a cell, and that of :func:`mivol.transport.line_integrals.radiance_field.bake`.
     """
     cells, model = cells_of(field), model_of(field, stop)
     source = bake(field, cells, camera.origin[None], mi.UInt32(0))
@@ -307,8 +316,8 @@ def render_view(field: SphericalGrid, camera: Camera, background: np.ndarray | S
     for start in range(0, len(order), PASS):
         o, d = rays(camera, pixels[start : start + PASS])
         o = np.broadcast_to(o, d.shape)
-        sent = Rays(*(kind(np.ascontiguousarray(np.float32(a.T))) for kind, a in ((mi.Point3f, o), (mi.Vector3f, d))))
-        seen = look(cells, source, model, sent)
+        sent = RayBatch(*(kind(np.ascontiguousarray(np.float32(a.T))) for kind, a in ((mi.Point3f, o), (mi.Vector3f, d))))
+        seen = render(cells, source, model, sent)
         behind = background.seen(sent.d) if isinstance(background, Sky) else mi.Color3f(*map(float, background))
         colour = seen.colour + seen.T * behind
         dr.eval(colour, seen.T, seen.distance)

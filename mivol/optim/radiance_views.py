@@ -18,7 +18,7 @@ import numpy as np
 
 from mivol.errors import MivolError
 from mivol.photos import Photo
-from mivol.transport.radiance import Rays
+from mivol.transport.line_integrals.radiance_field import RayBatch
 
 __all__ = ["TILE", "Batch", "Level", "Views"]
 
@@ -48,7 +48,7 @@ class Batch:
     or 0 where a mask leaves the pixel out.
     """
 
-    rays: Rays
+    rays: RayBatch
     slot: mi.UInt32
     target: mi.Color3f
     alpha: mi.Float
@@ -158,7 +158,7 @@ class Views:
         d = mi.Vector3f(*(dr.fma(lens[4 + 3 * a], x, dr.fma(lens[5 + 3 * a], y, -lens[6 + 3 * a])) for a in range(3)))
         o = mi.Point3f(lens[13], lens[14], lens[15])
         alpha = codes[3] if self.channels == 4 else mi.Float(1)
-        return Batch(Rays(o, dr.normalize(d)), slot, mi.Color3f(*codes[:3]), alpha, mi.Color3f(*lens[16:]), counted)
+        return Batch(RayBatch(o, dr.normalize(d)), slot, mi.Color3f(*codes[:3]), alpha, mi.Color3f(*lens[16:]), counted)
 
 
 LENS = 19

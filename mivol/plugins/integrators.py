@@ -7,7 +7,7 @@ from typing import Any
 import mitsuba as mi
 
 from mivol.scene.session import Session
-from mivol.transport.path import Settings
+from mivol.transport.path.settings import Settings
 
 
 class MivolIntegrator(mi.ad.integrators.common.ADIntegrator):

@@ -18,7 +18,7 @@ import numpy as np
 
 from mivol.errors import MivolError
 
-__all__ = ["Hemisphere", "LookAts", "RIGS", "Rig", "Ring", "SceneSensors", "find_box", "look_at", "rig_from"]
+__all__ = ["RIGS", "Hemisphere", "LookAts", "Rig", "Ring", "SceneSensors", "find_box", "look_at", "rig_from"]
 
 Vector = tuple[float, float, float]
 
@@ -267,8 +267,7 @@ def _fov_that_fits(radius: float, distance: float) -> float:
     """Full angle of the cone that touches a sphere: sin(fov/2) = radius/distance."""
     if distance <= radius:
         raise MivolError(
-            f"a camera {distance:.4g} from its target is inside the sphere of radius {radius:.4g} about the box; "
-            "give it a fov."
+            f"a camera {distance:.4g} from its target is inside the sphere of radius {radius:.4g} about the box; give it a fov."
         )
     return float(2 * np.degrees(np.arcsin(radius / distance)))
 

@@ -13,7 +13,7 @@ import mitsuba as mi
 import numpy as np
 
 from mivol.errors import MivolError
-from mivol.transport.lattice import slab
+from mivol.transport.traversal.lattice import slab
 
 __all__ = ["Coefficients"]
 

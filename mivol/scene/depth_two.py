@@ -28,10 +28,12 @@ import numpy as np
 
 from mivol.errors import MivolError
 from mivol.scene.nesting import extent
-from mivol.transport.medium import Box, MediumView, Part
-from mivol.transport.optical_depth import integrate_tau
-from mivol.transport.path import optical_depth_to
-from mivol.transport.world import Body, World
+from mivol.transport.media.body import Body
+from mivol.transport.media.box import Box
+from mivol.transport.media.grid_integral import integrate_tau
+from mivol.transport.media.medium_view import MediumView, Part
+from mivol.transport.media.ray_intervals import integrate_optical_depth
+from mivol.transport.media.scene_media import World
 
 __all__ = ["ALBEDOS", "TABLES", "TAUS", "depth_two_error", "draw_lines", "mean_albedo", "mean_cosine", "scattering_depth"]
 
@@ -91,7 +93,7 @@ def depth_two_error(albedo: float, tau: float, light: str = "constant", phase: s
     above its last column, where it hardly rises.
 
     Args:
-        albedo: single-scattering albedo, in [0, 1]; of a volume, its mean weighted by extinction.
+        albedo_arrays: single-scattering albedo, in [0, 1]; of a volume, its mean weighted by extinction.
         tau: optical depth as :func:`scattering_depth` measures it, at least 0.
         light: "constant" (sky, environment) or "collimated" (sun, lamps).
         phase: "isotropic" or "forward".
@@ -197,15 +199,15 @@ def _traced_depths(scene: mi.Scene, view: MediumView, ray: mi.Ray3f) -> np.ndarr
     """Optical depth (n, channels) of lines in a boundary of any shape, up to the first opaque surface."""
     world = World([Body(view, None)], has_surfaces=True, size=extent(scene))
     nowhere = dr.zeros(mi.MediumPtr, dr.width(ray))
-    _, tau = optical_depth_to(scene, world, ray, nowhere, dr.full(mi.Bool, True, dr.width(ray)))
+    _, tau = integrate_optical_depth(scene, world, ray, nowhere, dr.full(mi.Bool, True, dr.width(ray)))
     return np.stack([np.array(t, np.float64) for t in tau], axis=-1)
 
 
 def mean_albedo(view: MediumView) -> float:
     """Albedo [1] of a medium, mean over space (of scattering over that of extinction, where given), of its highest channel."""
-    means = [np.asarray(dr.detach(a), np.float64) for a in view.albedo]
+    means = [np.asarray(dr.detach(a), np.float64) for a in view.albedo_arrays]
     scattering = max(float(m.reshape(-1, m.shape[-1]).mean(axis=0).max()) if m.ndim == 4 else float(m.max()) for m in means)
-    if view.share is not None:
+    if view.albedo is not None:
         return scattering
     total = sum(_mean_value(part) for part in view.parts)
     return scattering / total if total > 0 else 0.0

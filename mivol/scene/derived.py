@@ -15,7 +15,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from mivol.transport.medium import traverse_medium
+from mivol.transport.media.read_medium import traverse_medium
 
 __all__ = ["renew", "tangents_led"]
 

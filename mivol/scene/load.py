@@ -23,7 +23,7 @@ import numpy as np
 
 from mivol.errors import MivolError
 
-__all__ = ["LoadedScene", "SceneSource", "VARIANTS", "check_variant", "content_hash", "find_sensor", "load_scene"]
+__all__ = ["VARIANTS", "LoadedScene", "SceneSource", "check_variant", "content_hash", "find_sensor", "load_scene"]
 
 SceneSource = str | os.PathLike | Mapping
 

@@ -22,12 +22,16 @@ from mivol.files import check_volume
 from mivol.scene.coefficients import check_constant
 from mivol.scene.load import check_variant
 from mivol.scene.nesting import Room, bounds, extent, nesting_fault, room_of
-from mivol.transport.direct import UNIFORM
-from mivol.transport.lattice import Lattice, block_bounds, block_gaps, box_nodes, locate
-from mivol.transport.light_grid import Coarse, coarsen
-from mivol.transport.medium import Box, MediumView, Part, box_of_cube, kind_of, view_medium
-from mivol.transport.optical_depth import interpolate
-from mivol.transport.tracking import Blocks, find_blocks
+from mivol.transport.estimators.emitters import UNIFORM
+from mivol.transport.media.box import Box, box_of_cube
+from mivol.transport.media.medium_view import MediumView, Part
+from mivol.transport.media.read_medium import kind_of, view_medium
+from mivol.transport.traversal.block_ranges import BlockRanges, find_block_ranges
+from mivol.transport.traversal.coarse_grid import CoarseGrid, coarsen_grid
+from mivol.transport.traversal.empty_blocks import block_bounds, empty_block_distances
+from mivol.transport.traversal.grid_walk import box_nodes
+from mivol.transport.traversal.interpolation import interpolate
+from mivol.transport.traversal.lattice import Lattice, locate
 
 __all__ = ["Boundary", "MediumFacts", "Needs", "find_needs", "is_scattering"]
 
@@ -80,7 +84,7 @@ class Needs:
         views: their extinction, in the same order, with its gradients.
         media: what each is made of, in the same order.
         surfaces: kinds of the shapes that are more than boundaries.
-        is_veiled: some surface lets light through undeviated and is more than a boundary.
+        has_null_transmission: some surface lets light through undeviated and is more than a boundary.
         emitters: kinds.
         lamps: of each emitter: ``uniform`` (the same from everywhere), ``sharp`` (of one position or direction) or ``wide``.
         refractive: names of the boundaries that bend or blur the light that passes them.
@@ -96,7 +100,7 @@ class Needs:
     views: tuple[MediumView, ...]
     media: tuple[MediumFacts, ...]
     surfaces: tuple[str, ...]
-    is_veiled: bool
+    has_null_transmission: bool
     emitters: tuple[str, ...]
     lamps: tuple[str, ...]
     refractive: tuple[str, ...]
@@ -116,7 +120,7 @@ class Survey:
 
     boundaries: tuple[Boundary, ...]
     surfaces: tuple[str, ...]
-    is_veiled: bool
+    has_null_transmission: bool
     emitters: tuple[str, ...]
     lamps: tuple[str, ...]
     refractive: tuple[str, ...]
@@ -162,7 +166,7 @@ def find_needs(scene: mi.Scene, sensor: mi.Sensor, survey: Survey | None = None,
         views=views,
         media=media,
         surfaces=survey.surfaces,
-        is_veiled=survey.is_veiled,
+        has_null_transmission=survey.has_null_transmission,
         emitters=survey.emitters,
         lamps=survey.lamps,
         refractive=survey.refractive,
@@ -401,24 +405,24 @@ def _check_look_up(part: Part, survey: Survey, name: str) -> None:
         survey.looked_up.add(volume.ptr)
 
 
-def read_gaps(part: Part, survey: Survey, name: str) -> mi.UInt8:
+def read_empty_distances(part: Part, survey: Survey, name: str) -> mi.UInt8:
     """Measure the gaps between the blocks of a part that hold anything, once for each state of its array."""
     array, res = dr.detach(part.lattice.values.array), part.lattice.res
-    return _once(survey, ("gaps",), array, lambda: block_gaps(read_part(part, survey, name).bounds, res))
+    return _once(survey, ("gaps",), array, lambda: empty_block_distances(read_part(part, survey, name).bounds, res))
 
 
-def read_blocks(part: Part, survey: Survey) -> Blocks:
+def read_block_ranges(part: Part, survey: Survey) -> BlockRanges:
     """Read what the blocks of a grid hold, once for each state of its array."""
     values = part.lattice.values
-    return _once(survey, ("blocks",), dr.detach(values.array), lambda: find_blocks(values))
+    return _once(survey, ("blocks",), dr.detach(values.array), lambda: find_block_ranges(values))
 
 
-def read_coarse(survey: Survey, lattice: Lattice, shift: int, lists: bool) -> Coarse:
+def read_coarse(survey: Survey, lattice: Lattice, shift: int, lists: bool) -> CoarseGrid:
     """Make a grid coarser once for each state of its array and place; anew where a function is being recorded."""
     if dr.flag(dr.JitFlag.FreezingScope):
-        return coarsen(lattice, shift, lists)
-    kind = ("coarse", shift, lists, lattice.gaps is None, lattice.to_world.tobytes())
-    return _once(survey, kind, dr.detach(lattice.values.array), lambda: coarsen(lattice, shift, lists))
+        return coarsen_grid(lattice, shift, lists)
+    kind = ("coarse", shift, lists, lattice.empty_distances is None, lattice.to_world.tobytes())
+    return _once(survey, kind, dr.detach(lattice.values.array), lambda: coarsen_grid(lattice, shift, lists))
 
 
 def is_scattering(view: MediumView, survey: Survey, name: str) -> bool:
@@ -427,7 +431,7 @@ def is_scattering(view: MediumView, survey: Survey, name: str) -> bool:
     Raises:
         MivolError: an albedo outside [0, 1].
     """
-    positive = [_is_positive(a, survey, name, view.share is not None) for a in view.albedo]
+    positive = [_is_positive(a, survey, name, view.albedo is not None) for a in view.albedo_arrays]
     return any(positive)
 
 
@@ -475,7 +479,7 @@ def check_light(view: MediumView, survey: Survey, name: str) -> None:
     Raises:
         MivolError: light that is negative, infinite or NaN.
     """
-    for values in view.lights:
+    for values in view.emission_arrays:
         flat = dr.detach(dr.ravel(values))
         _once(survey, ("light",), flat, lambda flat=flat: _check_emission(flat, name))
 

@@ -16,8 +16,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mivol.transport.medium import box_of_cube
-from mivol.transport.world import spawn_ray
+from mivol.transport.media.box import box_of_cube
+from mivol.transport.traversal.ray_spawning import spawn_ray
 
 __all__ = ["Room", "bounds", "extent", "nesting_fault", "room_of"]
 

@@ -19,16 +19,19 @@ from mivol.errors import MivolError
 from mivol.machine import available_memory
 from mivol.scene.depth_two import depth_two_error, mean_albedo, mean_cosine, scattering_depth
 from mivol.scene.load import find_sensor
-from mivol.scene.needs import MediumFacts, Needs, Survey, find_needs, read_blocks, read_gaps, survey_scene
+from mivol.scene.needs import MediumFacts, Needs, Survey, find_needs, read_block_ranges, read_empty_distances, survey_scene
 from mivol.scene.nesting import bounds
-from mivol.transport.aovs import AOVS
-from mivol.transport.direct import Lights
-from mivol.transport.field import share_cells
-from mivol.transport.light_grid import find_light_grid, measure_bias
-from mivol.transport.medium import Box, MediumView, traverse_medium
-from mivol.transport.optical_depth import PACKED_LIMIT, gradient_bytes
-from mivol.transport.path import Settings
-from mivol.transport.world import Body, World, share_flight
+from mivol.transport.estimators.emitters import SceneEmitters
+from mivol.transport.estimators.transmittance_grid import build_transmittance_grid, measure_transmittance_bias
+from mivol.transport.line_integrals.aovs import AOVS
+from mivol.transport.media.body import Body, flight_parts
+from mivol.transport.media.box import Box
+from mivol.transport.media.grid_integral import PACKED_LIMIT, gradient_bytes
+from mivol.transport.media.medium_view import MediumView
+from mivol.transport.media.read_medium import traverse_medium
+from mivol.transport.media.scene_media import World
+from mivol.transport.media.summed_extinction import share_cells
+from mivol.transport.path.settings import Settings
 
 __all__ = ["Choice", "Plan", "build_world", "check_aovs", "explain", "make_plan"]
 
@@ -123,7 +126,7 @@ def check_aovs(names: str) -> tuple[str, ...]:
     """Split a comma list of AOVs.
 
     Raises:
-        MivolError: a name that is not in :data:`mivol.transport.aovs.AOVS`, or one given twice.
+        MivolError: a name that is not in :data:`mivol.transport.line_integrals.aovs.AOVS`, or one given twice.
     """
     asked = tuple(n.strip() for n in names.split(",") if n.strip())
     for name in asked:
@@ -160,13 +163,13 @@ def _refuse_emission(needs: Needs, settings: Settings) -> None:
             "scattered by the other is not there yet: set max_depth to 1, or the albedo to 0."
         )
     for facts, view in zip(needs.media, needs.views, strict=True):
-        if isinstance(view.glow, mi.Volume) and not share_cells(view.guide, view.frame):
+        if isinstance(view.emission_density, mi.Volume) and not share_cells(view.walked_lattice, view.emission_lattice):
             raise MivolError(
-                f"the emission_density of the medium in {facts.name} has {view.frame.res} voxels (Z, Y, X) and its extinction "
-                f"{view.guide.res}, or they lie in different places; a glow is summed in the cells of the extinction: give "
-                "both the same resolution and to_world."
+                f"the emission_density of the medium in {facts.name} has {view.emission_lattice.res} voxels (Z, Y, X) and its "
+                f"extinction {view.walked_lattice.res}, or they lie in different places; it is summed in the cells of the "
+                "extinction: give both the same resolution and to_world."
             )
-        for name, volume in (("emission", view.source), ("albedo", view.share)) if view.source is not None else ():
+        for name, volume in (("emission", view.emission), ("albedo", view.albedo)) if view.emission is not None else ():
             least = _voxel_over_cells(volume, view) if isinstance(volume, mi.Volume) else 1.0
             if least < 1 - 1e-4:  # the place of a stock grid is known to 5e-6
                 led = any(p.lattice is not None for p in view.parts)
@@ -179,8 +182,8 @@ def _refuse_emission(needs: Needs, settings: Settings) -> None:
 
 def _voxel_over_cells(volume: mi.Volume, view: MediumView) -> float:
     """A voxel of a volume over the longest edge of a cell that is walked, both as the volume counts lengths."""
-    cells = view.guide
-    place = volume.mivol_to_world if hasattr(volume, "mivol_to_world") else view.rooms[volume.ptr].to_world
+    cells = view.walked_lattice
+    place = volume.mivol_to_world if hasattr(volume, "mivol_to_world") else view.stock_boxes[volume.ptr].to_world
     edges = cells.to_world[:3, :3] / np.array(cells.res[::-1])
     voxels = np.linalg.solve(place[:3, :3], edges) * np.array(volume.resolution(), dtype=np.float64)[:, None]
     return 1 / float(np.linalg.norm(voxels, axis=0).max())
@@ -226,7 +229,7 @@ def _refuse_quadrature(needs: Needs, settings: Settings) -> None:
 def _share_cells(needs: Needs) -> bool:
     """Whether one walk passes all of the first medium."""
     parts = needs.views[0].parts
-    return len(share_flight(parts)) == len(parts)
+    return len(flight_parts(parts)) == len(parts)
 
 
 def _pass_rays(needs: Needs) -> int:
@@ -366,20 +369,20 @@ def build_world(scene: mi.Scene, needs: Needs, plan: Plan, settings: Settings, s
     for boundary, view, skip, tracks in zip(needs.boundaries, needs.views, plan.skips, plan.tracks, strict=True):
         for part in view.parts:
             if skip and part.lattice is not None:
-                part.lattice.gaps = read_gaps(part, survey, boundary.name)
+                part.lattice.empty_distances = read_empty_distances(part, survey, boundary.name)
             # A grey variant sees the mean of an rgb extinction, and its transmittance is no mean.
             mixes = mi.is_monochromatic and part.channels > 1
             if tracks and part.lattice is not None and part.activation is None and not mixes:
-                part.lattice.blocks = read_blocks(part, survey)
+                part.lattice.block_ranges = read_block_ranges(part, survey)
         bodies.append(Body(view, boundary.box))
     return World(
         bodies,
         has_surfaces=bool(needs.surfaces),
         scatters=bool(needs.surfaces) and settings.max_depth not in (0, 1),
-        is_veiled=needs.is_veiled,
+        has_null_transmission=needs.has_null_transmission,
         start=needs.start,
-        locates=needs.camera_inside and needs.start is None,
-        lights=Lights(scene) if needs.lamps and _is_lit(needs, settings) else None,
+        locates_camera=needs.camera_inside and needs.start is None,
+        emitters=SceneEmitters(scene) if needs.lamps and _is_lit(needs, settings) else None,
         is_deterministic=settings.deterministic,
         events=plan.events,
         size=survey.size,
@@ -444,8 +447,8 @@ def _light_grid(scene: mi.Scene, needs: Needs, plan: Plan, settings: Settings) -
         return []
     with dr.suspend_grad():
         world = build_world(scene, needs, plan, settings, survey_scene(scene))
-        grid = find_light_grid(scene, world)
-        bias, rms = measure_bias(scene, world, grid)
+        grid = build_transmittance_grid(scene, world)
+        bias, rms = measure_transmittance_bias(scene, world, grid)
     nodes = grid.nodes[0] * grid.nodes[1] * grid.nodes[2]
     rays = needs.film_samples * sum(needs.media[0].resolutions[0])
     pays = "pays" if nodes < rays else "does not pay"

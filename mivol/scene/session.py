@@ -16,13 +16,16 @@ from mivol.scene.derived import renew, tangents_led
 from mivol.scene.load import find_sensor
 from mivol.scene.needs import Needs, Survey, find_needs, read_coarse, survey_scene
 from mivol.scene.plan import Plan, build_world, check_aovs, make_plan
-from mivol.transport.aovs import backproject_aovs, integrate_aovs, push_aovs
-from mivol.transport.control import View, find_control, find_level
-from mivol.transport.film import PLAIN, SPREAD, TILED, Rays, adjoint_rays, record
-from mivol.transport.light_grid import Shade, find_light_grid, find_shade
-from mivol.transport.path import Settings, is_straight, walk_path
-from mivol.transport.score import Adjoint, Primal, Tangent
-from mivol.transport.world import World
+from mivol.transport.estimators.constant_control import find_constant_control
+from mivol.transport.estimators.grid_control import CameraOrigins, build_grid_control
+from mivol.transport.estimators.transmittance_grid import build_transmittance_grid
+from mivol.transport.estimators.visibility_cache import VisibilityCache, build_visibility_cache
+from mivol.transport.line_integrals.aovs import integrate_aovs, jvp_aovs, vjp_aovs
+from mivol.transport.media.scene_media import World
+from mivol.transport.path.film import PLAIN, SPREAD, TILED, CameraRays, adjoint_rays, record
+from mivol.transport.path.scores import Primal, Replay, Tangent
+from mivol.transport.path.settings import Settings
+from mivol.transport.path.walk import is_straight, walk_path
 
 __all__ = ["Session"]
 
@@ -47,7 +50,7 @@ class Session:
 
     Args:
         settings: depth, roulette, hidden emitters.
-        aovs: comma list of the names in :data:`mivol.transport.aovs.AOVS`.
+        aovs: comma list of the names in :data:`mivol.transport.line_integrals.aovs.AOVS`.
 
     Raises:
         MivolError: an unknown AOV, or one named twice.
@@ -106,13 +109,11 @@ class Session:
             world.start_gradients()
             # What is pulled back to a volume waits there for the end: its edge to the parameter can be passed but once.
             with dr.isolate_grad():
-                for rays, dL, daovs in adjoint_rays(
-                    sensor, seed, spp, plan.pass_rays, self.aovs, grad_in, _layout(world)
-                ):
+                for rays, dL, daovs in adjoint_rays(sensor, seed, spp, plan.pass_rays, self.aovs, grad_in, _layout(world)):
                     self._replay(scene, world, rays, dL, daovs)
                     dr.eval()
             with dr.resume_grad():
-                world.push_gradients()
+                world.deliver_gradients()
 
     def sample(self, scene: mi.Scene, sampler: mi.Sampler, ray: mi.Ray3f, active: mi.Bool) -> tuple:
         """Radiance along given rays, for integrators that nest this one, which do not tell what sensor the rays come from."""
@@ -120,7 +121,7 @@ class Session:
             world, _ = self._open(scene, find_sensor(scene, 0), 1, pictures=True)
             named = [sensor.get_medium() for sensor in scene.sensors()]
             world.start = named[0] if all(medium is named[0] for medium in named) else None
-            world.locates = bool(world.traced)
+            world.locates_camera = bool(world.traced)
             score, valid = walk_path(scene, world, self.settings, sampler, ray, Primal(_black(ray)), active)
             return score.L, valid, integrate_aovs(scene, world, ray, self.aovs, active)
 
@@ -133,57 +134,59 @@ class Session:
         needs = find_needs(scene, sensor, survey, spp)
         plan = make_plan(needs, self.settings)
         world = build_world(scene, needs, plan, self.settings, survey)
-        if world.lights is not None:
+        if world.emitters is not None:
             with dr.suspend_grad():
-                world.shade = self._shade(scene, world, needs, plan, pictures)
+                world.visibility_cache = self._visibility_cache(scene, world, needs, plan, pictures)
                 if self.settings.shadows == "grid":
-                    world.light_grid = find_light_grid(scene, world)
+                    world.transmittance_grid = build_transmittance_grid(scene, world)
         return world, plan
 
-    def _shade(self, scene: mi.Scene, world: World, needs: Needs, plan: Plan, pictures: bool) -> Shade | None:
+    def _visibility_cache(
+        self, scene: mi.Scene, world: World, needs: Needs, plan: Plan, pictures: bool
+    ) -> VisibilityCache | None:
         """Find where lamps shine; derivatives are not 0 in empty blocks, which only values that were read can tell."""
         blind = not pictures or any(m.unread for m in needs.media)
         rays = needs.film_samples * (plan.events if pictures else 1)
         occupied = None if blind else needs.media[0].occupied
         survey = self._seen.survey
-        return find_shade(scene, world, rays, occupied, lambda *asked: read_coarse(survey, *asked))
+        return build_visibility_cache(scene, world, rays, occupied, lambda *asked: read_coarse(survey, *asked))
 
-    def _primal(self, scene: mi.Scene, world: World, rays: Rays) -> tuple:
+    def _primal(self, scene: mi.Scene, world: World, rays: CameraRays) -> tuple:
         score = Primal(_black(rays.ray))
         score, valid = walk_path(scene, world, self.settings, rays.sampler, rays.ray, score, strata=rays.strata)
         return score.L, valid, integrate_aovs(scene, world, rays.ray, self.aovs)
 
-    def _tangent(self, scene: mi.Scene, world: World, rays: Rays) -> tuple:
-        _take_control(scene, world, rays)
+    def _tangent(self, scene: mi.Scene, world: World, rays: CameraRays) -> tuple:
+        _find_controls(scene, world, rays)
         black = _black(rays.ray)
         score = Tangent(black, black, black)
         score, _ = walk_path(scene, world, self.settings, rays.sampler, rays.ray, score, strata=rays.strata)
-        return score.dL, dr.full(mi.Bool, False, dr.width(black)), push_aovs(scene, world, rays.ray, self.aovs)
+        return score.dL, dr.full(mi.Bool, False, dr.width(black)), jvp_aovs(scene, world, rays.ray, self.aovs)
 
-    def _replay(self, scene: mi.Scene, world: World, rays: Rays, dL: mi.Spectrum, daovs: list[mi.Float]) -> None:
-        _take_control(scene, world, rays)
+    def _replay(self, scene: mi.Scene, world: World, rays: CameraRays, dL: mi.Spectrum, daovs: list[mi.Float]) -> None:
+        _find_controls(scene, world, rays)
         again, L = rays.sampler.clone(), None
         if not is_straight(world, self.settings):
             known = Primal(_black(rays.ray), scatters=False)
             L = walk_path(scene, world, self.settings, rays.sampler, rays.ray, known, strata=rays.strata)[0].L
             dr.eval(L)
-        walk_path(scene, world, self.settings, again, rays.ray, Adjoint(L, dL), strata=rays.strata)
-        backproject_aovs(scene, world, rays.ray, self.aovs, daovs)
+        walk_path(scene, world, self.settings, again, rays.ray, Replay(L, dL), strata=rays.strata)
+        vjp_aovs(scene, world, rays.ray, self.aovs, daovs)
 
 
 def _layout(world: World) -> str:
     """How the rays of a pass lie: in tiles of pixels where they draw directions of the phase function, or to wide lamps."""
-    if world.lights is None:
+    if world.emitters is None:
         return PLAIN
-    return TILED if world.lights.has_lobes and not world.is_deterministic else SPREAD
+    return TILED if world.emitters.samples_phase and not world.is_deterministic else SPREAD
 
 
-def _take_control(scene: mi.Scene, world: World, rays: Rays) -> None:
+def _find_controls(scene: mi.Scene, world: World, rays: CameraRays) -> None:
     """Find the control variate of a derivative, once for all passes."""
-    if world.takes_control:
-        world.control = world.control or find_control(scene, world, world.bodies[0], View.of(rays.ray))
-    elif world.lights is not None and world.level is None:
-        world.level = find_level(scene, world)
+    if world.takes_grid_control:
+        world.grid_control = world.grid_control or build_grid_control(scene, world, world.bodies[0], CameraOrigins.of(rays.ray))
+    elif world.emitters is not None and world.constant_control is None:
+        world.constant_control = find_constant_control(scene, world)
 
 
 def _black(ray: mi.Ray3f) -> mi.Spectrum:

@@ -2,7 +2,7 @@
 
 Conventions. x is a grid (Z, Y, X) [1/length] of the trilinear model (values at voxel centres, clamped borders, nothing
 outside the box), y are projections (views, rows, cols), no unit. Either may be flat; the answer has the form of the
-question. Both are float32 and both operators are the very sums that :mod:`mivol.transport.optical_depth` defines, so the
+question. Both are float32 and both operators are the very sums that :mod:`mivol.transport.media.grid_integral` defines, so the
 pair is matched: ``<A x, y> = <x, A.T y>`` to rounding.
 
 Rays are set up in float64: their origins are moved to the edge of a sphere around the grid and measured from its
@@ -23,8 +23,9 @@ import numpy as np
 from mivol.errors import MivolError
 from mivol.threads import check_one_thread
 from mivol.tomography.geometry import Geometry, VoxelGrid
-from mivol.transport.lattice import Lattice, clip, find_gaps
-from mivol.transport.optical_depth import Gradient, backproject_segment, integrate_segment
+from mivol.transport.media.grid_integral import Gradient, backproject_segment, integrate_segment
+from mivol.transport.traversal.empty_blocks import find_empty_distances
+from mivol.transport.traversal.lattice import Lattice, clip
 
 if TYPE_CHECKING:
     import scipy.sparse.linalg
@@ -178,7 +179,7 @@ class Projector:
 
     def _lattice(self, values: mi.Float, skip: bool) -> Lattice:
         tensor = mi.TensorXf(values, (*self.grid.shape, 1))
-        return Lattice(tensor, self._to_world, find_gaps(tensor) if skip else None)
+        return Lattice(tensor, self._to_world, find_empty_distances(tensor) if skip else None)
 
     def _passes(self) -> Iterator[tuple[int, mi.Point3f, mi.Vector3f]]:
         """(index of the first ray, origins, directions), pass by pass."""

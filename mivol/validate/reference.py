@@ -33,11 +33,11 @@ from mivol.files.atomic import write_whole
 from mivol.files.exr import read_exr, write_exr
 from mivol.optim.interrupt import Stop
 from mivol.scene.load import LoadedScene, SceneSource, check_variant, content_hash, find_sensor, load_scene
-from mivol.transport.medium import traverse_medium
+from mivol.transport.media.read_medium import traverse_medium
 from mivol.validate.statistics import Moments
 from mivol.validate.trust import Doubt, trust
 
-__all__ = ["Doubt", "INTEGRATORS", "ReferenceResult", "read_reference", "render_reference", "trust"]
+__all__ = ["INTEGRATORS", "Doubt", "ReferenceResult", "read_reference", "render_reference", "trust"]
 
 # Who may judge: Mitsuba's forward integrators for media.
 INTEGRATORS = ("volpath", "volpathmis")

@@ -17,7 +17,7 @@ import mitsuba as mi
 import numpy as np
 
 from mivol.scene.nesting import bounds, nesting_fault
-from mivol.transport.medium import children_of, kind_of, traverse_medium
+from mivol.transport.media.read_medium import children_of, kind_of, traverse_medium
 
 __all__ = ["CHECKS", "Doubt", "trust"]
 

@@ -12,7 +12,7 @@ from emission_scenes import BOUNDARIES, LE, PLACE, B, aimed, colours, emitting, 
 from oracle import GAUSS_2, box_interval, corner_weights, quadrature_points, trilinear
 from scipy.special import erf
 
-from mivol.transport.collocation import glow_in_cell, share_cell
+from mivol.transport.traversal.cell_quadrature import share_opacity, weigh_emission_density
 from scenes import as_float32, ball_of, box_of, centred
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
@@ -25,7 +25,7 @@ EPS = 2.0**-23
 
 def cell(dt, s1, s2, kind="Float64"):
     """What the code makes of cells."""
-    return [rule(*(getattr(mi, kind)(np.ravel(x)) for x in (dt, s1, s2))) for rule in (share_cell, glow_in_cell)]
+    return [rule(*(getattr(mi, kind)(np.ravel(x)) for x in (dt, s1, s2))) for rule in (share_opacity, weigh_emission_density)]
 
 
 def swept(edges, sigma, c, j):

@@ -16,8 +16,8 @@ from scattering_scenes import PLACE, aimed, close_up, fog, mivol, pencils, point
 
 from mivol.scene.needs import find_needs, survey_scene
 from mivol.scene.plan import build_world, explain, make_plan
-from mivol.transport.light_grid import find_light_grid, measure_bias
-from mivol.transport.path import Settings
+from mivol.transport.estimators.transmittance_grid import build_transmittance_grid, measure_transmittance_bias
+from mivol.transport.path.settings import Settings
 from scenes import as_float32, box_of, centred, grid_volume, refused, sky
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
@@ -97,7 +97,8 @@ def test_light_grid_against_exact_shadows():
     scene = close_up({"smoke": box, "lamp": lamp})
     world = open_world(scene)
     with dr.suspend_grad():
-        coarse, fine = (measure_bias(scene, world, find_light_grid(scene, world, cells))[1] for cells in (4, 1))
+        grids = (build_transmittance_grid(scene, world, cells) for cells in (4, 1))
+        coarse, fine = (measure_transmittance_bias(scene, world, grid)[1] for grid in grids)
     assert 0 < fine < 0.5 * coarse < 0.25
     exact, looked_up = (
         np.array(mi.render(scene, integrator=mi.load_dict(mivol(deterministic=True, shadows=s)), spp=16))
@@ -114,7 +115,7 @@ def test_light_grid_keeps_optical_depth_not_transmittance():
     scene = close_up({"smoke": box, "lamp": lamp})
     with dr.suspend_grad():
         world = open_world(scene)
-        bias, rms = measure_bias(scene, world, find_light_grid(scene, world))
+        bias, rms = measure_transmittance_bias(scene, world, build_transmittance_grid(scene, world))
     # Nodes in the faces look from 1e-5 of the box inside, where tau is up to 4e-5 off.
     assert abs(bias) <= rms <= 1e-4
 

@@ -12,8 +12,8 @@ from scipy.ndimage import distance_transform_cdt
 
 from mivol.fields.activation import ACTIVATIONS
 from mivol.fields.spherical import SphericalGrid
-from mivol.transport.lattice import REACH
-from mivol.transport.radiance import bake, cells_of, exact, fold, look, look_back, model_of
+from mivol.transport.line_integrals.radiance_field import backward, bake, cells_of, exact, fold, model_of, render
+from mivol.transport.traversal.empty_blocks import REACH
 
 
 @pytest.mark.parametrize("activation", ACTIVATIONS)
@@ -68,9 +68,9 @@ def test_pinhole_derivatives_are_those_of_what_a_pinhole_sees(variant_rgb: str) 
         cells = cells_of(field)
         source = bake(field, cells, pinholes, view, slope)
         model = model_of(field)
-        seen = look(cells, source, model, rays)
+        seen = render(cells, source, model, rays)
         if slope:
-            look_back(cells, source, model, seen, mi.Color3f(1, 0.5, -0.7))
+            backward(cells, source, model, seen, mi.Color3f(1, 0.5, -0.7))
             return field.with_values(*fold(field, cells, source, pinholes)).values()
         return float(np.dot(np.array(seen.colour, np.float64).sum(axis=1), [1, 0.5, -0.7]))
 
@@ -109,7 +109,7 @@ def test_fourth_order_and_ten_times_nearer_than_midpoints(variant_rgb: str) -> N
         field = SphericalGrid.from_dense(density, sh, np.eye(4), activation="none", offset=0.0)
         rays = rays_of(o32, d32)
         rays.t_max = mi.Float(t_max)
-        seen = look(cells_of(field), exact(field, rays), model_of(field), rays)
+        seen = render(cells_of(field), exact(field, rays), model_of(field), rays)
 
         # The same line, finely, by the midpoint rule in float64, and with as many midpoints as ours has points.
         def line(count):

@@ -13,8 +13,9 @@ from scattering_scenes import aimed, pencils, smoke, sun
 
 from mivol.scene.needs import find_needs, survey_scene
 from mivol.scene.plan import build_world, make_plan
-from mivol.transport.light_grid import FLOOR, SHARE, coarsen, find_shade
-from mivol.transport.path import Settings
+from mivol.transport.estimators.visibility_cache import FLOOR, SHARE, build_visibility_cache
+from mivol.transport.path.settings import Settings
+from mivol.transport.traversal.coarse_grid import coarsen_grid
 from scenes import centred, make_lattice
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
@@ -36,7 +37,7 @@ def sparse(channels: int) -> np.ndarray:
 @pytest.mark.parametrize("channels", [1, 3])
 def test_coarse_grids_are_means_in_their_place(channels, shift):
     values, edge = sparse(channels), 1 << shift
-    coarse = coarsen(make_lattice(mi.TensorXf(values), TWO), shift, True)
+    coarse = coarsen_grid(make_lattice(mi.TensorXf(values), TWO), shift, True)
     sizes = [-(-n // edge) for n in SIZE]
     index = [np.minimum(np.arange(m * edge), n - 1) for m, n in zip(sizes, SIZE, strict=True)]
     means = values[np.ix_(*index)].reshape(sizes[0], edge, sizes[1], edge, sizes[2], edge, channels).mean((1, 3, 5), np.float64)
@@ -51,7 +52,7 @@ def test_coarse_grids_are_means_in_their_place(channels, shift):
 def test_blocks_that_hold_anything_are_listed(shift):
     """Every block with a node that is not 0; none that is further than a block from one."""
     values, edge = sparse(1)[..., 0], 1 << shift
-    held = np.array(coarsen(make_lattice(mi.TensorXf(values[..., None]), TWO), shift, True).held)
+    held = np.array(coarsen_grid(make_lattice(mi.TensorXf(values[..., None]), TWO), shift, True).held)
     blocks = [(n >> shift) + 1 for n in SIZE]
     nodes = [np.clip(np.arange(b * edge + 1)[None] - 1, 0, n - 1)[0] for b, n in zip(blocks, SIZE, strict=True)]
     padded = values[np.ix_(*nodes)] > 0
@@ -79,7 +80,7 @@ def test_weights_are_those_of_beer(shift, occupied):
         world = build_world(seen.scene, needs, make_plan(needs, settings), settings, survey_scene(seen.scene))
         blocks = np.array([(n >> shift) + 1 for n in SIZE])
         # As many rays as ask for this lattice and for none that is finer.
-        shade = find_shade(seen.scene, world, int(np.ceil(1.001 * blocks.prod() / SHARE)), occupied, coarsen)
+        shade = build_visibility_cache(seen.scene, world, int(np.ceil(1.001 * blocks.prod() / SHARE)), occupied, coarsen_grid)
     assert shade.blocks == tuple(blocks)
     middle = ((np.arange(blocks[0]) << shift) + 0.5 * (1 << shift) - 0.5) / SIZE[0]
     depth = 2 * (1 - np.clip(middle, 0.25 / SIZE[0], 1 - 0.25 / SIZE[0]))

@@ -14,11 +14,12 @@ from scattering_scenes import PLACE, aimed, assert_same_images, close_up, mivol,
 
 import scenes
 from mivol.scene.plan import explain
-from mivol.transport import tracking
-from mivol.transport.dice import roll, start_dice
-from mivol.transport.lattice import Lattice, clip
-from mivol.transport.optical_depth import integrate_segment
-from mivol.transport.tracking import find_blocks, track
+from mivol.transport.estimators import ratio_tracking
+from mivol.transport.estimators.ratio_tracking import residual_ratio_tracking
+from mivol.transport.media.grid_integral import integrate_segment
+from mivol.transport.traversal.block_ranges import find_block_ranges
+from mivol.transport.traversal.lattice import Lattice, clip
+from mivol.transport.traversal.random_numbers import draw_pcg32, seed_pcg32
 from scenes import as_float32, refused
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
@@ -56,7 +57,7 @@ FIELDS = {
 
 def grid(values: np.ndarray) -> Lattice:
     lattice = Lattice(mi.TensorXf(np.ascontiguousarray(values)), np.array(PLACE))
-    lattice.blocks = find_blocks(lattice.values)
+    lattice.block_ranges = find_block_ranges(lattice.values)
     return lattice
 
 
@@ -65,7 +66,7 @@ def estimates(lattice: Lattice, scale: float = 1.0) -> tuple[np.ndarray, np.ndar
     o, d = (np.tile(v, (REPEATS, 1)).T for v in aimed(7, RAYS))
     o, d = mi.Point3f(o), mi.Vector3f(d)
     n, segment = RAYS * REPEATS, clip(lattice, o, d, 0, dr.inf)
-    found, _ = track(lattice, segment, mi.Float(scale), start_dice(mi.Float(0.3), n), mi.Bool(True))
+    found, _ = residual_ratio_tracking(lattice, segment, mi.Float(scale), seed_pcg32(mi.Float(0.3), n), mi.Bool(True))
     exact = integrate_segment(lattice, lattice.values.array, segment)
     T = [np.exp(-scale * np.array(t, dtype=np.float64)[:RAYS]) for t in exact]
     return np.array([np.array(f, dtype=np.float64).reshape(REPEATS, RAYS) for f in found]), np.array(T)
@@ -106,15 +107,15 @@ def test_variance_is_as_derived():
     lattice, n = grid(values), 1 << 19
     o = mi.Point3f(dr.full(mi.Float, -2, n), mi.Float(0), mi.Float(0))
     segment = clip(lattice, o, mi.Vector3f(1, 0, 0), 0, dr.inf)
-    found, _ = track(lattice, segment, mi.Float(1), start_dice(mi.Float(0.7), n), mi.Bool(True))
+    found, _ = residual_ratio_tracking(lattice, segment, mi.Float(1), seed_pcg32(mi.Float(0.7), n), mi.Bool(True))
     found = np.array(found[0], dtype=np.float64)
     f = (np.arange(1000) + 0.5) / 1000
     low, high = values[0, 0, :-1, 0] - 0.1, values[0, 0, 1:, 0] - 0.1
     # Two half voxels at the ends, of constant value; 2 / 7 of a length a cell.
     square = np.mean((1 - f) * low[:, None] ** 2 + f * high[:, None] ** 2, axis=1).sum() + 0.5 * (low[0] ** 2 + high[-1] ** 2)
     T = np.exp(-values[0, 0, :, 0].sum() * 2 / 7)
-    variance = T**2 * np.expm1(square * 2 / 7 / (tracking.KAPPA * 0.9))
-    assert T > 3 * tracking.FAINT * 0.9
+    variance = T**2 * np.expm1(square * 2 / 7 / (ratio_tracking.KAPPA * 0.9))
+    assert T > 3 * ratio_tracking.FAINT * 0.9
     # Roulette, and 2^19 samples know a variance to 0.3 %.
     assert found.var() == pytest.approx(variance, rel=0.03)
 
@@ -122,8 +123,8 @@ def test_variance_is_as_derived():
 @pytest.mark.parametrize("shape", [(1, 1, 1), (7, 8, 9), (15, 16, 17), (23, 1, 24)])
 def test_blocks_hold_all_nodes_of_their_cells(shape):
     values = np.random.default_rng(1).uniform(0, 5, (*shape, 3)).astype(np.float32)
-    blocks = find_blocks(mi.TensorXf(values))
-    edge = 1 << tracking.SHIFT
+    blocks = find_block_ranges(mi.TensorXf(values))
+    edge = 1 << ratio_tracking.SHIFT
     assert blocks.res == tuple(-(-(n + 1) // edge) for n in shape)
     table = np.array(blocks.table).reshape(*blocks.res, 4)
     for index in np.ndindex(*blocks.res):
@@ -135,7 +136,7 @@ def test_blocks_hold_all_nodes_of_their_cells(shape):
 
 def test_dice_are_even():
     """2^16 lanes, 4 numbers each: means of 1/2 and of 1/3, no correlation of neighbours, within 5 standard errors."""
-    _, numbers = roll(start_dice(mi.Float(0.25), 1 << 16), 4)
+    _, numbers = draw_pcg32(seed_pcg32(mi.Float(0.25), 1 << 16), 4)
     u = np.array([np.array(x, dtype=np.float64) for x in numbers])
     assert u.min() > 0 and u.max() < 1
     assert np.all(np.abs(u.mean(axis=1) - 0.5) < 5 * np.sqrt(1 / 12 / 2**16))

@@ -10,7 +10,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mivol.transport.radiance import bake, cells_of, look, model_of
+from mivol.transport.line_integrals.radiance_field import bake, cells_of, model_of, render
 
 
 @pytest.fixture(scope="module")
@@ -24,7 +24,7 @@ def test_the_peer_sees_the_same_and_derives_the_same(variant_rgb: str, bench: Mo
     field = type(field).from_dense(density, sh * np.float32(0.3), field.to_world)
     task = bench.tasks(bench.QUICK)["camera"]
     cells, peer = cells_of(field), bench.peer_of(field)
-    seen = look(cells, bake(field, cells, task.pinholes, mi.UInt32(0)), model_of(field), task.rays)
+    seen = render(cells, bake(field, cells, task.pinholes, mi.UInt32(0)), model_of(field), task.rays)
     ours = np.array(seen.colour)
     theirs = np.array(peer.render(mi.Point3f((task.rays.o + 1) * 0.5), task.rays.d))
     # The peer's last step reaches up to a whole one behind the box: an optical depth of 1.5 * 2 / 32 too much.

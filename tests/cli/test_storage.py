@@ -15,7 +15,7 @@ import pytest
 from bench_script import SCRIPTS, load
 
 from mivol.fields.spherical import SphericalGrid, save_field
-from mivol.transport.radiance import cells_of
+from mivol.transport.line_integrals.radiance_field import cells_of
 
 RES = (5, 6, 7)
 

@@ -13,7 +13,7 @@ import pytest
 from oracle import box_interval, depth_twin, overlap, sphere_interval, tau_twin, to_lattice, trilinear
 
 from mivol.errors import MivolError
-from mivol.transport import distance
+from mivol.transport.line_integrals import expected_depth
 from scenes import (
     as_float32,
     ball_of,
@@ -239,7 +239,7 @@ def test_depth_is_of_sixth_order():
         edges = np.linspace(0, 3, n + 1)
         points = edges[:-1, None] + np.diff(edges)[:, None] * (0.5 + math.sqrt(15) / 10 * np.array([-1, 0, 1]))
         lanes = [mi.Float64(np.ascontiguousarray(c)) for c in (1 + 0.8 * np.sin(2 * points + 0.3)).T]
-        stop = distance.stop_in_cell(mi.Float64(edges[:-1]), mi.Float64(np.diff(edges)), *lanes)
+        stop = expected_depth.stop_in_cell(mi.Float64(edges[:-1]), mi.Float64(np.diff(edges)), *lanes)
         T, N = np.array(stop.T), np.array(stop.N)
         front = np.cumprod(np.concatenate([[1], T]))
         return float((front[:-1] * N).sum() / (1 - front[-1]))
@@ -355,7 +355,7 @@ def test_nothing_runs_that_was_not_asked_for(backward, expected, monkeypatch):
     def forbidden(*_, **__):
         raise AssertionError("a depth that nobody asked for")
 
-    monkeypatch.setattr(distance, "stop_in_cell", forbidden)
+    monkeypatch.setattr(expected_depth, "stop_in_cell", forbidden)
     assert (loops(""), loops("tau,alpha")) == expected[:2]
     with pytest.raises(RuntimeError, match="while_loop"):
         loops("depth")

@@ -12,8 +12,8 @@ import pytest
 
 import scenes
 from mivol.scene import plan
-from mivol.transport import film
-from mivol.transport.film import count_passes
+from mivol.transport.path import film
+from mivol.transport.path.film import count_passes
 from mivol.validate.statistics import Moments, assert_same_mean
 from scenes import box_of, camera, grid_volume, medium, sky
 

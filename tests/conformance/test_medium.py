@@ -9,7 +9,8 @@ import pytest
 
 import scenes
 from mivol.scene.needs import Survey, is_scattering
-from mivol.transport.medium import box_of_cube, place_of_grid, view_medium
+from mivol.transport.media.box import box_of_cube
+from mivol.transport.media.read_medium import place_of_grid, view_medium
 from scenes import FRAMES, box_of, camera, grid_volume, medium, refused, render, sky
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")

@@ -13,7 +13,7 @@ import scenes
 from mivol.scene import plan
 from mivol.scene.needs import find_needs
 from mivol.scene.plan import explain, make_plan
-from mivol.transport.path import Settings
+from mivol.transport.path.settings import Settings
 from scenes import ball_of, box_of, camera, grid_volume, medium, refused, sky
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")

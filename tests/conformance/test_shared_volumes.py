@@ -9,7 +9,7 @@ import pytest
 import scattering_scenes as small
 from scattering_scenes import PLACE, assert_same_images, close_up, mivol, point, rough_grid
 
-from mivol.transport.medium import traverse_medium, view_medium
+from mivol.transport.media.read_medium import traverse_medium, view_medium
 from mivol.validate.reference import render_reference
 from scenes import box_of, centred, grid_volume, medium, sky, transform
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from mivol.scene import plan
-from mivol.transport import distance
+from mivol.transport.line_integrals import expected_depth
 from scenes import (
     as_float32,
     ball_of,
@@ -196,8 +196,8 @@ def test_derivatives_of_a_cell(size):
     a, dt = rng.uniform(-2, 2, 200), rng.uniform(0.1, 1, 200)
     sigma = size * rng.uniform(0, 1, (3, 200))
 
-    def stop(sigma: np.ndarray) -> distance.Stop:
-        return distance.stop_in_cell(*(mi.Float64(x) for x in (a, dt, *sigma)))
+    def stop(sigma: np.ndarray) -> expected_depth.Stop:
+        return expected_depth.stop_in_cell(*(mi.Float64(x) for x in (a, dt, *sigma)))
 
     exact, h = stop(sigma), 1e-4 * (1 + size)
     for q in range(3):

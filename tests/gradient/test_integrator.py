@@ -195,8 +195,9 @@ def test_gradient_where_prbvolpath_has_none():
 def test_replay_counts_down_to_zero():
     """The adjoint passes all the light by that the render found: what is left is rounding."""
     from mivol.scene.needs import find_needs, survey_scene
-    from mivol.transport.path import Settings, walk_path
-    from mivol.transport.score import Adjoint, Primal
+    from mivol.transport.path.scores import Primal, Replay
+    from mivol.transport.path.settings import Settings
+    from mivol.transport.path.walk import walk_path
 
     scene = build()
     sensor = scene.sensors()[0]
@@ -214,7 +215,7 @@ def test_replay_counts_down_to_zero():
         dr.eval(L)
         sampler.seed(3, n)
         world.start_gradients()
-        left = walk_path(scene, world, settings, sampler, ray, Adjoint(L, dr.zeros(mi.Spectrum, n)))[0].L
+        left = walk_path(scene, world, settings, sampler, ray, Replay(L, dr.zeros(mi.Spectrum, n)))[0].L
     # Five additions and subtractions of float32 numbers of the size of L.
     assert np.abs(np.array(left)).max() <= 1e-6 * np.abs(np.array(L)).max()
     assert np.array(L).max() > 0.5

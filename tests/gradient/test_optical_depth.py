@@ -23,7 +23,7 @@ BOUND = 2e-6
 
 def integrate(values, to_world, o, d, t_max=math.inf, skip=False):
     """The optical depth of tensors, derivatives attached."""
-    from mivol.transport.optical_depth import integrate_tau
+    from mivol.transport.media.grid_integral import integrate_tau
 
     ends = mi.Float(np.broadcast_to(np.float32(t_max), len(o)).copy())
     return integrate_tau(make_lattice(values, to_world, skip), *to_lanes(o, d), ends, mi.Bool(True))
@@ -163,7 +163,7 @@ def test_a_detached_grid_asks_for_no_gradient(seed):
 
 
 def test_inactive_lanes_receive_and_give_nothing(seed):
-    from mivol.transport.optical_depth import integrate_tau
+    from mivol.transport.media.grid_integral import integrate_tau
 
     _, values, to_world, o, d = setting(seed, "unit", 1, n=64)
     v = tensor(values)
@@ -195,7 +195,7 @@ def test_hard_42_a_million_rays_into_few_voxels(seed, shape):
 def test_rays_with_gradients_are_refused(seed):
     _, values, to_world, o, d = setting(seed, "unit", 1, n=4)
     lattice, (p, w) = make_lattice(values, to_world), to_lanes(o, d)
-    from mivol.transport.optical_depth import integrate_tau
+    from mivol.transport.media.grid_integral import integrate_tau
 
     for attached in (p, w):
         dr.enable_grad(attached)

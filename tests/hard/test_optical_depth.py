@@ -251,7 +251,7 @@ def test_hard_14_segments_within_one_cell():
 
 
 def test_hard_14_inactive_and_broken_rays():
-    from mivol.transport.optical_depth import integrate_tau
+    from mivol.transport.media.grid_integral import integrate_tau
 
     lattice = make_lattice(np.ones((4, 4, 4)), np.eye(4))
     o, d = np.tile([0.5, 0.5, -1.0], (4, 1)), np.tile([0.0, 0, 1], (4, 1))
@@ -359,7 +359,7 @@ def test_hard_49_degenerate_frames_are_refused(matrix, named):
 
 @pytest.mark.parametrize("shape", [(0, 2, 2, 1), (2, 2, 2), (2, 2)])
 def test_hard_49_empty_or_flat_grids_are_refused(shape):
-    from mivol.transport.lattice import Lattice
+    from mivol.transport.traversal.lattice import Lattice
 
     with pytest.raises(ValueError, match="shape"):
         Lattice(mi.TensorXf(np.ones(shape, dtype=np.float32)), np.eye(4))
@@ -428,23 +428,23 @@ def test_hard_22_half_empty(skip):
 
 def test_hard_22_gaps_are_the_distances_between_blocks():
     # Chebyshev distances of integers, by brute force over the blocks that hold anything: equal, not close.
-    from mivol.transport.lattice import BLOCK, REACH, block_bounds, find_gaps
+    from mivol.transport.traversal.empty_blocks import BLOCK, REACH, block_bounds, find_empty_distances
 
     rng = np.random.default_rng(32)
     values = np.where(rng.uniform(size=(23, 90, 41)) < 2e-4, 1, 0)
-    gaps = np.array(find_gaps(tensor(values))).reshape(*(-(-(n + 1) // BLOCK) for n in values.shape))
-    held = np.argwhere(np.array(block_bounds(tensor(values))).reshape(gaps.shape) > 0)
-    assert 1 < len(held) < gaps.size / 4
-    away = np.abs(np.indices(gaps.shape).reshape(3, -1).T[:, None] - held).max(axis=2).min(axis=1)
+    empty_distances = np.array(find_empty_distances(tensor(values))).reshape(*(-(-(n + 1) // BLOCK) for n in values.shape))
+    held = np.argwhere(np.array(block_bounds(tensor(values))).reshape(empty_distances.shape) > 0)
+    assert 1 < len(held) < empty_distances.size / 4
+    away = np.abs(np.indices(empty_distances.shape).reshape(3, -1).T[:, None] - held).max(axis=2).min(axis=1)
     assert away.max() > 2
-    np.testing.assert_array_equal(gaps.ravel(), np.minimum(away, REACH))
-    assert np.all(np.array(find_gaps(tensor(np.zeros((9, 9, 9))))) == REACH)
+    np.testing.assert_array_equal(empty_distances.ravel(), np.minimum(away, REACH))
+    assert np.all(np.array(find_empty_distances(tensor(np.zeros((9, 9, 9))))) == REACH)
 
 
 @pytest.mark.parametrize("skip", [False, True])
 def test_hard_22_gradient_in_and_out_of_the_shell(skip):
     # d tau / d sigma does not know sigma: the voxels of an empty block have the same row of A as all others.
-    from mivol.transport.optical_depth import integrate_tau
+    from mivol.transport.media.grid_integral import integrate_tau
 
     values = tensor(shell(24))
     dr.enable_grad(values)

@@ -50,9 +50,10 @@ from mivol.optim.radiance_plan import PRESETS, Plan, Stage
 from mivol.optim.radiance_views import TILE, Views
 from mivol.photos import Camera, Photo, pixel_centres, rays
 from mivol.photos.camera import intrinsics
-from mivol.transport.lattice import REACH, clip
-from mivol.transport.occupied import march
-from mivol.transport.radiance import bake, cells_of, exact, look, look_back, model_of
+from mivol.transport.line_integrals.radiance_field import backward, bake, cells_of, exact, model_of, render
+from mivol.transport.traversal.empty_blocks import REACH
+from mivol.transport.traversal.lattice import clip
+from mivol.transport.traversal.occupied_cells import march
 from scenes import box_of, tensor, transform
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
@@ -202,14 +203,14 @@ def test_defect_5_1_03_a_ray_that_ends_inside_a_cell() -> None:
     ray.t_max = mi.Float(ends)
     cells = cells_of(field)
     source, model = exact(field, ray, slope=True), model_of(field)
-    seen = look(cells, source, model, ray)
+    seen = render(cells, source, model, ray)
     L = np.clip(ends - entry, 0, whole)
     # t_max is near 5 length units, of which float32 keeps 2.4e-7, and so do the faces of the box; times sigma.
     tolerance = 3 * 5 * 2.4e-7
     np.testing.assert_allclose(np.array(seen.T), np.exp(-sigma * L), atol=tolerance)
     sent = np.outer(-np.expm1(-sigma * L), np.full(3, 0.5 + Y0))
     np.testing.assert_allclose(np.array(seen.colour).T, sent, atol=tolerance)
-    look_back(cells, source, model, seen, mi.Color3f(0), 1.0)
+    backward(cells, source, model, seen, mi.Color3f(0), 1.0)
     assert np.array(source.density_slope, np.float64).sum() == pytest.approx(-np.sum(L * np.exp(-sigma * L)), rel=1e-5)
     share = L / whole
     assert all(kind.any() for kind in (share == 0, share == 1, (share > 0) & (share < 1)))

@@ -20,7 +20,7 @@ from mivol.optim.radiance_priors import Neighbours, dull, smooth, thin_out
 from mivol.optim.radiance_views import TILE, Views
 from mivol.photos import Camera, Lens, Photo, pixel_centres, rays
 from mivol.photos.camera import intrinsics
-from mivol.transport.radiance import bake, cells_of, look, model_of
+from mivol.transport.line_integrals.radiance_field import bake, cells_of, model_of, render
 
 BOX = np.array([[-1.0, -1, -1], [1, 1, 1]])
 CUBE = np.array([[2.0, 0, 0, -1], [0, 2, 0, -1], [0, 0, 2, -1], [0, 0, 0, 1]])
@@ -316,7 +316,7 @@ def test_opacities_are_asked_to_be_none_or_all(variant_rgb: str, photos: list[Ph
     def prior(density: np.ndarray) -> float:
         field = fit.field.with_values(mi.Float(np.float32(density)), fit.field.harmonics)
         cells = cells_of(field)
-        seen = look(cells, bake(field, cells, views.origins[chosen], batch.slot), model_of(field, PLAN.stop), batch.rays)
+        seen = render(cells, bake(field, cells, views.origins[chosen], batch.slot), model_of(field, PLAN.stop), batch.rays)
         T = np.array(seen.T, np.float64)
         near = np.clip(T, 0.01, 0.99)  # beyond, the prior goes on as its tangent
         return float(np.mean(np.log(near) + np.log(1 - near) + (1 / near - 1 / (1 - near)) * (T - near)))

@@ -191,7 +191,7 @@ def test_a_permutation_of_lanes_permutes_the_answers(seed):
 
 def test_width_one_broadcasts(seed):
     # One ray against many ends: lanes of width 1 mean the same for all.
-    from mivol.transport.optical_depth import integrate_tau
+    from mivol.transport.media.grid_integral import integrate_tau
     from scenes import make_lattice
 
     lattice = make_lattice(np.ones((3, 3, 3)), np.eye(4))

@@ -1,0 +1,196 @@
+r"""A distance in the candidate that a reservoir has kept, with the density that it was drawn from.
+
+The distance is drawn by inverting the candidate's exact optical depth, or evenly in the angle seen from the emitter; the
+density of the two together is known, so nothing is biased by the weights of candidates being approximate.
+
+References: Kulla & Fajardo 2012 (equiangular sampling); Miller et al. 2019 (spectral combination of free paths).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from mivol.numerics import one_minus_exp
+from mivol.transport.estimators.distance_reservoir import Candidate, inverse
+from mivol.transport.estimators.equiangular import EquiangularSampler
+from mivol.transport.media.body import Body
+from mivol.transport.media.scene_media import World
+from mivol.transport.traversal.grid_walk import box_nodes, read_nodes
+from mivol.transport.traversal.lattice import clip
+from mivol.transport.traversal.random_numbers import draw_pcg32
+
+__all__ = ["MediumEvent", "sample_distance"]
+
+
+NEWTON_STEPS = 8
+"""Each doubles the digits; where the extinction vanishes at an end they are halvings, and 2^-8 of a cell holds no light."""
+
+
+@dataclass
+class MediumEvent:
+    """A point of a ray where light may be scattered.
+
+    Attributes:
+        t, begin: distance [length], and that at which its piece begins.
+        pdf: density it was drawn from [1/length].
+        tau: optical depth [1] in front of it, of each channel, along the bodies in the order of the walk.
+        sigma_t: extinction [1/length] there, of each channel.
+        body: number of its body.
+        on: lanes that have one.
+    """
+
+    t: mi.Float
+    begin: mi.Float
+    pdf: mi.Float
+    tau: list[mi.Float]
+    sigma_t: list[mi.Float]
+    body: mi.UInt32
+    on: mi.Bool
+
+
+def sample_distance(
+    world: World,
+    ray: mi.Ray3f,
+    candidate: Candidate,
+    total: mi.Float,
+    equiangular: EquiangularSampler | None,
+    probe_depth: float,
+    u: mi.Point2f,
+    active: mi.Bool,
+) -> MediumEvent:
+    """Draw a distance in the piece that was kept.
+
+    Args:
+        world, ray, equiangular, probe_depth: as in :func:`fill_reservoir`.
+        candidate: a piece that the walk has kept.
+        total: sum of the weights of all pieces.
+        u: two numbers in [0, 1).
+        active: lanes that may scatter.
+    """
+    on = active & (candidate.weight > 0)
+    dt = dr.select(on, candidate.dt, 1)
+    curve = _curve(world, ray, candidate, on)
+    whole = [_partial(c, dt, 1) for c in curve]
+    front = [dr.exp(-f) for f in candidate.front]
+
+    # -- How: by collisions, or evenly (in angle, where a lamp is near) ------------------------------------------------
+    by_collision = mi.Float(1)
+    if probe_depth:
+        mean = sum(whole) / len(whole)
+        by_collision = mean * inverse(mean + candidate.probe_sigma * dt)
+    if equiangular is not None:
+        by_collision = dr.select(equiangular.finite, 0.5 * by_collision, by_collision)
+    collides = u.x < by_collision
+    begin = candidate.begin + candidate.s
+    even = u.y * dt if equiangular is None else dr.select(equiangular.finite, equiangular.sample(begin, dt, u.y), u.y * dt)
+    x = dr.select(collides, _invert(curve, whole, front, dt, u), even * dr.rcp(dt))
+
+    # -- The density of both together ------------------------------------------------------------------------------------
+    sigma = [dr.maximum(_at(c, x), 0) for c in curve]
+    tau = [_partial(c, dt, x) for c in curve]
+    taken = sum((f * one_minus_exp(w) for f, w in zip(front, whole, strict=True)), mi.Float(0))
+    hits = sum((f * s * dr.exp(-t) for f, s, t in zip(front, sigma, tau, strict=True)), mi.Float(0))
+    pdf = by_collision * dr.select(taken > 0, hits / dr.select(taken > 0, taken, 1), 0)
+    evenly = dr.rcp(dt)
+    if equiangular is not None:
+        evenly = dr.select(equiangular.finite, equiangular.density(begin, dt, x * dt), evenly)
+    pdf = (pdf + (1 - by_collision) * evenly) * candidate.weight / dr.select(on, total, 1)
+    t = mi.Float(mi.Float64(candidate.begin) + mi.Float64(candidate.s) + mi.Float64(x) * mi.Float64(dt))
+    on &= (pdf > 0) & dr.isfinite(pdf)
+    return MediumEvent(
+        t, begin, dr.select(on, pdf, 1), [f + a for f, a in zip(candidate.front, tau, strict=True)], sigma, candidate.body, on
+    )
+
+
+def _curve(world: World, ray: mi.Ray3f, candidate: Candidate, on: mi.Bool) -> list[list[mi.Float]]:
+    """The extinction along the piece that was kept, for each channel: the coefficients of a cubic of [0, 1]."""
+    values = [[mi.Float(0) for _ in range(4)] for _ in range(world.channels)]
+    for index, body in enumerate(world.bodies):
+        here = on & (candidate.body == index)
+        own = _values_along(world, body, ray, candidate, here)
+        values = [[dr.select(here, n, v) for n, v in zip(new, old, strict=True)] for new, old in zip(own, values, strict=True)]
+    return [_cubic(*v) for v in values]
+
+
+def _values_along(world: World, body: Body, ray: mi.Ray3f, candidate: Candidate, on: mi.Bool) -> list[list[mi.Float]]:
+    """[channel][point] extinction at 0, 1/3, 2/3 and 1 of the piece that was kept, in one body."""
+    field = body.extinction(ray, body.flight_parts)
+    constant = [[c] * 4 for c in field.constant]
+    lattice = next((p.lattice for p in body.flight_parts if p.lattice is not None), None)
+    if lattice is None:
+        return _by_point(world, constant)
+    start = mi.Float64(candidate.begin) + mi.Float64(candidate.s)
+    segment = clip(lattice, ray.o, ray.d, start, start + mi.Float64(candidate.dt))
+    # The middle of the piece tells its cell: an end lies in a face, and may be rounded to either side.
+    along = segment.d * segment.length
+    shift = mi.Vector3i(dr.floor(segment.frac + 0.5 * along))
+    cell, frac = segment.cell + shift, segment.frac - mi.Vector3f(shift)
+    points = [dr.clip(dr.fma(along, k / 3, frac), 0, 1) for k in range(4)]
+    inside = on & (segment.length > 0)
+    nodes = box_nodes(cell, dr.full(dr.mask_t(mi.Vector3f), True), lattice.res)
+    grid = field.along(read_nodes(field.reads, nodes, inside), points)
+    own = [[dr.select(inside, g, k) for g, k in zip(*row, strict=True)] for row in zip(grid, constant, strict=True)]
+    return _by_point(world, own)
+
+
+def _by_point(world: World, values: list[list[mi.Float]]) -> list[list[mi.Float]]:
+    """[channel of a body][point] as [channel of the world][point]."""
+    return [list(row) for row in zip(*(world.rows([v[k] for v in values]) for k in range(4)), strict=True)]
+
+
+def _cubic(f0: mi.Float, f1: mi.Float, f2: mi.Float, f3: mi.Float) -> list[mi.Float]:
+    """Coefficients of the cubic through values at 0, 1/3, 2/3, 1 (Lagrange)."""
+    return [
+        f0,
+        -5.5 * f0 + 9 * f1 - 4.5 * f2 + f3,
+        9 * f0 - 22.5 * f1 + 18 * f2 - 4.5 * f3,
+        4.5 * (f3 - f0) + 13.5 * (f1 - f2),
+    ]
+
+
+def _at(c: list[mi.Float], x: mi.Float) -> mi.Float:
+    return dr.fma(x, dr.fma(x, dr.fma(x, c[3], c[2]), c[1]), c[0])
+
+
+def _partial(c: list[mi.Float], dt: mi.Float, x: mi.Float) -> mi.Float:
+    """Optical depth from 0 to x."""
+    return dr.maximum(dt * x * dr.fma(x, dr.fma(x, dr.fma(x, 0.25 * c[3], c[2] / 3), 0.5 * c[1]), c[0]), 0)
+
+
+def _invert(curve: list, whole: list[mi.Float], front: list[mi.Float], dt: mi.Float, u: mi.Point2f) -> mi.Float:
+    """The share of a piece at which the light that it takes has fallen to the share ``u.y`` of it.
+
+    Of one channel, drawn by what each of them takes, where the extinction is rgb.
+    """
+    c, tau = curve[0], whole[0]
+    if len(curve) > 1:
+        shares = [f * one_minus_exp(w) for f, w in zip(front, whole, strict=True)]
+        # The digits of u.x that chose the way of drawing are used up; those of u.y are not, but it is wanted whole.
+        left = dr.select(sum(shares) > 0, _scramble(u), 0) * sum(shares)
+        for k in range(1, len(curve)):
+            later = left >= sum(shares[:k])
+            c = [dr.select(later, a, b) for a, b in zip(curve[k], c, strict=True)]
+            tau = dr.select(later, whole[k], tau)
+    goal = _log_share(u.y, tau)
+    low, high, x = mi.Float(0), mi.Float(1), dr.clip(goal / dr.maximum(tau, 1e-30), 0, 1)
+    for _ in range(NEWTON_STEPS):
+        error = _partial(c, dt, x) - goal
+        low, high = dr.select(error < 0, x, low), dr.select(error > 0, x, high)
+        step = x - error / dr.maximum(dt * _at(c, x), 1e-30)
+        x = dr.select((step > low) & (step < high), step, 0.5 * (low + high))
+    return x
+
+
+def _scramble(u: mi.Point2f) -> mi.Float:
+    """A third number in [0, 1) from the bits of two."""
+    return draw_pcg32(mi.UInt32(u.x * (1 << 24)) * mi.UInt32(0x9E3779B9) + mi.UInt32(u.y * (1 << 24)), 1)[1][0]
+
+
+def _log_share(u: mi.Float, tau: mi.Float) -> mi.Float:
+    """-log(1 - u (1 - exp(-tau))): the optical depth at which the share u of what is taken has been taken."""
+    x = u * one_minus_exp(tau)
+    series = dr.fma(x, dr.fma(x, dr.fma(x, dr.fma(x, dr.fma(x, 1 / 6, 1 / 5), 1 / 4), 1 / 3), 1 / 2), 1)
+    return dr.minimum(dr.select(x < 0.05, x * series, -dr.log(dr.maximum(1 - x, 1e-37))), tau)

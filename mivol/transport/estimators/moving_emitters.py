@@ -1,0 +1,209 @@
+r"""How the optical depth of a shadow ray changes as the lamp at its end moves.
+
+.. math:: \frac{\partial \tau}{\partial l} = \frac{\tau}{L}\,\omega + \int_0^L \frac{t}{L} \nabla\sigma\,dt
+          \mp \sum_{faces} \frac{t_f}{L}\,\sigma(t_f) \frac{n}{n \cdot \omega}
+
+for tau from x to l = x + L w: the ray grows, it turns through the field (two Gauss points a cell are exact: t times the
+gradient of a trilinear function is a cubic along a ray), and it enters and leaves boundaries elsewhere.
+
+Conventions. The upper sign is for a face through which the ray leaves. The faces of boxes are known; other boundaries are
+traced once more, and each shifts the step from the extinction before it to that behind it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import drjit as dr
+import mitsuba as mi
+
+from mivol.transport.media.body import Body
+from mivol.transport.media.channels import spectrum
+from mivol.transport.media.medium_view import Part
+from mivol.transport.media.ray_intervals import OWN_SURFACE, RaySegment, revisit_media
+from mivol.transport.media.scene_media import World
+from mivol.transport.traversal.grid_walk import Cell, Nodes, walk
+from mivol.transport.traversal.interpolation import GAUSS, gauss_points
+from mivol.transport.traversal.lattice import Lattice, Segment, clip
+from mivol.transport.traversal.ray_spawning import distance_along, spawn_ray
+
+__all__ = ["follow_lamp", "shadow_of_moving", "tau_by_end"]
+
+
+ASIDE = 1e-5
+"""How far beside a surface its two sides are looked at, as a share of the distance: ten times its rounding."""
+
+
+def tau_by_end(
+    scene: mi.Scene, world: World, ray_segment: RaySegment, tau: list[mi.Float], active: mi.Bool
+) -> list[mi.Vector3f]:
+    """Derivative of the optical depth of a shadow ray with respect to its far end.
+
+    Args:
+        scene, world: boundaries and media.
+        ray_segment: the shadow ray; its length is the distance to the lamp.
+        tau: its optical depth, each channel.
+        active: lanes to differentiate.
+
+    Returns:
+        One vector [1/length] for each channel.
+
+    Cost: one walk of each grid; where boundaries are traced, two more traces.
+    """
+    d, length = ray_segment.ray.d, dr.maximum(ray_segment.length, 1e-30)
+
+    def visit(total: list, body: Body, t0: mi.Float64, t1: mi.Float64, on: mi.Bool) -> list:
+        scale = dr.detach(body.view.scale) * body.area(d)
+        for part in body.view.parts:
+            rows = world.vectors([scale * v for v in _by_part(body, part, ray_segment, t0, t1, on)])
+            total = [a + b for a, b in zip(total, rows, strict=True)]
+        if body.view.microflakes is None:
+            return total
+        # The area that flakes show turns with the ray, whose direction moves across itself.
+        turn = body.facing(d) * dr.rcp(dr.maximum(dr.square(body.area(d)), 1e-30)) - d
+        own = body.optical_depth(ray_segment.ray, mi.Float(t0), mi.Float(t1), world.channels, on)
+        return [a + t * turn for a, t in zip(total, own, strict=True)]
+
+    zero = [mi.Vector3f(0) for _ in range(world.channels)]
+    turned = revisit_media(scene, world, ray_segment, visit, zero, active)
+    if world.traced:
+        turned = [a + b for a, b in zip(turned, _steps(scene, world, ray_segment, active), strict=True)]
+    return [dr.select(active, (d * t + v) / length, 0) for t, v in zip(tau, turned, strict=True)]
+
+
+def shadow_of_moving(
+    scene: mi.Scene, world: World, ray_segment: RaySegment, tau: list[mi.Float], end: mi.Point3f, active: mi.Bool
+) -> mi.Spectrum | float:
+    """The number 1, with the derivative of a shadow by the lamp's end of its ray, where that moves."""
+    if not dr.grad_enabled(end):
+        return 1.0
+    moved = end - dr.detach(end)
+    with dr.suspend_grad():
+        slopes = tau_by_end(scene, world, ray_segment, tau, active)
+    return spectrum([1 - dr.dot(s, moved) for s in slopes])
+
+
+@dr.syntax
+def _steps(scene: mi.Scene, world: World, ray_segment: RaySegment, active: mi.Bool) -> list[mi.Vector3f]:
+    """L times the part of the derivative by which boundaries that are traced shift, one vector a channel."""
+    # -- State ------------------------------------------------------------------------------------------------------------
+    ray = ray_segment.ray
+    onward = mi.Ray3f(ray)  #                        the ray from the last surface on
+    going = mi.Bool(active)
+    total = [dr.zeros(mi.Vector3f, dr.width(ray)) for _ in range(world.channels)]
+
+    while dr.hint(going, label="boundaries on the way to a lamp"):
+        hit = scene.ray_intersect(onward, mi.RayFlags.All, False, going)
+        t = distance_along(ray, hit)
+        going &= hit.is_valid() & (t < ray_segment.length * OWN_SURFACE)
+        crosses = going & hit.is_medium_transition()
+        total = _add_step(total, world, ray, hit, t, crosses)
+        onward = spawn_ray(hit, ray.d, world.size)
+    return total
+
+
+def _add_step(
+    total: list[mi.Vector3f], world: World, ray: mi.Ray3f, hit: mi.SurfaceInteraction3f, t: mi.Float, crosses: mi.Bool
+) -> list[mi.Vector3f]:
+    """Add the step of the extinction at a surface, from a little before it to a little behind it."""
+    slope = dr.dot(hit.n, ray.d)
+    face = mi.Vector3f(hit.n) * dr.rcp(dr.select(slope != 0, slope, 1))
+    for side, to, sign in ((-ray.d, 1 - ASIDE, -1.0), (ray.d, 1 + ASIDE, 1.0)):
+        medium = hit.target_medium(side)
+        for body in world.traced:
+            on = crosses & (slope != 0) & (medium == mi.MediumPtr(body.view.medium))
+            sigma = body.extinction_at(ray, t * to, world.channels, on)
+            total = [v + dr.select(on, sign * t * x * face, 0) for v, x in zip(total, sigma, strict=True)]
+    return total
+
+
+def _by_part(body: Body, part: Part, ray_segment: RaySegment, t0: mi.Float64, t1: mi.Float64, on: mi.Bool) -> list[mi.Vector3f]:
+    """L times the derivative of one part's integral, but for the growth of the ray; one vector a channel."""
+    ray, end = ray_segment.ray, mi.Float64(ray_segment.length)
+    if part.lattice is None:
+        value = dr.detach(part.constant)
+        each = [value] if part.channels == 1 else [value.x, value.y, value.z]
+        leaving = _face(body.rows, (0.0,) * 3, (1.0,) * 3, ray, t1) if body.box is not None else mi.Vector3f(0)
+        entering = _face(body.rows, (0.0,) * 3, (1.0,) * 3, ray, t0) if body.box is not None else mi.Vector3f(0)
+        shift = dr.select(on & (t0 > 0), entering * mi.Float(t0), 0) - dr.select(on & (t1 < end), leaving * mi.Float(t1), 0)
+        return [v * shift for v in each]
+    lattice = replace(part.lattice, empty_distances=None)
+    segment = clip(lattice, ray.o, ray.d, t0, t1)
+    a, b = mi.Float64(segment.t0), mi.Float64(segment.t0) + mi.Float64(segment.length)
+    inside = on & (segment.length > 0)
+    vectors = _turn(lattice, part, segment, inside)
+    high = tuple(n - 0.5 for n in lattice.res[::-1])
+    leaves, enters = b < end * (1 - 1e-6), a > 0
+    if body.box is None:
+        # Of a grid that is cut by a boundary that is traced, only the own faces.
+        leaves, enters = leaves & (b < t1 * (1 - 2 * ASIDE)), enters & (a > t0 * (1 + 2 * ASIDE))
+    for t, sign, moves in ((b, -1.0, leaves), (a, 1.0, enters)):
+        here = inside & moves
+        face = _face(lattice.from_world, (-0.5,) * 3, high, ray, t)
+        if body.cuts_grids:
+            # The boundary cuts the grid where its own faces are nearer than those of the grid.
+            cut = dr.abs(t - (t1 if sign < 0 else t0)) <= 1e-6 * dr.abs(t)
+            face = dr.select(cut, _face(body.rows, (0.0,) * 3, (1.0,) * 3, ray, t), face)
+        values = body.values_at(part, ray, mi.Float(t), here)
+        vectors = [v + dr.select(here, sign * mi.Float(t) * s * face, 0) for v, s in zip(vectors, values, strict=True)]
+    return vectors
+
+
+def _turn(lattice: Lattice, part: Part, segment: Segment, active: mi.Bool) -> list[mi.Vector3f]:
+    """The integral of t grad(sigma) over a grid, one world vector a channel."""
+    values = dr.detach(part.lattice.values.array)
+
+    def visit(total: list, cell: Cell, on: mi.Bool) -> list:
+        half = dr.select(on, 0.5 * cell.dt, 0)
+        for u, p in zip((GAUSS, 1 - GAUSS), gauss_points(cell), strict=True):
+            t = segment.t0 + cell.s + u * cell.dt
+            slopes = [dr.select(cell.ahead, g, -g) for g in (_slope(c, p) for c in cell.corners[0])]
+            total = [v + (half * t) * g for v, g in zip(total, slopes, strict=True)]
+        return total
+
+    zero = [dr.zeros(mi.Vector3f, dr.width(segment.length)) for _ in range(part.channels)]
+    found = walk(lattice, segment, visit, zero, [Nodes(values, part.channels)], active)
+    rows = [[mi.Float(v) for v in row[:3]] for row in lattice.from_world]
+    return [mi.Vector3f(*(sum(rows[a][k] * g[a] for a in range(3)) for k in range(3))) for g in found]
+
+
+def _slope(c: list[mi.Float], p: mi.Vector3f) -> mi.Vector3f:
+    """The gradient of the trilinear function of 8 corners at a point, in cells."""
+
+    def mix(a: mi.Float, b: mi.Float, t: mi.Float) -> mi.Float:
+        return dr.fma(t, b - a, a)
+
+    dx = mix(mix(c[1] - c[0], c[3] - c[2], p.y), mix(c[5] - c[4], c[7] - c[6], p.y), p.z)
+    x = [mix(c[q], c[q + 1], p.x) for q in (0, 2, 4, 6)]
+    dy = mix(x[1] - x[0], x[3] - x[2], p.z)
+    dz = mix(x[2], x[3], p.y) - mix(x[0], x[1], p.y)
+    return mi.Vector3f(dx, dy, dz)
+
+
+def _face(rows: list, low: tuple, high: tuple, ray: mi.Ray3f, t: mi.Float64) -> mi.Vector3f:
+    """n / (n . w) of the face of a box on which a point of a ray lies."""
+    best, normal = mi.Float64(dr.inf), mi.Vector3f(0)
+    p = [dr.fma(t, mi.Float64(ray.d[a]), mi.Float64(ray.o[a])) for a in range(3)]
+    for row, a, b in zip(rows, low, high, strict=True):
+        q = dr.fma(row[0], p[0], dr.fma(row[1], p[1], dr.fma(row[2], p[2], row[3])))
+        speed = sum(row[k] * mi.Float64(ray.d[k]) for k in range(3))
+        off = dr.minimum(dr.abs(q - a), dr.abs(q - b)) / (b - a)
+        nearer = (off < best) & (speed != 0)
+        inv = dr.rcp(dr.select(speed != 0, speed, 1))
+        normal = dr.select(nearer, mi.Vector3f(*(mi.Float(row[k] * inv) for k in range(3))), normal)
+        best = dr.select(nearer, off, best)
+    return normal
+
+
+def follow_lamp(
+    emitter: mi.EmitterPtr, it: mi.Interaction3f, u: mi.Point2f, direct: mi.DirectionSample3f, active: mi.Bool
+) -> mi.DirectionSample3f:
+    """The direction of a lamp of one position or direction, with the derivative of its place."""
+    moved, _ = emitter.sample_direction(it, u, active)
+    if not dr.grad_enabled(moved.p):
+        return direct
+    moved.p = dr.select(direct.delta, moved.p, direct.p)
+    moved.d = dr.select(direct.delta, moved.d, direct.d)
+    moved.dist = dr.select(direct.delta, moved.dist, direct.dist)
+    moved.n, moved.uv, moved.pdf, moved.emitter = direct.n, direct.uv, direct.pdf, direct.emitter
+    return moved

@@ -1,0 +1,143 @@
+r"""Transmittance by looking here and there: unbiased, and cheaper than every cell where a grid is fine.
+
+.. math:: \hat T = e^{-\int m\,dt} \prod_j \left(1 - \frac{\sigma(x_j) - m}{\kappa\,(M - m)}\right)
+
+Of each block of cells its least value m and its largest value M are known. What m takes from a ray is known exactly; of what
+lies above it the ray learns at points that a Poisson process of the rate kappa (M - m) puts on it (residual ratio tracking).
+At such a point one of the eight corners of the cell is read, drawn by its trilinear weight: the product is linear in each of
+its factors, so the mean is that of the trilinear value.
+
+Conventions. Every factor lies in [0, 1], for m and M bound the corners themselves: an estimate is never above exp(-int m), and
+its variance never above T (exp(-int m) - T). A block without extinction costs one step and no look-up.
+
+References: Novak et al. 2014 (residual ratio tracking); Szirmay-Kalos et al. 2011 (blocks); Hofmann et al. 2021 (a corner in
+place of eight).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from mivol.transport.traversal.block_ranges import BLOCK_SHIFT, largest
+from mivol.transport.traversal.grid_walk import Cell, walk
+from mivol.transport.traversal.lattice import Lattice, Segment
+from mivol.transport.traversal.random_numbers import draw_pcg32
+
+__all__ = ["residual_ratio_tracking"]
+
+
+FAINT = 0.1
+"""Estimate below which a ray is ended by chance: what little it would bring is not worth its look-ups."""
+
+LOOKUP_RATE = 4.0
+"""Look-ups for each optical depth 1 between the least and the largest value."""
+
+
+@dataclass
+class _Coarse:
+    """The blocks as cells of a lattice of their own, for a walk."""
+
+    res: tuple[int, int, int]
+    empty_distances: None = None
+
+
+@dataclass
+class Tracked:
+    """What has been learnt of a ray.
+
+    Attributes:
+        tau: optical depth [1] of the least values, of each channel.
+        weight: product of the factors, of each channel.
+        ahead: optical depth of the process to the next point.
+        rng: state of the generator.
+    """
+
+    tau: list[mi.Float]
+    weight: list[mi.Float]
+    ahead: mi.Float
+    rng: mi.UInt32
+
+
+def residual_ratio_tracking(
+    lattice: Lattice,
+    segment: Segment,
+    scale: mi.Float,
+    rng: mi.UInt32,
+    active: mi.Bool,
+) -> tuple[list[mi.Float], mi.UInt32]:
+    """Estimate the transmittance of a segment for each channel.
+
+    Args:
+        lattice: the grid, and its blocks.
+        segment: from :func:`mivol.transport.traversal.lattice.clip`.
+        scale: factor on the values.
+        rng: state of the generator.
+        active: lanes to track; the others return 1.
+
+    Returns:
+        The estimates, and the state of the generator.
+
+    Bias: none. Variance: T^2 (exp(int E(c - m)^2 / (kappa (M - m)) dt) - 1), c the corner that is drawn, and what the roulette
+        adds; T (max(exp(-int m dt), FAINT) - T) at most.
+    Cost: one step a block, one read for each look-up, kappa int (M - m) dt of them.
+    """
+    ahead = segment.d > 0
+    speed = dr.abs(segment.d) * 2.0**-BLOCK_SHIFT
+    rate = LOOKUP_RATE * scale
+    coarse = _coarse_segment(segment)
+    blocks, res, channels, values = lattice.block_ranges, lattice.res, lattice.channels, dr.detach(lattice.values.array)
+
+    def visit(state: Tracked, cell: Cell, on: mi.Bool) -> tuple[Tracked, mi.Float]:
+        least, above = blocks.at(cell.lower + 1, on)
+        density = rate * above
+        # -- How far: to the end of the block, or to the next point -----------------------------------------------------
+        meets = on & (state.ahead < density * cell.dt)
+        dt = dr.select(meets, dr.minimum(state.ahead / density, cell.dt), cell.dt)
+        tau = [t + dr.select(on, scale * m * dt, 0) for t, m in zip(state.tau, least, strict=True)]
+        # -- What is there: one corner of the cell ----------------------------------------------------------------------
+        near = dr.fma(speed, dt, cell.frac)
+        inside = dr.select(ahead, near, 1 - near) * (1 << BLOCK_SHIFT)
+        rng, u = draw_pcg32(state.rng, 5)
+        node = mi.Vector3i(dr.floor(inside + mi.Vector3f(*u[:3])))
+        node = (cell.lower + 1) * (1 << BLOCK_SHIFT) - 1 + node
+        node = dr.clip(node, 0, mi.Vector3i(res[2] - 1, res[1] - 1, res[0] - 1))
+        index = mi.UInt32((node.z * res[1] + node.y) * res[2] + node.x) * channels
+        weight = []
+        for c, (w, m) in enumerate(zip(state.weight, least, strict=True)):
+            value = dr.gather(mi.Float, values, index + c, meets)
+            factor = 1 - (value - m) / (LOOKUP_RATE * above)
+            weight.append(dr.select(meets, w * factor, w))
+        fresh = -dr.log(u[3])
+        left = dr.select(meets, fresh, dr.maximum(state.ahead - dr.select(on, density * dt, 0), 0))
+        # -- Roulette ---------------------------------------------------------------------------------------------------
+        seen = largest([w * dr.exp(-t) for w, t in zip(weight, tau, strict=True)])
+        lives = u[4] * FAINT < seen
+        lift = dr.select(lives, dr.maximum(1, FAINT / seen), 0)
+        weight = [dr.select(on, w * lift, w) for w in weight]
+        return Tracked(tau, weight, left, rng), dt
+
+    def is_dark(state: Tracked) -> mi.Bool:
+        return largest(state.weight) == 0
+
+    width = dr.width(segment.t0)
+    rng, u = draw_pcg32(rng, 1)
+    start = Tracked(
+        [dr.zeros(mi.Float, width) for _ in range(channels)],
+        [dr.full(mi.Float, 1, width) for _ in range(channels)],
+        -dr.log(u[0]),
+        mi.UInt32(rng),
+    )
+    end = walk(_Coarse(tuple(n - 1 for n in blocks.res)), coarse, visit, start, (), active, is_dark, halts=True)
+    return [w * dr.exp(-t) for t, w in zip(end.tau, end.weight, strict=True)], end.rng
+
+
+def _coarse_segment(segment: Segment) -> Segment:
+    """A segment among the cells as one among the blocks: exact, for a block is a power of two of cells."""
+    share = 2.0**-BLOCK_SHIFT
+    cell = segment.cell + 1
+    block = cell >> BLOCK_SHIFT
+    frac = (mi.Vector3f(cell & ((1 << BLOCK_SHIFT) - 1)) + segment.frac) * share
+    return Segment(block - 1, frac, segment.d * share, segment.d_rest * share, segment.t0, segment.length)

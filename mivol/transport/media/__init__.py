@@ -1,0 +1,1 @@
+"""Participating media: coefficients at a point, extinction along a ray, and the order of media along it."""

@@ -1,0 +1,279 @@
+r"""Exact optical depth of a ray through a grid, with its tangent and its transpose.
+
+.. math:: \tau = \int_{t_0}^{t_1} \sigma(o + t\,\omega)\,dt = (A \sigma)_{ray}
+
+Along a line a trilinear function is a cubic in each cell, so two Gauss points a cell integrate it exactly; the sum over
+the cells is linear in the values at the nodes, and ``A``, its tangent (``A`` again) and its transpose are visitors of one
+walk.
+
+Conventions. Optical depth is returned, never transmittance: exp(-tau) is 0 in float32 beyond 103, tau is not.
+
+References: Amanatides & Woo 1987 (the walk); Abramowitz & Stegun 25.4.30 (Gauss points); matched adjoints: De Man & Basu
+2004.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import drjit as dr
+import mitsuba as mi
+
+from mivol.errors import MivolError
+from mivol.fields.activation import Activation
+from mivol.transport.traversal.grid_walk import Cell, Nodes, box_nodes, walk
+from mivol.transport.traversal.interpolation import gauss_points, interpolate, node_weights
+from mivol.transport.traversal.lattice import Lattice, Segment, clip
+
+__all__ = [
+    "Gradient",
+    "backproject_activated",
+    "backproject_segment",
+    "integrate_activated",
+    "integrate_segment",
+    "integrate_tau",
+]
+
+
+PACKED_LIMIT = 4 << 30
+"""Most bytes that a packed gradient may take; a larger grid adds to its nodes one by one."""
+
+
+def integrate_tau(
+    lattice: Lattice,
+    o: mi.Point3f,
+    d: mi.Vector3f,
+    t_max: mi.Float = math.inf,
+    active: mi.Bool = True,
+) -> mi.Float | mi.Color3f:
+    """Integrate a grid along rays: optical depth where the grid is an extinction.
+
+    Args:
+        lattice: values [1/length] of 1 or 3 channels, and their place. Derivatives (reverse and forward) reach
+            ``lattice.values``; outside its box the grid is vacuum.
+        o, d: world rays, |d| = 1; they and ``t_max`` carry no derivatives.
+        t_max: where to stop [length]; may be infinite.
+        active: lanes to integrate; the others return 0.
+
+    Returns:
+        tau [1]: ``Float`` for one channel, ``Color3f`` for three.
+
+    Raises:
+        MivolError: another number of channels, or rays with gradients enabled.
+
+    Bias: none but rounding, |error| <= 2e-6 int (sigma + h |grad sigma|) dt, h the size of a voxel.
+    Cost: 4 reads a cell and channel forwards, one packed write of 8 a cell and channel in reverse.
+
+    Example:
+        >>> tau = integrate_tau(Lattice(mi.TensorXf(sigma_t), to_world), ray.o, ray.d)
+    """
+    if lattice.channels not in (1, 3):
+        raise MivolError(f"a grid of {lattice.channels} channels was given; an optical depth has 1 (grey) or 3 (rgb).")
+    if dr.grad_enabled(o, d, t_max):
+        raise MivolError("rays with gradients were given; optical depth is differentiable in the grid only: detach the rays.")
+    segment = clip(lattice, o, d, 0, t_max)
+    tau = dr.custom(_OpticalDepth, lattice.values.array, lattice, segment, mi.Bool(active))
+    return tau[0] if lattice.channels == 1 else mi.Color3f(*tau)
+
+
+def integrate_segment(
+    lattice: Lattice, values: mi.Float, segment: Segment, active: mi.Bool = True, enough: mi.Float | None = None
+) -> list[mi.Float]:
+    """Integrate node values along a segment: a row of ``A`` for each lane.
+
+    Args:
+        lattice: where the grid lies, and which blocks are empty.
+        values: flat node values (the lattice's own, or a tangent of them).
+        segment: from :func:`mivol.transport.traversal.lattice.clip`.
+        active: lanes to integrate; the others return 0.
+        enough: stop where every channel has more than this; None to walk to the end.
+
+    Returns:
+        The integral for each channel.
+
+    Bias, cost: as :func:`integrate_tau`. Derivatives are not tracked here.
+    """
+
+    def visit(tau: list[mi.Float], cell: Cell, on: mi.Bool) -> list[mi.Float]:
+        a, b = gauss_points(cell)
+        half = dr.select(on, 0.5 * cell.dt, 0)
+        return [dr.fma(half, interpolate(c, a) + interpolate(c, b), t) for t, c in zip(tau, cell.corners[0], strict=True)]
+
+    zero = [mi.Float(0) for _ in range(lattice.channels)]
+
+    def has_enough(tau: list[mi.Float]) -> mi.Bool:
+        least = tau[0]
+        for t in tau[1:]:
+            least = dr.minimum(least, t)
+        return least > enough
+
+    until = None if enough is None else has_enough
+    return walk(lattice, segment, visit, zero, [Nodes(values, lattice.channels)], active, until)
+
+
+def integrate_activated(
+    lattice: Lattice,
+    values: mi.Float,
+    activation: Activation,
+    segment: Segment,
+    active: mi.Bool = True,
+    enough: mi.Float | None = None,
+    tangent: mi.Float | None = None,
+) -> list[mi.Float]:
+    """Integrate an extinction that is a function of interpolated node values, or its tangent.
+
+    Args:
+        lattice, segment, active, enough: as :func:`integrate_segment`, of one channel.
+        values: flat node values before the activation.
+        activation: what is done to them.
+        tangent: of the values; None for the integral itself.
+
+    Returns:
+        The integral, in a list of one.
+
+    Bias: two points a cell are exact for polynomials of degree 3 only; the error falls with the fourth power of a cell where
+        the activation is smooth, with the second at the edge that a ``relu`` cuts.
+    """
+
+    def visit(tau: list[mi.Float], cell: Cell, on: mi.Bool) -> list[mi.Float]:
+        half, total = dr.select(on, 0.5 * cell.dt, 0), mi.Float(0)
+        for p in gauss_points(cell):
+            value, slope = activation.value_and_slope(interpolate(cell.corners[0][0], p))
+            total += value if tangent is None else slope * interpolate(cell.corners[1][0], p)
+        return [dr.fma(half, total, tau[0])]
+
+    reads = [Nodes(values)] if tangent is None else [Nodes(values), Nodes(tangent)]
+    until = None if enough is None else lambda tau: tau[0] > enough
+    return walk(lattice, segment, visit, [mi.Float(0)], reads, active, until)
+
+
+def backproject_activated(
+    lattice: Lattice,
+    values: mi.Float,
+    activation: Activation,
+    target: Gradient,
+    weight: mi.Float,
+    segment: Segment,
+    active: mi.Bool = True,
+) -> None:
+    """The transpose of the tangent of :func:`integrate_activated`."""
+
+    def visit(state: None, cell: Cell, on: mi.Bool) -> None:
+        row = [mi.Float(0)] * 8
+        for p in gauss_points(cell):
+            _, slope = activation.value_and_slope(interpolate(cell.corners[0][0], p))
+            row = [r + slope * w for r, w in zip(row, node_weights(p, cell, lattice.res), strict=True)]
+        target.add(0, cell, [0.5 * cell.dt * weight * r for r in row], on)
+        return state
+
+    walk(replace(lattice, empty_distances=None), segment, visit, None, [Nodes(values)], active)
+
+
+@dataclass
+class Gradient:
+    """What the transpose adds to: the derivative of a scalar with respect to the nodes of a grid.
+
+    On the CPU a cell adds its 8 corners as one packet to a buffer of its own, one copy a thread and no atomics; they
+    are folded to the nodes once, at the end (5 times faster than adding 8 numbers to the nodes). Where that buffer is
+    too large, or on a GPU, the corners are added to the nodes as they come.
+    """
+
+    buffer: mi.Float
+    res: tuple[int, int, int]
+    channels: int
+    packed: bool
+
+    @classmethod
+    def zeros(cls, lattice: Lattice) -> Gradient:
+        """A gradient of zero for the nodes of ``lattice``."""
+        z, y, x = lattice.res
+        cells = (z + 1) * (y + 1) * (x + 1) * lattice.channels
+        on_cpu = dr.backend_v(mi.Float) == dr.JitBackend.LLVM
+        packed = on_cpu and gradient_bytes(lattice.res, lattice.channels) <= PACKED_LIMIT
+        buffer = dr.zeros(mi.Float, 8 * cells if packed else z * y * x * lattice.channels)
+        return cls(buffer, lattice.res, lattice.channels, packed)
+
+    def add(self, channel: int, cell: Cell, corners: list[mi.Float], active: mi.Bool) -> None:
+        """Add 8 values, in the order of the grid's own axes, to the corners of a cell."""
+        self.add_at(channel, cell.lower, corners, active)
+
+    def add_at(self, channel: int, lower: mi.Vector3i, corners: list[mi.Float], active: mi.Bool) -> None:
+        """As :meth:`add`, for the cell behind the node ``lower``."""
+        _, y, x = self.res
+        if self.packed:
+            index = ((lower.z + 1) * (y + 1) + lower.y + 1) * (x + 1) + lower.x + 1
+            index = mi.UInt32(index) * self.channels + channel
+            dr.scatter_add(self.buffer, mi.ArrayXf(corners), index, active, mode=dr.ReduceMode.Expand)
+            return
+        upward = dr.full(dr.mask_t(mi.Vector3f), True)
+        for node, value in zip(box_nodes(lower, upward, self.res), corners, strict=True):
+            dr.scatter_add(self.buffer, value, node * self.channels + channel, active)
+
+    def fold(self) -> mi.Float:
+        """The derivative at each node (flat, channels fastest)."""
+        if not self.packed:
+            return self.buffer
+        z, y, x = self.res
+        entry = dr.arange(mi.UInt32, z * y * x * self.channels)
+        node, channel = entry // self.channels, entry % self.channels
+        i, j, k = node % x, (node // x) % y, node // (x * y)
+        total = mi.Float(0)
+        for q in range(8):
+            # Corner q belongs to the cell whose number, one more than its lower node, is lower by the bits of q.
+            a, b, c = i + 1 - (q & 1), j + 1 - (q >> 1 & 1), k + 1 - (q >> 2)
+            cell = (c * (y + 1) + b) * (x + 1) + a
+            total += dr.gather(mi.Float, self.buffer, (cell * self.channels + channel) * 8 + q)
+        return total
+
+
+def gradient_bytes(res: tuple[int, int, int], channels: int) -> int:
+    """Bytes that a packed gradient takes: its buffer and one copy a thread."""
+    z, y, x = res
+    return 32 * (z + 1) * (y + 1) * (x + 1) * channels * (1 + dr.thread_count())
+
+
+def backproject_segment(
+    lattice: Lattice, target: Gradient, weight: list[mi.Float], segment: Segment, active: mi.Bool = True
+) -> None:
+    """Add ``weight`` times the row of ``A`` of each lane to a gradient: the transpose ``A^T``.
+
+    Args:
+        lattice: where the grid lies. Its gaps are not used: an empty voxel has a derivative too.
+        target: what receives the sums.
+        weight: d loss / d tau of each lane, one entry a channel.
+        segment: from :func:`mivol.transport.traversal.lattice.clip`.
+        active: lanes to project back.
+
+    Cost: one packed write of 8 a cell and channel.
+    """
+
+    def visit(state: None, cell: Cell, on: mi.Bool) -> None:
+        a, b = (node_weights(p, cell, lattice.res) for p in gauss_points(cell))
+        row = [0.5 * cell.dt * (wa + wb) for wa, wb in zip(a, b, strict=True)]
+        for channel, w in enumerate(weight):
+            target.add(channel, cell, [w * r for r in row], on)
+        return state
+
+    walk(replace(lattice, empty_distances=None), segment, visit, None, (), active)
+
+
+class _OpticalDepth(dr.CustomOp):
+    """tau = A values, with its tangent and its transpose."""
+
+    def eval(self, values: mi.Float, lattice: Lattice, segment: Segment, active: mi.Bool) -> list[mi.Float]:
+        self.lattice, self.segment, self.active = lattice, segment, active
+        return integrate_segment(lattice, dr.detach(values), segment, active)
+
+    def forward(self) -> None:
+        # The tangent is not zero where the values are: no block is empty for it.
+        dense = replace(self.lattice, empty_distances=None)
+        self.set_grad_out(integrate_segment(dense, self.grad_in("values"), self.segment, self.active))
+
+    def backward(self) -> None:
+        target = Gradient.zeros(self.lattice)
+        backproject_segment(self.lattice, target, list(self.grad_out()), self.segment, self.active)
+        self.set_grad_in("values", target.fold())
+
+    def name(self) -> str:
+        return "optical depth"

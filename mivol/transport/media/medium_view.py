@@ -1,0 +1,107 @@
+r"""The extinction of a medium as a sum of fields, each in its place, the same for our plugins and for stock ones.
+
+.. math:: \sigma_t(x) = s \sum_k f_k(x)
+
+with a scale s and parts f_k that are a grid or a constant (``sigma_t`` alone, or ``sigma_a`` and ``sigma_s``). Optical depth
+is linear in each of them, so it is integrated part by part: a homogeneous medium stores no grid and two grids need not
+share a resolution.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import drjit as dr
+import mitsuba as mi
+
+from mivol.fields.activation import Activation
+from mivol.transport.media.box import Box
+from mivol.transport.traversal.lattice import Lattice
+
+__all__ = ["MediumView", "Part"]
+
+
+@dataclass
+class Part:
+    """One additive part of an extinction.
+
+    Attributes:
+        name: ``sigma_t``, ``sigma_a`` or ``sigma_s``.
+        constant: its value [1/length], ``Float`` or ``Color3f``; None for a grid.
+        lattice: the grid [1/length]; None for a constant.
+        activation: what makes an extinction of an interpolated value of the grid, in a radiance field; None elsewhere.
+        volume: the stock grid that ``lattice`` stands for, which may look its voxels up in another way; None elsewhere.
+    """
+
+    name: str
+    constant: mi.Float | mi.Color3f | None = None
+    lattice: Lattice | None = None
+    activation: Activation | None = None
+    volume: mi.Volume | None = None
+
+    @property
+    def channels(self) -> int:
+        """1 (grey) or 3 (rgb)."""
+        if self.lattice is not None:
+            return self.lattice.channels
+        return 3 if dr.size_v(self.constant) == 3 else 1
+
+
+@dataclass
+class MediumView:
+    """The extinction of one medium, as transport sees it.
+
+    Attributes:
+        medium: the Mitsuba object.
+        parts: their sum, times ``scale``, is sigma_t.
+        scale: dimensionless factor, differentiable where the plugin makes it so.
+        albedo_arrays: the arrays behind the albedo, or behind the ``sigma_s`` part: their maximum tells whether it scatters.
+        albedo: the albedo itself, a volume or a constant; None where ``sigma_s`` is a part.
+        microflakes: the matrix S (xx, yy, zz, xy, xz, yz) of an ``sggx`` phase function, which makes the extinction depend on
+            the direction: sigma_t sqrt(w^T S w) (Heitz et al. 2015, Eq. 6), with derivatives; None elsewhere.
+        emission: the radiance that a medium shows where nothing is seen through it, a volume or a constant; None where it
+            does not emit.
+        emission_density: radiance per length that does not go with the extinction, likewise.
+        emission_lattice: the grid of ``emission_density``, ``emission`` or ``albedo``: a sweep follows it where the extinction
+            has none.
+        emission_arrays: the arrays behind ``emission`` and ``emission_density``.
+        numbers: the constants among ``scale`` and the coefficients of the extinction, as ``mi.traverse`` hands them out.
+        stock_boxes: the boxes of stock grids of emission and albedo, by the volume's pointer: they repeat their border outside
+            of it, where emission is to be 0.
+    """
+
+    medium: mi.Medium
+    parts: list[Part]
+    scale: mi.Float
+    albedo_arrays: list = field(default_factory=list)
+    albedo: mi.Volume | mi.Float | mi.Color3f | None = None
+    microflakes: list[mi.Float] | None = None
+    emission: mi.Volume | mi.Float | mi.Color3f | None = None
+    emission_density: mi.Volume | mi.Float | mi.Color3f | None = None
+    emission_lattice: Lattice | None = None
+    emission_arrays: list = field(default_factory=list)
+    stock_boxes: dict[int, Box] = field(default_factory=dict)
+    numbers: dict[str, float | mi.Float | mi.Color3f] = field(default_factory=dict)
+
+    def holds(self, volume: mi.Volume, p: mi.Point3f) -> mi.Bool:
+        """Whether a point lies in the box of a volume of ``emission`` or ``emission_density`` that does not ask this itself."""
+        if volume.ptr not in self.stock_boxes:
+            return mi.Bool(True)
+        rows = self.stock_boxes[volume.ptr].rows()
+        local = [x * p.x + y * p.y + z * p.z + shift for x, y, z, shift in rows]
+        return (local[0] >= 0) & (local[0] <= 1) & (local[1] >= 0) & (local[1] <= 1) & (local[2] >= 0) & (local[2] <= 1)
+
+    @property
+    def emits(self) -> bool:
+        """Whether the medium is a source of light."""
+        return self.emission is not None or self.emission_density is not None
+
+    @property
+    def channels(self) -> int:
+        """1 where every part is grey, 3 where one is rgb."""
+        return max(part.channels for part in self.parts)
+
+    @property
+    def walked_lattice(self) -> Lattice | None:
+        """The grid whose cells a sweep follows; None where everything is a constant."""
+        return next((p.lattice for p in self.parts if p.lattice is not None), self.emission_lattice)

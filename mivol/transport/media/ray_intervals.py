@@ -1,0 +1,197 @@
+"""The media along a ray: where each begins and ends, and where the ray is stopped.
+
+A ray is carried to the first opaque surface, and each medium on the way is visited with its interval [t0, t1]. Boundaries that
+are boxes are cut by slab tests in float64; others are traced.
+
+Conventions. Distances are world lengths from the origin of the camera's own ray, never from the last boundary on, so that
+entry points keep their digits.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from mivol.transport.media.body import Body
+from mivol.transport.media.scene_media import World
+from mivol.transport.traversal.lattice import slab
+from mivol.transport.traversal.ray_spawning import distance_along, spawn_ray
+
+__all__ = [
+    "OWN_SURFACE",
+    "MediumVisitor",
+    "RaySegment",
+    "SegmentEnd",
+    "integrate_optical_depth",
+    "revisit_media",
+    "sum_optical_depth",
+    "transmittance",
+    "visit_boxed_media",
+    "visit_media",
+]
+
+
+@dataclass
+class SegmentEnd:
+    """Where a stretch ends: at an opaque surface (``si`` valid), or at the distance asked for.
+
+    ``t`` is the length of the segment, ``medium`` what surrounds its end, ``null_transmission`` the share of the light that
+    surfaces on the way let through undeviated.
+    """
+
+    si: mi.SurfaceInteraction3f
+    t: mi.Float
+    medium: mi.MediumPtr
+    null_transmission: mi.Spectrum | float
+
+
+@dataclass
+class RaySegment:
+    """A stretch that has been walked: its ray, the medium it began in, its length, and whether it passed veils."""
+
+    ray: mi.Ray3f
+    medium: mi.MediumPtr
+    length: mi.Float
+    passes_null: bool = False
+
+
+MediumVisitor = Callable[..., Any]
+"""``visit(state, body, t0, t1, active) -> state``: what to do with the stretch [t0, t1] of a ray in one medium."""
+
+
+def visit_media(
+    scene: mi.Scene,
+    world: World,
+    ray: mi.Ray3f,
+    medium: mi.MediumPtr,
+    visit: MediumVisitor,
+    state: Any,
+    active: mi.Bool,
+    passes_null: bool = False,
+) -> tuple[SegmentEnd, Any]:
+    """Carry a ray to the first opaque surface or to ``ray.maxt``, visiting each medium on the way.
+
+    Media in boxes come after the others and in no order: a visitor must be a sum. A ray that ``passes_null`` goes on straight
+    through surfaces that let part of the light through undeviated, and says how much.
+
+    Returns:
+        Where the ray ends, and the last state.
+    """
+    if world.traces:
+        end, state = _trace(scene, world, ray, medium, visit, state, active, passes_null and world.has_null_transmission)
+    else:
+        si = dr.zeros(mi.SurfaceInteraction3f, dr.width(ray))
+        si.wi, si.wavelengths, si.time = -ray.d, ray.wavelengths, ray.time
+        end = SegmentEnd(si, mi.Float(ray.maxt), medium, 1.0)
+    return end, visit_boxed_media(world, ray, end.t, visit, state, active)
+
+
+def visit_boxed_media(world: World, ray: mi.Ray3f, t_end: mi.Float, visit: MediumVisitor, state: Any, active: mi.Bool) -> Any:
+    """Visit the media in boxes between the ray's origin and ``t_end``."""
+    for body in world.boxed:
+        t0, t1 = mi.Float64(0), mi.Float64(t_end)
+        if body.cuts_grids:
+            _, _, t0, t1 = slab(body.rows, (0.0,) * 3, (1.0,) * 3, ray.o, ray.d, t0, t1)
+        state = visit(state, body, t0, t1, active & (t1 > t0))
+    return state
+
+
+def revisit_media(
+    scene: mi.Scene, world: World, ray_segment: RaySegment, visit: MediumVisitor, state: Any, active: mi.Bool
+) -> Any:
+    """Visit the media of a stretch whose end is known; only boundaries that have to be traced are traced again."""
+    if not world.traced:
+        return visit_boxed_media(world, ray_segment.ray, ray_segment.length, visit, state, active)
+    return visit_media(scene, world, ray_segment.ray, ray_segment.medium, visit, state, active, ray_segment.passes_null)[1]
+
+
+@dr.syntax
+def _trace(
+    scene: mi.Scene,
+    world: World,
+    ray: mi.Ray3f,
+    medium: mi.MediumPtr,
+    visit: MediumVisitor,
+    state: Any,
+    active: mi.Bool,
+    passes_null: bool,
+) -> tuple[SegmentEnd, Any]:
+    """Trace through transparent surfaces to the first opaque one; visit the media whose boundary is traced."""
+    # -- State ------------------------------------------------------------------------------------------------------------
+    onward = mi.Ray3f(ray)  #                        the ray from the last boundary on
+    medium = mi.MediumPtr(medium)  #                 what surrounds its origin
+    t = mi.Float(0)  #                               distance of that origin
+    si = dr.zeros(mi.SurfaceInteraction3f, dr.width(ray))
+    si.wi, si.wavelengths, si.time = -ray.d, ray.wavelengths, ray.time
+    going = mi.Bool(active)
+    null_transmission = dr.full(mi.Spectrum, 1, dr.width(ray)) if passes_null else 1.0
+
+    while dr.hint(going, label="to the next opaque surface"):
+        hit = scene.ray_intersect(onward, mi.RayFlags.All, False, going)
+        found = going & hit.is_valid()
+        t_hit = dr.select(found, dr.maximum(t, distance_along(ray, hit)), ray.maxt)
+
+        # -- The medium on this side of the surface fills the stretch ---------------------------------------------------------
+        transition = found & hit.is_medium_transition()
+        medium = dr.select(transition, hit.target_medium(-ray.d), medium)
+        state = _visit_traced(world, medium, visit, state, t, t_hit, going)
+
+        # -- Go on through what is transparent ------------------------------------------------------------------------------
+        clear = found & is_transparent(hit)
+        if passes_null:
+            thin = found & ~clear & mi.has_flag(hit.bsdf().flags(), mi.BSDFFlags.Null) & (t_hit < ray.maxt * OWN_SURFACE)
+            null_transmission = dr.select(
+                thin, null_transmission * hit.bsdf().eval_null_transmission(hit, thin), null_transmission
+            )
+            clear |= thin & dr.any(null_transmission != 0)
+        medium = dr.select(clear & transition, hit.target_medium(ray.d), medium)
+        si = dr.select(going, hit, si)
+        t = dr.select(going, t_hit, t)
+        onward = spawn_ray(hit, ray.d, world.size)
+        onward.maxt = ray.maxt - t_hit
+        going &= clear
+    return SegmentEnd(si, t, medium, null_transmission), state
+
+
+def _visit_traced(
+    world: World, medium: mi.MediumPtr, visit: MediumVisitor, state: Any, t0: mi.Float, t1: mi.Float, active: mi.Bool
+) -> Any:
+    for body in world.traced:
+        state = visit(state, body, t0, t1, active & (medium == mi.MediumPtr(body.view.medium)))
+    return state
+
+
+def is_transparent(si: mi.SurfaceInteraction3f) -> mi.Bool:
+    """Whether a surface is nothing but a boundary: a ``null`` BSDF and no emitter."""
+    lobes = si.bsdf().flags() & mi.UInt32(int(mi.BSDFFlags.All))
+    return (lobes == int(mi.BSDFFlags.Null)) & ~si.shape.is_emitter()
+
+
+OWN_SURFACE = 1 - 1e-3
+"""Share of the way to a lamp behind which a shadow ray meets the lamp's own surface (Mitsuba shortens its rays alike)."""
+
+
+def sum_optical_depth(ray: mi.Ray3f, enough: float | None = None) -> MediumVisitor:
+    """The visitor that sums the optical depth of each channel along ``ray``; in a grid it may stop at ``enough``."""
+
+    def visit(tau: list[mi.Float], body: Body, t0: mi.Float, t1: mi.Float, active: mi.Bool) -> list[mi.Float]:
+        return [t + d for t, d in zip(tau, body.optical_depth(ray, t0, t1, len(tau), active, None, enough), strict=True)]
+
+    return visit
+
+
+def integrate_optical_depth(
+    scene: mi.Scene, world: World, ray: mi.Ray3f, medium: mi.MediumPtr, active: mi.Bool
+) -> tuple[SegmentEnd, list[mi.Float]]:
+    """Optical depth [1] of each channel to the first opaque surface or ``ray.maxt``, and where that is."""
+    zero = [mi.Float(0) for _ in range(world.channels)]
+    return visit_media(scene, world, ray, medium, sum_optical_depth(ray), zero, active)
+
+
+def transmittance(tau: list[mi.Float]) -> mi.Spectrum:
+    """exp(-tau) of each channel."""
+    return mi.Spectrum(*(dr.exp(-t) for t in tau)) if len(tau) == 3 else mi.Spectrum(dr.exp(-tau[0]))

@@ -1,0 +1,152 @@
+r"""What a cell sends towards the ray that enters it, from two points in it: fourth order, and energy-conserving.
+
+.. math:: S = \int_0^\Delta \sigma c\, e^{-\tau(t)} dt \approx (1 - e^{-\tau}) \big( f c_1 + (1 - f) c_2 \big), \quad
+          f = \frac{\sigma_1 Q}{\sigma_1 Q + \sigma_2}, \quad Q = 1 + x + \tfrac{x^2}{2} + \tfrac{x^3}{6 + 3 x}, \quad
+          x = \frac{\tau}{\sqrt 3}
+
+with :math:`\tau = \tfrac{\Delta}{2} (\sigma_1 + \sigma_2)`, exact for a cubic. The optical depths in front of the two points
+differ by :math:`\tau / \sqrt 3` in the two-stage Gauss method (Hairer & Wanner 1996, table IV.5.1), so collocation weighs
+the second by :math:`\sigma_2 e^{-x}`. Its weights are scaled to sum to the cell's opacity, so a constant source
+function gives c (1 - T) to rounding at any optical depth; and exp(x) is replaced by Q, which agrees beyond the order of the
+method and grows with a power: a little extinction at the first point moves what an opaque cell shows by about tau of itself,
+where the exponential would make that exp(tau / sqrt 3). (Measured at 0.5 a cell: 1.9 times the error of the exponential; of
+1 + x + x^2 / 2 it is 4.5 times.)
+
+A glow j that does not go with the extinction (radiance per length) has the same points,
+
+.. math:: \int_0^\Delta j\, e^{-\tau(t)} dt \approx N \big( (1 - v) j_1 + v j_2 \big)
+
+with N and the mean place of that light in the cell from the moments E_n of :mod:`mivol.numerics`, to the second and first order
+in the slope of the extinction.
+
+Conventions. Points 1 and 2 are the first and second Gauss point on the way of the ray (:data:`GAUSS`). Nothing is divided by an
+extinction or by a transmittance: values and derivatives are finite for every sigma >= 0, 0 included. Derivatives are
+closed forms; none is tracked.
+
+References: Max 1995 (emission and absorption along a ray); Hochbruck & Ostermann 2010 (phi functions); Abramowitz &
+Stegun 25.4.30 (Gauss points).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from mivol.numerics import exp_moments, one_minus_exp, phi1
+from mivol.transport.traversal.interpolation import GAUSS
+
+__all__ = ["DensityWeights", "OpacityShares", "share_opacity", "weigh_emission_density"]
+
+
+STEEP = 1e12
+"""Largest x: beyond, 1 / Q is 0 beside any float32 ratio of the two extinctions, and Q itself must not overflow."""
+
+
+@dataclass
+class OpacityShares:
+    """How a cell shares its opacity out to the source functions at its two points.
+
+    Attributes:
+        tau, T, alpha: optical depth, transmittance and opacity of the cell [1].
+        f: the share of the first point.
+        half: half the length of the cell.
+        lean: what moves the share: d (alpha f) / d sigma_q is ``half * (T f + lean[q])``.
+        per_sigma: the weights over the extinction at their points [length], which stay finite where it is 0.
+    """
+
+    tau: mi.Float
+    T: mi.Float
+    alpha: mi.Float
+    f: mi.Float
+    half: mi.Float
+    lean: tuple[mi.Float, mi.Float]
+    per_sigma: tuple[mi.Float, mi.Float]
+
+    @property
+    def weights(self) -> tuple[mi.Float, mi.Float]:
+        """What a unit of source function at each point sends; they sum to the opacity."""
+        return self.alpha * self.f, self.alpha * (1 - self.f)
+
+    def sent(self, c1: mi.Float, c2: mi.Float) -> mi.Float:
+        """Light that the cell sends: S, of source functions c1 and c2 [radiance]."""
+        return self.alpha * dr.fma(self.f, c1 - c2, c2)
+
+    def slopes(self, c1: mi.Float, c2: mi.Float) -> tuple[mi.Float, mi.Float]:
+        """Derivatives of S with respect to the extinction at each point, at constant source functions."""
+        mean, difference = self.T * dr.fma(self.f, c1 - c2, c2), c1 - c2
+        return self.half * dr.fma(self.lean[0], difference, mean), self.half * dr.fma(self.lean[1], difference, mean)
+
+
+def share_opacity(dt: mi.Float, sigma1: mi.Float, sigma2: mi.Float) -> OpacityShares:
+    """Share out the opacity of a cell.
+
+    Args:
+        dt: its length [length], finite.
+        sigma1, sigma2: extinction [1/length] at its Gauss points, finite and at least 0.
+
+    Bias: O(dt^5) a cell for smooth fields; none for a constant source function.
+    """
+    half, total = 0.5 * dt, sigma1 + sigma2
+    tau = half * total
+    x = dr.minimum(tau * (1 / math.sqrt(3)), STEEP)
+    r = x * dr.rcp(x + 2)
+    q = dr.fma(x, dr.fma(x, dr.fma(r, 1 / 3, 0.5), 1), 1)
+    first = sigma1 * q
+    both = first + sigma2
+    some = both > 0
+    inverse = dr.rcp(dr.select(some, both, 1))
+    f = dr.select(some, first * inverse, 0.5)
+    scale = phi1(tau) * dr.select(some, total * inverse, 1)
+    growth = half * (1 / math.sqrt(3)) * (1 + x + (2 / 3) * dr.square(r) * (3 + x))  # dq / d sigma, for either point
+    lean = (scale * dr.fma(sigma1, growth, q) * (1 - f), -scale * f * (1 - sigma2 * growth / q))
+    return OpacityShares(tau, dr.exp(-tau), one_minus_exp(tau), f, half, lean, (half * scale * q, half * scale))
+
+
+@dataclass
+class DensityWeights:
+    """What a cell lets out of a glow in it.
+
+    ``weights`` [length] are for the glow at its two points; ``slopes`` their derivatives, [weight][point of the extinction].
+    """
+
+    weights: tuple[mi.Float, mi.Float]
+    slopes: tuple[tuple[mi.Float, mi.Float], tuple[mi.Float, mi.Float]]
+
+
+def weigh_emission_density(dt: mi.Float, sigma1: mi.Float, sigma2: mi.Float) -> DensityWeights:
+    """Weigh a glow at the two points of a cell.
+
+    Args:
+        dt, sigma1, sigma2: as :func:`share_opacity`.
+
+    Bias: O(dt^5) a cell for smooth fields; none for a constant glow in a constant extinction. Weights are never negative.
+    """
+    tau, lean = 0.5 * dt * (sigma1 + sigma2), (0.5 * math.sqrt(3)) * dt * (sigma2 - sigma1)
+    E = exp_moments(tau)
+    inverse = dr.rcp(E[0])
+    e = [m * inverse for m in E]
+    twice = e[2] - 2 * e[3] + e[4]
+    total = E[0] * (1 + lean * (e[1] - e[2] + 0.5 * lean * twice))
+    by_tau = -E[0] * (e[1] + lean * (e[2] - e[3] + 0.5 * lean * (e[3] - 2 * e[4] + e[5])))
+    by_lean = E[0] * (e[1] - e[2] + lean * twice)
+
+    # The mean place in the cell, 1/2 where it is thin, and how it moves.
+    drift = [dr.fma(e[n], e[1], -e[n + 1]) for n in range(5)]  # d e_n / d tau; that of e_0 is 0
+    pull = e[2] - e[3] - e[1] * (e[1] - e[2])
+    place = dr.fma(lean, pull, e[1])
+    moves = drift[1] + lean * (drift[2] - drift[3] - drift[1] * (e[1] - e[2]) - e[1] * (drift[1] - drift[2]))
+    spread = 1 / (1 - 2 * GAUSS)
+    v = (place - GAUSS) * spread
+    between = (v > 0) & (v < 1)
+    v = dr.clip(v, 0, 1)
+    v_tau, v_lean = dr.select(between, spread * moves, 0), dr.select(between, spread * pull, 0)
+
+    slopes = []
+    for share, turn in ((1 - v, -1.0), (v, 1.0)):
+        tau_slope = dr.fma(turn * total, v_tau, by_tau * share) * (0.5 * dt * dt)
+        lean_slope = dr.fma(turn * total, v_lean, by_lean * share) * (0.5 * math.sqrt(3) * dt * dt)
+        slopes.append((tau_slope - lean_slope, tau_slope + lean_slope))
+    return DensityWeights((dt * total * (1 - v), dt * total * v), (slopes[0], slopes[1]))

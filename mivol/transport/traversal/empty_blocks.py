@@ -1,0 +1,154 @@
+"""Which blocks of a grid's cells hold anything, and how far each block is from the nearest that does.
+
+A walk crosses all of an empty block's distance in one step. Distances are those of the maximum norm, in blocks.
+
+References: Cohen & Sheffer 1994 (proximity clouds); Szirmay-Kalos et al. 2011 (super-grids).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import drjit as dr
+import mitsuba as mi
+
+__all__ = [
+    "BLOCK",
+    "REACH",
+    "SHIFT",
+    "block_bounds",
+    "count_blocks",
+    "distances",
+    "empty_block_distances",
+    "find_empty_distances",
+    "over_blocks",
+]
+
+
+SHIFT = 2
+"""log2 of the edge of a block."""
+
+BLOCK = 1 << SHIFT
+"""Edge of a block of the super-grid, in cells (measured on threads in 512^3: 2 are no faster)."""
+
+REACH = 15
+"""Largest distance that a block or a cell knows [blocks, cells]: in an empty box of 128^3 cells a ray takes 10 steps."""
+
+
+def block_bounds(values: mi.TensorXf) -> mi.Float:
+    """Bound |values| over each block of ``BLOCK``^3 cells (all nodes that its cells touch), all channels together.
+
+    Returns:
+        Flat array over (blocks in z, y, x), ceil((N + 1) / BLOCK) of them along an axis. A block with bound 0 is empty.
+
+    Cost: 5/4 look-ups a voxel along x, fewer along the others.
+    """
+    flat = _channel_max(dr.abs(dr.detach(values.array)), values.shape[3])
+    return over_blocks(flat, values.shape[:3], SHIFT, dr.maximum, 0)
+
+
+def count_blocks(n: int, shift: int = SHIFT) -> int:
+    """Number of blocks of 2^shift cells along an axis of n voxels (n + 1 cells)."""
+    return -(-(n + 1) >> shift)
+
+
+def over_blocks(
+    flat: mi.Float, res: tuple[int, int, int], shift: int, reduce: Callable[[mi.Float, mi.Float], mi.Float], nothing: float
+) -> mi.Float:
+    """Reduce the nodes that the cells of each block of 2^shift along each axis touch, axis by axis.
+
+    Args:
+        flat: one number a voxel (Z, Y, X).
+        res: (Z, Y, X).
+        shift: log2 of the edge of a block [cells].
+        reduce, nothing: a function of two, associative, and what leaves the other one as it is.
+    """
+    z, y, x = res
+    b_y, b_x = count_blocks(y, shift), count_blocks(x, shift)
+    for outer, n, inner in ((z * y, x, 1), (z, y, b_x), (1, z, b_y * b_x)):
+        flat = _over_axis(flat, outer, n, inner, shift, reduce, nothing)
+    return flat
+
+
+def _channel_max(flat: mi.Float, channels: int) -> mi.Float:
+    """Maximum over the last axis of (voxels, channels)."""
+    base = dr.arange(mi.UInt32, dr.width(flat) // channels) * channels
+    best = mi.Float(0)
+    for c in range(channels):
+        best = dr.maximum(best, dr.gather(mi.Float, flat, base + c))
+    return best
+
+
+def _over_axis(
+    flat: mi.Float,
+    outer: int,
+    n: int,
+    inner: int,
+    shift: int,
+    reduce: Callable[[mi.Float, mi.Float], mi.Float],
+    nothing: float,
+) -> mi.Float:
+    """Reduce the nodes of each block along the middle axis of (outer, n, inner)."""
+    b, edge = count_blocks(n, shift), 1 << shift
+    i = dr.arange(mi.UInt32, outer * b * inner)
+    # Block b of edge e holds the cells e b - 1 .. e (b + 1) - 2, so the nodes e b - 1 .. e (b + 1) - 1.
+    first = mi.Int32((i // inner) % b) * edge - 1
+    row = (i // (inner * b)) * (n * inner) + i % inner
+    best = mi.Float(nothing)
+    for k in range(edge + 1):
+        node = mi.UInt32(dr.clip(first + k, 0, n - 1))
+        best = reduce(best, dr.gather(mi.Float, flat, row + node * inner))
+    dr.eval(best)
+    return best
+
+
+def find_empty_distances(values: mi.TensorXf) -> mi.UInt8:
+    """The :func:`empty_block_distances` of a grid (Z, Y, X, C)."""
+    return empty_block_distances(block_bounds(values), values.shape[:3])
+
+
+def empty_block_distances(bounds: mi.Float, res: tuple[int, int, int]) -> mi.UInt8:
+    """Measure how far each block is from the nearest that holds anything.
+
+    Args:
+        bounds: from :func:`block_bounds`.
+        res: of the grid (Z, Y, X).
+
+    Returns:
+        Flat array over the blocks: distances [blocks], the largest of the three axes'; 0 where the block itself holds
+        anything, ``REACH`` where it is further. From a block of distance k a ray may cross k - 1 more along each axis.
+
+    Cost: 6 ``REACH`` look-ups a block at most.
+    """
+    return distances(bounds > 0, tuple(count_blocks(n) for n in res))
+
+
+def distances(occupied: mi.Bool, counts: tuple[int, int, int]) -> mi.UInt8:
+    """How far each of (Z, Y, X) places is from the nearest occupied one: the largest of the three axes', at most ``REACH``.
+
+    Cost: 6 ``REACH`` look-ups a place at most, an axis at a time.
+    """
+    z, y, x = counts
+    far = dr.select(occupied, mi.UInt8(0), mi.UInt8(REACH))
+    for stride, n in ((1, x), (x, y), (x * y, z)):
+        dr.eval(far)
+        far = _nearest(far, stride, n)
+    dr.eval(far)
+    return far
+
+
+@dr.syntax
+def _nearest(far: mi.UInt8, stride: int, n: int) -> mi.UInt8:
+    """The least, over the neighbours along an axis, of the larger of their distance along it and their own ``far``."""
+    here = dr.arange(mi.Int32, dr.width(far))
+    place = here // stride % n
+    best = mi.UInt8(far)
+    k = mi.Int32(1)
+    while k < mi.Int32(best):
+        low = dr.gather(mi.UInt8, far, mi.UInt32(here - k * stride), place >= k)
+        high = dr.gather(mi.UInt8, far, mi.UInt32(here + k * stride), place + k < n)
+        low = dr.select(place >= k, low, mi.UInt8(REACH))
+        high = dr.select(place + k < n, high, mi.UInt8(REACH))
+        best = dr.minimum(best, dr.maximum(dr.minimum(low, high), mi.UInt8(k)))
+        k += 1
+    return best

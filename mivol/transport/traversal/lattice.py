@@ -1,0 +1,166 @@
+"""A grid placed in the world, and the part of a ray inside its box.
+
+Conventions. A cell (i, j, k), each index from -1 to N - 1, lies between the nodes i and i + 1; node indices are clamped
+to the grid, so that the outer half voxel is constant and a single voxel needs no special case. A ray is o + t d with t in
+world length for a unit d; it is mapped to the lattice without being normalised again, so t keeps its meaning under any
+scale, shear or mirroring. Box entry and exit are found in float64: a float32 entry point errs by 3e-3 of a cell
+from 1e4 scene sizes away.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mivol.errors import MivolError
+from mivol.space import check_affine, lattice_from_world
+
+__all__ = ["Lattice", "Mask3", "Segment", "clip", "locate", "slab"]
+
+
+Mask3 = Any
+"""Three masks a lane, ``dr.mask_t(mi.Vector3f)``: Mitsuba has no public name for the type."""
+
+
+@dataclass
+class Lattice:
+    """A grid placed in the world.
+
+    Attributes:
+        values: TensorXf (Z, Y, X, C), at voxel centres.
+        to_world: (4, 4) float64, unit cube to world.
+        empty_distances: how far each block of cells is from the nearest that holds anything, or None where no block is to be
+            skipped (:mod:`mivol.transport.traversal.empty_blocks`).
+        block_ranges: :class:`mivol.transport.traversal.block_ranges.BlockRanges`, or None where every cell is walked.
+        from_world: (3, 4) map from the world to lattice coordinates, made where it is not given.
+    """
+
+    values: mi.TensorXf
+    to_world: np.ndarray
+    empty_distances: mi.UInt8 | None = None
+    block_ranges: Any = None
+    from_world: list[list[mi.Float64]] | None = None
+
+    def __post_init__(self) -> None:
+        if self.from_world is not None:
+            return
+        if len(self.values.shape) != 4 or 0 in self.values.shape:
+            raise MivolError(f"a grid of shape {tuple(self.values.shape)} was given; (Z, Y, X, channels) is expected.")
+        if np.prod([n + 1 for n in self.values.shape[:3]]) * self.channels >= 2**31:
+            raise MivolError(f"a grid of shape {tuple(self.values.shape)} was given; a walk counts up to 2^31: split it.")
+        self.to_world = check_affine(self.to_world)
+        # Opaque: two grids placed differently share one kernel.
+        rows = lattice_from_world(self.to_world, self.res)
+        self.from_world = [[dr.opaque(mi.Float64, float(v)) for v in row] for row in rows]
+
+    @property
+    def res(self) -> tuple[int, int, int]:
+        """Resolution (Z, Y, X)."""
+        return tuple(self.values.shape[:3])
+
+    @property
+    def channels(self) -> int:
+        """Number of values at each voxel."""
+        return self.values.shape[3]
+
+    def place(self, u: mi.Vector3f) -> mi.Point3f:
+        """Points of the unit cube in the world, in float32."""
+        rows = [[dr.opaque(mi.Float, float(v)) for v in row] for row in self.to_world[:3]]
+        return mi.Point3f(*(dr.fma(r[0], u.x, dr.fma(r[1], u.y, dr.fma(r[2], u.z, r[3]))) for r in rows))
+
+
+@dataclass
+class Segment:
+    """A ray's stretch inside a box of the lattice: where it enters, and how far it goes.
+
+    ``cell`` and ``frac`` are the entry point (lattice coordinates), ``d`` the lattice distance per world length (and
+    ``d_rest`` what its rounding left over), ``t0`` the world distance from the ray's origin to the entry, ``length`` the
+    world length inside.
+    """
+
+    cell: mi.Vector3i
+    frac: mi.Vector3f
+    d: mi.Vector3f
+    d_rest: mi.Vector3f
+    t0: mi.Float
+    length: mi.Float
+
+
+def clip(lattice: Lattice, o: mi.Point3f, d: mi.Vector3f, t_min: mi.Float, t_max: mi.Float) -> Segment:
+    """Cut a ray to the box of a grid, in float64.
+
+    Args:
+        lattice: the grid and its place.
+        o, d: world ray; t is world length where |d| = 1.
+        t_min, t_max: the stretch asked for [length]; ``t_max`` may be infinite.
+
+    Returns:
+        The stretch inside the box; ``length`` is 0 where there is none.
+    """
+    n = lattice.res[::-1]
+    high = tuple(k - 0.5 for k in n)
+    q, v, t0, t1 = slab(lattice.from_world, (-0.5,) * 3, high, o, d, mi.Float64(t_min), mi.Float64(t_max))
+    hit = t1 > t0
+    t0 = dr.select(hit, t0, 0)
+    cell, frac = mi.Vector3i(), mi.Vector3f()
+    for a in range(3):
+        entry = dr.clip(dr.fma(t0, v[a], q[a]), -0.5, n[a] - 0.5)
+        low = dr.floor(entry)
+        cell[a], frac[a] = mi.Int32(low), mi.Float(entry - low)
+    direction = mi.Vector3f(mi.Float(v[0]), mi.Float(v[1]), mi.Float(v[2]))
+    rest = mi.Vector3f(*(mi.Float(v[a] - mi.Float64(direction[a])) for a in range(3)))
+    return Segment(cell, frac, direction, rest, mi.Float(t0), mi.Float(dr.select(hit, t1 - t0, 0)))
+
+
+def locate(lattice: Lattice, o: mi.Point3f, d: mi.Vector3f, t: mi.Float) -> tuple[mi.Vector3i, mi.Vector3f, mi.Bool]:
+    """Find the cell of a point of a ray, in float64.
+
+    Returns:
+        Its lower node (-1 to N - 1), the fractions from there, and whether the point is in the box.
+    """
+    n, t = lattice.res[::-1], mi.Float64(t)
+    cell, frac, inside = mi.Vector3i(), mi.Vector3f(), mi.Bool(True)
+    p = [dr.fma(t, mi.Float64(d[a]), mi.Float64(o[a])) for a in range(3)]
+    for a, row in enumerate(lattice.from_world):
+        q = dr.fma(row[0], p[0], dr.fma(row[1], p[1], dr.fma(row[2], p[2], row[3])))
+        # A distance that was drawn in the box and rounded may lie 1e-7 of the way outside it.
+        inside &= dr.abs(q - 0.5 * (n[a] - 1)) < 0.5 * n[a] + 1e-3
+        q = dr.clip(q, -0.5, n[a] - 0.5)
+        low = dr.minimum(dr.floor(q), n[a] - 1)
+        cell[a], frac[a] = mi.Int32(low), mi.Float(q - low)
+    return cell, frac, inside
+
+
+def slab(
+    rows: list, low: tuple, high: tuple, o: mi.Point3f, d: mi.Vector3f, t0: mi.Float64, t1: mi.Float64
+) -> tuple[list[mi.Float64], list[mi.Float64], mi.Float64, mi.Float64]:
+    """Cut [t0, t1] of a ray to a box, in float64 (the slab test of Kay & Kajiya 1986).
+
+    Args:
+        rows: (3, 4) map from the world to the box's coordinates.
+        low, high: the box there.
+        o, d: world ray.
+        t0, t1: the stretch asked for [length].
+
+    Returns:
+        The ray's origin and direction in the box's coordinates, and the stretch inside; t1 <= t0 where there is none.
+    """
+    f64 = mi.Float64
+    o, d = [f64(o[a]) for a in range(3)], [f64(d[a]) for a in range(3)]
+    q, v = [], []
+    for a, row in enumerate(rows):
+        q.append(dr.fma(row[0], o[0], dr.fma(row[1], o[1], dr.fma(row[2], o[2], row[3]))))
+        v.append(dr.fma(row[0], d[0], dr.fma(row[1], d[1], row[2] * d[2])))
+        parallel = v[a] == 0
+        inv = 1 / dr.select(parallel, 1, v[a])
+        near, far = (low[a] - q[a]) * inv, (high[a] - q[a]) * inv
+        # A ray parallel to the faces is in or out for ever: 0 * inf would be NaN. In the plane of a face it is out.
+        inside = (q[a] > low[a]) & (q[a] < high[a])
+        t0 = dr.select(parallel, dr.select(inside, t0, dr.inf), dr.maximum(t0, dr.minimum(near, far)))
+        t1 = dr.select(parallel, t1, dr.minimum(t1, dr.maximum(near, far)))
+    # NaN rays fail the comparison and are empty, as is a direction of length 0 (an infinite stretch).
+    return q, v, t0, dr.select((t1 > t0) & dr.isfinite(t1 - t0), t1, t0)
