@@ -262,4 +262,5 @@ def taken_light(tau: mi.Float, T: mi.Float, T_out: mi.Float) -> mi.Float:
 
 
 def inverse(x: mi.Float) -> mi.Float:
+    """1 / x for x >= 0, finite at 0 (1e30), so that a product with 0 stays 0."""
     return dr.rcp(dr.maximum(x, 1e-30))

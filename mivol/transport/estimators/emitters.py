@@ -90,6 +90,7 @@ def _ball(emitter: mi.Emitter) -> list[float] | None:
 
 
 def is_among(emitters: list[mi.Emitter], emitter: mi.EmitterPtr) -> mi.Bool:
+    """Whether the emitter of each lane is one of a list."""
     found = mi.Bool(False)
     for candidate in emitters:
         found |= emitter == mi.EmitterPtr(candidate)

@@ -22,6 +22,7 @@ def equiangular_sampler(ray: mi.Ray3f, ball: list[mi.Float] | None) -> Equiangul
 
 
 def equiangular_towards(ray: mi.Ray3f, centre: mi.Point3f, radius2: mi.Float, finite: mi.Bool) -> EquiangularSampler:
+    """The sampler of rays towards a ball about ``centre``, for the lanes whose emitter is ``finite``."""
     away = centre - ray.o
     t0 = dr.dot(away, ray.d)
     h2 = dr.squared_norm(away - t0 * ray.d)

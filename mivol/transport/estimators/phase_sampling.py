@@ -41,4 +41,5 @@ def _has_microflakes(phase: mi.PhaseFunctionPtr) -> mi.Bool:
 
 
 def phase_context() -> mi.PhaseFunctionContext:
+    """The context that asks a phase function for all of its components."""
     return mi.PhaseFunctionContext(None)

@@ -252,6 +252,7 @@ class Body:
 
 
 def is_followed(microflakes: list[mi.Float] | None) -> bool:
+    """Whether a derivative of the microflakes is asked for."""
     with dr.resume_grad():
         return microflakes is not None and dr.grad_enabled(microflakes)
 

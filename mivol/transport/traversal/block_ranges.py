@@ -70,6 +70,7 @@ def find_block_ranges(values: mi.TensorXf) -> BlockRanges:
 
 
 def largest(rows: list[mi.Float]) -> mi.Float:
+    """The largest of several numbers in each lane."""
     most = rows[0]
     for row in rows[1:]:
         most = dr.maximum(most, row)
