@@ -32,8 +32,8 @@ from mivol.transport.media.body import Body
 from mivol.transport.media.box import Box
 from mivol.transport.media.grid_integral import integrate_tau
 from mivol.transport.media.medium_view import MediumView, Part
-from mivol.transport.media.ray_intervals import integrate_optical_depth
-from mivol.transport.media.scene_media import World
+from mivol.transport.media.optical_depth import integrate_optical_depth
+from mivol.transport.media.scene_media import SceneMedia
 
 __all__ = ["ALBEDOS", "TABLES", "TAUS", "depth_two_error", "draw_lines", "mean_albedo", "mean_cosine", "scattering_depth"]
 
@@ -197,9 +197,9 @@ def _depths(view: MediumView, o: mi.Point3f, d: mi.Vector3f, length: np.ndarray)
 
 def _traced_depths(scene: mi.Scene, view: MediumView, ray: mi.Ray3f) -> np.ndarray:
     """Optical depth (n, channels) of lines in a boundary of any shape, up to the first opaque surface."""
-    world = World([Body(view, None)], has_surfaces=True, size=extent(scene))
+    media = SceneMedia(scene, [Body(view, None)], has_surfaces=True, size=extent(scene))
     nowhere = dr.zeros(mi.MediumPtr, dr.width(ray))
-    _, tau = integrate_optical_depth(scene, world, ray, nowhere, dr.full(mi.Bool, True, dr.width(ray)))
+    _, tau = integrate_optical_depth(media, ray, nowhere, dr.full(mi.Bool, True, dr.width(ray)))
     return np.stack([np.array(t, np.float64) for t in tau], axis=-1)
 
 

@@ -7,40 +7,26 @@ sentence, before a kernel runs.
 from __future__ import annotations
 
 import difflib
-import re
 from dataclasses import dataclass
-from pathlib import Path
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from mivol.errors import MivolError
 from mivol.machine import available_memory
-from mivol.scene.depth_two import depth_two_error, mean_albedo, mean_cosine, scattering_depth
-from mivol.scene.load import find_sensor
-from mivol.scene.needs import MediumFacts, Needs, Survey, find_needs, read_block_ranges, read_empty_distances, survey_scene
-from mivol.scene.nesting import bounds
-from mivol.transport.estimators.emitters import SceneEmitters
-from mivol.transport.estimators.transmittance_grid import build_transmittance_grid, measure_transmittance_bias
+from mivol.scene.needs import MediumFacts, Needs
 from mivol.transport.line_integrals.aovs import AOVS
-from mivol.transport.media.body import Body, flight_parts
-from mivol.transport.media.box import Box
+from mivol.transport.media.body import flight_parts
 from mivol.transport.media.grid_integral import PACKED_LIMIT, gradient_bytes
 from mivol.transport.media.medium_view import MediumView
-from mivol.transport.media.read_medium import traverse_medium
-from mivol.transport.media.scene_media import World
 from mivol.transport.media.summed_extinction import share_cells
 from mivol.transport.path.settings import Settings
 
-__all__ = ["Choice", "Plan", "build_world", "check_aovs", "explain", "make_plan"]
+__all__ = ["Choice", "Plan", "check_aovs", "is_lit", "make_plan", "shares_cells"]
 
 SKIP_BELOW = 0.45
 """Share of occupied blocks below which skipping pays (it costs 8 reads a cell in place of 4; measured, as fast as
 without: smoke of 48 % 0.9 times, CT of 43 % 1.05 to 1.1 times, smoke of 256^3, 43 %, 1.3 to 1.4 times)."""
-
-UNLIMITED = 0xFFFFFFFF
-"""The depth that Mitsuba's integrators print for -1."""
 
 PASS_RAYS = {"llvm": 1 << 22, "cuda": 1 << 25, "metal": 1 << 24}
 """Most rays of one pass, through media without grids or with small ones."""
@@ -80,13 +66,15 @@ class Plan:
     """The choices for a scene.
 
     ``skips`` tells for each medium whether empty blocks are skipped, ``tracks`` whether its shadows are estimated in pictures;
-    ``events`` how many points of a camera ray scatter in pictures; ``pass_rays`` how many rays a pass may hold;
-    ``gradient_bytes`` what a gradient step takes beyond the rays.
+    ``segment`` names the estimator of what media add along a segment, in
+    :data:`mivol.transport.path.estimators.SEGMENT_ESTIMATORS`; ``events`` how many points of a camera ray scatter in
+    pictures; ``pass_rays`` how many rays a pass may hold; ``gradient_bytes`` what a gradient step takes beyond the rays.
     """
 
     choices: tuple[Choice, ...]
     skips: tuple[bool, ...]
     tracks: tuple[bool, ...]
+    segment: str
     events: int
     pass_rays: int
     gradient_bytes: int
@@ -119,7 +107,16 @@ def make_plan(needs: Needs, settings: Settings) -> Plan:
     )
     memory, choice = _gradient(needs)
     choices.append(choice)
-    return Plan(tuple(choices), skips, tracks, events, pass_rays, memory)
+    return Plan(tuple(choices), skips, tracks, _segment(needs, settings), events, pass_rays, memory)
+
+
+def _segment(needs: Needs, settings: Settings) -> str:
+    """Name of the estimator of what media add along a segment."""
+    if any(m.emits for m in needs.media):
+        return "emission"
+    if not needs.lamps or not is_lit(needs, settings):
+        return "absorption"
+    return "scattering_quadrature" if settings.deterministic else "single_scattering"
 
 
 def check_aovs(names: str) -> tuple[str, ...]:
@@ -157,7 +154,7 @@ def _refuse_refraction(needs: Needs, settings: Settings) -> None:
 
 def _refuse_emission(needs: Needs, settings: Settings) -> None:
     glowing = [m.name for m in needs.media if m.emits]
-    if glowing and _is_lit(needs, settings):
+    if glowing and is_lit(needs, settings):
         raise MivolError(
             f"the medium in {glowing[0]} emits and a medium of its scene scatters at max_depth 2; the light of one that is "
             "scattered by the other is not there yet: set max_depth to 1, or the albedo to 0."
@@ -204,7 +201,7 @@ def _refuse_quadrature(needs: Needs, settings: Settings) -> None:
         raise MivolError("shadows is 'estimated' and deterministic is set: estimates are noise; set shadows to exact or grid.")
     if settings.shadows == "grid" and not settings.deterministic:
         raise MivolError("shadows is 'grid' without deterministic, and drawn light has exact shadows: set deterministic too.")
-    if not settings.deterministic or not _is_lit(needs, settings):
+    if not settings.deterministic or not is_lit(needs, settings):
         return
     other = [kind for kind, lamp in zip(needs.emitters, needs.lamps, strict=True) if lamp != "sharp"]
     if other:
@@ -212,7 +209,7 @@ def _refuse_quadrature(needs: Needs, settings: Settings) -> None:
             f"deterministic is set and the scene has a {other[0]}; quadrature is for lamps of one position or direction "
             "(point, spot, directional): leave deterministic out."
         )
-    if len(needs.media) > 1 or not _share_cells(needs):
+    if len(needs.media) > 1 or not shares_cells(needs):
         grids = sum(len(m.resolutions) for m in needs.media)
         raise MivolError(
             f"deterministic is set and the scene has {len(needs.media)} media with {grids} grids of extinction; quadrature is "
@@ -226,7 +223,7 @@ def _refuse_quadrature(needs: Needs, settings: Settings) -> None:
         )
 
 
-def _share_cells(needs: Needs) -> bool:
+def shares_cells(needs: Needs) -> bool:
     """Whether one walk passes all of the first medium."""
     parts = needs.views[0].parts
     return len(flight_parts(parts)) == len(parts)
@@ -239,7 +236,7 @@ def _pass_rays(needs: Needs) -> int:
     return min(PASS_RAYS[backend], PASS_STEPS[backend] // max(cells, 1))
 
 
-def _is_lit(needs: Needs, settings: Settings) -> bool:
+def is_lit(needs: Needs, settings: Settings) -> bool:
     """Whether media scatter light to the camera."""
     return settings.max_depth == 2 and any(m.is_scattering for m in needs.media)
 
@@ -247,7 +244,7 @@ def _is_lit(needs: Needs, settings: Settings) -> bool:
 def _transport(needs: Needs, settings: Settings) -> Choice:
     if not needs.media:
         return Choice("media", "none", "no shape bounds a medium")
-    if _is_lit(needs, settings):
+    if is_lit(needs, settings):
         where = "by quadrature" if settings.deterministic else "at a distance drawn in proportion to the light it takes"
         shadows = "a light grid for shadows" if settings.shadows == "grid" else "exact shadow rays"
         what = f"exact optical depth; one scattering {where}, {shadows}"
@@ -269,7 +266,7 @@ def _emission(needs: Needs) -> list[Choice]:
 
 def _lighting(needs: Needs, settings: Settings) -> list[Choice]:
     """How scattered light is found."""
-    if not _is_lit(needs, settings):
+    if not is_lit(needs, settings):
         return []
     drawn = [lamp for lamp in needs.lamps if lamp != "uniform"]
     met = [lamp for lamp in needs.lamps if lamp != "sharp"]
@@ -316,7 +313,7 @@ def _skipping(medium, skip: bool) -> Choice:
 
 def _shadows(medium: MediumFacts, needs: Needs, settings: Settings) -> Choice | None:
     """Whether shadow rays walk every cell of a medium or look here and there; None where the question does not arise."""
-    if not medium.resolutions or not _is_lit(needs, settings) or settings.deterministic:
+    if not medium.resolutions or not is_lit(needs, settings) or settings.deterministic:
         return None
     about, cells = f"shadows of {medium.name}", medium.occupied * max(sum(r) for r in medium.resolutions)
     if medium.unread:
@@ -333,7 +330,7 @@ def _shadows(medium: MediumFacts, needs: Needs, settings: Settings) -> Choice | 
 
 def _events(needs: Needs, settings: Settings) -> tuple[int, list[Choice]]:
     """How many points of a camera ray scatter."""
-    if not _is_lit(needs, settings) or settings.deterministic:
+    if not is_lit(needs, settings) or settings.deterministic:
         return 1, []
     about = "points that scatter"
     if len(needs.media) != 1 or len(needs.media[0].resolutions) != 1:
@@ -361,149 +358,3 @@ def _gradient(needs: Needs) -> tuple[int, Choice]:
     asked = ", ".join(needs.parameters) or "none asked for yet"
     what = f"{memory / 2**20:.1f} MiB beyond the rays ({'; '.join(sorted(ways)) or 'no grid'})"
     return memory, Choice("gradient step", what, f"parameters: {asked}")
-
-
-def build_world(scene: mi.Scene, needs: Needs, plan: Plan, settings: Settings, survey: Survey) -> World:
-    """Build the media that transport walks through, as planned."""
-    bodies = []
-    for boundary, view, skip, tracks in zip(needs.boundaries, needs.views, plan.skips, plan.tracks, strict=True):
-        for part in view.parts:
-            if skip and part.lattice is not None:
-                part.lattice.empty_distances = read_empty_distances(part, survey, boundary.name)
-            # A grey variant sees the mean of an rgb extinction, and its transmittance is no mean.
-            mixes = mi.is_monochromatic and part.channels > 1
-            if tracks and part.lattice is not None and part.activation is None and not mixes:
-                part.lattice.block_ranges = read_block_ranges(part, survey)
-        bodies.append(Body(view, boundary.box))
-    return World(
-        bodies,
-        has_surfaces=bool(needs.surfaces),
-        scatters=bool(needs.surfaces) and settings.max_depth not in (0, 1),
-        has_null_transmission=needs.has_null_transmission,
-        start=needs.start,
-        locates_camera=needs.camera_inside and needs.start is None,
-        emitters=SceneEmitters(scene) if needs.lamps and _is_lit(needs, settings) else None,
-        is_deterministic=settings.deterministic,
-        events=plan.events,
-        size=survey.size,
-    )
-
-
-def settings_of(scene: mi.Scene) -> Settings:
-    """What the scene's own integrator is set to: all of it where it is mivol, the depth of others, which they print."""
-    integrator = scene.integrator()
-    session = getattr(integrator, "session", None)
-    if session is not None:
-        return session.settings
-    told = re.search(r"max_depth ?= ?(-?\d+)", str(integrator))
-    depth = Settings().max_depth if told is None else int(told.group(1))
-    return Settings(max_depth=-1 if depth == UNLIMITED else depth)
-
-
-def explain(scene: mi.Scene | str | Path, max_depth: int | None = None, sensor: int = 0) -> str:
-    """Say what a scene needs and what will be done about it, before anything is rendered.
-
-    Args:
-        scene: a loaded scene, or the path of its XML.
-        max_depth: of the integrator asked about; None: that of the scene's own integrator, with its other settings.
-        sensor: index of the sensor asked about.
-
-    Raises:
-        MivolError: as :func:`make_plan`.
-    """
-    loaded = scene if isinstance(scene, mi.Scene) else mi.load_file(str(scene))
-    needs = find_needs(loaded, find_sensor(loaded, sensor), survey_scene(loaded))
-    settings = settings_of(loaded) if max_depth is None else Settings(max_depth=max_depth)
-    plan = make_plan(needs, settings)
-    lines = ["facts"]
-    for m in needs.media:
-        grids = ", ".join("x".join(map(str, r)) for r in m.resolutions) or "homogeneous"
-        scatters = "scatters" if m.is_scattering else "albedo 0"
-        tau = "" if m.tau_max is None else f", optical depth at most {m.tau_max:.3g}"
-        lines.append(
-            f"  medium    {m.name}: {m.kind} in {m.boundary}, {m.extinction} extinction, {grids}, {scatters}, {m.phase}{tau}"
-        )
-    lines += [
-        f"  surfaces  {', '.join(needs.surfaces) or 'none'}",
-        f"  emitters  {', '.join(needs.emitters) or 'none'}",
-        f"  camera    {'may be inside a medium' if needs.start or needs.camera_inside else 'in no traced boundary'}",
-        f"  variant   {needs.variant}, {dr.thread_count()} threads",
-        "plan",
-    ]
-    width = max(len(c.about) for c in plan.choices)
-    lines += [f"  {c.about:<{width}}  {c.choice}\n  {'':<{width}}    because {c.reason}" for c in plan.choices]
-    lines += [f"  table     {text}" for text in _tables(needs)]
-    if settings.max_depth == 2:
-        lines += [f"  model     {text}" for text in _depth_two(loaded, needs)]
-        lines += [f"  shadows   {text}" for text in _light_grid(loaded, needs, plan, settings)]
-    return "\n".join(lines)
-
-
-def _light_grid(scene: mi.Scene, needs: Needs, plan: Plan, settings: Settings) -> list[str]:
-    """What a light grid in place of shadow rays costs, and how wrong it is."""
-    if not _is_lit(needs, settings) or set(needs.lamps) != {"sharp"} or len(needs.media) != 1:
-        return []
-    if not _share_cells(needs) or any(part.lattice is None for part in needs.views[0].parts):
-        return []
-    with dr.suspend_grad():
-        world = build_world(scene, needs, plan, settings, survey_scene(scene))
-        grid = build_transmittance_grid(scene, world)
-        bias, rms = measure_transmittance_bias(scene, world, grid)
-    nodes = grid.nodes[0] * grid.nodes[1] * grid.nodes[2]
-    rays = needs.film_samples * sum(needs.media[0].resolutions[0])
-    pays = "pays" if nodes < rays else "does not pay"
-    offer = "asked for" if settings.shadows == "grid" else "exact; with deterministic"
-    return [
-        f"{offer}, a light grid of {nodes} nodes {pays} against about {rays} shadow rays, at a bias of "
-        f"{bias:+.2g} of a lamp's light (rms {rms:.2g}, measured against exact shadows)"
-    ]
-
-
-def _tables(needs: Needs) -> list[str]:
-    """What grids that were seen through a table miss of it between their nodes."""
-    lines = []
-    for facts, boundary in zip(needs.media, needs.boundaries, strict=True):
-        volumes = {key.split(".")[0]: entry[2] for key, entry in traverse_medium(boundary.medium).properties.items()}
-        for name, volume in volumes.items():
-            if not hasattr(volume, "mivol_transfer"):
-                continue
-            table = volume.mivol_transfer
-            missed, finer = table.departure(), table.refine + 2
-            advice = f"; refine = {finer} would follow it closer, at {(finer / table.refine) ** 3:.3g} times the memory"
-            lines.append(
-                f"{name} of {facts.name} departs from its table by {missed:.2g} of the largest entry half-way between nodes "
-                f"(rms){advice if missed > 0.02 else ''}"
-            )
-    return lines
-
-
-def _depth_two(scene: mi.Scene, needs: Needs) -> list[str]:
-    """What a model of one scattering leaves out of each medium."""
-    lines = []
-    light = "collimated" if "sharp" in needs.lamps else "constant"
-    for facts, boundary, view in zip(needs.media, needs.boundaries, needs.views, strict=True):
-        box, traced = (boundary.box, None) if boundary.box is not None else (_box_around(scene, boundary.medium), scene)
-        if not facts.is_scattering or box is None:
-            continue
-        tau, albedo = scattering_depth(view, box, scene=traced), mean_albedo(view)
-        phase = "forward" if mean_cosine(boundary.medium.phase_function()) > 0.4 else "isotropic"
-        missing = depth_two_error(min(albedo, 1.0), tau, light, phase)
-        warning = "; depth 2 is a poor model of it" if missing > 0.1 else ""
-        lines.append(
-            f"one scattering leaves out {missing:.0%} of the light that {facts.name} scatters (albedo {albedo:.2f}, optical "
-            f"depth {tau:.2g}, {light} light, {phase} phase){warning}"
-        )
-    return lines
-
-
-def _box_around(scene: mi.Scene, medium: mi.Medium) -> Box | None:
-    """A box around all that a medium fills; None where it lies outside of shapes, without an end."""
-    inside = [s.interior_medium() for s in scene.shapes()]
-    boxes = [bounds(s) for s, m in zip(scene.shapes(), inside, strict=True) if m is not None and m.ptr == medium.ptr]
-    if not boxes:
-        return None
-    low, high = np.min([b[0] for b in boxes], axis=0), np.max([b[1] for b in boxes], axis=0)
-    # Lines begin outside of what they are to enter.
-    room, place = 1e-3 * (high - low).max(), np.eye(4)
-    place[:3, :3], place[:3, 3] = np.diag(high - low + 2 * room), low - room
-    return Box(place)

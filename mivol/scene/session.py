@@ -12,17 +12,14 @@ import drjit as dr
 import mitsuba as mi
 
 from mivol.errors import MivolError
+from mivol.scene.build import build_estimators
 from mivol.scene.derived import renew, tangents_led
 from mivol.scene.load import find_sensor
-from mivol.scene.needs import Needs, Survey, find_needs, read_coarse, survey_scene
-from mivol.scene.plan import Plan, build_world, check_aovs, make_plan
-from mivol.transport.estimators.constant_control import find_constant_control
-from mivol.transport.estimators.grid_control import CameraOrigins, build_grid_control
-from mivol.transport.estimators.transmittance_grid import build_transmittance_grid
-from mivol.transport.estimators.visibility_cache import VisibilityCache, build_visibility_cache
+from mivol.scene.needs import Survey, find_needs, survey_scene
+from mivol.scene.plan import Plan, check_aovs, make_plan
 from mivol.transport.line_integrals.aovs import integrate_aovs, jvp_aovs, vjp_aovs
-from mivol.transport.media.scene_media import World
-from mivol.transport.path.film import PLAIN, SPREAD, TILED, CameraRays, adjoint_rays, record
+from mivol.transport.path.estimators import Estimators
+from mivol.transport.path.film import CameraRays, adjoint_rays, record
 from mivol.transport.path.scores import Primal, Replay, Tangent
 from mivol.transport.path.settings import Settings
 from mivol.transport.path.walk import is_straight, walk_path
@@ -77,10 +74,9 @@ class Session:
             raise MivolError("develop=False was asked for; mivol returns the developed image: leave it at True.")
         sensor = find_sensor(scene, sensor)
         with dr.suspend_grad():
-            world, plan = self._open(scene, sensor, spp, pictures=True)
-            image = record(
-                sensor, seed, spp, plan.pass_rays, self.aovs, lambda rays: self._primal(scene, world, rays), _layout(world)
-            )
+            estimators, plan = self._open(scene, sensor, spp, pictures=True)
+            layout = estimators.segment.directions
+            image = record(sensor, seed, spp, plan.pass_rays, self.aovs, lambda rays: self._primal(estimators, rays), layout)
         if evaluate:
             dr.eval(image)
         return image
@@ -90,11 +86,10 @@ class Session:
         sensor = find_sensor(scene, sensor)
         with dr.suspend_grad(), tangents_led(scene):
             with dr.resume_grad():
-                world, plan = self._open(scene, sensor, spp)
-                world.start_tangent()
-            return record(
-                sensor, seed, spp, plan.pass_rays, self.aovs, lambda rays: self._tangent(scene, world, rays), _layout(world)
-            )
+                estimators, plan = self._open(scene, sensor, spp)
+                estimators.media.start_tangent()
+            layout = estimators.segment.directions
+            return record(sensor, seed, spp, plan.pass_rays, self.aovs, lambda rays: self._tangent(estimators, rays), layout)
 
     def render_backward(self, scene: mi.Scene, grad_in: mi.TensorXf, sensor: int | mi.Sensor, seed: int, spp: int) -> None:
         """Add the derivatives of an image, weighted by ``grad_in``, to the gradients of the parameters.
@@ -105,88 +100,59 @@ class Session:
         with dr.suspend_grad():
             with dr.resume_grad():
                 renew(scene)
-                world, plan = self._open(scene, sensor, spp)
-            world.start_gradients()
+                estimators, plan = self._open(scene, sensor, spp)
+            media, layout = estimators.media, estimators.segment.directions
+            media.start_gradients()
             # What is pulled back to a volume waits there for the end: its edge to the parameter can be passed but once.
             with dr.isolate_grad():
-                for rays, dL, daovs in adjoint_rays(sensor, seed, spp, plan.pass_rays, self.aovs, grad_in, _layout(world)):
-                    self._replay(scene, world, rays, dL, daovs)
+                for rays, dL, daovs in adjoint_rays(sensor, seed, spp, plan.pass_rays, self.aovs, grad_in, layout):
+                    self._replay(estimators, rays, dL, daovs)
                     dr.eval()
             with dr.resume_grad():
-                world.deliver_gradients()
+                media.deliver_gradients()
 
     def sample(self, scene: mi.Scene, sampler: mi.Sampler, ray: mi.Ray3f, active: mi.Bool) -> tuple:
         """Radiance along given rays, for integrators that nest this one, which do not tell what sensor the rays come from."""
         with dr.suspend_grad():
-            world, _ = self._open(scene, find_sensor(scene, 0), 1, pictures=True)
+            estimators, _ = self._open(scene, find_sensor(scene, 0), 1, pictures=True)
+            media = estimators.media
             named = [sensor.get_medium() for sensor in scene.sensors()]
-            world.start = named[0] if all(medium is named[0] for medium in named) else None
-            world.locates_camera = bool(world.traced)
-            score, valid = walk_path(scene, world, self.settings, sampler, ray, Primal(_black(ray)), active)
-            return score.L, valid, integrate_aovs(scene, world, ray, self.aovs, active)
+            media.start = named[0] if all(medium is named[0] for medium in named) else None
+            media.locates_camera = bool(media.traced)
+            score, valid = walk_path(estimators, self.settings, sampler, ray, Primal(_black(ray)), active)
+            return score.L, valid, integrate_aovs(media, ray, self.aovs, active)
 
-    def _open(self, scene: mi.Scene, sensor: mi.Sensor, spp: int, pictures: bool = False) -> tuple[World, Plan]:
-        """Ask, plan, and build the media, for pictures or for derivatives."""
+    def _open(self, scene: mi.Scene, sensor: mi.Sensor, spp: int, pictures: bool = False) -> tuple[Estimators, Plan]:
+        """Ask, plan, and build the estimators, for pictures or for derivatives."""
         parts = [*scene.shapes(), *scene.emitters()]
         if self._seen is None or not self._seen.is_of(parts) or not self._seen.survey.is_current:
             self._seen = _Seen(parts, survey_scene(scene))
         survey = self._seen.survey
         needs = find_needs(scene, sensor, survey, spp)
         plan = make_plan(needs, self.settings)
-        world = build_world(scene, needs, plan, self.settings, survey)
-        if world.emitters is not None:
-            with dr.suspend_grad():
-                world.visibility_cache = self._visibility_cache(scene, world, needs, plan, pictures)
-                if self.settings.shadows == "grid":
-                    world.transmittance_grid = build_transmittance_grid(scene, world)
-        return world, plan
+        return build_estimators(scene, needs, plan, self.settings, survey, pictures), plan
 
-    def _visibility_cache(
-        self, scene: mi.Scene, world: World, needs: Needs, plan: Plan, pictures: bool
-    ) -> VisibilityCache | None:
-        """Find where lamps shine; derivatives are not 0 in empty blocks, which only values that were read can tell."""
-        blind = not pictures or any(m.unread for m in needs.media)
-        rays = needs.film_samples * (plan.events if pictures else 1)
-        occupied = None if blind else needs.media[0].occupied
-        survey = self._seen.survey
-        return build_visibility_cache(scene, world, rays, occupied, lambda *asked: read_coarse(survey, *asked))
-
-    def _primal(self, scene: mi.Scene, world: World, rays: CameraRays) -> tuple:
+    def _primal(self, estimators: Estimators, rays: CameraRays) -> tuple:
         score = Primal(_black(rays.ray))
-        score, valid = walk_path(scene, world, self.settings, rays.sampler, rays.ray, score, strata=rays.strata)
-        return score.L, valid, integrate_aovs(scene, world, rays.ray, self.aovs)
+        score, valid = walk_path(estimators, self.settings, rays.sampler, rays.ray, score, strata=rays.strata)
+        return score.L, valid, integrate_aovs(estimators.media, rays.ray, self.aovs)
 
-    def _tangent(self, scene: mi.Scene, world: World, rays: CameraRays) -> tuple:
-        _find_controls(scene, world, rays)
+    def _tangent(self, estimators: Estimators, rays: CameraRays) -> tuple:
+        estimators.find_controls(rays.ray)
         black = _black(rays.ray)
-        score = Tangent(black, black, black)
-        score, _ = walk_path(scene, world, self.settings, rays.sampler, rays.ray, score, strata=rays.strata)
-        return score.dL, dr.full(mi.Bool, False, dr.width(black)), jvp_aovs(scene, world, rays.ray, self.aovs)
+        score = Tangent(black, black)
+        score, _ = walk_path(estimators, self.settings, rays.sampler, rays.ray, score, strata=rays.strata)
+        return score.dL, dr.full(mi.Bool, False, dr.width(black)), jvp_aovs(estimators.media, rays.ray, self.aovs)
 
-    def _replay(self, scene: mi.Scene, world: World, rays: CameraRays, dL: mi.Spectrum, daovs: list[mi.Float]) -> None:
-        _find_controls(scene, world, rays)
+    def _replay(self, estimators: Estimators, rays: CameraRays, dL: mi.Spectrum, daovs: list[mi.Float]) -> None:
+        estimators.find_controls(rays.ray)
         again, L = rays.sampler.clone(), None
-        if not is_straight(world, self.settings):
-            known = Primal(_black(rays.ray), scatters=False)
-            L = walk_path(scene, world, self.settings, rays.sampler, rays.ray, known, strata=rays.strata)[0].L
+        if not is_straight(estimators, self.settings):
+            known = Primal(_black(rays.ray))
+            L = walk_path(estimators.replayed(), self.settings, rays.sampler, rays.ray, known, strata=rays.strata)[0].L
             dr.eval(L)
-        walk_path(scene, world, self.settings, again, rays.ray, Replay(L, dL), strata=rays.strata)
-        vjp_aovs(scene, world, rays.ray, self.aovs, daovs)
-
-
-def _layout(world: World) -> str:
-    """How the rays of a pass lie: in tiles of pixels where they draw directions of the phase function, or to wide lamps."""
-    if world.emitters is None:
-        return PLAIN
-    return TILED if world.emitters.samples_phase and not world.is_deterministic else SPREAD
-
-
-def _find_controls(scene: mi.Scene, world: World, rays: CameraRays) -> None:
-    """Find the control variate of a derivative, once for all passes."""
-    if world.takes_grid_control:
-        world.grid_control = world.grid_control or build_grid_control(scene, world, world.bodies[0], CameraOrigins.of(rays.ray))
-    elif world.emitters is not None and world.constant_control is None:
-        world.constant_control = find_constant_control(scene, world)
+        walk_path(estimators, self.settings, again, rays.ray, Replay(L, dL), strata=rays.strata)
+        vjp_aovs(estimators.media, rays.ray, self.aovs, daovs)
 
 
 def _black(ray: mi.Ray3f) -> mi.Spectrum:

@@ -6,29 +6,29 @@ import drjit as dr
 import mitsuba as mi
 
 from mivol.transport.estimators.emitters import UNIFORM
-from mivol.transport.media.scene_media import World
+from mivol.transport.media.scene_media import SceneMedia
 
 __all__ = ["find_constant_control"]
 
 
-def find_constant_control(scene: mi.Scene, world: World) -> mi.Spectrum | None:
+def find_constant_control(media: SceneMedia) -> mi.Spectrum | None:
     r"""A source function S [radiance] that is the same everywhere: the mean albedo times what a constant sky sends.
 
     The exact part of its gradient is the same number all along a ray, :math:`T(D)\,S`, so it needs no lattice and serves media
     of any number and boundary that have an albedo. None where there is no such medium or no constant sky.
     """
-    skies = [e for e in scene.emitters() if e.class_name() == UNIFORM]
-    shares = [a for body in world.bodies for a in body.view.albedo_arrays]
-    if not skies or any(body.view.albedo is None for body in world.bodies):
+    skies = [e for e in media.scene.emitters() if e.class_name() == UNIFORM]
+    shares = [a for body in media.bodies for a in body.view.albedo_arrays]
+    if not skies or any(body.view.albedo is None for body in media.bodies):
         return None
     mean = sum(_mean_of(a) for a in shares) / len(shares)
     return mean * dr.detach(skies[0].eval(dr.zeros(mi.SurfaceInteraction3f)))
 
 
-def _mean_of(eval_albedo: mi.TensorXf | mi.Float | mi.Color3f) -> mi.Spectrum:
+def _mean_of(albedo: mi.TensorXf | mi.Float | mi.Color3f) -> mi.Spectrum:
     """Mean over space of an albedo, or of its volume."""
-    flat = dr.ravel(dr.detach(eval_albedo))
-    n = eval_albedo.shape[-1] if dr.is_tensor_v(eval_albedo) else dr.width(flat)
+    flat = dr.ravel(dr.detach(albedo))
+    n = albedo.shape[-1] if dr.is_tensor_v(albedo) else dr.width(flat)
     of_each = dr.arange(mi.UInt32, dr.width(flat) // n) * n
     rows = [dr.mean(dr.gather(mi.Float, flat, of_each + c)) for c in range(n)]
     return mi.Spectrum(*rows) if len(rows) == 3 and not mi.is_monochromatic else mi.Spectrum(sum(rows) / n)

@@ -8,9 +8,10 @@ import drjit as dr
 import mitsuba as mi
 
 from mivol.transport.estimators.distance_reservoir import taken_light
+from mivol.transport.estimators.grid_control import GridControl
 from mivol.transport.media.body import Body
 from mivol.transport.media.ray_intervals import visit_boxed_media
-from mivol.transport.media.scene_media import World
+from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.traversal.grid_walk import Cell, Nodes, box_nodes, read_nodes, walk
 from mivol.transport.traversal.interpolation import GAUSS, gauss_points, interpolate, node_weights, upward_frac, weights
 from mivol.transport.traversal.lattice import clip, locate
@@ -63,7 +64,8 @@ class _Sweep:
 
 
 def sweep(
-    world: World,
+    media: SceneMedia,
+    control: GridControl,
     ray: mi.Ray3f,
     t_end: mi.Float,
     tau: list[mi.Float],
@@ -74,7 +76,8 @@ def sweep(
     """Pass all cells of a ray from the far end, with the derivative of its light with respect to the extinction in each.
 
     Args:
-        world: of a single body with a single grid, and a control.
+        media: a single body with a single grid.
+        control: the source function of its cells.
         ray: world space, unit direction.
         t_end: where the stretch ends [length].
         tau: optical depth of the whole stretch, each channel of the extinction.
@@ -87,15 +90,16 @@ def sweep(
 
     Cost: one walk, with one packed write of 8 a cell and channel for a gradient.
     """
-    (body,) = world.bodies
-    (found,) = visit_boxed_media(world, ray, t_end, lambda seen, b, t0, t1, on: [*seen, (t0, t1, on)], [], active)
+    (body,) = media.bodies
+    (found,) = visit_boxed_media(media, ray, t_end, lambda seen, b, t0, t1, on: [*seen, (t0, t1, on)], [], active)
     t0, t1, on = found
-    cells = _pass(world, body, ray, t0, t1, tau, tracks, probe, on)
-    return [a + b for a, b in zip(cells, _settle(world, body, ray, tracks, probe), strict=True)]
+    cells = _pass(media, control, body, ray, t0, t1, tau, tracks, probe, on)
+    return [a + b for a, b in zip(cells, _settle(media, body, ray, tracks, probe), strict=True)]
 
 
 def _pass(
-    world: World,
+    media: SceneMedia,
+    control: GridControl,
     body: Body,
     ray: mi.Ray3f,
     t0: mi.Float64,
@@ -107,7 +111,7 @@ def _pass(
 ) -> list[mi.Float]:
     """All cells: what they dim, and what they send to the camera by S."""
     (part,) = body.view.parts
-    field, control = body.extinction(ray), world.grid_control
+    field = body.extinction(ray)
     lattice = replace(part.lattice, empty_distances=None)
     segment = clip(lattice, ray.o, -ray.d, -t1, -t0)
     leave = -segment.t0
@@ -116,7 +120,7 @@ def _pass(
     def visit(state: _Sweep, cell: Cell, on: mi.Bool) -> _Sweep:
         points = list(gauss_points(cell))
         half = dr.select(on, 0.5 * cell.dt, 0)
-        own = world.rows([half * (a + b) for a, b in field.along(cell.corners[:1], points)])
+        own = media.rows([half * (a + b) for a, b in field.along(cell.corners[:1], points)])
         near = [dr.maximum(a - o, 0) for a, o in zip(state.ahead, own, strict=True)]
         T_out, T_in = state.T, [dr.exp(-n) for n in near]
         taken = [taken_light(o, i, t) for o, i, t in zip(own, T_in, T_out, strict=True)]
@@ -131,7 +135,7 @@ def _pass(
             behind.append(dr.fma(taken[c], source, state.behind[j]))
         change = state.change
         if tracks.tangent:
-            rows = world.rows([half * (interpolate(v, points[0]) + interpolate(v, points[1])) for v in cell.corners[1]])
+            rows = media.rows([half * (interpolate(v, points[0]) + interpolate(v, points[1])) for v in cell.corners[1]])
             change = [dr.fma(w, rows[j % len(rows)], t) for j, (w, t) in enumerate(zip(slopes, change, strict=True))]
         else:
             a, b = (node_weights(p, cell, lattice.res) for p in points)
@@ -144,7 +148,7 @@ def _pass(
     return walk(lattice, segment, visit, state, reads, active).change
 
 
-def _settle(world: World, body: Body, ray: mi.Ray3f, tracks: Tracks, probe: Probe) -> list[mi.Float]:
+def _settle(media: SceneMedia, body: Body, ray: mi.Ray3f, tracks: Tracks, probe: Probe) -> list[mi.Float]:
     """The cell of a probe: the point itself, and the part of the cell in front of it."""
     (part,) = body.view.parts
     cell, frac, inside = locate(part.lattice, ray.o, ray.d, probe.t)
@@ -156,8 +160,8 @@ def _settle(world: World, body: Body, ray: mi.Ray3f, tracks: Tracks, probe: Prob
     if tracks.tangent:
         upward = dr.full(dr.mask_t(mi.Vector3f), True)
         (corners,) = read_nodes([Nodes(body.tangents[0], part.channels)], box_nodes(cell, upward, part.lattice.res), on)
-        at = world.rows([interpolate(v, frac) for v in corners])
-        front = world.rows([0.5 * length * (interpolate(v, points[0]) + interpolate(v, points[1])) for v in corners])
+        at = media.rows([interpolate(v, frac) for v in corners])
+        front = media.rows([0.5 * length * (interpolate(v, points[0]) + interpolate(v, points[1])) for v in corners])
         k = len(at)
         return [dr.select(on, probe.source[j] * at[j % k] - probe.dims[j] * front[j % k], 0) for j in range(len(probe.source))]
     at, a, b = (weights(upward_frac(p, cell, part.lattice.res)) for p in (frac, *points))

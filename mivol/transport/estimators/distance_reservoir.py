@@ -25,9 +25,10 @@ import mitsuba as mi
 from mivol.transport.estimators.emitters import ChosenEmitter
 from mivol.transport.estimators.equiangular import EquiangularSampler
 from mivol.transport.estimators.shadow_rays import DARK
+from mivol.transport.estimators.visibility_cache import VisibilityCache
 from mivol.transport.media.body import Body
 from mivol.transport.media.ray_intervals import MediumVisitor
-from mivol.transport.media.scene_media import World
+from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.traversal.grid_walk import Cell, walk
 from mivol.transport.traversal.interpolation import gauss_points
 from mivol.transport.traversal.lattice import clip
@@ -84,98 +85,109 @@ class Reservoir:
         return found
 
 
-def start_reservoir(world: World, u: mi.Float, width: int, count: int = 1) -> Reservoir:
+def start_reservoir(media: SceneMedia, u: mi.Float, width: int, count: int = 1) -> Reservoir:
     """Begin with nothing; ``u`` in [0, 1) seeds the generators of ``count`` pieces."""
-    tau, T = [[dr.full(mi.Float, v, width) for _ in range(world.channels)] for v in (0, 1)]
+    tau, T = [[dr.full(mi.Float, v, width) for _ in range(media.channels)] for v in (0, 1)]
     return Reservoir(
-        tau, T, dr.zeros(mi.Float, width), [_start_candidate(world, seed_pcg32(u, width, k), width) for k in range(count)]
+        tau, T, dr.zeros(mi.Float, width), [_start_candidate(media, seed_pcg32(u, width, k), width) for k in range(count)]
     )
 
 
-def _start_candidate(world: World, rng: mi.UInt32, width: int) -> Candidate:
+def _start_candidate(media: SceneMedia, rng: mi.UInt32, width: int) -> Candidate:
     zero = [dr.zeros(mi.Float, width) for _ in range(5)]
-    front = [dr.zeros(mi.Float, width) for _ in range(world.channels)]
+    front = [dr.zeros(mi.Float, width) for _ in range(media.channels)]
     return Candidate(*zero[:4], front, zero[4], dr.zeros(mi.UInt32, width), dr.zeros(mi.Bool, width), rng)
 
 
-def fill_reservoir(world: World, ray: mi.Ray3f, lamp: ChosenEmitter, probe_depth: float) -> MediumVisitor:
+def fill_reservoir(
+    media: SceneMedia, ray: mi.Ray3f, chosen: ChosenEmitter, cache: VisibilityCache | None, probe_depth: float
+) -> MediumVisitor:
     """The visitor that sums optical depth and offers every piece of a ray to a :class:`Reservoir`.
 
     Args:
-        world: the media.
+        media: of the scene.
         ray: world space, unit direction.
-        lamp: the lamp that was chosen for each lane.
+        chosen: the emitter of each lane.
+        cache: where emitters shine; None where that is not known.
         probe_depth: optical depth to add evenly over each body, for probes of derivatives; 0 for an image.
 
     Cost: as an optical depth, with one exponential and one random number a cell (measured: 1.7 times its time).
     """
-    numbers = {id(body): index for index, body in enumerate(world.bodies)}
+    return _Filling(media, ray, chosen, cache, probe_depth).visit
 
-    def visit(reservoir: Reservoir, body: Body, t0: mi.Float, t1: mi.Float, on: mi.Bool) -> Reservoir:
-        reservoir = _fly(world, body, ray, mi.Float(t0), mi.Float(t1), lamp, probe_depth, reservoir, on)
-        for candidates in reservoir.candidates:
-            candidates.body = dr.select(candidates.is_new, numbers[id(body)], candidates.body)
-            candidates.is_new = dr.zeros(mi.Bool, dr.width(candidates.is_new))
+
+@dataclass
+class _Filling:
+    """What candidates are weighed by, as :func:`fill_reservoir` was told."""
+
+    media: SceneMedia
+    ray: mi.Ray3f
+    chosen: ChosenEmitter
+    cache: VisibilityCache | None
+    probe_depth: float
+
+    def visit(self, reservoir: Reservoir, body: Body, t0: mi.Float, t1: mi.Float, on: mi.Bool) -> Reservoir:
+        """Offer the pieces of one body, and sum the optical depth of its parts that have other cells."""
+        reservoir = self._offer_body(reservoir, body, mi.Float(t0), mi.Float(t1), on)
+        number = next(index for index, other in enumerate(self.media.bodies) if other is body)
+        for candidate in reservoir.candidates:
+            candidate.body = dr.select(candidate.is_new, number, candidate.body)
+            candidate.is_new = dr.zeros(mi.Bool, dr.width(candidate.is_new))
         others = [p for p in body.view.parts if not any(p is q for q in body.flight_parts)]
         if others:
-            rest = body.optical_depth(ray, t0, t1, world.channels, on, others)
+            rest = body.optical_depth(self.ray, t0, t1, self.media.channels, on, others)
             reservoir.tau = [t + r for t, r in zip(reservoir.tau, rest, strict=True)]
             reservoir.T = [dr.exp(-t) for t in reservoir.tau]
         return reservoir
 
-    return visit
+    def _offer_body(self, reservoir: Reservoir, body: Body, t0: mi.Float, t1: mi.Float, on: mi.Bool) -> Reservoir:
+        """Offer the pieces of one body, in their order."""
+        ray, rows, equiangular = self.ray, self.media.rows, self.chosen.equiangular
+        field = body.extinction(ray, body.flight_parts)
+        grid = next((p.lattice for p in body.flight_parts if p.lattice is not None), None)
+        segment = clip(grid, ray.o, ray.d, t0, t1) if grid is not None else None
+        filled = segment.length if segment is not None and not field.has_constants else t1 - t0
+        probe_sigma = self._probe_sigma(filled)
 
+        def add_constant(reservoir: Reservoir, a: mi.Float, b: mi.Float) -> Reservoir:
+            sigma, front = rows(field.constant), reservoir.tau
+            length = dr.select(on, dr.maximum(b - a, 0), 0)
+            dt = lit_length(sigma, length)
+            tau = [s * dt for s in sigma]
+            piece = (a, mi.Float(0), dt, tau, equiangular, None, probe_sigma, on & (dt > 0))
+            reservoir = _offer_candidate(reservoir, *piece)
+            # A length may have no end.
+            tau = [f + dr.select(s > 0, s * length, 0) for f, s in zip(front, sigma, strict=True)]
+            return replace(reservoir, tau=tau, T=[dr.exp(-t) for t in tau])
 
-def _fly(
-    world: World,
-    body: Body,
-    ray: mi.Ray3f,
-    t0: mi.Float,
-    t1: mi.Float,
-    lamp: ChosenEmitter,
-    probe_depth: float,
-    reservoir: Reservoir,
-    on: mi.Bool,
-) -> Reservoir:
-    """Offer the pieces of one body, in their order."""
-    field = body.extinction(ray, body.flight_parts)
-    grid = next((p.lattice for p in body.flight_parts if p.lattice is not None), None)
-    segment = clip(grid, ray.o, ray.d, t0, t1) if grid is not None else None
-    filled = segment.length if segment is not None and not field.has_constants else t1 - t0
-    probe_sigma = dr.select(dr.isfinite(filled) & (filled > 0), probe_depth * inverse(filled), 0) if probe_depth else None
+        if segment is None:
+            reservoir = add_constant(reservoir, t0, t1)
+            return _note_probe(reservoir, probe_sigma)
+        # Where there is no extinction there is no light, but there is a derivative.
+        walks_all = self.probe_depth > 0 or field.has_constants or len(field.reads) > 1
+        lattice = replace(grid, empty_distances=None) if walks_all else grid
+        hit = segment.length > 0
 
-    def add_constant(reservoir: Reservoir, a: mi.Float, b: mi.Float) -> Reservoir:
-        sigma, front = world.rows(field.constant), reservoir.tau
-        length = dr.select(on, dr.maximum(b - a, 0), 0)
-        dt = lit_length(sigma, length)
-        reservoir = _offer_candidate(
-            reservoir, a, mi.Float(0), dt, [s * dt for s in sigma], lamp.equiangular, None, probe_sigma, on & (dt > 0)
-        )
-        # A length may have no end.
-        tau = [f + dr.select(s > 0, s * length, 0) for f, s in zip(front, sigma, strict=True)]
-        return replace(reservoir, tau=tau, T=[dr.exp(-t) for t in tau])
+        def visit(reservoir: Reservoir, cell: Cell, full: mi.Bool) -> Reservoir:
+            half = dr.select(full, 0.5 * cell.dt, 0)
+            tau = rows([half * (a + b) for a, b in field.along(cell.corners, list(gauss_points(cell)))])
+            lit = None if self.cache is None else self.cache.at(cell.lower, self.chosen.number, full)
+            return _offer_candidate(reservoir, segment.t0, cell.s, cell.dt, tau, equiangular, lit, probe_sigma, full)
 
-    if segment is None:
-        reservoir = add_constant(reservoir, t0, t1)
+        if field.has_constants:
+            reservoir = add_constant(reservoir, t0, dr.select(hit, segment.t0, t1))
+        # An image takes no light from behind this depth; derivatives are swept back from the far end, and need all of it.
+        until = None if self.probe_depth else lambda p: _least_of(p.tau) > DARK
+        reservoir = walk(lattice, segment, visit, reservoir, field.reads, on, until)
+        if field.has_constants:
+            reservoir = add_constant(reservoir, dr.select(hit, segment.t0 + segment.length, t1), t1)
         return _note_probe(reservoir, probe_sigma)
-    # Where there is no extinction there is no light, but there is a derivative.
-    lattice = replace(grid, empty_distances=None) if probe_depth or field.has_constants or len(field.reads) > 1 else grid
-    hit = segment.length > 0
 
-    def visit(reservoir: Reservoir, cell: Cell, full: mi.Bool) -> Reservoir:
-        half = dr.select(full, 0.5 * cell.dt, 0)
-        tau = world.rows([half * (a + b) for a, b in field.along(cell.corners, list(gauss_points(cell)))])
-        lit = None if world.visibility_cache is None else world.visibility_cache.at(cell.lower, lamp.number, full)
-        return _offer_candidate(reservoir, segment.t0, cell.s, cell.dt, tau, lamp.equiangular, lit, probe_sigma, full)
-
-    if field.has_constants:
-        reservoir = add_constant(reservoir, t0, dr.select(hit, segment.t0, t1))
-    # An image takes no light from behind this depth; derivatives are swept back from the far end, and need all of it.
-    until = None if probe_depth else lambda p: _least_of(p.tau) > DARK
-    reservoir = walk(lattice, segment, visit, reservoir, field.reads, on, until)
-    if field.has_constants:
-        reservoir = add_constant(reservoir, dr.select(hit, segment.t0 + segment.length, t1), t1)
-    return _note_probe(reservoir, probe_sigma)
+    def _probe_sigma(self, length: mi.Float) -> mi.Float | None:
+        """Extinction [1/length] that a probe adds over a length; None for an image."""
+        if not self.probe_depth:
+            return None
+        return dr.select(dr.isfinite(length) & (length > 0), self.probe_depth * inverse(length), 0)
 
 
 def lit_length(sigma: list[mi.Float], length: mi.Float) -> mi.Float:

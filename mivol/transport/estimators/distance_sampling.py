@@ -17,7 +17,7 @@ from mivol.numerics import one_minus_exp
 from mivol.transport.estimators.distance_reservoir import Candidate, inverse
 from mivol.transport.estimators.equiangular import EquiangularSampler
 from mivol.transport.media.body import Body
-from mivol.transport.media.scene_media import World
+from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.traversal.grid_walk import box_nodes, read_nodes
 from mivol.transport.traversal.lattice import clip
 from mivol.transport.traversal.random_numbers import draw_pcg32
@@ -52,7 +52,7 @@ class MediumEvent:
 
 
 def sample_distance(
-    world: World,
+    media: SceneMedia,
     ray: mi.Ray3f,
     candidate: Candidate,
     total: mi.Float,
@@ -64,7 +64,7 @@ def sample_distance(
     """Draw a distance in the piece that was kept.
 
     Args:
-        world, ray, equiangular, probe_depth: as in :func:`fill_reservoir`.
+        media, ray, equiangular, probe_depth: as in :func:`fill_reservoir`.
         candidate: a piece that the walk has kept.
         total: sum of the weights of all pieces.
         u: two numbers in [0, 1).
@@ -72,7 +72,7 @@ def sample_distance(
     """
     on = active & (candidate.weight > 0)
     dt = dr.select(on, candidate.dt, 1)
-    curve = _curve(world, ray, candidate, on)
+    curve = _curve(media, ray, candidate, on)
     whole = [_partial(c, dt, 1) for c in curve]
     front = [dr.exp(-f) for f in candidate.front]
 
@@ -105,23 +105,23 @@ def sample_distance(
     )
 
 
-def _curve(world: World, ray: mi.Ray3f, candidate: Candidate, on: mi.Bool) -> list[list[mi.Float]]:
+def _curve(media: SceneMedia, ray: mi.Ray3f, candidate: Candidate, on: mi.Bool) -> list[list[mi.Float]]:
     """The extinction along the piece that was kept, for each channel: the coefficients of a cubic of [0, 1]."""
-    values = [[mi.Float(0) for _ in range(4)] for _ in range(world.channels)]
-    for index, body in enumerate(world.bodies):
+    values = [[mi.Float(0) for _ in range(4)] for _ in range(media.channels)]
+    for index, body in enumerate(media.bodies):
         here = on & (candidate.body == index)
-        own = _values_along(world, body, ray, candidate, here)
+        own = _values_along(media, body, ray, candidate, here)
         values = [[dr.select(here, n, v) for n, v in zip(new, old, strict=True)] for new, old in zip(own, values, strict=True)]
     return [_cubic(*v) for v in values]
 
 
-def _values_along(world: World, body: Body, ray: mi.Ray3f, candidate: Candidate, on: mi.Bool) -> list[list[mi.Float]]:
+def _values_along(media: SceneMedia, body: Body, ray: mi.Ray3f, candidate: Candidate, on: mi.Bool) -> list[list[mi.Float]]:
     """[channel][point] extinction at 0, 1/3, 2/3 and 1 of the piece that was kept, in one body."""
     field = body.extinction(ray, body.flight_parts)
     constant = [[c] * 4 for c in field.constant]
     lattice = next((p.lattice for p in body.flight_parts if p.lattice is not None), None)
     if lattice is None:
-        return _by_point(world, constant)
+        return _by_point(media, constant)
     start = mi.Float64(candidate.begin) + mi.Float64(candidate.s)
     segment = clip(lattice, ray.o, ray.d, start, start + mi.Float64(candidate.dt))
     # The middle of the piece tells its cell: an end lies in a face, and may be rounded to either side.
@@ -133,12 +133,12 @@ def _values_along(world: World, body: Body, ray: mi.Ray3f, candidate: Candidate,
     nodes = box_nodes(cell, dr.full(dr.mask_t(mi.Vector3f), True), lattice.res)
     grid = field.along(read_nodes(field.reads, nodes, inside), points)
     own = [[dr.select(inside, g, k) for g, k in zip(*row, strict=True)] for row in zip(grid, constant, strict=True)]
-    return _by_point(world, own)
+    return _by_point(media, own)
 
 
-def _by_point(world: World, values: list[list[mi.Float]]) -> list[list[mi.Float]]:
+def _by_point(media: SceneMedia, values: list[list[mi.Float]]) -> list[list[mi.Float]]:
     """[channel of a body][point] as [channel of the world][point]."""
-    return [list(row) for row in zip(*(world.rows([v[k] for v in values]) for k in range(4)), strict=True)]
+    return [list(row) for row in zip(*(media.rows([v[k] for v in values]) for k in range(4)), strict=True)]
 
 
 def _cubic(f0: mi.Float, f1: mi.Float, f2: mi.Float, f3: mi.Float) -> list[mi.Float]:

@@ -24,15 +24,16 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mivol.transport.estimators.direct_lighting import DirectSample, estimate_direct
+from mivol.transport.estimators.direct_lighting import DirectLighting, DirectSample
 from mivol.transport.estimators.event_samples import EventSamples
-from mivol.transport.estimators.single_scattering import eval_albedo
+from mivol.transport.estimators.vertex import MediumVertex
 from mivol.transport.media.body import Body
-from mivol.transport.media.scene_media import World
+from mivol.transport.media.coefficients import eval_albedo
+from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.traversal.interpolation import interpolate
 from mivol.transport.traversal.lattice import Lattice, locate
 
-__all__ = ["CameraOrigins", "GridControl", "build_grid_control"]
+__all__ = ["CameraOrigins", "GridControl", "build_grid_control", "takes_grid_control"]
 
 
 STEP = 8
@@ -91,19 +92,26 @@ class GridControl:
         return S * 3 if self.channels == 1 and not mi.is_monochromatic else S
 
 
-def build_grid_control(scene: mi.Scene, world: World, body: Body, view: CameraOrigins) -> GridControl:
+def takes_grid_control(media: SceneMedia) -> bool:
+    """Whether a grid control serves the media: one grid in a box that scatters by an albedo."""
+    parts = [p for b in media.bodies for p in b.view.parts]
+    alone = len(parts) == 1 and not media.traced and parts[0].lattice is not None
+    return alone and media.bodies[0].view.albedo is not None and not media.has_microflakes
+
+
+def build_grid_control(direct: DirectLighting, body: Body, origins: CameraOrigins) -> GridControl:
     """Find S on a coarse lattice and spread it over the cells of a body's grid.
 
     Args:
-        scene, world: surfaces, lamps and media.
+        direct: estimates the light that arrives at a node.
         body: one with a single grid.
-        view: the camera.
+        origins: of camera rays.
 
     Cost: 64 shadow rays for 512 cells at most, and 8 look-ups a cell.
     """
     lattice = body.view.parts[0].lattice
     nodes = [max(2, min(-(-(n + 1) // STEP) + 1, MOST)) for n in lattice.res]
-    coarse = _light_of_nodes(scene, world, body, view, lattice, nodes)
+    coarse = _light_of_nodes(direct, body, origins, lattice, nodes)
     z, y, x = (r + 1 for r in lattice.res)
     index = dr.arange(mi.UInt32, z * y * x)
     cell = [index // (y * x), (index // x) % y, index % x]
@@ -128,7 +136,7 @@ def build_grid_control(scene: mi.Scene, world: World, body: Body, view: CameraOr
 
 
 def _light_of_nodes(
-    scene: mi.Scene, world: World, body: Body, view: CameraOrigins, lattice: Lattice, nodes: list[int]
+    direct: DirectLighting, body: Body, origins: CameraOrigins, lattice: Lattice, nodes: list[int]
 ) -> list[mi.Float]:
     """L_s at the nodes of the coarse lattice, towards the camera, one array a channel."""
     z, y, x = nodes
@@ -137,7 +145,7 @@ def _light_of_nodes(
     at = [node % x, (node // x) % y, node // (x * y)]
     u = mi.Vector3f(*(mi.Float(a) / (k - 1) for a, k in zip(at, (x, y, z), strict=True)))
     p = lattice.place(u)
-    mei = _at(p, view.towards(p))
+    mei = _at(p, origins.towards(p))
     mei.medium = dr.select(dr.full(mi.Bool, True, dr.width(lane)), mi.MediumPtr(body.view.medium), None)
     # A lattice of rank 1 (Cranley-Patterson: shifted for each node by its number) over the directions of a node.
     shift = [_fraction(mi.Float(node) * k) for k in (0.7548776, 0.5698403, 0.3819660)]
@@ -146,8 +154,9 @@ def _light_of_nodes(
     lamps, lobes = _fraction(turn * 0.7548776 + shift[2]), _fraction(turn * 0.5698403)
     samples = EventSamples(mi.Float(0), mi.Point2f(0), lamps, flat, lobes, flat, mi.Float(0))
     ray = mi.Ray3f(p, -mei.wi, dr.inf, mi.Float(0), mi.Color0f())
-    lamp = world.emitters.choose(ray, samples.lamp)
-    found = estimate_direct(scene, world, mei, lamp, samples, False, dr.full(mi.Bool, True, dr.width(lane)))
+    chosen = direct.emitters.choose(ray, samples.lamp)
+    everywhere = dr.full(mi.Bool, True, dr.width(lane))
+    found = direct.in_medium(MediumVertex(direct.media, mei), chosen, samples, False, everywhere)
     apart = max(float(np.linalg.norm(lattice.to_world[:3, a])) / (k - 1) for a, k in enumerate((x, y, z)))
     light = sum((_spread(a, apart) for a in found), mi.Spectrum(0))
     dr.eval(light)

@@ -21,7 +21,7 @@ from mivol.transport.media.body import Body
 from mivol.transport.media.channels import spectrum
 from mivol.transport.media.medium_view import Part
 from mivol.transport.media.ray_intervals import OWN_SURFACE, RaySegment, revisit_media
-from mivol.transport.media.scene_media import World
+from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.traversal.grid_walk import Cell, Nodes, walk
 from mivol.transport.traversal.interpolation import GAUSS, gauss_points
 from mivol.transport.traversal.lattice import Lattice, Segment, clip
@@ -34,13 +34,11 @@ ASIDE = 1e-5
 """How far beside a surface its two sides are looked at, as a share of the distance: ten times its rounding."""
 
 
-def tau_by_end(
-    scene: mi.Scene, world: World, ray_segment: RaySegment, tau: list[mi.Float], active: mi.Bool
-) -> list[mi.Vector3f]:
+def tau_by_end(media: SceneMedia, ray_segment: RaySegment, tau: list[mi.Float], active: mi.Bool) -> list[mi.Vector3f]:
     """Derivative of the optical depth of a shadow ray with respect to its far end.
 
     Args:
-        scene, world: boundaries and media.
+        media: boundaries and media.
         ray_segment: the shadow ray; its length is the distance to the lamp.
         tau: its optical depth, each channel.
         active: lanes to differentiate.
@@ -55,64 +53,64 @@ def tau_by_end(
     def visit(total: list, body: Body, t0: mi.Float64, t1: mi.Float64, on: mi.Bool) -> list:
         scale = dr.detach(body.view.scale) * body.area(d)
         for part in body.view.parts:
-            rows = world.vectors([scale * v for v in _by_part(body, part, ray_segment, t0, t1, on)])
+            rows = media.vectors([scale * v for v in _by_part(body, part, ray_segment, t0, t1, on)])
             total = [a + b for a, b in zip(total, rows, strict=True)]
         if body.view.microflakes is None:
             return total
         # The area that flakes show turns with the ray, whose direction moves across itself.
         turn = body.facing(d) * dr.rcp(dr.maximum(dr.square(body.area(d)), 1e-30)) - d
-        own = body.optical_depth(ray_segment.ray, mi.Float(t0), mi.Float(t1), world.channels, on)
+        own = body.optical_depth(ray_segment.ray, mi.Float(t0), mi.Float(t1), media.channels, on)
         return [a + t * turn for a, t in zip(total, own, strict=True)]
 
-    zero = [mi.Vector3f(0) for _ in range(world.channels)]
-    turned = revisit_media(scene, world, ray_segment, visit, zero, active)
-    if world.traced:
-        turned = [a + b for a, b in zip(turned, _steps(scene, world, ray_segment, active), strict=True)]
+    zero = [mi.Vector3f(0) for _ in range(media.channels)]
+    turned = revisit_media(media, ray_segment, visit, zero, active)
+    if media.traced:
+        turned = [a + b for a, b in zip(turned, _steps(media, ray_segment, active), strict=True)]
     return [dr.select(active, (d * t + v) / length, 0) for t, v in zip(tau, turned, strict=True)]
 
 
 def shadow_of_moving(
-    scene: mi.Scene, world: World, ray_segment: RaySegment, tau: list[mi.Float], end: mi.Point3f, active: mi.Bool
+    media: SceneMedia, ray_segment: RaySegment, tau: list[mi.Float], end: mi.Point3f, active: mi.Bool
 ) -> mi.Spectrum | float:
     """The number 1, with the derivative of a shadow by the lamp's end of its ray, where that moves."""
     if not dr.grad_enabled(end):
         return 1.0
     moved = end - dr.detach(end)
     with dr.suspend_grad():
-        slopes = tau_by_end(scene, world, ray_segment, tau, active)
+        slopes = tau_by_end(media, ray_segment, tau, active)
     return spectrum([1 - dr.dot(s, moved) for s in slopes])
 
 
 @dr.syntax
-def _steps(scene: mi.Scene, world: World, ray_segment: RaySegment, active: mi.Bool) -> list[mi.Vector3f]:
+def _steps(media: SceneMedia, ray_segment: RaySegment, active: mi.Bool) -> list[mi.Vector3f]:
     """L times the part of the derivative by which boundaries that are traced shift, one vector a channel."""
     # -- State ------------------------------------------------------------------------------------------------------------
     ray = ray_segment.ray
     onward = mi.Ray3f(ray)  #                        the ray from the last surface on
     going = mi.Bool(active)
-    total = [dr.zeros(mi.Vector3f, dr.width(ray)) for _ in range(world.channels)]
+    total = [dr.zeros(mi.Vector3f, dr.width(ray)) for _ in range(media.channels)]
 
     while dr.hint(going, label="boundaries on the way to a lamp"):
-        hit = scene.ray_intersect(onward, mi.RayFlags.All, False, going)
+        hit = media.scene.ray_intersect(onward, mi.RayFlags.All, False, going)
         t = distance_along(ray, hit)
         going &= hit.is_valid() & (t < ray_segment.length * OWN_SURFACE)
         crosses = going & hit.is_medium_transition()
-        total = _add_step(total, world, ray, hit, t, crosses)
-        onward = spawn_ray(hit, ray.d, world.size)
+        total = _add_step(total, media, ray, hit, t, crosses)
+        onward = spawn_ray(hit, ray.d, media.size)
     return total
 
 
 def _add_step(
-    total: list[mi.Vector3f], world: World, ray: mi.Ray3f, hit: mi.SurfaceInteraction3f, t: mi.Float, crosses: mi.Bool
+    total: list[mi.Vector3f], media: SceneMedia, ray: mi.Ray3f, hit: mi.SurfaceInteraction3f, t: mi.Float, crosses: mi.Bool
 ) -> list[mi.Vector3f]:
     """Add the step of the extinction at a surface, from a little before it to a little behind it."""
     slope = dr.dot(hit.n, ray.d)
     face = mi.Vector3f(hit.n) * dr.rcp(dr.select(slope != 0, slope, 1))
     for side, to, sign in ((-ray.d, 1 - ASIDE, -1.0), (ray.d, 1 + ASIDE, 1.0)):
         medium = hit.target_medium(side)
-        for body in world.traced:
+        for body in media.traced:
             on = crosses & (slope != 0) & (medium == mi.MediumPtr(body.view.medium))
-            sigma = body.extinction_at(ray, t * to, world.channels, on)
+            sigma = body.extinction_at(ray, t * to, media.channels, on)
             total = [v + dr.select(on, sign * t * x * face, 0) for v, x in zip(total, sigma, strict=True)]
     return total
 

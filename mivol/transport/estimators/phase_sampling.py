@@ -7,20 +7,20 @@ import mitsuba as mi
 
 from mivol.phase.turn import INV_FOUR_PI
 from mivol.transport.estimators.event_samples import EventSamples
-from mivol.transport.media.scene_media import World
+from mivol.transport.media.scene_media import SceneMedia
 
 __all__ = ["phase_context", "phase_pdf", "sample_phase"]
 
 
 def sample_phase(
-    world: World, phase: mi.PhaseFunctionPtr, mei: mi.MediumInteraction3f, samples: EventSamples, active: mi.Bool
+    media: SceneMedia, phase: mi.PhaseFunctionPtr, mei: mi.MediumInteraction3f, samples: EventSamples, active: mi.Bool
 ) -> tuple[mi.Vector3f, mi.Spectrum, mi.Float]:
     """A direction, value over density, and density of a phase function; where it has flakes the direction is drawn evenly.
 
     Mitsuba 3.9.1 draws directions of flakes from another density than ``eval_pdf`` tells (6 % of a picture in a constant sky).
     """
     wo, weight, pdf = phase.sample(phase_context(), mei, samples.component, samples.direction, active)
-    if world.has_microflakes:
+    if media.has_microflakes:
         even = _has_microflakes(phase)
         wo = dr.select(even, mi.warp.square_to_uniform_sphere(samples.direction), wo)
         f, _ = phase.eval_pdf(phase_context(), mei, wo, active & even)
@@ -29,11 +29,11 @@ def sample_phase(
 
 
 def phase_pdf(
-    world: World, phase: mi.PhaseFunctionPtr, mei: mi.MediumInteraction3f, d: mi.Vector3f, active: mi.Bool
+    media: SceneMedia, phase: mi.PhaseFunctionPtr, mei: mi.MediumInteraction3f, d: mi.Vector3f, active: mi.Bool
 ) -> mi.Float:
     """Density of :func:`sample_phase`."""
     _, pdf = phase.eval_pdf(phase_context(), mei, d, active)
-    return dr.select(_has_microflakes(phase), INV_FOUR_PI, pdf) if world.has_microflakes else pdf
+    return dr.select(_has_microflakes(phase), INV_FOUR_PI, pdf) if media.has_microflakes else pdf
 
 
 def _has_microflakes(phase: mi.PhaseFunctionPtr) -> mi.Bool:

@@ -24,20 +24,25 @@ import drjit as dr
 import mitsuba as mi
 
 from mivol.numerics import phi1
+from mivol.transport.estimators.contribution import TrackedTerm
 from mivol.transport.estimators.distance_reservoir import lit_length
 from mivol.transport.estimators.equiangular import EquiangularSampler, equiangular_sampler
-from mivol.transport.estimators.path_segment import PathSegment
+from mivol.transport.estimators.event_samples import EventSamples
+from mivol.transport.estimators.segment import PICTURE, PathSegment, SegmentEstimate, Transmittance
 from mivol.transport.estimators.shadow_rays import shadow_ray
-from mivol.transport.estimators.single_scattering import eval_albedo, medium_interaction
+from mivol.transport.estimators.single_scattering import SingleScattering
+from mivol.transport.estimators.transmittance_grid import TransmittanceGrid
 from mivol.transport.media.body import Body
 from mivol.transport.media.channels import spectrum
-from mivol.transport.media.ray_intervals import SegmentEnd, visit_media
-from mivol.transport.media.scene_media import World
+from mivol.transport.media.coefficients import eval_albedo, medium_interaction
+from mivol.transport.media.ray_intervals import RaySegment, visit_media
+from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.traversal.grid_walk import Cell, walk
 from mivol.transport.traversal.interpolation import GAUSS
 from mivol.transport.traversal.lattice import clip
+from mivol.transport.traversal.strata import Strata
 
-__all__ = ["integrate_scattering"]
+__all__ = ["ScatteringQuadrature"]
 
 
 PIECE = 0.25
@@ -56,31 +61,41 @@ STRETCH = 64
 SKEW = math.sqrt(3) / 6
 
 
-def integrate_scattering(
-    scene: mi.Scene, world: World, path_segment: PathSegment, active: mi.Bool
-) -> tuple[SegmentEnd, list[mi.Float], mi.Spectrum]:
-    """Walk a stretch to its end and integrate what it scatters.
+class ScatteringQuadrature:
+    """Scatters the light of a segment once, by quadrature in pictures; derivatives are drawn.
 
     Args:
-        scene, world: surfaces, lamps and one body.
-        path_segment: ray and throughput.
-        active: lanes to walk.
-
-    Returns:
-        Where the stretch ends, its optical depth for each channel, and the light that it scatters to the camera.
+        drawn: the estimator of derivatives; it knows the media, a single body, and the emitters.
+        transmittance_grid: in place of shadow rays; None for exact ones.
 
     Bias: of fourth order in the size of a cell where the light is smooth; of first order across the edge of a shadow.
-    Cost: one walk for each lamp, and two shadow rays (or look-ups) a piece.
+    Cost: one walk for each emitter, and two shadow rays (or look-ups) a piece.
     """
-    L, end, tau = mi.Spectrum(0), None, None
-    for number, lamp in enumerate(world.emitters.sampled):
-        equiangular = equiangular_sampler(path_segment.ray, world.emitters.bounding_ball(number))
 
-        visit = partial(_integrate_body, scene, world, path_segment.ray, lamp, number, equiangular)
-        zero = _start(world, dr.width(path_segment.ray))
-        end, (tau, _, light) = visit_media(scene, world, path_segment.ray, path_segment.medium, visit, zero, active)
-        L += light
-    return end, tau, dr.select(path_segment.scatters, path_segment.beta * L, 0)
+    directions = "spread"
+
+    def __init__(self, drawn: SingleScattering, transmittance_grid: TransmittanceGrid | None) -> None:
+        self.drawn, self.media, self.emitters, self.transmittance_grid = drawn, drawn.media, drawn.emitters, transmittance_grid
+
+    def draw(self, sampler: mi.Sampler, active: mi.Bool, strata: Strata | None) -> EventSamples:
+        return self.drawn.draw(sampler, active, strata)
+
+    def find_controls(self, ray: mi.Ray3f) -> None:
+        """Find a control variate for derivatives along camera rays, once."""
+        self.drawn.find_controls(ray)
+
+    def estimate(self, segment: PathSegment, purpose: str, active: mi.Bool) -> SegmentEstimate:
+        if purpose != PICTURE:
+            return self.drawn.estimate(segment, purpose, active)
+        L, end, tau, ray = mi.Spectrum(0), None, None, segment.ray
+        for number, lamp in enumerate(self.emitters.sampled):
+            equiangular = equiangular_sampler(ray, self.emitters.bounding_ball(number))
+            visit = partial(_integrate_body, self, ray, lamp, number, equiangular)
+            zero = _start(self.media, dr.width(ray))
+            end, (tau, _, light) = visit_media(self.media, ray, segment.medium, visit, zero, active)
+            L += light
+        term = TrackedTerm(dr.select(segment.scatters, segment.beta * L, 0), active)
+        return SegmentEstimate(end, tau, term, Transmittance(self.media, RaySegment(ray, segment.medium, end.t), active))
 
 
 _Sum = tuple
@@ -93,14 +108,13 @@ Source = Callable[..., Any]
 """Source function at a distance along the ray: ``source(t, active)``."""
 
 
-def _start(world: World, width: int) -> _Sum:
-    rows = [[dr.full(mi.Float, v, width) for _ in range(world.channels)] for v in (0, 1)]
+def _start(media: SceneMedia, width: int) -> _Sum:
+    rows = [[dr.full(mi.Float, v, width) for _ in range(media.channels)] for v in (0, 1)]
     return rows[0], rows[1], dr.zeros(mi.Spectrum, width)
 
 
 def _integrate_body(
-    scene: mi.Scene,
-    world: World,
+    quadrature: ScatteringQuadrature,
     ray: mi.Ray3f,
     lamp: mi.Emitter,
     number: int,
@@ -111,15 +125,16 @@ def _integrate_body(
     t1: mi.Float,
     on: mi.Bool,
 ) -> _Sum:
-    """Add one body's stretch."""
+    """Add one body's interval."""
+    media = quadrature.media
     field = body.extinction(ray)
     grid = next((p.lattice for p in body.view.parts if p.lattice is not None), None)
 
     def source(t: mi.Float, active: mi.Bool) -> mi.Spectrum:
-        return _source(scene, world, body, ray, lamp, number, t, active)
+        return _source(quadrature, body, ray, lamp, number, t, active)
 
     def add_constant(state: _Sum, a: mi.Float, b: mi.Float) -> _Sum:
-        sigma = world.rows(field.constant)
+        sigma = media.rows(field.constant)
         dt = dr.select(on, lit_length(sigma, dr.maximum(b - a, 0)), 0)
         return _pieces(state, a, dt, lambda x: sigma, source, equiangular, mi.Float(STRETCH), on & (dt > 0))
 
@@ -131,7 +146,7 @@ def _integrate_body(
 
     def visit(state: _Sum, cell: Cell, full: mi.Bool) -> _Sum:
         def sigma(x: mi.Float) -> list[mi.Float]:
-            return world.rows([v[0] for v in field.along(cell.corners, [dr.fma(cell.step, x, cell.frac)])])
+            return media.rows([v[0] for v in field.along(cell.corners, [dr.fma(cell.step, x, cell.frac)])])
 
         dt = dr.select(full, cell.dt, 0)
         return _pieces(state, segment.t0 + cell.s, dt, sigma, source, equiangular, mi.Float(1), full & (dt > 0))
@@ -228,25 +243,26 @@ def _add_piece(
 
 
 def _source(
-    scene: mi.Scene, world: World, body: Body, ray: mi.Ray3f, lamp: mi.Emitter, number: int, t: mi.Float, on: mi.Bool
+    quadrature: ScatteringQuadrature, body: Body, ray: mi.Ray3f, lamp: mi.Emitter, number: int, t: mi.Float, on: mi.Bool
 ) -> mi.Spectrum:
     """Albedo times the light of one lamp that turns to the camera, at a point of its ray."""
     mei = medium_interaction(ray, t, body.view.medium)
     direct, weight = lamp.sample_direction(mei, mi.Point2f(0.5), on)
     f, _ = body.view.medium.phase_function().eval_pdf(mi.PhaseFunctionContext(None), mei, direct.d, on)
-    if world.transmittance_grid is None:
-        _, clear, _, seen = shadow_ray(scene, world, mi.Point3f(mei.p), mei.medium, direct, on)
+    media, grid = quadrature.media, quadrature.transmittance_grid
+    if grid is None:
+        _, clear, _, seen = shadow_ray(media, mi.Point3f(mei.p), mei.medium, direct, on)
         seen = dr.select(clear, seen, 0)
     else:
-        seen = world.transmittance_grid.transmittance(mei.p, number, on)
-    return dr.select(on & (direct.pdf > 0), _share(world, body, ray, mei, on) * f * weight * seen, 0)
+        seen = grid.transmittance(mei.p, number, on)
+    return dr.select(on & (direct.pdf > 0), _share(media, body, ray, mei, on) * f * weight * seen, 0)
 
 
-def _share(world: World, body: Body, ray: mi.Ray3f, mei: mi.MediumInteraction3f, on: mi.Bool) -> mi.Spectrum:
+def _share(media: SceneMedia, body: Body, ray: mi.Ray3f, mei: mi.MediumInteraction3f, on: mi.Bool) -> mi.Spectrum:
     """The albedo, or sigma_s over the extinction, which the weights of a piece are multiples of; 0 where that is 0."""
     if body.view.albedo is not None:
         return eval_albedo(body, mei, on)
-    scattered, whole = (spectrum(body.extinction_at(ray, mei.t, world.channels, on, name)) for name in ("sigma_s", "sigma_"))
+    scattered, whole = (spectrum(body.extinction_at(ray, mei.t, media.channels, on, name)) for name in ("sigma_s", "sigma_"))
     return dr.select(whole > 0, scattered / dr.select(whole > 0, whole, 1), 0)
 
 

@@ -6,33 +6,18 @@ The transmittance is exact, or an unbiased estimate where the blocks of grids ar
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import drjit as dr
 import mitsuba as mi
 
+from mivol.transport.estimators.ratio_tracking import residual_ratio_tracking
 from mivol.transport.media.body import Body
-from mivol.transport.media.ray_intervals import (
-    OWN_SURFACE,
-    MediumVisitor,
-    RaySegment,
-    SegmentEnd,
-    sum_optical_depth,
-    transmittance,
-    visit_media,
-)
-from mivol.transport.media.scene_media import World
+from mivol.transport.media.channels import as_rows
+from mivol.transport.media.optical_depth import sum_optical_depth, transmittance
+from mivol.transport.media.ray_intervals import OWN_SURFACE, MediumVisitor, RaySegment, SegmentEnd, visit_media
+from mivol.transport.media.scene_media import SceneMedia
+from mivol.transport.traversal.lattice import clip
 
-__all__ = ["DARK", "ShadowedLight", "light_through", "shadow_ray"]
-
-
-@dataclass
-class ShadowedLight:
-    """Light that a shadow ray carried: its value, already dimmed by ``tau``, and the lamp's end of the ray, which may move."""
-
-    value: mi.Spectrum
-    tau: list[mi.Float]
-    end: mi.Point3f
+__all__ = ["DARK", "light_through", "shadow_ray"]
 
 
 DARK = 30.0
@@ -40,19 +25,19 @@ DARK = 30.0
 
 
 def light_through(
-    scene: mi.Scene, world: World, ray: mi.Ray3f, medium: mi.MediumPtr, active: mi.Bool, rng: mi.UInt32 | None = None
+    media: SceneMedia, ray: mi.Ray3f, medium: mi.MediumPtr, active: mi.Bool, rng: mi.UInt32 | None = None
 ) -> tuple[SegmentEnd, list[mi.Float] | None, mi.Spectrum]:
     """Where a ray of light ends, its optical depth for each channel, and the share of it that gets there.
 
     It passes veils. Optical depth is summed no further than to ``DARK`` in a grid. With ``rng`` the share is an unbiased
     estimate where blocks of grids are known (:mod:`mivol.transport.estimators.ratio_tracking`), and the optical depth is None.
     """
-    if rng is not None and world.is_tracked:
-        start = ([mi.Float(1) for _ in range(world.channels)], rng)
-        end, (T, _) = visit_media(scene, world, ray, medium, _dim(ray), start, active, passes_null=True)
+    if rng is not None and media.has_block_ranges:
+        start = ([mi.Float(1) for _ in range(media.channels)], rng)
+        end, (T, _) = visit_media(media, ray, medium, _dim(ray), start, active, passes_null=True)
         return end, None, mi.Spectrum(*T) * end.null_transmission if len(T) == 3 else mi.Spectrum(T[0]) * end.null_transmission
-    zero = [mi.Float(0) for _ in range(world.channels)]
-    end, tau = visit_media(scene, world, ray, medium, sum_optical_depth(ray, DARK), zero, active, passes_null=True)
+    zero = [mi.Float(0) for _ in range(media.channels)]
+    end, tau = visit_media(media, ray, medium, sum_optical_depth(ray, DARK), zero, active, passes_null=True)
     return end, tau, transmittance(tau) * end.null_transmission
 
 
@@ -61,15 +46,32 @@ def _dim(ray: mi.Ray3f) -> MediumVisitor:
 
     def visit(state: tuple, body: Body, t0: mi.Float, t1: mi.Float, active: mi.Bool) -> tuple:
         T, rng = state
-        own, rng = body.transmittance(ray, t0, t1, len(T), active, rng, DARK)
+        own, rng = _estimate_transmittance(body, ray, t0, t1, len(T), active, rng)
         return [a * b for a, b in zip(T, own, strict=True)], rng
 
     return visit
 
 
+def _estimate_transmittance(
+    body: Body, ray: mi.Ray3f, t0: mi.Float, t1: mi.Float, channels: int, active: mi.Bool, rng: mi.UInt32
+) -> tuple[list[mi.Float], mi.UInt32]:
+    """Transmittance [1] of each channel of a body, and the state of the generator.
+
+    Estimated in grids whose blocks are known; exact in all else, which is walked to the optical depth ``DARK``.
+    """
+    tracked = [p for p in body.view.parts if p.lattice is not None and p.lattice.block_ranges is not None]
+    others = [p for p in body.view.parts if not any(p is q for q in tracked)]
+    T = [dr.exp(-t) for t in body.optical_depth(ray, t0, t1, channels, active, others, DARK)]
+    scale = dr.detach(body.view.scale) * body.area(ray.d)
+    for part in tracked:
+        segment = clip(part.lattice, ray.o, ray.d, t0, t1)
+        own, rng = residual_ratio_tracking(part.lattice, segment, scale, rng, active)
+        T = [a * b for a, b in zip(T, as_rows(own, channels), strict=True)]
+    return T, rng
+
+
 def shadow_ray(
-    scene: mi.Scene,
-    world: World,
+    media: SceneMedia,
     start: mi.Point3f,
     medium: mi.MediumPtr,
     direct: mi.DirectionSample3f,
@@ -84,6 +86,6 @@ def shadow_ray(
     """
     length = dr.norm(direct.p - start)
     ray = mi.Ray3f(start, dr.normalize(direct.p - start), length, direct.time, mi.Color0f())
-    stop, tau, light = light_through(scene, world, ray, medium, active, rng)
+    stop, tau, light = light_through(media, ray, medium, active, rng)
     clear = ~(stop.si.is_valid() & (stop.t < length * OWN_SURFACE))
     return RaySegment(ray, medium, length, True), clear, tau, light

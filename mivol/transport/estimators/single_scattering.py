@@ -1,12 +1,12 @@
-r"""One scattering along a stretch of a path: the light that a medium turns towards the camera.
+r"""One scattering along a path segment: the light that a medium turns towards the camera, at points that are drawn.
 
-.. math:: L = \int_0^D T(t)\,\sigma_s(x_t)\,L_s(x_t, \omega)\,dt \approx \frac{T \sigma_s L_s}{p(t)}
+.. math:: L = \int_0^D T(t)\,\sigma_s(x_t)\,L_d(x_t, \omega)\,dt \approx \frac{T \sigma_s L_d}{p(t)}
 
-Conventions. The stretch is walked once, for its optical depth and for the point at which it scatters. ``weight`` is what a unit
-of sigma_s at that point would send to the camera: the light is ``sigma_s * weight``, and its derivative with respect to
+Conventions. The segment is walked once, for its optical depth and for the points at which it scatters. ``weight`` is what a
+unit of sigma_s at a point would send to the camera: the light is ``sigma_s * weight``, and its derivative with respect to
 sigma_s is the weight itself, so nothing is divided by an extinction or by an albedo that may be 0.
 
-References: physically, the equation of transfer with the in-scattered radiance of one order (Chandrasekhar 1960).
+References: the equation of transfer with the in-scattered radiance of one order (Chandrasekhar 1960).
 """
 
 from __future__ import annotations
@@ -16,26 +16,31 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from mivol.transport.estimators.direct_lighting import DirectSample, estimate_direct
+from mivol.transport.estimators.constant_control import find_constant_control
+from mivol.transport.estimators.contribution import TrackedTerm
+from mivol.transport.estimators.direct_lighting import DirectLighting
 from mivol.transport.estimators.distance_reservoir import Candidate, Reservoir, fill_reservoir, start_reservoir
-from mivol.transport.estimators.distance_sampling import MediumEvent, sample_distance
+from mivol.transport.estimators.distance_sampling import sample_distance
 from mivol.transport.estimators.emitters import ChosenEmitter
 from mivol.transport.estimators.event_samples import EventSamples
-from mivol.transport.estimators.path_segment import PathSegment
-from mivol.transport.media.body import Body
-from mivol.transport.media.channels import spectrum
-from mivol.transport.media.ray_intervals import SegmentEnd, integrate_optical_depth, transmittance, visit_media
-from mivol.transport.media.scene_media import World
+from mivol.transport.estimators.grid_control import CameraOrigins, GridControl, build_grid_control, takes_grid_control
+from mivol.transport.estimators.scattering import Scattering, medium_event_interaction, sigma_s_at
+from mivol.transport.estimators.scattering_derivatives import ScatteredSegment
+from mivol.transport.estimators.segment import (
+    PICTURE,
+    PathSegment,
+    SegmentEstimate,
+    SegmentLight,
+    SegmentTransmittance,
+    Transmittance,
+)
+from mivol.transport.estimators.vertex import MediumVertex
+from mivol.transport.estimators.visibility_cache import VisibilityCache
+from mivol.transport.media.optical_depth import integrate_optical_depth, transmittance
+from mivol.transport.media.ray_intervals import RaySegment, SegmentEnd, visit_media
+from mivol.transport.traversal.strata import Strata
 
-__all__ = [
-    "Scattering",
-    "at_event",
-    "estimate_scattered_light",
-    "eval_albedo",
-    "medium_interaction",
-    "sample_scattering",
-    "sigma_t_at",
-]
+__all__ = ["SingleScattering"]
 
 
 PROBE_DEPTH = 4.0
@@ -43,166 +48,120 @@ PROBE_DEPTH = 4.0
 
 
 @dataclass
-class Scattering:
-    """A point of a stretch that scatters, and the light that arrives there.
+class _Flight:
+    """A segment that has been walked for one emitter: where it ends, and the candidates that it keeps."""
 
-    Attributes:
-        event: where.
-        mei: the point, as Mitsuba's phase functions want it.
-        gain: throughput and transmittance to the camera, over the density of the point.
-        direct: the shadow rays; their values carry derivatives where these are asked for.
-        sigma_s: scattering coefficient [1/length] there.
-        chance: a number in [0, 1), for the choice of one of the shadow rays.
-    """
-
-    event: MediumEvent
-    mei: mi.MediumInteraction3f
-    gain: mi.Spectrum
-    direct: list[DirectSample]
-    sigma_s: mi.Spectrum
-    chance: mi.Float
-
-    @property
-    def weight(self) -> mi.Spectrum:
-        """What a unit of sigma_s would send to the camera."""
-        return self.gain * sum((dr.detach(a.value) for a in self.direct), mi.Spectrum(0))
+    end: SegmentEnd
+    reservoir: Reservoir
+    chosen: ChosenEmitter
 
 
-def sample_scattering(
-    scene: mi.Scene, world: World, path_segment: PathSegment, probes: bool, active: mi.Bool
-) -> tuple[SegmentEnd, list[mi.Float], Scattering]:
-    """Walk a stretch to its end, and let it scatter once on the way.
+class SingleScattering:
+    """Scatters the light of a segment once, at points drawn in proportion to what they take from the camera's ray.
 
     Args:
-        scene, world: surfaces, lamps and media.
-        path_segment: ray, throughput and random numbers.
-        probes: draw points for derivatives: where there is no extinction too, and with derivatives of what arrives.
-        active: lanes to walk.
+        direct: estimates the light that arrives at a point.
+        count: points of a segment, in pictures; derivatives have one.
+        visibility_cache: where emitters shine, in pictures; None where that is not known.
 
-    Returns:
-        Where the stretch ends, the optical depth of each channel to there, and the scattering.
-
-    Bias: none. Cost: one walk of the stretch, one of each shadow ray; where several media lie along a ray, one to the point.
+    Bias: none. Variance: that of the distance in the light that reaches it, of one direction to an emitter and one of the phase
+    function; the points of a segment share the emitter. Cost: one walk of the segment, one of each shadow ray; where several
+    media lie along a ray, one to each point.
     """
-    end, reservoir, lamp = _walk(scene, world, path_segment, 1, probes, active)
-    samples = path_segment.samples.part(mi.UInt32(0), 1)
-    return (
-        end,
-        reservoir.tau,
-        _light_up(scene, world, path_segment, reservoir.candidates[0], reservoir.total, lamp, samples, probes, active),
-    )
 
+    def __init__(self, direct: DirectLighting, count: int = 1, visibility_cache: VisibilityCache | None = None) -> None:
+        self.direct, self.media, self.emitters = direct, direct.media, direct.emitters
+        self.count, self.visibility_cache = count, visibility_cache
+        self.grid_control: GridControl | None = None
+        self.constant_control: mi.Spectrum | None = None
 
-def estimate_scattered_light(
-    scene: mi.Scene, world: World, path_segment: PathSegment, active: mi.Bool
-) -> tuple[SegmentEnd, list[mi.Float], mi.Spectrum]:
-    """Walk a stretch to its end, and let it scatter at ``world.events`` points on the way, for a picture.
+    @property
+    def directions(self) -> str:
+        """Directions of the phase function are worth strata over tiles of pixels; those to small lamps are not."""
+        return "tiled" if self.emitters.samples_phase else "spread"
 
-    Returns:
-        Where the stretch ends, the optical depth of each channel to there, and the light of all points, in the mean.
+    def draw(self, sampler: mi.Sampler, active: mi.Bool, strata: Strata | None) -> EventSamples:
+        return self.emitters.draw_samples(sampler, active, strata)
 
-    Bias: none. Variance: of each point as of :func:`sample_scattering`; they share the emitter.
-    Cost: one walk of the segment, one of each shadow ray: on long segments several points pay.
-    """
-    count, samples = world.events, path_segment.samples
-    end, reservoir, lamp = _walk(scene, world, path_segment, count, False, active)
+    def find_controls(self, ray: mi.Ray3f) -> None:
+        """Find a control variate for derivatives along camera rays, once."""
+        if takes_grid_control(self.media):
+            if self.grid_control is None:
+                self.grid_control = build_grid_control(self.direct, self.media.bodies[0], CameraOrigins.of(ray))
+        elif self.constant_control is None:
+            self.constant_control = find_constant_control(self.media)
 
-    def light_of(number: mi.UInt32) -> mi.Spectrum:
-        candidates, numbers = reservoir.of(number), samples.part(number, count)
-        at = _light_up(scene, world, path_segment, candidates, reservoir.total, lamp, numbers, False, active)
-        return dr.select(at.event.on, at.sigma_s * at.weight, 0)
+    def estimate(self, segment: PathSegment, purpose: str, active: mi.Bool) -> SegmentEstimate:
+        if purpose == PICTURE:
+            return self._picture(segment, active)
+        flight = self._walk(segment, 1, PROBE_DEPTH, active)
+        samples = segment.samples.part(mi.UInt32(0), 1)
+        found = self._light_up(segment, flight, flight.reservoir.candidates[0], samples, PROBE_DEPTH, active)
+        tau, controls = flight.reservoir.tau, (self.grid_control, self.constant_control)
+        shared = ScatteredSegment(self.media, segment, flight.end, tau, found, *controls, active)
+        light = SegmentLight(shared, dr.select(found.event.on, found.sigma_s * found.weight, 0), is_replayed=False)
+        return SegmentEstimate(flight.end, tau, light, SegmentTransmittance(shared))
 
-    if count == 1:
-        return end, reservoir.tau, light_of(mi.UInt32(0))
-    _, light = dr.while_loop(
-        state=(dr.zeros(mi.UInt32, dr.width(path_segment.ray)), dr.zeros(mi.Spectrum, dr.width(path_segment.ray))),
-        cond=lambda number, light: number < count,
-        body=lambda number, light: (number + 1, light + light_of(number)),
-        label="points that scatter",
-    )
-    return end, reservoir.tau, light * (1 / count)
+    def _picture(self, segment: PathSegment, active: mi.Bool) -> SegmentEstimate:
+        """The mean of ``count`` points, without derivatives."""
+        count, width = self.count, dr.width(segment.ray)
+        flight = self._walk(segment, count, 0.0, active)
 
+        def light_of(number: mi.UInt32) -> mi.Spectrum:
+            candidate, samples = flight.reservoir.of(number), segment.samples.part(number, count)
+            found = self._light_up(segment, flight, candidate, samples, 0.0, active)
+            return dr.select(found.event.on, found.sigma_s * found.weight, 0)
 
-def _walk(
-    scene: mi.Scene, world: World, path_segment: PathSegment, count: int, probes: bool, active: mi.Bool
-) -> tuple[SegmentEnd, Reservoir, ChosenEmitter]:
-    """Walk a stretch to its end and keep pieces of it, for a lamp that was drawn before."""
-    probe_depth, samples, ray = PROBE_DEPTH if probes else 0.0, path_segment.samples, path_segment.ray
-    lamp = world.emitters.choose(ray, samples.lamp)
-    reservoir = start_reservoir(world, samples.piece, dr.width(ray), count)
-    end, reservoir = visit_media(
-        scene, world, ray, path_segment.medium, fill_reservoir(world, ray, lamp, probe_depth), reservoir, active
-    )
-    return end, reservoir, lamp
-
-
-def _light_up(
-    scene: mi.Scene,
-    world: World,
-    path_segment: PathSegment,
-    candidates: Candidate,
-    total: mi.Float,
-    lamp: ChosenEmitter,
-    samples: EventSamples,
-    probes: bool,
-    active: mi.Bool,
-) -> Scattering:
-    """Choose a point in a piece that was kept, and look from there to the lamps."""
-    probe_depth, ray = PROBE_DEPTH if probes else 0.0, path_segment.ray
-    event = sample_distance(
-        world, ray, candidates, total, lamp.equiangular, probe_depth, samples.inside, active & path_segment.scatters
-    )
-    mei = _interaction(world, ray, event)
-    tau = event.tau
-    if not world.is_single:
-        front = mi.Ray3f(ray.o, ray.d, event.t, ray.time, ray.wavelengths)
-        _, tau = integrate_optical_depth(scene, world, front, path_segment.medium, event.on)
-    gain = dr.select(event.on, path_segment.beta * transmittance(tau) / event.pdf, 0)
-    found = estimate_direct(scene, world, mei, lamp, samples, probes, event.on, estimates=not probes)
-    return Scattering(event, mei, gain, found, _sigma_s(world, ray, event, mei), samples.choice)
-
-
-def medium_interaction(ray: mi.Ray3f, t: mi.Float, medium: mi.Medium | None = None) -> mi.MediumInteraction3f:
-    """A point of a ray as Mitsuba's phase functions want it."""
-    mei = dr.zeros(mi.MediumInteraction3f, dr.width(ray))
-    mei.t, mei.p, mei.wi = t, ray(t), -ray.d
-    mei.sh_frame = mi.Frame3f(mei.wi)
-    mei.time, mei.wavelengths = ray.time, ray.wavelengths
-    if medium is not None:
-        mei.medium = dr.select(dr.full(mi.Bool, True, dr.width(ray)), mi.MediumPtr(medium), None)
-    return mei
-
-
-def _interaction(world: World, ray: mi.Ray3f, event: MediumEvent) -> mi.MediumInteraction3f:
-    mei = medium_interaction(ray, event.t)
-    for index, body in enumerate(world.bodies):
-        mei.medium = dr.select(event.on & (event.body == index), mi.MediumPtr(body.view.medium), mei.medium)
-    return mei
-
-
-def at_event(world: World, event: MediumEvent) -> list[tuple[Body, mi.Bool]]:
-    """The bodies, each with the lanes that scatter in it."""
-    return [(body, event.on & (event.body == index)) for index, body in enumerate(world.bodies)]
-
-
-def eval_albedo(body: Body, mei: mi.MediumInteraction3f, on: mi.Bool) -> mi.Spectrum:
-    """The albedo of a body at a point, with its derivative."""
-    albedo = body.view.albedo
-    return albedo.eval(mei, on) if isinstance(albedo, mi.Volume) else mi.Spectrum(albedo)
-
-
-def sigma_t_at(world: World, body: Body, ray: mi.Ray3f, event: MediumEvent, on: mi.Bool) -> mi.Spectrum:
-    """The extinction [1/length] at an event."""
-    rows = event.sigma_t if world.is_single else body.extinction_at(ray, event.t, world.channels, on)
-    return spectrum(rows)
-
-
-def _sigma_s(world: World, ray: mi.Ray3f, event: MediumEvent, mei: mi.MediumInteraction3f) -> mi.Spectrum:
-    total = mi.Spectrum(0)
-    for body, on in at_event(world, event):
-        if body.view.albedo is None:
-            value = spectrum(body.extinction_at(ray, event.t, world.channels, on, "sigma_s"))
+        if count == 1:
+            light = light_of(mi.UInt32(0))
         else:
-            value = dr.detach(eval_albedo(body, mei, on)) * sigma_t_at(world, body, ray, event, on)
-        total = dr.select(on, value, total)
-    return total
+            _, light = dr.while_loop(
+                state=(dr.zeros(mi.UInt32, width), dr.zeros(mi.Spectrum, width)),
+                cond=lambda number, light: number < count,
+                body=lambda number, light: (number + 1, light + light_of(number)),
+                label="points that scatter",
+            )
+            light *= 1 / count
+        passed = RaySegment(segment.ray, segment.medium, flight.end.t)
+        term = TrackedTerm(light, active)
+        return SegmentEstimate(flight.end, flight.reservoir.tau, term, Transmittance(self.media, passed, active))
+
+    def _walk(self, segment: PathSegment, count: int, probe_depth: float, active: mi.Bool) -> _Flight:
+        """Walk a segment to its end and keep candidates of it, for an emitter that was drawn before."""
+        ray, samples = segment.ray, segment.samples
+        chosen = self.emitters.choose(ray, samples.lamp)
+        reservoir = start_reservoir(self.media, samples.piece, dr.width(ray), count)
+        visit = fill_reservoir(self.media, ray, chosen, self.visibility_cache, probe_depth)
+        end, reservoir = visit_media(self.media, ray, segment.medium, visit, reservoir, active)
+        return _Flight(end, reservoir, chosen)
+
+    def _light_up(
+        self,
+        segment: PathSegment,
+        flight: _Flight,
+        candidate: Candidate,
+        samples: EventSamples,
+        probe_depth: float,
+        active: mi.Bool,
+    ) -> Scattering:
+        """Choose a point in a candidate, and look from there to the emitters."""
+        media, ray, chosen, probes = self.media, segment.ray, flight.chosen, probe_depth > 0
+        event = sample_distance(
+            media,
+            ray,
+            candidate,
+            flight.reservoir.total,
+            chosen.equiangular,
+            probe_depth,
+            samples.inside,
+            active & segment.scatters,
+        )
+        mei = medium_event_interaction(media, ray, event)
+        tau = event.tau
+        if not media.is_single:
+            front = mi.Ray3f(ray.o, ray.d, event.t, ray.time, ray.wavelengths)
+            _, tau = integrate_optical_depth(media, front, segment.medium, event.on)
+        gain = dr.select(event.on, segment.beta * transmittance(tau) / event.pdf, 0)
+        vertex = MediumVertex(media, mei)
+        direct = self.direct.in_medium(vertex, chosen, samples, probes, event.on, estimates=not probes)
+        return Scattering(event, mei, gain, direct, sigma_s_at(media, ray, event, mei), samples.choice)

@@ -11,9 +11,10 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
+from mivol.transport.estimators.emitters import SceneEmitters
 from mivol.transport.estimators.visibility_cache import tau_towards
 from mivol.transport.media.channels import spectrum
-from mivol.transport.media.scene_media import World
+from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.traversal.interpolation import interpolate
 from mivol.transport.traversal.lattice import Lattice
 
@@ -59,17 +60,18 @@ class TransmittanceGrid:
         return spectrum(rows)
 
 
-def build_transmittance_grid(scene: mi.Scene, world: World, cells: int = 1) -> TransmittanceGrid:
+def build_transmittance_grid(media: SceneMedia, emitters: SceneEmitters, cells: int = 1) -> TransmittanceGrid:
     """Walk from every node of a lattice to every lamp.
 
     Args:
-        scene, world: surfaces, lamps and a single body with one grid.
+        media: surfaces and a single body with one grid.
+        emitters: of the scene, each with one position or direction.
         cells: of the grid, between two nodes.
 
     Bias: O(h^2) of tau in the distance h of nodes; a cell across the edge of an opaque shadow leaks light.
     Cost: one shadow ray a node and lamp.
     """
-    (body,) = world.bodies
+    (body,) = media.bodies
     lattice = next(p.lattice for p in body.view.parts if p.lattice is not None)
     nodes = tuple(max(2, -(-n // cells) + 1) for n in lattice.res)
     z, y, x = nodes
@@ -78,34 +80,34 @@ def build_transmittance_grid(scene: mi.Scene, world: World, cells: int = 1) -> T
     # Just inside: a shadow ray in the plane of a face is outside the box.
     u = [dr.clip(mi.Float(a) / (m - 1), INSET, 1 - INSET) for a, m in zip(at, (x, y, z), strict=True)]
     p = lattice.place(mi.Vector3f(*u))
-    lamps, k = len(world.emitters.sampled), world.channels
+    lamps, k = len(emitters.sampled), media.channels
     tau = dr.zeros(mi.Float, z * y * x * lamps * k)
-    for number, lamp in enumerate(world.emitters.sampled):
-        for c, row in enumerate(tau_towards(scene, world, body, p, lamp)):
+    for number, lamp in enumerate(emitters.sampled):
+        for c, row in enumerate(tau_towards(media, body, p, lamp)):
             dr.scatter(tau, row, (index * lamps + number) * k + c)
     dr.eval(tau)
     return TransmittanceGrid(tau, nodes, lattice, lamps, k)
 
 
 def measure_transmittance_bias(
-    scene: mi.Scene, world: World, grid: TransmittanceGrid, points: int = 1 << 14
+    media: SceneMedia, emitters: SceneEmitters, grid: TransmittanceGrid, points: int = 1 << 14
 ) -> tuple[float, float]:
     """Compare a light grid with exact shadow rays at points of the grid's box, counted by extinction.
 
     Returns:
         Mean of T_grid - T_exact, and its root mean square, over points and lamps.
     """
-    (body,) = world.bodies
+    (body,) = media.bodies
     k = mi.Float64(dr.arange(mi.UInt32, points)) + 0.5
     u = [k / points, k * 0.7548776662 - dr.floor(k * 0.7548776662), k * 0.5698402910 - dr.floor(k * 0.5698402910)]
     p = grid.lattice.place(mi.Vector3f(*(mi.Float(v) for v in u)))
     ray = mi.Ray3f(p, mi.Vector3f(0, 0, 1), dr.inf, mi.Float(0), mi.Color0f())
     weight = body.extinction_at(ray, mi.Float(0), 1, mi.Bool(True))[0]
     total, first, second = dr.sum(weight), mi.Float(0), mi.Float(0)
-    for number, lamp in enumerate(world.emitters.sampled):
-        exact = tau_towards(scene, world, body, p, lamp)
+    for number, lamp in enumerate(emitters.sampled):
+        exact = tau_towards(media, body, p, lamp)
         off = grid.transmittance(p, number, mi.Bool(True))[0] - dr.exp(-exact[0])
         first += dr.sum(weight * off)
         second += dr.sum(weight * off * off)
-    scale = dr.rcp(dr.maximum(total * len(world.emitters.sampled), 1e-30))
+    scale = dr.rcp(dr.maximum(total * len(emitters.sampled), 1e-30))
     return float((first * scale)[0]), float(dr.sqrt(second * scale)[0])

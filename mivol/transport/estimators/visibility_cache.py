@@ -17,9 +17,10 @@ from dataclasses import dataclass, replace
 import drjit as dr
 import mitsuba as mi
 
+from mivol.transport.estimators.emitters import SceneEmitters
 from mivol.transport.estimators.shadow_rays import DARK, shadow_ray
 from mivol.transport.media.body import Body
-from mivol.transport.media.scene_media import World
+from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.traversal.coarse_grid import CoarseGrid
 from mivol.transport.traversal.lattice import Lattice
 
@@ -58,12 +59,17 @@ class VisibilityCache:
 
 
 def build_visibility_cache(
-    scene: mi.Scene, world: World, rays: int, occupied: float | None, take: Callable[[Lattice, int, bool], CoarseGrid]
+    media: SceneMedia,
+    emitters: SceneEmitters,
+    rays: int,
+    occupied: float | None,
+    take: Callable[[Lattice, int, bool], CoarseGrid],
 ) -> VisibilityCache | None:
     """Look from the blocks of a grid to the lamps.
 
     Args:
-        scene, world: surfaces, lamps and media.
+        media: surfaces and media.
+        emitters: of the scene.
         rays: shadow rays of the image, which decide how fine a lattice pays.
         occupied: share of the grid's blocks that hold anything, where no light is wanted from the others; None: from all.
         take: :func:`coarsen_grid`, or what keeps its answers.
@@ -74,12 +80,11 @@ def build_visibility_cache(
 
     Cost: one shadow ray through the coarse grid a block and lamp.
     """
-    lights = world.emitters
-    grids = [p.lattice for b in world.bodies for p in b.view.parts if p.lattice is not None]
-    sharp = [k for k, e in enumerate(lights.sampled) if int(e.flags()) & int(mi.EmitterFlags.Delta)]
-    if not world.is_single or len(grids) != 1 or not sharp or len(lights.sampled) > LAMPS:
+    grids = [p.lattice for b in media.bodies for p in b.view.parts if p.lattice is not None]
+    sharp = [k for k, e in enumerate(emitters.sampled) if int(e.flags()) & int(mi.EmitterFlags.Delta)]
+    if not media.is_single or len(grids) != 1 or not sharp or len(emitters.sampled) > LAMPS:
         return None
-    (lattice,), (body,) = grids, world.bodies
+    (lattice,), (body,) = grids, media.bodies
     # Where a constant lies under the grid no block is empty.
     lists = occupied is not None and len(body.view.parts) == 1
     share = (occupied if lists else 1) * len(sharp)
@@ -88,14 +93,14 @@ def build_visibility_cache(
         return None
     shift = fits[0]
     blocks = tuple((n >> shift) + 1 for n in lattice.res)
-    n, k = blocks[0] * blocks[1] * blocks[2], len(lights.sampled)
+    n, k = blocks[0] * blocks[1] * blocks[2], len(emitters.sampled)
     coarse = take(lattice, shift, lists)
     index = coarse.held if lists else dr.arange(mi.UInt32, n)
     weights = dr.full(mi.Float, 1, n * k)
     if dr.width(index):
-        far = _with_grid(world, coarse.lattice)
+        far = _with_grid(media, coarse.lattice)
         for lamp in sharp:
-            seen = _look(scene, far, lattice, blocks, shift, index, lights.sampled[lamp])
+            seen = _look(far, lattice, blocks, shift, index, emitters.sampled[lamp])
             dr.scatter(weights, seen, index * k + lamp)
     dr.eval(weights)
     return VisibilityCache(weights, blocks, shift, k)
@@ -107,18 +112,16 @@ def _count(lattice: Lattice, shift: int) -> int:
     return z * y * x
 
 
-def _with_grid(world: World, lattice: Lattice) -> World:
+def _with_grid(media: SceneMedia, lattice: Lattice) -> SceneMedia:
     """The media with another grid in the place of theirs."""
-    (body,) = world.bodies
+    (body,) = media.bodies
     parts = [p if p.lattice is None else replace(p, lattice=lattice) for p in body.view.parts]
-    other, bodies = copy.copy(world), [Body(replace(body.view, parts=parts), body.box)]
+    other, bodies = copy.copy(media), [Body(replace(body.view, parts=parts), body.box)]
     other.boxed, other.traced = (bodies, []) if body.box is not None else ([], bodies)
     return other
 
 
-def _look(
-    scene: mi.Scene, world: World, lattice: Lattice, blocks: tuple, shift: int, index: mi.UInt32, lamp: mi.Emitter
-) -> mi.Float:
+def _look(media: SceneMedia, lattice: Lattice, blocks: tuple, shift: int, index: mi.UInt32, lamp: mi.Emitter) -> mi.Float:
     """Weights of blocks for one lamp."""
     _, y, x = blocks
     at = (index % x, (index // x) % y, index // (x * y))
@@ -129,15 +132,15 @@ def _look(
         dr.clip((mi.Float(a) * (1 << shift) + half) / n, 0.25 / n, 1 - 0.25 / n)
         for a, n in zip(at, lattice.res[::-1], strict=True)
     ]
-    tau = tau_towards(scene, world, world.bodies[0], lattice.place(mi.Vector3f(*u)), lamp)
+    tau = tau_towards(media, media.bodies[0], lattice.place(mi.Vector3f(*u)), lamp)
     return dr.exp(-sum(tau) / len(tau)) + FLOOR
 
 
-def tau_towards(scene: mi.Scene, world: World, body: Body, p: mi.Point3f, lamp: mi.Emitter) -> list[mi.Float]:
+def tau_towards(media: SceneMedia, body: Body, p: mi.Point3f, lamp: mi.Emitter) -> list[mi.Float]:
     """Optical depth from points to a lamp; what an opaque surface hides is dark."""
     it = dr.zeros(mi.Interaction3f, dr.width(p))
     it.p = p
     medium = dr.select(dr.full(mi.Bool, True, dr.width(p)), mi.MediumPtr(body.view.medium), None)
     direct, _ = lamp.sample_direction(it, mi.Point2f(0.5), mi.Bool(True))
-    _, clear, tau, _ = shadow_ray(scene, world, p, medium, direct, mi.Bool(True))
+    _, clear, tau, _ = shadow_ray(media, p, medium, direct, mi.Bool(True))
     return [dr.select(clear, dr.minimum(t, DARK), DARK) for t in tau]

@@ -18,9 +18,9 @@ import mitsuba as mi
 
 from mivol.numerics import one_minus_exp
 from mivol.transport.line_integrals.expected_depth import integrate_expected_depth, jvp_expected_depth, vjp_expected_depth
-from mivol.transport.media.body import Body
-from mivol.transport.media.ray_intervals import RaySegment, SegmentEnd, integrate_optical_depth, revisit_media
-from mivol.transport.media.scene_media import World
+from mivol.transport.media.optical_depth import integrate_optical_depth, jvp_rows, vjp_rows
+from mivol.transport.media.ray_intervals import RaySegment, SegmentEnd
+from mivol.transport.media.scene_media import SceneMedia
 
 __all__ = ["AOVS", "integrate_aovs", "jvp_aovs", "vjp_aovs"]
 
@@ -40,14 +40,11 @@ class _FirstSegment:
     alpha: list[mi.Float]
 
 
-def integrate_aovs(
-    scene: mi.Scene, world: World, ray: mi.Ray3f, names: tuple[str, ...], active: mi.Bool = True
-) -> list[mi.Float]:
+def integrate_aovs(media: SceneMedia, ray: mi.Ray3f, names: tuple[str, ...], active: mi.Bool = True) -> list[mi.Float]:
     """Integrate AOVs along camera rays.
 
     Args:
-        scene: Mitsuba's scene.
-        world: its media.
+        media: of the scene.
         ray: world space, unit direction.
         names: of :data:`AOVS`.
         active: lanes to integrate.
@@ -62,88 +59,71 @@ def integrate_aovs(
     """
     if not names:
         return []
-    first = _find_first_segment(scene, world, ray, active)
+    first = _find_first_segment(media, ray, active)
     rows = {"tau": first.tau, "alpha": first.alpha}
-    values = {"depth": _depth(scene, world, first, active)[0]} if "depth" in names else {}
-    return [values[n] if n in values else _weigh(_shares(n, world.channels), rows[_row(n)]) for n in names]
+    values = {"depth": _depth(media, first, active)[0]} if "depth" in names else {}
+    return [values[n] if n in values else _weigh(_shares(n, media.channels), rows[_row(n)]) for n in names]
 
 
-def jvp_aovs(scene: mi.Scene, world: World, ray: mi.Ray3f, names: tuple[str, ...], active: mi.Bool = True) -> list[mi.Float]:
-    """Tangents of AOVs along that which :meth:`World.start_tangent` took from the parameters.
+def jvp_aovs(media: SceneMedia, ray: mi.Ray3f, names: tuple[str, ...], active: mi.Bool = True) -> list[mi.Float]:
+    """Tangents of AOVs along that which :meth:`SceneMedia.start_tangent` took from the parameters.
 
     Args:
-        scene, world, ray, names, active: as :func:`integrate_aovs`.
+        media, ray, names, active: as :func:`integrate_aovs`.
     """
     if not names:
         return []
-    first = _find_first_segment(scene, world, ray, active)
+    first = _find_first_segment(media, ray, active)
     rows, values = {}, {}
     if set(names) != {"depth"}:
-        rows["tau"] = _jvp_tau(scene, world, first.ray_segment, active)
+        rows["tau"] = jvp_rows(media, first.ray_segment, active)
         rows["alpha"] = [T * d for T, d in zip(first.T, rows["tau"], strict=True)]
     if "depth" in names:
-        depth, opacity = _depth(scene, world, first, active)
-        dN = jvp_expected_depth(scene, world, first.ray_segment, first.end, depth, active)
+        depth, opacity = _depth(media, first, active)
+        dN = jvp_expected_depth(media, first.ray_segment, first.end, depth, active)
         values["depth"] = dN * _inverse(opacity)
-    return [values[n] if n in values else _weigh(_shares(n, world.channels), rows[_row(n)]) for n in names]
+    return [values[n] if n in values else _weigh(_shares(n, media.channels), rows[_row(n)]) for n in names]
 
 
-def vjp_aovs(
-    scene: mi.Scene, world: World, ray: mi.Ray3f, names: tuple[str, ...], daovs: list[mi.Float], active: mi.Bool = True
-) -> None:
-    """Add the derivatives of AOVs, weighted by ``daovs``, to the gradients of the world.
+def vjp_aovs(media: SceneMedia, ray: mi.Ray3f, names: tuple[str, ...], daovs: list[mi.Float], active: mi.Bool = True) -> None:
+    """Add the derivatives of AOVs, weighted by ``daovs``, to the gradients of the media.
 
     Args:
-        scene, world, ray, names, active: as :func:`integrate_aovs`.
+        media, ray, names, active: as :func:`integrate_aovs`.
         daovs: d loss / d AOV of each ray, in the order of ``names``.
     """
     if not names:
         return
-    first = _find_first_segment(scene, world, ray, active)
-    weight = [mi.Float(0) for _ in range(world.channels)]
+    first = _find_first_segment(media, ray, active)
+    weight = [mi.Float(0) for _ in range(media.channels)]
     for name, d in zip(names, daovs, strict=True):
         if name != "depth":
-            slopes = first.T if _row(name) == "alpha" else [1] * world.channels
-            weight = [w + d * s * T for w, s, T in zip(weight, _shares(name, world.channels), slopes, strict=True)]
+            slopes = first.T if _row(name) == "alpha" else [1] * media.channels
+            weight = [w + d * s * T for w, s, T in zip(weight, _shares(name, media.channels), slopes, strict=True)]
     if set(names) != {"depth"}:
-        _vjp_tau(scene, world, first.ray_segment, weight, active)
+        vjp_rows(media, first.ray_segment, weight, active)
     for name, d in zip(names, daovs, strict=True):
         if name == "depth":
-            depth, opacity = _depth(scene, world, first, active)
-            vjp_expected_depth(scene, world, first.ray_segment, first.end, depth, d * _inverse(opacity), active)
+            depth, opacity = _depth(media, first, active)
+            vjp_expected_depth(media, first.ray_segment, first.end, depth, d * _inverse(opacity), active)
 
 
-def _find_first_segment(scene: mi.Scene, world: World, ray: mi.Ray3f, active: mi.Bool) -> _FirstSegment:
+def _find_first_segment(media: SceneMedia, ray: mi.Ray3f, active: mi.Bool) -> _FirstSegment:
     """Carry rays to the first opaque surface or out of the scene."""
     ray = mi.Ray3f(ray.o, ray.d, dr.inf, ray.time, ray.wavelengths)
-    medium = world.medium_at(scene, ray)
-    end, tau = integrate_optical_depth(scene, world, ray, medium, mi.Bool(active))
+    medium = media.medium_at(ray)
+    end, tau = integrate_optical_depth(media, ray, medium, mi.Bool(active))
     stopped = end.si.is_valid()
     T = [dr.select(stopped, 0, dr.exp(-t)) for t in tau]
     alpha = [dr.select(stopped, 1, one_minus_exp(t)) for t in tau]
     return _FirstSegment(RaySegment(ray, medium, end.t), end, tau, T, alpha)
 
 
-def _depth(scene: mi.Scene, world: World, first: _FirstSegment, active: mi.Bool) -> tuple[mi.Float, mi.Float]:
+def _depth(media: SceneMedia, first: _FirstSegment, active: mi.Bool) -> tuple[mi.Float, mi.Float]:
     """The mean distance, and the opacity that it is a mean over."""
-    N, opacity = integrate_expected_depth(scene, world, first.ray_segment, first.end, mi.Bool(active))
+    N, opacity = integrate_expected_depth(media, first.ray_segment, first.end, mi.Bool(active))
     some = opacity > 0
     return dr.select(some, N / dr.select(some, opacity, 1), 0), opacity
-
-
-def _jvp_tau(scene: mi.Scene, world: World, ray_segment: RaySegment, active: mi.Bool) -> list[mi.Float]:
-    def visit(tau: list[mi.Float], body: Body, t0: mi.Float, t1: mi.Float, on: mi.Bool) -> list[mi.Float]:
-        return [t + d for t, d in zip(tau, body.tangent(ray_segment.ray, t0, t1, len(tau), on), strict=True)]
-
-    return revisit_media(scene, world, ray_segment, visit, [mi.Float(0) for _ in range(world.channels)], mi.Bool(active))
-
-
-def _vjp_tau(scene: mi.Scene, world: World, ray_segment: RaySegment, weight: list[mi.Float], active: mi.Bool) -> None:
-    def visit(state: mi.Float, body: Body, t0: mi.Float, t1: mi.Float, on: mi.Bool) -> mi.Float:
-        body.backproject(ray_segment.ray, t0, t1, weight, on)
-        return state
-
-    revisit_media(scene, world, ray_segment, visit, mi.Float(0), mi.Bool(active))
 
 
 def _row(name: str) -> str:

@@ -24,7 +24,7 @@ from mivol.errors import MivolError
 from mivol.numerics import one_minus_exp
 from mivol.transport.media.body import Body
 from mivol.transport.media.ray_intervals import RaySegment, revisit_media, visit_boxed_media
-from mivol.transport.media.scene_media import World
+from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.media.summed_extinction import SummedExtinction, share_cells
 from mivol.transport.traversal.grid_walk import Cell, walk
 from mivol.transport.traversal.interpolation import node_weights
@@ -134,7 +134,7 @@ class _BodyLayout:
 class _BodySegment:
     """The stretch [t0, t1] of a ray in a body, with its coefficients and, for a tangent, their changes."""
 
-    world: World
+    media: SceneMedia
     integrand: Integrand
     body: Body
     ray: mi.Ray3f
@@ -180,7 +180,7 @@ class _BodySegment:
 
     def rows(self, channels: list[mi.Float]) -> list[mi.Float]:
         """Numbers for each channel of a body, for each row of the rule."""
-        channels = self.world.rows(channels)
+        channels = self.media.rows(channels)
         return [channels[r % len(channels)] for r in range(self.integrand.rows)]
 
     def cell(self, cell: Cell, on: mi.Bool) -> tuple[RayPiece, list[list[mi.Float]], list[CellIntegral]]:
@@ -196,11 +196,18 @@ class _BodySegment:
 
 
 def _open(
-    world: World, integrand: Integrand, body: Body, ray: mi.Ray3f, t0: mi.Float, t1: mi.Float, active: mi.Bool, tangent: bool
+    media: SceneMedia,
+    integrand: Integrand,
+    body: Body,
+    ray: mi.Ray3f,
+    t0: mi.Float,
+    t1: mi.Float,
+    active: mi.Bool,
+    tangent: bool,
 ) -> _BodySegment:
     field = body.extinction(ray)
     change = SummedExtinction(body.view.parts, body.tangents, mi.Float(1), linear=True) if tangent else None
-    return _BodySegment(world, integrand, body, ray, _lay_out(body, ray, t0, t1), field, change, active)
+    return _BodySegment(media, integrand, body, ray, _lay_out(body, ray, t0, t1), field, change, active)
 
 
 def _lay_out(body: Body, ray: mi.Ray3f, t0: mi.Float, t1: mi.Float) -> _BodyLayout:
@@ -295,7 +302,7 @@ def _vjp_body(body_segment: _BodySegment, weight: list[mi.Float], ahead: list[mi
         turns = body_segment.field.slopes(cell.corners, points)
         if turns is not None:
             slopes = [[g * turn for g, turn in zip(row, turns, strict=True)] for row in slopes]
-        by_point = [body_segment.world.sums([row[p] for row in slopes]) for p in range(len(corners))]
+        by_point = [body_segment.media.sums([row[p] for row in slopes]) for p in range(len(corners))]
         for part in grids:
             body.add_to_grid(part, cell.lower, list(zip(by_point, corners, strict=True)), on)
         return sweep
@@ -308,7 +315,7 @@ def _vjp_body(body_segment: _BodySegment, weight: list[mi.Float], ahead: list[mi
         )
     if body_segment.has_constants:
         sweep = add_constant(sweep, lay.t0, lay.enter)
-        body.add_to_constants(body_segment.world.sums(sweep.constant), body_segment.active)
+        body.add_to_constants(body_segment.media.sums(sweep.constant), body_segment.active)
     # After the walk: what Dr.Jit pulls back in a loop is lost where the same array was pulled to before it.
     for site, sigma, weights in outside:
         integrand.vjp(site, sigma, weights)
@@ -393,9 +400,8 @@ class Composite:
 
 
 def composite_ray(
-    world: World,
+    media: SceneMedia,
     integrand: Integrand,
-    scene: mi.Scene,
     ray_segment: RaySegment,
     end: list[mi.Float],
     active: mi.Bool,
@@ -405,12 +411,12 @@ def composite_ray(
     """Measure each body by itself and put them in the order of the ray.
 
     Args:
-        world, scene: the media, and Mitsuba's scene.
+        media: of the scene.
         integrand: what is summed.
         ray_segment: the ray, the medium around its origin, and how far it goes; world space, unit direction.
         end: what the end of the ray adds, each row, by itself.
         active: lanes to follow.
-        tangent: follow tangents too, along those that the world took from the parameters.
+        tangent: follow tangents too, along those that the media took from the parameters.
         skip: pass over empty blocks where the order of sums does not matter.
 
     Raises:
@@ -418,19 +424,19 @@ def composite_ray(
 
     Cost: a walk of each body.
     """
-    for body in world.bodies:
+    for body in media.bodies:
         _check(body, integrand)
     rows = integrand.rows * (2 if tangent else 1)
 
     def measure(body: Body, t0: mi.Float, t1: mi.Float, on: mi.Bool) -> _BodyIntegral:
-        return _measure(_open(world, integrand, body, ray_segment.ray, t0, t1, on, tangent), skip)
+        return _measure(_open(media, integrand, body, ray_segment.ray, t0, t1, on, tangent), skip)
 
     def visit_box(found: list[_Boxed], body: Body, t0: mi.Float64, t1: mi.Float64, on: mi.Bool) -> list[_Boxed]:
-        middle = _middle(body, ray_segment.ray, t0, t1) if len(world.bodies) > 1 else mi.Float64(0)
+        middle = _middle(body, ray_segment.ray, t0, t1) if len(media.bodies) > 1 else mi.Float64(0)
         own, none = measure(body, t0, t1, on), _zeros(mi.Float, rows)
         return [*found, _Boxed(body, t0, t1, on, middle, own, _zeros(mi.Float64, rows), [], none)]
 
-    boxes = visit_boxed_media(world, ray_segment.ray, ray_segment.length, visit_box, [], active)
+    boxes = visit_boxed_media(media, ray_segment.ray, ray_segment.length, visit_box, [], active)
 
     def visit_traced(t: _Traced, body: Body, t0: mi.Float, t1: mi.Float, on: mi.Bool) -> _Traced:
         if body.box is not None:
@@ -454,8 +460,8 @@ def composite_ray(
         [_zeros(mi.Float, rows) for _ in boxes],
         mi.Float(0),
     )
-    if world.traced:
-        traced = revisit_media(scene, world, ray_segment, visit_traced, traced, active)
+    if media.traced:
+        traced = revisit_media(media, ray_segment, visit_traced, traced, active)
     return _order(boxes, traced, end, integrand.rows, rows)
 
 
@@ -529,23 +535,22 @@ def _largest(values: list[mi.Float]) -> mi.Float:
 
 
 def vjp_composite(
-    world: World,
+    media: SceneMedia,
     integrand: Integrand,
-    scene: mi.Scene,
     ray_segment: RaySegment,
     composite: Composite,
     weight: list[mi.Float],
     rest: list[mi.Float],
     active: mi.Bool,
 ) -> None:
-    """Add ``weight`` times the derivative of N to the gradients of the world: the transpose of the tangent.
+    """Add ``weight`` times the derivative of N to the gradients of the media: the transpose of the tangent.
 
     What lies behind a cell is summed, never left over by a subtraction, so a voxel behind an optical depth of 50 gets
     its e^-50. Only between two stretches that were both found by tracing it is what is left over; that is clamped to
     what a known transmittance can let through.
 
     Args:
-        world, integrand, scene, ray_segment, active: as :func:`composite_ray`, which made ``composite``.
+        media, integrand, ray_segment, active: as :func:`composite_ray`, which made ``composite``.
         weight: d loss / d N of each row.
         rest: what else dims with the whole ray: d loss / d log T of each row, from behind its end.
 
@@ -554,12 +559,12 @@ def vjp_composite(
     for box in composite.boxes:
         ahead = _add(box.front, box.own.tau)
         behind = [dr.fma(w, b, r) for w, b, r in zip(weight, box.behind, rest, strict=True)]
-        _vjp_body(_open(world, integrand, box.body, ray_segment.ray, box.t0, box.t1, box.on, False), weight, ahead, behind)
+        _vjp_body(_open(media, integrand, box.body, ray_segment.ray, box.t0, box.t1, box.on, False), weight, ahead, behind)
 
     def visit(passed: _BodyIntegral, body: Body, t0: mi.Float, t1: mi.Float, on: mi.Bool) -> _BodyIntegral:
         if body.box is not None:
             return passed
-        body_segment, middle = _open(world, integrand, body, ray_segment.ray, t0, t1, on, False), _halfway(t0, t1)
+        body_segment, middle = _open(media, integrand, body, ray_segment.ray, t0, t1, on, False), _halfway(t0, t1)
         own = _measure(body_segment, False)
         front = _add(passed.tau, _tau_in_front(composite.boxes, middle, integrand.rows))
         ahead, N = _add(front, own.tau), _add(passed.N, _see(front, own.N, integrand.rows))
@@ -571,10 +576,9 @@ def vjp_composite(
         _vjp_body(body_segment, weight, ahead, behind)
         return _BodyIntegral(_add(passed.tau, own.tau), N)
 
-    if world.traced:
+    if media.traced:
         revisit_media(
-            scene,
-            world,
+            media,
             ray_segment,
             visit,
             _BodyIntegral(_zeros(mi.Float64, integrand.rows), _zeros(mi.Float, integrand.rows)),

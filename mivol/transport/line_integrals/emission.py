@@ -22,11 +22,11 @@ from typing import ClassVar
 import drjit as dr
 import mitsuba as mi
 
-from mivol.transport.estimators.single_scattering import medium_interaction
 from mivol.transport.line_integrals.composite import CellIntegral, Composite, RayPiece, composite_ray, vjp_composite
 from mivol.transport.media.channels import by_channel, spectrum, tangent_of
+from mivol.transport.media.coefficients import medium_interaction
 from mivol.transport.media.ray_intervals import RaySegment
-from mivol.transport.media.scene_media import World
+from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.traversal.cell_quadrature import share_opacity, weigh_emission_density
 from mivol.transport.traversal.interpolation import GAUSS
 
@@ -37,16 +37,14 @@ BLACK = 1000.0
 """Stands for an infinite optical depth: exp(-1000) is 0."""
 
 
-def integrate_emission(
-    scene: mi.Scene, world: World, ray_segment: RaySegment, active: mi.Bool, tangent: bool = False
-) -> Composite:
+def integrate_emission(media: SceneMedia, ray_segment: RaySegment, active: mi.Bool, tangent: bool = False) -> Composite:
     """Sum the light that media emit along a stretch.
 
     Args:
-        scene, world: Mitsuba's scene, and its media.
+        media: of the scene.
         ray_segment: the stretch; world space, unit direction.
         active: lanes to follow.
-        tangent: with derivatives along those that the world took from the parameters.
+        tangent: with derivatives along those that the media took from the parameters.
 
     Returns:
         The chain: its ``N`` is the light of each colour [radiance], its ``tau`` the optical depth, then their tangents.
@@ -57,31 +55,28 @@ def integrate_emission(
     Bias: of the order dt^4 of a cell; none for a constant source function. Cost: a walk of each medium and two look-ups of
         its emission a cell.
     """
-    integrand = _Emission.of(world)
-    return composite_ray(
-        world, integrand, scene, ray_segment, [mi.Float(0)] * integrand.rows, active, tangent, skip=not tangent
-    )
+    integrand = _Emission.of(media)
+    return composite_ray(media, integrand, ray_segment, [mi.Float(0)] * integrand.rows, active, tangent, skip=not tangent)
 
 
 def vjp_emission(
-    scene: mi.Scene,
-    world: World,
+    media: SceneMedia,
     ray_segment: RaySegment,
     composite: Composite,
     weight: mi.Spectrum,
     behind: mi.Spectrum,
     active: mi.Bool,
 ) -> None:
-    """Add the derivatives of the light along a stretch to the gradients of the world and of the emission.
+    """Add the derivatives of the light along a stretch to the gradients of the media and of the emission.
 
     Args:
-        scene, world, ray_segment, active: as :func:`integrate_emission`, which returned ``composite``.
+        media, ray_segment, active: as :func:`integrate_emission`, which returned ``composite``.
         weight: d loss / d light of each colour at the beginning of the stretch.
         behind: d loss times the light from behind the stretch, as the camera sees it: all of the stretch dims it.
     """
-    integrand = _Emission.of(world)
+    integrand = _Emission.of(media)
     rows, rest = ([v[c] for c in range(integrand.rows)] for v in (weight, behind))
-    vjp_composite(world, integrand, scene, ray_segment, composite, rows, rest, active)
+    vjp_composite(media, integrand, ray_segment, composite, rows, rest, active)
 
 
 @dataclass
@@ -95,8 +90,8 @@ class _Emission:
     way_out: ClassVar[str] = "take its emission out"
 
     @classmethod
-    def of(cls, world: World) -> _Emission:
-        return cls(dr.size_v(mi.Spectrum), world.channels)
+    def of(cls, media: SceneMedia) -> _Emission:
+        return cls(dr.size_v(mi.Spectrum), media.channels)
 
     def cell(self, site: RayPiece, sigma: list[list[mi.Float]]) -> list[CellIntegral]:
         source, emission_density = self._detached(site)

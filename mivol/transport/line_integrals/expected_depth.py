@@ -31,7 +31,7 @@ import mitsuba as mi
 from mivol.numerics import exp_moments, one_minus_exp
 from mivol.transport.line_integrals.composite import CellIntegral, RayPiece, composite_ray, vjp_composite
 from mivol.transport.media.ray_intervals import RaySegment, SegmentEnd
-from mivol.transport.media.scene_media import World
+from mivol.transport.media.scene_media import SceneMedia
 
 __all__ = ["integrate_distance_in_cell", "integrate_expected_depth", "jvp_expected_depth", "vjp_expected_depth"]
 
@@ -122,13 +122,12 @@ class _ExpectedDepth:
 
 
 def integrate_expected_depth(
-    scene: mi.Scene, world: World, ray_segment: RaySegment, end: SegmentEnd, active: mi.Bool
+    media: SceneMedia, ray_segment: RaySegment, end: SegmentEnd, active: mi.Bool
 ) -> tuple[mi.Float, mi.Float]:
     """Integrate the distance at which a ray is stopped, mean over channels.
 
     Args:
-        scene: Mitsuba's scene.
-        world: its media.
+        media: of the scene.
         ray_segment: the ray, the medium around its origin, and how far it goes; world space, unit direction.
         end: where it ends; an opaque surface there stops what is left.
         active: lanes to integrate.
@@ -142,43 +141,41 @@ def integrate_expected_depth(
 
     Bias: that of :func:`integrate_distance_in_cell`. Cost: a walk of each body.
     """
-    integrand = _ExpectedDepth(world.channels, mi.Float(0))
-    composite = composite_ray(world, integrand, scene, ray_segment, integrand.end(end), active, skip=True)
+    integrand = _ExpectedDepth(media.channels, mi.Float(0))
+    composite = composite_ray(media, integrand, ray_segment, integrand.end(end), active, skip=True)
     alpha = [dr.select(end.si.is_valid(), 1, one_minus_exp(mi.Float(t))) for t in composite.tau]
     return _mean(composite.N), _mean(alpha)
 
 
 def jvp_expected_depth(
-    scene: mi.Scene, world: World, ray_segment: RaySegment, end: SegmentEnd, origin: mi.Float, active: mi.Bool
+    media: SceneMedia, ray_segment: RaySegment, end: SegmentEnd, origin: mi.Float, active: mi.Bool
 ) -> mi.Float:
-    """Tangent of N, distances counted from ``origin``, along that which the world took from the parameters.
+    """Tangent of N, distances counted from ``origin``, along that which the media took from the parameters.
 
     Args:
-        scene, world, ray_segment, end, active: as :func:`integrate_expected_depth`.
+        media, ray_segment, end, active: as :func:`integrate_expected_depth`.
         origin: the mean distance, so that this over the opacity is the tangent of the mean.
     """
-    integrand = _ExpectedDepth(world.channels, origin)
-    return _mean(
-        composite_ray(world, integrand, scene, ray_segment, integrand.end(end), active, tangent=True).N[world.channels :]
-    )
+    integrand = _ExpectedDepth(media.channels, origin)
+    return _mean(composite_ray(media, integrand, ray_segment, integrand.end(end), active, tangent=True).N[media.channels :])
 
 
 def vjp_expected_depth(
-    scene: mi.Scene, world: World, ray_segment: RaySegment, end: SegmentEnd, origin: mi.Float, weight: mi.Float, active: mi.Bool
+    media: SceneMedia, ray_segment: RaySegment, end: SegmentEnd, origin: mi.Float, weight: mi.Float, active: mi.Bool
 ) -> None:
-    """Add ``weight`` (d loss / d N) times the derivative of N to the gradients of the world: the transpose of the tangent.
+    """Add ``weight`` (d loss / d N) times the derivative of N to the gradients of the media: the transpose of the tangent.
 
     Args:
-        scene, world, ray_segment, end, active: as :func:`integrate_expected_depth`.
+        media, ray_segment, end, active: as :func:`integrate_expected_depth`.
         origin: the mean distance, as in :func:`jvp_expected_depth`.
         weight: of each lane.
 
     Cost: two walks of each body, and one packed write of 8 a cell and channel.
     """
-    k = world.channels
+    k = media.channels
     integrand = _ExpectedDepth(k, origin)
-    composite = composite_ray(world, integrand, scene, ray_segment, integrand.end(end), active)
-    vjp_composite(world, integrand, scene, ray_segment, composite, [weight / k] * k, [mi.Float(0)] * k, active)
+    composite = composite_ray(media, integrand, ray_segment, integrand.end(end), active)
+    vjp_composite(media, integrand, ray_segment, composite, [weight / k] * k, [mi.Float(0)] * k, active)
 
 
 def _mean(rows: list[mi.Float]) -> mi.Float:

@@ -7,7 +7,6 @@ from dataclasses import replace
 import drjit as dr
 import mitsuba as mi
 
-from mivol.transport.estimators.ratio_tracking import residual_ratio_tracking
 from mivol.transport.media.box import Box
 from mivol.transport.media.channels import as_rows, for_part
 from mivol.transport.media.grid_integral import (
@@ -99,22 +98,6 @@ class Body:
         scale = dr.detach(self.view.scale) * self.area(ray.d)
         bound = None if enough is None else enough / scale
         return [scale * tau for tau in self._sum(ray, t0, t1, channels, active, pairs, True, bound)]
-
-    def transmittance(
-        self, ray: mi.Ray3f, t0: mi.Float, t1: mi.Float, channels: int, active: mi.Bool, rng: mi.UInt32, enough: float
-    ) -> tuple[list[mi.Float], mi.UInt32]:
-        """Transmittance [1] of each channel over a stretch, and what is left of the dice.
-
-        Estimated in grids whose blocks are known; exact in all else, which is walked to the optical depth ``enough``.
-        """
-        tracked = [p for p in self.view.parts if p.lattice is not None and p.lattice.block_ranges is not None]
-        others = [p for p in self.view.parts if not any(p is q for q in tracked)]
-        T = [dr.exp(-t) for t in self.optical_depth(ray, t0, t1, channels, active, others, enough)]
-        scale = dr.detach(self.view.scale) * self.area(ray.d)
-        for part in tracked:
-            own, rng = residual_ratio_tracking(part.lattice, clip(part.lattice, ray.o, ray.d, t0, t1), scale, rng, active)
-            T = [a * b for a, b in zip(T, as_rows(own, channels), strict=True)]
-        return T, rng
 
     def tangent(self, ray: mi.Ray3f, t0: mi.Float, t1: mi.Float, channels: int, active: mi.Bool) -> list[mi.Float]:
         """Derivative of the optical depth along the tangent that :meth:`World.start_tangent` took from the parameters."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-__all__ = ["as_rows", "by_channel", "for_part", "spectrum", "tangent_of"]
+__all__ = ["as_rows", "by_channel", "colours", "for_part", "spectrum", "tangent_of"]
 
 
 LUMINANCE = (0.212671, 0.715160, 0.072169)
@@ -17,7 +17,7 @@ LUMINANCE = (0.212671, 0.715160, 0.072169)
 
 
 def spectrum(rows: list[mi.Float]) -> mi.Spectrum:
-    """One number for each channel of the world as a spectrum."""
+    """One number for each channel of the scene as a spectrum."""
     return mi.Spectrum(*rows) if len(rows) == 3 else mi.Spectrum(rows[0])
 
 
@@ -29,14 +29,19 @@ def tangent_of(value: mi.Spectrum) -> mi.Spectrum:
     return dr.forward_to(value, flags=dr.ADFlag.ClearEdges) if dr.grad_enabled(value) else dr.zeros(type(value))
 
 
+def colours(value: mi.Spectrum) -> list[mi.Float]:
+    """The numbers of a spectrum, one for each colour."""
+    return [value[c] for c in range(dr.size_v(value))]
+
+
 def by_channel(value: mi.Spectrum, channels: int) -> list[mi.Float]:
     """The derivative of each channel of the extinction from that of each colour: a grey one gets the sum."""
-    parts = [value[c] for c in range(dr.size_v(value))]
+    parts = colours(value)
     return parts if len(parts) == channels else [sum(parts[1:], parts[0])]
 
 
 def as_rows(values: list[mi.Float], channels: int) -> list[mi.Float]:
-    """The values of a grey or rgb part for each channel of the world."""
+    """The values of a grey or rgb part for each channel of the scene."""
     if len(values) > channels:
         return _grey(values)
     return [values[c % len(values)] for c in range(channels)]

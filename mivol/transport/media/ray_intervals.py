@@ -16,8 +16,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from mivol.transport.media.body import Body
-from mivol.transport.media.scene_media import World
+from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.traversal.lattice import slab
 from mivol.transport.traversal.ray_spawning import distance_along, spawn_ray
 
@@ -26,10 +25,8 @@ __all__ = [
     "MediumVisitor",
     "RaySegment",
     "SegmentEnd",
-    "integrate_optical_depth",
+    "is_transparent",
     "revisit_media",
-    "sum_optical_depth",
-    "transmittance",
     "visit_boxed_media",
     "visit_media",
 ]
@@ -64,8 +61,7 @@ MediumVisitor = Callable[..., Any]
 
 
 def visit_media(
-    scene: mi.Scene,
-    world: World,
+    media: SceneMedia,
     ray: mi.Ray3f,
     medium: mi.MediumPtr,
     visit: MediumVisitor,
@@ -81,18 +77,20 @@ def visit_media(
     Returns:
         Where the ray ends, and the last state.
     """
-    if world.traces:
-        end, state = _trace(scene, world, ray, medium, visit, state, active, passes_null and world.has_null_transmission)
+    if media.traces:
+        end, state = _trace(media, ray, medium, visit, state, active, passes_null and media.has_null_transmission)
     else:
         si = dr.zeros(mi.SurfaceInteraction3f, dr.width(ray))
         si.wi, si.wavelengths, si.time = -ray.d, ray.wavelengths, ray.time
         end = SegmentEnd(si, mi.Float(ray.maxt), medium, 1.0)
-    return end, visit_boxed_media(world, ray, end.t, visit, state, active)
+    return end, visit_boxed_media(media, ray, end.t, visit, state, active)
 
 
-def visit_boxed_media(world: World, ray: mi.Ray3f, t_end: mi.Float, visit: MediumVisitor, state: Any, active: mi.Bool) -> Any:
+def visit_boxed_media(
+    media: SceneMedia, ray: mi.Ray3f, t_end: mi.Float, visit: MediumVisitor, state: Any, active: mi.Bool
+) -> Any:
     """Visit the media in boxes between the ray's origin and ``t_end``."""
-    for body in world.boxed:
+    for body in media.boxed:
         t0, t1 = mi.Float64(0), mi.Float64(t_end)
         if body.cuts_grids:
             _, _, t0, t1 = slab(body.rows, (0.0,) * 3, (1.0,) * 3, ray.o, ray.d, t0, t1)
@@ -100,19 +98,16 @@ def visit_boxed_media(world: World, ray: mi.Ray3f, t_end: mi.Float, visit: Mediu
     return state
 
 
-def revisit_media(
-    scene: mi.Scene, world: World, ray_segment: RaySegment, visit: MediumVisitor, state: Any, active: mi.Bool
-) -> Any:
+def revisit_media(media: SceneMedia, ray_segment: RaySegment, visit: MediumVisitor, state: Any, active: mi.Bool) -> Any:
     """Visit the media of a stretch whose end is known; only boundaries that have to be traced are traced again."""
-    if not world.traced:
-        return visit_boxed_media(world, ray_segment.ray, ray_segment.length, visit, state, active)
-    return visit_media(scene, world, ray_segment.ray, ray_segment.medium, visit, state, active, ray_segment.passes_null)[1]
+    if not media.traced:
+        return visit_boxed_media(media, ray_segment.ray, ray_segment.length, visit, state, active)
+    return visit_media(media, ray_segment.ray, ray_segment.medium, visit, state, active, ray_segment.passes_null)[1]
 
 
 @dr.syntax
 def _trace(
-    scene: mi.Scene,
-    world: World,
+    media: SceneMedia,
     ray: mi.Ray3f,
     medium: mi.MediumPtr,
     visit: MediumVisitor,
@@ -131,14 +126,14 @@ def _trace(
     null_transmission = dr.full(mi.Spectrum, 1, dr.width(ray)) if passes_null else 1.0
 
     while dr.hint(going, label="to the next opaque surface"):
-        hit = scene.ray_intersect(onward, mi.RayFlags.All, False, going)
+        hit = media.scene.ray_intersect(onward, mi.RayFlags.All, False, going)
         found = going & hit.is_valid()
         t_hit = dr.select(found, dr.maximum(t, distance_along(ray, hit)), ray.maxt)
 
         # -- The medium on this side of the surface fills the stretch ---------------------------------------------------------
         transition = found & hit.is_medium_transition()
         medium = dr.select(transition, hit.target_medium(-ray.d), medium)
-        state = _visit_traced(world, medium, visit, state, t, t_hit, going)
+        state = _visit_traced(media, medium, visit, state, t, t_hit, going)
 
         # -- Go on through what is transparent ------------------------------------------------------------------------------
         clear = found & is_transparent(hit)
@@ -151,16 +146,16 @@ def _trace(
         medium = dr.select(clear & transition, hit.target_medium(ray.d), medium)
         si = dr.select(going, hit, si)
         t = dr.select(going, t_hit, t)
-        onward = spawn_ray(hit, ray.d, world.size)
+        onward = spawn_ray(hit, ray.d, media.size)
         onward.maxt = ray.maxt - t_hit
         going &= clear
     return SegmentEnd(si, t, medium, null_transmission), state
 
 
 def _visit_traced(
-    world: World, medium: mi.MediumPtr, visit: MediumVisitor, state: Any, t0: mi.Float, t1: mi.Float, active: mi.Bool
+    media: SceneMedia, medium: mi.MediumPtr, visit: MediumVisitor, state: Any, t0: mi.Float, t1: mi.Float, active: mi.Bool
 ) -> Any:
-    for body in world.traced:
+    for body in media.traced:
         state = visit(state, body, t0, t1, active & (medium == mi.MediumPtr(body.view.medium)))
     return state
 
@@ -173,25 +168,3 @@ def is_transparent(si: mi.SurfaceInteraction3f) -> mi.Bool:
 
 OWN_SURFACE = 1 - 1e-3
 """Share of the way to a lamp behind which a shadow ray meets the lamp's own surface (Mitsuba shortens its rays alike)."""
-
-
-def sum_optical_depth(ray: mi.Ray3f, enough: float | None = None) -> MediumVisitor:
-    """The visitor that sums the optical depth of each channel along ``ray``; in a grid it may stop at ``enough``."""
-
-    def visit(tau: list[mi.Float], body: Body, t0: mi.Float, t1: mi.Float, active: mi.Bool) -> list[mi.Float]:
-        return [t + d for t, d in zip(tau, body.optical_depth(ray, t0, t1, len(tau), active, None, enough), strict=True)]
-
-    return visit
-
-
-def integrate_optical_depth(
-    scene: mi.Scene, world: World, ray: mi.Ray3f, medium: mi.MediumPtr, active: mi.Bool
-) -> tuple[SegmentEnd, list[mi.Float]]:
-    """Optical depth [1] of each channel to the first opaque surface or ``ray.maxt``, and where that is."""
-    zero = [mi.Float(0) for _ in range(world.channels)]
-    return visit_media(scene, world, ray, medium, sum_optical_depth(ray), zero, active)
-
-
-def transmittance(tau: list[mi.Float]) -> mi.Spectrum:
-    """exp(-tau) of each channel."""
-    return mi.Spectrum(*(dr.exp(-t) for t in tau)) if len(tau) == 3 else mi.Spectrum(dr.exp(-tau[0]))

@@ -1,13 +1,9 @@
-"""The media of a scene in their boundaries: what a stretch of a ray passes through, forwards and backwards.
+"""The media of a scene, and the start and end of derivatives that are taken with respect to them.
 
-Conventions. A body is one medium behind one boundary. Where the boundary is a box it is cut by a slab test in float64;
-elsewhere its stretches are found by tracing. A stretch [t0, t1] is given in world lengths along the camera's own ray, never
-from the last boundary on, so that entry points keep the precision of the walk's set-up.
+Conventions. A body is one medium behind one boundary. Boundaries that are boxes are cut by slab tests; others are traced.
 """
 
 from __future__ import annotations
-
-from typing import TYPE_CHECKING
 
 import drjit as dr
 import mitsuba as mi
@@ -17,73 +13,41 @@ from mivol.transport.media.channels import as_rows
 from mivol.transport.media.grid_integral import Gradient
 from mivol.transport.traversal.ray_spawning import spawn_ray
 
-if TYPE_CHECKING:
-    from mivol.transport.estimators.emitters import SceneEmitters
-    from mivol.transport.estimators.grid_control import GridControl
-    from mivol.transport.estimators.transmittance_grid import TransmittanceGrid
-    from mivol.transport.estimators.visibility_cache import VisibilityCache
-
-__all__ = ["World"]
+__all__ = ["SceneMedia"]
 
 
-class World:
+class SceneMedia:
     """The media of a scene, and what of Mitsuba's scene has to be traced.
 
     Args:
+        scene: Mitsuba's scene: surfaces and boundaries.
         bodies: the media.
         has_surfaces: some shape is more than the boundary of a medium.
-        scatters: light may turn at a surface (``max_depth`` above 1 and surfaces to turn at).
-        has_null_transmission: some surface lets part of the light through undeviated, so that a path of depth 1 may pass it.
+        has_null_transmission: some surface lets part of the light through undeviated.
         start: the medium that the sensor names, or None.
         locates_camera: the camera may be inside a boundary that has to be traced, and the sensor names no medium.
-        emitters: what lights the media that scatter; None where none does.
-        is_deterministic: images of scattered light are made by quadrature; derivatives are still drawn.
-        events: points of a camera ray that scatter, in pictures.
         size: of the scene [length], by which rays start anew behind a surface.
     """
 
     def __init__(
         self,
+        scene: mi.Scene,
         bodies: list[Body],
         has_surfaces: bool,
-        scatters: bool = False,
         has_null_transmission: bool = False,
         start: mi.Medium | None = None,
         locates_camera: bool = False,
-        emitters: SceneEmitters | None = None,
-        is_deterministic: bool = False,
-        events: int = 1,
         size: float = 1.0,
     ) -> None:
+        self.scene = scene
         self.boxed = [b for b in bodies if b.box is not None]
-        # A traced stretch is recognised by its medium, which several boundaries may share.
+        # The tracer tells a segment by its medium, which several boundaries may share.
         self.traced = list({b.view.medium.ptr: b for b in bodies if b.box is None}.values())
-        self.has_surfaces = has_surfaces
+        self.has_surfaces, self.has_null_transmission = has_surfaces, has_null_transmission
         self.traces = has_surfaces or bool(self.traced)
         self.channels = 1 if mi.is_monochromatic else max([b.view.channels for b in bodies], default=1)
-        self.scatters, self.has_null_transmission, self.start, self.locates_camera = (
-            scatters,
-            has_null_transmission,
-            start,
-            locates_camera,
-        )
-        self.emitters = emitters
-        self.grid_control: GridControl | None = None
-        self.constant_control: mi.Spectrum | None = None
-        self.visibility_cache: VisibilityCache | None = None
-        self.transmittance_grid: TransmittanceGrid | None = None
-        self.is_deterministic, self.events = is_deterministic, events
+        self.start, self.locates_camera = start, locates_camera
         self.size = dr.opaque(mi.Float, size)
-        self.is_tracked = any(
-            p.lattice is not None and p.lattice.block_ranges is not None for b in bodies for p in b.view.parts
-        )
-
-    @property
-    def takes_grid_control(self) -> bool:
-        """Whether a control variate for derivatives can be used: one grid in a box that scatters by an albedo."""
-        parts = [p for b in self.bodies for p in b.view.parts]
-        alone = len(parts) == 1 and not self.traced and parts[0].lattice is not None
-        return self.emitters is not None and alone and self.bodies[0].view.albedo is not None and not self.has_microflakes
 
     @property
     def has_microflakes(self) -> bool:
@@ -102,12 +66,17 @@ class World:
         return len(self.bodies) == 1 and len(self.bodies[0].flight_parts) == len(self.bodies[0].view.parts)
 
     def rows(self, values: list[mi.Float]) -> list[mi.Float]:
-        """Numbers of a grey or rgb body, for each channel of the world."""
+        """Numbers of a grey or rgb body, for each channel of the scene."""
         return as_rows(values, self.channels)
 
     def sums(self, rows: list[mi.Float]) -> list[mi.Float]:
-        """The derivative of each channel of the world from that of each colour: a grey one gets the sum."""
+        """The derivative of each channel of the scene from that of each colour: a grey one gets the sum."""
         return rows if len(rows) == self.channels else [sum(rows[1:], rows[0])]
+
+    @property
+    def has_block_ranges(self) -> bool:
+        """Whether some grid's blocks are known, so that its transmittance may be estimated."""
+        return any(p.lattice is not None and p.lattice.block_ranges is not None for b in self.bodies for p in b.view.parts)
 
     @property
     def emits(self) -> bool:
@@ -115,17 +84,17 @@ class World:
         return any(b.view.emits for b in self.bodies)
 
     def vectors(self, values: list[mi.Vector3f]) -> list[mi.Vector3f]:
-        """Vectors of a grey or rgb body, for each channel of the world."""
+        """Vectors of a grey or rgb body, for each channel of the scene."""
         axes = [self.rows([v[a] for v in values]) for a in range(3)]
         return [mi.Vector3f(*v) for v in zip(*axes, strict=True)]
 
-    def medium_at(self, scene: mi.Scene, ray: mi.Ray3f) -> mi.MediumPtr:
+    def medium_at(self, ray: mi.Ray3f) -> mi.MediumPtr:
         """The medium around the origin of camera rays."""
         n = dr.width(ray)
         if self.start is not None:
             return dr.select(dr.full(mi.Bool, True, n), mi.MediumPtr(self.start), None)
         if self.locates_camera:
-            return _locate(scene, ray, self.size)
+            return _locate(self.scene, ray, self.size)
         return dr.zeros(mi.MediumPtr, n)
 
     def start_gradients(self) -> None:

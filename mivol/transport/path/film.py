@@ -21,7 +21,7 @@ from mivol.transport.traversal.strata import Strata
 __all__ = ["CameraRays", "adjoint_rays", "film_passes", "record"]
 
 
-PLAIN, SPREAD, TILED = "plain", "spread", "tiled"
+PLAIN, SPREAD, TILED = "none", "spread", "tiled"
 
 TILE = 4
 """Edge of a tile of pixels: 16 lanes of one packet."""

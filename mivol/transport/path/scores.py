@@ -1,473 +1,90 @@
 r"""What is done with a path: its radiance, its tangent, or the derivatives of what it carries.
 
-A path tells its score four things, in this order: a ``path_segment`` through media, the light it ``add``s, a ``shadow`` ray
-with what it carries, and a ``turn`` at a surface. Three scores answer:
+A path tells its score two things, in the order of the path: a term that it adds to the light it carries, and a factor that all
+light ahead is multiplied by (:mod:`mivol.transport.estimators.contribution`). Three scores answer:
 
 * ``Primal`` sums the light.
-* ``Replay`` replays a path whose radiance ``L`` is known. Extinction dims all that lies ahead, so a stretch has
-  dL/dtau = -L_ahead, and ``L`` counts down as the light is passed: in the end it is 0, to rounding.
-* ``Tangent`` carries the derivative of the optical depth along with the path.
+* ``Replay`` follows a path whose radiance ``L`` is known. ``L`` counts down as terms are passed, so that it is the radiance
+  ahead where a factor is told: d loss / d log f = dL L. In the end it is 0, to rounding.
+* ``Tangent`` carries the derivative of the logarithm of all factors along with the path.
 
-Conventions. ``dL`` is d loss / d L in ``Replay`` and dL in ``Tangent``. What is added is already multiplied by everything
-in front of it, so no score divides by a transmittance.
+Terms and factors hold their own derivatives, so no score knows an estimator.
 
 References: Vicini et al. 2021 (replay with a running difference); Nimier-David et al. 2020 (adjoint radiance).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 
-import drjit as dr
 import mitsuba as mi
 
-from mivol.numerics import phi1
-from mivol.transport.estimators.control_sweep import Probe, Tracks, sweep
-from mivol.transport.estimators.moving_emitters import shadow_of_moving
-from mivol.transport.estimators.path_segment import PathSegment
-from mivol.transport.estimators.scattering_quadrature import integrate_scattering
-from mivol.transport.estimators.shadow_rays import ShadowedLight
-from mivol.transport.estimators.single_scattering import (
-    Scattering,
-    at_event,
-    estimate_scattered_light,
-    eval_albedo,
-    sample_scattering,
-    sigma_t_at,
-)
-from mivol.transport.line_integrals.composite import Composite
-from mivol.transport.line_integrals.emission import integrate_emission, vjp_emission
-from mivol.transport.media.body import Body
-from mivol.transport.media.channels import by_channel, spectrum, tangent_of
-from mivol.transport.media.ray_intervals import (
-    RaySegment,
-    SegmentEnd,
-    integrate_optical_depth,
-    revisit_media,
-    transmittance,
-    visit_media,
-)
-from mivol.transport.media.scene_media import World
+from mivol.transport.estimators.contribution import Factor, Term
+from mivol.transport.estimators.segment import FORWARD, PICTURE, REVERSE
 
 __all__ = ["Primal", "Replay", "Tangent"]
 
 
 @dataclass
 class Primal:
-    """Sum the light that a path carries, with what media scatter into it or (``scatters`` false) without."""
+    """Sum the light that a path carries."""
 
     L: mi.Spectrum
-    scatters: bool = True
-    attached = False
+    purpose = PICTURE
 
-    def pass_segment(
-        self, scene: mi.Scene, world: World, path_segment: PathSegment, active: mi.Bool
-    ) -> tuple[SegmentEnd, list[mi.Float], Primal]:
-        """Go to the end of a stretch; add what its media scatter."""
-        if world.emits:
-            end, composite = _emit(scene, world, path_segment, active)
-            return end, _tau(world, composite), self.add(path_segment.beta * _colours_of(composite.N), active)
-        if world.emitters is None or not self.scatters:
-            return *integrate_optical_depth(scene, world, path_segment.ray, path_segment.medium, active), self
-        if world.is_deterministic:
-            end, tau, light = integrate_scattering(scene, world, path_segment, active)
-            return end, tau, self.add(light, active)
-        end, tau, light = estimate_scattered_light(scene, world, path_segment, active)
-        return end, tau, self.add(light, active)
+    def add(self, term: Term) -> Primal:
+        return Primal(self.L + term.value)
 
-    def add(self, value: mi.Spectrum, active: mi.Bool) -> Primal:
-        """Light found at the end of a stretch."""
-        return Primal(self.L + dr.select(active, value, 0), self.scatters)
-
-    def shadow(self, scene: mi.Scene, world: World, ray_segment: RaySegment, light: ShadowedLight, active: mi.Bool) -> Primal:
-        """Light that arrived along a shadow ray."""
-        return self.add(light.value, active)
-
-    def turn(self, bsdf: mi.BSDFPtr, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool) -> Primal:
-        """Nothing to do."""
+    def scale(self, factor: Factor) -> Primal:
         return self
 
 
 @dataclass
 class Replay:
-    """Follow a path again and add its derivatives to the gradients of media and surfaces.
+    """Follow a path again and add its derivatives to the gradients of media, surfaces and emitters.
 
-    ``L`` is the light that it carried from lamps and surfaces, which counts down as it is passed. A path of one stretch need
-    not be known beforehand (``L`` None): all its light is met at the end, and the stretch waits for it (``waiting``).
+    Attributes:
+        L: the light that it carried, which counts down as it is passed. A path of one segment need not be known beforehand
+            (None): all its light is met at its end, and the segment's factor waits for it.
+        dL: d loss / d L.
+        waiting: that factor.
     """
 
     L: mi.Spectrum | None
     dL: mi.Spectrum
-    waiting: Callable[[mi.Spectrum], None] | None = None
-    attached = True
+    waiting: Factor | None = None
+    purpose = REVERSE
 
-    def pass_segment(
-        self, scene: mi.Scene, world: World, path_segment: PathSegment, active: mi.Bool
-    ) -> tuple[SegmentEnd, list[mi.Float], Replay]:
-        """Everything ahead is dimmed by this stretch: d loss / d tau = -dL L; what its media scatter is probed apart."""
-        event, ahead = None, self.L
-        if world.emits:
-            end, composite = _emit(scene, world, path_segment, active)
-            tau, dim = (
-                _tau(world, composite),
-                partial(_vjp_emission, scene, world, path_segment, end, composite, self.dL, active),
-            )
-            if ahead is not None:
-                ahead = ahead - dr.select(active, path_segment.beta * _colours_of(composite.N), 0)
-        elif world.emitters is None:
-            end, tau = integrate_optical_depth(scene, world, path_segment.ray, path_segment.medium, active)
-            dim = partial(_vjp_segment, scene, world, path_segment, end, tau, event, self.dL, active)
-        else:
-            end, tau, event = sample_scattering(scene, world, path_segment, True, active)
-            _vjp_direct(scene, world, event, self.dL)
-            _vjp_albedo(world, path_segment.ray, event, self.dL)
-            dim = partial(_vjp_segment, scene, world, path_segment, end, tau, event, self.dL, active)
-        if ahead is None:
-            return end, tau, Replay(None, self.dL, dim)
-        dim(ahead)
-        return end, tau, Replay(ahead, self.dL)
-
-    def add(self, value: mi.Spectrum, active: mi.Bool) -> Replay:
-        """Pass the light by; what made it (an emitter's radiance) gets its own derivative."""
-        with dr.resume_grad():
-            if dr.grad_enabled(value):
-                dr.backward_from(dr.select(active, self.dL * value, 0))
-        seen = dr.select(active, dr.detach(value), 0)
+    def add(self, term: Term) -> Replay:
+        term.vjp(self.dL)
+        if self.L is not None:
+            return Replay(self.L - term.value, self.dL) if term.is_replayed else self
         if self.waiting is not None:
-            # The path may be following derivatives of its lamps here.
-            with dr.suspend_grad():
-                self.waiting(seen)
-            return Replay(None, self.dL)
-        return Replay(self.L - seen, self.dL)
+            self.waiting.vjp(self.dL * term.value)
+        return Replay(None, self.dL)
 
-    def shadow(self, scene: mi.Scene, world: World, ray_segment: RaySegment, light: ShadowedLight, active: mi.Bool) -> Replay:
-        """Light that a shadow ray carried is dimmed by the media along it."""
-        _backproject(scene, world, ray_segment, -self.dL * dr.detach(light.value), active)
-        return self.add(_moving(scene, world, ray_segment, light, active), active)
-
-    def turn(self, bsdf: mi.BSDFPtr, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool) -> Replay:
-        """All that lies ahead passes through the BSDF: its parameters get dL L f' / f."""
-        with dr.resume_grad():
-            f = bsdf.eval(mi.BSDFContext(), si, wo, active)
-            if dr.grad_enabled(f):
-                pdf_f = dr.detach(f)
-                ratio = dr.select(pdf_f != 0, f * dr.rcp(dr.select(pdf_f != 0, pdf_f, 1)), 0)
-                dr.backward_from(dr.select(active, self.dL * self.L * ratio, 0))
+    def scale(self, factor: Factor) -> Replay:
+        if self.L is None:
+            return Replay(None, self.dL, factor)
+        factor.vjp(self.dL * self.L)
         return self
 
 
 @dataclass
 class Tangent:
-    """Carry the derivative of the optical depth along a path, and sum that of its radiance."""
+    """Carry the tangent of a path along with it.
 
-    L: mi.Spectrum
+    Attributes:
+        dL: tangent of the light so far.
+        dlog: tangent of the logarithm of all factors so far.
+    """
+
     dL: mi.Spectrum
-    dtau: mi.Spectrum
-    attached = True
+    dlog: mi.Spectrum
+    purpose = FORWARD
 
-    def pass_segment(
-        self, scene: mi.Scene, world: World, path_segment: PathSegment, active: mi.Bool
-    ) -> tuple[SegmentEnd, list[mi.Float], Tangent]:
-        """The stretch dims what lies ahead by its tangent; what its media scatter changes with them."""
-        dL = self.dL
-        if world.emits:
-            return self._pass_emitting_segment(scene, world, path_segment, active)
-        if world.emitters is None:
-            end, tau = integrate_optical_depth(scene, world, path_segment.ray, path_segment.medium, active)
-        else:
-            end, tau, event = sample_scattering(scene, world, path_segment, True, active)
-            dL = dL - dr.select(event.event.on, self.dtau * event.sigma_s * event.weight, 0)
-            dL += _jvp_attached(scene, world, path_segment.ray, event)
-            if world.grid_control is not None:
-                one, of = mi.Spectrum(1), world.grid_control.channels
-                lit = dr.select(path_segment.scatters, path_segment.beta, 0)
-                shares = [[(c % of, b)] for c, b in enumerate(_colours(lit))]
-                dL += mi.Spectrum(*_sweep(world, path_segment, end, tau, event, shares, 0 * one, one, True, active))
-            else:
-                dL += _jvp_coefficients(scene, world, path_segment, tau, event)
-        along = _tangent(scene, world, RaySegment(path_segment.ray, path_segment.medium, end.t), active)
-        if world.emitters is not None:
-            dL += _constant_source_behind(world, path_segment, tau) * along
-        return end, tau, Tangent(self.L, dL, self.dtau + along)
+    def add(self, term: Term) -> Tangent:
+        return Tangent(self.dL + term.jvp() + self.dlog * term.value, self.dlog)
 
-    def _pass_emitting_segment(
-        self, scene: mi.Scene, world: World, path_segment: PathSegment, active: mi.Bool
-    ) -> tuple[SegmentEnd, list[mi.Float], Tangent]:
-        """One chain for the light, the optical depth, and the tangents of both."""
-        end, composite = _emit(scene, world, path_segment, active, tangent=True)
-        k, c = len(composite.N) // 2, world.channels
-        N, dN = _colours_of(composite.N[:k]), _colours_of(composite.N[k:])
-        dtau = spectrum([mi.Float(t) for t in composite.tau[k : k + c]])
-        L = self.L + dr.select(active, path_segment.beta * N, 0)
-        dL = self.dL + dr.select(active, path_segment.beta * (dN - self.dtau * N), 0)
-        return end, _tau(world, composite), Tangent(L, dL, self.dtau + dr.select(active, dtau, 0))
-
-    def add(self, value: mi.Spectrum, active: mi.Bool) -> Tangent:
-        """Light found at the end of a stretch, and how it changes."""
-        with dr.resume_grad():
-            own = tangent_of(value)
-        seen = dr.detach(value)
-        dL = self.dL + dr.select(active, own - self.dtau * seen, 0)
-        return Tangent(self.L + dr.select(active, seen, 0), dL, self.dtau)
-
-    def shadow(self, scene: mi.Scene, world: World, ray_segment: RaySegment, light: ShadowedLight, active: mi.Bool) -> Tangent:
-        """As :meth:`add`, with the tangent of the shadow ray besides."""
-        along = _tangent(scene, world, ray_segment, active)
-        passed = self.add(_moving(scene, world, ray_segment, light, active), active)
-        return Tangent(passed.L, passed.dL - dr.select(active, along * dr.detach(light.value), 0), self.dtau)
-
-    def turn(self, bsdf: mi.BSDFPtr, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool) -> Tangent:
-        """A BSDF that changes scales all that lies ahead: a logarithmic tangent, kept with the media's."""
-        with dr.resume_grad():
-            f = bsdf.eval(mi.BSDFContext(), si, wo, active)
-            if not dr.grad_enabled(f):
-                return self
-            df = tangent_of(f)
-        f = dr.detach(f)
-        change = dr.select(active & (f != 0), df * dr.rcp(dr.select(f != 0, f, 1)), 0)
-        return Tangent(self.L, self.dL, self.dtau - change)
-
-
-def _moving(scene: mi.Scene, world: World, ray_segment: RaySegment, light: ShadowedLight, active: mi.Bool) -> mi.Spectrum:
-    """Light of a shadow ray, which changes with its end."""
-    with dr.resume_grad():
-        return light.value * shadow_of_moving(scene, world, ray_segment, light.tau, light.end, active)
-
-
-def _emit(
-    scene: mi.Scene, world: World, path_segment: PathSegment, active: mi.Bool, tangent: bool = False
-) -> tuple[SegmentEnd, Composite]:
-    """Where a stretch ends, and what its media emit."""
-    end, _ = visit_media(scene, world, path_segment.ray, path_segment.medium, lambda state, *_: state, mi.Float(0), active)
-    return end, integrate_emission(scene, world, RaySegment(path_segment.ray, path_segment.medium, end.t), active, tangent)
-
-
-def _tau(world: World, composite: Composite) -> list[mi.Float]:
-    """Optical depth of a chain, each channel."""
-    return [mi.Float(t) for t in composite.tau[: world.channels]]
-
-
-def _colours_of(rows: list[mi.Float]) -> mi.Spectrum:
-    """Rows of emitted light as a spectrum."""
-    return mi.Spectrum(*rows) if len(rows) > 1 else mi.Spectrum(rows[0])
-
-
-def _vjp_emission(
-    scene: mi.Scene,
-    world: World,
-    path_segment: PathSegment,
-    end: SegmentEnd,
-    composite: Composite,
-    dL: mi.Spectrum,
-    active: mi.Bool,
-    L: mi.Spectrum,
-) -> None:
-    """Derivatives of what a stretch emits, and of what it lets through of the light ``L`` behind it."""
-    ray_segment = RaySegment(path_segment.ray, path_segment.medium, end.t)
-    vjp_emission(scene, world, ray_segment, composite, dL * path_segment.beta, dL * L, active)
-
-
-def _vjp_segment(
-    scene: mi.Scene,
-    world: World,
-    path_segment: PathSegment,
-    end: SegmentEnd,
-    tau: list[mi.Float],
-    event: Scattering | None,
-    dL: mi.Spectrum,
-    active: mi.Bool,
-    L: mi.Spectrum,
-) -> None:
-    """Derivatives of the coefficients along a stretch, which dims the light ``L`` behind it and scatters light of its own."""
-    if event is not None and world.grid_control is not None:
-        lit = dr.select(path_segment.scatters, dL * path_segment.beta, 0)
-        shares = _sums(lit, world.channels, world.grid_control.channels)
-        _sweep(world, path_segment, end, tau, event, shares, dL * L, dL, False, active)
-        return
-    if event is not None:
-        _vjp_coefficients(scene, world, path_segment, tau, event, dL)
-    kept = 0 if event is None else _constant_source_behind(world, path_segment, tau)
-    _backproject(scene, world, RaySegment(path_segment.ray, path_segment.medium, end.t), dL * (kept - L), active)
-
-
-def _vjp_direct(scene: mi.Scene, world: World, event: Scattering, dL: mi.Spectrum) -> None:
-    """Derivatives of the light that arrives: of its lamp and the phase function, and of what dims it on its way.
-
-    Of two shadow rays one is walked back, drawn by what it brings.
-    """
-    carried = dL * event.sigma_s * event.gain
-    for sample in event.direct:
-        with dr.resume_grad():
-            if dr.grad_enabled(sample.value):
-                dr.backward_from(dr.select(sample.on, carried * sample.value, 0))
-    ray_segment, value, on = _choose(event)
-    _backproject(scene, world, ray_segment, -carried * value, on)
-
-
-def _choose(event: Scattering) -> tuple[RaySegment, mi.Spectrum, mi.Bool]:
-    """One of the shadow rays of an event, and what it brings over the probability of drawing it."""
-    first = event.direct[0]
-    if len(event.direct) == 1:
-        return first.ray_segment, dr.detach(first.value), first.on
-    second = event.direct[1]
-    values = [dr.detach(a.value) for a in event.direct]
-    light = [sum(v[c] for c in range(dr.size_v(v))) for v in values]
-    total = light[0] + light[1]
-    p = dr.select(total > 0, light[0] / dr.select(total > 0, total, 1), 0.5)
-    is_first = event.chance < p
-    ray_segment = RaySegment(
-        dr.select(is_first, first.ray_segment.ray, second.ray_segment.ray),
-        dr.select(is_first, first.ray_segment.medium, second.ray_segment.medium),
-        dr.select(is_first, first.ray_segment.length, second.ray_segment.length),
-        True,
-    )
-    value = dr.select(is_first, values[0] / dr.maximum(p, 1e-20), values[1] / dr.maximum(1 - p, 1e-20))
-    return ray_segment, value, dr.select(is_first, first.on, second.on) & (total > 0)
-
-
-def _vjp_albedo(world: World, ray: mi.Ray3f, event: Scattering, dL: mi.Spectrum) -> None:
-    """Derivative of the albedo at the point."""
-    for body, on in at_event(world, event.event):
-        if body.view.albedo is None:
-            continue
-        with dr.resume_grad():
-            albedo = eval_albedo(body, event.mei, on)
-            if dr.grad_enabled(albedo):
-                sigma_t = sigma_t_at(world, body, ray, event.event, on)
-                dr.backward_from(dr.select(on, dL * event.weight * sigma_t * albedo, 0))
-
-
-def _vjp_coefficients(
-    scene: mi.Scene, world: World, path_segment: PathSegment, tau: list[mi.Float], event: Scattering, dL: mi.Spectrum
-) -> None:
-    """Derivatives of the coefficients: at the point, and in front of it."""
-    ray, t = path_segment.ray, event.event.t
-    source, lost = _constant_source_at(world, path_segment, tau, event)
-    for body, on in at_event(world, event.event):
-        albedo, name = mi.Spectrum(1), "sigma_s"
-        if body.view.albedo is not None:
-            albedo, name = dr.detach(eval_albedo(body, event.mei, on)), "sigma_"
-        body.deposit(ray, t, by_channel(dL * (event.weight * albedo - source), world.channels), on, name)
-    _backproject(scene, world, _way_to(path_segment, t), -dL * (event.sigma_s * event.weight - lost), event.event.on)
-
-
-def _constant_source(world: World, tau: list[mi.Float]) -> mi.Spectrum:
-    """The source that is known [radiance], the same all along a ray: less comes through where more is taken.
-
-    Measured: 0.01 to 0.06 of the variance without it in thin media, 0.3 to 0.5 in those of a few optical depths, 0.8 beyond.
-    """
-    return world.constant_control * spectrum([phi1(t) for t in tau])
-
-
-def _constant_source_at(
-    world: World, path_segment: PathSegment, tau: list[mi.Float], event: Scattering
-) -> tuple[mi.Spectrum, mi.Spectrum]:
-    """What a unit of extinction at the point would send, and what its extinction sends, of the source that is known."""
-    if world.constant_control is None:
-        return mi.Spectrum(0), mi.Spectrum(0)
-    source, sigma_t = event.gain * _constant_source(world, tau), mi.Spectrum(0)
-    for body, on in at_event(world, event.event):
-        sigma_t = dr.select(on, sigma_t_at(world, body, path_segment.ray, event.event, on), sigma_t)
-    return source, source * sigma_t
-
-
-def _constant_source_behind(world: World, path_segment: PathSegment, tau: list[mi.Float]) -> mi.Spectrum:
-    """What the source that is known would have sent from behind the stretch: the exact part of its derivative."""
-    if world.constant_control is None:
-        return mi.Spectrum(0)
-    return dr.select(path_segment.scatters, path_segment.beta * transmittance(tau) * _constant_source(world, tau), 0)
-
-
-def _way_to(path_segment: PathSegment, t: mi.Float) -> RaySegment:
-    ray = path_segment.ray
-    return RaySegment(mi.Ray3f(ray.o, ray.d, t, ray.time, ray.wavelengths), path_segment.medium, t)
-
-
-def _sums(weight: mi.Spectrum, channels: int, of_control: int) -> list[list[tuple[int, mi.Float]]]:
-    """What each channel of the control counts in each channel of the extinction, summed over colours."""
-    colours = [weight[c] for c in range(dr.size_v(weight))]
-    if of_control == 1:
-        return [[(0, w)] for w in by_channel(weight, channels)]
-    if channels == 1:
-        return [list(enumerate(colours))]
-    return [[(c, w)] for c, w in enumerate(colours)]
-
-
-def _sweep(
-    world: World,
-    path_segment: PathSegment,
-    end: SegmentEnd,
-    tau: list[mi.Float],
-    event: Scattering,
-    shares: list,
-    rest: mi.Spectrum,
-    dL: mi.Spectrum,
-    tangent: bool,
-    active: mi.Bool,
-) -> list[mi.Float]:
-    """Derivatives of a stretch with a control variate: its cells exactly, what is left by the probe."""
-    (body,), point = world.bodies, event.event
-    S = world.grid_control.at_point(body, path_segment.ray, point.t, point.on)
-    albedo = dr.detach(eval_albedo(body, event.mei, point.on))
-    left = dr.select(point.on, event.weight * albedo - event.gain * spectrum(S), 0)
-    sigma_t = spectrum(point.sigma_t)
-    rows = [_colours(x) if tangent else by_channel(x, world.channels) for x in (dL * left, dL * left * sigma_t, rest)]
-    probe = Probe(point.begin, point.t, rows[0], rows[1], point.on)
-    return sweep(world, path_segment.ray, end.t, tau, Tracks(shares, rows[2], tangent), probe, active)
-
-
-def _jvp_attached(scene: mi.Scene, world: World, ray: mi.Ray3f, event: Scattering) -> mi.Spectrum:
-    """The tangent of what lights a point, dims its light and turns it: the transpose of the pulls of arrivals and albedo."""
-    carried = event.sigma_s * event.gain
-    with dr.resume_grad():
-        # One sum: each pass through the graph clears the edges behind it, which the terms share.
-        value = sum((dr.select(a.on, carried * a.value, 0) for a in event.direct), mi.Spectrum(0))
-        for body, on in at_event(world, event.event):
-            if body.view.albedo is not None:
-                sigma_t = sigma_t_at(world, body, ray, event.event, on)
-                value += dr.select(on, event.weight * sigma_t * eval_albedo(body, event.mei, on), 0)
-        dL = tangent_of(value)
-    ray_segment, dimmed, on = _choose(event)
-    return dL - dr.select(on, carried * dimmed * _tangent(scene, world, ray_segment, on), 0)
-
-
-def _jvp_coefficients(
-    scene: mi.Scene, world: World, path_segment: PathSegment, tau: list[mi.Float], event: Scattering
-) -> mi.Spectrum:
-    """The tangent of the coefficients at the point and in front of it: the transpose of :func:`_vjp_coefficients`."""
-    ray, t, k = path_segment.ray, event.event.t, world.channels
-    source, lost = _constant_source_at(world, path_segment, tau, event)
-    dL = -_tangent(scene, world, _way_to(path_segment, t), event.event.on) * (event.sigma_s * event.weight - lost)
-    for body, on in at_event(world, event.event):
-        albedo, name = mi.Spectrum(1), "sigma_s"
-        if body.view.albedo is not None:
-            albedo, name = dr.detach(eval_albedo(body, event.mei, on)), "sigma_"
-        dL += dr.select(on, (event.weight * albedo - source) * spectrum(body.tangent_at(ray, t, k, on, name)), 0)
-    return dr.select(event.event.on, dL, 0)
-
-
-def _colours(value: mi.Spectrum) -> list[mi.Float]:
-    return [value[c] for c in range(dr.size_v(value))]
-
-
-def _backproject(scene: mi.Scene, world: World, ray_segment: RaySegment, weight: mi.Spectrum, active: mi.Bool) -> None:
-    """Add a weight times a stretch to the gradients of its media."""
-    rows = by_channel(weight, world.channels)
-
-    def visit(state: mi.Float, body: Body, t0: mi.Float, t1: mi.Float, on: mi.Bool) -> mi.Float:
-        body.backproject(ray_segment.ray, t0, t1, rows, on)
-        return state
-
-    revisit_media(scene, world, ray_segment, visit, mi.Float(0), active & dr.any(weight != 0))
-
-
-def _tangent(scene: mi.Scene, world: World, ray_segment: RaySegment, active: mi.Bool) -> mi.Spectrum:
-    """Tangent of the optical depth of a stretch."""
-
-    def visit(tau: list[mi.Float], body: Body, t0: mi.Float, t1: mi.Float, on: mi.Bool) -> list[mi.Float]:
-        return [t + d for t, d in zip(tau, body.tangent(ray_segment.ray, t0, t1, len(tau), on), strict=True)]
-
-    tau = revisit_media(scene, world, ray_segment, visit, [mi.Float(0) for _ in range(world.channels)], active)
-    return mi.Spectrum(*tau) if len(tau) == 3 else mi.Spectrum(tau[0])
+    def scale(self, factor: Factor) -> Tangent:
+        return Tangent(self.dL, self.dlog + factor.jvp())

@@ -1,11 +1,11 @@
-r"""The path of light from a camera through absorbing media, surfaces and lamps.
+r"""The path of light from a camera through media, surfaces and lamps.
 
-.. math:: L = \sum_k \beta_k\, e^{-\tau_k} \left( w_k L_e + L_d e^{-\tau_{shadow}} \right)
+.. math:: L = \sum_k \beta_k \left( L_{media,k} + T_k\, ( w_k L_e + L_d ) \right)
 
-A path runs in straight stretches from one opaque surface to the next; along a stretch the media only take light away, by
-their exact optical depth. At a surface Mitsuba's own BSDFs and emitters shade it: one emitter sample and one BSDF sample,
-combined by the power heuristic (Veach 1997, Eq. 9.13). Whatever is done with a path (its radiance, its tangent, its
-derivatives) is a score; the walk itself is written once.
+A path runs in straight segments from one opaque surface to the next. What media add and take along a segment is found by the
+segment estimator that the plan has chosen. At a surface Mitsuba's own BSDFs and emitters shade it: one emitter sample
+and one BSDF sample, combined by the power heuristic (Veach 1997, Eq. 9.13). Whatever is done with a path (its radiance, its
+tangent, its derivatives) is a score; the walk itself is written once.
 
 Conventions. ``max_depth`` counts as in ``volpath``: 1 is emitters seen through media, 2 adds surfaces lit directly, -1 is no
 limit. Boundaries with a ``null`` BSDF do not count. Media that are bounded by boxes are cut by slab tests; the acceleration
@@ -17,29 +17,36 @@ References: radiative backpropagation by replaying paths: Vicini et al. 2021.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import drjit as dr
 import mitsuba as mi
 
-from mivol.transport.estimators.moving_emitters import follow_lamp
+from mivol.transport.estimators.contribution import TrackedFactor, TrackedTerm
+from mivol.transport.estimators.direct_lighting import DirectLight
 from mivol.transport.estimators.multiple_importance import power_heuristic
-from mivol.transport.estimators.path_segment import PathSegment
-from mivol.transport.estimators.shadow_rays import ShadowedLight, shadow_ray
-from mivol.transport.media.ray_intervals import SegmentEnd, transmittance
-from mivol.transport.media.scene_media import World
+from mivol.transport.estimators.segment import PICTURE, PathSegment
+from mivol.transport.estimators.vertex import SurfaceVertex
+from mivol.transport.media.optical_depth import transmittance
+from mivol.transport.path.estimators import Estimators
+from mivol.transport.path.event import PathEvent
+from mivol.transport.path.scores import Primal, Replay, Tangent
 from mivol.transport.path.settings import Settings
 from mivol.transport.traversal.ray_spawning import spawn_ray
 from mivol.transport.traversal.strata import Strata
 
 __all__ = ["Path", "is_straight", "walk_path"]
 
+Score = TypeVar("Score", Primal, Replay, Tangent)
+
+UNLIMITED = 0xFFFFFFFF
+
 
 @dataclass
 class Path:
     """The state of a path.
 
-    ``beta`` is the throughput so far, without the stretch ahead; ``pdf`` and ``delta`` tell how its direction was
+    ``beta`` is the throughput so far, without the segment ahead; ``pdf`` and ``delta`` tell how its direction was
     sampled at ``last`` (for the power heuristic); ``valid`` whether the film's alpha sees something.
     """
 
@@ -59,22 +66,20 @@ class Path:
 
 
 def walk_path(
-    scene: mi.Scene,
-    world: World,
+    estimators: Estimators,
     settings: Settings,
     sampler: mi.Sampler,
     ray: mi.Ray3f,
-    score: Any,
+    score: Score,
     active: mi.Bool = True,
     strata: Strata | None = None,
-) -> tuple[Any, mi.Bool]:
-    """Walk a path from the camera and give what it carries to a score.
+) -> tuple[Score, mi.Bool]:
+    """Walk a path from the camera and tell a score what it carries.
 
     Args:
-        scene: Mitsuba's scene: surfaces and emitters.
-        world: its media.
+        estimators: how light is found along segments and at surfaces; they know the scene and its media.
         settings: depth, roulette, hidden emitters.
-        sampler: three 2D and two 1D numbers a surface, three 2D and four 1D ones a stretch through media that scatter.
+        sampler: three 2D and two 1D numbers a surface, and what the segment estimator draws.
         ray: world space, unit direction.
         score: :mod:`mivol.transport.path.scores`.
         active: lanes to walk.
@@ -83,14 +88,15 @@ def walk_path(
     Returns:
         The score, and whether the film's alpha sees something.
 
-    Bias: none. Variance: none at depth 1 beyond the pixel's own; emitter and BSDF sampling at surfaces.
+    Bias: that of the segment estimator. Variance: none at depth 1 beyond the pixel's own; at surfaces, that of emitter and BSDF
+    samples.
     """
-    limit = settings.max_depth if settings.max_depth >= 0 else 0xFFFFFFFF
-    visible = not settings.hide_emitters and scene.environment() is not None
-    n = dr.width(ray)
+    media, n = estimators.media, dr.width(ray)
+    limit = settings.max_depth if settings.max_depth >= 0 else UNLIMITED
+    visible = not settings.hide_emitters and media.scene.environment() is not None
     path = Path(
         ray=mi.Ray3f(ray.o, ray.d, dr.inf, ray.time, ray.wavelengths),
-        medium=world.medium_at(scene, ray),
+        medium=media.medium_at(ray),
         beta=dr.full(mi.Spectrum, 1, n),
         eta=dr.full(mi.Float, 1, n),
         depth=dr.zeros(mi.UInt32, n),
@@ -103,87 +109,87 @@ def walk_path(
         sampler=sampler,
         strata=strata,
     )
-    if is_straight(world, settings):
-        path = _see(scene, world, settings, limit, path)[0]
-        return path.score, path.valid
-    (path,) = dr.while_loop(
-        state=(path,),
-        cond=lambda p: p.active,
-        body=lambda p: (_bounce(scene, world, settings, limit, *_see(scene, world, settings, limit, p)),),
-        label="path",
-    )
+
+    def step(path: Path) -> tuple[Path]:
+        path, event = _follow_segment(estimators, settings, limit, path)
+        path = _add_emission(estimators, settings, path, event)
+        return (_turn(estimators, settings, limit, path, event),)
+
+    if is_straight(estimators, settings):
+        path, event = _follow_segment(estimators, settings, limit, path)
+        path = _add_emission(estimators, settings, path, event)
+    else:
+        (path,) = dr.while_loop(state=(path,), cond=lambda p: p.active, body=step, label="path")
     return path.score, path.valid
 
 
-def is_straight(world: World, settings: Settings) -> bool:
-    """Whether paths have one stretch: nothing turns one that no surface meets, nor one of depth 1 that no surface lets pass."""
-    return not world.has_surfaces or (settings.max_depth in (0, 1) and not world.has_null_transmission)
+def is_straight(estimators: Estimators, settings: Settings) -> bool:
+    """Whether paths have one segment: nothing turns one that no surface meets, nor one of depth 1 that no surface lets pass."""
+    media = estimators.media
+    return not media.has_surfaces or (settings.max_depth in (0, 1) and not media.has_null_transmission)
 
 
-def _see(scene: mi.Scene, world: World, settings: Settings, limit: int, path: Path) -> tuple[Path, SegmentEnd]:
-    """Go to the next opaque surface and add the emission found there; media that scatter shine on the way."""
-    scatters = path.active & (path.depth + 1 < limit)
-    samples = world.emitters.draw_samples(path.sampler, scatters, path.strata) if world.emitters is not None else None
-    # A copy: the throughput is dimmed in place below, and a score may look at the stretch again after that.
-    path_segment = PathSegment(path.ray, path.medium, mi.Spectrum(path.beta), scatters, samples)
-    end, tau, path.score = path.score.pass_segment(scene, world, path_segment, path.active)
-    path.beta *= transmittance(tau)
-    path.medium = end.medium
+def _follow_segment(estimators: Estimators, settings: Settings, limit: int, path: Path) -> tuple[Path, PathEvent]:
+    """Go to the next opaque surface; media add their light on the way, and dim what lies ahead."""
+    may_scatter = path.active & (path.depth + 1 < limit)
+    samples = estimators.segment.draw(path.sampler, may_scatter, path.strata)
+    # A copy: the throughput is dimmed in place below, and derivatives look at the segment again after that.
+    segment = PathSegment(path.ray, path.medium, mi.Spectrum(path.beta), may_scatter, samples)
+    found = estimators.segment.estimate(segment, path.score.purpose, path.active)
+    if found.light is not None:
+        path.score = path.score.add(found.light)
+    path.score = path.score.scale(found.transmittance)
+    path.beta *= transmittance(found.tau)
+    path.medium = found.end.medium
+    return path, PathEvent.of(found.end, path.active)
 
-    si = end.si
+
+def _add_emission(estimators: Estimators, settings: Settings, path: Path, event: PathEvent) -> Path:
+    """Add what the surface, or the surroundings of the scene, emit towards the path."""
+    scene, si = estimators.media.scene, event.si
     shown = path.active & ~((path.depth == 0) & settings.hide_emitters)
     emitter = si.emitter(scene, shown)
-    direct = mi.DirectionSample3f(scene, si, path.last)
-    lit = ~path.delta & (emitter != None) if world.scatters else mi.Bool(False)
-    pdf_emitter = scene.pdf_emitter_direction(path.last, direct, lit) if world.scatters else mi.Float(0)
-    w_mis = dr.select(path.delta, 1, power_heuristic(path.pdf, pdf_emitter))
-    with dr.resume_grad(when=path.score.attached):
-        Le = emitter.eval(si, shown)
-        path.score = path.score.add(path.beta * w_mis * Le, shown)
-    path.valid |= path.active & si.is_valid()
-    return path, end
+    w_mis = mi.Float(1)
+    if estimators.lights_surfaces:
+        direct = mi.DirectionSample3f(scene, si, path.last)
+        pdf_emitter = scene.pdf_emitter_direction(path.last, direct, ~path.delta & (emitter != None))
+        w_mis = dr.select(path.delta, 1, power_heuristic(path.pdf, pdf_emitter))
+    with dr.resume_grad(when=path.score.purpose != PICTURE):
+        Le = path.beta * w_mis * emitter.eval(si, shown)
+        path.score = path.score.add(TrackedTerm(Le, shown))
+    path.valid |= event.at_surface
+    return path
 
 
-def _bounce(scene: mi.Scene, world: World, settings: Settings, limit: int, path: Path, end: SegmentEnd) -> Path:
+def _turn(estimators: Estimators, settings: Settings, limit: int, path: Path, event: PathEvent) -> Path:
     """Light the surface, and choose where the path goes on."""
-    si, sampler, score = end.si, path.sampler, path.score
-    on_surface = path.active & si.is_valid()
-    bsdf = si.bsdf(path.ray)
+    media, si, sampler = estimators.media, event.si, path.sampler
+    on_surface, attached = event.at_surface, path.score.purpose != PICTURE
+    vertex = event.vertex(media, path.ray)
 
     # -- Light from an emitter, dimmed by the media ---------------------------------------------------------------------------
     may_scatter = on_surface & (path.depth + 1 < limit)
-    lit = may_scatter & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
-    u = sampler.next_2d(lit)
-    direct, weight = scene.sample_emitter_direction(si, u, False, lit)
-    lit &= direct.pdf > 0
-    start = spawn_ray(si, direct.p - si.p, world.size).o
-    shadow_medium = dr.select(si.is_medium_transition(), si.target_medium(direct.p - start), path.medium)
-    ray_segment, clear, tau, light = shadow_ray(scene, world, start, shadow_medium, direct, lit)
-    lit &= clear
-    _, pdf_bsdf = bsdf.eval_pdf(mi.BSDFContext(), si, si.to_local(direct.d), lit)
-    w_mis = dr.select(direct.delta, 1, power_heuristic(direct.pdf, pdf_bsdf))
-    dim = path.beta * light * w_mis
-    with dr.resume_grad(when=score.attached):
-        moved = follow_lamp(direct.emitter, si, u, direct, lit) if score.attached else direct
-        f = bsdf.eval(mi.BSDFContext(), si, si.to_local(moved.d), lit)
-        source = scene.eval_emitter_direction(si, moved, lit) / direct.pdf if score.attached else weight
-        carried = dim * f * dr.select(direct.pdf > 0, source, 0)
-    score = score.shadow(scene, world, ray_segment, ShadowedLight(carried, tau, moved.p), lit)
+    lit = may_scatter & mi.has_flag(vertex.bsdf.flags(), mi.BSDFFlags.Smooth)
+    direct = estimators.direct.at_surface(vertex, sampler.next_2d(lit), attached, lit)
+    with dr.resume_grad(when=attached):
+        carried = path.beta * direct.value
+    path.score = path.score.add(DirectLight(media, direct.ray_segment, carried, direct.on))
 
     # -- The direction the path takes -----------------------------------------------------------------------------------------
     u1, u2 = sampler.next_1d(on_surface), sampler.next_2d(on_surface)
-    sample, f_over_pdf = bsdf.sample(mi.BSDFContext(), si, u1, u2, on_surface)
+    sample, f_over_pdf = vertex.bsdf.sample(mi.BSDFContext(), si, u1, u2, on_surface)
     through = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Null)
     on = on_surface & (may_scatter | through) & (sample.pdf > 0)
-    score = score.turn(bsdf, si, sample.wo, on & ~through)
+    turned = on & ~through
+    path.score = path.score.scale(_bsdf_factor(vertex, sample.wo, turned))
     path.beta *= dr.select(on, f_over_pdf, 0)
     path.eta *= dr.select(on, sample.eta, 1)
-    path.ray = spawn_ray(si, si.to_world(sample.wo), world.size)
+    path.ray = spawn_ray(si, si.to_world(sample.wo), media.size)
     path.medium = dr.select(on & si.is_medium_transition(), si.target_medium(path.ray.d), path.medium)
-    path.last = dr.select(on & ~through, mi.Interaction3f(si), path.last)
-    path.pdf = dr.select(on & ~through, sample.pdf, path.pdf)
-    path.delta = dr.select(on & ~through, mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta), path.delta)
-    path.depth += dr.select(on & ~through, mi.UInt32(1), mi.UInt32(0))
+    path.last = dr.select(turned, mi.Interaction3f(si), path.last)
+    path.pdf = dr.select(turned, sample.pdf, path.pdf)
+    path.delta = dr.select(turned, mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta), path.delta)
+    path.depth += dr.select(turned, mi.UInt32(1), mi.UInt32(0))
 
     # -- Roulette ------------------------------------------------------------------------------------------------------
     q = dr.minimum(dr.max(path.beta) * dr.square(path.eta), 0.95)
@@ -191,5 +197,9 @@ def _bounce(scene: mi.Scene, world: World, settings: Settings, limit: int, path:
     survives = ~late | (sampler.next_1d(on) < q)
     path.beta = dr.select(late, path.beta * dr.rcp(dr.maximum(q, 1e-30)), path.beta)
     path.active = on & survives & dr.any(path.beta != 0)
-    path.score = score
     return path
+
+
+def _bsdf_factor(vertex: SurfaceVertex, wo: mi.Vector3f, active: mi.Bool) -> TrackedFactor:
+    """The BSDF as a factor on all light ahead."""
+    return TrackedFactor(lambda: vertex.bsdf.eval(mi.BSDFContext(), vertex.interaction, wo, active), active)

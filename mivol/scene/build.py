@@ -1,0 +1,69 @@
+"""From a plan to the media that transport walks through, and the estimators that find their light."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from mivol.scene.needs import Needs, Survey, read_block_ranges, read_coarse, read_empty_distances
+from mivol.scene.plan import Plan
+from mivol.transport.estimators.direct_lighting import DirectLighting
+from mivol.transport.estimators.emitters import SceneEmitters
+from mivol.transport.estimators.transmittance_grid import build_transmittance_grid
+from mivol.transport.estimators.visibility_cache import VisibilityCache, build_visibility_cache
+from mivol.transport.media.body import Body
+from mivol.transport.media.scene_media import SceneMedia
+from mivol.transport.path.estimators import SEGMENT_ESTIMATORS, Estimators, SegmentChoice
+from mivol.transport.path.settings import Settings
+
+__all__ = ["build_estimators", "build_media"]
+
+
+def build_media(scene: mi.Scene, needs: Needs, plan: Plan, survey: Survey) -> SceneMedia:
+    """Build the media that transport walks through, as planned."""
+    bodies = []
+    for boundary, view, skip, tracks in zip(needs.boundaries, needs.views, plan.skips, plan.tracks, strict=True):
+        for part in view.parts:
+            if skip and part.lattice is not None:
+                part.lattice.empty_distances = read_empty_distances(part, survey, boundary.name)
+            # A grey variant sees the mean of an rgb extinction, and its transmittance is no mean.
+            mixes = mi.is_monochromatic and part.channels > 1
+            if tracks and part.lattice is not None and part.activation is None and not mixes:
+                part.lattice.block_ranges = read_block_ranges(part, survey)
+        bodies.append(Body(view, boundary.box))
+    return SceneMedia(
+        scene,
+        bodies,
+        has_surfaces=bool(needs.surfaces),
+        has_null_transmission=needs.has_null_transmission,
+        start=needs.start,
+        locates_camera=needs.camera_inside and needs.start is None,
+        size=survey.size,
+    )
+
+
+def build_estimators(
+    scene: mi.Scene, needs: Needs, plan: Plan, settings: Settings, survey: Survey, pictures: bool
+) -> Estimators:
+    """Build the estimators that the plan has chosen, for pictures or for derivatives."""
+    media = build_media(scene, needs, plan, survey)
+    direct = DirectLighting(media, SceneEmitters(scene))
+    choice = SegmentChoice(direct, plan.events)
+    if plan.segment in ("single_scattering", "scattering_quadrature"):
+        with dr.suspend_grad():
+            choice.visibility_cache = _find_visibility(direct, needs, plan, survey, pictures)
+            if settings.shadows == "grid":
+                choice.transmittance_grid = build_transmittance_grid(media, direct.emitters)
+    lights_surfaces = bool(needs.surfaces) and settings.max_depth not in (0, 1)
+    return Estimators(direct, SEGMENT_ESTIMATORS[plan.segment].make(choice), lights_surfaces)
+
+
+def _find_visibility(
+    direct: DirectLighting, needs: Needs, plan: Plan, survey: Survey, pictures: bool
+) -> VisibilityCache | None:
+    """Find where emitters shine; derivatives are not 0 in empty blocks, which only values that were read can tell."""
+    blind = not pictures or any(m.unread for m in needs.media)
+    rays = needs.film_samples * (plan.events if pictures else 1)
+    occupied = None if blind else needs.media[0].occupied
+    take = lambda *asked: read_coarse(survey, *asked)  # noqa: E731
+    return build_visibility_cache(direct.media, direct.emitters, rays, occupied, take)

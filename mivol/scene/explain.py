@@ -1,0 +1,147 @@
+"""What a scene needs and what will be done about it, in words, before anything is rendered."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mivol.scene.build import build_media
+from mivol.scene.depth_two import depth_two_error, mean_albedo, mean_cosine, scattering_depth
+from mivol.scene.load import find_sensor
+from mivol.scene.needs import Needs, find_needs, survey_scene
+from mivol.scene.nesting import bounds
+from mivol.scene.plan import Plan, is_lit, make_plan, shares_cells
+from mivol.transport.estimators.emitters import SceneEmitters
+from mivol.transport.estimators.transmittance_grid import build_transmittance_grid, measure_transmittance_bias
+from mivol.transport.media.box import Box
+from mivol.transport.media.read_medium import traverse_medium
+from mivol.transport.path.settings import Settings
+
+__all__ = ["explain", "settings_of"]
+
+UNLIMITED = 0xFFFFFFFF
+"""The depth that Mitsuba's integrators print for -1."""
+
+
+def settings_of(scene: mi.Scene) -> Settings:
+    """What the scene's own integrator is set to: all of it where it is mivol, the depth of others, which they print."""
+    integrator = scene.integrator()
+    session = getattr(integrator, "session", None)
+    if session is not None:
+        return session.settings
+    told = re.search(r"max_depth ?= ?(-?\d+)", str(integrator))
+    depth = Settings().max_depth if told is None else int(told.group(1))
+    return Settings(max_depth=-1 if depth == UNLIMITED else depth)
+
+
+def explain(scene: mi.Scene | str | Path, max_depth: int | None = None, sensor: int = 0) -> str:
+    """Say what a scene needs and what will be done about it, before anything is rendered.
+
+    Args:
+        scene: a loaded scene, or the path of its XML.
+        max_depth: of the integrator asked about; None: that of the scene's own integrator, with its other settings.
+        sensor: index of the sensor asked about.
+
+    Raises:
+        MivolError: as :func:`make_plan`.
+    """
+    loaded = scene if isinstance(scene, mi.Scene) else mi.load_file(str(scene))
+    needs = find_needs(loaded, find_sensor(loaded, sensor), survey_scene(loaded))
+    settings = settings_of(loaded) if max_depth is None else Settings(max_depth=max_depth)
+    plan = make_plan(needs, settings)
+    lines = ["facts"]
+    for m in needs.media:
+        grids = ", ".join("x".join(map(str, r)) for r in m.resolutions) or "homogeneous"
+        scatters = "scatters" if m.is_scattering else "albedo 0"
+        tau = "" if m.tau_max is None else f", optical depth at most {m.tau_max:.3g}"
+        lines.append(
+            f"  medium    {m.name}: {m.kind} in {m.boundary}, {m.extinction} extinction, {grids}, {scatters}, {m.phase}{tau}"
+        )
+    lines += [
+        f"  surfaces  {', '.join(needs.surfaces) or 'none'}",
+        f"  emitters  {', '.join(needs.emitters) or 'none'}",
+        f"  camera    {'may be inside a medium' if needs.start or needs.camera_inside else 'in no traced boundary'}",
+        f"  variant   {needs.variant}, {dr.thread_count()} threads",
+        "plan",
+    ]
+    width = max(len(c.about) for c in plan.choices)
+    lines += [f"  {c.about:<{width}}  {c.choice}\n  {'':<{width}}    because {c.reason}" for c in plan.choices]
+    lines += [f"  table     {text}" for text in _tables(needs)]
+    if settings.max_depth == 2:
+        lines += [f"  model     {text}" for text in _depth_two(loaded, needs)]
+        lines += [f"  shadows   {text}" for text in _transmittance_grid(loaded, needs, plan, settings)]
+    return "\n".join(lines)
+
+
+def _transmittance_grid(scene: mi.Scene, needs: Needs, plan: Plan, settings: Settings) -> list[str]:
+    """What a light grid in place of shadow rays costs, and how wrong it is."""
+    if not is_lit(needs, settings) or set(needs.lamps) != {"sharp"} or len(needs.media) != 1:
+        return []
+    if not shares_cells(needs) or any(part.lattice is None for part in needs.views[0].parts):
+        return []
+    with dr.suspend_grad():
+        media, emitters = build_media(scene, needs, plan, survey_scene(scene)), SceneEmitters(scene)
+        grid = build_transmittance_grid(media, emitters)
+        bias, rms = measure_transmittance_bias(media, emitters, grid)
+    nodes = grid.nodes[0] * grid.nodes[1] * grid.nodes[2]
+    rays = needs.film_samples * sum(needs.media[0].resolutions[0])
+    pays = "pays" if nodes < rays else "does not pay"
+    offer = "asked for" if settings.shadows == "grid" else "exact; with deterministic"
+    return [
+        f"{offer}, a light grid of {nodes} nodes {pays} against about {rays} shadow rays, at a bias of "
+        f"{bias:+.2g} of a lamp's light (rms {rms:.2g}, measured against exact shadows)"
+    ]
+
+
+def _tables(needs: Needs) -> list[str]:
+    """What grids that were seen through a table miss of it between their nodes."""
+    lines = []
+    for facts, boundary in zip(needs.media, needs.boundaries, strict=True):
+        volumes = {key.split(".")[0]: entry[2] for key, entry in traverse_medium(boundary.medium).properties.items()}
+        for name, volume in volumes.items():
+            if not hasattr(volume, "mivol_transfer"):
+                continue
+            table = volume.mivol_transfer
+            missed, finer = table.departure(), table.refine + 2
+            advice = f"; refine = {finer} would follow it closer, at {(finer / table.refine) ** 3:.3g} times the memory"
+            lines.append(
+                f"{name} of {facts.name} departs from its table by {missed:.2g} of the largest entry half-way between nodes "
+                f"(rms){advice if missed > 0.02 else ''}"
+            )
+    return lines
+
+
+def _depth_two(scene: mi.Scene, needs: Needs) -> list[str]:
+    """What a model of one scattering leaves out of each medium."""
+    lines = []
+    light = "collimated" if "sharp" in needs.lamps else "constant"
+    for facts, boundary, view in zip(needs.media, needs.boundaries, needs.views, strict=True):
+        box, traced = (boundary.box, None) if boundary.box is not None else (_box_around(scene, boundary.medium), scene)
+        if not facts.is_scattering or box is None:
+            continue
+        tau, albedo = scattering_depth(view, box, scene=traced), mean_albedo(view)
+        phase = "forward" if mean_cosine(boundary.medium.phase_function()) > 0.4 else "isotropic"
+        missing = depth_two_error(min(albedo, 1.0), tau, light, phase)
+        warning = "; depth 2 is a poor model of it" if missing > 0.1 else ""
+        lines.append(
+            f"one scattering leaves out {missing:.0%} of the light that {facts.name} scatters (albedo {albedo:.2f}, optical "
+            f"depth {tau:.2g}, {light} light, {phase} phase){warning}"
+        )
+    return lines
+
+
+def _box_around(scene: mi.Scene, medium: mi.Medium) -> Box | None:
+    """A box around all that a medium fills; None where it lies outside of shapes, without an end."""
+    inside = [s.interior_medium() for s in scene.shapes()]
+    boxes = [bounds(s) for s, m in zip(scene.shapes(), inside, strict=True) if m is not None and m.ptr == medium.ptr]
+    if not boxes:
+        return None
+    low, high = np.min([b[0] for b in boxes], axis=0), np.max([b[1] for b in boxes], axis=0)
+    # Lines begin outside of what they are to enter.
+    room, place = 1e-3 * (high - low).max(), np.eye(4)
+    place[:3, :3], place[:3, 3] = np.diag(high - low + 2 * room), low - room
+    return Box(place)

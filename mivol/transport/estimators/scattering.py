@@ -1,0 +1,74 @@
+"""A point of a segment that scatters light once: where it is, its coefficients, and what arrives there."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from mivol.transport.estimators.direct_lighting import DirectSample
+from mivol.transport.estimators.distance_sampling import MediumEvent
+from mivol.transport.media.body import Body
+from mivol.transport.media.channels import spectrum
+from mivol.transport.media.coefficients import eval_albedo, medium_interaction
+from mivol.transport.media.scene_media import SceneMedia
+
+__all__ = ["Scattering", "at_event", "medium_event_interaction", "sigma_s_at", "sigma_t_at"]
+
+
+@dataclass
+class Scattering:
+    """A point of a stretch that scatters, and the light that arrives there.
+
+    Attributes:
+        event: where.
+        mei: the point, as Mitsuba's phase functions want it.
+        gain: throughput and transmittance to the camera, over the density of the point.
+        direct: the shadow rays; their values carry derivatives where these are asked for.
+        sigma_s: scattering coefficient [1/length] there.
+        chance: a number in [0, 1), for the choice of one of the shadow rays.
+    """
+
+    event: MediumEvent
+    mei: mi.MediumInteraction3f
+    gain: mi.Spectrum
+    direct: list[DirectSample]
+    sigma_s: mi.Spectrum
+    chance: mi.Float
+
+    @property
+    def weight(self) -> mi.Spectrum:
+        """What a unit of sigma_s would send to the camera."""
+        return self.gain * sum((dr.detach(a.value) for a in self.direct), mi.Spectrum(0))
+
+
+def medium_event_interaction(media: SceneMedia, ray: mi.Ray3f, event: MediumEvent) -> mi.MediumInteraction3f:
+    """An event as Mitsuba's phase functions want it."""
+    mei = medium_interaction(ray, event.t)
+    for index, body in enumerate(media.bodies):
+        mei.medium = dr.select(event.on & (event.body == index), mi.MediumPtr(body.view.medium), mei.medium)
+    return mei
+
+
+def at_event(media: SceneMedia, event: MediumEvent) -> list[tuple[Body, mi.Bool]]:
+    """The bodies, each with the lanes that scatter in it."""
+    return [(body, event.on & (event.body == index)) for index, body in enumerate(media.bodies)]
+
+
+def sigma_t_at(media: SceneMedia, body: Body, ray: mi.Ray3f, event: MediumEvent, on: mi.Bool) -> mi.Spectrum:
+    """The extinction [1/length] at an event."""
+    rows = event.sigma_t if media.is_single else body.extinction_at(ray, event.t, media.channels, on)
+    return spectrum(rows)
+
+
+def sigma_s_at(media: SceneMedia, ray: mi.Ray3f, event: MediumEvent, mei: mi.MediumInteraction3f) -> mi.Spectrum:
+    """The scattering coefficient [1/length] at an event."""
+    total = mi.Spectrum(0)
+    for body, on in at_event(media, event):
+        if body.view.albedo is None:
+            value = spectrum(body.extinction_at(ray, event.t, media.channels, on, "sigma_s"))
+        else:
+            value = dr.detach(eval_albedo(body, mei, on)) * sigma_t_at(media, body, ray, event, on)
+        total = dr.select(on, value, total)
+    return total

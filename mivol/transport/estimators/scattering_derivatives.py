@@ -1,0 +1,234 @@
+r"""Derivatives of a segment that scatters once: of the light that its media turn to the camera, and of what they let through.
+
+The light is :math:`\int T \sigma_s L_d\,dt`. A probe, drawn where there is no extinction too, estimates its derivatives with
+respect to the coefficients at the probe's point (what a unit of ``sigma_s`` there sends) and in front of it (which dims what
+the point sends), and those of what arrives there: emitters, phase function, albedo, and the media along one shadow ray.
+
+A control variate takes a part of that over whose derivative is exact. With one grid and an albedo in a box it is a source
+function on a coarse lattice, swept cell by cell together with what the segment dims (:mod:`.control_sweep`); elsewhere, under a
+constant sky, it is one number a ray: its light :math:`S (1 - T)` has the derivative :math:`S T` all along the ray.
+
+Conventions. ``dL`` is d loss / d light and ``dlog`` d loss / d log T, which is dL times the light behind the segment.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from mivol.numerics import phi1
+from mivol.transport.estimators.control_sweep import Probe, Tracks, sweep
+from mivol.transport.estimators.grid_control import GridControl
+from mivol.transport.estimators.scattering import Scattering, at_event, sigma_t_at
+from mivol.transport.estimators.segment import PathSegment
+from mivol.transport.media.channels import by_channel, colours, spectrum, tangent_of
+from mivol.transport.media.coefficients import eval_albedo
+from mivol.transport.media.optical_depth import jvp_optical_depth, transmittance, vjp_optical_depth
+from mivol.transport.media.ray_intervals import RaySegment, SegmentEnd
+from mivol.transport.media.scene_media import SceneMedia
+
+__all__ = ["ScatteredSegment"]
+
+
+@dataclass
+class ScatteredSegment:
+    """A segment, the probe that was drawn on it, and the control variates of its derivatives.
+
+    Attributes:
+        media: of the scene.
+        segment: ray and throughput.
+        end: where it ends.
+        tau: its optical depth, each channel.
+        probe: the point that scatters, and what arrives there.
+        grid_control, constant_control: source functions [radiance] whose part is exact; at most one of them is not None.
+        active: lanes that are followed.
+        dL: d loss / d light, once it is known.
+    """
+
+    media: SceneMedia
+    segment: PathSegment
+    end: SegmentEnd
+    tau: list[mi.Float]
+    probe: Scattering
+    grid_control: GridControl | None
+    constant_control: mi.Spectrum | None
+    active: mi.Bool
+    dL: mi.Spectrum | None = None
+
+    # -- What arrives at the point -------------------------------------------------------------------------------------
+
+    def vjp_light(self, dL: mi.Spectrum) -> None:
+        """Derivatives of what arrives: of its emitter and the phase function, of what dims it on its way, of the albedo."""
+        probe = self.probe
+        carried = dL * probe.sigma_s * probe.gain
+        for sample in probe.direct:
+            with dr.resume_grad():
+                if dr.grad_enabled(sample.value):
+                    dr.backward_from(dr.select(sample.on, carried * sample.value, 0))
+        shadow, value, on = _choose_shadow_ray(probe)
+        vjp_optical_depth(self.media, shadow, -carried * value, on)
+        for body, here in at_event(self.media, probe.event):
+            if body.view.albedo is None:
+                continue
+            with dr.resume_grad():
+                albedo = eval_albedo(body, probe.mei, here)
+                if dr.grad_enabled(albedo):
+                    sigma_t = sigma_t_at(self.media, body, self.segment.ray, probe.event, here)
+                    dr.backward_from(dr.select(here, dL * probe.weight * sigma_t * albedo, 0))
+
+    def jvp_light(self) -> mi.Spectrum:
+        dL = self._jvp_arriving()
+        if self.grid_control is not None:
+            return dL + self._jvp_by_sweep()
+        dL += self._jvp_coefficients()
+        return dL - self._constant_source_behind() * self.jvp_transmittance()
+
+    def _jvp_arriving(self) -> mi.Spectrum:
+        """The tangent of what lights the point, dims its light and turns it: the transpose of :meth:`vjp_light`."""
+        probe = self.probe
+        carried = probe.sigma_s * probe.gain
+        with dr.resume_grad():
+            # One sum: each pass through the graph clears the edges behind it, which the terms share.
+            value = sum((dr.select(s.on, carried * s.value, 0) for s in probe.direct), mi.Spectrum(0))
+            for body, on in at_event(self.media, probe.event):
+                if body.view.albedo is not None:
+                    sigma_t = sigma_t_at(self.media, body, self.segment.ray, probe.event, on)
+                    value += dr.select(on, probe.weight * sigma_t * eval_albedo(body, probe.mei, on), 0)
+            dL = tangent_of(value)
+        shadow, dimmed, on = _choose_shadow_ray(probe)
+        return dL - dr.select(on, carried * dimmed * jvp_optical_depth(self.media, shadow, on), 0)
+
+    # -- Coefficients along the segment --------------------------------------------------------------------------------
+
+    def vjp(self, dlog: mi.Spectrum) -> None:
+        if self.grid_control is not None:
+            lit = dr.select(self.segment.scatters, self.dL * self.segment.beta, 0)
+            shares = _sums(lit, self.media.channels, self.grid_control.channels)
+            self._sweep(shares, dlog, self.dL, False)
+            return
+        self._vjp_coefficients()
+        kept = self._constant_source_behind()
+        vjp_optical_depth(self.media, self._passed, self.dL * kept - dlog, self.active)
+
+    def jvp_transmittance(self) -> mi.Spectrum:
+        return -jvp_optical_depth(self.media, self._passed, self.active)
+
+    def _vjp_coefficients(self) -> None:
+        """Derivatives of the coefficients: at the point, and in front of it."""
+        media, ray, probe, dL = self.media, self.segment.ray, self.probe, self.dL
+        source, lost = self._constant_source_at()
+        for body, on in at_event(media, probe.event):
+            albedo, name = mi.Spectrum(1), "sigma_s"
+            if body.view.albedo is not None:
+                albedo, name = dr.detach(eval_albedo(body, probe.mei, on)), "sigma_"
+            weight = by_channel(dL * (probe.weight * albedo - source), media.channels)
+            body.deposit(ray, probe.event.t, weight, on, name)
+        vjp_optical_depth(media, self._in_front, -dL * (probe.sigma_s * probe.weight - lost), probe.event.on)
+
+    def _jvp_coefficients(self) -> mi.Spectrum:
+        """The transpose of :meth:`_vjp_coefficients`."""
+        media, ray, probe = self.media, self.segment.ray, self.probe
+        source, lost = self._constant_source_at()
+        along = jvp_optical_depth(media, self._in_front, probe.event.on)
+        dL = -along * (probe.sigma_s * probe.weight - lost)
+        for body, on in at_event(media, probe.event):
+            albedo, name = mi.Spectrum(1), "sigma_s"
+            if body.view.albedo is not None:
+                albedo, name = dr.detach(eval_albedo(body, probe.mei, on)), "sigma_"
+            tangent = spectrum(body.tangent_at(ray, probe.event.t, media.channels, on, name))
+            dL += dr.select(on, (probe.weight * albedo - source) * tangent, 0)
+        return dr.select(probe.event.on, dL, 0)
+
+    # -- A source function on a lattice --------------------------------------------------------------------------------
+
+    def _jvp_by_sweep(self) -> mi.Spectrum:
+        one, lit = mi.Spectrum(1), dr.select(self.segment.scatters, self.segment.beta, 0)
+        shares = [[(c % self.grid_control.channels, b)] for c, b in enumerate(colours(lit))]
+        return mi.Spectrum(*self._sweep(shares, 0 * one, one, True))
+
+    def _sweep(
+        self, shares: list[list[tuple[int, mi.Float]]], rest: mi.Spectrum, dL: mi.Spectrum, tangent: bool
+    ) -> list[mi.Float]:
+        """Derivatives with the control: those of its light in every cell exactly, what is left by the probe."""
+        media, probe, point = self.media, self.probe, self.probe.event
+        (body,) = media.bodies
+        S = self.grid_control.at_point(body, self.segment.ray, point.t, point.on)
+        albedo = dr.detach(eval_albedo(body, probe.mei, point.on))
+        left = dr.select(point.on, probe.weight * albedo - probe.gain * spectrum(S), 0)
+        sigma_t = spectrum(point.sigma_t)
+        asked = (dL * left, dL * left * sigma_t, rest)
+        rows = [colours(x) if tangent else by_channel(x, media.channels) for x in asked]
+        tracks = Tracks(shares, rows[2], tangent)
+        found = Probe(point.begin, point.t, rows[0], rows[1], point.on)
+        return sweep(media, self.grid_control, self.segment.ray, self.end.t, self.tau, tracks, found, self.active)
+
+    # -- A source function that is one number --------------------------------------------------------------------------
+
+    @property
+    def _constant_source(self) -> mi.Spectrum:
+        """The source that is known [radiance], the same all along a ray: less comes through where more is taken.
+
+        Measured: 0.01 to 0.06 of the variance without it in thin media, 0.3 to 0.5 in those of a few optical depths, 0.8
+        beyond.
+        """
+        return self.constant_control * spectrum([phi1(t) for t in self.tau])
+
+    def _constant_source_at(self) -> tuple[mi.Spectrum, mi.Spectrum]:
+        """What a unit of extinction at the point would send, and what its extinction sends, of the source that is known."""
+        if self.constant_control is None:
+            return mi.Spectrum(0), mi.Spectrum(0)
+        source, sigma_t, event = self.probe.gain * self._constant_source, mi.Spectrum(0), self.probe.event
+        for body, on in at_event(self.media, event):
+            sigma_t = dr.select(on, sigma_t_at(self.media, body, self.segment.ray, event, on), sigma_t)
+        return source, source * sigma_t
+
+    def _constant_source_behind(self) -> mi.Spectrum:
+        """What the source that is known would have sent from behind the segment: the exact part of its derivative."""
+        if self.constant_control is None:
+            return mi.Spectrum(0)
+        lit = self.segment.beta * transmittance(self.tau) * self._constant_source
+        return dr.select(self.segment.scatters, lit, 0)
+
+    # -- Parts of the ray ----------------------------------------------------------------------------------------------
+
+    @property
+    def _passed(self) -> RaySegment:
+        return RaySegment(self.segment.ray, self.segment.medium, self.end.t)
+
+    @property
+    def _in_front(self) -> RaySegment:
+        """The ray up to the point."""
+        ray, t = self.segment.ray, self.probe.event.t
+        return RaySegment(mi.Ray3f(ray.o, ray.d, t, ray.time, ray.wavelengths), self.segment.medium, t)
+
+
+def _choose_shadow_ray(probe: Scattering) -> tuple[RaySegment, mi.Spectrum, mi.Bool]:
+    """One of the shadow rays of a point, drawn by what it brings, and that over the probability of drawing it."""
+    first = probe.direct[0]
+    if len(probe.direct) == 1:
+        return first.ray_segment, dr.detach(first.value), first.on
+    second = probe.direct[1]
+    values = [dr.detach(s.value) for s in probe.direct]
+    light = [sum(colours(v)) for v in values]
+    total = light[0] + light[1]
+    p = dr.select(total > 0, light[0] / dr.select(total > 0, total, 1), 0.5)
+    is_first = probe.chance < p
+    chosen = RaySegment(
+        dr.select(is_first, first.ray_segment.ray, second.ray_segment.ray),
+        dr.select(is_first, first.ray_segment.medium, second.ray_segment.medium),
+        dr.select(is_first, first.ray_segment.length, second.ray_segment.length),
+        True,
+    )
+    value = dr.select(is_first, values[0] / dr.maximum(p, 1e-20), values[1] / dr.maximum(1 - p, 1e-20))
+    return chosen, value, dr.select(is_first, first.on, second.on) & (total > 0)
+
+
+def _sums(weight: mi.Spectrum, channels: int, of_control: int) -> list[list[tuple[int, mi.Float]]]:
+    """What each channel of the control counts in each channel of the extinction, summed over colours."""
+    if of_control == 1:
+        return [[(0, w)] for w in by_channel(weight, channels)]
+    if channels == 1:
+        return [list(enumerate(colours(weight)))]
+    return [[(c, w)] for c, w in enumerate(colours(weight))]

@@ -1,0 +1,81 @@
+"""A path segment whose media emit: their light by a sweep from its far end, with what they let through."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from mivol.transport.estimators.segment import (
+    FORWARD,
+    PathSegment,
+    SegmentEstimate,
+    SegmentLight,
+    SegmentTransmittance,
+)
+from mivol.transport.line_integrals.composite import Composite
+from mivol.transport.line_integrals.emission import integrate_emission, vjp_emission
+from mivol.transport.media.channels import spectrum
+from mivol.transport.media.ray_intervals import RaySegment, visit_media
+from mivol.transport.media.scene_media import SceneMedia
+from mivol.transport.traversal.strata import Strata
+
+__all__ = ["Emission"]
+
+
+class Emission:
+    """Media emit and take light away, without scattering.
+
+    Bias and cost: as :func:`mivol.transport.line_integrals.emission.integrate_emission`. Variance: none.
+    """
+
+    directions = "none"
+
+    def __init__(self, media: SceneMedia) -> None:
+        self.media = media
+
+    def draw(self, sampler: mi.Sampler, active: mi.Bool, strata: Strata | None) -> Any:
+        """Nothing is random."""
+
+    def estimate(self, segment: PathSegment, purpose: str, active: mi.Bool) -> SegmentEstimate:
+        media = self.media
+        end, _ = visit_media(media, segment.ray, segment.medium, lambda state, *_: state, mi.Float(0), active)
+        passed = RaySegment(segment.ray, segment.medium, end.t)
+        composite = integrate_emission(media, passed, active, tangent=purpose == FORWARD)
+        shared = _EmittingSegment(media, segment, passed, composite, active)
+        light = SegmentLight(shared, dr.select(active, segment.beta * shared.rows(0), 0), is_replayed=True)
+        tau = [mi.Float(t) for t in composite.tau[: media.channels]]
+        return SegmentEstimate(end, tau, light, SegmentTransmittance(shared))
+
+
+@dataclass
+class _EmittingSegment:
+    """A segment and its composite; the rows of the light are followed by those of its tangent, where that is asked for."""
+
+    media: SceneMedia
+    segment: PathSegment
+    passed: RaySegment
+    composite: Composite
+    active: mi.Bool
+    dL: mi.Spectrum | None = None
+
+    def rows(self, block: int) -> mi.Spectrum:
+        """The light of each colour (block 0), or its tangent (block 1)."""
+        k = dr.size_v(mi.Spectrum)
+        return mi.Spectrum(*self.composite.N[block * k : (block + 1) * k])
+
+    def vjp_light(self, dL: mi.Spectrum) -> None:
+        """One sweep serves the light and the transmittance: it waits for the light behind."""
+
+    def vjp(self, dlog: mi.Spectrum) -> None:
+        vjp_emission(self.media, self.passed, self.composite, self.dL * self.segment.beta, dlog, self.active)
+
+    def jvp_light(self) -> mi.Spectrum:
+        return dr.select(self.active, self.segment.beta * self.rows(1), 0)
+
+    def jvp_transmittance(self) -> mi.Spectrum:
+        k = dr.size_v(mi.Spectrum)
+        dtau = spectrum([mi.Float(t) for t in self.composite.tau[k : k + self.media.channels]])
+        return -dr.select(self.active, dtau, 0)

@@ -1,0 +1,78 @@
+"""The optical depth of the media along a ray, with its tangent and its transpose.
+
+Conventions. Rows are one number for each channel of the scene's extinction; spectra have one for each colour.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from mivol.transport.media.body import Body
+from mivol.transport.media.channels import by_channel, spectrum
+from mivol.transport.media.ray_intervals import MediumVisitor, RaySegment, SegmentEnd, revisit_media, visit_media
+from mivol.transport.media.scene_media import SceneMedia
+
+__all__ = [
+    "integrate_optical_depth",
+    "jvp_optical_depth",
+    "jvp_rows",
+    "sum_optical_depth",
+    "transmittance",
+    "vjp_optical_depth",
+    "vjp_rows",
+]
+
+
+def sum_optical_depth(ray: mi.Ray3f, enough: float | None = None) -> MediumVisitor:
+    """The visitor that sums the optical depth of each channel along ``ray``; in a grid it may stop at ``enough``."""
+
+    def visit(tau: list[mi.Float], body: Body, t0: mi.Float, t1: mi.Float, active: mi.Bool) -> list[mi.Float]:
+        return [t + d for t, d in zip(tau, body.optical_depth(ray, t0, t1, len(tau), active, None, enough), strict=True)]
+
+    return visit
+
+
+def integrate_optical_depth(
+    media: SceneMedia, ray: mi.Ray3f, medium: mi.MediumPtr, active: mi.Bool
+) -> tuple[SegmentEnd, list[mi.Float]]:
+    """Optical depth [1] of each channel to the first opaque surface or ``ray.maxt``, and where that is."""
+    zero = [mi.Float(0) for _ in range(media.channels)]
+    return visit_media(media, ray, medium, sum_optical_depth(ray), zero, active)
+
+
+def transmittance(tau: list[mi.Float]) -> mi.Spectrum:
+    """exp(-tau) of each channel."""
+    return mi.Spectrum(*(dr.exp(-t) for t in tau)) if len(tau) == 3 else mi.Spectrum(dr.exp(-tau[0]))
+
+
+def vjp_optical_depth(media: SceneMedia, segment: RaySegment, weight: mi.Spectrum, active: mi.Bool) -> None:
+    """Add ``weight`` (d loss / d tau of each colour) times a segment to the gradients of its media.
+
+    Cost: one walk of each medium, with one packed write of 8 a cell and channel; lanes of weight 0 are left out.
+    """
+    vjp_rows(media, segment, by_channel(weight, media.channels), active & dr.any(weight != 0))
+
+
+def vjp_rows(media: SceneMedia, segment: RaySegment, weight: list[mi.Float], active: mi.Bool) -> None:
+    """As :func:`vjp_optical_depth`, ``weight`` one number for each channel."""
+
+    def visit(state: mi.Float, body: Body, t0: mi.Float, t1: mi.Float, on: mi.Bool) -> mi.Float:
+        body.backproject(segment.ray, t0, t1, weight, on)
+        return state
+
+    revisit_media(media, segment, visit, mi.Float(0), active)
+
+
+def jvp_optical_depth(media: SceneMedia, segment: RaySegment, active: mi.Bool) -> mi.Spectrum:
+    """Tangent of the optical depth of a segment, along that which :meth:`SceneMedia.start_tangent` took."""
+    return spectrum(jvp_rows(media, segment, active))
+
+
+def jvp_rows(media: SceneMedia, segment: RaySegment, active: mi.Bool) -> list[mi.Float]:
+    """As :func:`jvp_optical_depth`, one number for each channel."""
+
+    def visit(tau: list[mi.Float], body: Body, t0: mi.Float, t1: mi.Float, on: mi.Bool) -> list[mi.Float]:
+        return [t + d for t, d in zip(tau, body.tangent(segment.ray, t0, t1, len(tau), on), strict=True)]
+
+    return revisit_media(media, segment, visit, [mi.Float(0) for _ in range(media.channels)], active)
