@@ -15,7 +15,7 @@ from scattering_scenes import close_up
 
 from mivol.scene import depth_two
 from mivol.scene.depth_two import ALBEDOS, TABLES, TAUS, depth_two_error, draw_lines, scattering_depth
-from mivol.scene.plan import explain
+from mivol.scene.explain import explain
 from mivol.transport.media.box import Box
 from mivol.transport.media.read_medium import view_medium
 from scenes import FRAMES, affine, ball_of, medium, refused, rotation

@@ -14,8 +14,10 @@ import oracle_scattering as twins
 import pytest
 from scattering_scenes import PLACE, aimed, close_up, fog, mivol, pencils, point, rough_grid, smoke, spot, sun
 
+from mivol.scene.build import build_estimators
+from mivol.scene.explain import explain
 from mivol.scene.needs import find_needs, survey_scene
-from mivol.scene.plan import build_world, explain, make_plan
+from mivol.scene.plan import make_plan
 from mivol.transport.estimators.transmittance_grid import build_transmittance_grid, measure_transmittance_bias
 from mivol.transport.path.settings import Settings
 from scenes import as_float32, box_of, centred, grid_volume, refused, sky
@@ -84,10 +86,10 @@ def test_two_renders_are_the_same():
     assert np.array_equal(image(seen), image(seen))
 
 
-def open_world(scene: mi.Scene):
+def open_direct(scene: mi.Scene):
     survey, settings = survey_scene(scene), Settings(max_depth=2)
     needs = find_needs(scene, scene.sensors()[0], survey)
-    return build_world(scene, needs, make_plan(needs, settings), settings, survey)
+    return build_estimators(scene, needs, make_plan(needs, settings), settings, survey, pictures=True).direct
 
 
 def test_light_grid_against_exact_shadows():
@@ -95,10 +97,10 @@ def test_light_grid_against_exact_shadows():
     box, _ = smoke(rough_grid(1, shape=(16, 16, 16)))
     lamp, _ = sun([0.3, 0.2, -1.0])
     scene = close_up({"smoke": box, "lamp": lamp})
-    world = open_world(scene)
+    direct = open_direct(scene)
     with dr.suspend_grad():
-        grids = (build_transmittance_grid(scene, world, cells) for cells in (4, 1))
-        coarse, fine = (measure_transmittance_bias(scene, world, grid)[1] for grid in grids)
+        grids = (build_transmittance_grid(direct.media, direct.emitters, cells) for cells in (4, 1))
+        coarse, fine = (measure_transmittance_bias(direct.media, direct.emitters, grid)[1] for grid in grids)
     assert 0 < fine < 0.5 * coarse < 0.25
     exact, looked_up = (
         np.array(mi.render(scene, integrator=mi.load_dict(mivol(deterministic=True, shadows=s)), spp=16))
@@ -114,8 +116,9 @@ def test_light_grid_keeps_optical_depth_not_transmittance():
     lamp, _ = sun([0.0, 0.0, -1.0])
     scene = close_up({"smoke": box, "lamp": lamp})
     with dr.suspend_grad():
-        world = open_world(scene)
-        bias, rms = measure_transmittance_bias(scene, world, build_transmittance_grid(scene, world))
+        direct = open_direct(scene)
+        grid = build_transmittance_grid(direct.media, direct.emitters)
+        bias, rms = measure_transmittance_bias(direct.media, direct.emitters, grid)
     # Nodes in the faces look from 1e-5 of the box inside, where tau is up to 4e-5 off.
     assert abs(bias) <= rms <= 1e-4
 

@@ -11,8 +11,10 @@ import numpy as np
 import pytest
 from scattering_scenes import aimed, pencils, smoke, sun
 
+from mivol.scene.build import build_media
 from mivol.scene.needs import find_needs, survey_scene
-from mivol.scene.plan import build_world, make_plan
+from mivol.scene.plan import make_plan
+from mivol.transport.estimators.emitters import SceneEmitters
 from mivol.transport.estimators.visibility_cache import FLOOR, SHARE, build_visibility_cache
 from mivol.transport.path.settings import Settings
 from mivol.transport.traversal.coarse_grid import coarsen_grid
@@ -77,10 +79,12 @@ def test_weights_are_those_of_beer(shift, occupied):
     with dr.suspend_grad():
         needs = find_needs(seen.scene, seen.scene.sensors()[0], survey_scene(seen.scene))
         settings = Settings(max_depth=2)
-        world = build_world(seen.scene, needs, make_plan(needs, settings), settings, survey_scene(seen.scene))
+        media = build_media(seen.scene, needs, make_plan(needs, settings), survey_scene(seen.scene))
         blocks = np.array([(n >> shift) + 1 for n in SIZE])
         # As many rays as ask for this lattice and for none that is finer.
-        shade = build_visibility_cache(seen.scene, world, int(np.ceil(1.001 * blocks.prod() / SHARE)), occupied, coarsen_grid)
+        shade = build_visibility_cache(
+            media, SceneEmitters(seen.scene), int(np.ceil(1.001 * blocks.prod() / SHARE)), occupied, coarsen_grid
+        )
     assert shade.blocks == tuple(blocks)
     middle = ((np.arange(blocks[0]) << shift) + 0.5 * (1 << shift) - 0.5) / SIZE[0]
     depth = 2 * (1 - np.clip(middle, 0.25 / SIZE[0], 1 - 0.25 / SIZE[0]))

@@ -13,7 +13,7 @@ import pytest
 from scattering_scenes import PLACE, aimed, assert_same_images, close_up, mivol, point, rough_grid, smoke
 
 import scenes
-from mivol.scene.plan import explain
+from mivol.scene.explain import explain
 from mivol.transport.estimators import ratio_tracking
 from mivol.transport.estimators.ratio_tracking import residual_ratio_tracking
 from mivol.transport.media.grid_integral import integrate_segment
@@ -114,7 +114,7 @@ def test_variance_is_as_derived():
     # Two half voxels at the ends, of constant value; 2 / 7 of a length a cell.
     square = np.mean((1 - f) * low[:, None] ** 2 + f * high[:, None] ** 2, axis=1).sum() + 0.5 * (low[0] ** 2 + high[-1] ** 2)
     T = np.exp(-values[0, 0, :, 0].sum() * 2 / 7)
-    variance = T**2 * np.expm1(square * 2 / 7 / (ratio_tracking.KAPPA * 0.9))
+    variance = T**2 * np.expm1(square * 2 / 7 / (ratio_tracking.LOOKUP_RATE * 0.9))
     assert T > 3 * ratio_tracking.FAINT * 0.9
     # Roulette, and 2^19 samples know a variance to 0.3 %.
     assert found.var() == pytest.approx(variance, rel=0.03)
@@ -124,7 +124,7 @@ def test_variance_is_as_derived():
 def test_blocks_hold_all_nodes_of_their_cells(shape):
     values = np.random.default_rng(1).uniform(0, 5, (*shape, 3)).astype(np.float32)
     blocks = find_block_ranges(mi.TensorXf(values))
-    edge = 1 << ratio_tracking.SHIFT
+    edge = 1 << ratio_tracking.BLOCK_SHIFT
     assert blocks.res == tuple(-(-(n + 1) // edge) for n in shape)
     table = np.array(blocks.table).reshape(*blocks.res, 4)
     for index in np.ndindex(*blocks.res):

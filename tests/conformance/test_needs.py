@@ -11,8 +11,9 @@ import pytest
 
 import scenes
 from mivol.scene import plan
+from mivol.scene.explain import explain
 from mivol.scene.needs import find_needs
-from mivol.scene.plan import explain, make_plan
+from mivol.scene.plan import make_plan
 from mivol.transport.path.settings import Settings
 from scenes import ball_of, box_of, camera, grid_volume, medium, refused, sky
 

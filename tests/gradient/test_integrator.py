@@ -194,6 +194,7 @@ def test_gradient_where_prbvolpath_has_none():
 
 def test_replay_counts_down_to_zero():
     """The adjoint passes all the light by that the render found: what is left is rounding."""
+    from mivol.scene.build import build_estimators
     from mivol.scene.needs import find_needs, survey_scene
     from mivol.transport.path.scores import Primal, Replay
     from mivol.transport.path.settings import Settings
@@ -204,18 +205,18 @@ def test_replay_counts_down_to_zero():
     settings = Settings(max_depth=5)
     survey = survey_scene(scene)
     needs = find_needs(scene, sensor, survey)
-    world = plan.build_world(scene, needs, plan.make_plan(needs, settings), settings, survey)
+    estimators = build_estimators(scene, needs, plan.make_plan(needs, settings), settings, survey, pictures=False)
     sampler = sensor.sampler().clone()
     n = 2000
     position = mi.Point2f(np.random.default_rng(0).uniform(size=(2, n)).astype(np.float32))
     ray, _ = sensor.sample_ray(0, 0, position, mi.Point2f(0.5))
     with dr.suspend_grad():
         sampler.seed(3, n)
-        L = walk_path(scene, world, settings, sampler, ray, Primal(dr.zeros(mi.Spectrum, n)))[0].L
+        L = walk_path(estimators, settings, sampler, ray, Primal(dr.zeros(mi.Spectrum, n)))[0].L
         dr.eval(L)
         sampler.seed(3, n)
-        world.start_gradients()
-        left = walk_path(scene, world, settings, sampler, ray, Replay(L, dr.zeros(mi.Spectrum, n)))[0].L
+        estimators.media.start_gradients()
+        left = walk_path(estimators, settings, sampler, ray, Replay(L, dr.zeros(mi.Spectrum, n)))[0].L
     # Five additions and subtractions of float32 numbers of the size of L.
     assert np.abs(np.array(left)).max() <= 1e-6 * np.abs(np.array(L)).max()
     assert np.array(L).max() > 0.5
