@@ -18,6 +18,7 @@ from mivol.transport.estimators.emitters import SceneEmitters
 from mivol.transport.estimators.visibility_cache import FLOOR, SHARE, build_visibility_cache
 from mivol.transport.path.settings import Settings
 from mivol.transport.traversal.coarse_grid import coarsen_grid
+from mivol.transport.traversal.empty_blocks import find_empty_distances
 from scenes import centred, make_lattice
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
@@ -48,6 +49,14 @@ def test_coarse_grids_are_means_in_their_place(channels, shift):
     # A voxel is as wide as 2^shift: the far corner of the coarse grid is further out by what was repeated.
     far = TWO @ [*(edge * m / n for m, n in zip(sizes[::-1], SIZE[::-1], strict=True)), 1]
     np.testing.assert_allclose(coarse.lattice.to_world @ np.ones(4), far, rtol=1e-12)
+
+
+@pytest.mark.parametrize("skip", [False, True])
+def test_coarse_grids_skip_what_is_empty_where_the_fine_one_does(skip):
+    coarse = coarsen_grid(make_lattice(mi.TensorXf(sparse(1)), TWO, skip), 1, False).lattice
+    assert (coarse.empty_distances is not None) == skip
+    if skip:
+        assert np.array_equal(np.array(coarse.empty_distances), np.array(find_empty_distances(coarse.values)))
 
 
 @pytest.mark.parametrize("shift", [0, 1, 2, 3])

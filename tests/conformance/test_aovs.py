@@ -313,8 +313,8 @@ def test_a_sample_of_a_nested_integrator():
     o, d = rays(5)
     ray = mi.Ray3f(mi.Point3f(o.T.astype(np.float32)), mi.Vector3f(d.T.astype(np.float32)))
     sampler.seed(0, 5)
-    L, _, aovs = integrator.sample(scene, sampler, ray)
-    assert len(aovs) == 2
+    L, _, aovs, state = integrator.sample(scene, sampler, ray)
+    assert len(aovs) == 2 and state is None
     assert np.array(dr.exp(-aovs[0])) == pytest.approx(np.array(L.x), rel=8 * EPS)
     masked = integrator.sample(scene, sampler, ray, None, mi.Bool([True, False, True, True, False]))[2]
     assert np.array_equal(np.array(masked[0]) == 0, [False, True, False, False, True])
@@ -371,10 +371,8 @@ def test_two_grids_that_differ_are_refused_for_depth_only():
     image, o, d = see(parts, *rays(3), "tau,alpha")
     tau = tau_twin(grid(11), CUBE, o, d) + tau_twin(grid(12, shape=(4, 4, 4)), CUBE, o, d)
     assert image[:, :1] == pytest.approx(tau, rel=1e-5)
-    with pytest.raises(RuntimeError) as wrapped:
-        see(parts, *rays(3), "depth")
     with pytest.raises(MivolError, match="depth was asked for and a medium sums grids"):
-        raise wrapped.value.__cause__
+        see(parts, *rays(3), "depth")
 
 
 @pytest.mark.parametrize(("aovs", "match"), [("tau,taau", "did you mean"), ("tau, depth, tau", "2 times")])

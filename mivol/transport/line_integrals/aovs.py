@@ -21,6 +21,7 @@ from mivol.transport.line_integrals.expected_depth import integrate_expected_dep
 from mivol.transport.media.optical_depth import integrate_optical_depth, jvp_rows, vjp_rows
 from mivol.transport.media.ray_intervals import RaySegment, SegmentEnd
 from mivol.transport.media.scene_media import SceneMedia
+from mivol.transport.traversal.ray_spawning import camera_ray
 
 __all__ = ["AOVS", "integrate_aovs", "jvp_aovs", "vjp_aovs"]
 
@@ -110,7 +111,7 @@ def vjp_aovs(media: SceneMedia, ray: mi.Ray3f, names: tuple[str, ...], daovs: li
 
 def _find_first_segment(media: SceneMedia, ray: mi.Ray3f, active: mi.Bool) -> _FirstSegment:
     """Carry rays to the first opaque surface or out of the scene."""
-    ray = mi.Ray3f(ray.o, ray.d, dr.inf, ray.time, ray.wavelengths)
+    ray = camera_ray(ray)
     medium = media.medium_at(ray)
     end, tau = integrate_optical_depth(media, ray, medium, mi.Bool(active))
     stopped = end.si.is_valid()

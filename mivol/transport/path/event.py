@@ -22,18 +22,20 @@ class PathEvent:
 
     Attributes:
         si: the surface; not valid where the path has left the scene.
+        t: length of the segment.
         medium: what surrounds the end.
         at_surface: lanes that have met a surface; the others have escaped or ended before.
     """
 
     si: mi.SurfaceInteraction3f
+    t: mi.Float
     medium: mi.MediumPtr
     at_surface: mi.Bool
 
     @classmethod
     def of(cls, end: SegmentEnd, active: mi.Bool) -> PathEvent:
         """The event at the end of a segment."""
-        return cls(end.si, end.medium, active & end.si.is_valid())
+        return cls(end.si, end.t, end.medium, active & end.si.is_valid())
 
     def vertex(self, media: SceneMedia, ray: mi.Ray3f) -> SurfaceVertex:
         """The surface as a vertex that may turn the path."""

@@ -32,7 +32,7 @@ from mivol.transport.path.estimators import Estimators
 from mivol.transport.path.event import PathEvent
 from mivol.transport.path.scores import Primal, Replay, Tangent
 from mivol.transport.path.settings import Settings
-from mivol.transport.traversal.ray_spawning import spawn_ray
+from mivol.transport.traversal.ray_spawning import camera_ray, spawn_ray
 from mivol.transport.traversal.strata import Strata
 
 __all__ = ["Path", "is_straight", "walk_path"]
@@ -95,7 +95,7 @@ def walk_path(
     limit = settings.max_depth if settings.max_depth >= 0 else UNLIMITED
     visible = not settings.hide_emitters and media.scene.environment() is not None
     path = Path(
-        ray=mi.Ray3f(ray.o, ray.d, dr.inf, ray.time, ray.wavelengths),
+        ray=camera_ray(ray),
         medium=media.medium_at(ray),
         beta=dr.full(mi.Spectrum, 1, n),
         eta=dr.full(mi.Float, 1, n),
@@ -179,12 +179,16 @@ def _turn(estimators: Estimators, settings: Settings, limit: int, path: Path, ev
     u1, u2 = sampler.next_1d(on_surface), sampler.next_2d(on_surface)
     sample, f_over_pdf = vertex.bsdf.sample(mi.BSDFContext(), si, u1, u2, on_surface)
     through = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Null)
-    on = on_surface & (may_scatter | through) & (sample.pdf > 0)
+    # A direction of density 0 has the weight 0, and its path ends below.
+    on = on_surface & (may_scatter | through)
     turned = on & ~through
     path.score = path.score.scale(_bsdf_factor(vertex, sample.wo, turned))
     path.beta *= dr.select(on, f_over_pdf, 0)
     path.eta *= dr.select(on, sample.eta, 1)
+    rest = path.ray.maxt - event.t
     path.ray = spawn_ray(si, si.to_world(sample.wo), media.size)
+    # A ray that goes straight on ends where it was to end.
+    path.ray.maxt = dr.select(through, dr.minimum(rest, path.ray.maxt), path.ray.maxt)
     path.medium = dr.select(on & si.is_medium_transition(), si.target_medium(path.ray.d), path.medium)
     path.last = dr.select(turned, mi.Interaction3f(si), path.last)
     path.pdf = dr.select(turned, sample.pdf, path.pdf)

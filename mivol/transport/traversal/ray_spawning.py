@@ -5,7 +5,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-__all__ = ["distance_along", "spawn_ray"]
+__all__ = ["camera_ray", "distance_along", "spawn_ray"]
 
 
 def distance_along(ray: mi.Ray3f, hit: mi.SurfaceInteraction3f) -> mi.Float:
@@ -31,3 +31,9 @@ def spawn_ray(si: mi.SurfaceInteraction3f, d: mi.Vector3f, size: mi.Float) -> mi
     ray = si.spawn_ray(d)
     ray.o = si.p + si.n * dr.mulsign(step, dr.dot(si.n, d))
     return ray
+
+
+def camera_ray(ray: mi.Ray3f) -> mi.Ray3f:
+    """A ray of a sensor, which ends where the sensor ends it: at its ``far_clip``; without an end where that is not finite."""
+    end = dr.select(ray.maxt < dr.largest(mi.Float), ray.maxt, dr.inf)
+    return mi.Ray3f(ray.o, ray.d, end, ray.time, ray.wavelengths)
