@@ -14,6 +14,8 @@ ORDER = [
     *("transport", "tomography", "scene", "plugins", "optim", "validate", "report", "config", "doctor", "experiments"),
     *("bench", "cli", "__main__"),
 ]
+INSIDE = {"transport": ["traversal", "media", "estimators", "line_integrals", "path"]}
+"""Rooms with rooms of their own, lowest first: a module there imports its own room and those before it."""
 STARTS_THREADS = {"threading", "multiprocessing", "subprocess", "concurrent", "_thread", "asyncio"}
 STARTS_NOTHING = {
     *("subprocess.SubprocessError", "subprocess.TimeoutExpired", "threading.current_thread", "threading.main_thread"),
@@ -66,6 +68,53 @@ def test_nothing_imports_the_benches() -> None:
         path.name for path, room in rooms.items() if room != "bench" for name, _ in imported(path) if "mivol.bench" in name
     ]
     assert found == []
+
+
+@pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(PACKAGE)))
+def test_imports_point_up_inside_a_room(path: Path) -> None:
+    assert wrong_arrows_inside(path.relative_to(PACKAGE).parts, imported(path)) == []
+
+
+def wrong_arrows_inside(parts: tuple[str, ...], names: Iterable[tuple[str, int]]) -> list[str]:
+    """Imports of an inner room that stands behind the module's own, or of one that INSIDE does not know."""
+    if len(parts) < 3 or parts[0] not in INSIDE:
+        return []
+    order, wrong = INSIDE[parts[0]], []
+    for name, line in names:
+        target = name.split(".")
+        if target[:2] == ["mivol", parts[0]] and target[2] not in order[: order.index(parts[1]) + 1]:
+            wrong.append(f"line {line}: {name}")
+    return wrong
+
+
+def circles(edges: dict[str, set[str]]) -> list[str]:
+    """Modules that can be reached from themselves along imports."""
+    found = []
+    for start in edges:
+        seen, ahead = set(), list(edges[start])
+        while ahead:
+            module = ahead.pop()
+            if module not in seen:
+                seen.add(module)
+                ahead += edges.get(module, ())
+        found += [start] if start in seen else []
+    return found
+
+
+def test_no_circle_of_imports() -> None:
+    """Imports for types alone count: who needs them cannot be read without the others."""
+    modules = {".".join(("mivol", *path.relative_to(PACKAGE).with_suffix("").parts)): path for path in MODULES}
+    edges = {}
+    for module, path in modules.items():
+        names = {name for name, _ in imported(path)}
+        edges[module] = {m for m in modules if m != module and (m in names or any(n.rpartition(".")[0] == m for n in names))}
+    assert circles(edges) == []
+
+
+def test_circles_are_seen() -> None:
+    assert circles({"a": {"b"}, "b": {"c"}, "c": {"b"}, "d": {"a"}}) == ["b", "c"]
+    names = [("mivol.transport.path.walk.Path", 1), ("mivol.transport.media.body.Body", 2), ("mivol.fields.sky", 3)]
+    assert wrong_arrows_inside(("transport", "estimators", "segment.py"), names) == ["line 1: mivol.transport.path.walk.Path"]
 
 
 @pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(PACKAGE)))
