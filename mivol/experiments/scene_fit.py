@@ -26,8 +26,9 @@ from mivol.optim.shots import Shot, make_shots
 from mivol.report.page import write_page
 from mivol.report.record import Choice, RunRecord
 from mivol.scene.load import LoadedScene, load_scene
-from mivol.scene.needs import find_needs, survey_scene
+from mivol.scene.needs import find_needs
 from mivol.scene.plan import make_plan
+from mivol.scene.survey import survey_scene
 from mivol.transport.path.settings import Settings
 from mivol.validate.statistics import nrmse, psnr
 

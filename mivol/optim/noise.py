@@ -26,8 +26,9 @@ import mitsuba as mi
 
 from mivol.errors import MivolError
 from mivol.optim.losses import Loss
-from mivol.scene.needs import is_scattering, survey_scene
+from mivol.scene.readings import is_scattering
 from mivol.scene.session import Session
+from mivol.scene.survey import survey_scene
 from mivol.transport.media.read_medium import view_medium
 
 NOTABLE = 0.05

@@ -5,8 +5,10 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from mivol.scene.needs import Needs, Survey, read_block_ranges, read_coarse, read_empty_distances
+from mivol.scene.facts import Needs
 from mivol.scene.plan import Plan
+from mivol.scene.readings import read_block_ranges, read_coarse, read_empty_distances
+from mivol.scene.survey import Survey
 from mivol.transport.estimators.direct_lighting import DirectLighting
 from mivol.transport.estimators.emitters import SceneEmitters
 from mivol.transport.estimators.transmittance_grid import build_transmittance_grid

@@ -10,11 +10,14 @@ import mitsuba as mi
 import numpy as np
 
 from mivol.scene.build import build_media
+from mivol.scene.choices import is_lit, shares_cells
 from mivol.scene.depth_two import depth_two_error, mean_albedo, mean_cosine, scattering_depth
+from mivol.scene.facts import Needs
 from mivol.scene.load import find_sensor
-from mivol.scene.needs import Needs, find_needs, survey_scene
+from mivol.scene.needs import find_needs
 from mivol.scene.nesting import bounds
-from mivol.scene.plan import Plan, is_lit, make_plan, shares_cells
+from mivol.scene.plan import Plan, make_plan
+from mivol.scene.survey import survey_scene
 from mivol.transport.estimators.emitters import SceneEmitters
 from mivol.transport.estimators.transmittance_grid import build_transmittance_grid, measure_transmittance_bias
 from mivol.transport.media.box import Box

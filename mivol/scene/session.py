@@ -15,8 +15,10 @@ from mivol.errors import MivolError
 from mivol.scene.build import build_estimators
 from mivol.scene.derived import renew, tangents_led
 from mivol.scene.load import find_sensor
-from mivol.scene.needs import Survey, find_needs, survey_scene
-from mivol.scene.plan import Plan, check_aovs, make_plan
+from mivol.scene.needs import find_needs
+from mivol.scene.plan import Plan, make_plan
+from mivol.scene.refusals import check_aovs
+from mivol.scene.survey import Survey, survey_scene
 from mivol.transport.line_integrals.aovs import integrate_aovs, jvp_aovs, vjp_aovs
 from mivol.transport.path.estimators import Estimators
 from mivol.transport.path.film import CameraRays, adjoint_rays, record

@@ -9,8 +9,9 @@ import pytest
 from scattering_scenes import PLACE, close_up, point, smoke
 
 from mivol.scene.build import build_estimators
-from mivol.scene.needs import find_needs, survey_scene
+from mivol.scene.needs import find_needs
 from mivol.scene.plan import make_plan
+from mivol.scene.survey import survey_scene
 from mivol.transport.estimators.grid_control import CameraOrigins, GridControl, build_grid_control
 from mivol.transport.path.settings import Settings
 

@@ -9,8 +9,9 @@ import pytest
 from scattering_scenes import close_up, point, smoke
 
 from mivol.scene.build import build_media
-from mivol.scene.needs import find_needs, survey_scene
+from mivol.scene.needs import find_needs
 from mivol.scene.plan import make_plan
+from mivol.scene.survey import survey_scene
 from mivol.transport.estimators.distance_reservoir import Candidate
 from mivol.transport.estimators.distance_sampling import sample_distance
 from mivol.transport.path.settings import Settings

@@ -16,8 +16,9 @@ from scattering_scenes import PLACE, aimed, close_up, fog, mivol, pencils, point
 
 from mivol.scene.build import build_estimators
 from mivol.scene.explain import explain
-from mivol.scene.needs import find_needs, survey_scene
+from mivol.scene.needs import find_needs
 from mivol.scene.plan import make_plan
+from mivol.scene.survey import survey_scene
 from mivol.transport.estimators.transmittance_grid import build_transmittance_grid, measure_transmittance_bias
 from mivol.transport.path.settings import Settings
 from scenes import as_float32, box_of, centred, grid_volume, refused, sky

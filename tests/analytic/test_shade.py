@@ -12,8 +12,9 @@ import pytest
 from scattering_scenes import aimed, pencils, smoke, sun
 
 from mivol.scene.build import build_media
-from mivol.scene.needs import find_needs, survey_scene
+from mivol.scene.needs import find_needs
 from mivol.scene.plan import make_plan
+from mivol.scene.survey import survey_scene
 from mivol.transport.estimators.emitters import SceneEmitters
 from mivol.transport.estimators.visibility_cache import FLOOR, SHARE, build_visibility_cache
 from mivol.transport.path.settings import Settings

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 import scenes
-from mivol.scene.needs import Survey, is_scattering
+from mivol.scene.readings import is_scattering
+from mivol.scene.survey import Survey
 from mivol.transport.media.box import box_of_cube
 from mivol.transport.media.read_medium import place_of_grid, view_medium
 from scenes import FRAMES, box_of, camera, grid_volume, medium, refused, render, sky

@@ -195,7 +195,8 @@ def test_gradient_where_prbvolpath_has_none():
 def test_replay_counts_down_to_zero():
     """The adjoint passes all the light by that the render found: what is left is rounding."""
     from mivol.scene.build import build_estimators
-    from mivol.scene.needs import find_needs, survey_scene
+    from mivol.scene.needs import find_needs
+    from mivol.scene.survey import survey_scene
     from mivol.transport.path.scores import Primal, Replay
     from mivol.transport.path.settings import Settings
     from mivol.transport.path.walk import walk_path

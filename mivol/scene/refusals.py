@@ -1,0 +1,126 @@
+"""What cannot be rendered is refused here, in a sentence, before a kernel runs."""
+
+from __future__ import annotations
+
+import difflib
+
+import mitsuba as mi
+import numpy as np
+
+from mivol.errors import MivolError
+from mivol.scene.choices import is_lit, shares_cells
+from mivol.scene.facts import Needs
+from mivol.transport.line_integrals.aovs import AOVS
+from mivol.transport.media.medium_view import MediumView
+from mivol.transport.media.summed_extinction import share_cells
+from mivol.transport.path.settings import Settings
+
+__all__ = ["check_aovs", "refuse_emission", "refuse_places", "refuse_quadrature", "refuse_refraction", "refuse_scattering"]
+
+
+SHADOWS = ("auto", "exact", "estimated", "grid")
+"""How light from lamps is dimmed: ``grid`` for quadrature only, ``estimated`` for pictures that are drawn; ``auto`` chooses."""
+
+
+def check_aovs(names: str) -> tuple[str, ...]:
+    """Split a comma list of AOVs.
+
+    Raises:
+        MivolError: a name that is not in :data:`mivol.transport.line_integrals.aovs.AOVS`, or one given twice.
+    """
+    asked = tuple(n.strip() for n in names.split(",") if n.strip())
+    for name in asked:
+        if name not in AOVS:
+            near = difflib.get_close_matches(name, AOVS, 1, 0.0)[0]
+            raise MivolError(f"aovs asks for {name!r}; mivol has {', '.join(AOVS)} (did you mean {near!r}?).")
+        if asked.count(name) > 1:
+            raise MivolError(f"aovs asks for {name!r} {asked.count(name)} times; a film has one channel of a name: ask once.")
+    return asked
+
+
+def refuse_scattering(needs: Needs, settings: Settings) -> None:
+    for medium in needs.media:
+        if medium.is_scattering and not medium.unread and settings.max_depth not in (0, 1, 2):
+            raise MivolError(
+                f"the medium in {medium.name} scatters (its albedo is above 0) and max_depth is {settings.max_depth}; mivol "
+                "renders one scattering so far: set max_depth to 2, to 1 (what is seen through the medium), or the albedo to 0."
+            )
+
+
+def refuse_refraction(needs: Needs, settings: Settings) -> None:
+    if needs.refractive and settings.max_depth == 2 and any(m.is_scattering for m in needs.media):
+        raise MivolError(
+            f"the boundary {needs.refractive[0]} refracts and its scene has a medium that scatters; no straight shadow ray "
+            "reaches a lamp through it: make the boundary's BSDF null, set max_depth to 1, or the albedo to 0."
+        )
+
+
+def refuse_emission(needs: Needs, settings: Settings) -> None:
+    glowing = [m.name for m in needs.media if m.emits]
+    if glowing and is_lit(needs, settings):
+        raise MivolError(
+            f"the medium in {glowing[0]} emits and a medium of its scene scatters at max_depth 2; the light of one that is "
+            "scattered by the other is not there yet: set max_depth to 1, or the albedo to 0."
+        )
+    for facts, view in zip(needs.media, needs.views, strict=True):
+        if isinstance(view.emission_density, mi.Volume) and not share_cells(view.walked_lattice, view.emission_lattice):
+            raise MivolError(
+                f"the emission_density of the medium in {facts.name} has {view.emission_lattice.res} voxels (Z, Y, X) and its "
+                f"extinction {view.walked_lattice.res}, or they lie in different places; it is summed in the cells of the "
+                "extinction: give both the same resolution and to_world."
+            )
+        for name, volume in (("emission", view.emission), ("albedo", view.albedo)) if view.emission is not None else ():
+            least = _voxel_over_cells(volume, view) if isinstance(volume, mi.Volume) else 1.0
+            if least < 1 - 1e-4:  # the place of a stock grid is known to 5e-6
+                led = any(p.lattice is not None for p in view.parts)
+                whose, advice = ("extinction", ", or give it as a number") if led else ("emission_density", "")
+                raise MivolError(
+                    f"the {name} of the medium in {facts.name} varies over lengths of {least:.2g} of its {whose}'s cells, "
+                    f"which are looked at in two points; resample the {whose} to voxels as small{advice}."
+                )
+
+
+def _voxel_over_cells(volume: mi.Volume, view: MediumView) -> float:
+    """A voxel of a volume over the longest edge of a cell that is walked, both as the volume counts lengths."""
+    cells = view.walked_lattice
+    place = volume.mivol_to_world if hasattr(volume, "mivol_to_world") else view.stock_boxes[volume.ptr].to_world
+    edges = cells.to_world[:3, :3] / np.array(cells.res[::-1])
+    voxels = np.linalg.solve(place[:3, :3], edges) * np.array(volume.resolution(), dtype=np.float64)[:, None]
+    return 1 / float(np.linalg.norm(voxels, axis=0).max())
+
+
+def refuse_places(needs: Needs) -> None:
+    if needs.places:
+        raise MivolError(
+            f"the derivative of {needs.places[0]} was asked for; mivol has none of shapes, of lamps that have a size, nor of "
+            "cameras: take that of a point, spot or directional light, or finite differences."
+        )
+
+
+def refuse_quadrature(needs: Needs, settings: Settings) -> None:
+    if settings.shadows not in SHADOWS:
+        raise MivolError(f"shadows is {settings.shadows!r}; {', '.join(SHADOWS[:-1])} or {SHADOWS[-1]} is expected.")
+    if settings.shadows == "estimated" and settings.deterministic:
+        raise MivolError("shadows is 'estimated' and deterministic is set: estimates are noise; set shadows to exact or grid.")
+    if settings.shadows == "grid" and not settings.deterministic:
+        raise MivolError("shadows is 'grid' without deterministic, and drawn light has exact shadows: set deterministic too.")
+    if not settings.deterministic or not is_lit(needs, settings):
+        return
+    other = [kind for kind, lamp in zip(needs.emitters, needs.lamps, strict=True) if lamp != "sharp"]
+    if other:
+        raise MivolError(
+            f"deterministic is set and the scene has a {other[0]}; quadrature is for lamps of one position or direction "
+            "(point, spot, directional): leave deterministic out."
+        )
+    if len(needs.media) > 1 or not shares_cells(needs):
+        grids = sum(len(m.resolutions) for m in needs.media)
+        raise MivolError(
+            f"deterministic is set and the scene has {len(needs.media)} media with {grids} grids of extinction; quadrature is "
+            "for one medium whose grids share their cells: leave deterministic out."
+        )
+    constant = next((part.name for part in needs.views[0].parts if part.lattice is None), None)
+    if settings.shadows == "grid" and constant is not None:
+        raise MivolError(
+            f"shadows is 'grid' and {constant} of the medium in {needs.media[0].name} is a constant, which may fill more than "
+            "the cells that shadows are looked up in: set shadows to exact."
+        )

@@ -1,0 +1,125 @@
+"""What does not change while shapes stay where they are: boundaries, surfaces, emitters, found once for each scene."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
+
+import drjit as dr
+import mitsuba as mi
+
+from mivol.errors import MivolError
+from mivol.scene.facts import Boundary
+from mivol.scene.nesting import Room, extent, nesting_fault, room_of
+from mivol.transport.estimators.emitters import UNIFORM
+from mivol.transport.media.box import box_of_cube
+
+__all__ = ["AROUND", "Survey", "find_around", "is_instance", "survey_scene"]
+
+
+AROUND = "space around shapes"
+
+
+@dataclass
+class Survey:
+    """What does not change while shapes stay where they are: found once, with what was read of each array.
+
+    ``marks`` tells where boundaries were: shapes, and what another place would change of them; ``size`` is that of the scene.
+    """
+
+    boundaries: tuple[Boundary, ...]
+    surfaces: tuple[str, ...]
+    has_null_transmission: bool
+    emitters: tuple[str, ...]
+    lamps: tuple[str, ...]
+    refractive: tuple[str, ...]
+    marks: tuple[tuple[mi.Shape, object], ...] = ()
+    size: float = 1.0
+    looked_up: set = field(default_factory=set)
+    scatters: dict = field(default_factory=dict)
+    values: dict = field(default_factory=dict)
+    places: dict = field(default_factory=dict)
+    numbers: dict = field(default_factory=dict)
+    warned: set = field(default_factory=set)
+
+    @property
+    def is_current(self) -> bool:
+        """Whether no boundary has been moved since. What ``dr.freeze`` records stays where it is."""
+        return dr.flag(dr.JitFlag.FreezingScope) or all(_is_at(shape, mark) for shape, mark in self.marks)
+
+
+def survey_scene(scene: mi.Scene) -> Survey:
+    """Find the media, surfaces and emitters of a scene.
+
+    Raises:
+        MivolError: boundaries that do not agree which medium lies between them.
+    """
+    boundaries, surfaces, refractive, veiled = [], [], [], False
+    shapes = scene.shapes()
+    rooms = {s.ptr: room_of(s) for s in shapes if s.is_medium_transition()}
+    for index, shape in enumerate(shapes):
+        if shape.is_medium_transition():
+            name = shape.id() or f"shape {index}"
+            if shape.interior_medium() is not None:
+                boundaries.append(_boundary(shape, name, rooms))
+            if int(shape.bsdf().flags()) & (int(mi.BSDFFlags.DeltaTransmission) | int(mi.BSDFFlags.GlossyTransmission)):
+                refractive.append(f"{name} ({shape.bsdf().class_name()})")
+        if not _is_bare(shape):
+            surfaces.append(shape.class_name())
+            # What an instance shows has other BSDFs than its own.
+            veiled |= is_instance(shape) or mi.has_flag(shape.bsdf().flags(), mi.BSDFFlags.Null)
+    kinds = tuple(e.class_name() for e in scene.emitters())
+    # Mitsuba makes one object of equal media: where one boundary has to be traced, all boundaries of that medium are.
+    traced = {b.medium.ptr for b in boundaries if b.box is None}
+    boundaries = [replace(b, box=None) if b.medium.ptr in traced else b for b in boundaries]
+    boxed = {b.medium.ptr for b in boundaries if b.box is not None}
+    edges = [s for s in shapes if s.is_medium_transition() and not (s.interior_medium() and s.interior_medium().ptr in boxed)]
+    fault = None if dr.flag(dr.JitFlag.FreezingScope) else nesting_fault(scene, edges)
+    if fault is not None:
+        raise MivolError(fault)
+    boundaries += find_around([o for o in mi.traverse(scene).hierarchy if isinstance(o, mi.Medium)], boundaries)
+    lamps = tuple(_lamp(e) for e in scene.emitters())
+    marks = tuple((s, _mark(s)) for s in shapes if s.is_medium_transition())
+    return Survey(tuple(boundaries), tuple(surfaces), bool(veiled), kinds, lamps, tuple(refractive), marks, extent(scene))
+
+
+def _mark(shape: mi.Shape) -> object:
+    """What another place would change of a shape: the array of a mesh's vertices, else its box."""
+    params = mi.traverse(shape)
+    # A rectangle is a mesh that keeps its vertices to itself.
+    if "vertex_positions" in params:
+        return dr.detach(params["vertex_positions"])
+    return [*shape.bbox().min, *shape.bbox().max]
+
+
+def _is_at(shape: mi.Shape, mark: object) -> bool:
+    now = _mark(shape)
+    return now == mark if isinstance(mark, list) else now.index == mark.index
+
+
+def _lamp(emitter: mi.Emitter) -> str:
+    if emitter.class_name() == UNIFORM:
+        return "uniform"
+    return "sharp" if int(emitter.flags()) & int(mi.EmitterFlags.Delta) else "wide"
+
+
+def _is_bare(shape: mi.Shape) -> bool:
+    """Whether a shape is nothing but a boundary."""
+    bsdf = shape.bsdf()
+    return bsdf is not None and int(bsdf.flags()) & int(mi.BSDFFlags.All) == int(mi.BSDFFlags.Null) and not shape.is_emitter()
+
+
+def is_instance(shape: mi.Shape) -> bool:
+    return shape.class_name() == "Instance"
+
+
+def _boundary(shape: mi.Shape, name: str, rooms: dict[int, Room]) -> Boundary:
+    alone = not any(room.shares(rooms[shape.ptr]) for other, room in rooms.items() if other != shape.ptr)
+    is_box = shape.class_name() == "Cube" and shape.exterior_medium() is None and _is_bare(shape) and alone
+    return Boundary(shape.interior_medium(), name, shape.class_name(), box_of_cube(shape) if is_box else None)
+
+
+def find_around(media: Iterable[mi.Medium], boundaries: Sequence[Boundary]) -> list[Boundary]:
+    """Those of some media that fill no shape of their own: found on the way, by the surfaces around them."""
+    held = {b.medium.ptr for b in boundaries}
+    return [Boundary(m, m.id() or "a medium without an id", AROUND, None) for m in media if m.ptr not in held]
