@@ -1,4 +1,4 @@
-"""A path segment whose media emit: their light by a sweep from its far end, with what they let through."""
+"""A path segment whose media emit: emission-absorption compositing, with its derivatives."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ __all__ = ["Emission"]
 
 
 class Emission:
-    """Media emit and take light away, without scattering.
+    """The segment estimator for media that emit and absorb, without scattering.
 
     Bias and cost: as :func:`mivol.transport.line_integrals.emission.integrate_emission`. Variance: none.
     """
@@ -37,9 +37,10 @@ class Emission:
         self.media = media
 
     def draw(self, sampler: mi.Sampler, active: mi.Bool, strata: Strata | None) -> Any:
-        """Nothing is random."""
+        """Draw nothing: the estimate is deterministic."""
 
     def estimate(self, segment: PathSegment, purpose: str, active: mi.Bool) -> SegmentEstimate:
+        """Follow a segment to its end and sum its emission, for the purpose PICTURE, REVERSE or FORWARD."""
         media = self.media
         end, _ = visit_media(media, segment.ray, segment.medium, lambda state, *_: state, mi.Float(0), active)
         passed = RaySegment(segment.ray, segment.medium, end.t)
@@ -52,7 +53,10 @@ class Emission:
 
 @dataclass
 class _EmittingSegment:
-    """A segment and its composite; the rows of the light are followed by those of its tangent, where that is asked for."""
+    """A segment with its composite: the derivatives of its light and of its transmittance (a ``SharedSegment``).
+
+    The rows of the composite are the light of each colour; those of its tangent follow, where it is asked for.
+    """
 
     media: SceneMedia
     segment: PathSegment
@@ -62,12 +66,12 @@ class _EmittingSegment:
     dL: mi.Spectrum | None = None
 
     def rows(self, block: int) -> mi.Spectrum:
-        """The light of each colour (block 0), or its tangent (block 1)."""
+        """The light (block 0), or its tangent (block 1)."""
         k = dr.size_v(mi.Spectrum)
         return mi.Spectrum(*self.composite.N[block * k : (block + 1) * k])
 
     def vjp_light(self, dL: mi.Spectrum) -> None:
-        """One sweep serves the light and the transmittance: it waits for the light behind."""
+        """Do nothing yet: the sweep in :meth:`vjp` finds the derivatives of light and transmittance together."""
 
     def vjp(self, dlog: mi.Spectrum) -> None:
         vjp_emission(self.media, self.passed, self.composite, self.dL * self.segment.beta, dlog, self.active)

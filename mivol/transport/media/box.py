@@ -1,4 +1,4 @@
-"""Boundaries that are boxes: parallelepipeds, which a ray is cut to by a slab test."""
+"""Boundaries that are boxes (parallelepipeds), which rays are cut to by a slab test instead of being traced."""
 
 from __future__ import annotations
 
@@ -18,9 +18,10 @@ class Box:
     to_world: np.ndarray
 
     def rows(self) -> list[list[mi.Float64]]:
-        """The (3, 4) map from the world to the unit cube, as arrays: boxes in other places share one kernel.
+        """The (3, 4) map from the world to the unit cube, as opaque arrays, so that boxes in other places share one kernel.
 
-        Made anew for each render: an array that is older than a recording of ``dr.freeze`` could not take part in it.
+        They are made anew for each render: ``dr.freeze`` cannot record a function that uses arrays made before the recording
+        without being passed to it.
         """
         return [[dr.opaque(mi.Float64, float(v)) for v in row] for row in np.linalg.inv(self.to_world)[:3]]
 
@@ -38,12 +39,12 @@ class Box:
         """Whether another box has the same corners, to ``tolerance`` of its size."""
         theirs = Box(other).corners()
         size = np.ptp(theirs, axis=0).max()
-        empty_distances = np.linalg.norm(self.corners()[:, None] - theirs[None], axis=-1).min(axis=1)
-        return bool(empty_distances.max() <= tolerance * size)
+        apart = np.linalg.norm(self.corners()[:, None] - theirs[None], axis=-1).min(axis=1)
+        return bool(apart.max() <= tolerance * size)
 
 
 def box_of_cube(shape: mi.Shape) -> Box:
-    """The box of a ``cube`` shape, from its vertices. Reads them: not inside ``dr.freeze``."""
+    """The box of a ``cube`` shape. It reads the vertices on the host, which is not possible inside ``dr.freeze``."""
     world = _vertices(shape)
     unit = (_vertices(mi.load_dict({"type": "cube"})) + 1) / 2
     fit, *_ = np.linalg.lstsq(np.c_[unit, np.ones(len(unit))], world, rcond=None)

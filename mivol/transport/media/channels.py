@@ -1,7 +1,7 @@
-"""Colours of media: an extinction is grey (1 channel) or rgb (3), the media of a scene have the larger number.
+"""Channels of extinction: grey (1) or rgb (3) for a medium; for a scene, the larger number among its media.
 
-Conventions. Rows are lists of one ``Float`` for each channel. A grey medium counts in every channel of an rgb scene; its
-derivative is the sum over channels. In a mono variant an rgb medium counts by its luminance.
+Conventions. Rows are lists of one ``Float`` for each channel. A grey medium has the same value in every channel of an rgb
+scene, so its derivative is the sum over the channels. In a mono variant an rgb medium is replaced by its luminance.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ __all__ = ["as_rows", "by_channel", "colours", "for_part", "spectrum", "tangent_
 
 
 LUMINANCE = (0.212671, 0.715160, 0.072169)
-"""Share of each channel of an rgb field in the one channel of a mono variant (ITU-R BT.709, as in Mitsuba)."""
+"""Weight of each channel of an rgb field in the one channel of a mono variant (luminance, ITU-R BT.709, as in Mitsuba)."""
 
 
 def spectrum(rows: list[mi.Float]) -> mi.Spectrum:
@@ -24,18 +24,19 @@ def spectrum(rows: list[mi.Float]) -> mi.Spectrum:
 def tangent_of(value: mi.Spectrum) -> mi.Spectrum:
     """The tangent of a value that was computed from parameters; 0 where none of them has one.
 
-    The tangents that it reads are kept: other points and passes read them again.
+    Only the edges of the graph are cleared, and the tangents of the parameters are kept, since other points and passes read
+    them again.
     """
     return dr.forward_to(value, flags=dr.ADFlag.ClearEdges) if dr.grad_enabled(value) else dr.zeros(type(value))
 
 
 def colours(value: mi.Spectrum) -> list[mi.Float]:
-    """The numbers of a spectrum, one for each colour."""
+    """The components of a spectrum as a list."""
     return [value[c] for c in range(dr.size_v(value))]
 
 
 def by_channel(value: mi.Spectrum, channels: int) -> list[mi.Float]:
-    """The derivative of each channel of the extinction from that of each colour: a grey one gets the sum."""
+    """Derivatives by the channels of an extinction, from those by the components of a spectrum: a grey one gets the sum."""
     parts = colours(value)
     return parts if len(parts) == channels else [sum(parts[1:], parts[0])]
 
@@ -53,7 +54,7 @@ def _grey(rows: list[mi.Float]) -> list[mi.Float]:
 
 
 def for_part(weight: list[mi.Float], channels: int) -> list[mi.Float]:
-    """The derivative of each channel of a part: its own, the sum for a grey part, the share in the grey of a mono variant."""
+    """Derivatives by the channels of a part, from those by the channels of the scene: the transpose of :func:`as_rows`."""
     if len(weight) == channels:
         return weight
     return [sum(weight)] if channels == 1 else [share * weight[0] for share in LUMINANCE]

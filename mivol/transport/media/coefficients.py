@@ -11,7 +11,7 @@ __all__ = ["eval_albedo", "medium_interaction"]
 
 
 def medium_interaction(ray: mi.Ray3f, t: mi.Float, medium: mi.Medium | None = None) -> mi.MediumInteraction3f:
-    """A point of a ray as Mitsuba's phase functions want it."""
+    """A point of a ray as the interaction that Mitsuba's volumes and phase functions are evaluated at."""
     mei = dr.zeros(mi.MediumInteraction3f, dr.width(ray))
     mei.t, mei.p, mei.wi = t, ray(t), -ray.d
     mei.sh_frame = mi.Frame3f(mei.wi)
@@ -22,6 +22,6 @@ def medium_interaction(ray: mi.Ray3f, t: mi.Float, medium: mi.Medium | None = No
 
 
 def eval_albedo(body: Body, mei: mi.MediumInteraction3f, on: mi.Bool) -> mi.Spectrum:
-    """The albedo of a body at a point, with its derivative."""
+    """The single-scattering albedo of a body at a point [1], with its derivative."""
     albedo = body.view.albedo
     return albedo.eval(mei, on) if isinstance(albedo, mi.Volume) else mi.Spectrum(albedo)

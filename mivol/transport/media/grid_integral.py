@@ -6,7 +6,7 @@ Along a line a trilinear function is a cubic in each cell, so two Gauss points a
 the cells is linear in the values at the nodes, and ``A``, its tangent (``A`` again) and its transpose are visitors of one
 walk.
 
-Conventions. Optical depth is returned, never transmittance: exp(-tau) is 0 in float32 beyond 103, tau is not.
+Conventions. Optical depth is returned, and not transmittance: in float32 exp(-tau) underflows to 0 beyond tau = 103.
 
 References: Amanatides & Woo 1987 (the walk); Abramowitz & Stegun 25.4.30 (Gauss points); matched adjoints: De Man & Basu
 2004.
@@ -37,7 +37,7 @@ __all__ = [
 
 
 PACKED_LIMIT = 4 << 30
-"""Most bytes that a packed gradient may take; a larger grid adds to its nodes one by one."""
+"""Largest size of a packed gradient [bytes]; a larger grid adds to its nodes one by one."""
 
 
 def integrate_tau(
@@ -53,7 +53,7 @@ def integrate_tau(
         lattice: values [1/length] of 1 or 3 channels, and their place. Derivatives (reverse and forward) reach
             ``lattice.values``; outside its box the grid is vacuum.
         o, d: world rays, |d| = 1; they and ``t_max`` carry no derivatives.
-        t_max: where to stop [length]; may be infinite.
+        t_max: where the interval [0, t_max] of the ray ends [length]; may be infinite.
         active: lanes to integrate; the others return 0.
 
     Returns:
@@ -126,7 +126,7 @@ def integrate_activated(
     Args:
         lattice, segment, active, enough: as :func:`integrate_segment`, of one channel.
         values: flat node values before the activation.
-        activation: what is done to them.
+        activation: the function of the interpolated value.
         tangent: of the values; None for the integral itself.
 
     Returns:
@@ -172,11 +172,17 @@ def backproject_activated(
 
 @dataclass
 class Gradient:
-    """What the transpose adds to: the derivative of a scalar with respect to the nodes of a grid.
+    """The derivative of a scalar with respect to the nodes of a grid, to which the transpose adds.
 
-    On the CPU a cell adds its 8 corners as one packet to a buffer of its own, one copy a thread and no atomics; they
-    are folded to the nodes once, at the end (5 times faster than adding 8 numbers to the nodes). Where that buffer is
-    too large, or on a GPU, the corners are added to the nodes as they come.
+    On the CPU a cell adds its 8 corners as one packet to a buffer that has 8 numbers a cell and a copy for each thread, so that
+    no atomics are needed. The cells are summed to the nodes once, at the end (5 times faster than adding 8 numbers to the
+    nodes). Where that buffer is too large, or on a GPU, the corners are added to the nodes as they come.
+
+    Attributes:
+        buffer: flat sums; corners of cells where ``packed``, else nodes.
+        res: of the grid (Z, Y, X).
+        channels: of the grid.
+        packed: whether the buffer holds cells.
     """
 
     buffer: mi.Float
@@ -220,7 +226,8 @@ class Gradient:
         i, j, k = node % x, (node // x) % y, node // (x * y)
         total = mi.Float(0)
         for q in range(8):
-            # Corner q belongs to the cell whose number, one more than its lower node, is lower by the bits of q.
+            # This node is corner q of the cell whose lower node is (i, j, k) minus the bits of q; cells are numbered from 1
+            # on for lower node 0.
             a, b, c = i + 1 - (q & 1), j + 1 - (q >> 1 & 1), k + 1 - (q >> 2)
             cell = (c * (y + 1) + b) * (x + 1) + a
             total += dr.gather(mi.Float, self.buffer, (cell * self.channels + channel) * 8 + q)
@@ -239,8 +246,8 @@ def backproject_segment(
     """Add ``weight`` times the row of ``A`` of each lane to a gradient: the transpose ``A^T``.
 
     Args:
-        lattice: where the grid lies. Its gaps are not used: an empty voxel has a derivative too.
-        target: what receives the sums.
+        lattice: where the grid lies. Empty blocks are walked too, since an empty voxel has a derivative.
+        target: the gradient to add to.
         weight: d loss / d tau of each lane, one entry a channel.
         segment: from :func:`mivol.transport.traversal.lattice.clip`.
         active: lanes to project back.
@@ -266,7 +273,7 @@ class _OpticalDepth(dr.CustomOp):
         return integrate_segment(lattice, dr.detach(values), segment, active)
 
     def forward(self) -> None:
-        # The tangent is not zero where the values are: no block is empty for it.
+        # The tangent may be nonzero where the values are 0, so no block may be skipped.
         dense = replace(self.lattice, empty_distances=None)
         self.set_grad_out(integrate_segment(dense, self.grad_in("values"), self.segment, self.active))
 

@@ -25,7 +25,13 @@ __all__ = [
 
 
 def sum_optical_depth(ray: mi.Ray3f, enough: float | None = None) -> MediumVisitor:
-    """The visitor that sums the optical depth of each channel along ``ray``; in a grid it may stop at ``enough``."""
+    """The visitor that sums the optical depth of each channel along ``ray``.
+
+    Args:
+        ray: world space, unit direction.
+        enough: a walk of a grid may stop where the grid's own optical depth exceeds this in every channel; None to walk to the
+            end.
+    """
 
     def visit(tau: list[mi.Float], body: Body, t0: mi.Float, t1: mi.Float, active: mi.Bool) -> list[mi.Float]:
         return [t + d for t, d in zip(tau, body.optical_depth(ray, t0, t1, len(tau), active, None, enough), strict=True)]
@@ -36,7 +42,11 @@ def sum_optical_depth(ray: mi.Ray3f, enough: float | None = None) -> MediumVisit
 def integrate_optical_depth(
     media: SceneMedia, ray: mi.Ray3f, medium: mi.MediumPtr, active: mi.Bool
 ) -> tuple[SegmentEnd, list[mi.Float]]:
-    """Optical depth [1] of each channel to the first opaque surface or ``ray.maxt``, and where that is."""
+    """Integrate the optical depth [1] of each channel to the first opaque surface or to ``ray.maxt``.
+
+    Returns:
+        Where the ray ends, and the optical depth to there.
+    """
     zero = [mi.Float(0) for _ in range(media.channels)]
     return visit_media(media, ray, medium, sum_optical_depth(ray), zero, active)
 
@@ -47,9 +57,15 @@ def transmittance(tau: list[mi.Float]) -> mi.Spectrum:
 
 
 def vjp_optical_depth(media: SceneMedia, segment: RaySegment, weight: mi.Spectrum, active: mi.Bool) -> None:
-    """Add ``weight`` (d loss / d tau of each colour) times a segment to the gradients of its media.
+    """Add the derivatives of the optical depth of a segment, times ``weight``, to the gradients of its media.
 
-    Cost: one walk of each medium, with one packed write of 8 a cell and channel; lanes of weight 0 are left out.
+    Args:
+        media: of the scene.
+        segment: the ray, which has been walked before.
+        weight: d loss / d tau of each colour.
+        active: lanes that add; lanes of weight 0 are left out.
+
+    Cost: one walk of each medium, with one packed write of 8 a cell and channel.
     """
     vjp_rows(media, segment, by_channel(weight, media.channels), active & dr.any(weight != 0))
 
@@ -65,7 +81,7 @@ def vjp_rows(media: SceneMedia, segment: RaySegment, weight: list[mi.Float], act
 
 
 def jvp_optical_depth(media: SceneMedia, segment: RaySegment, active: mi.Bool) -> mi.Spectrum:
-    """Tangent of the optical depth of a segment, along that which :meth:`SceneMedia.start_tangent` took."""
+    """Tangent of the optical depth of a segment, from the parameters' tangents that :meth:`SceneMedia.start_tangent` took."""
     return spectrum(jvp_rows(media, segment, active))
 
 

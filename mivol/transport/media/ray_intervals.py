@@ -1,10 +1,10 @@
-"""The media along a ray: where each begins and ends, and where the ray is stopped.
+"""The media along a ray: the interval of each, and the surface at which the ray ends.
 
-A ray is carried to the first opaque surface, and each medium on the way is visited with its interval [t0, t1]. Boundaries that
+A ray is followed to the first opaque surface, and each medium on the way is visited with its interval [t0, t1]. Boundaries that
 are boxes are cut by slab tests in float64; others are traced.
 
-Conventions. Distances are world lengths from the origin of the camera's own ray, never from the last boundary on, so that
-entry points keep their digits.
+Conventions. Distances are world lengths from the origin of the camera's own ray, and not from the last boundary, so that entry
+points keep their digits.
 """
 
 from __future__ import annotations
@@ -34,10 +34,13 @@ __all__ = [
 
 @dataclass
 class SegmentEnd:
-    """Where a stretch ends: at an opaque surface (``si`` valid), or at the distance asked for.
+    """Where a segment ends: at an opaque surface (``si`` valid), or at the distance asked for.
 
-    ``t`` is the length of the segment, ``medium`` what surrounds its end, ``null_transmission`` the share of the light that
-    surfaces on the way let through undeviated.
+    Attributes:
+        si: the surface.
+        t: length of the segment [length].
+        medium: the medium around its end.
+        null_transmission: fraction of the light that surfaces on the way transmit without changing its direction.
     """
 
     si: mi.SurfaceInteraction3f
@@ -48,7 +51,14 @@ class SegmentEnd:
 
 @dataclass
 class RaySegment:
-    """A stretch that has been walked: its ray, the medium it began in, its length, and whether it passed veils."""
+    """A segment that has been walked before.
+
+    Attributes:
+        ray: world space, unit direction.
+        medium: the medium around its origin.
+        length: how far it went [length].
+        passes_null: whether it passed surfaces that transmit part of the light undeviated.
+    """
 
     ray: mi.Ray3f
     medium: mi.MediumPtr
@@ -57,7 +67,7 @@ class RaySegment:
 
 
 MediumVisitor = Callable[..., Any]
-"""``visit(state, body, t0, t1, active) -> state``: what to do with the stretch [t0, t1] of a ray in one medium."""
+"""``visit(state, body, t0, t1, active) -> state``: what to do with the interval [t0, t1] of a ray in one medium."""
 
 
 def visit_media(
@@ -69,10 +79,20 @@ def visit_media(
     active: mi.Bool,
     passes_null: bool = False,
 ) -> tuple[SegmentEnd, Any]:
-    """Carry a ray to the first opaque surface or to ``ray.maxt``, visiting each medium on the way.
+    """Follow a ray to the first opaque surface or to ``ray.maxt``, and visit each medium on the way.
 
-    Media in boxes come after the others and in no order: a visitor must be a sum. A ray that ``passes_null`` goes on straight
-    through surfaces that let part of the light through undeviated, and says how much.
+    Media in boxes come after the others and in no order, so a visitor must compute something that does not depend on it, such
+    as a sum.
+
+    Args:
+        media: of the scene.
+        ray: world space, unit direction.
+        medium: the medium around its origin.
+        visit: :data:`MediumVisitor`.
+        state: any PyTree of Dr.Jit arrays.
+        active: lanes to follow.
+        passes_null: the ray continues through surfaces that transmit part of the light undeviated (a shadow ray);
+            ``null_transmission`` of the result is how much.
 
     Returns:
         Where the ray ends, and the last state.
@@ -99,7 +119,7 @@ def visit_boxed_media(
 
 
 def revisit_media(media: SceneMedia, ray_segment: RaySegment, visit: MediumVisitor, state: Any, active: mi.Bool) -> Any:
-    """Visit the media of a stretch whose end is known; only boundaries that have to be traced are traced again."""
+    """Visit the media of a segment whose end is known; rays are traced again only where boundaries have to be traced."""
     if not media.traced:
         return visit_boxed_media(media, ray_segment.ray, ray_segment.length, visit, state, active)
     return visit_media(media, ray_segment.ray, ray_segment.medium, visit, state, active, ray_segment.passes_null)[1]
@@ -130,7 +150,7 @@ def _trace(
         found = going & hit.is_valid()
         t_hit = dr.select(found, dr.maximum(t, distance_along(ray, hit)), ray.maxt)
 
-        # -- The medium on this side of the surface fills the stretch ---------------------------------------------------------
+        # -- The medium on this side of the surface fills the interval --------------------------------------------------------
         transition = found & hit.is_medium_transition()
         medium = dr.select(transition, hit.target_medium(-ray.d), medium)
         state = _visit_traced(media, medium, visit, state, t, t_hit, going)
@@ -162,9 +182,9 @@ def _visit_traced(
 
 def is_transparent(si: mi.SurfaceInteraction3f) -> mi.Bool:
     """Whether a surface is nothing but a boundary: a ``null`` BSDF and no emitter."""
-    lobes = si.bsdf().flags() & mi.UInt32(int(mi.BSDFFlags.All))
-    return (lobes == int(mi.BSDFFlags.Null)) & ~si.shape.is_emitter()
+    components = si.bsdf().flags() & mi.UInt32(int(mi.BSDFFlags.All))
+    return (components == int(mi.BSDFFlags.Null)) & ~si.shape.is_emitter()
 
 
 OWN_SURFACE = 1 - 1e-3
-"""Share of the way to a lamp behind which a shadow ray meets the lamp's own surface (Mitsuba shortens its rays alike)."""
+"""Fraction of the length of a shadow ray beyond which a hit is the emitter's own surface (Mitsuba shortens its rays alike)."""

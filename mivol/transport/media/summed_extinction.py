@@ -21,13 +21,13 @@ __all__ = ["SummedExtinction", "share_cells"]
 
 
 class SummedExtinction:
-    """The sum of parts, for each channel: in a cell of their grids, and where only the constants are.
+    """The sum of the parts of an extinction for each channel: in a cell of their grids, and outside the grids.
 
     Args:
-        parts: grids among them share their cells.
+        parts: constants, and grids that share their cells.
         values: node values or constant of each part.
         scale: factor on the sum.
-        linear: whether the values are changes of the parts', which no activation turns.
+        linear: whether the values are tangents, which no activation is applied to.
     """
 
     def __init__(self, parts: list[Part], values: list, scale: mi.Float, linear: bool = False) -> None:
@@ -50,7 +50,7 @@ class SummedExtinction:
         ]
 
     def slopes(self, corners: list, points: list[mi.Vector3f]) -> list[mi.Float] | None:
-        """What the activation of a radiance field, which is alone in its medium, makes of a change at each point."""
+        """Slope of the activation at points of a cell; None without one. A radiance field is the only part of its medium."""
         if not any(self.activations):
             return None
         return [self.activations[0].value_and_slope(interpolate(corners[0][0], p))[1] for p in points]

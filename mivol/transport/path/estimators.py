@@ -1,6 +1,6 @@
-"""The estimators that a plan chooses among, by name, and those of one render.
+"""The table of estimators that a plan chooses from by name, and the estimators of one render.
 
-Each entry says what a scene must be like for the estimator to serve it, what it promises, and whom it follows; the plan picks
+Each entry states which scenes the estimator can render, its bias and variance, and the papers that it follows. The plan picks
 one for the segments of a path, ``mivol explain`` prints it, and tests measure what is promised.
 """
 
@@ -26,13 +26,13 @@ __all__ = ["SEGMENT_ESTIMATORS", "Estimators", "SegmentChoice", "SegmentEntry"]
 
 @dataclass
 class SegmentChoice:
-    """What a segment estimator is made from.
+    """The arguments that a segment estimator is made from.
 
     Attributes:
-        direct: light that arrives at points of surfaces and media.
-        count: points of a segment that scatter, in pictures.
-        visibility_cache: where emitters shine; None where that is not known.
-        transmittance_grid: in place of shadow rays; None for exact ones.
+        direct: the estimator of direct lighting, at surfaces and in media.
+        count: number of scattering points on a segment, in images; derivatives have one.
+        visibility_cache: rough visibility of the emitters, which distance sampling is guided by; None for none.
+        transmittance_grid: a lattice that replaces shadow rays; None for exact shadow rays.
     """
 
     direct: DirectLighting
@@ -43,11 +43,11 @@ class SegmentChoice:
 
 @dataclass(frozen=True)
 class SegmentEntry:
-    """A segment estimator by name.
+    """An entry of :data:`SEGMENT_ESTIMATORS`.
 
     Attributes:
-        make: builds it.
-        needs: what a scene must be like.
+        make: builds the estimator.
+        needs: the condition on the scene, in words.
         promises: bias and variance, in words.
         cites: keys of :mod:`mivol.report.cite`.
     """
@@ -82,16 +82,17 @@ SEGMENT_ESTIMATORS = {
         "error of the fourth order in the size of a cell where light is smooth, no variance; derivatives are drawn",
     ),
 }
-"""Estimators of what media add along a segment, by the name that a plan chooses them by."""
+"""Name -> estimator of what media add along a segment of a path."""
 
 
 class Estimators:
     """The estimators of one render.
 
     Args:
-        direct: light that arrives at points of surfaces and media.
-        segment: what media add and take along a segment.
-        lights_surfaces: surfaces turn light, so that emitters are met by two kinds of samples.
+        direct: the estimator of direct lighting, at surfaces and in media.
+        segment: the estimator of what media add and transmit along a segment.
+        lights_surfaces: some surface scatters light, so that emitters are hit by emitter samples and by BSDF samples, which are
+            combined by multiple importance sampling.
     """
 
     def __init__(self, direct: DirectLighting, segment: SegmentEstimator, lights_surfaces: bool) -> None:
@@ -99,7 +100,7 @@ class Estimators:
 
     @classmethod
     def of_media(cls, media: SceneMedia) -> Estimators:
-        """Those of media that only absorb, without surfaces that turn light."""
+        """Estimators for media that only absorb, in a scene without surfaces that scatter light."""
         return cls(DirectLighting(media, SceneEmitters(media.scene)), Absorption(media), False)
 
     def find_controls(self, ray: mi.Ray3f) -> None:
@@ -108,7 +109,11 @@ class Estimators:
             self.segment.find_controls(ray)
 
     def replayed(self) -> Estimators:
-        """Estimators of the radiance that a replay counts down: without light that is drawn anew for its derivative."""
+        """Estimators of the radiance that a replay subtracts from.
+
+        Single scattering is sampled anew for its derivatives (by probes), so the path that is replayed does not contain it; its
+        random numbers are still consumed, so that both passes follow the same path.
+        """
         if not isinstance(self.segment, SingleScattering | ScatteringQuadrature):
             return self
         return Estimators(self.direct, Absorption(self.media, drawn_by=self.segment), self.lights_surfaces)

@@ -1,6 +1,7 @@
-"""Where a segment of a path ends: at a surface, or outside of the scene.
+"""The event at the end of a path segment: a surface, or escape from the scene.
 
-Media that a segment passes are events of the segment's own estimator, which lights them without turning the path.
+Scattering inside a segment is no event of the path: the segment's estimator samples it and lights it, and the path itself goes
+straight on.
 """
 
 from __future__ import annotations
@@ -22,9 +23,9 @@ class PathEvent:
 
     Attributes:
         si: the surface; not valid where the path has left the scene.
-        t: length of the segment.
-        medium: what surrounds the end.
-        at_surface: lanes that have met a surface; the others have escaped or ended before.
+        t: length of the segment [length].
+        medium: the medium around the end.
+        at_surface: lanes that have hit a surface; the others have escaped, or ended before.
     """
 
     si: mi.SurfaceInteraction3f
@@ -38,5 +39,5 @@ class PathEvent:
         return cls(end.si, end.t, end.medium, active & end.si.is_valid())
 
     def vertex(self, media: SceneMedia, ray: mi.Ray3f) -> SurfaceVertex:
-        """The surface as a vertex that may turn the path."""
+        """The surface as a vertex, at which direct light is estimated."""
         return SurfaceVertex(media, self.si, self.si.bsdf(ray), self.medium)

@@ -1,10 +1,10 @@
-r"""From samples to pixels and back: the rays of a sensor, their sums on a film, and the transpose of both.
+r"""The rays of a sensor, the film that averages their radiance, and the transpose from image gradients to ray gradients.
 
 .. math:: I_p = \frac{\sum_s w_{ps} L_s}{\sum_s w_{ps}}
 
-Conventions. The samples of a render are split into passes of at most ``pass_rays`` rays; a film gathers them all before it
-divides by its weights, so the image does not depend on the split but for the order of sums, and the 2^32 samples of one
-launch are no limit. The samples of a sampler that stratifies stay stratified over all passes.
+Conventions. The samples of a render are split into passes of at most ``pass_rays`` rays. The film sums all passes before it
+divides by the filter weights, so the image depends on the split only through the order of sums, and a render may have more than
+the 2^32 samples that one launch can hold. The samples of a sampler that stratifies stay stratified over all passes.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ __all__ = ["CameraRays", "adjoint_rays", "film_passes", "record"]
 
 
 PLAIN, SPREAD, TILED = "none", "spread", "tiled"
+"""Layouts of the lanes of a pass: see :func:`film_passes`."""
 
 TILE = 4
 """Edge of a tile of pixels: 16 lanes of one packet."""
@@ -35,8 +36,8 @@ class CameraRays:
         sampler: what the pass draws its numbers from.
         ray: world space.
         weight: the sensor's importance.
-        position: where the sample falls on the film [pixel].
-        strata: parts of the square that directions are drawn from; None where the sampler stratifies by itself.
+        position: of the sample on the film [pixel].
+        strata: the stratum that each lane draws directions from; None where lanes have none.
     """
 
     sampler: mi.Sampler
@@ -47,7 +48,7 @@ class CameraRays:
 
 
 Sample = Callable[[CameraRays], tuple]
-"""``sample(rays)``: what rays carry: radiance, whether the film's alpha sees something, and the AOVs."""
+"""``sample(rays) -> (radiance, mask, AOVs)``; the film's alpha is 1 where the mask is true."""
 
 
 def film_passes(sensor: mi.Sensor, seed: int, spp: int, pass_rays: int, layout: str = PLAIN) -> Iterator[CameraRays]:
@@ -57,9 +58,10 @@ def film_passes(sensor: mi.Sensor, seed: int, spp: int, pass_rays: int, layout: 
         sensor: its film, filter, crop and sampler are used as they are.
         seed: of the sampler.
         spp: samples a pixel; 0 for the sampler's own count.
-        pass_rays: most rays of a pass.
-        layout: PLAIN; SPREAD, the samples of a pixel share it out among them; TILED, besides, the lanes of a tile of pixels
-            lie side by side and their directions are stratified (independent samplers only, TILED films of whole tiles only).
+        pass_rays: largest number of rays in a pass.
+        layout: ``PLAIN``: independent positions in the pixel. ``SPREAD``: the samples of a pixel are stratified over its area.
+            ``TILED``: besides, the lanes of a tile of pixels lie side by side, and directions are stratified. The last two need
+            an independent sampler, and ``TILED`` a film of whole tiles; elsewhere the layout is the next simpler one.
 
     Raises:
         MivolError: one sample a pixel is more than a launch can hold (2^32).
@@ -73,11 +75,14 @@ def film_passes(sensor: mi.Sensor, seed: int, spp: int, pass_rays: int, layout: 
 
 
 def _seed(sampler: mi.Sampler, seed: int, index: int, count: int) -> None:
-    """Seed a sampler for one pass, whatever the passes before have drawn: a replay may draw less of them."""
+    """Seed a sampler for one pass, so that it does not depend on how much the passes before have drawn.
+
+    A replay may draw fewer numbers than the pass that it repeats.
+    """
     if sampler.class_name() == "IndependentSampler":
         sampler.seed(seed if index == 0 else mi.sample_tea_32(mi.UInt32(seed), mi.UInt32(index))[0], count)
         return
-    # A sampler that stratifies has one permutation for all passes, and goes on in it from pass to pass.
+    # A sampler that stratifies has one permutation for all passes; ``advance`` moves on in it to the next pass.
     sampler.seed(seed, count)
     for _ in range(index):
         sampler.advance()
@@ -90,7 +95,7 @@ def count_passes(sensor: mi.Sensor, spp: int, pass_rays: int) -> int:
 
 
 def _prepare(sensor: mi.Sensor, spp: int, pass_rays: int) -> tuple[mi.Sampler, int, int]:
-    """A sampler of its own, the pixels of the film and the samples of a pixel in one pass."""
+    """A copy of the sensor's sampler, the number of pixels of the film, and the samples of a pixel in one pass."""
     sampler = sensor.sampler().clone()
     if spp:
         sampler.set_sample_count(spp)
@@ -114,7 +119,7 @@ def _camera_rays(sensor: mi.Sensor, sampler: mi.Sampler, count: int, per_pass: i
     film = sensor.film()
     width, height = _sampled_size(film)
     lane, strata = dr.arange(mi.UInt32, count), None
-    # Opaque: a seed that is part of a kernel has it compiled anew in every render.
+    # Opaque, since a kernel that contains the seed as a literal would be compiled anew in every render.
     salt = mi.UInt32(seed)
     dr.make_opaque(salt)
     salt += 0x9E3779B9
@@ -136,7 +141,8 @@ def _camera_rays(sensor: mi.Sensor, sampler: mi.Sampler, count: int, per_pass: i
     pixel += mi.Vector2i(film.crop_offset())
     u = sampler.next_2d()
     if shares:
-        # In another order in each tile (or pixel), so that no direction belongs to a part of the pixel.
+        # The strata of a pixel are visited in another order in each tile (or pixel); otherwise each stratum of directions would
+        # be tied to one part of the pixel.
         cell = mi.permute_kensler(sample, per_pass, other)
         u = Strata(cell, across, per_pass // across).jitter(u)
     position = mi.Vector2f(pixel) + u
@@ -148,7 +154,7 @@ def _camera_rays(sensor: mi.Sensor, sampler: mi.Sampler, count: int, per_pass: i
     if sensor.shutter_open_time() > 0:
         time += sampler.next_1d() * sensor.shutter_open_time()
     ray, weight = sensor.sample_ray_differential(time, mi.Float(0), dr.fma(position, scale, offset), aperture)
-    # A box filter counts a sample for its pixel, wherever in it the sample fell.
+    # A box filter gives a sample to its pixel, whatever its position in it.
     place = mi.Vector2f(pixel) if film.rfilter().is_box_filter() else position
     return CameraRays(sampler, ray, weight, place, strata)
 
@@ -156,12 +162,12 @@ def _camera_rays(sensor: mi.Sensor, sampler: mi.Sampler, count: int, per_pass: i
 def record(
     sensor: mi.Sensor, seed: int, spp: int, pass_rays: int, names: list[str], sample: Sample, layout: str = PLAIN
 ) -> mi.TensorXf:
-    """Render an image: send the rays of all passes, and gather what they carry on the sensor's film.
+    """Render an image: sample the rays of all passes, and average them on the sensor's film.
 
     Args:
         sensor, seed, spp, pass_rays, layout: as :func:`film_passes`.
         names: of the AOVs, in the order in which ``sample`` returns them.
-        sample: what rays carry.
+        sample: :data:`Sample`.
 
     Returns:
         (height, width, colours + AOVs).
@@ -187,7 +193,7 @@ def adjoint_rays(
     grad_image: mi.TensorXf,
     layout: str = PLAIN,
 ) -> Iterator[tuple[CameraRays, mi.Spectrum, list[mi.Float]]]:
-    """Send a gradient image back through the film, pass by pass.
+    """Turn a gradient image into a gradient for each ray, pass by pass: the transpose of the film.
 
     Args:
         sensor, seed, spp, pass_rays, names, layout: as :func:`record`.
@@ -207,7 +213,8 @@ def adjoint_rays(
             dr.enable_grad(L, aovs)
             film.prepare(names)
             block = _new_block(film, rays)
-            # Over several passes a pixel is divided by the weights of all of them: they come from a block of their own.
+            # A pixel is divided by the filter weights of all passes. Where there are several, the weights are therefore summed
+            # beforehand, in a block of their own.
             _splat(block, film, rays, L * rays.weight, mi.Float(0 if several else 1), mi.Float(0), aovs)
             film.put_block(block)
             if several:
@@ -223,7 +230,7 @@ def adjoint_rays(
 
 
 def _weights(sensor: mi.Sensor, seed: int, spp: int, pass_rays: int, names: list[str], layout: str) -> mi.ImageBlock:
-    """The filter weights of all passes, and nothing else."""
+    """An image block with the filter weights of all passes and no light."""
     film = sensor.film()
     film.prepare(names)
     block = None
@@ -237,8 +244,8 @@ def _weights(sensor: mi.Sensor, seed: int, spp: int, pass_rays: int, names: list
 
 def _new_block(film: mi.Film, rays: CameraRays) -> mi.ImageBlock:
     block = film.create_block()
-    # Coalescing gathers the samples of a pixel before it adds them: worth it from 4 on (Mitsuba's own rule),
-    # where they lie side by side.
+    # Coalescing sums the samples of a pixel before it writes them. It pays from 4 samples on (Mitsuba's own rule), and needs
+    # them in neighbouring lanes, which tiles do not give.
     block.set_coalesce(block.coalesce() and rays.sampler.sample_count() >= 4 and rays.strata is None)
     return block
 

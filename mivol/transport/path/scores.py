@@ -1,14 +1,15 @@
-r"""What is done with a path: its radiance, its tangent, or the derivatives of what it carries.
+r"""What a path is walked for: its radiance, the gradients of its parameters, or the tangent of its radiance.
 
-A path tells its score two things, in the order of the path: a term that it adds to the light it carries, and a factor that all
-light ahead is multiplied by (:mod:`mivol.transport.estimators.contribution`). Three scores answer:
+The walk reports two things to its score, in the order of the path: terms, which are added to the radiance, and factors, which
+multiply all light from further along the path (:mod:`mivol.transport.estimators.contribution`). There are three scores:
 
-* ``Primal`` sums the light.
-* ``Replay`` follows a path whose radiance ``L`` is known. ``L`` counts down as terms are passed, so that it is the radiance
-  ahead where a factor is told: d loss / d log f = dL L. In the end it is 0, to rounding.
-* ``Tangent`` carries the derivative of the logarithm of all factors along with the path.
+* ``Primal`` sums the radiance.
+* ``Replay`` (path replay backpropagation) follows a path whose radiance ``L`` is known. Each term is subtracted from ``L`` when
+  it is reached, so ``L`` is the radiance ahead when a factor is reported, and d loss / d log f = dL L. After the walk ``L`` is
+  0, to rounding.
+* ``Tangent`` carries the tangent of the logarithm of the product of all factors along the path.
 
-Terms and factors hold their own derivatives, so no score knows an estimator.
+Terms and factors know their own derivatives, so a score knows no estimator.
 
 References: Vicini et al. 2021 (replay with a running difference); Nimier-David et al. 2020 (adjoint radiance).
 """
@@ -27,15 +28,17 @@ __all__ = ["Primal", "Replay", "Tangent"]
 
 @dataclass
 class Primal:
-    """Sum the light that a path carries."""
+    """Sum the radiance of a path."""
 
     L: mi.Spectrum
     purpose = PICTURE
 
     def add(self, term: Term) -> Primal:
+        """The score after a term of the path was reached."""
         return Primal(self.L + term.value)
 
     def scale(self, factor: Factor) -> Primal:
+        """The score after a factor of all light further along the path was reached; term values contain it already."""
         return self
 
 
@@ -44,8 +47,8 @@ class Replay:
     """Follow a path again and add its derivatives to the gradients of media, surfaces and emitters.
 
     Attributes:
-        L: the light that it carried, which counts down as it is passed. A path of one segment need not be known beforehand
-            (None): all its light is met at its end, and the segment's factor waits for it.
+        L: radiance of the part of the path that is still ahead. It need not be known for a path of one segment (None): the only
+            light behind its factor is the emission at its end, so the factor is kept until that is reached.
         dL: d loss / d L.
         waiting: that factor.
     """
@@ -75,8 +78,8 @@ class Tangent:
     """Carry the tangent of a path along with it.
 
     Attributes:
-        dL: tangent of the light so far.
-        dlog: tangent of the logarithm of all factors so far.
+        dL: tangent of the radiance so far.
+        dlog: tangent of the logarithm of the product of all factors so far.
     """
 
     dL: mi.Spectrum

@@ -1,4 +1,4 @@
-"""What a user sets of an integrator: how long a path may be, and how scattered light is found."""
+"""The settings of an integrator that a user gives: path length, Russian roulette, quadrature and shadows."""
 
 from __future__ import annotations
 
@@ -9,11 +9,15 @@ __all__ = ["Settings"]
 
 @dataclass(frozen=True)
 class Settings:
-    """How long a path may be, and how scattered light is found.
+    """How long a path may be, and how scattered light is computed.
 
-    ``max_depth`` (-1: no limit), roulette from ``rr_depth`` on, ``hide_emitters``; ``deterministic``: by quadrature, with
-    ``shadows`` that are ``exact`` or looked up in a ``grid``; drawn light has ``exact`` or ``estimated`` shadows, or (``auto``)
-    what the plan chooses.
+    Attributes:
+        max_depth: largest path depth, counted as in ``volpath``; -1 for no limit.
+        rr_depth: depth from which Russian roulette may end a path.
+        hide_emitters: emitters are not seen directly by the camera.
+        deterministic: single scattering by quadrature in place of Monte Carlo.
+        shadows: with ``deterministic``, ``exact`` or interpolated in a ``grid``; else ``exact`` or ``estimated`` (ratio
+            tracking); ``auto`` leaves the choice to the plan.
     """
 
     max_depth: int = 6

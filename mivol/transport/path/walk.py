@@ -1,11 +1,11 @@
-r"""The path of light from a camera through media, surfaces and lamps.
+r"""The walk of a path from the camera through media and surfaces: path tracing with next-event estimation.
 
 .. math:: L = \sum_k \beta_k \left( L_{media,k} + T_k\, ( w_k L_e + L_d ) \right)
 
-A path runs in straight segments from one opaque surface to the next. What media add and take along a segment is found by the
-segment estimator that the plan has chosen. At a surface Mitsuba's own BSDFs and emitters shade it: one emitter sample
-and one BSDF sample, combined by the power heuristic (Veach 1997, Eq. 9.13). Whatever is done with a path (its radiance, its
-tangent, its derivatives) is a score; the walk itself is written once.
+A path runs in straight segments from one opaque surface to the next. What media add and transmit along a segment is found by
+the segment estimator that the plan has chosen. At a surface, direct light is estimated by one emitter sample (next-event
+estimation) and one BSDF sample, combined by the power heuristic (Veach 1997, Eq. 9.13). The walk is the same for radiance,
+gradients and tangents; a score decides what is made of it (:mod:`mivol.transport.path.scores`).
 
 Conventions. ``max_depth`` counts as in ``volpath``: 1 is emitters seen through media, 2 adds surfaces lit directly, -1 is no
 limit. Boundaries with a ``null`` BSDF do not count. Media that are bounded by boxes are cut by slab tests; the acceleration
@@ -46,8 +46,19 @@ UNLIMITED = 0xFFFFFFFF
 class Path:
     """The state of a path.
 
-    ``beta`` is the throughput so far, without the segment ahead; ``pdf`` and ``delta`` tell how its direction was
-    sampled at ``last`` (for the power heuristic); ``valid`` whether the film's alpha sees something.
+    Attributes:
+        ray: of the segment ahead.
+        medium: the medium around its origin.
+        beta: throughput to there.
+        eta: product of the relative indices of refraction, for Russian roulette.
+        depth: number of scattering events so far.
+        last: where the direction was sampled, for the power heuristic.
+        pdf: density [1/sr] that it was sampled with.
+        delta: whether that density is a delta function.
+        valid: whether the film's alpha is 1.
+        active: lanes that go on.
+        score: :mod:`mivol.transport.path.scores`.
+        sampler, strata: random numbers.
     """
 
     ray: mi.Ray3f
@@ -74,19 +85,19 @@ def walk_path(
     active: mi.Bool = True,
     strata: Strata | None = None,
 ) -> tuple[Score, mi.Bool]:
-    """Walk a path from the camera and tell a score what it carries.
+    """Walk a path from the camera and report its terms and factors to a score.
 
     Args:
-        estimators: how light is found along segments and at surfaces; they know the scene and its media.
+        estimators: of light along segments and at surfaces; they know the scene and its media.
         settings: depth, roulette, hidden emitters.
         sampler: three 2D and two 1D numbers a surface, and what the segment estimator draws.
         ray: world space, unit direction.
         score: :mod:`mivol.transport.path.scores`.
         active: lanes to walk.
-        strata: parts of the square that directions at media are drawn from.
+        strata: the stratum that each lane draws directions in media from.
 
     Returns:
-        The score, and whether the film's alpha sees something.
+        The score, and the mask of lanes where the film's alpha is 1.
 
     Bias: that of the segment estimator. Variance: none at depth 1 beyond the pixel's own; at surfaces, that of emitter and BSDF
     samples.
@@ -124,16 +135,16 @@ def walk_path(
 
 
 def is_straight(estimators: Estimators, settings: Settings) -> bool:
-    """Whether paths have one segment: nothing turns one that no surface meets, nor one of depth 1 that no surface lets pass."""
+    """Whether every path has one segment: there are no surfaces, or the depth is at most 1 and none of them transmits light."""
     media = estimators.media
     return not media.has_surfaces or (settings.max_depth in (0, 1) and not media.has_null_transmission)
 
 
 def _follow_segment(estimators: Estimators, settings: Settings, limit: int, path: Path) -> tuple[Path, PathEvent]:
-    """Go to the next opaque surface; media add their light on the way, and dim what lies ahead."""
+    """Follow the segment to the next opaque surface: media add a term, and their transmittance is a factor."""
     may_scatter = path.active & (path.depth + 1 < limit)
     samples = estimators.segment.draw(path.sampler, may_scatter, path.strata)
-    # A copy: the throughput is dimmed in place below, and derivatives look at the segment again after that.
+    # A copy of the throughput: it is multiplied in place below, and derivatives read the segment's own after that.
     segment = PathSegment(path.ray, path.medium, mi.Spectrum(path.beta), may_scatter, samples)
     found = estimators.segment.estimate(segment, path.score.purpose, path.active)
     if found.light is not None:
@@ -145,7 +156,7 @@ def _follow_segment(estimators: Estimators, settings: Settings, limit: int, path
 
 
 def _add_emission(estimators: Estimators, settings: Settings, path: Path, event: PathEvent) -> Path:
-    """Add what the surface, or the surroundings of the scene, emit towards the path."""
+    """Add the emission of the surface, or of the environment, towards the path."""
     scene, si = estimators.media.scene, event.si
     shown = path.active & ~((path.depth == 0) & settings.hide_emitters)
     emitter = si.emitter(scene, shown)
@@ -162,12 +173,12 @@ def _add_emission(estimators: Estimators, settings: Settings, path: Path, event:
 
 
 def _turn(estimators: Estimators, settings: Settings, limit: int, path: Path, event: PathEvent) -> Path:
-    """Light the surface, and choose where the path goes on."""
+    """Estimate the direct light at the surface, and sample the direction in which the path continues."""
     media, si, sampler = estimators.media, event.si, path.sampler
     on_surface, attached = event.at_surface, path.score.purpose != PICTURE
     vertex = event.vertex(media, path.ray)
 
-    # -- Light from an emitter, dimmed by the media ---------------------------------------------------------------------------
+    # -- Next-event estimation: light from an emitter, dimmed by the media ----------------------------------------------------
     may_scatter = on_surface & (path.depth + 1 < limit)
     lit = may_scatter & mi.has_flag(vertex.bsdf.flags(), mi.BSDFFlags.Smooth)
     direct = estimators.direct.at_surface(vertex, sampler.next_2d(lit), attached, lit)
@@ -179,7 +190,7 @@ def _turn(estimators: Estimators, settings: Settings, limit: int, path: Path, ev
     u1, u2 = sampler.next_1d(on_surface), sampler.next_2d(on_surface)
     sample, f_over_pdf = vertex.bsdf.sample(mi.BSDFContext(), si, u1, u2, on_surface)
     through = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Null)
-    # A direction of density 0 has the weight 0, and its path ends below.
+    # A sampled direction of density 0 has weight 0; its path ends below, where beta is 0.
     on = on_surface & (may_scatter | through)
     turned = on & ~through
     path.score = path.score.scale(_bsdf_factor(vertex, sample.wo, turned))
@@ -187,7 +198,7 @@ def _turn(estimators: Estimators, settings: Settings, limit: int, path: Path, ev
     path.eta *= dr.select(on, sample.eta, 1)
     rest = path.ray.maxt - event.t
     path.ray = spawn_ray(si, si.to_world(sample.wo), media.size)
-    # A ray that goes straight on ends where it was to end.
+    # A ray that is transmitted undeviated keeps its end (the sensor's far_clip).
     path.ray.maxt = dr.select(through, dr.minimum(rest, path.ray.maxt), path.ray.maxt)
     path.medium = dr.select(on & si.is_medium_transition(), si.target_medium(path.ray.d), path.medium)
     path.last = dr.select(turned, mi.Interaction3f(si), path.last)
@@ -205,5 +216,5 @@ def _turn(estimators: Estimators, settings: Settings, limit: int, path: Path, ev
 
 
 def _bsdf_factor(vertex: SurfaceVertex, wo: mi.Vector3f, active: mi.Bool) -> TrackedFactor:
-    """The BSDF as a factor on all light ahead."""
+    """The BSDF as a factor of all light ahead, with its derivatives."""
     return TrackedFactor(lambda: vertex.bsdf.eval(mi.BSDFContext(), vertex.interaction, wo, active), active)

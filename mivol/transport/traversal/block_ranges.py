@@ -1,4 +1,4 @@
-"""The least and the largest value of each block of a grid's cells: bounds for tracking.
+"""The smallest and the largest value in each block of a grid's cells: local minorants and majorants for ratio tracking.
 
 Conventions. Block b of an axis holds the cells b 2^BLOCK_SHIFT - 1 to (b + 1) 2^BLOCK_SHIFT - 2, and all nodes that they touch.
 """
@@ -21,14 +21,13 @@ BLOCK_SHIFT = 3
 
 @dataclass
 class BlockRanges:
-    """The least and the largest value of each block of cells of a grid.
-
-    Block b of an axis holds the cells b 2^BLOCK_SHIFT - 1 to (b + 1) 2^BLOCK_SHIFT - 2, and all nodes that they touch.
+    """The smallest value (minorant) and the range up to the largest (majorant) in each block of cells of a grid.
 
     Attributes:
-        table: flat (blocks in z, y, x; least value of each channel, then the largest that any channel has above its least).
-        res: blocks along Z, Y, X.
-        channels: of the grid.
+        table: flat (blocks in z, y, x; then the smallest value of each channel, and last one range for all channels: the
+            largest difference that any of them has between its largest and its smallest value).
+        res: number of blocks along Z, Y, X.
+        channels: number of channels of the grid.
     """
 
     table: mi.Float
@@ -36,7 +35,7 @@ class BlockRanges:
     channels: int
 
     def at(self, block: mi.Vector3i, active: mi.Bool) -> tuple[list[mi.Float], mi.Float]:
-        """Least value of each channel, and the range above, of a block."""
+        """The smallest value of each channel in a block, and the range above it."""
         _, y, x = self.res
         n = self.channels + 1
         index = mi.UInt32((block.z * y + block.y) * x + block.x)
@@ -45,10 +44,12 @@ class BlockRanges:
 
 
 def find_block_ranges(values: mi.TensorXf) -> BlockRanges:
-    """Look at every voxel of a grid once (9/8 times along each axis).
+    """Find the minorant and the range of each block of a grid.
 
     Args:
         values: (Z, Y, X, C), finite.
+
+    Cost: 9/8 reads a voxel along each axis, since neighbouring blocks share a layer of nodes.
     """
     z, y, x, c = values.shape
     flat = dr.detach(values.array)
@@ -59,7 +60,7 @@ def find_block_ranges(values: mi.TensorXf) -> BlockRanges:
         low = over_blocks(own, (z, y, x), BLOCK_SHIFT, dr.minimum, dr.inf)
         high = over_blocks(own, (z, y, x), BLOCK_SHIFT, dr.maximum, -dr.inf)
         rows.append(low)
-        # Rounding of the differences below must not take a factor out of [0, 1].
+        # A tracker divides (value - low) by this range. The range is rounded up, so that rounding never makes that exceed 1.
         ranges.append((high - low) * (1 + 1e-6))
     n = res[0] * res[1] * res[2]
     table = dr.zeros(mi.Float, n * (c + 1))

@@ -1,4 +1,4 @@
-"""A grid of the means over blocks of another grid's voxels, and a list of the blocks that hold anything."""
+"""A grid downsampled by means over blocks of voxels, and a list of the blocks that are not empty."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class CoarseGrid:
     Attributes:
         lattice: voxel i holds the mean of the voxels 2^shift i to 2^shift (i + 1) - 1, along each axis; the last one repeats
             the border of the grid.
-        held: numbers of the blocks of a visibility cache (z, y, x) that hold anything; None where they were not asked for.
+        held: flat indices (z, y, x) of the non-empty blocks, for a visibility cache; None where no list was asked for.
     """
 
     lattice: Lattice
@@ -29,7 +29,12 @@ class CoarseGrid:
 
 
 def coarsen_grid(lattice: Lattice, shift: int, lists: bool) -> CoarseGrid:
-    """Take means over blocks of 2^shift voxels along each axis, and list the blocks that hold anything if ``lists``.
+    """Take means over blocks of 2^shift voxels along each axis.
+
+    Args:
+        lattice: the grid.
+        shift: log2 of the edge of a block [voxels].
+        lists: whether to list the blocks that are not empty, too.
 
     Cost: 8/7 look-ups a voxel, 8 a block.
     """
@@ -61,7 +66,10 @@ def _mean_along(flat: mi.Float, n: int, inner: int, edge: int) -> mi.Float:
 
 
 def _held(means: mi.TensorXf, res: tuple[int, int, int], shift: int) -> mi.UInt32:
-    """Blocks one of whose nodes is not 0: they are those of two mean voxels along each axis, or fewer."""
+    """List the blocks of cells that have a node above 0.
+
+    A block of cells lies across two mean voxels along each axis (one at the border), so it is empty where all 8 means are 0.
+    """
     c, sizes = means.shape[3], [(n >> shift) + 1 for n in res]
     i, found = dr.arange(mi.UInt32, sizes[0] * sizes[1] * sizes[2]), mi.Bool(False)
     block = (i // (sizes[1] * sizes[2]), i // sizes[2] % sizes[1], i % sizes[2])

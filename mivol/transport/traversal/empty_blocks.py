@@ -1,6 +1,7 @@
-"""Which blocks of a grid's cells hold anything, and how far each block is from the nearest that does.
+"""Empty-space skipping: the distance of each block of a grid's cells from the nearest block that is not empty.
 
-A walk crosses all of an empty block's distance in one step. Distances are those of the maximum norm, in blocks.
+From a block at distance k a ray may cross everything within k - 1 blocks in one step. Distances are Chebyshev distances (the
+largest of the three axes' distances), counted in blocks.
 
 References: Cohen & Sheffer 1994 (proximity clouds); Szirmay-Kalos et al. 2011 (super-grids).
 """
@@ -29,10 +30,11 @@ SHIFT = 2
 """log2 of the edge of a block."""
 
 BLOCK = 1 << SHIFT
-"""Edge of a block of the super-grid, in cells (measured on threads in 512^3: 2 are no faster)."""
+"""Edge of a block, in cells (measured on threads in a grid of 512^3: an edge of 2 is no faster)."""
 
 REACH = 15
-"""Largest distance that a block or a cell knows [blocks, cells]: in an empty box of 128^3 cells a ray takes 10 steps."""
+"""Largest distance that is stored [blocks, or cells]; what is further counts as so far. In an empty box of 128^3 cells a ray
+takes 10 steps with it."""
 
 
 def block_bounds(values: mi.TensorXf) -> mi.Float:
@@ -55,13 +57,17 @@ def count_blocks(n: int, shift: int = SHIFT) -> int:
 def over_blocks(
     flat: mi.Float, res: tuple[int, int, int], shift: int, reduce: Callable[[mi.Float, mi.Float], mi.Float], nothing: float
 ) -> mi.Float:
-    """Reduce the nodes that the cells of each block of 2^shift along each axis touch, axis by axis.
+    """Reduce the values at all nodes that each block of cells touches, one axis after the other.
 
     Args:
         flat: one number a voxel (Z, Y, X).
         res: (Z, Y, X).
         shift: log2 of the edge of a block [cells].
-        reduce, nothing: a function of two, associative, and what leaves the other one as it is.
+        reduce: an associative function of two arrays, such as ``dr.maximum``.
+        nothing: its neutral element.
+
+    Returns:
+        Flat array over the blocks (z, y, x).
     """
     z, y, x = res
     b_y, b_x = count_blocks(y, shift), count_blocks(x, shift)
@@ -108,15 +114,15 @@ def find_empty_distances(values: mi.TensorXf) -> mi.UInt8:
 
 
 def empty_block_distances(bounds: mi.Float, res: tuple[int, int, int]) -> mi.UInt8:
-    """Measure how far each block is from the nearest that holds anything.
+    """Measure how far each block is from the nearest one that is not empty.
 
     Args:
         bounds: from :func:`block_bounds`.
         res: of the grid (Z, Y, X).
 
     Returns:
-        Flat array over the blocks: distances [blocks], the largest of the three axes'; 0 where the block itself holds
-        anything, ``REACH`` where it is further. From a block of distance k a ray may cross k - 1 more along each axis.
+        Flat array over the blocks: Chebyshev distances [blocks], 0 for a block that is not empty, at most ``REACH``. From a
+        block at distance k a ray may cross k - 1 more blocks along each axis.
 
     Cost: 6 ``REACH`` look-ups a block at most.
     """
@@ -124,9 +130,9 @@ def empty_block_distances(bounds: mi.Float, res: tuple[int, int, int]) -> mi.UIn
 
 
 def distances(occupied: mi.Bool, counts: tuple[int, int, int]) -> mi.UInt8:
-    """How far each of (Z, Y, X) places is from the nearest occupied one: the largest of the three axes', at most ``REACH``.
+    """The Chebyshev distance of each of (Z, Y, X) blocks or cells from the nearest occupied one, at most ``REACH``.
 
-    Cost: 6 ``REACH`` look-ups a place at most, an axis at a time.
+    Cost: 6 ``REACH`` look-ups each at most, one axis after the other.
     """
     z, y, x = counts
     far = dr.select(occupied, mi.UInt8(0), mi.UInt8(REACH))
@@ -139,7 +145,11 @@ def distances(occupied: mi.Bool, counts: tuple[int, int, int]) -> mi.UInt8:
 
 @dr.syntax
 def _nearest(far: mi.UInt8, stride: int, n: int) -> mi.UInt8:
-    """The least, over the neighbours along an axis, of the larger of their distance along it and their own ``far``."""
+    """Extend distances that are right across the axes before to one more axis.
+
+    The distance of a place is the smallest, over its neighbours along the axis, of the larger of two numbers: how far the
+    neighbour is along the axis, and the neighbour's own distance ``far`` across the other axes.
+    """
     here = dr.arange(mi.Int32, dr.width(far))
     place = here // stride % n
     best = mi.UInt8(far)

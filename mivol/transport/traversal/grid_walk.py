@@ -1,12 +1,13 @@
 """The walk through the cells of a grid that a ray crosses, one after the other.
 
-The walk owns the geometry; a visitor owns the meaning: ``visit(state, cell, active) -> state``.
+The walk knows the geometry only. What is done with a cell is decided by a visitor, ``visit(state, cell, active) -> state``,
+which sums an optical depth, its tangent, its transpose, or keeps a candidate of a reservoir.
 
 Conventions. Cells are those of :mod:`mivol.transport.traversal.lattice`. The state inside the grid is an integer cell and a
 fraction in it, so the error of a position does not grow with its coordinate.
 
-References: Amanatides & Woo 1987 (the traversal); blocks of cells that are skipped whole as in the super-grids of
-Szirmay-Kalos et al. 2011, and as many as are empty all around (proximity clouds, Cohen & Sheffer 1994).
+References: Amanatides & Woo 1987 (the traversal); Szirmay-Kalos et al. 2011 (super-grids: empty blocks are skipped whole);
+Cohen & Sheffer 1994 (proximity clouds: as many blocks are skipped as are empty all around).
 """
 
 from __future__ import annotations
@@ -67,22 +68,22 @@ def walk(
     A ray that leaves a cell through a face keeps the four corners of that face, so only the four new ones are read.
 
     Args:
-        lattice: the grid; where it has ``empty_distances``, empty blocks are crossed, as many at once as are empty all around,
-            and not
-            visited.
+        lattice: the grid; where it has ``empty_distances``, empty blocks are crossed without a visit, as many at once as are
+            empty all around.
         segment: from :func:`clip`.
         visit: ``visit(state, cell, active) -> state``; called once, while the loop is traced.
         state: any PyTree of Dr.Jit arrays.
         reads: arrays over the nodes; the visitor finds their corners in ``cell.corners``.
         active: lanes to walk.
-        until: whether a lane has seen enough, told from the state after a cell; None to walk to the end.
-        halts: the visitor may stop inside a cell: it returns its state and how far it went, at most ``cell.dt``, and is asked
+        until: ``until(state) -> mask`` of lanes that need not go on, asked after each cell; None to walk to the end.
+        halts: the visitor may stop inside a cell: it returns its state and how far it went, at most ``cell.dt``, and is called
             again from there.
 
-    Cost: one step per cell or gap, at most X + Y + Z + 6 of them; 4 reads a step and channel (8 a visited cell
+    Cost: one step per cell or empty region, at most X + Y + Z + 6 of them; 4 reads a step and channel (8 a visited cell
         where blocks are skipped).
     """
-    # Plain names for what the loop needs: it takes part in none of the rest.
+    # Dr.Jit makes every object that a loop's body names part of the loop's state: so the body names these two arrays only,
+    # and neither the lattice nor the segment.
     empty_distances, length = lattice.empty_distances, segment.length
     skip = empty_distances is not None
     res = lattice.res
@@ -145,7 +146,7 @@ def walk(
         if until is not None:
             active &= ~until(state)
 
-        # -- Advance: one plane further, or as many as a gap has ---------------------------------------------------------
+        # -- Advance: one plane further, or as many as the empty region has ----------------------------------------------
         if skip:
             there = dr.fma(speed, dt, frac)
             jump = dr.select(through, span + 1, dr.clip(mi.Vector3i(dr.floor(there)), 0, span))
@@ -157,16 +158,16 @@ def walk(
             near = dr.select(through, far, near)
             far = dr.select(through, dr.clip(far + sign * stride, 0, top * stride), far)
             corners = _shift(corners, through, read_nodes(reads, _far_face(near, far, through), active))
-        # Always from the entry, never from the last cell: a rounding of 3e-8 in each step, the same in every one, would
-        # carry a ray 1e-5 of a cell off its course in 256. The first product is as large as the count that is taken from
-        # it, and both are exact; what remains is rounded once.
+        # The fraction is found from the entry point, not from the last cell: the rounding of 3e-8 in a step has the same sign
+        # in every step, and would carry a ray 1e-5 of a cell off its course in 256. speed * s and the number of planes passed
+        # are nearly equal; the fused multiply-add subtracts them before it rounds, so that only the remainder is rounded.
         course = dr.fma(speed, s_rest, dr.fma(speed_rest, s, entry))
         frac = _least(_most(dr.fma(speed, s, -passed) + course, 0), 1)
     return state
 
 
 def _add(total: mi.Float, rest: mi.Float, term: mi.Float) -> tuple[mi.Float, mi.Float]:
-    """A sum and the digits that it loses (Knuth's two-sum): float32 alone lets the end of 256 cells drift by 8e-4 of one."""
+    """Add to a compensated sum (Knuth's two-sum): float32 alone lets the end of a walk of 256 cells drift by 8e-4 of one."""
     after = total + term
     took = after - total
     return after, rest + ((total - (after - took)) + (term - took))

@@ -1,4 +1,4 @@
-"""Trilinear interpolation in a cell, its transpose, and the two Gauss points of a ray's way through it.
+"""Trilinear interpolation in a cell, its transpose, and the two Gauss points of a ray's interval in it.
 
 Conventions. Bits 0, 1, 2 of the number of a corner are x, y, z. Along a line a trilinear function is a cubic in each cell, so
 two Gauss points integrate it exactly.
@@ -19,18 +19,18 @@ __all__ = ["GAUSS", "gauss_points", "interpolate", "node_weights", "upward_frac"
 
 
 GAUSS = 0.5 - math.sqrt(3) / 6
-"""First of the two Gauss points on [0, 1]; the other is its mirror image. Exact for cubics."""
+"""First of the two Gauss-Legendre points on [0, 1]; the other is 1 minus it. The rule is exact for cubics."""
 
 
 def gauss_points(cell: Cell) -> tuple[mi.Vector3f, mi.Vector3f]:
-    """The two Gauss points of a cell's stretch, as fractions from its near planes."""
+    """The two Gauss points of a ray's interval in a cell, as fractions from the cell's near planes."""
     return dr.fma(cell.step, GAUSS, cell.frac), dr.fma(cell.step, 1 - GAUSS, cell.frac)
 
 
 def interpolate(corners: list[mi.Float], frac: mi.Vector3f) -> mi.Float:
     """The trilinear value at a point of a cell; bits 0, 1, 2 of the corner are x, y, z."""
-    # a + t (b - a), not a (1 - t) + b t: the differences along x are shared by all points of a cell. It errs by an ulp of the
-    # larger corner, and is exact where the corners are equal.
+    # a + t (b - a), and not a (1 - t) + b t, since all points of a cell share the differences b - a along x. The result is off
+    # by at most an ulp of the larger corner, and exact where the corners are equal.
     x = [_lerp(corners[q], corners[q + 1], frac.x) for q in (0, 2, 4, 6)]
     y = [_lerp(x[0], x[1], frac.y), _lerp(x[2], x[3], frac.y)]
     return _lerp(y[0], y[1], frac.z)
@@ -52,11 +52,11 @@ def node_weights(frac: mi.Vector3f, cell: Cell, res: tuple[int, int, int]) -> li
 
 
 def _natural_frac(frac: mi.Vector3f, cell: Cell, res: tuple[int, int, int]) -> mi.Vector3f:
-    """Fractions along the grid's own axes; in the outer half voxel all weight goes to the node that exists."""
+    """Fractions along the grid's own axes, from fractions along the ray; see :func:`upward_frac`."""
     return upward_frac(dr.select(cell.ahead, frac, 1 - frac), cell.lower, res)
 
 
 def upward_frac(frac: mi.Vector3f, lower: mi.Vector3i, res: tuple[int, int, int]) -> mi.Vector3f:
-    """Fractions from the lower node of a cell, with all weight on the node that exists in the outer half voxel."""
+    """Fractions from the lower node of a cell; in the outer half voxel they put all weight on the only node that exists."""
     z, y, x = res
     return dr.select(lower < 0, 1, dr.select(lower >= mi.Vector3i(x - 1, y - 1, z - 1), 0, frac))

@@ -2,9 +2,9 @@
 
 Conventions. A cell (i, j, k), each index from -1 to N - 1, lies between the nodes i and i + 1; node indices are clamped
 to the grid, so that the outer half voxel is constant and a single voxel needs no special case. A ray is o + t d with t in
-world length for a unit d; it is mapped to the lattice without being normalised again, so t keeps its meaning under any
-scale, shear or mirroring. Box entry and exit are found in float64: a float32 entry point errs by 3e-3 of a cell
-from 1e4 scene sizes away.
+world length for a unit d. Its direction is mapped to the lattice without being normalised again, so t remains a world length
+under any scale, shear or mirroring. Box entry and exit are found in float64: in float32 the entry point of a ray that starts
+1e4 scene sizes away is off by 3e-3 of a cell.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class Lattice:
         if np.prod([n + 1 for n in self.values.shape[:3]]) * self.channels >= 2**31:
             raise MivolError(f"a grid of shape {tuple(self.values.shape)} was given; a walk counts up to 2^31: split it.")
         self.to_world = check_affine(self.to_world)
-        # Opaque: two grids placed differently share one kernel.
+        # Opaque numbers are arguments of a kernel, so grids in different places share one compiled kernel.
         rows = lattice_from_world(self.to_world, self.res)
         self.from_world = [[dr.opaque(mi.Float64, float(v)) for v in row] for row in rows]
 
@@ -68,18 +68,21 @@ class Lattice:
         return self.values.shape[3]
 
     def place(self, u: mi.Vector3f) -> mi.Point3f:
-        """Points of the unit cube in the world, in float32."""
+        """Map points of the unit cube to the world, in float32."""
         rows = [[dr.opaque(mi.Float, float(v)) for v in row] for row in self.to_world[:3]]
         return mi.Point3f(*(dr.fma(r[0], u.x, dr.fma(r[1], u.y, dr.fma(r[2], u.z, r[3]))) for r in rows))
 
 
 @dataclass
 class Segment:
-    """A ray's stretch inside a box of the lattice: where it enters, and how far it goes.
+    """The part of a ray inside the box of a lattice: where it enters, and how far it goes.
 
-    ``cell`` and ``frac`` are the entry point (lattice coordinates), ``d`` the lattice distance per world length (and
-    ``d_rest`` what its rounding left over), ``t0`` the world distance from the ray's origin to the entry, ``length`` the
-    world length inside.
+    Attributes:
+        cell, frac: the entry point: its cell, and the fraction from the cell's lower node.
+        d: lattice distance per world length.
+        d_rest: the rounding error of ``d``, so that d + d_rest has double precision.
+        t0: distance of the entry from the ray's origin [length].
+        length: length inside the box [length].
     """
 
     cell: mi.Vector3i
@@ -96,10 +99,10 @@ def clip(lattice: Lattice, o: mi.Point3f, d: mi.Vector3f, t_min: mi.Float, t_max
     Args:
         lattice: the grid and its place.
         o, d: world ray; t is world length where |d| = 1.
-        t_min, t_max: the stretch asked for [length]; ``t_max`` may be infinite.
+        t_min, t_max: the interval of the ray to cut [length]; ``t_max`` may be infinite.
 
     Returns:
-        The stretch inside the box; ``length`` is 0 where there is none.
+        The part inside the box; its ``length`` is 0 where there is none.
     """
     n = lattice.res[::-1]
     high = tuple(k - 0.5 for k in n)
@@ -127,7 +130,7 @@ def locate(lattice: Lattice, o: mi.Point3f, d: mi.Vector3f, t: mi.Float) -> tupl
     p = [dr.fma(t, mi.Float64(d[a]), mi.Float64(o[a])) for a in range(3)]
     for a, row in enumerate(lattice.from_world):
         q = dr.fma(row[0], p[0], dr.fma(row[1], p[1], dr.fma(row[2], p[2], row[3])))
-        # A distance that was drawn in the box and rounded may lie 1e-7 of the way outside it.
+        # A distance that was drawn inside the box may, once rounded to float32, lie outside it by 1e-7 of itself.
         inside &= dr.abs(q - 0.5 * (n[a] - 1)) < 0.5 * n[a] + 1e-3
         q = dr.clip(q, -0.5, n[a] - 0.5)
         low = dr.minimum(dr.floor(q), n[a] - 1)
@@ -144,10 +147,10 @@ def slab(
         rows: (3, 4) map from the world to the box's coordinates.
         low, high: the box there.
         o, d: world ray.
-        t0, t1: the stretch asked for [length].
+        t0, t1: the interval of the ray to cut [length].
 
     Returns:
-        The ray's origin and direction in the box's coordinates, and the stretch inside; t1 <= t0 where there is none.
+        The ray's origin and direction in the box's coordinates, and the interval inside; t1 <= t0 where there is none.
     """
     f64 = mi.Float64
     o, d = [f64(o[a]) for a in range(3)], [f64(d[a]) for a in range(3)]
@@ -158,9 +161,11 @@ def slab(
         parallel = v[a] == 0
         inv = 1 / dr.select(parallel, 1, v[a])
         near, far = (low[a] - q[a]) * inv, (high[a] - q[a]) * inv
-        # A ray parallel to the faces is in or out for ever: 0 * inf would be NaN. In the plane of a face it is out.
+        # A ray parallel to two faces lies between them along all its length or nowhere; the products with 1 / 0 would be NaN.
+        # In the plane of a face it counts as outside.
         inside = (q[a] > low[a]) & (q[a] < high[a])
         t0 = dr.select(parallel, dr.select(inside, t0, dr.inf), dr.maximum(t0, dr.minimum(near, far)))
         t1 = dr.select(parallel, t1, dr.minimum(t1, dr.maximum(near, far)))
-    # NaN rays fail the comparison and are empty, as is a direction of length 0 (an infinite stretch).
+    # The comparison is false for NaN, so rays with NaN get an empty interval; so do directions of length 0, whose interval
+    # would be infinite.
     return q, v, t0, dr.select((t1 > t0) & dr.isfinite(t1 - t0), t1, t0)

@@ -1,12 +1,12 @@
-"""The cells of a grid that hold something, and a walk that visits no other.
+"""The non-empty cells of a grid, and a walk along rays that visits only these.
 
 Conventions. Cells and nodes are those of :mod:`mivol.transport.traversal.lattice`: a cell lies between two nodes along each
-axis, -1 to N - 1, border nodes are repeated. ``Cells.number`` holds, for each cell of the box, its place in the list of
-occupied ones or, where it is not one, minus the distance in cells to the nearest that is (the largest of the three axes'
-distances): so far a ray may go in one step. Distances beyond REACH are said as REACH.
+axis, -1 to N - 1, border nodes are repeated. ``Cells.number`` holds for each cell of the box its index in the list of occupied
+cells; for a cell that is not occupied it holds minus the Chebyshev distance [cells] to the nearest that is, at most REACH. A
+ray may go that far in one step.
 
-The search for the next occupied cell is a loop of its own, so the lanes of a packet wait for each other there, where a step
-costs one read, and visit cells together.
+The search for the next occupied cell is an inner loop of its own. Lanes of a packet then wait for each other in the search,
+where a step costs one read, and visit cells, which costs far more, together.
 
 References: Amanatides & Woo 1987 (the traversal); Cohen & Sheffer 1994 (proximity clouds: distances that a ray may skip).
 """
@@ -37,9 +37,9 @@ class Cells:
     Attributes:
         res: nodes (Z, Y, X).
         to_world: (4, 4) float64, unit cube to world.
-        count: how many cells are listed.
-        number: Int32 over the (Z + 1) (Y + 1) (X + 1) cells, x fastest: the place in ``corners``, or minus a distance.
-        corners: UInt32, 8 a cell: its nodes, in ``rows``; bits 0, 1, 2 of the corner are x, y, z.
+        count: number of occupied cells.
+        number: Int32 over the (Z + 1) (Y + 1) (X + 1) cells, x fastest: index of the cell in ``corners``, or minus a distance.
+        corners: UInt32, 8 a cell: indices of its nodes in ``rows``; bits 0, 1, 2 of the corner are x, y, z.
         rows: UInt32, the rows of the nodes of listed cells, each once.
         from_world: (3, 4) map from the world to lattice coordinates.
     """
@@ -60,13 +60,13 @@ class Cells:
         rows: mi.UInt32,
         occupied: Callable[[list[mi.UInt32]], mi.Bool],
     ) -> Cells:
-        """Look at every cell of a grid.
+        """Find the occupied cells of a grid.
 
         Args:
             res: nodes (Z, Y, X).
             to_world: (4, 4) affine map of the unit cube.
             rows: the row of each node, flat, x fastest.
-            occupied: which cells to list, told from the rows of their 8 corners; called once.
+            occupied: ``occupied(rows of the 8 corners) -> mask`` of cells to list; called once for all cells.
 
         Raises:
             MivolError: more cells than a 32-bit number counts.
@@ -84,7 +84,8 @@ class Cells:
         if count:
             dr.scatter(number, dr.arange(mi.Int32, count), listed)
             number = dr.select(number >= 0, number, -mi.Int32(distances(number >= 0, tuple(n + 1 for n in res))))
-        # Arrays of no length cannot be read, even by no lane: where nothing is listed, a cell that no number leads to.
+        # Dr.Jit cannot gather from an array of length 0, not even with all lanes inactive. Where no cell is occupied the arrays
+        # hold one cell, to which no number points.
         named = _corner_rows(listed if count else mi.UInt32(0), rows, res)
         corners = dr.zeros(mi.UInt32, 8 * max(count, 1))
         for q, row in enumerate(named):
@@ -105,7 +106,7 @@ class Cells:
 
 
 def _numbered(rows: mi.UInt32, most: int) -> tuple[mi.UInt32, mi.UInt32]:
-    """The different ones among numbers up to ``most``, ascending, and the place of each among them."""
+    """The distinct numbers among ``rows`` (each at most ``most``), ascending, and the index of each row among them."""
     used = dr.zeros(mi.UInt8, most + 1)
     dr.scatter(used, mi.UInt8(1), rows)
     different = dr.compress(used > 0)
@@ -115,18 +116,18 @@ def _numbered(rows: mi.UInt32, most: int) -> tuple[mi.UInt32, mi.UInt32]:
 
 
 def _apart(cell: mi.UInt32, res: tuple[int, int, int]) -> tuple[mi.Int32, mi.Int32, mi.Int32]:
-    """Places along x, y, z of cells, counted from the outer half voxel."""
+    """Indices along x, y, z of cells from their flat index; index 0 is the outer half voxel."""
     _, y, x = res
     return mi.Int32(cell % (x + 1)), mi.Int32(cell // (x + 1) % (y + 1)), mi.Int32(cell // ((x + 1) * (y + 1)))
 
 
 def _between(place: mi.Int32, n: int) -> tuple[mi.Int32, mi.Int32]:
-    """The nodes before and after places counted from the outer half voxel."""
+    """The lower and the upper node of cells along one axis, clamped to the grid; cell 0 is the outer half voxel."""
     return dr.maximum(place - 1, 0), dr.minimum(place, n - 1)
 
 
 def _corner_rows(cell: mi.UInt32, rows: mi.UInt32, res: tuple[int, int, int]) -> list[mi.UInt32]:
-    """Rows of the 8 corners of cells, counted from the outer half voxel."""
+    """Rows of the 8 corners of cells, from their flat index."""
     z, y, x = res
     i, j, k = (_between(a, n) for a, n in zip(_apart(cell, res), (x, y, z), strict=True))
     return [dr.gather(mi.UInt32, rows, mi.UInt32((c * y + b) * x + a)) for c in k for b in j for a in i]
@@ -134,10 +135,13 @@ def _corner_rows(cell: mi.UInt32, rows: mi.UInt32, res: tuple[int, int, int]) ->
 
 @dataclass
 class CellVisitor:
-    """What a visitor sees of one occupied cell.
+    """What a visitor is told of one occupied cell.
 
-    ``number`` is its place in the list, ``points`` the fractions of the two Gauss points along the grid's own axes, in the
-    order in which the ray meets them, ``t`` the length walked before the cell and ``dt`` that in it.
+    Attributes:
+        number: index in the list of occupied cells.
+        points: the two Gauss points, as fractions along the grid's own axes, in the order in which the ray meets them.
+        t: length walked before the cell [length].
+        dt: length in the cell [length].
     """
 
     number: mi.UInt32
@@ -163,15 +167,15 @@ def march(
         visit: ``visit(state, here, active) -> state``, called once, while the loop is traced.
         state: any PyTree of Dr.Jit arrays.
         active: lanes to walk.
-        until: whether a lane has seen enough, told from the state after a cell; None to walk to the end.
+        until: ``until(state) -> mask`` of lanes that need not go on, asked after each cell; None to walk to the end.
 
     Returns:
         The last state, the last cell visited (lower node), and where the ray left it [length from the segment's start].
 
-    Error: a position is within 2^-23 (X + Y + Z) of a cell.
-    Cost: one read a search step, at most X + Y + Z + 3 of them, fewer where cells know that all around is empty.
+    Error: positions are off by at most 2^-23 (X + Y + Z) of a cell.
+    Cost: one read a search step, at most X + Y + Z + 3 of them, fewer where all around is empty.
     """
-    # -- Counted along the ray: n cells crossed since the first, an axis each ---------------------------------------------
+    # -- State: n counts the cells crossed since the first, along each axis ----------------------------------------------
     number, length = cells.number, segment.length
     z, y, x = cells.res
     # An axis to which the ray is parallel counts as ahead: its fraction is then used as it is, without a rounding.
@@ -228,7 +232,7 @@ def march(
 
 
 def reversed_from(segment: Segment, cell: mi.Vector3i, t: mi.Float, until: mi.Float) -> Segment:
-    """The way back along a segment, from a point of it in ``cell`` at ``t`` to ``until`` [length from its start]."""
+    """The reversed segment from the point in ``cell`` at ``t`` back to ``until`` [lengths from the start of ``segment``]."""
     planes = mi.Vector3f(cell - segment.cell)
     frac = dr.clip(dr.fma(segment.d, t, segment.frac - planes), 0, 1)
     return Segment(cell, frac, -segment.d, -segment.d_rest, segment.t0 + t, t - until)

@@ -1,6 +1,9 @@
-"""Random numbers that a lane makes for itself: a walk that draws in every cell would soon have used up a sampler.
+"""A random number generator for each lane (PCG32), for walks that draw a number in every cell.
 
-References: O'Neill 2014 (the generator).
+Mitsuba's samplers are not used there: the number of dimensions that a walk consumes differs from lane to lane, and samplers
+that stratify have only few. One sampler dimension seeds the generator.
+
+References: O'Neill 2014 (permuted congruential generators, RXS-M-XS 32).
 """
 
 from __future__ import annotations
@@ -12,16 +15,27 @@ __all__ = ["draw_pcg32", "seed_pcg32"]
 
 
 def seed_pcg32(u: mi.Float, width: int, number: int = 0) -> mi.UInt32:
-    """A generator for each lane, from a number in [0, 1); others, told apart by ``number``, from the same."""
+    """Seed a generator for each lane.
+
+    Args:
+        u: a uniform number in [0, 1), which may be the same in all lanes.
+        width: number of lanes.
+        number: generators with different numbers are independent although ``u`` is the same.
+
+    Returns:
+        The states.
+    """
     seed = mi.UInt32(u * (1 << 24)) * mi.UInt32(0x9E3779B9) + dr.arange(mi.UInt32, width) * mi.UInt32(0x85EBCA6B)
     return seed + mi.UInt32((0xC2B2AE35 * number) % (1 << 32))
 
 
 def draw_pcg32(state: mi.UInt32, count: int) -> tuple[mi.UInt32, list[mi.Float]]:
-    """Draw from a permuted congruential generator (RXS-M-XS 32).
+    """Draw uniform numbers from a permuted congruential generator (RXS-M-XS 32).
 
     Returns:
-        Its next state, and ``count`` numbers in (0, 1): never 0, which would be kept or met for ever.
+        The next state, and ``count`` numbers in the open interval (0, 1). They are never 0: a reservoir keeps a candidate where
+        u times the sum of weights is below its weight, so u = 0 would keep any; and -log(u), the distance to the next collision
+        of a tracker, would be infinite.
     """
     numbers = []
     for _ in range(count):

@@ -1,4 +1,4 @@
-"""Rays that go on from a surface, and the distance of a surface along the ray that began at the camera."""
+"""Rays that continue behind a surface, and the distance of a surface along the ray that began at the camera."""
 
 from __future__ import annotations
 
@@ -11,9 +11,10 @@ __all__ = ["camera_ray", "distance_along", "spawn_ray"]
 def distance_along(ray: mi.Ray3f, hit: mi.SurfaceInteraction3f) -> mi.Float:
     """Distance of a hit along the ray that began at the camera.
 
-    Not the sum of the parts: each spawned ray starts an epsilon (1e-4 of a length) further on and to the side, so the hit
-    lies beside the first ray. The plane of the surface is met by both; at grazing incidence, where that plane says little,
-    the nearest point of the ray does.
+    The lengths of the spawned rays are not summed: each of them starts an epsilon (1e-4 of a length) further on and to the
+        side,
+    so that the hit lies beside the first ray. Instead the first ray is intersected with the tangent plane of the surface at the
+    hit. At grazing incidence that intersection is ill-conditioned, and the point of the ray nearest to the hit is taken.
     """
     slope = dr.dot(hit.n, ray.d)
     steep = dr.abs(slope) > 1e-2
@@ -22,10 +23,10 @@ def distance_along(ray: mi.Ray3f, hit: mi.SurfaceInteraction3f) -> mi.Float:
 
 
 def spawn_ray(si: mi.SurfaceInteraction3f, d: mi.Vector3f, size: mi.Float) -> mi.Ray3f:
-    """A ray onward from a surface, which begins a little behind it.
+    """Spawn a ray that continues in direction ``d`` and begins a little behind the surface.
 
-    Mitsuba's own begin 1e-4 of (1 + the largest coordinate) behind it, which passes whole shapes by in scenes that are not much
-    larger than that: here, of a quarter of their ``size``, where that is below 1.
+    Mitsuba offsets the origin by 1e-4 (1 + the largest coordinate), which can step over whole shapes in a scene that is small.
+    Here the 1 is replaced by a quarter of the scene's ``size`` [length], where that is less.
     """
     step = (dr.minimum(0.25 * size, 1) + dr.max(dr.abs(si.p))) * mi.math.RayEpsilon
     ray = si.spawn_ray(d)
@@ -34,6 +35,6 @@ def spawn_ray(si: mi.SurfaceInteraction3f, d: mi.Vector3f, size: mi.Float) -> mi
 
 
 def camera_ray(ray: mi.Ray3f) -> mi.Ray3f:
-    """A ray of a sensor, which ends where the sensor ends it: at its ``far_clip``; without an end where that is not finite."""
+    """The ray of a sensor, ended at the sensor's ``far_clip``; ``maxt`` is infinite where that is not finite."""
     end = dr.select(ray.maxt < dr.largest(mi.Float), ray.maxt, dr.inf)
     return mi.Ray3f(ray.o, ray.d, end, ray.time, ray.wavelengths)
