@@ -7,7 +7,7 @@ import numpy as np
 
 from mivol.fields.spherical import SphericalGrid
 from mivol.transport.line_integrals.radiance_field import (
-    RayBatch,
+    RayBundle,
     RenderedRays,
     backward,
     bake,
@@ -37,9 +37,9 @@ def aim(count, to_world=TO_WORLD, seed=1):
     return o, np.float32(d / np.linalg.norm(d, axis=1, keepdims=True))
 
 
-def rays_of(o, d) -> RayBatch:
+def rays_of(o, d) -> RayBundle:
     o, d = (np.atleast_2d(np.asarray(a, np.float32)) for a in (o, d))
-    return RayBatch(mi.Point3f(np.ascontiguousarray(o.T)), mi.Vector3f(np.ascontiguousarray(d.T)))
+    return RayBundle(mi.Point3f(np.ascontiguousarray(o.T)), mi.Vector3f(np.ascontiguousarray(d.T)))
 
 
 def followed(field, o, d, stop=0.0, pinhole=None) -> RenderedRays:

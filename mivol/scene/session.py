@@ -121,8 +121,9 @@ class Session:
             named = [sensor.get_medium() for sensor in scene.sensors()]
             media.start = named[0] if all(medium is named[0] for medium in named) else None
             media.locates_camera = bool(media.traced)
-            score, valid = walk_path(estimators, self.settings, sampler, ray, Primal(_black(ray)), active)
-            return score.L, valid, integrate_aovs(media, ray, self.aovs, active)
+            score, alpha = walk_path(estimators, self.settings, sampler, ray, Primal(_black(ray)), active)
+            # Their alpha is whether something is seen: it is drawn.
+            return score.L, sampler.next_1d(active) < alpha, integrate_aovs(media, ray, self.aovs, active)
 
     def _open(self, scene: mi.Scene, sensor: mi.Sensor, spp: int, pictures: bool = False) -> tuple[Estimators, Plan]:
         """Ask, plan, and build the estimators, for pictures or for derivatives."""
@@ -136,15 +137,15 @@ class Session:
 
     def _primal(self, estimators: Estimators, rays: CameraRays) -> tuple:
         score = Primal(_black(rays.ray))
-        score, valid = walk_path(estimators, self.settings, rays.sampler, rays.ray, score, strata=rays.strata)
-        return score.L, valid, integrate_aovs(estimators.media, rays.ray, self.aovs)
+        score, alpha = walk_path(estimators, self.settings, rays.sampler, rays.ray, score, strata=rays.strata)
+        return score.L, alpha, integrate_aovs(estimators.media, rays.ray, self.aovs)
 
     def _tangent(self, estimators: Estimators, rays: CameraRays) -> tuple:
         estimators.find_controls(rays.ray)
         black = _black(rays.ray)
         score = Tangent(black, black)
         score, _ = walk_path(estimators, self.settings, rays.sampler, rays.ray, score, strata=rays.strata)
-        return score.dL, dr.full(mi.Bool, False, dr.width(black)), jvp_aovs(estimators.media, rays.ray, self.aovs)
+        return score.dL, dr.zeros(mi.Float, dr.width(black)), jvp_aovs(estimators.media, rays.ray, self.aovs)
 
     def _replay(self, estimators: Estimators, rays: CameraRays, dL: mi.Spectrum, daovs: list[mi.Float]) -> None:
         estimators.find_controls(rays.ray)

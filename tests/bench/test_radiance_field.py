@@ -16,6 +16,7 @@ from mivol.bench.radiance_field.fields import FIELDS, centred
 from mivol.bench.radiance_field.fits import EVERY, follow, held_out_psnr, our_fit, peer_fit
 from mivol.bench.radiance_field.steps import ask_memory, our_step, peer_of, peer_step, tasks
 from mivol.bench.radiance_field.views import BOX, between, photographed, rays_of, rays_through, ring, tiled
+from mivol.photos import Camera, Photo, intrinsics
 from mivol.transport.line_integrals.radiance_field import bake, cells_of, model_of, render
 
 TINY = replace(QUICK, resolution=8, side=16, steps=EVERY, fit_resolution=8, fit_side=16, chair_steps=8, fields=("fog",))
@@ -57,6 +58,15 @@ def test_both_fits_learn_the_views(variant_rgb: str) -> None:
         assert all(0 < early < late for (early, _), (late, _) in itertools.pairwise(curve))
 
 
+def test_views_that_are_hit_exactly_count_100_decibels() -> None:
+    """The mean over views: 100 dB for the one that is right, 20 dB for that off by a tenth, whatever lies beyond 1 cut off."""
+    camera = Camera(intrinsics(8, 8, 4, 4), (8, 8), np.eye(4))
+    shown = {"right": 1.0, "off": 0.9}
+    views = [Photo(name, np.full((8, 8, 3), v, np.float32), None, None, camera, np.zeros(3)) for name, v in shown.items()]
+    # float32 rounds 0.9 by 3e-8 of it, which is 2e-6 dB of an error of 0.1.
+    assert held_out_psnr(views, lambda camera: np.full((8, 8, 3), 1.5)) == pytest.approx((100 + 20) / 2, abs=1e-5)
+
+
 def test_views_show_the_field(variant_rgb: str) -> None:
     """Those of a ring look at the middle of the box from 3.1 away; those between are half a step further on."""
     cameras, others = ring(16, 4), between(16, 4)
@@ -84,7 +94,7 @@ def test_only_steps_are_counted() -> None:
 def test_pixels_are_drawn_anywhere(variant_rgb: str) -> None:
     """As many rays as tiles would have; four neighbours of a tile are rarely neighbours here."""
     photos = photographed(FIELDS["fog"](TINY)[0], ring(16, 3))
-    batches = [kind.of(photos).draw(1, np.arange(3), 4, np.random.default_rng(0)) for kind in (fits.Pixels, fits.Views)]
+    batches = [kind.of(photos).draw(1, np.arange(3), 4, np.random.default_rng(0)) for kind in (fits.Pixels, fits.RayBatches)]
     widths = [dr.width(batch.rays.d) for batch in batches]
     assert widths == [3 * 4 * 16] * 2
     steps = [np.linalg.norm(np.diff(np.array(batch.rays.d), axis=1), axis=0) for batch in batches]

@@ -17,7 +17,7 @@ from mivol.bench.radiance_field.size import STOP, Size
 from mivol.bench.radiance_field.views import camera, rays_of, rays_through, ring, tiled
 from mivol.bench.timing import race, ratio_of
 from mivol.fields.spherical import SphericalGrid
-from mivol.transport.line_integrals.radiance_field import RayBatch, backward, bake, cells_of, exact, fold, model_of, render
+from mivol.transport.line_integrals.radiance_field import RayBundle, backward, bake, cells_of, exact, fold, model_of, render
 
 __all__ = ["Task", "ask_memory", "ask_step", "our_step", "peer_of", "peer_step", "tasks"]
 
@@ -26,7 +26,7 @@ __all__ = ["Task", "ask_memory", "ask_step", "our_step", "peer_of", "peer_step",
 class Task:
     """Rays of one kind: what they are, their pinholes and which of them each has."""
 
-    rays: RayBatch
+    rays: RayBundle
     pinholes: np.ndarray | None = None
     view: np.ndarray | None = None
 

@@ -9,10 +9,10 @@ import mitsuba as mi
 import numpy as np
 
 from mivol.fields.spherical import SphericalGrid
-from mivol.optim.radiance_fit import render_view
+from mivol.optim.field_view import render_view
 from mivol.photos import Camera, Photo, intrinsics, pixel_centres, rays
 from mivol.photos.journey import facing
-from mivol.transport.line_integrals.radiance_field import RayBatch
+from mivol.transport.line_integrals.radiance_field import RayBundle
 
 __all__ = ["BOX", "between", "camera", "photographed", "rays_of", "rays_through", "ring", "tiled"]
 
@@ -57,8 +57,8 @@ def rays_through(one: Camera, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarra
     return np.broadcast_to(o, d.shape), d
 
 
-def rays_of(o: np.ndarray, d: np.ndarray) -> RayBatch:
+def rays_of(o: np.ndarray, d: np.ndarray) -> RayBundle:
     """Rays on the device."""
-    made = RayBatch(*(kind(np.ascontiguousarray(np.float32(a.T))) for kind, a in ((mi.Point3f, o), (mi.Vector3f, d))))
+    made = RayBundle(*(kind(np.ascontiguousarray(np.float32(a.T))) for kind, a in ((mi.Point3f, o), (mi.Vector3f, d))))
     dr.eval(made.o, made.d)
     return made

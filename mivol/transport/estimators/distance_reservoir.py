@@ -31,7 +31,7 @@ from mivol.transport.media.ray_intervals import MediumVisitor
 from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.traversal.grid_walk import Cell, walk
 from mivol.transport.traversal.interpolation import gauss_points
-from mivol.transport.traversal.lattice import clip
+from mivol.transport.traversal.lattice import clip, split
 from mivol.transport.traversal.random_numbers import draw_pcg32, seed_pcg32
 
 __all__ = ["Candidate", "Reservoir", "fill_reservoir", "inverse", "lit_length", "start_reservoir", "taken_light"]
@@ -128,7 +128,7 @@ class _Filling:
 
     def visit(self, reservoir: Reservoir, body: Body, t0: mi.Float, t1: mi.Float, on: mi.Bool) -> Reservoir:
         """Offer the pieces of one body, and sum the optical depth of its parts that have other cells."""
-        reservoir = self._offer_body(reservoir, body, mi.Float(t0), mi.Float(t1), on)
+        reservoir = self._offer_body(reservoir, body, t0, t1, on)
         number = next(index for index, other in enumerate(self.media.bodies) if other is body)
         for candidate in reservoir.candidates:
             candidate.body = dr.select(candidate.is_new, number, candidate.body)
@@ -140,21 +140,27 @@ class _Filling:
             reservoir.T = [dr.exp(-t) for t in reservoir.tau]
         return reservoir
 
-    def _offer_body(self, reservoir: Reservoir, body: Body, t0: mi.Float, t1: mi.Float, on: mi.Bool) -> Reservoir:
-        """Offer the pieces of one body, in their order."""
+    def _offer_body(
+        self, reservoir: Reservoir, body: Body, t0: mi.Float | mi.Float64, t1: mi.Float | mi.Float64, on: mi.Bool
+    ) -> Reservoir:
+        """Offer the pieces of one body, in their order.
+
+        Ends of a box come in float64: seen from 30 box sizes away, a float32 entry errs by 1e-6 of a box.
+        """
         ray, rows, equiangular = self.ray, self.media.rows, self.chosen.equiangular
         field = body.extinction(ray, body.flight_parts)
         grid = next((p.lattice for p in body.flight_parts if p.lattice is not None), None)
         segment = clip(grid, ray.o, ray.d, t0, t1) if grid is not None else None
-        filled = segment.length if segment is not None and not field.has_constants else t1 - t0
+        filled = segment.length if segment is not None and not field.has_constants else mi.Float(t1 - t0)
         probe_sigma = self._probe_sigma(filled)
 
-        def add_constant(reservoir: Reservoir, a: mi.Float, b: mi.Float) -> Reservoir:
+        def add_constant(reservoir: Reservoir, a: mi.Float | mi.Float64, b: mi.Float | mi.Float64) -> Reservoir:
             sigma, front = rows(field.constant), reservoir.tau
-            length = dr.select(on, dr.maximum(b - a, 0), 0)
+            length = dr.select(on, dr.maximum(mi.Float(b - a), 0), 0)
             dt = lit_length(sigma, length)
             tau = [s * dt for s in sigma]
-            piece = (a, mi.Float(0), dt, tau, equiangular, None, probe_sigma, on & (dt > 0))
+            begin, rest = split(a)
+            piece = (begin, rest, dt, tau, equiangular, None, probe_sigma, on & (dt > 0))
             reservoir = _offer_candidate(reservoir, *piece)
             # A length may have no end.
             tau = [f + dr.select(s > 0, s * length, 0) for f, s in zip(front, sigma, strict=True)]
@@ -172,15 +178,17 @@ class _Filling:
             half = dr.select(full, 0.5 * cell.dt, 0)
             tau = rows([half * (a + b) for a, b in field.along(cell.corners, list(gauss_points(cell)))])
             lit = None if self.cache is None else self.cache.at(cell.lower, self.chosen.number, full)
-            return _offer_candidate(reservoir, segment.t0, cell.s, cell.dt, tau, equiangular, lit, probe_sigma, full)
+            return _offer_candidate(
+                reservoir, segment.t0, segment.t0_rest + cell.s, cell.dt, tau, equiangular, lit, probe_sigma, full
+            )
 
         if field.has_constants:
-            reservoir = add_constant(reservoir, t0, dr.select(hit, segment.t0, t1))
+            reservoir = add_constant(reservoir, t0, dr.select(hit, segment.start, t1))
         # An image takes no light from behind this depth; derivatives are swept back from the far end, and need all of it.
         until = None if self.probe_depth else lambda p: _least_of(p.tau) > DARK
         reservoir = walk(lattice, segment, visit, reservoir, field.reads, on, until)
         if field.has_constants:
-            reservoir = add_constant(reservoir, dr.select(hit, segment.t0 + segment.length, t1), t1)
+            reservoir = add_constant(reservoir, dr.select(hit, segment.end, t1), t1)
         return _note_probe(reservoir, probe_sigma)
 
     def _probe_sigma(self, length: mi.Float) -> mi.Float | None:

@@ -34,7 +34,7 @@ class MediumEvent:
     """A point of a ray where light may be scattered.
 
     Attributes:
-        t, begin: distance [length], and that at which its piece begins.
+        t, begin: distance [length], and that at which its piece begins, in float64.
         pdf: density it was drawn from [1/length].
         tau: optical depth [1] in front of it, of each channel, along the bodies in the order of the walk.
         sigma_t: extinction [1/length] there, of each channel.
@@ -42,8 +42,8 @@ class MediumEvent:
         on: lanes that have one.
     """
 
-    t: mi.Float
-    begin: mi.Float
+    t: mi.Float64
+    begin: mi.Float64
     pdf: mi.Float
     tau: list[mi.Float]
     sigma_t: list[mi.Float]
@@ -98,10 +98,11 @@ def sample_distance(
     if equiangular is not None:
         evenly = dr.select(equiangular.finite, equiangular.density(begin, dt, x * dt), evenly)
     pdf = (pdf + (1 - by_collision) * evenly) * candidate.weight / dr.select(on, total, 1)
-    t = mi.Float(mi.Float64(candidate.begin) + mi.Float64(candidate.s) + mi.Float64(x) * mi.Float64(dt))
+    start = mi.Float64(candidate.begin) + mi.Float64(candidate.s)
+    t = start + mi.Float64(x) * mi.Float64(dt)
     on &= (pdf > 0) & dr.isfinite(pdf)
     return MediumEvent(
-        t, begin, dr.select(on, pdf, 1), [f + a for f, a in zip(candidate.front, tau, strict=True)], sigma, candidate.body, on
+        t, start, dr.select(on, pdf, 1), [f + a for f, a in zip(candidate.front, tau, strict=True)], sigma, candidate.body, on
     )
 
 

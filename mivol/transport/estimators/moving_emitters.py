@@ -59,7 +59,7 @@ def tau_by_end(media: SceneMedia, ray_segment: RaySegment, tau: list[mi.Float], 
             return total
         # The area that flakes show turns with the ray, whose direction moves across itself.
         turn = body.facing(d) * dr.rcp(dr.maximum(dr.square(body.area(d)), 1e-30)) - d
-        own = body.optical_depth(ray_segment.ray, mi.Float(t0), mi.Float(t1), media.channels, on)
+        own = body.optical_depth(ray_segment.ray, t0, t1, media.channels, on)
         return [a + t * turn for a, t in zip(total, own, strict=True)]
 
     zero = [mi.Vector3f(0) for _ in range(media.channels)]

@@ -200,8 +200,7 @@ class ScatteredSegment:
     @property
     def _in_front(self) -> RaySegment:
         """The ray up to the point."""
-        ray, t = self.segment.ray, self.probe.event.t
-        return RaySegment(mi.Ray3f(ray.o, ray.d, t, ray.time, ray.wavelengths), self.segment.medium, t)
+        return RaySegment.upto(self.segment.ray, self.segment.medium, self.probe.event.t)
 
 
 def _choose_shadow_ray(probe: Scattering) -> tuple[RaySegment, mi.Spectrum, mi.Bool]:

@@ -36,8 +36,8 @@ from mivol.transport.estimators.segment import (
 )
 from mivol.transport.estimators.vertex import MediumVertex
 from mivol.transport.estimators.visibility_cache import VisibilityCache
-from mivol.transport.media.optical_depth import integrate_optical_depth, transmittance
-from mivol.transport.media.ray_intervals import RaySegment, SegmentEnd, visit_media
+from mivol.transport.media.optical_depth import sum_optical_depth, transmittance
+from mivol.transport.media.ray_intervals import RaySegment, SegmentEnd, revisit_media, visit_media
 from mivol.transport.traversal.strata import Strata
 
 __all__ = ["SingleScattering"]
@@ -159,8 +159,9 @@ class SingleScattering:
         mei = medium_event_interaction(media, ray, event)
         tau = event.tau
         if not media.is_single:
-            front = mi.Ray3f(ray.o, ray.d, event.t, ray.time, ray.wavelengths)
-            _, tau = integrate_optical_depth(media, front, segment.medium, event.on)
+            front = RaySegment.upto(ray, segment.medium, event.t)
+            zero = [mi.Float(0) for _ in range(media.channels)]
+            tau = revisit_media(media, front, sum_optical_depth(ray), zero, event.on)
         gain = dr.select(event.on, segment.beta * transmittance(tau) / event.pdf, 0)
         vertex = MediumVertex(media, mei)
         direct = self.direct.in_medium(vertex, chosen, samples, probes, event.on, estimates=not probes)

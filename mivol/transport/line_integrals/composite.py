@@ -122,10 +122,10 @@ class _BodyLayout:
     ``segment`` runs from ``leave`` to ``enter``; it and ``lattice`` are None where no grid says where the cells are.
     """
 
-    t0: mi.Float
-    enter: mi.Float
-    leave: mi.Float
-    t1: mi.Float
+    t0: mi.Float64
+    enter: mi.Float64
+    leave: mi.Float64
+    t1: mi.Float64
     lattice: Lattice | None
     segment: Segment | None
 
@@ -155,12 +155,14 @@ class _BodySegment:
 
     def site(self, cell: Cell, on: mi.Bool) -> RayPiece:
         """A cell of the walk, which runs towards the camera."""
-        return RayPiece(self.body, self.ray, self.lay.leave - (cell.s + cell.dt), dr.select(on, cell.dt, 0), on)
+        return RayPiece(
+            self.body, self.ray, mi.Float(self.lay.leave - mi.Float64(cell.s + cell.dt)), dr.select(on, cell.dt, 0), on
+        )
 
-    def outside(self, a: mi.Float, b: mi.Float) -> RayPiece:
+    def outside(self, a: mi.Float64, b: mi.Float64) -> RayPiece:
         """A stretch [a, b] of constants."""
         on = self.active & (b > a)
-        return RayPiece(self.body, self.ray, dr.select(on, a, 0), dr.select(on, b - a, 0), on)
+        return RayPiece(self.body, self.ray, mi.Float(dr.select(on, a, 0)), mi.Float(dr.select(on, b - a, 0)), on)
 
     def points(self, cell: Cell) -> list[mi.Vector3f]:
         """The points of a cell, the one nearest to the camera first: a sweep meets it last."""
@@ -189,7 +191,7 @@ class _BodySegment:
         sigma = self.along(self.field, cell.corners[: len(self.field.reads)], cell)
         return site, sigma, self.integrand.cell(site, sigma)
 
-    def constant(self, a: mi.Float, b: mi.Float) -> tuple[RayPiece, list[list[mi.Float]], list[CellIntegral]]:
+    def constant(self, a: mi.Float64, b: mi.Float64) -> tuple[RayPiece, list[list[mi.Float]], list[CellIntegral]]:
         """As :meth:`cell`, a stretch of constants."""
         site, sigma = self.outside(a, b), self.rows(self.field.constant)
         return site, [[s] * len(self.integrand.points) for s in sigma], self.integrand.constant(site, sigma)
@@ -212,13 +214,13 @@ def _open(
 
 def _lay_out(body: Body, ray: mi.Ray3f, t0: mi.Float, t1: mi.Float) -> _BodyLayout:
     lattice = body.view.walked_lattice
-    start, end = mi.Float(t0), mi.Float(t1)
+    start, end = mi.Float64(t0), mi.Float64(t1)
     if lattice is None:
         return _BodyLayout(start, end, end, end, None, None)
     segment = clip(lattice, ray.o, -ray.d, -t1, -t0)
     hit = segment.length > 0
-    leave = dr.select(hit, -segment.t0, end)
-    return _BodyLayout(start, dr.select(hit, leave - segment.length, end), leave, end, lattice, segment)
+    leave = dr.select(hit, -segment.start, end)
+    return _BodyLayout(start, dr.select(hit, -segment.end, end), leave, end, lattice, segment)
 
 
 def _measure(body_segment: _BodySegment, skip: bool) -> _BodyIntegral:
@@ -227,7 +229,7 @@ def _measure(body_segment: _BodySegment, skip: bool) -> _BodyIntegral:
     rows = integrand.rows * (2 if tangent else 1)
     integral = _BodyIntegral(_zeros(mi.Float64, rows), _zeros(mi.Float, rows))
 
-    def add_constant(integral: _BodyIntegral, a: mi.Float, b: mi.Float) -> _BodyIntegral:
+    def add_constant(integral: _BodyIntegral, a: mi.Float64, b: mi.Float64) -> _BodyIntegral:
         site, sigma, integrals = body_segment.constant(a, b)
         if not tangent:
             return _put_in_front(integral, integrals, [], [])
@@ -287,7 +289,7 @@ def _vjp_body(body_segment: _BodySegment, weight: list[mi.Float], ahead: list[mi
     grids = [p for p in body.view.parts if p.lattice is not None]
     outside: list[tuple] = []
 
-    def add_constant(sweep: _ReverseSweep, a: mi.Float, b: mi.Float) -> _ReverseSweep:
+    def add_constant(sweep: _ReverseSweep, a: mi.Float64, b: mi.Float64) -> _ReverseSweep:
         site, sigma, integrals = body_segment.constant(a, b)
         sweep, _, weights = _pull_through(sweep, integrals, weight, behind)
         outside.append((site, sigma, weights))

@@ -35,7 +35,7 @@ from mivol.transport.traversal.interpolation import GAUSS, interpolate, weights
 from mivol.transport.traversal.lattice import Segment, clip
 from mivol.transport.traversal.occupied_cells import Cells, CellVisitor, march, reversed_from
 
-__all__ = ["Baked", "Exact", "Model", "RayBatch", "RenderedRays", "Source", "backward", "render"]
+__all__ = ["Baked", "Exact", "Model", "RayBundle", "RenderedRays", "Source", "backward", "render"]
 
 
 DEEPEST = 104.0
@@ -43,7 +43,7 @@ DEEPEST = 104.0
 
 
 @dataclass
-class RayBatch:
+class RayBundle:
     """World rays, |d| = 1; ``t_max`` [length] may be infinite."""
 
     o: mi.Point3f
@@ -278,7 +278,7 @@ def _spread(harmonics: list[mi.Float], packet: mi.ArrayXf, basis: list[mi.Float]
     return more + harmonics[len(more) :]
 
 
-def exact(field: SphericalGrid, rays: RayBatch, slope: bool = False) -> Exact:
+def exact(field: SphericalGrid, rays: RayBundle, slope: bool = False) -> Exact:
     """The field as it is stored, for rays of any directions."""
     zeros = [dr.zeros(mi.Float, dr.width(v)) if slope else None for v in (field.density, field.harmonics)]
     return Exact(field.density, field.harmonics, field.harmonics_of(rays.d), field.offset, *zeros)
@@ -333,7 +333,7 @@ def _points(cells: Cells, source: Source, model: Model, here: CellVisitor, on: m
     return _Points(sigma, slope, colour, shown)
 
 
-def render(cells: Cells, source: Source, model: Model, rays: RayBatch, active: mi.Bool = True) -> RenderedRays:
+def render(cells: Cells, source: Source, model: Model, rays: RayBundle, active: mi.Bool = True) -> RenderedRays:
     """Follow rays through a field.
 
     Args:
@@ -367,7 +367,7 @@ def render(cells: Cells, source: Source, model: Model, rays: RayBatch, active: m
     return RenderedRays(mi.Color3f(*light[:3]), dr.exp(-tau), light[3], tau, before, start, end, last, segment)
 
 
-def brightest_weights(cells: Cells, source: Source, model: Model, rays: RayBatch, weight: mi.Float) -> None:
+def brightest_weights(cells: Cells, source: Source, model: Model, rays: RayBundle, weight: mi.Float) -> None:
     """Raise ``weight``, one a listed cell, to the largest share T alpha of a ray that the cell has.
 
     Cost: as :func:`render`, and one write a visited cell.

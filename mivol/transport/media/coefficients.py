@@ -10,10 +10,11 @@ from mivol.transport.media.body import Body
 __all__ = ["eval_albedo", "medium_interaction"]
 
 
-def medium_interaction(ray: mi.Ray3f, t: mi.Float, medium: mi.Medium | None = None) -> mi.MediumInteraction3f:
-    """A point of a ray as the interaction that Mitsuba's volumes and phase functions are evaluated at."""
+def medium_interaction(ray: mi.Ray3f, t: mi.Float | mi.Float64, medium: mi.Medium | None = None) -> mi.MediumInteraction3f:
+    """A point of a ray as Mitsuba evaluates volumes and phase functions at it, found in float64 and rounded once."""
     mei = dr.zeros(mi.MediumInteraction3f, dr.width(ray))
-    mei.t, mei.p, mei.wi = t, ray(t), -ray.d
+    p = [mi.Float(dr.fma(mi.Float64(t), mi.Float64(ray.d[a]), mi.Float64(ray.o[a]))) for a in range(3)]
+    mei.t, mei.p, mei.wi = mi.Float(t), mi.Point3f(*p), -ray.d
     mei.sh_frame = mi.Frame3f(mei.wi)
     mei.time, mei.wavelengths = ray.time, ray.wavelengths
     if medium is not None:

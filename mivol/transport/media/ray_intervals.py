@@ -62,8 +62,13 @@ class RaySegment:
 
     ray: mi.Ray3f
     medium: mi.MediumPtr
-    length: mi.Float
+    length: mi.Float | mi.Float64
     passes_null: bool = False
+
+    @classmethod
+    def upto(cls, ray: mi.Ray3f, medium: mi.MediumPtr, t: mi.Float64) -> RaySegment:
+        """The first part of a ray, of length ``t``."""
+        return cls(mi.Ray3f(ray.o, ray.d, mi.Float(t), ray.time, ray.wavelengths), medium, t)
 
 
 MediumVisitor = Callable[..., Any]

@@ -48,7 +48,7 @@ class CameraRays:
 
 
 Sample = Callable[[CameraRays], tuple]
-"""``sample(rays) -> (radiance, mask, AOVs)``; the film's alpha is 1 where the mask is true."""
+"""``sample(rays) -> (radiance, alpha, AOVs)``; alpha in [0, 1] is what the film's alpha sees, without derivatives."""
 
 
 def film_passes(sensor: mi.Sensor, seed: int, spp: int, pass_rays: int, layout: str = PLAIN) -> Iterator[CameraRays]:
@@ -175,12 +175,12 @@ def record(
     film = sensor.film()
     film.prepare(names)
     for rays in film_passes(sensor, seed, spp, pass_rays, layout):
-        L, valid, aovs = sample(rays)
+        L, alpha, aovs = sample(rays)
         block = _new_block(film, rays)
-        _splat(block, film, rays, L * rays.weight, mi.Float(1), dr.select(valid, mi.Float(1), mi.Float(0)), aovs)
+        _splat(block, film, rays, L * rays.weight, mi.Float(1), alpha, aovs)
         film.put_block(block)
         dr.eval(block.tensor())
-        del L, valid, aovs, rays, block
+        del L, alpha, aovs, rays, block
     return film.develop()
 
 

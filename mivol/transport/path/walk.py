@@ -27,6 +27,7 @@ from mivol.transport.estimators.direct_lighting import DirectLight
 from mivol.transport.estimators.multiple_importance import power_heuristic
 from mivol.transport.estimators.segment import PICTURE, PathSegment
 from mivol.transport.estimators.vertex import SurfaceVertex
+from mivol.transport.media.channels import colours
 from mivol.transport.media.optical_depth import transmittance
 from mivol.transport.path.estimators import Estimators
 from mivol.transport.path.event import PathEvent
@@ -55,7 +56,8 @@ class Path:
         last: where the direction was sampled, for the power heuristic.
         pdf: density [1/sr] that it was sampled with.
         delta: whether that density is a delta function.
-        valid: whether the film's alpha is 1.
+        stopped: whether a surface stopped or turned the path, for the film's alpha.
+        clear: transmittance of the media up to there, for the film's alpha.
         active: lanes that go on.
         score: :mod:`mivol.transport.path.scores`.
         sampler, strata: random numbers.
@@ -69,7 +71,8 @@ class Path:
     last: mi.Interaction3f
     pdf: mi.Float
     delta: mi.Bool
-    valid: mi.Bool
+    stopped: mi.Bool
+    clear: mi.Spectrum
     active: mi.Bool
     score: Any
     sampler: mi.Sampler
@@ -84,7 +87,7 @@ def walk_path(
     score: Score,
     active: mi.Bool = True,
     strata: Strata | None = None,
-) -> tuple[Score, mi.Bool]:
+) -> tuple[Score, mi.Float]:
     """Walk a path from the camera and report its terms and factors to a score.
 
     Args:
@@ -97,7 +100,7 @@ def walk_path(
         strata: the stratum that each lane draws directions in media from.
 
     Returns:
-        The score, and the mask of lanes where the film's alpha is 1.
+        The score, and what the film's alpha sees, in [0, 1].
 
     Bias: that of the segment estimator. Variance: none at depth 1 beyond the pixel's own; at surfaces, that of emitter and BSDF
     samples.
@@ -114,7 +117,8 @@ def walk_path(
         last=dr.zeros(mi.Interaction3f, n),
         pdf=dr.full(mi.Float, 1, n),
         delta=dr.full(mi.Bool, True, n),
-        valid=dr.full(mi.Bool, visible, n),
+        stopped=dr.full(mi.Bool, visible, n),
+        clear=dr.full(mi.Spectrum, 1, n),
         active=mi.Bool(active) & (limit > 0),
         score=score,
         sampler=sampler,
@@ -129,9 +133,19 @@ def walk_path(
     if is_straight(estimators, settings):
         path, event = _follow_segment(estimators, settings, limit, path)
         path = _add_emission(estimators, settings, path, event)
+        path.stopped |= event.at_surface
     else:
         (path,) = dr.while_loop(state=(path,), cond=lambda p: p.active, body=step, label="path")
-    return path.score, path.valid
+    return path.score, _alpha(path.stopped, path.clear)
+
+
+def _alpha(stopped: mi.Bool, clear: mi.Spectrum) -> mi.Float:
+    """What a film's alpha sees of a path: all of it where a surface stopped it, else the opacity of the media.
+
+    This is the mean of what ``volpath`` draws from ``max_depth`` 2 on (1 where it finds a point in a medium or on a surface),
+    without its noise. At depth 1 ``volpath`` finds no points in media, and its smoke has no alpha; here it has the same one.
+    """
+    return dr.select(stopped, 1, 1 - sum(colours(clear)) / dr.size_v(clear))
 
 
 def is_straight(estimators: Estimators, settings: Settings) -> bool:
@@ -150,7 +164,9 @@ def _follow_segment(estimators: Estimators, settings: Settings, limit: int, path
     if found.light is not None:
         path.score = path.score.add(found.light)
     path.score = path.score.scale(found.transmittance)
-    path.beta *= transmittance(found.tau)
+    T = transmittance(found.tau)
+    path.beta *= T
+    path.clear *= T
     path.medium = found.end.medium
     return path, PathEvent.of(found.end, path.active)
 
@@ -168,7 +184,6 @@ def _add_emission(estimators: Estimators, settings: Settings, path: Path, event:
     with dr.resume_grad(when=path.score.purpose != PICTURE):
         Le = path.beta * w_mis * emitter.eval(si, shown)
         path.score = path.score.add(TrackedTerm(Le, shown))
-    path.valid |= event.at_surface
     return path
 
 
@@ -193,6 +208,7 @@ def _turn(estimators: Estimators, settings: Settings, limit: int, path: Path, ev
     # A sampled direction of density 0 has weight 0; its path ends below, where beta is 0.
     on = on_surface & (may_scatter | through)
     turned = on & ~through
+    path.stopped |= on_surface & ~through
     path.score = path.score.scale(_bsdf_factor(vertex, sample.wo, turned))
     path.beta *= dr.select(on, f_over_pdf, 0)
     path.eta *= dr.select(on, sample.eta, 1)

@@ -19,7 +19,7 @@ import numpy as np
 from mivol.errors import MivolError
 from mivol.space import check_affine, lattice_from_world
 
-__all__ = ["Lattice", "Mask3", "Segment", "clip", "locate", "slab"]
+__all__ = ["Lattice", "Mask3", "Segment", "clip", "locate", "slab", "split"]
 
 
 Mask3 = Any
@@ -82,6 +82,7 @@ class Segment:
         d: lattice distance per world length.
         d_rest: the rounding error of ``d``, so that d + d_rest has double precision.
         t0: distance of the entry from the ray's origin [length].
+        t0_rest: the rounding error of ``t0``.
         length: length inside the box [length].
     """
 
@@ -91,6 +92,17 @@ class Segment:
     d_rest: mi.Vector3f
     t0: mi.Float
     length: mi.Float
+    t0_rest: mi.Float | float = 0.0
+
+    @property
+    def start(self) -> mi.Float64:
+        """Distance from the ray's origin to the entry [length]."""
+        return mi.Float64(self.t0) + mi.Float64(self.t0_rest)
+
+    @property
+    def end(self) -> mi.Float64:
+        """Distance from the ray's origin to the exit [length]."""
+        return self.start + mi.Float64(self.length)
 
 
 def clip(lattice: Lattice, o: mi.Point3f, d: mi.Vector3f, t_min: mi.Float, t_max: mi.Float) -> Segment:
@@ -116,7 +128,14 @@ def clip(lattice: Lattice, o: mi.Point3f, d: mi.Vector3f, t_min: mi.Float, t_max
         cell[a], frac[a] = mi.Int32(low), mi.Float(entry - low)
     direction = mi.Vector3f(mi.Float(v[0]), mi.Float(v[1]), mi.Float(v[2]))
     rest = mi.Vector3f(*(mi.Float(v[a] - mi.Float64(direction[a])) for a in range(3)))
-    return Segment(cell, frac, direction, rest, mi.Float(t0), mi.Float(dr.select(hit, t1 - t0, 0)))
+    start, start_rest = split(t0)
+    return Segment(cell, frac, direction, rest, start, mi.Float(dr.select(hit, t1 - t0, 0)), start_rest)
+
+
+def split(x: mi.Float64 | mi.Float) -> tuple[mi.Float, mi.Float]:
+    """A number as the nearest float32 and what that leaves over."""
+    near = mi.Float(x)
+    return near, mi.Float(mi.Float64(x) - mi.Float64(near))
 
 
 def locate(lattice: Lattice, o: mi.Point3f, d: mi.Vector3f, t: mi.Float) -> tuple[mi.Vector3i, mi.Vector3f, mi.Bool]:
