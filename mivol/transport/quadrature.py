@@ -6,7 +6,11 @@ r"""Single scattering without noise: quadrature along the camera's ray, for lamp
 with the source function c = albedo L_s at the two Gauss points of a piece, and tau_q the optical depth in front of them by the
 two-stage Gauss method (order 4). The factor kappa makes the weights add up to 1 - exp(-tau), so a constant source is exact at
 any optical depth. A cell is cut into pieces of an optical depth of at most ``PIECE``, and of an angle of at most ``TURN`` as
-seen from a lamp near by, evenly in that angle.
+seen from a lamp near by, evenly in that angle. A cell that would need more than ``MOST`` of them is cut as far as light comes:
+to the optical depth ``DARK`` of each channel.
+
+Shadow rays start at float32 points: with an extinction sigma, what is lit errs by sigma times the rounding of a distance
+along the camera's ray and of a coordinate, so by 1 % where 1e5 optical depths lie between coordinates that differ by 1.
 
 Conventions. One body, whose grids share their cells. Shadows are exact walks, or looked up where the world has a light grid.
 References: Hairer & Wanner 1996, Table 5.1 (the two-stage Gauss method).
@@ -28,7 +32,7 @@ from mivol.transport.direct import focus_on
 from mivol.transport.free_flight import Focus, lit_length
 from mivol.transport.lattice import Cell, clip, walk
 from mivol.transport.optical_depth import GAUSS
-from mivol.transport.path import Reach, Stretch, reach, shadow_ray
+from mivol.transport.path import DARK, Reach, Stretch, reach, shadow_ray
 from mivol.transport.scatter import albedo, interaction
 from mivol.transport.world import Body, World, spectrum
 
@@ -42,7 +46,14 @@ TURN = 0.1
 """Largest angle [rad] of a piece as seen from a near lamp (1/r^2 is a constant in that angle)."""
 
 MOST = 256
-"""Most pieces of a cell or of a stretch of constant extinction."""
+"""Most pieces of a cell or of a stretch of constant extinction that is cut to its end."""
+
+DEEP = 2 * int(DARK / PIECE)
+"""Pieces of a deeper cell between the places where one channel and the next becomes dark: even in length, so twice as many as
+an even extinction would need."""
+
+BISECTIONS = 12
+"""Halvings of the logarithm of the share at which a cell is dark: from 2^-30 to 1, to 0.5 % of it."""
 
 STRETCH = 64
 """Pieces of a stretch of constant extinction, which may be as long as the medium, at least."""
@@ -154,7 +165,47 @@ def _pieces(
     count = dr.maximum(least, dr.ceil(thick / PIECE))
     if focus is not None:
         count = dr.maximum(count, dr.select(focus.finite, dr.ceil(focus.angle(start, dt) / TURN), 1))
-    return _add_pieces(state, start, dt, sigma, source, focus, mi.UInt32(dr.clip(count, 1, MOST)), on)
+    is_deep = on & (thick > MOST * PIECE)
+    edges = _in_order(_dark_shares(state[0], dt, sigma, is_deep))
+    lit = dr.select(_least(state[0]) < DARK, DEEP * len(edges) + 1, 1)
+    count = dr.select(is_deep, mi.UInt32(lit), mi.UInt32(dr.clip(count, 1, MOST)))
+    return _add_pieces(state, start, dt, sigma, source, focus, is_deep, edges, count, on)
+
+
+@dr.syntax
+def _dark_shares(front: list[mi.Float], dt: mi.Float, sigma: Profile, is_deep: mi.Bool) -> list[mi.Float]:
+    """The share of a cell at which each channel has the optical depth ``DARK``, by bisection; 1 where it never has."""
+    low = [dr.full(mi.Float, 2.0**-30, dr.width(dt)) for _ in front]
+    high = [dr.full(mi.Float, 1, dr.width(dt)) for _ in front]
+    step = dr.zeros(mi.UInt32, dr.width(dt))
+    going = mi.Bool(is_deep)
+    while dr.hint(going, label="where a cell is dark"):
+        low, high = _halve(front, dt, sigma, low, high)
+        step += 1
+        going &= step < BISECTIONS
+    return high
+
+
+def _halve(front: list[mi.Float], dt: mi.Float, sigma: Profile, low: list[mi.Float], high: list[mi.Float]) -> tuple:
+    """The half of [low, high], in its logarithm, in which each channel becomes dark."""
+    middle = [dr.sqrt(a * b) for a, b in zip(low, high, strict=True)]
+    is_lit = [front[k] + _depth_at(m, dt, sigma)[k] < DARK for k, m in enumerate(middle)]
+    low = [dr.select(i, m, a) for i, m, a in zip(is_lit, middle, low, strict=True)]
+    return low, [dr.select(i, b, m) for i, m, b in zip(is_lit, middle, high, strict=True)]
+
+
+def _depth_at(x: mi.Float, dt: mi.Float, sigma: Profile) -> list[mi.Float]:
+    """Optical depth of each channel from the start of a cell to a share of it."""
+    return [0.5 * x * dt * (a + b) for a, b in zip(sigma(GAUSS * x), sigma((1 - GAUSS) * x), strict=True)]
+
+
+def _in_order(shares: list[mi.Float]) -> list[mi.Float]:
+    """One or three numbers, the least first."""
+    if len(shares) == 1:
+        return shares
+    a, b, c = shares
+    low, high = dr.minimum(a, b), dr.maximum(a, b)
+    return [dr.minimum(low, c), dr.maximum(low, dr.minimum(high, c)), dr.maximum(high, c)]
 
 
 @dr.syntax
@@ -165,10 +216,12 @@ def _add_pieces(
     sigma: Profile,
     source: Source,
     focus: Focus | None,
+    is_deep: mi.Bool,
+    edges: list[mi.Float],
     count: mi.UInt32,
     on: mi.Bool,
 ) -> _Sum:
-    """Add ``count`` pieces, even in the angle seen from a near lamp, else in length."""
+    """Add ``count`` pieces, even in the angle seen from a near lamp, else in length; in a deep cell between its ``edges``."""
     tau, T, light = state
     index = dr.zeros(mi.UInt32, dr.width(dt))
     near = dr.zeros(mi.Float, dr.width(dt))
@@ -178,12 +231,22 @@ def _add_pieces(
         far = share * dt
         if focus is not None:
             far = dr.select(focus.finite, focus.sample(start, dt, share), far)
+        far = dr.select(is_deep, dt * _between(edges, index + 1), far)
         far = dr.select(index + 1 >= count, dt, dr.clip(far, near, dt))
         tau, T, light = _add_piece(tau, T, light, start, dt, near, far, sigma, source, going)
         near = far
         index += 1
         going &= index < count
     return tau, T, light
+
+
+def _between(edges: list[mi.Float], index: mi.UInt32) -> mi.Float:
+    """The share of a cell at which ``index`` pieces end, ``DEEP`` of them from 0 to the first edge and from one to the next."""
+    share, begin = mi.Float(0), mi.Float(0)
+    for k, end in enumerate(edges):
+        part = dr.clip((mi.Float(index) - k * DEEP) / DEEP, 0, 1)
+        share, begin = share + part * (end - begin), end
+    return share
 
 
 def _add_piece(
@@ -244,6 +307,13 @@ def _share(world: World, body: Body, ray: mi.Ray3f, mei: mi.MediumInteraction3f,
         spectrum(body.extinction_at(ray, mei.t, world.channels, on, name)) for name in ("sigma_s", "sigma_")
     )
     return dr.select(whole > 0, scattered / dr.select(whole > 0, whole, 1), 0)
+
+
+def _least(rows: list[mi.Float]) -> mi.Float:
+    best = rows[0]
+    for row in rows[1:]:
+        best = dr.minimum(best, row)
+    return best
 
 
 def _largest(rows: list[mi.Float]) -> mi.Float:
