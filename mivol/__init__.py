@@ -15,7 +15,7 @@ except (ImportError, NameError) as error:  # a NameError is how Dr.Jit 1.5 repor
     raise ImportError(llvm.missing_system_library() or f"Mitsuba cannot be imported: {error}") from error
 
 from . import plugins  # noqa: E402
-from .errors import MivolError  # noqa: E402
+from .errors import MivolError, reveal_refusals  # noqa: E402
 
 __all__ = ["MivolError", "__version__"]
 
@@ -28,6 +28,7 @@ def _on_variant_change(old: str | None, new: str) -> None:
 
 
 mi.detail.add_variant_callback(_on_variant_change)
+mi.render = mi.util.render = reveal_refusals(mi.render)
 
 try:
     llvm.check_backend()

@@ -75,7 +75,10 @@ class Transfer:
                 raise MivolError(f"the domain of {name} is {props['domain']}; two numbers in rising order are expected.")
             low, high = ends
         place = np.array(props.get("to_world", mi.ScalarTransform4f()).matrix, dtype=np.float64)
-        return cls(field, table, (low, high), int(props.get("refine", 1)), place, name)
+        refine = props.get("refine", 1)
+        if type(refine) is not int:
+            raise MivolError(f"refine of {name} is {refine!r}; a whole number of nodes per voxel is expected, at least 1.")
+        return cls(field, table, (low, high), refine, place, name)
 
     def classified(self) -> mi.TensorXf:
         """The table's entries at the nodes of the refined grid, (Z, Y, X, C), with derivatives by table and field."""

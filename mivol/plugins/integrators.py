@@ -6,6 +6,7 @@ from typing import Any
 
 import mitsuba as mi
 
+from mivol.errors import MivolError
 from mivol.scene.session import Session
 from mivol.transport.path import Settings
 
@@ -28,16 +29,15 @@ class MivolIntegrator(mi.ad.integrators.common.ADIntegrator):
     """
 
     def __init__(self, props: mi.Properties) -> None:
-        super().__init__(props)
-        depth = -1 if self.max_depth == 0xFFFFFFFF else self.max_depth
         settings = Settings(
-            depth,
-            self.rr_depth,
-            props.get("hide_emitters", False),
-            props.get("deterministic", False),
-            props.get("shadows", "auto"),
+            _read(props, "max_depth", 6),
+            _read(props, "rr_depth", 5),
+            _read(props, "hide_emitters", False),
+            _read(props, "deterministic", False),
+            _read(props, "shadows", "auto"),
         )
-        self.session = Session(settings, props.get("aovs", ""))
+        self.session = Session(settings, _read(props, "aovs", ""))
+        super().__init__(props)
 
     def aov_names(self) -> list[str]:
         return list(self.session.aovs)
@@ -75,6 +75,22 @@ class MivolIntegrator(mi.ad.integrators.common.ADIntegrator):
 
     def traverse(self, callback: mi.TraversalCallback) -> None:
         pass
+
+
+EXPECTED = {int: "a whole number", bool: "true or false", str: "a text"}
+
+
+def _read(props: mi.Properties, name: str, default: int | bool | str) -> int | bool | str:
+    """A parameter of the type that its default has. (Mitsuba's own ADIntegrator takes a max_depth of 2.5 for a number.)
+
+    Raises:
+        MivolError: a value of another type.
+    """
+    value = props.get(name, default)
+    if type(value) is not type(default):
+        expected = f"{EXPECTED[type(default)]} is expected, such as {default!r}"
+        raise MivolError(f"{name} of the integrator mivol is {value!r}; {expected}.")
+    return value
 
 
 mi.register_integrator("mivol", MivolIntegrator)

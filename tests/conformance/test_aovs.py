@@ -371,10 +371,8 @@ def test_two_grids_that_differ_are_refused_for_depth_only():
     image, o, d = see(parts, *rays(3), "tau,alpha")
     tau = tau_twin(grid(11), CUBE, o, d) + tau_twin(grid(12, shape=(4, 4, 4)), CUBE, o, d)
     assert image[:, :1] == pytest.approx(tau, rel=1e-5)
-    with pytest.raises(RuntimeError) as wrapped:
-        see(parts, *rays(3), "depth")
     with pytest.raises(MivolError, match="depth was asked for and a medium sums grids"):
-        raise wrapped.value.__cause__
+        see(parts, *rays(3), "depth")
 
 
 @pytest.mark.parametrize(("aovs", "match"), [("tau,taau", "did you mean"), ("tau, depth, tau", "2 times")])

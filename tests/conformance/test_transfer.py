@@ -137,6 +137,7 @@ def test_constant_scan_is_a_homogeneous_medium():
         ({"domain": "3, 3"}, "rising order"),
         ({"domain": "3"}, "MivolError: the domain of mivol_transfer is 3; two numbers"),
         ({"refine": 0}, "at least 1"),
+        ({"refine": 2.5}, "refine of mivol_transfer is 2.5; a whole number"),
         ({"data": np.full((3, 3, 3), np.nan)}, r"finite numbers are expected"),
         ({"data": np.ones((3, 3, 3, 3))}, r"\(Z, Y, X, 1\)"),
     ],
