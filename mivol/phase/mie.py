@@ -18,7 +18,7 @@ from collections.abc import Callable
 from types import ModuleType
 
 import numpy as np
-from scipy.special import gammainccinv, gammaincinv
+from scipy.special import gammainccinv, gammaincinv, ndtri
 
 from mivol.errors import MivolError
 from mivol.phase.tabulated import Table, adapt_nodes
@@ -89,11 +89,20 @@ def aerosol(
     if not geometric_deviation > 1:
         raise MivolError(f"geometric_deviation is {geometric_deviation}; a number above 1 is expected.")
     s = np.log(geometric_deviation)
-    # r^2 n(r) is lognormal about log(median) + 2 s^2; what small particles scatter counts r^4 more, about + 6 s^2.
-    low, high = (median_radius * np.exp(k) for k in (2 * s * s - 5 * s, 6 * s * s + 5 * s))
+    low, high = _ends_of_lognormal(median_radius, s)
     return _average(
         lambda r: np.log(r) - 0.5 * (np.log(r / median_radius) / s) ** 2, low, high, wavelength, index, tolerance
     )
+
+
+def _ends_of_lognormal(median: float, s: float) -> tuple[float, float]:
+    """The radii between which particles count, where log r has the standard deviation ``s``.
+
+    Below the first lies the share ``CUT`` of their area, above the second that of what small particles scatter: a lognormal
+    distribution times r^k is one about log(median) + k s^2, and they scatter like r^6.
+    """
+    reach = -ndtri(CUT) * s
+    return median * np.exp(2 * s * s - reach), median * np.exp(6 * s * s + reach)
 
 
 def _average(
@@ -108,7 +117,7 @@ def _average(
             f"the largest particles have a radius of {high:.3g} micrometre; at most {LARGEST_SIZE / 2 / np.pi:.0f} times "
             f"the wavelength of {wavelength:g} is expected: give smaller radii or a narrower distribution."
         )
-    radii = low * (high / low) ** ((np.arange(RADII) + 0.5) / RADII)
+    radii = np.geomspace(low, high, RADII)
     sizes = 2 * np.pi * radii / wavelength
     series = [np.atleast_2d(mie.coefficients(index, float(x))) for x in sizes]
     terms = max(s.shape[1] for s in series)

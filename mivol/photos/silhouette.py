@@ -57,7 +57,8 @@ def _kept(views: Sequence[Photo], cells: np.ndarray, radius: float) -> np.ndarra
         nearest = float(np.min(depth[depth > 0], initial=np.inf))
         if nearest <= 2 * radius:
             continue
-        # A sphere of radius r at depth z reaches at most f r / (z - r) times 1/cos(view angle) from its centre.
+        # A sphere of radius r at depth z reaches at most f r / (z - r) times 1/cos(view angle) from its centre; one pixel
+        # more is for a lens, which magnifies towards the border.
         slope = np.hypot(*np.maximum(view.camera.K[:2, 2], view.camera.size - view.camera.K[:2, 2])) / view.camera.K[0, 0]
         pixels = int(np.ceil(view.camera.K[:2, :2].max() * radius * np.sqrt(1 + slope**2) / (nearest - radius))) + 1
         near = maximum_filter(view.alpha > 0, size=2 * pixels + 1)

@@ -435,7 +435,8 @@ def _invert(curve: list, whole: list[mi.Float], front: list[mi.Float], dt: mi.Fl
         error = _partial(c, dt, x) - goal
         low, high = dr.select(error < 0, x, low), dr.select(error > 0, x, high)
         step = x - error / dr.maximum(dt * _at(c, x), 1e-30)
-        x = dr.select((step > low) & (step < high), step, 0.5 * (low + high))
+        # The ends count as inside: a step that is lost in rounding stays at the root, which is one of them by then.
+        x = dr.select((step >= low) & (step <= high), step, 0.5 * (low + high))
     return x
 
 

@@ -104,7 +104,8 @@ def _add_step(
     for side, to, sign in ((-ray.d, 1 - ASIDE, -1.0), (ray.d, 1 + ASIDE, 1.0)):
         medium = hit.target_medium(side)
         for body in world.traced:
-            on = crosses & (slope != 0) & (medium == mi.MediumPtr(body.view.medium))
+            # Where the ray only grazes the surface (slope 0) both sides name the same medium: the two terms cancel.
+            on = crosses & (medium == mi.MediumPtr(body.view.medium))
             sigma = body.extinction_at(ray, t * to, world.channels, on)
             total = [v + dr.select(on, sign * t * x * face, 0) for v, x in zip(total, sigma, strict=True)]
     return total

@@ -173,7 +173,8 @@ def march(
     # -- Counted along the ray: n cells crossed since the first, an axis each ---------------------------------------------
     number, length = cells.number, segment.length
     z, y, x = cells.res
-    ahead = segment.d > 0
+    # An axis to which the ray is parallel counts as ahead: its fraction is then used as it is, without a rounding.
+    ahead = segment.d >= 0
     sign = dr.select(ahead, mi.Vector3i(1), mi.Vector3i(-1))
     stride = sign * mi.Vector3i(1, x + 1, (x + 1) * (y + 1))
     first = segment.cell + 1

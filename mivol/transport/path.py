@@ -432,7 +432,8 @@ def _bounce(scene: mi.Scene, world: World, settings: Settings, limit: int, path:
     u1, u2 = sampler.next_1d(on_surface), sampler.next_2d(on_surface)
     sample, f_over_pdf = bsdf.sample(mi.BSDFContext(), si, u1, u2, on_surface)
     through = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Null)
-    on = on_surface & (may_scatter | through) & (sample.pdf > 0)
+    # A direction of density 0 has the weight 0, and its path ends below.
+    on = on_surface & (may_scatter | through)
     score = score.turn(bsdf, si, sample.wo, on & ~through)
     path.beta *= dr.select(on, f_over_pdf, 0)
     path.eta *= dr.select(on, sample.eta, 1)

@@ -138,8 +138,7 @@ def _integrate_body(
         def sigma(x: mi.Float) -> list[mi.Float]:
             return world.rows([v[0] for v in field.along(cell.corners, [dr.fma(cell.step, x, cell.frac)])])
 
-        dt = dr.select(full, cell.dt, 0)
-        return _pieces(state, segment.t0 + cell.s, dt, sigma, source, focus, mi.Float(1), full & (dt > 0))
+        return _pieces(state, segment.t0 + cell.s, cell.dt, sigma, source, focus, mi.Float(1), full & (cell.dt > 0))
 
     if not field.has_constants:
         return walk(grid, segment, visit, state, field.reads, on)

@@ -107,6 +107,15 @@ def test_light_grid_against_exact_shadows():
     assert 0 < np.abs(exact - looked_up).mean() <= 4 * fine * exact.mean()
 
 
+@pytest.mark.parametrize(("cells", "nodes"), [(1, (9, 6, 2)), (4, (3, 3, 2)), (3, (4, 3, 2))])
+def test_nodes_of_a_light_grid_are_so_many_cells_apart(cells, nodes):
+    """At most ``cells`` apart, and in both faces: n cells have ceil(n / cells) steps, and one node more than that."""
+    box, _ = smoke(rough_grid(1, shape=(8, 5, 1)))
+    scene = close_up({"smoke": box, "lamp": sun([0.3, 0.2, -1.0])[0]})
+    with dr.suspend_grad():
+        assert find_light_grid(scene, open_world(scene), cells).nodes == nodes
+
+
 def test_light_grid_keeps_optical_depth_not_transmittance():
     """Under a sun along an axis tau of a constant grid is linear: interpolated exactly, where T would be 8 % too bright."""
     box, _ = smoke(np.full((4, 4, 4), 2.0, np.float32), to_world=centred(2 * np.eye(3)))

@@ -13,6 +13,7 @@ from scattering_scenes import aimed, pencils, smoke, sun
 
 from mivol.scene.needs import find_needs, survey_scene
 from mivol.scene.plan import build_world, make_plan
+from mivol.transport.lattice import find_gaps
 from mivol.transport.light_grid import FLOOR, SHARE, coarsen, find_shade
 from mivol.transport.path import Settings
 from scenes import centred, make_lattice
@@ -45,6 +46,14 @@ def test_coarse_grids_are_means_in_their_place(channels, shift):
     # A voxel is as wide as 2^shift: the far corner of the coarse grid is further out by what was repeated.
     far = TWO @ [*(edge * m / n for m, n in zip(sizes[::-1], SIZE[::-1], strict=True)), 1]
     np.testing.assert_allclose(coarse.lattice.to_world @ np.ones(4), far, rtol=1e-12)
+
+
+@pytest.mark.parametrize("skip", [False, True])
+def test_coarse_grids_skip_what_is_empty_where_the_fine_one_does(skip):
+    coarse = coarsen(make_lattice(mi.TensorXf(sparse(1)), TWO, skip), 1, False).lattice
+    assert (coarse.gaps is not None) == skip
+    if skip:
+        assert np.array_equal(np.array(coarse.gaps), np.array(find_gaps(coarse.values)))
 
 
 @pytest.mark.parametrize("shift", [0, 1, 2, 3])

@@ -10,7 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from scattering_scenes import PLACE, aimed, assert_same_images, close_up, mivol, point, rough_grid, smoke
+from scattering_scenes import PLACE, aimed, assert_same_images, close_up, mivol, point, rough_grid, smoke, sun
 
 import scenes
 from mivol.scene.plan import explain
@@ -178,6 +178,17 @@ def test_fine_grids_are_looked_up():
     sparse = fine.copy()
     sparse[8:] = 0
     assert "estimated" not in explain(close_up({"smoke": smoke(sparse)[0], "sky": lamp}, res=4), 2)
+
+
+def test_one_grid_beside_fog_is_estimated():
+    """Shadows of a scene are estimated where some medium has blocks, and noise tells: both pictures have the same seed."""
+    fog = scenes.ball_of(scenes.medium("homogeneous", 0.5), (4, 0, 0), 0.5)
+    scene = close_up({"smoke": smoke(rough_grid(1))[0], "fog": fog, "sun": sun([0.3, 0.2, -1.0])[0]}, res=4)
+    exact, estimated = (
+        np.array(mi.render(scene, integrator=mi.load_dict(mivol(shadows=shadows)), spp=4, seed=1))
+        for shadows in ("exact", "estimated")
+    )
+    assert np.abs(estimated - exact).max() > 1e-3 * exact.max()
 
 
 def test_words_for_shadows():

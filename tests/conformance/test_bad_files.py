@@ -80,6 +80,7 @@ BAD: dict[str, tuple[str, Callable[[], bytes], tuple[str, ...]]] = {
     "npz none": ("a.npz", lambda: npz(a=np.arange(3)), ("0 arrays (none)",)),
     "npz objects": ("a.npz", lambda: npz(values=np.array([None])), ("Python objects",)),
     "npz frame": ("a.npz", lambda: npz(values=ONE, to_world=np.eye(3)), ("shape (3, 3)", "4x4")),
+    "npz frame of words": ("a.npz", lambda: npz(values=ONE, to_world=np.full((4, 4), "1")), ("type <U1", "4x4 real numbers")),
     "npz frame flat": ("a.npz", lambda: npz(values=ONE, to_world=np.diag([1.0, 1, 0, 1])), ("degenerate",)),
     "npz frame det 0": (
         "a.npz",

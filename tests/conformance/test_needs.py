@@ -220,6 +220,23 @@ def test_derivatives_of_places_are_refused(key):
         make_plan(find_needs(scene, scene.sensors()[0]), Settings(max_depth=1))
 
 
+def test_derivatives_of_what_is_painted_on_a_mesh_are_taken():
+    """A colour of its vertices is no place."""
+    floor = mi.load_dict({"type": "rectangle"})
+    mesh = mi.Mesh("floor", 4, 2, has_vertex_normals=True)
+    params = mi.traverse(mesh)
+    for name in ("vertex_positions", "vertex_normals", "faces"):
+        params[name] = mi.traverse(floor)[name] if name in mi.traverse(floor) else params[name]
+    mesh.add_attribute("vertex_color", 3, [0.5] * 12)
+    scene = scene_of(sigma_t=1.0, floor=mesh)
+    params = mi.traverse(scene)
+    key = next(k for k, _ in params if k.endswith("vertex_color"))
+    dr.enable_grad(params[key])
+    params.update()
+    needs = find_needs(scene, scene.sensors()[0])
+    assert key in needs.parameters and needs.places == ()
+
+
 def test_empty_space_is_skipped_where_it_pays():
     sparse = np.zeros((40, 40, 40, 1), np.float32)
     sparse[:8, :8, :8] = 1

@@ -38,6 +38,7 @@ from mivol.photos import (
     rays,
     rectified,
     region,
+    silhouette,
     silhouette_box,
     survey_photos,
     undistort,
@@ -248,6 +249,14 @@ def test_transforms_intrinsics_of_file_and_frame(tmp_path: Path) -> None:
 def test_transforms_with_less(tmp_path: Path, settings: dict, K: np.ndarray) -> None:
     folder = write_transforms(tmp_path / "set", settings)
     np.testing.assert_allclose(load_photos(folder).views[0].camera.K, K, rtol=1e-14)
+
+
+@pytest.mark.parametrize("angle", [-1.0, 0.0, 3.15, 60.0])
+def test_angles_of_no_lens_are_refused(tmp_path: Path, angle: float) -> None:
+    """60 is an angle in degrees: the focal length of its tangent would be negative, or any other number."""
+    folder = write_transforms(tmp_path / "set", {"camera_angle_x": angle})
+    with pytest.raises(MivolError, match=f"camera_angle_x = {angle:g}, expected an angle between 0 and pi"):
+        load_photos(folder)
 
 
 def test_transforms_with_lists_of_splits(tmp_path: Path) -> None:
@@ -494,6 +503,22 @@ def test_silhouette_box_holds_the_thing_and_little_more() -> None:
     assert (box[0] <= -radii).all() and (box[1] >= radii).all()
     # Two cells of the second search, each 1/40 of at most twice the thing, and the hull of 12 views around it.
     assert (np.abs(box) < 1.3 * radii + 0.05).all()
+
+
+def test_a_cell_is_kept_for_the_last_pixel_that_its_sphere_covers() -> None:
+    """One point of the sphere is all that is seen, 8 pixels from the one that sees its middle.
+
+    A pinhole would show it 7 pixels away at most; the lens magnifies by 1 + 3 k r^2 = 1.24 there.
+    """
+    camera = Camera(intrinsics(100, 100, 64, 4), (128, 8), np.eye(4), Lens(k1=0.35))
+    cell, radius = np.array([48.0, 0.0, -100.0]), 5.0
+    edge = cell + radius * np.array([1.0, 0, 0.48]) / np.hypot(1, 0.48)
+    (place, end), _ = project(camera, np.array([cell, edge]))
+    assert int(end[0]) - int(place[0]) == 8
+    alpha = np.zeros((8, 128), np.float32)
+    alpha[int(end[1]), int(end[0])] = 1
+    view = Photo("v", np.zeros((8, 128, 3), np.float32), alpha, None, camera, np.zeros(3))
+    assert len(silhouette._kept([view], cell[None], radius)) == 1
 
 
 def test_parallel_cameras_have_no_focus(blender: Path) -> None:

@@ -1,0 +1,58 @@
+"""The rough source function of a control variate: where light comes from one direction or from all, it is known exactly."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from scattering_scenes import PLACE, close_up, point, smoke
+
+from mivol.scene.needs import find_needs, survey_scene
+from mivol.scene.plan import build_world, make_plan
+from mivol.transport.control import Control, View, find_control
+from mivol.transport.path import Settings
+
+pytestmark = pytest.mark.usefixtures("variant_rgb")
+
+ALBEDO = 0.7
+
+
+def control_of(lamp: dict) -> Control:
+    """S in smoke so thin that it dims nothing: 4 x 3 x 5 voxels, whose coarse lattice has its nodes in the corners."""
+    values = np.full((4, 3, 5, 1), 1e-7, np.float32)
+    scene = close_up({"smoke": smoke(values, ALBEDO)[0], "lamp": lamp})
+    survey, settings = survey_scene(scene), Settings(max_depth=2)
+    with dr.suspend_grad():
+        needs = find_needs(scene, scene.sensors()[0], survey)
+        world = build_world(scene, needs, make_plan(needs, settings), settings, survey)
+        view = View(mi.Point3f(0, 0, 5), mi.Float(0), mi.Vector3f(0, 0, -1))
+        return find_control(scene, world, world.bodies[0], view)
+
+
+def test_constant_sky_of_a_colour():
+    """albedo L, in every cell and each channel."""
+    colour = [0.2, 1.0, 3.0]
+    found = control_of({"type": "constant", "radiance": {"type": "rgb", "value": colour}})
+    assert found.channels == 3
+    values = np.array(found.values).reshape(5, 4, 6, 3)
+    # 32 directions of weights that add up to 1, each rounded a few times, and a transmittance of 1 - 4e-7.
+    np.testing.assert_allclose(values, np.broadcast_to(ALBEDO * np.array(colour), values.shape), rtol=1e-5)
+
+
+def test_point_light_from_the_corners_of_the_grid():
+    """albedo I / (4 pi r^2) in the nodes, which lie in the corners of the box, and linear between them."""
+    place, intensity = np.array([4.0, 1.0, 2.5]), 3.0
+    found = control_of(point(place, intensity)[0])
+    values = np.array(found.values).reshape(5, 4, 6)
+
+    def light(x: float, y: float, z: float) -> float:
+        return ALBEDO * intensity / (4 * np.pi * np.sum((place - [x, y, z]) ** 2))
+
+    # The first and the last cell along each axis, z first; those of the middle along y are half-way between them.
+    corners = np.array([[[light(x, y, z) for x in (-1, 1)] for y in (-1, 1)] for z in (-1, 1)])
+    np.testing.assert_allclose(values[::4, ::3, ::5], corners, rtol=1e-5)
+    share = np.arange(4) / 3
+    between = (1 - share)[:, None] * corners[0, 0] + share[:, None] * corners[0, 1]
+    np.testing.assert_allclose(values[0, :, ::5], between, rtol=1e-5)
+    assert np.allclose(PLACE @ [0, 0, 0, 1], [-1, -1, -1, 1])
