@@ -1,4 +1,4 @@
-"""Are the tests able to fail?  Break one line at a time in a copy of the checkout, and demand that the named test goes red.
+"""Are the tests able to fail?  Break one line at a time in a copy of the checkout, and see whether a test goes red.
 
 Each entry of tests/mutations/*.toml names a file, a text that occurs in it once, the text to put in its place, and a
 test. The test must pass on the untouched copy and fail on the broken one; a crash or a hang of the broken one counts as
@@ -7,11 +7,14 @@ failing, an import that breaks does not.
     scripts/mutate.py                        all of them
     scripts/mutate.py --sample 12 --seed 7   twelve, drawn by the seed
     scripts/mutate.py --only '*lattice*'     those whose file, test or list matches
+    scripts/mutate.py --random 60 --seed 7   not these: 60 faults drawn from the whole package, and the share that the
+                                             tests of their modules notice (faults.py, guards.py, survivors.py)
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import fnmatch
 import os
 import random
@@ -22,8 +25,13 @@ import sys
 import tempfile
 import time
 import tomllib
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
+
+from faults import draw_faults, read_package
+from guards import index_guards
+from survivors import Checkout, judge_all, report
 
 ROOT = Path(__file__).resolve().parents[1]
 LEFT_OUT = (".git", ".venv", "runs", "__pycache__", ".pytest_cache", ".ruff_cache", ".hypothesis", "dist", "build")
@@ -129,28 +137,62 @@ def choose(entries: list[Mutation], only: str, sample: int | None, seed: int) ->
     return sorted(random.Random(seed).sample(chosen, sample), key=entries.index)
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Judge the chosen entries; 0 where each was noticed."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--only", default="*", metavar="GLOB", help="entries whose file, test or list matches")
-    parser.add_argument("--sample", type=int, metavar="N", help="a random choice of so many")
-    parser.add_argument("--seed", type=int, default=0, metavar="S", help="of the random choice")
-    parser.add_argument("--limit", type=float, default=300, metavar="SECONDS", help="time that one test may take")
-    args = parser.parse_args(argv)
-    chosen = choose(load_entries(), args.only, args.sample, args.seed)
-    if not chosen:
-        parser.error(f"no entry of tests/mutations matches {args.only!r}")
-    missed, seen = 0, {}
+@contextlib.contextmanager
+def copies(count: int) -> Iterator[list[Path]]:
+    """Copies of the checkout, as long as they are needed."""
     with tempfile.TemporaryDirectory(prefix="mivol-mutate-") as folder:
-        copy = Path(folder) / "checkout"
-        shutil.copytree(ROOT, copy, ignore=shutil.ignore_patterns(*LEFT_OUT), symlinks=True)
+        found = [Path(folder) / str(k) / "checkout" for k in range(count)]
+        for copy in found:
+            shutil.copytree(ROOT, copy, ignore=shutil.ignore_patterns(*LEFT_OUT), symlinks=True)
+        yield found
+
+
+def judge_entries(chosen: list[Mutation], limit: float) -> int:
+    """Say what becomes of each entry; the number of those that their test did not notice."""
+    missed, seen = 0, {}
+    with copies(1) as (copy,):
         for entry in chosen:
             start = time.perf_counter()
-            noticed, how = judge(copy, entry, seen, args.limit)
+            noticed, how = judge(copy, entry, seen, limit)
             missed += not noticed
             print(f"{how:<14}{time.perf_counter() - start:6.1f} s  {entry}  [{entry.test}]", flush=True)
     print(f"{len(chosen) - missed} of {len(chosen)} mutations noticed")
-    return 1 if missed else 0
+    return missed
+
+
+def judge_random(count: int, seed: int, jobs: int, limit: float, rounds: int) -> None:
+    """Draw faults from the package and say which of them its tests notice: a measurement, whose reader judges survivors."""
+    os.environ.setdefault("MIVOL_DATA", str(ROOT.parent / "shared" / "data"))
+    # Each process of tests takes its share of the cores, as tests/conftest.py does for those of pytest-xdist.
+    os.environ["PYTEST_XDIST_WORKER_COUNT"] = str(jobs)
+    faults = draw_faults(read_package(ROOT), count, seed)
+    guards = index_guards(ROOT, [(e.file, e.test) for e in load_entries()])
+    with copies(jobs + 1) as (untouched, *broken):
+        first = Checkout(broken[0], untouched, limit, rounds)
+        checkouts = [first, *(replace(first, broken=copy) for copy in broken[1:])]
+        report(judge_all(faults, guards, checkouts), count, lambda line: print(line, flush=True))
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Judge the chosen entries, 0 where each was noticed; or draw faults, and count those that are noticed."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--only", default="*", metavar="GLOB", help="entries whose file, test or list matches")
+    parser.add_argument("--sample", type=int, metavar="N", help="a random choice of so many")
+    parser.add_argument("--random", type=int, metavar="N", help="instead of entries, so many faults drawn from the package")
+    parser.add_argument("--seed", type=int, default=0, metavar="S", help="of the random choice")
+    parser.add_argument("--jobs", type=int, default=2, metavar="J", help="faults of --random that are judged at a time")
+    parser.add_argument("--rounds", type=int, default=3, choices=(1, 2, 3), help="of --random: 2 leave out the tests around")
+    parser.add_argument("--limit", type=float, default=300, metavar="SECONDS", help="time that one test may take")
+    args = parser.parse_args(argv)
+    if args.random is not None:
+        if args.random < 1 or args.jobs < 1:
+            parser.error("--random and --jobs take a number of 1 or more")
+        judge_random(args.random, args.seed, args.jobs, args.limit, args.rounds)
+        return 0
+    chosen = choose(load_entries(), args.only, args.sample, args.seed)
+    if not chosen:
+        parser.error(f"no entry of tests/mutations matches {args.only!r}")
+    return 1 if judge_entries(chosen, args.limit) else 0
 
 
 if __name__ == "__main__":

@@ -1,12 +1,13 @@
 """The list of mutations still fits the code: every entry applies, its test exists, and every module has one.
 
-scripts/mutate.py applies them and demands red; that takes minutes, this takes none.
+scripts/mutate.py applies them and demands red; that takes minutes, this takes none. The faults that it draws at random are
+held against small files, where all that may and may not be broken is known.
 """
 
 from __future__ import annotations
 
 import ast
-import importlib.util
+import importlib
 import sys
 from pathlib import Path
 from types import ModuleType
@@ -16,16 +17,17 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 
 
-def load_mutate() -> ModuleType:
-    """The script as a module."""
-    spec = importlib.util.spec_from_file_location("mutate", ROOT / "scripts" / "mutate.py")
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["mutate"] = module
-    spec.loader.exec_module(module)
-    return module
+SCRIPTS = ROOT / "scripts"
 
 
-mutate = load_mutate()
+def load(name: str) -> ModuleType:
+    """A script as a module; scripts find what they share beside them."""
+    if str(SCRIPTS) not in sys.path:
+        sys.path.append(str(SCRIPTS))
+    return importlib.import_module(name)
+
+
+mutate, faults, guards, survivors = map(load, ("mutate", "faults", "guards", "survivors"))
 ENTRIES = mutate.load_entries()
 
 
@@ -83,3 +85,160 @@ def test_the_runner_tells_red_from_green(tmp_path: Path) -> None:
         entry = mutate.Mutation("area", "doubling.py", "2 * x", "3 * x", f"test_doubling.py::{name}")
         assert mutate.judge(tmp_path, entry, seen, 60.0) == expected
     assert (tmp_path / "doubling.py").read_text() == "def double(x):\n    return 2 * x\n"
+
+
+# -- Faults at random --------------------------------------------------------------------------------------------------
+
+PACKAGE = faults.read_package(ROOT)
+
+SOURCE = '''"""Docstring with 1 + 2 and not this."""
+import os.path as p
+from typing import TYPE_CHECKING
+__all__ = ["f", "g"][0:2]
+if TYPE_CHECKING and 1 < 2:
+    import ast
+Kind = int | None
+SIZE: tuple[int, 3] = 7
+
+@decorated(5)
+def f(a: int | None, b: float = 0.5) -> dict[str, 4]:
+    """Docstring, a & b."""
+    if not (a < SIZE and b):
+        return -a * max(b.x, 3)
+    name = f"{a + 1} in text, 100 %" + "1 < 2"
+    π = [a // 2 for a in b if a is not None]  # a - b
+    return zip(name, select(π >= 1, a, ~b), strict=True)
+
+if __name__ == "__main__":
+    f(9, 9)
+'''
+
+EXPECTED = {
+    (8, "7", "8"), (8, "7", "14"), (8, "7", "0"),
+    (11, "0.5", "1.5"), (11, "0.5", "1.0"), (11, "0.5", "0.0"),
+    (13, "not (a < SIZE and b)", "True"), (13, "not (a < SIZE and b)", "False"), (13, "not ", ""), (13, "<", "<="),
+    (13, "and", "or"),
+    (14, "-", ""), (14, "*", "/"), (14, "max", "min"), (14, "x", "y"), (14, "3", "4"), (14, "3", "6"), (14, "3", "0"),
+    (15, "+", "-"),
+    (16, "//", "/"), (16, "2", "3"), (16, "2", "4"), (16, "2", "0"), (16, "is not", "is"), (16, "a is not None", "True"),
+    (16, "a is not None", "False"),
+    (17, ">=", ">"), (17, "π >= 1", "True"), (17, "π >= 1", "False"), (17, "1", "2"), (17, "1", "0"), (17, "~", ""),
+}  # fmt: skip
+"""(line, old, new) of every fault that SOURCE can be given; no more, whatever stands in strings and annotations."""
+
+
+def test_what_can_be_broken_and_what_cannot():
+    found = faults.find_faults("a.py", SOURCE)
+    assert {(f.line, f.old, f.new) for f in found} == EXPECTED
+    assert len(found) == len(EXPECTED)
+
+
+def test_the_package_can_be_broken_in_many_places_and_each_fault_is_one():
+    """Of 300 drawn faults each parses, changes the program, and leaves all but one line's text as it was."""
+    drawn = faults.draw_faults(PACKAGE, 300, seed=11)
+    assert len({(f.file, f.line) for f in drawn}) == 300
+    assert len({f.kind for f in drawn}) == 6
+    for fault in drawn:
+        before, after = PACKAGE[fault.file], fault.apply(PACKAGE[fault.file])
+        assert ast.dump(ast.parse(after)) != ast.dump(ast.parse(before)), fault
+        assert before[: fault.start] == after[: fault.start] and before.count("\n", 0, fault.start) == fault.line - 1
+        rest = len(before) - fault.start - len(fault.old)
+        assert before[len(before) - rest :] == after[len(after) - rest :]
+        assert documentation(after) == documentation(before)
+
+
+def documentation(source: str) -> list:
+    kinds = ast.Module | ast.ClassDef | ast.FunctionDef
+    return [ast.get_docstring(n) for n in ast.walk(ast.parse(source)) if isinstance(n, kinds)]
+
+
+def test_the_same_seed_draws_the_same_faults():
+    first, again, other = (faults.draw_faults(PACKAGE, 20, seed) for seed in (1, 1, 2))
+    assert first == again != other
+    with pytest.raises(ValueError, match="2 faults are asked for; 1 lines"):
+        faults.draw_faults({"a.py": "x = 1\n"}, 2, 0)
+
+
+def test_lines_are_drawn_alike():
+    """A line of one constant as often as one of twelve: 200 of 400, give or take 6 standard deviations of 10."""
+    source = "a = 1\nb = [1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12]\n"
+    lines = [faults.draw_faults({"a.py": source}, 1, seed)[0].line for seed in range(400)]
+    assert 140 <= lines.count(1) <= 260
+
+
+def test_tests_of_a_module_are_found(tmp_path: Path) -> None:
+    """By entries first, then by name and by import; a module that nothing names takes those of its folder."""
+    for name, text in {
+        "pkg/a.py": "",
+        "pkg/b.py": "",
+        "pkg/room/c.py": "",
+        "tests/one/test_a.py": "from pkg.b import x\n",
+        "tests/two/test_more.py": "from pkg import a, b\n",
+        "tests/two/test_other.py": "import os\n",
+    }.items():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(text)
+    entries = [("pkg/a.py", "tests/two/test_other.py::t"), ("pkg/a.py", "tests/two/test_more.py::t")] * 2
+    index = guards.index_guards(tmp_path, [*entries, entries[1]], package="pkg")
+    one, more, other = "tests/one/test_a.py", "tests/two/test_more.py", "tests/two/test_other.py"
+    assert index.rounds("pkg/a.py") == [[f"{more}::t", f"{other}::t"], [one, more, other], []]
+    assert index.rounds("pkg/b.py") == [[], [one, more], [other]]
+    assert index.rounds("pkg/room/c.py") == [[], [], [one, more, other]]
+
+
+def test_every_module_has_tests_of_its_own():
+    """Before the tests around it are asked, some of its own are known."""
+    index = guards.index_guards(ROOT, [(e.file, e.test) for e in ENTRIES])
+    modules = [str(path.relative_to(ROOT)) for path in (ROOT / "mivol").rglob("*.py") if has_logic(path)]
+    assert [m for m in modules if not any(index.rounds(m)[:2])] == []
+
+
+HALVING = "def half(x):\n    return x / 2\ndef least(x):\n    return x if x < 9 else 9\n"
+
+
+@pytest.fixture
+def checkout(tmp_path: Path) -> object:
+    """Two copies of a checkout with a test that sees half of the module, and one that is red anyway."""
+    for name in ("broken", "untouched"):
+        (tmp_path / name / "tests").mkdir(parents=True)
+        (tmp_path / name / "halving.py").write_text(HALVING)
+        (tmp_path / name / "tests" / "test_halving.py").write_text(
+            "from halving import half, least\n"
+            "def test_red_anyway(): assert half(2) == 3\n"
+            "def test_half(): assert half(6) == 3 and least(9) == 9\n"
+        )
+    return survivors.Checkout(tmp_path / "broken", tmp_path / "untouched", 60.0)
+
+
+@pytest.mark.parametrize(("old", "new", "killer"), [("/", "*", "tests/test_halving.py::test_half"), ("<", "<=", "")])
+def test_a_fault_is_killed_by_a_test_that_is_green_without_it(checkout, old: str, new: str, killer: str) -> None:
+    """9 is returned for 9 by either comparison: that fault is no fault. A test that is red anyway kills nothing."""
+    start = HALVING.index(f" {old} ") + 1
+    fault = faults.Fault("halving.py", 2, start, old, new, "operator")
+    index = guards.Guards(named={"halving.py": ["tests/test_halving.py"]})
+    verdict = survivors.judge_fault(checkout, fault, index)
+    assert (verdict.killed, verdict.test) == (bool(killer), killer)
+    assert (checkout.broken / "halving.py").read_text() == HALVING
+
+
+def test_a_fault_that_nothing_can_be_imported_with_is_killed(checkout) -> None:
+    fault = faults.Fault("halving.py", 1, 0, "def half(x):", "half = 1 +\\\n", "operator")
+    index = guards.Guards(named={"halving.py": ["tests/test_halving.py"]})
+    assert survivors.judge_fault(checkout, fault, index).killed
+
+
+def test_a_test_that_does_not_end_kills(checkout) -> None:
+    (checkout.broken / "tests" / "test_halving.py").write_text("import time\ndef test_half(): time.sleep(60)\n")
+    hasty = survivors.Checkout(checkout.broken, checkout.untouched, 1.0)
+    fault = faults.Fault("halving.py", 2, HALVING.index("/"), "/", "*", "operator")
+    index = guards.Guards(named={"halving.py": ["tests/test_halving.py"]})
+    assert survivors.judge_fault(hasty, fault, index).test == "a test that does not end"
+
+
+def test_survivors_are_counted_and_named():
+    one, two = (faults.Fault("a.py", k, 0, "+", "-", "operator") for k in (1, 2))
+    said = []
+    verdicts = [survivors.Verdict(one, True, "tests/test_a.py::t", 1.0), survivors.Verdict(two, False, "", 2.0)]
+    survivors.report(iter(verdicts), 2, said.append)
+    assert said[-2:] == ["1 of 2 faults were killed (50 %)", "survived: a.py:2: operator '+' -> '-'"]
+    assert "tests/test_a.py::t" in said[0] and "SURVIVED" in said[1]

@@ -1,0 +1,94 @@
+"""Which tests guard a module: those that its mutations name, those named like it, those that import it.
+
+Nothing is written down for this: the file names of the tests, their imports and the entries of tests/mutations say it.
+"""
+
+from __future__ import annotations
+
+import ast
+from collections import Counter, defaultdict
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+__all__ = ["Guards", "imported_modules", "index_guards"]
+
+
+@dataclass
+class Guards:
+    """Tests by module.
+
+    Attributes:
+        tests: the tests of the mutations of each file of the package, those of most mutations first.
+        named, importing: files of tests that are called like a file, or import it, those that import the fewest first.
+        files: every file of tests.
+    """
+
+    tests: dict[str, list[str]] = field(default_factory=dict)
+    named: dict[str, list[str]] = field(default_factory=dict)
+    importing: dict[str, list[str]] = field(default_factory=dict)
+    files: list[str] = field(default_factory=list)
+
+    def rounds(self, file: str) -> list[list[str]]:
+        """What to run for a file of the package, round by round, nothing twice but what the first round holds.
+
+        First the tests that its mutations name; then the files of tests that are called like it, hold those tests or import
+        it; then those of all files in its folder, or all there are where the folder has none. Rounds may be empty.
+        """
+        tests = self.tests.get(file, [])
+        own = _once([*self.named.get(file, []), *map(file_of, tests), *self.importing.get(file, [])])
+        near = [f for f in sorted({*self.tests, *self.named}) if Path(f).parent == Path(file).parent]
+        around = _once(t for f in near for t in (*map(file_of, self.tests.get(f, [])), *self.named.get(f, [])))
+        return [list(tests), own, [t for t in around or self.files if t not in own]]
+
+
+def file_of(test: str) -> str:
+    """The file of a test."""
+    return test.partition("::")[0]
+
+
+def _once(tests: Iterable[str]) -> list[str]:
+    return list(dict.fromkeys(tests))
+
+
+def index_guards(root: Path, entries: Iterable[tuple[str, str]], package: str = "mivol") -> Guards:
+    """Look through the tests of a checkout.
+
+    Args:
+        root: the checkout; its tests are the files tests/**/test_*.py.
+        entries: (file of the package, test that guards it) pairs.
+        package: the folder of the package.
+    """
+    modules = {_module(path.relative_to(root)): str(path.relative_to(root)) for path in sorted((root / package).rglob("*.py"))}
+    counts = defaultdict(Counter)
+    for file, test in entries:
+        counts[file][test] += 1
+    guards = Guards(tests={file: [test for test, _ in found.most_common()] for file, found in counts.items()})
+    reads = {}
+    for path in sorted((root / "tests").rglob("test_*.py")):
+        name = str(path.relative_to(root))
+        guards.files.append(name)
+        reads[name] = {modules[m] for m in imported_modules(path.read_text()) if m in modules}
+        for file in modules.values():
+            if path.stem.removeprefix("test_") == Path(file).stem:
+                guards.named.setdefault(file, []).append(name)
+    for name in sorted(reads, key=lambda n: (len(reads[n]), n)):
+        for file in reads[name]:
+            guards.importing.setdefault(file, []).append(name)
+    return guards
+
+
+def _module(path: Path) -> str:
+    parts = path.with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+def imported_modules(source: str) -> set[str]:
+    """The modules that a file may import: of ``from a import b`` both ``a`` and ``a.b``."""
+    found = set()
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
+            found |= {node.module} | {f"{node.module}.{alias.name}" for alias in node.names}
+    return found
