@@ -56,7 +56,10 @@ def vol(values: np.ndarray, *, box: tuple = (-1, -2, -3, 3, 4, 5), encoding: int
     return head + b"".join(struct.pack(code, cast(number)) for number in in_order(values))
 
 
-NRRD_TYPES = {"u1": "uchar", "i2": "short", "u2": "unsigned short", "i4": "int", "f4": "float", "f8": "double"}
+NRRD_TYPES = {
+    "i1": "signed char", "u1": "uchar", "i2": "short", "u2": "unsigned short", "i4": "int", "u4": "unsigned int",
+    "i8": "long long int", "u8": "unsigned long long int", "f4": "float", "f8": "double",
+}  # fmt: skip
 
 
 def nrrd_head(values: np.ndarray, *, dtype: str = "f4", order: str = "<", encoding: str = "raw", **fields: str) -> str:
@@ -85,7 +88,10 @@ def nrrd(values: np.ndarray, *, dtype: str = "f4", order: str = "<", encoding: s
     return head.encode() + PACK[encoding](packed(in_order(values), dtype, order))
 
 
-MET_TYPES = {"u1": "MET_UCHAR", "i2": "MET_SHORT", "u2": "MET_USHORT", "f4": "MET_FLOAT", "f8": "MET_DOUBLE"}
+MET_TYPES = {
+    "i1": "MET_CHAR", "u1": "MET_UCHAR", "i2": "MET_SHORT", "u2": "MET_USHORT", "i4": "MET_INT", "u4": "MET_UINT",
+    "i8": "MET_LONG_LONG", "u8": "MET_ULONG_LONG", "f4": "MET_FLOAT", "f8": "MET_DOUBLE",
+}  # fmt: skip
 
 
 def meta_head(values: np.ndarray, *, dtype: str = "f4", order: str = "<", data: str = "LOCAL", **keys: str) -> bytes:
@@ -115,7 +121,7 @@ def mha(values: np.ndarray, *, dtype: str = "f4", order: str = "<", **keys: str)
     return meta_head(values, dtype=dtype, order=order, **keys) + data
 
 
-NIFTI_TYPES = {"u1": 2, "i2": 4, "i4": 8, "f4": 16, "f8": 64, "u2": 512}
+NIFTI_TYPES = {"i1": 256, "u1": 2, "i2": 4, "u2": 512, "i4": 8, "u4": 768, "i8": 1024, "u8": 1280, "f4": 16, "f8": 64}
 
 
 def nifti(
@@ -162,7 +168,8 @@ def nifti(
     return bytes(head) + bytes(4) + packed(planes, dtype, order)
 
 
-VTK_TYPES = {"u1": "UInt8", "i2": "Int16", "u2": "UInt16", "f4": "Float32", "f8": "Float64"}
+VTK_TYPES = {f"{code}{size}": f"{name}{8 * size}" for code, name in (("i", "Int"), ("u", "UInt")) for size in (1, 2, 4, 8)}
+VTK_TYPES |= {"f4": "Float32", "f8": "Float64"}
 
 
 def vti_block(data: bytes, word: str, order: str, compressor: str | None, size: int) -> tuple[bytes, bytes]:

@@ -1,7 +1,7 @@
 """A radiance field fitted to photographs: from the settings of an experiment to a run folder, one call per arrow.
 
 Conventions. ``metrics.jsonl`` has ``loss`` (mean squared error of a step's rays) and the metrics of one judged view now and
-then; ``field.npz`` is the field, ``film/turntable.mp4`` a camera path around it.
+then; ``field.npz`` is the field, ``film/turntable.mp4`` (``.webp`` where there is no ffmpeg) a camera path around it.
 """
 
 from __future__ import annotations

@@ -21,7 +21,7 @@ from mivol.photos import Camera, Photo, Photos, turntable
 from mivol.photos.picture import decode_srgb
 from mivol.report.depth import depth_pixels, normal_pixels, normals_of_depth
 from mivol.report.record import Image, Table, Volume
-from mivol.report.video import write_video
+from mivol.report.video import WITHOUT_FFMPEG, film_suffix, write_video
 from mivol.validate.images import Quality, judge, score
 
 FILM_SIZE = 256
@@ -84,7 +84,9 @@ class PhotoOutputs:
     def write_film(self) -> Image:
         """A camera path around the box."""
         cameras, count = [view.camera for view in self.photos.views], self.task.chosen.show.frames
-        path = "film/turntable.mp4"
+        path = f"film/turntable{film_suffix()}"
+        if not path.endswith(".mp4"):
+            self.task.watcher.say([WITHOUT_FFMPEG])
         background = behind(self.fit, self.photos.views[0])
 
         def frames() -> Iterator[NDArray[np.uint8]]:

@@ -55,12 +55,10 @@ def surface_of(field: SphericalGrid, level: float | None = None) -> Mesh:
         triangles differ from the trilinear field by O(voxel^2).
 
     Raises:
-        MivolError: scikit-image is not installed, a level that is not above 0, or one that the field does not reach.
+        MivolError: a level that is not above 0, or one that the field does not reach.
     """
-    try:
-        from skimage.measure import marching_cubes
-    except ImportError:
-        raise MivolError('a mesh needs scikit-image, which is not installed; pip install "mivol[metrics]".') from None
+    from skimage.measure import marching_cubes  # slow to import
+
     level = level_of(field) if level is None else float(level)
     if not 0 < level < math.inf:
         raise MivolError(f"the level {level:g} was given for a surface; an extinction above 0 is expected.")

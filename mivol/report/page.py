@@ -33,6 +33,7 @@ PAGE = "report.html"
 SHOWN_VIEWS = 4
 Z_LIMIT = 4.0
 Z_ODD = 3.0
+FILMS = {".mp4": "video/mp4", ".webp": "image/webp", ".gif": "image/gif"}
 VERDICTS = {"finished": "Reconstructed in", "stopped": "Stopped after", "running": "Still running after"}
 
 
@@ -290,10 +291,11 @@ def _plain_picture(folder: Path, image: Image) -> Picture:
     return _picture(image.caption or image.view or Path(image.path).stem, _load(folder, image), None)
 
 
-def _film(folder: Path, image: Image) -> tuple[str, str]:
-    """The caption of a film and the film as an address."""
+def _film(folder: Path, image: Image) -> tuple[str, str, bool]:
+    """The caption of a film, the film as an address, and whether it is an animated image."""
     coded = base64.b64encode((folder / image.path).read_bytes()).decode()
-    return image.caption or image.view, f"data:video/mp4;base64,{coded}"
+    kind = FILMS[Path(image.path).suffix]
+    return image.caption or image.view, f"data:{kind};base64,{coded}", kind.startswith("image/")
 
 
 def _bar_labels(scales: dict[str, show.Scale], image: Image | None) -> list[tuple[str, str]]:

@@ -462,12 +462,10 @@ def ssim(image: np.ndarray, truth: np.ndarray, peak: float | None = None) -> flo
     The window is the paper's, 11 x 11 pixels with Gaussian weights of standard deviation 1.5, wholly inside the image.
 
     Raises:
-        MivolError: scikit-image is not installed, or the image is smaller than the window.
+        MivolError: the image is smaller than the window.
     """
-    try:
-        from skimage.metrics import structural_similarity
-    except ImportError:
-        raise MivolError('SSIM needs scikit-image, which is not installed; pip install "mivol[metrics]".') from None
+    from skimage.metrics import structural_similarity  # slow to import
+
     truth = np.asarray(truth, dtype=np.float64)
     if min(truth.shape[:2]) < 11:
         raise MivolError(f"an image of {truth.shape[1]}x{truth.shape[0]} is smaller than the 11 pixel window of SSIM.")

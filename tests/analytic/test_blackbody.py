@@ -33,6 +33,7 @@ def test_values():
     m, T = 550e-9, 1300.0
     expected = 2 * Planck * speed_of_light**2 / m**5 / np.expm1(Planck * speed_of_light / (m * Boltzmann * T)) * 1e-9
     assert planck(550.0, T) == pytest.approx(expected, rel=1e-9)
+    assert planck(550.0, 0.0) == 0
     assert planck(1e9, 300.0) == pytest.approx(2 * speed_of_light * Boltzmann * 300 * 1e-9, rel=1e-4)
 
 

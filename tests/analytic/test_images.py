@@ -50,7 +50,6 @@ def test_masked_pixels_do_not_count() -> None:
 
 def test_ssim_against_its_formula() -> None:
     """Wang et al., equation 13, with 11 x 11 Gaussian weights, at one place and over all."""
-    pytest.importorskip("skimage")
     image = np.clip(TRUTH + RNG.normal(0, 0.1, TRUTH.shape), 0, 1)
     a, b = quantised(image), quantised(TRUTH)
     line = np.exp(-(np.arange(-5, 6) ** 2) / 2 / 1.5**2)

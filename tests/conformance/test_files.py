@@ -15,6 +15,7 @@ import stat
 import subprocess
 import sys
 import warnings
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -44,6 +45,17 @@ def assert_volume(volume: files.VolumeData, values: np.ndarray, place: np.ndarra
     assert volume.values.flags.c_contiguous
     np.testing.assert_array_equal(volume.values, values)
     np.testing.assert_allclose(volume.to_world, place, rtol=tol, atol=100 * tol)
+
+
+@pytest.mark.parametrize("dtype", ["i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8", "f4", "f8"])
+@pytest.mark.parametrize("suffix", ["nrrd", "mha", "nii", "vti"])
+def test_every_type_of_numbers(tmp_path: Path, suffix: str, dtype: str) -> None:
+    """Large ones with the sign that the type has: another width or sign gives others. float32 holds each exactly."""
+    make = {"nrrd": made.nrrd, "mha": made.mha, "nii": partial(made.nifti, sform=SFORM), "vti": made.vti}[suffix]
+    bits, small = 8 * int(dtype[1]), made.numbered() // 4
+    whole = np.float32(2.0 ** (bits - 2)) + small * np.float32(2.0 ** max(bits - 10, 0))
+    values = {"i": -whole, "u": 2 * whole, "f": small / 3}[dtype[0]]
+    np.testing.assert_array_equal(read(tmp_path, f"a.{suffix}", make(values, dtype=dtype)).values, values)
 
 
 # -- Mitsuba .vol ---------------------------------------------------------------------------------------------------

@@ -5,6 +5,8 @@ from __future__ import annotations
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -14,7 +16,7 @@ from PIL import Image
 from mivol.errors import MivolError
 from mivol.photos import Camera, between, facing, intrinsics, pixel_centres, project, rays, turntable
 from mivol.report.depth import depth_pixels, normal_pixels, normals_of_depth
-from mivol.report.video import write_video
+from mivol.report.video import film_suffix, write_video
 
 LIKE = Camera(intrinsics(90, 100, 30, 20), (64, 48), np.eye(4))
 BOX = np.array([[-1.0, -1, -1], [1, 1, 1]])
@@ -146,10 +148,31 @@ def test_gif_needs_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
     assert not (tmp_path / "film.mp4").exists()
 
 
+def test_webp_needs_nothing_and_has_all_colours(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    path = write_video(tmp_path / "film.webp", frames(), fps=8)
+    with Image.open(path) as film:
+        assert film.format == "WEBP" and film.n_frames == 6
+        film.seek(5)
+        film.load()
+        assert film.info["duration"] == 125
+        # Lossy at quality 90: as far off as the rounding of 8-bit YUV and a quantiser of 2 to 3 codes leave a ramp.
+        np.testing.assert_allclose(np.asarray(film.convert("RGB"), float), frames()[5], atol=6)
+
+
+@pytest.mark.parametrize("module", [None, SimpleNamespace(get_ffmpeg_exe=Mock(side_effect=RuntimeError("No ffmpeg exe")))])
+def test_films_without_ffmpeg_are_webp(module: object, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where its package is not installed, and where the package has no program for this machine."""
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", module)
+    assert film_suffix() == ".webp"
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", SimpleNamespace(get_ffmpeg_exe=Mock(return_value="ffmpeg")))
+    assert film_suffix() == ".mp4"
+
+
 def test_films_that_are_refused(tmp_path: Path) -> None:
     one = frames(1)[0]
     cases = [
-        ("film.avi", [one], {}, ".mp4 or .gif"),
+        ("film.avi", [one], {}, ".mp4, .webp, .gif"),
         ("film.gif", [], {}, "no frame"),
         ("film.gif", [one, one[:-1]], {}, "frames of one size"),
         ("film.gif", [one / 255], {}, "frame 0 is float64"),

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import sys
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from mivol import config
 from mivol.cli import main
@@ -108,6 +110,20 @@ def test_photographs_become_a_field_and_a_page(photographs: Path, tmp_path: Path
     rows = [json.loads(line) for line in (tmp_path / "run/metrics.jsonl").read_text().splitlines()]
     assert rows[-1]["iteration"] == record["results"]["iterations"] == photo_plan.make_plan(config.load(path)).steps
     assert all({"loss", "held_out_psnr"} <= row.keys() for row in rows)
+
+
+def test_a_film_without_ffmpeg_is_an_animated_image(
+    photographs: Path, tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A fit that is done is not lost for want of a program: its film is written otherwise, which is said once."""
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    path = toml(tmp_path, photographs)
+    assert main(["optimize", str(path), "-o", str(tmp_path / "run"), "--set", "field.effort=0.02"]) == 0
+    assert capsys.readouterr().err.count("imageio-ffmpeg") == 1
+    with Image.open(tmp_path / "run/film/turntable.webp") as film:
+        assert film.n_frames == 3
+    page = (tmp_path / "run/report.html").read_text()
+    assert '<img alt="3 views around the box" src="data:image/webp;base64,' in page and "<video" not in page
 
 
 def test_what_is_behind_is_learned(photographs: Path, tmp_path: Path) -> None:
