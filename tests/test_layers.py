@@ -12,7 +12,7 @@ PACKAGE = Path(__file__).resolve().parents[1] / "mivol"
 ORDER = [
     *("errors", "threads", "machine", "llvm", "numerics", "space", "files", "photos", "fields", "phase"),
     *("transport", "tomography", "scene", "plugins", "optim", "validate", "report", "config", "doctor", "experiments"),
-    *("cli", "__main__"),
+    *("bench", "cli", "__main__"),
 ]
 STARTS_THREADS = {"threading", "multiprocessing", "subprocess", "concurrent", "_thread", "asyncio"}
 STARTS_NOTHING = {
@@ -57,6 +57,15 @@ def test_imports_point_up(path: Path) -> None:
     room = room_of(path)
     assert room == "" or room in ORDER, f"{room} has no place in ORDER"
     assert wrong_arrows(room, imported(path)) == []
+
+
+def test_nothing_imports_the_benches() -> None:
+    """They measure mivol; nothing that a user runs needs them."""
+    rooms = {path: room_of(path) for path in MODULES}
+    found = [
+        path.name for path, room in rooms.items() if room != "bench" for name, _ in imported(path) if "mivol.bench" in name
+    ]
+    assert found == []
 
 
 @pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(PACKAGE)))

@@ -1,19 +1,15 @@
-"""What depth 2 leaves out: the table obeys the laws of scattering orders, and Mitsuba measures it again."""
+"""What depth 2 leaves out: the table obeys the laws of scattering orders, and optical depths are those of its lines."""
 
 from __future__ import annotations
 
 import math
 import re
-from pathlib import Path
-from types import ModuleType
 
-import bench_script
 import mitsuba as mi
 import numpy as np
 import pytest
 from scattering_scenes import close_up
 
-from mivol.scene import depth_two
 from mivol.scene.depth_two import ALBEDOS, TABLES, TAUS, depth_two_error, draw_lines, scattering_depth
 from mivol.scene.plan import explain
 from mivol.transport.medium import Box, view_medium
@@ -23,11 +19,6 @@ ROUNDING = 5e-4
 """Of a table of three digits."""
 CUBE_DEPTH = 0.8966336
 """E[l^2] / E[l] of lines through the unit cube: 8 / (2 pi) int prod(1 - u_i) / |u|^2 du, which Gauss-Legendre gives below."""
-
-
-@pytest.fixture(scope="module")
-def bench() -> ModuleType:
-    return bench_script.load("bench_depth")
 
 
 # -- The table ----------------------------------------------------------------------------------------------------
@@ -167,48 +158,3 @@ def test_the_densest_channel_and_nothing(variant_rgb) -> None:
     grey = scattering_depth(view_of(medium("homogeneous", 0.9, 0.5)), Box(np.eye(4)))
     assert rgb == pytest.approx(grey, rel=1e-5)
     assert scattering_depth(view_of(medium("homogeneous", 0.0, 0.5)), Box(np.eye(4))) == 0.0
-
-
-# -- Measured again -----------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("light", ["constant", "collimated"])
-def test_a_cell_is_measured_again(variant_rgb, bench: ModuleType, light: str) -> None:
-    """Albedo 0.9 at tau = 1 by other lines and samples than the table's: within 5 standard errors of this measurement and
-    the table's own (0.0014, a quarter of this one's with 16 times the lines) and its rounding."""
-    key = (light, "isotropic")
-    cell = bench.measure(bench.cube(light), ("cube", *key), 0.9, 1.0, bench.CUBE_DEPTH, n=1 << 14, seed=77)
-    wanted = TABLES[key][ALBEDOS.index(0.9), TAUS.index(1.0)]
-    assert cell.standard_error < 0.01, "else the test sees nothing"
-    assert abs(cell.error - wanted) <= 5 * cell.standard_error * math.sqrt(1 + 1 / 16) + ROUNDING
-
-
-def test_standard_error_of_a_ratio(bench: ModuleType) -> None:
-    """2000 ratios of 400 pairs each scatter as the delta method says: their standard deviation errs by 1 / sqrt(2 * 2000)
-    = 1.6 %, the method by O(1 / n) = a few per mille; 6 of the former."""
-    rng = np.random.default_rng(0)
-    every = rng.exponential(1.0, (2000, 400))
-    once = 0.6 * every * rng.random((2000, 400))
-    found = [bench.left_out(a, b) for a, b in zip(once, every, strict=True)]
-    errors, said = np.array(found).T
-    assert abs(errors.mean() - 0.7) <= 6 * errors.std() / math.sqrt(2000) + 1e-3
-    assert abs(errors.std() / said.mean() - 1) <= 6 * 0.016
-
-
-@pytest.mark.slow
-def test_the_bench_runs(bench: ModuleType, tmp_path: Path) -> None:
-    """It prints its JSON, which is its file, and draws its chart; every cell of the quick run lies within 5 standard errors
-    of the table (whose own are a quarter) and its rounding, and no bar is missed."""
-    printed = bench_script.quick("bench_depth", tmp_path)
-    assert (tmp_path / "bench_depth.png").stat().st_size > 20_000
-    assert len(printed["table"]["cells"]) == len(TABLES) * len(bench.QUICK.taus) * len(ALBEDOS)
-    assert len(printed["bars"]) == 3
-    assert all(bar["met"] for bar in printed["bars"]), printed["bars"]
-
-
-def test_the_table_is_printed_as_the_module_holds_it(bench: ModuleType) -> None:
-    cells = [
-        bench.Cell("cube", *key, albedo, tau, 0.0, 0.0, TABLES[key][i, j], 0.0, 0.0)
-        for key in TABLES for i, albedo in enumerate(ALBEDOS) for j, tau in enumerate(TAUS)
-    ]  # fmt: skip
-    assert "\n".join(bench.table_lines(cells)) in Path(depth_two.__file__).read_text()

@@ -4,25 +4,18 @@ from __future__ import annotations
 
 import json
 import math
-import subprocess
-import sys
 import zipfile
 from pathlib import Path
 
 import drjit as dr
 import numpy as np
 import pytest
-from bench_script import SCRIPTS, load
 
+from mivol.bench import storage
 from mivol.fields.spherical import SphericalGrid, save_field
 from mivol.transport.radiance import cells_of
 
 RES = (5, 6, 7)
-
-
-@pytest.fixture(scope="module")
-def storage():
-    return load("storage")
 
 
 def field(degree: int, keep: np.ndarray | None) -> SphericalGrid:
@@ -39,7 +32,7 @@ def held(*arrays: object) -> int:
 
 @pytest.mark.parametrize("sparse", [False, True], ids=["dense", "sparse"])
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_formulas_are_the_bytes(storage, variant_rgb, tmp_path: Path, degree: int, sparse: bool) -> None:
+def test_formulas_are_the_bytes(variant_rgb, tmp_path: Path, degree: int, sparse: bool) -> None:
     keep = np.random.default_rng(9).random(RES) < 0.2
     made = field(degree, keep if sparse else None)
     kept = int(keep.sum()) if sparse else math.prod(RES)
@@ -56,7 +49,7 @@ def test_formulas_are_the_bytes(storage, variant_rgb, tmp_path: Path, degree: in
 
 
 @pytest.mark.parametrize("share", [0.02, 0.3, 1.0])
-def test_the_index_is_what_the_walk_reads(storage, variant_rgb, share: float) -> None:
+def test_the_index_is_what_the_walk_reads(variant_rgb, share: float) -> None:
     keep = np.random.default_rng(1).random(RES) <= share
     made = field(0, keep)
     cells = cells_of(made)
@@ -66,7 +59,7 @@ def test_the_index_is_what_the_walk_reads(storage, variant_rgb, share: float) ->
     assert index == storage.index_bytes(RES, listed, rows)
 
 
-def test_the_lecture_counts_4_gigabytes(storage) -> None:
+def test_the_lecture_counts_4_gigabytes() -> None:
     """1024^3 cells of 4 bytes; degree 2 is 27 numbers a cell in rows of 28, and the density; sparse falls as 1/N."""
     found = {kind.name: kind for kind in storage.kinds(0.1)}
     assert found["dense rgba, 8 bits (the lecture's)"].scenes[1024] == (4 * 2**30, 4 * 2**30)
@@ -77,15 +70,14 @@ def test_the_lecture_counts_4_gigabytes(storage) -> None:
     assert storage.shell(0.2).mean() == pytest.approx(0.2, abs=2e-3)
 
 
-def test_what_is_printed(variant_rgb, tmp_path: Path) -> None:
+def test_what_is_printed(variant_rgb, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     """A table, the run's quality in the row of its kind, and JSON with the bytes of its real file."""
     run = tmp_path / "a_run"
     run.mkdir()
     save_field(run / "field.npz", field(2, np.ones(RES, bool)))
     (run / "run.json").write_text(json.dumps({"title": "A fit", "results": {"held_out_psnr": 29.54}}))
-    command = [sys.executable, str(SCRIPTS / "storage.py"), "--runs", str(run)]
-    done = subprocess.run(command, capture_output=True, text=True, check=True)
-    lines = done.stdout.splitlines()
+    assert storage.main(["--runs", str(run)]) == 0
+    lines = capsys.readouterr().out.splitlines()
     assert all(line.count("|") == 8 for line in lines if line.startswith("|"))
     judged = {line.split("|")[1].strip(): line.split("|")[7].strip() for line in lines if line.startswith("|")}
     assert judged["sparse SH 2"] == "29.5 dB at 7^3 (A fit)"
@@ -94,7 +86,7 @@ def test_what_is_printed(variant_rgb, tmp_path: Path) -> None:
     assert (fitted["kept"], fitted["share"], fitted["file"]) == (210, 1.0, (run / "field.npz").stat().st_size)
 
 
-def test_a_folder_that_holds_no_fit(storage, tmp_path: Path) -> None:
+def test_a_folder_that_holds_no_fit(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     (tmp_path / "run.json").write_text("{}")
-    with pytest.raises(SystemExit, match="has no field.npz; give folders of fits to photographs"):
-        storage.Fitted.of(tmp_path)
+    assert storage.main(["--runs", str(tmp_path)]) == 1
+    assert "has no field.npz; give folders of fits to photographs" in capsys.readouterr().err

@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 import importlib.util
-import json
-import subprocess
-import sys
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 
-import bench_script
 import mitsuba as mi
 import numpy as np
 import pytest
 
+from mivol.bench import still_life as bench
 from mivol.photos import load_photos, project
+from scenes import refused
 
 SCRIPT = Path(__file__).resolve().parents[2] / "scenes" / "still_life" / "photographs.py"
+TINY = replace(bench.QUICK, views=10, side=24, longest=8, steps=24, tiles=16, spp=16)
 
 
 @pytest.fixture(scope="module")
@@ -77,25 +77,42 @@ def test_what_is_there_is_not_rendered_again(still_life, variant_rgb, tmp_path):
     assert (tmp_path / names[0]).read_bytes() == first
 
 
-def test_every_fit_of_the_bench(tmp_path):
-    """A quick run fits and judges all five; its figures mean nothing."""
-    figures = bench_script.quick("bench_still_life", tmp_path)
-    assert {q: set(figures[q]) for q in ("degree", "few")} == {
-        "degree": {"SH 0", "SH 0, no TV", "SH 2"},
-        "few": {"no TV", "TV"},
-    }
-    for found in (*figures["degree"].values(), *figures["few"].values()):
-        assert found["psnr"] == pytest.approx(np.mean(found["each"]))
-        assert found["psnr"] > 10
-    assert (figures["degree"]["SH 2"]["views"], figures["few"]["TV"]["views"]) == (12, 6)
+def test_every_fit_of_the_bench(monkeypatch):
+    """What is fitted, to how many views and with which priors; a fit itself is the next test's."""
+    asked = []
+    monkeypatch.setattr(bench, "still_life", lambda size: (range(12), range(3), None))
+    monkeypatch.setattr(bench, "fit", lambda photos, *rest, **priors: asked.append((len(photos), rest[-1], priors)))
+    degree, few = bench.ask_degree(TINY), bench.ask_few(TINY)
+    assert {"degree": set(degree), "few": set(few)} == {"degree": {"SH 0", "SH 0, no TV", "SH 2"}, "few": {"no TV", "TV"}}
+    assert asked == [(12, 0, {}), (12, 0, bench.NO_TV), (12, 2, {}), (6, 2, bench.NO_TV), (6, 2, {})]
+
+
+def test_a_fit_is_judged_by_held_out_views(variant_rgb, tmp_path):
+    """A few steps see that something stands in front of white; its figure is drawn."""
+    size = replace(TINY, folder=tmp_path / "photographs")
+    train, held_out, box = bench.still_life(size)
+    assert (len(train), len(held_out)) == (8, 2)
+    found = bench.fit(train, held_out, box, size, 2)
+    assert found["psnr"] == pytest.approx(np.mean(found["each"]))
+    white = np.mean([-10 * np.log10(np.mean((1 - photo.image) ** 2)) for photo in held_out])
+    assert found["psnr"] > white + 1
+    assert (found["degree"], found["views"], len(found["each"])) == (2, 8, 2)
+    figures = {"few": {"TV": found, "no TV": found | {"psnr": found["psnr"] - 1}}}
+    (bar,) = bench.compare("few", figures["few"])
+    assert bar["value"] == pytest.approx(1)
+    bench.draw(figures, tmp_path)
     assert (tmp_path / "bench_still_life.png").stat().st_size > 10_000
 
 
+def test_a_checkout_without_the_scene(monkeypatch, tmp_path):
+    monkeypatch.setattr(bench, "SCENE", tmp_path / "photographs.py")
+    with refused("run this bench from a checkout"):
+        bench.still_life(TINY)
+
+
 @pytest.mark.slow
-def test_a_field_sees_directions_and_total_variation_helps(tmp_path):
+def test_a_field_sees_directions_and_total_variation_helps(variant_rgb, tmp_path):
     """Two degrees more are worth 1.5 dB on views between the others, and total variation something where views are few."""
-    command = [sys.executable, str(bench_script.SCRIPTS / "bench_still_life.py"), "--out", str(tmp_path)]
-    done = subprocess.run(command, capture_output=True, text=True, check=True)
-    bars = json.loads(done.stdout)["bars"]
-    assert len(bars) == 2
-    assert all(bar["met"] for bar in bars), bars
+    answers = bench.BENCH.ask(("degree", "few"), replace(bench.FULL, folder=tmp_path))
+    assert len(answers["bars"]) == 2
+    assert all(bar["met"] for bar in answers["bars"]), answers["bars"]

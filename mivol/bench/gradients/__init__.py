@@ -1,0 +1,144 @@
+"""Density gradients of light that scatters once: how exact are they, and how much sooner than those of ``prbvolpath``?
+
+    scripts/bench_gradients.py                        # about 10 minutes on 2 idle cores: all but the tutorial
+    scripts/bench_gradients.py --only tutorial        # 5 minutes, nearly all of them in prbvolpath
+    scripts/bench_gradients.py --quick                # a minute, small sizes: are our gradients right?
+
+The derivatives are those with respect to the voxels of sigma_t [1/length]; albedo 0.75, ``max_depth`` 2 for all, stock scenes,
+the box [-1, 1]^3, box filter, independent samples, pictures of 64 x 64 pixels (estimators: 24 x 24). Times are of warm calls.
+
+smoke: the Mitsuba tutorial's smoke at its density (x 40), in constant light, and with HG g = 0.8 below a sun in a sky. Two
+gradients: of a linear functional of the picture, its mean (a call of ``render_backward``), and of an L2 loss, the mean squared
+difference to the picture of 0.7 of the density (a whole step: ``mi.render``, loss, ``dr.backward``). Both methods get the
+samples that take the same processor time (a power of two per pixel) and run in turns, 8 rounds, every one with another seed;
+printed is the sum over voxels of their variances over the 8 gradients, times the time: over the voxels with sigma_t >= 1 (the
+bars), and over those between 0 and 1 and those at 0, where the ratio says little since ``prbvolpath`` is biased there. Beside
+the ratio stands z: the derivative along sigma_t itself, summed over those voxels, in standard errors of its difference. If it
+is beyond its bound for sigma_t >= 1 (false alarm in one run in 1000, Student's t), the ratio means nothing and the script ends
+with status 1.
+
+estimators: bias and variance of both estimators where they differ: density 0, half empty, thin, dense (16^3 voxels). The
+derivative of the picture's mean along a fixed direction in the space of voxels (thin, dense: the density itself; density 0:
+all voxels alike; half empty: the empty half) is compared with finite differences of mivol's pictures with common random
+numbers: central of fourth order, or one-sided of third order where the density is 0. Both the differences and our derivative
+are repeated until their means are known to 0.06 %, 750 times at most. The bias is said in standard errors (of both together)
+and in percent; 0.5 % (with 3 standard errors to spare) and 3 standard errors are the bars for ours. Variance x time: summed
+over the voxels of that direction, prbvolpath's over ours.
+
+tutorial: the official Mitsuba tutorial on volume optimisation with ``max_depth`` 2 in the place of prbvolpath's default of 6,
+else as published: 5 cameras on a half circle, 64 x 64, tent filter, constant light, density 0.002 x 40 in 16^3 voxels, Adam
+with 0.02, 20 x 5 steps of 8 samples, resampled to 64^3, 20 x 5 steps of 64. prbvolpath and mivol run the same loop. The clock
+runs during the steps only. After each iteration (of 5 steps) the image loss of the volume is measured apart, without noise in
+the mean: the product of the errors of two independent renders by mivol, mean over pixels, summed over cameras. The references
+are rendered by mivol (4096 samples) and compared with volpath's (z is printed), so that their noise decides nothing. Printed:
+when mivol's volume has the image loss of prbvolpath's last one (the bar; and of its best one, which Adam leaves again for the
+noise), and the errors of both densities (root mean square over that of the truth).
+
+Prints JSON; writes bench_gradients.json and bench_gradients.png.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+
+from mivol.bench.bars import AT_LEAST, AT_MOST, Bar, judge, judge_agreement
+from mivol.bench.figures import drawn, plain_ticks
+from mivol.bench.gradients.bias import measure_estimators
+from mivol.bench.gradients.size import BARS, FULL, LIGHTS, OURS, QUICK, STOCK, Size
+from mivol.bench.gradients.tutorial import measure_tutorial
+from mivol.bench.gradients.variance import measure_smoke
+from mivol.bench.questions import Bench
+from mivol.report.figures import MARKERS, SERIES
+
+__all__ = ["BENCH", "FULL", "QUICK", "Size", "main"]
+
+QUESTIONS = {"smoke": measure_smoke, "estimators": measure_estimators, "tutorial": measure_tutorial}
+
+
+def compare(question: str, answer: dict) -> list[Bar]:
+    """The figures that have a bar, beside it."""
+    return {"smoke": compare_smoke, "estimators": compare_estimators, "tutorial": compare_tutorial}[question](answer)
+
+
+def compare_smoke(answer: dict) -> list[Bar]:
+    """Ratios, and z where they are said."""
+    rows = []
+    for light, bar in BARS.items():
+        for functional, figures in answer[light].items():
+            dense, what = figures["sigma_t >= 1"], f"gradient of {functional}, {light}"
+            rows.append(judge(f"variance x time: {what}", dense["variance_x_time"], AT_LEAST, bar))
+            rows.append(judge_agreement(what, dense["z"], dense["z_bound"]))
+    return rows
+
+
+def compare_estimators(answer: dict) -> list[Bar]:
+    """Our bias."""
+    rows = []
+    for light, table in answer.items():
+        for name, row in table.items():
+            what = f"{name}, {light}"
+            bound = abs(row[OURS]["bias_percent"]) + 3 * row[OURS]["known_to_percent"]
+            rows.append(judge(f"bias and 3 standard errors [%]: {what}", bound, AT_MOST, 0.5, aloud=False))
+            rows.append(
+                judge(f"bias [standard errors]: {what}", abs(row[OURS]["bias_standard_errors"]), AT_MOST, 3, aloud=False)
+            )
+    return rows
+
+
+def compare_tutorial(answer: dict) -> list[Bar]:
+    """How much sooner."""
+    return [judge("tutorial: how much sooner", answer["to_the_last_loss_of_prbvolpath"]["sooner"], AT_LEAST, 20)]
+
+
+def draw(answers: dict, folder: Path) -> None:
+    """A panel for each question that was asked."""
+    panels = {"smoke": draw_smoke, "estimators": draw_estimators, "tutorial": draw_tutorial}
+    with drawn(folder / "bench_gradients.png", 5 * len(answers), 4) as figure:
+        for axes, (question, answer) in zip(np.atleast_1d(figure.subplots(1, len(answers))), answers.items(), strict=True):
+            panels[question](axes, answer)
+
+
+def draw_smoke(axes: Axes, answer: dict) -> None:
+    """Ratios beside their bars."""
+    names = [(light, functional) for light in LIGHTS for functional in answer[light]]
+    for row, (light, functional) in enumerate(reversed(names)):
+        axes.semilogx([answer[light][functional]["sigma_t >= 1"]["variance_x_time"]], [row], MARKERS[0], color=SERIES[0])
+        axes.plot([BARS[light]] * 2, [row - 0.3, row + 0.3], color=SERIES[0], linestyle="--")
+    axes.set(yticks=range(len(names)), yticklabels=[f"{f}, {light}" for light, f in reversed(names)])
+    axes.set(title="Gradient, voxels with sigma_t >= 1", xlabel="variance x time over prbvolpath's (line: the bar)")
+    plain_ticks(axes.xaxis, "×")
+
+
+def draw_estimators(axes: Axes, answer: dict) -> None:
+    """Bias of both, with three standard errors."""
+    names = [(light, case) for light, table in answer.items() for case in table]
+    for i, estimator in enumerate((OURS, STOCK)):
+        rows = [answer[light][case][estimator] for light, case in reversed(names)]
+        at = np.arange(len(names)) + 0.2 * (0.5 - i)
+        bars = [3 * r["known_to_percent"] for r in rows]
+        axes.errorbar([r["bias_percent"] for r in rows], at, xerr=bars, fmt=MARKERS[i], color=SERIES[i], label=estimator)
+    axes.set_xscale("symlog", linthresh=1)
+    axes.set(yticks=range(len(names)), yticklabels=[f"{case}, {light}" for light, case in reversed(names)])
+    axes.set(title="Bias against finite differences", xlabel="bias [%], 3 standard errors")
+    axes.legend()
+
+
+def draw_tutorial(axes: Axes, answer: dict) -> None:
+    """Image loss against time."""
+    for i, name in enumerate((OURS, STOCK)):
+        run = answer["runs"][name]
+        axes.loglog(run["seconds"], np.maximum(run["loss"], 1e-9), marker=MARKERS[i], markersize=3, color=SERIES[i], label=name)
+    axes.set(title="Mitsuba's tutorial at depth 2", xlabel="time [s]", ylabel="image loss, without noise")
+    axes.legend()
+
+
+BENCH = Bench("bench_gradients", __doc__, QUESTIONS, FULL, QUICK, compare, draw, unasked=("tutorial",))
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the bench with these arguments (by default the process's own); its exit code."""
+    return BENCH.run(argv)

@@ -1,0 +1,129 @@
+"""Bias and variance of gradients where estimators differ, against finite differences with common random numbers."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from mivol.bench.agreement import compare_means, finite, mean_of_rounds, number
+from mivol.bench.bars import say
+from mivol.bench.gradients.size import LIGHTS, OURS, STOCK, Size
+from mivol.bench.gradients.subject import Subject, along, compete, subjects, variance_over
+from mivol.bench.timing import ratio_of
+from mivol.validate.statistics import Moments
+
+__all__ = ["Case", "cases", "difference", "measure_estimators", "refine", "table_row"]
+
+
+@dataclass(frozen=True)
+class Case:
+    """Densities (Z, Y, X), a direction to change them in, and the step of a finite difference along it."""
+
+    values: np.ndarray
+    direction: np.ndarray
+    step: float
+
+
+def cases(res: int) -> dict[str, Case]:
+    """Where estimators differ.
+
+    A step h changes an optical depth x of a path by h x; it is at most 0.05 (density 0), 0.1 (half empty), 0.03 (thin) and 0.15
+    (dense: for paths of x <= 3, which carry 95 % of the light), so that truncation is at most (h x)^4 / 30 = 0.002 % (central)
+    or (h x)^3 / 4 = 0.025 % (one-sided).
+    """
+    rng = np.random.default_rng(1)
+    noise = rng.uniform(0.5, 1.5, (res,) * 3)
+    ones, left = np.ones((res,) * 3), np.broadcast_to(np.arange(res) < res // 2, (res,) * 3)
+    return {
+        "density 0": Case(0 * ones, ones, 0.01),
+        "half empty": Case(np.where(left, 0, 4 * noise), np.where(left, 1.0, 0.0), 0.02),
+        "thin": Case(0.05 * noise, 0.05 * noise, 0.1),
+        "dense": Case(10 * noise, 10 * noise, 0.05),
+    }
+
+
+def difference(subject: Subject, case: Case, seed: int, spp: int) -> float:
+    """A finite difference along the direction with common random numbers: central of fourth order, or one-sided of third."""
+    v, h = case.direction, case.step
+    central = (case.values[v > 0] > 0).all()
+    weights = {-2: 0.5, -1: -4, 1: 4, 2: -0.5} if central else {0: -11, 1: 18, 2: -9, 3: 2}
+    return sum(w * subject.mean(case.values + s * h * v, seed, spp) for s, w in weights.items()) / (6 * h)
+
+
+def refine(found: Sequence[float], estimate: Callable[[int], float], percent: float, most: int) -> np.ndarray:
+    """Add independent estimates until their mean is known well enough.
+
+    Args:
+        found: those there are, two at least.
+        estimate: makes one from its number, which is its seed.
+        percent: wanted standard error of the mean, in percent of it.
+        most: how many there may be in all; no clock is asked.
+    """
+    found = list(found)
+    while len(found) < most:
+        m = Moments.of(np.array(found))
+        if math.sqrt(m.variance_of_mean) <= percent / 100 * abs(m.mean):
+            break
+        found.append(estimate(len(found)))
+    return np.array(found)
+
+
+def measure_estimators(size: Size) -> dict:
+    """Bias and variance per estimator: free flight (prbvolpath) and ours, at density 0, half empty, thin and dense."""
+    answer = {}
+    for light, parts in LIGHTS.items():
+        answer[light] = {}
+        for name, case in cases(size.table_res).items():
+            answer[light][name] = row = table_row(case, parts, size)
+            say(f"  {light}, {name}: {said_of_row(row)}")
+    return answer
+
+
+def table_row(case: Case, parts: Callable[[], dict], size: Size) -> dict:
+    """Both estimators in one case."""
+    both = subjects(case.values.astype(np.float32), size.table_side, parts)
+    timings, spp = compete({name: s.of_mean for name, s in both.items()}, size.table_budget, size.table_rounds)
+    derivatives = {name: along(timing, case.direction) for name, timing in timings.items()}
+    v = case.direction.ravel()
+
+    def derivative(k: int) -> float:
+        return float(np.array(both[OURS].of_mean(9000 + k, spp[OURS]), np.float64) @ v)
+
+    def differ(k: int) -> float:
+        return difference(both[OURS], case, 5000 + k, size.difference_spp)
+
+    known = {"percent": size.certain_percent, "most": size.most_estimates}
+    derivatives[OURS] = refine(derivatives[OURS], derivative, **known)
+    truth = refine([differ(k) for k in range(size.table_rounds)], differ, **known)
+    m = Moments.of(truth)
+    row = {"finite_difference": float(m.mean), "its_standard_error": float(np.sqrt(m.variance_of_mean))}
+    chosen = case.direction > 0
+    for name, timing in timings.items():
+        found = compare_means(mean_of_rounds(derivatives[name]), mean_of_rounds(truth), 2 * len(LIGHTS) * len(cases(2)))
+        row[name] = {
+            "derivative": float(derivatives[name].mean()),
+            "bias_standard_errors": found["z"],
+            "bias_percent": found["percent"],
+            "known_to_percent": found["standard_error_percent"],
+            "variance": variance_over(timing, chosen),
+            "spp": spp[name],
+            "seconds_median": timing.median,
+        }
+    a, b = row[STOCK]["variance"], row[OURS]["variance"]
+    row["variance_x_time"] = finite(a / b * ratio_of(timings[STOCK], timings[OURS])) if b > 0 else None
+    return row
+
+
+def said_of_row(row: dict) -> str:
+    """One line of the table."""
+    parts = [f"finite difference {row['finite_difference']:.4g} +- {row['its_standard_error']:.1g}"]
+    for name in (STOCK, OURS):
+        r = row[name]
+        parts.append(
+            f"{name} {number(r['bias_percent']):+.2f} % "
+            f"({number(r['bias_standard_errors']):+.1f} se of {number(r['known_to_percent']):.2f} %)"
+        )
+    return "; ".join(parts) + f"; variance x time {number(row['variance_x_time']):.3g}"

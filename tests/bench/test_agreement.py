@@ -1,0 +1,54 @@
+"""z of two means: shared noise, degrees of freedom, and what is said where nothing is left to divide by."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from mivol.bench.agreement import FALSE_ALARM, MeanError, compare_means, finite, mean_of_pixels, mean_of_rounds, number
+
+
+def test_pixels_that_share_their_noise_are_not_taken_for_many() -> None:
+    """The same number in all pixels of a round: the error is that of 8 numbers, not of 16000."""
+    rng = np.random.default_rng(6)
+    shared = np.repeat(rng.normal(10, 1, (8, 1)), 2000, axis=1)
+    found = mean_of_pixels(shared)
+    assert found.variance == pytest.approx(np.var(shared[:, 0], ddof=1) / 8)
+    assert found.dof == 7
+
+
+def test_the_noisiest_pixels_have_the_degrees_of_freedom() -> None:
+    """Rounds alternate in sign so that their means hide the noise: 50 equal pixels of 6 rounds have 250 degrees of freedom,
+    one pixel that outweighs 49 others has 5."""
+    signs = np.where(np.add.outer(np.arange(6), np.arange(50)) % 2, 1.0, -1.0)
+    equal = mean_of_pixels(10 + signs)
+    assert equal.variance == pytest.approx(6 / 5 / 6 / 50)
+    assert equal.dof == pytest.approx(250)
+    one = np.zeros(50)
+    one[3], one[4] = 1.0, 1.0
+    assert mean_of_pixels(10 + signs * (one + 1e-9)).dof == pytest.approx(10)
+
+
+def test_bounds_are_those_of_student() -> None:
+    """4 and 9 values of one variance: the bound is t's at the degrees of freedom that Welch's formula gives by hand."""
+    a, b = MeanError(1.0, 0.25, 3), MeanError(2.0, 0.1, 8)
+    found = compare_means(a, b, 1)
+    dof = 0.35**2 / (0.25**2 / 3 + 0.1**2 / 8)
+    assert found["z"] == pytest.approx(-1 / math.sqrt(0.35))
+    assert found["z_bound"] == pytest.approx(-stats.t.ppf(FALSE_ALARM / 2, dof), rel=1e-6)
+    assert found["percent"] == pytest.approx(-50)
+    assert found["standard_error_percent"] == pytest.approx(50 * math.sqrt(0.35))
+
+
+def test_means_of_rounds() -> None:
+    assert mean_of_rounds(np.array([1.0, 3.0])) == MeanError(2.0, 1.0, 1)
+
+
+def test_what_json_cannot_say_is_none() -> None:
+    found = compare_means(MeanError(1.0, 0.0, 3), MeanError(0.0, 0.0, 3), 1)
+    assert (found["z"], found["percent"], found["standard_error_percent"]) == (None, None, None)
+    assert finite(math.inf) is None and finite(2) == 2.0
+    assert math.isnan(number(None)) and number(0.0) == 0.0

@@ -1,0 +1,74 @@
+"""The bench of depth 2: it measures the table of mivol.scene.depth_two again, and says how sure it is."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mivol.bench import depth as bench
+from mivol.scene import depth_two
+from mivol.scene.depth_two import ALBEDOS, TABLES, TAUS
+
+ROUNDING = 5e-4
+"""Of a table of three digits."""
+
+
+@pytest.mark.parametrize("light", ["constant", "collimated"])
+def test_a_cell_is_measured_again(variant_rgb: str, light: str, seed: int) -> None:
+    """Albedo 0.9 at tau = 1 by other lines and samples than the table's: within 6 standard errors of this measurement and
+    the table's own (0.0014, a quarter of this one's with 16 times the lines) and its rounding; 16,384 lines: normal."""
+    key = (light, "isotropic")
+    cell = bench.measure(bench.cube(light), ("cube", *key), 0.9, 1.0, bench.CUBE_DEPTH, n=1 << 14, seed=77 + seed)
+    wanted = TABLES[key][ALBEDOS.index(0.9), TAUS.index(1.0)]
+    assert cell.standard_error < 0.01, "else the test sees nothing"
+    assert abs(cell.error - wanted) <= 6 * cell.standard_error * math.sqrt(1 + 1 / 16) + ROUNDING
+
+
+def test_standard_error_of_a_ratio() -> None:
+    """2000 ratios of 400 pairs each scatter as the delta method says: their standard deviation errs by 1 / sqrt(2 * 2000)
+    = 1.6 %, the method by O(1 / n) = a few per mille; 6 of the former."""
+    rng = np.random.default_rng(0)
+    every = rng.exponential(1.0, (2000, 400))
+    once = 0.6 * every * rng.random((2000, 400))
+    found = [bench.left_out(a, b) for a, b in zip(once, every, strict=True)]
+    errors, said = np.array(found).T
+    assert abs(errors.mean() - 0.7) <= 6 * errors.std() / math.sqrt(2000) + 1e-3
+    assert abs(errors.std() / said.mean() - 1) <= 6 * 0.016
+
+
+def test_the_table_is_printed_as_the_module_holds_it() -> None:
+    cells = [
+        bench.Cell("cube", *key, albedo, tau, 0.0, 0.0, TABLES[key][i, j], 0.0, 0.0)
+        for key in TABLES for i, albedo in enumerate(ALBEDOS) for j, tau in enumerate(TAUS)
+    ]  # fmt: skip
+    assert "\n".join(bench.table_lines(cells)) in Path(depth_two.__file__).read_text()
+
+
+def test_a_table_that_is_off_is_seen(tmp_path: Path) -> None:
+    """Cells that are the table meet their bars and are drawn; one that is off by six of its standard errors does not."""
+    size = replace(bench.QUICK, taus=TAUS)
+    cells = [
+        bench.Cell("cube", *key, albedo, tau, 0.0, 0.0, TABLES[key][i, j], 0.001, 0.0)
+        for key in TABLES for i, albedo in enumerate(ALBEDOS) for j, tau in enumerate(TAUS)
+    ]  # fmt: skip
+    answer = {"lines": size.lines, "cells": [asdict(c) for c in cells]}
+    assert all(bar["met"] for bar in bench.compare("table", answer))
+    bench.draw({"table": answer}, tmp_path)
+    assert (tmp_path / "bench_depth.png").stat().st_size > 20_000
+    answer["cells"][7]["error"] += 0.0066
+    assert [bar["met"] for bar in bench.compare("table", answer)] == [True, False]
+
+
+@pytest.mark.slow
+def test_every_question_is_answered(variant_rgb: str) -> None:
+    """Every cell is there, with a standard error that falls with the root of the lines; those are too few here for bars."""
+    size = replace(bench.QUICK, lines=1 << 10, taus=(1.0,))
+    answers = bench.BENCH.ask(("table", "beside"), size)
+    assert len(answers["table"]["cells"]) == len(TABLES) * len(ALBEDOS)
+    assert len(answers["beside"]["cells"]) == 3 * len(bench.BESIDE_ALBEDOS)
+    assert all(0 < cell["standard_error"] < 0.2 for cell in answers["table"]["cells"])
+    assert len(answers["bars"]) == 3

@@ -1,0 +1,118 @@
+"""The bench of radiance fields: the peer computes the same light and derivatives, so its ratios compare the same work."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import replace
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mivol.bench.radiance_field import BENCH, QUICK, fits
+from mivol.bench.radiance_field.fields import FIELDS, _resized
+from mivol.bench.radiance_field.fits import EVERY, follow, held_out_psnr, our_fit, peer_fit
+from mivol.bench.radiance_field.steps import ask_memory, our_step, peer_of, peer_step, tasks
+from mivol.bench.radiance_field.views import BOX, between, photographed, rays_of, rays_through, ring, tiled
+from mivol.transport.radiance import bake, cells_of, look, model_of
+
+TINY = replace(QUICK, resolution=8, side=16, steps=EVERY, fit_resolution=8, fit_side=16, chair_steps=8, fields=("fog",))
+
+
+def test_the_peer_sees_the_same_and_derives_the_same(variant_rgb: str) -> None:
+    field, _ = FIELDS["fog"](QUICK)
+    density, sh = field.to_dense()
+    field = type(field).from_dense(density, sh * np.float32(0.3), field.to_world)
+    task = tasks(QUICK)["camera"]
+    cells, peer = cells_of(field), peer_of(field)
+    seen = look(cells, bake(field, cells, task.pinholes, mi.UInt32(0)), model_of(field), task.rays)
+    ours = np.array(seen.colour)
+    theirs = np.array(peer.render(mi.Point3f((task.rays.o + 1) * 0.5), task.rays.d))
+    # The peer's last step reaches up to a whole one behind the box: an optical depth of 1.5 * 2 / 32 too much.
+    assert np.abs(ours - theirs).max() < 1.5 * 2 / 32
+    assert np.abs(ours - theirs).mean() < 0.02 * ours.max()
+    assert ours.max() > 0.2
+    slopes = [[np.array(a) for a in step(0)] for step in (our_step(field, task), peer_step(peer, task))]
+    # The longer way again, twice over: the derivative is of a square.
+    density = slopes[0][0], slopes[1][0] * 2  # the peer's lengths are half of ours
+    sh = slopes[0][1].reshape(-1, field.width)[:, :27], slopes[1][1].reshape(-1, 27)
+    for a, b in (density, sh):
+        assert np.vdot(a, b) / (np.linalg.norm(a) * np.linalg.norm(b)) > 0.98
+        assert np.linalg.norm(a) == pytest.approx(np.linalg.norm(b), rel=0.1)
+    dr.sync_thread()
+
+
+@pytest.mark.slow
+def test_both_fits_learn_the_views(variant_rgb: str) -> None:
+    """Seven steps a stage make views of a fog better than black ones, which is what both are compared by."""
+    field, _ = FIELDS["fog"](TINY)
+    photos, held_out = photographed(field, ring(16)), photographed(field, between(16))
+    black = held_out_psnr(held_out, lambda camera: np.zeros((16, 16, 3)))
+    for fit, stages in ((our_fit, 4), (peer_fit, 4)):
+        curve = fit(photos, held_out, TINY)
+        assert len(curve) == stages
+        assert curve[-1][1] > black + 1
+        assert all(0 < early < late for (early, _), (late, _) in itertools.pairwise(curve))
+
+
+def test_views_show_the_field(variant_rgb: str) -> None:
+    """Those of a ring look at the middle of the box from 3.1 away; those between are half a step further on."""
+    cameras, others = ring(16, 4), between(16, 4)
+    for camera in (*cameras, *others):
+        assert np.linalg.norm(camera.origin) == pytest.approx(np.hypot(3, 0.9))
+    turned = [np.arctan2(*camera.origin[1::-1]) for camera in (cameras[1], others[0])]
+    assert turned == pytest.approx([np.pi / 2, np.pi / 4])
+    (photo,) = photographed(FIELDS["shell"](TINY)[0], cameras[:1])
+    assert photo.image[8, 8].max() > 0.2 > photo.image[0, 0].max()
+    o, d = rays_through(cameras[0], tiled(16))
+    assert np.allclose(o, cameras[0].origin) and np.allclose(np.linalg.norm(d, axis=1), 1)
+    assert np.array_equal(np.sort(tiled(16) @ [16, 1]), np.arange(256))
+    assert np.array_equal(tiled(16)[:5], [[0, 0], [0, 1], [0, 2], [0, 3], [1, 0]])
+
+
+def test_only_steps_are_counted() -> None:
+    """Judged after every seventh of 20 steps: twice, and the last six are taken too."""
+    taken = []
+    steps = (taken.append(k) for k in range(20))
+    judged = []
+    curve = follow(steps, lambda: judged.append(len(taken)) or 1.0)
+    assert (judged, len(curve), len(taken)) == ([7, 14], 2, 20)
+
+
+def test_pixels_are_drawn_anywhere(variant_rgb: str) -> None:
+    """As many rays as tiles would have; four neighbours of a tile are rarely neighbours here."""
+    photos = photographed(FIELDS["fog"](TINY)[0], ring(16, 3))
+    batches = [kind.of(photos).draw(1, np.arange(3), 4, np.random.default_rng(0)) for kind in (fits.Pixels, fits.Views)]
+    widths = [dr.width(batch.rays.d) for batch in batches]
+    assert widths == [3 * 4 * 16] * 2
+    steps = [np.linalg.norm(np.diff(np.array(batch.rays.d), axis=1), axis=0) for batch in batches]
+    assert np.median(steps[0]) > 3 * np.median(steps[1])
+
+
+def test_memory_a_ray(variant_rgb: str) -> None:
+    (bar,) = BENCH.compare("memory", ask_memory(replace(TINY, fields=("shell",), side=64)))
+    assert bar["met"], bar
+
+
+def test_a_smaller_array_stands_in_the_middle() -> None:
+    found = _resized(np.ones((2, 3, 4, 2), np.float32), 6)
+    assert found.shape == (6, 6, 6, 2)
+    assert np.all(found[2:4, 1:4, 1:5] == 1) and found.sum() == 2 * 24
+
+
+def test_rays_are_float32(variant_rgb: str) -> None:
+    made = rays_of(BOX.repeat(2, axis=0), np.ones((4, 3)))
+    assert np.array_equal(np.array(made.o).T, BOX.repeat(2, axis=0).astype(np.float32))
+
+
+@pytest.mark.slow
+def test_every_question_is_answered(variant_rgb: str, tmp_path: Path) -> None:
+    answers = BENCH.ask(tuple(BENCH.questions), TINY)
+    assert all(answers["step"]["fog"][kind]["ratio_of_processor_time"] > 0 for kind in ("camera", "pixels", "any"))
+    assert set(answers["locality"]) == {"tiles", "pixels"}
+    assert answers["fit"]["fog"]["peer_psnr"] > 5
+    assert len(answers.pop("bars")) == 1 + 2 + 1
+    BENCH.draw(answers, tmp_path)
+    assert (tmp_path / "bench_radiance_field.png").read_bytes().startswith(b"\x89PNG")

@@ -1,0 +1,45 @@
+"""The scenes that every renderer of a bench takes."""
+
+from __future__ import annotations
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mivol.bench.scenes import box_scene, depth_two, point_light, sun_and_sky
+
+
+def test_the_box_holds_its_grid(variant_rgb: str) -> None:
+    """Through the middle of a constant box of extinction 0.3, 2 thick, the sky of radiance 1 is seen at exp(-0.6)."""
+    scene = mi.load_dict(box_scene(np.full((2, 2, 2), 0.3, np.float32), 8))
+    ray = mi.RayDifferential3f(mi.Ray3f(mi.Point3f(0.1, -5, 0.2), mi.Vector3f(0, 1, 0)))
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(0, 1)
+    radiance, *_ = mi.load_dict({"type": "mivol", "max_depth": 1}).sample(scene, sampler, ray)
+    assert radiance.x[0] == pytest.approx(np.exp(-0.6), rel=1e-5)
+
+
+def test_a_lamp_takes_the_place_of_the_sky(variant_rgb: str) -> None:
+    made = box_scene(np.zeros((2, 2, 2), np.float32), 8, 0.5, **point_light((1, 2, 3)))
+    assert {"lamp"} == set(made) - {"type", "box", "sensor"}
+    assert made["box"]["interior"]["phase"] == {"type": "isotropic"}
+    assert made["box"]["interior"]["albedo"] == 0.5
+
+
+def test_the_sun_gives_a_third_of_the_light(variant_rgb: str) -> None:
+    """By the pixels of the map and their solid angles; the sun stands at (0.6, 0.48, 0.64), z up."""
+    parts = sun_and_sky(512)
+    picture = np.array(parts["lamp"]["bitmap"], np.float64).mean(axis=-1)
+    theta = (np.arange(512) + 0.5) / 512 * np.pi
+    light = picture * np.sin(theta)[:, None]
+    sun = picture > 100
+    assert 0.28 < light[sun].sum() / light.sum() < 0.4
+    # what the map sees along its y axis, Mitsuba's upward direction, is at z here
+    up = np.array(parts["lamp"]["to_world"] @ mi.ScalarVector3f(0, 1, 0)).ravel()
+    assert np.allclose(up, [0, 0, 1], atol=1e-6)
+    assert np.median(theta[np.nonzero(sun)[0]]) == pytest.approx(np.arccos(0.64 / np.linalg.norm([0.6, 0.48, 0.64])), abs=0.01)
+
+
+def test_integrators_scatter_once_and_are_made_anew(variant_rgb: str) -> None:
+    assert depth_two("volpath") is not depth_two("volpath")
+    assert "max_depth = 2" in str(depth_two("volpath"))

@@ -1,0 +1,122 @@
+"""The bench of single scattering: renderers have one mean, the judge of that can say no, and ratios weigh variance and time.
+
+Renders have fixed samples and seeds. Nothing is concluded from times, nor from the mean where a lamp stands in the medium:
+single samples have no bound there.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mivol.bench import single_scattering as bench
+from mivol.bench.agreement import MeanError, compare_means
+from mivol.bench.scenes import box_scene, depth_two
+from mivol.bench.timing import Budget, Timing
+
+TINY = replace(bench.QUICK, rounds=6, most_pixels=8, budget=Budget(spp=64))
+
+
+def fog() -> np.ndarray:
+    """An extinction of 0.5 to 1.5, empty at its boundary."""
+    return np.pad(np.random.default_rng(1).uniform(0.5, 1.5, (3, 4, 5)), 1).astype(np.float32)
+
+
+def fake(rounds: np.ndarray, seconds: float = 1.0) -> Timing:
+    """A contestant that returned these images (rounds, H, W) and took so long each."""
+    images = np.repeat(np.asarray(rounds)[..., None], 3, axis=-1)
+    return Timing({}, [seconds] * len(images), [seconds] * len(images), list(images))
+
+
+def test_renderers_agree_in_a_sky(variant_rgb: str, tmp_path) -> None:
+    """Radiance is at most 1 and its samples are many: t has hundreds of degrees of freedom, and the bound of a run, of which
+    a false alarm in 1000 is allowed to 40 comparisons, is exceeded by either of these two once in 20,000 seeds; the seeds
+    are fixed. A bound on z says nothing where the standard error is as large as the mean."""
+    figures = bench.contend(fog(), bench.LIGHTS["constant light"], TINY, (1, 4))
+    assert figures["pixels_that_count"] > 0
+    assert [[row["spp"] for row in figures[name]] for name in (bench.OURS, *bench.STOCK)] == [[64, 16]] * 3
+    answer = {"smoke": dict.fromkeys(bench.LIGHTS, figures)}
+    rows = bench.compare("smoke", answer["smoke"])
+    agreement = [row for row in rows if row["figure"].startswith("|z|: ")]
+    assert (len(rows), len(agreement)) == (2 * len(bench.LIGHTS) * len(bench.STOCK), len(bench.LIGHTS) * len(bench.STOCK))
+    assert all(row["met"] for row in agreement), agreement
+    for stock in bench.STOCK:
+        assert figures[f"mivol over {stock}"]["relative_standard_error"] < 0.05
+        assert figures[f"mivol over {stock}"]["variance_x_time_mean_over_pixels"] > 0
+    bench.draw(answer, tmp_path)
+    assert (tmp_path / "bench_single_scattering.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize("name", bench.LIGHTS)
+def test_every_light_lights_the_medium(variant_rgb: str, name: str) -> None:
+    scene = mi.load_dict(box_scene(fog(), 8, bench.ALBEDO, **bench.LIGHTS[name].parts()))
+    image = np.array(mi.render(scene, integrator=depth_two(bench.OURS), spp=4, seed=0))
+    assert image[bench.pixels_of_medium(scene)].mean() > 0.01
+
+
+def test_volumes_have_the_resolution_of_their_size(variant_rgb: str) -> None:
+    size = replace(TINY, fine_res=12, sparse_res=16)
+    for name, res in (("fine smoke", 12), ("CT", 12), ("threads", 16)):
+        assert bench.VOLUMES[name](size).values.shape == (res,) * 3
+
+
+def test_a_bias_of_six_standard_errors_is_seen() -> None:
+    """2000 pixels of unit variance, 8 rounds: the mean has the error sqrt(2 / 16000), and the bound is 4.2 of them."""
+    rng = np.random.default_rng(3)
+    a, b = rng.normal(10, 1, (2, 8, 2000, 1))
+    counts = np.ones((2000, 1), bool)
+    assert abs(bench.difference(fake(a), fake(b), counts)["z"]) < 4.3
+    found = bench.difference(fake(a), fake(b + 10 * math.sqrt(2 / 16000)), counts)
+    assert found["z"] > found["z_bound"]
+    assert found["relative_standard_error"] == pytest.approx(math.sqrt(2 / 16000) / 10, rel=0.05)
+
+
+def test_equal_error_weighs_variance_and_time() -> None:
+    """Twice the deviation and three times the time: 12."""
+    rng = np.random.default_rng(4)
+    fast, slow = (fake(rng.normal(0, s, (8, 4000, 1)), seconds) for s, seconds in ((1, 1.0), (2, 3.0)))
+    got = bench.gain(slow, fast, np.ones((4000, 1), bool))
+    # the variance of 8 values is known to sqrt(2/7) of itself, that of 4000 of them to 0.85 %, their ratio to 1.2 %: 6 times
+    assert got["variance_x_time_mean_over_pixels"] == pytest.approx(12, rel=0.072)
+    # the ratio of two chi-square of 7 degrees of freedom has the median 1 and there the density 0.5 a unit of its logarithm:
+    # the median of 4000 is known to 1 / (2 * 0.5 * sqrt(4000)) = 1.6 %: 6 of it
+    assert got["variance_x_time_median_over_pixels"] == pytest.approx(12, rel=0.095)
+    assert (got["time"], got["processor_time"]) == (3, 3)
+
+
+def test_pixels_at_the_lamp_do_not_count(variant_rgb: str) -> None:
+    """The brightest pixel of a thin fog is at the lamp; it and its neighbours are left out, no others."""
+    light = bench.LIGHTS["point light inside"]
+    scene = mi.load_dict(box_scene(np.full((4, 4, 4), 0.1, np.float32), 24, 0.75, **light.parts()))
+    image = np.array(mi.render(scene, integrator=depth_two("mivol"), spp=64)).mean(axis=-1)
+    left_out = bench.pixels_from_lamp(scene, light, 24) <= bench.AT_LAMP
+    assert left_out[np.unravel_index(image.argmax(), image.shape)]
+    # a disc of 1.5 pixels' radius holds the centres of 4 to 9 pixels
+    assert 4 <= left_out.sum() <= 9
+    assert np.isinf(bench.pixels_from_lamp(scene, light._replace(inside=None), 24)).all()
+
+
+def test_means_are_compared_away_from_a_lamp_inside(variant_rgb: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What z is of has no pixel within a quarter of the picture from the lamp; what variances are of has."""
+    seen = {}
+    monkeypatch.setattr(bench, "gain", lambda slow, fast, counts: seen.setdefault("gain", counts) is None or {})
+    monkeypatch.setattr(bench, "difference", lambda slow, fast, counts: seen.setdefault("difference", counts) is None or {})
+    rendered = fake(np.random.default_rng(0).uniform(1, 2, (4, 24, 24)))
+    every = {(name, 1): rendered for name in (bench.OURS, *bench.STOCK)}
+    monkeypatch.setattr(bench, "render_in_turns", lambda *_: (every, dict.fromkeys(every, 1)))
+    light = bench.LIGHTS["point light inside"]
+    bench.contend(np.full((4, 4, 4), 0.1, np.float32), light, replace(TINY, most_pixels=24))
+    scene = mi.load_dict(box_scene(np.full((4, 4, 4), 0.1, np.float32), 24, 0.75, **light.parts()))
+    away = bench.pixels_from_lamp(scene, light, 24)
+    assert away[seen["difference"]].min() > 6 > 1.6 > away[seen["gain"]].min() - 0.6
+    assert 0 < seen["difference"].sum() < seen["gain"].sum()
+
+
+def test_a_difference_without_noise_is_beyond_every_bound() -> None:
+    found = compare_means(MeanError(1.0, 0.0, 5.0), MeanError(2.0, 0.0, 5.0), 1)
+    assert found["z"] is None
+    assert found["percent"] == pytest.approx(-50)

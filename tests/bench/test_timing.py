@@ -1,0 +1,70 @@
+"""Contestants run in turns and are counted apart from their first call; budgets in samples ask no clock."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mivol.bench import timing
+from mivol.bench.timing import Budget, Stopwatch, Timing, race, ratio_of
+
+
+def test_contestants_take_turns(variant_rgb: str) -> None:
+    """Each is called once uncounted, with the number 0, then in every round, in another order than in the round before."""
+    calls = []
+    contestants = {name: lambda k, name=name: calls.append((k, name)) or mi.Float(k) for name in "abc"}
+    found = race(contestants, 3, keep=True)
+    assert calls[:3] == [(0, "a"), (0, "b"), (0, "c")]
+    assert ["".join(name for k, name in calls if k == number) for number in (1, 2, 3)] == ["bca", "cab", "abc"]
+    assert [np.ravel(r).tolist() for r in found["b"].results] == [[1], [2], [3]]
+    assert len(found["c"].seconds) == len(found["c"].processor) == 3
+
+
+def test_first_calls_count_their_kernels(variant_rgb: str) -> None:
+    """A kernel that no one has compiled before in this process, whether a disk had it or not."""
+    x = dr.arange(mi.Float, 1000)
+    dr.eval(x)
+    first = timing.first_call(lambda _: dr.sin(x) * 0.12345 + dr.cos(x))
+    assert set(first) == {"seconds", "compile_seconds", "kernels_compiled", "kernels_from_disk"}
+    assert first["kernels_compiled"] == 1
+    assert timing.first_call(lambda _: dr.sin(x) * 0.12345 + dr.cos(x))["kernels_compiled"] == 0
+
+
+def test_ratios_are_medians_of_rounds() -> None:
+    """2 in two rounds and 10 in one: neither the mean nor the ratio of medians."""
+    slow = Timing({}, [2.0, 40.0, 60.0], [3.0, 3.0, 3.0])
+    fast = Timing({}, [1.0, 20.0, 6.0], [1.0, 1.0, 3.0])
+    assert ratio_of(slow, fast) == 2
+    assert ratio_of(slow, fast, "processor") == 3
+    report = slow.report(80, "rays")
+    assert (report["seconds_median"], report["seconds_min"], report["rays_per_second_median"]) == (40, 2, 2)
+    assert report["rays_per_second_best"] == 40
+
+
+@pytest.mark.parametrize(("a_sample", "expected"), [(0.01, 64), (1.0, 4), (1e-9, 4096)])
+def test_samples_for_a_time(monkeypatch: pytest.MonkeyPatch, variant_rgb: str, a_sample: float, expected: int) -> None:
+    """The largest power of two that takes 1 s by a clock of ours, between 4 and 4096."""
+    now = [0.0]
+    monkeypatch.setattr(timing.time, "process_time", lambda: now[0])
+
+    def render(seed: int, spp: int) -> mi.Float:
+        now[0] += a_sample * spp
+        return mi.Float(0)
+
+    assert Budget(seconds=1.0).samples(render) == expected
+    assert Budget(seconds=1.0, spp=7).samples(None) == 7
+
+
+def test_a_stopwatch_adds_up_its_blocks(monkeypatch: pytest.MonkeyPatch, variant_rgb: str) -> None:
+    """What stands between two blocks is not counted."""
+    now = [0.0]
+    monkeypatch.setattr(timing.time, "process_time", lambda: 2 * now[0])
+    monkeypatch.setattr(timing.time, "perf_counter", lambda: now[0])
+    watch = Stopwatch()
+    for inside, outside in ((1.0, 100.0), (2.0, 100.0)):
+        with watch:
+            now[0] += inside
+        now[0] += outside
+    assert (watch.seconds, watch.processor) == (3.0, 6.0)
