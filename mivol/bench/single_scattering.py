@@ -87,6 +87,7 @@ class Size:
         budget: samples of one render.
         levels: the samples are divided by these, for curves of error against time.
         fine_res, sparse_res: voxels along an edge of the fine volumes, and of the threads.
+        seed: of all renders; another one gives independent images.
     """
 
     name: str = "full"
@@ -96,6 +97,7 @@ class Size:
     levels: tuple[int, ...] = (1, 4, 16)
     fine_res: int = 256
     sparse_res: int = 512
+    seed: int = 0
 
 
 FULL = Size()
@@ -179,7 +181,7 @@ def render_in_turns(scene: mi.Scene, size: Size, levels: tuple[int, ...]) -> tup
         integrator = depth_two(name)
 
         def render(seed: int, n: int, integrator: mi.Integrator = integrator, place: int = place) -> mi.TensorXf:
-            return mi.render(scene, integrator=integrator, spp=n, seed=1000 * place + seed)
+            return mi.render(scene, integrator=integrator, spp=n, seed=10_000 * size.seed + 1000 * place + seed)
 
         most = size.budget.samples(render)
         for level in levels:

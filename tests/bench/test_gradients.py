@@ -17,8 +17,8 @@ from mivol.bench.gradients.bias import Case, cases, difference, refine, table_ro
 from mivol.bench.gradients.size import BARS, LIGHTS, OURS, STOCK
 from mivol.bench.gradients.subject import compete, subjects
 from mivol.bench.gradients.tutorial import Run, at_voxels, finish, measure_tutorial, upright, warm_up
-from mivol.bench.gradients.variance import measure_smoke
-from mivol.bench.timing import Budget
+from mivol.bench.gradients.variance import measure_smoke, outcome
+from mivol.bench.timing import Budget, Timing
 from mivol.files import read_volume
 
 TINY = replace(
@@ -70,6 +70,41 @@ def test_gradients_of_a_mean_and_of_a_loss(variant_rgb: str) -> None:
     # Radiance is at most 1 and about 0.9 where the cube is seen: the derivative of its square is below twice its own.
     assert np.all(mean < 0)
     assert np.all((loss < 0) & (loss > 2.02 * mean))
+
+
+def test_a_region_has_its_own_variance_and_derivative() -> None:
+    """Gradients that swing by 1 about the same values, and by 2 in the dense half and in three times the time: 12 there, 3
+    in the empty half; the derivative along sigma_t itself is that of the dense voxels only."""
+    values = np.array([2.0, 2, 2, 2, 0, 0, 0, 0]).reshape(2, 2, 2)
+    swing = np.array([-1.0, 1, -1, 1, -1, 1])[:, None]
+    slow = Timing({}, [3.0] * 6, [6.0] * 6, list(5 + swing * np.repeat([2.0, 1.0], 4)))
+    fast = Timing({}, [1.0] * 6, [1.0] * 6, list(5 + swing * np.ones(8)))
+    regions = {"dense": values > 0, "empty": values == 0}
+    found = outcome({OURS: fast, STOCK: slow}, {OURS: 1, STOCK: 2}, regions, values, 4)
+    assert (found["time"], found["processor_time"]) == (3, 6)
+    assert found["dense"]["variance_x_time"] == pytest.approx(12)
+    assert found["empty"]["variance_x_time"] == pytest.approx(3)
+    assert (found["dense"]["voxels"], found["dense"]["z"], found["dense"]["percent"]) == (4, 0, 0)
+    # four voxels of 2, each with a deviation of 1 and of 2 that all share: variances of sums 8^2 and 16^2 times 6/5 over 6
+    error = math.sqrt((8**2 + 16**2) / 5) / 40
+    assert found["dense"]["standard_error_percent"] == pytest.approx(100 * error)
+    assert found["empty"]["standard_error_percent"] == pytest.approx(100 * math.sqrt((4**2 + 4**2) / 5) / 20)
+    assert found[STOCK]["samples_per_second_median"] == pytest.approx(4 * 4 * 2 / 3)
+
+
+def test_every_figure_has_its_bar() -> None:
+    """A ratio and |z| for each light and functional of the smoke, two bounds on the bias of each case, one of the tutorial."""
+    dense = {"variance_x_time": 100.0, "z": -5.0, "z_bound": 4.0}
+    smoke = {light: {"mean": {"sigma_t >= 1": dense}, "L2": {"sigma_t >= 1": dense}} for light in LIGHTS}
+    rows = BENCH.compare("smoke", smoke)
+    assert [row["met"] for row in rows] == [True, False] * 4
+    assert [row["bar"] for row in rows[::2]] == [BARS[light] for light in LIGHTS for _ in range(2)]
+    ours = {"bias_percent": -0.3, "known_to_percent": 0.1, "bias_standard_errors": -3.0}
+    table = {light: {name: {OURS: ours} for name in cases(2)} for light in LIGHTS}
+    rows = BENCH.compare("estimators", table)
+    assert [row["value"] for row in rows] == pytest.approx([0.6, 3.0] * 8)
+    assert [row["met"] for row in rows] == [False, True] * 8
+    assert BENCH.compare("tutorial", {"to_the_last_loss_of_prbvolpath": {"sooner": 21.0}})[0]["met"]
 
 
 @pytest.mark.slow

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mivol.bench.agreement import compare_means, finite, mean_of_rounds, number
+from mivol.bench.agreement import MeanError, compare_means, finite, mean_of_rounds, number
 from mivol.bench.bars import say
 from mivol.bench.gradients.size import LIGHTS, OURS, STOCK, Size
-from mivol.bench.gradients.subject import Subject, along, compete, subjects, variance_over
+from mivol.bench.gradients.subject import SEEDS, Subject, along, compete, subjects, variance_over
 from mivol.bench.timing import ratio_of
 from mivol.validate.statistics import Moments
 
@@ -83,38 +83,43 @@ def measure_estimators(size: Size) -> dict:
 
 
 def table_row(case: Case, parts: Callable[[], dict], size: Size) -> dict:
-    """Both estimators in one case."""
+    """Both estimators in one case, in one light."""
     both = subjects(case.values.astype(np.float32), size.table_side, parts)
-    timings, spp = compete({name: s.of_mean for name, s in both.items()}, size.table_budget, size.table_rounds)
+    steps = {name: s.of_mean for name, s in both.items()}
+    timings, spp = compete(steps, size.table_budget, size.table_rounds, size.seed)
     derivatives = {name: along(timing, case.direction) for name, timing in timings.items()}
-    v = case.direction.ravel()
+    first, v = SEEDS * size.seed, case.direction.ravel()
 
     def derivative(k: int) -> float:
-        return float(np.array(both[OURS].of_mean(9000 + k, spp[OURS]), np.float64) @ v)
+        return float(np.array(both[OURS].of_mean(first + 9000 + k, spp[OURS]), np.float64) @ v)
 
     def differ(k: int) -> float:
-        return difference(both[OURS], case, 5000 + k, size.difference_spp)
+        return difference(both[OURS], case, first + 5000 + k, size.difference_spp)
 
     known = {"percent": size.certain_percent, "most": size.most_estimates}
     derivatives[OURS] = refine(derivatives[OURS], derivative, **known)
-    truth = refine([differ(k) for k in range(size.table_rounds)], differ, **known)
-    m = Moments.of(truth)
-    row = {"finite_difference": float(m.mean), "its_standard_error": float(np.sqrt(m.variance_of_mean))}
-    chosen = case.direction > 0
+    truth = mean_of_rounds(refine([differ(k) for k in range(size.table_rounds)], differ, **known))
+    row = {"finite_difference": truth.mean, "its_standard_error": math.sqrt(truth.variance)}
     for name, timing in timings.items():
-        found = compare_means(mean_of_rounds(derivatives[name]), mean_of_rounds(truth), 2 * len(LIGHTS) * len(cases(2)))
-        row[name] = {
-            "derivative": float(derivatives[name].mean()),
-            "bias_standard_errors": found["z"],
-            "bias_percent": found["percent"],
-            "known_to_percent": found["standard_error_percent"],
-            "variance": variance_over(timing, chosen),
+        row[name] = figures_of(derivatives[name], truth) | {
+            "variance": variance_over(timing, case.direction > 0),
             "spp": spp[name],
             "seconds_median": timing.median,
         }
     a, b = row[STOCK]["variance"], row[OURS]["variance"]
     row["variance_x_time"] = finite(a / b * ratio_of(timings[STOCK], timings[OURS])) if b > 0 else None
     return row
+
+
+def figures_of(derivatives: np.ndarray, truth: MeanError) -> dict:
+    """Derivatives (rounds,) of one estimator against the finite difference."""
+    found = compare_means(mean_of_rounds(derivatives), truth, 2 * len(LIGHTS) * len(cases(2)))
+    return {
+        "derivative": float(derivatives.mean()),
+        "bias_standard_errors": found["z"],
+        "bias_percent": found["percent"],
+        "known_to_percent": found["standard_error_percent"],
+    }
 
 
 def said_of_row(row: dict) -> str:

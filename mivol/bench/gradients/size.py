@@ -32,6 +32,7 @@ class Size:
         most_estimates: of which such a mean is made at most.
         reference_spp, check_spp, loss_spp: samples of the tutorial's references, of those by volpath, of its image loss.
         resolutions, steps, step_spp: of the tutorial's stages.
+        seed: of the gradients and differences; another one gives independent ones.
     """
 
     name: str = "full"
@@ -51,6 +52,7 @@ class Size:
     resolutions: tuple[int, ...] = (16, 64)
     steps: tuple[int, ...] = (20, 20)
     step_spp: tuple[int, ...] = (8, 64)
+    seed: int = 0
 
 
 FULL = Size()

@@ -14,10 +14,13 @@ from mivol.bench.scenes import box_scene, depth_two
 from mivol.bench.timing import Budget, Contestant, Timing, race
 from mivol.validate.statistics import Moments
 
-__all__ = ["KEY", "Step", "Subject", "along", "compete", "subjects", "variance_over"]
+__all__ = ["KEY", "SEEDS", "Step", "Subject", "along", "compete", "subjects", "variance_over"]
 
 KEY = "box.interior_medium.sigma_t.data"
 """Of the voxels in ``mi.traverse``."""
+
+SEEDS = 100_000
+"""How far seeds of a size lie from those of the next one."""
 
 
 @dataclass
@@ -73,11 +76,18 @@ Step = Callable[[int, int], object]
 """Seed and samples per pixel to a gradient."""
 
 
-def compete(steps: dict[str, Step], budget: Budget, rounds: int) -> tuple[dict[str, Timing], dict[str, int]]:
-    """Gradients in turns, each with the samples of its budget; timings with their results, and samples per pixel."""
+def compete(steps: dict[str, Step], budget: Budget, rounds: int, seed: int = 0) -> tuple[dict[str, Timing], dict[str, int]]:
+    """Gradients in turns, each with the samples of its budget; timings with their results, and samples per pixel.
+
+    Args:
+        steps: by name; each gets seeds of its own.
+        budget: of one gradient.
+        rounds: gradients of each.
+        seed: another one gives independent gradients.
+    """
     spp = {name: budget.samples(step) for name, step in steps.items()}
     calls: dict[str, Contestant] = {
-        name: lambda seed, step=step, n=spp[name], k=k: step(1000 * (k + 1) + seed, n)
+        name: lambda number, step=step, n=spp[name], k=k: step(SEEDS * seed + 1000 * (k + 1) + number, n)
         for k, (name, step) in enumerate(steps.items())
     }
     return race(calls, rounds, keep=True), spp

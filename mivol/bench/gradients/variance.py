@@ -15,7 +15,7 @@ from mivol.bench.gradients.subject import along, compete, subjects, variance_ove
 from mivol.bench.scenes import box_scene, depth_two
 from mivol.bench.timing import Timing, ratio_of
 
-__all__ = ["measure_smoke"]
+__all__ = ["measure_smoke", "outcome"]
 
 
 def measure_smoke(size: Size) -> dict:
@@ -36,7 +36,7 @@ def measure_smoke(size: Size) -> dict:
         }
         answer[light] = {}
         for functional, steps in functionals.items():
-            timings, spp = compete(steps, size.budget, size.rounds)
+            timings, spp = compete(steps, size.budget, size.rounds, size.seed)
             answer[light][functional] = outcome(timings, spp, regions, found.values, size.side)
             say(f"  {light}, {functional}: {said(answer[light][functional])}")
     return answer
