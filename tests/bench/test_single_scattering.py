@@ -55,7 +55,7 @@ def test_renderers_agree_in_a_sky(variant_rgb: str, tmp_path) -> None:
 def test_every_light_lights_the_medium(variant_rgb: str, name: str) -> None:
     scene = mi.load_dict(box_scene(fog(), 8, bench.ALBEDO, **bench.LIGHTS[name].parts()))
     image = np.array(mi.render(scene, integrator=depth_two(bench.OURS), spp=4, seed=0))
-    assert image[bench.pixels_of_medium(scene)].mean() > 0.01
+    assert image[bench.optical_depths(scene) > bench.SEEN].mean() > 0.01
 
 
 def test_volumes_have_the_resolution_of_their_size(variant_rgb: str) -> None:
@@ -100,20 +100,30 @@ def test_pixels_at_the_lamp_do_not_count(variant_rgb: str) -> None:
     assert np.isinf(bench.pixels_from_lamp(scene, light._replace(inside=None), 24)).all()
 
 
-def test_means_are_compared_away_from_a_lamp_inside(variant_rgb: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What z is of has no pixel within a quarter of the picture from the lamp; what variances are of has."""
-    seen = {}
-    monkeypatch.setattr(bench, "gain", lambda slow, fast, counts: seen.setdefault("gain", counts) is None or {})
-    monkeypatch.setattr(bench, "difference", lambda slow, fast, counts: seen.setdefault("difference", counts) is None or {})
-    rendered = fake(np.random.default_rng(0).uniform(1, 2, (4, 24, 24)))
-    every = {(name, 1): rendered for name in (bench.OURS, *bench.STOCK)}
-    monkeypatch.setattr(bench, "render_in_turns", lambda *_: (every, dict.fromkeys(every, 1)))
+def test_a_lamp_inside_is_judged_in_thin_matter_away_from_it(variant_rgb: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ratios are of the volume itself, and pixels up to the lamp count; means are compared in the volume thinned to an
+    optical depth of 1, in pixels further than a quarter of the picture from it."""
+    used, depths, side = {}, [], 16
+    monkeypatch.setattr(bench, "gain", lambda slow, fast, counts: used.setdefault("gain", (fast.median, counts)) and {})
+    monkeypatch.setattr(bench, "difference", lambda slow, fast, fair: used.setdefault("z", (fast.median, fair)) and {})
+    rng = np.random.default_rng(0)
+
+    def rendered(scene: mi.Scene, *_: object) -> tuple[dict, dict]:
+        depths.append(bench.optical_depths(scene).max())
+        made = fake(rng.uniform(1, 2, (4, side, side)), len(depths))
+        return ({(name, 1): made for name in (bench.OURS, *bench.STOCK)}, {(name, 1): 1 for name in (bench.OURS, *bench.STOCK)})
+
+    monkeypatch.setattr(bench, "render_in_turns", rendered)
     light = bench.LIGHTS["point light inside"]
-    bench.contend(np.full((4, 4, 4), 0.1, np.float32), light, replace(TINY, most_pixels=24))
-    scene = mi.load_dict(box_scene(np.full((4, 4, 4), 0.1, np.float32), 24, 0.75, **light.parts()))
-    away = bench.pixels_from_lamp(scene, light, 24)
-    assert away[seen["difference"]].min() > 6 > 1.6 > away[seen["gain"]].min() - 0.6
-    assert 0 < seen["difference"].sum() < seen["gain"].sum()
+    bench.contend(np.full((4, 4, 4), 7.0, np.float32), light, replace(TINY, most_pixels=side))
+    assert depths[0] > 10
+    assert depths[1] == pytest.approx(1, rel=1e-3)
+    away = bench.pixels_from_lamp(mi.load_dict(box_scene(np.ones((2, 2, 2), np.float32), side)), light, side)
+    (first, counts), (second, fair) = used["gain"], used["z"]
+    assert (first, second) == (1, 2)
+    assert bench.AT_LAMP < away[counts].min() < 3
+    assert away[fair].min() > side / 4
+    assert 0 < fair.sum() < counts.sum()
 
 
 def test_a_difference_without_noise_is_beyond_every_bound() -> None:
