@@ -64,7 +64,7 @@ class MivolIntegrator(mi.ad.integrators.common.ADIntegrator):
         self.session.render_backward(scene, grad_in, sensor, seed, spp)
 
     def sample(
-        self, scene: mi.Scene, sampler: mi.Sampler, ray: mi.Ray3f, active: mi.Bool = True, **_: Any
+        self, scene: mi.Scene, sampler: mi.Sampler, ray: mi.Ray3f, medium: mi.Medium = None, active: mi.Bool = True, **_: Any
     ) -> tuple[mi.Spectrum, mi.Bool, list[mi.Float], None]:
         # Integrators that nest this one call it as they call every ADIntegrator: by keywords, among them ``mode`` and
         # ``state_in``, and without the sensor's medium; they expect a state for a second pass, which mivol does not need.

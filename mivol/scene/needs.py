@@ -268,7 +268,9 @@ def _camera_inside(scene: mi.Scene, sensor: mi.Sensor, survey: Survey) -> bool:
     if not eye.valid() or not boxes:
         return False
     low, high = np.min([b[0] for b in boxes], axis=0), np.max([b[1] for b in boxes], axis=0)
-    return bool((np.array(eye.max) >= low).all() and (np.array(eye.min) <= high).all())
+    # Rays begin at the near plane: this far from the eye in a field of view of 150 degrees.
+    ahead = 4 * sensor.near_clip() if hasattr(sensor, "near_clip") else 0.0
+    return bool((np.array(eye.max) + ahead >= low).all() and (np.array(eye.min) - ahead <= high).all())
 
 
 @dataclass

@@ -18,7 +18,7 @@ import mitsuba as mi
 
 from mivol.numerics import one_minus_exp
 from mivol.transport.distance import backproject_distance, integrate_distance, push_distance
-from mivol.transport.path import Reach, Way, optical_depth_to, revisit
+from mivol.transport.path import Reach, Way, camera_ray, optical_depth_to, revisit
 from mivol.transport.world import Body, World
 
 __all__ = ["AOVS", "backproject_aovs", "integrate_aovs", "push_aovs"]
@@ -115,7 +115,7 @@ def backproject_aovs(
 
 def _go(scene: mi.Scene, world: World, ray: mi.Ray3f, active: mi.Bool) -> _First:
     """Carry rays to the first opaque surface or out of the scene."""
-    ray = mi.Ray3f(ray.o, ray.d, dr.inf, ray.time, ray.wavelengths)
+    ray = camera_ray(ray)
     medium = world.medium_at(scene, ray)
     end, tau = optical_depth_to(scene, world, ray, medium, mi.Bool(active))
     stopped = end.si.is_valid()

@@ -36,6 +36,7 @@ __all__ = [
     "Stretch",
     "Visit",
     "Way",
+    "camera_ray",
     "distance_along",
     "follow_lamp",
     "is_straight",
@@ -347,7 +348,7 @@ def walk_path(
     visible = not settings.hide_emitters and scene.environment() is not None
     n = dr.width(ray)
     path = Path(
-        ray=mi.Ray3f(ray.o, ray.d, dr.inf, ray.time, ray.wavelengths),
+        ray=camera_ray(ray),
         medium=world.medium_at(scene, ray),
         beta=dr.full(mi.Spectrum, 1, n),
         eta=dr.full(mi.Float, 1, n),
@@ -371,6 +372,12 @@ def walk_path(
         label="path",
     )
     return path.score, path.valid
+
+
+def camera_ray(ray: mi.Ray3f) -> mi.Ray3f:
+    """A ray of a sensor, which ends where the sensor ends it: at its ``far_clip``; without an end where that is not finite."""
+    end = dr.select(ray.maxt < dr.largest(mi.Float), ray.maxt, dr.inf)
+    return mi.Ray3f(ray.o, ray.d, end, ray.time, ray.wavelengths)
 
 
 def is_straight(world: World, settings: Settings) -> bool:
@@ -437,7 +444,10 @@ def _bounce(scene: mi.Scene, world: World, settings: Settings, limit: int, path:
     score = score.turn(bsdf, si, sample.wo, on & ~through)
     path.beta *= dr.select(on, f_over_pdf, 0)
     path.eta *= dr.select(on, sample.eta, 1)
+    rest = path.ray.maxt - end.t
     path.ray = spawn_ray(si, si.to_world(sample.wo), world.size)
+    # A ray that goes straight on ends where it was to end.
+    path.ray.maxt = dr.select(through, dr.minimum(rest, path.ray.maxt), path.ray.maxt)
     path.medium = dr.select(on & si.is_medium_transition(), si.target_medium(path.ray.d), path.medium)
     path.last = dr.select(on & ~through, mi.Interaction3f(si), path.last)
     path.pdf = dr.select(on & ~through, sample.pdf, path.pdf)

@@ -487,7 +487,7 @@ def spawn_ray(si: mi.SurfaceInteraction3f, d: mi.Vector3f, size: mi.Float) -> mi
 @dr.syntax
 def _locate(scene: mi.Scene, ray: mi.Ray3f, size: mi.Float) -> mi.MediumPtr:
     """Find the medium around a point: the near side of the first boundary along a ray, through all else."""
-    probe = mi.Ray3f(ray)
+    probe = mi.Ray3f(ray.o, ray.d, dr.inf, ray.time, ray.wavelengths)  # the boundary may lie beyond the sensor's far_clip
     medium = dr.zeros(mi.MediumPtr, dr.width(ray))
     going = dr.full(mi.Bool, True, dr.width(ray))
     while dr.hint(going, label="the medium around the camera"):

@@ -313,8 +313,8 @@ def test_a_sample_of_a_nested_integrator():
     o, d = rays(5)
     ray = mi.Ray3f(mi.Point3f(o.T.astype(np.float32)), mi.Vector3f(d.T.astype(np.float32)))
     sampler.seed(0, 5)
-    L, _, aovs = integrator.sample(scene, sampler, ray)
-    assert len(aovs) == 2
+    L, _, aovs, state = integrator.sample(scene, sampler, ray)
+    assert len(aovs) == 2 and state is None
     assert np.array(dr.exp(-aovs[0])) == pytest.approx(np.array(L.x), rel=8 * EPS)
     masked = integrator.sample(scene, sampler, ray, None, mi.Bool([True, False, True, True, False]))[2]
     assert np.array_equal(np.array(masked[0]) == 0, [False, True, False, False, True])

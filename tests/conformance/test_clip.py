@@ -1,0 +1,76 @@
+"""Rays of a sensor begin at its ``near_clip`` and end at its ``far_clip``; what lies beyond is not there, but for the sky."""
+
+from __future__ import annotations
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from scattering_scenes import assert_same_images, fog, mivol, point, smoke
+
+from scenes import ball_of, camera, medium, sky
+
+pytestmark = pytest.mark.usefixtures("variant_rgb")
+
+SIGMA = 0.7
+FOG = {
+    "box": lambda: fog(SIGMA)[0],
+    "traced": lambda: ball_of(medium("homogeneous", SIGMA), (0, 0, 0), 1.0),
+    "grid": lambda: smoke(np.full((3, 4, 5, 1), SIGMA))[0],
+}
+RED = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.8, 0.3, 0.2]}}
+
+
+def look_down(parts: dict, near: float, far: float) -> mi.Scene:
+    """A camera of parallel rays, 0.002 wide, 4 above the origin."""
+    turn = mi.ScalarTransform4f()
+    place = turn.look_at([0, 0, 4], [0, 0, 0], [0, 1, 0]) @ turn.scale([1e-3, 1e-3, 1])
+    sensor = camera((0, 0, 4), (0, 0, 0), res=4) | {"type": "orthographic", "to_world": place}
+    del sensor["fov"]
+    return mi.load_dict({"type": "scene", **parts, "sky": sky(), "sensor": sensor | {"near_clip": near, "far_clip": far}})
+
+
+@pytest.mark.parametrize("kind", FOG)
+def test_fog_is_cut_at_both_planes(kind):
+    """It lies from 3 to 5 in front of the camera."""
+    for near, far, seen in ((0.01, 1e4, 2.0), (3.5, 1e4, 1.5), (0.01, 4.5, 1.5), (3.5, 4.75, 1.25), (0.01, 2.0, 0.0)):
+        scene = look_down({"fog": FOG[kind]()}, near, far)
+        image = np.array(mi.render(scene, integrator=mi.load_dict(mivol(max_depth=1, aovs="tau")), spp=4))
+        # Chords of the ball are 2e-6 shorter, places of planes are rounded 4 times to float32, in numbers below 8.
+        np.testing.assert_allclose(image[..., 3], SIGMA * seen, atol=5e-6)
+        np.testing.assert_allclose(image[..., 0], np.exp(-SIGMA * seen), rtol=5e-6)
+
+
+def test_what_a_veil_lets_through_ends_at_the_same_plane():
+    """A black mask at 2, a lamp at 4.5: in front of it there is the sky of 1, whatever straight rays pass."""
+    turn = mi.ScalarTransform4f()
+    mask = {"type": "mask", "opacity": 0.6, "nested": {"type": "diffuse", "reflectance": 0.0}}
+    veil = {"type": "rectangle", "to_world": turn.translate([0, 0, 2]), "bsdf": mask}
+    lamp = {"type": "rectangle", "to_world": turn.translate([0, 0, -0.5]), "emitter": {"type": "area", "radiance": 5.0}}
+    for far, top in ((4.4, 1.0), (4.6, 5.0)):
+        scene = look_down({"veil": veil, "lamp": lamp}, 0.01, far)
+        # 16 pixels of one sample: all pass, or none, with a chance of 0.6^16 = 3e-4 for this seed.
+        image = np.array(mi.render(scene, integrator=mi.load_dict(mivol()), spp=1, seed=1))
+        assert np.unique(image).tolist() == [0.0, top]
+
+
+def test_the_same_picture_as_volpath():
+    """Fog around the camera that scatters, a ball in front of the far plane and one behind it; light comes from beyond.
+
+    (Behind a boundary volpath forgets the plane: a ray that it starts anew there has no end. In a medium with
+    has_spectral_extinction it loses the rays that meet the plane.)
+    """
+    ref = {"type": "ref", "id": "haze"}
+    balls = {"near": (0.1, 0.1, 2.3), "far": (-0.3, 0.1, 0.5)}
+    parts = {
+        "haze": medium("homogeneous", 0.4, 0.8, has_spectral_extinction=False) | {"id": "haze"},
+        "room": ball_of(ref, (0, 0, 0), 4.0),
+        **{k: {"type": "sphere", "center": list(c), "radius": 0.25, "bsdf": RED} for k, c in balls.items()},
+        "bulb": point([0.5, 1.0, -0.5], 6.0)[0],
+        "sky": sky(0.3),
+    }
+    sensor = camera((0, 0, 3.0), (0, 0, 0), res=16, fov=30.0) | {"medium": ref, "near_clip": 0.1, "far_clip": 1.6}
+    scene = mi.load_dict({"type": "scene", **parts, "sensor": sensor})
+    assert_same_images(scene, rounding=1e-4)
+    open_end = mi.load_dict({"type": "scene", **parts, "sensor": sensor | {"far_clip": 100.0}})
+    cut, whole = (np.array(mi.render(s, integrator=mi.load_dict(mivol()), spp=16)).mean() for s in (scene, open_end))
+    assert abs(cut - whole) > 0.1 * whole
