@@ -20,6 +20,7 @@ import time
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -34,7 +35,7 @@ from mivol.bench.questions import Bench
 from mivol.scene.depth_two import ALBEDOS, TAUS, depth_two_error, draw_lines, scattering_depth
 from mivol.transport.medium import Box, view_medium
 
-__all__ = ["BENCH", "CUBE_DEPTH", "FULL", "QUICK", "Cell", "Size", "cube", "left_out", "main", "measure", "table_lines"]
+__all__ = ["BENCH", "FULL", "QUICK", "Cell", "Size", "Subject", "left_out", "main", "measure", "table_lines", "tabled_cube"]
 
 LIGHTS = {
     "constant": {"type": "constant", "radiance": {"type": "uniform", "value": 1.0}},
@@ -139,26 +140,48 @@ def left_out(once: np.ndarray, every: np.ndarray) -> tuple[float, float]:
     return float(1 - ratio), float((once - ratio * every).std() / every.mean() / np.sqrt(len(once)))
 
 
-def measure(scene: mi.Scene, place: tuple[str, str, str], albedo: float, tau: float, depth: float, n: int, seed: int) -> Cell:
-    """One cell; ``place`` is (medium, light, phase), ``depth`` the optical depth of the medium with the factor 1."""
+class Subject(NamedTuple):
+    """A medium in a light.
+
+    Attributes:
+        scene: of :func:`cube`.
+        medium, light, phase: what they are called.
+        depth: optical depth of the medium with the factor 1.
+    """
+
+    scene: mi.Scene
+    medium: str
+    light: str
+    phase: str
+    depth: float
+
+
+def measure(subject: Subject, albedo: float, tau: float, n: int, seed: int = SEED) -> Cell:
+    """One cell, from n lines, with the medium scaled to the optical depth tau."""
     start = time.perf_counter()
-    fill(scene, albedo, tau / depth)
-    once, every = (scattered(scene, limit, n, seed) for limit in (2, -1))
+    fill(subject.scene, albedo, tau / subject.depth)
+    once, every = (scattered(subject.scene, limit, n, seed) for limit in (2, -1))
     seconds = round(time.perf_counter() - start, 2)
-    return Cell(*place, albedo, tau, once.mean(), every.mean(), *left_out(once, every), seconds)
+    names = subject.medium, subject.light, subject.phase
+    return Cell(*names, albedo, tau, once.mean(), every.mean(), *left_out(once, every), seconds)
+
+
+def tabled_cube(light: str, phase: str) -> Subject:
+    """The homogeneous cube of the table."""
+    return Subject(cube(light, phase), "cube", light, phase, CUBE_DEPTH)
 
 
 def measure_table(size: Size) -> Iterator[Cell]:
     """The cells of the table."""
     for light, phase in TABLED:
-        scene = cube(light, phase)
+        subject = tabled_cube(light, phase)
         for tau in size.taus:
             for albedo in ALBEDOS:
-                yield measure(scene, ("cube", light, phase), albedo, tau, CUBE_DEPTH, size.lines, SEED)
+                yield measure(subject, albedo, tau, size.lines)
 
 
 def measure_beside(size: Size) -> Iterator[Cell]:
-    """Cells of other media and lights."""
+    """Cells of other media and lights, with isotropic scattering."""
     for medium, lights in BESIDE.items():
         values = smoke().values if medium == "smoke" else None
         for light in lights:
@@ -166,7 +189,7 @@ def measure_beside(size: Size) -> Iterator[Cell]:
             depth = scattering_depth(view_medium(scene.shapes()[0].interior_medium(), UNIT), UNIT)
             for tau in size.taus:
                 for albedo in BESIDE_ALBEDOS:
-                    yield measure(scene, (medium, light, "isotropic"), albedo, tau, depth, size.lines // 8, SEED)
+                    yield measure(Subject(scene, medium, light, "isotropic", depth), albedo, tau, size.lines // 8)
 
 
 def said(cells: Iterator[Cell]) -> Iterator[Cell]:

@@ -22,7 +22,7 @@ def test_a_cell_is_measured_again(variant_rgb: str, light: str, seed: int) -> No
     """Albedo 0.9 at tau = 1 by other lines and samples than the table's: within 6 standard errors of this measurement and
     the table's own (0.0014, a quarter of this one's with 16 times the lines) and its rounding; 16,384 lines: normal."""
     key = (light, "isotropic")
-    cell = bench.measure(bench.cube(light), ("cube", *key), 0.9, 1.0, bench.CUBE_DEPTH, n=1 << 14, seed=77 + seed)
+    cell = bench.measure(bench.tabled_cube(*key), 0.9, 1.0, n=1 << 14, seed=77 + seed)
     wanted = TABLES[key][ALBEDOS.index(0.9), TAUS.index(1.0)]
     assert cell.standard_error < 0.01, "else the test sees nothing"
     assert abs(cell.error - wanted) <= 6 * cell.standard_error * math.sqrt(1 + 1 / 16) + ROUNDING

@@ -111,13 +111,15 @@ def test_random_peers_have_the_exact_mean(variant_rgb: str, seed: int) -> None:
 
 
 def test_walks_count_what_they_cross(variant_rgb: str) -> None:
-    """Where 93 of 100 blocks are empty, most cells are not visited; the counts do not depend on the order of rays."""
+    """Where most blocks are empty most cells are not visited: a jump over a block is a step that visits none. The counts do
+    not depend on the order of rays."""
     for name, grid in measure_grids(TINY).items():
         for order in ("camera order", "random order"):
             every, skipped = grid[f"{order}, every cell"], grid[f"{order}, empty blocks skipped"]
             assert every["cells_visited_per_ray"] == every["steps_per_ray"]
             assert skipped["cells_visited_per_ray"] <= skipped["steps_per_ray"] <= every["steps_per_ray"]
         if name == "threads":
+            assert skipped["cells_visited_per_ray"] < skipped["steps_per_ray"]
             assert skipped["steps_per_ray"] < every["steps_per_ray"] / 2
 
 

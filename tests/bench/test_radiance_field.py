@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from mivol.bench.radiance_field import BENCH, QUICK, fits
-from mivol.bench.radiance_field.fields import FIELDS, _resized
+from mivol.bench.radiance_field.fields import FIELDS, centred
 from mivol.bench.radiance_field.fits import EVERY, follow, held_out_psnr, our_fit, peer_fit
 from mivol.bench.radiance_field.steps import ask_memory, our_step, peer_of, peer_step, tasks
 from mivol.bench.radiance_field.views import BOX, between, photographed, rays_of, rays_through, ring, tiled
@@ -97,7 +97,7 @@ def test_memory_a_ray(variant_rgb: str) -> None:
 
 
 def test_a_smaller_array_stands_in_the_middle() -> None:
-    found = _resized(np.ones((2, 3, 4, 2), np.float32), 6)
+    found = centred(np.ones((2, 3, 4, 2), np.float32), 6)
     assert found.shape == (6, 6, 6, 2)
     assert np.all(found[2:4, 1:4, 1:5] == 1) and found.sum() == 2 * 24
 

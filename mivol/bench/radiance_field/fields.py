@@ -71,13 +71,13 @@ def fitted(size: Size) -> tuple[SphericalGrid, str]:
         fit.advance()
     # Into the box of the others, dense: the peer has nothing else.
     density, sh = fit.field.to_dense()
-    density, sh = (_resized(a, size.resolution) for a in (density * fit.unit, sh))
+    density, sh = (centred(a, size.resolution) for a in (density * fit.unit, sh))
     keep = density > 0
     keep |= np.roll(keep, 1, 0) | np.roll(keep, -1, 0) | np.roll(keep, 1, 1) | np.roll(keep, -1, 1)
     return SphericalGrid.from_dense(density, sh, TO_WORLD, keep), f"{origin}, fitted in {size.chair_steps} steps"
 
 
-def _resized(values: np.ndarray, n: int) -> np.ndarray:
+def centred(values: np.ndarray, n: int) -> np.ndarray:
     """Put an array in the middle of n^3 nodes."""
     out = np.zeros((n, n, n, *values.shape[3:]), np.float32)
     low = [(n - s) // 2 for s in values.shape[:3]]
