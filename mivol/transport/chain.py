@@ -120,10 +120,10 @@ class _Lay:
     ``segment`` runs from ``leave`` to ``enter``; it and ``lattice`` are None where no grid says where the cells are.
     """
 
-    t0: mi.Float
-    enter: mi.Float
-    leave: mi.Float
-    t1: mi.Float
+    t0: mi.Float64
+    enter: mi.Float64
+    leave: mi.Float64
+    t1: mi.Float64
     lattice: Lattice | None
     segment: Segment | None
 
@@ -153,12 +153,12 @@ class _Stretch:
 
     def site(self, cell: Cell, on: mi.Bool) -> Site:
         """A cell of the walk, which runs towards the camera."""
-        return Site(self.body, self.ray, self.lay.leave - (cell.s + cell.dt), dr.select(on, cell.dt, 0), on)
+        return Site(self.body, self.ray, mi.Float(self.lay.leave - mi.Float64(cell.s + cell.dt)), dr.select(on, cell.dt, 0), on)
 
-    def outside(self, a: mi.Float, b: mi.Float) -> Site:
+    def outside(self, a: mi.Float64, b: mi.Float64) -> Site:
         """A stretch [a, b] of constants."""
         on = self.active & (b > a)
-        return Site(self.body, self.ray, dr.select(on, a, 0), dr.select(on, b - a, 0), on)
+        return Site(self.body, self.ray, mi.Float(dr.select(on, a, 0)), mi.Float(dr.select(on, b - a, 0)), on)
 
     def points(self, cell: Cell) -> list[mi.Vector3f]:
         """The points of a cell, the one nearest to the camera first: a sweep meets it last."""
@@ -187,7 +187,7 @@ class _Stretch:
         sigma = self.along(self.field, cell.corners[: len(self.field.reads)], cell)
         return site, sigma, self.rule.cell(site, sigma)
 
-    def constant(self, a: mi.Float, b: mi.Float) -> tuple[Site, list[list[mi.Float]], list[Stop]]:
+    def constant(self, a: mi.Float64, b: mi.Float64) -> tuple[Site, list[list[mi.Float]], list[Stop]]:
         """As :meth:`cell`, a stretch of constants."""
         site, sigma = self.outside(a, b), self.rows(self.field.constant)
         return site, [[s] * len(self.rule.points) for s in sigma], self.rule.constant(site, sigma)
@@ -203,13 +203,13 @@ def _open(
 
 def _lay(body: Body, ray: mi.Ray3f, t0: mi.Float, t1: mi.Float) -> _Lay:
     lattice = body.view.guide
-    start, end = mi.Float(t0), mi.Float(t1)
+    start, end = mi.Float64(t0), mi.Float64(t1)
     if lattice is None:
         return _Lay(start, end, end, end, None, None)
     segment = clip(lattice, ray.o, -ray.d, -t1, -t0)
     hit = segment.length > 0
-    leave = dr.select(hit, -segment.t0, end)
-    return _Lay(start, dr.select(hit, leave - segment.length, end), leave, end, lattice, segment)
+    leave = dr.select(hit, -segment.start, end)
+    return _Lay(start, dr.select(hit, -segment.end, end), leave, end, lattice, segment)
 
 
 def _measure(stretch: _Stretch, skip: bool) -> _Moment:
@@ -218,7 +218,7 @@ def _measure(stretch: _Stretch, skip: bool) -> _Moment:
     rows = rule.rows * (2 if tangent else 1)
     moment = _Moment(_zeros(mi.Float64, rows), _zeros(mi.Float, rows))
 
-    def add_constant(moment: _Moment, a: mi.Float, b: mi.Float) -> _Moment:
+    def add_constant(moment: _Moment, a: mi.Float64, b: mi.Float64) -> _Moment:
         site, sigma, stops = stretch.constant(a, b)
         if not tangent:
             return _put_in_front(moment, stops, [], [])
@@ -278,7 +278,7 @@ def _backproject(
     grids = [p for p in body.view.parts if p.lattice is not None]
     outside: list[tuple] = []
 
-    def add_constant(pull: _Pull, a: mi.Float, b: mi.Float) -> _Pull:
+    def add_constant(pull: _Pull, a: mi.Float64, b: mi.Float64) -> _Pull:
         site, sigma, stops = stretch.constant(a, b)
         pull, _, weights = _pull_through(pull, stops, weight, behind)
         outside.append((site, sigma, weights))

@@ -221,8 +221,8 @@ class Probe:
         on: lanes that have one.
     """
 
-    begin: mi.Float
-    t: mi.Float
+    begin: mi.Float64
+    t: mi.Float64
     source: list[mi.Float]
     dims: list[mi.Float]
     on: mi.Bool
@@ -301,7 +301,8 @@ def _pass(
     field, control = body.extinction(ray), world.control
     lattice = replace(part.lattice, gaps=None)
     segment = clip(lattice, ray.o, -ray.d, -t1, -t0)
-    leave = -segment.t0
+    # Distances from the far end, where the walk begins: those from the camera would have to be compared in float64.
+    begin = mi.Float(-segment.start - probe.begin)
     reads = [*field.reads, Nodes(body.tangents[0], part.channels)] if tracks.tangent else field.reads
 
     def visit(state: _Sweep, cell: Cell, on: mi.Bool) -> _Sweep:
@@ -312,7 +313,7 @@ def _pass(
         T_out, T_in = state.T, [dr.exp(-n) for n in near]
         taken = [taken_light(o, i, t) for o, i, t in zip(own, T_in, T_out, strict=True)]
         S = control.at(cell.lower, on)
-        in_front = leave - (cell.s + 0.5 * cell.dt) < probe.begin
+        in_front = cell.s + 0.5 * cell.dt > begin
         slopes, behind = [], []
         for j, shares in enumerate(tracks.shares):
             c = j % len(own)
@@ -340,7 +341,7 @@ def _settle(world: World, body: Body, ray: mi.Ray3f, tracks: Tracks, probe: Prob
     (part,) = body.view.parts
     cell, frac, inside = locate(part.lattice, ray.o, ray.d, probe.t)
     on = inside & probe.on
-    length = dr.maximum(probe.t - probe.begin, 0)
+    length = mi.Float(dr.maximum(probe.t - probe.begin, 0))
     speed = mi.Vector3f(*(mi.Float(sum(row[a] * mi.Float64(ray.d[a]) for a in range(3))) for row in part.lattice.from_world))
     start = dr.clip(frac - speed * length, 0, 1)
     points = [dr.fma(frac - start, g, start) for g in (GAUSS, 1 - GAUSS)]

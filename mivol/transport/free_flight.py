@@ -24,7 +24,7 @@ import mitsuba as mi
 
 from mivol.numerics import one_minus_exp
 from mivol.transport.dice import roll, start_dice
-from mivol.transport.lattice import Cell, box_nodes, clip, read_nodes, walk
+from mivol.transport.lattice import Cell, box_nodes, clip, read_nodes, split, walk
 from mivol.transport.optical_depth import gauss_points
 from mivol.transport.path import DARK, Visit
 from mivol.transport.world import Body, World
@@ -147,7 +147,7 @@ def offer(world: World, ray: mi.Ray3f, lamp: Lamp, kappa: float) -> Visit:
     numbers = {id(body): index for index, body in enumerate(world.bodies)}
 
     def visit(pick: Pick, body: Body, t0: mi.Float, t1: mi.Float, on: mi.Bool) -> Pick:
-        pick = _fly(world, body, ray, mi.Float(t0), mi.Float(t1), lamp, kappa, pick, on)
+        pick = _fly(world, body, ray, t0, t1, lamp, kappa, pick, on)
         for kept in pick.kept:
             kept.body = dr.select(kept.fresh, numbers[id(body)], kept.body)
             kept.fresh = dr.zeros(mi.Bool, dr.width(kept.fresh))
@@ -165,25 +165,29 @@ def _fly(
     world: World,
     body: Body,
     ray: mi.Ray3f,
-    t0: mi.Float,
-    t1: mi.Float,
+    t0: mi.Float | mi.Float64,
+    t1: mi.Float | mi.Float64,
     lamp: Lamp,
     kappa: float,
     pick: Pick,
     on: mi.Bool,
 ) -> Pick:
-    """Offer the pieces of one body, in their order."""
+    """Offer the pieces of one body, in their order.
+
+    Ends of a box come in float64: seen from 30 box sizes away, a float32 entry errs by 1e-6 of a box.
+    """
     field = body.extinction(ray, body.flight)
     grid = next((p.lattice for p in body.flight if p.lattice is not None), None)
     segment = clip(grid, ray.o, ray.d, t0, t1) if grid is not None else None
-    filled = segment.length if segment is not None and not field.has_constants else t1 - t0
+    filled = segment.length if segment is not None and not field.has_constants else mi.Float(t1 - t0)
     spread = dr.select(dr.isfinite(filled) & (filled > 0), kappa * _inverse(filled), 0) if kappa else None
 
-    def add_constant(pick: Pick, a: mi.Float, b: mi.Float) -> Pick:
+    def add_constant(pick: Pick, a: mi.Float | mi.Float64, b: mi.Float | mi.Float64) -> Pick:
         sigma, front = world.rows(field.constant), pick.tau
-        length = dr.select(on, dr.maximum(b - a, 0), 0)
+        length = dr.select(on, dr.maximum(mi.Float(b - a), 0), 0)
         dt = lit_length(sigma, length)
-        pick = _offer_piece(pick, a, mi.Float(0), dt, [s * dt for s in sigma], lamp.focus, None, spread, on & (dt > 0))
+        begin, rest = split(a)
+        pick = _offer_piece(pick, begin, rest, dt, [s * dt for s in sigma], lamp.focus, None, spread, on & (dt > 0))
         # A length may have no end.
         tau = [f + dr.select(s > 0, s * length, 0) for f, s in zip(front, sigma, strict=True)]
         return replace(pick, tau=tau, T=[dr.exp(-t) for t in tau])
@@ -199,15 +203,15 @@ def _fly(
         half = dr.select(full, 0.5 * cell.dt, 0)
         tau = world.rows([half * (a + b) for a, b in field.along(cell.corners, list(gauss_points(cell)))])
         lit = None if world.shade is None else world.shade.at(cell.lower, lamp.number, full)
-        return _offer_piece(pick, segment.t0, cell.s, cell.dt, tau, lamp.focus, lit, spread, full)
+        return _offer_piece(pick, segment.t0, segment.t0_rest + cell.s, cell.dt, tau, lamp.focus, lit, spread, full)
 
     if field.has_constants:
-        pick = add_constant(pick, t0, dr.select(hit, segment.t0, t1))
+        pick = add_constant(pick, t0, dr.select(hit, segment.start, t1))
     # An image takes no light from behind this depth; derivatives are swept back from the far end, and need all of it.
     until = None if kappa else lambda p: _least_of(p.tau) > DARK
     pick = walk(lattice, segment, visit, pick, field.reads, on, until)
     if field.has_constants:
-        pick = add_constant(pick, dr.select(hit, segment.t0 + segment.length, t1), t1)
+        pick = add_constant(pick, dr.select(hit, segment.end, t1), t1)
     return _note_spread(pick, spread)
 
 
@@ -291,7 +295,7 @@ class Event:
     """A point of a ray where light may be scattered.
 
     Attributes:
-        t, begin: distance [length], and that at which its piece begins.
+        t, begin: distance [length], and that at which its piece begins, in float64.
         pdf: density it was drawn from [1/length].
         tau: optical depth [1] in front of it, of each channel, along the bodies in the order of the walk.
         sigma_t: extinction [1/length] there, of each channel.
@@ -299,8 +303,8 @@ class Event:
         on: lanes that have one.
     """
 
-    t: mi.Float
-    begin: mi.Float
+    t: mi.Float64
+    begin: mi.Float64
     pdf: mi.Float
     tau: list[mi.Float]
     sigma_t: list[mi.Float]
@@ -355,9 +359,10 @@ def place(
     if focus is not None:
         evenly = dr.select(focus.finite, focus.density(begin, dt, x * dt), evenly)
     pdf = (pdf + (1 - by_collision) * evenly) * pick.weight / dr.select(on, total, 1)
-    t = mi.Float(mi.Float64(pick.begin) + mi.Float64(pick.s) + mi.Float64(x) * mi.Float64(dt))
+    start = mi.Float64(pick.begin) + mi.Float64(pick.s)
+    t = start + mi.Float64(x) * mi.Float64(dt)
     on &= (pdf > 0) & dr.isfinite(pdf)
-    return Event(t, begin, dr.select(on, pdf, 1), [f + a for f, a in zip(pick.front, tau, strict=True)], sigma, pick.body, on)
+    return Event(t, start, dr.select(on, pdf, 1), [f + a for f, a in zip(pick.front, tau, strict=True)], sigma, pick.body, on)
 
 
 def _curve(world: World, ray: mi.Ray3f, pick: Kept, on: mi.Bool) -> list[list[mi.Float]]:

@@ -54,7 +54,7 @@ def tau_by_end(scene: mi.Scene, world: World, way: Way, tau: list[mi.Float], act
             return total
         # The area that flakes show turns with the ray, whose direction moves across itself.
         turn = body.facing(d) * dr.rcp(dr.maximum(dr.square(body.area(d)), 1e-30)) - d
-        own = body.optical_depth(way.ray, mi.Float(t0), mi.Float(t1), world.channels, on)
+        own = body.optical_depth(way.ray, t0, t1, world.channels, on)
         return [a + t * turn for a, t in zip(total, own, strict=True)]
 
     zero = [mi.Vector3f(0) for _ in range(world.channels)]

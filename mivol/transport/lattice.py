@@ -44,6 +44,7 @@ __all__ = [
     "over_blocks",
     "read_nodes",
     "slab",
+    "split",
     "walk",
 ]
 
@@ -112,8 +113,8 @@ class Segment:
     """A ray's stretch inside a box of the lattice: where it enters, and how far it goes.
 
     ``cell`` and ``frac`` are the entry point (lattice coordinates), ``d`` the lattice distance per world length (and
-    ``d_rest`` what its rounding left over), ``t0`` the world distance from the ray's origin to the entry, ``length`` the
-    world length inside.
+    ``d_rest`` what its rounding left over), ``t0`` the world distance from the ray's origin to the entry (and ``t0_rest`` what
+    its rounding left over), ``length`` the world length inside.
     """
 
     cell: mi.Vector3i
@@ -122,6 +123,17 @@ class Segment:
     d_rest: mi.Vector3f
     t0: mi.Float
     length: mi.Float
+    t0_rest: mi.Float | float = 0.0
+
+    @property
+    def start(self) -> mi.Float64:
+        """Distance from the ray's origin to the entry [length]."""
+        return mi.Float64(self.t0) + mi.Float64(self.t0_rest)
+
+    @property
+    def end(self) -> mi.Float64:
+        """Distance from the ray's origin to the exit [length]."""
+        return self.start + mi.Float64(self.length)
 
 
 @dataclass
@@ -174,7 +186,14 @@ def clip(lattice: Lattice, o: mi.Point3f, d: mi.Vector3f, t_min: mi.Float, t_max
         cell[a], frac[a] = mi.Int32(low), mi.Float(entry - low)
     direction = mi.Vector3f(mi.Float(v[0]), mi.Float(v[1]), mi.Float(v[2]))
     rest = mi.Vector3f(*(mi.Float(v[a] - mi.Float64(direction[a])) for a in range(3)))
-    return Segment(cell, frac, direction, rest, mi.Float(t0), mi.Float(dr.select(hit, t1 - t0, 0)))
+    start, start_rest = split(t0)
+    return Segment(cell, frac, direction, rest, start, mi.Float(dr.select(hit, t1 - t0, 0)), start_rest)
+
+
+def split(x: mi.Float64 | mi.Float) -> tuple[mi.Float, mi.Float]:
+    """A number as the nearest float32 and what that leaves over."""
+    near = mi.Float(x)
+    return near, mi.Float(mi.Float64(x) - mi.Float64(near))
 
 
 def locate(lattice: Lattice, o: mi.Point3f, d: mi.Vector3f, t: mi.Float) -> tuple[mi.Vector3i, mi.Vector3f, mi.Bool]:

@@ -120,15 +120,15 @@ def _integrate_body(
     field = body.extinction(ray)
     grid = next((p.lattice for p in body.view.parts if p.lattice is not None), None)
 
-    def source(t: mi.Float, active: mi.Bool) -> mi.Spectrum:
+    def source(t: mi.Float64, active: mi.Bool) -> mi.Spectrum:
         return _source(scene, world, body, ray, lamp, number, t, active)
 
-    def add_constant(state: _Sum, a: mi.Float, b: mi.Float) -> _Sum:
+    def add_constant(state: _Sum, a: mi.Float64, b: mi.Float64) -> _Sum:
         sigma = world.rows(field.constant)
-        dt = dr.select(on, lit_length(sigma, dr.maximum(b - a, 0)), 0)
+        dt = dr.select(on, lit_length(sigma, dr.maximum(mi.Float(b - a), 0)), 0)
         return _pieces(state, a, dt, lambda x: sigma, source, focus, mi.Float(STRETCH), on & (dt > 0))
 
-    t0, t1 = mi.Float(t0), mi.Float(t1)
+    t0, t1 = mi.Float64(t0), mi.Float64(t1)
     if grid is None:
         return add_constant(state, t0, t1)
     segment = clip(grid, ray.o, ray.d, t0, t1)
@@ -138,19 +138,20 @@ def _integrate_body(
         def sigma(x: mi.Float) -> list[mi.Float]:
             return world.rows([v[0] for v in field.along(cell.corners, [dr.fma(cell.step, x, cell.frac)])])
 
-        return _pieces(state, segment.t0 + cell.s, cell.dt, sigma, source, focus, mi.Float(1), full & (cell.dt > 0))
+        start = segment.start + mi.Float64(cell.s)
+        return _pieces(state, start, cell.dt, sigma, source, focus, mi.Float(1), full & (cell.dt > 0))
 
     if not field.has_constants:
         return walk(grid, segment, visit, state, field.reads, on)
-    state = add_constant(state, t0, dr.select(hit, segment.t0, t1))
+    state = add_constant(state, t0, dr.select(hit, segment.start, t1))
     # Where the grid is empty the constants are not.
     state = walk(replace(grid, gaps=None), segment, visit, state, field.reads, on)
-    return add_constant(state, dr.select(hit, segment.t0 + segment.length, t1), t1)
+    return add_constant(state, dr.select(hit, segment.end, t1), t1)
 
 
 def _pieces(
     state: _Sum,
-    start: mi.Float,
+    start: mi.Float64,
     dt: mi.Float,
     sigma: Profile,
     source: Source,
@@ -163,7 +164,7 @@ def _pieces(
     thick = _largest([0.5 * dt * (a + b) for a, b in zip(near, far, strict=True)])
     count = dr.maximum(least, dr.ceil(thick / PIECE))
     if focus is not None:
-        count = dr.maximum(count, dr.select(focus.finite, dr.ceil(focus.angle(start, dt) / TURN), 1))
+        count = dr.maximum(count, dr.select(focus.finite, dr.ceil(focus.angle(mi.Float(start), dt) / TURN), 1))
     is_deep = on & (thick > MOST * PIECE)
     edges = _in_order(_dark_shares(state[0], dt, sigma, is_deep))
     lit = dr.select(_least(state[0]) < DARK, DEEP * len(edges) + 1, 1)
@@ -210,7 +211,7 @@ def _in_order(shares: list[mi.Float]) -> list[mi.Float]:
 @dr.syntax
 def _add_pieces(
     state: _Sum,
-    start: mi.Float,
+    start: mi.Float64,
     dt: mi.Float,
     sigma: Profile,
     source: Source,
@@ -229,7 +230,7 @@ def _add_pieces(
         share = mi.Float(index + 1) / mi.Float(count)
         far = share * dt
         if focus is not None:
-            far = dr.select(focus.finite, focus.sample(start, dt, share), far)
+            far = dr.select(focus.finite, focus.sample(mi.Float(start), dt, share), far)
         far = dr.select(is_deep, dt * _between(edges, index + 1), far)
         far = dr.select(index + 1 >= count, dt, dr.clip(far, near, dt))
         tau, T, light = _add_piece(tau, T, light, start, dt, near, far, sigma, source, going)
@@ -252,7 +253,7 @@ def _add_piece(
     tau: list[mi.Float],
     T: list[mi.Float],
     light: mi.Spectrum,
-    start: mi.Float,
+    start: mi.Float64,
     dt: mi.Float,
     near: mi.Float,
     far: mi.Float,
@@ -265,7 +266,7 @@ def _add_piece(
     places = [near + GAUSS * (far - near), near + (1 - GAUSS) * (far - near)]
     inverse = dr.rcp(dr.maximum(dt, 1e-30))
     values = [sigma(p * inverse) for p in places]
-    c = [source(start + p, on & (step > 0)) for p in places]
+    c = [source(start + mi.Float64(p), on & (step > 0)) for p in places]
     ahead, beyond, gain = [], [], []
     for k in range(len(tau)):
         s1, s2 = values[0][k], values[1][k]
@@ -284,7 +285,7 @@ def _add_piece(
 
 
 def _source(
-    scene: mi.Scene, world: World, body: Body, ray: mi.Ray3f, lamp: mi.Emitter, number: int, t: mi.Float, on: mi.Bool
+    scene: mi.Scene, world: World, body: Body, ray: mi.Ray3f, lamp: mi.Emitter, number: int, t: mi.Float64, on: mi.Bool
 ) -> mi.Spectrum:
     """Albedo times the light of one lamp that turns to the camera, at a point of its ray."""
     mei = interaction(ray, t, body.view.medium)

@@ -18,10 +18,10 @@ import mitsuba as mi
 
 from mivol.transport.direct import Arrival, Draw, arrivals
 from mivol.transport.free_flight import Event, Kept, Lamp, Pick, offer, place, start_pick
-from mivol.transport.path import Reach, Stretch, optical_depth_to, reach, transmittance
+from mivol.transport.path import Reach, Stretch, Way, add_optical_depth, reach, revisit, transmittance
 from mivol.transport.world import Body, World, spectrum
 
-__all__ = ["Scattering", "albedo", "at_event", "interaction", "scatter", "scattered_light", "sigma_t_at"]
+__all__ = ["Scattering", "albedo", "at_event", "interaction", "scatter", "scattered_light", "sigma_t_at", "way_to"]
 
 KAPPA = 4.0
 """Optical depth that a probe for derivatives adds over a body (measured: flat between 2 and 8)."""
@@ -132,17 +132,24 @@ def _light_up(
     mei = _interaction(world, ray, event)
     tau = event.tau
     if not world.is_single:
-        front = mi.Ray3f(ray.o, ray.d, event.t, ray.time, ray.wavelengths)
-        _, tau = optical_depth_to(scene, world, front, stretch.medium, event.on)
+        zero = [mi.Float(0) for _ in range(world.channels)]
+        tau = revisit(scene, world, way_to(stretch, event.t), add_optical_depth(ray), zero, event.on)
     gain = dr.select(event.on, stretch.beta * transmittance(tau) / event.pdf, 0)
     found = arrivals(scene, world, mei, lamp, draw, probes, event.on, estimates=not probes)
     return Scattering(event, mei, gain, found, _sigma_s(world, ray, event, mei), draw.choice)
 
 
-def interaction(ray: mi.Ray3f, t: mi.Float, medium: mi.Medium | None = None) -> mi.MediumInteraction3f:
-    """A point of a ray as Mitsuba's phase functions want it."""
+def way_to(stretch: Stretch, t: mi.Float64) -> Way:
+    """The first part of a stretch, of length ``t``."""
+    ray = stretch.ray
+    return Way(mi.Ray3f(ray.o, ray.d, mi.Float(t), ray.time, ray.wavelengths), stretch.medium, t)
+
+
+def interaction(ray: mi.Ray3f, t: mi.Float | mi.Float64, medium: mi.Medium | None = None) -> mi.MediumInteraction3f:
+    """A point of a ray as Mitsuba's phase functions want it, found in float64 and rounded once."""
     mei = dr.zeros(mi.MediumInteraction3f, dr.width(ray))
-    mei.t, mei.p, mei.wi = t, ray(t), -ray.d
+    p = [mi.Float(dr.fma(mi.Float64(t), mi.Float64(ray.d[a]), mi.Float64(ray.o[a]))) for a in range(3)]
+    mei.t, mei.p, mei.wi = mi.Float(t), mi.Point3f(*p), -ray.d
     mei.sh_frame = mi.Frame3f(mei.wi)
     mei.time, mei.wavelengths = ray.time, ray.wavelengths
     if medium is not None:

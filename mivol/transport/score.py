@@ -30,7 +30,7 @@ from mivol.transport.emission import backproject_emission, integrate_emission
 from mivol.transport.lamp_motion import shadow_of_moving
 from mivol.transport.path import Dimmed, Reach, Stretch, Way, optical_depth_to, reach, revisit, transmittance
 from mivol.transport.quadrature import integrate_scattering
-from mivol.transport.scatter import Scattering, albedo, at_event, scatter, scattered_light, sigma_t_at
+from mivol.transport.scatter import Scattering, albedo, at_event, scatter, scattered_light, sigma_t_at, way_to
 from mivol.transport.world import Body, World, by_channel, spectrum, tangent_of
 
 __all__ = ["Adjoint", "Primal", "Tangent"]
@@ -329,7 +329,7 @@ def _pull_source(
         if body.view.share is not None:
             share, name = dr.detach(albedo(body, event.mei, on)), "sigma_"
         body.deposit(ray, t, by_channel(dL * (event.weight * share - level), world.channels), on, name)
-    _backproject(scene, world, _way_to(stretch, t), -dL * (event.sigma_s * event.weight - lost), event.event.on)
+    _backproject(scene, world, way_to(stretch, t), -dL * (event.sigma_s * event.weight - lost), event.event.on)
 
 
 def _level_of(world: World, tau: list[mi.Float]) -> mi.Spectrum:
@@ -357,11 +357,6 @@ def _level_behind(world: World, stretch: Stretch, tau: list[mi.Float]) -> mi.Spe
     if world.level is None:
         return mi.Spectrum(0)
     return dr.select(stretch.scatters, stretch.beta * transmittance(tau) * _level_of(world, tau), 0)
-
-
-def _way_to(stretch: Stretch, t: mi.Float) -> Way:
-    ray = stretch.ray
-    return Way(mi.Ray3f(ray.o, ray.d, t, ray.time, ray.wavelengths), stretch.medium, t)
 
 
 def _sums(weight: mi.Spectrum, channels: int, of_control: int) -> list[list[tuple[int, mi.Float]]]:
@@ -418,7 +413,7 @@ def _push_source(
     """The tangent of the coefficients at the point and in front of it: the transpose of :func:`_pull_source`."""
     ray, t, k = stretch.ray, event.event.t, world.channels
     level, lost = _level_at(world, stretch, tau, event)
-    dL = -_tangent(scene, world, _way_to(stretch, t), event.event.on) * (event.sigma_s * event.weight - lost)
+    dL = -_tangent(scene, world, way_to(stretch, t), event.event.on) * (event.sigma_s * event.weight - lost)
     for body, on in at_event(world, event.event):
         share, name = mi.Spectrum(1), "sigma_s"
         if body.view.share is not None:

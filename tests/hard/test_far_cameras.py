@@ -1,0 +1,101 @@
+"""Dense media seen from afar: extinctions of 1e5 and more, cameras hundreds of box sizes away.
+
+A float32 distance of 300 is rounded by 1.5e-5: 15 optical depths of an extinction of 1e6. Where a stretch begins, how long it
+is and where a point lies are therefore found in float64. The face that is seen lies at z = 0, where coordinates are exact:
+what float32 points may do to shadow rays is no part of these tests.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from scattering_scenes import mivol, pencils, sun
+
+from mivol.validate.statistics import assert_same_mean
+from scenes import affine, box_of, grid_volume, medium
+
+pytestmark = pytest.mark.usefixtures("variant_rgb")
+
+MU, ALBEDO, IRRADIANCE = 0.6, 0.8, 2.0
+TRUTH = ALBEDO * IRRADIANCE / (4 * np.pi) / (1 + 1 / MU)
+"""Of a half-space, seen along its normal and lit at the cosine MU, whatever its extinction."""
+
+PARTS = {
+    "homogeneous": lambda s: medium("homogeneous", s, ALBEDO),
+    "grid": lambda s: medium("mivol_medium", grid_volume("mivol_voxels", np.full((4, 3, 5, 1), s)), ALBEDO),
+    "both": lambda s: {
+        "type": "mivol_medium",
+        "sigma_s": grid_volume("mivol_voxels", np.full((4, 3, 5, 1), ALBEDO * s)),
+        "sigma_a": (1 - ALBEDO) * s,
+    },
+}
+
+
+def half_space(name: str, sigma: float, away: float, beside: bool = False):
+    """A dense box above z = 0, lit from below, seen by one ray from ``away`` below it."""
+    box = box_of(PARTS[name](sigma), np.eye(4))
+    parts = {"box": box, "lamp": sun([0.8, 0, MU], IRRADIANCE)[0]}
+    if beside:  # a second medium: the optical depth in front of a point is walked again
+        parts["other"] = box_of(medium("homogeneous", 1.0), affine(np.eye(3), [0, 0, 2]))
+    return pencils(parts, [0.55, 0.45, -away], [0.0, 0.0, 1.0])
+
+
+@pytest.mark.parametrize("away", [30.7, 300.7])
+@pytest.mark.parametrize("sigma", [1e5, 1e6])
+@pytest.mark.parametrize("name", PARTS)
+def test_quadrature(name, sigma, away):
+    found = half_space(name, sigma, away).scene
+    found = np.array(mi.render(found, integrator=mi.load_dict(mivol(deterministic=True)), spp=1))[0, 0]
+    # The error of the rule, as in tests/analytic/test_quadrature.py.
+    assert np.abs(found / TRUTH - 1).max() <= 1e-4
+
+
+@pytest.mark.parametrize("beside", [False, True], ids=["alone", "beside another"])
+@pytest.mark.parametrize("name", PARTS)
+def test_drawn_light(name, beside):
+    m = half_space(name, 1e6, 300.7, beside).moments(mivol(), 1024)
+    error = np.sqrt(m.variance_of_mean).max() / TRUTH
+    assert error < 0.02
+    assert_same_mean(m.mean, m.variance_of_mean, np.full_like(m.mean, TRUTH), n_a=m.n, rounding=1e-5 * TRUTH, what="rays")
+
+
+@pytest.mark.parametrize("name", ["homogeneous", "grid"])
+def test_derivative_of_the_extinction(name):
+    """None: what is lit nearer to the face is what is dimmed behind it. Each half of it is as large as the light."""
+    scene = half_space(name, 1e6, 300.7).scene
+    params, found = mi.traverse(scene), []
+    key = next(k for k, _ in params if k.endswith(("sigma_t.data", "sigma_t.value.value")))
+    for seed in range(16):
+        dr.enable_grad(params[key])
+        dr.set_grad(params[key], 0)
+        image = mi.render(scene, params, integrator=mi.load_dict(mivol()), spp=1024, seed=seed)
+        dr.backward(dr.mean(image, axis=None))
+        found.append(np.array(dr.grad(params[key])).sum() * 1e6)
+    mean, error = np.mean(found), np.std(found, ddof=1) / 4
+    assert error < 0.05 * TRUTH
+    # Student's t with 15 degrees of freedom: 7.3 standard errors at 1e-6 (both sides).
+    assert abs(mean) <= 7.3 * error
+
+
+THIN = 2.0**-17
+"""Thickness of a sheet whose extinction is the inverse: optical depth 1. Seen from 30, it is four steps of float32 thick."""
+
+
+@pytest.mark.parametrize("away", [0.5, 30.7])
+def test_thin_sheets(away):
+    """Emission, and scattered light, of a sheet of optical depth 1: its length is a difference of distances."""
+    sheet = affine(np.diag([1, 1, THIN]))
+    o, d = [0.55, 0.45, -away], [0.0, 0.0, 1.0]
+    glow = box_of(medium("mivol_medium", 1 / THIN, emission=2.0), sheet)
+    seen = np.array(mi.render(pencils({"sheet": glow}, o, d).scene, integrator=mi.load_dict(mivol(max_depth=1)), spp=1))
+    # The sheet is as thick as float32 vertices have it: exactly. The rest is some roundings of float32.
+    assert np.abs(seen / (2 * (1 - np.exp(-1))) - 1).max() <= 1e-6
+    fog = box_of(medium("homogeneous", 1 / THIN, ALBEDO), sheet)
+    fog = pencils({"sheet": fog, "lamp": sun([0.8, 0, MU], IRRADIANCE)[0]}, o, d)
+    truth = TRUTH * (1 - np.exp(-(1 + 1 / MU)))
+    seen = np.array(mi.render(fog.scene, integrator=mi.load_dict(mivol(deterministic=True)), spp=1))
+    assert np.abs(seen / truth - 1).max() <= 1e-4
+    m = fog.moments(mivol(), 1024)
+    assert_same_mean(m.mean, m.variance_of_mean, np.full_like(m.mean, truth), n_a=m.n, rounding=1e-5 * truth, what="rays")
