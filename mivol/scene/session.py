@@ -121,8 +121,9 @@ class Session:
             named = [sensor.get_medium() for sensor in scene.sensors()]
             world.start = named[0] if all(medium is named[0] for medium in named) else None
             world.locates = bool(world.traced)
-            score, valid = walk_path(scene, world, self.settings, sampler, ray, Primal(_black(ray)), active)
-            return score.L, valid, integrate_aovs(scene, world, ray, self.aovs, active)
+            score, alpha = walk_path(scene, world, self.settings, sampler, ray, Primal(_black(ray)), active)
+            # Their alpha is whether something is seen: it is drawn.
+            return score.L, sampler.next_1d(active) < alpha, integrate_aovs(scene, world, ray, self.aovs, active)
 
     def _open(self, scene: mi.Scene, sensor: mi.Sensor, spp: int, pictures: bool = False) -> tuple[World, Plan]:
         """Ask, plan, and build the media, for pictures or for derivatives."""
@@ -150,15 +151,15 @@ class Session:
 
     def _primal(self, scene: mi.Scene, world: World, rays: Rays) -> tuple:
         score = Primal(_black(rays.ray))
-        score, valid = walk_path(scene, world, self.settings, rays.sampler, rays.ray, score, strata=rays.strata)
-        return score.L, valid, integrate_aovs(scene, world, rays.ray, self.aovs)
+        score, alpha = walk_path(scene, world, self.settings, rays.sampler, rays.ray, score, strata=rays.strata)
+        return score.L, alpha, integrate_aovs(scene, world, rays.ray, self.aovs)
 
     def _tangent(self, scene: mi.Scene, world: World, rays: Rays) -> tuple:
         _take_control(scene, world, rays)
         black = _black(rays.ray)
         score = Tangent(black, black, black)
         score, _ = walk_path(scene, world, self.settings, rays.sampler, rays.ray, score, strata=rays.strata)
-        return score.dL, dr.full(mi.Bool, False, dr.width(black)), push_aovs(scene, world, rays.ray, self.aovs)
+        return score.dL, dr.zeros(mi.Float, dr.width(black)), push_aovs(scene, world, rays.ray, self.aovs)
 
     def _replay(self, scene: mi.Scene, world: World, rays: Rays, dL: mi.Spectrum, daovs: list[mi.Float]) -> None:
         _take_control(scene, world, rays)

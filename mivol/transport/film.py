@@ -64,7 +64,7 @@ class Rays:
 
 
 Sample = Callable[[Rays], tuple]
-"""``sample(rays)``: what rays carry: radiance, whether the film's alpha sees something, and the AOVs."""
+"""``sample(rays)``: what rays carry: radiance, what the film's alpha sees (in [0, 1], without derivatives), and the AOVs."""
 
 
 def film_passes(sensor: mi.Sensor, seed: int, spp: int, pass_rays: int, layout: str = PLAIN) -> Iterator[Rays]:
@@ -188,12 +188,12 @@ def record(
     film = sensor.film()
     film.prepare(names)
     for rays in film_passes(sensor, seed, spp, pass_rays, layout):
-        L, valid, aovs = sample(rays)
+        L, alpha, aovs = sample(rays)
         block = _new_block(film, rays)
-        _splat(block, film, rays, L * rays.weight, mi.Float(1), dr.select(valid, mi.Float(1), mi.Float(0)), aovs)
+        _splat(block, film, rays, L * rays.weight, mi.Float(1), alpha, aovs)
         film.put_block(block)
         dr.eval(block.tensor())
-        del L, valid, aovs, rays, block
+        del L, alpha, aovs, rays, block
     return film.develop()
 
 

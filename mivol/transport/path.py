@@ -299,7 +299,8 @@ class Path:
     """The state of a path.
 
     ``beta`` is the throughput so far, without the stretch ahead; ``pdf`` and ``delta`` tell how its direction was
-    sampled at ``last`` (for the power heuristic); ``valid`` whether the film's alpha sees something.
+    sampled at ``last`` (for the power heuristic). For the film's alpha: ``stopped`` tells whether a surface stopped or turned
+    the path, ``clear`` how much of each channel the media let through up to there.
     """
 
     ray: mi.Ray3f
@@ -310,7 +311,8 @@ class Path:
     last: mi.Interaction3f
     pdf: mi.Float
     delta: mi.Bool
-    valid: mi.Bool
+    stopped: mi.Bool
+    clear: mi.Spectrum
     active: mi.Bool
     score: Any
     sampler: mi.Sampler
@@ -326,7 +328,7 @@ def walk_path(
     score: Any,
     active: mi.Bool = True,
     strata: Strata | None = None,
-) -> tuple[Any, mi.Bool]:
+) -> tuple[Any, mi.Float]:
     """Walk a path from the camera and give what it carries to a score.
 
     Args:
@@ -340,7 +342,7 @@ def walk_path(
         strata: parts of the square that directions at media are drawn from.
 
     Returns:
-        The score, and whether the film's alpha sees something.
+        The score, and what the film's alpha sees, in [0, 1].
 
     Bias: none. Variance: none at depth 1 beyond the pixel's own; emitter and BSDF sampling at surfaces.
     """
@@ -356,22 +358,32 @@ def walk_path(
         last=dr.zeros(mi.Interaction3f, n),
         pdf=dr.full(mi.Float, 1, n),
         delta=dr.full(mi.Bool, True, n),
-        valid=dr.full(mi.Bool, visible, n),
+        stopped=dr.full(mi.Bool, visible, n),
+        clear=dr.full(mi.Spectrum, 1, n),
         active=mi.Bool(active) & (limit > 0),
         score=score,
         sampler=sampler,
         strata=strata,
     )
     if is_straight(world, settings):
-        path = _see(scene, world, settings, limit, path)[0]
-        return path.score, path.valid
+        path, end = _see(scene, world, settings, limit, path)
+        return path.score, _alpha(path.stopped | (path.active & end.si.is_valid()), path.clear)
     (path,) = dr.while_loop(
         state=(path,),
         cond=lambda p: p.active,
         body=lambda p: (_bounce(scene, world, settings, limit, *_see(scene, world, settings, limit, p)),),
         label="path",
     )
-    return path.score, path.valid
+    return path.score, _alpha(path.stopped, path.clear)
+
+
+def _alpha(stopped: mi.Bool, clear: mi.Spectrum) -> mi.Float:
+    """What a film's alpha sees of a path: all of it where a surface stopped it, else the opacity of the media.
+
+    This is the mean of what ``volpath`` draws from ``max_depth`` 2 on (1 where it finds a point in a medium or on a surface),
+    without its noise. At depth 1 ``volpath`` finds no points in media, and its smoke has no alpha; here it has the same one.
+    """
+    return dr.select(stopped, 1, 1 - sum(clear[c] for c in range(dr.size_v(clear))) / dr.size_v(clear))
 
 
 def camera_ray(ray: mi.Ray3f) -> mi.Ray3f:
@@ -392,7 +404,9 @@ def _see(scene: mi.Scene, world: World, settings: Settings, limit: int, path: Pa
     # A copy: the throughput is dimmed in place below, and a score may look at the stretch again after that.
     stretch = Stretch(path.ray, path.medium, mi.Spectrum(path.beta), scatters, draw)
     end, tau, path.score = path.score.stretch(scene, world, stretch, path.active)
-    path.beta *= transmittance(tau)
+    T = transmittance(tau)
+    path.beta *= T
+    path.clear *= T
     path.medium = end.medium
 
     si = end.si
@@ -405,7 +419,6 @@ def _see(scene: mi.Scene, world: World, settings: Settings, limit: int, path: Pa
     with dr.resume_grad(when=path.score.attached):
         Le = emitter.eval(si, shown)
         path.score = path.score.add(path.beta * w_mis * Le, shown)
-    path.valid |= path.active & si.is_valid()
     return path, end
 
 
@@ -440,6 +453,7 @@ def _bounce(scene: mi.Scene, world: World, settings: Settings, limit: int, path:
     sample, f_over_pdf = bsdf.sample(mi.BSDFContext(), si, u1, u2, on_surface)
     through = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Null)
     # A direction of density 0 has the weight 0, and its path ends below.
+    path.stopped |= on_surface & ~through
     on = on_surface & (may_scatter | through)
     score = score.turn(bsdf, si, sample.wo, on & ~through)
     path.beta *= dr.select(on, f_over_pdf, 0)

@@ -1,0 +1,71 @@
+"""The alpha of a film: what a camera ray meets, a surface or media, on its way straight ahead."""
+
+from __future__ import annotations
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from scattering_scenes import fog, mivol, moments, rough_grid, smoke, volpath
+
+from mivol.validate.statistics import assert_same_mean
+from scenes import ball_of, camera, film, medium, sky
+
+pytestmark = pytest.mark.usefixtures("variant_rgb")
+
+RGBA = film(8, 8) | {"pixel_format": "rgba"}
+
+
+def seen(parts: dict) -> mi.Scene:
+    return mi.load_dict({"type": "scene", **parts, "sensor": camera((1.5, -2.5, 1.2), (0, 0, 0), fov=50.0) | {"film": RGBA}})
+
+
+def mask(opacity: float) -> dict:
+    place = mi.ScalarTransform4f().look_at([0.6, -1, 0.5], [1.5, -2.5, 1.2], [0, 0, 1]) @ mi.ScalarTransform4f().scale(0.5)
+    return {"type": "rectangle", "to_world": place, "bsdf": {"type": "mask", "opacity": opacity, "nested": {"type": "diffuse"}}}
+
+
+BALL = {"type": "sphere", "radius": 0.4, "bsdf": {"type": "diffuse"}}
+SCENES = {
+    "thin": lambda: {"fog": fog(0.2)[0]},
+    "thick": lambda: {"fog": fog(5.0)[0]},
+    "grid": lambda: {"smoke": smoke(rough_grid(1))[0]},
+    "traced": lambda: {"fog": ball_of(medium("homogeneous", 0.8), (0, 0, 0), 1.0)},
+    "ball in a grid": lambda: {"smoke": smoke(rough_grid(1))[0], "ball": BALL},
+    "mask": lambda: {"smoke": smoke(rough_grid(1))[0], "ball": BALL, "mask": mask(0.6)},
+}
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_alpha_is_what_volpath_draws(name):
+    """Welch's t, 16 batches each; emitters are hidden, so that the sky does not count."""
+    scene = seen(SCENES[name]() | {"sky": sky(0.5)})
+    ours, stock = moments(scene, mivol(hide_emitters=True), 64), moments(scene, volpath(hide_emitters=True), 256, first=500)
+    a, b = ((m.mean[..., 3:], m.variance_of_mean[..., 3:]) for m in (ours, stock))
+    # Rays of volpath enter 1e-4 behind a boundary; sums of 256 float32 ones and zeros.
+    rounding = 1e-3
+    assert_same_mean(*a, *b, n_a=16, n_b=16, tile=4, rounding=rounding)
+    whole = [(m.mean(), v.sum() / 64**2) for m, v in (a, b)]
+    assert_same_mean(*(np.array([x]) for pair in whole for x in pair), n_a=16, n_b=16, rounding=rounding)
+    assert whole[1][1] < 0.01**2 and 0.05 < whole[0][0] < 0.999
+
+
+def test_alpha_is_the_opacity_at_any_depth():
+    """At depth 1 too, where volpath finds no point in a medium: 1 - exp(-tau), the mean of the channels, without noise."""
+    grey, rgb = fog(0.5)[0], {"type": "rgb", "value": [0.2, 1.0, 4.0]}
+    colourful = grey | {"interior": medium("mivol_medium", rgb)}
+    for parts in ({"fog": grey}, {"fog": colourful}, {"fog": grey, "ball": BALL}):
+        scene = seen(parts)
+        for depth in (1, 2):
+            image = np.array(mi.render(scene, integrator=mi.load_dict(mivol(max_depth=depth, aovs="alpha")), spp=16))
+            np.testing.assert_allclose(image[..., 3], image[..., 4], atol=1e-6)
+            assert image[..., 3].max() > 0.5
+
+
+def test_nested_integrators_draw_it():
+    scene = seen(SCENES["thin"]() | {"sky": sky(0.5)})
+    alone = moments(scene, mivol(hide_emitters=True), 64)
+    nested = moments(scene, {"type": "moment", "inner": mivol(hide_emitters=True)}, 64, first=500)
+    a, b = (np.array([m.mean[..., 3].mean()]) for m in (alone, nested))
+    var_a, var_b = (np.array([m.variance_of_mean[..., 3].sum() / 64**2]) for m in (alone, nested))
+    assert_same_mean(a, var_a, b, var_b, n_a=16, n_b=16, rounding=1e-6)
+    assert var_b[0] < 0.01**2
