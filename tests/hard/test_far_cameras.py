@@ -79,8 +79,8 @@ def test_derivative_of_the_extinction(name):
     assert abs(mean) <= 7.3 * error
 
 
-THIN = 2.0**-17
-"""Thickness of a sheet whose extinction is the inverse: optical depth 1. Seen from 30, it is four steps of float32 thick."""
+THIN = 2.0**-20
+"""Thickness of a sheet whose extinction is the inverse: optical depth 1. Seen from 30, it is half a step of float32 thick."""
 
 
 @pytest.mark.parametrize("away", [0.5, 30.7])
