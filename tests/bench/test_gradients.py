@@ -61,15 +61,14 @@ def test_density_0_tells_a_biased_estimator_from_ours(variant_rgb: str) -> None:
 
 
 def test_gradients_of_a_mean_and_of_a_loss(variant_rgb: str) -> None:
-    """The loss of a picture against itself, without noise in its mean, has the derivative 2 (picture - target) / n of each."""
-    both = subjects(np.full((2, 2, 2), 0.5, np.float32), 4, LIGHTS["constant light"])
-    ours = both[OURS]
-    dark = mi.TensorXf(np.zeros((4, 4, 3), np.float32))
-    mean, loss = np.array(ours.of_mean(3, 16)), np.array(ours.of_loss(dark, 3, 16))
+    """Against the picture less 3, the derivative of the squared difference is 6 times that of the mean. The sum over voxels is
+    known to a few percent by 64 samples of 16 pixels, and its seeds are fixed: 4 to 8 tells it from 1, 3 and 12."""
+    ours = subjects(np.full((2, 2, 2), 0.5, np.float32), 4, LIGHTS["constant light"])[OURS]
+    picture = mi.render(ours.scene, integrator=ours.integrator, spp=256, seed=1)
+    mean, loss = np.array(ours.of_mean(3, 64)), np.array(ours.of_loss(picture - 3, 3, 64))
     assert mean.shape == loss.shape == (8,)
-    # Radiance is at most 1 and about 0.9 where the cube is seen: the derivative of its square is below twice its own.
     assert np.all(mean < 0)
-    assert np.all((loss < 0) & (loss > 2.02 * mean))
+    assert 4 < loss.sum() / mean.sum() < 8
 
 
 def test_a_region_has_its_own_variance_and_derivative() -> None:
@@ -142,11 +141,10 @@ def test_differences_are_exact_for_a_parabola() -> None:
 
 
 def test_refined_until_the_mean_is_known_well_enough() -> None:
-    """Of unit variance about 10: 1 % of the mean needs 100 values; the estimate of the variance is known to 15 % then."""
-    rng = np.random.default_rng(7)
+    """Values that swing by 1 about 10: the mean of n has the variance 1 / (n - 1), which is (1 % of 10)^2 at 101 or so."""
     numbers = []
-    found = refine(rng.normal(10, 1, 16), lambda k: numbers.append(k) or rng.normal(10, 1), 1.0, 1000)
-    assert 60 < len(found) < 160
+    found = refine([9.0, 11.0] * 8, lambda k: numbers.append(k) or 9.0 + 2 * (k % 2), 1.0, 1000)
+    assert len(found) in (101, 102)
     assert numbers == list(range(16, len(found)))
     assert len(refine(found, None, math.inf, 1000)) == len(found)
     assert len(refine(found, None, 0.0, len(found))) == len(found)

@@ -64,28 +64,36 @@ def test_volumes_have_the_resolution_of_their_size(variant_rgb: str) -> None:
         assert bench.VOLUMES[name](size).values.shape == (res,) * 3
 
 
+def swings(rounds: int, pixels: int) -> np.ndarray:
+    """(rounds, pixels, 1): every pixel swings by 1 about 0, neighbours against each other, so that no round stands out."""
+    return np.where(np.add.outer(np.arange(rounds), np.arange(pixels)) % 2, 1.0, -1.0)[..., None]
+
+
 def test_a_bias_of_six_standard_errors_is_seen() -> None:
-    """2000 pixels of unit variance, 8 rounds: the mean has the error sqrt(2 / 16000), and the bound is 4.2 of them."""
-    rng = np.random.default_rng(3)
-    a, b = rng.normal(10, 1, (2, 8, 2000, 1))
-    counts = np.ones((2000, 1), bool)
-    assert abs(bench.difference(fake(a), fake(b), counts)["z"]) < 4.3
-    found = bench.difference(fake(a), fake(b + 10 * math.sqrt(2 / 16000)), counts)
-    assert found["z"] > found["z_bound"]
-    assert found["relative_standard_error"] == pytest.approx(math.sqrt(2 / 16000) / 10, rel=0.05)
+    """2000 pixels that swing by 1 over 8 rounds: each mean has the variance 1 / (7 x 2000), and t has 28,000 degrees of
+    freedom, so that the bound is the normal law's, 4.2."""
+    a, counts = 10 + swings(8, 2000), np.ones((2000, 1), bool)
+    error = math.sqrt(2 / 14000)
+    found = bench.difference(fake(a), fake(a[::-1] + 6 * error), counts)
+    assert found["z"] == pytest.approx(6)
+    assert found["z_bound"] == pytest.approx(4.2, abs=0.05)
+    assert found["relative_standard_error"] == pytest.approx(error / 10, rel=0.01)
 
 
 def test_equal_error_weighs_variance_and_time() -> None:
-    """Twice the deviation and three times the time: 12."""
-    rng = np.random.default_rng(4)
-    fast, slow = (fake(rng.normal(0, s, (8, 4000, 1)), seconds) for s, seconds in ((1, 1.0), (2, 3.0)))
-    got = bench.gain(slow, fast, np.ones((4000, 1), bool))
-    # the variance of 8 values is known to sqrt(2/7) of itself, that of 4000 of them to 0.85 %, their ratio to 1.2 %: 6 times
-    assert got["variance_x_time_mean_over_pixels"] == pytest.approx(12, rel=0.072)
-    # the ratio of two chi-square of 7 degrees of freedom has the median 1 and there the density 0.5 a unit of its logarithm:
-    # the median of 4000 is known to 1 / (2 * 0.5 * sqrt(4000)) = 1.6 %: 6 of it
-    assert got["variance_x_time_median_over_pixels"] == pytest.approx(12, rel=0.095)
+    """Twice the deviation and three times the time: 12. Pixels without any noise count for neither; where a quarter of the
+    others has ten times the deviation, the mean shows it and the median does not."""
+    swing, counts = swings(8, 400), np.ones((400, 1), bool)
+    swing[:, 200:] = 0
+    got = bench.gain(fake(2 * swing, 3.0), fake(swing), counts)
+    assert got["variance_x_time_mean_over_pixels"] == pytest.approx(12)
+    assert got["variance_x_time_median_over_pixels"] == pytest.approx(12)
     assert (got["time"], got["processor_time"]) == (3, 3)
+    uneven = 2 * swing
+    uneven[:, 150:] *= 10
+    got = bench.gain(fake(uneven, 3.0), fake(swing), counts)
+    assert got["variance_x_time_mean_over_pixels"] == pytest.approx(12 * (0.75 + 0.25 * 100))
+    assert got["variance_x_time_median_over_pixels"] == pytest.approx(12)
 
 
 def test_pixels_at_the_lamp_do_not_count(variant_rgb: str) -> None:
