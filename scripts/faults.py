@@ -15,6 +15,7 @@ from bisect import bisect_left
 from collections import defaultdict
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import cache
 from itertools import pairwise
 from pathlib import Path
 
@@ -42,6 +43,9 @@ OF_TYPES = ("isinstance", "issubclass", "cast", "TypeVar")
 
 GENERICS = ("Annotated", "Callable", "Literal", "dict", "list", "tuple", "type")
 BUILT_IN = ("bool", "bytes", "complex", "dict", "float", "int", "list", "object", "set", "str", "tuple")
+
+DECLARATIONS = ("annotation", "returns", "decorator_list", "type_params", "bases")
+"""Fields of nodes that say what something is, not what it does; the keywords of a class are such, too."""
 
 SMALL, LARGE = 1e-6, 1e6
 """Outside of them a constant stands for zero or for infinity: twice as much of it is the same."""
@@ -92,14 +96,10 @@ class _Text:
 
     def operator(self, start: int, end: int) -> tuple[int, str]:
         """Place and text of the operator between two operands; parentheses around them are passed over."""
-        found = []
-        for place, word in self._tokens[bisect_left(self._tokens, (start, "")) :]:
-            if place >= end:
-                break
-            if word not in ("(", ")"):
-                found.append(place)
-        last = next(len(w) for p, w in self._tokens if p == found[-1])
-        return found[0], self.source[found[0] : found[-1] + last]
+        between = self._tokens[bisect_left(self._tokens, (start, "")) : bisect_left(self._tokens, (end, ""))]
+        words = [(place, word) for place, word in between if word not in ("(", ")")]
+        first, (last, word) = words[0][0], words[-1]
+        return first, self.source[first : last + len(word)]
 
 
 def read_package(root: Path, package: str = "mivol") -> dict[str, str]:
@@ -129,15 +129,23 @@ def draw_faults(sources: Mapping[str, str], count: int, seed: int) -> list[Fault
     return [generator.choice(places[generator.choice(sorted(places))]) for places in chosen]
 
 
-def find_faults(file: str, source: str) -> list[Fault]:
+@cache
+def find_faults(file: str, source: str) -> tuple[Fault, ...]:
     """All faults that a file can be given, in the order of its text."""
-    text = _Text(source)
-    found = set()
-    for node in _walk(ast.parse(source, file)):
+    text, tree, found = _Text(source), ast.parse(source, file), set()
+    indices = {id(n.slice) for n in ast.walk(tree) if _has_index(n)}
+    for node in _walk(tree):
+        if id(node) in indices:
+            continue
         for start, end, new, kind in _faults_of(node, text):
             line = source.count("\n", 0, start) + 1
             found.add(Fault(file, line, start, source[start:end], new, kind))
-    return sorted(found, key=lambda f: (f.start, f.old, f.new))
+    return tuple(sorted(found, key=lambda f: (f.start, f.old, f.new)))
+
+
+def _has_index(node: ast.AST) -> bool:
+    """Whether a node takes an element by a number that is written there."""
+    return isinstance(node, ast.Subscript) and isinstance(node.slice, ast.Constant) and type(node.slice.value) is int
 
 
 def _walk(node: ast.AST) -> Iterator[ast.AST]:
@@ -146,7 +154,7 @@ def _walk(node: ast.AST) -> Iterator[ast.AST]:
         return
     yield node
     for name, value in ast.iter_fields(node):
-        if name in ("annotation", "returns", "decorator_list", "type_params", "bases"):
+        if name in DECLARATIONS or (isinstance(node, ast.ClassDef) and name == "keywords"):
             continue
         children = value if isinstance(value, list) else [value]
         for child in children:
@@ -200,6 +208,10 @@ def _faults_of(node: ast.AST, text: _Text) -> Iterator[tuple[int, int, str, str]
     elif isinstance(node, ast.Attribute) and node.attr in AXES and isinstance(node.ctx, ast.Load):
         end = text.span(node)[1]
         yield end - 1, end, AXES[node.attr], "index"
+    elif _has_index(node):
+        start, end = text.span(node.slice)
+        for other in {node.slice.value + 1, abs(node.slice.value - 1)}:
+            yield start, end, repr(other), "index"
     elif isinstance(node, ast.Call):
         yield from _swap_function(node, text)
     if isinstance(node, ast.If | ast.IfExp | ast.While):

@@ -126,6 +126,15 @@ def test_a_film_without_ffmpeg_is_an_animated_image(
     assert '<img alt="3 views around the box" src="data:image/webp;base64,' in page and "<video" not in page
 
 
+def test_what_a_field_takes_is_told_in_bytes_a_node(tmp_path: Path, variant_rgb: str) -> None:
+    """Of 6^3 nodes: 4 numbers of a byte, 4 of four bytes; a density and 3 colours, in rows of 4, of four bytes."""
+    (tmp_path / "field.npz").write_bytes(bytes(864))
+    table = photo_outputs.storage(ball(6), tmp_path / "field.npz")
+    assert [row[2] for row in table.rows] == ["4", "16", "20", "20", "4"]
+    assert [row[1] for row in table.rows][-1] == f"{864 / 2**20:.2f} MiB"
+    assert table.head[0] == "216 of 216 nodes are kept (100.0%)"
+
+
 def test_what_is_behind_is_learned(photographs: Path, tmp_path: Path) -> None:
     """Views over white, said to be over black: a sky finds the white, and is kept as an image beside the field."""
     path = toml(tmp_path, photographs)
