@@ -28,4 +28,6 @@ def test_wheel(tmp_path: Path) -> None:
     assert parsed["mitsuba"]["mivol"] == "mivol.plugins"
     assert any(name.endswith("licenses/LICENSE") for name in names)
     assert "Requires-Dist: mitsuba<3.10,>=3.9.1" in metadata
+    # SSIM, which fits of photographs are judged by, is no extra (such a line would end with its name).
+    assert "Requires-Dist: scikit-image>=0.25" in metadata.splitlines()
     assert "License-Expression: BSD-3-Clause" in metadata
