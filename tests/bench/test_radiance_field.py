@@ -16,6 +16,7 @@ from mivol.bench.radiance_field.fields import FIELDS, centred
 from mivol.bench.radiance_field.fits import EVERY, follow, held_out_psnr, our_fit, peer_fit
 from mivol.bench.radiance_field.steps import ask_memory, our_step, peer_of, peer_step, tasks
 from mivol.bench.radiance_field.views import BOX, between, photographed, rays_of, rays_through, ring, tiled
+from mivol.photos import Camera, Photo, intrinsics
 from mivol.transport.radiance import bake, cells_of, look, model_of
 
 TINY = replace(QUICK, resolution=8, side=16, steps=EVERY, fit_resolution=8, fit_side=16, chair_steps=8, fields=("fog",))
@@ -55,6 +56,15 @@ def test_both_fits_learn_the_views(variant_rgb: str) -> None:
         assert len(curve) == stages
         assert curve[-1][1] > black + 1
         assert all(0 < early < late for (early, _), (late, _) in itertools.pairwise(curve))
+
+
+def test_views_that_are_hit_exactly_count_100_decibels() -> None:
+    """The mean over views: 100 dB for the one that is right, 20 dB for that off by a tenth, whatever lies beyond 1 cut off."""
+    camera = Camera(intrinsics(8, 8, 4, 4), (8, 8), np.eye(4))
+    shown = {"right": 1.0, "off": 0.9}
+    views = [Photo(name, np.full((8, 8, 3), v, np.float32), None, None, camera, np.zeros(3)) for name, v in shown.items()]
+    # float32 rounds 0.9 by 3e-8 of it, which is 2e-6 dB of an error of 0.1.
+    assert held_out_psnr(views, lambda camera: np.full((8, 8, 3), 1.5)) == pytest.approx((100 + 20) / 2, abs=1e-5)
 
 
 def test_views_show_the_field(variant_rgb: str) -> None:
