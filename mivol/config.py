@@ -17,11 +17,14 @@ from typing import Annotated, Any, get_args, get_origin, get_type_hints
 import msgspec
 
 from mivol.errors import MivolError
+from mivol.optim.adam import Adam
 from mivol.optim.events import Checkpoint, Evaluate, Upsample
+from mivol.optim.gauss_newton import GaussNewton
+from mivol.optim.lbfgs import Lbfgs
 from mivol.optim.losses import L1, L2, Huber, Log, RelativeL2
-from mivol.optim.optimisers import Adam, GaussNewton, Lbfgs
 from mivol.optim.parameters import MAPS
 from mivol.optim.priors import Bounds, HuberTotalVariation, Laplacian, Sparse, TotalVariation
+from mivol.optim.rmsprop import RMSprop
 from mivol.optim.schedules import Constant, Cosine, Exponential, Step
 from mivol.optim.solvers import SOLVERS
 from mivol.optim.strategy import nearest, of
@@ -120,7 +123,7 @@ class Experiment(Section):
     reference: Annotated[Rendered | Files, of("1", "what was seen")] = Rendered()
     truth: Annotated[Truth | None, of("1", "what the references show, where known")] = None
     fit: Annotated[Fit, of("1", "how long and how finely")] = Fit()
-    optimiser: Annotated[Adam | Lbfgs | GaussNewton, of("1", "how to walk downhill")] = Adam()
+    optimiser: Annotated[Adam | RMSprop | Lbfgs | GaussNewton, of("1", "how to walk downhill")] = Adam()
     schedule: Annotated[Constant | Cosine | Step | Exponential, of("1", "factor on the learning rate")] = Constant()
     loss: Annotated[L1 | L2 | RelativeL2 | Huber | Log, of("1", "distance of image and reference")] = L2()
     event: Annotated[tuple[Upsample | Checkpoint | Evaluate, ...], of("1", "what happens between iterations")] = (

@@ -6,12 +6,12 @@ from pathlib import Path
 
 import mivol  # noqa: F401  (chooses the LLVM library; call it before the first variant)
 from mivol.fields.procedural import make_procedural
+from mivol.optim.gauss_newton import GaussNewton
 from mivol.optim.loop import reconstruct
-from mivol.optim.optimisers import GaussNewton
 from mivol.optim.parameters import Parameter
 from mivol.optim.priors import HuberTotalVariation
-from mivol.optim.problem import Problem
-from mivol.optim.shots import View
+from mivol.optim.render_batches import View
+from mivol.optim.scene_problem import SceneProblem
 from mivol.scene.cameras import Hemisphere
 
 import mitsuba as mi
@@ -31,7 +31,8 @@ views = [View(f"view {i}", s, mi.render(scene, sensor=s, spp=256, seed=i)) for i
 params[key] = mi.TensorXf(np.full((20, 20, 20, 1), 0.1, dtype=np.float32))
 params.update()
 prior = HuberTotalVariation(weight=3e-5, edge=1.0)
-problem = Problem(scene, views, [Parameter(key, domain=(0, np.inf), priors=(prior,))], mi.load_dict({"type": "mivol"}), spp=16)
+parameter = Parameter(key, domain=(0, np.inf), priors=(prior,))
+problem = SceneProblem(scene, views, [parameter], mi.load_dict({"type": "mivol"}), spp=16)
 fit = reconstruct(problem, GaussNewton(), 8, observer=lambda fit: print(fit.history[-1]))
 
 found = np.asarray(fit.values()[key])

@@ -6,8 +6,8 @@ import mitsuba as mi
 import numpy as np
 
 from mivol.optim.parameters import Parameter
-from mivol.optim.problem import Problem
-from mivol.optim.shots import View
+from mivol.optim.render_batches import View
+from mivol.optim.scene_problem import SceneProblem
 
 KEY = "cube.interior_medium.sigma_t.data"
 
@@ -63,11 +63,11 @@ def views_of_truth(truth: np.ndarray, sensors: list[mi.Sensor], spp: int = 64) -
     return [View(f"view {i}", s, mi.TensorXf(image)) for i, (s, image) in enumerate(zip(sensors, images, strict=True))]
 
 
-def small_problem(start: float = 0.3, n_views: int = 3, **settings: object) -> Problem:
+def small_problem(start: float = 0.3, n_views: int = 3, **settings: object) -> SceneProblem:
     """A random 4^3 truth in [0, 2], three views of 8 x 8 pixels, a constant start."""
     truth = np.random.default_rng(3).uniform(0, 2, (4, 4, 4, 1))
     sensors = [camera(2 * np.pi * i / n_views + 0.3) for i in range(n_views)]
     parameter = Parameter(KEY, "1/length", (0.0, np.inf), lr=0.1)
     scene = absorbing_scene(np.full((4, 4, 4, 1), start))
     chosen = {"parameters": [parameter], "spp": 4, "seed": 5} | settings
-    return Problem(scene, views_of_truth(truth, sensors), **chosen)
+    return SceneProblem(scene, views_of_truth(truth, sensors), **chosen)

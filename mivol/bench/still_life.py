@@ -20,7 +20,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import drjit as dr
 import numpy as np
 
 from mivol.bench.bars import AT_LEAST, Bar, judge, say
@@ -29,9 +28,11 @@ from mivol.bench.figures import drawn
 from mivol.bench.questions import Bench
 from mivol.bench.timing import Stopwatch
 from mivol.errors import MivolError
-from mivol.optim.radiance_fit import RadianceFit, render_view
-from mivol.optim.radiance_plan import Plan, Stage
-from mivol.optim.radiance_views import Views
+from mivol.optim.field_view import render_view
+from mivol.optim.loop import reconstruct
+from mivol.optim.radiance_plan import FitPlan, Stage
+from mivol.optim.radiance_problem import RadianceProblem
+from mivol.optim.ray_batches import RayBatches
 from mivol.photos import Photo, load_photos
 from mivol.validate import images
 
@@ -97,19 +98,18 @@ def fit(photos: Sequence[Photo], held_out: Sequence[Photo], box: np.ndarray, siz
         box: (2, 3) what is looked at.
         size: nodes, steps, rays.
         degree: of the harmonics.
-        priors: fields of :class:`mivol.optim.radiance_plan.Plan`.
+        priors: fields of :class:`mivol.optim.radiance_plan.FitPlan`.
 
     Returns:
         PSNR [dB] of the held-out views, nodes, processor time; and for the figure the middle one of them and its render.
     """
     half = Stage(size.longest // 2, size.steps // 4, size.shrink, 4, max(size.tiles // size.shrink, 16))
     whole = Stage(size.longest, size.steps - size.steps // 4, 1, 4, size.tiles)
-    plan = Plan((half, whole), degree=degree, **priors)
-    work, watch = RadianceFit(Views.of(photos, [stage.shrink for stage in plan.stages]), box, plan), Stopwatch()
+    plan = FitPlan((half, whole), degree=degree, **priors)
+    problem, watch = RadianceProblem(RayBatches.of(photos, [stage.shrink for stage in plan.stages]), box, plan), Stopwatch()
     with watch:
-        for _ in range(plan.steps):
-            dr.eval(work.advance())
-    shown = [render_view(work.field, photo.camera, photo.background).image for photo in held_out]
+        reconstruct(problem, plan.optimiser, plan.course())
+    shown = [render_view(problem.field, photo.camera, photo.background).image for photo in held_out]
     judged = [
         images.judge(image, photo.image, space="srgb", metrics=("psnr",)) for image, photo in zip(shown, held_out, strict=True)
     ]
@@ -122,7 +122,7 @@ def fit(photos: Sequence[Photo], held_out: Sequence[Photo], box: np.ndarray, siz
         **priors,
         "psnr": psnr,
         "each": [image.values["psnr"] for image in judged],
-        "nodes": work.field.rows,
+        "nodes": problem.field.rows,
         "processor_seconds": watch.processor,
         "view": shown[middle],
         "photograph": held_out[middle].image,

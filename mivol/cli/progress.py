@@ -64,6 +64,7 @@ class Display:
         self.said = 0
         self.logged = 0
         self.drawn = 0.0
+        self.newest: Fit | None = None
 
     def __enter__(self) -> Display:
         self.bar.start()
@@ -73,9 +74,13 @@ class Display:
     def __exit__(self, *exception: object) -> None:
         self.bar.refresh()
         self.bar.stop()
+        if self.newest is not None and not self.console.is_terminal:
+            fit = self.newest
+            self.console.print(f"{fit.next} iterations in {fit.seconds:.1f} s: {figures(fit)}", soft_wrap=True)
 
     def __call__(self, fit: Fit) -> None:
         """Draw, at most ten times a second; what the fit has to say is printed above."""
+        self.newest = fit
         for line in fit.log[self.logged :]:
             self.console.print(line, soft_wrap=True, highlight=False, markup=False)
         self.logged = len(fit.log)

@@ -6,11 +6,7 @@ then; ``field.npz`` is the field, ``film/turntable.mp4`` (``.webp`` where there 
 
 from __future__ import annotations
 
-import time
-from collections.abc import Iterator
 from pathlib import Path
-
-import drjit as dr
 
 from mivol import config
 from mivol.config import FieldFit
@@ -20,9 +16,11 @@ from mivol.experiments.photo_outputs import PhotoOutputs, compare, named
 from mivol.experiments.photo_plan import choices, make_plan, shrunk
 from mivol.experiments.run_folder import RunFolder
 from mivol.experiments.task import Task
-from mivol.optim import checkpoint
-from mivol.optim.radiance_fit import RadianceFit
-from mivol.optim.radiance_views import Views
+from mivol.optim.checkpoint import Store
+from mivol.optim.events import Checkpoint
+from mivol.optim.loop import Fit, begin_fit
+from mivol.optim.radiance_problem import RadianceProblem
+from mivol.optim.ray_batches import RayBatches
 from mivol.photos import Photos, rectified
 from mivol.report.page import write_page
 from mivol.report.record import RunRecord
@@ -43,11 +41,11 @@ def photo_fit(task: Task) -> Path:
             photos, judged = read_photos(chosen, task.base)
             photos = boxed(chosen, photos)
             plan = shrunk(asked, photos)
-            views = Views.of([rectified(view) for view in photos.views], [stage.shrink for stage in plan.stages])
-            run.record.plan, run.record.notes = choices(plan, photos, views), notes(photos)
+            batches = RayBatches.of([rectified(view) for view in photos.views], [stage.shrink for stage in plan.stages])
+            run.record.plan, run.record.notes = choices(plan, photos, batches), notes(photos)
             task.watcher.say([photos.text, *(f"{one.choice}: {one.reason}" for one in run.record.plan)])
         with run.stage("fit"):
-            fit = solve(task, run, RadianceFit(views, photos.box, plan, chosen.seed), judged)
+            fit = solve(task, run, RadianceProblem(batches, photos.box, plan, chosen.seed), judged)
         with run.stage("images and volumes"):
             PhotoOutputs(task, run, fit, photos, judged).write()
     return write_page(task.folder)
@@ -65,54 +63,35 @@ def new_record(chosen: FieldFit) -> RunRecord:
     )
 
 
-def solve(task: Task, run: RunFolder, fit: RadianceFit, judged: Photos | None) -> RadianceFit:
+def solve(task: Task, run: RunFolder, problem: RadianceProblem, judged: Photos | None) -> Fit:
     """All steps, with metrics and checkpoints.
 
     Raises:
-        MivolError: a checkpoint of another run.
+        MivolError: a checkpoint of another run, or photographs that show nothing in the box.
     """
     chosen: FieldFit = task.chosen
-    fingerprint = {"photos": fit.views.digest(), **config.flat(config.resolved(chosen))}
-    path = run.checkpoint
-    if task.resume:
-        fit.restore(*checkpoint.read(path, fingerprint))
-    run.rewind(fit.step)
+    plan, every = problem.plan, chosen.show.every
+    store = Store(
+        run.checkpoint, {"photos": problem.batches.digest(), **config.flat(config.resolved(chosen))}, task.resume
+    )
+    fit = begin_fit(problem, plan.optimiser, plan.course(Checkpoint(every=chosen.checkpoint_every)), store=store)
+    run.rewind(fit.next)
+    with task.watcher.watch(plan.steps) as watch:
 
-    def keep() -> None:
-        arrays, about = fit.pack()
-        checkpoint.write(path, arrays, {**about, "fingerprint": fingerprint})
+        def observe(fit: Fit) -> None:
+            if fit.next % every == 0 or fit.next == plan.steps:
+                problem.set(fit.run.reals)
+                run.append(fit.next, fit.seconds, loss=fit.history[-1]["loss"], **judge_one(chosen, problem, judged, fit.next))
+            watch(fit)
 
-    started = time.perf_counter() - fit.seconds
-    try:
-        for loss in task.watcher.track(Steps(fit), "steps"):
-            fit.seconds = time.perf_counter() - started
-            if fit.step % chosen.show.every == 0 or fit.step == fit.plan.steps:
-                run.append(fit.step, fit.seconds, loss=loss, **look(chosen, fit, judged))
-            if fit.step % chosen.checkpoint_every == 0:
-                keep()
-    finally:
-        if fit.field is not None:
-            keep()
+        fit.complete(observe)
+    run.record.notes += fit.log
     return fit
 
 
-class Steps:
-    """The steps that are left of a fit, each with its mean squared error; their number is known."""
-
-    def __init__(self, fit: RadianceFit) -> None:
-        self.fit, self.left = fit, max(fit.plan.steps - fit.step, 0)
-
-    def __len__(self) -> int:
-        return self.left
-
-    def __iter__(self) -> Iterator[float]:
-        for _ in range(len(self)):
-            yield float(dr.mean(self.fit.advance())[0])
-
-
-def look(chosen: FieldFit, fit: RadianceFit, judged: Photos | None) -> dict[str, float]:
-    """How well one judged view is seen, another one each time."""
+def judge_one(chosen: FieldFit, problem: RadianceProblem, judged: Photos | None, step: int) -> dict[str, float]:
+    """How well one judged view is rendered, another one each time."""
     if judged is None:
         return {}
-    photo = judged.views[fit.step // chosen.show.every % len(judged.views)]
-    return named(compare(chosen, fit, judged, photo)[1].values)
+    photo = judged.views[step // chosen.show.every % len(judged.views)]
+    return named(compare(chosen, problem, judged, photo)[1].values)

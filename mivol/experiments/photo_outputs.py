@@ -16,7 +16,9 @@ from mivol.experiments.task import Task
 from mivol.fields.sky import Sky
 from mivol.fields.spherical import SphericalGrid, save_field
 from mivol.files import write_exr, write_png, write_volume
-from mivol.optim.radiance_fit import RadianceFit, Seen, render_view
+from mivol.optim.field_view import FieldView, render_view
+from mivol.optim.loop import Fit
+from mivol.optim.radiance_problem import RadianceProblem
 from mivol.photos import Camera, Photo, Photos, turntable
 from mivol.photos.picture import decode_srgb
 from mivol.report.depth import depth_pixels, normal_pixels, normals_of_depth
@@ -42,22 +44,27 @@ class PhotoOutputs:
 
     task: Task
     run: RunFolder
-    fit: RadianceFit
+    fit: Fit
     photos: Photos
     judged: Photos | None
 
+    @property
+    def problem(self) -> RadianceProblem:
+        """The field that was found."""
+        return self.fit.problem
+
     def write(self) -> None:
         """Write all, and put it and the results on record."""
-        folder, record, field = self.run.path, self.run.record, self.fit.field
+        folder, record, field = self.run.path, self.run.record, self.problem.field
         self.run.make("views", "volumes", "film")
         save_field(folder / "field.npz", field)
-        if self.fit.sky is not None:
-            write_exr(folder / "sky.exr", {"": self.fit.sky.image()})
+        if self.problem.sky is not None:
+            write_exr(folder / "sky.exr", {"": self.problem.sky.image()})
         record.tables = [storage(field, folder / "field.npz")]
         record.volumes.append(write_density(folder, field))
         record.results = {
             "views": float(len(self.photos.views)),
-            "iterations": float(self.fit.step),
+            "iterations": float(self.fit.next),
             "nodes": float(field.rows - (field.nodes is not None)),
             "bytes": field.bytes / 2**20,
         }
@@ -73,7 +80,7 @@ class PhotoOutputs:
         views, found, images = self.judged.views, [], self.run.record.images
         shown = set(np.linspace(0, len(views) - 1, min(chosen.show.views, len(views))).astype(int).tolist())
         for number, photo in enumerate(views):
-            seen, quality = compare(chosen, self.fit, self.judged, photo)
+            seen, quality = compare(chosen, self.problem, self.judged, photo)
             found.append(quality)
             if number in shown:
                 images += write_view(self.run.path, photo, number, seen.image)
@@ -87,20 +94,20 @@ class PhotoOutputs:
         path = f"film/turntable{film_suffix()}"
         if not path.endswith(".mp4"):
             self.task.watcher.say([WITHOUT_FFMPEG])
-        background = behind(self.fit, self.photos.views[0])
+        background = behind(self.problem, self.photos.views[0])
 
         def frames() -> Iterator[NDArray[np.uint8]]:
-            for camera in self.task.watcher.track(turntable(cameras, self.fit.box, count), "frames"):
-                seen = render_view(self.fit.field, _small(camera), background)
+            for camera in self.task.watcher.track(turntable(cameras, self.problem.box, count), "frames"):
+                seen = render_view(self.problem.field, _small(camera), background)
                 yield np.round(np.clip(seen.image, 0, 1) * 255).astype(np.uint8)
 
         write_video(self.run.path / path, frames(), fps=count / 4)
         return Image(path=path, role="film", caption=f"{count} views around the box")
 
 
-def compare(chosen: FieldFit, fit: RadianceFit, judged: Photos, photo: Photo) -> tuple[Seen, Quality]:
+def compare(chosen: FieldFit, problem: RadianceProblem, judged: Photos, photo: Photo) -> tuple[FieldView, Quality]:
     """A photograph's view of the field, and how alike they are."""
-    seen = render_view(fit.field, photo.camera, behind(fit, photo))
+    seen = render_view(problem.field, photo.camera, behind(problem, photo))
     asked = {"space": judged.space, "mask": photo.mask, "metrics": chosen.show.metrics, "name": photo.name}
     return seen, judge(seen.image, photo.image, **asked)
 
@@ -110,9 +117,9 @@ def named(values: dict[str, float]) -> dict[str, float]:
     return {("held_out_psnr" if name == "psnr" else name): value for name, value in values.items()}
 
 
-def behind(fit: RadianceFit, photo: Photo) -> NDArray | Sky:
+def behind(problem: RadianceProblem, photo: Photo) -> NDArray | Sky:
     """What a photograph shows where nothing is."""
-    return photo.background if fit.sky is None else fit.sky
+    return photo.background if problem.sky is None else problem.sky
 
 
 def storage(field: SphericalGrid, path: Path) -> Table:
@@ -150,7 +157,7 @@ def write_view(folder: Path, photo: Photo, number: int, image: NDArray) -> list[
     return written
 
 
-def write_geometry(folder: Path, seen: Seen, camera: Camera, near_far: tuple[float, float]) -> list[Image]:
+def write_geometry(folder: Path, seen: FieldView, camera: Camera, near_far: tuple[float, float]) -> list[Image]:
     """Distance and normals of a view as colours."""
     pictures = {
         "distance": depth_pixels(seen.depth, near_far, seen.opacity),

@@ -8,8 +8,8 @@ import numpy as np
 
 from mivol.config import FieldFit
 from mivol.errors import MivolError
-from mivol.optim.radiance_fit import PRESETS, Plan, memory_of
-from mivol.optim.radiance_views import Views
+from mivol.optim.radiance_plan import PRESETS, FitPlan, memory_of
+from mivol.optim.ray_batches import RayBatches
 from mivol.optim.strategy import nearest
 from mivol.photos import Photos
 from mivol.report.record import Choice
@@ -18,7 +18,7 @@ SMALLEST = 16
 """Shortest edge of a photograph that was made smaller [pixel]."""
 
 
-def make_plan(chosen: FieldFit) -> Plan:
+def make_plan(chosen: FieldFit) -> FitPlan:
     """The preset with what the file says otherwise.
 
     Raises:
@@ -36,7 +36,7 @@ def make_plan(chosen: FieldFit) -> Plan:
     return plan if wanted.longest is None else plan.up_to(wanted.longest)
 
 
-def shrunk(plan: Plan, photos: Photos) -> Plan:
+def shrunk(plan: FitPlan, photos: Photos) -> FitPlan:
     """The plan with photographs as small as its grids can tell: pixels of half a voxel, at the middle of the box."""
     cameras, box = [view.camera for view in photos.views], photos.box
     pixel = np.median([np.linalg.norm(camera.origin - box.mean(axis=0)) / camera.K[0, 0] for camera in cameras])
@@ -49,7 +49,7 @@ def shrunk(plan: Plan, photos: Photos) -> Plan:
     return replace(plan, stages=tuple(stages))
 
 
-def choices(plan: Plan, photos: Photos, views: Views) -> list[Choice]:
+def choices(plan: FitPlan, photos: Photos, batches: RayBatches) -> list[Choice]:
     """What will be done, and why."""
     box = photos.box
     resolutions = ", ".join(str(stage.longest) for stage in plan.stages)
@@ -64,11 +64,11 @@ def choices(plan: Plan, photos: Photos, views: Views) -> list[Choice]:
         Choice(choice=f"harmonics of degree {plan.degree}", reason=f"{(plan.degree + 1) ** 2} numbers a colour and node"),
         what_is_behind(plan, photos),
         Choice(choice=f"rays end at a transmittance of {plan.stop:g}", reason="what is left out is at most that share"),
-        Choice(choice=memory_of(plan, box, views), reason="counted before it is taken"),
+        Choice(choice=memory_of(plan, box, batches), reason="counted before it is taken"),
     ]
 
 
-def what_is_behind(plan: Plan, photos: Photos) -> Choice:
+def what_is_behind(plan: FitPlan, photos: Photos) -> Choice:
     """What rays see that pass the box; where a colour is only believed, the one that the photographs' edges show is told."""
     if plan.sky:
         return Choice(choice=f"a sky of {plan.sky} rows behind the box", reason="field.sky; it is learned with the field")

@@ -16,7 +16,7 @@ from mivol.errors import MivolError
 from mivol.experiments.task import Task
 from mivol.experiments.truth import holding
 from mivol.files import layers, read_exr
-from mivol.optim.shots import View, check_sizes
+from mivol.optim.render_batches import View, check_sizes
 from mivol.scene.load import LoadedScene, load_scene
 from mivol.validate.reference import ReferenceResult, read_reference, render_reference
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from mivol.errors import MivolError
 from mivol.files import write_exr, write_png
-from mivol.optim.problem import seed_of
+from mivol.optim.seeds import seed_of
 from mivol.scene.load import find_sensor
 
 SAMPLES_PER_PASS = 1 << 21

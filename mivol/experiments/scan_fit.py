@@ -6,9 +6,6 @@ the truth is known. Views that are held out are predicted at the end.
 
 from __future__ import annotations
 
-import itertools
-import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +17,11 @@ from mivol.experiments.projections import Projections, held_out_views, make_data
 from mivol.experiments.run_folder import RunFolder
 from mivol.experiments.scan_outputs import write_outputs
 from mivol.experiments.task import Task
-from mivol.optim import checkpoint
+from mivol.optim.checkpoint import Store
+from mivol.optim.course import Course
+from mivol.optim.events import Checkpoint
+from mivol.optim.inversion import Inversion, Solve
+from mivol.optim.loop import Fit, begin_fit
 from mivol.optim.solvers import SOLVERS, LeastSquares, PoissonCounts, SmoothedTV, State
 from mivol.report.page import write_page
 from mivol.report.record import Choice, RunRecord
@@ -54,7 +55,8 @@ def scan_fit(task: Task) -> Path:
         projector = Projector(data.geometry, grid)
         held_out = held_out_views(chosen, projector.n_views)
         with run.stage("solve"):
-            state = solve(task, run, projector, data, held_out)
+            problem = make_problem(chosen, projector, data, held_out)
+            state = solve(task, run, problem, data)
             run.record.results = {"iterations": float(state.iteration)}
         with run.stage("images and volumes"):
             write_outputs(run, projector, data, held_out, state.x.reshape(grid.shape))
@@ -78,81 +80,52 @@ def new_record(chosen: config.Scan) -> RunRecord:
     )
 
 
-def make_problem(
-    chosen: config.Scan, projector: Projector, data: Projections, kept: np.ndarray
-) -> LeastSquares | PoissonCounts:
-    """What the solver minimises, over the views that are kept.
+def make_problem(chosen: config.Scan, projector: Projector, data: Projections, held_out: np.ndarray) -> Inversion:
+    """What the solver minimises, over the views that are not held out.
 
     Raises:
         MivolError: ML-TR without counts.
     """
     wanted = chosen.solve
+    kept = np.setdiff1d(np.arange(projector.n_views), held_out)
     prior = SmoothedTV(projector.grid.shape, wanted.tv, wanted.delta, projector.grid.voxel_size) if wanted.tv else None
     a = projector.subset(kept)
     if SOLVERS[wanted.name].problem is LeastSquares:
-        return LeastSquares(a, data.y[kept], data.weights[kept], None, wanted.nonnegative, prior)
+        return Inversion(LeastSquares(a, data.y[kept], data.weights[kept], None, wanted.nonnegative, prior))
     if data.counts is None:
         raise MivolError("ml-tr needs counts of quanta, found line integrals: simulate with photons, or choose pcg.")
-    return PoissonCounts(a, data.counts[kept], chosen.data.photons, prior=prior)
+    return Inversion(PoissonCounts(a, data.counts[kept], chosen.data.photons, prior=prior))
 
 
-def solve(task: Task, run: RunFolder, projector: Projector, data: Projections, held_out: np.ndarray) -> State:
-    """All iterations, with metrics and checkpoints.
+def solve(task: Task, run: RunFolder, problem: Inversion, data: Projections) -> State:
+    """All iterations, with metrics and checkpoints; where the solver stands after them.
 
     Raises:
-        MivolError: a checkpoint of another run, or settings that the solver refuses.
+        MivolError: a checkpoint of another run, settings that the solver refuses, or projections that hold nothing.
     """
     chosen: config.Scan = task.chosen
-    kept = np.setdiff1d(np.arange(projector.n_views), held_out)
-    problem = make_problem(chosen, projector, data, kept)
-    fingerprint = {"data": data.digest(), **config.flat(config.resolved(chosen))}
-    path, state = run.checkpoint, None
-    if task.resume:
-        state = State.from_arrays(checkpoint.read(path, fingerprint)[0])
-    done = state.iteration if state else 0
-    run.rewind(done)
-    started = time.perf_counter()
-    try:
-        for reached in task.watcher.track(Bounded(chosen, problem, state), "iterations"):
-            state = reached
-            write_metrics(run, problem, data, state, time.perf_counter() - started)
-            if state.iteration % chosen.checkpoint_every == 0:
-                checkpoint.write(path, state.to_arrays(), {"fingerprint": fingerprint})
-    finally:
-        if state is not None:
-            checkpoint.write(path, state.to_arrays(), {"fingerprint": fingerprint})
-    if state is None:
-        raise MivolError("the projections hold nothing to reconstruct: all weights are 0, or all line integrals.")
-    return state
+    course = Course(chosen.solve.iterations, events=(Checkpoint(every=chosen.checkpoint_every),))
+    store = Store(run.checkpoint, {"data": data.digest(), **config.flat(config.resolved(chosen))}, task.resume)
+    fit = begin_fit(problem, Solve(solver=chosen.solve.name, subsets=chosen.solve.subsets), course, store=store)
+    run.rewind(fit.next)
+    with task.watcher.watch(course.iterations) as watch:
+
+        def observe(fit: Fit) -> None:
+            run.append(fit.next, fit.seconds, loss=fit.history[-1]["loss"], **errors_of(fit.run.state, problem.task, data))
+            watch(fit)
+
+        fit.complete(observe)
+    return fit.run.state
 
 
-class Bounded:
-    """The states of a solver up to the last iteration asked for; its length is known."""
-
-    def __init__(self, chosen: config.Scan, problem: LeastSquares | PoissonCounts, state: State | None) -> None:
-        options = {"n_subsets": chosen.solve.subsets} if chosen.solve.name == "os-sart" else {}
-        self.left = chosen.solve.iterations - (state.iteration if state else 0)
-        self.states = SOLVERS[chosen.solve.name].run(problem, state, **options)
-
-    def __len__(self) -> int:
-        return max(self.left, 0)
-
-    def __iter__(self) -> Iterator[State]:
-        return itertools.islice(self.states, len(self))
+def errors_of(state: State, task: LeastSquares | PoissonCounts, data: Projections) -> dict[str, float]:
+    """The relative residual, and the error of the volume where the truth is known."""
+    errors = {"residual": state.residual_norm / norm_of(task)}
+    return errors if data.truth is None else errors | {"nrmse": nrmse(state.x.reshape(data.truth.shape), data.truth)}
 
 
-def write_metrics(
-    run: RunFolder, problem: LeastSquares | PoissonCounts, data: Projections, state: State, seconds: float
-) -> None:
-    """One line for an iteration; seconds since the start or the resumption."""
-    values = {"loss": state.objective, "residual": state.residual_norm / norm_of(problem)}
-    if data.truth is not None:
-        values["nrmse"] = nrmse(state.x.reshape(data.truth.shape), data.truth)
-    run.append(state.iteration, seconds, **values)
-
-
-def norm_of(problem: LeastSquares | PoissonCounts) -> float:
+def norm_of(task: LeastSquares | PoissonCounts) -> float:
     """|W^(1/2) b|, or the expected norm of Pearson's residuals, sqrt(m)."""
-    if isinstance(problem, PoissonCounts):
-        return float(np.sqrt(np.size(problem.counts)))
-    return float(np.sqrt(np.sum(problem.weights * problem.b**2))) or 1.0
+    if isinstance(task, PoissonCounts):
+        return float(np.sqrt(np.size(task.counts)))
+    return float(np.sqrt(np.sum(task.weights * task.b**2))) or 1.0

@@ -18,11 +18,14 @@ from mivol.experiments.scene_outputs import SceneOutputs
 from mivol.experiments.start import Start, make_start
 from mivol.experiments.task import Task
 from mivol.experiments.truth import check_truth, make_truth, put
+from mivol.optim.checkpoint import Store
+from mivol.optim.course import Course
 from mivol.optim.events import upsample
 from mivol.optim.loop import Fit, reconstruct
 from mivol.optim.parameters import check_names
-from mivol.optim.problem import Problem, seed_of
-from mivol.optim.shots import Shot, make_shots
+from mivol.optim.render_batches import RenderBatch, make_batches
+from mivol.optim.scene_problem import SceneProblem
+from mivol.optim.seeds import HELD_OUT, seed_of
 from mivol.report.page import write_page
 from mivol.report.record import Choice, RunRecord
 from mivol.scene.load import LoadedScene, load_scene
@@ -30,9 +33,6 @@ from mivol.scene.needs import find_needs, survey_scene
 from mivol.scene.plan import make_plan
 from mivol.transport.path import Settings
 from mivol.validate.statistics import nrmse, psnr
-
-HELD_OUT = 2
-"""Purpose of the random numbers of evaluations, beside those of the fit."""
 
 
 def scene_fit(task: Task) -> Path:
@@ -87,11 +87,11 @@ def new_record(chosen: Experiment) -> RunRecord:
     )
 
 
-def choices(chosen: Experiment, problem: Problem) -> list[Choice]:
+def choices(chosen: Experiment, problem: SceneProblem) -> list[Choice]:
     """The plan of mivol's integrator for this scene, with its reasons; other integrators have none."""
     if chosen.fit.integrator != "mivol":
         return []
-    needs = find_needs(problem.scene, problem.shots[0].sensor, survey_scene(problem.scene))
+    needs = find_needs(problem.scene, problem.batches[0].sensor, survey_scene(problem.scene))
     made = make_plan(needs, Settings(max_depth=chosen.fit.max_depth))
     return [Choice(choice=f"{c.about}: {c.choice}", reason=c.reason) for c in made.choices]
 
@@ -112,21 +112,24 @@ def make_integrator(chosen: Experiment) -> mi.Integrator:
 
 def make_problem(
     chosen: Experiment, scene: mi.Scene, integrator: mi.Integrator, starts: Sequence[Start], seen: References
-) -> Problem:
+) -> SceneProblem:
     """The problem of an experiment, with the scene at its start."""
     params = mi.traverse(scene)
     for start in starts:
         put(params, start.parameter.name, start.value)
-    wanted, parameters = chosen.fit, [start.parameter for start in starts]
-    problem = Problem(scene, seen.fitted, parameters, integrator, chosen.loss, wanted.spp, wanted.samples_per_pass, chosen.seed)
+    settings = {"spp": chosen.fit.spp, "samples_per_pass": chosen.fit.samples_per_pass, "seed": chosen.seed}
+    parameters = [start.parameter for start in starts]
+    problem = SceneProblem(scene, seen.fitted, parameters, integrator, chosen.loss, **settings)
     problem.set(problem.start())
     return problem
 
 
-def solve(task: Task, run: RunFolder, loaded: LoadedScene, problem: Problem, measure: Measure) -> Fit:
+def solve(task: Task, run: RunFolder, loaded: LoadedScene, problem: SceneProblem, measure: Measure) -> Fit:
     """Fit the scene to its views; the metrics grow by a line an iteration."""
     chosen: Experiment = task.chosen
-    settings = config.flat(config.resolved(chosen))
+    course = Course(chosen.fit.iterations, chosen.schedule, chosen.event)
+    digests = {"scene": loaded.content_hash, "references": measure.seen.digest()}
+    store = Store(run.checkpoint, digests | config.flat(config.resolved(chosen)), task.resume)
     with task.watcher.watch(chosen.fit.iterations) as watch:
         begun = False
 
@@ -138,13 +141,7 @@ def solve(task: Task, run: RunFolder, loaded: LoadedScene, problem: Problem, mea
             write_metrics(run, fit)
             watch(fit)
 
-        fit = reconstruct(
-            problem, chosen.optimiser, chosen.fit.iterations, schedule=chosen.schedule, events=chosen.event,
-            measure=measure, observer=observe, path=run.checkpoint,
-            fingerprint={"scene": loaded.content_hash, "references": measure.seen.digest(), **settings},
-            resume=task.resume,
-        )  # fmt: skip
-    fit.save()
+        fit = reconstruct(problem, chosen.optimiser, course, measure=measure, observer=observe, store=store)
     append_last(run, fit)
     return fit
 
@@ -169,14 +166,14 @@ class Measure:
 
     def __init__(self, chosen: Experiment, seen: References, truth: np.ndarray | None) -> None:
         self.seen, self.truth = seen, truth
-        self.shots = make_shots(seen.held_out, chosen.fit.samples_per_pass) if seen.held_out else []
+        self.batches = make_batches(seen.held_out, chosen.fit.samples_per_pass) if seen.held_out else []
         self.key = chosen.truth.key if chosen.truth else ""
         self.spp = chosen.fit.spp_shown or chosen.fit.spp
 
-    def __call__(self, problem: Problem) -> dict[str, float]:
+    def __call__(self, problem: SceneProblem) -> dict[str, float]:
         errors: dict[str, float] = {}
-        if self.shots:
-            errors["held_out_psnr"] = float(np.mean([value for shot in self.shots for value in self.psnr(problem, shot)]))
+        if self.batches:
+            errors["held_out_psnr"] = float(np.mean([value for batch in self.batches for value in self.psnr(problem, batch)]))
         if self.truth is not None and self.key in problem.values():
             found = problem.values()[self.key]
             if tuple(found.shape) != self.truth.shape:
@@ -184,14 +181,14 @@ class Measure:
             errors["nrmse"] = nrmse(np.asarray(found), self.truth)
         return errors | numbers(problem)
 
-    def psnr(self, problem: Problem, shot: Shot) -> list[float]:
-        """PSNR [dB] of each view of a shot, of what the scene holds now."""
-        image = np.asarray(problem.render(shot.sensor, seed_of(problem.seed, 0, 0, HELD_OUT), self.spp))
-        pairs = zip(np.split(image, shot.n_views, 1), np.split(np.asarray(shot.reference), shot.n_views, 1), strict=True)
+    def psnr(self, problem: SceneProblem, batch: RenderBatch) -> list[float]:
+        """PSNR [dB] of each view of a batch, of what the scene holds now."""
+        image = np.asarray(problem.render(batch.sensor, seed_of(problem.seed, 0, 0, HELD_OUT), self.spp))
+        pairs = zip(np.split(image, batch.n_views, 1), np.split(np.asarray(batch.reference), batch.n_views, 1), strict=True)
         return [psnr(render, reference) for render, reference in pairs]
 
 
-def numbers(problem: Problem) -> dict[str, float]:
+def numbers(problem: SceneProblem) -> dict[str, float]:
     """Each number of the parameters that are no grids or images, by key and place, as the scene holds it now."""
     values = {name: np.asarray(value) for name, value in problem.values().items() if value.ndim == 1}
     return {f"{name}[{i}]": float(x) for name, value in values.items() for i, x in enumerate(value)}

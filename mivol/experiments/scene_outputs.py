@@ -18,12 +18,9 @@ from mivol.experiments.start import edges_of, place_of
 from mivol.files import write_exr, write_png, write_volume
 from mivol.optim.loop import Fit
 from mivol.optim.parameters import GRID
-from mivol.optim.problem import seed_of
-from mivol.optim.shots import View
+from mivol.optim.render_batches import View
+from mivol.optim.seeds import FINAL, seed_of
 from mivol.report.record import Image, Volume
-
-FINAL = 3
-"""Purpose of the random numbers of the images that are kept, beside those of the fit and of its evaluations."""
 
 
 @dataclass(frozen=True)

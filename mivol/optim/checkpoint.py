@@ -1,14 +1,15 @@
 """A run on disk, from which it continues as if it had not stopped.
 
-Conventions. One ``.npz`` file, written whole: the arrays of ``Run.pack`` and one JSON text, ``about``, with the next
-iteration, the history and the fingerprint (every setting that changes the result, and the scene's hash, by dotted key).
-A file of another fingerprint is refused. No pickles.
+Conventions. One ``.npz`` file, written whole: the arrays of the optimiser and the problem, and one JSON text,
+``about``, with the next iteration, the history and the fingerprint (every setting that changes the result, and the scene's
+hash, by dotted key). A file of another fingerprint is refused. No pickles.
 """
 
 from __future__ import annotations
 
 import json
 import zipfile
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,29 @@ ABOUT = "about"
 
 DIGESTS = ("scene", "references", "photos", "data")
 """Keys of fingerprints that are no settings: digests of what a run reads."""
+
+
+@dataclass(frozen=True)
+class Store:
+    """Where a run is kept, and what tells it from others.
+
+    Attributes:
+        path: the file.
+        fingerprint: what the result depends on, by name; JSON values.
+        resume: continue from what is there.
+    """
+
+    path: Path
+    fingerprint: dict[str, Any]
+    resume: bool = False
+
+    def write(self, arrays: dict[str, np.ndarray], about: dict[str, Any]) -> None:
+        """Write a checkpoint of this run; refusals as :func:`write`."""
+        write(self.path, arrays, {**about, "fingerprint": self.fingerprint})
+
+    def read(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+        """Arrays and ``about`` of the checkpoint; refusals as :func:`read`."""
+        return read(self.path, self.fingerprint)
 
 
 def write(path: Path, arrays: dict[str, np.ndarray], about: dict[str, Any]) -> None:

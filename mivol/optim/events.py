@@ -6,17 +6,36 @@ goes into the log. Events of one iteration are applied in the order given, check
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated, Protocol
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from mivol.errors import MivolError
+from mivol.optim.optimiser import Run
+from mivol.optim.problem import Problem
 from mivol.optim.strategy import Strategy, of, table
 
-if TYPE_CHECKING:
-    from mivol.optim.loop import Fit
+
+class FitAtWork(Protocol):
+    """What an event may know and do of a fit.
+
+    Attributes:
+        problem: what is minimised.
+        run: the optimiser at work, with the reals.
+        next: the iteration that comes after the event.
+    """
+
+    problem: Problem
+    run: Run
+    next: int
+
+    def save(self) -> None:
+        """Write the checkpoint."""
+
+    def evaluate(self) -> None:
+        """Measure, and remember."""
 
 
 def upsample(field: mi.TensorXf, shape: tuple[int, int, int]) -> mi.TensorXf:
@@ -48,7 +67,7 @@ class Event(Strategy, tag="event"):
         """Whether it happens before this iteration."""
         raise NotImplementedError
 
-    def apply(self, fit: Fit) -> str:
+    def apply(self, fit: FitAtWork) -> str:
         """Let it happen; what a reader of the report must know, or ""."""
         raise NotImplementedError
 
@@ -62,17 +81,46 @@ class Upsample(Event, tag="upsample"):
     def due(self, iteration: int) -> bool:
         return iteration in self.at
 
-    def apply(self, fit: Fit) -> str:
+    def apply(self, fit: FitAtWork) -> str:
         shapes = [self._refine(fit, p) for p in fit.problem.parameters if fit.run.reals[p.name].ndim == 4]
         if not shapes:
             raise MivolError("upsample found no grid among the parameters: take the event out.")
         return "refined to " + ", ".join(" x ".join(str(n) for n in shape) for shape in shapes)
 
-    def _refine(self, fit: Fit, parameter: object) -> tuple[int, int, int]:
+    def _refine(self, fit: FitAtWork, parameter: object) -> tuple[int, int, int]:
         value = parameter.from_reals(fit.run.reals[parameter.name])
         shape = tuple(n * self.factor for n in value.shape[:3])
         fit.run.replace(parameter.name, parameter.project(parameter.to_reals(upsample(dr.detach(value), shape))))
         return shape
+
+
+class CoarseToFine(Event, tag="coarse_to_fine"):
+    """Begin the next stage of a problem that has stages: finer unknowns, and only where something was found."""
+
+    at: Annotated[tuple[int, ...], of("iteration", "before which the second stage begins, the third, ...")]
+
+    def due(self, iteration: int) -> bool:
+        return iteration in self.at
+
+    def apply(self, fit: FitAtWork) -> str:
+        fit.problem.set(fit.run.reals)
+        refinement = fit.problem.refine(1 + self.at.index(fit.next))
+        fit.run.refine(refinement)
+        return refinement.says
+
+
+class Survey(Event, tag="survey"):
+    """Let a problem look again for what the next steps can leave out without a change: cells that have become empty."""
+
+    every: Annotated[int, of("iteration", "how often", ge=1)] = 64
+
+    def due(self, iteration: int) -> bool:
+        return iteration > 0 and iteration % self.every == 0
+
+    def apply(self, fit: FitAtWork) -> str:
+        fit.problem.set(fit.run.reals)
+        fit.problem.survey()
+        return ""
 
 
 class Checkpoint(Event, tag="checkpoint"):
@@ -83,7 +131,7 @@ class Checkpoint(Event, tag="checkpoint"):
     def due(self, iteration: int) -> bool:
         return iteration > 0 and iteration % self.every == 0
 
-    def apply(self, fit: Fit) -> str:
+    def apply(self, fit: FitAtWork) -> str:
         fit.save()
         return ""
 
@@ -96,12 +144,12 @@ class Evaluate(Event, tag="evaluate"):
     def due(self, iteration: int) -> bool:
         return iteration % self.every == 0
 
-    def apply(self, fit: Fit) -> str:
+    def apply(self, fit: FitAtWork) -> str:
         fit.evaluate()
         return ""
 
 
-EVENTS = table(Upsample, Checkpoint, Evaluate)
+EVENTS = table(Upsample, CoarseToFine, Survey, Checkpoint, Evaluate)
 
 
 def in_order(events: tuple[Event, ...]) -> list[Event]:

@@ -10,24 +10,25 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from pathlib import Path
-from typing import Any
 
 import mitsuba as mi
 
 from mivol.errors import MivolError
-from mivol.optim import checkpoint
+from mivol.optim.checkpoint import Store
+from mivol.optim.course import Course
 from mivol.optim.events import Event, in_order
 from mivol.optim.interrupt import Stop
-from mivol.optim.optimisers import Optimiser, Run
+from mivol.optim.optimiser import Optimiser, Run
 from mivol.optim.problem import Problem
-from mivol.optim.schedules import Constant, Schedule
 from mivol.threads import check_one_thread
 
 KEPT = ("next", "events_done", "history", "measures", "log", "warned", "seconds")
-"""What a checkpoint keeps of a fit beside the run and its fingerprint."""
+"""What a checkpoint keeps of a fit beside the run and the problem."""
+
+Measure = Callable[[Problem], dict[str, float]]
+"""Errors by name, of what a problem holds."""
 
 
 @dataclass
@@ -37,6 +38,9 @@ class Fit:
     Attributes:
         problem: what is minimised.
         run: the optimiser at work, with the reals.
+        course: what the fit goes through.
+        measure: what ``evaluate`` calls; None measures nothing.
+        store: where the checkpoint lies; None keeps none.
         next: the next iteration.
         events_done: how many of its events have been applied.
         history: one record (iteration, loss, seconds) per iteration.
@@ -44,13 +48,13 @@ class Fit:
         log: what the events said, and what the noise of renders does to the loss, once.
         warned: whether it has been said.
         seconds: time spent, interruptions not counted.
-        measure: what ``evaluate`` calls: errors by name.
-        path: the checkpoint.
-        fingerprint: what the run depends on.
     """
 
     problem: Problem
     run: Run
+    course: Course
+    measure: Measure | None = None
+    store: Store | None = None
     next: int = 0
     events_done: int = 0
     history: list[dict[str, float]] = field(default_factory=list)
@@ -58,12 +62,19 @@ class Fit:
     log: list[str] = field(default_factory=list)
     warned: bool = False
     seconds: float = 0.0
-    measure: Callable[[Problem], dict[str, float]] | None = None
-    path: Path | None = None
-    fingerprint: dict[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self._events = in_order(self.course.events)
+        if self.store is not None and self.store.resume:
+            self.restore()
+
+    @property
+    def is_done(self) -> bool:
+        """Whether nothing is left to do."""
+        return self.next >= self.course.iterations or bool(self.run.finished)
 
     def values(self) -> dict[str, mi.TensorXf]:
-        """What was found, by parameter; the scene holds it too."""
+        """What was found, by parameter; the problem's model holds it too."""
         self.problem.set(self.run.reals)
         return self.problem.values()
 
@@ -79,11 +90,78 @@ class Fit:
         newest = self.measures[-1] if self.measures else {}
         return {name: value for name, value in newest.items() if name not in ("iteration", "seconds")}
 
+    # -- Steps --------------------------------------------------------------------------------------------------------
+
+    def advance(self) -> None:
+        """The events of the next iteration, then its step; nothing counts as done before it is.
+
+        Raises:
+            MivolError: the loss is not finite.
+        """
+        for number, event in enumerate(self._events):
+            if number >= self.events_done and event.due(self.next):
+                self._apply(event)
+                self.events_done = number + 1
+        started = time.perf_counter()
+        loss = self.run.step(self.next, self.course.schedule.factor(self.next, self.course.iterations))
+        if loss is None:
+            return
+        loss = _number(loss)
+        if not math.isfinite(loss):
+            raise MivolError(
+                f"the loss became {loss} in iteration {self.next}: lower the learning rate, or bound the parameters."
+            )
+        self.seconds += time.perf_counter() - started
+        self._warn()
+        self.history.append({"iteration": self.next, "loss": loss, "seconds": self.seconds})
+        self.next, self.events_done = self.next + 1, 0
+
+    def complete(self, observer: Callable[[Fit], None] = lambda fit: None) -> Fit:
+        """Take all steps that are left; what was found is in the problem's model and, where there is one, in the store.
+
+        Raises:
+            MivolError: as :meth:`advance`.
+            Interrupted: Ctrl-C or SIGTERM; the checkpoint has been written.
+        """
+        check_one_thread()
+        with Stop() as stop:
+            self.problem.safe_point = stop.check
+            try:
+                while not self.is_done:
+                    before = self.next
+                    self.advance()
+                    if self.next > before:
+                        observer(self)
+                    stop.check()
+                self.evaluate()
+            except KeyboardInterrupt:
+                self.save()
+                raise
+            finally:
+                self.problem.safe_point = lambda: None
+        self.problem.set(self.run.reals)
+        self.save()
+        return self
+
+    def _apply(self, event: Event) -> None:
+        says = event.apply(self)
+        self.log += [f"iteration {self.next}: {says}"] if says else []
+
+    def _warn(self) -> None:
+        """Say once how much of the loss is the noise of renders, as soon as that is notable."""
+        says = "" if self.warned else self.problem.warning()
+        if says:
+            self.log.append(f"iteration {self.next}: {says}")
+            self.warned = True
+
+    # -- On disk ------------------------------------------------------------------------------------------------------
+
     def save(self) -> None:
         """Write the checkpoint, where there is a place for one."""
-        if self.path is None:
+        if self.store is None:
             return
-        checkpoint.write(self.path, self.run.pack(), {name: getattr(self, name) for name in (*KEPT, "fingerprint")})
+        problem = {f"problem/{name}": array for name, array in self.problem.pack(self.run.reals).items()}
+        self.store.write(self.run.pack() | problem, {name: getattr(self, name) for name in KEPT})
 
     def restore(self) -> None:
         """Continue from the checkpoint.
@@ -91,88 +169,57 @@ class Fit:
         Raises:
             MivolError: there is none, or it is of another run.
         """
-        arrays, about = checkpoint.read(self.path, self.fingerprint)
+        arrays, about = self.store.read()
         self.run.unpack(arrays)
+        problem = {name.removeprefix("problem/"): arrays[name] for name in arrays if name.startswith("problem/")}
+        self.problem.unpack(problem, self.run.reals)
         for name in KEPT:
             setattr(self, name, about[name])
+
+
+def _number(loss: float | mi.Float) -> float:
+    """A loss that may still be on its way through Dr.Jit's queue."""
+    return float(loss[0]) if isinstance(loss, mi.Float) else float(loss)
+
+
+def begin_fit(
+    problem: Problem,
+    optimiser: Optimiser,
+    course: Course | int,
+    *,
+    measure: Measure | None = None,
+    store: Store | None = None,
+) -> Fit:
+    """A fit before its first step, or where its checkpoint has it; arguments as :func:`reconstruct`."""
+    course = course if isinstance(course, Course) else Course(course)
+    return Fit(problem, optimiser.begin(problem), course, measure, store)
 
 
 def reconstruct(
     problem: Problem,
     optimiser: Optimiser,
-    iterations: int,
+    course: Course | int,
     *,
-    schedule: Schedule | None = None,
-    events: Sequence[Event] = (),
-    measure: Callable[[Problem], dict[str, float]] | None = None,
+    measure: Measure | None = None,
     observer: Callable[[Fit], None] = lambda fit: None,
-    path: Path | None = None,
-    fingerprint: dict[str, Any] | None = None,
-    resume: bool = False,
+    store: Store | None = None,
 ) -> Fit:
-    """Fit a scene to its views.
+    """Fit a model to what was seen.
 
     Args:
-        problem: scene, views, parameters, loss; the scene holds the start and, afterwards, the result.
+        problem: model, data and parameters; the model holds the start and, afterwards, the result.
         optimiser: one of OPTIMISERS.
-        iterations: at most so many.
-        schedule: factor on the learning rate; constant by default.
-        events: what happens between iterations.
+        course: iterations, schedule and events, or the number of iterations only.
         measure: errors by name, for ``evaluate``.
         observer: called after each iteration (progress bars).
-        path: checkpoint file; None writes none.
-        fingerprint: what the result depends on, by name, JSON values.
-        resume: continue from ``path``.
+        store: checkpoint, and whether to continue from it; None keeps none.
 
     Raises:
         MivolError: a loss that is not finite, or a checkpoint of another run.
         Interrupted: Ctrl-C or SIGTERM; the checkpoint has been written.
 
     Example:
-        >>> fit = reconstruct(Problem(scene, views, [Parameter("medium.sigma_t.data", domain=(0, 50))]), Adam(), 100)
+        >>> problem = SceneProblem(scene, views, [Parameter("medium.sigma_t.data", domain=(0, 50))])
+        >>> fit = reconstruct(problem, Adam(), 100)
     """
-    check_one_thread()
-    fit = Fit(problem, optimiser.begin(problem), measure=measure, path=path, fingerprint=fingerprint or {})
-    if resume:
-        fit.restore()
-    with Stop() as stop:
-        problem.safe_point = stop.check
-        try:
-            while fit.next < iterations and not fit.run.finished:
-                _iterate(fit, iterations, schedule or Constant(), in_order(tuple(events)))
-                observer(fit)
-                stop.check()
-            if measure is not None:
-                fit.evaluate()
-        except KeyboardInterrupt:
-            fit.save()
-            raise
-        finally:
-            problem.safe_point = lambda: None
-    fit.problem.set(fit.run.reals)
-    return fit
-
-
-def _iterate(fit: Fit, iterations: int, schedule: Schedule, events: list[Event]) -> None:
-    """The events of an iteration, then its step; nothing counts as done before it is."""
-    for number, event in enumerate(events):
-        if number >= fit.events_done and event.due(fit.next):
-            said = event.apply(fit)
-            fit.log += [f"iteration {fit.next}: {said}"] if said else []
-            fit.events_done = number + 1
-    started = time.perf_counter()
-    loss = fit.run.step(fit.next, schedule.factor(fit.next, iterations))
-    if not math.isfinite(loss):
-        raise MivolError(f"the loss became {loss} in iteration {fit.next}: lower the learning rate, or bound the parameters.")
-    fit.seconds += time.perf_counter() - started
-    _warn(fit)
-    fit.history.append({"iteration": fit.next, "loss": loss, "seconds": fit.seconds})
-    fit.next, fit.events_done = fit.next + 1, 0
-
-
-def _warn(fit: Fit) -> None:
-    """Say once how much of the loss is the noise of renders, as soon as that is notable."""
-    said = "" if fit.warned else fit.problem.warning()
-    if said:
-        fit.log.append(f"iteration {fit.next}: {said}")
-        fit.warned = True
+    return begin_fit(problem, optimiser, course, measure=measure, store=store).complete(observer)

@@ -4,7 +4,8 @@ Conventions. A field is a tensor (Z, Y, X, C) of values at voxel centres with sp
 across the border vanish (clamped borders). An energy is the mean over the volume, an integral per volume, so that
 refining the grid does not change it. Gradients come from Dr.Jit's AD; :meth:`Prior.value_and_gradient` serves NumPy.
 Non-quadratic energies also give the quadratic form that touches them from above at a field (lagged diffusivity), which
-Gauss-Newton and conjugate gradients need. PRIORS lists them.
+Gauss-Newton and conjugate gradients need. PRIORS lists them, and those that act apart from the gradient
+(:mod:`mivol.optim.decoupled_priors`).
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import mitsuba as mi
 import numpy as np
 
 from mivol.errors import MivolError
+from mivol.optim.decoupled_priors import Smoothness, Sparsity, ViewDependence
 from mivol.optim.strategy import Strategy, of, table
 
 Spacing = tuple[float, float, float]
@@ -177,4 +179,7 @@ class Bounds(Prior, tag="bounds"):
         return 0.5 * dr.mean(dr.select(self.outside(x) != 0.0, dr.square(v.array), 0.0))
 
 
-PRIORS = table(TotalVariation, HuberTotalVariation, Laplacian, Sparse, Bounds)
+PRIORS = table(
+    *(TotalVariation, HuberTotalVariation, Laplacian, Sparse, Bounds),
+    *(Smoothness, Sparsity, ViewDependence),
+)

@@ -1,253 +1,105 @@
-r"""The fit as a function: real numbers in, loss and derivatives out, through any Mitsuba integrator.
+r"""What can be fitted: the questions that the loop, first-order optimisers and events ask of a model and its data.
 
-.. math:: f(u) = \frac{1}{V}\sum_v \mathrm{loss}(I_v(x(u)), I_v^{ref}) + \sum_k \mathrm{energy}_k(x(u))
+.. math:: \min_u f(u), \qquad f(u) = \mathrm{loss}(x(u)) + \mathrm{energy}(x(u))
 
-Conventions. ``u`` are the reals of each :class:`~mivol.optim.parameters.Parameter`, ``x`` the scene's values. An image
-is the mean of passes of at most ``samples_per_pass`` samples: the adjoint of the loss is taken at the whole image, then
-carried back pass by pass, so that non-linear losses do not depend on the split. Where light is sampled, an image is
-the mean of two renders with seeds of their own, which tell how much of the loss is noise. Seeds are a function of (seed,
-iteration, shot, purpose, half, pass) only. Between passes ``safe_point`` is called; nothing that outlives the call has
-changed until it returns, but ``seen``.
+Conventions. ``u`` are the *reals*, tensors by the name of the parameter; ``x`` is what the model makes of them. A scene that is
+compared with images, a radiance field that is compared with rays of photographs and a volume behind projections are problems;
+a network, a hash grid or a set of Gaussians is one more class with these methods, and an event for whatever changes its shape.
+
+What a problem answers in iteration i depends on the reals, what :meth:`Problem.pack` gives, and i; all its random numbers are a
+function of its seed and i.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Protocol, TypeAlias
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mivol.errors import MivolError
-from mivol.optim.losses import L2, Loss
-from mivol.optim.noise import Compared, compare, halves_of, noise_check, warning
-from mivol.optim.parameters import Parameter, as_tensor, check_names, find, like
-from mivol.optim.shots import Shot, View, check_views, make_shots, pixels, single_shots
-
-PRIMAL, ADJOINT = 0, 1
+Reals: TypeAlias = "dict[str, mi.TensorXf]"
+"""What an optimiser moves: one tensor for each parameter."""
 
 
-def seed_of(*key: int) -> int:
-    """A 32-bit seed from integers: SeedSequence mixes them, so that neighbours share nothing."""
-    return int(np.random.SeedSequence(key).generate_state(1)[0])
-
-
-@dataclass
-class Problem:
-    """A scene, what was seen of it, and what is being looked for.
+class Problem(Protocol):
+    """What the loop asks of whatever is fitted.
 
     Attributes:
-        scene: any Mitsuba scene.
-        views: all of one size.
-        parameters: what is looked for.
-        integrator: differentiable; None takes the scene's own.
-        loss: one of LOSSES.
-        spp: samples per pixel of an image, and of its derivative.
-        samples_per_pass: most samples in one kernel.
-        seed: root of all random numbers.
-        safe_point: called between kernels.
-        noisy: whether images hold noise of sampled light, with the values that the scene holds now.
-        seen: loss of the views (no priors) and its noise, of the newest gradient.
+        safe_point: called between kernels, where a run may be stopped: nothing that outlives the call under way has changed.
     """
 
-    scene: mi.Scene
-    views: Sequence[View]
-    parameters: Sequence[Parameter]
-    integrator: mi.Integrator | None = None
-    loss: Loss = field(default_factory=L2)
-    spp: int = 16
-    samples_per_pass: int = 1 << 20
-    seed: int = 0
-    safe_point: Callable[[], None] = lambda: None
+    safe_point: Callable[[], None]
 
-    def __post_init__(self) -> None:
-        check_views(self.views)
-        if not self.parameters:
-            raise MivolError("found no parameter to look for: name at least one key of mi.traverse(scene).")
-        self.integrator = self.integrator or self.scene.integrator()
-        self.params = mi.traverse(self.scene)
-        for parameter in self.parameters:
-            find(parameter.name, self.params)
-        check_names([parameter.name for parameter in self.parameters])
-        self.params.keep([parameter.name for parameter in self.parameters])
-        self.shots = make_shots(self.views, self.samples_per_pass)
-        self.seen = (0.0, 0.0)
-        self._has_noise = noise_check(self.integrator, self.scene)
-        self.noisy = self._has_noise()
+    def start(self) -> Reals:
+        """Where the fit begins: the reals of what the model holds now."""
 
-    # -- Values ---------------------------------------------------------------------------------------------------
+    def set(self, reals: Reals) -> None:
+        """Let the model hold what these reals stand for."""
 
     def values(self) -> dict[str, mi.TensorXf]:
-        """What the scene holds now, by parameter."""
-        return {p.name: dr.detach(as_tensor(self.params[p.name])) for p in self.parameters}
-
-    def gradients(self) -> dict[str, mi.TensorXf]:
-        """What has been carried back to the scene since :meth:`set`, by parameter.
-
-        Raises:
-            MivolError: nothing ever is, to one of them.
-        """
-        found = {}
-        for p in self.parameters:
-            gradient = dr.detach(dr.grad(self.params[p.name]))
-            if _is_untouched(gradient):
-                raise MivolError(
-                    f"no derivative leads from the images to {p.name}, which would stay as it is: take it out of the fit, or "
-                    "let the images depend on it (for scattered light set fit.max_depth to 2)."
-                )
-            found[p.name] = as_tensor(gradient)
-        return found
-
-    def start(self) -> dict[str, mi.TensorXf]:
-        """The reals of what the scene holds now.
-
-        Raises:
-            MivolError: the scene's values lie outside the domain of their parameter.
-        """
-        return {p.name: p.to_reals(value) for p, value in zip(self.parameters, self.values().values(), strict=True)}
-
-    def set(self, reals: dict[str, mi.TensorXf]) -> None:
-        """Put x(u) into the scene, ready to receive gradients."""
-        for p in self.parameters:
-            value = like(dr.detach(p.from_reals(reals[p.name])), self.params[p.name])
-            dr.make_opaque(value)
-            dr.enable_grad(value)
-            self.params[p.name] = value
-        given = {p.name: type(self.params[p.name])(self.params[p.name]) for p in self.parameters}
-        self.params.update()
-        # Mitsuba's envmap puts another array in the place of what it was given.
-        for name, value in given.items():
-            self.params[name] = value
-        self.noisy = self._has_noise()
-
-    # -- Images ---------------------------------------------------------------------------------------------------
-
-    def passes(self, sensor: mi.Sensor, spp: int) -> list[int]:
-        """Samples per pixel of each pass; they sum to ``spp`` and hardly differ."""
-        most = max(self.samples_per_pass // pixels(sensor), 1)
-        n = math.ceil(spp / most)
-        return [spp // n + (i < spp % n) for i in range(n)]
-
-    def seed_for(self, iteration: int, index: int, purpose: int) -> int:
-        """Seed of a shot, given its number."""
-        return seed_of(self.seed, iteration, index, purpose)
-
-    def render(self, sensor: mi.Sensor, seed: int, spp: int | None = None) -> mi.TensorXf:
-        """Mean image of a sensor over all passes, detached; of the problem's ``spp`` by default."""
-        total, spp = None, spp or self.spp
-        for number, share in enumerate(self.passes(sensor, spp)):
-            with dr.suspend_grad():
-                image = self.integrator.render(self.scene, sensor, seed=seed_of(seed, number), spp=share)
-                total = image * share if total is None else total + image * share
-            self._finish(total)
-        return total / spp
-
-    def pull_back(self, sensor: mi.Sensor, adjoint: mi.TensorXf, seed: int) -> None:
-        """Add J^T adjoint of a sensor's image to the gradients of the scene's parameters."""
-        for number, spp in enumerate(self.passes(sensor, self.spp)):
-            self.integrator.render_backward(
-                self.scene, self.params, adjoint * (spp / self.spp), sensor, seed_of(seed, number), spp
-            )
-            self._finish(self.gradients())
-
-    def push_forward(self, sensor: mi.Sensor, tangents: dict[str, mi.TensorXf], seed: int) -> mi.TensorXf:
-        """J v of a sensor's image, for a direction v of the scene's parameters."""
-        total = None
-        for number, spp in enumerate(self.passes(sensor, self.spp)):
-            self._set_tangents(tangents)
-            image = self.integrator.render_forward(self.scene, self.params, sensor, seed_of(seed, number), spp)
-            total = dr.detach(image) * spp if total is None else total + dr.detach(image) * spp
-            self._finish(total)
-        return total / self.spp
-
-    def _set_tangents(self, tangents: dict[str, mi.TensorXf]) -> None:
-        """Once per render: some integrators use the tangents up."""
-        for p in self.parameters:
-            value = self.params[p.name]
-            dr.set_grad(value, like(tangents[p.name], value))
-
-    def _finish(self, arrays: object) -> None:
-        dr.eval(arrays)
-        dr.sync_thread()
-        self.safe_point()
-
-    # -- Loss and gradient ----------------------------------------------------------------------------------------
-
-    def loss_and_gradient(
-        self, reals: dict[str, mi.TensorXf], iteration: int, chosen: Sequence[int] | None = None
-    ) -> tuple[float, dict[str, mi.TensorXf]]:
-        """f(u) and its gradient, over the ``chosen`` views (all of them by default).
-
-        The seeds of image and derivative differ: an estimate of d(I^2) = 2 I dI from one set of samples is biased.
-        Noise: of the integrator; none for media that only absorb, beyond the pixel filter's. What it does to the loss:
-        :func:`mivol.optim.noise.compare`.
-        """
-        shots = self.shots if chosen is None else single_shots([self.views[index] for index in chosen])
-        self.set(reals)
-        n_views, compared = sum(shot.n_views for shot in shots), []
-        for index, shot in enumerate(shots):
-            compared.append(self.compare(shot, self.seed_for(iteration, index, PRIMAL), n_views))
-            self.pull_back(shot.sensor, compared[-1].adjoint, self.seed_for(iteration, index, ADJOINT))
-        energy, gradients = self.through_priors_and_maps(reals, self.gradients())
-        return self.look(compared) + energy, gradients
-
-    def loss_value(self, reals: dict[str, mi.TensorXf], iteration: int) -> float:
-        """f(u), without derivatives."""
-        self.set(reals)
-        return self.mean_loss(iteration) + self.energy(reals)
-
-    def mean_loss(self, iteration: int) -> float:
-        """Mean loss over all views, of what the scene holds now."""
-        pairs = enumerate(self.shots)
-        return math.fsum(self.compare(s, self.seed_for(iteration, i, PRIMAL), len(self.views)).loss for i, s in pairs)
-
-    def compare(self, shot: Shot, seed: int, n_views: int) -> Compared:
-        """Render a shot; its part of the mean loss over ``n_views`` views.
-
-        Raises:
-            MivolError: the loss takes pairs, the render is noisy and has one sample per pixel.
-        """
-        parts = halves_of(self.spp, self.loss) if self.noisy else (self.spp,)
-        if len(parts) == 1:
-            renders = [self.render(shot.sensor, seed)]
-        else:
-            renders = [self.render(shot.sensor, seed_of(seed, half), spp) for half, spp in enumerate(parts)]
-        return compare(self.loss, renders, [n / self.spp for n in parts], shot.reference, shot.n_views / n_views)
-
-    def look(self, compared: Sequence[Compared]) -> float:
-        """The sum of the losses of some shots, remembered with its noise for :meth:`warning`."""
-        unknown = self.noisy and self.spp == 1
-        self.seen = math.fsum(c.loss for c in compared), math.nan if unknown else math.fsum(c.noise for c in compared)
-        return self.seen[0]
+        """What the model holds now, by parameter."""
 
     def warning(self) -> str:
-        """What a reader of the newest loss must know of its noise, or ""."""
-        return warning(self.loss, *self.seen)
+        """What a reader of the newest loss must know, in a sentence, or ""."""
 
-    def energy(self, reals: dict[str, mi.TensorXf]) -> float:
-        """Sum of all weighted prior energies."""
-        return math.fsum(float(p.energy(p.from_reals(dr.detach(reals[p.name])))[0]) for p in self.parameters)
+    def pack(self, reals: Reals) -> dict[str, np.ndarray]:
+        """What the next step depends on beside the reals: where a sparse field has nodes, for one.
 
-    def through_priors_and_maps(
-        self, reals: dict[str, mi.TensorXf], gradients: dict[str, mi.TensorXf]
-    ) -> tuple[float, dict[str, mi.TensorXf]]:
-        """Prior energy, and the gradients by the reals for given gradients by the values."""
-        total, by_reals = 0.0, {}
-        for p in self.parameters:
-            u = mi.TensorXf(dr.detach(reals[p.name]))
-            dr.enable_grad(u)
-            value = p.from_reals(u)
-            energy = p.energy(value)
-            total += float(dr.detach(energy)[0])
-            dr.backward(energy + dr.sum(value.array * gradients[p.name].array))
-            by_reals[p.name] = dr.grad(u)
-        dr.eval(by_reals)
-        return total, by_reals
+        Whatever is found anew by :meth:`unpack` is found anew here too, or a resumed run would go on otherwise.
+        """
+
+    def unpack(self, arrays: dict[str, np.ndarray], reals: Reals) -> None:
+        """Continue from what :meth:`pack` gave, with the reals of the same moment."""
 
 
-def _is_untouched(gradient: object) -> bool:
-    """Whether a gradient is the 0 that Dr.Jit makes up where none was ever carried to."""
-    rows = [gradient.array] if dr.is_tensor_v(gradient) else gradient if dr.depth_v(gradient) > 1 else [gradient]
-    return all(row.state == dr.VarState.Literal for row in rows)
+class Differentiable(Problem, Protocol):
+    """What optimisers of first order ask for besides."""
+
+    def loss_and_gradient(self, reals: Reals, iteration: int, views: int = 0) -> tuple[float | mi.Float, Reals]:
+        """f(u), a number or a Dr.Jit array of width 1 that is not waited for, and its gradient.
+
+        Args:
+            reals: u.
+            iteration: which random numbers, and which part of the data.
+            views: how many views are looked at; 0 leaves it to the problem.
+        """
+
+    def rates(self, iteration: int) -> dict[str, float]:
+        """Learning rate of each parameter in an iteration, in the unit of its reals."""
+
+    def after_step(self, reals: Reals, iteration: int) -> Reals:
+        """What becomes of the reals of a step: on to their domain, and moved by priors that act apart from the gradient.
+
+        Args:
+            reals: of the step.
+            iteration: that of the newest :meth:`loss_and_gradient`.
+        """
+
+
+@dataclass(frozen=True)
+class Refinement:
+    """How a problem goes over to other unknowns.
+
+    Attributes:
+        reals: of the new unknowns, for the same model.
+        carry: what is known of the old unknowns, tensors shaped like their reals, to the new ones.
+        shrinks: by how much derivatives become smaller, by parameter; 1 for those that are not named.
+        says: a sentence for the log.
+    """
+
+    reals: Reals
+    carry: Callable[[Reals], Reals]
+    shrinks: dict[str, float] = field(default_factory=dict)
+    says: str = ""
+
+
+class Staged(Differentiable, Protocol):
+    """What :class:`~mivol.optim.events.CoarseToFine` and :class:`~mivol.optim.events.Survey` ask for besides."""
+
+    def refine(self, stage: int) -> Refinement:
+        """Begin a stage, with the model at the newest reals; the problem has the stage's unknowns from here on."""
+
+    def survey(self) -> None:
+        """Look again for what can be left out of the next steps without changing them."""

@@ -16,9 +16,11 @@ import numpy as np
 from mivol.errors import MivolError
 from mivol.fields.spherical import basis_size, row_width
 from mivol.machine import available_memory
-from mivol.optim.radiance_views import TILE, Views
-
-__all__ = ["PRESETS", "Plan", "Stage", "bytes_of", "memory_of", "place_grid"]
+from mivol.optim.course import Course
+from mivol.optim.decoupled_priors import DecoupledPrior, Smoothness, Sparsity, ViewDependence
+from mivol.optim.events import CoarseToFine, Event, Survey
+from mivol.optim.ray_batches import TILE, RayBatches
+from mivol.optim.rmsprop import RMSprop
 
 
 @dataclass(frozen=True)
@@ -41,7 +43,7 @@ class Stage:
 
 
 @dataclass(frozen=True)
-class Plan:
+class FitPlan:
     """How a fit goes.
 
     Attributes:
@@ -96,18 +98,34 @@ class Plan:
         """Steps of all stages."""
         return sum(stage.steps for stage in self.stages)
 
-    def up_to(self, longest: int) -> Plan:
+    @property
+    def begins(self) -> tuple[int, ...]:
+        """Steps before which the stages after the first begin."""
+        return tuple(int(n) for n in np.cumsum([stage.steps for stage in self.stages])[:-1])
+
+    @property
+    def optimiser(self) -> RMSprop:
+        """What takes the steps."""
+        return RMSprop(memory=self.memory)
+
+    @property
+    def priors(self) -> tuple[tuple[str, DecoupledPrior], ...]:
+        """Parameters, and the priors that act on them after each step, in this order."""
+        return (
+            ("density", Sparsity(weight=self.sparsity)),
+            ("harmonics", ViewDependence(weight=self.matte)),
+            ("density", Smoothness(weight=self.tv_density, share=self.tv_share)),
+            ("harmonics", Smoothness(weight=self.tv_sh, share=self.tv_share)),
+        )
+
+    def course(self, *more: Event) -> Course:
+        """All steps, with the stages, the surveys and what else is to happen between them."""
+        return Course(self.steps, events=(CoarseToFine(at=self.begins), Survey(every=self.survey), *more))
+
+    def up_to(self, longest: int) -> FitPlan:
         """The plan that ends with so many nodes along the longest edge; stages that are coarser stay."""
         coarser = [stage for stage in self.stages if stage.longest < longest]
         return replace(self, stages=(*coarser, replace(self.stages[-1], longest=longest)))
-
-    def stage_at(self, step: int) -> int:
-        """The number of the stage to which a step belongs."""
-        for number, stage in enumerate(self.stages):
-            step -= stage.steps
-            if step < 0:
-                return number
-        return len(self.stages) - 1
 
     def degree_at(self, number: int) -> int:
         """The degree of the harmonics in a stage."""
@@ -124,10 +142,10 @@ class Plan:
         return self.density_rate * self.last**share * rise, self.sh_rate * self.last**share
 
 
-PRESETS: dict[str, Plan] = {
-    "tiny": Plan((Stage(24, 100, 4, tiles=32), Stage(48, 200, 2, tiles=64))),
-    "cpu": Plan((Stage(32, 200, 4, tiles=64), Stage(64, 300, 4, tiles=128), Stage(128, 1400, 2, tiles=256))),
-    "gpu": Plan(
+PRESETS: dict[str, FitPlan] = {
+    "tiny": FitPlan((Stage(24, 100, 4, tiles=32), Stage(48, 200, 2, tiles=64))),
+    "cpu": FitPlan((Stage(32, 200, 4, tiles=64), Stage(64, 300, 4, tiles=128), Stage(128, 1400, 2, tiles=256))),
+    "gpu": FitPlan(
         (
             Stage(64, 300, 4, 16, 512),
             Stage(128, 700, 2, 16, 1024),
@@ -160,7 +178,7 @@ RAY = 256
 """Bytes a ray: its state and what it saw (128 measured), its target, and what is in flight."""
 
 
-def bytes_of(plan: Plan, stage: Stage, box: np.ndarray, rows: int | None = None) -> int:
+def bytes_of(plan: FitPlan, stage: Stage, box: np.ndarray, rows: int | None = None) -> int:
     """Memory of a stage [bytes]: values, derivatives and the optimiser's squares, tables of pinholes, cells, rays.
 
     Args:
@@ -175,18 +193,18 @@ def bytes_of(plan: Plan, stage: Stage, box: np.ndarray, rows: int | None = None)
     return int(rows * a_row + 16 * nodes + stage.views * stage.tiles * TILE**2 * RAY)
 
 
-def memory_of(plan: Plan, box: np.ndarray, views: Views, limit: int | None = None) -> str:
+def memory_of(plan: FitPlan, box: np.ndarray, batches: RayBatches, limit: int | None = None) -> str:
     """What a fit will take, in a sentence.
 
     Args:
-        plan, box, views: what is asked for.
+        plan, box, batches: what is asked for.
         limit: [bytes]; None for what the machine has left (on a GPU nothing is checked).
 
     Raises:
         MivolError: more than there is; the largest resolution that fits is said.
     """
-    def needed(some: Plan) -> int:
-        return views.bytes + max(bytes_of(some, stage, box) for stage in some.stages)
+    def needed(some: FitPlan) -> int:
+        return batches.bytes + max(bytes_of(some, stage, box) for stage in some.stages)
 
     most, last = needed(plan), plan.stages[-1]
     if limit is None and dr.backend_v(mi.Float) == dr.JitBackend.LLVM:
@@ -198,6 +216,6 @@ def memory_of(plan: Plan, box: np.ndarray, views: Views, limit: int | None = Non
         raise MivolError(f"a fit with {last.longest} nodes along an edge takes about {taken} and {left} are left; {advice}.")
     first = bytes_of(plan, plan.stages[0], box)
     return (
-        f"about {most / 2**20:.0f} MiB: photographs {views.bytes / 2**20:.0f}, the first grid {first / 2**20:.0f}, "
+        f"about {most / 2**20:.0f} MiB: photographs {batches.bytes / 2**20:.0f}, the first grid {first / 2**20:.0f}, "
         f"the last {bytes_of(plan, last, box) / 2**20:.0f} if it fills {FILLED:.0%} of its box"
     )

@@ -94,7 +94,7 @@ def test_only_steps_are_counted() -> None:
 def test_pixels_are_drawn_anywhere(variant_rgb: str) -> None:
     """As many rays as tiles would have; four neighbours of a tile are rarely neighbours here."""
     photos = photographed(FIELDS["fog"](TINY)[0], ring(16, 3))
-    batches = [kind.of(photos).draw(1, np.arange(3), 4, np.random.default_rng(0)) for kind in (fits.Pixels, fits.Views)]
+    batches = [kind.of(photos).draw(1, np.arange(3), 4, np.random.default_rng(0)) for kind in (fits.Pixels, fits.RayBatches)]
     widths = [dr.width(batch.rays.d) for batch in batches]
     assert widths == [3 * 4 * 16] * 2
     steps = [np.linalg.norm(np.diff(np.array(batch.rays.d), axis=1), axis=0) for batch in batches]

@@ -22,7 +22,7 @@ from mivol.experiments import render
 from mivol.experiments.start import make_start
 from mivol.fields.procedural import PROCEDURAL, make_procedural
 from mivol.files import atomic, read_exr, read_volume, write_exr, write_volume
-from mivol.optim.problem import Problem
+from mivol.optim.scene_problem import SceneProblem
 from mivol.validate.statistics import nrmse
 
 SCENE = """<scene version="3.0.0">
@@ -264,13 +264,13 @@ def test_views_that_are_held_out_come_after_the_others(variant_rgb, folder: Path
 
 def test_images_that_are_compared_may_have_more_samples(variant_rgb, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Four samples in each image of the fit, 32 in what is compared with held-out views and in what is kept."""
-    asked, render = [], Problem.render
+    asked, render = [], SceneProblem.render
 
-    def listen(self: Problem, sensor: mi.Sensor, seed: int, spp: int | None = None) -> mi.TensorXf:
+    def listen(self: SceneProblem, sensor: mi.Sensor, seed: int, spp: int | None = None) -> mi.TensorXf:
         asked.append(spp or self.spp)
         return render(self, sensor, seed, spp)
 
-    monkeypatch.setattr(Problem, "render", listen)
+    monkeypatch.setattr(SceneProblem, "render", listen)
     flags = ["--set", "fit.spp=4", "--set", "fit.spp_shown=32", "--set", "fit.iterations=1"]
     assert run("optimize", folder / "fit.toml", "-o", folder / "run", *flags) == 0
     # An evaluation, the step, an evaluation, and three views that are kept.

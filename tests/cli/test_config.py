@@ -12,7 +12,7 @@ import pytest
 
 from mivol import config
 from mivol.errors import MivolError
-from mivol.optim.optimisers import GaussNewton
+from mivol.optim.gauss_newton import GaussNewton
 from mivol.optim.priors import TotalVariation
 
 ROOT = Path(__file__).resolve().parents[2]

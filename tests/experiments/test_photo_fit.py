@@ -18,7 +18,10 @@ from mivol.errors import MivolError
 from mivol.experiments import photo_data, photo_fit, photo_outputs, photo_plan
 from mivol.fields.spherical import SphericalGrid, load_field
 from mivol.files import read_exr, write_exr, write_png
-from mivol.optim.radiance_fit import PRESETS, Stage, render_view
+from mivol.optim.field_view import render_view
+from mivol.optim.problem import Reals
+from mivol.optim.radiance_plan import PRESETS, FitPlan, Stage
+from mivol.optim.radiance_problem import RadianceProblem
 from mivol.photos import Camera, intrinsics
 from mivol.photos.journey import facing
 from mivol.photos.picture import decode_srgb
@@ -94,7 +97,8 @@ def test_photographs_become_a_field_and_a_page(photographs: Path, tmp_path: Path
     assert main(["optimize", str(path), "-o", str(tmp_path / "run")]) == 0
     printed = capsys.readouterr()
     assert printed.out.strip().endswith("report.html")
-    before, _, _ = printed.err.partition("steps: ")
+    before, _, after = printed.err.partition(" iterations in ")
+    assert "loss" in after
     for text in ("box (-1, -1, -1) to (1, 1, 1), as given", "behind the box: photos.behind", "near 1.", "MiB: photographs"):
         assert text in before
     record = json.loads((tmp_path / "run/run.json").read_text())
@@ -150,18 +154,21 @@ def test_what_is_behind_is_learned(photographs: Path, tmp_path: Path) -> None:
 def test_a_stopped_fit_goes_on(photographs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Ctrl-C in the middle keeps what was done; the resumed fit ends with all steps, and says nothing twice."""
     path = toml(tmp_path, photographs)
-    whole = photo_fit.RadianceFit.advance
+    whole = RadianceProblem.loss_and_gradient
 
-    def stops(fit: photo_fit.RadianceFit) -> object:
-        if fit.step == 45:
+    def stops(problem: RadianceProblem, reals: Reals, iteration: int, views: int) -> object:
+        if iteration == 45:
             raise KeyboardInterrupt
-        return whole(fit)
+        return whole(problem, reals, iteration, views)
 
-    monkeypatch.setattr(photo_fit.RadianceFit, "advance", stops)
+    def notes(problem: RadianceProblem, reals: Reals, iteration: int, views: int) -> object:
+        started.append(iteration)
+        return whole(problem, reals, iteration, views)
+
+    monkeypatch.setattr(RadianceProblem, "loss_and_gradient", stops)
     assert main(["optimize", str(path), "-o", str(tmp_path / "run")]) == 130
-    monkeypatch.setattr(photo_fit.RadianceFit, "advance", whole)
-    started = []
-    monkeypatch.setattr(photo_fit.RadianceFit, "advance", lambda fit: started.append(fit.step) or whole(fit))
+    started: list[int] = []
+    monkeypatch.setattr(RadianceProblem, "loss_and_gradient", notes)
     assert main(["optimize", str(path), "-o", str(tmp_path / "run"), "--resume"]) == 0
     assert started[0] == 45
     rows = [json.loads(line)["iteration"] for line in (tmp_path / "run/metrics.jsonl").read_text().splitlines()]
@@ -214,7 +221,7 @@ def test_photographs_are_shrunk_to_half_a_voxel(photographs: Path, tmp_path: Pat
     """
     chosen = config.load(toml(tmp_path, photographs))
     photos, _ = photo_data.read_photos(chosen, tmp_path)
-    plan = photo_plan.Plan((Stage(4, 1), Stage(8, 1), Stage(16, 1, shrink=4)))
+    plan = FitPlan((Stage(4, 1), Stage(8, 1), Stage(16, 1, shrink=4)))
     assert [stage.shrink for stage in photo_plan.shrunk(plan, photos).stages] == [2, 2, 1]
 
 
@@ -244,13 +251,13 @@ def test_each_look_is_at_another_view(photographs: Path, tmp_path: Path, monkeyp
     mask[:, :7] = True
     kept = replace(judged, views=tuple(replace(view, mask=mask) for view in judged.views))
     nothing = SphericalGrid.from_dense(np.zeros((2, 2, 2)), np.zeros((2, 2, 2, 1, 3)), np.eye(4))
-    fit = SimpleNamespace(field=nothing, sky=None)
+    problem = SimpleNamespace(field=nothing, sky=None)
     monkeypatch.setattr(photo_outputs, "judge", lambda *images, **asked: names.append(asked["name"]) or judge(*images, **asked))
-    for fit.step in (20, 40, 60):
-        found = photo_fit.look(chosen, fit, kept)
+    for step in (20, 40, 60):
+        found = photo_fit.judge_one(chosen, problem, kept, step)
         assert found.keys() == {"held_out_psnr", "ssim"}
         # The columns that count show nothing but what is behind.
-        assert found["held_out_psnr"] == np.inf > photo_fit.look(chosen, fit, judged)["held_out_psnr"]
+        assert found["held_out_psnr"] == np.inf > photo_fit.judge_one(chosen, problem, judged, step)["held_out_psnr"]
     assert names[::2] == ["view_8.png", "view_3.png", "view_8.png"]
 
 

@@ -11,7 +11,8 @@ import pytest
 from mivol import config
 from mivol.cli import main
 from mivol.errors import MivolError
-from mivol.experiments import projections, scan_fit
+from mivol.experiments import projections
+from mivol.experiments.run_folder import RunFolder
 from mivol.files import read_volume, write_volume
 
 SCAN = """title = "tiny head"
@@ -68,20 +69,20 @@ def test_every_solver_is_reached_by_name(variant_rgb, folder: Path, solver: str)
 def test_an_interrupted_scan_is_resumed(variant_rgb, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Ctrl-C after the third iteration, then --resume: every number as if it had not stopped (one thread)."""
     assert run(folder, to="whole") == 0
-    write = scan_fit.write_metrics
+    append = RunFolder.append
 
-    def stop(*arguments: object) -> None:
-        write(*arguments)
-        if arguments[3].iteration == 3:
+    def stop(run: RunFolder, iteration: int, seconds: float, **values: float) -> None:
+        append(run, iteration, seconds, **values)
+        if iteration == 3:
             raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(scan_fit, "write_metrics", stop)
+        patch.setattr(RunFolder, "append", stop)
         assert run(folder, to="cut") == 130
     assert json.loads((folder / "cut" / "run.json").read_text())["status"] == "stopped"
     continued = []
     with monkeypatch.context() as patch:
-        patch.setattr(scan_fit, "write_metrics", lambda *a: (continued.append(a[3].iteration), write(*a)))
+        patch.setattr(RunFolder, "append", lambda run, i, t, **v: (continued.append(i), append(run, i, t, **v)))
         assert run(folder, "--resume", to="cut") == 0
     assert continued == [4, 5, 6]
     values = [[(row["iteration"], row["loss"], row["nrmse"]) for row in rows_of(folder, to)] for to in ("whole", "cut")]

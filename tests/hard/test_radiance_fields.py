@@ -9,16 +9,16 @@ defect    what goes wrong there                               shown by
 4         NaN where the transmittance underflows              here; ``...::test_constant_colour_and_no_nan_at_any_depth``
 5         colours outside [0, 1] lose their derivative        here
 6         an all-negative density is dead                     here
-7         no background, alpha always 1                       here; ``optim/test_radiance_fit::test_backgrounds_that...``
+7         no background, alpha always 1                       here; ``optim/test_radiance_problem::test_backgrounds...``
 8         dense storage; no priors, no pruning                here; ``analytic/test_radiance::test_sparse_is_dense``,
-                                                              ``optim/test_radiance_fit::test_beliefs_move_values...``
+                                                              ``optim/test_decoupled_priors::test_priors_move...``
 9         harmonics read where nothing is; one degree         here
 10        rays end at a transmittance of exactly 0            here; ``analytic/test_radiance::test_a_ray_that_stops...``
 11        no forward mode                                     ``conformance/test_spherical_volume::test_derivatives_...``
 12        texture units round weights on a GPU                does not arise: nodes are gathered, no texture is read
-13        another field after refinement                      ``optim/test_radiance_fit::test_a_field_on_finer_nodes...``
-14        images of one size, jitter inside pixels            here; ``optim/test_radiance_fit::test_views_know_their...``
-15        nothing to stop, resume, measure or look at         ``optim/test_radiance_fit::test_a_fit_that_went_on...``,
+13        another field after refinement                      ``analytic/test_resampling::test_a_field_on_finer...``
+14        images of one size, jitter inside pixels            here; ``optim/test_ray_batches::test_views_know_their...``
+15        nothing to stop, resume, measure or look at         ``optim/test_radiance_problem::test_a_fit_that...``,
                                                               ``experiments/test_photo_fit``
 16        a camera inside sees what is behind it              here; ``analytic/test_radiance::test_hard_45_...``
 ========  ==================================================  ==========================================================
@@ -45,9 +45,11 @@ from scipy.special import lpmv
 
 from mivol.fields.activation import ACTIVATIONS
 from mivol.fields.spherical import MAX_DEGREE, SphericalGrid, basis_size
-from mivol.optim.radiance_fit import RadianceFit, render_view
-from mivol.optim.radiance_plan import PRESETS, Plan, Stage
-from mivol.optim.radiance_views import TILE, Views
+from mivol.optim.field_view import render_view
+from mivol.optim.loop import begin_fit, reconstruct
+from mivol.optim.radiance_plan import PRESETS, FitPlan, Stage
+from mivol.optim.radiance_problem import RadianceProblem
+from mivol.optim.ray_batches import TILE, RayBatches
 from mivol.photos import Camera, Photo, pixel_centres, rays
 from mivol.photos.camera import intrinsics
 from mivol.transport.lattice import REACH, clip
@@ -128,15 +130,14 @@ def test_defect_5_1_01_a_short_fit_makes_matter_opaque() -> None:
     """40 steps from a fog of an optical depth of 0.1 to something that hides all, in a box of any size."""
     half = 0.02
     photos = [plain_view(4 * half * np.array(v)) for v in ([1.0, 0, 0], [0, 1.0, 0], [0, 0, 1.0], [-0.6, -0.6, -0.6])]
-    plan = Plan((Stage(8, 40, 1, 4, 16),), degree=0, delay=0.0)
-    fit = RadianceFit(Views.of(photos), np.array([[-half] * 3, [half] * 3]), plan)
-    while fit.step < plan.steps:
-        fit.advance()
-    opacity = render_view(fit.field, photos[0].camera, np.ones(3)).opacity
+    plan = FitPlan((Stage(8, 40, 1, 4, 16),), degree=0, delay=0.0)
+    problem = RadianceProblem(RayBatches.of(photos), np.array([[-half] * 3, [half] * 3]), plan)
+    reconstruct(problem, plan.optimiser, plan.course())
+    opacity = render_view(problem.field, photos[0].camera, np.ones(3)).opacity
     # Rates add up to 100 over half the edge: an optical depth of 25 a voxel if all derivatives agree. A tenth is asked for.
     assert np.quantile(opacity, 0.1) > 0.99
     # And not by depth alone: single voxels are walls.
-    assert np.array(fit.field.density).max() * 2 * half / 8 > 2.5
+    assert np.array(problem.field.density).max() * 2 * half / 8 > 2.5
 
 
 # -- 2: what is empty ------------------------------------------------------------------------------------------------------
@@ -255,14 +256,18 @@ def test_defect_5_1_04_no_nan_where_transmittance_underflows(most: float) -> Non
 def test_defect_5_1_04_a_fit_goes_on_from_an_opaque_field() -> None:
     """A step from densities up to 1e5 leaves finite values and a finite state."""
     photos = [plain_view(4 * np.array(v)) for v in ([1.0, 0, 0], [0, 1.0, 0])]
-    fit = RadianceFit(Views.of(photos), np.array([[-1.0] * 3, [1.0] * 3]), Plan((Stage(16, 4, 1, 2, 16),), degree=0))
-    fit.begin(0)
+    plan = FitPlan((Stage(16, 4, 1, 2, 16),), degree=0)
+    problem = RadianceProblem(RayBatches.of(photos), np.array([[-1.0] * 3, [1.0] * 3]), plan)
     rng = np.random.default_rng(1)
-    dense = mi.Float(rng.uniform(0, 1e5, fit.field.rows).astype(np.float32))
-    fit.field = fit.field.with_values(dense, mi.Float(rng.normal(size=dr.width(fit.field.harmonics)).astype(np.float32)))
+    dense = mi.Float(rng.uniform(0, 1e5, problem.field.rows).astype(np.float32))
+    harmonics = mi.Float(rng.normal(size=dr.width(problem.field.harmonics)).astype(np.float32))
+    problem.field = problem.field.with_values(dense, harmonics)
+    fit = begin_fit(problem, plan.optimiser, plan.course())
     fit.advance()
-    assert all(dr.all(dr.isfinite(v)) for v in (*fit.squares, fit.field.density, fit.field.harmonics))
-    assert dr.any(fit.squares[0] > 0) and dr.any(fit.squares[1] > 0)
+    state = fit.run.pack()
+    assert set(state) == {"reals/density", "reals/harmonics", "squares/density", "squares/harmonics"}
+    assert all(np.isfinite(array).all() for array in state.values())
+    assert np.any(state["squares/density"] > 0) and np.any(state["squares/harmonics"] > 0)
 
 
 # -- 5: colours --------------------------------------------------------------------------------------------------------
@@ -313,10 +318,10 @@ def test_defect_5_1_06_negative_densities(name: str) -> None:
 
 def test_defect_5_1_06_a_fit_begins_above_zero() -> None:
     for plan in PRESETS.values():
-        small = Plan((Stage(8, 1, 1, 1, 1),), degree=plan.degree, start=plan.start)
-        fit = RadianceFit(Views.of([plain_view(np.array([4.0, 0, 0]))]), np.array([[-1.0] * 3, [1.0] * 3]), small)
-        fit.begin(0)
-        assert dr.all(fit.field.density > 0) and fit.field.activation in ACTIVATIONS
+        small = FitPlan((Stage(8, 1, 1, 1, 1),), degree=plan.degree, start=plan.start)
+        batches = RayBatches.of([plain_view(np.array([4.0, 0, 0]))])
+        field = RadianceProblem(batches, np.array([[-1.0] * 3, [1.0] * 3]), small).field
+        assert dr.all(field.density > 0) and field.activation in ACTIVATIONS
 
 
 # -- 7: background and alpha -------------------------------------------------------------------------------------------
@@ -447,7 +452,7 @@ def test_defect_5_1_14_photographs_of_different_sizes_without_jitter() -> None:
         camera = Camera(intrinsics(1.3 * width, 1.1 * width, 0.45 * width, 0.6 * height), (width, height), camera.to_world)
         codes = rng.integers(0, 256, (height, width, 4)).astype(np.float32) / 255
         photos.append(Photo("noise", codes[..., :3], codes[..., 3], None, camera, np.ones(3)))
-    views = Views.of(photos)
+    views = RayBatches.of(photos)
     order = np.array([2, 0, 1])
     batches = [views.draw(1, order, 30, np.random.default_rng(seed)) for seed in range(2)]
     for batch in batches:

@@ -6,7 +6,6 @@ import os
 import signal
 from pathlib import Path
 
-import drjit as dr
 import numpy as np
 import pytest
 from fit_scene import KEY, small_problem
@@ -14,22 +13,20 @@ from fit_scene import KEY, small_problem
 from mivol.errors import MivolError
 from mivol.files import atomic
 from mivol.optim import checkpoint
+from mivol.optim.adam import Adam
+from mivol.optim.checkpoint import Store
+from mivol.optim.course import Course
 from mivol.optim.events import Checkpoint, Evaluate, Upsample
+from mivol.optim.gauss_newton import GaussNewton
 from mivol.optim.interrupt import Interrupted
+from mivol.optim.lbfgs import Lbfgs
 from mivol.optim.loop import Fit, reconstruct
-from mivol.optim.optimisers import Adam, GaussNewton, Lbfgs
+from mivol.optim.rmsprop import RMSprop
+from mivol.optim.scene_problem import SceneProblem
 
 ITERATIONS = 6
 EVENTS = (Upsample(at=(2,)), Evaluate(every=3))
-CASES = {"adam": Adam(views=2), "lbfgs": Lbfgs(), "gauss_newton": GaussNewton(inner=2)}
-
-
-@pytest.fixture
-def one_thread(variant_rgb):
-    before = dr.thread_count()
-    dr.set_thread_count(1)
-    yield
-    dr.set_thread_count(before)
+CASES = {"adam": Adam(views=2), "rmsprop": RMSprop(views=1), "lbfgs": Lbfgs(), "gauss_newton": GaussNewton(inner=2)}
 
 
 def fit(optimiser, path: Path | None = None, *, stop_after: int = -1, how: int = signal.SIGINT, resume: bool = False) -> Fit:
@@ -39,10 +36,12 @@ def fit(optimiser, path: Path | None = None, *, stop_after: int = -1, how: int =
         if at_work.next == stop_after:
             os.kill(os.getpid(), how)
 
-    return reconstruct(
-        small_problem(), optimiser, ITERATIONS, events=EVENTS, observer=observe, path=path, resume=resume,
-        measure=lambda problem: {"mean": float(np.asarray(problem.values()[KEY]).mean())}, fingerprint={"a": 1},
-    )  # fmt: skip
+    def measure(problem: SceneProblem) -> dict[str, float]:
+        return {"mean": float(np.asarray(problem.values()[KEY]).mean())}
+
+    store = None if path is None else Store(path, {"a": 1}, resume)
+    course = Course(ITERATIONS, events=EVENTS)
+    return reconstruct(small_problem(), optimiser, course, measure=measure, observer=observe, store=store)
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -88,7 +87,7 @@ def test_a_signal_in_the_middle_of_an_iteration_loses_nothing(one_thread, ctrl_c
 
     problem.render = render
     with pytest.raises(Interrupted):
-        reconstruct(problem, Adam(), ITERATIONS, events=EVENTS, path=path, fingerprint={"a": 1})
+        reconstruct(problem, Adam(), Course(ITERATIONS, events=EVENTS), store=Store(path, {"a": 1}))
     assert renders == iteration + 1
     resumed = fit(Adam(), path, resume=True)
     assert [r["loss"] for r in resumed.history] == [r["loss"] for r in whole.history]
@@ -102,7 +101,7 @@ def test_checkpoints_are_written_when_due(variant_rgb, tmp_path: Path) -> None:
     def observe(at_work: Fit) -> None:
         found.append(checkpoint.read(path, {})[1]["next"] if path.exists() else 0)
 
-    reconstruct(small_problem(), Adam(), 6, events=(Checkpoint(every=2),), observer=observe, path=path)
+    reconstruct(small_problem(), Adam(), Course(6, events=(Checkpoint(every=2),)), observer=observe, store=Store(path, {}))
     assert found == [0, 0, 2, 2, 4, 4]
 
 

@@ -13,33 +13,35 @@ import pytest
 from fit_scene import KEY, absorbing_scene, camera, film, frontal, small_problem
 
 from mivol.errors import MivolError
+from mivol.optim.adam import Adam
+from mivol.optim.course import Course
 from mivol.optim.events import Evaluate, Upsample
+from mivol.optim.gauss_newton import GaussNewton, Linearised, conjugate_gradients
 from mivol.optim.interrupt import Interrupted, Stop
+from mivol.optim.lbfgs import Lbfgs, two_loops
 from mivol.optim.loop import reconstruct
 from mivol.optim.losses import Huber, Log
-from mivol.optim.optimisers import (
-    OPTIMISERS,
-    Adam,
-    GaussNewton,
-    Lbfgs,
-    Linearised,
-    Packing,
-    conjugate_gradients,
-    two_loops,
-    views_of,
-)
+from mivol.optim.optimisers import OPTIMISERS
+from mivol.optim.packing import Packing
 from mivol.optim.parameters import Parameter
 from mivol.optim.priors import Laplacian, TotalVariation
-from mivol.optim.problem import Problem, seed_of
+from mivol.optim.render_batches import View, make_batches
+from mivol.optim.rmsprop import RMSprop
+from mivol.optim.scene_problem import SceneProblem, views_of
 from mivol.optim.schedules import Cosine
-from mivol.optim.shots import View, make_shots
+from mivol.optim.seeds import seed_of
 
 EPS = float(np.finfo(np.float32).eps)
 
 #: optimiser -> (settings, iterations, relative error of both optima that it must reach in a two-parameter problem).
-#: Gauss-Newton and L-BFGS converge superlinearly to the float32 noise of the loss (its square root: 3e-4); Adam steps of
-#: lr times the last cosine factors (below 1e-2 of 0.2) end within 1e-2.
-EXACT = {"adam": (Adam(), 80, 1e-2), "lbfgs": (Lbfgs(), 25, 1e-3), "gauss_newton": (GaussNewton(), 12, 1e-3)}
+#: Gauss-Newton and L-BFGS converge superlinearly to the float32 noise of the loss (its square root: 3e-4); Adam's and RMSprop's
+#: steps of lr times the last cosine factors (below 1e-2 of 0.2) end within 1e-2.
+EXACT = {
+    "adam": (Adam(), 80, 1e-2),
+    "rmsprop": (RMSprop(), 80, 1e-2),
+    "lbfgs": (Lbfgs(), 25, 1e-3),
+    "gauss_newton": (GaussNewton(), 12, 1e-3),
+}
 
 
 def two_cubes(start: float) -> mi.Scene:
@@ -65,7 +67,7 @@ def test_finds_a_known_optimum(variant_rgb, name: str) -> None:
     tau = 2 * np.repeat([[0.7, 0.7, 0.2, 0.2]], 4, axis=0)[..., None].repeat(3, axis=2)
     view = View("both", sensor, mi.TensorXf(np.exp(-tau).astype(np.float32)))
     parameters = [Parameter(key, domain=(0.0, 10.0), lr=0.2) for key in keys]
-    fit = reconstruct(Problem(scene, [view], parameters, spp=4), optimiser, iterations, schedule=Cosine())
+    fit = reconstruct(SceneProblem(scene, [view], parameters, spp=4), optimiser, Course(iterations, Cosine()))
     values = [float(np.asarray(fit.values()[key]).ravel()[0]) for key in keys]
     assert np.allclose(values, [0.7, 0.2], rtol=bound)
 
@@ -73,7 +75,7 @@ def test_finds_a_known_optimum(variant_rgb, name: str) -> None:
 # -- Derivatives --------------------------------------------------------------------------------------------------
 
 
-def vectors(problem: Problem, seed: int = 0) -> tuple[dict, Packing, np.ndarray, np.ndarray]:
+def vectors(problem: SceneProblem, seed: int = 0) -> tuple[dict, Packing, np.ndarray, np.ndarray]:
     reals = problem.start()
     packing = Packing(problem, reals)
     v, w = np.random.default_rng(seed).standard_normal((2, len(packing.low)))
@@ -86,7 +88,7 @@ def test_gradient_is_that_of_the_loss(variant_rgb) -> None:
     parameter = Parameter(KEY, "1", (0.0, np.inf), "softplus", lr=0.1, priors=(TotalVariation(weight=0.01, edge=1.0),))
     problem = small_problem(parameters=[parameter])
     reals, packing, v, _ = vectors(problem)
-    linear = Linearised(problem, reals, [problem.loss.weight(s.reference) for s in problem.shots], packing)
+    linear = Linearised(problem, reals, [problem.loss.weight(s.reference) for s in problem.batches], packing)
     x, h = packing.vector(reals), 1e-2
     ends = [problem.loss_value(packing.tensors(x + sign * h * v), 0) for sign in (1, -1)]
     expected = (ends[0] - ends[1]) / (2 * h)
@@ -102,7 +104,7 @@ def test_gradient_of_a_sky(variant_rgb) -> None:
     parts = {"sky": {"type": "envmap", "bitmap": mi.Bitmap(texels)}, "ball": {"type": "sphere", "radius": 0.1}}
     scene = mi.load_dict({"type": "scene", "integrator": {"type": "mivol"}, **parts})
     views = [View(f"view {i}", camera(i), dr.zeros(mi.TensorXf, (8, 8, 3))) for i in range(2)]
-    problem = Problem(scene, views, [Parameter("sky.data", "1", (0.0, np.inf), lr=0.1)], spp=64)
+    problem = SceneProblem(scene, views, [Parameter("sky.data", "1", (0.0, np.inf), lr=0.1)], spp=64)
     (key, x), h = next(iter(problem.start().items())), 1e-2
     v = mi.TensorXf(np.random.default_rng(2).uniform(0.5, 1, x.shape).astype(np.float32))
     ends = [problem.loss_value({key: x + sign * h * v}, 0) for sign in (1, -1)]
@@ -122,12 +124,12 @@ def test_gauss_newton_product_is_that_of_the_jacobian(variant_rgb) -> None:
     """<v, J^T W J v> is the weighted square of J v, which differences of images give; and the product is symmetric."""
     problem = small_problem()
     reals, packing, v, w = vectors(problem, 1)
-    linear = Linearised(problem, reals, [problem.loss.weight(s.reference) for s in problem.shots], packing)
-    x, h, shot, seed = packing.vector(reals), 1e-2, problem.shots[0], linear.seeds[0]
+    linear = Linearised(problem, reals, [problem.loss.weight(s.reference) for s in problem.batches], packing)
+    x, h, batch, seed = packing.vector(reals), 1e-2, problem.batches[0], linear.seeds[0]
     images = []
     for sign in (1, -1):
         problem.set(packing.tensors(x + sign * h * v))
-        images.append(np.asarray(problem.render(shot.sensor, seed), dtype=np.float64))
+        images.append(np.asarray(problem.render(batch.sensor, seed), dtype=np.float64))
     jv = (images[0] - images[1]) / (2 * h)
     product = linear.curvature(v)
     # Differences err by h^2 and by the rounding of images, eps / h = 1e-5 of each pixel.
@@ -142,7 +144,7 @@ def test_priors_enter_the_gauss_newton_product(variant_rgb) -> None:
     with_prior = small_problem(parameters=[dataclasses.replace(plain.parameters[0], priors=(prior,))])
     products = []
     for problem in (plain, with_prior):
-        weights = [problem.loss.weight(s.reference) for s in problem.shots]
+        weights = [problem.loss.weight(s.reference) for s in problem.batches]
         products.append(Linearised(problem, reals, weights, packing).curvature(v))
     direction = packing.tensors(v)[KEY]
     extra = np.asarray(prior.curvature(reals[KEY], direction, (0.25, 0.25, 0.25))).ravel() * 0.1
@@ -209,7 +211,7 @@ def test_a_nonlinear_loss_does_not_see_the_passes(variant_rgb) -> None:
     wanted = mi.TensorXf(np.full((4, 4, 3), 0.6, "f"))
     parameter = Parameter(KEY, domain=(0.0, np.inf))
     for most in (1 << 20, 16):
-        problem = Problem(scene, [View("a", frontal(), wanted)], [parameter], loss=Log(), spp=8, samples_per_pass=most)
+        problem = SceneProblem(scene, [View("a", frontal(), wanted)], [parameter], loss=Log(), spp=8, samples_per_pass=most)
         loss, gradients = problem.loss_and_gradient(problem.start(), 0)
         r = -0.8 - np.log(0.6)
         weight = 0.36 / (0.36 + 1e-6)
@@ -232,12 +234,12 @@ def test_views_side_by_side_are_the_views(variant_rgb) -> None:
     scene = absorbing_scene(truth)
     tau = 2 * truth.item()
     views = [View(str(i), frontal(), mi.TensorXf(np.full((4, 4, 3), i, "f"))) for i in range(3)]
-    (shot,) = make_shots(views, 1 << 20)
-    image = np.asarray(mi.render(scene, sensor=shot.sensor, spp=4))
+    (batch,) = make_batches(views, 1 << 20)
+    image = np.asarray(mi.render(scene, sensor=batch.sensor, spp=4))
     assert image.shape == (4, 12, 3)
     assert np.allclose(image, np.exp(-tau), rtol=4 * EPS)
-    assert np.array_equal(np.asarray(shot.reference)[:, 4:8], np.ones((4, 4, 3)))
-    assert [s.n_views for s in make_shots(views, 2 * 16)] == [2, 1]
+    assert np.array_equal(np.asarray(batch.reference)[:, 4:8], np.ones((4, 4, 3)))
+    assert [s.n_views for s in make_batches(views, 2 * 16)] == [2, 1]
 
 
 def test_cameras_side_by_side_keep_their_order_and_orientation(variant_rgb) -> None:
@@ -246,8 +248,8 @@ def test_cameras_side_by_side_keep_their_order_and_orientation(variant_rgb) -> N
     far less than two different views do."""
     problem = small_problem(spp=64)
     problem.set(problem.start())
-    (shot,) = problem.shots
-    batch = np.split(np.asarray(problem.render(shot.sensor, 1)), 3, axis=1)
+    (batch,) = problem.batches
+    batch = np.split(np.asarray(problem.render(batch.sensor, 1)), 3, axis=1)
     single = [np.asarray(problem.render(view.sensor, 2)) for view in problem.views]
     own = max(np.abs(a - b).mean() for a, b in zip(batch, single, strict=True))
     other = min(np.abs(batch[i] - single[(i + 1) % 3]).mean() for i in range(3))
@@ -258,7 +260,7 @@ def test_cameras_side_by_side_keep_their_order_and_orientation(variant_rgb) -> N
 
 def test_views_with_wide_filters_are_rendered_one_by_one(variant_rgb) -> None:
     views = [View(str(i), camera(i, 8, "gaussian"), mi.TensorXf(np.ones((8, 8, 3), "f"))) for i in range(2)]
-    assert [shot.n_views for shot in make_shots(views, 1 << 20)] == [1, 1]
+    assert [batch.n_views for batch in make_batches(views, 1 << 20)] == [1, 1]
 
 
 # -- The loop -----------------------------------------------------------------------------------------------------
@@ -269,10 +271,13 @@ def test_coarse_to_fine_keeps_the_image(variant_rgb) -> None:
     start, and the result lies on the fine grid."""
     problem = small_problem()
     measured: list[int] = []
-    fit = reconstruct(
-        problem, GaussNewton(), 6, events=(Upsample(at=(4,)), Evaluate(every=2)),
-        measure=lambda p: {"voxels": float(measured.append(1) or np.asarray(p.values()[KEY]).size)},
-    )  # fmt: skip
+    course = Course(6, events=(Upsample(at=(4,)), Evaluate(every=2)))
+
+    def measure(problem: SceneProblem) -> dict[str, float]:
+        measured.append(1)
+        return {"voxels": float(np.asarray(problem.values()[KEY]).size)}
+
+    fit = reconstruct(problem, GaussNewton(), course, measure=measure)
     losses = [record["loss"] for record in fit.history]
     assert fit.values()[KEY].shape == (8, 8, 8, 1)
     assert losses[4] < 0.2 * losses[0]
@@ -348,14 +353,14 @@ def bad_views() -> dict:
 def test_refused_views(variant_rgb, case: str) -> None:
     views, sentence = bad_views()[case]
     with pytest.raises(MivolError, match=sentence):
-        Problem(absorbing_scene(np.ones((2, 2, 2, 1))), views, [Parameter(KEY)])
+        SceneProblem(absorbing_scene(np.ones((2, 2, 2, 1))), views, [Parameter(KEY)])
 
 
 def test_a_loss_that_is_not_finite_stops_the_run(variant_rgb) -> None:
     """And what was found before it is kept."""
     problem = small_problem()
     reals, kept = problem.start(), problem.loss_and_gradient
-    problem.loss_and_gradient = lambda r, i, chosen=None: (np.nan if i == 1 else kept(r, i, chosen)[0], kept(r, i, chosen)[1])
+    problem.loss_and_gradient = lambda r, i, views=0: (np.nan if i == 1 else kept(r, i, views)[0], kept(r, i, views)[1])
     with pytest.raises(MivolError, match="became nan in iteration 1: lower the learning rate"):
         reconstruct(problem, Adam(), 4)
     assert not np.array_equal(np.asarray(problem.values()[KEY]), np.asarray(reals[KEY]))

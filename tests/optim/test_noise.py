@@ -14,13 +14,16 @@ from fit_scene import KEY, absorbing_scene, frontal, small_problem
 from mivol import config
 from mivol.cli.progress import Display
 from mivol.errors import MivolError
+from mivol.optim.adam import Adam
+from mivol.optim.checkpoint import Store
+from mivol.optim.gauss_newton import Linearised
 from mivol.optim.loop import reconstruct
 from mivol.optim.losses import L1, L2, LOSSES, Huber, Log, RelativeL2
 from mivol.optim.noise import compare, halves_of, noise_check, warning
-from mivol.optim.optimisers import Adam, Linearised, Packing
+from mivol.optim.packing import Packing
 from mivol.optim.parameters import Parameter
-from mivol.optim.problem import Problem
-from mivol.optim.shots import View
+from mivol.optim.render_batches import View
+from mivol.optim.scene_problem import SceneProblem
 
 SIGMA, SEEN, SPP = 0.4, 0.6, 8
 T = math.exp(-2 * SIGMA)
@@ -130,14 +133,14 @@ def test_one_exact_render_has_no_noise(variant_rgb) -> None:
 # -- Through Mitsuba ----------------------------------------------------------------------------------------------
 
 
-def cube_problem(integrator: str = "prbvolpath", **settings: object) -> Problem:
+def cube_problem(integrator: str = "prbvolpath", **settings: object) -> SceneProblem:
     """A constant cube seen by parallel rays. Delta tracking (``prbvolpath``, albedo 0) sees the sky or nothing: a pixel's
     mean of n samples has the expectation T and the variance T (1 - T) / n; mivol's is T."""
     scene = absorbing_scene(np.full((2, 2, 2, 1), SIGMA))
     view = View("face", frontal(8), mi.TensorXf(np.full((8, 8, 3), SEEN, "f")))
     tracer = mi.load_dict({"type": integrator, "max_depth": 2})
     chosen = {"spp": SPP, "integrator": tracer} | settings
-    return Problem(scene, [view], [Parameter(KEY, domain=(0.0, np.inf), lr=1e-3)], **chosen)
+    return SceneProblem(scene, [view], [Parameter(KEY, domain=(0.0, np.inf), lr=1e-3)], **chosen)
 
 
 @pytest.mark.parametrize("pairs", [False, True], ids=["plain", "pairs"])
@@ -160,13 +163,13 @@ def test_the_measured_noise_is_the_variance(variant_rgb) -> None:
     found = []
     for i in range(60):
         problem.loss_and_gradient(problem.start(), i)
-        found.append(problem.seen[1])
+        found.append(problem.newest_loss[1])
     error = np.std(found, ddof=1) / math.sqrt(len(found))
     assert abs(np.mean(found) - T * (1 - T) / SPP) <= 5 * error
 
 
 def test_exact_renders_do_not_pay(variant_rgb) -> None:
-    """One render a shot, no noise, and pairs change no bit; noisy renders come in two halves of the samples."""
+    """One render a batch, no noise, and pairs change no bit; noisy renders come in two halves of the samples."""
     for integrator, wanted in (("mivol", [SPP]), ("prbvolpath", [SPP // 2, SPP // 2])):
         losses = []
         for pairs in (False, True):
@@ -175,7 +178,7 @@ def test_exact_renders_do_not_pay(variant_rgb) -> None:
             problem.integrator = Counting(problem.integrator, samples)
             losses.append(problem.loss_and_gradient(problem.start(), 0)[0])
             assert samples == wanted
-            assert (problem.seen[1] == 0.0) == (integrator == "mivol")
+            assert (problem.newest_loss[1] == 0.0) == (integrator == "mivol")
         assert (losses[0] == losses[1]) == (integrator == "mivol")
     assert halves_of(5, L2()) == (3, 2)
 
@@ -198,14 +201,14 @@ def test_gauss_newton_carries_noise_back_by_other_samples(variant_rgb) -> None:
     """Seeds of J^T differ from the image's where there is noise, and are the image's where there is none."""
     for integrator, same in (("mivol", True), ("prbvolpath", False)):
         problem = cube_problem(integrator)
-        images, derivatives = [noted(problem, name, place) for name, place in (("compare", 1), ("pull_back", 2))]
+        images, derivatives = [noted(problem, name, place) for name, place in (("compare", 1), ("vjp", 2))]
         reals = problem.start()
-        Linearised(problem, reals, [L2().weight(problem.shots[0].reference)], Packing(problem, reals))
+        Linearised(problem, reals, [L2().weight(problem.batches[0].reference)], Packing(problem, reals))
         assert len(images) == 1
         assert (images == derivatives) == same
 
 
-def noted(problem: Problem, method: str, place: int) -> list[int]:
+def noted(problem: SceneProblem, method: str, place: int) -> list[int]:
     """The seeds, at that place of the arguments, that a method is called with from now on."""
     seeds, kept = [], getattr(problem, method)
     setattr(problem, method, lambda *given: seeds.append(given[place]) or kept(*given))
@@ -242,7 +245,7 @@ def test_said_once_with_its_size(variant_rgb, tmp_path: Path, capsys) -> None:
     (64 pixels, sqrt(2 / 64) = 18 % of 0.031, and as much of the loss) leaves 40 to 75 %."""
     path = tmp_path / "checkpoint.npz"
     with Display(3) as display:
-        fit = reconstruct(cube_problem(), Adam(), 3, path=path, observer=display)
+        fit = reconstruct(cube_problem(), Adam(), 3, store=Store(path, {}), observer=display)
     fit.save()
     (line,) = fit.log
     assert line.startswith("iteration 0: the render's noise makes up 0.0")
@@ -251,7 +254,7 @@ def test_said_once_with_its_size(variant_rgb, tmp_path: Path, capsys) -> None:
     assert "its gradient is not biased" in line
     assert "loss.pairs = true" in line
     assert capsys.readouterr().err.count("loss.pairs = true") == 1
-    assert reconstruct(cube_problem(), Adam(), 5, path=path, resume=True).log == [line]
+    assert reconstruct(cube_problem(), Adam(), 5, store=Store(path, {}, resume=True)).log == [line]
 
 
 def test_nothing_is_said_of_exact_renders_and_of_pairs(variant_rgb) -> None:

@@ -11,9 +11,10 @@ from mivol.bench.extinctions import DATA, TO_WORLD
 from mivol.bench.radiance_field.size import Size
 from mivol.bench.radiance_field.views import BOX, photographed, ring
 from mivol.fields.spherical import SphericalGrid
-from mivol.optim.radiance_fit import RadianceFit
-from mivol.optim.radiance_plan import Plan, Stage
-from mivol.optim.radiance_views import Views
+from mivol.optim.loop import reconstruct
+from mivol.optim.radiance_plan import FitPlan, Stage
+from mivol.optim.radiance_problem import RadianceProblem
+from mivol.optim.ray_batches import RayBatches
 from mivol.photos import load_photos, silhouette_box
 
 __all__ = ["FIELDS", "field_of"]
@@ -62,16 +63,16 @@ def fitted(size: Size) -> tuple[SphericalGrid, str]:
     path = DATA / "multiview" / "chair"
     if path.is_dir():
         photos = load_photos(path, split="train", background="white", scale=0.5)
-        views, box, origin = Views.of(photos.views, (1, 2, 4)), silhouette_box(photos), "NeRF's chair"
+        views, box, origin = RayBatches.of(photos.views, (1, 2, 4)), silhouette_box(photos), "NeRF's chair"
     else:
         photos = photographed(shell(size)[0], ring(size.side, 24))
-        views, box, origin = Views.of(photos, (1, 2, 4)), BOX, "views of the shell (no data folder)"
-    fit = RadianceFit(views, box, Plan(stages))
-    for _ in range(fit.plan.steps):
-        fit.advance()
+        views, box, origin = RayBatches.of(photos, (1, 2, 4)), BOX, "views of the shell (no data folder)"
+    plan = FitPlan(stages)
+    problem = RadianceProblem(views, box, plan)
+    reconstruct(problem, plan.optimiser, plan.course())
     # Into the box of the others, dense: the peer has nothing else.
-    density, sh = fit.field.to_dense()
-    density, sh = (centred(a, size.resolution) for a in (density * fit.unit, sh))
+    density, sh = problem.field.to_dense()
+    density, sh = (centred(a, size.resolution) for a in (density * problem.unit, sh))
     keep = density > 0
     keep |= np.roll(keep, 1, 0) | np.roll(keep, -1, 0) | np.roll(keep, 1, 1) | np.roll(keep, -1, 1)
     return SphericalGrid.from_dense(density, sh, TO_WORLD, keep), f"{origin}, fitted in {size.chair_steps} steps"

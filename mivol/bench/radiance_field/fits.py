@@ -16,9 +16,11 @@ from mivol.bench.radiance_field.size import STOP, Size
 from mivol.bench.radiance_field.views import BLACK, BOX, between, photographed, rays_of, rays_through, ring, tiled
 from mivol.bench.timing import Stopwatch
 from mivol.fields.spherical import SphericalGrid
-from mivol.optim.radiance_fit import RadianceFit, render_view
-from mivol.optim.radiance_plan import Plan, Stage
-from mivol.optim.radiance_views import TILE, Batch, Views
+from mivol.optim.field_view import render_view
+from mivol.optim.loop import Fit
+from mivol.optim.radiance_fit import begin_radiance_fit, newest_field
+from mivol.optim.radiance_plan import FitPlan, Stage
+from mivol.optim.ray_batches import TILE, RayBatch, RayBatches
 from mivol.photos import Camera, Photo
 from mivol.validate.statistics import psnr
 
@@ -65,10 +67,10 @@ def follow(steps: Iterable, judge: Callable[[], float]) -> Curve:
 # -- Which rays a step has ------------------------------------------------------------------------------------------------
 
 
-class Pixels(Views):
+class Pixels(RayBatches):
     """Views of which single pixels are drawn, not tiles."""
 
-    def draw(self, shrink: int, views: np.ndarray, tiles: int, rng: np.random.Generator) -> Batch:
+    def draw(self, shrink: int, views: np.ndarray, tiles: int, rng: np.random.Generator) -> RayBatch:
         """As many pixels as the tiles would have, in any order."""
         width, height = self.levels[shrink].sizes[views[0]]
         n = len(views) * tiles * TILE**2
@@ -83,33 +85,33 @@ def ask_locality(size: Size) -> dict:
     photos, held_out = photographed(field, ring(side, 24)), photographed(field, between(side, 24)[::3])
     stages = (Stage(n // 2, size.steps, 2, 8, max(side**2 // 512, 1)), Stage(n, 2 * size.steps, 1, 8, max(side**2 // 128, 1)))
     answer = {}
-    for name, kind in {"tiles": Views, "pixels": Pixels}.items():
+    for name, kind in {"tiles": RayBatches, "pixels": Pixels}.items():
         views = kind.of(photos, (1, 2))
         compile_fit(views, stages[-1:])
-        fit, watch = RadianceFit(views, BOX, Plan(stages)), Stopwatch()
+        fit, watch = begin_radiance_fit(views, BOX, FitPlan(stages)), Stopwatch()
         with watch:
             for _ in our_steps(fit):
                 pass
-        found = held_out_psnr(held_out, lambda camera, fit=fit: view_of(fit.field, camera))
-        answer[name] = {"psnr": found, "processor_seconds": watch.processor, "steps": fit.plan.steps}
-        say(f"  {name}: {found:.2f} dB, {watch.processor / fit.plan.steps * 1e3:.1f} ms a step")
+        found = held_out_psnr(held_out, lambda camera, fit=fit: view_of(newest_field(fit), camera))
+        answer[name] = {"psnr": found, "processor_seconds": watch.processor, "steps": fit.course.iterations}
+        say(f"  {name}: {found:.2f} dB, {watch.processor / fit.course.iterations * 1e3:.1f} ms a step")
     return answer
 
 
 # -- Fits beside the peer's -----------------------------------------------------------------------------------------------
 
 
-def compile_fit(views: Views, stages: Sequence[Stage]) -> None:
+def compile_fit(views: RayBatches, stages: Sequence[Stage]) -> None:
     """Take a step of each stage, so that its kernels are there before a clock runs."""
     for stage in stages:
-        dr.eval(RadianceFit(views, BOX, Plan((replace(stage, steps=2),))).advance())
+        begin_radiance_fit(views, BOX, FitPlan((replace(stage, steps=2),))).advance()
     dr.sync_thread()
 
 
-def our_steps(fit: RadianceFit) -> Iterator[None]:
+def our_steps(fit: Fit) -> Iterator[None]:
     """Take all steps of a plan."""
-    for _ in range(fit.plan.steps):
-        yield dr.eval(fit.advance())
+    for _ in range(fit.course.iterations):
+        yield fit.advance()
 
 
 def our_fit(photos: list[Photo], held_out: list[Photo], size: Size) -> Curve:
@@ -118,10 +120,10 @@ def our_fit(photos: list[Photo], held_out: list[Photo], size: Size) -> Curve:
     tiles = max(size.fit_side**2 // 112, 4)
     kinds = ((8, 1, 4, tiles // 4), (4, 1, 2, tiles // 4), (1, 2, 1, tiles))
     stages = tuple(Stage(n // k, steps * s, shrink, 7, count) for k, s, shrink, count in kinds)
-    views = Views.of(photos, (1, 2, 4))
+    views = RayBatches.of(photos, (1, 2, 4))
     compile_fit(views, stages)
-    fit = RadianceFit(views, BOX, Plan(stages))
-    return follow(our_steps(fit), lambda: held_out_psnr(held_out, lambda camera: view_of(fit.field, camera)))
+    fit = begin_radiance_fit(views, BOX, FitPlan(stages))
+    return follow(our_steps(fit), lambda: held_out_psnr(held_out, lambda camera: view_of(newest_field(fit), camera)))
 
 
 def peer_fit(photos: list[Photo], held_out: list[Photo], size: Size) -> Curve:

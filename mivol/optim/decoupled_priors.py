@@ -1,9 +1,9 @@
-r"""What is believed of a radiance field before it is seen: it varies little, most of it is empty, most of it is matte.
+r"""Priors of a radiance field that act apart from the gradient: it varies little, most of it is empty, most of it is matte.
 
 .. math:: TV = \sum_k \sqrt{\delta^2 + |\nabla_h v_k|^2}, \qquad S = \sum_k \log(1 + 2 \sigma_k^2)
 
-Conventions. A belief moves values by itself, after the step that the photographs asked for, as decoupled weight decay does:
-inside RMSprop's quotient the weakest belief would move a row that no ray touched by a whole learning rate (measured on the
+Conventions. A prior moves values by itself, after the step that the photographs asked for, as decoupled weight decay does:
+inside RMSprop's quotient the weakest prior would move a row that no ray touched by a whole learning rate (measured on the
 still life from 12 views: 24.4 dB so, 25.7 dB without, 30.5 dB with all three moved apart). How far is a share of the learning
 rate, for that is how far photographs that agree move a value. Differences go to the next node along each axis (0 at the
 border; nodes that are not stored hold the vacuum).
@@ -15,14 +15,14 @@ al. 2021); Loshchilov & Hutter 2019 (decoupling).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated, ClassVar
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from mivol.fields.spherical import SphericalGrid
-
-__all__ = ["Neighbours", "dull", "smooth", "thin_out"]
+from mivol.optim.strategy import Strategy, of
 
 
 @dataclass
@@ -54,25 +54,86 @@ class Neighbours:
         return found
 
 
-def smooth(values: mi.Float, width: int, around: Neighbours, amount: float, share: float, start: int) -> None:
+@dataclass(frozen=True)
+class Rows:
+    """Where a prior acts: one parameter of a field, of so many numbers a row.
+
+    Attributes:
+        width: numbers a row.
+        neighbours: who lies beside whom.
+        rate: learning rate over the number of photographs, times ``unit``: what one photograph is worth in a step.
+        unit: values times this have no unit.
+        first: the row at which a prior begins that looks at a share of them.
+    """
+
+    width: int
+    neighbours: Neighbours
+    rate: float
+    unit: float
+    first: int
+
+
+class DecoupledPrior(Strategy, tag="decoupled prior"):
+    """A move of the values of one parameter after each step; ``is_spatial`` tells that it compares neighbours."""
+
+    is_spatial: ClassVar[bool] = False
+
+    weight: Annotated[float, of("photograph", "how many photographs, all asking for the same, hold against it", ge=0)] = 1.0
+
+    def apply(self, values: mi.Float, rows: Rows) -> mi.Float:
+        """Values after the move; a spatial prior takes them evaluated."""
+        raise NotImplementedError
+
+
+class Smoothness(DecoupledPrior, tag="smoothness"):
+    """Total variation over a share of the rows at a time. Source: Rudin, Osher and Fatemi 1992."""
+
+    is_spatial = True
+    cites = ("rudin_1992",)
+
+    share: Annotated[float, of("1", "of the rows that a step looks at", gt=0, le=1)] = 1 / 8
+
+    def apply(self, values: mi.Float, rows: Rows) -> mi.Float:
+        moved = mi.Float(values)
+        smooth(moved, rows, self.weight, self.share)
+        return moved
+
+
+class Sparsity(DecoupledPrior, tag="sparsity"):
+    """The Cauchy prior on a density. Source: Hedman et al. 2021."""
+
+    def apply(self, values: mi.Float, rows: Rows) -> mi.Float:
+        return sparsify(values, rows.rate * self.weight, rows.unit)
+
+
+class ViewDependence(DecoupledPrior, tag="view_dependence"):
+    """Decay of what goes with the direction: few photographs say more about it than there is."""
+
+    def apply(self, values: mi.Float, rows: Rows) -> mi.Float:
+        return decay_view_dependence(values, rows.width, rows.rate * self.weight)
+
+
+def smooth(values: mi.Float, rows: Rows, weight: float, share: float) -> None:
     """Move a run of rows down the slope of the total variation.
 
-    A row is in four terms of it, its own and those of the three nodes before it. With delta = 6 amount / share none of them
-    moves it by more than a sixth of a difference, so what was between the smallest and the largest value stays there.
+    A step down a slope of 1 has the length amount = rate * weight / unit. A row is in four terms, its own and those of the
+    three nodes before it. With delta = 6 amount / share none of them moves it by more than a sixth of a difference, so what
+    was between the smallest and the largest value stays there.
 
     Args:
-        values: ``width`` numbers a row; moved in place.
-        around: who lies beside whom.
-        amount: length of a step down a slope of 1, in the values' unit; 0 moves nothing.
+        values: moved in place.
+        rows: how they lie.
+        weight: of the prior; 0 moves nothing.
         share: of the rows that are moved; they stand for all.
-        start: the first of them.
 
     Cost: 13 rows read a row that is moved, and one written: by one lane, so nothing is added at once.
     """
+    amount = rows.rate * weight / rows.unit
     if amount == 0:
         return
+    around, width = rows.neighbours, rows.width
     count = dr.width(around.after[0])
-    row = (dr.arange(mi.UInt32, max(int(count * share), 1)) + dr.opaque(mi.UInt32, start)) % count
+    row = (dr.arange(mi.UInt32, max(int(count * share), 1)) + dr.opaque(mi.UInt32, rows.first)) % count
     length = dr.opaque(mi.Float, amount / share)
 
     def numbers(row: mi.UInt32) -> mi.ArrayXf:
@@ -97,7 +158,7 @@ def _slopes(steps: list[mi.Float], delta: mi.Float) -> list[mi.Float]:
     return [s * dr.rsqrt(dr.square(delta) + sum(dr.square(s) for s in steps)) for s in steps]
 
 
-def thin_out(density: mi.Float, amount: float, unit: float) -> mi.Float:
+def sparsify(density: mi.Float, amount: float, unit: float) -> mi.Float:
     """Density after a step of ``amount`` [1] down the Cauchy prior's slope, in units of 1 / ``unit``; it ends at 0."""
     if amount == 0:
         return density
@@ -106,7 +167,7 @@ def thin_out(density: mi.Float, amount: float, unit: float) -> mi.Float:
     return density - dr.minimum(step, sigma) * (1 / unit)
 
 
-def dull(harmonics: mi.Float, width: int, share: float) -> mi.Float:
+def decay_view_dependence(harmonics: mi.Float, width: int, share: float) -> mi.Float:
     """Coefficients, ``width`` a row, of which all but the three constant ones have lost a share."""
     if share == 0:
         return harmonics

@@ -1,6 +1,6 @@
 """Many views, few renders: views of one size side by side in one image.
 
-Conventions. A :class:`View` is a sensor with what it saw, (height, width, channels); a :class:`Shot` is one render, of a
+Conventions. A :class:`View` is a sensor with what it saw, (height, width, channels); a :class:`RenderBatch` is one render, of a
 view or of several side by side (Mitsuba's ``batch`` sensor). Tracing and starting a kernel costs as much for one small
 view as for twenty; only views whose pixels do not reach over their border (box filter) are put side by side.
 """
@@ -33,7 +33,7 @@ class View:
 
 
 @dataclass(frozen=True)
-class Shot:
+class RenderBatch:
     """One render.
 
     Attributes:
@@ -89,16 +89,16 @@ def check_sizes(sensors: Mapping[str, mi.Sensor]) -> None:
             raise MivolError(f'view "{name}" is {other} pixels and view "{first}" {size}: give all views one size.')
 
 
-def single_shots(views: Sequence[View]) -> list[Shot]:
+def single_batches(views: Sequence[View]) -> list[RenderBatch]:
     """One render for each view."""
-    return [Shot(view.sensor, view.reference, 1) for view in views]
+    return [RenderBatch(view.sensor, view.reference, 1) for view in views]
 
 
-def make_shots(views: Sequence[View], most_pixels: int) -> list[Shot]:
+def make_batches(views: Sequence[View], most_pixels: int) -> list[RenderBatch]:
     """As few renders as there can be with at most ``most_pixels`` pixels each, in the order of the views."""
     together = max(most_pixels // pixels(views[0].sensor), 1)
     if together == 1 or len(views) == 1 or not all(is_closed(view) for view in views):
-        return single_shots(views)
+        return single_batches(views)
     return [side_by_side(views[first : first + together]) for first in range(0, len(views), together)]
 
 
@@ -110,7 +110,7 @@ def is_closed(view: View) -> bool:
     return whole and plain and view.reference.shape[2] in (1, 3) and view.sensor.get_medium() is None
 
 
-def side_by_side(views: Sequence[View]) -> Shot:
+def side_by_side(views: Sequence[View]) -> RenderBatch:
     """One render of several views, from left to right."""
     height, width, channels = views[0].reference.shape
     film = {
@@ -125,4 +125,4 @@ def side_by_side(views: Sequence[View]) -> Shot:
     sampler = {"type": "independent"}
     batch = mi.load_dict({"type": "batch", **sensors, "film": film, "sampler": sampler}, parallel=False)
     reference = np.concatenate([np.asarray(view.reference) for view in views], axis=1)
-    return Shot(batch, mi.TensorXf(np.ascontiguousarray(reference)), len(views))
+    return RenderBatch(batch, mi.TensorXf(np.ascontiguousarray(reference)), len(views))

@@ -1,4 +1,4 @@
-"""Photographs where a fit draws its rays: pixels in memory, in several sizes, and the ray of each.
+"""Batches of rays of photographs: pixels in memory, in several sizes, and the ray of each.
 
 Conventions. A batch is square tiles of pixels: neighbours cross the same cells, so their reads and writes meet in the cache,
 and a packet of lanes walks as one. Tiles lie anywhere in a view, all places alike. Smaller sizes are exact means over area;
@@ -20,8 +20,6 @@ from mivol.errors import MivolError
 from mivol.photos import Photo
 from mivol.transport.radiance import Rays
 
-__all__ = ["TILE", "Batch", "Level", "Views"]
-
 TILE = 4
 """Edge of a tile [pixel]: 16 lanes, a packet of AVX-512."""
 
@@ -41,13 +39,20 @@ class Level:
 
 
 @dataclass
-class Batch:
-    """Rays of pixels: the slot of each ray's view among the chosen ones, and what the photograph shows.
+class RayBatch:
+    """Rays of pixels of some views, and what the photographs show.
 
-    ``alpha`` is 1 where the photographs have none; ``before`` is the colour that the photograph lies over; ``counted`` is 1,
-    or 0 where a mask leaves the pixel out.
+    Attributes:
+        origins: (V, 3) pinholes of the chosen views.
+        rays: in the world.
+        slot: of each ray's view among the chosen ones.
+        target: what the photograph shows.
+        alpha: 1 where the photographs have none.
+        before: the colour that the photograph lies over.
+        counted: 1, or 0 where a mask leaves the pixel out.
     """
 
+    origins: np.ndarray
     rays: Rays
     slot: mi.UInt32
     target: mi.Color3f
@@ -57,7 +62,7 @@ class Batch:
 
 
 @dataclass
-class Views:
+class RayBatches:
     """Photographs of pinhole cameras.
 
     Attributes:
@@ -72,7 +77,7 @@ class Views:
     channels: int
 
     @classmethod
-    def of(cls, photos: Sequence[Photo], shrinks: Sequence[int] = (1,), with_alpha: bool | None = None) -> Views:
+    def of(cls, photos: Sequence[Photo], shrinks: Sequence[int] = (1,), with_alpha: bool | None = None) -> RayBatches:
         """Take over photographs.
 
         Args:
@@ -112,7 +117,12 @@ class Views:
         counted = codes if level.counted is None else codes[np.array(level.counted) > 0]
         return np.median(counted, axis=0) / 255 if len(counted) else np.full(3, 0.5)
 
-    def draw(self, shrink: int, views: np.ndarray, tiles: int, rng: np.random.Generator) -> Batch:
+    def choose(self, count: int, rng: np.random.Generator) -> np.ndarray:
+        """Numbers of so many views, each at most once, in ascending order; of all where there are fewer."""
+        there = len(self.origins)
+        return np.sort(rng.choice(there, min(count, there), replace=False))
+
+    def draw(self, shrink: int, views: np.ndarray, tiles: int, rng: np.random.Generator) -> RayBatch:
         """Draw tiles of some views: ``tiles`` of each, rays of a view side by side."""
         level = self.levels[shrink]
         room = level.sizes[views] - TILE + 1
@@ -125,7 +135,7 @@ class Views:
         place = [dr.gather(mi.UInt32, mi.UInt32(np.ascontiguousarray(corner[..., a]).reshape(-1)), tile) for a in range(2)]
         return self.look_up(shrink, views, tile // tiles, place[0] + within % TILE, place[1] + within // TILE)
 
-    def whole(self, shrink: int, view: int) -> Batch:
+    def whole(self, shrink: int, view: int) -> RayBatch:
         """All pixels of a view, tile by tile; those of tiles that reach over its edge more than once."""
         width, height = (int(n) for n in self.levels[shrink].sizes[view])
         across, down = -(-width // TILE), -(-height // TILE)
@@ -142,7 +152,7 @@ class Views:
             found.update(np.array(pixels).tobytes())
         return found.hexdigest()[:16]
 
-    def look_up(self, shrink: int, views: np.ndarray, slot: mi.UInt32, column: mi.UInt32, row: mi.UInt32) -> Batch:
+    def look_up(self, shrink: int, views: np.ndarray, slot: mi.UInt32, column: mi.UInt32, row: mi.UInt32) -> RayBatch:
         """The rays through the centres of pixels, and what is there."""
         level = self.levels[shrink]
         table = np.stack([views, level.starts[views], level.sizes[views][:, 0]], axis=1).astype(np.uint32)
@@ -158,7 +168,8 @@ class Views:
         d = mi.Vector3f(*(dr.fma(lens[4 + 3 * a], x, dr.fma(lens[5 + 3 * a], y, -lens[6 + 3 * a])) for a in range(3)))
         o = mi.Point3f(lens[13], lens[14], lens[15])
         alpha = codes[3] if self.channels == 4 else mi.Float(1)
-        return Batch(Rays(o, dr.normalize(d)), slot, mi.Color3f(*codes[:3]), alpha, mi.Color3f(*lens[16:]), counted)
+        target, before = mi.Color3f(*codes[:3]), mi.Color3f(*lens[16:])
+        return RayBatch(self.origins[views], Rays(o, dr.normalize(d)), slot, target, alpha, before, counted)
 
 
 LENS = 19

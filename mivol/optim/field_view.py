@@ -1,0 +1,69 @@
+"""A radiance field as a camera sees it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mivol.fields.sky import Sky
+from mivol.fields.spherical import SphericalGrid
+from mivol.photos import Camera, pixel_centres, rays
+from mivol.transport.radiance import Rays, bake, cells_of, look, model_of
+
+
+@dataclass(frozen=True)
+class FieldView:
+    """A picture of a field: ``image`` (H, W, 3) over its background, ``opacity`` (H, W), ``depth`` (H, W) [length].
+
+    ``depth`` is the mean distance of what is seen from the camera; NaN where nothing is.
+    """
+
+    image: np.ndarray
+    opacity: np.ndarray
+    depth: np.ndarray
+
+
+PASS = 1 << 20
+"""Rays of a picture that are followed at once."""
+
+
+def render_view(field: SphericalGrid, camera: Camera, background: np.ndarray | Sky, stop: float = 0.0) -> FieldView:
+    """Render what a camera sees.
+
+    Args:
+        field: what is there.
+        camera: with or without distortion.
+        background: behind the field: a colour (3,), or a sky.
+        stop: a ray ends at this transmittance.
+
+    Bias: O(h^4) in a cell, and that of :func:`mivol.transport.radiance.bake`.
+    """
+    cells, model = cells_of(field), model_of(field, stop)
+    source = bake(field, cells, camera.origin[None], mi.UInt32(0))
+    width, height = camera.size
+    order = _by_tiles(width, height)
+    pixels = pixel_centres(camera.size).reshape(-1, 2)[order]
+    found = np.empty((width * height, 5), np.float32)
+    for start in range(0, len(order), PASS):
+        o, d = rays(camera, pixels[start : start + PASS])
+        o = np.broadcast_to(o, d.shape)
+        sent = Rays(*(kind(np.ascontiguousarray(np.float32(a.T))) for kind, a in ((mi.Point3f, o), (mi.Vector3f, d))))
+        seen = look(cells, source, model, sent)
+        behind = background.seen(sent.d) if isinstance(background, Sky) else mi.Color3f(*map(float, background))
+        colour = seen.colour + seen.T * behind
+        dr.eval(colour, seen.T, seen.distance)
+        found[order[start : start + PASS]] = np.stack([*np.array(colour), np.array(seen.T), np.array(seen.distance)], axis=1)
+    found = found.reshape(height, width, 5)
+    opacity = 1 - found[..., 3]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        depth = np.where(opacity > 0, found[..., 4] / opacity, np.nan)
+    return FieldView(found[..., :3], opacity, depth)
+
+
+def _by_tiles(width: int, height: int) -> np.ndarray:
+    """Flat numbers of pixels, tile by tile of 4 x 4."""
+    row, column = np.divmod(np.arange(width * height), width)
+    return np.lexsort((column % 4, row % 4, column // 4, row // 4))

@@ -1,0 +1,115 @@
+"""Projections as a problem of the loop, and the linear solvers as its optimisers.
+
+Conventions. A solver needs more of its problem than a gradient (the operator and its transpose, whose products it shares out),
+so it takes its iterations itself; the loop brings events, history, checkpoints and a clean stop. Vectors stay in NumPy.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Annotated
+
+import numpy as np
+
+from mivol.errors import MivolError
+from mivol.optim.optimiser import Optimiser, Run
+from mivol.optim.problem import Reals
+from mivol.optim.solvers import SOLVERS, LeastSquares, PoissonCounts, State
+from mivol.optim.strategy import of
+
+KEY = "x"
+"""The name of the volume among values."""
+
+
+@dataclass
+class Inversion:
+    """A volume behind projections.
+
+    Attributes:
+        task: what a solver minimises.
+        x: (n,) what was found; None before the first step.
+        safe_point: called before each iteration.
+    """
+
+    task: LeastSquares | PoissonCounts
+    x: np.ndarray | None = None
+    safe_point: Callable[[], None] = lambda: None
+
+    def start(self) -> Reals:
+        """Nothing: a solver begins where its task says."""
+        return {}
+
+    def set(self, reals: Reals) -> None:
+        """Take over what was found."""
+        self.x = reals.get(KEY)
+
+    def values(self) -> Reals:
+        """What was found."""
+        return {} if self.x is None else {KEY: self.x}
+
+    def warning(self) -> str:
+        """Nothing: projections are computed without noise."""
+        return ""
+
+    def pack(self, reals: Reals) -> dict[str, np.ndarray]:
+        """Nothing: the solver's state is all there is."""
+        return {}
+
+    def unpack(self, arrays: dict[str, np.ndarray], reals: Reals) -> None:
+        """Nothing to do."""
+
+
+class Solve(Optimiser, tag="solve"):
+    """The iterations of a linear solver."""
+
+    solver: Annotated[str, of("1", "key of SOLVERS", min_length=1)] = "pcg"
+    subsets: Annotated[int, of("1", "subsets of views, for os-sart", ge=1)] = 10
+
+    def begin(self, problem: Inversion) -> SolverRun:
+        return SolverRun(self, problem)
+
+
+class SolverRun(Run):
+    """State: that of the solver, whose arrays are never written again.
+
+    Attributes:
+        state: the newest; None before the first iteration.
+    """
+
+    def __init__(self, settings: Solve, problem: Inversion) -> None:
+        super().__init__(problem)
+        self.settings = settings
+        self.state: State | None = None
+        self._go_on(None)
+
+    def _go_on(self, state: State | None) -> None:
+        options = {"n_subsets": self.settings.subsets} if self.settings.solver == "os-sart" else {}
+        self._states = SOLVERS[self.settings.solver].run(self.problem.task, state, **options)
+        self._keep(state)
+
+    def _keep(self, state: State | None) -> None:
+        self.state = state
+        self.reals = {} if state is None else {KEY: state.x}
+
+    def step(self, iteration: int, factor: float) -> float | None:
+        """The solver's next iteration; what it minimises, after it.
+
+        Raises:
+            MivolError: the projections hold nothing, so that there is no first iteration.
+        """
+        self.problem.safe_point()
+        state = next(self._states, None)
+        if state is None:
+            if self.state is None:
+                raise MivolError("the projections hold nothing to reconstruct: all weights are 0, or all line integrals.")
+            self.finished = "no direction lowers the objective"
+            return None
+        self._keep(state)
+        return state.objective
+
+    def pack(self) -> dict[str, np.ndarray]:
+        return {} if self.state is None else self.state.to_arrays()
+
+    def unpack(self, arrays: dict[str, np.ndarray]) -> None:
+        self._go_on(State.from_arrays(arrays) if arrays else None)

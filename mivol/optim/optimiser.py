@@ -1,0 +1,71 @@
+"""An optimiser, and a walk that it takes: the two protocols of whatever goes downhill.
+
+Conventions. An :class:`Optimiser` is a strategy (settings only); :meth:`Optimiser.begin` gives a :class:`Run`, which owns the
+reals. ``Run.step`` either completes or, when a safe point stops it, leaves the run as it was. ``pack`` and ``unpack`` hold
+everything that the next step depends on, so that a restored run continues to the last bit.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import mitsuba as mi
+import numpy as np
+
+from mivol.optim.problem import Problem, Reals, Refinement
+from mivol.optim.strategy import Strategy, of
+
+
+class Run:
+    """An optimiser at work.
+
+    Attributes:
+        problem: what is minimised.
+        reals: where the walk stands.
+        finished: why there is nothing left to gain, or "".
+    """
+
+    finished = ""
+
+    def __init__(self, problem: Problem) -> None:
+        self.problem = problem
+        self.reals: Reals = problem.start()
+
+    def step(self, iteration: int, factor: float) -> float | mi.Float | None:
+        """One iteration with the learning rate times ``factor``.
+
+        Returns:
+            The loss as the step met it; None where there was nothing left to gain and no step was taken.
+        """
+        raise NotImplementedError
+
+    def pack(self) -> dict[str, np.ndarray]:
+        """Everything that the next step depends on, as arrays."""
+        return {f"reals/{name}": np.array(value) for name, value in self.reals.items()}
+
+    def unpack(self, arrays: dict[str, np.ndarray]) -> None:
+        """Continue from what :meth:`pack` gave."""
+        self.reals = {name: mi.TensorXf(arrays[f"reals/{name}"]) for name in self.reals}
+
+    def replace(self, name: str, reals: mi.TensorXf) -> None:
+        """Give a parameter another value, of another shape perhaps: what was learnt about its old one is dropped."""
+        self.reals = {**self.reals, name: reals}
+
+    def refine(self, refinement: Refinement) -> None:
+        """Go over to other unknowns: what was learnt about the old ones is dropped, unless the optimiser can carry it over."""
+        for name, value in refinement.reals.items():
+            self.replace(name, value)
+
+
+class Optimiser(Strategy, tag="optimiser"):
+    """Settings of a walk."""
+
+    def begin(self, problem: Problem) -> Run:
+        """Start from the values that the problem holds."""
+        raise NotImplementedError
+
+
+class FirstOrder(Optimiser, tag="first order"):
+    """Settings of a walk along gradients of some of the views."""
+
+    views: Annotated[int, of("view", "views per iteration, drawn without replacement; 0 leaves it to the problem", ge=0)] = 0

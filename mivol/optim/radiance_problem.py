@@ -1,0 +1,284 @@
+"""A radiance field and photographs of it as a problem: a sparse grid of density and spherical harmonics, coarse first.
+
+Conventions. A step looks at tiles of a few views; its loss is the squared error of a ray, mean over rgb and rays. Densities are
+signed and pass a ReLU after interpolation, so a cell whose corners are all negative is vacuum and costs nothing. A stage begins
+with nodes where the last one's field gave some ray a weight (and their neighbours).
+
+The reals are ``density`` (rows,), ``harmonics`` (rows, width) and, where the plan asks for one, ``sky`` (texels, 4). What a
+step does is a function of them, of the listed cells, the seed and the step's number.
+
+References: Fridovich-Keil, Yu et al. 2022 (Plenoxels: model, optimiser, total variation, pruning by weight); Karnewar et al.
+2022 (ReLU after interpolation).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from scipy.ndimage import maximum_filter
+
+from mivol.errors import MivolError
+from mivol.fields.resampling import resample_field
+from mivol.fields.sky import TEXEL, Sky
+from mivol.fields.spherical import SphericalGrid, basis_size, row_width
+from mivol.optim.decoupled_priors import Neighbours, Rows
+from mivol.optim.problem import Reals, Refinement
+from mivol.optim.radiance_plan import FitPlan, place_grid
+from mivol.optim.ray_batches import RayBatch, RayBatches
+from mivol.transport.occupied import Cells
+from mivol.transport.radiance import bake, brightest_weights, cells_of, fold, look, look_back, model_of
+
+
+@dataclasses.dataclass
+class RadianceProblem:
+    """A radiance field in a box, fitted to photographs.
+
+    Attributes:
+        batches: what is looked at.
+        box: (2, 3) [length], where the field may be.
+        plan: how the fit goes.
+        seed: of the rays.
+        safe_point: called between the views of a survey.
+        field: what was found so far; a thin fog at first.
+        sky: what was found behind it, where the plan asks for that.
+        stage: the stage at work.
+
+    Example:
+        >>> problem = RadianceProblem(RayBatches.of(photos.views, (1, 2, 4)), photos.box, PRESETS["cpu"])
+        >>> reconstruct(problem, problem.plan.optimiser, problem.plan.course())
+        >>> render_view(problem.field, camera, background)
+    """
+
+    batches: RayBatches
+    box: np.ndarray
+    plan: FitPlan
+    seed: int = 0
+    safe_point: Callable[[], None] = lambda: None
+    field: SphericalGrid = dataclasses.field(init=False)
+    sky: Sky | None = dataclasses.field(init=False, default=None)
+    stage: int = dataclasses.field(init=False, default=0)
+
+    def __post_init__(self) -> None:
+        self.box = np.asarray(self.box, np.float64)
+        if self.box.shape != (2, 3) or not (self.box[1] > self.box[0]).all():
+            raise MivolError(f"the box {self.box.tolist()} was given; its lower and its upper corner are expected.")
+        absent = {stage.shrink for stage in self.plan.stages} - self.batches.levels.keys()
+        if absent:
+            raise MivolError(f"views shrunk by {min(absent)} are asked for; take them over in that size (RayBatches.of).")
+        if self.plan.sky:
+            if self.batches.channels == 4:
+                raise MivolError("a sky was asked for and the photographs have alpha, which says what is behind: sky = 0.")
+            self.sky = Sky.even(self.plan.sky, self.batches.median())
+        self.unit = float((self.box[1] - self.box[0]).max()) / 2
+        place, degree = place_grid(self.box, self.plan.stages[0].longest), self.plan.degree_at(0)
+        self.field = _fog(*place, degree, self.plan.start / self.unit)
+        self._first_row = 0
+        self._look_around()
+
+    # -- Values -------------------------------------------------------------------------------------------------------
+
+    def start(self) -> Reals:
+        """The reals of the field and the sky that are there now."""
+        return self.values()
+
+    def values(self) -> Reals:
+        """Field and sky as tensors."""
+        sky = {} if self.sky is None else {"sky": mi.TensorXf(self.sky.texels, (dr.width(self.sky.texels) // TEXEL, TEXEL))}
+        return _tensors(self.field) | sky
+
+    def set(self, reals: Reals) -> None:
+        """Put values into the field and the sky."""
+        self.field = _with_tensors(self.field, reals)
+        if self.sky is not None:
+            self.sky = self.sky.with_texels(reals["sky"].array)
+
+    # -- Loss and gradient --------------------------------------------------------------------------------------------
+
+    def loss_and_gradient(self, reals: Reals, iteration: int, views: int = 0) -> tuple[mi.Float, Reals]:
+        """Mean squared error of the rays of an iteration, and its gradient; 0 views: as many as the stage says.
+
+        Noise: of which pixels were drawn. Bias: that of :func:`mivol.transport.radiance.bake`.
+        """
+        self.set(reals)
+        stage = self.plan.stages[self.stage]
+        rng = np.random.default_rng((self.seed, iteration))
+        batch = self.batches.draw(stage.shrink, self.batches.choose(views or stage.views, rng), stage.tiles, rng)
+        loss, slopes = self.slopes(batch, self._background(rng))
+        self._first_row = int(rng.integers(dr.width(self._neighbours.after[0])))
+        return dr.mean(loss), {name: mi.TensorXf(slopes[name], value.shape) for name, value in reals.items()}
+
+    def _background(self, rng: np.random.Generator) -> np.ndarray | None:
+        random = self.plan.random_background and self.batches.channels == 4
+        return rng.random(3) if random else None
+
+    def slopes(self, batch: RayBatch, background: np.ndarray | None = None) -> tuple[mi.Float, dict[str, mi.Float]]:
+        """Squared error of each ray of a batch, mean over rgb, and the derivatives of the mean over rays, by parameter.
+
+        Args:
+            batch: rays and what they should see.
+            background: put behind all photographs (3,); None: each has its own.
+        """
+        source = bake(self.field, self._cells, batch.origins, batch.slot, slope=True)
+        model, count = model_of(self.field, self.plan.stop), dr.width(batch.slot)
+        seen = look(self._cells, source, model, batch.rays)
+        before = batch.before
+        behind = before if background is None else mi.Color3f(*(dr.opaque(mi.Float, float(c)) for c in background))
+        behind = behind if self.sky is None else self.sky.seen(batch.rays.d)
+        # Where a photograph was transparent, it shows what it is over: put what is behind there instead.
+        error = seen.colour + seen.T * behind - batch.target - (1 - batch.alpha) * (behind - before)
+        error *= batch.counted
+        by = error * (2 / (3 * count))
+        through = dr.dot(by, behind)
+        if self.plan.beta > 0:
+            # Bounded: at 0 and 1 the prior is satisfied, and its derivative infinite.
+            T = dr.clip(seen.T, 0.01, 0.99)
+            through += self.plan.beta / count * batch.counted * (dr.rcp(T) - dr.rcp(1 - T))
+        loss = dr.squared_norm(error) * (1 / 3)
+        dr.eval(seen, by, through, loss)
+        look_back(self._cells, source, model, seen, by, through)
+        dr.eval(source.slope)
+        density, harmonics = fold(self.field, self._cells, source, batch.origins)
+        slopes = {"density": self._stored(density), "harmonics": self._stored(harmonics)}
+        return loss, slopes if self.sky is None else slopes | {"sky": self.sky.slopes(batch.rays.d, by * seen.T)}
+
+    def _stored(self, slope: mi.Float) -> mi.Float:
+        """Derivatives of the nodes that are stored: the last row of a sparse field is the vacuum around, and stays."""
+        own = self.field.rows if self.field.nodes is None else self.field.rows - 1
+        return dr.select(dr.arange(mi.UInt32, dr.width(slope)) < own * (dr.width(slope) // self.field.rows), slope, 0)
+
+    # -- Steps --------------------------------------------------------------------------------------------------------
+
+    def rates(self, iteration: int) -> dict[str, float]:
+        """Learning rates; those of the density count in half the longest edge of the box."""
+        density, sh = self.plan.rates(iteration)
+        sky = {} if self.sky is None else {"sky": self.plan.sky_rate * sh / self.plan.sh_rate}
+        return {"density": density / self.unit, "harmonics": sh} | sky
+
+    def after_step(self, reals: Reals, iteration: int) -> Reals:
+        """Move values as the priors ask: by shares of the learning rate, fewer the more photographs there are."""
+        arrays = {name: value.array for name, value in reals.items()}
+        where = self._rows(iteration)
+        for name, prior in self.plan.priors:
+            if not prior.is_spatial:
+                arrays[name] = prior.apply(arrays[name], where[name])
+        # Evaluated here, or the neighbours that are read next would make the step be taken twice.
+        dr.eval(arrays)
+        for name, prior in self.plan.priors:
+            if prior.is_spatial:
+                arrays[name] = prior.apply(arrays[name], where[name])
+        return {name: mi.TensorXf(array, reals[name].shape) for name, array in arrays.items()}
+
+    def _rows(self, iteration: int) -> dict[str, Rows]:
+        """Where priors act in an iteration, by parameter."""
+        density, sh = (rate / len(self.batches.origins) for rate in self.plan.rates(iteration))
+        return {
+            "density": Rows(1, self._neighbours, density, self.unit, self._first_row),
+            "harmonics": Rows(self.field.width, self._neighbours, sh, 1.0, self._first_row),
+        }
+
+    def warning(self) -> str:
+        """Nothing: what noise there is is that of drawn pixels, and has no bias."""
+        return ""
+
+    # -- Stages -------------------------------------------------------------------------------------------------------
+
+    def refine(self, stage: int) -> Refinement:
+        """Go over to the nodes of a finer stage, where the field is seen now.
+
+        Raises:
+            MivolError: nothing is seen.
+        """
+        keep, old = self.seen_nodes(), self.field
+        if not keep.any():
+            raise MivolError("no view sees anything in the box: check the box, the cameras and the background.")
+        place, degree = place_grid(self.box, self.plan.stages[stage].longest), self.plan.degree_at(stage)
+
+        def resampled(grid: SphericalGrid) -> SphericalGrid:
+            return resample_field(grid, *place, keep).with_degree(degree)
+
+        self.field, self.stage = resampled(old), stage
+        self._look_around()
+        # Derivatives go with the length of a ray in a voxel.
+        shrink = max(old.res) / max(self.field.res)
+        nodes = " x ".join(str(n) for n in self.field.res)
+        says = f"refined to {nodes} nodes, of which {self.field.rows - 1} are kept"
+        return Refinement(
+            self.values(),
+            lambda tensors: tensors | _tensors(resampled(_with_tensors(old, tensors))),
+            {"density": shrink, "harmonics": shrink},
+            says,
+        )
+
+    def survey(self) -> None:
+        """List the cells that hold anything: the others have neither light nor derivatives."""
+        self._cells = cells_of(self.field)
+
+    def _look_around(self) -> None:
+        self._neighbours = Neighbours.of(self.field)
+        self.survey()
+
+    def seen_nodes(self) -> np.ndarray:
+        """Nodes (Z, Y, X) of cells to which some ray of the training views gives the plan's weight, and their neighbours."""
+        cells, model = cells_of(self.field), model_of(self.field, self.plan.stop)
+        weight = dr.zeros(mi.Float, max(cells.count, 1))
+        shrink = max(self.batches.levels)
+        for view, origin in enumerate(self.batches.origins):
+            source = bake(self.field, cells, origin[None], mi.UInt32(0))
+            brightest_weights(cells, source, model, self.batches.whole(shrink, view).rays, weight)
+            dr.eval(weight)
+            self.safe_point()
+        return maximum_filter(_nodes_of(self.field, cells, weight >= self.plan.keep_weight), 3)
+
+    # -- On disk ------------------------------------------------------------------------------------------------------
+
+    def pack(self, reals: Reals) -> dict[str, np.ndarray]:
+        """The stage, and the nodes that a sparse field has; makes the list of cells anew, as :meth:`unpack` does."""
+        self.set(reals)
+        self.survey()
+        nodes = {} if self.field.nodes is None else {"nodes": np.array(self.field.nodes)}
+        return {"stage": np.array(self.stage), **nodes}
+
+    def unpack(self, arrays: dict[str, np.ndarray], reals: Reals) -> None:
+        """Go on from what :meth:`pack` gave; the plan, the batches and the box must be the same."""
+        self.stage = int(arrays["stage"])
+        place, degree = place_grid(self.box, self.plan.stages[self.stage].longest), self.plan.degree_at(self.stage)
+        nodes = mi.UInt32(arrays["nodes"]) if "nodes" in arrays else None
+        self.field = SphericalGrid(*place, degree, reals["density"].array, reals["harmonics"].array, nodes)
+        self.set(reals)
+        self._look_around()
+
+
+def _tensors(grid: SphericalGrid) -> Reals:
+    return {
+        "density": mi.TensorXf(grid.density, (grid.rows,)),
+        "harmonics": mi.TensorXf(grid.harmonics, (grid.rows, grid.width)),
+    }
+
+
+def _with_tensors(grid: SphericalGrid, reals: Reals) -> SphericalGrid:
+    return grid.with_values(reals["density"].array, reals["harmonics"].array)
+
+
+def _fog(res: tuple[int, int, int], to_world: np.ndarray, degree: int, density: float) -> SphericalGrid:
+    """A thin grey fog that fills the box."""
+    rows = math.prod(res)
+    width = row_width(basis_size(degree))
+    return SphericalGrid(res, to_world, degree, dr.full(mi.Float, density, rows), dr.zeros(mi.Float, rows * width))
+
+
+def _nodes_of(field: SphericalGrid, cells: Cells, chosen: mi.Bool) -> np.ndarray:
+    """Nodes (Z, Y, X) of the listed cells that are chosen."""
+    mask = np.zeros(math.prod(field.res), bool)
+    index = dr.compress(chosen)
+    if cells.count and dr.width(index):
+        keep = dr.zeros(mi.UInt8, field.rows)
+        for row in cells.node_rows(index, mi.Bool(True)):
+            dr.scatter(keep, mi.UInt8(1), row)
+        listed = field.listed()
+        mask[listed] = np.array(keep)[: len(listed)] > 0
+    return mask.reshape(field.res)

@@ -1,0 +1,272 @@
+r"""A scene and images of it as a problem: real numbers in, loss and derivatives out, through any Mitsuba integrator.
+
+.. math:: f(u) = \frac{1}{V}\sum_v \mathrm{loss}(I_v(x(u)), I_v^{ref}) + \sum_k \mathrm{energy}_k(x(u))
+
+Conventions. ``u`` are the reals of each :class:`~mivol.optim.parameters.Parameter`, ``x`` the scene's values. An image
+is the mean of passes of at most ``samples_per_pass`` samples: the adjoint of the loss is taken at the whole image, then
+carried back pass by pass, so that non-linear losses do not depend on the split. Where light is sampled, an image is
+the mean of two renders with seeds of their own, which tell how much of the loss is noise. Seeds are a function of (seed,
+iteration, batch, purpose, half, pass) only. Between passes ``safe_point`` is called; nothing that outlives the call has
+changed until it returns, but ``newest_loss``.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mivol.errors import MivolError
+from mivol.optim.losses import L2, Loss
+from mivol.optim.noise import Compared, compare, halves_of, noise_check, warning
+from mivol.optim.parameters import Parameter, as_tensor, check_names, find, like
+from mivol.optim.problem import Reals
+from mivol.optim.render_batches import RenderBatch, View, check_views, make_batches, pixels, single_batches
+from mivol.optim.seeds import ADJOINT, PRIMAL, seed_of
+
+
+@dataclass
+class SceneProblem:
+    """A scene, what was seen of it, and what is being looked for.
+
+    Attributes:
+        scene: any Mitsuba scene.
+        views: all of one size.
+        parameters: what is looked for.
+        integrator: differentiable; None takes the scene's own.
+        loss: one of LOSSES.
+        spp: samples per pixel of an image, and of its derivative.
+        samples_per_pass: most samples in one kernel.
+        seed: root of all random numbers.
+        safe_point: called between kernels.
+        noisy: whether images hold noise of sampled light, with the values that the scene holds now.
+        newest_loss: loss of the views (no priors) and its noise, of the newest gradient.
+    """
+
+    scene: mi.Scene
+    views: Sequence[View]
+    parameters: Sequence[Parameter]
+    integrator: mi.Integrator | None = None
+    loss: Loss = field(default_factory=L2)
+    spp: int = 16
+    samples_per_pass: int = 1 << 20
+    seed: int = 0
+    safe_point: Callable[[], None] = lambda: None
+
+    def __post_init__(self) -> None:
+        check_views(self.views)
+        if not self.parameters:
+            raise MivolError("found no parameter to look for: name at least one key of mi.traverse(scene).")
+        self.integrator = self.integrator or self.scene.integrator()
+        self.params = mi.traverse(self.scene)
+        for parameter in self.parameters:
+            find(parameter.name, self.params)
+        check_names([parameter.name for parameter in self.parameters])
+        self.params.keep([parameter.name for parameter in self.parameters])
+        self.batches = make_batches(self.views, self.samples_per_pass)
+        self.newest_loss = (0.0, 0.0)
+        self._has_noise = noise_check(self.integrator, self.scene)
+        self.noisy = self._has_noise()
+
+    # -- Values ---------------------------------------------------------------------------------------------------
+
+    def values(self) -> Reals:
+        """What the scene holds now, by parameter."""
+        return {p.name: dr.detach(as_tensor(self.params[p.name])) for p in self.parameters}
+
+    def gradients(self) -> Reals:
+        """What has been carried back to the scene since :meth:`set`, by parameter.
+
+        Raises:
+            MivolError: nothing ever is, to one of them.
+        """
+        found = {}
+        for p in self.parameters:
+            gradient = dr.detach(dr.grad(self.params[p.name]))
+            if _is_untouched(gradient):
+                raise MivolError(
+                    f"no derivative leads from the images to {p.name}, which would stay as it is: take it out of the fit, or "
+                    "let the images depend on it (for scattered light set fit.max_depth to 2)."
+                )
+            found[p.name] = as_tensor(gradient)
+        return found
+
+    def start(self) -> Reals:
+        """The reals of what the scene holds now.
+
+        Raises:
+            MivolError: the scene's values lie outside the domain of their parameter.
+        """
+        return {p.name: p.to_reals(value) for p, value in zip(self.parameters, self.values().values(), strict=True)}
+
+    def set(self, reals: Reals) -> None:
+        """Put x(u) into the scene, ready to receive gradients."""
+        for p in self.parameters:
+            value = like(dr.detach(p.from_reals(reals[p.name])), self.params[p.name])
+            dr.make_opaque(value)
+            dr.enable_grad(value)
+            self.params[p.name] = value
+        given = {p.name: type(self.params[p.name])(self.params[p.name]) for p in self.parameters}
+        self.params.update()
+        # Mitsuba's envmap puts another array in the place of what it was given.
+        for name, value in given.items():
+            self.params[name] = value
+        self.noisy = self._has_noise()
+
+    # -- Images ---------------------------------------------------------------------------------------------------
+
+    def passes(self, sensor: mi.Sensor, spp: int) -> list[int]:
+        """Samples per pixel of each pass; they sum to ``spp`` and hardly differ."""
+        most = max(self.samples_per_pass // pixels(sensor), 1)
+        n = math.ceil(spp / most)
+        return [spp // n + (i < spp % n) for i in range(n)]
+
+    def seed_for(self, iteration: int, index: int, purpose: int) -> int:
+        """Seed of a batch, given its number."""
+        return seed_of(self.seed, iteration, index, purpose)
+
+    def render(self, sensor: mi.Sensor, seed: int, spp: int | None = None) -> mi.TensorXf:
+        """Mean image of a sensor over all passes, detached; of the problem's ``spp`` by default."""
+        total, spp = None, spp or self.spp
+        for number, share in enumerate(self.passes(sensor, spp)):
+            with dr.suspend_grad():
+                image = self.integrator.render(self.scene, sensor, seed=seed_of(seed, number), spp=share)
+                total = image * share if total is None else total + image * share
+            self._finish(total)
+        return total / spp
+
+    def vjp(self, sensor: mi.Sensor, adjoint: mi.TensorXf, seed: int) -> None:
+        """Add J^T adjoint of a sensor's image to the gradients of the scene's parameters."""
+        for number, spp in enumerate(self.passes(sensor, self.spp)):
+            self.integrator.render_backward(
+                self.scene, self.params, adjoint * (spp / self.spp), sensor, seed_of(seed, number), spp
+            )
+            self._finish(self.gradients())
+
+    def jvp(self, sensor: mi.Sensor, tangents: Reals, seed: int) -> mi.TensorXf:
+        """J v of a sensor's image, for a direction v of the scene's parameters."""
+        total = None
+        for number, spp in enumerate(self.passes(sensor, self.spp)):
+            self._set_tangents(tangents)
+            image = self.integrator.render_forward(self.scene, self.params, sensor, seed_of(seed, number), spp)
+            total = dr.detach(image) * spp if total is None else total + dr.detach(image) * spp
+            self._finish(total)
+        return total / self.spp
+
+    def _set_tangents(self, tangents: Reals) -> None:
+        """Once per render: some integrators use the tangents up."""
+        for p in self.parameters:
+            value = self.params[p.name]
+            dr.set_grad(value, like(tangents[p.name], value))
+
+    def _finish(self, arrays: object) -> None:
+        dr.eval(arrays)
+        dr.sync_thread()
+        self.safe_point()
+
+    # -- Loss and gradient ----------------------------------------------------------------------------------------
+
+    def loss_and_gradient(self, reals: Reals, iteration: int, views: int = 0) -> tuple[float, Reals]:
+        """f(u) and its gradient, over so many views, drawn anew in each iteration; 0: over all.
+
+        The seeds of image and derivative differ: an estimate of d(I^2) = 2 I dI from one set of samples is biased.
+        Noise: of the integrator; none for media that only absorb, beyond the pixel filter's. What it does to the loss:
+        :func:`mivol.optim.noise.compare`.
+        """
+        batches = self.batches
+        if views:
+            chosen = views_of(iteration, len(self.views), views, self.seed)
+            batches = single_batches([self.views[index] for index in chosen])
+        self.set(reals)
+        n_views, compared = sum(batch.n_views for batch in batches), []
+        for index, batch in enumerate(batches):
+            compared.append(self.compare(batch, self.seed_for(iteration, index, PRIMAL), n_views))
+            self.vjp(batch.sensor, compared[-1].adjoint, self.seed_for(iteration, index, ADJOINT))
+        energy, gradients = self.through_priors_and_maps(reals, self.gradients())
+        return self.remember(compared) + energy, gradients
+
+    def rates(self, iteration: int) -> dict[str, float]:
+        """Each parameter's own learning rate, the same in all iterations."""
+        return {p.name: p.lr for p in self.parameters}
+
+    def after_step(self, reals: Reals, iteration: int) -> Reals:
+        """The nearest points of the domains; priors are part of the gradient."""
+        return {p.name: p.project(reals[p.name]) for p in self.parameters}
+
+    def loss_value(self, reals: Reals, iteration: int) -> float:
+        """f(u), without derivatives."""
+        self.set(reals)
+        return self.mean_loss(iteration) + self.energy(reals)
+
+    def mean_loss(self, iteration: int) -> float:
+        """Mean loss over all views, of what the scene holds now."""
+        pairs = enumerate(self.batches)
+        return math.fsum(self.compare(s, self.seed_for(iteration, i, PRIMAL), len(self.views)).loss for i, s in pairs)
+
+    def compare(self, batch: RenderBatch, seed: int, n_views: int) -> Compared:
+        """Render a batch; its part of the mean loss over ``n_views`` views.
+
+        Raises:
+            MivolError: the loss takes pairs, the render is noisy and has one sample per pixel.
+        """
+        parts = halves_of(self.spp, self.loss) if self.noisy else (self.spp,)
+        if len(parts) == 1:
+            renders = [self.render(batch.sensor, seed)]
+        else:
+            renders = [self.render(batch.sensor, seed_of(seed, half), spp) for half, spp in enumerate(parts)]
+        return compare(self.loss, renders, [n / self.spp for n in parts], batch.reference, batch.n_views / n_views)
+
+    def remember(self, compared: Sequence[Compared]) -> float:
+        """The sum of the losses of some batches, remembered with its noise for :meth:`warning`."""
+        unknown = self.noisy and self.spp == 1
+        self.newest_loss = math.fsum(c.loss for c in compared), math.nan if unknown else math.fsum(c.noise for c in compared)
+        return self.newest_loss[0]
+
+    def pack(self, reals: Reals) -> dict[str, np.ndarray]:
+        """Nothing: the scene's values are the reals'."""
+        return {}
+
+    def unpack(self, arrays: dict[str, np.ndarray], reals: Reals) -> None:
+        """Nothing to do: every question brings its reals."""
+
+    def warning(self) -> str:
+        """What a reader of the newest loss must know of its noise, or ""."""
+        return warning(self.loss, *self.newest_loss)
+
+    def energy(self, reals: Reals) -> float:
+        """Sum of all weighted prior energies."""
+        return math.fsum(float(p.energy(p.from_reals(dr.detach(reals[p.name])))[0]) for p in self.parameters)
+
+    def through_priors_and_maps(
+        self, reals: Reals, gradients: Reals
+    ) -> tuple[float, Reals]:
+        """Prior energy, and the gradients by the reals for given gradients by the values."""
+        total, by_reals = 0.0, {}
+        for p in self.parameters:
+            u = mi.TensorXf(dr.detach(reals[p.name]))
+            dr.enable_grad(u)
+            value = p.from_reals(u)
+            energy = p.energy(value)
+            total += float(dr.detach(energy)[0])
+            dr.backward(energy + dr.sum(value.array * gradients[p.name].array))
+            by_reals[p.name] = dr.grad(u)
+        dr.eval(by_reals)
+        return total, by_reals
+
+
+def views_of(iteration: int, n_views: int, per_iteration: int, seed: int) -> list[int]:
+    """The views of an iteration: a fresh order per epoch, each view once in it; a function of its arguments only."""
+    per_iteration = min(per_iteration, n_views)
+    drawn = range(iteration * per_iteration, (iteration + 1) * per_iteration)
+    orders = {k: np.random.default_rng([seed, k, n_views]).permutation(n_views) for k in {i // n_views for i in drawn}}
+    return [int(orders[i // n_views][i % n_views]) for i in drawn]
+
+
+def _is_untouched(gradient: object) -> bool:
+    """Whether a gradient is the 0 that Dr.Jit makes up where none was ever carried to."""
+    rows = [gradient.array] if dr.is_tensor_v(gradient) else gradient if dr.depth_v(gradient) > 1 else [gradient]
+    return all(row.state == dr.VarState.Literal for row in rows)

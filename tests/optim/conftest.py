@@ -1,0 +1,28 @@
+"""What the tests of several modules of the room share."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import drjit as dr
+import mitsuba as mi
+import pytest
+from ball_photos import ball, photo
+
+from mivol.photos import Photo
+
+
+@pytest.fixture(scope="session")
+def photos() -> list[Photo]:
+    """16 photographs of a ball."""
+    mi.set_variant("llvm_ad_rgb")
+    return [photo(ball(), k) for k in range(16)]
+
+
+@pytest.fixture
+def one_thread(variant_rgb: str) -> Iterator[None]:
+    """One Dr.Jit thread: sums have a fixed order."""
+    before = dr.thread_count()
+    dr.set_thread_count(1)
+    yield
+    dr.set_thread_count(before)

@@ -1,0 +1,65 @@
+"""Plans of radiance fields: stages, rates, grids, and the memory that they take."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from ball_photos import BOX, PLAN
+
+from mivol.errors import MivolError
+from mivol.optim.radiance_plan import PRESETS, FitPlan, Stage, memory_of, place_grid
+from mivol.optim.ray_batches import RayBatches
+from mivol.photos import Photo
+
+
+def test_memory_is_counted_first(variant_rgb: str, photos: list[Photo]) -> None:
+    views = RayBatches.of(photos[:2])
+    text = memory_of(PRESETS["cpu"], BOX, views, limit=1 << 40)
+    assert "MiB" in text
+    with pytest.raises(MivolError, match=r"512 nodes along an edge .* longest = (\d+) fits"):
+        memory_of(PRESETS["gpu"], BOX, views, limit=2 << 30)
+    with pytest.raises(MivolError, match="no resolution fits"):
+        memory_of(PRESETS["gpu"], BOX, views, limit=1000)
+
+
+TOO_LARGE = [("cpu", 32, 40), ("cpu", 128, 20), ("gpu", 64, 200), ("gpu", 300, 500)]
+
+
+@pytest.mark.parametrize(("preset", "longest", "limit"), TOO_LARGE)
+def test_the_resolution_that_is_said_to_fit_fits(
+    variant_rgb: str, photos: list[Photo], preset: str, longest: int, limit: int
+) -> None:
+    """Taken as the next ``longest``, whichever stage then takes the most; one more is refused. Limits in MiB."""
+    views = RayBatches.of(photos[:2])
+
+    def memory(nodes: int) -> str:
+        return memory_of(PRESETS[preset].up_to(nodes), BOX, views, limit=limit << 20)
+
+    with pytest.raises(MivolError) as refused:
+        memory(longest)
+    fits = int(re.search(r"longest = (\d+) fits", str(refused.value)).group(1))
+    assert "about" in memory(fits)
+    with pytest.raises(MivolError, match=f"longest = {fits} fits"):
+        memory(fits + 1)
+
+
+def test_grids_have_cubic_voxels_and_cover_the_box(variant_rgb: str) -> None:
+    box = np.array([[0.0, 1, 2], [1, 1.5, 4]])
+    res, to_world = place_grid(box, 20)
+    assert res == (20, 5, 10)
+    np.testing.assert_allclose(np.diag(to_world)[:3] / res[::-1], 0.1)
+    np.testing.assert_allclose(to_world[:3, 3], box[0], atol=1e-12)
+
+
+def test_schedules() -> None:
+    plan = replace(PLAN, delay=0.1, last=0.01)
+    assert (plan.begins, plan.steps) == ((60,), 150)
+    assert [event.due(step) for event in plan.course().events[:1] for step in (0, 59, 60, 61)] == [False, False, True, False]
+    assert plan.rates(0) == pytest.approx((0.1, 0.05))
+    assert plan.rates(150) == pytest.approx((0.1, 0.0005))
+    climbing = FitPlan((Stage(8, 1), Stage(16, 1), Stage(32, 1)), degree=2, first_degree=0)
+    assert [climbing.degree_at(k) for k in range(3)] == [0, 1, 2]
+    assert [replace(climbing, first_degree=None).degree_at(k) for k in range(3)] == [2, 2, 2]

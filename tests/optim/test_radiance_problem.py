@@ -1,0 +1,212 @@
+"""A radiance field as a problem: its gradient against what is known, and small fits from their first step to their pictures."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from ball_photos import BOX, PLAN, WHITE, ball, camera, error_of, fitted
+
+from mivol.errors import MivolError
+from mivol.fields.sky import Sky
+from mivol.optim.checkpoint import Store
+from mivol.optim.field_view import render_view
+from mivol.optim.loop import Fit, begin_fit, reconstruct
+from mivol.optim.radiance_plan import Stage
+from mivol.optim.radiance_problem import RadianceProblem
+from mivol.optim.ray_batches import TILE, RayBatches
+from mivol.photos import Lens, Photo
+from mivol.transport.radiance import bake, cells_of, look, model_of
+
+
+def test_a_fit_finds_what_it_did_not_see(variant_rgb: str, photos: list[Photo]) -> None:
+    fit = fitted(RayBatches.of(photos, (1, 2)), PLAN)
+    # 0.0032: 25 dB in a view between those it saw. The mean colour of the views alone gives 11 dB.
+    assert error_of(fit) < 0.0032
+    field = fit.problem.field
+    assert field.nodes is not None and field.rows < 0.9 * 24**3
+    assert fit.log == [f"iteration 60: refined to 24 x 24 x 24 nodes, of which {field.rows - 1} are kept"]
+    seen = render_view(field, camera(2.5), WHITE)
+    truth = render_view(ball(), camera(2.5), WHITE).depth[22:26, 22:26]
+    # Two voxels.
+    assert np.abs(seen.depth[22:26, 22:26] - truth).max() < 2 * 2 / 24
+    assert np.isnan(seen.depth[0, 0]) and seen.opacity[0, 0] == 0
+
+
+def test_a_finer_stage_goes_on_where_the_last_one_stopped(variant_rgb: str, photos: list[Photo]) -> None:
+    """Its first step knows how large derivatives were: begun anew, it would move all that it touches by a whole rate."""
+    fit = fitted(RayBatches.of(photos, (1, 2)), replace(PLAN, tv_density=0.0), PLAN.stages[0].steps)
+    fit.course.events[0].apply(fit)
+    fit.events_done = 1
+    before = np.array(fit.run.reals["density"])
+    fit.advance()
+    moved = np.abs(np.array(fit.run.reals["density"]) - before) * fit.problem.unit
+    # Where no more rays than before cross a voxel, and not all agree, steps are below the rate.
+    assert 0 < np.median(moved[moved > 0]) < 0.5 * PLAN.rates(PLAN.stages[0].steps)[0]
+
+
+@pytest.mark.parametrize("steps", [9, 14], ids=["first stage", "second stage"])
+def test_a_fit_that_went_on_equals_one_that_did_not_stop(one_thread, photos: list[Photo], tmp_path: Path, steps: int) -> None:
+    """With one thread every value and every mean square is equal to the last bit, and what is forgotten shows in it."""
+    batches, path = RayBatches.of(photos[:6], (1, 2)), tmp_path / "checkpoint.npz"
+    plan = replace(PLAN, stages=(Stage(8, 10, 2, 3, 8), Stage(16, 10, 1, 3, 8)), tv_density=0.1, first_degree=0)
+
+    def begin(store: Store) -> Fit:
+        return begin_fit(RadianceProblem(batches, BOX, plan), plan.optimiser, plan.course(), store=store)
+
+    whole = fitted(batches, plan, steps, begin(Store(path, {})))
+    whole.save()
+    whole = fitted(batches, plan, 20, whole)
+    resumed = begin(Store(path, {}, resume=True))
+    assert (resumed.next, resumed.problem.field.degree) == (steps, int(steps > 10))
+    resumed = fitted(batches, plan, 20, resumed)
+    kept, found = whole.run.pack(), resumed.run.pack()
+    assert kept.keys() == found.keys() == {"reals/density", "reals/harmonics", "squares/density", "squares/harmonics"}
+    assert all(np.array_equal(kept[name], found[name]) for name in kept)
+    assert [row["loss"] for row in resumed.history] == [row["loss"] for row in whole.history]
+    assert resumed.log == whole.log
+
+
+def test_the_vacuum_around_a_sparse_field_stays_empty(variant_rgb: str, photos: list[Photo]) -> None:
+    """Its row is a corner of cells at the edge of what is stored: what they would have it become, it does not."""
+    plan = replace(PLAN, stages=(Stage(12, 30, 2, 4, 24), Stage(24, 5, 1, 4, 24)))
+    field = fitted(RayBatches.of(photos, (1, 2)), plan).problem.field
+    assert np.array(field.density)[-1] == field.act.vacuum
+    assert not np.array(field.harmonics)[-field.width :].any()
+    assert np.array(field.density)[:-1].any()
+
+
+def test_backgrounds_that_change_leave_no_white_in_the_air(variant_rgb: str, photos: list[Photo]) -> None:
+    batches = RayBatches.of(photos, (1, 2), with_alpha=True)
+    fit = fitted(batches, replace(PLAN, random_background=True))
+    assert error_of(fit) < 0.0064
+    # A corner of the view is empty whatever stands behind it.
+    black = render_view(fit.problem.field, camera(2.5), np.zeros(3)).image
+    assert black[:4, :4].max() < 0.05
+
+
+def slopes_of(photos: list[Photo], shrink: int = 2, background: np.ndarray | None = None) -> list[np.ndarray]:
+    """Squared errors and derivatives of the first step of a fog."""
+    problem, chosen = RadianceProblem(RayBatches.of(photos, (1, 2)), BOX, PLAN), np.arange(len(photos))
+    batch = problem.batches.draw(shrink, chosen, 30, np.random.default_rng(3))
+    loss, slopes = problem.slopes(batch, background)
+    return [np.array(a) for a in (loss, *slopes.values())]
+
+
+def test_what_a_mask_leaves_out_is_not_fitted(variant_rgb: str, photos: list[Photo]) -> None:
+    """Whatever a masked pixel shows, nothing changes; a shrunk one counts where all that it is the mean of do."""
+    rng = np.random.default_rng(8)
+    mask = rng.random((48, 48)) > 0.2
+    painted = [
+        [replace(p, mask=mask, image=np.where(mask[..., None], p.image, rng.random(3))) for p in photos[:3]] for _ in range(2)
+    ]
+    for shrink in (1, 2):
+        first, second = (slopes_of(some, shrink) for some in painted)
+        for a, b in zip(first, second, strict=True):
+            np.testing.assert_allclose(a, b, rtol=0, atol=1e-6 * np.abs(a).max())  # sums in another order
+        whole = RayBatches.of(painted[0], (1, 2)).whole(shrink, 1)
+        tiles = 48 // shrink // TILE
+        counted = np.array(whole.counted).reshape(tiles, tiles, TILE, TILE).transpose(0, 2, 1, 3).reshape(2 * [48 // shrink])
+        np.testing.assert_array_equal(counted, mask.reshape(48 // shrink, shrink, 48 // shrink, shrink).all(axis=(1, 3)))
+        assert np.any(slopes_of(photos[:3], shrink)[0] != first[0])
+    some = [*painted[0][:2], photos[2]]
+    assert RayBatches.of(some).bytes == RayBatches.of(photos[:3]).bytes + 3 * 48 * 48
+    assert RayBatches.of(some).digest() != RayBatches.of([replace(p, mask=None) for p in some]).digest()
+
+
+def test_each_photograph_may_lie_over_its_own_colour(variant_rgb: str, photos: list[Photo]) -> None:
+    """Photographs over three colours have the derivatives of the same over white, whatever is put behind both."""
+    whole = [replace(p, alpha=(p.alpha > 0.5).astype(np.float32)) for p in photos[:3]]
+    colours = np.array([[10, 200, 30], [0, 0, 0], [90, 80, 255]], np.float32) / 255
+
+    def over(photo: Photo, colour: np.ndarray) -> Photo:
+        return replace(photo, image=np.where(photo.alpha[..., None] > 0, photo.image, colour), background=colour)
+
+    white = slopes_of([over(p, WHITE) for p in whole], 1, np.array([0.3, 0.9, 0.1]))
+    other = slopes_of([over(p, c) for p, c in zip(whole, colours, strict=True)], 1, np.array([0.3, 0.9, 0.1]))
+    for a, b in zip(white, other, strict=True):
+        np.testing.assert_allclose(a, b, rtol=0, atol=1e-5 * np.abs(a).max())  # a background added and taken off again
+    kept = RayBatches.of([over(p, c) for p, c in zip(whole, colours, strict=True)], with_alpha=False)
+    np.testing.assert_array_equal(np.array(kept.whole(1, 2).before).T[0], colours[2])
+
+
+def test_what_is_behind_is_found_too(variant_rgb: str, photos: list[Photo]) -> None:
+    """A ball under a sky of two colours, photographs without alpha: the sky is found where rays pass the ball."""
+    v, u = np.meshgrid(np.linspace(0, 1, 8), (np.arange(16) + 0.5) / 16, indexing="ij")
+    image = np.stack([0.5 + 0.4 * np.sin(2 * np.pi * u), 0.9 - 0.8 * v, 0.3 + 0 * u], axis=-1)
+    sky = Sky.of_image(image)
+    images = [np.clip(render_view(ball(), p.camera, sky).image, 0, 1) for p in photos]
+    taken = [Photo(p.name, image, None, None, p.camera, WHITE) for p, image in zip(photos, images, strict=True)]
+    fit = fitted(RayBatches.of(taken, (1, 2)), replace(PLAN, sky=8))
+    seen, truth = render_view(fit.problem.field, camera(2.5), fit.problem.sky), render_view(ball(), camera(2.5), sky)
+    # 22 dB between the views; without a sky 16 dB, and the box is full.
+    assert np.mean((np.clip(seen.image, 0, 1) - truth.image) ** 2) < 0.0064
+    assert seen.opacity[truth.opacity < 0.01].mean() < 0.01
+    # A corner of a view that was taken looks past the ball: the sky itself, within 10 steps of a photograph's 255.
+    corner = render_view(fit.problem.field, photos[3].camera, fit.problem.sky).image[:4, :4]
+    assert np.abs(corner - images[3][:4, :4]).mean() < 10 / 255
+    problem = fit.problem
+    again = RadianceProblem(problem.batches, BOX, problem.plan)
+    again.unpack(problem.pack(fit.run.reals), fit.run.reals)
+    np.testing.assert_array_equal(again.sky.image(), problem.sky.image())
+    with pytest.raises(MivolError, match="alpha, which says what is behind"):
+        RadianceProblem(RayBatches.of(photos, (1, 2), with_alpha=True), BOX, problem.plan)
+
+
+def test_a_sky_begins_with_what_most_pixels_show(variant_rgb: str, photos: list[Photo]) -> None:
+    """A dark sky begins dark, or the field would have to be what darkens a grey one; what masks leave out says nothing."""
+    dark = np.array([20, 30, 60], np.float32) / 255
+    images = [np.where(p.alpha[..., None] > 0.5, p.image, dark) for p in photos[:3]]
+    masks = [np.ones(p.alpha.shape, bool) for p in photos[:3]]
+    images[0][:], masks[0][:] = 1, False
+    taken = [Photo(p.name, i, None, m, p.camera, WHITE) for p, i, m in zip(photos, images, masks, strict=False)]
+    problem = RadianceProblem(RayBatches.of(taken, (1, 2)), BOX, replace(PLAN, sky=8))
+    np.testing.assert_allclose(problem.sky.image(), np.broadcast_to(dark, (8, 16, 3)), atol=1e-6)
+    blind = [replace(p, mask=np.zeros_like(p.mask)) for p in taken]
+    np.testing.assert_array_equal(RayBatches.of(blind).median(), 0.5)
+
+
+def test_opacities_are_asked_to_be_none_or_all(variant_rgb: str, photos: list[Photo]) -> None:
+    """The beta prior's part of the derivatives is that of the mean of log T + log(1 - T) over the rays."""
+    batches, parts = RayBatches.of(photos[:3], (1, 2)), {}
+    problem = RadianceProblem(batches, BOX, replace(PLAN, start=1.0))  # a fog: no density is at the ReLU's kink
+    batch = batches.draw(2, np.arange(3), 30, np.random.default_rng(3))
+    for beta in (0.0, 0.5):
+        problem.plan = replace(PLAN, beta=beta)
+        parts[beta] = np.array(problem.slopes(batch, np.ones(3))[1]["density"], np.float64)
+    way = np.random.default_rng(4).normal(size=parts[0.0].shape)
+
+    def prior(density: np.ndarray) -> float:
+        field = problem.field.with_values(mi.Float(np.float32(density)), problem.field.harmonics)
+        cells = cells_of(field)
+        seen = look(cells, bake(field, cells, batch.origins, batch.slot), model_of(field, PLAN.stop), batch.rays)
+        T = np.array(seen.T, np.float64)
+        near = np.clip(T, 0.01, 0.99)  # beyond, the prior goes on as its tangent
+        return float(np.mean(np.log(near) + np.log(1 - near) + (1 / near - 1 / (1 - near)) * (T - near)))
+
+    v, h = np.array(problem.field.density, np.float64), 1e-3
+    expected = 0.5 * (prior(v + h * way) - prior(v - h * way)) / (2 * h)
+    assert np.sum((parts[0.5] - parts[0.0]) * way) == pytest.approx(expected, rel=1e-3)
+
+
+def test_fits_that_are_refused(variant_rgb: str, photos: list[Photo]) -> None:
+    batches = RayBatches.of(photos[:2])
+    for box, said in ((BOX[::-1], "lower and its upper"), (np.zeros(3), "lower and its upper")):
+        with pytest.raises(MivolError, match=said):
+            RadianceProblem(batches, box, replace(PLAN, stages=PLAN.stages[1:]))
+    with pytest.raises(MivolError, match="shrunk by 2"):
+        RadianceProblem(batches, BOX, PLAN)
+    bent = replace(photos[0], camera=replace(photos[0].camera, distortion=Lens(k1=0.1)))
+    with pytest.raises(MivolError, match="rectify"):
+        RayBatches.of([bent])
+    with pytest.raises(MivolError, match="no alpha"):
+        RayBatches.of([replace(photos[0], alpha=None)], with_alpha=True)
+    with pytest.raises(MivolError, match="shrink less"):
+        RayBatches.of(photos[:1], (16,))
+    empty = [replace(p, image=np.ones_like(p.image)) for p in photos[:4]]
+    nothing = RadianceProblem(RayBatches.of(empty, (1, 2)), BOX + 50.0, PLAN)
+    with pytest.raises(MivolError, match="no view sees"):
+        reconstruct(nothing, PLAN.optimiser, PLAN.course())

@@ -1,0 +1,24 @@
+"""Batches of rays: their directions and what the photographs show there."""
+
+from __future__ import annotations
+
+import drjit as dr
+import numpy as np
+
+from mivol.optim.ray_batches import TILE, RayBatches
+from mivol.photos import Photo, pixel_centres, rays
+
+
+def test_views_know_their_rays_and_pixels(variant_rgb: str, photos: list[Photo]) -> None:
+    views = RayBatches.of(photos[:3], (1, 2))
+    batch = views.draw(1, np.array([0, 2]), 5, np.random.default_rng(0))
+    assert dr.width(batch.slot) == 2 * 5 * TILE**2
+    whole = views.whole(1, 1)
+    _, d = rays(photos[1].camera, pixel_centres((48, 48)))
+    found = np.array(whole.rays.d).T.reshape(12, 12, 4, 4, 3).transpose(0, 2, 1, 3, 4).reshape(48, 48, 3)
+    np.testing.assert_allclose(found, d, atol=3e-7)
+    image = np.array(whole.target).T.reshape(12, 12, 4, 4, 3).transpose(0, 2, 1, 3, 4).reshape(48, 48, 3)
+    np.testing.assert_allclose(image, photos[1].image, atol=0.5 / 255 + 1e-6)
+    half = np.array(views.whole(2, 1).rays.d).T[0]
+    assert np.abs(half - d[0:2, 0:2].mean(axis=(0, 1))).max() < 1e-3
+    assert views.digest() != RayBatches.of(photos[1:4], (1, 2)).digest()
