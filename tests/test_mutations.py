@@ -232,6 +232,18 @@ def test_a_fault_that_nothing_can_be_imported_with_is_killed(checkout) -> None:
     assert survivors.judge_fault(checkout, fault, index).killed
 
 
+def test_a_test_that_is_red_by_chance_kills_nothing(checkout) -> None:
+    """It fails where it is run for the first time, in the broken copy, and in no later run."""
+    mark = checkout.broken / "mark"
+    text = f"from pathlib import Path\ndef test_half():\n    m = Path({str(mark)!r})\n    first = not m.exists()\n"
+    for copy in (checkout.broken, checkout.untouched):
+        (copy / "tests" / "test_halving.py").write_text(text + "    m.touch()\n    assert not first\n")
+    fault = faults.Fault("halving.py", 2, HALVING.index("/"), "/", "*", "operator")
+    index = guards.Guards(named={"halving.py": ["tests/test_halving.py"]})
+    assert not survivors.judge_fault(checkout, fault, index).killed
+    assert mark.exists()
+
+
 def test_a_test_that_does_not_end_kills(checkout) -> None:
     (checkout.broken / "tests" / "test_halving.py").write_text("import time\ndef test_half(): time.sleep(60)\n")
     hasty = survivors.Checkout(checkout.broken, checkout.untouched, 1.0)
