@@ -107,6 +107,19 @@ def test_rgb_extinction_is_rendered_channel_by_channel(variant_rgb, tmp_path):
     assert abs(red - truth[0, 0, 0]) > 10 * error, "Mitsuba's heterogeneous is right now: rgb at once need not be refused"
 
 
+def test_a_reference_without_colours_has_one_channel(variant_rgb, tmp_path):
+    """Of a mono variant, in the image and in its file."""
+    try:
+        mi.set_variant("llvm_ad_mono")
+        scene = _scene(_homogeneous(1.5))
+        scene["sensor"]["film"]["pixel_format"] = "luminance"
+        found = _small(scene, tmp_path / "r.exr", max_spp=32)
+        assert found.mean.shape == (SIZE, SIZE, 1)
+        assert {name for name in read_exr(tmp_path / "r.exr")[0] if "." not in name} == {"Y"}
+    finally:
+        mi.set_variant(variant_rgb)
+
+
 @pytest.mark.parametrize("form", ["rgb", "constvolume", "shared by id"])
 def test_every_form_of_rgb_extinction_is_found(variant_rgb, tmp_path, form):
     """A colour, a constvolume of a colour, a medium that two shapes share."""
