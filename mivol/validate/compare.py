@@ -101,10 +101,11 @@ def compare(
     if image.shape != reference.mean.shape:
         raise MivolError(f"an image of shape {image.shape} cannot be compared with a reference of {reference.mean.shape}.")
     var = np.maximum(reference.variance, (samples_seen / reference.spp) ** 2)
-    difference = bias(image, variance, reference.mean, var, alpha=alpha / 2, correlated=correlated)
+    dof = reference.batches - 1
+    difference = bias(image, variance, reference.mean, var, alpha=alpha / 2, correlated=correlated, dof_b=dof)
     dark = not reference.mean.any()
     z = z_image(image, variance, reference.mean, var, rounding)
-    bound = float(z_bound(alpha / 2, z.size, dof=reference.batches - 1))
+    bound = float(z_bound(alpha / 2, z.size, dof=dof))
     return Comparison(
         z=z,
         bound=bound,
@@ -112,7 +113,9 @@ def compare(
         above_three=float(np.mean(np.abs(z) > 3)),
         worst=tuple(int(i) for i in np.unravel_index(np.argmax(np.abs(z)), z.shape)),
         bias=difference,
-        detectable=float(np.median(smallest_detectable_bias(variance, var, alpha=alpha / 2, comparisons=z.size))),
+        detectable=float(
+            np.median(smallest_detectable_bias(variance, var, alpha=alpha / 2, comparisons=z.size, dof=dof))
+        ),
         psnr=-np.inf if dark else psnr(image, reference.mean),
         nrmse=np.inf if dark else nrmse(image, reference.mean),
         alpha=alpha,

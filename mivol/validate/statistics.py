@@ -5,8 +5,8 @@ both float64 arrays of one shape. ``alpha`` is the chance that a test raises the
 whole image: it is divided among the comparisons (:data:`FAMILIES`). Nothing here knows of Mitsuba.
 
 Source: Welford 1962 (Technometrics 4) and Chan, Golub, LeVeque 1983 (The American Statistician 37) for running moments;
-Sidak 1967 (JASA 62) for many comparisons; Welch 1947 (Biometrika 34) for unequal variances; Hoeffding 1963 (JASA 58),
-Theorem 1, for bounded samples.
+Sidak 1967 (JASA 62) for many comparisons; Satterthwaite 1946 (Biometrics Bulletin 2) and Welch 1947 (Biometrika 34) for
+sums of estimated variances; Hoeffding 1963 (JASA 58), Theorem 1, for bounded samples.
 """
 
 from __future__ import annotations
@@ -28,9 +28,12 @@ __all__ = [
     "batches_for",
     "bias",
     "bounded_p_value",
+    "effective_dof",
     "level_of_one",
     "nrmse",
+    "p_value",
     "pool",
+    "pooled_dof",
     "psnr",
     "smallest_detectable_bias",
     "ssim",
@@ -126,15 +129,59 @@ def pool(mean: np.ndarray, var: np.ndarray, tile: int) -> tuple[np.ndarray, np.n
     Returns:
         mean and variance of the mean, (H // tile, W // tile, C).
     """
-    h, w, c = mean.shape
+    return _tiles(mean, tile).mean(axis=(1, 3)), _tiles(var, tile).sum(axis=(1, 3)) / tile**4
+
+
+def _tiles(image: np.ndarray, tile: int) -> np.ndarray:
+    """An image (H, W, C) as (rows of tiles, tile, columns of tiles, tile, C), without what fills no tile."""
+    h, w, c = image.shape
     if tile < 1 or h < tile or w < tile:
         raise MivolError(f"tiles of {tile} pixels do not fit an image of {w}x{h}; choose 1 to {min(h, w)}.")
     cut = (h // tile, tile, w // tile, tile, c)
+    return image[: cut[0] * tile, : cut[2] * tile].reshape(cut)
 
-    def tiles(a: np.ndarray) -> np.ndarray:
-        return a[: cut[0] * tile, : cut[2] * tile].reshape(cut)
 
-    return tiles(mean).mean(axis=(1, 3)), tiles(var).sum(axis=(1, 3)) / tile**4
+# -- Degrees of freedom ---------------------------------------------------------------------------
+
+
+def effective_dof(variances: np.ndarray, dof: np.ndarray | float, axis: int | tuple[int, ...] | None = None) -> np.ndarray:
+    r"""Degrees of freedom of a sum of independent estimated variances, by Welch and Satterthwaite.
+
+    An estimate v of a variance with d degrees of freedom, of normal values, is :math:`E[v]\,\chi^2_d/d`: its own variance is
+    :math:`2 E[v]^2/d`. The sum of independent ones has the mean :math:`\sum E[v_i]` and the variance
+    :math:`\sum 2 E[v_i]^2/d_i`; a single scaled :math:`\chi^2_\nu` of the same mean and variance has
+
+    .. math:: \nu = \frac{(\sum_i v_i)^2}{\sum_i v_i^2/d_i}
+
+    with the estimates in the place of the expectations. Since :math:`E[v_i^2] = E[v_i]^2 (1 + 2/d_i)`, the denominator is
+    estimated too large and :math:`\nu` too small: a t-test at it is cautious. k equal variances of d degrees have k d, one
+    that outweighs all others has its own d.
+
+    Args:
+        variances: estimates, at least 0, in any common unit.
+        dof: degrees of freedom of each; inf where a variance is known.
+        axis: along which variances are added; all by default.
+
+    Returns:
+        float64 array; inf where no variance was estimated or all are 0.
+    """
+    v = np.asarray(variances, dtype=np.float64)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        # Relative to the largest: squares of variances below 1e-154 would be 0 in float64.
+        v = v / v.max(axis=axis, keepdims=True)
+        nu = v.sum(axis=axis) ** 2 / (v**2 / dof).sum(axis=axis)
+    return np.where(np.isnan(nu), np.inf, nu)
+
+
+def pooled_dof(var: np.ndarray, dof: float, tile: int) -> np.ndarray:
+    """Degrees of freedom of the variances that :func:`pool` gives, (H // tile, W // tile, C).
+
+    Args:
+        var: (H, W, C), of independent pixels.
+        dof: of the variance of one pixel.
+        tile: side of a tile [pixel].
+    """
+    return effective_dof(_tiles(var, tile), dof, axis=(1, 3))
 
 
 # -- Tests ----------------------------------------------------------------------------------------
@@ -185,12 +232,10 @@ def z_bound(alpha: float, comparisons: int = 1, dof: np.ndarray | float = np.inf
     return np.where(np.isinf(dof), normal, -stdtrit(np.where(np.isinf(dof), 1.0, dof), tail))
 
 
-def _welch(var_a: np.ndarray, n_a: float, var_b: np.ndarray, n_b: float) -> np.ndarray:
-    """Welch-Satterthwaite degrees of freedom of the variance of a difference; n = inf: the variance is known."""
-    with np.errstate(divide="ignore", invalid="ignore"):
-        dof = (var_a + var_b) ** 2 / (var_a**2 / (n_a - 1) + var_b**2 / (n_b - 1))
-    # 0/0: no variance at all, nothing was estimated; then z is 0 or infinite and its bound does not matter.
-    return np.where(np.isnan(dof), np.inf, dof)
+def _welch(var_a: np.ndarray, dof_a: np.ndarray | float, var_b: np.ndarray, dof_b: np.ndarray | float) -> np.ndarray:
+    """Degrees of freedom of the variance of a difference."""
+    dof = np.stack(np.broadcast_arrays(dof_a, dof_b, var_a)[:2]).astype(np.float64)
+    return effective_dof(np.stack([var_a, var_b]), dof, axis=0)
 
 
 def z_image(
@@ -220,8 +265,8 @@ def assert_same_mean(
     var_b: np.ndarray | float = 0.0,
     *,
     alpha: float = 1e-6,
-    n_a: float = np.inf,
-    n_b: float = np.inf,
+    dof_a: np.ndarray | float = np.inf,
+    dof_b: np.ndarray | float = np.inf,
     comparisons: int | None = None,
     tile: int = 1,
     rounding: float = 0.0,
@@ -234,11 +279,13 @@ def assert_same_mean(
         a, b: means; any shape, (H, W, C) where ``tile`` is above 1.
         var_a, var_b: variances of the means.
         alpha: chance that this call raises although the means agree.
-        n_a, n_b: batches behind each estimated variance: Student's t with Welch's degrees of freedom takes the place of
-            the normal law. Infinite: the variance is exact.
+        dof_a, dof_b: degrees of freedom of each estimated variance, one less than the batches behind it (or what
+            :func:`effective_dof` gives for a sum; an array only where ``tile`` is 1): Student's t with Welch's degrees of
+            freedom takes the place of the normal law. Infinite: the variance is exact.
         comparisons: how many comparisons share alpha; by default the pixels of this image. Give more where several
             images are tested for one alpha.
-        tile: average tiles of so many pixels first; for heavy tails, see :func:`pool`.
+        tile: average tiles of so many pixels first; for heavy tails, see :func:`pool`. The variance of a tile has the
+            degrees of freedom of all its pixels, :func:`pooled_dof`.
         rounding: see :func:`z_image`.
         family: key of ``FAMILIES``.
         what: subject of the sentence.
@@ -248,22 +295,53 @@ def assert_same_mean(
             that this test would find nine times in ten.
         MivolError: a value that is not finite, or a negative variance: nothing can be said then.
     """
-    a, b, var_a, var_b = _checked(a, b, var_a, var_b)
-    if tile > 1:
-        (a, var_a), (b, var_b) = pool(a, var_a, tile), pool(b, var_b, tile)
+    a, b, var_a, var_b, dof = _prepared(a, var_a, b, var_b, dof_a, dof_b, tile)
     m = comparisons or max(a.size, 1)
     z = z_image(a, var_a, b, var_b, rounding)
-    bound = z_bound(alpha, m, _welch(var_a, n_a, var_b, n_b), family)
+    bound = z_bound(alpha, m, dof, family)
     beyond = np.abs(z) > bound
     if not beyond.any():
         return
     worst = np.unravel_index(np.argmax(np.where(beyond, np.abs(z) / bound, 0)), z.shape)
-    power = smallest_detectable_bias(var_a, var_b, alpha=alpha, comparisons=m)
+    power = smallest_detectable_bias(var_a, var_b, alpha=alpha, comparisons=m, dof=dof)
     raise AssertionError(
         f"{what} differ at {tuple(int(i) for i in worst)}: {a[worst]:.8g} and {b[worst]:.8g}, {z[worst]:+.2f} standard "
         f"errors, bound {bound[worst]:.2f} (alpha {alpha:g} over {m} comparisons); {beyond.sum()} of {z.size} beyond it; "
         f"a bias of {np.median(power):.2g} is found 9 times in 10."
     )
+
+
+def p_value(
+    a: np.ndarray,
+    var_a: np.ndarray,
+    b: np.ndarray,
+    var_b: np.ndarray | float = 0.0,
+    *,
+    dof_a: np.ndarray | float = np.inf,
+    dof_b: np.ndarray | float = np.inf,
+    comparisons: int | None = None,
+    tile: int = 1,
+    rounding: float = 0.0,
+) -> float:
+    """Chance that means that agree differ as much as these do somewhere: the alpha at which :func:`assert_same_mean` turns.
+
+    Args: see :func:`assert_same_mean`; many comparisons by Sidak's formula.
+    """
+    from scipy.special import ndtr, stdtr
+
+    a, b, var_a, var_b, dof = _prepared(a, var_a, b, var_b, dof_a, dof_b, tile)
+    z = np.abs(z_image(a, var_a, b, var_b, rounding))
+    tail = 2 * np.where(np.isinf(dof), ndtr(-z), stdtr(np.where(np.isinf(dof), 1.0, dof), -z))
+    return float(-np.expm1((comparisons or max(a.size, 1)) * np.log1p(-np.min(tail, initial=1.0).clip(max=1 - 1e-16))))
+
+
+def _prepared(a, var_a, b, var_b, dof_a, dof_b, tile: int) -> tuple[np.ndarray, ...]:
+    """Means and variances of pixels or tiles, and the degrees of freedom of the variance of their difference."""
+    a, b, var_a, var_b = _checked(a, b, var_a, var_b)
+    if tile > 1:
+        dof_a, dof_b = pooled_dof(var_a, dof_a, tile), pooled_dof(var_b, dof_b, tile)
+        (a, var_a), (b, var_b) = pool(a, var_a, tile), pool(b, var_b, tile)
+    return a, b, var_a, var_b, _welch(var_a, dof_a, var_b, dof_b)
 
 
 def _checked(a, b, var_a, var_b) -> tuple[np.ndarray, ...]:
@@ -351,17 +429,24 @@ def assert_same_bounded_mean(
 
 
 def smallest_detectable_bias(
-    var_a: np.ndarray, var_b: np.ndarray | float = 0.0, *, alpha: float = 1e-6, comparisons: int = 1, power: float = 0.9
+    var_a: np.ndarray,
+    var_b: np.ndarray | float = 0.0,
+    *,
+    alpha: float = 1e-6,
+    comparisons: int = 1,
+    power: float = 0.9,
+    dof: np.ndarray | float = np.inf,
 ) -> np.ndarray:
     """Bias that a two-sided z-test finds with chance ``power``: (z_alpha + z_power) standard errors.
 
     The test fires when |difference| > z_alpha s; with a bias b the difference is normal about b, and exceeds z_alpha s with
-    chance Phi(b/s - z_alpha) (the other tail is below alpha/2): b = (z_alpha + Phi^-1(power)) s.
+    chance Phi(b/s - z_alpha) (the other tail is below alpha/2): b = (z_alpha + Phi^-1(power)) s. With ``dof`` degrees of
+    freedom z_alpha is the bound of Student's t, and b what is found in the mean over estimates of s.
     """
     if not 0 < power < 1:
         raise MivolError(f"power = {power}; expected a chance between 0 and 1.")
     s = np.sqrt(np.asarray(var_a, dtype=np.float64) + var_b)
-    return (z_bound(alpha, comparisons) + NormalDist().inv_cdf(power)) * s
+    return (z_bound(alpha, comparisons, dof) + NormalDist().inv_cdf(power)) * s
 
 
 def batches_for(
@@ -404,10 +489,14 @@ def bias(
     *,
     alpha: float = 1e-3,
     correlated: int = 1,
+    dof_a: float = np.inf,
+    dof_b: float = np.inf,
 ) -> Bias:
     """Mean difference of two images: finds a bias too small for any one pixel to show.
 
     Args:
+        dof_a, dof_b: degrees of freedom of each pixel's variance, one less than the batches behind it; their sum has as
+            many as :func:`effective_dof` says, of which ``correlated`` pixels share each one.
         correlated: how many values share samples with any one, itself included (1: box filter and grey noise; a filter of
             radius r pixels: at most (2 floor(2 r) + 1)^2 pixels; times 3 where the channels share paths). The variance of
             the sum is at most ``correlated`` times the sum of variances, since Cov(i, j) <= (v_i + v_j)/2.
@@ -415,7 +504,8 @@ def bias(
     a, b, var_a, var_b = _checked(a, b, var_a, var_b)
     value = float((a - b).mean())
     error = float(np.sqrt(correlated * (var_a + var_b).sum()) / a.size)
-    half = float(z_bound(alpha)) * error
+    spread = effective_dof(np.stack([var_a, var_b]), np.reshape([dof_a, dof_b], (2,) + (1,) * a.ndim))
+    half = float(z_bound(alpha, dof=spread / correlated)) * error
     return Bias(value, error, value - half, value + half, alpha)
 
 
