@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import json
-import os
-import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import drjit as dr
@@ -432,23 +429,36 @@ def test_disk_full(variant_rgb, folder: Path, capsys: pytest.CaptureFixture, mon
     assert run("optimize", folder / "fit.toml", "-o", target, *PHOTOS) == 0
 
 
+STOPPED_AFTER_THREE = """
+import os, signal, sys
+from mivol.cli import main
+from mivol.experiments import run_folder
+
+write = run_folder.append_metrics
+
+def write_and_stop(folder, iteration, seconds, **values):
+    write(folder, iteration, seconds, **values)
+    if iteration == 2:
+        os.kill(os.getpid(), signal.SIGTERM)
+
+run_folder.append_metrics = write_and_stop
+sys.exit(main(sys.argv[1:]))
+"""
+"""The command line in a process that is asked to stop once it has written its third row, of iteration 2; whatever the load."""
+
+
 def test_interrupted_run_is_resumed(variant_rgb, folder: Path) -> None:
     """Rationale: SIGTERM is how clusters stop jobs. Expected: exit code 130, one sentence, a checkpoint, status
     "stopped"; --resume ends with the very metrics of a run that was not stopped (one thread), each row once."""
     long = [*PHOTOS, "--set", "fit.iterations=20"]
     assert run("optimize", folder / "fit.toml", "-o", folder / "whole", *long) == 0
-    command = [sys.executable, "-m", "mivol", "optimize", str(folder / "fit.toml"), "-o", str(folder / "cut"), *long]
-    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=os.environ) as child:
-        metrics, deadline = folder / "cut" / "metrics.jsonl", time.monotonic() + 60
-        while time.monotonic() < deadline and (not metrics.exists() or metrics.read_text().count("\n") < 3):
-            time.sleep(0.02)
-        child.send_signal(signal.SIGTERM)
-        asked = time.monotonic()
-        said = child.communicate(timeout=60)[1]
+    command = [sys.executable, "-c", STOPPED_AFTER_THREE, "optimize", folder / "fit.toml", "-o", folder / "cut", *long]
+    child = subprocess.run(command, stderr=subprocess.PIPE, text=True, check=False)
     assert child.returncode == 130
-    assert time.monotonic() - asked < 20
-    assert "mivol: stopped" in said
-    assert "Traceback" not in said
+    assert "mivol: stopped" in child.stderr
+    assert "Traceback" not in child.stderr
+    # It stops at the next safe point, in iteration 3 or before the one after.
+    assert (folder / "cut" / "metrics.jsonl").read_text().count("\n") in (3, 4)
     assert json.loads((folder / "cut" / "run.json").read_text())["status"] == "stopped"
     assert run("optimize", folder / "fit.toml", "-o", folder / "cut", *long, "--resume") == 0
     texts = [(folder / name / "metrics.jsonl").read_text() for name in ("whole", "cut")]
