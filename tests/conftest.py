@@ -14,6 +14,7 @@ import mivol  # noqa: F401  (before Mitsuba: it chooses the LLVM library)
 
 # isort: split
 import drjit
+import false_alarms
 import mitsuba as mi
 import pytest
 
@@ -25,21 +26,28 @@ ROOT = Path(__file__).resolve().parents[1]
 def pytest_addoption(parser: pytest.Parser) -> None:
     """Options of the suite."""
     parser.addoption("--variant", default="llvm_ad_rgb", help="the Mitsuba variant of the fixture variant_rgb")
-    parser.addoption("--seeds", type=int, default=1, help="how many seeds each test that asks for one is run with")
+    parser.addoption("--seeds", type=int, default=1, help="how many rounds of seeds tests of noise run with")
     parser.addoption("--artefacts", type=Path, default=ROOT / "runs" / "tests", help="where tests leave pictures")
 
 
-def pytest_configure() -> None:
-    """Workers of pytest-xdist share the cores; a pool's idle thread spins, at the other worker's cost."""
+def pytest_configure(config: pytest.Config) -> None:
+    """Chances of false alarms are counted. Workers of pytest-xdist share the cores: a pool's idle thread spins, at the other
+    worker's cost."""
+    config.pluginmanager.register(false_alarms.Count())
     workers = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", 1))
     if workers > 1:
         drjit.set_thread_count(max(1, machine.cores() // workers))
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
-    """A test with an argument ``seed`` runs once for each of ``--seeds`` seeds."""
+    """A test with an argument ``seed``, or of noise, runs once for each of ``--seeds`` rounds of seeds."""
+    rounds = metafunc.config.getoption("--seeds")
     if "seed" in metafunc.fixturenames:
-        metafunc.parametrize("seed", range(metafunc.config.getoption("--seeds")))
+        metafunc.parametrize("seed", range(rounds))
+    elif rounds > 1 and metafunc.definition.get_closest_marker("statistical"):
+        # Read by false_alarms.fresh; the name of a test stays what it is where there is but one round.
+        metafunc.fixturenames.append("seed")
+        metafunc.parametrize("seed", range(rounds))
 
 
 def pytest_collection_finish() -> None:

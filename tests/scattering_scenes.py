@@ -10,8 +10,9 @@ import mitsuba as mi
 import numpy as np
 import oracle_scattering as twins
 import pytest
+from false_alarms import Estimate, assert_precise, assert_same_mean, difference, fresh, over_pixels
 
-from mivol.validate.statistics import Moments, assert_same_mean
+from mivol.validate.statistics import Moments
 from scenes import as_float32, box_of, camera, centred, film, grid_volume, medium, pencil, pixel_rays
 
 KINDS = {"stock": ("heterogeneous", "gridvolume"), "own": ("mivol_medium", "mivol_voxels")}
@@ -37,7 +38,7 @@ def moments(scene: mi.Scene, integrator: dict | mi.Integrator, spp: int, batches
     """Mean and variance of an image over independent renders."""
     integrator = mi.load_dict(integrator) if isinstance(integrator, dict) else integrator
     seeds = range(first, first + batches)
-    return Moments.of(np.stack([np.array(mi.render(scene, integrator=integrator, spp=spp, seed=s)) for s in seeds]))
+    return Moments.of(np.stack([np.array(mi.render(scene, integrator=integrator, spp=spp, seed=fresh(s))) for s in seeds]))
 
 
 def mivol(**more: object) -> dict:
@@ -61,28 +62,23 @@ def assert_same_images(
     channels: int = 3,
     precision: float = 0.01,
 ) -> tuple[Moments, Moments]:
-    """mivol and volpath have the same mean in tiles of `tile` pixels, and over the whole image, at 1e-6 each.
+    """mivol and volpath have the same mean in tiles of `tile` pixels, and over the whole image.
 
-    With 16 batches of each Welch's t has about 30 degrees of freedom: bounds of 7.5 (an image of 48 tiles and channels)
-    and 6 standard errors. `precision` is what the standard error of the whole image may be of its mean: a bias of seven
-    times that cannot hide.
+    The variance of a tile of 16 pixels of 16 batches has up to 240 degrees of freedom: bounds of 7 (an image of 48 tiles and
+    channels) and 6 standard errors. `precision` is what the standard error of the whole image may be of its mean.
     """
     a = moments(scene, ours or mivol(), spp[0], batches)
     b = moments(scene, stock or volpath(), spp[1], batches, first=1000)
     image, judge = (replace(m, mean=m.mean[..., :channels], m2=m.m2[..., :channels]) for m in (a, b))
-    known = {"n_a": batches, "n_b": batches, "rounding": rounding}
-    assert_same_mean(image.mean, image.variance_of_mean, judge.mean, judge.variance_of_mean, tile=tile, what="tiles", **known)
+    assert_same_mean(image, judge, tile=tile, rounding=rounding, what="tiles")
     return assert_same_whole(image, judge, rounding, precision)
 
 
 def assert_same_whole(image: Moments, judge: Moments, rounding: float = 0.0, precision: float = 0.01) -> tuple:
-    """The mean of each channel over all pixels, at 1e-6."""
-    mean, var = [m.mean.mean(axis=(0, 1)) for m in (image, judge)], []
-    for m in (image, judge):
-        var.append(m.variance_of_mean.sum(axis=(0, 1)) / np.prod(m.mean.shape[:2]) ** 2)
-    assert_same_mean(mean[0], var[0], mean[1], var[1], n_a=image.n, n_b=judge.n, rounding=rounding, what="whole images")
-    error = np.sqrt(sum(var))
-    assert np.all(error <= precision * np.abs(mean[1]) + 1e-12), f"standard error {error} of {mean[1]}"
+    """The mean of each channel over all pixels."""
+    a, b = over_pixels(image), over_pixels(judge)
+    assert_same_mean(a, b, rounding=rounding, what="whole images")
+    assert_precise(difference(a, b), precision * np.abs(b.mean) + 1e-12, what="whole images")
     return image, judge
 
 
@@ -192,7 +188,7 @@ def assert_twin(
     quadrature: float = 1e-5,
     **more: object,
 ) -> None:
-    """The mean of renders along pencils is the radiance of the twin, each ray by Student's t, 1e-6 in all.
+    """The mean of renders along pencils is the radiance of the twin, each ray by Student's t.
 
     `quadrature`: relative error of the twin; `rounding`: absolute error of float32. `precision` is what the median
     standard error may be of the radiance.
@@ -201,9 +197,10 @@ def assert_twin(
     m = seen.moments(integrator, spp, batches)
     truth = np.broadcast_to(truth, m.mean.shape)
     allowed = rounding + quadrature * np.abs(truth).max()
-    assert_same_mean(m.mean, m.variance_of_mean, truth, n_a=batches, rounding=allowed, what="rays")
-    error = np.sqrt(m.variance_of_mean[truth > 0.1 * truth.max()]) / truth[truth > 0.1 * truth.max()]
-    assert np.median(error) <= precision, f"a median standard error of {np.median(error):.2g}"
+    assert_same_mean(m, truth, rounding=allowed, what="rays")
+    bright = truth > 0.1 * truth.max()
+    seen_there = Estimate(m.mean[bright], m.variance_of_mean[bright], batches - 1)
+    assert_precise(seen_there, precision * truth[bright], of=np.median, what="rays")
 
 
 def close_up(

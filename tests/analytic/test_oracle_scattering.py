@@ -205,6 +205,7 @@ JUDGED = {
 }
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("name", JUDGED)
 def test_twins_against_volpath(variant_rgb, name):
     """16 batches of 8192 paths along each of 6 rays; Student's t."""

@@ -1,7 +1,7 @@
 """Light that turns once, by the integrator `mivol`, against closed forms and the float64 twin.
 
 Each ray is a pencil without a footprint; its radiance is the mean of 16 independent renders and held against the exact
-one by Student's t, false alarms 1e-6 a test. Where nothing is sampled (no noise at all) what is left is float32 rounding,
+one by Student's t (tests/false_alarms.py). Where nothing is sampled (no noise at all) what is left is float32 rounding,
 which `rounding` names: 2e-5 of the largest radiance, a few EPS for each of about 50 operations on cells and lamps.
 """
 
@@ -14,10 +14,11 @@ import numpy as np
 import oracle_scattering as twins
 import pytest
 import scattering_scenes as small
+from false_alarms import Estimate, assert_precise, assert_same_mean, difference
 from scattering_scenes import PLACE, aimed, assert_twin, fog, mivol, moments, pencils, point, rough_grid, smoke, spot, sun
 
 import scenes
-from mivol.validate.statistics import assert_same_mean
+from mivol.validate.statistics import effective_dof
 from scenes import affine, as_float32, ball_of, box_of, centred, grid_volume, medium
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
@@ -47,6 +48,7 @@ LAMPS = {
 PHASES = {"isotropic": ("isotropic", 0.0), "hg": ("hg", 0.6), "backward": ("hg", -0.4), "rayleigh": ("rayleigh", 0.0)}
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("kind", small.KINDS)
 @pytest.mark.parametrize("lamps", LAMPS)
 def test_grid_and_lamps(lamps, kind):
@@ -54,18 +56,21 @@ def test_grid_and_lamps(lamps, kind):
     check({"smoke": box}, [m], LAMPS[lamps](), *aimed(1))
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("name", PHASES)
 def test_phase_functions(name):
     box, m = smoke(rough_grid(2), 0.9, "own", PLACE, *PHASES[name])
     check({"smoke": box}, [m], LAMPS["three"](), *aimed(2))
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("lamps", ["point outside", "point inside", "sun"])
 def test_homogeneous_box(lamps):
     box, m = fog(1.1, 0.8, name="hg", g=-0.3)
     check({"fog": box}, [m], LAMPS[lamps](), *aimed(3))
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("name", ["stretched", "rotated", "sheared"])
 def test_frames(name):
     frame = as_float32(scenes.FRAMES[name])
@@ -77,6 +82,7 @@ def test_frames(name):
     check({"smoke": box}, [m], [point(middle + size * np.array([1.0, 3, 2]))], as_float32(middle + size * o), d)
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("kind", small.KINDS)
 def test_albedo_grid(kind):
     """An albedo on another grid than the extinction."""
@@ -87,6 +93,7 @@ def test_albedo_grid(kind):
     check({"smoke": box_of(interior, PLACE)}, [m], LAMPS["point outside"](), *aimed(5))
 
 
+@pytest.mark.statistical
 def test_rgb_albedo_and_rgb_extinction():
     """Three channels, each with an extinction and an albedo of its own."""
     values = rough_grid(7, 1.0) * np.array([0.2, 1.0, 4.0])
@@ -97,6 +104,7 @@ def test_rgb_albedo_and_rgb_extinction():
     check({"smoke": box_of(interior, PLACE)}, [m], LAMPS["point outside"](), *aimed(7))
 
 
+@pytest.mark.statistical
 def test_rgb_homogeneous():
     """A homogeneous rgb box: each channel is its own exponential."""
     sigma = as_float32([0.1, 0.5, 0.9])
@@ -105,6 +113,7 @@ def test_rgb_homogeneous():
     check({"fog": box_of(interior, PLACE)}, [m], LAMPS["sun"](), *aimed(8))
 
 
+@pytest.mark.statistical
 def test_absorption_and_scattering_grids():
     """sigma_a and sigma_s on grids of different resolution: a medium of albedo 0 and one of albedo 1 in one place."""
     absorb, scatter = rough_grid(9, 1.0, (2, 3, 4)), rough_grid(10, 1.5)
@@ -118,6 +127,7 @@ def test_absorption_and_scattering_grids():
     check({"smoke": box_of(interior, PLACE)}, media, LAMPS["point outside"](), *aimed(9))
 
 
+@pytest.mark.statistical
 def test_two_media_shade_each_other():
     lower, upper = (as_float32(centred(np.diag([2.0, 2, 1]), (0, 0, z))) for z in (-0.5, 0.5))
     parts, media = {}, []
@@ -129,6 +139,7 @@ def test_two_media_shade_each_other():
     check(parts, media, [point([0.3, 0.2, 3.5])], *aimed(11, 10, 1.0, 6.0))
 
 
+@pytest.mark.statistical
 def test_background_shines_through():
     """A grid in a constant sky: what is turned and what is left of the background."""
     box, m = smoke(rough_grid(12), 0.9, name="hg", g=0.7)
@@ -140,6 +151,7 @@ def test_background_shines_through():
 # -- Closed forms ----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize(
     ("sigma_s", "sigma_t", "intensity", "t0", "h", "D", "answer"),
     [
@@ -156,10 +168,11 @@ def test_point_light_in_fog(sigma_s, sigma_t, intensity, t0, h, D, answer):
     seen = pencils({"fog": fog, "lamp": lamp}, [-1, 0, 0], [1, 0, 0])
     m = seen.moments(mivol(), 16384)
     # sigma_s/sigma_t and the lamp's place are float32 numbers; a few EPS each.
-    assert_same_mean(m.mean, m.variance_of_mean, np.full((1, 3), answer), n_a=16, rounding=1e-5 * answer, what="fog")
-    assert np.all(np.sqrt(m.variance_of_mean) < 0.01 * answer)
+    assert_same_mean(m, np.full((1, 3), answer), rounding=1e-5 * answer, what="fog")
+    assert_precise(m, 0.01 * answer)
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("name", ["isotropic", "rayleigh"])
 def test_thin_limit(name):
     """tau of 1e-4: the closed form without extinction, to that."""
@@ -168,10 +181,11 @@ def test_thin_limit(name):
     seen = pencils({"fog": fog, "lamp": point([1.2, 0.3, 0.0], 2.0)[0]}, [-1, 0, 0], [1, 0, 0])
     m = seen.moments(mivol(), 8192)
     answer = twins.point_thin(0.5e-5, 2.0, 1.2, 0.3, 4.0, name)
-    assert_same_mean(m.mean, m.variance_of_mean, np.full((1, 3), answer), n_a=16, rounding=1e-4 * answer, what=name)
-    assert np.all(np.sqrt(m.variance_of_mean) < 0.01 * answer)
+    assert_same_mean(m, np.full((1, 3), answer), rounding=1e-4 * answer, what=name)
+    assert_precise(m, 0.01 * answer)
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize(("mu", "mu0"), [(0.6, 0.9), (0.9, 0.6), (0.7, 0.7), (1.0, 1.0)])
 @pytest.mark.parametrize("kind", ["homogeneous", "grid"])
 def test_collimated_slab(mu, mu0, kind):
@@ -193,10 +207,11 @@ def test_collimated_slab(mu, mu0, kind):
     ]
     m = seen.moments(mivol(), 4096)
     truth = np.repeat(np.array(answer)[:, None], 3, axis=1)
-    assert_same_mean(m.mean, m.variance_of_mean, truth, n_a=16, rounding=1e-5 * max(answer), what="slab")
-    assert np.all(np.sqrt(m.variance_of_mean) < 0.01 * truth)
+    assert_same_mean(m, truth, rounding=1e-5 * max(answer), what="slab")
+    assert_precise(m, 0.01 * truth)
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("kind", ["homogeneous", "grid"])
 def test_cube_lit_from_above_seen_from_the_side(kind):
     """alpha p E0 e^{-sigma y} (1 - e^{-sigma D}) at each depth y."""
@@ -206,9 +221,10 @@ def test_cube_lit_from_above_seen_from_the_side(kind):
     seen = pencils({"cube": build[0], "sun": sun([0, 0, -1.0], 3.0)[0]}, o, [1.0, 0, 0])
     m = seen.moments(mivol(), 4096)
     truth = [[twins.cube_from_the_side(0.6, 1 / (4 * math.pi), 3.0, sigma, 1 - z, 1.0)] * 3 for z in seen.o[:, 2]]
-    assert_same_mean(m.mean, m.variance_of_mean, np.array(truth), n_a=16, rounding=1e-5 * truth[0][0], what="cube")
+    assert_same_mean(m, np.array(truth), rounding=1e-5 * truth[0][0], what="cube")
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("sigma", [0.2, 1.3, 8.0])
 def test_ball_in_a_constant_sky(sigma):
     """By symmetry two nested integrals; the boundary is traced, a few EPS of its coordinates."""
@@ -218,9 +234,10 @@ def test_ball_in_a_constant_sky(sigma):
     m = seen.moments(mivol(), 4096)
     truth = np.repeat([[twins.ball_in_sky(0.9, sigma, 1.0, b)] for b in seen.o[:, 1]], 3, axis=1)
     # Shadow rays leave Mitsuba's sphere at float32 distances; sigma times 1e-5 of a length.
-    assert_same_mean(m.mean, m.variance_of_mean, truth, n_a=16, rounding=1e-5 * max(sigma, 1), what="ball")
+    assert_same_mean(m, truth, rounding=1e-5 * max(sigma, 1), what="ball")
 
 
+@pytest.mark.statistical
 def test_reciprocity():
     """The light of a lamp at a that passes b, from all sides, is that of a lamp at b that passes a (fluence).
 
@@ -228,7 +245,7 @@ def test_reciprocity():
     """
     a, b = np.array([-3.0, 0.3, 0.5]), np.array([1.5, 2.5, 1.0])
     box, _ = smoke(rough_grid(13), 0.9, "own", name="hg", g=0.5)
-    fluences, errors = [], []
+    fluences = []
     for eye, lamp in ((a, b), (b, a)):
         fov, res = 75.0, 32
         sensor = scenes.camera(eye, (0, 0, 0), res=res, fov=fov)
@@ -238,16 +255,17 @@ def test_reciprocity():
         solid = (2 * half / res) ** 2 / (1 + x[:, None] ** 2 + x[None] ** 2) ** 1.5
         m = moments(scene, mivol(), 64)
         assert not m.mean[0].any() and not m.mean[-1].any() and not m.mean[:, 0].any(), "the box is not all seen"
-        fluences.append(np.sum(m.mean[..., 0] * solid))
-        errors.append(np.sum(m.variance_of_mean[..., 0] * solid**2))
-    one, two = zip(np.array(fluences)[:, None], np.array(errors)[:, None], strict=True)
-    assert_same_mean(*one, *two, n_a=16, n_b=16, rounding=2e-4 * fluences[0], what="fluences")
-    assert math.sqrt(sum(errors)) < 5e-3 * fluences[0]
+        var = m.variance_of_mean[..., 0] * solid**2
+        fluences.append(Estimate(np.sum(m.mean[..., 0] * solid), var.sum(), effective_dof(var, m.n - 1)))
+    one, two = fluences
+    assert_same_mean(one, two, rounding=2e-4 * one.mean, what="fluences")
+    assert_precise(difference(one, two), 5e-3 * one.mean, what="fluences")
 
 
 # -- Laws of scale ---------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("scale", [1e-3, 1e3])
 def test_the_size_of_the_world(scale):
     """k times larger, thinner by k, under a directional lamp: the same radiance."""

@@ -2,42 +2,45 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from false_alarms import Estimate, assert_same_mean, assert_same_variance, fresh
 
 from mivol.bench import depth as bench
 from mivol.scene import depth_two
 from mivol.scene.depth_two import ALBEDOS, TABLES, TAUS
+from mivol.validate.statistics import Moments
 
 ROUNDING = 5e-4
 """Of a table of three digits."""
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("light", ["constant", "collimated"])
 def test_a_cell_is_measured_again(variant_rgb: str, light: str, seed: int) -> None:
-    """Albedo 0.9 at tau = 1 by other lines and samples than the table's: within 6 standard errors of this measurement and
-    the table's own (0.0014, a quarter of this one's with 16 times the lines) and its rounding; 16,384 lines: normal."""
+    """Albedo 0.9 at tau = 1 by other lines and samples than the table's: within the noise of this measurement, the table's own
+    (0.0014, a quarter of this one's with 16 times the lines) and its rounding; 16,384 lines: normal."""
     key = (light, "isotropic")
     cell = bench.measure(bench.tabled_cube(*key), 0.9, 1.0, n=1 << 14, seed=77 + seed)
     wanted = TABLES[key][ALBEDOS.index(0.9), TAUS.index(1.0)]
     assert cell.standard_error < 0.01, "else the test sees nothing"
-    assert abs(cell.error - wanted) <= 6 * cell.standard_error * math.sqrt(1 + 1 / 16) + ROUNDING
+    measured = Estimate(cell.error, cell.standard_error**2 * (1 + 1 / 16))
+    assert_same_mean(measured, wanted, rounding=ROUNDING, what="light left out")
 
 
+@pytest.mark.statistical
 def test_standard_error_of_a_ratio() -> None:
-    """2000 ratios of 400 pairs each scatter as the delta method says: their standard deviation errs by 1 / sqrt(2 * 2000)
-    = 1.6 %, the method by O(1 / n) = a few per mille; 6 of the former."""
-    rng = np.random.default_rng(0)
+    """2000 ratios of 400 pairs each scatter as the delta method says, which errs by O(1 / n) = a few per mille."""
+    rng = np.random.default_rng(fresh(0))
     every = rng.exponential(1.0, (2000, 400))
     once = 0.6 * every * rng.random((2000, 400))
     found = [bench.left_out(a, b) for a, b in zip(once, every, strict=True)]
     errors, said = np.array(found).T
-    assert abs(errors.mean() - 0.7) <= 6 * errors.std() / math.sqrt(2000) + 1e-3
-    assert abs(errors.std() / said.mean() - 1) <= 6 * 0.016
+    assert_same_mean(Moments.of(errors), 0.7, rounding=1e-3, what="ratios")
+    assert_same_variance(errors, np.mean(said**2), what="ratios")
 
 
 def test_the_table_is_printed_as_the_module_holds_it() -> None:

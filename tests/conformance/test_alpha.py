@@ -5,9 +5,10 @@ from __future__ import annotations
 import mitsuba as mi
 import numpy as np
 import pytest
+from false_alarms import assert_precise, assert_same_mean, over_pixels
 from scattering_scenes import fog, mivol, moments, rough_grid, smoke, volpath
 
-from mivol.validate.statistics import assert_same_mean
+from mivol.validate.statistics import Moments
 from scenes import ball_of, camera, film, medium, sky
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
@@ -35,18 +36,23 @@ SCENES = {
 }
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("name", SCENES)
 def test_alpha_is_what_volpath_draws(name):
     """Welch's t, 16 batches each; emitters are hidden, so that the sky does not count."""
     scene = seen(SCENES[name]() | {"sky": sky(0.5)})
     ours, stock = moments(scene, mivol(hide_emitters=True), 64), moments(scene, volpath(hide_emitters=True), 256, first=500)
-    a, b = ((m.mean[..., 3:], m.variance_of_mean[..., 3:]) for m in (ours, stock))
+    a, b = alpha_of(ours), alpha_of(stock)
     # Rays of volpath enter 1e-4 behind a boundary; sums of 256 float32 ones and zeros.
-    rounding = 1e-3
-    assert_same_mean(*a, *b, n_a=16, n_b=16, tile=4, rounding=rounding)
-    whole = [(m.mean(), v.sum() / 64**2) for m, v in (a, b)]
-    assert_same_mean(*(np.array([x]) for pair in whole for x in pair), n_a=16, n_b=16, rounding=rounding)
-    assert whole[1][1] < 0.01**2 and 0.05 < whole[0][0] < 0.999
+    assert_same_mean(a, b, tile=4, rounding=1e-3, what="tiles")
+    a, b = over_pixels(a), over_pixels(b)
+    assert_same_mean(a, b, rounding=1e-3, what="whole images")
+    assert_precise(b, 0.01, what="whole images")
+    assert 0.05 < a.mean[0] < 0.999
+
+
+def alpha_of(image: Moments) -> Moments:
+    return Moments(image.n, image.mean[..., 3:4], image.m2[..., 3:4])
 
 
 def test_alpha_is_the_opacity_at_any_depth():
@@ -61,11 +67,11 @@ def test_alpha_is_the_opacity_at_any_depth():
             assert image[..., 3].max() > 0.5
 
 
+@pytest.mark.statistical
 def test_nested_integrators_draw_it():
     scene = seen(SCENES["thin"]() | {"sky": sky(0.5)})
     alone = moments(scene, mivol(hide_emitters=True), 64)
     nested = moments(scene, {"type": "moment", "inner": mivol(hide_emitters=True)}, 64, first=500)
-    a, b = (np.array([m.mean[..., 3].mean()]) for m in (alone, nested))
-    var_a, var_b = (np.array([m.variance_of_mean[..., 3].sum() / 64**2]) for m in (alone, nested))
-    assert_same_mean(a, var_a, b, var_b, n_a=16, n_b=16, rounding=1e-6)
-    assert var_b[0] < 0.01**2
+    a, b = over_pixels(alpha_of(alone)), over_pixels(alpha_of(nested))
+    assert_same_mean(a, b, rounding=1e-6, what="whole images")
+    assert_precise(b, 0.01, what="whole images")

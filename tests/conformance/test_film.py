@@ -9,12 +9,13 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from false_alarms import Estimate, assert_same_mean, assert_same_spread, fresh
 
 import scenes
 from mivol.scene import plan
 from mivol.transport.path import film
 from mivol.transport.path.film import count_passes
-from mivol.validate.statistics import Moments, assert_same_mean
+from mivol.validate.statistics import Moments
 from scenes import box_of, camera, grid_volume, medium, sky
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
@@ -52,7 +53,7 @@ def sensor_of(kind: str = "perspective", rfilter: str = "box", **film: object) -
 
 def moments(scene: mi.Scene, integrator: mi.Integrator, spp: int, first: int, batches: int = 12) -> Moments:
     """Mean and its variance over independent images."""
-    images = [np.array(mi.render(scene, integrator=integrator, spp=spp, seed=first + seed)) for seed in range(batches)]
+    images = [np.array(mi.render(scene, integrator=integrator, spp=spp, seed=fresh(first + seed))) for seed in range(batches)]
     return Moments.of(np.stack(images))
 
 
@@ -69,6 +70,7 @@ CAMERAS = {
 }
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("name", CAMERAS)
 def test_same_image_as_volpath(name):
     """Batch means of both, 12 batches of 64 samples: the stock integrator is the judge of film and sensor."""
@@ -77,11 +79,10 @@ def test_same_image_as_volpath(name):
     stock = moments(scene, mi.load_dict({"type": "volpath", "max_depth": 1}), 64, 500)
     assert ours.mean.shape == stock.mean.shape
     # Stock measures media from spawned rays, 1e-4 of a length further on: at sigma 2 it lets 2e-4 more through.
-    assert_same_mean(
-        ours.mean, ours.variance_of_mean, stock.mean, stock.variance_of_mean, n_a=12, n_b=12, rounding=6e-4, what=name
-    )
+    assert_same_mean(ours, stock, rounding=6e-4, what=name)
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("kind", ["independent", "stratified", "multijitter", "ldsampler"])
 def test_split_into_passes(kind, monkeypatch):
     """16 passes of one sample have the mean of one pass of 16, and a stratifying sampler stays better than none."""
@@ -93,34 +94,34 @@ def test_split_into_passes(kind, monkeypatch):
     monkeypatch.setitem(plan.PASS_RAYS, mi.variant().split("_")[0], 1)
     assert count_passes(scene.sensors()[0], 16, 1) == 16
     split = moments(scene, integrator, 16, 900, 16)
-    assert_same_mean(
-        whole.mean, whole.variance_of_mean, split.mean, split.variance_of_mean, n_a=16, n_b=16, rounding=1e-5, what=kind
-    )
+    assert_same_mean(whole, split, rounding=1e-5, what=kind)
 
 
+@pytest.mark.statistical
 def test_passes_of_stratified_samples_stay_stratified(monkeypatch):
     """A step across a pixel: n strata leave about n^-1/2 of the variance of n independent samples, whatever the passes."""
-    variance = {}
+    grey = {}
     for kind in ("independent", "multijitter"):
-        made = sensor_of()
+        made = sensor_of(width=24, height=24)
         made["sampler"] = {"type": kind, "sample_count": 16}
         scene = mi.load_dict(parts(made))
         monkeypatch.setitem(plan.PASS_RAYS, mi.variant().split("_")[0], 1)
         found = moments(scene, mi.load_dict({"type": "mivol", "max_depth": 1}), 16, 40)
-        variance[kind] = found.variance_of_mean.mean()
+        grey[kind] = Estimate(found.mean[..., 0], found.variance_of_mean[..., 0], found.n - 1)
     # 16^-1/2 is a quarter; passes that were not stratified together would leave 1.
-    assert variance["multijitter"] < 0.5 * variance["independent"]
+    assert_same_spread(grey["multijitter"], grey["independent"], expected=0.25, high=0.75, what="strata")
 
 
+@pytest.mark.statistical
 def test_pixels_are_not_correlated_between_passes(monkeypatch):
     """Each pass draws its own numbers: the variance of the mean falls as 1/passes."""
     scene = mi.load_dict(parts(sensor_of()))
     integrator = mi.load_dict({"type": "mivol", "max_depth": 1})
     monkeypatch.setitem(plan.PASS_RAYS, mi.variant().split("_")[0], 1)
-    one = moments(scene, integrator, 1, 0, 64).variance_of_mean.mean()
-    many = moments(scene, integrator, 16, 5000, 64).variance_of_mean.mean()
-    # 64 batches over 144 pixels: each variance is known to 2 %; a repeated pass would give a ratio of 1.
-    assert 0.8 / 16 < many / one < 1.25 / 16
+    one, many = (moments(scene, integrator, spp, first, 64) for spp, first in ((1, 0), (16, 5000)))
+    one, many = (Estimate(m.mean[..., 0], m.variance_of_mean[..., 0], m.n - 1) for m in (one, many))
+    # The pixels at the edges bring some 700 degrees of freedom: each variance is known to 5 %; a repeated pass would give 1.
+    assert_same_spread(many, one, expected=1 / 16, low=0.6 / 16, high=1.7 / 16, what="passes")
 
 
 @pytest.mark.parametrize("layout", [film.SPREAD, film.TILED])

@@ -6,9 +6,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from false_alarms import Estimate, assert_precise, assert_same_mean, difference, fresh, over_pixels
 from scattering_scenes import close_up, mivol, moments, rough_grid, smoke
 
-from mivol.validate.statistics import assert_same_mean
+from mivol.validate.statistics import Moments
 from scenes import ball_of, medium, pencil, sky
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
@@ -29,27 +30,26 @@ def surfaces_in_smoke() -> mi.Scene:
     return close_up({"smoke": box, "ball": ball, "floor": {"type": "rectangle", "to_world": place}, "sky": light})
 
 
+@pytest.mark.statistical
 def test_moment_has_the_same_mean_and_the_right_second_moment():
     """Welch's t of 16 batches each; the squares come from renders of one sample a pixel, 96 of them in 16 batches."""
     scene = surfaces_in_smoke()
     nested = moments(scene, {"type": "moment", "inner": mivol()}, 32, first=500)
     alone = moments(scene, mivol(), 32)
     assert nested.mean.shape == (16, 16, 9)
-    same = {"n_a": 16, "n_b": 16}
-    mean, var = nested.mean[..., :3], nested.variance_of_mean[..., :3]
-    assert_same_mean(mean, var, alone.mean, alone.variance_of_mean, tile=4, what="tiles", **same)
+    mean = nested.mean[..., :3]
+    assert_same_mean(Estimate(mean, nested.variance_of_mean[..., :3], 15), alone, tile=4, what="tiles")
     np.testing.assert_allclose(nested.mean[..., 3:6], mean @ XYZ.T, rtol=1e-5)  # 6 digits of the matrix
 
     integrator = mi.load_dict(mivol())
-    single = np.stack([np.array(mi.render(scene, integrator=integrator, spp=1, seed=1000 + s)) for s in range(96)])
+    single = np.stack([np.array(mi.render(scene, integrator=integrator, spp=1, seed=fresh(1000 + s))) for s in range(96)])
     squares = ((single @ XYZ.T) ** 2).mean(axis=(1, 2)).reshape(16, 6, 3).mean(axis=1)
-    whole = nested.mean[..., 6:].mean(axis=(0, 1))
-    # The batches of ``moment`` share no random numbers, and neither do pixels of one: the variance of a mean over pixels.
-    error = nested.variance_of_mean[..., 6:].sum(axis=(0, 1)) / 256**2
-    truth, var = squares.mean(axis=0), squares.var(axis=0, ddof=1) / 16
-    assert_same_mean(whole, error, truth, var, what="second moments", **same)
-    assert np.all(np.sqrt(error + var) < 0.01 * truth)
-    assert np.all(truth > 1.05 * (alone.mean @ XYZ.T).mean(axis=(0, 1)) ** 2)  # it is not the square of the mean
+    # The batches of ``moment`` share no random numbers, and neither do pixels of one.
+    whole, truth = over_pixels(Moments(nested.n, nested.mean[..., 6:], nested.m2[..., 6:])), Moments.of(squares)
+    assert_same_mean(whole, truth, what="second moments")
+    assert_precise(difference(whole, truth), 0.01 * truth.mean, what="second moments")
+    # It is not the square of the mean, by more than 5 of the 1 % above.
+    assert np.all(truth.mean > 1.05 * (alone.mean @ XYZ.T).mean(axis=(0, 1)) ** 2)
 
 
 def test_moment_of_light_through_media_alone_is_exact():

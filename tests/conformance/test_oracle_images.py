@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import mitsuba as mi
 import numpy as np
 import pytest
+from false_alarms import Estimate, assert_precise, assert_same_bounded_mean, assert_same_mean, difference, fresh
 from oracle import (
     box_interval,
     depth_twin,
@@ -24,7 +25,7 @@ from oracle import (
     trilinear,
 )
 
-from mivol.validate.statistics import assert_same_bounded_mean, assert_same_mean
+from mivol.validate.statistics import Moments
 from scenes import (
     FRAMES,
     affine,
@@ -350,6 +351,7 @@ def test_surface_in_the_medium_lit_by_a_point_light(kind):
     assert np.array_equal(see(parts, o, d, mivol(max_depth=1)).image, np.zeros((8, 3)))
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize(("kind", "depth"), [("own", 2), ("stock", 3), ("stock", -1)])
 def test_corner_in_the_medium_lit_by_the_sky(kind, depth):
     # Two white walls that light each other under a constant sky, no closed form: the mean over the picture against stock
@@ -361,15 +363,13 @@ def test_corner_in_the_medium_lit_by_the_sky(kind, depth):
     upright = mi.ScalarTransform4f().translate([-0.4, 0, 0]).rotate([0, 1, 0], 90)
     parts |= {"floor": wall(-0.37, white), "side": {"type": "rectangle", "to_world": upright, "bsdf": white}}
     scene = mi.load_dict({"type": "scene", **parts, "sensor": camera([1.5, 0.5, 3], [-0.3, 0, -0.3], res=8, fov=10)})
-    batches = 8
-    ours = np.array([render(scene, mivol(max_depth=depth, rr_depth=99), 64, seed) for seed in range(batches)])
+    seeds = range(16)
+    ours = np.array([render(scene, mivol(max_depth=depth, rr_depth=99), 32, fresh(seed)) for seed in seeds])
     stock = {"type": "volpath", "max_depth": depth, "rr_depth": 99}
-    theirs = np.array([render(scene, stock, 512, 100 + seed) for seed in range(batches)])
-    means = [x.mean(axis=(1, 2, 3)) for x in (ours, theirs)]
-    a, b = (m.mean() for m in means)
-    var_a, var_b = (m.var(ddof=1) / batches for m in means)
-    assert_same_mean(a, var_a, b, var_b, n_a=batches, n_b=batches, what="lit by the sky")
-    assert math.sqrt(var_a + var_b) < 0.01 * b
+    theirs = np.array([render(scene, stock, 256, fresh(100 + seed)) for seed in seeds])
+    ours, theirs = (Moments.of(x.mean(axis=(1, 2, 3))) for x in (ours, theirs))
+    assert_same_mean(ours, theirs, what="lit by the sky")
+    assert_precise(difference(ours, theirs), 0.01 * theirs.mean, what="lit by the sky")
 
 
 # -- Against stock volpath ---------------------------------------------------------------------------------------------------
@@ -399,14 +399,15 @@ COMPARED = {
 }
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("name", COMPARED)
 def test_same_mean_as_volpath(name):
     # With albedo 0 and a sky of 1 a path of volpath brings 0 or 1: Hoeffding bounds its mean with no variance to
     # estimate. The truth it is held against is our picture, whose own noise (the pixel's footprint) is below a tenth.
     parts, centre = COMPARED[name]()
     scene = framed(parts, centre, 6)
-    ours, spp = render(scene, mivol(), 256), 512
-    theirs = render(scene, {"type": "volpath", "max_depth": -1, "rr_depth": 10_000}, spp, seed=1)
+    ours, spp = render(scene, mivol(), 256, fresh(0)), 512
+    theirs = render(scene, {"type": "volpath", "max_depth": -1, "rr_depth": 10_000}, spp, seed=fresh(1))
     assert 0.02 < ours.mean() < 0.98
     grey = np.clip(theirs[..., 0], 0, 1)
     assert_same_bounded_mean(grey, spp, np.clip(ours[..., 0], 0, 1), what=name)
@@ -414,6 +415,7 @@ def test_same_mean_as_volpath(name):
     assert_same_bounded_mean(grey.mean(), spp * grey.size, np.clip(ours[..., 0], 0, 1).mean(), what=name + ", mean")
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("kind", KINDS)
 def test_pixel_means_of_a_camera(kind):
     # A pixel averages T, not tau: the twin's mean over 6 x 6 rays of each pixel, whose error is of second order in 1/6.
@@ -422,9 +424,10 @@ def test_pixel_means_of_a_camera(kind):
     k, spp = 6, 256
     o, d = pixel_rays(scene.sensors()[0], k)
     mean, variance = pixel_means(lambda o, d: np.exp(-tau_twin(values, to_world, o, d)), o, d)
-    image = render(scene, mivol(), spp)
+    image = render(scene, mivol(), spp, fresh(0))
     assert variance.max() > 1e-6
-    assert_same_mean(image[..., :1], variance / spp, mean, variance / k**4, rounding=1e-6, what="pixel means")
+    known = Estimate(mean, variance / k**4)
+    assert_same_mean(Estimate(image[..., :1], variance / spp), known, rounding=1e-6, what="pixel means")
     assert np.array_equal(image[..., 0], image[..., 1])
 
 

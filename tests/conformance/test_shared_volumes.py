@@ -7,10 +7,12 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import scattering_scenes as small
+from false_alarms import assert_precise, assert_same_mean, difference, fresh
 from scattering_scenes import PLACE, assert_same_images, close_up, mivol, point, rough_grid
 
 from mivol.transport.media.read_medium import traverse_medium, view_medium
 from mivol.validate.reference import render_reference
+from mivol.validate.statistics import Moments
 from scenes import box_of, centred, grid_volume, medium, sky, transform
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
@@ -47,6 +49,7 @@ MEDIA = {
 }
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("name", small.cases(MEDIA, ["equal", "ref, own"]))
 def test_the_same_picture_as_volpath(name):
     parts = MEDIA[name]() | {"sky": sky(0.3), "bulb": point([1.6, -1.3, 1.7], 4.0)[0]}
@@ -61,6 +64,7 @@ def test_each_coefficient_stands_under_its_own_name():
     assert [p.name for p in view_medium(interior).parts] == ["sigma_a", "sigma_s"]
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("name", ["ref", "sigma_a and sigma_s"])
 def test_the_derivative_is_the_sum_of_both(name):
     """Reverse and forward, against central differences of pictures without noise (the same rays, a point light)."""
@@ -71,10 +75,10 @@ def test_the_derivative_is_the_sum_of_both(name):
     def picture(h: float, seed: int) -> float:
         params["both.data"] = mi.TensorXf((base + h * w).astype(np.float32))
         params.update()
-        image = mi.render(scene, integrator=mi.load_dict(mivol(deterministic=True)), spp=64, seed=seed)
+        image = mi.render(scene, integrator=mi.load_dict(mivol(deterministic=True)), spp=64, seed=fresh(seed))
         return float(np.array(image).mean(dtype=np.float64))
 
-    slopes = [(picture(0.04, s) - picture(0.0, s)) / 0.04 for s in range(8)]
+    slopes = [(picture(0.04, s) - picture(0.0, s)) / 0.04 for s in map(fresh, range(8))]
     base = (base + 0.02 * w).astype(np.float32)  # voxels may not be below 0: the middle of the difference
     drawn = {"reverse": [], "forward": []}
     for seed in range(16):
@@ -84,19 +88,20 @@ def test_the_derivative_is_the_sum_of_both(name):
             dr.set_grad(variable, mi.TensorXf(w) if mode == "forward" else 0)
             params["both.data"] = variable
             params.update()
-            image = mi.render(scene, params, integrator=mi.load_dict(mivol()), spp=64, seed=seed)
+            image = mi.render(scene, params, integrator=mi.load_dict(mivol()), spp=64, seed=fresh(seed))
             if mode == "forward":
                 found.append(float(np.array(dr.forward_to(image)).mean(dtype=np.float64)))
             else:
                 dr.backward(dr.mean(image, axis=None))
                 found.append(float((np.array(dr.grad(variable), dtype=np.float64) * w).sum()))
-    slope = np.mean(slopes)
+    slopes = Moments.of(np.array(slopes))
+    slope = abs(float(slopes.mean))
     for mode, found in drawn.items():
-        error = np.hypot(np.std(found, ddof=1) / 4, np.std(slopes, ddof=1) / np.sqrt(8))
-        assert error < 0.02 * abs(slope), mode
-        # Student's t of at least 7 degrees of freedom, 1e-6: 14.1. A step of h = 0.02 either way in an extinction that is
+        found = Moments.of(np.array(found))
+        assert_precise(difference(found, slopes), 0.02 * slope, what=mode)
+        # A step of h = 0.02 either way in an extinction that is
         # 0.3 on average changes the slope by less than h^2 / 6 times its second derivative, (2 optical lengths)^2: 3e-4.
-        assert abs(np.mean(found) - slope) < 14.1 * error + 3e-4 * abs(slope), mode
+        assert_same_mean(found, slopes, rounding=3e-4 * slope, what=mode)
 
 
 def test_a_reference_knows_the_shared_extinction(tmp_path):

@@ -11,9 +11,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from false_alarms import assert_precise, assert_same_mean
 from scattering_scenes import mivol, pencils, sun
 
-from mivol.validate.statistics import assert_same_mean
 from scenes import affine, box_of, grid_volume, medium
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
@@ -56,13 +56,13 @@ def test_quadrature(name, sigma, away):
     assert np.abs(found / TRUTH - 1).max() <= 1e-4
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("beside", [False, True], ids=["alone", "beside another"])
 @pytest.mark.parametrize("name", PARTS)
 def test_drawn_light(name, beside):
     m = half_space(name, 1e6, 300.7, beside).moments(mivol(), 1024)
-    error = np.sqrt(m.variance_of_mean).max() / TRUTH
-    assert error < 0.02
-    assert_same_mean(m.mean, m.variance_of_mean, np.full_like(m.mean, TRUTH), n_a=m.n, rounding=1e-5 * TRUTH, what="rays")
+    assert_precise(m, 0.02 * TRUTH, what="rays")
+    assert_same_mean(m, TRUTH, rounding=1e-5 * TRUTH, what="rays")
 
 
 @pytest.mark.parametrize("name", ["homogeneous", "grid"])
@@ -87,6 +87,7 @@ THIN = 2.0**-20
 """Thickness of a sheet whose extinction is the inverse: optical depth 1. Seen from 30, it is half a step of float32 thick."""
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("away", [0.5, 30.7])
 def test_thin_sheets(away):
     """Emission, and scattered light, of a sheet of optical depth 1: its length is a difference of distances."""
@@ -102,4 +103,4 @@ def test_thin_sheets(away):
     seen = np.array(mi.render(fog.scene, integrator=mi.load_dict(mivol(deterministic=True)), spp=1))
     assert np.abs(seen / truth - 1).max() <= 1e-4
     m = fog.moments(mivol(), 1024)
-    assert_same_mean(m.mean, m.variance_of_mean, np.full_like(m.mean, truth), n_a=m.n, rounding=1e-5 * truth, what="rays")
+    assert_same_mean(m, truth, rounding=1e-5 * truth, what="rays")

@@ -10,6 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from false_alarms import assert_precise, assert_same_mean, fresh
 from fit_scene import KEY, absorbing_scene, camera, film, frontal, small_problem
 
 from mivol.errors import MivolError
@@ -30,6 +31,7 @@ from mivol.optim.rmsprop import RMSprop
 from mivol.optim.scene_problem import SceneProblem, views_of
 from mivol.optim.schedules import Cosine
 from mivol.optim.seeds import seed_of
+from mivol.validate.statistics import Moments
 
 EPS = float(np.finfo(np.float32).eps)
 
@@ -203,6 +205,7 @@ def test_passes_sum_to_the_samples(variant_rgb) -> None:
     assert max(problem.passes(sensor, 10)) - min(problem.passes(sensor, 10)) <= 1
 
 
+@pytest.mark.statistical
 def test_a_nonlinear_loss_does_not_see_the_passes(variant_rgb) -> None:
     """Parallel rays through a constant cube: each sample is exp(-2 sigma), so loss and gradient are known whatever the
     passes. A loss taken pass by pass would be the same here for any noise-free image; so noise is put in by cameras at
@@ -221,10 +224,10 @@ def test_a_nonlinear_loss_does_not_see_the_passes(variant_rgb) -> None:
     for most in (1 << 20, 3 * 64):
         problem = small_problem(spp=4, samples_per_pass=most, loss=Huber(delta=0.02))
         problem.set(problem.start())
-        coverage.append([problem.mean_loss(i) for i in range(6)])
-    spread = np.std(coverage, axis=1).max()
+        coverage.append(Moments.of(np.array([problem.mean_loss(fresh(i)) for i in range(24)])))
     # One pass of 4 samples and 4 passes of one: a mean of losses of single passes would be about 4 times as large.
-    assert abs(np.mean(coverage[0]) - np.mean(coverage[1])) <= 6 * spread / np.sqrt(6)
+    assert_same_mean(*coverage, what="losses")
+    assert_precise(coverage[0], 0.1 * float(coverage[0].mean), what="losses")
 
 
 def test_views_side_by_side_are_the_views(variant_rgb) -> None:

@@ -9,7 +9,9 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 import pytest
+from false_alarms import assert_precise, assert_same_mean, assert_same_variance, assert_within, fresh, note
 from fit_scene import KEY, absorbing_scene, frontal, small_problem
+from scipy import stats
 
 from mivol import config
 from mivol.cli.progress import Display
@@ -24,10 +26,15 @@ from mivol.optim.packing import Packing
 from mivol.optim.parameters import Parameter
 from mivol.optim.render_batches import View
 from mivol.optim.scene_problem import SceneProblem
+from mivol.validate.statistics import Moments
 
 SIGMA, SEEN, SPP = 0.4, 0.6, 8
 T = math.exp(-2 * SIGMA)
 """Transmittance of the constant cube along the frontal camera's rays; ``SEEN`` is its reference."""
+
+
+SIX = 2e-9
+"""Chance of 6 standard errors of a normal mean, either way."""
 
 
 def tensor(a: np.ndarray) -> mi.TensorXf:
@@ -36,28 +43,29 @@ def tensor(a: np.ndarray) -> mi.TensorXf:
 
 def noisy_halves(n: int, mean: float, s: float, shares: tuple[float, ...], seed: int = 0) -> list[mi.TensorXf]:
     """Images of n pixels whose weighted mean has Gaussian noise s."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(fresh(seed))
     return [tensor(rng.normal(mean, s / math.sqrt(share), n)) for share in shares]
 
 
 # -- The estimator ------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("shares", [(0.5, 0.5), (0.6, 0.4)], ids=["equal", "unequal"])
 @pytest.mark.parametrize("name", ["l2", "relative_l2"])
 def test_pairs_take_the_noise_out_of_a_squared_loss(variant_rgb, name: str, shares: tuple[float, ...]) -> None:
-    """W/2 (r^2 + s^2) plainly and W/2 r^2 with pairs; the standard errors are those of the docstring, 6 of them allowed
-    (1e-9 a check). Unequal shares w1 w2 make the variance of b 2 s^4 as well, for b = w1 w2 (I1 - I2)^2."""
+    """W/2 (r^2 + s^2) plainly and W/2 r^2 with pairs; the standard errors are those of the docstring, 6 of them allowed.
+    Unequal shares w1 w2 make the variance of b 2 s^4 as well, for b = w1 w2 (I1 - I2)^2."""
     n, r, s, reference = 40_000, 0.02, 0.05, 0.5
     halves, seen = noisy_halves(n, reference + r, s, shares), tensor(np.full(n, reference))
     w = {"l2": 1.0, "relative_l2": 1 / (reference**2 + 1e-4)}[name]
     plain = compare(LOSSES[name](), halves, shares, seen)
     pairs = compare(LOSSES[name](pairs=True), halves, shares, seen)
     error = [w * math.sqrt((4 * r**2 * s**2 + k * s**4) / n) for k in (2, 4)]
-    assert abs(plain.loss - w * (r**2 + s**2)) <= 6 * error[0]
-    assert abs(pairs.loss - w * r**2) <= 6 * error[1]
+    assert_within(plain.loss - w * (r**2 + s**2), 6 * error[0], chance=SIX, what="losses")
+    assert_within(pairs.loss - w * r**2, 6 * error[1], chance=SIX, what="losses of pairs")
     assert w * s**2 > 50 * error[1], "the bias is what is tested for: it must stand out"
-    assert abs(plain.noise - w * s**2) <= 6 * w * math.sqrt(2 * s**4 / n)
+    assert_within(plain.noise - w * s**2, 6 * w * math.sqrt(2 * s**4 / n), chance=SIX, what="noise")
     # Carried back by samples of its own, the plain gradient is unbiased already: 2 W/2 (mean - R) / n, to rounding.
     expected = 2 * w / n * (sum(np.asarray(h) * share for h, share in zip(halves, shares, strict=True)) - reference)
     for found in (plain, pairs):
@@ -72,19 +80,22 @@ def test_two_halves_give_their_product(variant_rgb) -> None:
         assert abs(found - (a - r) * (b - r)) <= 16 * 6e-8 * 4
 
 
+@pytest.mark.statistical
 def test_variance_is_as_said(variant_rgb) -> None:
-    """Without a residual 2 s^4 plainly and 4 s^4 with pairs, from 300 images of 64 pixels: a sample variance of 300 nearly
-    normal means errs by sqrt(2 / 300) = 8 %, and 5 of these are allowed."""
+    """Without a residual 2 s^4 plainly and 4 s^4 with pairs, from 300 images of 64 pixels: means of 64 squares (of excess
+    kurtosis 12) or products (6) of normal numbers, s^2 and 0 in the mean."""
     s, trials, n = 0.1, 300, 64
     seen = tensor(np.full(n, 0.5))
     values = []
     for trial in range(trials):
         halves = noisy_halves(n, 0.5, s, (0.5, 0.5), trial)
         values.append([compare(L2(pairs=pairs), halves, (0.5, 0.5), seen).loss for pairs in (False, True)])
-    found = np.var(values, axis=0, ddof=1) * n / s**4
-    assert np.all(np.abs(found / [2, 4] - 1) <= 5 * math.sqrt(2 / trials))
+    plain, pairs = np.transpose(values)
+    assert_same_variance(plain, 2 * s**4 / n, mean=s**2, excess=12 / n, what="losses")
+    assert_same_variance(pairs, 4 * s**4 / n, mean=0.0, excess=6 / n, what="losses of pairs")
 
 
+@pytest.mark.statistical
 def test_pairs_leave_the_next_order_of_a_smooth_loss(variant_rgb) -> None:
     """log^2(1 + x) = x^2 - x^3 + 11/12 x^4 - 5/6 x^5 + 137/180 x^6 ...: for noise s its mean is s^2 + 2.75 s^4 + 11.4 s^6;
     halves have the variance 2 s^2, so that 2 f(mean) - f(halves) leaves (2 - 4) 2.75 s^4 + (2 - 8) 11.4 s^6 = -6.2e-4 of
@@ -95,10 +106,11 @@ def test_pairs_leave_the_next_order_of_a_smooth_loss(variant_rgb) -> None:
     plain = compare(Log(), halves, (0.5, 0.5), seen).loss / weight
     pairs = compare(Log(pairs=True), halves, (0.5, 0.5), seen).loss / weight
     error = math.sqrt(4 * s**4 / n)
-    assert abs(plain - (s**2 + 2.75 * s**4 + 11.4 * s**6)) <= 6 * error + 70 * s**8
-    assert abs(pairs - (-5.5 * s**4 - 68.5 * s**6)) <= 6 * error + 960 * s**8
+    assert_within(plain - (s**2 + 2.75 * s**4 + 11.4 * s**6), 6 * error + 70 * s**8, chance=SIX, what="losses")
+    assert_within(pairs - (-5.5 * s**4 - 68.5 * s**6), 6 * error + 960 * s**8, chance=SIX, what="losses of pairs")
 
 
+@pytest.mark.statistical
 def test_pairs_at_the_kink_of_l1(variant_rgb) -> None:
     """E|N(0, s)| = sqrt(2 / pi) s = 0.798 s, and of halves sqrt(2) of that: pairs leave 2 - sqrt(2) = 0.59 of it."""
     n, s = 100_000, 0.1
@@ -106,8 +118,8 @@ def test_pairs_at_the_kink_of_l1(variant_rgb) -> None:
     mean = math.sqrt(2 / math.pi) * s
     plain, pairs = (compare(L1(pairs=on), halves, (0.5, 0.5), seen).loss for on in (False, True))
     # |N| has the standard deviation 0.6 s, and three such numbers enter with weights 2, 1/2, 1/2: below 2 s.
-    assert abs(plain - mean) <= 6 * s / math.sqrt(n)
-    assert abs(pairs - (2 - math.sqrt(2)) * mean) <= 6 * 2 * s / math.sqrt(n)
+    assert_within(plain - mean, 6 * s / math.sqrt(n), chance=SIX, what="losses")
+    assert_within(pairs - (2 - math.sqrt(2)) * mean, 6 * 2 * s / math.sqrt(n), chance=SIX, what="losses of pairs")
 
 
 @pytest.mark.parametrize("name", LOSSES)
@@ -133,39 +145,38 @@ def test_one_exact_render_has_no_noise(variant_rgb) -> None:
 # -- Through Mitsuba ----------------------------------------------------------------------------------------------
 
 
-def cube_problem(integrator: str = "prbvolpath", **settings: object) -> SceneProblem:
+def cube_problem(integrator: str = "prbvolpath", size: int = 8, **settings: object) -> SceneProblem:
     """A constant cube seen by parallel rays. Delta tracking (``prbvolpath``, albedo 0) sees the sky or nothing: a pixel's
     mean of n samples has the expectation T and the variance T (1 - T) / n; mivol's is T."""
     scene = absorbing_scene(np.full((2, 2, 2, 1), SIGMA))
-    view = View("face", frontal(8), mi.TensorXf(np.full((8, 8, 3), SEEN, "f")))
+    view = View("face", frontal(size), mi.TensorXf(np.full((size, size, 3), SEEN, "f")))
     tracer = mi.load_dict({"type": integrator, "max_depth": 2})
-    chosen = {"spp": SPP, "integrator": tracer} | settings
+    chosen = {"spp": SPP, "integrator": tracer, "seed": fresh(0)} | settings
     return SceneProblem(scene, [view], [Parameter(KEY, domain=(0.0, np.inf), lr=1e-3)], **chosen)
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("pairs", [False, True], ids=["plain", "pairs"])
 def test_the_renderers_noise_in_the_loss(variant_rgb, pairs: bool) -> None:
     """Rationale: what a fit reports as its loss is the mismatch plus T (1 - T) / n, here as large as the mismatch.
-    Expected: the mean of 60 losses is (T - R)^2 plus that, and with pairs without it, within 5 standard errors of the 60
-    (Student's t, 59 degrees: chance 6e-6)."""
+    Expected: the mean of 60 losses is (T - R)^2 plus that, and with pairs without it."""
     problem = cube_problem(loss=L2(pairs=pairs))
     problem.set(problem.start())
-    losses = [problem.mean_loss(i) for i in range(60)]
-    error = np.std(losses, ddof=1) / math.sqrt(len(losses))
+    losses = Moments.of(np.array([problem.mean_loss(i) for i in range(60)]))
     bias = T * (1 - T) / SPP
-    assert bias > 20 * error
-    assert abs(np.mean(losses) - (T - SEEN) ** 2 - (0 if pairs else bias)) <= 5 * error
+    assert_precise(losses, bias / 20, what="losses")
+    assert_same_mean(losses, (T - SEEN) ** 2 + (0 if pairs else bias), what="losses")
 
 
+@pytest.mark.statistical
 def test_the_measured_noise_is_the_variance(variant_rgb) -> None:
-    """Its mean over 60 iterations is T (1 - T) / n within 5 standard errors."""
+    """Its mean over 60 iterations is T (1 - T) / n."""
     problem = cube_problem()
     found = []
     for i in range(60):
         problem.loss_and_gradient(problem.start(), i)
         found.append(problem.newest_loss[1])
-    error = np.std(found, ddof=1) / math.sqrt(len(found))
-    assert abs(np.mean(found) - T * (1 - T) / SPP) <= 5 * error
+    assert_same_mean(Moments.of(np.array(found)), T * (1 - T) / SPP, what="noise")
 
 
 def test_exact_renders_do_not_pay(variant_rgb) -> None:
@@ -240,21 +251,23 @@ def test_who_is_noisy(variant_rgb) -> None:
 # -- What is said -------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.statistical
 def test_said_once_with_its_size(variant_rgb, tmp_path: Path, capsys) -> None:
-    """At (T - R)^2 = 0.0227 and T (1 - T) / 8 = 0.031 the noise is 58 % of the loss; the noise of one iteration's estimate
-    (64 pixels, sqrt(2 / 64) = 18 % of 0.031, and as much of the loss) leaves 40 to 75 %."""
+    """At (T - R)^2 = 0.0227 and T (1 - T) / 8 = 0.031 the noise is 58 % of the loss; both are means over 4096 pixels in one
+    iteration: sqrt(2 / 4096) = 2.2 % of the noise, 3 % of the loss, so 8 of their standard errors leave 40 to 75 %."""
     path = tmp_path / "checkpoint.npz"
     with Display(3) as display:
-        fit = reconstruct(cube_problem(), Adam(), 3, store=Store(path, {}), observer=display)
+        fit = reconstruct(cube_problem(size=64), Adam(), 3, store=Store(path, {}), observer=display)
     fit.save()
     (line,) = fit.log
     assert line.startswith("iteration 0: the render's noise makes up 0.0")
     share = int(line.partition("%")[0].split()[-1])
+    note(2 * stats.norm.sf(8), "share of noise")
     assert 40 <= share <= 75
     assert "its gradient is not biased" in line
     assert "loss.pairs = true" in line
     assert capsys.readouterr().err.count("loss.pairs = true") == 1
-    assert reconstruct(cube_problem(), Adam(), 5, store=Store(path, {}, resume=True)).log == [line]
+    assert reconstruct(cube_problem(size=64), Adam(), 5, store=Store(path, {}, resume=True)).log == [line]
 
 
 def test_nothing_is_said_of_exact_renders_and_of_pairs(variant_rgb) -> None:
