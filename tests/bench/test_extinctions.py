@@ -22,8 +22,10 @@ from mivol.bench.extinctions import (
 
 
 def test_volumes_without_data(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, variant_rgb: str) -> None:
-    """Made-up ones of the same sizes, which say so."""
+    """Made-up ones of the same sizes, which say so; what they are made of is the procedural fields' own test."""
     monkeypatch.setattr(extinctions, "DATA", tmp_path)
+    constant = lambda kind, shape, seed, peak: np.full((*shape, 1), peak, np.float32)  # noqa: E731
+    monkeypatch.setattr(extinctions, "make_procedural", constant)
     assert str(smoke()) == "44x45x53, procedural (no data folder)"
     assert str(les_cloud()) == "32x37x26, procedural (no data folder)"
     found = ct_scan(8)

@@ -87,6 +87,7 @@ def test_every_fit_of_the_bench(monkeypatch):
     assert asked == [(12, 0, {}), (12, 0, bench.NO_TV), (12, 2, {}), (6, 2, bench.NO_TV), (6, 2, {})]
 
 
+@pytest.mark.slow
 def test_a_fit_is_judged_by_held_out_views(variant_rgb, tmp_path):
     """A few steps see that something stands in front of white; its figure is drawn."""
     size = replace(TINY, folder=tmp_path / "photographs")
