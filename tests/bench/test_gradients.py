@@ -52,6 +52,7 @@ def test_budgets_are_kept(variant_rgb: str) -> None:
     assert len({seed for _, seed, _ in calls}) == len(calls) == 6
 
 
+@pytest.mark.slow
 def test_density_0_tells_a_biased_estimator_from_ours(variant_rgb: str) -> None:
     """Where the density is 0 free flights never stop, and their derivative is exactly 0. Ours is known to 5 %, and its
     seeds are fixed: a miss of the bound by chance would have been seen when they were chosen."""
