@@ -20,7 +20,9 @@ from pathlib import Path
 
 import mivol
 from mivol.files import ProjectionData, read_projections, whole_file, write_whole_text
-from mivol.optim.solvers import SOLVERS, LeastSquares, SmoothedTV
+from mivol.optim.linear_problems import LeastSquares
+from mivol.optim.smoothed_tv import SmoothedTV
+from mivol.optim.solvers import SOLVERS
 from mivol.tomography.geometry import ParallelBeam, VoxelGrid
 from mivol.tomography.preprocess import (
     Axis,

@@ -34,7 +34,9 @@ from mivol.bench.figures import drawn
 from mivol.bench.timing import Stopwatch
 from mivol.errors import MivolError
 from mivol.files import read_volume, write_whole_text
-from mivol.optim.solvers import SOLVERS, LeastSquares, SmoothedTV
+from mivol.optim.linear_problems import LeastSquares
+from mivol.optim.smoothed_tv import SmoothedTV
+from mivol.optim.solvers import SOLVERS
 from mivol.tomography.geometry import ConeBeam, VoxelGrid, cone_beam_of_tigre
 from mivol.tomography.phantoms import SHEPP_LOGAN, shepp_logan
 from mivol.tomography.projector import Projector

@@ -21,8 +21,11 @@ from mivol.optim.checkpoint import Store
 from mivol.optim.course import Course
 from mivol.optim.events import Checkpoint
 from mivol.optim.inversion import Inversion, Solve
+from mivol.optim.linear_problems import LeastSquares, PoissonCounts
 from mivol.optim.loop import Fit, begin_fit
-from mivol.optim.solvers import SOLVERS, LeastSquares, PoissonCounts, SmoothedTV, State
+from mivol.optim.smoothed_tv import SmoothedTV
+from mivol.optim.solver import State
+from mivol.optim.solvers import SOLVERS
 from mivol.report.page import write_page
 from mivol.report.record import Choice, RunRecord
 from mivol.tomography.geometry import VoxelGrid

@@ -13,9 +13,11 @@ from typing import Annotated
 import numpy as np
 
 from mivol.errors import MivolError
+from mivol.optim.linear_problems import LeastSquares, PoissonCounts
 from mivol.optim.optimiser import Optimiser, Run
 from mivol.optim.problem import Reals
-from mivol.optim.solvers import SOLVERS, LeastSquares, PoissonCounts, State
+from mivol.optim.solver import State
+from mivol.optim.solvers import SOLVERS
 from mivol.optim.strategy import of
 
 KEY = "x"

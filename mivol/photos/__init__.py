@@ -7,6 +7,7 @@ sees, :func:`project` where a point lies in the image.
 from __future__ import annotations
 
 from mivol.photos.camera import Camera, directions, intrinsics, pixel_centres, project, rays
+from mivol.photos.camera_path import between, facing, turntable
 from mivol.photos.dataset import (
     BACKGROUNDS,
     FORMATS,
@@ -19,7 +20,6 @@ from mivol.photos.dataset import (
     load_photos,
     survey_photos,
 )
-from mivol.photos.journey import between, facing, turntable
 from mivol.photos.lens import Lens, distort, undistort
 from mivol.photos.rectify import pinhole_of, rectified
 from mivol.photos.silhouette import silhouette_box

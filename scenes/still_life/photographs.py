@@ -19,7 +19,7 @@ import mivol  # noqa: F401  (chooses the LLVM library; call it before the first 
 from mivol.files import write_png, write_whole_text
 from mivol.files.mesh import Mesh, write_mesh
 from mivol.photos import Camera, intrinsics
-from mivol.photos.journey import facing
+from mivol.photos.camera_path import facing
 from mivol.photos.transforms import write_transforms
 from mivol.scene.load import content_hash
 from mivol.scene.photographs import sensor_of

@@ -23,7 +23,7 @@ from mivol.optim.problem import Reals
 from mivol.optim.radiance_plan import PRESETS, FitPlan, Stage
 from mivol.optim.radiance_problem import RadianceProblem
 from mivol.photos import Camera, intrinsics
-from mivol.photos.journey import facing
+from mivol.photos.camera_path import facing
 from mivol.photos.picture import decode_srgb
 from mivol.photos.transforms import write_transforms
 from mivol.validate.images import judge

@@ -13,7 +13,10 @@ import scipy.sparse
 import scipy.sparse.linalg
 
 from mivol.errors import MivolError
-from mivol.optim.solvers import SOLVERS, LeastSquares, PoissonCounts, SmoothedTV, State
+from mivol.optim.linear_problems import LeastSquares, PoissonCounts
+from mivol.optim.smoothed_tv import SmoothedTV
+from mivol.optim.solver import State
+from mivol.optim.solvers import SOLVERS
 from mivol.tomography.geometry import ParallelBeam, VoxelGrid
 from mivol.tomography.phantoms import shepp_logan
 

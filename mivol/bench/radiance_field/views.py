@@ -11,7 +11,7 @@ import numpy as np
 from mivol.fields.spherical import SphericalGrid
 from mivol.optim.field_view import render_view
 from mivol.photos import Camera, Photo, intrinsics, pixel_centres, rays
-from mivol.photos.journey import facing
+from mivol.photos.camera_path import facing
 from mivol.transport.line_integrals.radiance_field import RayBundle
 
 __all__ = ["BOX", "between", "camera", "photographed", "rays_of", "rays_through", "ring", "tiled"]

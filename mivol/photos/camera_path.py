@@ -1,6 +1,6 @@
 """Cameras for a film of what was photographed: around it, or from view to view.
 
-Conventions. Every camera of a journey is a pinhole like the first of those given (its size and focal length, without
+Conventions. Every camera of a path is a pinhole like the first of those given (its size and focal length, without
 distortion, its axis through the middle of the image). A turntable keeps the photographs' mean distance and elevation.
 """
 

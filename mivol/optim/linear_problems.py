@@ -1,0 +1,133 @@
+"""Problems of line integrals: least squares, and the likelihood of counts, each with a penalty where one is wanted.
+
+Conventions. The operator A maps voxels (n,) to rays (m,), both flat; ``A.shape`` is (m, n). ``b`` are line integrals
+(dimensionless), ``weights`` their inverse variances (0: the ray is not used), x the field (1/length). Vectors keep the
+operator's dtype, sums are float64 and are formed in a fixed order, so a run is bitwise repeatable where the operator is.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+
+from mivol.errors import MivolError
+
+
+class Penalty(Protocol):
+    """A convex penalty with a quadratic majoriser that touches it at x."""
+
+    def value(self, x: np.ndarray) -> float: ...
+    def gradient(self, x: np.ndarray) -> np.ndarray: ...
+    def curvature(self, x: np.ndarray, p: np.ndarray) -> float:
+        """Second derivative along ``p`` of the majoriser at ``x``."""
+
+    def separable(self, x: np.ndarray) -> np.ndarray:
+        """Diagonal of a separable quadratic that majorises the majoriser."""
+
+
+@dataclass(frozen=True, eq=False)
+class LeastSquares:
+    """Minimise ``1/2 |W^(1/2) (A x - b)|^2 + prior(x)``, over ``x >= 0`` where ``nonnegative``.
+
+    Args:
+        A: linear operator (m, n).
+        b: (m,) line integrals, of any shape with m entries.
+        weights: inverse variances of ``b``, or None for all 1.
+        x0: start, or None for 0.
+        nonnegative: keep every voxel at or above 0.
+        prior: optional penalty.
+    """
+
+    A: Any
+    b: np.ndarray
+    weights: np.ndarray | None = None
+    x0: np.ndarray | None = None
+    nonnegative: bool = False
+    prior: Penalty | None = None
+
+    def __post_init__(self) -> None:
+        check_sizes(self.A, self.x0, b=self.b, weights=self.weights)
+        if self.weights is not None and np.min(self.weights) < 0:
+            raise MivolError("Found a negative weight, expected inverse variances (0 for rays that are not to be used).")
+
+
+@dataclass(frozen=True, eq=False)
+class PoissonCounts:
+    """Maximise the likelihood of ``counts ~ Poisson(blank exp(-A x) + background)`` over ``x >= 0``, less a prior.
+
+    Args:
+        A: linear operator (m, n) with entries >= 0.
+        counts: (m,) numbers of quanta; a detector's reading divided by its gain.
+        blank: quanta without an object, one number or (m,).
+        background: expected quanta that are not the object's (dark, scatter), one number or (m,).
+        x0: start, >= 0, or None for 0.
+        prior: optional penalty.
+    """
+
+    A: Any
+    counts: np.ndarray
+    blank: np.ndarray | float
+    background: np.ndarray | float = 0.0
+    x0: np.ndarray | None = None
+    prior: Penalty | None = None
+
+    def __post_init__(self) -> None:
+        check_sizes(self.A, self.x0, counts=self.counts)
+        if np.min(self.counts) < 0 or np.min(self.blank) <= 0 or np.min(self.background) < 0:
+            raise MivolError("Found negative counts or background or a blank of 0, expected counts >= 0 and a blank above 0.")
+
+
+def check_sizes(a: Any, x0: np.ndarray | None, **data: np.ndarray | None) -> None:
+    """Refuse data that do not fit an operator.
+
+    Raises:
+        MivolError: another number of values than rays or voxels, or a value that is not finite.
+    """
+    m, n = a.shape
+    for name, value in data.items():
+        if value is None:
+            continue
+        if np.size(value) != m:
+            raise MivolError(f"Found {np.size(value)} values in '{name}', expected {m}, one for each ray of the operator.")
+        if not np.isfinite(value).all():
+            raise MivolError(
+                f"Found a value that is not finite in '{name}' at flat index {int(np.argmin(np.isfinite(value)))}, "
+                "expected finite numbers: give unusable rays a weight of 0 and any value."
+            )
+    if x0 is not None and (np.size(x0) != n or not np.isfinite(x0).all()):
+        raise MivolError(
+            f"Found a start of {np.size(x0)} values, expected {n} finite ones, one for each voxel of the operator."
+        )
+
+
+def flat(a: np.ndarray, dtype: Any) -> np.ndarray:
+    """A vector of any array."""
+    return np.asarray(a, dtype).reshape(-1)
+
+
+def first_field(a: Any, x0: np.ndarray | None) -> np.ndarray:
+    """A copy of the start, or 0."""
+    return np.zeros(a.shape[1], a.dtype) if x0 is None else flat(x0, a.dtype).copy()
+
+
+def weights_of(problem: LeastSquares) -> np.ndarray | None:
+    """Weights of rays (m,), or None for all 1."""
+    return None if problem.weights is None else flat(problem.weights, problem.A.dtype)
+
+
+def times(weights: np.ndarray | None, v: np.ndarray) -> np.ndarray:
+    """Weights times a vector of rays."""
+    return v if weights is None else weights * v
+
+
+def dot(a: np.ndarray, b: np.ndarray) -> float:
+    """Sum in float64 in a fixed order (BLAS promises neither)."""
+    return float(np.sum(a * b, dtype=np.float64))
+
+
+def inverse(v: np.ndarray) -> np.ndarray:
+    """1 / v, and 0 where v is below 1e-6 of the largest: such rays and voxels are only grazed, and are left alone."""
+    floor = 1e-6 * float(np.max(v, initial=0.0))
+    return np.where(v > floor, 1.0 / np.where(v > floor, v, 1.0), 0.0).astype(v.dtype)
