@@ -110,7 +110,7 @@ def noise_check(integrator: mi.Integrator, scene: mi.Scene) -> Callable[[], bool
     session = getattr(integrator, "session", None)
     if not isinstance(session, Session):
         return lambda: True
-    if session.settings.max_depth in (0, 1):
+    if session.settings.scatterings == 0:
         return lambda: False
     survey = survey_scene(scene)
     if survey.surfaces:

@@ -56,7 +56,7 @@ def build_estimators(
             choice.visibility_cache = _find_visibility(direct, needs, plan, survey, pictures)
             if settings.shadows == "grid":
                 choice.transmittance_grid = build_transmittance_grid(media, direct.emitters)
-    lights_surfaces = bool(needs.surfaces) and settings.max_depth not in (0, 1)
+    lights_surfaces = bool(needs.surfaces) and settings.scatterings >= 1
     return Estimators(direct, SEGMENT_ESTIMATORS[plan.segment].make(choice), lights_surfaces)
 
 

@@ -59,7 +59,7 @@ def shares_cells(needs: Needs) -> bool:
 
 def is_lit(needs: Needs, settings: Settings) -> bool:
     """Whether media scatter light to the camera."""
-    return settings.max_depth == 2 and any(m.is_scattering for m in needs.media)
+    return settings.scatterings >= 1 and any(m.is_scattering for m in needs.media)
 
 
 def choose_transport(needs: Needs, settings: Settings) -> Choice:

@@ -26,6 +26,7 @@ from mivol.scene.choices import (
 from mivol.scene.facts import Needs
 from mivol.scene.refusals import refuse_emission, refuse_places, refuse_quadrature, refuse_refraction, refuse_scattering
 from mivol.transport.media.grid_integral import PACKED_LIMIT, gradient_bytes
+from mivol.transport.path.estimators import SegmentQuestion, choose_segment_estimator
 from mivol.transport.path.settings import Settings
 
 __all__ = ["Plan", "make_plan"]
@@ -94,12 +95,10 @@ def make_plan(needs: Needs, settings: Settings) -> Plan:
 
 
 def _segment(needs: Needs, settings: Settings) -> str:
-    """Name of the estimator of what media add along a segment."""
-    if any(m.emits for m in needs.media):
-        return "emission"
-    if not needs.lamps or not is_lit(needs, settings):
-        return "absorption"
-    return "scattering_quadrature" if settings.deterministic else "single_scattering"
+    """Name of the estimator of what media add along a segment; what no estimator answers has been refused."""
+    scatters = bool(needs.lamps) and is_lit(needs, settings)
+    emits = any(m.emits for m in needs.media)
+    return choose_segment_estimator(SegmentQuestion(scatters, emits, settings.deterministic))
 
 
 def _pass_rays(needs: Needs) -> int:

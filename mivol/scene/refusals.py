@@ -13,6 +13,7 @@ from mivol.scene.facts import Needs
 from mivol.transport.line_integrals.aovs import AOVS
 from mivol.transport.media.medium_view import MediumView
 from mivol.transport.media.summed_extinction import share_cells
+from mivol.transport.path.estimators import MOST_SCATTERINGS
 from mivol.transport.path.settings import Settings
 
 __all__ = ["check_aovs", "refuse_emission", "refuse_places", "refuse_quadrature", "refuse_refraction", "refuse_scattering"]
@@ -40,7 +41,7 @@ def check_aovs(names: str) -> tuple[str, ...]:
 
 def refuse_scattering(needs: Needs, settings: Settings) -> None:
     for medium in needs.media:
-        if medium.is_scattering and not medium.unread and settings.max_depth not in (0, 1, 2):
+        if medium.is_scattering and not medium.unread and settings.scatterings > MOST_SCATTERINGS:
             raise MivolError(
                 f"the medium in {medium.name} scatters (its albedo is above 0) and max_depth is {settings.max_depth}; mivol "
                 "renders one scattering so far: set max_depth to 2, to 1 (what is seen through the medium), or the albedo to 0."
@@ -48,7 +49,7 @@ def refuse_scattering(needs: Needs, settings: Settings) -> None:
 
 
 def refuse_refraction(needs: Needs, settings: Settings) -> None:
-    if needs.refractive and settings.max_depth == 2 and any(m.is_scattering for m in needs.media):
+    if needs.refractive and is_lit(needs, settings):
         raise MivolError(
             f"the boundary {needs.refractive[0]} refracts and its scene has a medium that scatters; no straight shadow ray "
             "reaches a lamp through it: make the boundary's BSDF null, set max_depth to 1, or the albedo to 0."

@@ -32,7 +32,7 @@ from mivol.transport.estimators.contribution import TrackedTerm
 from mivol.transport.estimators.distance_reservoir import lit_length
 from mivol.transport.estimators.equiangular import EquiangularSampler, equiangular_sampler
 from mivol.transport.estimators.event_samples import EventSamples
-from mivol.transport.estimators.segment import PICTURE, PathSegment, SegmentEstimate, Transmittance
+from mivol.transport.estimators.segment import PICTURE, Absorption, PathSegment, SegmentEstimate, Transmittance
 from mivol.transport.estimators.shadow_rays import DARK, shadow_ray
 from mivol.transport.estimators.single_scattering import SingleScattering
 from mivol.transport.estimators.transmittance_grid import TransmittanceGrid
@@ -91,9 +91,12 @@ class ScatteringQuadrature:
     def draw(self, sampler: mi.Sampler, active: mi.Bool, strata: Strata | None) -> EventSamples:
         return self.drawn.draw(sampler, active, strata)
 
-    def find_controls(self, ray: mi.Ray3f) -> None:
+    def prepare_derivatives(self, ray: mi.Ray3f) -> None:
         """Find a control variate for derivatives along camera rays, once."""
-        self.drawn.find_controls(ray)
+        self.drawn.prepare_derivatives(ray)
+
+    def replayed(self) -> Absorption:
+        return Absorption(self.media, drawn_by=self.drawn)
 
     def estimate(self, segment: PathSegment, purpose: str, active: mi.Bool) -> SegmentEstimate:
         if purpose != PICTURE:

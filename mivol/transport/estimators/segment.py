@@ -84,6 +84,12 @@ class SegmentEstimator(Protocol):
     def estimate(self, segment: PathSegment, purpose: str, active: mi.Bool) -> SegmentEstimate:
         """Follow a segment to its end, for PICTURE, REVERSE or FORWARD."""
 
+    def prepare_derivatives(self, ray: mi.Ray3f) -> None:
+        """Find what derivatives along camera rays need beforehand; called before each pass, and done once."""
+
+    def replayed(self) -> SegmentEstimator:
+        """The estimator of the light that a replay meets again, with the same random numbers: without what is drawn anew."""
+
 
 class Transmittance:
     """The factor of a segment whose media only take light away."""
@@ -121,6 +127,12 @@ class Absorption:
         end, tau = integrate_optical_depth(self.media, segment.ray, segment.medium, active)
         passed = RaySegment(segment.ray, segment.medium, end.t)
         return SegmentEstimate(end, tau, None, Transmittance(self.media, passed, active))
+
+    def prepare_derivatives(self, ray: mi.Ray3f) -> None:
+        """Nothing is needed."""
+
+    def replayed(self) -> Absorption:
+        return self
 
 
 class SharedSegment(Protocol):

@@ -28,6 +28,7 @@ from mivol.transport.estimators.scattering import Scattering, medium_event_inter
 from mivol.transport.estimators.scattering_derivatives import ScatteredSegment
 from mivol.transport.estimators.segment import (
     PICTURE,
+    Absorption,
     PathSegment,
     SegmentEstimate,
     SegmentLight,
@@ -83,13 +84,16 @@ class SingleScattering:
     def draw(self, sampler: mi.Sampler, active: mi.Bool, strata: Strata | None) -> EventSamples:
         return self.emitters.draw_samples(sampler, active, strata)
 
-    def find_controls(self, ray: mi.Ray3f) -> None:
+    def prepare_derivatives(self, ray: mi.Ray3f) -> None:
         """Find a control variate for derivatives along camera rays, once."""
         if takes_grid_control(self.media):
             if self.grid_control is None:
                 self.grid_control = build_grid_control(self.direct, self.media.bodies[0], CameraOrigins.of(ray))
         elif self.constant_control is None:
             self.constant_control = find_constant_control(self.media)
+
+    def replayed(self) -> Absorption:
+        return Absorption(self.media, drawn_by=self)
 
     def estimate(self, segment: PathSegment, purpose: str, active: mi.Bool) -> SegmentEstimate:
         if purpose == PICTURE:

@@ -39,6 +39,12 @@ class Emission:
     def draw(self, sampler: mi.Sampler, active: mi.Bool, strata: Strata | None) -> Any:
         """Draw nothing: the estimate is deterministic."""
 
+    def prepare_derivatives(self, ray: mi.Ray3f) -> None:
+        """Nothing is needed."""
+
+    def replayed(self) -> Emission:
+        return self
+
     def estimate(self, segment: PathSegment, purpose: str, active: mi.Bool) -> SegmentEstimate:
         """Follow a segment to its end and sum its emission, for the purpose PICTURE, REVERSE or FORWARD."""
         media = self.media

@@ -21,7 +21,15 @@ from mivol.transport.estimators.visibility_cache import VisibilityCache
 from mivol.transport.line_integrals.emitting_segment import Emission
 from mivol.transport.media.scene_media import SceneMedia
 
-__all__ = ["SEGMENT_ESTIMATORS", "Estimators", "SegmentChoice", "SegmentEntry"]
+__all__ = [
+    "MOST_SCATTERINGS",
+    "SEGMENT_ESTIMATORS",
+    "Estimators",
+    "SegmentChoice",
+    "SegmentEntry",
+    "SegmentQuestion",
+    "choose_segment_estimator",
+]
 
 
 @dataclass
@@ -42,47 +50,85 @@ class SegmentChoice:
 
 
 @dataclass(frozen=True)
+class SegmentQuestion:
+    """What a scene and its settings ask of the segment estimator.
+
+    Attributes:
+        scatters: media turn light of emitters to the camera.
+        emits: some medium is a source of light.
+        deterministic: images without noise were asked for.
+    """
+
+    scatters: bool
+    emits: bool
+    deterministic: bool
+
+
+@dataclass(frozen=True)
 class SegmentEntry:
     """An entry of :data:`SEGMENT_ESTIMATORS`.
 
     Attributes:
         make: builds the estimator.
+        answers: whether the estimator answers a question.
+        scatterings: how often it lets light turn in media on its way from an emitter.
         needs: the condition on the scene, in words.
         promises: bias and variance, in words.
         cites: keys of :mod:`mivol.report.cite`.
     """
 
     make: Callable[[SegmentChoice], SegmentEstimator]
+    answers: Callable[[SegmentQuestion], bool]
+    scatterings: int
     needs: str
     promises: str
     cites: tuple[str, ...] = ()
 
 
+def _make_quadrature(choice: SegmentChoice) -> ScatteringQuadrature:
+    drawn = SingleScattering(choice.direct, visibility_cache=choice.visibility_cache)
+    return ScatteringQuadrature(drawn, choice.transmittance_grid)
+
+
 SEGMENT_ESTIMATORS = {
     "absorption": SegmentEntry(
         lambda choice: Absorption(choice.direct.media),
-        "no medium shines or scatters light to the camera",
+        lambda asked: not asked.scatters and not asked.emits,
+        0,
+        "no medium emits, or scatters light to the camera",
         "no bias, no variance",
     ),
     "emission": SegmentEntry(
         lambda choice: Emission(choice.direct.media),
-        "a medium emits and none scatters light to the camera",
+        lambda asked: asked.emits and not asked.scatters,
+        0,
+        "a medium emits, and none scatters light to the camera",
         "error of the fourth order in the size of a cell, no variance",
     ),
     "single_scattering": SegmentEntry(
         lambda choice: SingleScattering(choice.direct, choice.count, choice.visibility_cache),
-        "a medium scatters once",
+        lambda asked: asked.scatters and not asked.emits and not asked.deterministic,
+        1,
+        "a medium scatters once, and none emits",
         "no bias",
     ),
     "scattering_quadrature": SegmentEntry(
-        lambda choice: ScatteringQuadrature(
-            SingleScattering(choice.direct, visibility_cache=choice.visibility_cache), choice.transmittance_grid
-        ),
+        _make_quadrature,
+        lambda asked: asked.scatters and not asked.emits and asked.deterministic,
+        1,
         "one medium scatters once, its grids share their cells, every emitter has one position or direction",
         "error of the fourth order in the size of a cell where light is smooth, no variance; derivatives are drawn",
     ),
 }
-"""Name -> estimator of what media add along a segment of a path."""
+"""Estimators of what media add along a segment, by the name that a plan chooses them by. A question has one answer, or none."""
+
+MOST_SCATTERINGS = max(entry.scatterings for entry in SEGMENT_ESTIMATORS.values())
+"""How often some estimator of the table lets light turn in media; a plan refuses more."""
+
+
+def choose_segment_estimator(asked: SegmentQuestion) -> str | None:
+    """The name of the estimator that answers a question; None where none does."""
+    return next((name for name, entry in SEGMENT_ESTIMATORS.items() if entry.answers(asked)), None)
 
 
 class Estimators:
@@ -103,17 +149,10 @@ class Estimators:
         """Estimators for media that only absorb, in a scene without surfaces that scatter light."""
         return cls(DirectLighting(media, SceneEmitters(media.scene)), Absorption(media), False)
 
-    def find_controls(self, ray: mi.Ray3f) -> None:
-        """Find control variates for derivatives along camera rays, once for all passes."""
-        if isinstance(self.segment, SingleScattering | ScatteringQuadrature):
-            self.segment.find_controls(ray)
+    def prepare_derivatives(self, ray: mi.Ray3f) -> None:
+        """Find what derivatives along camera rays need beforehand, once for all passes."""
+        self.segment.prepare_derivatives(ray)
 
     def replayed(self) -> Estimators:
-        """Estimators of the radiance that a replay subtracts from.
-
-        Single scattering is sampled anew for its derivatives (by probes), so the path that is replayed does not contain it; its
-        random numbers are still consumed, so that both passes follow the same path.
-        """
-        if not isinstance(self.segment, SingleScattering | ScatteringQuadrature):
-            return self
-        return Estimators(self.direct, Absorption(self.media, drawn_by=self.segment), self.lights_surfaces)
+        """Estimators of the radiance that a replay counts down: without light that is drawn anew for its derivative."""
+        return Estimators(self.direct, self.segment.replayed(), self.lights_surfaces)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 __all__ = ["Settings"]
@@ -25,3 +26,8 @@ class Settings:
     hide_emitters: bool = False
     deterministic: bool = False
     shadows: str = "auto"
+
+    @property
+    def scatterings(self) -> float:
+        """How often light may turn between an emitter and the camera, on surfaces and in media; infinite without a limit."""
+        return math.inf if self.max_depth < 0 else max(self.max_depth - 1, 0)

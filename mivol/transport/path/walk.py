@@ -151,7 +151,7 @@ def _alpha(stopped: mi.Bool, clear: mi.Spectrum) -> mi.Float:
 def is_straight(estimators: Estimators, settings: Settings) -> bool:
     """Whether every path has one segment: there are no surfaces, or the depth is at most 1 and none of them transmits light."""
     media = estimators.media
-    return not media.has_surfaces or (settings.max_depth in (0, 1) and not media.has_null_transmission)
+    return not media.has_surfaces or (settings.scatterings == 0 and not media.has_null_transmission)
 
 
 def _follow_segment(estimators: Estimators, settings: Settings, limit: int, path: Path) -> tuple[Path, PathEvent]:

@@ -1,0 +1,52 @@
+"""The table of segment estimators: every question has one answer at most, and a plan takes it."""
+
+from __future__ import annotations
+
+import itertools
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mivol.scene.needs import find_needs
+from mivol.scene.plan import make_plan
+from mivol.scene.survey import survey_scene
+from mivol.transport.path.estimators import SEGMENT_ESTIMATORS, SegmentQuestion, choose_segment_estimator
+from mivol.transport.path.settings import Settings
+from scenes import box_of, camera, centred, medium
+
+QUESTIONS = [SegmentQuestion(*flags) for flags in itertools.product((False, True), repeat=3)]
+
+
+@pytest.mark.parametrize("asked", QUESTIONS, ids=str)
+def test_a_question_has_one_answer_at_most(asked: SegmentQuestion) -> None:
+    """Media that emit beside media that scatter have no estimator yet; every other question has exactly one."""
+    found = [name for name, entry in SEGMENT_ESTIMATORS.items() if entry.answers(asked)]
+    assert len(found) == (0 if asked.emits and asked.scatters else 1)
+    assert choose_segment_estimator(asked) == (found[0] if found else None)
+
+
+@pytest.mark.parametrize("name", SEGMENT_ESTIMATORS)
+def test_an_entry_says_what_it_needs_and_promises(name: str) -> None:
+    entry = SEGMENT_ESTIMATORS[name]
+    assert entry.needs and entry.promises
+    answered = [asked for asked in QUESTIONS if entry.answers(asked)]
+    assert answered and all(asked.scatters == (entry.scatterings > 0) for asked in answered)
+
+
+@pytest.mark.parametrize(
+    ("lamp", "settings", "name"),
+    [
+        ("constant", Settings(max_depth=2), "single_scattering"),
+        ("constant", Settings(max_depth=1), "absorption"),
+        (None, Settings(max_depth=2), "absorption"),
+        ("point", Settings(max_depth=2, deterministic=True), "scattering_quadrature"),
+        ("point", Settings(max_depth=1, deterministic=True), "absorption"),
+    ],
+)
+def test_a_plan_takes_the_answer(variant_rgb: str, lamp: str | None, settings: Settings, name: str) -> None:
+    parts = {"lamp": {"type": lamp, **({"position": [0, 0, 3]} if lamp == "point" else {})}} if lamp else {}
+    fog = box_of(medium("homogeneous", 1.0, 0.5), centred(2 * np.eye(3)))
+    scene = mi.load_dict({"type": "scene", "fog": fog, "sensor": camera([0, -4, 0], [0, 0, 0], res=4), **parts})
+    needs = find_needs(scene, scene.sensors()[0], survey_scene(scene))
+    assert make_plan(needs, settings).segment == name
