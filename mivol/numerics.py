@@ -1,4 +1,4 @@
-r"""Forms of exp that survive float32: opacity, and the moments of an exponential over a unit interval.
+r"""Forms of exp that survive float32 (opacity, and the moments of an exponential over a unit interval), and extremes.
 
 .. math:: E_n(x) = \int_0^1 u^n e^{-x u}\,du, \qquad E_0 = \varphi_1, \qquad x E_0 = 1 - e^{-x}
 
@@ -11,10 +11,13 @@ References: Abramowitz & Stegun 6.5.29 (the series of the incomplete gamma funct
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Sequence
+
 import drjit as dr
 import mitsuba as mi
 
-__all__ = ["exp_moments", "one_minus_exp", "phi1"]
+__all__ = ["exp_moments", "greater", "largest_of", "least_of", "lesser", "one_minus_exp", "phi1"]
 
 PHI_SERIES_BELOW, PHI_TERMS = 0.5, 8
 """The term left out is x^8 / 9! <= 1.1e-8."""
@@ -56,6 +59,26 @@ def exp_moments(x: mi.Float) -> list[mi.Float]:
         down.insert(0, dr.fma(x, down[0], tr) * (1 / (MOMENTS - n)))
         up.append((n * up[-1] - tr) * inv)
     return [dr.select(small, d, u) for d, u in zip(down, up, strict=True)]
+
+
+def lesser(a: mi.Float, b: mi.Float) -> mi.Float:
+    """The smaller of two numbers that are not NaN; ``dr.minimum`` costs twice as much, since it passes NaN on."""
+    return dr.select(a < b, a, b)
+
+
+def greater(a: mi.Float, b: mi.Float) -> mi.Float:
+    """The larger of two numbers that are not NaN."""
+    return dr.select(a > b, a, b)
+
+
+def least_of(rows: Sequence[mi.Float]) -> mi.Float:
+    """The smallest of one or more numbers in each lane; NaN where one of them is."""
+    return functools.reduce(dr.minimum, rows)
+
+
+def largest_of(rows: Sequence[mi.Float]) -> mi.Float:
+    """The largest of one or more numbers in each lane; NaN where one of them is."""
+    return functools.reduce(dr.maximum, rows)
 
 
 def _series(x: mi.Float, n: int, terms: int) -> mi.Float:

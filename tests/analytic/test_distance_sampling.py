@@ -12,8 +12,9 @@ from mivol.scene.build import build_media
 from mivol.scene.needs import find_needs
 from mivol.scene.plan import make_plan
 from mivol.scene.survey import survey_scene
-from mivol.transport.estimators.distance_reservoir import Candidate
+from mivol.transport.estimators.distance_reservoir import Candidate, DistanceProposal
 from mivol.transport.estimators.distance_sampling import sample_distance
+from mivol.transport.estimators.emitters import ChosenEmitter
 from mivol.transport.path.settings import Settings
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
@@ -34,7 +35,8 @@ def test_collisions_in_a_cell_of_linear_extinction(ends):
         ray = mi.Ray3f(mi.Point3f(0.1, 0.2, -5 + zero), mi.Vector3f(0, 0, 1), dr.inf, mi.Float(0), mi.Color0f())
         kept = Candidate(one, begin * one, zero, length * one, [zero], zero, mi.UInt32(zero), mi.Bool(True), mi.UInt32(1))
         numbers = mi.Point2f(mi.Float(0.5), mi.Float(np.float32(u)))
-        event = sample_distance(media, ray, kept, one, None, 0.0, numbers, mi.Bool(True))
+        proposal = DistanceProposal(media, ray, ChosenEmitter(mi.UInt32(0), None, None))
+        event = sample_distance(proposal, kept, one, numbers, mi.Bool(True))
     a, b = map(float, np.float32(ends))
     goal = -np.log1p(u * np.expm1(-length * (a + b) / 2))
     x = (-a + np.sqrt(a * a + 2 * (b - a) * goal / length)) / (b - a)

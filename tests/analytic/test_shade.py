@@ -16,7 +16,7 @@ from mivol.scene.needs import find_needs
 from mivol.scene.plan import make_plan
 from mivol.scene.survey import survey_scene
 from mivol.transport.estimators.emitters import SceneEmitters
-from mivol.transport.estimators.visibility_cache import FLOOR, SHARE, build_visibility_cache
+from mivol.transport.estimators.visibility_cache import FLOOR, RAY_FRACTION, build_visibility_cache
 from mivol.transport.path.settings import Settings
 from mivol.transport.traversal.coarse_grid import coarsen_grid
 from mivol.transport.traversal.empty_blocks import find_empty_distances
@@ -93,7 +93,7 @@ def test_weights_are_those_of_beer(shift, occupied):
         blocks = np.array([(n >> shift) + 1 for n in SIZE])
         # As many rays as ask for this lattice and for none that is finer.
         shade = build_visibility_cache(
-            media, SceneEmitters(seen.scene), int(np.ceil(1.001 * blocks.prod() / SHARE)), occupied, coarsen_grid
+            media, SceneEmitters(seen.scene), int(np.ceil(1.001 * blocks.prod() / RAY_FRACTION)), occupied, coarsen_grid
         )
     assert shade.blocks == tuple(blocks)
     middle = ((np.arange(blocks[0]) << shift) + 0.5 * (1 << shift) - 0.5) / SIZE[0]

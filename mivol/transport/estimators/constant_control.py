@@ -1,4 +1,4 @@
-"""A control variate for derivatives that is one source function for all of space: light of a constant sky."""
+"""A control variate for derivatives with one source function for all of space, for media under a constant sky."""
 
 from __future__ import annotations
 
@@ -12,16 +12,19 @@ __all__ = ["find_constant_control"]
 
 
 def find_constant_control(media: SceneMedia) -> mi.Spectrum | None:
-    r"""A source function S [radiance] that is the same everywhere: the mean albedo times what a constant sky sends.
+    r"""Find the constant source function S [radiance]: the mean albedo times the radiance of a constant sky.
 
-    The exact part of its gradient is the same number all along a ray, :math:`T(D)\,S`, so it needs no lattice and serves media
-    of any number and boundary that have an albedo. None where there is no such medium or no constant sky.
+    The light of S along a ray is :math:`S (1 - T(D))`, and its derivative by the optical depth of any part of the ray is
+    :math:`T(D)\,S`. So it needs no lattice, and serves any number of media in any boundaries.
+
+    Returns:
+        S; None where there is no constant sky, or a medium has no albedo (but a ``sigma_s``).
     """
     skies = [e for e in media.scene.emitters() if e.class_name() == UNIFORM]
-    shares = [a for body in media.bodies for a in body.view.albedo_arrays]
+    albedos = [a for body in media.bodies for a in body.view.albedo_arrays]
     if not skies or any(body.view.albedo is None for body in media.bodies):
         return None
-    mean = sum(_mean_of(a) for a in shares) / len(shares)
+    mean = sum(_mean_of(a) for a in albedos) / len(albedos)
     return mean * dr.detach(skies[0].eval(dr.zeros(mi.SurfaceInteraction3f)))
 
 

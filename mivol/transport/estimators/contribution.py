@@ -1,15 +1,17 @@
-r"""What an estimator adds to a path, and what it multiplies a path by: a value with its derivatives in both directions.
+r"""Terms and factors of a path: values with their derivatives in reverse (vjp) and forward mode (jvp).
 
 A path's radiance is a sum of terms, each multiplied by all the factors in front of it:
 
 .. math:: L = t_1 + f_1 (t_2 + f_2 (t_3 + \dots))
 
-Forwards the tangent of a term adds dt, and the tangent of a factor f'/f dims or lifts all that lies ahead. In reverse the term
-receives d loss / d t = dL, and the factor d loss / d log f = dL L, with L the radiance ahead: no factor is divided by where it
-has no derivative of its own, and a transmittance never is.
+In forward mode the tangent of a term is added, and the tangent of a factor's logarithm, f'/f, multiplies all light further
+along the path. In reverse mode a term receives d loss / d t = dL, and a factor d loss / d log f = dL L, with L the radiance
+from further along the path. Each factor computes the derivative of its logarithm itself, so there is no division by a factor
+that has none, and never one by a transmittance.
 
-Conventions. Values are already multiplied by the path's throughput in front of them. Lanes that a term is not for have the
-value 0. :class:`Term` and :class:`Factor` are what a score asks for; the classes below serve values that Dr.Jit tracks.
+Conventions. Values are already multiplied by the throughput of the path in front of them. A term is 0 in lanes that do not have
+it. :class:`Term` and :class:`Factor` are the protocols that scores use; the classes below are for values whose derivatives
+Dr.Jit tracks.
 
 References: Vicini et al. 2021 (replay of a path with a running radiance).
 """
@@ -29,29 +31,29 @@ __all__ = ["Factor", "Term", "TrackedFactor", "TrackedTerm"]
 
 
 class Term(Protocol):
-    """Light that is added to what a path carries.
+    """Radiance that is added to a path.
 
     Attributes:
-        value: radiance as the camera sees it, without derivatives; 0 in lanes that it is not for.
-        is_replayed: whether a path that is followed again meets the same value, and counts it down; light that is estimated
-            anew for its derivative is not part of the radiance that was known.
+        value: radiance as the camera sees it, without derivatives; 0 in lanes that do not have it.
+        is_replayed: whether the replay of a path finds the same value again and subtracts it from the known radiance. Light
+            that is estimated anew for its derivative is not part of that radiance.
     """
 
     value: mi.Spectrum
     is_replayed: bool
 
     def vjp(self, dL: mi.Spectrum) -> None:
-        """Add the derivatives of the value, weighted by ``dL``, to the gradients of what it was made of."""
+        """Add the derivatives of the value, weighted by ``dL``, to the gradients of its parameters."""
 
     def jvp(self) -> mi.Spectrum:
-        """Tangent of the value along that which was set on the parameters."""
+        """Tangent of the value, from the tangents of its parameters."""
 
 
 class Factor(Protocol):
-    """What all light ahead is multiplied by."""
+    """A factor of all light further along the path."""
 
     def vjp(self, dlog: mi.Spectrum) -> None:
-        """Add the derivatives of the factor's logarithm, weighted by ``dlog`` (dL times the radiance ahead)."""
+        """Add the derivatives of the factor's logarithm, weighted by ``dlog`` = dL L, to the gradients of its parameters."""
 
     def jvp(self) -> mi.Spectrum:
         """Tangent of the factor's logarithm."""
@@ -84,10 +86,10 @@ class TrackedTerm:
 
 @dataclass
 class TrackedFactor:
-    """A factor whose derivatives Dr.Jit tracks (a BSDF): 0 has no logarithm, and lets nothing through that could change.
+    """A factor whose derivatives Dr.Jit tracks (a BSDF). Where it is 0 it has no logarithm, and its derivative counts as 0.
 
     Attributes:
-        evaluate: returns the factor, attached to its parameters; asked only where a derivative is wanted.
+        evaluate: returns the factor, attached to its parameters; called only where a derivative is needed.
         active: lanes that are multiplied by it.
     """
 

@@ -1,17 +1,18 @@
-r"""Direct lighting: light that reaches a vertex from emitters, through volumetric shadows, and turns towards the camera.
+r"""Direct lighting (next-event estimation): light from emitters that a vertex scatters towards the camera, with shadows of
+media.
 
 .. math:: L_d(x, \omega) = \int_{4\pi} f(x, \omega, \omega_i)\, L_e(x, \omega_i)\, e^{-\tau(x, \omega_i)}\,d\omega_i
 
-One estimator serves surfaces and media: a direction towards an emitter is drawn, the transmittance of the shadow ray dims what
-the emitter sends, and the power heuristic (Veach 1997, Eq. 9.13) weighs it against the density of the vertex' own directions.
-Where a path goes on from a surface, its own next segment is the other sample; a medium vertex of single scattering draws one
-of its phase function here.
+One estimator serves surfaces and media. A direction towards an emitter is sampled, the emitted radiance is multiplied by the
+transmittance of the shadow ray, and the sample is weighed by the power heuristic (multiple importance sampling, Veach 1997,
+Eq. 9.13) against the density of the vertex' own directions. For a surface, the path's next segment is the other sample; for a
+medium vertex of single scattering, a phase sample is drawn here.
 
-Emitters on surfaces that let light pass undeviated (transmissive ones) are no end of a shadow ray: rays of the phase function
-pass them, so only the first kind of sample finds them there.
+Rays of the phase function are not stopped by emitters on transmissive surfaces, which let part of the light pass undeviated.
+Such an emitter is found by emitter samples only, whose weight there is 1.
 
-Conventions. A sample is one shadow ray: the light that it brings is already dimmed by the optical depth along it and turned by
-the vertex. Surfaces cast shadows; what they reflect is one more scattering and not seen.
+Conventions. A direct sample is one shadow ray; its value contains the transmittance and the BSDF or phase function. Surfaces
+cast shadows; light that they reflect towards a medium has scattered twice, and is not part of direct lighting.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ import mitsuba as mi
 
 from mivol.transport.estimators.emitters import ChosenEmitter, SceneEmitters, is_among
 from mivol.transport.estimators.event_samples import EventSamples
-from mivol.transport.estimators.moving_emitters import follow_lamp, shadow_of_moving
+from mivol.transport.estimators.moving_emitters import follow_emitter, shadow_of_moving
 from mivol.transport.estimators.multiple_importance import power_heuristic
 from mivol.transport.estimators.phase_sampling import sample_phase
 from mivol.transport.estimators.shadow_rays import light_through, shadow_ray
@@ -39,11 +40,11 @@ __all__ = ["DirectLight", "DirectLighting", "DirectSample"]
 
 @dataclass
 class DirectSample:
-    """Radiance that one shadow ray brings to a vertex, turned to the camera; with its derivatives where these are asked for.
+    """The contribution of one shadow ray to the radiance that a vertex scatters towards the camera.
 
     Attributes:
         ray_segment: the shadow ray.
-        value: radiance; its optical depth along the ray is detached.
+        value: radiance, with derivatives where these are asked for; the optical depth along the ray is detached.
         on: lanes that receive any.
     """
 
@@ -54,15 +55,15 @@ class DirectSample:
 
 @dataclass
 class EmitterAim:
-    """A direction towards an emitter.
+    """A direction that was sampled towards an emitter.
 
     Attributes:
         direct: Mitsuba's sample.
-        weight: radiance over density, without the choice among emitters.
-        emitter: what is aimed at.
-        u: the numbers that drew it.
-        count: the emitter was drawn from so many, all alike, and ``direct.pdf`` does not count that.
-        is_met_by_chance: lanes in which a direction of the vertex could have met the emitter.
+        weight: radiance over ``direct.pdf``.
+        emitter: the emitter.
+        u: the random numbers of the direction.
+        count: number of emitters that it was chosen from with equal probabilities; not contained in ``direct.pdf``.
+        has_alternative: lanes in which a BSDF or phase sample could have hit the emitter, so that the two are weighed.
     """
 
     direct: mi.DirectionSample3f
@@ -70,14 +71,14 @@ class EmitterAim:
     emitter: mi.EmitterPtr
     u: mi.Point2f
     count: int
-    is_met_by_chance: mi.Bool | bool
+    has_alternative: mi.Bool | bool
 
 
 class DirectLighting:
-    """Estimates direct light at surfaces and in media.
+    """The estimator of direct lighting at surfaces and in media.
 
     Args:
-        media: surfaces and media.
+        media: media of the scene, and its surfaces.
         emitters: of the scene.
     """
 
@@ -85,16 +86,18 @@ class DirectLighting:
         self.media, self.emitters = media, emitters
 
     def at_surface(self, vertex: SurfaceVertex, u: mi.Point2f, attached: bool, active: mi.Bool) -> DirectSample:
-        """Estimate what a surface receives from one emitter and turns; the path's next segment holds the other sample.
+        """Estimate direct light at a surface by one emitter sample; the path's next segment is the BSDF sample.
 
         Args:
             vertex: the point.
             u: two numbers in [0, 1).
             attached: keep the derivatives of BSDF and emitter.
-            active: lanes to light.
+            active: lanes to estimate.
+
+        Bias: none. Variance: that of one emitter sample. Cost: one shadow ray.
         """
         direct, weight = self.media.scene.sample_emitter_direction(vertex.interaction, u, False, active)
-        return self._aimed(vertex, EmitterAim(direct, weight, direct.emitter, u, 1, True), attached, active)
+        return self._emitter_sample(vertex, EmitterAim(direct, weight, direct.emitter, u, 1, True), attached, active)
 
     def in_medium(
         self,
@@ -105,62 +108,64 @@ class DirectLighting:
         active: mi.Bool,
         estimates: bool = False,
     ) -> list[DirectSample]:
-        """Estimate the light that arrives at a point of a medium and turns into ``vertex.interaction.wi``.
+        """Estimate direct light at a point of a medium that is scattered into ``vertex.interaction.wi``.
 
         Args:
             vertex: the point.
-            chosen: the emitter that was drawn for each lane.
+            chosen: the emitter that was chosen for each lane.
             samples: random numbers.
             attached: keep the derivatives of phase function and emitters.
-            active: lanes to light.
-            estimates: shadows may be estimated, in grids whose blocks are known; otherwise they are exact.
+            active: lanes to estimate.
+            estimates: transmittance may be estimated, in grids whose block ranges are known; otherwise it is exact.
 
         Returns:
             One or two shadow rays, whose values add up to L_d.
 
-        Bias: none. Variance: that of one direction towards an emitter and one of the phase function.
+        Bias: none. Variance: that of one emitter sample and one phase sample. Cost: a shadow ray for each.
         """
         found = []
-        # Where shadows are estimated no ray is followed back: the number that would choose one is free.
-        one, two = (seed_pcg32(samples.choice, dr.width(active), k) if estimates else None for k in range(2))
+        # Shadows are estimated in images only, and images need no choice of a shadow ray to differentiate: its random number
+        # seeds the generators of the trackers.
+        one, two = (seed_pcg32(samples.which_shadow_ray, dr.width(active), k) if estimates else None for k in range(2))
         if self.emitters.sampled:
             mei = vertex.interaction
             direct, weight = chosen.emitter.sample_direction(mei, samples.emitter, active)
-            met = ~is_among(self.emitters.transmissive, chosen.emitter) if self.emitters.samples_phase else False
-            aim = EmitterAim(direct, weight, chosen.emitter, samples.emitter, len(self.emitters.sampled), met)
-            found.append(self._aimed(vertex, aim, attached, active, one))
+            weighed = ~is_among(self.emitters.transmissive, chosen.emitter) if self.emitters.samples_phase else False
+            aim = EmitterAim(direct, weight, chosen.emitter, samples.emitter, len(self.emitters.sampled), weighed)
+            found.append(self._emitter_sample(vertex, aim, attached, active, one))
         if self.emitters.samples_phase:
-            found.append(self._met(vertex, samples, attached, active, two))
+            found.append(self._phase_sample(vertex, samples, attached, active, two))
         return found
 
-    def _aimed(
+    def _emitter_sample(
         self, vertex: Vertex, aim: EmitterAim, attached: bool, active: mi.Bool, rng: mi.UInt32 | None = None
     ) -> DirectSample:
-        """Light from the direction of an emitter."""
+        """Light from a direction that was sampled towards an emitter."""
         direct, it = aim.direct, vertex.interaction
         on = active & (direct.pdf > 0)
         start, medium = vertex.leave(direct.p)
         ray_segment, clear, tau, light = shadow_ray(self.media, start, medium, direct, on, rng)
         on &= clear
         w_mis = mi.Float(1)
-        if aim.is_met_by_chance is not False:
+        if aim.has_alternative is not False:
             pdf = direct.pdf / aim.count
-            w_mis = dr.select(direct.delta | ~mi.Bool(aim.is_met_by_chance), 1, power_heuristic(pdf, vertex.pdf(direct.d, on)))
+            w_mis = dr.select(direct.delta | ~mi.Bool(aim.has_alternative), 1, power_heuristic(pdf, vertex.pdf(direct.d, on)))
         dim = light * (w_mis * aim.count)
         with dr.resume_grad(when=attached):
             source, moved = aim.weight, direct
             if attached:
-                moved = follow_lamp(aim.emitter, it, aim.u, direct, on)
+                moved = follow_emitter(aim.emitter, it, aim.u, direct, on)
                 source = aim.emitter.eval_direction(it, moved, on) / direct.pdf
                 source = source * shadow_of_moving(self.media, ray_segment, tau, moved.p, on)
-            # A density of 0 would make the source infinite: 0 times it, in lanes that are left out, has no derivative.
+            # Where the density is 0 the source is infinite; the lanes are not active, but 0 * inf in their derivative would be
+            # NaN.
             value = dr.select(on, dim * vertex.eval(moved.d, on) * dr.select(direct.pdf > 0, source, 0), 0)
         return DirectSample(ray_segment, value, on)
 
-    def _met(
+    def _phase_sample(
         self, vertex: MediumVertex, samples: EventSamples, attached: bool, active: mi.Bool, rng: mi.UInt32 | None
     ) -> DirectSample:
-        """Light from a direction of the phase function."""
+        """Light from a direction that was sampled from the phase function."""
         emitters, mei = self.emitters, vertex.interaction
         wo, weight, pdf = sample_phase(self.media, vertex.phase, mei, samples, active)
         on = active & (pdf > 0)
@@ -183,12 +188,12 @@ class DirectLighting:
 
 
 class DirectLight:
-    """The term of a shadow ray: its value, and the media that dim it.
+    """The term of a shadow ray, with derivatives with respect to the media along it.
 
     Args:
         media: of the scene.
         ray_segment: the shadow ray.
-        value: radiance as the camera sees it, attached to all but the media along the ray.
+        value: radiance as the camera sees it, attached to all parameters but those of the media along the ray.
         active: lanes that receive it.
     """
 

@@ -1,7 +1,8 @@
-r"""A distance in the candidate that a reservoir has kept, with the density that it was drawn from.
+r"""Distance sampling in the piece of a ray that a reservoir has kept, with the density of the distance.
 
-The distance is drawn by inverting the candidate's exact optical depth, or evenly in the angle seen from the emitter; the
-density of the two together is known, so nothing is biased by the weights of candidates being approximate.
+The distance is drawn by inverting the piece's exact optical depth (free-flight sampling), or evenly in the angle seen from the
+emitter (equiangular sampling). The density of their mixture, times the probability of the piece, is returned; so the estimate
+is unbiased whatever the weights of the pieces were.
 
 References: Kulla & Fajardo 2012 (equiangular sampling); Miller et al. 2019 (spectral combination of free paths).
 """
@@ -14,8 +15,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mivol.numerics import one_minus_exp
-from mivol.transport.estimators.distance_reservoir import Candidate, inverse
-from mivol.transport.estimators.equiangular import EquiangularSampler
+from mivol.transport.estimators.distance_reservoir import Candidate, DistanceProposal, inverse
 from mivol.transport.media.body import Body
 from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.traversal.grid_walk import box_nodes, read_nodes
@@ -26,19 +26,20 @@ __all__ = ["MediumEvent", "sample_distance"]
 
 
 NEWTON_STEPS = 8
-"""Each doubles the digits; where the extinction vanishes at an end they are halvings, and 2^-8 of a cell holds no light."""
+"""Each step doubles the number of right digits. Where the extinction vanishes at an end of the piece the steps are bisections;
+these leave an error of 2^-8 of a cell in a place that holds hardly any light."""
 
 
 @dataclass
 class MediumEvent:
-    """A point of a ray where light may be scattered.
+    """A scattering event on a ray.
 
     Attributes:
-        t, begin: distance [length], and that at which its piece begins, in float64.
-        pdf: density it was drawn from [1/length].
-        tau: optical depth [1] in front of it, of each channel, along the bodies in the order of the walk.
+        t, begin: its distance, and that at which its piece begins [length], in float64.
+        pdf: density that the distance was drawn with [1/length].
+        tau: optical depth [1] in front of it, of each channel, summed over the media in the order of the walk.
         sigma_t: extinction [1/length] there, of each channel.
-        body: number of its body.
+        body: index of its medium.
         on: lanes that have one.
     """
 
@@ -52,33 +53,27 @@ class MediumEvent:
 
 
 def sample_distance(
-    media: SceneMedia,
-    ray: mi.Ray3f,
-    candidate: Candidate,
-    total: mi.Float,
-    equiangular: EquiangularSampler | None,
-    probe_depth: float,
-    u: mi.Point2f,
-    active: mi.Bool,
+    proposal: DistanceProposal, candidate: Candidate, total: mi.Float, u: mi.Point2f, active: mi.Bool
 ) -> MediumEvent:
-    """Draw a distance in the piece that was kept.
+    """Draw a distance in the piece that a reservoir has kept.
 
     Args:
-        media, ray, equiangular, probe_depth: as in :func:`fill_reservoir`.
-        candidate: a piece that the walk has kept.
+        proposal: that the reservoir was filled with.
+        candidate: the piece.
         total: sum of the weights of all pieces.
         u: two numbers in [0, 1).
         active: lanes that may scatter.
     """
+    media, ray, equiangular = proposal.media, proposal.ray, proposal.chosen.equiangular
     on = active & (candidate.weight > 0)
     dt = dr.select(on, candidate.dt, 1)
     curve = _curve(media, ray, candidate, on)
     whole = [_partial(c, dt, 1) for c in curve]
     front = [dr.exp(-f) for f in candidate.front]
 
-    # -- How: by collisions, or evenly (in angle, where a lamp is near) ------------------------------------------------
+    # -- The technique: free flight, or evenly (in angle where the emitter has a place, in length for probes) ---------
     by_collision = mi.Float(1)
-    if probe_depth:
+    if proposal.probe_depth:
         mean = sum(whole) / len(whole)
         by_collision = mean * inverse(mean + candidate.probe_sigma * dt)
     if equiangular is not None:
@@ -88,7 +83,7 @@ def sample_distance(
     even = u.y * dt if equiangular is None else dr.select(equiangular.finite, equiangular.sample(begin, dt, u.y), u.y * dt)
     x = dr.select(collides, _invert(curve, whole, front, dt, u), even * dr.rcp(dt))
 
-    # -- The density of both together ------------------------------------------------------------------------------------
+    # -- The density of their mixture ------------------------------------------------------------------------------------
     sigma = [dr.maximum(_at(c, x), 0) for c in curve]
     tau = [_partial(c, dt, x) for c in curve]
     taken = sum((f * one_minus_exp(w) for f, w in zip(front, whole, strict=True)), mi.Float(0))
@@ -107,7 +102,7 @@ def sample_distance(
 
 
 def _curve(media: SceneMedia, ray: mi.Ray3f, candidate: Candidate, on: mi.Bool) -> list[list[mi.Float]]:
-    """The extinction along the piece that was kept, for each channel: the coefficients of a cubic of [0, 1]."""
+    """The extinction along a piece for each channel: the coefficients of a cubic on [0, 1]."""
     values = [[mi.Float(0) for _ in range(4)] for _ in range(media.channels)]
     for index, body in enumerate(media.bodies):
         here = on & (candidate.body == index)
@@ -117,28 +112,28 @@ def _curve(media: SceneMedia, ray: mi.Ray3f, candidate: Candidate, on: mi.Bool) 
 
 
 def _values_along(media: SceneMedia, body: Body, ray: mi.Ray3f, candidate: Candidate, on: mi.Bool) -> list[list[mi.Float]]:
-    """[channel][point] extinction at 0, 1/3, 2/3 and 1 of the piece that was kept, in one body."""
-    field = body.extinction(ray, body.flight_parts)
-    constant = [[c] * 4 for c in field.constant]
+    """[channel][point] extinction at 0, 1/3, 2/3 and 1 of a piece, in one medium."""
+    extinction = body.extinction(ray, body.flight_parts)
+    constant = [[c] * 4 for c in extinction.constant]
     lattice = next((p.lattice for p in body.flight_parts if p.lattice is not None), None)
     if lattice is None:
         return _by_point(media, constant)
     start = mi.Float64(candidate.begin) + mi.Float64(candidate.s)
     segment = clip(lattice, ray.o, ray.d, start, start + mi.Float64(candidate.dt))
-    # The middle of the piece tells its cell: an end lies in a face, and may be rounded to either side.
+    # The cell is that of the middle of the piece: its ends lie in faces of the cell, and rounding may put them on either side.
     along = segment.d * segment.length
     shift = mi.Vector3i(dr.floor(segment.frac + 0.5 * along))
     cell, frac = segment.cell + shift, segment.frac - mi.Vector3f(shift)
     points = [dr.clip(dr.fma(along, k / 3, frac), 0, 1) for k in range(4)]
     inside = on & (segment.length > 0)
     nodes = box_nodes(cell, dr.full(dr.mask_t(mi.Vector3f), True), lattice.res)
-    grid = field.along(read_nodes(field.reads, nodes, inside), points)
+    grid = extinction.along(read_nodes(extinction.reads, nodes, inside), points)
     own = [[dr.select(inside, g, k) for g, k in zip(*row, strict=True)] for row in zip(grid, constant, strict=True)]
     return _by_point(media, own)
 
 
 def _by_point(media: SceneMedia, values: list[list[mi.Float]]) -> list[list[mi.Float]]:
-    """[channel of a body][point] as [channel of the world][point]."""
+    """[channel of the scene][point], from [channel of the medium][point]."""
     return [list(row) for row in zip(*(media.rows([v[k] for v in values]) for k in range(4)), strict=True)]
 
 
@@ -157,19 +152,19 @@ def _at(c: list[mi.Float], x: mi.Float) -> mi.Float:
 
 
 def _partial(c: list[mi.Float], dt: mi.Float, x: mi.Float) -> mi.Float:
-    """Optical depth from 0 to x."""
+    """Optical depth of a piece from 0 to x."""
     return dr.maximum(dt * x * dr.fma(x, dr.fma(x, dr.fma(x, 0.25 * c[3], c[2] / 3), 0.5 * c[1]), c[0]), 0)
 
 
 def _invert(curve: list, whole: list[mi.Float], front: list[mi.Float], dt: mi.Float, u: mi.Point2f) -> mi.Float:
-    """The share of a piece at which the light that it takes has fallen to the share ``u.y`` of it.
+    """Invert the cumulative distribution of collisions in a piece: the fraction of its length at which it is ``u.y``.
 
-    Of one channel, drawn by what each of them takes, where the extinction is rgb.
+    Where the extinction is rgb, one channel is drawn in proportion to the light that the piece takes from each.
     """
     c, tau = curve[0], whole[0]
     if len(curve) > 1:
         shares = [f * one_minus_exp(w) for f, w in zip(front, whole, strict=True)]
-        # The digits of u.x that chose the way of drawing are used up; those of u.y are not, but it is wanted whole.
+        # u.x has chosen the technique already and u.y is needed below, so the channel is drawn with a third number.
         left = dr.select(sum(shares) > 0, _scramble(u), 0) * sum(shares)
         for k in range(1, len(curve)):
             later = left >= sum(shares[:k])
@@ -181,7 +176,8 @@ def _invert(curve: list, whole: list[mi.Float], front: list[mi.Float], dt: mi.Fl
         error = _partial(c, dt, x) - goal
         low, high = dr.select(error < 0, x, low), dr.select(error > 0, x, high)
         step = x - error / dr.maximum(dt * _at(c, x), 1e-30)
-        # The ends count as inside: a step that is lost in rounding stays at the root, which is one of them by then.
+        # The ends of the bracket count as inside: once x is at the root, it is one of the ends, and a step of 0 must keep it
+        # there.
         x = dr.select((step >= low) & (step <= high), step, 0.5 * (low + high))
     return x
 
@@ -192,7 +188,7 @@ def _scramble(u: mi.Point2f) -> mi.Float:
 
 
 def _log_share(u: mi.Float, tau: mi.Float) -> mi.Float:
-    """-log(1 - u (1 - exp(-tau))): the optical depth at which the share u of what is taken has been taken."""
+    """-log(1 - u (1 - exp(-tau))): the optical depth at which the fraction u of all collisions within tau has happened."""
     x = u * one_minus_exp(tau)
     series = dr.fma(x, dr.fma(x, dr.fma(x, dr.fma(x, dr.fma(x, 1 / 6, 1 / 5), 1 / 4), 1 / 3), 1 / 2), 1)
     return dr.minimum(dr.select(x < 0.05, x * series, -dr.log(dr.maximum(1 - x, 1e-37))), tau)

@@ -1,4 +1,4 @@
-"""The emitters of a scene, how their light is to be found, and the choice of one of them."""
+"""The emitters of a scene: which of them are sampled by direction, which by the phase function, and the choice of one."""
 
 from __future__ import annotations
 
@@ -17,18 +17,20 @@ __all__ = ["UNIFORM", "ChosenEmitter", "SceneEmitters", "is_among"]
 
 
 UNIFORM = "ConstantBackgroundEmitter"
+"""Mitsuba's class of an environment that is the same in all directions; phase samples alone find its light."""
 
 
 class SceneEmitters:
-    """The emitters of a scene, and how their light is to be found.
+    """The emitters of a scene, and by which samples their light is found.
 
     Args:
         scene: Mitsuba's scene.
 
     Attributes:
-        sampled: emitters that directions are drawn towards, all alike: all but a constant background.
-        transmissive: emitters on surfaces that let light pass undeviated.
-        samples_phase: directions are drawn from the phase function too, since some emitter can be met by chance.
+        sampled: emitters that next-event estimation chooses from with equal probabilities: all but a constant environment.
+        transmissive: emitters on surfaces that transmit part of the light undeviated.
+        samples_phase: directions are drawn from the phase function too, since they can hit some emitter.
+        is_near: some emitter has a finite distance.
     """
 
     def __init__(self, scene: mi.Scene) -> None:
@@ -36,18 +38,18 @@ class SceneEmitters:
         delta = int(mi.EmitterFlags.Delta)
         self.sampled = [e for e in emitters if e.class_name() != UNIFORM]
         self.transmissive = [e for e in self.sampled if _is_transmissive(e)]
-        met = [e for e in emitters if not any(e is emitter for emitter in self.transmissive)]
-        self.samples_phase = any(not int(e.flags()) & delta for e in met)
+        opaque = [e for e in emitters if not any(e is emitter for emitter in self.transmissive)]
+        self.samples_phase = any(not int(e.flags()) & delta for e in opaque)
         balls = [_ball(e) for e in self.sampled]
         self.is_near = any(b is not None for b in balls)
         self._balls = [None if b is None else [dr.opaque(mi.Float, v) for v in b] for b in balls]
 
     def bounding_ball(self, number: int) -> list[mi.Float] | None:
-        """Centre and radius of a lamp that directions are drawn towards; None for one at infinity."""
+        """Centre and radius of one of the ``sampled`` emitters; None for one at infinity."""
         return self._balls[number]
 
     def draw_samples(self, sampler: mi.Sampler, active: mi.Bool, strata: Strata | None = None) -> EventSamples:
-        """Draw the numbers of one event, and note the strata of a pass, where it has some, for directions."""
+        """Draw the random numbers of one scattering event from a sampler."""
         return EventSamples(
             sampler.next_1d(active),
             sampler.next_2d(active),
@@ -60,7 +62,7 @@ class SceneEmitters:
         )
 
     def choose(self, ray: mi.Ray3f, u: mi.Float) -> ChosenEmitter:
-        """Draw a lamp, each with the same probability."""
+        """Choose one of the ``sampled`` emitters for each lane, with equal probabilities, by a number in [0, 1)."""
         n, width = len(self.sampled), dr.width(ray)
         index = dr.minimum(mi.UInt32(u * n), max(n - 1, 0))
         emitter = dr.zeros(mi.EmitterPtr, width)
@@ -81,7 +83,7 @@ def _is_transmissive(emitter: mi.Emitter) -> bool:
 
 
 def _ball(emitter: mi.Emitter) -> list[float] | None:
-    """Centre and radius of an emitter; None for one at infinity."""
+    """Centre of an emitter's bounding box, and the root mean square distance of points in it; None for one at infinity."""
     box = emitter.get_shape().bbox() if emitter.get_shape() is not None else emitter.bbox()
     low, high = np.array(box.min, dtype=np.float64), np.array(box.max, dtype=np.float64)
     if emitter.is_environment() or not np.isfinite([low, high]).all() or (high < low).any():
@@ -99,7 +101,13 @@ def is_among(emitters: list[mi.Emitter], emitter: mi.EmitterPtr) -> mi.Bool:
 
 @dataclass
 class ChosenEmitter:
-    """The lamp that was drawn for each lane: its number, the emitter, and where it is (None: all are at infinity)."""
+    """The emitter that was chosen for each lane.
+
+    Attributes:
+        number: its index among the sampled ones.
+        emitter: Mitsuba's object.
+        equiangular: sampler of distances seen from it; None where all emitters are at infinity.
+    """
 
     number: mi.UInt32
     emitter: mi.EmitterPtr

@@ -1,4 +1,4 @@
-"""The random numbers of one scattering event, and of several events on one ray."""
+"""The random numbers of a scattering event, and quasi-random shifts of them for several events on one ray."""
 
 from __future__ import annotations
 
@@ -14,23 +14,36 @@ __all__ = ["EventSamples"]
 
 @dataclass
 class EventSamples:
-    """The random numbers of one scattering event: which piece, where in it, which lamp, its direction, the phase function's,
-    and which of the two is followed back."""
+    """The random numbers of one scattering event, uniform in [0, 1).
+
+    Attributes:
+        piece: seeds the reservoir that keeps a piece of the ray.
+        inside: technique of distance sampling, and the distance in the piece.
+        which_emitter: the emitter.
+        emitter: point or direction on it.
+        component: component of the phase function.
+        direction: direction of the phase sample.
+        which_shadow_ray: the shadow ray whose derivative is computed.
+        strata: strata that directions are drawn from; None for the whole square.
+    """
 
     piece: mi.Float
     inside: mi.Point2f
-    lamp: mi.Float
+    which_emitter: mi.Float
     emitter: mi.Point2f
     component: mi.Float
     direction: mi.Point2f
-    choice: mi.Float
+    which_shadow_ray: mi.Float
     strata: Strata | None = None
 
     def part(self, number: mi.UInt32, count: int) -> EventSamples:
-        """The numbers of one of ``count`` events: those of the first, moved on, each in its part of the strata."""
+        """The numbers of one of ``count`` events on a ray.
+
+        They are those of the first event, shifted by an additive recurrence; directions are stratified over the events.
+        """
         if count == 1:
             return self.aim(self.emitter, self.direction)
-        # Multiples of the generalised golden ratios fill one and two dimensions evenly (Roberts 2018).
+        # Additive recurrences with the generalised golden ratios have low discrepancy in one and two dimensions (Roberts 2018).
         k, across = mi.Float(number), max(a for a in range(1, int(count**0.5) + 1) if count % a == 0)
         part = Strata(number, across, count // across)
 
@@ -43,17 +56,17 @@ class EventSamples:
         moved = EventSamples(
             self.piece,
             two(self.inside),
-            self.lamp,
+            self.which_emitter,
             self.emitter,
             one(self.component),
             self.direction,
-            one(self.choice),
+            one(self.which_shadow_ray),
             self.strata,
         )
         return moved.aim(part.jitter(two(self.emitter)), part.jitter(two(self.direction)))
 
     def aim(self, emitter: mi.Point2f, direction: mi.Point2f) -> EventSamples:
-        """The same with other numbers for directions, in their strata."""
+        """The same numbers with others for directions, which are moved into their strata."""
         if self.strata is not None:
             emitter, direction = self.strata.jitter(emitter), self.strata.jitter(direction)
         return replace(self, emitter=emitter, direction=direction, strata=None)

@@ -1,19 +1,20 @@
-r"""A control variate for derivatives: a rough, cheap source function whose part of the gradient is exact.
+r"""A control variate for derivatives of single scattering: a rough source function on a grid, whose gradient is exact.
 
 .. math:: \frac{d}{d\sigma} \int T \sigma (\alpha L_s)\,dt
           = \frac{d}{d\sigma} \int T \sigma S\,dt + \frac{d}{d\sigma} \int T \sigma (\alpha L_s - S)\,dt
 
-The first term has S constant in a cell, so its integral along a ray is a sum of closed forms,
-:math:`\sum_c T_c S_c (1 - e^{-\tau_c})`, and its derivative is one weight for each cell; the second is left to random probes,
-whose variance falls with the square of what is left (measured: 6 times less in constant light). Any S is unbiased.
+In the first term S is constant in a cell, so the integral along a ray is a sum of closed forms,
+:math:`\sum_c T_c S_c (1 - e^{-\tau_c})`, whose derivative is one weight for each cell. The second term is estimated by random
+probes; its variance falls with the square of the difference (measured: 6 times less variance in constant light). The sum is
+unbiased for any S, as long as S is held fixed while the derivative is taken.
 
-Conventions. S is found on a coarse lattice from a few directions a node, towards the middle of the cameras' rays, and spread
-over the cells of the grid; light near a lamp is cut at a few times the mean, since a wrong S costs more than none.
+Conventions. S is estimated on a coarse lattice, from a few directions a node, for light that is scattered towards the mean of
+the cameras' origins, and interpolated to the cells of the grid. Light near an emitter is cut at a few times the mean, since a
+wrong S adds more variance than S = 0.
 
-Where the lattice does not serve, S may be one number for all places (:func:`find_constant_control`).
+Where this control does not serve, S may be the same everywhere (:func:`find_constant_control`).
 
-References: Rousselle et al. 2016 (control variates in rendering); the split is for a fixed S the reparameterisation-free
-derivative of the equation of transfer.
+References: Rousselle et al. 2016 (control variates in rendering).
 """
 
 from __future__ import annotations
@@ -40,18 +41,25 @@ STEP = 8
 """Cells between the nodes of the coarse lattice."""
 
 MOST = 33
-"""Most nodes along an axis."""
+"""Largest number of nodes along an axis."""
 
 DIRECTIONS = 32
-"""Directions at each of its nodes."""
+"""Directions at each node of the coarse lattice."""
 
 CAP = 4.0
-"""Largest S, in means of it: near a lamp it is not constant over a cell, let alone over eight."""
+"""Largest S as a multiple of its mean: near an emitter the true source function varies strongly within one cell of the grid,
+and S is interpolated over ``STEP`` cells."""
 
 
 @dataclass
 class CameraOrigins:
-    """Where the rays of a camera come from: near one point (``eye``), or from ``direction`` where they are spread."""
+    """Where the rays of a camera start: all near one point, or spread over an area (an orthographic camera).
+
+    Attributes:
+        eye: mean of the origins.
+        spread: root mean square distance of the origins from it [length].
+        direction: mean direction.
+    """
 
     eye: mi.Point3f
     spread: mi.Float
@@ -59,28 +67,34 @@ class CameraOrigins:
 
     @classmethod
     def of(cls, ray: mi.Ray3f) -> CameraOrigins:
-        """The middle of rays."""
+        """The mean origin and direction of rays."""
         eye = mi.Point3f(*(dr.mean(ray.o[a] + 0 * ray.d[a]) for a in range(3)))
         spread = dr.sqrt(dr.mean(dr.squared_norm(ray.o - eye) + 0 * ray.d.x))
         direction = dr.normalize(mi.Vector3f(*(dr.mean(ray.d[a]) for a in range(3))) + mi.Vector3f(0, 0, 1e-20))
         return cls(eye, spread, direction)
 
     def towards(self, p: mi.Point3f) -> mi.Vector3f:
-        """The direction in which light travels along a ray of the camera at a point."""
+        """The direction of the camera's ray at a point; the mean direction where the point is near the spread origins."""
         away = p - self.eye
         return dr.select(dr.norm(away) > 4 * self.spread, dr.normalize(away), self.direction)
 
 
 @dataclass
 class GridControl:
-    """S [radiance] of each cell of a grid: flat (Z + 1, Y + 1, X + 1, channels)."""
+    """A control variate for one grid.
+
+    Attributes:
+        values: S [radiance] of each cell of the grid: flat (Z + 1, Y + 1, X + 1, channels).
+        res: of the grid (Z, Y, X).
+        channels: 1 or 3.
+    """
 
     values: mi.Float
     res: tuple[int, int, int]
     channels: int
 
     def at(self, lower: mi.Vector3i, active: mi.Bool) -> list[mi.Float]:
-        """S of the cell behind a node, one number a channel."""
+        """S of the cell with the lower node ``lower``, one number a channel."""
         _, y, x = self.res
         index = mi.UInt32(((lower.z + 1) * (y + 1) + lower.y + 1) * (x + 1) + lower.x + 1) * self.channels
         return [dr.gather(mi.Float, self.values, index + c, active) for c in range(self.channels)]
@@ -93,18 +107,18 @@ class GridControl:
 
 
 def takes_grid_control(media: SceneMedia) -> bool:
-    """Whether a grid control serves the media: one grid in a box that scatters by an albedo."""
+    """Whether the media can have a grid control: a single medium in a box, one grid of extinction, and an albedo."""
     parts = [p for b in media.bodies for p in b.view.parts]
     alone = len(parts) == 1 and not media.traced and parts[0].lattice is not None
     return alone and media.bodies[0].view.albedo is not None and not media.has_microflakes
 
 
 def build_grid_control(direct: DirectLighting, body: Body, origins: CameraOrigins) -> GridControl:
-    """Find S on a coarse lattice and spread it over the cells of a body's grid.
+    """Estimate S on a coarse lattice and interpolate it to the cells of a medium's grid.
 
     Args:
-        direct: estimates the light that arrives at a node.
-        body: one with a single grid.
+        direct: estimator of direct light at the nodes.
+        body: a medium with a single grid.
         origins: of camera rays.
 
     Cost: 64 shadow rays for 512 cells at most, and 8 look-ups a cell.
@@ -115,7 +129,7 @@ def build_grid_control(direct: DirectLighting, body: Body, origins: CameraOrigin
     z, y, x = (r + 1 for r in lattice.res)
     index = dr.arange(mi.UInt32, z * y * x)
     cell = [index // (y * x), (index // x) % y, index % x]
-    # The middle of a cell, as a share of the grid's box, in steps of the coarse lattice.
+    # The middle of each cell, as a fraction of the grid's box, in steps of the coarse lattice.
     q = [mi.Float(c) / m * (k - 1) for c, m, k in zip(cell, lattice.res, nodes, strict=True)]
     low = [dr.minimum(mi.UInt32(v), k - 2) for v, k in zip(q, nodes, strict=True)]
     frac = mi.Vector3f(*(v - mi.Float(a) for v, a in zip(q[::-1], low[::-1], strict=True)))
@@ -123,10 +137,10 @@ def build_grid_control(direct: DirectLighting, body: Body, origins: CameraOrigin
     rows = [interpolate([dr.gather(mi.Float, c, k) for k in corner], frac) for c in coarse]
     if isinstance(body.view.albedo, mi.Volume):
         u = mi.Vector3f(*(mi.Float(c) / m for c, m in zip(cell[::-1], lattice.res[::-1], strict=True)))
-        share = eval_albedo(body, _at(lattice.place(u), mi.Vector3f(0, 0, 1)), mi.Bool(True))
+        albedo = eval_albedo(body, _at(lattice.place(u), mi.Vector3f(0, 0, 1)), mi.Bool(True))
     else:
-        share = eval_albedo(body, dr.zeros(mi.MediumInteraction3f), mi.Bool(True))
-    rows = _merge_equal([row * dr.detach(share[c]) for c, row in enumerate(rows)])
+        albedo = eval_albedo(body, dr.zeros(mi.MediumInteraction3f), mi.Bool(True))
+    rows = _merge_equal([row * dr.detach(albedo[c]) for c, row in enumerate(rows)])
     n = len(rows)
     values = dr.zeros(mi.Float, z * y * x * n)
     for c, row in enumerate(rows):
@@ -138,7 +152,7 @@ def build_grid_control(direct: DirectLighting, body: Body, origins: CameraOrigin
 def _light_of_nodes(
     direct: DirectLighting, body: Body, origins: CameraOrigins, lattice: Lattice, nodes: list[int]
 ) -> list[mi.Float]:
-    """L_s at the nodes of the coarse lattice, towards the camera, one array a channel."""
+    """In-scattered radiance L_s at the nodes of the coarse lattice, towards the camera, one array a channel."""
     z, y, x = nodes
     lane = dr.arange(mi.UInt32, z * y * x * DIRECTIONS)
     node, turn = lane // DIRECTIONS, mi.Float(lane % DIRECTIONS)
@@ -147,14 +161,15 @@ def _light_of_nodes(
     p = lattice.place(u)
     mei = _at(p, origins.towards(p))
     mei.medium = dr.select(dr.full(mi.Bool, True, dr.width(lane)), mi.MediumPtr(body.view.medium), None)
-    # A lattice of rank 1 (Cranley-Patterson: shifted for each node by its number) over the directions of a node.
+    # A rank-1 lattice over the directions of a node, with a shift (Cranley-Patterson rotation) that depends on the node's
+    # number.
     shift = [_fraction(mi.Float(node) * k) for k in (0.7548776, 0.5698403, 0.3819660)]
     first, second = (turn + 0.5) / DIRECTIONS, _fraction(turn * 0.6180340)
     flat = mi.Point2f(_fraction(first + shift[0]), _fraction(second + shift[1]))
-    lamps, lobes = _fraction(turn * 0.7548776 + shift[2]), _fraction(turn * 0.5698403)
-    samples = EventSamples(mi.Float(0), mi.Point2f(0), lamps, flat, lobes, flat, mi.Float(0))
+    which, component = _fraction(turn * 0.7548776 + shift[2]), _fraction(turn * 0.5698403)
+    samples = EventSamples(mi.Float(0), mi.Point2f(0), which, flat, component, flat, mi.Float(0))
     ray = mi.Ray3f(p, -mei.wi, dr.inf, mi.Float(0), mi.Color0f())
-    chosen = direct.emitters.choose(ray, samples.lamp)
+    chosen = direct.emitters.choose(ray, samples.which_emitter)
     everywhere = dr.full(mi.Bool, True, dr.width(lane))
     found = direct.in_medium(MediumVertex(direct.media, mei), chosen, samples, False, everywhere)
     apart = max(float(np.linalg.norm(lattice.to_world[:3, a])) / (k - 1) for a, k in enumerate((x, y, z)))
@@ -169,14 +184,17 @@ def _light_of_nodes(
 
 
 def _spread(sample: DirectSample, apart: float) -> mi.Spectrum:
-    """What an arrival brings to a node that stands for all within ``apart`` of it: a lamp that is nearer counts as if it were
-    that far away, and one in the node itself, whose light has no bound, as dark."""
+    """The value of a direct sample at a node, which stands for all points within the distance ``apart`` of it.
+
+    An emitter that is nearer than ``apart`` counts as if it were that far away; one at the node itself, whose light is
+    infinite, counts as 0.
+    """
     value = dr.select(sample.on, sample.value, 0)
     return dr.select(dr.isfinite(value), value * dr.minimum(dr.square(sample.ray_segment.length / apart), 1), 0)
 
 
 def _merge_equal(rows: list[mi.Float]) -> list[mi.Float]:
-    """One channel where all are the same; a recording by ``dr.freeze`` cannot look, and keeps them."""
+    """One channel where all are the same; a recording by ``dr.freeze`` cannot read the values, and keeps all channels."""
     if dr.flag(dr.JitFlag.FreezingScope) or any(dr.any(row != rows[0]) for row in rows[1:]):
         return rows
     return rows[:1]

@@ -1,13 +1,15 @@
-r"""How the optical depth of a shadow ray changes as the lamp at its end moves.
+r"""The derivative of the optical depth of a shadow ray with respect to the position of the emitter at its end.
 
 .. math:: \frac{\partial \tau}{\partial l} = \frac{\tau}{L}\,\omega + \int_0^L \frac{t}{L} \nabla\sigma\,dt
           \mp \sum_{faces} \frac{t_f}{L}\,\sigma(t_f) \frac{n}{n \cdot \omega}
 
-for tau from x to l = x + L w: the ray grows, it turns through the field (two Gauss points a cell are exact: t times the
-gradient of a trilinear function is a cubic along a ray), and it enters and leaves boundaries elsewhere.
+for tau from x to l = x + L w. The three terms: the ray becomes longer; it rotates about x through the extinction (two Gauss
+points a cell are exact, since t times the gradient of a trilinear function is a cubic along a ray); and it crosses the
+boundaries of media elsewhere.
 
-Conventions. The upper sign is for a face through which the ray leaves. The faces of boxes are known; other boundaries are
-traced once more, and each shifts the step from the extinction before it to that behind it.
+Conventions. The upper sign is for a face through which the ray leaves. The faces of boxes are known. Other boundaries are
+traced once more; at each, the extinction steps from its value on one side to that on the other, and the step moves along the
+ray.
 """
 
 from __future__ import annotations
@@ -20,18 +22,18 @@ import mitsuba as mi
 from mivol.transport.media.body import Body
 from mivol.transport.media.channels import spectrum
 from mivol.transport.media.medium_view import Part
-from mivol.transport.media.ray_intervals import OWN_SURFACE, RaySegment, revisit_media
+from mivol.transport.media.ray_intervals import OWN_SURFACE, MediumInterval, RaySegment, revisit_media
 from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.traversal.grid_walk import Cell, Nodes, walk
 from mivol.transport.traversal.interpolation import GAUSS, gauss_points
 from mivol.transport.traversal.lattice import Lattice, Segment, clip
 from mivol.transport.traversal.ray_spawning import distance_along, spawn_ray
 
-__all__ = ["follow_lamp", "shadow_of_moving", "tau_by_end"]
+__all__ = ["follow_emitter", "shadow_of_moving", "tau_by_end"]
 
 
 ASIDE = 1e-5
-"""How far beside a surface its two sides are looked at, as a share of the distance: ten times its rounding."""
+"""How far before and behind a surface the extinction is read, as a fraction of the distance: ten times the rounding of it."""
 
 
 def tau_by_end(media: SceneMedia, ray_segment: RaySegment, tau: list[mi.Float], active: mi.Bool) -> list[mi.Vector3f]:
@@ -39,7 +41,7 @@ def tau_by_end(media: SceneMedia, ray_segment: RaySegment, tau: list[mi.Float], 
 
     Args:
         media: boundaries and media.
-        ray_segment: the shadow ray; its length is the distance to the lamp.
+        ray_segment: the shadow ray; its length is the distance to the emitter.
         tau: its optical depth, each channel.
         active: lanes to differentiate.
 
@@ -50,14 +52,15 @@ def tau_by_end(media: SceneMedia, ray_segment: RaySegment, tau: list[mi.Float], 
     """
     d, length = ray_segment.ray.d, dr.maximum(ray_segment.length, 1e-30)
 
-    def visit(total: list, body: Body, t0: mi.Float64, t1: mi.Float64, on: mi.Bool) -> list:
+    def visit(total: list, interval: MediumInterval) -> list:
+        body, t0, t1, on = interval.body, interval.t0, interval.t1, interval.active
         scale = dr.detach(body.view.scale) * body.area(d)
         for part in body.view.parts:
             rows = media.vectors([scale * v for v in _by_part(body, part, ray_segment, t0, t1, on)])
             total = [a + b for a, b in zip(total, rows, strict=True)]
         if body.view.microflakes is None:
             return total
-        # The area that flakes show turns with the ray, whose direction moves across itself.
+        # The projected area of microflakes changes with the direction of the ray, which moves perpendicular to itself.
         turn = body.facing(d) * dr.rcp(dr.maximum(dr.square(body.area(d)), 1e-30)) - d
         own = body.optical_depth(ray_segment.ray, t0, t1, media.channels, on)
         return [a + t * turn for a, t in zip(total, own, strict=True)]
@@ -72,7 +75,7 @@ def tau_by_end(media: SceneMedia, ray_segment: RaySegment, tau: list[mi.Float], 
 def shadow_of_moving(
     media: SceneMedia, ray_segment: RaySegment, tau: list[mi.Float], end: mi.Point3f, active: mi.Bool
 ) -> mi.Spectrum | float:
-    """The number 1, with the derivative of a shadow by the lamp's end of its ray, where that moves."""
+    """The number 1 with the derivative of exp(-tau) / exp(-tau) by the end of the shadow ray, where that has a derivative."""
     if not dr.grad_enabled(end):
         return 1.0
     moved = end - dr.detach(end)
@@ -83,14 +86,14 @@ def shadow_of_moving(
 
 @dr.syntax
 def _steps(media: SceneMedia, ray_segment: RaySegment, active: mi.Bool) -> list[mi.Vector3f]:
-    """L times the part of the derivative by which boundaries that are traced shift, one vector a channel."""
+    """L times the term of the derivative from boundaries that are traced, one vector a channel."""
     # -- State ------------------------------------------------------------------------------------------------------------
     ray = ray_segment.ray
     onward = mi.Ray3f(ray)  #                        the ray from the last surface on
     going = mi.Bool(active)
     total = [dr.zeros(mi.Vector3f, dr.width(ray)) for _ in range(media.channels)]
 
-    while dr.hint(going, label="boundaries on the way to a lamp"):
+    while dr.hint(going, label="boundaries on the way to an emitter"):
         hit = media.scene.ray_intersect(onward, mi.RayFlags.All, False, going)
         t = distance_along(ray, hit)
         going &= hit.is_valid() & (t < ray_segment.length * OWN_SURFACE)
@@ -103,13 +106,13 @@ def _steps(media: SceneMedia, ray_segment: RaySegment, active: mi.Bool) -> list[
 def _add_step(
     total: list[mi.Vector3f], media: SceneMedia, ray: mi.Ray3f, hit: mi.SurfaceInteraction3f, t: mi.Float, crosses: mi.Bool
 ) -> list[mi.Vector3f]:
-    """Add the step of the extinction at a surface, from a little before it to a little behind it."""
+    """Add the term of one boundary, from the extinctions a little before and a little behind it."""
     slope = dr.dot(hit.n, ray.d)
     face = mi.Vector3f(hit.n) * dr.rcp(dr.select(slope != 0, slope, 1))
     for side, to, sign in ((-ray.d, 1 - ASIDE, -1.0), (ray.d, 1 + ASIDE, 1.0)):
         medium = hit.target_medium(side)
         for body in media.traced:
-            # Where the ray only grazes the surface (slope 0) both sides name the same medium: the two terms cancel.
+            # Where the ray grazes the surface (slope 0), both sides are in the same medium and the two terms cancel.
             on = crosses & (medium == mi.MediumPtr(body.view.medium))
             sigma = body.extinction_at(ray, t * to, media.channels, on)
             total = [v + dr.select(on, sign * t * x * face, 0) for v, x in zip(total, sigma, strict=True)]
@@ -117,7 +120,7 @@ def _add_step(
 
 
 def _by_part(body: Body, part: Part, ray_segment: RaySegment, t0: mi.Float64, t1: mi.Float64, on: mi.Bool) -> list[mi.Vector3f]:
-    """L times the derivative of one part's integral, but for the growth of the ray; one vector a channel."""
+    """L times the derivative of one part's optical depth without the first term; one vector a channel."""
     ray, end = ray_segment.ray, mi.Float64(ray_segment.length)
     if part.lattice is None:
         value = dr.detach(part.constant)
@@ -134,13 +137,13 @@ def _by_part(body: Body, part: Part, ray_segment: RaySegment, t0: mi.Float64, t1
     high = tuple(n - 0.5 for n in lattice.res[::-1])
     leaves, enters = b < end * (1 - 1e-6), a > 0
     if body.box is None:
-        # Of a grid that is cut by a boundary that is traced, only the own faces.
+        # A traced boundary that cuts the grid has terms of its own; of the grid's faces only those inside it count.
         leaves, enters = leaves & (b < t1 * (1 - 2 * ASIDE)), enters & (a > t0 * (1 + 2 * ASIDE))
     for t, sign, moves in ((b, -1.0, leaves), (a, 1.0, enters)):
         here = inside & moves
         face = _face(lattice.from_world, (-0.5,) * 3, high, ray, t)
         if body.cuts_grids:
-            # The boundary cuts the grid where its own faces are nearer than those of the grid.
+            # The ray leaves (or enters) the medium through a face of its boundary where the boundary cuts the grid.
             cut = dr.abs(t - (t1 if sign < 0 else t0)) <= 1e-6 * dr.abs(t)
             face = dr.select(cut, _face(body.rows, (0.0,) * 3, (1.0,) * 3, ray, t), face)
         values = body.values_at(part, ray, mi.Float(t), here)
@@ -194,10 +197,10 @@ def _face(rows: list, low: tuple, high: tuple, ray: mi.Ray3f, t: mi.Float64) -> 
     return normal
 
 
-def follow_lamp(
+def follow_emitter(
     emitter: mi.EmitterPtr, it: mi.Interaction3f, u: mi.Point2f, direct: mi.DirectionSample3f, active: mi.Bool
 ) -> mi.DirectionSample3f:
-    """The direction of a lamp of one position or direction, with the derivative of its place."""
+    """The sample of an emitter of one position or direction, with its derivative by that; other samples stay as they are."""
     moved, _ = emitter.sample_direction(it, u, active)
     if not dr.grad_enabled(moved.p):
         return direct

@@ -15,9 +15,20 @@ __all__ = ["phase_context", "phase_pdf", "sample_phase"]
 def sample_phase(
     media: SceneMedia, phase: mi.PhaseFunctionPtr, mei: mi.MediumInteraction3f, samples: EventSamples, active: mi.Bool
 ) -> tuple[mi.Vector3f, mi.Spectrum, mi.Float]:
-    """A direction, value over density, and density of a phase function; where it has flakes the direction is drawn evenly.
+    """Sample a direction from a phase function.
 
-    Mitsuba 3.9.1 draws directions of flakes from another density than ``eval_pdf`` tells (6 % of a picture in a constant sky).
+    Microflake phase functions are sampled uniformly over the sphere, since Mitsuba 3.9.1 samples them with another density than
+    its ``eval_pdf`` returns (an error of 6 % in an image under a constant sky).
+
+    Args:
+        media: of the scene.
+        phase: the phase function of each lane.
+        mei: the point, and the direction towards the camera.
+        samples: random numbers.
+        active: lanes to sample.
+
+    Returns:
+        The direction, value over density [1], and density [1/sr].
     """
     wo, weight, pdf = phase.sample(phase_context(), mei, samples.component, samples.direction, active)
     if media.has_microflakes:
@@ -31,7 +42,7 @@ def sample_phase(
 def phase_pdf(
     media: SceneMedia, phase: mi.PhaseFunctionPtr, mei: mi.MediumInteraction3f, d: mi.Vector3f, active: mi.Bool
 ) -> mi.Float:
-    """Density of :func:`sample_phase`."""
+    """Density [1/sr] of the direction ``d`` in :func:`sample_phase`."""
     _, pdf = phase.eval_pdf(phase_context(), mei, d, active)
     return dr.select(_has_microflakes(phase), INV_FOUR_PI, pdf) if media.has_microflakes else pdf
 

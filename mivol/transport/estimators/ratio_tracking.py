@@ -1,14 +1,14 @@
-r"""Transmittance by looking here and there: unbiased, and cheaper than every cell where a grid is fine.
+r"""Residual ratio tracking: an unbiased estimate of transmittance, which is cheaper than a walk of all cells in a fine grid.
 
 .. math:: \hat T = e^{-\int m\,dt} \prod_j \left(1 - \frac{\sigma(x_j) - m}{\kappa\,(M - m)}\right)
 
-Of each block of cells its least value m and its largest value M are known. What m takes from a ray is known exactly; of what
-lies above it the ray learns at points that a Poisson process of the rate kappa (M - m) puts on it (residual ratio tracking).
-At such a point one of the eight corners of the cell is read, drawn by its trilinear weight: the product is linear in each of
-its factors, so the mean is that of the trilinear value.
+For each block of cells the smallest value m (a control extinction, the minorant) and the largest value M (the majorant) are
+known. The optical depth of m is exact. The residual above m is estimated at the points x_j of a Poisson process with the rate
+kappa (M - m). At each of them one of the eight corners of the cell is read, drawn with its trilinear weight as probability: the
+estimate is linear in each factor, so its mean is that with the interpolated value.
 
-Conventions. Every factor lies in [0, 1], for m and M bound the corners themselves: an estimate is never above exp(-int m), and
-its variance never above T (exp(-int m) - T). A block without extinction costs one step and no look-up.
+Conventions. m and M bound the values at the corners too, so every factor lies in [0, 1]. An estimate is therefore at most
+exp(-int m), and its variance at most T (exp(-int m) - T). An empty block costs one step and no look-up.
 
 References: Novak et al. 2014 (residual ratio tracking); Szirmay-Kalos et al. 2011 (blocks); Hofmann et al. 2021 (a corner in
 place of eight).
@@ -21,7 +21,8 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from mivol.transport.traversal.block_ranges import BLOCK_SHIFT, largest
+from mivol.numerics import largest_of
+from mivol.transport.traversal.block_ranges import BLOCK_SHIFT
 from mivol.transport.traversal.grid_walk import Cell, walk
 from mivol.transport.traversal.lattice import Lattice, Segment
 from mivol.transport.traversal.random_numbers import draw_pcg32
@@ -30,15 +31,15 @@ __all__ = ["residual_ratio_tracking"]
 
 
 FAINT = 0.1
-"""Estimate below which a ray is ended by chance: what little it would bring is not worth its look-ups."""
+"""Estimate below which Russian roulette may end a ray, to save look-ups for light that hardly counts."""
 
 LOOKUP_RATE = 4.0
-"""Look-ups for each optical depth 1 between the least and the largest value."""
+"""kappa: look-ups for each unit of residual optical depth int (M - m) dt."""
 
 
 @dataclass
 class _Coarse:
-    """The blocks as cells of a lattice of their own, for a walk."""
+    """The blocks as cells of a coarse lattice, for :func:`walk`."""
 
     res: tuple[int, int, int]
     empty_distances: None = None
@@ -46,13 +47,13 @@ class _Coarse:
 
 @dataclass
 class Tracked:
-    """What has been learnt of a ray.
+    """State of a tracked ray.
 
     Attributes:
-        tau: optical depth [1] of the least values, of each channel.
-        weight: product of the factors, of each channel.
-        ahead: optical depth of the process to the next point.
-        rng: state of the generator.
+        tau: optical depth [1] of the minorant so far, of each channel.
+        weight: product of the factors so far, of each channel.
+        ahead: integral of the rate of the Poisson process to its next point.
+        rng: state of the random number generator.
     """
 
     tau: list[mi.Float]
@@ -71,7 +72,7 @@ def residual_ratio_tracking(
     """Estimate the transmittance of a segment for each channel.
 
     Args:
-        lattice: the grid, and its blocks.
+        lattice: the grid, with its ``block_ranges``.
         segment: from :func:`mivol.transport.traversal.lattice.clip`.
         scale: factor on the values.
         rng: state of the generator.
@@ -93,11 +94,11 @@ def residual_ratio_tracking(
     def visit(state: Tracked, cell: Cell, on: mi.Bool) -> tuple[Tracked, mi.Float]:
         least, above = blocks.at(cell.lower + 1, on)
         density = rate * above
-        # -- How far: to the end of the block, or to the next point -----------------------------------------------------
+        # -- To the end of the block, or to the next point of the process -----------------------------------------------
         meets = on & (state.ahead < density * cell.dt)
         dt = dr.select(meets, dr.minimum(state.ahead / density, cell.dt), cell.dt)
         tau = [t + dr.select(on, scale * m * dt, 0) for t, m in zip(state.tau, least, strict=True)]
-        # -- What is there: one corner of the cell ----------------------------------------------------------------------
+        # -- The factor, from one corner of the cell there --------------------------------------------------------------
         near = dr.fma(speed, dt, cell.frac)
         inside = dr.select(ahead, near, 1 - near) * (1 << BLOCK_SHIFT)
         rng, u = draw_pcg32(state.rng, 5)
@@ -113,14 +114,14 @@ def residual_ratio_tracking(
         fresh = -dr.log(u[3])
         left = dr.select(meets, fresh, dr.maximum(state.ahead - dr.select(on, density * dt, 0), 0))
         # -- Roulette ---------------------------------------------------------------------------------------------------
-        seen = largest([w * dr.exp(-t) for w, t in zip(weight, tau, strict=True)])
+        seen = largest_of([w * dr.exp(-t) for w, t in zip(weight, tau, strict=True)])
         lives = u[4] * FAINT < seen
         lift = dr.select(lives, dr.maximum(1, FAINT / seen), 0)
         weight = [dr.select(on, w * lift, w) for w in weight]
         return Tracked(tau, weight, left, rng), dt
 
     def is_dark(state: Tracked) -> mi.Bool:
-        return largest(state.weight) == 0
+        return largest_of(state.weight) == 0
 
     width = dr.width(segment.t0)
     rng, u = draw_pcg32(rng, 1)
@@ -135,7 +136,7 @@ def residual_ratio_tracking(
 
 
 def _coarse_segment(segment: Segment) -> Segment:
-    """A segment among the cells as one among the blocks: exact, for a block is a power of two of cells."""
+    """A segment in the coordinates of the blocks; exact, since the edge of a block is a power of two."""
     share = 2.0**-BLOCK_SHIFT
     cell = segment.cell + 1
     block = cell >> BLOCK_SHIFT

@@ -1,4 +1,4 @@
-"""A point of a segment that scatters light once: where it is, its coefficients, and what arrives there."""
+"""A scattering event on a segment: its position, its coefficients, and the direct light there."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ __all__ = ["Scattering", "at_event", "medium_event_interaction", "sigma_s_at", "
 
 @dataclass
 class Scattering:
-    """A point of a stretch that scatters, and the light that arrives there.
+    """A scattering event, and the direct light there.
 
     Attributes:
-        event: where.
-        mei: the point, as Mitsuba's phase functions want it.
-        gain: throughput and transmittance to the camera, over the density of the point.
+        event: its position.
+        mei: the same as Mitsuba's interaction.
+        gain: throughput times transmittance to the camera, over the density of the position.
         direct: the shadow rays; their values carry derivatives where these are asked for.
         sigma_s: scattering coefficient [1/length] there.
-        chance: a number in [0, 1), for the choice of one of the shadow rays.
+        chance: a number in [0, 1), which chooses the shadow ray whose derivative is computed.
     """
 
     event: MediumEvent
@@ -39,12 +39,12 @@ class Scattering:
 
     @property
     def weight(self) -> mi.Spectrum:
-        """What a unit of sigma_s would send to the camera."""
+        """Radiance at the camera for sigma_s = 1: the light is ``sigma_s * weight``."""
         return self.gain * sum((dr.detach(a.value) for a in self.direct), mi.Spectrum(0))
 
 
 def medium_event_interaction(media: SceneMedia, ray: mi.Ray3f, event: MediumEvent) -> mi.MediumInteraction3f:
-    """An event as Mitsuba's phase functions want it."""
+    """An event as the interaction that Mitsuba's phase functions are evaluated at."""
     mei = medium_interaction(ray, event.t)
     for index, body in enumerate(media.bodies):
         mei.medium = dr.select(event.on & (event.body == index), mi.MediumPtr(body.view.medium), mei.medium)

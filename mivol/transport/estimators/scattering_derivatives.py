@@ -1,12 +1,15 @@
-r"""Derivatives of a segment that scatters once: of the light that its media turn to the camera, and of what they let through.
+r"""Derivatives of single scattering along a segment: of the in-scattered light and of the segment's transmittance.
 
-The light is :math:`\int T \sigma_s L_d\,dt`. A probe, drawn where there is no extinction too, estimates its derivatives with
-respect to the coefficients at the probe's point (what a unit of ``sigma_s`` there sends) and in front of it (which dims what
-the point sends), and those of what arrives there: emitters, phase function, albedo, and the media along one shadow ray.
+The light is :math:`\int T \sigma_s L_d\,dt`. A probe is a scattering event that is drawn where there is no extinction too. It
+estimates the derivatives with respect to the coefficients at its own position (the weight of the event), with respect to those
+in front of it (which dim the event), and those of the direct light: emitters, phase function, albedo, and the media along one
+shadow ray.
 
-A control variate takes a part of that over whose derivative is exact. With one grid and an albedo in a box it is a source
-function on a coarse lattice, swept cell by cell together with what the segment dims (:mod:`.control_sweep`); elsewhere, under a
-constant sky, it is one number a ray: its light :math:`S (1 - T)` has the derivative :math:`S T` all along the ray.
+A control variate is subtracted whose own derivative is exact. With one grid and an albedo in a box it is a source function on a
+coarse lattice, swept cell by cell together with the segment's transmittance (:mod:`.control_sweep`). Elsewhere, under a
+constant
+sky, it is one source function for the whole ray: its light :math:`S (1 - T)` has the derivative :math:`S T` by the optical
+depth of any part of the ray.
 
 Conventions. ``dL`` is d loss / d light and ``dlog`` d loss / d log T, which is dL times the light behind the segment.
 """
@@ -19,7 +22,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mivol.numerics import phi1
-from mivol.transport.estimators.control_sweep import Probe, Tracks, sweep
+from mivol.transport.estimators.control_sweep import ControlSweep, Probe, Tracks
 from mivol.transport.estimators.grid_control import GridControl
 from mivol.transport.estimators.scattering import Scattering, at_event, sigma_t_at
 from mivol.transport.estimators.segment import PathSegment
@@ -34,15 +37,15 @@ __all__ = ["ScatteredSegment"]
 
 @dataclass
 class ScatteredSegment:
-    """A segment, the probe that was drawn on it, and the control variates of its derivatives.
+    """A segment, the probe that was drawn on it, and the control variate of its derivatives (a ``SharedSegment``).
 
     Attributes:
         media: of the scene.
         segment: ray and throughput.
         end: where it ends.
-        tau: its optical depth, each channel.
-        probe: the point that scatters, and what arrives there.
-        grid_control, constant_control: source functions [radiance] whose part is exact; at most one of them is not None.
+        tau: its optical depth [1], each channel.
+        probe: the scattering event, and the direct light there.
+        grid_control, constant_control: source functions [radiance] of the control variate; at most one of them is not None.
         active: lanes that are followed.
         dL: d loss / d light, once it is known.
     """
@@ -57,10 +60,10 @@ class ScatteredSegment:
     active: mi.Bool
     dL: mi.Spectrum | None = None
 
-    # -- What arrives at the point -------------------------------------------------------------------------------------
+    # -- Direct light at the event -------------------------------------------------------------------------------------
 
     def vjp_light(self, dL: mi.Spectrum) -> None:
-        """Derivatives of what arrives: of its emitter and the phase function, of what dims it on its way, of the albedo."""
+        """Derivatives of the direct light: emitters and phase function, the media along a shadow ray, and the albedo."""
         probe = self.probe
         carried = dL * probe.sigma_s * probe.gain
         for sample in probe.direct:
@@ -79,18 +82,18 @@ class ScatteredSegment:
                     dr.backward_from(dr.select(here, dL * probe.weight * sigma_t * albedo, 0))
 
     def jvp_light(self) -> mi.Spectrum:
-        dL = self._jvp_arriving()
+        dL = self._jvp_direct()
         if self.grid_control is not None:
             return dL + self._jvp_by_sweep()
         dL += self._jvp_coefficients()
         return dL - self._constant_source_behind() * self.jvp_transmittance()
 
-    def _jvp_arriving(self) -> mi.Spectrum:
-        """The tangent of what lights the point, dims its light and turns it: the transpose of :meth:`vjp_light`."""
+    def _jvp_direct(self) -> mi.Spectrum:
+        """The tangent from emitters, phase function, shadow ray and albedo: the transpose of :meth:`vjp_light`."""
         probe = self.probe
         carried = probe.sigma_s * probe.gain
         with dr.resume_grad():
-            # One sum: each pass through the graph clears the edges behind it, which the terms share.
+            # The terms are differentiated as one sum: they share edges of the graph, and each traversal clears those behind it.
             value = sum((dr.select(s.on, carried * s.value, 0) for s in probe.direct), mi.Spectrum(0))
             for body, on in at_event(self.media, probe.event):
                 if body.view.albedo is not None:
@@ -116,7 +119,7 @@ class ScatteredSegment:
         return -jvp_optical_depth(self.media, self._passed, self.active)
 
     def _vjp_coefficients(self) -> None:
-        """Derivatives of the coefficients: at the point, and in front of it."""
+        """Derivatives with respect to the coefficients at the event, and in front of it."""
         media, ray, probe, dL = self.media, self.segment.ray, self.probe, self.dL
         source, lost = self._constant_source_at()
         for body, on in at_event(media, probe.event):
@@ -141,7 +144,7 @@ class ScatteredSegment:
             dL += dr.select(on, (probe.weight * albedo - source) * tangent, 0)
         return dr.select(probe.event.on, dL, 0)
 
-    # -- A source function on a lattice --------------------------------------------------------------------------------
+    # -- Control variate: a source function on a lattice ---------------------------------------------------------------
 
     def _jvp_by_sweep(self) -> mi.Spectrum:
         one, lit = mi.Spectrum(1), dr.select(self.segment.scatters, self.segment.beta, 0)
@@ -151,7 +154,7 @@ class ScatteredSegment:
     def _sweep(
         self, shares: list[list[tuple[int, mi.Float]]], rest: mi.Spectrum, dL: mi.Spectrum, tangent: bool
     ) -> list[mi.Float]:
-        """Derivatives with the control: those of its light in every cell exactly, what is left by the probe."""
+        """Derivatives with the control variate: exact for its light in every cell; the probe estimates the difference."""
         media, probe, point = self.media, self.probe, self.probe.event
         (body,) = media.bodies
         S = self.grid_control.at_point(body, self.segment.ray, point.t, point.on)
@@ -162,21 +165,21 @@ class ScatteredSegment:
         rows = [colours(x) if tangent else by_channel(x, media.channels) for x in asked]
         tracks = Tracks(shares, rows[2], tangent)
         found = Probe(point.begin, point.t, rows[0], rows[1], point.on)
-        return sweep(media, self.grid_control, self.segment.ray, self.end.t, self.tau, tracks, found, self.active)
+        return ControlSweep(media, self.grid_control, self._passed, self.tau, tracks, found).differentiate(self.active)
 
-    # -- A source function that is one number --------------------------------------------------------------------------
+    # -- Control variate: one source function for the whole ray --------------------------------------------------------
 
     @property
     def _constant_source(self) -> mi.Spectrum:
-        """The source that is known [radiance], the same all along a ray: less comes through where more is taken.
+        """The source function of the control variate [radiance], the same all along a ray.
 
-        Measured: 0.01 to 0.06 of the variance without it in thin media, 0.3 to 0.5 in those of a few optical depths, 0.8
-        beyond.
+        It is scaled by (1 - T) / tau, since less light of a constant sky reaches the inside of a thicker medium. (Measured:
+        0.01 to 0.06 of the variance without it in thin media, 0.3 to 0.5 in those of a few optical depths, 0.8 beyond.)
         """
         return self.constant_control * spectrum([phi1(t) for t in self.tau])
 
     def _constant_source_at(self) -> tuple[mi.Spectrum, mi.Spectrum]:
-        """What a unit of extinction at the point would send, and what its extinction sends, of the source that is known."""
+        """The control variate's weight of the event for an extinction of 1, and for its actual extinction."""
         if self.constant_control is None:
             return mi.Spectrum(0), mi.Spectrum(0)
         source, sigma_t, event = self.probe.gain * self._constant_source, mi.Spectrum(0), self.probe.event
@@ -185,7 +188,7 @@ class ScatteredSegment:
         return source, source * sigma_t
 
     def _constant_source_behind(self) -> mi.Spectrum:
-        """What the source that is known would have sent from behind the segment: the exact part of its derivative."""
+        """T S of the whole segment: the exact derivative of the control variate by the optical depth of any part of it."""
         if self.constant_control is None:
             return mi.Spectrum(0)
         lit = self.segment.beta * transmittance(self.tau) * self._constant_source
@@ -199,12 +202,16 @@ class ScatteredSegment:
 
     @property
     def _in_front(self) -> RaySegment:
-        """The ray up to the point."""
+        """The ray up to the event."""
         return RaySegment.upto(self.segment.ray, self.segment.medium, self.probe.event.t)
 
 
 def _choose_shadow_ray(probe: Scattering) -> tuple[RaySegment, mi.Spectrum, mi.Bool]:
-    """One of the shadow rays of a point, drawn by what it brings, and that over the probability of drawing it."""
+    """Choose one of the shadow rays of an event, in proportion to its light.
+
+    Returns:
+        The shadow ray, its value over the probability of choosing it, and the lanes that have one.
+    """
     first = probe.direct[0]
     if len(probe.direct) == 1:
         return first.ray_segment, dr.detach(first.value), first.on
@@ -225,7 +232,7 @@ def _choose_shadow_ray(probe: Scattering) -> tuple[RaySegment, mi.Spectrum, mi.B
 
 
 def _sums(weight: mi.Spectrum, channels: int, of_control: int) -> list[list[tuple[int, mi.Float]]]:
-    """What each channel of the control counts in each channel of the extinction, summed over colours."""
+    """For each channel of the extinction, the (channel of S, factor) pairs of the control variate, summed over colours."""
     if of_control == 1:
         return [[(0, w)] for w in by_channel(weight, channels)]
     if channels == 1:

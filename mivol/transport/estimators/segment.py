@@ -1,10 +1,11 @@
-r"""What a path segment through media does to the light behind it: it adds light of its own and lets a share through.
+r"""The protocol of segment estimators: light that media add along a path segment, and the transmittance of the segment.
 
 .. math:: L = L_{media} + T\, L_{behind}
 
-A segment runs from one surface to the next. A :class:`SegmentEstimator` says how its light is found: not at all
-(:class:`Absorption`), by one scattering, by emission. Both parts carry their derivatives (:mod:`.contribution`); where one walk
-back serves both, they share a :class:`SharedSegment`, whose light is always told before its transmittance.
+A segment runs from one opaque surface to the next. A :class:`SegmentEstimator` computes its light: none (:class:`Absorption`),
+single scattering, or emission. Light and transmittance carry their derivatives as a term and a factor (:mod:`.contribution`).
+Where one walk of the cells gives the derivatives of both, they share a :class:`SharedSegment`; the walk reports the term first,
+then the factor.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ __all__ = [
 ]
 
 PICTURE, REVERSE, FORWARD = "picture", "reverse", "forward"
-"""What a path is followed for: its radiance, the gradients of what it met, or the tangent of its radiance."""
+"""Purposes of a walk: the radiance, the gradients of its parameters, or its tangent."""
 
 
 @dataclass
@@ -43,9 +44,10 @@ class PathSegment:
     """The segment that lies ahead of a path.
 
     Attributes:
-        ray, medium: where it begins, and what surrounds its origin.
-        beta: throughput to there.
-        scatters: lanes whose path may turn once more.
+        ray: world space, unit direction.
+        medium: the medium around its origin.
+        beta: throughput of the path to there.
+        scatters: lanes whose path may scatter once more.
         samples: random numbers that the estimator has drawn; None where it needs none.
     """
 
@@ -58,13 +60,13 @@ class PathSegment:
 
 @dataclass
 class SegmentEstimate:
-    """What was found along a segment.
+    """The result of a segment estimator.
 
     Attributes:
-        end: where it ends.
-        tau: optical depth [1] of each channel to there.
-        light: what its media add; None where they add nothing.
-        transmittance: what they let through of the light behind.
+        end: where the segment ends.
+        tau: its optical depth [1], of each channel.
+        light: the light of its media; None where they add none.
+        transmittance: the factor of the light behind.
     """
 
     end: SegmentEnd
@@ -74,12 +76,16 @@ class SegmentEstimate:
 
 
 class SegmentEstimator(Protocol):
-    """How the light of a segment is found. ``directions`` tells the film which lanes may share out the unit square."""
+    """How the light of a segment is estimated.
+
+    Attributes:
+        directions: the layout of lanes that its directions need (:func:`mivol.transport.path.film.film_passes`).
+    """
 
     directions: str
 
     def draw(self, sampler: mi.Sampler, active: mi.Bool, strata: Strata | None) -> Any:
-        """Draw the random numbers of one segment."""
+        """Draw the random numbers of one segment; whatever is returned becomes ``PathSegment.samples``."""
 
     def estimate(self, segment: PathSegment, purpose: str, active: mi.Bool) -> SegmentEstimate:
         """Follow a segment to its end, for PICTURE, REVERSE or FORWARD."""
@@ -92,7 +98,7 @@ class SegmentEstimator(Protocol):
 
 
 class Transmittance:
-    """The factor of a segment whose media only take light away."""
+    """The factor of a segment: the exact transmittance of its media."""
 
     def __init__(self, media: SceneMedia, segment: RaySegment, active: mi.Bool) -> None:
         self.media, self.segment, self.active = media, segment, active
@@ -105,11 +111,11 @@ class Transmittance:
 
 
 class Absorption:
-    """Media add nothing: the exact optical depth, and no random number.
+    """The segment estimator for media that only absorb: exact transmittance, no light.
 
     Args:
         media: of the scene.
-        drawn_by: an estimator whose random numbers are drawn all the same, so that a path that is followed again turns alike.
+        drawn_by: an estimator whose random numbers are drawn and not used, so that a replay with it follows the same path.
 
     Bias: that of the walk, none but rounding. Variance: none. Cost: one walk of each medium.
     """
@@ -136,10 +142,10 @@ class Absorption:
 
 
 class SharedSegment(Protocol):
-    """Derivatives of a segment's light and transmittance that are found in one walk.
+    """Derivatives of a segment's light and of its transmittance that come from one walk of its cells.
 
     Attributes:
-        dL: d loss / d light, noted when the light was told.
+        dL: d loss / d light, known once the term was reported.
     """
 
     dL: mi.Spectrum | None

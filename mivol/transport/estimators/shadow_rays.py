@@ -1,6 +1,6 @@
-"""Light along a shadow ray: what media and surfaces that transmit light undeviated let through.
+"""Shadow rays: the transmittance of media, and of surfaces that transmit part of the light undeviated.
 
-The transmittance is exact, or an unbiased estimate where the blocks of grids are known
+The transmittance is exact, or an unbiased estimate by residual ratio tracking in grids whose block ranges are known
 (:mod:`mivol.transport.estimators.ratio_tracking`).
 """
 
@@ -10,10 +10,16 @@ import drjit as dr
 import mitsuba as mi
 
 from mivol.transport.estimators.ratio_tracking import residual_ratio_tracking
-from mivol.transport.media.body import Body
 from mivol.transport.media.channels import as_rows
 from mivol.transport.media.optical_depth import sum_optical_depth, transmittance
-from mivol.transport.media.ray_intervals import OWN_SURFACE, MediumVisitor, RaySegment, SegmentEnd, visit_media
+from mivol.transport.media.ray_intervals import (
+    OWN_SURFACE,
+    MediumInterval,
+    MediumVisitor,
+    RaySegment,
+    SegmentEnd,
+    visit_media,
+)
 from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.traversal.lattice import clip
 
@@ -21,16 +27,25 @@ __all__ = ["DARK", "light_through", "shadow_ray"]
 
 
 DARK = 30.0
-"""Optical depth from which a shadow ray is dark: 1e-13 of a lamp's light is below the rounding of everything beside it."""
+"""Optical depth beyond which light is neglected: 1e-13 of it is below the rounding of everything that it is added to."""
 
 
 def light_through(
     media: SceneMedia, ray: mi.Ray3f, medium: mi.MediumPtr, active: mi.Bool, rng: mi.UInt32 | None = None
 ) -> tuple[SegmentEnd, list[mi.Float] | None, mi.Spectrum]:
-    """Where a ray of light ends, its optical depth for each channel, and the share of it that gets there.
+    """Follow a ray to the first opaque surface, and find its transmittance.
 
-    It passes veils. Optical depth is summed no further than to ``DARK`` in a grid. With ``rng`` the share is an unbiased
-    estimate where blocks of grids are known (:mod:`mivol.transport.estimators.ratio_tracking`), and the optical depth is None.
+    Args:
+        media: media and surfaces of the scene.
+        ray: world space, unit direction.
+        medium: the medium around its origin.
+        active: lanes to follow.
+        rng: state of a random number generator; where it is given, and block ranges of some grid are known, the transmittance
+            is an unbiased estimate.
+
+    Returns:
+        Where the ray ends; its optical depth [1] for each channel, in a grid at most a little above ``DARK``, or None where the
+        transmittance was estimated; and the transmittance of media and surfaces.
     """
     if rng is not None and media.has_block_ranges:
         start = ([mi.Float(1) for _ in range(media.channels)], rng)
@@ -42,23 +57,25 @@ def light_through(
 
 
 def _dim(ray: mi.Ray3f) -> MediumVisitor:
-    """The visitor that multiplies transmittances along ``ray``, estimated where blocks are known."""
+    """The visitor that multiplies the transmittances of media along ``ray``."""
 
-    def visit(state: tuple, body: Body, t0: mi.Float, t1: mi.Float, active: mi.Bool) -> tuple:
+    def visit(state: tuple, interval: MediumInterval) -> tuple:
         T, rng = state
-        own, rng = _estimate_transmittance(body, ray, t0, t1, len(T), active, rng)
+        own, rng = _estimate_transmittance(interval, ray, len(T), rng)
         return [a * b for a, b in zip(T, own, strict=True)], rng
 
     return visit
 
 
 def _estimate_transmittance(
-    body: Body, ray: mi.Ray3f, t0: mi.Float, t1: mi.Float, channels: int, active: mi.Bool, rng: mi.UInt32
+    interval: MediumInterval, ray: mi.Ray3f, channels: int, rng: mi.UInt32
 ) -> tuple[list[mi.Float], mi.UInt32]:
-    """Transmittance [1] of each channel of a body, and the state of the generator.
+    """Transmittance [1] of one medium for each channel, and the next state of the generator.
 
-    Estimated in grids whose blocks are known; exact in all else, which is walked to the optical depth ``DARK``.
+    It is estimated by residual ratio tracking in grids whose block ranges are known, and exact in all other parts, which are
+    walked to the optical depth ``DARK``.
     """
+    body, t0, t1, active = interval.body, interval.t0, interval.t1, interval.active
     tracked = [p for p in body.view.parts if p.lattice is not None and p.lattice.block_ranges is not None]
     others = [p for p in body.view.parts if not any(p is q for q in tracked)]
     T = [dr.exp(-t) for t in body.optical_depth(ray, t0, t1, channels, active, others, DARK)]
@@ -78,11 +95,18 @@ def shadow_ray(
     active: mi.Bool,
     rng: mi.UInt32 | None = None,
 ) -> tuple[RaySegment, mi.Bool, list[mi.Float] | None, mi.Spectrum]:
-    """Go from a point to a point of a lamp; ``rng`` as in :func:`light_through`.
+    """Follow the ray from a point to a point of an emitter.
+
+    Args:
+        media: media and surfaces of the scene.
+        start: where the ray begins.
+        medium: the medium around that point.
+        direct: Mitsuba's sample of the emitter.
+        active, rng: as in :func:`light_through`.
 
     Returns:
-        The way, whether no opaque surface stands in it, its optical depth for each channel, and the share of the light that
-        media and veils let through.
+        The shadow ray, whether no opaque surface blocks it, and its optical depth and transmittance as in
+        :func:`light_through`.
     """
     length = dr.norm(direct.p - start)
     ray = mi.Ray3f(start, dr.normalize(direct.p - start), length, direct.time, mi.Color0f())

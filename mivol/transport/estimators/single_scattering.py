@@ -1,10 +1,10 @@
-r"""One scattering along a path segment: the light that a medium turns towards the camera, at points that are drawn.
+r"""Single scattering along a path segment: Monte Carlo integration of the in-scattered radiance.
 
 .. math:: L = \int_0^D T(t)\,\sigma_s(x_t)\,L_d(x_t, \omega)\,dt \approx \frac{T \sigma_s L_d}{p(t)}
 
-Conventions. The segment is walked once, for its optical depth and for the points at which it scatters. ``weight`` is what a
-unit of sigma_s at a point would send to the camera: the light is ``sigma_s * weight``, and its derivative with respect to
-sigma_s is the weight itself, so nothing is divided by an extinction or by an albedo that may be 0.
+Conventions. The segment is walked once, for its optical depth and for the points at which light is scattered. The weight of a
+point is T L_d / p, the radiance at the camera for a scattering coefficient of 1: the light is ``sigma_s * weight``, and its
+derivative with respect to sigma_s is the weight itself, so nothing is divided by an extinction or by an albedo that may be 0.
 
 References: the equation of transfer with the in-scattered radiance of one order (Chandrasekhar 1960).
 """
@@ -19,9 +19,14 @@ import mitsuba as mi
 from mivol.transport.estimators.constant_control import find_constant_control
 from mivol.transport.estimators.contribution import TrackedTerm
 from mivol.transport.estimators.direct_lighting import DirectLighting
-from mivol.transport.estimators.distance_reservoir import Candidate, Reservoir, fill_reservoir, start_reservoir
+from mivol.transport.estimators.distance_reservoir import (
+    Candidate,
+    DistanceProposal,
+    Reservoir,
+    fill_reservoir,
+    start_reservoir,
+)
 from mivol.transport.estimators.distance_sampling import sample_distance
-from mivol.transport.estimators.emitters import ChosenEmitter
 from mivol.transport.estimators.event_samples import EventSamples
 from mivol.transport.estimators.grid_control import CameraOrigins, GridControl, build_grid_control, takes_grid_control
 from mivol.transport.estimators.scattering import Scattering, medium_event_interaction, sigma_s_at
@@ -45,29 +50,36 @@ __all__ = ["SingleScattering"]
 
 
 PROBE_DEPTH = 4.0
-"""Optical depth that a probe for derivatives adds over a body (measured: flat between 2 and 8)."""
+"""Optical depth that a probe for derivatives adds over a medium (measured: the variance is flat between 2 and 8)."""
 
 
 @dataclass
 class _Flight:
-    """A segment that has been walked for one emitter: where it ends, and the candidates that it keeps."""
+    """A segment that has been walked for one emitter.
+
+    Attributes:
+        end: where it ends.
+        reservoir: the candidates of scattering points.
+        proposal: that the reservoir was filled with.
+    """
 
     end: SegmentEnd
     reservoir: Reservoir
-    chosen: ChosenEmitter
+    proposal: DistanceProposal
 
 
 class SingleScattering:
-    """Scatters the light of a segment once, at points drawn in proportion to what they take from the camera's ray.
+    """The segment estimator of single scattering, at points drawn by weighted reservoir sampling.
 
     Args:
-        direct: estimates the light that arrives at a point.
-        count: points of a segment, in pictures; derivatives have one.
-        visibility_cache: where emitters shine, in pictures; None where that is not known.
+        direct: estimator of direct lighting at a point.
+        count: scattering points on a segment, in images; derivatives have one.
+        visibility_cache: rough visibility of emitters, which distances in images are drawn by; None for none.
 
-    Bias: none. Variance: that of the distance in the light that reaches it, of one direction to an emitter and one of the phase
-    function; the points of a segment share the emitter. Cost: one walk of the segment, one of each shadow ray; where several
-    media lie along a ray, one to each point.
+    Bias: none.
+    Variance: that of the distance, of one direction to an emitter and of one of the phase function; the points of a segment
+        share the emitter. It need not be finite near a point light.
+    Cost: one walk of the segment, and one of each shadow ray; where several media lie along a ray, one walk to each point.
     """
 
     def __init__(self, direct: DirectLighting, count: int = 1, visibility_cache: VisibilityCache | None = None) -> None:
@@ -78,14 +90,14 @@ class SingleScattering:
 
     @property
     def directions(self) -> str:
-        """Directions of the phase function are worth strata over tiles of pixels; those to small lamps are not."""
+        """Layout of the film's lanes: strata over tiles of pixels pay for phase samples, and not for small emitters."""
         return "tiled" if self.emitters.samples_phase else "spread"
 
     def draw(self, sampler: mi.Sampler, active: mi.Bool, strata: Strata | None) -> EventSamples:
         return self.emitters.draw_samples(sampler, active, strata)
 
     def prepare_derivatives(self, ray: mi.Ray3f) -> None:
-        """Find a control variate for derivatives along camera rays, once."""
+        """Find a control variate for the derivatives along camera rays; later calls keep the first one."""
         if takes_grid_control(self.media):
             if self.grid_control is None:
                 self.grid_control = build_grid_control(self.direct, self.media.bodies[0], CameraOrigins.of(ray))
@@ -100,7 +112,7 @@ class SingleScattering:
             return self._picture(segment, active)
         flight = self._walk(segment, 1, PROBE_DEPTH, active)
         samples = segment.samples.part(mi.UInt32(0), 1)
-        found = self._light_up(segment, flight, flight.reservoir.candidates[0], samples, PROBE_DEPTH, active)
+        found = self._scatter(segment, flight, flight.reservoir.candidates[0], samples, active)
         tau, controls = flight.reservoir.tau, (self.grid_control, self.constant_control)
         shared = ScatteredSegment(self.media, segment, flight.end, tau, found, *controls, active)
         light = SegmentLight(shared, dr.select(found.event.on, found.sigma_s * found.weight, 0), is_replayed=False)
@@ -113,7 +125,7 @@ class SingleScattering:
 
         def light_of(number: mi.UInt32) -> mi.Spectrum:
             candidate, samples = flight.reservoir.of(number), segment.samples.part(number, count)
-            found = self._light_up(segment, flight, candidate, samples, 0.0, active)
+            found = self._scatter(segment, flight, candidate, samples, active)
             return dr.select(found.event.on, found.sigma_s * found.weight, 0)
 
         if count == 1:
@@ -131,35 +143,22 @@ class SingleScattering:
         return SegmentEstimate(flight.end, flight.reservoir.tau, term, Transmittance(self.media, passed, active))
 
     def _walk(self, segment: PathSegment, count: int, probe_depth: float, active: mi.Bool) -> _Flight:
-        """Walk a segment to its end and keep candidates of it, for an emitter that was drawn before."""
+        """Choose an emitter, walk the segment to its end, and fill a reservoir with candidates of scattering points."""
         ray, samples = segment.ray, segment.samples
-        chosen = self.emitters.choose(ray, samples.lamp)
+        chosen = self.emitters.choose(ray, samples.which_emitter)
         reservoir = start_reservoir(self.media, samples.piece, dr.width(ray), count)
-        visit = fill_reservoir(self.media, ray, chosen, self.visibility_cache, probe_depth)
-        end, reservoir = visit_media(self.media, ray, segment.medium, visit, reservoir, active)
-        return _Flight(end, reservoir, chosen)
+        proposal = DistanceProposal(self.media, ray, chosen, self.visibility_cache, probe_depth)
+        end, reservoir = visit_media(self.media, ray, segment.medium, fill_reservoir(proposal), reservoir, active)
+        return _Flight(end, reservoir, proposal)
 
-    def _light_up(
-        self,
-        segment: PathSegment,
-        flight: _Flight,
-        candidate: Candidate,
-        samples: EventSamples,
-        probe_depth: float,
-        active: mi.Bool,
+    def _scatter(
+        self, segment: PathSegment, flight: _Flight, candidate: Candidate, samples: EventSamples, active: mi.Bool
     ) -> Scattering:
-        """Choose a point in a candidate, and look from there to the emitters."""
-        media, ray, chosen, probes = self.media, segment.ray, flight.chosen, probe_depth > 0
-        event = sample_distance(
-            media,
-            ray,
-            candidate,
-            flight.reservoir.total,
-            chosen.equiangular,
-            probe_depth,
-            samples.inside,
-            active & segment.scatters,
-        )
+        """Draw a scattering point in a candidate, and estimate the direct light there."""
+        media, ray, proposal = self.media, segment.ray, flight.proposal
+        chosen, probes = proposal.chosen, proposal.probe_depth > 0
+        on = active & segment.scatters
+        event = sample_distance(proposal, candidate, flight.reservoir.total, samples.inside, on)
         mei = medium_event_interaction(media, ray, event)
         tau = event.tau
         if not media.is_single:
@@ -169,4 +168,4 @@ class SingleScattering:
         gain = dr.select(event.on, segment.beta * transmittance(tau) / event.pdf, 0)
         vertex = MediumVertex(media, mei)
         direct = self.direct.in_medium(vertex, chosen, samples, probes, event.on, estimates=not probes)
-        return Scattering(event, mei, gain, direct, sigma_s_at(media, ray, event, mei), samples.choice)
+        return Scattering(event, mei, gain, direct, sigma_s_at(media, ray, event, mei), samples.which_shadow_ray)

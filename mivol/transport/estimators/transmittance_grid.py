@@ -1,6 +1,7 @@
-"""Optical depth towards emitters at the nodes of a lattice, in place of shadow rays: biased, and the bias is measured.
+"""A transmittance grid: optical depth towards emitters at the nodes of a lattice, which replaces shadow rays, with a measured
+bias.
 
-Conventions. Optical depth is stored and interpolated, never a transmittance, which would be too bright between nodes (by 54 %
+Conventions. Optical depth is stored and interpolated. An interpolated transmittance would be too bright between nodes (by 54 %
 for a step of 2 in optical depth).
 """
 
@@ -22,28 +23,28 @@ __all__ = ["TransmittanceGrid", "build_transmittance_grid", "measure_transmittan
 
 
 INSET = 1e-5
-"""How far inside the box the nodes in its faces look, as a share of it."""
+"""Distance inside the box from which the nodes in its faces send shadow rays, as a fraction of the box."""
 
 
 @dataclass
 class TransmittanceGrid:
-    """Optical depth towards each lamp at the nodes of a lattice over a grid's box, in place of shadow rays.
+    """Optical depth towards each emitter at the nodes of a lattice over a grid's box.
 
     Attributes:
-        tau: flat (nodes in z, y, x; lamps; channels).
-        nodes: their number along z, y, x; the first and the last lie in the faces of the box.
+        tau: flat (nodes in z, y, x; emitters; channels).
+        nodes: number of nodes along z, y, x; the first and the last lie in the faces of the box.
         lattice: the grid.
-        lamps, channels: of ``tau``.
+        emitters, channels: their numbers in ``tau``.
     """
 
     tau: mi.Float
     nodes: tuple[int, int, int]
     lattice: Lattice
-    lamps: int
+    emitters: int
     channels: int
 
-    def transmittance(self, p: mi.Point3f, lamp: int, active: mi.Bool) -> mi.Spectrum:
-        """exp(-tau), tau interpolated: a transmittance that is interpolated itself is too bright between nodes."""
+    def transmittance(self, p: mi.Point3f, number: int, active: mi.Bool) -> mi.Spectrum:
+        """exp(-tau) towards one emitter, with tau interpolated trilinearly at a point."""
         z, y, x = self.nodes
         q = []
         for row, n, m in zip(self.lattice.from_world, self.lattice.res[::-1], (x, y, z), strict=True):
@@ -54,22 +55,22 @@ class TransmittanceGrid:
         node = [((low[2] + (b >> 2)) * y + low[1] + (b >> 1 & 1)) * x + low[0] + (b & 1) for b in range(8)]
         rows = []
         for c in range(self.channels):
-            offset = lamp * self.channels + c
-            corners = [dr.gather(mi.Float, self.tau, k * (self.lamps * self.channels) + offset, active) for k in node]
+            offset = number * self.channels + c
+            corners = [dr.gather(mi.Float, self.tau, k * (self.emitters * self.channels) + offset, active) for k in node]
             rows.append(dr.exp(-interpolate(corners, frac)))
         return spectrum(rows)
 
 
 def build_transmittance_grid(media: SceneMedia, emitters: SceneEmitters, cells: int = 1) -> TransmittanceGrid:
-    """Walk from every node of a lattice to every lamp.
+    """Integrate the optical depth from every node of a lattice to every emitter.
 
     Args:
-        media: surfaces and a single body with one grid.
+        media: surfaces, and a single medium with one grid.
         emitters: of the scene, each with one position or direction.
-        cells: of the grid, between two nodes.
+        cells: number of cells of the grid between two nodes.
 
     Bias: O(h^2) of tau in the distance h of nodes; a cell across the edge of an opaque shadow leaks light.
-    Cost: one shadow ray a node and lamp.
+    Cost: one shadow ray a node and emitter.
     """
     (body,) = media.bodies
     lattice = next(p.lattice for p in body.view.parts if p.lattice is not None)
@@ -77,25 +78,25 @@ def build_transmittance_grid(media: SceneMedia, emitters: SceneEmitters, cells: 
     z, y, x = nodes
     index = dr.arange(mi.UInt32, z * y * x)
     at = (index % x, (index // x) % y, index // (x * y))
-    # Just inside: a shadow ray in the plane of a face is outside the box.
+    # A little inside, since a shadow ray in the plane of a face counts as outside the box.
     u = [dr.clip(mi.Float(a) / (m - 1), INSET, 1 - INSET) for a, m in zip(at, (x, y, z), strict=True)]
     p = lattice.place(mi.Vector3f(*u))
-    lamps, k = len(emitters.sampled), media.channels
-    tau = dr.zeros(mi.Float, z * y * x * lamps * k)
-    for number, lamp in enumerate(emitters.sampled):
-        for c, row in enumerate(tau_towards(media, body, p, lamp)):
-            dr.scatter(tau, row, (index * lamps + number) * k + c)
+    count, k = len(emitters.sampled), media.channels
+    tau = dr.zeros(mi.Float, z * y * x * count * k)
+    for number, emitter in enumerate(emitters.sampled):
+        for c, row in enumerate(tau_towards(media, body, p, emitter)):
+            dr.scatter(tau, row, (index * count + number) * k + c)
     dr.eval(tau)
-    return TransmittanceGrid(tau, nodes, lattice, lamps, k)
+    return TransmittanceGrid(tau, nodes, lattice, count, k)
 
 
 def measure_transmittance_bias(
     media: SceneMedia, emitters: SceneEmitters, grid: TransmittanceGrid, points: int = 1 << 14
 ) -> tuple[float, float]:
-    """Compare a light grid with exact shadow rays at points of the grid's box, counted by extinction.
+    """Compare a transmittance grid with exact shadow rays at points of the grid's box.
 
     Returns:
-        Mean of T_grid - T_exact, and its root mean square, over points and lamps.
+        Mean of T_grid - T_exact, and its root mean square, over points and emitters; points are weighted by their extinction.
     """
     (body,) = media.bodies
     k = mi.Float64(dr.arange(mi.UInt32, points)) + 0.5
@@ -104,8 +105,8 @@ def measure_transmittance_bias(
     ray = mi.Ray3f(p, mi.Vector3f(0, 0, 1), dr.inf, mi.Float(0), mi.Color0f())
     weight = body.extinction_at(ray, mi.Float(0), 1, mi.Bool(True))[0]
     total, first, second = dr.sum(weight), mi.Float(0), mi.Float(0)
-    for number, lamp in enumerate(emitters.sampled):
-        exact = tau_towards(media, body, p, lamp)
+    for number, emitter in enumerate(emitters.sampled):
+        exact = tau_towards(media, body, p, emitter)
         off = grid.transmittance(p, number, mi.Bool(True))[0] - dr.exp(-exact[0])
         first += dr.sum(weight * off)
         second += dr.sum(weight * off * off)

@@ -1,7 +1,7 @@
-"""A point at which light turns: on a surface, by its BSDF, or in a medium, by its phase function; the same to direct lighting.
+"""Vertices of a path: a point of a surface with its BSDF, or of a medium with its phase function, with one interface.
 
-Conventions. ``eval`` is the BSDF times the cosine, or the phase function [1/sr]; ``pdf`` the density that directions are drawn
-from at the vertex [1/sr], which multiple importance sampling weighs emitter samples against.
+Conventions. ``eval`` is the BSDF times the cosine, or the phase function [1/sr]. ``pdf`` is the density of directions that are
+sampled at the vertex [1/sr]; multiple importance sampling weighs emitter samples against it.
 """
 
 from __future__ import annotations
@@ -20,18 +20,18 @@ __all__ = ["MediumVertex", "SurfaceVertex", "Vertex"]
 
 
 class Vertex(Protocol):
-    """Where light turns, and how."""
+    """A point at which light is scattered."""
 
     interaction: mi.Interaction3f
 
     def leave(self, p: mi.Point3f) -> tuple[mi.Point3f, mi.MediumPtr]:
-        """Where a ray towards ``p`` begins, and the medium around that point."""
+        """The origin of a ray from the vertex towards ``p``, and the medium around that origin."""
 
     def eval(self, d: mi.Vector3f, active: mi.Bool) -> mi.Spectrum:
-        """How much light from the direction ``d`` turns to where the path came from, with its derivatives."""
+        """BSDF times cosine, or phase function, for light from the direction ``d`` [1/sr], with its derivatives."""
 
     def pdf(self, d: mi.Vector3f, active: mi.Bool) -> mi.Float:
-        """Density of the direction ``d`` among those that are drawn at the vertex."""
+        """Density [1/sr] of the direction ``d`` when directions are sampled at the vertex."""
 
 
 @dataclass
@@ -42,7 +42,7 @@ class SurfaceVertex:
         media: of the scene.
         interaction: the point.
         bsdf: of the surface there.
-        medium: what surrounds the end of the ray that met it.
+        medium: the medium around the end of the ray that hit it.
     """
 
     media: SceneMedia
@@ -64,7 +64,7 @@ class SurfaceVertex:
 
 @dataclass
 class MediumVertex:
-    """A point of a medium; ``interaction.medium`` is what surrounds it."""
+    """A point of the medium ``interaction.medium``."""
 
     media: SceneMedia
     interaction: mi.MediumInteraction3f

@@ -1,11 +1,11 @@
-r"""Optical depth towards emitters for each block of a grid: which cells lie in the light.
+r"""A visibility cache: rough transmittance towards emitters for each block of a grid, which guides distance sampling.
 
 .. math:: w_b = e^{-\overline{\tau}_l(x_b)} + w_0
 
-An emitter with one position or one direction lights a medium through its own shadow, which a walk along a camera ray does not
-see. Its optical depth from the middle of each block of cells tells where scattering is worth a look: distances are drawn in
-proportion. It is summed over a grid as coarse as the blocks, and shadow rays stay exact, so nothing is biased; where a block
-lies across the edge of a shadow the floor ``w_0`` bounds the weights.
+Light of an emitter with one position or one direction reaches only parts of a dense medium, and the extinction along a camera
+ray does not tell which. The optical depth from the middle of each block of cells to the emitter does, so distances are drawn in
+proportion to w_b. The optical depth is integrated over a grid that is as coarse as the blocks. Shadow rays stay exact, so
+nothing is biased. The floor ``w_0`` bounds the sample weights where a block lies across the edge of a shadow.
 """
 
 from __future__ import annotations
@@ -28,33 +28,41 @@ __all__ = ["VisibilityCache", "build_visibility_cache", "tau_towards"]
 
 
 FLOOR = 0.02
-"""Weight of a block in full shadow: a lit point in it counts 50 times at most."""
+"""w_0, the weight of a block in full shadow: the sample weight of a lit point in it is at most 50 times as large."""
 
-SHARE = 0.2
-"""Most shadow rays of the lattice, in those of the image (measured: blocks of 2 cells take 2.7 times the variance off a
-directional light's image of smoke, blocks of 4 nothing; blocks of 4 half of a point light's on a CT of 256^3 that 8 leave)."""
+RAY_FRACTION = 0.2
+"""Largest number of shadow rays of the cache, as a fraction of those of the image. The smallest blocks that keep to it are
+chosen. (Measured: under a directional light on smoke, blocks of 2 cells divide the variance by 2.7, blocks of 4 do nothing;
+under a point light on a CT of 256^3, blocks of 4 halve the variance that blocks of 8 leave.)"""
 
 COARSEST = 3
-"""log2 of the largest block: shadows change from one cell to the next, and larger ones tell nothing."""
+"""log2 of the edge of the largest blocks [cells]; shadows vary too much within larger ones."""
 
-LAMPS = 8
-"""Most lamps that are looked at one by one."""
+MOST_EMITTERS = 8
+"""Largest number of emitters for which a cache is built."""
 
 
 @dataclass
 class VisibilityCache:
-    """Weight of each block of cells for each lamp: flat (blocks in z, y, x; lamps)."""
+    """Weights of blocks of cells.
+
+    Attributes:
+        weights: flat (blocks in z, y, x; emitters) [1].
+        blocks: number of blocks along z, y, x.
+        shift: log2 of the edge of a block [cells].
+        emitters: number of emitters.
+    """
 
     weights: mi.Float
     blocks: tuple[int, int, int]
     shift: int
-    lamps: int
+    emitters: int
 
-    def at(self, lower: mi.Vector3i, lamp: mi.UInt32, active: mi.Bool) -> mi.Float:
-        """The weight of the cell behind a node, for the lamp of each lane."""
+    def at(self, lower: mi.Vector3i, number: mi.UInt32, active: mi.Bool) -> mi.Float:
+        """The weight of the cell with the lower node ``lower``, for the emitter of each lane."""
         _, y, x = self.blocks
         b = (lower + 1) >> self.shift
-        index = mi.UInt32((b.z * y + b.y) * x + b.x) * self.lamps + lamp
+        index = mi.UInt32((b.z * y + b.y) * x + b.x) * self.emitters + number
         return dr.gather(mi.Float, self.weights, index, active)
 
 
@@ -65,30 +73,30 @@ def build_visibility_cache(
     occupied: float | None,
     take: Callable[[Lattice, int, bool], CoarseGrid],
 ) -> VisibilityCache | None:
-    """Look from the blocks of a grid to the lamps.
+    """Integrate the optical depth from the blocks of a grid to the emitters.
 
     Args:
         media: surfaces and media.
         emitters: of the scene.
-        rays: shadow rays of the image, which decide how fine a lattice pays.
-        occupied: share of the grid's blocks that hold anything, where no light is wanted from the others; None: from all.
-        take: :func:`coarsen_grid`, or what keeps its answers.
+        rays: number of shadow rays of the image, which decides how fine a cache pays.
+        occupied: fraction of the grid's blocks that are not empty, if only those are needed; None for all blocks.
+        take: :func:`coarsen_grid`, or a function that remembers its results.
 
     Returns:
-        The weights; None where no lamp has one position or direction, several bodies or grids lie along a ray, or the image is
-        too small for it to pay.
+        The cache; None where no emitter has one position or direction, there are several media or grids or more than
+        ``MOST_EMITTERS`` emitters, or the image is too small for a cache to pay.
 
-    Cost: one shadow ray through the coarse grid a block and lamp.
+    Cost: one shadow ray through the coarse grid for each block and emitter.
     """
     grids = [p.lattice for b in media.bodies for p in b.view.parts if p.lattice is not None]
-    sharp = [k for k, e in enumerate(emitters.sampled) if int(e.flags()) & int(mi.EmitterFlags.Delta)]
-    if not media.is_single or len(grids) != 1 or not sharp or len(emitters.sampled) > LAMPS:
+    delta = [k for k, e in enumerate(emitters.sampled) if int(e.flags()) & int(mi.EmitterFlags.Delta)]
+    if not media.is_single or len(grids) != 1 or not delta or len(emitters.sampled) > MOST_EMITTERS:
         return None
     (lattice,), (body,) = grids, media.bodies
-    # Where a constant lies under the grid no block is empty.
+    # A medium that has a constant beside its grid has no empty blocks.
     lists = occupied is not None and len(body.view.parts) == 1
-    share = (occupied if lists else 1) * len(sharp)
-    fits = [shift for shift in range(COARSEST + 1) if _count(lattice, shift) * share <= SHARE * rays]
+    rays_of_block = (occupied if lists else 1) * len(delta)
+    fits = [shift for shift in range(COARSEST + 1) if _count(lattice, shift) * rays_of_block <= RAY_FRACTION * rays]
     if not fits:
         return None
     shift = fits[0]
@@ -99,9 +107,10 @@ def build_visibility_cache(
     weights = dr.full(mi.Float, 1, n * k)
     if dr.width(index):
         far = _with_grid(media, coarse.lattice)
-        for lamp in sharp:
-            seen = _look(far, lattice, blocks, shift, index, emitters.sampled[lamp])
-            dr.scatter(weights, seen, index * k + lamp)
+        p = _middles(lattice, blocks, shift, index)
+        for number in delta:
+            tau = tau_towards(far, far.bodies[0], p, emitters.sampled[number])
+            dr.scatter(weights, dr.exp(-sum(tau) / len(tau)) + FLOOR, index * k + number)
     dr.eval(weights)
     return VisibilityCache(weights, blocks, shift, k)
 
@@ -113,7 +122,7 @@ def _count(lattice: Lattice, shift: int) -> int:
 
 
 def _with_grid(media: SceneMedia, lattice: Lattice) -> SceneMedia:
-    """The media with another grid in the place of theirs."""
+    """The media, with the grid of their only medium replaced."""
     (body,) = media.bodies
     parts = [p if p.lattice is None else replace(p, lattice=lattice) for p in body.view.parts]
     other, bodies = copy.copy(media), [Body(replace(body.view, parts=parts), body.box)]
@@ -121,26 +130,28 @@ def _with_grid(media: SceneMedia, lattice: Lattice) -> SceneMedia:
     return other
 
 
-def _look(media: SceneMedia, lattice: Lattice, blocks: tuple, shift: int, index: mi.UInt32, lamp: mi.Emitter) -> mi.Float:
-    """Weights of blocks for one lamp."""
+def _middles(lattice: Lattice, blocks: tuple[int, int, int], shift: int, index: mi.UInt32) -> mi.Point3f:
+    """The middles of blocks in the world."""
     _, y, x = blocks
     at = (index % x, (index // x) % y, index // (x * y))
-    # Block b holds the cells from b 2^shift - 1 on, of which the outermost are half as wide; its middle, as a share of the box,
-    # may lie outside in the last one.
+    # Block b holds the cells from b 2^shift - 1 on, of which the outermost are half as wide. As a fraction of the box, the
+    # middle of the last block may lie outside; it is clamped.
     half = 0.5 * (1 << shift) - 0.5
     u = [
         dr.clip((mi.Float(a) * (1 << shift) + half) / n, 0.25 / n, 1 - 0.25 / n)
         for a, n in zip(at, lattice.res[::-1], strict=True)
     ]
-    tau = tau_towards(media, media.bodies[0], lattice.place(mi.Vector3f(*u)), lamp)
-    return dr.exp(-sum(tau) / len(tau)) + FLOOR
+    return lattice.place(mi.Vector3f(*u))
 
 
-def tau_towards(media: SceneMedia, body: Body, p: mi.Point3f, lamp: mi.Emitter) -> list[mi.Float]:
-    """Optical depth from points to a lamp; what an opaque surface hides is dark."""
+def tau_towards(media: SceneMedia, body: Body, p: mi.Point3f, emitter: mi.Emitter) -> list[mi.Float]:
+    """Optical depth [1] of each channel from points in a medium to an emitter of one position or direction.
+
+    It is at most ``DARK``, and ``DARK`` where an opaque surface hides the emitter.
+    """
     it = dr.zeros(mi.Interaction3f, dr.width(p))
     it.p = p
     medium = dr.select(dr.full(mi.Bool, True, dr.width(p)), mi.MediumPtr(body.view.medium), None)
-    direct, _ = lamp.sample_direction(it, mi.Point2f(0.5), mi.Bool(True))
+    direct, _ = emitter.sample_direction(it, mi.Point2f(0.5), mi.Bool(True))
     _, clear, tau, _ = shadow_ray(media, p, medium, direct, mi.Bool(True))
     return [dr.select(clear, dr.minimum(t, DARK), DARK) for t in tau]

@@ -1,369 +1,47 @@
-r"""What a ray meets in its order, and what each thing adds: sums over the media along a ray that each cell in front dims.
+r"""Emission-absorption compositing of all media along a ray, with the tangent and the transpose of the sum.
 
-.. math:: N = \sum_i T_1 \cdots T_{i-1} N_i, \qquad N \leftarrow N_i + T_i N
+.. math:: N = \sum_i T_1 \cdots T_{i-1} N_i
 
-A rule says what a cell adds (N_i: the distance at which it stops a ray, the light that it sends); the chain puts cells, bodies
-and surfaces in the order of the ray, with the tangent and the transpose of the sum.
+Each medium is integrated by itself (:mod:`mivol.transport.line_integrals.body_sweep`). Media are disjoint, so the middles of
+their intervals put them in their order along the ray, and the optical depth of those in front dims each of them.
 
-Conventions. A body is swept from its far end to its near end: what lies behind a cell is known when it is passed, and no sum
-is undone. The transpose repeats the very walk that measured the body, so optical depths taken off a float64 sum
-are those that went into it. Rows are what is followed (channels, or colours), then their tangents where these are asked for.
+Conventions. Media in boxes are integrated once and kept in a list; intervals that are found by tracing come in the order of the
+ray, in a loop, and only their sums are kept. Rows are channels or colours; where tangents are asked for, their rows follow.
 
-References: the sum is the discrete equation of transfer (Max 1995); a sweep back to front is Porter & Duff's ``over``.
+References: Max 1995 (the discrete emission-absorption integral).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import Protocol
+from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
 
-from mivol.errors import MivolError
-from mivol.numerics import one_minus_exp
-from mivol.transport.media.body import Body
-from mivol.transport.media.ray_intervals import RaySegment, revisit_media, visit_boxed_media
-from mivol.transport.media.scene_media import SceneMedia
-from mivol.transport.media.summed_extinction import SummedExtinction, share_cells
-from mivol.transport.traversal.grid_walk import Cell, walk
-from mivol.transport.traversal.interpolation import node_weights
-from mivol.transport.traversal.lattice import Lattice, Segment, clip, slab
-
-__all__ = ["CellIntegral", "Composite", "Integrand", "RayPiece", "composite_ray", "vjp_composite"]
-
-
-@dataclass
-class CellIntegral:
-    """What a cell does to a ray that enters it: optical depth, transmittance, and N, of one row.
-
-    ``dtau`` and ``dN`` are their derivatives with respect to the extinction at each point that it was given at.
-    """
-
-    tau: mi.Float
-    T: mi.Float
-    N: mi.Float
-    dtau: list[mi.Float]
-    dN: list[mi.Float]
-
-
-@dataclass
-class RayPiece:
-    """A stretch of a ray in a body that is taken as one: a cell, or a stretch of constant extinction.
-
-    ``a`` is the distance of its near end from the ray's origin and ``dt`` its length [length]; only a constant may be infinite.
-    """
-
-    body: Body
-    ray: mi.Ray3f
-    a: mi.Float
-    dt: mi.Float
-    on: mi.Bool
-
-
-class Integrand(Protocol):
-    """What a chain sums.
-
-    Attributes:
-        rows: how many sums are followed, a multiple of the channels of the extinction.
-        points: where a cell wants its extinction, as fractions of its length, nearest to the camera first.
-        asked, way_out: what a sentence that refuses a medium says was asked for, and how to do without.
-    """
-
-    rows: int
-    points: tuple[float, ...]
-    asked: str
-    way_out: str
-
-    def cell(self, site: RayPiece, sigma: list[list[mi.Float]]) -> list[CellIntegral]:
-        """Each row of a cell, from the extinction [row][point]."""
-
-    def constant(self, site: RayPiece, sigma: list[mi.Float]) -> list[CellIntegral]:
-        """Each row of a stretch of constant extinction (one derivative)."""
-
-    def vjp(self, site: RayPiece, sigma: list[list[mi.Float]], weight: list[mi.Float]) -> None:
-        """Hand ``weight`` (d loss / d N of each row) on to whatever else N depends on; extinction as in :meth:`cell`."""
-
-    def jvp(self, site: RayPiece, sigma: list[list[mi.Float]]) -> list[mi.Float]:
-        """Tangent of N of each row by whatever else it depends on."""
-
-    def least(self, t1: mi.Float) -> mi.Float | float:
-        """A lower bound of what a unit of opacity behind ``t1`` may add."""
-
-
-def _check(body: Body, integrand: Integrand) -> None:
-    """Refuse grids that do not share their cells, and an extinction that depends on the direction."""
-    if body.view.microflakes is not None:
-        raise MivolError(f"{integrand.asked} and a medium has the phase function sggx; {integrand.way_out}.")
-    grids = [p.lattice for p in body.view.parts if p.lattice is not None]
-    for other in grids[1:]:
-        if not share_cells(grids[0], other):
-            raise MivolError(
-                f"{integrand.asked} and a medium sums grids of {grids[0].res} and {other.res} voxels (Z, Y, X); "
-                f"give both the same resolution and to_world, or {integrand.way_out}."
-            )
-
-
-# -- One body ----------------------------------------------------------------------------------------------------------
-
-
-@dataclass
-class _BodyIntegral:
-    """Rows of a stretch by itself: optical depth (in float64, since parts of it are taken off again) and N."""
-
-    tau: list[mi.Float64]
-    N: list[mi.Float]
-
-
-@dataclass
-class _BodyLayout:
-    """A stretch of a ray in a body: up to ``enter`` and from ``leave`` on there are only constants.
-
-    ``segment`` runs from ``leave`` to ``enter``; it and ``lattice`` are None where no grid says where the cells are.
-    """
-
-    t0: mi.Float64
-    enter: mi.Float64
-    leave: mi.Float64
-    t1: mi.Float64
-    lattice: Lattice | None
-    segment: Segment | None
-
-
-@dataclass
-class _BodySegment:
-    """The stretch [t0, t1] of a ray in a body, with its coefficients and, for a tangent, their changes."""
-
-    media: SceneMedia
-    integrand: Integrand
-    body: Body
-    ray: mi.Ray3f
-    lay: _BodyLayout
-    field: SummedExtinction
-    change: SummedExtinction | None
-    active: mi.Bool
-
-    @property
-    def has_constants(self) -> bool:
-        """Whether there is something outside the grid too, so that no block may be skipped."""
-        return self.body.view.emission_density is not None or any(p.lattice is None for p in self.body.view.parts)
-
-    @property
-    def reads(self) -> list:
-        """What the walk reads."""
-        return self.field.reads + (self.change.reads if self.change else [])
-
-    def site(self, cell: Cell, on: mi.Bool) -> RayPiece:
-        """A cell of the walk, which runs towards the camera."""
-        return RayPiece(
-            self.body, self.ray, mi.Float(self.lay.leave - mi.Float64(cell.s + cell.dt)), dr.select(on, cell.dt, 0), on
-        )
-
-    def outside(self, a: mi.Float64, b: mi.Float64) -> RayPiece:
-        """A stretch [a, b] of constants."""
-        on = self.active & (b > a)
-        return RayPiece(self.body, self.ray, mi.Float(dr.select(on, a, 0)), mi.Float(dr.select(on, b - a, 0)), on)
-
-    def points(self, cell: Cell) -> list[mi.Vector3f]:
-        """The points of a cell, the one nearest to the camera first: a sweep meets it last."""
-        return [dr.fma(cell.step, 1 - p, cell.frac) for p in self.integrand.points]
-
-    def along(self, field: SummedExtinction, corners: list, cell: Cell) -> list[list[mi.Float]]:
-        """[row][point] values of a field at the points of a cell."""
-        values = field.along(corners, self.points(cell))
-        points = [self.rows([row[p] for row in values]) for p in range(len(self.integrand.points))]
-        return [list(row) for row in zip(*points, strict=True)]
-
-    def changes(self, cell: Cell) -> list[list[mi.Float]]:
-        """[row][point] tangents of the extinction."""
-        values = self.along(self.change, cell.corners[len(self.field.reads) :], cell)
-        turns = self.field.slopes(cell.corners, self.points(cell))
-        return values if turns is None else [[v * turn for v, turn in zip(row, turns, strict=True)] for row in values]
-
-    def rows(self, channels: list[mi.Float]) -> list[mi.Float]:
-        """Numbers for each channel of a body, for each row of the rule."""
-        channels = self.media.rows(channels)
-        return [channels[r % len(channels)] for r in range(self.integrand.rows)]
-
-    def cell(self, cell: Cell, on: mi.Bool) -> tuple[RayPiece, list[list[mi.Float]], list[CellIntegral]]:
-        """A cell, its extinction, and what it does, each row."""
-        site = self.site(cell, on)
-        sigma = self.along(self.field, cell.corners[: len(self.field.reads)], cell)
-        return site, sigma, self.integrand.cell(site, sigma)
-
-    def constant(self, a: mi.Float64, b: mi.Float64) -> tuple[RayPiece, list[list[mi.Float]], list[CellIntegral]]:
-        """As :meth:`cell`, a stretch of constants."""
-        site, sigma = self.outside(a, b), self.rows(self.field.constant)
-        return site, [[s] * len(self.integrand.points) for s in sigma], self.integrand.constant(site, sigma)
-
-
-def _open(
-    media: SceneMedia,
-    integrand: Integrand,
-    body: Body,
-    ray: mi.Ray3f,
-    t0: mi.Float,
-    t1: mi.Float,
-    active: mi.Bool,
-    tangent: bool,
-) -> _BodySegment:
-    field = body.extinction(ray)
-    change = SummedExtinction(body.view.parts, body.tangents, mi.Float(1), linear=True) if tangent else None
-    return _BodySegment(media, integrand, body, ray, _lay_out(body, ray, t0, t1), field, change, active)
-
-
-def _lay_out(body: Body, ray: mi.Ray3f, t0: mi.Float, t1: mi.Float) -> _BodyLayout:
-    lattice = body.view.walked_lattice
-    start, end = mi.Float64(t0), mi.Float64(t1)
-    if lattice is None:
-        return _BodyLayout(start, end, end, end, None, None)
-    segment = clip(lattice, ray.o, -ray.d, -t1, -t0)
-    hit = segment.length > 0
-    leave = dr.select(hit, -segment.start, end)
-    return _BodyLayout(start, dr.select(hit, -segment.end, end), leave, end, lattice, segment)
-
-
-def _measure(body_segment: _BodySegment, skip: bool) -> _BodyIntegral:
-    """Rows of a stretch of a body; empty blocks may be skipped where nothing depends on the order of sums."""
-    integrand, lay, tangent = body_segment.integrand, body_segment.lay, body_segment.change is not None
-    rows = integrand.rows * (2 if tangent else 1)
-    integral = _BodyIntegral(_zeros(mi.Float64, rows), _zeros(mi.Float, rows))
-
-    def add_constant(integral: _BodyIntegral, a: mi.Float64, b: mi.Float64) -> _BodyIntegral:
-        site, sigma, integrals = body_segment.constant(a, b)
-        if not tangent:
-            return _put_in_front(integral, integrals, [], [])
-        changes = [[d] for d in body_segment.rows(body_segment.change.constant)]
-        return _put_in_front(integral, integrals, changes, integrand.jvp(site, sigma))
-
-    def visit(integral: _BodyIntegral, cell: Cell, on: mi.Bool) -> _BodyIntegral:
-        site, sigma, integrals = body_segment.cell(cell, on)
-        if not tangent:
-            return _put_in_front(integral, integrals, [], [])
-        changes = body_segment.changes(cell)
-        return _put_in_front(integral, integrals, changes, integrand.jvp(site, sigma))
-
-    if body_segment.has_constants and lay.lattice is not None:
-        integral = add_constant(integral, lay.leave, lay.t1)
-    if lay.lattice is not None:
-        alone = skip and len(body_segment.field.reads) == 1 and not body_segment.has_constants
-        lattice = lay.lattice if alone else replace(lay.lattice, empty_distances=None)
-        integral = walk(lattice, lay.segment, visit, integral, body_segment.reads, body_segment.active)
-    if body_segment.has_constants:
-        integral = add_constant(integral, lay.t0, lay.enter)
-    return integral
-
-
-def _put_in_front(
-    integral: _BodyIntegral, integrals: list[CellIntegral], changes: list[list[mi.Float]], pushed: list[mi.Float]
-) -> _BodyIntegral:
-    """A cell dims all that has been swept so far, and adds its own."""
-    tau = [t + mi.Float64(s.tau) for t, s in zip(integral.tau, integrals, strict=False)]
-    N = [dr.fma(s.T, n, s.N) for n, s in zip(integral.N, integrals, strict=False)]
-    for c, (s, change) in enumerate(zip(integrals, changes, strict=False)):
-        dtau, row = _dot(s.dtau, change), len(integrals) + c
-        tau.append(integral.tau[row] + mi.Float64(dtau))
-        N.append(_dot(s.dN, change) + pushed[c] + s.T * (integral.N[row] - dtau * integral.N[c]))
-    return _BodyIntegral(tau, N)
-
-
-@dataclass
-class _ReverseSweep:
-    """State of a reverse sweep: N of what was swept, optical depth still ahead, derivatives of the constants."""
-
-    N: list[mi.Float]
-    ahead: list[mi.Float64]
-    constant: list[mi.Float]
-
-
-def _vjp_body(body_segment: _BodySegment, weight: list[mi.Float], ahead: list[mi.Float64], behind: list[mi.Float]) -> None:
-    """Add ``weight`` dN of a stretch to the gradients of a body.
-
-    Args:
-        weight: d loss / d N of each row.
-        ahead: optical depth from the camera to the far end of the stretch.
-        behind: weight times N of what lies behind the stretch, as the camera sees it.
-    """
-    integrand, lay, body = body_segment.integrand, body_segment.lay, body_segment.body
-    sweep = _ReverseSweep(_zeros(mi.Float, integrand.rows), [mi.Float64(a) for a in ahead], _zeros(mi.Float, integrand.rows))
-    grids = [p for p in body.view.parts if p.lattice is not None]
-    outside: list[tuple] = []
-
-    def add_constant(sweep: _ReverseSweep, a: mi.Float64, b: mi.Float64) -> _ReverseSweep:
-        site, sigma, integrals = body_segment.constant(a, b)
-        sweep, _, weights = _pull_through(sweep, integrals, weight, behind)
-        outside.append((site, sigma, weights))
-        return sweep
-
-    def visit(sweep: _ReverseSweep, cell: Cell, on: mi.Bool) -> _ReverseSweep:
-        site, sigma, integrals = body_segment.cell(cell, on)
-        sweep, slopes, weights = _pull_through(sweep, integrals, weight, behind)
-        integrand.vjp(site, sigma, weights)
-        points = body_segment.points(cell)
-        corners = [node_weights(p, cell, lay.lattice.res) for p in points]
-        turns = body_segment.field.slopes(cell.corners, points)
-        if turns is not None:
-            slopes = [[g * turn for g, turn in zip(row, turns, strict=True)] for row in slopes]
-        by_point = [body_segment.media.sums([row[p] for row in slopes]) for p in range(len(corners))]
-        for part in grids:
-            body.add_to_grid(part, cell.lower, list(zip(by_point, corners, strict=True)), on)
-        return sweep
-
-    if body_segment.has_constants and lay.lattice is not None:
-        sweep = add_constant(sweep, lay.leave, lay.t1)
-    if lay.lattice is not None:
-        sweep = walk(
-            replace(lay.lattice, empty_distances=None), lay.segment, visit, sweep, body_segment.field.reads, body_segment.active
-        )
-    if body_segment.has_constants:
-        sweep = add_constant(sweep, lay.t0, lay.enter)
-        body.add_to_constants(body_segment.media.sums(sweep.constant), body_segment.active)
-    # After the walk: what Dr.Jit pulls back in a loop is lost where the same array was pulled to before it.
-    for site, sigma, weights in outside:
-        integrand.vjp(site, sigma, weights)
-
-
-def _pull_through(
-    sweep: _ReverseSweep, integrals: list[CellIntegral], weight: list[mi.Float], behind: list[mi.Float]
-) -> tuple[_ReverseSweep, list[list[mi.Float]], list[mi.Float]]:
-    """Pass a cell: its derivatives with respect to the extinction, [row][point], and those with respect to its own N."""
-    ahead = [a - mi.Float64(s.tau) for a, s in zip(sweep.ahead, integrals, strict=True)]
-    weights = [w * _transmittance(a) for w, a in zip(weight, ahead, strict=True)]
-    slopes = []
-    for s, P, n, b in zip(integrals, weights, sweep.N, behind, strict=True):
-        # More extinction here dims what was swept of this body, and what lies behind the body.
-        dims = dr.fma(P * s.T, n, b)
-        slopes.append([dr.fma(P, dN, -dims * dtau) for dN, dtau in zip(s.dN, s.dtau, strict=True)])
-    N = [dr.fma(s.T, n, s.N) for n, s in zip(sweep.N, integrals, strict=True)]
-    constant = [sum(g, total) for total, g in zip(sweep.constant, slopes, strict=True)]
-    return _ReverseSweep(N, ahead, constant), slopes, weights
-
-
-def _dot(a: list[mi.Float], b: list[mi.Float]) -> mi.Float:
-    return sum((x * y for x, y in zip(a, b, strict=True)), mi.Float(0))
-
-
-def _transmittance(tau: mi.Float64) -> mi.Float:
-    return dr.exp(-mi.Float(dr.maximum(tau, 0)))
-
-
-# -- All bodies along a ray --------------------------------------------------------------------------------------------
+from mivol.numerics import largest_of, one_minus_exp
+from mivol.transport.line_integrals.body_sweep import BodyIntegral, BodySweep, transmittance_of, zeros
+from mivol.transport.line_integrals.integrand import LineIntegral, check_media
+from mivol.transport.media.ray_intervals import MediumInterval, find_boxed_intervals, revisit_media
+
+__all__ = ["Composite", "composite_ray", "vjp_composite"]
 
 
 @dataclass
 class _Boxed:
-    """A body in a box as a ray crosses it.
+    """A medium in a box, as a ray crosses it.
 
-    ``middle`` tells which of two bodies lies in front, since they are disjoint; ``own`` is the body by itself, ``front`` the
-    optical depth in front of it, ``seen`` its N and ``behind`` that of all behind it as the camera sees them.
+    Attributes:
+        interval: of the ray.
+        middle: of the interval, which orders the media.
+        own: the medium by itself.
+        front: optical depth in front of it.
+        seen: its N as the camera sees it.
+        behind: N of all that lies behind it as the camera sees it.
     """
 
-    body: Body
-    t0: mi.Float64
-    t1: mi.Float64
-    on: mi.Bool
+    interval: MediumInterval
     middle: mi.Float64
-    own: _BodyIntegral
+    own: BodyIntegral
     front: list[mi.Float64]
     seen: list[mi.Float]
     behind: list[mi.Float]
@@ -371,9 +49,14 @@ class _Boxed:
 
 @dataclass
 class _Traced:
-    """What the stretches found by tracing, which come in the order of the ray, leave behind them.
+    """Sums over the intervals that were found by tracing.
 
-    ``fronts`` and ``behinds`` are what they add to those of each body in a box; ``reach`` is the largest N of an opaque one.
+    Attributes:
+        tau: their optical depth.
+        N: their sum as the camera sees it.
+        fronts: for each medium in a box, the optical depth of those in front of it.
+        behinds: for each medium in a box, N of those behind it as the camera sees it.
+        reach: the largest N that one of them would have if it were opaque.
     """
 
     tau: list[mi.Float64]
@@ -385,11 +68,11 @@ class _Traced:
 
 @dataclass
 class Composite:
-    """All that a ray meets.
+    """The sum along a ray, and what its transpose needs of it.
 
     Attributes:
-        boxes, traced: bodies in boxes, and stretches found by tracing.
-        tau: optical depth of the whole ray, each row (then its tangent).
+        boxes, traced: media in boxes, and intervals found by tracing.
+        tau: optical depth [1] of the whole ray, each row (then its tangent).
         last: what the end of the ray adds, as the camera sees it.
         N: the sum, each row (then its tangent).
     """
@@ -401,50 +84,35 @@ class Composite:
     N: list[mi.Float]
 
 
-def composite_ray(
-    media: SceneMedia,
-    integrand: Integrand,
-    ray_segment: RaySegment,
-    end: list[mi.Float],
-    active: mi.Bool,
-    tangent: bool = False,
-    skip: bool = False,
-) -> Composite:
-    """Measure each body by itself and put them in the order of the ray.
+def composite_ray(line: LineIntegral, end: list[mi.Float], tangent: bool = False, skip: bool = False) -> Composite:
+    """Integrate each medium by itself and composite them in the order of the ray.
 
     Args:
-        media: of the scene.
-        integrand: what is summed.
-        ray_segment: the ray, the medium around its origin, and how far it goes; world space, unit direction.
+        line: what is summed along which ray.
         end: what the end of the ray adds, each row, by itself.
-        active: lanes to follow.
-        tangent: follow tangents too, along those that the media took from the parameters.
-        skip: pass over empty blocks where the order of sums does not matter.
+        tangent: follow tangents too, from those that the media took from the parameters.
+        skip: skip empty blocks, which changes the order of sums.
 
     Raises:
         MivolError: a medium that sums grids of two resolutions or places, or whose extinction depends on the direction.
 
-    Cost: a walk of each body.
+    Cost: a walk of each medium.
     """
-    for body in media.bodies:
-        _check(body, integrand)
+    media, integrand, ray_segment = line.media, line.integrand, line.ray_segment
+    check_media(media, integrand)
     rows = integrand.rows * (2 if tangent else 1)
 
-    def measure(body: Body, t0: mi.Float, t1: mi.Float, on: mi.Bool) -> _BodyIntegral:
-        return _measure(_open(media, integrand, body, ray_segment.ray, t0, t1, on, tangent), skip)
+    boxes = []
+    for interval in find_boxed_intervals(media, ray_segment.ray, ray_segment.length, line.active):
+        middle = interval.middle(ray_segment.ray) if len(media.bodies) > 1 else mi.Float64(0)
+        own = BodySweep(line, interval, tangent).integrate(skip)
+        boxes.append(_Boxed(interval, middle, own, zeros(mi.Float64, rows), [], zeros(mi.Float, rows)))
 
-    def visit_box(found: list[_Boxed], body: Body, t0: mi.Float64, t1: mi.Float64, on: mi.Bool) -> list[_Boxed]:
-        middle = _middle(body, ray_segment.ray, t0, t1) if len(media.bodies) > 1 else mi.Float64(0)
-        own, none = measure(body, t0, t1, on), _zeros(mi.Float, rows)
-        return [*found, _Boxed(body, t0, t1, on, middle, own, _zeros(mi.Float64, rows), [], none)]
-
-    boxes = visit_boxed_media(media, ray_segment.ray, ray_segment.length, visit_box, [], active)
-
-    def visit_traced(t: _Traced, body: Body, t0: mi.Float, t1: mi.Float, on: mi.Bool) -> _Traced:
-        if body.box is not None:
+    def visit_traced(t: _Traced, interval: MediumInterval) -> _Traced:
+        if interval.body.box is not None:
             return t
-        own, middle = measure(body, t0, t1, on), _halfway(t0, t1)
-        seen = _see(_add(t.tau, _tau_in_front(boxes, middle, rows)), own.N, integrand.rows)
+        own, middle = BodySweep(line, interval, tangent).integrate(skip), interval.middle(ray_segment.ray)
+        seen = _dim(_add(t.tau, _tau_in_front(boxes, middle, rows)), own.N, integrand.rows)
         opaque = [one_minus_exp(mi.Float(x)) for x in own.tau[: integrand.rows]]
         means = [dr.select(a > 0, n / dr.select(a > 0, a, 1), 0) for n, a in zip(own.N, opaque, strict=False)]
         return _Traced(
@@ -452,30 +120,30 @@ def composite_ray(
             _add(t.N, seen),
             [_add(f, _where(middle < b.middle, own.tau)) for f, b in zip(t.fronts, boxes, strict=True)],
             [_add(g, _where(middle > b.middle, seen)) for g, b in zip(t.behinds, boxes, strict=True)],
-            dr.maximum(t.reach, _largest(means)),
+            dr.maximum(t.reach, largest_of(means)),
         )
 
     traced = _Traced(
-        _zeros(mi.Float64, rows),
-        _zeros(mi.Float, rows),
-        [_zeros(mi.Float64, rows) for _ in boxes],
-        [_zeros(mi.Float, rows) for _ in boxes],
+        zeros(mi.Float64, rows),
+        zeros(mi.Float, rows),
+        [zeros(mi.Float64, rows) for _ in boxes],
+        [zeros(mi.Float, rows) for _ in boxes],
         mi.Float(0),
     )
     if media.traced:
-        traced = revisit_media(media, ray_segment, visit_traced, traced, active)
+        traced = revisit_media(media, ray_segment, visit_traced, traced, line.active)
     return _order(boxes, traced, end, integrand.rows, rows)
 
 
 def _order(boxes: list[_Boxed], traced: _Traced, end: list[mi.Float], channels: int, rows: int) -> Composite:
-    """Find what is in front of and behind each body in a box, and N of the whole ray."""
+    """Find what is in front of and behind each medium in a box, and N of the whole ray."""
     for box, front in zip(boxes, traced.fronts, strict=True):
         box.front = _add(front, _tau_in_front(boxes, box.middle, rows))
-        box.seen = _see(box.front, box.own.N, channels)
+        box.seen = _dim(box.front, box.own.N, channels)
     total = traced.tau
     for box in boxes:
         total = _add(total, box.own.tau)
-    last = _see(total, end + _zeros(mi.Float, rows - channels), channels)
+    last = _dim(total, end + zeros(mi.Float, rows - channels), channels)
     N = _add(traced.N, last)
     for box, behind in zip(boxes, traced.behinds, strict=True):
         N = _add(N, box.seen)
@@ -483,42 +151,72 @@ def _order(boxes: list[_Boxed], traced: _Traced, end: list[mi.Float], channels: 
     return Composite(boxes, traced, total, last, N)
 
 
+def vjp_composite(line: LineIntegral, composite: Composite, weight: list[mi.Float], rest: list[mi.Float]) -> None:
+    """Add ``weight`` times the derivatives of N to the gradients of the media: the transpose of the tangent.
+
+    What lies behind a cell is summed, and not found as a difference, so a voxel behind an optical depth of 50 gets its
+    derivative of the size e^-50. Only what lies behind an interval that was found by tracing is a difference of two sums; it is
+    clamped to what the known transmittance in front of it can let through.
+
+    Args:
+        line: as :func:`composite_ray`, which made ``composite``.
+        composite: the sum.
+        weight: d loss / d N of each row.
+        rest: d loss / d log T of each row, with T the transmittance of the whole ray, for light from behind its end.
+
+    Cost: a walk of each medium, and one packed write of 8 a cell and channel; intervals found by tracing are walked twice.
+    """
+    media, integrand, ray_segment = line.media, line.integrand, line.ray_segment
+    for box in composite.boxes:
+        ahead = _add(box.front, box.own.tau)
+        behind = [dr.fma(w, b, r) for w, b, r in zip(weight, box.behind, rest, strict=True)]
+        BodySweep(line, box.interval).vjp(weight, ahead, behind)
+
+    def visit(passed: BodyIntegral, interval: MediumInterval) -> BodyIntegral:
+        if interval.body.box is not None:
+            return passed
+        sweep, middle = BodySweep(line, interval), interval.middle(ray_segment.ray)
+        own = sweep.integrate(False)
+        front = _add(passed.tau, _tau_in_front(composite.boxes, middle, integrand.rows))
+        ahead, N = _add(front, own.tau), _add(passed.N, _dim(front, own.N, integrand.rows))
+        P = [transmittance_of(a) for a in ahead]
+        near, far = integrand.least(interval.t1), composite.traced.reach
+        left = [dr.clip(n - m, p * near, p * far) for n, m, p in zip(composite.traced.N, N, P, strict=True)]
+        seen = _add(left, _add(composite.last, _seen_behind(composite.boxes, middle, integrand.rows)))
+        behind = [dr.fma(w, b, r) for w, b, r in zip(weight, seen, rest, strict=True)]
+        sweep.vjp(weight, ahead, behind)
+        return BodyIntegral(_add(passed.tau, own.tau), N)
+
+    if media.traced:
+        nothing = BodyIntegral(zeros(mi.Float64, integrand.rows), zeros(mi.Float, integrand.rows))
+        revisit_media(media, ray_segment, visit, nothing, line.active)
+
+
+# -- Rows of media in the order of the ray -----------------------------------------------------------------------------
+
+
 def _tau_in_front(boxes: list[_Boxed], middle: mi.Float64, rows: int) -> list[mi.Float64]:
-    """Optical depth of the bodies in boxes in front of a distance."""
-    total = _zeros(mi.Float64, rows)
+    """Optical depth of the media in boxes in front of a distance."""
+    total = zeros(mi.Float64, rows)
     for box in boxes:
         total = _add(total, _where(box.middle < middle, box.own.tau))
     return total
 
 
 def _seen_behind(boxes: list[_Boxed], middle: mi.Float64, rows: int) -> list[mi.Float]:
-    """N, as the camera sees it, of the bodies in boxes behind a distance."""
-    total = _zeros(mi.Float, rows)
+    """N, as the camera sees it, of the media in boxes behind a distance."""
+    total = zeros(mi.Float, rows)
     for box in boxes:
         total = _add(total, _where(box.middle > middle, box.seen))
     return total
 
 
-def _see(front: list[mi.Float64], N: list[mi.Float], channels: int) -> list[mi.Float]:
-    """Rows of N behind rows of optical depth."""
-    P = [_transmittance(f) for f in front[:channels]]
+def _dim(front: list[mi.Float64], N: list[mi.Float], channels: int) -> list[mi.Float]:
+    """Rows of N, and of its tangent, as seen through rows of optical depth."""
+    P = [transmittance_of(f) for f in front[:channels]]
     seen = [p * n for p, n in zip(P, N, strict=False)]
     changes = zip(P, N, N[channels:], front[channels:], strict=False)
     return seen + [p * (dn - mi.Float(df) * n) for p, n, dn, df in changes]
-
-
-def _middle(body: Body, ray: mi.Ray3f, t0: mi.Float64, t1: mi.Float64) -> mi.Float64:
-    """The middle of the part of a stretch inside a body's box."""
-    _, _, t0, t1 = slab(body.rows, (0.0,) * 3, (1.0,) * 3, ray.o, ray.d, t0, t1)
-    return _halfway(t0, t1)
-
-
-def _halfway(t0: mi.Float, t1: mi.Float) -> mi.Float64:
-    return 0.5 * (mi.Float64(t0) + mi.Float64(t1))
-
-
-def _zeros(kind: type, rows: int) -> list:
-    return [kind(0) for _ in range(rows)]
 
 
 def _add(a: list, b: list) -> list:
@@ -527,62 +225,3 @@ def _add(a: list, b: list) -> list:
 
 def _where(mask: mi.Bool, rows: list) -> list:
     return [dr.select(mask, row, 0) for row in rows]
-
-
-def _largest(values: list[mi.Float]) -> mi.Float:
-    best = values[0]
-    for value in values[1:]:
-        best = dr.maximum(best, value)
-    return best
-
-
-def vjp_composite(
-    media: SceneMedia,
-    integrand: Integrand,
-    ray_segment: RaySegment,
-    composite: Composite,
-    weight: list[mi.Float],
-    rest: list[mi.Float],
-    active: mi.Bool,
-) -> None:
-    """Add ``weight`` times the derivative of N to the gradients of the media: the transpose of the tangent.
-
-    What lies behind a cell is summed, never left over by a subtraction, so a voxel behind an optical depth of 50 gets
-    its e^-50. Only between two stretches that were both found by tracing it is what is left over; that is clamped to
-    what a known transmittance can let through.
-
-    Args:
-        media, integrand, ray_segment, active: as :func:`composite_ray`, which made ``composite``.
-        weight: d loss / d N of each row.
-        rest: what else dims with the whole ray: d loss / d log T of each row, from behind its end.
-
-    Cost: a walk of each body, and one packed write of 8 a cell and channel; stretches found by tracing are walked twice.
-    """
-    for box in composite.boxes:
-        ahead = _add(box.front, box.own.tau)
-        behind = [dr.fma(w, b, r) for w, b, r in zip(weight, box.behind, rest, strict=True)]
-        _vjp_body(_open(media, integrand, box.body, ray_segment.ray, box.t0, box.t1, box.on, False), weight, ahead, behind)
-
-    def visit(passed: _BodyIntegral, body: Body, t0: mi.Float, t1: mi.Float, on: mi.Bool) -> _BodyIntegral:
-        if body.box is not None:
-            return passed
-        body_segment, middle = _open(media, integrand, body, ray_segment.ray, t0, t1, on, False), _halfway(t0, t1)
-        own = _measure(body_segment, False)
-        front = _add(passed.tau, _tau_in_front(composite.boxes, middle, integrand.rows))
-        ahead, N = _add(front, own.tau), _add(passed.N, _see(front, own.N, integrand.rows))
-        P = [_transmittance(a) for a in ahead]
-        near, far = integrand.least(t1), composite.traced.reach
-        left = [dr.clip(n - m, p * near, p * far) for n, m, p in zip(composite.traced.N, N, P, strict=True)]
-        seen = _add(left, _add(composite.last, _seen_behind(composite.boxes, middle, integrand.rows)))
-        behind = [dr.fma(w, b, r) for w, b, r in zip(weight, seen, rest, strict=True)]
-        _vjp_body(body_segment, weight, ahead, behind)
-        return _BodyIntegral(_add(passed.tau, own.tau), N)
-
-    if media.traced:
-        revisit_media(
-            media,
-            ray_segment,
-            visit,
-            _BodyIntegral(_zeros(mi.Float64, integrand.rows), _zeros(mi.Float, integrand.rows)),
-            active,
-        )

@@ -22,7 +22,8 @@ from typing import ClassVar
 import drjit as dr
 import mitsuba as mi
 
-from mivol.transport.line_integrals.composite import CellIntegral, Composite, RayPiece, composite_ray, vjp_composite
+from mivol.transport.line_integrals.composite import Composite, composite_ray, vjp_composite
+from mivol.transport.line_integrals.integrand import CellIntegral, LineIntegral, RayPiece
 from mivol.transport.media.channels import by_channel, spectrum, tangent_of
 from mivol.transport.media.coefficients import medium_interaction
 from mivol.transport.media.ray_intervals import RaySegment
@@ -55,8 +56,8 @@ def integrate_emission(media: SceneMedia, ray_segment: RaySegment, active: mi.Bo
     Bias: of the order dt^4 of a cell; none for a constant source function. Cost: a walk of each medium and two look-ups of
         its emission a cell.
     """
-    integrand = _Emission.of(media)
-    return composite_ray(media, integrand, ray_segment, [mi.Float(0)] * integrand.rows, active, tangent, skip=not tangent)
+    line = LineIntegral(media, _Emission.of(media), ray_segment, active)
+    return composite_ray(line, [mi.Float(0)] * line.integrand.rows, tangent, skip=not tangent)
 
 
 def vjp_emission(
@@ -74,9 +75,9 @@ def vjp_emission(
         weight: d loss / d light of each colour at the beginning of the stretch.
         behind: d loss times the light from behind the stretch, as the camera sees it: all of the stretch dims it.
     """
-    integrand = _Emission.of(media)
-    rows, rest = ([v[c] for c in range(integrand.rows)] for v in (weight, behind))
-    vjp_composite(media, integrand, ray_segment, composite, rows, rest, active)
+    line = LineIntegral(media, _Emission.of(media), ray_segment, active)
+    rows, rest = ([v[c] for c in range(line.integrand.rows)] for v in (weight, behind))
+    vjp_composite(line, composite, rows, rest)
 
 
 @dataclass

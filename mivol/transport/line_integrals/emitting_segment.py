@@ -48,7 +48,7 @@ class Emission:
     def estimate(self, segment: PathSegment, purpose: str, active: mi.Bool) -> SegmentEstimate:
         """Follow a segment to its end and sum its emission, for the purpose PICTURE, REVERSE or FORWARD."""
         media = self.media
-        end, _ = visit_media(media, segment.ray, segment.medium, lambda state, *_: state, mi.Float(0), active)
+        end, _ = visit_media(media, segment.ray, segment.medium, lambda state, _: state, mi.Float(0), active)
         passed = RaySegment(segment.ray, segment.medium, end.t)
         composite = integrate_emission(media, passed, active, tangent=purpose == FORWARD)
         shared = _EmittingSegment(media, segment, passed, composite, active)

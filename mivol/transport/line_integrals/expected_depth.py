@@ -29,7 +29,8 @@ import drjit as dr
 import mitsuba as mi
 
 from mivol.numerics import exp_moments, one_minus_exp
-from mivol.transport.line_integrals.composite import CellIntegral, RayPiece, composite_ray, vjp_composite
+from mivol.transport.line_integrals.composite import composite_ray, vjp_composite
+from mivol.transport.line_integrals.integrand import CellIntegral, LineIntegral, RayPiece
 from mivol.transport.media.ray_intervals import RaySegment, SegmentEnd
 from mivol.transport.media.scene_media import SceneMedia
 
@@ -142,7 +143,7 @@ def integrate_expected_depth(
     Bias: that of :func:`integrate_distance_in_cell`. Cost: a walk of each body.
     """
     integrand = _ExpectedDepth(media.channels, mi.Float(0))
-    composite = composite_ray(media, integrand, ray_segment, integrand.end(end), active, skip=True)
+    composite = composite_ray(LineIntegral(media, integrand, ray_segment, active), integrand.end(end), skip=True)
     alpha = [dr.select(end.si.is_valid(), 1, one_minus_exp(mi.Float(t))) for t in composite.tau]
     return _mean(composite.N), _mean(alpha)
 
@@ -157,7 +158,8 @@ def jvp_expected_depth(
         origin: the mean distance, so that this over the opacity is the tangent of the mean.
     """
     integrand = _ExpectedDepth(media.channels, origin)
-    return _mean(composite_ray(media, integrand, ray_segment, integrand.end(end), active, tangent=True).N[media.channels :])
+    line = LineIntegral(media, integrand, ray_segment, active)
+    return _mean(composite_ray(line, integrand.end(end), tangent=True).N[media.channels :])
 
 
 def vjp_expected_depth(
@@ -174,8 +176,8 @@ def vjp_expected_depth(
     """
     k = media.channels
     integrand = _ExpectedDepth(k, origin)
-    composite = composite_ray(media, integrand, ray_segment, integrand.end(end), active)
-    vjp_composite(media, integrand, ray_segment, composite, [weight / k] * k, [mi.Float(0)] * k, active)
+    line = LineIntegral(media, integrand, ray_segment, active)
+    vjp_composite(line, composite_ray(line, integrand.end(end)), [weight / k] * k, [mi.Float(0)] * k)
 
 
 def _mean(rows: list[mi.Float]) -> mi.Float:

@@ -22,6 +22,7 @@ import mitsuba as mi
 
 from mivol.errors import MivolError
 from mivol.fields.activation import Activation
+from mivol.numerics import least_of
 from mivol.transport.traversal.grid_walk import Cell, Nodes, box_nodes, walk
 from mivol.transport.traversal.interpolation import gauss_points, interpolate, node_weights
 from mivol.transport.traversal.lattice import Lattice, Segment, clip
@@ -102,13 +103,7 @@ def integrate_segment(
 
     zero = [mi.Float(0) for _ in range(lattice.channels)]
 
-    def has_enough(tau: list[mi.Float]) -> mi.Bool:
-        least = tau[0]
-        for t in tau[1:]:
-            least = dr.minimum(least, t)
-        return least > enough
-
-    until = None if enough is None else has_enough
+    until = None if enough is None else lambda tau: least_of(tau) > enough
     return walk(lattice, segment, visit, zero, [Nodes(values, lattice.channels)], active, until)
 
 

@@ -8,9 +8,15 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from mivol.transport.media.body import Body
 from mivol.transport.media.channels import by_channel, spectrum
-from mivol.transport.media.ray_intervals import MediumVisitor, RaySegment, SegmentEnd, revisit_media, visit_media
+from mivol.transport.media.ray_intervals import (
+    MediumInterval,
+    MediumVisitor,
+    RaySegment,
+    SegmentEnd,
+    revisit_media,
+    visit_media,
+)
 from mivol.transport.media.scene_media import SceneMedia
 
 __all__ = [
@@ -33,8 +39,9 @@ def sum_optical_depth(ray: mi.Ray3f, enough: float | None = None) -> MediumVisit
             end.
     """
 
-    def visit(tau: list[mi.Float], body: Body, t0: mi.Float, t1: mi.Float, active: mi.Bool) -> list[mi.Float]:
-        return [t + d for t, d in zip(tau, body.optical_depth(ray, t0, t1, len(tau), active, None, enough), strict=True)]
+    def visit(tau: list[mi.Float], interval: MediumInterval) -> list[mi.Float]:
+        own = interval.body.optical_depth(ray, interval.t0, interval.t1, len(tau), interval.active, None, enough)
+        return [t + d for t, d in zip(tau, own, strict=True)]
 
     return visit
 
@@ -73,8 +80,8 @@ def vjp_optical_depth(media: SceneMedia, segment: RaySegment, weight: mi.Spectru
 def vjp_rows(media: SceneMedia, segment: RaySegment, weight: list[mi.Float], active: mi.Bool) -> None:
     """As :func:`vjp_optical_depth`, ``weight`` one number for each channel."""
 
-    def visit(state: mi.Float, body: Body, t0: mi.Float, t1: mi.Float, on: mi.Bool) -> mi.Float:
-        body.backproject(segment.ray, t0, t1, weight, on)
+    def visit(state: mi.Float, interval: MediumInterval) -> mi.Float:
+        interval.body.backproject(segment.ray, interval.t0, interval.t1, weight, interval.active)
         return state
 
     revisit_media(media, segment, visit, mi.Float(0), active)
@@ -88,7 +95,8 @@ def jvp_optical_depth(media: SceneMedia, segment: RaySegment, active: mi.Bool) -
 def jvp_rows(media: SceneMedia, segment: RaySegment, active: mi.Bool) -> list[mi.Float]:
     """As :func:`jvp_optical_depth`, one number for each channel."""
 
-    def visit(tau: list[mi.Float], body: Body, t0: mi.Float, t1: mi.Float, on: mi.Bool) -> list[mi.Float]:
-        return [t + d for t, d in zip(tau, body.tangent(segment.ray, t0, t1, len(tau), on), strict=True)]
+    def visit(tau: list[mi.Float], interval: MediumInterval) -> list[mi.Float]:
+        own = interval.body.tangent(segment.ray, interval.t0, interval.t1, len(tau), interval.active)
+        return [t + d for t, d in zip(tau, own, strict=True)]
 
     return revisit_media(media, segment, visit, [mi.Float(0) for _ in range(media.channels)], active)

@@ -1,7 +1,7 @@
-"""The media along a ray: the interval of each, and the surface at which the ray ends.
+"""The media along a ray: the interval of each, their order, and the surface at which the ray ends.
 
 A ray is followed to the first opaque surface, and each medium on the way is visited with its interval [t0, t1]. Boundaries that
-are boxes are cut by slab tests in float64; others are traced.
+are boxes are cut by slab tests in float64; others are traced. Media are disjoint, so the middles of their intervals order them.
 
 Conventions. Distances are world lengths from the origin of the camera's own ray, and not from the last boundary, so that entry
 points keep their digits.
@@ -16,18 +16,20 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from mivol.transport.media.body import Body
 from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.traversal.lattice import slab
 from mivol.transport.traversal.ray_spawning import distance_along, spawn_ray
 
 __all__ = [
     "OWN_SURFACE",
+    "MediumInterval",
     "MediumVisitor",
     "RaySegment",
     "SegmentEnd",
+    "find_boxed_intervals",
     "is_transparent",
     "revisit_media",
-    "visit_boxed_media",
     "visit_media",
 ]
 
@@ -71,8 +73,32 @@ class RaySegment:
         return cls(mi.Ray3f(ray.o, ray.d, mi.Float(t), ray.time, ray.wavelengths), medium, t)
 
 
-MediumVisitor = Callable[..., Any]
-"""``visit(state, body, t0, t1, active) -> state``: what to do with the interval [t0, t1] of a ray in one medium."""
+@dataclass
+class MediumInterval:
+    """The interval of a ray in one medium.
+
+    Attributes:
+        body: the medium in its boundary.
+        t0, t1: distances from the ray's origin [length]. Where the boundary is a box that all grids of the medium fit into, the
+            grids' own boxes are enough, and the interval is that of the whole ray.
+        active: lanes that have the interval.
+    """
+
+    body: Body
+    t0: mi.Float64 | mi.Float
+    t1: mi.Float64 | mi.Float
+    active: mi.Bool
+
+    def middle(self, ray: mi.Ray3f) -> mi.Float64:
+        """Distance of the middle of the interval inside the boundary: of two media that with the lesser one is in front."""
+        t0, t1 = mi.Float64(self.t0), mi.Float64(self.t1)
+        if self.body.box is not None and not self.body.cuts_grids:
+            _, _, t0, t1 = slab(self.body.rows, (0.0,) * 3, (1.0,) * 3, ray.o, ray.d, t0, t1)
+        return 0.5 * (t0 + t1)
+
+
+MediumVisitor = Callable[[Any, MediumInterval], Any]
+"""``visit(state, interval) -> state``: what to do with the interval of a ray in one medium."""
 
 
 def visit_media(
@@ -108,25 +134,42 @@ def visit_media(
         si = dr.zeros(mi.SurfaceInteraction3f, dr.width(ray))
         si.wi, si.wavelengths, si.time = -ray.d, ray.wavelengths, ray.time
         end = SegmentEnd(si, mi.Float(ray.maxt), medium, 1.0)
-    return end, visit_boxed_media(media, ray, end.t, visit, state, active)
+    return end, _visit_boxed(media, ray, end.t, visit, state, active)
 
 
-def visit_boxed_media(
-    media: SceneMedia, ray: mi.Ray3f, t_end: mi.Float, visit: MediumVisitor, state: Any, active: mi.Bool
-) -> Any:
-    """Visit the media in boxes between the ray's origin and ``t_end``."""
+def find_boxed_intervals(media: SceneMedia, ray: mi.Ray3f, t_end: mi.Float, active: mi.Bool) -> list[MediumInterval]:
+    """Find the intervals of the media in boxes between the ray's origin and ``t_end``.
+
+    Args:
+        media: of the scene.
+        ray: world space, unit direction.
+        t_end: where the ray ends [length]; may be infinite.
+        active: lanes to cut.
+
+    Returns:
+        One interval for each of ``media.boxed``, in their order.
+    """
+    found = []
     for body in media.boxed:
         t0, t1 = mi.Float64(0), mi.Float64(t_end)
         if body.cuts_grids:
             _, _, t0, t1 = slab(body.rows, (0.0,) * 3, (1.0,) * 3, ray.o, ray.d, t0, t1)
-        state = visit(state, body, t0, t1, active & (t1 > t0))
+        found.append(MediumInterval(body, t0, t1, active & (t1 > t0)))
+    return found
+
+
+def _visit_boxed(
+    media: SceneMedia, ray: mi.Ray3f, t_end: mi.Float, visit: MediumVisitor, state: Any, active: mi.Bool
+) -> Any:
+    for interval in find_boxed_intervals(media, ray, t_end, active):
+        state = visit(state, interval)
     return state
 
 
 def revisit_media(media: SceneMedia, ray_segment: RaySegment, visit: MediumVisitor, state: Any, active: mi.Bool) -> Any:
     """Visit the media of a segment whose end is known; rays are traced again only where boundaries have to be traced."""
     if not media.traced:
-        return visit_boxed_media(media, ray_segment.ray, ray_segment.length, visit, state, active)
+        return _visit_boxed(media, ray_segment.ray, ray_segment.length, visit, state, active)
     return visit_media(media, ray_segment.ray, ray_segment.medium, visit, state, active, ray_segment.passes_null)[1]
 
 
@@ -181,7 +224,7 @@ def _visit_traced(
     media: SceneMedia, medium: mi.MediumPtr, visit: MediumVisitor, state: Any, t0: mi.Float, t1: mi.Float, active: mi.Bool
 ) -> Any:
     for body in media.traced:
-        state = visit(state, body, t0, t1, active & (medium == mi.MediumPtr(body.view.medium)))
+        state = visit(state, MediumInterval(body, t0, t1, active & (medium == mi.MediumPtr(body.view.medium))))
     return state
 
 

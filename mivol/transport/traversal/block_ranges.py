@@ -10,9 +10,10 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
+from mivol.numerics import largest_of
 from mivol.transport.traversal.empty_blocks import count_blocks, over_blocks
 
-__all__ = ["BLOCK_SHIFT", "BlockRanges", "find_block_ranges", "largest"]
+__all__ = ["BLOCK_SHIFT", "BlockRanges", "find_block_ranges"]
 
 
 BLOCK_SHIFT = 3
@@ -64,15 +65,7 @@ def find_block_ranges(values: mi.TensorXf) -> BlockRanges:
         ranges.append((high - low) * (1 + 1e-6))
     n = res[0] * res[1] * res[2]
     table = dr.zeros(mi.Float, n * (c + 1))
-    for k, row in enumerate([*rows, largest(ranges)]):
+    for k, row in enumerate([*rows, largest_of(ranges)]):
         dr.scatter(table, row, dr.arange(mi.UInt32, n) * (c + 1) + k)
     dr.eval(table)
     return BlockRanges(table, res, c)
-
-
-def largest(rows: list[mi.Float]) -> mi.Float:
-    """The largest of several numbers in each lane."""
-    most = rows[0]
-    for row in rows[1:]:
-        most = dr.maximum(most, row)
-    return most

@@ -19,6 +19,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from mivol.numerics import greater, lesser
 from mivol.transport.traversal.empty_blocks import BLOCK, SHIFT, count_blocks
 from mivol.transport.traversal.lattice import Lattice, Mask3, Segment
 
@@ -124,9 +125,9 @@ def walk(
 
         # -- Distance to the planes ahead, and visit ----------------------------------------------------------------------
         reach = (mi.Vector3f(span) + (1 - frac)) * pace
-        plane = _least(_least(reach.x, reach.y), reach.z)
+        plane = lesser(lesser(reach.x, reach.y), reach.z)
         left = (length - s) - s_rest
-        dt = _least(plane, left)
+        dt = lesser(plane, left)
         here = Cell(corners, cell, ahead, frac, speed * dt, s, dt)
         if halts:
             state, dt = visit(state, here, active & full)
@@ -162,7 +163,7 @@ def walk(
         # in every step, and would carry a ray 1e-5 of a cell off its course in 256. speed * s and the number of planes passed
         # are nearly equal; the fused multiply-add subtracts them before it rounds, so that only the remainder is rounded.
         course = dr.fma(speed, s_rest, dr.fma(speed_rest, s, entry))
-        frac = _least(_most(dr.fma(speed, s, -passed) + course, 0), 1)
+        frac = lesser(greater(dr.fma(speed, s, -passed) + course, 0), 1)
     return state
 
 
@@ -171,16 +172,6 @@ def _add(total: mi.Float, rest: mi.Float, term: mi.Float) -> tuple[mi.Float, mi.
     after = total + term
     took = after - total
     return after, rest + ((total - (after - took)) + (term - took))
-
-
-def _least(a: mi.Float, b: mi.Float) -> mi.Float:
-    """The smaller of two numbers that are not NaN: ``dr.minimum`` would carry a NaN on, at twice the price of this."""
-    return dr.select(a < b, a, b)
-
-
-def _most(a: mi.Float, b: mi.Float) -> mi.Float:
-    """The larger of two numbers that are not NaN."""
-    return dr.select(a > b, a, b)
 
 
 def _strides(res: tuple[int, int, int]) -> tuple[mi.Vector3i, mi.Vector3i]:

@@ -22,6 +22,7 @@ import mitsuba as mi
 import numpy as np
 
 from mivol.errors import MivolError
+from mivol.numerics import greater, lesser
 from mivol.space import check_affine, lattice_from_world
 from mivol.transport.traversal.empty_blocks import REACH, distances
 from mivol.transport.traversal.interpolation import GAUSS
@@ -206,7 +207,7 @@ def march(
             searching &= found < 0
             ends = n - found
             reach = dr.fma(mi.Vector3f(ends) - entry, pace, never)
-            exit = _least(_least(reach.x, reach.y), reach.z)
+            exit = lesser(lesser(reach.x, reach.y), reach.z)
             there = dr.clip(mi.Vector3i(dr.fma(speed, exit, entry)), n, ends - 1)
             there = dr.select(reach <= exit, ends, there)
             t = dr.select(searching, exit, t)
@@ -217,8 +218,8 @@ def march(
 
         # -- Visit it, and leave it ----------------------------------------------------------------------------------------
         reach = dr.fma(mi.Vector3f(n + 1) - entry, pace, never)
-        exit = _least(_least(reach.x, reach.y), reach.z)
-        dt = _most(_least(exit, length) - t, 0)
+        exit = lesser(lesser(reach.x, reach.y), reach.z)
+        dt = greater(lesser(exit, length) - t, 0)
         offset = entry - mi.Vector3f(n)
         points = tuple(_natural(dr.fma(speed, dr.fma(dt, g, t), offset), ahead) for g in (GAUSS, 1 - GAUSS))
         state = visit(state, CellVisitor(mi.UInt32(found), points, t, dt), active)
@@ -243,11 +244,3 @@ def _natural(frac: mi.Vector3f, ahead: Any) -> mi.Vector3f:
     """Fractions along the grid's own axes, of fractions along the ray."""
     frac = dr.clip(frac, 0, 1)
     return dr.select(ahead, frac, 1 - frac)
-
-
-def _least(a: mi.Float, b: mi.Float) -> mi.Float:
-    return dr.select(a < b, a, b)
-
-
-def _most(a: mi.Float, b: mi.Float) -> mi.Float:
-    return dr.select(a > b, a, b)
