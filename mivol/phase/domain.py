@@ -1,8 +1,8 @@
-"""What values a phase function's parameter may have: refused where they can be read, projected where they cannot.
+"""Domains of the parameters of phase functions: a value outside is refused where it can be read, and projected where it cannot.
 
-Conventions. An optimiser's overshoot is refused with a sentence when the new value is handed in. Inside a recording by
-``dr.freeze``, and behind a volume whose values are not known, nothing can be read: there the value is moved to the nearest
-one that is allowed, and its derivative is 0.
+Conventions. A value that an optimiser has moved outside is refused with a sentence when it is set. Inside a recording by
+``dr.freeze``, and for volumes whose values are not known, the host cannot read it: it is replaced by the nearest value inside,
+and its derivative is 0.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ class Domain:
 
     Attributes:
         low, high: the least and the largest number that is allowed.
-        words: the interval in a sentence.
-        way_out: what to do about a value outside it.
+        words: the interval, for the sentence that refuses a value.
+        way_out: what to do about the value, for the same sentence.
     """
 
     low: float
@@ -49,8 +49,8 @@ class Domain:
         raise MivolError(f"{name} is {float(values[first]):.9g}{place}; {self.words} is expected: {self.way_out}.")
 
     def project(self, x: mi.Float) -> mi.Float:
-        """The nearest allowed value, without derivative where it is another one; NaN stays NaN."""
-        # Not dr.minimum and dr.maximum: where x lies on a bound their derivative may be that of the constant.
+        """The nearest value inside; its derivative is 0 where it is another value than ``x``. NaN stays NaN."""
+        # dr.minimum and dr.maximum are not used: where x lies on a bound, their derivative may be that of the constant.
         x = dr.select(x < self.low, self.low, x)
         return x if math.isinf(self.high) else dr.select(x > self.high, self.high, x)
 
@@ -59,7 +59,7 @@ NEXT_TO_ONE = 1 - 2.0**-24
 """The largest float32 below 1."""
 
 LARGEST = 1e30
-"""Sums of such numbers, and one over them, are float32 numbers still."""
+"""Largest weight or value. Sums of a few such numbers, and their inverses, are within the range of float32."""
 
 ASYMMETRY = Domain(
     -NEXT_TO_ONE, NEXT_TO_ONE, "a number above -1 and below 1", "choose one, or clip it after each step, for instance to 0.999"

@@ -1,4 +1,4 @@
-r"""Draine's phase function: Henyey-Greenstein's times 1 + alpha cos^2, which both Rayleigh's and Cornette-Shanks' are.
+r"""Draine's phase function: Henyey-Greenstein times 1 + alpha cos^2, with Rayleigh and Cornette-Shanks as special cases.
 
 .. math:: p(\theta) = p_{HG}(\theta; g)\,\frac{1 + \alpha \cos^2\theta}{1 + \alpha (1 + 2 g^2)/3}
 
@@ -7,8 +7,8 @@ mean cosine for alpha = 0 only: :func:`mean_cosine`.
 
 Source: Draine 2003 (Scattering by Interstellar Dust Grains. I, Astrophysical Journal 598); Cornette & Shanks 1992 (Applied
 Optics 31); droplets by Jendersie & d'Eon 2023 (An Approximate Mie Scattering Function for Fog and Cloud Rendering).
-Sampling by one of their quartic roots loses its digits in float32; here the cumulative distribution is inverted by Newton
-steps in the variable of the Henyey-Greenstein inversion, where it is smooth for every g.
+The closed-form inversion by the root of a quartic equation, which they give, loses its digits in float32. Here the cumulative
+distribution is inverted by Newton steps in the variable of the Henyey-Greenstein inversion, in which it is smooth for every g.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from mivol.phase.turn import Turn
 __all__ = ["droplets", "eval_draine", "mean_cosine", "sample_draine"]
 
 NEWTON_STEPS = 16
-"""Each divides the error of u by 3.4 at least (where 1 + alpha cos^2 nearly vanishes), by its square elsewhere."""
+"""Each step divides the error of u by 3.4 at least (where 1 + alpha cos^2 nearly vanishes); elsewhere it squares the error."""
 
 
 def mean_cosine(g: mi.Float | float, alpha: mi.Float | float) -> mi.Float | float:
@@ -79,13 +79,13 @@ def sample_draine(u: mi.Float, g: mi.Float, alpha: mi.Float) -> Turn:
 
 
 def droplets(diameter: float) -> dict[str, float]:
-    """A mixture of two lobes that comes near the Mie phase function of water droplets, fog to cloud.
+    """The parameters of a mixture of Henyey-Greenstein and Draine that approximates Mie scattering by water droplets.
 
     Args:
         diameter: of the droplets [micrometre], 5 to 50.
 
     Returns:
-        ``g_hg``, ``g_draine``, ``alpha`` and ``weight_draine``, the share of the second lobe; white light.
+        ``g_hg``, ``g_draine``, ``alpha`` and ``weight_draine``, the fraction of the second component; for white light.
 
     Raises:
         MivolError: a diameter that the fit does not cover.

@@ -1,4 +1,4 @@
-r"""The Henyey-Greenstein phase function: one lobe, known by its mean cosine g.
+r"""The Henyey-Greenstein phase function, with its mean cosine g as the only parameter.
 
 .. math:: p(\theta) = \frac{1}{4\pi} \frac{1 - g^2}{D^{3/2}}, \qquad D = 1 + g^2 - 2 g \cos\theta
 
@@ -28,12 +28,12 @@ def eval_hg(turn: Turn, g: mi.Float) -> mi.Float:
     Error: about 6e-7 of it, for every g in (-1, 1) and every turn.
     """
     back = g < 0
-    # Not dr.abs: its derivative at 0 is 0, and that of p is not.
+    # dr.abs is not used, since its derivative at 0 is 0 and that of p is not.
     a = dr.select(back, -g, g)
     m = dr.select(back, turn.above_minus_one, turn.below_one)
-    # 1 + g^2 - 2 g cos loses all but (1 - a)^2 / 6e-8 at the peak: at a = 0.9999 a tenth of its value is rounding.
+    # As 1 + g^2 - 2 g cos, D has a rounding error of 6e-8 beside a smallest value of (1 - a)^2: several times D at a = 0.9999.
     inv = dr.rcp(dr.fma(2 * a, m, dr.square(1 - a)))
-    # inv sqrt(inv), not rsqrt cubed: Dr.Jit's approximate rsqrt would cost digits.
+    # inv sqrt(inv) is more accurate than the cube of Dr.Jit's rsqrt, which is approximate.
     return INV_FOUR_PI * ((1 - a) * (1 + a)) * (inv * dr.sqrt(inv))
 
 
@@ -49,7 +49,7 @@ def sample_hg(u: mi.Float, g: mi.Float) -> Turn:
     """
     back = g < 0
     a = dr.select(back, -g, g)
-    # Both u and 1 - u are used as they are: 1 - (1 - u) would not be u.
+    # u and 1 - u are both needed with full precision; in float32 1 - (1 - u) is not u.
     v, w = dr.select(back, 1 - u, u), dr.select(back, u, 1 - u)
     inv = dr.rcp(dr.square(dr.fma(2 * a, v, 1 - a)))
     below_one = 2 * dr.square(1 - a) * w * dr.fma(a, v, 1) * inv

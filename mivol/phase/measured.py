@@ -113,7 +113,7 @@ class MeasuredMedium(NamedTuple):
     g: Triple
 
     def mean_g(self) -> float:
-        """One g for all channels: the mean, weighted by scattering."""
+        """One g for all channels: the mean, weighted by the scattering coefficients."""
         total = sum(self.sigma_s)
         return float(np.dot(self.g, self.sigma_s) / total) if total > 0 else 0.0
 
@@ -125,7 +125,7 @@ class MeasuredMedium(NamedTuple):
 
         Args:
             mm_per_unit: length of one scene unit [mm]: 1000 for a scene in metres.
-            dilution: share of the medium in clear water, above 0 and at most 1.
+            dilution: fraction of the medium in clear water, above 0 and at most 1.
             channel: 0, 1 or 2 for a grey medium with the coefficients and g of that channel; None for rgb.
 
         Raises:

@@ -26,18 +26,20 @@ from mivol.phase.tabulated import Table, adapt_nodes
 __all__ = ["WATER_INDEX", "aerosol", "water_droplets"]
 
 WATER_INDEX = 1.333
-"""Refractive index of water in the middle of the visible; what it absorbs there does not change the shape."""
+"""Refractive index of water in the middle of the visible range; its absorption there does not change the phase function."""
 
 RADII = 1024
-"""Radii, in equal steps of their logarithm. Resonances of clear droplets are narrower still: for effective radii of 3 to 20
-micrometre they leave 1.5 to 2 % (root mean square over angles), 4 to 9 % at the worst angle, near straight back."""
+"""Number of radii, in equal steps of their logarithm. The resonances of droplets that do not absorb are narrower than a step:
+for effective radii of 3 to 20 micrometre this leaves an error of 1.5 to 2 % (root mean square over angles), and of 4 to 9 % at
+the worst angle, near backward scattering."""
 
 
 LARGEST_SIZE = 1e4
-"""Largest circumference over the wavelength whose series is summed: in a minute and 1 GiB. Beyond it light goes in rays."""
+"""Largest size parameter (circumference over wavelength) whose series is summed, which takes a minute and 1 GiB. Larger
+particles are in the regime of geometric optics."""
 
 CUT = 1e-7
-"""Share of a distribution that is left out at each end."""
+"""Fraction of a size distribution that is left out at each end."""
 
 
 def water_droplets(
@@ -54,7 +56,7 @@ def water_droplets(
         effective_variance: its relative variance, above 0 and below 1/2; clouds have about 0.1.
         wavelength: in the surroundings [micrometre].
         index: refractive index relative to the surroundings.
-        tolerance: how far a line between nodes may miss the function, as a part of it.
+        tolerance: largest relative error of linear interpolation between the nodes of the table.
 
     Raises:
         MivolError: a size, variance or wavelength that cannot be, or ``miepython`` is not installed.
@@ -64,7 +66,7 @@ def water_droplets(
     _check_positive(effective_radius=effective_radius, wavelength=wavelength, tolerance=tolerance)
     if not 0 < effective_variance < 0.5:
         raise MivolError(f"effective_variance is {effective_variance}; a number above 0 and below 0.5 is expected.")
-    # The area r^2 n(r) is a gamma distribution of shape 1/b and mean a; what small droplets scatter counts r^4 more.
+    # The area r^2 n(r) is a gamma distribution of shape 1/b and mean a. Small droplets scatter in proportion to r^6, r^4 more.
     shape, scale = 1 / effective_variance, effective_radius * effective_variance
     low, high = gammaincinv(shape, CUT) * scale, gammainccinv(shape + 4, CUT) * scale
     return _average(lambda r: (shape - 1) * np.log(r) - r / scale, low, high, wavelength, index, tolerance)
@@ -80,7 +82,7 @@ def aerosol(
         geometric_deviation: exp of the standard deviation of log r, above 1; 1.5 to 2.2 is usual.
         index: refractive index relative to the surroundings, for instance 1.53 - 0.006j for dust.
         wavelength: in the surroundings [micrometre].
-        tolerance: how far a line between nodes may miss the function, as a part of it.
+        tolerance: largest relative error of linear interpolation between the nodes of the table.
 
     Raises:
         MivolError: a size, deviation or wavelength that cannot be, or ``miepython`` is not installed.
@@ -96,10 +98,10 @@ def aerosol(
 
 
 def _ends_of_lognormal(median: float, s: float) -> tuple[float, float]:
-    """The radii between which particles count, where log r has the standard deviation ``s``.
+    """The smallest and the largest radius of a lognormal distribution that are integrated; log r has standard deviation ``s``.
 
-    Below the first lies the share ``CUT`` of their area, above the second that of what small particles scatter: a lognormal
-    distribution times r^k is one about log(median) + k s^2, and they scatter like r^6.
+    The fraction ``CUT`` of the particles' area lies below the first, and the fraction ``CUT`` of the light that small particles
+    scatter, which goes as r^6, above the second. (A lognormal distribution times r^k is lognormal about log(median) + k s^2.)
     """
     reach = -ndtri(CUT) * s
     return median * np.exp(2 * s * s - reach), median * np.exp(6 * s * s + reach)

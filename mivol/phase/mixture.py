@@ -1,9 +1,9 @@
-r"""A sum of phase functions: each scattering follows one of them, with the chance of its share.
+r"""A mixture of phase functions: a convex combination, sampled by choosing one of the components.
 
 .. math:: p = \sum_k s_k p_k, \qquad s_k = w_k / \sum_j w_j
 
-Conventions. Weights are at least 0 and need not sum to 1; where all of them are 0 (a corner of a grid of weights) the lobes
-have equal shares.
+Conventions. Weights are at least 0 and need not sum to 1. Where all of them are 0 (a voxel in a grid of weights), the
+components have equal probabilities.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ __all__ = ["choose_lobe", "shares_of"]
 
 
 def shares_of(weights: Sequence[mi.Float]) -> list[mi.Float]:
-    """Weights divided by their sum, with derivatives; equal ones where the sum is 0."""
+    """Normalise weights by their sum, with derivatives; they become equal where the sum is 0."""
     total = sum(weights[1:], weights[0])
     empty = ~(total > 0) & (total == 0)
     inv = dr.rcp(dr.select(empty, 1, total))
@@ -25,15 +25,15 @@ def shares_of(weights: Sequence[mi.Float]) -> list[mi.Float]:
 
 
 def choose_lobe(shares: Sequence[mi.Float], u: mi.Float) -> tuple[mi.UInt32, mi.Float]:
-    """Pick one lobe with the chance of its share.
+    """Choose a component with its normalised weight as probability.
 
     Returns:
-        its number, and where in its interval u lay: uniform in [0, 1) again.
+        The index of the component, and ``u`` rescaled to [0, 1) within its interval, to be used again.
     """
     chosen, low, high = mi.UInt32(0), dr.zeros(mi.Float, 1), mi.Float(shares[0])
     start = mi.Float(0)
     for k, share in enumerate(shares):
-        # A share of 0 is an empty interval and is never chosen, not even by a u that rounding left above all of them.
+        # A component of weight 0 is never chosen, not even where rounding leaves u above the sum of all weights.
         here = (u >= start) & (share > 0)
         end = start + share
         chosen, low, high = dr.select(here, k, chosen), dr.select(here, start, low), dr.select(here, end, high)

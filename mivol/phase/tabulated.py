@@ -1,9 +1,10 @@
-r"""A phase function given by numbers: linear in the cosine between nodes that lie where they like.
+r"""A tabulated phase function: linear in the cosine between nodes at arbitrary positions.
 
 .. math:: p(c) = \frac{f(c)}{2\pi \int_{-1}^1 f\,dc}, \qquad f \text{ linear between } (c_i, f_i)
 
 Conventions. Nodes rise from exactly -1 to exactly 1. :class:`Table` is the checked data, float64 NumPy; :class:`Lookup` is the
-same on Dr.Jit arrays. A node is kept as 1 - c and as 1 + c: nodes of a forward peak 1e-4 wide stay apart in float32.
+same on Dr.Jit arrays. A node is stored as 1 - c and as 1 + c, so that the nodes of a forward peak of a width of 1e-4 remain
+distinct in float32.
 
 Source of the inversion inside a segment: the smaller root of the quadratic, written without cancellation as in Press et al.,
 Numerical Recipes, section 5.6.
@@ -40,7 +41,7 @@ class Table:
         name: what the table is called in a sentence that refuses it.
 
     Raises:
-        MivolError: anything else.
+        MivolError: arrays of another form, or values that no phase function has.
     """
 
     cosines: np.ndarray
@@ -162,7 +163,7 @@ class Table:
         return float(self.moments(2)[1])
 
     def to_dict(self) -> dict[str, str]:
-        """The same as a plugin for ``mi.load_dict``; as text, which keeps cosines near 1 apart."""
+        """The plugin for ``mi.load_dict``. Numbers are written as text: rounded to float32, cosines near 1 would coincide."""
         text = {key: ", ".join(f"{x:.17g}" for x in getattr(self, key)) for key in ("cosines", "values")}
         return {"type": "mivol_tabulated", **text}
 
@@ -240,11 +241,11 @@ def _is_number(text: str) -> bool:
 
 @dataclass
 class Lookup:
-    """Where the nodes lie, on Dr.Jit arrays. Values are handed in, so that they can be a parameter.
+    """The nodes of a table on Dr.Jit arrays. Its methods take the values as an argument, since they may be a parameter.
 
     Attributes:
         below_one, above_minus_one: (n,) 1 - c and 1 + c of the nodes.
-        ratio: (n,) (1 + c) / (1 - c), rising from 0 to infinity: what is searched.
+        ratio: (n,) (1 + c) / (1 - c), rising from 0 to infinity: the key of the binary search.
         width: (n - 1,) differences of the cosines.
     """
 
@@ -274,7 +275,7 @@ class Lookup:
         values = dr.select(dr.max(dr.detach(values)) >= 1 / LARGEST, values, 1)
         i = dr.arange(mi.UInt32, len(self.width))
         parts = 0.5 * (dr.gather(mi.Float, values, i) + dr.gather(mi.Float, values, i + 1)) * self.width
-        # Summed in float64: a table of 1000 nodes keeps the digits of its narrow segments.
+        # In float32 the sum over a table of 1000 nodes would lose the digits of its narrow segments.
         sums = dr.cumsum(mi.Float64(dr.detach(parts)))
         total = dr.gather(mi.Float64, sums, len(self.width) - 1)
         cumulative = dr.zeros(mi.Float, len(self.ratio))
@@ -286,7 +287,7 @@ class Lookup:
 
         Error: 1e-6 of the larger of the two values around it.
         """
-        # 1 + c > ratio (1 - c), and not a quotient, which is 0/0 for a turn whose directions are both 0 in idle lanes.
+        # The comparison is ratio (1 - c) < 1 + c, without a quotient: in inactive lanes both directions may be 0, and it 0/0.
         below, above = dr.detach(turn.below_one), dr.detach(turn.above_minus_one)
         n = len(self.width)
         i = dr.binary_search(0, n, lambda k: dr.gather(mi.Float, self.ratio, k, active) * below < above)
@@ -299,7 +300,7 @@ class Lookup:
     def sample(
         self, u: mi.Float, values: mi.Float, integral: mi.Float, cumulative: mi.Float, active: mi.Bool = True
     ) -> Turn:
-        """Draw a turn with density :meth:`eval`, exactly: the distribution of a line is a square root away."""
+        """Draw a scattering angle with density :meth:`eval`, by exact inversion: a quadratic equation in each segment."""
         n = len(self.width)
         i = dr.binary_search(0, n, lambda k: dr.gather(mi.Float, cumulative, k, active) <= u)
         i = dr.clip(mi.Int32(i) - 1, 0, n - 1)
@@ -308,7 +309,7 @@ class Lookup:
         )
         area = (u - dr.gather(mi.Float, cumulative, i, active)) * integral
         slope = (right - left) * dr.rcp(width)
-        # 2 area / (left + root), never (root - left) / slope: that is 0/0 on a level segment.
+        # 2 area / (left + root) is the same as (root - left) / slope, which is 0/0 on a level segment.
         root = dr.sqrt(dr.maximum(dr.fma(2 * area, slope, left * left), 0))
         offset = 2 * area * dr.rcp(dr.select(left + root > 0, left + root, 1))
         offset = dr.clip(offset, 0, width)
@@ -318,7 +319,7 @@ class Lookup:
         )
 
     def _offset(self, turn: Turn, i: mi.Int32, active: mi.Bool) -> mi.Float:
-        """How far the cosine lies above node i, from the nearer end of the scale."""
+        """Difference of the cosine and node i, computed from 1 - c or 1 + c, whichever is smaller and so more accurate."""
         ahead = dr.gather(mi.Float, self.below_one, i, active) - turn.below_one
         behind = turn.above_minus_one - dr.gather(mi.Float, self.above_minus_one, i, active)
         return dr.select(turn.below_one < turn.above_minus_one, ahead, behind)

@@ -1,10 +1,10 @@
-r"""The angle of one scattering, held so that it keeps its digits near straight on and straight back.
+r"""The scattering angle, stored as 1 - cos and 1 + cos so that it is accurate near forward and backward scattering.
 
 .. math:: 1 - \cos\theta = \tfrac12 |\omega - \omega'|^2, \qquad 1 + \cos\theta = \tfrac12 |\omega + \omega'|^2
 
-Conventions. Travel goes along omega' before and omega after the scattering. ``wi`` is Mitsuba's: it points back to where
-light's adjoint came from, so omega' = -wi. In float32 ``1 - dot`` is a multiple of 6e-8 and has no digit left at an angle of
-3e-4; the squared differences keep theirs.
+Conventions. Light travels along omega' before and along omega after the scattering. ``wi`` is Mitsuba's: it points back along
+the path, so omega' = -wi. In float32 ``1 - dot`` is a multiple of 6e-8 and has no digit left at an angle of 3e-4; the squared
+differences keep their relative precision.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ INV_FOUR_PI = 0.07957747154594767
 
 @dataclass
 class Turn:
-    """Cosine of a scattering angle as its distances from 1 and from -1.
+    """The cosine of a scattering angle, as its differences from 1 and from -1.
 
     Attributes:
         below_one: 1 - cos, in [0, 2].
@@ -34,7 +34,7 @@ class Turn:
 
     @property
     def cos(self) -> mi.Float:
-        """The cosine, to half a unit of 6e-8."""
+        """The cosine, to 3e-8."""
         return 0.5 * (self.above_minus_one - self.below_one)
 
     @property
@@ -43,7 +43,7 @@ class Turn:
         return dr.sqrt(self.below_one * self.above_minus_one)
 
     def mirrored(self, where: mi.Bool) -> Turn:
-        """The turn with cos negated in some lanes."""
+        """The same with the cosine negated in some lanes."""
         return Turn(
             dr.select(where, self.above_minus_one, self.below_one),
             dr.select(where, self.below_one, self.above_minus_one),
@@ -51,7 +51,7 @@ class Turn:
 
 
 def turn_between(wi: mi.Vector3f, wo: mi.Vector3f) -> Turn:
-    """The turn from travel along ``-wi`` to travel along ``wo``, both of unit length.
+    """The scattering angle between travel along ``-wi`` and travel along ``wo``, both of unit length.
 
     Error: that of the directions themselves; an angle near 0 or pi is known to 1e-7.
     """
@@ -59,7 +59,7 @@ def turn_between(wi: mi.Vector3f, wo: mi.Vector3f) -> Turn:
 
 
 def direction_after(wi: mi.Vector3f, turn: Turn, u: mi.Float) -> mi.Vector3f:
-    """The direction that a turn leads to; ``u`` chooses the angle about the axis."""
+    """The direction after scattering by an angle; ``u`` in [0, 1) is the azimuth, as a fraction of 2 pi."""
     s, t = mi.coordinate_system(wi)
     sin_phi, cos_phi = dr.sincos(2 * dr.pi * u)
     return turn.sin * (cos_phi * s + sin_phi * t) - turn.cos * wi

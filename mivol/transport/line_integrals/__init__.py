@@ -1,1 +1,1 @@
-"""Sums along a ray from back to front: emission, radiance fields, expected depth, AOVs."""
+"""Emission-absorption integrals along a ray, composited from back to front: emission, radiance fields, expected depth, AOVs."""

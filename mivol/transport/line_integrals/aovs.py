@@ -1,12 +1,12 @@
-r"""What a camera ray meets besides radiance: optical depth, opacity, and the mean distance at which it is stopped.
+r"""Arbitrary output variables (AOVs) of a camera ray: optical depth, opacity, and expected depth.
 
 .. math:: \tau = \int \sigma\,dt, \qquad \alpha = 1 - e^{-\tau}, \qquad
           \bar t = \frac{1}{\alpha} \Big( \int t\,\sigma T\,dt + t_s T_s \Big)
 
-Conventions. All is about the first stretch of a ray: from the camera to the first opaque surface (at t_s; alpha is 1 there), or
-out of the scene. Optical depth never passes through exp. ``tau`` and ``alpha`` are means over the channels of the
-extinction, and so are both sides of the quotient in ``depth``, which is 0 where nothing stops the ray; ``tau.R`` is
-``tau`` where the extinction is grey. Rays and surfaces carry no derivatives.
+Conventions. AOVs belong to the first segment of a ray: from the camera to the first opaque surface (at t_s; alpha is 1 there),
+or out of the scene. Optical depth is returned as it was integrated, and not as -log T, which is infinite where T underflows.
+``tau`` and ``alpha`` are means over the channels of the extinction, and so are numerator and denominator of ``depth``, which is
+0 where nothing stops the ray; ``tau.R`` is ``tau`` where the extinction is grey. Rays and surfaces carry no derivatives.
 """
 
 from __future__ import annotations
@@ -27,12 +27,17 @@ __all__ = ["AOVS", "integrate_aovs", "jvp_aovs", "vjp_aovs"]
 
 
 AOVS = ("tau", "tau.R", "tau.G", "tau.B", "alpha", "depth")
-"""Names: optical depth [1] (mean, and of a channel), opacity [1], and mean distance [length]."""
+"""Names: optical depth [1] (mean, and of a channel), opacity [1], and expected depth [length]."""
 
 
 @dataclass
 class _FirstSegment:
-    """The first stretch of camera rays: ``tau``, ``T`` and ``alpha`` for each channel (T is 0 behind a surface)."""
+    """The first segment of camera rays.
+
+    Attributes:
+        ray_segment, end: the ray, and where it ends.
+        tau, T, alpha: optical depth, transmittance (0 behind a surface) and opacity [1], of each channel.
+    """
 
     ray_segment: RaySegment
     end: SegmentEnd
@@ -56,18 +61,18 @@ def integrate_aovs(media: SceneMedia, ray: mi.Ray3f, names: tuple[str, ...], act
     Raises:
         MivolError: ``depth`` of a medium that sums grids of two resolutions or places.
 
-    Cost: a walk of the first stretch, and another one for ``depth``.
+    Cost: a walk of the first segment, and another one for ``depth``.
     """
     if not names:
         return []
     first = _find_first_segment(media, ray, active)
     rows = {"tau": first.tau, "alpha": first.alpha}
     values = {"depth": _depth(media, first, active)[0]} if "depth" in names else {}
-    return [values[n] if n in values else _weigh(_shares(n, media.channels), rows[_row(n)]) for n in names]
+    return [values[n] if n in values else _weigh(_channel_weights(n, media.channels), rows[_row(n)]) for n in names]
 
 
 def jvp_aovs(media: SceneMedia, ray: mi.Ray3f, names: tuple[str, ...], active: mi.Bool = True) -> list[mi.Float]:
-    """Tangents of AOVs along that which :meth:`SceneMedia.start_tangent` took from the parameters.
+    """Tangents of AOVs, from the parameters' tangents that :meth:`SceneMedia.start_tangent` took.
 
     Args:
         media, ray, names, active: as :func:`integrate_aovs`.
@@ -83,7 +88,7 @@ def jvp_aovs(media: SceneMedia, ray: mi.Ray3f, names: tuple[str, ...], active: m
         depth, opacity = _depth(media, first, active)
         dN = jvp_expected_depth(media, first.ray_segment, first.end, depth, active)
         values["depth"] = dN * _inverse(opacity)
-    return [values[n] if n in values else _weigh(_shares(n, media.channels), rows[_row(n)]) for n in names]
+    return [values[n] if n in values else _weigh(_channel_weights(n, media.channels), rows[_row(n)]) for n in names]
 
 
 def vjp_aovs(media: SceneMedia, ray: mi.Ray3f, names: tuple[str, ...], daovs: list[mi.Float], active: mi.Bool = True) -> None:
@@ -100,7 +105,7 @@ def vjp_aovs(media: SceneMedia, ray: mi.Ray3f, names: tuple[str, ...], daovs: li
     for name, d in zip(names, daovs, strict=True):
         if name != "depth":
             slopes = first.T if _row(name) == "alpha" else [1] * media.channels
-            weight = [w + d * s * T for w, s, T in zip(weight, _shares(name, media.channels), slopes, strict=True)]
+            weight = [w + d * s * T for w, s, T in zip(weight, _channel_weights(name, media.channels), slopes, strict=True)]
     if set(names) != {"depth"}:
         vjp_rows(media, first.ray_segment, weight, active)
     for name, d in zip(names, daovs, strict=True):
@@ -110,7 +115,7 @@ def vjp_aovs(media: SceneMedia, ray: mi.Ray3f, names: tuple[str, ...], daovs: li
 
 
 def _find_first_segment(media: SceneMedia, ray: mi.Ray3f, active: mi.Bool) -> _FirstSegment:
-    """Carry rays to the first opaque surface or out of the scene."""
+    """Follow rays to the first opaque surface or out of the scene."""
     ray = camera_ray(ray)
     medium = media.medium_at(ray)
     end, tau = integrate_optical_depth(media, ray, medium, mi.Bool(active))
@@ -121,7 +126,7 @@ def _find_first_segment(media: SceneMedia, ray: mi.Ray3f, active: mi.Bool) -> _F
 
 
 def _depth(media: SceneMedia, first: _FirstSegment, active: mi.Bool) -> tuple[mi.Float, mi.Float]:
-    """The mean distance, and the opacity that it is a mean over."""
+    """The expected depth, and the opacity that it is divided by."""
     N, opacity = integrate_expected_depth(media, first.ray_segment, first.end, mi.Bool(active))
     some = opacity > 0
     return dr.select(some, N / dr.select(some, opacity, 1), 0), opacity
@@ -131,19 +136,19 @@ def _row(name: str) -> str:
     return name.partition(".")[0]
 
 
-def _shares(name: str, channels: int) -> list[float]:
-    """What each channel counts in an AOV: a mean, or one channel alone."""
+def _channel_weights(name: str, channels: int) -> list[float]:
+    """The weight of each channel in an AOV: that of a mean, or of one channel alone."""
     channel = name.partition(".")[2]
     if not channel:
         return [1 / channels] * channels
     return [float(c == "RGB".index(channel) % channels) for c in range(channels)]
 
 
-def _weigh(shares: list[float], rows: list[mi.Float]) -> mi.Float:
-    return sum((s * row for s, row in zip(shares, rows, strict=True) if s), mi.Float(0))
+def _weigh(weights: list[float], rows: list[mi.Float]) -> mi.Float:
+    return sum((s * row for s, row in zip(weights, rows, strict=True) if s), mi.Float(0))
 
 
 def _inverse(alpha: mi.Float) -> mi.Float:
-    """1 / alpha; 0 where nothing stops a ray and its depth is 0 by definition (1e-37: the inverse stays finite)."""
+    """1 / alpha; 0 where nothing stops the ray, whose depth is 0 by definition. 1 / 1e-37 is still finite in float32."""
     some = alpha > 1e-37
     return dr.select(some, dr.rcp(dr.select(some, alpha, 1)), 0)

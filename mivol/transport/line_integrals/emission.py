@@ -1,17 +1,17 @@
-r"""Light that media emit towards the camera, dimmed by all in front of it; with its tangent and its transpose.
+r"""Emission of media along a ray (the emission-absorption integral), with its tangent and its transpose.
 
 .. math:: L = \int_0^D T(t) \Big( \sigma_t (1 - \alpha)\, L_e(x_t, \omega) + j(x_t, \omega) \Big) dt
 
-The source function (1 - albedo) Le goes with the extinction, so an infinitely thick medium that does not scatter shows Le; with
-``sigma_a`` and ``sigma_s`` the emitted power is sigma_a Le. The glow j (``emission_density``) does not go with it.
+The source function (1 - albedo) Le is multiplied by the extinction, so an infinitely thick medium that does not scatter has the
+radiance Le; with ``sigma_a`` and ``sigma_s`` the emitted power is sigma_a Le. The emission density j (``emission_density``)
+does not depend on the extinction.
 
-Conventions. A stretch is swept cell by cell (:mod:`mivol.transport.composite`); in a cell both are weighed at the two points of
-the cell quadrature (:mod:`mivol.transport.traversal.cell_quadrature`). Cells are those of the extinction's grid, or of the
-emission's where the extinction has none; a segment outside any grid is one cell. ``omega`` is the direction from the point to
-the camera (``wi``).
+Conventions. A ray is composited cell by cell (:mod:`mivol.transport.line_integrals.composite`). In a cell both are evaluated at
+the two points of the cell quadrature (:mod:`mivol.transport.traversal.cell_quadrature`). Cells are those of the extinction's
+grid, or of the emission's where the extinction has none; an interval outside any grid is one cell. ``omega`` is the direction
+from the point to the camera (``wi``).
 
-References: Max 1995; the derivative is a sweep from the far end, so nothing is divided by a transmittance and a voxel that
-is hidden behind an optical depth of 50 gets its e^-50.
+References: Max 1995 (the emission-absorption integral).
 """
 
 from __future__ import annotations
@@ -39,16 +39,16 @@ BLACK = 1000.0
 
 
 def integrate_emission(media: SceneMedia, ray_segment: RaySegment, active: mi.Bool, tangent: bool = False) -> Composite:
-    """Sum the light that media emit along a stretch.
+    """Integrate the light that media emit along a ray.
 
     Args:
         media: of the scene.
-        ray_segment: the stretch; world space, unit direction.
+        ray_segment: the ray, and how far it goes; world space, unit direction.
         active: lanes to follow.
-        tangent: with derivatives along those that the media took from the parameters.
+        tangent: follow tangents too, from those that the media took from the parameters.
 
     Returns:
-        The chain: its ``N`` is the light of each colour [radiance], its ``tau`` the optical depth, then their tangents.
+        The composite: its ``N`` is the light of each colour [radiance], its ``tau`` the optical depth; their tangents follow.
 
     Raises:
         MivolError: a medium whose grids of extinction do not share their cells.
@@ -68,12 +68,12 @@ def vjp_emission(
     behind: mi.Spectrum,
     active: mi.Bool,
 ) -> None:
-    """Add the derivatives of the light along a stretch to the gradients of the media and of the emission.
+    """Add the derivatives of the light along a ray to the gradients of the media and of the emission.
 
     Args:
         media, ray_segment, active: as :func:`integrate_emission`, which returned ``composite``.
-        weight: d loss / d light of each colour at the beginning of the stretch.
-        behind: d loss times the light from behind the stretch, as the camera sees it: all of the stretch dims it.
+        weight: d loss / d light of each colour, at the origin of the ray.
+        behind: d loss / d log T of each colour: the derivative times the light from behind the ray, as the camera sees it.
     """
     line = LineIntegral(media, _Emission.of(media), ray_segment, active)
     rows, rest = ([v[c] for c in range(line.integrand.rows)] for v in (weight, behind))
@@ -82,7 +82,7 @@ def vjp_emission(
 
 @dataclass
 class _Emission:
-    """The rule of a chain that sums emitted light: a row for each colour, over ``channels`` of extinction."""
+    """The integrand of emitted light: a row for each colour, over ``channels`` of extinction."""
 
     rows: int
     channels: int
@@ -140,8 +140,8 @@ class _Emission:
         if body.view.emission is None or body.view.albedo is not None:
             return
         for t, per in zip(self._places(site), per_sigma, strict=True):
-            Le, share = self._absorbed(site, t)
-            for name, by in (("sigma_a", 1 - share), ("sigma_s", -share)):
+            Le, fraction = self._absorbed(site, t)
+            for name, by in (("sigma_a", 1 - fraction), ("sigma_s", -fraction)):
                 rows = factor * per * Le * by
                 body.deposit(site.ray, t, by_channel(rows, self.channels), site.on, name)
 
@@ -155,11 +155,11 @@ class _Emission:
             change = tangent_of(sent)
         if body.view.emission is not None and body.view.albedo is None:
             for t, per in zip(self._places(site), per_sigma, strict=True):
-                Le, share = self._absorbed(site, t)
+                Le, fraction = self._absorbed(site, t)
                 by_a, by_s = (
                     spectrum(body.tangent_at(site.ray, t, self.channels, site.on, name)) for name in ("sigma_a", "sigma_s")
                 )
-                change += per * Le * ((1 - share) * by_a - share * by_s)
+                change += per * Le * ((1 - fraction) * by_a - fraction * by_s)
         return [change[r] for r in range(self.rows)]
 
     def least(self, t1: mi.Float) -> float:
@@ -171,21 +171,22 @@ class _Emission:
         return [dr.fma(dt, p, site.a) for p in self.points]
 
     def _detached(self, site: RayPiece) -> tuple[list[mi.Spectrum], list[mi.Spectrum]]:
-        """Source function and glow at the points; nothing where there is none."""
+        """Source function and emission density at the points; empty lists where the medium has none."""
         view, places = site.body.view, self._places(site)
-        source = [dr.detach(self._source(site, t) * self._share(site, t)) for t in places] if view.emission is not None else []
-        emission_density = (
-            [dr.detach(_evaluate(view.emission_density, site, t)) for t in places] if view.emission_density is not None else []
-        )
+        source, emission_density = [], []
+        if view.emission is not None:
+            source = [dr.detach(self._source(site, t) * self._absorbed_fraction(site, t)) for t in places]
+        if view.emission_density is not None:
+            emission_density = [dr.detach(_evaluate(view.emission_density, site, t)) for t in places]
         return source, emission_density
 
     def _source(self, site: RayPiece, t: mi.Float) -> mi.Spectrum:
-        """(1 - albedo) Le with its derivative, where the medium has an albedo; else Le."""
+        """The source function (1 - albedo) Le, with its derivative, where the medium has an albedo; else Le."""
         view = site.body.view
         Le = _evaluate(view.emission, site, t)
         return Le if view.albedo is None else (1 - _albedo(site, t)) * Le
 
-    def _share(self, site: RayPiece, t: mi.Float) -> mi.Spectrum:
+    def _absorbed_fraction(self, site: RayPiece, t: mi.Float) -> mi.Spectrum:
         """sigma_a / sigma_t where the medium has both coefficients (1 in a vacuum); else 1."""
         body = site.body
         if body.view.albedo is not None:
@@ -196,10 +197,10 @@ class _Emission:
         return dr.detach(dr.select(sigma_t > 0, sigma_a / dr.select(sigma_t > 0, sigma_t, 1), 1))
 
     def _absorbed(self, site: RayPiece, t: mi.Float) -> tuple[mi.Spectrum, mi.Spectrum]:
-        return dr.detach(_evaluate(site.body.view.emission, site, t)), self._share(site, t)
+        return dr.detach(_evaluate(site.body.view.emission, site, t)), self._absorbed_fraction(site, t)
 
     def _weights(self, site: RayPiece, sigma: list[list[mi.Float]]) -> tuple[list, list, list]:
-        """What a unit of source function, of glow, and of emitted power per extinction sends from each point."""
+        """Weights at each point: of the source function, of the emission density, of source function times extinction."""
         finite = dr.isfinite(site.dt)
         dt = dr.select(finite, site.dt, 0)
         rows = sigma[: self.channels]
@@ -219,10 +220,11 @@ class _Emission:
         return by_source, by_density, per_sigma
 
     def _sent(self, site: RayPiece, by_source: list, by_density: list) -> mi.Spectrum:
-        """The light of a cell, with derivatives of the emission and the albedo."""
+        """The light of a cell, with derivatives with respect to emission and albedo."""
         total, places = mi.Spectrum(0), self._places(site)
         if site.body.view.emission is not None:
-            total += sum((w * self._share(site, t) * self._source(site, t) for w, t in zip(by_source, places, strict=True)))
+            total += sum((w * self._absorbed_fraction(site, t) * self._source(site, t) for w, t in zip(by_source, places,
+            strict=True)))
         if site.body.view.emission_density is not None:
             total += sum(
                 (w * _evaluate(site.body.view.emission_density, site, t) for w, t in zip(by_density, places, strict=True))
@@ -233,7 +235,7 @@ class _Emission:
 def _endless(
     integral: CellIntegral, endless: mi.Bool, sigma: mi.Float, source: mi.Float, emission_density: mi.Float
 ) -> CellIntegral:
-    """A stretch of constants: as a cell, or without an end, where it is opaque and shows source + glow / sigma."""
+    """The integral over constants; where they have no end, the ray is opaque and has the radiance source + density / sigma."""
     mean = dr.rcp(dr.select(endless, sigma, 1))
     return CellIntegral(
         dr.select(endless, BLACK, integral.tau),
@@ -245,9 +247,9 @@ def _endless(
 
 
 def _albedo(site: RayPiece, t: mi.Float) -> mi.Spectrum:
-    """The albedo at a point of a ray, with its derivative; a stock grid repeats its border, as where light is scattered."""
-    share = site.body.view.albedo
-    return share.eval(medium_interaction(site.ray, t), site.on) if isinstance(share, mi.Volume) else mi.Spectrum(share)
+    """The albedo at a point of a ray, with its derivative. A stock grid repeats its border outside its box."""
+    albedo = site.body.view.albedo
+    return albedo.eval(medium_interaction(site.ray, t), site.on) if isinstance(albedo, mi.Volume) else mi.Spectrum(albedo)
 
 
 def _evaluate(field: mi.Volume | mi.Float | mi.Color3f, site: RayPiece, t: mi.Float) -> mi.Spectrum:
@@ -260,5 +262,5 @@ def _evaluate(field: mi.Volume | mi.Float | mi.Color3f, site: RayPiece, t: mi.Fl
 
 
 def _by_point(pairs: list[tuple[mi.Float, mi.Float]]) -> list[mi.Spectrum]:
-    """[channel](first, second) as a spectrum for each point."""
+    """A spectrum for each of the two points, from the (first, second) pair of each channel."""
     return [spectrum([pair[q] for pair in pairs]) for q in range(2)]

@@ -1,20 +1,21 @@
-r"""The mean distance at which a ray is stopped, with its tangent and its transpose.
+r"""Expected depth: the mean distance at which a ray is stopped, with its tangent and its transpose.
 
 .. math:: N = \int t\,\sigma T\,dt + t_s T_s, \quad N_{cell} = a \alpha + \Delta \Big(\int_0^1 e^{-\tau(u)} du - e^{-\tau}\Big)
 
-The mean is N over the opacity. In a cell [a, a + D] three Gauss points give the optical depth, and the first and second
-Legendre moments (slope and bend) of the extinction; T = exp(-tau u) exp(B (u - u^2) - G (2 u^3 - 3 u^2 + u)) is expanded in
-these two, to the orders 2 and 1, about a cell of the same optical depth without them:
+The expected depth is N over the opacity. In a cell [a, a + D] three Gauss points give the optical depth, and the first and
+second Legendre moments (slope B and bend G) of the extinction. The transmittance T = exp(-tau u) exp(B (u - u^2) - G (2 u^3 - 3
+u^2 + u)) is expanded in these, to second order in B and first order in G, about a cell of constant extinction with the same
+optical depth:
 
 .. math:: N_{cell} = a\,\alpha + \Delta \Big(\tau E_1 + B (E_1 - E_2) + \frac{B^2}{2} (E_2 - 2 E_3 + E_4)
           - G (E_1 - 3 E_2 + 2 E_3)\Big)
 
-with E_n(tau) from :mod:`mivol.numerics`. It is exact for a thin cell of any (cubic) extinction, and for a constant one at any
-optical depth, so that constants are cells of any length; the error falls as D^6. Nothing is divided by a transmittance or by
-an extinction: derivatives are finite everywhere.
+with E_n(tau) from :mod:`mivol.numerics`. This is exact for a thin cell of any (cubic) extinction, and for a constant extinction
+at any optical depth, so a region of constant extinction is one cell of any length; else the error falls as D^6. Nothing is
+divided by a transmittance or by an extinction, so derivatives are finite everywhere.
 
-Conventions. Distances are counted from ``origin``: with the mean distance itself as origin, the derivative of the mean is
-that of N over the opacity, since N is 0.
+Conventions. Distances are counted from ``origin``. With the expected depth itself as origin N is 0, so the derivative of the
+quotient N / alpha is that of N over alpha.
 
 References: Max 1995 (the integral, with distance as the source); Abramowitz & Stegun 25.4.30 (Gauss points).
 """
@@ -41,7 +42,7 @@ SPREAD = math.sqrt(15) / 10
 """Distance of the outer Gauss points from the middle of [0, 1]; with the weights 5/18, 8/18, 5/18 exact to degree 5."""
 
 BLACK = 1000.0
-"""Stands for an infinite optical depth: exp(-1000) is 0, and 1000 + x - 1000 is x in float64."""
+"""Stands for an infinite optical depth: exp(-1000) is 0, and in float64 1000 + x - 1000 is x again, to 1e-13."""
 
 
 def integrate_distance_in_cell(a: mi.Float, dt: mi.Float, near: mi.Float, middle: mi.Float, far: mi.Float) -> CellIntegral:
@@ -52,8 +53,8 @@ def integrate_distance_in_cell(a: mi.Float, dt: mi.Float, near: mi.Float, middle
         dt: its length [length], finite.
         near, middle, far: extinction [1/length] at its three Gauss points.
 
-    Bias: none for a thin cell or a constant extinction; of seventh order in dt for a smooth one; where an extinction rises
-        or falls within a cell of large optical depth, at most about that cell.
+    Bias: none for a thin cell or a constant extinction; O(dt^7) for a smooth one; at most about the length of the cell where
+        the extinction changes strongly within a cell of large optical depth.
     """
     sides = near + far
     tau = dt * dr.fma(sides, 5 / 18, middle * (8 / 18))
@@ -74,9 +75,9 @@ def integrate_distance_in_cell(a: mi.Float, dt: mi.Float, near: mi.Float, middle
 
 
 def _integrate_in_constant(site: RayPiece, origin: mi.Float, sigma: mi.Float) -> CellIntegral:
-    """A stretch of constant extinction; it may be infinite.
+    """Integrate over constant extinction of any length.
 
-    There N = a + 1/sigma; a medium of extinction 0 that never ends has no derivative, and 0 is returned.
+    For an infinite length N = a + 1/sigma. There is no expected depth for extinction 0; N and its derivative are then 0.
     """
     begin = dr.select(site.on, site.a - origin, 0)
     finite = dr.isfinite(site.dt)
@@ -94,7 +95,7 @@ def _integrate_in_constant(site: RayPiece, origin: mi.Float, sigma: mi.Float) ->
 
 @dataclass
 class _ExpectedDepth:
-    """The rule of a chain that sums distances, counted from ``origin``; a row for each channel."""
+    """The integrand of expected depth: distances counted from ``origin``, a row for each channel."""
 
     rows: int
     origin: mi.Float
@@ -109,7 +110,7 @@ class _ExpectedDepth:
         return [_integrate_in_constant(site, self.origin, s) for s in sigma]
 
     def vjp(self, site: RayPiece, sigma: list[list[mi.Float]], weight: list[mi.Float]) -> None:
-        """Nothing but the extinction moves a distance."""
+        """Do nothing: N depends on the extinction only."""
 
     def jvp(self, site: RayPiece, sigma: list[list[mi.Float]]) -> list[mi.Float]:
         return [mi.Float(0) for _ in range(self.rows)]
@@ -118,7 +119,7 @@ class _ExpectedDepth:
         return dr.minimum(t1 - self.origin, 0)
 
     def end(self, end: SegmentEnd) -> list[mi.Float]:
-        """The opaque surface at the end of a ray stops what is left."""
+        """What the opaque surface at the end of a ray adds, by itself."""
         return [dr.select(end.si.is_valid(), end.t - self.origin, 0)] * self.rows
 
 
@@ -130,12 +131,12 @@ def integrate_expected_depth(
     Args:
         media: of the scene.
         ray_segment: the ray, the medium around its origin, and how far it goes; world space, unit direction.
-        end: where it ends; an opaque surface there stops what is left.
+        end: where it ends, possibly at an opaque surface.
         active: lanes to integrate.
 
     Returns:
-        N [length], the mean distance times the opacity, and that opacity [1]: of the very optical depth in N, since a
-        radiance field's own depends on where in its cells it is looked at.
+        N [length], the expected depth times the opacity, and that opacity [1]. The opacity is that of the optical depth in N:
+        with a radiance field it differs a little from ``alpha``, since an activated extinction depends on the points of a cell.
 
     Raises:
         MivolError: a medium that sums grids of two resolutions or places.
@@ -151,11 +152,11 @@ def integrate_expected_depth(
 def jvp_expected_depth(
     media: SceneMedia, ray_segment: RaySegment, end: SegmentEnd, origin: mi.Float, active: mi.Bool
 ) -> mi.Float:
-    """Tangent of N, distances counted from ``origin``, along that which the media took from the parameters.
+    """Tangent of N, with distances counted from ``origin``, from the tangents that the media took from the parameters.
 
     Args:
         media, ray_segment, end, active: as :func:`integrate_expected_depth`.
-        origin: the mean distance, so that this over the opacity is the tangent of the mean.
+        origin: the expected depth; the result over the opacity is then its tangent.
     """
     integrand = _ExpectedDepth(media.channels, origin)
     line = LineIntegral(media, integrand, ray_segment, active)
@@ -169,7 +170,7 @@ def vjp_expected_depth(
 
     Args:
         media, ray_segment, end, active: as :func:`integrate_expected_depth`.
-        origin: the mean distance, as in :func:`jvp_expected_depth`.
+        origin: the expected depth, as in :func:`jvp_expected_depth`.
         weight: of each lane.
 
     Cost: two walks of each body, and one packed write of 8 a cell and channel.

@@ -1,18 +1,19 @@
-r"""Light along rays through a radiance field, and its derivatives by a sweep back along them.
+r"""Emission-absorption rendering of a radiance field along rays, and its derivatives by a sweep back along them.
 
 .. math:: L = \sum_i T_i\, S_i, \qquad T_{i+1} = T_i e^{-\tau_i}, \qquad S_i = \alpha_i \big( f c_1 + (1 - f) c_2 \big)
 
-over the occupied cells of a ray, with the shares f of the cell quadrature
-(:mod:`mivol.transport.traversal.cell_quadrature`): fourth order in the size of a cell, and exact for a constant colour.
+over the occupied cells of a ray, with the fractions f of the cell quadrature
+(:mod:`mivol.transport.traversal.cell_quadrature`). It is of fourth order in the size of a cell, and exact for a constant
+colour.
 
-Conventions. Density and colour are interpolated between nodes; then the density goes through its activation and the
-colour is clamped at 0. A ``source`` says what the corners of a cell hold: ``Baked`` for rays from pinholes, where the
-harmonics are summed once per node and pinhole in the direction from there, ``Exact`` for any rays. The distance of what is
-seen is a fourth colour, c = t.
+Conventions. Density and colour are interpolated between nodes; then the activation is applied to the density, and the colour is
+clamped at 0. A ``source`` reads the corners of a cell: ``Baked`` for rays from pinholes, where the harmonics of each node are
+summed once per pinhole, in the direction from there; ``Exact`` for any rays. Distance is composited as a fourth colour, c = t.
 
-Derivatives. With r the light from behind a cell (weighted by the derivative asked for, so one number a ray), the sweep goes
-from the last cell visited to the first, r <- S + exp(-tau) r, all sums of what is there: nothing is subtracted from the
-radiance, nothing is divided by a transmittance or an opacity, and behind the point where a ray was stopped nothing is added.
+Derivatives. Let r be the light from behind a cell times the derivative of the loss by it (one number a ray). The sweep goes
+from the last cell that was visited to the first, with r <- S + exp(-tau) r. So r is a sum of what lies behind; it is
+not the difference of the radiance and a prefix, and nothing is divided by a transmittance or an opacity. Nothing is added
+from behind the point where a ray was stopped.
 
 References: Max 1995 (the integral); Sloan 2008, 2013 (the basis of ``dr.sh_eval``); Fridovich-Keil, Yu et al. 2022 (the model).
 """
@@ -39,7 +40,7 @@ __all__ = ["Baked", "Exact", "Model", "RayBundle", "RenderedRays", "Source", "ba
 
 
 DEEPEST = 104.0
-"""Optical depth behind which float32 has no light left."""
+"""Optical depth beyond which exp(-tau) is 0 in float32."""
 
 
 @dataclass
@@ -53,12 +54,12 @@ class RayBundle:
 
 @dataclass(frozen=True)
 class Model:
-    """How interpolated values become extinction and colour.
+    """How extinction and colour follow from interpolated values.
 
     Attributes:
         activation: of the density, after interpolation.
-        clamp: whether colours below 0 are shown as 0.
-        stop: a ray ends where its transmittance is below this; what is left out is at most ``stop`` times the brightest colour.
+        clamp: whether colours below 0 count as 0.
+        stop: a ray ends where its transmittance is below this; the error is at most ``stop`` times the brightest colour.
     """
 
     activation: Activation
@@ -76,7 +77,7 @@ Colours = list
 
 
 class Source(Protocol):
-    """What the corners of cells hold."""
+    """Reads density and colour at the corners of cells, and takes their derivatives."""
 
     def read(self, cells: Cells, number: mi.UInt32, on: mi.Bool) -> tuple[list[mi.Float], Callable[[mi.Bool], Colours]]:
         """Raw densities of the 8 corners of listed cells, and a call for their colours where a mask says they are needed."""
@@ -87,12 +88,12 @@ class Source(Protocol):
 
 @dataclass
 class Baked:
-    """Density and the colours that pinholes see, 4 numbers for each node of a listed cell and pinhole: a packet a corner.
+    """Density, and colour as seen from each pinhole, at the nodes of occupied cells: 4 numbers, which are read as one packet.
 
     Attributes:
-        table: Float: raw density and rgb (its offset included) of a node; a block of nodes for each pinhole.
+        table: Float: raw density and rgb (its offset included) of a node; a block of all nodes for each pinhole.
         first: where the block of each lane's pinhole begins.
-        slope: the derivative, as ``table``; None where none is asked for.
+        slope: the derivative, laid out as ``table``; None where none is computed.
     """
 
     table: mi.Float
@@ -120,7 +121,7 @@ class Exact:
         harmonics: Float, ``row_width`` a row.
         basis: the harmonics of each lane's direction.
         offset: added to each colour.
-        density_slope, harmonics_slope: the derivatives; None where none are asked for.
+        density_slope, harmonics_slope: the derivatives; None where none are computed.
     """
 
     density: mi.Float
@@ -162,14 +163,14 @@ def _summed(row: mi.ArrayXf, basis: list[mi.Float], offset: float) -> list[mi.Fl
 
 
 def _add_packet(target: mi.Float, values: Sequence[mi.Float], row: mi.UInt32, on: mi.Bool) -> None:
-    """Add numbers that lie side by side; on the CPU each thread has a copy and none needs atomics."""
+    """Add numbers that lie side by side in memory; on the CPU each thread adds to a copy of its own, without atomics."""
     mode = dr.ReduceMode.Expand if dr.backend_v(mi.Float) == dr.JitBackend.LLVM else dr.ReduceMode.Auto
     value = mi.ArrayXf(list(values)) if len(values) > 1 else values[0]
     dr.scatter_add(target, value, row, on, mode=mode)
 
 
 def cells_of(field: SphericalGrid) -> Cells:
-    """The cells of a field where there is light or a derivative: others are skipped, exactly."""
+    """The cells of a field that have light or a derivative; skipping the others changes nothing."""
     below = field.act.empty_below
     vacuum = field.rows - 1
 
@@ -189,7 +190,7 @@ def _any(masks: list[mi.Bool]) -> mi.Bool:
 
 
 def model_of(field: SphericalGrid, stop: float = 0.0) -> Model:
-    """How a field's values are understood."""
+    """The model of a field: its activation and clamp."""
     return Model(field.act, field.clamp, stop)
 
 
@@ -197,14 +198,15 @@ def bake(field: SphericalGrid, cells: Cells, points: np.ndarray, view: mi.UInt32
     """Sum the harmonics of each node in the directions from pinholes.
 
     Args:
-        field: what is seen.
-        cells: its occupied cells: other nodes are left out.
+        field: the radiance field.
+        cells: its occupied cells; other nodes are left out.
         points: (V, 3) world, the pinholes.
-        view: the pinhole of each ray.
-        slope: whether derivatives will be asked for.
+        view: the index of each ray's pinhole.
+        slope: whether derivatives will be computed.
 
-    Bias: O(h^2 / r^2) of the colour for a node at distance r of a pinhole: where trilinear weights meet, the directions to the
-        nodes average to that of the ray to first order. Cost: the field read once, and 4 numbers a node and pinhole written.
+    Bias: O(h^2 / r^2) of the colour for a cell of size h at distance r from a pinhole: the directions to the nodes, averaged
+        with their trilinear weights, are that of the ray to first order.
+    Cost: the field is read once, and 4 numbers a node and pinhole are written.
     """
     table = dr.zeros(mi.Float, 4 * dr.width(cells.rows) * len(points))
     _bake(field, cells.rows, table, points)
@@ -214,7 +216,7 @@ def bake(field: SphericalGrid, cells: Cells, points: np.ndarray, view: mi.UInt32
 
 @dr.syntax
 def _bake(field: SphericalGrid, rows: mi.UInt32, table: mi.Float, points: np.ndarray) -> None:
-    """Fill the blocks of a table; a loop, so a field is read once and one kernel serves any number of pinholes."""
+    """Fill the blocks of a table, in a loop, so that the field is read once and one kernel serves any number of pinholes."""
     number, node, seen_from = dr.arange(mi.UInt32, dr.width(rows)), _node(field, rows), field.viewer(points)
     pinholes, count = dr.opaque(mi.UInt32, len(points)), _count(rows)
     raw = dr.gather(mi.Float, field.density, rows)
@@ -226,23 +228,27 @@ def _bake(field: SphericalGrid, rows: mi.UInt32, table: mi.Float, points: np.nda
 
 
 def _roomy(size: int) -> int:
-    """At least a size, and one of few: a kernel that adds to an expanded array knows its length, and would be compiled anew."""
+    """Round a size up to one of few.
+
+    A kernel that adds to an array with a copy for each thread contains its length, and is compiled anew for another.
+    """
     step = 1 << max(size.bit_length() - 4, 2)
     return -(-size // step) * step
 
 
 def _count(rows: mi.UInt32) -> mi.UInt32:
-    """How many rows there are, opaque: a fit has another number of them now and then, and keeps its kernels."""
+    """The number of rows as an opaque number: it changes during a fit, and the kernels need not be compiled anew."""
     return dr.opaque(mi.UInt32, dr.width(rows))
 
 
 def _node(field: SphericalGrid, row: mi.UInt32) -> mi.UInt32:
-    """The node of a row; that of the vacuum is as good as any."""
+    """The node of a row; any node for the row of the vacuum, whose values are not used."""
     return row if field.nodes is None else dr.gather(mi.UInt32, field.nodes, row, row < field.rows - 1)
 
 
 def fold(field: SphericalGrid, cells: Cells, baked: Baked, points: np.ndarray) -> tuple[mi.Float, mi.Float]:
-    """Derivatives with respect to the rows of a field, from those with respect to what was baked of it.
+    """Derivatives with respect to the rows of a field, from those with respect to its baked table: the transpose of
+    :func:`bake`.
 
     Returns:
         Those of ``density`` and of ``harmonics``.
@@ -252,7 +258,7 @@ def fold(field: SphericalGrid, cells: Cells, baked: Baked, points: np.ndarray) -
 
 @dr.syntax
 def _over_pinholes(field: SphericalGrid, rows: mi.UInt32, nodes: mi.Float, points: np.ndarray) -> tuple[mi.Float, mi.Float]:
-    """Sum what pinholes add to the rows of a field; a loop, so one kernel serves any number of them."""
+    """Sum the derivatives of all pinholes, in a loop, so that one kernel serves any number of them."""
     number = dr.arange(mi.UInt32, dr.width(rows))
     node = _node(field, rows)
     seen_from = field.viewer(points)
@@ -286,15 +292,15 @@ def exact(field: SphericalGrid, rays: RayBundle, slope: bool = False) -> Exact:
 
 @dataclass
 class RenderedRays:
-    """What rays saw, and what a sweep back along them needs: a fixed number of values a ray.
+    """The result of a render, and the state from which a sweep back along the rays starts: a fixed number of values a ray.
 
     Attributes:
-        colour: radiance without what is behind the field.
-        T: transmittance of the ray; 0 behind DEEPEST.
-        distance: sum of the cells' shares of light times their distance from the ray's origin [length]: divide by 1 - T.
+        colour: radiance, without that from behind the field.
+        T: transmittance of the ray; 0 beyond DEEPEST.
+        distance: expected depth times opacity [length]: divide by 1 - T.
         tau: optical depth, as far as the ray was followed.
         before: optical depth in front of the last cell.
-        start, end: the stretch with extinction [length from ``segment``'s start].
+        start, end: the interval that has extinction [lengths from the start of ``segment``].
         last: the last cell visited (lower node).
         segment: the ray in the box.
     """
@@ -312,7 +318,12 @@ class RenderedRays:
 
 @dataclass
 class _Points:
-    """Extinction and colour at the two points of a cell, before the activation and after."""
+    """Extinction and colour at the two points of a cell.
+
+    Attributes:
+        sigma, sigma_slope: extinction, and its derivative by the interpolated density.
+        colour, shown: colour, and whether it is above its clamp.
+    """
 
     sigma: tuple[mi.Float, mi.Float]
     sigma_slope: tuple[mi.Float, mi.Float]
@@ -337,11 +348,11 @@ def render(cells: Cells, source: Source, model: Model, rays: RayBundle, active: 
     """Follow rays through a field.
 
     Args:
-        cells: where it is.
-        source: what it holds there.
-        model: how its values are understood.
+        cells: its occupied cells.
+        source: reads their corners.
+        model: activation, clamp and stop.
         rays: in the world.
-        active: lanes to follow; the others see nothing.
+        active: lanes to follow; the others are black.
 
     Bias: O(h^4) in the size of a cell; at most ``model.stop`` of the brightest colour behind the stop. No variance.
     Cost: 9 packets a visited cell with ``Baked``. Memory: some 20 numbers a ray, nothing a cell.
@@ -368,7 +379,7 @@ def render(cells: Cells, source: Source, model: Model, rays: RayBundle, active: 
 
 
 def brightest_weights(cells: Cells, source: Source, model: Model, rays: RayBundle, weight: mi.Float) -> None:
-    """Raise ``weight``, one a listed cell, to the largest share T alpha of a ray that the cell has.
+    """Raise ``weight``, one number an occupied cell, to the largest compositing weight T alpha that the cell has on a ray.
 
     Cost: as :func:`render`, and one write a visited cell.
     """
@@ -406,18 +417,19 @@ def backward(
         colour, T, distance: derivatives of the scalar with respect to these of ``rendered``.
         active: lanes to follow.
 
-    Bias: none beyond that of :func:`render`: the derivative of what it computes. Cost: as :func:`render`, and 8 packets
-        written.
+    Bias: none beyond that of :func:`render`: these are the derivatives of what it computes. Cost: as :func:`render`, and 8
+        packets written a visited cell.
     """
     back = reversed_from(rendered.segment, rendered.last, rendered.end, rendered.start)
     by = [mi.Float(c) for c in colour]
     distance = mi.Float(distance)
-    # r, what is behind; the optical depth in front of the cell visited last; whether one was.
+    # State: r, the weighted light from behind; optical depth in front of the cell that was passed last; whether the cell ahead
+    # is the last one of the ray.
     state = [mi.Float(T), mi.Float(rendered.before), mi.Bool(True)]
 
     def visit(state: list, here: CellVisitor, on: mi.Bool) -> list:
         r, before, is_last = state
-        # Points in the ray's own order: the sweep meets the second one first.
+        # The points in the order of the ray: the sweep runs the other way.
         here = CellVisitor(here.number, here.points[::-1], here.t, here.dt)
         at = _points(cells, source, model, here, on)
         share = share_opacity(here.dt, *at.sigma)
@@ -448,5 +460,5 @@ def _weigh(by: list[mi.Float], colour: list[mi.Float]) -> mi.Float:
 
 
 def _mirror(back: Segment, t: mi.Float) -> mi.Float:
-    """Distance from the ray's origin of a point at ``back.t0 + t`` of the way back."""
+    """Distance from the ray's origin of a point that lies ``back.t0 + t`` along the reversed ray."""
     return 2 * back.t0 - t
