@@ -26,6 +26,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -131,11 +132,11 @@ class _LightSum:
     light: mi.Spectrum
 
 
-Profile = Callable[[mi.Float], list[mi.Float]]
-"""Extinction [1/length] of each channel at a fraction of a span."""
+Profile = Callable[..., list]
+"""``sigma(x)``: extinction [1/length] of each channel at the fraction x of a span."""
 
-Source = Callable[[mi.Float64, mi.Bool], mi.Spectrum]
-"""Source function [radiance] at a distance along the ray: ``source(t, active)``."""
+Source = Callable[..., Any]
+"""``source(t, active)``: source function [radiance] at a distance along the ray, in float64."""
 
 
 @dataclass
