@@ -94,7 +94,10 @@ class SegmentEstimator(Protocol):
         """Find what derivatives along camera rays need beforehand; called before each pass, and done once."""
 
     def replayed(self) -> SegmentEstimator:
-        """The estimator of the light that a replay meets again, with the same random numbers: without what is drawn anew."""
+        """The estimator of the light that a replay finds again, without light that is sampled anew for its derivatives.
+
+        It consumes the same random numbers, so that both passes follow the same path.
+        """
 
 
 class Transmittance:

@@ -54,8 +54,8 @@ class SegmentQuestion:
     """What a scene and its settings ask of the segment estimator.
 
     Attributes:
-        scatters: media turn light of emitters to the camera.
-        emits: some medium is a source of light.
+        scatters: some medium scatters light of emitters to the camera.
+        emits: some medium emits light.
         deterministic: images without noise were asked for.
     """
 
@@ -71,7 +71,7 @@ class SegmentEntry:
     Attributes:
         make: builds the estimator.
         answers: whether the estimator answers a question.
-        scatterings: how often it lets light turn in media on its way from an emitter.
+        scatterings: number of scattering events in media between an emitter and the camera that it accounts for.
         needs: the condition on the scene, in words.
         promises: bias and variance, in words.
         cites: keys of :mod:`mivol.report.cite`.
@@ -123,7 +123,7 @@ SEGMENT_ESTIMATORS = {
 """Estimators of what media add along a segment, by the name that a plan chooses them by. A question has one answer, or none."""
 
 MOST_SCATTERINGS = max(entry.scatterings for entry in SEGMENT_ESTIMATORS.values())
-"""How often some estimator of the table lets light turn in media; a plan refuses more."""
+"""Largest number of scattering events in media that some estimator of the table accounts for; a plan refuses more."""
 
 
 def choose_segment_estimator(asked: SegmentQuestion) -> str | None:
@@ -154,5 +154,5 @@ class Estimators:
         self.segment.prepare_derivatives(ray)
 
     def replayed(self) -> Estimators:
-        """Estimators of the radiance that a replay counts down: without light that is drawn anew for its derivative."""
+        """Estimators of the radiance that a replay subtracts from: without light that is sampled anew for its derivatives."""
         return Estimators(self.direct, self.segment.replayed(), self.lights_surfaces)

@@ -29,5 +29,5 @@ class Settings:
 
     @property
     def scatterings(self) -> float:
-        """How often light may turn between an emitter and the camera, on surfaces and in media; infinite without a limit."""
+        """Largest number of scattering events between an emitter and the camera, on surfaces and in media; may be infinite."""
         return math.inf if self.max_depth < 0 else max(self.max_depth - 1, 0)
