@@ -122,8 +122,11 @@ TAUS = np.append(0, np.logspace(-8, 6, 43))
 
 
 @pytest.mark.parametrize("ratio", [0.0, 1e-6, 0.3, 1.0, 40.0, 1e9])
-def test_hard_02_cells_of_any_optical_depth(ratio):
-    """float32 weights against the float64 twin, from an optical depth of 1e-8 to 1e6: finite, never negative, and right."""
+def test_cells_of_any_optical_depth(ratio):
+    """float32 weights against the float64 twin, from an optical depth of 1e-8 to 1e6: finite, never negative, and right.
+
+    Hard case 2.
+    """
     dt, mean = 0.5, TAUS / 0.5
     s1 = as_float32(2 * mean / (1 + ratio))
     s2 = as_float32(s1 * ratio)
@@ -183,8 +186,8 @@ NAMES = [
 
 
 @pytest.mark.parametrize(("boundary", "extinction"), NAMES)
-def test_hard_38_constant_source(boundary, extinction):
-    """C = Le (1 - T) + B T to rounding; of c = B nothing remains but B, and no gradient."""
+def test_constant_source(boundary, extinction):
+    """C = Le (1 - T) + B T to rounding; of c = B nothing remains but B, and no gradient. Hard case 38."""
     seen = emitting(twins.Medium(EXTINCTIONS[extinction], LE), boundary)
     C = light(seen)
     put(seen.scene, **{"emission.value.value": 0 * LE, "radiance.value": 0 * B + 1})
@@ -222,8 +225,8 @@ def _inside(o, d) -> dict:
 
 
 @pytest.mark.parametrize("boundary", ["box", "ball"])
-def test_hard_45_camera_inside(boundary):
-    """What lies behind the camera neither dims nor adds, in a box and in a boundary that is traced."""
+def test_camera_inside(boundary):
+    """What lies behind the camera neither dims nor adds, in a box and in a boundary that is traced. Hard case 45."""
     medium = twins.Medium((rough(5, 0, 4), PLACE), (rough(6, 0, 1, 3), PLACE), (rough(7, 0, 1, 3), PLACE))
     rng = np.random.default_rng(1)
     o, d = as_float32(rng.uniform(-0.4, 0.4, (8, 3))), rng.normal(size=(8, 3))
@@ -254,8 +257,8 @@ def test_refining_the_grid():
     assert slopes.mean() > 3.5, (found, slopes)
 
 
-def test_hard_20_21_zero_density():
-    """No extinction: C = B and the glow's plain integral; the derivative is the integral of w (c - B)."""
+def test_zero_density():
+    """No extinction: C = B and the glow's plain integral; the derivative is the integral of w (c - B). Hard cases 20 and 21."""
     empty = np.zeros((5, 4, 6, 1))
     source = (rough(8, 0, 1, 3), PLACE)
     seen = emitting(twins.Medium((empty, PLACE), source))
@@ -276,8 +279,11 @@ def test_hard_20_21_zero_density():
 
 
 @pytest.mark.parametrize("tau", [1e-8, 1e-3, 1.0, 1e3, 1e6])
-def test_hard_37_gradients_are_finite_at_any_optical_depth(tau):
-    """Cells of an optical depth from 1e-8 to 1e6, empty ones between them: no NaN, no infinity, and C between its sources."""
+def test_gradients_are_finite_at_any_optical_depth(tau):
+    """Cells of an optical depth from 1e-8 to 1e6, empty ones between them: no NaN, no infinity, and C between its sources.
+
+    Hard case 37.
+    """
     values = rough(9, 0, 1) * (rough(10, 0, 1) > 0.4) * tau * 3
     medium = twins.Medium((as_float32(values), PLACE), (rough(11, 0, 1, 3), PLACE), (rough(12, 0, 1, 3), PLACE))
     seen = emitting(medium)

@@ -24,15 +24,16 @@ def test_chord_of_a_ball_is_two_roots():
     np.testing.assert_allclose(chords, 0.5 * 2 * np.sqrt(np.maximum(1.44 - b * b, 0)), atol=ROUNDING)
 
 
-def test_hard_13_ray_from_inside_sees_the_rest_only():
+def test_ray_from_inside_sees_the_rest_only():
+    """Hard case 13."""
     o, d = np.array([[0.3, 0.0, 0.0]]), np.array([[1.0, 0.0, 0.0]])
     assert ball(1.0).integrate_lines(o, d) == pytest.approx(0.7, abs=ROUNDING)
     assert ball(1.0).integrate_lines(o, d, whole_lines=True) == pytest.approx(2.0, abs=ROUNDING)
     assert ball(1.0).integrate_lines(o + np.array([3.0, 0, 0]), d) == 0.0
 
 
-def test_hard_15_chord_does_not_cancel_far_away():
-    """sqrt(B^2 - A C) has lost 12 of 16 digits 1e6 radii away; the nearest-point form keeps those of o + t d."""
+def test_chord_does_not_cancel_far_away():
+    """sqrt(B^2 - A C) has lost 12 of 16 digits 1e6 radii away; the nearest-point form keeps those of o + t d. Hard case 15."""
     o = np.array([[-1e6, 0.6, 0.0]])
     chord = ball(1.0).integrate_lines(o, np.array([[1.0, 0.0, 0.0]]))
     assert chord == pytest.approx(1.6, abs=4e-16 * 1e6 * 4)

@@ -37,11 +37,13 @@ def test_centres_and_faces():
         (np.diag([1, 1, 1, 2.0]), "affine"),
     ],
 )
-def test_hard_49_places_without_volume(matrix, word):
+def test_places_without_volume(matrix, word):
+    """Hard case 49."""
     with pytest.raises(MivolError, match=word):
         check_affine(matrix)
 
 
 @pytest.mark.parametrize("scale", [1e-6, 1e6])
-def test_hard_16_small_and_large_boxes_pass(scale):
+def test_small_and_large_boxes_pass(scale):
+    """Hard case 16."""
     check_affine(box((scale, 0, 0), (0, 3 * scale, 0), (0, 0, scale)))

@@ -92,8 +92,8 @@ def assert_means(found: np.ndarray, T: np.ndarray, variance: np.ndarray, count: 
 
 @pytest.mark.statistical
 @pytest.mark.parametrize("name", FIELDS)
-def test_hard_01_estimates_have_the_exact_mean(name):
-    """Of each ray, and of all rays together, which tells a bias sqrt(32) times smaller."""
+def test_estimates_have_the_exact_mean(name):
+    """Of each ray, and of all rays together, which tells a bias sqrt(32) times smaller. Hard case 1."""
     found, T = estimates(grid(FIELDS[name]()))
     assert found.min() >= 0 and found.max() <= 1
     variance = T * (1 - T)

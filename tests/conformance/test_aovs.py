@@ -171,7 +171,8 @@ def test_depth_and_alpha_against_the_twin(name, walled):
     assert np.ptp(image[:, 0]) > 0.01
 
 
-def test_hard_45_camera_inside():
+def test_camera_inside():
+    """Hard case 45."""
     fog = {**medium("mivol_medium", grid_volume("mivol_voxels", grid(7), CUBE)), "id": "fog"}
     parts = {"fog": fog, "box": box_of({"type": "ref", "id": "fog"}, CUBE)}
     o = as_float32(np.random.default_rng(7).uniform(-0.4, 0.4, (6, 3)))
@@ -185,8 +186,9 @@ def test_hard_45_camera_inside():
 
 @pytest.mark.parametrize("sigma", [1e-8, 1e-3, 0.7, 20.0, 1e3, 1e6])
 @pytest.mark.parametrize("kind", ["homogeneous", "grid"])
-def test_hard_01_depth_of_a_slab_at_any_optical_depth(sigma, kind):
+def test_depth_of_a_slab_at_any_optical_depth(sigma, kind):
     # 1/sigma - L T / (1 - T) behind the entry: L/2 where it is thin, 1/sigma where it is thick.
+    """Hard case 1."""
     sigma = float(as_float32(sigma))
     values = np.full((7, 3, 2), sigma)
     inside = medium("heterogeneous", grid_volume("gridvolume", values))

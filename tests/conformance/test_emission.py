@@ -351,8 +351,8 @@ def test_flakes_are_refused():
 
 @pytest.mark.parametrize("bad", [-0.1, np.nan, np.inf])
 @pytest.mark.parametrize("kind", ["mivol_voxels", "gridvolume"])
-def test_hard_26_27_light_that_cannot_be(kind, bad):
-    """Our grids look at their values when they are loaded, stock ones are looked at before a render."""
+def test_light_that_cannot_be(kind, bad):
+    """Our grids look at their values when they are loaded, stock ones are looked at before a render. Hard cases 26 and 27."""
     values = rough(2, 0, 1, 3).astype(np.float32)
     values[1, 2, 3, 0] = bad
     given = interior(twins.Medium((rough(1, 0, 2), PLACE), (values, PLACE)), kind)
@@ -364,7 +364,8 @@ def test_hard_26_27_light_that_cannot_be(kind, bad):
         shoot(picture(given))
 
 
-def test_hard_26_a_constant_that_became_negative():
+def test_a_constant_that_became_negative():
+    """Hard case 26."""
     scene = picture(interior(twins.Medium(0.5, LE)))
     params = mi.traverse(scene)
     key = find(params, "emission.value.value")

@@ -139,8 +139,8 @@ NUMBERS = {
 
 @pytest.mark.parametrize("bad", [-1.0, np.nan, np.inf])
 @pytest.mark.parametrize("name", NUMBERS)
-def test_hard_26_a_number_that_no_medium_has_is_refused(name, bad):
-    """When it is handed in or at the next image, in each channel; after a step back all is as before."""
+def test_a_number_that_no_medium_has_is_refused(name, bad):
+    """When it is handed in or at the next image, in each channel; after a step back all is as before. Hard case 26."""
     key, interior = NUMBERS[name]
     scene = fog(interior())
     before = render(scene, {"type": "mivol", "max_depth": 1}, 1)

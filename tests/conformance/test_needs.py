@@ -359,8 +359,8 @@ def test_a_dome_without_a_floor_may_stand_on_one(tmp_path):
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
-def test_hard_27_bad_stock_voxels_are_named(bad):
-    """Stock gridvolume takes them in silence; the voxel is named before a kernel runs."""
+def test_bad_stock_voxels_are_named(bad):
+    """Stock gridvolume takes them in silence; the voxel is named before a kernel runs. Hard case 27."""
     wrong = values()
     wrong[1, 2, 3] = bad
     scene = scene_of(kind="heterogeneous", sigma_t=grid_volume("gridvolume", wrong, PLACE))

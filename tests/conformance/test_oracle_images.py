@@ -241,8 +241,9 @@ def test_one_grid_in_two_boundaries():
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_hard_03_vacuum_between_boundary_and_dense_grid(kind):
+def test_vacuum_between_boundary_and_dense_grid(kind):
     # Majorant 500 over 10 lengths of empty boundary: 1, where tracking with a global majorant underflows to 0.
+    """Hard case 3."""
     values = np.full((4, 4, 4, 1), 500.0)
     parts = in_frame(kind, values, np.eye(4), boundary=centred(10 * np.eye(3)))
     image = see(parts, [[-9, 3, 3], [0.5, 0.5, -9]], [[1, 0, 0], [0, 0, 1]]).image
@@ -252,8 +253,9 @@ def test_hard_03_vacuum_between_boundary_and_dense_grid(kind):
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("name", ODD_FRAMES[1:])
-def test_hard_04_boundary_larger_than_the_grid(kind, name):
+def test_boundary_larger_than_the_grid(kind, name):
     # Outside its own box a grid is vacuum, even where stock Mitsuba fills a rotated grid's bounding box.
+    """Hard case 4."""
     to_world, values = as_float32(FRAMES[name]), random_grid(8)
     middle, size = to_world[:3] @ [0.5, 0.5, 0.5, 1], np.linalg.norm(to_world[:3, :3] @ np.ones(3))
     boundary = as_float32(centred(3 * size * rotation([1, 0, 1], 0.4), middle))
@@ -266,7 +268,8 @@ def test_hard_04_boundary_larger_than_the_grid(kind, name):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_hard_04_boundary_smaller_than_the_grid(kind):
+def test_boundary_smaller_than_the_grid(kind):
+    """Hard case 4."""
     to_world, values = as_float32(FRAMES["rotated"]), random_grid(9)
     medium_type, volume_type = KINDS[kind]
     centre = as_float32(to_world[:3] @ [0.5, 0.5, 0.5, 1])
@@ -281,8 +284,9 @@ def test_hard_04_boundary_smaller_than_the_grid(kind):
 # -- Cameras inside, surfaces, lights -------------------------------------------------------------------------------------
 
 
-def test_hard_45_camera_inside_a_sphere():
+def test_camera_inside_a_sphere():
     # sigma = 1, R = 1, camera in the middle: e^-1.
+    """Hard case 45."""
     ball = ball_of({"type": "ref", "id": "fog"}, [0, 0, 0], 1)
     parts = {"fog": {**medium("homogeneous", 1.0), "id": "fog"}, "sky": sky(), "ball": ball}
     seen = see(parts, np.zeros((3, 3)), [[0, 0, 1], [0.6, 0.8, 0], [-1, 0, 0]], inside="fog")
@@ -293,7 +297,8 @@ def test_hard_45_camera_inside_a_sphere():
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("sigma", [1.0, 60.0])
-def test_hard_45_camera_inside_a_dense_grid(kind, sigma):
+def test_camera_inside_a_dense_grid(kind, sigma):
+    """Hard case 45."""
     values, to_world = sigma * random_grid(10, top=1.0), np.eye(4)
     medium_type, volume_type = KINDS[kind]
     fog = {**medium(medium_type, grid_volume(volume_type, values)), "id": "fog"}
@@ -443,8 +448,9 @@ def test_no_noise_along_pencils():
 # -- AOVs -----------------------------------------------------------------------------------------------------------------
 
 
-def test_hard_01_tau_and_alpha_at_any_optical_depth():
+def test_tau_and_alpha_at_any_optical_depth():
     # tau never passes through exp: 1e4 is 1e4; alpha = 1 - T to 4 EPS even at 1e-8; T below float32 is 0, not NaN.
+    """Hard case 1."""
     for power in (-8, -4, 0, 2, 4):
         values = np.full((3, 3, 3, 1), 10.0**power)
         for kind in KINDS:

@@ -297,7 +297,8 @@ def test_absorption_and_scattering_are_the_same_medium(variant):
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -1.0])
-def test_hard_27_bad_voxels_are_named(variant, bad):
+def test_bad_voxels_are_named(variant, bad):
+    """Hard case 27."""
     values = grid()
     values[3, 1, 4, 0] = bad
     with pytest.raises(Exception, match="z=3, y=1, x=4"):
@@ -321,7 +322,8 @@ def test_signed_voxels_are_a_g_and_no_extinction(variant):
         render(scene, {"type": "mivol"}, 1)
 
 
-def test_hard_49_degenerate_place_is_refused(variant):
+def test_degenerate_place_is_refused(variant):
+    """Hard case 49."""
     with pytest.raises(Exception, match="degenerate|invert|singular"):
         mi.load_dict(grid_volume("mivol_voxels", grid(), np.diag([1.0, 0, 1, 1])))
 
@@ -336,8 +338,11 @@ def test_a_rotation_about_an_axis_of_another_length_is_refused(variant):
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
-def test_hard_26_27_an_update_with_bad_values_is_refused(variant, bad):
-    """What an optimiser's overshoot leaves behind is named when it is handed in, not when it is rendered."""
+def test_an_update_with_bad_values_is_refused(variant, bad):
+    """What an optimiser's overshoot leaves behind is named when it is handed in, not when it is rendered.
+
+    Hard cases 26 and 27.
+    """
     params = mi.traverse(mi.load_dict(grid_volume("mivol_voxels", grid())))
     wrong = grid().astype(np.float32)
     wrong[1, 2, 3] = bad

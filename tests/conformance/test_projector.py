@@ -62,8 +62,11 @@ def test_rows_and_columns_of_a_larger_scan_agree():
     assert abs(ax @ y - x @ aty) <= 1e-6 * np.linalg.norm(ax) * np.linalg.norm(y)
 
 
-def test_hard_42_a_million_rays_in_one_voxel():
-    """All chords of a box of one voxel: float32 in turn loses 8e-4; passes of 8192 and float64 between them, 3e-5."""
+def test_a_million_rays_in_one_voxel():
+    """All chords of a box of one voxel: float32 in turn loses 8e-4; passes of 8192 and float64 between them, 3e-5.
+
+    Hard case 42.
+    """
     a = Projector(ParallelBeam(np.array([0.3]), (1000, 1000), 1e-3), VoxelGrid((1, 1, 1), 2.0))
     chords = a @ np.ones(1, np.float32)
     assert a.column_sums.sum(dtype=float) == pytest.approx(chords.sum(dtype=float), rel=3e-5)
@@ -89,8 +92,11 @@ def test_projects_what_an_ellipsoid_projects(name):
     assert errors[1] < 0.6 * errors[0]
 
 
-def test_hard_09_axis_aligned_rays_are_row_sums():
-    """theta = 0 looks along +y, theta = pi / 2 along -x, rays through voxel centres: voxel size times the sum of a row."""
+def test_axis_aligned_rays_are_row_sums():
+    """theta = 0 looks along +y, theta = pi / 2 along -x, rays through voxel centres: voxel size times the sum of a row.
+
+    Hard case 9.
+    """
     grid = VoxelGrid((4, 6, 6), 0.5)
     x = numbers(*grid.shape)
     y = Projector(ParallelBeam(np.array([0.0, np.pi / 2]), (4, 6), 0.5), grid) @ x
@@ -98,11 +104,13 @@ def test_hard_09_axis_aligned_rays_are_row_sums():
     np.testing.assert_allclose(y[1], 0.5 * x.sum(axis=2), atol=1e-5)
 
 
-def test_hard_15_object_and_source_far_away():
+def test_object_and_source_far_away():
     """The same scan 1e6 units from the world's origin, and from 1e5 grid sizes away: float64 set-up loses nothing.
 
     Expected: moving grid and rays together changes each float64 coordinate by 1e6 * 1e-16 only. A far cone is the
     parallel beam to 1e-5 (angle of the rays).
+
+    Hard case 15.
     """
     rays = PencilRays(np.array([[-5.0, 0.3, 0.2], [-5.0, -0.4, 0.6]]), np.array([[1.0, 0.01, -0.02], [1.0, 0.05, 0.0]]))
     shift = np.array([1e6, -2e6, 5e5])

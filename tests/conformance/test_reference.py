@@ -379,8 +379,11 @@ def _wrong_scenes() -> dict[str, tuple[dict, float, float]]:
     "kind",
     ["too deep", "rotated grid", "rotated grid of ours", "mirrored", "camera inside", "touching", "overlap", "constant box"],
 )
-def test_hard_03_04_doubt_where_mitsuba_is_wrong(variant_rgb, tmp_path, kind):
-    """Each doubt is raised, alone, and Mitsuba does show the wrong value: a release that mends it turns this red."""
+def test_doubt_where_mitsuba_is_wrong(variant_rgb, tmp_path, kind):
+    """Each doubt is raised, alone, and Mitsuba does show the wrong value: a release that mends it turns this red.
+
+    Hard cases 3 and 4.
+    """
     scene, right, shown = _wrong_scenes()[kind]
     doubts = trust(mi.load_dict(scene))
     assert [d.kind for d in doubts] == [kind.removesuffix(" of ours")]
@@ -453,8 +456,8 @@ def _voxels(value: float, **extra) -> dict:
     return {"type": "mivol_voxels", "data": mi.TensorXf(np.ascontiguousarray(values)), **extra}
 
 
-def test_hard_03_our_own_plugins(variant_rgb):
-    """mivol_voxels under a stock medium is as wrong as gridvolume; mivol_medium is right, and raises no doubt."""
+def test_our_own_plugins(variant_rgb):
+    """mivol_voxels under a stock medium is as wrong as gridvolume; mivol_medium is right, and raises no doubt. Hard case 3."""
     big = _t().translate([0.5, 0.5, 0.5]).scale(3)
     stock = {"type": "heterogeneous", "sigma_t": _voxels(30.0), "albedo": 0.0}
     ours = {"type": "mivol_medium", "sigma_t": _voxels(30.0)}

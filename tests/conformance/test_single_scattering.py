@@ -564,8 +564,11 @@ def test_rgb_extinction(kind, ratio):
 
 @pytest.mark.statistical
 @pytest.mark.slow
-def test_hard_46_depth_2_is_one_turn():
-    """Depth 1 is the background alone; depth 2 adds what turned once, and no more: dense smoke of albedo 1 stays below 1."""
+def test_depth_2_is_one_turn():
+    """Depth 1 is the background alone; depth 2 adds what turned once, and no more: dense smoke of albedo 1 stays below 1.
+
+    Hard case 46.
+    """
     box, _ = smoke(rough_grid(7, 12.0), albedo=1.0)
     scene = close_up({"smoke": box, "sky": scenes.sky(1.0)})
     two, _ = assert_same_images(scene, rounding=LEAK)

@@ -216,10 +216,12 @@ def corridor(wall: float) -> twins.Medium:
 
 @pytest.mark.parametrize("depth", [1, pytest.param(3, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("wall", [50.0, 1e6])
-def test_hard_37_no_phantom_gradient_behind_a_wall(wall, depth):
+def test_no_phantom_gradient_behind_a_wall(wall, depth):
     """Hidden voxels get their e^-50 (or their 0), where what is left of a subtraction would be 1e-7.
 
     At depth 3 the light from behind the field is what a replay has left: before a black floor it is 0.
+
+    Hard case 37.
     """
     medium, bright = corridor(wall), np.full(3, 5.0)
     more = {"floor": _floor()} if depth == 3 else {}

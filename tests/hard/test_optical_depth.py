@@ -65,7 +65,8 @@ def assert_tau(values, to_world, o, d, t_max=math.inf, skip=False):
 
 
 @pytest.mark.parametrize("power", [-8, -4, 0, 2, 4])
-def test_hard_01_any_optical_depth(power):
+def test_any_optical_depth(power):
+    """Hard case 1."""
     rng = np.random.default_rng(1)
     values = as_float32(10.0**power * rng.uniform(0.5, 1, (6, 6, 6)))
     fast = assert_tau(values, np.eye(4), *random_rays(rng, np.eye(4), 64))
@@ -77,8 +78,9 @@ def test_hard_01_any_optical_depth(power):
 
 @pytest.mark.parametrize("zero", [0.0, -0.0])
 @pytest.mark.parametrize("axis", [0, 1, 2])
-def test_hard_09_axis_aligned_row_sums(axis, zero):
+def test_axis_aligned_row_sums(axis, zero):
     # Through voxel centres tau is the voxel's edge times the sum of the row: 8 terms, 8 roundings at most.
+    """Hard case 9."""
     rng = np.random.default_rng(9)
     values = as_float32(rng.uniform(0.1, 1, (8, 8, 8)))
     index = list(itertools.product(range(8), repeat=2))
@@ -92,7 +94,8 @@ def test_hard_09_axis_aligned_row_sums(axis, zero):
         assert np.all(np.abs(fast - rows) <= 8 * EPS * rows)
 
 
-def test_hard_09_axis_aligned_off_centre():
+def test_axis_aligned_off_centre():
+    """Hard case 9."""
     rng = np.random.default_rng(10)
     values = positive(rng, (5, 7, 6, 3))
     for axis, sign, zero in itertools.product(range(3), (1.0, -1.0), (0.0, -0.0)):
@@ -102,7 +105,8 @@ def test_hard_09_axis_aligned_off_centre():
         assert_tau(values, np.eye(4), o, d)
 
 
-def test_hard_09_in_a_coordinate_plane():
+def test_in_a_coordinate_plane():
+    """Hard case 9."""
     rng = np.random.default_rng(11)
     values = positive(rng, (5, 7, 6))
     for axis, zero in itertools.product(range(3), (0.0, -0.0)):
@@ -113,7 +117,8 @@ def test_hard_09_in_a_coordinate_plane():
 
 
 @pytest.mark.parametrize("tiny", [1e-7, 1e-16, -1e-16, 1e-30, 1e-38, -1e-38, 1e-41, -1e-45])
-def test_hard_10_nearly_axis_aligned(tiny):
+def test_nearly_axis_aligned(tiny):
+    """Hard case 10."""
     rng = np.random.default_rng(12)
     values = positive(rng, (4, 6, 5))
     for axis in range(3):
@@ -130,8 +135,9 @@ def test_hard_10_nearly_axis_aligned(tiny):
             assert np.all(np.abs(fast - straight) <= allowed)
 
 
-def test_hard_10_a_tilt_of_1e_7_counts_from_far_away():
+def test_a_tilt_of_1e_7_counts_from_far_away():
     # 1e-7 over 1e6 lengths is a tenth of the box: rays that start beside it and hit, or start level with it and miss.
+    """Hard case 10."""
     rng = np.random.default_rng(40)
     values = as_float32(rng.uniform(0.5, 1, (4, 6, 5)))
     for axis in range(3):
@@ -147,8 +153,9 @@ def test_hard_10_a_tilt_of_1e_7_counts_from_far_away():
 # -- 11, 12: faces, edges, corners ------------------------------------------------------------------------------------
 
 
-def test_hard_11_in_cell_faces_and_edges():
+def test_in_cell_faces_and_edges():
     # Cells meet in the planes through voxel centres; 8 voxels, so those planes are exact in binary.
+    """Hard case 11."""
     rng = np.random.default_rng(13)
     values = positive(rng, (8, 8, 8))
     for axis in range(3):
@@ -163,8 +170,9 @@ def test_hard_11_in_cell_faces_and_edges():
         assert_tau(values, np.eye(4), o, d)  # along an edge
 
 
-def test_hard_11_midway_between_rows():
+def test_midway_between_rows():
     # On the plane between two rows of voxels: half of each, to the 8 roundings of the sum.
+    """Hard case 11."""
     rng = np.random.default_rng(14)
     values = as_float32(rng.uniform(0.1, 1, (8, 8, 8)))
     o = np.array([[-1, j / 8, (k + 0.5) / 8] for j in range(1, 8) for k in range(8)])
@@ -174,7 +182,8 @@ def test_hard_11_midway_between_rows():
 
 
 @pytest.mark.parametrize("n", [1, 2, 8, 16])
-def test_hard_11_diagonals_through_corners(n):
+def test_diagonals_through_corners(n):
+    """Hard case 11."""
     rng = np.random.default_rng(15)
     values = positive(rng, (n, n, n))
     signs = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
@@ -186,7 +195,8 @@ def test_hard_11_diagonals_through_corners(n):
     assert np.all(np.abs(fast - 1) <= (3 * n + 3) * EPS)
 
 
-def test_hard_12_grazing_from_outside():
+def test_grazing_from_outside():
+    """Hard case 12."""
     ones = np.ones((4, 4, 4))
     corner = np.array([[2.0, 0, 0.5], [2, 0, 1], [0, 2, 0], [0.5, 2, 0]])  # x + y = 2 touches the edge x = y = 1
     d = np.array([[-1.0, 1, 0], [-1, 1, 0], [1, -1, 0], [0, -1, 1]]) / math.sqrt(2)
@@ -202,8 +212,9 @@ def test_hard_12_grazing_from_outside():
     assert set(fast.ravel()) <= {0.0, 1.0}
 
 
-def test_hard_12_chord_across_a_corner():
+def test_chord_across_a_corner():
     # From 0.1 to one float32 step inside the edge: the chord is sqrt(2) times the depth, in float64.
+    """Hard case 12."""
     depths = 2.0 ** -np.arange(3, 23)
     o = np.array([[2 - h, 0, 0.5] for h in depths])
     d = np.array([-1.0, 1, 0]) / math.sqrt(2)
@@ -213,7 +224,8 @@ def test_hard_12_chord_across_a_corner():
 # -- 13, 14, 45: where the ray begins and ends ------------------------------------------------------------------------
 
 
-def test_hard_13_origin_inside_or_on_a_face():
+def test_origin_inside_or_on_a_face():
+    """Hard case 13."""
     rng = np.random.default_rng(16)
     values = positive(rng, (6, 5, 8))
     o, d = rng.uniform(0, 1, (64, 3)), rng.normal(size=(64, 3))
@@ -230,7 +242,8 @@ def test_hard_13_origin_inside_or_on_a_face():
 
 
 @pytest.mark.parametrize("skip", [False, True])
-def test_hard_14_where_the_segment_ends(skip):
+def test_where_the_segment_ends(skip):
+    """Hard case 14."""
     rng = np.random.default_rng(17)
     values = positive(rng, (6, 5, 8))
     o, d = random_rays(rng, np.eye(4), 64, away=0.3)
@@ -241,7 +254,8 @@ def test_hard_14_where_the_segment_ends(skip):
         assert np.array_equal(tau_fast(values, np.eye(4), o, d, t_max, skip), np.zeros((64, 1)))
 
 
-def test_hard_14_segments_within_one_cell():
+def test_segments_within_one_cell():
+    """Hard case 14."""
     rng = np.random.default_rng(18)
     values = as_float32(rng.uniform(0.5, 1, (4, 4, 4)))
     o, d = rng.uniform(0.3, 0.6, (64, 3)), rng.normal(size=(64, 3))
@@ -250,7 +264,8 @@ def test_hard_14_segments_within_one_cell():
         assert_tau(values, np.eye(4), o, d, t_max)
 
 
-def test_hard_14_inactive_and_broken_rays():
+def test_inactive_and_broken_rays():
+    """Hard case 14."""
     from mivol.transport.media.grid_integral import integrate_tau
 
     lattice = make_lattice(np.ones((4, 4, 4)), np.eye(4))
@@ -262,7 +277,8 @@ def test_hard_14_inactive_and_broken_rays():
 
 
 @pytest.mark.parametrize("sigma", [1.0, 1e3])
-def test_hard_45_camera_inside_a_dense_medium(sigma):
+def test_camera_inside_a_dense_medium(sigma):
+    """Hard case 45."""
     values = np.full((16, 16, 16), sigma)
     rng = np.random.default_rng(19)
     d = rng.normal(size=(64, 3))
@@ -275,8 +291,9 @@ def test_hard_45_camera_inside_a_dense_medium(sigma):
 
 
 @pytest.mark.parametrize("power", [2, 3, 4, 5, 6])
-def test_hard_15_origin_far_away(power):
+def test_origin_far_away(power):
     # A float32 origin there is a coarse one, but it is a point like any other: through the middle, exactly.
+    """Hard case 15."""
     rng = np.random.default_rng(20)
     values = positive(rng, (24, 24, 24))
     n = 64
@@ -292,7 +309,8 @@ def test_hard_15_origin_far_away(power):
     assert np.count_nonzero(fast) == n
 
 
-def test_hard_15_box_far_from_the_origin_of_the_world():
+def test_box_far_from_the_origin_of_the_world():
+    """Hard case 15."""
     rng = np.random.default_rng(21)
     values = positive(rng, (8, 8, 8))
     to_world = centred(100 * rotation([1, 1, 0], 0.5), (1e5, -2e5, 3e4))
@@ -300,7 +318,8 @@ def test_hard_15_box_far_from_the_origin_of_the_world():
 
 
 @pytest.mark.parametrize("scale", [1e-6, 1e-3, 1e3, 1e6])
-def test_hard_16_scene_scale(scale):
+def test_scene_scale(scale):
+    """Hard case 16."""
     rng = np.random.default_rng(22)
     values = positive(rng, (7, 6, 5))
     o, d = random_rays(rng, centred(np.eye(3)), 64)
@@ -310,15 +329,17 @@ def test_hard_16_scene_scale(scale):
 
 @pytest.mark.parametrize("name", FRAMES)
 @pytest.mark.parametrize("skip", [False, True])
-def test_hard_17_frames(name, skip):
+def test_frames(name, skip):
+    """Hard case 17."""
     rng = np.random.default_rng(23)
     values = positive(rng, (12, 5, 9, 3))
     assert_tau(values, FRAMES[name], *random_rays(rng, FRAMES[name], 64), skip=skip)
 
 
-def test_hard_17_change_of_frame_changes_nothing():
+def test_change_of_frame_changes_nothing():
     # The same rays and the same field, turned, mirrored and moved together; both errors count, and the rounding of the
     # moved ray to float32 (positions of up to 8 voxels by EPS) is below the third.
+    """Hard case 17."""
     rng = np.random.default_rng(24)
     values = positive(rng, (8, 8, 8))
     o, d = random_rays(rng, centred(np.eye(3)), 128)
@@ -331,7 +352,8 @@ def test_hard_17_change_of_frame_changes_nothing():
         assert np.all((np.abs(there - here) <= allowed)[sane])
 
 
-def test_hard_17_length_is_world_length():
+def test_length_is_world_length():
+    """Hard case 17."""
     rng = np.random.default_rng(25)
     for to_world in FRAMES.values():
         o, d = random_rays(rng, to_world, 32)
@@ -352,13 +374,15 @@ def test_hard_17_length_is_world_length():
         (np.diag([1.0, 1, 1, 2]), "affine"),
     ],
 )
-def test_hard_49_degenerate_frames_are_refused(matrix, named):
+def test_degenerate_frames_are_refused(matrix, named):
+    """Hard case 49."""
     with pytest.raises(ValueError, match=named):
         make_lattice(np.ones((2, 2, 2)), matrix)
 
 
 @pytest.mark.parametrize("shape", [(0, 2, 2, 1), (2, 2, 2), (2, 2)])
-def test_hard_49_empty_or_flat_grids_are_refused(shape):
+def test_empty_or_flat_grids_are_refused(shape):
+    """Hard case 49."""
     from mivol.transport.traversal.lattice import Lattice
 
     with pytest.raises(ValueError, match="shape"):
@@ -369,7 +393,8 @@ def test_hard_49_empty_or_flat_grids_are_refused(shape):
 
 
 @pytest.mark.parametrize("shape", [(1, 1, 1), (1, 1, 7), (1, 7, 1), (7, 1, 1), (1, 5, 6), (5, 1, 6), (5, 6, 1)])
-def test_hard_18_single_voxels(shape):
+def test_single_voxels(shape):
+    """Hard case 18."""
     rng = np.random.default_rng(26)
     values = as_float32(rng.uniform(0.1, 1, shape))
     o, d = random_rays(rng, FRAMES["stretched"], 48)
@@ -382,7 +407,8 @@ def test_hard_18_single_voxels(shape):
 
 
 @pytest.mark.parametrize("n", [2, 3, 17])
-def test_hard_19_checkerboard(n):
+def test_checkerboard(n):
+    """Hard case 19."""
     rng = np.random.default_rng(27)
     values = 50.0 * (np.indices((n, n, n)).sum(axis=0) % 2)
     for skip in (False, True):
@@ -390,7 +416,8 @@ def test_hard_19_checkerboard(n):
 
 
 @pytest.mark.parametrize("skip", [False, True])
-def test_hard_20_empty_grid(skip):
+def test_empty_grid(skip):
+    """Hard case 20."""
     rng = np.random.default_rng(28)
     fast = tau_fast(np.zeros((20, 9, 17, 3)), np.eye(4), *random_rays(rng, np.eye(4), 64), skip=skip)
     assert fast.shape == (64, 3)
@@ -406,7 +433,8 @@ def shell(n):
 
 @pytest.mark.parametrize("tau_shell", [1e-3, 1.0, 1e3])
 @pytest.mark.parametrize("skip", [False, True])
-def test_hard_22_thin_shell(tau_shell, skip):
+def test_thin_shell(tau_shell, skip):
+    """Hard case 22."""
     rng = np.random.default_rng(29)
     n = 40
     values = as_float32(shell(n) * n * tau_shell)
@@ -415,7 +443,8 @@ def test_hard_22_thin_shell(tau_shell, skip):
 
 
 @pytest.mark.parametrize("skip", [False, True])
-def test_hard_22_half_empty(skip):
+def test_half_empty(skip):
+    """Hard case 22."""
     rng = np.random.default_rng(30)
     values = positive(rng, (33, 20, 41, 3))
     values[:, :, 13:] = 0
@@ -426,8 +455,9 @@ def test_hard_22_half_empty(skip):
     assert assert_tau(values, np.eye(4), o, [0, 0, 1], skip=skip)[0, 0] > 0.01
 
 
-def test_hard_22_gaps_are_the_distances_between_blocks():
+def test_gaps_are_the_distances_between_blocks():
     # Chebyshev distances of integers, by brute force over the blocks that hold anything: equal, not close.
+    """Hard case 22."""
     from mivol.transport.traversal.empty_blocks import BLOCK, REACH, block_bounds, find_empty_distances
 
     rng = np.random.default_rng(32)
@@ -442,8 +472,9 @@ def test_hard_22_gaps_are_the_distances_between_blocks():
 
 
 @pytest.mark.parametrize("skip", [False, True])
-def test_hard_22_gradient_in_and_out_of_the_shell(skip):
+def test_gradient_in_and_out_of_the_shell(skip):
     # d tau / d sigma does not know sigma: the voxels of an empty block have the same row of A as all others.
+    """Hard case 22."""
     from mivol.transport.media.grid_integral import integrate_tau
 
     values = tensor(shell(24))
@@ -457,8 +488,9 @@ def test_hard_22_gradient_in_and_out_of_the_shell(skip):
     assert np.count_nonzero(got) >= np.count_nonzero(row > 1e-4)
 
 
-def test_hard_50_outer_half_voxel():
+def test_outer_half_voxel():
     # Between the outermost voxel centres and the faces the field is constant in that direction.
+    """Hard case 50."""
     rng = np.random.default_rng(31)
     values = as_float32(rng.uniform(0.1, 1, (8, 4, 6)))
     assert_tau(values, np.eye(4), np.column_stack([np.full(16, -1), rng.uniform(0, 1 / 8, 16), rng.uniform(0, 1, 16)]),
@@ -475,7 +507,8 @@ def test_hard_50_outer_half_voxel():
 # -- 41, 43, 44, 52: rounding -----------------------------------------------------------------------------------------
 
 
-def test_hard_41_long_rays():
+def test_long_rays():
+    """Hard case 41."""
     rng = np.random.default_rng(32)
     for shape in ((1024, 2, 2), (2, 1024, 2), (2, 2, 1024)):
         values = positive(rng, shape)
@@ -492,8 +525,9 @@ def test_hard_41_long_rays():
         assert fast.min() > 100
 
 
-def test_hard_43_the_same_twice():
+def test_the_same_twice():
     # Forward there is no sum across lanes, so no order: bit for bit the same, alone or among others.
+    """Hard case 43."""
     rng = np.random.default_rng(33)
     values = positive(rng, (9, 9, 9))
     o, d = random_rays(rng, np.eye(4), 4096)
@@ -502,7 +536,8 @@ def test_hard_43_the_same_twice():
     assert np.array_equal(whole[100:117], tau_fast(values, np.eye(4), o[100:117], d[100:117]))
 
 
-def test_hard_43_gradients_bitwise_with_one_thread(two_threads):
+def test_gradients_bitwise_with_one_thread(two_threads):
+    """Hard case 43."""
     rng = np.random.default_rng(34)
     o, d = random_rays(rng, np.eye(4), 100_000)
     threads = dr.thread_count()
@@ -518,8 +553,9 @@ def test_hard_43_gradients_bitwise_with_one_thread(two_threads):
     assert np.all(np.abs(several[0] - one[0]) <= 1e-5 * one[0])
 
 
-def test_hard_44_planes_that_coincide():
+def test_planes_that_coincide():
     # Rays through the edges and corners of cells reach two or three planes at once: each unit of length still once.
+    """Hard case 44."""
     rng = np.random.default_rng(35)
     values = positive(rng, (8, 8, 8))
     nodes = (rng.integers(0, 8, (96, 3)) + 0.5) / 8
@@ -534,7 +570,8 @@ def test_hard_44_planes_that_coincide():
 
 
 @pytest.mark.parametrize("skip", [False, True])
-def test_hard_52_256_cubed_against_the_twin(skip):
+def test_cubed_against_the_twin(skip):
+    """Hard cases 52 and 256."""
     rng = np.random.default_rng(36)
     values = np.zeros((256, 256, 256), dtype=np.float32)
     values[40:210, 60:250, 10:230] = rng.uniform(0, 1, (170, 190, 220)).astype(np.float32)
@@ -548,9 +585,11 @@ def lattice_step(n):
 
 
 @pytest.mark.parametrize("filled", [slice(250, 256), slice(255, 256)])
-def test_hard_14_the_end_is_where_it_is_after_256_cells(filled):
+def test_the_end_is_where_it_is_after_256_cells(filled):
     """Rationale: a wall, or the box, ends a ray in the only filled cells, after 250 empty ones.
     Expected: the end is as good as a float32 position on that lattice, not as a running difference of 600 steps.
+
+    Hard case 14.
     """
     rng = np.random.default_rng(38)
     n, rays = 256, 100
@@ -568,9 +607,10 @@ def test_hard_14_the_end_is_where_it_is_after_256_cells(filled):
         assert np.all(error <= allowed), f"the end is off by {error.max():.2g} voxels, {allowed.max():.2g} allowed"
 
 
-def test_hard_52_along_the_edge_of_the_support():
+def test_along_the_edge_of_the_support():
     # Rays that graze a diagonal sheet for 256 cells: a position errs by the float32 step of the lattice, always to one
     # side, and the gradient turns that into optical depth.
+    """Hard case 52."""
     rng = np.random.default_rng(39)
     n, rays = 256, 100
     x = np.arange(n)
@@ -585,8 +625,9 @@ def test_hard_52_along_the_edge_of_the_support():
     assert np.all(np.abs(fast - twin) <= allowed)
 
 
-def test_hard_52_smooth_fields_against_the_twin():
+def test_smooth_fields_against_the_twin():
     # A smooth field leaves no random sign to cancel what a systematic error of position would do.
+    """Hard case 52."""
     n = 128
     c = (np.arange(n) + 0.5) / n - 0.5
     r2 = c[:, None, None] ** 2 + c[None, :, None] ** 2 + c[None, None, :] ** 2

@@ -104,10 +104,12 @@ def seen_by(scene: Pencils, **more) -> np.ndarray:
 
 
 @pytest.mark.parametrize("name", PRESETS)
-def test_defect_5_1_01_rates_of_a_stage_reach_opaque_voxels(name: str) -> None:
+def test_rates_of_a_stage_reach_opaque_voxels(name: str) -> None:
     """The density can climb to an optical depth of 4.6 (alpha 0.99) in one voxel of the last stage within that stage.
 
     The tutorial's 420 steps of 0.05 make a voxel of 1/128 opaque to 15 %.
+
+    Defect 1.
     """
     plan = PRESETS[name]
     last = plan.stages[-1]
@@ -127,8 +129,8 @@ def plain_view(back: np.ndarray, side: int = 16) -> Photo:
     return Photo("grey", np.full((side, side, 3), 0.5, np.float32), np.ones((side, side), np.float32), None, camera, np.ones(3))
 
 
-def test_defect_5_1_01_a_short_fit_makes_matter_opaque() -> None:
-    """40 steps from a fog of an optical depth of 0.1 to something that hides all, in a box of any size."""
+def test_a_short_fit_makes_matter_opaque() -> None:
+    """40 steps from a fog of an optical depth of 0.1 to something that hides all, in a box of any size. Defect 1."""
     half = 0.02
     photos = [plain_view(4 * half * np.array(v)) for v in ([1.0, 0, 0], [0, 1.0, 0], [0, 0, 1.0], [-0.6, -0.6, -0.6])]
     plan = FitPlan((Stage(8, 40, 1, 4, 16),), degree=0, delay=0.0)
@@ -152,8 +154,8 @@ def visited(field: SphericalGrid, o, d) -> np.ndarray:
     return np.array(count)
 
 
-def test_defect_5_1_02_only_occupied_cells_are_visited() -> None:
-    """As many visits as a ray crosses cells with a corner above 0, counted from sorted crossings in float64."""
+def test_only_occupied_cells_are_visited() -> None:
+    """As many visits as a ray crosses cells with a corner above 0, counted from sorted crossings in float64. Defect 2."""
     density = np.random.default_rng(4).normal(-1.2, 1, (9, 8, 10)).astype(np.float32)
     field = SphericalGrid.from_dense(density, np.zeros((*density.shape, 1, 3)), TO_WORLD)
     o, d = aim(40)
@@ -174,8 +176,11 @@ def test_defect_5_1_02_only_occupied_cells_are_visited() -> None:
 
 
 @pytest.mark.parametrize(("density", "reads"), [(-1.0, math.ceil(61 / REACH)), (1.0, 61)])
-def test_defect_5_1_02_an_empty_box_is_left_in_leaps(density: float, reads: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Reads of the map of cells along a row of 60 voxels: one a cell where it is full, one in 15 cells where it is empty."""
+def test_an_empty_box_is_left_in_leaps(density: float, reads: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Reads of the map of cells along a row of 60 voxels: one a cell where it is full, one in 15 cells where it is empty.
+
+    Defect 2.
+    """
     field = even(density, res=(1, 1, 60))
     ray, cells = rays_of([-3, 0.1, 0.2], [1, 0, 0]), cells_of(field)
     segment = clip(cells, ray.o, ray.d, 0, ray.t_max)
@@ -195,8 +200,8 @@ def test_defect_5_1_02_an_empty_box_is_left_in_leaps(density: float, reads: int,
 # -- 3: other boxes, and where a ray ends ------------------------------------------------------------------------------
 
 
-def test_defect_5_1_03_a_ray_that_ends_inside_a_cell() -> None:
-    """c (1 - exp(-sigma L)) for the length L up to its end, in a sheared box with voxels of three lengths."""
+def test_a_ray_that_ends_inside_a_cell() -> None:
+    """c (1 - exp(-sigma L)) for the length L up to its end, in a sheared box with voxels of three lengths. Defect 3."""
     o, d = aim(60)
     sigma, (entry, whole) = 3.0, entries(TO_WORLD, o, d)
     field, ray = even(sigma, 1.0, TO_WORLD), rays_of(o, d)
@@ -221,8 +226,11 @@ def test_defect_5_1_03_a_ray_that_ends_inside_a_cell() -> None:
 
 
 @pytest.mark.parametrize("most", [3e3, 1e5])
-def test_defect_5_1_04_no_nan_where_transmittance_underflows(most: float) -> None:
-    """A random grid 16^3, optical depths up to 190 and 6000 a step: derivatives of fields and of scenes, against the twin."""
+def test_no_nan_where_transmittance_underflows(most: float) -> None:
+    """A random grid 16^3, optical depths up to 190 and 6000 a step: derivatives of fields and of scenes, against the twin.
+
+    Defect 4.
+    """
     rng = np.random.default_rng(0)
     density = rng.uniform(0, most, (16, 16, 16)).astype(np.float32)
     sh = rng.normal(0, 0.4, (16, 16, 16, 1, 3)).astype(np.float32)
@@ -254,8 +262,8 @@ def test_defect_5_1_04_no_nan_where_transmittance_underflows(most: float) -> Non
         assert size > 0
 
 
-def test_defect_5_1_04_a_fit_goes_on_from_an_opaque_field() -> None:
-    """A step from densities up to 1e5 leaves finite values and a finite state."""
+def test_a_fit_goes_on_from_an_opaque_field() -> None:
+    """A step from densities up to 1e5 leaves finite values and a finite state. Defect 4."""
     photos = [plain_view(4 * np.array(v)) for v in ([1.0, 0, 0], [0, 1.0, 0])]
     plan = FitPlan((Stage(16, 4, 1, 2, 16),), degree=0)
     problem = RadianceProblem(RayBatches.of(photos), np.array([[-1.0] * 3, [1.0] * 3]), plan)
@@ -275,8 +283,11 @@ def test_defect_5_1_04_a_fit_goes_on_from_an_opaque_field() -> None:
 
 
 @pytest.mark.parametrize(("sh", "clamp"), [(10.0, True), (0.3, True), (-2.0, True), (-2.0, False)])
-def test_defect_5_1_05_colours_keep_their_derivatives(sh: float, clamp: bool) -> None:
-    """Above 1 as between 0 and 1: Y_0 alpha; below 0, where black is shown, the density still knows the background."""
+def test_colours_keep_their_derivatives(sh: float, clamp: bool) -> None:
+    """Above 1 as between 0 and 1: Y_0 alpha; below 0, where black is shown, the density still knows the background.
+
+    Defect 5.
+    """
     field, behind = even(1.5, sh, clamp=clamp), 0.25
     o, d = aim(10, CUBE)
     L = lengths(CUBE, o, d)
@@ -299,8 +310,11 @@ def test_defect_5_1_05_colours_keep_their_derivatives(sh: float, clamp: bool) ->
 
 
 @pytest.mark.parametrize("name", ["relu", "softplus", "exp"])
-def test_defect_5_1_06_negative_densities(name: str) -> None:
-    """Softplus and exp have an extinction and a derivative everywhere; a ReLU has neither below 0, and a fit begins above."""
+def test_negative_densities(name: str) -> None:
+    """Softplus and exp have an extinction and a derivative everywhere; a ReLU has neither below 0, and a fit begins above.
+
+    Defect 6.
+    """
     raw = -3.0
     field = even(raw, 1.0, activation=name)
     o, d = aim(10, CUBE)
@@ -317,7 +331,8 @@ def test_defect_5_1_06_negative_densities(name: str) -> None:
         assert (density == 0).all() and (harmonics == 0).all() and (colour == 0).all()
 
 
-def test_defect_5_1_06_a_fit_begins_above_zero() -> None:
+def test_a_fit_begins_above_zero() -> None:
+    """Defect 6."""
     for plan in PRESETS.values():
         small = FitPlan((Stage(8, 1, 1, 1, 1),), degree=plan.degree, start=plan.start)
         batches = RayBatches.of([plain_view(np.array([4.0, 0, 0]))])
@@ -328,8 +343,11 @@ def test_defect_5_1_06_a_fit_begins_above_zero() -> None:
 # -- 7: background and alpha -------------------------------------------------------------------------------------------
 
 
-def test_defect_5_1_07_background_and_alpha_have_their_derivatives() -> None:
-    """An empty volume is not there; through a fog the sky is seen, and alpha = 1 - exp(-sigma L) has its derivative."""
+def test_background_and_alpha_have_their_derivatives() -> None:
+    """An empty volume is not there; through a fog the sky is seen, and alpha = 1 - exp(-sigma L) has its derivative.
+
+    Defect 7.
+    """
     o, d = aim(8, CUBE)
     empty = seen_by(in_a_scene(even(-1.0), o, d, 0.25), aovs="alpha")
     assert (empty[:, :3] == 0.25).all() and (empty[:, 3] == 0).all()
@@ -354,8 +372,11 @@ def test_defect_5_1_07_background_and_alpha_have_their_derivatives() -> None:
 # -- 8: memory -----------------------------------------------------------------------------------------------------------
 
 
-def test_defect_5_1_08_memory_goes_with_what_is_there() -> None:
-    """Values, derivatives, squares and tables of a thin shell in 64^3: a tenth of the tutorial's 16 bytes a coefficient."""
+def test_memory_goes_with_what_is_there() -> None:
+    """Values, derivatives, squares and tables of a thin shell in 64^3: a tenth of the tutorial's 16 bytes a coefficient.
+
+    Defect 8.
+    """
     n = 64
     g = (np.arange(n) + 0.5) / n * 2 - 1
     z, y, x = np.meshgrid(g, g, g, indexing="ij")
@@ -380,8 +401,11 @@ def test_defect_5_1_08_memory_goes_with_what_is_there() -> None:
 # -- 9: colours are read where there is something -------------------------------------------------------------------------
 
 
-def test_defect_5_1_09_no_colour_is_read_where_nothing_is() -> None:
-    """Harmonics are NaN but at the corners of cells with extinction on the ray: neither light nor derivatives see it."""
+def test_no_colour_is_read_where_nothing_is() -> None:
+    """Harmonics are NaN but at the corners of cells with extinction on the ray: neither light nor derivatives see it.
+
+    Defect 9.
+    """
     density = np.full((4, 4, 30), -1.0, np.float32)
     density[:, :, 12:14] = 2.0
     # A corner of cells 20 and 21 is above 0, off the ray, whose points in them are below.
@@ -413,8 +437,8 @@ def harmonics(d: np.ndarray, degree: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("degree", range(MAX_DEGREE + 1))
-def test_defect_5_1_09_any_degree(degree: int) -> None:
-    """0.5 + Y . k from opaque matter of the same coefficients everywhere, and the same after a degree is added."""
+def test_any_degree(degree: int) -> None:
+    """0.5 + Y . k from opaque matter of the same coefficients everywhere, and the same after a degree is added. Defect 9."""
     k = np.random.default_rng(degree).normal(0, 0.1, (basis_size(degree), 3))
     o, d = aim(20, CUBE)
     field = SphericalGrid.from_dense(np.full((2, 2, 2), 200.0), np.broadcast_to(k, (2, 2, 2, *k.shape)), CUBE)
@@ -429,8 +453,11 @@ def test_defect_5_1_09_any_degree(degree: int) -> None:
 # -- 10: rays that end early ----------------------------------------------------------------------------------------------
 
 
-def test_defect_5_1_10_a_ray_stops_in_the_cell_that_hides_enough() -> None:
-    """At the first plane behind which less than ``stop`` of the light is left, and there its transmittance is the true one."""
+def test_a_ray_stops_in_the_cell_that_hides_enough() -> None:
+    """At the first plane behind which less than ``stop`` of the light is left, and there its transmittance is the true one.
+
+    Defect 10.
+    """
     n, sigma, stop = 40, 6.0, 0.01
     seen = followed(even(sigma, res=(1, 1, n)), [-3, 0.1, 0.1], [1, 0, 0], stop)
     # Planes: the outer half voxel, then one voxel after the other.
@@ -445,8 +472,11 @@ def test_defect_5_1_10_a_ray_stops_in_the_cell_that_hides_enough() -> None:
 # -- 14: photographs of any size ----------------------------------------------------------------------------------------
 
 
-def test_defect_5_1_14_photographs_of_different_sizes_without_jitter() -> None:
-    """Each ray goes through the middle of the pixel whose value it is compared with, whatever the photograph's size."""
+def test_photographs_of_different_sizes_without_jitter() -> None:
+    """Each ray goes through the middle of the pixel whose value it is compared with, whatever the photograph's size.
+
+    Defect 14.
+    """
     rng, photos = np.random.default_rng(0), []
     for width, height in ((20, 12), (9, 30), (17, 16)):
         camera = plain_view(rng.normal(size=3) * 3).camera
@@ -477,8 +507,11 @@ def test_defect_5_1_14_photographs_of_different_sizes_without_jitter() -> None:
 # -- 16: a camera inside ------------------------------------------------------------------------------------------------
 
 
-def test_defect_5_1_16_a_camera_inside_sees_nothing_behind_it() -> None:
-    """Matter behind the camera only: radiance 0, alpha 0 and no derivative, exactly; turned round it is all there."""
+def test_a_camera_inside_sees_nothing_behind_it() -> None:
+    """Matter behind the camera only: radiance 0, alpha 0 and no derivative, exactly; turned round it is all there.
+
+    Defect 16.
+    """
     density = np.full((6, 6, 8), -1.0, np.float32)
     density[:, :, :3] = 40.0
     field = SphericalGrid.from_dense(density, np.zeros((6, 6, 8, 1, 3)), CUBE)
@@ -496,8 +529,11 @@ def test_defect_5_1_16_a_camera_inside_sees_nothing_behind_it() -> None:
 # -- 37: behind a wall ---------------------------------------------------------------------------------------------------
 
 
-def test_hard_37_what_a_wall_of_depth_50_leaves() -> None:
-    """Hidden nodes get their e^-50 to float32's digits, before a bright background, where a remainder would be 1e-7."""
+def test_what_a_wall_of_depth_50_leaves() -> None:
+    """Hidden nodes get their e^-50 to float32's digits, before a bright background, where a remainder would be 1e-7.
+
+    Hard case 37.
+    """
     rng = np.random.default_rng(3)
     density = rng.uniform(0.2, 2, (1, 1, 24))
     density[..., 9] = 50 / (2 / 24)

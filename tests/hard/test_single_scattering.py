@@ -57,8 +57,8 @@ def holds_twin(seen: Pencils, m: twins.Medium, lamp: twins.Lamp, spp: int = 2048
 @pytest.mark.statistical
 @pytest.mark.parametrize("kind", small.cases(small.KINDS, ["stock"]))
 @pytest.mark.parametrize("lit", ["point", "sky"])
-def test_hard_21_derivative_of_no_density(lit, kind):
-    """d L / d sigma_k = integral of w_k (albedo L_s - B): not 0, and of either sign."""
+def test_derivative_of_no_density(lit, kind):
+    """d L / d sigma_k = integral of w_k (albedo L_s - B): not 0, and of either sign. Hard case 21."""
     values, albedo = 0 * rough_grid(1), 0.6
     lamp = point([1.5, 1, 2.0]) if lit == "point" else ({"type": "constant", "radiance": 0.5}, twins.Sky(0.5, 4))
     box, m = smoke(values, albedo, kind)
@@ -73,8 +73,8 @@ def test_hard_21_derivative_of_no_density(lit, kind):
     assert_precise(Estimate(0.0, found.variance_of_mean.sum(), BATCHES - 1), 0.02 * abs(truth.sum()))
 
 
-def test_hard_21_picture_of_no_density():
-    """The background to the last digit, and nothing else; no NaN from 0/0."""
+def test_picture_of_no_density():
+    """The background to the last digit, and nothing else; no NaN from 0/0. Hard case 21."""
     box, _ = smoke(0 * rough_grid(1), 1.0)
     seen = pencils({"smoke": box, "sky": scenes.sky(0.7), "bulb": point([0.1, 0.2, 0.3])[0]}, *aimed(1, 6))
     assert np.all(np.abs(scenes.render(seen.scene, mivol(), 16) - as_float32(0.7)) <= 4 * EPS)
@@ -82,8 +82,8 @@ def test_hard_21_picture_of_no_density():
 
 @pytest.mark.statistical
 @pytest.mark.parametrize("kind", small.cases(small.KINDS, ["own"]))
-def test_hard_23_albedo_0(kind):
-    """L = T B without noise; the derivative with respect to the albedo is the integral of T sigma L_s, not 0."""
+def test_albedo_0(kind):
+    """L = T B without noise; the derivative with respect to the albedo is the integral of T sigma L_s, not 0. Hard case 23."""
     values = rough_grid(2)
     box, _ = smoke(values, 0.0, kind)
     lamp = point([1.5, 1, 2.0])
@@ -103,8 +103,11 @@ def test_hard_23_albedo_0(kind):
 
 @pytest.mark.parametrize("kind", small.KINDS)
 @pytest.mark.parametrize("value", [-0.1, 1.2, math.nan])
-def test_hard_25_albedo_outside_its_domain(value, kind):
-    """An optimiser's overshoot is refused with a sentence that names the albedo, not rendered as energy out of nothing."""
+def test_albedo_outside_its_domain(value, kind):
+    """An optimiser's overshoot is refused with a sentence that names the albedo, not rendered as energy out of nothing.
+
+    Hard case 25.
+    """
     box, _ = smoke(rough_grid(3), 0.8, kind)
     seen = pencils({"smoke": box, "lamp": point([1.5, 1, 2.0])[0]}, *aimed(3, 2))
     params = mi.traverse(seen.scene)
@@ -116,8 +119,8 @@ def test_hard_25_albedo_outside_its_domain(value, kind):
 
 @pytest.mark.parametrize("kind", small.KINDS)
 @pytest.mark.parametrize("value", [-0.1, 1.2, math.inf])
-def test_hard_25_albedo_grid_outside_its_domain(value, kind):
-    """One voxel of an albedo grid."""
+def test_albedo_grid_outside_its_domain(value, kind):
+    """One voxel of an albedo grid. Hard case 25."""
     medium_type, volume_type = small.KINDS[kind]
     albedo = grid_volume(volume_type, np.full((2, 3, 4, 1), 0.5), PLACE)
     box = box_of(medium(medium_type, grid_volume(volume_type, rough_grid(3), PLACE), albedo), PLACE)
@@ -131,8 +134,11 @@ def test_hard_25_albedo_grid_outside_its_domain(value, kind):
 
 @pytest.mark.parametrize("kind", small.KINDS)
 @pytest.mark.parametrize("value", [math.nan, math.inf])
-def test_hard_26_density_that_is_no_number(value, kind):
-    """One voxel that is not a number, or infinite, is refused and named by its indices; after a step back all is well."""
+def test_density_that_is_no_number(value, kind):
+    """One voxel that is not a number, or infinite, is refused and named by its indices; after a step back all is well.
+
+    Hard case 26.
+    """
     values = rough_grid(4)
     box, _ = smoke(values, 0.8, kind)
     seen = pencils({"smoke": box, "lamp": point([1.5, 1, 2.0])[0]}, *aimed(4, 2))
@@ -151,8 +157,8 @@ def test_hard_26_density_that_is_no_number(value, kind):
 
 @pytest.mark.statistical
 @pytest.mark.parametrize("kind", small.KINDS)
-def test_hard_30_density_that_has_grown(kind):
-    """Values that an optimiser has raised tenfold: nothing that was found for the old ones may be used."""
+def test_density_that_has_grown(kind):
+    """Values that an optimiser has raised tenfold: nothing that was found for the old ones may be used. Hard case 30."""
     values = rough_grid(5, 0.5)
     box, m = smoke(values, 0.8, kind)
     lamp = point([1.5, 1, 2.0])
@@ -170,8 +176,11 @@ def test_hard_30_density_that_has_grown(kind):
 
 @pytest.mark.statistical
 @pytest.mark.parametrize("peak", [20.0, 2000.0])
-def test_hard_31_one_dense_voxel(peak):
-    """One voxel 10 or 1000 times denser than the rest, off the rays and between some of them and the lamp: the same law."""
+def test_one_dense_voxel(peak):
+    """One voxel 10 or 1000 times denser than the rest, off the rays and between some of them and the lamp: the same law.
+
+    Hard case 31.
+    """
     values = rough_grid(6)
     values[-1, -1, -1] = peak
     box, m = smoke(values, 0.8, "own")
@@ -179,8 +188,11 @@ def test_hard_31_one_dense_voxel(peak):
     holds_twin(pencils({"smoke": box, "lamp": lamp[0]}, *aimed(6, 6)), m, lamp[1], quadrature=1e-4, order=16)
 
 
-def test_hard_31_noise_does_not_follow_the_majorant():
-    """Rays that never come near the dense voxel see what they see without it, to the last digits, with the same noise."""
+def test_noise_does_not_follow_the_majorant():
+    """Rays that never come near the dense voxel see what they see without it, to the last digits, with the same noise.
+
+    Hard case 31.
+    """
     values = rough_grid(6)
     o = as_float32(np.stack([np.full(4, -3.0), np.linspace(-0.8, 0.0, 4), np.full(4, -0.5)], axis=1))
     images = []
@@ -194,8 +206,8 @@ def test_hard_31_noise_does_not_follow_the_majorant():
 
 @pytest.mark.statistical
 @pytest.mark.parametrize("ratio", [(1e-3, 1.0, 10.0), (0.0, 1.0, 2.0), (8.0, 8.0, 8e-4)])
-def test_hard_32_channels_of_very_different_extinction(ratio):
-    """Each channel is its own grey picture: at ratios of 1e4, and with a channel that is vacuum."""
+def test_channels_of_very_different_extinction(ratio):
+    """Each channel is its own grey picture: at ratios of 1e4, and with a channel that is vacuum. Hard case 32."""
     values = as_float32(rough_grid(7, 1.0) * np.array(ratio))
     interior = medium("mivol_medium", grid_volume("mivol_voxels", values, PLACE), 0.8, phase={"type": "hg", "g": 0.4})
     lamp = point([1.5, 1, 2.0])
@@ -218,8 +230,8 @@ def test_hard_32_channels_of_very_different_extinction(ratio):
 
 @pytest.mark.statistical
 @pytest.mark.parametrize("h", [1e-3, 0.03, 0.4])
-def test_hard_33_point_light_beside_the_ray(h):
-    """Close to the ray the radiance is as 1/h: equal angles keep the noise where it was."""
+def test_point_light_beside_the_ray(h):
+    """Close to the ray the radiance is as 1/h: equal angles keep the noise where it was. Hard case 33."""
     values = rough_grid(8)
     box, m = smoke(values, 0.8, "own")
     lamp = point([0.1, as_float32(0.2 + h), 0.3])
@@ -230,8 +242,8 @@ def test_hard_33_point_light_beside_the_ray(h):
 
 @pytest.mark.statistical
 @pytest.mark.parametrize("kind", ["grid", "homogeneous"])
-def test_hard_33_point_light_on_the_ray(kind):
-    """The integral diverges there: what is shown must be finite numbers, and its neighbours right."""
+def test_point_light_on_the_ray(kind):
+    """The integral diverges there: what is shown must be finite numbers, and its neighbours right. Hard case 33."""
     values = rough_grid(8)
     box, m = smoke(values, 0.8, "own") if kind == "grid" else fog(0.7, 0.8)
     lamp = point([0.1, 0.2, 0.3])
@@ -245,8 +257,8 @@ def test_hard_33_point_light_on_the_ray(kind):
 
 @pytest.mark.statistical
 @pytest.mark.parametrize("where", ["node", "face", "edge", "border"])
-def test_hard_33_point_light_at_a_special_place(where):
-    """On a voxel's centre, on a face and on an edge between cells, on the border of the grid."""
+def test_point_light_at_a_special_place(where):
+    """On a voxel's centre, on a face and on an edge between cells, on the border of the grid. Hard case 33."""
     values = rough_grid(9, 1.0, (4, 4, 4))
     step = 0.5  # voxel centres of [-1, 1]^3 in 4: -0.75, -0.25, 0.25, 0.75
     place = {
@@ -263,8 +275,11 @@ def test_hard_33_point_light_at_a_special_place(where):
 
 @pytest.mark.statistical
 @pytest.mark.parametrize("away", [1e3, 1e5])
-def test_hard_34_point_light_far_away_is_a_sun(away):
-    """Irradiance I / r^2 from one direction, to the parallax 1/r; the angle that a cell fills is not a difference."""
+def test_point_light_far_away_is_a_sun(away):
+    """Irradiance I / r^2 from one direction, to the parallax 1/r; the angle that a cell fills is not a difference.
+
+    Hard case 34.
+    """
     values = rough_grid(10)
     box, m = smoke(values, 0.8, "own", name="hg", g=0.5)
     towards = np.array([0.48, -0.6, 0.64])
@@ -277,8 +292,8 @@ def test_hard_34_point_light_far_away_is_a_sun(away):
 @pytest.mark.statistical
 @pytest.mark.parametrize("kind", ["grid", "homogeneous"])
 @pytest.mark.parametrize("tilt", [0.0, 1e-6, 1e-3])
-def test_hard_35_light_along_the_camera_ray(tilt, kind):
-    """mu -> mu0 in transmission: alpha p E0 (tau/mu) e^{-tau/mu}, no 0/0 anywhere near it."""
+def test_light_along_the_camera_ray(tilt, kind):
+    """mu -> mu0 in transmission: alpha p E0 (tau/mu) e^{-tau/mu}, no 0/0 anywhere near it. Hard case 35."""
     sigma = 1.3
     frame = as_float32(scenes.affine(np.diag([400.0, 400, 1]), (-200, -200, 0)))
     build = fog(sigma, 0.8, frame) if kind == "homogeneous" else smoke(np.full((3, 2, 2, 1), sigma), 0.8, "own", frame)
@@ -295,8 +310,11 @@ def test_hard_35_light_along_the_camera_ray(tilt, kind):
 
 @pytest.mark.statistical
 @pytest.mark.parametrize("direction", [[0, 0, -1.0], [0, -1.0, 0], [1.0, 0, 0]])
-def test_hard_36_shadow_rays_along_the_faces_of_cells(direction):
-    """Camera rays in planes between cells, through voxel centres, the light along other such planes: T is continuous."""
+def test_shadow_rays_along_the_faces_of_cells(direction):
+    """Camera rays in planes between cells, through voxel centres, the light along other such planes: T is continuous.
+
+    Hard case 36.
+    """
     values = rough_grid(11, 2.0, (4, 4, 4))
     box, m = smoke(values, 0.8, "own")
     lamp = sun(direction)
@@ -307,8 +325,11 @@ def test_hard_36_shadow_rays_along_the_faces_of_cells(direction):
 
 
 @pytest.mark.statistical
-def test_hard_36_no_light_is_lost_where_shadow_rays_start():
-    """Dense smoke of voxels 1e-3 wide: an offset of Mitsuba's 1e-4 at the start of a shadow ray would show as 10 %."""
+def test_no_light_is_lost_where_shadow_rays_start():
+    """Dense smoke of voxels 1e-3 wide: an offset of Mitsuba's 1e-4 at the start of a shadow ray would show as 10 %.
+
+    Hard case 36.
+    """
     scale = 2e-3
     values = as_float32(rough_grid(12, 2.0) / scale)
     frame = as_float32(centred(scale * np.eye(3)))
@@ -324,8 +345,11 @@ def test_hard_36_no_light_is_lost_where_shadow_rays_start():
 
 @pytest.mark.statistical
 @pytest.mark.parametrize("kind", ["grid", "homogeneous"])
-def test_hard_46_depth_2_is_one_scattering(kind):
-    """Depth 1: the background through the medium, exactly; depth 2: one scattering more, by its closed form; not two."""
+def test_depth_2_is_one_scattering(kind):
+    """Depth 1: the background through the medium, exactly; depth 2: one scattering more, by its closed form; not two.
+
+    Hard case 46.
+    """
     sigma, depth = 2.2, 0.4
     build = fog(sigma, 1.0, np.eye(4)) if kind == "homogeneous" else smoke(np.full((4, 3, 2, 1), sigma), 1.0, "own", np.eye(4))
     seen = pencils({"cube": build[0], "sun": sun([0, 0, -1.0], 3.0)[0]}, [-2, 0.3, 1 - depth], [1.0, 0, 0])
@@ -337,8 +361,8 @@ def test_hard_46_depth_2_is_one_scattering(kind):
     assert_precise(found, 0.01 * truth)
 
 
-def test_hard_46_surfaces_shine_on_the_medium_only_directly():
-    """A white floor lit by a lamp lights the smoke above it at depth 3, not at 2; an area light does at 2."""
+def test_surfaces_shine_on_the_medium_only_directly():
+    """A white floor lit by a lamp lights the smoke above it at depth 3, not at 2; an area light does at 2. Hard case 46."""
     box, _ = smoke(rough_grid(13), 0.9)
     turn, ray = mi.ScalarTransform4f, ([-5, 0.1, 0.2], [1.0, 0, 0])
     floor = {"type": "rectangle", "to_world": turn().translate([0, 0, -1.2]).scale(3)}

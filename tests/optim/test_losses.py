@@ -85,8 +85,8 @@ def test_zero_where_images_agree(variant_rgb, name: str) -> None:
     assert np.all(slope == 0.0)
 
 
-def test_hard_51_huber_negative_residual(variant_rgb) -> None:
-    """A residual of -r costs what +r costs, and its slope is the line's, not the parabola's."""
+def test_huber_negative_residual(variant_rgb) -> None:
+    """A residual of -r costs what +r costs, and its slope is the line's, not the parabola's. Hard case 51."""
     r = np.array([0.05, 0.2, 3.0, 100.0]).reshape(-1, 1, 1)
     up, slope_up = value_and_slope(Huber(delta=0.1), r, 0 * r)
     down, slope_down = value_and_slope(Huber(delta=0.1), -r, 0 * r)
@@ -96,8 +96,11 @@ def test_hard_51_huber_negative_residual(variant_rgb) -> None:
     assert np.allclose(slope_down[1:] * 4, -0.1, rtol=2 * EPS, atol=0)
 
 
-def test_hard_39_underflow_of_transmittance(variant_rgb) -> None:
-    """exp(-104) is 0 in float32: the log loss stays finite, leads back up, and a saturated reference counts for nothing."""
+def test_underflow_of_transmittance(variant_rgb) -> None:
+    """exp(-104) is 0 in float32: the log loss stays finite, leads back up, and a saturated reference counts for nothing.
+
+    Hard case 39.
+    """
     dark, lit = np.zeros((1, 1, 3)), np.full((1, 1, 3), 0.5)
     value, slope = value_and_slope(Log(floor=1e-3), dark, lit)
     assert np.isfinite(value)
@@ -110,8 +113,11 @@ def test_hard_39_underflow_of_transmittance(variant_rgb) -> None:
     assert value == 0.0
 
 
-def test_hard_40_pixel_brighter_than_the_light(variant_rgb) -> None:
-    """log(1.3) > 0 is a negative optical depth: finite, kept, and the image is pulled towards it, not to the light."""
+def test_pixel_brighter_than_the_light(variant_rgb) -> None:
+    """log(1.3) > 0 is a negative optical depth: finite, kept, and the image is pulled towards it, not to the light.
+
+    Hard case 40.
+    """
     light, brighter, negative = (np.full((1, 1, 3), value) for value in (1.0, 1.3, -0.02))
     value, slope = value_and_slope(Log(), light, brighter)
     assert abs(value - np.log(1.3) ** 2) <= 1e-6 + 4 * EPS  # the weight is 1 - 6e-7

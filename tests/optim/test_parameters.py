@@ -114,11 +114,14 @@ NEW_SIZES = st.tuples(*[st.integers(1, 11)] * 3)
 
 @settings(max_examples=60, deadline=None)
 @given(SIZES, NEW_SIZES, st.integers(1, 3), st.integers(0, 1000))
-def test_hard_47_upsampling_conserves_mass(old: tuple[int, ...], new: tuple[int, ...], channels: int, seed: int) -> None:
+def test_upsampling_conserves_mass(old: tuple[int, ...], new: tuple[int, ...], channels: int, seed: int) -> None:
     """Rationale: a refined start must absorb as much as the coarse one, or the loss jumps. Whole factors conserve the
     mass by themselves, others do not.
     Expected: the mean of each channel is kept to the rounding of float32 values (eps / 2 each, of one sign at worst);
-    nothing is negative (linear, not cubic)."""
+    nothing is negative (linear, not cubic).
+
+    Hard case 47.
+    """
     mi.set_variant("llvm_ad_rgb")
     rng = np.random.default_rng(seed)
     field = rng.uniform(0, 1, (*old, channels)) ** 8 * (rng.uniform(size=(*old, 1)) > 0.5)
@@ -130,8 +133,11 @@ def test_hard_47_upsampling_conserves_mass(old: tuple[int, ...], new: tuple[int,
     assert fine.min(initial=0.0) >= 0.0
 
 
-def test_hard_47_no_overshoot(variant_rgb) -> None:
-    """A step stays between its levels, but for the factor that restores the mass, which is 1 for a step by symmetry."""
+def test_no_overshoot(variant_rgb) -> None:
+    """A step stays between its levels, but for the factor that restores the mass, which is 1 for a step by symmetry.
+
+    Hard case 47.
+    """
     step = np.zeros((4, 4, 4, 1), "f")
     step[2:] = 1.0
     fine = np.asarray(upsample(mi.TensorXf(step), (8, 8, 8)))

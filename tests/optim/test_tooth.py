@@ -103,7 +103,8 @@ def test_weights_make_residuals_of_unit_size(simulated):
     assert_within(np.mean(z**2) - 1, 6 * 0.073, chance=2 * stats.norm.sf(6), what="squared residuals")
 
 
-def test_hard_39_no_light_has_weight_0():
+def test_no_light_has_weight_0():
+    """Hard case 39."""
     t = Transmission(np.array([[[0.5, 1e-4, -0.02, 0.0, np.nan, np.inf]]]), np.full((1, 1, 6), 1e-4))
     y, weights = line_integrals(t)
     assert np.isfinite(y).all()
@@ -113,7 +114,8 @@ def test_hard_39_no_light_has_weight_0():
     assert (weights[0, 0, 1:] == 0).all()
 
 
-def test_hard_40_brighter_than_the_light_stays_negative():
+def test_brighter_than_the_light_stays_negative():
+    """Hard case 40."""
     y, weights = line_integrals(Transmission(np.full((1, 1, 1), 1.1), np.full((1, 1, 1), 1e-4)))
     assert y == pytest.approx(-np.log(1.1))
     assert weights == pytest.approx(1.21 / 1e-4)
