@@ -99,7 +99,7 @@ class Sought(Section):
             raise ValueError(f'unknown map "{self.map}": {nearest(self.map, list(MAPS))}'.rstrip("."))
 
 
-class Fit(Section):
+class SceneFitSettings(Section):
     """How long and how finely."""
 
     iterations: Annotated[int, of("iteration", "at most so many", ge=1)] = 100
@@ -122,7 +122,7 @@ class Experiment(Section):
     ] = None
     reference: Annotated[Rendered | Files, of("1", "what was seen")] = Rendered()
     truth: Annotated[Truth | None, of("1", "what the references show, where known")] = None
-    fit: Annotated[Fit, of("1", "how long and how finely")] = Fit()
+    fit: Annotated[SceneFitSettings, of("1", "how long and how finely")] = SceneFitSettings()
     optimiser: Annotated[Adam | RMSprop | Lbfgs | GaussNewton, of("1", "how to walk downhill")] = Adam()
     schedule: Annotated[Constant | Cosine | Step | Exponential, of("1", "factor on the learning rate")] = Constant()
     loss: Annotated[L1 | L2 | RelativeL2 | Huber | Log, of("1", "distance of image and reference")] = L2()

@@ -12,7 +12,7 @@ from mivol.optim.radiance_plan import PRESETS, FitPlan, memory_of
 from mivol.optim.ray_batches import RayBatches
 from mivol.optim.strategy import nearest
 from mivol.photos import Photos
-from mivol.report.record import Choice
+from mivol.report.record import PlanLine
 
 SMALLEST = 16
 """Shortest edge of a photograph that was made smaller [pixel]."""
@@ -49,35 +49,35 @@ def shrunk(plan: FitPlan, photos: Photos) -> FitPlan:
     return replace(plan, stages=tuple(stages))
 
 
-def choices(plan: FitPlan, photos: Photos, batches: RayBatches) -> list[Choice]:
+def choices(plan: FitPlan, photos: Photos, batches: RayBatches) -> list[PlanLine]:
     """What will be done, and why."""
     box = photos.box
     resolutions = ", ".join(str(stage.longest) for stage in plan.stages)
     size = " x ".join(f"{edge:.4g}" for edge in box[1] - box[0])
     return [
-        Choice(choice=f"{len(photos.views)} photographs, a box of {size}", reason=photos.survey.box_from),
-        Choice(choice=f"grids of {resolutions} nodes along the longest edge", reason="coarse first, to find what is empty"),
-        Choice(
+        PlanLine(choice=f"{len(photos.views)} photographs, a box of {size}", reason=photos.survey.box_from),
+        PlanLine(choice=f"grids of {resolutions} nodes along the longest edge", reason="coarse first, to find what is empty"),
+        PlanLine(
             choice=f"photographs shrunk by {', '.join(str(stage.shrink) for stage in plan.stages)}",
             reason="a pixel of half a voxel says as much as four smaller ones",
         ),
-        Choice(choice=f"harmonics of degree {plan.degree}", reason=f"{(plan.degree + 1) ** 2} numbers a colour and node"),
+        PlanLine(choice=f"harmonics of degree {plan.degree}", reason=f"{(plan.degree + 1) ** 2} numbers a colour and node"),
         what_is_behind(plan, photos),
-        Choice(choice=f"rays end at a transmittance of {plan.stop:g}", reason="what is left out is at most that share"),
-        Choice(choice=memory_of(plan, box, batches), reason="counted before it is taken"),
+        PlanLine(choice=f"rays end at a transmittance of {plan.stop:g}", reason="what is left out is at most that share"),
+        PlanLine(choice=memory_of(plan, box, batches), reason="counted before it is taken"),
     ]
 
 
-def what_is_behind(plan: FitPlan, photos: Photos) -> Choice:
+def what_is_behind(plan: FitPlan, photos: Photos) -> PlanLine:
     """What rays see that pass the box; where a colour is only believed, the one that the photographs' edges show is told."""
     if plan.sky:
-        return Choice(choice=f"a sky of {plan.sky} rows behind the box", reason="field.sky; it is learned with the field")
+        return PlanLine(choice=f"a sky of {plan.sky} rows behind the box", reason="field.sky; it is learned with the field")
     if photos.views[0].alpha is not None:
-        return Choice(choice="nothing behind the box", reason="alpha says what is there")
+        return PlanLine(choice="nothing behind the box", reason="alpha says what is there")
     edges = [view.image[at] for view in photos.views for at in (0, -1, (slice(None), 0), (slice(None), -1))]
     most, believed = (
         "(" + ", ".join(f"{c:.2g}" for c in colour) + ")"
         for colour in (np.median(np.concatenate(edges), axis=0), photos.views[0].background)
     )
     reason = f"photos.behind; the edges of the photographs show {most} mostly, and field.sky would learn it"
-    return Choice(choice=f"the colour {believed} behind the box", reason=reason)
+    return PlanLine(choice=f"the colour {believed} behind the box", reason=reason)

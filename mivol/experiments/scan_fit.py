@@ -27,7 +27,7 @@ from mivol.optim.smoothed_tv import SmoothedTV
 from mivol.optim.solver import State
 from mivol.optim.solvers import SOLVERS
 from mivol.report.page import write_page
-from mivol.report.record import Choice, RunRecord
+from mivol.report.record import PlanLine, RunRecord
 from mivol.tomography.geometry import VoxelGrid
 from mivol.tomography.projector import Projector
 from mivol.validate.statistics import nrmse
@@ -76,8 +76,8 @@ def new_record(chosen: config.Scan) -> RunRecord:
         command="mivol optimize",
         seeds={"noise": getattr(chosen.data, "seed", 0)},
         plan=[
-            Choice(choice="projector: exact line integrals and their exact transpose", reason="a matched pair: no bias"),
-            Choice(choice=f"solver: {chosen.solve.name}", reason=solver.promises),
+            PlanLine(choice="projector: exact line integrals and their exact transpose", reason="a matched pair: no bias"),
+            PlanLine(choice=f"solver: {chosen.solve.name}", reason=solver.promises),
         ],
         citations=["mitsuba3", "drjit", *CITED[chosen.solve.name], *(["rudin_1992", "huber_1964"] if chosen.solve.tv else [])],
     )
@@ -114,7 +114,7 @@ def solve(task: Task, run: RunFolder, problem: Inversion, data: Projections) -> 
     with task.watcher.watch(course.iterations) as watch:
 
         def observe(fit: Fit) -> None:
-            run.append(fit.next, fit.seconds, loss=fit.history[-1]["loss"], **errors_of(fit.run.state, problem.task, data))
+            run.append(fit.next, fit.seconds, loss=fit.history[-1]["loss"], **errors_of(fit.run.state, problem.linear_problem, data))
             watch(fit)
 
         fit.complete(observe)

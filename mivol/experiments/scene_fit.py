@@ -27,7 +27,7 @@ from mivol.optim.render_batches import RenderBatch, make_batches
 from mivol.optim.scene_problem import SceneProblem
 from mivol.optim.seeds import HELD_OUT, seed_of
 from mivol.report.page import write_page
-from mivol.report.record import Choice, RunRecord
+from mivol.report.record import PlanLine, RunRecord
 from mivol.scene.load import LoadedScene, load_scene
 from mivol.scene.needs import find_needs
 from mivol.scene.plan import make_plan
@@ -67,7 +67,7 @@ def scene_fit(task: Task) -> Path:
         with run.stage("fit"):
             problem = make_problem(chosen, loaded.scene, integrator, starts, seen)
             run.record.plan = choices(chosen, problem)
-            fit = solve(task, run, loaded, problem, Measure(chosen, seen, truth))
+            fit = solve(task, run, loaded, problem, SceneErrors(chosen, seen, truth))
         with run.stage("images and volumes"):
             SceneOutputs(chosen, run, fit, seen, truth).write()
     return write_page(task.folder)
@@ -88,13 +88,13 @@ def new_record(chosen: Experiment) -> RunRecord:
     )
 
 
-def choices(chosen: Experiment, problem: SceneProblem) -> list[Choice]:
+def choices(chosen: Experiment, problem: SceneProblem) -> list[PlanLine]:
     """The plan of mivol's integrator for this scene, with its reasons; other integrators have none."""
     if chosen.fit.integrator != "mivol":
         return []
     needs = find_needs(problem.scene, problem.batches[0].sensor, survey_scene(problem.scene))
     made = make_plan(needs, Settings(max_depth=chosen.fit.max_depth))
-    return [Choice(choice=f"{c.about}: {c.choice}", reason=c.reason) for c in made.choices]
+    return [PlanLine(choice=f"{c.about}: {c.choice}", reason=c.reason) for c in made.choices]
 
 
 def make_integrator(chosen: Experiment) -> mi.Integrator:
@@ -125,7 +125,7 @@ def make_problem(
     return problem
 
 
-def solve(task: Task, run: RunFolder, loaded: LoadedScene, problem: SceneProblem, measure: Measure) -> Fit:
+def solve(task: Task, run: RunFolder, loaded: LoadedScene, problem: SceneProblem, measure: SceneErrors) -> Fit:
     """Fit the scene to its views; the metrics grow by a line an iteration."""
     chosen: Experiment = task.chosen
     course = Course(chosen.fit.iterations, chosen.schedule, chosen.event)
@@ -161,7 +161,7 @@ def append_last(run: RunFolder, fit: Fit) -> None:
         run.append(**fit.measures[-1])
 
 
-class Measure:
+class SceneErrors:
     """What a fit does not minimise: PSNR of held-out views, the error of the volume where the truth is known, and what is
     found of parameters that are few numbers."""
 

@@ -109,7 +109,7 @@ class CoarseToFine(Event, tag="coarse_to_fine"):
         return refinement.says
 
 
-class Survey(Event, tag="survey"):
+class UpdateOccupancy(Event, tag="update_occupancy"):
     """Let a problem look again for what the next steps can leave out without a change: cells that have become empty."""
 
     every: Annotated[int, of("iteration", "how often", ge=1)] = 64
@@ -119,7 +119,7 @@ class Survey(Event, tag="survey"):
 
     def apply(self, fit: FitAtWork) -> str:
         fit.problem.set(fit.run.reals)
-        fit.problem.survey()
+        fit.problem.update_occupancy()
         return ""
 
 
@@ -149,7 +149,7 @@ class Evaluate(Event, tag="evaluate"):
         return ""
 
 
-EVENTS = table(Upsample, CoarseToFine, Survey, Checkpoint, Evaluate)
+EVENTS = table(Upsample, CoarseToFine, UpdateOccupancy, Checkpoint, Evaluate)
 
 
 def in_order(events: tuple[Event, ...]) -> list[Event]:

@@ -29,17 +29,17 @@ class Inversion:
     """A volume behind projections.
 
     Attributes:
-        task: what a solver minimises.
+        linear_problem: what a solver minimises.
         x: (n,) what was found; None before the first step.
         safe_point: called before each iteration.
     """
 
-    task: LeastSquares | PoissonCounts
+    linear_problem: LeastSquares | PoissonCounts
     x: np.ndarray | None = None
     safe_point: Callable[[], None] = lambda: None
 
     def start(self) -> Reals:
-        """Nothing: a solver begins where its task says."""
+        """Nothing: a solver begins where its problem says."""
         return {}
 
     def set(self, reals: Reals) -> None:
@@ -87,7 +87,7 @@ class SolverRun(Run):
 
     def _go_on(self, state: State | None) -> None:
         options = {"n_subsets": self.settings.subsets} if self.settings.solver == "os-sart" else {}
-        self._states = SOLVERS[self.settings.solver].run(self.problem.task, state, **options)
+        self._states = SOLVERS[self.settings.solver].run(self.problem.linear_problem, state, **options)
         self._keep(state)
 
     def _keep(self, state: State | None) -> None:

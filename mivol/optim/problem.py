@@ -96,10 +96,10 @@ class Refinement:
 
 
 class Staged(Differentiable, Protocol):
-    """What :class:`~mivol.optim.events.CoarseToFine` and :class:`~mivol.optim.events.Survey` ask for besides."""
+    """What :class:`~mivol.optim.events.CoarseToFine` and :class:`~mivol.optim.events.UpdateOccupancy` ask for besides."""
 
     def refine(self, stage: int) -> Refinement:
         """Begin a stage, with the model at the newest reals; the problem has the stage's unknowns from here on."""
 
-    def survey(self) -> None:
+    def update_occupancy(self) -> None:
         """Look again for what can be left out of the next steps without changing them."""

@@ -18,7 +18,7 @@ from mivol.fields.spherical import basis_size, row_width
 from mivol.machine import available_memory
 from mivol.optim.course import Course
 from mivol.optim.decoupled_priors import DecoupledPrior, Smoothness, Sparsity, ViewDependence
-from mivol.optim.events import CoarseToFine, Event, Survey
+from mivol.optim.events import CoarseToFine, Event, UpdateOccupancy
 from mivol.optim.ray_batches import TILE, RayBatches
 from mivol.optim.rmsprop import RMSprop
 
@@ -64,7 +64,7 @@ class FitPlan:
         stop: a ray ends at this transmittance; what is left out is at most that share of the brightest colour.
         keep_weight: a node is kept where some ray gives a cell of it this weight.
         start: the first density, times half the longest edge.
-        survey: steps after which the map of occupied cells is made anew.
+        occupancy_every: steps after which the map of occupied cells is made anew.
         sky: rows of a map of what is behind the field, learned with it (:mod:`mivol.fields.sky`); 0: the photographs' colour.
         sky_rate: first learning rate of the sky [radiance]; it must lead, or the field fills the box with what is behind.
         random_background: photographs with alpha are seen over another colour each step, so that nothing stands in the air in
@@ -88,7 +88,7 @@ class FitPlan:
     stop: float = 1e-4
     keep_weight: float = 0.01
     start: float = 0.1
-    survey: int = 64
+    occupancy_every: int = 64
     sky: int = 0
     sky_rate: float = 0.1
     random_background: bool = True
@@ -120,7 +120,7 @@ class FitPlan:
 
     def course(self, *more: Event) -> Course:
         """All steps, with the stages, the surveys and what else is to happen between them."""
-        return Course(self.steps, events=(CoarseToFine(at=self.begins), Survey(every=self.survey), *more))
+        return Course(self.steps, events=(CoarseToFine(at=self.begins), UpdateOccupancy(every=self.occupancy_every), *more))
 
     def up_to(self, longest: int) -> FitPlan:
         """The plan that ends with so many nodes along the longest edge; stages that are coarser stay."""

@@ -43,7 +43,7 @@ class RadianceProblem:
         box: (2, 3) [length], where the field may be.
         plan: how the fit goes.
         seed: of the rays.
-        safe_point: called between the views of a survey.
+        safe_point: called between the views that are asked what they see.
         field: what was found so far; a thin fog at first.
         sky: what was found behind it, where the plan asks for that.
         stage: the stage at work.
@@ -214,13 +214,13 @@ class RadianceProblem:
             says,
         )
 
-    def survey(self) -> None:
+    def update_occupancy(self) -> None:
         """List the cells that hold anything: the others have neither light nor derivatives."""
         self._cells = cells_of(self.field)
 
     def _look_around(self) -> None:
         self._neighbours = Neighbours.of(self.field)
-        self.survey()
+        self.update_occupancy()
 
     def seen_nodes(self) -> np.ndarray:
         """Nodes (Z, Y, X) of cells to which some ray of the training views gives the plan's weight, and their neighbours."""
@@ -239,7 +239,7 @@ class RadianceProblem:
     def pack(self, reals: Reals) -> dict[str, np.ndarray]:
         """The stage, and the nodes that a sparse field has; makes the list of cells anew, as :meth:`unpack` does."""
         self.set(reals)
-        self.survey()
+        self.update_occupancy()
         nodes = {} if self.field.nodes is None else {"nodes": np.array(self.field.nodes)}
         return {"stage": np.array(self.stage), **nodes}
 

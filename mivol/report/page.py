@@ -52,7 +52,7 @@ class Picture(NamedTuple):
         return max(self.width, self.height) <= 320
 
 
-class View(NamedTuple):
+class ShownView(NamedTuple):
     """A row of pictures of one view with its numbers."""
 
     name: str
@@ -74,7 +74,7 @@ class Bar(NamedTuple):
 class Gallery(NamedTuple):
     """Views that share scales."""
 
-    rows: list[View]
+    rows: list[ShownView]
     bars: list[Bar]
 
 
@@ -256,7 +256,7 @@ def _scales(views: Iterable[dict[str, NDArray]]) -> dict[str, show.Scale]:
 PANELS = {"reference": "Reference", "render": "Render", "difference": "Render − reference", "z": "z-image"}
 
 
-def _view(name: str, images: dict[str, Image], roles: dict[str, NDArray], scales: dict[str, show.Scale]) -> View:
+def _view(name: str, images: dict[str, Image], roles: dict[str, NDArray], scales: dict[str, show.Scale]) -> ShownView:
     pictures = [_picture(PANELS[role], roles[role], scales.get(role)) for role in PANELS if role in roles]
     words = [next((image.caption for image in images.values() if image.caption), "")]
     psnr = None
@@ -266,7 +266,7 @@ def _view(name: str, images: dict[str, Image], roles: dict[str, NDArray], scales
     if "z" in roles:
         words.append(f"|z| > {Z_ODD:g} in {np.mean(np.abs(roles['z']) > Z_ODD):.1%} of the values")
     held_out = any(image.held_out for image in images.values())
-    return View(name, held_out, pictures, psnr, " · ".join(word for word in words if word))
+    return ShownView(name, held_out, pictures, psnr, " · ".join(word for word in words if word))
 
 
 def _agreement(reference: NDArray, difference: NDArray) -> tuple[float | None, str]:
@@ -360,7 +360,7 @@ def _plane(plane: str, cuts: dict[str, show.Slices], scales: dict[str, show.Scal
 # -- Numbers, curves, times, settings -----------------------------------------------------------------------------------
 
 
-def _held_out_psnr(record: RunRecord, views: Sequence[View]) -> list[float]:
+def _held_out_psnr(record: RunRecord, views: Sequence[ShownView]) -> list[float]:
     """PSNR of the views that were not fitted: of those that are shown, or the mean of all that the run has judged itself."""
     judged = record.results.get("held_out_psnr")
     if judged is not None:
@@ -368,7 +368,7 @@ def _held_out_psnr(record: RunRecord, views: Sequence[View]) -> list[float]:
     return [view.psnr for view in views if view.held_out and view.psnr is not None]
 
 
-def _numbers(record: RunRecord, views: Sequence[View], volumes: Sequence[Cut]) -> list[tuple[str, str, str]]:
+def _numbers(record: RunRecord, views: Sequence[ShownView], volumes: Sequence[Cut]) -> list[tuple[str, str, str]]:
     """Tiles under the headline: value, unit, label."""
     held_out = _held_out_psnr(record, views)
     seconds, said, tiles = _seconds(record), ("nrmse", "held_out_psnr", "seconds"), []

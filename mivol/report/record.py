@@ -28,7 +28,7 @@ from mivol.machine import cores
 
 __all__ = [
     "QUANTITIES",
-    "Choice",
+    "PlanLine",
     "Image",
     "Machine",
     "Quantity",
@@ -83,7 +83,7 @@ class _Part(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     pass
 
 
-class Choice(_Part):
+class PlanLine(_Part):
     """One line of the plan: what was chosen, and why."""
 
     choice: str
@@ -152,7 +152,7 @@ class RunRecord(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
     config: dict[str, Any] = {}
     versions: dict[str, str] = {}
     seeds: dict[str, int] = {}
-    plan: list[Choice] = []
+    plan: list[PlanLine] = []
     timings: dict[str, float] = {}
     """Seconds by stage, in order; the stages do not overlap."""
     results: dict[str, float | None] = {}

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.sparse import csr_matrix
 
 from mivol.files import write_exr, write_volume
-from mivol.report.record import Choice, Image, RunRecord, Volume, append_metrics, write_record
+from mivol.report.record import Image, PlanLine, RunRecord, Volume, append_metrics, write_record
 
 
 def blobs(n: int, rng: np.random.Generator) -> np.ndarray:
@@ -90,9 +90,9 @@ def write_run(folder: Path, *, n: int = 12, size: int = 16, fitted: int = 8, hel
         },
         seeds={"volume": 3, "noise": 3},
         plan=[
-            Choice(choice="Absorption along each ray", reason="The albedo is 0 everywhere: light is lost, never turned."),
-            Choice(choice="One channel", reason="The extinction is grey, so the three channels would be the same."),
-            Choice(choice="Conjugate gradients in log space", reason="Optical depth is linear in sigma_t along a pencil ray."),
+            PlanLine(choice="Absorption along each ray", reason="The albedo is 0 everywhere: light is lost, never turned."),
+            PlanLine(choice="One channel", reason="The extinction is grey, so the three channels would be the same."),
+            PlanLine(choice="Conjugate gradients on logarithms", reason="Optical depth is linear in sigma_t along a thin ray."),
         ],
         timings={"references": 0.41, "set-up": 0.18, "solver": 1.9, "held-out views": 0.12, "report": 0.3},
         results={"nrmse": rows[-1]["nrmse"], "iterations": steps, "views": fitted},

@@ -25,8 +25,8 @@ from mivol.report import figures, show
 from mivol.report.cite import CITATIONS, citations
 from mivol.report.page import headline, write_page
 from mivol.report.record import (
-    Choice,
     Image,
+    PlanLine,
     RunRecord,
     Volume,
     append_metrics,
@@ -247,7 +247,7 @@ def test_each_volume_is_shown_beside_its_own_truth(tmp_path):
 
 
 def test_text_of_a_run_cannot_become_markup(tmp_path):
-    plan = [Choice(choice="<img src=x onerror=alert(1)>", reason="a < b & c")]
+    plan = [PlanLine(choice="<img src=x onerror=alert(1)>", reason="a < b & c")]
     write_record(RunRecord.new("<script>alert(1)</script>", plan=plan, config={"a": "</pre><b>"}), tmp_path)
     found = Page(write_page(tmp_path).read_text(encoding="utf-8"))
     assert "script" not in {tag for tag, _ in found.tags}

@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mivol.errors import MivolError
-from mivol.optim.events import EVENTS, Checkpoint, CoarseToFine, Evaluate, Survey, Upsample, in_order, upsample
+from mivol.optim.events import EVENTS, Checkpoint, CoarseToFine, Evaluate, UpdateOccupancy, Upsample, in_order, upsample
 from mivol.optim.parameters import MAPS, Parameter, as_tensor, find, inverse_softplus, like, softplus
 from mivol.optim.schedules import SCHEDULES, Constant, Cosine, Exponential, Step
 
@@ -159,8 +159,8 @@ def test_events_are_due_when_they_say(variant_rgb) -> None:
     assert [i for i in range(9) if Checkpoint(every=4).due(i)] == [4, 8]
     assert [i for i in range(9) if Evaluate(every=4).due(i)] == [0, 4, 8]
     assert [i for i in range(9) if CoarseToFine(at=(3, 5)).due(i)] == [3, 5]
-    assert [i for i in range(9) if Survey(every=4).due(i)] == [4, 8]
-    assert set(EVENTS) == {"upsample", "coarse_to_fine", "survey", "checkpoint", "evaluate"}
+    assert [i for i in range(9) if UpdateOccupancy(every=4).due(i)] == [4, 8]
+    assert set(EVENTS) == {"upsample", "coarse_to_fine", "update_occupancy", "checkpoint", "evaluate"}
     assert isinstance(in_order((Upsample(at=(1,)), Evaluate(), Checkpoint()))[0], Checkpoint)
 
 

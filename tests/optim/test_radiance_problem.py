@@ -77,7 +77,7 @@ def test_the_vacuum_around_a_sparse_field_stays_empty(variant_rgb: str, photos: 
     middle = np.zeros(problem.field.res, bool)
     middle[3:9, 3:9, 3:9] = True
     problem.field = problem.field.sparse(middle)
-    problem.survey()
+    problem.update_occupancy()
     batch = problem.batches.draw(2, np.arange(3), 30, np.random.default_rng(3))
     _, slopes = problem.slopes(batch)
     density = np.array(slopes["density"])
