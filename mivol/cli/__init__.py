@@ -150,9 +150,9 @@ def explain(arguments: argparse.Namespace) -> None:
 def explain_scene(arguments: argparse.Namespace) -> None:
     """Facts, choices, reasons."""
     from mivol.cli.loading import load
-    from mivol.scene import plan
+    from mivol.scene.explain import explain as explain_plan
 
-    print(plan.explain(load(arguments).scene, arguments.max_depth))
+    print(explain_plan(load(arguments).scene, arguments.max_depth))
 
 
 def explain_photos(arguments: argparse.Namespace) -> None:

@@ -114,7 +114,8 @@ def solve(task: Task, run: RunFolder, problem: Inversion, data: Projections) -> 
     with task.watcher.watch(course.iterations) as watch:
 
         def observe(fit: Fit) -> None:
-            run.append(fit.next, fit.seconds, loss=fit.history[-1]["loss"], **errors_of(fit.run.state, problem.linear_problem, data))
+            errors = errors_of(fit.run.state, problem.linear_problem, data)
+            run.append(fit.next, fit.seconds, loss=fit.history[-1]["loss"], **errors)
             watch(fit)
 
         fit.complete(observe)

@@ -1,0 +1,14 @@
+"""What the tests of several modules of the room share."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from tiny_experiment import write_experiment
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A scene, its start volume and an experiment."""
+    return write_experiment(tmp_path)

@@ -1,0 +1,63 @@
+"""What was seen of a scene: rendered once, read from files, and held out."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tiny_experiment import SCENE, refused, run
+
+from mivol.files import write_exr
+
+
+def test_references_are_cached(variant_rgb, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A second fit of the same views renders none again, another truth does; and each row of the metrics is there once."""
+    target = folder / "run"
+    fewer = ["--set", 'reference={source="render", spp=32}', "--set", 'views={rig="ring", count=1, width=4, height=4}']
+    flags = ["optimize", folder / "fit.toml", "-o", target, *fewer]
+    assert run(*flags, "--set", "fit.iterations=1") == 0
+    before = {path: path.stat().st_mtime_ns for path in (target / "references").iterdir()}
+    assert run(*flags, "--set", "fit.iterations=2") == 0
+    assert {path: path.stat().st_mtime_ns for path in (target / "references").iterdir()} == before
+    assert len((target / "metrics.jsonl").read_text().splitlines()) == 3
+    assert run(*flags, "--set", "fit.iterations=1", "--set", "truth.seed=4") == 0
+    assert len(list((target / "references").glob("*.exr"))) == 2
+
+
+def test_references_from_files(variant_rgb, folder: Path, capsys: pytest.CaptureFixture) -> None:
+    """Photographs (no header) are taken as they are; mivol's own must be of this scene."""
+    write_exr(folder / "a.exr", {"": np.full((6, 8, 3), 0.7, "f")})
+    (folder / "other.xml").write_text(SCENE.replace('value="35"', 'value="36"'))
+    changes = ["--set", 'views={rig="scene", indices=[0]}', "--set", "event=[]", "--set", "fit.iterations=2"]
+    files = ["--set", 'reference={source="files", paths=["a.exr"]}']
+    assert run("optimize", folder / "fit.toml", "-o", folder / "run", *changes, *files) == 0
+    assert run("reference", folder / "other.xml", "-o", folder / "d.exr", "--max-depth", 6, "--spp", 32) == 0
+    capsys.readouterr()
+    wrong = ["--set", 'reference={source="files", paths=["d.exr"]}']
+    said = refused(capsys, "optimize", folder / "fit.toml", "-o", folder / "run", *changes, *wrong)
+    assert "reference of another scene" in said
+    right = ["--set", 'reference={source="files", paths=["d.exr"], scene="other.xml"}']
+    assert run("optimize", folder / "fit.toml", "-o", folder / "run", *changes, *right) == 0
+
+
+def test_views_that_are_held_out_come_after_the_others(variant_rgb, folder: Path) -> None:
+    """A rig of their own: none of its views is fitted, all of them are compared, and their files follow the others'."""
+    (folder / "d.exr").write_bytes((folder / "c.exr").read_bytes())
+    files = 'reference={source="files", paths=["a.exr", "b.exr", "c.exr", "d.exr"], held_out=[0]}'
+    more = 'held_out={rig="ring", count=1, width=8, height=8, elevation=40}'
+    assert run("optimize", folder / "fit.toml", "-o", folder / "run", "--set", files, "--set", more) == 0
+    record = json.loads((folder / "run" / "run.json").read_text())
+    assert {image["view"] for image in record["images"] if image.get("held_out")} == {"view 0", "view 3"}
+    assert {image["view"] for image in record["images"] if not image.get("held_out")} == {"view 1", "view 2"}
+    assert record["results"]["views"] == 2
+
+
+def test_views_of_different_sizes(variant_rgb, folder: Path, capsys: pytest.CaptureFixture) -> None:
+    sensor = SCENE[SCENE.index("<sensor") : SCENE.index("</sensor>") + 9]
+    (folder / "scene.xml").write_text(SCENE.replace(sensor, sensor + sensor.replace('value="6"', 'value="5"')))
+    flags = ["--set", 'views={rig="scene"}', "--set", 'reference={source="render", spp=64}']
+    said = refused(capsys, "optimize", folder / "fit.toml", "-o", folder / "run", *flags)
+    assert "8 x 5 pixels" in said
+    assert "8 x 6" in said

@@ -1,0 +1,165 @@
+"""A scene fitted to images of it: a whole run folder, refusals, interruption and resumption."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fit_scene import KEY
+from tiny_experiment import PHOTOS, files_of, refused, run
+
+from mivol.files import atomic, read_volume
+
+
+def test_optimize_leaves_a_whole_run_folder(variant_rgb, folder: Path, capsys: pytest.CaptureFixture) -> None:
+    """Everything that the issue names: record, volumes, renders with held-out views, curves, page; nothing half-written."""
+    target = folder / "run"
+    assert run("optimize", folder / "fit.toml", "-o", target, "--set", "fit.iterations=5") == 0
+    assert capsys.readouterr().out.strip() == str(target / "report.html")
+    names = files_of(target)
+    stem = "volumes/" + KEY.replace(".", "_")
+    assert {"run.json", "metrics.jsonl", "report.html", "checkpoint.npz"} <= names
+    assert {f"{stem}_reconstruction.vol", f"{stem}_reconstruction.npz", f"{stem}_truth.npz"} <= names
+    assert {f"views/view_{i}.{kind}" for i in range(3) for kind in ("exr", "png")} <= names
+    assert {"curves/loss.png", "curves/nrmse.png", "curves/held_out_psnr.png"} <= names
+    assert not any(name.endswith(".part") for name in names)
+    record = json.loads((target / "run.json").read_text())
+    assert record["status"] == "finished"
+    assert record["config"]["fit"]["iterations"] == 5
+    assert record["config"]["optimiser"]["beta_1"] == 0.9
+    assert record["seeds"] == {"fit": 0, "references": 1}
+    assert {"mivol", "mitsuba", "drjit"} <= set(record["versions"])
+    assert record["plan"]
+    assert all(choice["reason"] for choice in record["plan"])
+    assert set(record["timings"]) == {"scene", "references", "fit", "images and volumes"}
+    assert [image["view"] for image in record["images"] if image.get("held_out")] == ["view 1"] * 3
+    rows = [json.loads(line) for line in (target / "metrics.jsonl").read_text().splitlines()]
+    assert [row["iteration"] for row in rows] == [0, 1, 2, 3, 4, 5]
+    assert [("nrmse" in row) for row in rows] == [True, False, True, False, True, True]
+    assert rows[4]["loss"] < rows[0]["loss"]
+    values = read_volume(target / f"{stem}_reconstruction.vol")
+    assert values.values.shape == (3, 3, 3, 1)
+    assert np.allclose(values.to_world[:3, 3], -1)
+    page = (target / "report.html").read_text()
+    assert "tiny" in page
+    assert str(folder) not in page
+
+
+OPTIMIZE_REFUSED = {
+    "misspelt key": (["fit.iteratons=3"], 'did you mean "iterations"'),
+    "no views": (["views.count=0"], "views.count = 0"),
+    "all views held out": (["reference.held_out=[0,1,2]"], "all 3 views are held out"),
+    "a view to hold out that is not there": (["reference.held_out=[7]"], "no view 7"),
+    "unknown parameter": (['parameter.0.key="cube.interior_medium.sigma_t.dat"'], f'did you mean "{KEY}"'),
+    "start outside its domain": (["parameter.0.start=-1.0"], r"[0, 0, 0, 0] = -1"),
+    "scene that is not there": (['scene.file="none.xml"'], "no scene file"),
+    "truth that is not there": ([f'truth={{key="{KEY}", file="none.vol"}}'], "none.vol"),
+    "more views than files": (['reference={source="files", paths=["a.exr"]}'], "1 reference files for 3 views"),
+    "unknown integrator": (['fit.integrator="mivoll"'], "mivoll"),
+    "unknown variant": (['variant="llvm_rgb"'], 'no variant "llvm_rgb"'),
+    "a parameter twice": ([f'parameter=[{{key="{KEY}"}}, {{key="{KEY}", start=0.1}}]'], "twice"),
+    "a truth that nobody looks for": (
+        ['parameter=[{key="cube.interior_medium.albedo.value.value", domain=[0, 1]}]'],
+        "which is no parameter of the fit",
+    ),
+    "voxels of a number": (
+        ['parameter=[{key="cube.interior_medium.albedo.value.value", shape=[3,3,3], start=0.0}]'],
+        "is no grid of voxels",
+    ),
+    "a prior of a number": (
+        ['parameter=[{key="cube.interior_medium.albedo.value.value", prior=[{name="tv"}]}]'],
+        "compares neighbours",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", OPTIMIZE_REFUSED)
+def test_optimize_refuses(variant_rgb, folder: Path, capsys: pytest.CaptureFixture, case: str) -> None:
+    changes, sentence = OPTIMIZE_REFUSED[case]
+    flags = [part for change in changes for part in ("--set", change)]
+    assert sentence in refused(capsys, "optimize", folder / "fit.toml", "-o", folder / "run", *flags)
+
+
+def test_disk_full(variant_rgb, folder: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The disk fills up at the first checkpoint: one sentence, nothing half-written, and a second try ends well."""
+    sync, target = atomic._sync, folder / "run"
+
+    def full(path: Path) -> None:
+        if "checkpoint" in path.name:
+            raise OSError(28, "No space left on device")
+        sync(path)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(atomic, "_sync", full)
+        said = refused(capsys, "optimize", folder / "fit.toml", "-o", target, *PHOTOS)
+    assert "no space left" in said
+    record = json.loads((target / "run.json").read_text())
+    assert record["status"] == "stopped"
+    assert any("no space left" in note for note in record["notes"])
+    assert not any(name.endswith(".part") for name in files_of(target))
+    assert run("optimize", folder / "fit.toml", "-o", target, *PHOTOS) == 0
+
+
+STOPPED_AFTER_THREE = """
+import os, signal, sys
+from mivol.cli import main
+from mivol.experiments import run_folder
+
+write = run_folder.append_metrics
+
+def write_and_stop(folder, iteration, seconds, **values):
+    write(folder, iteration, seconds, **values)
+    if iteration == 2:
+        os.kill(os.getpid(), signal.SIGTERM)
+
+run_folder.append_metrics = write_and_stop
+sys.exit(main(sys.argv[1:]))
+"""
+"""The command line in a process that is asked to stop once it has written its third row, of iteration 2; whatever the load."""
+
+
+def test_interrupted_run_is_resumed(variant_rgb, folder: Path) -> None:
+    """Rationale: SIGTERM is how clusters stop jobs. Expected: exit code 130, one sentence, a checkpoint, status
+    "stopped"; --resume ends with the very metrics of a run that was not stopped (one thread), each row once."""
+    long = [*PHOTOS, "--set", "fit.iterations=20"]
+    assert run("optimize", folder / "fit.toml", "-o", folder / "whole", *long) == 0
+    command = [sys.executable, "-c", STOPPED_AFTER_THREE, "optimize", folder / "fit.toml", "-o", folder / "cut", *long]
+    child = subprocess.run(command, stderr=subprocess.PIPE, text=True, check=False)
+    assert child.returncode == 130
+    assert "mivol: stopped" in child.stderr
+    assert "Traceback" not in child.stderr
+    # It stops at the next safe point, in iteration 3 or before the one after.
+    assert (folder / "cut" / "metrics.jsonl").read_text().count("\n") in (3, 4)
+    assert json.loads((folder / "cut" / "run.json").read_text())["status"] == "stopped"
+    assert run("optimize", folder / "fit.toml", "-o", folder / "cut", *long, "--resume") == 0
+    texts = [(folder / name / "metrics.jsonl").read_text() for name in ("whole", "cut")]
+    rows = [[(row["iteration"], row.get("loss")) for row in map(json.loads, text.splitlines())] for text in texts]
+    assert rows[0] == rows[1]
+    assert [iteration for iteration, _ in rows[0]] == list(range(21))
+    assert json.loads((folder / "cut" / "run.json").read_text())["status"] == "finished"
+
+
+def test_resume_refuses_other_settings(variant_rgb, folder: Path, capsys: pytest.CaptureFixture) -> None:
+    """Before anything of the run is touched: its folder is not made, and its record stays that of what was done."""
+    flags = ["optimize", folder / "fit.toml", "-o", folder / "run", *PHOTOS, "--set", "fit.iterations=2"]
+    assert "without --resume first" in refused(capsys, *flags, "--resume")
+    assert not (folder / "run").exists()
+    assert run(*flags) == 0
+    record = (folder / "run" / "run.json").read_text()
+    said = refused(capsys, *flags, "--resume", "--set", "optimiser.beta_1=0.8")
+    assert "optimiser.beta_1 is 0.9 there and 0.8 here" in said
+    assert "parameter.0.shape.0 is 3 there" in refused(capsys, *flags, "--resume", "--set", f'parameter=[{{key="{KEY}"}}]')
+    assert (folder / "run" / "run.json").read_text() == record
+
+
+def test_a_run_that_is_done_may_be_resumed(variant_rgb, folder: Path) -> None:
+    """There is nothing left to do, and nothing is said twice."""
+    flags = ["optimize", folder / "fit.toml", "-o", folder / "run", *PHOTOS, "--set", "fit.iterations=2"]
+    assert run(*flags) == 0
+    metrics = (folder / "run" / "metrics.jsonl").read_text()
+    assert run(*flags, "--resume") == 0
+    assert (folder / "run" / "metrics.jsonl").read_text() == metrics
