@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 import re
 
@@ -10,9 +9,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from aov_scenes import CUBE, EPS, grid, rays, see
 from oracle import box_interval, depth_twin, overlap, sphere_interval, tau_twin, to_lattice, trilinear
 
-from mivol.errors import MivolError
 from mivol.transport.line_integrals import expected_depth
 from scenes import (
     as_float32,
@@ -20,11 +19,8 @@ from scenes import (
     box_of,
     camera,
     centred,
-    film,
     grid_volume,
     medium,
-    pencil,
-    pixel_rays,
     render,
     rotation,
     sky,
@@ -32,41 +28,13 @@ from scenes import (
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
 
-EPS = 2.0**-23
-CUBE = centred(np.eye(3))
 TURNED = as_float32(centred(rotation([1, 2, 0], 0.5), (0.1, 0, 0)))
 SMALL = as_float32(centred(0.5 * rotation([1, 2, 0], 0.5), (0.05, 0, 0)))
 RGB = [0.9, 0.2, 3.0]
 
 
-def see(parts, o, d, aovs, inside=None, **more):
-    """AOVs (n, names) along rays (n, 3), and those rays as the sensor sent them."""
-    rays = {f"ray{i:03d}": pencil(p, w) for i, (p, w) in enumerate(zip(o, d, strict=True))}
-    sensor = {"type": "batch", **rays, "film": film(len(o), 1), "sampler": {"type": "independent"}}
-    if inside is not None:
-        sensor["medium"] = {"type": "ref", "id": inside}
-    scene = mi.load_dict({"type": "scene", **parts, "sensor": sensor})
-    o, d = (x[0, :, 0] for x in pixel_rays(scene.sensors()[0], 1))
-    return render(scene, {"type": "mivol", "max_depth": 1, "aovs": aovs, **more}, 1)[0, :, 3:].astype(np.float64), o, d
-
-
-def rays(n=8, origin=(0.2, 0.3, 4.0), seed=0, wide=0.35):
-    """Rays from around one point through the middle of the scene."""
-    rng = np.random.default_rng([seed, 5])
-    o = as_float32(np.asarray(origin) + rng.uniform(-0.1, 0.1, (n, 3)))
-    d = np.column_stack([rng.uniform(-wide, wide, (n, 2)), np.zeros(n)]) - o
-    return o, as_float32(d / np.linalg.norm(d, axis=1, keepdims=True))
-
-
-def grid(seed, channels=1, top=4.0, shape=(9, 8, 10)):
-    """A smooth grid: a few waves along each axis, at least a tenth of its top."""
-    rng = np.random.default_rng(seed)
-    z, y, x = np.meshgrid(*(np.linspace(0, 1, n) for n in shape), indexing="ij")
-    waves = [np.sin(2 * math.pi * (rng.uniform(0.3, 1, 3) @ [z.ravel(), y.ravel(), x.ravel()]) + c) for c in range(channels)]
-    return as_float32(top * (0.55 + 0.45 * np.array(waves).T.reshape(*shape, channels)))
-
-
 # -- The twin: media as pairs (interval(o, d), sigma(o, d, t)): where along a ray, and how much (m, C) ---
+
 
 def grid_field(values, place, interval=None):
     def sigma(o, d, t):
@@ -184,36 +152,6 @@ def test_camera_inside():
         assert image[i] == pytest.approx([depth, alpha], abs=4e-6)
 
 
-@pytest.mark.parametrize("sigma", [1e-8, 1e-3, 0.7, 20.0, 1e3, 1e6])
-@pytest.mark.parametrize("kind", ["homogeneous", "grid"])
-def test_depth_of_a_slab_at_any_optical_depth(sigma, kind):
-    # 1/sigma - L T / (1 - T) behind the entry: L/2 where it is thin, 1/sigma where it is thick.
-    """Hard case 1."""
-    sigma = float(as_float32(sigma))
-    values = np.full((7, 3, 2), sigma)
-    inside = medium("heterogeneous", grid_volume("gridvolume", values))
-    if kind == "homogeneous":
-        inside = medium("homogeneous", sigma)
-    image, o, _ = see({"box": box_of(inside, np.eye(4))}, [[0.3, 0.4, -1]], [[0, 0, 1]], "tau,alpha,depth")
-    behind = 0.5 - sigma / 12 if sigma < 1e-2 else 1 / sigma - (1 / math.expm1(sigma) if sigma < 500 else 0)
-    assert image[0, 0] == pytest.approx(sigma, rel=16 * EPS)
-    assert image[0, 1] == pytest.approx(-math.expm1(-sigma), rel=16 * EPS)
-    assert image[0, 2] == pytest.approx(-o[0, 2] + behind, rel=16 * EPS)
-
-
-def test_depth_where_a_medium_never_ends():
-    # The camera in a fog without a boundary in front of it, 1/sigma; a surface at 2 cuts it: (1 - T)/sigma.
-    sigma = 0.8
-    fog = {**medium("homogeneous", sigma), "id": "fog"}
-    ball = ball_of({"type": "ref", "id": "fog"}, [0, 0, -50], 1.0)
-    wall = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, 2.0]).scale(0.5)}
-    o, d = np.zeros((2, 3)), np.array([[0, 0, 1.0], [0, 1.0, 0]])
-    image, o, _ = see({"fog": fog, "ball": ball, "wall": wall}, o, d, "depth,alpha", inside="fog")
-    length = 2.0 - o[0, 2]
-    assert image[0] == pytest.approx([-math.expm1(-sigma * length) / sigma, 1.0], rel=16 * EPS)
-    assert image[1] == pytest.approx([1 / sigma, 1.0], rel=16 * EPS)
-
-
 def test_nothing_there():
     # 0 where alpha is 0: beside the medium, in an empty one, and in a scene without media.
     image, *_ = see({"box": box_of(medium("homogeneous", 1.0), CUBE)}, [[3.0, 3, 3]], [[0, 0, -1.0]], "tau,alpha,depth")
@@ -232,24 +170,6 @@ def test_behind_a_wall_is_nothing():
         {"box": box_of(medium("homogeneous", 1.0), place), "wall": wall}, [[0.1, 0, 2]], [[0, 0, -1.0]], "tau,alpha,depth"
     )
     assert image[0] == pytest.approx([0, 1, o[0, 2]], abs=8 * EPS)
-
-
-def test_depth_is_of_sixth_order():
-    # A smooth field on a line, twice as fine twice: the error falls by 2^6 = 64 each time. In the cell formula's own
-    # terms, in float64, since float32 ends at 1e-7: the very function that the walk calls, on a double variant of lanes.
-    def depth(n: int) -> float:
-        edges = np.linspace(0, 3, n + 1)
-        points = edges[:-1, None] + np.diff(edges)[:, None] * (0.5 + math.sqrt(15) / 10 * np.array([-1, 0, 1]))
-        lanes = [mi.Float64(np.ascontiguousarray(c)) for c in (1 + 0.8 * np.sin(2 * points + 0.3)).T]
-        stop = expected_depth.stop_in_cell(mi.Float64(edges[:-1]), mi.Float64(np.diff(edges)), *lanes)
-        T, N = np.array(stop.T), np.array(stop.N)
-        front = np.cumprod(np.concatenate([[1], T]))
-        return float((front[:-1] * N).sum() / (1 - front[-1]))
-
-    _, exact = depth_twin(lambda t: (1 + 0.8 * np.sin(2 * t + 0.3))[:, None], np.linspace(0, 3, 31), n=40_000)
-    errors = [abs(depth(n) - exact) for n in (5, 10, 20)]
-    orders = [math.log2(a / b) for a, b in itertools.pairwise(errors)]
-    assert min(orders) > 5.5, errors
 
 
 def test_rgb_names_and_their_order():
@@ -357,24 +277,10 @@ def test_nothing_runs_that_was_not_asked_for(backward, expected, monkeypatch):
     def forbidden(*_, **__):
         raise AssertionError("a depth that nobody asked for")
 
-    monkeypatch.setattr(expected_depth, "stop_in_cell", forbidden)
+    monkeypatch.setattr(expected_depth, "integrate_distance_in_cell", forbidden)
     assert (loops(""), loops("tau,alpha")) == expected[:2]
     with pytest.raises(RuntimeError, match="while_loop"):
         loops("depth")
-
-
-def test_two_grids_that_differ_are_refused_for_depth_only():
-    inside = {
-        "type": "mivol_medium",
-        "sigma_a": grid_volume("mivol_voxels", grid(11), CUBE),
-        "sigma_s": grid_volume("mivol_voxels", grid(12, shape=(4, 4, 4)), CUBE),
-    }
-    parts = {"box": box_of(inside, CUBE)}
-    image, o, d = see(parts, *rays(3), "tau,alpha")
-    tau = tau_twin(grid(11), CUBE, o, d) + tau_twin(grid(12, shape=(4, 4, 4)), CUBE, o, d)
-    assert image[:, :1] == pytest.approx(tau, rel=1e-5)
-    with pytest.raises(MivolError, match="depth was asked for and a medium sums grids"):
-        see(parts, *rays(3), "depth")
 
 
 @pytest.mark.parametrize(("aovs", "match"), [("tau,taau", "did you mean"), ("tau, depth, tau", "2 times")])

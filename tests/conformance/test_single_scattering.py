@@ -33,88 +33,34 @@ from scattering_scenes import (
     point,
     rough_grid,
     smoke,
-    spot,
-    sun,
     volpath,
+)
+from volpath_scenes import (
+    BARE,
+    FOG,
+    LAMPS,
+    LEAK,
+    RED,
+    area,
+    cube,
+    floor,
+    grid_in,
+    lit,
+    same,
+    square,
+    turn,
+    veil,
 )
 
 import scenes
 from mivol.validate.reference import render_reference
 from mivol.validate.statistics import Moments
-from scenes import affine, as_float32, ball_of, box_of, centred, grid_volume, medium, refused, rotation, transform
+from scenes import as_float32, ball_of, box_of, centred, grid_volume, medium, refused, rotation
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
 
-LEAK = 1e-4
-RED = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.8, 0.3, 0.2]}}
-
-
-def turn() -> mi.ScalarTransform4f:
-    return mi.ScalarTransform4f()
-
-
-def same(parts: dict, level: float | None = None, **more: object) -> tuple[Moments, Moments]:
-    """Both integrators show the same; what volpath leaks is counted as a share of the brightest pixel."""
-    scene = close_up(parts)
-    level = float(moments(scene, volpath(), 16, 2).mean.max()) if level is None else level
-    return assert_same_images(scene, rounding=LEAK * level, **more)
-
 
 # -- Lamps -----------------------------------------------------------------------------------------------------------
-
-
-def panorama() -> mi.Bitmap:
-    """A sky of 8 x 16 with a bright spot of 60 in it, one texel of another colour."""
-    sky = np.random.default_rng(3).uniform(0.1, 0.6, (8, 16, 3)).astype(np.float32)
-    sky[2, 5] = (60.0, 50.0, 30.0)
-    return mi.Bitmap(sky)
-
-
-def square(x: float, y: float, z: float, size: float = 0.5, towards: tuple = (0, 0, 0)) -> dict:
-    """A square at a place, facing another."""
-    place = turn().look_at([x, y, z], list(towards), [0.1, 0.9, 0.2])
-    return {"type": "rectangle", "to_world": place.scale([size, size, 1])}
-
-
-def area(x: float, y: float, z: float, radiance: object = 8.0, size: float = 0.5) -> dict:
-    """A luminous square facing the middle."""
-    light = {"type": "rgb", "value": radiance} if isinstance(radiance, list) else radiance
-    return square(x, y, z, size) | {"emitter": {"type": "area", "radiance": light}}
-
-
-def projector() -> dict:
-    picture = np.random.default_rng(4).uniform(0, 2, (4, 6, 3)).astype(np.float32)
-    return {
-        "type": "projector",
-        "irradiance": {"type": "bitmap", "bitmap": mi.Bitmap(picture), "filter_type": "nearest", "raw": True},
-        "to_world": turn().look_at([2.0, -1, 2.5], [0, 0, 0], [0, 0, 1]),
-        "fov": 40,
-        "scale": 5.0,
-    }
-
-
-def textured() -> dict:
-    picture = np.random.default_rng(5).uniform(0, 9, (3, 5, 3)).astype(np.float32)
-    radiance = {"type": "bitmap", "bitmap": mi.Bitmap(picture), "raw": True}
-    return square(0, -0.4, 2.2, 1.0) | {"emitter": {"type": "area", "radiance": radiance}}
-
-
-LAMPS = {
-    "constant": lambda: {"lamp": scenes.sky(0.8)},
-    "envmap": lambda: {"lamp": {"type": "envmap", "bitmap": panorama(), "to_world": turn().rotate([1, 0, 0], 70)}},
-    "sunsky": lambda: {"lamp": {"type": "sunsky", "turbidity": 4.0, "sun_direction": [0.4, 0.3, 0.8], "sun_aperture": 3.0}},
-    "directional": lambda: {"lamp": sun([0.3, 0.5, -1.0])[0]},
-    "point": lambda: {"lamp": point([1.5, -1.2, 1.6])[0]},
-    "spot": lambda: {"lamp": spot([1.0, -2, 2.2], [0, 0, 0])[0]},
-    "projector": lambda: {"lamp": projector()},
-    "area outside": lambda: {"lamp": area(1.5, 0.5, 1.8, [9.0, 6.0, 2.0])},
-    "textured area": lambda: {"lamp": textured()},
-    "area inside": lambda: {"lamp": {"type": "sphere", "radius": 0.25, "center": [0.3, 0.2, 0.1]}
-                            | {"emitter": {"type": "area", "radiance": 4.0}}},
-    "two that can be met": lambda: {**LAMPS["envmap"](), "wide": area(-1.6, 0.5, 1.5, 3.0, 1.5)},
-    "several": lambda: {"a": scenes.sky(0.1), "b": point([1.5, -1.2, 1.6])[0], "c": sun([0, 1, -0.5], 0.5)[0],
-                        "d": area(-1.6, 0.5, 1.5)},
-}  # fmt: skip
 
 
 @pytest.mark.statistical
@@ -137,107 +83,11 @@ def test_no_lamp_at_all():
     assert not np.any(dr.grad(params[key]))
 
 
-# -- Phase functions -------------------------------------------------------------------------------------------------
-
-
-def flakes(voxels: int = 1) -> dict:
-    """Microflakes: a random symmetric matrix in each voxel of a row (xx, yy, zz, xy, xz, yz)."""
-    m = np.random.default_rng(6).normal(size=(1, 1, voxels, 3, 3))
-    m = np.einsum("...ij,...kj->...ik", m, m) / 6 + 0.1 * np.eye(3)
-    S = np.stack([m[..., 0, 0], m[..., 1, 1], m[..., 2, 2], m[..., 0, 1], m[..., 0, 2], m[..., 1, 2]], axis=-1)
-    return {"type": "sggx", "S": {"type": "gridvolume", "grid": mi.VolumeGrid(S.astype(np.float32)), "raw": True,
-                                  "to_world": transform(PLACE)}}  # fmt: skip
-
-
-PHASES = {
-    "isotropic": lambda: {"type": "isotropic"},
-    "hg forward": lambda: {"type": "hg", "g": 0.85},
-    "hg backward": lambda: {"type": "hg", "g": -0.6},
-    "rayleigh": lambda: {"type": "rayleigh"},
-    "tabphase": lambda: {"type": "tabphase", "values": "0.2, 0.1, 0.5, 0.3, 1.5"},
-    "blendphase": lambda: {"type": "blendphase", "weight": 0.3, "a": {"type": "hg", "g": 0.7}, "b": {"type": "rayleigh"}},
-    "blendphase by a grid": lambda: {
-        "type": "blendphase",
-        "weight": grid_volume("gridvolume", np.random.default_rng(7).uniform(0, 1, (2, 3, 2, 1)), PLACE),
-        "a": {"type": "hg", "g": 0.7},
-        "b": {"type": "hg", "g": -0.3},
-    },
-    "sggx": flakes,
-}
-
-
-OWN_PHASES = [("hg forward", "own"), ("tabphase", "own"), ("blendphase", "own")]
-
-
-@pytest.mark.statistical
-@pytest.mark.parametrize(
-    ("name", "kind"), small.cases([*((name, "stock") for name in PHASES), *OWN_PHASES], [("hg backward", "stock"), *OWN_PHASES])
-)
-def test_phase_functions(name, kind):
-    """Under a sky with a bright spot (directions are sampled both ways) and a point light (one direction only).
-
-    Volpath draws the directions of flakes wrongly (tests/conformance/test_reference.py): they are judged by the point light.
-    """
-    medium_type, volume_type = small.KINDS[kind]
-    interior = medium(medium_type, grid_volume(volume_type, rough_grid(2), PLACE), 0.7, phase=PHASES[name]())
-    lamps = {} if name == "sggx" else LAMPS["envmap"]()
-    same({"smoke": box_of(interior, PLACE), **lamps, "bulb": point([1.5, -1.2, 1.6], 1.5)[0]})
-
-
-@pytest.mark.statistical
-@pytest.mark.parametrize("inside", ["alone", "a blend", "a mixture"])
-def test_flakes_in_a_sky(inside):
-    """Thin: albedo tau sqrt(w^T S w) times the sky's mean over eval_pdf; the sun in it is found by both ways of sampling."""
-    lobes = {"a": flakes(), "b": {"type": "hg", "g": 0.5}}
-    phase = {"alone": flakes(), "a blend": {"type": "blendphase", "weight": 0.3, **lobes},
-             "a mixture": {"type": "mivol_mixture", "weight_a": 0.7, "weight_b": 0.3, **lobes}}[inside]  # fmt: skip
-    tau, albedo = 1e-3, 0.8
-    box = box_of(medium("homogeneous", tau / 2, albedo, phase=phase), PLACE)
-    o, d = np.array([0.1, -3.0, 0.2]), np.array([0, 1.0, 0])
-    seen = small.pencils({"smoke": box, **LAMPS["envmap"]()}, o, d)
-    found = seen.moments(mivol(hide_emitters=True), 1 << 14)
-    n = 1 << 20
-    k = np.arange(n) + 0.5
-    w = mi.warp.square_to_uniform_sphere(mi.Point2f(np.stack([k / n, k * 0.6180339887 % 1]).astype(np.float32)))
-    mei = dr.zeros(mi.MediumInteraction3f, n)
-    mei.wi = mi.Vector3f(0, -1, 0)
-    mei.sh_frame = mi.Frame3f(mei.wi)
-    si = dr.zeros(mi.SurfaceInteraction3f, n)
-    si.wi = -w
-    phase = seen.scene.shapes()[0].interior_medium().phase_function()
-    _, pdf = phase.eval_pdf(mi.PhaseFunctionContext(None), mei, w)
-    light = seen.scene.environment().eval(si) * pdf
-    area = phase.projected_area(mei)[0] if inside == "alone" else 1.0
-    truth = [albedo * tau * area * 4 * np.pi * dr.mean(light[c])[0] for c in range(3)]
-    truth = np.array(truth)
-    # light is lost again on the way, less than 2 tau of it; the rule of 2^20 points errs by 1e-3 at the edges of the texels
-    assert_same_mean(found, truth[None], rounding=4e-3 * truth.min(), what="radiances")
-    assert_precise(found, 0.01 * truth, what="radiances")
-
-
 # -- Boundaries, media, places of the camera -------------------------------------------------------------------------
 
 
-def lit(parts: dict) -> dict:
-    return {**parts, "bulb": point([1.6, -1.3, 1.7], 40.0)[0], "sky": scenes.sky(0.1)}
-
-
-def grid_in(boundary: dict, kind: str = "stock", to_world: np.ndarray = PLACE, seed: int = 3, **more: object) -> dict:
-    """A boundary around a grid."""
-    medium_type, volume_type = small.KINDS[kind]
-    phase = {"type": "hg", "g": 0.3}
-    albedo = more.pop("albedo", 0.8)
-    interior = medium(medium_type, grid_volume(volume_type, rough_grid(seed), to_world), albedo, phase=phase, **more)
-    return boundary | {"interior": interior}
-
-
 TURNED = as_float32(centred(1.4 * rotation([1, 2, 3], 0.7)))
-BARE = {"bsdf": {"type": "null"}}
 BALL = {"type": "sphere", "radius": 0.9, **BARE}
-
-
-def cube(to_world: np.ndarray) -> dict:
-    return {"type": "cube", "to_world": transform(np.asarray(to_world) @ affine(0.5 * np.eye(3), np.full(3, 0.5))), **BARE}
 
 
 def two_media() -> dict:
@@ -270,12 +120,6 @@ def mirrors() -> dict:
     """At depth 2 a mirror shows lamps and the sky through the volume, not the light that the volume turns."""
     mirror = {"type": "rectangle", "to_world": turn().translate([0, 0, -0.7]).scale(0.8), "bsdf": {"type": "conductor"}}
     return {"smoke": grid_in(cube(PLACE)), "mirror": mirror, "lamp": area(-0.5, 2.0, 2.0)}
-
-
-def veil() -> dict:
-    """A black mask between the bulb and the volume lets 40 % of the light through, and of what the camera sees behind it."""
-    bsdf = {"type": "mask", "opacity": 0.6, "nested": {"type": "diffuse", "reflectance": 0.0}}
-    return {"smoke": grid_in(cube(PLACE)), "veil": square(0.8, -0.65, 0.85, 0.6, (1.6, -1.3, 1.7)) | {"bsdf": bsdf}}
 
 
 PLACES = {
@@ -322,104 +166,6 @@ def test_places(name):
 
 
 @pytest.mark.statistical
-@pytest.mark.parametrize("lamp", small.cases(["bulb", "lamp", "sky"], ["lamp", "sky"]))
-def test_shadow_rays_go_on_through_what_is_partly_clear(lamp):
-    """A mask dims them by its transparency, as volpath does, towards all kinds of lamps."""
-    shine = {"bulb": point([1.6, -1.3, 1.7])[0], "lamp": area(1.6, -1.3, 1.7), "sky": LAMPS["envmap"]()["lamp"]}[lamp]
-    same(veil() | {"shine": shine})
-
-
-@pytest.mark.statistical
-@pytest.mark.parametrize("lamp", small.cases(["bulb", "sky"], ["sky"]))
-@pytest.mark.parametrize("kind", ["pane", "boundary"])
-def test_lamps_that_let_light_pass(kind, lamp):
-    """A luminous mask before another lamp, and a boundary that shines itself: what is behind them is seen through them."""
-    shine = {"bulb": {"bulb": point([1.6, -1.3, 1.7], 40.0)[0]}, "sky": LAMPS["envmap"]()}[lamp]
-    light = {"emitter": {"type": "area", "radiance": 5.0}}
-    if kind == "boundary":
-        same({"smoke": grid_in(cube(PLACE)) | light, **shine})
-        return
-    mask = {"type": "mask", "opacity": 0.4, "nested": {"type": "twosided", "nested": RED}}
-    same({"smoke": grid_in(cube(PLACE)), "pane": square(0.8, -0.65, 0.85, 0.6) | light | {"bsdf": mask}, **shine})
-
-
-@pytest.mark.statistical
-@pytest.mark.parametrize("shape", small.cases(["box", "ball"], ["box"]))
-def test_camera_inside(shape):
-    """The sensor names its medium, as volpath needs it to."""
-    interior = grid_in({}, seed=4)["interior"] | {"id": "fog"}
-    ref = {"type": "ref", "id": "fog"}
-    parts = lit({"fog": interior, "box": box_of(ref, PLACE) if shape == "box" else ball_of(ref, (0, 0, 0), 1.0)})
-    sensor = scenes.camera((0.4, -0.3, 0.2), (-0.5, 0.4, 0), res=16, fov=60.0) | {"medium": ref}
-    scene = mi.load_dict({"type": "scene", **parts, "sensor": sensor})
-    assert_same_images(scene, rounding=LEAK)
-
-
-FOG = {"type": "homogeneous", "sigma_t": 0.3, "albedo": 0.7, "phase": {"type": "hg", "g": 0.3}, "id": "fog"}
-
-
-def floor() -> dict:
-    return {"floor": {"type": "rectangle", "to_world": turn().translate([0, 0, -1]).scale(5), "bsdf": RED}}
-
-
-def walls(**more: object) -> dict:
-    """Six walls that face the inside of a room, from -2 to 2."""
-    tilts = [([1, 0, 0], 0), ([1, 0, 0], 180), ([1, 0, 0], 90), ([1, 0, 0], -90), ([0, 1, 0], 90), ([0, 1, 0], -90)]
-    place = [turn().rotate(*tilt).translate([0, 0, -2]).scale(2) for tilt in tilts]
-    return {f"wall{k}": {"type": "rectangle", "to_world": p, "bsdf": {"type": "diffuse"}, **more} for k, p in enumerate(place)}
-
-
-def instances(interior: dict) -> dict:
-    """Two balls of one kind."""
-    places = [turn().translate([0.4, 0, 0]), turn().translate([-0.7, 0.1, 0])]
-    balls = {f"ball{k}": {"type": "instance", "to_world": p, "of": {"type": "ref", "id": "kind"}} for k, p in enumerate(places)}
-    return {"kind": {"type": "shapegroup", "ball": ball_of(interior, (0, 0, 0), 0.5)}, **balls}
-
-
-INSIDE = {
-    "fog without an end": lambda fog: floor(),
-    "fog around a ball": lambda fog: {"ball": ball_of(medium("homogeneous", 2.0, 0.8), (0, 0, 0), 0.6) | {"exterior": fog}},
-    "a room": lambda fog: {**walls(exterior=fog), "ball": {"type": "sphere", "radius": 0.4, "bsdf": RED}},
-}
-
-
-@pytest.mark.statistical
-@pytest.mark.parametrize("where", small.cases(INSIDE, ["fog around a ball"]))
-def test_media_that_fill_no_shape_of_their_own(where):
-    """Around the camera, around shapes, and between walls: where no boundary ends a homogeneous medium it has no end."""
-    ref = {"type": "ref", "id": "fog"}
-    parts = {"fog": FOG, **INSIDE[where](ref), "bulb": point([0.3, 0.2, 1.5], 4.0)[0]}
-    sensor = scenes.camera((1.5, -1.2, 1.0), (0, 0, 0), res=16, fov=40.0)
-    scene = mi.load_dict({"type": "scene", **parts, "sensor": sensor | {"medium": ref}})
-    assert_same_images(scene, rounding=LEAK, precision=0.02)
-    if where == "a room":
-        silent = mi.load_dict({"type": "scene", **parts, "sensor": sensor})
-        small.assert_same_whole(moments(silent, mivol(), 32), moments(scene, mivol(), 32, first=500), precision=0.02)
-
-
-@pytest.mark.statistical
-def test_fog_in_a_room_that_is_open_on_one_side():
-    """Rectangles bound it, one of them a null one; each wall has a BSDF of its own, so that Mitsuba merges none into a mesh."""
-    ref, placed = {"type": "ref", "id": "fog"}, walls(exterior={"type": "ref", "id": "fog"})
-    for k, name in enumerate(placed):
-        placed[name]["bsdf"] = {"type": "diffuse", "reflectance": 0.2 + 0.1 * k}
-    # The second wall is the one at z = 2: the opening, whose normal shows inwards.
-    placed["wall1"]["bsdf"] = {"type": "null"}
-    lamp = square(0, 0.5, -1.9, 0.5, (0, 0.5, 5)) | {"emitter": {"type": "area", "radiance": 5.0}, "exterior": ref}
-    sensor = scenes.camera((0.6, -0.4, 7.0), (0, 0, 0), res=16, fov=40.0)
-    scene = mi.load_dict({"type": "scene", "fog": FOG, **placed, "lamp": lamp, "sensor": sensor})
-    assert {s.class_name() for s in scene.shapes()} == {"Rectangle"}
-    assert_same_images(scene, rounding=5 * LEAK, precision=0.02)  # of the lamp's radiance, the brightest there is
-
-
-@pytest.mark.statistical
-@pytest.mark.parametrize("kind", small.cases(["homogeneous", "grid"], ["grid"]))
-def test_media_in_instances(kind):
-    interior = medium("homogeneous", 2.0, 0.8) if kind == "homogeneous" else grid_in({})["interior"]
-    same(lit(instances(interior)))
-
-
-@pytest.mark.statistical
 def test_fog_without_an_end_by_quadrature_and_its_derivatives():
     """The same light as drawn; the derivative of its density, forward and by differences of pictures without noise."""
     parts = {"fog": FOG, **floor(), "bulb": point([0.3, 0.2, 1.5], 4.0)[0]}
@@ -455,24 +201,6 @@ def test_fog_without_an_end_by_quadrature_and_its_derivatives():
     assert_precise(difference(found, slope), 0.05 * abs(float(slope.mean)), what="slopes")
 
 
-@pytest.mark.statistical
-def test_boundaries_that_are_moved():
-    """An integrator that has rendered a scene sees that its box was moved, turned and taken back; volpath judges."""
-    fog = box_of(medium("homogeneous", 1.0, 0.8), centred(0.5 * np.eye(3), (0, 0, 1.6)))
-    scene = close_up(lit({"smoke": grid_in(cube(PLACE)), "fog": fog}))
-    ours, params = mi.load_dict(mivol()), mi.traverse(scene)
-    first = np.array(mi.render(scene, integrator=ours, spp=16))
-    key = "smoke.vertex_positions"
-    there = np.array(params[key]).reshape(-1, 3)
-    for change in (lambda p: 0.6 * p + [0.2, 0, 0], lambda p: p @ rotation([0, 0, 1], 0.4).T):
-        params[key] = mi.Float(change(there).astype(np.float32).ravel())
-        params.update()
-        assert_same_images(scene, rounding=LEAK, ours=ours)
-    params[key] = mi.Float(there.ravel())
-    params.update()
-    np.testing.assert_array_equal(np.array(mi.render(scene, integrator=ours, spp=16)), first)
-
-
 def _world(unit: float) -> dict:
     """A ball of fog in one of haze above one of wood, in lengths of ``unit``."""
     place = turn().scale(unit)
@@ -497,17 +225,6 @@ def test_worlds_of_any_size(unit):
     )
     # A power of two changes no rounding but that of Mitsuba's own constants (a few float32 eps of each of 64 samples).
     np.testing.assert_allclose(small_one, big, rtol=1e-4)
-
-
-@pytest.mark.statistical
-def test_camera_inside_that_names_no_medium():
-    """Volpath starts in vacuum then; we find the medium: the picture is that of a sensor that names it."""
-    interior = grid_in({}, seed=4)["interior"] | {"id": "fog"}
-    parts = lit({"fog": interior, "box": box_of({"type": "ref", "id": "fog"}, PLACE)})
-    sensor = scenes.camera((0.4, -0.3, 0.2), (-0.5, 0.4, 0), res=8, fov=60.0)
-    names = mi.load_dict({"type": "scene", **parts, "sensor": sensor | {"medium": {"type": "ref", "id": "fog"}}})
-    silent = mi.load_dict({"type": "scene", **parts, "sensor": sensor})
-    small.assert_same_whole(moments(silent, mivol(), 32), moments(names, mivol(), 32, first=500))
 
 
 @pytest.mark.statistical
@@ -594,14 +311,6 @@ def test_a_medium_that_only_absorbs_may_go_deeper():
     box, _ = smoke(rough_grid(8), albedo=0.0)
     parts = {"smoke": box, "sky": scenes.sky(1.0), "floor": square(0, 0, -1.5, 3.0) | {"bsdf": RED}}
     assert_same_images(close_up(parts), ours=mivol(max_depth=5), stock=volpath(max_depth=5), rounding=LEAK)
-
-
-def test_flakes_that_vary_are_refused():
-    """Their extinction along a ray is no longer that of the grid times a number."""
-    interior = medium("heterogeneous", grid_volume("gridvolume", rough_grid(2), PLACE), 0.7, phase=flakes(2))
-    scene = close_up({"smoke": box_of(interior, PLACE), "sky": scenes.sky(1.0)}, res=2)
-    with refused("sggx"):
-        scenes.render(scene, mivol(), 1)
 
 
 @pytest.mark.parametrize("bsdf", ["dielectric", "roughdielectric"])

@@ -7,7 +7,6 @@ voxel (tests/false_alarms.py). The twin's derivatives are exact, or central diff
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 
 import drjit as dr
@@ -17,40 +16,30 @@ import oracle_scattering as twins
 import pytest
 import scattering_scenes as small
 from false_alarms import assert_precise, assert_same_mean, fresh
+from scattering_gradients import (
+    BATCHES,
+    DENSITIES,
+    GRID,
+    assert_gradient,
+    gradients,
+    pulled,
+    release,
+    twin_difference,
+    watched,
+    weights,
+)
 from scattering_scenes import PLACE, Pencils, aimed, fog, mivol, pencils, point, rough_grid, smoke, spot, sun
 
 import scenes
 from mivol.validate.statistics import Moments
-from scenes import as_float32, box_of, centred, grid_volume, medium
+from scenes import as_float32, box_of, grid_volume, medium
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
 
-GRID = "smoke.interior_medium.sigma_t.data"
 MEDIUM = "smoke.interior_medium."
-BATCHES = 16
 
 
 # -- Gradients of renders -----------------------------------------------------------------------------------------------
-
-
-def watched(scene: mi.Scene, key: str) -> tuple[mi.SceneParameters, object]:
-    """A parameter whose derivatives are asked for, as an optimiser does it: stock textures make copies of the variable."""
-    params = mi.traverse(scene)
-    variable = type(params[key])(params[key])
-    dr.enable_grad(variable)
-    params[key] = variable
-    params.update()
-    return params, variable
-
-
-def pulled(scene: mi.Scene, key: str, w: np.ndarray, spp: int, seed: int, integrator: mi.Integrator) -> np.ndarray:
-    """J^T w: the derivative of <w, image>, by `mi.render`; `seed` is that of the derivatives."""
-    params, variable = watched(scene, key)
-    image = mi.render(scene, params, integrator=integrator, spp=1, spp_grad=spp, seed=seed + 10_000, seed_grad=seed)
-    dr.backward(dr.sum(image * mi.TensorXf(np.asarray(w, dtype=np.float32))))
-    gradient = np.array(dr.grad(variable), dtype=np.float64)
-    release(scene, key, variable)
-    return gradient
 
 
 def pushed(scene: mi.Scene, key: str, v: np.ndarray, spp: int, seed: int, integrator: mi.Integrator) -> np.ndarray:
@@ -66,55 +55,8 @@ def pushed(scene: mi.Scene, key: str, v: np.ndarray, spp: int, seed: int, integr
     return tangent
 
 
-def release(scene: mi.Scene, key: str, parameter: object) -> None:
-    """No derivatives any more."""
-    params = mi.traverse(scene)
-    params[key] = dr.detach(parameter)
-    params.update()
-
-
-def weights(n: int, seed: int = 1) -> tuple[np.ndarray, np.ndarray]:
-    """A gradient image (1, n, 3), and what each ray weighs where the channels are equal."""
-    w = np.random.default_rng(seed).uniform(0.5, 1.5, (1, n, 3))
-    return w, w[0].sum(axis=1)
-
-
-def gradients(seen: Pencils, key: str, w: np.ndarray, spp: int) -> np.ndarray:
-    """J^T w of independent passes, (BATCHES, ...)."""
-    integrator = mi.load_dict(mivol())
-    return np.stack([pulled(seen.scene, key, w, spp, fresh(seed), integrator) for seed in range(BATCHES)])
-
-
-def assert_gradient(found: np.ndarray, truth: np.ndarray, what: str, precision: float = 0.02, rounding: float = 2e-5) -> None:
-    """Each entry, and the sum of all weighted by numbers in [0.5, 1.5].
-
-    `rounding` is a share of the largest entry (or of the sum), `precision` what the standard error of the sum may be of the
-    sum of sizes.
-    """
-    truth = np.broadcast_to(truth, found.shape[1:])
-    v = np.random.default_rng(4).uniform(0.5, 1.5, truth.shape)
-    axes = tuple(range(1, found.ndim))
-    for each, exact in ((found, truth), (np.sum(found * v, axis=axes, keepdims=True)[:, 0], np.sum(truth * v)[None])):
-        m, exact = Moments.of(each.reshape(BATCHES, -1)), exact.ravel()
-        top = np.abs(exact).max()
-        assert_same_mean(m, exact, rounding=rounding * top, what=what)
-    assert_precise(m, precision * np.sum(np.abs(truth * v)), what=what)
-
-
-def twin_difference(at: Callable[[float], float], x: float, h: float = 1e-4) -> float:
-    return (at(x + h) - at(x - h)) / (2 * h)
-
-
 # -- Density, voxel by voxel ---------------------------------------------------------------------------------------------
 
-DENSITIES = {
-    "empty": lambda: 0.0 * rough_grid(1),
-    "half empty": lambda: rough_grid(1) * (np.arange(6) < 3)[None, None, :, None],
-    "thin": lambda: 1e-3 * rough_grid(1),
-    "flat": lambda: np.full((3, 4, 2, 1), 0.7),
-    "rough": lambda: rough_grid(1),
-    "dense": lambda: rough_grid(1, 12.0),
-}
 LAMPS = {
     "point": lambda: point([1.5, 1, 2.0]),
     "point inside": lambda: point([0.3, -0.2, 0.35]),
@@ -172,56 +114,6 @@ def test_density_under_a_sky(density, albedo):
     truth, _ = twins.radiance_gradient(m, [twins.Sky(0.7, 12)], seen.o, seen.d, rows, background=0.7, order=3)
     # 12 x 24 directions: 1e-3 of the derivative of the turned light.
     assert_gradient(gradients(seen, GRID, w, 512), truth[..., None], density, rounding=2e-3 if albedo else 2e-5)
-
-
-WHITE = {
-    "a box": lambda interior: {"smoke": box_of(interior, PLACE)},
-    "a ball": lambda interior: {"smoke": scenes.ball_of(interior, (0, 0, 0), 1.2)},
-    "two boxes": lambda interior: {"smoke": box_of(interior, PLACE), "fog": fog(0.0, 1.0, centred(np.eye(3), (0, 0, 1.6)))[0]},
-}
-
-
-@pytest.mark.parametrize(("kind", "place"), [(k, "a box") for k in small.KINDS] + [("own", p) for p in WHITE if p != "a box"])
-def test_white_smoke_of_no_density_in_a_constant_sky_has_no_gradient(kind, place):
-    """What turns in is what is turned away: 0 in each sample, to rounding of the two (a few EPS of their size)."""
-    gradients = []
-    for albedo in (0.0, 1.0):
-        medium_type, volume_type = small.KINDS[kind]
-        interior = medium(medium_type, grid_volume(volume_type, as_float32(DENSITIES["empty"]()), PLACE), albedo)
-        seen = pencils({**WHITE[place](interior), "sky": scenes.sky(0.7)}, *aimed(1, 8))
-        integrator = mi.load_dict(mivol())
-        gradients.append([pulled(seen.scene, GRID, np.ones((1, 8, 3)), 1, seed, integrator) for seed in range(8)])
-    black, white = (np.abs(g).max() for g in gradients)
-    assert black > 0.1
-    assert white <= 4e-6 * black
-
-
-@pytest.mark.statistical
-@pytest.mark.parametrize("alone", [True, False])
-def test_a_ball_under_a_constant_sky(alone):
-    """Density in a boundary that is traced, by itself and behind a box that shades it: against differences."""
-    interior = medium("mivol_medium", grid_volume("mivol_voxels", 0.2 + rough_grid(1), PLACE), 0.8)
-    parts = {"smoke": scenes.ball_of(interior, (0, 0, 0), 1.0), "sky": scenes.sky(0.7)}
-    if not alone:
-        parts["fog"] = fog(0.8, 0.3, centred(np.eye(3), (0.9, -0.9, 1.3)))[0]
-    scene, integrator, w = small.close_up(parts, res=8), mi.load_dict(mivol()), np.ones((8, 8, 3))
-    params = mi.traverse(scene)
-    start, h = np.array(params[GRID]), 0.02
-    v = np.random.default_rng(2).uniform(0.2, 1, start.shape)
-
-    def at(x: float, seed: int) -> float:
-        params[GRID] = mi.TensorXf((start + x * v).astype(np.float32))
-        params.update()
-        return np.array(integrator.render(scene, seed=seed, spp=256), dtype=np.float64).sum()
-
-    seeds = [fresh(s) for s in range(BATCHES)]
-    differences = np.array([(at(h, s) - at(-h, s)) / (2 * h) for s in seeds])
-    at(0, 0)
-    found = np.array([np.sum(v * pulled(scene, GRID, w, 256, s, integrator)) for s in seeds])
-    m, level = Moments.of((differences - found)[:, None]), abs(differences.mean())
-    # Truncation as below.
-    assert_same_mean(m, rounding=2e-3 * level, what="ball")
-    assert_precise(m, 0.02 * level, what="ball")
 
 
 @pytest.mark.statistical
@@ -566,142 +458,6 @@ def test_radiance_of_the_sky():
     w, rows = weights(3)
     truth = rows @ twins.radiance([m], [twins.Sky(1.0, 24)], seen.o, seen.d, background=1.0)[:, 0]
     assert_gradient(sums(seen, "sky.radiance.value", w, 2048), np.array([truth]), "sky", rounding=3e-4)
-
-
-@pytest.mark.statistical
-def test_position_of_a_point_light():
-    """Smooth where the light is outside: distance, direction and shadow all move."""
-    values = rough_grid(10)
-    box, m = smoke(values, 0.7, "own", PLACE, "hg", 0.4)
-    lamp = point([1.5, 1, 2.0])
-    seen = pencils({"smoke": box, "lamp": lamp[0]}, *aimed(3, 6))
-    w, rows = weights(6)
-    at = np.array([1.5, 1, 2.0])
-
-    def light(x, axis):
-        place = twins.Point(at + x * np.eye(3)[axis], 3.0)
-        return rows @ twins.radiance([m], [place], seen.o, seen.d, order=10)[:, 0]
-
-    truth = np.array([twin_difference(lambda x, a=a: light(x, a), 0.0) for a in range(3)])
-    assert_gradient(gradients(seen, "lamp.position", w, 2048), truth[:, None], "position", rounding=1e-4)
-
-
-TURNED = {
-    "sun": lambda axis: sun(axis),
-    "spot": lambda axis: spot([1.0, -2, 2.5], np.array([1.0, -2, 2.5]) + 3 * axis, cutoff=40, beam=5),
-}
-
-
-@pytest.mark.statistical
-@pytest.mark.parametrize("kind", TURNED)
-def test_direction_of_a_lamp(kind):
-    """A sun that turns takes its shadows along; a spot turns its cone only. About an axis across, by an angle [rad]."""
-    box, m = smoke(rough_grid(10), 0.7, "own", PLACE, "hg", 0.4)
-    axis, across = np.array([-0.3, 0.6, -0.74]), np.array([0.8, 0.6, 0.0])
-    axis = axis / np.linalg.norm(axis)
-
-    def turned(x: float) -> np.ndarray:
-        # Rodrigues' formula.
-        c, s = math.cos(x), math.sin(x)
-        return c * axis + s * np.cross(across, axis) + (1 - c) * across * (across @ axis)
-
-    seen = pencils({"smoke": box, "lamp": TURNED[kind](axis)[0]}, *aimed(3, 6))
-    w, rows = weights(6)
-    known = lambda x: rows @ twins.radiance([m], [TURNED[kind](turned(x))[1]], seen.o, seen.d, order=10)[:, 0]  # noqa: E731
-    truth = twin_difference(known, 0.0)
-
-    params, integrator = mi.traverse(seen.scene), mi.load_dict(mivol())
-    placed = params["lamp.to_world"]
-    still, at = mi.AffineTransform4f(placed.matrix), mi.Vector3f(*np.array(placed.matrix)[:3, 3].ravel().tolist())
-    found = []
-    for seed in range(BATCHES):
-        x = mi.Float(0)
-        dr.enable_grad(x)
-        move = mi.AffineTransform4f().translate(at).rotate(across.tolist(), dr.rad2deg(x)).translate(-at)
-        params["lamp.to_world"] = move @ still
-        params.update()
-        image = mi.render(seen.scene, params, integrator=integrator, spp=2048, seed=fresh(seed))
-        dr.backward(dr.sum(image * mi.TensorXf(w), axis=None))
-        found.append(dr.grad(x)[0])
-    assert_gradient(np.array(found)[:, None], np.array([truth]), kind, rounding=1e-4)
-
-
-@pytest.mark.statistical
-@pytest.mark.parametrize("depth", [2, 3])
-def test_place_of_a_lamp_over_a_floor(depth):
-    """A floor under haze is lit from elsewhere: its distance, its slope and the haze in between; in each of two bounces.
-
-    No lamp in the plane of a face of the haze: there the light has a kink, for rays close to the face leave by it, or along it.
-    """
-    haze = medium("homogeneous", 0.7, 0.6 if depth == 2 else 0.0)
-    floor = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, -1.5]).scale(3)}
-    wall = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 3, 0]).rotate([1, 0, 0], 90).scale(3)}
-    parts = {"haze": box_of(haze, PLACE), "floor": floor, "wall": wall, "lamp": point([1.6, 1.3, 2.0])[0]}
-    scene = small.close_up(parts, res=8)
-    params, integrator = mi.traverse(scene), mi.load_dict({"type": "mivol", "max_depth": depth})
-    along = mi.Vector3f(0.6, -0.3, 0.5)
-
-    def picture(x: mi.Float, seed: int) -> mi.Float:
-        params["lamp.position"] = mi.Point3f(1.6, 1.3, 2) + x * along
-        params.update()
-        return dr.sum(mi.render(scene, params, integrator=integrator, spp=256, seed=seed, seed_grad=seed + 100), axis=None)
-
-    h, differences, found = 0.02, [], []
-    for seed in map(fresh, range(BATCHES)):
-        ends = [float(picture(mi.Float(sign * h), seed).array[0]) for sign in (1, -1)]
-        differences.append((ends[0] - ends[1]) / (2 * h))
-        x = mi.Float(0)
-        dr.enable_grad(x)
-        dr.backward(picture(x, seed))
-        found.append(dr.grad(x)[0])
-    m = Moments.of((np.array(differences) - np.array(found))[:, None])
-    level = abs(np.mean(differences))
-    # Truncation: (h / distance)^2 = 1e-4; the box's edges are kinks of the haze in between.
-    assert_same_mean(m, rounding=2e-3 * level, what="floor")
-    assert_precise(m, 0.02 * level, what="floor")
-
-
-def traced_media() -> dict[str, dict]:
-    """Black media whose boundaries are traced, over a floor."""
-    grid, haze = medium("mivol_medium", grid_volume("mivol_voxels", 0.2 + rough_grid(1), PLACE)), medium("homogeneous", 0.4)
-    turned = mi.ScalarTransform4f().rotate([1, 0, 0], 35).scale([0.7, 1.1, 0.8])
-    egg = {"type": "sphere", "to_world": turned, "bsdf": {"type": "null"}, "interior": medium("homogeneous", 1.2)}
-    return {
-        "an egg": {"ball": egg},
-        "a ball in its grid": {"ball": scenes.ball_of(grid, (0.1, 0, 0), 0.8)},
-        "a ball around its grid": {"ball": scenes.ball_of(grid, (0, 0, 0), 1.8)},
-        "a ball in a box": {
-            "box": box_of(haze, PLACE),
-            "ball": scenes.ball_of(medium("homogeneous", 1.5), (0, 0, 0), 0.6) | {"exterior": haze},
-        },
-    }
-
-
-TRACED = ("an egg", "a ball in its grid", "a ball around its grid", "a ball in a box")
-
-
-@pytest.mark.parametrize("lamp", [(0.3, -0.2, 3.0), (0.05, 0.1, 0.2)])
-@pytest.mark.parametrize("name", TRACED)
-def test_place_of_a_lamp_behind_boundaries_that_are_traced(name, lamp):
-    """What a floor shows has no noise: differences of the same pencils. One lamp is outside, one in the medium."""
-    floor = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, -2.2]).scale(3)}
-    o = np.column_stack([np.random.default_rng(4).uniform(-0.3, 0.3, (6, 2)), np.full(6, -2.0)])
-    parts = {**traced_media()[name], "floor": floor, "lamp": point(lamp)[0]}
-    seen = pencils(parts, as_float32(o), as_float32([0, 0, -1]))
-    params, integrator, w = mi.traverse(seen.scene), mi.load_dict(mivol()), weights(6)[0]
-
-    def shown(x: np.ndarray) -> float:
-        params["lamp.position"] = mi.Point3f(*(np.array(lamp) + x).tolist())
-        params.update()
-        return float((np.array(integrator.render(seen.scene, spp=1), np.float64) * w).sum())
-
-    h = 0.004
-    truth = [(shown(h * e) - shown(-h * e)) / (2 * h) for e in np.eye(3)]
-    shown(np.zeros(3))
-    found = pulled(seen.scene, "lamp.position", w, 1, 0, integrator).ravel()
-    # A ray along a plane of voxels turns over a kink within h: a share h / voxel of the slope, 1.2e-2 of one ray in six; of the
-    # rest truncation is 1e-5 and rounding 1e-7 / h.
-    assert np.abs(found - truth).max() <= 3e-3 * np.abs(truth).max()
 
 
 # -- Forward against reverse, and differences ---------------------------------------------------------------------------------

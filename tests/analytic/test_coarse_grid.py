@@ -1,30 +1,20 @@
-"""Where lamps shine, from blocks of a grid: means and lists against NumPy, weights against Beer's law.
-
-None of it can bias an image: weights only tell where to look. What is held here is that they tell the truth.
-"""
+"""Means of a grid over blocks of voxels, and the list of blocks that are not empty, against NumPy."""
 
 from __future__ import annotations
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from scattering_scenes import aimed, pencils, smoke, sun
 
-from mivol.scene.build import build_media
-from mivol.scene.needs import find_needs
-from mivol.scene.plan import make_plan
-from mivol.scene.survey import survey_scene
-from mivol.transport.estimators.emitters import SceneEmitters
-from mivol.transport.estimators.visibility_cache import FLOOR, RAY_FRACTION, build_visibility_cache
-from mivol.transport.path.settings import Settings
 from mivol.transport.traversal.coarse_grid import coarsen_grid
 from mivol.transport.traversal.empty_blocks import find_empty_distances
 from scenes import centred, make_lattice
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
 
+
 SIZE = (9, 14, 11)
+
 
 TWO = centred(2 * np.eye(3))
 
@@ -77,27 +67,3 @@ def test_blocks_that_hold_anything_are_listed(shift):
     assert np.all(listed[own])
     assert not np.any(listed[~wide])
     assert 0 < own.sum() < own.size
-
-
-@pytest.mark.parametrize("occupied", [None, 1.0])
-@pytest.mark.parametrize("shift", [0, 1, 2, 3])
-def test_weights_are_those_of_beer(shift, occupied):
-    """In a grid of one value light from above is dimmed by the depth of a block's middle, however coarse the grid."""
-    box, _ = smoke(np.full(SIZE, 0.8, np.float32), to_world=TWO)
-    lamp, _ = sun([0, 0, -1.0])
-    seen = pencils({"smoke": box, "lamp": lamp}, *aimed(3))
-    with dr.suspend_grad():
-        needs = find_needs(seen.scene, seen.scene.sensors()[0], survey_scene(seen.scene))
-        settings = Settings(max_depth=2)
-        media = build_media(seen.scene, needs, make_plan(needs, settings), survey_scene(seen.scene))
-        blocks = np.array([(n >> shift) + 1 for n in SIZE])
-        # As many rays as ask for this lattice and for none that is finer.
-        shade = build_visibility_cache(
-            media, SceneEmitters(seen.scene), int(np.ceil(1.001 * blocks.prod() / RAY_FRACTION)), occupied, coarsen_grid
-        )
-    assert shade.blocks == tuple(blocks)
-    middle = ((np.arange(blocks[0]) << shift) + 0.5 * (1 << shift) - 0.5) / SIZE[0]
-    depth = 2 * (1 - np.clip(middle, 0.25 / SIZE[0], 1 - 0.25 / SIZE[0]))
-    weights = np.array(shade.weights).reshape(blocks)
-    # The box is 2 high; the optical depth is known to 2e-6 of itself, and float32 adds a few roundings.
-    np.testing.assert_allclose(weights, np.broadcast_to((np.exp(-0.8 * depth) + FLOOR)[:, None, None], blocks), rtol=1e-5)

@@ -20,7 +20,7 @@ from mivol.transport.estimators.ratio_tracking import residual_ratio_tracking
 from mivol.transport.media.grid_integral import integrate_segment
 from mivol.transport.traversal.block_ranges import find_block_ranges
 from mivol.transport.traversal.lattice import Lattice, clip
-from mivol.transport.traversal.random_numbers import draw_pcg32, seed_pcg32
+from mivol.transport.traversal.random_numbers import seed_pcg32
 from mivol.validate.statistics import Moments
 from scenes import as_float32, refused
 
@@ -133,33 +133,6 @@ def test_variance_is_as_derived():
     assert T > 3 * ratio_tracking.FAINT * 0.9
     # The midpoints of the square's integral err by 1e-6, optical depths of 1 by 2e-6.
     assert_same_mean(Moments.of((found - T) ** 2), variance, rounding=1e-5 * variance, what="variances")
-
-
-@pytest.mark.parametrize("shape", [(1, 1, 1), (7, 8, 9), (15, 16, 17), (23, 1, 24)])
-def test_blocks_hold_all_nodes_of_their_cells(shape):
-    values = np.random.default_rng(1).uniform(0, 5, (*shape, 3)).astype(np.float32)
-    blocks = find_block_ranges(mi.TensorXf(values))
-    edge = 1 << ratio_tracking.BLOCK_SHIFT
-    assert blocks.res == tuple(-(-(n + 1) // edge) for n in shape)
-    table = np.array(blocks.table).reshape(*blocks.res, 4)
-    for index in np.ndindex(*blocks.res):
-        nodes = [np.clip(np.arange(edge * b - 1, edge * b + edge), 0, n - 1) for b, n in zip(index, shape, strict=True)]
-        own = values[np.ix_(*nodes)].reshape(-1, 3)
-        assert np.array_equal(table[index][:3], own.min(axis=0))
-        assert table[index][3] == pytest.approx(np.ptp(own, axis=0).max(), rel=2e-6)
-
-
-@pytest.mark.statistical
-def test_dice_are_even():
-    """2^16 lanes, 4 numbers each: means of 1/2, squares of 1/3, no correlation of numbers in a lane, nor of neighbours."""
-    _, numbers = draw_pcg32(seed_pcg32(start(0.25), 1 << 16), 4)
-    u = np.array([np.array(x, dtype=np.float64) for x in numbers])
-    assert u.min() > 0 and u.max() < 1
-    assert_same_mean(Moments.of(u.T), 1 / 2, what="numbers")
-    assert_same_mean(Moments.of(u.T**2), 1 / 3, what="squares")
-    rows = np.vstack([u, np.roll(u[0], 1)]) - 0.5
-    pairs = [rows[i] * rows[j] for i in range(5) for j in range(i)]
-    assert_same_mean(Moments.of(np.array(pairs).T), what="products")
 
 
 # -- Pictures ----------------------------------------------------------------------------------------------------------

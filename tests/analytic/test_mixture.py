@@ -1,0 +1,33 @@
+"""Mixtures of phase functions: normalised weights and the choice of a component."""
+
+from __future__ import annotations
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from phase_angles import EPS, as64, lanes
+
+from mivol.phase.mixture import choose_lobe, shares_of
+
+pytestmark = pytest.mark.usefixtures("variant_rgb")
+
+
+def test_shares_and_choice():
+    shares = shares_of([mi.Float(1), mi.Float(0), mi.Float(3)])
+    assert [float(s[0]) for s in shares] == [0.25, 0, 0.75]
+    chosen, inside = choose_lobe(shares, *lanes([0, 0.1, 0.2499, 0.25, 0.5, 1 - 2.0**-24]))
+    assert list(chosen) == [0, 0, 0, 2, 2, 2]
+    # u / 0.25 is exact; (u - 0.25) / 0.75 has two roundings.
+    assert as64(inside) == pytest.approx([0, 0.4, 0.9996, 0, 1 / 3, 1], abs=2 * EPS)
+    assert np.all(as64(inside) < 1)
+
+
+def test_a_lobe_without_a_share_is_never_chosen():
+    """Not at the ends either: u = 0 before a first one, u = 1 (shares may sum to less, by rounding) after a last one."""
+    for weights, want in (([0, 1, 0], [1, 1, 1]), ([2, 0, 0], [0, 0, 0]), ([0, 0, 3], [2, 2, 2])):
+        chosen, _ = choose_lobe(shares_of([mi.Float(w) for w in weights]), mi.Float(0, 0.5, 1))
+        assert list(chosen) == want
+
+
+def test_shares_without_any_weight_are_equal():
+    assert [float(s[0]) for s in shares_of([mi.Float(0), mi.Float(0)])] == [0.5, 0.5]

@@ -1,0 +1,31 @@
+"""Random numbers of lanes: means, squares and correlations."""
+
+from __future__ import annotations
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from false_alarms import assert_same_mean, fresh
+
+from mivol.transport.traversal.random_numbers import draw_pcg32, seed_pcg32
+from mivol.validate.statistics import Moments
+
+pytestmark = pytest.mark.usefixtures("variant_rgb")
+
+
+def start(number: float) -> mi.Float:
+    """What dice start from, of this round of seeds: a number in [0, 1)."""
+    return mi.Float((number + fresh(0) * 0.6180339887498949) % 1)
+
+
+@pytest.mark.statistical
+def test_dice_are_even():
+    """2^16 lanes, 4 numbers each: means of 1/2, squares of 1/3, no correlation of numbers in a lane, nor of neighbours."""
+    _, numbers = draw_pcg32(seed_pcg32(start(0.25), 1 << 16), 4)
+    u = np.array([np.array(x, dtype=np.float64) for x in numbers])
+    assert u.min() > 0 and u.max() < 1
+    assert_same_mean(Moments.of(u.T), 1 / 2, what="numbers")
+    assert_same_mean(Moments.of(u.T**2), 1 / 3, what="squares")
+    rows = np.vstack([u, np.roll(u[0], 1)]) - 0.5
+    pairs = [rows[i] * rows[j] for i in range(5) for j in range(i)]
+    assert_same_mean(Moments.of(np.array(pairs).T), what="products")

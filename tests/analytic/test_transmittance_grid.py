@@ -1,0 +1,74 @@
+"""A transmittance grid in place of shadow rays: its bias is the one that is reported, and falls with its step."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from scattering_scenes import close_up, mivol, rough_grid, smoke, sun
+
+from mivol.scene.build import build_estimators
+from mivol.scene.explain import explain
+from mivol.scene.needs import find_needs
+from mivol.scene.plan import make_plan
+from mivol.scene.survey import survey_scene
+from mivol.transport.estimators.transmittance_grid import build_transmittance_grid, measure_transmittance_bias
+from mivol.transport.path.settings import Settings
+from scenes import centred
+
+pytestmark = pytest.mark.usefixtures("variant_rgb")
+
+
+def open_direct(scene: mi.Scene):
+    survey, settings = survey_scene(scene), Settings(max_depth=2)
+    needs = find_needs(scene, scene.sensors()[0], survey)
+    return build_estimators(scene, needs, make_plan(needs, settings), settings, survey, pictures=True).direct
+
+
+def test_light_grid_against_exact_shadows():
+    """tau between nodes is wrong by h^2: two nodes a cell leave a quarter of the error of one node in two cells, or less."""
+    box, _ = smoke(rough_grid(1, shape=(16, 16, 16)))
+    lamp, _ = sun([0.3, 0.2, -1.0])
+    scene = close_up({"smoke": box, "lamp": lamp})
+    direct = open_direct(scene)
+    with dr.suspend_grad():
+        grids = (build_transmittance_grid(direct.media, direct.emitters, cells) for cells in (4, 1))
+        coarse, fine = (measure_transmittance_bias(direct.media, direct.emitters, grid)[1] for grid in grids)
+    assert 0 < fine < 0.5 * coarse < 0.25
+    exact, looked_up = (
+        np.array(mi.render(scene, integrator=mi.load_dict(mivol(deterministic=True, shadows=s)), spp=16))
+        for s in ("exact", "grid")
+    )
+    # The image is an integral of the same transmittances: it cannot be off by more than some of their rms errors.
+    assert 0 < np.abs(exact - looked_up).mean() <= 4 * fine * exact.mean()
+
+
+@pytest.mark.parametrize(("cells", "nodes"), [(1, (9, 6, 2)), (4, (3, 3, 2)), (3, (4, 3, 2))])
+def test_nodes_of_a_light_grid_are_so_many_cells_apart(cells, nodes):
+    """At most ``cells`` apart, and in both faces: n cells have ceil(n / cells) steps, and one node more than that."""
+    box, _ = smoke(rough_grid(1, shape=(8, 5, 1)))
+    scene = close_up({"smoke": box, "lamp": sun([0.3, 0.2, -1.0])[0]})
+    with dr.suspend_grad():
+        direct = open_direct(scene)
+        assert build_transmittance_grid(direct.media, direct.emitters, cells).nodes == nodes
+
+
+def test_light_grid_keeps_optical_depth_not_transmittance():
+    """Under a sun along an axis tau of a constant grid is linear: interpolated exactly, where T would be 8 % too bright."""
+    box, _ = smoke(np.full((4, 4, 4), 2.0, np.float32), to_world=centred(2 * np.eye(3)))
+    lamp, _ = sun([0.0, 0.0, -1.0])
+    scene = close_up({"smoke": box, "lamp": lamp})
+    with dr.suspend_grad():
+        direct = open_direct(scene)
+        grid = build_transmittance_grid(direct.media, direct.emitters)
+        bias, rms = measure_transmittance_bias(direct.media, direct.emitters, grid)
+    # Nodes in the faces look from 1e-5 of the box inside, where tau is up to 4e-5 off.
+    assert abs(bias) <= rms <= 1e-4
+
+
+def test_explain_measures_the_light_grid():
+    box, _ = smoke(rough_grid(1))
+    lamp, _ = sun([0.3, 0.2, -1.0])
+    text = explain(close_up({"smoke": box, "lamp": lamp}), max_depth=2)
+    assert "light grid" in text and "bias" in text

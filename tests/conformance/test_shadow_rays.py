@@ -1,0 +1,44 @@
+"""Shadow rays: surfaces and emitters that transmit part of the light undeviated."""
+
+from __future__ import annotations
+
+import pytest
+import scattering_scenes as small
+from scattering_scenes import (
+    PLACE,
+    point,
+)
+from volpath_scenes import (
+    LAMPS,
+    RED,
+    area,
+    cube,
+    grid_in,
+    same,
+    square,
+    veil,
+)
+
+pytestmark = pytest.mark.usefixtures("variant_rgb")
+
+
+@pytest.mark.statistical
+@pytest.mark.parametrize("lamp", small.cases(["bulb", "lamp", "sky"], ["lamp", "sky"]))
+def test_shadow_rays_go_on_through_what_is_partly_clear(lamp):
+    """A mask dims them by its transparency, as volpath does, towards all kinds of lamps."""
+    shine = {"bulb": point([1.6, -1.3, 1.7])[0], "lamp": area(1.6, -1.3, 1.7), "sky": LAMPS["envmap"]()["lamp"]}[lamp]
+    same(veil() | {"shine": shine})
+
+
+@pytest.mark.statistical
+@pytest.mark.parametrize("lamp", small.cases(["bulb", "sky"], ["sky"]))
+@pytest.mark.parametrize("kind", ["pane", "boundary"])
+def test_lamps_that_let_light_pass(kind, lamp):
+    """A luminous mask before another lamp, and a boundary that shines itself: what is behind them is seen through them."""
+    shine = {"bulb": {"bulb": point([1.6, -1.3, 1.7], 40.0)[0]}, "sky": LAMPS["envmap"]()}[lamp]
+    light = {"emitter": {"type": "area", "radiance": 5.0}}
+    if kind == "boundary":
+        same({"smoke": grid_in(cube(PLACE)) | light, **shine})
+        return
+    mask = {"type": "mask", "opacity": 0.4, "nested": {"type": "twosided", "nested": RED}}
+    same({"smoke": grid_in(cube(PLACE)), "pane": square(0.8, -0.65, 0.85, 0.6) | light | {"bsdf": mask}, **shine})

@@ -1,0 +1,87 @@
+"""Gradients of single scattering and the float64 twin's differences, for tests of several modules."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from false_alarms import assert_precise, assert_same_mean, fresh
+from scattering_scenes import Pencils, mivol, rough_grid
+
+from mivol.validate.statistics import Moments
+
+GRID = "smoke.interior_medium.sigma_t.data"
+
+
+BATCHES = 16
+
+
+def watched(scene: mi.Scene, key: str) -> tuple[mi.SceneParameters, object]:
+    """A parameter whose derivatives are asked for, as an optimiser does it: stock textures make copies of the variable."""
+    params = mi.traverse(scene)
+    variable = type(params[key])(params[key])
+    dr.enable_grad(variable)
+    params[key] = variable
+    params.update()
+    return params, variable
+
+
+def pulled(scene: mi.Scene, key: str, w: np.ndarray, spp: int, seed: int, integrator: mi.Integrator) -> np.ndarray:
+    """J^T w: the derivative of <w, image>, by `mi.render`; `seed` is that of the derivatives."""
+    params, variable = watched(scene, key)
+    image = mi.render(scene, params, integrator=integrator, spp=1, spp_grad=spp, seed=seed + 10_000, seed_grad=seed)
+    dr.backward(dr.sum(image * mi.TensorXf(np.asarray(w, dtype=np.float32))))
+    gradient = np.array(dr.grad(variable), dtype=np.float64)
+    release(scene, key, variable)
+    return gradient
+
+
+def release(scene: mi.Scene, key: str, parameter: object) -> None:
+    """No derivatives any more."""
+    params = mi.traverse(scene)
+    params[key] = dr.detach(parameter)
+    params.update()
+
+
+def weights(n: int, seed: int = 1) -> tuple[np.ndarray, np.ndarray]:
+    """A gradient image (1, n, 3), and what each ray weighs where the channels are equal."""
+    w = np.random.default_rng(seed).uniform(0.5, 1.5, (1, n, 3))
+    return w, w[0].sum(axis=1)
+
+
+def gradients(seen: Pencils, key: str, w: np.ndarray, spp: int) -> np.ndarray:
+    """J^T w of independent passes, (BATCHES, ...)."""
+    integrator = mi.load_dict(mivol())
+    return np.stack([pulled(seen.scene, key, w, spp, fresh(seed), integrator) for seed in range(BATCHES)])
+
+
+def assert_gradient(found: np.ndarray, truth: np.ndarray, what: str, precision: float = 0.02, rounding: float = 2e-5) -> None:
+    """Each entry, and the sum of all weighted by numbers in [0.5, 1.5].
+
+    `rounding` is a share of the largest entry (or of the sum), `precision` what the standard error of the sum may be of the
+    sum of sizes.
+    """
+    truth = np.broadcast_to(truth, found.shape[1:])
+    v = np.random.default_rng(4).uniform(0.5, 1.5, truth.shape)
+    axes = tuple(range(1, found.ndim))
+    for each, exact in ((found, truth), (np.sum(found * v, axis=axes, keepdims=True)[:, 0], np.sum(truth * v)[None])):
+        m, exact = Moments.of(each.reshape(BATCHES, -1)), exact.ravel()
+        top = np.abs(exact).max()
+        assert_same_mean(m, exact, rounding=rounding * top, what=what)
+    assert_precise(m, precision * np.sum(np.abs(truth * v)), what=what)
+
+
+def twin_difference(at: Callable[[float], float], x: float, h: float = 1e-4) -> float:
+    return (at(x + h) - at(x - h)) / (2 * h)
+
+
+DENSITIES = {
+    "empty": lambda: 0.0 * rough_grid(1),
+    "half empty": lambda: rough_grid(1) * (np.arange(6) < 3)[None, None, :, None],
+    "thin": lambda: 1e-3 * rough_grid(1),
+    "flat": lambda: np.full((3, 4, 2, 1), 0.7),
+    "rough": lambda: rough_grid(1),
+    "dense": lambda: rough_grid(1, 12.0),
+}
