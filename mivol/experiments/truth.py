@@ -32,7 +32,7 @@ def make_truth(chosen: Experiment, base: Path, scene: mi.Scene) -> np.ndarray | 
 
 
 def check_truth(chosen: Experiment) -> None:
-    """Refuse a truth that nobody looks for: the references would show it and the renders what the scene holds.
+    """Refuse a truth of a parameter that is not fitted: references would show it, and renders what the scene holds.
 
     Raises:
         MivolError: with its key.

@@ -60,7 +60,7 @@ class Rows:
 
     Attributes:
         width: numbers a row.
-        neighbours: who lies beside whom.
+        neighbours: the rows beside each row.
         rate: learning rate over the number of photographs, times ``unit``: what one photograph is worth in a step.
         unit: values times this have no unit.
         first: the row at which a prior begins that looks at a share of them.

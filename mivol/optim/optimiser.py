@@ -1,4 +1,4 @@
-"""An optimiser, and a walk that it takes: the two protocols of whatever goes downhill.
+"""The protocols of optimisers: settings, and the run that they begin.
 
 Conventions. An :class:`Optimiser` is a strategy (settings only); :meth:`Optimiser.begin` gives a :class:`Run`, which owns the
 reals. ``Run.step`` either completes or, when a safe point stops it, leaves the run as it was. ``pack`` and ``unpack`` hold
@@ -21,7 +21,7 @@ class Run:
 
     Attributes:
         problem: what is minimised.
-        reals: where the walk stands.
+        reals: the newest point.
         finished: why there is nothing left to gain, or "".
     """
 
@@ -58,7 +58,7 @@ class Run:
 
 
 class Optimiser(Strategy, tag="optimiser"):
-    """Settings of a walk."""
+    """Settings of a minimisation."""
 
     def begin(self, problem: Problem) -> Run:
         """Start from the values that the problem holds."""
@@ -66,6 +66,6 @@ class Optimiser(Strategy, tag="optimiser"):
 
 
 class FirstOrder(Optimiser, tag="first order"):
-    """Settings of a walk along gradients of some of the views."""
+    """Settings of a minimisation along gradients, of some of the views at a time where that is asked for."""
 
     views: Annotated[int, of("view", "views per iteration, drawn without replacement; 0 leaves it to the problem", ge=0)] = 0

@@ -79,10 +79,10 @@ class SceneProblem:
         return {p.name: dr.detach(as_tensor(self.params[p.name])) for p in self.parameters}
 
     def gradients(self) -> Reals:
-        """What has been carried back to the scene since :meth:`set`, by parameter.
+        """Sum of the derivatives that renders have brought to the scene since :meth:`set`, by parameter.
 
         Raises:
-            MivolError: nothing ever is, to one of them.
+            MivolError: the images do not depend on one of them.
         """
         found = {}
         for p in self.parameters:
@@ -267,6 +267,6 @@ def views_of(iteration: int, n_views: int, per_iteration: int, seed: int) -> lis
 
 
 def _is_untouched(gradient: object) -> bool:
-    """Whether a gradient is the 0 that Dr.Jit makes up where none was ever carried to."""
+    """Whether a gradient is the literal 0 that Dr.Jit gives where no derivative has arrived."""
     rows = [gradient.array] if dr.is_tensor_v(gradient) else gradient if dr.depth_v(gradient) > 1 else [gradient]
     return all(row.state == dr.VarState.Literal for row in rows)

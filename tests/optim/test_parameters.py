@@ -1,4 +1,4 @@
-"""Parameters: maps there and back, projection, refusals; and the grids that events refine."""
+"""Parameters: maps there and back, projection, refusals."""
 
 from __future__ import annotations
 
@@ -9,13 +9,9 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from fit_scene import KEY, absorbing_scene
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from mivol.errors import MivolError
-from mivol.optim.events import EVENTS, Checkpoint, CoarseToFine, Evaluate, UpdateOccupancy, Upsample, in_order, upsample
 from mivol.optim.parameters import MAPS, Parameter, as_tensor, find, inverse_softplus, like, softplus
-from mivol.optim.schedules import SCHEDULES, Constant, Cosine, Exponential, Step
 
 EPS = float(np.finfo(np.float32).eps)
 DOMAINS = {"identity": (0.0, math.inf), "softplus": (0.0, math.inf), "log": (0.0, math.inf), "logistic": (0.0, 1.0)}
@@ -104,77 +100,3 @@ def test_find_offers_the_nearest_key(variant_rgb) -> None:
     if addressed:
         with pytest.raises(MivolError, match="memory address"):
             find(addressed, nameless)
-
-
-# -- Refining a grid ----------------------------------------------------------------------------------------------
-
-SIZES = st.tuples(*[st.integers(1, 6)] * 3)
-NEW_SIZES = st.tuples(*[st.integers(1, 11)] * 3)
-
-
-@settings(max_examples=60, deadline=None)
-@given(SIZES, NEW_SIZES, st.integers(1, 3), st.integers(0, 1000))
-def test_upsampling_conserves_mass(old: tuple[int, ...], new: tuple[int, ...], channels: int, seed: int) -> None:
-    """Rationale: a refined start must absorb as much as the coarse one, or the loss jumps. Whole factors conserve the
-    mass by themselves, others do not.
-    Expected: the mean of each channel is kept to the rounding of float32 values (eps / 2 each, of one sign at worst);
-    nothing is negative (linear, not cubic).
-
-    Hard case 47.
-    """
-    mi.set_variant("llvm_ad_rgb")
-    rng = np.random.default_rng(seed)
-    field = rng.uniform(0, 1, (*old, channels)) ** 8 * (rng.uniform(size=(*old, 1)) > 0.5)
-    fine = np.asarray(upsample(mi.TensorXf(field.astype("f")), new))
-    assert fine.shape == (*new, channels)
-    before = field.astype("f").astype(np.float64).mean(axis=(0, 1, 2))
-    after = fine.astype(np.float64).mean(axis=(0, 1, 2))
-    assert np.all(np.abs(after - before) <= EPS * before)
-    assert fine.min(initial=0.0) >= 0.0
-
-
-def test_no_overshoot(variant_rgb) -> None:
-    """A step stays between its levels, but for the factor that restores the mass, which is 1 for a step by symmetry.
-
-    Hard case 47.
-    """
-    step = np.zeros((4, 4, 4, 1), "f")
-    step[2:] = 1.0
-    fine = np.asarray(upsample(mi.TensorXf(step), (8, 8, 8)))
-    assert fine.min() == 0.0
-    assert fine.max() <= 1.0 + EPS
-    ramp = fine[:, 0, 0, 0]
-    assert np.all(np.diff(ramp) >= 0)
-    assert np.allclose(ramp[3:5], [0.25, 0.75], rtol=2 * EPS)
-
-
-def test_upsampling_of_a_field_of_both_signs_without_mass(variant_rgb) -> None:
-    values = np.array([1.0, -1.0], "f").reshape(2, 1, 1, 1)
-    fine = np.asarray(upsample(mi.TensorXf(values), (4, 1, 1)))
-    assert np.allclose(fine.ravel(), [1, 0.5, -0.5, -1], atol=EPS)
-
-
-def test_events_are_due_when_they_say(variant_rgb) -> None:
-    assert [i for i in range(9) if Upsample(at=(3, 5)).due(i)] == [3, 5]
-    assert [i for i in range(9) if Checkpoint(every=4).due(i)] == [4, 8]
-    assert [i for i in range(9) if Evaluate(every=4).due(i)] == [0, 4, 8]
-    assert [i for i in range(9) if CoarseToFine(at=(3, 5)).due(i)] == [3, 5]
-    assert [i for i in range(9) if UpdateOccupancy(every=4).due(i)] == [4, 8]
-    assert set(EVENTS) == {"upsample", "coarse_to_fine", "update_occupancy", "checkpoint", "evaluate"}
-    assert isinstance(in_order((Upsample(at=(1,)), Evaluate(), Checkpoint()))[0], Checkpoint)
-
-
-# -- Schedules ----------------------------------------------------------------------------------------------------
-
-
-def test_schedules_begin_at_one_and_end_where_they_say() -> None:
-    n = 41
-    chosen = [Constant(), Cosine(final=0.2), Step(at=(0.5, 0.9), ratio=0.1), Exponential(final=0.01, delay=10)]
-    assert {schedule.label() for schedule in chosen} == set(SCHEDULES)
-    factors = np.array([[s.factor(i, n) for i in range(n)] for s in chosen])
-    assert np.allclose(factors[:, 0], 1.0)
-    assert np.allclose(factors[:, -1], [1.0, 0.2, 0.01, 0.01])
-    assert np.all(np.diff(factors, axis=1) <= 1e-12)
-    assert np.isclose(factors[1, 20], 0.6)
-    assert np.allclose(factors[3, [10, 25]], [1.0, 0.1])
-    assert np.allclose(factors[2, [20, 21]], [1.0, 0.1])
