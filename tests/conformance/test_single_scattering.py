@@ -38,7 +38,6 @@ from scattering_scenes import (
 from volpath_scenes import (
     BARE,
     FOG,
-    LAMPS,
     LEAK,
     RED,
     area,
@@ -61,26 +60,6 @@ pytestmark = pytest.mark.usefixtures("variant_rgb")
 
 
 # -- Lamps -----------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.statistical
-@pytest.mark.parametrize("name", small.cases(LAMPS, ["textured area", "area inside", "two that can be met"]))
-def test_lamps(name):
-    box, _ = smoke(rough_grid(1), name="hg", g=0.4)
-    image, _ = same({"smoke": box, **LAMPS[name]()}, precision=0.02)
-    assert image.mean.min() >= 0
-
-
-def test_no_lamp_at_all():
-    """Nothing shines, nothing is seen: exactly. Nor does anything change it."""
-    box, _ = smoke(rough_grid(1))
-    scene = close_up({"smoke": box})
-    assert not moments(scene, mivol(), 4, 2).mean.any()
-    params = mi.traverse(scene)
-    key = "smoke.interior_medium.sigma_t.data"
-    dr.enable_grad(params[key])
-    dr.backward(dr.mean(mi.render(scene, params, integrator=mi.load_dict(mivol()), spp=4), axis=None))
-    assert not np.any(dr.grad(params[key]))
 
 
 # -- Boundaries, media, places of the camera -------------------------------------------------------------------------

@@ -1,0 +1,225 @@
+"""Walks of cells where they are hard: rays along planes, through edges and corners, along the edge of what is there."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+from hard_rays import BOUND, EPS, assert_tau, positive
+from oracle import tau_scale, tau_twin
+
+from scenes import (
+    affine,
+    as_float32,
+    random_rays,
+    tau_fast,
+)
+
+pytestmark = pytest.mark.usefixtures("variant_rgb")
+
+
+@pytest.mark.parametrize("zero", [0.0, -0.0])
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_axis_aligned_row_sums(axis, zero):
+    # Through voxel centres tau is the voxel's edge times the sum of the row: 8 terms, 8 roundings at most.
+    """Hard case 9."""
+    rng = np.random.default_rng(9)
+    values = as_float32(rng.uniform(0.1, 1, (8, 8, 8)))
+    index = list(itertools.product(range(8), repeat=2))
+    for sign in (1.0, -1.0):
+        o, d = np.empty((64, 3)), np.full((64, 3), zero)
+        o[:, axis], d[:, axis] = -3.0 * sign + 0.5, sign
+        others = [a for a in range(3) if a != axis]
+        o[:, others] = (np.array(index) + 0.5) / 8
+        rows = values.transpose(2, 1, 0).transpose(*others, axis).reshape(64, 8).sum(axis=1) / 8
+        fast = tau_fast(values, np.eye(4), o, d)[:, 0]
+        assert np.all(np.abs(fast - rows) <= 8 * EPS * rows)
+
+
+def test_axis_aligned_off_centre():
+    """Hard case 9."""
+    rng = np.random.default_rng(10)
+    values = positive(rng, (5, 7, 6, 3))
+    for axis, sign, zero in itertools.product(range(3), (1.0, -1.0), (0.0, -0.0)):
+        o, d = rng.uniform(-0.1, 1.1, (32, 3)), np.full((32, 3), zero)
+        o[:, axis] -= 2 * sign
+        d[:, axis] = sign
+        assert_tau(values, np.eye(4), o, d)
+
+
+def test_in_a_coordinate_plane():
+    """Hard case 9."""
+    rng = np.random.default_rng(11)
+    values = positive(rng, (5, 7, 6))
+    for axis, zero in itertools.product(range(3), (0.0, -0.0)):
+        o, d = random_rays(rng, np.eye(4), 32)
+        d[:, axis] = zero
+        d /= np.linalg.norm(d, axis=1, keepdims=True)
+        assert_tau(values, np.eye(4), o, d)
+
+
+@pytest.mark.parametrize("tiny", [1e-7, 1e-16, -1e-16, 1e-30, 1e-38, -1e-38, 1e-41, -1e-45])
+def test_nearly_axis_aligned(tiny):
+    """Hard case 10."""
+    rng = np.random.default_rng(12)
+    values = positive(rng, (4, 6, 5))
+    for axis in range(3):
+        o, d = rng.uniform(0.02, 0.98, (24, 3)), np.full((24, 3), tiny)
+        o[:, axis] = -1.5
+        d[:, axis] = 1.0
+        o[:8] = (np.floor(o[:8] * 4) + 0.5) / 4  # some of them in the planes where cells meet
+        o[:8, axis] = -1.5
+        fast = assert_tau(values, np.eye(4), o, d)
+        # A ray turned by 1e-16 is displaced by less than float64 sees: the same as the straight one.
+        if abs(tiny) < 1e-10:
+            straight = tau_fast(values, np.eye(4), o, np.eye(3)[axis])
+            allowed = 2 * BOUND * tau_scale(values, np.eye(4), as_float32(o), np.tile(np.eye(3)[axis], (24, 1)))
+            assert np.all(np.abs(fast - straight) <= allowed)
+
+
+def test_a_tilt_of_1e_7_counts_from_far_away():
+    # 1e-7 over 1e6 lengths is a tenth of the box: rays that start beside it and hit, or start level with it and miss.
+    """Hard case 10."""
+    rng = np.random.default_rng(40)
+    values = as_float32(rng.uniform(0.5, 1, (4, 6, 5)))
+    for axis in range(3):
+        other = (axis + 1) % 3
+        o, d = np.full((2, 3), 0.4), np.zeros((2, 3))
+        o[:, axis], o[:, other] = -1e6, (-0.05, 0.95)
+        d[:, axis], d[:, other] = 1, 1e-7
+        fast = assert_tau(values, np.eye(4), o, d)
+        assert fast[0] > 0.5
+        assert fast[1] == 0
+
+
+def test_in_cell_faces_and_edges():
+    # Cells meet in the planes through voxel centres; 8 voxels, so those planes are exact in binary.
+    """Hard case 11."""
+    rng = np.random.default_rng(13)
+    values = positive(rng, (8, 8, 8))
+    for axis in range(3):
+        b, c = (a for a in range(3) if a != axis)
+        o, d = np.empty((64, 3)), rng.normal(size=(64, 3))
+        o[:] = rng.uniform(-0.2, 1.2, (64, 3))
+        o[:, axis] = (rng.integers(0, 8, 64) + 0.5) / 8
+        d[:, axis] = 0
+        assert_tau(values, np.eye(4), o, d / np.linalg.norm(d, axis=1, keepdims=True))  # in a face
+        o[:, b] = (rng.integers(0, 8, 64) + 0.5) / 8
+        o[:, c], d[:, b], d[:, c] = -1, 0, 1
+        assert_tau(values, np.eye(4), o, d)  # along an edge
+
+
+def test_midway_between_rows():
+    # On the plane between two rows of voxels: half of each, to the 8 roundings of the sum.
+    """Hard case 11."""
+    rng = np.random.default_rng(14)
+    values = as_float32(rng.uniform(0.1, 1, (8, 8, 8)))
+    o = np.array([[-1, j / 8, (k + 0.5) / 8] for j in range(1, 8) for k in range(8)])
+    mean = np.array([(values[k, j - 1] + values[k, j]).sum() / 16 for j in range(1, 8) for k in range(8)])
+    fast = tau_fast(values, np.eye(4), o, [1, 0, 0])[:, 0]
+    assert np.all(np.abs(fast - mean) <= 8 * EPS * mean)
+
+
+@pytest.mark.parametrize("n", [1, 2, 8, 16])
+def test_diagonals_through_corners(n):
+    """Hard case 11."""
+    rng = np.random.default_rng(15)
+    values = positive(rng, (n, n, n))
+    signs = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
+    d = signs / math.sqrt(3)
+    assert_tau(values, np.eye(4), 0.5 - 2 * signs, d)
+    assert_tau(values, np.eye(4), 0.5 - 2 * signs, d, skip=True)
+    # Each unit of length once: through a grid of ones, the diagonal of the cube.
+    fast = tau_fast(np.ones((n, n, n)), np.eye(4), 0.5 - 2 * signs, signs)
+    assert np.all(np.abs(fast - 1) <= (3 * n + 3) * EPS)
+
+
+def test_grazing_from_outside():
+    """Hard case 12."""
+    ones = np.ones((4, 4, 4))
+    corner = np.array([[2.0, 0, 0.5], [2, 0, 1], [0, 2, 0], [0.5, 2, 0]])  # x + y = 2 touches the edge x = y = 1
+    d = np.array([[-1.0, 1, 0], [-1, 1, 0], [1, -1, 0], [0, -1, 1]]) / math.sqrt(2)
+    fast = tau_fast(ones, np.eye(4), corner, d)
+    assert np.array_equal(fast[:3], np.zeros((3, 1)))
+    assert_tau(ones, np.eye(4), corner[3:], d[3:])
+    outside = np.nextafter(np.float32(1), np.float32(2))
+    fast = tau_fast(
+        ones, np.eye(4), [[-1, outside, 0.5], [0.5, -1e-20, -1], [0.5, 0.5, -1e-30]], [[1, 0, 0], [0, 0, 1], [0, 1, 0]]
+    )
+    assert np.array_equal(fast, np.zeros((3, 1)))
+    # A face belongs to the grid or to the vacuum, as a set of no volume: all of it or none, never a part.
+    fast = tau_fast(ones, np.eye(4), [[-1, 1, 0.5], [-1, 0, 0.5], [0.5, 1, -1]], [[1, 0, 0], [1, 0, 0], [0, 0, 1]])
+    assert set(fast.ravel()) <= {0.0, 1.0}
+
+
+def test_chord_across_a_corner():
+    # From 0.1 to one float32 step inside the edge: the chord is sqrt(2) times the depth, in float64.
+    """Hard case 12."""
+    depths = 2.0 ** -np.arange(3, 23)
+    o = np.array([[2 - h, 0, 0.5] for h in depths])
+    d = np.array([-1.0, 1, 0]) / math.sqrt(2)
+    assert_tau(np.ones((4, 4, 4)), np.eye(4), o, d)
+
+
+def test_planes_that_coincide():
+    # Rays through the edges and corners of cells reach two or three planes at once: each unit of length still once.
+    """Hard case 44."""
+    rng = np.random.default_rng(35)
+    values = positive(rng, (8, 8, 8))
+    nodes = (rng.integers(0, 8, (96, 3)) + 0.5) / 8
+    steps = rng.integers(-2, 3, (96, 3)).astype(float)
+    steps[np.all(steps == 0, axis=1)] = [1, 1, 0]
+    d = steps / np.linalg.norm(steps, axis=1, keepdims=True)
+    for skip in (False, True):
+        assert_tau(values, np.eye(4), nodes - 4 * steps, d, skip=skip)
+        assert_tau(values, np.eye(4), nodes, d, skip=skip)
+        # Directions of any length: t then counts in that length, and the planes coincide to the last bit.
+        assert_tau(values, np.eye(4), nodes - 4 * steps, steps, skip=skip)
+
+
+def lattice_step(n):
+    """Half a float32 spacing at n: how well a position among n voxels is known, in voxels."""
+    return n * EPS / 2
+
+
+@pytest.mark.parametrize("filled", [slice(250, 256), slice(255, 256)])
+def test_the_end_is_where_it_is_after_256_cells(filled):
+    """Rationale: a wall, or the box, ends a ray in the only filled cells, after 250 empty ones.
+    Expected: the end is as good as a float32 position on that lattice, not as a running difference of 600 steps.
+
+    Hard case 14.
+    """
+    rng = np.random.default_rng(38)
+    n, rays = 256, 100
+    values = np.zeros((160, 160, n), dtype=np.float32)
+    values[:, :, filled] = 1
+    to_world = affine(np.diag([n, 160.0, 160.0]))
+    d = np.column_stack([np.ones(rays), rng.uniform(-0.3, 0.3, (rays, 2))])
+    d = as_float32(d / np.linalg.norm(d, axis=1, keepdims=True))
+    o = as_float32(np.column_stack([np.full(rays, -3), rng.uniform(78, 82, (rays, 2))]))
+    t_max = as_float32((3 + rng.uniform(filled.start + 0.6, n, rays)) / d[:, 0])
+    allowed = BOUND * tau_scale(values, to_world, o, d, 0.0, t_max) + 2 * lattice_step(n)
+    for end in (t_max, math.inf):
+        fast, twin = tau_fast(values, to_world, o, d, end), tau_twin(values, to_world, o, d, 0.0, end)
+        error = np.abs(fast - twin)
+        assert np.all(error <= allowed), f"the end is off by {error.max():.2g} voxels, {allowed.max():.2g} allowed"
+
+
+def test_along_the_edge_of_the_support():
+    # Rays that graze a diagonal sheet for 256 cells: a position errs by the float32 step of the lattice, always to one
+    # side, and the gradient turns that into optical depth.
+    """Hard case 52."""
+    rng = np.random.default_rng(39)
+    n, rays = 256, 100
+    x = np.arange(n)
+    values = np.tile(np.clip(x[None, :] - x[:, None], 0, 1).astype(np.float32), (3, 1, 1))
+    to_world = affine(np.diag([n, n, 3.0]))
+    start = rng.uniform(-5, 5, rays)
+    o = as_float32(np.column_stack([start, start + rng.uniform(-0.5, 1.2, rays), np.full(rays, 1.4)]))
+    d = np.column_stack([np.ones(rays), 1 + rng.uniform(-1e-3, 1e-3, rays), rng.uniform(-2e-3, 2e-3, rays)])
+    d = as_float32(d / np.linalg.norm(d, axis=1, keepdims=True))
+    fast, twin = tau_fast(values, to_world, o, d), tau_twin(values, to_world, o, d)
+    allowed = (BOUND + lattice_step(n)) * tau_scale(values, to_world, o, d)
+    assert np.all(np.abs(fast - twin) <= allowed)
