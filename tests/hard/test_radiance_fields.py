@@ -4,28 +4,28 @@
 defect    what goes wrong there                               shown by
 ========  ==================================================  ==========================================================
 1         opacity capped by the learning rate                 here
-2         an empty box costs what a full one does             here; ``analytic/test_radiance::test_cells_know_the_way...``
-3         wrong steps in other boxes, a last one too long     here; ``analytic/test_radiance::test_agrees_with_the_twin``
+2         an empty box costs what a full one does             here; ``analytic/test_radiance_field::test_cells_know_the_way...``
+3         wrong steps in other boxes, a last one too long     here; ``analytic/test_radiance_field::test_agrees_with_the_twin``
 4         NaN where the transmittance underflows              here; ``...::test_constant_colour_and_no_nan_at_any_depth``
 5         colours outside [0, 1] lose their derivative        here
 6         an all-negative density is dead                     here
 7         no background, alpha always 1                       here; ``optim/test_radiance_problem::test_backgrounds...``
-8         dense storage; no priors, no pruning                here; ``analytic/test_radiance::test_sparse_is_dense``,
+8         dense storage; no priors, no pruning                here; ``analytic/test_radiance_field::test_sparse_is_dense``,
                                                               ``optim/test_decoupled_priors::test_priors_move...``
 9         harmonics read where nothing is; one degree         here
-10        rays end at a transmittance of exactly 0            here; ``analytic/test_radiance::test_a_ray_that_stops...``
+10        rays end at a transmittance of exactly 0            here; ``analytic/test_radiance_field::test_a_ray_that_stops...``
 11        no forward mode                                     ``conformance/test_spherical_volume::test_derivatives_...``
 12        texture units round weights on a GPU                does not arise: nodes are gathered, no texture is read
 13        another field after refinement                      ``analytic/test_resampling::test_a_field_on_finer...``
 14        images of one size, jitter inside pixels            here; ``optim/test_ray_batches::test_views_know_their...``
 15        nothing to stop, resume, measure or look at         ``optim/test_radiance_problem::test_a_fit_that...``,
                                                               ``experiments/test_photo_fit``
-16        a camera inside sees what is behind it              here; ``analytic/test_radiance::test_hard_45_...``
+16        a camera inside sees what is behind it              here; ``analytic/test_radiance_field::test_camera_inside``
 ========  ==================================================  ==========================================================
 
 Of the hard cases by number, 2 (cells of any optical depth), 38 (a source like the background) and 45 (a camera inside) are in
-``analytic/test_emission``, ``analytic/test_numerics`` and ``analytic/test_radiance``; 37 (a wall) is there for a wall that
-nothing passes, and here for one that leaves exp(-50).
+``analytic/test_emission``, ``analytic/test_numerics`` and ``analytic/test_radiance_field``; 37 (a wall) is there for a wall
+that nothing passes, and here for one that leaves exp(-50).
 """
 
 from __future__ import annotations

@@ -45,10 +45,10 @@ def coarsen_grid(lattice: Lattice, shift: int, lists: bool) -> CoarseGrid:
         flat = _mean_along(flat, shape[axis], inner, edge)
         shape[axis] = -(-shape[axis] // edge)
     values = mi.TensorXf(flat, (*shape, c))
-    stretch = np.diag([edge * m / n for m, n in zip(shape[::-1], lattice.res[::-1], strict=True)] + [1.0])
+    scale = np.diag([edge * m / n for m, n in zip(shape[::-1], lattice.res[::-1], strict=True)] + [1.0])
     empty_distances = find_empty_distances(values) if lattice.empty_distances is not None else None
     return CoarseGrid(
-        Lattice(values, lattice.to_world @ stretch, empty_distances), _held(values, lattice.res, shift) if lists else None
+        Lattice(values, lattice.to_world @ scale, empty_distances), _held(values, lattice.res, shift) if lists else None
     )
 
 
