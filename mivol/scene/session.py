@@ -21,7 +21,7 @@ from mivol.scene.refusals import check_aovs
 from mivol.scene.survey import Survey, survey_scene
 from mivol.transport.line_integrals.aovs import integrate_aovs, jvp_aovs, vjp_aovs
 from mivol.transport.path.estimators import Estimators
-from mivol.transport.path.film import CameraRays, adjoint_rays, record
+from mivol.transport.path.film import CameraRays, RenderSamples, adjoint_rays, record
 from mivol.transport.path.scores import Primal, Replay, Tangent
 from mivol.transport.path.settings import Settings
 from mivol.transport.path.walk import is_straight, walk_path
@@ -77,8 +77,8 @@ class Session:
         sensor = find_sensor(scene, sensor)
         with dr.suspend_grad():
             estimators, plan = self._open(scene, sensor, spp, pictures=True)
-            layout = estimators.segment.directions
-            image = record(sensor, seed, spp, plan.pass_rays, self.aovs, lambda rays: self._primal(estimators, rays), layout)
+            samples = RenderSamples(sensor, seed, spp, plan.pass_rays, estimators.segment.directions)
+            image = record(samples, self.aovs, lambda rays: self._primal(estimators, rays))
         if evaluate:
             dr.eval(image)
         return image
@@ -90,8 +90,8 @@ class Session:
             with dr.resume_grad():
                 estimators, plan = self._open(scene, sensor, spp)
                 estimators.media.start_tangent()
-            layout = estimators.segment.directions
-            return record(sensor, seed, spp, plan.pass_rays, self.aovs, lambda rays: self._tangent(estimators, rays), layout)
+            samples = RenderSamples(sensor, seed, spp, plan.pass_rays, estimators.segment.directions)
+            return record(samples, self.aovs, lambda rays: self._tangent(estimators, rays))
 
     def render_backward(self, scene: mi.Scene, grad_in: mi.TensorXf, sensor: int | mi.Sensor, seed: int, spp: int) -> None:
         """Add the derivatives of an image, weighted by ``grad_in``, to the gradients of the parameters.
@@ -103,11 +103,12 @@ class Session:
             with dr.resume_grad():
                 renew(scene)
                 estimators, plan = self._open(scene, sensor, spp)
-            media, layout = estimators.media, estimators.segment.directions
+            media = estimators.media
+            samples = RenderSamples(sensor, seed, spp, plan.pass_rays, estimators.segment.directions)
             media.start_gradients()
             # What is pulled back to a volume waits there for the end: its edge to the parameter can be passed but once.
             with dr.isolate_grad():
-                for rays, dL, daovs in adjoint_rays(sensor, seed, spp, plan.pass_rays, self.aovs, grad_in, layout):
+                for rays, dL, daovs in adjoint_rays(samples, self.aovs, grad_in):
                     self._replay(estimators, rays, dL, daovs)
                     dr.eval()
             with dr.resume_grad():

@@ -128,7 +128,8 @@ def test_pixels_are_not_correlated_between_passes(monkeypatch):
 def test_samples_of_a_pixel_share_it_out(layout):
     """Of 12 samples one lies in each cell of 3 x 4, in an order of its own in each tile or pixel."""
     # A box filter would count all samples of a pixel at its corner.
-    (rays,) = film.film_passes(mi.load_dict(sensor_of(rfilter="gaussian")), 5, 12, 1 << 20, layout)
+    samples = film.RenderSamples(mi.load_dict(sensor_of(rfilter="gaussian")), 5, 12, 1 << 20, layout)
+    (rays,) = film.film_passes(samples)
     x, y = (np.array(v) for v in (rays.position.x, rays.position.y))
     pixel = np.floor(x).astype(int) + 12 * np.floor(y).astype(int)
     cell = np.floor(x % 1 * 3).astype(int) + 3 * np.floor(y % 1 * 4).astype(int)

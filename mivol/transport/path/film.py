@@ -18,7 +18,7 @@ import mitsuba as mi
 from mivol.errors import MivolError
 from mivol.transport.traversal.strata import Strata
 
-__all__ = ["CameraRays", "adjoint_rays", "film_passes", "record"]
+__all__ = ["CameraRays", "RenderSamples", "adjoint_rays", "film_passes", "record"]
 
 
 PLAIN, SPREAD, TILED = "none", "spread", "tiled"
@@ -26,6 +26,27 @@ PLAIN, SPREAD, TILED = "none", "spread", "tiled"
 
 TILE = 4
 """Edge of a tile of pixels: 16 lanes of one packet."""
+
+
+@dataclass
+class RenderSamples:
+    """The samples of a render.
+
+    Attributes:
+        sensor: its film, filter, crop and sampler are used as they are.
+        seed: of the sampler.
+        spp: samples a pixel; 0 for the sampler's own count.
+        pass_rays: largest number of rays in a pass.
+        layout: ``PLAIN``: independent positions in the pixel. ``SPREAD``: the samples of a pixel are stratified over its area.
+            ``TILED``: besides, the lanes of a tile of pixels lie side by side, and directions are stratified. The last two need
+            an independent sampler, and ``TILED`` a film of whole tiles; elsewhere the layout is the next simpler one.
+    """
+
+    sensor: mi.Sensor
+    seed: int
+    spp: int
+    pass_rays: int
+    layout: str = PLAIN
 
 
 @dataclass
@@ -51,27 +72,18 @@ Sample = Callable[[CameraRays], tuple]
 """``sample(rays) -> (radiance, alpha, AOVs)``; alpha in [0, 1] is what the film's alpha sees, without derivatives."""
 
 
-def film_passes(sensor: mi.Sensor, seed: int, spp: int, pass_rays: int, layout: str = PLAIN) -> Iterator[CameraRays]:
+def film_passes(samples: RenderSamples) -> Iterator[CameraRays]:
     """Generate the rays of a render, pass by pass.
-
-    Args:
-        sensor: its film, filter, crop and sampler are used as they are.
-        seed: of the sampler.
-        spp: samples a pixel; 0 for the sampler's own count.
-        pass_rays: largest number of rays in a pass.
-        layout: ``PLAIN``: independent positions in the pixel. ``SPREAD``: the samples of a pixel are stratified over its area.
-            ``TILED``: besides, the lanes of a tile of pixels lie side by side, and directions are stratified. The last two need
-            an independent sampler, and ``TILED`` a film of whole tiles; elsewhere the layout is the next simpler one.
 
     Raises:
         MivolError: one sample a pixel is more than a launch can hold (2^32).
     """
-    base, pixels, per_pass = _prepare(sensor, spp, pass_rays)
+    base, pixels, per_pass = _prepare(samples.sensor, samples.spp, samples.pass_rays)
     base.set_samples_per_wavefront(per_pass)
     for index in range(base.sample_count() // per_pass):
         sampler = base.clone()
-        _seed(sampler, seed, index, pixels * per_pass)
-        yield _camera_rays(sensor, sampler, pixels * per_pass, per_pass, layout, seed)
+        _seed(sampler, samples.seed, index, pixels * per_pass)
+        yield _camera_rays(samples, sampler, pixels * per_pass, per_pass)
 
 
 def _seed(sampler: mi.Sampler, seed: int, index: int, count: int) -> None:
@@ -115,12 +127,13 @@ def _sampled_size(film: mi.Film) -> tuple[int, int]:
     return int(width) + border, int(height) + border
 
 
-def _camera_rays(sensor: mi.Sensor, sampler: mi.Sampler, count: int, per_pass: int, layout: str, seed: int) -> CameraRays:
+def _camera_rays(samples: RenderSamples, sampler: mi.Sampler, count: int, per_pass: int) -> CameraRays:
+    sensor, layout = samples.sensor, samples.layout
     film = sensor.film()
     width, height = _sampled_size(film)
     lane, strata = dr.arange(mi.UInt32, count), None
     # Opaque, since a kernel that contains the seed as a literal would be compiled anew in every render.
-    salt = mi.UInt32(seed)
+    salt = mi.UInt32(samples.seed)
     dr.make_opaque(salt)
     salt += 0x9E3779B9
     across = max(a for a in range(1, int(per_pass**0.5) + 1) if per_pass % a == 0)
@@ -159,22 +172,20 @@ def _camera_rays(sensor: mi.Sensor, sampler: mi.Sampler, count: int, per_pass: i
     return CameraRays(sampler, ray, weight, place, strata)
 
 
-def record(
-    sensor: mi.Sensor, seed: int, spp: int, pass_rays: int, names: list[str], sample: Sample, layout: str = PLAIN
-) -> mi.TensorXf:
+def record(samples: RenderSamples, names: list[str], sample: Sample) -> mi.TensorXf:
     """Render an image: sample the rays of all passes, and average them on the sensor's film.
 
     Args:
-        sensor, seed, spp, pass_rays, layout: as :func:`film_passes`.
+        samples: of the render.
         names: of the AOVs, in the order in which ``sample`` returns them.
         sample: :data:`Sample`.
 
     Returns:
         (height, width, colours + AOVs).
     """
-    film = sensor.film()
+    film = samples.sensor.film()
     film.prepare(names)
-    for rays in film_passes(sensor, seed, spp, pass_rays, layout):
+    for rays in film_passes(samples):
         L, alpha, aovs = sample(rays)
         block = _new_block(film, rays)
         _splat(block, film, rays, L * rays.weight, mi.Float(1), alpha, aovs)
@@ -185,27 +196,21 @@ def record(
 
 
 def adjoint_rays(
-    sensor: mi.Sensor,
-    seed: int,
-    spp: int,
-    pass_rays: int,
-    names: list[str],
-    grad_image: mi.TensorXf,
-    layout: str = PLAIN,
+    samples: RenderSamples, names: list[str], grad_image: mi.TensorXf
 ) -> Iterator[tuple[CameraRays, mi.Spectrum, list[mi.Float]]]:
     """Turn a gradient image into a gradient for each ray, pass by pass: the transpose of the film.
 
     Args:
-        sensor, seed, spp, pass_rays, names, layout: as :func:`record`.
+        samples, names: as :func:`record`.
         grad_image: d loss / d image.
 
     Yields:
         The rays of a pass, d loss / d L of each, and d loss / d AOV.
     """
-    film = sensor.film()
-    several = count_passes(sensor, spp, pass_rays) > 1
-    weights = _weights(sensor, seed, spp, pass_rays, names, layout) if several else None
-    for rays in film_passes(sensor, seed, spp, pass_rays, layout):
+    film = samples.sensor.film()
+    several = count_passes(samples.sensor, samples.spp, samples.pass_rays) > 1
+    weights = _weights(samples, names) if several else None
+    for rays in film_passes(samples):
         with dr.resume_grad():
             n = dr.width(rays.ray)
             L = dr.full(mi.Spectrum, 1, n)
@@ -229,12 +234,12 @@ def adjoint_rays(
         yield rays, dL, daovs
 
 
-def _weights(sensor: mi.Sensor, seed: int, spp: int, pass_rays: int, names: list[str], layout: str) -> mi.ImageBlock:
+def _weights(samples: RenderSamples, names: list[str]) -> mi.ImageBlock:
     """An image block with the filter weights of all passes and no light."""
-    film = sensor.film()
+    film = samples.sensor.film()
     film.prepare(names)
     block = None
-    for rays in film_passes(sensor, seed, spp, pass_rays, layout):
+    for rays in film_passes(samples):
         block = block or _new_block(film, rays)
         zero = [mi.Float(0) for _ in names]
         _splat(block, film, rays, mi.Spectrum(0), mi.Float(1), mi.Float(0), zero)
