@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import ast
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
+from functools import cache
 from pathlib import Path
 
 import pytest
+from syntax import tree_of
 
 PACKAGE = Path(__file__).resolve().parents[1] / "mivol"
 ORDER = [
@@ -29,16 +31,19 @@ def room_of(path: Path) -> str:
     return "" if parts == ("__init__",) else parts[0]
 
 
-def imported(path: Path) -> Iterator[tuple[str, int]]:
+@cache
+def imported(path: Path) -> list[tuple[str, int]]:
     """Full names of everything that a module imports, wherever the statement stands, with line numbers."""
     package = ["mivol", *path.relative_to(PACKAGE).parent.parts]
-    for node in ast.walk(ast.parse(path.read_text(), str(path))):
+    found = []
+    for node in ast.walk(tree_of(path)):
         if isinstance(node, ast.Import):
-            yield from ((alias.name, node.lineno) for alias in node.names)
+            found += [(alias.name, node.lineno) for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
             base = ".".join(package[: len(package) - node.level + 1]) if node.level else ""
             module = ".".join(part for part in (base, node.module or "") if part)
-            yield from ((f"{module}.{alias.name}", node.lineno) for alias in node.names)
+            found += [(f"{module}.{alias.name}", node.lineno) for alias in node.names]
+    return found
 
 
 def wrong_arrows(room: str, names: Iterable[tuple[str, int]]) -> list[str]:
@@ -107,7 +112,7 @@ def test_no_circle_of_imports() -> None:
     edges = {}
     for module, path in modules.items():
         names = {name for name, _ in imported(path)}
-        edges[module] = {m for m in modules if m != module and (m in names or any(n.rpartition(".")[0] == m for n in names))}
+        edges[module] = (names | {name.rpartition(".")[0] for name in names}) & modules.keys() - {module}
     assert circles(edges) == []
 
 
@@ -122,7 +127,7 @@ def test_only_threads_starts_threads_and_processes(path: Path) -> None:
     """One thread of a process uses Dr.Jit, and what starts another must go through the module that says so."""
     if room_of(path) == "threads":
         return
-    tree = ast.parse(path.read_text(), str(path))
+    tree = tree_of(path)
     used = {ast.unparse(node) for node in ast.walk(tree) if isinstance(node, ast.Attribute)}
     starts = {name for name in used - STARTS_NOTHING if name.split(".")[0] in STARTS_THREADS}
     froms = {name for name, _ in imported(path) if "." in name and name.split(".")[0] in STARTS_THREADS}
@@ -133,7 +138,7 @@ def test_only_plugins_define_classes_with_mitsuba_bases() -> None:
     """But for callbacks that ask an object for its parameters: Mitsuba never holds one."""
     found = []
     for path in MODULES:
-        for node in ast.walk(ast.parse(path.read_text(), str(path))):
+        for node in ast.walk(tree_of(path)):
             if isinstance(node, ast.ClassDef) and room_of(path) != "plugins":
                 bases = {ast.unparse(base) for base in node.bases} - {"mi.TraversalCallback"}
                 found += [f"{path.name}: {node.name}" for base in bases if base.startswith("mi.")]

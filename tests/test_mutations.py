@@ -9,10 +9,12 @@ from __future__ import annotations
 import ast
 import importlib
 import sys
+from functools import cache
 from pathlib import Path
 from types import ModuleType
 
 import pytest
+from syntax import tree_of
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -33,9 +35,14 @@ ENTRIES = mutate.load_entries()
 
 def has_logic(path: Path) -> bool:
     """Whether a module defines a function that does more than name a protocol."""
-    functions = [n for n in ast.walk(ast.parse(path.read_text())) if isinstance(n, ast.FunctionDef)]
+    functions = [n for n in ast.walk(tree_of(path)) if isinstance(n, ast.FunctionDef)]
     bodies = [[s for s in f.body if not (isinstance(s, ast.Expr) and isinstance(s.value, ast.Constant))] for f in functions]
     return any(bodies)
+
+
+@cache
+def functions_in(path: Path) -> set[str]:
+    return {n.name for n in ast.walk(tree_of(path)) if isinstance(n, ast.FunctionDef)}
 
 
 @pytest.mark.parametrize("entry", ENTRIES, ids=lambda e: f"{e.area}: {e.file}")
@@ -45,8 +52,7 @@ def test_entry_applies(entry: mutate.Mutation) -> None:
     if entry.file.endswith(".py"):
         ast.parse(after, entry.file)
     path, _, name = entry.test.partition("::")
-    functions = [n.name for n in ast.walk(ast.parse((ROOT / path).read_text())) if isinstance(n, ast.FunctionDef)]
-    assert name.split("::")[-1].partition("[")[0] in functions
+    assert name.split("::")[-1].partition("[")[0] in functions_in(ROOT / path)
 
 
 def test_every_module_has_a_mutation() -> None:
@@ -72,6 +78,13 @@ def test_verdicts() -> None:
     assert not mutate.verdict(1, "1 error in 0.1 s")[0]
 
 
+@pytest.fixture
+def bare_pytest(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The tests of small checkouts run in processes of their own: loading plugins, which none needs, is most of their work."""
+    monkeypatch.setenv("PYTEST_DISABLE_PLUGIN_AUTOLOAD", "1")
+
+
+@pytest.mark.usefixtures("bare_pytest")
 def test_the_runner_tells_red_from_green(tmp_path: Path) -> None:
     """A test that sees a mutation and one that does not, in a checkout of two files."""
     (tmp_path / "doubling.py").write_text("def double(x):\n    return 2 * x\n")
@@ -195,7 +208,7 @@ HALVING = "def half(x):\n    return x / 2\ndef least(x):\n    return x if x < 9 
 
 
 @pytest.fixture
-def checkout(tmp_path: Path) -> object:
+def checkout(tmp_path: Path, bare_pytest: None) -> object:
     """Two copies of a checkout with a test that sees half of the module, and one that is red anyway."""
     for name in ("broken", "untouched"):
         (tmp_path / name / "tests").mkdir(parents=True)

@@ -8,9 +8,11 @@ import re
 import sys
 import tomllib
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import pytest
+from syntax import tree_of
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "mivol"
@@ -46,9 +48,10 @@ def untyped(function: Function) -> list[str]:
     return missing + ([] if function.returns is not None else ["return"])
 
 
+@cache
 def said_in(room: Path) -> set[str]:
     """Names of the methods that some class in a folder documents: a protocol says it once for all that follow it."""
-    trees = [ast.parse(path.read_text()) for path in room.glob("*.py")]
+    trees = [tree_of(path) for path in room.glob("*.py")]
     classes = [node for tree in trees for node in tree.body if isinstance(node, ast.ClassDef)]
     return {n.name for node in classes for n in node.body if isinstance(n, Function) and ast.get_docstring(n)}
 
@@ -57,7 +60,7 @@ def said_in(room: Path) -> set[str]:
 def test_docstrings_and_types(path: Path) -> None:
     """Methods of the Mitsuba shells are excused: their names and arguments are Mitsuba's."""
     said = said_in(path.parent)
-    tree = ast.parse(path.read_text(), str(path))
+    tree = tree_of(path)
     assert ast.get_docstring(tree) or not tree.body, f"{path} has no docstring"
     shell = path.parent.name == "plugins"
     faults = []
@@ -87,7 +90,7 @@ def test_third_party_imports_are_declared() -> None:
     declared = {IMPORTED_AS.get(name, name) for name in declared} | {"drjit"}  # mitsuba pins drjit itself
     imported = set()
     for path in MODULES:
-        for node in ast.walk(ast.parse(path.read_text(), str(path))):
+        for node in ast.walk(tree_of(path)):
             if isinstance(node, ast.Import):
                 imported |= {alias.name.split(".")[0] for alias in node.names}
             elif isinstance(node, ast.ImportFrom) and not node.level:
