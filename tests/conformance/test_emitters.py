@@ -23,7 +23,9 @@ pytestmark = pytest.mark.usefixtures("variant_rgb")
 
 
 @pytest.mark.statistical
-@pytest.mark.parametrize("name", small.cases(LAMPS, ["textured area", "area inside", "two that can be met"]))
+@pytest.mark.parametrize(
+    "name", small.cases(LAMPS, ["directional", "point", "textured area", "area inside", "two that can be met"])
+)
 def test_lamps(name):
     box, _ = smoke(rough_grid(1), name="hg", g=0.4)
     image, _ = same({"smoke": box, **LAMPS[name]()}, precision=0.02)

@@ -60,7 +60,11 @@ OWN_PHASES = [("hg forward", "own"), ("tabphase", "own"), ("blendphase", "own")]
 
 @pytest.mark.statistical
 @pytest.mark.parametrize(
-    ("name", "kind"), small.cases([*((name, "stock") for name in PHASES), *OWN_PHASES], [("hg backward", "stock"), *OWN_PHASES])
+    ("name", "kind"),
+    small.cases(
+        [*((name, "stock") for name in PHASES), *OWN_PHASES],
+        [*((name, "stock") for name in ("isotropic", "hg backward", "blendphase")), *OWN_PHASES],
+    ),
 )
 def test_phase_functions(name, kind):
     """Under a sky with a bright spot (directions are sampled both ways) and a point light (one direction only).

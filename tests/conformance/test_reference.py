@@ -467,7 +467,7 @@ def test_our_own_plugins(variant_rgb):
 
 
 @pytest.mark.statistical
-@pytest.mark.parametrize("names", [("sigma_t", "albedo"), ("sigma_a", "sigma_s")])
+@pytest.mark.parametrize("names", [pytest.param(("sigma_t", "albedo"), marks=pytest.mark.slow), ("sigma_a", "sigma_s")])
 def test_our_own_medium_channel_by_channel(variant_rgb, tmp_path, names):
     """Both pairs of coefficients of mivol_medium, over rgb voxels."""
     medium = {"type": "mivol_medium", names[0]: _voxels(RGB / 4), names[1]: 0.0}

@@ -154,7 +154,8 @@ def test_fog_without_an_end_by_quadrature_and_its_derivatives():
     quiet = mi.load_dict(mivol(deterministic=True))
 
     def picture(sigma: float, spp: int, seed: int = 0) -> float:
-        params[key] = mi.Float(sigma)
+        # Opaque: as a literal each density would be compiled anew.
+        params[key] = dr.opaque(mi.Float, sigma)
         params.update()
         return float(np.array(mi.render(scene, integrator=quiet, spp=spp, seed=seed)).mean(dtype=np.float64))
 
@@ -196,7 +197,7 @@ def _world(unit: float) -> dict:
     }
 
 
-@pytest.mark.parametrize("unit", [2.0**-7, 2.0**-14])
+@pytest.mark.parametrize("unit", small.cases([2.0**-7, 2.0**-14], [2.0**-7]))
 def test_worlds_of_any_size(unit):
     """Lengths in another unit: the same image. Mitsuba starts rays 1e-4 behind a surface, whatever the scene's size."""
     big, small_one = (
@@ -211,7 +212,7 @@ def test_hidden_emitters():
     """hide_emitters takes the lamps out of the picture, not their light off the smoke."""
     parts = {"smoke": smoke(rough_grid(5))[0], "lamp": area(0.0, 2.0, 0.0, size=1.0), "sky": scenes.sky(0.5)}
     image, _ = same(parts, ours=mivol(hide_emitters=True), stock=volpath(hide_emitters=True))
-    shown = moments(close_up(parts), mivol(), 16, 2)
+    shown = moments(close_up(parts), mivol(), 32, 2)
     assert shown.mean.max() > 4 > image.mean.max() > 0.01
 
 
