@@ -1,0 +1,66 @@
+"""Reservoirs of distances where they are hard: one dense voxel, and channels of very different extinction."""
+
+from __future__ import annotations
+
+import numpy as np
+import oracle_scattering as twins
+import pytest
+from false_alarms import Estimate, assert_precise, assert_same_mean
+from hard_scattering import BATCHES, holds_twin
+from scattering_scenes import PLACE, aimed, mivol, pencils, point, rough_grid, smoke, sun
+
+import scenes
+from scenes import as_float32, box_of, grid_volume, medium
+
+pytestmark = pytest.mark.usefixtures("variant_rgb")
+
+
+@pytest.mark.statistical
+@pytest.mark.parametrize("peak", [20.0, 2000.0])
+def test_one_dense_voxel(peak):
+    """One voxel 10 or 1000 times denser than the rest, off the rays and between some of them and the lamp: the same law.
+
+    Hard case 31.
+    """
+    values = rough_grid(6)
+    values[-1, -1, -1] = peak
+    box, m = smoke(values, 0.8, "own")
+    lamp = point([1.5, 1, 2.0])
+    holds_twin(pencils({"smoke": box, "lamp": lamp[0]}, *aimed(6, 6)), m, lamp[1], quadrature=1e-4, order=16)
+
+
+def test_noise_does_not_follow_the_majorant():
+    """Rays that never come near the dense voxel see what they see without it, to the last digits, with the same noise.
+
+    Hard case 31.
+    """
+    values = rough_grid(6)
+    o = as_float32(np.stack([np.full(4, -3.0), np.linspace(-0.8, 0.0, 4), np.full(4, -0.5)], axis=1))
+    images = []
+    for peak in (1.0, 1000.0):
+        values[-1, -1, -1] = peak
+        box, _ = smoke(values, 0.8, "own")
+        seen = pencils({"smoke": box, "sun": sun([0, 0, 1.0])[0]}, o, [1.0, 0, 0])
+        images.append(scenes.render(seen.scene, mivol(), 16, seed=2))
+    assert np.allclose(*images, rtol=1e-5, atol=0)
+
+
+@pytest.mark.statistical
+@pytest.mark.parametrize("ratio", [(1e-3, 1.0, 10.0), (0.0, 1.0, 2.0), (8.0, 8.0, 8e-4)])
+def test_channels_of_very_different_extinction(ratio):
+    """Each channel is its own grey picture: at ratios of 1e4, and with a channel that is vacuum. Hard case 32."""
+    values = as_float32(rough_grid(7, 1.0) * np.array(ratio))
+    interior = medium("mivol_medium", grid_volume("mivol_voxels", values, PLACE), 0.8, phase={"type": "hg", "g": 0.4})
+    lamp = point([1.5, 1, 2.0])
+    seen = pencils({"smoke": box_of(interior, PLACE), "lamp": lamp[0]}, *aimed(7, 6))
+    m = twins.Medium(twins.Grid(values, PLACE), float(as_float32(0.8)), twins.hg(0.4))
+    truth = twins.radiance([m], [lamp[1]], seen.o, seen.d)
+    found = seen.moments(mivol(), 4096, BATCHES)
+    for c in range(3):
+        top = truth[:, c].max()
+        channel = Estimate(found.mean[:, c], found.variance_of_mean[:, c], BATCHES - 1)
+        assert_same_mean(channel, truth[:, c], rounding=2e-5 * top + 1e-30, what=f"channel {c}")
+        bright = truth[:, c] > 0.1 * top
+        if top > 0:
+            assert_precise(channel._replace(var=channel.var[bright]), 0.03 * truth[bright, c], what=f"channel {c}")
+    assert np.all(found.mean >= 0)

@@ -1,0 +1,15 @@
+"""Scenes and renders for the hard cases of single scattering."""
+
+from __future__ import annotations
+
+import oracle_scattering as twins
+import scattering_scenes as small
+from scattering_scenes import Pencils, mivol
+
+BATCHES = 16
+
+
+def holds_twin(seen: Pencils, m: twins.Medium, lamp: twins.Lamp, spp: int = 2048, level: float = 2e-5, **more: object) -> None:
+    """The twin's radiance within Student's t, and float32 rounding of `level` of the largest."""
+    top = twins.radiance([m], [lamp], seen.o, seen.d).max()
+    small.assert_twin(seen, [m], [lamp], mivol(), spp, rounding=level * top, **more)
