@@ -154,8 +154,7 @@ def test_fog_without_an_end_by_quadrature_and_its_derivatives():
     quiet = mi.load_dict(mivol(deterministic=True))
 
     def picture(sigma: float, spp: int, seed: int = 0) -> float:
-        # Opaque: as a literal each density would be compiled anew.
-        params[key] = dr.opaque(mi.Float, sigma)
+        params[key] = mi.Float(sigma)
         params.update()
         return float(np.array(mi.render(scene, integrator=quiet, spp=spp, seed=seed)).mean(dtype=np.float64))
 
