@@ -163,23 +163,28 @@ def _disagreements(scene: mi.Scene, ray: mi.Ray3f, closed: set[int], size: float
     going, sure, found = np.ones(n, bool), np.ones(n, bool), []
     for _ in range(CROSSINGS):
         si = scene.ray_intersect(ray, mi.RayFlags.All, False, mi.Bool(going))
-        hit = np.array(si.is_valid()) & going
+        sides = [_numbers(p) for p in (si.shape, si.target_medium(-ray.d), si.target_medium(ray.d))]
+        facts = [si.is_valid(), si.is_medium_transition(), dr.dot(si.n, ray.d) < 0, _is_opaque(si)]
+        ray = spawn_ray(si, ray.d, size)
+        # At once, and the next ray too: otherwise the kernels of each crossing would repeat all crossings before it, so that
+        # every one of them would be compiled anew (8 s for 12 boxes).
+        dr.eval(sides, facts, ray)
+        shape, near, far = (np.array(numbers).astype(int) for numbers in sides)
+        valid, transition, enters, opaque = map(np.array, facts)
+        hit = valid & going
         left = going & ~hit & sure & (inside != UNKNOWN) & (inside != outside)
         found += zip(*(np.stack([np.arange(n), last, last])[:, left]).tolist(), strict=True)
         going = hit
         if not going.any():
             break
-        shape = np.array(_numbers(si.shape)).astype(int)
-        crosses = going & np.array(si.is_medium_transition())
-        near, far = (np.array(_numbers(si.target_medium(d))).astype(int) for d in (-ray.d, ray.d))
-        whole, enters = np.isin(shape, list(closed)), np.array(dr.dot(si.n, ray.d) < 0)
+        crosses = going & transition
+        whole = np.isin(shape, list(closed))
         wrong = crosses & (inside != UNKNOWN) & (near != inside) & ((sure & whole) | (enters & (inside != 0)))
         found += zip(*(np.stack([np.arange(n), last, shape])[:, wrong]).tolist(), strict=True)
         sure &= whole | ~crosses
         outside = np.where(crosses & (outside == UNKNOWN), near, outside)
-        inside = np.where(crosses, far, np.where(np.array(_is_opaque(si)), UNKNOWN, inside))
+        inside = np.where(crosses, far, np.where(opaque, UNKNOWN, inside))
         last = np.where(crosses, shape, last)
-        ray = spawn_ray(si, ray.d, size)
     return found
 
 

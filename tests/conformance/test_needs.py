@@ -13,6 +13,7 @@ import scenes
 from mivol.scene import plan
 from mivol.scene.explain import explain
 from mivol.scene.needs import find_needs
+from mivol.scene.nesting import nesting_fault
 from mivol.scene.plan import make_plan
 from mivol.transport.path.settings import Settings
 from scenes import ball_of, box_of, camera, grid_volume, medium, refused, sky
@@ -273,6 +274,20 @@ def test_media_that_say_what_is_around_them_are_taken():
     ask(nested(ball_of(medium("homogeneous", 2.0), (side, side, side), 0.9)))
     one, two = ((x, 0.4 * x / abs(x), 0) for x in (-2.0, 2.0))
     ask(scene_of(ball=ball_of(haze, one, 0.9), other=ball_of(medium("homogeneous", 2.0), two, 0.9)))
+
+
+def test_the_crossings_of_a_row_of_boxes_share_their_kernels():
+    """4 faces of 2 boxes, up to 12 of 6: rays that are not evaluated at each would have it compiled anew."""
+
+    def launched(boxes: int) -> set:
+        row = {f"box{k}": box_of(medium("homogeneous", 1.0), scenes.centred(np.eye(3), (0, 0, 1.5 * k))) for k in range(boxes)}
+        scene = mi.load_dict({"type": "scene", **row})
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+            dr.kernel_history_clear()
+            assert nesting_fault(scene) is None
+            return {k["hash"] for k in dr.kernel_history([dr.KernelType.JIT])}
+
+    assert 0 < len(launched(6)) == len(launched(2))
 
 
 def _turned(centre: tuple, size: tuple = (1, 1, 1)) -> np.ndarray:
