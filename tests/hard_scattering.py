@@ -1,4 +1,4 @@
-"""Scenes and renders for the hard cases of single scattering."""
+"""What tests of hard cases of single scattering share: the comparison of pencils with the float64 twin."""
 
 from __future__ import annotations
 
