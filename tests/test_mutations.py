@@ -265,3 +265,8 @@ def test_survivors_are_counted_and_named():
     survivors.report(iter(verdicts), 2, said.append)
     assert said[-2:] == ["1 of 2 faults were killed (50 %)", "survived: a.py:2: operator '+' -> '-'"]
     assert "tests/test_a.py::t" in said[0] and "SURVIVED" in said[1]
+
+
+def test_the_page_of_guards_is_what_the_mutations_say() -> None:
+    """docs/guards.md is made by scripts/guard_page.py --write."""
+    assert (ROOT / "docs" / "guards.md").read_text() == load("guard_page").page()

@@ -63,6 +63,7 @@ def is_lit(needs: Needs, settings: Settings) -> bool:
 
 
 def choose_transport(needs: Needs, settings: Settings) -> Choice:
+    """How light passes media: what is computed of it."""
     if not needs.media:
         return Choice("media", "none", "no shape bounds a medium")
     if is_lit(needs, settings):
@@ -112,6 +113,7 @@ def choose_lighting(needs: Needs, settings: Settings) -> list[Choice]:
 
 
 def choose_tracing(needs: Needs) -> Choice:
+    """Whether Mitsuba's acceleration structure is traced."""
     traced = [m.name for m, b in zip(needs.media, needs.boundaries, strict=True) if b.box is None]
     if needs.surfaces:
         return Choice("acceleration structure", "traced", f"surfaces may stop a ray: {', '.join(sorted(set(needs.surfaces)))}")
@@ -121,13 +123,15 @@ def choose_tracing(needs: Needs) -> Choice:
 
 
 def choose_channels(needs: Needs) -> Choice:
+    """How many channels an extinction is integrated in."""
     rgb = [m.name for m in needs.media if m.extinction == "rgb"]
     if rgb:
         return Choice("channels", "3", f"rgb extinction in {', '.join(rgb)}")
     return Choice("channels", "1", "every extinction is grey")
 
 
-def choose_skipping(medium, skip: bool) -> Choice:
+def choose_skipping(medium: MediumFacts, skip: bool) -> Choice:
+    """Whether a walk of a medium skips empty blocks."""
     share = f"{medium.occupied:.0%} of its blocks hold anything"
     return Choice(f"empty space in {medium.name}", "skipped" if skip else "walked", share)
 

@@ -40,6 +40,7 @@ def check_aovs(names: str) -> tuple[str, ...]:
 
 
 def refuse_scattering(needs: Needs, settings: Settings) -> None:
+    """Refuse media that scatter more often than an estimator follows."""
     for medium in needs.media:
         if medium.is_scattering and not medium.unread and settings.scatterings > MOST_SCATTERINGS:
             raise MivolError(
@@ -49,6 +50,7 @@ def refuse_scattering(needs: Needs, settings: Settings) -> None:
 
 
 def refuse_refraction(needs: Needs, settings: Settings) -> None:
+    """Refuse boundaries that bend shadow rays."""
     if needs.refractive and is_lit(needs, settings):
         raise MivolError(
             f"the boundary {needs.refractive[0]} refracts and its scene has a medium that scatters; no straight shadow ray "
@@ -57,6 +59,7 @@ def refuse_refraction(needs: Needs, settings: Settings) -> None:
 
 
 def refuse_emission(needs: Needs, settings: Settings) -> None:
+    """Refuse emission beside scattering, and emission that varies faster than the cells that are summed."""
     glowing = [m.name for m in needs.media if m.emits]
     if glowing and is_lit(needs, settings):
         raise MivolError(
@@ -91,6 +94,7 @@ def _voxel_over_cells(volume: mi.Volume, view: MediumView) -> float:
 
 
 def refuse_places(needs: Needs) -> None:
+    """Refuse derivatives of places that are not followed."""
     if needs.places:
         raise MivolError(
             f"the derivative of {needs.places[0]} was asked for; mivol has none of shapes, of lamps that have a size, nor of "
@@ -99,6 +103,7 @@ def refuse_places(needs: Needs) -> None:
 
 
 def refuse_quadrature(needs: Needs, settings: Settings) -> None:
+    """Refuse settings of shadows that contradict each other, and quadrature of scenes that it does not serve."""
     if settings.shadows not in SHADOWS:
         raise MivolError(f"shadows is {settings.shadows!r}; {', '.join(SHADOWS[:-1])} or {SHADOWS[-1]} is expected.")
     if settings.shadows == "estimated" and settings.deterministic:

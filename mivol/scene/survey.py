@@ -110,6 +110,7 @@ def _is_bare(shape: mi.Shape) -> bool:
 
 
 def is_instance(shape: mi.Shape) -> bool:
+    """Whether a shape is an instance of a group of shapes."""
     return shape.class_name() == "Instance"
 
 

@@ -43,6 +43,7 @@ class Emission:
         """Nothing is needed."""
 
     def replayed(self) -> Emission:
+        """The light of emission is met again by a replay."""
         return self
 
     def estimate(self, segment: PathSegment, purpose: str, active: mi.Bool) -> SegmentEstimate:
