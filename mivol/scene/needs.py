@@ -122,7 +122,7 @@ def _phase_name(phase: mi.PhaseFunction | None) -> str:
 
 def _tau_max(boundary: Boundary, view: MediumView, reads: list[Reading]) -> float | None:
     """Bound the optical depth through a medium: its largest extinction times the diagonal of its box."""
-    constants = [float(np.max(np.array(dr.detach(p.constant)))) for p in view.parts if p.constant is not None]
+    constants = [float(np.max(np.array(dr.detach(p.constant)))) for p in view.parts if p.lattice is None]
     if boundary.box is None:
         return None
     corners = boundary.box.corners()

@@ -14,8 +14,12 @@ import mitsuba as mi
 import numpy as np
 
 from mivol.errors import MivolError
+from mivol.transport.media.activated_grid_extinction import ActivatedGridExtinction
 from mivol.transport.media.box import Box
-from mivol.transport.media.medium_view import MediumView, Part
+from mivol.transport.media.constant_extinction import ConstantExtinction
+from mivol.transport.media.extinction import Extinction
+from mivol.transport.media.grid_extinction import GridExtinction
+from mivol.transport.media.medium_view import MediumView
 from mivol.transport.traversal.lattice import Lattice
 
 __all__ = ["children_of", "traverse_medium", "view_medium"]
@@ -101,10 +105,10 @@ def _field(params: mi.SceneParameters, name: str) -> mi.Volume | mi.Float | mi.C
     return None if key is None else params.properties[key][2]
 
 
-def _part_of_field(volume: mi.Volume) -> Part:
+def _part_of_field(volume: mi.Volume) -> ActivatedGridExtinction:
     """The extinction of a radiance field, which brings its own."""
     lattice = Lattice(volume.mivol_density, volume.mivol_to_world)
-    return Part("sigma_t", lattice=lattice, activation=volume.mivol_field.act)
+    return ActivatedGridExtinction("sigma_t", lattice, volume.mivol_field.act)
 
 
 def _emission_lattice(emission_density: object, others: list, boundary: Box | None, places: dict) -> Lattice | None:
@@ -168,12 +172,14 @@ def traverse_medium(medium: mi.Medium) -> mi.SceneParameters:
     return params
 
 
-def _part(name: str, params: mi.SceneParameters, volume: mi.Volume, kind: str, boundary: Box | None, places: dict) -> Part:
+def _part(
+    name: str, params: mi.SceneParameters, volume: mi.Volume, kind: str, boundary: Box | None, places: dict
+) -> Extinction:
     """The part of an extinction under ``name`` among a medium's parameters."""
     grid, constant = f"{name}.data", f"{name}.value.value"
     if grid in params.properties:
         lattice = Lattice(_tensor(params[grid]), _place(volume, boundary, places))
-        return Part(name, lattice=lattice, volume=volume if volume.class_name() == "GridVolume" else None)
+        return GridExtinction(name, lattice, volume if volume.class_name() == "GridVolume" else None)
     if constant not in params.properties:
         found = sorted(k for k in params.properties if k.startswith(name + "."))
         raise MivolError(
@@ -182,12 +188,12 @@ def _part(name: str, params: mi.SceneParameters, volume: mi.Volume, kind: str, b
         )
     value = params[constant]
     if kind != "HeterogeneousMedium":  # a stock heterogeneous fills the box of its constvolume only
-        return Part(name, constant=value)
+        return ConstantExtinction(name, value)
     channels = [value[c] for c in range(dr.size_v(value))] if dr.size_v(value) == 3 else [mi.Float(value)]
     values = mi.TensorXf(dr.ravel(mi.Color3f(*channels)) if len(channels) == 3 else channels[0], (1, 1, 1, len(channels)))
     if volume.ptr not in places:
         places[volume.ptr] = place_of_grid(volume)
-    return Part(name, lattice=Lattice(values, places[volume.ptr]))
+    return GridExtinction(name, Lattice(values, places[volume.ptr]))
 
 
 def _tensor(values: mi.TensorXf) -> mi.TensorXf:
