@@ -50,9 +50,7 @@ class ConstantExtinction:
     ) -> list[mi.Float]:
         return self._along(dr.detach(self.constant), _length(t0, t1, active))
 
-    def jvp(
-        self, tangent: mi.Float | mi.Color3f, ray: mi.Ray3f, t0: mi.Float, t1: mi.Float, active: mi.Bool
-    ) -> list[mi.Float]:
+    def jvp(self, tangent: mi.Float | mi.Color3f, ray: mi.Ray3f, t0: mi.Float, t1: mi.Float, active: mi.Bool) -> list[mi.Float]:
         return self._along(tangent, _ending(_length(t0, t1, active)))
 
     def vjp(

@@ -66,7 +66,5 @@ class ExactExtinction(Extinction, Protocol):
     def jvp(self, tangent: Any, ray: mi.Ray3f, t0: mi.Float, t1: mi.Float, active: mi.Bool) -> list[mi.Float]:
         """Tangent of the optical depth, the scale included."""
 
-    def vjp(
-        self, gradient: Any, weight: list[mi.Float], ray: mi.Ray3f, t0: mi.Float, t1: mi.Float, active: mi.Bool
-    ) -> None:
+    def vjp(self, gradient: Any, weight: list[mi.Float], ray: mi.Ray3f, t0: mi.Float, t1: mi.Float, active: mi.Bool) -> None:
         """Add ``weight`` (d loss / d tau) times the interval to a gradient: the transpose of :meth:`jvp`."""

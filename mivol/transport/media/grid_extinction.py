@@ -80,9 +80,7 @@ class GridExtinction:
         add_to_cell(gradient, cell, [(weight, corners)], inside & active)
 
 
-def interpolate_at(
-    lattice: Lattice, values: mi.Float, ray: mi.Ray3f, t: mi.Float, active: mi.Bool
-) -> list[mi.Float]:
+def interpolate_at(lattice: Lattice, values: mi.Float, ray: mi.Ray3f, t: mi.Float, active: mi.Bool) -> list[mi.Float]:
     """Each channel of flat node values at a point of a ray; 0 outside the grid's box."""
     cell, frac, inside = locate(lattice, ray.o, ray.d, t)
     upward = dr.full(dr.mask_t(mi.Vector3f), True)
