@@ -24,7 +24,14 @@ from mivol.scene.choices import (
     is_lit,
 )
 from mivol.scene.facts import Needs
-from mivol.scene.refusals import refuse_emission, refuse_places, refuse_quadrature, refuse_refraction, refuse_scattering
+from mivol.scene.refusals import (
+    refuse_bounded,
+    refuse_emission,
+    refuse_places,
+    refuse_quadrature,
+    refuse_refraction,
+    refuse_scattering,
+)
 from mivol.transport.media.grid_integral import PACKED_LIMIT, gradient_bytes
 from mivol.transport.path.settings import Settings
 
@@ -57,7 +64,7 @@ class Plan:
     gradient_bytes: int
 
 
-def make_plan(needs: Needs, settings: Settings) -> Plan:
+def make_plan(needs: Needs, settings: Settings, aovs: tuple[str, ...] = ()) -> Plan:
     """Choose from the facts.
 
     Raises:
@@ -69,6 +76,7 @@ def make_plan(needs: Needs, settings: Settings) -> Plan:
     refuse_emission(needs, settings)
     refuse_quadrature(needs, settings)
     refuse_places(needs)
+    refuse_bounded(needs, settings, aovs)
     choices = [
         choose_transport(needs, settings),
         *choose_emission(needs),
@@ -97,6 +105,8 @@ def _segment(needs: Needs, settings: Settings) -> str:
     """Name of the estimator of what media add along a segment."""
     if any(m.emits for m in needs.media):
         return "emission"
+    if any(m.bounded for m in needs.media):
+        return "tracked_absorption"
     if not needs.lamps or not is_lit(needs, settings):
         return "absorption"
     return "scattering_quadrature" if settings.deterministic else "single_scattering"

@@ -84,7 +84,9 @@ class DirectLighting:
     def __init__(self, media: SceneMedia, emitters: SceneEmitters) -> None:
         self.media, self.emitters = media, emitters
 
-    def at_surface(self, vertex: SurfaceVertex, u: mi.Point2f, attached: bool, active: mi.Bool) -> DirectSample:
+    def at_surface(
+        self, vertex: SurfaceVertex, u: mi.Point2f, attached: bool, active: mi.Bool, chance: mi.Float | None = None
+    ) -> DirectSample:
         """Estimate what a surface receives from one emitter and turns; the path's next segment holds the other sample.
 
         Args:
@@ -92,9 +94,11 @@ class DirectLighting:
             u: two numbers in [0, 1).
             attached: keep the derivatives of BSDF and emitter.
             active: lanes to light.
+            chance: a number in [0, 1) that estimates the shadow, where media are bounded.
         """
+        rng = None if chance is None else seed_pcg32(chance, dr.width(active))
         direct, weight = self.media.scene.sample_emitter_direction(vertex.interaction, u, False, active)
-        return self._aimed(vertex, EmitterAim(direct, weight, direct.emitter, u, 1, True), attached, active)
+        return self._aimed(vertex, EmitterAim(direct, weight, direct.emitter, u, 1, True), attached, active, rng)
 
     def in_medium(
         self,

@@ -39,6 +39,7 @@ from mivol.transport.estimators.transmittance_grid import TransmittanceGrid
 from mivol.transport.media.body import Body
 from mivol.transport.media.channels import spectrum
 from mivol.transport.media.coefficients import eval_albedo, medium_interaction
+from mivol.transport.media.optical_depth import transmittance
 from mivol.transport.media.ray_intervals import RaySegment, visit_media
 from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.traversal.grid_walk import Cell, walk
@@ -106,7 +107,8 @@ class ScatteringQuadrature:
             end, (tau, _, light) = visit_media(self.media, ray, segment.medium, visit, zero, active)
             L += light
         term = TrackedTerm(dr.select(segment.scatters, segment.beta * L, 0), active)
-        return SegmentEstimate(end, tau, term, Transmittance(self.media, RaySegment(ray, segment.medium, end.t), active))
+        passed = RaySegment(ray, segment.medium, end.t)
+        return SegmentEstimate(end, transmittance(tau), term, Transmittance(self.media, passed, active))
 
 
 _Sum = tuple

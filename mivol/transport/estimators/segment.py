@@ -15,7 +15,12 @@ from typing import Any, Protocol
 import mitsuba as mi
 
 from mivol.transport.estimators.contribution import Factor, Term
-from mivol.transport.media.optical_depth import integrate_optical_depth, jvp_optical_depth, vjp_optical_depth
+from mivol.transport.media.optical_depth import (
+    integrate_optical_depth,
+    jvp_optical_depth,
+    transmittance,
+    vjp_optical_depth,
+)
 from mivol.transport.media.ray_intervals import RaySegment, SegmentEnd
 from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.traversal.strata import Strata
@@ -62,13 +67,13 @@ class SegmentEstimate:
 
     Attributes:
         end: where it ends.
-        tau: optical depth [1] of each channel to there.
+        T: share of the light behind that its media let through, or an estimate of it.
         light: what its media add; None where they add nothing.
         transmittance: what they let through of the light behind.
     """
 
     end: SegmentEnd
-    tau: list[mi.Float]
+    T: mi.Spectrum
     light: Term | None
     transmittance: Factor
 
@@ -120,7 +125,7 @@ class Absorption:
     def estimate(self, segment: PathSegment, purpose: str, active: mi.Bool) -> SegmentEstimate:
         end, tau = integrate_optical_depth(self.media, segment.ray, segment.medium, active)
         passed = RaySegment(segment.ray, segment.medium, end.t)
-        return SegmentEstimate(end, tau, None, Transmittance(self.media, passed, active))
+        return SegmentEstimate(end, transmittance(tau), None, Transmittance(self.media, passed, active))
 
 
 class SharedSegment(Protocol):

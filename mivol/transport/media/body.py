@@ -8,6 +8,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from mivol.errors import MivolError
 from mivol.transport.media.box import Box
 from mivol.transport.media.channels import as_rows, for_part
 from mivol.transport.media.extinction import ExactExtinction, Extinction
@@ -24,6 +25,7 @@ class Body:
     Attributes:
         view: the medium's extinction.
         box: the boundary, where it is a box; None where it has to be traced.
+        exact_parts: the parts whose integral along a ray is known.
         flight_parts: the parts that free flights are drawn from in one walk: constants, and grids that share their cells.
         cuts_grids: whether the boundary is smaller than what lies in it, so that stretches must be cut to it.
     """
@@ -34,11 +36,17 @@ class Body:
             view.emission_density is not None or not all(_fits(part, box) for part in view.parts)
         )
         self.rows = box.rows() if box is not None else None
+        self.exact_parts = [p for p in view.parts if p.exact_line]
         self.flight_parts = flight_parts(view.parts)
         self.gradients: list[Any] = []
         self.tangents: list[Any] = []
         self.microflakes_gradient: mi.Float | None = None
         self.microflakes_tangent: list[mi.Float] | None = None
+
+    @property
+    def is_bounded(self) -> bool:
+        """Whether the integral of some part along a ray is not known."""
+        return len(self.exact_parts) < len(self.view.parts)
 
     def area(self, d: mi.Vector3f) -> mi.Float | float:
         """Factor on the extinction for light that travels along ``d``: the projected area of flakes, else 1."""
@@ -83,7 +91,13 @@ class Body:
         parts: list[ExactExtinction] | None = None,
         enough: float | None = None,
     ) -> list[mi.Float]:
-        """Optical depth [1] of each channel over a stretch, of all parts unless told which; a grid may stop at ``enough``."""
+        """Optical depth [1] of each channel over a stretch, of all parts unless told which; a grid may stop at ``enough``.
+
+        Raises:
+            MivolError: of all parts, and one of them is bounded.
+        """
+        if parts is None and self.is_bounded:
+            raise MivolError("the optical depth of a bounded field was asked for; only its transmittance can be estimated.")
         parts = self.view.parts if parts is None else parts
         scale = dr.detach(self.view.scale) * self.area(ray.d)
         bound = None if enough is None else enough / scale
@@ -91,8 +105,8 @@ class Body:
         return [scale * tau for tau in rows]
 
     def tangent(self, ray: mi.Ray3f, t0: mi.Float, t1: mi.Float, channels: int, active: mi.Bool) -> list[mi.Float]:
-        """Derivative of the optical depth along the tangent that :meth:`SceneMedia.start_tangent` took from the parameters."""
-        pairs = zip(self.view.parts, self.tangents, strict=True)
+        """Derivative of the optical depth of the exact parts along the tangent that :meth:`SceneMedia.start_tangent` took."""
+        pairs = [(p, v) for p, v in zip(self.view.parts, self.tangents, strict=True) if p.exact_line]
         area = self.area(ray.d)
         rows = [area * row for row in _sum((part.jvp(change, ray, t0, t1, active) for part, change in pairs), channels)]
         if self.microflakes_tangent is None:
@@ -101,12 +115,23 @@ class Body:
         return [r + t * turned for r, t in zip(rows, self.optical_depth(ray, t0, t1, channels, active), strict=True)]
 
     def backproject(self, ray: mi.Ray3f, t0: mi.Float, t1: mi.Float, weight: list[mi.Float], active: mi.Bool) -> None:
-        """Add ``weight`` (d loss / d tau of each channel) times this stretch to the gradients of the parts."""
+        """Add ``weight`` (d loss / d tau of each channel) times this stretch to the gradients of the exact parts."""
         if self.microflakes_gradient is not None:
             self._vjp_microflakes(ray.d, weight, self.optical_depth(ray, t0, t1, len(weight), active), active)
         weight = [self.area(ray.d) * w for w in weight]
         for part, gradient in zip(self.view.parts, self.gradients, strict=True):
-            part.vjp(gradient, for_part(weight, part.channels), ray, t0, t1, active)
+            if part.exact_line:
+                part.vjp(gradient, for_part(weight, part.channels), ray, t0, t1, active)
+
+    def tangent_of_part(self, part: Extinction, ray: mi.Ray3f, t: mi.Float, channels: int, active: mi.Bool) -> list[mi.Float]:
+        """Tangent of one part's coefficient [1/length] at a point of a ray."""
+        change = next(v for p, v in zip(self.view.parts, self.tangents, strict=True) if p is part)
+        return as_rows(part.jvp_at(change, ray, t, active), channels)
+
+    def deposit_in_part(self, part: Extinction, ray: mi.Ray3f, t: mi.Float, weight: list[mi.Float], active: mi.Bool) -> None:
+        """Add ``weight`` (d loss / d coefficient of each channel) at a point: the transpose of :meth:`tangent_of_part`."""
+        gradient = next(g for p, g in zip(self.view.parts, self.gradients, strict=True) if p is part)
+        part.vjp_at(gradient, for_part(weight, part.channels), ray, t, active)
 
     def extinction_at(self, ray: mi.Ray3f, t: mi.Float, channels: int, active: mi.Bool, name: str = "sigma_") -> list[mi.Float]:
         """Coefficient [1/length] of each channel at a point of a ray: of all parts, or of those called ``name``."""
@@ -163,7 +188,7 @@ def flight_parts(parts: list[Extinction]) -> list[ExactExtinction]:
     """The constants, and the grids that share the cells of the one that scatters."""
     grids = [p for p in parts if p.lattice is not None]
     lead = next((p for p in grids if p.name == "sigma_s"), grids[0] if grids else None)
-    return [p for p in parts if p.lattice is None or share_cells(p.lattice, lead.lattice)]
+    return [p for p in parts if p.exact_line and (p.lattice is None or share_cells(p.lattice, lead.lattice))]
 
 
 def _sum(parts: Iterable[list[mi.Float]], channels: int) -> list[mi.Float]:

@@ -10,6 +10,7 @@ import mitsuba as mi
 
 from mivol.transport.media.body import Body
 from mivol.transport.media.channels import by_channel, spectrum
+from mivol.transport.media.drawn_points import DrawnPoint, bounded_parts, draw_in, start_points
 from mivol.transport.media.ray_intervals import MediumVisitor, RaySegment, SegmentEnd, revisit_media, visit_media
 from mivol.transport.media.scene_media import SceneMedia
 
@@ -73,11 +74,17 @@ def vjp_optical_depth(media: SceneMedia, segment: RaySegment, weight: mi.Spectru
 def vjp_rows(media: SceneMedia, segment: RaySegment, weight: list[mi.Float], active: mi.Bool) -> None:
     """As :func:`vjp_optical_depth`, ``weight`` one number for each channel."""
 
-    def visit(state: mi.Float, body: Body, t0: mi.Float, t1: mi.Float, on: mi.Bool) -> mi.Float:
-        body.backproject(segment.ray, t0, t1, weight, on)
-        return state
+    bounded = bounded_parts(media.bodies)
 
-    revisit_media(media, segment, visit, mi.Float(0), active)
+    def visit(points: list[DrawnPoint], body: Body, t0: mi.Float, t1: mi.Float, on: mi.Bool) -> list[DrawnPoint]:
+        body.backproject(segment.ray, t0, t1, weight, on)
+        return _pass(points, bounded, body, segment.ray, t0, t1, on)
+
+    points = revisit_media(media, segment, visit, start_points(len(bounded), segment.u, dr.width(segment.ray)), active)
+    for (body, part), point in zip(bounded, points, strict=True):
+        # After the walk: what Dr.Jit pulls back in a loop is lost where the same array was pulled to before it.
+        on, each = active & (point.total > 0), [w * point.total for w in weight]
+        body.deposit_in_part(part, segment.ray, point.t, each, on)
 
 
 def jvp_optical_depth(media: SceneMedia, segment: RaySegment, active: mi.Bool) -> mi.Spectrum:
@@ -88,7 +95,27 @@ def jvp_optical_depth(media: SceneMedia, segment: RaySegment, active: mi.Bool) -
 def jvp_rows(media: SceneMedia, segment: RaySegment, active: mi.Bool) -> list[mi.Float]:
     """As :func:`jvp_optical_depth`, one number for each channel."""
 
-    def visit(tau: list[mi.Float], body: Body, t0: mi.Float, t1: mi.Float, on: mi.Bool) -> list[mi.Float]:
-        return [t + d for t, d in zip(tau, body.tangent(segment.ray, t0, t1, len(tau), on), strict=True)]
+    bounded, zero = bounded_parts(media.bodies), [mi.Float(0) for _ in range(media.channels)]
 
-    return revisit_media(media, segment, visit, [mi.Float(0) for _ in range(media.channels)], active)
+    def visit(state: tuple, body: Body, t0: mi.Float, t1: mi.Float, on: mi.Bool) -> tuple:
+        tau, points = state
+        tau = [t + d for t, d in zip(tau, body.tangent(segment.ray, t0, t1, len(tau), on), strict=True)]
+        return tau, _pass(points, bounded, body, segment.ray, t0, t1, on)
+
+    start = (zero, start_points(len(bounded), segment.u, dr.width(segment.ray)))
+    tau, points = revisit_media(media, segment, visit, start, active)
+    for (body, part), point in zip(bounded, points, strict=True):
+        on = active & (point.total > 0)
+        rows = body.tangent_of_part(part, segment.ray, point.t, media.channels, on)
+        tau = [t + dr.select(on, point.total * row, 0) for t, row in zip(tau, rows, strict=True)]
+    return tau
+
+
+def _pass(
+    points: list[DrawnPoint], bounded: list[tuple], body: Body, ray: mi.Ray3f, t0: mi.Float, t1: mi.Float, on: mi.Bool
+) -> list[DrawnPoint]:
+    """Pass an interval of one body with the points of all bounded parts."""
+    return [
+        draw_in(point, part, ray, t0, t1, on) if owner is body else point
+        for (owner, part), point in zip(bounded, points, strict=True)
+    ]

@@ -58,12 +58,15 @@ class RaySegment:
         medium: the medium around its origin.
         length: how far it went [length].
         passes_null: whether it passed surfaces that transmit part of the light undeviated.
+        u: a number in [0, 1) that draws the points at which derivatives of bounded media are looked at; None where all optical
+            depths are exact.
     """
 
     ray: mi.Ray3f
     medium: mi.MediumPtr
     length: mi.Float | mi.Float64
     passes_null: bool = False
+    u: mi.Float | None = None
 
     @classmethod
     def upto(cls, ray: mi.Ray3f, medium: mi.MediumPtr, t: mi.Float64) -> RaySegment:

@@ -78,6 +78,11 @@ class SceneMedia:
         return any(p.lattice is not None and p.lattice.block_ranges is not None for b in self.bodies for p in b.view.parts)
 
     @property
+    def is_bounded(self) -> bool:
+        """Whether the optical depth of some medium is not known along a ray, so that its transmittance is estimated."""
+        return any(b.is_bounded for b in self.bodies)
+
+    @property
     def emits(self) -> bool:
         """Whether some medium is a source of light."""
         return any(b.view.emits for b in self.bodies)

@@ -16,6 +16,7 @@ from mivol.transport.estimators.emitters import SceneEmitters
 from mivol.transport.estimators.scattering_quadrature import ScatteringQuadrature
 from mivol.transport.estimators.segment import Absorption, SegmentEstimator
 from mivol.transport.estimators.single_scattering import SingleScattering
+from mivol.transport.estimators.tracked_absorption import TrackedAbsorption
 from mivol.transport.estimators.transmittance_grid import TransmittanceGrid
 from mivol.transport.estimators.visibility_cache import VisibilityCache
 from mivol.transport.line_integrals.emitting_segment import Emission
@@ -63,6 +64,11 @@ SEGMENT_ESTIMATORS = {
         lambda choice: Absorption(choice.direct.media),
         "no medium shines or scatters light to the camera",
         "no bias, no variance",
+    ),
+    "tracked_absorption": SegmentEntry(
+        lambda choice: TrackedAbsorption(choice.direct.media),
+        "a medium is bounded, and none shines or scatters light to the camera",
+        "no bias, of derivatives neither; variance of ratio tracking, and of one point a segment for derivatives",
     ),
     "emission": SegmentEntry(
         lambda choice: Emission(choice.direct.media),
