@@ -37,7 +37,10 @@ class Field(Protocol):
     to_world: np.ndarray
 
     def eval(self, p: mi.Point3f, w: mi.Vector3f, active: mi.Bool) -> list[mi.Float]:
-        """Values of each channel at world points, for light that travels along ``w``; attached to the parameters."""
+        """Values of each channel at world points, for light that travels along ``w``; attached to the parameters.
+
+        Lanes that are not active have the value 0.
+        """
 
     def accumulate(self, p: mi.Point3f, w: mi.Vector3f, d: list[mi.Float], active: mi.Bool) -> None:
         """Add ``d`` (d loss / d value of each channel) at points to the gradients of the parameters: the transpose."""
@@ -54,5 +57,4 @@ def accumulate_tracked(field: Field, p: mi.Point3f, w: mi.Vector3f, d: list[mi.F
     with dr.resume_grad():
         values = field.eval(p, w, active)
         if dr.grad_enabled(values):
-            carried = (dr.select(active, weight * value, 0) for weight, value in zip(d, values, strict=True))
-            dr.backward_from(sum(carried, mi.Float(0)))
+            dr.backward_from(sum((weight * value for weight, value in zip(d, values, strict=True)), mi.Float(0)))
