@@ -11,6 +11,7 @@ import mitsuba as mi
 import numpy as np
 
 from mivol.errors import MivolError
+from mivol.fields.protocol import EXACT_LINE, accumulate_tracked
 from mivol.files import check_volume, read_volume
 from mivol.space import check_affine
 
@@ -30,6 +31,8 @@ class Voxels:
     Raises:
         MivolError: values or a placement that no medium can have; the first bad voxel is named.
     """
+
+    line = EXACT_LINE
 
     def __init__(
         self,
@@ -92,16 +95,24 @@ class Voxels:
         """Resolution (Z, Y, X)."""
         return tuple(self.texture.tensor().shape[:3])
 
-    def eval(self, p: mi.Point3f, active: mi.Bool = True) -> list[mi.Float]:
-        """Values at world points, one entry a channel; 0 outside the box."""
+    def eval(self, p: mi.Point3f, w: mi.Vector3f | None = None, active: mi.Bool = True) -> list[mi.Float]:
+        """Values at world points, one entry a channel; 0 outside the box. The direction ``w`` changes nothing."""
         q = mi.AffineTransform4f(self.to_local) @ p
         inside = mi.Bool(active) & dr.all((q >= 0) & (q <= 1))
         return [dr.select(inside, v, 0) for v in self.texture.eval(q, inside)]
 
     def eval_colour(self, p: mi.Point3f, active: mi.Bool = True) -> list[mi.Float]:
         """As :meth:`eval`; an rgb grid has one channel, its luminance, in a mono variant, as ``gridvolume`` has it."""
-        values = self.eval(p, active)
+        values = self.eval(p, None, active)
         return [mi.luminance(mi.Color3f(*values))] if mi.is_monochromatic and len(values) == 3 else values
+
+    def accumulate(self, p: mi.Point3f, w: mi.Vector3f | None, d: list[mi.Float], active: mi.Bool = True) -> None:
+        """Add ``d`` (d loss / d value of each channel) at world points to the gradient of the voxels."""
+        accumulate_tracked(self, p, w, d, active)
+
+    def parameters(self) -> dict[str, mi.TensorXf]:
+        """The tensor of the voxels, ``data``."""
+        return {"data": self.texture.tensor()}
 
     def bound(self) -> list[float]:
         """Largest value of each channel."""

@@ -40,10 +40,10 @@ class VoxelVolume(mi.Volume):
         return self.field.eval_colour(it.p, active)[0]
 
     def eval_3(self, it: mi.Interaction3f, active: mi.Bool = True) -> mi.Vector3f:
-        return mi.Vector3f(*self.field.eval(it.p, active))
+        return mi.Vector3f(*self.field.eval(it.p, None, active))
 
     def eval_n(self, it: mi.Interaction3f, active: mi.Bool = True) -> list[mi.Float]:
-        return self.field.eval(it.p, active)
+        return self.field.eval(it.p, None, active)
 
     def max(self) -> float:
         return max(self.field.bound())
@@ -58,7 +58,8 @@ class VoxelVolume(mi.Volume):
         return self.field.channels
 
     def traverse(self, callback: mi.TraversalCallback) -> None:
-        callback.put("data", self.field.texture.tensor(), mi.ParamFlags.Differentiable)
+        for name, value in self.field.parameters().items():
+            callback.put(name, value, mi.ParamFlags.Differentiable)
 
     def parameters_changed(self, keys: list[str]) -> None:
         self.field.refresh()

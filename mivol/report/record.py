@@ -28,9 +28,9 @@ from mivol.machine import cores
 
 __all__ = [
     "QUANTITIES",
-    "PlanLine",
     "Image",
     "Machine",
+    "PlanLine",
     "Quantity",
     "RunRecord",
     "Table",

@@ -74,7 +74,9 @@ def choose_transport(needs: Needs, settings: Settings) -> Choice:
     why = "albedo 0" if not any(m.is_scattering for m in needs.media) else "max_depth 1 sees no scattered light"
     if any(m.unread for m in needs.media):
         why = "values cannot be read while dr.freeze records; absorption was promised by max_depth or by an earlier render"
-    what = "exact optical depth; no phase function, no light sampling in media, no albedo look-up"
+    tracked = [m.name for m in needs.media if m.bounded]
+    what = "exact optical depth" if not tracked else f"transmittance of {', '.join(tracked)} by ratio tracking, exact elsewhere"
+    what += "; no phase function, no light sampling in media, no albedo look-up"
     return Choice("media", what, why)
 
 

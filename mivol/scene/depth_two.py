@@ -30,8 +30,9 @@ from mivol.errors import MivolError
 from mivol.scene.nesting import extent
 from mivol.transport.media.body import Body
 from mivol.transport.media.box import Box
+from mivol.transport.media.extinction import ExactExtinction
 from mivol.transport.media.grid_integral import integrate_tau
-from mivol.transport.media.medium_view import MediumView, Part
+from mivol.transport.media.medium_view import MediumView
 from mivol.transport.media.optical_depth import integrate_optical_depth
 from mivol.transport.media.scene_media import SceneMedia
 
@@ -213,7 +214,7 @@ def mean_albedo(view: MediumView) -> float:
     return scattering / total if total > 0 else 0.0
 
 
-def _mean_value(part: Part) -> float:
+def _mean_value(part: ExactExtinction) -> float:
     """Mean of a part over space, of its highest channel."""
     values = part.constant if part.lattice is None else part.lattice.values
     host = np.asarray(dr.detach(values), np.float64)

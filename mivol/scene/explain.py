@@ -59,7 +59,8 @@ def explain(scene: mi.Scene | str | Path, max_depth: int | None = None, sensor: 
     plan = make_plan(needs, settings)
     lines = ["facts"]
     for m in needs.media:
-        grids = ", ".join("x".join(map(str, r)) for r in m.resolutions) or "homogeneous"
+        kind = f"a bounded {m.bounded}" if m.bounded else "homogeneous"
+        grids = ", ".join("x".join(map(str, r)) for r in m.resolutions) or kind
         scatters = "scatters" if m.is_scattering else "albedo 0"
         tau = "" if m.tau_max is None else f", optical depth at most {m.tau_max:.3g}"
         lines.append(

@@ -31,7 +31,8 @@ class MediumFacts:
 
     ``resolutions`` are those of its grids (Z, Y, X), none for a homogeneous medium; ``emits`` tells whether it is a source of
     light, ``occupied`` which share of their blocks of cells holds anything; ``tau_max`` bounds the optical depth through its
-    box [1] (None where it is not bounded by a box); ``unread``: values could not be read, because a function is being recorded.
+    box [1] (None where it is not bounded by a box); ``unread``: values could not be read, because a function is being recorded;
+    ``bounded`` names the field of which no more than a majorant is known along a ray, None where optical depths are exact.
     """
 
     name: str
@@ -45,6 +46,7 @@ class MediumFacts:
     occupied: float
     tau_max: float | None
     unread: bool = False
+    bounded: str | None = None
 
 
 @dataclass(frozen=True)

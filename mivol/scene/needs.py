@@ -94,6 +94,7 @@ def _facts(boundary: Boundary, view: MediumView, survey: Survey, recording: bool
         "resolutions": tuple(g.res for g in grids),
         "phase": _phase_name(phase),
         "emits": view.emits,
+        "bounded": next((type(p.field).__name__ for p in view.parts if not p.exact_line), None),
     }
     if recording:
         # What it was when it was last read; a medium that was never read may scatter.
@@ -122,10 +123,11 @@ def _phase_name(phase: mi.PhaseFunction | None) -> str:
 
 def _tau_max(boundary: Boundary, view: MediumView, reads: list[Reading]) -> float | None:
     """Bound the optical depth through a medium: its largest extinction times the diagonal of its box."""
-    constants = [float(np.max(np.array(dr.detach(p.constant)))) for p in view.parts if p.constant is not None]
+    bounds = [float(p.majorant[0]) for p in view.parts if not p.exact_line]
+    constants = [float(np.max(np.array(dr.detach(p.constant)))) for p in view.parts if p.exact_line and p.lattice is None]
     if boundary.box is None:
         return None
     corners = boundary.box.corners()
     diagonal = max(np.linalg.norm(corners[i] - corners[7 - i]) for i in range(4))
     scale = float(np.max(np.array(dr.detach(view.scale))))
-    return scale * (sum(constants) + sum(r.maximum for r in reads)) * float(diagonal)
+    return scale * (sum(constants) + sum(bounds) + sum(r.maximum for r in reads)) * float(diagonal)

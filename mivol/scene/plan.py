@@ -24,7 +24,14 @@ from mivol.scene.choices import (
     is_lit,
 )
 from mivol.scene.facts import Needs
-from mivol.scene.refusals import refuse_emission, refuse_places, refuse_quadrature, refuse_refraction, refuse_scattering
+from mivol.scene.refusals import (
+    refuse_bounded,
+    refuse_emission,
+    refuse_places,
+    refuse_quadrature,
+    refuse_refraction,
+    refuse_scattering,
+)
 from mivol.transport.media.grid_integral import PACKED_LIMIT, gradient_bytes
 from mivol.transport.path.estimators import SegmentQuestion, choose_segment_estimator
 from mivol.transport.path.settings import Settings
@@ -58,7 +65,7 @@ class Plan:
     gradient_bytes: int
 
 
-def make_plan(needs: Needs, settings: Settings) -> Plan:
+def make_plan(needs: Needs, settings: Settings, aovs: tuple[str, ...] = ()) -> Plan:
     """Choose from the facts.
 
     Raises:
@@ -70,6 +77,7 @@ def make_plan(needs: Needs, settings: Settings) -> Plan:
     refuse_emission(needs, settings)
     refuse_quadrature(needs, settings)
     refuse_places(needs)
+    refuse_bounded(needs, settings, aovs)
     choices = [
         choose_transport(needs, settings),
         *choose_emission(needs),
@@ -97,8 +105,8 @@ def make_plan(needs: Needs, settings: Settings) -> Plan:
 def _segment(needs: Needs, settings: Settings) -> str:
     """Name of the estimator of what media add along a segment; what no estimator answers has been refused."""
     scatters = bool(needs.lamps) and is_lit(needs, settings)
-    emits = any(m.emits for m in needs.media)
-    return choose_segment_estimator(SegmentQuestion(scatters, emits, settings.deterministic))
+    emits, is_bounded = any(m.emits for m in needs.media), any(m.bounded for m in needs.media)
+    return choose_segment_estimator(SegmentQuestion(scatters, emits, settings.deterministic, is_bounded))
 
 
 def _pass_rays(needs: Needs) -> int:

@@ -20,7 +20,8 @@ from mivol.fields.activation import Activation
 from mivol.files import check_volume
 from mivol.scene.coefficients import check_constant
 from mivol.scene.survey import Survey
-from mivol.transport.media.medium_view import MediumView, Part
+from mivol.transport.media.extinction import ExactExtinction
+from mivol.transport.media.medium_view import MediumView
 from mivol.transport.traversal.block_ranges import BlockRanges, find_block_ranges
 from mivol.transport.traversal.coarse_grid import CoarseGrid, coarsen_grid
 from mivol.transport.traversal.empty_blocks import block_bounds, empty_block_distances
@@ -51,7 +52,7 @@ def _once(survey: Survey, kind: tuple, array: mi.Float, make: Callable[[], Any])
     return survey.values[key][1]
 
 
-def read_part(part: Part, survey: Survey, name: str) -> Reading:
+def read_part(part: ExactExtinction, survey: Survey, name: str) -> Reading:
     """Read the bounds of a part of an extinction once for each state of its array.
 
     Voxels below 0, where a step of an optimiser or a filter overshot, count as 0 from here on, and have the derivative that
@@ -87,7 +88,7 @@ def read_part(part: Part, survey: Survey, name: str) -> Reading:
     return read
 
 
-def _floor(part: Part, survey: Survey, name: str) -> mi.Float:
+def _floor(part: ExactExtinction, survey: Survey, name: str) -> mi.Float:
     """The values of a grid with 0 for those below it; says so once for each grid of a scene.
 
     Raises:
@@ -128,7 +129,7 @@ ALIKE = 0.02
 where a turned stock grid does not fill its boundary; the nearest voxel is about 0.4 off)."""
 
 
-def _check_look_up(part: Part, survey: Survey, name: str) -> None:
+def _check_look_up(part: ExactExtinction, survey: Survey, name: str) -> None:
     """Refuse a stock grid with another filter or with borders that are not clamped: it tells neither, but its values do."""
     volume, lattice = part.volume, part.lattice
     mixes = mi.is_monochromatic and lattice.channels > 1
@@ -161,13 +162,13 @@ def _check_look_up(part: Part, survey: Survey, name: str) -> None:
         survey.looked_up.add(volume.ptr)
 
 
-def read_empty_distances(part: Part, survey: Survey, name: str) -> mi.UInt8:
+def read_empty_distances(part: ExactExtinction, survey: Survey, name: str) -> mi.UInt8:
     """Measure the gaps between the blocks of a part that hold anything, once for each state of its array."""
     array, res = dr.detach(part.lattice.values.array), part.lattice.res
     return _once(survey, ("gaps",), array, lambda: empty_block_distances(read_part(part, survey, name).bounds, res))
 
 
-def read_block_ranges(part: Part, survey: Survey) -> BlockRanges:
+def read_block_ranges(part: ExactExtinction, survey: Survey) -> BlockRanges:
     """Read what the blocks of a grid hold, once for each state of its array."""
     values = part.lattice.values
     return _once(survey, ("blocks",), dr.detach(values.array), lambda: find_block_ranges(values))

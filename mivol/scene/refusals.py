@@ -16,7 +16,15 @@ from mivol.transport.media.summed_extinction import share_cells
 from mivol.transport.path.estimators import MOST_SCATTERINGS
 from mivol.transport.path.settings import Settings
 
-__all__ = ["check_aovs", "refuse_emission", "refuse_places", "refuse_quadrature", "refuse_refraction", "refuse_scattering"]
+__all__ = [
+    "check_aovs",
+    "refuse_bounded",
+    "refuse_emission",
+    "refuse_places",
+    "refuse_quadrature",
+    "refuse_refraction",
+    "refuse_scattering",
+]
 
 
 SHADOWS = ("auto", "exact", "estimated", "grid")
@@ -130,3 +138,25 @@ def refuse_quadrature(needs: Needs, settings: Settings) -> None:
             f"shadows is 'grid' and {constant} of the medium in {needs.media[0].name} is a constant, which may fill more than "
             "the cells that shadows are looked up in: set shadows to exact."
         )
+
+
+def refuse_bounded(needs: Needs, settings: Settings, aovs: tuple[str, ...]) -> None:
+    """Refuse what needs an exact optical depth where a field declares none."""
+    medium = next((m for m in needs.media if m.bounded), None)
+    if medium is None:
+        return
+    moved = [k for k in needs.parameters if k.endswith((".position", ".to_world"))]
+    reasons = [
+        (bool(aovs), f"aovs asks for {', '.join(aovs)}", "leave aovs out"),
+        (settings.deterministic, "deterministic is set", "leave it out, for transmittance is estimated"),
+        (is_lit(needs, settings), "a medium of its scene scatters at max_depth 2", "set max_depth to 1, or the albedo to 0"),
+        (any(m.emits for m in needs.media), "a medium of its scene emits", "take the emission out"),
+        (any(v.microflakes is not None for v in needs.views), "a medium of its scene has sggx microflakes", "take them out"),
+        (bool(moved), f"the derivative of {', '.join(moved)} was asked for", "take finite differences"),
+    ]
+    for found, what, way_out in reasons:
+        if found:
+            raise MivolError(
+                f"the medium in {medium.name} is a {medium.bounded}, which is bounded (a majorant is known, and no optical "
+                f"depth of a ray), and {what}: {way_out}, or voxelise the field."
+            )

@@ -133,7 +133,7 @@ class Session:
             self._seen = _Seen(parts, survey_scene(scene))
         survey = self._seen.survey
         needs = find_needs(scene, sensor, survey, spp)
-        plan = make_plan(needs, self.settings)
+        plan = make_plan(needs, self.settings, self.aovs)
         return build_estimators(scene, needs, plan, self.settings, survey, pictures), plan
 
     def _primal(self, estimators: Estimators, rays: CameraRays) -> tuple:

@@ -140,7 +140,6 @@ class ControlSweep:
         state = _Sweep(zero, [mi.Float(t) for t in self.tau], [dr.exp(-t) for t in self.tau], list(zero))
         return walk(lattice, segment, visit, state, reads, interval.active).change
 
-
     def _add_probe(self) -> list[mi.Float]:
         """Differentiate the probe: its extinction, and that of the part of its cell in front of it."""
         media, (body,), ray, tracks, probe = self.media, self.media.bodies, self.passed.ray, self.tracks, self.probe

@@ -85,7 +85,9 @@ class DirectLighting:
     def __init__(self, media: SceneMedia, emitters: SceneEmitters) -> None:
         self.media, self.emitters = media, emitters
 
-    def at_surface(self, vertex: SurfaceVertex, u: mi.Point2f, attached: bool, active: mi.Bool) -> DirectSample:
+    def at_surface(
+        self, vertex: SurfaceVertex, u: mi.Point2f, attached: bool, active: mi.Bool, chance: mi.Float | None = None
+    ) -> DirectSample:
         """Estimate direct light at a surface by one emitter sample; the path's next segment is the BSDF sample.
 
         Args:
@@ -93,11 +95,14 @@ class DirectLighting:
             u: two numbers in [0, 1).
             attached: keep the derivatives of BSDF and emitter.
             active: lanes to estimate.
+            chance: a number in [0, 1) that estimates the shadow where media are bounded.
 
         Bias: none. Variance: that of one emitter sample. Cost: one shadow ray.
         """
+        rng = None if chance is None else seed_pcg32(chance, dr.width(active))
         direct, weight = self.media.scene.sample_emitter_direction(vertex.interaction, u, False, active)
-        return self._emitter_sample(vertex, EmitterAim(direct, weight, direct.emitter, u, 1, True), attached, active)
+        aim = EmitterAim(direct, weight, direct.emitter, u, 1, True)
+        return self._emitter_sample(vertex, aim, attached, active, rng)
 
     def in_medium(
         self,

@@ -230,9 +230,7 @@ class _Filling:
             return None
         return dr.select(dr.isfinite(length) & (length > 0), self.proposal.probe_depth * inverse(length), 0)
 
-    def _offer(
-        self, reservoir: Reservoir, piece: _Piece, lit: mi.Float | None, probe_sigma: mi.Float | None
-    ) -> Reservoir:
+    def _offer(self, reservoir: Reservoir, piece: _Piece, lit: mi.Float | None, probe_sigma: mi.Float | None) -> Reservoir:
         """Offer a piece to each candidate; ``lit`` is its entry in the visibility cache."""
         equiangular, dt = self.proposal.chosen.equiangular, piece.dt
         ahead = [a + b for a, b in zip(reservoir.tau, piece.tau, strict=True)]

@@ -21,7 +21,7 @@ import mitsuba as mi
 
 from mivol.transport.media.body import Body
 from mivol.transport.media.channels import spectrum
-from mivol.transport.media.medium_view import Part
+from mivol.transport.media.extinction import ExactExtinction
 from mivol.transport.media.ray_intervals import OWN_SURFACE, MediumInterval, RaySegment, revisit_media
 from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.traversal.grid_walk import Cell, Nodes, walk
@@ -119,7 +119,9 @@ def _add_step(
     return total
 
 
-def _by_part(body: Body, part: Part, ray_segment: RaySegment, t0: mi.Float64, t1: mi.Float64, on: mi.Bool) -> list[mi.Vector3f]:
+def _by_part(
+    body: Body, part: ExactExtinction, ray_segment: RaySegment, t0: mi.Float64, t1: mi.Float64, on: mi.Bool
+) -> list[mi.Vector3f]:
     """L times the derivative of one part's optical depth without the first term; one vector a channel."""
     ray, end = ray_segment.ray, mi.Float64(ray_segment.length)
     if part.lattice is None:
@@ -146,12 +148,12 @@ def _by_part(body: Body, part: Part, ray_segment: RaySegment, t0: mi.Float64, t1
             # The ray leaves (or enters) the medium through a face of its boundary where the boundary cuts the grid.
             cut = dr.abs(t - (t1 if sign < 0 else t0)) <= 1e-6 * dr.abs(t)
             face = dr.select(cut, _face(body.rows, (0.0,) * 3, (1.0,) * 3, ray, t), face)
-        values = body.values_at(part, ray, mi.Float(t), here)
+        values = part.eval_at(1.0, ray, mi.Float(t), here)
         vectors = [v + dr.select(here, sign * mi.Float(t) * s * face, 0) for v, s in zip(vectors, values, strict=True)]
     return vectors
 
 
-def _turn(lattice: Lattice, part: Part, segment: Segment, active: mi.Bool) -> list[mi.Vector3f]:
+def _turn(lattice: Lattice, part: ExactExtinction, segment: Segment, active: mi.Bool) -> list[mi.Vector3f]:
     """The integral of t grad(sigma) over a grid, one world vector a channel."""
     values = dr.detach(part.lattice.values.array)
 

@@ -43,6 +43,7 @@ from mivol.transport.estimators.transmittance_grid import TransmittanceGrid
 from mivol.transport.media.body import Body
 from mivol.transport.media.channels import spectrum
 from mivol.transport.media.coefficients import eval_albedo, medium_interaction
+from mivol.transport.media.optical_depth import transmittance
 from mivol.transport.media.ray_intervals import MediumInterval, RaySegment, visit_media
 from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.traversal.grid_walk import Cell, walk
@@ -115,7 +116,8 @@ class ScatteringQuadrature:
             end, found = visit_media(self.media, ray, segment.medium, visit, zero, active)
             tau, L = found.tau, L + found.light
         term = TrackedTerm(dr.select(segment.scatters, segment.beta * L, 0), active)
-        return SegmentEstimate(end, tau, term, Transmittance(self.media, RaySegment(ray, segment.medium, end.t), active))
+        passed = RaySegment(ray, segment.medium, end.t)
+        return SegmentEstimate(end, transmittance(tau), term, Transmittance(self.media, passed, active))
 
 
 @dataclass
@@ -283,9 +285,7 @@ def _in_order(shares: list[mi.Float]) -> list[mi.Float]:
 
 
 @dr.syntax
-def _add_pieces(
-    state: _LightSum, span: _Span, is_deep: mi.Bool, edges: list[mi.Float], count: mi.UInt32
-) -> _LightSum:
+def _add_pieces(state: _LightSum, span: _Span, is_deep: mi.Bool, edges: list[mi.Float], count: mi.UInt32) -> _LightSum:
     """Add ``count`` pieces, equal in the angle seen from a near emitter, else in length; in a deep cell between ``edges``."""
     start, dt, equiangular = span.start, span.length, span.equiangular
     index = dr.zeros(mi.UInt32, dr.width(dt))

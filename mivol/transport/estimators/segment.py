@@ -16,7 +16,12 @@ from typing import Any, Protocol
 import mitsuba as mi
 
 from mivol.transport.estimators.contribution import Factor, Term
-from mivol.transport.media.optical_depth import integrate_optical_depth, jvp_optical_depth, vjp_optical_depth
+from mivol.transport.media.optical_depth import (
+    integrate_optical_depth,
+    jvp_optical_depth,
+    transmittance,
+    vjp_optical_depth,
+)
 from mivol.transport.media.ray_intervals import RaySegment, SegmentEnd
 from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.traversal.strata import Strata
@@ -64,13 +69,13 @@ class SegmentEstimate:
 
     Attributes:
         end: where the segment ends.
-        tau: its optical depth [1], of each channel.
+        T: transmittance of its media, of each colour, or an estimate of it.
         light: the light of its media; None where they add none.
         transmittance: the factor of the light behind.
     """
 
     end: SegmentEnd
-    tau: list[mi.Float]
+    T: mi.Spectrum
     light: Term | None
     transmittance: Factor
 
@@ -135,7 +140,7 @@ class Absorption:
     def estimate(self, segment: PathSegment, purpose: str, active: mi.Bool) -> SegmentEstimate:
         end, tau = integrate_optical_depth(self.media, segment.ray, segment.medium, active)
         passed = RaySegment(segment.ray, segment.medium, end.t)
-        return SegmentEstimate(end, tau, None, Transmittance(self.media, passed, active))
+        return SegmentEstimate(end, transmittance(tau), None, Transmittance(self.media, passed, active))
 
     def prepare_derivatives(self, ray: mi.Ray3f) -> None:
         """Nothing is needed."""

@@ -9,8 +9,9 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from mivol.transport.estimators.majorant_tracking import ratio_tracking
 from mivol.transport.estimators.ratio_tracking import residual_ratio_tracking
-from mivol.transport.media.channels import as_rows
+from mivol.transport.media.channels import as_rows, spectrum
 from mivol.transport.media.optical_depth import sum_optical_depth, transmittance
 from mivol.transport.media.ray_intervals import (
     OWN_SURFACE,
@@ -22,8 +23,9 @@ from mivol.transport.media.ray_intervals import (
 )
 from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.traversal.lattice import clip
+from mivol.transport.traversal.random_numbers import draw_pcg32
 
-__all__ = ["DARK", "light_through", "shadow_ray"]
+__all__ = ["DARK", "estimate_transmittance", "light_through", "shadow_ray"]
 
 
 DARK = 30.0
@@ -40,20 +42,28 @@ def light_through(
         ray: world space, unit direction.
         medium: the medium around its origin.
         active: lanes to follow.
-        rng: state of a random number generator; where it is given, and block ranges of some grid are known, the transmittance
-            is an unbiased estimate.
+        rng: state of a random number generator; where it is given, and block ranges of some grid are known or some medium is
+            bounded, the transmittance is an unbiased estimate.
 
     Returns:
         Where the ray ends; its optical depth [1] for each channel, in a grid at most a little above ``DARK``, or None where the
         transmittance was estimated; and the transmittance of media and surfaces.
     """
-    if rng is not None and media.has_block_ranges:
-        start = ([mi.Float(1) for _ in range(media.channels)], rng)
-        end, (T, _) = visit_media(media, ray, medium, _dim(ray), start, active, passes_null=True)
-        return end, None, mi.Spectrum(*T) * end.null_transmission if len(T) == 3 else mi.Spectrum(T[0]) * end.null_transmission
+    if rng is not None and (media.has_block_ranges or media.is_bounded):
+        end, T = estimate_transmittance(media, ray, medium, active, rng, passes_null=True)
+        return end, None, T * end.null_transmission
     zero = [mi.Float(0) for _ in range(media.channels)]
     end, tau = visit_media(media, ray, medium, sum_optical_depth(ray, DARK), zero, active, passes_null=True)
     return end, tau, transmittance(tau) * end.null_transmission
+
+
+def estimate_transmittance(
+    media: SceneMedia, ray: mi.Ray3f, medium: mi.MediumPtr, active: mi.Bool, rng: mi.UInt32, passes_null: bool = False
+) -> tuple[SegmentEnd, mi.Spectrum]:
+    """Where a ray ends, and an unbiased estimate of the share of light that its media let through; ``rng`` draws it."""
+    start = ([mi.Float(1) for _ in range(media.channels)], rng)
+    end, (T, _) = visit_media(media, ray, medium, _dim(ray), start, active, passes_null)
+    return end, spectrum(T)
 
 
 def _dim(ray: mi.Ray3f) -> MediumVisitor:
@@ -72,17 +82,20 @@ def _estimate_transmittance(
 ) -> tuple[list[mi.Float], mi.UInt32]:
     """Transmittance [1] of one medium for each channel, and the next state of the generator.
 
-    It is estimated by residual ratio tracking in grids whose block ranges are known, and exact in all other parts, which are
-    walked to the optical depth ``DARK``.
+    It is estimated by ratio tracking in bounded parts, by residual ratio tracking in grids whose block ranges are known, and
+    exact in all other parts, which are walked to the optical depth ``DARK``.
     """
     body, t0, t1, active = interval.body, interval.t0, interval.t1, interval.active
-    tracked = [p for p in body.view.parts if p.lattice is not None and p.lattice.block_ranges is not None]
-    others = [p for p in body.view.parts if not any(p is q for q in tracked)]
+    tracked = [p for p in body.exact_parts if p.lattice is not None and p.lattice.block_ranges is not None]
+    others = [p for p in body.exact_parts if not any(p is q for q in tracked)]
     T = [dr.exp(-t) for t in body.optical_depth(ray, t0, t1, channels, active, others, DARK)]
     scale = dr.detach(body.view.scale) * body.area(ray.d)
     for part in tracked:
         segment = clip(part.lattice, ray.o, ray.d, t0, t1)
         own, rng = residual_ratio_tracking(part.lattice, segment, scale, rng, active)
+        T = [a * b for a, b in zip(T, as_rows(own, channels), strict=True)]
+    for part in (p for p in body.view.parts if not p.exact_line):
+        own, rng = ratio_tracking(part, scale, ray, t0, t1, rng, active)
         T = [a * b for a, b in zip(T, as_rows(own, channels), strict=True)]
     return T, rng
 
@@ -108,8 +121,11 @@ def shadow_ray(
         The shadow ray, whether no opaque surface blocks it, and its optical depth and transmittance as in
         :func:`light_through`.
     """
+    u = None
+    if rng is not None and media.is_bounded:
+        rng, (u,) = draw_pcg32(rng, 1)
     length = dr.norm(direct.p - start)
     ray = mi.Ray3f(start, dr.normalize(direct.p - start), length, direct.time, mi.Color0f())
     stop, tau, light = light_through(media, ray, medium, active, rng)
     clear = ~(stop.si.is_valid() & (stop.t < length * OWN_SURFACE))
-    return RaySegment(ray, medium, length, True), clear, tau, light
+    return RaySegment(ray, medium, length, True, u), clear, tau, light

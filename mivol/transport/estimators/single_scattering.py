@@ -116,7 +116,7 @@ class SingleScattering:
         tau, controls = flight.reservoir.tau, (self.grid_control, self.constant_control)
         shared = ScatteredSegment(self.media, segment, flight.end, tau, found, *controls, active)
         light = SegmentLight(shared, dr.select(found.event.on, found.sigma_s * found.weight, 0), is_replayed=False)
-        return SegmentEstimate(flight.end, tau, light, SegmentTransmittance(shared))
+        return SegmentEstimate(flight.end, transmittance(tau), light, SegmentTransmittance(shared))
 
     def _picture(self, segment: PathSegment, active: mi.Bool) -> SegmentEstimate:
         """The mean of ``count`` points, without derivatives."""
@@ -140,7 +140,8 @@ class SingleScattering:
             light *= 1 / count
         passed = RaySegment(segment.ray, segment.medium, flight.end.t)
         term = TrackedTerm(light, active)
-        return SegmentEstimate(flight.end, flight.reservoir.tau, term, Transmittance(self.media, passed, active))
+        T = transmittance(flight.reservoir.tau)
+        return SegmentEstimate(flight.end, T, term, Transmittance(self.media, passed, active))
 
     def _walk(self, segment: PathSegment, count: int, probe_depth: float, active: mi.Bool) -> _Flight:
         """Choose an emitter, walk the segment to its end, and fill a reservoir with candidates of scattering points."""

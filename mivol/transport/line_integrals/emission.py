@@ -223,8 +223,9 @@ class _Emission:
         """The light of a cell, with derivatives with respect to emission and albedo."""
         total, places = mi.Spectrum(0), self._places(site)
         if site.body.view.emission is not None:
-            total += sum((w * self._absorbed_fraction(site, t) * self._source(site, t) for w, t in zip(by_source, places,
-            strict=True)))
+            total += sum(
+                (w * self._absorbed_fraction(site, t) * self._source(site, t) for w, t in zip(by_source, places, strict=True))
+            )
         if site.body.view.emission_density is not None:
             total += sum(
                 (w * _evaluate(site.body.view.emission_density, site, t) for w, t in zip(by_density, places, strict=True))

@@ -18,6 +18,7 @@ from mivol.transport.estimators.segment import (
 from mivol.transport.line_integrals.composite import Composite
 from mivol.transport.line_integrals.emission import integrate_emission, vjp_emission
 from mivol.transport.media.channels import spectrum
+from mivol.transport.media.optical_depth import transmittance
 from mivol.transport.media.ray_intervals import RaySegment, visit_media
 from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.traversal.strata import Strata
@@ -54,8 +55,8 @@ class Emission:
         composite = integrate_emission(media, passed, active, tangent=purpose == FORWARD)
         shared = _EmittingSegment(media, segment, passed, composite, active)
         light = SegmentLight(shared, dr.select(active, segment.beta * shared.rows(0), 0), is_replayed=True)
-        tau = [mi.Float(t) for t in composite.tau[: media.channels]]
-        return SegmentEstimate(end, tau, light, SegmentTransmittance(shared))
+        T = transmittance([mi.Float(t) for t in composite.tau[: media.channels]])
+        return SegmentEstimate(end, T, light, SegmentTransmittance(shared))
 
 
 @dataclass

@@ -3,48 +3,21 @@ r"""The extinction of a medium as a sum of fields, each in its place, the same f
 .. math:: \sigma_t(x) = s \sum_k f_k(x)
 
 with a scale s and parts f_k that are a grid or a constant (``sigma_t`` alone, or ``sigma_a`` and ``sigma_s``). Optical depth
-is linear in each of them, so it is integrated part by part: a homogeneous medium stores no grid and two grids need not
-share a resolution.
+is linear in each of them, so it is integrated part by part (:mod:`mivol.transport.media.extinction`): a homogeneous medium
+stores no grid and two grids need not share a resolution.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-import drjit as dr
 import mitsuba as mi
 
-from mivol.fields.activation import Activation
 from mivol.transport.media.box import Box
+from mivol.transport.media.extinction import Extinction
 from mivol.transport.traversal.lattice import Lattice
 
-__all__ = ["MediumView", "Part"]
-
-
-@dataclass
-class Part:
-    """One additive part of an extinction.
-
-    Attributes:
-        name: ``sigma_t``, ``sigma_a`` or ``sigma_s``.
-        constant: its value [1/length], ``Float`` or ``Color3f``; None for a grid.
-        lattice: the grid [1/length]; None for a constant.
-        activation: what makes an extinction of an interpolated value of the grid, in a radiance field; None elsewhere.
-        volume: the stock grid that ``lattice`` stands for, which may look its voxels up in another way; None elsewhere.
-    """
-
-    name: str
-    constant: mi.Float | mi.Color3f | None = None
-    lattice: Lattice | None = None
-    activation: Activation | None = None
-    volume: mi.Volume | None = None
-
-    @property
-    def channels(self) -> int:
-        """1 (grey) or 3 (rgb)."""
-        if self.lattice is not None:
-            return self.lattice.channels
-        return 3 if dr.size_v(self.constant) == 3 else 1
+__all__ = ["MediumView"]
 
 
 @dataclass
@@ -71,7 +44,7 @@ class MediumView:
     """
 
     medium: mi.Medium
-    parts: list[Part]
+    parts: list[Extinction]
     scale: mi.Float
     albedo_arrays: list = field(default_factory=list)
     albedo: mi.Volume | mi.Float | mi.Color3f | None = None

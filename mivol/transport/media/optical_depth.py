@@ -9,6 +9,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mivol.transport.media.channels import by_channel, spectrum
+from mivol.transport.media.drawn_points import DrawnPoint, bounded_parts, draw_in, start_points
 from mivol.transport.media.ray_intervals import (
     MediumInterval,
     MediumVisitor,
@@ -80,11 +81,17 @@ def vjp_optical_depth(media: SceneMedia, segment: RaySegment, weight: mi.Spectru
 def vjp_rows(media: SceneMedia, segment: RaySegment, weight: list[mi.Float], active: mi.Bool) -> None:
     """As :func:`vjp_optical_depth`, ``weight`` one number for each channel."""
 
-    def visit(state: mi.Float, interval: MediumInterval) -> mi.Float:
-        interval.body.backproject(segment.ray, interval.t0, interval.t1, weight, interval.active)
-        return state
+    bounded = bounded_parts(media.bodies)
 
-    revisit_media(media, segment, visit, mi.Float(0), active)
+    def visit(points: list[DrawnPoint], interval: MediumInterval) -> list[DrawnPoint]:
+        interval.body.backproject(segment.ray, interval.t0, interval.t1, weight, interval.active)
+        return _pass(points, bounded, interval, segment.ray)
+
+    points = revisit_media(media, segment, visit, start_points(len(bounded), segment.u, dr.width(segment.ray)), active)
+    for (body, part), point in zip(bounded, points, strict=True):
+        # After the walk: what Dr.Jit pulls back in a loop is lost where the same array was pulled to before it.
+        on, each = active & (point.total > 0), [w * point.total for w in weight]
+        body.deposit_in_part(part, segment.ray, point.t, each, on)
 
 
 def jvp_optical_depth(media: SceneMedia, segment: RaySegment, active: mi.Bool) -> mi.Spectrum:
@@ -95,8 +102,26 @@ def jvp_optical_depth(media: SceneMedia, segment: RaySegment, active: mi.Bool) -
 def jvp_rows(media: SceneMedia, segment: RaySegment, active: mi.Bool) -> list[mi.Float]:
     """As :func:`jvp_optical_depth`, one number for each channel."""
 
-    def visit(tau: list[mi.Float], interval: MediumInterval) -> list[mi.Float]:
-        own = interval.body.tangent(segment.ray, interval.t0, interval.t1, len(tau), interval.active)
-        return [t + d for t, d in zip(tau, own, strict=True)]
+    bounded, zero = bounded_parts(media.bodies), [mi.Float(0) for _ in range(media.channels)]
 
-    return revisit_media(media, segment, visit, [mi.Float(0) for _ in range(media.channels)], active)
+    def visit(state: tuple, interval: MediumInterval) -> tuple:
+        tau, points = state
+        own = interval.body.tangent(segment.ray, interval.t0, interval.t1, len(tau), interval.active)
+        return [t + d for t, d in zip(tau, own, strict=True)], _pass(points, bounded, interval, segment.ray)
+
+    start = (zero, start_points(len(bounded), segment.u, dr.width(segment.ray)))
+    tau, points = revisit_media(media, segment, visit, start, active)
+    for (body, part), point in zip(bounded, points, strict=True):
+        on = active & (point.total > 0)
+        rows = body.tangent_of_part(part, segment.ray, point.t, media.channels, on)
+        tau = [t + dr.select(on, point.total * row, 0) for t, row in zip(tau, rows, strict=True)]
+    return tau
+
+
+def _pass(points: list[DrawnPoint], bounded: list[tuple], interval: MediumInterval, ray: mi.Ray3f) -> list[DrawnPoint]:
+    """Pass an interval of one medium with the points of all bounded parts."""
+    t0, t1, on = interval.t0, interval.t1, interval.active
+    return [
+        draw_in(point, part, ray, t0, t1, on) if owner is interval.body else point
+        for (owner, part), point in zip(bounded, points, strict=True)
+    ]

@@ -60,12 +60,15 @@ class RaySegment:
         medium: the medium around its origin.
         length: how far it went [length].
         passes_null: whether it passed surfaces that transmit part of the light undeviated.
+        u: a number in [0, 1) that draws the points at which derivatives of bounded media are looked at; None where all optical
+            depths are exact.
     """
 
     ray: mi.Ray3f
     medium: mi.MediumPtr
     length: mi.Float | mi.Float64
     passes_null: bool = False
+    u: mi.Float | None = None
 
     @classmethod
     def upto(cls, ray: mi.Ray3f, medium: mi.MediumPtr, t: mi.Float64) -> RaySegment:
@@ -158,9 +161,7 @@ def find_boxed_intervals(media: SceneMedia, ray: mi.Ray3f, t_end: mi.Float, acti
     return found
 
 
-def _visit_boxed(
-    media: SceneMedia, ray: mi.Ray3f, t_end: mi.Float, visit: MediumVisitor, state: Any, active: mi.Bool
-) -> Any:
+def _visit_boxed(media: SceneMedia, ray: mi.Ray3f, t_end: mi.Float, visit: MediumVisitor, state: Any, active: mi.Bool) -> Any:
     for interval in find_boxed_intervals(media, ray, t_end, active):
         state = visit(state, interval)
     return state

@@ -14,8 +14,14 @@ import mitsuba as mi
 import numpy as np
 
 from mivol.errors import MivolError
+from mivol.fields.protocol import BOUNDED, Field
+from mivol.transport.media.activated_grid_extinction import ActivatedGridExtinction
+from mivol.transport.media.bounded_extinction import BoundedExtinction
 from mivol.transport.media.box import Box
-from mivol.transport.media.medium_view import MediumView, Part
+from mivol.transport.media.constant_extinction import ConstantExtinction
+from mivol.transport.media.extinction import Extinction
+from mivol.transport.media.grid_extinction import GridExtinction
+from mivol.transport.media.medium_view import MediumView
 from mivol.transport.traversal.lattice import Lattice
 
 __all__ = ["children_of", "traverse_medium", "view_medium"]
@@ -41,9 +47,16 @@ def view_medium(medium: mi.Medium, boundary: Box | None = None, places: dict | N
     params = traverse_medium(medium)
     if kind not in (*STOCK, "mivol_medium"):
         raise MivolError(f"a medium of type {kind} was found; mivol renders mivol_medium, homogeneous and heterogeneous media.")
-    names = [n for n in ("sigma_t", "sigma_a", "sigma_s") if any(k.startswith(n + ".") for k in params.properties)]
+    children = children_of(medium)
+    names = [n for n in ("sigma_t", "sigma_a", "sigma_s") if n in children]
     places = {} if places is None else places
-    parts = [_part(name, params, children_of(medium)[name], kind, boundary, places) for name in names]
+    scale = mi.Float(params["scale"]) if "scale" in params.properties else mi.Float(1)
+    parts = [
+        _bounded_part(name, children[name].mivol_extinction, scale)
+        if hasattr(children[name], "mivol_extinction")
+        else _part(name, params, children[name], kind, boundary, places)
+        for name in names
+    ]
     albedo_arrays = [v for k, v in params if k.startswith("sigma_s." if "sigma_s" in names else "albedo.")]
     albedo = _field(params, "albedo") if "sigma_s" not in names else None
     emission, emission_density = _field(params, "emission"), _field(params, "emission_density")
@@ -53,7 +66,6 @@ def view_medium(medium: mi.Medium, boundary: Box | None = None, places: dict | N
     light = [f for f in (emission_density, emission, albedo) if emission is not None or emission_density is not None]
     emission_lattice = _emission_lattice(emission_density, light, boundary, places)
     stock_boxes = {v.ptr: Box(_place(v, boundary, places)) for v in light if _repeats_border(v)}
-    scale = mi.Float(params["scale"]) if "scale" in params.properties else mi.Float(1)
     numbers = {k.partition(".")[0]: v for k, v in params if k in ("scale", *(f"{n}.value.value" for n in names))}
     return MediumView(
         medium,
@@ -101,10 +113,10 @@ def _field(params: mi.SceneParameters, name: str) -> mi.Volume | mi.Float | mi.C
     return None if key is None else params.properties[key][2]
 
 
-def _part_of_field(volume: mi.Volume) -> Part:
+def _part_of_field(volume: mi.Volume) -> ActivatedGridExtinction:
     """The extinction of a radiance field, which brings its own."""
     lattice = Lattice(volume.mivol_density, volume.mivol_to_world)
-    return Part("sigma_t", lattice=lattice, activation=volume.mivol_field.act)
+    return ActivatedGridExtinction("sigma_t", lattice, volume.mivol_field.act)
 
 
 def _emission_lattice(emission_density: object, others: list, boundary: Box | None, places: dict) -> Lattice | None:
@@ -168,12 +180,32 @@ def traverse_medium(medium: mi.Medium) -> mi.SceneParameters:
     return params
 
 
-def _part(name: str, params: mi.SceneParameters, volume: mi.Volume, kind: str, boundary: Box | None, places: dict) -> Part:
+def _bounded_part(name: str, field: Field, scale: mi.Float) -> BoundedExtinction:
+    """The part of an extinction that a bounded field is.
+
+    Raises:
+        MivolError: a field of another kind, a majorant that is none, or a recording, in which no majorant can be read.
+    """
+    if field.line != BOUNDED:
+        raise MivolError(f"{name} is a {type(field).__name__} that declares {field.line!r}; media read {BOUNDED!r} fields.")
+    if dr.flag(dr.JitFlag.FreezingScope):
+        raise MivolError(
+            f"{name} is a {type(field).__name__}, whose majorant cannot be read while dr.freeze records: render without it."
+        )
+    majorant = max(field.bound())
+    if not 0 <= majorant < np.inf:
+        raise MivolError(f"the majorant of {name}, a {type(field).__name__}, is {majorant:.4g}; a finite one is expected.")
+    return BoundedExtinction(name, field, dr.detach(scale), dr.opaque(mi.Float, majorant))
+
+
+def _part(
+    name: str, params: mi.SceneParameters, volume: mi.Volume, kind: str, boundary: Box | None, places: dict
+) -> Extinction:
     """The part of an extinction under ``name`` among a medium's parameters."""
     grid, constant = f"{name}.data", f"{name}.value.value"
     if grid in params.properties:
         lattice = Lattice(_tensor(params[grid]), _place(volume, boundary, places))
-        return Part(name, lattice=lattice, volume=volume if volume.class_name() == "GridVolume" else None)
+        return GridExtinction(name, lattice, volume if volume.class_name() == "GridVolume" else None)
     if constant not in params.properties:
         found = sorted(k for k in params.properties if k.startswith(name + "."))
         raise MivolError(
@@ -182,12 +214,12 @@ def _part(name: str, params: mi.SceneParameters, volume: mi.Volume, kind: str, b
         )
     value = params[constant]
     if kind != "HeterogeneousMedium":  # a stock heterogeneous fills the box of its constvolume only
-        return Part(name, constant=value)
+        return ConstantExtinction(name, value)
     channels = [value[c] for c in range(dr.size_v(value))] if dr.size_v(value) == 3 else [mi.Float(value)]
     values = mi.TensorXf(dr.ravel(mi.Color3f(*channels)) if len(channels) == 3 else channels[0], (1, 1, 1, len(channels)))
     if volume.ptr not in places:
         places[volume.ptr] = place_of_grid(volume)
-    return Part(name, lattice=Lattice(values, places[volume.ptr]))
+    return GridExtinction(name, Lattice(values, places[volume.ptr]))
 
 
 def _tensor(values: mi.TensorXf) -> mi.TensorXf:

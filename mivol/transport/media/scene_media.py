@@ -8,9 +8,8 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from mivol.transport.media.body import Body, is_followed, part_values
+from mivol.transport.media.body import Body, is_followed
 from mivol.transport.media.channels import as_rows
-from mivol.transport.media.grid_integral import Gradient
 from mivol.transport.traversal.ray_spawning import spawn_ray
 
 __all__ = ["SceneMedia"]
@@ -79,6 +78,11 @@ class SceneMedia:
         return any(p.lattice is not None and p.lattice.block_ranges is not None for b in self.bodies for p in b.view.parts)
 
     @property
+    def is_bounded(self) -> bool:
+        """Whether the optical depth of some medium is not known along a ray, so that its transmittance is estimated."""
+        return any(b.is_bounded for b in self.bodies)
+
+    @property
     def emits(self) -> bool:
         """Whether some medium is a source of light."""
         return any(b.view.emits for b in self.bodies)
@@ -101,19 +105,15 @@ class SceneMedia:
         """Begin a reverse pass: gradients of zero for each part."""
         for body in self.bodies:
             body.microflakes_gradient = dr.zeros(mi.Float, 6) if is_followed(body.view.microflakes) else None
-            body.gradients = [
-                Gradient.zeros(p.lattice) if p.lattice is not None else dr.zeros(mi.Float, p.channels) for p in body.view.parts
-            ]
+            body.gradients = [part.start_gradient() for part in body.view.parts]
 
     def deliver_gradients(self) -> None:
         """End a reverse pass: hand the gradients of the parts to the parameters behind them."""
         total = mi.Float(0)
         for body in self.bodies:
             for part, gradient in zip(body.view.parts, body.gradients, strict=True):
-                flat = gradient.fold() if part.lattice is not None else gradient
-                dr.eval(flat)
-                # The derivative of this product is the gradient, for the values and for the scale alike.
-                total += dr.sum(dr.ravel(body.view.scale * part_values(part)) * flat)
+                # The derivative of what is delivered is the gradient, for the values and for the scale alike.
+                total += part.deliver(body.view.scale, gradient)
             if body.microflakes_gradient is not None:
                 slopes = (dr.gather(mi.Float, body.microflakes_gradient, mi.UInt32(k)) for k in range(6))
                 total += sum(s * g for s, g in zip(body.view.microflakes, slopes, strict=True))
@@ -124,7 +124,7 @@ class SceneMedia:
     def start_tangent(self) -> None:
         """Begin a forward pass: take the tangent of each part from the parameters."""
         for body in self.bodies:
-            products = [body.view.scale * part_values(p) for p in body.view.parts]
+            products = [p.scaled(body.view.scale) for p in body.view.parts]
             asked = [p for p in products if dr.grad_enabled(p)]
             if asked:
                 # The tangents of the parameters are kept: what else was made of them, such as an albedo, is followed later.

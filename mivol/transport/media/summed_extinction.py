@@ -12,7 +12,7 @@ import mitsuba as mi
 import numpy as np
 
 from mivol.fields.activation import Activation
-from mivol.transport.media.medium_view import Part
+from mivol.transport.media.extinction import ExactExtinction
 from mivol.transport.traversal.grid_walk import Nodes
 from mivol.transport.traversal.interpolation import interpolate
 from mivol.transport.traversal.lattice import Lattice
@@ -30,7 +30,7 @@ class SummedExtinction:
         linear: whether the values are tangents, which no activation is applied to.
     """
 
-    def __init__(self, parts: list[Part], values: list, scale: mi.Float, linear: bool = False) -> None:
+    def __init__(self, parts: list[ExactExtinction], values: list, scale: mi.Float, linear: bool = False) -> None:
         self.channels, self.scale = max(p.channels for p in parts), scale
         pairs = list(zip(parts, values, strict=True))
         self.activations = [None if linear else p.activation for p, _ in pairs if p.lattice is not None]

@@ -16,6 +16,7 @@ from mivol.transport.estimators.emitters import SceneEmitters
 from mivol.transport.estimators.scattering_quadrature import ScatteringQuadrature
 from mivol.transport.estimators.segment import Absorption, SegmentEstimator
 from mivol.transport.estimators.single_scattering import SingleScattering
+from mivol.transport.estimators.tracked_absorption import TrackedAbsorption
 from mivol.transport.estimators.transmittance_grid import TransmittanceGrid
 from mivol.transport.estimators.visibility_cache import VisibilityCache
 from mivol.transport.line_integrals.emitting_segment import Emission
@@ -57,11 +58,13 @@ class SegmentQuestion:
         scatters: some medium scatters light of emitters to the camera.
         emits: some medium emits light.
         deterministic: images without noise were asked for.
+        is_bounded: some medium is known by a majorant only.
     """
 
     scatters: bool
     emits: bool
     deterministic: bool
+    is_bounded: bool = False
 
 
 @dataclass(frozen=True)
@@ -93,28 +96,35 @@ def _make_quadrature(choice: SegmentChoice) -> ScatteringQuadrature:
 SEGMENT_ESTIMATORS = {
     "absorption": SegmentEntry(
         lambda choice: Absorption(choice.direct.media),
-        lambda asked: not asked.scatters and not asked.emits,
+        lambda asked: not asked.scatters and not asked.emits and not asked.is_bounded,
         0,
         "no medium emits, or scatters light to the camera",
         "no bias, no variance",
     ),
+    "tracked_absorption": SegmentEntry(
+        lambda choice: TrackedAbsorption(choice.direct.media),
+        lambda asked: asked.is_bounded and not asked.scatters and not asked.emits,
+        0,
+        "a medium is bounded, and none emits, or scatters light to the camera",
+        "no bias, of derivatives neither; variance of ratio tracking, and of one point a segment for derivatives",
+    ),
     "emission": SegmentEntry(
         lambda choice: Emission(choice.direct.media),
-        lambda asked: asked.emits and not asked.scatters,
+        lambda asked: asked.emits and not asked.scatters and not asked.is_bounded,
         0,
         "a medium emits, and none scatters light to the camera",
         "error of the fourth order in the size of a cell, no variance",
     ),
     "single_scattering": SegmentEntry(
         lambda choice: SingleScattering(choice.direct, choice.count, choice.visibility_cache),
-        lambda asked: asked.scatters and not asked.emits and not asked.deterministic,
+        lambda asked: asked.scatters and not asked.emits and not asked.deterministic and not asked.is_bounded,
         1,
         "a medium scatters once, and none emits",
         "no bias",
     ),
     "scattering_quadrature": SegmentEntry(
         _make_quadrature,
-        lambda asked: asked.scatters and not asked.emits and asked.deterministic,
+        lambda asked: asked.scatters and not asked.emits and asked.deterministic and not asked.is_bounded,
         1,
         "one medium scatters once, its grids share their cells, every emitter has one position or direction",
         "error of the fourth order in the size of a cell where light is smooth, no variance; derivatives are drawn",

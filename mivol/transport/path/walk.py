@@ -28,7 +28,6 @@ from mivol.transport.estimators.multiple_importance import power_heuristic
 from mivol.transport.estimators.segment import PICTURE, PathSegment
 from mivol.transport.estimators.vertex import SurfaceVertex
 from mivol.transport.media.channels import colours
-from mivol.transport.media.optical_depth import transmittance
 from mivol.transport.path.estimators import Estimators
 from mivol.transport.path.event import PathEvent
 from mivol.transport.path.scores import Primal, Replay, Tangent
@@ -164,9 +163,8 @@ def _follow_segment(estimators: Estimators, settings: Settings, limit: int, path
     if found.light is not None:
         path.score = path.score.add(found.light)
     path.score = path.score.scale(found.transmittance)
-    T = transmittance(found.tau)
-    path.beta *= T
-    path.clear *= T
+    path.beta *= found.T
+    path.clear *= found.T
     path.medium = found.end.medium
     return path, PathEvent.of(found.end, path.active)
 
@@ -196,7 +194,8 @@ def _turn(estimators: Estimators, settings: Settings, limit: int, path: Path, ev
     # -- Next-event estimation: light from an emitter, dimmed by the media ----------------------------------------------------
     may_scatter = on_surface & (path.depth + 1 < limit)
     lit = may_scatter & mi.has_flag(vertex.bsdf.flags(), mi.BSDFFlags.Smooth)
-    direct = estimators.direct.at_surface(vertex, sampler.next_2d(lit), attached, lit)
+    u, chance = sampler.next_2d(lit), sampler.next_1d(lit) if media.is_bounded else None
+    direct = estimators.direct.at_surface(vertex, u, attached, lit, chance)
     with dr.resume_grad(when=attached):
         carried = path.beta * direct.value
     path.score = path.score.add(DirectLight(media, direct.ray_segment, carried, direct.on))

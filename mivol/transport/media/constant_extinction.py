@@ -1,0 +1,88 @@
+"""An extinction that is the same everywhere in its boundary."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import drjit as dr
+import mitsuba as mi
+
+__all__ = ["ConstantExtinction"]
+
+
+@dataclass
+class ConstantExtinction:
+    """A number, grey or rgb (:class:`mivol.transport.media.extinction.ExactExtinction`).
+
+    Attributes:
+        name: ``sigma_t``, ``sigma_a`` or ``sigma_s``.
+        constant: its value [1/length], with its derivatives.
+    """
+
+    name: str
+    constant: mi.Float | mi.Color3f
+    exact_line: ClassVar[bool] = True
+    lattice: ClassVar[None] = None
+
+    @property
+    def channels(self) -> int:
+        """1 (grey) or 3 (rgb)."""
+        return 3 if dr.size_v(self.constant) == 3 else 1
+
+    @property
+    def values(self) -> mi.Float | mi.Color3f:
+        """The number."""
+        return self.constant
+
+    def scaled(self, scale: mi.Float) -> mi.Float | mi.Color3f:
+        return scale * self.constant
+
+    def start_gradient(self) -> mi.Float:
+        return dr.zeros(mi.Float, self.channels)
+
+    def deliver(self, scale: mi.Float, gradient: mi.Float) -> mi.Float:
+        dr.eval(gradient)
+        return dr.sum(dr.ravel(self.scaled(scale)) * gradient)
+
+    def integrate(
+        self, ray: mi.Ray3f, t0: mi.Float, t1: mi.Float, active: mi.Bool, enough: mi.Float | None = None
+    ) -> list[mi.Float]:
+        return self._along(dr.detach(self.constant), _length(t0, t1, active))
+
+    def jvp(self, tangent: mi.Float | mi.Color3f, ray: mi.Ray3f, t0: mi.Float, t1: mi.Float, active: mi.Bool) -> list[mi.Float]:
+        return self._along(tangent, _ending(_length(t0, t1, active)))
+
+    def vjp(
+        self, gradient: mi.Float, weight: list[mi.Float], ray: mi.Ray3f, t0: mi.Float, t1: mi.Float, active: mi.Bool
+    ) -> None:
+        length = _ending(_length(t0, t1, active))
+        for c, w in enumerate(weight):
+            dr.scatter_add(gradient, dr.select(w != 0, w * length, 0), mi.UInt32(c), active)
+
+    def eval_at(self, scale: mi.Float, ray: mi.Ray3f, t: mi.Float, active: mi.Bool) -> list[mi.Float]:
+        return self._rows(dr.detach(self.scaled(scale)))
+
+    def jvp_at(self, tangent: mi.Float | mi.Color3f, ray: mi.Ray3f, t: mi.Float, active: mi.Bool) -> list[mi.Float]:
+        return self._rows(tangent)
+
+    def vjp_at(self, gradient: mi.Float, weight: list[mi.Float], ray: mi.Ray3f, t: mi.Float, active: mi.Bool) -> None:
+        for c, w in enumerate(weight):
+            dr.scatter_add(gradient, dr.select(active, w, 0), mi.UInt32(c), active)
+
+    def _along(self, value: mi.Float | mi.Color3f, length: mi.Float) -> list[mi.Float]:
+        # A ray that never leaves a medium has infinite length: 0 * inf would be NaN.
+        return [dr.select(v != 0, v * length, 0) for v in self._rows(value)]
+
+    def _rows(self, value: mi.Float | mi.Color3f) -> list[mi.Float]:
+        # A grey value is taken whole: the index of a Dr.Jit array reads it, and bakes it into the kernel.
+        return [value] if self.channels == 1 else [value.x, value.y, value.z]
+
+
+def _length(t0: mi.Float, t1: mi.Float, active: mi.Bool) -> mi.Float:
+    return dr.select(active & (t1 > t0), mi.Float(t1 - t0), 0)
+
+
+def _ending(length: mi.Float) -> mi.Float:
+    """A length for derivatives: a stretch without end lets nothing through, and nothing behind it changes."""
+    return dr.select(length < 1e30, length, 0)

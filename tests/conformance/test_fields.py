@@ -1,0 +1,88 @@
+"""Every field keeps the promises of the protocol: values below the bound, nothing outside, a transpose that is one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import bounded_ball
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mivol.fields.protocol import BOUNDED, EXACT_LINE, Field
+from mivol.fields.voxels import Voxels
+
+pytestmark = pytest.mark.usefixtures("variant_rgb")
+
+POINTS = 5000
+
+
+def voxels(channels: int) -> Voxels:
+    values = np.random.default_rng(2).uniform(0, 3, (5, 6, 7, channels)).astype(np.float32)
+    place = np.array([[1.5, -0.4, 0, 0.2], [0.4, 1.5, 0, -1], [0, 0.3, 2, -0.7], [0, 0, 0, 1]])
+    return Voxels(values, place, "voxels")
+
+
+FIELDS: dict[str, tuple[Callable[[], Field], str]] = {
+    "grey voxels": (lambda: voxels(1), EXACT_LINE),
+    "rgb voxels": (lambda: voxels(3), EXACT_LINE),
+    "a ball": (lambda: bounded_ball.Ball(dr.opaque(mi.Float, 1.5), 0.8, (0.1, 0.2, -0.3)), BOUNDED),
+    "an rgb ball": (lambda: bounded_ball.Ball(mi.Color3f(0.2, 1, 3), 0.8, (0.1, 0.2, -0.3), 2.0), BOUNDED),
+}
+
+
+def renew(field: Field) -> None:
+    """Do what a shell does after an update. An rgb texture is padded, and Dr.Jit passes that edge but once."""
+    if isinstance(field, Voxels):
+        field.refresh()
+
+
+def points(field: Field, margin: float) -> tuple[np.ndarray, mi.Point3f, mi.Vector3f]:
+    """Points in and around the box of a field, in its own coordinates and in the world, and directions."""
+    rng = np.random.default_rng(4)
+    q = rng.uniform(-margin, 1 + margin, (3, POINTS))
+    p = field.to_world[:3, :3] @ q + field.to_world[:3, 3:]
+    w = rng.normal(size=(3, POINTS))
+    return q, mi.Point3f(p.astype(np.float32)), mi.Vector3f((w / np.linalg.norm(w, axis=0)).astype(np.float32))
+
+
+@pytest.mark.parametrize("name", FIELDS)
+def test_values_are_bounded_and_lie_in_the_box(name: str) -> None:
+    make, line = FIELDS[name]
+    field = make()
+    q, p, w = points(field, 0.2)
+    values = np.array([np.array(v) for v in field.eval(p, w, mi.Bool(True))])
+    # A convex combination of float32 values may be rounded up, once for each of its 8 terms.
+    bound = np.array(field.bound()) * (1 + 8 * 2**-24)
+    assert field.line == line
+    assert values.shape == (field.channels, POINTS)
+    assert (values <= bound[:, None]).all()
+    assert (values.max(axis=1) > 0.3 * np.array(field.bound())).all()
+    # Places are rounded to float32: 1e-6 of the box beside its faces may count for either side.
+    outside = ((q < -1e-6) | (q > 1 + 1e-6)).any(axis=0)
+    assert outside.any()
+    assert (values[:, outside] == 0).all()
+
+
+@pytest.mark.parametrize("name", FIELDS)
+def test_accumulate_is_the_transpose_of_eval(name: str) -> None:
+    """<J v, d> = <v, accumulate d>, lanes that are not active left out: there the weight may be NaN."""
+    field, rng = FIELDS[name][0](), np.random.default_rng(6)
+    _, p, w = points(field, 0.1)
+    (parameter,) = field.parameters().values()
+    v = rng.normal(size=dr.shape(parameter)).astype(np.float32)
+    on, weights = rng.uniform(size=POINTS) < 0.7, rng.normal(size=(field.channels, POINTS)).astype(np.float32)
+    active, d = mi.Bool(on), [mi.Float(np.where(on, row, np.nan)) for row in weights]
+    dr.enable_grad(parameter)
+    renew(field)
+    with dr.suspend_grad():
+        field.accumulate(p, w, d, active)
+    pulled = np.array(dr.grad(parameter), np.float64)
+    renew(field)
+    dr.set_grad(parameter, type(parameter)(v))
+    pushed = dr.forward_to(field.eval(p, w, mi.Bool(True)), flags=dr.ADFlag.ClearEdges)
+    terms = np.array([np.array(x, np.float64) * row * on for x, row in zip(pushed, weights, strict=True)])
+    # Sums of 5000 float32 numbers: 1e-5 of the sum of their sizes.
+    assert np.abs(terms).sum() > 100
+    assert abs(terms.sum() - (v * pulled).sum()) < 1e-5 * np.abs(terms).sum()
