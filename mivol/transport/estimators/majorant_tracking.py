@@ -12,9 +12,9 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from mivol.numerics import largest_of
 from mivol.transport.estimators.ratio_tracking import FAINT, LOOKUP_RATE
 from mivol.transport.media.bounded_extinction import BoundedExtinction
-from mivol.transport.traversal.block_ranges import largest
 from mivol.transport.traversal.random_numbers import draw_pcg32
 
 __all__ = ["ratio_tracking"]
@@ -56,7 +56,7 @@ def ratio_tracking(
         values = part.eval_at(scale, ray, t, on)
         T = [dr.select(on, a * (1 - value / rate), a) for a, value in zip(T, values, strict=True)]
         # -- Roulette ---------------------------------------------------------------------------------------------------
-        seen = largest(T)
+        seen = largest_of(T)
         lift = dr.select(chance * FAINT < seen, dr.maximum(1, FAINT / seen), 0)
         T = [dr.select(on, a * lift, a) for a in T]
         return t, T, rng, on & (lift > 0)
