@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from mivol.scene.facts import MediumFacts, Needs
 from mivol.transport.media.body import flight_parts
+from mivol.transport.path.estimators import MOST_SCATTERINGS
 from mivol.transport.path.settings import Settings
 
 __all__ = [
@@ -58,8 +59,12 @@ def shares_cells(needs: Needs) -> bool:
 
 
 def is_lit(needs: Needs, settings: Settings) -> bool:
-    """Whether media scatter light to the camera."""
-    return settings.scatterings >= 1 and any(m.is_scattering for m in needs.media)
+    """Whether media scatter light to the camera.
+
+    Media whose values a recording cannot read count as scattering where an estimator would follow the light; at more
+    scatterings than that they were promised to absorb only (:func:`mivol.scene.refusals.refuse_scattering`).
+    """
+    return 1 <= settings.scatterings <= MOST_SCATTERINGS and any(m.is_scattering for m in needs.media)
 
 
 def choose_transport(needs: Needs, settings: Settings) -> Choice:

@@ -10,11 +10,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from false_alarms import Estimate, assert_same_mean
 
 from mivol.errors import MivolError
 from mivol.scene import plan
 from mivol.transport.estimators.ratio_tracking import LOOKUP_RATE
-from mivol.validate.statistics import assert_same_mean
 
 SIDE, SPP, SKY, SCALE = 12, 256, 0.8, 1.2
 BATCHES = SIDE * SIDE
@@ -73,15 +73,20 @@ def assert_transposed(terms: np.ndarray, gradients: dict) -> None:
     assert all(value != 0 for value in gradients.values())
 
 
+def of_batches(values: np.ndarray) -> Estimate:
+    """The mean of values that are drawn alike and independently."""
+    return Estimate(values.mean(), values.var(ddof=1) / values.size, values.size - 1)
+
+
 def check(found: np.ndarray, truth: float, what: str) -> None:
     """Compare the mean over batches (one channel) with the truth by Student's t."""
-    values = found.reshape(BATCHES)
-    assert_same_mean(values.mean(), values.var(ddof=1) / BATCHES, truth, n_a=BATCHES, comparisons=1, what=what)
+    assert_same_mean(of_batches(found), truth, what=what)
 
 
 BOUNDARIES = {"a box": "cube", "a traced sphere": "sphere"}
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("slack", [1.0, 3.0])
 @pytest.mark.parametrize("boundary", BOUNDARIES)
 def test_beer_lambert_through_a_ball(boundary: str, slack: float) -> None:
@@ -95,6 +100,7 @@ def test_beer_lambert_through_a_ball(boundary: str, slack: float) -> None:
     check(tangent[..., 0], -SCALE * chord * seen, "the derivative by sigma")
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("slack", [1.0, 3.0])
 def test_the_variance_is_the_one_that_is_declared(slack: float) -> None:
     """T^2 (exp(int sigma^2 / (kappa M) dt) - 1) = T^2 (exp(tau / (kappa slack)) - 1): a loose majorant has less of it.
@@ -109,10 +115,10 @@ def test_the_variance_is_the_one_that_is_declared(slack: float) -> None:
     T = np.exp(-tau)
     squares = (np.array(images, np.float64) / SKY - T) ** 2
     declared = T**2 * (np.exp(tau / (LOOKUP_RATE * slack)) - 1)
-    n = squares.size
-    assert_same_mean(squares.mean(), squares.var(ddof=1) / n, declared, n_a=n, comparisons=1, what="the variance")
+    assert_same_mean(of_batches(squares), declared, what="the variance")
 
 
+@pytest.mark.statistical
 def test_colours_and_the_scale_of_the_medium() -> None:
     """Each channel by itself, under one majorant for all of them; the scale is followed like the field's own parameters."""
     sigma, chord = [0.3, 1.0, 2.0], 1.6
@@ -123,6 +129,7 @@ def test_colours_and_the_scale_of_the_medium() -> None:
         check(tangent[..., channel], -(SCALE + own) * chord * seen, f"the derivative of channel {channel}")
 
 
+@pytest.mark.statistical
 def test_several_media_along_a_ray() -> None:
     """Two bounded media, one in a box and one that is traced, beside a grid and a constant, which stay exact."""
     place = mi.ScalarTransform4f().translate([-0.5, 1.5, -0.5])
@@ -141,6 +148,7 @@ def test_several_media_along_a_ray() -> None:
     check(tangent[..., 0], -(SCALE * 1.4 + SCALE * 0.8 + 1 + 1) * seen, "the derivative")
 
 
+@pytest.mark.statistical
 def test_a_boundary_that_is_entered_twice() -> None:
     """One medium in two spheres on a diagonal of the field's box: the nearer one lies in the box and beyond the ball, and a
     point of the derivative is drawn in each by its length."""
@@ -157,6 +165,7 @@ def test_a_boundary_that_is_entered_twice() -> None:
     check(tangent[..., 0], -SCALE * 0.8 * seen, "the derivative")
 
 
+@pytest.mark.statistical
 def test_surfaces_behind_are_lit_through_the_field() -> None:
     """Rationale: shadow rays meet the field as camera rays do. Expected: the means of a homogeneous sphere in its place, of
     images, of derivatives by the extinction, and of the film over two passes."""
@@ -173,13 +182,10 @@ def test_surfaces_behind_are_lit_through_the_field() -> None:
         for own, key in ((shape("cube", fog(radius=0.8)), "sigma_t.sigma"), (known, "sigma_t.value.value"))
     ]
     for ours, truth, what in zip(*(s[:2] for s in seen), ("the radiance", "the derivative"), strict=True):
-        a, b = ours[..., 0].reshape(-1), truth[..., 0].reshape(-1)
-        assert_same_mean(
-            a.mean(), a.var(ddof=1) / BATCHES, b.mean(), b.var(ddof=1) / BATCHES,
-            n_a=BATCHES, n_b=BATCHES, comparisons=1, what=what,
-        )  # fmt: skip
+        assert_same_mean(of_batches(ours[..., 0]), of_batches(truth[..., 0]), what=what)
 
 
+@pytest.mark.statistical
 def test_several_passes_add_up(monkeypatch: pytest.MonkeyPatch) -> None:
     """A gradient that Dr.Jit pulls back in one pass is kept in the next."""
     monkeypatch.setitem(plan.PASS_RAYS, "llvm", SIDE * SIDE * SPP // 4)

@@ -288,7 +288,7 @@ def test_light_that_would_be_scattered_is_refused():
 def test_glow_in_other_cells_is_refused():
     sigma = (rough(1, 0, 2), PLACE)
     for glow in ((rough(2, 0, 1, 3, (5, 4, 7)), PLACE), (rough(2, 0, 1, 3), as_float32(centred(1.5 * np.eye(3))))):
-        with refused("glow is summed in the cells of the extinction"):
+        with refused("it is summed in the cells of the extinction"):
             shoot(picture(interior(twins.Medium(sigma, 0.0, glow))))
     # Where the extinction has no grid, the glow's own cells are walked.
     assert np.isfinite(shoot(picture(interior(twins.Medium(0.5, 0.0, (rough(2, 0, 1, 3), PLACE)))))).all()

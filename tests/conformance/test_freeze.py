@@ -168,13 +168,13 @@ def test_constant_that_changes_between_calls():
 def test_a_recording_reads_no_numbers(monkeypatch):
     """What is looked at when a medium is updated, and before an image, is left alone while a function is recorded."""
     from mivol.plugins import media
-    from mivol.scene import needs
+    from mivol.scene import readings
 
     box = box_of(medium("mivol_medium", 0.5), PLACE)
     view = camera((2.0, 1.5, 3.0), (0.0, 0.0, 0.0), res=8, fov=45.0)
     scene = mi.load_dict({"type": "scene", "box": box, "sky": sky(), "sensor": view})
     integrator, params, read = mi.load_dict({"type": "mivol"}), mi.traverse(scene), []
-    for module in (media, needs):
+    for module in (media, readings):
         monkeypatch.setattr(module, "check_constant", lambda value, name, owner: read.append(name))
     monkeypatch.setattr(media.Coefficients, "check_constants", lambda self: read.append("constants"))
 
