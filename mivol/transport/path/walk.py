@@ -181,7 +181,7 @@ def _add_emission(estimators: Estimators, settings: Settings, path: Path, event:
         w_mis = dr.select(path.delta, 1, power_heuristic(path.pdf, pdf_emitter))
     with dr.resume_grad(when=path.score.purpose != PICTURE):
         Le = path.beta * w_mis * emitter.eval(si, shown)
-        path.score = path.score.add(TrackedTerm(Le, shown))
+    path.score = path.score.add(TrackedTerm(Le, shown))
     return path
 
 
