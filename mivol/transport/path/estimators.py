@@ -12,7 +12,6 @@ from dataclasses import dataclass
 import mitsuba as mi
 
 from mivol.transport.estimators.direct_lighting import DirectLighting
-from mivol.transport.estimators.emitters import SceneEmitters
 from mivol.transport.estimators.scattering_quadrature import ScatteringQuadrature
 from mivol.transport.estimators.segment import Absorption, SegmentEstimator
 from mivol.transport.estimators.single_scattering import SingleScattering
@@ -20,7 +19,6 @@ from mivol.transport.estimators.tracked_absorption import TrackedAbsorption
 from mivol.transport.estimators.transmittance_grid import TransmittanceGrid
 from mivol.transport.estimators.visibility_cache import VisibilityCache
 from mivol.transport.line_integrals.emitting_segment import Emission
-from mivol.transport.media.scene_media import SceneMedia
 
 __all__ = [
     "MOST_SCATTERINGS",
@@ -153,11 +151,6 @@ class Estimators:
 
     def __init__(self, direct: DirectLighting, segment: SegmentEstimator, lights_surfaces: bool) -> None:
         self.media, self.direct, self.segment, self.lights_surfaces = direct.media, direct, segment, lights_surfaces
-
-    @classmethod
-    def of_media(cls, media: SceneMedia) -> Estimators:
-        """Estimators for media that only absorb, in a scene without surfaces that scatter light."""
-        return cls(DirectLighting(media, SceneEmitters(media.scene)), Absorption(media), False)
 
     def prepare_derivatives(self, ray: mi.Ray3f) -> None:
         """Find what derivatives along camera rays need beforehand, once for all passes."""
