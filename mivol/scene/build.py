@@ -10,7 +10,6 @@ from mivol.scene.plan import Plan
 from mivol.scene.readings import read_block_ranges, read_coarse, read_empty_distances
 from mivol.scene.survey import Survey
 from mivol.transport.estimators.direct_lighting import DirectLighting
-from mivol.transport.estimators.emitters import SceneEmitters
 from mivol.transport.estimators.transmittance_grid import build_transmittance_grid
 from mivol.transport.estimators.visibility_cache import VisibilityCache, build_visibility_cache
 from mivol.transport.media.body import Body
@@ -49,7 +48,7 @@ def build_estimators(
 ) -> Estimators:
     """Build the estimators that the plan has chosen, for pictures or for derivatives."""
     media = build_media(scene, needs, plan, survey)
-    direct = DirectLighting(media, SceneEmitters(scene))
+    direct = DirectLighting(media)
     choice = SegmentChoice(direct, plan.events)
     if plan.segment in ("single_scattering", "scattering_quadrature"):
         with dr.suspend_grad():

@@ -18,6 +18,7 @@ cast shadows; light that they reflect towards a medium has scattered twice, and 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import drjit as dr
 import mitsuba as mi
@@ -79,11 +80,15 @@ class DirectLighting:
 
     Args:
         media: media of the scene, and its surfaces.
-        emitters: of the scene.
     """
 
-    def __init__(self, media: SceneMedia, emitters: SceneEmitters) -> None:
-        self.media, self.emitters = media, emitters
+    def __init__(self, media: SceneMedia) -> None:
+        self.media = media
+
+    @cached_property
+    def emitters(self) -> SceneEmitters:
+        """The emitters of the scene, looked at where media scatter their light; surfaces ask Mitsuba."""
+        return SceneEmitters(self.media.scene)
 
     def at_surface(
         self, vertex: SurfaceVertex, u: mi.Point2f, attached: bool, active: mi.Bool, chance: mi.Float | None = None
