@@ -12,7 +12,7 @@ from syntax import tree_of
 
 PACKAGE = Path(__file__).resolve().parents[1] / "mivol"
 ORDER = [
-    *("errors", "threads", "machine", "llvm", "numerics", "space", "files", "photos", "fields", "phase"),
+    *("errors", "cite", "threads", "machine", "llvm", "numerics", "space", "files", "photos", "fields", "phase"),
     *("transport", "tomography", "scene", "plugins", "optim", "validate", "report", "config", "doctor", "experiments"),
     *("bench", "cli", "__main__"),
 ]

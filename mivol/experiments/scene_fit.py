@@ -30,8 +30,9 @@ from mivol.report.page import write_page
 from mivol.report.record import PlanLine, RunRecord
 from mivol.scene.load import LoadedScene, load_scene
 from mivol.scene.needs import find_needs
-from mivol.scene.plan import make_plan
+from mivol.scene.plan import Plan, make_plan
 from mivol.scene.survey import survey_scene
+from mivol.transport.path.estimators import SEGMENT_ESTIMATORS
 from mivol.transport.path.settings import Settings
 from mivol.validate.statistics import nrmse, psnr
 
@@ -66,7 +67,9 @@ def scene_fit(task: Task) -> Path:
             seen = find_references(task, loaded, truth)
         with run.stage("fit"):
             problem = make_problem(chosen, loaded.scene, integrator, starts, seen)
-            run.record.plan = choices(chosen, problem)
+            made = plan_of(chosen, problem)
+            run.record.plan = lines_of(made)
+            run.record.citations += cited(made, run.record.citations)
             fit = solve(task, run, loaded, problem, SceneErrors(chosen, seen, truth))
         with run.stage("images and volumes"):
             SceneOutputs(chosen, run, fit, seen, truth).write()
@@ -88,13 +91,22 @@ def new_record(chosen: Experiment) -> RunRecord:
     )
 
 
-def choices(chosen: Experiment, problem: SceneProblem) -> list[PlanLine]:
-    """The plan of mivol's integrator for this scene, with its reasons; other integrators have none."""
+def plan_of(chosen: Experiment, problem: SceneProblem) -> Plan | None:
+    """The plan of mivol's integrator for this scene; other integrators have none."""
     if chosen.fit.integrator != "mivol":
-        return []
+        return None
     needs = find_needs(problem.scene, problem.batches[0].sensor, survey_scene(problem.scene))
-    made = make_plan(needs, Settings(max_depth=chosen.fit.max_depth))
-    return [PlanLine(choice=f"{c.about}: {c.choice}", reason=c.reason) for c in made.choices]
+    return make_plan(needs, Settings(max_depth=chosen.fit.max_depth))
+
+
+def lines_of(plan: Plan | None) -> list[PlanLine]:
+    """The choices of a plan, with their reasons."""
+    return [] if plan is None else [PlanLine(choice=f"{c.about}: {c.choice}", reason=c.reason) for c in plan.choices]
+
+
+def cited(plan: Plan | None, known: Sequence[str]) -> list[str]:
+    """What the estimator of a plan cites beside ``known`` keys."""
+    return [] if plan is None else [key for key in SEGMENT_ESTIMATORS[plan.segment].cites if key not in known]
 
 
 def make_integrator(chosen: Experiment) -> mi.Integrator:

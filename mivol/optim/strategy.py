@@ -23,7 +23,7 @@ def of(unit: str, meaning: str, **domain: float) -> msgspec.Meta:
 
 
 class Strategy(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="name"):
-    """Base of all named choices; ``cites`` are keys of ``mivol.report.cite.CITATIONS``."""
+    """Base of all named choices; ``cites`` are keys of ``mivol.cite.CITATIONS``."""
 
     cites: ClassVar[tuple[str, ...]] = ()
 

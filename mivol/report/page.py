@@ -21,10 +21,10 @@ import numpy as np
 from matplotlib.image import imread
 from numpy.typing import NDArray
 
+from mivol.cite import citations
 from mivol.errors import MivolError
 from mivol.files import layers, read_exr, read_volume, write_whole_text
 from mivol.report import figures, show
-from mivol.report.cite import citations
 from mivol.report.record import QUANTITIES, Image, Quantity, RunRecord, Volume, read_metrics, read_record
 
 __all__ = ["PAGE", "headline", "write_page"]

@@ -163,7 +163,7 @@ class RunRecord(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
     notes: list[str] = []
     """Sentences that a reader must know: limits, refusals, events."""
     citations: list[str] = []
-    """Keys of :data:`mivol.report.cite.CITATIONS`."""
+    """Keys of :data:`mivol.cite.CITATIONS`."""
 
     @classmethod
     def new(cls, title: str, *, device: str = "", **fields: Any) -> RunRecord:

@@ -9,6 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mivol.cite import citations
 from mivol.scene.build import build_media
 from mivol.scene.choices import is_lit, shares_cells
 from mivol.scene.depth_two import depth_two_error, mean_albedo, mean_cosine, scattering_depth
@@ -22,7 +23,7 @@ from mivol.transport.estimators.emitters import SceneEmitters
 from mivol.transport.estimators.transmittance_grid import build_transmittance_grid, measure_transmittance_bias
 from mivol.transport.media.box import Box
 from mivol.transport.media.read_medium import traverse_medium
-from mivol.transport.path.estimators import MOST_SCATTERINGS
+from mivol.transport.path.estimators import MOST_SCATTERINGS, SEGMENT_ESTIMATORS
 from mivol.transport.path.settings import Settings
 
 __all__ = ["explain", "settings_of"]
@@ -79,6 +80,7 @@ def explain(scene: mi.Scene | str | Path, max_depth: int | None = None, sensor: 
     if settings.scatterings == MOST_SCATTERINGS:
         lines += [f"  model     {text}" for text in _depth_two(loaded, needs)]
         lines += [f"  shadows   {text}" for text in _transmittance_grid(loaded, needs, plan, settings)]
+    lines += ["references", *(f"  {source}" for source in citations(SEGMENT_ESTIMATORS[plan.segment].cites))]
     return "\n".join(lines)
 
 

@@ -19,10 +19,10 @@ import pytest
 from cli.run_folder import write_run
 from matplotlib.image import imread
 
+from mivol.cite import CITATIONS, citations
 from mivol.errors import MivolError
 from mivol.files import write_exr, write_volume
 from mivol.report import figures, show
-from mivol.report.cite import CITATIONS, citations
 from mivol.report.page import headline, write_page
 from mivol.report.record import (
     Image,

@@ -151,8 +151,10 @@ def test_explain_gives_a_reason_for_each_choice():
     text = explain(scene_of(sigma_t=grid_volume("mivol_voxels", values(3), PLACE)))
     for fact in ("rgb extinction", "4x5x6", "albedo 0", "ConstantBackgroundEmitter", "not traced", "gradient step"):
         assert fact in text
-    choices = [line for line in text.split("plan\n")[1].splitlines() if "because" not in line]
+    plan, _, references = text.split("plan\n")[1].partition("references\n")
+    choices = [line for line in plan.splitlines() if "because" not in line]
     assert text.count("because") == len(choices) >= 5
+    assert "A fast voxel traversal algorithm" in references
 
 
 @pytest.mark.parametrize(

@@ -35,6 +35,7 @@ def test_optimize_leaves_a_whole_run_folder(variant_rgb, folder: Path, capsys: p
     assert {"mivol", "mitsuba", "drjit"} <= set(record["versions"])
     assert record["plan"]
     assert all(choice["reason"] for choice in record["plan"])
+    assert {"mitsuba3", "kingma_2015", "amanatides_1987"} <= set(record["citations"])
     assert set(record["timings"]) == {"scene", "references", "fit", "images and volumes"}
     assert [image["view"] for image in record["images"] if image.get("held_out")] == ["view 1"] * 3
     rows = [json.loads(line) for line in (target / "metrics.jsonl").read_text().splitlines()]

@@ -75,7 +75,7 @@ class SegmentEntry:
         scatterings: number of scattering events in media between an emitter and the camera that it accounts for.
         needs: the condition on the scene, in words.
         promises: bias and variance, in words.
-        cites: keys of :mod:`mivol.report.cite`.
+        cites: keys of :mod:`mivol.cite`.
     """
 
     make: Callable[[SegmentChoice], SegmentEstimator]
@@ -83,7 +83,7 @@ class SegmentEntry:
     scatterings: int
     needs: str
     promises: str
-    cites: tuple[str, ...] = ()
+    cites: tuple[str, ...]
 
 
 def _make_quadrature(choice: SegmentChoice) -> ScatteringQuadrature:
@@ -98,6 +98,7 @@ SEGMENT_ESTIMATORS = {
         0,
         "no medium emits, or scatters light to the camera",
         "no bias, no variance",
+        ("amanatides_1987", "vicini_2021"),
     ),
     "tracked_absorption": SegmentEntry(
         lambda choice: TrackedAbsorption(choice.direct.media),
@@ -105,6 +106,7 @@ SEGMENT_ESTIMATORS = {
         0,
         "a medium is bounded, and none emits, or scatters light to the camera",
         "no bias, of derivatives neither; variance of ratio tracking, and of one point a segment for derivatives",
+        ("novak_2014", "amanatides_1987", "vicini_2021"),
     ),
     "emission": SegmentEntry(
         lambda choice: Emission(choice.direct.media),
@@ -112,6 +114,7 @@ SEGMENT_ESTIMATORS = {
         0,
         "a medium emits, and none scatters light to the camera",
         "error of the fourth order in the size of a cell, no variance",
+        ("max_1995", "amanatides_1987", "hairer_1996"),
     ),
     "single_scattering": SegmentEntry(
         lambda choice: SingleScattering(choice.direct, choice.count, choice.visibility_cache),
@@ -119,6 +122,10 @@ SEGMENT_ESTIMATORS = {
         1,
         "a medium scatters once, and none emits",
         "no bias",
+        (
+            *("chao_1982", "kulla_2012", "miller_2019", "veach_1995"),
+            *("amanatides_1987", "novak_2014", "hofmann_2021", "rousselle_2016", "vicini_2021"),
+        ),
     ),
     "scattering_quadrature": SegmentEntry(
         _make_quadrature,
@@ -126,6 +133,7 @@ SEGMENT_ESTIMATORS = {
         1,
         "one medium scatters once, its grids share their cells, every emitter has one position or direction",
         "error of the fourth order in the size of a cell where light is smooth, no variance; derivatives are drawn",
+        ("hairer_1996", "kulla_2012", "amanatides_1987", "vicini_2021"),
     ),
 }
 """Estimators of what media add along a segment, by the name that a plan chooses them by. A question has one answer, or none."""
