@@ -197,10 +197,10 @@ def surfaces() -> Iterator:
 
 
 def emission() -> Iterator:
-    glowing = medium(grid(rough(12, (8, 7, 8, 1))), emission=grid(rough(13, (8, 7, 8, 3))),
+    emitting = medium(grid(rough(12, (8, 7, 8, 1))), emission=grid(rough(13, (8, 7, 8, 3))),
                      emission_density=grid(rough(14, (8, 7, 8, 3), top=0.5)))  # fmt: skip
     fog = medium(0.7, emission=rgb(0.2, 0.1, 0.4))
-    scene = {"body": box(glowing), "ball": ball(fog, (-1.4, 0, 0), 0.4), "floor": floor(), "sky": SKY, "sensor": camera()}
+    scene = {"body": box(emitting), "ball": ball(fog, (-1.4, 0, 0), 0.4), "floor": floor(), "sky": SKY, "sensor": camera()}
     yield from follow(scene, ("sigma_t.data", "emission.data", "emission_density.data"), max_depth=2, aovs="tau,depth")
 
 

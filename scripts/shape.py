@@ -47,7 +47,7 @@ def measure(package: Path) -> dict[str, object]:
         "functions": len(bodies),
         "median lines of a body": statistics.median(bodies.values()),
         f"bodies of {LONG_FUNCTION} lines and more": _largest(bodies, LONG_FUNCTION),
-        f"functions of {MANY} parameters and more": len(_largest(parameters, MANY)),
+        f"functions of {MANY} parameters and more": _largest(parameters, MANY),
         "signatures with scene and its media apart": trains,
         "modules in circles of imports": circle,
     }

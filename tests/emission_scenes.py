@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import drjit as dr
 import mitsuba as mi
@@ -45,7 +46,8 @@ def _given(field: object, kind: str) -> object:
 
 def interior(medium: Medium, kind: str = "mivol_voxels", **more: object) -> dict:
     """The twin's medium as a `mivol_medium`."""
-    given = {"sigma_t": medium.sigma, "albedo": medium.albedo, "emission": medium.source, "emission_density": medium.glow}
+    light = {"emission": medium.source, "emission_density": medium.emission_density}
+    given = {"sigma_t": medium.sigma, "albedo": medium.albedo, **light}
     absent = [k for k, v in given.items() if not isinstance(v, tuple) and k != "sigma_t" and not np.any(v)]
     return {"type": "mivol_medium", **{k: _given(v, kind) for k, v in given.items() if k not in absent}, **more}
 
@@ -53,7 +55,7 @@ def interior(medium: Medium, kind: str = "mivol_voxels", **more: object) -> dict
 def body(medium: Medium, boundary: str = "box", kind: str = "mivol_voxels", **more: object) -> tuple[dict, Medium]:
     """The same medium in the same boundary, for Mitsuba and for the twin."""
     build, interval = BOUNDARIES[boundary]
-    return build(interior(medium, kind, **more)), Medium(medium.sigma, medium.source, medium.glow, medium.albedo, interval)
+    return build(interior(medium, kind, **more)), replace(medium, interval=interval)
 
 
 def emitting(

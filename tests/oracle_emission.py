@@ -55,17 +55,17 @@ class Medium:
 
     sigma: object
     source: object = 0.0
-    glow: object = 0.0
+    emission_density: object = 0.0
     albedo: object = 0.0
     interval: Interval = lambda o, d: (-math.inf, math.inf)
 
     @property
     def fields(self) -> tuple:
-        return self.sigma, self.source, self.glow, self.albedo
+        return self.sigma, self.source, self.emission_density, self.albedo
 
     def at(self, ray: Ray, t: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Extinction, source function and glow at distances t."""
-        return ray.at(self.sigma, t), (1 - ray.at(self.albedo, t)) * ray.at(self.source, t), ray.at(self.glow, t)
+        """Extinction, source function and density at distances t."""
+        return ray.at(self.sigma, t), (1 - ray.at(self.albedo, t)) * ray.at(self.source, t), ray.at(self.emission_density, t)
 
 
 # -- The integral itself -------------------------------------------------------------------------------------------------
@@ -123,8 +123,8 @@ def share(dt: np.ndarray, s1: np.ndarray, s2: np.ndarray) -> tuple[np.ndarray, n
     return alpha * f, alpha * (1 - f)
 
 
-def glow(dt: np.ndarray, s1: np.ndarray, s2: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Weights of the glow at the two Gauss points: what exp(-tau u + lean u (1 - u)) lets out, and from where."""
+def weigh_emission_density(dt: np.ndarray, s1: np.ndarray, s2: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Weights of the emission density at the two Gauss points: what exp(-tau u + lean u (1 - u)) lets out, and from where."""
     tau, lean = np.asarray(0.5 * dt * (s1 + s2)), np.asarray(0.5 * math.sqrt(3) * dt * (s2 - s1))
     u, w = np.polynomial.legendre.leggauss(16)
     ends = np.append(0, np.geomspace(1e-8, 1, 24))
@@ -167,7 +167,7 @@ def _cell_radiance(medium: Medium, ray: Ray, background: object, end: float) -> 
         w = share(b - a, *sigma)
         L += T * (w[0] * source[0] + w[1] * source[1])
         if np.any(j):
-            g = glow(b - a, *sigma)
+            g = weigh_emission_density(b - a, *sigma)
             L += T * (g[0] * j[0] + g[1] * j[1])
         T *= np.exp(-0.5 * (b - a) * (sigma[0] + sigma[1]))
     return L + T * np.asarray(background, dtype=np.float64)

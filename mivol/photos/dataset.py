@@ -33,7 +33,7 @@ __all__ = [
     "Frame",
     "Photo",
     "Photos",
-    "Survey",
+    "PhotoSurvey",
     "find_format",
     "load_photos",
     "survey_photos",
@@ -78,7 +78,7 @@ class Frame:
 
 
 @dataclass(frozen=True)
-class Survey:
+class PhotoSurvey:
     """What a data set holds, from its cameras and the headers of its images.
 
     Attributes:
@@ -164,7 +164,7 @@ class Photos:
 
     views: tuple[Photo, ...]
     space: str
-    survey: Survey
+    survey: PhotoSurvey
 
     @property
     def box(self) -> np.ndarray:
@@ -194,7 +194,7 @@ def survey_photos(
     split: str = "all",
     held_out: int | Sequence[str] = 0,
     box: np.ndarray | None = None,
-) -> Survey:
+) -> PhotoSurvey:
     """Cameras, sizes and box of a data set; no pixel is read.
 
     Args:
@@ -223,7 +223,7 @@ def survey_photos(
     found, whence = _box(box, listing.points, looking, path)
     region.check_views([frame.camera for frame in frames], found)
     near_far = region.near_far_of([*looking, *(frame.camera for frame in frames)], found)
-    return Survey(path, name, tuple(frames), tuple(absent), found, whence, near_far, listing.points)
+    return PhotoSurvey(path, name, tuple(frames), tuple(absent), found, whence, near_far, listing.points)
 
 
 def load_photos(

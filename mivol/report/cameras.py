@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from mivol.photos import SPLITS, Frame, Survey
+from mivol.photos import SPLITS, Frame, PhotoSurvey
 from mivol.report.figures import FAINT, INK, SERIES, STYLE, save
 
 __all__ = ["plot_cameras"]
@@ -28,7 +28,7 @@ EDGE = 0.12
 MOST_POINTS = 4000
 
 
-def plot_cameras(survey: Survey, path: str | Path | None = None) -> Figure:
+def plot_cameras(survey: PhotoSurvey, path: str | Path | None = None) -> Figure:
     """Cameras, box and points from the side and from above.
 
     Args:
@@ -80,7 +80,7 @@ def _pen(edges: NDArray) -> NDArray:
     return np.concatenate([edges, lifted], axis=1).reshape(-1, 3).T
 
 
-def _by_split(survey: Survey) -> dict[str, list[Frame]]:
+def _by_split(survey: PhotoSurvey) -> dict[str, list[Frame]]:
     found = {split: [frame for frame in survey.frames if frame.split == split] for split in SPLITS}
     return {split: frames for split, frames in found.items() if frames}
 
@@ -89,7 +89,7 @@ def _colour(split: str) -> str:
     return dict(zip(SPLITS, SERIES, strict=False))[split]
 
 
-def _points(survey: Survey) -> NDArray:
+def _points(survey: PhotoSurvey) -> NDArray:
     if survey.points is None:
         return np.empty((0, 3))
     inside = ((survey.points >= survey.box[0]) & (survey.points <= survey.box[1])).all(axis=1)
@@ -97,7 +97,7 @@ def _points(survey: Survey) -> NDArray:
     return points[:: max(1, len(points) // MOST_POINTS)]
 
 
-def _draw_side(axes: Axes, survey: Survey, lines: dict[str, NDArray], up: int) -> None:
+def _draw_side(axes: Axes, survey: PhotoSurvey, lines: dict[str, NDArray], up: int) -> None:
     order = _order(up)
     for split, edges in lines.items():
         axes.plot(*_pen(edges)[order], color=_colour(split), linewidth=0.7, alpha=0.8)
@@ -113,7 +113,7 @@ def _draw_side(axes: Axes, survey: Survey, lines: dict[str, NDArray], up: int) -
     axes.view_init(22, -60)
 
 
-def _draw_plan(axes: Axes, survey: Survey, lines: dict[str, NDArray], up: int) -> None:
+def _draw_plan(axes: Axes, survey: PhotoSurvey, lines: dict[str, NDArray], up: int) -> None:
     first, second, _ = _order(up)
     for split, edges in lines.items():
         axes.plot(*_pen(edges)[[first, second]], color=_colour(split), linewidth=0.7, alpha=0.8, label=split)

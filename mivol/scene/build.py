@@ -8,7 +8,7 @@ import mitsuba as mi
 from mivol.scene.facts import Needs
 from mivol.scene.plan import Plan
 from mivol.scene.readings import read_block_ranges, read_coarse, read_empty_distances
-from mivol.scene.survey import Survey
+from mivol.scene.survey import SceneSurvey
 from mivol.transport.estimators.direct_lighting import DirectLighting
 from mivol.transport.estimators.transmittance_grid import build_transmittance_grid
 from mivol.transport.estimators.visibility_cache import VisibilityCache, build_visibility_cache
@@ -20,7 +20,7 @@ from mivol.transport.path.settings import Settings
 __all__ = ["build_estimators", "build_media"]
 
 
-def build_media(scene: mi.Scene, needs: Needs, plan: Plan, survey: Survey) -> SceneMedia:
+def build_media(scene: mi.Scene, needs: Needs, plan: Plan, survey: SceneSurvey) -> SceneMedia:
     """Build the media that transport walks through, as planned."""
     bodies = []
     for boundary, view, skip, tracks in zip(needs.boundaries, needs.views, plan.skips, plan.tracks, strict=True):
@@ -44,7 +44,7 @@ def build_media(scene: mi.Scene, needs: Needs, plan: Plan, survey: Survey) -> Sc
 
 
 def build_estimators(
-    scene: mi.Scene, needs: Needs, plan: Plan, settings: Settings, survey: Survey, pictures: bool
+    scene: mi.Scene, needs: Needs, plan: Plan, settings: Settings, survey: SceneSurvey, pictures: bool
 ) -> Estimators:
     """Build the estimators that the plan has chosen, for pictures or for derivatives."""
     media = build_media(scene, needs, plan, survey)
@@ -60,7 +60,7 @@ def build_estimators(
 
 
 def _find_visibility(
-    direct: DirectLighting, needs: Needs, plan: Plan, survey: Survey, pictures: bool
+    direct: DirectLighting, needs: Needs, plan: Plan, survey: SceneSurvey, pictures: bool
 ) -> VisibilityCache | None:
     """Find where emitters shine; derivatives are not 0 in empty blocks, which only values that were read can tell."""
     blind = not pictures or any(m.unread for m in needs.media)

@@ -34,8 +34,8 @@ FINE = 300
 variance x time: smoke of 142 cells 0.4 times as fast, of 256^3 twice; CT of 445 cells 1.9 times; threads of 111 0.9)."""
 
 EVENTS = {(True, False): 4, (True, True): 8, (False, False): 2, (False, True): 2}
-"""Points of a camera ray that scatter, by whether its grid is filled and whether every lamp has one position or direction, so
-that a walk costs more and a shadow ray less (measured, variance x time over that of 1 point: smoke 1.5 to 2, CT 1.5 to 2.4;
+"""Points of a camera ray that scatter, by whether its grid is filled and whether every emitter has one position or direction,
+so that a walk costs more and a shadow ray less (measured, variance x time over that of 1 point: smoke 1.5 to 2, CT 1.5 to 2.4;
 threads, whose noise is what a pixel sees of them: 1.0 to 1.2, 4 points 0.9 to 1.3; of 8 points over 4, point lights: smoke 1.1,
 CT 1.1 and 1.3)."""
 
@@ -97,24 +97,24 @@ def choose_lighting(needs: Needs, settings: Settings) -> list[Choice]:
     """How scattered light is found."""
     if not is_lit(needs, settings):
         return []
-    drawn = [lamp for lamp in needs.lamps if lamp != "uniform"]
-    met = [lamp for lamp in needs.lamps if lamp != "sharp"]
-    if not needs.lamps:
+    drawn = [kind for kind in needs.emitter_kinds if kind != "uniform"]
+    met = [kind for kind in needs.emitter_kinds if kind != "delta"]
+    if not needs.emitter_kinds:
         return [Choice("directions", "none", "the scene has no emitter")]
     if settings.deterministic:
-        where = "at two points of each piece of a cell, from every lamp"
+        where = "at two points of each piece of a cell, from every emitter"
         return [Choice("where to scatter", where, "deterministic was asked for")]
     if not drawn:
         choices = [Choice("directions", "one, of the phase function", "light is the same from everywhere")]
     elif not met:
-        choices = [Choice("directions", f"one, to one of {len(drawn)} lamps", "no lamp can be met by chance")]
+        choices = [Choice("directions", f"one, to one of {len(drawn)} emitters", "no phase sample can hit one")]
     else:
-        why = f"{len(drawn)} lamps to aim at, {len(met)} that can be met by chance: the power heuristic weighs both"
-        choices = [Choice("directions", "two: to a lamp, and of the phase function", why)]
-    if "sharp" in drawn:
+        why = f"{len(drawn)} emitters to sample, {len(met)} that phase samples can hit: the power heuristic weighs both"
+        choices = [Choice("directions", "two: to an emitter, and of the phase function", why)]
+    if "delta" in drawn:
         alone = len(needs.media) == 1 and len(needs.media[0].resolutions) == 1
-        what = "weighed by optical depth towards the lamps, from blocks of the grid" if alone else "by the camera's own ray"
-        why = "a lamp of one position or direction" + ("" if alone else ", but more than one grid or none")
+        what = "weighed by optical depth towards the emitters, from blocks of the grid" if alone else "by the camera's own ray"
+        why = "an emitter of one position or direction" + ("" if alone else ", but more than one grid or none")
         choices.append(Choice("where to scatter", what, why))
     return choices
 
@@ -155,8 +155,8 @@ def choose_shadows(medium: MediumFacts, needs: Needs, settings: Settings) -> Cho
     size = f"{cells:.0f} occupied cells along the three axes"
     if cells < FINE:
         return Choice(about, "exact", f"{size}: they are soon walked")
-    if set(needs.lamps) == {"sharp"}:
-        return Choice(about, "exact", "no lamp is wide: where all light is faint, estimates are coarse")
+    if set(needs.emitter_kinds) == {"delta"}:
+        return Choice(about, "exact", "no emitter is extended: where all light is faint, estimates are coarse")
     return Choice(about, "estimated", f"{size}: unbiased look-ups cost less; gradients walk every cell")
 
 
@@ -168,5 +168,5 @@ def choose_events(needs: Needs, settings: Settings) -> tuple[int, list[Choice]]:
     if len(needs.media) != 1 or len(needs.media[0].resolutions) != 1:
         return 1, [Choice(about, "1 of a camera ray", "there is more than one grid or none")]
     share = needs.media[0].occupied
-    count = EVENTS[share >= FILLED, set(needs.lamps) == {"sharp"}]
+    count = EVENTS[share >= FILLED, set(needs.emitter_kinds) == {"delta"}]
     return count, [Choice(about, f"{count} of a camera ray", f"one walk for them all; {share:.0%} of the blocks hold anything")]

@@ -96,7 +96,7 @@ def depth_two_error(albedo: float, tau: float, light: str = "constant", phase: s
     Args:
         albedo_arrays: single-scattering albedo, in [0, 1]; of a volume, its mean weighted by extinction.
         tau: optical depth as :func:`scattering_depth` measures it, at least 0.
-        light: "constant" (sky, environment) or "collimated" (sun, lamps).
+        light: "constant" (sky, environment) or "collimated" (sun, point and spot lights).
         phase: "isotropic" or "forward".
 
     Returns:

@@ -86,7 +86,7 @@ def explain(scene: mi.Scene | str | Path, max_depth: int | None = None, sensor: 
 
 def _transmittance_grid(scene: mi.Scene, needs: Needs, plan: Plan, settings: Settings) -> list[str]:
     """What a light grid in place of shadow rays costs, and how wrong it is."""
-    if not is_lit(needs, settings) or set(needs.lamps) != {"sharp"} or len(needs.media) != 1:
+    if not is_lit(needs, settings) or set(needs.emitter_kinds) != {"delta"} or len(needs.media) != 1:
         return []
     if not shares_cells(needs) or any(part.lattice is None for part in needs.views[0].parts):
         return []
@@ -97,10 +97,10 @@ def _transmittance_grid(scene: mi.Scene, needs: Needs, plan: Plan, settings: Set
     nodes = grid.nodes[0] * grid.nodes[1] * grid.nodes[2]
     rays = needs.film_samples * sum(needs.media[0].resolutions[0])
     pays = "pays" if nodes < rays else "does not pay"
-    offer = "asked for" if settings.shadows == "grid" else "exact; with deterministic"
+    asked = "asked for" if settings.shadows == "grid" else "exact; with deterministic"
     return [
-        f"{offer}, a light grid of {nodes} nodes {pays} against about {rays} shadow rays, at a bias of "
-        f"{bias:+.2g} of a lamp's light (rms {rms:.2g}, measured against exact shadows)"
+        f"{asked}, a light grid of {nodes} nodes {pays} against about {rays} shadow rays, at a bias of "
+        f"{bias:+.2g} of an emitter's light (rms {rms:.2g}, measured against exact shadows)"
     ]
 
 
@@ -125,7 +125,7 @@ def _tables(needs: Needs) -> list[str]:
 def _depth_two(scene: mi.Scene, needs: Needs) -> list[str]:
     """What a model of one scattering leaves out of each medium."""
     lines = []
-    light = "collimated" if "sharp" in needs.lamps else "constant"
+    light = "collimated" if "delta" in needs.emitter_kinds else "constant"
     for facts, boundary, view in zip(needs.media, needs.boundaries, needs.views, strict=True):
         box, traced = (boundary.box, None) if boundary.box is not None else (_box_around(scene, boundary.medium), scene)
         if not facts.is_scattering or box is None:

@@ -58,10 +58,11 @@ class Needs:
         boundaries: media and where they are.
         views: their extinction, in the same order, with its gradients.
         media: what each is made of, in the same order.
-        surfaces: kinds of the shapes that are more than boundaries.
+        surfaces: class names of the shapes that are more than boundaries.
         has_null_transmission: some surface lets light through undeviated and is more than a boundary.
-        emitters: kinds.
-        lamps: of each emitter: ``uniform`` (the same from everywhere), ``sharp`` (of one position or direction) or ``wide``.
+        emitters: class names.
+        emitter_kinds: ``uniform`` (an environment that is the same in all directions), ``delta`` (one position or direction) or
+            ``extended``, of each emitter.
         refractive: names of the boundaries that bend or blur the light that passes them.
         start: medium that the sensor names.
         camera_inside: the camera may be inside the box around a boundary.
@@ -77,7 +78,7 @@ class Needs:
     surfaces: tuple[str, ...]
     has_null_transmission: bool
     emitters: tuple[str, ...]
-    lamps: tuple[str, ...]
+    emitter_kinds: tuple[str, ...]
     refractive: tuple[str, ...]
     start: mi.Medium | None
     camera_inside: bool

@@ -15,14 +15,14 @@ from mivol.scene.facts import Boundary, MediumFacts, Needs
 from mivol.scene.load import check_variant
 from mivol.scene.nesting import bounds
 from mivol.scene.readings import Reading, check_light, check_numbers, is_scattering, read_part
-from mivol.scene.survey import AROUND, Survey, find_around, is_instance, survey_scene
+from mivol.scene.survey import AROUND, SceneSurvey, find_around, is_instance, survey_scene
 from mivol.transport.media.medium_view import MediumView
 from mivol.transport.media.read_medium import kind_of, view_medium
 
 __all__ = ["find_needs"]
 
 
-def find_needs(scene: mi.Scene, sensor: mi.Sensor, survey: Survey | None = None, spp: int = 0) -> Needs:
+def find_needs(scene: mi.Scene, sensor: mi.Sensor, survey: SceneSurvey | None = None, spp: int = 0) -> Needs:
     """Ask a scene what it needs.
 
     Args:
@@ -51,7 +51,7 @@ def find_needs(scene: mi.Scene, sensor: mi.Sensor, survey: Survey | None = None,
         surfaces=survey.surfaces,
         has_null_transmission=survey.has_null_transmission,
         emitters=survey.emitters,
-        lamps=survey.lamps,
+        emitter_kinds=survey.emitter_kinds,
         refractive=survey.refractive,
         start=sensor.get_medium(),
         camera_inside=_camera_inside(scene, sensor, survey),
@@ -68,7 +68,7 @@ def _is_place(key: str, owner: object) -> bool:
     return isinstance(owner, mi.Shape | mi.Sensor) and not painted
 
 
-def _camera_inside(scene: mi.Scene, sensor: mi.Sensor, survey: Survey) -> bool:
+def _camera_inside(scene: mi.Scene, sensor: mi.Sensor, survey: SceneSurvey) -> bool:
     """Whether the sensor may lie in the bounding box of a boundary that has to be traced."""
     if all(b.box is not None for b in survey.boundaries):
         return False
@@ -83,7 +83,7 @@ def _camera_inside(scene: mi.Scene, sensor: mi.Sensor, survey: Survey) -> bool:
     return bool((np.array(eye.max) + ahead >= low).all() and (np.array(eye.min) - ahead <= high).all())
 
 
-def _facts(boundary: Boundary, view: MediumView, survey: Survey, recording: bool) -> MediumFacts:
+def _facts(boundary: Boundary, view: MediumView, survey: SceneSurvey, recording: bool) -> MediumFacts:
     grids = [p.lattice for p in view.parts if p.lattice is not None]
     phase = boundary.medium.phase_function()
     common = {

@@ -104,7 +104,7 @@ def make_plan(needs: Needs, settings: Settings, aovs: tuple[str, ...] = ()) -> P
 
 def _segment(needs: Needs, settings: Settings) -> str:
     """Name of the estimator of what media add along a segment; what no estimator answers has been refused."""
-    scatters = bool(needs.lamps) and is_lit(needs, settings)
+    scatters = bool(needs.emitter_kinds) and is_lit(needs, settings)
     emits, is_bounded = any(m.emits for m in needs.media), any(m.bounded for m in needs.media)
     return choose_segment_estimator(SegmentQuestion(scatters, emits, settings.deterministic, is_bounded))
 

@@ -19,7 +19,7 @@ from mivol.errors import MivolError
 from mivol.fields.activation import Activation
 from mivol.files import check_volume
 from mivol.scene.coefficients import check_constant
-from mivol.scene.survey import Survey
+from mivol.scene.survey import SceneSurvey
 from mivol.transport.media.extinction import ExactExtinction
 from mivol.transport.media.medium_view import MediumView
 from mivol.transport.traversal.block_ranges import BlockRanges, find_block_ranges
@@ -42,7 +42,7 @@ class Reading:
     floored: mi.Float | None = None
 
 
-def _once(survey: Survey, kind: tuple, array: mi.Float, make: Callable[[], Any]) -> Any:
+def _once(survey: SceneSurvey, kind: tuple, array: mi.Float, make: Callable[[], Any]) -> Any:
     """Make something once for each state of an array, which is kept so that its number cannot be given to another one."""
     key = (*kind, array.index)
     if key not in survey.values:
@@ -52,7 +52,7 @@ def _once(survey: Survey, kind: tuple, array: mi.Float, make: Callable[[], Any])
     return survey.values[key][1]
 
 
-def read_part(part: ExactExtinction, survey: Survey, name: str) -> Reading:
+def read_part(part: ExactExtinction, survey: SceneSurvey, name: str) -> Reading:
     """Read the bounds of a part of an extinction once for each state of its array.
 
     Voxels below 0, where a step of an optimiser or a filter overshot, count as 0 from here on, and have the derivative that
@@ -88,7 +88,7 @@ def read_part(part: ExactExtinction, survey: Survey, name: str) -> Reading:
     return read
 
 
-def _floor(part: ExactExtinction, survey: Survey, name: str) -> mi.Float:
+def _floor(part: ExactExtinction, survey: SceneSurvey, name: str) -> mi.Float:
     """The values of a grid with 0 for those below it; says so once for each grid of a scene.
 
     Raises:
@@ -129,7 +129,7 @@ ALIKE = 0.02
 where a turned stock grid does not fill its boundary; the nearest voxel is about 0.4 off)."""
 
 
-def _check_look_up(part: ExactExtinction, survey: Survey, name: str) -> None:
+def _check_look_up(part: ExactExtinction, survey: SceneSurvey, name: str) -> None:
     """Refuse a stock grid with another filter or with borders that are not clamped: it tells neither, but its values do."""
     volume, lattice = part.volume, part.lattice
     mixes = mi.is_monochromatic and lattice.channels > 1
@@ -162,19 +162,19 @@ def _check_look_up(part: ExactExtinction, survey: Survey, name: str) -> None:
         survey.looked_up.add(volume.ptr)
 
 
-def read_empty_distances(part: ExactExtinction, survey: Survey, name: str) -> mi.UInt8:
+def read_empty_distances(part: ExactExtinction, survey: SceneSurvey, name: str) -> mi.UInt8:
     """Measure the gaps between the blocks of a part that hold anything, once for each state of its array."""
     array, res = dr.detach(part.lattice.values.array), part.lattice.res
     return _once(survey, ("gaps",), array, lambda: empty_block_distances(read_part(part, survey, name).bounds, res))
 
 
-def read_block_ranges(part: ExactExtinction, survey: Survey) -> BlockRanges:
+def read_block_ranges(part: ExactExtinction, survey: SceneSurvey) -> BlockRanges:
     """Read what the blocks of a grid hold, once for each state of its array."""
     values = part.lattice.values
     return _once(survey, ("blocks",), dr.detach(values.array), lambda: find_block_ranges(values))
 
 
-def read_coarse(survey: Survey, lattice: Lattice, shift: int, lists: bool) -> CoarseGrid:
+def read_coarse(survey: SceneSurvey, lattice: Lattice, shift: int, lists: bool) -> CoarseGrid:
     """Make a grid coarser once for each state of its array and place; anew where a function is being recorded."""
     if dr.flag(dr.JitFlag.FreezingScope):
         return coarsen_grid(lattice, shift, lists)
@@ -182,7 +182,7 @@ def read_coarse(survey: Survey, lattice: Lattice, shift: int, lists: bool) -> Co
     return _once(survey, kind, dr.detach(lattice.values.array), lambda: coarsen_grid(lattice, shift, lists))
 
 
-def is_scattering(view: MediumView, survey: Survey, name: str) -> bool:
+def is_scattering(view: MediumView, survey: SceneSurvey, name: str) -> bool:
     """Whether any albedo (or sigma_s) of a medium is above 0, or its derivative is asked for. Each array is read once.
 
     Raises:
@@ -192,7 +192,7 @@ def is_scattering(view: MediumView, survey: Survey, name: str) -> bool:
     return any(positive)
 
 
-def _is_positive(values: mi.TensorXf, survey: Survey, name: str, is_albedo: bool) -> bool:
+def _is_positive(values: mi.TensorXf, survey: SceneSurvey, name: str, is_albedo: bool) -> bool:
     flat = dr.detach(dr.ravel(values))
 
     def make() -> bool:
@@ -208,7 +208,7 @@ def _is_positive(values: mi.TensorXf, survey: Survey, name: str, is_albedo: bool
     return _once(survey, ("albedo",), flat, make) or dr.grad_enabled(values)
 
 
-def check_numbers(view: MediumView, survey: Survey, name: str) -> None:
+def check_numbers(view: MediumView, survey: SceneSurvey, name: str) -> None:
     """Look at the constants of an extinction and its scale. Each state of them is read once.
 
     Raises:
@@ -230,7 +230,7 @@ def _state(value: float | mi.Float | mi.Color3f) -> float | tuple[int, ...]:
     return (value.index,) if dr.depth_v(value) == 1 else tuple(v.index for v in value)
 
 
-def check_light(view: MediumView, survey: Survey, name: str) -> None:
+def check_light(view: MediumView, survey: SceneSurvey, name: str) -> None:
     """Look at what a medium emits. Each array is read once.
 
     Raises:

@@ -28,7 +28,7 @@ __all__ = [
 
 
 SHADOWS = ("auto", "exact", "estimated", "grid")
-"""How light from lamps is dimmed: ``grid`` for quadrature only, ``estimated`` for pictures that are drawn; ``auto`` chooses."""
+"""How shadows are found: ``exact``, in a ``grid`` (quadrature) or ``estimated`` (Monte Carlo images); ``auto`` chooses."""
 
 
 def check_aovs(names: str) -> tuple[str, ...]:
@@ -62,16 +62,16 @@ def refuse_refraction(needs: Needs, settings: Settings) -> None:
     if needs.refractive and is_lit(needs, settings):
         raise MivolError(
             f"the boundary {needs.refractive[0]} refracts and its scene has a medium that scatters; no straight shadow ray "
-            "reaches a lamp through it: make the boundary's BSDF null, set max_depth to 1, or the albedo to 0."
+            "reaches an emitter through it: make the boundary's BSDF null, set max_depth to 1, or the albedo to 0."
         )
 
 
 def refuse_emission(needs: Needs, settings: Settings) -> None:
     """Refuse emission beside scattering, and emission that varies faster than the cells that are summed."""
-    glowing = [m.name for m in needs.media if m.emits]
-    if glowing and is_lit(needs, settings):
+    emitting = [m.name for m in needs.media if m.emits]
+    if emitting and is_lit(needs, settings):
         raise MivolError(
-            f"the medium in {glowing[0]} emits and a medium of its scene scatters at max_depth 2; the light of one that is "
+            f"the medium in {emitting[0]} emits and a medium of its scene scatters at max_depth 2; the light of one that is "
             "scattered by the other is not there yet: set max_depth to 1, or the albedo to 0."
         )
     for facts, view in zip(needs.media, needs.views, strict=True):
@@ -105,8 +105,8 @@ def refuse_places(needs: Needs) -> None:
     """Refuse derivatives of places that are not followed."""
     if needs.places:
         raise MivolError(
-            f"the derivative of {needs.places[0]} was asked for; mivol has none of shapes, of lamps that have a size, nor of "
-            "cameras: take that of a point, spot or directional light, or finite differences."
+            f"the derivative of {needs.places[0]} was asked for; mivol has none of shapes, of emitters that have a size, nor "
+            "of cameras: take that of a point, spot or directional light, or finite differences."
         )
 
 
@@ -120,10 +120,10 @@ def refuse_quadrature(needs: Needs, settings: Settings) -> None:
         raise MivolError("shadows is 'grid' without deterministic, and drawn light has exact shadows: set deterministic too.")
     if not settings.deterministic or not is_lit(needs, settings):
         return
-    other = [kind for kind, lamp in zip(needs.emitters, needs.lamps, strict=True) if lamp != "sharp"]
+    other = [name for name, kind in zip(needs.emitters, needs.emitter_kinds, strict=True) if kind != "delta"]
     if other:
         raise MivolError(
-            f"deterministic is set and the scene has a {other[0]}; quadrature is for lamps of one position or direction "
+            f"deterministic is set and the scene has a {other[0]}; quadrature is for emitters of one position or direction "
             "(point, spot, directional): leave deterministic out."
         )
     if len(needs.media) > 1 or not shares_cells(needs):

@@ -18,7 +18,7 @@ from mivol.scene.load import find_sensor
 from mivol.scene.needs import find_needs
 from mivol.scene.plan import Plan, make_plan
 from mivol.scene.refusals import check_aovs
-from mivol.scene.survey import Survey, survey_scene
+from mivol.scene.survey import SceneSurvey, survey_scene
 from mivol.transport.line_integrals.aovs import integrate_aovs, jvp_aovs, vjp_aovs
 from mivol.transport.path.estimators import Estimators
 from mivol.transport.path.film import CameraRays, RenderSamples, adjoint_rays, record
@@ -30,14 +30,14 @@ __all__ = ["Session"]
 
 
 @dataclass
-class _Seen:
+class _SurveyedScene:
     """A scene, known by its shapes and emitters, and its survey.
 
     Not the scene itself: it may hold the integrator that this session belongs to, and neither would ever be freed.
     """
 
     parts: list[mi.Object]
-    survey: Survey
+    survey: SceneSurvey
 
     def is_of(self, parts: list[mi.Object]) -> bool:
         """Whether these are the very same shapes and emitters."""
@@ -58,7 +58,7 @@ class Session:
     def __init__(self, settings: Settings, aovs: str = "") -> None:
         self.settings = settings
         self.aovs = check_aovs(aovs)
-        self._seen: _Seen | None = None
+        self._surveyed: _SurveyedScene | None = None
 
     def __repr__(self) -> str:
         s = self.settings
@@ -129,9 +129,9 @@ class Session:
     def _open(self, scene: mi.Scene, sensor: mi.Sensor, spp: int, pictures: bool = False) -> tuple[Estimators, Plan]:
         """Ask, plan, and build the estimators, for pictures or for derivatives."""
         parts = [*scene.shapes(), *scene.emitters()]
-        if self._seen is None or not self._seen.is_of(parts) or not self._seen.survey.is_current:
-            self._seen = _Seen(parts, survey_scene(scene))
-        survey = self._seen.survey
+        if self._surveyed is None or not self._surveyed.is_of(parts) or not self._surveyed.survey.is_current:
+            self._surveyed = _SurveyedScene(parts, survey_scene(scene))
+        survey = self._surveyed.survey
         needs = find_needs(scene, sensor, survey, spp)
         plan = make_plan(needs, self.settings, self.aovs)
         return build_estimators(scene, needs, plan, self.settings, survey, pictures), plan

@@ -14,14 +14,14 @@ from mivol.scene.nesting import Room, extent, nesting_fault, room_of
 from mivol.transport.estimators.emitters import UNIFORM
 from mivol.transport.media.box import box_of_cube
 
-__all__ = ["AROUND", "Survey", "find_around", "is_instance", "survey_scene"]
+__all__ = ["AROUND", "SceneSurvey", "find_around", "is_instance", "survey_scene"]
 
 
 AROUND = "space around shapes"
 
 
 @dataclass
-class Survey:
+class SceneSurvey:
     """What does not change while shapes stay where they are: found once, with what was read of each array.
 
     ``marks`` tells where boundaries were: shapes, and what another place would change of them; ``size`` is that of the scene.
@@ -31,7 +31,7 @@ class Survey:
     surfaces: tuple[str, ...]
     has_null_transmission: bool
     emitters: tuple[str, ...]
-    lamps: tuple[str, ...]
+    emitter_kinds: tuple[str, ...]
     refractive: tuple[str, ...]
     marks: tuple[tuple[mi.Shape, object], ...] = ()
     size: float = 1.0
@@ -48,13 +48,13 @@ class Survey:
         return dr.flag(dr.JitFlag.FreezingScope) or all(_is_at(shape, mark) for shape, mark in self.marks)
 
 
-def survey_scene(scene: mi.Scene) -> Survey:
+def survey_scene(scene: mi.Scene) -> SceneSurvey:
     """Find the media, surfaces and emitters of a scene.
 
     Raises:
         MivolError: boundaries that do not agree which medium lies between them.
     """
-    boundaries, surfaces, refractive, veiled = [], [], [], False
+    boundaries, surfaces, refractive, has_null = [], [], [], False
     shapes = scene.shapes()
     rooms = {s.ptr: room_of(s) for s in shapes if s.is_medium_transition()}
     for index, shape in enumerate(shapes):
@@ -67,8 +67,8 @@ def survey_scene(scene: mi.Scene) -> Survey:
         if not _is_bare(shape):
             surfaces.append(shape.class_name())
             # What an instance shows has other BSDFs than its own.
-            veiled |= is_instance(shape) or mi.has_flag(shape.bsdf().flags(), mi.BSDFFlags.Null)
-    kinds = tuple(e.class_name() for e in scene.emitters())
+            has_null |= is_instance(shape) or mi.has_flag(shape.bsdf().flags(), mi.BSDFFlags.Null)
+    names = tuple(e.class_name() for e in scene.emitters())
     # Mitsuba makes one object of equal media: where one boundary has to be traced, all boundaries of that medium are.
     traced = {b.medium.ptr for b in boundaries if b.box is None}
     boundaries = [replace(b, box=None) if b.medium.ptr in traced else b for b in boundaries]
@@ -78,9 +78,11 @@ def survey_scene(scene: mi.Scene) -> Survey:
     if fault is not None:
         raise MivolError(fault)
     boundaries += find_around([o for o in mi.traverse(scene).hierarchy if isinstance(o, mi.Medium)], boundaries)
-    lamps = tuple(_lamp(e) for e in scene.emitters())
+    kinds = tuple(_emitter_kind(e) for e in scene.emitters())
     marks = tuple((s, _mark(s)) for s in shapes if s.is_medium_transition())
-    return Survey(tuple(boundaries), tuple(surfaces), bool(veiled), kinds, lamps, tuple(refractive), marks, extent(scene))
+    return SceneSurvey(
+        tuple(boundaries), tuple(surfaces), bool(has_null), names, kinds, tuple(refractive), marks, extent(scene)
+    )
 
 
 def _mark(shape: mi.Shape) -> object:
@@ -97,10 +99,10 @@ def _is_at(shape: mi.Shape, mark: object) -> bool:
     return now == mark if isinstance(mark, list) else now.index == mark.index
 
 
-def _lamp(emitter: mi.Emitter) -> str:
+def _emitter_kind(emitter: mi.Emitter) -> str:
     if emitter.class_name() == UNIFORM:
         return "uniform"
-    return "sharp" if int(emitter.flags()) & int(mi.EmitterFlags.Delta) else "wide"
+    return "delta" if int(emitter.flags()) & int(mi.EmitterFlags.Delta) else "extended"
 
 
 def _is_bare(shape: mi.Shape) -> bool:

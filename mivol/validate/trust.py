@@ -64,7 +64,7 @@ class Doubt:
 
 
 @dataclass(frozen=True)
-class Boundary:
+class MediumShape:
     """A shape that holds a medium, and where the medium's extinction is given.
 
     Attributes:
@@ -148,14 +148,14 @@ def trust(scene: mi.Scene, sensors: Sequence[mi.Sensor] | None = None) -> list[D
 Found = Iterator[tuple[str, bool]]
 
 
-def _not_finite(b: Boundary) -> Found:
+def _not_finite(b: MediumShape) -> Found:
     if not np.isfinite(b.majorant) or b.majorant < 0:
         yield (
             f"the extinction inside {b.name} has {b.majorant} as its largest value; its voxels must be finite and not negative."
         ), True
 
 
-def _rotated(b: Boundary) -> Found:
+def _rotated(b: MediumShape) -> Found:
     linear = [np.abs(to_local[:3, :3]) for to_local in b.grids if b.overhang(to_local)]
     if any(np.any(np.sort(m, axis=1)[:, :2] > 1e-5 * m.max(axis=1, keepdims=True)) for m in linear):
         yield (
@@ -164,7 +164,7 @@ def _rotated(b: Boundary) -> Found:
         ), True
 
 
-def _too_deep(b: Boundary) -> Found:
+def _too_deep(b: MediumShape) -> Found:
     depth = b.majorant * b.diagonal
     if b.overhangs and depth > DEEPEST:
         yield (
@@ -173,7 +173,7 @@ def _too_deep(b: Boundary) -> Found:
         ), True
 
 
-def _constant_box(b: Boundary) -> Found:
+def _constant_box(b: MediumShape) -> Found:
     if b.volume == "ConstVolume" and b.overhangs:
         yield (
             f"the heterogeneous medium inside {b.name} has a constant extinction, which Mitsuba puts into the unit cube of the "
@@ -181,7 +181,7 @@ def _constant_box(b: Boundary) -> Found:
         ), False
 
 
-def _mirrored(b: Boundary) -> Found:
+def _mirrored(b: MediumShape) -> Found:
     turned = b.to_world is not None and np.linalg.det(b.to_world[:3, :3]) < 0
     if b.faces is not None:
         p, q, r = (b.points[b.faces[:, i]] - b.points.mean(axis=0) for i in range(3))
@@ -193,7 +193,7 @@ def _mirrored(b: Boundary) -> Found:
         ), True
 
 
-def _wrong_inverse(b: Boundary) -> Found:
+def _wrong_inverse(b: MediumShape) -> Found:
     if b.to_local is None or b.to_local_inverse is None:
         return
     # 1e-4: both are printed with 6 digits.
@@ -205,7 +205,7 @@ def _wrong_inverse(b: Boundary) -> Found:
         ), True
 
 
-def _small_g(b: Boundary) -> Found:
+def _small_g(b: MediumShape) -> Found:
     g = _number(b.params.get("phase_function.g", 0.0))
     if 0 < abs(g) < SMALLEST_G and not _is_black(b):
         yield (
@@ -214,26 +214,26 @@ def _small_g(b: Boundary) -> Found:
         ), False
 
 
-def _flakes(b: Boundary) -> Found:
+def _microflakes(b: MediumShape) -> Found:
     if any(re.search(r"^phase_function.*\bS\.", key) for key in b.params) and not _is_black(b):
         yield (
-            f"the phase function inside {b.name} has flakes (sggx), and Mitsuba draws their directions from another density "
-            "than it divides by; light them by lamps of one position or direction, or use another phase function."
+            f"the phase function inside {b.name} has microflakes (sggx), and Mitsuba draws their directions from another "
+            "density than it divides by; light them by emitters of one position or direction, or use another phase function."
         ), True
 
 
-def _is_black(b: Boundary) -> bool:
+def _is_black(b: MediumShape) -> bool:
     albedo = [np.asarray(v) for k, v in b.params.items() if k.startswith(("albedo", "sigma_s"))]
     return bool(albedo) and all(np.all(v == 0) for v in albedo)
 
 
-def _emission(b: Boundary) -> Found:
+def _emission(b: MediumShape) -> Found:
     key = next((k for k in b.params if k.startswith("emission")), None)
     if key is not None and np.any(np.asarray(b.params[key]) != 0):
         yield f"the medium inside {b.name} emits light, which Mitsuba's integrators do not render; set its emission to 0.", True
 
 
-def _thick_skin(b: Boundary) -> Found:
+def _thick_skin(b: MediumShape) -> Found:
     if b.skin > SMALLEST_SKIN and not _is_black(b):
         yield (
             f"the medium inside {b.name} is dense where it touches it: Mitsuba starts rays a little behind the surface where "
@@ -242,7 +242,7 @@ def _thick_skin(b: Boundary) -> Found:
         ), False
 
 
-CHECKS: dict[str, Callable[[Boundary], Found]] = {
+CHECKS: dict[str, Callable[[MediumShape], Found]] = {
     "not finite": _not_finite,
     "rotated grid": _rotated,
     "too deep": _too_deep,
@@ -250,18 +250,18 @@ CHECKS: dict[str, Callable[[Boundary], Found]] = {
     "mirrored": _mirrored,
     "wrong inverse": _wrong_inverse,
     "small g": _small_g,
-    "flakes": _flakes,
+    "microflakes": _microflakes,
     "emission": _emission,
     "thick skin": _thick_skin,
 }
 
 
-def _touch(a: Boundary, b: Boundary) -> bool:
+def _touch(a: MediumShape, b: MediumShape) -> bool:
     """Whether part of one's surface lies on the other's: a point that passes the one changes sides of the other as well."""
     return _lies_on(a, b) or _lies_on(b, a)
 
 
-def _lies_on(a: Boundary, b: Boundary) -> bool:
+def _lies_on(a: MediumShape, b: MediumShape) -> bool:
     p = a.surface[:TOUCHES]
     out = p - a.points.mean(axis=0)
     step = RESTART * (1 + np.abs(p).max(axis=1, keepdims=True)) * out / np.linalg.norm(out, axis=1, keepdims=True)
@@ -270,7 +270,7 @@ def _lies_on(a: Boundary, b: Boundary) -> bool:
     return changes >= 0.01 * len(p)
 
 
-def _touching(a: Boundary, b: Boundary) -> str:
+def _touching(a: MediumShape, b: MediumShape) -> str:
     return (
         f"{a.name} and {b.name} touch: Mitsuba starts rays a little behind the surface they leave, and so inside the other "
         "without having entered its medium, which is then vacuum; leave a gap of a thousandth of the scene, or make one grid "
@@ -284,7 +284,7 @@ SAMPLER = (
 )
 
 
-def _near_lamp(lamp: mi.Shape, b: Boundary) -> Found:
+def _near_lamp(lamp: mi.Shape, b: MediumShape) -> Found:
     near, far = (np.array(v, np.float64) for v in bounds(lamp))
     low, high = b.points.min(axis=0), b.points.max(axis=0)
     reach = NEAR_LAMP * (1 + np.abs([near, far, low, high]).max())
@@ -299,7 +299,7 @@ def _near_lamp(lamp: mi.Shape, b: Boundary) -> Found:
         )
 
 
-def _camera_inside(sensor: mi.Sensor, boundaries: list[Boundary]) -> Iterator[str]:
+def _camera_inside(sensor: mi.Sensor, boundaries: list[MediumShape]) -> Iterator[str]:
     if sensor.get_medium() is not None:
         return
     origin = np.array(sensor.world_transform().matrix, dtype=np.float64).reshape(4, 4)[:3, 3]
@@ -314,7 +314,7 @@ def _camera_inside(sensor: mi.Sensor, boundaries: list[Boundary]) -> Iterator[st
 # -- Facts of a scene -----------------------------------------------------------------------------
 
 
-def _boundary(shape: mi.Shape) -> Boundary:
+def _boundary(shape: mi.Shape) -> MediumShape:
     geometry = mi.traverse(shape)
     params = traverse_medium(shape.interior_medium())
     volumes = _extinction_volumes(shape.interior_medium())
@@ -326,7 +326,7 @@ def _boundary(shape: mi.Shape) -> Boundary:
     to_world = _matrix(geometry["to_world"]) if shape.shape_type() == mi.ShapeType.Sphere.value else None
     to_local, scale = _reach(kind, volumes), _number(params.get("scale", 1.0))
     surface = _surface(points, faces, to_world)
-    return Boundary(
+    return MediumShape(
         name=shape.id() or f"the {shape.class_name()}",
         points=points,
         faces=faces,

@@ -166,7 +166,7 @@ def test_clumps_count_for_what_they_scatter(variant_rgb, fresh_lines) -> None:
 
 
 @pytest.mark.statistical
-def test_depth_is_that_of_the_world(variant_rgb, fresh_lines) -> None:
+def test_depth_is_that_of_the_placed_grid(variant_rgb, fresh_lines) -> None:
     """A cube twice as large, turned and moved, has twice the depth, by other lines: 6 standard errors of 0.25 % each."""
     large = Box(affine(2 * rotation([1, 2, 3], 0.7), (5, -1, 2)))
     view = view_of(medium("homogeneous", 1.0, 0.5))

@@ -29,12 +29,12 @@ def cell(dt, s1, s2, kind="Float64"):
 
 
 def swept(edges, sigma, c, j):
-    """Light of a source function and of a glow along a row of cells, as the code weighs them."""
+    """Light of a source function and of an emission density along a row of cells, as the code weighs them."""
     a, dt = edges[:-1], np.diff(edges)
     t1, t2 = (a + g * dt for g in GAUSS_2)
-    share, glow = cell(dt, sigma(t1), sigma(t2))
+    share, density = cell(dt, sigma(t1), sigma(t2))
     T = np.exp(-np.append(0, np.cumsum(np.array(share.tau))[:-1]))
-    w, g = (np.array(x.weights) for x in (share, glow))
+    w, g = (np.array(x.weights) for x in (share, density))
     return T @ (w[0] * c(t1) + w[1] * c(t2)), T @ (g[0] * j(t1) + g[1] * j(t2))
 
 
@@ -104,13 +104,13 @@ def test_gaussian():
     assert found == pytest.approx([s * truth, truth], rel=1e-6)
 
 
-def test_linear_glow_in_constant_extinction():
+def test_linear_emission_density_in_constant_extinction():
     """(a + b t) exp(-s t): exact in one cell, up to an optical depth of 4 (then the mean place leaves the points)."""
     s, D = np.array([0.0, 1e-6, 0.3, 1.0, 3.0]), 1.2
-    _, glow = cell(np.full(5, D), s, s)
+    _, density = cell(np.full(5, D), s, s)
     t1, t2 = (g * D for g in GAUSS_2)
     a, b = 0.7, 2.0
-    g = np.array(glow.weights)
+    g = np.array(density.weights)
     u, w = np.polynomial.legendre.leggauss(30)
     t = D * (u + 1) / 2
     truth = [(w * D / 2) @ ((a + b * t) * np.exp(-x * t)) for x in s]
@@ -130,17 +130,17 @@ def test_cells_of_any_optical_depth(ratio):
     dt, mean = 0.5, TAUS / 0.5
     s1 = as_float32(2 * mean / (1 + ratio))
     s2 = as_float32(s1 * ratio)
-    share, glow = cell(np.full(len(TAUS), dt), s1, s2, "Float")
-    truth, lit = (np.array(rule(np.full(len(TAUS), dt), s1, s2)) for rule in (twins.share, twins.glow))
+    share, density = cell(np.full(len(TAUS), dt), s1, s2, "Float")
+    truth, lit = (np.array(rule(np.full(len(TAUS), dt), s1, s2)) for rule in (twins.share, twins.weigh_emission_density))
     # The share to a few roundings and those of phi_1 (4e-7); of the moments the third is known to 8e-7 only.
     assert np.all(np.abs(np.array(share.weights) - truth) <= 1e-6 * (truth + 1e-30) + 2e-7 * truth.sum(0))
-    assert np.all(np.abs(np.array(glow.weights) - lit) <= 2e-5 * lit.sum(0))
+    assert np.all(np.abs(np.array(density.weights) - lit) <= 2e-5 * lit.sum(0))
     # 1 - f is a difference of numbers of size 1.
     total = np.array(share.weights).sum(0)
     assert np.all(np.abs(total - truth.sum(0)) <= 1e-6 * truth.sum(0))
-    for values in (*share.weights, *share.per_sigma, *glow.weights, *share.lean, *np.ravel(glow.slopes).tolist()):
+    for values in (*share.weights, *share.per_sigma, *density.weights, *share.lean, *np.ravel(density.slopes).tolist()):
         assert np.all(np.isfinite(np.array(values)))
-    assert min(np.array(w).min() for w in (*share.weights, *share.per_sigma, *glow.weights)) >= 0
+    assert min(np.array(w).min() for w in (*share.weights, *share.per_sigma, *density.weights)) >= 0
 
 
 @pytest.mark.parametrize("scale", [1e-5, 0.1, 1.0, 10.0, 1e3])
@@ -151,11 +151,11 @@ def test_derivatives_of_a_cell(scale):
     c = [mi.Float64(x) for x in rng.uniform(size=(2, 200))]
 
     def sent(s1, s2):
-        share, glow = cell(dt, s1, s2)
-        return np.array(share.sent(*c)), np.array(glow.weights[0] * c[0] + glow.weights[1] * c[1])
+        share, density = cell(dt, s1, s2)
+        return np.array(share.sent(*c)), np.array(density.weights[0] * c[0] + density.weights[1] * c[1])
 
-    share, glow = cell(dt, s1, s2)
-    slopes = np.array(share.slopes(*c)), np.array([glow.slopes[0][q] * c[0] + glow.slopes[1][q] * c[1] for q in (0, 1)])
+    share, density = cell(dt, s1, s2)
+    slopes = np.array(share.slopes(*c)), np.array([density.slopes[0][q] * c[0] + density.slopes[1][q] * c[1] for q in (0, 1)])
     h = 1e-4 * scale
     for q, step in enumerate(((h, 0), (0, h))):
         far, near = (sent(s1 + sign * step[0], s2 + sign * step[1]) for sign in (1, -1))
@@ -205,7 +205,7 @@ def test_constant_source(boundary, extinction):
 
 
 def test_medium_that_never_ends():
-    """A camera in a medium without an end sees Le, and a glow j as j / sigma."""
+    """A camera in a medium without an end sees Le, and an emission density j as j / sigma."""
     j = as_float32([0.2, 0.1, 0.4])
     fog = interior(twins.Medium(0.6, LE, j)) | {"id": "fog"}
     ball = ball_of(fog, [50, 0, 0], 1.0)
@@ -231,7 +231,7 @@ def test_camera_inside(boundary):
     rng = np.random.default_rng(1)
     o, d = as_float32(rng.uniform(-0.4, 0.4, (8, 3))), rng.normal(size=(8, 3))
     seen = emitting(medium, boundary, rays=(o, as_float32(d / np.linalg.norm(d, axis=1, keepdims=True))))
-    here = twins.Medium(medium.sigma, medium.source, medium.glow, 0.0, BOUNDARIES[boundary][1])
+    here = twins.Medium(medium.sigma, medium.source, medium.emission_density, 0.0, BOUNDARIES[boundary][1])
     truth = twins.cell_radiance(here, seen.o, seen.d, B)
     # A traced end is Mitsuba's, in float32: 4e-6 of an extinction of 4.
     assert np.abs(light(seen) - truth).max() <= 2e-5
@@ -258,7 +258,7 @@ def test_refining_the_grid():
 
 
 def test_zero_density():
-    """No extinction: C = B and the glow's plain integral; the derivative is the integral of w (c - B). Hard cases 20 and 21."""
+    """No extinction: C = B and the emission density's plain integral, with a derivative of w (c - B). Hard cases 20, 21."""
     empty = np.zeros((5, 4, 6, 1))
     source = (rough(8, 0, 1, 3), PLACE)
     seen = emitting(twins.Medium((empty, PLACE), source))
@@ -273,9 +273,9 @@ def test_zero_density():
             np.add.at(size, node, np.abs(bright * corner))
     # A share of a cell is one half to a rounding; ends of cells lie where float32 puts them, 1e-6 of a voxel.
     assert np.abs(g[..., 0] - truth).max() <= 4e-6 * size.max()
-    glow = emitting(twins.Medium((empty, PLACE), 0.0, LE))
-    length = np.array([np.diff(BOUNDARIES["box"][1](*ray))[0] for ray in zip(glow.o, glow.d, strict=True)])
-    assert light(glow) == pytest.approx(B + LE * length[:, None], rel=8 * EPS, abs=4e-6)
+    vacuum = emitting(twins.Medium((empty, PLACE), 0.0, LE))
+    length = np.array([np.diff(BOUNDARIES["box"][1](*ray))[0] for ray in zip(vacuum.o, vacuum.d, strict=True)])
+    assert light(vacuum) == pytest.approx(B + LE * length[:, None], rel=8 * EPS, abs=4e-6)
 
 
 @pytest.mark.parametrize("tau", [1e-8, 1e-3, 1.0, 1e3, 1e6])

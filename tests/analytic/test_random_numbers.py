@@ -14,12 +14,12 @@ pytestmark = pytest.mark.usefixtures("variant_rgb")
 
 
 def start(number: float) -> mi.Float:
-    """What dice start from, of this round of seeds: a number in [0, 1)."""
+    """What generators are seeded with, of this round of seeds: a number in [0, 1)."""
     return mi.Float((number + fresh(0) * 0.6180339887498949) % 1)
 
 
 @pytest.mark.statistical
-def test_dice_are_even():
+def test_numbers_are_uniform():
     """2^16 lanes, 4 numbers each: means of 1/2, squares of 1/3, no correlation of numbers in a lane, nor of neighbours."""
     _, numbers = draw_pcg32(seed_pcg32(start(0.25), 1 << 16), 4)
     u = np.array([np.array(x, dtype=np.float64) for x in numbers])

@@ -64,7 +64,7 @@ def grid(values: np.ndarray) -> Lattice:
 
 
 def start(number: float) -> mi.Float:
-    """What dice start from, of this round of seeds: a number in [0, 1)."""
+    """What generators are seeded with, of this round of seeds: a number in [0, 1)."""
     return mi.Float((number + fresh(0) * 0.6180339887498949) % 1)
 
 

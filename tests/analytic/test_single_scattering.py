@@ -51,7 +51,7 @@ PHASES = {"isotropic": ("isotropic", 0.0), "hg": ("hg", 0.6), "backward": ("hg",
 @pytest.mark.statistical
 @pytest.mark.parametrize("kind", small.KINDS)
 @pytest.mark.parametrize("lamps", LAMPS)
-def test_grid_and_lamps(lamps, kind):
+def test_grid_and_emitters(lamps, kind):
     box, m = smoke(rough_grid(1), kind=kind, name="hg", g=0.4)
     check({"smoke": box}, [m], LAMPS[lamps](), *aimed(1))
 
@@ -267,7 +267,7 @@ def test_reciprocity():
 
 @pytest.mark.statistical
 @pytest.mark.parametrize("scale", [1e-3, 1e3])
-def test_the_size_of_the_world(scale):
+def test_the_size_of_the_scene(scale):
     """k times larger, thinner by k, under a directional lamp: the same radiance."""
     frame = as_float32(centred(2 * scale * np.eye(3)))
     box, m = smoke(rough_grid(14) / scale, 0.8, "own", frame)
@@ -275,7 +275,7 @@ def test_the_size_of_the_world(scale):
     check({"smoke": box}, [m], [sun([0.3, 0.2, -1.0])], as_float32(o * scale), d)
 
 
-def test_radiance_is_linear_in_the_lamps():
+def test_radiance_is_linear_in_the_emitters():
     """Twice the lamp is twice the picture, to the last bit, with the same samples."""
     box, _ = smoke(rough_grid(15), 0.8)
     o, d = aimed(15)

@@ -102,7 +102,7 @@ def test_equal_error_weighs_variance_and_time() -> None:
     assert got["variance_x_time_median_over_pixels"] == pytest.approx(12)
 
 
-def test_pixels_at_the_lamp_do_not_count(variant_rgb: str) -> None:
+def test_pixels_at_the_emitter_do_not_count(variant_rgb: str) -> None:
     """The brightest pixel of a thin fog is at the lamp; it and its neighbours are left out, no others."""
     light = bench.LIGHTS["point light inside"]
     scene = mi.load_dict(box_scene(np.full((4, 4, 4), 0.1, np.float32), 24, 0.75, **light.parts()))
@@ -114,7 +114,7 @@ def test_pixels_at_the_lamp_do_not_count(variant_rgb: str) -> None:
     assert np.isinf(bench.pixels_from_lamp(scene, light._replace(inside=None), 24)).all()
 
 
-def test_a_lamp_inside_is_judged_in_thin_matter_away_from_it(variant_rgb: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_emitter_inside_is_judged_in_thin_matter_away_from_it(variant_rgb: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Ratios are of the volume itself, and pixels up to the lamp count; means are compared in the volume thinned to an
     optical depth of 1, in pixels further than a quarter of the picture from it."""
     used, depths, side = {}, [], 16

@@ -44,9 +44,9 @@ EPS = 2.0**-23
 @pytest.mark.parametrize("kind", ["mivol_voxels", "gridvolume"])
 @pytest.mark.parametrize("frame", ["stretched", pytest.param("sheared", marks=pytest.mark.slow)])
 def test_grids_in_any_frame(kind, frame):
-    """Extinction, albedo, source and glow in one place, wherever that is."""
+    """Extinction, albedo, source function and emission density in one place, wherever that is."""
     place = as_float32(FRAMES[frame])
-    at = {"sigma": (1, 0.0, 3.0), "source": (3, 0.0, 1.0), "glow": (3, 0.0, 1.0), "albedo": (1, 0.0, 0.8)}
+    at = {"sigma": (1, 0.0, 3.0), "source": (3, 0.0, 1.0), "emission_density": (3, 0.0, 1.0), "albedo": (1, 0.0, 0.8)}
     m = twins.Medium(**{k: (rough(i, low, top, n), place) for i, (k, (n, low, top)) in enumerate(at.items())})
     centre = (place @ [0.5, 0.5, 0.5, 1])[:3]
     o, d = aimed(3, 12, away=8)
@@ -70,8 +70,8 @@ def test_light_is_vacuum_outside_its_grid(kind):
     assert np.abs(light(seen) - twins.cell_radiance(m, seen.o, seen.d, B)).max() <= 4e-6
 
 
-def test_glow_ends_with_its_boundary():
-    """A constant glow fills the box, and nothing in front of or behind it."""
+def test_emission_ends_with_its_boundary():
+    """A constant emission density fills the box, and nothing in front of or behind it."""
     m = twins.Medium((rough(1, 0, 2), PLACE), 0.0, LE)
     seen, m = emitting(m), body(m)[1]
     assert np.abs(light(seen) - twins.cell_radiance(m, seen.o, seen.d, B)).max() <= 4e-6
@@ -123,8 +123,9 @@ def stack(kinds: str) -> tuple[dict, list[twins.Medium]]:
     for i, kind in enumerate(kinds):
         z = 2.2 * (i - (len(kinds) - 1) / 2)
         place = as_float32(centred(2 * np.eye(3), (0, 0, z)))
-        sigma, source, glow = (rough(3 * i + k, 0, top, n, (4, 5, 3)) for k, (top, n) in enumerate(((1.5, 1), (1, 3), (1, 3))))
-        fields = ((sigma, place), (source, place), (glow, place)) if kind != "c" else (as_float32([0.3, 0.5, 0.9]), LE, B)
+        tops = enumerate(((1.5, 1), (1, 3), (1, 3)))
+        sigma, source, density = (rough(3 * i + k, 0, top, n, (4, 5, 3)) for k, (top, n) in tops)
+        fields = ((sigma, place), (source, place), (density, place)) if kind != "c" else (as_float32([0.3, 0.5, 0.9]), LE, B)
         m = twins.Medium(*fields)
         if kind == "b":
             parts[f"part{i}"] = box_of(interior(m), place)
@@ -150,7 +151,7 @@ def test_several_media(kinds):
     parts, media = stack(kinds)
     seen = pencils(parts, *along_z())
     truth = twins.chain_radiance(media, seen.o, seen.d, B)
-    # Ends of traced stretches are Mitsuba's, 4e-6 of an extinction or glow of 1.5 at coordinates of 6.
+    # Ends of traced intervals are Mitsuba's, 4e-6 of an extinction or emission density of 1.5 at coordinates of 6.
     assert np.abs(light(seen) - truth).max() <= 1e-4
     ends = [k for k, _ in mi.traverse(seen.scene) if "interior_medium" in k and k.endswith(("data", "value.value"))]
     ends = tuple(k for k in ends if "albedo" not in k)
@@ -172,7 +173,7 @@ def test_a_ball_within_a_box():
     for o, d in zip(seen.o, seen.d, strict=True):
         (a, b), (c, e) = box_interval(PLACE, o, d), sphere_interval([0, 0, 0], 0.5, o, d)
         cuts = [(outer, a, c), (inner, c, e), (outer, e, b)] if e > c else [(outer, a, b)]
-        media = [twins.Medium(m.sigma, m.source, m.glow, 0.0, lambda o, d, i=(x, y): i) for m, x, y in cuts]
+        media = [twins.Medium(m.sigma, m.source, m.emission_density, 0.0, lambda o, d, i=(x, y): i) for m, x, y in cuts]
         truth.append(twins.chain_radiance(media, o, d, 0.3)[0])
     assert np.abs(light(seen) - truth).max() <= 2e-5
 
@@ -216,7 +217,7 @@ def test_mono():
 
 
 def test_frozen_renders_follow_the_light():
-    """dr.freeze: extinction, source and glow that change between calls."""
+    """dr.freeze: extinction, source function and emission density that change between calls."""
     m = twins.Medium((rough(1, 0, 2), PLACE), (rough(2, 0, 1, 3), PLACE), (rough(3, 0, 1, 3), PLACE))
     seen, integrator = emitting(m), mi.load_dict({"type": "mivol", "max_depth": 1})
     params = mi.traverse(seen.scene)
@@ -285,12 +286,12 @@ def test_light_that_would_be_scattered_is_refused():
     assert np.isfinite(shoot(scene)).all()
 
 
-def test_glow_in_other_cells_is_refused():
+def test_emission_density_in_other_cells_is_refused():
     sigma = (rough(1, 0, 2), PLACE)
-    for glow in ((rough(2, 0, 1, 3, (5, 4, 7)), PLACE), (rough(2, 0, 1, 3), as_float32(centred(1.5 * np.eye(3))))):
+    for density in ((rough(2, 0, 1, 3, (5, 4, 7)), PLACE), (rough(2, 0, 1, 3), as_float32(centred(1.5 * np.eye(3))))):
         with refused("it is summed in the cells of the extinction"):
-            shoot(picture(interior(twins.Medium(sigma, 0.0, glow))))
-    # Where the extinction has no grid, the glow's own cells are walked.
+            shoot(picture(interior(twins.Medium(sigma, 0.0, density))))
+    # Where the extinction has no grid, the emission density's own cells are walked.
     assert np.isfinite(shoot(picture(interior(twins.Medium(0.5, 0.0, (rough(2, 0, 1, 3), PLACE)))))).all()
 
 
@@ -328,7 +329,7 @@ def test_a_source_that_varies_within_the_cells_is_refused(kind):
     for source in ((rough(2, 0, 1, 3, (5, 4, 7)), PLACE), (rough(2, 0, 1, 3), as_float32(PLACE @ np.diag([0.5, 0.9, 0.9, 1])))):
         with refused("the emission of the medium in box varies over lengths of .* of its extinction's cells"):
             shoot(picture(interior(twins.Medium(sigma, source), kind)))
-    # In a constant extinction it is the light's cells that are walked: the glow's, where there are both.
+    # In a constant extinction it is the light's cells that are walked: the emission density's, where there are both.
     fine, coarse = (rough(2, 0, 1, 3, (9, 4, 6)), PLACE), (rough(3, 0, 1, 3), PLACE)
     with refused("the emission of the medium in box varies over lengths of .* of its emission_density's cells"):
         shoot(picture(interior(twins.Medium(0.5, fine, coarse), kind)))
@@ -343,10 +344,10 @@ def test_extinctions_in_other_cells_are_refused():
         shoot(picture(inside))
 
 
-def test_flakes_are_refused():
-    flakes = {"type": "sggx", "S": {"type": "gridvolume", "grid": mi.VolumeGrid(np.ones((1, 1, 1, 6), np.float32))}}
+def test_microflakes_are_refused():
+    microflakes = {"type": "sggx", "S": {"type": "gridvolume", "grid": mi.VolumeGrid(np.ones((1, 1, 1, 6), np.float32))}}
     with refused("a medium emits and a medium has the phase function sggx"):
-        shoot(picture(interior(twins.Medium(0.5, LE)) | {"phase": flakes}))
+        shoot(picture(interior(twins.Medium(0.5, LE)) | {"phase": microflakes}))
 
 
 @pytest.mark.parametrize("bad", [-0.1, np.nan, np.inf])

@@ -26,13 +26,13 @@ pytestmark = pytest.mark.usefixtures("variant_rgb")
 @pytest.mark.parametrize(
     "name", small.cases(LAMPS, ["directional", "point", "textured area", "area inside", "two that can be met"])
 )
-def test_lamps(name):
+def test_emitters(name):
     box, _ = smoke(rough_grid(1), name="hg", g=0.4)
     image, _ = same({"smoke": box, **LAMPS[name]()}, precision=0.02)
     assert image.mean.min() >= 0
 
 
-def test_no_lamp_at_all():
+def test_no_emitter_at_all():
     """Nothing shines, nothing is seen: exactly. Nor does anything change it."""
     box, _ = smoke(rough_grid(1))
     scene = close_up({"smoke": box})

@@ -29,7 +29,7 @@ from scenes import box_of, grid_volume, medium, refused, transform
 pytestmark = pytest.mark.usefixtures("variant_rgb")
 
 
-def flakes(voxels: int = 1) -> dict:
+def microflakes(voxels: int = 1) -> dict:
     """Microflakes: a random symmetric matrix in each voxel of a row (xx, yy, zz, xy, xz, yz)."""
     m = np.random.default_rng(6).normal(size=(1, 1, voxels, 3, 3))
     m = np.einsum("...ij,...kj->...ik", m, m) / 6 + 0.1 * np.eye(3)
@@ -51,7 +51,7 @@ PHASES = {
         "a": {"type": "hg", "g": 0.7},
         "b": {"type": "hg", "g": -0.3},
     },
-    "sggx": flakes,
+    "sggx": microflakes,
 }
 
 
@@ -69,7 +69,7 @@ OWN_PHASES = [("hg forward", "own"), ("tabphase", "own"), ("blendphase", "own")]
 def test_phase_functions(name, kind):
     """Under a sky with a bright spot (directions are sampled both ways) and a point light (one direction only).
 
-    Volpath draws the directions of flakes wrongly (tests/conformance/test_reference.py): they are judged by the point light.
+    Volpath draws the directions of microflakes wrongly (tests/conformance/test_reference.py): the point light judges them.
     """
     medium_type, volume_type = small.KINDS[kind]
     interior = medium(medium_type, grid_volume(volume_type, rough_grid(2), PLACE), 0.7, phase=PHASES[name]())
@@ -79,10 +79,10 @@ def test_phase_functions(name, kind):
 
 @pytest.mark.statistical
 @pytest.mark.parametrize("inside", ["alone", "a blend", "a mixture"])
-def test_flakes_in_a_sky(inside):
+def test_microflakes_in_a_sky(inside):
     """Thin: albedo tau sqrt(w^T S w) times the sky's mean over eval_pdf; the sun in it is found by both ways of sampling."""
-    lobes = {"a": flakes(), "b": {"type": "hg", "g": 0.5}}
-    phase = {"alone": flakes(), "a blend": {"type": "blendphase", "weight": 0.3, **lobes},
+    lobes = {"a": microflakes(), "b": {"type": "hg", "g": 0.5}}
+    phase = {"alone": microflakes(), "a blend": {"type": "blendphase", "weight": 0.3, **lobes},
              "a mixture": {"type": "mivol_mixture", "weight_a": 0.7, "weight_b": 0.3, **lobes}}[inside]  # fmt: skip
     tau, albedo = 1e-3, 0.8
     box = box_of(medium("homogeneous", tau / 2, albedo, phase=phase), PLACE)
@@ -108,9 +108,9 @@ def test_flakes_in_a_sky(inside):
     assert_precise(found, 0.01 * truth, what="radiances")
 
 
-def test_flakes_that_vary_are_refused():
+def test_microflakes_that_vary_are_refused():
     """Their extinction along a ray is no longer that of the grid times a number."""
-    interior = medium("heterogeneous", grid_volume("gridvolume", rough_grid(2), PLACE), 0.7, phase=flakes(2))
+    interior = medium("heterogeneous", grid_volume("gridvolume", rough_grid(2), PLACE), 0.7, phase=microflakes(2))
     scene = close_up({"smoke": box_of(interior, PLACE), "sky": scenes.sky(1.0)}, res=2)
     with refused("sggx"):
         scenes.render(scene, mivol(), 1)

@@ -29,7 +29,7 @@ from mivol.photos import (
     Lens,
     Photo,
     Photos,
-    Survey,
+    PhotoSurvey,
     distort,
     intrinsics,
     load_photos,
@@ -498,7 +498,7 @@ def test_silhouette_box_holds_the_thing_and_little_more() -> None:
         hit = np.sum(o * d, -1) ** 2 >= np.sum(d * d, -1) * (np.sum(o * o, -1) - 1)
         views.append(Photo("v", np.zeros((*hit.shape, 3), np.float32), hit.astype(np.float32), None, camera, np.zeros(3)))
     cameras = [view.camera for view in views]
-    survey = Survey(Path(), "", (), (), region.shared_box(cameras), "", (0, 1))
+    survey = PhotoSurvey(Path(), "", (), (), region.shared_box(cameras), "", (0, 1))
     box = silhouette_box(Photos(tuple(views), "srgb", survey))
     assert (box[0] <= -radii).all() and (box[1] >= radii).all()
     # Two cells of the second search, each 1/40 of at most twice the thing, and the hull of 12 views around it.

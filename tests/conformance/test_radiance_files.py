@@ -41,7 +41,7 @@ def test_values_that_half_floats_cannot_hold_stay(variant_rgb: str, tmp_path: Pa
     assert np.array_equal(load_field(tmp_path / "f.npz").values()[0], density.reshape(-1))
 
 
-def test_densities_of_large_worlds_keep_their_digits(variant_rgb: str, tmp_path: Path) -> None:
+def test_densities_of_large_scenes_keep_their_digits(variant_rgb: str, tmp_path: Path) -> None:
     """Extinctions go as 1 / length: in a box of 1e9 units half floats would make 0 of them."""
     density, sh = arrays()
     for small in (1e-4, 1e-9):

@@ -40,7 +40,7 @@ def test_fog_is_cut_at_both_planes(kind):
         np.testing.assert_allclose(image[..., 0], np.exp(-SIGMA * seen), rtol=5e-6)
 
 
-def test_what_a_veil_lets_through_ends_at_the_same_plane():
+def test_what_a_mask_transmits_ends_at_the_same_plane():
     """A black mask at 2, a lamp at 4.5: in front of it there is the sky of 1, whatever straight rays pass."""
     turn = mi.ScalarTransform4f()
     mask = {"type": "mask", "opacity": 0.6, "nested": {"type": "diffuse", "reflectance": 0.0}}

@@ -8,7 +8,7 @@ import pytest
 
 import scenes
 from mivol.scene.readings import is_scattering
-from mivol.scene.survey import Survey
+from mivol.scene.survey import SceneSurvey
 from mivol.transport.media.box import box_of_cube
 from mivol.transport.media.read_medium import place_of_grid, view_medium
 from scenes import FRAMES, box_of, grid_volume, medium, refused
@@ -47,7 +47,7 @@ def test_our_grid_knows_its_place():
 
 
 def scatters(description: dict) -> bool:
-    return is_scattering(view_medium(mi.load_dict(description)), Survey((), (), False, (), (), ()), "box")
+    return is_scattering(view_medium(mi.load_dict(description)), SceneSurvey((), (), False, (), (), ()), "box")
 
 
 def test_a_medium_that_scatters_says_so():

@@ -430,7 +430,7 @@ def test_doubt_a_sampler_whose_dimensions_depend_on_each_other(variant_rgb):
 
 
 @pytest.mark.statistical
-def test_doubt_a_lamp_near_a_boundary(variant_rgb):
+def test_doubt_a_emitter_near_a_boundary(variant_rgb):
     """In a small scene most light of a lamp with a surface is lost; the same scene in another unit is right."""
     found = {}
     for unit in (1.0, 0.01):
@@ -490,7 +490,7 @@ def test_doubts_that_need_no_render(variant_rgb):
         assert [d.kind for d in trust(mi.load_dict(scene))] == [kind]
 
 
-def _flakes() -> dict:
+def _microflakes() -> dict:
     """Discs that lie aslant."""
     S = np.array([0.3, 0.3, 0.8, 0.1, 0.2, 0.0], dtype=np.float32)
     return {"type": "sggx", "S": {"type": "gridvolume", "grid": mi.VolumeGrid(S.reshape(1, 1, 1, 6))}}
@@ -498,21 +498,21 @@ def _flakes() -> dict:
 
 @pytest.mark.statistical
 @pytest.mark.parametrize("inside", ["alone", "in a blend"])
-def test_flakes_are_drawn_from_another_density_than_is_told(variant_rgb, inside):
+def test_microflakes_are_drawn_from_another_density_than_is_told(variant_rgb, inside):
     """Means of the directions of 2^18 samples and of their density: a release that mends it turns this red."""
-    blend = {"type": "blendphase", "weight": 0.5, "a": {"type": "rayleigh"}, "b": _flakes()}
-    scene = mi.load_dict(_scene(_homogeneous(0.5, albedo=0.5, phase=_flakes() if inside == "alone" else blend)))
+    blend = {"type": "blendphase", "weight": 0.5, "a": {"type": "rayleigh"}, "b": _microflakes()}
+    scene = mi.load_dict(_scene(_homogeneous(0.5, albedo=0.5, phase=_microflakes() if inside == "alone" else blend)))
     (doubt,) = trust(scene)
-    assert doubt.kind == "flakes" and doubt.fatal
-    assert trust(mi.load_dict(_scene(_homogeneous(0.5, phase=_flakes())))) == []
+    assert doubt.kind == "microflakes" and doubt.fatal
+    assert trust(mi.load_dict(_scene(_homogeneous(0.5, phase=_microflakes())))) == []
     n = 1 << 18
     rng, ctx, mei = mi.PCG32(n, fresh(0)), mi.PhaseFunctionContext(None), dr.zeros(mi.MediumInteraction3f, n)
     mei.wi = mi.Vector3f(0.6, 0, 0.8)
     mei.sh_frame = mi.Frame3f(mei.wi)
-    flakes = mi.load_dict(_flakes())
-    drawn, _, _ = flakes.sample(ctx, mei, rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32()))
+    microflakes = mi.load_dict(_microflakes())
+    drawn, _, _ = microflakes.sample(ctx, mei, rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32()))
     evenly = mi.warp.square_to_uniform_sphere(mi.Point2f(rng.next_float32(), rng.next_float32()))
-    told = 4 * np.pi * np.array(flakes.eval_pdf(ctx, mei, evenly)[1]) * np.array(evenly.x)
+    told = 4 * np.pi * np.array(microflakes.eval_pdf(ctx, mei, evenly)[1]) * np.array(evenly.x)
     # 0.27 and 0, measured once
     means = (Moments.of(np.array(x, dtype=np.float64)) for x in (drawn.x, told))
     assert_apart(*means, expected=0.27, what="directions drawn and told")

@@ -197,7 +197,7 @@ def _world(unit: float) -> dict:
 
 
 @pytest.mark.parametrize("unit", [2.0**-7, 2.0**-14])
-def test_worlds_of_any_size(unit):
+def test_scenes_of_any_size(unit):
     """Lengths in another unit: the same image. Mitsuba starts rays 1e-4 behind a surface, whatever the scene's size."""
     big, small_one = (
         np.array(mi.render(mi.load_dict(_world(u)), integrator=mi.load_dict(mivol()), spp=64)) for u in (1.0, unit)

@@ -88,7 +88,7 @@ def batches(scene: mi.Scene, kind: str, depth: int, first: int, **more: object) 
 
 @pytest.mark.statistical
 @pytest.mark.parametrize("name", NAMES)
-def test_surfaces_and_lamps_like_volpath(name):
+def test_surfaces_and_emitters_like_volpath(name):
     """Means of 10 batches of 96 samples, Student's t over all pixels and channels."""
     parts, depth = rooms()[name]
     scene = mi.load_dict({k: v for k, v in parts.items() if v is not None})

@@ -35,7 +35,7 @@ VALUE = ("sigma_t.value.value", "albedo.value.value", "emission.value.value", "e
 
 def grids(channels: int, **more) -> twins.Medium:
     """Every coefficient a grid, none near the end of its domain."""
-    tops = {"sigma": 2.0, "source": 1.0, "glow": 1.0, "albedo": 0.8}
+    tops = {"sigma": 2.0, "source": 1.0, "emission_density": 1.0, "albedo": 0.8}
     return twins.Medium(**{k: (rough(i, 0.1 * v, v, channels), PLACE) for i, (k, v) in enumerate(tops.items())} | more)
 
 
@@ -126,7 +126,7 @@ PASSES = [
 @pytest.mark.parametrize(("end", "channels", "depth"), PASSES)
 def test_several_passes_are_one(end, channels, depth, monkeypatch):
     """A grid of three channels is padded inside its texture: its edge to the parameter can be passed but once."""
-    medium = interior(grids(channels, **({"source": 0.0, "glow": 0.0} if depth == 2 else {})))
+    medium = interior(grids(channels, **({"source": 0.0, "emission_density": 0.0} if depth == 2 else {})))
     scene, spp = picture(medium), 4
     w = np.random.default_rng(3).uniform(size=(6, 6, 3))
     (v,) = directions(scene, (end,)).values()
@@ -240,10 +240,10 @@ def test_no_phantom_gradient_behind_a_wall(wall, depth):
     back = {"background": bright if depth == 1 else 0.0}
 
     def rest(**changed) -> float:
-        fields = {"sigma": medium.sigma, "source": medium.source, "glow": medium.glow} | changed
+        fields = {"sigma": medium.sigma, "source": medium.source, "emission_density": medium.emission_density} | changed
         return float(twins.cell_radiance(twins.Medium(**fields), o, d, **back).sum())
 
-    for name, g in zip(("sigma", "source", "glow"), found, strict=True):
+    for name, g in zip(("sigma", "source", "emission_density"), found, strict=True):
         values = getattr(medium, name)[0].astype(np.float64)
         truth = front * twins.differences(lambda v, name=name: rest(**{name: (v, CORRIDOR)}), values)
         # An optical depth of 50 is known to 4e-6, float32's half ulp.

@@ -96,7 +96,7 @@ def test_density_under_a_point_light(density, kind):
         [("empty", "sun"), ("empty", "spot"), ("rough", "spot"), ("empty", "point at a corner")],
     ),
 )
-def test_density_under_other_lamps(density, name):
+def test_density_under_other_emitters(density, name):
     lamp = LAMPS[name]()
     seen, m = lit_smoke(density, lamp)
     w, rows = weights(8)
@@ -401,17 +401,17 @@ def test_weight_of_a_blend():
     scalar(parts, MEDIUM + "phase_function.weight.value.value", light, 0.3)
 
 
-FLAKES = [[0.3, 0.8, 0.2, 0.05, 0.02, -0.03]]
+MICROFLAKES = [[0.3, 0.8, 0.2, 0.05, 0.02, -0.03]]
 
 
 @pytest.mark.statistical
 @pytest.mark.parametrize("key", ["phase_function.S.data", "lamp.position"])
-def test_flakes(key):
-    """Extinction is in proportion to the area that flakes show to the ray: it changes with their matrix, and as a ray turns.
+def test_extinction_of_microflakes(key):
+    """Extinction is in proportion to the area that microflakes show to the ray: it changes with matrix and direction.
 
     Against differences of renders by quadrature, which err by 5e-3 (where shadow rays begin to leave by another face).
     """
-    S = mi.VolumeGrid(np.array(FLAKES, dtype=np.float32).reshape(1, 1, 1, 6))
+    S = mi.VolumeGrid(np.array(MICROFLAKES, dtype=np.float32).reshape(1, 1, 1, 6))
     phase = {"type": "sggx", "S": {"type": "gridvolume", "grid": S, "raw": True}}
     box = box_of({"type": "mivol_medium", "sigma_a": 0.3, "sigma_s": 0.7, "phase": phase}, PLACE)
     scene = small.close_up({"smoke": box, "lamp": point([1.5, 1, 2.0])[0]}, res=8)
@@ -436,7 +436,7 @@ def test_flakes(key):
 
 @pytest.mark.statistical
 @pytest.mark.parametrize(("name", "key"), [("point", "intensity"), ("spot", "intensity"), ("sun", "irradiance")])
-def test_power_of_a_lamp(name, key):
+def test_power_of_a_emitter(name, key):
     """Linear: the derivative is the picture of a lamp of 1."""
     lamp = LAMPS[name]()
     values = rough_grid(9)

@@ -93,8 +93,8 @@ def test_thin_sheets(away):
     """Emission, and scattered light, of a sheet of optical depth 1: its length is a difference of distances."""
     sheet = affine(np.diag([1, 1, THIN]))
     o, d, crossed = np.array([0.45, 0.4, 0]) - away * VIEW, VIEW, 1 / VIEW[2]
-    glow = box_of(medium("mivol_medium", 1 / THIN, emission=2.0), sheet)
-    seen = np.array(mi.render(pencils({"sheet": glow}, o, d).scene, integrator=mi.load_dict(mivol(max_depth=1)), spp=1))
+    emitting = box_of(medium("mivol_medium", 1 / THIN, emission=2.0), sheet)
+    seen = np.array(mi.render(pencils({"sheet": emitting}, o, d).scene, integrator=mi.load_dict(mivol(max_depth=1)), spp=1))
     # The sheet is as thick as float32 vertices have it: exactly. The rest is some roundings of float32.
     assert np.abs(seen / (2 * (1 - np.exp(-crossed))) - 1).max() <= 1e-6
     fog = box_of(medium("homogeneous", 1 / THIN, ALBEDO), sheet)

@@ -27,7 +27,7 @@ class Body:
         box: the boundary, where it is a box; None where it has to be traced.
         exact_parts: the parts whose integral along a ray is known.
         flight_parts: the parts that free flights are drawn from in one walk: constants, and grids that share their cells.
-        cuts_grids: whether the boundary is smaller than what lies in it, so that stretches must be cut to it.
+        cuts_grids: whether the boundary is smaller than what lies in it, so that intervals must be cut to it.
     """
 
     def __init__(self, view: MediumView, box: Box | None) -> None:
@@ -49,13 +49,13 @@ class Body:
         return len(self.exact_parts) < len(self.view.parts)
 
     def area(self, d: mi.Vector3f) -> mi.Float | float:
-        """Factor on the extinction for light that travels along ``d``: the projected area of flakes, else 1."""
+        """Factor on the extinction for light that travels along ``d``: the projected area of microflakes, else 1."""
         if self.view.microflakes is None:
             return 1.0
         return dr.safe_sqrt(dr.dot(d, self.facing(d)))
 
     def facing(self, d: mi.Vector3f) -> mi.Vector3f:
-        """The matrix of the flakes times a direction: half the gradient of the squared area."""
+        """The matrix of the microflakes times a direction: half the gradient of the squared area."""
         xx, yy, zz, xy, xz, yz = dr.detach(self.view.microflakes)
         return mi.Vector3f(xx * d.x + xy * d.y + xz * d.z, xy * d.x + yy * d.y + yz * d.z, xz * d.x + yz * d.y + zz * d.z)
 
@@ -91,7 +91,7 @@ class Body:
         parts: list[ExactExtinction] | None = None,
         enough: float | None = None,
     ) -> list[mi.Float]:
-        """Optical depth [1] of each channel over a stretch, of all parts unless told which; a grid may stop at ``enough``.
+        """Optical depth [1] of each channel over an interval, of all parts unless told which; a grid may stop at ``enough``.
 
         Raises:
             MivolError: of all parts, and one of them is bounded.
@@ -115,7 +115,7 @@ class Body:
         return [r + t * turned for r, t in zip(rows, self.optical_depth(ray, t0, t1, channels, active), strict=True)]
 
     def backproject(self, ray: mi.Ray3f, t0: mi.Float, t1: mi.Float, weight: list[mi.Float], active: mi.Bool) -> None:
-        """Add ``weight`` (d loss / d tau of each channel) times this stretch to the gradients of the exact parts."""
+        """Add ``weight`` (d loss / d tau of each channel) times this interval to the gradients of the exact parts."""
         if self.microflakes_gradient is not None:
             self._vjp_microflakes(ray.d, weight, self.optical_depth(ray, t0, t1, len(weight), active), active)
         weight = [self.area(ray.d) * w for w in weight]

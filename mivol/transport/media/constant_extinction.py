@@ -84,5 +84,5 @@ def _length(t0: mi.Float, t1: mi.Float, active: mi.Bool) -> mi.Float:
 
 
 def _ending(length: mi.Float) -> mi.Float:
-    """A length for derivatives: a stretch without end lets nothing through, and nothing behind it changes."""
+    """A length for derivatives: an interval without end lets nothing through, and nothing behind it changes."""
     return dr.select(length < 1e30, length, 0)

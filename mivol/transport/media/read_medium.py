@@ -84,13 +84,13 @@ def view_medium(medium: mi.Medium, boundary: Box | None = None, places: dict | N
 
 
 def _read_microflakes(medium: mi.Medium) -> list[mi.Float] | None:
-    """The matrix of the flakes of a medium, if its phase function has them; mivol takes one that is the same everywhere.
+    """The matrix S of the microflakes of a medium with an ``sggx`` phase function; None for all others.
 
     Raises:
         MivolError: a matrix that varies in space.
     """
     phase = medium.phase_function()
-    # In a blend or a mixture Mitsuba lets flakes turn light, and the extinction as it is.
+    # In a blend or a mixture Mitsuba lets microflakes scatter light, but leaves the extinction independent of direction.
     if phase is None or phase.class_name() != "SGGXPhaseFunction":
         return None
     flat = dr.ravel(next(v for k, v in mi.traverse(phase) if k.startswith("S.")))
@@ -120,7 +120,7 @@ def _part_of_field(volume: mi.Volume) -> ActivatedGridExtinction:
 
 
 def _emission_lattice(emission_density: object, others: list, boundary: Box | None, places: dict) -> Lattice | None:
-    """Where a glow has its cells, else the finest of other fields; None without a grid. Values are not looked at."""
+    """The grid of the emission density, else the finest of other fields, as a lattice of zeros; None without a grid."""
     grids = [v for v in others if _is_grid(v)]
     lead = (
         emission_density if _is_grid(emission_density) else max(grids, key=lambda v: int(np.prod(v.resolution())), default=None)

@@ -50,7 +50,7 @@ class SceneMedia:
 
     @property
     def has_microflakes(self) -> bool:
-        """Whether some phase function has flakes among its lobes."""
+        """Whether some phase function is, or contains, a microflake phase function."""
         phases = [b.view.medium.phase_function() for b in self.bodies]
         return any(p is not None and int(p.flags()) & int(mi.PhaseFunctionFlags.Microflake) for p in phases)
 
