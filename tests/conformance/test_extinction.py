@@ -12,7 +12,7 @@ import pytest
 from mivol.fields.activation import activation_of
 from mivol.transport.media.activated_grid_extinction import ActivatedGridExtinction
 from mivol.transport.media.constant_extinction import ConstantExtinction
-from mivol.transport.media.extinction import ExactExtinction
+from mivol.transport.media.extinction import ExactExtinction, RayInterval
 from mivol.transport.media.grid_extinction import GridExtinction
 from mivol.transport.traversal.empty_blocks import block_bounds, empty_block_distances
 from mivol.transport.traversal.lattice import Lattice
@@ -67,7 +67,7 @@ def test_an_optical_depth_is_the_sum_of_the_values_on_its_way(name: str) -> None
         rows = part.eval_at(mi.Float(1), many, start + k * step, mi.Bool(True))
         total += np.array([np.broadcast_to(np.array(r, np.float64), 500 * RAYS).reshape(500, RAYS).sum(axis=0) for r in rows])
     largest = np.exp(2) if "exp" in name else 2.0
-    found = numbers(part.integrate(ray, t0, t1, mi.Bool(True)))
+    found = numbers(part.integrate(RayInterval(ray, t0, t1, mi.Bool(True))))
     # A sum at midpoints misses half a step at each of the two faces of the box, and less inside; a point counts as inside up to
     # 1e-3 of a voxel beyond a face (lattice.locate). Two Gauss points a cell are wrong by up to 2 % of what an activation makes
     # of noise (the table of mivol.fields.activation, an optical depth of 0.1 to 1 a voxel: 0.5 % rms; relu has edges).
@@ -93,8 +93,8 @@ def test_derivatives_are_transposes(name: str, where: str) -> None:
             pushed = numbers(part.jvp_at(tangent, ray, 0.5 * (t0 + t1), on))
             part.vjp_at(gradient, weight, ray, 0.5 * (t0 + t1), on)
         else:
-            pushed = numbers(part.jvp(tangent, ray, t0, t1, on))
-            part.vjp(gradient, weight, ray, t0, t1, on)
+            pushed = numbers(part.jvp(tangent, RayInterval(ray, t0, t1, on)))
+            part.vjp(gradient, weight, RayInterval(ray, t0, t1, on))
     dr.backward(part.deliver(mi.Float(1), gradient))
     pulled = np.array(dr.grad(part.values), np.float64).reshape(shape)
     # Each of the terms is rounded a few times: 1e-6 of the sum of their sizes is 16 roundings of float32 each.

@@ -162,7 +162,7 @@ class _Filling:
 
     def visit(self, reservoir: Reservoir, interval: MediumInterval) -> Reservoir:
         """Offer the pieces of one medium, and sum the optical depth of its parts that have other cells."""
-        body, t0, t1, on = interval.body, interval.t0, interval.t1, interval.active
+        body = interval.body
         reservoir = self._offer_body(reservoir, interval)
         media = self.proposal.media
         number = next(index for index, other in enumerate(media.bodies) if other is body)
@@ -171,7 +171,7 @@ class _Filling:
             candidate.is_new = dr.zeros(mi.Bool, dr.width(candidate.is_new))
         others = [p for p in body.view.parts if not any(p is q for q in body.flight_parts)]
         if others:
-            rest = body.optical_depth(self.proposal.ray, t0, t1, media.channels, on, others)
+            rest = body.optical_depth(interval, media.channels, others)
             reservoir.tau = [t + r for t, r in zip(reservoir.tau, rest, strict=True)]
             reservoir.T = [dr.exp(-t) for t in reservoir.tau]
         return reservoir

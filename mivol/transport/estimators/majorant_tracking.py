@@ -15,29 +15,22 @@ import mitsuba as mi
 from mivol.numerics import largest_of
 from mivol.transport.estimators.ratio_tracking import FAINT, LOOKUP_RATE
 from mivol.transport.media.bounded_extinction import BoundedExtinction
+from mivol.transport.media.extinction import RayInterval
 from mivol.transport.traversal.random_numbers import draw_pcg32
 
 __all__ = ["ratio_tracking"]
 
 
 def ratio_tracking(
-    part: BoundedExtinction,
-    scale: mi.Float,
-    ray: mi.Ray3f,
-    t0: mi.Float,
-    t1: mi.Float,
-    rng: mi.UInt32,
-    active: mi.Bool,
+    part: BoundedExtinction, scale: mi.Float, interval: RayInterval, rng: mi.UInt32
 ) -> tuple[list[mi.Float], mi.UInt32]:
     """Estimate the transmittance of an interval of a ray for each channel.
 
     Args:
         part: the extinction; that its values are no larger than its majorant is the field's promise.
         scale: factor on the values.
-        ray: world space, unit direction.
-        t0, t1: the interval [length]; the field has a box, so it may be infinite.
+        interval: of the ray; the field has a box, so it may be infinite. Lanes that are not active return 1.
         rng: state of the generator.
-        active: lanes to track; the others return 1.
 
     Returns:
         The estimates, and the state of the generator.
@@ -45,7 +38,8 @@ def ratio_tracking(
     Bias: none. Variance: T^2 (exp(int sigma^2 / (kappa M) dt) - 1), and what the roulette adds, which ends rays below FAINT.
     Cost: kappa M l look-ups for a length l in the box.
     """
-    begin, end = part.interval(ray, t0, t1)
+    ray = interval.ray
+    begin, end = part.clip(interval)
     rate = LOOKUP_RATE * scale * part.majorant
 
     def look(t: mi.Float, T: list[mi.Float], rng: mi.UInt32, on: mi.Bool) -> tuple:
@@ -62,6 +56,7 @@ def ratio_tracking(
         return t, T, rng, on & (lift > 0)
 
     width = dr.width(ray)
-    start = (begin, [dr.full(mi.Float, 1, width) for _ in range(part.channels)], mi.UInt32(rng), active & (end > begin))
+    T = [dr.full(mi.Float, 1, width) for _ in range(part.channels)]
+    start = (begin, T, mi.UInt32(rng), interval.active & (end > begin))
     _, T, rng, _ = dr.while_loop(start, lambda t, T, rng, on: on, look, label="points of a bounded medium")
     return T, rng

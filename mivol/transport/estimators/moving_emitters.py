@@ -62,7 +62,7 @@ def tau_by_end(media: SceneMedia, ray_segment: RaySegment, tau: list[mi.Float], 
             return total
         # The projected area of microflakes changes with the direction of the ray, which moves perpendicular to itself.
         turn = body.facing(d) * dr.rcp(dr.maximum(dr.square(body.area(d)), 1e-30)) - d
-        own = body.optical_depth(ray_segment.ray, t0, t1, media.channels, on)
+        own = body.optical_depth(interval, media.channels)
         return [a + t * turn for a, t in zip(total, own, strict=True)]
 
     zero = [mi.Vector3f(0) for _ in range(media.channels)]

@@ -12,17 +12,16 @@ import mitsuba as mi
 from mivol.transport.estimators.majorant_tracking import ratio_tracking
 from mivol.transport.estimators.ratio_tracking import residual_ratio_tracking
 from mivol.transport.media.channels import as_rows, spectrum
+from mivol.transport.media.grid_extinction import clip_interval
 from mivol.transport.media.optical_depth import sum_optical_depth, transmittance
 from mivol.transport.media.ray_intervals import (
     OWN_SURFACE,
     MediumInterval,
-    MediumVisitor,
     RaySegment,
     SegmentEnd,
     visit_media,
 )
 from mivol.transport.media.scene_media import SceneMedia
-from mivol.transport.traversal.lattice import clip
 from mivol.transport.traversal.random_numbers import draw_pcg32
 
 __all__ = ["DARK", "estimate_transmittance", "light_through", "shadow_ray"]
@@ -53,7 +52,7 @@ def light_through(
         end, T = estimate_transmittance(media, ray, medium, active, rng, passes_null=True)
         return end, None, T * end.null_transmission
     zero = [mi.Float(0) for _ in range(media.channels)]
-    end, tau = visit_media(media, ray, medium, sum_optical_depth(ray, DARK), zero, active, passes_null=True)
+    end, tau = visit_media(media, ray, medium, sum_optical_depth(DARK), zero, active, passes_null=True)
     return end, tau, transmittance(tau) * end.null_transmission
 
 
@@ -62,40 +61,34 @@ def estimate_transmittance(
 ) -> tuple[SegmentEnd, mi.Spectrum]:
     """Where a ray ends, and an unbiased estimate of the share of light that its media let through; ``rng`` draws it."""
     start = ([mi.Float(1) for _ in range(media.channels)], rng)
-    end, (T, _) = visit_media(media, ray, medium, _dim(ray), start, active, passes_null)
+    end, (T, _) = visit_media(media, ray, medium, _dim, start, active, passes_null)
     return end, spectrum(T)
 
 
-def _dim(ray: mi.Ray3f) -> MediumVisitor:
-    """The visitor that multiplies the transmittances of media along ``ray``."""
-
-    def visit(state: tuple, interval: MediumInterval) -> tuple:
-        T, rng = state
-        own, rng = _estimate_transmittance(interval, ray, len(T), rng)
-        return [a * b for a, b in zip(T, own, strict=True)], rng
-
-    return visit
+def _dim(state: tuple, interval: MediumInterval) -> tuple:
+    """The visitor that multiplies the transmittances of media along a ray."""
+    T, rng = state
+    own, rng = _estimate_transmittance(interval, len(T), rng)
+    return [a * b for a, b in zip(T, own, strict=True)], rng
 
 
-def _estimate_transmittance(
-    interval: MediumInterval, ray: mi.Ray3f, channels: int, rng: mi.UInt32
-) -> tuple[list[mi.Float], mi.UInt32]:
+def _estimate_transmittance(interval: MediumInterval, channels: int, rng: mi.UInt32) -> tuple[list[mi.Float], mi.UInt32]:
     """Transmittance [1] of one medium for each channel, and the next state of the generator.
 
     It is estimated by ratio tracking in bounded parts, by residual ratio tracking in grids whose block ranges are known, and
     exact in all other parts, which are walked to the optical depth ``DARK``.
     """
-    body, t0, t1, active = interval.body, interval.t0, interval.t1, interval.active
+    body = interval.body
     tracked = [p for p in body.exact_parts if p.lattice is not None and p.lattice.block_ranges is not None]
     others = [p for p in body.exact_parts if not any(p is q for q in tracked)]
-    T = [dr.exp(-t) for t in body.optical_depth(ray, t0, t1, channels, active, others, DARK)]
-    scale = dr.detach(body.view.scale) * body.area(ray.d)
+    T = [dr.exp(-t) for t in body.optical_depth(interval, channels, others, DARK)]
+    scale = dr.detach(body.view.scale) * body.area(interval.ray.d)
     for part in tracked:
-        segment = clip(part.lattice, ray.o, ray.d, t0, t1)
-        own, rng = residual_ratio_tracking(part.lattice, segment, scale, rng, active)
+        segment = clip_interval(part.lattice, interval)
+        own, rng = residual_ratio_tracking(part.lattice, segment, scale, rng, interval.active)
         T = [a * b for a, b in zip(T, as_rows(own, channels), strict=True)]
     for part in (p for p in body.view.parts if not p.exact_line):
-        own, rng = ratio_tracking(part, scale, ray, t0, t1, rng, active)
+        own, rng = ratio_tracking(part, scale, interval, rng)
         T = [a * b for a, b in zip(T, as_rows(own, channels), strict=True)]
     return T, rng
 

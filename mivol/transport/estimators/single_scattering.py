@@ -165,7 +165,7 @@ class SingleScattering:
         if not media.is_single:
             front = RaySegment.upto(ray, segment.medium, event.t)
             zero = [mi.Float(0) for _ in range(media.channels)]
-            tau = revisit_media(media, front, sum_optical_depth(ray), zero, event.on)
+            tau = revisit_media(media, front, sum_optical_depth(), zero, event.on)
         gain = dr.select(event.on, segment.beta * transmittance(tau) / event.pdf, 0)
         vertex = MediumVertex(media, mei)
         direct = self.direct.in_medium(vertex, chosen, samples, probes, event.on, estimates=not probes)

@@ -104,14 +104,14 @@ def composite_ray(line: LineIntegral, end: list[mi.Float], tangent: bool = False
 
     boxes = []
     for interval in find_boxed_intervals(media, ray_segment.ray, ray_segment.length, line.active):
-        middle = interval.middle(ray_segment.ray) if len(media.bodies) > 1 else mi.Float64(0)
+        middle = interval.middle() if len(media.bodies) > 1 else mi.Float64(0)
         own = BodySweep(line, interval, tangent).integrate(skip)
         boxes.append(_Boxed(interval, middle, own, zeros(mi.Float64, rows), [], zeros(mi.Float, rows)))
 
     def visit_traced(t: _Traced, interval: MediumInterval) -> _Traced:
         if interval.body.box is not None:
             return t
-        own, middle = BodySweep(line, interval, tangent).integrate(skip), interval.middle(ray_segment.ray)
+        own, middle = BodySweep(line, interval, tangent).integrate(skip), interval.middle()
         seen = _dim(_add(t.tau, _tau_in_front(boxes, middle, rows)), own.N, integrand.rows)
         opaque = [one_minus_exp(mi.Float(x)) for x in own.tau[: integrand.rows]]
         means = [dr.select(a > 0, n / dr.select(a > 0, a, 1), 0) for n, a in zip(own.N, opaque, strict=False)]
@@ -175,7 +175,7 @@ def vjp_composite(line: LineIntegral, composite: Composite, weight: list[mi.Floa
     def visit(passed: BodyIntegral, interval: MediumInterval) -> BodyIntegral:
         if interval.body.box is not None:
             return passed
-        sweep, middle = BodySweep(line, interval), interval.middle(ray_segment.ray)
+        sweep, middle = BodySweep(line, interval), interval.middle()
         own = sweep.integrate(False)
         front = _add(passed.tau, _tau_in_front(composite.boxes, middle, integrand.rows))
         ahead, N = _add(front, own.tau), _add(passed.N, _dim(front, own.N, integrand.rows))

@@ -11,7 +11,7 @@ import mitsuba as mi
 from mivol.errors import MivolError
 from mivol.transport.media.box import Box
 from mivol.transport.media.channels import as_rows, for_part
-from mivol.transport.media.extinction import ExactExtinction, Extinction
+from mivol.transport.media.extinction import ExactExtinction, Extinction, RayInterval
 from mivol.transport.media.grid_extinction import add_to_cell
 from mivol.transport.media.medium_view import MediumView
 from mivol.transport.media.summed_extinction import SummedExtinction, share_cells
@@ -83,11 +83,8 @@ class Body:
 
     def optical_depth(
         self,
-        ray: mi.Ray3f,
-        t0: mi.Float,
-        t1: mi.Float,
+        interval: RayInterval,
         channels: int,
-        active: mi.Bool,
         parts: list[ExactExtinction] | None = None,
         enough: float | None = None,
     ) -> list[mi.Float]:
@@ -99,29 +96,30 @@ class Body:
         if parts is None and self.is_bounded:
             raise MivolError("the optical depth of a bounded field was asked for; only its transmittance can be estimated.")
         parts = self.view.parts if parts is None else parts
-        scale = dr.detach(self.view.scale) * self.area(ray.d)
+        scale = dr.detach(self.view.scale) * self.area(interval.ray.d)
         bound = None if enough is None else enough / scale
-        rows = _sum((part.integrate(ray, t0, t1, active, bound) for part in parts), channels)
+        rows = _sum((part.integrate(interval, bound) for part in parts), channels)
         return [scale * tau for tau in rows]
 
-    def tangent(self, ray: mi.Ray3f, t0: mi.Float, t1: mi.Float, channels: int, active: mi.Bool) -> list[mi.Float]:
+    def tangent(self, interval: RayInterval, channels: int) -> list[mi.Float]:
         """Derivative of the optical depth of the exact parts along the tangent that :meth:`SceneMedia.start_tangent` took."""
         pairs = [(p, v) for p, v in zip(self.view.parts, self.tangents, strict=True) if p.exact_line]
-        area = self.area(ray.d)
-        rows = [area * row for row in _sum((part.jvp(change, ray, t0, t1, active) for part, change in pairs), channels)]
+        area = self.area(interval.ray.d)
+        rows = [area * row for row in _sum((part.jvp(change, interval) for part, change in pairs), channels)]
         if self.microflakes_tangent is None:
             return rows
-        turned = self._jvp_microflakes(ray.d)
-        return [r + t * turned for r, t in zip(rows, self.optical_depth(ray, t0, t1, channels, active), strict=True)]
+        turned = self._jvp_microflakes(interval.ray.d)
+        return [r + t * turned for r, t in zip(rows, self.optical_depth(interval, channels), strict=True)]
 
-    def backproject(self, ray: mi.Ray3f, t0: mi.Float, t1: mi.Float, weight: list[mi.Float], active: mi.Bool) -> None:
+    def backproject(self, interval: RayInterval, weight: list[mi.Float]) -> None:
         """Add ``weight`` (d loss / d tau of each channel) times this interval to the gradients of the exact parts."""
         if self.microflakes_gradient is not None:
-            self._vjp_microflakes(ray.d, weight, self.optical_depth(ray, t0, t1, len(weight), active), active)
-        weight = [self.area(ray.d) * w for w in weight]
+            amount = self.optical_depth(interval, len(weight))
+            self._vjp_microflakes(interval.ray.d, weight, amount, interval.active)
+        weight = [self.area(interval.ray.d) * w for w in weight]
         for part, gradient in zip(self.view.parts, self.gradients, strict=True):
             if part.exact_line:
-                part.vjp(gradient, for_part(weight, part.channels), ray, t0, t1, active)
+                part.vjp(gradient, for_part(weight, part.channels), interval)
 
     def tangent_of_part(self, part: Extinction, ray: mi.Ray3f, t: mi.Float, channels: int, active: mi.Bool) -> list[mi.Float]:
         """Tangent of one part's coefficient [1/length] at a point of a ray."""

@@ -11,6 +11,7 @@ import mitsuba as mi
 from mivol.fields.protocol import Field
 from mivol.transport.media.box import Box
 from mivol.transport.media.channels import tangent_of
+from mivol.transport.media.extinction import RayInterval
 from mivol.transport.traversal.lattice import slab
 
 __all__ = ["BoundedExtinction"]
@@ -54,9 +55,10 @@ class BoundedExtinction:
         dr.eval(gradient)
         return dr.sum(scale * gradient)
 
-    def interval(self, ray: mi.Ray3f, t0: mi.Float, t1: mi.Float) -> tuple[mi.Float, mi.Float]:
-        """The part of an interval of a ray that lies in the field's box; the end is not behind the start where none does."""
-        _, _, t0, t1 = slab(self._rows, (0.0,) * 3, (1.0,) * 3, ray.o, ray.d, mi.Float64(t0), mi.Float64(t1))
+    def clip(self, interval: RayInterval) -> tuple[mi.Float, mi.Float]:
+        """The part [t0, t1] of an interval of a ray that lies in the field's box; t1 <= t0 where there is none."""
+        ray, t0, t1 = interval.ray, mi.Float64(interval.t0), mi.Float64(interval.t1)
+        _, _, t0, t1 = slab(self._rows, (0.0,) * 3, (1.0,) * 3, ray.o, ray.d, t0, t1)
         return mi.Float(t0), mi.Float(t1)
 
     def eval_at(self, scale: mi.Float, ray: mi.Ray3f, t: mi.Float, active: mi.Bool) -> list[mi.Float]:

@@ -8,6 +8,8 @@ from typing import ClassVar
 import drjit as dr
 import mitsuba as mi
 
+from mivol.transport.media.extinction import RayInterval
+
 __all__ = ["ConstantExtinction"]
 
 
@@ -45,20 +47,16 @@ class ConstantExtinction:
         dr.eval(gradient)
         return dr.sum(dr.ravel(self.scaled(scale)) * gradient)
 
-    def integrate(
-        self, ray: mi.Ray3f, t0: mi.Float, t1: mi.Float, active: mi.Bool, enough: mi.Float | None = None
-    ) -> list[mi.Float]:
-        return self._along(dr.detach(self.constant), _length(t0, t1, active))
+    def integrate(self, interval: RayInterval, enough: mi.Float | None = None) -> list[mi.Float]:
+        return self._along(dr.detach(self.constant), _length(interval))
 
-    def jvp(self, tangent: mi.Float | mi.Color3f, ray: mi.Ray3f, t0: mi.Float, t1: mi.Float, active: mi.Bool) -> list[mi.Float]:
-        return self._along(tangent, _ending(_length(t0, t1, active)))
+    def jvp(self, tangent: mi.Float | mi.Color3f, interval: RayInterval) -> list[mi.Float]:
+        return self._along(tangent, _finite(_length(interval)))
 
-    def vjp(
-        self, gradient: mi.Float, weight: list[mi.Float], ray: mi.Ray3f, t0: mi.Float, t1: mi.Float, active: mi.Bool
-    ) -> None:
-        length = _ending(_length(t0, t1, active))
+    def vjp(self, gradient: mi.Float, weight: list[mi.Float], interval: RayInterval) -> None:
+        length = _finite(_length(interval))
         for c, w in enumerate(weight):
-            dr.scatter_add(gradient, dr.select(w != 0, w * length, 0), mi.UInt32(c), active)
+            dr.scatter_add(gradient, dr.select(w != 0, w * length, 0), mi.UInt32(c), interval.active)
 
     def eval_at(self, scale: mi.Float, ray: mi.Ray3f, t: mi.Float, active: mi.Bool) -> list[mi.Float]:
         return self._rows(dr.detach(self.scaled(scale)))
@@ -79,10 +77,10 @@ class ConstantExtinction:
         return [value] if self.channels == 1 else [value.x, value.y, value.z]
 
 
-def _length(t0: mi.Float, t1: mi.Float, active: mi.Bool) -> mi.Float:
-    return dr.select(active & (t1 > t0), mi.Float(t1 - t0), 0)
+def _length(interval: RayInterval) -> mi.Float:
+    return dr.select(interval.active & (interval.t1 > interval.t0), mi.Float(interval.t1 - interval.t0), 0)
 
 
-def _ending(length: mi.Float) -> mi.Float:
-    """A length for derivatives: an interval without end lets nothing through, and nothing behind it changes."""
+def _finite(length: mi.Float) -> mi.Float:
+    """A length for derivatives: 0 for an interval without end, whose transmittance stays 0 whatever the constant is."""
     return dr.select(length < 1e30, length, 0)

@@ -16,6 +16,7 @@ import mitsuba as mi
 from mivol.errors import MivolError
 from mivol.transport.media.body import Body
 from mivol.transport.media.bounded_extinction import BoundedExtinction
+from mivol.transport.media.extinction import RayInterval
 
 __all__ = ["DrawnPoint", "bounded_parts", "draw_in", "start_points"]
 
@@ -58,10 +59,10 @@ def start_points(count: int, u: mi.Float | None, width: int) -> list[DrawnPoint]
     return [DrawnPoint(zero, zero, zero, mi.Float(u)) for _ in range(count)]
 
 
-def draw_in(point: DrawnPoint, part: BoundedExtinction, ray: mi.Ray3f, t0: mi.Float, t1: mi.Float, on: mi.Bool) -> DrawnPoint:
-    """Pass one more interval."""
-    begin, end = part.interval(ray, t0, t1)
-    length = dr.select(on & (end > begin), end - begin, 0)
+def draw_in(point: DrawnPoint, part: BoundedExtinction, interval: RayInterval) -> DrawnPoint:
+    """Offer one more interval to the reservoir."""
+    begin, end = part.clip(interval)
+    length = dr.select(interval.active & (end > begin), end - begin, 0)
     total = point.total + length
     share = length / dr.select(total > 0, total, 1)
     keep = point.u < share

@@ -5,20 +5,37 @@ r"""One additive part of the extinction of a medium, as transport asks for it: a
 The scale s belongs to the medium, a part is one f_k. Each kind of field has an adapter that answers these questions, so that
 what walks through media does not ask for the kind. An :class:`ExactExtinction` also knows its integral along a ray.
 
-Conventions. ``t``, ``t0``, ``t1`` are distances along ``ray`` [length]; rows are lists of one ``Float`` for each channel of the
+Conventions. Distances are along the ray, from its origin [length]; rows are lists of one ``Float`` for each channel of the
 part. Values come without derivatives. Tangents and gradients are those of ``scaled(s)``, the array that the scale and the
 parameters behind the part are found through: ``jvp`` multiplies by the derivative, ``vjp`` by its transpose.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 import mitsuba as mi
 
 from mivol.transport.traversal.lattice import Lattice
 
-__all__ = ["ExactExtinction", "Extinction"]
+__all__ = ["ExactExtinction", "Extinction", "RayInterval"]
+
+
+@dataclass
+class RayInterval:
+    """An interval of a ray, over which an extinction is integrated.
+
+    Attributes:
+        ray: world space, unit direction.
+        t0, t1: distances from its origin [length]; ``t1`` may be infinite.
+        active: lanes that have the interval.
+    """
+
+    ray: mi.Ray3f
+    t0: mi.Float64 | mi.Float
+    t1: mi.Float64 | mi.Float
+    active: mi.Bool
 
 
 class Extinction(Protocol):
@@ -58,13 +75,11 @@ class Extinction(Protocol):
 class ExactExtinction(Extinction, Protocol):
     """A part whose integral over an interval of a ray is known: in closed form, or cell by cell."""
 
-    def integrate(
-        self, ray: mi.Ray3f, t0: mi.Float, t1: mi.Float, active: mi.Bool, enough: mi.Float | None = None
-    ) -> list[mi.Float]:
+    def integrate(self, interval: RayInterval, enough: mi.Float | None = None) -> list[mi.Float]:
         """Optical depth [1] for a scale of 1; it may stop where every channel has more than ``enough``."""
 
-    def jvp(self, tangent: Any, ray: mi.Ray3f, t0: mi.Float, t1: mi.Float, active: mi.Bool) -> list[mi.Float]:
+    def jvp(self, tangent: Any, interval: RayInterval) -> list[mi.Float]:
         """Tangent of the optical depth, the scale included."""
 
-    def vjp(self, gradient: Any, weight: list[mi.Float], ray: mi.Ray3f, t0: mi.Float, t1: mi.Float, active: mi.Bool) -> None:
+    def vjp(self, gradient: Any, weight: list[mi.Float], interval: RayInterval) -> None:
         """Add ``weight`` (d loss / d tau) times the interval to a gradient: the transpose of :meth:`jvp`."""

@@ -8,29 +8,27 @@ from typing import ClassVar
 import drjit as dr
 import mitsuba as mi
 
+from mivol.transport.media.extinction import RayInterval
 from mivol.transport.media.grid_integral import Gradient, backproject_segment, integrate_segment
 from mivol.transport.traversal.grid_walk import box_nodes
 from mivol.transport.traversal.interpolation import interpolate, upward_frac, weights
-from mivol.transport.traversal.lattice import Lattice, clip, locate
+from mivol.transport.traversal.lattice import Lattice, Segment, clip, locate
 
-__all__ = ["GridExtinction", "add_to_cell", "interpolate_at"]
+__all__ = ["GridExtinction", "NodeValues", "add_to_cell", "clip_interval", "interpolate_at"]
 
 
 @dataclass
-class GridExtinction:
-    """A grid, grey or rgb (:class:`mivol.transport.media.extinction.ExactExtinction`).
+class NodeValues:
+    """The part of an extinction that is stored at the nodes of a grid, and the gradient of what is stored.
 
     Attributes:
         name: ``sigma_t``, ``sigma_a`` or ``sigma_s``.
-        lattice: its values [1/length], with their derivatives, and their place.
-        volume: the stock grid that ``lattice`` stands for, which may look its voxels up in another way; None elsewhere.
+        lattice: node values, with their derivatives, and their place.
     """
 
     name: str
     lattice: Lattice
-    volume: mi.Volume | None = None
     exact_line: ClassVar[bool] = True
-    activation: ClassVar[None] = None
 
     @property
     def channels(self) -> int:
@@ -53,20 +51,34 @@ class GridExtinction:
         dr.eval(flat)
         return dr.sum(dr.ravel(self.scaled(scale)) * flat)
 
-    def integrate(
-        self, ray: mi.Ray3f, t0: mi.Float, t1: mi.Float, active: mi.Bool, enough: mi.Float | None = None
-    ) -> list[mi.Float]:
-        segment = clip(self.lattice, ray.o, ray.d, t0, t1)
-        return integrate_segment(self.lattice, dr.detach(self.values), segment, active, enough)
+    def add_at_point(self, gradient: Gradient, weight: list[mi.Float], ray: mi.Ray3f, t: mi.Float, active: mi.Bool) -> None:
+        """Add ``weight`` (d loss / d interpolated value of each channel) at a point of a ray to a gradient of the nodes."""
+        cell, frac, inside = locate(self.lattice, ray.o, ray.d, t)
+        corners = weights(upward_frac(frac, cell, self.lattice.res))
+        add_to_cell(gradient, cell, [(weight, corners)], inside & active)
 
-    def jvp(self, tangent: mi.Float, ray: mi.Ray3f, t0: mi.Float, t1: mi.Float, active: mi.Bool) -> list[mi.Float]:
+
+@dataclass
+class GridExtinction(NodeValues):
+    """A grid of extinction [1/length], grey or rgb (:class:`mivol.transport.media.extinction.ExactExtinction`).
+
+    Attributes:
+        volume: the stock grid that ``lattice`` stands for, which may look its voxels up in another way; None elsewhere.
+    """
+
+    volume: mi.Volume | None = None
+    activation: ClassVar[None] = None
+
+    def integrate(self, interval: RayInterval, enough: mi.Float | None = None) -> list[mi.Float]:
+        segment = clip_interval(self.lattice, interval)
+        return integrate_segment(self.lattice, dr.detach(self.values), segment, interval.active, enough)
+
+    def jvp(self, tangent: mi.Float, interval: RayInterval) -> list[mi.Float]:
         lattice = replace(self.lattice, empty_distances=None)
-        return integrate_segment(lattice, tangent, clip(lattice, ray.o, ray.d, t0, t1), active)
+        return integrate_segment(lattice, tangent, clip_interval(lattice, interval), interval.active)
 
-    def vjp(
-        self, gradient: Gradient, weight: list[mi.Float], ray: mi.Ray3f, t0: mi.Float, t1: mi.Float, active: mi.Bool
-    ) -> None:
-        backproject_segment(self.lattice, gradient, weight, clip(self.lattice, ray.o, ray.d, t0, t1), active)
+    def vjp(self, gradient: Gradient, weight: list[mi.Float], interval: RayInterval) -> None:
+        backproject_segment(self.lattice, gradient, weight, clip_interval(self.lattice, interval), interval.active)
 
     def eval_at(self, scale: mi.Float, ray: mi.Ray3f, t: mi.Float, active: mi.Bool) -> list[mi.Float]:
         return interpolate_at(self.lattice, dr.detach(self.scaled(scale)), ray, t, active)
@@ -75,9 +87,12 @@ class GridExtinction:
         return interpolate_at(self.lattice, tangent, ray, t, active)
 
     def vjp_at(self, gradient: Gradient, weight: list[mi.Float], ray: mi.Ray3f, t: mi.Float, active: mi.Bool) -> None:
-        cell, frac, inside = locate(self.lattice, ray.o, ray.d, t)
-        corners = weights(upward_frac(frac, cell, self.lattice.res))
-        add_to_cell(gradient, cell, [(weight, corners)], inside & active)
+        self.add_at_point(gradient, weight, ray, t, active)
+
+
+def clip_interval(lattice: Lattice, interval: RayInterval) -> Segment:
+    """The part of an interval of a ray inside the box of a grid."""
+    return clip(lattice, interval.ray.o, interval.ray.d, interval.t0, interval.t1)
 
 
 def interpolate_at(lattice: Lattice, values: mi.Float, ray: mi.Ray3f, t: mi.Float, active: mi.Bool) -> list[mi.Float]:

@@ -28,6 +28,7 @@ from mivol.transport.traversal.interpolation import gauss_points, interpolate, n
 from mivol.transport.traversal.lattice import Lattice, Segment, clip
 
 __all__ = [
+    "ActivatedNodes",
     "Gradient",
     "backproject_activated",
     "backproject_segment",
@@ -107,10 +108,23 @@ def integrate_segment(
     return walk(lattice, segment, visit, zero, [Nodes(values, lattice.channels)], active, until)
 
 
+@dataclass
+class ActivatedNodes:
+    """An extinction that is a function of the interpolated values of a grid of one channel.
+
+    Attributes:
+        lattice: where the grid lies, and which blocks are empty.
+        values: flat node values before the activation, detached.
+        activation: the function of the interpolated value.
+    """
+
+    lattice: Lattice
+    values: mi.Float
+    activation: Activation
+
+
 def integrate_activated(
-    lattice: Lattice,
-    values: mi.Float,
-    activation: Activation,
+    nodes: ActivatedNodes,
     segment: Segment,
     active: mi.Bool = True,
     enough: mi.Float | None = None,
@@ -119,9 +133,8 @@ def integrate_activated(
     """Integrate an extinction that is a function of interpolated node values, or its tangent.
 
     Args:
-        lattice, segment, active, enough: as :func:`integrate_segment`, of one channel.
-        values: flat node values before the activation.
-        activation: the function of the interpolated value.
+        nodes: the grid and the function.
+        segment, active, enough: as :func:`integrate_segment`.
         tangent: of the values; None for the integral itself.
 
     Returns:
@@ -134,35 +147,29 @@ def integrate_activated(
     def visit(tau: list[mi.Float], cell: Cell, on: mi.Bool) -> list[mi.Float]:
         half, total = dr.select(on, 0.5 * cell.dt, 0), mi.Float(0)
         for p in gauss_points(cell):
-            value, slope = activation.value_and_slope(interpolate(cell.corners[0][0], p))
+            value, slope = nodes.activation.value_and_slope(interpolate(cell.corners[0][0], p))
             total += value if tangent is None else slope * interpolate(cell.corners[1][0], p)
         return [dr.fma(half, total, tau[0])]
 
-    reads = [Nodes(values)] if tangent is None else [Nodes(values), Nodes(tangent)]
+    reads = [Nodes(nodes.values)] if tangent is None else [Nodes(nodes.values), Nodes(tangent)]
     until = None if enough is None else lambda tau: tau[0] > enough
-    return walk(lattice, segment, visit, [mi.Float(0)], reads, active, until)
+    return walk(nodes.lattice, segment, visit, [mi.Float(0)], reads, active, until)
 
 
 def backproject_activated(
-    lattice: Lattice,
-    values: mi.Float,
-    activation: Activation,
-    target: Gradient,
-    weight: mi.Float,
-    segment: Segment,
-    active: mi.Bool = True,
+    nodes: ActivatedNodes, target: Gradient, weight: mi.Float, segment: Segment, active: mi.Bool = True
 ) -> None:
-    """The transpose of the tangent of :func:`integrate_activated`."""
+    """The transpose of the tangent of :func:`integrate_activated`: add ``weight`` (d loss / d tau) times it to ``target``."""
 
     def visit(state: None, cell: Cell, on: mi.Bool) -> None:
         row = [mi.Float(0)] * 8
         for p in gauss_points(cell):
-            _, slope = activation.value_and_slope(interpolate(cell.corners[0][0], p))
-            row = [r + slope * w for r, w in zip(row, node_weights(p, cell, lattice.res), strict=True)]
+            _, slope = nodes.activation.value_and_slope(interpolate(cell.corners[0][0], p))
+            row = [r + slope * w for r, w in zip(row, node_weights(p, cell, nodes.lattice.res), strict=True)]
         target.add(0, cell, [0.5 * cell.dt * weight * r for r in row], on)
         return state
 
-    walk(replace(lattice, empty_distances=None), segment, visit, None, [Nodes(values)], active)
+    walk(replace(nodes.lattice, empty_distances=None), segment, visit, None, [Nodes(nodes.values)], active)
 
 
 @dataclass

@@ -31,17 +31,16 @@ __all__ = [
 ]
 
 
-def sum_optical_depth(ray: mi.Ray3f, enough: float | None = None) -> MediumVisitor:
-    """The visitor that sums the optical depth of each channel along ``ray``.
+def sum_optical_depth(enough: float | None = None) -> MediumVisitor:
+    """The visitor that sums the optical depth of each channel along a ray.
 
     Args:
-        ray: world space, unit direction.
         enough: a walk of a grid may stop where the grid's own optical depth exceeds this in every channel; None to walk to the
             end.
     """
 
     def visit(tau: list[mi.Float], interval: MediumInterval) -> list[mi.Float]:
-        own = interval.body.optical_depth(ray, interval.t0, interval.t1, len(tau), interval.active, None, enough)
+        own = interval.body.optical_depth(interval, len(tau), None, enough)
         return [t + d for t, d in zip(tau, own, strict=True)]
 
     return visit
@@ -56,7 +55,7 @@ def integrate_optical_depth(
         Where the ray ends, and the optical depth to there.
     """
     zero = [mi.Float(0) for _ in range(media.channels)]
-    return visit_media(media, ray, medium, sum_optical_depth(ray), zero, active)
+    return visit_media(media, ray, medium, sum_optical_depth(), zero, active)
 
 
 def transmittance(tau: list[mi.Float]) -> mi.Spectrum:
@@ -84,8 +83,8 @@ def vjp_rows(media: SceneMedia, segment: RaySegment, weight: list[mi.Float], act
     bounded = bounded_parts(media.bodies)
 
     def visit(points: list[DrawnPoint], interval: MediumInterval) -> list[DrawnPoint]:
-        interval.body.backproject(segment.ray, interval.t0, interval.t1, weight, interval.active)
-        return _pass(points, bounded, interval, segment.ray)
+        interval.body.backproject(interval, weight)
+        return _pass(points, bounded, interval)
 
     points = revisit_media(media, segment, visit, start_points(len(bounded), segment.u, dr.width(segment.ray)), active)
     for (body, part), point in zip(bounded, points, strict=True):
@@ -106,8 +105,8 @@ def jvp_rows(media: SceneMedia, segment: RaySegment, active: mi.Bool) -> list[mi
 
     def visit(state: tuple, interval: MediumInterval) -> tuple:
         tau, points = state
-        own = interval.body.tangent(segment.ray, interval.t0, interval.t1, len(tau), interval.active)
-        return [t + d for t, d in zip(tau, own, strict=True)], _pass(points, bounded, interval, segment.ray)
+        own = interval.body.tangent(interval, len(tau))
+        return [t + d for t, d in zip(tau, own, strict=True)], _pass(points, bounded, interval)
 
     start = (zero, start_points(len(bounded), segment.u, dr.width(segment.ray)))
     tau, points = revisit_media(media, segment, visit, start, active)
@@ -118,10 +117,9 @@ def jvp_rows(media: SceneMedia, segment: RaySegment, active: mi.Bool) -> list[mi
     return tau
 
 
-def _pass(points: list[DrawnPoint], bounded: list[tuple], interval: MediumInterval, ray: mi.Ray3f) -> list[DrawnPoint]:
+def _pass(points: list[DrawnPoint], bounded: list[tuple], interval: MediumInterval) -> list[DrawnPoint]:
     """Pass an interval of one medium with the points of all bounded parts."""
-    t0, t1, on = interval.t0, interval.t1, interval.active
     return [
-        draw_in(point, part, ray, t0, t1, on) if owner is interval.body else point
+        draw_in(point, part, interval) if owner is interval.body else point
         for (owner, part), point in zip(bounded, points, strict=True)
     ]

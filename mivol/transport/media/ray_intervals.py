@@ -17,6 +17,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mivol.transport.media.body import Body
+from mivol.transport.media.extinction import RayInterval
 from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.traversal.lattice import slab
 from mivol.transport.traversal.ray_spawning import distance_along, spawn_ray
@@ -77,26 +78,23 @@ class RaySegment:
 
 
 @dataclass
-class MediumInterval:
+class MediumInterval(RayInterval):
     """The interval of a ray in one medium.
+
+    Where the boundary is a box that all grids of the medium fit into, the grids' own boxes are enough, and the interval is that
+    of the whole ray.
 
     Attributes:
         body: the medium in its boundary.
-        t0, t1: distances from the ray's origin [length]. Where the boundary is a box that all grids of the medium fit into, the
-            grids' own boxes are enough, and the interval is that of the whole ray.
-        active: lanes that have the interval.
     """
 
     body: Body
-    t0: mi.Float64 | mi.Float
-    t1: mi.Float64 | mi.Float
-    active: mi.Bool
 
-    def middle(self, ray: mi.Ray3f) -> mi.Float64:
+    def middle(self) -> mi.Float64:
         """Distance of the middle of the interval inside the boundary: of two media that with the lesser one is in front."""
         t0, t1 = mi.Float64(self.t0), mi.Float64(self.t1)
         if self.body.box is not None and not self.body.cuts_grids:
-            _, _, t0, t1 = slab(self.body.rows, (0.0,) * 3, (1.0,) * 3, ray.o, ray.d, t0, t1)
+            _, _, t0, t1 = slab(self.body.rows, (0.0,) * 3, (1.0,) * 3, self.ray.o, self.ray.d, t0, t1)
         return 0.5 * (t0 + t1)
 
 
@@ -157,7 +155,7 @@ def find_boxed_intervals(media: SceneMedia, ray: mi.Ray3f, t_end: mi.Float, acti
         t0, t1 = mi.Float64(0), mi.Float64(t_end)
         if body.cuts_grids:
             _, _, t0, t1 = slab(body.rows, (0.0,) * 3, (1.0,) * 3, ray.o, ray.d, t0, t1)
-        found.append(MediumInterval(body, t0, t1, active & (t1 > t0)))
+        found.append(MediumInterval(ray, t0, t1, active & (t1 > t0), body))
     return found
 
 
@@ -202,7 +200,7 @@ def _trace(
         # -- The medium on this side of the surface fills the interval --------------------------------------------------------
         transition = found & hit.is_medium_transition()
         medium = dr.select(transition, hit.target_medium(-ray.d), medium)
-        state = _visit_traced(media, medium, visit, state, t, t_hit, going)
+        state = _visit_traced(media, medium, visit, state, RayInterval(ray, t, t_hit, going))
 
         # -- Go on through what is transparent ------------------------------------------------------------------------------
         clear = found & is_transparent(hit)
@@ -221,11 +219,12 @@ def _trace(
     return SegmentEnd(si, t, medium, null_transmission), state
 
 
-def _visit_traced(
-    media: SceneMedia, medium: mi.MediumPtr, visit: MediumVisitor, state: Any, t0: mi.Float, t1: mi.Float, active: mi.Bool
-) -> Any:
+def _visit_traced(media: SceneMedia, medium: mi.MediumPtr, visit: MediumVisitor, state: Any, interval: RayInterval) -> Any:
+    """Visit each medium with the lanes in which it is ``medium``, the one that fills an interval."""
+    ray, t0, t1 = interval.ray, interval.t0, interval.t1
     for body in media.traced:
-        state = visit(state, MediumInterval(body, t0, t1, active & (medium == mi.MediumPtr(body.view.medium))))
+        on = interval.active & (medium == mi.MediumPtr(body.view.medium))
+        state = visit(state, MediumInterval(ray, t0, t1, on, body))
     return state
 
 
