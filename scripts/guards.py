@@ -13,6 +13,9 @@ from pathlib import Path
 
 __all__ = ["Guards", "imported_modules", "index_guards"]
 
+MOST_FILES = 10
+"""Files of tests in the second round. Modules that half of the tests import would have most of the suite run otherwise."""
+
 
 @dataclass
 class Guards:
@@ -30,16 +33,18 @@ class Guards:
     files: list[str] = field(default_factory=list)
 
     def rounds(self, file: str) -> list[list[str]]:
-        """What to run for a file of the package, round by round, nothing twice but what the first round holds.
+        """What to run for a file of the package, round by round, the likeliest and cheapest to notice a fault first.
 
-        First the tests that its mutations name; then the files of tests that are called like it, hold those tests or import
-        it; then those of all files in its folder, or all there are where the folder has none. Rounds may be empty.
+        First the files of tests that are called like it, and the tests elsewhere that its mutations name; then the rest of the
+        files that hold those tests, and those that import it, MOST_FILES at most; then those of all files in its folder, or all
+        there are where the folder has none. Rounds may be empty; what a later round runs again are single tests of a file.
         """
-        tests = self.tests.get(file, [])
-        own = _once([*self.named.get(file, []), *map(file_of, tests), *self.importing.get(file, [])])
+        named, tests = self.named.get(file, []), self.tests.get(file, [])
+        first = [*named, *(t for t in tests if file_of(t) not in named)]
+        rest = [t for t in _once([*map(file_of, tests), *self.importing.get(file, [])]) if t not in named][:MOST_FILES]
         near = [f for f in sorted({*self.tests, *self.named}) if Path(f).parent == Path(file).parent]
         around = _once(t for f in near for t in (*map(file_of, self.tests.get(f, [])), *self.named.get(f, [])))
-        return [list(tests), own, [t for t in around or self.files if t not in own]]
+        return [first, rest, [t for t in around or self.files if t not in (*named, *rest)]]
 
 
 def file_of(test: str) -> str:

@@ -219,6 +219,19 @@ def render(scene: mi.Scene, integrator: dict | mi.Integrator, spp: int, seed: in
     return np.asarray(mi.render(scene, integrator=integrator, spp=spp, seed=seed, sensor=sensor))
 
 
+def media_of(scene: mi.Scene) -> object:
+    """The media of a scene as transport walks through them, planned for the first sensor at depth 2."""
+    from mivol.scene.build import build_media
+    from mivol.scene.needs import find_needs
+    from mivol.scene.plan import make_plan
+    from mivol.scene.survey import survey_scene
+    from mivol.transport.path.settings import Settings
+
+    survey = survey_scene(scene)
+    needs = find_needs(scene, scene.sensors()[0], survey)
+    return build_media(scene, needs, make_plan(needs, Settings(max_depth=2)), survey)
+
+
 def pixel_rays(sensor: mi.Sensor, k: int) -> tuple[np.ndarray, np.ndarray]:
     """The rays through the middles of k x k parts of each pixel, o and d (H, W, k * k, 3), float64."""
     w, h = sensor.film().size()

@@ -62,6 +62,13 @@ def test_every_module_has_a_mutation() -> None:
     assert len(ENTRIES) >= 20
 
 
+def test_every_module_of_transport_has_tests_of_its_own() -> None:
+    """A file of tests that is called like it: who changes a module finds what guards it, and the tests that are cheapest."""
+    modules = {path.stem for path in (ROOT / "mivol" / "transport").rglob("*.py") if has_logic(path)}
+    tests = {path.stem.removeprefix("test_") for path in (ROOT / "tests").rglob("test_*.py")}
+    assert sorted(modules - tests) == []
+
+
 def test_a_text_that_occurs_twice_is_refused(tmp_path: Path) -> None:
     (tmp_path / "a.py").write_text("x = 1\ny = 1\n")
     with pytest.raises(ValueError, match="2 times"):
@@ -185,7 +192,7 @@ def test_lines_are_drawn_alike():
 
 
 def test_tests_of_a_module_are_found(tmp_path: Path) -> None:
-    """By entries first, then by name and by import; a module that nothing names takes those of its folder."""
+    """By name and by entries first, then by import; a module that nothing names takes those of its folder."""
     for name, text in {
         "pkg/a.py": "",
         "pkg/b.py": "",
@@ -199,8 +206,10 @@ def test_tests_of_a_module_are_found(tmp_path: Path) -> None:
     entries = [("pkg/a.py", "tests/two/test_other.py::t"), ("pkg/a.py", "tests/two/test_more.py::t")] * 2
     index = guards.index_guards(tmp_path, [*entries, entries[1]], package="pkg")
     one, more, other = "tests/one/test_a.py", "tests/two/test_more.py", "tests/two/test_other.py"
-    assert index.rounds("pkg/a.py") == [[f"{more}::t", f"{other}::t"], [one, more, other], []]
+    assert index.rounds("pkg/a.py") == [[one, f"{more}::t", f"{other}::t"], [more, other], []]
     assert index.rounds("pkg/b.py") == [[], [one, more], [other]]
+    index.importing["pkg/b.py"] = [f"tests/test_{k}.py" for k in range(guards.MOST_FILES + 1)]
+    assert index.rounds("pkg/b.py")[1] == index.importing["pkg/b.py"][:-1]
     assert index.rounds("pkg/room/c.py") == [[], [], [one, more, other]]
 
 

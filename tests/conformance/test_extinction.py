@@ -101,10 +101,3 @@ def test_derivatives_are_transposes(name: str, where: str) -> None:
     terms = np.abs(pushed * w).sum() + np.abs(v * pulled).sum()
     assert np.abs(pushed).max() > 0.01
     assert abs((pushed * w).sum() - (v * pulled).sum()) < 1e-6 * terms
-
-
-def test_nothing_lies_outside_of_the_box_of_a_grid() -> None:
-    """exp of the 0 that is read there would be 1."""
-    part, (ray, _, _) = KINDS["exp of a grid"](), rays()
-    far = numbers(part.eval_at(mi.Float(1), ray, mi.Float(30), mi.Bool(True)))
-    assert (far == 0).all()

@@ -6,8 +6,10 @@ from collections.abc import Iterator
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 import pytest
 from ball_photos import ball, photo
+from small_scan import Views, small_scan
 
 from mivol.photos import Photo
 
@@ -26,3 +28,9 @@ def one_thread(variant_rgb: str) -> Iterator[None]:
     dr.set_thread_count(1)
     yield
     dr.set_thread_count(before)
+
+
+@pytest.fixture(scope="session")
+def scan() -> tuple[Views, np.ndarray, np.ndarray]:
+    """A small scan: its matrix, the truth, and exact line integrals."""
+    return small_scan()

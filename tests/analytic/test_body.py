@@ -1,0 +1,178 @@
+"""One medium in its boundary: which parts are walked together, and its extinction with derivatives, on paper."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from bounded_ball import Ball
+
+from mivol.errors import MivolError
+from mivol.transport.media.body import Body, flight_parts, is_followed
+from mivol.transport.media.bounded_extinction import BoundedExtinction
+from mivol.transport.media.box import Box
+from mivol.transport.media.constant_extinction import ConstantExtinction
+from mivol.transport.media.extinction import RayInterval
+from mivol.transport.media.grid_extinction import GridExtinction
+from mivol.transport.media.medium_view import MediumView
+from mivol.transport.traversal.lattice import Lattice
+from scenes import centred
+
+pytestmark = pytest.mark.usefixtures("variant_rgb")
+
+UNIT = Box(np.eye(4))
+ON = True
+ROUNDING = 8 * 2.0**-23
+"""A few roundings of numbers of size 1, relative to them."""
+
+
+def grid(name: str = "sigma_t", n: int = 2, edge: float = 1.0, value: float = 0.5) -> GridExtinction:
+    place = centred(edge * np.eye(3), (0.5, 0.5, 0.5))
+    return GridExtinction(name, Lattice(mi.TensorXf(np.full((n, n, n, 1), value, np.float32)), place))
+
+
+def constant(*value: float, name: str = "sigma_a") -> ConstantExtinction:
+    return ConstantExtinction(name, mi.Float(*value) if len(value) == 1 else mi.Color3f(*value))
+
+
+def bounded() -> BoundedExtinction:
+    return BoundedExtinction("sigma_t", Ball(mi.Float(1), 0.5, (0.5, 0.5, 0.5)), mi.Float(1), mi.Float(1))
+
+
+def body_of(*parts: object, box: Box | None = UNIT, **more: object) -> Body:
+    return Body(MediumView(None, list(parts), mi.Float(2), **more), box)
+
+
+def across() -> mi.Ray3f:
+    """Through the middle of the unit cube, which lies from 1 to 2."""
+    return mi.Ray3f(mi.Point3f(-1, 0.5, 0.5), mi.Vector3f(1, 0, 0))
+
+
+def inside() -> RayInterval:
+    return RayInterval(across(), mi.Float(1), mi.Float(2), mi.Bool(ON))
+
+
+def values(rows: list[mi.Float]) -> list[float]:
+    return [float(row[0]) for row in rows]
+
+
+def test_a_boundary_cuts_what_does_not_fit_into_it():
+    assert not body_of(grid()).cuts_grids and not body_of(grid(edge=1 + 1e-6)).cuts_grids
+    assert body_of(grid(edge=1.01)).cuts_grids and body_of(grid(), constant(1.0)).cuts_grids
+    assert body_of(grid(), emission_density=mi.Float(1)).cuts_grids
+    assert not body_of(constant(1.0), box=None).cuts_grids
+
+
+def test_free_flights_walk_the_cells_of_the_grid_that_scatters():
+    absorbs, scatters, alike, same = grid("sigma_a", 3), grid("sigma_s"), grid("sigma_a"), constant(1.0)
+    assert flight_parts([absorbs, scatters, same]) == [scatters, same]
+    assert flight_parts([alike, scatters, same]) == [alike, scatters, same]
+    assert flight_parts([absorbs, same, bounded()]) == [absorbs, same]
+    assert flight_parts([same]) == [same]
+
+
+def test_optical_depth_is_the_sum_of_the_parts_times_the_scale():
+    body, ray = body_of(constant(0.25, 0.5, 1), grid()), across()
+    found = body.optical_depth(inside(), 3)
+    np.testing.assert_allclose(values(found), [1.5, 2, 3], rtol=ROUNDING)
+    only = body.optical_depth(inside(), 3, body.view.parts[1:])
+    np.testing.assert_allclose(values(only), [1, 1, 1], rtol=ROUNDING)
+    assert values(body.extinction(ray).constant) == [0.5, 1, 2]
+    assert values(body.extinction(ray, body.view.parts[:1]).constant) == [0.5, 1, 2]
+
+
+def test_the_optical_depth_of_a_bounded_field_is_refused():
+    body = body_of(bounded(), constant(0.5))
+    assert body.is_bounded and not body_of(grid()).is_bounded
+    with pytest.raises(MivolError, match="only its transmittance can be estimated"):
+        body.optical_depth(inside(), 1)
+    assert values(body.optical_depth(inside(), 1, body.exact_parts)) == [1.0]
+
+
+def test_a_point_has_the_parts_that_are_asked_for():
+    body, at = body_of(constant(0.25), grid("sigma_s")), (across(), mi.Float(1.5), 3, mi.Bool(ON))
+    np.testing.assert_allclose(values(body.extinction_at(*at)), [1.5] * 3, rtol=ROUNDING)
+    np.testing.assert_allclose(values(body.extinction_at(*at, "sigma_s")), [1] * 3, rtol=ROUNDING)
+    body.tangents = [mi.Float(3), dr.full(mi.Float, 4, 8)]
+    np.testing.assert_allclose(values(body.tangent_at(*at)), [7] * 3, rtol=ROUNDING)
+    np.testing.assert_allclose(values(body.tangent_at(*at, "sigma_s")), [4] * 3, rtol=ROUNDING)
+    np.testing.assert_allclose(values(body.tangent_of_part(body.view.parts[1], *at)), [4] * 3, rtol=ROUNDING)
+    np.testing.assert_allclose(values(body.tangent(inside(), 3)), [7] * 3, rtol=ROUNDING)
+
+
+def started(*parts: object, **more: object) -> Body:
+    body = body_of(*parts, **more)
+    body.gradients = [p.start_gradient() for p in parts]
+    return body
+
+
+def pulled(body: Body) -> list[float]:
+    """The sum of the gradient of each part."""
+    flat = [g.fold() if hasattr(g, "fold") else g for g in body.gradients]
+    return [float(np.array(g).sum()) for g in flat]
+
+
+def test_gradients_go_to_the_parts_that_are_named():
+    weight, ray, t, on = [mi.Float(1), mi.Float(2), mi.Float(4)], across(), mi.Float(1.5), mi.Bool(ON)
+    for deposit, expected in {
+        "all": (lambda b: b.deposit(ray, t, weight, on), [7, 7]),
+        "named": (lambda b: b.deposit(ray, t, weight, on, "sigma_s"), [0, 7]),
+        "one": (lambda b: b.deposit_in_part(b.view.parts[1], ray, t, weight, on), [0, 7]),
+        "along": (lambda b: b.backproject(inside(), weight), [7, 7]),
+        "constants": (lambda b: b.add_to_constants(weight, on), [7, 0]),
+        "a cell": (lambda b: b.add_to_grid(b.view.parts[1], mi.Vector3i(0), [(weight, [mi.Float(0.125)] * 8)], on), [0, 7]),
+    }.values():
+        body = started(constant(0.25), grid("sigma_s"))
+        deposit(body)
+        np.testing.assert_allclose(pulled(body), expected, rtol=ROUNDING)
+
+
+def test_bounded_parts_are_left_out_of_derivatives_along_a_ray():
+    body = started(constant(0.25), bounded())
+    body.backproject(inside(), [mi.Float(3)])
+    assert pulled(body) == [3, 0]
+    body.tangents = [mi.Float(5), mi.Float(7)]
+    assert values(body.tangent(inside(), 1)) == [5]
+
+
+FLAKES = np.array([[4, 1, 0.5], [1, 2, 0.25], [0.5, 0.25, 8]])
+"""The matrix S of microflakes."""
+
+ENTRIES = [(0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)]
+
+
+def flakes() -> list[mi.Float]:
+    return [mi.Float(FLAKES[a, b]) for a, b in ENTRIES]
+
+
+@pytest.mark.parametrize("where", ["at a point", "along an interval"])
+def test_flakes_multiply_the_extinction_by_their_projected_area(where: str) -> None:
+    """sigma = sqrt(w S w), whose derivatives by S are w w / (2 sqrt(w S w)); an entry off the diagonal occurs twice."""
+    d = np.array([0.48, 0.6, 0.64])
+    area = np.sqrt(d @ FLAKES @ d)
+    slopes = np.array([(1 if a == b else 2) * d[a] * d[b] / (2 * area) for a, b in ENTRIES])
+    ray, on, tangent = mi.Ray3f(mi.Point3f(0), mi.Vector3f(d)), mi.Bool(ON), np.array([1, -2, 3, -1, 2, -3])
+    body = started(constant(0.5, name="sigma_t"), microflakes=flakes())
+    body.tangents, body.microflakes_gradient = [mi.Float(0)], dr.zeros(mi.Float, 6)
+    body.microflakes_tangent = [mi.Float(t) for t in tangent]
+    weight = [mi.Float(3)]
+    if where == "at a point":
+        (sigma,), (change,) = (f(ray, mi.Float(1), 1, on) for f in (body.extinction_at, body.tangent_at))
+        body.deposit(ray, mi.Float(1), weight, on)
+    else:
+        interval = RayInterval(ray, mi.Float(1), mi.Float(2), on)
+        (sigma,), (change,) = (f(interval, 1) for f in (body.optical_depth, body.tangent))
+        body.backproject(interval, weight)
+    # The scale is 2 and the constant 0.5.
+    assert sigma[0] == pytest.approx(area, rel=ROUNDING)
+    assert change[0] == pytest.approx(slopes @ tangent, abs=ROUNDING * np.abs(slopes * tangent).sum())
+    np.testing.assert_allclose(np.array(body.microflakes_gradient), 3 * slopes, rtol=2 * ROUNDING)
+    assert pulled(body) == [pytest.approx(3 * area, rel=ROUNDING)]
+
+
+def test_derivatives_of_flakes_are_followed_where_they_are_asked_for():
+    plain, asked = flakes(), flakes()
+    dr.enable_grad(asked)
+    with dr.suspend_grad():
+        assert is_followed(asked) and not is_followed(plain) and not is_followed(None)

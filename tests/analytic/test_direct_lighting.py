@@ -1,0 +1,120 @@
+"""Direct light of lamps on paper: at a wall and at a point of smoke, dimmed by fog on the way."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mivol.transport.estimators.direct_lighting import DirectLight, DirectLighting
+from mivol.transport.estimators.event_samples import EventSamples
+from mivol.transport.estimators.vertex import MediumVertex, SurfaceVertex
+from mivol.transport.media.coefficients import medium_interaction
+from scenes import box_of, camera, centred, media_of, medium, sky
+
+pytestmark = pytest.mark.usefixtures("variant_rgb")
+
+ROUNDING = 16 * 2.0**-23
+POWER, FAR, DEPTH = 3.0, 4.0, 0.5
+KEY = "fog.interior_medium.sigma_t.value.value"
+
+
+def scene(**lamps: dict) -> mi.Scene:
+    """A wall at z = 0, whose other side is lit as well, and fog of an optical depth of DEPTH between z = 1 and 2."""
+    wall = {"type": "rectangle", "bsdf": {"type": "diffuse", "reflectance": 0.5}}
+    fog = box_of(medium("mivol_medium", DEPTH), centred(np.diag([20.0, 20, 1]), (0, 0, 1.5)))
+    return mi.load_dict({"type": "scene", "wall": wall, "fog": fog, "sensor": camera([0, -1, 9], [0, 0, 0]), **lamps})
+
+
+def lamp(z: float = FAR, power: float = POWER) -> dict:
+    return {"type": "point", "position": [0, 0, z], "intensity": power}
+
+
+def at_wall(found: mi.Scene) -> tuple[DirectLighting, SurfaceVertex]:
+    media = media_of(found)
+    ray = mi.Ray3f(mi.Point3f(0, 0, 0.5), mi.Vector3f(0, 0, -1))
+    si = found.ray_intersect(ray)
+    return DirectLighting(media), SurfaceVertex(media, si, si.bsdf(ray), mi.MediumPtr(None))
+
+
+def test_a_wall_under_a_lamp():
+    """reflectance / pi I / r^2 exp(-tau); nothing in a lane that is off."""
+    direct, vertex = at_wall(scene(lamp=lamp()))
+    with dr.suspend_grad():
+        found, off = (direct.at_surface(vertex, mi.Point2f(0.5), False, mi.Bool(on)) for on in (True, False))
+    # Rays start a little above the wall: 1e-5 of a scene of 20, and the lamp is that much nearer.
+    assert np.array(found.value).ravel() == pytest.approx([0.5 / np.pi * POWER / FAR**2 * np.exp(-DEPTH)] * 3, rel=1e-3)
+    assert found.on[0] and not off.on[0] and not np.array(off.value).any()
+
+
+def test_a_shadow_ray_has_the_derivative_of_its_optical_depth():
+    """-1 for each unit of extinction in a slab of thickness 1, times the light, beside the derivatives that Dr.Jit tracks."""
+    found = scene(lamp=lamp())
+    params = mi.traverse(found)
+    dr.enable_grad(params[KEY])
+    dr.set_grad(params[KEY], 0.25)
+    direct, vertex = at_wall(found)
+    direct.media.start_tangent()
+    tracked = mi.Spectrum(7)
+    dr.enable_grad(tracked)
+    dr.set_grad(tracked, 0.5)
+    with dr.suspend_grad():
+        sample = direct.at_surface(vertex, mi.Point2f(0.5), False, mi.Bool(True))
+
+    def term() -> DirectLight:
+        """In a lane that receives the light, and in one that does not."""
+        return DirectLight(direct.media, sample.ray_segment, 2 * tracked, mi.Bool(True, False))
+
+    seen = term()
+    assert seen.is_replayed
+    np.testing.assert_array_equal(np.array(seen.value), [[14, 0]] * 3)
+    with dr.suspend_grad():
+        tangent = np.array(seen.jvp())
+    np.testing.assert_allclose(tangent, [[2 * 0.5 - 0.25 * 14, 0]] * 3, rtol=ROUNDING)
+    direct.media.start_gradients()
+    dr.set_grad(tracked, 0)
+    again = term()
+    with dr.suspend_grad():
+        again.vjp(mi.Spectrum(1, 2, 3))
+    assert np.array(direct.media.bodies[0].gradients[0]).sum() == pytest.approx(-14 * (1 + 2 + 3), rel=ROUNDING)
+    assert np.array(dr.grad(tracked)).ravel().tolist() == [2, 4, 6]
+
+
+def at_smoke(found: mi.Scene) -> tuple[DirectLighting, MediumVertex]:
+    """A point at z = 3, of the fog's isotropic phase function, and above it."""
+    media = media_of(found)
+    fog = media.bodies[0].view.medium
+    mei = medium_interaction(mi.Ray3f(mi.Point3f(0, 0, 9), mi.Vector3f(0, 0, -1)), mi.Float(6), fog)
+    return DirectLighting(media), MediumVertex(media, mei)
+
+
+def samples() -> EventSamples:
+    u, uv = mi.Float(0.75), mi.Point2f(0.25, 0.125)
+    return EventSamples(u, uv, u, uv, u, uv, u)
+
+
+def test_a_point_of_smoke_under_two_lamps():
+    """I / (4 pi r^2) of the lamp that was chosen, twice since one of two was; the fog lies below."""
+    found = scene(one=lamp(4.0, 3.0), two=lamp(5.0, 7.0))
+    direct, vertex = at_smoke(found)
+    assert len(direct.emitters.sampled) == 2 and not direct.emitters.samples_phase
+    light = []
+    for u in (0.25, 0.75):
+        chosen = direct.emitters.choose(mi.Ray3f(vertex.interaction.p, mi.Vector3f(0, 0, 1)), mi.Float(u))
+        with dr.suspend_grad():
+            (sample,) = direct.in_medium(vertex, chosen, samples(), False, mi.Bool(True))
+        light.append(np.array(sample.value).ravel()[0])
+    np.testing.assert_allclose(sorted(light), np.array([7 / 4, 3 / 1]) * 2 / (4 * np.pi), rtol=ROUNDING)
+
+
+def test_a_point_of_smoke_under_a_sky():
+    """Directions are drawn from the phase function alone: the radiance itself, where the direction meets no wall."""
+    direct, vertex = at_smoke(scene(sky=sky(0.7)))
+    assert direct.emitters.samples_phase and not direct.emitters.sampled
+    chosen = direct.emitters.choose(mi.Ray3f(vertex.interaction.p, mi.Vector3f(0, 0, 1)), mi.Float(0.5))
+    upward = samples()
+    with dr.suspend_grad():
+        (sample,) = direct.in_medium(vertex, chosen, upward, False, mi.Bool(True))
+    passed = np.exp(-DEPTH / abs(sample.ray_segment.ray.d.z[0])) if sample.ray_segment.ray.d.z[0] < 0 else 1.0
+    np.testing.assert_allclose(np.array(sample.value).ravel(), [0.7 * passed] * 3, rtol=ROUNDING)

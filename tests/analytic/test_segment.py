@@ -1,0 +1,83 @@
+"""Segments that only absorb, and light and transmittance that share a walk of the cells."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mivol.transport.estimators.segment import PICTURE, Absorption, PathSegment, SegmentLight, SegmentTransmittance
+from scenes import box_of, camera, centred, media_of, medium
+
+pytestmark = pytest.mark.usefixtures("variant_rgb")
+
+KEY = "box.interior_medium.sigma_t.value.value"
+
+
+class Recorder:
+    """A shared segment that remembers what it is told, and an estimator that remembers what it draws."""
+
+    def __init__(self) -> None:
+        self.said, self.dL = [], None
+
+    def vjp_light(self, dL: object) -> None:
+        self.said.append(("vjp_light", dL, self.dL))
+
+    def vjp(self, dlog: object) -> None:
+        self.said.append(("vjp", dlog, self.dL))
+
+    def jvp_light(self) -> str:
+        return "tangent of the light"
+
+    def jvp_transmittance(self) -> str:
+        return "tangent of log T"
+
+    def draw(self, *asked: object) -> str:
+        self.said.append(asked)
+        return "samples"
+
+
+def test_light_and_transmittance_tell_the_segment_that_they_share():
+    """The light first: its weight is known when the transmittance starts the walk."""
+    shared = Recorder()
+    light, T = SegmentLight(shared, mi.Spectrum(1), True), SegmentTransmittance(shared)
+    light.vjp("dL")
+    T.vjp("dlog")
+    assert shared.said == [("vjp_light", "dL", "dL"), ("vjp", "dlog", "dL")]
+    assert (light.jvp(), T.jvp()) == ("tangent of the light", "tangent of log T")
+
+
+def test_absorption_draws_for_the_estimator_whose_path_it_follows():
+    """And hands its numbers on to nobody."""
+    other = Recorder()
+    absorption = Absorption(None, other)
+    assert absorption.draw("sampler", "active", "strata") is None and other.said == [("sampler", "active", "strata")]
+    assert Absorption(None).draw("sampler", "active", None) is None
+    assert absorption.replayed() is absorption
+
+
+def test_absorption_is_beers_law_with_its_derivatives():
+    """T = exp(-sigma), over a length of 1 in a box; d log T / d sigma = -1 in each colour."""
+    box = box_of(medium("mivol_medium", 0.5), centred(np.eye(3)))
+    scene = mi.load_dict({"type": "scene", "box": box, "sensor": camera([0, -4, 0], [0, 0, 0])})
+    params = mi.traverse(scene)
+    dr.enable_grad(params[KEY])
+    dr.set_grad(params[KEY], 0.25)
+    media = media_of(scene)
+    ray = mi.Ray3f(mi.Point3f(0, 0, -3), mi.Vector3f(0, 0, 1), dr.inf, mi.Float(0), mi.Color0f())
+    segment = PathSegment(ray, mi.MediumPtr(None), mi.Spectrum(1), mi.Bool(True), None)
+    media.start_tangent()
+    with dr.suspend_grad():
+        found = Absorption(media).estimate(segment, PICTURE, mi.Bool(True))
+        tangent = found.transmittance.jvp()
+    rounding = 4 * 2.0**-23
+    assert found.light is None and not found.end.si.is_valid()[0]
+    np.testing.assert_allclose(np.array(found.T).ravel(), [np.exp(-0.5)] * 3, rtol=rounding)
+    np.testing.assert_allclose(np.array(tangent).ravel(), [-0.25] * 3, rtol=rounding)
+    dr.set_grad(params[KEY], 0)
+    with dr.suspend_grad():
+        media.start_gradients()
+        found.transmittance.vjp(mi.Spectrum(1, 2, 4))
+    media.deliver_gradients()
+    assert dr.grad(params[KEY])[0] == pytest.approx(-7, rel=rounding)
