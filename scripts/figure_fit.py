@@ -16,7 +16,7 @@ import mivol  # noqa: F401  (chooses LLVM before anything loads it)
 from mivol.files import layers, read_exr, read_volume
 from mivol.report import figures, show
 from mivol.report.record import RunRecord, read_metrics, read_record
-from mivol.validate.statistics import psnr
+from mivol.validate.metrics import psnr
 
 import matplotlib as mpl
 import numpy as np

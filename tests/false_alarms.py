@@ -18,14 +18,14 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Iterator
-from typing import NamedTuple
 
 import numpy as np
 import pytest
 from scipy import stats
 
-from mivol.validate import statistics
-from mivol.validate.statistics import Moments, effective_dof
+from mivol.validate import bounded_means, statistics
+from mivol.validate.moments import Moments
+from mivol.validate.statistics import Estimate, Significance, effective_dof
 
 ALPHA = 1e-8
 """Chance of a false alarm of one comparison, of all its pixels together. Some 600 of them in the suite leave room below AIM."""
@@ -41,23 +41,6 @@ ROUND = 1_000_003
 # -- What is compared ----------------------------------------------------------------------------------------------------
 
 
-class Estimate(NamedTuple):
-    """Means (any shape), the variances of these means, and the degrees of freedom of the variances."""
-
-    mean: np.ndarray
-    var: np.ndarray | float = 0.0
-    dof: np.ndarray | float = np.inf
-
-
-def estimate(given: Estimate | Moments | np.ndarray | float) -> Estimate:
-    """Moments of batches, or an exact answer, as an estimate."""
-    if isinstance(given, Estimate):
-        return given
-    if isinstance(given, Moments):
-        return Estimate(given.mean, given.variance_of_mean, given.n - 1)
-    return Estimate(np.asarray(given, dtype=np.float64))
-
-
 def over_pixels(image: Moments) -> Estimate:
     """The mean of each channel (C,) over the independent pixels of an image (H, W, C)."""
     var, pixels = image.variance_of_mean, np.prod(image.mean.shape[:2])
@@ -68,7 +51,7 @@ def over_pixels(image: Moments) -> Estimate:
 
 def difference(a: Estimate | Moments, b: Estimate | Moments | np.ndarray | float) -> Estimate:
     """a - b of independent estimates."""
-    a, b = estimate(a), estimate(b)
+    a, b = Estimate.of(a), Estimate.of(b)
     var, dof = np.broadcast_arrays(a.var, b.var), np.broadcast_arrays(a.dof, b.dof)
     dof = np.stack([np.broadcast_to(d, var[0].shape) for d in dof])
     return Estimate(a.mean - b.mean, var[0] + var[1], effective_dof(np.stack(var), dof, axis=0))
@@ -88,20 +71,20 @@ def assert_same_mean(
         tile: images (H, W, C) are averaged over tiles of so many pixels first.
         rounding: what float32 arithmetic may cause, as one standard deviation.
     """
-    a, b = estimate(a), estimate(b)
+    a, b = Estimate.of(a), Estimate.of(b)
     b = b._replace(mean=np.broadcast_to(b.mean, np.shape(a.mean)))
-    means, how = (a.mean, a.var, b.mean, b.var), {"dof_a": a.dof, "dof_b": b.dof, "tile": tile, "rounding": rounding}
-    note(ALPHA, what, statistics.p_value(*means, **how))
-    statistics.assert_same_mean(*means, alpha=ALPHA, what=what, **how)
+    how = {"tile": tile, "rounding": rounding}
+    note(ALPHA, what, statistics.p_value(a, b, **how))
+    statistics.assert_same_mean(a, b, level=Significance(ALPHA), what=what, **how)
 
 
 def assert_same_bounded_mean(
-    mean: np.ndarray, n: int, truth: np.ndarray, *, low: float = 0.0, high: float = 1.0, what: str = "the means"
+    mean: np.ndarray, n: int, truth: np.ndarray, *, bounds: tuple[float, float] = (0.0, 1.0), what: str = "the means"
 ) -> None:
     """Means of n samples between two bounds agree with exact answers, by Hoeffding's bound: no normality is assumed."""
-    p = statistics.bounded_p_value(mean, n, truth, low, high)
+    p = bounded_means.bounded_p_value(mean, n, truth, bounds)
     note(ALPHA, what, min(1.0, float(np.min(p)) * np.size(p)))
-    statistics.assert_same_bounded_mean(mean, n, truth, low=low, high=high, alpha=ALPHA, what=what)
+    bounded_means.assert_same_bounded_mean(mean, n, truth, bounds=bounds, level=Significance(ALPHA), what=what)
 
 
 def assert_rate(hits: int, runs: int, rate: float, at_least: float | None = None) -> None:
@@ -140,7 +123,7 @@ def assert_precise(
     Args:
         of: np.max asks it of each entry, np.median of half of them (which fails only where one of that half fails).
     """
-    given = estimate(given)
+    given = Estimate.of(given)
     var, allowed, dof = np.broadcast_arrays(given.var, np.square(limit), given.dof)
     known = np.isinf(dof)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -166,7 +149,7 @@ def assert_same_spread(
     Both are sums over independent pixels (give one channel), of effective degrees of freedom d_a and d_b, or of those given.
     Their ratio over ``expected`` follows F(d_a, d_b), which gives the chance of either side.
     """
-    a, b = estimate(a), estimate(b)
+    a, b = Estimate.of(a), Estimate.of(b)
     dof = dof or tuple(float(effective_dof(x.var, x.dof)) for x in (a, b))
     ratio = float(np.mean(a.var) / np.mean(b.var))
     law = stats.f(*dof)

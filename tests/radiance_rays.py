@@ -8,14 +8,14 @@ import numpy as np
 from mivol.fields.spherical import SphericalGrid
 from mivol.transport.line_integrals.radiance_field import (
     RayBundle,
+    RayGradient,
     RenderedRays,
     backward,
-    bake,
     cells_of,
-    exact,
     model_of,
     render,
 )
+from mivol.transport.line_integrals.radiance_source import bake, exact
 
 TO_WORLD = np.array([[2.0, 0.3, 0.0, -1.2], [-0.2, 1.5, 0.1, -0.7], [0.0, 0.1, 2.5, -1.3], [0, 0, 0, 1]])
 """Rotated a little, sheared and of three lengths."""
@@ -44,7 +44,7 @@ def rays_of(o, d) -> RayBundle:
 
 def followed(field, o, d, stop=0.0, pinhole=None) -> RenderedRays:
     rays, cells = rays_of(o, d), cells_of(field)
-    source = exact(field, rays) if pinhole is None else bake(field, cells, np.atleast_2d(pinhole), mi.UInt32(0))
+    source = exact(field, rays.d) if pinhole is None else bake(field, cells, np.atleast_2d(pinhole), mi.UInt32(0))
     return render(cells, source, model_of(field, stop), rays)
 
 
@@ -57,7 +57,7 @@ def see(field, o, d, stop=0.0, pinhole=None):
 def derive(field: SphericalGrid, o, d, colour, T=0.0, distance=0.0, stop=0.0):
     """Derivatives of sum(colour . L + T T + distance D) for the raw densities and harmonics of the nodes."""
     rays, cells = rays_of(o, d), cells_of(field)
-    source, model = exact(field, rays, slope=True), model_of(field, stop)
+    source, model = exact(field, rays.d, slope=True), model_of(field, stop)
     seen = render(cells, source, model, rays)
-    backward(cells, source, model, seen, mi.Color3f(*colour), T, distance)
+    backward(cells, source, model, seen, RayGradient(mi.Color3f(*colour), T, distance))
     return field.with_values(source.density_slope, source.harmonics_slope).values()

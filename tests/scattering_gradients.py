@@ -10,7 +10,7 @@ import numpy as np
 from false_alarms import assert_precise, assert_same_mean, fresh
 from scattering_scenes import Pencils, mivol, rough_grid
 
-from mivol.validate.statistics import Moments
+from mivol.validate.moments import Moments
 
 GRID = "smoke.interior_medium.sigma_t.data"
 

@@ -18,7 +18,7 @@ from scattering_scenes import (
 )
 
 import scenes
-from mivol.validate.statistics import Moments
+from mivol.validate.moments import Moments
 from scenes import affine, grid_volume, medium, transform
 
 LEAK = 1e-4

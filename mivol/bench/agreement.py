@@ -1,58 +1,47 @@
 """Do two noisy measurements have the same mean? z, its bound by Student's t, and how small a bias could have been seen.
 
 Conventions. Values are float64, one for each round (a round has its own seed); an error is a variance of a mean together
-with the degrees of freedom that it was estimated with. A ratio of times between methods whose means differ says nothing,
-so every bench of unbiased methods judges their means first.
-
-Source: Welch 1947 (Biometrika 34) and Satterthwaite 1946 (Biometrics Bulletin 2) for effective degrees of freedom of sums
-of estimated variances.
+with the degrees of freedom that it was estimated with (:class:`mivol.validate.statistics.Estimate`). A ratio of times between
+methods whose means differ says nothing, so every bench of unbiased methods judges their means first.
 """
 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 
-from mivol.validate.statistics import Moments, z_bound, z_image
+from mivol.validate.moments import Moments
+from mivol.validate.statistics import Estimate, Significance, effective_dof, z_bound, z_image
 
-__all__ = ["FALSE_ALARM", "MeanError", "compare_means", "finite", "mean_of_pixels", "mean_of_rounds", "number"]
+__all__ = ["FALSE_ALARM", "compare_means", "finite", "mean_of_pixels", "mean_of_rounds", "number"]
 
 FALSE_ALARM = 1e-3
 """Chance that a run of a bench in which all means agree is said not to."""
 
 
-class MeanError(NamedTuple):
-    """A mean, its variance, and the degrees of freedom of that variance."""
-
-    mean: float
-    variance: float
-    dof: float
-
-
-def mean_of_rounds(values: np.ndarray) -> MeanError:
+def mean_of_rounds(values: np.ndarray) -> Estimate:
     """The mean of independent values (rounds,), two at least."""
     m = Moments.of(values)
-    return MeanError(float(m.mean), float(m.variance_of_mean), m.n - 1)
+    return Estimate(float(m.mean), float(m.variance_of_mean), m.n - 1)
 
 
-def mean_of_pixels(rounds: np.ndarray) -> MeanError:
+def mean_of_pixels(rounds: np.ndarray) -> Estimate:
     """The mean over rounds and pixels (rounds, pixels).
 
-    Pixels with samples of their own tell its variance well: it is the sum of theirs, v_i, and has (sum v)^2 / sum(v^2)
-    times the degrees of freedom of one pixel, few where one pixel has most of the noise. Rounds tell it whatever pixels
+    Pixels with samples of their own tell its variance well: it is the sum of theirs, with the degrees of freedom that
+    :func:`effective_dof` gives: few where one pixel has most of the noise. Rounds tell it whatever pixels
     share (random numbers, in a tile). The larger of the two variances counts.
     """
     shared = mean_of_rounds(rounds.mean(axis=1))
     v = Moments.of(rounds).variance_of_mean
     alone = float(v.sum()) / v.size**2
-    if alone <= shared.variance:
+    if alone <= shared.var:
         return shared
-    return MeanError(shared.mean, alone, (rounds.shape[0] - 1) * float(v.sum() ** 2 / (v**2).sum()))
+    return Estimate(shared.mean, alone, float(effective_dof(v, rounds.shape[0] - 1)))
 
 
-def compare_means(a: MeanError, b: MeanError, comparisons: int) -> dict[str, float | None]:
+def compare_means(a: Estimate, b: Estimate, comparisons: int) -> dict[str, float | None]:
     """Compare two means by Student's t with Welch's degrees of freedom.
 
     Args:
@@ -62,13 +51,12 @@ def compare_means(a: MeanError, b: MeanError, comparisons: int) -> dict[str, flo
     Returns:
         z of a - b, its bound, the difference and its standard error in percent of b; None where b, or both variances, are 0.
     """
-    variance = a.variance + b.variance
-    shares = a.variance**2 / a.dof + b.variance**2 / b.dof
-    dof = variance**2 / shares if shares > 0 else math.inf
+    variance = a.var + b.var
+    dof = effective_dof(np.array([a.var, b.var]), np.array([a.dof, b.dof]))
     scale = 100 / abs(b.mean) if b.mean else math.inf
     return {
-        "z": finite(z_image(a.mean, a.variance, b.mean, b.variance)),
-        "z_bound": float(z_bound(FALSE_ALARM, comparisons, dof)),
+        "z": finite(z_image(a, b)),
+        "z_bound": float(z_bound(Significance(FALSE_ALARM, comparisons), dof)),
         "percent": finite(scale * math.copysign(1, b.mean) * (a.mean - b.mean)),
         "standard_error_percent": finite(scale * math.sqrt(variance)),
     }

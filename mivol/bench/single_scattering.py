@@ -66,7 +66,7 @@ from mivol.bench.questions import Bench
 from mivol.bench.scenes import box_scene, constant_light, depth_two, point_light, sun_and_sky
 from mivol.bench.timing import Budget, Timing, race, ratio_of
 from mivol.report.figures import MARKERS, SERIES
-from mivol.validate.statistics import Moments
+from mivol.validate.moments import Moments
 
 __all__ = ["BENCH", "FULL", "LIGHTS", "QUICK", "VOLUMES", "Light", "Size", "contend", "main"]
 

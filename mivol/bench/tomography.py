@@ -40,7 +40,7 @@ from mivol.optim.solvers import SOLVERS
 from mivol.tomography.geometry import ConeBeam, VoxelGrid, cone_beam_of_tigre
 from mivol.tomography.phantoms import SHEPP_LOGAN, shepp_logan
 from mivol.tomography.projector import Projector
-from mivol.validate.statistics import nrmse
+from mivol.validate.metrics import nrmse
 
 __all__ = ["Scan", "adjoint_mismatch", "costs", "main", "methods", "reconstruct", "scan_of_head", "scan_of_volume", "table"]
 

@@ -18,7 +18,8 @@ from mivol.experiments.truth import holding
 from mivol.files import layers, read_exr
 from mivol.optim.render_batches import View, check_sizes
 from mivol.scene.load import LoadedScene, load_scene
-from mivol.validate.reference import ReferenceResult, read_reference, render_reference
+from mivol.validate.reference import render_reference
+from mivol.validate.reference_file import ReferenceResult, read_reference
 
 
 @dataclass

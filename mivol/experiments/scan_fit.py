@@ -30,7 +30,7 @@ from mivol.report.page import write_page
 from mivol.report.record import PlanLine, RunRecord
 from mivol.tomography.geometry import VoxelGrid
 from mivol.tomography.projector import Projector
-from mivol.validate.statistics import nrmse
+from mivol.validate.metrics import nrmse
 
 CITED = {
     "pcg": ("hestenes_1952", "erdogan_1999"),

@@ -12,7 +12,7 @@ from mivol.files import write_exr, write_volume
 from mivol.report.record import Image, Volume
 from mivol.tomography.geometry import VoxelGrid
 from mivol.tomography.projector import Projector
-from mivol.validate.statistics import nrmse
+from mivol.validate.metrics import nrmse
 
 
 def write_outputs(run: RunFolder, projector: Projector, data: Projections, held_out: np.ndarray, x: np.ndarray) -> None:

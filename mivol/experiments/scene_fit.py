@@ -34,7 +34,7 @@ from mivol.scene.plan import Plan, make_plan
 from mivol.scene.survey import survey_scene
 from mivol.transport.path.estimators import SEGMENT_ESTIMATORS
 from mivol.transport.path.settings import Settings
-from mivol.validate.statistics import nrmse, psnr
+from mivol.validate.metrics import nrmse, psnr
 
 
 def scene_fit(task: Task) -> Path:

@@ -11,7 +11,8 @@ import numpy as np
 from mivol.fields.sky import Sky
 from mivol.fields.spherical import SphericalGrid
 from mivol.photos import Camera, pixel_centres, rays
-from mivol.transport.line_integrals.radiance_field import RayBundle, bake, cells_of, model_of, render
+from mivol.transport.line_integrals.radiance_field import RayBundle, cells_of, model_of, render
+from mivol.transport.line_integrals.radiance_source import bake
 
 
 @dataclass(frozen=True)
@@ -39,7 +40,7 @@ def render_view(field: SphericalGrid, camera: Camera, background: np.ndarray | S
         background: behind the field: a colour (3,), or a sky.
         stop: a ray ends at this transmittance.
 
-    Bias: O(h^4) in a cell, and that of :func:`mivol.transport.line_integrals.radiance_field.bake`.
+    Bias: O(h^4) in a cell, and that of :func:`mivol.transport.line_integrals.radiance_source.bake`.
     """
     cells, model = cells_of(field), model_of(field, stop)
     source = bake(field, cells, camera.origin[None], mi.UInt32(0))

@@ -30,7 +30,8 @@ from mivol.optim.decoupled_priors import Neighbours, Rows
 from mivol.optim.problem import Reals, Refinement
 from mivol.optim.radiance_plan import FitPlan, place_grid
 from mivol.optim.ray_batches import RayBatch, RayBatches
-from mivol.transport.line_integrals.radiance_field import backward, bake, brightest_weights, cells_of, fold, model_of, render
+from mivol.transport.line_integrals.radiance_field import RayGradient, backward, brightest_weights, cells_of, model_of, render
+from mivol.transport.line_integrals.radiance_source import bake, fold
 from mivol.transport.traversal.occupied_cells import Cells
 
 
@@ -102,7 +103,7 @@ class RadianceProblem:
     def loss_and_gradient(self, reals: Reals, iteration: int, views: int = 0) -> tuple[mi.Float, Reals]:
         """Mean squared error of the rays of an iteration, and its gradient; 0 views: as many as the stage says.
 
-        Noise: of which pixels were drawn. Bias: that of :func:`mivol.transport.line_integrals.radiance_field.bake`.
+        Noise: of which pixels were drawn. Bias: that of :func:`mivol.transport.line_integrals.radiance_source.bake`.
         """
         self.set(reals)
         stage = self.plan.stages[self.stage]
@@ -140,7 +141,7 @@ class RadianceProblem:
             through += self.plan.beta / count * batch.counted * (dr.rcp(T) - dr.rcp(1 - T))
         loss = dr.squared_norm(error) * (1 / 3)
         dr.eval(seen, by, through, loss)
-        backward(self._cells, source, model, seen, by, through)
+        backward(self._cells, source, model, seen, RayGradient(by, through))
         dr.eval(source.slope)
         density, harmonics = fold(self.field, self._cells, source, batch.origins)
         slopes = {"density": self._stored(density), "harmonics": self._stored(harmonics)}

@@ -8,21 +8,11 @@ from __future__ import annotations
 
 from mivol.photos.camera import Camera, directions, intrinsics, pixel_centres, project, rays
 from mivol.photos.camera_path import between, facing, turntable
-from mivol.photos.dataset import (
-    BACKGROUNDS,
-    FORMATS,
-    SPLITS,
-    Frame,
-    Photo,
-    Photos,
-    PhotoSurvey,
-    find_format,
-    load_photos,
-    survey_photos,
-)
+from mivol.photos.dataset import BACKGROUNDS, Photo, Photos, load_photos
 from mivol.photos.lens import Lens, distort, undistort
 from mivol.photos.rectify import pinhole_of, rectified
 from mivol.photos.silhouette import silhouette_box
+from mivol.photos.survey import FORMATS, SPLITS, Frame, PhotoSurvey, find_format, survey_photos
 from mivol.photos.transforms import write_transforms
 
 __all__ = [

@@ -8,13 +8,13 @@ chance of a false alarm, one half goes to the largest of all pixels and one half
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
 from mivol.errors import MivolError
-from mivol.validate.reference import ReferenceResult, read_reference
-from mivol.validate.statistics import Bias, bias, nrmse, psnr, smallest_detectable_bias, z_bound, z_image
+from mivol.validate.metrics import nrmse, psnr
+from mivol.validate.reference_file import ReferenceResult
+from mivol.validate.statistics import Bias, Estimate, Significance, bias, smallest_detectable_bias, z_bound, z_image
 
 __all__ = ["Comparison", "compare"]
 
@@ -66,11 +66,9 @@ class Comparison:
 
 
 def compare(
-    image: np.ndarray,
-    reference: ReferenceResult | str | Path,
+    image: Estimate,
+    reference: ReferenceResult,
     *,
-    variance: np.ndarray | float = 0.0,
-    content_hash: str | None = None,
     alpha: float = 1e-3,
     samples_seen: float = 0.0,
     rounding: float = 0.0,
@@ -79,10 +77,8 @@ def compare(
     """Compare an image with a reference.
 
     Args:
-        image: (H, W, C).
-        reference: what ``render_reference`` gave, or its file.
-        variance: of the image's own mean; 0 where it is exact.
-        content_hash: of the scene that the image shows; a reference of another is refused.
+        image: (H, W, C), with the variance of its own mean; 0 where it is exact.
+        reference: what ``render_reference`` gave, or ``read_reference`` (which refuses the reference of another scene).
         alpha: chance that images of equal mean are said to differ.
         samples_seen: largest value of one sample [radiance], for instance the background's. A pixel whose few bright
             samples were never seen has an estimated variance of 0; with this it has at least that of one sample in all,
@@ -91,21 +87,17 @@ def compare(
         correlated: see :func:`mivol.validate.statistics.bias`; 3: the channels share their paths, the filter is a box.
 
     Raises:
-        MivolError: another size, another scene, or values that are not finite.
+        MivolError: another size, or values that are not finite.
     """
-    if not isinstance(reference, ReferenceResult):
-        reference = read_reference(reference, content_hash)
-    elif content_hash not in (None, reference.identity["scene"]):
-        raise MivolError(f"{reference.path} is the reference of another scene; render this one's.")
-    image = np.asarray(image, dtype=np.float64)
-    if image.shape != reference.mean.shape:
-        raise MivolError(f"an image of shape {image.shape} cannot be compared with a reference of {reference.mean.shape}.")
+    mean = np.asarray(image.mean, dtype=np.float64)
+    if mean.shape != reference.mean.shape:
+        raise MivolError(f"an image of shape {mean.shape} cannot be compared with a reference of {reference.mean.shape}.")
     var = np.maximum(reference.variance, (samples_seen / reference.spp) ** 2)
-    dof = reference.batches - 1
-    difference = bias(image, variance, reference.mean, var, alpha=alpha / 2, correlated=correlated, dof_b=dof)
+    truth, dof = Estimate(reference.mean, var, reference.batches - 1), reference.batches - 1
+    difference = bias(image, truth, alpha=alpha / 2, correlated=correlated)
     dark = not reference.mean.any()
-    z = z_image(image, variance, reference.mean, var, rounding)
-    bound = float(z_bound(alpha / 2, z.size, dof=dof))
+    z, level = z_image(image, truth, rounding), Significance(alpha / 2, mean.size)
+    bound = float(z_bound(level, dof))
     return Comparison(
         z=z,
         bound=bound,
@@ -113,10 +105,8 @@ def compare(
         above_three=float(np.mean(np.abs(z) > 3)),
         worst=tuple(int(i) for i in np.unravel_index(np.argmax(np.abs(z)), z.shape)),
         bias=difference,
-        detectable=float(
-            np.median(smallest_detectable_bias(variance, var, alpha=alpha / 2, comparisons=z.size, dof=dof))
-        ),
-        psnr=-np.inf if dark else psnr(image, reference.mean),
-        nrmse=np.inf if dark else nrmse(image, reference.mean),
+        detectable=float(np.median(smallest_detectable_bias(image.var + var, level=level, dof=dof))),
+        psnr=-np.inf if dark else psnr(mean, reference.mean),
+        nrmse=np.inf if dark else nrmse(mean, reference.mean),
         alpha=alpha,
     )

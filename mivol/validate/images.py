@@ -19,7 +19,7 @@ import numpy as np
 
 from mivol.errors import MivolError
 from mivol.photos.picture import SPACES
-from mivol.validate.statistics import psnr, ssim
+from mivol.validate.metrics import psnr, ssim
 
 __all__ = ["METRICS", "Quality", "Score", "flip", "judge", "quantised", "score"]
 

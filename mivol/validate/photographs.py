@@ -17,7 +17,8 @@ from mivol.errors import MivolError
 from mivol.photos.transforms import write_transforms
 from mivol.scene.load import LoadedScene, SceneSource, find_sensor, load_scene
 from mivol.scene.photographs import camera_of
-from mivol.validate.reference import ReferenceResult, render_reference
+from mivol.validate.reference import render_reference
+from mivol.validate.reference_file import ReferenceResult
 
 __all__ = ["photograph"]
 

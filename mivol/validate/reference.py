@@ -1,22 +1,15 @@
 """Reference images by Mitsuba's own integrators: the mean, and how well it is known.
 
 Conventions. A reference is the mean of independent batches, each one render of ``pass_spp`` samples a pixel with a seed of
-its own, and the variance of that mean, both float64 in memory and float32 on disk: channels R, G, B and variance.R, .G, .B
-(Y and variance.Y in mono variants) of one OpenEXR file. Its header says what it is an image of (the scene's content hash)
-and how it was made; beside it ``<name>.state.npz`` holds the batches so far in float64, so that stopping changes nothing
-and a better reference can be asked for later. An integrator of mivol's never makes a reference.
-
-Where the extinction differs between channels, each channel is rendered alone with its extinction in all three: Mitsuba's
-``heterogeneous`` tracks all channels with one collision and is biased then (0.077 for 0.135 at sigma_t = (2, 6, 9)).
+its own, and the variance of that mean, both float64 (:mod:`mivol.validate.reference_file` says how they are stored). An
+integrator of mivol's never makes a reference. Where the extinction differs between channels, each channel is rendered alone
+(:mod:`mivol.validate.rgb_extinction`).
 """
 
 from __future__ import annotations
 
-import hashlib
-import json
 import time
 import warnings
-import zipfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
@@ -27,17 +20,25 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-import mivol
 from mivol.errors import MivolError
-from mivol.files.atomic import write_whole
-from mivol.files.exr import read_exr, write_exr
 from mivol.optim.interrupt import Stop
 from mivol.scene.load import LoadedScene, SceneSource, check_variant, content_hash, find_sensor, load_scene
-from mivol.transport.media.read_medium import traverse_medium
-from mivol.validate.statistics import Moments
+from mivol.validate.moments import Moments
+from mivol.validate.reference_file import (
+    ReferenceResult,
+    check_identity,
+    destination_of,
+    read_reference,
+    read_state,
+    relative_error,
+    save_state,
+    state_path,
+    write_reference,
+)
+from mivol.validate.rgb_extinction import RgbExtinction, find_rgb_extinctions, with_channel
 from mivol.validate.trust import Doubt, trust
 
-__all__ = ["INTEGRATORS", "Doubt", "ReferenceResult", "read_reference", "render_reference", "trust"]
+__all__ = ["INTEGRATORS", "render_reference"]
 
 # Who may judge: Mitsuba's forward integrators for media.
 INTEGRATORS = ("volpath", "volpathmis")
@@ -49,57 +50,6 @@ FEWEST_BATCHES = 32
 PATHS_PER_PASS = {"llvm": 2**18, "cuda": 2**22}
 
 SECONDS_BETWEEN_CHECKPOINTS = 20.0
-
-
-@dataclass(frozen=True)
-class ReferenceResult:
-    """A reference image.
-
-    Attributes:
-        mean: (H, W, C) radiance.
-        variance: (H, W, C) of the mean.
-        batches: independent batches behind both.
-        spp: samples behind each pixel and channel.
-        identity: what it is an image of, and how it was made; equal for references that may be averaged.
-        path: its file.
-        doubts: why it should not be believed, where there are reasons.
-        seconds: time spent rendering, all sessions together.
-        reached: whether it has the accuracy that was asked for; False where ``max_spp`` came first.
-    """
-
-    mean: np.ndarray
-    variance: np.ndarray
-    batches: int
-    spp: int
-    identity: dict[str, Any]
-    path: Path
-    doubts: tuple[Doubt, ...] = ()
-    seconds: float = 0.0
-    reached: bool = True
-
-    @property
-    def standard_error(self) -> float:
-        """Root mean square over pixels and channels of the standard error of the mean [radiance]."""
-        return float(np.sqrt(self.variance.mean()))
-
-    @property
-    def relative_error(self) -> float:
-        """``standard_error`` divided by the mean absolute radiance of the image."""
-        return _relative(self.standard_error, self.mean)
-
-    @property
-    def text(self) -> str:
-        """One paragraph."""
-        how = self.identity
-        missed = "" if self.reached else ", above the target"
-        one = "each channel alone" if how["channels_alone"] else "all channels at once"
-        doubts = "".join(f" Doubt: {d.sentence}" for d in self.doubts)
-        return (
-            f"{self.path.name}: {self.mean.shape[1]}x{self.mean.shape[0]} by {how['integrator']} "
-            f"(max_depth {how['max_depth']}, {one}), {self.spp} samples a pixel in {self.batches} batches, "
-            f"standard error {self.standard_error:.3g} "
-            f"({100 * self.relative_error:.2g} % of the mean{missed}), {self.seconds:.0f} s.{doubts}"
-        )
 
 
 def render_reference(
@@ -161,7 +111,7 @@ def render_reference(
     loaded = scene if isinstance(scene, LoadedScene) else load_scene(scene, overrides)
     method = {"integrator": integrator, "max_depth": max_depth, "rr_depth": rr_depth, "hide_emitters": hide_emitters}
     setup = _Setup.of(loaded, sensor, method, seed)
-    path = _destination(Path(out), loaded.name, setup.identity)
+    path = destination_of(Path(out), loaded.name, setup.identity)
     doubts = _judge(loaded.scene, setup.sensor, accept_doubts)
     goal = _Goal(target_se, relative, max_spp)
 
@@ -172,35 +122,6 @@ def render_reference(
         with progress_bar as show:
             result = _render_until(goal, setup, _load_state(path, setup), path, doubts, show)
     return replace(result, reached=target_se is None or goal.accurate(result.mean, result.variance))
-
-
-def read_reference(path: str | Path, content_hash: str | None = None) -> ReferenceResult:
-    """Read a reference from its file.
-
-    Args:
-        path: the EXR.
-        content_hash: of the scene that it must be a reference of; None: any.
-
-    Raises:
-        MivolError: not a reference of mivol's, or that of another scene.
-    """
-    channels, header = read_exr(path)
-    if "mivol_reference" not in header:
-        raise MivolError(f"{path} is an image but not a reference of mivol's; make one with mivol reference.")
-    made = json.loads(header["mivol_reference"])
-    names = [name for name in ("R", "G", "B", "Y") if name in channels]
-    if content_hash is not None and made["identity"]["scene"] != content_hash:
-        raise MivolError(_other(Path(path), "scene", made["identity"]["scene"], content_hash))
-    return ReferenceResult(
-        mean=np.stack([channels[n] for n in names], axis=-1).astype(np.float64),
-        variance=np.stack([channels[f"variance.{n}"] for n in names], axis=-1).astype(np.float64),
-        batches=made["batches"],
-        spp=made["spp"],
-        identity=made["identity"],
-        path=Path(path),
-        doubts=tuple(Doubt(**d) for d in made["doubts"]),
-        seconds=made["seconds"],
-    )
 
 
 # -- What is rendered -----------------------------------------------------------------------------
@@ -214,7 +135,7 @@ class _Setup:
     sensor: mi.Sensor
     integrator: mi.Integrator
     identity: dict[str, Any]
-    extinction: list[_Extinction]
+    extinction: list[RgbExtinction]
     shape: tuple[int, int, int]
     pass_spp: int = 0
 
@@ -224,7 +145,7 @@ class _Setup:
         look = _sensor(loaded.scene, sensor)
         columns, rows = (int(n) for n in look.film().crop_size())
         channels = _channels(look.film())
-        extinction = _rgb_extinction(loaded.scene) if channels == 3 else []
+        extinction = find_rgb_extinctions(loaded.scene) if channels == 3 else []
         settings = {key: value for key, value in method.items() if key != "integrator"}
         made = mi.load_dict({"type": method["integrator"], **settings})
         identity = {
@@ -263,7 +184,7 @@ class _Setup:
         else:
             image = np.empty(self.shape)
             for channel in range(3):
-                with _grey_extinction(self.extinction, channel):
+                with with_channel(self.extinction, channel):
                     image[..., channel] = self._render(3 * index + channel)[..., channel]
         if not np.isfinite(image).all():
             row, column, channel = (int(i) for i in np.argwhere(~np.isfinite(image))[0])
@@ -313,58 +234,6 @@ def _base_seed(seed: int) -> int:
     return int(np.random.SeedSequence([0x6D69766F, seed]).generate_state(1)[0])
 
 
-# -- Extinction, one channel at a time ------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class _Extinction:
-    """The parameters of one medium that make its extinction differ between channels, with their values."""
-
-    params: mi.SceneParameters
-    values: dict[str, np.ndarray]
-
-    def assign(self, values: dict[str, np.ndarray]) -> None:
-        for key, value in values.items():
-            kind = type(self.params[key])
-            self.params[key] = kind(*value.tolist()) if kind is mi.Color3f else kind(np.ascontiguousarray(value))
-        self.params.update()
-
-
-def _rgb_extinction(scene: mi.Scene) -> list[_Extinction]:
-    """Media whose extinction differs between channels."""
-    media = [m for s in scene.shapes() for m in (s.interior_medium(), s.exterior_medium()) if m is not None]
-    media += [m for s in scene.sensors() if (m := s.get_medium()) is not None]
-    found = []
-    for i, medium in enumerate(media):
-        if any(medium is other for other in media[:i]):
-            continue
-        params = traverse_medium(medium)
-        keys = [k for k in params.keys() if k.partition(".")[0] in ("sigma_t", "sigma_a", "sigma_s")]  # noqa: SIM118
-        values = {key: _array(params[key]) for key in keys}
-        values = {k: v for k, v in values.items() if v.ndim and v.shape[-1] == 3 and np.any(v != v[..., :1])}
-        if values:
-            found.append(_Extinction(params, values))
-    return found
-
-
-def _array(value: Any) -> np.ndarray:
-    """A copy of the values, channels last."""
-    array = np.array(value)
-    return array.reshape(-1) if isinstance(value, mi.Color3f) else array
-
-
-@contextmanager
-def _grey_extinction(media: list[_Extinction], channel: int) -> Iterator[None]:
-    """Give all channels the extinction of one, for a while."""
-    try:
-        for medium in media:
-            medium.assign({k: np.repeat(v[..., channel : channel + 1], 3, axis=-1) for k, v in medium.values.items()})
-        yield
-    finally:
-        for medium in media:
-            medium.assign(medium.values)
-
-
 # -- Batches until it is good enough ---------------------------------------------------------------
 
 
@@ -379,7 +248,7 @@ class _Goal:
 
     def accurate(self, mean: np.ndarray, variance: np.ndarray) -> bool:
         error = float(np.sqrt(variance.mean()))
-        return self.target_se is not None and (_relative(error, mean) if self.relative else error) <= self.target_se
+        return self.target_se is not None and (relative_error(error, mean) if self.relative else error) <= self.target_se
 
 
 @dataclass
@@ -394,11 +263,6 @@ class _Run:
     def reached(self, goal: _Goal) -> bool:
         m = self.moments
         return m.n > 1 and goal.reached(m.n, m.n * self.pass_spp, m.mean, m.variance_of_mean)
-
-
-def _relative(error: float, mean: np.ndarray) -> float:
-    level = float(np.abs(mean).mean())
-    return error / level if level > 0 else (0.0 if error == 0 else float("inf"))
 
 
 def _render_until(
@@ -420,7 +284,7 @@ def _render_until(
         if rendered:
             _save_state(path, setup, run)
     result = _result(setup, run, path, doubts)
-    _write(result)
+    write_reference(result)
     return result
 
 
@@ -443,7 +307,7 @@ def _progress(name: str, goal: _Goal) -> Iterator[Callable[[_Run], None]]:
             if run.moments.n < 2:
                 return
             error = float(np.sqrt(run.moments.variance_of_mean.mean()))
-            reached = _relative(error, run.moments.mean) if goal.relative else error
+            reached = relative_error(error, run.moments.mean) if goal.relative else error
             # The error falls as 1/sqrt(n): batches still to come follow from the error now.
             most = goal.max_spp / run.pass_spp
             needed = run.moments.n * (reached / goal.target_se) ** 2 if goal.target_se else most
@@ -453,21 +317,7 @@ def _progress(name: str, goal: _Goal) -> Iterator[Callable[[_Run], None]]:
         yield show
 
 
-# -- On disk --------------------------------------------------------------------------------------
-
-
-def _destination(out: Path, name: str, identity: dict[str, Any]) -> Path:
-    if out.suffix.lower() == ".exr":
-        return out
-    if out.suffix or (out.exists() and not out.is_dir()):
-        raise MivolError(f"a reference is an OpenEXR file, not {out.name}; give a name that ends in .exr, or a folder.")
-    out.mkdir(parents=True, exist_ok=True)
-    how = hashlib.sha256(json.dumps(identity, sort_keys=True).encode()).hexdigest()
-    return out / f"{name}-{identity['scene'][:12]}-{how[:8]}.exr"
-
-
-def _state_path(path: Path) -> Path:
-    return path.with_suffix(".state.npz")
+# -- What is on disk already ------------------------------------------------------------------------
 
 
 def _finished(path: Path, identity: dict[str, Any], goal: _Goal) -> ReferenceResult | None:
@@ -475,70 +325,30 @@ def _finished(path: Path, identity: dict[str, Any], goal: _Goal) -> ReferenceRes
     if not path.exists():
         return None
     found = read_reference(path)
-    _check_identity(path, found.identity, identity)
+    check_identity(path, found.identity, identity)
     return found if goal.reached(found.batches, found.spp, found.mean, found.variance) else None
-
-
-def _check_identity(path: Path, found: dict[str, Any], wanted: dict[str, Any]) -> None:
-    for key, value in wanted.items():
-        if found.get(key) != value:
-            raise MivolError(_other(path, key, found.get(key), value))
-
-
-def _other(path: Path, key: str, found: Any, wanted: Any) -> str:
-    if key == "scene":
-        return (
-            f"{path} is the reference of another scene (content {str(found)[:12]}, not {str(wanted)[:12]}); choose another "
-            "file, or delete it."
-        )
-    return f"{path} was made with {key} = {found}, not {wanted}; choose another file, or delete it."
 
 
 def _stored_pass_spp(path: Path) -> int | None:
     """Samples of a pass of what is on disk, so that a reference can be continued to a higher accuracy."""
-    state = _state_path(path)
+    state = state_path(path)
     if state.exists():
-        return int(_read_state(state)[0]["identity"]["pass_spp"])
+        return int(read_state(state)[0]["identity"]["pass_spp"])
     return int(read_reference(path).identity["pass_spp"]) if path.exists() else None
 
 
-def _save_state(path: Path, setup: _Setup, run: _Run) -> None:
-    text = json.dumps({"identity": setup.identity, "seconds": run.seconds})
-    m = run.moments
-    write_whole(_state_path(path), lambda file: np.savez(file, n=m.n, mean=m.mean, m2=m.m2, made=np.array(text)))
-    run.saved = time.monotonic()
-
-
-def _read_state(state: Path) -> tuple[dict[str, Any], Moments]:
-    try:
-        with state.open("rb") as file, np.load(file) as stored:
-            return json.loads(str(stored["made"])), Moments(int(stored["n"]), stored["mean"], stored["m2"])
-    except (ValueError, KeyError, OSError, EOFError, zipfile.BadZipFile) as error:
-        raise MivolError(f"{state} is not a whole checkpoint of a reference; delete it to start over.") from error
-
-
 def _load_state(path: Path, setup: _Setup) -> _Run:
-    state = _state_path(path)
+    state = state_path(path)
     if not state.exists():
         return _Run(Moments.empty(setup.shape), setup.pass_spp, 0.0)
-    made, moments = _read_state(state)
-    _check_identity(state, made["identity"], setup.identity)
+    made, moments = read_state(state)
+    check_identity(state, made["identity"], setup.identity)
     return _Run(moments, setup.pass_spp, made["seconds"])
 
 
-def _write(result: ReferenceResult) -> None:
-    names = "RGB" if result.mean.shape[-1] == 3 else "Y"
-    channels = {name: result.mean[..., i] for i, name in enumerate(names)}
-    channels |= {f"variance.{name}": result.variance[..., i] for i, name in enumerate(names)}
-    made = {
-        "identity": result.identity,
-        "batches": result.batches,
-        "spp": result.spp,
-        "seconds": result.seconds,
-        "doubts": [vars(d) for d in result.doubts],
-        "mivol": mivol.__version__,
-    }
-    write_exr(result.path, channels, {"mivol_reference": json.dumps(made)})
+def _save_state(path: Path, setup: _Setup, run: _Run) -> None:
+    save_state(path, setup.identity, run.moments, run.seconds)
+    run.saved = time.monotonic()
 
 
 # -- Doubts ---------------------------------------------------------------------------------------

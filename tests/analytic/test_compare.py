@@ -9,8 +9,8 @@ import pytest
 
 from mivol.errors import MivolError
 from mivol.validate.compare import Comparison, compare
-from mivol.validate.reference import ReferenceResult
-from mivol.validate.statistics import bias, smallest_detectable_bias, z_bound
+from mivol.validate.reference_file import ReferenceResult
+from mivol.validate.statistics import Estimate, Significance, bias, smallest_detectable_bias, z_bound
 
 SHAPE = (4, 6, 3)
 MEAN, ERROR = 0.5, 1e-3
@@ -23,36 +23,41 @@ def reference(batches: int = 32, mean: float = MEAN) -> ReferenceResult:
     )
 
 
-def beside(change: np.ndarray | float, **more: object) -> Comparison:
-    """An exact image that differs by multiples of the standard error."""
-    return compare(MEAN + ERROR * np.broadcast_to(change, SHAPE), reference(), **more)
+def even(value: float, var: float = 0.0) -> Estimate:
+    """An image of one value."""
+    return Estimate(np.full(SHAPE, value), var)
+
+
+def beside(change: np.ndarray | float, var: float = 0.0, **more: object) -> Comparison:
+    """An image that differs by multiples of the standard error; exact, unless a variance is given."""
+    return compare(Estimate(MEAN + ERROR * np.broadcast_to(change, SHAPE), var), reference(), **more)
 
 
 def test_pixels_are_judged_by_students_t_of_the_batches():
     found = beside(0.0)
-    assert found.agrees and found.bound == z_bound(0.5e-3, 72, dof=31)
-    assert compare(np.full(SHAPE, MEAN), reference(3)).bound == z_bound(0.5e-3, 72, dof=2) > 3 * found.bound
+    assert found.agrees and found.bound == z_bound(Significance(0.5e-3, 72), 31)
+    assert compare(even(MEAN), reference(3)).bound == z_bound(Significance(0.5e-3, 72), 2) > 3 * found.bound
 
 
 def test_the_mean_is_judged_by_students_t_of_all_pixels():
     """72 pixels of one error have 72 times the degrees of freedom, of which channels share their paths three by three."""
     for batches, correlated in ((3, 3), (32, 3), (3, 1)):
         ours = reference(batches)
-        found = compare(np.full(SHAPE, MEAN), ours, correlated=correlated).bias
+        found = compare(even(MEAN), ours, correlated=correlated).bias
         freedom = 72 * (batches - 1) / correlated
         error = ERROR * np.sqrt(correlated / 72)
         assert found.standard_error == pytest.approx(error)
-        assert found.high == pytest.approx(float(z_bound(0.5e-3, dof=freedom)) * error)
+        assert found.high == pytest.approx(float(z_bound(Significance(0.5e-3), freedom)) * error)
         assert found.low == -found.high
 
 
 def test_the_image_has_errors_of_its_own():
     """As large as the reference's: z is 1 / sqrt(2) of what it is of an exact image."""
-    exact, noisy = beside(2.5), beside(2.5, variance=ERROR**2)
+    exact, noisy = beside(2.5), beside(2.5, ERROR**2)
     np.testing.assert_allclose(exact.z, 2.5)
     np.testing.assert_allclose(noisy.z, 2.5 / np.sqrt(2))
     assert not exact.agrees and exact.beyond == 0 and exact.bias.low > 0
-    own = bias(np.full(SHAPE, 0.5), np.full(SHAPE, ERROR**2), np.full(SHAPE, 0.5), ERROR**2)
+    own = bias(even(0.5, ERROR**2), even(0.5, ERROR**2))
     assert noisy.bias.standard_error == pytest.approx(np.sqrt(3) * own.standard_error)
 
 
@@ -75,7 +80,7 @@ def test_what_chance_may_explain_depends_on_alpha():
 
 def test_the_smallest_bias_that_would_be_found():
     """Of one of 72 values by the same bound, 9 times in 10."""
-    expected = smallest_detectable_bias(0.0, ERROR**2, alpha=0.5e-3, comparisons=72, dof=31)
+    expected = smallest_detectable_bias(ERROR**2, level=Significance(0.5e-3, 72), dof=31)
     assert beside(0.0).detectable == pytest.approx(float(expected))
     assert f"{float(expected):.2g} would be found 9 times in 10" in beside(0.0).text
 
@@ -84,7 +89,7 @@ def test_distances():
     """2 standard errors everywhere: 20 log10(0.5 / 2e-3) dB and 2e-3 / 0.5; a black reference has neither."""
     found = beside(2.0)
     assert found.psnr == pytest.approx(20 * np.log10(250)) and found.nrmse == pytest.approx(1 / 250)
-    black = compare(np.full(SHAPE, 0.1), reference(mean=0.0))
+    black = compare(even(0.1), reference(mean=0.0))
     assert black.psnr == -np.inf and black.nrmse == np.inf
 
 
@@ -92,14 +97,15 @@ def test_an_unseen_sample_is_an_error_that_is_not_in_the_variance():
     """One sample of 1 among 32 x 64 may have been missed: its share is a standard error."""
     unseen = reference()
     unseen.variance[:] = 0
-    image = np.full(SHAPE, MEAN + 1 / 2048)
+    image = even(MEAN + 1 / 2048)
     assert not compare(image, unseen, samples_seen=0.01).agrees
     np.testing.assert_allclose(compare(image, unseen, samples_seen=1.0).z, 1.0)
 
 
 def test_refusals():
     with pytest.raises(MivolError, match=r"shape \(3, 6, 3\) cannot be compared with a reference of \(4, 6, 3\)"):
-        compare(np.zeros((3, 6, 3)), reference())
-    with pytest.raises(MivolError, match="another scene"):
-        compare(np.zeros(SHAPE), reference(), content_hash="b" * 64)
-    compare(np.full(SHAPE, MEAN), reference(), content_hash="a" * 64)
+        compare(Estimate(np.zeros((3, 6, 3))), reference())
+    image = even(MEAN)
+    image.mean[0, 0, 0] = np.nan
+    with pytest.raises(MivolError, match=r"first mean is nan at \(0, 0, 0\)"):
+        compare(image, reference())

@@ -17,7 +17,7 @@ from mivol.scene.depth_two import ALBEDOS, TABLES, TAUS, depth_two_error, draw_l
 from mivol.scene.explain import explain
 from mivol.transport.media.box import Box
 from mivol.transport.media.read_medium import view_medium
-from mivol.validate.statistics import Moments
+from mivol.validate.moments import Moments
 from scenes import FRAMES, affine, ball_of, medium, refused, rotation
 
 ROUNDING = 5e-4

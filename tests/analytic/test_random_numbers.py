@@ -8,7 +8,7 @@ import pytest
 from false_alarms import assert_same_mean, fresh
 
 from mivol.transport.traversal.random_numbers import draw_pcg32, seed_pcg32
-from mivol.validate.statistics import Moments
+from mivol.validate.moments import Moments
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
 

@@ -21,7 +21,7 @@ from mivol.transport.media.grid_integral import integrate_segment
 from mivol.transport.traversal.block_ranges import find_block_ranges
 from mivol.transport.traversal.lattice import Lattice, clip
 from mivol.transport.traversal.random_numbers import seed_pcg32
-from mivol.validate.statistics import Moments
+from mivol.validate.moments import Moments
 from scenes import as_float32, refused
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from mivol.bench.agreement import FALSE_ALARM, MeanError, compare_means, finite, mean_of_pixels, mean_of_rounds, number
+from mivol.bench.agreement import FALSE_ALARM, compare_means, finite, mean_of_pixels, mean_of_rounds, number
+from mivol.validate.statistics import Estimate
 
 
 def test_pixels_that_share_their_noise_are_not_taken_for_many() -> None:
@@ -16,7 +17,7 @@ def test_pixels_that_share_their_noise_are_not_taken_for_many() -> None:
     rng = np.random.default_rng(6)
     shared = np.repeat(rng.normal(10, 1, (8, 1)), 2000, axis=1)
     found = mean_of_pixels(shared)
-    assert found.variance == pytest.approx(np.var(shared[:, 0], ddof=1) / 8)
+    assert found.var == pytest.approx(np.var(shared[:, 0], ddof=1) / 8)
     assert found.dof == 7
 
 
@@ -25,7 +26,7 @@ def test_the_noisiest_pixels_have_the_degrees_of_freedom() -> None:
     one pixel that outweighs 49 others has 5."""
     signs = np.where(np.add.outer(np.arange(6), np.arange(50)) % 2, 1.0, -1.0)
     equal = mean_of_pixels(10 + signs)
-    assert equal.variance == pytest.approx(6 / 5 / 6 / 50)
+    assert equal.var == pytest.approx(6 / 5 / 6 / 50)
     assert equal.dof == pytest.approx(250)
     one = np.zeros(50)
     one[3], one[4] = 1.0, 1.0
@@ -34,7 +35,7 @@ def test_the_noisiest_pixels_have_the_degrees_of_freedom() -> None:
 
 def test_bounds_are_those_of_student() -> None:
     """4 and 9 values of one variance: the bound is t's at the degrees of freedom that Welch's formula gives by hand."""
-    a, b = MeanError(1.0, 0.25, 3), MeanError(2.0, 0.1, 8)
+    a, b = Estimate(1.0, 0.25, 3), Estimate(2.0, 0.1, 8)
     found = compare_means(a, b, 1)
     dof = 0.35**2 / (0.25**2 / 3 + 0.1**2 / 8)
     assert found["z"] == pytest.approx(-1 / math.sqrt(0.35))
@@ -44,11 +45,11 @@ def test_bounds_are_those_of_student() -> None:
 
 
 def test_means_of_rounds() -> None:
-    assert mean_of_rounds(np.array([1.0, 3.0])) == MeanError(2.0, 1.0, 1)
+    assert mean_of_rounds(np.array([1.0, 3.0])) == Estimate(2.0, 1.0, 1)
 
 
 def test_what_json_cannot_say_is_none() -> None:
-    found = compare_means(MeanError(1.0, 0.0, 3), MeanError(0.0, 0.0, 3), 1)
+    found = compare_means(Estimate(1.0, 0.0, 3), Estimate(0.0, 0.0, 3), 1)
     assert (found["z"], found["percent"], found["standard_error_percent"]) == (None, None, None)
     assert finite(math.inf) is None and finite(2) == 2.0
     assert math.isnan(number(None)) and number(0.0) == 0.0

@@ -17,7 +17,8 @@ from mivol.bench.radiance_field.fits import EVERY, follow, held_out_psnr, our_fi
 from mivol.bench.radiance_field.steps import ask_memory, our_step, peer_of, peer_step, tasks
 from mivol.bench.radiance_field.views import BOX, between, photographed, rays_of, rays_through, ring, tiled
 from mivol.photos import Camera, Photo, intrinsics
-from mivol.transport.line_integrals.radiance_field import bake, cells_of, model_of, render
+from mivol.transport.line_integrals.radiance_field import cells_of, model_of, render
+from mivol.transport.line_integrals.radiance_source import bake
 
 TINY = replace(QUICK, resolution=8, side=16, steps=EVERY, fit_resolution=8, fit_side=16, chair_steps=8, fields=("fog",))
 

@@ -19,7 +19,7 @@ def test_the_box_holds_its_grid(variant_rgb: str) -> None:
     assert radiance.x[0] == pytest.approx(np.exp(-0.6), rel=1e-5)
 
 
-def test_a_emitter_takes_the_place_of_the_sky(variant_rgb: str) -> None:
+def test_an_emitter_takes_the_place_of_the_sky(variant_rgb: str) -> None:
     made = box_scene(np.zeros((2, 2, 2), np.float32), 8, 0.5, **point_light((1, 2, 3)))
     assert {"lamp"} == set(made) - {"type", "box", "sensor"}
     assert made["box"]["interior"]["phase"] == {"type": "isotropic"}

@@ -16,9 +16,10 @@ from false_alarms import ALPHA, fresh, note
 
 from mivol.bench import agreement
 from mivol.bench import single_scattering as bench
-from mivol.bench.agreement import MeanError, compare_means
+from mivol.bench.agreement import compare_means
 from mivol.bench.scenes import box_scene, depth_two
 from mivol.bench.timing import Budget, Timing
+from mivol.validate.statistics import Estimate
 
 TINY = replace(bench.QUICK, rounds=6, most_pixels=8, budget=Budget(spp=64))
 
@@ -114,7 +115,7 @@ def test_pixels_at_the_emitter_do_not_count(variant_rgb: str) -> None:
     assert np.isinf(bench.pixels_from_lamp(scene, light._replace(inside=None), 24)).all()
 
 
-def test_a_emitter_inside_is_judged_in_thin_matter_away_from_it(variant_rgb: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_emitter_inside_is_judged_in_thin_matter_away_from_it(variant_rgb: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Ratios are of the volume itself, and pixels up to the lamp count; means are compared in the volume thinned to an
     optical depth of 1, in pixels further than a quarter of the picture from it."""
     used, depths, side = {}, [], 16
@@ -141,6 +142,6 @@ def test_a_emitter_inside_is_judged_in_thin_matter_away_from_it(variant_rgb: str
 
 
 def test_a_difference_without_noise_is_beyond_every_bound() -> None:
-    found = compare_means(MeanError(1.0, 0.0, 5.0), MeanError(2.0, 0.0, 5.0), 1)
+    found = compare_means(Estimate(1.0, 0.0, 5.0), Estimate(2.0, 0.0, 5.0), 1)
     assert found["z"] is None
     assert found["percent"] == pytest.approx(-50)

@@ -25,7 +25,7 @@ from oracle import (
     trilinear,
 )
 
-from mivol.validate.statistics import Moments
+from mivol.validate.moments import Moments
 from scenes import (
     FRAMES,
     affine,

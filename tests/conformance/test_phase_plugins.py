@@ -9,7 +9,7 @@ import pytest
 from false_alarms import ALPHA, assert_precise, assert_same_mean, fresh, note
 
 from mivol.phase.tabulated import Table
-from mivol.validate.statistics import Moments
+from mivol.validate.moments import Moments
 from scenes import box_of, camera, render, sky
 
 EPS = 2.0**-23

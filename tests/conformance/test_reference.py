@@ -29,8 +29,9 @@ from mivol.files.exr import read_exr, write_exr
 from mivol.scene.cameras import Ring
 from mivol.validate import reference
 from mivol.validate.compare import compare
-from mivol.validate.reference import read_reference, render_reference
-from mivol.validate.statistics import Moments
+from mivol.validate.moments import Moments
+from mivol.validate.reference import render_reference
+from mivol.validate.reference_file import ReferenceResult, read_reference
 from mivol.validate.trust import trust
 
 SIZE = 8
@@ -70,11 +71,11 @@ def _homogeneous(sigma_t=1.5, **extra) -> dict:
     return {"type": "homogeneous", "sigma_t": sigma_t, "albedo": 0.0, **extra}
 
 
-def _small(scene, path, **settings) -> reference.ReferenceResult:
+def _small(scene, path, **settings) -> ReferenceResult:
     return render_reference(scene, path, **{"max_depth": 2, "max_spp": 256, "progress": False, "seed": fresh(0), **settings})
 
 
-def _estimate(found: reference.ReferenceResult) -> Estimate:
+def _estimate(found: ReferenceResult) -> Estimate:
     return Estimate(found.mean, found.variance, found.batches - 1)
 
 
@@ -430,7 +431,7 @@ def test_doubt_a_sampler_whose_dimensions_depend_on_each_other(variant_rgb):
 
 
 @pytest.mark.statistical
-def test_doubt_a_emitter_near_a_boundary(variant_rgb):
+def test_doubt_an_emitter_near_a_boundary(variant_rgb):
     """In a small scene most light of a lamp with a surface is lost; the same scene in another unit is right."""
     found = {}
     for unit in (1.0, 0.01):
@@ -442,7 +443,7 @@ def test_doubt_a_emitter_near_a_boundary(variant_rgb):
         scene["sensor"] = scene["sensor"] | {"to_world": look, "near_clip": 1e-3 * unit}
         del scene["sky"]
         found[unit] = [Moments.of(_lit(scene, kind)) for kind in ("volpath", "mivol")]
-        assert [d.kind for d in trust(mi.load_dict(scene)) if d.fatal] == ([] if unit == 1 else ["near lamp"])
+        assert [d.kind for d in trust(mi.load_dict(scene)) if d.fatal] == ([] if unit == 1 else ["near emitter"])
     (stock, ours), (lost, same) = found[1.0], found[0.01]
     # Stock rays start 1e-4 of a length behind a surface, in an extinction of 1.
     assert_same_mean(stock, ours, rounding=2e-4 * ours.mean)
@@ -590,18 +591,18 @@ def test_compare(variant_rgb, tmp_path):
     found = _small(_scene(_grid(1.5)), tmp_path / "r.exr", max_spp=2048)
     exact = np.full_like(found.mean, np.exp(-1.5))
     note(ALPHA, "images")
-    good = compare(exact, found, alpha=ALPHA)
+    good = compare(Estimate(exact), found, alpha=ALPHA)
     assert good.agrees and good.beyond == 0 and "agrees" in good.text
-    assert compare(exact, found.path, content_hash=found.identity["scene"], alpha=ALPHA).agrees
+    assert compare(Estimate(exact), read_reference(found.path, found.identity["scene"]), alpha=ALPHA).agrees
     spot = exact.copy()
     spot[2, 5, 1] += 20 * np.sqrt(found.variance[2, 5, 1])
     # Bounds of 10 standard errors for a pixel and 5.9 for all: the noise of the errors given is 1.
     note(3 * stats.norm.sf(6), "images made wrong")
-    wrong = compare(spot, found, alpha=ALPHA)
+    wrong = compare(Estimate(spot), found, alpha=ALPHA)
     assert not wrong.agrees and wrong.worst == (2, 5, 1) and "row 2, column 5, channel 1" in wrong.text
-    shifted = compare(exact + 2 * found.standard_error, found, alpha=ALPHA)
+    shifted = compare(Estimate(exact + 2 * found.standard_error), found, alpha=ALPHA)
     assert not shifted.agrees and shifted.beyond == 0 and shifted.bias.low > 0
-    noisy = compare(spot, found, variance=400 * found.variance, alpha=ALPHA)
+    noisy = compare(Estimate(spot, 400 * found.variance), found, alpha=ALPHA)
     assert noisy.agrees
 
 
@@ -611,5 +612,5 @@ def test_compare_where_nothing_was_seen(variant_rgb, tmp_path):
     found = _small(_scene(_grid(32.0)), tmp_path / "r.exr")
     exact = np.full_like(found.mean, np.exp(-32.0))
     note(256 * SIZE**2 * np.exp(-32.0), "a sample that is seen")
-    assert not compare(exact, found).agrees
-    assert compare(exact, found, samples_seen=1.0).agrees
+    assert not compare(Estimate(exact), found).agrees
+    assert compare(Estimate(exact), found, samples_seen=1.0).agrees

@@ -52,8 +52,8 @@ from volpath_scenes import (
 )
 
 import scenes
+from mivol.validate.moments import Moments
 from mivol.validate.reference import render_reference
-from mivol.validate.statistics import Moments
 from scenes import as_float32, ball_of, box_of, centred, grid_volume, medium, refused, rotation
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")

@@ -8,7 +8,7 @@ import pytest
 from false_alarms import Estimate, assert_apart, assert_precise, assert_same_mean, fresh, over_pixels
 
 import scenes
-from mivol.validate.statistics import Moments
+from mivol.validate.moments import Moments
 from scenes import ball_of, box_of, camera, grid_volume, medium, sky
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")

@@ -10,7 +10,7 @@ import pytest
 from tiny_experiment import FIT, SCENE, TRUTH, files_of, refused, run
 
 from mivol.files import read_volume
-from mivol.validate.statistics import nrmse
+from mivol.validate.metrics import nrmse
 
 
 def test_a_colour_is_looked_for_from_a_start_of_its_own(variant_rgb, folder: Path, capsys: pytest.CaptureFixture) -> None:

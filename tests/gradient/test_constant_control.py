@@ -16,7 +16,7 @@ from scattering_gradients import (
 from scattering_scenes import PLACE, aimed, fog, mivol, pencils, rough_grid
 
 import scenes
-from mivol.validate.statistics import Moments
+from mivol.validate.moments import Moments
 from scenes import as_float32, box_of, centred, grid_volume, medium
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")

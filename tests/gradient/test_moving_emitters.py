@@ -22,7 +22,7 @@ from scattering_gradients import (
 from scattering_scenes import PLACE, aimed, mivol, pencils, point, rough_grid, smoke, spot, sun
 
 import scenes
-from mivol.validate.statistics import Moments
+from mivol.validate.moments import Moments
 from scenes import as_float32, box_of, grid_volume, medium
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
@@ -54,7 +54,7 @@ TURNED = {
 
 @pytest.mark.statistical
 @pytest.mark.parametrize("kind", TURNED)
-def test_direction_of_a_emitter(kind):
+def test_direction_of_an_emitter(kind):
     """A sun that turns takes its shadows along; a spot turns its cone only. About an axis across, by an angle [rad]."""
     box, m = smoke(rough_grid(10), 0.7, "own", PLACE, "hg", 0.4)
     axis, across = np.array([-0.3, 0.6, -0.74]), np.array([0.8, 0.6, 0.0])
@@ -88,7 +88,7 @@ def test_direction_of_a_emitter(kind):
 
 @pytest.mark.statistical
 @pytest.mark.parametrize("depth", [2, 3])
-def test_place_of_a_emitter_over_a_floor(depth):
+def test_place_of_an_emitter_over_a_floor(depth):
     """A floor under haze is lit from elsewhere: its distance, its slope and the haze in between; in each of two bounces.
 
     No lamp in the plane of a face of the haze: there the light has a kink, for rays close to the face leave by it, or along it.
@@ -142,7 +142,7 @@ TRACED = ("an egg", "a ball in its grid", "a ball around its grid", "a ball in a
 
 @pytest.mark.parametrize("lamp", [(0.3, -0.2, 3.0), (0.05, 0.1, 0.2)])
 @pytest.mark.parametrize("name", TRACED)
-def test_place_of_a_emitter_behind_boundaries_that_are_traced(name, lamp):
+def test_place_of_an_emitter_behind_boundaries_that_are_traced(name, lamp):
     """What a floor shows has no noise: differences of the same pencils. One lamp is outside, one in the medium."""
     floor = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, -2.2]).scale(3)}
     o = np.column_stack([np.random.default_rng(4).uniform(-0.3, 0.3, (6, 2)), np.full(6, -2.0)])

@@ -31,7 +31,7 @@ from scattering_gradients import (
 from scattering_scenes import PLACE, Pencils, aimed, fog, mivol, pencils, point, rough_grid, smoke, spot, sun
 
 import scenes
-from mivol.validate.statistics import Moments
+from mivol.validate.moments import Moments
 from scenes import as_float32, box_of, grid_volume, medium
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
@@ -436,7 +436,7 @@ def test_extinction_of_microflakes(key):
 
 @pytest.mark.statistical
 @pytest.mark.parametrize(("name", "key"), [("point", "intensity"), ("spot", "intensity"), ("sun", "irradiance")])
-def test_power_of_a_emitter(name, key):
+def test_power_of_an_emitter(name, key):
     """Linear: the derivative is the picture of a lamp of 1."""
     lamp = LAMPS[name]()
     values = rough_grid(9)

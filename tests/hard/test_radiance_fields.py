@@ -52,7 +52,8 @@ from mivol.optim.radiance_problem import RadianceProblem
 from mivol.optim.ray_batches import TILE, RayBatches
 from mivol.photos import Camera, Photo, pixel_centres, rays
 from mivol.photos.camera import intrinsics
-from mivol.transport.line_integrals.radiance_field import backward, bake, cells_of, exact, model_of, render
+from mivol.transport.line_integrals.radiance_field import RayGradient, backward, cells_of, model_of, render
+from mivol.transport.line_integrals.radiance_source import bake, exact
 from mivol.transport.traversal.empty_blocks import REACH
 from mivol.transport.traversal.lattice import clip
 from mivol.transport.traversal.occupied_cells import march
@@ -208,7 +209,7 @@ def test_a_ray_that_ends_inside_a_cell() -> None:
     ends = np.float32(entry + whole * np.random.default_rng(2).uniform(-0.3, 1.3, 60))
     ray.t_max = mi.Float(ends)
     cells = cells_of(field)
-    source, model = exact(field, ray, slope=True), model_of(field)
+    source, model = exact(field, ray.d, slope=True), model_of(field)
     seen = render(cells, source, model, ray)
     L = np.clip(ends - entry, 0, whole)
     # t_max is near 5 length units, of which float32 keeps 2.4e-7, and so do the faces of the box; times sigma.
@@ -216,7 +217,7 @@ def test_a_ray_that_ends_inside_a_cell() -> None:
     np.testing.assert_allclose(np.array(seen.T), np.exp(-sigma * L), atol=tolerance)
     sent = np.outer(-np.expm1(-sigma * L), np.full(3, 0.5 + Y0))
     np.testing.assert_allclose(np.array(seen.colour).T, sent, atol=tolerance)
-    backward(cells, source, model, seen, mi.Color3f(0), 1.0)
+    backward(cells, source, model, seen, RayGradient(mi.Color3f(0), 1.0))
     assert np.array(source.density_slope, np.float64).sum() == pytest.approx(-np.sum(L * np.exp(-sigma * L)), rel=1e-5)
     share = L / whole
     assert all(kind.any() for kind in (share == 0, share == 1, (share > 0) & (share < 1)))
@@ -387,7 +388,7 @@ def test_memory_goes_with_what_is_there() -> None:
     cells, pinholes = cells_of(field), np.array([[3.0, 0, 0]])
     tables = bake(field, cells, pinholes, mi.UInt32(0), slope=True)
     ray = rays_of([3, 0, 0], [-1, 0, 0])
-    slopes = exact(field, ray, slope=True)
+    slopes = exact(field, ray.d, slope=True)
     held = [field.density, field.harmonics] * 2  # the values and the optimiser's squares
     held += [slopes.density_slope, slopes.harmonics_slope, field.nodes, field.node_rows()]
     held += [cells.number, cells.corners, cells.rows, tables.table, tables.slope]

@@ -16,7 +16,7 @@ from scattering_scenes import PLACE, Pencils, aimed, fog, mivol, pencils, point,
 
 import scenes
 from mivol.errors import MivolError
-from mivol.validate.statistics import Moments
+from mivol.validate.moments import Moments
 from scenes import as_float32, box_of, centred, grid_volume, medium, refused, tensor
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")

@@ -31,7 +31,7 @@ from mivol.optim.rmsprop import RMSprop
 from mivol.optim.scene_problem import SceneProblem, views_of
 from mivol.optim.schedules import Cosine
 from mivol.optim.seeds import seed_of
-from mivol.validate.statistics import Moments
+from mivol.validate.moments import Moments
 
 EPS = float(np.finfo(np.float32).eps)
 

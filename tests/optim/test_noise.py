@@ -26,7 +26,7 @@ from mivol.optim.packing import Packing
 from mivol.optim.parameters import Parameter
 from mivol.optim.render_batches import View
 from mivol.optim.scene_problem import SceneProblem
-from mivol.validate.statistics import Moments
+from mivol.validate.moments import Moments
 
 SIGMA, SEEN, SPP = 0.4, 0.6, 8
 T = math.exp(-2 * SIGMA)

@@ -19,7 +19,8 @@ from mivol.optim.radiance_plan import Stage
 from mivol.optim.radiance_problem import RadianceProblem
 from mivol.optim.ray_batches import TILE, RayBatches
 from mivol.photos import Lens, Photo
-from mivol.transport.line_integrals.radiance_field import bake, cells_of, model_of, render
+from mivol.transport.line_integrals.radiance_field import cells_of, model_of, render
+from mivol.transport.line_integrals.radiance_source import bake
 
 
 def test_a_fit_finds_what_it_did_not_see(variant_rgb: str, photos: list[Photo]) -> None:

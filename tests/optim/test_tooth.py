@@ -34,7 +34,7 @@ from mivol.tomography.preprocess import (
     normalise_air,
 )
 from mivol.tomography.projector import Projector
-from mivol.validate.statistics import Moments
+from mivol.validate.moments import Moments
 
 SCRIPT = Path(__file__).resolve().parents[2] / "scripts" / "tooth.py"
 

@@ -8,12 +8,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mivol.bench.agreement import MeanError, compare_means, finite, mean_of_rounds, number
+from mivol.bench.agreement import compare_means, finite, mean_of_rounds, number
 from mivol.bench.bars import say
 from mivol.bench.gradients.size import LIGHTS, OURS, STOCK, Size
 from mivol.bench.gradients.subject import SEEDS, Subject, along, compete, subjects, variance_over
 from mivol.bench.timing import ratio_of
-from mivol.validate.statistics import Moments
+from mivol.validate.moments import Moments
+from mivol.validate.statistics import Estimate
 
 __all__ = ["Case", "cases", "difference", "measure_estimators", "refine", "table_row"]
 
@@ -99,7 +100,7 @@ def table_row(case: Case, parts: Callable[[], dict], size: Size) -> dict:
     known = {"percent": size.certain_percent, "most": size.most_estimates}
     derivatives[OURS] = refine(derivatives[OURS], derivative, **known)
     truth = mean_of_rounds(refine([differ(k) for k in range(size.table_rounds)], differ, **known))
-    row = {"finite_difference": truth.mean, "its_standard_error": math.sqrt(truth.variance)}
+    row = {"finite_difference": truth.mean, "its_standard_error": math.sqrt(truth.var)}
     for name, timing in timings.items():
         row[name] = figures_of(derivatives[name], truth) | {
             "variance": variance_over(timing, case.direction > 0),
@@ -111,7 +112,7 @@ def table_row(case: Case, parts: Callable[[], dict], size: Size) -> dict:
     return row
 
 
-def figures_of(derivatives: np.ndarray, truth: MeanError) -> dict:
+def figures_of(derivatives: np.ndarray, truth: Estimate) -> dict:
     """Derivatives (rounds,) of one estimator against the finite difference."""
     found = compare_means(mean_of_rounds(derivatives), truth, 2 * len(LIGHTS) * len(cases(2)))
     return {

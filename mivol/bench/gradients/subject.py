@@ -12,7 +12,7 @@ import numpy as np
 from mivol.bench.gradients.size import ALBEDO, OURS, STOCK
 from mivol.bench.scenes import box_scene, depth_two
 from mivol.bench.timing import Budget, Contestant, Timing, race
-from mivol.validate.statistics import Moments
+from mivol.validate.moments import Moments
 
 __all__ = ["KEY", "SEEDS", "Step", "Subject", "along", "compete", "subjects", "variance_over"]
 

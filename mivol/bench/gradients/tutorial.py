@@ -10,14 +10,15 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mivol.bench.agreement import MeanError, compare_means, mean_of_rounds
+from mivol.bench.agreement import compare_means, mean_of_rounds
 from mivol.bench.bars import say
 from mivol.bench.extinctions import TUTORIAL_SCALE, smoke
 from mivol.bench.gradients.size import ALBEDO, OURS, STOCK, Size
 from mivol.bench.gradients.subject import KEY
 from mivol.bench.scenes import box_scene, constant_light, depth_two, perspective
 from mivol.bench.timing import Stopwatch
-from mivol.validate.statistics import nrmse
+from mivol.validate.metrics import nrmse
+from mivol.validate.statistics import Estimate
 
 __all__ = ["Run", "at_voxels", "finish", "measure_tutorial", "upright"]
 
@@ -159,7 +160,7 @@ def check_references(scene: mi.Scene, sensors: list, references: list, spp: int)
         return float(np.mean([np.array(image).mean() for image in images]))
 
     ours = float(np.mean([np.array(r, np.float64).mean() for r in references]))
-    found = compare_means(MeanError(ours, 0.0, math.inf), mean_of_rounds(np.array([batch(b) for b in range(8)])), 1)
+    found = compare_means(Estimate(ours, 0.0, math.inf), mean_of_rounds(np.array([batch(b) for b in range(8)])), 1)
     error = found["standard_error_percent"]
     return {
         "mean": ours,

@@ -22,7 +22,7 @@ from mivol.optim.radiance_fit import begin_radiance_fit, newest_field
 from mivol.optim.radiance_plan import FitPlan, Stage
 from mivol.optim.ray_batches import TILE, RayBatch, RayBatches
 from mivol.photos import Camera, Photo
-from mivol.validate.statistics import psnr
+from mivol.validate.metrics import psnr
 
 __all__ = ["Pixels", "ask_fit", "ask_locality", "our_fit", "peer_fit"]
 

@@ -17,7 +17,8 @@ from mivol.bench.radiance_field.size import STOP, Size
 from mivol.bench.radiance_field.views import camera, rays_of, rays_through, ring, tiled
 from mivol.bench.timing import race, ratio_of
 from mivol.fields.spherical import SphericalGrid
-from mivol.transport.line_integrals.radiance_field import RayBundle, backward, bake, cells_of, exact, fold, model_of, render
+from mivol.transport.line_integrals.radiance_field import RayBundle, RayGradient, backward, cells_of, model_of, render
+from mivol.transport.line_integrals.radiance_source import bake, exact, fold
 
 __all__ = ["Task", "ask_memory", "ask_step", "our_step", "peer_of", "peer_step", "tasks"]
 
@@ -57,10 +58,10 @@ def our_step(field: SphericalGrid, task: Task) -> Callable[[int], list[mi.Float]
 
     def step(number: int) -> list[mi.Float]:
         baked = view is not None
-        source = bake(field, cells, task.pinholes, view, True) if baked else exact(field, task.rays, True)
+        source = bake(field, cells, task.pinholes, view, True) if baked else exact(field, task.rays.d, True)
         seen = render(cells, source, model, task.rays)
         dr.eval(seen)
-        backward(cells, source, model, seen, 2 * seen.colour)
+        backward(cells, source, model, seen, RayGradient(2 * seen.colour))
         return list(fold(field, cells, source, task.pinholes)) if baked else [source.density_slope, source.harmonics_slope]
 
     return step

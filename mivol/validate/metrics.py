@@ -1,0 +1,62 @@
+"""Distances between images and between volumes: PSNR, relative error, structural similarity. None of them knows of noise."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mivol.errors import MivolError
+
+__all__ = ["nrmse", "psnr", "ssim"]
+
+
+def _rms(a: np.ndarray, b: np.ndarray) -> float:
+    return float(np.sqrt(np.mean((np.asarray(a, dtype=np.float64) - b) ** 2)))
+
+
+def psnr(image: np.ndarray, truth: np.ndarray, peak: float | None = None) -> float:
+    """Peak signal to noise ratio, 20 log10(peak / RMSE) [dB]; infinite for equal images.
+
+    Args:
+        peak: the largest value of a signal; by default the truth's.
+
+    Raises:
+        MivolError: the peak is not above 0.
+    """
+    peak = float(np.max(truth)) if peak is None else peak
+    if not peak > 0:
+        raise MivolError(f"a peak of {peak} leaves no signal to compare the noise with; give the largest value expected.")
+    error = _rms(image, truth)
+    return float("inf") if error == 0 else float(20 * np.log10(peak / error))
+
+
+def nrmse(x: np.ndarray, truth: np.ndarray) -> float:
+    """Root mean square error divided by the root mean square of the truth: |x - truth| / |truth|.
+
+    (Some divide by the range of the truth instead, which makes the number of a mostly empty volume several times smaller.)
+
+    Raises:
+        MivolError: the truth is 0 everywhere.
+    """
+    norm = float(np.linalg.norm(np.asarray(truth, dtype=np.float64)))
+    if norm == 0:
+        raise MivolError("the truth is 0 everywhere; a relative error has no meaning there.")
+    return float(np.linalg.norm(np.asarray(x, dtype=np.float64) - truth)) / norm
+
+
+def ssim(image: np.ndarray, truth: np.ndarray, peak: float | None = None) -> float:
+    """Structural similarity (Wang et al. 2004, IEEE TIP 13), by scikit-image, mean over channels; 1 for equal images.
+
+    The window is the paper's, 11 x 11 pixels with Gaussian weights of standard deviation 1.5, wholly inside the image.
+
+    Raises:
+        MivolError: the image is smaller than the window.
+    """
+    from skimage.metrics import structural_similarity  # slow to import
+
+    truth = np.asarray(truth, dtype=np.float64)
+    if min(truth.shape[:2]) < 11:
+        raise MivolError(f"an image of {truth.shape[1]}x{truth.shape[0]} is smaller than the 11 pixel window of SSIM.")
+    window = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False}
+    peak = float(truth.max()) if peak is None else peak
+    axis = 2 if truth.ndim == 3 else None
+    return float(structural_similarity(np.asarray(image, np.float64), truth, data_range=peak, channel_axis=axis, **window))

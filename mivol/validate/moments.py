@@ -1,0 +1,112 @@
+"""Running means and variances of independent batches, and averages over tiles of pixels.
+
+Conventions. float64 throughout; the variance of a mean is the standard error squared.
+
+Source: Welford 1962 (Technometrics 4) and Chan, Golub, LeVeque 1983 (The American Statistician 37).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mivol.errors import MivolError
+
+__all__ = ["Moments", "pool", "tiles_of"]
+
+
+@dataclass(frozen=True)
+class Moments:
+    r"""Mean and sum of squared deviations of n values, one or many at a time.
+
+    A value x changes the mean m and the sum M of squared deviations by
+
+    .. math:: d = x - m, \quad m' = m + d/n', \quad M' = M + d\,(x - m'),
+
+    and two sets merge by
+
+    .. math:: m = m_a + \delta\,n_b/n, \quad M = M_a + M_b + \delta^2 n_a n_b/n, \quad \delta = m_b - m_a:
+
+    no large numbers are subtracted, so that M keeps its digits where the naive sum of squares minus n m^2 loses them all.
+
+    Attributes:
+        n: number of values.
+        mean: float64 array.
+        m2: sum of squared deviations from the mean, same shape.
+    """
+
+    n: int
+    mean: np.ndarray
+    m2: np.ndarray
+
+    @staticmethod
+    def empty(shape: tuple[int, ...] = ()) -> Moments:
+        """No values yet."""
+        return Moments(0, np.zeros(shape), np.zeros(shape))
+
+    @staticmethod
+    def of(values: np.ndarray) -> Moments:
+        """Moments of all values along the first axis."""
+        v = np.asarray(values, dtype=np.float64)
+        mean = v.mean(axis=0)
+        return Moments(len(v), mean, ((v - mean) ** 2).sum(axis=0))
+
+    def add(self, value: np.ndarray) -> Moments:
+        """With one value more (Welford)."""
+        x = np.asarray(value, dtype=np.float64)
+        n = self.n + 1
+        mean = self.mean + (x - self.mean) / n
+        return Moments(n, mean, self.m2 + (x - self.mean) * (x - mean))
+
+    def merge(self, other: Moments) -> Moments:
+        """With all values of another set (Chan, Golub, LeVeque)."""
+        n = self.n + other.n
+        if n == 0:
+            return self
+        delta = other.mean - self.mean
+        mean = self.mean + delta * (other.n / n)
+        return Moments(n, mean, self.m2 + other.m2 + delta**2 * (self.n * other.n / n))
+
+    @property
+    def variance(self) -> np.ndarray:
+        """Unbiased variance of one value, M/(n - 1).
+
+        Raises:
+            MivolError: fewer than two values.
+        """
+        if self.n < 2:
+            raise MivolError(f"the variance of {self.n} batches is not known; at least 2 are needed.")
+        return self.m2 / (self.n - 1)
+
+    @property
+    def variance_of_mean(self) -> np.ndarray:
+        """Unbiased variance of the mean of n independent values, M/(n (n - 1))."""
+        return self.variance / self.n
+
+
+def pool(mean: np.ndarray, var: np.ndarray, tile: int) -> tuple[np.ndarray, np.ndarray]:
+    """Average tiles of pixels, for estimators with heavy tails.
+
+    A batch mean with rare bright samples is far from normal: seen rarely, both its mean and its variance are too small.
+    The skewness of an average of k independent values falls as 1/sqrt(k), so tiles come nearer to the normal law than
+    pixels; what is lost is the place of a bias smaller than a tile. Rows and columns that fill no tile are left out.
+
+    Args:
+        mean: (H, W, C).
+        var: (H, W, C), of independent pixels (a box filter).
+        tile: side of a tile [pixel].
+
+    Returns:
+        mean and variance of the mean, (H // tile, W // tile, C).
+    """
+    return tiles_of(mean, tile).mean(axis=(1, 3)), tiles_of(var, tile).sum(axis=(1, 3)) / tile**4
+
+
+def tiles_of(image: np.ndarray, tile: int) -> np.ndarray:
+    """An image (H, W, C) as (rows of tiles, tile, columns of tiles, tile, C), without what fills no tile."""
+    h, w, c = image.shape
+    if tile < 1 or h < tile or w < tile:
+        raise MivolError(f"tiles of {tile} pixels do not fit an image of {w}x{h}; choose 1 to {min(h, w)}.")
+    cut = (h // tile, tile, w // tile, tile, c)
+    return image[: cut[0] * tile, : cut[2] * tile].reshape(cut)

@@ -1,0 +1,199 @@
+"""A reference image on disk, and the checkpoint of its batches.
+
+Conventions. A reference is one OpenEXR file, float32: channels R, G, B and variance.R, .G, .B (Y and variance.Y in mono
+variants). Its header says what it is an image of (the scene's content hash) and how it was made. Beside it
+``<name>.state.npz`` holds the moments of the batches so far in float64, so that stopping changes nothing and a better reference
+can be asked for later.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import mivol
+from mivol.errors import MivolError
+from mivol.files.atomic import write_whole
+from mivol.files.exr import read_exr, write_exr
+from mivol.validate.moments import Moments
+from mivol.validate.trust import Doubt
+
+__all__ = [
+    "ReferenceResult",
+    "check_identity",
+    "destination_of",
+    "read_reference",
+    "read_state",
+    "relative_error",
+    "save_state",
+    "state_path",
+    "write_reference",
+]
+
+
+@dataclass(frozen=True)
+class ReferenceResult:
+    """A reference image.
+
+    Attributes:
+        mean: (H, W, C) radiance.
+        variance: (H, W, C) of the mean.
+        batches: independent batches behind both.
+        spp: samples behind each pixel and channel.
+        identity: what it is an image of, and how it was made; equal for references that may be averaged.
+        path: its file.
+        doubts: why it should not be believed, where there are reasons.
+        seconds: time spent rendering, all sessions together.
+        reached: whether it has the accuracy that was asked for; False where ``max_spp`` came first.
+    """
+
+    mean: np.ndarray
+    variance: np.ndarray
+    batches: int
+    spp: int
+    identity: dict[str, Any]
+    path: Path
+    doubts: tuple[Doubt, ...] = ()
+    seconds: float = 0.0
+    reached: bool = True
+
+    @property
+    def standard_error(self) -> float:
+        """Root mean square over pixels and channels of the standard error of the mean [radiance]."""
+        return float(np.sqrt(self.variance.mean()))
+
+    @property
+    def relative_error(self) -> float:
+        """``standard_error`` divided by the mean absolute radiance of the image."""
+        return relative_error(self.standard_error, self.mean)
+
+    @property
+    def text(self) -> str:
+        """One paragraph."""
+        how = self.identity
+        missed = "" if self.reached else ", above the target"
+        one = "each channel alone" if how["channels_alone"] else "all channels at once"
+        doubts = "".join(f" Doubt: {d.sentence}" for d in self.doubts)
+        return (
+            f"{self.path.name}: {self.mean.shape[1]}x{self.mean.shape[0]} by {how['integrator']} "
+            f"(max_depth {how['max_depth']}, {one}), {self.spp} samples a pixel in {self.batches} batches, "
+            f"standard error {self.standard_error:.3g} "
+            f"({100 * self.relative_error:.2g} % of the mean{missed}), {self.seconds:.0f} s.{doubts}"
+        )
+
+
+def relative_error(error: float, mean: np.ndarray) -> float:
+    """An error divided by the mean absolute radiance of an image; infinite where that is 0 and the error is not."""
+    level = float(np.abs(mean).mean())
+    return error / level if level > 0 else (0.0 if error == 0 else float("inf"))
+
+
+def read_reference(path: str | Path, content_hash: str | None = None) -> ReferenceResult:
+    """Read a reference from its file.
+
+    Args:
+        path: the EXR.
+        content_hash: of the scene that it must be a reference of; None: any.
+
+    Raises:
+        MivolError: not a reference of mivol's, or that of another scene.
+    """
+    channels, header = read_exr(path)
+    if "mivol_reference" not in header:
+        raise MivolError(f"{path} is an image but not a reference of mivol's; make one with mivol reference.")
+    made = json.loads(header["mivol_reference"])
+    names = [name for name in ("R", "G", "B", "Y") if name in channels]
+    if content_hash is not None and made["identity"]["scene"] != content_hash:
+        raise MivolError(_other(Path(path), "scene", made["identity"]["scene"], content_hash))
+    return ReferenceResult(
+        mean=np.stack([channels[n] for n in names], axis=-1).astype(np.float64),
+        variance=np.stack([channels[f"variance.{n}"] for n in names], axis=-1).astype(np.float64),
+        batches=made["batches"],
+        spp=made["spp"],
+        identity=made["identity"],
+        path=Path(path),
+        doubts=tuple(Doubt(**d) for d in made["doubts"]),
+        seconds=made["seconds"],
+    )
+
+
+def destination_of(out: Path, name: str, identity: dict[str, Any]) -> Path:
+    """The file of a reference: ``out`` itself, or a file in the folder ``out`` named after the scene and the identity.
+
+    Raises:
+        MivolError: another suffix than .exr.
+    """
+    if out.suffix.lower() == ".exr":
+        return out
+    if out.suffix or (out.exists() and not out.is_dir()):
+        raise MivolError(f"a reference is an OpenEXR file, not {out.name}; give a name that ends in .exr, or a folder.")
+    out.mkdir(parents=True, exist_ok=True)
+    how = hashlib.sha256(json.dumps(identity, sort_keys=True).encode()).hexdigest()
+    return out / f"{name}-{identity['scene'][:12]}-{how[:8]}.exr"
+
+
+def state_path(path: Path) -> Path:
+    """Where the batches so far are kept."""
+    return path.with_suffix(".state.npz")
+
+
+def check_identity(path: Path, found: dict[str, Any], wanted: dict[str, Any]) -> None:
+    """Refuse what is on disk where it shows another scene or was made in another way than is wanted.
+
+    Raises:
+        MivolError: the first key that differs.
+    """
+    for key, value in wanted.items():
+        if found.get(key) != value:
+            raise MivolError(_other(path, key, found.get(key), value))
+
+
+def _other(path: Path, key: str, found: Any, wanted: Any) -> str:
+    if key == "scene":
+        return (
+            f"{path} is the reference of another scene (content {str(found)[:12]}, not {str(wanted)[:12]}); choose another "
+            "file, or delete it."
+        )
+    return f"{path} was made with {key} = {found}, not {wanted}; choose another file, or delete it."
+
+
+def save_state(path: Path, identity: dict[str, Any], moments: Moments, seconds: float) -> None:
+    """Write the batches so far beside a reference."""
+    text = json.dumps({"identity": identity, "seconds": seconds})
+    m = moments
+    write_whole(state_path(path), lambda file: np.savez(file, n=m.n, mean=m.mean, m2=m.m2, made=np.array(text)))
+
+
+def read_state(state: Path) -> tuple[dict[str, Any], Moments]:
+    """The batches of a checkpoint, with ``identity`` and ``seconds``.
+
+    Raises:
+        MivolError: it is not whole.
+    """
+    try:
+        with state.open("rb") as file, np.load(file) as stored:
+            return json.loads(str(stored["made"])), Moments(int(stored["n"]), stored["mean"], stored["m2"])
+    except (ValueError, KeyError, OSError, EOFError, zipfile.BadZipFile) as error:
+        raise MivolError(f"{state} is not a whole checkpoint of a reference; delete it to start over.") from error
+
+
+def write_reference(result: ReferenceResult) -> None:
+    """Write the image, its variance and how it was made to ``result.path``."""
+    names = "RGB" if result.mean.shape[-1] == 3 else "Y"
+    channels = {name: result.mean[..., i] for i, name in enumerate(names)}
+    channels |= {f"variance.{name}": result.variance[..., i] for i, name in enumerate(names)}
+    made = {
+        "identity": result.identity,
+        "batches": result.batches,
+        "spp": result.spp,
+        "seconds": result.seconds,
+        "doubts": [vars(d) for d in result.doubts],
+        "mivol": mivol.__version__,
+    }
+    write_exr(result.path, channels, {"mivol_reference": json.dumps(made)})
