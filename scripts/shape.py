@@ -13,6 +13,8 @@ import statistics
 import sys
 from pathlib import Path
 
+__all__ = ["circles", "find_circles", "measure"]
+
 ROOT = Path(__file__).resolve().parents[1]
 MANY = 7
 LONG_FUNCTION, LONG_FILE = 60, 300
@@ -38,7 +40,7 @@ def measure(package: Path) -> dict[str, object]:
                 name = f"{path.relative_to(package)}:{node.name}"
                 bodies[name], parameters[name] = _body(node), _parameters(node)
     trains = sum(_is_train(node) for tree in trees.values() for node in ast.walk(tree) if isinstance(node, ast.FunctionDef))
-    circle = sorted(_circles(package, trees))
+    circle = sorted(_circles_of(package, trees))
     return {
         "files": len(trees),
         "lines": sum(lines.values()),
@@ -75,18 +77,26 @@ def _largest(sizes: dict[str, int], least: int) -> dict[str, int]:
     return {name: size for name, size in sorted(sizes.items(), key=lambda item: -item[1]) if size >= least}
 
 
-def _circles(package: Path, trees: dict[Path, ast.Module]) -> list[str]:
-    """Modules that can be reached from themselves along imports, those for types alone included."""
+def find_circles(package: Path) -> list[str]:
+    """Modules of a package that can be reached from themselves along imports, those for types alone included."""
+    return _circles_of(package, {path: ast.parse(path.read_text(), str(path)) for path in sorted(package.rglob("*.py"))})
+
+
+def _circles_of(package: Path, trees: dict[Path, ast.Module]) -> list[str]:
     names = {".".join((package.name, *path.relative_to(package).with_suffix("").parts)): path for path in trees}
-    edges = {name: _imported(trees[path], set(names)) - {name} for name, path in names.items()}
+    return circles({name: _imported(trees[path], set(names)) - {name} for name, path in names.items()})
+
+
+def circles(edges: dict[str, set[str]]) -> list[str]:
+    """Nodes of a graph that can be reached from themselves, in the order of ``edges`` (node -> nodes it points to)."""
     found = []
     for start in edges:
         seen, ahead = set(), list(edges[start])
         while ahead:
-            module = ahead.pop()
-            if module not in seen:
-                seen.add(module)
-                ahead += edges[module]
+            node = ahead.pop()
+            if node not in seen:
+                seen.add(node)
+                ahead += edges.get(node, ())
         found += [start] if start in seen else []
     return found
 

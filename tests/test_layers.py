@@ -8,7 +8,10 @@ from functools import cache
 from pathlib import Path
 
 import pytest
+from script_modules import load
 from syntax import tree_of
+
+shape = load("shape")
 
 PACKAGE = Path(__file__).resolve().parents[1] / "mivol"
 ORDER = [
@@ -92,32 +95,12 @@ def wrong_arrows_inside(parts: tuple[str, ...], names: Iterable[tuple[str, int]]
     return wrong
 
 
-def circles(edges: dict[str, set[str]]) -> list[str]:
-    """Modules that can be reached from themselves along imports."""
-    found = []
-    for start in edges:
-        seen, ahead = set(), list(edges[start])
-        while ahead:
-            module = ahead.pop()
-            if module not in seen:
-                seen.add(module)
-                ahead += edges.get(module, ())
-        found += [start] if start in seen else []
-    return found
-
-
 def test_no_circle_of_imports() -> None:
     """Imports for types alone count: who needs them cannot be read without the others."""
-    modules = {".".join(("mivol", *path.relative_to(PACKAGE).with_suffix("").parts)): path for path in MODULES}
-    edges = {}
-    for module, path in modules.items():
-        names = {name for name, _ in imported(path)}
-        edges[module] = (names | {name.rpartition(".")[0] for name in names}) & modules.keys() - {module}
-    assert circles(edges) == []
+    assert shape.find_circles(PACKAGE) == []
 
 
-def test_circles_are_seen() -> None:
-    assert circles({"a": {"b"}, "b": {"c"}, "c": {"b"}, "d": {"a"}}) == ["b", "c"]
+def test_wrong_arrows_inside_a_room_are_seen() -> None:
     names = [("mivol.transport.path.walk.Path", 1), ("mivol.transport.media.body.Body", 2), ("mivol.fields.sky", 3)]
     assert wrong_arrows_inside(("transport", "estimators", "segment.py"), names) == ["line 1: mivol.transport.path.walk.Path"]
 

@@ -7,27 +7,14 @@ held against small files, where all that may and may not be broken is known.
 from __future__ import annotations
 
 import ast
-import importlib
-import sys
 from functools import cache
 from pathlib import Path
-from types import ModuleType
 
 import pytest
+from script_modules import load
 from syntax import tree_of
 
 ROOT = Path(__file__).resolve().parents[1]
-
-
-SCRIPTS = ROOT / "scripts"
-
-
-def load(name: str) -> ModuleType:
-    """A script as a module; scripts find what they share beside them."""
-    if str(SCRIPTS) not in sys.path:
-        sys.path.append(str(SCRIPTS))
-    return importlib.import_module(name)
-
 
 mutate, faults, guards, survivors = map(load, ("mutate", "faults", "guards", "survivors"))
 ENTRIES = mutate.load_entries()
