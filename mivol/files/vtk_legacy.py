@@ -130,9 +130,8 @@ def _floats(keys: dict[str, list[str]], path: Path, *names: str) -> np.ndarray:
 
 
 def _arrays(cursor: _Cursor, points: list[int]) -> dict[str, tuple[np.ndarray, bool]]:
-    """name -> (flat numbers, whether on cells); reading ends at the first word that is not known."""
+    """name -> (flat numbers, whether on cells); the cursor is at a section, and reading ends at the first unknown word."""
     arrays: dict[str, tuple[np.ndarray, bool]] = {}
-    count, is_cell = 0, False
     while words := cursor.line():
         key = words[0].upper()
         if key in SECTIONS:

@@ -182,6 +182,8 @@ def test_when_ours_is_there_is_read_off_its_own_clock() -> None:
     assert (last["mivol_after_iterations"], last["sooner"], last["sooner_by_processor_time"]) == (2, 30.0, 40.0)
     assert last["density_errors"] == {OURS: 0.8, STOCK: 0.84}
     assert (lowest["mivol_after_iterations"], lowest["sooner"]) == (3, 10.0)
+    assert got["whole_schedule_is_faster"] == 20.0
+    assert got["ends"] == {OURS: {"loss": 0.5, "density_error": 0.7}, STOCK: {"loss": 1.0, "density_error": 0.84}}
     ours.loss = [5.0, 4.0, 3.0]
     assert finish({OURS: ours, STOCK: theirs})["to_its_lowest_loss"]["sooner"] == 0
 

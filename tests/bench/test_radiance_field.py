@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import drjit as dr
 import mitsuba as mi
@@ -57,6 +59,49 @@ def test_both_fits_learn_the_views(variant_rgb: str) -> None:
         assert len(curve) == stages
         assert curve[-1][1] > black + 1
         assert all(0 < early < late for (early, _), (late, _) in itertools.pairwise(curve))
+
+
+def asked_plans(monkeypatch: pytest.MonkeyPatch, fit: Callable[[], object]) -> list[list[tuple]]:
+    """The stages of each plan that a bench fits: resolution, steps, shrinking, views and tiles of a step."""
+    asked = []
+
+    def begin(views: object, box: object, plan: object) -> SimpleNamespace:
+        asked.append([(s.longest, s.steps, s.shrink, s.views, s.tiles) for s in plan.stages])
+        return SimpleNamespace(course=SimpleNamespace(iterations=0), advance=lambda: None)
+
+    monkeypatch.setattr(fits, "begin_radiance_fit", begin)
+    monkeypatch.setattr(fits.RayBatches, "of", lambda *of: of)
+    fit()
+    return asked
+
+
+def test_our_fit_has_three_stages(monkeypatch: pytest.MonkeyPatch, variant_rgb: str) -> None:
+    """An eighth, a quarter and all of the nodes, from views shrunk by 4, by 2 and not at all; each is compiled first."""
+    size = replace(QUICK, fit_resolution=32, fit_side=64, steps=10)
+    plans = asked_plans(monkeypatch, lambda: our_fit([], [], size))
+    assert plans[-1] == [(4, 10, 4, 7, 9), (8, 10, 2, 7, 9), (32, 20, 1, 7, 36)]
+    assert plans[:-1] == [[(n, 2, shrink, 7, tiles)] for n, _, shrink, _, tiles in plans[-1]]
+    small = asked_plans(monkeypatch, lambda: our_fit([], [], replace(size, fit_side=8)))[-1]
+    assert [stage[-1] for stage in small] == [1, 1, 4]
+
+
+@pytest.mark.parametrize("kind", ["camera", "pixels", "any"])
+def test_rays_of_a_step(variant_rgb: str, kind: str) -> None:
+    """Of one camera, of pixels of eight, sorted by view, or from a sphere of radius 3 towards points of the field."""
+    task, n = tasks(TINY)[kind], TINY.side**2
+    o, d = np.array(task.rays.o).T, np.array(task.rays.d).T
+    assert len(o) == len(d) == n
+    # Of float32 numbers of size 3.
+    np.testing.assert_allclose(np.linalg.norm(d, axis=1), 1, atol=1e-6)
+    if kind == "any":
+        np.testing.assert_allclose(np.linalg.norm(o, axis=1), 3, atol=1e-6)
+        assert task.view is None and task.pinholes is None
+        # The target was in [-0.7, 0.7]^3: the ray passes the middle within the corner of that.
+        assert np.linalg.norm(np.cross(o, d), axis=1).max() <= 0.7 * np.sqrt(3) + 1e-5
+        return
+    assert len(task.pinholes) == (1 if kind == "camera" else 8)
+    assert (np.diff(task.view) >= 0).all() and set(task.view) == set(range(len(task.pinholes)))
+    np.testing.assert_allclose(o, task.pinholes[task.view], atol=1e-6)
 
 
 def test_views_that_are_hit_exactly_count_100_decibels() -> None:

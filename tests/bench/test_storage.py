@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 
 import drjit as dr
@@ -90,3 +91,26 @@ def test_a_folder_that_holds_no_fit(tmp_path: Path, capsys: pytest.CaptureFixtur
     (tmp_path / "run.json").write_text("{}")
     assert storage.main(["--runs", str(tmp_path)]) == 1
     assert "has no field.npz; give folders of fits to photographs" in capsys.readouterr().err
+
+
+def test_a_fit_in_a_line():
+    """Whether it was judged, and whether it is sparse."""
+    dense = storage.Fitted("A fit", 64, 2, False, 262144, 1.0, 29 * 2**20, 14 * 2**20, None)
+    assert dense.text == "A fit: 64^3, dense SH 2, no held-out view; 262144 nodes (1e+02 %), 29 MiB, 14 MiB on disk, compressed"
+    sparse = replace(dense, sparse=True, kept=2621, share=0.01, psnr=31.426)
+    assert sparse.text == "A fit: 64^3, sparse SH 2, 31.43 dB; 2621 nodes (1 %), 29 MiB, 14 MiB on disk, compressed"
+
+
+@pytest.mark.parametrize(
+    ("count", "text"), [(0, "0 B"), (1000, "1e+03 B"), (1023, "1.02e+03 B"), (1024, "1 KiB"), (2**50, "1.02e+03 TiB")]
+)
+def test_bytes_in_units(count: int, text: str) -> None:
+    assert storage.size(count) == text
+
+
+def test_shares_are_numbers_up_to_1(capsys: pytest.CaptureFixture) -> None:
+    assert storage.arguments([]).kept == 0.1 and storage.arguments(["--kept", "1"]).kept == 1
+    for wrong in ("0", "1.01"):
+        with pytest.raises(SystemExit):
+            storage.arguments(["--kept", wrong])
+        assert f"--kept {wrong} is no share" in capsys.readouterr().err

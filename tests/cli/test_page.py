@@ -11,6 +11,7 @@ import io
 import json
 import platform
 import re
+import tomllib
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -23,6 +24,7 @@ from mivol.cite import CITATIONS, citations
 from mivol.errors import MivolError
 from mivol.files import write_exr, write_volume
 from mivol.report import figures, show
+from mivol.report import page as page_module
 from mivol.report.page import headline, write_page
 from mivol.report.record import (
     Image,
@@ -126,6 +128,14 @@ def test_page_shows_all_that_the_record_names(run_folder, page):
         assert source.title in page.text
     assert "[views]" in page.text and "held_out = 2" in page.text
     assert [tag for tag, _ in page.tags].count("svg") == 2
+
+
+def test_a_configuration_is_shown_as_toml():
+    """Tables within tables by their full names, plain values first, and nothing that is not set."""
+    config = {"a": {"b": {"c": 1, "d": None}, "e": "x"}, "f": [{"g": 2.5, "h": None}, {"g": True}], "i": None}
+    text = page_module._toml(config)
+    assert text == 'f = [{ g = 2.5 }, { g = true }]\n\n[a]\ne = "x"\n\n[a.b]\nc = 1'
+    assert tomllib.loads(text) == {"a": {"b": {"c": 1}, "e": "x"}, "f": [{"g": 2.5}, {"g": True}]}
 
 
 def test_page_has_unique_ids_and_named_pictures(page):

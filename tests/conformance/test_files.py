@@ -468,8 +468,23 @@ def test_png_is_srgb(tmp_path: Path) -> None:
     row = np.array([[[0.5, 0.002, 2.0, 0.5], [-1.0, 1.0, 0.0, 1.0]]])
     files.write_png(tmp_path / "a.png", row)
     assert np.array(Image.open(tmp_path / "a.png")).tolist() == [[[188, 7, 255, 128], [0, 255, 0, 255]]]
-    files.write_png(tmp_path / "b.png", np.full((2, 3), 0.5))
-    assert np.array(Image.open(tmp_path / "b.png")).tolist() == [[188] * 3] * 2
+    for grey in (np.full((2, 3), 0.5), np.full((2, 3, 1), 0.5)):
+        files.write_png(tmp_path / "b.png", grey)
+        assert np.array(Image.open(tmp_path / "b.png")).tolist() == [[188] * 3] * 2
+
+
+def test_png_names_the_pixel_that_is_no_number(tmp_path: Path) -> None:
+    for shape in ((4, 5), (4, 5, 3)):
+        image = np.zeros(shape)
+        image[2, 3] = np.nan
+        with pytest.raises(MivolError, match="NaN at row 2, column 3"):
+            files.write_png(tmp_path / "c.png", image)
+
+
+@pytest.mark.parametrize("shape", [(3,), (2, 3, 2), (2, 3, 5), (0, 3), (1, 2, 3, 3)])
+def test_png_is_no_other_array(tmp_path: Path, shape: tuple[int, ...]) -> None:
+    with pytest.raises(MivolError, match="reshape it|choose channels"):
+        files.write_png(tmp_path / "c.png", np.zeros(shape))
 
 
 # -- Whole writes ---------------------------------------------------------------------------------------------------

@@ -436,6 +436,13 @@ def test_colmap_points_make_the_box_without_outliers(tmp_path: Path, encoding: s
 
 
 @pytest.mark.parametrize("encoding", ["bin", "txt"])
+def test_colmap_need_not_tell_its_points(tmp_path: Path, encoding: str) -> None:
+    folder = write_colmap(tmp_path / "set", "PINHOLE", encoding)
+    (folder / "sparse" / "0" / f"points3D.{encoding}").unlink()
+    assert survey_photos(folder).points is None
+
+
+@pytest.mark.parametrize("encoding", ["bin", "txt"])
 def test_colmap_fisheye_is_refused_by_name(tmp_path: Path, encoding: str) -> None:
     with pytest.raises(MivolError, match="the camera model OPENCV_FISHEYE, expected one of SIMPLE_PINHOLE"):
         load_photos(write_colmap(tmp_path / "set", "OPENCV_FISHEYE", encoding))

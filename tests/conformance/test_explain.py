@@ -1,0 +1,57 @@
+"""The text that says what a scene needs: every fact of a medium in its line."""
+
+from __future__ import annotations
+
+import bounded_ball
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mivol.scene.explain import explain
+from scenes import ball_of, box_of, camera, centred, grid_volume, medium
+
+pytestmark = pytest.mark.usefixtures("variant_rgb")
+
+PLACE = centred(2 * np.eye(3))
+
+
+def facts(interior: dict, depth: int = 1, **more: dict) -> dict[str, str]:
+    """The lines of facts, by their first word."""
+    scene = mi.load_dict({"type": "scene", "fog": box_of(interior, PLACE), "sensor": camera([0, -9, 0], [0, 0, 0]), **more})
+    lines = explain(scene, max_depth=depth).partition("plan\n")[0].splitlines()[1:]
+    return {line.split()[0]: line.split(maxsplit=1)[1] for line in lines}
+
+
+def test_a_number_in_a_box_is_homogeneous():
+    """Its optical depth is that of the diagonal of a box of 2."""
+    found = facts(medium("homogeneous", 0.5))
+    assert found["medium"].startswith("fog: HomogeneousMedium in a box")
+    assert ", grey extinction, homogeneous, albedo 0, IsotropicPhaseFunction, optical depth at most 1.73" in found["medium"]
+    assert (found["surfaces"], found["emitters"]) == ("none", "none")
+    assert found["camera"] == "in no traced boundary" and found["variant"].startswith(mi.variant())
+
+
+def test_a_grid_says_its_voxels_and_a_bounded_field_its_name():
+    grid = grid_volume("mivol_voxels", np.ones((3, 4, 5, 3)), PLACE)
+    assert ", rgb extinction, 3x4x5, scatters, " in facts(medium("mivol_medium", grid, 0.5))["medium"]
+    bounded_ball.register()
+    ball = facts(medium("mivol_medium", {"type": "test_ball", "sigma": 1.5}))["medium"]
+    assert ", grey extinction, a bounded Ball, albedo 0, " in ball
+
+
+def test_surfaces_emitters_and_a_camera_inside():
+    inside = ball_of(medium("homogeneous", 0.5), (0, -9, 0), 2.0)
+    found = facts(medium("homogeneous", 0.5), wall={"type": "rectangle"}, sky={"type": "constant"}, around=inside)
+    assert found["surfaces"] == "Rectangle" and found["emitters"].startswith("ConstantBackgroundEmitter")
+    assert found["camera"] == "may be inside a medium"
+
+
+@pytest.mark.parametrize(("value", "doubtful"), [(0.01, False), (5.0, True)])
+def test_what_one_scattering_leaves_out(value: float, doubtful: bool) -> None:
+    """Of thin fog little, of dense fog most; of fog that does not scatter nothing is said."""
+    parts = {"fog": box_of(medium("homogeneous", value, 0.9), PLACE), "sky": {"type": "constant"}}
+    scene = mi.load_dict({"type": "scene", **parts, "sensor": camera([0, -9, 0], [0, 0, 0])})
+    text = explain(scene, max_depth=2)
+    assert "of the light that fog scatters (albedo 0.90, optical depth" in text and "constant light, isotropic phase)" in text
+    assert ("depth 2 is a poor model of it" in text) == doubtful
+    assert "one scattering" not in explain(scene, max_depth=1)
