@@ -13,7 +13,7 @@ from pathlib import Path
 
 __all__ = ["Guards", "imported_modules", "index_guards"]
 
-MOST_FILES = 10
+MOST_FILES = 5
 """Files of tests in the second round. Modules that half of the tests import would have most of the suite run otherwise."""
 
 

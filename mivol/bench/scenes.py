@@ -30,7 +30,6 @@ def perspective(side: int) -> dict:
             "height": side,
             "component_format": "float32",
             "rfilter": {"type": "box"},
-            "sample_border": False,
         },
         "sampler": {"type": "independent"},
     }

@@ -154,7 +154,7 @@ def write_volume(
 
 def _suffix(path: Path, table: Mapping[str, Any]) -> str:
     name = path.name.lower()
-    for suffix in sorted(table, key=len, reverse=True):
+    for suffix in table:
         if name.endswith(suffix):
             return suffix
     raise refusal(path, f"the suffix {path.suffix!r}", f"one of {', '.join(table)}", "convert the file or correct its name")

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from mivol.errors import MivolError
+from mivol.phase import measured
 from mivol.phase.domain import ASYMMETRY
 from mivol.phase.measured import ALIASES, NAMES, named_medium
 
@@ -25,6 +26,14 @@ def test_named_media_are_the_published_ones():
     assert sigma_a == (0.11632, 0.25191, 0.29434)
     assert sigma_s == pytest.approx((0.00081, 0, 0), abs=5e-6)
     assert named_medium("chicken 1").sigma_a[0] == 0.015
+
+
+def test_no_number_of_the_tables_was_changed():
+    """Sums of what was typed from the papers, by columns: one wrong digit changes one of them."""
+    sums = [sum(sum(row[k]) for row in measured._JENSEN_2001.values()) for k in range(2)]
+    assert sums == pytest.approx([101.52, 4.231], rel=1e-12)
+    sums = [sum(sum(row[k]) for row in measured._NARASIMHAN_2006.values()) for k in range(3)]
+    assert sums == pytest.approx([68.0478653809, 284.2882205, 87.445], rel=1e-12)
 
 
 def test_every_named_medium_is_physical():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -30,4 +31,11 @@ def test_a_lobe_without_a_share_is_never_chosen():
 
 
 def test_shares_without_any_weight_are_equal():
-    assert [float(s[0]) for s in shares_of([mi.Float(0), mi.Float(0)])] == [0.5, 0.5]
+    """And have a derivative of 0 by weights that sum to 0, where w / 0 would have none."""
+    weights = [mi.Float(0, 1), mi.Float(0, 3)]
+    dr.enable_grad(weights)
+    shares = shares_of(weights)
+    assert [list(s) for s in shares] == [[0.5, 0.25], [0.5, 0.75]]
+    dr.backward(shares[0])
+    # Of 1 / (1 + 3): 3/16 by the first weight and -1/16 by the second.
+    assert [list(dr.grad(w)) for w in weights] == [[0, 0.1875], [0, -0.0625]]

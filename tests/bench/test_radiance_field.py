@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -12,10 +13,13 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
+from mivol.bench import radiance_field
 from mivol.bench.radiance_field import BENCH, QUICK, fits
 from mivol.bench.radiance_field.fields import FIELDS, centred
 from mivol.bench.radiance_field.fits import EVERY, follow, held_out_psnr, our_fit, peer_fit
+from mivol.bench.radiance_field.peer import Peer
 from mivol.bench.radiance_field.steps import ask_memory, our_step, peer_of, peer_step, tasks
 from mivol.bench.radiance_field.views import BOX, between, photographed, rays_of, rays_through, ring, tiled
 from mivol.photos import Camera, Photo, intrinsics
@@ -172,3 +176,45 @@ def test_every_question_is_answered(variant_rgb: str, tmp_path: Path) -> None:
     assert len(answers.pop("bars")) == 1 + 2 + 1
     BENCH.draw(answers, tmp_path)
     assert (tmp_path / "bench_radiance_field.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_stage_of_the_peer_has_twice_the_resolution(variant_rgb: str) -> None:
+    refined = Peer.start(4).refined()
+    assert (refined.density.shape, refined.harmonics.shape) == ((8, 8, 8, 1), (8, 8, 8, 27))
+
+
+def test_figures_show_the_answers(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """A panel for each question that has one, and for each field of the fits; ratios, bars and curves are where they belong."""
+    kept = []
+
+    @contextmanager
+    def keep(path: Path, width: float, height: float) -> Iterator[Figure]:
+        kept.append((path.name, width, height, Figure()))
+        yield kept[-1][3]
+
+    monkeypatch.setattr(radiance_field, "drawn", keep)
+    ratios = {kind: {"ratio_of_processor_time": k + 2.0} for k, kind in enumerate(("camera", "pixels", "any"))}
+    curves = {"ours": [(1.0, 20.0), (2.0, 25.0)], "peer": [(10.0, 18.0), (20.0, 24.0)], "peer_psnr": 24.0}
+    tiles = {"tiles": {"processor_seconds": 3.0, "steps": 100, "psnr": 30.0}}
+    BENCH.draw(
+        {
+            "step": {"fog": ratios, "shell": ratios},
+            "memory": {"peak_bytes": [2**20, 4 * 2**20], "field_bytes": 3 * 2**20, "bytes_per_ray": 100.4},
+            "locality": tiles,
+            "fit": {"fog": curves, "shell": curves},
+        },
+        tmp_path,
+    )
+    ((name, width, height, figure),) = kept
+    assert (name, width, height) == ("bench_radiance_field.png", 4.2 * 5, 3.6)
+    step, memory, locality, fog, shell = figure.axes
+    lines = [(list(line.get_xdata()), list(line.get_ydata())) for line in step.lines]
+    assert lines[0] == ([2.0, 2.0], [1, 0]) and ([8, 8], [0, 1]) in lines and ([4, 4], [0, 1]) in lines
+    assert [label.get_text() for label in step.get_legend().get_texts()] == ["camera rays", "random pixels", "any rays"]
+    assert step.get_ylim() == (-0.6, 2.5)
+    assert [bar.get_height() for bar in memory.patches] == [1, 4] and list(memory.lines[0].get_ydata()) == [3, 3]
+    assert memory.get_title() == "100 bytes a ray"
+    assert (list(locality.lines[0].get_xdata()), list(locality.lines[0].get_ydata())) == ([30.0], [30.0])
+    for axes, field in ((fog, "fog"), (shell, "shell")):
+        assert axes.get_title() == f"{field}, 7 views"
+        assert [list(line.get_ydata()) for line in axes.lines] == [[20, 25], [18, 24], [24, 24]]

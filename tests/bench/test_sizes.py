@@ -10,10 +10,11 @@ import math
 from dataclasses import asdict
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from mivol.bench import agreement, single_scattering, still_life, tomography
-from mivol.bench.depth import BESIDE_ALBEDOS, CUBE_DEPTH, SEED, TAUS
+from mivol.bench.depth import BESIDE_ALBEDOS, CUBE_DEPTH, SEED, TAUS, UNIT
 from mivol.bench.extinctions import TUTORIAL_SCALE
 from mivol.bench.gradients.size import ALBEDO, BARS
 from mivol.bench.gradients.subject import SEEDS
@@ -91,6 +92,7 @@ def test_what_is_promised():
     assert BARS == {"constant light": 60, "HG 0.8, sun in a sky": 30} and ALBEDO == 0.75
     assert (SIZES, DEGREES, MODEL) == ((128, 256, 512, 1024), (0, 1, 2, 3), 64)
     assert FULL["depth"]["taus"] == TAUS and SEED == 0 and BESIDE_ALBEDOS == (0.5, 0.9) and CUBE_DEPTH == 0.8966336
+    assert UNIT.to_world.tolist() == np.eye(4).tolist()
     assert (tomography.REPORTED, tomography.BAR) == ((5, 10, 20), 0.2)
     assert (single_scattering.ALBEDO, single_scattering.SEEN, agreement.FALSE_ALARM) == (0.75, 0.01, 1e-3)
     assert (EVERY, LEARNING_RATE, SEEDS, TUTORIAL_SCALE) == (7, 0.05, 100_000, 40.0)

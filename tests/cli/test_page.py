@@ -20,7 +20,7 @@ import pytest
 from cli.run_folder import write_run
 from matplotlib.image import imread
 
-from mivol.cite import CITATIONS, citations
+from mivol.cite import CITATIONS, Citation, citations
 from mivol.errors import MivolError
 from mivol.files import write_exr, write_volume
 from mivol.report import figures, show
@@ -356,6 +356,11 @@ def test_citations_are_complete_and_come_once_each():
     assert [source.year for source in citations(["novak_2018", "kak_1988", "novak_2018"])] == [2018, 1988]
     with pytest.raises(MivolError, match="use kingma_2015"):
         citations(["kingma_2014"])
+
+
+def test_a_citation_ends_with_its_link_where_it_has_one():
+    with_link = Citation("A", 2001, "T", "W", "https://x")
+    assert str(with_link) == "A (2001). T. W. https://x" and str(with_link._replace(link="")) == "A (2001). T. W."
 
 
 def test_ratio_at_equal_error_on_paper():

@@ -157,6 +157,11 @@ def test_bare_meshes_on_disk(tmp_path: Path) -> None:
     assert np.array_equal(again.points, points)
     assert again.normals is None
     assert again.colours is None
+    coloured = Mesh(points, faces, colours=np.array([[0, 0.5, 1], [2, -1, 0.2], [1, 1, 1]]))
+    write_mesh(tmp_path / "b.ply", coloured)
+    again = read_ply(tmp_path / "b.ply")
+    assert again.normals is None and np.array_equal(again.points, points)
+    assert again.colours * 255 == pytest.approx(np.array([[0, 128, 255], [255, 0, 51], [255, 255, 255]]))
     write_mesh(tmp_path / "a.obj", Mesh(points, faces))
     assert (tmp_path / "a.obj").read_text().splitlines() == ["v 1 0 0", "v 0 1 0", "v 0 0 1", "f 1 2 3"]
 

@@ -309,6 +309,8 @@ def test_legacy_vtk_by_hand(tmp_path: Path, binary: bool, kind: str) -> None:
 def test_legacy_vtk_of_cells_and_of_several_arrays(tmp_path: Path) -> None:
     """Cell centres lie half a step in; an array after a binary one is found by its name."""
     volume = read(tmp_path, "a.vtk", made.vtk(made.numbered(), cells=True))
+    assert volume.meta["centering"] == "cell"
+    assert read(tmp_path, "c.vtk", made.vtk(made.numbered())).meta["centering"] == "point"
     np.testing.assert_allclose(volume.origin, (10.75, 21, 31.25))
     data = made.vtk(made.numbered()) + b"METADATA\nINFORMATION 0\n\nSCALARS two unsigned_char\n" + bytes(range(24)) + b"\n"
     np.testing.assert_array_equal(read(tmp_path, "b.vtk", data, dataset="two").values.ravel(), np.arange(24))

@@ -85,6 +85,11 @@ def test_explain_says_what_a_grid_misses_of_its_table():
     assert finer[0] < 0.3 * float(told[0][1]) and "refine = 3 would" in explain(view(values).scene)
 
 
+def test_a_table_of_nothing_departs_by_nothing():
+    volume = mi.load_dict(through(scan(), 0 * OPACITY))
+    assert volume.mivol_transfer.departure() == 0
+
+
 def test_derivatives_by_table_and_scan():
     """Opacity and colour are optimisable, and so are the values that they are of."""
     seen, rng = view(scan(), 3), np.random.default_rng(1)

@@ -7,8 +7,10 @@ import pytest
 from small_scan import Views, run
 
 from mivol.errors import MivolError
+from mivol.optim.course import Course
 from mivol.optim.inversion import Inversion, Solve
 from mivol.optim.linear_problems import LeastSquares
+from mivol.optim.loop import reconstruct
 
 
 def inversion(scan: tuple[Views, np.ndarray, np.ndarray], **more: object) -> Inversion:
@@ -59,3 +61,11 @@ def test_a_solver_that_has_arrived_says_so():
 
 def test_defaults():
     assert (Solve().solver, Solve().subsets) == ("pcg", 10)
+
+
+def test_a_fit_ends_where_its_solver_has_arrived():
+    """Before the iterations that it was given are done; what did not happen is not in its history."""
+    one = Inversion(LeastSquares(Views(np.array([[2.0]]), 1), np.array([4.0])))
+    fit = reconstruct(one, Solve(), Course(iterations=9))
+    assert 1 <= fit.next < 9 and len(fit.history) == fit.next and fit.is_done
+    assert one.values()["x"] == pytest.approx([2.0])

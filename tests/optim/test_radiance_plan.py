@@ -52,6 +52,9 @@ def test_grids_have_cubic_voxels_and_cover_the_box(variant_rgb: str) -> None:
     assert res == (20, 5, 10)
     np.testing.assert_allclose(np.diag(to_world)[:3] / res[::-1], 0.1)
     np.testing.assert_allclose(to_world[:3, 3], box[0], atol=1e-12)
+    flat, place = place_grid(np.array([[0.0, 0, 0], [1, 0, 0.05]]), 10)
+    assert flat == (1, 1, 10)
+    np.testing.assert_allclose(place[:3, 3], [0, -0.05, -0.025], atol=1e-12)
 
 
 def test_schedules() -> None:

@@ -24,8 +24,8 @@ def test_prior_derivatives_and_majorisers():
 
 
 def test_total_variation_of_a_step_is_its_area_times_height():
-    """delta -> 0: a step of height 3 across an area of 5 x 4 voxels of 0.5 x 2 (y, z) has TV 3 * 5 * 0.5 * 4 * 2."""
+    """delta -> 0: a step of height 3 across an area of 5 x 4 voxels of 0.5 x 2 (y, z); a quarter of 3 * 5 * 0.5 * 4 * 2."""
     x = np.zeros((4, 5, 6))
     x[:, :, 3:] = 3.0
-    prior = SmoothedTV(x.shape, 1.0, 1e-9, (1.0, 0.5, 2.0))
-    assert prior.value(x.reshape(-1)) == pytest.approx(3 * 5 * 0.5 * 4 * 2, rel=1e-8)
+    prior = SmoothedTV(x.shape, 0.25, 1e-9, (3.0, 0.5, 2.0))
+    assert prior.value(x.reshape(-1)) == pytest.approx(0.25 * 3 * 5 * 0.5 * 4 * 2, rel=1e-8)

@@ -1,0 +1,36 @@
+"""Compressed bytes: streams that are joined, and limits that the header sets."""
+
+from __future__ import annotations
+
+import bz2
+import gzip
+import zlib
+from pathlib import Path
+
+import pytest
+
+from mivol.errors import MivolError
+from mivol.files import source
+
+PATH, DATA = Path("a.nrrd"), bytes(range(200)) * 3
+PACK = {"zlib": zlib.compress, "gzip": gzip.compress, "bzip2": bz2.compress}
+
+
+@pytest.mark.parametrize("codec", [c for c in source.CODECS if c in PACK])
+def test_streams_are_joined_up_to_the_limit(codec: str) -> None:
+    """Exactly as much as the header promises is taken, and not a byte more; a promise beyond all memory is one, too."""
+    packed = PACK[codec](DATA)
+    for limit in (len(DATA), 2**70):
+        assert source.inflate(packed, codec, limit, PATH) == DATA
+    with pytest.raises(MivolError, match=f"more than {len(DATA) - 1} bytes after decompression"):
+        source.inflate(packed, codec, len(DATA) - 1, PATH)
+    assert source.inflate(packed + packed + b"\0" * 8, codec, 2 * len(DATA), PATH) == 2 * DATA
+    with pytest.raises(MivolError, match="more than"):
+        source.inflate(packed + packed, codec, 2 * len(DATA) - 1, PATH)
+
+
+def test_damaged_streams_are_refused() -> None:
+    with pytest.raises(MivolError, match="damaged gzip data"):
+        source.inflate(b"nothing of that kind", "gzip", 100, PATH)
+    with pytest.raises(MivolError):
+        source.inflate(gzip.compress(DATA)[:-20], "gzip", len(DATA), PATH)

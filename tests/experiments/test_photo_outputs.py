@@ -1,0 +1,94 @@
+"""What a fit of photographs leaves in its folder, piece by piece."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from mivol.experiments import photo_outputs
+from mivol.fields.spherical import SphericalGrid, save_field
+from mivol.files import read_volume
+from mivol.optim.field_view import FieldView
+from mivol.photos import Camera, Photo, intrinsics
+
+pytestmark = pytest.mark.usefixtures("variant_rgb")
+
+RES = (3, 4, 5)
+EDGES = (2.0, 1.0, 0.5)
+
+
+def field(keep: np.ndarray | None = None) -> SphericalGrid:
+    """Densities of 1 to 60, colours of degree 1."""
+    sigma = 1 + np.arange(60.0).reshape(RES)
+    return SphericalGrid.from_dense(sigma, np.zeros((*RES, 4, 3)), np.diag([*EDGES, 1.0]), keep)
+
+
+def camera(width: int = 4, height: int = 2) -> Camera:
+    return Camera(intrinsics(width, height, width, height), (width, height), np.eye(4))
+
+
+def test_a_view_stands_beside_its_photograph(tmp_path):
+    """Both as sRGB, clipped; on record as held out."""
+    (tmp_path / "views").mkdir()
+    photo = Photo("lamp", np.full((2, 4, 3), 0.6, np.float32), None, None, camera(), np.zeros(3))
+    found = photo_outputs.write_view(tmp_path, photo, 7, np.full((2, 4, 3), [1.5, 0.4, -1]))
+    assert [(i.path, i.role, i.view, i.held_out, i.quantity) for i in found] == [
+        ("views/007_render.png", "render", "lamp", True, "sRGB value"),
+        ("views/007_reference.png", "reference", "lamp", True, "sRGB value"),
+    ]
+    pixels = [np.array(Image.open(tmp_path / image.path))[0, 0].tolist() for image in found]
+    assert pixels == [[255, 102, 0], [153, 153, 153]]
+
+
+@pytest.mark.parametrize("kept", [60, 10])
+def test_what_a_field_takes(tmp_path, kept):
+    """60 nodes of a box: 4 and 16 bytes each; 4 (1 + 4 x 3) with harmonics of degree 1 in rows of 12."""
+    sparse = field(None if kept == 60 else np.arange(60).reshape(RES) < kept)
+    save_field(tmp_path / "field.npz", sparse)
+    table = photo_outputs.storage(sparse, tmp_path / "field.npz")
+    assert table.head[0] == f"{kept} of 60 nodes are kept ({kept / 60:.1%})"
+    rows = {name: each for name, _, each in table.rows}
+    assert rows["every node: r, g, b and density of 8 bits"] == "4" and rows["every node: four numbers"] == "16"
+    assert rows["every node: harmonics of degree 1"] == "52"
+    assert rows["this field, in memory"] == f"{sparse.bytes / 60:.3g}"
+    assert rows["this field, its file"] == f"{(tmp_path / 'field.npz').stat().st_size / 60:.3g}"
+    # Two digits of a MiB say nothing of so few bytes; of a thousand times as many they do.
+    big = SimpleNamespace(res=(256, 256, 256), listed=lambda: range(2**20), degree=0, width=4, bytes=3 * 2**20)
+    sizes = {name: size for name, size, _ in photo_outputs.storage(big, tmp_path / "field.npz").rows}
+    assert sizes["every node: four numbers"] == "256.00 MiB" and sizes["this field, in memory"] == "3.00 MiB"
+
+
+def test_densities_are_written_for_other_programs(tmp_path):
+    (tmp_path / "volumes").mkdir()
+    found = photo_outputs.write_density(tmp_path, field())
+    assert (found.path, found.role, found.size) == ("volumes/density.npz", "reconstruction", EDGES)
+    for name in ("density.vol", "density.npz"):
+        np.testing.assert_allclose(read_volume(tmp_path / "volumes" / name).values.ravel(), 1 + np.arange(60), rtol=1e-6)
+
+
+def test_distance_and_normals_are_pictures(tmp_path):
+    (tmp_path / "views").mkdir()
+    seen = FieldView(np.zeros((2, 4, 3)), np.ones((2, 4)), np.full((2, 4), 1.5))
+    found = photo_outputs.write_geometry(tmp_path, seen, camera(), (1.0, 2.0))
+    assert [(i.path, i.role) for i in found] == [("views/distance.png", "picture"), ("views/normals.png", "picture")]
+    assert found[0].caption == "distance of the first judged view"
+    for image in found:
+        assert np.array(Image.open(tmp_path / image.path)).shape == (2, 4, 3)
+
+
+@pytest.mark.parametrize(("given", "expected"), [((64, 32), (64, 32)), ((1024, 512), (256, 128)), ((2048, 1), (256, 1))])
+def test_films_are_small(given, expected):
+    assert photo_outputs._small(camera(*given)).size == expected
+
+
+def test_metrics_have_the_names_of_the_record():
+    assert photo_outputs.named({"psnr": 30.0, "ssim": 0.9}) == {"held_out_psnr": 30.0, "ssim": 0.9}
+
+
+def test_behind_a_field_is_its_sky_or_the_photographs_own_background():
+    photo, sky = SimpleNamespace(background="white"), object()
+    assert photo_outputs.behind(SimpleNamespace(sky=None), photo) == "white"
+    assert photo_outputs.behind(SimpleNamespace(sky=sky), photo) is sky
