@@ -8,11 +8,10 @@ to the TOML file. :func:`resolved` is what ``run.json`` keeps.
 from __future__ import annotations
 
 import math
-import re
 import tomllib
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any, get_args, get_origin, get_type_hints
+from typing import Annotated, Any
 
 import msgspec
 
@@ -29,6 +28,7 @@ from mivol.optim.schedules import Constant, Cosine, Exponential, Step
 from mivol.optim.solvers import SOLVERS
 from mivol.optim.strategy import nearest, of
 from mivol.scene.cameras import Hemisphere, LookAts, Ring, SceneSensors
+from mivol.schema import check_keys, sentence
 from mivol.validate.images import METRICS
 
 INFINITY = math.inf
@@ -409,104 +409,3 @@ def _entry(place: Any, step: str, change: str) -> Any:
     if not isinstance(place, list) or not step.isdigit() or int(step) >= len(place):
         raise MivolError(f'--set "{change}": "{step}" is not there to change: entries of a list count from 0.')
     return place[int(step)]
-
-
-# -- What is wrong, in a sentence ---------------------------------------------------------------------------------
-
-
-def check_keys(raw: Any, kind: Any, where: str, name: str) -> None:
-    """Refuse the first key or strategy that the schema does not know, offering the nearest.
-
-    Raises:
-        MivolError: with the dotted key.
-    """
-    struct = struct_of(kind, raw)
-    if isinstance(raw, list):
-        for number, item in enumerate(raw):
-            check_keys(item, entry_kind(kind), f"{where}.{number}", name)
-    if struct is None or not isinstance(raw, dict):
-        return
-    tag = struct.__struct_config__.tag_field
-    _check_tag(raw, tag, {s.__struct_config__.tag: s for s in structs_in(kind)}, where, name)
-    known = list(struct.__struct_fields__)
-    unknown = next((key for key in raw if key not in known and key != tag), None)
-    if unknown is not None:
-        dotted = f"{where}.{unknown}".lstrip(".")
-        raise MivolError(f'{name}: unknown key "{dotted}": {nearest(unknown, [*known, *([tag] if tag else [])])}')
-    hints = get_type_hints(struct)
-    for key, value in raw.items():
-        if key in hints:
-            check_keys(value, hints[key], f"{where}.{key}".lstrip("."), name)
-
-
-def _check_tag(raw: dict[str, Any], tag: str | None, choices: dict[str, type], where: str, name: str) -> None:
-    if tag and raw.get(tag) not in choices:
-        found = raw.get(tag)
-        what = f'"{where}.{tag}" is missing' if found is None else f'{where}.{tag} = "{found}" is unknown'
-        raise MivolError(f"{name}: {what}: {nearest(str(found), list(choices))}")
-
-
-def structs_in(kind: Any) -> list[type]:
-    """The structs that a value of this type may be."""
-    if get_origin(kind) is tuple or isinstance(kind, str):
-        return []
-    if isinstance(kind, type) and issubclass(kind, msgspec.Struct):
-        return [kind]
-    return [struct for part in get_args(kind) for struct in structs_in(part)]
-
-
-def struct_of(kind: Any, raw: Any) -> type | None:
-    """The struct that ``raw`` asks for by its tag; the first possible one where the tag is missing or unknown."""
-    structs = structs_in(kind)
-    if not structs or not isinstance(raw, dict):
-        return None
-    tag = structs[0].__struct_config__.tag_field
-    return next((s for s in structs if tag and s.__struct_config__.tag == raw.get(tag)), structs[0])
-
-
-def entry_kind(kind: Any) -> Any:
-    """The type of the entries of a list type."""
-    if get_origin(kind) is tuple:
-        return get_args(kind)[0]
-    return next((entry_kind(part) for part in get_args(kind) if get_args(part)), Any)
-
-
-def sentence(raw: Any, message: str) -> str:
-    """msgspec's message as: where = found: expected."""
-    what, _, place = message.partition(" - at `$")
-    steps = re.findall(r"\.(\w+)|\[(\d+|\.\.\.)\]", place.rstrip("`"))
-    dotted = ".".join(word or number for word, number in steps)
-    found = raw
-    for word, number in steps:
-        try:
-            found = found[word] if word else found[int(number)]
-        except (KeyError, IndexError, TypeError, ValueError):
-            found = None
-            break
-    if what.startswith("Object missing required field"):
-        missing = f"{dotted}.{what.split('`')[1]}".lstrip(".")
-        return f'the key "{missing}" is missing: give it.'
-    what = f"{what[0].lower()}{what[1:]}".rstrip(".") + "." * (what[-1] != "?")
-    plain = found is not None and not isinstance(found, dict)
-    return f"{dotted or 'the file'}{f' = {found!r}' if plain else ''}: {what}"
-
-
-def describe(kind: type = Experiment, prefix: str = "") -> list[str]:
-    """One line per setting: key, default, unit, meaning; for ``mivol optimize --help``."""
-    lines = []
-    hints = get_type_hints(kind, include_extras=True)
-    for field in msgspec.structs.fields(kind):
-        hint, key = hints[field.name], f"{prefix}{field.name}"
-        meta = getattr(hint, "__metadata__", (of("1", "one of " + ", ".join(map(str, get_args(hint)))),))[0]
-        structs = structs_in(getattr(hint, "__origin__", hint))
-        if len(structs) == 1 and structs[0].__struct_config__.tag_field is None:
-            lines += describe(structs[0], f"{key}.")
-            continue
-        tags = " | ".join(str(s.__struct_config__.tag) for s in structs)
-        default = "" if field.default is msgspec.NODEFAULT or structs else f" = {field.default!r}"
-        unit = meta.extra["unit"]
-        lines.append(f"{key}{default}{f' [{unit}]' if unit != '1' else ''}: {meta.description}{f' ({tags})' * bool(tags)}")
-        for struct in structs:
-            label = struct.__struct_config__.tag
-            lines += describe(struct, f"{key}[{label}]." if label else f"{key}.")
-    return lines

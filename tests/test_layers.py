@@ -16,8 +16,8 @@ shape = load("shape")
 PACKAGE = Path(__file__).resolve().parents[1] / "mivol"
 ORDER = [
     *("errors", "cite", "threads", "machine", "llvm", "numerics", "space", "files", "photos", "fields", "phase"),
-    *("transport", "tomography", "scene", "plugins", "optim", "validate", "report", "config", "doctor", "experiments"),
-    *("bench", "cli", "__main__"),
+    *("transport", "tomography", "scene", "plugins", "optim", "validate", "report", "schema", "config", "doctor"),
+    *("experiments", "bench", "cli", "__main__"),
 ]
 INSIDE = {"transport": ["traversal", "media", "estimators", "line_integrals", "path"]}
 """Rooms with rooms of their own, lowest first: a module there imports its own room and those before it."""

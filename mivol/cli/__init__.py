@@ -102,9 +102,10 @@ def sensor_number(text: str) -> int | str:
 def optimize_flags(sub: argparse.ArgumentParser) -> None:
     """Flags of a fit; the settings of the file come from the schema."""
     from mivol import config
+    from mivol.schema import describe
 
-    lines = ["images:", *config.describe(), "", "projections:", *config.describe(config.Scan)]
-    lines += ["", "photographs:", *config.describe(config.FieldFit)]
+    lines = ["images:", *describe(config.Experiment), "", "projections:", *describe(config.Scan)]
+    lines += ["", "photographs:", *describe(config.FieldFit)]
     sub.epilog = "settings of the file for " + "\n  ".join(line.replace("%", "%%") for line in lines)
     sub.add_argument("experiment", type=Path, help="TOML file")
     sub.add_argument("--set", action="append", default=[], metavar="key=value", help="override a setting of the file")
@@ -222,7 +223,7 @@ def export(arguments: argparse.Namespace) -> None:
     """Write a radiance field as a mesh, as volumes, or for another program."""
     from mivol.experiments.back_end import set_variant
     from mivol.fields.export import export_field
-    from mivol.fields.spherical import load_field
+    from mivol.fields.spherical_files import load_field
 
     set_variant(arguments.mode)
     print("\n".join(str(path) for path in export_field(arguments.output, load_field(arguments.field), arguments.level)))

@@ -14,7 +14,8 @@ from mivol.config import FieldFit
 from mivol.experiments.run_folder import RunFolder
 from mivol.experiments.task import Task
 from mivol.fields.sky import Sky
-from mivol.fields.spherical import SphericalGrid, save_field
+from mivol.fields.spherical import SphericalGrid
+from mivol.fields.spherical_files import save_field
 from mivol.files import write_exr, write_png, write_volume
 from mivol.optim.field_view import FieldView, render_view
 from mivol.optim.loop import Fit

@@ -16,7 +16,8 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 
-from mivol.fields.spherical import SphericalGrid, save_field
+from mivol.fields.spherical import SphericalGrid
+from mivol.fields.spherical_files import save_field
 from mivol.fields.spherical_svox2 import save_svox2
 from mivol.fields.surface import surface_of
 from mivol.files import write_volume

@@ -20,10 +20,8 @@ factor).
 from __future__ import annotations
 
 import math
-import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import drjit as dr
 import mitsuba as mi
@@ -31,17 +29,11 @@ import numpy as np
 
 from mivol.errors import MivolError
 from mivol.fields.activation import Activation, activation_of
-from mivol.files import write_whole
 from mivol.space import check_affine, lattice_from_world
 
-__all__ = ["MAX_DEGREE", "SphericalGrid", "basis_size", "degree_of", "load_field", "row_width", "save_field"]
+__all__ = ["MAX_DEGREE", "SphericalGrid", "basis_size", "degree_of", "row_width"]
 
 MAX_DEGREE = 4
-
-FORMAT = "mivol spherical grid 1"
-
-SMALL = 2.0**-12
-"""Below it the least step of a half float, 2^-24, is more than 2^-12 of the largest value."""
 
 
 def basis_size(degree: int) -> int:
@@ -317,115 +309,3 @@ class SphericalGrid:
 
 def _affine(row: list[mi.Float], v: mi.Vector3f, rest: mi.Float) -> mi.Float:
     return dr.fma(row[0], v[0], dr.fma(row[1], v[1], dr.fma(row[2], v[2], rest)))
-
-
-# -- On disk ---------------------------------------------------------------------------------------------------------------
-
-
-def save_field(path: str | Path, field: SphericalGrid, half: bool = True) -> None:
-    """Write a field as ``.npz``.
-
-    Args:
-        path: ends in .npz.
-        field: what to write.
-        half: as half floats (11 bits); arrays with a value beyond 65504, or with none beyond 2^-12, stay float32 in any case.
-
-    Raises:
-        MivolError: another suffix, or the disk's refusal.
-    """
-    path = Path(path)
-    if path.suffix != ".npz":
-        raise MivolError(f"{path.name} was given for a radiance field; a name ending in .npz is expected.")
-    density, sh = field.values()
-    arrays = {"density": _narrow(density, half), "sh": _narrow(sh, half)}
-    arrays |= {"res": np.array(field.res), "to_world": field.to_world}
-    if field.nodes is not None:
-        arrays["nodes"] = np.array(field.nodes)
-    about = {"format": FORMAT, "activation": field.activation, "offset": field.offset, "clamp": field.clamp}
-    write_whole(path, lambda file: np.savez_compressed(file, **arrays, **{k: np.array(v) for k, v in about.items()}))
-
-
-def _narrow(values: np.ndarray, half: bool) -> np.ndarray:
-    largest = np.abs(values).max(initial=0.0)
-    return values.astype(np.float16) if half and SMALL <= largest <= np.finfo(np.float16).max else values
-
-
-def load_field(path: str | Path) -> SphericalGrid:
-    """Read a field: our ``.npz``, or a checkpoint of svox2.
-
-    Raises:
-        MivolError: no such file, no such format, or contents that do not fit together.
-    """
-    path = Path(path)
-    if not path.is_file():
-        raise MivolError(f"found no file {path}; give a radiance field (.npz).")
-    try:
-        with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
-            arrays = {name: stored[name] for name in stored.files}
-    except (ValueError, OSError, EOFError, zipfile.BadZipFile) as error:
-        raise MivolError(f"{path.name} is not a whole .npz archive ({error}); write it again.") from error
-    if "links" in arrays:
-        return _of_svox2(path.name, arrays)
-    if str(arrays.get("format", "")) != FORMAT:
-        held = ", ".join(arrays) or "nothing"
-        raise MivolError(f"{path.name} holds {held}; a field of mivol or a checkpoint of svox2 is expected.")
-    return _of_ours(path.name, arrays)
-
-
-def _of_ours(name: str, arrays: dict[str, np.ndarray]) -> SphericalGrid:
-    needed = {"density", "sh", "res", "to_world", "activation", "offset", "clamp"} - arrays.keys()
-    if needed:
-        raise MivolError(f"{name} lacks {', '.join(sorted(needed))}; write it again.")
-    res = tuple(int(n) for n in arrays["res"])
-    nodes = arrays.get("nodes")
-    n, shape = math.prod(res) if nodes is None else len(nodes), arrays["sh"].shape
-    if len(res) != 3 or arrays["density"].shape != (n,) or len(shape) != 3 or shape[0] != n or shape[2] != 3:
-        found = f"{arrays['density'].shape} densities and {shape} harmonics"
-        raise MivolError(f"{name} holds {found} for {n} nodes; write it again.")
-    if nodes is not None:
-        _check_nodes(name, nodes, math.prod(res))
-    return SphericalGrid.from_rows(
-        res,
-        arrays["to_world"],
-        arrays["density"].astype(np.float32),
-        arrays["sh"].astype(np.float32),
-        None if nodes is None else mi.UInt32(nodes.astype(np.uint32)),
-        str(arrays["activation"]),
-        float(arrays["offset"]),
-        bool(arrays["clamp"]),
-    )
-
-
-def _check_nodes(name: str, nodes: np.ndarray, count: int) -> None:
-    ordered = nodes.ndim == 1 and (len(nodes) < 2 or (np.diff(nodes.astype(np.int64)) > 0).all())
-    if not ordered or (len(nodes) and int(nodes[-1]) >= count):
-        raise MivolError(f"{name} lists nodes out of order or beyond the {count} of its grid; write it again.")
-
-
-SVOX2_SH = 1
-"""svox2's number for a basis of spherical harmonics."""
-
-
-def _of_svox2(name: str, arrays: dict[str, np.ndarray]) -> SphericalGrid:
-    """A checkpoint of svox2: axes X Y Z, links to rows (negative: empty), harmonics [rgb][basis], centre and radius."""
-    needed = {"density_data", "sh_data", "radius", "center"} - arrays.keys()
-    if needed:
-        raise MivolError(f"{name} has links but lacks {', '.join(sorted(needed))}; a checkpoint of svox2 holds them.")
-    if int(arrays.get("basis_type", SVOX2_SH)) != SVOX2_SH:
-        found = int(arrays["basis_type"])
-        raise MivolError(f"{name} is of svox2's basis type {found}; only spherical harmonics (1) can be read.")
-    if arrays.get("background_data", np.empty(0)).size:
-        raise MivolError(f"{name} has a background of sphere layers, which mivol does not model; save it without one.")
-    links, sh = arrays["links"].transpose(2, 1, 0), arrays["sh_data"].astype(np.float32)
-    density = arrays["density_data"].astype(np.float32).reshape(-1)
-    if links.ndim != 3 or sh.ndim != 2 or len(sh) != len(density) or sh.shape[1] % 3 or links.max(initial=-1) >= len(density):
-        found = f"links {links.shape}, densities {density.shape} and harmonics {sh.shape}"
-        raise MivolError(f"{name} holds {found} that do not fit together; write it again.")
-    nodes = np.flatnonzero(links >= 0)
-    row = links.reshape(-1)[nodes]
-    rows = sh[row].reshape(len(row), 3, -1).transpose(0, 2, 1)
-    radius, center = (np.broadcast_to(np.asarray(arrays[k], np.float64).reshape(-1), 3) for k in ("radius", "center"))
-    to_world = np.eye(4)
-    to_world[:3, :3], to_world[:3, 3] = np.diag(2 * radius), center - radius
-    listed = mi.UInt32(nodes.astype(np.uint32))
-    return SphericalGrid.from_rows(links.shape, to_world, density[row], np.ascontiguousarray(rows), listed)

@@ -1,4 +1,4 @@
-"""A radiance field as a checkpoint of svox2, the program of Plenoxels; :func:`mivol.fields.spherical.load_field` reads them.
+"""A radiance field as a checkpoint of svox2, the program of Plenoxels.
 
 Conventions. Its axes are X Y Z, ``links`` hold the row of each node (-1: none), coefficients lie [rgb][basis] in half floats,
 and the box is said by its middle and half its edges. After interpolation it shows ``max(0, 1/2 + sum)`` and
@@ -12,15 +12,21 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
+import mitsuba as mi
 import numpy as np
 
-from mivol.fields.spherical import SVOX2_SH, SphericalGrid
+from mivol.errors import MivolError
+from mivol.fields.spherical import SphericalGrid
 from mivol.files import write_whole
 from mivol.files.source import refusal
 
-__all__ = ["save_svox2"]
+__all__ = ["read_svox2", "save_svox2"]
 
 HALF = float(np.finfo(np.float16).max)
+
+
+SVOX2_SH = 1
+"""svox2's number for a basis of spherical harmonics."""
 
 
 def save_svox2(path: Path, field: SphericalGrid) -> None:
@@ -48,3 +54,28 @@ def save_svox2(path: Path, field: SphericalGrid) -> None:
         "sh_data": sh.transpose(0, 2, 1).reshape(len(sh), -1).astype(np.float16),
     }  # fmt: skip
     write_whole(path, lambda file: np.savez_compressed(file, **arrays))
+
+
+def read_svox2(name: str, arrays: dict[str, np.ndarray]) -> SphericalGrid:
+    """A checkpoint of svox2: axes X Y Z, links to rows (negative: empty), harmonics [rgb][basis], centre and radius."""
+    needed = {"density_data", "sh_data", "radius", "center"} - arrays.keys()
+    if needed:
+        raise MivolError(f"{name} has links but lacks {', '.join(sorted(needed))}; a checkpoint of svox2 holds them.")
+    if int(arrays.get("basis_type", SVOX2_SH)) != SVOX2_SH:
+        found = int(arrays["basis_type"])
+        raise MivolError(f"{name} is of svox2's basis type {found}; only spherical harmonics (1) can be read.")
+    if arrays.get("background_data", np.empty(0)).size:
+        raise MivolError(f"{name} has a background of sphere layers, which mivol does not model; save it without one.")
+    links, sh = arrays["links"].transpose(2, 1, 0), arrays["sh_data"].astype(np.float32)
+    density = arrays["density_data"].astype(np.float32).reshape(-1)
+    if links.ndim != 3 or sh.ndim != 2 or len(sh) != len(density) or sh.shape[1] % 3 or links.max(initial=-1) >= len(density):
+        found = f"links {links.shape}, densities {density.shape} and harmonics {sh.shape}"
+        raise MivolError(f"{name} holds {found} that do not fit together; write it again.")
+    nodes = np.flatnonzero(links >= 0)
+    row = links.reshape(-1)[nodes]
+    rows = sh[row].reshape(len(row), 3, -1).transpose(0, 2, 1)
+    radius, center = (np.broadcast_to(np.asarray(arrays[k], np.float64).reshape(-1), 3) for k in ("radius", "center"))
+    to_world = np.eye(4)
+    to_world[:3, :3], to_world[:3, 3] = np.diag(2 * radius), center - radius
+    listed = mi.UInt32(nodes.astype(np.uint32))
+    return SphericalGrid.from_rows(links.shape, to_world, density[row], np.ascontiguousarray(rows), listed)

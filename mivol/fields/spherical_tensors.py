@@ -14,7 +14,8 @@ import mitsuba as mi
 import numpy as np
 
 from mivol.errors import MivolError
-from mivol.fields.spherical import SphericalGrid, degree_of, load_field, row_width
+from mivol.fields.spherical import SphericalGrid, degree_of, row_width
+from mivol.fields.spherical_files import load_field
 
 __all__ = ["dense_density", "field_from_props", "with_tensors"]
 

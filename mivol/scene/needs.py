@@ -12,8 +12,8 @@ import mitsuba as mi
 import numpy as np
 
 from mivol.scene.facts import Boundary, MediumFacts, Needs
-from mivol.scene.load import check_variant
 from mivol.scene.nesting import bounds
+from mivol.scene.parsing import check_variant
 from mivol.scene.readings import Reading, check_light, check_numbers, is_scattering, read_part
 from mivol.scene.survey import AROUND, SceneSurvey, find_around, is_instance, survey_scene
 from mivol.transport.media.medium_view import MediumView

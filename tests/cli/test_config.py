@@ -14,6 +14,7 @@ from mivol import config
 from mivol.errors import MivolError
 from mivol.optim.gauss_newton import GaussNewton
 from mivol.optim.priors import TotalVariation
+from mivol.schema import describe, structs_in
 
 ROOT = Path(__file__).resolve().parents[2]
 SMALLEST = """
@@ -48,7 +49,7 @@ def test_resolved_settings_are_an_experiment_again() -> None:
 
 def test_every_setting_says_what_it_is() -> None:
     """Each line of the help names a setting, and each setting has one; units are said where there are any."""
-    lines = config.describe()
+    lines = describe(config.Experiment)
     assert any(line.startswith("optimiser[adam].beta_1 = 0.9: ") for line in lines)
     assert any(line.startswith("fit.spp = 16 [sample/pixel]: ") for line in lines)
     assert all(line.partition(": ")[2].strip() for line in lines)
@@ -140,5 +141,5 @@ def test_the_schema_is_strict() -> None:
     for struct in seen:
         assert struct.__struct_config__.forbid_unknown_fields, struct
         for field in msgspec.structs.fields(struct):
-            seen += [s for s in config.structs_in(getattr(field.type, "__origin__", field.type)) if s not in seen]
+            seen += [s for s in structs_in(getattr(field.type, "__origin__", field.type)) if s not in seen]
     assert len(seen) > 12

@@ -12,7 +12,8 @@ from mivol.cli import main
 from mivol.errors import MivolError
 from mivol.fields.activation import ACTIVATIONS
 from mivol.fields.export import EXPORTS, export_field
-from mivol.fields.spherical import SphericalGrid, load_field, save_field
+from mivol.fields.spherical import SphericalGrid
+from mivol.fields.spherical_files import load_field, save_field
 from mivol.fields.surface import INVERSES, level_of, surface_of
 from mivol.files import read_volume
 from mivol.files.mesh import Mesh, read_ply, write_mesh

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from mivol.errors import MivolError
-from mivol.scene.load import content_hash, load_scene
+from mivol.scene.content_hash import content_hash
+from mivol.scene.load import load_scene
 from mivol.threads import run_child
 
 INCLUDED = """<scene version="3.0.0">

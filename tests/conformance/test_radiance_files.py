@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from mivol.errors import MivolError
-from mivol.fields.spherical import SphericalGrid, degree_of, load_field, save_field
+from mivol.fields.spherical import SphericalGrid, degree_of
+from mivol.fields.spherical_files import load_field, save_field
 
 CUBE = np.array([[2.0, 0, 0, -1], [0, 2, 0, -1], [0, 0, 2, -1], [0, 0, 0, 1]])
 

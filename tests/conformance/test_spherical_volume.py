@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 from scattering_scenes import cases
 
-from mivol.fields.spherical import SphericalGrid, save_field
+from mivol.fields.spherical import SphericalGrid
+from mivol.fields.spherical_files import save_field
 from scenes import box_of, camera, centred, refused, render, rotation, sky, tensor, transform
 
 PLACE = centred(2 * np.eye(3))
