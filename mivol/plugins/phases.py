@@ -1,9 +1,9 @@
-"""<phase type="mivol_hg"> and its kin: phase functions for our media and for stock ones.
+"""The phase functions <phase type="mivol_hg">, "mivol_rayleigh", "mivol_draine", "mivol_tabulated" and "mivol_mixture".
 
 Conventions. A phase function of the angle alone is one component; a mixture has those of its lobes. A stock ``blendphase``
 does not see this count: it reads a C++ member that Mitsuba 3.9 gives Python no access to, and numbers no phase function that is
-written in Python. Its renders are right, since no integrator of Mitsuba's asks for a component; whoever does nests the lobes
-in a ``mivol_mixture``.
+written in Python. Its renders are right, since no integrator of Mitsuba's asks for a component. Where components are asked
+for, nest the phase functions in a ``mivol_mixture``.
 """
 
 from __future__ import annotations
@@ -185,7 +185,8 @@ class Mixture(mi.PhaseFunction):
 
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
-        # Looking at a property counts as using it, and one that nobody uses is an error: only phase functions are looked at.
+        # Mitsuba counts a property as used once it is read, and raises for those that never are. So only phase functions are
+        # read here.
         nested = dict(props.objects(False))
         self.lobes = {name: props[name] for name, part in nested.items() if isinstance(part, mi.PhaseFunction)}
         self.weights = _read_weights(props, list(self.lobes))

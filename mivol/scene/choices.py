@@ -53,7 +53,7 @@ class Choice:
 
 
 def shares_cells(needs: Needs) -> bool:
-    """Whether one walk passes all of the first medium."""
+    """Whether one walk of cells passes all parts of the first medium: its grids share their cells."""
     parts = needs.views[0].parts
     return len(flight_parts(parts)) == len(parts)
 

@@ -5,7 +5,7 @@ r"""How much of the light that a medium scatters is missing where it may scatter
 with the radiance :math:`\omega^n s_n` that reaches the eye after n scatterings in a medium of albedo :math:`\omega`:
 max_depth 2 knows :math:`s_1` only. So e rises with the albedo, always.
 
-Conventions. S is the mean over all lines through the medium (even in place and direction) of the scattered radiance; light
+Conventions. S is the mean over all lines through the medium (uniform in place and direction) of the scattered radiance; light
 that reaches the eye unscattered is in neither S. The optical depth that belongs to it is that of the same lines, each
 counted by what it scatters,
 
@@ -94,7 +94,7 @@ def depth_two_error(albedo: float, tau: float, light: str = "constant", phase: s
     above its last column, where it hardly rises.
 
     Args:
-        albedo_arrays: single-scattering albedo, in [0, 1]; of a volume, its mean weighted by extinction.
+        albedo: single-scattering albedo, in [0, 1]; of a volume, its mean weighted by extinction.
         tau: optical depth as :func:`scattering_depth` measures it, at least 0.
         light: "constant" (sky, environment) or "collimated" (sun, point and spot lights).
         phase: "isotropic" or "forward".
@@ -120,7 +120,7 @@ def depth_two_error(albedo: float, tau: float, light: str = "constant", phase: s
 
 
 def draw_lines(box: Box, n: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Lines through a box, spread evenly over places and directions: even over its faces, cosine-weighted inwards.
+    """Lines through a box, uniform in place and direction: uniform over its faces, cosine-weighted inwards.
 
     Args:
         box: in the world.

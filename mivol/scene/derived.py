@@ -1,8 +1,9 @@
-"""What plugins make of their parameters: textures and tables that derivatives have to pass.
+"""Derived values: the textures and tables that plugins compute from their parameters, and that derivatives pass through.
 
-Conventions. A plugin makes them when it is told of a change, and Dr.Jit passes the edge from a parameter to what was made of it
-once, and not from inside a loop. So a reverse pass lets plugins make them anew before it begins, and a forward pass lets them
-be made of copies of the parameters, whose tangents it brings to where they are read. Extinction is read where it stands.
+Conventions. A plugin computes them when a parameter changes. Dr.Jit follows the edge from a parameter to a derived value only
+once, and never from inside a loop. So before a reverse pass the derived values are computed anew, with fresh edges; for a
+forward pass they are computed from copies of the parameters, and the tangents are carried to them before any kernel reads
+them. Extinction needs neither: transport reads it from the parameters themselves.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ import mitsuba as mi
 
 from mivol.transport.media.read_medium import traverse_medium
 
-__all__ = ["renew", "tangents_led"]
+__all__ = ["carry_tangents", "recompute_derived"]
 
 
 @dataclass
@@ -34,26 +35,26 @@ class _Asked:
         return self.value if dr.is_array_v(self.value) else self.value.matrix
 
     def make_of(self, value: Any) -> None:
-        """Have everything made of a value."""
+        """Set the parameter to a value, and compute all derived values from it."""
         self.params[self.key] = value
         self.params.set_dirty(self.key)
         self.params.update()
 
     def put_back(self) -> None:
-        """Let the parameter be what it was."""
+        """Set the parameter to what it was, without an update."""
         self.params[self.key] = self.value
 
 
-def renew(scene: mi.Scene) -> None:
-    """Have everything made anew of parameters whose derivatives are asked for. Not while a function is being recorded."""
+def recompute_derived(scene: mi.Scene) -> None:
+    """Compute the derived values of all parameters with gradients anew. While ``dr.freeze`` records, nothing is done."""
     for asked in _find_asked(scene):
         asked.make_of(asked.value)
         asked.put_back()
 
 
 @contextmanager
-def tangents_led(scene: mi.Scene) -> Iterator[None]:
-    """Everything is made of copies of the parameters, and has its tangent; afterwards it is made of the parameters again."""
+def carry_tangents(scene: mi.Scene) -> Iterator[None]:
+    """Within this context derived values come from copies of the parameters, and have their tangents."""
     with dr.resume_grad():
         found = _find_asked(scene)
         copies = [dr.detach(asked.numbers) for asked in found]

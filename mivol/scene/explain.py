@@ -85,7 +85,7 @@ def explain(scene: mi.Scene | str | Path, max_depth: int | None = None, sensor: 
 
 
 def _transmittance_grid(scene: mi.Scene, needs: Needs, plan: Plan, settings: Settings) -> list[str]:
-    """What a light grid in place of shadow rays costs, and how wrong it is."""
+    """What a transmittance grid in place of shadow rays costs, and its measured bias."""
     if not is_lit(needs, settings) or set(needs.emitter_kinds) != {"delta"} or len(needs.media) != 1:
         return []
     if not shares_cells(needs) or any(part.lattice is None for part in needs.views[0].parts):
@@ -105,7 +105,7 @@ def _transmittance_grid(scene: mi.Scene, needs: Needs, plan: Plan, settings: Set
 
 
 def _tables(needs: Needs) -> list[str]:
-    """What grids that were seen through a table miss of it between their nodes."""
+    """How far each ``mivol_transfer``, whose nodes are made by a table, departs from that table between its nodes."""
     lines = []
     for facts, boundary in zip(needs.media, needs.boundaries, strict=True):
         volumes = {key.split(".")[0]: entry[2] for key, entry in traverse_medium(boundary.medium).properties.items()}
@@ -123,7 +123,7 @@ def _tables(needs: Needs) -> list[str]:
 
 
 def _depth_two(scene: mi.Scene, needs: Needs) -> list[str]:
-    """What a model of one scattering leaves out of each medium."""
+    """Which share of the light that each medium scatters is missing at max_depth 2 (:mod:`mivol.scene.depth_two`)."""
     lines = []
     light = "collimated" if "delta" in needs.emitter_kinds else "constant"
     for facts, boundary, view in zip(needs.media, needs.boundaries, needs.views, strict=True):
@@ -148,7 +148,7 @@ def _box_around(scene: mi.Scene, medium: mi.Medium) -> Box | None:
     if not boxes:
         return None
     low, high = np.min([b[0] for b in boxes], axis=0), np.max([b[1] for b in boxes], axis=0)
-    # Lines begin outside of what they are to enter.
+    # A little larger than the medium, so that the lines of :func:`draw_lines` begin outside of its boundary.
     room, place = 1e-3 * (high - low).max(), np.eye(4)
     place[:3, :3], place[:3, 3] = np.diag(high - low + 2 * room), low - room
     return Box(place)

@@ -1,4 +1,4 @@
-"""The facts of a scene: what it is made of, as a plan is told. Nothing is decided here."""
+"""The facts of a scene that a plan is made from; choices are made in :mod:`mivol.scene.choices`."""
 
 from __future__ import annotations
 
@@ -14,9 +14,13 @@ __all__ = ["Boundary", "MediumFacts", "Needs"]
 
 @dataclass(frozen=True)
 class Boundary:
-    """One medium and where it is: its name in the scene, the shape that it fills, and its box, if the shape is one.
+    """One medium and where it is.
 
-    A medium that fills no shape of its own (around other shapes, around the camera, in instances) is behind ``AROUND``.
+    Attributes:
+        medium: Mitsuba's object.
+        name: of the shape that it fills.
+        shape: class of that shape; ``AROUND`` for a medium that fills none (around other shapes or the camera, in instances).
+        box: the shape, where it is a box that no other boundary overlaps; None where it has to be traced.
     """
 
     medium: mi.Medium
@@ -29,10 +33,19 @@ class Boundary:
 class MediumFacts:
     """What one medium is made of.
 
-    ``resolutions`` are those of its grids (Z, Y, X), none for a homogeneous medium; ``emits`` tells whether it is a source of
-    light, ``occupied`` which share of their blocks of cells holds anything; ``tau_max`` bounds the optical depth through its
-    box [1] (None where it is not bounded by a box); ``unread``: values could not be read, because a function is being recorded;
-    ``bounded`` names the field of which no more than a majorant is known along a ray, None where optical depths are exact.
+    Attributes:
+        name: of the shape that it fills.
+        kind: class of the medium.
+        boundary: where it is, in words.
+        extinction: ``grey`` or ``rgb``.
+        resolutions: of its grids (Z, Y, X); none for a homogeneous medium.
+        is_scattering: some albedo or ``sigma_s`` is above 0, or its derivative is asked for.
+        emits: it has an emission or an emission density.
+        phase: kind of its phase function.
+        occupied: fraction of its blocks of cells that are not empty; of its emptiest grid.
+        tau_max: upper bound of the optical depth [1] through its box; None where its boundary is no box.
+        unread: values could not be read, because ``dr.freeze`` records.
+        bounded: class of a field of which no more than a majorant is known along a ray; None where optical depths are exact.
     """
 
     name: str

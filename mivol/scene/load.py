@@ -56,9 +56,10 @@ class LoadedScene:
 
 @contextmanager
 def two_threads() -> Iterator[None]:
-    """Let Mitsuba read files: it hands an EXR to a second thread of the pool, and waits for ever where there is none.
+    """Give Dr.Jit a second thread while Mitsuba reads files, where it has one only.
 
-    That is so in a process pinned to one CPU, and where one thread was asked for.
+    Mitsuba hands an EXR to another thread of the pool and waits for it: without end in a process that is pinned to one CPU, or
+    in which one thread was asked for.
     """
     single = mi.variant().startswith("llvm") and dr.thread_count() == 1
     if single:

@@ -19,7 +19,7 @@ import numpy as np
 from mivol.transport.media.box import box_of_cube
 from mivol.transport.traversal.ray_spawning import spawn_ray
 
-__all__ = ["Room", "bounds", "extent", "nesting_fault", "room_of"]
+__all__ = ["OrientedBox", "bounds", "box_around", "extent", "nesting_fault"]
 
 RAYS = 512
 """Rays for each pair of shapes that share space, through what their boxes share."""
@@ -44,8 +44,8 @@ UNKNOWN = -1
 
 
 @dataclass(frozen=True)
-class Room:
-    """A parallelepiped around a shape: a cube itself, else the upright box.
+class OrientedBox:
+    """A parallelepiped around a shape: a ``cube`` itself, else the upright bounding box.
 
     Attributes:
         corners: (8, 3).
@@ -55,8 +55,8 @@ class Room:
     corners: np.ndarray
     edges: np.ndarray
 
-    def shares(self, other: Room, margin: float = -ON_FACE) -> bool:
-        """Whether no plane parts two rooms by less than ``margin`` (in sizes; negative: they may reach into each other)."""
+    def shares(self, other: OrientedBox, margin: float = -ON_FACE) -> bool:
+        """Whether no plane separates two boxes by less than ``margin`` (in sizes; negative: they may reach into each other)."""
         across = [np.cross(a, b) for a in self.edges for b in other.edges]
         across += [np.cross(r.edges[i], r.edges[i - 1]) for r in (self, other) for i in range(3)]
         axes = np.array([a / n for a in across if (n := np.linalg.norm(a)) > ON_FACE])
@@ -66,14 +66,14 @@ class Room:
         return bool((gap < margin * size).all())
 
 
-def room_of(shape: mi.Shape) -> Room:
-    """The room that a shape is in."""
+def box_around(shape: mi.Shape) -> OrientedBox:
+    """A box around a shape."""
     if shape.class_name() == "Cube":
         box = box_of_cube(shape)
         edges = box.to_world[:3, :3].T
-        return Room(box.corners(), edges / np.linalg.norm(edges, axis=1, keepdims=True))
+        return OrientedBox(box.corners(), edges / np.linalg.norm(edges, axis=1, keepdims=True))
     low, high = bounds(shape)
-    return Room(np.where(np.indices((2, 2, 2)).reshape(3, 8).T == 0, low, high), np.eye(3))
+    return OrientedBox(np.where(np.indices((2, 2, 2)).reshape(3, 8).T == 0, low, high), np.eye(3))
 
 
 def nesting_fault(scene: mi.Scene, traced: Sequence[mi.Shape] = ()) -> str | None:
@@ -105,9 +105,9 @@ def nesting_fault(scene: mi.Scene, traced: Sequence[mi.Shape] = ()) -> str | Non
 
 def _pairs(shapes: list[mi.Shape], traced: set[int]) -> list[tuple[mi.Shape, mi.Shape]]:
     """Shapes that share space, or touch where it matters; meshes, which may hold several pieces, with themselves."""
-    rooms = [(s, room_of(s), _number(mi.ShapePtr(s)) in traced) for s in shapes]
+    boxes = [(s, box_around(s), _number(mi.ShapePtr(s)) in traced) for s in shapes]
     alone = [(s, s) for s in shapes if s.is_mesh() and s.class_name() not in ("Cube", "Rectangle")]
-    close = ((a, b) for a, b in combinations(rooms, 2) if a[1].shares(b[1], ON_FACE if a[2] or b[2] else -ON_FACE))
+    close = ((a, b) for a, b in combinations(boxes, 2) if a[1].shares(b[1], ON_FACE if a[2] or b[2] else -ON_FACE))
     return [*alone, *((a[0], b[0]) for a, b in close)][:MOST_PAIRS]
 
 

@@ -163,9 +163,9 @@ def _check_look_up(part: ExactExtinction, survey: SceneSurvey, name: str) -> Non
 
 
 def read_empty_distances(part: ExactExtinction, survey: SceneSurvey, name: str) -> mi.UInt8:
-    """Measure the gaps between the blocks of a part that hold anything, once for each state of its array."""
+    """Measure how far each block of a part is from the nearest one that is not empty, once for each state of its array."""
     array, res = dr.detach(part.lattice.values.array), part.lattice.res
-    return _once(survey, ("gaps",), array, lambda: empty_block_distances(read_part(part, survey, name).bounds, res))
+    return _once(survey, ("empty distances",), array, lambda: empty_block_distances(read_part(part, survey, name).bounds, res))
 
 
 def read_block_ranges(part: ExactExtinction, survey: SceneSurvey) -> BlockRanges:

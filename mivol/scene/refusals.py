@@ -88,7 +88,7 @@ def refuse_emission(needs: Needs, settings: Settings) -> None:
                 whose, advice = ("extinction", ", or give it as a number") if led else ("emission_density", "")
                 raise MivolError(
                     f"the {name} of the medium in {facts.name} varies over lengths of {least:.2g} of its {whose}'s cells, "
-                    f"which are looked at in two points; resample the {whose} to voxels as small{advice}."
+                    f"which are integrated by two points; resample the {whose} to voxels as small{advice}."
                 )
 
 

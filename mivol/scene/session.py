@@ -13,7 +13,7 @@ import mitsuba as mi
 
 from mivol.errors import MivolError
 from mivol.scene.build import build_estimators
-from mivol.scene.derived import renew, tangents_led
+from mivol.scene.derived import carry_tangents, recompute_derived
 from mivol.scene.load import find_sensor
 from mivol.scene.needs import find_needs
 from mivol.scene.plan import Plan, make_plan
@@ -86,7 +86,7 @@ class Session:
     def render_forward(self, scene: mi.Scene, sensor: int | mi.Sensor, seed: int, spp: int) -> mi.TensorXf:
         """Render the derivative of an image along the gradients that were set on the parameters."""
         sensor = find_sensor(scene, sensor)
-        with dr.suspend_grad(), tangents_led(scene):
+        with dr.suspend_grad(), carry_tangents(scene):
             with dr.resume_grad():
                 estimators, plan = self._open(scene, sensor, spp)
                 estimators.media.start_tangent()
@@ -101,12 +101,13 @@ class Session:
         sensor = find_sensor(scene, sensor)
         with dr.suspend_grad():
             with dr.resume_grad():
-                renew(scene)
+                recompute_derived(scene)
                 estimators, plan = self._open(scene, sensor, spp)
             media = estimators.media
             samples = RenderSamples(sensor, seed, spp, plan.pass_rays, estimators.segment.directions)
             media.start_gradients()
-            # What is pulled back to a volume waits there for the end: its edge to the parameter can be passed but once.
+            # Gradients of volumes wait for the end of all passes: Dr.Jit follows the edge from a derived value to its parameter
+            # only once.
             with dr.isolate_grad():
                 for rays, dL, daovs in adjoint_rays(samples, self.aovs, grad_in):
                     self._replay(estimators, rays, dL, daovs)
@@ -123,11 +124,11 @@ class Session:
             media.start = named[0] if all(medium is named[0] for medium in named) else None
             media.locates_camera = bool(media.traced)
             score, alpha = walk_path(estimators, self.settings, sampler, ray, Primal(_black(ray)), active)
-            # Their alpha is whether something is seen: it is drawn.
+            # To an integrator that nests this one alpha is a mask, whether something is seen: it is drawn with that chance.
             return score.L, sampler.next_1d(active) < alpha, integrate_aovs(media, ray, self.aovs, active)
 
     def _open(self, scene: mi.Scene, sensor: mi.Sensor, spp: int, pictures: bool = False) -> tuple[Estimators, Plan]:
-        """Ask, plan, and build the estimators, for pictures or for derivatives."""
+        """Survey a scene that is not known yet, find its needs, plan, and build estimators for images or for derivatives."""
         parts = [*scene.shapes(), *scene.emitters()]
         if self._surveyed is None or not self._surveyed.is_of(parts) or not self._surveyed.survey.is_current:
             self._surveyed = _SurveyedScene(parts, survey_scene(scene))

@@ -10,7 +10,7 @@ import mitsuba as mi
 
 from mivol.errors import MivolError
 from mivol.scene.facts import Boundary
-from mivol.scene.nesting import Room, extent, nesting_fault, room_of
+from mivol.scene.nesting import OrientedBox, box_around, extent, nesting_fault
 from mivol.transport.estimators.emitters import UNIFORM
 from mivol.transport.media.box import box_of_cube
 
@@ -22,9 +22,18 @@ AROUND = "space around shapes"
 
 @dataclass
 class SceneSurvey:
-    """What does not change while shapes stay where they are: found once, with what was read of each array.
+    """What does not change while shapes stay where they are, and a cache of what was read of arrays.
 
-    ``marks`` tells where boundaries were: shapes, and what another place would change of them; ``size`` is that of the scene.
+    Attributes:
+        boundaries, surfaces, has_null_transmission, emitters, emitter_kinds, refractive: as in
+            :class:`mivol.scene.facts.Needs`.
+        marks: boundaries, each with what another place would change of it: its vertices or its box.
+        size: diagonal of the box around all shapes [length].
+        looked_up: stock grids whose look-up was compared with mivol's, by pointer.
+        scatters: whether each medium scattered when it was last read, by name.
+        values, numbers: what was read of arrays and of constants (:mod:`mivol.scene.readings`).
+        places: where grids lie (:func:`mivol.transport.media.read_medium.view_medium`).
+        warned: grids whose values below 0 were told of.
     """
 
     boundaries: tuple[Boundary, ...]
@@ -44,7 +53,7 @@ class SceneSurvey:
 
     @property
     def is_current(self) -> bool:
-        """Whether no boundary has been moved since. What ``dr.freeze`` records stays where it is."""
+        """Whether no boundary has been moved since. While ``dr.freeze`` records, which cannot be told, all count as unmoved."""
         return dr.flag(dr.JitFlag.FreezingScope) or all(_is_at(shape, mark) for shape, mark in self.marks)
 
 
@@ -56,12 +65,12 @@ def survey_scene(scene: mi.Scene) -> SceneSurvey:
     """
     boundaries, surfaces, refractive, has_null = [], [], [], False
     shapes = scene.shapes()
-    rooms = {s.ptr: room_of(s) for s in shapes if s.is_medium_transition()}
+    boxes = {s.ptr: box_around(s) for s in shapes if s.is_medium_transition()}
     for index, shape in enumerate(shapes):
         if shape.is_medium_transition():
             name = shape.id() or f"shape {index}"
             if shape.interior_medium() is not None:
-                boundaries.append(_boundary(shape, name, rooms))
+                boundaries.append(_boundary(shape, name, boxes))
             if int(shape.bsdf().flags()) & (int(mi.BSDFFlags.DeltaTransmission) | int(mi.BSDFFlags.GlossyTransmission)):
                 refractive.append(f"{name} ({shape.bsdf().class_name()})")
         if not _is_bare(shape):
@@ -106,7 +115,7 @@ def _emitter_kind(emitter: mi.Emitter) -> str:
 
 
 def _is_bare(shape: mi.Shape) -> bool:
-    """Whether a shape is nothing but a boundary."""
+    """Whether a shape is only a boundary: a ``null`` BSDF, and no emitter."""
     bsdf = shape.bsdf()
     return bsdf is not None and int(bsdf.flags()) & int(mi.BSDFFlags.All) == int(mi.BSDFFlags.Null) and not shape.is_emitter()
 
@@ -116,13 +125,13 @@ def is_instance(shape: mi.Shape) -> bool:
     return shape.class_name() == "Instance"
 
 
-def _boundary(shape: mi.Shape, name: str, rooms: dict[int, Room]) -> Boundary:
-    alone = not any(room.shares(rooms[shape.ptr]) for other, room in rooms.items() if other != shape.ptr)
+def _boundary(shape: mi.Shape, name: str, boxes: dict[int, OrientedBox]) -> Boundary:
+    alone = not any(box.shares(boxes[shape.ptr]) for other, box in boxes.items() if other != shape.ptr)
     is_box = shape.class_name() == "Cube" and shape.exterior_medium() is None and _is_bare(shape) and alone
     return Boundary(shape.interior_medium(), name, shape.class_name(), box_of_cube(shape) if is_box else None)
 
 
 def find_around(media: Iterable[mi.Medium], boundaries: Sequence[Boundary]) -> list[Boundary]:
-    """Those of some media that fill no shape of their own: found on the way, by the surfaces around them."""
+    """The media that fill no shape of their own: a ray learns of them from the exterior of a boundary, or from the sensor."""
     held = {b.medium.ptr for b in boundaries}
     return [Boundary(m, m.id() or "a medium without an id", AROUND, None) for m in media if m.ptr not in held]

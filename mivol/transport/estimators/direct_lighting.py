@@ -87,7 +87,7 @@ class DirectLighting:
 
     @cached_property
     def emitters(self) -> SceneEmitters:
-        """The emitters of the scene, looked at where media scatter their light; surfaces ask Mitsuba."""
+        """The emitters of the scene, read when media first scatter their light; at surfaces Mitsuba chooses the emitter."""
         return SceneEmitters(self.media.scene)
 
     def at_surface(

@@ -55,7 +55,7 @@ class DistanceProposal:
         ray: world space, unit direction.
         chosen: the emitter of each lane.
         cache: rough visibility of the emitters; None for none.
-        probe_depth: optical depth that is added evenly over each medium, for probes of derivatives; 0 for an image.
+        probe_depth: optical depth that is added uniformly over each medium, for probes of derivatives; 0 for an image.
     """
 
     media: SceneMedia

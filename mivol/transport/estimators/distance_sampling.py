@@ -1,8 +1,8 @@
 r"""Distance sampling in the piece of a ray that a reservoir has kept, with the density of the distance.
 
-The distance is drawn by inverting the piece's exact optical depth (free-flight sampling), or evenly in the angle seen from the
-emitter (equiangular sampling). The density of their mixture, times the probability of the piece, is returned; so the estimate
-is unbiased whatever the weights of the pieces were.
+The distance is drawn by inverting the piece's exact optical depth (free-flight sampling), or uniformly in the angle seen from
+the emitter (equiangular sampling). The density of their mixture, times the probability of the piece, is returned; so the
+estimate is unbiased whatever the weights of the pieces were.
 
 References: Kulla & Fajardo 2012 (equiangular sampling); Miller et al. 2019 (spectral combination of free paths).
 """
@@ -71,7 +71,7 @@ def sample_distance(
     whole = [_partial(c, dt, 1) for c in curve]
     front = [dr.exp(-f) for f in candidate.front]
 
-    # -- The technique: free flight, or evenly (in angle where the emitter has a place, in length for probes) ---------
+    # -- The technique: free flight, or uniform (in angle where the emitter is finite, in length for probes) -----------
     by_collision = mi.Float(1)
     if proposal.probe_depth:
         mean = sum(whole) / len(whole)

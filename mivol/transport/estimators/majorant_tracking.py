@@ -2,7 +2,7 @@ r"""The transmittance of a field of which no more than a majorant is known, by r
 
 .. math:: \hat T = \prod_j \left(1 - \frac{\sigma(x_j)}{\kappa M}\right)
 
-at the points of a Poisson process of the rate kappa M, for a majorant M of the extinction.
+at the points x_j of a Poisson process of the rate kappa M, for a majorant M of the extinction sigma; kappa = ``LOOKUP_RATE``.
 
 References: Cramer 1978; Novak et al. 2014 (ratio tracking).
 """

@@ -7,9 +7,8 @@ shadow ray.
 
 A control variate is subtracted whose own derivative is exact. With one grid and an albedo in a box it is a source function on a
 coarse lattice, swept cell by cell together with the segment's transmittance (:mod:`.control_sweep`). Elsewhere, under a
-constant
-sky, it is one source function for the whole ray: its light :math:`S (1 - T)` has the derivative :math:`S T` by the optical
-depth of any part of the ray.
+constant sky, it is one source function for the whole ray: its light :math:`S (1 - T)` has the derivative :math:`S T` by the
+optical depth of any part of the ray.
 
 Conventions. ``dL`` is d loss / d light and ``dlog`` d loss / d log T, which is dL times the light behind the segment.
 """

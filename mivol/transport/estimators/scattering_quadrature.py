@@ -9,8 +9,7 @@ function is exact at any optical depth.
 
 Each cell is cut into pieces of an optical depth of at most ``PIECE``, and of an angle of at most ``TURN`` as seen from an
 emitter near by; then the cuts are uniform in that angle. A cell that would need more than ``MOST`` pieces is cut only as far as
-light
-comes: to the optical depth ``DARK`` of each channel.
+light comes: to the optical depth ``DARK`` of each channel.
 
 Shadow rays start at float32 points. With an extinction sigma, the optical depth of the lit layer is therefore off by sigma
 times the rounding of a distance along the camera's ray and of a coordinate: 1 % where 1e5 optical depths lie between

@@ -1,9 +1,11 @@
-r"""Media of which some are bounded take light away: their transmittance is estimated, that of all others is exact.
+r"""Absorption where some media are known by a majorant only: their transmittance is estimated, that of all others is exact.
 
 .. math:: L = \hat T\, L_{behind}, \qquad \partial L = -L\,\ell\;\partial\sigma(t)
 
-The point t of a derivative is drawn evenly and independently of the estimate (:mod:`mivol.transport.media.drawn_points`), so
-that the product is unbiased too.
+The estimate T is that of ratio tracking (:mod:`.majorant_tracking`). The point t of a derivative is drawn uniformly over the
+length l in the medium, and independently of T (:mod:`mivol.transport.media.drawn_points`), so the product is unbiased too.
+
+References: Novak et al. 2014 (ratio tracking).
 """
 
 from __future__ import annotations
@@ -22,7 +24,7 @@ __all__ = ["TrackedAbsorption"]
 
 
 class TrackedAbsorption:
-    """Media add nothing, and some of them are bounded.
+    """The segment estimator for media that only absorb, of which some are known by a majorant only.
 
     Args:
         media: of the scene.
@@ -37,7 +39,11 @@ class TrackedAbsorption:
         self.media = media
 
     def draw(self, sampler: mi.Sampler, active: mi.Bool, strata: Strata | None) -> mi.Float:
-        """One number in every lane: ``active`` are those that may turn, and all others would draw the same one again."""
+        """One number in every lane.
+
+        Not in ``active`` lanes only, which are those that may scatter once more: a sampler does not advance in the others, and
+        would give them the same number at each segment.
+        """
         return sampler.next_1d()
 
     def estimate(self, segment: PathSegment, purpose: str, active: mi.Bool) -> SegmentEstimate:
@@ -52,5 +58,5 @@ class TrackedAbsorption:
         """Nothing is needed."""
 
     def replayed(self) -> TrackedAbsorption:
-        """A replay meets the same estimates of the transmittance."""
+        """This estimator: a replay draws the same numbers, and finds the same transmittance again."""
         return self

@@ -1,5 +1,4 @@
-"""A transmittance grid: optical depth towards emitters at the nodes of a lattice, which replaces shadow rays, with a measured
-bias.
+"""A transmittance grid: optical depth towards emitters at the nodes of a lattice, in place of shadow rays; a biased estimator.
 
 Conventions. Optical depth is stored and interpolated. An interpolated transmittance would be too bright between nodes (by 54 %
 for a step of 2 in optical depth).

@@ -1,4 +1,12 @@
-"""One medium in its boundary: its extinction at a point and along a segment, with derivatives in both directions."""
+r"""One medium in its boundary: its extinction at a point and over an interval of a ray, with jvp and vjp.
+
+.. math:: \sigma_t(x, \omega) = s\,A(\omega) \sum_k f_k(x), \qquad A(\omega) = \sqrt{\omega^T S\, \omega}
+
+with the medium's scale s, its parts f_k (:mod:`mivol.transport.media.extinction`) and the projected area A of microflakes of
+the matrix S; A = 1 without microflakes. Each method computes the sum over the parts and multiplies it with s and A.
+
+References: Heitz et al. 2015, Eq. 6 (the projected area).
+"""
 
 from __future__ import annotations
 
@@ -49,35 +57,35 @@ class Body:
         return len(self.exact_parts) < len(self.view.parts)
 
     def area(self, d: mi.Vector3f) -> mi.Float | float:
-        """Factor on the extinction for light that travels along ``d``: the projected area of microflakes, else 1."""
+        """A(d) [1], the factor on the extinction for light that travels along the unit vector ``d``; 1 without microflakes."""
         if self.view.microflakes is None:
             return 1.0
         return dr.safe_sqrt(dr.dot(d, self.facing(d)))
 
     def facing(self, d: mi.Vector3f) -> mi.Vector3f:
-        """The matrix of the microflakes times a direction: half the gradient of the squared area."""
+        """S d, the matrix of the microflakes times a direction: half the gradient of A^2 with respect to ``d``."""
         xx, yy, zz, xy, xz, yz = dr.detach(self.view.microflakes)
         return mi.Vector3f(xx * d.x + xy * d.y + xz * d.z, xy * d.x + yy * d.y + yz * d.z, xz * d.x + yz * d.y + zz * d.z)
 
     def _area_slopes(self, d: mi.Vector3f) -> list[mi.Float]:
-        """Derivative of the logarithm of the area by each number of the matrix: of it, extinction is a multiple."""
+        """d log A / d S_k for the six entries (xx, yy, zz, xy, xz, yz); 0 where A is 0. Extinction is proportional to A."""
         square = dr.dot(d, self.facing(d))
         half = dr.select(square > 0, 0.5 * dr.rcp(dr.select(square > 0, square, 1)), 0)
         twice = 2 * half
         return [half * d.x * d.x, half * d.y * d.y, half * d.z * d.z, twice * d.x * d.y, twice * d.x * d.z, twice * d.y * d.z]
 
     def _vjp_microflakes(self, d: mi.Vector3f, weight: list[mi.Float], amount: list[mi.Float], active: mi.Bool) -> None:
-        """Add ``weight`` (d loss / d amount) to the gradient of the matrix, for amounts in proportion to the area."""
+        """Add ``weight`` (d loss / d amount of each channel) to the gradient of S, for an ``amount`` proportional to A."""
         change = sum((dr.select(w != 0, w * a, 0) for w, a in zip(weight, amount, strict=True)), mi.Float(0))
         for k, slope in enumerate(self._area_slopes(d)):
             dr.scatter_add(self.microflakes_gradient, change * slope, mi.UInt32(k), active)
 
     def _jvp_microflakes(self, d: mi.Vector3f) -> mi.Float:
-        """Tangent of the logarithm of the area."""
+        """Tangent of log A, from the tangent of S."""
         return sum((s * t for s, t in zip(self._area_slopes(d), self.microflakes_tangent, strict=True)), mi.Float(0))
 
     def extinction(self, ray: mi.Ray3f, parts: list[ExactExtinction] | None = None) -> SummedExtinction:
-        """The sum of parts (all of them, unless told which), which share their cells, along a ray, without derivatives."""
+        """The sum of ``parts`` (None: all), whose grids share their cells, along a ray; without derivatives."""
         parts = self.view.parts if parts is None else parts
         return SummedExtinction(parts, [dr.detach(p.values) for p in parts], dr.detach(self.view.scale) * self.area(ray.d))
 
@@ -88,7 +96,16 @@ class Body:
         parts: list[ExactExtinction] | None = None,
         enough: float | None = None,
     ) -> list[mi.Float]:
-        """Optical depth [1] of each channel over an interval, of all parts unless told which; a grid may stop at ``enough``.
+        """Optical depth [1] of each channel over an interval.
+
+        Args:
+            interval: of a ray.
+            channels: of the scene, 1 or 3.
+            parts: of the medium; None for all of them.
+            enough: a walk of a grid may stop where the grid's own optical depth exceeds this in every channel.
+
+        Returns:
+            ``channels`` numbers a lane, without derivatives.
 
         Raises:
             MivolError: of all parts, and one of them is bounded.
@@ -183,7 +200,7 @@ def is_followed(microflakes: list[mi.Float] | None) -> bool:
 
 
 def flight_parts(parts: list[Extinction]) -> list[ExactExtinction]:
-    """The constants, and the grids that share the cells of the one that scatters."""
+    """The parts that one walk of cells can sum: constants, and grids that share the cells of ``sigma_s`` (or the first)."""
     grids = [p for p in parts if p.lattice is not None]
     lead = next((p for p in grids if p.name == "sigma_s"), grids[0] if grids else None)
     return [p for p in parts if p.exact_line and (p.lattice is None or share_cells(p.lattice, lead.lattice))]

@@ -49,7 +49,7 @@ def as_rows(values: list[mi.Float], channels: int) -> list[mi.Float]:
 
 
 def _grey(rows: list[mi.Float]) -> list[mi.Float]:
-    """Three channels as the one of a mono variant."""
+    """Three channels as the one of a mono variant: their luminance."""
     return [sum(share * row for share, row in zip(LUMINANCE, rows, strict=True))]
 
 

@@ -1,9 +1,12 @@
-r"""A point of each bounded extinction along a segment, drawn evenly: derivatives of the optical depth are looked at there.
+r"""A point of each bounded extinction along a segment, drawn uniformly, for the derivative of its optical depth.
 
 .. math:: \partial \tau = \int \partial \sigma\,dt = E[\ell\; \partial \sigma(t)], \qquad t \sim \mathrm{uniform}
 
-with the length l of all the segment's intervals in the field's box. A segment may leave a boundary and enter it again: the
-interval is kept by its share of the length so far (reservoir sampling), which needs no more than the one number of the segment.
+with the length l of all the segment's intervals in the field's box. A segment may leave a boundary and enter it again: one of
+its intervals is kept with a probability proportional to its length, by weighted reservoir sampling, which reuses the one random
+number of the segment.
+
+References: Chao 1982 (weighted reservoir sampling).
 """
 
 from __future__ import annotations
@@ -23,12 +26,12 @@ __all__ = ["DrawnPoint", "bounded_parts", "draw_in", "start_points"]
 
 @dataclass
 class DrawnPoint:
-    """What has been seen of one bounded extinction.
+    """The reservoir of one bounded extinction.
 
     Attributes:
         total: length [length] of the intervals so far.
         begin, length: the one that was kept.
-        u: what is left of the random number, even in [0, 1).
+        u: what is left of the random number, uniform in [0, 1).
     """
 
     total: mi.Float
@@ -38,7 +41,7 @@ class DrawnPoint:
 
     @property
     def t(self) -> mi.Float:
-        """Distance of the point."""
+        """Distance of the point [length]."""
         return dr.fma(self.u, self.length, self.begin)
 
 
@@ -66,6 +69,6 @@ def draw_in(point: DrawnPoint, part: BoundedExtinction, interval: RayInterval) -
     total = point.total + length
     share = length / dr.select(total > 0, total, 1)
     keep = point.u < share
-    # Given the outcome, the number is even again in its part of [0, 1).
+    # Given the outcome, the number is uniform in [0, share) or in [share, 1), and is stretched to [0, 1) again.
     u = dr.select(keep, point.u / dr.select(share > 0, share, 1), (point.u - share) / dr.select(share < 1, 1 - share, 1))
     return DrawnPoint(total, dr.select(keep, begin, point.begin), dr.select(keep, length, point.length), u)

@@ -28,19 +28,18 @@ class MediumView:
         medium: the Mitsuba object.
         parts: their sum, times ``scale``, is sigma_t.
         scale: dimensionless factor, differentiable where the plugin makes it so.
-        albedo_arrays: the arrays behind the albedo, or behind the ``sigma_s`` part: their maximum tells whether it scatters.
+        albedo_arrays: the arrays behind the albedo, or behind the ``sigma_s`` part.
         albedo: the albedo itself, a volume or a constant; None where ``sigma_s`` is a part.
         microflakes: the matrix S (xx, yy, zz, xy, xz, yz) of an ``sggx`` phase function, which makes the extinction depend on
             the direction: sigma_t sqrt(w^T S w) (Heitz et al. 2015, Eq. 6), with derivatives; None elsewhere.
-        emission: the radiance that a medium shows where nothing is seen through it, a volume or a constant; None where it
-            does not emit.
-        emission_density: radiance per length that does not go with the extinction, likewise.
-        emission_lattice: the grid of ``emission_density``, ``emission`` or ``albedo``: a sweep follows it where the extinction
-            has none.
+        emission: Le [radiance], a volume or a constant; its source function is (1 - albedo) Le. None where there is none.
+        emission_density: [radiance/length], which does not depend on the extinction; likewise.
+        emission_lattice: the grid of ``emission_density``, ``emission`` or ``albedo``, whose cells are walked where the
+            extinction has no grid. Its values are zeros.
         emission_arrays: the arrays behind ``emission`` and ``emission_density``.
         numbers: the constants among ``scale`` and the coefficients of the extinction, as ``mi.traverse`` hands them out.
-        stock_boxes: the boxes of stock grids of emission and albedo, by the volume's pointer: they repeat their border outside
-            of it, where emission is to be 0.
+        stock_boxes: the boxes of stock grids of emission and albedo, by the volume's pointer. Mitsuba repeats the border of
+            such a grid outside of its box, where mivol has no emission.
     """
 
     medium: mi.Medium
@@ -57,7 +56,7 @@ class MediumView:
     numbers: dict[str, float | mi.Float | mi.Color3f] = field(default_factory=dict)
 
     def holds(self, volume: mi.Volume, p: mi.Point3f) -> mi.Bool:
-        """Whether a point lies in the box of a volume of ``emission`` or ``emission_density`` that does not ask this itself."""
+        """Whether a point lies in the box of a stock volume of emission; our volumes are 0 outside, and always hold it."""
         if volume.ptr not in self.stock_boxes:
             return mi.Bool(True)
         rows = self.stock_boxes[volume.ptr].rows()

@@ -61,7 +61,7 @@ class RaySegment:
         medium: the medium around its origin.
         length: how far it went [length].
         passes_null: whether it passed surfaces that transmit part of the light undeviated.
-        u: a number in [0, 1) that draws the points at which derivatives of bounded media are looked at; None where all optical
+        u: a number in [0, 1) that draws the points at which derivatives of bounded media are estimated; None where all optical
             depths are exact.
     """
 
@@ -91,7 +91,7 @@ class MediumInterval(RayInterval):
     body: Body
 
     def middle(self) -> mi.Float64:
-        """Distance of the middle of the interval inside the boundary: of two media that with the lesser one is in front."""
+        """Distance of the middle of the interval inside the boundary [length], which orders disjoint media."""
         t0, t1 = mi.Float64(self.t0), mi.Float64(self.t1)
         if self.body.box is not None and not self.body.cuts_grids:
             _, _, t0, t1 = slab(self.body.rows, (0.0,) * 3, (1.0,) * 3, self.ray.o, self.ray.d, t0, t1)

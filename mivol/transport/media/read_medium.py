@@ -36,9 +36,9 @@ def view_medium(medium: mi.Medium, boundary: Box | None = None, places: dict | N
     Args:
         medium: ``mivol_medium``, ``homogeneous`` or ``heterogeneous`` (over ``gridvolume``, ``constvolume`` or
             ``mivol_voxels``).
-        boundary: the box that bounds it, if it is one: a stock grid tells its place to 6 digits only, and is put
-            exactly into a boundary that it fills.
-        places: where earlier views found the grids of this scene; filled.
+        boundary: the box that bounds it, if it is one. Mitsuba prints the place of a stock grid to 6 digits only; a grid that
+            fills its boundary to these digits is put exactly there.
+        places: a cache of where grids lie, by volume and boundary, which is added to; None for none.
 
     Raises:
         MivolError: a medium or a volume of another kind.
@@ -106,7 +106,7 @@ def _read_microflakes(medium: mi.Medium) -> list[mi.Float] | None:
 
 
 def _field(params: mi.SceneParameters, name: str) -> mi.Volume | mi.Float | mi.Color3f | None:
-    """What a medium has under a name: a constant with its gradient, or the volume that knows it; None for nothing."""
+    """The coefficient of a medium under a name: a constant with its gradient, or a volume; None where there is none."""
     if f"{name}.value.value" in params.properties:
         return params[f"{name}.value.value"]
     key = next((k for k in params.properties if k.startswith(name + ".")), None)
@@ -114,7 +114,7 @@ def _field(params: mi.SceneParameters, name: str) -> mi.Volume | mi.Float | mi.C
 
 
 def _part_of_field(volume: mi.Volume) -> ActivatedGridExtinction:
-    """The extinction of a radiance field, which brings its own."""
+    """The extinction of a medium that is a radiance field: the activation of the density of ``mivol_sh``."""
     lattice = Lattice(volume.mivol_density, volume.mivol_to_world)
     return ActivatedGridExtinction("sigma_t", lattice, volume.mivol_field.act)
 
@@ -136,12 +136,12 @@ def _is_grid(volume: object) -> bool:
 
 
 def _repeats_border(volume: object) -> bool:
-    """Whether a volume has values outside its own box."""
+    """Whether a volume repeats its border outside its own box, as stock grids do."""
     return _is_grid(volume) and not hasattr(volume, "mivol_to_world")
 
 
 def _place(volume: mi.Volume, boundary: Box | None, places: dict) -> np.ndarray:
-    """Where a grid lies, found once."""
+    """Where a grid lies (4x4, unit cube to world), from the cache ``places`` or by :func:`place_of_grid`."""
     key = (volume.ptr, None if boundary is None else boundary.to_world.tobytes())
     if key not in places:
         places[key] = place_of_grid(volume, boundary)
@@ -230,9 +230,9 @@ def _tensor(values: mi.TensorXf) -> mi.TensorXf:
 def place_of_grid(volume: mi.Volume, boundary: Box | None = None) -> np.ndarray:
     """Find where a grid volume lies: the (4, 4) float64 map of the unit cube to the world.
 
-    A ``mivol_voxels`` knows. Stock ``gridvolume`` keeps its transform to itself: it prints it to 6 digits, and its
-    bounding box exactly (float32). Together they are exact for boxes along the axes; a turned grid is exact where it
-    fills its boundary, and else right to 5e-6 of its size.
+    A ``mivol_voxels`` hands its own map out. A stock ``gridvolume`` only prints its transform, to 6 digits, and returns its
+    bounding box, in float32. The two together are exact for boxes along the axes. A turned grid is exact where it fills its
+    boundary, and elsewhere right to 5e-6 of its size.
     """
     if hasattr(volume, "mivol_to_world"):
         return volume.mivol_to_world
@@ -250,10 +250,10 @@ def place_of_grid(volume: mi.Volume, boundary: Box | None = None) -> np.ndarray:
 
 
 def _same_axes(exact: np.ndarray, rough: np.ndarray) -> np.ndarray:
-    """The exact box, its axes and its corner chosen as in the rough one."""
+    """The exact box, with its axes in the order and the direction of those of the rough one."""
     edges = exact[:3, :3]
-    albedo = np.linalg.solve(edges, rough[:3, :3])  # a signed permutation, but for the digits of ``rough``
-    axes = edges @ np.round(albedo)
+    permutation = np.linalg.solve(edges, rough[:3, :3])  # of the axes, with signs, to the digits of ``rough``
+    axes = edges @ np.round(permutation)
     centre = exact[:3, 3] + edges.sum(axis=1) / 2
     place = np.eye(4)
     place[:3, :3], place[:3, 3] = axes, centre - axes.sum(axis=1) / 2

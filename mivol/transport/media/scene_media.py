@@ -61,7 +61,7 @@ class SceneMedia:
 
     @property
     def is_single(self) -> bool:
-        """Whether one walk passes all extinction in its order."""
+        """Whether one walk of cells passes all extinction in its order: one medium, whose grids share their cells."""
         return len(self.bodies) == 1 and len(self.bodies[0].flight_parts) == len(self.bodies[0].view.parts)
 
     def rows(self, values: list[mi.Float]) -> list[mi.Float]:
@@ -69,7 +69,7 @@ class SceneMedia:
         return as_rows(values, self.channels)
 
     def sums(self, rows: list[mi.Float]) -> list[mi.Float]:
-        """The derivative of each channel of the scene from that of each colour: a grey one gets the sum."""
+        """Derivatives by the channels of the scene, from those by colours: the transpose of :meth:`rows`."""
         return rows if len(rows) == self.channels else [sum(rows[1:], rows[0])]
 
     @property

@@ -188,7 +188,7 @@ def record(samples: RenderSamples, names: list[str], sample: Sample) -> mi.Tenso
     for rays in film_passes(samples):
         L, alpha, aovs = sample(rays)
         block = _new_block(film, rays)
-        _splat(block, film, rays, L * rays.weight, mi.Float(1), alpha, aovs)
+        _splat(block, film, rays, _FilmSample(L * rays.weight, mi.Float(1), alpha, aovs))
         film.put_block(block)
         dr.eval(block.tensor())
         del L, alpha, aovs, rays, block
@@ -220,7 +220,8 @@ def adjoint_rays(
             block = _new_block(film, rays)
             # A pixel is divided by the filter weights of all passes. Where there are several, the weights are therefore summed
             # beforehand, in a block of their own.
-            _splat(block, film, rays, L * rays.weight, mi.Float(0 if several else 1), mi.Float(0), aovs)
+            weight = mi.Float(0 if several else 1)
+            _splat(block, film, rays, _FilmSample(L * rays.weight, weight, mi.Float(0), aovs))
             film.put_block(block)
             if several:
                 film.put_block(weights)
@@ -242,7 +243,7 @@ def _weights(samples: RenderSamples, names: list[str]) -> mi.ImageBlock:
     for rays in film_passes(samples):
         block = block or _new_block(film, rays)
         zero = [mi.Float(0) for _ in names]
-        _splat(block, film, rays, mi.Spectrum(0), mi.Float(1), mi.Float(0), zero)
+        _splat(block, film, rays, _FilmSample(mi.Spectrum(0), mi.Float(1), mi.Float(0), zero))
         dr.eval(block.tensor())
     return block
 
@@ -255,22 +256,31 @@ def _new_block(film: mi.Film, rays: CameraRays) -> mi.ImageBlock:
     return block
 
 
-def _splat(
-    block: mi.ImageBlock,
-    film: mi.Film,
-    rays: CameraRays,
-    L: mi.Spectrum,
-    weight: mi.Float,
-    alpha: mi.Float,
-    aovs: list[mi.Float],
-) -> None:
+@dataclass
+class _FilmSample:
+    """What a ray adds to the film.
+
+    Attributes:
+        L: radiance times the sensor's importance.
+        weight: what its filter weight is multiplied with in the sum that the film divides by.
+        alpha, aovs: alpha, and the AOVs in their order.
+    """
+
+    L: mi.Spectrum
+    weight: mi.Float
+    alpha: mi.Float
+    aovs: list[mi.Float]
+
+
+def _splat(block: mi.ImageBlock, film: mi.Film, rays: CameraRays, sample: _FilmSample) -> None:
     """Add samples to a block, in the order of channels of the film."""
     if mi.has_flag(film.flags(), mi.FilmFlags.Special):
         count = block.channel_count()
-        block.put(rays.position, film.prepare_sample(L, rays.ray.wavelengths, count, weight=weight, alpha=alpha))
+        how = {"weight": sample.weight, "alpha": sample.alpha}
+        block.put(rays.position, film.prepare_sample(sample.L, rays.ray.wavelengths, count, **how))
         return
-    colour = mi.Color3f(L.x) if mi.is_monochromatic else L
+    colour = mi.Color3f(sample.L.x) if mi.is_monochromatic else sample.L
     head = [colour.x, colour.y, colour.z]
     if mi.has_flag(film.flags(), mi.FilmFlags.Alpha):
-        head.append(alpha)
-    block.put(rays.position, [*head, weight, *aovs])
+        head.append(sample.alpha)
+    block.put(rays.position, [*head, sample.weight, *sample.aovs])

@@ -11,7 +11,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mivol.numerics import largest_of
-from mivol.transport.traversal.empty_blocks import count_blocks, over_blocks
+from mivol.transport.traversal.empty_blocks import Reduction, count_blocks, over_blocks
 
 __all__ = ["BLOCK_SHIFT", "BlockRanges", "find_block_ranges"]
 
@@ -58,8 +58,8 @@ def find_block_ranges(values: mi.TensorXf) -> BlockRanges:
     rows, ranges = [], []
     for channel in range(c):
         own = dr.gather(mi.Float, flat, dr.arange(mi.UInt32, z * y * x) * c + channel) if c > 1 else flat
-        low = over_blocks(own, (z, y, x), BLOCK_SHIFT, dr.minimum, dr.inf)
-        high = over_blocks(own, (z, y, x), BLOCK_SHIFT, dr.maximum, -dr.inf)
+        low = over_blocks(own, (z, y, x), BLOCK_SHIFT, Reduction(dr.minimum, dr.inf))
+        high = over_blocks(own, (z, y, x), BLOCK_SHIFT, Reduction(dr.maximum, -dr.inf))
         rows.append(low)
         # A tracker divides (value - low) by this range. The range is rounded up, so that rounding never makes that exceed 1.
         ranges.append((high - low) * (1 + 1e-6))

@@ -9,6 +9,7 @@ References: Cohen & Sheffer 1994 (proximity clouds); Szirmay-Kalos et al. 2011 (
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -17,6 +18,7 @@ __all__ = [
     "BLOCK",
     "REACH",
     "SHIFT",
+    "Reduction",
     "block_bounds",
     "count_blocks",
     "distances",
@@ -46,7 +48,7 @@ def block_bounds(values: mi.TensorXf) -> mi.Float:
     Cost: 5/4 look-ups a voxel along x, fewer along the others.
     """
     flat = _channel_max(dr.abs(dr.detach(values.array)), values.shape[3])
-    return over_blocks(flat, values.shape[:3], SHIFT, dr.maximum, 0)
+    return over_blocks(flat, values.shape[:3], SHIFT, Reduction(dr.maximum, 0))
 
 
 def count_blocks(n: int, shift: int = SHIFT) -> int:
@@ -54,25 +56,29 @@ def count_blocks(n: int, shift: int = SHIFT) -> int:
     return -(-(n + 1) >> shift)
 
 
-def over_blocks(
-    flat: mi.Float, res: tuple[int, int, int], shift: int, reduce: Callable[[mi.Float, mi.Float], mi.Float], nothing: float
-) -> mi.Float:
+class Reduction(NamedTuple):
+    """An associative function of two arrays, and its neutral element."""
+
+    combine: Callable[[mi.Float, mi.Float], mi.Float]
+    neutral: float
+
+
+def over_blocks(flat: mi.Float, res: tuple[int, int, int], shift: int, reduction: Reduction) -> mi.Float:
     """Reduce the values at all nodes that each block of cells touches, one axis after the other.
 
     Args:
         flat: one number a voxel (Z, Y, X).
         res: (Z, Y, X).
         shift: log2 of the edge of a block [cells].
-        reduce: an associative function of two arrays, such as ``dr.maximum``.
-        nothing: its neutral element.
+        reduction: of the values.
 
     Returns:
         Flat array over the blocks (z, y, x).
     """
     z, y, x = res
     b_y, b_x = count_blocks(y, shift), count_blocks(x, shift)
-    for outer, n, inner in ((z * y, x, 1), (z, y, b_x), (1, z, b_y * b_x)):
-        flat = _over_axis(flat, outer, n, inner, shift, reduce, nothing)
+    for shape in ((z * y, x, 1), (z, y, b_x), (1, z, b_y * b_x)):
+        flat = _over_axis(flat, shape, shift, reduction)
     return flat
 
 
@@ -85,25 +91,18 @@ def _channel_max(flat: mi.Float, channels: int) -> mi.Float:
     return best
 
 
-def _over_axis(
-    flat: mi.Float,
-    outer: int,
-    n: int,
-    inner: int,
-    shift: int,
-    reduce: Callable[[mi.Float, mi.Float], mi.Float],
-    nothing: float,
-) -> mi.Float:
-    """Reduce the nodes of each block along the middle axis of (outer, n, inner)."""
+def _over_axis(flat: mi.Float, shape: tuple[int, int, int], shift: int, reduction: Reduction) -> mi.Float:
+    """Reduce the nodes of each block along the middle axis of ``shape`` = (outer, n, inner)."""
+    outer, n, inner = shape
     b, edge = count_blocks(n, shift), 1 << shift
     i = dr.arange(mi.UInt32, outer * b * inner)
     # Block b of edge e holds the cells e b - 1 .. e (b + 1) - 2, so the nodes e b - 1 .. e (b + 1) - 1.
     first = mi.Int32((i // inner) % b) * edge - 1
     row = (i // (inner * b)) * (n * inner) + i % inner
-    best = mi.Float(nothing)
+    best = mi.Float(reduction.neutral)
     for k in range(edge + 1):
         node = mi.UInt32(dr.clip(first + k, 0, n - 1))
-        best = reduce(best, dr.gather(mi.Float, flat, row + node * inner))
+        best = reduction.combine(best, dr.gather(mi.Float, flat, row + node * inner))
     dr.eval(best)
     return best
 

@@ -116,10 +116,10 @@ def walk(
         if skip:
             block = (cell + 1) >> SHIFT
             index = (block.z * blocks_y + block.y) * blocks_x + block.x
-            gap = mi.Int32(dr.gather(mi.UInt8, empty_distances, mi.UInt32(index), active))
-            full = gap == 0
+            distance = mi.Int32(dr.gather(mi.UInt8, empty_distances, mi.UInt32(index), active))
+            full = distance == 0
             inner = (cell + 1) & (BLOCK - 1)
-            span = dr.select(full, 0, dr.select(ahead, BLOCK - 1 - inner, inner) + (gap - 1) * BLOCK)
+            span = dr.select(full, 0, dr.select(ahead, BLOCK - 1 - inner, inner) + (distance - 1) * BLOCK)
             near, far = _planes(cell, ahead, res)
             corners = read_nodes(reads, _box(near, far), full)
 

@@ -79,7 +79,7 @@ class Cells:
         if total >= 2**31:
             raise MivolError(f"a grid of {x} x {y} x {z} nodes was given; its cells are counted up to 2^31: split it.")
         cell = dr.arange(mi.UInt32, total)
-        # What is told of all cells at once, by a mask of one lane, is told of each.
+        # A mask of one lane stands for all cells.
         listed = dr.compress(occupied(_corner_rows(cell, rows, res)) & dr.full(mi.Bool, True, total))
         count = dr.width(listed)
         number = dr.full(mi.Int32, -REACH, total)

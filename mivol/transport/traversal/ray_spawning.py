@@ -12,9 +12,8 @@ def distance_along(ray: mi.Ray3f, hit: mi.SurfaceInteraction3f) -> mi.Float:
     """Distance of a hit along the ray that began at the camera.
 
     The lengths of the spawned rays are not summed: each of them starts an epsilon (1e-4 of a length) further on and to the
-        side,
-    so that the hit lies beside the first ray. Instead the first ray is intersected with the tangent plane of the surface at the
-    hit. At grazing incidence that intersection is ill-conditioned, and the point of the ray nearest to the hit is taken.
+    side, so the hit lies beside the first ray. Instead the first ray is intersected with the tangent plane of the surface at
+    the hit. At grazing incidence that intersection is ill-conditioned, and the point of the ray nearest to the hit is taken.
     """
     slope = dr.dot(hit.n, ray.d)
     steep = dr.abs(slope) > 1e-2
