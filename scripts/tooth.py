@@ -24,16 +24,9 @@ from mivol.optim.linear_problems import LeastSquares
 from mivol.optim.smoothed_tv import SmoothedTV
 from mivol.optim.solvers import SOLVERS
 from mivol.tomography.geometry import ParallelBeam, VoxelGrid
-from mivol.tomography.preprocess import (
-    Axis,
-    LightDrift,
-    correct_transmission,
-    find_axis,
-    fit_light_drift,
-    line_integrals,
-    normalise_air,
-)
+from mivol.tomography.preprocess import LightDrift, correct_transmission, fit_light_drift, line_integrals, normalise_air
 from mivol.tomography.projector import Projector
+from mivol.tomography.rotation_axis import Axis, find_axis
 
 import mitsuba as mi
 import numpy as np

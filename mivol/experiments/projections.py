@@ -14,8 +14,9 @@ from mivol.errors import MivolError
 from mivol.files import read_projections, read_volume
 from mivol.tomography.geometry import ConeBeam, Geometry, ParallelBeam, VoxelGrid
 from mivol.tomography.phantoms import shepp_logan
-from mivol.tomography.preprocess import correct_transmission, find_axis, line_integrals, normalise_air
+from mivol.tomography.preprocess import correct_transmission, line_integrals, normalise_air
 from mivol.tomography.projector import Projector
+from mivol.tomography.rotation_axis import find_axis
 
 
 @dataclass(frozen=True)

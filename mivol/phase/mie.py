@@ -21,7 +21,7 @@ import numpy as np
 from scipy.special import gammainccinv, gammaincinv, ndtri
 
 from mivol.errors import MivolError
-from mivol.phase.tabulated import Table, adapt_nodes
+from mivol.phase.table import Table, adapt_nodes
 
 __all__ = ["WATER_INDEX", "aerosol", "water_droplets"]
 

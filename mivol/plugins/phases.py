@@ -20,7 +20,8 @@ from mivol.phase.draine import eval_draine, sample_draine
 from mivol.phase.hg import eval_hg, sample_hg
 from mivol.phase.mixture import choose_lobe, shares_of
 from mivol.phase.rayleigh import eval_rayleigh, sample_rayleigh
-from mivol.phase.tabulated import Lookup, Table, check_values
+from mivol.phase.table import Table, check_values
+from mivol.phase.tabulated import Lookup
 from mivol.phase.turn import Turn, direction_after, turn_between
 
 VALUES_OF_VOLUMES = ("data", "value.value")

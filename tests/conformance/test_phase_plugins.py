@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from false_alarms import ALPHA, assert_precise, assert_same_mean, fresh, note
 
-from mivol.phase.tabulated import Table
+from mivol.phase.table import Table
 from mivol.validate.moments import Moments
 from scenes import box_of, camera, render, sky
 

@@ -11,7 +11,8 @@ import pytest
 from mivol.phase.draine import eval_draine
 from mivol.phase.hg import eval_hg
 from mivol.phase.mixture import shares_of
-from mivol.phase.tabulated import Lookup, Table
+from mivol.phase.table import Table
+from mivol.phase.tabulated import Lookup
 from mivol.phase.turn import Turn, turn_between
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")

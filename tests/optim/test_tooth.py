@@ -22,18 +22,9 @@ from mivol.optim.linear_problems import LeastSquares
 from mivol.optim.solvers import SOLVERS
 from mivol.tomography.geometry import ConeBeam, ParallelBeam, VoxelGrid
 from mivol.tomography.phantoms import random_ellipsoids
-from mivol.tomography.preprocess import (
-    Transmission,
-    axis_from_mirrors,
-    axis_from_moments,
-    axis_from_reconstructions,
-    correct_transmission,
-    find_axis,
-    fit_light_drift,
-    line_integrals,
-    normalise_air,
-)
+from mivol.tomography.preprocess import Transmission, correct_transmission, fit_light_drift, line_integrals, normalise_air
 from mivol.tomography.projector import Projector
+from mivol.tomography.rotation_axis import axis_from_mirrors, axis_from_moments, axis_from_reconstructions, find_axis
 from mivol.validate.moments import Moments
 
 SCRIPT = Path(__file__).resolve().parents[2] / "scripts" / "tooth.py"
