@@ -192,6 +192,7 @@ def _picture(name: str, image: NDArray, scale: show.Scale | None, aspect: float 
 
 
 def plain_picture(folder: Path, image: Image) -> Picture:
+    """An image that stands alone, with a scale of its own."""
     return _picture(image.caption or image.view or Path(image.path).stem, _load(folder, image), None)
 
 

@@ -27,6 +27,7 @@ class RgbExtinction:
     values: dict[str, np.ndarray]
 
     def assign(self, values: dict[str, np.ndarray]) -> None:
+        """Put other values, one for each key of ``values``, into the medium."""
         for key, value in values.items():
             kind = type(self.params[key])
             self.params[key] = kind(*value.tolist()) if kind is mi.Color3f else kind(np.ascontiguousarray(value))
