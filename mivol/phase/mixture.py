@@ -20,7 +20,7 @@ def shares_of(weights: Sequence[mi.Float]) -> list[mi.Float]:
     """Normalise weights by their sum, with derivatives; they become equal where the sum is 0."""
     total = sum(weights[1:], weights[0])
     empty = ~(total > 0) & (total == 0)
-    inv = dr.rcp(dr.select(empty, 1, total))
+    inv = dr.rcp(total)  # infinite where nothing is taken of it: Dr.Jit's derivatives of what is not taken are 0
     return [dr.select(empty, 1 / len(weights), w * inv) for w in weights]
 
 

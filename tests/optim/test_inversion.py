@@ -63,7 +63,7 @@ def test_defaults():
     assert (Solve().solver, Solve().subsets) == ("pcg", 10)
 
 
-def test_a_fit_ends_where_its_solver_has_arrived():
+def test_a_fit_ends_where_its_solver_has_arrived(variant_rgb):
     """Before the iterations that it was given are done; what did not happen is not in its history."""
     one = Inversion(LeastSquares(Views(np.array([[2.0]]), 1), np.array([4.0])))
     fit = reconstruct(one, Solve(), Course(iterations=9))
