@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from mivol.errors import MivolError
+from mivol.tomography import phantoms
 from mivol.tomography.geometry import ConeBeam, ParallelBeam, VoxelGrid
 from mivol.tomography.phantoms import SHEPP_LOGAN, EllipsoidPhantom, random_ellipsoids, shepp_logan
 
@@ -164,3 +165,14 @@ def _one(a: float, b: float, c: float, phi: float = 0.0, theta: float = 0.0):
 
     rotation = _euler(np.radians(phi), np.radians(theta), 0.0)
     return (rotation / np.array([a, b, c])[:, None])[None], np.zeros((1, 3)), np.ones(1)
+
+
+def test_no_number_of_the_tables_was_changed():
+    """Sums of what was typed from the papers, by columns: one wrong digit changes one of them."""
+    sums = {name: np.sum(getattr(phantoms, name), axis=0) for name in ("_KAK_SLANEY", "_TOFT_SCHABEL")}
+    np.testing.assert_allclose(
+        sums["_KAK_SLANEY"], [2.5324, 2.502, 2.996, 0.04, -0.855, -0.25, 360, 0, 0, 1.04], rtol=0, atol=1e-9
+    )
+    np.testing.assert_allclose(
+        sums["_TOFT_SCHABEL"], [2.0164, 2.948, 2.69, -0.02, -1.4844, 0.35, 0, 0, 20, 0.4], rtol=0, atol=1e-9
+    )

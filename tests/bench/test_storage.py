@@ -72,6 +72,19 @@ def test_the_lecture_counts_4_gigabytes() -> None:
     assert storage.shell(0.2).mean() == pytest.approx(0.2, abs=2e-3)
 
 
+def test_the_index_grows_with_the_surface() -> None:
+    """4 bytes a node and a cell of the grid, 32 a listed cell and 4 a row, of which a surface has as at 64^3."""
+    shell = storage.shell(0.1 * 128 / 64)
+    listed, rows = (count / shell.sum() for count in storage.count_cells(shell))
+    found = storage.kinds(0.1)[-1]
+    for n in (128, 1024):
+        near = 0.1 * 128 / n * n**3
+        expected = 4 * n**3 + 4 * (n + 1) ** 3 + 32 * round(listed * near) + 4 * round(rows * near)
+        assert found.scenes[n] == (expected, 0)
+    assert found.per_cell == (found.scenes[128][0] / 128**3, 0)
+    assert [kind.sparse for kind in storage.kinds(0.1)] == [False] * 6 + [True] * 4 + [False]
+
+
 def test_what_is_printed(variant_rgb, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     """A table, the run's quality in the row of its kind, and JSON with the bytes of its real file."""
     run = tmp_path / "a_run"

@@ -35,6 +35,16 @@ def test_first_calls_count_their_kernels(variant_rgb: str) -> None:
     assert timing.first_call(lambda _: dr.sin(x) * new + dr.cos(x))["kernels_compiled"] == 0
 
 
+def test_first_calls_add_up_what_the_compiler_took(monkeypatch: pytest.MonkeyPatch, variant_rgb: str) -> None:
+    """Milliseconds of Dr.Jit; kernels that were known or found on disk are not compiled, and other entries are no kernels."""
+    jit, other = dr.KernelType.JIT, next(kind for kind in dr.KernelType if kind != dr.KernelType.JIT)
+    kernel = {"type": jit, "codegen_time": 200.0, "backend_time": 300.0, "cache_hit": False, "cache_disk": False}
+    found = [kernel, {**kernel, "cache_hit": True, "cache_disk": True}, {**kernel, "type": other}]
+    monkeypatch.setattr(dr, "kernel_history", lambda: found)
+    first = timing.first_call(lambda _: mi.Float(1))
+    assert (first["compile_seconds"], first["kernels_compiled"], first["kernels_from_disk"]) == (1.0, 1, 1)
+
+
 def test_ratios_are_medians_of_rounds() -> None:
     """2 in two rounds and 10 in one: neither the mean nor the ratio of medians."""
     slow = Timing({}, [2.0, 40.0, 60.0], [3.0, 3.0, 3.0])

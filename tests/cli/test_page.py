@@ -216,6 +216,10 @@ def test_pixels_that_are_not_finite_are_seen():
     rgb = show.pixels(image, show.scale_of(image))
     assert rgb[0, 1].tolist() == rgb[1, 1].tolist() == [255, 0, 255]
     assert rgb[0, 0].tolist() == [0, 0, 0] and rgb[1, 0].tolist() == [255, 255, 255]
+    colour = np.zeros((1, 2, 3))
+    colour[0, 1, 2] = np.nan
+    rgb = show.pixels(colour, show.Scale("grey", 0.0, 1.0))
+    assert rgb[0].tolist() == [[0, 0, 0], [255, 0, 255]]
 
 
 def test_layers_of_one_file_and_a_volume_without_truth(tmp_path):

@@ -182,6 +182,7 @@ def test_exr_is_linear_and_multiplied(tmp_path: Path) -> None:
     folder = write_blender(tmp_path / "set", train=2)
     values = np.random.default_rng(0).random((8, 12, 4), np.float32) * 2
     values[..., 3] = np.minimum(values[..., 3], 1)
+    values[0, 0, 3] = 0  # a glow that hides nothing keeps its light
     for i in range(2):
         (folder / "train" / f"r_{i}.png").unlink()
         write_exr(folder / "train" / f"r_{i}.exr", {"": values})

@@ -111,6 +111,16 @@ def test_curvature_is_the_derivative_of_the_quadratic(variant_rgb, prior) -> Non
 
 
 @pytest.mark.parametrize("prior", CHOSEN[:3], ids=lambda prior: prior.label())
+def test_majorisers_of_gradients_touch_what_they_majorise(variant_rgb, prior) -> None:
+    """<H(x) x, x> = <g, x>: the quadratic form of x at x has the slope of the energy there."""
+    x = field(seed=3)
+    _, gradient = prior.value_and_gradient(x, SPACING)
+    tensor = mi.TensorXf(x.astype("f"))
+    # Float32 sums of 120 numbers.
+    assert 2 * float(prior.quadratic(tensor, tensor, SPACING)[0]) == pytest.approx(np.sum(gradient * x), rel=1e-5)
+
+
+@pytest.mark.parametrize("prior", CHOSEN[:3], ids=lambda prior: prior.label())
 def test_a_constant_field_costs_nothing(variant_rgb, prior) -> None:
     value, gradient = prior.value_and_gradient(np.full((4, 4, 4), 0.7), SPACING)
     assert abs(value) <= 1e-7 * prior.edge if hasattr(prior, "edge") else value == 0.0

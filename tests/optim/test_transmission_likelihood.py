@@ -8,6 +8,7 @@ from small_scan import GRID, problem_for, run
 
 from mivol.optim.linear_problems import PoissonCounts
 from mivol.optim.smoothed_tv import SmoothedTV
+from mivol.optim.transmission_likelihood import _Counts
 
 
 @pytest.mark.parametrize("background", [0.0, 5.0])
@@ -55,3 +56,32 @@ def test_rays_without_light_keep_ml_tr_finite(scan):
     states = run("ml-tr", PoissonCounts(a, counts, 500.0), 30)
     assert np.isfinite([s.objective for s in states]).all()
     assert np.isfinite(states[-1].x).all()
+
+
+def test_a_prior_is_followed(scan):
+    """Its share of the objective is lowered too: the fit that knows it ends lower than the one that does not."""
+    prior = SmoothedTV(GRID.shape, 2000.0, 0.3, GRID.voxel_size)
+    problem = problem_for("ml-tr", scan, prior=prior)
+    told = run("ml-tr", problem, 40)[-1]
+    untold = run("ml-tr", problem_for("ml-tr", scan), 40)[-1]
+    assert told.objective < untold.objective + prior.value(untold.x) - 1
+
+
+def test_the_parabola_of_a_ray_meets_its_likelihood_where_there_is_nothing():
+    """h(l) - l h'(l) + l^2 c / 2 = h(0), the optimum curvature; at l = 0 it is h''(0)."""
+    y, blank, background = np.array([3.0, 40.0, 0.0]), np.array([50.0, 60.0, 70.0]), np.array([2.0, 0.0, 5.0])
+    counts = _Counts(y, blank, background, None)
+    line = np.array([0.7, 0.2, 1.5])
+
+    def h(at: np.ndarray) -> np.ndarray:
+        expected = blank * np.exp(-at) + background
+        return expected - y * np.log(expected)
+
+    step = 1e-6
+    slope = (h(line + step) - h(line - step)) / (2 * step)
+    np.testing.assert_allclose(counts.slope(line), slope, rtol=1e-7, atol=1e-7)
+    c = counts.optimum_curvature(line)
+    expected = 2 * (h(0 * line) - h(line) + line * slope) / line**2
+    np.testing.assert_allclose(c, np.maximum(expected, 0), rtol=1e-6, atol=1e-6)
+    at_zero = blank * (1 - y * background / (blank + background) ** 2)
+    np.testing.assert_allclose(counts.optimum_curvature(0 * line), at_zero, rtol=1e-12)
