@@ -1,6 +1,6 @@
 """One-line faults of the kinds that programmers make, drawn at random from source files.
 
-A fault replaces one stretch of a file's text: an operator, a sign, a constant, an index or a whole condition. They are
+A fault replaces one piece of a file's text: an operator, a sign, a constant, an index or a whole condition. They are
 found in the syntax tree, so that docstrings, other strings, annotations, imports, decorators and ``__all__`` are never
 touched, nor what only a type checker or a direct call of the file runs.
 """

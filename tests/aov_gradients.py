@@ -16,7 +16,7 @@ def mivol(aovs: str = NAMES) -> mi.Integrator:
     return mi.load_dict({"type": "mivol", "max_depth": 1, "aovs": aovs})
 
 
-def pulled(scene: mi.Scene, integrator: mi.Integrator, keys: list[str], w: np.ndarray, spp: int) -> dict[str, np.ndarray]:
+def vjp(scene: mi.Scene, integrator: mi.Integrator, keys: list[str], w: np.ndarray, spp: int) -> dict[str, np.ndarray]:
     """J^T w, w a weight of each AOV."""
     params = mi.traverse(scene)
     for key in keys:

@@ -28,7 +28,7 @@ def watched(scene: mi.Scene, key: str) -> tuple[mi.SceneParameters, object]:
     return params, variable
 
 
-def pulled(scene: mi.Scene, key: str, w: np.ndarray, spp: int, seed: int, integrator: mi.Integrator) -> np.ndarray:
+def vjp(scene: mi.Scene, key: str, w: np.ndarray, spp: int, seed: int, integrator: mi.Integrator) -> np.ndarray:
     """J^T w: the derivative of <w, image>, by `mi.render`; `seed` is that of the derivatives."""
     params, variable = watched(scene, key)
     image = mi.render(scene, params, integrator=integrator, spp=1, spp_grad=spp, seed=seed + 10_000, seed_grad=seed)
@@ -54,7 +54,7 @@ def weights(n: int, seed: int = 1) -> tuple[np.ndarray, np.ndarray]:
 def gradients(seen: Pencils, key: str, w: np.ndarray, spp: int) -> np.ndarray:
     """J^T w of independent passes, (BATCHES, ...)."""
     integrator = mi.load_dict(mivol())
-    return np.stack([pulled(seen.scene, key, w, spp, fresh(seed), integrator) for seed in range(BATCHES)])
+    return np.stack([vjp(seen.scene, key, w, spp, fresh(seed), integrator) for seed in range(BATCHES)])
 
 
 def assert_gradient(found: np.ndarray, truth: np.ndarray, what: str, precision: float = 0.02, rounding: float = 2e-5) -> None:

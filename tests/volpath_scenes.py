@@ -112,10 +112,10 @@ def cube(to_world: np.ndarray) -> dict:
     return {"type": "cube", "to_world": transform(np.asarray(to_world) @ affine(0.5 * np.eye(3), np.full(3, 0.5))), **BARE}
 
 
-def veil() -> dict:
+def behind_a_mask() -> dict:
     """A black mask between the bulb and the volume lets 40 % of the light through, and of what the camera sees behind it."""
     bsdf = {"type": "mask", "opacity": 0.6, "nested": {"type": "diffuse", "reflectance": 0.0}}
-    return {"smoke": grid_in(cube(PLACE)), "veil": square(0.8, -0.65, 0.85, 0.6, (1.6, -1.3, 1.7)) | {"bsdf": bsdf}}
+    return {"smoke": grid_in(cube(PLACE)), "mask": square(0.8, -0.65, 0.85, 0.6, (1.6, -1.3, 1.7)) | {"bsdf": bsdf}}
 
 
 FOG = {"type": "homogeneous", "sigma_t": 0.3, "albedo": 0.7, "phase": {"type": "hg", "g": 0.3}, "id": "fog"}

@@ -107,7 +107,7 @@ def started(*parts: object, **more: object) -> Body:
     return body
 
 
-def pulled(body: Body) -> list[float]:
+def vjp(body: Body) -> list[float]:
     """The sum of the gradient of each part."""
     flat = [g.fold() if hasattr(g, "fold") else g for g in body.gradients]
     return [float(np.array(g).sum()) for g in flat]
@@ -125,13 +125,13 @@ def test_gradients_go_to_the_parts_that_are_named():
     }.values():
         body = started(constant(0.25), grid("sigma_s"))
         deposit(body)
-        np.testing.assert_allclose(pulled(body), expected, rtol=ROUNDING)
+        np.testing.assert_allclose(vjp(body), expected, rtol=ROUNDING)
 
 
 def test_bounded_parts_are_left_out_of_derivatives_along_a_ray():
     body = started(constant(0.25), bounded())
     body.backproject(inside(), [mi.Float(3)])
-    assert pulled(body) == [3, 0]
+    assert vjp(body) == [3, 0]
     body.tangents = [mi.Float(5), mi.Float(7)]
     assert values(body.tangent(inside(), 1)) == [5]
 
@@ -168,7 +168,7 @@ def test_flakes_multiply_the_extinction_by_their_projected_area(where: str) -> N
     assert sigma[0] == pytest.approx(area, rel=ROUNDING)
     assert change[0] == pytest.approx(slopes @ tangent, abs=ROUNDING * np.abs(slopes * tangent).sum())
     np.testing.assert_allclose(np.array(body.microflakes_gradient), 3 * slopes, rtol=2 * ROUNDING)
-    assert pulled(body) == [pytest.approx(3 * area, rel=ROUNDING)]
+    assert vjp(body) == [pytest.approx(3 * area, rel=ROUNDING)]
 
 
 def test_derivatives_of_flakes_are_followed_where_they_are_asked_for():

@@ -205,12 +205,12 @@ def test_mono():
     w = np.random.default_rng(1).uniform(size=(12, 1))
     ends = ["sigma_t.data", "emission.data", "emission_density.data"]
     luminance = np.array([0.212671, 0.715160, 0.072169])
-    colour, pulled = light(rgb), gradients(rgb, ends, w * luminance)
+    colour, vjp = light(rgb), gradients(rgb, ends, w * luminance)
     try:
         mi.set_variant("llvm_ad_mono")
         mono = emitting(m, background=0.5)
         assert np.abs(light(mono)[:, :1] - colour @ luminance[:, None]).max() <= 4e-6
-        for g, truth in zip(gradients(mono, ends, w), pulled, strict=True):
+        for g, truth in zip(gradients(mono, ends, w), vjp, strict=True):
             assert np.abs(g - truth).max() <= 4e-6 * np.abs(truth).max()
     finally:
         mi.set_variant("llvm_ad_rgb")

@@ -90,14 +90,14 @@ def test_derivatives_are_transposes(name: str, where: str) -> None:
     with dr.suspend_grad():
         tangent = type(dr.detach(part.values))(v)
         if where == "at a point":
-            pushed = numbers(part.jvp_at(tangent, ray, 0.5 * (t0 + t1), on))
+            jvp = numbers(part.jvp_at(tangent, ray, 0.5 * (t0 + t1), on))
             part.vjp_at(gradient, weight, ray, 0.5 * (t0 + t1), on)
         else:
-            pushed = numbers(part.jvp(tangent, RayInterval(ray, t0, t1, on)))
+            jvp = numbers(part.jvp(tangent, RayInterval(ray, t0, t1, on)))
             part.vjp(gradient, weight, RayInterval(ray, t0, t1, on))
     dr.backward(part.deliver(mi.Float(1), gradient))
-    pulled = np.array(dr.grad(part.values), np.float64).reshape(shape)
+    vjp = np.array(dr.grad(part.values), np.float64).reshape(shape)
     # Each of the terms is rounded a few times: 1e-6 of the sum of their sizes is 16 roundings of float32 each.
-    terms = np.abs(pushed * w).sum() + np.abs(v * pulled).sum()
-    assert np.abs(pushed).max() > 0.01
-    assert abs((pushed * w).sum() - (v * pulled).sum()) < 1e-6 * terms
+    terms = np.abs(jvp * w).sum() + np.abs(v * vjp).sum()
+    assert np.abs(jvp).max() > 0.01
+    assert abs((jvp * w).sum() - (v * vjp).sum()) < 1e-6 * terms

@@ -78,11 +78,11 @@ def test_accumulate_is_the_transpose_of_eval(name: str) -> None:
     renew(field)
     with dr.suspend_grad():
         field.accumulate(p, w, d, active)
-    pulled = np.array(dr.grad(parameter), np.float64)
+    vjp = np.array(dr.grad(parameter), np.float64)
     renew(field)
     dr.set_grad(parameter, type(parameter)(v))
-    pushed = dr.forward_to(field.eval(p, w, mi.Bool(True)), flags=dr.ADFlag.ClearEdges)
-    terms = np.array([np.array(x, np.float64) * row * on for x, row in zip(pushed, weights, strict=True)])
+    jvp = dr.forward_to(field.eval(p, w, mi.Bool(True)), flags=dr.ADFlag.ClearEdges)
+    terms = np.array([np.array(x, np.float64) * row * on for x, row in zip(jvp, weights, strict=True)])
     # Sums of 5000 float32 numbers: 1e-5 of the sum of their sizes.
     assert np.abs(terms).sum() > 100
-    assert abs(terms.sum() - (v * pulled).sum()) < 1e-5 * np.abs(terms).sum()
+    assert abs(terms.sum() - (v * vjp).sum()) < 1e-5 * np.abs(terms).sum()

@@ -12,11 +12,11 @@ from volpath_scenes import (
     LAMPS,
     RED,
     area,
+    behind_a_mask,
     cube,
     grid_in,
     same,
     square,
-    veil,
 )
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
@@ -27,12 +27,12 @@ pytestmark = pytest.mark.usefixtures("variant_rgb")
 def test_shadow_rays_go_on_through_what_is_partly_clear(lamp):
     """A mask dims them by its transparency, as volpath does, towards all kinds of lamps."""
     shine = {"bulb": point([1.6, -1.3, 1.7])[0], "lamp": area(1.6, -1.3, 1.7), "sky": LAMPS["envmap"]()["lamp"]}[lamp]
-    same(veil() | {"shine": shine})
+    same(behind_a_mask() | {"shine": shine})
 
 
 @pytest.mark.statistical
 @pytest.mark.parametrize("lamp", small.cases(["bulb", "sky"], ["sky"]))
-@pytest.mark.parametrize("kind", ["pane", "boundary"])
+@pytest.mark.parametrize("kind", ["transmissive", "boundary"])
 def test_emitters_that_let_light_pass(kind, lamp):
     """A luminous mask before another lamp, and a boundary that shines itself: what is behind them is seen through them."""
     shine = {"bulb": {"bulb": point([1.6, -1.3, 1.7], 40.0)[0]}, "sky": LAMPS["envmap"]()}[lamp]
@@ -41,4 +41,4 @@ def test_emitters_that_let_light_pass(kind, lamp):
         same({"smoke": grid_in(cube(PLACE)) | light, **shine})
         return
     mask = {"type": "mask", "opacity": 0.4, "nested": {"type": "twosided", "nested": RED}}
-    same({"smoke": grid_in(cube(PLACE)), "pane": square(0.8, -0.65, 0.85, 0.6) | light | {"bsdf": mask}, **shine})
+    same({"smoke": grid_in(cube(PLACE)), "transmissive": square(0.8, -0.65, 0.85, 0.6) | light | {"bsdf": mask}, **shine})

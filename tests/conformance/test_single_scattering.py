@@ -41,6 +41,7 @@ from volpath_scenes import (
     LEAK,
     RED,
     area,
+    behind_a_mask,
     cube,
     floor,
     grid_in,
@@ -48,7 +49,6 @@ from volpath_scenes import (
     same,
     square,
     turn,
-    veil,
 )
 
 import scenes
@@ -128,13 +128,13 @@ PLACES = {
     "two balls": crossing_media,
     "surfaces": surfaces,
     "mirrors": mirrors,
-    "veil": veil,
+    "mask": behind_a_mask,
 }
 
 
 SLOW_PLACES = (
     "homogeneous box", "rgb albedo, own", "albedo grid, own", "albedo grid in a homogeneous", "scaled, own", "turned, own",
-    "box smaller than its grid", "ball larger than its grid", "two boxes", "mirrors", "veil",
+    "box smaller than its grid", "ball larger than its grid", "two boxes", "mirrors", "mask",
 )  # fmt: skip
 
 

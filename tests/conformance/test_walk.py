@@ -51,7 +51,7 @@ MASK = {"type": "mask", "opacity": 0.4, "nested": RED}
 
 def rooms() -> dict[str, tuple[dict, int]]:
     spot = SPOT | {"to_world": turn().look_at([1, 3, 1], [0, 0, 0], [0, 0, 1])}
-    veil = {"type": "rectangle", "bsdf": MASK, "to_world": turn().translate([0, 0, 1.5])}
+    masked = {"type": "rectangle", "bsdf": MASK, "to_world": turn().translate([0, 0, 1.5])}
     glass = ball_of(medium("homogeneous", 0.7), (0, 0, 0), 0.8) | {"bsdf": {"type": "dielectric"}}
     fogs = {
         "one": ball_of(medium("homogeneous", 0.7), (0, 0, 0), 1.0),
@@ -67,8 +67,8 @@ def rooms() -> dict[str, tuple[dict, int]]:
         "area, depth 1": (room(lamp=lamp(3), sensor=camera((0.0, -1.0, 4.0), (0.0, 1.5, 0.0), res=8, fov=60.0)), 1),
         "area, depth 4": (room(lamp=lamp()), 4),
         "glossy under a wide lamp": (room(lamp=lamp(3), floor=room()["floor"] | {"bsdf": SHINY}), 2),
-        "mask, depth 1": (room(sky=sky(), veil=veil), 1),
-        "mask, depth 3": (room(sky=sky(), veil=veil), 3),
+        "mask, depth 1": (room(sky=sky(), mask=masked), 1),
+        "mask, depth 3": (room(sky=sky(), mask=masked), 3),
         "two fogs in spheres": (room(sky=sky(), **del_box, **fogs), 2),
         "glass full of ink": (room(sky=sky(), **del_box, glass=glass), 8),
     }

@@ -6,7 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from aov_gradients import DATA, NAMES, VALUE, aovs, mivol, pulled
+from aov_gradients import DATA, NAMES, VALUE, aovs, mivol, vjp
 
 from mivol.scene import plan
 from scenes import (
@@ -109,7 +109,7 @@ def directions(params: mi.SceneParameters, keys: list[str], rng: np.random.Gener
     return {k: rng.uniform(0, 1, np.array(params[k]).shape).astype(np.float32) for k in keys}
 
 
-def pushed(scene: mi.Scene, integrator: mi.Integrator, v: dict[str, np.ndarray], spp: int) -> np.ndarray:
+def jvp(scene: mi.Scene, integrator: mi.Integrator, v: dict[str, np.ndarray], spp: int) -> np.ndarray:
     """J v of the AOVs, (H, W, AOVs)."""
     params = mi.traverse(scene)
     for key, value in v.items():
@@ -127,9 +127,9 @@ def test_forward_against_reverse(name):
     scene, keys = build(name)
     rng = np.random.default_rng(1)
     v = directions(mi.traverse(scene), keys, rng)
-    jv = pushed(scene, mivol(), v, 4)
+    jv = jvp(scene, mivol(), v, 4)
     w = rng.uniform(0, 1, jv.shape)
-    jtw = pulled(scene, mivol(), keys, w, 4)
+    jtw = vjp(scene, mivol(), keys, w, 4)
     products = np.concatenate([(v[k] * jtw[k].reshape(v[k].shape)).ravel() for k in keys])
     assert abs((jv * w).sum() - products.sum()) <= 1e-6 * max(np.abs(products).sum(), np.abs(jv * w).sum())
     assert np.all(np.abs(jv).max(axis=(0, 1)) > 1e-3)
@@ -154,7 +154,7 @@ def test_forward_against_finite_differences(name):
     one, two = (at(h) - at(-h)) / (2 * h), (at(2 * h) - at(-2 * h)) / (4 * h)
     at(0)
     difference = (4 * one - two) / 3
-    jv = pushed(scene, mivol(), v, 4)
+    jv = jvp(scene, mivol(), v, 4)
     for c, aov in enumerate(NAMES.split(",")):
         error = np.abs(jv[..., c] - difference[..., c])
         assert np.all(error <= 1e-3 * np.abs(difference[..., c]).max() + 5e-5), aov
@@ -179,7 +179,7 @@ def test_through_mi_render_with_a_crop(passes, rfilter, monkeypatch):
     rng = np.random.default_rng(5)
     params = mi.traverse(scene)
     v = directions(params, keys[:1], rng)
-    jv = pushed(scene, mivol(), v, 3)
+    jv = jvp(scene, mivol(), v, 3)
     assert jv.shape == (1, 3, 4)
     w = rng.uniform(0, 1, jv.shape)
     dr.enable_grad(params[keys[0]])

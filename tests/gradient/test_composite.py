@@ -7,7 +7,7 @@ import math
 import mitsuba as mi
 import numpy as np
 import pytest
-from aov_gradients import DATA, VALUE, mivol, pulled
+from aov_gradients import DATA, VALUE, mivol, vjp
 
 from scenes import (
     as_float32,
@@ -69,7 +69,7 @@ def test_every_voxel_has_its_gradient(name, boundary):
     # 1.6 here and where the extinction jumps: 3e-4.
     """Hard case 37."""
     sigma = PROFILES[name]
-    got = pulled(column(sigma, boundary), mivol("depth"), [f"box.{DATA}"], np.ones((1, 1, 1)), 1)[f"box.{DATA}"].ravel()
+    got = vjp(column(sigma, boundary), mivol("depth"), [f"box.{DATA}"], np.ones((1, 1, 1)), 1)[f"box.{DATA}"].ravel()
     exact = depth_gradient(as_float32(sigma), START)
     nearby = np.convolve(np.abs(exact), np.ones(3), "same")
     assert np.all(np.abs(got - exact) <= 3e-4 * nearby)
@@ -90,7 +90,7 @@ def test_media_hidden_behind_another(shape):
     parts = {"a": at(0, 50.0), "b": at(2, 1.3), "c": at(4, 0.7)}
     scene = mi.load_dict({"type": "scene", **parts, "sensor": pencil([0, 0, -1], [0, 0, 1])})
     keys = [f"{k}.{VALUE}" for k in parts]
-    got = pulled(scene, mivol("depth"), keys, np.ones((1, 1, 1)), 1)
+    got = vjp(scene, mivol("depth"), keys, np.ones((1, 1, 1)), 1)
     first, second, third = (float(got[k].ravel()[0]) for k in keys)
     assert first == pytest.approx(-1 / 50**2, rel=1e-4)
     if shape == "box":
@@ -123,7 +123,7 @@ def hidden_slope(which: int) -> float:
 def test_a_black_cell_does_not_disturb_what_is_in_front_of_it():
     # Behind the visible half lies an optical depth of 1e6 a cell: what is ahead of a cell must not be what is left of it.
     sigma = np.where(np.arange(48) < 32, 1.0, 5e7)
-    got = pulled(column(sigma), mivol("depth"), [f"box.{DATA}"], np.ones((1, 1, 1)), 1)[f"box.{DATA}"].ravel()
+    got = vjp(column(sigma), mivol("depth"), [f"box.{DATA}"], np.ones((1, 1, 1)), 1)[f"box.{DATA}"].ravel()
     nodes = (np.arange(48) + 0.5) / 48
     # Nothing gets past z0, the rise to the wall: d depth / d sigma = T t - N behind, N behind = int t T dt + z0 T.
     z0 = nodes[31]

@@ -11,7 +11,7 @@ from scattering_gradients import (
     BATCHES,
     DENSITIES,
     GRID,
-    pulled,
+    vjp,
 )
 from scattering_scenes import PLACE, aimed, fog, mivol, pencils, rough_grid
 
@@ -38,7 +38,7 @@ def test_white_smoke_of_no_density_in_a_constant_sky_has_no_gradient(kind, place
         interior = medium(medium_type, grid_volume(volume_type, as_float32(DENSITIES["empty"]()), PLACE), albedo)
         seen = pencils({**WHITE[place](interior), "sky": scenes.sky(0.7)}, *aimed(1, 8))
         integrator = mi.load_dict(mivol())
-        gradients.append([pulled(seen.scene, GRID, np.ones((1, 8, 3)), 1, seed, integrator) for seed in range(8)])
+        gradients.append([vjp(seen.scene, GRID, np.ones((1, 8, 3)), 1, seed, integrator) for seed in range(8)])
     black, white = (np.abs(g).max() for g in gradients)
     assert black > 0.1
     assert white <= 4e-6 * black
@@ -65,7 +65,7 @@ def test_a_ball_under_a_constant_sky(alone):
     seeds = [fresh(s) for s in range(BATCHES)]
     differences = np.array([(at(h, s) - at(-h, s)) / (2 * h) for s in seeds])
     at(0, 0)
-    found = np.array([np.sum(v * pulled(scene, GRID, w, 256, s, integrator)) for s in seeds])
+    found = np.array([np.sum(v * vjp(scene, GRID, w, 256, s, integrator)) for s in seeds])
     m, level = Moments.of((differences - found)[:, None]), abs(differences.mean())
     # Truncation as below.
     assert_same_mean(m, rounding=2e-3 * level, what="ball")

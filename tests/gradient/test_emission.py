@@ -130,17 +130,17 @@ def test_several_passes_are_one(end, channels, depth, monkeypatch):
     scene, spp = picture(medium), 4
     w = np.random.default_rng(3).uniform(size=(6, 6, 3))
     (v,) = directions(scene, (end,)).values()
-    pulled, pushed = [], []
+    vjps, jvps = [], []
     for passes in (1, 4):
         in_passes(monkeypatch, passes, spp)
-        pulled.append(gradients(scene, [end], w, spp, 3, max_depth=depth)[0])
-        pushed.append(changes(scene, {end: v}, spp, 3, max_depth=depth))
+        vjps.append(gradients(scene, [end], w, spp, 3, max_depth=depth)[0])
+        jvps.append(changes(scene, {end: v}, spp, 3, max_depth=depth))
     # Each pass has its own numbers: what is the same is the sum that they make of their own.
-    for g, jv in zip(pulled, pushed, strict=True):
+    for g, jv in zip(vjps, jvps, strict=True):
         assert abs((g * v).sum() - (jv * w).sum()) <= 5e-6 * np.abs(jv * w).sum()
     # The jitter of four samples in 36 pixels; all passes but one lost would leave a quarter.
-    assert abs(pulled[1].sum() / pulled[0].sum() - 1) < 0.3
-    assert abs(pushed[1].sum() / pushed[0].sum() - 1) < 0.3
+    assert abs(vjps[1].sum() / vjps[0].sum() - 1) < 0.3
+    assert abs(jvps[1].sum() / jvps[0].sum() - 1) < 0.3
 
 
 def test_two_bodies_that_share_their_light():

@@ -35,7 +35,7 @@ def lanes_like(tau, y):
     return type(tau)(y[0]) if len(y) == 1 else type(tau)(y)
 
 
-def pull(values, y, to_world, o, d, t_max=math.inf, skip=False):
+def vjp(values, y, to_world, o, d, t_max=math.inf, skip=False):
     """A^T y, in reverse mode."""
     values = tensor(values)
     dr.enable_grad(values)
@@ -46,7 +46,7 @@ def pull(values, y, to_world, o, d, t_max=math.inf, skip=False):
     return np.asarray(dr.grad(values))
 
 
-def push(values, tangent, to_world, o, d, t_max=math.inf, skip=False):
+def jvp(values, tangent, to_world, o, d, t_max=math.inf, skip=False):
     """A x, in forward mode."""
     values = tensor(values)
     dr.enable_grad(values)
@@ -66,13 +66,13 @@ def setting(seed, name, channels, n=200):
 @pytest.mark.parametrize("name", FRAMES)
 @pytest.mark.parametrize("channels", [1, 3])
 def test_transpose_is_the_rows_of_the_twin(seed, name, channels):
-    # A row's weight has the error of its stretch: BOUND times the ray's length in the cell and of its two neighbours.
+    # A row's weight has the error of its interval: BOUND times the ray's length in the cell and of its two neighbours.
     rng, values, to_world, o, d = setting(seed, name, channels, n=24)
     y = as_float32(rng.normal(size=(24, channels)))
     rows = np.array([tau_gradient_twin(values.shape, to_world, *ray) for ray in zip(o, d, strict=True)])
     exact = np.einsum("nzyx,nc->zyxc", rows, y)
     reach = np.abs(y).max() * rows.max() * 24
-    got = pull(values, y, to_world, o, d)
+    got = vjp(values, y, to_world, o, d)
     assert np.all(np.abs(got - exact) <= BOUND * reach)
     assert np.abs(exact).max() > 1e3 * BOUND * reach
 
@@ -83,7 +83,7 @@ def test_transpose_of_a_cut_segment(seed, t_max):
     y = as_float32(rng.normal(size=(24, 1)))
     end = as_float32(t_max)
     rows = np.array([tau_gradient_twin(values.shape, to_world, *ray, 0, end) for ray in zip(o, d, strict=True)])
-    got = pull(values, y, to_world, o, d, t_max)[..., 0]
+    got = vjp(values, y, to_world, o, d, t_max)[..., 0]
     assert np.all(np.abs(got - np.einsum("nzyx,nc->zyx", rows, y)) <= BOUND * np.abs(y).max() * rows.max() * 24)
 
 
@@ -94,7 +94,7 @@ def test_adjoint_identity(seed, name, channels, skip):
     # <A x, y> = <x, A^T y> to 1e-6 |A x| |y|, products in float64.
     rng, values, to_world, o, d = setting(seed, name, channels)
     x, y = (as_float32(rng.normal(size=s)) for s in (values.shape, (len(o), channels)))
-    ax, aty = push(values, x, to_world, o, d, skip=skip), pull(values, y, to_world, o, d, skip=skip)
+    ax, aty = jvp(values, x, to_world, o, d, skip=skip), vjp(values, y, to_world, o, d, skip=skip)
     difference = abs(np.sum(ax.astype(np.float64) * y) - np.sum(x * aty.astype(np.float64)))
     assert difference <= 1e-6 * np.linalg.norm(ax) * np.linalg.norm(y)
 
@@ -105,19 +105,19 @@ def test_tangent_is_the_integral_of_the_tangent(seed, channels, skip):
     # Linear: the tangent is A itself, at any point, even where the field is empty and the walk could skip.
     rng, values, to_world, o, d = setting(seed, "rotated", channels)
     x = as_float32(rng.normal(size=values.shape))
-    assert np.array_equal(push(values, x, to_world, o, d, skip=skip), tau_fast(x, to_world, o, d))
+    assert np.array_equal(jvp(values, x, to_world, o, d, skip=skip), tau_fast(x, to_world, o, d))
 
 
 @pytest.mark.parametrize("channels", [1, 3])
 def test_forward_against_reverse_entry_by_entry(seed, channels):
-    # Column k of A by pushing a unit vector, and entry k of A^T 1 by pulling: the same sum over rays.
+    # Column k of A by the jvp of a unit vector, and entry k of A^T 1 by a vjp: the same sum over rays.
     rng, values, to_world, o, d = setting(seed, "sheared", channels, n=32)
-    aty = pull(values, np.ones((32, channels)), to_world, o, d)
+    aty = vjp(values, np.ones((32, channels)), to_world, o, d)
     for _ in range(4):
         k = tuple(rng.integers(0, values.shape))
         unit = np.zeros(values.shape)
         unit[k] = 1
-        column = push(values, unit, to_world, o, d)
+        column = jvp(values, unit, to_world, o, d)
         assert column.sum(dtype=np.float64) == pytest.approx(aty[k], abs=BOUND * float(aty.max()))
         assert np.array_equal(column[:, [c for c in range(channels) if c != k[3]]], np.zeros((32, channels - 1)))
 
@@ -125,7 +125,7 @@ def test_forward_against_reverse_entry_by_entry(seed, channels):
 def test_finite_differences(seed):
     # tau(sigma + 1/2 e_k) - tau(sigma - 1/2 e_k) is column k; each tau has a rounding of its own, 1e-6 of it.
     _, values, to_world, o, d = setting(seed, "mirrored", 1, n=64)
-    aty = pull(values, np.ones((64, 1)), to_world, o, d)
+    aty = vjp(values, np.ones((64, 1)), to_world, o, d)
     tau = tau_fast(values, to_world, o, d)
     for k in [tuple(k) for k in np.argwhere(aty > 0.2 * aty.max())[::7]]:
         step = np.zeros(values.shape)
@@ -142,7 +142,7 @@ def test_chain_rule_through_a_map_of_the_voxels(seed):
     dr.enable_grad(x)
     tau = integrate(dr.exp(x), to_world, o, d)
     dr.backward(dr.sum(tau * mi.Float(y[:, 0].astype(np.float32))))
-    expected = pull(values, y, to_world, o, d) * (values + 0.1)
+    expected = vjp(values, y, to_world, o, d) * (values + 0.1)
     # exp and log each add an EPS, the log one multiplied by |log| <= 2.3.
     assert np.allclose(np.asarray(dr.grad(x)), expected, rtol=4e-6, atol=1e-6 * expected.max())
 
@@ -153,7 +153,7 @@ def test_gradients_add_up_over_two_integrals_of_one_grid(seed):
     dr.enable_grad(v)
     dr.backward(dr.sum(integrate(v, to_world, o, d)) + 2 * dr.sum(integrate(v, to_world, o, -d)))
     ones = np.ones((len(o), 1))
-    expected = pull(values, ones, to_world, o, d) + 2 * pull(values, ones, to_world, o, -d)
+    expected = vjp(values, ones, to_world, o, d) + 2 * vjp(values, ones, to_world, o, -d)
     assert np.allclose(np.asarray(dr.grad(v)), expected, rtol=0, atol=BOUND * expected.max())
 
 
@@ -171,7 +171,7 @@ def test_inactive_lanes_receive_and_give_nothing(seed):
     on = np.arange(64) % 3 == 0
     tau = integrate_tau(make_lattice(v, to_world), *to_lanes(o, d), mi.Float(math.inf), mi.Bool(on))
     dr.backward(dr.sum(tau))
-    expected = pull(values, on[:, None].astype(float), to_world, o, d)
+    expected = vjp(values, on[:, None].astype(float), to_world, o, d)
     assert np.array_equal(np.asarray(tau)[~on], np.zeros((~on).sum()))
     assert np.allclose(np.asarray(dr.grad(v)), expected, rtol=0, atol=BOUND * expected.max())
 

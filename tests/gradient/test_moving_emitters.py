@@ -15,8 +15,8 @@ from scattering_gradients import (
     BATCHES,
     assert_gradient,
     gradients,
-    pulled,
     twin_difference,
+    vjp,
     weights,
 )
 from scattering_scenes import PLACE, aimed, mivol, pencils, point, rough_grid, smoke, spot, sun
@@ -158,7 +158,7 @@ def test_place_of_an_emitter_behind_boundaries_that_are_traced(name, lamp):
     h = 0.004
     truth = [(shown(h * e) - shown(-h * e)) / (2 * h) for e in np.eye(3)]
     shown(np.zeros(3))
-    found = pulled(seen.scene, "lamp.position", w, 1, 0, integrator).ravel()
+    found = vjp(seen.scene, "lamp.position", w, 1, 0, integrator).ravel()
     # A ray along a plane of voxels turns over a kink within h: a share h / voxel of the slope, 1.2e-2 of one ray in six; of the
     # rest truncation is 1e-5 and rounding 1e-7 / h.
     assert np.abs(found - truth).max() <= 3e-3 * np.abs(truth).max()

@@ -22,9 +22,9 @@ from scattering_gradients import (
     GRID,
     assert_gradient,
     gradients,
-    pulled,
     release,
     twin_difference,
+    vjp,
     watched,
     weights,
 )
@@ -42,8 +42,8 @@ MEDIUM = "smoke.interior_medium."
 # -- Gradients of renders -----------------------------------------------------------------------------------------------
 
 
-def pushed(scene: mi.Scene, key: str, v: np.ndarray, spp: int, seed: int, integrator: mi.Integrator) -> np.ndarray:
-    """J v: the derivative of the image along v, by `mi.render` with the same random numbers as :func:`pulled`."""
+def jvp(scene: mi.Scene, key: str, v: np.ndarray, spp: int, seed: int, integrator: mi.Integrator) -> np.ndarray:
+    """J v: the derivative of the image along v, by `mi.render` with the same random numbers as :func:`vjp`."""
     params, variable = watched(scene, key)
     image = mi.render(scene, params, integrator=integrator, spp=1, spp_grad=spp, seed=seed + 10_000, seed_grad=seed)
     kind = type(variable)
@@ -502,8 +502,8 @@ def test_forward_against_reverse(key):
     start = np.array(mi.traverse(scene)[KEYS[key]])
     rng = np.random.default_rng(1)
     v, w = rng.uniform(0.2, 1, start.shape or (1,)), rng.uniform(0.2, 1, (8, 8, 3))
-    jv = pushed(scene, KEYS[key], v if start.ndim else float(v[0]), 8, 5, integrator)
-    jtw = pulled(scene, KEYS[key], w, 8, 5, integrator)
+    jv = jvp(scene, KEYS[key], v if start.ndim else float(v[0]), 8, 5, integrator)
+    jtw = vjp(scene, KEYS[key], w, 8, 5, integrator)
     assert abs((jv * w).sum() - (jtw * v).sum()) <= 1e-5 * np.abs(jv * w).sum()
     assert np.abs(jv).max() > 1e-4
 
@@ -533,7 +533,7 @@ def test_against_differences_with_common_random_numbers(key, kind):
     seeds = [fresh(s) for s in range(32)]
     differences = np.array([(at(start + h * v, s) - at(start - h * v, s)) / (2 * h) for s in seeds])
     at(start, 0)
-    jv = np.array([pushed(scene, name, v, spp, s, integrator).mean(axis=(0, 1)) for s in seeds])
+    jv = np.array([jvp(scene, name, v, spp, s, integrator).mean(axis=(0, 1)) for s in seeds])
     m, level = Moments.of(differences - jv), np.abs(differences.mean(axis=0))
     assert_same_mean(m, rounding=2e-3 * level.max(), what=key)
     assert_precise(m, 0.02 * level.max(), what=key)

@@ -55,7 +55,7 @@ def build(
     return mi.load_dict(parts)
 
 
-def pushed(scene: mi.Scene, integrator: mi.Integrator, key: str, v: np.ndarray, seed: int, spp: int) -> np.ndarray:
+def jvp(scene: mi.Scene, integrator: mi.Integrator, key: str, v: np.ndarray, seed: int, spp: int) -> np.ndarray:
     """J v: the derivative of the image along v."""
     params = mi.traverse(scene)
     kind = type(params[key])
@@ -66,7 +66,7 @@ def pushed(scene: mi.Scene, integrator: mi.Integrator, key: str, v: np.ndarray, 
     return image
 
 
-def pulled(scene: mi.Scene, integrator: mi.Integrator, key: str, w: np.ndarray, seed: int, spp: int) -> np.ndarray:
+def vjp(scene: mi.Scene, integrator: mi.Integrator, key: str, w: np.ndarray, seed: int, spp: int) -> np.ndarray:
     """J^T w: the derivative of <w, image>."""
     params = mi.traverse(scene)
     dr.enable_grad(params[key])
@@ -104,8 +104,8 @@ def test_forward_against_reverse(name, passes, monkeypatch):
     if passes > 1:
         monkeypatch.setitem(plan.PASS_RAYS, mi.variant().split("_")[0], 1)
     v, w = rng.uniform(size=values(case.get("channels", 1)).shape), rng.uniform(size=shape)
-    jv = pushed(scene, integrator, GRID, v, 7, spp)
-    jtw = pulled(scene, integrator, GRID, w, 7, spp)
+    jv = jvp(scene, integrator, GRID, v, 7, spp)
+    jtw = vjp(scene, integrator, GRID, w, 7, spp)
     # Float32 sums of 100 pixels and 120 voxels, each to 6e-8 of its size: 1e-6 leaves a factor of ten.
     assert abs((jv * w).sum() - (jtw * v).sum()) <= 1e-6 * np.abs(jv).sum()
     assert np.abs(jv).max() > 0.01
@@ -130,7 +130,7 @@ def test_reverse_against_finite_differences(name):
 
     far, near = at(start + h * v), at(start - h * v)
     at(start)
-    jv = pushed(scene, integrator, GRID, v, 11, 8)
+    jv = jvp(scene, integrator, GRID, v, 11, 8)
     # Along v a pixel is a sum of exp(-a h) with a <= 7 (the mean of v times 1.5 times paths up to 9 long): h^2 a^3 / 6 L is
     # 0.023 L at the very worst, 1e-3 L at the mean; rounding adds 2e-7 / 0.02 = 1e-5 L.
     assert np.abs((far - near) / (2 * h) - jv).max() <= 4e-3 * np.abs(jv).max()
@@ -164,9 +164,9 @@ def test_other_parameters_against_finite_differences(key, depth):
     difference = (at(start + h) - at(start - h)) / (2 * h)
     at(start)
     w = np.random.default_rng(4).uniform(size=difference.shape)
-    gradient = pulled(scene, integrator, key, w, 5, 16)
+    gradient = vjp(scene, integrator, key, w, 5, 16)
     one = np.ones(np.array(start).shape)
-    jv = pushed(scene, integrator, key, one, 5, 16)
+    jv = jvp(scene, integrator, key, one, 5, 16)
     # Radiance enters linearly, reflectance as a polynomial of degree 3, the scale as exp(-a h), a <= 6: h^2 a^2 / 6 = 2.4e-3.
     # BSDF sampling follows the reflectance only through its colour, not its direction, so the same paths are compared.
     assert np.abs(difference - jv).max() <= 5e-3 * np.abs(difference).max() + 1e-4
@@ -187,7 +187,7 @@ def test_gradient_where_prbvolpath_has_none():
         }
     )
     integrator = mi.load_dict({"type": "mivol"})
-    gradient = pulled(scene, integrator, GRID, np.ones((1, 1, 3)), 0, 1)
+    gradient = vjp(scene, integrator, GRID, np.ones((1, 1, 3)), 0, 1)
     # Three channels, each with d/dsigma_k sum = -T times the chord of 2; float32 sums of a few numbers.
     assert gradient.sum() == pytest.approx(-3 * 2 * np.exp(-1.0), rel=2e-6)
 

@@ -1,6 +1,6 @@
 """Dense media seen from afar: extinctions of 1e5 and more, cameras hundreds of box sizes away.
 
-A float32 distance of 300 is rounded by 1.5e-5: 15 optical depths of an extinction of 1e6. Where a stretch begins, how long it
+A float32 distance of 300 is rounded by 1.5e-5: 15 optical depths of an extinction of 1e6. Where an interval begins, how long it
 is and where a point lies are therefore found in float64. The face that is seen lies at z = 0, where coordinates are exact:
 what float32 points may do to shadow rays is no part of these tests.
 """

@@ -177,7 +177,7 @@ def test_two_loops_are_the_inverse_hessian(variant_rgb) -> None:
     assert np.allclose(two_loops(v, conjugate, [a @ s for s in conjugate]), np.linalg.solve(a, v), rtol=1e-12)
 
 
-# -- Randomness, passes, shots ------------------------------------------------------------------------------------
+# -- Randomness, passes, batches ---------------------------------------------------------------------------------
 
 
 def test_seeds_are_a_function_of_their_key() -> None:

@@ -151,7 +151,7 @@ def test_row_sums_to_the_chord(seed, name, skip):
 
 
 def test_first_moments(seed):
-    # sum_k x_k d tau / d sigma_k = integral of x ds, along stretches between the outermost voxel centres.
+    # sum_k x_k d tau / d sigma_k = integral of x ds, along intervals between the outermost voxel centres.
     rng = np.random.default_rng([seed, 1])
     n = np.array([7, 6, 9])
     to_world = affine(rotation([1, -1, 2], 0.4) @ np.diag([2.0, 1.0, 1.5]))

@@ -88,7 +88,7 @@ def vjp_rows(media: SceneMedia, segment: RaySegment, weight: list[mi.Float], act
 
     points = revisit_media(media, segment, visit, start_points(len(bounded), segment.u, dr.width(segment.ray)), active)
     for (body, part), point in zip(bounded, points, strict=True):
-        # After the walk: what Dr.Jit pulls back in a loop is lost where the same array was pulled to before it.
+        # After the walk: Dr.Jit loses what is differentiated in a loop with respect to an array that already has a gradient.
         on, each = active & (point.total > 0), [w * point.total for w in weight]
         body.deposit_in_part(part, segment.ray, point.t, each, on)
 

@@ -142,14 +142,14 @@ def weigh_emission_density(dt: mi.Float, sigma1: mi.Float, sigma2: mi.Float) -> 
 
     # The mean position in the cell of the light that leaves it (1/2 in a thin cell), and its derivatives.
     drift = [dr.fma(e[n], e[1], -e[n + 1]) for n in range(5)]  # d e_n / d tau; that of e_0 is 0
-    pull = e[2] - e[3] - e[1] * (e[1] - e[2])
-    place = dr.fma(lean, pull, e[1])
+    shift = e[2] - e[3] - e[1] * (e[1] - e[2])
+    place = dr.fma(lean, shift, e[1])
     moves = drift[1] + lean * (drift[2] - drift[3] - drift[1] * (e[1] - e[2]) - e[1] * (drift[1] - drift[2]))
     spread = 1 / (1 - 2 * GAUSS)
     v = (place - GAUSS) * spread
     between = (v > 0) & (v < 1)
     v = dr.clip(v, 0, 1)
-    v_tau, v_lean = dr.select(between, spread * moves, 0), dr.select(between, spread * pull, 0)
+    v_tau, v_lean = dr.select(between, spread * moves, 0), dr.select(between, spread * shift, 0)
 
     slopes = []
     for share, turn in ((1 - v, -1.0), (v, 1.0)):
