@@ -10,6 +10,9 @@ import signal
 from collections.abc import Iterator
 from pathlib import Path
 
+import one_blas_thread  # noqa: F401  (before NumPy)
+
+# isort: split
 import mivol  # noqa: F401  (before Mitsuba: it chooses the LLVM library)
 
 # isort: split

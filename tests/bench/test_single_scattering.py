@@ -35,6 +35,7 @@ def fake(rounds: np.ndarray, seconds: float = 1.0) -> Timing:
     return Timing({}, [seconds] * len(images), [seconds] * len(images), list(images))
 
 
+@pytest.mark.slow
 @pytest.mark.statistical
 def test_renderers_agree_in_a_sky(variant_rgb: str, tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Radiance is at most 1 and its samples are many: t has hundreds of degrees of freedom. Of the comparisons that share the

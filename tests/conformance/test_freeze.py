@@ -101,7 +101,7 @@ def test_gradient_step():
         assert np.abs(replayed - plain).max() <= 1e-5 * np.abs(plain).max()
 
 
-@pytest.mark.parametrize("lamp", ["sky", "bulb"])
+@pytest.mark.parametrize("lamp", ["sky", pytest.param("bulb", marks=pytest.mark.slow)])
 def test_gradient_step_of_scattered_light(lamp):
     """Density, albedo and asymmetry of a medium that turns light once, in one recording: what an ordinary step gives."""
     values = np.random.default_rng(1).uniform(0.1, 1.0, (4, 5, 6, 1)).astype(np.float32)

@@ -32,23 +32,23 @@ def surfaces_in_smoke() -> mi.Scene:
 
 @pytest.mark.statistical
 def test_moment_has_the_same_mean_and_the_right_second_moment():
-    """Welch's t of 16 batches each; the squares come from renders of one sample a pixel, 96 of them in 16 batches."""
+    """Welch's t of 8 batches each; the squares come from renders of one sample a pixel, 48 of them in 16 batches."""
     scene = surfaces_in_smoke()
-    nested = moments(scene, {"type": "moment", "inner": mivol()}, 32, first=500)
-    alone = moments(scene, mivol(), 32)
+    nested = moments(scene, {"type": "moment", "inner": mivol()}, 32, 8, first=500)
+    alone = moments(scene, mivol(), 32, 8)
     assert nested.mean.shape == (16, 16, 9)
     mean = nested.mean[..., :3]
-    assert_same_mean(Estimate(mean, nested.variance_of_mean[..., :3], 15), alone, tile=4, what="tiles")
+    assert_same_mean(Estimate(mean, nested.variance_of_mean[..., :3], 7), alone, tile=4, what="tiles")
     np.testing.assert_allclose(nested.mean[..., 3:6], mean @ XYZ.T, rtol=1e-5)  # 6 digits of the matrix
 
     integrator = mi.load_dict(mivol())
-    single = np.stack([np.array(mi.render(scene, integrator=integrator, spp=1, seed=fresh(1000 + s))) for s in range(96)])
-    squares = ((single @ XYZ.T) ** 2).mean(axis=(1, 2)).reshape(16, 6, 3).mean(axis=1)
+    single = np.stack([np.array(mi.render(scene, integrator=integrator, spp=1, seed=fresh(1000 + s))) for s in range(48)])
+    squares = ((single @ XYZ.T) ** 2).mean(axis=(1, 2)).reshape(16, 3, 3).mean(axis=1)
     # The batches of ``moment`` share no random numbers, and neither do pixels of one.
     whole, truth = over_pixels(Moments(nested.n, nested.mean[..., 6:], nested.m2[..., 6:])), Moments.of(squares)
     assert_same_mean(whole, truth, what="second moments")
-    assert_precise(difference(whole, truth), 0.01 * truth.mean, what="second moments")
-    # It is not the square of the mean, by more than 5 of the 1 % above.
+    assert_precise(difference(whole, truth), 0.015 * truth.mean, what="second moments")
+    # It is not the square of the mean, by more than 3 of the 1.5 % above.
     assert np.all(truth.mean > 1.05 * (alone.mean @ XYZ.T).mean(axis=(0, 1)) ** 2)
 
 

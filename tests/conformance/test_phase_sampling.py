@@ -63,7 +63,7 @@ OWN_PHASES = [("hg forward", "own"), ("tabphase", "own"), ("blendphase", "own")]
     ("name", "kind"),
     small.cases(
         [*((name, "stock") for name in PHASES), *OWN_PHASES],
-        [*((name, "stock") for name in ("isotropic", "hg backward", "blendphase")), *OWN_PHASES],
+        [*((name, "stock") for name in ("isotropic", "hg forward", "hg backward", "rayleigh", "blendphase")), *OWN_PHASES],
     ),
 )
 def test_phase_functions(name, kind):
@@ -78,7 +78,7 @@ def test_phase_functions(name, kind):
 
 
 @pytest.mark.statistical
-@pytest.mark.parametrize("inside", ["alone", "a blend", "a mixture"])
+@pytest.mark.parametrize("inside", small.cases(["alone", "a blend", "a mixture"], ["a blend"]))
 def test_microflakes_in_a_sky(inside):
     """Thin: albedo tau sqrt(w^T S w) times the sky's mean over eval_pdf; the sun in it is found by both ways of sampling."""
     lobes = {"a": microflakes(), "b": {"type": "hg", "g": 0.5}}

@@ -167,7 +167,7 @@ def test_vacuum_outside_the_box(variant, channels):
     assert np.all(values[np.all(np.abs(u - 0.5) < 0.4999, axis=1)] > 0.99)
 
 
-@pytest.mark.parametrize("frame", ["unit", "rotated"])
+@pytest.mark.parametrize("frame", [pytest.param("unit", marks=pytest.mark.slow), "rotated"])
 def test_same_picture_as_gridvolume_under_stock_medium_and_volpath(variant, frame):
     # Same numbers, same random numbers, same paths: the pictures differ at most by the order of float sums in a pixel.
     to_world = as_float32(FRAMES[frame])

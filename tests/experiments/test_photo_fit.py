@@ -140,6 +140,7 @@ def test_what_a_field_takes_is_told_in_bytes_a_node(tmp_path: Path, variant_rgb:
     assert table.head[0] == "216 of 216 nodes are kept (100.0%)"
 
 
+@pytest.mark.slow
 def test_what_is_behind_is_learned(photographs: Path, tmp_path: Path) -> None:
     """Views over white, said to be over black: a sky finds the white, and is kept as an image beside the field."""
     path = toml(tmp_path, photographs)

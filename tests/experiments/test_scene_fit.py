@@ -123,6 +123,7 @@ sys.exit(main(sys.argv[1:]))
 """The command line in a process that is asked to stop once it has written its third row, of iteration 2; whatever the load."""
 
 
+@pytest.mark.slow
 def test_interrupted_run_is_resumed(variant_rgb, folder: Path) -> None:
     """Rationale: SIGTERM is how clusters stop jobs. Expected: exit code 130, one sentence, a checkpoint, status
     "stopped"; --resume ends with the very metrics of a run that was not stopped (one thread), each row once."""

@@ -7,6 +7,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from aov_gradients import DATA, NAMES, VALUE, aovs, mivol, vjp
+from scattering_scenes import cases
 
 from mivol.scene import plan
 from scenes import (
@@ -97,6 +98,10 @@ CASES = {
 }
 
 
+SLOW = ("rgb constant", "two grids", "cut grid", "boxes", "traced")
+"""What is in these, other cases combine."""
+
+
 def build(name: str, res: int = 6) -> tuple[mi.Scene, list[str]]:
     """A scene under a sky, and the keys of its parameters."""
     parts, keys = CASES[name]()
@@ -121,7 +126,7 @@ def jvp(scene: mi.Scene, integrator: mi.Integrator, v: dict[str, np.ndarray], sp
     return image[..., 3:]
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", cases(CASES, SLOW))
 def test_forward_against_reverse(name):
     # <J v, w> = <v, J^T w>: both sides are float32 sums of the same numbers, in another order.
     scene, keys = build(name)
@@ -135,7 +140,7 @@ def test_forward_against_reverse(name):
     assert np.all(np.abs(jv).max(axis=(0, 1)) > 1e-3)
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", cases(CASES, SLOW))
 def test_forward_against_finite_differences(name):
     # Central differences with common random numbers, extrapolated once (Richardson): what is left is of order h^4, and the
     # rounding of a difference of numbers of about 4 (a depth), 5e-7 / h, three times that with the extrapolation.

@@ -98,7 +98,7 @@ def derivative(parts: dict, key: str, mode: str, updates: bool) -> float:
     return float((np.array(change, dtype=np.float64) * np.array(w)).sum())
 
 
-@pytest.mark.parametrize("name", small.cases(MADE, ["area", "projector", "albedo"]))
+@pytest.mark.parametrize("name", small.cases(MADE, ["tabphase", "area", "projector", "albedo", "extinction and albedo in one"]))
 def test_every_way_of_asking(name):
     """Backward and forward, from the parameter or to the image, with and without params.update(): one number.
 
@@ -108,7 +108,7 @@ def test_every_way_of_asking(name):
     truth = derivative(parts(), key, "backward", updates=True)
     assert abs(truth) > 1e-3
     for mode in ("backward", "forward to the image", "forward from the parameter"):
-        for updates in (True, False):
+        for updates in (True, False)[mode == "backward" :]:
             assert derivative(parts(), key, mode, updates) == pytest.approx(truth, rel=1e-5), (mode, updates)
 
 

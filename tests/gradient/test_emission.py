@@ -63,7 +63,7 @@ CASES = {
         ("sigma_a.data", "sigma_s.data", "emission.data"),
     ),
 }
-SLOW = ("stock", "constant extinction, gridded light")
+SLOW = ("three channels", "stock", "constant extinction, gridded light")
 
 
 @pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow if n in SLOW else ()) for n in CASES])
@@ -87,7 +87,7 @@ def test_every_coefficient(name):
     assert abs(both - (jv * weight).sum()) <= 2e-6 * sum(np.abs(found[end] * v).sum() for end, v in along.items())
 
 
-@pytest.mark.parametrize("kind", ["mivol_voxels", "gridvolume"])
+@pytest.mark.parametrize("kind", [pytest.param("mivol_voxels", marks=pytest.mark.slow), "gridvolume"])
 def test_a_texture_need_not_be_told(kind):
     """dr.enable_grad without params.update() leaves a texture without the derivative, which it must have all the same."""
     found = []
@@ -116,7 +116,7 @@ def in_passes(monkeypatch, passes: int, spp: int) -> None:
 
 
 PASSES = [
-    ("albedo.data", 3, 2),
+    pytest.param("albedo.data", 3, 2, marks=pytest.mark.slow),
     ("emission.data", 3, 1),
     *(pytest.param(key, n, 1, marks=pytest.mark.slow) for key in DATA for n in (1, 3) if (key, n) != ("emission.data", 3)),
     pytest.param("albedo.data", 1, 2, marks=pytest.mark.slow),

@@ -87,7 +87,7 @@ def test_direction_of_an_emitter(kind):
 
 
 @pytest.mark.statistical
-@pytest.mark.parametrize("depth", [2, 3])
+@pytest.mark.parametrize("depth", [pytest.param(2, marks=pytest.mark.slow), 3])
 def test_place_of_an_emitter_over_a_floor(depth):
     """A floor under haze is lit from elsewhere: its distance, its slope and the haze in between; in each of two bounces.
 

@@ -77,7 +77,10 @@ STOCK = [("empty", "stock"), ("flat", "stock"), ("rough", "stock")]
 @pytest.mark.statistical
 @pytest.mark.parametrize(
     ("density", "kind"),
-    small.cases([*((name, "own") for name in DENSITIES), *STOCK], [("thin", "own"), ("dense", "own"), *STOCK[1:]]),
+    small.cases(
+        [*((name, "own") for name in DENSITIES), *STOCK],
+        [*((name, "own") for name in DENSITIES if name not in ("empty", "rough")), *STOCK[1:]],
+    ),
 )
 def test_density_under_a_point_light(density, kind):
     """Empty, half empty and flat (density equal to the majorant) are where other estimators are biased."""
@@ -88,12 +91,15 @@ def test_density_under_a_point_light(density, kind):
     assert_gradient(gradients(seen, GRID, w, 512), truth[..., None], density, 0.05 if density == "dense" else 0.02)
 
 
+LIT = [("rough", "point inside"), ("rough", "sun")]
+
+
 @pytest.mark.statistical
 @pytest.mark.parametrize(
     ("density", "name"),
     small.cases(
         [(d, n) for d in ("empty", "rough") for n in ("point inside", "point at a corner", "spot", "sun")],
-        [("empty", "sun"), ("empty", "spot"), ("rough", "spot"), ("empty", "point at a corner")],
+        [(d, n) for d in ("empty", "rough") for n in ("point inside", "point at a corner", "spot", "sun") if (d, n) not in LIT],
     ),
 )
 def test_density_under_other_emitters(density, name):
@@ -105,7 +111,10 @@ def test_density_under_other_emitters(density, name):
 
 
 @pytest.mark.statistical
-@pytest.mark.parametrize(("density", "albedo"), small.cases([("empty", 0.6), ("rough", 0.6), ("rough", 0.0)], [("rough", 0.0)]))
+@pytest.mark.parametrize(
+    ("density", "albedo"),
+    small.cases([("empty", 0.6), ("rough", 0.6), ("rough", 0.0)], [("empty", 0.6), ("rough", 0.0)]),
+)
 def test_density_under_a_sky(density, albedo):
     """Turned light against the background that is taken away, of nearly the same size."""
     box, m = smoke(as_float32(DENSITIES[density]()), albedo, "own", PLACE, "hg", 0.4)
@@ -159,7 +168,7 @@ LUMINANCE = np.array([0.212671, 0.715160, 0.072169])
 
 
 @pytest.mark.statistical
-@pytest.mark.parametrize("shares", [[1.0], LUMINANCE], ids=["grey", "rgb"])
+@pytest.mark.parametrize("shares", [pytest.param([1.0], id="grey", marks=pytest.mark.slow), pytest.param(LUMINANCE, id="rgb")])
 def test_a_mono_variant(shares):
     """One number a sample: density voxel by voxel, and albedo. An rgb grid counts by its luminance, in derivatives too."""
     mi.set_variant("llvm_ad_mono")
@@ -249,7 +258,9 @@ def test_homogeneous_extinction_and_albedo():
 @pytest.mark.statistical
 @pytest.mark.parametrize(
     ("albedo", "kind"),
-    small.cases([(a, k) for a in (0.0, 0.7, 1.0) for k in small.KINDS], [(0.7, "own"), (1.0, "stock"), (1.0, "own")]),
+    small.cases(
+        [(a, k) for a in (0.0, 0.7, 1.0) for k in small.KINDS], [(0.0, "stock"), (0.7, "own"), (1.0, "stock"), (1.0, "own")]
+    ),
 )
 def test_albedo(albedo, kind):
     """At albedo 0 nothing turns, and the derivative is not 0."""
@@ -427,7 +438,7 @@ def test_extinction_of_microflakes(key):
 
     truth = twin_difference(light, 0.0, 5e-3)
     light(0.0)
-    found = gradients(Pencils(scene, None, None), key, w, 512).reshape(BATCHES, -1) @ v.ravel()
+    found = gradients(Pencils(scene, None, None, {}), key, w, 512).reshape(BATCHES, -1) @ v.ravel()
     assert_gradient(found[:, None], np.array([truth]), key, rounding=1e-2)
 
 
