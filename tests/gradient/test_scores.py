@@ -6,6 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from scattering_scenes import cases
 
 import scenes
 from mivol.scene import plan
@@ -91,8 +92,8 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("passes", [1, 4])
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("passes", [pytest.param(1, marks=pytest.mark.slow), 4])
+@pytest.mark.parametrize("name", cases(CASES, ["depth 1", "rgb, depth 2"]))
 def test_forward_against_reverse(name, passes, monkeypatch):
     """<J v, w> = <v, J^T w> with the same random numbers: no step size at all, whatever the film and the passes."""
     case = dict(CASES[name])
@@ -111,7 +112,7 @@ def test_forward_against_reverse(name, passes, monkeypatch):
     assert np.abs(jv).max() > 0.01
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", cases(CASES, ["depth 1", "depth 2"]))
 def test_reverse_against_finite_differences(name):
     """Central differences with common random numbers; error h^2 f'''/6 plus rounding 1e-7/h."""
     case = dict(CASES[name])
@@ -136,16 +137,19 @@ def test_reverse_against_finite_differences(name):
     assert np.abs((far - near) / (2 * h) - jv).max() <= 4e-3 * np.abs(jv).max()
 
 
+OTHERS = [
+    ("box.interior_medium.scale", 2),
+    ("sky.radiance.value", 1),
+    ("lamp.emitter.radiance.value", 2),
+    ("floor.bsdf.reflectance.value", 2),
+    ("floor.bsdf.reflectance.value", 4),
+    ("sky.radiance.value", 3),
+]
+
+
 @pytest.mark.parametrize(
     ("key", "depth"),
-    [
-        ("box.interior_medium.scale", 2),
-        ("sky.radiance.value", 1),
-        ("lamp.emitter.radiance.value", 2),
-        ("floor.bsdf.reflectance.value", 2),
-        ("floor.bsdf.reflectance.value", 4),
-        ("sky.radiance.value", 3),
-    ],
+    cases(OTHERS, [("floor.bsdf.reflectance.value", 2), ("sky.radiance.value", 1)]),
 )
 def test_other_parameters_against_finite_differences(key, depth):
     """The scale of a medium, the radiance of lamps and the colour of surfaces have their derivatives too."""

@@ -150,7 +150,7 @@ def test_density_that_is_no_number(value, kind):
 
 
 @pytest.mark.statistical
-@pytest.mark.parametrize("kind", small.KINDS)
+@pytest.mark.parametrize("kind", small.cases(small.KINDS, ["stock"]))
 def test_density_that_has_grown(kind):
     """Values that an optimiser has raised tenfold: nothing that was found for the old ones may be used. Hard case 30."""
     values = rough_grid(5, 0.5)

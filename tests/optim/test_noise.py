@@ -156,7 +156,7 @@ def cube_problem(integrator: str = "prbvolpath", size: int = 8, **settings: obje
 
 
 @pytest.mark.statistical
-@pytest.mark.parametrize("pairs", [False, True], ids=["plain", "pairs"])
+@pytest.mark.parametrize("pairs", [pytest.param(False, id="plain", marks=pytest.mark.slow), pytest.param(True, id="pairs")])
 def test_the_renderers_noise_in_the_loss(variant_rgb, pairs: bool) -> None:
     """Rationale: what a fit reports as its loss is the mismatch plus T (1 - T) / n, here as large as the mismatch.
     Expected: the mean of 60 losses is (T - R)^2 plus that, and with pairs without it."""
@@ -168,6 +168,7 @@ def test_the_renderers_noise_in_the_loss(variant_rgb, pairs: bool) -> None:
     assert_same_mean(losses, (T - SEEN) ** 2 + (0 if pairs else bias), what="losses")
 
 
+@pytest.mark.slow
 @pytest.mark.statistical
 def test_the_measured_noise_is_the_variance(variant_rgb) -> None:
     """Its mean over 60 iterations is T (1 - T) / n."""

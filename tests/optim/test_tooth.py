@@ -200,6 +200,7 @@ def test_mirror_pairs_need_half_a_turn():
 # -- The tooth ----------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("variant_rgb")
 def test_tooth_axis_and_held_out_views_small(data_dir):
     """One of the two rows, columns summed by 2. The axis is known: others put it at column 296 of 640, to half a pixel.
