@@ -1,0 +1,153 @@
+"""Choices about scenes, from facts that are made up: which one is taken, and the reason that is given for it."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import pytest
+
+from mivol.scene import choices
+from mivol.scene.facts import MediumFacts
+from mivol.transport.path.settings import Settings
+
+LIT = Settings(max_depth=2)
+GRID = ((10, 20, 30),)
+
+
+def fog(name: str = "fog", **more: object) -> MediumFacts:
+    """Grey fog on a grid, filled by half, that scatters."""
+    facts = {"kind": "k", "boundary": "a box", "extinction": "grey", "resolutions": GRID, "is_scattering": True, "emits": False}
+    return MediumFacts(name, **{**facts, "phase": "p", "occupied": 0.5, "tau_max": None, **more})
+
+
+def needs(*media: MediumFacts, emitters: tuple[str, ...] = ("delta",), **more: object) -> SimpleNamespace:
+    return SimpleNamespace(media=media, emitter_kinds=emitters, surfaces=(), boundaries=(), **more)
+
+
+@pytest.mark.parametrize(
+    ("media", "settings", "what", "why"),
+    [
+        ((), LIT, "none", "no shape bounds a medium"),
+        (
+            (fog(),),
+            LIT,
+            "exact optical depth; one scattering at a distance drawn in proportion to the light it takes, exact",
+            "max_depth is 2",
+        ),
+        (
+            (fog(),),
+            Settings(max_depth=2, deterministic=True, shadows="grid"),
+            "by quadrature, a light grid for shadows",
+            "above 0",
+        ),
+        ((fog(),), Settings(max_depth=1), "exact optical depth; no phase function", "max_depth 1 sees no scattered light"),
+        ((fog(is_scattering=False),), LIT, "exact optical depth; no phase function", "albedo 0"),
+        ((fog(is_scattering=False, unread=True),), LIT, "no albedo look-up", "values cannot be read while dr.freeze records"),
+        (
+            (fog(is_scattering=False, bounded="Ball"), fog("b", is_scattering=False)),
+            LIT,
+            "transmittance of fog by ratio tracking",
+            "albedo 0",
+        ),
+    ],
+)
+def test_transport(media: tuple, settings: Settings, what: str, why: str) -> None:
+    found = choices.choose_transport(needs(*media), settings)
+    assert what in found.choice and why in found.reason
+
+
+@pytest.mark.parametrize(("depth", "lit"), [(0, False), (1, False), (2, True), (3, False), (-1, False)])
+def test_light_is_scattered_once(depth: int, lit: bool) -> None:
+    settings = Settings(max_depth=depth)
+    assert choices.is_lit(needs(fog("a", is_scattering=False), fog()), settings) == lit
+    assert not choices.is_lit(needs(fog(is_scattering=False)), settings)
+
+
+@pytest.mark.parametrize(
+    ("emitters", "media", "found"),
+    [
+        ((), (fog(),), [("directions", "none")]),
+        (("uniform",), (fog(),), [("directions", "one, of the phase function")]),
+        (
+            ("delta", "delta"),
+            (fog(),),
+            [("directions", "one, to one of 2 emitters"), ("where to scatter", "weighed by optical depth")],
+        ),
+        (("area",), (fog(),), [("directions", "two: to an emitter, and of the phase function")]),
+        (("delta", "uniform"), (fog(),), [("directions", "two:"), ("where to scatter", "weighed by optical depth towards")]),
+        (("delta",), (fog(), fog("b")), [("directions", "one, to one of 1"), ("where to scatter", "by the camera's own ray")]),
+        (
+            ("delta",),
+            (fog(resolutions=()),),
+            [("directions", "one, to one of 1"), ("where to scatter", "by the camera's own ray")],
+        ),
+    ],
+)
+def test_lighting(emitters: tuple, media: tuple, found: list) -> None:
+    chosen = choices.choose_lighting(needs(*media, emitters=emitters), LIT)
+    assert len(chosen) == len(found)
+    assert all(c.about == about and c.choice.startswith(choice) for c, (about, choice) in zip(chosen, found, strict=True))
+
+
+def test_lighting_by_quadrature_and_without_light():
+    (only,) = choices.choose_lighting(needs(fog()), Settings(max_depth=2, deterministic=True))
+    assert only.choice.startswith("at two points of each piece")
+    assert choices.choose_lighting(needs(fog(is_scattering=False)), LIT) == []
+
+
+@pytest.mark.parametrize(
+    ("medium", "emitters", "settings", "choice"),
+    [
+        (fog(), ("area",), LIT, "exact"),
+        (fog(resolutions=((200, 200, 200),), occupied=0.5), ("area",), LIT, "estimated"),
+        (fog(resolutions=((200, 200, 199),), occupied=0.5), ("area",), LIT, "exact"),
+        (fog(resolutions=((1, 1, 1), (200, 200, 200)), occupied=0.5), ("area", "delta"), LIT, "estimated"),
+        (fog(resolutions=((200, 200, 200),), occupied=1.0), ("delta",), LIT, "exact"),
+        (fog(unread=True, resolutions=((200, 200, 200),), occupied=1.0), ("area",), LIT, "exact"),
+        (fog(), ("area",), Settings(max_depth=2, shadows="estimated"), "estimated"),
+    ],
+)
+def test_shadows(medium: MediumFacts, emitters: tuple, settings: Settings, choice: str) -> None:
+    """From 300 occupied cells along the axes on they are estimated, but under lamps of one position alone."""
+    assert choices.choose_shadows(medium, needs(medium, emitters=emitters), settings).choice == choice
+
+
+def test_shadows_are_no_question_without_a_grid_or_light():
+    for medium, settings in (
+        (fog(resolutions=()), LIT),
+        (fog(), Settings(max_depth=1)),
+        (fog(), Settings(2, deterministic=True)),
+    ):
+        assert choices.choose_shadows(medium, needs(medium), settings) is None
+
+
+@pytest.mark.parametrize(
+    ("occupied", "emitters", "count"), [(0.5, ("area",), 4), (0.25, ("delta",), 8), (0.24, ("delta",), 2), (0.1, ("area",), 2)]
+)
+def test_points_that_scatter(occupied: float, emitters: tuple, count: int) -> None:
+    medium = fog(occupied=occupied)
+    found, (choice,) = choices.choose_events(needs(medium, emitters=emitters), LIT)
+    assert found == count and choice.choice == f"{count} of a camera ray" and f"{occupied:.0%} of the blocks" in choice.reason
+
+
+def test_one_point_scatters_where_there_is_more_than_one_grid():
+    for media in ((fog(), fog("b")), (fog(resolutions=(*GRID, *GRID)),), (fog(resolutions=()),)):
+        found, (choice,) = choices.choose_events(needs(*media), LIT)
+        assert found == 1 and choice.reason == "there is more than one grid or none"
+    assert choices.choose_events(needs(fog()), Settings(max_depth=2, deterministic=True)) == (1, [])
+    assert choices.choose_events(needs(fog()), Settings(max_depth=1)) == (1, [])
+
+
+def test_channels_emission_skipping_and_tracing():
+    grey, rgb = fog(), fog("smoke", extinction="rgb", emits=True)
+    assert choices.choose_channels(needs(grey)) == choices.Choice("channels", "1", "every extinction is grey")
+    assert choices.choose_channels(needs(grey, rgb)).reason == "rgb extinction in smoke"
+    assert choices.choose_emission(needs(grey)) == [] and choices.choose_emission(needs(grey, rgb))[0].reason == "smoke emit"
+    assert [choices.choose_skipping(grey, skip).choice for skip in (True, False)] == ["skipped", "walked"]
+    scene = needs(grey, rgb)
+    scene.boundaries = (SimpleNamespace(box=1), SimpleNamespace(box=None))
+    assert choices.choose_tracing(scene).reason == "not a box, or not alone in its place: smoke"
+    scene.boundaries = (SimpleNamespace(box=1), SimpleNamespace(box=1))
+    assert choices.choose_tracing(scene).choice == "not traced"
+    scene.surfaces = ("Sphere", "Rectangle", "Sphere")
+    assert choices.choose_tracing(scene).reason == "surfaces may stop a ray: Rectangle, Sphere"
