@@ -106,7 +106,7 @@ def test_scene_sensors(variant_rgb):
 BAD = {
     "unknown rig": ({"rig": "rnig"}, 'did you mean "ring"'),
     "unknown setting": ({"rig": "ring", "elevaton": 3}, 'did you mean "elevation"'),
-    "a rig like none": ({"rig": "wwwww"}, "known are: ring, hemisphere, look_at, sensors."),
+    "a rig like none": ({"rig": "wwwww"}, "known are: ring, hemisphere, look_at, scene\\."),
     "too close": ({"rig": "ring", "distance": 0.5}, "distance"),
     "no views": ({"rig": "hemisphere", "count": 0}, "count"),
     "wrong type": ({"rig": "ring", "count": "eight"}, "count"),

@@ -96,6 +96,7 @@ def test_refusals(xml, tmp_path):
     (tmp_path / "typo.xml").write_text(f'<scene version="3.0.0">{sphere}</scene>')
     cases = [
         ((xml, {"scal": 3}), 'override "scal" is not used by scene.xml; did you mean "scale"'),
+        ((xml, {"qqqq": 3}), 'override "qqqq" is not used by scene.xml; its parameters are: '),
         ((xml, {"sspp": 3}), 'did you mean "spp"'),
         ((tmp_path / "none.xml",), "there is no scene file"),
         ((tmp_path / "sphere.xml",), "describes a Shape, not a scene"),

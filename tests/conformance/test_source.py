@@ -34,3 +34,28 @@ def test_damaged_streams_are_refused() -> None:
         source.inflate(b"nothing of that kind", "gzip", 100, PATH)
     with pytest.raises(MivolError):
         source.inflate(gzip.compress(DATA)[:-20], "gzip", len(DATA), PATH)
+
+
+def test_the_nearest_name_is_offered_where_one_is_near(tmp_path: Path) -> None:
+    (tmp_path / "density.nrrd").write_bytes(b"")
+    for name, way_out in {
+        "densty.nrrd": "did you mean density.nrrd",
+        "qqqq": "check the spelling and the folder",
+        "no/density.nrrd": "the folder .*no does not exist either",
+    }.items():
+        with pytest.raises(MivolError, match=way_out):
+            source.read_bytes(tmp_path / name)
+    names = ["density", "temperature"]
+    assert source.choose(PATH, "density", names) == "density" and source.choose(PATH, None, ["one"]) == "one"
+    for asked, way_out in {
+        "densty": "did you mean 'density'",
+        "qqqq": "choose one of those",
+        None: r"2 arrays \('density', 'temperature'\).*dataset=",
+    }.items():
+        with pytest.raises(MivolError, match=way_out):
+            source.choose(PATH, asked, names)
+    with pytest.raises(MivolError, match="0 arrays"):
+        source.choose(PATH, None, [])
+    source.no_dataset(PATH, None)
+    with pytest.raises(MivolError, match="leave it out"):
+        source.no_dataset(PATH, "density")
