@@ -13,7 +13,7 @@ from scattering_scenes import close_up
 from scipy import stats
 
 from mivol.scene import depth_two
-from mivol.scene.depth_two import ALBEDOS, TABLES, TAUS, depth_two_error, draw_lines, scattering_depth
+from mivol.scene.depth_two import ALBEDOS, TABLES, TAUS, depth_two_error, draw_lines, mean_cosine, scattering_depth
 from mivol.scene.explain import explain
 from mivol.transport.media.box import Box
 from mivol.transport.media.read_medium import view_medium
@@ -186,3 +186,11 @@ def test_the_densest_channel_and_nothing(variant_rgb) -> None:
     grey = scattering_depth(view_of(medium("homogeneous", 0.9, 0.5)), Box(np.eye(4)))
     assert rgb == pytest.approx(grey, rel=1e-5)
     assert scattering_depth(view_of(medium("homogeneous", 0.0, 0.5)), Box(np.eye(4))) == 0.0
+
+
+@pytest.mark.parametrize("weight", [0.0, 0.25, 1.0])
+def test_mean_cosine_of_a_blend(variant_rgb: str, weight: float) -> None:
+    """(1 - w) 0.8 - w 0.6, to the promise of 1 / sqrt(n)."""
+    parts = {"first": {"type": "hg", "g": 0.8}, "second": {"type": "hg", "g": -0.6}}
+    phase = mi.load_dict({"type": "blendphase", "weight": weight, **parts})
+    assert mean_cosine(phase) == pytest.approx((1 - weight) * 0.8 - weight * 0.6, abs=1 / 64)

@@ -15,8 +15,9 @@ from mivol.scene.explain import explain
 from mivol.scene.needs import find_needs
 from mivol.scene.nesting import nesting_fault
 from mivol.scene.plan import make_plan
+from mivol.scene.survey import survey_scene
 from mivol.transport.path.settings import Settings
-from scenes import ball_of, box_of, camera, grid_volume, medium, refused, sky
+from scenes import ball_of, box_of, camera, film, grid_volume, medium, refused, sky
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
 
@@ -394,3 +395,30 @@ def test_a_pass_is_shorter_where_rays_cross_more_cells():
     many = make_plan(find_needs(scene, scene.sensors()[0]), Settings(max_depth=1)).pass_rays
     backend = mi.variant().split("_")[0]
     assert few == plan.PASS_STEPS[backend] // 4002 < many == plan.PASS_RAYS[backend]
+
+
+def meter(z: float) -> dict:
+    """A sensor that is a surface, and has no near plane."""
+    place = mi.ScalarTransform4f().translate([0, 0, z]).scale(0.1)
+    return {"type": "rectangle", "to_world": place, "meter": {"type": "irradiancemeter", "film": film(1, 1)}}
+
+
+SENSORS = {
+    "above, far": (lambda: camera((0, 0, 1.5), (0, 0, 0)) | {"near_clip": 0.1}, False),
+    "above, near": (lambda: camera((0, 0, 1.5), (0, 0, 0)) | {"near_clip": 0.15}, True),
+    "below, far": (lambda: camera((0, 0, -1.5), (0, 0, 0)) | {"near_clip": 0.1}, False),
+    "below, near": (lambda: camera((0, 0, -1.5), (0, 0, 0)) | {"near_clip": 0.15}, True),
+    "at infinity": (lambda: {"type": "distant", "film": film(1, 1)}, False),
+    "a surface above": (lambda: meter(1.5), False),
+    "a surface within": (lambda: meter(0.5), True),
+}
+
+
+@pytest.mark.parametrize("name", SENSORS)
+def test_a_camera_is_inside_where_its_rays_may_begin_in_a_boundary(name: str) -> None:
+    """A ball of radius 1, which is traced: rays begin at the near plane, up to four times its distance to the side."""
+    make, inside = SENSORS[name]
+    fog = medium("homogeneous", 1.0)
+    for shape, expected in ((ball_of(fog, (0, 0, 0), 1.0), inside), (box_of(fog, PLACE), False)):
+        scene = mi.load_dict({"type": "scene", "shape": shape, "sensor": make()})
+        assert find_needs(scene, scene.sensors()[0], survey_scene(scene)).camera_inside == expected

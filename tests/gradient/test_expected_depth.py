@@ -1,13 +1,16 @@
-"""Derivatives of expected depth in one cell."""
+"""Derivatives of expected depth, in one cell and along a ray."""
 
 from __future__ import annotations
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from aov_gradients import VALUE, mivol, vjp
 
 from mivol.transport.line_integrals import expected_depth
 from mivol.transport.line_integrals.integrand import CellIntegral
+from scenes import box_of, medium, pencil
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
 
@@ -30,3 +33,20 @@ def test_derivatives_of_a_cell(size):
         for slope, f in ((exact.dtau[q], "tau"), (exact.dN[q], "N")):
             difference = (np.array(getattr(up, f)) - np.array(getattr(down, f))) / (2 * h)
             assert np.array(slope) == pytest.approx(difference, abs=2e-5 * np.abs(difference).max())
+
+
+@pytest.mark.parametrize("sigma", [0.7, 4.0])
+def test_derivatives_of_a_slab(sigma: float) -> None:
+    """The depth behind the entry is 1/s - 1/(e^s - 1): forward and in reverse -1/s^2 + e^s/(e^s - 1)^2."""
+    box = box_of(medium("homogeneous", sigma), np.eye(4))
+    scene = mi.load_dict({"type": "scene", "box": box, "sensor": pencil([0.3, 0.4, -1], [0, 0, 1])})
+    slope = -1 / sigma**2 + np.exp(sigma) / np.expm1(sigma) ** 2
+    key, integrator = f"box.{VALUE}", mivol("depth")
+    found = vjp(scene, integrator, [key], np.ones((1, 1, 1)), 1)[key]
+    # Differences of numbers of size 1, each of some roundings.
+    assert found.sum() == pytest.approx(slope, abs=32 * 2.0**-23)
+    params = mi.traverse(scene)
+    dr.enable_grad(params[key])
+    dr.set_grad(params[key], 0.5)
+    tangent = np.array(integrator.render_forward(scene, params, seed=1, spp=1))
+    assert tangent[0, 0, 3] == pytest.approx(0.5 * slope, abs=32 * 2.0**-23)
