@@ -29,9 +29,10 @@ def build_media(scene: mi.Scene, needs: Needs, plan: Plan, survey: SceneSurvey) 
                 part.lattice.empty_distances = read_empty_distances(part, survey, boundary.name)
             # A grey variant sees the mean of an rgb extinction, and its transmittance is no mean.
             mixes = mi.is_monochromatic and part.channels > 1
-            if tracks and part.lattice is not None and part.activation is None and not mixes:
+            flies = plan.segment == "free_flight" and part.channels == 1
+            if (tracks or flies) and part.lattice is not None and part.activation is None and not mixes:
                 part.lattice.block_ranges = read_block_ranges(part, survey)
-        bodies.append(Body(view, boundary.box))
+        bodies.append(Body(view, boundary.box, tracks))
     return SceneMedia(
         scene,
         bodies,
@@ -56,7 +57,9 @@ def build_estimators(
             if settings.shadows == "grid":
                 choice.transmittance_grid = build_transmittance_grid(media, direct.emitters)
     lights_surfaces = bool(needs.surfaces) and settings.scatterings >= 1
-    return Estimators(direct, SEGMENT_ESTIMATORS[plan.segment].make(choice), lights_surfaces)
+    segment = SEGMENT_ESTIMATORS[plan.segment].make(choice)
+    lights_media = segment.ends_in_media and any(kind != "uniform" for kind in needs.emitter_kinds)
+    return Estimators(direct, segment, lights_surfaces, lights_media)
 
 
 def _find_visibility(

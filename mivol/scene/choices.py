@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 from mivol.scene.facts import MediumFacts, Needs
 from mivol.transport.media.body import flight_parts
-from mivol.transport.path.estimators import MOST_SCATTERINGS
 from mivol.transport.path.settings import Settings
 
 __all__ = [
@@ -15,6 +15,7 @@ __all__ = [
     "choose_channels",
     "choose_emission",
     "choose_events",
+    "choose_flights",
     "choose_lighting",
     "choose_shadows",
     "choose_skipping",
@@ -61,16 +62,20 @@ def shares_cells(needs: Needs) -> bool:
 def is_lit(needs: Needs, settings: Settings) -> bool:
     """Whether media scatter light to the camera.
 
-    Media whose values a recording cannot read count as scattering where an estimator would follow the light; at more
-    scatterings than that they were promised to absorb only (:func:`mivol.scene.refusals.refuse_scattering`).
+    Media whose values a recording cannot read count as scattering, unless an earlier render has read them.
     """
-    return 1 <= settings.scatterings <= MOST_SCATTERINGS and any(m.is_scattering for m in needs.media)
+    return settings.scatterings >= 1 and any(m.is_scattering for m in needs.media)
 
 
-def choose_transport(needs: Needs, settings: Settings) -> Choice:
+def choose_transport(needs: Needs, settings: Settings, segment: str) -> Choice:
     """How light passes media: what is computed of it."""
     if not needs.media:
         return Choice("media", "none", "no shape bounds a medium")
+    if segment == "free_flight":
+        often = (
+            "any number of scatterings" if math.isinf(settings.scatterings) else f"at most {settings.scatterings} scatterings"
+        )
+        return Choice("media", f"free flights from collision to collision; {often}", _why_free_flights(needs, settings))
     if is_lit(needs, settings):
         where = "by quadrature" if settings.deterministic else "at a distance drawn in proportion to the light it takes"
         shadows = "a light grid for shadows" if settings.shadows == "grid" else "exact shadow rays"
@@ -85,15 +90,27 @@ def choose_transport(needs: Needs, settings: Settings) -> Choice:
     return Choice("media", what, why)
 
 
-def choose_emission(needs: Needs) -> list[Choice]:
+def _why_free_flights(needs: Needs, settings: Settings) -> str:
+    """What a single scattering on straight segments would leave out."""
+    reasons = [f"{m.name} emits beside scattering" for m in needs.media if m.emits]
+    reasons += [f"{m.name} is bounded" for m in needs.media if m.bounded]
+    reasons += [f"{name} refracts" for name in needs.refractive]
+    if settings.scatterings > 1:
+        reasons.insert(0, f"an albedo is above 0 and max_depth is {settings.max_depth}")
+    return "; ".join(reasons)
+
+
+def choose_emission(needs: Needs, segment: str) -> list[Choice]:
     """How emitted light is summed."""
     names = [m.name for m in needs.media if m.emits]
     if not names:
         return []
+    if segment == "free_flight":
+        return [Choice("emission", "at one point of each flight", f"{', '.join(names)} emit, and light scatters")]
     return [Choice("emission", "two points a cell, swept from the far end", f"{', '.join(names)} emit")]
 
 
-def choose_lighting(needs: Needs, settings: Settings) -> list[Choice]:
+def choose_lighting(needs: Needs, settings: Settings, segment: str) -> list[Choice]:
     """How scattered light is found."""
     if not is_lit(needs, settings):
         return []
@@ -104,6 +121,13 @@ def choose_lighting(needs: Needs, settings: Settings) -> list[Choice]:
     if settings.deterministic:
         where = "at two points of each piece of a cell, from every emitter"
         return [Choice("where to scatter", where, "deterministic was asked for")]
+    if segment == "free_flight":
+        if not drawn:
+            return [
+                Choice("directions", "one, of the phase function", "light is the same from everywhere: what escapes finds it")
+            ]
+        what = "to an emitter from each collision, and of the phase function onwards"
+        return [Choice("directions", what, "the power heuristic weighs emitters that both can find")]
     if not drawn:
         choices = [Choice("directions", "one, of the phase function", "light is the same from everywhere")]
     elif not met:
@@ -143,6 +167,22 @@ def choose_skipping(medium: MediumFacts, skip: bool) -> Choice:
     return Choice(f"empty space in {medium.name}", "skipped" if skip else "walked", share)
 
 
+def choose_flights(medium: MediumFacts, segment: str) -> Choice | None:
+    """How flights through a medium are drawn in pictures; None where there are none."""
+    if segment != "free_flight":
+        return None
+    about = f"flights in {medium.name}"
+    if medium.bounded:
+        return Choice(about, "delta tracking", "a majorant is known, and no optical depth")
+    if not medium.resolutions:
+        return Choice(about, "exact", "its extinction is a constant")
+    if medium.extinction == "rgb":
+        return Choice(about, "exact, by one channel each", "rgb extinction: the optical depth of all channels weighs them")
+    if medium.unread:
+        return Choice(about, "exact", "values cannot be read while dr.freeze records")
+    return Choice(about, "delta tracking", "majorants of blocks are known; gradients walk every cell")
+
+
 def choose_shadows(medium: MediumFacts, needs: Needs, settings: Settings) -> Choice | None:
     """Whether shadow rays walk every cell of a medium or look here and there; None where the question does not arise."""
     if not medium.resolutions or not is_lit(needs, settings) or settings.deterministic:
@@ -160,9 +200,9 @@ def choose_shadows(medium: MediumFacts, needs: Needs, settings: Settings) -> Cho
     return Choice(about, "estimated", f"{size}: unbiased look-ups cost less; gradients walk every cell")
 
 
-def choose_events(needs: Needs, settings: Settings) -> tuple[int, list[Choice]]:
+def choose_events(needs: Needs, settings: Settings, segment: str) -> tuple[int, list[Choice]]:
     """How many points of a camera ray scatter."""
-    if not is_lit(needs, settings) or settings.deterministic:
+    if segment != "single_scattering":
         return 1, []
     about = "points that scatter"
     if len(needs.media) != 1 or len(needs.media[0].resolutions) != 1:

@@ -23,7 +23,7 @@ from mivol.transport.estimators.emitters import SceneEmitters
 from mivol.transport.estimators.transmittance_grid import build_transmittance_grid, measure_transmittance_bias
 from mivol.transport.media.box import Box
 from mivol.transport.media.read_medium import traverse_medium
-from mivol.transport.path.estimators import MOST_SCATTERINGS, SEGMENT_ESTIMATORS
+from mivol.transport.path.estimators import SEGMENT_ESTIMATORS
 from mivol.transport.path.settings import Settings
 
 __all__ = ["explain", "settings_of"]
@@ -77,7 +77,7 @@ def explain(scene: mi.Scene | str | Path, max_depth: int | None = None, sensor: 
     width = max(len(c.about) for c in plan.choices)
     lines += [f"  {c.about:<{width}}  {c.choice}\n  {'':<{width}}    because {c.reason}" for c in plan.choices]
     lines += [f"  table     {text}" for text in _tables(needs)]
-    if settings.scatterings == MOST_SCATTERINGS:
+    if settings.scatterings == 1:
         lines += [f"  model     {text}" for text in _depth_two(loaded, needs)]
         lines += [f"  shadows   {text}" for text in _transmittance_grid(loaded, needs, plan, settings)]
     lines += ["references", *(f"  {source}" for source in citations(SEGMENT_ESTIMATORS[plan.segment].cites))]

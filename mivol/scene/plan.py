@@ -16,6 +16,7 @@ from mivol.scene.choices import (
     choose_channels,
     choose_emission,
     choose_events,
+    choose_flights,
     choose_lighting,
     choose_shadows,
     choose_skipping,
@@ -29,7 +30,6 @@ from mivol.scene.refusals import (
     refuse_emission,
     refuse_places,
     refuse_quadrature,
-    refuse_refraction,
     refuse_scattering,
 )
 from mivol.transport.media.grid_integral import PACKED_LIMIT, gradient_bytes
@@ -69,28 +69,29 @@ def make_plan(needs: Needs, settings: Settings, aovs: tuple[str, ...] = ()) -> P
     """Choose from the facts.
 
     Raises:
-        MivolError: what is asked for is not there yet (a medium that scatters, at depth 3 or more; derivatives of shapes),
-            or a gradient step would not fit into memory.
+        MivolError: what is asked for is not there (quadrature of several scatterings, derivatives of shapes), or a gradient
+            step would not fit into memory.
     """
     refuse_scattering(needs, settings)
-    refuse_refraction(needs, settings)
     refuse_emission(needs, settings)
     refuse_quadrature(needs, settings)
     refuse_places(needs)
     refuse_bounded(needs, settings, aovs)
+    segment = _segment(needs, settings)
     choices = [
-        choose_transport(needs, settings),
-        *choose_emission(needs),
-        *choose_lighting(needs, settings),
+        choose_transport(needs, settings, segment),
+        *choose_emission(needs, segment),
+        *choose_lighting(needs, settings, segment),
         choose_tracing(needs),
         choose_channels(needs),
     ]
     skips = tuple(bool(m.resolutions) and m.occupied < SKIP_BELOW for m in needs.media)
     choices += [choose_skipping(m, skip) for m, skip in zip(needs.media, skips, strict=True) if m.resolutions]
+    choices += [choice for m in needs.media if (choice := choose_flights(m, segment)) is not None]
     shadows = [choose_shadows(m, needs, settings) for m in needs.media]
     tracks = tuple(choice is not None and choice.choice == "estimated" for choice in shadows)
     choices += [choice for choice in shadows if choice is not None]
-    events, why = choose_events(needs, settings)
+    events, why = choose_events(needs, settings, segment)
     choices += why
     pass_rays = _pass_rays(needs)
     passes = -(-needs.film_samples // pass_rays)
@@ -99,14 +100,17 @@ def make_plan(needs: Needs, settings: Settings, aovs: tuple[str, ...] = ()) -> P
     )
     memory, choice = _gradient(needs)
     choices.append(choice)
-    return Plan(tuple(choices), skips, tracks, _segment(needs, settings), events, pass_rays, memory)
+    return Plan(tuple(choices), skips, tracks, segment, events, pass_rays, memory)
 
 
 def _segment(needs: Needs, settings: Settings) -> str:
     """Name of the estimator of what media add along a segment; what no estimator answers has been refused."""
-    scatters = bool(needs.emitter_kinds) and is_lit(needs, settings)
     emits, is_bounded = any(m.emits for m in needs.media), any(m.bounded for m in needs.media)
-    return choose_segment_estimator(SegmentQuestion(scatters, emits, settings.deterministic, is_bounded))
+    scatters = (emits or bool(needs.emitter_kinds)) and is_lit(needs, settings)
+    question = SegmentQuestion(
+        scatters, emits, settings.deterministic, is_bounded, settings.scatterings, bool(needs.refractive)
+    )
+    return choose_segment_estimator(question)
 
 
 def _pass_rays(needs: Needs) -> int:

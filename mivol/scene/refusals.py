@@ -13,7 +13,6 @@ from mivol.scene.facts import Needs
 from mivol.transport.line_integrals.aovs import AOVS
 from mivol.transport.media.medium_view import MediumView
 from mivol.transport.media.summed_extinction import share_cells
-from mivol.transport.path.estimators import MOST_SCATTERINGS
 from mivol.transport.path.settings import Settings
 
 __all__ = [
@@ -22,7 +21,6 @@ __all__ = [
     "refuse_emission",
     "refuse_places",
     "refuse_quadrature",
-    "refuse_refraction",
     "refuse_scattering",
 ]
 
@@ -48,32 +46,19 @@ def check_aovs(names: str) -> tuple[str, ...]:
 
 
 def refuse_scattering(needs: Needs, settings: Settings) -> None:
-    """Refuse media that scatter more often than an estimator follows."""
-    for medium in needs.media:
-        if medium.is_scattering and not medium.unread and settings.scatterings > MOST_SCATTERINGS:
-            raise MivolError(
-                f"the medium in {medium.name} scatters (its albedo is above 0) and max_depth is {settings.max_depth}; mivol "
-                "renders one scattering so far: set max_depth to 2, to 1 (what is seen through the medium), or the albedo to 0."
-            )
-
-
-def refuse_refraction(needs: Needs, settings: Settings) -> None:
-    """Refuse boundaries that bend shadow rays."""
-    if needs.refractive and is_lit(needs, settings):
+    """Refuse what is not there yet of light that scatters more than once."""
+    if not is_lit(needs, settings):
+        return
+    medium = next(m.name for m in needs.media if m.is_scattering)
+    if settings.deterministic and settings.scatterings > 1:
         raise MivolError(
-            f"the boundary {needs.refractive[0]} refracts and its scene has a medium that scatters; no straight shadow ray "
-            "reaches an emitter through it: make the boundary's BSDF null, set max_depth to 1, or the albedo to 0."
+            f"deterministic is set, the medium in {medium} scatters and max_depth is {settings.max_depth}; quadrature is for "
+            "one scattering: set max_depth to 2, or leave deterministic out."
         )
 
 
 def refuse_emission(needs: Needs, settings: Settings) -> None:
     """Refuse emission beside scattering, and emission that varies faster than the cells that are summed."""
-    emitting = [m.name for m in needs.media if m.emits]
-    if emitting and is_lit(needs, settings):
-        raise MivolError(
-            f"the medium in {emitting[0]} emits and a medium of its scene scatters at max_depth 2; the light of one that is "
-            "scattered by the other is not there yet: set max_depth to 1, or the albedo to 0."
-        )
     for facts, view in zip(needs.media, needs.views, strict=True):
         if isinstance(view.emission_density, mi.Volume) and not share_cells(view.walked_lattice, view.emission_lattice):
             raise MivolError(
@@ -149,7 +134,6 @@ def refuse_bounded(needs: Needs, settings: Settings, aovs: tuple[str, ...]) -> N
     reasons = [
         (bool(aovs), f"aovs asks for {', '.join(aovs)}", "leave aovs out"),
         (settings.deterministic, "deterministic is set", "leave it out, for transmittance is estimated"),
-        (is_lit(needs, settings), "a medium of its scene scatters at max_depth 2", "set max_depth to 1, or the albedo to 0"),
         (any(m.emits for m in needs.media), "a medium of its scene emits", "take the emission out"),
         (any(v.microflakes is not None for v in needs.views), "a medium of its scene has sggx microflakes", "take them out"),
         (bool(moved), f"the derivative of {', '.join(moved)} was asked for", "take finite differences"),

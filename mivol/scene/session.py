@@ -22,6 +22,7 @@ from mivol.scene.survey import SceneSurvey, survey_scene
 from mivol.transport.line_integrals.aovs import integrate_aovs, jvp_aovs, vjp_aovs
 from mivol.transport.path.estimators import Estimators
 from mivol.transport.path.film import CameraRays, RenderSamples, adjoint_rays, record
+from mivol.transport.path.level import prepare_derivatives
 from mivol.transport.path.scores import Primal, Replay, Tangent
 from mivol.transport.path.settings import Settings
 from mivol.transport.path.walk import is_straight, walk_path
@@ -143,14 +144,14 @@ class Session:
         return score.L, alpha, integrate_aovs(estimators.media, rays.ray, self.aovs)
 
     def _tangent(self, estimators: Estimators, rays: CameraRays) -> tuple:
-        estimators.prepare_derivatives(rays.ray)
+        prepare_derivatives(estimators, self.settings, rays.ray)
         black = _black(rays.ray)
         score = Tangent(black, black)
         score, _ = walk_path(estimators, self.settings, rays.sampler, rays.ray, score, strata=rays.strata)
         return score.dL, dr.zeros(mi.Float, dr.width(black)), jvp_aovs(estimators.media, rays.ray, self.aovs)
 
     def _replay(self, estimators: Estimators, rays: CameraRays, dL: mi.Spectrum, daovs: list[mi.Float]) -> None:
-        estimators.prepare_derivatives(rays.ray)
+        prepare_derivatives(estimators, self.settings, rays.ray)
         again, L = rays.sampler.clone(), None
         if not is_straight(estimators, self.settings):
             known = Primal(_black(rays.ray))

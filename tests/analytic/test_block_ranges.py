@@ -6,7 +6,6 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mivol.transport.estimators import ratio_tracking
 from mivol.transport.traversal.block_ranges import find_block_ranges
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
@@ -16,7 +15,7 @@ pytestmark = pytest.mark.usefixtures("variant_rgb")
 def test_blocks_hold_all_nodes_of_their_cells(shape):
     values = np.random.default_rng(1).uniform(0, 5, (*shape, 3)).astype(np.float32)
     blocks = find_block_ranges(mi.TensorXf(values))
-    edge = 1 << ratio_tracking.BLOCK_SHIFT
+    edge = 1 << blocks.shift
     assert blocks.res == tuple(-(-(n + 1) // edge) for n in shape)
     table = np.array(blocks.table).reshape(*blocks.res, 4)
     for index in np.ndindex(*blocks.res):

@@ -29,7 +29,7 @@ from mivol.transport.estimators.moving_emitters import follow_emitter, shadow_of
 from mivol.transport.estimators.multiple_importance import power_heuristic
 from mivol.transport.estimators.phase_sampling import sample_phase
 from mivol.transport.estimators.shadow_rays import light_through, shadow_ray
-from mivol.transport.estimators.vertex import MediumVertex, SurfaceVertex, Vertex
+from mivol.transport.estimators.vertex import MediumVertex, Vertex
 from mivol.transport.media.channels import tangent_of
 from mivol.transport.media.optical_depth import jvp_optical_depth, vjp_optical_depth
 from mivol.transport.media.ray_intervals import RaySegment
@@ -90,17 +90,18 @@ class DirectLighting:
         """The emitters of the scene, read when media first scatter their light; at surfaces Mitsuba chooses the emitter."""
         return SceneEmitters(self.media.scene)
 
-    def at_surface(
-        self, vertex: SurfaceVertex, u: mi.Point2f, attached: bool, active: mi.Bool, chance: mi.Float | None = None
+    def at_vertex(
+        self, vertex: Vertex, u: mi.Point2f, attached: bool, active: mi.Bool, chance: mi.Float | None = None
     ) -> DirectSample:
-        """Estimate direct light at a surface by one emitter sample; the path's next segment is the BSDF sample.
+        """Estimate direct light at a vertex of a path by one emitter sample; the path's next segment is the other sample.
 
         Args:
             vertex: the point.
             u: two numbers in [0, 1).
-            attached: keep the derivatives of BSDF and emitter.
+            attached: keep the derivatives of BSDF or phase function, and emitter.
             active: lanes to estimate.
-            chance: a number in [0, 1) that estimates the shadow where media are bounded.
+            chance: a number in [0, 1) that estimates the shadow, where media are bounded or their block ranges are known;
+                None for an exact one.
 
         Bias: none. Variance: that of one emitter sample. Cost: one shadow ray.
         """
@@ -177,7 +178,7 @@ class DirectLighting:
     ) -> DirectSample:
         """Light from a direction that was sampled from the phase function."""
         emitters, mei = self.emitters, vertex.interaction
-        wo, weight, pdf = sample_phase(self.media, vertex.phase, mei, samples, active)
+        wo, weight, pdf = sample_phase(self.media, mei, samples.component, samples.direction, active)
         on = active & (pdf > 0)
         ray = mi.Ray3f(mei.p, wo, dr.inf, mei.time, mei.wavelengths)
         end, _, light = light_through(self.media, ray, mei.medium, on, rng)

@@ -18,16 +18,12 @@ from mivol.numerics import one_minus_exp
 from mivol.transport.estimators.distance_reservoir import Candidate, DistanceProposal, inverse
 from mivol.transport.media.body import Body
 from mivol.transport.media.scene_media import SceneMedia
+from mivol.transport.traversal.cubic import cubic_at, cubic_integral, cubic_through, invert_cubic_integral
 from mivol.transport.traversal.grid_walk import box_nodes, read_nodes
-from mivol.transport.traversal.lattice import clip
+from mivol.transport.traversal.lattice import piece_points
 from mivol.transport.traversal.random_numbers import draw_pcg32
 
 __all__ = ["MediumEvent", "sample_distance"]
-
-
-NEWTON_STEPS = 8
-"""Each step doubles the number of right digits. Where the extinction vanishes at an end of the piece the steps are bisections;
-these leave an error of 2^-8 of a cell in a place that holds hardly any light."""
 
 
 @dataclass
@@ -68,7 +64,7 @@ def sample_distance(
     on = active & (candidate.weight > 0)
     dt = dr.select(on, candidate.dt, 1)
     curve = _curve(media, ray, candidate, on)
-    whole = [_partial(c, dt, 1) for c in curve]
+    whole = [cubic_integral(c, dt, 1) for c in curve]
     front = [dr.exp(-f) for f in candidate.front]
 
     # -- The technique: free flight, or uniform (in angle where the emitter is finite, in length for probes) -----------
@@ -84,8 +80,8 @@ def sample_distance(
     x = dr.select(collides, _invert(curve, whole, front, dt, u), even * dr.rcp(dt))
 
     # -- The density of their mixture ------------------------------------------------------------------------------------
-    sigma = [dr.maximum(_at(c, x), 0) for c in curve]
-    tau = [_partial(c, dt, x) for c in curve]
+    sigma = [dr.maximum(cubic_at(c, x), 0) for c in curve]
+    tau = [cubic_integral(c, dt, x) for c in curve]
     taken = sum((f * one_minus_exp(w) for f, w in zip(front, whole, strict=True)), mi.Float(0))
     hits = sum((f * s * dr.exp(-t) for f, s, t in zip(front, sigma, tau, strict=True)), mi.Float(0))
     pdf = by_collision * dr.select(taken > 0, hits / dr.select(taken > 0, taken, 1), 0)
@@ -108,7 +104,7 @@ def _curve(media: SceneMedia, ray: mi.Ray3f, candidate: Candidate, on: mi.Bool) 
         here = on & (candidate.body == index)
         own = _values_along(media, body, ray, candidate, here)
         values = [[dr.select(here, n, v) for n, v in zip(new, old, strict=True)] for new, old in zip(own, values, strict=True)]
-    return [_cubic(*v) for v in values]
+    return [cubic_through(*v) for v in values]
 
 
 def _values_along(media: SceneMedia, body: Body, ray: mi.Ray3f, candidate: Candidate, on: mi.Bool) -> list[list[mi.Float]]:
@@ -119,13 +115,7 @@ def _values_along(media: SceneMedia, body: Body, ray: mi.Ray3f, candidate: Candi
     if lattice is None:
         return _by_point(media, constant)
     start = mi.Float64(candidate.begin) + mi.Float64(candidate.s)
-    segment = clip(lattice, ray.o, ray.d, start, start + mi.Float64(candidate.dt))
-    # The cell is that of the middle of the piece: its ends lie in faces of the cell, and rounding may put them on either side.
-    along = segment.d * segment.length
-    shift = mi.Vector3i(dr.floor(segment.frac + 0.5 * along))
-    cell, frac = segment.cell + shift, segment.frac - mi.Vector3f(shift)
-    points = [dr.clip(dr.fma(along, k / 3, frac), 0, 1) for k in range(4)]
-    inside = on & (segment.length > 0)
+    cell, points, inside = piece_points(lattice, ray, start, candidate.dt, on)
     nodes = box_nodes(cell, dr.full(dr.mask_t(mi.Vector3f), True), lattice.res)
     grid = extinction.along(read_nodes(extinction.reads, nodes, inside), points)
     own = [[dr.select(inside, g, k) for g, k in zip(*row, strict=True)] for row in zip(grid, constant, strict=True)]
@@ -135,25 +125,6 @@ def _values_along(media: SceneMedia, body: Body, ray: mi.Ray3f, candidate: Candi
 def _by_point(media: SceneMedia, values: list[list[mi.Float]]) -> list[list[mi.Float]]:
     """[channel of the scene][point], from [channel of the medium][point]."""
     return [list(row) for row in zip(*(media.rows([v[k] for v in values]) for k in range(4)), strict=True)]
-
-
-def _cubic(f0: mi.Float, f1: mi.Float, f2: mi.Float, f3: mi.Float) -> list[mi.Float]:
-    """Coefficients of the cubic through values at 0, 1/3, 2/3, 1 (Lagrange)."""
-    return [
-        f0,
-        -5.5 * f0 + 9 * f1 - 4.5 * f2 + f3,
-        9 * f0 - 22.5 * f1 + 18 * f2 - 4.5 * f3,
-        4.5 * (f3 - f0) + 13.5 * (f1 - f2),
-    ]
-
-
-def _at(c: list[mi.Float], x: mi.Float) -> mi.Float:
-    return dr.fma(x, dr.fma(x, dr.fma(x, c[3], c[2]), c[1]), c[0])
-
-
-def _partial(c: list[mi.Float], dt: mi.Float, x: mi.Float) -> mi.Float:
-    """Optical depth of a piece from 0 to x."""
-    return dr.maximum(dt * x * dr.fma(x, dr.fma(x, dr.fma(x, 0.25 * c[3], c[2] / 3), 0.5 * c[1]), c[0]), 0)
 
 
 def _invert(curve: list, whole: list[mi.Float], front: list[mi.Float], dt: mi.Float, u: mi.Point2f) -> mi.Float:
@@ -171,15 +142,7 @@ def _invert(curve: list, whole: list[mi.Float], front: list[mi.Float], dt: mi.Fl
             c = [dr.select(later, a, b) for a, b in zip(curve[k], c, strict=True)]
             tau = dr.select(later, whole[k], tau)
     goal = _log_share(u.y, tau)
-    low, high, x = mi.Float(0), mi.Float(1), dr.clip(goal / dr.maximum(tau, 1e-30), 0, 1)
-    for _ in range(NEWTON_STEPS):
-        error = _partial(c, dt, x) - goal
-        low, high = dr.select(error < 0, x, low), dr.select(error > 0, x, high)
-        step = x - error / dr.maximum(dt * _at(c, x), 1e-30)
-        # The ends of the bracket count as inside: once x is at the root, it is one of the ends, and a step of 0 must keep it
-        # there.
-        x = dr.select((step >= low) & (step <= high), step, 0.5 * (low + high))
-    return x
+    return invert_cubic_integral(c, dt, goal, tau)
 
 
 def _scramble(u: mi.Point2f) -> mi.Float:

@@ -6,14 +6,17 @@ import drjit as dr
 import mitsuba as mi
 
 from mivol.phase.turn import INV_FOUR_PI
-from mivol.transport.estimators.event_samples import EventSamples
 from mivol.transport.media.scene_media import SceneMedia
 
 __all__ = ["phase_context", "phase_pdf", "sample_phase"]
 
 
 def sample_phase(
-    media: SceneMedia, phase: mi.PhaseFunctionPtr, mei: mi.MediumInteraction3f, samples: EventSamples, active: mi.Bool
+    media: SceneMedia,
+    mei: mi.MediumInteraction3f,
+    component: mi.Float,
+    direction: mi.Point2f,
+    active: mi.Bool,
 ) -> tuple[mi.Vector3f, mi.Spectrum, mi.Float]:
     """Sample a direction from a phase function.
 
@@ -22,18 +25,18 @@ def sample_phase(
 
     Args:
         media: of the scene.
-        phase: the phase function of each lane.
-        mei: the point, and the direction towards the camera.
-        samples: random numbers.
+        mei: the point, its medium, and the direction towards the camera.
+        component, direction: three numbers in [0, 1), of which the first chooses a component of the phase function.
         active: lanes to sample.
 
     Returns:
         The direction, value over density [1], and density [1/sr].
     """
-    wo, weight, pdf = phase.sample(phase_context(), mei, samples.component, samples.direction, active)
+    phase = mei.medium.phase_function()
+    wo, weight, pdf = phase.sample(phase_context(), mei, component, direction, active)
     if media.has_microflakes:
         even = _has_microflakes(phase)
-        wo = dr.select(even, mi.warp.square_to_uniform_sphere(samples.direction), wo)
+        wo = dr.select(even, mi.warp.square_to_uniform_sphere(direction), wo)
         f, _ = phase.eval_pdf(phase_context(), mei, wo, active & even)
         weight, pdf = dr.select(even, f / INV_FOUR_PI, weight), dr.select(even, INV_FOUR_PI, pdf)
     return wo, weight, pdf

@@ -22,12 +22,11 @@ import drjit as dr
 import mitsuba as mi
 
 from mivol.numerics import largest_of
-from mivol.transport.traversal.block_ranges import BLOCK_SHIFT
 from mivol.transport.traversal.grid_walk import Cell, walk
 from mivol.transport.traversal.lattice import Lattice, Segment
 from mivol.transport.traversal.random_numbers import draw_pcg32
 
-__all__ = ["residual_ratio_tracking"]
+__all__ = ["CoarseLattice", "coarse_segment", "residual_ratio_tracking"]
 
 
 FAINT = 0.1
@@ -38,7 +37,7 @@ LOOKUP_RATE = 4.0
 
 
 @dataclass
-class _Coarse:
+class CoarseLattice:
     """The blocks as cells of a coarse lattice, for :func:`walk`."""
 
     res: tuple[int, int, int]
@@ -86,10 +85,11 @@ def residual_ratio_tracking(
     Cost: one step a block, one read for each look-up, kappa int (M - m) dt of them.
     """
     ahead = segment.d > 0
-    speed = dr.abs(segment.d) * 2.0**-BLOCK_SHIFT
-    rate = LOOKUP_RATE * scale
-    coarse = _coarse_segment(segment)
     blocks, res, channels, values = lattice.block_ranges, lattice.res, lattice.channels, dr.detach(lattice.values.array)
+    shift = blocks.shift
+    speed = dr.abs(segment.d) * 2.0**-shift
+    rate = LOOKUP_RATE * scale
+    coarse = coarse_segment(segment, shift)
 
     def visit(state: Tracked, cell: Cell, on: mi.Bool) -> tuple[Tracked, mi.Float]:
         least, above = blocks.at(cell.lower + 1, on)
@@ -100,10 +100,10 @@ def residual_ratio_tracking(
         tau = [t + dr.select(on, scale * m * dt, 0) for t, m in zip(state.tau, least, strict=True)]
         # -- The factor, from one corner of the cell there --------------------------------------------------------------
         near = dr.fma(speed, dt, cell.frac)
-        inside = dr.select(ahead, near, 1 - near) * (1 << BLOCK_SHIFT)
+        inside = dr.select(ahead, near, 1 - near) * (1 << shift)
         rng, u = draw_pcg32(state.rng, 5)
         node = mi.Vector3i(dr.floor(inside + mi.Vector3f(*u[:3])))
-        node = (cell.lower + 1) * (1 << BLOCK_SHIFT) - 1 + node
+        node = (cell.lower + 1) * (1 << shift) - 1 + node
         node = dr.clip(node, 0, mi.Vector3i(res[2] - 1, res[1] - 1, res[0] - 1))
         index = mi.UInt32((node.z * res[1] + node.y) * res[2] + node.x) * channels
         weight = []
@@ -131,14 +131,14 @@ def residual_ratio_tracking(
         -dr.log(u[0]),
         mi.UInt32(rng),
     )
-    end = walk(_Coarse(tuple(n - 1 for n in blocks.res)), coarse, visit, start, (), active, is_dark, halts=True)
+    end = walk(CoarseLattice(tuple(n - 1 for n in blocks.res)), coarse, visit, start, (), active, is_dark, halts=True)
     return [w * dr.exp(-t) for t, w in zip(end.tau, end.weight, strict=True)], end.rng
 
 
-def _coarse_segment(segment: Segment) -> Segment:
+def coarse_segment(segment: Segment, shift: int) -> Segment:
     """A segment in the coordinates of the blocks; exact, since the edge of a block is a power of two."""
-    share = 2.0**-BLOCK_SHIFT
+    share = 2.0**-shift
     cell = segment.cell + 1
-    block = cell >> BLOCK_SHIFT
-    frac = (mi.Vector3f(cell & ((1 << BLOCK_SHIFT) - 1)) + segment.frac) * share
+    block = cell >> shift
+    frac = (mi.Vector3f(cell & ((1 << shift) - 1)) + segment.frac) * share
     return Segment(block - 1, frac, segment.d * share, segment.d_rest * share, segment.t0, segment.length)

@@ -90,6 +90,7 @@ class ScatteringQuadrature:
     """
 
     directions = "spread"
+    ends_in_media = False
 
     def __init__(self, drawn: SingleScattering, transmittance_grid: TransmittanceGrid | None) -> None:
         self.drawn, self.media, self.emitters, self.transmittance_grid = drawn, drawn.media, drawn.emitters, transmittance_grid

@@ -16,6 +16,7 @@ from typing import Any, Protocol
 import mitsuba as mi
 
 from mivol.transport.estimators.contribution import Factor, Term
+from mivol.transport.media.even_point import EvenPoint
 from mivol.transport.media.optical_depth import (
     integrate_optical_depth,
     jvp_optical_depth,
@@ -31,6 +32,8 @@ __all__ = [
     "PICTURE",
     "REVERSE",
     "Absorption",
+    "Collision",
+    "FlightPoint",
     "PathSegment",
     "SegmentEstimate",
     "SegmentEstimator",
@@ -64,6 +67,40 @@ class PathSegment:
 
 
 @dataclass
+class Collision:
+    """A collision with a medium that ends the flight along a segment.
+
+    Attributes:
+        mei: the point, and its medium, as Mitsuba's phase functions are evaluated at it.
+        albedo: probability [1] that it scatters, of each colour.
+        on: lanes whose flight ends so; the others reach the end of their segment.
+        t: its distance on the ray [length].
+        body: index of its medium.
+    """
+
+    mei: mi.MediumInteraction3f
+    albedo: mi.Spectrum
+    on: mi.Bool
+    t: mi.Float64
+    body: mi.UInt32
+
+
+@dataclass
+class FlightPoint:
+    """A point that is drawn evenly from a flight.
+
+    Attributes:
+        point: the point.
+        gain: throughput to it, times the length that it stands for.
+        chance: a number in [0, 1), by which one of several flights' points is kept.
+    """
+
+    point: EvenPoint
+    gain: mi.Spectrum
+    chance: mi.Float
+
+
+@dataclass
 class SegmentEstimate:
     """The result of a segment estimator.
 
@@ -72,12 +109,16 @@ class SegmentEstimate:
         T: transmittance of its media, of each colour, or an estimate of it.
         light: the light of its media; None where they add none.
         transmittance: the factor of the light behind.
+        collision: where the path meets a medium before that end; None of estimators whose paths go straight on.
+        probe: for derivatives, a point of the flight at which they may be looked at besides; None where none is needed.
     """
 
     end: SegmentEnd
     T: mi.Spectrum
     light: Term | None
     transmittance: Factor
+    collision: Collision | None = None
+    probe: FlightPoint | None = None
 
 
 class SegmentEstimator(Protocol):
@@ -85,9 +126,11 @@ class SegmentEstimator(Protocol):
 
     Attributes:
         directions: the layout of lanes that its directions need (:func:`mivol.transport.path.film.film_passes`).
+        ends_in_media: a segment may end at a collision with a medium, where the path scatters.
     """
 
     directions: str
+    ends_in_media: bool
 
     def draw(self, sampler: mi.Sampler, active: mi.Bool, strata: Strata | None) -> Any:
         """Draw the random numbers of one segment; whatever is returned becomes ``PathSegment.samples``."""
@@ -129,6 +172,7 @@ class Absorption:
     """
 
     directions = "none"
+    ends_in_media = False
 
     def __init__(self, media: SceneMedia, drawn_by: SegmentEstimator | None = None) -> None:
         self.media, self.drawn_by = media, drawn_by

@@ -48,7 +48,7 @@ def light_through(
         Where the ray ends; its optical depth [1] for each channel, in a grid at most a little above ``DARK``, or None where the
         transmittance was estimated; and the transmittance of media and surfaces.
     """
-    if rng is not None and (media.has_block_ranges or media.is_bounded):
+    if rng is not None and (media.estimates_shadows or media.is_bounded):
         end, T = estimate_transmittance(media, ray, medium, active, rng, passes_null=True)
         return end, None, T * end.null_transmission
     zero = [mi.Float(0) for _ in range(media.channels)]
@@ -79,7 +79,8 @@ def _estimate_transmittance(interval: MediumInterval, channels: int, rng: mi.UIn
     exact in all other parts, which are walked to the optical depth ``DARK``.
     """
     body = interval.body
-    tracked = [p for p in body.exact_parts if p.lattice is not None and p.lattice.block_ranges is not None]
+    known = (p for p in body.exact_parts if p.lattice is not None and p.lattice.block_ranges is not None)
+    tracked = list(known) if body.estimates_shadows else []
     others = [p for p in body.exact_parts if not any(p is q for q in tracked)]
     T = [dr.exp(-t) for t in body.optical_depth(interval, channels, others, DARK)]
     scale = dr.detach(body.view.scale) * body.area(interval.ray.d)

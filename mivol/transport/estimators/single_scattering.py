@@ -82,6 +82,8 @@ class SingleScattering:
     Cost: one walk of the segment, and one of each shadow ray; where several media lie along a ray, one walk to each point.
     """
 
+    ends_in_media = False
+
     def __init__(self, direct: DirectLighting, count: int = 1, visibility_cache: VisibilityCache | None = None) -> None:
         self.direct, self.media, self.emitters = direct, direct.media, direct.emitters
         self.count, self.visibility_cache = count, visibility_cache

@@ -34,6 +34,7 @@ class TrackedAbsorption:
     """
 
     directions = "none"
+    ends_in_media = False
 
     def __init__(self, media: SceneMedia) -> None:
         self.media = media

@@ -16,7 +16,7 @@ from mivol.transport.estimators.phase_sampling import phase_context, phase_pdf
 from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.traversal.ray_spawning import spawn_ray
 
-__all__ = ["MediumVertex", "SurfaceVertex", "Vertex"]
+__all__ = ["EitherVertex", "MediumVertex", "SurfaceVertex", "Vertex"]
 
 
 class Vertex(Protocol):
@@ -82,3 +82,34 @@ class MediumVertex:
 
     def pdf(self, d: mi.Vector3f, active: mi.Bool) -> mi.Float:
         return phase_pdf(self.media, self.phase, self.interaction, d, active)
+
+
+@dataclass
+class EitherVertex:
+    """A point of a medium in some lanes, of a surface in the others: one shadow ray serves both.
+
+    Attributes:
+        surface, medium: the two.
+        in_medium: lanes that are in a medium.
+    """
+
+    surface: SurfaceVertex
+    medium: MediumVertex
+    in_medium: mi.Bool
+
+    @property
+    def interaction(self) -> mi.Interaction3f:
+        """The point."""
+        return dr.select(self.in_medium, mi.Interaction3f(self.medium.interaction), mi.Interaction3f(self.surface.interaction))
+
+    def leave(self, p: mi.Point3f) -> tuple[mi.Point3f, mi.MediumPtr]:
+        (inside, medium), (outside, around) = self.medium.leave(p), self.surface.leave(p)
+        return dr.select(self.in_medium, inside, outside), dr.select(self.in_medium, medium, around)
+
+    def eval(self, d: mi.Vector3f, active: mi.Bool) -> mi.Spectrum:
+        scattered = self.medium.eval(d, active & self.in_medium)
+        return dr.select(self.in_medium, scattered, self.surface.eval(d, active & ~self.in_medium))
+
+    def pdf(self, d: mi.Vector3f, active: mi.Bool) -> mi.Float:
+        scattered = self.medium.pdf(d, active & self.in_medium)
+        return dr.select(self.in_medium, scattered, self.surface.pdf(d, active & ~self.in_medium))

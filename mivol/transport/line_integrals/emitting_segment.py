@@ -33,6 +33,7 @@ class Emission:
     """
 
     directions = "none"
+    ends_in_media = False
 
     def __init__(self, media: SceneMedia) -> None:
         self.media = media

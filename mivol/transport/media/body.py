@@ -33,17 +33,20 @@ class Body:
     Attributes:
         view: the medium's extinction.
         box: the boundary, where it is a box; None where it has to be traced.
+        edge: mean length of an edge of the box [length], as an opaque array; None without one.
         exact_parts: the parts whose integral along a ray is known.
         flight_parts: the parts that free flights are drawn from in one walk: constants, and grids that share their cells.
+        estimates_shadows: whether shadow rays through grids whose block ranges are known are estimated, and not exact.
         cuts_grids: whether the boundary is smaller than what lies in it, so that intervals must be cut to it.
     """
 
-    def __init__(self, view: MediumView, box: Box | None) -> None:
-        self.view, self.box = view, box
+    def __init__(self, view: MediumView, box: Box | None, estimates_shadows: bool = False) -> None:
+        self.view, self.box, self.estimates_shadows = view, box, estimates_shadows
         self.cuts_grids = box is not None and (
             view.emission_density is not None or not all(_fits(part, box) for part in view.parts)
         )
         self.rows = box.rows() if box is not None else None
+        self.edge = dr.opaque(mi.Float, box.edge) if box is not None else None
         self.exact_parts = [p for p in view.parts if p.exact_line]
         self.flight_parts = flight_parts(view.parts)
         self.gradients: list[Any] = []

@@ -25,6 +25,11 @@ class Box:
         """
         return [[dr.opaque(mi.Float64, float(v)) for v in row] for row in np.linalg.inv(self.to_world)[:3]]
 
+    @property
+    def edge(self) -> float:
+        """Length of an edge of the cube of the same volume."""
+        return float(abs(np.linalg.det(self.to_world[:3, :3])) ** (1 / 3))
+
     def corners(self) -> np.ndarray:
         """The 8 corners, (8, 3)."""
         unit = np.array([[x, y, z, 1] for z in (0, 1) for y in (0, 1) for x in (0, 1)], dtype=np.float64)

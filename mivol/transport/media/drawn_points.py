@@ -21,7 +21,7 @@ from mivol.transport.media.body import Body
 from mivol.transport.media.bounded_extinction import BoundedExtinction
 from mivol.transport.media.extinction import RayInterval
 
-__all__ = ["DrawnPoint", "bounded_parts", "draw_in", "start_points"]
+__all__ = ["DrawnPoint", "bounded_parts", "draw_in", "offer_interval", "start_points"]
 
 
 @dataclass
@@ -64,11 +64,16 @@ def start_points(count: int, u: mi.Float | None, width: int) -> list[DrawnPoint]
 
 def draw_in(point: DrawnPoint, part: BoundedExtinction, interval: RayInterval) -> DrawnPoint:
     """Offer one more interval to the reservoir."""
-    begin, end = part.clip(interval)
-    length = dr.select(interval.active & (end > begin), end - begin, 0)
+    return offer_interval(point, *part.clip(interval), interval.active)[0]
+
+
+def offer_interval(point: DrawnPoint, begin: mi.Float, end: mi.Float, on: mi.Bool) -> tuple[DrawnPoint, mi.Bool]:
+    """Offer the interval between two distances to the reservoir; besides, the lanes that keep it."""
+    length = dr.select(on & (end > begin), end - begin, 0)
     total = point.total + length
     share = length / dr.select(total > 0, total, 1)
     keep = point.u < share
     # Given the outcome, the number is uniform in [0, share) or in [share, 1), and is stretched to [0, 1) again.
     u = dr.select(keep, point.u / dr.select(share > 0, share, 1), (point.u - share) / dr.select(share < 1, 1 - share, 1))
-    return DrawnPoint(total, dr.select(keep, begin, point.begin), dr.select(keep, length, point.length), u)
+    kept = DrawnPoint(total, dr.select(keep, begin, point.begin), dr.select(keep, length, point.length), u)
+    return kept, keep & (length > 0)

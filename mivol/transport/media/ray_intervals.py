@@ -92,10 +92,15 @@ class MediumInterval(RayInterval):
 
     def middle(self) -> mi.Float64:
         """Distance of the middle of the interval inside the boundary [length], which orders disjoint media."""
+        t0, t1 = self.inside()
+        return 0.5 * (t0 + t1)
+
+    def inside(self) -> tuple[mi.Float64, mi.Float64]:
+        """The interval inside the boundary [length]; the end is not behind the start where it misses it."""
         t0, t1 = mi.Float64(self.t0), mi.Float64(self.t1)
         if self.body.box is not None and not self.body.cuts_grids:
             _, _, t0, t1 = slab(self.body.rows, (0.0,) * 3, (1.0,) * 3, self.ray.o, self.ray.d, t0, t1)
-        return 0.5 * (t0 + t1)
+        return t0, t1
 
 
 MediumVisitor = Callable[[Any, MediumInterval], Any]

@@ -73,9 +73,9 @@ class SceneMedia:
         return rows if len(rows) == self.channels else [sum(rows[1:], rows[0])]
 
     @property
-    def has_block_ranges(self) -> bool:
-        """Whether some grid's blocks are known, so that its transmittance may be estimated."""
-        return any(p.lattice is not None and p.lattice.block_ranges is not None for b in self.bodies for p in b.view.parts)
+    def estimates_shadows(self) -> bool:
+        """Whether the transmittance of some medium may be estimated in pictures, since its blocks are known."""
+        return any(b.estimates_shadows for b in self.bodies)
 
     @property
     def is_bounded(self) -> bool:

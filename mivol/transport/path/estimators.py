@@ -6,12 +6,14 @@ one for the segments of a path, ``mivol explain`` prints it, and tests measure w
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import mitsuba as mi
 
 from mivol.transport.estimators.direct_lighting import DirectLighting
+from mivol.transport.estimators.free_flight import FreeFlight
 from mivol.transport.estimators.scattering_quadrature import ScatteringQuadrature
 from mivol.transport.estimators.segment import Absorption, SegmentEstimator
 from mivol.transport.estimators.single_scattering import SingleScattering
@@ -21,7 +23,6 @@ from mivol.transport.estimators.visibility_cache import VisibilityCache
 from mivol.transport.line_integrals.emitting_segment import Emission
 
 __all__ = [
-    "MOST_SCATTERINGS",
     "SEGMENT_ESTIMATORS",
     "Estimators",
     "SegmentChoice",
@@ -53,16 +54,25 @@ class SegmentQuestion:
     """What a scene and its settings ask of the segment estimator.
 
     Attributes:
-        scatters: some medium scatters light of emitters to the camera.
+        scatters: some medium scatters light to the camera.
         emits: some medium emits light.
         deterministic: images without noise were asked for.
         is_bounded: some medium is known by a majorant only.
+        scatterings: largest number of scattering events between an emitter and the camera; may be infinite.
+        refracts: the boundary of some medium bends or blurs the light that passes it, so that no straight shadow ray does.
     """
 
     scatters: bool
     emits: bool
     deterministic: bool
     is_bounded: bool = False
+    scatterings: float = 1
+    refracts: bool = False
+
+    @property
+    def is_single(self) -> bool:
+        """Whether straight shadow rays from one scattering event on a segment find all light."""
+        return self.scatterings <= 1 and not (self.emits or self.is_bounded or self.refracts)
 
 
 @dataclass(frozen=True)
@@ -118,18 +128,25 @@ SEGMENT_ESTIMATORS = {
     ),
     "single_scattering": SegmentEntry(
         lambda choice: SingleScattering(choice.direct, choice.count, choice.visibility_cache),
-        lambda asked: asked.scatters and not asked.emits and not asked.deterministic and not asked.is_bounded,
+        lambda asked: asked.scatters and asked.is_single and not asked.deterministic,
         1,
-        "a medium scatters once, and none emits",
+        "a medium scatters once, none emits or is bounded, and no boundary refracts",
         "no bias",
         (
             *("chao_1982", "kulla_2012", "miller_2019", "veach_1995"),
             *("amanatides_1987", "novak_2014", "hofmann_2021", "rousselle_2016", "vicini_2021"),
         ),
     ),
+    "free_flight": SegmentEntry(
+        lambda choice: FreeFlight(choice.direct.media),
+        lambda asked: asked.scatters and not asked.is_single and not asked.deterministic,
+        math.inf,
+        "media scatter any number of times, emit beside it, are bounded, or lie behind boundaries that refract",
+        "no bias; variance of one flight a segment",
+    ),
     "scattering_quadrature": SegmentEntry(
         _make_quadrature,
-        lambda asked: asked.scatters and not asked.emits and asked.deterministic and not asked.is_bounded,
+        lambda asked: asked.scatters and asked.is_single and asked.deterministic,
         1,
         "one medium scatters once, its grids share their cells, every emitter has one position or direction",
         "error of the fourth order in the size of a cell where light is smooth, no variance; derivatives are drawn",
@@ -137,10 +154,6 @@ SEGMENT_ESTIMATORS = {
     ),
 }
 """Estimators of what media add along a segment, by the name that a plan chooses them by. A question has one answer, or none."""
-
-MOST_SCATTERINGS = max(entry.scatterings for entry in SEGMENT_ESTIMATORS.values())
-"""Largest number of scattering events in media that some estimator of the table accounts for; a plan refuses more."""
-
 
 def choose_segment_estimator(asked: SegmentQuestion) -> str | None:
     """The name of the estimator that answers a question; None where none does."""
@@ -155,10 +168,15 @@ class Estimators:
         segment: the estimator of what media add and transmit along a segment.
         lights_surfaces: some surface scatters light, so that emitters are hit by emitter samples and by BSDF samples, which are
             combined by multiple importance sampling.
+        lights_media: likewise where a path ends a segment in a medium. Under a constant environment alone it is not so: light
+            that is the same from everywhere is found without noise by the paths that escape.
     """
 
-    def __init__(self, direct: DirectLighting, segment: SegmentEstimator, lights_surfaces: bool) -> None:
-        self.media, self.direct, self.segment, self.lights_surfaces = direct.media, direct, segment, lights_surfaces
+    def __init__(
+        self, direct: DirectLighting, segment: SegmentEstimator, lights_surfaces: bool, lights_media: bool = False
+    ) -> None:
+        self.media, self.direct, self.segment = direct.media, direct, segment
+        self.lights_surfaces, self.lights_media = lights_surfaces, lights_media
 
     def prepare_derivatives(self, ray: mi.Ray3f) -> None:
         """Find what derivatives along camera rays need beforehand, once for all passes."""
@@ -166,4 +184,4 @@ class Estimators:
 
     def replayed(self) -> Estimators:
         """Estimators of the radiance that a replay subtracts from: without light that is sampled anew for its derivatives."""
-        return Estimators(self.direct, self.segment.replayed(), self.lights_surfaces)
+        return Estimators(self.direct, self.segment.replayed(), self.lights_surfaces, self.lights_media)

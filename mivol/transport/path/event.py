@@ -1,8 +1,4 @@
-"""The event at the end of a path segment: a surface, or escape from the scene.
-
-Scattering inside a segment is no event of the path: the segment's estimator samples it and lights it, and the path itself goes
-straight on.
-"""
+"""The event at the end of a path segment: a collision with a medium, a surface, or escape from the scene."""
 
 from __future__ import annotations
 
@@ -10,8 +6,8 @@ from dataclasses import dataclass
 
 import mitsuba as mi
 
-from mivol.transport.estimators.vertex import SurfaceVertex
-from mivol.transport.media.ray_intervals import SegmentEnd
+from mivol.transport.estimators.segment import Collision, SegmentEstimate
+from mivol.transport.estimators.vertex import EitherVertex, MediumVertex, SurfaceVertex, Vertex
 from mivol.transport.media.scene_media import SceneMedia
 
 __all__ = ["PathEvent"]
@@ -23,21 +19,37 @@ class PathEvent:
 
     Attributes:
         si: the surface; not valid where the path has left the scene.
-        t: length of the segment [length].
-        medium: the medium around the end.
-        at_surface: lanes that have hit a surface; the others have escaped, or ended before.
+        t: length of the segment to there [length].
+        medium: the medium around it.
+        at_surface: lanes that have hit a surface.
+        collision: where lanes have met a medium before; None where paths scatter at surfaces only.
     """
 
     si: mi.SurfaceInteraction3f
     t: mi.Float
     medium: mi.MediumPtr
     at_surface: mi.Bool
+    collision: Collision | None
 
     @classmethod
-    def of(cls, end: SegmentEnd, active: mi.Bool) -> PathEvent:
+    def of(cls, found: SegmentEstimate, active: mi.Bool) -> PathEvent:
         """The event at the end of a segment."""
-        return cls(end.si, end.t, end.medium, active & end.si.is_valid())
+        end, collision = found.end, found.collision
+        arrives = active if collision is None else active & ~collision.on
+        return cls(end.si, end.t, end.medium, arrives & end.si.is_valid(), collision)
 
-    def vertex(self, media: SceneMedia, ray: mi.Ray3f) -> SurfaceVertex:
-        """The surface as a vertex, at which direct light is estimated."""
+    @property
+    def in_medium(self) -> mi.Bool:
+        """Lanes that have met a medium."""
+        return mi.Bool(False) if self.collision is None else self.collision.on
+
+    def vertex(self, media: SceneMedia, ray: mi.Ray3f) -> Vertex:
+        """The point at which light is scattered."""
+        if self.collision is None:
+            return self.surface_vertex(media, ray)
+        inside = MediumVertex(media, self.collision.mei)
+        return EitherVertex(self.surface_vertex(media, ray), inside, self.collision.on) if media.has_surfaces else inside
+
+    def surface_vertex(self, media: SceneMedia, ray: mi.Ray3f) -> SurfaceVertex:
+        """The point of the surface."""
         return SurfaceVertex(media, self.si, self.si.bsdf(ray), self.medium)

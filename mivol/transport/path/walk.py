@@ -22,17 +22,19 @@ from typing import Any, TypeVar
 import drjit as dr
 import mitsuba as mi
 
-from mivol.transport.estimators.contribution import TrackedFactor, TrackedTerm
+from mivol.transport.estimators.contribution import TrackedTerm
 from mivol.transport.estimators.direct_lighting import DirectLight
+from mivol.transport.estimators.flight_derivatives import Probe, ProbeTerm
 from mivol.transport.estimators.multiple_importance import power_heuristic
-from mivol.transport.estimators.segment import PICTURE, PathSegment
-from mivol.transport.estimators.vertex import SurfaceVertex
+from mivol.transport.estimators.segment import PICTURE, Collision, PathSegment
 from mivol.transport.media.channels import colours
+from mivol.transport.media.coefficients import medium_interaction
 from mivol.transport.path.estimators import Estimators
 from mivol.transport.path.event import PathEvent
 from mivol.transport.path.scores import Primal, Replay, Tangent
 from mivol.transport.path.settings import Settings
-from mivol.transport.traversal.ray_spawning import camera_ray, spawn_ray
+from mivol.transport.path.turn import TurnSamples, sample_turn
+from mivol.transport.traversal.ray_spawning import camera_ray
 from mivol.transport.traversal.strata import Strata
 
 __all__ = ["Path", "is_straight", "walk_path"]
@@ -60,6 +62,7 @@ class Path:
         active: lanes that go on.
         score: :mod:`mivol.transport.path.scores`.
         sampler, strata: random numbers.
+        probe: a point of one of the flights so far, at which derivatives are looked at besides; None for pictures.
     """
 
     ray: mi.Ray3f
@@ -76,6 +79,7 @@ class Path:
     score: Any
     sampler: mi.Sampler
     strata: Strata | None
+    probe: Probe | None = None
 
 
 def walk_path(
@@ -104,38 +108,73 @@ def walk_path(
     Bias: that of the segment estimator. Variance: none at depth 1 beyond the pixel's own; at surfaces, that of emitter and BSDF
     samples.
     """
-    media, n = estimators.media, dr.width(ray)
+    media = estimators.media
     limit = settings.max_depth if settings.max_depth >= 0 else UNLIMITED
-    visible = not settings.hide_emitters and media.scene.environment() is not None
-    path = Path(
-        ray=camera_ray(ray),
-        medium=media.medium_at(ray),
+    path = _start(estimators, camera_ray(ray), score, sampler, strata, mi.Bool(active) & (limit > 0))
+    path.stopped |= not settings.hide_emitters and media.scene.environment() is not None
+    path.medium = media.medium_at(ray)
+    if is_straight(estimators, settings):
+        path, event = _follow_segment(estimators, settings, limit, path)
+        path = _add_emission(estimators, settings, path, event)
+        path.stopped |= event.at_surface
+        return path.score, _alpha(path.stopped, path.clear)
+    if estimators.segment.ends_in_media and score.purpose != PICTURE:
+        path.probe = Probe.none(ray)
+    path = _walk_on(estimators, settings, limit, path)
+    if path.probe is not None:
+        path.score = path.score.add(_estimate_probe(estimators, settings, limit, path.probe, sampler))
+    return path.score, _alpha(path.stopped, path.clear)
+
+
+def _start(
+    estimators: Estimators, ray: mi.Ray3f, score: Score, sampler: mi.Sampler, strata: Strata | None, active: mi.Bool
+) -> Path:
+    """A path that has not met anything yet, outside all media."""
+    n = dr.width(ray)
+    return Path(
+        ray=ray,
+        medium=dr.zeros(mi.MediumPtr, n),
         beta=dr.full(mi.Spectrum, 1, n),
         eta=dr.full(mi.Float, 1, n),
         depth=dr.zeros(mi.UInt32, n),
         last=dr.zeros(mi.Interaction3f, n),
         pdf=dr.full(mi.Float, 1, n),
         delta=dr.full(mi.Bool, True, n),
-        stopped=dr.full(mi.Bool, visible, n),
+        stopped=dr.full(mi.Bool, False, n),
         clear=dr.full(mi.Spectrum, 1, n),
-        active=mi.Bool(active) & (limit > 0),
+        active=active,
         score=score,
         sampler=sampler,
         strata=strata,
     )
 
+
+def _walk_on(estimators: Estimators, settings: Settings, limit: int, path: Path) -> Path:
+    """Follow a path to its end."""
+
     def step(path: Path) -> tuple[Path]:
         path, event = _follow_segment(estimators, settings, limit, path)
         path = _add_emission(estimators, settings, path, event)
-        return (_turn(estimators, settings, limit, path, event),)
+        return (_scatter(estimators, settings, limit, path, event),)
 
-    if is_straight(estimators, settings):
-        path, event = _follow_segment(estimators, settings, limit, path)
-        path = _add_emission(estimators, settings, path, event)
-        path.stopped |= event.at_surface
-    else:
-        (path,) = dr.while_loop(state=(path,), cond=lambda p: p.active, body=step, label="path")
-    return path.score, _alpha(path.stopped, path.clear)
+    return dr.while_loop(state=(path,), cond=lambda p: p.active, body=step, label="path")[0]
+
+
+def _estimate_probe(
+    estimators: Estimators, settings: Settings, limit: int, probe: Probe, sampler: mi.Sampler
+) -> ProbeTerm:
+    """Estimate the radiance that is scattered at a probe towards the path, by a path of its own."""
+    media, n = estimators.media, dr.width(probe.ray)
+    on = probe.weight > 0
+    mei = medium_interaction(probe.ray, dr.select(on, probe.t, 0))
+    for index, body in enumerate(media.bodies):
+        mei.medium = dr.select(on & (probe.body == index), mi.MediumPtr(body.view.medium), mei.medium)
+    path = _start(estimators, probe.ray, Primal(dr.zeros(mi.Spectrum, n)), sampler, None, on)
+    path.depth = mi.UInt32(probe.depth)
+    collision = Collision(mei, dr.full(mi.Spectrum, 1, n), on, probe.t, probe.body)
+    event = PathEvent(dr.zeros(mi.SurfaceInteraction3f, n), mi.Float(0), mei.medium, dr.full(mi.Bool, False, n), collision)
+    path = _walk_on(estimators, settings, limit, _scatter(estimators, settings, limit, path, event))
+    return ProbeTerm(media, probe, mei, dr.detach(path.score.L), estimators.segment.level, on)
 
 
 def _alpha(stopped: mi.Bool, clear: mi.Spectrum) -> mi.Float:
@@ -150,6 +189,8 @@ def _alpha(stopped: mi.Bool, clear: mi.Spectrum) -> mi.Float:
 def is_straight(estimators: Estimators, settings: Settings) -> bool:
     """Whether every path has one segment: there are no surfaces, or the depth is at most 1 and none of them transmits light."""
     media = estimators.media
+    if estimators.segment.ends_in_media:
+        return False
     return not media.has_surfaces or (settings.scatterings == 0 and not media.has_null_transmission)
 
 
@@ -163,19 +204,21 @@ def _follow_segment(estimators: Estimators, settings: Settings, limit: int, path
     if found.light is not None:
         path.score = path.score.add(found.light)
     path.score = path.score.scale(found.transmittance)
+    if found.probe is not None:
+        path.probe = path.probe.offer(segment, found.probe, path.depth)
     path.beta *= found.T
     path.clear *= found.T
     path.medium = found.end.medium
-    return path, PathEvent.of(found.end, path.active)
+    return path, PathEvent.of(found, path.active)
 
 
 def _add_emission(estimators: Estimators, settings: Settings, path: Path, event: PathEvent) -> Path:
     """Add the emission of the surface, or of the environment, towards the path."""
     scene, si = estimators.media.scene, event.si
-    shown = path.active & ~((path.depth == 0) & settings.hide_emitters)
+    shown = path.active & ~event.in_medium & ~((path.depth == 0) & settings.hide_emitters)
     emitter = si.emitter(scene, shown)
     w_mis = mi.Float(1)
-    if estimators.lights_surfaces:
+    if estimators.lights_surfaces or estimators.lights_media:
         direct = mi.DirectionSample3f(scene, si, path.last)
         pdf_emitter = scene.pdf_emitter_direction(path.last, direct, ~path.delta & (emitter != None))
         w_mis = dr.select(path.delta, 1, power_heuristic(path.pdf, pdf_emitter))
@@ -185,51 +228,56 @@ def _add_emission(estimators: Estimators, settings: Settings, path: Path, event:
     return path
 
 
-def _turn(estimators: Estimators, settings: Settings, limit: int, path: Path, event: PathEvent) -> Path:
-    """Estimate the direct light at the surface, and sample the direction in which the path continues."""
-    media, si, sampler = estimators.media, event.si, path.sampler
-    on_surface, attached = event.at_surface, path.score.purpose != PICTURE
-    vertex = event.vertex(media, path.ray)
-
-    # -- Next-event estimation: light from an emitter, dimmed by the media ----------------------------------------------------
-    may_scatter = on_surface & (path.depth + 1 < limit)
-    lit = may_scatter & mi.has_flag(vertex.bsdf.flags(), mi.BSDFFlags.Smooth)
-    u, chance = sampler.next_2d(lit), sampler.next_1d(lit) if media.is_bounded else None
-    direct = estimators.direct.at_surface(vertex, u, attached, lit, chance)
-    with dr.resume_grad(when=attached):
-        carried = path.beta * direct.value
-    path.score = path.score.add(DirectLight(media, direct.ray_segment, carried, direct.on))
+def _scatter(estimators: Estimators, settings: Settings, limit: int, path: Path, event: PathEvent) -> Path:
+    """Estimate the direct light where the segment has ended, and sample the direction in which the path continues."""
+    arrives, sampler = event.at_surface | event.in_medium, path.sampler
+    may_scatter = arrives & (path.depth + 1 < limit)
+    path = _add_direct_light(estimators, path, event, may_scatter)
 
     # -- The direction the path takes -----------------------------------------------------------------------------------------
-    u1, u2 = sampler.next_1d(on_surface), sampler.next_2d(on_surface)
-    sample, f_over_pdf = vertex.bsdf.sample(mi.BSDFContext(), si, u1, u2, on_surface)
-    through = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Null)
-    # A sampled direction of density 0 has weight 0; its path ends below, where beta is 0.
-    on = on_surface & (may_scatter | through)
-    turned = on & ~through
-    path.stopped |= on_surface & ~through
-    path.score = path.score.scale(_bsdf_factor(vertex, sample.wo, turned))
-    path.beta *= dr.select(on, f_over_pdf, 0)
-    path.eta *= dr.select(on, sample.eta, 1)
-    rest = path.ray.maxt - event.t
-    path.ray = spawn_ray(si, si.to_world(sample.wo), media.size)
-    # A ray that is transmitted undeviated keeps its end (the sensor's far_clip).
-    path.ray.maxt = dr.select(through, dr.minimum(rest, path.ray.maxt), path.ray.maxt)
-    path.medium = dr.select(on & si.is_medium_transition(), si.target_medium(path.ray.d), path.medium)
-    path.last = dr.select(turned, mi.Interaction3f(si), path.last)
-    path.pdf = dr.select(turned, sample.pdf, path.pdf)
-    path.delta = dr.select(turned, mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta), path.delta)
+    u1, u2 = sampler.next_1d(arrives), sampler.next_2d(arrives)
+    turn = sample_turn(estimators, path.ray, event, TurnSamples(u1, u2), may_scatter)
+    path.stopped |= arrives & ~turn.through
+    for factor in turn.factors:
+        path.score = path.score.scale(factor)
+    path.beta *= dr.select(turn.on, turn.weight, 0)
+    path.eta *= dr.select(turn.on, turn.eta, 1)
+    path.ray, path.medium = turn.ray, dr.select(turn.on, turn.medium, path.medium)
+    turned = turn.on & ~turn.through
+    path.last = dr.select(turned, turn.origin, path.last)
+    path.pdf = dr.select(turned, turn.pdf, path.pdf)
+    path.delta = dr.select(turned, turn.delta, path.delta)
     path.depth += dr.select(turned, mi.UInt32(1), mi.UInt32(0))
 
     # -- Roulette ------------------------------------------------------------------------------------------------------
-    q = dr.minimum(dr.max(path.beta) * dr.square(path.eta), 0.95)
+    # At surfaces it ends paths that never lose any light; in media these find their way out.
+    most = dr.select(event.in_medium, 1, mi.Float(0.95)) if event.collision is not None else 0.95
+    q = dr.minimum(dr.max(path.beta) * dr.square(path.eta), most)
     late = path.depth >= settings.rr_depth
-    survives = ~late | (sampler.next_1d(on) < q)
+    survives = ~late | (sampler.next_1d(turn.on) < q)
     path.beta = dr.select(late, path.beta * dr.rcp(dr.maximum(q, 1e-30)), path.beta)
-    path.active = on & survives & dr.any(path.beta != 0)
+    path.active = turn.on & survives & dr.any(path.beta != 0)
     return path
 
 
-def _bsdf_factor(vertex: SurfaceVertex, wo: mi.Vector3f, active: mi.Bool) -> TrackedFactor:
-    """The BSDF as a factor of all light ahead, with its derivatives."""
-    return TrackedFactor(lambda: vertex.bsdf.eval(mi.BSDFContext(), vertex.interaction, wo, active), active)
+def _add_direct_light(estimators: Estimators, path: Path, event: PathEvent, may_scatter: mi.Bool) -> Path:
+    """Next-event estimation: light from an emitter, dimmed by the media, that is scattered towards the path."""
+    media, sampler, purpose = estimators.media, path.sampler, path.score.purpose
+    lit = mi.Bool(False)
+    if estimators.lights_surfaces:
+        smooth = mi.has_flag(event.si.bsdf(path.ray).flags(), mi.BSDFFlags.Smooth)
+        lit = may_scatter & event.at_surface & smooth
+    if estimators.lights_media:
+        lit |= may_scatter & event.in_medium
+    if not (estimators.lights_surfaces or estimators.lights_media):
+        return path
+    estimates = media.is_bounded or (estimators.segment.ends_in_media and media.estimates_shadows and purpose == PICTURE)
+    u, chance = sampler.next_2d(lit), sampler.next_1d(lit) if estimates else None
+    vertex = event.vertex(media, path.ray)
+    direct = estimators.direct.at_vertex(vertex, u, purpose != PICTURE, lit, chance)
+    with dr.resume_grad(when=purpose != PICTURE):
+        carried = path.beta * direct.value
+        if event.collision is not None:
+            carried = dr.select(event.in_medium, carried * event.collision.albedo, carried)
+    path.score = path.score.add(DirectLight(media, direct.ray_segment, carried, direct.on))
+    return path

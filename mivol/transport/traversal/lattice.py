@@ -19,7 +19,7 @@ import numpy as np
 from mivol.errors import MivolError
 from mivol.space import check_affine, lattice_from_world
 
-__all__ = ["Lattice", "Mask3", "Segment", "clip", "locate", "slab", "split"]
+__all__ = ["Lattice", "Mask3", "Segment", "clip", "locate", "piece_points", "slab", "split"]
 
 
 Mask3 = Any
@@ -155,6 +155,29 @@ def locate(lattice: Lattice, o: mi.Point3f, d: mi.Vector3f, t: mi.Float) -> tupl
         low = dr.minimum(dr.floor(q), n[a] - 1)
         cell[a], frac[a] = mi.Int32(low), mi.Float(q - low)
     return cell, frac, inside
+
+
+def piece_points(
+    lattice: Lattice, ray: mi.Ray3f, start: mi.Float64, dt: mi.Float, active: mi.Bool
+) -> tuple[mi.Vector3i, list[mi.Vector3f], mi.Bool]:
+    """Four points of a piece of a ray that lies in one cell, at 0, 1/3, 2/3 and 1 of its length.
+
+    Args:
+        lattice: the grid.
+        ray: world space, unit direction.
+        start, dt: where the piece begins on the ray, and its length [length].
+        active: lanes that have a piece.
+
+    Returns:
+        The lower node of the cell, the points as fractions from there, and the lanes whose piece lies in the box.
+    """
+    segment = clip(lattice, ray.o, ray.d, start, start + mi.Float64(dt))
+    # The cell is that of the middle of the piece: its ends lie in faces of the cell, and rounding may put them on either side.
+    along = segment.d * segment.length
+    shift = mi.Vector3i(dr.floor(segment.frac + 0.5 * along))
+    cell, frac = segment.cell + shift, segment.frac - mi.Vector3f(shift)
+    points = [dr.clip(dr.fma(along, k / 3, frac), 0, 1) for k in range(4)]
+    return cell, points, active & (segment.length > 0)
 
 
 def slab(

@@ -1,0 +1,327 @@
+r"""Derivatives of free flights, with respect to the coefficients of media along them and at their collisions.
+
+.. math:: \partial L = \int_0^D T \left( \partial\sigma\,(\alpha L_s - L_t) + \sigma\,\partial\alpha\,L_s \right) dt
+
+with the in-scattered radiance L_s at t, and L_t the radiance that arrives there from further along the ray. A flight of
+length t that finds the radiance L at its end estimates this by
+
+.. math:: -(L - b) \int_0^t \partial\sigma\,dt' + (L - b)\,\frac{\partial\sigma(t)}{\sigma(t) + \kappa}\,[\text{collision}]
+          + \ell\,(\alpha \hat L_s - b)\,\frac{\kappa\,\partial\sigma(s)}{\sigma(s) + \kappa}
+
+The first term is an exact walk back along the flight. Collisions alone would miss the derivative where there is no extinction,
+so they are given the weight sigma / (sigma + kappa), and a probe at a point s, drawn evenly from the flight's length l in the
+media, has the rest: the mean over all flights of an integral over [0, t] is the integral of T times its integrand. Any level b
+leaves the mean as it is, since the same two terms without L have the mean 0; a level about as bright as L takes most of the
+noise.
+
+Where the albedo is below ``LEAST_ALBEDO`` its derivative is found by the probe too, and not by L / albedo.
+
+References: Vicini et al. 2021 (path replay); Nimier-David et al. 2022 (probes where there is no extinction); Yu et al. 2026
+(one point for both terms).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from mivol.transport.estimators.segment import Collision, FlightPoint, PathSegment
+from mivol.transport.media.body import Body
+from mivol.transport.media.channels import by_channel, spectrum, tangent_of
+from mivol.transport.media.coefficients import emission_slope, eval_albedo, eval_emission
+from mivol.transport.media.optical_depth import jvp_optical_depth, vjp_optical_depth
+from mivol.transport.media.ray_intervals import RaySegment
+from mivol.transport.media.scene_media import SceneMedia
+
+__all__ = ["FlownSegment", "Probe", "ProbeTerm"]
+
+
+PROBE_TAU = 0.6
+"""Optical depth across a medium of the extinction kappa that is added to collisions (measured in a box: 0.3 per half edge)."""
+
+LEAST_ALBEDO = 0.1
+"""Albedo below which derivatives by it come from probes; L / albedo is at most 10 times L above it."""
+
+
+@dataclass
+class FlownSegment:
+    """A flight: the derivatives of its emission and of its throughput (a ``SharedSegment``).
+
+    Attributes:
+        media: of the scene.
+        segment: ray and throughput.
+        passed: the ray to the end of the flight.
+        collision: where it ends in a medium.
+        weight: of each channel at its end.
+        level: the level b [radiance]; None for 0.
+        emission: where emission was looked at; None where no medium emits.
+        active: lanes that fly.
+        dL: d loss / d emission, once it is known.
+    """
+
+    media: SceneMedia
+    segment: PathSegment
+    passed: RaySegment
+    collision: Collision
+    weight: mi.Spectrum
+    level: mi.Spectrum | None
+    emission: FlightPoint | None
+    active: mi.Bool
+    dL: mi.Spectrum | None = None
+
+    @property
+    def _level(self) -> mi.Spectrum:
+        """Light of the level as the camera sees it at the end of the flight; 0 where the path may not scatter any more."""
+        if self.level is None:
+            return mi.Spectrum(0)
+        return dr.select(self.segment.scatters, self.segment.beta * self.weight * self.level, 0)
+
+    @property
+    def emitted(self) -> mi.Spectrum:
+        """The light that media emit along the flight, as the camera sees it."""
+        total = mi.Spectrum(0)
+        if self.emission is None:
+            return total
+        ray, point = self.segment.ray, self.emission.point
+        for body, on in _bodies_at(self.media, point.body, point.on):
+            if body.view.emits:
+                light = self.emission.gain * dr.detach(eval_emission(body, ray, point.t, self.media.channels, on))
+                total = dr.select(on, light, total)
+        return total
+
+    # -- Emission --------------------------------------------------------------------------------------------------------
+
+    def vjp_light(self, dL: mi.Spectrum) -> None:
+        """Derivatives of the emission, and of the media in front of the point where it was looked at."""
+        if self.emission is None:
+            return
+        media, ray, found = self.media, self.segment.ray, self.emission
+        value = mi.Spectrum(0)
+        for body, on in _bodies_at(media, found.point.body, found.point.on):
+            if not body.view.emits:
+                continue
+            with dr.resume_grad():
+                emitted = eval_emission(body, ray, found.point.t, media.channels, on)
+                if dr.grad_enabled(emitted):
+                    dr.backward_from(dr.select(on, dL * found.gain * emitted, 0))
+            value = dr.select(on, dr.detach(emitted), value)
+            for name, slope in _emission_slopes(body, ray, found.point.t, on):
+                body.deposit(ray, found.point.t, by_channel(dL * found.gain * slope, media.channels), on, name)
+        vjp_optical_depth(media, self._to_emission, -dL * found.gain * value, found.point.on)
+
+    def jvp_light(self) -> mi.Spectrum:
+        total = -self._level * self._jvp_extinction
+        if self.emission is None:
+            return total
+        media, ray, found = self.media, self.segment.ray, self.emission
+        value, change = mi.Spectrum(0), mi.Spectrum(0)
+        for body, on in _bodies_at(media, found.point.body, found.point.on):
+            if not body.view.emits:
+                continue
+            with dr.resume_grad():
+                emitted = eval_emission(body, ray, found.point.t, media.channels, on)
+                own = tangent_of(emitted)
+            for name, slope in _emission_slopes(body, ray, found.point.t, on):
+                own += slope * spectrum(body.tangent_at(ray, found.point.t, media.channels, on, name))
+            value, change = dr.select(on, dr.detach(emitted), value), dr.select(on, own, change)
+        change -= value * jvp_optical_depth(media, self._to_emission, found.point.on)
+        return total + dr.select(found.point.on, found.gain * change, 0)
+
+    @property
+    def _to_emission(self) -> RaySegment:
+        return RaySegment.upto(self.segment.ray, self.segment.medium, self.emission.point.t)
+
+    # -- Throughput ------------------------------------------------------------------------------------------------------
+
+    def vjp(self, dlog: mi.Spectrum) -> None:
+        media, ray, hit = self.media, self.segment.ray, self.collision
+        rest = dlog - self.dL * self._level
+        vjp_optical_depth(media, self.passed, -rest, self.active)
+        for body, on in _bodies_at(media, hit.body, hit.on & self.segment.scatters):
+            name, sigma = _scattering_part(media, body, ray, hit.t, on)
+            weight = dr.select(on, rest * dr.rcp(sigma + _kappa(media, body)), 0)
+            body.deposit(ray, dr.select(on, hit.t, 0), by_channel(weight, media.channels), on, name)
+            if body.view.albedo is None:
+                continue
+            with dr.resume_grad():
+                albedo = eval_albedo(body, hit.mei, on)
+                if dr.grad_enabled(albedo):
+                    dr.backward_from(dr.select(on, dlog * _over_albedo(albedo), 0))
+
+    def jvp_transmittance(self) -> mi.Spectrum:
+        media, hit, change = self.media, self.collision, self._jvp_extinction
+        for body, on in _bodies_at(media, hit.body, hit.on & self.segment.scatters):
+            if body.view.albedo is None:
+                continue
+            with dr.resume_grad():
+                own = tangent_of(_over_albedo(eval_albedo(body, hit.mei, on)))
+            change += dr.select(on, own, 0)
+        return change
+
+    @property
+    def _jvp_extinction(self) -> mi.Spectrum:
+        """Tangent of the logarithm of the throughput by the extinction, without the share that probes have."""
+        if not hasattr(self, "_tangent"):
+            media, ray, hit = self.media, self.segment.ray, self.collision
+            change = -jvp_optical_depth(media, self.passed, self.active)
+            for body, on in _bodies_at(media, hit.body, hit.on & self.segment.scatters):
+                name, sigma = _scattering_part(media, body, ray, hit.t, on)
+                own = spectrum(body.tangent_at(ray, dr.select(on, hit.t, 0), media.channels, on, name))
+                change += dr.select(on, own * dr.rcp(sigma + _kappa(media, body)), 0)
+            self._tangent = change
+        return self._tangent
+
+
+@dataclass
+class Probe:
+    """A probe of one of the flights of a path, kept in proportion to the light that it stands for (reservoir sampling).
+
+    Attributes:
+        ray, medium: the flight's ray, and the medium around its origin.
+        t: distance of the point [length].
+        body: index of its medium.
+        gain: throughput to the point, times the length that it stands for.
+        depth: of the path there.
+        weight: that it was kept with.
+        total: of the weights of all flights.
+    """
+
+    ray: mi.Ray3f
+    medium: mi.MediumPtr
+    t: mi.Float64
+    body: mi.UInt32
+    gain: mi.Spectrum
+    depth: mi.UInt32
+    weight: mi.Float
+    total: mi.Float
+
+    @classmethod
+    def none(cls, ray: mi.Ray3f) -> Probe:
+        """No flight yet."""
+        n = dr.width(ray)
+        zero = dr.zeros(mi.Float, n)
+        nothing = dr.zeros(mi.MediumPtr, n), dr.zeros(mi.Float64, n), dr.zeros(mi.UInt32, n), dr.zeros(mi.Spectrum, n)
+        return cls(mi.Ray3f(ray), *nothing, dr.zeros(mi.UInt32, n), zero, zero)
+
+    def offer(self, segment: PathSegment, found: FlightPoint, depth: mi.UInt32) -> Probe:
+        """Keep a point of one more flight, or the one that was kept before."""
+        point, gain = found.point, found.gain
+        weight = dr.select(point.on & segment.scatters, dr.max(gain), 0)
+        total = self.total + weight
+        keep = found.chance * total < weight
+        return Probe(
+            dr.select(keep, segment.ray, self.ray),
+            dr.select(keep, segment.medium, self.medium),
+            dr.select(keep, point.t, self.t),
+            dr.select(keep, point.body, self.body),
+            dr.select(keep, gain, self.gain),
+            dr.select(keep, depth, self.depth),
+            dr.select(keep, weight, self.weight),
+            total,
+        )
+
+
+@dataclass
+class ProbeTerm:
+    """The derivatives that a probe finds, as a term of value 0.
+
+    Attributes:
+        media: of the scene.
+        probe: the probe.
+        mei: its point.
+        source: an estimate of the in-scattered radiance there.
+        level: the level b [radiance]; None for 0.
+        on: lanes that have one.
+    """
+
+    media: SceneMedia
+    probe: Probe
+    mei: mi.MediumInteraction3f
+    source: mi.Spectrum
+    level: mi.Spectrum | None
+    on: mi.Bool
+    is_replayed = True
+
+    @property
+    def value(self) -> mi.Spectrum:
+        """Nothing: the light of the path has been counted."""
+        return mi.Spectrum(0)
+
+    @property
+    def _gain(self) -> mi.Spectrum:
+        return dr.select(self.on, self.probe.gain * (self.probe.total / dr.select(self.on, self.probe.weight, 1)), 0)
+
+    def _weight(self, body: Body, on: mi.Bool) -> tuple[str, mi.Spectrum]:
+        """The coefficient that the probe is of, and the derivative of the light by it."""
+        name, sigma = _scattering_part(self.media, body, self.probe.ray, self.probe.t, on)
+        bracket = self.source
+        if body.view.albedo is not None:
+            bracket = bracket * dr.detach(eval_albedo(body, self.mei, on))
+        if self.level is not None:
+            bracket = bracket - self.level
+        kappa = _kappa(self.media, body)
+        return name, self._gain * bracket * kappa * dr.rcp(sigma + kappa)
+
+    def vjp(self, dL: mi.Spectrum) -> None:
+        media, probe = self.media, self.probe
+        for body, on in _bodies_at(media, probe.body, self.on):
+            name, weight = self._weight(body, on)
+            body.deposit(probe.ray, probe.t, by_channel(dr.select(on, dL * weight, 0), media.channels), on, name)
+            if body.view.albedo is None:
+                continue
+            with dr.resume_grad():
+                albedo = eval_albedo(body, self.mei, on)
+                if dr.grad_enabled(albedo):
+                    dr.backward_from(dr.select(on, dL * self._by_albedo(body, albedo, on) * albedo, 0))
+
+    def jvp(self) -> mi.Spectrum:
+        media, probe, total = self.media, self.probe, mi.Spectrum(0)
+        for body, on in _bodies_at(media, probe.body, self.on):
+            name, weight = self._weight(body, on)
+            own = weight * spectrum(body.tangent_at(probe.ray, probe.t, media.channels, on, name))
+            if body.view.albedo is not None:
+                with dr.resume_grad():
+                    albedo = eval_albedo(body, self.mei, on)
+                    own += tangent_of(self._by_albedo(body, albedo, on) * albedo)
+            total += dr.select(on, own, 0)
+        return total
+
+    def _by_albedo(self, body: Body, albedo: mi.Spectrum, on: mi.Bool) -> mi.Spectrum:
+        """The derivative of the light by an albedo that collisions leave out."""
+        sigma_t = spectrum(body.extinction_at(self.probe.ray, self.probe.t, self.media.channels, on))
+        return dr.select(dr.detach(albedo) < LEAST_ALBEDO, self._gain * sigma_t * self.source, 0)
+
+
+def _bodies_at(media: SceneMedia, index: mi.UInt32, on: mi.Bool) -> list[tuple[Body, mi.Bool]]:
+    """The bodies, each with the lanes that are in it."""
+    return [(body, on & (index == k)) for k, body in enumerate(media.bodies)]
+
+
+def _scattering_part(
+    media: SceneMedia, body: Body, ray: mi.Ray3f, t: mi.Float64, on: mi.Bool
+) -> tuple[str, mi.Spectrum]:
+    """The name of the coefficient that makes collisions scatter, and its value [1/length] at a point."""
+    name = "sigma_s" if body.view.albedo is None else "sigma_"
+    return name, spectrum(body.extinction_at(ray, dr.select(on, t, 0), media.channels, on, name))
+
+
+def _kappa(media: SceneMedia, body: Body) -> mi.Float:
+    """The extinction that stands for vacuum [1/length]: an optical depth of ``PROBE_TAU`` across the medium."""
+    return PROBE_TAU / (media.size if body.edge is None else body.edge)
+
+
+def _over_albedo(albedo: mi.Spectrum) -> mi.Spectrum:
+    """An albedo over its own value, where that is not small: its derivative is that of the logarithm."""
+    value = dr.detach(albedo)
+    large = value >= LEAST_ALBEDO
+    return dr.select(large, albedo * dr.rcp(dr.select(large, value, 1)), 0)
+
+
+def _emission_slopes(body: Body, ray: mi.Ray3f, t: mi.Float64, on: mi.Bool) -> list[tuple[str, mi.Spectrum]]:
+    """The coefficients that emission goes with, and its derivative by each."""
+    if body.view.emission is None:
+        return []
+    name, slope = emission_slope(body, ray, t, on)
+    return [(name, dr.detach(slope))]
