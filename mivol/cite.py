@@ -136,6 +136,25 @@ CITATIONS: dict[str, Citation] = {
         "ACM Transactions on Graphics 40(4), 108",
         "https://doi.org/10.1145/3450626.3459804",
     ),
+    "woodcock_1965": Citation(
+        "E. R. Woodcock, T. Murphy, P. J. Hemmings, T. C. Longworth",
+        1965,
+        "Techniques used in the GEM code for Monte Carlo neutronics calculations in reactors and other systems of complex "
+        "geometry",
+        "Applications of Computing Methods to Reactor Problems, Argonne National Laboratory, ANL-7050",
+    ),
+    "wilkie_2014": Citation(
+        "A. Wilkie, S. Nawaz, M. Droske, A. Weidlich, J. Hanika",
+        2014,
+        "Hero wavelength spectral sampling",
+        "Computer Graphics Forum 33(4)",
+    ),
+    "nimier_david_2022": Citation(
+        "M. Nimier-David, T. Müller, A. Keller, W. Jakob",
+        2022,
+        "Unbiased inverse volume rendering with differential trackers",
+        "ACM Transactions on Graphics 41(4)",
+    ),
     "kettunen_2021": Citation(
         "M. Kettunen, E. d'Eon, J. Pantaleoni, J. Novák",
         2021,

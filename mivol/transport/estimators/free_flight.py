@@ -149,7 +149,7 @@ class FreeFlight:
         if self.media.channels == 1:
             return mi.Spectrum(1)
         zero = [mi.Float(0) for _ in range(self.media.channels)]
-        tau = revisit_media(self.media, passed, sum_optical_depth(segment.ray), zero, active)
+        tau = revisit_media(self.media, passed, sum_optical_depth(), zero, active)
         # Only ratios of transmittances count, and the largest of them is made 1.
         least = least_of(tau)
         value = spectrum([dr.exp(least - row) for row in tau])

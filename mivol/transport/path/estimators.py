@@ -143,6 +143,10 @@ SEGMENT_ESTIMATORS = {
         math.inf,
         "media scatter any number of times, emit beside it, are bounded, or lie behind boundaries that refract",
         "no bias; variance of one flight a segment",
+        (
+            *("woodcock_1965", "hofmann_2021", "amanatides_1987", "veach_1995", "wilkie_2014", "miller_2019"),
+            *("vicini_2021", "nimier_david_2022"),
+        ),
     ),
     "scattering_quadrature": SegmentEntry(
         _make_quadrature,
@@ -154,6 +158,7 @@ SEGMENT_ESTIMATORS = {
     ),
 }
 """Estimators of what media add along a segment, by the name that a plan chooses them by. A question has one answer, or none."""
+
 
 def choose_segment_estimator(asked: SegmentQuestion) -> str | None:
     """The name of the estimator that answers a question; None where none does."""
