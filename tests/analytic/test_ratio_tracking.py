@@ -57,9 +57,9 @@ FIELDS = {
 }
 
 
-def grid(values: np.ndarray) -> Lattice:
+def grid(values: np.ndarray, shift: int | None = None) -> Lattice:
     lattice = Lattice(mi.TensorXf(np.ascontiguousarray(values)), np.array(PLACE))
-    lattice.block_ranges = find_block_ranges(lattice.values)
+    lattice.block_ranges = find_block_ranges(lattice.values, shift)
     return lattice
 
 
@@ -119,7 +119,7 @@ def test_variance_is_as_derived():
     """T^2 (exp(int E(c - m)^2 / (kappa (M - m)) dt) - 1) along the x axis, through one block whose values rise along x."""
     values = np.zeros((7, 7, 7, 1), np.float32)
     values[..., 0] = 0.1 + 0.15 * np.arange(7)
-    lattice, n = grid(values), 1 << 19
+    lattice, n = grid(values, shift=3), 1 << 19
     o = mi.Point3f(dr.full(mi.Float, -2, n), mi.Float(0), mi.Float(0))
     segment = clip(lattice, o, mi.Vector3f(1, 0, 0), 0, dr.inf)
     found, _ = residual_ratio_tracking(lattice, segment, mi.Float(1), seed_pcg32(start(0.7), n), mi.Bool(True))

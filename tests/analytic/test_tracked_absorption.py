@@ -179,7 +179,6 @@ def test_several_passes_add_up(monkeypatch: pytest.MonkeyPatch) -> None:
 REFUSED = {
     "aovs": ({"max_depth": 1, "aovs": "tau,depth"}, {}, "aovs asks for tau, depth: leave aovs out"),
     "deterministic": ({"max_depth": 1, "deterministic": True}, {}, "deterministic is set: leave it out"),
-    "scattering": ({"max_depth": 2}, {"albedo": 0.5}, "scatters at max_depth 2: set max_depth to 1"),
     "emission": ({"max_depth": 1}, {"emission": 0.5}, "a medium of its scene emits: take the emission out"),
 }
 

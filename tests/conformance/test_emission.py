@@ -279,13 +279,6 @@ def test_volpath_does_not_leave_the_light_out():
     assert np.isfinite(np.array(mi.render(plain, integrator=volpath, spp=4))).all()
 
 
-def test_light_that_would_be_scattered_is_refused():
-    scene = picture(interior(twins.Medium(0.5, LE, 0.0, 0.5)))
-    with refused("emits and a medium of its scene scatters at max_depth 2"):
-        shoot(scene, max_depth=2)
-    assert np.isfinite(shoot(scene)).all()
-
-
 def test_emission_density_in_other_cells_is_refused():
     sigma = (rough(1, 0, 2), PLACE)
     for density in ((rough(2, 0, 1, 3, (5, 4, 7)), PLACE), (rough(2, 0, 1, 3), as_float32(centred(1.5 * np.eye(3))))):

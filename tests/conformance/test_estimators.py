@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 
 import mitsuba as mi
 import numpy as np
@@ -16,15 +17,20 @@ from mivol.transport.path.estimators import SEGMENT_ESTIMATORS, SegmentQuestion,
 from mivol.transport.path.settings import Settings
 from scenes import box_of, camera, centred, medium
 
-QUESTIONS = [SegmentQuestion(*flags) for flags in itertools.product((False, True), repeat=4)]
+TURNS = ((1, False), (1, True), (2, False), (math.inf, False), (math.inf, True))
+QUESTIONS = [SegmentQuestion(*flags, *turns) for flags in itertools.product((False, True), repeat=4) for turns in TURNS]
 
 
 @pytest.mark.parametrize("asked", QUESTIONS, ids=str)
 def test_a_question_has_one_answer_at_most(asked: SegmentQuestion) -> None:
-    """Emission beside scattering has no estimator yet, nor have bounded media that do either; all else has exactly one."""
+    """Quadrature is for one scattering, and bounded media that emit must scatter besides; all else has exactly one."""
     found = [name for name, entry in SEGMENT_ESTIMATORS.items() if entry.answers(asked)]
-    asked_at_once = (asked.scatters, asked.emits, asked.is_bounded)
-    assert len(found) == (0 if sum(asked_at_once) > 1 else 1)
+    if asked.scatters:
+        several = asked.scatterings > 1 or asked.emits or asked.is_bounded or asked.refracts
+        assert len(found) == (0 if asked.deterministic and several else 1)
+        assert ("free_flight" in found) == (several and not asked.deterministic)
+    else:
+        assert len(found) == (0 if asked.emits and asked.is_bounded else 1)
     assert choose_segment_estimator(asked) == (found[0] if found else None)
 
 
@@ -43,6 +49,9 @@ def test_an_entry_says_what_it_needs_and_promises(name: str) -> None:
         ("constant", Settings(max_depth=2), "single_scattering"),
         ("constant", Settings(max_depth=1), "absorption"),
         (None, Settings(max_depth=2), "absorption"),
+        ("constant", Settings(max_depth=3), "free_flight"),
+        ("constant", Settings(max_depth=-1), "free_flight"),
+        (None, Settings(max_depth=-1), "absorption"),
         ("point", Settings(max_depth=2, deterministic=True), "scattering_quadrature"),
         ("point", Settings(max_depth=1, deterministic=True), "absorption"),
     ],

@@ -45,10 +45,12 @@ def update() -> None:
     params.update()
 
 
+QUADRATURE = mivol(max_depth=6, deterministic=True)
+
 ROUTES = {
-    "render": (lambda: render(mivol(max_depth=6)), "mivol renders one scattering so far"),
-    "nested": (lambda: render({"type": "moment", "inner": mivol(max_depth=6)}), "mivol renders one scattering so far"),
-    "method": (lambda: mi.load_dict(mivol(max_depth=6)).render(foggy()), "mivol renders one scattering so far"),
+    "render": (lambda: render(QUADRATURE), "quadrature is for one scattering"),
+    "nested": (lambda: render({"type": "moment", "inner": QUADRATURE}), "quadrature is for one scattering"),
+    "method": (lambda: mi.load_dict(QUADRATURE).render(foggy()), "quadrature is for one scattering"),
     "backward": (lambda: carry(lambda image, _: dr.backward(dr.mean(image, axis=None))), MOVED),
     "forward": (lambda: carry(lambda image, _: dr.forward_to(image)), MOVED),
     "from a parameter": (lambda: carry(lambda _, variable: dr.forward(variable)), MOVED),

@@ -289,14 +289,6 @@ def test_a_medium_that_only_absorbs_may_go_deeper():
     assert_same_images(close_up(parts), ours=mivol(max_depth=5), stock=volpath(max_depth=5), rounding=LEAK)
 
 
-@pytest.mark.parametrize("bsdf", ["dielectric", "roughdielectric"])
-def test_a_refractive_boundary_is_refused_by_name(bsdf):
-    ball = ball_of(medium("homogeneous", 0.9, 0.8), (0, 0, 0), 0.9) | {"id": "tank", "bsdf": {"type": bsdf}}
-    scene = close_up({"tank": ball, "sky": scenes.sky(1.0)}, res=2)
-    with refused("tank.*refract|refract.*tank"):
-        scenes.render(scene, mivol(), 1)
-
-
 # -- Samplers, recordings, variants --------------------------------------------------------------------------------------
 
 

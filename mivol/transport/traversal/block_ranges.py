@@ -47,16 +47,19 @@ class BlockRanges:
         return row[:-1], row[-1]
 
 
-def find_block_ranges(values: mi.TensorXf) -> BlockRanges:
+def find_block_ranges(values: mi.TensorXf, shift: int | None = None) -> BlockRanges:
     """Find the minorant and the range of each block of a grid.
 
     Args:
         values: (Z, Y, X, C), finite.
+        shift: log2 of the edge of a block [cells]; None for 2 in a grid of at most ``SMALL`` voxels an axis, else 3.
 
     Cost: 9/8 reads a voxel along each axis, since neighbouring blocks share a layer of nodes.
     """
     z, y, x, c = values.shape
-    flat, shift = dr.detach(values.array), 2 if max(z, y, x) <= SMALL else 3
+    flat = dr.detach(values.array)
+    if shift is None:
+        shift = 2 if max(z, y, x) <= SMALL else 3
     res = tuple(count_blocks(n, shift) for n in (z, y, x))
     rows, ranges = [], []
     for channel in range(c):
