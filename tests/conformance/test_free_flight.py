@@ -1,0 +1,214 @@
+"""Light that scatters any number of times: furnaces, half-spaces and slabs of known radiance, one scattering against the twin,
+channels against their own grey renders, and scenes of surfaces, refraction and emission against Mitsuba."""
+
+from __future__ import annotations
+
+import mitsuba as mi
+import numpy as np
+import pytest
+import scattering_scenes as small
+from false_alarms import assert_precise, assert_same_mean, difference, fresh, over_pixels
+from scattering_scenes import PLACE, aimed, close_up, fog, mivol, pencils, phase, point, rough_grid, smoke
+
+import scenes
+from mivol.scene import plan
+from mivol.validate.moments import Moments
+from scenes import ball_of, box_of, centred, grid_volume, medium
+
+pytestmark = pytest.mark.usefixtures("variant_rgb")
+
+
+@pytest.fixture
+def flies(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Free flights at depth 2 too, where the plan would take the estimator of one scattering."""
+    choose = plan.choose_segment_estimator
+    monkeypatch.setattr(plan, "choose_segment_estimator", lambda asked: "free_flight" if asked.scatters else choose(asked))
+
+
+def volpath(**more: object) -> dict:
+    return {"type": "volpath", "max_depth": -1, "rr_depth": 1000, **more}
+
+
+def unlimited(**more: object) -> dict:
+    return mivol(max_depth=-1, **more)
+
+
+# -- Known radiance ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("top", [1.0, 40.0])
+def test_white_furnace(top):
+    """A medium that only scatters cannot be seen in light that is the same from everywhere: each sample is 1, to rounding.
+
+    The throughput is a product of albedos of 1 and of phase weights that are 1 to some ulps; paths through an optical depth
+    of 40 have some hundred factors of 1 +- 1e-7.
+    """
+    scene = close_up({"smoke": smoke(rough_grid(2, top), 1.0, name="hg", g=0.6)[0], "sky": scenes.sky(1.0)}, res=8)
+    image = scenes.render(scene, unlimited(), 4, seed=fresh(1))
+    assert np.abs(image - 1).max() <= 1e-5
+
+
+@pytest.mark.statistical
+def test_isothermal_furnace():
+    """What absorbs and glows like its surroundings cannot be seen either, whatever it scatters."""
+    interior = medium("mivol_medium", grid_volume("mivol_voxels", rough_grid(3, 3.0), PLACE), 0.6, emission=1.0)
+    scene = close_up({"smoke": box_of(interior, PLACE), "sky": scenes.sky(1.0)}, res=8)
+    found = over_pixels(small.moments(scene, unlimited(rr_depth=50), 64))
+    assert_same_mean(found, 1.0, rounding=1e-5, what="radiance")
+    assert_precise(found, 5e-3, what="radiance")
+
+
+def h_function(albedo: float, mu: float = 1.0) -> float:
+    """Chandrasekhar's H for isotropic scattering, from 1/H = sqrt(1 - w) + w/2 int_0^1 x H(x)/(mu + x) dx (1960, Ch. V)."""
+    x, weight = np.polynomial.legendre.leggauss(200)
+    x, weight = (x + 1) / 2, weight / 2
+    h = np.ones_like(x)
+    for _ in range(3000):
+        h = 1 / (np.sqrt(1 - albedo) + albedo / 2 * (weight * x * h / (x[:, None] + x)).sum(axis=1))
+    return 1 / (np.sqrt(1 - albedo) + albedo / 2 * (weight * x * h / (mu + x)).sum())
+
+
+def half_space(albedo: float) -> mi.Scene:
+    """Seen from above in a constant sky: 400 free paths deep, and as wide to each side as no path gets."""
+    place = centred(np.diag([8000.0, 8000.0, 400.0]), (0, 0, -200.0))
+    sensor = {"type": "orthographic", "to_world": mi.ScalarTransform4f().look_at([0, 0, 5], [0, 0, 0], [0, 1, 0])}
+    sensor |= {"film": scenes.film(4, 4), "sampler": {"type": "independent"}}
+    parts = {"ground": box_of(medium("homogeneous", 1.0, albedo), place), "sky": scenes.sky(1.0), "sensor": sensor}
+    return mi.load_dict({"type": "scene", **parts})
+
+
+@pytest.mark.statistical
+@pytest.mark.parametrize(
+    "albedo", [0.5, 0.9, pytest.param(0.99, marks=pytest.mark.slow), pytest.param(0.999, marks=pytest.mark.slow)]
+)
+def test_half_space(albedo):
+    """By reciprocity the radiance straight down is the plane albedo for light straight down, 1 - H(1) sqrt(1 - w)."""
+    found = over_pixels(small.moments(half_space(albedo), unlimited(rr_depth=20), 1 << 12))
+    truth = 1 - h_function(albedo) * np.sqrt(1 - albedo)
+    assert_same_mean(found, truth, rounding=1e-5, what="albedo")
+    assert_precise(found, 1.5e-3, what="albedo")
+
+
+@pytest.mark.slow
+@pytest.mark.statistical
+@pytest.mark.parametrize(("behind", "truth"), [(-1e3, 0.0973946), (1e3, 0.6609577)], ids=["reflectance", "transmittance"])
+def test_slab_of_van_de_hulst(behind, truth):
+    """Optical depth 2, albedo 0.9, HG 0.75: R and T of light that falls in straight (van de Hulst 1980, table 35).
+
+    A black plane takes the light of one side of the sky; what is left is, by reciprocity, R or T.
+    """
+    place = centred(np.diag([2000.0, 2000.0, 2.0]))
+    look = mi.ScalarTransform4f().look_at([0, 0, 5], [0, 0, 0], [0, 1, 0])
+    lid = mi.ScalarTransform4f().translate([0, 0, behind]).scale(1e8)
+    black = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.0}}
+    sensor = {"type": "orthographic", "to_world": look, "film": scenes.film(8, 8), "sampler": {"type": "independent"}}
+    interior = medium("homogeneous", 1.0, 0.9, phase={"type": "hg", "g": 0.75})
+    parts = {"slab": box_of(interior, place), "sky": scenes.sky(1.0), "sensor": sensor}
+    parts["lid"] = {"type": "rectangle", "to_world": lid, "bsdf": {"type": "twosided", "inner": black}}
+    found = over_pixels(small.moments(mi.load_dict({"type": "scene", **parts}), unlimited(rr_depth=20), 1 << 13))
+    assert_same_mean(found, truth, rounding=2e-5, what="radiance")
+    assert_precise(found, 2e-4 * 2, what="radiance")
+
+
+# -- One scattering, against the twin -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.statistical
+@pytest.mark.parametrize("kind", ["grid", "fog", "rgb"])
+def test_one_scattering_is_that_of_the_twin(flies, kind):
+    lamp, twin = point([1.7, -0.6, 1.4])
+    if kind == "fog":
+        box, own = fog(0.8, name="hg", g=0.4)
+    else:
+        grid = rough_grid(4, 3.0)
+        box, own = smoke(np.concatenate([grid, 0.1 * grid, 0 * grid], axis=-1) if kind == "rgb" else grid, name="hg", g=0.4)
+    seen = pencils({"smoke": box, "bulb": lamp}, *aimed(5))
+    small.assert_twin(seen, [own], [twin], mivol(), 1 << 11, precision=0.05)
+
+
+# -- Channels ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.statistical
+@pytest.mark.parametrize("ratio", [(1.0, 0.1, 3.0), pytest.param((1.0, 0.0, 1e4), marks=pytest.mark.slow)], ids=str)
+def test_each_channel_is_its_grey_render(ratio):
+    grid, lamps = rough_grid(6, 1.0), {"sky": scenes.sky(0.5), "bulb": point([1.7, -0.6, 1.4])[0]}
+    seen = lambda values: small.moments(close_up({"smoke": smoke(values, 0.8)[0], **lamps}, res=8), mivol(max_depth=6), 256)  # noqa: E731
+    colour = over_pixels(seen(np.concatenate([r * grid for r in ratio], axis=-1)))
+    for channel, r in enumerate(ratio):
+        grey = over_pixels(seen(np.float32(r) * grid))
+        both = [type(e)(*(np.asarray(v)[channel, None] for v in e)) for e in (colour, grey)]
+        assert_same_mean(*both, rounding=1e-5, what=f"channel {channel}")
+        assert_precise(difference(*both), 0.02 * grey.mean[channel], what=f"channel {channel}")
+
+
+# -- Scenes, against Mitsuba ---------------------------------------------------------------------------------------------------
+
+
+def _floor() -> dict:
+    down = mi.ScalarTransform4f().translate([0, 0, -1.3]).scale(3)
+    return {"type": "rectangle", "to_world": down, "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.6}}}
+
+
+def _area(radius: float = 0.4, radiance: float = 8.0) -> dict:
+    lamp = {"type": "area", "radiance": {"type": "rgb", "value": radiance}}
+    return {"type": "sphere", "center": [1.2, 0.3, 1.9], "radius": radius, "emitter": lamp}
+
+
+def _tank(bsdf: dict) -> dict:
+    milk = medium("homogeneous", 2.0, 0.9, phase=phase("hg", 0.5)[0])
+    return ball_of(milk, (0, 0, 0), 0.9) | {"bsdf": bsdf}
+
+
+SCENES = {
+    "smoke in a room": lambda: {
+        "smoke": smoke(rough_grid(7, 3.0), 0.8, name="hg", g=0.5)[0],
+        "floor": _floor(),
+        "lamp": _area(),
+    },
+    "milk in a glass": lambda: {"tank": _tank({"type": "dielectric"}), "sky": scenes.sky(0.4), "lamp": _area(0.7)},
+    "milk in rough glass": lambda: {"tank": _tank({"type": "roughdielectric", "alpha": 0.3}), "sky": scenes.sky(0.4)},
+    "two media": lambda: {
+        "smoke": box_of(medium("homogeneous", 0.7, 0.9), centred(np.eye(3), (0.8, 0, 0))),
+        "ball": ball_of(medium("homogeneous", 1.5, 0.6, phase=phase("hg", -0.3)[0]), (-0.7, 0, 0), 0.6),
+        "sky": scenes.sky(0.4),
+        "lamp": _area(),
+    },
+    "a wall inside": lambda: {
+        "smoke": smoke(rough_grid(9, 2.0), 0.9)[0],
+        "wall": {"type": "sphere", "radius": 0.4, "bsdf": {"type": "conductor"}},
+        "bulb": point([1.7, -0.6, 1.4])[0],
+    },
+}
+
+
+@pytest.mark.statistical
+@pytest.mark.parametrize("name", small.cases(SCENES, slow=("milk in rough glass", "two media", "a wall inside")))
+def test_scenes_are_those_of_volpath(name):
+    """Grids have empty borders, where volpath's delta tracking loses light at a boundary."""
+    scene = close_up(SCENES[name](), res=8)
+    small.assert_same_images(
+        scene, (128, 128), 16, ours=unlimited(rr_depth=1000), stock=volpath(), rounding=1e-5, precision=0.03
+    )
+
+
+@pytest.mark.statistical
+def test_roulette_keeps_the_mean():
+    scene = close_up({"smoke": smoke(rough_grid(7, 3.0), 0.7)[0], "sky": scenes.sky(1.0)}, res=8)
+    early, never = (over_pixels(small.moments(scene, unlimited(rr_depth=k), 128, first=k)) for k in (1, 1000))
+    assert_same_mean(early, never, rounding=1e-6, what="radiance")
+    assert_precise(difference(early, never), 5e-3, what="radiance")
+
+
+@pytest.mark.statistical
+def test_alpha_is_the_opacity():
+    """What is drawn has the mean of what is known."""
+    rgba = mi.load_dict({"type": "hdrfilm", "width": 8, "height": 8, "pixel_format": "rgba", "rfilter": {"type": "box"}})
+    scene = mi.load_dict(
+        {"type": "scene", "smoke": smoke(rough_grid(7, 2.0), 0.8)[0], "bulb": point([1.7, -0.6, 1.4])[0]}
+        | {"sensor": scenes.camera((1.5, -2.5, 1.2), (0, 0, 0), res=8, fov=40.0) | {"film": rgba}}
+    )
+    drawn, known = (small.moments(scene, mivol(max_depth=depth), 64) for depth in (3, 2))
+    a, b = (over_pixels(Moments(m.n, m.mean[..., 3:], m.m2[..., 3:])) for m in (drawn, known))
+    assert_same_mean(a, b, rounding=1e-6, what="alpha")
+    assert_precise(difference(a, b), 5e-3, what="alpha")

@@ -1,0 +1,212 @@
+"""Derivatives of light that scatters any number of times: against the float64 twin at one scattering, forward against reverse,
+furnaces that no density changes, and differences of renders."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import oracle_scattering as twins
+import pytest
+import scattering_scenes as small
+from false_alarms import assert_precise, assert_same_mean, difference, fresh
+from scattering_gradients import BATCHES, DENSITIES, GRID, assert_gradient, gradients, release, watched, weights
+from scattering_scenes import PLACE, aimed, close_up, mivol, pencils, point, rough_grid, smoke, sun
+
+import scenes
+from mivol.scene import plan
+from mivol.validate.moments import Moments
+from mivol.validate.statistics import Estimate
+from scenes import as_float32, ball_of, box_of, grid_volume, medium
+
+pytestmark = pytest.mark.usefixtures("variant_rgb")
+
+MEDIUM = "smoke.interior_medium."
+
+
+@pytest.fixture
+def flies(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Free flights at depth 2 too, where the plan would take the estimator of one scattering."""
+    choose = plan.choose_segment_estimator
+    monkeypatch.setattr(plan, "choose_segment_estimator", lambda asked: "free_flight" if asked.scatters else choose(asked))
+
+
+# -- One scattering, against the twin -----------------------------------------------------------------------------------
+
+
+@pytest.mark.statistical
+@pytest.mark.parametrize(
+    ("density", "lamp"),
+    small.cases(
+        [("empty", "point"), ("half empty", "point"), ("flat", "point"), ("rough", "sun"), ("dense", "point")],
+        [("flat", "point"), ("dense", "point"), ("rough", "sun")],
+    ),
+)
+def test_density(flies, density, lamp):
+    """Empty, half empty and flat (density equal to the majorant) are where other estimators are biased."""
+    shine = point([1.5, 1, 2.0]) if lamp == "point" else sun([0.3, 0.2, -1.0])
+    box, m = smoke(as_float32(DENSITIES[density]()), 0.7, "own", PLACE, "hg", 0.4)
+    seen = pencils({"smoke": box, "lamp": shine[0]}, *aimed(1, 8))
+    w, rows = weights(8)
+    truth, _ = twins.radiance_gradient(m, [shine[1]], seen.o, seen.d, rows)
+    assert_gradient(gradients(seen, GRID, w, 2048), truth[..., None], density, 0.1)
+
+
+# -- Any number ----------------------------------------------------------------------------------------------------------
+
+
+def _backward(scene: mi.Scene, key: str, w: np.ndarray, spp: int, seed: int, integrator: mi.Integrator) -> np.ndarray:
+    """J^T w, by the integrator's own pass."""
+    params, variable = watched(scene, key)
+    integrator.render_backward(scene, params, mi.TensorXf(np.asarray(w, dtype=np.float32)), seed=seed, spp=spp)
+    found = np.array(dr.grad(variable), dtype=np.float64)
+    release(scene, key, variable)
+    return found
+
+
+def _forward(scene: mi.Scene, key: str, v: np.ndarray, spp: int, seed: int, integrator: mi.Integrator) -> np.ndarray:
+    """J v with the same random numbers."""
+    params, variable = watched(scene, key)
+    kind = type(variable)
+    dr.set_grad(variable, kind(np.asarray(v, dtype=np.float32)) if np.ndim(v) else kind(float(v)))
+    found = np.array(integrator.render_forward(scene, params, seed=seed, spp=spp), dtype=np.float64)
+    release(scene, key, variable)
+    return found
+
+
+@pytest.mark.parametrize("g", [0.0, 0.6])
+def test_a_white_furnace_has_no_derivative(g):
+    """Light at the end of a flight is that of the level, and so is the light that a probe finds, sample by sample."""
+    scene = close_up({"smoke": smoke(rough_grid(2, 5.0), 1.0, "own", name="hg", g=g)[0], "sky": scenes.sky(1.0)}, res=8)
+    integrator = mi.load_dict(mivol(max_depth=-1, rr_depth=100))
+    found = _backward(scene, GRID, np.ones((8, 8, 3)), 16, fresh(3), integrator)
+    # A white surface in place of the sky's light has the derivative of the optical depth: some samples a voxel of size 1.
+    plain = _backward(scene, GRID, np.ones((8, 8, 3)), 16, fresh(3), mi.load_dict({"type": "mivol", "max_depth": 1}))
+    assert np.abs(found).max() <= 1e-5 * np.abs(plain).max()
+
+
+def _everything(colour: bool = False) -> mi.Scene:
+    """One scene with each kind of parameter; a half of the density is empty, and of the albedo a part is 0."""
+    density = rough_grid(4, 3.0) * (np.arange(6) < 3)[None, None, :, None]
+    albedo = 0.9 * rough_grid(5, 1.0, (3, 3, 3)) * (np.arange(3) > 0)[None, None, :, None]
+    if colour:
+        density = np.concatenate([density, 0.2 * density, 2 * density], axis=-1)
+    interior = medium(
+        "mivol_medium",
+        grid_volume("mivol_voxels", density, PLACE),
+        grid_volume("mivol_voxels", albedo, PLACE),
+        phase={"type": "mivol_hg", "g": 0.3},
+        emission=grid_volume("mivol_voxels", rough_grid(6, 1.0, (3, 3, 3)), PLACE),
+    )
+    down = mi.ScalarTransform4f().translate([0, 0, -1.3]).scale(3)
+    floor = {"type": "rectangle", "to_world": down, "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.6}}}
+    parts = {"smoke": box_of(interior, PLACE), "bulb": point([1.7, -0.6, 1.4])[0], "sky": scenes.sky(0.3), "floor": floor}
+    return close_up(parts, res=8)
+
+
+PARAMETERS = {
+    "density": MEDIUM + "sigma_t.data",
+    "albedo": MEDIUM + "albedo.data",
+    "g": MEDIUM + "phase_function.g",
+    "emission": MEDIUM + "emission.data",
+    "scale": MEDIUM + "scale",
+    "lamp": "bulb.intensity.value",
+    "floor": "floor.bsdf.reflectance.value",
+}
+
+
+@pytest.mark.parametrize("colour", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["grey", "rgb"])
+@pytest.mark.parametrize("name", small.cases(PARAMETERS, slow=("scale", "floor", "lamp")))
+def test_forward_is_the_transpose_of_reverse(name, colour):
+    """<J v, w> = <v, J^T w> of one seed: both are sums of the same terms in another order, in float32."""
+    scene, key = _everything(colour), PARAMETERS[name]
+    integrator = mi.load_dict(mivol(max_depth=5, rr_depth=3))
+    w = np.random.default_rng(1).uniform(0.5, 1.5, (8, 8, 3))
+    params = mi.traverse(scene)
+    v = np.random.default_rng(2).uniform(0.5, 1.5, np.shape(params[key])) if np.size(params[key]) > 3 else 1.0
+    seed = fresh(5)
+    there = _forward(scene, key, v, 16, seed, integrator)
+    back = _backward(scene, key, w, 16, seed, integrator)
+    a, b = np.sum(there * w), np.sum(back * v)
+    # 1024 paths of some ten terms each, summed in float32; they are of both signs, so the sum of sizes counts.
+    assert a == pytest.approx(b, abs=1e-4 * max(np.abs(there * w).sum(), np.abs(back * v).sum()))
+    assert a != 0
+
+
+def _along(scene: mi.Scene, key: str, v: np.ndarray, integrator: mi.Integrator, spp: int) -> Estimate:
+    """The derivative of the mean image along v, from 16 reverse passes."""
+    w = np.full((8, 8, 3), 1 / 192)
+    found = [np.sum(_backward(scene, key, w, spp, fresh(k), integrator) * v) for k in range(BATCHES)]
+    return Estimate.of(Moments.of(np.array(found)[:, None]))
+
+
+def _difference(scene: mi.Scene, key: str, v: np.ndarray, h: float, integrator: mi.Integrator, spp: int) -> Estimate:
+    """(f(x + h v) - f(x - h v)) / 2 h of the mean image; batches share their random numbers, which takes most of the noise."""
+    params = mi.traverse(scene)
+    kind, start = type(params[key]), np.array(params[key], dtype=np.float64)
+    found = []
+    for k in range(BATCHES):
+        both = []
+        for sign in (1, -1):
+            value = np.asarray(start + sign * h * v, dtype=np.float32)
+            params[key] = kind(value) if value.ndim else kind(float(value))
+            params.update()
+            both.append(scenes.render(scene, integrator, spp, seed=fresh(900 + k)).astype(np.float64).mean())
+        found.append((both[0] - both[1]) / (2 * h))
+    value = start.astype(np.float32)
+    params[key] = kind(value) if value.ndim else kind(float(value))
+    params.update()
+    return Estimate.of(Moments.of(np.array(found)[:, None]))
+
+
+ROOMS = {
+    "sky": lambda density: {"smoke": smoke(density, 0.75, "own")[0], "sky": scenes.sky(1.0)},
+    "sun": lambda density: {"smoke": smoke(density, 0.75, "own", name="hg", g=0.8)[0], "sun": sun([0.3, 0.2, -1.0])[0]},
+    "lamp inside": lambda density: {
+        "smoke": smoke(density, 0.75, "own")[0],
+        "lamp": {"type": "sphere", "center": [0.2, 0.1, 0.3], "radius": 0.2, "emitter": {"type": "area", "radiance": 9.0}},
+    },
+    "glass": lambda density: {
+        "smoke": ball_of(medium("mivol_medium", grid_volume("mivol_voxels", density, PLACE), 0.75), (0, 0, 0), 0.9)
+        | {"bsdf": {"type": "dielectric"}},
+        "sky": scenes.sky(0.5),
+        "lamp": {"type": "sphere", "center": [1.2, 0.3, 1.9], "radius": 0.6, "emitter": {"type": "area", "radiance": 9.0}},
+    },
+}
+
+
+@pytest.mark.slow
+@pytest.mark.statistical
+@pytest.mark.parametrize("depth", [6, -1])
+@pytest.mark.parametrize("room", ROOMS)
+def test_density_by_differences(room, depth):
+    """Along the density itself, which keeps empty voxels empty.
+
+    The truncation of a central difference is h^2/6 of the third derivative; along the density that is of the size of the
+    derivative at an optical depth of about 1, so 0.05^2/6 = 4e-4 of it.
+    """
+    density = rough_grid(4, 3.0)
+    scene = close_up(ROOMS[room](density), res=8)
+    integrator = mi.load_dict(mivol(max_depth=depth, rr_depth=50))
+    found = _along(scene, GRID, density, integrator, 1024)
+    truth = _difference(scene, GRID, density, 0.05, integrator, 4096)
+    assert_same_mean(found, truth, rounding=2e-3 * np.abs(truth.mean), what="derivative")
+    assert_precise(difference(found, truth), 0.1 * np.abs(truth.mean) + 1e-4, what="derivative")
+
+
+@pytest.mark.slow
+@pytest.mark.statistical
+def test_coefficients_are_those_of_density_and_albedo():
+    """sigma_a and sigma_s in place of sigma_t and albedo, at voxels of 0 of each: the chain rule between the two."""
+    density, albedo = rough_grid(4, 2.0), 0.6
+    whole = close_up({"smoke": smoke(density, albedo, "own")[0], "bulb": point([1.5, 1, 2.0])[0]}, res=8)
+    shares = (("sigma_a", 0.4), ("sigma_s", 0.6))
+    parts = {name: grid_volume("mivol_voxels", as_float32(c * density), PLACE) for name, c in shares}
+    interior = {"type": "mivol_medium", **parts}
+    split = close_up({"smoke": box_of(interior, PLACE), "bulb": point([1.5, 1, 2.0])[0]}, res=8)
+    integrator = mi.load_dict(mivol(max_depth=4))
+    by_density = _along(whole, GRID, density, integrator, 256)
+    a, s = (_along(split, f"{MEDIUM}{name}.data", as_float32(c * density), integrator, 256) for name, c in shares)
+    total = Estimate(a.mean + s.mean, a.var + s.var, np.minimum(a.dof, s.dof))
+    assert_same_mean(total, by_density, rounding=1e-6, what="derivative")
+    assert_precise(difference(total, by_density), 0.2 * np.abs(by_density.mean) + 1e-3, what="derivative")
