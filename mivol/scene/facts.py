@@ -45,6 +45,8 @@ class MediumFacts:
         occupied: fraction of its blocks of cells that are not empty; of its emptiest grid.
         tau_max: upper bound of the optical depth [1] through its box; None where its boundary is no box.
         unread: values could not be read, because ``dr.freeze`` records.
+        mean_cosine: of its phase function [1], when it was first asked; None where it does not scatter, or where some emitter
+            is not at infinity and nothing depends on it.
         bounded: class of a field of which no more than a majorant is known along a ray; None where optical depths are exact.
     """
 
@@ -60,6 +62,7 @@ class MediumFacts:
     tau_max: float | None
     unread: bool = False
     bounded: str | None = None
+    mean_cosine: float | None = None
 
 
 @dataclass(frozen=True)
@@ -76,6 +79,7 @@ class Needs:
         emitters: class names.
         emitter_kinds: ``uniform`` (an environment that is the same in all directions), ``delta`` (one position or direction) or
             ``extended``, of each emitter.
+        are_emitters_far: every emitter is at infinity, and one of them is not ``uniform``.
         refractive: names of the boundaries that bend or blur the light that passes them.
         start: medium that the sensor names.
         camera_inside: the camera may be inside the box around a boundary.
@@ -92,6 +96,7 @@ class Needs:
     has_null_transmission: bool
     emitters: tuple[str, ...]
     emitter_kinds: tuple[str, ...]
+    are_emitters_far: bool
     refractive: tuple[str, ...]
     start: mi.Medium | None
     camera_inside: bool

@@ -11,6 +11,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mivol.scene.depth_two import mean_cosine
 from mivol.scene.facts import Boundary, MediumFacts, Needs
 from mivol.scene.nesting import bounds
 from mivol.scene.parsing import check_variant
@@ -52,6 +53,7 @@ def find_needs(scene: mi.Scene, sensor: mi.Sensor, survey: SceneSurvey | None = 
         has_null_transmission=survey.has_null_transmission,
         emitters=survey.emitters,
         emitter_kinds=survey.emitter_kinds,
+        are_emitters_far=survey.are_emitters_far,
         refractive=survey.refractive,
         start=sensor.get_medium(),
         camera_inside=_camera_inside(scene, sensor, survey),
@@ -87,6 +89,7 @@ def _facts(boundary: Boundary, view: MediumView, survey: SceneSurvey, recording:
     grids = [p.lattice for p in view.parts if p.lattice is not None]
     phase = boundary.medium.phase_function()
     common = {
+        "mean_cosine": survey.cosines.get(boundary.name),
         "name": boundary.name,
         "kind": kind_of(boundary.medium),
         "boundary": _where(boundary),
@@ -105,6 +108,9 @@ def _facts(boundary: Boundary, view: MediumView, survey: SceneSurvey, recording:
     reads = [read_part(p, survey, boundary.name) for p in view.parts if p.lattice is not None]
     occupied = min((r.occupied for r in reads), default=1.0)
     scatters = survey.scatters[boundary.name] = is_scattering(view, survey, boundary.name)
+    if scatters and survey.are_emitters_far and common["mean_cosine"] is None:
+        # Once: where a fit changes the phase function, what is made of this stays unbiased.
+        common["mean_cosine"] = survey.cosines[boundary.name] = mean_cosine(phase)
     return MediumFacts(**common, is_scattering=scatters, occupied=occupied, tau_max=_tau_max(boundary, view, reads))
 
 

@@ -19,6 +19,7 @@ from mivol.scene.choices import (
     choose_flights,
     choose_lighting,
     choose_shadows,
+    choose_side_flights,
     choose_skipping,
     choose_tracing,
     choose_transport,
@@ -53,7 +54,8 @@ class Plan:
     ``skips`` tells for each medium whether empty blocks are skipped, ``tracks`` whether its shadows are estimated in pictures;
     ``segment`` names the estimator of what media add along a segment, in
     :data:`mivol.transport.path.estimators.SEGMENT_ESTIMATORS`; ``events`` how many points of a camera ray scatter in
-    pictures; ``pass_rays`` how many rays a pass may hold; ``gradient_bytes`` what a gradient step takes beyond the rays.
+    pictures; ``pass_rays`` how many rays a pass may hold; ``gradient_bytes`` what a gradient step takes beyond the rays;
+    ``lobe`` the mean cosine of the lobe that side flights are drawn from, None for no side flights.
     """
 
     choices: tuple[Choice, ...]
@@ -63,6 +65,7 @@ class Plan:
     events: int
     pass_rays: int
     gradient_bytes: int
+    lobe: float | None = None
 
 
 def make_plan(needs: Needs, settings: Settings, aovs: tuple[str, ...] = ()) -> Plan:
@@ -100,7 +103,9 @@ def make_plan(needs: Needs, settings: Settings, aovs: tuple[str, ...] = ()) -> P
     )
     memory, choice = _gradient(needs)
     choices.append(choice)
-    return Plan(tuple(choices), skips, tracks, segment, events, pass_rays, memory)
+    lobe, why = choose_side_flights(needs, settings, segment)
+    choices += why
+    return Plan(tuple(choices), skips, tracks, segment, events, pass_rays, memory, lobe)
 
 
 def _segment(needs: Needs, settings: Settings) -> str:

@@ -25,7 +25,7 @@ class SceneSurvey:
     """What does not change while shapes stay where they are, and a cache of what was read of arrays.
 
     Attributes:
-        boundaries, surfaces, has_null_transmission, emitters, emitter_kinds, refractive: as in
+        boundaries, surfaces, has_null_transmission, emitters, emitter_kinds, are_emitters_far, refractive: as in
             :class:`mivol.scene.facts.Needs`.
         marks: boundaries, each with what another place would change of it: its vertices or its box.
         size: diagonal of the box around all shapes [length].
@@ -33,6 +33,7 @@ class SceneSurvey:
         scatters: whether each medium scattered when it was last read, by name.
         values, numbers: what was read of arrays and of constants (:mod:`mivol.scene.readings`).
         places: where grids lie (:func:`mivol.transport.media.read_medium.view_medium`).
+        cosines: mean cosines of phase functions, by the name of the medium.
         warned: grids whose values below 0 were told of.
     """
 
@@ -41,6 +42,7 @@ class SceneSurvey:
     has_null_transmission: bool
     emitters: tuple[str, ...]
     emitter_kinds: tuple[str, ...]
+    are_emitters_far: bool
     refractive: tuple[str, ...]
     marks: tuple[tuple[mi.Shape, object], ...] = ()
     size: float = 1.0
@@ -49,6 +51,7 @@ class SceneSurvey:
     values: dict = field(default_factory=dict)
     places: dict = field(default_factory=dict)
     numbers: dict = field(default_factory=dict)
+    cosines: dict = field(default_factory=dict)
     warned: set = field(default_factory=set)
 
     @property
@@ -90,7 +93,15 @@ def survey_scene(scene: mi.Scene) -> SceneSurvey:
     kinds = tuple(_emitter_kind(e) for e in scene.emitters())
     marks = tuple((s, _mark(s)) for s in shapes if s.is_medium_transition())
     return SceneSurvey(
-        tuple(boundaries), tuple(surfaces), bool(has_null), names, kinds, tuple(refractive), marks, extent(scene)
+        tuple(boundaries),
+        tuple(surfaces),
+        bool(has_null),
+        names,
+        kinds,
+        _are_far(scene.emitters()),
+        tuple(refractive),
+        marks,
+        extent(scene),
     )
 
 
@@ -112,6 +123,12 @@ def _emitter_kind(emitter: mi.Emitter) -> str:
     if emitter.class_name() == UNIFORM:
         return "uniform"
     return "delta" if int(emitter.flags()) & int(mi.EmitterFlags.Delta) else "extended"
+
+
+def _are_far(emitters: list[mi.Emitter]) -> bool:
+    """Whether every emitter is at infinity, and one of them is not the same from everywhere."""
+    infinite = all(int(e.flags()) & int(mi.EmitterFlags.Infinite) for e in emitters)
+    return infinite and any(_emitter_kind(e) != "uniform" for e in emitters)
 
 
 def _is_bare(shape: mi.Shape) -> bool:

@@ -299,9 +299,7 @@ def _bodies_at(media: SceneMedia, index: mi.UInt32, on: mi.Bool) -> list[tuple[B
     return [(body, on & (index == k)) for k, body in enumerate(media.bodies)]
 
 
-def _scattering_part(
-    media: SceneMedia, body: Body, ray: mi.Ray3f, t: mi.Float64, on: mi.Bool
-) -> tuple[str, mi.Spectrum]:
+def _scattering_part(media: SceneMedia, body: Body, ray: mi.Ray3f, t: mi.Float64, on: mi.Bool) -> tuple[str, mi.Spectrum]:
     """The name of the coefficient that makes collisions scatter, and its value [1/length] at a point."""
     name = "sigma_s" if body.view.albedo is None else "sigma_"
     return name, spectrum(body.extinction_at(ray, dr.select(on, t, 0), media.channels, on, name))

@@ -135,9 +135,7 @@ class FreeFlight:
     def _extinction(self, body: Body, ray: mi.Ray3f, t: mi.Float64, on: mi.Bool, name: str = "sigma_") -> mi.Spectrum:
         return spectrum(body.extinction_at(ray, dr.select(on, t, 0), self.media.channels, on, name))
 
-    def _weigh(
-        self, segment: PathSegment, passed: RaySegment, collision: Collision | None, active: mi.Bool
-    ) -> mi.Spectrum:
+    def _weigh(self, segment: PathSegment, passed: RaySegment, collision: Collision | None, active: mi.Bool) -> mi.Spectrum:
         """The value of each channel's flight over the mean density of all of them, weighed by their throughputs.
 
         Args:

@@ -80,6 +80,10 @@ class MediumVertex:
     def eval(self, d: mi.Vector3f, active: mi.Bool) -> mi.Spectrum:
         return self.phase.eval_pdf(phase_context(), self.interaction, d, active)[0]
 
+    def eval_and_pdf(self, d: mi.Vector3f, active: mi.Bool) -> tuple[mi.Spectrum, mi.Float]:
+        """Both, without derivatives."""
+        return dr.detach(self.eval(d, active)), self.pdf(d, active)
+
     def pdf(self, d: mi.Vector3f, active: mi.Bool) -> mi.Float:
         return phase_pdf(self.media, self.phase, self.interaction, d, active)
 

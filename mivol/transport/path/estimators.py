@@ -175,13 +175,19 @@ class Estimators:
             combined by multiple importance sampling.
         lights_media: likewise where a path ends a segment in a medium. Under a constant environment alone it is not so: light
             that is the same from everywhere is found without noise by the paths that escape.
+        lobe: mean cosine of the lobe that side flights are drawn from (:mod:`.side_flight`); None for no side flights.
     """
 
     def __init__(
-        self, direct: DirectLighting, segment: SegmentEstimator, lights_surfaces: bool, lights_media: bool = False
+        self,
+        direct: DirectLighting,
+        segment: SegmentEstimator,
+        lights_surfaces: bool,
+        lights_media: bool = False,
+        lobe: mi.Float | None = None,
     ) -> None:
         self.media, self.direct, self.segment = direct.media, direct, segment
-        self.lights_surfaces, self.lights_media = lights_surfaces, lights_media
+        self.lights_surfaces, self.lights_media, self.lobe = lights_surfaces, lights_media, lobe
 
     def prepare_derivatives(self, ray: mi.Ray3f) -> None:
         """Find what derivatives along camera rays need beforehand, once for all passes."""

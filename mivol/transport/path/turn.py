@@ -55,9 +55,7 @@ class Turn:
     factors: list[TrackedFactor]
 
 
-def sample_turn(
-    estimators: Estimators, ray: mi.Ray3f, event: PathEvent, samples: TurnSamples, may_scatter: mi.Bool
-) -> Turn:
+def sample_turn(estimators: Estimators, ray: mi.Ray3f, event: PathEvent, samples: TurnSamples, may_scatter: mi.Bool) -> Turn:
     """Sample the direction in which a path goes on.
 
     Args:

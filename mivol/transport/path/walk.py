@@ -33,6 +33,7 @@ from mivol.transport.path.estimators import Estimators
 from mivol.transport.path.event import PathEvent
 from mivol.transport.path.scores import Primal, Replay, Tangent
 from mivol.transport.path.settings import Settings
+from mivol.transport.path.side_flight import Aim, SideSamples, fly_aside, weigh_aim
 from mivol.transport.path.turn import TurnSamples, sample_turn
 from mivol.transport.traversal.ray_spawning import camera_ray
 from mivol.transport.traversal.strata import Strata
@@ -63,6 +64,7 @@ class Path:
         score: :mod:`mivol.transport.path.scores`.
         sampler, strata: random numbers.
         probe: a point of one of the flights so far, at which derivatives are looked at besides; None for pictures.
+        aim: the emitter sample that was drawn for the next vertex; None where there are no side flights.
     """
 
     ray: mi.Ray3f
@@ -80,6 +82,7 @@ class Path:
     sampler: mi.Sampler
     strata: Strata | None
     probe: Probe | None = None
+    aim: Aim | None = None
 
 
 def walk_path(
@@ -120,6 +123,8 @@ def walk_path(
         return path.score, _alpha(path.stopped, path.clear)
     if estimators.segment.ends_in_media and score.purpose != PICTURE:
         path.probe = Probe.none(ray)
+    if estimators.lobe is not None:
+        path.aim = Aim.none(dr.width(ray))
     path = _walk_on(estimators, settings, limit, path)
     if path.probe is not None:
         path.score = path.score.add(_estimate_probe(estimators, settings, limit, path.probe, sampler))
@@ -160,9 +165,16 @@ def _walk_on(estimators: Estimators, settings: Settings, limit: int, path: Path)
     return dr.while_loop(state=(path,), cond=lambda p: p.active, body=step, label="path")[0]
 
 
-def _estimate_probe(
-    estimators: Estimators, settings: Settings, limit: int, probe: Probe, sampler: mi.Sampler
-) -> ProbeTerm:
+def _add_side_flight(estimators: Estimators, path: Path, event: PathEvent, active: mi.Bool) -> tuple[Path, SideSamples]:
+    """Draw an emitter sample for the next vertex, and look at it from the end of a side flight."""
+    media, sampler = estimators.media, path.sampler
+    u, lobe, flight = sampler.next_2d(active), sampler.next_2d(active), estimators.segment.draw(sampler, active, None)
+    samples = SideSamples(u, lobe, flight, sampler.next_1d(active) if media.is_bounded or media.estimates_shadows else None)
+    path.score = path.score.add(fly_aside(estimators, event.collision, path.beta, samples, active))
+    return path, samples
+
+
+def _estimate_probe(estimators: Estimators, settings: Settings, limit: int, probe: Probe, sampler: mi.Sampler) -> ProbeTerm:
     """Estimate the radiance that is scattered at a probe towards the path, by a path of its own."""
     media, n = estimators.media, dr.width(probe.ray)
     on = probe.weight > 0
@@ -233,6 +245,9 @@ def _scatter(estimators: Estimators, settings: Settings, limit: int, path: Path,
     arrives, sampler = event.at_surface | event.in_medium, path.sampler
     may_scatter = arrives & (path.depth + 1 < limit)
     path = _add_direct_light(estimators, path, event, may_scatter)
+    ahead = event.in_medium & (path.depth + 2 < limit)
+    if path.aim is not None:
+        path, aside = _add_side_flight(estimators, path, event, ahead)
 
     # -- The direction the path takes -----------------------------------------------------------------------------------------
     u1, u2 = sampler.next_1d(arrives), sampler.next_2d(arrives)
@@ -240,6 +255,8 @@ def _scatter(estimators: Estimators, settings: Settings, limit: int, path: Path,
     path.stopped |= arrives & ~turn.through
     for factor in turn.factors:
         path.score = path.score.scale(factor)
+    if path.aim is not None:
+        path.aim = weigh_aim(estimators, event.collision.mei, aside.emitter, turn.ray.d, turn.pdf, ahead & turn.on)
     path.beta *= dr.select(turn.on, turn.weight, 0)
     path.eta *= dr.select(turn.on, turn.eta, 1)
     path.ray, path.medium = turn.ray, dr.select(turn.on, turn.medium, path.medium)
@@ -271,13 +288,16 @@ def _add_direct_light(estimators: Estimators, path: Path, event: PathEvent, may_
         lit |= may_scatter & event.in_medium
     if not (estimators.lights_surfaces or estimators.lights_media):
         return path
-    estimates = media.is_bounded or (estimators.segment.ends_in_media and media.estimates_shadows and purpose == PICTURE)
+    estimates = media.is_bounded or (estimators.segment.ends_in_media and media.estimates_shadows)
     u, chance = sampler.next_2d(lit), sampler.next_1d(lit) if estimates else None
+    if path.aim is not None:
+        u = dr.select(path.aim.on, path.aim.u, u)
     vertex = event.vertex(media, path.ray)
     direct = estimators.direct.at_vertex(vertex, u, purpose != PICTURE, lit, chance)
     with dr.resume_grad(when=purpose != PICTURE):
         carried = path.beta * direct.value
         if event.collision is not None:
-            carried = dr.select(event.in_medium, carried * event.collision.albedo, carried)
+            inside = event.collision.albedo if path.aim is None else event.collision.albedo * path.aim.weight
+            carried = dr.select(event.in_medium, carried * inside, carried)
     path.score = path.score.add(DirectLight(media, direct.ray_segment, carried, direct.on))
     return path

@@ -1,0 +1,103 @@
+r"""A second technique for light that scatters twice in peaked phase functions: a side flight towards the light.
+
+At a vertex x of a path in a medium the direction w of an emitter sample is drawn for the *next* vertex x'. The path's own
+direction comes from the phase function at x, with density p; x' then scatters little of the light from w, unless that
+direction happens to be near w. A side flight leaves x in a direction from a lobe about w, with density q, and looks at the
+emitter along w from where it collides. Given w, both estimate the light that goes from w over x' to x, so they are combined by
+the balance heuristic: the direct light at x' counts p / (p + q), that at the end of the side flight q / (p + q).
+
+Emitters are at infinity here, so that w is as probable at x' as at x.
+
+Source: the balance heuristic of Veach & Guibas 1995, applied to next-event estimation with a direction drawn one vertex early.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from mivol.phase.hg import eval_hg, sample_hg
+from mivol.phase.turn import direction_after, turn_between
+from mivol.transport.estimators.direct_lighting import DirectLight
+from mivol.transport.estimators.segment import PICTURE, Collision, PathSegment
+from mivol.transport.estimators.vertex import MediumVertex
+from mivol.transport.path.estimators import Estimators
+
+__all__ = ["Aim", "SideSamples", "fly_aside", "weigh_aim"]
+
+
+@dataclass
+class Aim:
+    """The emitter sample that the next vertex takes.
+
+    Attributes:
+        u: its random numbers.
+        weight: of the direct light there.
+        on: lanes that have one; the others draw their own, of weight 1.
+    """
+
+    u: mi.Point2f
+    weight: mi.Float
+    on: mi.Bool
+
+    @classmethod
+    def none(cls, width: int) -> Aim:
+        """No aim yet."""
+        return cls(dr.zeros(mi.Point2f, width), dr.full(mi.Float, 1, width), dr.full(mi.Bool, False, width))
+
+
+@dataclass
+class SideSamples:
+    """The random numbers of a side flight: of the emitter, of the lobe, and of the flight."""
+
+    emitter: mi.Point2f
+    lobe: mi.Point2f
+    flight: tuple[mi.Float, mi.Float]
+    chance: mi.Float | None
+
+
+def fly_aside(
+    estimators: Estimators, collision: Collision, beta: mi.Spectrum, samples: SideSamples, active: mi.Bool
+) -> DirectLight:
+    """Estimate the light that scatters twice by a side flight.
+
+    Args:
+        estimators: of the render; their ``lobe`` is the mean cosine of the lobe.
+        collision: the vertex that the flight leaves.
+        beta: throughput to there.
+        samples: random numbers.
+        active: lanes whose path may scatter here and once more.
+
+    Returns:
+        The light, as a term; where the flight meets no medium there is none.
+
+    Cost: one flight and one shadow ray.
+    """
+    media, mei = estimators.media, collision.mei
+    w = _direction_to_emitter(estimators, mei, samples.emitter, active)
+    wo = direction_after(-w, sample_hg(samples.lobe.x, estimators.lobe), samples.lobe.y)
+    f, p = MediumVertex(media, mei).eval_and_pdf(wo, active)
+    carried = beta * collision.albedo * f * dr.rcp(p + eval_hg(turn_between(-w, wo), estimators.lobe))
+    ray = mi.Ray3f(mei.p, wo, dr.inf, mei.time, mei.wavelengths)
+    flown = estimators.segment.estimate(PathSegment(ray, mei.medium, carried, active, samples.flight), PICTURE, active)
+    there = flown.collision
+    on = active & there.on
+    direct = estimators.direct.at_vertex(MediumVertex(media, there.mei), samples.emitter, False, on, samples.chance)
+    return DirectLight(media, direct.ray_segment, carried * flown.T * there.albedo * direct.value, on & direct.on)
+
+
+def weigh_aim(
+    estimators: Estimators, mei: mi.MediumInteraction3f, u: mi.Point2f, wo: mi.Vector3f, p: mi.Float, active: mi.Bool
+) -> Aim:
+    """The aim of the next vertex, for a path that leaves this one in the direction ``wo`` of density ``p``."""
+    w = _direction_to_emitter(estimators, mei, u, active)
+    q = eval_hg(turn_between(-w, wo), estimators.lobe)
+    return Aim(u, dr.select(active, p * dr.rcp(p + q), 1), active)
+
+
+def _direction_to_emitter(estimators: Estimators, mei: mi.MediumInteraction3f, u: mi.Point2f, active: mi.Bool) -> mi.Vector3f:
+    direct, _ = estimators.media.scene.sample_emitter_direction(mi.Interaction3f(mei), u, False, active)
+    # Where an emitter has no light to sample, the direction is 0; its light is 0, whatever the lobe is about.
+    return dr.select(dr.squared_norm(direct.d) > 0.5, direct.d, mi.Vector3f(0, 0, 1))
