@@ -42,7 +42,7 @@ def test_a_wall_under_a_lamp():
     """reflectance / pi I / r^2 exp(-tau); nothing in a lane that is off."""
     direct, vertex = at_wall(scene(lamp=lamp()))
     with dr.suspend_grad():
-        found, off = (direct.at_surface(vertex, mi.Point2f(0.5), False, mi.Bool(on)) for on in (True, False))
+        found, off = (direct.at_vertex(vertex, mi.Point2f(0.5), False, mi.Bool(on)) for on in (True, False))
     # Rays start a little above the wall: 1e-5 of a scene of 20, and the lamp is that much nearer.
     assert np.array(found.value).ravel() == pytest.approx([0.5 / np.pi * POWER / FAR**2 * np.exp(-DEPTH)] * 3, rel=1e-3)
     assert found.on[0] and not off.on[0] and not np.array(off.value).any()
@@ -60,7 +60,7 @@ def test_a_shadow_ray_has_the_derivative_of_its_optical_depth():
     dr.enable_grad(tracked)
     dr.set_grad(tracked, 0.5)
     with dr.suspend_grad():
-        sample = direct.at_surface(vertex, mi.Point2f(0.5), False, mi.Bool(True))
+        sample = direct.at_vertex(vertex, mi.Point2f(0.5), False, mi.Bool(True))
 
     def term() -> DirectLight:
         """In a lane that receives the light, and in one that does not."""

@@ -272,15 +272,6 @@ def test_depth_2_is_one_turn():
     assert_apart(deeper, two, expected=0.23, what="four turns and one")
 
 
-@pytest.mark.parametrize("depth", [3, 6, -1])
-@pytest.mark.parametrize("kind", ["stock", "own", "homogeneous"])
-def test_deeper_than_2_is_refused(kind, depth):
-    box = fog(0.9)[0] if kind == "homogeneous" else smoke(rough_grid(8), kind=kind)[0]
-    scene = close_up({"smoke": box, "sky": scenes.sky(1.0)}, res=2)
-    with refused("scatter.*max_depth"):
-        scenes.render(scene, {"type": "mivol", "max_depth": depth}, 1)
-
-
 @pytest.mark.statistical
 @pytest.mark.slow
 def test_a_medium_that_only_absorbs_may_go_deeper():
