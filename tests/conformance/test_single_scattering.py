@@ -54,7 +54,7 @@ from volpath_scenes import (
 import scenes
 from mivol.validate.moments import Moments
 from mivol.validate.reference import render_reference
-from scenes import as_float32, ball_of, box_of, centred, grid_volume, medium, refused, rotation
+from scenes import as_float32, ball_of, box_of, centred, grid_volume, medium, rotation
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
 

@@ -15,6 +15,11 @@ from mivol.transport.media.scene_media import SceneMedia
 __all__ = ["EvenPoint", "draw_even_point"]
 
 
+ENDLESS = 1e30
+"""Distance [length] from which a ray counts as one without end: those that start at a surface are as long as the largest
+float32, the others infinite."""
+
+
 @dataclass
 class EvenPoint:
     """A point of a segment, and the length that it stands for.
@@ -49,7 +54,7 @@ def draw_even_point(media: SceneMedia, passed: RaySegment, among: list[Body], u:
         if not any(interval.body is body for body in among):
             return state
         begin, end = interval.inside()
-        on = interval.active & (end > begin) & dr.isfinite(end)
+        on = interval.active & (end > begin) & (end < ENDLESS)
         point, kept = offer_interval(point, mi.Float(dr.select(on, begin, 0)), mi.Float(dr.select(on, end, 0)), on)
         number = next(k for k, body in enumerate(bodies) if body is interval.body)
         return point, dr.select(kept, mi.UInt32(number), index)
