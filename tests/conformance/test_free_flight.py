@@ -212,17 +212,3 @@ def test_alpha_is_the_opacity():
     a, b = (over_pixels(Moments(m.n, m.mean[..., 3:], m.m2[..., 3:])) for m in (drawn, known))
     assert_same_mean(a, b, rounding=1e-6, what="alpha")
     assert_precise(difference(a, b), 5e-3, what="alpha")
-
-
-@pytest.mark.statistical
-@pytest.mark.parametrize("lit", small.cases(["sun", "sky"], slow=("sky",)))
-def test_side_flights_keep_the_mean(lit, monkeypatch):
-    """With them and without: the same mean."""
-    image = mi.Bitmap(np.random.default_rng(3).uniform(0, 1, (8, 16, 3)).astype(np.float32) ** 4)
-    far = {"sun": small.sun([0.3, 0.2, -1.0])[0], "sky": {"type": "envmap", "bitmap": image}}[lit]
-    scene = close_up({"smoke": smoke(rough_grid(7, 6.0), 0.9, name="hg", g=0.8)[0], "far": far}, res=8)
-    with_them = over_pixels(small.moments(scene, mivol(max_depth=5), 256))
-    monkeypatch.setattr(plan, "choose_side_flights", lambda *_: (None, []))
-    without = over_pixels(small.moments(scene, mivol(max_depth=5), 256, first=500))
-    assert_same_mean(with_them, without, rounding=1e-6, what="radiance")
-    assert_precise(difference(with_them, without), 0.03 * without.mean, what="radiance")

@@ -159,6 +159,7 @@ def test_constant_that_changes_between_calls():
     integrator = mi.load_dict({"type": "mivol"})
     params = mi.traverse(scene)
     key = "box.interior_medium.sigma_t.value.value"
+    mi.render(scene, integrator=integrator, spp=1)
     frozen = dr.freeze(lambda scene, integrator, seed: mi.render(scene, integrator=integrator, spp=4, seed=seed))
     for call in range(4):
         params[key] = dr.opaque(mi.Float, 0.25 * (1 + call))

@@ -194,6 +194,39 @@ def test_density_by_differences(room, depth):
     assert_precise(difference(found, truth), 0.1 * np.abs(truth.mean) + 1e-4, what="derivative")
 
 
+@pytest.mark.parametrize(("name", "depth"), [("emission", 5), ("lamp", 5)])
+def test_light_is_linear_in_what_emits(name, depth):
+    """The derivative along an emission is the image of that emission alone, sample by sample."""
+    scene, key = _everything(), PARAMETERS[name]
+    integrator, params = mi.load_dict(mivol(max_depth=depth, rr_depth=3)), mi.traverse(scene)
+    kind, value = type(params[key]), np.array(params[key], dtype=np.float32)
+    seed = fresh(7)
+    tangent = _forward(scene, key, value if value.size > 3 else float(value.ravel()[0]), 16, seed, integrator)
+    images = []
+    for factor in (1.0, 0.0):
+        params[key] = kind(value * np.float32(factor)) if value.size > 3 else kind(float(value.ravel()[0]) * factor)
+        params.update()
+        images.append(scenes.render(scene, integrator, 16, seed=seed))
+    assert np.abs(tangent).max() > 0.01
+    # Sums of some hundred terms in float32, of which the rest of the light cancels.
+    assert np.abs(tangent - (images[0] - images[1])).max() <= 2e-5 * images[0].max()
+
+
+@pytest.mark.statistical
+def test_albedo_of_zero(monkeypatch):
+    """Where nothing scatters yet, light that would is found by probes; the estimator of one scattering never divides by it."""
+    values = 0.9 * rough_grid(5, 1.0, (3, 3, 3)) * (np.arange(3) > 0)[None, None, :, None]
+    density, albedo = (grid_volume("mivol_voxels", grid, PLACE) for grid in (rough_grid(4), values))
+    interior = medium("mivol_medium", density, albedo)
+    scene = close_up({"smoke": box_of(interior, PLACE), "bulb": point([1.5, 1, 2.0])[0]}, res=8)
+    at_zero, integrator = 1.0 * (values == 0), mi.load_dict(mivol())
+    truth = _along(scene, MEDIUM + "albedo.data", at_zero, integrator, 64)
+    monkeypatch.setattr(plan, "choose_segment_estimator", lambda asked: "free_flight")
+    found = _along(scene, MEDIUM + "albedo.data", at_zero, integrator, 512)
+    assert_same_mean(found, truth, rounding=1e-7, what="derivative")
+    assert_precise(difference(found, truth), 0.05 * np.abs(truth.mean), what="derivative")
+
+
 @pytest.mark.slow
 @pytest.mark.statistical
 def test_coefficients_are_those_of_density_and_albedo():
