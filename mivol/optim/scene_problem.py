@@ -90,7 +90,7 @@ class SceneProblem:
             if _is_untouched(gradient):
                 raise MivolError(
                     f"no derivative leads from the images to {p.name}, which would stay as it is: take it out of the fit, or "
-                    "let the images depend on it (for scattered light set fit.max_depth to 2)."
+                    "let the images depend on it (for scattered light set fit.max_depth to 2 or more)."
                 )
             found[p.name] = as_tensor(gradient)
         return found

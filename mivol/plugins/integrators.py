@@ -1,4 +1,4 @@
-"""<integrator type="mivol">: images of volumes that absorb and scatter once, and their derivatives."""
+"""<integrator type="mivol">: images of volumes that absorb, scatter and emit, and their derivatives."""
 
 from __future__ import annotations
 
@@ -12,16 +12,17 @@ from mivol.transport.path.settings import Settings
 
 
 class MivolIntegrator(mi.ad.integrators.common.ADIntegrator):
-    """``<integrator type="mivol">``: volumes rendered by exact optical depth, and one scattering.
+    """``<integrator type="mivol">``: volumes rendered by exact optical depths and free flights.
 
     Takes the place of ``prbvolpath`` over ``mivol_medium``, ``homogeneous`` and ``heterogeneous`` media.
 
     Parameters:
-        max_depth: 1: emitters seen through media; 2: surfaces lit directly; -1: no limit. Default 6.
+        max_depth: counted as in ``volpath``. 1: emitters seen through media; 2: surfaces lit directly, and media that scatter
+            once; n: n - 1 scatterings; -1: no limit. Default 6.
         rr_depth: depth from which roulette may end a path. Default 5.
         hide_emitters: do not show emitters to the camera. Default false.
-        deterministic: scattered light by quadrature along the ray, without noise; for point, spot and directional lights.
-            Derivatives are drawn as ever. Default false.
+        deterministic: scattered light by quadrature along the ray, without noise; at depth 2, for point, spot and directional
+            lights. Derivatives are drawn as ever. Default false.
         shadows: exact; estimated: without bias, from a few look-ups, in pictures (gradients walk every cell); grid: with
             ``deterministic``, looked up in a lattice of optical depths; auto: exact, or estimated where grids are fine. Default
             auto.

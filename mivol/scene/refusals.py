@@ -46,7 +46,7 @@ def check_aovs(names: str) -> tuple[str, ...]:
 
 
 def refuse_scattering(needs: Needs, settings: Settings) -> None:
-    """Refuse what is not there yet of light that scatters more than once."""
+    """Refuse quadrature of light that scatters more than once."""
     if not is_lit(needs, settings):
         return
     medium = next(m.name for m in needs.media if m.is_scattering)
@@ -58,7 +58,7 @@ def refuse_scattering(needs: Needs, settings: Settings) -> None:
 
 
 def refuse_emission(needs: Needs, settings: Settings) -> None:
-    """Refuse emission beside scattering, and emission that varies faster than the cells that are summed."""
+    """Refuse emission that varies faster than the cells that are summed."""
     for facts, view in zip(needs.media, needs.views, strict=True):
         if isinstance(view.emission_density, mi.Volume) and not share_cells(view.walked_lattice, view.emission_lattice):
             raise MivolError(

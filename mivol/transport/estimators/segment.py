@@ -2,10 +2,10 @@ r"""The protocol of segment estimators: light that media add along a path segmen
 
 .. math:: L = L_{media} + T\, L_{behind}
 
-A segment runs from one opaque surface to the next. A :class:`SegmentEstimator` computes its light: none (:class:`Absorption`),
-single scattering, or emission. Light and transmittance carry their derivatives as a term and a factor (:mod:`.contribution`).
-Where one walk of the cells gives the derivatives of both, they share a :class:`SharedSegment`; the walk reports the term first,
-then the factor.
+A segment runs from one event to the next: an opaque surface or, for estimators that end segments in media, a collision. A
+:class:`SegmentEstimator` computes its light: none (:class:`Absorption`), single scattering, or emission. Light and
+transmittance carry their derivatives as a term and a factor (:mod:`.contribution`). Where one walk of the cells gives the
+derivatives of both, they share a :class:`SharedSegment`; the walk reports the term first, then the factor.
 """
 
 from __future__ import annotations

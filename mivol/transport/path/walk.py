@@ -2,12 +2,13 @@ r"""The walk of a path from the camera through media and surfaces: path tracing 
 
 .. math:: L = \sum_k \beta_k \left( L_{media,k} + T_k\, ( w_k L_e + L_d ) \right)
 
-A path runs in straight segments from one opaque surface to the next. What media add and transmit along a segment is found by
-the segment estimator that the plan has chosen. At a surface, direct light is estimated by one emitter sample (next-event
-estimation) and one BSDF sample, combined by the power heuristic (Veach 1997, Eq. 9.13). The walk is the same for radiance,
-gradients and tangents; a score decides what is made of it (:mod:`mivol.transport.path.scores`).
+A path runs in straight segments from one event to the next: to an opaque surface or, where the segment estimator that the plan
+has chosen ends segments in media, to a collision. The estimator also finds what media add and transmit along a segment. At an
+event, direct light is estimated by one emitter sample (next-event estimation) and one sample of the BSDF or phase function,
+combined by the power heuristic (Veach 1997, Eq. 9.13). The walk is the same for radiance, gradients and tangents; a score
+decides what is made of it (:mod:`mivol.transport.path.scores`).
 
-Conventions. ``max_depth`` counts as in ``volpath``: 1 is emitters seen through media, 2 adds surfaces lit directly, -1 is no
+Conventions. ``max_depth`` counts as in ``volpath``: 1 is emitters seen through media, each scattering adds 1, -1 is no
 limit. Boundaries with a ``null`` BSDF do not count. Media that are bounded by boxes are cut by slab tests; the acceleration
 structure is traced only for surfaces and for boundaries of other shapes.
 
