@@ -131,10 +131,12 @@ def refuse_bounded(needs: Needs, settings: Settings, aovs: tuple[str, ...]) -> N
     if medium is None:
         return
     moved = [k for k in needs.parameters if k.endswith((".position", ".to_world"))]
+    rgb = [m.name for m in needs.media if m.extinction == "rgb"] if is_lit(needs, settings) else []
     reasons = [
         (bool(aovs), f"aovs asks for {', '.join(aovs)}", "leave aovs out"),
         (settings.deterministic, "deterministic is set", "leave it out, for transmittance is estimated"),
         (any(m.emits for m in needs.media), "a medium of its scene emits", "take the emission out"),
+        (bool(rgb), f"light scatters where the extinction of {', '.join(rgb)} is rgb", "make it grey, or set max_depth to 1"),
         (any(v.microflakes is not None for v in needs.views), "a medium of its scene has sggx microflakes", "take them out"),
         (bool(moved), f"the derivative of {', '.join(moved)} was asked for", "take finite differences"),
     ]

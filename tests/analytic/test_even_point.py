@@ -11,7 +11,7 @@ from mivol.transport.media.body import Body
 from mivol.transport.media.even_point import EvenPoint, draw_even_point
 from mivol.transport.media.ray_intervals import RaySegment
 from mivol.transport.media.scene_media import SceneMedia
-from scenes import ball_of, box_of, camera, centred, media_of, medium
+from scenes import ball_of, box_of, camera, centred, grid_volume, media_of, medium
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
 
@@ -20,10 +20,12 @@ LOW, HIGH = (2.0, 3.0), (4.5, 4.75)
 """What the ray along z from z = -3 sees of two boxes, which lie from -1 to 0 and from 1.5 to 1.75."""
 
 
-def two_boxes(other: float = 0.7) -> SceneMedia:
-    """Of extinctions of 0.5 and another; media that are the same become one, whose two boundaries are traced."""
+def two_boxes(same: bool = False) -> SceneMedia:
+    """Of a grid, whose box need not cut its intervals, and a constant; or of one medium, whose two boundaries are traced."""
     low, high = (centred(np.diag([2, 2, z]), (0, 0, m)) for z, m in ((1, -0.5), (0.25, 1.625)))
-    boxes = {"low": box_of(medium("homogeneous", 0.5), low), "high": box_of(medium("homogeneous", other), high)}
+    constant = medium("homogeneous", 0.5)
+    grid = medium("mivol_medium", grid_volume("mivol_voxels", np.full((3, 2, 4), 0.5), low))
+    boxes = {"low": box_of(constant if same else grid, low), "high": box_of(dict(constant), high)}
     return media_of(mi.load_dict({"type": "scene", **boxes, "sensor": camera([0, -1, 6], [0, 0, 0])}))
 
 
@@ -37,11 +39,11 @@ def drawn(
     return draw_even_point(media, passed, media.bodies if among is None else among, u, dr.full(mi.Bool, on, N))
 
 
-@pytest.mark.parametrize("other", [0.7, 0.5], ids=["two media", "one medium, entered twice"])
-def test_means_are_integrals(other):
+@pytest.mark.parametrize("same", [False, True], ids=["two media", "one medium, entered twice"])
+def test_means_are_integrals(same):
     """The means of t^p times the length are its integrals over both boxes."""
-    media = two_boxes(other)
-    assert len(media.bodies) == (1 if other == 0.5 else 2) and bool(media.traced) == (other == 0.5)
+    media = two_boxes(same)
+    assert len(media.bodies) == (1 if same else 2) and bool(media.traced) == same
     point = drawn(media)
     assert np.array(point.on).all()
     for power in (0, 1, 2):

@@ -167,6 +167,20 @@ def test_surfaces_behind_are_lit_through_the_field() -> None:
 
 
 @pytest.mark.statistical
+def test_a_ball_that_scatters_any_number_of_times() -> None:
+    """Expected: the means of a homogeneous sphere in its place, which flights see exactly, of images and derivatives."""
+    lamp = {"type": "point", "position": [0.3, -2, 0.2], "intensity": 4.0}
+    own = shape("cube", {**fog(radius=0.8), "albedo": 0.6})
+    known = shape("sphere", {"type": "mivol_medium", "sigma_t": 1.5, "scale": SCALE, "albedo": 0.6}, radius=0.8)
+    seen = [
+        follow(scene([0, -4, 0.4], [0, 0, 0.2], fog=ball, lamp=lamp), (key,), 4)
+        for ball, key in ((own, "sigma_t.sigma"), (known, "sigma_t.value.value"))
+    ]
+    for ours, truth, what in zip(*(s[:2] for s in seen), ("the radiance", "the derivative"), strict=True):
+        assert_same_mean(of_batches(ours[..., 0]), of_batches(truth[..., 0]), what=what)
+
+
+@pytest.mark.statistical
 def test_several_passes_add_up(monkeypatch: pytest.MonkeyPatch) -> None:
     """A gradient that Dr.Jit pulls back in one pass is kept in the next."""
     monkeypatch.setitem(plan.PASS_RAYS, "llvm", SIDE * SIDE * SPP // 4)
@@ -179,6 +193,7 @@ def test_several_passes_add_up(monkeypatch: pytest.MonkeyPatch) -> None:
 REFUSED = {
     "aovs": ({"max_depth": 1, "aovs": "tau,depth"}, {}, "aovs asks for tau, depth: leave aovs out"),
     "deterministic": ({"max_depth": 1, "deterministic": True}, {}, "deterministic is set: leave it out"),
+    "rgb": ({"max_depth": 3}, {**fog([1.0, 0.5, 2.0]), "albedo": 0.5}, "the extinction of fog is rgb: make it grey"),
     "emission": ({"max_depth": 1}, {"emission": 0.5}, "a medium of its scene emits: take the emission out"),
 }
 

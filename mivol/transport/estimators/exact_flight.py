@@ -13,6 +13,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from mivol.transport.media.channels import as_rows
 from mivol.transport.media.extinction import ExactExtinction, RayInterval
 from mivol.transport.media.grid_extinction import clip_interval
 from mivol.transport.traversal.cubic import cubic_integral, cubic_through, invert_cubic_integral
@@ -103,7 +104,8 @@ def _activation(part: ExactExtinction):
 
 
 def _of_channel(rows: list[mi.Float], channel: mi.UInt32) -> mi.Float:
-    """The number of one channel; a grey part has but one."""
+    """The number of one channel; a grey part has but one, and a mono variant sees the luminance of the three."""
+    rows = as_rows(rows, 1) if mi.is_monochromatic else rows
     value = rows[0]
     for k, row in enumerate(rows[1:], 1):
         value = dr.select(channel == k, row, value)

@@ -107,6 +107,9 @@ class FreeFlight:
         collides = active & (flight.t < mi.Float64(end.t))
         t = dr.select(collides, flight.t, mi.Float64(end.t))
         passed = RaySegment.upto(ray, segment.medium, t)
+        if media.is_bounded:
+            # Derivatives of depths that are not known are looked at in one point of the flight.
+            _, (passed.u,) = draw_pcg32(flight.rng, 1)
         collision = self._collision(ray, flight, collides)
         weight = self._weigh(segment, passed, collision, active)
         emitting = [body for body in media.bodies if body.view.emits]
