@@ -91,7 +91,7 @@ def assert_means(found: np.ndarray, T: np.ndarray, variance: np.ndarray, count: 
 
 
 @pytest.mark.statistical
-@pytest.mark.parametrize("name", cases(FIELDS, ["empty", "one voxel", "a sheet of voxels", "tau 1e-3"]))
+@pytest.mark.parametrize("name", cases(FIELDS, ["empty", "one voxel", "a sheet of voxels", "one dense voxel", "tau 1e-3"]))
 def test_estimates_have_the_exact_mean(name):
     """Of each ray, and of all rays together, which tells a bias sqrt(32) times smaller. Hard case 1."""
     found, T = estimates(grid(FIELDS[name]()))

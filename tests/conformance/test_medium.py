@@ -6,6 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from scattering_scenes import cases
 
 from scenes import box_of, camera, grid_volume, medium, refused, render, sky
 
@@ -159,7 +160,7 @@ def image_and_derivatives(scene: mi.Scene, values: np.ndarray, more: dict) -> li
     return [np.array(image), gradient, np.array(dr.forward_to(mi.render(scene, params, integrator=integrator, spp=4, seed=3)))]
 
 
-@pytest.mark.parametrize("name", GRIDS)
+@pytest.mark.parametrize("name", cases(GRIDS, ["rgb, ours", "deterministic"]))
 def test_voxels_below_0_count_as_0(name):
     """The same image, gradient and tangent as of a grid with 0 there, and a gradient to leave 0 by; told once."""
     kind, volume, channels, more = GRIDS[name]

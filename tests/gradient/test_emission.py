@@ -265,7 +265,8 @@ def _floor() -> dict:
 # -- Surfaces --------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("depth", [2, *(pytest.param(n, marks=pytest.mark.slow) for n in (1, 3))])
+@pytest.mark.slow
+@pytest.mark.parametrize("depth", [1, 2, 3])
 def test_surfaces_in_and_behind_the_field(depth):
     """A ball in the field and a floor behind it, which the field lights at depth 3 as much as a lamp does."""
     turn = mi.ScalarTransform4f().translate([0, -1.2, 0]).rotate([1, 0, 0], -90).scale(5)

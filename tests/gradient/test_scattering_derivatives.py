@@ -383,6 +383,7 @@ def test_asymmetry_under_a_sky_that_is_not_constant():
     assert_gradient(sums(seen, MEDIUM + "phase_function.g", w, 2048), truth, "g under a sky", rounding=3e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.statistical
 def test_density_under_a_sky_that_is_not_constant():
     """Two shadow rays an event, of which one is walked back, drawn by what it brings; the background is not seen."""
@@ -448,7 +449,9 @@ def test_extinction_of_microflakes(key):
 @pytest.mark.statistical
 @pytest.mark.parametrize(
     ("name", "key"),
-    small.cases([("point", "intensity"), ("spot", "intensity"), ("sun", "irradiance")], [("spot", "intensity")]),
+    small.cases(
+        [("point", "intensity"), ("spot", "intensity"), ("sun", "irradiance")], [("spot", "intensity"), ("sun", "irradiance")]
+    ),
 )
 def test_power_of_an_emitter(name, key):
     """Linear: the derivative is the picture of a lamp of 1."""
@@ -509,7 +512,7 @@ KEYS = {
 }
 
 
-@pytest.mark.parametrize("key", small.cases(KEYS, ["albedo", "lamp", "floor", "bulb"]))
+@pytest.mark.parametrize("key", small.cases(KEYS, ["albedo", "g", "lamp", "floor", "bulb"]))
 def test_forward_against_reverse(key):
     """<J v, w> = <v, J^T w> with the same random numbers: no step size and no noise, to float32 sums (1e-5 of the terms)."""
     scene, integrator = everything(), mi.load_dict(mivol())

@@ -155,8 +155,9 @@ def cube_problem(integrator: str = "prbvolpath", size: int = 8, **settings: obje
     return SceneProblem(scene, [view], [Parameter(KEY, domain=(0.0, np.inf), lr=1e-3)], **chosen)
 
 
+@pytest.mark.slow
 @pytest.mark.statistical
-@pytest.mark.parametrize("pairs", [pytest.param(False, id="plain", marks=pytest.mark.slow), pytest.param(True, id="pairs")])
+@pytest.mark.parametrize("pairs", [False, True], ids=["plain", "pairs"])
 def test_the_renderers_noise_in_the_loss(variant_rgb, pairs: bool) -> None:
     """Rationale: what a fit reports as its loss is the mismatch plus T (1 - T) / n, here as large as the mismatch.
     Expected: the mean of 60 losses is (T - R)^2 plus that, and with pairs without it."""
