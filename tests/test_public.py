@@ -82,6 +82,19 @@ def test_all_is_true(path: Path) -> None:
     assert len(names) == len(set(names))
 
 
+OUTSIDE = sorted(path for folder in ("scripts", "scenes") for path in (ROOT / folder).rglob("*.py"))
+"""What uses the package from outside, and is run by slow tests only."""
+
+
+@pytest.mark.parametrize("path", OUTSIDE, ids=lambda path: str(path.relative_to(ROOT)))
+def test_scripts_and_scenes_import_what_is_there(variant_rgb: str, path: Path) -> None:
+    for node in ast.walk(tree_of(path)):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == "mivol":
+            module = importlib.import_module(node.module)
+            for alias in node.names:
+                assert hasattr(module, alias.name) or importlib.import_module(f"{node.module}.{alias.name}")
+
+
 def test_third_party_imports_are_declared() -> None:
     """Whoever installs the wheel gets what the modules import; torch is the user's own."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]

@@ -16,8 +16,8 @@ from pathlib import Path
 import mivol  # noqa: F401  (chooses the LLVM library; call it before the first variant)
 from mivol.files import read_volume, write_volume
 from mivol.report import figures, show
+from mivol.validate.metrics import psnr
 from mivol.validate.reference import render_reference
-from mivol.validate.statistics import psnr
 
 import matplotlib as mpl
 import mitsuba as mi

@@ -21,7 +21,7 @@ from mivol.files.mesh import Mesh, write_mesh
 from mivol.photos import Camera, intrinsics
 from mivol.photos.camera_path import facing
 from mivol.photos.transforms import write_transforms
-from mivol.scene.load import content_hash
+from mivol.scene.content_hash import content_hash
 from mivol.scene.photographs import sensor_of
 
 import mitsuba as mi
