@@ -13,7 +13,16 @@ import numpy as np
 
 from mivol.bench.extinctions import TO_WORLD
 
-__all__ = ["box_scene", "constant_light", "depth_two", "perspective", "point_light", "sun_and_sky"]
+__all__ = [
+    "box_scene",
+    "constant_light",
+    "depth_two",
+    "directional_light",
+    "of_depth",
+    "perspective",
+    "point_light",
+    "sun_and_sky",
+]
 
 
 def perspective(side: int) -> dict:
@@ -86,6 +95,20 @@ def sun_and_sky(height: int = 128) -> dict:
     return {"lamp": lamp, "phase": {"type": "hg", "g": 0.8}}
 
 
+def directional_light() -> dict:
+    """A directional light from above, HG g = 0.8."""
+    lamp = {"type": "directional", "direction": [0.3, 0.2, -1.0], "irradiance": {"type": "rgb", "value": [3.0, 2.5, 2.0]}}
+    return {"lamp": lamp, "phase": {"type": "hg", "g": 0.8}}
+
+
+def of_depth(name: str, depth: int) -> mi.Integrator:
+    """That integrator with this ``max_depth``, made anew for each scene: ``prbvolpath`` keeps flags of the first scene it sees.
+
+    Roulette begins at depth 64 for all, beyond which a path of an unlimited one hardly counts in scenes that absorb.
+    """
+    return mi.load_dict({"type": name, "max_depth": depth, "rr_depth": 64})
+
+
 def depth_two(name: str) -> mi.Integrator:
-    """That integrator with ``max_depth`` 2, made anew for each scene: ``prbvolpath`` keeps flags of the first scene it sees."""
-    return mi.load_dict({"type": name, "max_depth": 2, "rr_depth": 64})
+    """As :func:`of_depth`, with ``max_depth`` 2."""
+    return of_depth(name, 2)

@@ -63,12 +63,25 @@ from mivol.bench.extinctions import (
 )
 from mivol.bench.figures import drawn, plain_ticks
 from mivol.bench.questions import Bench
-from mivol.bench.scenes import box_scene, constant_light, depth_two, point_light, sun_and_sky
+from mivol.bench.scenes import box_scene, constant_light, of_depth, point_light, sun_and_sky
 from mivol.bench.timing import Budget, Timing, race, ratio_of
 from mivol.report.figures import MARKERS, SERIES
 from mivol.validate.moments import Moments
 
-__all__ = ["BENCH", "FULL", "LIGHTS", "QUICK", "VOLUMES", "Light", "Size", "contend", "main"]
+__all__ = [
+    "BENCH",
+    "FULL",
+    "LIGHTS",
+    "QUICK",
+    "STOCK",
+    "VOLUMES",
+    "Light",
+    "Size",
+    "contend",
+    "draw_errors",
+    "main",
+    "said",
+]
 
 ALBEDO = 0.75
 OURS = "mivol"
@@ -120,6 +133,8 @@ class Light(NamedTuple):
         by_pixel: judge the median over pixels, where the mean of their variances does not exist.
         side: of the picture [pixels].
         inside: where a lamp stands in the medium.
+        albedo: of the medium.
+        depth: ``max_depth`` of all integrators; -1 for no limit.
     """
 
     parts: Callable[[], dict]
@@ -127,6 +142,8 @@ class Light(NamedTuple):
     by_pixel: bool = False
     side: int = 64
     inside: tuple[float, float, float] | None = None
+    albedo: float = ALBEDO
+    depth: int = 2
 
     @property
     def average(self) -> str:
@@ -165,8 +182,8 @@ def contend(values: np.ndarray, light: Light, size: Size, levels: tuple[int, ...
         levels: see ``Size.levels``; the first one, 1, is what ratios are of.
     """
     side = min(light.side, size.most_pixels)
-    scene = mi.load_dict(box_scene(values, side, ALBEDO, **light.parts()))
-    timings, spp = render_in_turns(scene, size, levels)
+    scene = mi.load_dict(box_scene(values, side, light.albedo, **light.parts()))
+    timings, spp = render_in_turns(scene, size, levels, light.depth)
     tau, away = optical_depths(scene), pixels_from_lamp(scene, light, side)
     counts = (tau > SEEN) & (away > AT_LAMP)
     figures = {"pixels_that_count": int(counts.sum())}
@@ -174,8 +191,8 @@ def contend(values: np.ndarray, light: Light, size: Size, levels: tuple[int, ...
         figures[name] = [{"spp": spp[name, k]} | errors(timings[name, k], counts, spp[name, k]) for k in levels]
     compared, fair = timings, counts
     if light.inside is not None:
-        thinned = mi.load_dict(box_scene(values * np.float32(min(1, 1 / tau.max())), side, ALBEDO, **light.parts()))
-        compared, _ = render_in_turns(thinned, size, (1,))
+        thinned = mi.load_dict(box_scene(values * np.float32(min(1, 1 / tau.max())), side, light.albedo, **light.parts()))
+        compared, _ = render_in_turns(thinned, size, (1,), light.depth)
         fair = (tau > SEEN) & (away > TRUNCATED * side)
     for name in STOCK:
         ratios = gain(timings[name, 1], timings[OURS, 1], counts)
@@ -183,11 +200,11 @@ def contend(values: np.ndarray, light: Light, size: Size, levels: tuple[int, ...
     return figures
 
 
-def render_in_turns(scene: mi.Scene, size: Size, levels: tuple[int, ...]) -> tuple[dict, dict]:
+def render_in_turns(scene: mi.Scene, size: Size, levels: tuple[int, ...], depth: int = 2) -> tuple[dict, dict]:
     """Images of all integrators at all levels; timings and samples per pixel by (name, level)."""
     calls, spp = {}, {}
     for place, name in enumerate((OURS, *STOCK)):
-        integrator = depth_two(name)
+        integrator = of_depth(name, depth)
 
         def render(seed: int, n: int, integrator: mi.Integrator = integrator, place: int = place) -> mi.TensorXf:
             return mi.render(scene, integrator=integrator, spp=n, seed=10_000 * size.seed + 1000 * place + seed)

@@ -1,0 +1,119 @@
+"""Light that scatters many times: how much sooner does mivol reach an error than Mitsuba's ``volpath`` and ``prbvolpath``?
+
+    scripts/bench_multiple_scattering.py                  # 12 minutes on 2 idle cores
+    scripts/bench_multiple_scattering.py --quick          # a minute, small sizes: are the means the same?
+    scripts/bench_multiple_scattering.py --only smoke     # one of the volumes
+
+The volumes fill [-1, 1]^3: the smoke of the Mitsuba tutorial at its density (x 40) and at a twentieth of it, the smoke
+upsampled to 256^3, threads in 512^3, a cloud of a large-eddy simulation with an albedo of 0.999, and a white box of an
+optical depth of 64. Albedo 0.75 unless said, ``max_depth`` 6 or unlimited. Everything else is as in
+``scripts/bench_single_scattering.py``: samples of equal processor time, rounds in turns, variance x time. Bars are on the mean
+over pixels, for unlimited depth on the median: the errors of long paths have heavy tails.
+
+Prints JSON; writes bench_multiple_scattering.json and bench_multiple_scattering.png.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from mivol.bench.bars import AT_LEAST, Bar, judge, judge_agreement, say
+from mivol.bench.extinctions import Extinction, as_dense_as_smoke, fine_smoke, les_cloud, smoke, threads_in_space
+from mivol.bench.figures import drawn
+from mivol.bench.questions import Bench
+from mivol.bench.scenes import constant_light, directional_light, sun_and_sky
+from mivol.bench.single_scattering import FULL, QUICK, STOCK, Light, Size, contend, draw_errors, said
+
+__all__ = ["BENCH", "CONTESTS", "VOLUMES", "main"]
+
+THIN, WHITE_DEPTH = 0.05, 64.0
+"""Factor on the density of the smoke; optical depth along an edge of the white box."""
+
+
+def thin_smoke() -> Extinction:
+    """The smoke at a twentieth of its density."""
+    found = smoke()
+    return found._replace(values=found.values * np.float32(THIN))
+
+
+def white_box() -> Extinction:
+    """A constant grid; the box has an edge of 2."""
+    return Extinction(np.full((4, 4, 4), WHITE_DEPTH / 2, np.float32), "made up: constant")
+
+
+VOLUMES: dict[str, Callable[[Size], Extinction]] = {
+    "smoke": lambda _: smoke(),
+    "thin smoke": lambda _: thin_smoke(),
+    "cloud": lambda _: les_cloud(),
+    "fine smoke": lambda size: fine_smoke(size.fine_res),
+    "threads": lambda size: as_dense_as_smoke(threads_in_space(size.sparse_res)),
+    "white box": lambda _: white_box(),
+}
+
+CONSTANT, SUN, DIRECTIONAL = "constant light", "HG 0.8, sun in a sky", "HG 0.8, directional"
+PARTS = {CONSTANT: constant_light, SUN: sun_and_sky, DIRECTIONAL: directional_light}
+
+
+def _light(name: str, bar: float, depth: int = 6, albedo: float = 0.75) -> Light:
+    return Light(PARTS[name], bar, by_pixel=depth < 0, albedo=albedo, depth=depth)
+
+
+CONTESTS: dict[str, dict[str, Light]] = {
+    "smoke": {CONSTANT: _light(CONSTANT, 40), SUN: _light(SUN, 50), DIRECTIONAL: _light(DIRECTIONAL, 80)},
+    "thin smoke": {CONSTANT: _light(CONSTANT, 5), SUN: _light(SUN, 6), DIRECTIONAL: _light(DIRECTIONAL, 9)},
+    "cloud": {f"{SUN}, depth 6": _light(SUN, 80, 6, 0.999), f"{SUN}, unlimited": _light(SUN, 30, -1, 0.999)},
+    "fine smoke": {CONSTANT: _light(CONSTANT, 25), SUN: _light(SUN, 25)},
+    "threads": {SUN: _light(SUN, 12)},
+    "white box": {f"{CONSTANT}, unlimited": _light(CONSTANT, 300, -1, 0.999)},
+}
+"""Lights of each volume; the bars are on the ratio to ``volpath``."""
+
+
+def ask(volume: str) -> Callable[[Size], dict]:
+    """The question about one volume."""
+
+    def measure(size: Size) -> dict:
+        found = VOLUMES[volume](size)
+        answer = {"grid": str(found)}
+        for name, light in CONTESTS[volume].items():
+            answer[name] = contend(found.values, light, size, size.levels if volume == "smoke" else (1,))
+            say(f"  {name}: {said(answer[name])}")
+        return answer
+
+    measure.__doc__ = f"How much sooner has mivol the same error in the {volume}?"
+    return measure
+
+
+def compare(volume: str, answer: dict) -> list[Bar]:
+    """Every ratio beside its bar, and every z beside its bound; prbvolpath has no bar."""
+    rows = []
+    for name, light in CONTESTS[volume].items():
+        for stock in STOCK:
+            g = answer[name][f"mivol over {stock}"]
+            what, ratio = f"{volume}, {name}, {stock}", g[f"variance_x_time_{light.average}_over_pixels"]
+            if stock == "volpath":
+                rows.append(judge(f"variance x time, {light.average}: {what}", ratio, AT_LEAST, light.bar))
+            rows.append(judge_agreement(what, g["z"], g["z_bound"]))
+    return rows
+
+
+def draw(answers: dict, folder: Path) -> None:
+    """Error against time for each light of the first volume asked about."""
+    volume = next(iter(answers))
+    lights = CONTESTS[volume]
+    with drawn(folder / "bench_multiple_scattering.png", 4.4 * len(lights), 3.8) as figure:
+        for axes, (name, light) in zip(np.atleast_1d(figure.subplots(1, len(lights))), lights.items(), strict=True):
+            draw_errors(axes, answers[volume][name], light)
+            axes.set_title(f"{volume}: {name}")
+        axes.legend()
+
+
+BENCH = Bench("bench_multiple_scattering", __doc__, {v: ask(v) for v in VOLUMES}, FULL, QUICK, compare, draw)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the bench with these arguments (by default the process's own); its exit code."""
+    return BENCH.run(argv)

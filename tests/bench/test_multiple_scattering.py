@@ -1,0 +1,44 @@
+"""The bench of multiple scattering: renderers have one mean at their own depth, and every contest has its bar."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from false_alarms import ALPHA, fresh, note
+
+from mivol.bench import agreement
+from mivol.bench import multiple_scattering as bench
+from mivol.bench.single_scattering import QUICK
+from mivol.bench.timing import Budget
+
+TINY = replace(QUICK, rounds=6, most_pixels=8, budget=Budget(spp=64))
+
+
+def test_contests_are_those_of_the_published_table():
+    """Volume, light, depth, albedo and bar of every row."""
+    rows = {(v, n): (light.depth, light.albedo, light.bar) for v, c in bench.CONTESTS.items() for n, light in c.items()}
+    assert list(rows.values()) == [
+        *((6, 0.75, bar) for bar in (40, 50, 80, 5, 6, 9)),
+        (6, 0.999, 80),
+        (-1, 0.999, 30),
+        *((6, 0.75, bar) for bar in (25, 25, 12)),
+        (-1, 0.999, 300),
+    ]
+    assert all(light.by_pixel == (light.depth < 0) for c in bench.CONTESTS.values() for light in c.values())
+    assert bench.white_box().values.max() * 2 == bench.WHITE_DEPTH == 64
+    assert np.allclose(bench.thin_smoke().values.max() * 20, bench.smoke().values.max())
+
+
+@pytest.mark.slow
+@pytest.mark.statistical
+def test_renderers_agree(variant_rgb: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In a small fog of each light; the bench's own judge at the suite's chance of a false alarm."""
+    monkeypatch.setattr(agreement, "FALSE_ALARM", ALPHA)
+    values = np.pad(np.random.default_rng(1).uniform(0.5, 1.5, (3, 4, 5)), 1).astype(np.float32)
+    for name, light in bench.CONTESTS["smoke"].items():
+        figures = bench.contend(values, light, replace(TINY, seed=fresh(0) % 100_000))
+        bars = bench.compare("smoke", dict.fromkeys(bench.CONTESTS["smoke"], figures))
+        note(ALPHA, name)
+        assert all(bar["met"] for bar in bars if bar["figure"].startswith("|z|")), name
