@@ -35,7 +35,7 @@ def test_collisions_in_a_cell_of_linear_extinction(ends):
         ray = mi.Ray3f(mi.Point3f(0.1, 0.2, -5 + zero), mi.Vector3f(0, 0, 1), dr.inf, mi.Float(0), mi.Color0f())
         kept = Candidate(one, begin * one, zero, length * one, [zero], zero, mi.UInt32(zero), mi.Bool(True), mi.UInt32(1))
         numbers = mi.Point2f(mi.Float(0.5), mi.Float(np.float32(u)))
-        proposal = DistanceProposal(media, ray, ChosenEmitter(mi.UInt32(0), None, None))
+        proposal = DistanceProposal(media, ray, ChosenEmitter(mi.UInt32(0), None, None), None, 0.0)
         event = sample_distance(proposal, kept, one, numbers, mi.Bool(True))
     a, b = map(float, np.float32(ends))
     goal = -np.log1p(u * np.expm1(-length * (a + b) / 2))

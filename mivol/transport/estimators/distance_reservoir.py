@@ -61,8 +61,8 @@ class DistanceProposal:
     media: SceneMedia
     ray: mi.Ray3f
     chosen: ChosenEmitter
-    cache: VisibilityCache | None = None
-    probe_depth: float = 0.0
+    cache: VisibilityCache | None
+    probe_depth: float
 
 
 @dataclass
