@@ -12,6 +12,7 @@ from mivol.transport.path.settings import Settings
 
 LIT = Settings(max_depth=2)
 GRID = ((10, 20, 30),)
+ONCE, FLIGHTS = "single_scattering", "free_flight"
 
 
 def fog(name: str = "fog", **more: object) -> MediumFacts:
@@ -52,12 +53,13 @@ def needs(*media: MediumFacts, emitters: tuple[str, ...] = ("delta",), **more: o
     ],
 )
 def test_transport(media: tuple, settings: Settings, what: str, why: str) -> None:
-    found = choices.choose_transport(needs(*media), settings)
+    segment = "single_scattering" if settings.max_depth == 2 else "absorption"
+    found = choices.choose_transport(needs(*media), settings, segment)
     assert what in found.choice and why in found.reason
 
 
-@pytest.mark.parametrize(("depth", "lit"), [(0, False), (1, False), (2, True), (3, False), (-1, False)])
-def test_light_is_scattered_once(depth: int, lit: bool) -> None:
+@pytest.mark.parametrize(("depth", "lit"), [(0, False), (1, False), (2, True), (3, True), (-1, True)])
+def test_light_is_scattered_from_depth_2_on(depth: int, lit: bool) -> None:
     settings = Settings(max_depth=depth)
     assert choices.is_lit(needs(fog("a", is_scattering=False), fog()), settings) == lit
     assert not choices.is_lit(needs(fog(is_scattering=False)), settings)
@@ -84,15 +86,15 @@ def test_light_is_scattered_once(depth: int, lit: bool) -> None:
     ],
 )
 def test_lighting(emitters: tuple, media: tuple, found: list) -> None:
-    chosen = choices.choose_lighting(needs(*media, emitters=emitters), LIT)
+    chosen = choices.choose_lighting(needs(*media, emitters=emitters), LIT, ONCE)
     assert len(chosen) == len(found)
     assert all(c.about == about and c.choice.startswith(choice) for c, (about, choice) in zip(chosen, found, strict=True))
 
 
 def test_lighting_by_quadrature_and_without_light():
-    (only,) = choices.choose_lighting(needs(fog()), Settings(max_depth=2, deterministic=True))
+    (only,) = choices.choose_lighting(needs(fog()), Settings(max_depth=2, deterministic=True), ONCE)
     assert only.choice.startswith("at two points of each piece")
-    assert choices.choose_lighting(needs(fog(is_scattering=False)), LIT) == []
+    assert choices.choose_lighting(needs(fog(is_scattering=False)), LIT, ONCE) == []
 
 
 @pytest.mark.parametrize(
@@ -126,23 +128,25 @@ def test_shadows_are_no_question_without_a_grid_or_light():
 )
 def test_points_that_scatter(occupied: float, emitters: tuple, count: int) -> None:
     medium = fog(occupied=occupied)
-    found, (choice,) = choices.choose_events(needs(medium, emitters=emitters), LIT)
+    found, (choice,) = choices.choose_events(needs(medium, emitters=emitters), LIT, ONCE)
     assert found == count and choice.choice == f"{count} of a camera ray" and f"{occupied:.0%} of the blocks" in choice.reason
 
 
 def test_one_point_scatters_where_there_is_more_than_one_grid():
     for media in ((fog(), fog("b")), (fog(resolutions=(*GRID, *GRID)),), (fog(resolutions=()),)):
-        found, (choice,) = choices.choose_events(needs(*media), LIT)
+        found, (choice,) = choices.choose_events(needs(*media), LIT, ONCE)
         assert found == 1 and choice.reason == "there is more than one grid or none"
-    assert choices.choose_events(needs(fog()), Settings(max_depth=2, deterministic=True)) == (1, [])
-    assert choices.choose_events(needs(fog()), Settings(max_depth=1)) == (1, [])
+    for segment in ("scattering_quadrature", "absorption", FLIGHTS):
+        assert choices.choose_events(needs(fog()), LIT, segment) == (1, [])
 
 
 def test_channels_emission_skipping_and_tracing():
     grey, rgb = fog(), fog("smoke", extinction="rgb", emits=True)
     assert choices.choose_channels(needs(grey)) == choices.Choice("channels", "1", "every extinction is grey")
     assert choices.choose_channels(needs(grey, rgb)).reason == "rgb extinction in smoke"
-    assert choices.choose_emission(needs(grey)) == [] and choices.choose_emission(needs(grey, rgb))[0].reason == "smoke emit"
+    assert choices.choose_emission(needs(grey), ONCE) == []
+    assert choices.choose_emission(needs(grey, rgb), "emission")[0].reason == "smoke emit"
+    assert choices.choose_emission(needs(grey, rgb), FLIGHTS)[0].choice == "at one point of each flight"
     assert [choices.choose_skipping(grey, skip).choice for skip in (True, False)] == ["skipped", "walked"]
     scene = needs(grey, rgb)
     scene.boundaries = (SimpleNamespace(box=1), SimpleNamespace(box=None))
@@ -151,3 +155,60 @@ def test_channels_emission_skipping_and_tracing():
     assert choices.choose_tracing(scene).choice == "not traced"
     scene.surfaces = ("Sphere", "Rectangle", "Sphere")
     assert choices.choose_tracing(scene).reason == "surfaces may stop a ray: Rectangle, Sphere"
+
+
+@pytest.mark.parametrize(
+    ("media", "refractive", "depth", "what", "why"),
+    [
+        ((fog(),), (), 4, "at most 3 scatterings", "an albedo is above 0 and max_depth is 4"),
+        ((fog(),), (), -1, "any number of scatterings", "an albedo is above 0 and max_depth is -1"),
+        ((fog(emits=True),), (), 2, "at most 1 scatterings", "fog emits beside scattering"),
+        ((fog(bounded="Ball"), fog("b")), ("glass",), 2, "free flights", "fog is bounded; glass refracts"),
+    ],
+)
+def test_free_flights(media: tuple, refractive: tuple, depth: int, what: str, why: str) -> None:
+    found = choices.choose_transport(needs(*media, refractive=refractive), Settings(max_depth=depth), FLIGHTS)
+    assert what in found.choice and found.reason == why
+
+
+def test_lighting_of_free_flights():
+    for emitters, directions in (
+        (("uniform",), "one, of the phase function"),
+        (("delta", "uniform"), "to an emitter from each"),
+    ):
+        (found,) = choices.choose_lighting(needs(fog(), emitters=emitters), LIT, FLIGHTS)
+        assert found.choice.startswith(directions)
+
+
+@pytest.mark.parametrize(
+    ("medium", "choice"),
+    [
+        (fog(bounded="Ball"), "delta tracking"),
+        (fog(resolutions=()), "exact"),
+        (fog(extinction="rgb"), "exact, by one channel each"),
+        (fog(unread=True), "exact"),
+        (fog(), "delta tracking"),
+    ],
+)
+def test_how_flights_are_drawn(medium: MediumFacts, choice: str) -> None:
+    assert choices.choose_flights(medium, FLIGHTS).choice == choice and choices.choose_flights(medium, ONCE) is None
+
+
+@pytest.mark.parametrize(
+    ("cosines", "far", "depth", "segment", "expected"),
+    [
+        ((0.8, None), True, 3, FLIGHTS, 0.8),
+        ((0.3, 0.99), True, -1, FLIGHTS, 0.95),
+        ((choices.PEAKED,), True, 3, FLIGHTS, choices.PEAKED),
+        ((choices.PEAKED - 0.01,), True, 3, FLIGHTS, None),
+        ((None,), True, 3, FLIGHTS, None),
+        ((0.8,), False, 3, FLIGHTS, None),
+        ((0.8,), True, 2, FLIGHTS, None),
+        ((0.8,), True, 3, ONCE, None),
+    ],
+)
+def test_side_flights(cosines: tuple, far: bool, depth: int, segment: str, expected: float | None) -> None:
+    """Of peaked phase functions, for emitters at infinity, where light scatters twice."""
+    asked = needs(*(fog(mean_cosine=c) for c in cosines), are_emitters_far=far)
+    found, said = choices.choose_side_flights(asked, Settings(max_depth=depth), segment)
+    assert found == expected and len(said) == (expected is not None)

@@ -14,7 +14,7 @@ from mivol.optim.priors import PRIORS, Bounds, HuberTotalVariation, Laplacian, S
 SPACING = (0.5, 0.25, 0.2)
 CHOSEN = [
     TotalVariation(edge=0.3),
-    HuberTotalVariation(edge=2.0),
+    HuberTotalVariation(edge=1.5),  # of which the square is not twice as much
     Laplacian(),
     Sparse(),
     Bounds(low=0.2, high=0.8),
