@@ -218,3 +218,14 @@ def test_figures_show_the_answers(monkeypatch: pytest.MonkeyPatch, tmp_path: Pat
     for axes, field in ((fog, "fog"), (shell, "shell")):
         assert axes.get_title() == f"{field}, 7 views"
         assert [list(line.get_ydata()) for line in axes.lines] == [[20, 25], [18, 24], [24, 24]]
+
+
+@pytest.mark.parametrize(("ours", "ratio"), [([(1.0, 20.0), (2.0, 25.0), (4.0, 30.0)], 10.0), ([(1.0, 20.0)], 0.0)])
+def test_a_fit_is_as_good_as_the_peers_best(monkeypatch: pytest.MonkeyPatch, ours: list, ratio: float) -> None:
+    """24 dB, which the peer had after 20 s and lost again; ours is there after 2 s, or never."""
+    monkeypatch.setattr(fits, "field_of", lambda name, size: (None, "made"))
+    monkeypatch.setattr(fits, "photographed", lambda field, cameras: [])
+    monkeypatch.setattr(fits, "our_fit", lambda *asked: ours)
+    monkeypatch.setattr(fits, "peer_fit", lambda *asked: [(10.0, 18.0), (20.0, 24.0), (30.0, 23.0)])
+    found = fits.ask_fit(TINY)["fog"]
+    assert (found["peer_psnr"], found["ratio"], found["field"]) == (24.0, ratio, "made")
