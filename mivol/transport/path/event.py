@@ -23,6 +23,7 @@ class PathEvent:
         medium: the medium around it.
         at_surface: lanes that have hit a surface.
         collision: where lanes have met a medium before; None where paths scatter at surfaces only.
+        chance: for derivatives of paths that scatter in media, a number in [0, 1) by which one of their shadow rays is kept.
     """
 
     si: mi.SurfaceInteraction3f
@@ -30,13 +31,15 @@ class PathEvent:
     medium: mi.MediumPtr
     at_surface: mi.Bool
     collision: Collision | None
+    chance: mi.Float | None = None
 
     @classmethod
     def of(cls, found: SegmentEstimate, active: mi.Bool) -> PathEvent:
         """The event at the end of a segment."""
         end, collision = found.end, found.collision
         arrives = active if collision is None else active & ~collision.on
-        return cls(end.si, end.t, end.medium, arrives & end.si.is_valid(), collision)
+        chance = None if found.probe is None else found.probe.chance
+        return cls(end.si, end.t, end.medium, arrives & end.si.is_valid(), collision, chance)
 
     @property
     def in_medium(self) -> mi.Bool:

@@ -28,6 +28,7 @@ from mivol.transport.estimators.direct_lighting import DirectLight
 from mivol.transport.estimators.flight_derivatives import Probe, ProbeTerm
 from mivol.transport.estimators.multiple_importance import power_heuristic
 from mivol.transport.estimators.segment import PICTURE, Collision, PathSegment
+from mivol.transport.estimators.shadow_reservoir import ShadowReservoir, ShadowTerm
 from mivol.transport.media.channels import colours
 from mivol.transport.media.coefficients import medium_interaction
 from mivol.transport.path.estimators import Estimators
@@ -65,6 +66,7 @@ class Path:
         score: :mod:`mivol.transport.path.scores`.
         sampler, strata: random numbers.
         probe: a point of one of the flights so far, at which derivatives are looked at besides; None for pictures.
+        shadow: the shadow ray that is walked back for derivatives; None for pictures, and where paths scatter at surfaces only.
         aim: the emitter sample that was drawn for the next vertex; None where there are no side flights.
     """
 
@@ -83,6 +85,7 @@ class Path:
     sampler: mi.Sampler
     strata: Strata | None
     probe: Probe | None = None
+    shadow: ShadowReservoir | None = None
     aim: Aim | None = None
 
 
@@ -124,9 +127,12 @@ def walk_path(
         return path.score, _alpha(path.stopped, path.clear)
     if estimators.segment.ends_in_media and score.purpose != PICTURE:
         path.probe = Probe.none(ray)
+        path.shadow = ShadowReservoir.empty(media, ray)
     if estimators.lobe is not None:
         path.aim = Aim.none(dr.width(ray))
     path = _walk_on(estimators, settings, limit, path)
+    if path.shadow is not None:
+        path.score = path.score.add(ShadowTerm(media, path.shadow))
     if path.probe is not None:
         path.score = path.score.add(_estimate_probe(estimators, settings, limit, path.probe, sampler))
     return path.score, _alpha(path.stopped, path.clear)
@@ -300,5 +306,10 @@ def _add_direct_light(estimators: Estimators, path: Path, event: PathEvent, may_
         if event.collision is not None:
             inside = event.collision.albedo if path.aim is None else event.collision.albedo * path.aim.weight
             carried = dr.select(event.in_medium, carried * inside, carried)
-    path.score = path.score.add(DirectLight(media, direct.ray_segment, carried, direct.on))
+    light = DirectLight(media, direct.ray_segment, carried, direct.on)
+    if path.shadow is None:
+        path.score = path.score.add(light)
+        return path
+    path.score = path.score.add(TrackedTerm(carried, direct.on))
+    path.shadow = path.shadow.offer(light, event.chance)
     return path
