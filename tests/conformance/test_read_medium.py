@@ -47,7 +47,7 @@ def test_our_grid_knows_its_place():
 
 
 def scatters(description: dict) -> bool:
-    return is_scattering(view_medium(mi.load_dict(description)), SceneSurvey((), (), False, (), (), ()), "box")
+    return is_scattering(view_medium(mi.load_dict(description)), SceneSurvey((), (), False, (), (), False, ()), "box")
 
 
 def test_a_medium_that_scatters_says_so():
