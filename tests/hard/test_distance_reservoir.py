@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import mitsuba as mi
 import numpy as np
 import oracle_scattering as twins
 import pytest
@@ -10,6 +11,8 @@ from hard_scattering import BATCHES, holds_twin
 from scattering_scenes import PLACE, aimed, mivol, pencils, point, rough_grid, smoke, sun
 
 import scenes
+from mivol.transport.estimators.distance_reservoir import lit_length
+from mivol.transport.estimators.shadow_rays import DARK
 from scenes import as_float32, box_of, grid_volume, medium
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
@@ -64,3 +67,20 @@ def test_channels_of_very_different_extinction(ratio):
         if top > 0:
             assert_precise(channel._replace(var=channel.var[bright]), 0.03 * truth[bright, c], what=f"channel {c}")
     assert np.all(found.mean >= 0)
+
+
+@pytest.mark.parametrize(
+    ("sigma", "length", "lit"),
+    [
+        ((2.0,), 1e9, DARK / 2),
+        ((2.0, 0.5, 4.0), 1e9, DARK / 0.5),
+        ((2.0, 0.0), 1e9, DARK / 2),
+        ((2.0,), 3.0, 3.0),
+        ((0.0,), 7.0, 7.0),
+    ],
+    ids=["grey", "rgb", "a channel of 0", "short", "empty"],
+)
+def test_what_is_behind_the_dark_takes_no_candidates(sigma, length, lit):
+    """A region of constant extinction may have no end; its clearest channel tells how much of it is lit."""
+    found = lit_length([mi.Float(s) for s in sigma], mi.Float(length))
+    assert float(np.array(found).item()) == pytest.approx(lit, rel=1e-6)
