@@ -173,7 +173,7 @@ def choose_skipping(medium: MediumFacts, skip: bool) -> Choice:
 
 
 def choose_flights(medium: MediumFacts, segment: str) -> Choice | None:
-    """How flights through a medium are drawn in pictures; None where there are none."""
+    """How flights through a medium are drawn; None where there are none."""
     if segment != "free_flight":
         return None
     about = f"flights in {medium.name}"
@@ -183,9 +183,7 @@ def choose_flights(medium: MediumFacts, segment: str) -> Choice | None:
         return Choice(about, "exact", "its extinction is a constant")
     if medium.extinction == "rgb":
         return Choice(about, "exact, by one channel each", "rgb extinction: the optical depth of all channels weighs them")
-    if medium.unread:
-        return Choice(about, "exact", "values cannot be read while dr.freeze records")
-    return Choice(about, "delta tracking", "majorants of blocks are known; gradients walk every cell")
+    return Choice(about, "delta tracking", "majorants of blocks are known; derivatives walk back through every cell")
 
 
 def choose_shadows(medium: MediumFacts, needs: Needs, settings: Settings) -> Choice | None:

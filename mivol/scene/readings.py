@@ -43,7 +43,12 @@ class Reading:
 
 
 def _once(survey: SceneSurvey, kind: tuple, array: mi.Float, make: Callable[[], Any]) -> Any:
-    """Make something once for each state of an array, which is kept so that its number cannot be given to another one."""
+    """Make something once for each state of an array, which is kept so that its number cannot be given to another one.
+
+    While a function is being recorded it is made anew: a recording can use no array that was made before it.
+    """
+    if dr.flag(dr.JitFlag.FreezingScope):
+        return make()
     key = (*kind, array.index)
     if key not in survey.values:
         made = make()
@@ -175,9 +180,7 @@ def read_block_ranges(part: ExactExtinction, survey: SceneSurvey) -> BlockRanges
 
 
 def read_coarse(survey: SceneSurvey, lattice: Lattice, shift: int, lists: bool) -> CoarseGrid:
-    """Make a grid coarser once for each state of its array and place; anew where a function is being recorded."""
-    if dr.flag(dr.JitFlag.FreezingScope):
-        return coarsen_grid(lattice, shift, lists)
+    """Make a grid coarser once for each state of its array and place."""
     kind = ("coarse", shift, lists, lattice.empty_distances is None, lattice.to_world.tobytes())
     return _once(survey, kind, dr.detach(lattice.values.array), lambda: coarsen_grid(lattice, shift, lists))
 

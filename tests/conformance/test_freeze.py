@@ -62,6 +62,28 @@ def test_values_that_change_between_calls(kind, floor, depth):
     assert frozen.n_recordings < 6
 
 
+@pytest.mark.parametrize("kind", ["heterogeneous", "mivol_medium"])
+def test_light_that_scatters_many_times(kind):
+    """The majorants of a grid are made in the recording, also of an array that an ordinary render has read before."""
+    volume = "mivol_voxels" if kind == "mivol_medium" else "gridvolume"
+    values = np.random.default_rng(1).uniform(0.1, 1.0, (4, 5, 6, 1)).astype(np.float32)
+    parts = {"type": "scene", "box": box_of(medium(kind, grid_volume(volume, values, PLACE), 0.7), PLACE), "sky": sky()}
+    scene = mi.load_dict(parts | {"sensor": camera((2.0, 1.5, 3.0), (0.0, 0.0, 0.0), res=8, fov=45.0)})
+    integrator, params = mi.load_dict({"type": "mivol", "max_depth": 4}), mi.traverse(scene)
+
+    def shoot(scene: mi.Scene, integrator: mi.Integrator, seed: mi.UInt32) -> mi.TensorXf:
+        return mi.render(scene, integrator=integrator, spp=4, seed=seed)
+
+    mi.render(scene, integrator=integrator, spp=1)
+    frozen = dr.freeze(shoot)
+    for call in range(6):
+        replayed = np.array(frozen(scene, integrator, mi.UInt32(call)))
+        assert np.array_equal(replayed, np.array(shoot(scene, integrator, mi.UInt32(call))))
+        params[GRID] = times(values, 2 + 3 * call)
+        params.update()
+    assert frozen.n_recordings < 6
+
+
 def test_scale_that_changes_between_calls():
     """The scale of mivol_medium is an array, so that a recording follows it; stock media keep a Python number."""
     scene, _ = build("mivol_medium", False)
