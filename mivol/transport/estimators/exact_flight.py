@@ -16,6 +16,7 @@ import mitsuba as mi
 from mivol.transport.media.channels import as_rows
 from mivol.transport.media.extinction import ExactExtinction, RayInterval
 from mivol.transport.media.grid_extinction import clip_interval
+from mivol.transport.media.summed_extinction import activate
 from mivol.transport.traversal.cubic import cubic_integral, cubic_through, invert_cubic_integral
 from mivol.transport.traversal.grid_walk import Cell, Nodes, box_nodes, read_nodes, walk
 from mivol.transport.traversal.interpolation import gauss_points, interpolate
@@ -54,8 +55,7 @@ def collide_exactly(
 def _in_constant(
     part: ExactExtinction, scale: mi.Float, interval: RayInterval, goal: mi.Float, channel: mi.UInt32
 ) -> mi.Float64:
-    value = dr.detach(part.constant)
-    sigma = scale * _of_channel([value] if part.channels == 1 else [value.x, value.y, value.z], channel)
+    sigma = _of_channel(part.eval_at(scale, interval.ray, interval.t0, interval.active), channel)
     t = mi.Float64(interval.t0) + mi.Float64(goal / sigma)
     return dr.select(interval.active & (sigma > 0) & (t < interval.t1), t, dr.inf)
 
@@ -69,21 +69,20 @@ def _in_grid(
 ) -> mi.Float64:
     lattice, ray = part.lattice, interval.ray
     segment, width = clip_interval(lattice, interval), dr.width(ray)
-    activate, reads = _activation(part), [Nodes(dr.detach(part.values), part.channels)]
+    reads = [Nodes(dr.detach(part.values), part.channels)]
 
     def visit(state: tuple, cell: Cell, on: mi.Bool) -> tuple:
-        left, s, dt, tau_there, found = state
+        left, s, dt, found = state
         corners = [_of_channel([row[q] for row in cell.corners[0]], channel) for q in range(8)]
-        a, b = (activate(interpolate(corners, p)) for p in gauss_points(cell))
+        a, b = (activate(part.activation, interpolate(corners, p)) for p in gauss_points(cell))
         tau = 0.5 * cell.dt * scale * (a + b)
         here = on & (tau >= left)
         s, dt = dr.select(here, cell.s, s), dr.select(here, cell.dt, dt)
-        tau_there = dr.select(here, tau, tau_there)
-        return dr.select(on & ~here, left - tau, left), s, dt, tau_there, found | here
+        return dr.select(on & ~here, left - tau, left), s, dt, found | here
 
     zero = dr.zeros(mi.Float, width)
-    start = (mi.Float(goal), zero, zero, zero, dr.full(mi.Bool, False, width))
-    left, s, dt, tau, found = walk(lattice, segment, visit, start, reads, interval.active, until=lambda state: state[4])
+    start = (mi.Float(goal), zero, zero, dr.full(mi.Bool, False, width))
+    left, s, dt, found = walk(lattice, segment, visit, start, reads, interval.active, until=lambda state: state[3])
 
     # -- The cell of the collision once more: where in it --------------------------------------------------------------
     begin = segment.start + mi.Float64(s)
@@ -91,16 +90,9 @@ def _in_grid(
     nodes = box_nodes(cell, dr.full(dr.mask_t(mi.Vector3f), True), lattice.res)
     rows = read_nodes(reads, nodes, inside)[0]
     corners = [_of_channel([row[q] for row in rows], channel) for q in range(8)]
-    curve = cubic_through(*(scale * activate(interpolate(corners, p)) for p in points))
-    x = invert_cubic_integral(curve, dt, dr.minimum(left, tau), cubic_integral(curve, dt, mi.Float(1)))
+    curve = cubic_through(*(scale * activate(part.activation, interpolate(corners, p)) for p in points))
+    x = invert_cubic_integral(curve, dt, left, cubic_integral(curve, dt, mi.Float(1)))
     return dr.select(found, begin + mi.Float64(x) * mi.Float64(dt), dr.inf)
-
-
-def _activation(part: ExactExtinction):
-    """What makes an extinction of an interpolated value."""
-    if part.activation is None:
-        return lambda value: value
-    return lambda value: part.activation.value_and_slope(value)[0]
 
 
 def _of_channel(rows: list[mi.Float], channel: mi.UInt32) -> mi.Float:

@@ -23,6 +23,7 @@ References: Vicini et al. 2021 (path replay); Nimier-David et al. 2022 (probes w
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import drjit as dr
 import mitsuba as mi
@@ -85,7 +86,7 @@ class FlownSegment:
         if self.emission is None:
             return total
         ray, point = self.segment.ray, self.emission.point
-        for body, on in _bodies_at(self.media, point.body, point.on):
+        for body, on in self.media.bodies_at(point.body, point.on):
             if body.view.emits:
                 light = self.emission.gain * dr.detach(eval_emission(body, ray, point.t, self.media.channels, on))
                 total = dr.select(on, light, total)
@@ -99,7 +100,7 @@ class FlownSegment:
             return
         media, ray, found = self.media, self.segment.ray, self.emission
         value = mi.Spectrum(0)
-        for body, on in _bodies_at(media, found.point.body, found.point.on):
+        for body, on in media.bodies_at(found.point.body, found.point.on):
             if not body.view.emits:
                 continue
             with dr.resume_grad():
@@ -117,7 +118,7 @@ class FlownSegment:
             return total
         media, ray, found = self.media, self.segment.ray, self.emission
         value, change = mi.Spectrum(0), mi.Spectrum(0)
-        for body, on in _bodies_at(media, found.point.body, found.point.on):
+        for body, on in media.bodies_at(found.point.body, found.point.on):
             if not body.view.emits:
                 continue
             with dr.resume_grad():
@@ -139,7 +140,7 @@ class FlownSegment:
         media, ray, hit = self.media, self.segment.ray, self.collision
         rest = dlog - self.dL * self._level
         vjp_optical_depth(media, self.passed, -rest, self.active)
-        for body, on in _bodies_at(media, hit.body, hit.on & self.segment.scatters):
+        for body, on in media.bodies_at(hit.body, hit.on & self.segment.scatters):
             name, sigma = _scattering_part(media, body, ray, hit.t, on)
             weight = dr.select(on, rest * dr.rcp(sigma + _kappa(media, body)), 0)
             body.deposit(ray, dr.select(on, hit.t, 0), by_channel(weight, media.channels), on, name)
@@ -151,8 +152,8 @@ class FlownSegment:
                     dr.backward_from(dr.select(on, dlog * _over_albedo(albedo), 0))
 
     def jvp_transmittance(self) -> mi.Spectrum:
-        media, hit, change = self.media, self.collision, self._jvp_extinction
-        for body, on in _bodies_at(media, hit.body, hit.on & self.segment.scatters):
+        media, hit, change = self.media, self.collision, mi.Spectrum(self._jvp_extinction)
+        for body, on in media.bodies_at(hit.body, hit.on & self.segment.scatters):
             if body.view.albedo is None:
                 continue
             with dr.resume_grad():
@@ -160,18 +161,16 @@ class FlownSegment:
             change += dr.select(on, own, 0)
         return change
 
-    @property
+    @cached_property
     def _jvp_extinction(self) -> mi.Spectrum:
         """Tangent of the logarithm of the throughput by the extinction, without the share that probes have."""
-        if not hasattr(self, "_tangent"):
-            media, ray, hit = self.media, self.segment.ray, self.collision
-            change = -jvp_optical_depth(media, self.passed, self.active)
-            for body, on in _bodies_at(media, hit.body, hit.on & self.segment.scatters):
-                name, sigma = _scattering_part(media, body, ray, hit.t, on)
-                own = spectrum(body.tangent_at(ray, dr.select(on, hit.t, 0), media.channels, on, name))
-                change += dr.select(on, own * dr.rcp(sigma + _kappa(media, body)), 0)
-            self._tangent = change
-        return self._tangent
+        media, ray, hit = self.media, self.segment.ray, self.collision
+        change = -jvp_optical_depth(media, self.passed, self.active)
+        for body, on in media.bodies_at(hit.body, hit.on & self.segment.scatters):
+            name, sigma = _scattering_part(media, body, ray, hit.t, on)
+            own = spectrum(body.tangent_at(ray, dr.select(on, hit.t, 0), media.channels, on, name))
+            change += dr.select(on, own * dr.rcp(sigma + _kappa(media, body)), 0)
+        return change
 
 
 @dataclass
@@ -179,7 +178,7 @@ class Probe:
     """A probe of one of the flights of a path, kept in proportion to the light that it stands for (reservoir sampling).
 
     Attributes:
-        ray, medium: the flight's ray, and the medium around its origin.
+        ray: of the flight.
         t: distance of the point [length].
         body: index of its medium.
         gain: throughput to the point, times the length that it stands for.
@@ -189,7 +188,6 @@ class Probe:
     """
 
     ray: mi.Ray3f
-    medium: mi.MediumPtr
     t: mi.Float64
     body: mi.UInt32
     gain: mi.Spectrum
@@ -202,7 +200,7 @@ class Probe:
         """No flight yet."""
         n = dr.width(ray)
         zero = dr.zeros(mi.Float, n)
-        nothing = dr.zeros(mi.MediumPtr, n), dr.zeros(mi.Float64, n), dr.zeros(mi.UInt32, n), dr.zeros(mi.Spectrum, n)
+        nothing = dr.zeros(mi.Float64, n), dr.zeros(mi.UInt32, n), dr.zeros(mi.Spectrum, n)
         return cls(mi.Ray3f(ray), *nothing, dr.zeros(mi.UInt32, n), zero, zero)
 
     def offer(self, segment: PathSegment, found: FlightPoint, depth: mi.UInt32) -> Probe:
@@ -213,7 +211,6 @@ class Probe:
         keep = found.chance * total < weight
         return Probe(
             dr.select(keep, segment.ray, self.ray),
-            dr.select(keep, segment.medium, self.medium),
             dr.select(keep, point.t, self.t),
             dr.select(keep, point.body, self.body),
             dr.select(keep, gain, self.gain),
@@ -266,7 +263,7 @@ class ProbeTerm:
 
     def vjp(self, dL: mi.Spectrum) -> None:
         media, probe = self.media, self.probe
-        for body, on in _bodies_at(media, probe.body, self.on):
+        for body, on in media.bodies_at(probe.body, self.on):
             name, weight = self._weight(body, on)
             body.deposit(probe.ray, probe.t, by_channel(dr.select(on, dL * weight, 0), media.channels), on, name)
             if body.view.albedo is None:
@@ -278,7 +275,7 @@ class ProbeTerm:
 
     def jvp(self) -> mi.Spectrum:
         media, probe, total = self.media, self.probe, mi.Spectrum(0)
-        for body, on in _bodies_at(media, probe.body, self.on):
+        for body, on in media.bodies_at(probe.body, self.on):
             name, weight = self._weight(body, on)
             own = weight * spectrum(body.tangent_at(probe.ray, probe.t, media.channels, on, name))
             if body.view.albedo is not None:
@@ -292,11 +289,6 @@ class ProbeTerm:
         """The derivative of the light by an albedo that collisions leave out."""
         sigma_t = spectrum(body.extinction_at(self.probe.ray, self.probe.t, self.media.channels, on))
         return dr.select(dr.detach(albedo) < LEAST_ALBEDO, self._gain * sigma_t * self.source, 0)
-
-
-def _bodies_at(media: SceneMedia, index: mi.UInt32, on: mi.Bool) -> list[tuple[Body, mi.Bool]]:
-    """The bodies, each with the lanes that are in it."""
-    return [(body, on & (index == k)) for k, body in enumerate(media.bodies)]
 
 
 def _scattering_part(media: SceneMedia, body: Body, ray: mi.Ray3f, t: mi.Float64, on: mi.Bool) -> tuple[str, mi.Spectrum]:

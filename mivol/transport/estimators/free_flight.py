@@ -122,9 +122,8 @@ class FreeFlight:
     def _collision(self, ray: mi.Ray3f, flight: _Flight, collides: mi.Bool) -> Collision:
         """The point of a collision, and its albedo."""
         mei, albedo = medium_interaction(ray, dr.select(collides, flight.t, 0)), mi.Spectrum(0)
-        for index, body in enumerate(self.media.bodies):
-            here = collides & (flight.body == index)
-            mei.medium = dr.select(here, mi.MediumPtr(body.view.medium), mei.medium)
+        mei.medium = self.media.medium_of(flight.body, collides)
+        for body, here in self.media.bodies_at(flight.body, collides):
             albedo = dr.select(here, self._albedo(body, ray, flight.t, mei, here), albedo)
         return Collision(mei, albedo, collides, flight.t, flight.body)
 
@@ -154,8 +153,8 @@ class FreeFlight:
         # Only ratios of transmittances count, and the largest of them is made 1.
         least = least_of(tau)
         value = spectrum([dr.exp(least - row) for row in tau])
-        for index, body in enumerate(self.media.bodies if collision is not None else []):
-            here = collision.on & (collision.body == index)
+        hits = [] if collision is None else self.media.bodies_at(collision.body, collision.on)
+        for body, here in hits:
             value = dr.select(here, value * self._extinction(body, segment.ray, collision.t, here), value)
         shares = _shares(segment.beta)
         density = sum((p * v for p, v in zip(shares, colours(value), strict=True)), mi.Float(0))

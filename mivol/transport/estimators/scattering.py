@@ -46,14 +46,13 @@ class Scattering:
 def medium_event_interaction(media: SceneMedia, ray: mi.Ray3f, event: MediumEvent) -> mi.MediumInteraction3f:
     """An event as the interaction that Mitsuba's phase functions are evaluated at."""
     mei = medium_interaction(ray, event.t)
-    for index, body in enumerate(media.bodies):
-        mei.medium = dr.select(event.on & (event.body == index), mi.MediumPtr(body.view.medium), mei.medium)
+    mei.medium = media.medium_of(event.body, event.on)
     return mei
 
 
 def at_event(media: SceneMedia, event: MediumEvent) -> list[tuple[Body, mi.Bool]]:
     """The bodies, each with the lanes that scatter in it."""
-    return [(body, event.on & (event.body == index)) for index, body in enumerate(media.bodies)]
+    return media.bodies_at(event.body, event.on)
 
 
 def sigma_t_at(media: SceneMedia, body: Body, ray: mi.Ray3f, event: MediumEvent, on: mi.Bool) -> mi.Spectrum:

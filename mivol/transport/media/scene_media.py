@@ -59,6 +59,17 @@ class SceneMedia:
         """All media."""
         return self.boxed + self.traced
 
+    def bodies_at(self, index: mi.UInt32, on: mi.Bool) -> list[tuple[Body, mi.Bool]]:
+        """The media, each with the lanes of ``on`` whose ``index`` among ``bodies`` is its own."""
+        return [(body, on & (index == k)) for k, body in enumerate(self.bodies)]
+
+    def medium_of(self, index: mi.UInt32, on: mi.Bool) -> mi.MediumPtr:
+        """Mitsuba's medium by its index among ``bodies``; null in lanes that are not ``on``."""
+        medium = dr.zeros(mi.MediumPtr, dr.width(on))
+        for body, here in self.bodies_at(index, on):
+            medium = dr.select(here, mi.MediumPtr(body.view.medium), medium)
+        return medium
+
     @property
     def is_single(self) -> bool:
         """Whether one walk of cells passes all extinction in its order: one medium, whose grids share their cells."""

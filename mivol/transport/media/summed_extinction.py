@@ -17,7 +17,7 @@ from mivol.transport.traversal.grid_walk import Nodes
 from mivol.transport.traversal.interpolation import interpolate
 from mivol.transport.traversal.lattice import Lattice
 
-__all__ = ["SummedExtinction", "share_cells"]
+__all__ = ["SummedExtinction", "activate", "share_cells"]
 
 
 class SummedExtinction:
@@ -43,7 +43,7 @@ class SummedExtinction:
         """[channel][point] values at points of a cell (fractions from its near planes), from [read][channel][corner]."""
         pairs = list(zip(corners, self.activations, strict=False))
         grids = [
-            [[_activate(a, interpolate(g[c % len(g)], p)) for g, a in pairs] for p in points] for c in range(self.channels)
+            [[activate(a, interpolate(g[c % len(g)], p)) for g, a in pairs] for p in points] for c in range(self.channels)
         ]
         return [
             [dr.fma(self.scale, sum(s, mi.Float(0)), k) for s in sums] for sums, k in zip(grids, self.constant, strict=True)
@@ -61,7 +61,8 @@ def share_cells(a: Lattice, b: Lattice) -> bool:
     return a.res == b.res and np.array_equal(a.to_world, b.to_world)
 
 
-def _activate(activation: Activation | None, value: mi.Float) -> mi.Float:
+def activate(activation: Activation | None, value: mi.Float) -> mi.Float:
+    """The extinction of an interpolated value: the value itself without an activation."""
     return value if activation is None else activation.value_and_slope(value)[0]
 
 

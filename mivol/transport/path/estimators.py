@@ -189,6 +189,11 @@ class Estimators:
         self.media, self.direct, self.segment = direct.media, direct, segment
         self.lights_surfaces, self.lights_media, self.lobe = lights_surfaces, lights_media, lobe
 
+    @property
+    def estimates_shadows(self) -> bool:
+        """Whether shadow rays of vertices are estimated, which takes a random number."""
+        return self.media.is_bounded or (self.segment.ends_in_media and self.media.estimates_shadows)
+
     def prepare_derivatives(self, ray: mi.Ray3f) -> None:
         """Find what derivatives along camera rays need beforehand, once for all passes."""
         self.segment.prepare_derivatives(ray)

@@ -174,9 +174,9 @@ def _walk_on(estimators: Estimators, settings: Settings, limit: int, path: Path)
 
 def _add_side_flight(estimators: Estimators, path: Path, event: PathEvent, active: mi.Bool) -> tuple[Path, SideSamples]:
     """Draw an emitter sample for the next vertex, and look at it from the end of a side flight."""
-    media, sampler = estimators.media, path.sampler
+    sampler = path.sampler
     u, lobe, flight = sampler.next_2d(active), sampler.next_2d(active), estimators.segment.draw(sampler, active, None)
-    samples = SideSamples(u, lobe, flight, sampler.next_1d(active) if media.is_bounded or media.estimates_shadows else None)
+    samples = SideSamples(u, lobe, flight, sampler.next_1d(active) if estimators.estimates_shadows else None)
     path.score = path.score.add(fly_aside(estimators, event.collision, path.beta, samples, active))
     return path, samples
 
@@ -186,8 +186,7 @@ def _estimate_probe(estimators: Estimators, settings: Settings, limit: int, prob
     media, n = estimators.media, dr.width(probe.ray)
     on = probe.weight > 0
     mei = medium_interaction(probe.ray, dr.select(on, probe.t, 0))
-    for index, body in enumerate(media.bodies):
-        mei.medium = dr.select(on & (probe.body == index), mi.MediumPtr(body.view.medium), mei.medium)
+    mei.medium = media.medium_of(probe.body, on)
     path = _start(estimators, probe.ray, Primal(dr.zeros(mi.Spectrum, n)), sampler, None, on)
     path.depth = mi.UInt32(probe.depth)
     collision = Collision(mei, dr.full(mi.Spectrum, 1, n), on, probe.t, probe.body)
@@ -295,8 +294,7 @@ def _add_direct_light(estimators: Estimators, path: Path, event: PathEvent, may_
         lit |= may_scatter & event.in_medium
     if not (estimators.lights_surfaces or estimators.lights_media):
         return path
-    estimates = media.is_bounded or (estimators.segment.ends_in_media and media.estimates_shadows)
-    u, chance = sampler.next_2d(lit), sampler.next_1d(lit) if estimates else None
+    u, chance = sampler.next_2d(lit), sampler.next_1d(lit) if estimators.estimates_shadows else None
     if path.aim is not None:
         u = dr.select(path.aim.on, path.aim.u, u)
     vertex = event.vertex(media, path.ray)
