@@ -227,7 +227,7 @@ STRANGERS = (
 @pytest.mark.slow
 @pytest.mark.statistical
 @pytest.mark.parametrize("name", STRANGERS)
-def test_media_scenes_of_mitsubas_own_tests(name, data_dir):
+def test_media_scenes_of_mitsubas_own_tests(two_threads, name, data_dir):
     """At their own depth of 6, with the name of the integrator as the only change: the means of whole pictures.
 
     A wide filter shares samples between pixels, so batches tell the noise of a mean. An rgb extinction is rendered
