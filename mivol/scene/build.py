@@ -59,7 +59,7 @@ def build_estimators(
     lights_surfaces = bool(needs.surfaces) and settings.scatterings >= 1
     segment = SEGMENT_ESTIMATORS[plan.segment].make(choice)
     lights_media = segment.ends_in_media and any(kind != "uniform" for kind in needs.emitter_kinds)
-    lobe = dr.opaque(mi.Float, plan.lobe) if plan.lobe is not None and pictures else None
+    lobe = None if plan.lobe is None else dr.opaque(mi.Float, plan.lobe)
     return Estimators(direct, segment, lights_surfaces, lights_media, lobe)
 
 

@@ -204,14 +204,14 @@ def choose_shadows(medium: MediumFacts, needs: Needs, settings: Settings) -> Cho
 
 
 def choose_side_flights(needs: Needs, settings: Settings, segment: str) -> tuple[float | None, list[Choice]]:
-    """The mean cosine of the lobe that side flights are drawn from, in pictures; None for no side flights."""
+    """The mean cosine of the lobe that side flights are drawn from; None for no side flights."""
     if segment != "free_flight" or settings.scatterings < 2 or not needs.are_emitters_far:
         return None, []
     cosine = max((m.mean_cosine for m in needs.media if m.mean_cosine is not None), default=0.0)
     if cosine < PEAKED:
         return None, []
     why = f"emitters are at infinity, and a phase function has a mean cosine of {cosine:.2f}"
-    return min(cosine, 0.95), [Choice("side flights", "towards the emitter of the next collision, in pictures", why)]
+    return min(cosine, 0.95), [Choice("side flights", "towards the emitter of the next collision", why)]
 
 
 def choose_events(needs: Needs, settings: Settings, segment: str) -> tuple[int, list[Choice]]:

@@ -17,7 +17,7 @@ from oracle_phase import gauss, hg
 
 from mivol.transport.estimators.direct_lighting import DirectLighting
 from mivol.transport.estimators.free_flight import FreeFlight
-from mivol.transport.estimators.segment import Collision
+from mivol.transport.estimators.segment import PICTURE, Collision
 from mivol.transport.media.coefficients import medium_interaction
 from mivol.transport.path.estimators import Estimators
 from mivol.transport.path.side_flight import SideSamples, fly_aside, weigh_aim
@@ -55,8 +55,8 @@ def test_light_at_the_end_of_a_side_flight():
     sampler.seed(fresh(1), N)
     samples = SideSamples(sampler.next_2d(), sampler.next_2d(), (sampler.next_1d(), sampler.next_1d()), None)
     with dr.suspend_grad():
-        found = fly_aside(estimators, hit, mi.Spectrum(0.5, 1, 2), samples, dr.arange(mi.UInt32, N) > 0)
-    value = np.array(found.value, np.float64)
+        found = fly_aside(estimators, hit, mi.Spectrum(0.5, 1, 2), samples, PICTURE, dr.arange(mi.UInt32, N) > 0)
+    value = np.array(found.light.value, np.float64)
     (c, wc), (t, wt) = gauss(64), gauss(64)
     t, wt = 0.5 * (t + 1), 0.5 * wt
     s = -t * c[:, None] + np.sqrt(1 - t**2 * (1 - c[:, None] ** 2))

@@ -194,6 +194,49 @@ def test_density_by_differences(room, depth):
     assert_precise(difference(found, truth), 0.1 * np.abs(truth.mean) + 1e-4, what="derivative")
 
 
+# -- Side flights --------------------------------------------------------------------------------------------------------
+
+OF_A_SUN = PARAMETERS | {"lamp": "sun.irradiance.value"}
+
+
+def _in_the_sun() -> mi.Scene:
+    """A peaked phase function under the sun, whose light side flights look for."""
+    smoky = grid_volume("mivol_voxels", rough_grid(4, 4.0), PLACE)
+    albedo = grid_volume("mivol_voxels", 0.9 * rough_grid(5, 1.0, (3, 3, 3)), PLACE)
+    interior = medium("mivol_medium", smoky, albedo, phase={"type": "mivol_hg", "g": 0.8})
+    return close_up({"smoke": box_of(interior, PLACE), "sun": sun([0.3, 0.2, -1.0])[0]}, res=8)
+
+
+@pytest.mark.parametrize("name", ["density", "albedo", "g", "lamp"])
+def test_of_side_flights_forward_is_the_transpose_of_reverse(name):
+    """As above, to the same bound."""
+    scene, key, integrator = _in_the_sun(), OF_A_SUN[name], mi.load_dict(mivol(max_depth=4))
+    w = np.random.default_rng(1).uniform(0.5, 1.5, (8, 8, 3))
+    params = mi.traverse(scene)
+    v = np.random.default_rng(2).uniform(0.5, 1.5, np.shape(params[key])) if np.size(params[key]) > 3 else 1.0
+    seed = fresh(5)
+    there, back = _forward(scene, key, v, 16, seed, integrator), _backward(scene, key, w, 16, seed, integrator)
+    assert np.sum(there * w) == pytest.approx(
+        np.sum(back * v), abs=1e-4 * max(np.abs(there * w).sum(), np.abs(back * v).sum())
+    )
+
+
+@pytest.mark.statistical
+@pytest.mark.parametrize("name", ["density", "albedo", "g"])
+def test_side_flights_keep_the_mean_of_derivatives(name, monkeypatch):
+    """With them and without, along a random direction in the upper half: what the two halves scatter nearly cancels."""
+    scene, key, integrator = _in_the_sun(), OF_A_SUN[name], mi.load_dict(mivol(max_depth=4))
+    shape = np.shape(mi.traverse(scene)[key])
+    v = np.random.default_rng(2).uniform(0.5, 1.5, shape) if len(shape) == 4 else 1.0
+    if len(shape) == 4:
+        v[: shape[0] // 2] = 0
+    with_them = _along(scene, key, v, integrator, 512)
+    monkeypatch.setattr(plan, "choose_side_flights", lambda *_: (None, []))
+    without = _along(scene, key, v, integrator, 1024)
+    assert_same_mean(with_them, without, rounding=1e-4 * np.abs(without.mean), what="derivative")
+    assert_precise(difference(with_them, without), 0.1 * np.abs(without.mean), what="derivative")
+
+
 @pytest.mark.parametrize(("name", "depth"), [("emission", 5), ("lamp", 5)])
 def test_light_is_linear_in_what_emits(name, depth):
     """The derivative along an emission is the image of that emission alone, sample by sample."""

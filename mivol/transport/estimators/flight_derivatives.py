@@ -138,7 +138,7 @@ class FlownSegment:
 
     def vjp(self, dlog: mi.Spectrum) -> None:
         media, ray, hit = self.media, self.segment.ray, self.collision
-        rest = dlog - self.dL * self._level
+        rest = dlog if self.level is None else dlog - self.dL * self._level
         vjp_optical_depth(media, self.passed, -rest, self.active)
         for body, on in media.bodies_at(hit.body, hit.on & self.segment.scatters):
             name, sigma = _scattering_part(media, body, ray, hit.t, on)

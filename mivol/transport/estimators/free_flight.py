@@ -114,7 +114,9 @@ class FreeFlight:
         weight = self._weigh(segment, passed, collision, active)
         emitting = [body for body in media.bodies if body.view.emits]
         emission = self._point_of(segment, passed, emitting, at_emission, chance, active) if emitting else None
-        shared = FlownSegment(media, segment, passed, collision, weight, self.level, emission, active)
+        # What a side flight leaves to probes is found by those of the path itself, and so is the light of the level.
+        level = None if segment.is_aside else self.level
+        shared = FlownSegment(media, segment, passed, collision, weight, level, emission, active)
         light = SegmentLight(shared, shared.emitted, is_replayed=True)
         probe = self._point_of(segment, passed, media.bodies, at_probe, chance, active) if purpose != PICTURE else None
         return SegmentEstimate(end, weight, light, SegmentTransmittance(shared), collision, probe)

@@ -57,6 +57,7 @@ class PathSegment:
         beta: throughput of the path to there.
         scatters: lanes whose path may scatter once more.
         samples: random numbers that the estimator has drawn; None where it needs none.
+        is_aside: a side flight, which the path does not take itself (:mod:`mivol.transport.path.side_flight`).
     """
 
     ray: mi.Ray3f
@@ -64,6 +65,7 @@ class PathSegment:
     beta: mi.Spectrum
     scatters: mi.Bool
     samples: Any
+    is_aside: bool = False
 
 
 @dataclass

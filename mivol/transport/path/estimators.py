@@ -200,4 +200,4 @@ class Estimators:
 
     def replayed(self) -> Estimators:
         """Estimators of the radiance that a replay subtracts from: without light that is sampled anew for its derivatives."""
-        return Estimators(self.direct, self.segment.replayed(), self.lights_surfaces, self.lights_media)
+        return Estimators(self.direct, self.segment.replayed(), self.lights_surfaces, self.lights_media, self.lobe)

@@ -8,6 +8,10 @@ the balance heuristic: the direct light at x' counts p / (p + q), that at the en
 
 Emitters are at infinity here, so that w is as probable at x' as at x.
 
+For derivatives a side flight is walked back like the path's own flights, and its shadow ray is offered to the path's reservoir.
+The light that is missed where there is no extinction is found by the probes of the path alone
+(:mod:`mivol.transport.estimators.flight_derivatives`), since their points are drawn without those weights.
+
 Source: the balance heuristic of Veach & Guibas 1995, applied to next-event estimation with a direction drawn one vertex early.
 """
 
@@ -20,12 +24,13 @@ import mitsuba as mi
 
 from mivol.phase.hg import eval_hg, sample_hg
 from mivol.phase.turn import direction_after, turn_between
+from mivol.transport.estimators.contribution import Factor, TrackedTerm
 from mivol.transport.estimators.direct_lighting import DirectLight
 from mivol.transport.estimators.segment import PICTURE, Collision, PathSegment
 from mivol.transport.estimators.vertex import MediumVertex
 from mivol.transport.path.estimators import Estimators
 
-__all__ = ["Aim", "SideSamples", "fly_aside", "weigh_aim"]
+__all__ = ["Aim", "SideFlight", "SideLight", "SideSamples", "fly_aside", "weigh_aim"]
 
 
 @dataclass
@@ -58,9 +63,45 @@ class SideSamples:
     chance: mi.Float | None
 
 
+class SideLight(TrackedTerm):
+    """The light at the end of a side flight, as a term, but for the derivatives of the media along its shadow ray.
+
+    Args:
+        value: as the camera sees it, attached to the phase functions and the emitter.
+        flown: the transmittance of the flight, and the albedo at its end, as a factor.
+        active: lanes that receive it.
+    """
+
+    def __init__(self, value: mi.Spectrum, flown: Factor, active: mi.Bool) -> None:
+        super().__init__(value, active)
+        self.flown = flown
+
+    def vjp(self, dL: mi.Spectrum) -> None:
+        super().vjp(dL)
+        self.flown.vjp(dL * self.value)
+
+    def jvp(self) -> mi.Spectrum:
+        return super().jvp() + self.value * self.flown.jvp()
+
+
+@dataclass
+class SideFlight:
+    """A side flight.
+
+    Attributes:
+        light: that it finds.
+        shadow: the shadow ray at its end.
+        chance: for derivatives, a number in [0, 1) by which one of a path's shadow rays is kept; None for pictures.
+    """
+
+    light: SideLight
+    shadow: DirectLight
+    chance: mi.Float | None
+
+
 def fly_aside(
-    estimators: Estimators, collision: Collision, beta: mi.Spectrum, samples: SideSamples, active: mi.Bool
-) -> DirectLight:
+    estimators: Estimators, collision: Collision, beta: mi.Spectrum, samples: SideSamples, purpose: str, active: mi.Bool
+) -> SideFlight:
     """Estimate the light that scatters twice by a side flight.
 
     Args:
@@ -68,24 +109,33 @@ def fly_aside(
         collision: the vertex that the flight leaves.
         beta: throughput to there.
         samples: random numbers.
+        purpose: PICTURE, or that of derivatives, which keeps the values attached.
         active: lanes whose path may scatter here and once more.
 
     Returns:
-        The light, as a term; where the flight meets no medium there is none.
+        The light; where the flight meets no medium there is none.
 
     Cost: one flight and one shadow ray.
     """
-    media, mei = estimators.media, collision.mei
+    media, mei, attached = estimators.media, collision.mei, purpose != PICTURE
     w = _direction_to_emitter(estimators, mei, samples.emitter, active)
     wo = direction_after(-w, sample_hg(samples.lobe.x, estimators.lobe), samples.lobe.y)
-    f, p = MediumVertex(media, mei).eval_and_pdf(wo, active)
-    carried = beta * collision.albedo * f * dr.rcp(p + eval_hg(turn_between(-w, wo), estimators.lobe))
+    vertex = MediumVertex(media, mei)
+    f, p = vertex.eval_and_pdf(wo, active)
+    reached = beta * collision.albedo * dr.rcp(p + eval_hg(turn_between(-w, wo), estimators.lobe))
     ray = mi.Ray3f(mei.p, wo, dr.inf, mei.time, mei.wavelengths)
-    flown = estimators.segment.estimate(PathSegment(ray, mei.medium, carried, active, samples.flight), PICTURE, active)
+    ahead = PathSegment(ray, mei.medium, reached * f, active, samples.flight, is_aside=True)
+    flown = estimators.segment.estimate(ahead, purpose, active)
     there = flown.collision
     on = active & there.on
-    direct = estimators.direct.at_vertex(MediumVertex(media, there.mei), samples.emitter, False, on, samples.chance)
-    return DirectLight(media, direct.ray_segment, carried * flown.T * there.albedo * direct.value, on & direct.on)
+    direct = estimators.direct.at_vertex(MediumVertex(media, there.mei), samples.emitter, attached, on, samples.chance)
+    with dr.resume_grad(when=attached):
+        if attached:
+            f = vertex.eval(wo, active)
+        value = reached * f * (flown.T * there.albedo) * direct.value
+    lit = on & direct.on
+    chance = None if flown.probe is None else flown.probe.chance
+    return SideFlight(SideLight(value, flown.transmittance, lit), DirectLight(media, direct.ray_segment, value, lit), chance)
 
 
 def weigh_aim(

@@ -177,7 +177,10 @@ def _add_side_flight(estimators: Estimators, path: Path, event: PathEvent, activ
     sampler = path.sampler
     u, lobe, flight = sampler.next_2d(active), sampler.next_2d(active), estimators.segment.draw(sampler, active, None)
     samples = SideSamples(u, lobe, flight, sampler.next_1d(active) if estimators.estimates_shadows else None)
-    path.score = path.score.add(fly_aside(estimators, event.collision, path.beta, samples, active))
+    flight = fly_aside(estimators, event.collision, path.beta, samples, path.score.purpose, active)
+    path.score = path.score.add(flight.light)
+    if path.shadow is not None:
+        path.shadow = path.shadow.offer(flight.shadow, flight.chance)
     return path, samples
 
 
