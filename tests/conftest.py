@@ -31,6 +31,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--variant", default="llvm_ad_rgb", help="the Mitsuba variant of the fixture variant_rgb")
     parser.addoption("--seeds", type=int, default=1, help="how many rounds of seeds tests of noise run with")
     parser.addoption("--artefacts", type=Path, default=ROOT / "runs" / "tests", help="where tests leave pictures")
+    parser.addoption("--record", action="store_true", help="record anew what tests/report/looks holds")
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -76,6 +77,12 @@ def _collect_new_garbage() -> None:
     objects that a collection of all of them lasts 0.1 s to 0.3 s, once a test."""
     gc.collect()
     gc.freeze()
+
+
+@pytest.fixture
+def record(request: pytest.FixtureRequest) -> bool:
+    """Whether figures are recorded anew."""
+    return request.config.getoption("--record")
 
 
 @pytest.fixture

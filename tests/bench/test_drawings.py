@@ -1,0 +1,108 @@
+"""Figures of the benches are as they were when somebody looked at them: made-up answers, drawn and described."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+
+import numpy as np
+import pytest
+from matplotlib import rc_context
+from matplotlib.figure import Figure
+from report.looks import assert_recorded
+
+from mivol.bench import depth, gradients, multiple_scattering, single_scattering, still_life, tomography
+from mivol.bench.depth import TABLED, Cell
+from mivol.bench.gradients.size import LIGHTS, OURS, STOCK
+from mivol.report.figures import STYLE
+
+
+@contextmanager
+def kept(module: ModuleType, found: list[Figure], monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Keep the figures that a module draws, and write none."""
+
+    @contextmanager
+    def keep(path: Path, width: float, height: float) -> Iterator[Figure]:
+        with rc_context(STYLE):
+            found.append(Figure(figsize=(width, height)))
+            yield found[-1]
+
+    monkeypatch.setattr(module, "drawn", keep)
+    yield
+
+
+def drawn(module: ModuleType, monkeypatch: pytest.MonkeyPatch, *arguments: object) -> Figure:
+    """The one figure of a module's ``draw``."""
+    found: list[Figure] = []
+    with kept(module, found, monkeypatch):
+        module.draw(*arguments)
+    (figure,) = found
+    return figure
+
+
+def contest(names: dict, stocks: tuple[str, ...]) -> dict:
+    """Errors that fall with the root of time, of each method in each light, and ratios that differ by light."""
+    answer = {}
+    for k, (name, light) in enumerate(names.items(), 1):
+        rows = [{"seconds_median": t, f"relative_error_{light.average}_over_pixels": k * t**-0.5} for t in (0.5, 2.0)]
+        ratios = {
+            f"mivol over {s}": {f"variance_x_time_{light.average}_over_pixels": 10.0 * k + i} for i, s in enumerate(stocks)
+        }
+        answer[name] = dict.fromkeys((single_scattering.OURS, *stocks), rows) | ratios
+    return answer
+
+
+def test_single_scattering(monkeypatch: pytest.MonkeyPatch, record: bool) -> None:
+    answer = contest(single_scattering.LIGHTS, single_scattering.STOCK)
+    figure = drawn(single_scattering, monkeypatch, {"smoke": answer, "cloud": answer}, Path())
+    assert_recorded("bench_single_scattering", figure, record)
+
+
+def test_multiple_scattering(monkeypatch: pytest.MonkeyPatch, record: bool) -> None:
+    lights = multiple_scattering.CONTESTS["smoke"]
+    figure = drawn(multiple_scattering, monkeypatch, {"smoke": contest(lights, multiple_scattering.STOCK)}, Path())
+    assert_recorded("bench_multiple_scattering", figure, record)
+
+
+def test_gradients(monkeypatch: pytest.MonkeyPatch, record: bool) -> None:
+    smoke = {
+        light: {what: {"sigma_t >= 1": {"variance_x_time": 10.0 * k + i}} for i, what in enumerate(("mean", "L2"))}
+        for k, light in enumerate(LIGHTS, 4)
+    }
+    one = {name: {"bias_percent": 2.0 + k, "known_to_percent": 0.1 + k} for k, name in enumerate((OURS, STOCK))}
+    estimators = {light: {"dense": one, "density 0": one} for light in LIGHTS}
+    runs = {name: {"seconds": [1.0, 2.0 + k], "loss": [0.5, 0.0]} for k, name in enumerate((OURS, STOCK))}
+    answers = {"smoke": smoke, "estimators": estimators, "tutorial": {"runs": runs}}
+    assert_recorded("bench_gradients", drawn(gradients, monkeypatch, answers, Path()), record)
+
+
+def test_depth(monkeypatch: pytest.MonkeyPatch, record: bool) -> None:
+    cells = [
+        Cell("cube", light, phase, albedo, tau, 1.0, 2.0, albedo * tau / (4 + tau), 0.01 * k, 1.0)
+        for k, (light, phase) in enumerate(TABLED, 1)
+        for albedo in depth.ALBEDOS
+        for tau in (0.1, 1.0, 10.0)
+    ]
+    beside = [Cell(*place, "isotropic", 0.5, 2.0, 1.0, 2.0, 0.2 + 0.1 * k, 0.01, 1.0) for k, place in enumerate(depth.MARKS)]
+    answers = {"table": {"cells": [asdict(c) for c in cells]}, "beside": {"cells": [asdict(c) for c in beside]}}
+    assert_recorded("bench_depth", drawn(depth, monkeypatch, answers, Path()), record)
+
+
+def test_still_life(monkeypatch: pytest.MonkeyPatch, record: bool) -> None:
+    ramp = np.linspace(0, 1, 3 * 4 * 3).reshape(3, 4, 3)
+    fits = {"SH 2": {"photograph": ramp, "view": ramp * 1.5, "psnr": 20.125, "views": 8}}
+    figure = drawn(still_life, monkeypatch, {"degree": fits, "few": fits}, Path())
+    assert_recorded("bench_still_life", figure, record)
+
+
+def test_tomography(monkeypatch: pytest.MonkeyPatch, record: bool) -> None:
+    """The slice is three eighths up, and white is 0.6 of the truth's brightest thousandth."""
+    truth = np.arange(8.0 * 3 * 4).reshape(8, 3, 4)
+    curves = {"SIRT": {"nrmse": [0.5, 0.25], "seconds": [3.0, 6.0]}}
+    figure = drawn(
+        tomography, monkeypatch, SimpleNamespace(name="head", truth=truth), curves, {"SIRT": truth / 2}, Path("a.png")
+    )
+    assert_recorded("bench_tomography", figure, record)

@@ -1,0 +1,105 @@
+"""The picture of a set's cameras: what is up stays up, right-handed, and every line lies where its camera says."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from photo_sets import write_blender
+from scipy.spatial.transform import Rotation
+
+from mivol.photos import PhotoSurvey, survey_photos
+from mivol.photos.camera import Camera
+from mivol.photos.survey import Frame
+from mivol.report.cameras import EDGE, MOST_POINTS, outline, plot_cameras
+
+TURNS = {"x": [0, 90, 0], "y": [-90, 0, 0], "z": [0, 0, 0]}
+"""Angles about x, y and z that take z to an axis."""
+
+
+def turned(survey: PhotoSurvey, up: str) -> PhotoSurvey:
+    """The cameras and the box with another axis of the world upwards."""
+    pose = np.eye(4)
+    pose[:3, :3] = Rotation.from_euler("xyz", TURNS[up], degrees=True).as_matrix()
+    frames = tuple(replace(f, camera=replace(f.camera, to_world=pose @ f.camera.to_world)) for f in survey.frames)
+    corners = survey.box @ pose[:3, :3].T
+    return replace(survey, frames=frames, box=np.array([corners.min(axis=0), corners.max(axis=0)]))
+
+
+@pytest.fixture
+def survey(tmp_path: Path) -> PhotoSurvey:
+    found = survey_photos(write_blender(tmp_path / "set"), held_out=2)
+    return replace(found, box=np.array([[-1.0, -2.0, -3.0], [1.5, 2.5, 3.5]]))
+
+
+@pytest.mark.parametrize(("up", "order"), [("x", (1, 2, 0)), ("y", (2, 0, 1)), ("z", (0, 1, 2))])
+def test_up_is_up_and_the_picture_is_right_handed(survey: PhotoSurvey, up: str, order: tuple[int, int, int]) -> None:
+    """Cameras stand on a ring about the axis that is up. Seen from the side it is vertical; the plan shows the others."""
+    stands = turned(survey, up)
+    side, plan = plot_cameras(stands).axes
+    assert [side.get_xlabel(), side.get_ylabel(), side.get_zlabel()] == ["xyz"[k] for k in order]
+    assert plan.get_title(loc="left") == f"from above ({up} is up)"
+    assert (plan.get_xlabel(), plan.get_ylabel()) == tuple(f"{'xyz'[k]} [length]" for k in order[:2])
+    assert np.linalg.det(np.eye(3)[list(order)]) == 1
+    cameras = np.array([frame.camera.origin for frame in stands.frames])
+    drawn = {line.get_label(): np.array(line.get_data()).T for line in plan.lines}
+    lifted = {label: np.array(line.get_data_3d()).T for label, line in zip(drawn, side.lines, strict=True)}
+    for split in ("train", "held_out", "test"):
+        own = cameras[[frame.split == split for frame in stands.frames]]
+        begins = drawn[split].reshape(len(own), 8, 3, 2)[:, :4, 0]
+        np.testing.assert_allclose(begins, np.repeat(own[:, None, order[:2]], 4, axis=1))
+        np.testing.assert_allclose(
+            lifted[split].reshape(len(own), 8, 3, 3)[:, :4, 0], np.repeat(own[:, None, order], 4, axis=1)
+        )
+    for found, axes in ((drawn["box"], order[:2]), (lifted["box"], order)):
+        edges = found.reshape(12, 3, len(axes))
+        assert np.isnan(edges[:, 2]).all()
+        # The turn of the box is rounded by 2^-53 a term.
+        np.testing.assert_allclose(edges[:, :2].min(axis=(0, 1)), stands.box[0][list(axes)])
+        np.testing.assert_allclose(edges[:, :2].max(axis=(0, 1)), stands.box[1][list(axes)])
+
+
+def test_the_side_view_is_in_true_proportions(survey: PhotoSurvey) -> None:
+    """A unit is as long along each axis, and nothing that is drawn lies outside."""
+    side, plan = plot_cameras(survey).axes
+    limits = np.array([side.get_xlim(), side.get_ylim(), side.get_zlim()]).T
+    drawn = np.concatenate([np.array(line.get_data_3d()).T for line in side.lines])
+    np.testing.assert_allclose(limits, [np.nanmin(drawn, axis=0), np.nanmax(drawn, axis=0)])
+    # Of three dimensions matplotlib tells the proportions of the drawn box in this attribute alone.
+    ratios = side._box_aspect / np.ptp(limits, axis=0)
+    np.testing.assert_allclose(ratios / ratios[0], 1)
+    assert plan.get_aspect() == 1
+
+
+def test_edges_of_a_view_go_through_the_corners_of_its_film() -> None:
+    """A camera at (1, 2, 3) that looks along -z: its corner (u, v) is at ((u - cx) / fx, (cy - v) / fy, -1)."""
+    pose = np.eye(4)
+    pose[:3, 3] = 1, 2, 3
+    camera = Camera(np.array([[20.0, 0, 7], [0, 10, 3], [0, 0, 1]]), (12, 8), pose)
+    edges = outline(Frame(Path("a.png"), camera, "train"), 2.0)
+    corners = np.array([1, 2, 3]) + 2 * np.array([[-0.35, 0.3, -1], [0.25, 0.3, -1], [0.25, -0.5, -1], [-0.35, -0.5, -1]])
+    np.testing.assert_allclose(edges[:4], np.stack([np.tile([1.0, 2, 3], (4, 1)), corners], axis=1))
+    np.testing.assert_allclose(edges[4:], np.stack([corners, np.roll(corners, -1, axis=0)], axis=1))
+
+
+def test_views_are_drawn_as_long_as_the_cameras_are_far(survey: PhotoSurvey) -> None:
+    """Along its axis a view is EDGE of the median distance from the middle of the box."""
+    plan = plot_cameras(survey).axes[1]
+    middle = survey.box.mean(axis=0)
+    length = EDGE * np.median([np.linalg.norm(frame.camera.origin - middle) for frame in survey.frames])
+    first = next(frame for frame in survey.frames if frame.split == "train")
+    own = np.array(plan.lines[0].get_data()).T.reshape(-1, 8, 3, 2)[0]
+    np.testing.assert_allclose(own[:, :2], outline(first, length)[:, :, :2])
+
+
+@pytest.mark.parametrize(("many", "shown"), [(MOST_POINTS - 1, MOST_POINTS - 1), (3 * MOST_POINTS, MOST_POINTS)])
+def test_points_in_the_box_are_shown_up_to_a_number(survey: PhotoSurvey, many: int, shown: int) -> None:
+    """One point lies outside on each side of the box; the others are on its faces and within."""
+    grid = np.linspace(survey.box[0], survey.box[1], many)
+    beyond = [survey.box[k] + (2 * k - 1) * step for k in (0, 1) for step in np.eye(3)]
+    side, plan = plot_cameras(replace(survey, points=np.concatenate([grid, beyond]))).axes
+    points = np.asarray(plan.collections[0].get_offsets())
+    np.testing.assert_allclose(points, grid[:: many // shown, :2])
+    np.testing.assert_allclose(np.transpose(side.collections[0]._offsets3d), grid[:: many // shown])

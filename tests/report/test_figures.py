@@ -1,0 +1,84 @@
+"""Figures are as they were when somebody looked at them, and their rules hold: one scale, no axis without a unit."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+from photo_sets import ring
+from PIL import Image
+from report.looks import assert_recorded
+
+from mivol.photos import PhotoSurvey
+from mivol.photos.camera import Camera
+from mivol.photos.survey import Frame
+from mivol.report.cameras import plot_cameras
+from mivol.report.figures import Series, plot_curve, plot_error_against_time, plot_image_row, plot_slices, save
+
+
+def falling_curve() -> Figure:
+    return plot_curve([{"iteration": k, "seconds": 0.5 * k, "loss": 4.0 / 2**k} for k in range(9)], "loss")
+
+
+def long_curve() -> Figure:
+    return plot_curve([{"iteration": k, "seconds": 0.5 * k, "psnr": 20.0 + k} for k in range(31)], "psnr", against="seconds")
+
+
+def methods() -> Figure:
+    t = np.array([4.0, 1.0, 16.0])
+    series = [
+        Series("ours", t / 8, 1 / t),
+        Series("tracking", t, t**-0.5),
+        Series("exact", [5e4], [1e-6]),
+        Series("even", t, 0.3 / t),
+    ]
+    return plot_error_against_time(series, title="Which is sooner?")
+
+
+def ramps() -> tuple[np.ndarray, np.ndarray]:
+    z, y, x = np.meshgrid(*(np.arange(n) for n in (3, 4, 5)), indexing="ij")
+    return z + y / 4 + x / 20, (z + x) / 7
+
+
+def slices() -> Figure:
+    found, truth = ramps()
+    return plot_slices(found, truth, size=(5.0, 2.0, 3.0))
+
+
+def slices_alone() -> Figure:
+    return plot_slices(ramps()[0], quantity="albedo", unit="1")
+
+
+def row() -> Figure:
+    reference = ramps()[0][0]
+    return plot_image_row(reference, reference[:, ::-1], np.full_like(reference, 0.1), unit="W")
+
+
+def row_in_colour() -> Figure:
+    reference = np.stack([ramps()[0][k] for k in range(3)], axis=-1)
+    return plot_image_row(reference, 0.9 * reference)
+
+
+def cameras() -> Figure:
+    views = [Camera(np.array([[20.0, 0, 6], [0, 20, 4], [0, 0, 1]]), (12, 8), pose) for pose in ring(5)]
+    splits = ("train", "held_out", "val", "test", "train")
+    frames = tuple(Frame(Path(f"{k}.png"), view, split) for k, (view, split) in enumerate(zip(views, splits, strict=True)))
+    box = np.array([[-1.0, -1, -1], [1, 1, 1]])
+    return plot_cameras(PhotoSurvey(Path("ring"), "COLMAP", frames, (), box, "points", (1.0, 9.0), np.zeros((1, 3))))
+
+
+DRAWN = [cameras, falling_curve, long_curve, methods, slices, slices_alone, row, row_in_colour]
+
+
+@pytest.mark.parametrize("draw", DRAWN, ids=lambda draw: draw.__name__)
+def test_a_figure_looks_as_recorded(draw: Callable[[], Figure], record: bool) -> None:
+    assert_recorded(draw.__name__, draw(), record)
+
+
+def test_a_picture_has_160_pixels_an_inch(tmp_path: Path) -> None:
+    """A curve of 4.4 x 2.75 inches."""
+    with Image.open(save(long_curve(), tmp_path / "curve.png")) as image:
+        assert image.size == (704, 440)
