@@ -16,8 +16,9 @@ from mivol.bench.extinctions import TO_WORLD
 __all__ = [
     "box_scene",
     "constant_light",
-    "depth_two",
     "directional_light",
+    "lamp_inside",
+    "milky_glass",
     "of_depth",
     "perspective",
     "point_light",
@@ -51,16 +52,18 @@ def box_scene(values: np.ndarray, side: int, albedo: float = 0.0, **more: dict) 
         values: (Z, Y, X) [1/length].
         side: of the picture [pixels].
         albedo: of the medium.
-        more: ``phase`` of the medium; all else are parts of the scene. Without lamps, a sky of radiance 1.
+        more: ``phase`` of the medium, ``bsdf`` of the box; all else are parts of the scene. Without lamps, a sky of
+            radiance 1.
     """
     to_world = mi.ScalarTransform4f(np.float32(TO_WORLD))
     grid = {"type": "gridvolume", "grid": mi.VolumeGrid(values[..., None]), "raw": True, "to_world": to_world}
     medium = {"type": "heterogeneous", "sigma_t": grid, "albedo": albedo}
     if "phase" in more:
         medium["phase"] = more.pop("phase")
+    bsdf = more.pop("bsdf", {"type": "null"})
     return {
         "type": "scene",
-        "box": {"type": "cube", "bsdf": {"type": "null"}, "interior": medium},
+        "box": {"type": "cube", "bsdf": bsdf, "interior": medium},
         "sensor": perspective(side),
         **(more or {"sky": {"type": "constant", "radiance": {"type": "uniform", "value": 1.0}}}),
     }
@@ -101,14 +104,22 @@ def directional_light() -> dict:
     return {"lamp": lamp, "phase": {"type": "hg", "g": 0.8}}
 
 
+def lamp_inside() -> dict:
+    """A small ball of light in the medium, isotropic scattering."""
+    lamp = {"type": "sphere", "center": [0.2, 0.1, 0.3], "radius": 0.2, "emitter": {"type": "area", "radiance": 9.0}}
+    return {"lamp": lamp, "phase": {"type": "isotropic"}}
+
+
+def milky_glass() -> dict:
+    """A box of smooth glass under a large lamp and a faint sky, isotropic scattering."""
+    lamp = {"type": "sphere", "center": [1.2, -1.5, 2.2], "radius": 0.6, "emitter": {"type": "area", "radiance": 9.0}}
+    sky = {"type": "constant", "radiance": 0.5}
+    return {"lamp": lamp, "sky": sky, "phase": {"type": "isotropic"}, "bsdf": {"type": "dielectric"}}
+
+
 def of_depth(name: str, depth: int) -> mi.Integrator:
     """That integrator with this ``max_depth``, made anew for each scene: ``prbvolpath`` keeps flags of the first scene it sees.
 
     Roulette begins at depth 64 for all, beyond which a path of an unlimited one hardly counts in scenes that absorb.
     """
     return mi.load_dict({"type": name, "max_depth": depth, "rr_depth": 64})
-
-
-def depth_two(name: str) -> mi.Integrator:
-    """As :func:`of_depth`, with ``max_depth`` 2."""
-    return of_depth(name, 2)

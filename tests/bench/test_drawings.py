@@ -16,7 +16,7 @@ from report.looks import assert_recorded
 
 from mivol.bench import depth, gradients, multiple_scattering, single_scattering, still_life, tomography
 from mivol.bench.depth import TABLED, Cell
-from mivol.bench.gradients.size import LIGHTS, OURS, STOCK
+from mivol.bench.gradients.size import CONTESTS, OURS, STOCK
 from mivol.report.figures import STYLE
 
 
@@ -70,10 +70,10 @@ def test_multiple_scattering(monkeypatch: pytest.MonkeyPatch, record: bool) -> N
 def test_gradients(monkeypatch: pytest.MonkeyPatch, record: bool) -> None:
     smoke = {
         light: {what: {"sigma_t >= 1": {"variance_x_time": 10.0 * k + i}} for i, what in enumerate(("mean", "L2"))}
-        for k, light in enumerate(LIGHTS, 4)
+        for k, light in enumerate(CONTESTS["smoke"][1], 4)
     }
     one = {name: {"bias_percent": 2.0 + k, "known_to_percent": 0.1 + k} for k, name in enumerate((OURS, STOCK))}
-    estimators = {light: {"dense": one, "density 0": one} for light in LIGHTS}
+    estimators = {light: {"dense": one, "density 0": one} for light in CONTESTS["smoke"][1]}
     runs = {name: {"seconds": [1.0, 2.0 + k], "loss": [0.5, 0.0]} for k, name in enumerate((OURS, STOCK))}
     answers = {"smoke": smoke, "estimators": estimators, "tutorial": {"runs": runs}}
     assert_recorded("bench_gradients", drawn(gradients, monkeypatch, answers, Path()), record)

@@ -16,12 +16,15 @@ from false_alarms import ALPHA, note
 from mivol.bench import agreement
 from mivol.bench.gradients import BENCH, QUICK
 from mivol.bench.gradients.bias import Case, cases, difference, refine, table_row
-from mivol.bench.gradients.size import BARS, LIGHTS, OURS, STOCK
+from mivol.bench.gradients.size import CONTESTS, OURS, STOCK, TABLES
 from mivol.bench.gradients.subject import compete, subjects
 from mivol.bench.gradients.tutorial import Run, at_voxels, finish, measure_tutorial, upright, warm_up
-from mivol.bench.gradients.variance import measure_smoke, outcome
+from mivol.bench.gradients.variance import measure_contest, outcome
 from mivol.bench.timing import Budget, Timing
 from mivol.files import read_volume
+
+LIGHTS = TABLES["estimators"]
+SMOKE = CONTESTS["smoke"][1]
 
 TINY = replace(
     QUICK,
@@ -82,7 +85,7 @@ def test_a_region_has_its_own_variance_and_derivative() -> None:
     slow = Timing({}, [3.0] * 6, [6.0] * 6, list(5 + swing * np.repeat([2.0, 1.0], 4)))
     fast = Timing({}, [1.0] * 6, [1.0] * 6, list(5 + swing * np.ones(8)))
     regions = {"dense": values > 0, "empty": values == 0}
-    found = outcome({OURS: fast, STOCK: slow}, {OURS: 1, STOCK: 2}, regions, values, 4)
+    found = outcome({OURS: fast, STOCK: slow}, {OURS: 1, STOCK: 2}, regions, values, 4, 4)
     assert (found["time"], found["processor_time"]) == (3, 6)
     assert found["dense"]["variance_x_time"] == pytest.approx(12)
     assert found["empty"]["variance_x_time"] == pytest.approx(3)
@@ -97,26 +100,28 @@ def test_a_region_has_its_own_variance_and_derivative() -> None:
 def test_every_figure_has_its_bar() -> None:
     """A ratio and |z| for each light and functional of the smoke, two bounds on the bias of each case, one of the tutorial."""
     dense = {"variance_x_time": 100.0, "z": -5.0, "z_bound": 4.0}
-    smoke = {light: {"mean": {"sigma_t >= 1": dense}, "L2": {"sigma_t >= 1": dense}} for light in LIGHTS}
+    smoke = {light: {"mean": {"sigma_t >= 1": dense}, "L2": {"sigma_t >= 1": dense}} for light in SMOKE}
     rows = BENCH.compare("smoke", smoke)
     assert [row["met"] for row in rows] == [True, False] * 4
-    assert [row["bar"] for row in rows[::2]] == [BARS[light] for light in LIGHTS for _ in range(2)]
+    assert [row["bar"] for row in rows[::2]] == [light.bar for light in SMOKE.values() for _ in range(2)]
     ours = {"bias_percent": -0.3, "known_to_percent": 0.1, "bias_standard_errors": -3.0}
     table = {light: {name: {OURS: ours} for name in cases(2)} for light in LIGHTS}
     rows = BENCH.compare("estimators", table)
     assert [row["value"] for row in rows] == pytest.approx([0.6, 3.0] * 8)
     assert [row["met"] for row in rows] == [False, True] * 8
-    assert BENCH.compare("tutorial", {"to_the_last_loss_of_prbvolpath": {"sooner": 21.0}})[0]["met"]
+    run = {"to_the_last_loss_of_prbvolpath": {"sooner": 21.0}, "to_its_lowest_loss": {"sooner": 40.0}}
+    assert [row["met"] for row in BENCH.compare("tutorial", run)] == [True]
+    assert [row["met"] for row in BENCH.compare("deep tutorial", run)] == [False, True]
 
 
 @pytest.mark.slow
 def test_every_question_is_answered(variant_rgb: str, tmp_path: Path) -> None:
     """Figures of all three questions are there, compared and drawn; what they are is for the sizes that are quoted."""
     answers = BENCH.ask(("estimators", "tutorial"), TINY)
-    answers["smoke"] = measure_smoke(replace(TINY, side=4))
+    answers["smoke"] = measure_contest("smoke", replace(TINY, side=4))
     bars = answers.pop("bars") + BENCH.compare("smoke", answers["smoke"])
-    assert len(bars) == 2 * len(LIGHTS) * len(cases(2)) + 1 + 4 * len(BARS)
-    for light in LIGHTS:
+    assert len(bars) == 2 * len(LIGHTS) * len(cases(2)) + 1 + 4 * len(SMOKE)
+    for light in SMOKE:
         assert set(answers["estimators"][light]) == set(cases(2))
         for functional in ("mean", "L2"):
             assert answers["smoke"][light][functional]["sigma_t >= 1"]["variance_x_time"] > 0
@@ -132,7 +137,7 @@ def test_the_tutorial_of_mivol_learns(variant_rgb: str, monkeypatch: pytest.Monk
     """Its image loss falls to a half at least within 2 x 2 iterations, and its references are those of volpath."""
     monkeypatch.setattr(agreement, "FALSE_ALARM", ALPHA)
     note(ALPHA, "references")
-    answer = measure_tutorial(replace(TINY, side=12, reference_spp=64, loss_spp=16, resolutions=(4, 8), steps=(2, 2)))
+    answer = measure_tutorial(2, replace(TINY, side=12, reference_spp=64, loss_spp=16, resolutions=(4, 8), steps=(2, 2)))
     ours = answer["runs"][OURS]["loss"]
     assert ours[-1] < 0.5 * ours[0]
     assert abs(answer["references"]["z_against_volpath"]) <= answer["references"]["z_bound"]

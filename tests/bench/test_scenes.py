@@ -6,7 +6,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mivol.bench.scenes import box_scene, depth_two, point_light, sun_and_sky
+from mivol.bench.scenes import box_scene, of_depth, point_light, sun_and_sky
 
 
 def test_the_box_holds_its_grid(variant_rgb: str) -> None:
@@ -41,5 +41,5 @@ def test_the_sun_gives_a_third_of_the_light(variant_rgb: str) -> None:
 
 
 def test_integrators_scatter_once_and_are_made_anew(variant_rgb: str) -> None:
-    assert depth_two("volpath") is not depth_two("volpath")
-    assert "max_depth = 2" in str(depth_two("volpath"))
+    assert of_depth("volpath", 2) is not of_depth("volpath", 2)
+    assert "max_depth = 2" in str(of_depth("volpath", 2))

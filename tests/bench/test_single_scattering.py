@@ -17,7 +17,7 @@ from false_alarms import ALPHA, fresh, note
 from mivol.bench import agreement
 from mivol.bench import single_scattering as bench
 from mivol.bench.agreement import compare_means
-from mivol.bench.scenes import box_scene, depth_two
+from mivol.bench.scenes import box_scene, of_depth
 from mivol.bench.timing import Budget, Timing
 from mivol.validate.statistics import Estimate
 
@@ -62,7 +62,7 @@ def test_renderers_agree_in_a_sky(variant_rgb: str, tmp_path, monkeypatch: pytes
 @pytest.mark.parametrize("name", bench.LIGHTS)
 def test_every_light_lights_the_medium(variant_rgb: str, name: str) -> None:
     scene = mi.load_dict(box_scene(fog(), 8, bench.ALBEDO, **bench.LIGHTS[name].parts()))
-    image = np.array(mi.render(scene, integrator=depth_two(bench.OURS), spp=4, seed=0))
+    image = np.array(mi.render(scene, integrator=of_depth(bench.OURS, 2), spp=4, seed=0))
     assert image[bench.optical_depths(scene) > bench.SEEN].mean() > 0.01
 
 
@@ -108,7 +108,7 @@ def test_pixels_at_the_emitter_do_not_count(variant_rgb: str) -> None:
     """The brightest pixel of a thin fog is at the lamp; it and its neighbours are left out, no others."""
     light = bench.LIGHTS["point light inside"]
     scene = mi.load_dict(box_scene(np.full((4, 4, 4), 0.1, np.float32), 24, 0.75, **light.parts()))
-    image = np.array(mi.render(scene, integrator=depth_two("mivol"), spp=64)).mean(axis=-1)
+    image = np.array(mi.render(scene, integrator=of_depth("mivol", 2), spp=64)).mean(axis=-1)
     left_out = bench.pixels_from_lamp(scene, light, 24) <= bench.AT_LAMP
     assert left_out[np.unravel_index(image.argmax(), image.shape)]
     # a disc of 1.5 pixels' radius holds the centres of 4 to 9 pixels

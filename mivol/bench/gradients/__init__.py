@@ -1,7 +1,9 @@
-"""Density gradients of light that scatters once: how exact are they, and how much sooner than those of ``prbvolpath``?
+"""Density gradients of light that scatters once or often: how exact are they, how much sooner than those of ``prbvolpath``?
 
     scripts/bench_gradients.py                        # about 10 minutes on 2 idle cores: all but the tutorial
     scripts/bench_gradients.py --only tutorial        # 5 minutes, nearly all of them in prbvolpath
+    scripts/bench_gradients.py --only "deep smoke,deep cloud"      # 8 minutes: light that scatters up to five times
+    scripts/bench_gradients.py --only "deep tutorial"              # 15 minutes
     scripts/bench_gradients.py --quick                # a minute, small sizes: are our gradients right?
 
 The derivatives are those with respect to the voxels of sigma_t [1/length]; albedo 0.75, ``max_depth`` 2 for all, stock scenes,
@@ -34,11 +36,16 @@ are rendered by mivol (4096 samples) and compared with volpath's (z is printed),
 when mivol's volume has the image loss of prbvolpath's last one (the bar; and of its best one, which Adam leaves again for the
 noise), and the errors of both densities (root mean square over that of the truth).
 
+deep smoke, deep cloud: as smoke, at ``max_depth`` 6; also in directional light, and a cloud of a large-eddy simulation with an
+albedo of 0.999. deep estimators: as estimators, at depth 6 and unlimited; also with a small lamp inside, and in a box of glass.
+deep tutorial: the tutorial as published, at depth 6.
+
 Prints JSON; writes bench_gradients.json and bench_gradients.png.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -47,30 +54,36 @@ from matplotlib.axes import Axes
 
 from mivol.bench.bars import AT_LEAST, AT_MOST, Bar, judge, judge_agreement
 from mivol.bench.figures import drawn, plain_ticks
-from mivol.bench.gradients.bias import measure_estimators
-from mivol.bench.gradients.size import BARS, FULL, LIGHTS, OURS, QUICK, STOCK, Size
-from mivol.bench.gradients.tutorial import measure_tutorial
-from mivol.bench.gradients.variance import measure_smoke
+from mivol.bench.gradients.bias import ask_table
+from mivol.bench.gradients.size import CONTESTS, FULL, OURS, QUICK, STOCK, TABLES, TUTORIALS, Size
+from mivol.bench.gradients.tutorial import ask_tutorial
+from mivol.bench.gradients.variance import ask_contest
 from mivol.bench.questions import Bench
 from mivol.report.figures import MARKERS, SERIES
 
 __all__ = ["BENCH", "FULL", "QUICK", "Size", "main"]
 
-QUESTIONS = {"smoke": measure_smoke, "estimators": measure_estimators, "tutorial": measure_tutorial}
+QUESTIONS = (
+    {question: ask_contest(question) for question in CONTESTS}
+    | {question: ask_table(question) for question in TABLES}
+    | {question: ask_tutorial(question) for question in TUTORIALS}
+)
 
 
 def compare(question: str, answer: dict) -> list[Bar]:
     """The figures that have a bar, beside it."""
-    return {"smoke": compare_smoke, "estimators": compare_estimators, "tutorial": compare_tutorial}[question](answer)
+    if question in CONTESTS:
+        return compare_contest(question, answer)
+    return compare_estimators(answer) if question in TABLES else compare_tutorial(question, answer)
 
 
-def compare_smoke(answer: dict) -> list[Bar]:
+def compare_contest(question: str, answer: dict) -> list[Bar]:
     """Ratios, and z where they are said."""
     rows = []
-    for light, bar in BARS.items():
-        for functional, figures in answer[light].items():
-            dense, what = figures["sigma_t >= 1"], f"gradient of {functional}, {light}"
-            rows.append(judge(f"variance x time: {what}", dense["variance_x_time"], AT_LEAST, bar))
+    for name, light in CONTESTS[question][1].items():
+        for functional, figures in answer[name].items():
+            dense, what = figures["sigma_t >= 1"], f"{question}, gradient of {functional}, {name}"
+            rows.append(judge(f"variance x time: {what}", dense["variance_x_time"], AT_LEAST, light.bar))
             rows.append(judge_agreement(what, dense["z"], dense["z_bound"]))
     return rows
 
@@ -89,27 +102,38 @@ def compare_estimators(answer: dict) -> list[Bar]:
     return rows
 
 
-def compare_tutorial(answer: dict) -> list[Bar]:
+def compare_tutorial(question: str, answer: dict) -> list[Bar]:
     """How much sooner."""
-    return [judge("tutorial: how much sooner", answer["to_the_last_loss_of_prbvolpath"]["sooner"], AT_LEAST, 20)]
+    _, last, lowest = TUTORIALS[question]
+    rows = [judge(f"{question}: how much sooner", answer["to_the_last_loss_of_prbvolpath"]["sooner"], AT_LEAST, last)]
+    if not math.isnan(lowest):
+        sooner = answer["to_its_lowest_loss"]["sooner"]
+        rows.append(judge(f"{question}: how much sooner at the lowest loss", sooner, AT_LEAST, lowest))
+    return rows
 
 
 def draw(answers: dict, folder: Path) -> None:
     """A panel for each question that was asked."""
-    panels = {"smoke": draw_smoke, "estimators": draw_estimators, "tutorial": draw_tutorial}
     with drawn(folder / "bench_gradients.png", 5 * len(answers), 4) as figure:
         for axes, (question, answer) in zip(np.atleast_1d(figure.subplots(1, len(answers))), answers.items(), strict=True):
-            panels[question](axes, answer)
+            if question in CONTESTS:
+                draw_contest(axes, question, answer)
+            elif question in TABLES:
+                draw_estimators(axes, answer)
+            else:
+                draw_tutorial(axes, question, answer)
 
 
-def draw_smoke(axes: Axes, answer: dict) -> None:
+def draw_contest(axes: Axes, question: str, answer: dict) -> None:
     """Ratios beside their bars."""
-    names = [(light, functional) for light in LIGHTS for functional in answer[light]]
+    lights = CONTESTS[question][1]
+    names = [(light, functional) for light in lights for functional in answer[light]]
     for row, (light, functional) in enumerate(reversed(names)):
         axes.semilogx([answer[light][functional]["sigma_t >= 1"]["variance_x_time"]], [row], MARKERS[0], color=SERIES[0])
-        axes.plot([BARS[light]] * 2, [row - 0.3, row + 0.3], color=SERIES[0], linestyle="--")
+        axes.plot([lights[light].bar] * 2, [row - 0.3, row + 0.3], color=SERIES[0], linestyle="--")
     axes.set(yticks=range(len(names)), yticklabels=[f"{f}, {light}" for light, f in reversed(names)])
-    axes.set(title="Gradient, voxels with sigma_t >= 1", xlabel="variance x time over prbvolpath's (line: the bar)")
+    axes.set(title=f"Gradient ({question}), voxels with sigma_t >= 1")
+    axes.set(xlabel="variance x time over prbvolpath's (line: the bar)")
     plain_ticks(axes.xaxis, "×")
 
 
@@ -127,16 +151,19 @@ def draw_estimators(axes: Axes, answer: dict) -> None:
     axes.legend()
 
 
-def draw_tutorial(axes: Axes, answer: dict) -> None:
+def draw_tutorial(axes: Axes, question: str, answer: dict) -> None:
     """Image loss against time."""
     for i, name in enumerate((OURS, STOCK)):
         run = answer["runs"][name]
         axes.loglog(run["seconds"], np.maximum(run["loss"], 1e-9), marker=MARKERS[i], markersize=3, color=SERIES[i], label=name)
-    axes.set(title="Mitsuba's tutorial at depth 2", xlabel="time [s]", ylabel="image loss, without noise")
+    axes.set(title=f"Mitsuba's tutorial at depth {TUTORIALS[question][0]}")
+    axes.set(xlabel="time [s]", ylabel="image loss, without noise")
     axes.legend()
 
 
-BENCH = Bench("bench_gradients", __doc__, QUESTIONS, FULL, QUICK, compare, draw, unasked=("tutorial",))
+UNASKED = ("tutorial", "deep smoke", "deep cloud", "deep estimators", "deep tutorial")
+
+BENCH = Bench("bench_gradients", __doc__, QUESTIONS, FULL, QUICK, compare, draw, unasked=UNASKED)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

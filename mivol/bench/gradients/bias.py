@@ -10,13 +10,13 @@ import numpy as np
 
 from mivol.bench.agreement import compare_means, finite, mean_of_rounds, number
 from mivol.bench.bars import say
-from mivol.bench.gradients.size import LIGHTS, OURS, STOCK, Size
+from mivol.bench.gradients.size import OURS, STOCK, TABLES, Light, Size
 from mivol.bench.gradients.subject import SEEDS, Subject, along, compete, subjects, variance_over
 from mivol.bench.timing import ratio_of
 from mivol.validate.moments import Moments
 from mivol.validate.statistics import Estimate
 
-__all__ = ["Case", "cases", "difference", "measure_estimators", "refine", "table_row"]
+__all__ = ["Case", "cases", "difference", "ask_table", "refine", "table_row"]
 
 
 @dataclass(frozen=True)
@@ -72,20 +72,26 @@ def refine(found: Sequence[float], estimate: Callable[[int], float], percent: fl
     return np.array(found)
 
 
-def measure_estimators(size: Size) -> dict:
-    """Bias and variance per estimator: free flight (prbvolpath) and ours, at density 0, half empty, thin and dense."""
-    answer = {}
-    for light, parts in LIGHTS.items():
-        answer[light] = {}
-        for name, case in cases(size.table_res).items():
-            answer[light][name] = row = table_row(case, parts, size)
-            say(f"  {light}, {name}: {said_of_row(row)}")
-    return answer
+def ask_table(question: str) -> Callable[[Size], dict]:
+    """The question about bias in some lights."""
+    lights = TABLES[question]
+
+    def measure(size: Size) -> dict:
+        answer = {}
+        for name, light in lights.items():
+            answer[name] = {}
+            for which, case in cases(size.table_res).items():
+                answer[name][which] = row = table_row(case, light, size, len(lights) * len(cases(2)))
+                say(f"  {name}, {which}: {said_of_row(row)}")
+        return answer
+
+    measure.__doc__ = "Bias and variance of free flights (prbvolpath) and of ours, at density 0, half empty, thin and dense."
+    return measure
 
 
-def table_row(case: Case, parts: Callable[[], dict], size: Size) -> dict:
-    """Both estimators in one case, in one light."""
-    both = subjects(case.values.astype(np.float32), size.table_side, parts)
+def table_row(case: Case, light: Light, size: Size, rows: int = 1) -> dict:
+    """Both estimators in one case, in one light; the bound on z allows for so many rows."""
+    both = subjects(case.values.astype(np.float32), size.table_side, light)
     steps = {name: s.of_mean for name, s in both.items()}
     timings, spp = compete(steps, size.table_budget, size.table_rounds, size.seed)
     derivatives = {name: along(timing, case.direction) for name, timing in timings.items()}
@@ -102,7 +108,7 @@ def table_row(case: Case, parts: Callable[[], dict], size: Size) -> dict:
     truth = mean_of_rounds(refine([differ(k) for k in range(size.table_rounds)], differ, **known))
     row = {"finite_difference": truth.mean, "its_standard_error": math.sqrt(truth.var)}
     for name, timing in timings.items():
-        row[name] = figures_of(derivatives[name], truth) | {
+        row[name] = figures_of(derivatives[name], truth, rows) | {
             "variance": variance_over(timing, case.direction > 0),
             "spp": spp[name],
             "seconds_median": timing.median,
@@ -112,9 +118,9 @@ def table_row(case: Case, parts: Callable[[], dict], size: Size) -> dict:
     return row
 
 
-def figures_of(derivatives: np.ndarray, truth: Estimate) -> dict:
+def figures_of(derivatives: np.ndarray, truth: Estimate, rows: int) -> dict:
     """Derivatives (rounds,) of one estimator against the finite difference."""
-    found = compare_means(mean_of_rounds(derivatives), truth, 2 * len(LIGHTS) * len(cases(2)))
+    found = compare_means(mean_of_rounds(derivatives), truth, 2 * rows)
     return {
         "derivative": float(derivatives.mean()),
         "bias_standard_errors": found["z"],

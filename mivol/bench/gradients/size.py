@@ -1,4 +1,4 @@
-"""How much work the bench of gradients does, and in which lights."""
+"""How much work the bench of gradients does, on which volumes, and in which lights."""
 
 from __future__ import annotations
 
@@ -6,17 +6,74 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from mivol.bench.scenes import constant_light, sun_and_sky
+import mitsuba as mi
+import numpy as np
+
+from mivol.bench.extinctions import Extinction, les_cloud, smoke
+from mivol.bench.scenes import box_scene, constant_light, directional_light, lamp_inside, milky_glass, of_depth, sun_and_sky
 from mivol.bench.timing import Budget
 
-__all__ = ["ALBEDO", "BARS", "FULL", "LIGHTS", "OURS", "QUICK", "STOCK", "Size"]
+__all__ = ["ALBEDO", "CONTESTS", "FULL", "OURS", "QUICK", "STOCK", "TABLES", "TUTORIALS", "Light", "Size"]
 
 ALBEDO = 0.75
 OURS, STOCK = "mivol", "prbvolpath"
 
-LIGHTS: dict[str, Callable[[], dict]] = {"constant light": constant_light, "HG 0.8, sun in a sky": sun_and_sky}
-BARS = {"constant light": 60, "HG 0.8, sun in a sky": 30}
-"""How many times sooner mivol's gradient has to be as exact, in each light."""
+
+@dataclass(frozen=True)
+class Light:
+    """What lights a box, and how often it may scatter there.
+
+    Attributes:
+        parts: of the scene.
+        bar: how many times sooner mivol's gradient has to be as exact.
+        depth: ``max_depth``.
+        albedo: of the medium.
+    """
+
+    parts: Callable[[], dict]
+    bar: float = math.nan
+    depth: int = 2
+    albedo: float = ALBEDO
+
+    def scene(self, values: np.ndarray, side: int) -> mi.Scene:
+        """The box around extinctions (Z, Y, X), seen in a picture of that size [pixels]."""
+        return mi.load_dict(box_scene(values, side, self.albedo, **self.parts()))
+
+    def integrator(self, name: str) -> mi.Integrator:
+        """That integrator at this depth."""
+        return of_depth(name, self.depth)
+
+
+CONSTANT, SUN, DIRECTIONAL = "constant light", "HG 0.8, sun in a sky", "HG 0.8, directional"
+
+SHONE = {CONSTANT: constant_light, SUN: sun_and_sky, "lamp inside": lamp_inside, "glass": milky_glass}
+
+CONTESTS: dict[str, tuple[Callable[[], Extinction], dict[str, Light]]] = {
+    "smoke": (smoke, {CONSTANT: Light(constant_light, 60), SUN: Light(sun_and_sky, 30)}),
+    "deep smoke": (
+        smoke,
+        {
+            CONSTANT: Light(constant_light, 100, 6),
+            SUN: Light(sun_and_sky, 100, 6),
+            DIRECTIONAL: Light(directional_light, 35, 6),
+        },
+    ),
+    "deep cloud": (les_cloud, {SUN: Light(sun_and_sky, 80, 6, 0.999)}),
+}
+"""Volumes and lights in which variance x time is compared, by question."""
+
+TABLES: dict[str, dict[str, Light]] = {
+    "estimators": {CONSTANT: Light(constant_light), SUN: Light(sun_and_sky)},
+    "deep estimators": {
+        f"{name}, {'depth 6' if depth > 0 else 'unlimited'}": Light(parts, depth=depth)
+        for depth in (6, -1)
+        for name, parts in SHONE.items()
+    },
+}
+"""Lights in which estimators are compared with finite differences, by question."""
+
+TUTORIALS: dict[str, tuple[int, float, float]] = {"tutorial": (2, 20, math.nan), "deep tutorial": (6, 60, 30)}
+"""``max_depth`` of the tutorial, and how many times sooner mivol has to have prbvolpath's last and its lowest loss."""
 
 
 @dataclass(frozen=True)

@@ -9,8 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mivol.bench.gradients.size import ALBEDO, OURS, STOCK
-from mivol.bench.scenes import box_scene, depth_two
+from mivol.bench.gradients.size import OURS, STOCK, Light
 from mivol.bench.timing import Budget, Contestant, Timing, race
 from mivol.validate.moments import Moments
 
@@ -28,10 +27,10 @@ class Subject:
     """A scene whose densities are differentiated, and an integrator made for it."""
 
     scene: mi.Scene
-    name: str
+    integrator: mi.Integrator
 
     def __post_init__(self) -> None:
-        self.params, self.integrator = mi.traverse(self.scene), depth_two(self.name)
+        self.params = mi.traverse(self.scene)
 
     def _collect(self, backward: Callable[[], None]) -> mi.Float:
         values = mi.TensorXf(self.params[KEY])
@@ -67,9 +66,9 @@ class Subject:
         return float(np.mean(np.array(mi.render(self.scene, integrator=self.integrator, seed=seed, spp=spp), np.float64)))
 
 
-def subjects(values: np.ndarray, side: int, light: Callable[[], dict]) -> dict[str, Subject]:
+def subjects(values: np.ndarray, side: int, light: Light) -> dict[str, Subject]:
     """The same scene once for each integrator."""
-    return {name: Subject(mi.load_dict(box_scene(values, side, ALBEDO, **light())), name) for name in (OURS, STOCK)}
+    return {name: Subject(light.scene(values, side), light.integrator(name)) for name in (OURS, STOCK)}
 
 
 Step = Callable[[int, int], object]

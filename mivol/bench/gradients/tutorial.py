@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 
 import drjit as dr
@@ -13,14 +13,14 @@ import numpy as np
 from mivol.bench.agreement import compare_means, mean_of_rounds
 from mivol.bench.bars import say
 from mivol.bench.extinctions import TUTORIAL_SCALE, smoke
-from mivol.bench.gradients.size import ALBEDO, OURS, STOCK, Size
+from mivol.bench.gradients.size import ALBEDO, OURS, STOCK, TUTORIALS, Size
 from mivol.bench.gradients.subject import KEY
-from mivol.bench.scenes import box_scene, constant_light, depth_two, perspective
+from mivol.bench.scenes import box_scene, constant_light, of_depth, perspective
 from mivol.bench.timing import Stopwatch
 from mivol.validate.metrics import nrmse
 from mivol.validate.statistics import Estimate
 
-__all__ = ["Run", "at_voxels", "finish", "measure_tutorial", "upright"]
+__all__ = ["Run", "at_voxels", "finish", "ask_tutorial", "upright"]
 
 
 def half_circle(side: int, count: int = 5) -> list[mi.Sensor]:
@@ -90,11 +90,11 @@ def tutorial_scene(values: mi.TensorXf) -> dict:
     return scene
 
 
-def optimise(name: str, judge: Judge, size: Size) -> Iterator[Run]:
+def optimise(name: str, depth: int, judge: Judge, size: Size) -> Iterator[Run]:
     """The tutorial's loop with one integrator: its state after each iteration of a step for each camera."""
     res = size.resolutions[0]
     scene = mi.load_dict(tutorial_scene(dr.full(mi.TensorXf, 0.002, (res, res, res, 1))))
-    params, integrator, eye = mi.traverse(scene), depth_two(name), depth_two(OURS)
+    params, integrator, eye = mi.traverse(scene), of_depth(name, depth), of_depth(OURS, depth)
     opt = mi.ad.Adam(lr=0.02)
     opt[KEY] = params[KEY]
     params.update(opt)
@@ -123,23 +123,37 @@ def optimise(name: str, judge: Judge, size: Size) -> Iterator[Run]:
             yield run
 
 
-def measure_tutorial(size: Size) -> dict:
-    """When has mivol the image loss that prbvolpath ends with, in the official tutorial on volume optimisation?"""
+def ask_tutorial(question: str) -> Callable[[Size], dict]:
+    """The question at one depth."""
+    depth, *_ = TUTORIALS[question]
+
+    def measure(size: Size) -> dict:
+        return measure_tutorial(depth, size)
+
+    measure.__doc__ = (
+        f"When has mivol the image loss that prbvolpath ends with, in the official tutorial on volumes, at depth {depth}?"
+    )
+    return measure
+
+
+def measure_tutorial(depth: int, size: Size) -> dict:
+    """Both loops, and when the faster one is where the other ends."""
     found = smoke()
     truth = upright(found.values / np.float32(TUTORIAL_SCALE))
     sensors = half_circle(size.side)
     scene = mi.load_dict(tutorial_scene(mi.TensorXf(truth[..., None])))
-    ours = depth_two(OURS)
+    ours = of_depth(OURS, depth)
     references = [mi.render(scene, sensor=s, integrator=ours, spp=size.reference_spp, seed=k) for k, s in enumerate(sensors)]
     dr.eval(references)
     judge = Judge(sensors, references, at_voxels(truth, size.resolutions[-1]), size.loss_spp)
-    answer = {"grid": str(found), "references": check_references(scene, sensors, references, size.check_spp)}
+    checked = check_references(scene, sensors, references, of_depth("volpath", depth), size.check_spp)
+    answer = {"grid": str(found), "references": checked}
     for name in (OURS, STOCK):
-        for _ in optimise(name, judge, warm_up(size)):
+        for _ in optimise(name, depth, judge, warm_up(size)):
             pass
     runs = {}
     for name in (OURS, STOCK):
-        for run in optimise(name, judge, size):
+        for run in optimise(name, depth, judge, size):
             runs[name] = run
             at = f"{run.seconds[-1]:7.1f} s (processor {run.processor[-1]:.1f})"
             say(f"  {name} {len(run.loss):3d}: {at}, loss {run.loss[-1]:.5f}, density {run.density_error[-1]:.3f}")
@@ -151,9 +165,8 @@ def warm_up(size: Size) -> Size:
     return replace(size, steps=(1,) * len(size.steps), step_spp=(1,) * len(size.steps))
 
 
-def check_references(scene: mi.Scene, sensors: list, references: list, spp: int) -> dict:
+def check_references(scene: mi.Scene, sensors: list, references: list, volpath: mi.Integrator, spp: int) -> dict:
     """The references against volpath: 8 batches, the mean over all pixels and cameras."""
-    volpath = depth_two("volpath")
 
     def batch(b: int) -> float:
         images = [mi.render(scene, sensor=s, integrator=volpath, spp=spp, seed=100 * b + k) for k, s in enumerate(sensors)]

@@ -1,4 +1,4 @@
-"""How much sooner has mivol the same error in the density gradient of the smoke, in a picture's mean and in an L2 loss?"""
+"""How much sooner has mivol the same error in the density gradient of a volume, in a picture's mean and in an L2 loss?"""
 
 from __future__ import annotations
 
@@ -9,47 +9,58 @@ import numpy as np
 
 from mivol.bench.agreement import compare_means, mean_of_rounds, number
 from mivol.bench.bars import say
-from mivol.bench.extinctions import smoke
-from mivol.bench.gradients.size import ALBEDO, LIGHTS, OURS, STOCK, Size
+from mivol.bench.gradients.size import CONTESTS, OURS, STOCK, Light, Size
 from mivol.bench.gradients.subject import along, compete, subjects, variance_over
-from mivol.bench.scenes import box_scene, depth_two
 from mivol.bench.timing import Timing, ratio_of
 
-__all__ = ["measure_smoke", "outcome"]
+__all__ = ["ask_contest", "outcome"]
 
 
-def measure_smoke(size: Size) -> dict:
-    """How much sooner has mivol the same error in the density gradient of the smoke?"""
-    found = smoke()
+def ask_contest(question: str) -> Callable[[Size], dict]:
+    """The question about one volume in some lights."""
+
+    def measure(size: Size) -> dict:
+        return measure_contest(question, size)
+
+    measure.__doc__ = f"How much sooner has mivol the same error in the density gradient ({question})?"
+    return measure
+
+
+def measure_contest(question: str, size: Size) -> dict:
+    """Ratios of variance x time in the regions of a volume, in each light."""
+    volume, lights = CONTESTS[question]
+    found = volume()
     answer = {"grid": str(found)}
     regions = {
         "sigma_t >= 1": found.values >= 1,
         "0 < sigma_t < 1": (found.values > 0) & (found.values < 1),
         "sigma_t = 0": found.values == 0,
     }
-    for light, parts in LIGHTS.items():
-        target = picture_of(0.7 * found.values, size, parts)
-        both = subjects(found.values, size.side, parts)
+    for name, light in lights.items():
+        target = picture_of(0.7 * found.values, size, light)
+        both = subjects(found.values, size.side, light)
         functionals = {
-            "mean": {name: s.of_mean for name, s in both.items()},
-            "L2": {name: lambda seed, spp, s=s, target=target: s.of_loss(target, seed, spp) for name, s in both.items()},
+            "mean": {who: s.of_mean for who, s in both.items()},
+            "L2": {who: lambda seed, spp, s=s, target=target: s.of_loss(target, seed, spp) for who, s in both.items()},
         }
-        answer[light] = {}
+        answer[name] = {}
         for functional, steps in functionals.items():
             timings, spp = compete(steps, size.budget, size.rounds, size.seed)
-            answer[light][functional] = outcome(timings, spp, regions, found.values, size.side)
-            say(f"  {light}, {functional}: {said(answer[light][functional])}")
+            answer[name][functional] = outcome(timings, spp, regions, found.values, size.side, 2 * len(lights))
+            say(f"  {name}, {functional}: {said(answer[name][functional])}")
     return answer
 
 
-def picture_of(values: np.ndarray, size: Size, parts: Callable[[], dict]) -> mi.TensorXf:
+def picture_of(values: np.ndarray, size: Size, light: Light) -> mi.TensorXf:
     """A picture without much noise."""
-    scene = mi.load_dict(box_scene(values, size.side, ALBEDO, **parts()))
-    return mi.render(scene, integrator=depth_two(OURS), seed=77, spp=size.difference_spp)
+    scene = light.scene(values, size.side)
+    return mi.render(scene, integrator=light.integrator(OURS), seed=77, spp=size.difference_spp)
 
 
-def outcome(timings: dict[str, Timing], spp: dict[str, int], regions: dict, values: np.ndarray, side: int) -> dict:
-    """Times and, for each region, what variance x time and the means are."""
+def outcome(
+    timings: dict[str, Timing], spp: dict[str, int], regions: dict, values: np.ndarray, side: int, contests: int
+) -> dict:
+    """Times and, for each region, what variance x time and the means are; the bound on z allows for so many contests."""
     slow, fast = timings[STOCK], timings[OURS]
     ratio = ratio_of(slow, fast)
     figures = {name: {"spp": spp[name]} | t.report(side * side * spp[name], "samples") for name, t in timings.items()}
@@ -60,7 +71,7 @@ def outcome(timings: dict[str, Timing], spp: dict[str, int], regions: dict, valu
         figures[region] = {
             "voxels": int(chosen.sum()),
             "variance_x_time": a / b * ratio,
-            **compare_means(*(mean_of_rounds(along(t, direction)) for t in (fast, slow)), 2 * len(LIGHTS)),
+            **compare_means(*(mean_of_rounds(along(t, direction)) for t in (fast, slow)), contests),
         }
     return figures
 
