@@ -99,6 +99,10 @@ class Sought(Section):
             raise ValueError(f'unknown map "{self.map}": {nearest(self.map, list(MAPS))}'.rstrip("."))
 
 
+AUTO = "auto"
+"""A depth that is measured before the fit."""
+
+
 class SceneFitSettings(Section):
     """How long and how finely."""
 
@@ -106,8 +110,15 @@ class SceneFitSettings(Section):
     spp: Annotated[int, of("sample/pixel", "samples of an image and of its derivative", ge=1)] = 16
     spp_shown: Annotated[int, of("sample/pixel", "samples of images that are compared or kept; 0: as spp", ge=0)] = 0
     samples_per_pass: Annotated[int, of("sample", "most samples in one kernel: Ctrl-C waits for one", ge=1)] = 1 << 20
-    max_depth: Annotated[int, of("1", "as Mitsuba's volpath; -1 is unlimited", ge=-1)] = 6
+    max_depth: Annotated[
+        Annotated[int, msgspec.Meta(ge=-1)] | str, of("1", "as Mitsuba's volpath; -1: unlimited; auto: measured")
+    ] = 6
+    noise: Annotated[float, of("1", "of a pixel over the mean radiance: max_depth = auto leaves out less", gt=0)] = 0.02
     integrator: Annotated[str, of("1", "Mitsuba integrator that differentiates", min_length=1)] = "mivol"
+
+    def __post_init__(self) -> None:
+        if isinstance(self.max_depth, str) and self.max_depth != AUTO:
+            raise ValueError(f'max_depth is "{self.max_depth}": expected a whole number from -1 on, or "{AUTO}"')
 
 
 class Experiment(Section):

@@ -73,6 +73,8 @@ def explain_flags(sub: argparse.ArgumentParser) -> None:
     scene_flags(sub, "Mitsuba XML, or posed photographs: a folder or its transforms.json")
     sub.add_argument("-o", "--output", type=Path, help="picture of the cameras (.png, .svg); default: NAME-cameras.png")
     sub.add_argument("--max-depth", type=int, help="longest path asked about; default: that of the scene's integrator")
+    aim = "noise of a pixel over the mean radiance; max_depth has to leave out less (default: %(default)s)"
+    sub.add_argument("--noise", type=float, default=0.02, help=aim)
 
 
 def render_flags(sub: argparse.ArgumentParser) -> None:
@@ -138,7 +140,7 @@ def no_flags(sub: argparse.ArgumentParser) -> None:
 
 
 def explain(arguments: argparse.Namespace) -> None:
-    """What a scene needs, and how mivol would render it: facts, choices, reasons. Nothing is rendered.
+    """What a scene needs, and how mivol would render it: facts, choices, reasons. A small preview says which depth it needs.
 
     Of posed photographs: what there is, what is missing, and a picture of the cameras and the box that they look at.
     """
@@ -153,7 +155,7 @@ def explain_scene(arguments: argparse.Namespace) -> None:
     from mivol.cli.loading import load
     from mivol.scene.explain import explain as explain_plan
 
-    print(explain_plan(load(arguments).scene, arguments.max_depth))
+    print(explain_plan(load(arguments).scene, arguments.max_depth, noise=arguments.noise))
 
 
 def explain_photos(arguments: argparse.Namespace) -> None:

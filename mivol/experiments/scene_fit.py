@@ -12,6 +12,7 @@ from mivol import config
 from mivol.config import Experiment
 from mivol.errors import MivolError
 from mivol.experiments.back_end import choose_back_end
+from mivol.experiments.depth import settle_depth
 from mivol.experiments.references import References, find_references
 from mivol.experiments.run_folder import RunFolder
 from mivol.experiments.scene_outputs import SceneOutputs
@@ -59,6 +60,8 @@ def scene_fit(task: Task) -> Path:
         with run.stage("scene"):
             loaded = load_scene(task.base / chosen.scene.file, chosen.scene.define)
             truth = make_truth(chosen, task.base, loaded.scene)
+            task, depth = settle_depth(task, loaded, truth)
+            chosen = task.chosen
             integrator = make_integrator(chosen)
             check_names([sought.key for sought in chosen.parameter])
             starts = [make_start(sought, task.base, loaded.scene) for sought in chosen.parameter]
@@ -68,7 +71,7 @@ def scene_fit(task: Task) -> Path:
         with run.stage("fit"):
             problem = make_problem(chosen, loaded.scene, integrator, starts, seen)
             made = plan_of(chosen, problem)
-            run.record.plan = lines_of(made)
+            run.record.plan = depth + lines_of(made)
             run.record.citations += cited(made, run.record.citations)
             fit = solve(task, run, loaded, problem, SceneErrors(chosen, seen, truth))
         with run.stage("images and volumes"):

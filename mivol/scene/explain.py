@@ -12,6 +12,7 @@ import numpy as np
 from mivol.cite import citations
 from mivol.scene.build import build_media
 from mivol.scene.choices import is_lit, shares_cells
+from mivol.scene.depth_preview import measure_depths
 from mivol.scene.depth_two import depth_two_error, mean_albedo, mean_cosine, scattering_depth
 from mivol.scene.facts import Needs
 from mivol.scene.load import find_sensor
@@ -43,19 +44,24 @@ def settings_of(scene: mi.Scene) -> Settings:
     return Settings(max_depth=-1 if depth == UNLIMITED else depth)
 
 
-def explain(scene: mi.Scene | str | Path, max_depth: int | None = None, sensor: int = 0) -> str:
-    """Say what a scene needs and what will be done about it, before anything is rendered.
+def explain(
+    scene: mi.Scene | str | Path, max_depth: int | None = None, sensor: int = 0, noise: float | None = None
+) -> str:
+    """Say what a scene needs and what will be done about it, before more than a small preview is rendered.
 
     Args:
         scene: a loaded scene, or the path of its XML.
         max_depth: of the integrator asked about; None: that of the scene's own integrator, with its other settings.
         sensor: index of the sensor asked about.
+        noise: measure which ``max_depth`` leaves out less than this noise of a pixel, over the mean radiance
+            (:mod:`mivol.scene.depth_preview`); None to measure nothing.
 
     Raises:
         MivolError: as :func:`make_plan`.
     """
     loaded = scene if isinstance(scene, mi.Scene) else mi.load_file(str(scene))
-    needs = find_needs(loaded, find_sensor(loaded, sensor), survey_scene(loaded))
+    eye = find_sensor(loaded, sensor)
+    needs = find_needs(loaded, eye, survey_scene(loaded))
     settings = settings_of(loaded) if max_depth is None else Settings(max_depth=max_depth)
     plan = make_plan(needs, settings)
     lines = ["facts"]
@@ -80,6 +86,10 @@ def explain(scene: mi.Scene | str | Path, max_depth: int | None = None, sensor: 
     if settings.scatterings == 1:
         lines += [f"  model     {text}" for text in _depth_two(loaded, needs)]
         lines += [f"  shadows   {text}" for text in _transmittance_grid(loaded, needs, plan, settings)]
+    if noise is not None and is_lit(needs, settings):
+        answer = measure_depths(loaded, eye, settings, noise)
+        depth = "without a limit (-1)" if answer.depth < 0 else answer.depth
+        lines += [f"  depth     {depth} is enough\n              because {answer.reason}"]
     lines += ["references", *(f"  {source}" for source in citations(SEGMENT_ESTIMATORS[plan.segment].cites))]
     return "\n".join(lines)
 

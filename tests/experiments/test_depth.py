@@ -1,0 +1,46 @@
+"""A fit whose depth is measured: in the truth, once, and written down."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from tiny_experiment import PHOTOS, refused, run
+
+ONE = ["--set", 'fit.max_depth="auto"', "--set", "fit.iterations=1", "--set", "reference.spp=32"]
+
+
+def record_of(folder: Path) -> dict:
+    return json.loads((folder / "run" / "run.json").read_text())
+
+
+def whiten(folder: Path, albedo: float) -> None:
+    """Give the medium an albedo, where it had none."""
+    scene = folder / "scene.xml"
+    scene.write_text(scene.read_text().replace('name="albedo" value="0"', f'name="albedo" value="{albedo}"'))
+
+
+@pytest.mark.parametrize(("albedo", "noise", "depth"), [(0.0, 0.02, 2), (0.99, 1e-6, -1)])
+def test_the_depth_is_measured_in_the_truth(variant_rgb, folder: Path, albedo: float, noise: float, depth: int) -> None:
+    """What only absorbs needs no more than 2, whatever noise is asked for; the start is empty, the truth is not."""
+    whiten(folder, albedo)
+    more = ["--set", f"fit.noise={noise}", "--set", "parameter.0.start=0.0"]
+    assert run("optimize", folder / "fit.toml", "-o", folder / "run", *ONE, *more) == 0
+    first = record_of(folder)["plan"][0]
+    assert first["choice"] == f"max_depth: {depth}"
+    assert "depth 2 leaves out" in first["reason"]
+
+
+def test_of_photographs_nothing_is_known(variant_rgb, folder: Path) -> None:
+    """Paths have no limit where the references are files and no truth is given."""
+    text = (folder / "fit.toml").read_text()
+    (folder / "fit.toml").write_text("\n".join(line for line in text.splitlines() if not line.startswith("truth")))
+    assert run("optimize", folder / "fit.toml", "-o", folder / "run", *ONE[:4], *PHOTOS) == 0
+    first = record_of(folder)["plan"][0]
+    assert (first["choice"], first["reason"]) == ("max_depth: -1", "the references are files, and what they show is not known")
+
+
+def test_other_words_are_refused(variant_rgb, folder: Path, capsys: pytest.CaptureFixture) -> None:
+    said = refused(capsys, "optimize", folder / "fit.toml", "--set", 'fit.max_depth="atuo"')
+    assert 'max_depth is "atuo": expected a whole number from -1 on, or "auto"' in said
