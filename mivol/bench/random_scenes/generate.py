@@ -1,0 +1,270 @@
+"""Random scenes with media that Mitsuba renders rightly: what bounds and fills them, what lights them, how far light may go.
+
+A seed decides everything. An rgb extinction is judged by the grey scenes of its channels, since ``heterogeneous`` follows one
+grey majorant; each grid fills the box of its boundary, since Mitsuba's volumes go on outside theirs; emitters are not hidden.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import mitsuba as mi
+import numpy as np
+
+__all__ = ["RandomScene", "draw_scene"]
+
+SIDE = 12
+"""Of the picture [pixels]."""
+
+DEPTHS = (2, 3, 4, 6, 12, -1)
+
+
+@dataclass
+class RandomScene:
+    """A scene that was drawn.
+
+    Attributes:
+        parts: for ``mi.load_dict``.
+        settings: of the integrators, ``max_depth`` and ``rr_depth``.
+        features: what is in it, in words.
+        is_rgb: some extinction has a value for each colour.
+    """
+
+    parts: dict
+    settings: dict
+    features: list[str] = field(default_factory=list)
+    is_rgb: bool = False
+
+
+@dataclass
+class _Draw:
+    """What is drawn so far.
+
+    Attributes:
+        rng: of all numbers.
+        channel: the one that rgb extinctions are reduced to; None for all three.
+        features: in words.
+        is_rgb: some extinction had three.
+    """
+
+    rng: np.random.Generator
+    channel: int | None
+    features: list[str] = field(default_factory=list)
+    is_rgb: bool = False
+
+    def one_of(self, kinds: dict[str, float]) -> str:
+        """A kind in proportion to its weight, remembered as a feature."""
+        names, weights = list(kinds), np.array(list(kinds.values()))
+        name = names[self.rng.choice(len(names), p=weights / weights.sum())]
+        self.features.append(name)
+        return name
+
+    def number(self, low: float, high: float) -> float:
+        """A uniform number."""
+        return float(self.rng.uniform(low, high))
+
+    def chance(self, p: float) -> bool:
+        """Whether something of this probability happens."""
+        return bool(self.rng.uniform() < p)
+
+    def colour(self, low: float, high: float) -> dict:
+        """A uniform colour."""
+        return {"type": "rgb", "value": [self.number(low, high) for _ in range(3)]}
+
+
+def draw_scene(seed: int, channel: int | None = None) -> RandomScene:
+    """Draw a scene.
+
+    Args:
+        seed: decides everything.
+        channel: reduces rgb extinctions to this one of theirs; None leaves all three.
+    """
+    draw = _Draw(np.random.default_rng(seed), channel)
+    parts: dict = {"type": "scene"}
+    parts |= _bodies(draw)
+    parts |= _surfaces(draw)
+    parts |= _lamps(draw)
+    parts["sensor"] = _camera(draw, parts)
+    depth = DEPTHS[draw.rng.integers(len(DEPTHS))]
+    draw.features.append(f"depth {depth}")
+    settings = {"max_depth": depth, "rr_depth": int(draw.rng.choice([5, 20]))}
+    return RandomScene(parts, settings, draw.features, draw.is_rgb)
+
+
+# -- Media --------------------------------------------------------------------------------------------------------------
+
+
+def _bodies(draw: _Draw) -> dict:
+    """One body, or two side by side, or one inside the other."""
+    kind = draw.one_of({"one body": 0.65, "side by side": 0.2, "nested": 0.15})
+    first = _body(draw, [-0.9 if kind == "side by side" else 0.0, 0, 0], draw.number(0.7, 1.1), "m1")
+    if kind == "one body":
+        return {"body": first}
+    if kind == "side by side":
+        return {"body": first, "other": _body(draw, [1.6, 0, 0], draw.number(0.5, 0.7), "m2")}
+    inner = _body(draw, [0.05, -0.1, 0.02], 0.3, "m2")
+    inner["exterior"] = {"type": "ref", "id": "m1"}
+    # A reference is found where what it names has been loaded before.
+    return {"a": first, "b": inner}
+
+
+def _body(draw: _Draw, centre: list[float], size: float, name: str) -> dict:
+    """A closed shape with a medium in it."""
+    place = mi.ScalarTransform4f().translate(centre)
+    if draw.one_of({"cube": 0.6, "sphere": 0.4}) == "cube":
+        axis = draw.rng.normal(size=3)
+        place = place.rotate((axis / np.linalg.norm(axis)).tolist(), draw.number(0, 90))
+        place = place.scale([size * draw.number(0.6, 1.0) for _ in range(3)])
+        shape = {"type": "cube", "to_world": place}
+    else:
+        place, shape = place.scale(size), {"type": "sphere", "center": centre, "radius": size}
+    to_grid = place @ mi.ScalarTransform4f().translate(-1).scale(2)
+    return shape | {"bsdf": _boundary(draw), "interior": _medium(draw, to_grid, size) | {"id": name}}
+
+
+def _boundary(draw: _Draw) -> dict:
+    ior = draw.number(1.1, 1.6)
+    boundaries: dict[str, dict] = {
+        "null": {"type": "null"},
+        "dielectric": {"type": "dielectric", "int_ior": ior},
+        "roughdielectric": {"type": "roughdielectric", "int_ior": ior, "alpha": draw.number(0.1, 0.5)},
+        "thindielectric": {"type": "thindielectric", "int_ior": ior},
+        "mask": {"type": "mask", "opacity": draw.number(0.2, 0.8), "nested": {"type": "diffuse"}},
+    }
+    weights = {"null": 0.6, "dielectric": 0.12, "roughdielectric": 0.12, "thindielectric": 0.08, "mask": 0.08}
+    return boundaries[draw.one_of(weights)]
+
+
+def _medium(draw: _Draw, to_grid: mi.ScalarTransform4f, size: float) -> dict:
+    tau, albedo = 10 ** draw.number(-0.7, 1.1), _albedo(draw, to_grid)
+    kind = draw.one_of({"homogeneous": 0.3, "grid": 0.45, "rgb grid": 0.25})
+    phase = _phase(draw)
+    if kind == "homogeneous":
+        return {"type": "homogeneous", "sigma_t": tau / (2 * size), "albedo": albedo, "phase": phase}
+    channels = 3 if kind == "rgb grid" else 1
+    res = [int(draw.rng.integers(1, 9)) for _ in range(3)]
+    values = draw.rng.uniform(0, 1, (*res, channels)) ** draw.number(0.5, 4)
+    if draw.chance(0.3):
+        values *= draw.rng.uniform(size=res)[..., None] < 0.5
+    if channels == 3:
+        draw.is_rgb = True
+        values *= 10 ** draw.rng.uniform(-1, 0, 3)
+        values = values if draw.channel is None else values[..., draw.channel : draw.channel + 1]
+    sigma_t = _grid(values * tau / size, to_grid)
+    return {"type": "heterogeneous", "sigma_t": sigma_t, "albedo": albedo, "phase": phase}
+
+
+def _albedo(draw: _Draw, to_grid: mi.ScalarTransform4f) -> dict | float:
+    kind = draw.one_of({"one albedo": 0.4, "white": 0.1, "colour": 0.2, "albedo grid": 0.3})
+    if kind == "albedo grid":
+        return _grid(draw.rng.uniform(0, 1, (3, 2, 4, 3)), to_grid)
+    return {"one albedo": draw.number(0.0, 0.99), "white": 1.0}.get(kind) or draw.colour(0.2, 0.95)
+
+
+def _grid(values: np.ndarray, to_world: mi.ScalarTransform4f) -> dict:
+    return {"type": "gridvolume", "grid": mi.VolumeGrid(values.astype(np.float32)), "raw": True, "to_world": to_world}
+
+
+def _phase(draw: _Draw) -> dict:
+    g = draw.number(-0.6, 0.9)
+    table = ",".join(f"{v:.4f}" for v in draw.rng.uniform(0.1, 1, 7))
+    phases: dict[str, dict] = {
+        "isotropic": {"type": "isotropic"},
+        "hg": {"type": "hg", "g": g},
+        "rayleigh": {"type": "rayleigh"},
+        "tabphase": {"type": "tabphase", "values": table},
+        "blendphase": {"type": "blendphase", "weight": draw.number(0.1, 0.9),
+                       "a": {"type": "hg", "g": g}, "b": {"type": "isotropic"}},
+    }  # fmt: skip
+    return phases[draw.one_of({"isotropic": 0.25, "hg": 0.4, "rayleigh": 0.1, "tabphase": 0.1, "blendphase": 0.15})]
+
+
+# -- Surfaces, lamps, camera ----------------------------------------------------------------------------------------------
+
+
+def _surfaces(draw: _Draw) -> dict:
+    parts = {}
+    if draw.chance(0.4):
+        down = mi.ScalarTransform4f().translate([0, 0, -1.7]).scale(4)
+        bsdf = {"type": "diffuse", "reflectance": draw.colour(0.1, 0.9)}
+        parts["floor"] = {"type": "rectangle", "to_world": down, "bsdf": bsdf}
+        draw.features.append("floor")
+    if draw.chance(0.3):
+        bsdfs = {
+            "diffuse ball": {"type": "twosided", "nested": {"type": "diffuse"}},
+            "plastic ball": {"type": "plastic", "diffuse_reflectance": draw.colour(0.1, 0.6)},
+            "metal ball": {"type": "roughconductor", "alpha": draw.number(0.2, 0.5)},
+        }
+        bsdf = bsdfs[draw.one_of(dict.fromkeys(bsdfs, 1.0))]
+        parts["ball"] = {"type": "sphere", "center": [0.2, -1.5, 0.9], "radius": 0.3, "bsdf": bsdf}
+    return parts
+
+
+def _lamps(draw: _Draw) -> dict:
+    """A faint sky, so that no scene is black, and one or two lamps."""
+    parts: dict = {}
+    for k in range(1 if draw.chance(0.6) else 2):
+        kind = draw.one_of({name: 1.0 for name in LAMPS if name not in SKIES or not SKIES & set(draw.features)})
+        parts[f"lamp{k}"] = LAMPS[kind](draw)
+    if not SKIES & set(draw.features):
+        parts["sky"] = {"type": "constant", "radiance": 0.2}
+    return parts
+
+
+def _direction(draw: _Draw) -> np.ndarray:
+    """From somewhere above."""
+    d = draw.rng.normal(size=3) * [1, 1, 0.5] + [0, 0, 1.2]
+    return d / np.linalg.norm(d)
+
+
+def _from(draw: _Draw, distance: float) -> mi.ScalarTransform4f:
+    """A place at a distance that looks at the middle."""
+    origin = (distance * _direction(draw)).tolist()
+    return mi.ScalarTransform4f().look_at(origin=origin, target=[0, 0, 0], up=[0.1, 0.9, 0.2])
+
+
+def _envmap(draw: _Draw) -> dict:
+    picture = draw.rng.uniform(0, 1, (8, 16, 3)).astype(np.float32) ** 2
+    picture[2, 5] = 20.0
+    return {"type": "envmap", "bitmap": mi.Bitmap(picture)}
+
+
+def _ball(draw: _Draw, inside: bool) -> dict:
+    centre = [0.15, 0.1, 0.2] if inside else (2.2 * _direction(draw)).tolist()
+    lamp = {"type": "area", "radiance": draw.colour(1, 6)}
+    return {"type": "sphere", "center": centre, "radius": 0.2 if inside else 0.5, "emitter": lamp}
+
+
+LAMPS: dict[str, Callable[[_Draw], dict]] = {
+    "constant": lambda draw: {"type": "constant", "radiance": draw.colour(0.2, 1)},
+    "envmap": _envmap,
+    "directional": lambda draw: {"type": "directional", "direction": (-_direction(draw)).tolist(),
+                                 "irradiance": draw.colour(1, 4)},
+    "point": lambda draw: {"type": "point", "position": (2.5 * _direction(draw)).tolist(), "intensity": draw.colour(5, 15)},
+    "spot": lambda draw: {"type": "spot", "to_world": _from(draw, 3.0), "intensity": draw.colour(10, 30), "cutoff_angle": 30.0},
+    "square": lambda draw: {"type": "rectangle", "to_world": _from(draw, 2.6).scale(draw.number(0.4, 1.0)),
+                            "emitter": {"type": "area", "radiance": draw.colour(1, 6)}},
+    "ball of light": lambda draw: _ball(draw, False),
+    "ball of light inside": lambda draw: _ball(draw, True),
+}  # fmt: skip
+
+SKIES = {"constant", "envmap"}
+"""A scene has one environment at most."""
+
+
+def _camera(draw: _Draw, parts: dict) -> dict:
+    origin = [draw.number(-1, 1), -4.5, draw.number(-0.5, 1.5)]
+    body = parts.get("body", parts.get("a"))
+    camera = {
+        "type": "perspective",
+        "fov": 42,
+        "film": {"type": "hdrfilm", "width": SIDE, "height": SIDE, "rfilter": {"type": "box"}, "pixel_format": "rgb"},
+        "sampler": {"type": "independent"},
+    }
+    if body["bsdf"]["type"] == "null" and draw.chance(0.15):
+        draw.features.append("camera inside")
+        origin = [0.02, -0.35, 0.05] if "other" not in parts else [-0.9, -0.2, 0.05]
+        camera["medium"] = {"type": "ref", "id": "m1"}
+    camera["to_world"] = mi.ScalarTransform4f().look_at(origin=origin, target=[0.1, 0, 0], up=[0, 0, 1])
+    return camera
