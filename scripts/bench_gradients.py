@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Density gradients of light that scatters once: how exact are they, and how much sooner than those of ``prbvolpath``?
+"""Density gradients of light that scatters once or often: how exact are they, how much sooner than those of ``prbvolpath``?
 
 See ``scripts/bench_gradients.py --help``; everything is in :mod:`mivol.bench.gradients`.
 """

@@ -23,6 +23,7 @@ BENCHES = {
     "bench_optical_depth": "optical_depth",
     "bench_radiance_field": "radiance_field",
     "bench_multiple_scattering": "multiple_scattering",
+    "bench_random_scenes": "random_scenes",
     "bench_single_scattering": "single_scattering",
     "bench_still_life": "still_life",
     "bench_tomography": "tomography",
