@@ -13,6 +13,9 @@ from pathlib import Path
 
 __all__ = ["Guards", "imported_modules", "index_guards"]
 
+EVERYWHERE = 8
+"""A test that mutations in so many folders name looks at every module: it guards those that have no mutation, too."""
+
 MOST_FILES = 5
 """Files of tests in the second round. Modules that half of the tests import would have most of the suite run otherwise."""
 
@@ -24,24 +27,28 @@ class Guards:
     Attributes:
         tests: the tests of the mutations of each file of the package, those of most mutations first.
         named, importing: files of tests that are called like a file, or import it, those that import the fewest first.
+        everywhere: tests that guard every module.
         files: every file of tests.
     """
 
     tests: dict[str, list[str]] = field(default_factory=dict)
     named: dict[str, list[str]] = field(default_factory=dict)
     importing: dict[str, list[str]] = field(default_factory=dict)
+    everywhere: list[str] = field(default_factory=list)
     files: list[str] = field(default_factory=list)
 
     def rounds(self, file: str) -> list[list[str]]:
         """What to run for a file of the package, round by round, the likeliest and cheapest to notice a fault first.
 
-        First the files of tests that are called like it, and the tests elsewhere that its mutations name; then the rest of the
+        First the files of tests that are called like it, the tests elsewhere that its mutations name, and those that guard
+        every module; then the rest of the
         files that hold those tests, and those that import it, MOST_FILES at most; then those of all files in its folder, or all
         there are where the folder has none. Rounds may be empty; what a later round runs again are single tests of a file.
         """
         named, tests = self.named.get(file, []), self.tests.get(file, [])
         first = [*named, *(t for t in tests if file_of(t) not in named)]
         rest = [t for t in _once([*map(file_of, tests), *self.importing.get(file, [])]) if t not in named][:MOST_FILES]
+        first += [t for t in self.everywhere if t not in first]
         near = [f for f in sorted({*self.tests, *self.named}) if Path(f).parent == Path(file).parent]
         around = _once(t for f in near for t in (*map(file_of, self.tests.get(f, [])), *self.named.get(f, [])))
         return [first, rest, [t for t in around or self.files if t not in (*named, *rest)]]
@@ -65,10 +72,14 @@ def index_guards(root: Path, entries: Iterable[tuple[str, str]], package: str = 
         package: the folder of the package.
     """
     modules = {_module(path.relative_to(root)): str(path.relative_to(root)) for path in sorted((root / package).rglob("*.py"))}
-    counts = defaultdict(Counter)
+    entries, counts = list(entries), defaultdict(Counter)
     for file, test in entries:
         counts[file][test] += 1
     guards = Guards(tests={file: [test for test, _ in found.most_common()] for file, found in counts.items()})
+    folders = defaultdict(set)
+    for file, test in entries:
+        folders[test].add(Path(file).parent)
+    guards.everywhere = sorted(test for test, found in folders.items() if len(found) >= EVERYWHERE)
     reads = {}
     for path in sorted((root / "tests").rglob("test_*.py")):
         name = str(path.relative_to(root))

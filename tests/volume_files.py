@@ -135,10 +135,12 @@ def nifti(
     pixdim: tuple[float, ...] = (1.0, 1.5, 2.0, 2.5),
     scale: tuple[float, float] = (0.0, 0.0),
     code: int | None = None,
+    axis: int = 5,
 ) -> bytes:
-    """NIfTI-1 or -2 in one file; channels, if any, are the fifth axis (slowest)."""
+    """NIfTI-1 or -2 in one file; channels, if any, are the axis of that number (slowest)."""
     nz, ny, nx, channels = values.shape
-    dim = [5, nx, ny, nz, 1, channels, 1, 1] if channels > 1 else [3, nx, ny, nz, 1, 1, 1, 1]
+    dim = [axis if channels > 1 else 3, nx, ny, nz, 1, 1, 1, 1]
+    dim[axis] = channels
     head = bytearray(348 if version == 1 else 540)
 
     def put(code: str, offset: int, *numbers: float) -> None:

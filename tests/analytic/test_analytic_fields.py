@@ -171,3 +171,18 @@ def test_voxelise_puts_values_at_voxel_centres():
 def test_refusals(make, says):
     with pytest.raises(MivolError, match=says):
         make()
+
+
+@pytest.mark.parametrize("name", SMOOTH | BOUNDED)
+def test_points_and_rays_may_have_any_shape(name):
+    """Each point and each ray by itself gives what it gives in an array."""
+    field = (SMOOTH | BOUNDED)[name]
+    o, d, t0, t1 = rays(6, 3)
+    one = [float(np.squeeze(field.eval(p))) for p in o]
+    found = field.eval(o.reshape(2, 3, 3))
+    assert found.shape == (2, 3)
+    np.testing.assert_allclose(found.ravel(), one, rtol=1e-13)
+    tau = field.optical_depth(o.reshape(2, 3, 3), d.reshape(2, 3, 3), t0.reshape(2, 3), t1.reshape(2, 3))
+    assert tau.shape == (2, 3)
+    one = [float(np.squeeze(field.optical_depth(*ray))) for ray in zip(o, d, t0, t1, strict=True)]
+    np.testing.assert_allclose(tau.ravel(), one, rtol=1e-12)

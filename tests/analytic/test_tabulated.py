@@ -45,6 +45,8 @@ def test_samples_of_a_table_invert_its_distribution():
     m = as64(turn.below_one)
     assert np.all(m >= 0)
     assert np.all(np.diff(m) <= 0)
+    # Both are rounded once as sums of a node and an offset of 2 at most.
+    assert np.max(np.abs(m + as64(turn.above_minus_one) - 2)) <= 4 * EPS
     # Above each sample: whole segments and a trapezoid, from 1 downwards, so that the peak is judged by its own size.
     d, f = (1 - COSINES)[::-1], VALUES[::-1] / np.trapezoid(VALUES, COSINES)
     sums = np.concatenate([[0], np.cumsum((f[1:] + f[:-1]) / 2 * np.diff(d))])

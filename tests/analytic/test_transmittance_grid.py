@@ -71,4 +71,4 @@ def test_explain_measures_the_light_grid():
     box, _ = smoke(rough_grid(1))
     lamp, _ = sun([0.3, 0.2, -1.0])
     text = explain(close_up({"smoke": box, "lamp": lamp}), max_depth=2)
-    assert "light grid" in text and "bias" in text
+    assert "exact; with deterministic, a light grid" in text and "bias" in text

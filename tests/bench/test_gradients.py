@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -18,7 +19,7 @@ from mivol.bench.gradients import BENCH, QUICK
 from mivol.bench.gradients.bias import Case, cases, difference, refine, table_row
 from mivol.bench.gradients.size import CONTESTS, OURS, STOCK, TABLES
 from mivol.bench.gradients.subject import compete, subjects
-from mivol.bench.gradients.tutorial import Run, at_voxels, finish, measure_tutorial, upright, warm_up
+from mivol.bench.gradients.tutorial import Run, at_voxels, finish, half_circle, measure_tutorial, optimise, upright, warm_up
 from mivol.bench.gradients.variance import measure_contest, outcome
 from mivol.bench.timing import Budget, Timing
 from mivol.files import read_volume
@@ -143,6 +144,24 @@ def test_the_tutorial_of_mivol_learns(variant_rgb: str, monkeypatch: pytest.Monk
     assert abs(answer["references"]["z_against_volpath"]) <= answer["references"]["z_bound"]
 
 
+def test_cases_change_where_they_say() -> None:
+    """Directions are 1 where nothing is, and the medium itself elsewhere; its noise is a half about 1."""
+    found = cases(8)
+    steps = {"density 0": 0.01, "half empty": 0.02, "thin": 0.1, "dense": 0.05}
+    assert {name: case.step for name, case in found.items()} == steps
+    empty, half, thin, dense = found.values()
+    assert (empty.values == 0).all() and (empty.direction == 1).all()
+    left = np.arange(8) < 4
+    assert (half.values[..., left] == 0).all() and (half.direction[..., left] == 1).all()
+    assert (half.direction[..., ~left] == 0).all()
+    noise = dense.values / 10
+    assert noise.min() >= 0.5 and noise.max() <= 1.5
+    # A product and a quotient are rounded to 2^-53 each.
+    np.testing.assert_allclose(half.values[..., ~left], 4 * noise[..., ~left], rtol=1e-15)
+    np.testing.assert_allclose(thin.values, 0.05 * noise, rtol=1e-15)
+    assert (thin.direction == thin.values).all() and (dense.direction == dense.values).all()
+
+
 def test_differences_are_exact_for_a_parabola() -> None:
     """Central ones, and one-sided ones where a negative density would be needed; float64, step 0.01."""
     subject = SimpleNamespace(mean=lambda values, seed, spp: float(np.sum(3 * values + values**2)))
@@ -176,6 +195,36 @@ def test_the_smoke_stands_as_in_the_tutorial(variant_rgb: str, data_dir: Path) -
     assert a.max() > 0.5
     # the rotation by cos(90 degrees) = 6e-17 moves a point by an ulp: 53 voxels * 6e-8 * a difference of at most 1.85
     np.testing.assert_allclose(a, b, atol=2e-5)
+
+
+def test_the_tutorials_cameras_stand_on_half_a_circle(variant_rgb: str) -> None:
+    """4 away from the middle, which they look at, from -x over z towards x in steps of 36 degrees."""
+    for i, sensor in enumerate(half_circle(4)):
+        pose = np.array(sensor.world_transform().matrix).reshape(4, 4)
+        angle = np.radians(36 * i - 90)
+        place = 4 * np.array([np.sin(angle), 0, np.cos(angle)])
+        # Rounded to 2^-24 of 4 by a few products of float32.
+        np.testing.assert_allclose(pose[:3, 3], place, atol=2e-6)
+        np.testing.assert_allclose(pose[:3, 2], -place / 4, atol=1e-6)
+        np.testing.assert_allclose(pose[:3, 1], [0, 1, 0], atol=1e-6)
+        assert tuple(sensor.film().size()) == (4, 4)
+
+
+def test_the_tutorials_loop_follows_its_references(variant_rgb: str) -> None:
+    """Matter takes more of the constant light than it scatters: a first step of Adam, of its rate, thins the smoke where the
+    reference is brighter and thickens it where that is darker."""
+    sensors, found = half_circle(2, 1), {}
+    for light in (0.0, 2.0):
+        judge = SimpleNamespace(
+            sensors=sensors,
+            references=[dr.full(mi.TensorXf, light, (2, 2, 3))],
+            loss=lambda *_: 0.0,
+            density_error=lambda values: float(values.mean()),
+        )
+        (run,) = optimise(OURS, 2, judge, replace(TINY, resolutions=(2,), steps=(1,), step_spp=(4,)))
+        found[light] = run.density_error[0]
+    # From 0.002 by 0.02, and not below 1e-6.
+    assert found == pytest.approx({0.0: 0.022, 2.0: 1e-6}, rel=1e-3)
 
 
 def test_when_ours_is_there_is_read_off_its_own_clock() -> None:

@@ -16,7 +16,7 @@ import pytest
 from matplotlib.figure import Figure
 
 from mivol.bench import radiance_field
-from mivol.bench.radiance_field import BENCH, QUICK, fits
+from mivol.bench.radiance_field import BENCH, QUICK, fields, fits
 from mivol.bench.radiance_field.fields import FIELDS, centred
 from mivol.bench.radiance_field.fits import EVERY, follow, held_out_psnr, our_fit, peer_fit
 from mivol.bench.radiance_field.peer import Peer
@@ -156,6 +156,27 @@ def test_memory_a_ray(variant_rgb: str) -> None:
     assert bar["met"], bar
 
 
+@pytest.mark.parametrize("there", [True, False])
+def test_the_fitted_field_is_the_chair_where_there_is_one(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, there: bool) -> None:
+    """Without the data, views of the shell are fitted instead."""
+
+    class Asked(Exception):
+        pass
+
+    def ask(what: object, **how: object) -> None:
+        raise Asked(what, how)
+
+    if there:
+        (tmp_path / "multiview" / "chair").mkdir(parents=True)
+    monkeypatch.setattr(fields, "DATA", tmp_path)
+    monkeypatch.setattr(fields, "load_photos", ask)
+    monkeypatch.setattr(fields, "shell", lambda size: ask("shell"))
+    with pytest.raises(Asked) as asked:
+        fields.fitted(TINY)
+    chair = (tmp_path / "multiview" / "chair", {"split": "train", "background": "white", "scale": 0.5})
+    assert asked.value.args == (chair if there else ("shell", {}))
+
+
 def test_a_smaller_array_stands_in_the_middle() -> None:
     found = centred(np.ones((2, 3, 4, 2), np.float32), 6)
     assert found.shape == (6, 6, 6, 2)
@@ -181,6 +202,16 @@ def test_every_question_is_answered(variant_rgb: str, tmp_path: Path) -> None:
 def test_a_stage_of_the_peer_has_twice_the_resolution(variant_rgb: str) -> None:
     refined = Peer.start(4).refined()
     assert (refined.density.shape, refined.harmonics.shape) == ((8, 8, 8, 1), (8, 8, 8, 27))
+
+
+@pytest.mark.parametrize("target", [2.0, -2.0])
+def test_a_step_of_the_peer_goes_to_its_target(variant_rgb: str, target: float) -> None:
+    """It gets brighter where the target is, and darker where that is."""
+    peer = Peer.start(2)
+    o, d = mi.Point3f([0.5, 0.4], [0.5, 0.6], -1.0), mi.Vector3f(0, 0, 1)
+    before = np.array(peer.render(o, d))
+    next(peer.fit([(o, d, mi.Color3f(target))], 1))
+    assert np.all(np.sign(np.array(peer.render(o, d)) - before) == np.sign(target))
 
 
 def test_figures_show_the_answers(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

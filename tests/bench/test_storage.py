@@ -66,6 +66,7 @@ def test_the_lecture_counts_4_gigabytes() -> None:
     found = {kind.name: kind for kind in storage.kinds(0.1)}
     assert found["dense rgba, 8 bits (the lecture's)"].scenes[1024] == (4 * 2**30, 4 * 2**30)
     assert found["dense SH 2"].per_cell == (4 * 29, 2 * 28)
+    assert found["sparse SH 2"].per_cell == (4 * 29 + 4, 2 * 28 + 4)
     ratio = found["sparse SH 2"].scenes[1024][0] / found["dense SH 2"].scenes[1024][0]
     assert ratio == pytest.approx(0.1 / 8 * 30 / 29, rel=1e-6)
     # Hundreds of nodes of 64^3 lie at one distance: a share is met to a thousandth or two.

@@ -25,6 +25,7 @@ from mivol.errors import MivolError
 from mivol.files import write_exr, write_volume
 from mivol.report import figures, show
 from mivol.report import page as page_module
+from mivol.report.gallery import ShownView
 from mivol.report.page import headline, write_page
 from mivol.report.record import (
     Image,
@@ -157,6 +158,13 @@ def test_numbers_of_a_view_on_paper(tmp_path):
     found = one_view(tmp_path, np.ones((4, 6)), np.full((4, 6), 0.9), status="finished")
     assert "PSNR 20.0 dB" in found.text and "nRMSE 0.1" in found.text
     assert "to 20.0 dB PSNR" in found.text.replace("\u00a0", " ")
+
+
+@pytest.mark.parametrize(("found", "said"), [([30.0], ""), ([30.0, 31.26], " (30.0 to 31.3)")], ids=["one", "two"])
+def test_views_that_are_held_out_have_a_range_where_there_are_two(found, said):
+    views = [ShownView(str(k), True, [], psnr, "") for k, psnr in enumerate(found)]
+    tiles = page_module._numbers(RunRecord.new("A run"), views, [])
+    assert tiles == [(f"{np.mean(found):.1f}", "dB", f"PSNR, held-out views{said}")]
 
 
 def test_a_broken_render_has_no_psnr(tmp_path):

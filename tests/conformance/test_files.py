@@ -178,6 +178,12 @@ def test_nrrd_byte_skip_from_the_end(tmp_path: Path) -> None:
     assert_volume(read(tmp_path, "a.nhdr", head.encode()), values)
 
 
+def test_nrrd_that_is_longer_than_it_says_is_not_cut_at_either_end(tmp_path: Path) -> None:
+    """Only a negative byte skip counts from the end."""
+    with pytest.raises(MivolError, match="longer than its header says"):
+        read(tmp_path, "a.nrrd", made.nrrd(made.numbered()) + b"and more")
+
+
 @pytest.mark.parametrize("names", ["LIST\nslice-0\nslice-1\n", "slice-%d 0 1 1\n"])
 def test_nrrd_slices(tmp_path: Path, names: str) -> None:
     values = made.numbered()
@@ -231,6 +237,12 @@ def test_nifti_by_hand(tmp_path: Path, version: int, name: str, channels: int) -
         volume = read(tmp_path, name, made.PACK["gzip" if name.endswith("gz") else "raw"](data))
         assert_volume(volume, values)
         assert (volume.meta["space"], volume.meta["unit"]) == ("RAS", "mm")
+
+
+@pytest.mark.parametrize("axis", [4, 5, 6, 7])
+def test_nifti_channels_on_any_further_axis(tmp_path: Path, axis: int) -> None:
+    values = made.numbered(channels=3)
+    assert_volume(read(tmp_path, "a.nii", made.nifti(values, sform=SFORM, axis=axis)), values)
 
 
 def test_nifti_qform_is_a_quaternion(tmp_path: Path) -> None:

@@ -66,6 +66,7 @@ def test_a_way_between_views_goes_through_them() -> None:
     found = between(given, 7)
     for camera, wanted in zip(found[::2], given, strict=True):
         np.testing.assert_allclose(camera.to_world, wanted.to_world, atol=1e-9)
+    np.testing.assert_allclose(between(given[:2], 3)[2].to_world, given[1].to_world, atol=1e-9)
     with pytest.raises(MivolError, match="found 1 cameras"):
         between(given[:1], 5)
 
@@ -138,6 +139,8 @@ def test_mp4_is_what_a_player_shows(tmp_path: Path) -> None:
 
 def test_gif_needs_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    with Image.open(write_video(tmp_path / "usual.gif", frames())) as film:
+        assert film.info["duration"] == 40  # 25 frames a second
     path = write_video(tmp_path / "film.gif", frames(), fps=20)
     with Image.open(path) as film:
         assert film.n_frames == 6 and film.info["duration"] == 50

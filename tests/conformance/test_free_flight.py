@@ -12,6 +12,7 @@ from scattering_scenes import PLACE, aimed, close_up, fog, mivol, pencils, phase
 
 import scenes
 from mivol.scene import plan
+from mivol.transport.estimators import free_flight
 from mivol.validate.moments import Moments
 from scenes import ball_of, box_of, centred, grid_volume, medium
 
@@ -243,3 +244,13 @@ def test_media_scenes_of_mitsubas_own_tests(two_threads, name, data_dir):
         found.append(Moments.of(np.array(pictures, dtype=np.float64)))
     assert_same_mean(*found, rounding=1e-6, what="pictures")
     assert_precise(difference(*found), 0.02 * found[1].mean, what="pictures")
+
+
+@pytest.mark.parametrize(
+    ("beta", "u", "channel"),
+    [((0, 1, 0), 0, 1), ((0, 0, 3), 0, 2), ((1, 0, 1), 0.5, 2), ((1, 1, 2), 0.2, 0), ((1, 1, 2), 0.3, 1), ((1, 1, 2), 0.6, 2)],
+)
+def test_a_channel_without_throughput_is_never_drawn(beta, u, channel):
+    """Shares of [0, 1) in the order of the channels; one of no width holds no number, not even 0."""
+    found = free_flight._draw_channel(mi.Spectrum(*map(float, beta)), mi.Float(u))
+    assert int(np.array(found).item()) == channel

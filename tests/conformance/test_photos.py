@@ -82,6 +82,10 @@ def test_project_inverts_rays() -> None:
     back, depth = project(camera, o + 2.5 * d)
     np.testing.assert_allclose(back, pixel, atol=1e-11)  # 64 pixels, 1e-16 each, over a few operations
     assert (depth > 0).all() and (depth <= 2.5).all()
+    near, depth = project(camera, o + 1e-3 * d)
+    np.testing.assert_allclose(near, pixel, atol=1e-8)  # a distance of 4 less its 1e-3 loses 12 of 53 bits
+    assert (depth > 0).all() and (depth <= 1e-3).all()
+    assert np.isnan(project(camera, camera.origin)[0]).all()
     behind, negative = project(camera, o - d)
     assert np.isnan(behind).all() and (negative < 0).all()
 
@@ -511,6 +515,17 @@ def test_silhouette_box_holds_the_thing_and_little_more() -> None:
     assert (box[0] <= -radii).all() and (box[1] >= radii).all()
     # Two cells of the second search, each 1/40 of at most twice the thing, and the hull of 12 views around it.
     assert (np.abs(box) < 1.3 * radii + 0.05).all()
+
+
+def test_silhouettes_are_looked_through_twice(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A search of the whole box, and one of what it left: each costs a projection of all cells to every view."""
+    camera = Camera(intrinsics(16, 16, 8, 8), (16, 16), look_at(np.array([0.0, -4, 0])))
+    view = Photo("v", np.zeros((16, 16, 3), np.float32), np.ones((16, 16), np.float32), None, camera, np.zeros(3))
+    survey = PhotoSurvey(Path(), "", (), (), np.array([[-1.0] * 3, [1.0] * 3]), "", (0, 1))
+    searched, see = [], silhouette.views_seeing
+    monkeypatch.setattr(silhouette, "views_seeing", lambda cameras, cells: searched.append(len(cells)) or see(cameras, cells))
+    silhouette_box(Photos((view,), "srgb", survey))
+    assert searched == [silhouette.CELLS**3] * 2
 
 
 def test_a_cell_is_kept_for_the_last_pixel_that_its_sphere_covers() -> None:

@@ -213,3 +213,15 @@ def test_rays_with_gradients_are_refused(seed):
 def test_other_channel_counts_are_refused(channels):
     with pytest.raises(ValueError, match="channels"):
         tau_fast(np.ones((2, 2, 2, channels)), np.eye(4), [0, 0, 0], [0, 0, 1])
+
+
+@pytest.mark.parametrize("spare", [-1, 0])
+def test_gradients_are_packed_up_to_a_size(variant_rgb, monkeypatch, spare):
+    """Packed gradients hold a cell's 8 corners side by side; larger ones hold a number a node, whatever the back end."""
+    from mivol.transport.media import grid_integral
+
+    lattice = make_lattice(np.ones((3, 4, 5, 2), np.float32), FRAMES["unit"], False)
+    monkeypatch.setattr(grid_integral, "PACKED_LIMIT", grid_integral.gradient_bytes(lattice.res, 2) + spare)
+    found = grid_integral.Gradient.zeros(lattice)
+    packed = spare == 0 and "llvm" in variant_rgb
+    assert (found.packed, dr.width(found.buffer)) == (packed, 8 * 4 * 5 * 6 * 2 if packed else 3 * 4 * 5 * 2)

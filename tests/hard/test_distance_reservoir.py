@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import oracle_scattering as twins
@@ -11,9 +12,11 @@ from hard_scattering import BATCHES, holds_twin
 from scattering_scenes import PLACE, aimed, mivol, pencils, point, rough_grid, smoke, sun
 
 import scenes
-from mivol.transport.estimators.distance_reservoir import lit_length
+from mivol.transport.estimators.distance_reservoir import DistanceProposal, fill_reservoir, lit_length, start_reservoir
+from mivol.transport.estimators.emitters import ChosenEmitter
 from mivol.transport.estimators.shadow_rays import DARK
-from scenes import as_float32, box_of, grid_volume, medium
+from mivol.transport.media.ray_intervals import visit_media
+from scenes import as_float32, box_of, grid_volume, media_of, medium
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
 
@@ -86,3 +89,24 @@ def test_what_is_behind_the_dark_takes_no_candidates(sigma, length, lit):
     """
     found = lit_length([mi.Float(s) for s in sigma], mi.Float(length))
     assert float(np.array(found).item()) == pytest.approx(lit, rel=1e-6)
+
+
+def test_a_probe_is_spread_over_the_grid_alone():
+    """A grid fills the middle half of a box of vacuum: a probe's optical depth is even over the grid's length."""
+    grid = np.diag([1.0, 1, 1, 1])
+    grid[:3, 3] = -0.5
+    place = np.diag([2.0, 2, 2, 1])
+    place[:3, 3] = -1
+    interior = medium("mivol_medium", grid_volume("mivol_voxels", np.ones((4, 4, 4, 1), np.float32), grid), 0.8)
+    seen = pencils({"smoke": box_of(interior, place), "sun": sun([0, 0, 1.0])[0]}, *aimed(4, 4))
+    n = 8
+    with dr.suspend_grad():
+        media = media_of(seen.scene)
+        ray = mi.Ray3f(mi.Point3f(0.1, 0.2, -5 + dr.zeros(mi.Float, n)), mi.Vector3f(0, 0, 1))
+        proposal = DistanceProposal(media, ray, ChosenEmitter(mi.UInt32(0), None, None), None, 0.7)
+        start = start_reservoir(media, mi.Float((np.arange(n) + 0.5) / n), n)
+        _, reservoir = visit_media(media, ray, media.medium_at(ray), fill_reservoir(proposal), start, mi.Bool(True))
+    (kept,) = reservoir.candidates
+    # The length of the grid comes from two slabs in float32.
+    np.testing.assert_allclose(np.array(kept.probe_sigma), 0.7, rtol=1e-5)
+    np.testing.assert_allclose(np.array(reservoir.tau[0]), 1.0, rtol=1e-5)

@@ -153,3 +153,8 @@ def test_slope_of_tv_is_finite_where_the_field_is_flat(variant_rgb) -> None:
 def test_refuses_a_flat_array(variant_rgb) -> None:
     with pytest.raises(MivolError, match="reshape"):
         Sparse().value_and_gradient(np.zeros(8), SPACING)
+
+
+def test_which_priors_compare_neighbours() -> None:
+    """The others may act on parameters that are no grid."""
+    assert {name for name, prior in PRIORS.items() if prior.is_spatial} == {"tv", "huber_tv", "laplacian", "smoothness"}

@@ -85,3 +85,7 @@ def test_the_parabola_of_a_ray_meets_its_likelihood_where_there_is_nothing():
     np.testing.assert_allclose(c, np.maximum(expected, 0), rtol=1e-6, atol=1e-6)
     at_zero = blank * (1 - y * background / (blank + background) ** 2)
     np.testing.assert_allclose(counts.optimum_curvature(0 * line), at_zero, rtol=1e-12)
+
+
+def test_iterations_are_counted(scan):
+    assert [state.iteration for state in run("ml-tr", problem_for("ml-tr", scan), 3)] == [1, 2, 3]

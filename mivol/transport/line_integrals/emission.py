@@ -129,7 +129,7 @@ class _Emission:
         ]
 
     def vjp(self, site: RayPiece, sigma: list[list[mi.Float]], weight: list[mi.Float]) -> None:
-        body, factor = site.body, mi.Spectrum(*weight) if self.rows > 1 else mi.Spectrum(weight[0])
+        body, factor = site.body, mi.Spectrum(*weight)
         if not body.view.emits:
             return
         by_source, by_density, per_sigma = self._weights(site, sigma)

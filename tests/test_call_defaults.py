@@ -1,0 +1,72 @@
+"""What holds where a call says nothing: numbers and switches that a public function, method or class takes by itself.
+
+Whoever changes one changes the results of every script that is silent about it, and no formula tells that it is wrong. So they
+are recorded, module by module, and ``pytest tests/test_call_defaults.py --record`` records them anew: the change is seen then.
+What is not recorded yet is not judged, and what is gone is left out of the next record.
+"""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import json
+import pkgutil
+from collections.abc import Iterator
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+import mivol
+
+RECORDED = Path(__file__).with_suffix(".json")
+MODULES = sorted(m.name for m in pkgutil.walk_packages(mivol.__path__, "mivol.") if not m.name.endswith("__main__"))
+
+
+def is_plain(value: object) -> bool:
+    """A number, a switch or a tuple of them."""
+    return isinstance(value, bool | int | float) or (isinstance(value, tuple) and value != () and all(map(is_plain, value)))
+
+
+def callables(module: ModuleType) -> Iterator[tuple[str, object]]:
+    """Public functions and classes of a module, and public methods of these classes."""
+    for name, found in vars(module).items():
+        if name.startswith("_") or getattr(found, "__module__", "") != module.__name__:
+            continue
+        if inspect.isclass(found):
+            yield name, found
+            for method, function in vars(found).items():
+                function = getattr(function, "__func__", function)
+                if not method.startswith("_") and inspect.isfunction(function):
+                    yield f"{name}.{method}", function
+        elif inspect.isfunction(found):
+            yield name, found
+
+
+def defaults(called: object) -> dict[str, object]:
+    """Plain defaults by parameter, as JSON holds them."""
+    try:
+        parameters = inspect.signature(called).parameters.values()
+    except (TypeError, ValueError):
+        return {}
+    plain = {p.name: p.default for p in parameters if is_plain(p.default)}
+    return json.loads(json.dumps(plain))
+
+
+def defaults_of(name: str) -> dict[str, dict]:
+    """Those of a module, by function."""
+    found = {called: defaults(function) for called, function in callables(importlib.import_module(name))}
+    return {called: plain for called, plain in sorted(found.items()) if plain}
+
+
+@pytest.mark.usefixtures("variant_rgb")
+def test_defaults_are_as_recorded(record: bool) -> None:
+    found = {name: defaults_of(name) for name in MODULES}
+    if record:
+        text = json.dumps({name: kept for name, kept in found.items() if kept}, indent=1)
+        RECORDED.write_text(text + "\n", encoding="utf-8")
+    recorded = json.loads(RECORDED.read_text(encoding="utf-8"))
+    known = [(module, called, name) for module, kept in recorded.items() for called, plain in kept.items() for name in plain]
+    held = {key: value for key in known if (value := found.get(key[0], {}).get(key[1], {}).get(key[2])) is not None}
+    assert len(held) > 0.9 * len(known)
+    assert held == {(module, called, name): recorded[module][called][name] for module, called, name in held}
