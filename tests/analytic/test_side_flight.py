@@ -70,11 +70,11 @@ def test_light_at_the_end_of_a_side_flight():
 
 def test_the_next_vertex_counts_by_the_balance_heuristic():
     """p / (p + q) where the path goes on, 1 where it draws an emitter sample of its own; the numbers are handed on."""
-    estimators, hit = middle()
+    estimators, _ = middle()
     c = np.linspace(-1, 1, N)
     wo = mi.Vector3f(mi.Float(np.sqrt(1 - c**2)), 0, mi.Float(c))
     on, u = dr.arange(mi.UInt32, N) > 9, mi.Point2f(0.25, 0.75)
-    aim = weigh_aim(estimators, hit.mei, u, wo, mi.Float(of_cosine(c, G)), on)
+    aim = weigh_aim(estimators, mi.Vector3f(0, 0, 1), u, wo, mi.Float(of_cosine(c, G)), on)
     expected = of_cosine(c, G) / (of_cosine(c, G) + of_cosine(c, LOBE))
     # The cosine is rounded to 2^-24 twice, and the relative slope of HG by it is 3 g / (1 - g)^2 = 60 at most.
     np.testing.assert_allclose(np.array(aim.weight)[10:], expected[10:], rtol=60 * 2.0**-23)

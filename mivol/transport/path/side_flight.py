@@ -77,10 +77,12 @@ class SideLight(TrackedTerm):
         self.flown = flown
 
     def vjp(self, dL: mi.Spectrum) -> None:
+        """Derivatives of the phase functions and the emitter, and of the flight."""
         super().vjp(dL)
         self.flown.vjp(dL * self.value)
 
     def jvp(self) -> mi.Spectrum:
+        """Tangent of both."""
         return super().jvp() + self.value * self.flown.jvp()
 
 
@@ -89,11 +91,13 @@ class SideFlight:
     """A side flight.
 
     Attributes:
+        to_emitter: the direction of the emitter sample that the next vertex takes too.
         light: that it finds.
         shadow: the shadow ray at its end.
         chance: for derivatives, a number in [0, 1) by which one of a path's shadow rays is kept; None for pictures.
     """
 
+    to_emitter: mi.Vector3f
     light: SideLight
     shadow: DirectLight
     chance: mi.Float | None
@@ -135,14 +139,14 @@ def fly_aside(
         value = reached * f * (flown.T * there.albedo) * direct.value
     lit = on & direct.on
     chance = None if flown.probe is None else flown.probe.chance
-    return SideFlight(SideLight(value, flown.transmittance, lit), DirectLight(media, direct.ray_segment, value, lit), chance)
+    return SideFlight(w, SideLight(value, flown.transmittance, lit), DirectLight(media, direct.ray_segment, value, lit), chance)
 
 
-def weigh_aim(
-    estimators: Estimators, mei: mi.MediumInteraction3f, u: mi.Point2f, wo: mi.Vector3f, p: mi.Float, active: mi.Bool
-) -> Aim:
-    """The aim of the next vertex, for a path that leaves this one in the direction ``wo`` of density ``p``."""
-    w = _direction_to_emitter(estimators, mei, u, active)
+def weigh_aim(estimators: Estimators, w: mi.Vector3f, u: mi.Point2f, wo: mi.Vector3f, p: mi.Float, active: mi.Bool) -> Aim:
+    """The aim of the next vertex at an emitter in the direction ``w``, which the numbers ``u`` sample there too.
+
+    The path leaves this vertex in the direction ``wo``, of density ``p``.
+    """
     q = eval_hg(turn_between(-w, wo), estimators.lobe)
     return Aim(u, dr.select(active, p * dr.rcp(p + q), 1), active)
 

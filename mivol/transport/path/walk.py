@@ -172,7 +172,9 @@ def _walk_on(estimators: Estimators, settings: Settings, limit: int, path: Path)
     return dr.while_loop(state=(path,), cond=lambda p: p.active, body=step, label="path")[0]
 
 
-def _add_side_flight(estimators: Estimators, path: Path, event: PathEvent, active: mi.Bool) -> tuple[Path, SideSamples]:
+def _add_side_flight(
+    estimators: Estimators, path: Path, event: PathEvent, active: mi.Bool
+) -> tuple[Path, SideSamples, mi.Vector3f]:
     """Draw an emitter sample for the next vertex, and look at it from the end of a side flight."""
     sampler = path.sampler
     u, lobe, flight = sampler.next_2d(active), sampler.next_2d(active), estimators.segment.draw(sampler, active, None)
@@ -181,7 +183,7 @@ def _add_side_flight(estimators: Estimators, path: Path, event: PathEvent, activ
     path.score = path.score.add(flight.light)
     if path.shadow is not None:
         path.shadow = path.shadow.offer(flight.shadow, flight.chance)
-    return path, samples
+    return path, samples, flight.to_emitter
 
 
 def _estimate_probe(estimators: Estimators, settings: Settings, limit: int, probe: Probe, sampler: mi.Sampler) -> ProbeTerm:
@@ -256,7 +258,7 @@ def _scatter(estimators: Estimators, settings: Settings, limit: int, path: Path,
     path = _add_direct_light(estimators, path, event, may_scatter)
     ahead = event.in_medium & (path.depth + 2 < limit)
     if path.aim is not None:
-        path, aside = _add_side_flight(estimators, path, event, ahead)
+        path, aside, w = _add_side_flight(estimators, path, event, ahead)
 
     # -- The direction the path takes -----------------------------------------------------------------------------------------
     u1, u2 = sampler.next_1d(arrives), sampler.next_2d(arrives)
@@ -265,7 +267,7 @@ def _scatter(estimators: Estimators, settings: Settings, limit: int, path: Path,
     for factor in turn.factors:
         path.score = path.score.scale(factor)
     if path.aim is not None:
-        path.aim = weigh_aim(estimators, event.collision.mei, aside.emitter, turn.ray.d, turn.pdf, ahead & turn.on)
+        path.aim = weigh_aim(estimators, w, aside.emitter, turn.ray.d, turn.pdf, ahead & turn.on)
     path.beta *= dr.select(turn.on, turn.weight, 0)
     path.eta *= dr.select(turn.on, turn.eta, 1)
     path.ray, path.medium = turn.ray, dr.select(turn.on, turn.medium, path.medium)
