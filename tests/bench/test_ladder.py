@@ -1,0 +1,46 @@
+"""The bench of four models: errors, ratios, and that every rung is rendered and differentiated."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mivol.bench import ladder
+from mivol.bench.ladder import BENCH, QUICK, RUNGS, climb
+from mivol.bench.timing import Budget, Timing
+
+TINY = replace(QUICK, side=4, rounds=2, budget=Budget(spp=2), levels=(1, 2))
+
+
+def test_errors_are_those_of_what_counts() -> None:
+    """Two values, of which the second counts: means of 4 and 2, deviations of 1 and 3 (variances of 2 samples: 2 and 18)."""
+    swing = np.array([-1.0, 1.0])[:, None]
+    ours = Timing({}, [2.0] * 2, [2.0] * 2, list(np.array([[100.0, 4.0]]) + swing * [50, 1]))
+    theirs = Timing({}, [6.0] * 2, [6.0] * 2, list(np.array([[100.0, 2.0]]) + swing * [0, 3]))
+    timings = {("mivol", 1): ours, ("other", 1): theirs}
+    found, mean = ladder._figures(timings, TINY, np.array([False, True]), np.mean)
+    assert mean.tolist() == [100.0, 4.0]
+    assert found["mivol"] == [{"level": 1, "seconds_median": 2.0, "relative_error": pytest.approx(math.sqrt(2) / 4)}]
+    assert found["other"][0]["relative_error"] == pytest.approx(math.sqrt(18) / 4)
+    assert found["variance_x_time"] == pytest.approx(27)
+    # means of two: variances 1 and 9
+    assert found["agreement"]["z"] == pytest.approx(2 / math.sqrt(10))
+
+
+@pytest.mark.slow
+def test_every_rung_is_climbed(variant_rgb: str, tmp_path: Path) -> None:
+    """Images and gradients of all four models, both methods but for the emission; the pictures are not black."""
+    answer = climb(TINY)
+    for name, rung in RUNGS.items():
+        for what, stock in (("image", "volpath"), ("gradient", "prbvolpath")):
+            figures = answer[name][what]
+            assert len(figures["mivol"]) == len(TINY.levels)
+            assert (stock in figures) == ("variance_x_time" in figures) == (not rung.emits)
+        assert answer[name]["image"]["picture"].max() > 0.1
+    assert len(BENCH.compare("ladder", answer)) == 6
+    BENCH.draw({"ladder": answer}, tmp_path)
+    assert (tmp_path / "bench_ladder.png").read_bytes().startswith(b"\x89PNG")
