@@ -262,7 +262,8 @@ def _camera(draw: _Draw, parts: dict) -> dict:
         "film": {"type": "hdrfilm", "width": SIDE, "height": SIDE, "rfilter": {"type": "box"}, "pixel_format": "rgb"},
         "sampler": {"type": "independent"},
     }
-    if body["bsdf"]["type"] == "null" and draw.chance(0.15):
+    # Among nested bodies the place could lie in the inner one, while the sensor names the outer.
+    if body["bsdf"]["type"] == "null" and draw.chance(0.15) and "b" not in parts:
         draw.features.append("camera inside")
         origin = [0.02, -0.35, 0.05] if "other" not in parts else [-0.9, -0.2, 0.05]
         camera["medium"] = {"type": "ref", "id": "m1"}
