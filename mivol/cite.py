@@ -183,6 +183,20 @@ CITATIONS: dict[str, Citation] = {
         "Ultrasonic Imaging 6(1), 81-94",
         "https://doi.org/10.1016/0161-7346(84)90008-7",
     ),
+    "feldkamp_1984": Citation(
+        "L. A. Feldkamp, L. C. Davis, J. W. Kress",
+        1984,
+        "Practical cone-beam algorithm",
+        "Journal of the Optical Society of America A 1(6), 612-619",
+        "https://doi.org/10.1364/josaa.1.000612",
+    ),
+    "parker_1982": Citation(
+        "D. L. Parker",
+        1982,
+        "Optimal short scan convolution reconstruction for fan beam CT",
+        "Medical Physics 9(2), 254-257",
+        "https://doi.org/10.1118/1.595078",
+    ),
     "nuyts_1998": Citation(
         "J. Nuyts, B. De Man, P. Dupont, M. Defrise, P. Suetens, L. Mortelmans",
         1998,

@@ -11,7 +11,7 @@ import math
 import tomllib
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import msgspec
 
@@ -25,10 +25,11 @@ from mivol.optim.parameters import MAPS
 from mivol.optim.priors import Bounds, HuberTotalVariation, Laplacian, Sparse, TotalVariation
 from mivol.optim.rmsprop import RMSprop
 from mivol.optim.schedules import Constant, Cosine, Exponential, Step
-from mivol.optim.solvers import SOLVERS
+from mivol.optim.solvers import METHODS
 from mivol.optim.strategy import nearest, of
 from mivol.scene.cameras import Hemisphere, LookAts, Ring, SceneSensors
 from mivol.schema import check_keys, sentence
+from mivol.tomography.ramp import WINDOWS
 from mivol.validate.images import METRICS
 
 INFINITY = math.inf
@@ -156,7 +157,11 @@ class Detector(Section, tag_field="beam"):
     views: Annotated[int, of("view", "number of views, evenly over the arc", ge=1)] = 90
     arc: Annotated[float, of("degree", "angle covered", gt=0, le=360)] = 180.0
     detector: Annotated[tuple[int, int], of("pixel", "(rows, columns)")] = (1, 128)
-    pitch: Annotated[float, of("length", "distance of pixel centres", gt=0)] = 1.0
+    pitch: Annotated[float | tuple[float, float], of("length", "distance of pixel centres: one, or of (rows, columns)")] = 1.0
+    detector_offset: Annotated[tuple[float, float], of("length", "shift of the detector's middle along (rows, columns)")] = (
+        0.0,
+        0.0,
+    )
     axis_offset: Annotated[float, of("length", "rotation axis from the middle, along the columns")] = 0.0
 
 
@@ -206,22 +211,28 @@ class Grid(Section):
     """Where the voxels lie."""
 
     shape: Annotated[tuple[int, int, int], of("voxel", "(Z, Y, X)")]
-    voxel_size: Annotated[float, of("length", "edge of a voxel", gt=0)] = 1.0
+    voxel_size: Annotated[float | tuple[float, float, float], of("length", "edges of a voxel: one, or (x, y, z)")] = 1.0
+    centre: Annotated[tuple[float, float, float], of("length", "(x, y, z) of the box's middle")] = (0.0, 0.0, 0.0)
 
 
 class Solve(Section):
     """How the projections are inverted."""
 
-    name: Annotated[str, of("1", "key of mivol.optim.solvers.SOLVERS", min_length=1)] = "pcg"
+    name: Annotated[str, of("1", "key of mivol.optim.solvers.METHODS", min_length=1)] = "pcg"
+    start: Annotated[Literal["empty", "filtered"], of("1", "first volume: empty, or by fbp or fdk")] = "empty"
     iterations: Annotated[int, of("iteration", "at most so many", ge=1)] = 20
     nonnegative: Annotated[bool, of("1", "keep every voxel at or above 0")] = True
     subsets: Annotated[int, of("1", "subsets of views, for os-sart", ge=1)] = 10
+    window: Annotated[str, of("1", "filter of fbp and fdk: key of mivol.tomography.ramp.WINDOWS", min_length=1)] = "ram-lak"
+    cutoff: Annotated[float, of("1", "where the window ends, in parts of the Nyquist frequency", gt=0, le=1)] = 1.0
     tv: Annotated[float, of("1", "strength of the total variation; 0: none", ge=0)] = 0.0
     delta: Annotated[float, of("1/length^2", "slope below which noise is smoothed", gt=0)] = 1e-3
 
     def __post_init__(self) -> None:
-        if self.name not in SOLVERS:
-            raise ValueError(f'unknown solver "{self.name}": {nearest(self.name, list(SOLVERS))}'.rstrip("."))
+        if self.name not in METHODS:
+            raise ValueError(f'unknown solver "{self.name}": {nearest(self.name, list(METHODS))}'.rstrip("."))
+        if self.window not in WINDOWS:
+            raise ValueError(f'unknown window "{self.window}": {nearest(self.window, list(WINDOWS))}'.rstrip("."))
 
 
 class Scan(Section):

@@ -50,8 +50,8 @@ def make_geometry(chosen: config.Scan) -> Geometry:
     angles = np.radians(wanted.arc) * np.arange(wanted.views) / wanted.views
     if isinstance(wanted, Cone):
         distances = wanted.source_to_axis, wanted.source_to_detector
-        return ConeBeam(angles, wanted.detector, *distances, wanted.pitch, wanted.axis_offset)
-    return ParallelBeam(angles, wanted.detector, wanted.pitch, wanted.axis_offset)
+        return ConeBeam(angles, wanted.detector, *distances, wanted.pitch, wanted.axis_offset, wanted.detector_offset)
+    return ParallelBeam(angles, wanted.detector, wanted.pitch, wanted.axis_offset, wanted.detector_offset)
 
 
 def make_data(chosen: config.Scan, base: Path, grid: VoxelGrid) -> Projections:

@@ -25,10 +25,12 @@ from mivol.optim.linear_problems import LeastSquares, PoissonCounts
 from mivol.optim.loop import Fit, begin_fit
 from mivol.optim.smoothed_tv import SmoothedTV
 from mivol.optim.solver import State
-from mivol.optim.solvers import SOLVERS
+from mivol.optim.solvers import DIRECT, METHODS
 from mivol.report.page import write_page
 from mivol.report.record import PlanLine, RunRecord
-from mivol.tomography.geometry import VoxelGrid
+from mivol.tomography.filtered import feldkamp, filtered_backprojection
+from mivol.tomography.geometry import ParallelBeam, VoxelGrid
+from mivol.tomography.preprocess import bridge_gaps
 from mivol.tomography.projector import Projector
 from mivol.validate.metrics import nrmse
 
@@ -38,6 +40,8 @@ CITED = {
     "sirt": ("andersen_1984",),
     "os-sart": ("andersen_1984",),
     "ml-tr": ("nuyts_1998", "erdogan_1999"),
+    "fbp": ("kak_1988",),
+    "fdk": ("feldkamp_1984", "parker_1982"),
 }
 
 
@@ -50,7 +54,7 @@ def scan_fit(task: Task) -> Path:
     chosen: config.Scan = task.chosen
     choose_back_end(chosen.variant, chosen.threads)
     run = RunFolder(task.folder, new_record(chosen))
-    grid = VoxelGrid(chosen.grid.shape, chosen.grid.voxel_size)
+    grid = VoxelGrid(chosen.grid.shape, chosen.grid.voxel_size, chosen.grid.centre)
     with run.at_work():
         with run.stage("projections"):
             data = make_data(chosen, task.base, grid)
@@ -68,7 +72,7 @@ def scan_fit(task: Task) -> Path:
 
 def new_record(chosen: config.Scan) -> RunRecord:
     """The record of a run that begins."""
-    solver = SOLVERS[chosen.solve.name]
+    solver = METHODS[chosen.solve.name]
     return RunRecord.new(
         chosen.title,
         method=f"{chosen.solve.name} on line integrals of a {type(chosen.scan).__name__.lower()} beam",
@@ -93,11 +97,25 @@ def make_problem(chosen: config.Scan, projector: Projector, data: Projections, h
     kept = np.setdiff1d(np.arange(projector.n_views), held_out)
     prior = SmoothedTV(projector.grid.shape, wanted.tv, wanted.delta, projector.grid.voxel_size) if wanted.tv else None
     a = projector.subset(kept)
-    if SOLVERS[wanted.name].problem is LeastSquares:
-        return Inversion(LeastSquares(a, data.y[kept], data.weights[kept], None, wanted.nonnegative, prior))
+    x0 = start_volume(wanted, a, data, kept)
+    if METHODS[wanted.name].problem is LeastSquares:
+        return Inversion(LeastSquares(a, data.y[kept], data.weights[kept], x0, wanted.nonnegative, prior))
     if data.counts is None:
         raise MivolError("ml-tr needs counts of quanta, found line integrals: simulate with photons, or choose pcg.")
-    return Inversion(PoissonCounts(a, data.counts[kept], chosen.data.photons, prior=prior))
+    return Inversion(PoissonCounts(a, data.counts[kept], chosen.data.photons, x0=x0, prior=prior))
+
+
+def start_volume(wanted: config.Solve, a: Projector, data: Projections, kept: np.ndarray) -> np.ndarray | None:
+    """Where an iterative solver begins: None for an empty volume, else by fbp or fdk, at or above 0 where that is asked for.
+
+    Raises:
+        MivolError: what the direct method refuses.
+    """
+    if wanted.start == "empty" or wanted.name in DIRECT:
+        return None
+    method = filtered_backprojection if isinstance(a.geometry, ParallelBeam) else feldkamp
+    x = method(a, bridge_gaps(data.y[kept], data.weights[kept]), wanted.window, wanted.cutoff)
+    return np.maximum(x, 0) if wanted.nonnegative else x
 
 
 def solve(task: Task, run: RunFolder, problem: Inversion, data: Projections) -> State:
@@ -109,7 +127,9 @@ def solve(task: Task, run: RunFolder, problem: Inversion, data: Projections) -> 
     chosen: config.Scan = task.chosen
     course = Course(chosen.solve.iterations, events=(Checkpoint(every=chosen.checkpoint_every),))
     store = Store(run.checkpoint, {"data": data.digest(), **config.flat(config.resolved(chosen))}, task.resume)
-    fit = begin_fit(problem, Solve(solver=chosen.solve.name, subsets=chosen.solve.subsets), course, store=store)
+    wanted = chosen.solve
+    settings = Solve(solver=wanted.name, subsets=wanted.subsets, window=wanted.window, cutoff=wanted.cutoff)
+    fit = begin_fit(problem, settings, course, store=store)
     run.rewind(fit.next)
     with task.watcher.watch(course.iterations) as watch:
 

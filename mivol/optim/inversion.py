@@ -17,7 +17,7 @@ from mivol.optim.linear_problems import LeastSquares, PoissonCounts
 from mivol.optim.optimiser import Optimiser, Run
 from mivol.optim.problem import Reals
 from mivol.optim.solver import State
-from mivol.optim.solvers import SOLVERS
+from mivol.optim.solvers import DIRECT, METHODS
 from mivol.optim.strategy import of
 
 KEY = "x"
@@ -65,8 +65,16 @@ class Inversion:
 class Solve(Optimiser, tag="solve"):
     """The iterations of a linear solver."""
 
-    solver: Annotated[str, of("1", "key of SOLVERS", min_length=1)] = "pcg"
+    solver: Annotated[str, of("1", "key of METHODS", min_length=1)] = "pcg"
     subsets: Annotated[int, of("1", "subsets of views, for os-sart", ge=1)] = 10
+    window: Annotated[str, of("1", "key of mivol.tomography.ramp.WINDOWS, for fbp and fdk", min_length=1)] = "ram-lak"
+    cutoff: Annotated[float, of("1", "where the window ends, in parts of the Nyquist frequency", gt=0, le=1)] = 1.0
+
+    def options(self) -> dict[str, object]:
+        """What is given to the solver."""
+        if self.solver in DIRECT:
+            return {"window": self.window, "cutoff": self.cutoff}
+        return {"n_subsets": self.subsets} if self.solver == "os-sart" else {}
 
     def begin(self, problem: Inversion) -> SolverRun:
         return SolverRun(self, problem)
@@ -86,8 +94,8 @@ class SolverRun(Run):
         self._go_on(None)
 
     def _go_on(self, state: State | None) -> None:
-        options = {"n_subsets": self.settings.subsets} if self.settings.solver == "os-sart" else {}
-        self._states = SOLVERS[self.settings.solver].run(self.problem.linear_problem, state, **options)
+        method = METHODS[self.settings.solver]
+        self._states = method.run(self.problem.linear_problem, state, **self.settings.options())
         self._keep(state)
 
     def _keep(self, state: State | None) -> None:

@@ -1,14 +1,15 @@
-"""All solvers of line integrals by name, for any linear operator that has ``@`` and ``.T``."""
+"""All solvers of line integrals by name: iterative ones for any operator with ``@`` and ``.T``, direct ones for scans."""
 
 from __future__ import annotations
 
 from mivol.optim.algebraic import ordered_subsets_sart, sirt
+from mivol.optim.direct import fbp, fdk
 from mivol.optim.linear_problems import LeastSquares, PoissonCounts
 from mivol.optim.projected_cg import cgls, projected_cg
 from mivol.optim.solver import Solver
 from mivol.optim.transmission_likelihood import transmission_likelihood
 
-#: Methods by name. ``run(problem, state=None, **options)``.
+#: Iterative methods by name. ``run(problem, state=None, **options)``.
 SOLVERS: dict[str, Solver] = {
     "pcg": Solver(
         projected_cg,
@@ -46,3 +47,24 @@ SOLVERS: dict[str, Solver] = {
         citation="Nuyts et al. 1998; Erdogan & Fessler 1999",
     ),
 }
+
+#: Methods of one step. ``run(problem, state=None, window=..., cutoff=...)``; the problem's operator is a projector.
+DIRECT: dict[str, Solver] = {
+    "fbp": Solver(
+        fbp,
+        LeastSquares,
+        needs="a parallel beam over half a turn or more",
+        promises="exact for many views without noise; linear, so that values below 0 stay",
+        citation="Kak & Slaney 1988, section 3.3",
+    ),
+    "fdk": Solver(
+        fdk,
+        LeastSquares,
+        needs="a cone beam on a circle, over half a turn and the fan or more",
+        promises="exact in the source's plane for many views without noise; linear, so that values below 0 stay",
+        citation="Feldkamp, Davis & Kress 1984; Parker 1982; Wang 2002",
+    ),
+}
+
+METHODS: dict[str, Solver] = SOLVERS | DIRECT
+"""What a file may ask for."""

@@ -1,6 +1,8 @@
-"""Filtered back-projection: the inverse of the Radon transform for parallel beams, cheap and without noise weights.
+"""Filtered back-projection in parallel and in cone beams: one step, cheap and without noise weights.
 
-References: Kak & Slaney, Principles of Computerized Tomographic Imaging (1988), section 3.3, Eq. 61 (the ramp kernel).
+References: Kak & Slaney, Principles of Computerized Tomographic Imaging (1988), sections 3.3 and 3.6; Feldkamp, Davis & Kress
+1984, J. Opt. Soc. Am. A 1, 612; Parker 1982; Wang 2002; Gullberg, Crawford & Tsui 1986, IEEE Trans. Med. Imaging 5, 23 (a
+rotation axis that the central ray misses).
 """
 
 from __future__ import annotations
@@ -8,49 +10,132 @@ from __future__ import annotations
 import numpy as np
 
 from mivol.errors import MivolError
-from mivol.tomography.geometry import ParallelBeam
+from mivol.tomography.geometry import ConeBeam, ParallelBeam
 from mivol.tomography.projector import Projector
+from mivol.tomography.ramp import filter_ramp
+from mivol.tomography.redundancy import angle_steps, covers, full_turn_shares, half_scan_shares, widest_gap
+from mivol.tomography.voxel_driven import pixel_matrices, smear
+
+__all__ = ["feldkamp", "filtered_backprojection"]
 
 
-def filtered_backprojection(projector: Projector, y: np.ndarray) -> np.ndarray:
-    """Reconstruct a parallel-beam scan over half a turn or whole turns in one step.
+def filtered_backprojection(projector: Projector, y: np.ndarray, window: str = "ram-lak", cutoff: float = 1.0) -> np.ndarray:
+    """Reconstruct a parallel-beam scan in one step: ``x = sum_views step share (h * y)(x . u)``.
 
-    The ramp-filtered views are smeared back with the projector's own transpose, each voxel divided by what it gets from
-    views of all ones: ``x = pi A^T(h * y) / A^T 1``.
+    The views may be spread in any way over half a turn or more: each stands for the directions nearest to it. A detector
+    that the rotation axis divides unevenly reaches its whole width over a whole turn
+    (:func:`~mivol.tomography.redundancy.full_turn_shares`).
 
     Args:
-        projector: of a :class:`~mivol.tomography.geometry.ParallelBeam` with angles evenly spread.
+        projector: of a :class:`~mivol.tomography.geometry.ParallelBeam`; its views are those of ``y``.
         y: (views, rows, cols) line integrals.
+        window, cutoff: of :func:`~mivol.tomography.ramp.filter_ramp`.
 
     Returns:
         (Z, Y, X) float32 [1/length].
 
-    Bias: the ramp stops at the pixels' Nyquist frequency; few views leave streaks.
-    Cost: two A^T (one is kept by the projector).
+    Raises:
+        MivolError: another beam, or directions that are missing.
+
+    Bias: the ramp stops at the pixels' Nyquist frequency; few views leave streaks. Values are not clipped at 0.
+    Cost: four reads a voxel and view.
     """
-    if not isinstance(projector.geometry, ParallelBeam):
-        raise MivolError(f"Found {type(projector.geometry).__name__}, expected a ParallelBeam: use an iterative solver.")
-    filtered = filter_ramp(y, projector.geometry.pitch[1])
-    weights = projector.column_sums
-    smeared = projector.T @ filtered.astype(np.float32)
-    return np.pi * smeared / np.where(weights > 1e-6 * weights.max(), weights, np.inf)
+    beam = projector.geometry
+    if not isinstance(beam, ParallelBeam):
+        raise MivolError(
+            f"Found {type(beam).__name__}, expected a ParallelBeam: fdk is filtered back-projection of a ConeBeam."
+        )
+    angles, u = beam.angles[projector.views], beam.u
+    if not covers(angles, np.pi):
+        gap = np.degrees(widest_gap(angles, np.pi)[0])
+        raise MivolError(
+            f"found views with a gap of {gap:.1f} degrees among the directions of half a turn, expected them all around: "
+            "choose an iterative solver (and give the angles in the unit that is asked for: radians here, degrees in files)."
+        )
+    if covers(angles, 2 * np.pi):
+        weights = angle_steps(angles, 2 * np.pi)[:, None] * full_turn_shares(u)
+    else:
+        weights = np.broadcast_to(angle_steps(angles, np.pi)[:, None], (len(angles), len(u)))
+    weighted, matrices = _on_both_sides(y * weights[:, None], pixel_matrices(beam, projector.grid, projector.views), u)
+    return smear(matrices, filter_ramp(weighted, beam.pitch[1], window, cutoff), projector.grid, weighted=False)
 
 
-def filter_ramp(y: np.ndarray, pitch: float) -> np.ndarray:
-    """Convolve each row with the band-limited ramp, zero beyond the detector.
+def feldkamp(projector: Projector, y: np.ndarray, window: str = "ram-lak", cutoff: float = 1.0) -> np.ndarray:
+    """Reconstruct a circular cone-beam scan in one step (FDK).
 
-    ``h(0) = 1 / (4 pitch^2)``, ``h(n) = -1 / (pi n pitch)^2`` for odd n, 0 for even n; the sum is times ``pitch``.
+    ``x = sum_views step / U^2 (h * (share cos y))``: ``U`` is a voxel's depth over the axis' depth, ``cos`` the cosine of a
+    ray's angle to the central one, and the ramp acts on rows scaled to the axis. Where the central ray misses the axis by
+    ``tau``, ``cos = (D^2 + tau p) / (D sqrt(D^2 + p^2 + q^2))`` for the ray through (p, q) in the axis' plane (Gullberg
+    1986). Shares are those of a whole turn, of a displaced detector on one, or Parker's on half a turn and the fan.
 
-    Args:
-        y: (..., cols).
-        pitch: of the columns [length].
+    Args, returns: as :func:`filtered_backprojection`, of a :class:`~mivol.tomography.geometry.ConeBeam`.
 
-    Returns:
-        (..., cols) float64 [1/length].
+    Raises:
+        MivolError: another beam, or fewer views than half a turn and the fan's angle.
+
+    Bias: exact in the source's plane; elsewhere it grows with the cone's angle (Feldkamp 1984).
+    Cost: four reads a voxel and view.
     """
-    n = y.shape[-1]
-    size = 2 * n
-    k = np.minimum(np.arange(size), size - np.arange(size))
-    h = np.where(k % 2 == 1, -1.0 / (np.pi * np.maximum(k, 1) * pitch) ** 2, 0.0)
-    h[0] = 1.0 / (4 * pitch**2)
-    return pitch * np.fft.irfft(np.fft.rfft(y, size) * np.fft.rfft(h), size)[..., :n]
+    beam, grid = projector.geometry, projector.grid
+    if not isinstance(beam, ConeBeam):
+        raise MivolError(
+            f"Found {type(beam).__name__}, expected a ConeBeam on a circle: fbp is for parallel beams, for any other "
+            "trajectory choose an iterative solver."
+        )
+    angles, scale = beam.angles[projector.views], beam.source_to_axis / beam.source_to_detector
+    distance, tau = beam.source_to_axis, beam.axis_offset
+    # From the central ray, on a detector that is scaled down to the axis.
+    p, q = (beam.u + tau) * scale, beam.v * scale
+    cosine = (distance**2 + tau * p) / (distance * np.sqrt(distance**2 + p**2 + q[:, None] ** 2))
+    gamma = np.arctan2(p, distance) - np.arctan2(tau, distance)
+    weights = cone_weights(angles, gamma, _needed_fan(projector, gamma))
+    weighted, matrices = _on_both_sides(y * weights[:, None] * cosine, pixel_matrices(beam, grid, projector.views), p)
+    filtered = filter_ramp(weighted, beam.pitch[1] * scale, window, cutoff)
+    # t of the matrices is the depth over source_to_detector, U the depth over source_to_axis.
+    return smear(matrices, filtered * scale**2, grid, weighted=True)
+
+
+def cone_weights(angles: np.ndarray, gamma: np.ndarray, needed: float) -> np.ndarray:
+    """Step times share (views, cols) of rays at ``gamma`` to the axis, an object within ``needed`` of it [rad].
+
+    Raises:
+        MivolError: the views cover less than half a turn and twice ``needed``.
+    """
+    if covers(angles, 2 * np.pi):
+        return angle_steps(angles, 2 * np.pi)[:, None] * full_turn_shares(gamma)
+    gap, start = widest_gap(angles, 2 * np.pi)
+    beta = np.mod(angles - start + 1e-9, 2 * np.pi) - 1e-9
+    arc = 2 * np.pi - gap
+    excess = (arc - np.pi) / 2
+    # Half a step of slack: each view stands for half a step beyond it.
+    if excess + arc / len(angles) / 2 < needed:
+        raise MivolError(
+            f"found cone-beam views over {np.degrees(arc):.1f} degrees, expected half a turn and the fan of "
+            f"{np.degrees(2 * needed):.1f} at least: choose an iterative solver."
+        )
+    order = np.argsort(beta, kind="stable")
+    steps = np.empty(len(angles))
+    steps[order] = np.gradient(beta[order])
+    steps[order[[0, -1]]] /= 2
+    return steps[:, None] * half_scan_shares(beta, gamma, excess)
+
+
+def _on_both_sides(y: np.ndarray, matrices: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Projections with columns of 0 added, and their matrices, until the detector reaches as far on either side of the axis.
+
+    The filter spreads a row beyond its ends. Voxels whose shadow misses the shorter side of a displaced detector read there.
+    """
+    missing = round(abs(u[0] + u[-1]) * (len(u) - 1) / (u[-1] - u[0])) if len(u) > 1 else 0
+    on_the_left = missing if u[-1] > -u[0] else 0
+    moved = matrices.copy()
+    moved[:, 0] += on_the_left * matrices[:, 2]
+    return np.pad(y, ((0, 0), (0, 0), (on_the_left, missing - on_the_left))), moved
+
+
+def _needed_fan(projector: Projector, gamma: np.ndarray) -> float:
+    """Largest angle [rad] to the axis at which the detector sees the cylinder inside the grid."""
+    grid, beam = projector.grid, projector.geometry
+    radius = min(grid.extent[:2]) / 2 + np.hypot(*grid.centre[:2])
+    reach = np.hypot(beam.source_to_axis, beam.axis_offset)
+    object_fan = np.arcsin(min(1.0, radius / reach))
+    return float(min(object_fan, max(-gamma[0], gamma[-1])))

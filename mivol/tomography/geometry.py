@@ -21,6 +21,8 @@ import numpy as np
 
 from mivol.errors import MivolError
 
+_Z = np.array([0.0, 0.0, 1.0])
+
 
 class Geometry(Protocol):
     """What a projector asks of a scanner.
@@ -33,6 +35,28 @@ class Geometry(Protocol):
     whole_lines: bool
 
     def rays(self, views: Sequence[int] | np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]: ...
+
+
+@dataclass(frozen=True, eq=False)
+class Panels:
+    """Where the flat detector stands in each view, (views, 3) float64 each [length].
+
+    Attributes:
+        source: position of the source; in parallel light the direction of the beam.
+        corner: centre of the pixel of row 0 and column 0.
+        along_u, along_v: from a pixel's centre to that of the next column, and of the next row.
+    """
+
+    source: np.ndarray
+    corner: np.ndarray
+    along_u: np.ndarray
+    along_v: np.ndarray
+
+
+class FlatDetector(Geometry, Protocol):
+    """A geometry whose detector is a plane with a regular lattice of pixels."""
+
+    def panels(self, views: Sequence[int] | np.ndarray | None = None) -> Panels: ...
 
 
 @dataclass(frozen=True)
@@ -161,11 +185,26 @@ class ParallelBeam:
     def rays(self, views: Sequence[int] | np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
         """Points of the lines nearest the rotation axis, and unit directions, each (views, rows, cols, 3) float64."""
         u, w = _frame(self.angles[_view_index(views, len(self.angles))])
-        v_of_row, u_of_col = _pixel_centres(self)
+        v_of_row, u_of_col = self.v, self.u
         o = np.zeros((len(u), *self.detector, 3))
         o += u_of_col[:, None] * u[:, None, None, :]
         o[..., 2] = v_of_row[:, None]
         return o, np.broadcast_to(w[:, None, None, :], o.shape)
+
+    @property
+    def u(self) -> np.ndarray:
+        """Where each column lies [length], from the rotation axis."""
+        return _pixel_centres(self)[1]
+
+    @property
+    def v(self) -> np.ndarray:
+        """Where each row lies [length], from z = 0."""
+        return _pixel_centres(self)[0]
+
+    def panels(self, views: Sequence[int] | np.ndarray | None = None) -> Panels:
+        """The detector's plane through the axis; ``source`` is the direction of the light."""
+        u, w = _frame(self.angles[_view_index(views, len(self.angles))])
+        return Panels(w, self.u[0] * u + self.v[0] * _Z, self.pitch[1] * u, np.broadcast_to(self.pitch[0] * _Z, u.shape))
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,13 +247,33 @@ class ConeBeam:
     def rays(self, views: Sequence[int] | np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
         """The source, and unit directions towards the pixel centres, each (views, rows, cols, 3) float64."""
         u, w = _frame(self.angles[_view_index(views, len(self.angles))])
-        v_of_row, u_of_col = _pixel_centres(self)
-        source = -self.axis_offset * u - self.source_to_axis * w
+        v_of_row, u_of_col = self.v, self.u
+        source = self._sources(u, w)
         d = np.zeros((len(u), *self.detector, 3))
         d += (u_of_col + self.axis_offset)[:, None] * u[:, None, None, :] + self.source_to_detector * w[:, None, None, :]
         d[..., 2] = v_of_row[:, None]
         d /= np.linalg.norm(d, axis=-1, keepdims=True)
         return np.broadcast_to(source[:, None, None, :], d.shape), d
+
+    @property
+    def u(self) -> np.ndarray:
+        """Where each column lies on the detector [length], from the foot of the rotation axis' plane."""
+        return _pixel_centres(self)[1]
+
+    @property
+    def v(self) -> np.ndarray:
+        """Where each row lies on the detector [length], from the central ray."""
+        return _pixel_centres(self)[0]
+
+    def panels(self, views: Sequence[int] | np.ndarray | None = None) -> Panels:
+        """Source and detector of each view."""
+        u, w = _frame(self.angles[_view_index(views, len(self.angles))])
+        source = self._sources(u, w)
+        corner = source + (self.u[0] + self.axis_offset) * u + self.v[0] * _Z + self.source_to_detector * w
+        return Panels(source, corner, self.pitch[1] * u, np.broadcast_to(self.pitch[0] * _Z, u.shape))
+
+    def _sources(self, u: np.ndarray, w: np.ndarray) -> np.ndarray:
+        return -self.axis_offset * u - self.source_to_axis * w
 
 
 def cone_beam_of_tigre(n: int = 256, n_views: int = 100) -> tuple[ConeBeam, VoxelGrid]:

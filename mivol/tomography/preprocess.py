@@ -106,6 +106,27 @@ def line_integrals(transmission: Transmission, n_sigma: float = 3.0) -> tuple[np
     return np.where(seen, -np.log(safe), 0.0), np.where(seen, safe**2 / np.where(seen, variance, 1.0), 0.0)
 
 
+def bridge_gaps(y: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Line integrals with unused pixels (weight 0: dead, saturated, no light) on the line between their neighbours.
+
+    For methods without weights, as filtered back-projection, in which a pixel of 0 would leave a streak through the object.
+
+    Args:
+        y, weights: (views, rows, cols).
+
+    Returns:
+        (views, rows, cols); a row without any used pixel is 0.
+    """
+    used = weights > 0
+    if used.all():
+        return y
+    bridged, columns = np.where(used, y, 0.0), np.arange(y.shape[-1])
+    for view, row in np.argwhere(used.any(-1) & ~used.all(-1)):
+        seen = used[view, row]
+        bridged[view, row, ~seen] = np.interp(columns[~seen], columns[seen], y[view, row, seen])
+    return bridged
+
+
 # -- Drift of the light ---------------------------------------------------------------------------------------------------
 
 

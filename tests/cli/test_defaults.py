@@ -65,7 +65,10 @@ DEFAULTS = {
     },
     "config.Shown": {"views": 4, "frames": 60, "every": 250, "metrics": ("psnr", "ssim")},
     "config.Simulated": {"photons": 0.0, "seed": 1},
-    "config.Solve": {"name": "pcg", "iterations": 20, "nonnegative": True, "subsets": 10, "tv": 0.0, "delta": 0.001},
+    "config.Solve": {
+        **{"name": "pcg", "start": "empty", "iterations": 20, "nonnegative": True, "subsets": 10},
+        **{"window": "ram-lak", "cutoff": 1.0, "tv": 0.0, "delta": 0.001},
+    },
     "config.Sought": {
         "unit": "1/length",
         "domain": (0.0, math.inf),
@@ -87,7 +90,7 @@ DEFAULTS = {
     "optim.events.UpdateOccupancy": {"every": 64},
     "optim.events.Upsample": {"factor": 2},
     "optim.gauss_newton.GaussNewton": {"inner": 6, "damping": 0.001},
-    "optim.inversion.Solve": {"solver": "pcg", "subsets": 10},
+    "optim.inversion.Solve": {"solver": "pcg", "subsets": 10, "window": "ram-lak", "cutoff": 1.0},
     "optim.lbfgs.Lbfgs": {"memory": 10},
     "optim.losses.Huber": {"pairs": False, "delta": 0.1},
     "optim.losses.L1": {"pairs": False},

@@ -10,7 +10,6 @@ import scipy.sparse.linalg
 
 from mivol.errors import MivolError
 from mivol.tomography import projector as projector_module
-from mivol.tomography.filtered import filtered_backprojection
 from mivol.tomography.geometry import ConeBeam, ParallelBeam, PencilRays, VoxelGrid
 from mivol.tomography.phantoms import random_ellipsoids
 from mivol.tomography.projector import Projector
@@ -243,21 +242,6 @@ def test_column_sums_are_what_a_voxel_is_seen():
     a = Projector(BEAMS["cone"], GRID)
     chords = a @ np.ones(GRID.shape, np.float32)
     assert a.column_sums.sum(dtype=float) == pytest.approx(chords.sum(dtype=float), rel=1e-6)
-
-
-def test_filtered_backprojection_returns_a_disc():
-    """A cylinder of value 2 and radius 20 pixels from 90 views: 2 inside to the ringing of its edge, its mass to 1 %."""
-    n, s = 64, np.arange(64) - 31.5
-    chord = 2 * 2 * np.sqrt(np.maximum(400 - s**2, 0))
-    y = np.broadcast_to(chord, (90, 1, n))
-    a = Projector(ParallelBeam(np.arange(90) * np.pi / 90, (1, n)), VoxelGrid((1, n, n)))
-    x = filtered_backprojection(a, y)[0]
-    radius = np.hypot(s[:, None], s)
-    assert x[radius < 15].mean() == pytest.approx(2.0, rel=5e-3)
-    assert x[radius < 30].sum() == pytest.approx(2 * np.pi * 400, rel=1e-2)
-    assert abs(x[(radius > 23) & (radius < 30)]).mean() < 0.05
-    with pytest.raises(MivolError, match="expected a ParallelBeam"):
-        filtered_backprojection(Projector(BEAMS["cone"], GRID), np.zeros((5, 7, 9)))
 
 
 def test_views_that_are_not_there_are_refused():

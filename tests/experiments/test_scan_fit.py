@@ -68,6 +68,28 @@ def test_every_solver_is_reached_by_name(variant_rgb, folder: Path, solver: str)
     assert rows_of(folder)[-1]["nrmse"] < 0.75
 
 
+def test_direct_methods_are_reached_by_name(variant_rgb, folder: Path) -> None:
+    """FDK of 15 views, smoothed, is well below an empty volume; it ends after its one step, and has nothing to resume."""
+    changes = ["--set", "solve.name=fdk", "--set", "solve.window=hann"]
+    assert run(folder, *changes) == 0
+    rows = rows_of(folder)
+    assert len(rows) == 1
+    assert rows[0]["nrmse"] < 0.75
+    assert run(folder, "--resume", *changes) == 0
+    assert len(rows_of(folder)) == 1
+    record = json.loads((folder / "run" / "run.json").read_text())
+    assert "feldkamp_1984" in record["citations"]
+
+
+@pytest.mark.parametrize("solver", cases(["pcg", "sirt", "ml-tr"], ["pcg"]))
+def test_solvers_start_where_fdk_ends(variant_rgb, folder: Path, solver: str) -> None:
+    """One iteration from FDK has a lower error than one from nothing."""
+    changes = ["--set", f"solve.name={solver}", "--set", "solve.iterations=1", "--set", "data.photons=1e5"]
+    assert run(folder, *changes, to="cold") == 0
+    assert run(folder, *changes, "--set", "solve.start=filtered", to="warm") == 0
+    assert rows_of(folder, "warm")[0]["nrmse"] < 0.95 * rows_of(folder, "cold")[0]["nrmse"]
+
+
 def test_an_interrupted_scan_is_resumed(variant_rgb, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Ctrl-C after the third iteration, then --resume: every number as if it had not stopped (one thread)."""
     assert run(folder, to="whole") == 0
@@ -134,6 +156,9 @@ REFUSED = {
     "unknown table": (['data={source="shepp_logan", table="x"}'], "x"),
     "source inside the object's axis": (["scan.source_to_axis=0"], "> 0"),
     "prior where none is used": (["solve.name=sirt", "solve.tv=1"], "prior"),
+    "misspelt window": (["solve.window=han"], 'did you mean "hann"'),
+    "filtered back-projection of a cone": (["solve.name=fbp"], "fdk is filtered"),
+    "prior beside a direct method": (["solve.name=fdk", "solve.tv=1"], "prior"),
     "subsets beyond the views": (["solve.name=os-sart", "solve.subsets=99"], "99 subsets"),
 }
 
