@@ -223,6 +223,8 @@ class Solve(Section):
     iterations: Annotated[int, of("iteration", "at most so many", ge=1)] = 20
     nonnegative: Annotated[bool, of("1", "keep every voxel at or above 0")] = True
     subsets: Annotated[int, of("1", "subsets of views, for os-sart", ge=1)] = 10
+    relaxation: Annotated[float, of("1", "of the first sweep of sart and os-sart", gt=0, lt=2)] = 1.0
+    decay: Annotated[float, of("1", "of the relaxation, a sweep", gt=0, le=1)] = 0.99
     window: Annotated[str, of("1", "filter of fbp and fdk: key of mivol.tomography.ramp.WINDOWS", min_length=1)] = "ram-lak"
     cutoff: Annotated[float, of("1", "where the window ends, in parts of the Nyquist frequency", gt=0, le=1)] = 1.0
     tv: Annotated[float, of("1", "strength of the total variation; 0: none", ge=0)] = 0.0

@@ -38,6 +38,7 @@ CITED = {
     "pcg": ("hestenes_1952", "erdogan_1999"),
     "cgls": ("hestenes_1952",),
     "sirt": ("andersen_1984",),
+    "sart": ("andersen_1984",),
     "os-sart": ("andersen_1984",),
     "ml-tr": ("nuyts_1998", "erdogan_1999"),
     "fbp": ("kak_1988",),
@@ -128,7 +129,8 @@ def solve(task: Task, run: RunFolder, problem: Inversion, data: Projections) -> 
     course = Course(chosen.solve.iterations, events=(Checkpoint(every=chosen.checkpoint_every),))
     store = Store(run.checkpoint, {"data": data.digest(), **config.flat(config.resolved(chosen))}, task.resume)
     wanted = chosen.solve
-    settings = Solve(solver=wanted.name, subsets=wanted.subsets, window=wanted.window, cutoff=wanted.cutoff)
+    shared = {name: getattr(wanted, name) for name in ("subsets", "relaxation", "decay", "window", "cutoff")}
+    settings = Solve(solver=wanted.name, **shared)
     fit = begin_fit(problem, settings, course, store=store)
     run.rewind(fit.next)
     with task.watcher.watch(course.iterations) as watch:

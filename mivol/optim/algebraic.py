@@ -63,6 +63,11 @@ def sirt(problem: LeastSquares, state: State | None = None, relaxation: float = 
     return ordered_subsets_sart(problem, state, 1, relaxation, 1.0)
 
 
+def sart(problem: LeastSquares, state: State | None = None, relaxation: float = 1.0, decay: float = 0.99) -> Iterator[State]:
+    """A subset for each view, as Andersen and Kak have it; one sweep over all views per iteration."""
+    return ordered_subsets_sart(problem, state, getattr(problem.A, "n_views", 1), relaxation, decay)
+
+
 @dataclass(frozen=True, eq=False)
 class _Block:
     a: Any
@@ -74,6 +79,7 @@ class _Block:
 
 def _blocks(problem: LeastSquares, n_subsets: int) -> list[_Block]:
     a = problem.A
+    chord = a @ np.ones(a.shape[1], a.dtype)
     if n_subsets == 1:
         views = [None]
     else:
@@ -84,10 +90,10 @@ def _blocks(problem: LeastSquares, n_subsets: int) -> list[_Block]:
                 "and an operator with n_views and subset(views)."
             )
         views = [np.arange(s, n_views, n_subsets) for s in _golden_order(n_subsets)]
-    return [_block(problem, v) for v in views]
+    return [_block(problem, v, chord) for v in views]
 
 
-def _block(problem: LeastSquares, views: np.ndarray | None) -> _Block:
+def _block(problem: LeastSquares, views: np.ndarray | None, chord: np.ndarray) -> _Block:
     a = problem.A if views is None else problem.A.subset(views)
 
     def part(data: np.ndarray) -> np.ndarray:
@@ -95,7 +101,7 @@ def _block(problem: LeastSquares, views: np.ndarray | None) -> _Block:
         return rays if views is None else rays.reshape(problem.A.n_views, -1)[views].reshape(-1)
 
     used = np.ones(a.shape[0], a.dtype) if problem.weights is None else (part(problem.weights) > 0).astype(a.dtype)
-    per_ray = used * inverse(a @ np.ones(a.shape[1], a.dtype))
+    per_ray = used * inverse(part(chord))
     return _Block(a, part(problem.b), used, per_ray, inverse(a.T @ used))
 
 

@@ -67,6 +67,8 @@ class Solve(Optimiser, tag="solve"):
 
     solver: Annotated[str, of("1", "key of METHODS", min_length=1)] = "pcg"
     subsets: Annotated[int, of("1", "subsets of views, for os-sart", ge=1)] = 10
+    relaxation: Annotated[float, of("1", "of the first sweep of sart and os-sart", gt=0, lt=2)] = 1.0
+    decay: Annotated[float, of("1", "of the relaxation, a sweep", gt=0, le=1)] = 0.99
     window: Annotated[str, of("1", "key of mivol.tomography.ramp.WINDOWS, for fbp and fdk", min_length=1)] = "ram-lak"
     cutoff: Annotated[float, of("1", "where the window ends, in parts of the Nyquist frequency", gt=0, le=1)] = 1.0
 
@@ -74,7 +76,8 @@ class Solve(Optimiser, tag="solve"):
         """What is given to the solver."""
         if self.solver in DIRECT:
             return {"window": self.window, "cutoff": self.cutoff}
-        return {"n_subsets": self.subsets} if self.solver == "os-sart" else {}
+        steps = {"relaxation": self.relaxation, "decay": self.decay}
+        return {"sart": steps, "os-sart": steps | {"n_subsets": self.subsets}}.get(self.solver, {})
 
     def begin(self, problem: Inversion) -> SolverRun:
         return SolverRun(self, problem)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from mivol.optim.algebraic import ordered_subsets_sart, sirt
+from mivol.optim.algebraic import ordered_subsets_sart, sart, sirt
 from mivol.optim.direct import fbp, fdk
 from mivol.optim.linear_problems import LeastSquares, PoissonCounts
 from mivol.optim.projected_cg import cgls, projected_cg
@@ -31,6 +31,13 @@ SOLVERS: dict[str, Solver] = {
         needs="A with entries >= 0 and its transpose",
         promises="converges to a least-squares solution weighted by 1 / (ray length)",
         citation="Gregor & Benson 2008",
+    ),
+    "sart": Solver(
+        sart,
+        LeastSquares,
+        needs="A with entries >= 0, its transpose, n_views and subset(views)",
+        promises="the fastest first sweeps; a limit cycle on inconsistent data, which relaxation and decay shrink",
+        citation="Andersen & Kak 1984",
     ),
     "os-sart": Solver(
         ordered_subsets_sart,

@@ -7,12 +7,12 @@ pair is matched: ``<A x, y> = <x, A.T y>`` to rounding.
 
 Rays are set up in float64: their origins are moved to the edge of a sphere around the grid and measured from its
 centre, so a source or an object far from the world's origin costs no accuracy. They are given to the kernels as
-arrays; a subset of views, another pass or another geometry compiles nothing.
+arrays; a subset of views, another pass or another geometry compiles nothing, and traces nothing (:class:`RecordedKernels`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -38,6 +38,10 @@ PASS_SUM = 1 << 13
 """Most rays of one kernel through a voxel, on average: 1e6 equal float32 terms added in turn err by 8e-4, 8192 by 1e-5.
 Kernels are added up in float64."""
 
+SKIP_CELLS = 16
+"""Empty blocks are looked for where the rays cross this many times as many cells as the grid has: looking reads each voxel a
+few times."""
+
 CACHE_BYTES = 1 << 30
 """Rays (24 bytes each) are kept between calls up to this size, and set up anew in each call beyond it."""
 
@@ -49,6 +53,7 @@ class Projector:
         geometry: a ParallelBeam, ConeBeam, PencilRays, or anything with ``shape``, ``whole_lines`` and ``rays(views)``.
         grid: where the voxels lie, in the geometry's unit of length.
         views: the views that take part, in this order; all by default.
+        kernels: of another projector of this grid, whose recordings are to be shared; its own by default.
 
     Attributes:
         shape: (rays, voxels). dtype: float32. n_views: number of views. projection_shape: (views, rows, cols).
@@ -64,7 +69,13 @@ class Projector:
 
     dtype = np.dtype(np.float32)
 
-    def __init__(self, geometry: Geometry, grid: VoxelGrid, views: Sequence[int] | np.ndarray | None = None) -> None:
+    def __init__(
+        self,
+        geometry: Geometry,
+        grid: VoxelGrid,
+        views: Sequence[int] | np.ndarray | None = None,
+        kernels: RecordedKernels | None = None,
+    ) -> None:
         if mi.variant() is None or mi.variant().startswith("scalar"):
             raise MivolError(
                 f"Found the variant {mi.variant()}, expected one that compiles: call mi.set_variant('llvm_ad_rgb') or "
@@ -78,8 +89,7 @@ class Projector:
         self.n_views = len(self.views)
         self.projection_shape = (self.n_views, *geometry.shape[1:])
         self.shape = (int(np.prod(self.projection_shape)), grid.size)
-        # The grid's centre is the origin of the rays that the kernels see.
-        self._to_world = VoxelGrid(grid.shape, grid.voxel_size).to_world
+        self._kernels = kernels or RecordedKernels(grid)
         self._cache: list[tuple[int, mi.Point3f, mi.Vector3f]] | None = None
 
     def __repr__(self) -> str:
@@ -88,7 +98,7 @@ class Projector:
     def __matmul__(self, x: np.ndarray) -> np.ndarray:
         """Line integrals of ``x``: (Z, Y, X) gives (views, rows, cols), (voxels,) gives (rays,)."""
         x, flat = _as_array(x, self.grid.shape, "voxels")
-        y = np.array(self._project(mi.Float(x)))
+        y = np.array(self._project(mi.Float(_aligned(x))))
         return y if flat else y.reshape(self.projection_shape)
 
     @property
@@ -98,7 +108,7 @@ class Projector:
 
     def subset(self, views: Sequence[int] | np.ndarray) -> Projector:
         """The rows of some views, counted among this projector's own. Compiles nothing."""
-        return Projector(self.geometry, self.grid, self.views[np.asarray(views, int)])
+        return Projector(self.geometry, self.grid, self.views[np.asarray(views, int)], self._kernels)
 
     @cached_property
     def column_sums(self) -> np.ndarray:
@@ -154,10 +164,15 @@ class Projector:
     def _project(self, values: mi.Float) -> mi.Float:
         """``A values``, flat."""
         check_one_thread()
-        lattice = self._lattice(values, skip=True)
-        y = dr.zeros(mi.Float, self.shape[0])
+        empty = None
+        if self.shape[0] * sum(self.grid.shape) > SKIP_CELLS * self.grid.size:
+            empty = find_empty_distances(mi.TensorXf(values, (*self.grid.shape, 1)))
+        y = None
         for start, o, d in self._passes():
-            tau = integrate_segment(lattice, values, clip(lattice, o, d, 0, dr.inf))[0]
+            tau = self._kernels.integrate(values, empty, o, d)
+            if dr.width(o) == self.shape[0]:
+                return tau
+            y = dr.zeros(mi.Float, self.shape[0]) if y is None else y
             dr.scatter(y, tau, dr.arange(mi.UInt32, dr.width(o)) + dr.opaque(mi.UInt32, start))
             dr.eval(y)
             dr.sync_thread()
@@ -166,32 +181,22 @@ class Projector:
     def _backproject(self, y: mi.Float) -> mi.Float:
         """``A^T y``, flat; the passes are added up in float64."""
         check_one_thread()
-        lattice = self._lattice(dr.zeros(mi.Float, self.grid.size), skip=False)
-        total = dr.zeros(mi.Float64, self.grid.size)
+        total = None
         for start, o, d in self._passes():
+            if dr.width(o) == self.shape[0]:
+                return self._kernels.backproject(y, o, d)
             weight = dr.gather(mi.Float, y, dr.arange(mi.UInt32, dr.width(o)) + dr.opaque(mi.UInt32, start))
-            target = Gradient.zeros(lattice)
-            backproject_segment(lattice, target, [weight], clip(lattice, o, d, 0, dr.inf))
-            total += mi.Float64(target.fold())
+            total = dr.zeros(mi.Float64, self.grid.size) if total is None else total
+            total += mi.Float64(self._kernels.backproject(weight, o, d))
             dr.eval(total)
             dr.sync_thread()
         return mi.Float(total)
 
-    def _lattice(self, values: mi.Float, skip: bool) -> Lattice:
-        tensor = mi.TensorXf(values, (*self.grid.shape, 1))
-        return Lattice(tensor, self._to_world, find_empty_distances(tensor) if skip else None)
-
-    def _passes(self) -> Iterator[tuple[int, mi.Point3f, mi.Vector3f]]:
+    def _passes(self) -> Iterable[tuple[int, mi.Point3f, mi.Vector3f]]:
         """(index of the first ray, origins, directions), pass by pass."""
-        if self._cache is not None:
-            yield from self._cache
-            return
-        kept = []
-        for part in self._set_up_passes():
-            kept.append(part)
-            yield part
-        if 24 * self.shape[0] <= CACHE_BYTES:
-            self._cache = kept
+        if self._cache is None and 24 * self.shape[0] <= CACHE_BYTES:
+            self._cache = list(self._set_up_passes())
+        return self._set_up_passes() if self._cache is None else self._cache
 
     def _set_up_passes(self) -> Iterator[tuple[int, mi.Point3f, mi.Vector3f]]:
         per_view = int(np.prod(self.projection_shape[1:]))
@@ -215,6 +220,55 @@ class Projector:
         return (o + to_sphere[:, None] * d).astype(np.float32), d.astype(np.float32)
 
 
+class RecordedKernels:
+    """Both operators through a grid for any rays, traced once and replayed.
+
+    Tracing a walk takes milliseconds, which is more than the walk itself where a subset has a few hundred rays. Dr.Jit records
+    the kernels at the first call (``dr.freeze``) and launches them for any other rays and values without tracing.
+
+    Args:
+        grid: the grid's centre is the origin of the rays.
+    """
+
+    def __init__(self, grid: VoxelGrid) -> None:
+        self.grid = grid
+        self._shape = (*grid.shape, 1)
+        self._from_world = self._lattice_of(dr.zeros(mi.Float, grid.size)).from_world
+        self._record()
+
+    def _record(self) -> None:
+        # A buffer with a copy for each thread is part of the recording of the transpose.
+        self._threads = dr.thread_count()
+        self._integrate, self._backproject = dr.freeze(self._trace_integral), dr.freeze(self._trace_backprojection)
+
+    def integrate(self, values: mi.Float, empty: mi.UInt8 | None, o: mi.Point3f, d: mi.Vector3f) -> mi.Float:
+        """Line integrals of ``values`` along rays; blocks that are ``empty`` are skipped."""
+        return self._integrate(values, empty, o, d, self._from_world)
+
+    def backproject(self, weight: mi.Float, o: mi.Point3f, d: mi.Vector3f) -> mi.Float:
+        """Sum over rays of ``weight`` times what each voxel adds to them."""
+        if self._threads != dr.thread_count():
+            self._record()
+        return self._backproject(weight, o, d, self._from_world)
+
+    def _trace_integral(self, values: mi.Float, empty: mi.UInt8 | None, o: mi.Point3f, d: mi.Vector3f, rows: Rows) -> mi.Float:
+        lattice = Lattice(mi.TensorXf(values, self._shape), None, empty, from_world=rows)
+        return integrate_segment(lattice, values, clip(lattice, o, d, 0, dr.inf))[0]
+
+    def _trace_backprojection(self, weight: mi.Float, o: mi.Point3f, d: mi.Vector3f, rows: Rows) -> mi.Float:
+        lattice = Lattice(mi.TensorXf(dr.zeros(mi.Float, self.grid.size), self._shape), None, from_world=rows)
+        target = Gradient.zeros(lattice)
+        backproject_segment(lattice, target, [weight], clip(lattice, o, d, 0, dr.inf))
+        return target.fold()
+
+    def _lattice_of(self, values: mi.Float) -> Lattice:
+        return Lattice(mi.TensorXf(values, self._shape), VoxelGrid(self.grid.shape, self.grid.voxel_size).to_world)
+
+
+Rows = list
+"""``Lattice.from_world``: 3 rows of 4 numbers."""
+
+
 class Transpose:
     """The transpose of a :class:`Projector`."""
 
@@ -227,7 +281,7 @@ class Transpose:
     def __matmul__(self, y: np.ndarray) -> np.ndarray:
         """Back-projection of ``y``: (views, rows, cols) gives (Z, Y, X), (rays,) gives (voxels,)."""
         y, flat = _as_array(y, self.T.projection_shape, "rays")
-        x = np.array(self.T._backproject(mi.Float(y)))
+        x = np.array(self.T._backproject(mi.Float(_aligned(y))))
         return x if flat else x.reshape(self.T.grid.shape)
 
 

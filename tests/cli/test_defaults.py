@@ -67,7 +67,7 @@ DEFAULTS = {
     "config.Simulated": {"photons": 0.0, "seed": 1},
     "config.Solve": {
         **{"name": "pcg", "start": "empty", "iterations": 20, "nonnegative": True, "subsets": 10},
-        **{"window": "ram-lak", "cutoff": 1.0, "tv": 0.0, "delta": 0.001},
+        **{"relaxation": 1.0, "decay": 0.99, "window": "ram-lak", "cutoff": 1.0, "tv": 0.0, "delta": 0.001},
     },
     "config.Sought": {
         "unit": "1/length",
@@ -90,7 +90,9 @@ DEFAULTS = {
     "optim.events.UpdateOccupancy": {"every": 64},
     "optim.events.Upsample": {"factor": 2},
     "optim.gauss_newton.GaussNewton": {"inner": 6, "damping": 0.001},
-    "optim.inversion.Solve": {"solver": "pcg", "subsets": 10, "window": "ram-lak", "cutoff": 1.0},
+    "optim.inversion.Solve": {
+        **{"solver": "pcg", "subsets": 10, "relaxation": 1.0, "decay": 0.99, "window": "ram-lak", "cutoff": 1.0},
+    },
     "optim.lbfgs.Lbfgs": {"memory": 10},
     "optim.losses.Huber": {"pairs": False, "delta": 0.1},
     "optim.losses.L1": {"pairs": False},

@@ -141,7 +141,11 @@ def test_subset_is_the_rows_of_its_views():
 
 
 def test_subset_compiles_nothing():
-    """Kernels have no sizes and no geometry in their code: the same ones (by hash) serve any views and another scanner."""
+    """Kernels have no sizes and no geometry in their code: the same ones (by hash) serve any views and another scanner.
+
+    Few rays look for no empty blocks, which are other kernels than those of many. Each is traced once for all subsets: the
+    transpose has one recording, the integral one with and one without empty blocks.
+    """
     import drjit as dr
 
     def kernels(a: Projector) -> set[str]:
@@ -151,10 +155,29 @@ def test_subset_compiles_nothing():
             return {k["hash"] for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT}
 
     a, x = Projector(BEAMS["parallel"], GRID), numbers(*GRID.shape)
-    first = kernels(a)
-    assert len(first) >= 3
-    for other in (a.subset([0]), a.subset([1, 4]), Projector(BEAMS["cone"], GRID)):
-        assert kernels(other) == first
+    cone = Projector(BEAMS["cone"], GRID)
+    many, few = kernels(a), kernels(a.subset([0]))
+    assert len(few) >= 2
+    assert kernels(cone) == many
+    for other in (a.subset([1, 4]), a.subset([3]), cone.subset([2])):
+        assert kernels(other) == few
+    assert (a._kernels._integrate.n_recordings, a._kernels._backproject.n_recordings) == (2, 1)
+
+
+def test_threads_may_change():
+    """The transpose has a copy of its sums for each thread: more threads than it was recorded with are no danger."""
+    import drjit as dr
+
+    a, before = Projector(BEAMS["cone"], GRID), dr.thread_count()
+    y = numbers(*a.projection_shape)
+    try:
+        dr.set_thread_count(1)
+        alone = a.T @ y
+        dr.set_thread_count(2)
+        assert np.abs(a.T @ y - alone).max() < 2e-6 * np.abs(alone).max()
+        assert a._kernels._threads == 2
+    finally:
+        dr.set_thread_count(before)
 
 
 @pytest.mark.parametrize("cells", [1, 400, 5000])

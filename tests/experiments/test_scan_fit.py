@@ -60,7 +60,7 @@ def test_a_scan_leaves_a_whole_run_folder(variant_rgb, folder: Path) -> None:
     assert np.allclose(read_volume(folder / "run" / "volumes" / "truth.npz").to_world[:3, 3], -1)
 
 
-@pytest.mark.parametrize("solver", cases(["pcg", "cgls", "sirt", "os-sart", "ml-tr"], ["pcg", "cgls", "sirt"]))
+@pytest.mark.parametrize("solver", cases(["pcg", "cgls", "sirt", "sart", "os-sart", "ml-tr"], ["pcg", "cgls", "sirt"]))
 def test_every_solver_is_reached_by_name(variant_rgb, folder: Path, solver: str) -> None:
     """And lowers the error of the volume well below that of an empty one, which is 1."""
     extra = ["--set", "data.photons=1e5"] if solver == "ml-tr" else []

@@ -40,3 +40,11 @@ def test_one_subset_of_os_sart_is_sirt_and_many_are_faster(scan):
     np.testing.assert_array_equal(sirt.x, one.x)
     many = run("os-sart", problem, 3, n_subsets=8)[-1]
     assert np.linalg.norm(many.x - truth) < 0.8 * np.linalg.norm(sirt.x - truth)
+
+
+def test_sart_takes_a_view_at_a_time(scan):
+    """Andersen and Kak's update is that of ordered subsets of one view each."""
+    a, _, b = scan
+    problem = LeastSquares(a, b)
+    each, all_views = run("sart", problem, 2, relaxation=0.5)[-1], run("os-sart", problem, 2, n_subsets=24, relaxation=0.5)[-1]
+    np.testing.assert_array_equal(each.x, all_views.x)
