@@ -176,6 +176,13 @@ class Cone(Detector, kw_only=True, tag="cone"):
     source_to_detector: Annotated[float, of("length", "source to detector", gt=0)]
 
 
+class Table(Section, kw_only=True, tag_field="beam", tag="table"):
+    """A point source and a flat detector on any trajectory; of measured projections, the detector's size is the data's."""
+
+    file: Annotated[str, of("path", "text, 12 lengths a view: source, detector's middle, steps to next column and row")]
+    detector: Annotated[tuple[int, int], of("pixel", "(rows, columns) of computed projections")] = (1, 128)
+
+
 class Simulated(Section):
     """Noise of projections that are computed."""
 
@@ -198,13 +205,40 @@ class Known(Simulated, kw_only=True, tag_field="source", tag="volume"):
     scale: Annotated[float, of("1/length", "factor on its values", gt=0)] = 1.0
 
 
-class Measured(Section, tag_field="source", tag="measured"):
-    """A Data Exchange file (HDF5) with flat and dark fields, of a parallel beam."""
+class Readings(Section):
+    """What measured projections share."""
+
+    find_axis: Annotated[bool, of("1", "find the rotation axis of a parallel beam; false: axis_offset holds")] = True
+    air: Annotated[int, of("pixel", "columns at either edge that see no object; 0: light does not drift", ge=0)] = 0
+    drift: Annotated[
+        int, of("iteration", "how often the drift of the light since the flats is fitted to each pixel; 0: never", ge=0)
+    ] = 0
+
+
+class Measured(Readings, kw_only=True, tag_field="source", tag="measured"):
+    """A Data Exchange file (HDF5) with flat and dark fields."""
 
     file: Annotated[str, of("path", "HDF5", min_length=1)]
     group: Annotated[str, of("1", "where data, data_white, data_dark and theta lie")] = "exchange"
-    find_axis: Annotated[bool, of("1", "find the rotation axis; false: axis_offset holds")] = True
-    air: Annotated[int, of("pixel", "columns at either edge that see no object; 0: light does not drift", ge=0)] = 0
+
+
+class Stack(Readings, kw_only=True, tag_field="source", tag="stack"):
+    """Projections as images or arrays, with flat and dark fields beside them."""
+
+    file: Annotated[str, of("path", "TIFF, .npy, .npz or HDF5, (views, rows, cols); a pattern of TIFF files", min_length=1)]
+    reading: Annotated[
+        Literal["intensity", "transmission", "line_integral"], of("1", "what a pixel holds; an intensity needs flats and darks")
+    ]
+    dataset: Annotated[str, of("1", "which array of an .npz or HDF5 file")] = ""
+    flats: Annotated[str, of("path", "readings of light without an object, as file")] = ""
+    darks: Annotated[str, of("path", "readings without light, as file")] = ""
+    angles: Annotated[str, of("path", "text with an angle for each view; empty: evenly over scan.arc")] = ""
+    angle_unit: Annotated[Literal["degree", "radian"], of("1", "of the angles' file")] = "degree"
+    first_row: Annotated[Literal["lowest", "highest"], of("1", "which row of the detector a file's first is")] = "lowest"
+
+    def __post_init__(self) -> None:
+        if (self.reading == "intensity") != bool(self.flats and self.darks):
+            raise ValueError("an intensity needs flats and darks, and nothing else takes them: give both, or change reading")
 
 
 class Grid(Section):
@@ -241,8 +275,8 @@ class Scan(Section):
     """All of a TOML file for tomography: it has a table ``[scan]`` in place of ``[scene]``."""
 
     title: Annotated[str, of("1", "heading of the report", min_length=1)]
-    scan: Annotated[Parallel | Cone, of("1", "beam and detector")]
-    data: Annotated[Ellipsoids | Known | Measured, of("1", "what was seen")]
+    scan: Annotated[Parallel | Cone | Table, of("1", "beam and detector")]
+    data: Annotated[Ellipsoids | Known | Measured | Stack, of("1", "what was seen")]
     grid: Annotated[Grid, of("1", "where the voxels lie")]
     solve: Annotated[Solve, of("1", "how it is inverted")] = Solve()
     held_out_every: Annotated[int, of("view", "every so many is predicted, not fitted; 0: none", ge=0)] = 0

@@ -9,14 +9,18 @@ from pathlib import Path
 import numpy as np
 
 from mivol import config
-from mivol.config import Cone, Ellipsoids, Known, Measured
+from mivol.config import Cone, Detector, Ellipsoids, Known, Measured, Parallel, Stack, Table
 from mivol.errors import MivolError
-from mivol.files import read_projections, read_volume
+from mivol.files import read_columns, read_projections, read_stack, read_volume
 from mivol.tomography.geometry import ConeBeam, Geometry, ParallelBeam, VoxelGrid
+from mivol.tomography.panel_views import COLUMNS, PanelViews
 from mivol.tomography.phantoms import shepp_logan
-from mivol.tomography.preprocess import correct_transmission, line_integrals, normalise_air
+from mivol.tomography.preprocess import Transmission, correct_transmission, line_integrals, normalise_air
 from mivol.tomography.projector import Projector
 from mivol.tomography.rotation_axis import find_axis
+
+UNKNOWN_NOISE = 1e-4
+"""Variance of a transmission of 1 where the noise was not measured: that of 1e4 quanta."""
 
 
 @dataclass(frozen=True)
@@ -29,7 +33,7 @@ class Projections:
         weights: their inverse variances.
         truth: (Z, Y, X), where known.
         counts: quanta (views, rows, cols), where noise was simulated.
-        note: what was found out on the way, or "".
+        notes: what was found out on the way.
     """
 
     geometry: Geometry
@@ -37,34 +41,71 @@ class Projections:
     weights: np.ndarray
     truth: np.ndarray | None = None
     counts: np.ndarray | None = None
-    note: str = ""
+    notes: tuple[str, ...] = ()
 
     def digest(self) -> str:
         """SHA-256 of projections and weights."""
         return hashlib.sha256(self.y.tobytes() + self.weights.tobytes()).hexdigest()
 
 
-def make_geometry(chosen: config.Scan) -> Geometry:
+def make_geometry(chosen: config.Scan, base: Path) -> Geometry:
     """Beam and detector of computed projections."""
     wanted = chosen.scan
-    angles = np.radians(wanted.arc) * np.arange(wanted.views) / wanted.views
+    angles = np.arange(0) if isinstance(wanted, Table) else evenly(wanted)
+    return place_beam(chosen, base, angles, wanted.detector)
+
+
+def evenly(wanted: Detector) -> np.ndarray:
+    """Angles [rad] spread over the arc."""
+    return np.radians(wanted.arc) * np.arange(wanted.views) / wanted.views
+
+
+def place_beam(
+    chosen: config.Scan, base: Path, angles: np.ndarray, detector: tuple[int, int], axis_offset: float | None = None
+) -> Geometry:
+    """The beam that was asked for, with these angles [rad] and pixels; a found ``axis_offset`` replaces the file's."""
+    wanted = chosen.scan
+    if isinstance(wanted, Table):
+        return PanelViews(read_columns(base / wanted.file, COLUMNS), detector)
+    offsets = {
+        "axis_offset": wanted.axis_offset if axis_offset is None else axis_offset,
+        "detector_offset": wanted.detector_offset,
+    }
     if isinstance(wanted, Cone):
-        distances = wanted.source_to_axis, wanted.source_to_detector
-        return ConeBeam(angles, wanted.detector, *distances, wanted.pitch, wanted.axis_offset, wanted.detector_offset)
-    return ParallelBeam(angles, wanted.detector, wanted.pitch, wanted.axis_offset, wanted.detector_offset)
+        return ConeBeam(angles, detector, wanted.source_to_axis, wanted.source_to_detector, wanted.pitch, **offsets)
+    return ParallelBeam(angles, detector, wanted.pitch, **offsets)
 
 
 def make_data(chosen: config.Scan, base: Path, grid: VoxelGrid) -> Projections:
     """Projections, measured or computed.
 
     Raises:
-        MivolError: files that cannot be read or do not fit, or a measured cone beam.
+        MivolError: files that cannot be read or do not fit, or rays that all miss the grid.
     """
-    if isinstance(chosen.data, Measured):
-        return read_measured(chosen, base)
-    geometry = make_geometry(chosen)
-    exact, truth = SIMULATED[type(chosen.data)](chosen.data, base, geometry, grid)
-    return add_noise(geometry, exact, truth, chosen.data.photons, chosen.data.seed)
+    if isinstance(chosen.data, Measured | Stack):
+        data = read_measured(chosen, base)
+    else:
+        geometry = make_geometry(chosen, base)
+        exact, truth = SIMULATED[type(chosen.data)](chosen.data, base, geometry, grid)
+        data = add_noise(geometry, exact, truth, chosen.data.photons, chosen.data.seed)
+    check_hits(Projector(data.geometry, grid))
+    return data
+
+
+def check_hits(projector: Projector) -> None:
+    """Refuse a scan whose rays all miss the grid, by up to eight of its views.
+
+    Raises:
+        MivolError: how far the grid is from the rays' origins.
+    """
+    some = projector.subset(np.unique(np.linspace(0, projector.n_views - 1, 8).astype(int)))
+    if (some @ np.ones(projector.grid.shape, np.float32)).any():
+        return
+    grid = projector.grid
+    raise MivolError(
+        f"no ray meets the grid, which reaches {grid.radius:.4g} from {tuple(round(c, 4) for c in grid.centre)}: give all "
+        "lengths of scan and grid in one unit, and check distances, offsets and grid.centre."
+    )
 
 
 def project_ellipsoids(wanted: Ellipsoids, base: Path, geometry: Geometry, grid: VoxelGrid) -> tuple[np.ndarray, np.ndarray]:
@@ -102,22 +143,88 @@ def add_noise(geometry: Geometry, exact: np.ndarray, truth: np.ndarray, photons:
 
 
 def read_measured(chosen: config.Scan, base: Path) -> Projections:
-    """Readings with flat and dark fields; the axis is found where asked for.
+    """Readings from files as line integrals with weights; the axis of a parallel beam is found where asked for.
 
     Raises:
-        MivolError: the file cannot be read, or the beam is not parallel.
+        MivolError: a file that cannot be read, or does not fit the others.
     """
-    if isinstance(chosen.scan, Cone):
-        raise MivolError('a measured scan is of a parallel beam, found scan.beam = "cone": set it to "parallel".')
-    wanted, scan = chosen.data, read_projections(base / chosen.data.file, chosen.data.group)
-    transmission = correct_transmission(scan.projections, scan.flats, scan.darks)
+    wanted, notes = chosen.data, []
+    if isinstance(wanted, Measured):
+        scan = read_projections(base / wanted.file, wanted.group)
+        transmission, angles = correct_transmission(scan.projections, scan.flats, scan.darks), scan.angles
+    else:
+        transmission, angles = read_stack_scan(chosen, base)
+    if angles is not None:
+        notes += note_order(angles)
     y, weights = line_integrals(normalise_air(transmission, wanted.air) if wanted.air else transmission)
-    offset, note = chosen.scan.axis_offset, ""
-    if wanted.find_axis:
-        axis = find_axis(y, weights, scan.angles)
-        offset = axis.offset(y.shape[2], chosen.scan.pitch)
-        note = f"rotation axis at column {axis.column:.2f} +- {axis.uncertainty:.2f} ({axis.method})"
-    return Projections(ParallelBeam(scan.angles, y.shape[1:], chosen.scan.pitch, offset), y, weights, note=note)
+    offset = None
+    if wanted.find_axis and isinstance(chosen.scan, Parallel):
+        axis = find_axis(y, weights, angles)
+        offset = axis.offset(y.shape[2], float(np.broadcast_to(chosen.scan.pitch, (2,))[1]))
+        notes.append(f"rotation axis at column {axis.column:.2f} +- {axis.uncertainty:.2f} ({axis.method})")
+    unused = int((weights == 0).sum())
+    if unused:
+        notes.append(f"{unused} of {weights.size} pixels have no light or no finite reading: they are not used")
+    geometry = place_beam(chosen, base, np.arange(0) if angles is None else angles, y.shape[1:], offset)
+    if geometry.shape != y.shape:
+        raise MivolError(f"found {len(y)} projections and a geometry of {geometry.shape[0]} views, expected as many.")
+    return Projections(geometry, y, weights, notes=tuple(notes))
+
+
+def read_stack_scan(chosen: config.Scan, base: Path) -> tuple[Transmission, np.ndarray | None]:
+    """Transmission and angles [rad] (None where a table has the geometry).
+
+    Raises:
+        MivolError: as :func:`read_measured`.
+    """
+    wanted: Stack = chosen.data
+
+    def stack(name: str) -> np.ndarray:
+        values = read_stack(base / name, wanted.dataset or None)
+        return values[:, ::-1] if wanted.first_row == "highest" else values
+
+    readings = stack(wanted.file)
+    if wanted.reading == "intensity":
+        transmission = correct_transmission(readings, stack(wanted.flats), stack(wanted.darks))
+    else:
+        # Of the noise only its form is known: that of quanta, var T ~ T, whose size no solver without a prior asks for.
+        t = np.asarray(readings, float) if wanted.reading == "transmission" else np.exp(-np.asarray(readings, float))
+        transmission = Transmission(t, np.maximum(t, 0.0) * UNKNOWN_NOISE)
+    if isinstance(chosen.scan, Table):
+        return transmission, None
+    if not wanted.angles:
+        return transmission, np.radians(chosen.scan.arc) * np.arange(len(readings)) / len(readings)
+    angles = read_columns(base / wanted.angles, 1)[:, 0]
+    if len(angles) != len(readings):
+        raise MivolError(f"{wanted.angles} has {len(angles)} angles for {len(readings)} projections: give one for each.")
+    return transmission, to_radians(angles, wanted.angle_unit)
+
+
+def to_radians(angles: np.ndarray, unit: str) -> np.ndarray:
+    """Angles in radians.
+
+    Raises:
+        MivolError: numbers that are of the other unit: over 8 turns in radians, or 16 views and more within 6.3 degrees.
+    """
+    span = float(np.ptp(angles))
+    if unit == "radian" and span > 16 * np.pi:
+        raise MivolError(
+            f"the angles span {span:.4g} radians ({span / (2 * np.pi):.0f} turns): they seem to be degrees, set angle_unit."
+        )
+    if unit == "degree" and len(angles) >= 16 and span <= 2 * np.pi + 1e-3:
+        raise MivolError(f"{len(angles)} views span {span:.4g} degrees: they seem to be radians, set angle_unit.")
+    return np.radians(angles) if unit == "degree" else angles
+
+
+def note_order(angles: np.ndarray) -> list[str]:
+    """A sentence where angles go back and forth, which a scanner rarely does."""
+    steps = np.diff(angles)
+    back = np.flatnonzero(np.sign(steps) * np.sign(np.sum(np.sign(steps))) < 0)
+    if not len(back):
+        return []
+    at = int(back[0])
+    turned = f"view {at + 1} at {np.degrees(angles[at + 1]):.2f} degrees follows view {at} at {np.degrees(angles[at]):.2f}"
+    return [f"the angles turn back {len(back)} times ({turned}): they are taken as they are"]
 
 
 def held_out_views(chosen: config.Scan, count: int) -> np.ndarray:

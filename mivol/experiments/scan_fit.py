@@ -6,6 +6,7 @@ the truth is known. Views that are held out are predicted at the end.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,7 @@ from mivol.experiments.scan_outputs import write_outputs
 from mivol.experiments.task import Task
 from mivol.optim.checkpoint import Store
 from mivol.optim.course import Course
+from mivol.optim.drifting_light import fit_drift
 from mivol.optim.events import Checkpoint
 from mivol.optim.inversion import Inversion, Solve
 from mivol.optim.linear_problems import LeastSquares, PoissonCounts
@@ -59,13 +61,14 @@ def scan_fit(task: Task) -> Path:
     with run.at_work():
         with run.stage("projections"):
             data = make_data(chosen, task.base, grid)
-            run.record.notes += [data.note] if data.note else []
+            run.record.notes += data.notes
         projector = Projector(data.geometry, grid)
         held_out = held_out_views(chosen, projector.n_views)
         with run.stage("solve"):
             problem = make_problem(chosen, projector, data, held_out)
             state = solve(task, run, problem, data)
             run.record.results = {"iterations": float(state.iteration)}
+            data = without_drift(problem, data, held_out, state)
         with run.stage("images and volumes"):
             write_outputs(run, projector, data, held_out, state.x.reshape(grid.shape))
     return write_page(task.folder)
@@ -100,10 +103,24 @@ def make_problem(chosen: config.Scan, projector: Projector, data: Projections, h
     a = projector.subset(kept)
     x0 = start_volume(wanted, a, data, kept)
     if METHODS[wanted.name].problem is LeastSquares:
-        return Inversion(LeastSquares(a, data.y[kept], data.weights[kept], x0, wanted.nonnegative, prior))
+        least_squares = LeastSquares(a, data.y[kept], data.weights[kept], x0, wanted.nonnegative, prior)
+        return Inversion(least_squares, times=times_of(data)[kept] if getattr(chosen.data, "drift", 0) else None)
     if data.counts is None:
         raise MivolError("ml-tr needs counts of quanta, found line integrals: simulate with photons, or choose pcg.")
     return Inversion(PoissonCounts(a, data.counts[kept], chosen.data.photons, x0=x0, prior=prior))
+
+
+def times_of(data: Projections) -> np.ndarray:
+    """When each view was taken, from -1 to 1: views are taken one after the other."""
+    return np.linspace(-1.0, 1.0, len(data.y))
+
+
+def without_drift(problem: Inversion, data: Projections, held_out: np.ndarray, state: State) -> Projections:
+    """Line integrals of the object alone, the drift of the light fitted to the views that are not held out."""
+    if problem.times is None:
+        return data
+    drift = fit_drift(problem.linear_problem, state.x, problem.times)
+    return replace(data, y=data.y - drift.eval(times_of(data)))
 
 
 def start_volume(wanted: config.Solve, a: Projector, data: Projections, kept: np.ndarray) -> np.ndarray | None:
@@ -130,7 +147,7 @@ def solve(task: Task, run: RunFolder, problem: Inversion, data: Projections) -> 
     store = Store(run.checkpoint, {"data": data.digest(), **config.flat(config.resolved(chosen))}, task.resume)
     wanted = chosen.solve
     shared = {name: getattr(wanted, name) for name in ("subsets", "relaxation", "decay", "window", "cutoff")}
-    settings = Solve(solver=wanted.name, **shared)
+    settings = Solve(solver=wanted.name, drift=getattr(chosen.data, "drift", 0), **shared)
     fit = begin_fit(problem, settings, course, store=store)
     run.rewind(fit.next)
     with task.watcher.watch(course.iterations) as watch:

@@ -51,7 +51,7 @@ def read_slices(
     folder = Path(folder)
     if not folder.is_dir():
         raise refusal(folder, "no folder", "a folder of raw slices", "check the path")
-    files = sorted((name for name in folder.glob(pattern) if name.is_file()), key=_order)
+    files = sorted((name for name in folder.glob(pattern) if name.is_file()), key=order_of_numbers)
     if not files:
         raise refusal(folder, f"no file that fits {pattern!r}", "at least one slice", "give another pattern")
     rows, columns = shape
@@ -71,6 +71,6 @@ def read_slices(
     return VolumeData(values, to_world, meta)
 
 
-def _order(path: Path) -> tuple:
+def order_of_numbers(path: Path) -> tuple:
     """Numbers in a name compare as numbers: pieces alternate text, number, text ..."""
     return tuple(int(piece) if piece.isdigit() else piece for piece in re.split(r"(\d+)", path.name))

@@ -13,6 +13,7 @@ from typing import Annotated
 import numpy as np
 
 from mivol.errors import MivolError
+from mivol.optim.drifting_light import with_drift
 from mivol.optim.linear_problems import LeastSquares, PoissonCounts
 from mivol.optim.optimiser import Optimiser, Run
 from mivol.optim.problem import Reals
@@ -31,11 +32,13 @@ class Inversion:
     Attributes:
         linear_problem: what a solver minimises.
         x: (n,) what was found; None before the first step.
+        times: (views,) when each was taken, where the light drifts; None where it does not.
         safe_point: called before each iteration.
     """
 
     linear_problem: LeastSquares | PoissonCounts
     x: np.ndarray | None = None
+    times: np.ndarray | None = None
     safe_point: Callable[[], None] = lambda: None
 
     def start(self) -> Reals:
@@ -67,6 +70,7 @@ class Solve(Optimiser, tag="solve"):
 
     solver: Annotated[str, of("1", "key of METHODS", min_length=1)] = "pcg"
     subsets: Annotated[int, of("1", "subsets of views, for os-sart", ge=1)] = 10
+    drift: Annotated[int, of("iteration", "how often the drift of the light is fitted, where views have times", ge=0)] = 0
     relaxation: Annotated[float, of("1", "of the first sweep of sart and os-sart", gt=0, lt=2)] = 1.0
     decay: Annotated[float, of("1", "of the relaxation, a sweep", gt=0, le=1)] = 0.99
     window: Annotated[str, of("1", "key of mivol.tomography.ramp.WINDOWS, for fbp and fdk", min_length=1)] = "ram-lak"
@@ -98,7 +102,11 @@ class SolverRun(Run):
 
     def _go_on(self, state: State | None) -> None:
         method = METHODS[self.settings.solver]
-        self._states = method.run(self.problem.linear_problem, state, **self.settings.options())
+        problem, options = self.problem.linear_problem, self.settings.options()
+        if self.problem.times is not None and self.settings.drift:
+            self._states = with_drift(method.run, problem, self.problem.times, self.settings.drift, state, **options)
+        else:
+            self._states = method.run(problem, state, **options)
         self._keep(state)
 
     def _keep(self, state: State | None) -> None:

@@ -149,7 +149,7 @@ class PencilRays:
 
     def rays(self, views: Sequence[int] | np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
         """Origins and unit directions, each (views, 1, 1, 3) float64."""
-        index = _view_index(views, len(self.o))
+        index = view_index(views, len(self.o))
         return self.o[index][:, None, None], self.d[index][:, None, None]
 
 
@@ -184,7 +184,7 @@ class ParallelBeam:
 
     def rays(self, views: Sequence[int] | np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
         """Points of the lines nearest the rotation axis, and unit directions, each (views, rows, cols, 3) float64."""
-        u, w = _frame(self.angles[_view_index(views, len(self.angles))])
+        u, w = _frame(self.angles[view_index(views, len(self.angles))])
         v_of_row, u_of_col = self.v, self.u
         o = np.zeros((len(u), *self.detector, 3))
         o += u_of_col[:, None] * u[:, None, None, :]
@@ -203,7 +203,7 @@ class ParallelBeam:
 
     def panels(self, views: Sequence[int] | np.ndarray | None = None) -> Panels:
         """The detector's plane through the axis; ``source`` is the direction of the light."""
-        u, w = _frame(self.angles[_view_index(views, len(self.angles))])
+        u, w = _frame(self.angles[view_index(views, len(self.angles))])
         return Panels(w, self.u[0] * u + self.v[0] * _Z, self.pitch[1] * u, np.broadcast_to(self.pitch[0] * _Z, u.shape))
 
 
@@ -246,7 +246,7 @@ class ConeBeam:
 
     def rays(self, views: Sequence[int] | np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
         """The source, and unit directions towards the pixel centres, each (views, rows, cols, 3) float64."""
-        u, w = _frame(self.angles[_view_index(views, len(self.angles))])
+        u, w = _frame(self.angles[view_index(views, len(self.angles))])
         v_of_row, u_of_col = self.v, self.u
         source = self._sources(u, w)
         d = np.zeros((len(u), *self.detector, 3))
@@ -267,7 +267,7 @@ class ConeBeam:
 
     def panels(self, views: Sequence[int] | np.ndarray | None = None) -> Panels:
         """Source and detector of each view."""
-        u, w = _frame(self.angles[_view_index(views, len(self.angles))])
+        u, w = _frame(self.angles[view_index(views, len(self.angles))])
         source = self._sources(u, w)
         corner = source + (self.u[0] + self.axis_offset) * u + self.v[0] * _Z + self.source_to_detector * w
         return Panels(source, corner, self.pitch[1] * u, np.broadcast_to(self.pitch[0] * _Z, u.shape))
@@ -311,7 +311,12 @@ def _freeze_detector(beam: ParallelBeam | ConeBeam) -> None:
     object.__setattr__(beam, "pitch", tuple(map(float, pitch)))
 
 
-def _view_index(views: Sequence[int] | np.ndarray | None, n_views: int) -> np.ndarray:
+def view_index(views: Sequence[int] | np.ndarray | None, n_views: int) -> np.ndarray:
+    """Numbers of views as an array: all of them for None.
+
+    Raises:
+        MivolError: a number from 0 to ``n_views`` - 1 is expected.
+    """
     index = np.arange(n_views) if views is None else np.atleast_1d(np.asarray(views, int))
     wrong = index[(index < 0) | (index >= n_views)]
     if len(wrong):

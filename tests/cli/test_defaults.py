@@ -15,8 +15,14 @@ from mivol.optim.losses import L2
 from mivol.optim.schedules import Constant
 
 DEFAULTS = {
-    "config.Cone": {"views": 90, "arc": 180.0, "detector": (1, 128), "pitch": 1.0, "axis_offset": 0.0},
-    "config.Detector": {"views": 90, "arc": 180.0, "detector": (1, 128), "pitch": 1.0, "axis_offset": 0.0},
+    "config.Cone": {
+        **{"views": 90, "arc": 180.0, "detector": (1, 128), "pitch": 1.0},
+        **{"detector_offset": (0.0, 0.0), "axis_offset": 0.0},
+    },
+    "config.Detector": {
+        **{"views": 90, "arc": 180.0, "detector": (1, 128), "pitch": 1.0},
+        **{"detector_offset": (0.0, 0.0), "axis_offset": 0.0},
+    },
     "config.Ellipsoids": {"photons": 0.0, "seed": 1, "table": "yu-ye-wang", "half_width": 1.0, "scale": 1.0},
     "config.Experiment": {
         "held_out": None,
@@ -41,10 +47,13 @@ DEFAULTS = {
     },
     "config.FieldFit": {"checkpoint_every": 500, "variant": "llvm_ad_rgb", "seed": 0, "threads": 0, "output": "runs/field"},
     "config.Files": {"scene": "", "held_out": ()},
-    "config.Grid": {"voxel_size": 1.0},
+    "config.Grid": {"voxel_size": 1.0, "centre": (0.0, 0.0, 0.0)},
     "config.Known": {"photons": 0.0, "seed": 1, "scale": 1.0},
-    "config.Measured": {"group": "exchange", "find_axis": True, "air": 0},
-    "config.Parallel": {"views": 90, "arc": 180.0, "detector": (1, 128), "pitch": 1.0, "axis_offset": 0.0},
+    "config.Measured": {"group": "exchange", "find_axis": True, "air": 0, "drift": 0},
+    "config.Parallel": {
+        **{"views": 90, "arc": 180.0, "detector": (1, 128), "pitch": 1.0},
+        **{"detector_offset": (0.0, 0.0), "axis_offset": 0.0},
+    },
     "config.Photographs": {
         "scale": 1.0,
         "background": "",
@@ -64,11 +73,17 @@ DEFAULTS = {
         "integrator": "mivol",
     },
     "config.Shown": {"views": 4, "frames": 60, "every": 250, "metrics": ("psnr", "ssim")},
+    "config.Readings": {"find_axis": True, "air": 0, "drift": 0},
     "config.Simulated": {"photons": 0.0, "seed": 1},
     "config.Solve": {
         **{"name": "pcg", "start": "empty", "iterations": 20, "nonnegative": True, "subsets": 10},
         **{"relaxation": 1.0, "decay": 0.99, "window": "ram-lak", "cutoff": 1.0, "tv": 0.0, "delta": 0.001},
     },
+    "config.Stack": {
+        **{"find_axis": True, "air": 0, "drift": 0, "dataset": "", "flats": "", "darks": "", "angles": ""},
+        **{"angle_unit": "degree", "first_row": "lowest"},
+    },
+    "config.Table": {"detector": (1, 128)},
     "config.Sought": {
         "unit": "1/length",
         "domain": (0.0, math.inf),
@@ -91,7 +106,7 @@ DEFAULTS = {
     "optim.events.Upsample": {"factor": 2},
     "optim.gauss_newton.GaussNewton": {"inner": 6, "damping": 0.001},
     "optim.inversion.Solve": {
-        **{"solver": "pcg", "subsets": 10, "relaxation": 1.0, "decay": 0.99, "window": "ram-lak", "cutoff": 1.0},
+        **{"solver": "pcg", "subsets": 10, "drift": 0, "relaxation": 1.0, "decay": 0.99, "window": "ram-lak", "cutoff": 1.0},
     },
     "optim.lbfgs.Lbfgs": {"memory": 10},
     "optim.losses.Huber": {"pairs": False, "delta": 0.1},

@@ -28,6 +28,7 @@ TINY = {
     "lamp": [*SMALL_VIEWS, *SMALL_HELD_OUT, "fit.iterations=40", "event.0.every=40"],
     "shepp_logan": ["solve.iterations=3"],
     "smoke": ["views.width=16", "views.height=16", "reference.spp=32", "fit.iterations=2"],
+    "tooth": ["solve.iterations=4", "data.drift=2", "grid.shape=[2,95,95]", "grid.voxel_size=4.0", "solve.tv=0"],
     "still_life": ['field.preset="tiny"', "field.longest=32", "field.effort=0.3", "show.frames=4"],
     "white_smoke": [*SMALL_VIEWS, *SMALL_HELD_OUT, "views.count=8", "fit.iterations=16", "event.0.at=[8]", "event.1.every=8"],
 }
@@ -35,6 +36,7 @@ DATA = {
     "cloud": ("truth.file", "clouds_les/rico32x37x26.txt"),
     "lamp": ("scene.define.volume", "volumes_vol/tutorials_volume.vol"),
     "smoke": ("truth.file", "volumes_vol/tutorials_volume.vol"),
+    "tooth": ("data.file", "ct_projections/tooth.h5"),
     "white_smoke": ("truth.file", "volumes_vol/tutorials_volume.vol"),
 }
 """Which setting names the data beside the project, and which file it is."""

@@ -140,6 +140,77 @@ def test_a_known_volume_is_projected_by_the_projector(variant_rgb, folder: Path)
     assert np.allclose(data.y, projections.Projector(data.geometry, grid) @ (2 * values[..., 0]))
 
 
+def circle_table(views: int) -> np.ndarray:
+    """The cone beam of SCAN as a table."""
+    panels = projections.ConeBeam(np.arange(views) * 2 * np.pi / views, (1, 1), 6.0, 6.0, 0.2).panels()
+    return np.hstack([panels.source, panels.corner, panels.along_u, panels.along_v])
+
+
+def test_a_table_of_views_is_the_beam_that_it_lists(variant_rgb, folder: Path) -> None:
+    """Chords along the rays of the table are those of the circular cone beam, and a helix is a table like any other."""
+    np.savetxt(folder / "table.txt", circle_table(18), header="source, middle, step u, step v")
+    beam = projections.make_geometry(config.load(folder / "fit.toml"), folder)
+    table = projections.make_geometry(
+        config.load(folder / "fit.toml", ['scan={beam="table", file="table.txt", detector=[14,14]}']), folder
+    )
+    for found, expected in zip(table.rays([0, 7]), beam.rays([0, 7]), strict=True):
+        assert np.abs(found - expected).max() < 1e-12
+    helix = circle_table(36)
+    helix[:, [2, 5]] += np.linspace(-0.4, 0.4, 36)[:, None]
+    np.savetxt(folder / "table.txt", helix, delimiter=",", header="sx,sy,sz,dx,dy,dz,ux,uy,uz,vx,vy,vz", comments="")
+    assert run(folder, "--set", 'scan={beam="table", file="table.txt", detector=[20,14]}') == 0
+    assert rows_of(folder)[-1]["nrmse"] < 0.5
+
+
+@pytest.mark.parametrize("kind", ["npy", "tif", "h5"])
+def test_cone_beam_data_from_files_need_no_python(variant_rgb, folder: Path, kind: str) -> None:
+    """Counts with flats and darks, first row at the top, in a table's geometry: the line integrals that made the counts.
+
+    Flats and darks scatter about means that are exact. Counts reach down to 7 % of 1e6 and are stored as float32, whose
+    rounding of 6e-8 is all that differs: y to 1e-7, and the rays to that of float64.
+    """
+    chosen = config.load(folder / "fit.toml")
+    grid = projections.VoxelGrid(chosen.grid.shape, chosen.grid.voxel_size)
+    data = projections.make_data(chosen, folder, grid)
+    scatter = np.where(np.arange(6) % 2, 1.0, -1.0)[:, None, None] * np.ones((1, 14, 14))
+    stacks = {"counts": 64.0 + 1e6 * np.exp(-data.y), "flats": 1000064.0 + 1000 * scatter, "darks": 64.0 + scatter}
+    for name, values in stacks.items():
+        write_stack(folder / f"{name}.{kind}", values[:, ::-1].astype(np.float32))
+    np.savetxt(folder / "table.txt", circle_table(18))
+    files = ", ".join(f'{key}="{name}.{kind}"' for key, name in (("file", "counts"), ("flats", "flats"), ("darks", "darks")))
+    changes = [
+        f'data={{source="stack", reading="intensity", first_row="highest", {files}}}',
+        'scan={beam="table", file="table.txt"}',
+        "solve.iterations=2",
+    ]
+    found = projections.make_data(config.load(folder / "fit.toml", changes), folder, grid)
+    assert np.abs(found.y - data.y).max() < 2e-7
+    for ours, theirs in zip(found.geometry.rays(), data.geometry.rays(), strict=True):
+        np.testing.assert_allclose(ours, theirs, atol=1e-14)
+    assert run(folder, *[part for change in changes for part in ("--set", change)]) == 0
+
+
+def write_stack(path: Path, values: np.ndarray) -> None:
+    if path.suffix == ".npy":
+        np.save(path, values)
+    elif path.suffix == ".h5":
+        import h5py
+
+        with h5py.File(path, "w") as file:
+            file["projections"] = values
+    else:
+        from PIL import Image
+
+        pages = [Image.fromarray(page) for page in values]
+        pages[0].save(path, save_all=True, append_images=pages[1:])
+
+
+def test_angles_that_turn_back_are_said() -> None:
+    assert projections.note_order(np.radians([0.0, 1.0, 2.0])) == projections.note_order(np.radians([2.0, 1.0, 0.0])) == []
+    (note,) = projections.note_order(np.radians([0.0, 1.0, 3.0, 2.0, 4.0]))
+    assert "turn back 1 times (view 3 at 2.00 degrees follows view 2 at 3.00)" in note
+
+
 REFUSED = {
     "misspelt key": (["solve.iteratons=3"], 'did you mean "iterations"'),
     "misspelt beam": (["scan.beam=fan"], 'scan.beam = "fan" is unknown'),
@@ -148,7 +219,34 @@ REFUSED = {
     "all views held out": (["held_out_every=1"], "holds out all views"),
     "volume that is not there": (['data={source="volume", file="none.npz"}'], "none.npz"),
     "volume of another shape": (['data={source="volume", file="v.npz"}'], "make them equal"),
-    "measured cone beam": (['data={source="measured", file="a.h5"}'], "parallel beam"),
+    "grid that no ray meets": (["grid.centre=[0,0,400]"], "no ray meets the grid, which reaches 1.732 from (0.0, 0.0, 400.0)"),
+    "stack that is not there": (['data={source="stack", file="a.npy", reading="line_integral"}'], "a.npy"),
+    "intensity alone": (['data={source="stack", file="a.npy", reading="intensity"}'], "needs flats and darks"),
+    "stack with a hole": (
+        ['data={source="stack", file="hole.npy", reading="line_integral"}'],
+        "1 pixels that are not finite, the first at (view, row, column) = (1, 2, 3)",
+    ),
+    "degrees as radians": (
+        ['data={source="stack", file="y.npy", reading="line_integral", angles="degrees.txt", angle_unit="radian"}'],
+        "span 340 radians (54 turns): they seem to be degrees",
+    ),
+    "radians as degrees": (
+        ['data={source="stack", file="y.npy", reading="line_integral", angles="radians.txt"}'],
+        "18 views span 5.934 degrees: they seem to be radians",
+    ),
+    "angles of another scan": (
+        ['data={source="stack", file="y.npy", reading="line_integral", angles="few.txt"}'],
+        "3 angles for 18 projections",
+    ),
+    "flats of another size": (
+        ['data={source="stack", file="y.npy", reading="intensity", flats="flats.npy", darks="flats.npy"}'],
+        "expected three stacks (n, rows, cols) of one detector",
+    ),
+    "table of another scan": (
+        ['data={source="stack", file="y.npy", reading="line_integral"}', 'scan={beam="table", file="table.txt"}'],
+        "18 projections and a geometry of 3 views",
+    ),
+    "table with a line too short": (['scan={beam="table", file="degrees.txt", detector=[14,14]}'], "12 finite numbers"),
     "measured file that is not there": (
         ['data={source="measured", file="a.h5"}', 'scan={beam="parallel"}'],
         "a.h5",
@@ -167,6 +265,15 @@ REFUSED = {
 def test_scans_that_are_refused(variant_rgb, folder: Path, capsys: pytest.CaptureFixture, case: str) -> None:
     changes, sentence = REFUSED[case]
     write_volume(folder / "v.npz", np.ones((3, 3, 3, 1), "f"))
+    hole = np.zeros((18, 14, 14), "f")
+    np.save(folder / "y.npy", hole)
+    hole[1, 2, 3] = np.nan
+    np.save(folder / "hole.npy", hole)
+    np.save(folder / "flats.npy", np.ones((3, 14, 13), "f"))
+    np.savetxt(folder / "degrees.txt", 20.0 * np.arange(18))
+    np.savetxt(folder / "radians.txt", np.radians(20.0 * np.arange(18)))
+    np.savetxt(folder / "few.txt", np.arange(3))
+    np.savetxt(folder / "table.txt", circle_table(3))
     assert run(folder, *[part for change in changes for part in ("--set", change)]) == 1
     said = [line for line in capsys.readouterr().err.splitlines() if line.startswith("mivol: ")]
     assert len(said) == 1

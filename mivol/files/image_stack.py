@@ -1,0 +1,70 @@
+"""Stacks of projections: TIFF (one file of many pages, or many files), NumPy and HDF5, as one array.
+
+Conventions. (n, rows, cols) float32. A pattern (``scan_*.tif``) takes the files in the order of the numbers in their names.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+
+from mivol.errors import MivolError
+from mivol.files.formats import read_volume
+from mivol.files.slices import order_of_numbers
+from mivol.files.source import existing_file, refusal
+
+TIFF = (".tif", ".tiff")
+
+
+def read_stack(path: str | os.PathLike, dataset: str | None = None) -> np.ndarray:
+    """Read projections.
+
+    Args:
+        path: a TIFF, .npy, .npz or HDF5 file, or a pattern of TIFF files.
+        dataset: which array of an .npz or HDF5 file.
+
+    Returns:
+        (n, rows, cols) float32.
+
+    Raises:
+        MivolError: no such file, not such a stack, images of several sizes, numbers that are not finite.
+    """
+    files = sorted(Path(path).parent.glob(Path(path).name), key=order_of_numbers)
+    if not files:
+        existing_file(path)
+    if files[0].suffix.lower() in TIFF:
+        stack = _pages(files)
+    elif len(files) > 1:
+        raise refusal(path, f"{len(files)} files", "one, or a pattern of TIFF files", "name one of them")
+    else:
+        stack = read_volume(files[0], dataset).values[..., 0]
+    bad = ~np.isfinite(stack)
+    if bad.any():
+        where = tuple(map(int, np.argwhere(bad)[0]))
+        raise refusal(
+            path,
+            f"{int(bad.sum())} pixels that are not finite, the first at (view, row, column) = {where}",
+            "finite numbers",
+            "write 0 there: a reading of 0 has weight 0",
+        )
+    return stack
+
+
+def _pages(files: list[Path]) -> np.ndarray:
+    from PIL import Image, ImageSequence, UnidentifiedImageError
+
+    pages = []
+    for file in files:
+        try:
+            with Image.open(existing_file(file)) as image:
+                pages += [np.asarray(page, np.float32) for page in ImageSequence.Iterator(image)]
+        except (UnidentifiedImageError, OSError, ValueError, SyntaxError) as error:
+            if isinstance(error, MivolError):
+                raise
+            raise refusal(file, f"a damaged or foreign file ({error})", "TIFF", "copy it again") from error
+    shapes = {page.shape for page in pages}
+    if len(shapes) > 1 or len(next(iter(shapes))) != 2:
+        raise refusal(files[0], f"images of shapes {sorted(shapes)[:3]}", "grey images of one size", "crop or convert them")
+    return np.stack(pages)
