@@ -67,7 +67,8 @@ def scan_fit(task: Task) -> Path:
         with run.stage("solve"):
             problem = make_problem(chosen, projector, data, held_out)
             state = solve(task, run, problem, data)
-            run.record.results = {"iterations": float(state.iteration)}
+            residual = state.residual_norm / norm_of(problem.linear_problem)
+            run.record.results = {"iterations": float(state.iteration), "residual": residual}
             data = without_drift(problem, data, held_out, state)
         with run.stage("images and volumes"):
             write_outputs(run, projector, data, held_out, state.x.reshape(grid.shape))

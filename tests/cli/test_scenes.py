@@ -108,7 +108,14 @@ def more_than_white(results):
     assert results["held_out_psnr"] > 12
 
 
-FOUND = dict.fromkeys(TINY, better_than_nothing) | {"lamp": nearer_the_lamp, "still_life": more_than_white}
+def explains_something(results):
+    """The truth is not known: below the residual of an empty volume, which is 1 by definition."""
+    assert results["residual"] < 1
+
+
+FOUND = dict.fromkeys(TINY, better_than_nothing) | {
+    **{"lamp": nearer_the_lamp, "still_life": more_than_white, "tooth": explains_something},
+}
 
 
 def script(name, *arguments, **environment):
