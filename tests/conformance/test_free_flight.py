@@ -49,6 +49,16 @@ def test_white_furnace(top):
     assert np.abs(image - 1).max() <= 1e-5
 
 
+def test_roulette_spares_paths_that_lose_little():
+    """Each of 4096 paths through an optical depth of 4 ends with the power of 0.99 that it has lost, none with 0 or more than
+    that. After 68 collisions one would be below 1/2, from where roulette may end it; the longest path here has 34."""
+    scene = close_up({"smoke": smoke(np.full((3, 3, 3, 1), 2.0, np.float32), 0.99)[0], "sky": scenes.sky(1.0)}, res=64)
+    image = scenes.render(scene, unlimited(rr_depth=1), 1, seed=fresh(4))
+    powers = np.log(image) / np.log(0.99)
+    assert powers.max() > 10
+    np.testing.assert_allclose(powers, np.round(powers), atol=1e-2)  # a hundred roundings of 6e-8, over log(0.99) = 0.01
+
+
 @pytest.mark.statistical
 def test_isothermal_furnace():
     """What absorbs and glows like its surroundings cannot be seen either, whatever it scatters."""
