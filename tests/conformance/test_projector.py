@@ -168,10 +168,10 @@ def test_threads_may_change():
     """The transpose has a copy of its sums for each thread: more threads than it was recorded with are no danger."""
     import drjit as dr
 
-    a, before = Projector(BEAMS["cone"], GRID), dr.thread_count()
-    y = numbers(*a.projection_shape)
+    before, y = dr.thread_count(), numbers(*BEAMS["cone"].shape)
     try:
         dr.set_thread_count(1)
+        a = Projector(BEAMS["cone"], GRID)
         alone = a.T @ y
         dr.set_thread_count(2)
         assert np.abs(a.T @ y - alone).max() < 2e-6 * np.abs(alone).max()
