@@ -1,4 +1,4 @@
-"""The level that derivatives of free flights are taken from: about as bright as the light of paths that meet a medium."""
+"""The level that derivatives of free flights are taken from: the light of paths that collide."""
 
 from __future__ import annotations
 
@@ -22,13 +22,17 @@ ALBEDO, SIGMA = 0.8, 0.05
 FAR, POWER = 200.0, 3e4
 
 
-def level_of(lamp: dict, *interiors: dict, depth: int = 3) -> np.ndarray | None:
-    """For boxes beside each other with these media; half of the rays miss the first, [-1, 1]^3."""
+MISSED = 40.0
+"""Where a ray passes all boxes."""
+
+
+def level_of(lamp: dict, *interiors: dict, depth: int = 3, at: tuple = (0, MISSED, 0.5, MISSED)) -> np.ndarray | None:
+    """For boxes with these media, 5 beside each other, the first one [-1, 1]^3, and rays that pass x = ``at``."""
     boxes = {f"box{k}": box_of(interior, PLACE + 5 * k * np.eye(4, k=3)) for k, interior in enumerate(interiors)}
     scene = mi.load_dict({"type": "scene", **boxes, "lamp": lamp, "sensor": camera([0, -1, 6], [0, 0, 0])})
     survey, settings = survey_scene(scene), Settings(max_depth=depth)
-    o = mi.Point3f(mi.Float([0, 40, 0.5, 40]), 0, -4)
-    ray = mi.Ray3f(o, mi.Vector3f(0, 0, 1), dr.inf, dr.zeros(mi.Float, 4), mi.Color0f())
+    o = mi.Point3f(mi.Float(at), 0, -4)
+    ray = mi.Ray3f(o, mi.Vector3f(0, 0, 1), dr.inf, dr.zeros(mi.Float, len(at)), mi.Color0f())
     with dr.suspend_grad():
         needs = find_needs(scene, scene.sensors()[0], survey)
         plan = make_plan(needs, settings)
@@ -39,10 +43,24 @@ def level_of(lamp: dict, *interiors: dict, depth: int = 3) -> np.ndarray | None:
     return None if level is None else np.array(level).ravel()
 
 
-def test_under_a_constant_sky_it_is_what_media_scatter_of_it():
-    """The mean albedo times the radiance."""
-    found = level_of(sky(0.5), medium("homogeneous", SIGMA, 0.6), medium("homogeneous", SIGMA, 0.8))
-    np.testing.assert_allclose(found, 0.7 * 0.5, rtol=4 * 2.0**-23)
+def test_in_a_white_furnace_it_is_the_light_of_the_sky():
+    """Of every path, to the rounding of a sum of 4096."""
+    found = level_of(sky(0.5), medium("homogeneous", SIGMA, 1.0), depth=-1)
+    np.testing.assert_allclose(found, 0.5, rtol=12 * 2.0**-23)
+
+
+def test_collisions_count_as_their_derivatives_weigh():
+    """A white box of sigma 3 and a black one of 0.5, kappa = 0.6 / 2: half of the paths fly to each, and collide there with
+    probabilities of 1 - exp(-2 sigma). 2048 paths tell the second one to 1.7 %, and are always the same."""
+    sigma, light = np.array([3.0, 0.5]), np.array([0.5, 0.0])
+    weight = (1 - np.exp(-2 * sigma)) / (sigma + 0.3) ** 2
+    boxes = [medium("homogeneous", s, albedo) for s, albedo in zip(sigma, (1.0, 0.0), strict=True)]
+    found = level_of(sky(0.5), *boxes, depth=-1, at=(0, 5, 0, 5))
+    np.testing.assert_allclose(found, np.sum(weight * light) / weight.sum(), rtol=0.08)
+
+
+def test_where_nothing_collides_it_is_the_mean_of_all_rays():
+    np.testing.assert_allclose(level_of(sky(0.5), medium("homogeneous", SIGMA, 1.0), at=(MISSED, MISSED)), 0.5, rtol=1e-6)
 
 
 def test_under_a_lamp_it_is_the_mean_of_paths_that_collide():

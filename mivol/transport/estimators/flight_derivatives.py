@@ -36,7 +36,7 @@ from mivol.transport.media.optical_depth import jvp_optical_depth, vjp_optical_d
 from mivol.transport.media.ray_intervals import RaySegment
 from mivol.transport.media.scene_media import SceneMedia
 
-__all__ = ["FlownSegment", "Probe", "ProbeTerm"]
+__all__ = ["FlownSegment", "Probe", "ProbeTerm", "weigh_collisions"]
 
 
 PROBE_TAU = 0.6
@@ -289,6 +289,15 @@ class ProbeTerm:
         """The derivative of the light by an albedo that collisions leave out."""
         sigma_t = spectrum(body.extinction_at(self.probe.ray, self.probe.t, self.media.channels, on))
         return dr.select(dr.detach(albedo) < LEAST_ALBEDO, self._gain * sigma_t * self.source, 0)
+
+
+def weigh_collisions(media: SceneMedia, ray: mi.Ray3f, hit: Collision) -> mi.Spectrum:
+    """The weight [length] that derivatives at collisions have: 1 / (sigma + kappa); 0 where there is none."""
+    weight = mi.Spectrum(0)
+    for body, on in media.bodies_at(hit.body, hit.on):
+        _, sigma = _scattering_part(media, body, ray, hit.t, on)
+        weight = dr.select(on, dr.rcp(sigma + _kappa(media, body)), weight)
+    return weight
 
 
 def _scattering_part(media: SceneMedia, body: Body, ray: mi.Ray3f, t: mi.Float64, on: mi.Bool) -> tuple[str, mi.Spectrum]:
