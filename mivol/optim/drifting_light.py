@@ -49,16 +49,14 @@ def with_drift(
         memory = dict(state.memory)
         drift = LightDrift(memory.pop("offset"), memory.pop("slope"))
         done, turn = state.iteration, int(memory.pop("turn"))
-        problem = replace(problem, x0=memory.pop("begun"))
         own = {name.removeprefix(INNER): value for name, value in memory.items()}
         inner = replace(state, iteration=turn, memory=own)
     while True:
-        begun = np.zeros(problem.A.shape[1], problem.A.dtype) if problem.x0 is None else np.reshape(problem.x0, -1)
         states = run(replace(problem, b=problem.b - drift.eval(times)), inner, **options)
         for inner in itertools.islice(states, every - turn):
             done, turn = done + 1, turn + 1
             memory = {INNER + name: value for name, value in inner.memory.items()}
-            about = {"offset": drift.offset, "slope": drift.slope, "turn": np.asarray(turn), "begun": begun}
+            about = {"offset": drift.offset, "slope": drift.slope, "turn": np.asarray(turn)}
             yield replace(inner, iteration=done, memory=memory | about)
         if inner is None:
             return
