@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import ast
-import subprocess
+import contextlib
+import io
 import sys
 from pathlib import Path
+from unittest import mock
 
 import false_alarms
 import numpy as np
@@ -33,6 +35,7 @@ TESTS = Path(__file__).parent
 # -- A run of pytest ---------------------------------------------------------------------------------------------------
 
 CONFTEST = """
+import json
 import false_alarms
 import pytest
 
@@ -40,20 +43,32 @@ def pytest_configure(config):
     config.addinivalue_line("markers", "statistical: compares noise")
     config.pluginmanager.register(false_alarms.Count())
 
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(item):
+    "A report goes the way that it takes from a worker of pytest-xdist: as numbers, strings, lists and dictionaries."
+    report, hook = (yield), item.config.hook
+    sent = json.loads(json.dumps(hook.pytest_report_to_serializable(config=item.config, report=report)))
+    return hook.pytest_report_from_serializable(config=item.config, data=sent)
+
 def pytest_generate_tests(metafunc):
     if "seed" in metafunc.fixturenames:
         metafunc.parametrize("seed", range(2))
 """
 
 
-def outcome(folder: Path, tests: str, *flags: str) -> tuple[int, str]:
-    """Exit code and output of a run of these tests."""
+QUIET = ("cacheprovider", "faulthandler", "xdist", "hypothesispytest", "unraisableexception", "threadexception")
+"""Plugins of the run that would touch what the run around it holds, or collect garbage."""
+
+
+def outcome(folder: Path, tests: str) -> tuple[int, str]:
+    """Exit code and output of a run of these tests, in this process: one of its own would import Mitsuba again."""
     (folder / "conftest.py").write_text(CONFTEST)
     (folder / "test_it.py").write_text("from false_alarms import *\nimport pytest\nnoise = pytest.mark.statistical\n" + tests)
-    (folder / "pytest.ini").write_text(f"[pytest]\npythonpath = {TESTS} {TESTS.parent}\naddopts = --import-mode=importlib\n")
-    command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", *flags, str(folder)]
-    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
-    return done.returncode, done.stdout
+    (folder / "pytest.ini").write_text("[pytest]\naddopts = --import-mode=importlib\n")
+    # Modules are forgotten: those of the next run have the same names.
+    with contextlib.redirect_stdout(io.StringIO()) as said, mock.patch.dict(sys.modules):
+        code = pytest.main(["--capture=no", *(f"-pno:{name}" for name in QUIET), "--rootdir", str(folder), str(folder)])
+    return int(code), said.getvalue()
 
 
 def test_chances_of_a_run_add_up(tmp_path):
@@ -72,7 +87,7 @@ def test_two(seed):
 def test_silent():
     pass
 """
-    code, said = outcome(tmp_path, tests, "-n", "2")
+    code, said = outcome(tmp_path, tests)
     assert code == 0, said
     assert "4 comparisons of noise in 3 tests: a false alarm with a chance of at most 6e-07 in each of 2 rounds" in said
     assert "smallest of 3 p-values: 0.05 (as small with a chance of 0.14)" in said
