@@ -1,8 +1,8 @@
 """Dense media seen from afar: extinctions of 1e5 and more, cameras hundreds of box sizes away.
 
 A float32 distance of 300 is rounded by 1.5e-5: 15 optical depths of an extinction of 1e6. Where an interval begins, how long it
-is and where a point lies are therefore found in float64. The face that is seen lies at z = 0, where coordinates are exact:
-what float32 points may do to shadow rays is no part of these tests.
+is and where a point lies are therefore found in float64. The face that is seen lies at z = 0, where coordinates are exact; one
+test says what the float32 points from which shadow rays start do elsewhere.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ PARTS = {
 def half_space(name: str, sigma: float, away: float, beside: bool = False):
     """A dense box above z = 0, lit from below, seen by one ray from ``away`` below."""
     box = box_of(PARTS[name](sigma), np.eye(4))
-    parts = {"box": box, "lamp": sun([0.8, 0, MU], IRRADIANCE)[0]}
+    parts = {"box": box, "emitter": sun([0.8, 0, MU], IRRADIANCE)[0]}
     if beside:  # a second medium: the optical depth in front of a point is walked again
         parts["other"] = box_of(medium("homogeneous", 1.0), affine(np.eye(3), [0, 0, 2]))
     return pencils(parts, np.array([0.45, 0.4, 0]) - away * VIEW, VIEW)
@@ -63,6 +63,26 @@ def test_drawn_light(name, beside):
     m = half_space(name, 1e6, 300.7, beside).moments(mivol(), 1024)
     assert_precise(m, 0.02 * TRUTH, what="rays")
     assert_same_mean(m, TRUTH, rounding=1e-5 * TRUTH, what="rays")
+
+
+@pytest.mark.statistical
+@pytest.mark.parametrize(("place", "step", "sigma", "error"), [(100.0, 2.0**-17, 1e5, 0.165), (8.0, 2.0**-20, 1e6, 0.242)])
+def test_shadows_far_from_the_origin_of_the_world(place, step, sigma, error):
+    """A limit of today, with its size: shadow rays start at float32 points, which lie ``step`` apart where the face is.
+
+    A point at the depth z, of the density rate exp(-rate z), is moved to the nearest multiple of the step. Its light is that
+    of this depth, while the camera sees it through its own: a sum over the steps. For a step of less than 0.1 / sigma the sum
+    is the truth to 1e-3; here it is brighter, since a shorter way counts for more than a longer one.
+    """
+    at, rate, k = affine(np.eye(3), [0, 0, place]), sigma / VIEW[2], np.arange(1000)
+    shares = np.exp(-rate * step * np.maximum(k - 0.5, 0)) - np.exp(-rate * step * (k + 0.5))
+    moved = ALBEDO * IRRADIANCE / (4 * np.pi) * np.sum(shares * np.exp(-sigma / MU * step * k))
+    assert moved / TRUTH - 1 == pytest.approx(error, abs=1e-3)
+    voxels = grid_volume("mivol_voxels", np.full((4, 3, 5, 1), sigma), at)
+    parts = {"box": box_of(medium("mivol_medium", voxels, ALBEDO), at), "sun": sun([0.8, 0, MU], IRRADIANCE)[0]}
+    m = pencils(parts, np.array([0.45, 0.4, place]) - 0.5 * VIEW, VIEW).moments(mivol(), 1024)
+    assert_precise(m, 0.005 * TRUTH, what="rays")
+    assert_same_mean(m, moved, rounding=1e-5 * TRUTH, what="rays")
 
 
 @pytest.mark.parametrize("name", ["homogeneous", "grid"])
@@ -98,7 +118,7 @@ def test_thin_sheets(away):
     # The sheet is as thick as float32 vertices have it: exactly. The rest is some roundings of float32.
     assert np.abs(seen / (2 * (1 - np.exp(-crossed))) - 1).max() <= 1e-6
     fog = box_of(medium("homogeneous", 1 / THIN, ALBEDO), sheet)
-    fog = pencils({"sheet": fog, "lamp": sun([0.8, 0, MU], IRRADIANCE)[0]}, o, d)
+    fog = pencils({"sheet": fog, "emitter": sun([0.8, 0, MU], IRRADIANCE)[0]}, o, d)
     truth = TRUTH * (1 - np.exp(-crossed * RATE))
     seen = np.array(mi.render(fog.scene, integrator=mi.load_dict(mivol(deterministic=True)), spp=1))
     assert np.abs(seen / truth - 1).max() <= 1e-4
