@@ -158,6 +158,38 @@ def smoke_explain(folder: Path) -> None:
     check((folder / "cameras.png").read_bytes().startswith(b"\x89PNG"), "cameras.png is no PNG")
 
 
+def smoke_demo(folder: Path) -> None:
+    """The examples are in the wheel: listed, copied, and one of them run, small."""
+    check("shepp_logan" in mivol("demo"), "demo does not list the head")
+    mivol("demo", "cloud", "--into", "my_cloud")
+    check((folder / "my_cloud" / "scene.xml").is_file(), "demo --into copies no scene")
+    small = ["grid.shape=[8,8,8]", "grid.voxel_size=0.25", "scan.views=8", "scan.detector=[8,8]", "scan.pitch=0.4"]
+    flags = [part for one in (*small, "solve.iterations=2") for part in ("--set", one)]
+    page = folder / mivol("demo", "shepp_logan", "-o", "head", *flags).splitlines()[-1]
+    check((folder / "head" / "report.html").is_file(), f"no page {page}")
+
+
+def smoke_fetch(folder: Path) -> None:
+    """The sets are listed; none is fetched here."""
+    check("licence: BSD-3-Clause" in mivol("fetch"), "fetch tells no licence")
+    check("no data set" in mivol("fetch", "frog", code=1), "a set that is not there is not named")
+
+
+def smoke_validate(folder: Path) -> None:
+    """Fog agrees with Mitsuba's own, and both files are there."""
+    said = mivol("validate", "fog.xml", "-o", "fog_validation", "--spp", "16", "--reference-spp", "64")
+    check("mivol agrees with Mitsuba's volpath" in said, f"fog is not validated:\n{said}")
+    found = {path.suffix for path in (folder / "fog_validation").iterdir()}
+    check({".png", ".json", ".exr"} <= found, f"expected a picture, figures and a reference, found {found}")
+
+
+def smoke_bench(folder: Path) -> None:
+    """The studies are listed, and the quickest is run."""
+    check("optical_depth" in mivol("bench"), "bench lists no study")
+    mivol("bench", "tomography", "--size", "16", "--views", "8", "--iterations", "2", "--out", "tomography")
+    check((folder / "tomography" / "tomography.json").is_file(), "bench tomography writes no figures")
+
+
 def smoke_render(folder: Path) -> None:
     """An EXR with the right answer, a PNG, and a refusal."""
     mivol("render", "fog.xml", "-o", "fog.exr")
@@ -223,7 +255,8 @@ def smoke_report(folder: Path) -> None:
 
 
 SMOKES: tuple[Callable[[Path], None], ...] = (
-    smoke_doctor, smoke_render, smoke_reference, smoke_explain, smoke_optimize, smoke_export, smoke_report,
+    smoke_doctor, smoke_render, smoke_reference, smoke_explain, smoke_optimize, smoke_export, smoke_report, smoke_demo,
+    smoke_fetch, smoke_validate, smoke_bench,
 )  # fmt: skip
 """In the order in which each finds what it needs."""
 

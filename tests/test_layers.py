@@ -70,12 +70,12 @@ def test_imports_point_up(path: Path) -> None:
 
 
 def test_nothing_imports_the_benches() -> None:
-    """They measure mivol; nothing that a user runs needs them."""
+    """They measure mivol; nothing that a user runs needs them, but the verb that runs them."""
     rooms = {path: room_of(path) for path in MODULES}
     found = [
-        path.name for path, room in rooms.items() if room != "bench" for name, _ in imported(path) if "mivol.bench" in name
+        name for path, room in rooms.items() if room != "bench" for name, _ in imported(path) if "mivol.bench" in name
     ]
-    assert found == []
+    assert set(found) == {"mivol.bench.studies.list_studies", "mivol.bench.studies.run_study"}
 
 
 @pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(PACKAGE)))

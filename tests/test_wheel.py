@@ -23,8 +23,10 @@ def test_wheel(tmp_path: Path) -> None:
         parsed.read_string(wheel.read(points).decode())
         (metadata,) = [wheel.read(name).decode() for name in names if name.endswith("METADATA")]
     sources = {str(p.relative_to(ROOT)) for p in (ROOT / "mivol").rglob("*") if p.is_file() and "__pycache__" not in p.parts}
-    assert {name for name in names if ".dist-info/" not in name} == sources
-    assert parsed["console_scripts"]["mivol"] == "mivol.cli:main"
+    scenes = [p for p in (ROOT / "scenes").rglob("*") if p.is_file() and "__pycache__" not in p.parts]
+    examples = {f"mivol/examples/{p.relative_to(ROOT / 'scenes').as_posix()}" for p in scenes}
+    assert {name for name in names if ".dist-info/" not in name} == sources | examples | {"mivol_command.py"}
+    assert parsed["console_scripts"]["mivol"] == "mivol_command:main"
     assert parsed["mitsuba"]["mivol"] == "mivol.plugins"
     assert any(name.endswith("licenses/LICENSE") for name in names)
     assert "Requires-Dist: mitsuba<3.10,>=3.9.1" in metadata

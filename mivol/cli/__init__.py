@@ -7,12 +7,13 @@ not 0; only a mistake of the program itself shows a traceback. Slow imports wait
 from __future__ import annotations
 
 import argparse
-import signal
+import shlex
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import mivol
+from mivol.cli.interrupts import Signals
 from mivol.errors import MivolError
 
 USAGE, STOPPED = 2, 130
@@ -22,18 +23,26 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run ``mivol`` with these arguments (by default the process's own).
 
     Returns:
-        Exit code: 0, 1 for what was refused, 2 for wrong arguments, 130 for Ctrl-C and SIGTERM.
+        Exit code: 0, 1 for what was refused, 2 for wrong arguments, 130 for Ctrl-C and SIGTERM; ``validate`` has more.
     """
-    arguments = parser().parse_args(argv)
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    given = list(sys.argv[1:] if argv is None else argv)
+    known = parser()
+    arguments, rest = known.parse_known_args(given)
+    arguments.rest = rest
+    if rest and arguments.verb is not bench:
+        known.error(f"unrecognized arguments: {' '.join(rest)}")
+    arguments.command = shlex.join(["mivol", *given])
+    signals = Signals()
     try:
         return arguments.verb(arguments) or 0
-    except (MivolError, OSError) as error:
+    except BaseException as error:
+        if signals.are_behind(error):
+            print("mivol: stopped; what was finished is kept.", file=sys.stderr)
+            return STOPPED
+        if not isinstance(error, MivolError | OSError):
+            raise
         print(f"mivol: {error}", file=sys.stderr)
         return 1
-    except KeyboardInterrupt:
-        print("mivol: stopped; what was finished is kept.", file=sys.stderr)
-        return STOPPED
 
 
 def parser() -> argparse.ArgumentParser:
@@ -70,8 +79,8 @@ def scene_flags(sub: argparse.ArgumentParser, what: str = "Mitsuba XML") -> None
 
 def explain_flags(sub: argparse.ArgumentParser) -> None:
     """A scene, or a data set with a picture of its cameras."""
-    scene_flags(sub, "Mitsuba XML, or posed photographs: a folder or its transforms.json")
-    sub.add_argument("-o", "--output", type=Path, help="picture of the cameras (.png, .svg); default: NAME-cameras.png")
+    scene_flags(sub, "Mitsuba XML, an experiment (.toml), or posed photographs: a folder or its transforms.json")
+    sub.add_argument("-o", "--output", type=Path, help="draw the cameras of photographs (.png, .svg)")
     sub.add_argument("--max-depth", type=int, help="longest path asked about; default: that of the scene's integrator")
     aim = "noise of a pixel over the mean radiance; max_depth has to leave out less (default: %(default)s)"
     sub.add_argument("--noise", type=float, default=0.02, help=aim)
@@ -82,6 +91,9 @@ def render_flags(sub: argparse.ArgumentParser) -> None:
     scene_flags(sub)
     sub.add_argument("-s", "--sensor", type=int, default=0, help="number of the sensor")
     sub.add_argument("-o", "--output", type=Path, help="image (.exr or .png); default: the XML's name with .exr")
+    sub.add_argument("--integrator", help="in place of the scene's own, with its max_depth: mivol, volpath, ...")
+    sub.add_argument("--spp", type=int, help="samples per pixel; default: those of the sensor's sampler")
+    sub.add_argument("--seed", type=int, default=0, help="of the random numbers (default: %(default)s)")
 
 
 def reference_flags(sub: argparse.ArgumentParser) -> None:
@@ -132,6 +144,40 @@ def export_flags(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("-m", "--mode", default="llvm_ad_rgb", help="variant (default: %(default)s)")
 
 
+def demo_flags(sub: argparse.ArgumentParser) -> None:
+    """Which example, and what to do with it."""
+    sub.add_argument("name", nargs="?", default="", help="which; without one they are listed")
+    sub.add_argument("--into", type=Path, metavar="folder", help="copy the example's files there instead of running it")
+    sub.add_argument("--set", action="append", default=[], metavar="key=value", help="override a setting")
+    sub.add_argument("-o", "--output", type=Path, help="run folder (default: runs/NAME)")
+
+
+def fetch_flags(sub: argparse.ArgumentParser) -> None:
+    """Which data."""
+    sub.add_argument("name", nargs="?", default="", help="which; without one they are listed, with licence and size")
+    sub.add_argument("--into", type=Path, metavar="folder", help="where to keep it; default: MIVOL_CACHE, or the user's cache")
+
+
+def validate_flags(sub: argparse.ArgumentParser) -> None:
+    """Flags of a comparison with Mitsuba's own path tracer."""
+    scene_flags(sub)
+    sub.add_argument("-s", "--sensor", type=int, default=0, help="number of the sensor")
+    sub.add_argument("-o", "--output", type=Path, default=Path("validation"), help="folder (default: %(default)s)")
+    sub.add_argument("--max-depth", type=int, help="longest path; default: that of the scene's integrator")
+    sub.add_argument("--spp", type=int, default=256, help="samples per pixel of ours (default: %(default)s)")
+    sub.add_argument("--reference-spp", type=int, default=1024, help="of Mitsuba's volpath (default: %(default)s)")
+    sub.add_argument("--seed", type=int, default=0, help="root of all random numbers")
+    sub.add_argument("--parameter", action="append", default=[], metavar="key", help="check the gradient of this parameter too")
+
+
+def bench_flags(sub: argparse.ArgumentParser) -> None:
+    """Flags that every study knows; what else is given is the study's own."""
+    sub.add_argument("study", nargs="?", default="", help="which; without one they are listed")
+    sub.add_argument("--quick", action="store_true", help="small work: whether it runs; its times mean nothing")
+    sub.add_argument("--compare", type=Path, metavar="old.json", help="say what has changed since this result")
+    sub.epilog = "Other flags are the study's own: --only, --out, --variant, ..."
+
+
 def no_flags(sub: argparse.ArgumentParser) -> None:
     """None."""
 
@@ -139,44 +185,65 @@ def no_flags(sub: argparse.ArgumentParser) -> None:
 # -- Verbs --------------------------------------------------------------------------------------------------------
 
 
-def explain(arguments: argparse.Namespace) -> None:
-    """What a scene needs, and how mivol would render it: facts, choices, reasons. A small preview says which depth it needs.
+def explain(arguments: argparse.Namespace) -> int:
+    """What a scene or a fit needs, and what mivol would do: facts, choices, reasons; a small preview says which depth it needs.
 
-    Of posed photographs: what there is, what is missing, and a picture of the cameras and the box that they look at.
+    Of posed photographs: what there is, what is missing, and where asked for a picture of the cameras and the box that they
+    look at. What is refused is said after the facts, and the exit code is 1.
     """
     from mivol.photos import find_format
 
+    if arguments.scene.suffix.lower() == ".toml":
+        return explain_experiment(arguments)
     kind = explain_photos if arguments.scene.is_dir() or find_format(arguments.scene) else explain_scene
-    kind(arguments)
+    return kind(arguments)
 
 
-def explain_scene(arguments: argparse.Namespace) -> None:
+def explain_scene(arguments: argparse.Namespace) -> int:
     """Facts, choices, reasons."""
     from mivol.cli.loading import load
-    from mivol.scene.explain import explain as explain_plan
+    from mivol.scene.explain import examine
 
-    print(explain_plan(load(arguments).scene, arguments.max_depth, noise=arguments.noise))
+    said = examine(load(arguments).scene, arguments.max_depth, noise=arguments.noise)
+    print(said.text)
+    return int(bool(said.refusal))
 
 
-def explain_photos(arguments: argparse.Namespace) -> None:
-    """Facts and picture of a data set."""
+def explain_experiment(arguments: argparse.Namespace) -> int:
+    """Facts, choices, reasons of a fit, with every check that it would make."""
+    from mivol import config
+    from mivol.experiments.explain import explain_fit
+
+    said = explain_fit(config.load(arguments.scene), arguments.scene.parent)
+    print(said.text)
+    return int(bool(said.refusal))
+
+
+def explain_photos(arguments: argparse.Namespace) -> int:
+    """Facts of a data set, and a picture of its cameras where one is asked for."""
     from mivol.photos import survey_photos
     from mivol.report.cameras import plot_cameras
 
     survey = survey_photos(arguments.scene)
-    path = arguments.output or Path(f"{arguments.scene.resolve().stem}-cameras.png")
-    plot_cameras(survey, path)
     print(survey.text)
-    print(path)
+    if arguments.output is not None:
+        plot_cameras(survey, arguments.output)
+        print(arguments.output)
+    return 0
 
 
 def render(arguments: argparse.Namespace) -> None:
     """Render a scene to an image, with the flags of the command ``mitsuba``."""
     from mivol.cli.loading import load
-    from mivol.experiments.render import render_image, write_image
+    from mivol.experiments.render import check_output, choose_integrator, name_of, render_image, write_image
 
     path = arguments.output or arguments.scene.with_suffix(".exr")
-    write_image(path, *render_image(load(arguments).scene, arguments.sensor))
+    check_output(path)
+    scene = load(arguments).scene
+    integrator = choose_integrator(scene, arguments.integrator)
+    if name_of(integrator) != "mivol":
+        print(f"rendered by {name_of(integrator)}; --integrator mivol renders with mivol", file=sys.stderr)
+    write_image(path, *render_image(scene, arguments.sensor, integrator, arguments.spp, arguments.seed))
     print(path)
 
 
@@ -211,7 +278,7 @@ def optimize(arguments: argparse.Namespace) -> None:
 
     chosen = config.load(arguments.experiment, arguments.set)
     folder = arguments.output or Path(chosen.output)
-    print(run_experiment(Task(chosen, arguments.experiment.parent, folder, arguments.resume, Terminal())))
+    print(run_experiment(Task(chosen, arguments.experiment.parent, folder, arguments.resume, Terminal(), arguments.command)))
 
 
 def report(arguments: argparse.Namespace) -> None:
@@ -231,6 +298,61 @@ def export(arguments: argparse.Namespace) -> None:
     print("\n".join(str(path) for path in export_field(arguments.output, load_field(arguments.field), arguments.level)))
 
 
+def demo(arguments: argparse.Namespace) -> None:
+    """Run an example that comes with mivol, list them, or copy one to begin from."""
+    from mivol.cli.progress import Terminal
+    from mivol.experiments.examples import copy_example, list_examples, run_example
+
+    if not arguments.name:
+        print(list_examples())
+    elif arguments.into is not None:
+        print(copy_example(arguments.name, arguments.into))
+    else:
+        folder = arguments.output or Path("runs") / arguments.name
+        settings = {"changes": tuple(arguments.set), "watcher": Terminal(), "command": arguments.command}
+        print(run_example(arguments.name, folder, **settings))
+
+
+def fetch(arguments: argparse.Namespace) -> None:
+    """Bring public data that the examples show from its public address, checked and kept in a cache."""
+    from mivol.files.fetch import DATA, data_named, fetch_data
+
+    if not arguments.name:
+        print("\n".join(data.text for data in DATA.values()))
+        return
+    data = data_named(arguments.name)
+    print(data.text, file=sys.stderr)
+    print(fetch_data(data, arguments.into))
+
+
+def validate(arguments: argparse.Namespace) -> int:
+    """Compare mivol with Mitsuba's own path tracer on a scene: bias, z-image, relMSE, gradients, a verdict.
+
+    The exit code is 0 where they agree, 3 where they differ, 4 where Mitsuba itself cannot be trusted.
+    """
+    from mivol.cli.loading import load
+    from mivol.experiments.validation import Validation, validate_scene
+
+    chosen = Validation(
+        max_depth=arguments.max_depth, spp=arguments.spp, reference_spp=arguments.reference_spp, seed=arguments.seed,
+        sensor=arguments.sensor, parameters=tuple(arguments.parameter),
+    )  # fmt: skip
+    verdict = validate_scene(load(arguments), arguments.output, chosen)
+    print(verdict.text)
+    return verdict.code
+
+
+def bench(arguments: argparse.Namespace) -> int:
+    """Run a bench: a question about speed or accuracy beside what else could be used; JSON, a figure and its bars."""
+    from mivol.bench.studies import list_studies, run_study
+
+    if not arguments.study:
+        print(list_studies())
+        return 0
+    flags = ["--quick"] if arguments.quick else []
+    return run_study(arguments.study, [*flags, *arguments.rest], arguments.compare)
+
+
 def doctor(arguments: argparse.Namespace) -> int:
     """Say whether a render would work on this machine, and what to do where not."""
     from mivol.doctor import main
@@ -239,11 +361,15 @@ def doctor(arguments: argparse.Namespace) -> int:
 
 
 VERBS: dict[str, tuple[Callable, Callable]] = {
+    "demo": (demo, demo_flags),
     "explain": (explain, explain_flags),
     "render": (render, render_flags),
     "reference": (reference, reference_flags),
     "optimize": (optimize, optimize_flags),
+    "validate": (validate, validate_flags),
     "export": (export, export_flags),
     "report": (report, report_flags),
+    "fetch": (fetch, fetch_flags),
+    "bench": (bench, bench_flags),
     "doctor": (doctor, no_flags),
 }

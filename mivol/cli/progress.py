@@ -72,6 +72,8 @@ class Display:
         return self
 
     def __exit__(self, *exception: object) -> None:
+        if self.newest is not None:  # measured once more since the last call
+            self.bar.update(self.task, completed=self.newest.next, description=figures(self.newest))
         self.bar.refresh()
         self.bar.stop()
         if self.newest is not None and not self.console.is_terminal:

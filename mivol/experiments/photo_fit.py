@@ -35,7 +35,7 @@ def photo_fit(task: Task) -> Path:
     chosen: FieldFit = task.chosen
     choose_back_end(chosen.variant, chosen.threads)
     asked = make_plan(chosen)
-    run = RunFolder(task.folder, new_record(chosen))
+    run = RunFolder(task.folder, new_record(task), task.resume)
     with run.at_work():
         with run.stage("photographs"):
             photos, judged = read_photos(chosen, task.base)
@@ -48,16 +48,19 @@ def photo_fit(task: Task) -> Path:
             fit = solve(task, run, RadianceProblem(batches, photos.box, plan, chosen.seed), judged)
         with run.stage("images and volumes"):
             PhotoOutputs(task, run, fit, photos, judged).write()
-    return write_page(task.folder)
+    page = write_page(task.folder)
+    task.watcher.say([run.summary()])
+    return page
 
 
-def new_record(chosen: FieldFit) -> RunRecord:
+def new_record(task: Task) -> RunRecord:
     """The record of a run that begins."""
+    chosen: FieldFit = task.chosen
     return RunRecord.new(
         chosen.title,
         method=f"a sparse grid of density and spherical harmonics, fitted to photographs; preset {chosen.field.preset}",
         config=config.resolved(chosen),
-        command="mivol optimize",
+        command=task.command,
         seeds={"fit": chosen.seed},
         citations=["mitsuba3", "drjit", "plenoxels_2022", "relu_fields_2022", "max_1995"],
     )
@@ -75,7 +78,7 @@ def solve(task: Task, run: RunFolder, problem: RadianceProblem, judged: Photos |
         run.checkpoint, {"photos": problem.batches.digest(), **config.flat(config.resolved(chosen))}, task.resume
     )
     fit = begin_fit(problem, plan.optimiser, plan.course(Checkpoint(every=chosen.checkpoint_every)), store=store)
-    run.rewind(fit.next)
+    run.begin(fit.next)
     with task.watcher.watch(plan.steps) as watch:
 
         def observe(fit: Fit) -> None:

@@ -12,6 +12,7 @@ from mivol import config
 from mivol.config import Cone, Detector, Ellipsoids, Known, Measured, Parallel, Stack, Table
 from mivol.errors import MivolError
 from mivol.files import read_columns, read_projections, read_stack, read_volume
+from mivol.files.fetch import place_of
 from mivol.tomography.geometry import ConeBeam, Geometry, ParallelBeam, VoxelGrid
 from mivol.tomography.panel_views import COLUMNS, PanelViews
 from mivol.tomography.phantoms import shepp_logan
@@ -120,7 +121,7 @@ def project_volume(wanted: Known, base: Path, geometry: Geometry, grid: VoxelGri
     Raises:
         MivolError: it has several channels or another shape than the grid.
     """
-    values = read_volume(base / wanted.file).values
+    values = read_volume(place_of(base, wanted.file)).values
     if values.shape != (*grid.shape, 1):
         raise MivolError(f"{wanted.file} has shape {values.shape}, grid.shape is {grid.shape} of one channel: make them equal.")
     truth = wanted.scale * values[..., 0]
@@ -150,7 +151,7 @@ def read_measured(chosen: config.Scan, base: Path) -> Projections:
     """
     wanted, notes = chosen.data, []
     if isinstance(wanted, Measured):
-        scan = read_projections(base / wanted.file, wanted.group)
+        scan = read_projections(place_of(base, wanted.file), wanted.group)
         transmission, angles = correct_transmission(scan.projections, scan.flats, scan.darks), scan.angles
     else:
         transmission, angles = read_stack_scan(chosen, base)

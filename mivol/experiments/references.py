@@ -16,6 +16,7 @@ from mivol.errors import MivolError
 from mivol.experiments.task import Task
 from mivol.experiments.truth import holding
 from mivol.files import layers, read_exr
+from mivol.files.fetch import PREFIX, place_of
 from mivol.optim.render_batches import View, check_sizes
 from mivol.scene.load import LoadedScene, load_scene
 from mivol.validate.reference import render_reference
@@ -61,21 +62,43 @@ def find_references(task: Task, loaded: LoadedScene, truth: np.ndarray | None) -
         MivolError: no views, held-out views that are not there, files that do not fit.
     """
     chosen: Experiment = task.chosen
-    sensors = list(chosen.views.sensors(loaded.scene))
-    more = list(chosen.held_out.sensors(loaded.scene)) if chosen.held_out is not None else []
-    check_held_out(chosen.reference.held_out, len(sensors))
-    held_out = (*chosen.reference.held_out, *range(len(sensors), len(sensors) + len(more)))
-    sensors += more
-    check_sizes({f"view {index}": camera_of(sensor) for index, sensor in enumerate(sensors)})
-    seen = References(frozenset(held_out))
+    sensors, held_out = find_sensors(chosen, loaded.scene)
     if isinstance(chosen.reference, Files):
-        read_files(seen, chosen.reference, task.base, loaded, sensors)
-    elif truth is None:
+        return read_references(chosen, task.base, loaded, sensors, held_out)
+    seen = References(held_out)
+    if truth is None:
         render_views(seen, task, loaded, sensors)
     else:
         with holding(loaded.scene, chosen.truth.key, truth):
             render_views(seen, task, load_scene(loaded.scene), sensors)
     return seen
+
+
+def find_sensors(chosen: Experiment, scene: mi.Scene) -> tuple[list[Any], frozenset[int]]:
+    """All views in their order, and the numbers of those that are held out.
+
+    Raises:
+        MivolError: no views, views of several sizes, or held-out views that are not there.
+    """
+    sensors = list(chosen.views.sensors(scene))
+    more = list(chosen.held_out.sensors(scene)) if chosen.held_out is not None else []
+    check_held_out(chosen.reference.held_out, len(sensors))
+    held_out = (*chosen.reference.held_out, *range(len(sensors), len(sensors) + len(more)))
+    sensors += more
+    check_sizes({f"view {index}": camera_of(sensor) for index, sensor in enumerate(sensors)})
+    return sensors, frozenset(held_out)
+
+
+def load_experiment_scene(chosen: Experiment, base: Path) -> LoadedScene:
+    """The scene of an experiment, with its defines; those may name public data (``data:NAME``).
+
+    Raises:
+        MivolError: as :func:`mivol.scene.load.load_scene`, or data that has not been fetched.
+    """
+    given = chosen.scene.define.items()
+    is_data = {key: isinstance(value, str) and value.startswith(PREFIX) for key, value in given}
+    defines = {key: str(place_of(base, value)) if is_data[key] else value for key, value in given}
+    return load_scene(base / chosen.scene.file, defines)
 
 
 def camera_of(sensor: dict | mi.Sensor) -> mi.Sensor:
@@ -119,12 +142,15 @@ def standard_error(made: ReferenceResult) -> np.ndarray:
     return np.sqrt(made.variance + (made.mean.max() / made.spp) ** 2)
 
 
-def read_files(seen: References, wanted: Files, base: Path, loaded: LoadedScene, sensors: Sequence[Any]) -> None:
+def read_references(
+    chosen: Experiment, base: Path, loaded: LoadedScene, sensors: Sequence[Any], held_out: frozenset[int]
+) -> References:
     """References from OpenEXR files; those that mivol wrote must be of the scene that they are said to be of.
 
     Raises:
         MivolError: another number of files than views, or a file of another scene.
     """
+    wanted, seen = chosen.reference, References(held_out)
     if len(wanted.paths) != len(sensors):
         raise MivolError(f"found {len(wanted.paths)} reference files for {len(sensors)} views: give one for each.")
     of = load_scene(base / wanted.scene).content_hash if wanted.scene else loaded.content_hash
@@ -135,3 +161,4 @@ def read_files(seen: References, wanted: Files, base: Path, loaded: LoadedScene,
             seen.add(sensor, made.mean, standard_error(made))
         else:
             seen.add(sensor, layers(channels)[""][..., :3])
+    return seen

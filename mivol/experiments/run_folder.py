@@ -2,23 +2,37 @@
 
 Conventions. A run folder holds ``run.json``, ``metrics.jsonl``, ``checkpoint.npz``, ``report.html``, and in folders of their
 own what came of the run: ``views/``, ``volumes/``, ``curves/``, and ``references/`` or ``film/``. Every file is written whole.
+What an earlier run recorded stays as it is until another one takes its first step; then it moves to ``earlier/``.
 """
 
 from __future__ import annotations
 
-import errno
-import fcntl
-import os
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from mivol.errors import MivolError
+from mivol.files.atomic import sweep
+from mivol.files.lock import locked
 from mivol.report import figures
-from mivol.report.record import RunRecord, append_metrics, read_metrics, rewind_metrics, write_record
+from mivol.report.record import (
+    METRICS,
+    QUANTITIES,
+    RECORD,
+    Quantity,
+    RunRecord,
+    append_metrics,
+    read_metrics,
+    rewind_metrics,
+    write_record,
+)
 
 CHECKPOINT = "checkpoint.npz"
+BEST = "best.npz"
+EARLIER = "earlier"
+KEPT = (RECORD, METRICS, CHECKPOINT, BEST, "report.html")
+"""What is kept of an earlier run in the same folder, in ``earlier/``."""
 
 
 class RunFolder:
@@ -27,10 +41,12 @@ class RunFolder:
     Attributes:
         path: of the folder.
         record: what ``run.json`` will say.
+        is_resumed: whether the run goes on from the folder's checkpoint.
     """
 
-    def __init__(self, path: Path, record: RunRecord) -> None:
-        self.path, self.record = path, record
+    def __init__(self, path: Path, record: RunRecord, is_resumed: bool = False) -> None:
+        self.path, self.record, self.is_resumed = path, record, is_resumed
+        self._has_begun = False
         path.mkdir(parents=True, exist_ok=True)
 
     @property
@@ -38,25 +54,62 @@ class RunFolder:
         """Where the run's checkpoint lies."""
         return self.path / CHECKPOINT
 
+    @property
+    def best(self) -> Path:
+        """Where the run's best iterate lies."""
+        return self.path / BEST
+
     @contextmanager
     def at_work(self) -> Iterator[None]:
         """Keep ``run.json`` true: "running" at first, "finished" or "stopped" in the end, with what stopped it.
+
+        The record of an earlier run is left alone by a run that is refused before it begins.
 
         Raises:
             MivolError: another run is at work in the folder.
         """
         with locked(self.path):
-            write_record(self.record, self.path)
+            sweep(self.path)
+            if not (self.path / METRICS).exists():
+                self._write()
             try:
                 yield
             except BaseException as error:
                 self.record.status = "stopped"
                 self.record.notes += [f"stopped by: {error}"] if str(error) else []
-                with suppress(MivolError, OSError):
-                    write_record(self.record, self.path)
+                if self._has_begun:
+                    with suppress(MivolError, OSError):
+                        self._write()
                 raise
             self.record.status = "finished"
-            write_record(self.record, self.path)
+            self._write()
+
+    def begin(self, iteration: int) -> None:
+        """From here on the folder is this run's: before its first step, when nothing can be refused any more.
+
+        Args:
+            iteration: the last one that a resumed run keeps the metrics of; a new run keeps none.
+        """
+        if self.is_resumed:
+            rewind_metrics(self.path, iteration)
+        else:
+            self._put_away()
+        self._write()
+
+    def _put_away(self) -> None:
+        """Move what an earlier run recorded out of the way, so that the two are never mixed and neither is lost."""
+        there = [] if self._has_begun else [name for name in KEPT if (self.path / name).exists()]
+        if not there:
+            return
+        self.make(EARLIER)
+        for name in KEPT:
+            (self.path / EARLIER / name).unlink(missing_ok=True)
+        for name in there:
+            (self.path / name).replace(self.path / EARLIER / name)
+
+    def _write(self) -> None:
+        write_record(self.record, self.path)
+        self._has_begun = True
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
@@ -71,6 +124,14 @@ class RunFolder:
         """Make folders in it."""
         for name in names:
             (self.path / name).mkdir(exist_ok=True)
+
+    def summary(self) -> str:
+        """What was saved, in a line: the results of the record."""
+        words = []
+        for name, value in self.record.results.items():
+            quantity = QUANTITIES.get(name, Quantity(name))
+            words += [] if value is None else [f"{quantity.label} {value:.4g} {quantity.unit}".rstrip()]
+        return f"saved: {', '.join(words)}"
 
     def rewind(self, iteration: int) -> None:
         """Drop the metrics after an iteration, so that a resumed run says nothing twice."""
@@ -87,30 +148,3 @@ class RunFolder:
         names = {name for row in rows for name, value in row.items() if value is not None} - {"iteration", "seconds"}
         for name in sorted(names):
             figures.save(figures.plot_curve(rows, name), self.path / "curves" / f"{name}.png")
-
-
-@contextmanager
-def locked(folder: Path) -> Iterator[None]:
-    """Hold a folder for this process; the system lets go of it however the process ends.
-
-    Where the file system knows no locks (some network disks) nothing is held, and nothing is refused.
-
-    Raises:
-        MivolError: another process holds it.
-    """
-    held = os.open(folder, os.O_RDONLY)
-    try:
-        _lock(held, folder.name)
-        yield
-    finally:
-        os.close(held)
-
-
-def _lock(held: int, name: str) -> None:
-    try:
-        fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        raise MivolError(f'another run is at work in "{name}": wait for its end, or choose another folder.') from None
-    except OSError as error:
-        if error.errno not in (errno.ENOLCK, errno.EOPNOTSUPP):
-            raise

@@ -14,9 +14,10 @@ import numpy as np
 from mivol import config
 from mivol.errors import MivolError
 from mivol.experiments.back_end import choose_back_end
+from mivol.experiments.best import BestIterate
 from mivol.experiments.projections import Projections, held_out_views, make_data
 from mivol.experiments.run_folder import RunFolder
-from mivol.experiments.scan_outputs import write_outputs
+from mivol.experiments.scan_outputs import write_best, write_outputs
 from mivol.experiments.task import Task
 from mivol.optim.checkpoint import Store
 from mivol.optim.course import Course
@@ -56,7 +57,7 @@ def scan_fit(task: Task) -> Path:
     """
     chosen: config.Scan = task.chosen
     choose_back_end(chosen.variant, chosen.threads)
-    run = RunFolder(task.folder, new_record(chosen))
+    run = RunFolder(task.folder, new_record(task), task.resume)
     grid = VoxelGrid(chosen.grid.shape, chosen.grid.voxel_size, chosen.grid.centre)
     with run.at_work():
         with run.stage("projections"):
@@ -66,23 +67,28 @@ def scan_fit(task: Task) -> Path:
         held_out = held_out_views(chosen, projector.n_views)
         with run.stage("solve"):
             problem = make_problem(chosen, projector, data, held_out)
-            state = solve(task, run, problem, data)
+            best = BestIterate(run)
+            state = solve(task, run, problem, data, best)
             residual = state.residual_norm / norm_of(problem.linear_problem)
             run.record.results = {"iterations": float(state.iteration), "residual": residual}
             data = without_drift(problem, data, held_out, state)
         with run.stage("images and volumes"):
             write_outputs(run, projector, data, held_out, state.x.reshape(grid.shape))
-    return write_page(task.folder)
+            write_best(run, grid, best)
+    page = write_page(task.folder)
+    task.watcher.say([*best.says(), run.summary()])
+    return page
 
 
-def new_record(chosen: config.Scan) -> RunRecord:
+def new_record(task: Task) -> RunRecord:
     """The record of a run that begins."""
+    chosen: config.Scan = task.chosen
     solver = METHODS[chosen.solve.name]
     return RunRecord.new(
         chosen.title,
         method=f"{chosen.solve.name} on line integrals of a {type(chosen.scan).__name__.lower()} beam",
         config=config.resolved(chosen),
-        command="mivol optimize",
+        command=task.command,
         seeds={"noise": getattr(chosen.data, "seed", 0)},
         plan=[
             PlanLine(choice="projector: exact line integrals and their exact transpose", reason="a matched pair: no bias"),
@@ -137,7 +143,7 @@ def start_volume(wanted: config.Solve, a: Projector, data: Projections, kept: np
     return np.maximum(x, 0) if wanted.nonnegative else x
 
 
-def solve(task: Task, run: RunFolder, problem: Inversion, data: Projections) -> State:
+def solve(task: Task, run: RunFolder, problem: Inversion, data: Projections, best: BestIterate) -> State:
     """All iterations, with metrics and checkpoints; where the solver stands after them.
 
     Raises:
@@ -150,12 +156,14 @@ def solve(task: Task, run: RunFolder, problem: Inversion, data: Projections) -> 
     shared = {name: getattr(wanted, name) for name in ("subsets", "relaxation", "decay", "window", "cutoff")}
     settings = Solve(solver=wanted.name, drift=getattr(chosen.data, "drift", 0), **shared)
     fit = begin_fit(problem, settings, course, store=store)
-    run.rewind(fit.next)
+    best.restore()
+    run.begin(fit.next)
     with task.watcher.watch(course.iterations) as watch:
 
         def observe(fit: Fit) -> None:
             errors = errors_of(fit.run.state, problem.linear_problem, data)
             run.append(fit.next, fit.seconds, loss=fit.history[-1]["loss"], **errors)
+            best.see(fit.next, errors, {"volume": fit.run.state.x})
             watch(fit)
 
         fit.complete(observe)

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from mivol.experiments.best import BestIterate
 from mivol.experiments.projections import Projections
 from mivol.experiments.run_folder import RunFolder
 from mivol.files import write_exr, write_volume
@@ -40,6 +41,13 @@ def write_outputs(run: RunFolder, projector: Projector, data: Projections, held_
     if len(held_out):
         z = (data.y - predicted)[held_out] * np.sqrt(data.weights[held_out])
         record.results["held_out_rms_of_residual_over_noise"] = float(np.sqrt(np.mean(z**2)))
+
+
+def write_best(run: RunFolder, grid: VoxelGrid, best: BestIterate) -> None:
+    """The best iterate beside the last one, and a note, where they differ."""
+    run.record.notes += best.says()
+    if not best.is_newest:
+        write_volume(run.path / "volumes/reconstruction_best.npz", best.read()["volume"].reshape(grid.shape), grid.to_world)
 
 
 def write_pair(folder: Path, name: str, measured: np.ndarray, predicted: np.ndarray, held_out: bool) -> list[Image]:

@@ -12,8 +12,9 @@ from mivol import config
 from mivol.config import Experiment
 from mivol.errors import MivolError
 from mivol.experiments.back_end import choose_back_end
+from mivol.experiments.best import BestIterate
 from mivol.experiments.depth import settle_depth
-from mivol.experiments.references import References, find_references
+from mivol.experiments.references import References, find_references, load_experiment_scene
 from mivol.experiments.run_folder import RunFolder
 from mivol.experiments.scene_outputs import SceneOutputs
 from mivol.experiments.start import Start, make_start
@@ -22,14 +23,14 @@ from mivol.experiments.truth import check_truth, make_truth, put
 from mivol.optim.checkpoint import Store
 from mivol.optim.course import Course
 from mivol.optim.events import upsample
-from mivol.optim.loop import Fit, reconstruct
+from mivol.optim.loop import Fit, begin_fit
 from mivol.optim.parameters import check_names
 from mivol.optim.render_batches import RenderBatch, make_batches
 from mivol.optim.scene_problem import SceneProblem
 from mivol.optim.seeds import HELD_OUT, seed_of
 from mivol.report.page import write_page
 from mivol.report.record import PlanLine, RunRecord
-from mivol.scene.load import LoadedScene, load_scene
+from mivol.scene.load import LoadedScene
 from mivol.scene.needs import find_needs
 from mivol.scene.plan import Plan, make_plan
 from mivol.scene.survey import survey_scene
@@ -55,10 +56,10 @@ def scene_fit(task: Task) -> Path:
     """
     chosen: Experiment = task.chosen
     choose_back_end(chosen.variant, chosen.threads)
-    run = RunFolder(task.folder, new_record(chosen))
+    run = RunFolder(task.folder, new_record(task), task.resume)
     with run.at_work():
         with run.stage("scene"):
-            loaded = load_scene(task.base / chosen.scene.file, chosen.scene.define)
+            loaded = load_experiment_scene(chosen, task.base)
             truth = make_truth(chosen, task.base, loaded.scene)
             task, depth = settle_depth(task, loaded, truth)
             chosen = task.chosen
@@ -73,14 +74,18 @@ def scene_fit(task: Task) -> Path:
             made = plan_of(chosen, problem)
             run.record.plan = depth + lines_of(made)
             run.record.citations += cited(made, run.record.citations)
-            fit = solve(task, run, loaded, problem, SceneErrors(chosen, seen, truth))
+            best = BestIterate(run)
+            fit = solve(task, run, loaded, problem, SceneErrors(chosen, seen, truth), best)
         with run.stage("images and volumes"):
-            SceneOutputs(chosen, run, fit, seen, truth).write()
-    return write_page(task.folder)
+            SceneOutputs(chosen, run, fit, seen, truth, best).write()
+    page = write_page(task.folder)
+    task.watcher.say([*best.says(), run.summary()])
+    return page
 
 
-def new_record(chosen: Experiment) -> RunRecord:
+def new_record(task: Task) -> RunRecord:
     """The record of a run that begins."""
+    chosen: Experiment = task.chosen
     priors = [prior for sought in chosen.parameter for prior in sought.prior]
     strategies = [chosen.optimiser, chosen.loss, *priors]
     sought = ", ".join(sought.key for sought in chosen.parameter)
@@ -88,7 +93,7 @@ def new_record(chosen: Experiment) -> RunRecord:
         chosen.title,
         method=f"{chosen.fit.integrator}, {chosen.optimiser.label()} on {chosen.loss.label()}; looked for: {sought}",
         config=config.resolved(chosen),
-        command="mivol optimize",
+        command=task.command,
         seeds={"fit": chosen.seed, "references": getattr(chosen.reference, "seed", 0)},
         citations=["mitsuba3", "drjit", *dict.fromkeys(key for s in strategies for key in s.cites)],
     )
@@ -140,24 +145,29 @@ def make_problem(
     return problem
 
 
-def solve(task: Task, run: RunFolder, loaded: LoadedScene, problem: SceneProblem, measure: SceneErrors) -> Fit:
-    """Fit the scene to its views; the metrics grow by a line an iteration."""
+def solve(
+    task: Task, run: RunFolder, loaded: LoadedScene, problem: SceneProblem, measure: SceneErrors, best: BestIterate
+) -> Fit:
+    """Fit the scene to its views; the metrics grow by a line an iteration, and the best iterate is kept."""
     chosen: Experiment = task.chosen
     course = Course(chosen.fit.iterations, chosen.schedule, chosen.event)
     digests = {"scene": loaded.content_hash, "references": measure.seen.digest()}
     store = Store(run.checkpoint, digests | config.flat(config.resolved(chosen)), task.resume)
+
+    def judge(problem: SceneProblem) -> dict[str, float]:
+        errors = measure(problem)
+        best.see(fit.next, errors, problem.values())
+        return errors
+
+    def observe(fit: Fit) -> None:
+        write_metrics(run, fit)
+        watch(fit)
+
+    fit = begin_fit(problem, chosen.optimiser, course, measure=judge, store=store)
+    best.restore()
+    run.begin(fit.next - 1)
     with task.watcher.watch(chosen.fit.iterations) as watch:
-        begun = False
-
-        def observe(fit: Fit) -> None:
-            nonlocal begun
-            if not begun:
-                run.rewind(fit.next - 2)
-            begun = True
-            write_metrics(run, fit)
-            watch(fit)
-
-        fit = reconstruct(problem, chosen.optimiser, course, measure=measure, observer=observe, store=store)
+        fit.complete(observe)
     append_last(run, fit)
     return fit
 

@@ -12,6 +12,7 @@ import mitsuba as mi
 import numpy as np
 
 from mivol.config import Experiment, Sought
+from mivol.experiments.best import BestIterate
 from mivol.experiments.references import References
 from mivol.experiments.run_folder import RunFolder
 from mivol.experiments.start import edges_of, place_of
@@ -33,6 +34,7 @@ class SceneOutputs:
         fit: the fit, done.
         seen: the references.
         truth: the true volume, where known.
+        best: the best iterate, where it is not the last.
     """
 
     chosen: Experiment
@@ -40,12 +42,13 @@ class SceneOutputs:
     fit: Fit
     seen: References
     truth: np.ndarray | None
+    best: BestIterate
 
     def write(self) -> None:
         """Write images, volumes and curves, and put them and the results on record."""
         record, fit = self.run.record, self.fit
         self.run.make("views", "volumes")
-        record.notes += fit.log + ([f"stopped early: {fit.run.finished}"] if fit.run.finished else [])
+        record.notes += fit.log + ([f"stopped early: {fit.run.finished}"] if fit.run.finished else []) + self.best.says()
         for number, view in enumerate((*self.seen.fitted, *self.seen.held_out)):
             record.images += self.write_view(view, seed_of(self.chosen.seed, 0, number, FINAL))
         for sought in self.chosen.parameter:
@@ -97,6 +100,9 @@ class SceneOutputs:
             write_volume(self.run.path / f"{stem}.npz", grid, place, metadata={"key": sought.key, "unit": sought.unit})
             about = {"quantity": quantity, "unit": sought.unit, "size": edges_of(place), "caption": sought.key}
             found.append(Volume(path=f"{stem}.npz", role=role, **about))
+        if not self.best.is_newest:
+            stem = f"volumes/{sought.key.replace('.', '_')}_best"
+            write_volume(self.run.path / f"{stem}.npz", self.best.read()[sought.key], place)
         return found
 
     def write_image(self, key: str) -> list[Image]:

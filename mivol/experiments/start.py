@@ -13,6 +13,7 @@ import numpy as np
 from mivol.config import Sought
 from mivol.errors import MivolError
 from mivol.files import read_volume
+from mivol.files.fetch import place_of as place_in
 from mivol.optim.parameters import GRID, Parameter, as_tensor, find
 from mivol.transport.media.read_medium import place_of_grid
 
@@ -40,7 +41,7 @@ def make_start(sought: Sought, base: Path, scene: mi.Scene) -> Start:
             f"{sought.key} is no grid of voxels but has the shape {now.shape}: give start, and neither shape nor start_file."
         )
     if sought.start_file:
-        value = read_volume(base / sought.start_file).values
+        value = read_volume(place_in(base, sought.start_file)).values
     elif sought.start is not None:
         shape = (*sought.shape, now.shape[3]) if sought.shape else now.shape
         value = np.full(shape, start_of(sought, shape), dtype=np.float32)

@@ -52,6 +52,7 @@ class Task:
         folder: run folder; made where it is not there.
         resume: continue from the folder's checkpoint.
         watcher: who is told how it goes.
+        command: what was typed, for the record; empty where no command was.
     """
 
     chosen: Experiment | Scan | FieldFit
@@ -59,3 +60,4 @@ class Task:
     folder: Path
     resume: bool = False
     watcher: Watcher = field(default_factory=Nobody)
+    command: str = ""

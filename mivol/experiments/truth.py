@@ -13,6 +13,7 @@ from mivol.config import Experiment
 from mivol.errors import MivolError
 from mivol.fields.procedural import make_procedural
 from mivol.files import read_volume
+from mivol.files.fetch import place_of
 from mivol.optim.parameters import find, like
 
 
@@ -26,7 +27,7 @@ def make_truth(chosen: Experiment, base: Path, scene: mi.Scene) -> np.ndarray | 
         return None
     find(chosen.truth.key, mi.traverse(scene))
     if chosen.truth.file:
-        return read_volume(base / chosen.truth.file).values
+        return read_volume(place_of(base, chosen.truth.file)).values
     wanted = chosen.truth
     return make_procedural(wanted.procedural, wanted.shape, wanted.seed, wanted.peak)
 

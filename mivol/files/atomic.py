@@ -5,7 +5,7 @@ is hidden and ends in ``.part``; it is removed whatever goes wrong, Ctrl-C inclu
 file it points to is replaced and the link stays.
 
 Here: :func:`whole_file` (for writers that want a path), :func:`write_whole` (for writers that want a binary file),
-:func:`write_whole_bytes`, :func:`write_whole_text`.
+:func:`write_whole_bytes`, :func:`write_whole_text`; :func:`sweep` removes what a killed process has left of its own.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import os
+import re
 import secrets
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -91,6 +92,33 @@ def write_whole_bytes(path: str | os.PathLike, data: bytes) -> None:
 def write_whole_text(path: str | os.PathLike, text: str) -> None:
     """Write ``text`` to ``path`` as UTF-8, never half: see :func:`write_whole`."""
     write_whole_bytes(path, text.encode("utf-8"))
+
+
+_TEMPORARY = re.compile(r"\..+\.[0-9a-f]{8}\.part")
+
+
+def sweep(folder: Path) -> list[Path]:
+    """Remove the temporaries of killed processes from a folder and the folders in it; call it where nobody else writes.
+
+    Returns:
+        What was removed.
+    """
+    stale = [path for path in folder.rglob(".*.part") if _TEMPORARY.fullmatch(path.name) and path.is_file()]
+    for path in stale:
+        path.unlink(missing_ok=True)
+    return stale
+
+
+def check_destination(path: str | os.PathLike) -> None:
+    """Refuse a file name that nothing can be written to, before there is anything to write.
+
+    Raises:
+        MivolError: the name is that of a folder, its folder is missing, or nothing may be written there.
+    """
+    target = _destination(Path(path))
+    if not os.access(target.parent, os.W_OK):
+        found, way_out = DISK_FAULTS[errno.EACCES]
+        raise MivolError(f"{path}: found {found}, expected a folder to write into; {way_out}.")
 
 
 def _destination(path: Path) -> Path:

@@ -2,7 +2,7 @@
 
 Conventions. One ``.npz`` file, written whole: the arrays of the optimiser and the problem, and one JSON text,
 ``about``, with the next iteration, the history and the fingerprint (every setting that changes the result, and the scene's
-hash, by dotted key). A file of another fingerprint is refused. No pickles.
+hash, by dotted key). A file of another fingerprint is refused; only the number of iterations may grow. No pickles.
 """
 
 from __future__ import annotations
@@ -22,6 +22,9 @@ ABOUT = "about"
 
 DIGESTS = ("scene", "references", "photos", "data")
 """Keys of fingerprints that are no settings: digests of what a run reads."""
+
+GROWING = ("fit.iterations", "solve.iterations")
+"""Settings that a run may be resumed with a larger value of: it goes on from where it ended."""
 
 
 @dataclass(frozen=True)
@@ -103,6 +106,8 @@ def check_same(path: Path, there: dict[str, Any], here: dict[str, Any]) -> None:
     """
     here = json.loads(json.dumps(here))
     for key in sorted({*there, *here}):
+        if key in GROWING and there.get(key, 0) <= here.get(key, 0):
+            continue
         if there.get(key) != here.get(key):
             raise MivolError(
                 f"{path} belongs to another run: {key} is {there.get(key)!r} there and {here.get(key)!r} here; "

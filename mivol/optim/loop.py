@@ -22,6 +22,7 @@ from mivol.optim.events import Event, in_order
 from mivol.optim.interrupt import Stop
 from mivol.optim.optimiser import Optimiser, Run
 from mivol.optim.problem import Problem
+from mivol.optim.schedules import Constant
 from mivol.threads import check_one_thread
 
 KEPT = ("next", "events_done", "history", "measures", "log", "warned", "seconds")
@@ -161,7 +162,8 @@ class Fit:
         if self.store is None:
             return
         problem = {f"problem/{name}": array for name, array in self.problem.pack(self.run.reals).items()}
-        self.store.write(self.run.pack() | problem, {name: getattr(self, name) for name in KEPT})
+        about = {name: getattr(self, name) for name in KEPT}
+        self.store.write(self.run.pack() | problem, {**about, "iterations": self.course.iterations})
 
     def restore(self) -> None:
         """Continue from the checkpoint.
@@ -175,6 +177,12 @@ class Fit:
         self.problem.unpack(problem, self.run.reals)
         for name in KEPT:
             setattr(self, name, about[name])
+        planned, now = about["iterations"], self.course.iterations
+        if planned < now and not isinstance(self.course.schedule, Constant):
+            self.log.append(
+                f"iteration {self.next}: the schedule of {planned} iterations goes on as one of {now}, so this is not what one "
+                f"run of {now} gives"
+            )
 
 
 def _number(loss: float | mi.Float) -> float:

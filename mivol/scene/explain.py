@@ -1,8 +1,12 @@
-"""What a scene needs and what will be done about it, in words, before anything is rendered."""
+"""What a scene needs and what will be done about it, in words, before anything is rendered.
+
+Conventions. The facts come first, whatever is refused; a refusal is the last part of the text.
+"""
 
 from __future__ import annotations
 
 import re
+from dataclasses import dataclass
 from pathlib import Path
 
 import drjit as dr
@@ -10,6 +14,7 @@ import mitsuba as mi
 import numpy as np
 
 from mivol.cite import citations
+from mivol.errors import MivolError
 from mivol.scene.build import build_media
 from mivol.scene.choices import is_lit, shares_cells
 from mivol.scene.depth_preview import measure_depths
@@ -27,7 +32,7 @@ from mivol.transport.media.read_medium import traverse_medium
 from mivol.transport.path.estimators import SEGMENT_ESTIMATORS
 from mivol.transport.path.settings import Settings
 
-__all__ = ["explain", "settings_of"]
+__all__ = ["Explanation", "examine", "explain", "settings_of"]
 
 UNLIMITED = 0xFFFFFFFF
 """The depth that Mitsuba's integrators print for -1."""
@@ -44,27 +49,68 @@ def settings_of(scene: mi.Scene) -> Settings:
     return Settings(max_depth=-1 if depth == UNLIMITED else depth)
 
 
+@dataclass(frozen=True)
+class Explanation:
+    """What can be said of a scene before anything is rendered.
+
+    Attributes:
+        lines: facts, plan and references.
+        refusal: why it cannot be rendered as it is; empty where it can.
+    """
+
+    lines: tuple[str, ...]
+    refusal: str = ""
+
+    @property
+    def text(self) -> str:
+        """All of it."""
+        return "\n".join([*self.lines, *(["refused", f"  {self.refusal}"] if self.refusal else [])])
+
+
 def explain(
-    scene: mi.Scene | str | Path, max_depth: int | None = None, sensor: int = 0, noise: float | None = None
+    scene: mi.Scene | str | Path,
+    max_depth: int | None = None,
+    sensor: int | mi.Sensor = 0,
+    noise: float | None = None,
 ) -> str:
     """Say what a scene needs and what will be done about it, before more than a small preview is rendered.
 
     Args:
         scene: a loaded scene, or the path of its XML.
         max_depth: of the integrator asked about; None: that of the scene's own integrator, with its other settings.
-        sensor: index of the sensor asked about.
+        sensor: the sensor asked about, or its number.
         noise: measure which ``max_depth`` leaves out less than this noise of a pixel, over the mean radiance
             (:mod:`mivol.scene.depth_preview`); None to measure nothing.
 
-    Raises:
-        MivolError: as :func:`make_plan`.
+    Returns:
+        Facts, choices with their reasons, and at the end what is refused, where something is.
     """
+    return examine(scene, max_depth, sensor, noise).text
+
+
+def examine(
+    scene: mi.Scene | str | Path,
+    max_depth: int | None = None,
+    sensor: int | mi.Sensor = 0,
+    noise: float | None = None,
+) -> Explanation:
+    """What :func:`explain` says, with the refusal by itself; arguments as there."""
     loaded = scene if isinstance(scene, mi.Scene) else mi.load_file(str(scene))
     eye = find_sensor(loaded, sensor)
-    needs = find_needs(loaded, eye, survey_scene(loaded))
+    try:
+        needs = find_needs(loaded, eye, survey_scene(loaded))
+    except MivolError as error:
+        return Explanation(("facts", *_plain_facts(loaded), *_warnings(loaded)), str(error))
     settings = settings_of(loaded) if max_depth is None else Settings(max_depth=max_depth)
-    plan = make_plan(needs, settings)
-    lines = ["facts"]
+    facts = ("facts", *_facts(needs), *_warnings(loaded))
+    try:
+        return Explanation((*facts, *_plan(loaded, eye, needs, settings, noise)))
+    except MivolError as error:
+        return Explanation(facts, str(error))
+
+
+def _facts(needs: Needs) -> list[str]:
+    lines = []
     for m in needs.media:
         kind = f"a bounded {m.bounded}" if m.bounded else "homogeneous"
         grids = ", ".join("x".join(map(str, r)) for r in m.resolutions) or kind
@@ -73,25 +119,66 @@ def explain(
         lines.append(
             f"  medium    {m.name}: {m.kind} in {m.boundary}, {m.extinction} extinction, {grids}, {scatters}, {m.phase}{tau}"
         )
-    lines += [
+    return [
+        *lines,
         f"  surfaces  {', '.join(needs.surfaces) or 'none'}",
         f"  emitters  {', '.join(needs.emitters) or 'none'}",
         f"  camera    {'may be inside a medium' if needs.start or needs.camera_inside else 'in no traced boundary'}",
         f"  variant   {needs.variant}, {dr.thread_count()} threads",
-        "plan",
     ]
+
+
+def _plain_facts(scene: mi.Scene) -> list[str]:
+    """What Mitsuba itself tells of a scene that mivol refuses to look into."""
+    lines = []
+    for shape in scene.shapes():
+        medium = shape.interior_medium()
+        inside = "" if medium is None else f", {medium.class_name()} inside"
+        lines.append(f"  shape     {shape.id()}: {shape.class_name()}{inside}")
+    integrator = scene.integrator()
+    return [
+        *lines,
+        f"  emitters  {', '.join(emitter.class_name() for emitter in scene.emitters()) or 'none'}",
+        f"  sensors   {len(scene.sensors())}",
+        f"  traced by {'nothing' if integrator is None else str(integrator).partition('[')[0].strip()}",
+        f"  variant   {mi.variant()}, {dr.thread_count()} threads",
+    ]
+
+
+def _warnings(scene: mi.Scene) -> list[str]:
+    """Media that no light reaches: behind a BSDF that lets none through, as Mitsuba's default one."""
+    lines, open_ = [], int(mi.BSDFFlags.Null) | int(mi.BSDFFlags.Transmission)
+    for shape in scene.shapes():
+        if not shape.is_medium_transition():
+            continue
+        bsdf = shape.bsdf()
+        flags = 0 if bsdf is None else int(mi.BSDFFlags.Null) if bsdf.class_name() == "NullBSDF" else _flags(bsdf)
+        if bsdf is not None and not flags & open_:
+            lines.append(
+                f"  warning   the medium of {shape.id()} lies behind an opaque {bsdf.class_name()}, so that no light gets in: "
+                'give the shape <bsdf type="null"/> (Mitsuba takes a diffuse one where none is given)'
+            )
+    return lines
+
+
+def _flags(bsdf: mi.BSDF) -> int:
+    flags = bsdf.flags()
+    return int(flags[0]) if dr.is_array_v(flags) else int(flags)
+
+
+def _plan(scene: mi.Scene, eye: mi.Sensor, needs: Needs, settings: Settings, noise: float | None) -> list[str]:
+    plan = make_plan(needs, settings)
     width = max(len(c.about) for c in plan.choices)
-    lines += [f"  {c.about:<{width}}  {c.choice}\n  {'':<{width}}    because {c.reason}" for c in plan.choices]
+    lines = ["plan", *(f"  {c.about:<{width}}  {c.choice}\n  {'':<{width}}    because {c.reason}" for c in plan.choices)]
     lines += [f"  table     {text}" for text in _tables(needs)]
     if settings.scatterings == 1:
-        lines += [f"  model     {text}" for text in _depth_two(loaded, needs)]
-        lines += [f"  shadows   {text}" for text in _transmittance_grid(loaded, needs, plan, settings)]
+        lines += [f"  model     {text}" for text in _depth_two(scene, needs)]
+        lines += [f"  shadows   {text}" for text in _transmittance_grid(scene, needs, plan, settings)]
     if noise is not None and is_lit(needs, settings):
-        answer = measure_depths(loaded, eye, settings, noise)
+        answer = measure_depths(scene, eye, settings, noise)
         depth = "without a limit (-1)" if answer.depth < 0 else answer.depth
         lines += [f"  depth     {depth} is enough\n              because {answer.reason}"]
-    lines += ["references", *(f"  {source}" for source in citations(SEGMENT_ESTIMATORS[plan.segment].cites))]
-    return "\n".join(lines)
+    return [*lines, "references", *(f"  {source}" for source in citations(SEGMENT_ESTIMATORS[plan.segment].cites))]
 
 
 def _transmittance_grid(scene: mi.Scene, needs: Needs, plan: Plan, settings: Settings) -> list[str]:

@@ -10,11 +10,11 @@ stands the reconstruction's mass spread evenly inside its hull: what the right o
 from __future__ import annotations
 
 import argparse
-import os
 from pathlib import Path
 
 import mivol  # noqa: F401  (chooses the LLVM library; call it before the first variant)
 from mivol.files import read_volume, write_volume
+from mivol.files.fetch import place_of
 from mivol.report import figures, show
 from mivol.validate.metrics import psnr
 from mivol.validate.reference import render_reference
@@ -25,7 +25,6 @@ import numpy as np
 
 HERE = Path(__file__).parent
 XML = HERE / "scene.xml"
-DATA = Path(os.environ.get("MIVOL_DATA", HERE.parents[2] / "shared" / "data"))
 FOUND = Path("runs/white_smoke/volumes/smoke_interior_medium_sigma_t_data_reconstruction.vol")
 """Where `mivol optimize scenes/white_smoke/fit.toml` leaves the reconstruction."""
 
@@ -49,7 +48,7 @@ def main() -> None:
     given.output.mkdir(parents=True, exist_ok=True)
     truth = render_reference(
         XML, given.output / "references", max_depth=2, max_spp=given.reference_spp, progress=False,
-        overrides={"volume": given.truth.resolve(), "size": given.size},
+        overrides={"volume": place_of(Path(), given.truth).resolve(), "size": given.size},
     )  # fmt: skip
     found = read_volume(given.volume, frame="unit").values
     write_volume(given.output / "flat.vol", flat(found))
@@ -88,7 +87,7 @@ def arguments() -> argparse.Namespace:
     """The command line."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--volume", type=Path, default=FOUND, help="reconstruction, .vol")
-    parser.add_argument("--truth", type=Path, default=DATA / "volumes_vol" / "tutorials_volume.vol")
+    parser.add_argument("--truth", default="data:smoke")
     parser.add_argument("--size", type=int, default=128, help="pixels along a side")
     parser.add_argument("--spp", type=int, default=256, help="samples of mivol's renders")
     parser.add_argument("--reference-spp", type=int, default=1024)

@@ -1,6 +1,6 @@
 """A CT scan through a table of opacity and one of colour, and both tables found again from pictures.
 
-    python scenes/scan_view/tables.py [--scan ../shared/data/ct_mri/tooth.nrrd] [--iterations 60] [-o runs/scan_view]
+    python scenes/scan_view/tables.py [--scan data:tooth] [--iterations 60] [-o runs/scan_view]
 
 Conventions. A table has sixteen entries, at values 0, 16, ... 240 of the scan; opacity is extinction per voxel, colour the
 radiance that an opaque thickness of the value shows, linear sRGB. The pictures are mivol's own, from four sides; the fit
@@ -11,18 +11,17 @@ from __future__ import annotations
 
 import argparse
 import math
-import os
 from pathlib import Path
 
 import mivol  # noqa: F401  (chooses the LLVM library; call it before the first variant)
 from mivol.files import write_png
+from mivol.files.fetch import place_of
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 HERE = Path(__file__).parent
-SCAN = Path(os.environ.get("MIVOL_DATA", HERE.parents[2] / "shared" / "data")) / "ct_mri" / "tooth.nrrd"
 KEYS = {"opacity": "tooth.interior_medium.sigma_t.table", "colour": "tooth.interior_medium.emission.table"}
 MOST = {"opacity": 0.01, "colour": 0.3}
 """The start's entry at the upper end of the scan's values."""
@@ -65,7 +64,7 @@ def fit(scene: mi.Scene, cameras: list[mi.Sensor], iterations: int, spp: int) ->
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--scan", type=Path, default=SCAN, help="a scan of 103 x 94 x 161 voxels")
+    parser.add_argument("--scan", default="data:tooth", help="a scan of 103 x 94 x 161 voxels; mivol fetch tooth brings it")
     parser.add_argument("--size", type=int, default=384, help="pixels a side of the view; a sixth of it for the fit")
     parser.add_argument("--spp", type=int, default=16, help="samples a pixel")
     parser.add_argument("--iterations", type=int, default=120)
@@ -74,7 +73,8 @@ def main() -> None:
     mi.set_variant("llvm_ad_rgb")
     given.output.mkdir(parents=True, exist_ok=True)
 
-    scene = mi.load_file(str(HERE / "scene.xml"), scan=str(given.scan.resolve()), size=given.size, spp=given.spp)
+    scan = str(place_of(Path(), given.scan).resolve())
+    scene = mi.load_file(str(HERE / "scene.xml"), scan=scan, size=given.size, spp=given.spp)
     truth = {name: np.array(mi.traverse(scene)[key]) for name, key in KEYS.items()}
     before = np.array(mi.render(scene))
     found = fit(scene, sides(max(given.size // 6, 8)), given.iterations, max(given.spp // 4, 1))

@@ -9,7 +9,6 @@ that none has seen. Iterations draw four views each, so that fifty cost what fiv
 from __future__ import annotations
 
 import argparse
-import os
 from pathlib import Path
 
 import mivol  # noqa: F401  (chooses the LLVM library; call it before the first variant)
@@ -22,13 +21,12 @@ import matplotlib as mpl
 import numpy as np
 
 HERE = Path(__file__).parent
-DATA = Path(os.environ.get("MIVOL_DATA", HERE.parents[2] / "shared" / "data"))
 
 
 def fit(count: int, folder: Path, given: argparse.Namespace) -> RunRecord:
     """The experiment from ``count`` views."""
     changes = [
-        f'truth.file="{DATA / "volumes_vol" / "tutorials_volume.vol"}"',
+        'truth.file="data:smoke"',
         *(f"{rig}.{side}={given.size}" for rig in ("views", "held_out") for side in ("width", "height")),
         f"views.count={count}",
         f"fit.iterations={given.iterations}",

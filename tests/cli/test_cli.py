@@ -93,6 +93,37 @@ def test_reference_is_rendered_and_said(variant_rgb, folder: Path, capsys: pytes
     assert "mivol_reference" in header
 
 
+# -- What render is told ------------------------------------------------------------------------------------------
+
+
+def test_render_by_another_integrator_with_samples_and_seed(
+    variant_rgb, folder: Path, capsys: pytest.CaptureFixture
+) -> None:
+    """The image is Mitsuba's own of that integrator, sample count and seed; what is not ours is named."""
+    flags = ["--integrator", "volpath", "--spp", 3, "--seed", 5, "-o", folder / "a.exr"]
+    assert run("render", folder / "scene.xml", *flags) == 0
+    assert "rendered by VolumetricSimplePathIntegrator" in capsys.readouterr().err
+    scene = mi.load_file(str(folder / "scene.xml"))
+    stock = mi.load_dict({"type": "volpath", "max_depth": 6})
+    image = np.asarray(mi.render(scene, integrator=stock, spp=3, seed=5))
+    assert np.array_equal(read_exr(folder / "a.exr")[0]["R"], image[..., 0])
+    assert run("render", folder / "scene.xml", "-o", folder / "b.exr") == 0
+    assert capsys.readouterr().err == ""
+
+
+def test_render_checks_where_it_writes_before_it_renders(
+    variant_rgb, folder: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("mivol.experiments.render.render_image", lambda *given: pytest.fail("rendered first"))
+    assert ".exr or .png" in refused(capsys, "render", folder / "scene.xml", "-o", "a.jpg")
+    assert "no folder" in refused(capsys, "render", folder / "scene.xml", "-o", folder / "nowhere" / "a.exr")
+
+
+def test_render_refuses_an_unknown_integrator(variant_rgb, folder: Path, capsys: pytest.CaptureFixture) -> None:
+    assert '"volpat" cannot be loaded' in refused(capsys, "render", folder / "scene.xml", "--integrator", "volpat")
+    assert "0 samples a pixel" in refused(capsys, "render", folder / "scene.xml", "--spp", 0)
+
+
 # -- The command itself -------------------------------------------------------------------------------------------
 
 
@@ -114,7 +145,7 @@ def test_every_verb_says_what_it_does(capsys: pytest.CaptureFixture) -> None:
 
 
 def test_wrong_arguments_end_with_2(capsys: pytest.CaptureFixture) -> None:
-    for arguments in ([], ["rendr"], ["render"], ["reference", "a.xml"]):
+    for arguments in ([], ["rendr"], ["render"], ["reference", "a.xml"], ["doctor", "--quik"]):
         with pytest.raises(SystemExit) as done:
             run(*arguments)
         assert done.value.code == 2

@@ -4,15 +4,28 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from mivol.errors import MivolError
-from mivol.experiments.run_folder import RunFolder
-from mivol.report.record import RunRecord, read_record
+from mivol.experiments.best import BestIterate
+from mivol.experiments.run_folder import EARLIER, RunFolder
+from mivol.files.atomic import whole_file
+from mivol.report.record import RunRecord, read_metrics, read_record
 
 
-def folder(path: Path) -> RunFolder:
-    return RunFolder(path / "run", RunRecord.new("a run"))
+def folder(path: Path, title: str = "a run", is_resumed: bool = False) -> RunFolder:
+    return RunFolder(path / "run", RunRecord.new(title), is_resumed)
+
+
+def finished(path: Path) -> RunFolder:
+    """A run of two iterations that is done."""
+    run = folder(path)
+    with run.at_work():
+        run.begin(0)
+        run.append(1, 0.1, loss=3.0)
+        run.append(2, 0.2, loss=2.0)
+    return run
 
 
 def test_two_runs_do_not_share_a_folder(tmp_path: Path) -> None:
@@ -39,3 +52,79 @@ def test_the_record_says_what_stopped_a_run(tmp_path: Path) -> None:
     with folder(tmp_path).at_work():
         pass
     assert read_record(run.path).status == "finished"
+
+
+def test_a_refused_run_leaves_a_finished_one_alone(tmp_path: Path) -> None:
+    """Whatever a second command is refused for: record and metrics of the first stay, byte for byte."""
+    run = finished(tmp_path)
+    before = [(run.path / name).read_bytes() for name in ("run.json", "metrics.jsonl")]
+    with pytest.raises(MivolError), folder(tmp_path, "another").at_work():
+        raise MivolError("no such file")
+    assert [(run.path / name).read_bytes() for name in ("run.json", "metrics.jsonl")] == before
+
+
+def test_curves_of_two_runs_are_never_mixed(tmp_path: Path) -> None:
+    """A new run begins with no metrics, and what the earlier one recorded lies beside it; a resumed one keeps its own."""
+    finished(tmp_path)
+    run = folder(tmp_path, "another")
+    with run.at_work():
+        run.begin(2)
+        assert read_metrics(run.path) == []
+        run.append(1, 0.1, loss=9.0)
+        run.append(2, 0.2, loss=8.0)
+    assert [row["loss"] for row in read_metrics(run.path / EARLIER)] == [3.0, 2.0]
+    assert read_record(run.path / EARLIER).title == "a run"
+    resumed = folder(tmp_path, "another", is_resumed=True)
+    with resumed.at_work():
+        resumed.begin(1)
+        assert [row["loss"] for row in read_metrics(run.path)] == [9.0]
+    assert read_record(run.path / EARLIER).title == "a run"
+
+
+def test_what_a_killed_run_was_writing_is_swept(tmp_path: Path) -> None:
+    """Only names that mivol's writer gives, and the folders in it too; the user's own files are left."""
+    run = folder(tmp_path)
+    (run.path / "views").mkdir()
+    for name in (".run.json.0123abcd.part", "views/.a.exr.89abcdef.part", "own.part", ".own.part"):
+        (run.path / name).touch()
+    with run.at_work():
+        pass
+    left = {str(path.relative_to(run.path)) for path in run.path.rglob("*.part")}
+    assert left == {"own.part", ".own.part"}
+    with whole_file(run.path / "a") as temporary:
+        temporary.touch()
+        other = folder(tmp_path)
+        with other.at_work():
+            assert not temporary.exists()
+        temporary.touch()
+
+
+def test_the_best_iterate_is_kept(tmp_path: Path) -> None:
+    """The error falls and rises: the smallest one's values lie in the file, and the rise is said. The same after a stop."""
+    run = folder(tmp_path)
+    best = BestIterate(run)
+    assert best.is_newest
+    with run.at_work():
+        run.begin(0)
+        for iteration, error in enumerate([0.9, 0.4, 0.6]):
+            best.see(iteration, {"nrmse": error, "held_out_psnr": 10.0 + iteration}, {"volume": np.full(2, iteration)})
+            run.append(iteration, 0.0, nrmse=error)
+    again = BestIterate(folder(tmp_path, is_resumed=True))
+    again.restore()
+    for one in (best, again):
+        assert not one.is_newest
+        assert np.array_equal(one.read()["volume"], [1, 1])
+        assert "nRMSE of the volume was best at iteration 1, 0.4, and is 0.6 at the end" in one.says()[0]
+    again.see(3, {"nrmse": 0.3}, {"volume": np.full(2, 3)})
+    assert again.is_newest
+    assert again.says() == []
+    views = BestIterate(folder(tmp_path / "views"))
+    views.see(0, {"held_out_psnr": 20.0}, {})
+    views.see(1, {"held_out_psnr": 25.0}, {})
+    assert views.is_newest
+
+
+def test_the_summary_is_what_was_recorded(tmp_path: Path) -> None:
+    run = folder(tmp_path)
+    run.record.results = {"held_out_psnr": 30.25, "nrmse": 0.863, "gone": None}
+    assert run.summary() == "saved: PSNR of the held-out views 30.25 dB, nRMSE of the volume 0.863"

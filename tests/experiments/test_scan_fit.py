@@ -115,6 +115,40 @@ def test_an_interrupted_scan_is_resumed(variant_rgb, folder: Path, monkeypatch: 
     assert files[0] == files[1]
 
 
+def test_more_iterations_resume_a_run_that_is_done(variant_rgb, folder: Path, capsys: pytest.CaptureFixture) -> None:
+    """Four iterations, then two more: every number as if there had been six; fewer than there are is another run. What is on
+    record is the command as it was typed, and the last line on the console is what was saved."""
+    assert run(folder, to="whole") == 0
+    assert run(folder, "--set", "solve.iterations=4", to="more") == 0
+    assert run(folder, "--resume", to="more") == 0
+    said = capsys.readouterr().err.splitlines()
+    losses = [[(row["iteration"], row["loss"], row["nrmse"]) for row in rows_of(folder, to)] for to in ("whole", "more")]
+    assert losses[0] == losses[1]
+    record = json.loads((folder / "more" / "run.json").read_text())
+    assert record["command"].startswith("mivol optimize ")
+    assert record["command"].endswith("more --resume")
+    assert said[-1].startswith("saved: ")
+    assert f"nRMSE of the volume {record['results']['nrmse']:.4g}" in said[-1]
+    assert run(folder, "--resume", "--set", "solve.iterations=3", to="more") == 1
+    assert "solve.iterations is 6 there and 3 here" in capsys.readouterr().err
+
+
+def test_a_rise_is_flagged_and_the_best_volume_kept(variant_rgb, folder: Path, capsys: pytest.CaptureFixture) -> None:
+    """100 quanta a pixel are a noise of 10 %: conjugate gradients without bounds fit it after a few iterations."""
+    noisy = ["data.photons=100", "solve.iterations=12", "solve.nonnegative=false"]
+    assert run(folder, *[part for one in noisy for part in ("--set", one)]) == 0
+    errors = [row["nrmse"] for row in rows_of(folder)]
+    lowest = int(np.argmin(errors))
+    assert errors[-1] > errors[lowest]
+    said = f"nRMSE of the volume was best at iteration {lowest + 1}"
+    assert said in capsys.readouterr().err
+    assert any(said in note for note in json.loads((folder / "run" / "run.json").read_text())["notes"])
+    volumes = {name: read_volume(folder / f"run/volumes/{name}.npz").values for name in ("reconstruction_best", "truth")}
+    difference = volumes["reconstruction_best"] - volumes["truth"]
+    # Volumes are stored in float32.
+    assert np.isclose(np.linalg.norm(difference) / np.linalg.norm(volumes["truth"]), errors[lowest], rtol=1e-6)
+
+
 @pytest.mark.statistical
 def test_noise_has_the_variance_that_its_weight_claims(variant_rgb, folder: Path) -> None:
     """z = (y - exact) sqrt(counts) has mean square 1 + O(1/counts); 3528 pixels know it to sqrt(2 / 3528) = 2.4 %."""

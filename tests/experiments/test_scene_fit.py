@@ -165,3 +165,15 @@ def test_a_run_that_is_done_may_be_resumed(variant_rgb, folder: Path) -> None:
     metrics = (folder / "run" / "metrics.jsonl").read_text()
     assert run(*flags, "--resume") == 0
     assert (folder / "run" / "metrics.jsonl").read_text() == metrics
+
+
+def test_a_stretched_schedule_is_said(variant_rgb, folder: Path) -> None:
+    """A run goes on with more iterations; where the schedule knew how many there would be, the record says what that means."""
+    flags = ["optimize", folder / "fit.toml", "-o", folder / "run", *PHOTOS, "--set", 'schedule={name="cosine", final=0.5}']
+    assert run(*flags, "--set", "fit.iterations=2") == 0
+    assert run(*flags, "--resume", "--set", "fit.iterations=3") == 0
+    record = json.loads((folder / "run" / "run.json").read_text())
+    assert record["results"]["iterations"] == 3
+    assert any("the schedule of 2 iterations goes on as one of 3" in note for note in record["notes"])
+    rows = [json.loads(line)["iteration"] for line in (folder / "run" / "metrics.jsonl").read_text().splitlines()]
+    assert rows[:3] == [0, 1, 2]

@@ -1,0 +1,179 @@
+"""Examples that come with mivol: which there are, where their files lie, and what it takes to run one.
+
+Conventions. An example is a folder of ``scenes/`` with a ``fit.toml``; in a wheel they lie in ``mivol/examples``. One that
+shows public data has a stand-in, a procedural volume from a seed, so that it runs where the data has not been fetched.
+"""
+
+from __future__ import annotations
+
+import runpy
+import shutil
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+from mivol import config
+from mivol.errors import MivolError
+from mivol.experiments.runs import run_experiment
+from mivol.experiments.task import Nobody, Task, Watcher
+from mivol.fields.procedural import make_procedural
+from mivol.files import write_volume
+from mivol.files.fetch import find_data
+from mivol.optim.strategy import nearest
+
+__all__ = ["EXAMPLES", "Example", "copy_example", "examples_folder", "list_examples", "run_example"]
+
+INSTALLED = Path(__file__).resolve().parents[1] / "examples"
+CHECKOUT = Path(__file__).resolve().parents[2] / "scenes"
+
+
+@dataclass(frozen=True)
+class StandIn:
+    """What takes the place of public data: a procedural volume.
+
+    Attributes:
+        data: name of the public set.
+        setting: of the experiment that names the file.
+        shape: (Z, Y, X).
+        peak: largest value, about that of the set.
+    """
+
+    data: str
+    setting: str
+    shape: tuple[int, int, int]
+    peak: float
+
+
+@dataclass(frozen=True)
+class Example:
+    """An example.
+
+    Attributes:
+        says: what it shows.
+        stand_in: of the public data that it shows; None where it makes its own.
+        photographs: script of its folder that makes the photographs that are fitted; "" for none.
+    """
+
+    says: str
+    stand_in: StandIn | None = None
+    photographs: str = ""
+
+
+def _smoke(setting: str) -> StandIn:
+    return StandIn("smoke", setting, (53, 45, 44), 1.8)
+
+
+EXAMPLES: dict[str, Example] = {
+    "demo": Example("a tangle of absorbing matter from 16 pictures, about a minute"),
+    "shepp_logan": Example("the head phantom of Shepp and Logan from cone-beam projections"),
+    "still_life": Example("glossy and matt things from photographs, as a radiance field", photographs="photographs.py"),
+    "smoke": Example("an absorbing smoke from 16 pictures", _smoke("truth.file")),
+    "white_smoke": Example("a smoke that scatters, under a white sky", _smoke("truth.file")),
+    "lamp": Example("where is the lamp, seen through a smoke that is known?", _smoke("scene.define.volume")),
+    "cloud": Example("a cloud under sun and sky", StandIn("cloud", "truth.file", (26, 37, 32), 0.12)),
+}
+
+
+def examples_folder() -> Path:
+    """Where the examples' files lie: in the package, or beside it in a checkout."""
+    return INSTALLED if INSTALLED.is_dir() else CHECKOUT
+
+
+def list_examples() -> str:
+    """The examples, one a line."""
+    width = max(map(len, EXAMPLES))
+    return "\n".join(f"{name:<{width}}  {example.says}" for name, example in EXAMPLES.items())
+
+
+def example_named(name: str) -> Example:
+    """The example of that name.
+
+    Raises:
+        MivolError: there is none; the nearest is offered.
+    """
+    if name not in EXAMPLES:
+        raise MivolError(f'there is no example "{name}": {nearest(name, list(EXAMPLES))}')
+    return EXAMPLES[name]
+
+
+def copy_example(name: str, into: Path) -> Path:
+    """Copy an example's files, to be read and changed.
+
+    Args:
+        name: key of ``EXAMPLES``.
+        into: folder that is made; the files lie in it.
+
+    Returns:
+        Its ``fit.toml``.
+
+    Raises:
+        MivolError: no such example, or something lies there already.
+    """
+    example_named(name)
+    if into.exists() and (not into.is_dir() or any(into.iterdir())):
+        raise MivolError(f'"{into}" is there already: name a folder that is not there yet, or is empty.')
+    source = examples_folder() / name
+    for path in sorted(source.rglob("*")):
+        if path.is_file() and "__pycache__" not in path.parts:
+            target = into / path.relative_to(source)
+            target.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(path, target)
+    return into / "fit.toml"
+
+
+def run_example(
+    name: str, folder: Path, *, changes: tuple[str, ...] = (), watcher: Watcher | None = None, command: str = ""
+) -> Path:
+    """Run an example; the page.
+
+    Args:
+        name: key of ``EXAMPLES``.
+        folder: run folder.
+        changes: settings as ``--set`` takes them.
+        watcher: who is told how it goes.
+        command: what was typed, for the record.
+
+    Raises:
+        MivolError: no such example, and whatever its fit refuses.
+    """
+    example, watcher = example_named(name), watcher or Nobody()
+    source = examples_folder() / name
+    given = (*prepare(name, example, source, folder, watcher), *changes)
+    chosen = config.load(source / "fit.toml", given)
+    return run_experiment(Task(chosen, source, folder, watcher=watcher, command=command))
+
+
+def prepare(name: str, example: Example, source: Path, folder: Path, watcher: Watcher) -> list[str]:
+    """What lies ready before an example runs, as changes of its settings: photographs, or a stand-in for public data."""
+    folder.mkdir(parents=True, exist_ok=True)
+    if example.photographs:
+        photographs = folder.resolve() / "photographs"
+        if not (photographs / "transforms.json").exists():
+            watcher.say(["making the photographs"])
+            run_script(source / example.photographs, ["-o", str(photographs)])
+        return [f"photos.path={quoted(photographs)}"]
+    if example.stand_in is None or find_data(example.stand_in.data) is not None:
+        return []
+    wanted = example.stand_in
+    path = folder.resolve() / f"{wanted.data}.vol"
+    write_volume(path, make_procedural("tangle", wanted.shape, 2, wanted.peak))
+    watcher.say([
+        f'the public data set "{wanted.data}" is not on this machine: a procedural volume stands in for it '
+        f"(mivol fetch {wanted.data} brings it)"
+    ])  # fmt: skip
+    return [f"{wanted.setting}={quoted(path)}"]
+
+
+def quoted(path: Path) -> str:
+    """A path as a string of TOML; backslashes are letters there."""
+    return f"'{path}'"
+
+
+def run_script(path: Path, arguments: list[str]) -> None:
+    """A script of an example, in this process: Mitsuba is loaded already."""
+    before = sys.argv
+    sys.argv = [str(path), *arguments]
+    try:
+        runpy.run_path(str(path), run_name="__main__")
+    finally:
+        sys.argv = before

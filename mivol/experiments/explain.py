@@ -1,0 +1,123 @@
+"""What a fit would do, before it does anything: its data, what it looks for, its plan, and every check that it makes itself."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+
+from mivol import config
+from mivol.config import Experiment, FieldFit, Files, Scan
+from mivol.errors import MivolError
+from mivol.experiments.back_end import choose_back_end
+from mivol.experiments.photo_data import boxed, read_photos
+from mivol.experiments.photo_plan import choices, make_plan, shrunk
+from mivol.experiments.projections import held_out_views, make_data
+from mivol.experiments.references import camera_of, find_sensors, load_experiment_scene, read_references
+from mivol.experiments.scan_fit import make_problem as make_scan_problem
+from mivol.experiments.scene_fit import make_integrator
+from mivol.experiments.start import make_start
+from mivol.experiments.truth import check_truth, make_truth, put
+from mivol.optim.parameters import check_names
+from mivol.optim.ray_batches import RayBatches
+from mivol.optim.solvers import SOLVERS
+from mivol.photos import rectified
+from mivol.scene.explain import Explanation, examine
+from mivol.tomography.geometry import VoxelGrid
+from mivol.tomography.projector import Projector
+
+Say = Callable[[str], None]
+"""Takes one line of facts."""
+
+
+def explain_fit(chosen: Experiment | Scan | FieldFit, base: Path) -> Explanation:
+    """What a fit would do; nothing is rendered, fitted or written.
+
+    Args:
+        chosen: all settings.
+        base: folder that the paths in them are relative to.
+
+    Returns:
+        Facts as far as they were found, and what is refused, where something is.
+    """
+    lines = [f"experiment  {chosen.title}"]
+    try:
+        choose_back_end(chosen.variant, chosen.threads)
+        found = KINDS[type(chosen)](chosen, base, lines.append)
+    except MivolError as error:
+        return Explanation(tuple(lines), str(error))
+    return Explanation((*lines, *found.lines), found.refusal)
+
+
+def explain_scene_fit(chosen: Experiment, base: Path, say: Say) -> Explanation:
+    """Views, parameters and scene; the scene holds the truth where one is known, else the start.
+
+    Raises:
+        MivolError: whatever :func:`mivol.experiments.scene_fit.scene_fit` refuses before its first render.
+    """
+    loaded = load_experiment_scene(chosen, base)
+    scene = loaded.scene
+    sensors, held_out = find_sensors(chosen, scene)
+    width, height = (int(n) for n in camera_of(sensors[0]).film().crop_size())
+    said = f", {len(held_out)} of them held out" if held_out else ""
+    say(f"  views     {len(sensors)} of {width} x {height} pixels{said}")
+    truth = make_truth(chosen, base, scene)
+    make_integrator(chosen)
+    check_names([sought.key for sought in chosen.parameter])
+    starts = [make_start(sought, base, scene) for sought in chosen.parameter]
+    for start in starts:
+        low, high = start.parameter.domain
+        shape = " x ".join(map(str, start.value.shape))
+        mean = float(np.mean(start.value))
+        say(f"  sought    {start.parameter.name}: {shape}, in [{low:g}, {high:g}] {start.parameter.unit}, from {mean:.4g}")
+    check_truth(chosen)
+    if isinstance(chosen.reference, Files):
+        read_references(chosen, base, loaded, sensors, held_out)
+    params = mi.traverse(scene)
+    for start in starts:
+        put(params, start.parameter.name, start.value)
+    if truth is not None:
+        put(params, chosen.truth.key, truth)
+    say(f"  holding   {'the truth' if truth is not None else 'the start'}, in what follows")
+    return examine(scene, chosen.fit.max_depth, camera_of(sensors[0]))
+
+
+def explain_scan_fit(chosen: Scan, base: Path, say: Say) -> Explanation:
+    """Projections, grid and solver.
+
+    Raises:
+        MivolError: whatever :func:`mivol.experiments.scan_fit.scan_fit` refuses before its first iteration.
+    """
+    grid = VoxelGrid(chosen.grid.shape, chosen.grid.voxel_size)
+    say(f"  grid      {' x '.join(map(str, grid.shape))} voxels of {chosen.grid.voxel_size:g}")
+    data = make_data(chosen, base, grid)
+    views, rows, columns = data.y.shape
+    say(f"  scan      {views} views of {rows} x {columns} pixels, {type(chosen.scan).__name__.lower()} beam")
+    if data.note:
+        say(f"  axis      {data.note}")
+    held_out = held_out_views(chosen, views)
+    say(f"  held out  {len(held_out)} views")
+    make_scan_problem(chosen, Projector(data.geometry, grid), data, held_out)
+    solver = SOLVERS[chosen.solve.name]
+    return Explanation((f"  solver    {chosen.solve.name}, {chosen.solve.iterations} iterations: {solver.promises}",))
+
+
+def explain_photo_fit(chosen: FieldFit, base: Path, say: Say) -> Explanation:
+    """Photographs, box and plan.
+
+    Raises:
+        MivolError: whatever :func:`mivol.experiments.photo_fit.photo_fit` refuses before its first step.
+    """
+    asked = make_plan(chosen)
+    photos, judged = read_photos(chosen, base)
+    photos = boxed(chosen, photos)
+    say(photos.text)
+    say(f"  judged by {0 if judged is None else len(judged.views)} photographs")
+    plan = shrunk(asked, photos)
+    batches = RayBatches.of([rectified(view) for view in photos.views], [stage.shrink for stage in plan.stages])
+    return Explanation(tuple(f"  {one.choice}: {one.reason}" for one in choices(plan, photos, batches)))
+
+
+KINDS = {config.Experiment: explain_scene_fit, config.Scan: explain_scan_fit, config.FieldFit: explain_photo_fit}

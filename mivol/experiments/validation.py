@@ -1,0 +1,286 @@
+"""mivol beside Mitsuba's own path tracer on a scene: images, gradients, and a verdict in words.
+
+Conventions. Both images are means of independent renders, so each knows its variance; the comparison is
+:func:`mivol.validate.compare.compare`. A gradient is checked along a random direction v, by Student's t: the mean radiance of
+our image differentiated in reverse mode, g . v, against central differences of our own image, which the comparison judges
+(differences of Mitsuba's are hundreds of times noisier). A double step measures what the difference leaves out.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import warnings
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mivol.errors import MivolError
+from mivol.experiments.truth import put
+from mivol.files import write_whole_text
+from mivol.optim.parameters import as_tensor, find
+from mivol.optim.seeds import seed_of
+from mivol.report import figures
+from mivol.scene.explain import settings_of
+from mivol.scene.load import LoadedScene, find_sensor
+from mivol.validate.compare import Comparison, compare
+from mivol.validate.moments import Moments
+from mivol.validate.reference import render_reference
+from mivol.validate.reference_file import ReferenceResult
+from mivol.validate.statistics import Estimate, Significance, effective_dof, z_bound
+from mivol.validate.trust import Doubt, trust
+
+AGREES, DIFFERS, UNTRUSTED = 0, 3, 4
+"""Exit codes."""
+
+BATCHES = 16
+"""Independent renders behind each of our means: their standard error is known to 1 / sqrt(2 * 15) = 18 %."""
+
+ALPHA = 1e-3
+"""Chance that a right renderer is called wrong, by the image and by the gradients each."""
+
+STEP = 0.02
+"""Step of central differences, relative to each value: of e^-tau they err by (STEP tau)^2 / 6 of the slope."""
+
+IMAGE, GRADIENT = 1, 2
+"""Purposes of random numbers."""
+
+
+@dataclass(frozen=True)
+class Validation:
+    """How a scene is validated.
+
+    Attributes:
+        max_depth: longest path; None: that of the scene's own integrator.
+        spp: samples per pixel of ours.
+        reference_spp: of Mitsuba's ``volpath``.
+        seed: root of all random numbers.
+        sensor: number of the sensor.
+        parameters: keys of ``mi.traverse(scene)`` whose gradients are checked.
+    """
+
+    max_depth: int | None = None
+    spp: int = 256
+    reference_spp: int = 1024
+    seed: int = 0
+    sensor: int = 0
+    parameters: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.spp < BATCHES:
+            raise MivolError(f"{self.spp} samples a pixel are too few: a variance takes {BATCHES} renders of one or more.")
+
+
+@dataclass(frozen=True)
+class Slope:
+    """A derivative of the mean radiance along a random direction of a parameter.
+
+    Attributes:
+        key: of the parameter.
+        ours: g . v by reverse mode.
+        differences: the central difference.
+        error: standard error of their difference.
+        left_out: how far the central difference of twice the step is from that of the step, over 3: what the step leaves out.
+        bound: on their difference, beyond which they differ.
+    """
+
+    key: str
+    ours: float
+    differences: float
+    error: float
+    left_out: float
+    bound: float
+
+    @property
+    def agrees(self) -> bool:
+        """Whether they do."""
+        return abs(self.ours - self.differences) <= self.bound
+
+    @property
+    def text(self) -> str:
+        """A sentence."""
+        verdict = "agrees with" if self.agrees else "differs from"
+        return (
+            f"The derivative by {self.key} along a random direction {verdict} central differences: {self.ours:+.4g} and "
+            f"{self.differences:+.4g}, {self.error:.2g} of noise and {self.left_out:.2g} of the step's own."
+        )
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What came of a validation.
+
+    Attributes:
+        comparison: of the images.
+        rel_mse: mean over pixels and channels of (ours - reference)^2 / (reference^2 + 1e-2 of its mean square).
+        slopes: of the parameters that were named.
+        doubts: why the reference should not be believed.
+        files: what was written.
+    """
+
+    comparison: Comparison
+    rel_mse: float
+    slopes: tuple[Slope, ...]
+    doubts: tuple[Doubt, ...]
+    files: tuple[Path, ...] = ()
+
+    @property
+    def code(self) -> int:
+        """0: they agree; 4: the reference cannot be trusted, whatever it says; 3: they differ."""
+        if any(doubt.fatal for doubt in self.doubts):
+            return UNTRUSTED
+        return AGREES if self.comparison.agrees and all(slope.agrees for slope in self.slopes) else DIFFERS
+
+    @property
+    def words(self) -> str:
+        """The verdict in a sentence."""
+        return {
+            AGREES: "mivol agrees with Mitsuba's volpath on this scene.",
+            DIFFERS: "mivol differs from Mitsuba's volpath on this scene.",
+            UNTRUSTED: f"Mitsuba {mi.__version__} is no reference here, so nothing is decided.",
+        }[self.code]
+
+    @property
+    def text(self) -> str:
+        """All that is said."""
+        said = [f"Doubt: {doubt.sentence}" for doubt in self.doubts]
+        said += [self.comparison.text, f"relMSE {self.rel_mse:.3g}.", *(slope.text for slope in self.slopes), self.words]
+        return "\n".join([*said, *(str(path) for path in self.files)])
+
+
+def validate_scene(loaded: LoadedScene, folder: Path, chosen: Validation) -> Verdict:
+    """Compare mivol with Mitsuba's own path tracer; ``validation.json``, ``validation.png`` and the reference are written.
+
+    Args:
+        loaded: the scene.
+        folder: where the files go; made where it is not there.
+        chosen: how.
+
+    Raises:
+        MivolError: what mivol or Mitsuba refuses to render, or a parameter that is not there.
+    """
+    scene, camera = loaded.scene, find_sensor(loaded.scene, chosen.sensor)
+    for key in chosen.parameters:
+        find(key, mi.traverse(scene))
+    folder.mkdir(parents=True, exist_ok=True)
+    depth = settings_of(scene).max_depth if chosen.max_depth is None else chosen.max_depth
+    ours = mi.load_dict({"type": "mivol", "max_depth": depth})
+    image = render_batches(scene, camera, ours, chosen)
+    doubts = tuple(trust(scene, [camera]))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # doubts are part of the verdict
+        reference = render_reference(
+            loaded, folder, max_depth=depth, max_spp=chosen.reference_spp, seed=chosen.seed + 1, sensor=camera,
+            accept_doubts=True, progress=False,
+        )  # fmt: skip
+    estimate = Estimate.of(image)
+    # Our spread of a pixel that saw nothing is 0, and so may be volpath's: one missed event a pixel is allowed for.
+    compared = compare(estimate, reference, alpha=ALPHA, samples_seen=float(reference.mean.max()), correlated=27)
+    slopes = check_gradients(scene, camera, ours, chosen)
+    floor = 1e-2 * float(np.mean(reference.mean**2)) or 1.0
+    rel_mse = float(np.mean((estimate.mean - reference.mean) ** 2 / (reference.mean**2 + floor)))
+    verdict = Verdict(compared, rel_mse, slopes, doubts)
+    return write_verdict(verdict, estimate, reference, folder, chosen)
+
+
+def render_batches(scene: mi.Scene, camera: mi.Sensor, integrator: mi.Integrator, chosen: Validation) -> Moments:
+    """Independent renders of the colour channels."""
+    spp, found = math.ceil(chosen.spp / BATCHES), Moments.empty()
+    for batch in range(BATCHES):
+        with dr.suspend_grad():
+            image = integrator.render(scene, camera, seed=seed_of(chosen.seed, IMAGE, batch), spp=spp)
+        found = found.add(np.asarray(image)) if batch else Moments.of(np.asarray(image)[None])
+    return found
+
+
+# -- Gradients ----------------------------------------------------------------------------------------------------
+
+
+def check_gradients(scene: mi.Scene, camera: mi.Sensor, ours: mi.Integrator, chosen: Validation) -> tuple[Slope, ...]:
+    """The derivative of the mean radiance along one random direction of each parameter."""
+    level = Significance(ALPHA, max(len(chosen.parameters), 1))
+    return tuple(check_gradient(scene, camera, ours, key, chosen, level) for key in chosen.parameters)
+
+
+def check_gradient(
+    scene: mi.Scene, camera: mi.Sensor, ours: mi.Integrator, key: str, chosen: Validation, level: Significance
+) -> Slope:
+    """One direction of one parameter: each value times a random number from 0 to 2, so that no step leads past 0 and what
+    the values do to the light does not cancel."""
+    params = mi.traverse(scene)
+    start = np.array(as_tensor(params[key]), dtype=np.float64)
+    direction = np.random.default_rng([chosen.seed, len(key)]).uniform(0.0, 2.0, start.shape) * start
+    if not direction.any():
+        raise MivolError(f"{key} is 0 everywhere, where a central difference would step below 0: put values into the scene.")
+    spp, slopes, near, far = math.ceil(chosen.spp / BATCHES), Moments.empty(), Moments.empty(), Moments.empty()
+    for batch in range(BATCHES):
+        seeds = [seed_of(chosen.seed, GRADIENT, batch, which) for which in range(4)]
+        slopes = slopes.add(slope_of(scene, camera, ours, key, direction, spp, (seeds[0], seeds[1])))
+        near = near.add(difference(scene, camera, ours, key, start, STEP * direction, spp, seeds[2]) / STEP)
+        far = far.add(difference(scene, camera, ours, key, start, 2 * STEP * direction, spp, seeds[3]) / (2 * STEP))
+    put(params, key, start)
+    g, d = Estimate.of(slopes), Estimate.of(near)
+    error = float(np.sqrt(g.var + d.var))
+    left_out = abs(float(far.mean - near.mean)) / 3
+    dof = effective_dof(np.array([g.var, d.var]), np.array([g.dof, d.dof]))
+    return Slope(key, float(g.mean), float(d.mean), error, left_out, float(z_bound(level, dof)) * error + left_out)
+
+
+def slope_of(
+    scene: mi.Scene, camera: mi.Sensor, integrator: mi.Integrator, key: str, direction: np.ndarray, spp: int,
+    seeds: tuple[int, int],
+) -> float:  # fmt: skip
+    """d mean radiance / d t of the parameter x + t v, by reverse mode."""
+    params = mi.traverse(scene)
+    dr.enable_grad(params[key])
+    params.update()
+    image = mi.render(scene, params, integrator=integrator, sensor=camera, spp=spp, seed=seeds[0], seed_grad=seeds[1])
+    dr.backward(dr.mean(image, axis=None))
+    gradient = np.array(as_tensor(dr.grad(params[key])), dtype=np.float64)
+    dr.disable_grad(params[key])
+    return float(np.sum(gradient * direction))
+
+
+def difference(
+    scene: mi.Scene, camera: mi.Sensor, integrator: mi.Integrator, key: str, start: np.ndarray, step: np.ndarray, spp: int,
+    seed: int,
+) -> float:  # fmt: skip
+    """Half the difference of the mean radiance a step on and a step back, with the same random numbers."""
+    params, means = mi.traverse(scene), []
+    for sign in (1.0, -1.0):
+        put(params, key, start + sign * step)
+        with dr.suspend_grad():
+            means.append(float(np.mean(np.asarray(integrator.render(scene, camera, seed=seed, spp=spp), np.float64))))
+    put(params, key, start)
+    return (means[0] - means[1]) / 2
+
+
+# -- Files --------------------------------------------------------------------------------------------------------
+
+
+def write_verdict(
+    verdict: Verdict, image: Estimate, reference: ReferenceResult, folder: Path, chosen: Validation
+) -> Verdict:
+    """``validation.json`` and ``validation.png``; the verdict that names them."""
+    # Where neither has any noise, z is drawn as if float32 had rounded the values once.
+    error = np.sqrt(np.asarray(image.var) + reference.variance + (6e-8 * max(float(reference.mean.max()), 1e-30)) ** 2)
+    picture = figures.save(figures.plot_image_row(reference.mean, image.mean, error), folder / "validation.png")
+    compared = verdict.comparison
+    about = {
+        "verdict": verdict.words,
+        "code": verdict.code,
+        "bias": asdict(compared.bias),
+        "z": {"bound": compared.bound, "share beyond": compared.beyond, "worst": float(np.max(np.abs(compared.z)))},
+        "relMSE": verdict.rel_mse,
+        "psnr": compared.psnr,
+        "gradients": [asdict(slope) | {"agrees": slope.agrees} for slope in verdict.slopes],
+        "doubts": [asdict(doubt) for doubt in verdict.doubts],
+        "settings": asdict(chosen),
+        "reference": reference.path.name,
+    }
+    path = folder / "validation.json"
+    write_whole_text(path, json.dumps(about, indent=2) + "\n")
+    return Verdict(compared, verdict.rel_mse, verdict.slopes, verdict.doubts, (path, picture))

@@ -1,0 +1,98 @@
+"""Examples that come with mivol: listed, copied, run, with a stand-in where public data is not there."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from tiny_experiment import SCENE, refused, run, write_experiment
+
+from mivol import config
+from mivol.experiments import examples
+from mivol.experiments.examples import EXAMPLES, examples_folder
+from mivol.experiments.references import load_experiment_scene
+from mivol.experiments.task import Nobody
+from mivol.files import read_volume
+from mivol.files.fetch import DATA
+
+SHORT = ["--set", "solve.iterations=1", "--set", "grid.shape=[4,4,4]", "--set", "scan.views=4", "--set", "scan.detector=[4,4]"]
+
+
+@pytest.fixture(autouse=True)
+def nothing_fetched(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A machine that holds no public data."""
+    monkeypatch.delenv("MIVOL_DATA", raising=False)
+    monkeypatch.setenv("MIVOL_CACHE", str(tmp_path / "cache"))
+
+
+def test_examples_are_listed_and_are_there(capsys: pytest.CaptureFixture) -> None:
+    """Each experiment of the scenes is an example."""
+    assert run("demo") == 0
+    assert [line.split()[0] for line in capsys.readouterr().out.splitlines()] == list(EXAMPLES)
+    assert {path.parent.name for path in examples_folder().glob("*/fit.toml")} == set(EXAMPLES)
+    assert 'did you mean "smoke"' in refused(capsys, "demo", "smok")
+
+
+def test_an_example_is_copied_once(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    assert run("demo", "demo", "--into", tmp_path / "mine") == 0
+    assert capsys.readouterr().out.strip() == str(tmp_path / "mine" / "fit.toml")
+    assert {path.name for path in (tmp_path / "mine").iterdir()} == {
+        path.name for path in (examples_folder() / "demo").iterdir()
+    }
+    assert "is there already" in refused(capsys, "demo", "demo", "--into", tmp_path / "mine")
+
+
+def test_an_example_runs(variant_rgb: str, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    assert run("demo", "shepp_logan", "-o", tmp_path / "run", *SHORT) == 0
+    assert capsys.readouterr().out.strip() == str(tmp_path / "run" / "report.html")
+    record = json.loads((tmp_path / "run" / "run.json").read_text())
+    assert record["config"]["grid"]["shape"] == [4, 4, 4]
+    assert record["command"].startswith("mivol demo shepp_logan")
+
+
+@pytest.mark.parametrize("name", [name for name, example in EXAMPLES.items() if example.stand_in is not None])
+def test_a_stand_in_takes_the_place_of_public_data(tmp_path: Path, name: str) -> None:
+    """Where the data is not there the settings name a seeded volume of its shape; where it is, they are left alone."""
+    example, told = EXAMPLES[name], []
+    watcher = Nobody()
+    watcher.say = told.extend
+    source = examples_folder() / name
+    changes = examples.prepare(name, example, source, tmp_path / "run", watcher)
+    assert "stands in for it" in told[0]
+    chosen = config.load(source / "fit.toml", changes)
+    setting = chosen.truth.file if example.stand_in.setting == "truth.file" else chosen.scene.define["volume"]
+    values = read_volume(setting, frame="unit").values
+    assert values.shape == (*example.stand_in.shape, 1)
+    assert 0.3 * example.stand_in.peak < values.max() <= example.stand_in.peak
+    there = tmp_path / "cache" / DATA[example.stand_in.data].path
+    there.parent.mkdir(parents=True)
+    there.touch()
+    assert examples.prepare(name, example, source, tmp_path / "run", watcher) == []
+
+
+def test_a_define_may_name_public_data(variant_rgb: str, tmp_path: Path) -> None:
+    """The scene of an experiment finds a set in the cache by its name."""
+    folder = write_experiment(tmp_path)
+    there = tmp_path / "cache" / DATA["smoke"].path
+    there.parent.mkdir(parents=True)
+    (folder / "start.vol").rename(there)
+    scene = SCENE.replace('value="start.vol"', 'value="$volume"')
+    default = '<default name="volume" value="none.vol"/>'
+    (folder / "scene.xml").write_text(scene.replace("<integrator", f"{default}<integrator", 1))
+    chosen = config.load(folder / "fit.toml", ['scene.define={volume="data:smoke"}'])
+    assert len(load_experiment_scene(chosen, folder).scene.shapes()) == 1
+
+
+def test_data_is_listed_with_licence_and_size(capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch) -> None:
+    """And the verb passes on what was asked for."""
+    assert run("fetch") == 0
+    said = capsys.readouterr().out.splitlines()
+    assert len(said) == len(DATA)
+    assert all("MiB; licence: " in line for line in said)
+    monkeypatch.setattr("mivol.files.fetch.fetch_data", lambda data, into: Path(into) / data.path)
+    assert run("fetch", "tooth", "--into", "here") == 0
+    printed = capsys.readouterr()
+    assert printed.out.strip() == str(Path("here/ct_mri/tooth.nrrd"))
+    assert "licence: BSD-3-Clause" in printed.err
+    assert 'did you mean "tooth"' in refused(capsys, "fetch", "tuth")
