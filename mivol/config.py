@@ -353,7 +353,8 @@ class Shown(Section):
 
     views: Annotated[int, of("view", "judged views that are shown beside their photographs", ge=0)] = 4
     frames: Annotated[int, of("frame", "of a turntable film; 0: none", ge=0)] = 60
-    every: Annotated[int, of("step", "between two looks at a held-out view", ge=1)] = 250
+    every: Annotated[int, of("step", "between two points of the curve of held-out views", ge=1)] = 250
+    judged: Annotated[int, of("view", "held-out views in that curve, the same at each point; 0: all", ge=0)] = 4
     metrics: Annotated[tuple[str, ...], of("1", "of the judged views: psnr, ssim, flip", min_length=1)] = ("psnr", "ssim")
 
     def __post_init__(self) -> None:

@@ -15,7 +15,7 @@ import platform
 import re
 import subprocess
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from types import ModuleType
 from typing import NamedTuple
@@ -63,6 +63,10 @@ _INSTALL = (
 )
 
 
+NAMES = ("libLLVM[-.]*so*", "libLLVM*.dylib", "LLVM-C.dll")
+"""Files of the library on Linux, macOS and Windows."""
+
+
 class LlvmError(MivolError, ImportError):
     """An llvm variant was asked for where no LLVM library works."""
 
@@ -74,15 +78,33 @@ class Library(NamedTuple):
     major: int
 
 
+def folders_of(system: str, machine: str, root: Path, prefix: Path, environment: Mapping[str, str]) -> list[Path]:
+    """Where LLVM libraries usually lie.
+
+    Args:
+        system: as ``sys.platform`` names it.
+        machine: as ``platform.machine()`` names it.
+        root: of the file system.
+        prefix: of this Python's environment.
+        environment: variables; ``CONDA_PREFIX`` and, on Windows, ``ProgramFiles`` and ``LOCALAPPDATA`` count.
+
+    Returns:
+        Folders in the order of the search, whether they are there or not.
+    """
+    bases = [prefix, *([Path(conda)] if (conda := environment.get("CONDA_PREFIX")) else [])]
+    if system == "win32":
+        programs = [Path(environment[name]) for name in ("ProgramFiles", "LOCALAPPDATA") if environment.get(name)]
+        return [*(base / "Library" / "bin" for base in bases), *(folder / "LLVM" / "bin" for folder in programs)]
+    own = [base / "lib" for base in bases]
+    if system == "darwin":
+        brews = [root / "opt/homebrew/opt", root / "usr/local/opt"]
+        return [*own, *(brew / "llvm/lib" for brew in brews), *(lib for b in brews for lib in sorted(b.glob("llvm@*/lib")))]
+    fixed = [root / f"usr/lib/{machine}-linux-gnu", root / "usr/lib64", root / "usr/local/lib"]
+    return [*own, *fixed, *sorted([*root.glob("usr/lib/llvm-*/lib"), *root.glob("usr/lib64/llvm*/lib*")])]
+
+
 def _folders() -> list[Path]:
-    machine = platform.machine()
-    prefixes = [Path(sys.prefix) / "lib"]
-    if conda := os.environ.get("CONDA_PREFIX"):
-        prefixes.append(Path(conda) / "lib")
-    fixed = [f"/usr/lib/{machine}-linux-gnu", "/usr/lib64", "/usr/local/lib", "/opt/homebrew/opt/llvm/lib"]
-    versioned = [*Path("/usr/lib").glob("llvm-*/lib"), *Path("/usr/lib64").glob("llvm*/lib*")]
-    versioned += Path("/opt/homebrew/opt").glob("llvm@*/lib")
-    return [*prefixes, *map(Path, fixed), *sorted(versioned)]
+    return folders_of(sys.platform, platform.machine(), Path("/"), Path(sys.prefix), os.environ)
 
 
 def _stated_major(path: Path) -> int | None:
@@ -128,7 +150,7 @@ def find_libraries(folders: Iterable[Path] | None = None) -> list[Library]:
     """
     found: dict[Path, Library] = {}
     for folder in _folders() if folders is None else folders:
-        for path in sorted([*folder.glob("libLLVM[-.]*so*"), *folder.glob("libLLVM*.dylib")]):
+        for path in sorted(path for name in NAMES for path in folder.glob(name)):
             real = Path(os.path.realpath(path))
             if real in found or not real.is_file():
                 continue

@@ -251,3 +251,29 @@ def test_machine_limits_of_a_control_group(tmp_path: Path, monkeypatch: pytest.M
     (tmp_path / "memory.stat").write_text("anon 500000\ninactive_file 100000\n")
     assert machine.cores() == 1
     assert free is None or machine.available_memory() == 500000
+
+
+FAKED = {
+    "linux": ("usr/lib/llvm-19/lib/libLLVM.so.19.1", "usr/lib64/llvm18/lib64/libLLVM-18.so", "env/lib/libLLVM.so.20.1"),
+    "darwin": ("opt/homebrew/opt/llvm@19/lib/libLLVM.dylib", "usr/local/opt/llvm/lib/libLLVM.dylib", "env/lib/libLLVM.dylib"),
+    "win32": ("programs/LLVM/bin/LLVM-C.dll", "local/LLVM/bin/LLVM-C.dll", "conda/Library/bin/LLVM-C.dll"),
+}
+
+
+@pytest.mark.parametrize("system", FAKED)
+def test_search_knows_where_each_system_keeps_libraries(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, system: str
+) -> None:
+    """A tree as that system has it: every library in it is found, and nothing of the other systems'."""
+    for names in FAKED.values():
+        for name in names:
+            (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+            (tmp_path / name).touch()
+    monkeypatch.setattr(llvm, "probe", lambda path: (19, ""))
+    variables = {"ProgramFiles": tmp_path / "programs", "LOCALAPPDATA": tmp_path / "local", "CONDA_PREFIX": tmp_path / "conda"}
+    environment = {name: str(path) for name, path in variables.items()}
+    folders = llvm.folders_of(system, "x86_64", tmp_path, tmp_path / "env", environment)
+    found = {lib.path.relative_to(tmp_path).as_posix() for lib in llvm.find_libraries(folders)}
+    assert set(FAKED[system]) <= found
+    own = {"env/lib/libLLVM.so.20.1", "env/lib/libLLVM.dylib"}
+    assert found - set(FAKED[system]) <= own

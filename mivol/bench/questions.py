@@ -80,7 +80,7 @@ class Bench:
         """What :meth:`run` does with a command line that was read; the JSON."""
         mi.set_variant(args.variant)
         size = self.quick if args.quick else self.full
-        start, load = time.perf_counter(), os.getloadavg()[0]
+        start, load = time.perf_counter(), load_of_machine()
         answers = self.ask(args.only.split(","), size)
         figures = header(size.name, args.variant, load, start) | answers
         args.out.mkdir(parents=True, exist_ok=True)
@@ -106,7 +106,7 @@ class Bench:
         return args
 
 
-def header(size: str, variant: str, load: float, start: float) -> dict:
+def header(size: str, variant: str, load: float | None, start: float) -> dict:
     """With what every JSON begins: size, machine, versions, load of the machine, seconds since the start."""
     return {
         "size": size,
@@ -114,9 +114,14 @@ def header(size: str, variant: str, load: float, start: float) -> dict:
         "versions": versions(),
         "variant": variant,
         "threads": dr.thread_count(),
-        "load_before_and_after": [load, os.getloadavg()[0]],
+        "load_before_and_after": [load, load_of_machine()],
         "seconds": round(time.perf_counter() - start, 1),
     }
+
+
+def load_of_machine() -> float | None:
+    """Processes that want to run, on the mean over a minute; None on Windows, which does not count them."""
+    return os.getloadavg()[0] if hasattr(os, "getloadavg") else None
 
 
 def without_arrays(answer: object) -> object:

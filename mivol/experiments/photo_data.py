@@ -66,11 +66,17 @@ def _about_silhouettes(photos: Photos) -> Photos:
 BOXES = {"cameras": lambda photos: photos, "silhouettes": _about_silhouettes}
 
 
-def notes(photos: Photos) -> list[str]:
+def notes(photos: Photos, judged: Photos | None = None) -> list[str]:
     """What a reader must know of the photographs."""
     found = [f"Colours are {photos.space} code values; in a scene mivol_sh shows them as they are."]
     if any(space_of(frame.file) == "linear" for frame in photos.survey.frames):
         found.append("The light of OpenEXR photographs was encoded; what is above 1 counts as 1.")
+    if judged is not None:
+        width, height = judged.views[0].camera.size
+        found.append(
+            f"{len(judged.views)} views are judged, the first at {width} x {height} pixels; PSNR is the mean over them, of "
+            "sRGB codes of 8 bits, with the peak 1."
+        )
     if photos.skipped:
         found.append(f"{len(photos.skipped)} photographs are listed and not there: {', '.join(photos.skipped[:5])} ...")
     return found

@@ -1,18 +1,20 @@
 """A radiance field fitted to photographs: from the settings of an experiment to a run folder, one call per arrow.
 
-Conventions. ``metrics.jsonl`` has ``loss`` (mean squared error of a step's rays) and the metrics of one judged view now and
-then; ``field.npz`` is the field, ``film/turntable.mp4`` (``.webp`` where there is no ffmpeg) a camera path around it.
+Conventions. ``metrics.jsonl`` has ``loss`` (mean squared error of a step's rays) and the PSNR of a fixed set of judged views
+now and then; ``field.npz`` is the field, ``film/turntable.mp4`` (``.webp`` where there is no ffmpeg) a camera path around it.
 """
 
 from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
+
 from mivol import config
 from mivol.config import FieldFit
 from mivol.experiments.back_end import choose_back_end
 from mivol.experiments.photo_data import boxed, notes, read_photos
-from mivol.experiments.photo_outputs import PhotoOutputs, compare, named
+from mivol.experiments.photo_outputs import PhotoOutputs, compare
 from mivol.experiments.photo_plan import choices, make_plan, shrunk
 from mivol.experiments.run_folder import RunFolder
 from mivol.experiments.task import Task
@@ -42,7 +44,7 @@ def photo_fit(task: Task) -> Path:
             photos = boxed(chosen, photos)
             plan = shrunk(asked, photos)
             batches = RayBatches.of([rectified(view) for view in photos.views], [stage.shrink for stage in plan.stages])
-            run.record.plan, run.record.notes = choices(plan, photos, batches), notes(photos)
+            run.record.plan, run.record.notes = choices(plan, photos, batches), notes(photos, judged)
             task.watcher.say([photos.text, *(f"{one.choice}: {one.reason}" for one in run.record.plan)])
         with run.stage("fit"):
             fit = solve(task, run, RadianceProblem(batches, photos.box, plan, chosen.seed), judged)
@@ -84,7 +86,7 @@ def solve(task: Task, run: RunFolder, problem: RadianceProblem, judged: Photos |
         def observe(fit: Fit) -> None:
             if fit.next % every == 0 or fit.next == plan.steps:
                 problem.set(fit.run.reals)
-                run.append(fit.next, fit.seconds, loss=fit.history[-1]["loss"], **judge_one(chosen, problem, judged, fit.next))
+                run.append(fit.next, fit.seconds, loss=fit.history[-1]["loss"], **judge_few(chosen, problem, judged))
             watch(fit)
 
         fit.complete(observe)
@@ -92,9 +94,14 @@ def solve(task: Task, run: RunFolder, problem: RadianceProblem, judged: Photos |
     return fit
 
 
-def judge_one(chosen: FieldFit, problem: RadianceProblem, judged: Photos | None, step: int) -> dict[str, float]:
-    """How well one judged view is rendered, another one each time."""
+def judge_few(chosen: FieldFit, problem: RadianceProblem, judged: Photos | None) -> dict[str, float]:
+    """Mean PSNR of a fixed set of judged views, spread evenly over them: the points of a curve can be compared.
+
+    It is called that of the held-out views where it is that of all of them only.
+    """
     if judged is None:
         return {}
-    photo = judged.views[step // chosen.show.every % len(judged.views)]
-    return named(compare(chosen, problem, judged, photo)[1].values)
+    count = min(chosen.show.judged or len(judged.views), len(judged.views))
+    numbers = np.linspace(0, len(judged.views) - 1, count).round().astype(int)
+    found = [compare(problem, judged, judged.views[number], ("psnr",))[1].values["psnr"] for number in numbers]
+    return {"held_out_psnr" if count == len(judged.views) else "few_psnr": float(np.mean(found))}

@@ -81,7 +81,7 @@ class PhotoOutputs:
         views, found, images = self.judged.views, [], self.run.record.images
         shown = set(np.linspace(0, len(views) - 1, min(chosen.show.views, len(views))).astype(int).tolist())
         for number, photo in enumerate(views):
-            seen, quality = compare(chosen, self.problem, self.judged, photo)
+            seen, quality = compare(self.problem, self.judged, photo, chosen.show.metrics)
             found.append(quality)
             if number in shown:
                 images += write_view(self.run.path, photo, number, seen.image)
@@ -106,10 +106,12 @@ class PhotoOutputs:
         return Image(path=path, role="film", caption=f"{count} views around the box")
 
 
-def compare(chosen: FieldFit, problem: RadianceProblem, judged: Photos, photo: Photo) -> tuple[FieldView, Quality]:
+def compare(
+    problem: RadianceProblem, judged: Photos, photo: Photo, metrics: tuple[str, ...]
+) -> tuple[FieldView, Quality]:
     """A photograph's view of the field, and how alike they are."""
     seen = render_view(problem.field, photo.camera, behind(problem, photo))
-    asked = {"space": judged.space, "mask": photo.mask, "metrics": chosen.show.metrics, "name": photo.name}
+    asked = {"space": judged.space, "mask": photo.mask, "metrics": metrics, "name": photo.name}
     return seen, judge(seen.image, photo.image, **asked)
 
 

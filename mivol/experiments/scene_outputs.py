@@ -48,6 +48,11 @@ class SceneOutputs:
         """Write images, volumes and curves, and put them and the results on record."""
         record, fit = self.run.record, self.fit
         self.run.make("views", "volumes")
+        if self.seen.held_out:
+            record.notes.append(
+                f"PSNR of the held-out views is the mean over {len(self.seen.held_out)} of them, the same at each point of the "
+                "curve; the peak is the largest value of each reference."
+            )
         record.notes += fit.log + ([f"stopped early: {fit.run.finished}"] if fit.run.finished else []) + self.best.says()
         for number, view in enumerate((*self.seen.fitted, *self.seen.held_out)):
             record.images += self.write_view(view, seed_of(self.chosen.seed, 0, number, FINAL))

@@ -118,14 +118,19 @@ def _listed(file: Path, table: Mapping[str, Any]) -> dict[str, str]:
 
 def _place(file: Path, name: str) -> str:
     """Where a photograph lies, however it is written: ``./a.png`` and ``a.png`` are one."""
-    return os.path.normpath(file.parent.absolute() / name)
+    return os.path.normpath(file.parent.absolute() / slashed(file.parent, name))
+
+
+def slashed(folder: Path, name: str) -> str:
+    """The name of a file with forward slashes: data sets made on Windows name ``images\\a.png``, which other systems miss."""
+    return name if "\\" not in name or (folder / name).is_file() else name.replace("\\", "/")
 
 
 def _entry(file: Path, table: Mapping[str, Any], frame: Mapping[str, Any], number: int, split: str) -> Entry:
     missing = [key for key in ("file_path", "transform_matrix") if not isinstance(frame, dict) or key not in frame]
     if missing:
         raise refusal(file, f"frame {number} without {missing[0]}", "file_path and transform_matrix", "write it again")
-    name = str(frame["file_path"])
+    name = slashed(file.parent, str(frame["file_path"]))
     settings = Settings({**table, **frame}, f"{file.name} {name}")
 
     def camera(size: tuple[int, int]) -> Camera:
@@ -140,7 +145,7 @@ def _entry(file: Path, table: Mapping[str, Any], frame: Mapping[str, Any], numbe
         camera,
         split,
         settings.size(),
-        file.parent / mask if mask else None,
+        file.parent / slashed(file.parent, mask) if mask else None,
     )
 
 

@@ -280,6 +280,15 @@ def test_lists_of_splits_are_of_files_however_they_are_written(tmp_path: Path, p
     assert "4 photographs (2 train, 1 test, 1 in no list)" in survey_photos(folder).text
 
 
+def test_names_of_another_system_are_found(tmp_path: Path) -> None:
+    """A data set that was written on Windows: backslashes in frames and lists lead to the same files."""
+    folder = write_transforms(tmp_path / "set", {"fl_x": 20, "test_filenames": ["images\\0002.png"]})
+    file = folder / "transforms.json"
+    file.write_text(file.read_text().replace("images/", "images\\\\"))
+    assert [view.name for view in load_photos(folder, split="test").views] == ["0002.png"]
+    assert len(load_photos(folder).views) == 3
+
+
 def test_masks_are_black_where_nothing_counts(tmp_path: Path) -> None:
     folder = write_transforms(tmp_path / "set", {"fl_x": 20})
     mask = np.full((8, 12), 255, np.uint8)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import resource
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -126,5 +126,14 @@ def ask_memory(size: Size) -> dict:
         "field_bytes": field.bytes,
         "peak_bytes": peaks,
         "bytes_per_ray": (peaks[1] - peaks[0]) / rays_more,
-        "resident_bytes": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024,
+        "resident_bytes": resident_bytes(),
     }
+
+
+def resident_bytes() -> int | None:
+    """The most memory that this process has held; None on Windows, whose Python does not tell."""
+    if sys.platform == "win32":
+        return None
+    import resource
+
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
