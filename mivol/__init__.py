@@ -1,4 +1,9 @@
-"""Differentiable and inverse volume rendering on Mitsuba 3. Importing this needs no variant."""
+"""Differentiable and inverse volume rendering on Mitsuba 3. Importing this needs no variant.
+
+``mivol.<tab>`` shows what a script needs: scenes (``load_scene``, ``explain``, ``render_reference``), fits (``Problem``,
+``Parameter``, ``optimize`` and optimisers), volumes (``read_volume``, ``write_volume``), photographs (``load_photos``,
+``fit_photographs``, ``load_field``) and tomography (``Projector`` and its geometries). Each is imported when it is first used.
+"""
 
 from __future__ import annotations
 
@@ -17,9 +22,43 @@ except (ImportError, NameError) as error:  # a NameError is how Dr.Jit 1.5 repor
 from . import plugins  # noqa: E402
 from .errors import MivolError, reveal_refusals  # noqa: E402
 
-__all__ = ["MivolError", "__version__"]
-
 __version__ = "0.1.0"
+
+PUBLIC = {
+    "Adam": "optim.adam",
+    "ConeBeam": "tomography.geometry",
+    "GaussNewton": "optim.gauss_newton",
+    "Lbfgs": "optim.lbfgs",
+    "ParallelBeam": "tomography.geometry",
+    "Parameter": "optim.parameters",
+    "Problem": "experiments.script",
+    "Projector": "tomography.projector",
+    "RMSprop": "optim.rmsprop",
+    "VoxelGrid": "tomography.geometry",
+    "explain": "scene.explain",
+    "fit_photographs": "experiments.script",
+    "load_field": "fields.spherical_files",
+    "load_photos": "photos",
+    "load_scene": "scene.load",
+    "optimize": "experiments.script",
+    "read_volume": "files",
+    "render_reference": "validate.reference",
+    "save_field": "fields.spherical_files",
+    "write_volume": "files",
+}
+"""What ``mivol.<name>`` is, and the module below mivol that it comes from."""
+
+__all__ = ["MivolError", "__version__", *PUBLIC]
+
+
+def __getattr__(name: str) -> object:
+    if name not in PUBLIC:
+        raise AttributeError(f"module 'mivol' has no attribute {name!r}")
+    return getattr(importlib.import_module(f"mivol.{PUBLIC[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)
 
 
 def _on_variant_change(old: str | None, new: str) -> None:

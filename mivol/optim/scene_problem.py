@@ -21,6 +21,7 @@ import mitsuba as mi
 import numpy as np
 
 from mivol.errors import MivolError
+from mivol.optim.given import GivenLoss, as_loss
 from mivol.optim.losses import L2, Loss
 from mivol.optim.noise import Compared, compare, halves_of, noise_check, warning
 from mivol.optim.parameters import Parameter, as_tensor, check_names, find, like
@@ -38,7 +39,7 @@ class SceneProblem:
         views: all of one size.
         parameters: what is looked for.
         integrator: differentiable; None takes the scene's own.
-        loss: one of LOSSES.
+        loss: one of LOSSES, or any function of image and reference (:class:`mivol.optim.given.GivenLoss`).
         spp: samples per pixel of an image, and of its derivative.
         samples_per_pass: most samples in one kernel.
         seed: root of all random numbers.
@@ -67,7 +68,9 @@ class SceneProblem:
             find(parameter.name, self.params)
         check_names([parameter.name for parameter in self.parameters])
         self.params.keep([parameter.name for parameter in self.parameters])
-        self.batches = make_batches(self.views, self.samples_per_pass)
+        self.loss = as_loss(self.loss)
+        alone = isinstance(self.loss, GivenLoss)
+        self.batches = single_batches(self.views) if alone else make_batches(self.views, self.samples_per_pass)
         self.newest_loss = (0.0, 0.0)
         self._has_noise = noise_check(self.integrator, self.scene)
         self.noisy = self._has_noise()

@@ -1,0 +1,180 @@
+"""What a script needs in a line each: a problem from a scene and pictures, its optimisation, a field from photographs.
+
+Conventions. Everything here is made of parts that can be had by themselves (``mivol.optim``, ``mivol.experiments``); nothing is
+printed, and nothing is written but by :func:`fit_photographs`.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mivol import config
+from mivol.errors import MivolError
+from mivol.experiments.runs import run_experiment
+from mivol.experiments.task import Nobody, Task, Watcher
+from mivol.fields.spherical import SphericalGrid
+from mivol.fields.spherical_files import load_field
+from mivol.files import layers, read_exr
+from mivol.optim.adam import Adam
+from mivol.optim.given import as_optimiser
+from mivol.optim.loop import Fit, Measure, reconstruct
+from mivol.optim.losses import L2, Loss
+from mivol.optim.optimiser import Optimiser
+from mivol.optim.parameters import Parameter
+from mivol.optim.render_batches import View
+from mivol.optim.scene_problem import SceneProblem
+from mivol.scene.explain import settings_of
+from mivol.scene.load import SceneSource, load_scene
+
+__all__ = ["Problem", "fit_photographs", "optimize"]
+
+Reference: TypeAlias = "np.ndarray | mi.TensorXf | str | os.PathLike[str]"
+"""A picture: an array (height, width, channels) of linear radiance, or the OpenEXR file of one."""
+
+
+class Problem(SceneProblem):
+    """A scene, pictures of it, and what is looked for.
+
+    Args:
+        scene: a scene, a dict, or the path of its XML.
+        references: one picture a sensor; or a scene, which is rendered from the same sensors by its own integrator.
+        parameters: what is looked for: keys of ``mi.traverse(scene)``, or :class:`Parameter` with domain, rate and priors.
+        loss: one of ``mivol.optim.losses``, or any function (image, reference) -> one number, of tensors (height, width,
+            channels).
+        integrator: that differentiates; None takes the scene's own where that is mivol's, else mivol's at the same depth.
+        sensors: where the pictures were taken from; None: the scene's own sensors.
+        spp: samples per pixel of an image, and of its derivative.
+        seed: root of all random numbers.
+
+    Raises:
+        MivolError: another number of pictures than sensors, pictures of another size than their sensors or not finite, or a
+            key that is not there.
+
+    Example:
+        >>> problem = mivol.Problem("scene.xml", ["a.exr", "b.exr"], ["smoke.interior_medium.sigma_t.data"])
+        >>> fit = mivol.optimize(problem, mivol.Adam(), 100)
+    """
+
+    def __init__(
+        self,
+        scene: SceneSource | mi.Scene,
+        references: Sequence[Reference] | mi.Scene,
+        parameters: Sequence[str | Parameter],
+        *,
+        loss: Loss | Callable[[mi.TensorXf, mi.TensorXf], Any] = L2(),  # noqa: B008  (frozen)
+        integrator: mi.Integrator | None = None,
+        sensors: Sequence[mi.Sensor] | None = None,
+        spp: int = 16,
+        seed: int = 0,
+    ) -> None:
+        loaded = load_scene(scene).scene
+        looked_from = list(loaded.sensors() if sensors is None else sensors)
+        sought = [Parameter(one) if isinstance(one, str) else one for one in parameters]
+        views = make_views(references, looked_from)
+        super().__init__(loaded, views, sought, integrator or ours_for(loaded), loss, spp, seed=seed)
+
+
+def ours_for(scene: mi.Scene) -> mi.Integrator:
+    """The scene's own integrator where it is mivol's, else mivol's at the same depth."""
+    own = scene.integrator()
+    return own if hasattr(own, "session") else mi.load_dict({"type": "mivol", "max_depth": settings_of(scene).max_depth})
+
+
+def make_views(references: Sequence[Reference] | mi.Scene, sensors: Sequence[mi.Sensor]) -> list[View]:
+    """Sensors with what they saw.
+
+    Raises:
+        MivolError: another number of pictures than sensors.
+    """
+    if isinstance(references, mi.Scene):
+        integrator = references.integrator() or ours_for(references)
+        with dr.suspend_grad():
+            seen = [mi.render(references, sensor=sensor, integrator=integrator, seed=n) for n, sensor in enumerate(sensors)]
+    else:
+        seen = [picture(one) for one in references]
+    if len(seen) != len(sensors):
+        raise MivolError(f"found {len(seen)} references for {len(sensors)} sensors: give one for each (sensors=...).")
+    return [View(f"view {number}", sensor, one) for number, (sensor, one) in enumerate(zip(sensors, seen, strict=True))]
+
+
+def picture(reference: Reference) -> mi.TensorXf:
+    """A reference as a tensor (height, width, channels); of a file its colour.
+
+    Raises:
+        MivolError: a file that cannot be read, or an array that is no picture.
+    """
+    if isinstance(reference, str | os.PathLike):
+        values = layers(read_exr(Path(reference))[0])[""][..., :3]
+    else:
+        values = np.asarray(reference, dtype=np.float32)
+    values = values[..., None] if values.ndim == 2 else values
+    if values.ndim != 3:
+        raise MivolError(f"a reference has the shape {values.shape}, expected (height, width, channels) of a picture.")
+    return mi.TensorXf(np.ascontiguousarray(values, dtype=np.float32))
+
+
+def optimize(
+    problem: SceneProblem,
+    optimiser: Optimiser | mi.ad.Optimizer | None = None,
+    iterations: int = 100,
+    *,
+    measure: Measure | None = None,
+    observer: Callable[[Fit], None] = lambda fit: None,
+) -> Fit:
+    """Minimise; the scene holds the result afterwards.
+
+    Args:
+        problem: what is minimised.
+        optimiser: one of mivol's, one of ``mi.ad``, or your own with a method ``begin(problem)``; None: Adam.
+        iterations: at most so many.
+        measure: errors by name, of what the problem holds at the end.
+        observer: called after each iteration.
+
+    Returns:
+        The fit: ``fit.values()`` are what was found, ``fit.history`` the losses.
+
+    Raises:
+        MivolError: a loss that is not finite, or what cannot be rendered.
+        KeyboardInterrupt: Ctrl-C; the scene holds what was found so far.
+    """
+    return reconstruct(problem, as_optimiser(optimiser or Adam()), iterations, measure=measure, observer=observer)
+
+
+def fit_photographs(
+    photographs: str | os.PathLike,
+    output: str | os.PathLike = "runs/field",
+    settings: Mapping[str, Any] | None = None,
+    watcher: Watcher | None = None,
+) -> SphericalGrid:
+    """Fit a radiance field to posed photographs; ``field.npz`` and its page lie in the run folder.
+
+    Args:
+        photographs: a folder, or its file of cameras (Blender, nerfstudio, instant-ngp, COLMAP).
+        output: run folder.
+        settings: of the TOML file by dotted key, as ``{"field.preset": "tiny", "photos.background": "white"}``.
+        watcher: who is told how it goes; None: nobody.
+
+    Raises:
+        MivolError: what ``mivol optimize`` refuses, in the same words.
+
+    Example:
+        >>> field = mivol.fit_photographs("photographs", "runs/field", {"field.preset": "tiny"})
+    """
+    path = Path(photographs).resolve()
+    raw: dict[str, Any] = {"title": path.stem, "photos": {"path": str(path)}}
+    for key, value in (settings or {}).items():
+        *tables, last = key.split(".")
+        place = raw
+        for table in tables:
+            place = place.setdefault(table, {})
+        place[last] = value
+    chosen = config.from_dict(raw, "fit_photographs")
+    run_experiment(Task(chosen, Path(), Path(output), watcher=watcher or Nobody()))
+    return load_field(Path(output) / "field.npz")

@@ -1,0 +1,166 @@
+"""What a script needs in a line each: problems with a loss and an optimiser of one's own, references of every kind."""
+
+from __future__ import annotations
+
+import runpy
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from ball_photos import ball, photo
+from fit_scene import KEY
+from PIL import Image
+from tiny_experiment import SCENE
+
+import mivol
+from mivol.errors import MivolError
+from mivol.experiments.script import Problem, optimize
+from mivol.files import read_exr, write_exr
+from mivol.optim.losses import L2
+from mivol.photos.transforms import write_transforms
+
+SCRIPTS = Path(__file__).resolve().parents[2] / "docs" / "scripts"
+
+
+def mean_square(image: mi.TensorXf, reference: mi.TensorXf) -> mi.Float:
+    return dr.mean(dr.square(image - reference), axis=None)
+
+
+@pytest.fixture
+def scene(variant_rgb: str, folder: Path) -> mi.Scene:
+    return mi.load_file(str(folder / "scene.xml"))
+
+
+def seen(level: float = 0.6) -> np.ndarray:
+    """A picture of the scene's sensor."""
+    return np.full((6, 8, 3), level, np.float32)
+
+
+def test_a_function_is_a_loss(scene: mi.Scene) -> None:
+    """The mean square written down by hand has the value and the gradient of the loss of that name."""
+    found = []
+    for loss in (mean_square, L2()):
+        problem = Problem(scene, [seen()], [KEY], loss=loss, spp=4)
+        value, gradients = problem.loss_and_gradient(problem.start(), 0)
+        found.append((value, np.array(gradients[KEY])))
+    assert np.isclose(found[0][0], found[1][0], rtol=1e-6)
+    np.testing.assert_allclose(found[0][1], found[1][1], rtol=1e-5)
+    assert np.abs(found[0][1]).max() > 0
+
+
+def test_a_function_sees_one_view_at_a_time(scene: mi.Scene) -> None:
+    """Views side by side in one image would give a loss that looks at neighbours the wrong ones."""
+    shapes = []
+
+    def look(image: mi.TensorXf, reference: mi.TensorXf) -> mi.Float:
+        shapes.append(tuple(image.shape))
+        return mean_square(image, reference)
+
+    sensor = scene.sensors()[0]
+    problem = Problem(scene, [seen(), seen()], [KEY], loss=look, sensors=[sensor, sensor], spp=4)
+    problem.loss_and_gradient(problem.start(), 0)
+    assert shapes == [(6, 8, 3)] * 2
+
+
+@pytest.mark.parametrize(
+    "make", [None, lambda: mi.ad.Adam(lr=0.1), lambda: mi.ad.SGD(lr=2.0, momentum=0.5), mivol.Adam], ids=str
+)
+def test_any_optimiser_lowers_the_loss(scene: mi.Scene, make) -> None:
+    """The start's transmittance of 0.6 and more is brought towards 0.3 by every optimiser; values stay in their domain."""
+    sought = mivol.Parameter(KEY, domain=(0, 0.9), lr=0.1)
+    fit = optimize(Problem(scene, [seen(0.3)], [sought], spp=4), make and make(), 8)
+    losses = [row["loss"] for row in fit.history]
+    assert losses[-1] < losses[0]
+    assert np.array(fit.values()[KEY]).max() <= np.float32(0.9)
+
+
+def test_references_are_arrays_files_or_a_scene(scene: mi.Scene, folder: Path) -> None:
+    write_exr(folder / "seen.exr", {"": seen(0.5)})
+    for given in ([seen(0.5)], [folder / "seen.exr"], [str(folder / "seen.exr")], [mi.TensorXf(seen(0.5))]):
+        problem = Problem(folder / "scene.xml", given, [KEY])
+        assert np.array_equal(np.array(problem.views[0].reference), seen(0.5))
+    (folder / "plain.xml").write_text(SCENE.replace('<string name="aovs" value="tau"/>', ""))
+    plain = mi.load_file(str(folder / "plain.xml"))
+    problem = Problem(plain, plain, [KEY])
+    # Absorption has no noise but that of the places in a pixel: the scene is its own reference to a few thousandths.
+    assert problem.loss_value(problem.start(), 0) < 1e-3
+
+
+def refuses(sentence: str):
+    return pytest.raises(MivolError, match=sentence)
+
+
+def test_what_a_script_gets_wrong_is_said(scene: mi.Scene) -> None:
+    with refuses("2 references for 1 sensors"):
+        Problem(scene, [seen(), seen()], [KEY])
+    with refuses(r"shape \(6,\), expected \(height, width, channels\)"):
+        Problem(scene, [np.zeros(6)], [KEY])
+    with refuses("found int"):
+        Problem(scene, [seen()], [KEY], loss=3)
+    with refuses("found str"):
+        optimize(Problem(scene, [seen()], [KEY]), "adam", 1)
+    for loss, sentence in (
+        (lambda image, reference: 0.5, "gave a float"),
+        (lambda image, reference: image - reference, r"gave a TensorXf of shape \(6, 8, 3\)"),
+        (lambda image, reference: mi.Float(0.5), "no derivative leads"),
+    ):
+        problem = Problem(scene, [seen()], [KEY], loss=loss)
+        with refuses(sentence):
+            problem.loss_and_gradient(problem.start(), 0)
+
+
+def test_the_package_shows_what_a_script_needs() -> None:
+    """Every name is there, has a docstring, and is listed; none other is."""
+    for name in mivol.PUBLIC:
+        assert (getattr(mivol, name).__doc__ or "").strip(), name
+        assert name in dir(mivol)
+    with pytest.raises(AttributeError, match="no attribute 'frog'"):
+        mivol.frog  # noqa: B018
+
+
+@pytest.mark.parametrize("path", sorted(SCRIPTS.glob("*.py")), ids=lambda path: path.stem)
+def test_scripts_of_the_docs_are_short(path: Path) -> None:
+    assert sum(bool(line.strip()) for line in path.read_text().splitlines()) <= 15
+
+
+@pytest.mark.slow
+def test_scripts_of_the_docs_run(variant_rgb: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ten pictures of a denser cube: its density is found to a tenth, and the light that is put in its place is orange."""
+    monkeypatch.chdir(folder)
+    text = SCENE.replace('<emitter type="constant"/>', '<emitter type="constant" id="sky"/>').replace('"tau"', '""')
+    sensor = text[text.index("<sensor") : text.index("</sensor>") + 9]
+    turned = [sensor.replace("0, 1, 4", f"{4 * np.sin(a):.4f}, 1, {4 * np.cos(a):.4f}") for a in np.linspace(0, 3, 10)]
+    (folder / "scene.xml").write_text(text.replace(sensor, "\n".join(turned)))
+    scene = mi.load_file(str(folder / "scene.xml"))
+    params = mi.traverse(scene)
+    params[KEY] = mi.TensorXf(np.full((2, 2, 2, 1), 0.75, np.float32))
+    params.update()
+    (folder / "pictures").mkdir()
+    for number in range(10):
+        image = np.array(mi.render(scene, sensor=number, spp=64))
+        write_exr(folder / "pictures" / f"{number:02d}.exr", {"": image})
+    runpy.run_path(str(SCRIPTS / "own_loss.py"))
+    np.testing.assert_allclose(mivol.read_volume("density.vol").values, 0.75, rtol=0.1)
+    runpy.run_path(str(SCRIPTS / "relight.py"))
+    channels, _ = read_exr(folder / "relit.exr")
+    assert channels["R"].mean() > 1.5 * channels["B"].mean() > 0
+
+
+@pytest.mark.slow
+def test_photographs_of_the_docs_become_a_scene(variant_rgb: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Twelve views of a ball, with alpha: the scene shows something other than its floor where the ball is."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "photographs").mkdir()
+    field, cameras = ball(), {}
+    for number in range(12):
+        view = photo(field, number, 32)
+        rgba = np.dstack([view.image, np.clip(view.alpha, 0, 1)])
+        Image.fromarray(np.round(rgba * 255).astype(np.uint8)).save(tmp_path / "photographs" / f"{number}.png")
+        cameras[f"{number}.png"] = view.camera
+    write_transforms(tmp_path / "photographs" / "transforms.json", cameras, [])
+    runpy.run_path(str(SCRIPTS / "photographs.py"))
+    image = np.array(mi.Bitmap("scene.exr"))[..., :3]
+    assert np.isfinite(image).all()
+    assert image.reshape(-1, 3).std(axis=0).min() > 0.02
