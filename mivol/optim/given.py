@@ -17,7 +17,7 @@ from mivol.optim.problem import Differentiable
 __all__ = ["GivenLoss", "GivenOptimiser", "as_loss", "as_optimiser"]
 
 
-class GivenLoss(Loss, tag="given"):
+class GivenLoss(Loss, tag="given", kw_only=True):
     """A function (image, reference) -> number, of one view at a time: it may look at neighbours, which views side by side would
     give it wrong ones of.
 
@@ -47,7 +47,7 @@ class GivenLoss(Loss, tag="given"):
         return value.array if dr.is_tensor_v(value) else value
 
 
-class GivenOptimiser(Optimiser, tag="given"):
+class GivenOptimiser(Optimiser, tag="given", kw_only=True):
     """An optimiser of ``mi.ad``, at the learning rate that it was made with.
 
     Its state is its own, so that such a fit has no checkpoint.
