@@ -15,7 +15,7 @@ shape = load("shape")
 
 PACKAGE = Path(__file__).resolve().parents[1] / "mivol"
 ORDER = [
-    *("errors", "cite", "threads", "machine", "llvm", "numerics", "space", "files", "photos", "fields", "phase"),
+    *("errors", "shown", "cite", "threads", "machine", "llvm", "numerics", "space", "files", "photos", "fields", "phase"),
     *("transport", "tomography", "scene", "plugins", "optim", "validate", "report", "schema", "config", "doctor"),
     *("experiments", "bench", "cli", "__main__"),
 ]

@@ -13,6 +13,7 @@ from mivol.config import Cone, Detector, Ellipsoids, Known, Measured, Parallel, 
 from mivol.errors import MivolError
 from mivol.files import read_columns, read_projections, read_stack, read_volume
 from mivol.files.fetch import place_of
+from mivol.shown import briefly
 from mivol.tomography.geometry import ConeBeam, Geometry, ParallelBeam, VoxelGrid
 from mivol.tomography.panel_views import COLUMNS, PanelViews
 from mivol.tomography.phantoms import shepp_logan
@@ -24,6 +25,7 @@ UNKNOWN_NOISE = 1e-4
 """Variance of a transmission of 1 where the noise was not measured: that of 1e4 quanta."""
 
 
+@briefly
 @dataclass(frozen=True)
 class Projections:
     """Line integrals and what they were taken with.

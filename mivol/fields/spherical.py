@@ -29,6 +29,8 @@ import numpy as np
 
 from mivol.errors import MivolError
 from mivol.fields.activation import Activation, activation_of
+from mivol.files.notebook import slices_html
+from mivol.shown import briefly
 from mivol.space import check_affine, lattice_from_world
 
 __all__ = ["MAX_DEGREE", "SphericalGrid", "basis_size", "degree_of", "row_width"]
@@ -58,6 +60,7 @@ def row_width(basis: int) -> int:
     return -(-3 * basis // 4) * 4
 
 
+@briefly
 @dataclass
 class SphericalGrid:
     """A field of density and directional colour.
@@ -85,6 +88,10 @@ class SphericalGrid:
     offset: float = 0.5
     clamp: bool = True
     links: mi.UInt32 | None = None
+
+    def _repr_html_(self) -> str:
+        """Three middle slices of the density, for notebooks."""
+        return slices_html(np.array(self.to_dense()[0]), repr(self))
 
     def __post_init__(self) -> None:
         self.to_world = check_affine(self.to_world)

@@ -22,6 +22,7 @@ import numpy as np
 from mivol.errors import MivolError
 from mivol.files.source import choose, existing_file, refusal
 from mivol.files.volume import VolumeData, as_values
+from mivol.shown import briefly
 
 MAGIC = b"\x89HDF\r\n\x1a\n"
 
@@ -36,6 +37,7 @@ ANGLES: dict[str, float] = {
 }
 
 
+@briefly
 @dataclasses.dataclass(frozen=True)
 class ProjectionData:
     """What a detector counted while the sample turned.

@@ -17,7 +17,9 @@ from typing import Any
 
 import numpy as np
 
+from mivol.files.notebook import slices_html
 from mivol.files.source import refusal
+from mivol.shown import brief, briefly
 
 #: Sides of a box below this are not normal float32 numbers, so their reciprocal overflows.
 SMALLEST_SIDE = float(np.finfo(np.float32).tiny)
@@ -29,6 +31,7 @@ FLATTEST = 16 * float(np.finfo(np.float32).eps)
 SPACES: dict[str, tuple[int, int, int]] = {"RAS": (1, 1, 1), "LPS": (-1, -1, 1), "LAS": (-1, 1, 1)}
 
 
+@briefly
 @dataclasses.dataclass(frozen=True)
 class VolumeData:
     """A volume as it was read: numbers, place, and where they came from.
@@ -42,6 +45,10 @@ class VolumeData:
     values: np.ndarray
     to_world: np.ndarray
     meta: dict[str, Any] = dataclasses.field(default_factory=dict)
+
+    def _repr_html_(self) -> str:
+        """Three middle slices, for notebooks."""
+        return slices_html(self.values, f"{brief(self.values)}, from {self.values.min():.4g} to {self.values.max():.4g}")
 
     @property
     def size(self) -> np.ndarray:

@@ -23,6 +23,7 @@ from mivol.optim.interrupt import Stop
 from mivol.optim.optimiser import Optimiser, Run
 from mivol.optim.problem import Problem
 from mivol.optim.schedules import Constant
+from mivol.shown import curve_html
 from mivol.threads import check_one_thread
 
 KEPT = ("next", "events_done", "history", "measures", "log", "warned", "seconds")
@@ -32,7 +33,7 @@ Measure = Callable[[Problem], dict[str, float]]
 """Errors by name, of what a problem holds."""
 
 
-@dataclass
+@dataclass(repr=False)
 class Fit:
     """A fit at work, or done.
 
@@ -68,6 +69,15 @@ class Fit:
         self._events = in_order(self.course.events)
         if self.store is not None and self.store.resume:
             self.restore()
+
+    def __repr__(self) -> str:
+        newest = {**({"loss": self.history[-1]["loss"]} if self.history else {}), **self.newest_errors()}
+        figures = "".join(f", {name} {value:.4g}" for name, value in newest.items())
+        return f"Fit({self.next} of {self.course.iterations} iterations in {self.seconds:.1f} s{figures})"
+
+    def _repr_html_(self) -> str:
+        """The loss against the iteration, for notebooks."""
+        return curve_html([row["loss"] for row in self.history], repr(self))
 
     @property
     def is_done(self) -> bool:

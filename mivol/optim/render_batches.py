@@ -15,8 +15,10 @@ import mitsuba as mi
 import numpy as np
 
 from mivol.errors import MivolError
+from mivol.shown import briefly
 
 
+@briefly
 @dataclass(frozen=True)
 class View:
     """A sensor and what it saw.
@@ -32,6 +34,7 @@ class View:
     reference: mi.TensorXf
 
 
+@briefly
 @dataclass(frozen=True)
 class RenderBatch:
     """One render.

@@ -30,7 +30,7 @@ from mivol.optim.render_batches import RenderBatch, View, check_views, make_batc
 from mivol.optim.seeds import ADJOINT, PRIMAL, seed_of
 
 
-@dataclass
+@dataclass(repr=False)
 class SceneProblem:
     """A scene, what was seen of it, and what is being looked for.
 
@@ -74,6 +74,12 @@ class SceneProblem:
         self.newest_loss = (0.0, 0.0)
         self._has_noise = noise_check(self.integrator, self.scene)
         self.noisy = self._has_noise()
+
+    def __repr__(self) -> str:
+        width, height = (int(n) for n in self.views[0].sensor.film().crop_size())
+        sought = ", ".join(f"{p.name} {tuple(as_tensor(self.params[p.name]).shape)}" for p in self.parameters)
+        seen = f"{len(self.views)} views of {width} x {height} pixels"
+        return f"{type(self).__name__}({seen}, {self.loss.label()}, looks for {sought})"
 
     # -- Values ---------------------------------------------------------------------------------------------------
 

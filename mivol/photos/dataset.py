@@ -17,6 +17,7 @@ from mivol.files.source import refusal
 from mivol.photos.camera import Camera
 from mivol.photos.picture import read_mask, read_picture, shrink, space_of
 from mivol.photos.survey import Frame, PhotoSurvey, survey_photos
+from mivol.shown import briefly
 
 __all__ = ["BACKGROUNDS", "Photo", "Photos", "load_photos"]
 
@@ -31,6 +32,7 @@ BACKGROUNDS: dict[str, Callable[[int, int], np.ndarray]] = {
 }
 
 
+@briefly
 @dataclass(frozen=True)
 class Photo:
     """A photograph and its camera.
@@ -62,6 +64,7 @@ class Photo:
         return self.image + (1 - self.alpha[..., None]) * (np.asarray(colour, np.float32) - self.background)
 
 
+@briefly
 @dataclass(frozen=True)
 class Photos:
     """Photographs, ready to be fitted.

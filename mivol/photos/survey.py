@@ -24,6 +24,7 @@ from mivol.photos.colmap import find_model, read_colmap
 from mivol.photos.listing import UNLISTED, Entry, Listing
 from mivol.photos.picture import picture_size
 from mivol.photos.transforms import read_blender, read_transforms
+from mivol.shown import briefly
 
 __all__ = ["FORMATS", "SPLITS", "Format", "Frame", "PhotoSurvey", "find_format", "survey_photos"]
 
@@ -56,6 +57,7 @@ class Frame:
     mask: Path | None = None
 
 
+@briefly
 @dataclass(frozen=True)
 class PhotoSurvey:
     """What a data set holds, from its cameras and the headers of its images.

@@ -19,11 +19,13 @@ import mitsuba as mi
 from mivol.errors import MivolError
 from mivol.scene.content_hash import hash_object, hash_state
 from mivol.scene.parsing import as_text, check_variant, named_files, parse_dict, parse_file, reason_of, resolving_beside
+from mivol.shown import briefly, text_html
 
 __all__ = ["LoadedScene", "SceneSource", "find_sensor", "load_scene"]
 
 SceneSource = str | os.PathLike | Mapping
 
+@briefly
 @dataclass(frozen=True)
 class LoadedScene:
     """A scene, and where it came from.
@@ -41,6 +43,12 @@ class LoadedScene:
     files: tuple[Path, ...] = ()
     _digest: str | None = field(default=None, repr=False)
     _obstacle: str = field(default="", repr=False)
+
+    def _repr_html_(self) -> str:
+        """The scene's facts, for notebooks."""
+        from mivol.scene.explain import examine  # it imports this module
+
+        return text_html(f"{self!r}\n{examine(self.scene).text}")
 
     @property
     def content_hash(self) -> str:

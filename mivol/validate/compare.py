@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mivol.errors import MivolError
+from mivol.shown import briefly
 from mivol.validate.metrics import nrmse, psnr
 from mivol.validate.reference_file import ReferenceResult
 from mivol.validate.statistics import Bias, Estimate, Significance, bias, smallest_detectable_bias, z_bound, z_image
@@ -19,6 +20,7 @@ from mivol.validate.statistics import Bias, Estimate, Significance, bias, smalle
 __all__ = ["Comparison", "compare"]
 
 
+@briefly
 @dataclass(frozen=True)
 class Comparison:
     """What can be said of an image and its reference.

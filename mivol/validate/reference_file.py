@@ -21,6 +21,7 @@ import mivol
 from mivol.errors import MivolError
 from mivol.files.atomic import write_whole
 from mivol.files.exr import read_exr, write_exr
+from mivol.shown import briefly
 from mivol.validate.moments import Moments
 from mivol.validate.trust import Doubt
 
@@ -37,6 +38,7 @@ __all__ = [
 ]
 
 
+@briefly
 @dataclass(frozen=True)
 class ReferenceResult:
     """A reference image.
