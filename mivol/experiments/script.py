@@ -82,9 +82,14 @@ class Problem(SceneProblem):
 
 
 def ours_for(scene: mi.Scene) -> mi.Integrator:
-    """The scene's own integrator where it is mivol's, else mivol's at the same depth."""
+    """The scene's own integrator where it is mivol's and shows colours only, else mivol's at the same depth.
+
+    Pictures have no AOVs to compare with.
+    """
     own = scene.integrator()
-    return own if hasattr(own, "session") else mi.load_dict({"type": "mivol", "max_depth": settings_of(scene).max_depth})
+    if hasattr(own, "session") and not list(own.aov_names()):
+        return own
+    return mi.load_dict({"type": "mivol", "max_depth": settings_of(scene).max_depth})
 
 
 def make_views(references: Sequence[Reference] | mi.Scene, sensors: Sequence[mi.Sensor]) -> list[View]:
@@ -94,7 +99,8 @@ def make_views(references: Sequence[Reference] | mi.Scene, sensors: Sequence[mi.
         MivolError: another number of pictures than sensors.
     """
     if isinstance(references, mi.Scene):
-        integrator = references.integrator() or ours_for(references)
+        own = references.integrator()
+        integrator = ours_for(references) if own is None or list(own.aov_names()) else own
         with dr.suspend_grad():
             seen = [mi.render(references, sensor=sensor, integrator=integrator, seed=n) for n, sensor in enumerate(sensors)]
     else:

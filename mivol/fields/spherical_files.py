@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import zipfile
 from pathlib import Path
 
 import mitsuba as mi
@@ -13,6 +12,7 @@ from mivol.errors import MivolError
 from mivol.fields.spherical import SphericalGrid
 from mivol.fields.spherical_svox2 import read_svox2
 from mivol.files import write_whole
+from mivol.files.archive import check_memory, read_archive
 
 __all__ = ["load_field", "save_field"]
 
@@ -59,11 +59,7 @@ def load_field(path: str | Path) -> SphericalGrid:
     path = Path(path)
     if not path.is_file():
         raise MivolError(f"found no file {path}; give a radiance field (.npz).")
-    try:
-        with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
-            arrays = {name: stored[name] for name in stored.files}
-    except (ValueError, OSError, EOFError, zipfile.BadZipFile) as error:
-        raise MivolError(f"{path.name} is not a whole .npz archive ({error}); write it again.") from error
+    arrays = read_archive(path)
     if "links" in arrays:
         return read_svox2(path.name, arrays)
     if str(arrays.get("format", "")) != FORMAT:
@@ -76,6 +72,7 @@ def _of_ours(name: str, arrays: dict[str, np.ndarray]) -> SphericalGrid:
     needed = {"density", "sh", "res", "to_world", "activation", "offset", "clamp"} - arrays.keys()
     if needed:
         raise MivolError(f"{name} lacks {', '.join(sorted(needed))}; write it again.")
+    _check_kinds(name, arrays)
     res = tuple(int(n) for n in arrays["res"])
     nodes = arrays.get("nodes")
     n, shape = math.prod(res) if nodes is None else len(nodes), arrays["sh"].shape
@@ -96,7 +93,37 @@ def _of_ours(name: str, arrays: dict[str, np.ndarray]) -> SphericalGrid:
     )
 
 
+KINDS = {
+    "res": ("iu", (3,)), "to_world": ("f", (4, 4)), "density": ("f", None), "sh": ("f", None), "nodes": ("iu", None),
+    "activation": ("U", ()), "offset": ("fiu", ()), "clamp": ("biu", ()),
+}  # fmt: skip
+"""Of each array the kinds of NumPy types, and the shape where there is one only."""
+
+MOST_NODES = 2**32 - 1
+"""Nodes are counted in 32 bits."""
+
+
+def _check_kinds(name: str, arrays: dict[str, np.ndarray]) -> None:
+    """Refuse arrays of another type or shape, numbers that are not finite, and a grid that cannot be.
+
+    Raises:
+        MivolError: with what was found.
+    """
+    for key, (kinds, shape) in KINDS.items():
+        array = arrays.get(key)
+        if array is None:
+            continue
+        if array.dtype.kind not in kinds or (shape is not None and array.shape != shape):
+            raise MivolError(f"{name} holds {key} of type {array.dtype} and shape {array.shape}; write it again.")
+        if array.dtype.kind == "f" and not np.isfinite(array).all():
+            raise MivolError(f"{name} holds {key} with values that are not finite; write it again.")
+    res = [int(n) for n in arrays["res"]]
+    if min(res) < 1 or math.prod(res) > MOST_NODES:
+        raise MivolError(f"{name} has a grid of {' x '.join(map(str, res))} nodes; 1 to {MOST_NODES} in all are expected.")
+    check_memory(Path(name), 4 * math.prod(res))  # the row of each node, which rays look up
+
+
 def _check_nodes(name: str, nodes: np.ndarray, count: int) -> None:
     ordered = nodes.ndim == 1 and (len(nodes) < 2 or (np.diff(nodes.astype(np.int64)) > 0).all())
-    if not ordered or (len(nodes) and int(nodes[-1]) >= count):
+    if not ordered or (len(nodes) and not (int(nodes[0]) >= 0 and int(nodes[-1]) < count)):
         raise MivolError(f"{name} lists nodes out of order or beyond the {count} of its grid; write it again.")

@@ -56,11 +56,34 @@ def save_svox2(path: Path, field: SphericalGrid) -> None:
     write_whole(path, lambda file: np.savez_compressed(file, **arrays))
 
 
+def _check_kinds(name: str, arrays: dict[str, np.ndarray]) -> None:
+    """Refuse links that are no whole numbers on three axes, numbers of another type, and a box that is none.
+
+    Raises:
+        MivolError: with what was found.
+    """
+    kinds = {"links": "iu", "density_data": "f", "sh_data": "f", "radius": "fiu", "center": "fiu", "basis_type": "iu"}
+    for key, wanted in kinds.items():
+        if key in arrays and arrays[key].dtype.kind not in wanted:
+            raise MivolError(f"{name} holds {key} of type {arrays[key].dtype}; a checkpoint of svox2 has other numbers there.")
+    if arrays["links"].ndim != 3 or arrays["links"].size == 0:
+        raise MivolError(f"{name} holds links of the shape {arrays['links'].shape}; three axes are expected.")
+    for key in ("radius", "center"):
+        if arrays[key].size not in (1, 3) or not np.isfinite(arrays[key]).all():
+            found = arrays[key].reshape(-1)[:4].tolist()
+            raise MivolError(f"{name} holds {key} {found}; one or three finite numbers are expected.")
+    if not (arrays["radius"] > 0).all():
+        raise MivolError(f"{name} holds radius {arrays['radius'].reshape(-1).tolist()}; numbers above 0 are expected.")
+    if arrays.get("basis_type", np.array(SVOX2_SH)).size != 1:
+        raise MivolError(f"{name} holds basis_type of the shape {arrays['basis_type'].shape}; one number is expected.")
+
+
 def read_svox2(name: str, arrays: dict[str, np.ndarray]) -> SphericalGrid:
     """A checkpoint of svox2: axes X Y Z, links to rows (negative: empty), harmonics [rgb][basis], centre and radius."""
     needed = {"density_data", "sh_data", "radius", "center"} - arrays.keys()
     if needed:
         raise MivolError(f"{name} has links but lacks {', '.join(sorted(needed))}; a checkpoint of svox2 holds them.")
+    _check_kinds(name, arrays)
     if int(arrays.get("basis_type", SVOX2_SH)) != SVOX2_SH:
         found = int(arrays["basis_type"])
         raise MivolError(f"{name} is of svox2's basis type {found}; only spherical harmonics (1) can be read.")
@@ -74,6 +97,8 @@ def read_svox2(name: str, arrays: dict[str, np.ndarray]) -> SphericalGrid:
     nodes = np.flatnonzero(links >= 0)
     row = links.reshape(-1)[nodes]
     rows = sh[row].reshape(len(row), 3, -1).transpose(0, 2, 1)
+    if nodes.size and (not np.isfinite(density[row]).all() or not np.isfinite(sh[row]).all()):
+        raise MivolError(f"{name} holds densities or harmonics that are not finite; write it again.")
     radius, center = (np.broadcast_to(np.asarray(arrays[k], np.float64).reshape(-1), 3) for k in ("radius", "center"))
     to_world = np.eye(4)
     to_world[:3, :3], to_world[:3, 3] = np.diag(2 * radius), center - radius

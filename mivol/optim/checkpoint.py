@@ -8,7 +8,6 @@ hash, by dotted key). A file of another fingerprint is refused; only the number 
 from __future__ import annotations
 
 import json
-import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,12 +15,16 @@ from typing import Any
 import numpy as np
 
 from mivol.errors import MivolError
+from mivol.files.archive import read_archive
 from mivol.files.atomic import write_whole
 
 ABOUT = "about"
 
 DIGESTS = ("scene", "references", "photos", "data")
 """Keys of fingerprints that are no settings: digests of what a run reads."""
+
+NEEDED = ("fingerprint",)
+"""What every checkpoint says of itself."""
 
 GROWING = ("fit.iterations", "solve.iterations")
 """Settings that a run may be resumed with a larger value of: it goes on from where it ended."""
@@ -88,13 +91,15 @@ def _load(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         MivolError: there is none, or it is no checkpoint.
     """
     try:
-        with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
-            arrays = {name: stored[name] for name in stored.files}
+        arrays = read_archive(path)
         about = json.loads(str(arrays.pop(ABOUT)))
+        missing = [key for key in NEEDED if key not in about]
     except FileNotFoundError:
         raise MivolError(f"found no checkpoint {path} to resume from: run without --resume first.") from None
-    except (OSError, ValueError, KeyError, EOFError, AttributeError, zipfile.BadZipFile) as error:
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise MivolError(f"{path} is not a whole checkpoint of mivol ({error}): run without --resume.") from error
+    if missing:
+        raise MivolError(f"{path} is not a whole checkpoint of mivol (no {missing[0]}): run without --resume.")
     return arrays, about
 
 

@@ -10,7 +10,7 @@ import mitsuba as mi
 import numpy as np
 
 from mivol.errors import MivolError
-from mivol.optim.losses import Loss
+from mivol.optim.losses import Loss, check_shapes
 from mivol.optim.optimiser import Optimiser, Run
 from mivol.optim.problem import Differentiable
 
@@ -30,8 +30,9 @@ class GivenLoss(Loss, tag="given", kw_only=True):
         """The function's number.
 
         Raises:
-            MivolError: it gives something else, or nothing that depends on the image.
+            MivolError: image and reference differ in shape, or it gives something else, or nothing that depends on the image.
         """
+        check_shapes(image, reference)
         value = self.function(image, reference)
         name = getattr(self.function, "__name__", type(self.function).__name__)
         if not dr.is_array_v(value) or dr.width(value) != 1 or not dr.is_float_v(value):

@@ -50,12 +50,21 @@ class Loss(Strategy, tag="loss"):
         Raises:
             MivolError: the shapes differ.
         """
-        if image.shape != reference.shape:
-            raise MivolError(
-                f"the image has shape {tuple(image.shape)} and its reference {tuple(reference.shape)}: "
-                "render or crop the reference to the size of its sensor."
-            )
+        check_shapes(image, reference)
         return dr.mean(self.penalty(image, reference).array)
+
+
+def check_shapes(image: mi.TensorXf, reference: mi.TensorXf) -> None:
+    """Refuse an image and a reference that differ in shape.
+
+    Raises:
+        MivolError: with both.
+    """
+    if image.shape != reference.shape:
+        raise MivolError(
+            f"the image has shape {tuple(image.shape)} and its reference {tuple(reference.shape)}: "
+            "render or crop the reference to the size of its sensor."
+        )
 
 
 class L1(Loss, tag="l1"):

@@ -11,6 +11,7 @@ import pytest
 from mivol.errors import MivolError
 from mivol.fields.spherical import SphericalGrid, degree_of
 from mivol.fields.spherical_files import load_field, save_field
+from mivol.files import archive
 
 CUBE = np.array([[2.0, 0, 0, -1], [0, 2, 0, -1], [0, 0, 2, -1], [0, 0, 0, 1]])
 
@@ -103,11 +104,58 @@ def test_checkpoints_that_are_refused(variant_rgb: str, tmp_path: Path, change: 
 def test_files_that_are_refused(variant_rgb: str, tmp_path: Path) -> None:
     np.savez(tmp_path / "other.npz", a=np.zeros(3))
     (tmp_path / "torn.npz").write_bytes(b"PK\x03\x04 and no more")
-    for name, said in (("none.npz", "found no file"), ("other.npz", "holds a;"), ("torn.npz", "not a whole")):
+    for name, said in (("none.npz", "found no file"), ("other.npz", "holds a;"), ("torn.npz", "a damaged archive")):
         with pytest.raises(MivolError, match=said):
             load_field(tmp_path / name)
     with pytest.raises(MivolError, match="ending in .npz"):
         save_field(tmp_path / "f.vol", SphericalGrid.from_dense(*arrays(), CUBE))
+
+
+HOSTILE_FIELDS = {
+    "nodes below 0": ({"nodes": np.array([-200000000])}, "out of order or beyond"),
+    "nodes beyond the grid": ({"nodes": np.array([60])}, "out of order or beyond"),
+    "nodes of another type": ({"nodes": np.array([0.5])}, "nodes of type float64"),
+    "a grid that wraps": ({"res": np.array([2048, 2048, 2048])}, "2048 x 2048 x 2048 nodes"),
+    "a grid that takes too much": ({"res": np.array([1625, 1625, 1625])}, "GiB"),
+    "a negative grid": ({"res": np.array([-3, -4, 5])}, "-3 x -4 x 5 nodes"),
+    "a flat grid": ({"res": np.array([3, 4])}, r"res of type int64 and shape \(2,\)"),
+    "an offset of nothing": ({"offset": np.array(np.nan)}, "offset with values that are not finite"),
+    "a place of nothing": ({"to_world": np.full((4, 4), np.inf)}, "to_world with values that are not finite"),
+    "a clamp of text": ({"clamp": np.array("yes")}, "clamp of type"),
+}
+
+
+@pytest.mark.parametrize("case", HOSTILE_FIELDS)
+def test_hostile_fields_are_refused(variant_rgb: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, case: str) -> None:
+    """One node of a field of 3 x 4 x 5, spoilt: a sentence each, where one of them ended the process."""
+    change, said = HOSTILE_FIELDS[case]
+    keep = np.zeros((3, 4, 5), bool)
+    keep[0, 0, 0] = True
+    save_field(tmp_path / "f.npz", SphericalGrid.from_dense(*arrays(), CUBE, keep))
+    with np.load(tmp_path / "f.npz") as stored:
+        held = dict(stored)
+    np.savez(tmp_path / "f.npz", **held | change)
+    monkeypatch.setattr(archive, "available_memory", lambda: 2**33)
+    with pytest.raises(MivolError, match=said):
+        load_field(tmp_path / "f.npz")
+
+
+HOSTILE_CHECKPOINTS = {
+    "links of another type": ({"links": np.zeros((1, 1, 1))}, "links of type float64"),
+    "links of one axis": ({"links": np.zeros(3, np.int32)}, r"links of the shape \(3,\)"),
+    "no links": ({"links": np.zeros((0, 1, 1), np.int32)}, r"shape \(0, 1, 1\)"),
+    "a box of no size": ({"radius": np.zeros(3)}, "numbers above 0"),
+    "a box of two numbers": ({"radius": np.ones(2)}, "one or three finite"),
+    "a box nowhere": ({"center": np.full(3, np.nan)}, "one or three finite"),
+    "harmonics that are none": ({"sh_data": np.full((1, 12), np.nan)}, "not finite"),
+    "two bases": ({"basis_type": np.ones(2, int)}, r"basis_type of the shape \(2,\)"),
+}
+
+
+@pytest.mark.parametrize("case", HOSTILE_CHECKPOINTS)
+def test_hostile_checkpoints_are_refused(variant_rgb: str, tmp_path: Path, case: str) -> None:
+    change, said = HOSTILE_CHECKPOINTS[case]
+    test_checkpoints_that_are_refused(variant_rgb, tmp_path, change, said)
 
 
 def test_fields_that_are_refused(variant_rgb: str) -> None:
