@@ -23,6 +23,7 @@ STUDIES = {
     "radiance_field": "bench_radiance_field",
     "still_life": "bench_still_life",
     "depth": "bench_depth",
+    "random_scenes": "bench_random_scenes",
 }
 """Module of ``mivol.bench`` -> stem of the JSON that it writes."""
 

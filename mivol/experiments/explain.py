@@ -12,6 +12,7 @@ from mivol import config
 from mivol.config import Experiment, FieldFit, Files, Scan
 from mivol.errors import MivolError
 from mivol.experiments.back_end import choose_back_end
+from mivol.experiments.depth import settle_depth
 from mivol.experiments.photo_data import boxed, read_photos
 from mivol.experiments.photo_plan import choices, make_plan, shrunk
 from mivol.experiments.projections import held_out_views, make_data
@@ -19,6 +20,7 @@ from mivol.experiments.references import camera_of, find_sensors, load_experimen
 from mivol.experiments.scan_fit import make_problem as make_scan_problem
 from mivol.experiments.scene_fit import make_integrator
 from mivol.experiments.start import make_start
+from mivol.experiments.task import Task
 from mivol.experiments.truth import check_truth, make_truth, put
 from mivol.optim.parameters import check_names
 from mivol.optim.ray_batches import RayBatches
@@ -64,6 +66,10 @@ def explain_scene_fit(chosen: Experiment, base: Path, say: Say) -> Explanation:
     said = f", {len(held_out)} of them held out" if held_out else ""
     say(f"  views     {len(sensors)} of {width} x {height} pixels{said}")
     truth = make_truth(chosen, base, scene)
+    task, depth = settle_depth(Task(chosen, base, Path()), loaded, truth)
+    chosen = task.chosen
+    for line in depth:
+        say(f"  depth     {line.choice}, because {line.reason}")
     make_integrator(chosen)
     check_names([sought.key for sought in chosen.parameter])
     starts = [make_start(sought, base, scene) for sought in chosen.parameter]
