@@ -1,20 +1,34 @@
 """The command ``mivol`` from its first line on: Ctrl-C while Mitsuba is imported is one sentence too.
 
-This module lies outside the package, since importing anything in the package imports Mitsuba, which takes a second.
+This module lies outside the package, since importing anything in it imports Mitsuba, which takes a second. Dr.Jit's own
+import makes another error of an interrupt, so a handler notes that one has come.
 """
 
 from __future__ import annotations
 
+import signal
 import sys
+from types import FrameType
 
 STOPPED = 130
 
 
 def main() -> int:
     """Run ``mivol``; its exit code."""
+    came: list[int] = []
+
+    def note(number: int, frame: FrameType | None) -> None:
+        came.append(number)
+        raise KeyboardInterrupt
+
+    if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
+        signal.signal(signal.SIGINT, note)
     try:
         from mivol.cli import main as command
-    except KeyboardInterrupt:
+    except BaseException:
+        if not came:
+            raise
+    if came:
         print("mivol: stopped before anything was done.", file=sys.stderr)
         return STOPPED
     return command()

@@ -25,15 +25,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     Returns:
         Exit code: 0, 1 for what was refused, 2 for wrong arguments, 130 for Ctrl-C and SIGTERM; ``validate`` has more.
     """
-    given = list(sys.argv[1:] if argv is None else argv)
-    known = parser()
-    arguments, rest = known.parse_known_args(given)
-    arguments.rest = rest
-    if rest and arguments.verb is not bench:
-        known.error(f"unrecognized arguments: {' '.join(rest)}")
-    arguments.command = shlex.join(["mivol", *given])
     signals = Signals()
     try:
+        arguments = parse(list(sys.argv[1:] if argv is None else argv))
         return arguments.verb(arguments) or 0
     except BaseException as error:
         if signals.are_behind(error):
@@ -43,6 +37,17 @@ def main(argv: Sequence[str] | None = None) -> int:
             raise
         print(f"mivol: {error}", file=sys.stderr)
         return 1
+
+
+def parse(given: Sequence[str]) -> argparse.Namespace:
+    """The flags of a command, with the command as it was typed and what is a study's own; wrong ones end the process."""
+    known = parser()
+    arguments, rest = known.parse_known_args(given)
+    arguments.rest = rest
+    if rest and arguments.verb is not bench:
+        known.error(f"unrecognized arguments: {' '.join(rest)}")
+    arguments.command = shlex.join(["mivol", *given])
+    return arguments
 
 
 def parser() -> argparse.ArgumentParser:

@@ -59,17 +59,40 @@ def test_another_error_shows_its_traceback(monkeypatch: pytest.MonkeyPatch) -> N
     assert not Signals().came
 
 
-STRIKES = """import os, signal
-signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell may have started the tests with it ignored
-os.kill(os.getpid(), signal.SIGINT)
-"""
-"""A package whose import is struck by Ctrl-C."""
+def test_ctrl_c_while_flags_are_read_is_one_sentence(
+    ctrl_c: None, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What a verb's flags need is imported then, which takes a second."""
+    monkeypatch.setitem(cli.VERBS, "doctor", (cli.doctor, lambda sub: os.kill(os.getpid(), signal.SIGINT)))
+    assert cli.main(["doctor"]) == 130
+    assert capsys.readouterr().err == "mivol: stopped; what was finished is kept.\n"
 
 
-def test_ctrl_c_while_mitsuba_is_imported_is_one_sentence(tmp_path: Path) -> None:
+STRIKES = {
+    "at once": "os.kill(os.getpid(), signal.SIGINT)",
+    "in a library that makes another error of it": """
+try:
+    os.kill(os.getpid(), signal.SIGINT)
+except KeyboardInterrupt:
+    raise ImportError("a name is not defined")
+""",
+    "in a library that swallows it": """
+try:
+    os.kill(os.getpid(), signal.SIGINT)
+except KeyboardInterrupt:
+    pass
+""",
+}
+"""Packages whose import is struck by Ctrl-C."""
+
+
+@pytest.mark.parametrize("strike", STRIKES)
+def test_ctrl_c_while_mitsuba_is_imported_is_one_sentence(tmp_path: Path, strike: str) -> None:
     (tmp_path / "mivol").mkdir()
-    (tmp_path / "mivol" / "__init__.py").write_text(STRIKES)
-    first = f"sys.path[:0] = [{str(tmp_path)!r}, {str(ROOT)!r}]"
-    command = [sys.executable, "-P", "-c", f"import sys; {first}; import mivol_command; sys.exit(mivol_command.main())"]
+    (tmp_path / "mivol" / "__init__.py").write_text(f"import os, signal\n{STRIKES[strike]}\n")
+    (tmp_path / "mivol" / "cli.py").write_text("main = lambda: 0")
+    # A shell may have started the tests with Ctrl-C ignored.
+    first = f"signal.signal(signal.SIGINT, signal.default_int_handler); sys.path[:0] = [{str(tmp_path)!r}, {str(ROOT)!r}]"
+    command = [sys.executable, "-P", "-c", f"import signal, sys; {first}; import mivol_command; sys.exit(mivol_command.main())"]
     done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=60)
     assert (done.returncode, done.stderr) == (130, "mivol: stopped before anything was done.\n")
