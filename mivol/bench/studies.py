@@ -24,6 +24,7 @@ STUDIES = {
     "still_life": "bench_still_life",
     "depth": "bench_depth",
     "random_scenes": "bench_random_scenes",
+    "ladder": "bench_ladder",
 }
 """Module of ``mivol.bench`` -> stem of the JSON that it writes."""
 
