@@ -24,7 +24,7 @@ from mivol.experiments.task import Task
 from mivol.experiments.truth import check_truth, make_truth, put
 from mivol.optim.parameters import check_names
 from mivol.optim.ray_batches import RayBatches
-from mivol.optim.solvers import SOLVERS
+from mivol.optim.solvers import METHODS
 from mivol.photos import rectified
 from mivol.scene.explain import Explanation, examine
 from mivol.tomography.geometry import VoxelGrid
@@ -96,17 +96,17 @@ def explain_scan_fit(chosen: Scan, base: Path, say: Say) -> Explanation:
     Raises:
         MivolError: whatever :func:`mivol.experiments.scan_fit.scan_fit` refuses before its first iteration.
     """
-    grid = VoxelGrid(chosen.grid.shape, chosen.grid.voxel_size)
+    grid = VoxelGrid(chosen.grid.shape, chosen.grid.voxel_size, chosen.grid.centre)
     say(f"  grid      {' x '.join(map(str, grid.shape))} voxels of {chosen.grid.voxel_size:g}")
     data = make_data(chosen, base, grid)
     views, rows, columns = data.y.shape
     say(f"  scan      {views} views of {rows} x {columns} pixels, {type(chosen.scan).__name__.lower()} beam")
-    if data.note:
-        say(f"  axis      {data.note}")
+    for note in data.notes:
+        say(f"  data      {note}")
     held_out = held_out_views(chosen, views)
     say(f"  held out  {len(held_out)} views")
     make_scan_problem(chosen, Projector(data.geometry, grid), data, held_out)
-    solver = SOLVERS[chosen.solve.name]
+    solver = METHODS[chosen.solve.name]
     return Explanation((f"  solver    {chosen.solve.name}, {chosen.solve.iterations} iterations: {solver.promises}",))
 
 
