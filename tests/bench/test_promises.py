@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from mivol.bench import bars, depth, gradients, optical_depth, radiance_field
-from mivol.bench.gradients.size import LIGHTS, OURS
+from mivol.bench.gradients.size import CONTESTS, OURS
 from mivol.bench.questions import Bench
 
 
@@ -52,7 +52,7 @@ def test_radiance_field(question: str) -> None:
 def test_gradients():
     """A ratio beside its bar, then its agreement; of a table the bias with its error, in percent and in standard errors."""
     dense = {"sigma_t >= 1": {"variance_x_time": 40.0, "z": -2.0, "z_bound": 3.5}}
-    smoke = judged(gradients.BENCH, "smoke", {light: {"the sum": dense} for light in LIGHTS})
+    smoke = judged(gradients.BENCH, "smoke", {light: {"the sum": dense} for light in CONTESTS["smoke"][1]})
     assert smoke == [
         (40, "at least", 60, False),
         (2, "at most", 3.5, True),

@@ -16,7 +16,7 @@ import pytest
 from mivol.bench import agreement, single_scattering, still_life, tomography
 from mivol.bench.depth import BESIDE_ALBEDOS, CUBE_DEPTH, SEED, TAUS, UNIT
 from mivol.bench.extinctions import TUTORIAL_SCALE
-from mivol.bench.gradients.size import ALBEDO, BARS
+from mivol.bench.gradients.size import ALBEDO, CONTESTS, TUTORIALS
 from mivol.bench.gradients.subject import SEEDS
 from mivol.bench.radiance_field import STEP_BARS
 from mivol.bench.radiance_field.fits import EVERY
@@ -89,7 +89,9 @@ def test_sizes_are_those_of_the_published_figures(name: str) -> None:
 def test_what_is_promised():
     """Bars, and the media that they are measured in."""
     assert STEP_BARS == {"camera": 8, "pixels": 4} and STOP == 1e-4
-    assert BARS == {"constant light": 60, "HG 0.8, sun in a sky": 30} and ALBEDO == 0.75
+    bars = {question: [light.bar for light in lights.values()] for question, (_, lights) in CONTESTS.items()}
+    assert bars == {"smoke": [60, 30], "deep smoke": [100, 100, 35], "deep cloud": [80]} and ALBEDO == 0.75
+    assert TUTORIALS["tutorial"][:2] == (2, 20) and TUTORIALS["deep tutorial"] == (6, 60, 30)
     assert (SIZES, DEGREES, MODEL) == ((128, 256, 512, 1024), (0, 1, 2, 3), 64)
     assert FULL["depth"]["taus"] == TAUS and SEED == 0 and BESIDE_ALBEDOS == (0.5, 0.9) and CUBE_DEPTH == 0.8966336
     assert UNIT.to_world.tolist() == np.eye(4).tolist()
