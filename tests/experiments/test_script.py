@@ -65,7 +65,9 @@ def test_a_function_sees_one_view_at_a_time(scene: mi.Scene) -> None:
 
 
 @pytest.mark.parametrize(
-    "make", [None, lambda: mi.ad.Adam(lr=0.1), lambda: mi.ad.SGD(lr=2.0, momentum=0.5), mivol.Adam], ids=str
+    "make",
+    [None, lambda: mi.ad.Adam(lr=0.1), lambda: mi.ad.SGD(lr=2.0, momentum=0.5), mivol.Adam],
+    ids=["none", "Mitsuba's Adam", "Mitsuba's SGD", "ours"],
 )
 def test_any_optimiser_lowers_the_loss(scene: mi.Scene, make) -> None:
     """The start's transmittance of 0.6 and more is brought towards 0.3 by every optimiser; values stay in their domain."""
