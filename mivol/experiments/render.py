@@ -17,8 +17,8 @@ from mivol.files import write_exr, write_png
 from mivol.files.atomic import check_destination
 from mivol.optim.seeds import seed_of
 from mivol.scene.explain import settings_of
-from mivol.scene.load import find_sensor
 from mivol.scene.parsing import reason_of
+from mivol.scene.sensors import find_sensor
 
 SAMPLES_PER_PASS = 1 << 21
 COLOURS = {1: ("Y",), 2: ("Y", "A"), 3: ("R", "G", "B"), 4: ("R", "G", "B", "A")}

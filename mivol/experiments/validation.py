@@ -25,7 +25,8 @@ from mivol.optim.parameters import as_tensor, find
 from mivol.optim.seeds import seed_of
 from mivol.report import figures
 from mivol.scene.explain import settings_of
-from mivol.scene.load import LoadedScene, find_sensor
+from mivol.scene.load import LoadedScene
+from mivol.scene.sensors import find_sensor
 from mivol.validate.compare import Comparison, compare
 from mivol.validate.moments import Moments
 from mivol.validate.reference import render_reference

@@ -20,10 +20,10 @@ from mivol.scene.choices import is_lit, shares_cells
 from mivol.scene.depth_preview import measure_depths
 from mivol.scene.depth_two import depth_two_error, mean_albedo, mean_cosine, scattering_depth
 from mivol.scene.facts import Needs
-from mivol.scene.load import find_sensor
 from mivol.scene.needs import find_needs
 from mivol.scene.nesting import bounds
 from mivol.scene.plan import Plan, make_plan
+from mivol.scene.sensors import find_sensor
 from mivol.scene.survey import survey_scene
 from mivol.transport.estimators.emitters import SceneEmitters
 from mivol.transport.estimators.transmittance_grid import build_transmittance_grid, measure_transmittance_bias

@@ -18,10 +18,11 @@ import mitsuba as mi
 
 from mivol.errors import MivolError
 from mivol.scene.content_hash import hash_object, hash_state
+from mivol.scene.explain import examine
 from mivol.scene.parsing import as_text, check_variant, named_files, parse_dict, parse_file, reason_of, resolving_beside
 from mivol.shown import briefly, text_html
 
-__all__ = ["LoadedScene", "SceneSource", "find_sensor", "load_scene"]
+__all__ = ["LoadedScene", "SceneSource", "load_scene"]
 
 SceneSource = str | os.PathLike | Mapping
 
@@ -46,8 +47,6 @@ class LoadedScene:
 
     def _repr_html_(self) -> str:
         """The scene's facts, for notebooks."""
-        from mivol.scene.explain import examine  # it imports this module
-
         return text_html(f"{self!r}\n{examine(self.scene).text}")
 
     @property
@@ -78,19 +77,6 @@ def two_threads() -> Iterator[None]:
         if single:
             dr.set_thread_count(1)
 
-
-def find_sensor(scene: mi.Scene, sensor: int | mi.Sensor) -> mi.Sensor:
-    """A sensor of the scene by its number, or the one that is given.
-
-    Raises:
-        MivolError: the scene has none of that number.
-    """
-    if not isinstance(sensor, int):
-        return sensor
-    sensors = scene.sensors()
-    if not 0 <= sensor < len(sensors):
-        raise MivolError(f"the scene has no sensor {sensor}, only {len(sensors)} of them; count from 0, or add one.")
-    return sensors[sensor]
 
 
 def load_scene(source: SceneSource | mi.Scene, overrides: Mapping[str, Any] | None = None) -> LoadedScene:

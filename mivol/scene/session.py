@@ -14,10 +14,10 @@ import mitsuba as mi
 from mivol.errors import MivolError
 from mivol.scene.build import build_estimators
 from mivol.scene.derived import carry_tangents, recompute_derived
-from mivol.scene.load import find_sensor
 from mivol.scene.needs import find_needs
 from mivol.scene.plan import Plan, make_plan
 from mivol.scene.refusals import check_aovs
+from mivol.scene.sensors import find_sensor
 from mivol.scene.survey import SceneSurvey, survey_scene
 from mivol.transport.line_integrals.aovs import integrate_aovs, jvp_aovs, vjp_aovs
 from mivol.transport.path.estimators import Estimators

@@ -23,8 +23,9 @@ import numpy as np
 from mivol.errors import MivolError
 from mivol.optim.interrupt import Stop
 from mivol.scene.content_hash import content_hash
-from mivol.scene.load import LoadedScene, SceneSource, find_sensor, load_scene
+from mivol.scene.load import LoadedScene, SceneSource, load_scene
 from mivol.scene.parsing import check_variant
+from mivol.scene.sensors import find_sensor
 from mivol.validate.moments import Moments
 from mivol.validate.reference_file import (
     ReferenceResult,
