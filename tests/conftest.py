@@ -35,12 +35,12 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Chances of false alarms are counted. Workers of pytest-xdist share the cores: a pool's idle thread spins, at the other
-    worker's cost."""
+    """Chances of false alarms are counted. Workers of pytest-xdist share the cores, so that more threads would only spin. Two
+    there must be: with one, Mitsuba waits for ever for a second to read an EXR, and has done so to load a scene."""
     config.pluginmanager.register(false_alarms.Count())
     workers = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", 1))
     if workers > 1:
-        drjit.set_thread_count(max(1, machine.cores() // workers))
+        drjit.set_thread_count(max(2, machine.cores() // workers))
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:

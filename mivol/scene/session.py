@@ -16,6 +16,7 @@ from mivol.scene.build import build_estimators
 from mivol.scene.derived import carry_tangents, recompute_derived
 from mivol.scene.needs import find_needs
 from mivol.scene.plan import Plan, make_plan
+from mivol.scene.recording import without_collections
 from mivol.scene.refusals import check_aovs
 from mivol.scene.sensors import find_sensor
 from mivol.scene.survey import SceneSurvey, survey_scene
@@ -76,7 +77,7 @@ class Session:
         if not develop:
             raise MivolError("develop=False was asked for; mivol returns the developed image: leave it at True.")
         sensor = find_sensor(scene, sensor)
-        with dr.suspend_grad():
+        with without_collections(), dr.suspend_grad():
             estimators, plan = self._open(scene, sensor, spp, pictures=True)
             samples = RenderSamples(sensor, seed, spp, plan.pass_rays, estimators.segment.directions)
             image = record(samples, self.aovs, lambda rays: self._primal(estimators, rays))
@@ -87,7 +88,7 @@ class Session:
     def render_forward(self, scene: mi.Scene, sensor: int | mi.Sensor, seed: int, spp: int) -> mi.TensorXf:
         """Render the derivative of an image along the gradients that were set on the parameters."""
         sensor = find_sensor(scene, sensor)
-        with dr.suspend_grad(), carry_tangents(scene):
+        with without_collections(), dr.suspend_grad(), carry_tangents(scene):
             with dr.resume_grad():
                 estimators, plan = self._open(scene, sensor, spp)
                 estimators.media.start_tangent()
@@ -100,7 +101,7 @@ class Session:
         Cost: a render and its replay; memory independent of the samples, beyond those of a pass.
         """
         sensor = find_sensor(scene, sensor)
-        with dr.suspend_grad():
+        with without_collections(), dr.suspend_grad():
             with dr.resume_grad():
                 recompute_derived(scene)
                 estimators, plan = self._open(scene, sensor, spp)
