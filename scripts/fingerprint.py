@@ -115,7 +115,7 @@ def rgb(*value: float) -> dict:
 
 
 SKY = {"type": "constant", "radiance": 0.8}
-LAMP = {"type": "point", "position": [0.3, -0.2, 2.2], "intensity": 4.0}
+EMITTER = {"type": "point", "position": [0.3, -0.2, 2.2], "intensity": 4.0}
 SUN = {"type": "directional", "direction": [0.3, 0.5, -1], "irradiance": 2.0}
 HG = {"type": "mivol_hg", "g": 0.6}
 
@@ -147,15 +147,15 @@ def constant_light() -> Iterator:
     yield from follow(scene, ("sigma_t.data", "albedo.data", "scale"), max_depth=2)
 
 
-def lamp_and_sky() -> Iterator:
+def emitter_and_sky() -> Iterator:
     body = medium(grid(rough(5, (9, 9, 9, 1), top=4.0)), rgb(0.9, 0.7, 0.5), HG)
-    scene = {"body": box(body), "lamp": LAMP, "sky": envmap(), "sensor": camera()}
+    scene = {"body": box(body), "emitter": EMITTER, "sky": envmap(), "sensor": camera()}
     yield from follow(scene, ("sigma_t.data", "albedo.value.value", ".g", "intensity.value", "position"), max_depth=2)
 
 
 def sun_by_sums() -> Iterator:
     body = medium(grid(rough(6, (9, 8, 9, 1), top=4.0, empty=0.3)), 0.8, HG)
-    scene = {"body": box(body), "sun": SUN, "lamp": LAMP, "sensor": camera()}
+    scene = {"body": box(body), "sun": SUN, "emitter": EMITTER, "sensor": camera()}
     yield from follow(scene, ("sigma_t.data",), max_depth=2, deterministic=True)
 
 
@@ -167,7 +167,7 @@ def sun_by_sums_in_a_lattice() -> Iterator:
 
 def estimated_shadows() -> Iterator:
     body = medium(grid(rough(7, (40, 40, 40, 1), top=4.0, empty=0.3)), 0.8, HG)
-    scene = {"body": box(body), "lamp": LAMP, "sky": envmap(), "sensor": camera()}
+    scene = {"body": box(body), "emitter": EMITTER, "sky": envmap(), "sensor": camera()}
     yield from follow(scene, ("sigma_t.data",), max_depth=2, shadows="estimated")
 
 
@@ -181,7 +181,7 @@ def several_media() -> Iterator:
     shell = {"type": "cube", "bsdf": {"type": "null"}, "interior": stock, "to_world": around}
     scene = {
         "body": box(split, 0.9), "ball": ball(fog, (-1.4, 0.2, 0.1), 0.45), "shell": shell, "floor": floor(),
-        "lamp": LAMP, "sky": SKY, "sensor": camera(),
+        "emitter": EMITTER, "sky": SKY, "sensor": camera(),
     }  # fmt: skip
     ends = ("sigma_a.data", "sigma_s.data", "sigma_t.value.value", "albedo.value.value", "sigma_t.data", "reflectance.value")
     yield from follow(scene, ends, max_depth=2, aovs="tau")
@@ -192,7 +192,8 @@ def surfaces() -> Iterator:
     haze = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, -1.5, 0.3]).rotate([1, 0, 0], 90).scale(0.4),
             "bsdf": {"type": "mask", "opacity": 0.4, "nested": {"type": "diffuse"}}}  # fmt: skip
     body = box(medium(grid(rough(11, (7, 7, 7, 1), top=1.0))), 1.1)
-    scene = {"body": body, "mirror": mirror, "haze": haze, "floor": floor(), "lamp": LAMP, "sky": envmap(), "sensor": camera()}
+    lit = {"emitter": EMITTER, "sky": envmap()}
+    scene = {"body": body, "mirror": mirror, "haze": haze, "floor": floor(), **lit, "sensor": camera()}
     yield from follow(scene, ("sigma_t.data", "reflectance.value"), max_depth=5, rr_depth=3)
 
 
@@ -228,7 +229,7 @@ def projector() -> Iterator:
 CASES: dict[str, Callable[[], Iterator[tuple[str, np.ndarray]]]] = {
     case.__name__: case
     for case in (
-        absorption, absorption_rgb, constant_light, lamp_and_sky, sun_by_sums, sun_by_sums_in_a_lattice, estimated_shadows,
+        absorption, absorption_rgb, constant_light, emitter_and_sky, sun_by_sums, sun_by_sums_in_a_lattice, estimated_shadows,
         several_media, surfaces, emission, radiance_field, projector,
     )
 }  # fmt: skip

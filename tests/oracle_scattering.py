@@ -5,7 +5,7 @@ r"""The slow, obvious twins of single scattering: light that turns once, in floa
 
 Conventions. Those of tests/oracle.py: grids (Z, Y, X[, C]) at voxel centres in the unit cube under `to_world`, vacuum
 outside, points ordered (x, y, z), |d| = 1 so that t is a world length. A ray runs along d; light comes to a point x from
-the direction w (from x towards the lamp), so that the cosine of the scattering angle is -(-d).w = d.w: 1 is forward.
+the direction w (from x towards the emitter), so that the cosine of the scattering angle is -(-d).w = d.w: 1 is forward.
 Many rays (n, 3) at once; colours are (n, C), and one channel stands for all that are equal.
 
 Nothing here knows Dr.Jit, Mitsuba or mivol. Closed forms are at the end, with their sources.
@@ -202,15 +202,15 @@ def box_edges(to_world: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.array(points) @ linear.T + shift, np.array(along) @ linear.T
 
 
-def shadow_kinks(field: Field, lamp: Lamp, o: np.ndarray, d: np.ndarray) -> np.ndarray:
-    """(n, K) distances at which the way to a lamp begins to leave a box by another face: its depth has a kink there.
+def shadow_kinks(field: Field, emitter: Emitter, o: np.ndarray, d: np.ndarray) -> np.ndarray:
+    """(n, K) distances at which the way to an emitter begins to leave a box by another face: its depth has a kink there.
 
-    The planes through an edge of the box and the lamp; a sky has no such places, only many of them, averaged.
+    The planes through an edge of the box and the emitter; a sky has no such places, only many of them, averaged.
     """
-    if not hasattr(field, "to_world") or not hasattr(lamp, "place"):
+    if not hasattr(field, "to_world") or not hasattr(emitter, "place"):
         return np.zeros((len(o), 0))
     a, e = box_edges(field.to_world)
-    where, is_far = lamp.place
+    where, is_far = emitter.place
     normal = np.cross(e, np.asarray(where) - (0 if is_far else a))
     with np.errstate(divide="ignore", invalid="ignore"):
         t = (np.sum(normal * a, axis=1) - o @ normal.T) / (d @ normal.T)
@@ -234,14 +234,14 @@ def trilinear_albedo(values: np.ndarray, to_world: np.ndarray) -> Callable[[np.n
     return Grid(values, to_world).sigma
 
 
-# -- Lamps: for each point the directions that light comes from, how far the lamp is, and how much (weights included) --------
+# -- Emitters: for each point the directions that light comes from, how far that is, and how much (weights included) ----------
 
 
-class Lamp(Protocol):
+class Emitter(Protocol):
     """Light that arrives at points (n, 3) if nothing is in the way."""
 
     def shine(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Towards the lamp (n, K, 3), distance (n, K), radiance times solid angle (n, K, C) of K directions."""
+        """Towards the emitter (n, K, 3), distance (n, K), radiance times solid angle (n, K, C) of K directions."""
 
     def edges(self, o: np.ndarray, d: np.ndarray) -> np.ndarray:
         """(n, J) distances along rays at which the light changes fast."""
@@ -354,11 +354,17 @@ class Sky:
 
 
 def nodes_along(
-    media: Sequence[Medium], lamps: Sequence[Lamp], o: np.ndarray, d: np.ndarray, t0: np.ndarray, t1: np.ndarray, order: int
+    media: Sequence[Medium],
+    emitters: Sequence[Emitter],
+    o: np.ndarray,
+    d: np.ndarray,
+    t0: np.ndarray,
+    t1: np.ndarray,
+    order: int,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Distances and weights (n, K): Gauss-Legendre of an order between every two edges of media and lamps."""
-    cuts = [m.field.edges(o, d) for m in media] + [lamp.edges(o, d) for lamp in lamps] + [t0[:, None], t1[:, None]]
-    cuts += [shadow_kinks(m.field, lamp, o, d) for m in media for lamp in lamps]
+    """Distances and weights (n, K): Gauss-Legendre of an order between every two edges of media and emitters."""
+    cuts = [m.field.edges(o, d) for m in media] + [emitter.edges(o, d) for emitter in emitters] + [t0[:, None], t1[:, None]]
+    cuts += [shadow_kinks(m.field, emitter, o, d) for m in media for emitter in emitters]
     t = np.sort(np.clip(np.concatenate(cuts, axis=1), t0[:, None], t1[:, None]), axis=1)
     x, w = np.polynomial.legendre.leggauss(order)
     length = np.diff(t, axis=1)
@@ -379,12 +385,12 @@ def total_tau(media: Sequence[Medium], o: np.ndarray, d: np.ndarray, t_max: np.n
 
 @dataclass
 class Turned:
-    """Every turn of light that the quadrature sees: one row for each ray, distance and direction to a lamp.
+    """Every turn of light that the quadrature sees: one row for each ray, distance and direction to an emitter.
 
     Attributes:
         ray: index of the ray.
         t, x: where the light turns.
-        w, r: towards the lamp, and how far it is.
+        w, r: towards the emitter, and how far it is.
         light: T(camera) p Li T(shadow) times the quadrature weight (n, C), without sigma and albedo of the medium.
         medium: index of the medium that turns it.
     """
@@ -405,7 +411,7 @@ class Turned:
 
 def turns(
     media: Sequence[Medium],
-    lamps: Sequence[Lamp],
+    emitters: Sequence[Emitter],
     o: np.ndarray,
     d: np.ndarray,
     t0: object = 0.0,
@@ -418,20 +424,20 @@ def turns(
 
     Args:
         phases: in the place of the media's own (a derivative, say).
-        blocked: (x, w, r) -> (n,), True where something opaque stands between a point and a lamp.
+        blocked: (x, w, r) -> (n,), True where something opaque stands between a point and an emitter.
     """
     o, d, t0, t1 = as_rays(o, d, t0, t1)
     ends = np.concatenate([m.field.edges(o, d) for m in media], axis=1)
     t0, t1 = np.maximum(t0, np.maximum(ends.min(axis=1), 0)), np.minimum(t1, np.maximum(ends.max(axis=1), 0))
     found = []
-    for lamp in lamps:
-        t, weight = nodes_along(media, [lamp], o, d, t0, np.maximum(t0, t1), order)
+    for emitter in emitters:
+        t, weight = nodes_along(media, [emitter], o, d, t0, np.maximum(t0, t1), order)
         ray = np.repeat(np.arange(len(o)), t.shape[1])
         t, weight = t.ravel(), weight.ravel()
         on = weight > 0
         ray, t, weight = ray[on], t[on], weight[on]
         x = o[ray] + t[:, None] * d[ray]
-        w, r, light = lamp.shine(x)
+        w, r, light = emitter.shine(x)
         k = w.shape[1]
         ray, t, x, weight = (np.repeat(a, k, axis=0) for a in (ray, t, x, weight))
         w, r, light = w.reshape(-1, 3), r.ravel(), light.reshape(len(x), -1)
@@ -448,7 +454,7 @@ def turns(
 
 def radiance(
     media: Sequence[Medium],
-    lamps: Sequence[Lamp],
+    emitters: Sequence[Emitter],
     o: np.ndarray,
     d: np.ndarray,
     t0: object = 0.0,
@@ -460,24 +466,30 @@ def radiance(
     """Radiance (n, C) that arrives along rays (n, 3): what turned once, and the background through all media."""
     o, d, t0, t1 = as_rays(o, d, t0, t1)
     L = np.atleast_1d(background) * np.exp(-total_tau(media, o, d, t1))
-    for turned in turns(media, lamps, o, d, t0, t1, order, **more):
+    for turned in turns(media, emitters, o, d, t0, t1, order, **more):
         part = turned.contribution(media)
         L = L + np.stack([np.bincount(turned.ray, part[:, c], len(o)) for c in range(part.shape[1])], axis=1)
     return L
 
 
 def radiance_gradient(
-    medium: Medium, lamps: Sequence[Lamp], o: np.ndarray, d: np.ndarray, weight: object = 1.0, background: float = 0.0, **more
+    medium: Medium,
+    emitters: Sequence[Emitter],
+    o: np.ndarray,
+    d: np.ndarray,
+    weight: object = 1.0,
+    background: float = 0.0,
+    **more,
 ) -> tuple[np.ndarray, float]:
     """d/d values (Z, Y, X) and d/d albedo of sum_i weight_i L_i, for one grey medium: a grid and a constant albedo.
 
-    Three terms: more light turns at x; less comes from x to the camera; less comes from the lamp to x. Exact derivatives
+    Three terms: more light turns at x; less comes from x to the camera; less comes from the emitter to x. Exact derivatives
     of the very quadrature that :func:`radiance` is.
     """
     o, d, weight = as_rays(o, d, weight)
     grid, t_max = medium.field, np.full(len(o), math.inf)
     row, slope = np.zeros(grid.values.shape[:3]), 0.0
-    for turned in turns([medium], lamps, o, d, **more):
+    for turned in turns([medium], emitters, o, d, **more):
         light = weight[turned.ray] * turned.light[:, 0]
         grid.weigh(row, turned.x, light * float(medium.albedo))
         lost = -light * float(medium.albedo) * grid.sigma(turned.x)[:, 0]
@@ -500,7 +512,7 @@ def angular_integral(u: float, v: float) -> float:
 
 
 def point_in_fog(sigma_s: float, sigma_t: float, intensity: float, t0: float, h: float, D: float) -> float:
-    """Isotropic single scattering in a homogeneous medium without end: a lamp at distance h from the ray, beside its t0.
+    """Isotropic single scattering in a homogeneous medium without end: an emitter at distance h from the ray, beside its t0.
 
     L = sigma_s I / (2 pi h) e^{-sigma t0} [F(sigma h, xi1) - F(sigma h, xi0)], xi = pi/4 + atan((t - t0)/h)/2 at both ends
     of [0, D] (Sun et al. 2005; Pegoraro 2010).

@@ -132,16 +132,16 @@ def aimed(seed: int, n: int = 8, size: float = 0.8, away: float = 3.0) -> tuple[
     return o, as_float32(d / np.linalg.norm(d, axis=1, keepdims=True))
 
 
-# -- The same lamp for Mitsuba and for the twins -----------------------------------------------------------------------
+# -- The same emitter for Mitsuba and for the twins -----------------------------------------------------------------------
 
 
-def point(position: np.ndarray, intensity: float = 3.0) -> tuple[dict, twins.Lamp]:
+def point(position: np.ndarray, intensity: float = 3.0) -> tuple[dict, twins.Emitter]:
     return {"type": "point", "position": list(map(float, position)), "intensity": intensity}, twins.Point(
         as_float32(position), intensity
     )
 
 
-def sun(direction: np.ndarray, irradiance: float = 2.0) -> tuple[dict, twins.Lamp]:
+def sun(direction: np.ndarray, irradiance: float = 2.0) -> tuple[dict, twins.Emitter]:
     return {"type": "directional", "direction": list(map(float, direction)), "irradiance": irradiance}, twins.Directional(
         np.asarray(direction), irradiance
     )
@@ -149,12 +149,12 @@ def sun(direction: np.ndarray, irradiance: float = 2.0) -> tuple[dict, twins.Lam
 
 def spot(
     position: np.ndarray, target: np.ndarray, intensity: float = 3.0, cutoff: float = 30.0, beam: float = 20.0
-) -> tuple[dict, twins.Lamp]:
+) -> tuple[dict, twins.Emitter]:
     """Angles in degrees."""
     position, target = np.asarray(position, dtype=np.float64), np.asarray(target, dtype=np.float64)
     place = mi.ScalarTransform4f().look_at(list(position), list(target), [0.1, 0.9, 0.3])
-    lamp = {"type": "spot", "to_world": place, "intensity": intensity, "cutoff_angle": cutoff, "beam_width": beam}
-    return lamp, twins.Spot(position, intensity, target - position, math.radians(cutoff), math.radians(beam))
+    emitter = {"type": "spot", "to_world": place, "intensity": intensity, "cutoff_angle": cutoff, "beam_width": beam}
+    return emitter, twins.Spot(position, intensity, target - position, math.radians(cutoff), math.radians(beam))
 
 
 def phase(name: str, g: float = 0.0) -> tuple[dict, object]:
@@ -193,7 +193,7 @@ def fog(
 def assert_twin(
     seen: Pencils,
     media: list,
-    lamps: list,
+    emitters: list,
     integrator: dict,
     spp: int,
     batches: int = 16,
@@ -208,7 +208,7 @@ def assert_twin(
     `quadrature`: relative error of the twin; `rounding`: absolute error of float32. `precision` is what the median
     standard error may be of the radiance.
     """
-    truth = twins.radiance(media, lamps, seen.o, seen.d, background=background, **more)
+    truth = twins.radiance(media, emitters, seen.o, seen.d, background=background, **more)
     m = seen.moments(integrator, spp, batches)
     truth = np.broadcast_to(truth, m.mean.shape)
     allowed = rounding + quadrature * np.abs(truth).max()

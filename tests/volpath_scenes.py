@@ -74,19 +74,19 @@ def textured() -> dict:
     return square(0, -0.4, 2.2, 1.0) | {"emitter": {"type": "area", "radiance": radiance}}
 
 
-LAMPS = {
-    "constant": lambda: {"lamp": scenes.sky(0.8)},
-    "envmap": lambda: {"lamp": {"type": "envmap", "bitmap": panorama(), "to_world": turn().rotate([1, 0, 0], 70)}},
-    "sunsky": lambda: {"lamp": {"type": "sunsky", "turbidity": 4.0, "sun_direction": [0.4, 0.3, 0.8], "sun_aperture": 3.0}},
-    "directional": lambda: {"lamp": sun([0.3, 0.5, -1.0])[0]},
-    "point": lambda: {"lamp": point([1.5, -1.2, 1.6])[0]},
-    "spot": lambda: {"lamp": spot([1.0, -2, 2.2], [0, 0, 0])[0]},
-    "projector": lambda: {"lamp": projector()},
-    "area outside": lambda: {"lamp": area(1.5, 0.5, 1.8, [9.0, 6.0, 2.0])},
-    "textured area": lambda: {"lamp": textured()},
-    "area inside": lambda: {"lamp": {"type": "sphere", "radius": 0.25, "center": [0.3, 0.2, 0.1]}
+EMITTERS = {
+    "constant": lambda: {"emitter": scenes.sky(0.8)},
+    "envmap": lambda: {"emitter": {"type": "envmap", "bitmap": panorama(), "to_world": turn().rotate([1, 0, 0], 70)}},
+    "sunsky": lambda: {"emitter": {"type": "sunsky", "turbidity": 4.0, "sun_direction": [0.4, 0.3, 0.8], "sun_aperture": 3.0}},
+    "directional": lambda: {"emitter": sun([0.3, 0.5, -1.0])[0]},
+    "point": lambda: {"emitter": point([1.5, -1.2, 1.6])[0]},
+    "spot": lambda: {"emitter": spot([1.0, -2, 2.2], [0, 0, 0])[0]},
+    "projector": lambda: {"emitter": projector()},
+    "area outside": lambda: {"emitter": area(1.5, 0.5, 1.8, [9.0, 6.0, 2.0])},
+    "textured area": lambda: {"emitter": textured()},
+    "area inside": lambda: {"emitter": {"type": "sphere", "radius": 0.25, "center": [0.3, 0.2, 0.1]}
                             | {"emitter": {"type": "area", "radiance": 4.0}}},
-    "two that can be met": lambda: {**LAMPS["envmap"](), "wide": area(-1.6, 0.5, 1.5, 3.0, 1.5)},
+    "two that can be met": lambda: {**EMITTERS["envmap"](), "wide": area(-1.6, 0.5, 1.5, 3.0, 1.5)},
     "several": lambda: {"a": scenes.sky(0.1), "b": point([1.5, -1.2, 1.6])[0], "c": sun([0, 1, -0.5], 0.5)[0],
                         "d": area(-1.6, 0.5, 1.5)},
 }  # fmt: skip

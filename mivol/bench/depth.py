@@ -248,7 +248,7 @@ def draw_table(axes: Axes, cells: list[Cell], light: str, phase: str) -> None:
 
 
 def tabled(cell: Cell) -> tuple[str, str]:
-    """The table that a cell is compared with: lamps count as collimated."""
+    """The table that a cell is compared with: emitters count as collimated."""
     return "constant" if cell.light == "constant" else "collimated", cell.phase
 
 

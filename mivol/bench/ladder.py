@@ -70,7 +70,7 @@ class Rung:
 
 RUNGS = {
     "absorption": Rung(constant_light, 0.0, 2),
-    "emission": Rung(lambda: {"lamp": {"type": "constant", "radiance": 0.2}}, 0.0, 2, True),
+    "emission": Rung(lambda: {"emitter": {"type": "constant", "radiance": 0.2}}, 0.0, 2, True),
     "single scattering": Rung(sun_and_sky, 0.75, 2),
     "multiple scattering": Rung(sun_and_sky, 0.75, 6),
 }

@@ -1,6 +1,6 @@
 """Scenes of stock plugins that every renderer takes: a box of extinction, a camera of the tutorial's, a kind of light.
 
-Conventions. The box is [-1, 1]^3. Lights are functions that return the parts of a scene which they change: ``lamp`` and
+Conventions. The box is [-1, 1]^3. Lights are functions that return the parts of a scene which they change: ``emitter`` and
 the medium's ``phase``.
 """
 
@@ -17,7 +17,7 @@ __all__ = [
     "box_scene",
     "constant_light",
     "directional_light",
-    "lamp_inside",
+    "emitter_inside",
     "milky_glass",
     "of_depth",
     "perspective",
@@ -52,7 +52,7 @@ def box_scene(values: np.ndarray, side: int, albedo: float = 0.0, **more: dict) 
         values: (Z, Y, X) [1/length].
         side: of the picture [pixels].
         albedo: of the medium.
-        more: ``phase`` of the medium, ``bsdf`` of the box; all else are parts of the scene. Without lamps, a sky of
+        more: ``phase`` of the medium, ``bsdf`` of the box; all else are parts of the scene. Without emitters, a sky of
             radiance 1.
     """
     to_world = mi.ScalarTransform4f(np.float32(TO_WORLD))
@@ -71,13 +71,13 @@ def box_scene(values: np.ndarray, side: int, albedo: float = 0.0, **more: dict) 
 
 def constant_light() -> dict:
     """Light of radiance 1 from everywhere, isotropic scattering."""
-    return {"lamp": {"type": "constant"}, "phase": {"type": "isotropic"}}
+    return {"emitter": {"type": "constant"}, "phase": {"type": "isotropic"}}
 
 
 def point_light(position: tuple[float, float, float]) -> dict:
     """A point light, isotropic scattering."""
-    lamp = {"type": "point", "position": list(position), "intensity": {"type": "rgb", "value": [3.0, 2.5, 2.0]}}
-    return {"lamp": lamp, "phase": {"type": "isotropic"}}
+    emitter = {"type": "point", "position": list(position), "intensity": {"type": "rgb", "value": [3.0, 2.5, 2.0]}}
+    return {"emitter": emitter, "phase": {"type": "isotropic"}}
 
 
 def sun_and_sky(height: int = 128) -> dict:
@@ -94,27 +94,27 @@ def sun_and_sky(height: int = 128) -> dict:
     picture = np.where(sun[..., None], np.array([420.0, 390.0, 330.0]), sky).astype(np.float32)
     # Mitsuba's maps have y up, the benches z.
     turned = mi.ScalarTransform4f().rotate([1, 0, 0], 90)
-    lamp = {"type": "envmap", "bitmap": mi.Bitmap(picture), "to_world": turned}
-    return {"lamp": lamp, "phase": {"type": "hg", "g": 0.8}}
+    emitter = {"type": "envmap", "bitmap": mi.Bitmap(picture), "to_world": turned}
+    return {"emitter": emitter, "phase": {"type": "hg", "g": 0.8}}
 
 
 def directional_light() -> dict:
     """A directional light from above, HG g = 0.8."""
-    lamp = {"type": "directional", "direction": [0.3, 0.2, -1.0], "irradiance": {"type": "rgb", "value": [3.0, 2.5, 2.0]}}
-    return {"lamp": lamp, "phase": {"type": "hg", "g": 0.8}}
+    emitter = {"type": "directional", "direction": [0.3, 0.2, -1.0], "irradiance": {"type": "rgb", "value": [3.0, 2.5, 2.0]}}
+    return {"emitter": emitter, "phase": {"type": "hg", "g": 0.8}}
 
 
-def lamp_inside() -> dict:
+def emitter_inside() -> dict:
     """A small ball of light in the medium, isotropic scattering."""
-    lamp = {"type": "sphere", "center": [0.2, 0.1, 0.3], "radius": 0.2, "emitter": {"type": "area", "radiance": 9.0}}
-    return {"lamp": lamp, "phase": {"type": "isotropic"}}
+    emitter = {"type": "sphere", "center": [0.2, 0.1, 0.3], "radius": 0.2, "emitter": {"type": "area", "radiance": 9.0}}
+    return {"emitter": emitter, "phase": {"type": "isotropic"}}
 
 
 def milky_glass() -> dict:
-    """A box of smooth glass under a large lamp and a faint sky, isotropic scattering."""
-    lamp = {"type": "sphere", "center": [1.2, -1.5, 2.2], "radius": 0.6, "emitter": {"type": "area", "radiance": 9.0}}
+    """A box of smooth glass under a large emitter and a faint sky, isotropic scattering."""
+    emitter = {"type": "sphere", "center": [1.2, -1.5, 2.2], "radius": 0.6, "emitter": {"type": "area", "radiance": 9.0}}
     sky = {"type": "constant", "radiance": 0.5}
-    return {"lamp": lamp, "sky": sky, "phase": {"type": "isotropic"}, "bsdf": {"type": "dielectric"}}
+    return {"emitter": emitter, "sky": sky, "phase": {"type": "isotropic"}, "bsdf": {"type": "dielectric"}}
 
 
 def of_depth(name: str, depth: int) -> mi.Integrator:

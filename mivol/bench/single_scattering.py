@@ -22,16 +22,16 @@ the ratio of two renders of one round, median over the rounds. Printed are
 The bar is on the first, but for point lights, near which the mean does not exist: there it is on the second, and the picture is
 small, so that each pixel has samples enough to show the long tail of its variance (from 32 samples ``volpath`` seems to have
 half the variance that it shows in 500). Only pixels that see the medium count (a mean optical depth above 0.01), and none
-within a pixel and a half of a lamp inside it. A pixel in which the other integrator found no light in 8 images counts as a
+within a pixel and a half of an emitter inside it. A pixel in which the other integrator found no light in 8 images counts as a
 ratio of 0. Beside the time on the wall stands that of the processors (``processor_time``), which a busy machine moves less.
 
 Equality. Beside every ratio stands z: the difference of the means over those pixels in standard errors, with the relative
-standard error, which says how small a bias it could have seen. Where a lamp stands inside, most of the mean comes from samples
-that are rare (through dense matter) or without bound (near the lamp), and no number of rounds makes it normal. There the means
-of the same volume are compared after it was thinned to an optical depth of 1 at most, and truncated to pixels beyond a quarter
-of the picture from the lamp. If any z of a run is beyond its bound by Student's t with effective degrees of freedom (a false
-alarm in one run in 1000), the script ends with status 1: then the ratios mean nothing. Samples are camera paths, per second of
-a warm render.
+standard error, which says how small a bias it could have seen. Where an emitter stands inside, most of the mean comes from
+samples that are rare (through dense matter) or without bound (near the emitter), and no number of rounds makes it normal.
+There the means of the same volume are compared after it was thinned to an optical depth of 1 at most, and truncated to pixels
+beyond a quarter of the picture from the emitter. If any z of a run is beyond its bound by Student's t with effective degrees
+of freedom (a false alarm in one run in 1000), the script ends with status 1: then the ratios mean nothing. Samples are camera
+paths, per second of a warm render.
 
 Prints JSON; writes bench_single_scattering.json and bench_single_scattering.png (error against time in the smoke, and the
 ratios of all volumes). Data is read from MIVOL_DATA (default ../shared/data); where it is missing made-up fields take its
@@ -89,8 +89,8 @@ STOCK = ("volpath", "prbvolpath")
 SEEN = 0.01
 """Mean optical depth of a pixel from which on it counts."""
 
-AT_LAMP, TRUNCATED = 1.5, 0.25
-"""Pixels so near to a lamp inside do not count [pixels], and are left out of the means that are compared [share of a side]."""
+AT_EMITTER, TRUNCATED = 1.5, 0.25
+"""Pixels so near to an emitter inside do not count [pixels], and are left out of the means compared [share of a side]."""
 
 
 @dataclass(frozen=True)
@@ -121,18 +121,18 @@ FULL = Size()
 QUICK = Size(name="quick", most_pixels=16, budget=Budget(seconds=0.02), levels=(1, 4), fine_res=48, sparse_res=64)
 
 
-# -- Lamps and volumes -----------------------------------------------------------------------------------------------------
+# -- Emitters and volumes -----------------------------------------------------------------------------------------------------
 
 
 class Light(NamedTuple):
-    """A lamp and a phase function.
+    """An emitter and a phase function.
 
     Attributes:
         parts: of the scene.
         bar: how many times sooner mivol has to be.
         by_pixel: judge the median over pixels, where the mean of their variances does not exist.
         side: of the picture [pixels].
-        inside: where a lamp stands in the medium.
+        inside: where an emitter stands in the medium.
         albedo: of the medium.
         depth: ``max_depth`` of all integrators; -1 for no limit.
     """
@@ -177,15 +177,15 @@ def contend(values: np.ndarray, light: Light, size: Size, levels: tuple[int, ...
 
     Args:
         values: (Z, Y, X) extinction of the box.
-        light: lamp and phase function.
+        light: emitter and phase function.
         size: pixels, samples and rounds.
         levels: see ``Size.levels``; the first one, 1, is what ratios are of.
     """
     side = min(light.side, size.most_pixels)
     scene = mi.load_dict(box_scene(values, side, light.albedo, **light.parts()))
     timings, spp = render_in_turns(scene, size, levels, light.depth)
-    tau, away = optical_depths(scene), pixels_from_lamp(scene, light, side)
-    counts = (tau > SEEN) & (away > AT_LAMP)
+    tau, away = optical_depths(scene), pixels_from_emitter(scene, light, side)
+    counts = (tau > SEEN) & (away > AT_EMITTER)
     figures = {"pixels_that_count": int(counts.sum())}
     for name in (OURS, *STOCK):
         figures[name] = [{"spp": spp[name, k]} | errors(timings[name, k], counts, spp[name, k]) for k in levels]
@@ -222,8 +222,8 @@ def optical_depths(scene: mi.Scene) -> np.ndarray:
     return np.array(tau)[..., 3]
 
 
-def pixels_from_lamp(scene: mi.Scene, light: Light, side: int) -> np.ndarray:
-    """How far each pixel (H, W) is from a lamp in the medium [pixels]; infinite where none stands in it."""
+def pixels_from_emitter(scene: mi.Scene, light: Light, side: int) -> np.ndarray:
+    """How far each pixel (H, W) is from an emitter in the medium [pixels]; infinite where none stands in it."""
     if light.inside is None:
         return np.full((side, side), np.inf)
     seen = np.array(mi.Transform4f(scene.sensors()[0].world_transform()).inverse() @ mi.Point3f(light.inside)).ravel()

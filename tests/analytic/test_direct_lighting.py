@@ -1,4 +1,4 @@
-"""Direct light of lamps on paper: at a wall and at a point of smoke, dimmed by fog on the way."""
+"""Direct light of emitters on paper: at a wall and at a point of smoke, dimmed by fog on the way."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ POWER, FAR, DEPTH = 3.0, 4.0, 0.5
 KEY = "fog.interior_medium.sigma_t.value.value"
 
 
-def scene(**lamps: dict) -> mi.Scene:
+def scene(**emitters: dict) -> mi.Scene:
     """A wall at z = 0, whose other side is lit as well, and fog of an optical depth of DEPTH between z = 1 and 2."""
     wall = {"type": "rectangle", "bsdf": {"type": "diffuse", "reflectance": 0.5}}
     fog = box_of(medium("mivol_medium", DEPTH), centred(np.diag([20.0, 20, 1]), (0, 0, 1.5)))
-    return mi.load_dict({"type": "scene", "wall": wall, "fog": fog, "sensor": camera([0, -1, 9], [0, 0, 0]), **lamps})
+    return mi.load_dict({"type": "scene", "wall": wall, "fog": fog, "sensor": camera([0, -1, 9], [0, 0, 0]), **emitters})
 
 
-def lamp(z: float = FAR, power: float = POWER) -> dict:
+def emitter(z: float = FAR, power: float = POWER) -> dict:
     return {"type": "point", "position": [0, 0, z], "intensity": power}
 
 
@@ -38,19 +38,19 @@ def at_wall(found: mi.Scene) -> tuple[DirectLighting, SurfaceVertex]:
     return DirectLighting(media), SurfaceVertex(media, si, si.bsdf(ray), mi.MediumPtr(None))
 
 
-def test_a_wall_under_a_lamp():
+def test_a_wall_under_a_emitter():
     """reflectance / pi I / r^2 exp(-tau); nothing in a lane that is off."""
-    direct, vertex = at_wall(scene(lamp=lamp()))
+    direct, vertex = at_wall(scene(emitter=emitter()))
     with dr.suspend_grad():
         found, off = (direct.at_vertex(vertex, mi.Point2f(0.5), False, mi.Bool(on)) for on in (True, False))
-    # Rays start a little above the wall: 1e-5 of a scene of 20, and the lamp is that much nearer.
+    # Rays start a little above the wall: 1e-5 of a scene of 20, and the emitter is that much nearer.
     assert np.array(found.value).ravel() == pytest.approx([0.5 / np.pi * POWER / FAR**2 * np.exp(-DEPTH)] * 3, rel=1e-3)
     assert found.on[0] and not off.on[0] and not np.array(off.value).any()
 
 
 def test_a_shadow_ray_has_the_derivative_of_its_optical_depth():
     """-1 for each unit of extinction in a slab of thickness 1, times the light, beside the derivatives that Dr.Jit tracks."""
-    found = scene(lamp=lamp())
+    found = scene(emitter=emitter())
     params = mi.traverse(found)
     dr.enable_grad(params[KEY])
     dr.set_grad(params[KEY], 0.25)
@@ -94,9 +94,9 @@ def samples() -> EventSamples:
     return EventSamples(u, uv, u, uv, u, uv, u)
 
 
-def test_a_point_of_smoke_under_two_lamps():
-    """I / (4 pi r^2) of the lamp that was chosen, twice since one of two was; the fog lies below."""
-    found = scene(one=lamp(4.0, 3.0), two=lamp(5.0, 7.0))
+def test_a_point_of_smoke_under_two_emitters():
+    """I / (4 pi r^2) of the emitter that was chosen, twice since one of two was; the fog lies below."""
+    found = scene(one=emitter(4.0, 3.0), two=emitter(5.0, 7.0))
     direct, vertex = at_smoke(found)
     assert len(direct.emitters.sampled) == 2 and not direct.emitters.samples_phase
     light = []

@@ -24,7 +24,7 @@ pytestmark = pytest.mark.usefixtures("variant_rgb")
 def test_collisions_in_a_cell_of_linear_extinction(ends):
     r"""tau(x) = d (a x + (b - a) x^2 / 2) for a cell of length d reaches -log(1 - u (1 - exp(-tau(1)))) where x says."""
     values = np.repeat(np.float32([ends[0], *ends, ends[1]]), 4).reshape(4, 2, 2, 1)
-    scene = close_up({"smoke": smoke(values)[0], "lamp": point([0, 0, 30.0])[0]})
+    scene = close_up({"smoke": smoke(values)[0], "emitter": point([0, 0, 30.0])[0]})
     survey, settings, n = survey_scene(scene), Settings(max_depth=2), 64
     with dr.suspend_grad():
         needs = find_needs(scene, scene.sensors()[0], survey)

@@ -20,10 +20,10 @@ pytestmark = pytest.mark.usefixtures("variant_rgb")
 ALBEDO = 0.7
 
 
-def control_of(lamp: dict) -> GridControl:
+def control_of(emitter: dict) -> GridControl:
     """S in smoke so thin that it dims nothing: 4 x 3 x 5 voxels, whose coarse lattice has its nodes in the corners."""
     values = np.full((4, 3, 5, 1), 1e-7, np.float32)
-    scene = close_up({"smoke": smoke(values, ALBEDO)[0], "lamp": lamp})
+    scene = close_up({"smoke": smoke(values, ALBEDO)[0], "emitter": emitter})
     survey, settings = survey_scene(scene), Settings(max_depth=2)
     with dr.suspend_grad():
         needs = find_needs(scene, scene.sensors()[0], survey)

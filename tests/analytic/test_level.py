@@ -26,10 +26,10 @@ MISSED = 40.0
 """Where a ray passes all boxes."""
 
 
-def level_of(lamp: dict, *interiors: dict, depth: int = 3, at: tuple = (0, MISSED, 0.5, MISSED)) -> np.ndarray | None:
+def level_of(emitter: dict, *interiors: dict, depth: int = 3, at: tuple = (0, MISSED, 0.5, MISSED)) -> np.ndarray | None:
     """For boxes with these media, 5 beside each other, the first one [-1, 1]^3, and rays that pass x = ``at``."""
     boxes = {f"box{k}": box_of(interior, PLACE + 5 * k * np.eye(4, k=3)) for k, interior in enumerate(interiors)}
-    scene = mi.load_dict({"type": "scene", **boxes, "lamp": lamp, "sensor": camera([0, -1, 6], [0, 0, 0])})
+    scene = mi.load_dict({"type": "scene", **boxes, "emitter": emitter, "sensor": camera([0, -1, 6], [0, 0, 0])})
     survey, settings = survey_scene(scene), Settings(max_depth=depth)
     o = mi.Point3f(mi.Float(at), 0, -4)
     ray = mi.Ray3f(o, mi.Vector3f(0, 0, 1), dr.inf, dr.zeros(mi.Float, len(at)), mi.Color0f())
@@ -63,15 +63,15 @@ def test_where_nothing_collides_it_is_the_mean_of_all_rays():
     np.testing.assert_allclose(level_of(sky(0.5), medium("homogeneous", SIGMA, 1.0), at=(MISSED, MISSED)), 0.5, rtol=1e-6)
 
 
-def test_under_a_lamp_it_is_the_mean_of_paths_that_collide():
+def test_under_an_emitter_it_is_the_mean_of_paths_that_collide():
     """Albedo times I / (4 pi r^2), of the one path in twenty that collides.
 
     Shadows take 1 - exp(-0.17) of it at most, since no way through the box is longer than 3.5, and a second scattering adds
-    less than that share; the lamp is 200 away, give or take 1. The paths are always the same.
+    less than that share; the emitter is 200 away, give or take 1. The paths are always the same.
     """
-    lamp = {"type": "point", "position": [0.0, 0.0, FAR], "intensity": POWER}
+    emitter = {"type": "point", "position": [0.0, 0.0, FAR], "intensity": POWER}
     once = ALBEDO * POWER / (4 * np.pi * FAR**2)
-    found = level_of(lamp, medium("homogeneous", SIGMA, ALBEDO))
+    found = level_of(emitter, medium("homogeneous", SIGMA, ALBEDO))
     assert np.all((0.82 * once < found) & (found < 1.19 * once))
 
 

@@ -33,8 +33,8 @@ def test_point_light_in_fog_check_values(numbers, answer):
     assert twins.point_in_fog(*numbers) == pytest.approx(answer, rel=1e-9)
     sigma_s, sigma_t, intensity, t0, h, D = numbers
     fog = twins.Medium(twins.Box(sigma_t, WIDE), sigma_s / sigma_t)
-    lamp = twins.Point([t0, h, 0.0], intensity)
-    found = twins.radiance([fog], [lamp], *along([0, 0, 0], [1, 0, 0]), t1=D, order=12)
+    emitter = twins.Point([t0, h, 0.0], intensity)
+    found = twins.radiance([fog], [emitter], *along([0, 0, 0], [1, 0, 0]), t1=D, order=12)
     assert found[0, 0] == pytest.approx(answer, rel=1e-8)
 
 
@@ -48,7 +48,7 @@ def test_thin_limits(name):
 
 
 def test_thin_limit_of_any_phase():
-    """sigma_s I / h times the integral of p(-sin theta): theta is the angle at the lamp from the shortest way."""
+    """sigma_s I / h times the integral of p(-sin theta): theta is the angle at the emitter from the shortest way."""
     h, t0, D = 0.3, 1.2, 4.0
     p = twins.hg(0.6)
     x, w = np.polynomial.legendre.leggauss(60)
@@ -113,9 +113,9 @@ def test_optical_depth_of_many_rays():
 def test_a_grid_of_one_value_is_a_box():
     o, d = small.aimed(4)
     spot = twins.Spot([0, 0, 3.0], 2.0, (0, 0.1, -1), 0.5, 0.3)
-    for lamp in (twins.Point([0.3, 0.2, 1.4], 2.0), spot, twins.Directional([1, 2, 3.0])):
+    for emitter in (twins.Point([0.3, 0.2, 1.4], 2.0), spot, twins.Directional([1, 2, 3.0])):
         pair = [
-            twins.radiance([twins.Medium(field, 0.5, twins.hg(-0.3))], [lamp], o, d, order=12)
+            twins.radiance([twins.Medium(field, 0.5, twins.hg(-0.3))], [emitter], o, d, order=12)
             for field in (twins.Box(1.1, small.PLACE), twins.Grid(np.full((2, 3, 2), 1.1), small.PLACE))
         ]
         assert np.allclose(*pair, rtol=1e-5, atol=0)
@@ -126,18 +126,18 @@ def test_two_halves_are_one_box():
     halves = [twins.Medium(twins.Box(0.9, centred(np.diag([2.0, 2, 1]), (0, 0, z))), 0.8, twins.rayleigh) for z in (-0.5, 0.5)]
     whole = twins.Medium(twins.Box(0.9, small.PLACE), 0.8, twins.rayleigh)
     o, d = small.aimed(6)
-    lamp = twins.Point([0.4, -0.3, 2.0])
-    pair = [twins.radiance(media, [lamp], o, d, background=0.5, order=12) for media in (halves, [whole])]
+    emitter = twins.Point([0.4, -0.3, 2.0])
+    pair = [twins.radiance(media, [emitter], o, d, background=0.5, order=12) for media in (halves, [whole])]
     assert np.allclose(*pair, rtol=1e-6, atol=0)
 
 
 def test_reciprocity():
-    """A turn counts the same from camera to lamp and back: at one point x, T(a,x) sigma p T(x,b) is symmetric."""
+    """A turn counts the same from camera to emitter and back: at one point x, T(a,x) sigma p T(x,b) is symmetric."""
     grid, p = twins.Grid(small.rough_grid(7), small.PLACE), twins.hg(0.5)
     a, b, x = np.array([[-3.0, 0.2, 0.1]]), np.array([[0.5, 2.0, 1.0]]), np.array([[0.2, -0.3, 0.4]])
 
-    def one(eye, lamp):
-        d, w = x - eye, lamp - x
+    def one(eye, emitter):
+        d, w = x - eye, emitter - x
         r, s = np.linalg.norm(d), np.linalg.norm(w)
         tau = grid.tau(eye, d / r, [r]) + grid.tau(x, w / s, [s])
         return np.exp(-tau) * p(np.sum(d * w) / (r * s))
@@ -145,7 +145,7 @@ def test_reciprocity():
     assert one(a, b) == pytest.approx(one(b, a), rel=1e-12)
 
 
-LAMPS = {
+EMITTERS = {
     "point": twins.Point([0.5, 0.6, 1.7], 2.0),
     "spot": twins.Spot([0.5, 0.6, 1.7], 2.0, (-0.2, -0.3, -1), 0.6, 0.4),
     "sun": twins.Directional([0.3, 0.2, -1]),
@@ -153,21 +153,21 @@ LAMPS = {
 }
 
 
-@pytest.mark.parametrize("name", LAMPS)
+@pytest.mark.parametrize("name", EMITTERS)
 @pytest.mark.parametrize("empty", [False, True])
 def test_gradient_is_the_difference(name, empty):
     """Central differences in float64, h = 1e-5: truncation 1e-10, rounding 1e-16/1e-5. Density 0 is not special."""
     values = small.rough_grid(8)[..., 0] * (0 if empty else 1)
     o, d = small.aimed(8, n=3)
     weight = np.array([1.0, -0.4, 2.0])
-    lamps, v = [LAMPS[name]], np.random.default_rng(8).uniform(0.1, 1, values.shape)
+    emitters, v = [EMITTERS[name]], np.random.default_rng(8).uniform(0.1, 1, values.shape)
 
     def at(values, albedo=0.7):
         m = twins.Medium(twins.Grid(values, small.PLACE, 1.3), albedo, twins.hg(0.4))
-        return weight @ twins.radiance([m], lamps, o, d, background=0.6)[:, 0]
+        return weight @ twins.radiance([m], emitters, o, d, background=0.6)[:, 0]
 
     m = twins.Medium(twins.Grid(values, small.PLACE, 1.3), 0.7, twins.hg(0.4))
-    row, slope = twins.radiance_gradient(m, lamps, o, d, weight, background=0.6)
+    row, slope = twins.radiance_gradient(m, emitters, o, d, weight, background=0.6)
     h = 1e-5
     assert np.sum(row * v) == pytest.approx((at(values + h * v) - at(values - h * v)) / (2 * h), rel=1e-7)
     assert slope == pytest.approx((at(values, 0.8) - at(values, 0.6)) / 0.2, rel=1e-9, abs=1e-14)
@@ -200,7 +200,7 @@ JUDGED = {
     "point, grid, hg": lambda: (small.smoke(small.rough_grid(1), name="hg", g=0.5), [small.point([1.5, 1, 2.0])], 0),
     "spot, grid": lambda: (small.smoke(small.rough_grid(2)), [small.spot([1.0, -2, 2.5], [0, 0, 0])], 0),
     "sun, box, rayleigh": lambda: (small.fog(0.8, name="rayleigh"), [small.sun([0.3, 0.2, -1.0])], 0),
-    "two lamps, grid": lambda: (small.smoke(small.rough_grid(3)), [small.point([0, 2, 2]), small.sun([1, 0, -0.5], 0.2)], 0),
+    "two emitters, grid": lambda: (small.smoke(small.rough_grid(3)), [small.point([0, 2, 2]), small.sun([1, 0, -0.5], 0.2)], 0),
     "sky, box, hg": lambda: (small.fog(0.8, name="hg", g=0.6), [SKY], 0.5),
 }
 
@@ -209,17 +209,17 @@ JUDGED = {
 @pytest.mark.parametrize("name", small.cases(JUDGED, [name for name in JUDGED if name != "point, grid, hg"]))
 def test_twins_against_volpath(variant_rgb, name):
     """16 batches of 8192 paths along each of 6 rays; Student's t."""
-    (box, m), lamps, background = JUDGED[name]()
+    (box, m), emitters, background = JUDGED[name]()
     o, d = small.aimed(11, n=6)
-    parts = {"smoke": box} | {f"lamp{i}": lamp for i, (lamp, _) in enumerate(lamps)}
+    parts = {"smoke": box} | {f"emitter{i}": emitter for i, (emitter, _) in enumerate(emitters)}
     # The sky's 24 x 48 directions leave 1e-4; volpath's spawned rays skip 1e-4 of a length at each boundary.
     small.assert_twin(
-        small.pencils(parts, o, d), [m], [twin for _, twin in lamps], small.volpath(), 8192, background=background,
+        small.pencils(parts, o, d), [m], [twin for _, twin in emitters], small.volpath(), 8192, background=background,
         rounding=2e-5 if not background else 2e-4,
     )  # fmt: skip
 
 
 def test_as_float32_positions_are_kept():
-    """The lamps of both sides stand in the same place."""
-    _, lamp = small.point([0.1, 0.2, 0.3])
-    assert np.array_equal(lamp.position, as_float32([0.1, 0.2, 0.3]))
+    """The emitters of both sides stand in the same place."""
+    _, emitter = small.point([0.1, 0.2, 0.3])
+    assert np.array_equal(emitter.position, as_float32([0.1, 0.2, 0.3]))

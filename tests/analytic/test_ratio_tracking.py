@@ -141,7 +141,7 @@ def test_variance_is_as_derived():
 @pytest.mark.statistical
 @pytest.mark.parametrize("name", cases(["rough", "rgb"], ["rough"]))
 def test_pictures_have_the_same_mean(name):
-    """A sky and a lamp, exact and estimated shadows."""
+    """A sky and an emitter, exact and estimated shadows."""
     parts = {"smoke": smoke(FIELDS[name]() * 0.5, name="hg", g=0.4)[0], "bulb": point([1.5, -1.2, 1.6])[0]}
     scene = close_up({**parts, "sky": scenes.sky(0.3)}, res=8)
     one, other = mivol(shadows="estimated"), mivol(shadows="exact")
@@ -166,13 +166,13 @@ def test_gradients_have_exact_shadows():
 
 def test_fine_grids_are_looked_up():
     """The plan says which shadows are estimated, and why."""
-    lamp, fine = scenes.sky(0.3), np.full((160, 160, 8, 1), 0.1, np.float32)
-    coarse, dense = (explain(close_up({"smoke": smoke(v)[0], "sky": lamp}, res=4), 2) for v in (fine[::8, ::8], fine))
+    emitter, fine = scenes.sky(0.3), np.full((160, 160, 8, 1), 0.1, np.float32)
+    coarse, dense = (explain(close_up({"smoke": smoke(v)[0], "sky": emitter}, res=4), 2) for v in (fine[::8, ::8], fine))
     assert "shadows of smoke" in coarse and "estimated" not in coarse
     assert "estimated" in dense and "328 occupied cells" in dense
     sparse = fine.copy()
     sparse[8:] = 0
-    assert "estimated" not in explain(close_up({"smoke": smoke(sparse)[0], "sky": lamp}, res=4), 2)
+    assert "estimated" not in explain(close_up({"smoke": smoke(sparse)[0], "sky": emitter}, res=4), 2)
 
 
 def test_one_grid_beside_fog_is_estimated():

@@ -1,8 +1,8 @@
 """Scattered light by quadrature along pencils: against the float64 twin, without any noise to hide behind.
 
-The rule is exact for smooth light to far below what is allowed; its error is where shadows bend within a piece: tau towards a
-lamp has a kink where the shadow ray begins to cross another cell, or to leave by another face. A piece of optical depth p with
-a kink of its own slope errs by p^2 / 8 of its light: 0.25^2 / 8 = 8e-3; of the pieces of a ray at most half have one.
+The rule is exact for smooth light to far below what is allowed; its error is where shadows bend within a piece: tau towards
+an emitter has a kink where the shadow ray begins to cross another cell, or to leave by another face. A piece of optical depth p
+with a kink of its own slope errs by p^2 / 8 of its light: 0.25^2 / 8 = 8e-3; of the pieces of a ray at most half have one.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from scenes import as_float32, box_of, centred, grid_volume, refused, sky
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
 
-LAMPS = {
+EMITTERS = {
     "point outside": lambda: [point([1.5, 1, 2.0])],
     "point inside": lambda: [point([0.3, -0.2, 0.35])],
     "spot": lambda: [spot([1.0, -2, 2.5], [0, 0, 0], cutoff=60, beam=59)],
@@ -31,25 +31,25 @@ def image(seen, **more) -> np.ndarray:
     return np.array(mi.render(seen.scene, integrator=mi.load_dict(mivol(deterministic=True, **more)), spp=1))[0]
 
 
-def beside(parts: dict, media: list, lamps: list, order: int = 6) -> tuple[np.ndarray, np.ndarray]:
-    seen = pencils(parts | {f"lamp{i}": lamp for i, (lamp, _) in enumerate(lamps)}, *aimed(3))
-    truth = twins.radiance(media, [twin for _, twin in lamps], seen.o, seen.d, order=order)
+def beside(parts: dict, media: list, emitters: list, order: int = 6) -> tuple[np.ndarray, np.ndarray]:
+    seen = pencils(parts | {f"emitter{i}": emitter for i, (emitter, _) in enumerate(emitters)}, *aimed(3))
+    truth = twins.radiance(media, [twin for _, twin in emitters], seen.o, seen.d, order=order)
     return image(seen), np.broadcast_to(truth, (len(seen.o), 3))
 
 
-@pytest.mark.parametrize("lamps", LAMPS)
-def test_grid(lamps):
+@pytest.mark.parametrize("emitters", EMITTERS)
+def test_grid(emitters):
     box, m = smoke(rough_grid(1), name="hg", g=0.4)
-    found, truth = beside({"smoke": box}, [m], LAMPS[lamps]())
+    found, truth = beside({"smoke": box}, [m], EMITTERS[emitters]())
     assert np.abs(found - truth).max() <= 4e-3 * truth.max()
 
 
-@pytest.mark.parametrize("lamps", ["point outside", "sun", "point inside"])
+@pytest.mark.parametrize("emitters", ["point outside", "sun", "point inside"])
 @pytest.mark.parametrize("sigma_t", [0.1, 2.0, 30.0])
-def test_homogeneous(lamps, sigma_t):
+def test_homogeneous(emitters, sigma_t):
     box, m = fog(sigma_t)
     # Sixty optical depths across: the twin's own Gauss rule needs more points than a cell would.
-    found, truth = beside({"fog": box}, [m], LAMPS[lamps](), order=96)
+    found, truth = beside({"fog": box}, [m], EMITTERS[emitters](), order=96)
     # 64 to 256 pieces; the face by which shadows leave changes once or twice along a ray.
     assert np.abs(found - truth).max() <= 4e-3 * truth.max()
 
@@ -75,16 +75,16 @@ def test_absorption_beside_scattering(name):
 
 def test_two_renders_are_the_same():
     box, _ = smoke(rough_grid(1))
-    lamp, _ = point([1.5, 1, 2.0])
-    seen = pencils({"smoke": box, "lamp": lamp}, *aimed(3))
+    emitter, _ = point([1.5, 1, 2.0])
+    seen = pencils({"smoke": box, "emitter": emitter}, *aimed(3))
     assert np.array_equal(image(seen), image(seen))
 
 
 def test_gradients_are_drawn():
     """A deterministic image has the derivative of the image that is drawn: the same integrator makes it."""
     box, _ = smoke(rough_grid(1))
-    lamp, _ = point([1.5, 1, 2.0])
-    scene = close_up({"smoke": box, "lamp": lamp})
+    emitter, _ = point([1.5, 1, 2.0])
+    scene = close_up({"smoke": box, "emitter": emitter})
     params, grads = mi.traverse(scene), []
     key = next(k for k, _ in params if k.endswith("sigma_t.data"))
     for more in ({}, {"deterministic": True}):
@@ -101,21 +101,21 @@ def test_gradients_are_drawn():
 
 def test_refusals():
     box, _ = smoke(rough_grid(1))
-    lamp, _ = point([1.5, 1, 2.0])
+    emitter, _ = point([1.5, 1, 2.0])
     for more, why in (({"deterministic": True}, "ConstantBackground"), ({"shadows": "grid"}, "without deterministic")):
         with refused(why):
-            mi.render(close_up({"smoke": box, "lamp": lamp, "sky": sky()}), integrator=mi.load_dict(mivol(**more)), spp=1)
+            mi.render(close_up({"smoke": box, "emitter": emitter, "sky": sky()}), integrator=mi.load_dict(mivol(**more)), spp=1)
     apart = {"sigma_a": rough_grid(1), "sigma_s": rough_grid(2, shape=(2, 3, 4))}
     for volumes, more, why in (
         (apart, {}, "share their cells"),
         ({"sigma_a": apart["sigma_a"], "sigma_s": 0.4}, {"shadows": "grid"}, "sigma_s of the medium in smoke is a constant"),
     ):
         given = {k: v if isinstance(v, float) else grid_volume("mivol_voxels", v, PLACE) for k, v in volumes.items()}
-        scene = close_up({"smoke": box_of({"type": "mivol_medium", **given}, PLACE), "lamp": lamp})
+        scene = close_up({"smoke": box_of({"type": "mivol_medium", **given}, PLACE), "emitter": emitter})
         with refused(why):
             mi.render(scene, integrator=mi.load_dict(mivol(deterministic=True, **more)), spp=1)
     with refused("estimated or grid"):
-        mi.render(close_up({"smoke": box, "lamp": lamp}), integrator=mi.load_dict(mivol(shadows="soft")), spp=1)
+        mi.render(close_up({"smoke": box, "emitter": emitter}), integrator=mi.load_dict(mivol(shadows="soft")), spp=1)
 
 
 # -- Cells that no light crosses ---------------------------------------------------------------------------------------------
@@ -139,7 +139,7 @@ def test_deep_cells_lose_no_light(name, tau):
     """
     mu, albedo = 0.6, 0.8
     box = box_of({"type": "mivol_medium", "sigma_t": DEEP_CELLS[name](tau), "albedo": albedo}, np.eye(4))
-    seen = pencils({"smoke": box, "lamp": sun([0.8, 0, mu], 2.0)[0]}, [0.55, 0.45, -0.25], [0.0, 0.0, 1.0])
+    seen = pencils({"smoke": box, "emitter": sun([0.8, 0, mu], 2.0)[0]}, [0.55, 0.45, -0.25], [0.0, 0.0, 1.0])
     found = image(seen)[0]
     truth = albedo * 2.0 / (4 * np.pi) / (1 + 1 / mu)
     # Distances along the ray are rounded by half an ulp of 1/4 (the face is at z = 0, coordinates are exact there): what is lit

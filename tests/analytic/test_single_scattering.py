@@ -2,7 +2,7 @@
 
 Each ray is a pencil without a footprint; its radiance is the mean of 16 independent renders and held against the exact
 one by Student's t (tests/false_alarms.py). Where nothing is sampled (no noise at all) what is left is float32 rounding,
-which `rounding` names: 2e-5 of the largest radiance, a few EPS for each of about 50 operations on cells and lamps.
+which `rounding` names: 2e-5 of the largest radiance, a few EPS for each of about 50 operations on cells and emitters.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ pytestmark = pytest.mark.usefixtures("variant_rgb")
 SPP = 1024
 
 
-def check(parts, media, lamps, o, d, spp=SPP, integrator=None, level=2e-5, **more):
+def check(parts, media, emitters, o, d, spp=SPP, integrator=None, level=2e-5, **more):
     """Rounding is `level` times the largest radiance."""
-    seen = pencils(parts | {f"lamp{i}": lamp for i, (lamp, _) in enumerate(lamps)}, o, d)
-    known = [twin for _, twin in lamps]
+    seen = pencils(parts | {f"emitter{i}": emitter for i, (emitter, _) in enumerate(emitters)}, o, d)
+    known = [twin for _, twin in emitters]
     background = more.get("background", 0.0)
     top = twins.radiance(media, known, seen.o, seen.d, background=background).max()
     assert_twin(seen, media, known, integrator or mivol(), spp, rounding=level * top, **more)
@@ -37,7 +37,7 @@ def check(parts, media, lamps, o, d, spp=SPP, integrator=None, level=2e-5, **mor
 
 # -- Grids and boxes against the twin --------------------------------------------------------------------------------
 
-LAMPS = {
+EMITTERS = {
     "point outside": lambda: [point([1.5, 1, 2.0])],
     "point inside": lambda: [point([0.3, -0.2, 0.35])],
     "spot outside": lambda: [spot([1.0, -2, 2.5], [0, 0, 0])],
@@ -50,28 +50,29 @@ PHASES = {"isotropic": ("isotropic", 0.0), "hg": ("hg", 0.6), "backward": ("hg",
 
 @pytest.mark.statistical
 @pytest.mark.parametrize(
-    ("lamps", "kind"),
+    ("emitters", "kind"),
     small.cases(
-        [(lamps, kind) for lamps in LAMPS for kind in small.KINDS], [(lamps, "stock") for lamps in LAMPS if lamps != "three"]
+        [(emitters, kind) for emitters in EMITTERS for kind in small.KINDS],
+        [(emitters, "stock") for emitters in EMITTERS if emitters != "three"],
     ),
 )
-def test_grid_and_emitters(lamps, kind):
+def test_grid_and_emitters(emitters, kind):
     box, m = smoke(rough_grid(1), kind=kind, name="hg", g=0.4)
-    check({"smoke": box}, [m], LAMPS[lamps](), *aimed(1))
+    check({"smoke": box}, [m], EMITTERS[emitters](), *aimed(1))
 
 
 @pytest.mark.statistical
 @pytest.mark.parametrize("name", small.cases(PHASES, ["isotropic", "backward"]))
 def test_phase_functions(name):
     box, m = smoke(rough_grid(2), 0.9, "own", PLACE, *PHASES[name])
-    check({"smoke": box}, [m], LAMPS["three"](), *aimed(2))
+    check({"smoke": box}, [m], EMITTERS["three"](), *aimed(2))
 
 
 @pytest.mark.statistical
-@pytest.mark.parametrize("lamps", ["point outside", "point inside", "sun"])
-def test_homogeneous_box(lamps):
+@pytest.mark.parametrize("emitters", ["point outside", "point inside", "sun"])
+def test_homogeneous_box(emitters):
     box, m = fog(1.1, 0.8, name="hg", g=-0.3)
-    check({"fog": box}, [m], LAMPS[lamps](), *aimed(3))
+    check({"fog": box}, [m], EMITTERS[emitters](), *aimed(3))
 
 
 @pytest.mark.statistical
@@ -94,7 +95,7 @@ def test_albedo_grid(kind):
     medium_type, volume_type = small.KINDS[kind]
     interior = medium(medium_type, grid_volume(volume_type, values, PLACE), grid_volume(volume_type, albedo, PLACE))
     m = twins.Medium(twins.Grid(values, PLACE), twins.trilinear_albedo(albedo, PLACE))
-    check({"smoke": box_of(interior, PLACE)}, [m], LAMPS["point outside"](), *aimed(5))
+    check({"smoke": box_of(interior, PLACE)}, [m], EMITTERS["point outside"](), *aimed(5))
 
 
 @pytest.mark.statistical
@@ -105,7 +106,7 @@ def test_rgb_albedo_and_rgb_extinction():
     grid = grid_volume("mivol_voxels", as_float32(values), PLACE)
     interior = medium("mivol_medium", grid, {"type": "rgb", "value": list(albedo)})
     m = twins.Medium(twins.Grid(as_float32(values), PLACE), albedo)
-    check({"smoke": box_of(interior, PLACE)}, [m], LAMPS["point outside"](), *aimed(7))
+    check({"smoke": box_of(interior, PLACE)}, [m], EMITTERS["point outside"](), *aimed(7))
 
 
 @pytest.mark.statistical
@@ -114,7 +115,7 @@ def test_rgb_homogeneous():
     sigma = as_float32([0.1, 0.5, 0.9])
     interior = medium("homogeneous", {"type": "rgb", "value": list(sigma)}, 0.8)
     m = twins.Medium(twins.Box(sigma, PLACE), 0.8)
-    check({"fog": box_of(interior, PLACE)}, [m], LAMPS["sun"](), *aimed(8))
+    check({"fog": box_of(interior, PLACE)}, [m], EMITTERS["sun"](), *aimed(8))
 
 
 @pytest.mark.statistical
@@ -128,7 +129,7 @@ def test_absorption_and_scattering_grids():
         "phase": {"type": "rayleigh"},
     }
     media = [twins.Medium(twins.Grid(absorb, PLACE), 0.0), twins.Medium(twins.Grid(scatter, PLACE), 1.0, twins.rayleigh)]
-    check({"smoke": box_of(interior, PLACE)}, media, LAMPS["point outside"](), *aimed(9))
+    check({"smoke": box_of(interior, PLACE)}, media, EMITTERS["point outside"](), *aimed(9))
 
 
 @pytest.mark.statistical
@@ -168,10 +169,10 @@ def test_point_light_in_fog(sigma_s, sigma_t, intensity, t0, h, D, answer):
     """A box of length D along the ray, wide across it: light from beside the ray stays inside on its way."""
     frame = affine(np.diag([D, 400.0, 400.0]), (0, -200, -200))
     fog = box_of(medium("homogeneous", sigma_t, sigma_s / sigma_t), frame)
-    lamp = point([t0, h, 0.0] if t0 > 0 else [1e-6, h, 0], intensity)[0]
-    seen = pencils({"fog": fog, "lamp": lamp}, [-1, 0, 0], [1, 0, 0])
+    emitter = point([t0, h, 0.0] if t0 > 0 else [1e-6, h, 0], intensity)[0]
+    seen = pencils({"fog": fog, "emitter": emitter}, [-1, 0, 0], [1, 0, 0])
     m = seen.moments(mivol(), 16384)
-    # sigma_s/sigma_t and the lamp's place are float32 numbers; a few EPS each.
+    # sigma_s/sigma_t and the emitter's place are float32 numbers; a few EPS each.
     assert_same_mean(m, np.full((1, 3), answer), rounding=1e-5 * answer, what="fog")
     assert_precise(m, 0.01 * answer)
 
@@ -182,7 +183,7 @@ def test_thin_limit(name):
     """tau of 1e-4: the closed form without extinction, to that."""
     frame = affine(np.diag([4.0, 400.0, 400.0]), (0, -200, -200))
     fog = box_of(medium("homogeneous", 1e-5, 0.5, phase={"type": name}), frame)
-    seen = pencils({"fog": fog, "lamp": point([1.2, 0.3, 0.0], 2.0)[0]}, [-1, 0, 0], [1, 0, 0])
+    seen = pencils({"fog": fog, "emitter": point([1.2, 0.3, 0.0], 2.0)[0]}, [-1, 0, 0], [1, 0, 0])
     m = seen.moments(mivol(), 8192)
     answer = twins.point_thin(0.5e-5, 2.0, 1.2, 0.3, 4.0, name)
     assert_same_mean(m, np.full((1, 3), answer), rounding=1e-4 * answer, what=name)
@@ -202,7 +203,7 @@ def test_collimated_slab(mu, mu0, kind):
     travel = np.array([math.sqrt(1 - mu0 * mu0), 0, -mu0])
     view = np.array([0, math.sqrt(1 - mu * mu), mu])
     eyes = np.array([view, view * [1, 1, -1]])
-    # A camera that looks straight into the sun's direction is no problem: a directional lamp cannot be seen.
+    # A camera that looks straight into the sun's direction is no problem: a directional emitter cannot be seen.
     seen = pencils({"slab": build[0], "sun": sun(travel, E0)[0]}, np.array([0, 0, 0.5]) + 5 * eyes, -eyes)
     p = twins.hg(g)
     answer = [
@@ -242,18 +243,19 @@ def test_ball_in_a_constant_sky(sigma):
 
 
 @pytest.mark.statistical
+@pytest.mark.slow
 def test_reciprocity():
-    """The light of a lamp at a that passes b, from all sides, is that of a lamp at b that passes a (fluence).
+    """The light of an emitter at a that passes b, from all sides, is that of an emitter at b that passes a (fluence).
 
     Both cameras see the whole box; a pixel weighs what it sees of the sphere, to second order in its size (1e-4).
     """
     a, b = np.array([-3.0, 0.3, 0.5]), np.array([1.5, 2.5, 1.0])
     box, _ = smoke(rough_grid(13), 0.9, "own", name="hg", g=0.5)
     fluences = []
-    for eye, lamp in ((a, b), (b, a)):
+    for eye, emitter in ((a, b), (b, a)):
         fov, res = 75.0, 32
         sensor = scenes.camera(eye, (0, 0, 0), res=res, fov=fov)
-        scene = mi.load_dict({"type": "scene", "smoke": box, "lamp": point(lamp)[0], "sensor": sensor})
+        scene = mi.load_dict({"type": "scene", "smoke": box, "emitter": point(emitter)[0], "sensor": sensor})
         half = math.tan(math.radians(fov / 2))
         x = (np.arange(res) + 0.5) / res * 2 * half - half
         solid = (2 * half / res) ** 2 / (1 + x[:, None] ** 2 + x[None] ** 2) ** 1.5
@@ -272,7 +274,7 @@ def test_reciprocity():
 @pytest.mark.statistical
 @pytest.mark.parametrize("scale", small.cases([1e-3, 1e3], [1e3]))
 def test_the_size_of_the_scene(scale):
-    """k times larger, thinner by k, under a directional lamp: the same radiance."""
+    """k times larger, thinner by k, under a directional emitter: the same radiance."""
     frame = as_float32(centred(2 * scale * np.eye(3)))
     box, m = smoke(rough_grid(14) / scale, 0.8, "own", frame)
     o, d = aimed(14)
@@ -280,11 +282,11 @@ def test_the_size_of_the_scene(scale):
 
 
 def test_radiance_is_linear_in_the_emitters():
-    """Twice the lamp is twice the picture, to the last bit, with the same samples."""
+    """Twice the emitter is twice the picture, to the last bit, with the same samples."""
     box, _ = smoke(rough_grid(15), 0.8)
     o, d = aimed(15)
     images = [
-        scenes.render(pencils({"smoke": box, "lamp": point([1.5, 1, 2.0], power)[0]}, o, d).scene, mivol(), 16, seed=3)
+        scenes.render(pencils({"smoke": box, "emitter": point([1.5, 1, 2.0], power)[0]}, o, d).scene, mivol(), 16, seed=3)
         for power in (1.0, 2.0)
     ]
     assert np.array_equal(2 * images[0], images[1])
@@ -294,7 +296,7 @@ def test_radiance_is_linear_in_the_emitters():
 def test_where_nothing_is_sampled_twice_is_the_same():
     """The seed decides all: two renders of one seed are equal to the last bit."""
     box, _ = smoke(rough_grid(16), 0.8)
-    seen = pencils({"smoke": box, "lamp": point([1.5, 1, 2.0])[0]}, *aimed(16))
+    seen = pencils({"smoke": box, "emitter": point([1.5, 1, 2.0])[0]}, *aimed(16))
     first, second, other = (scenes.render(seen.scene, mivol(), 16, seed=s) for s in (3, 3, 4))
     assert np.array_equal(first, second)
     assert not np.array_equal(first, other)

@@ -155,11 +155,11 @@ def test_surfaces_behind_are_lit_through_the_field() -> None:
         "to_world": mi.ScalarTransform4f().translate([0, 1.2, 0]).rotate([1, 0, 0], 90).scale(3),
         "bsdf": {"type": "diffuse", "reflectance": 0.6},
     }
-    lamp = {"type": "point", "position": [0.3, -2, 0.2], "intensity": 4.0}
+    emitter = {"type": "point", "position": [0.3, -2, 0.2], "intensity": 4.0}
     constant = {"type": "mivol_medium", "sigma_t": 1.5, "scale": SCALE}
     known = shape("sphere", constant, radius=0.8)
     seen = [
-        follow(scene([0, -4, 0.4], [0, 0, 0.2], fog=own, floor=floor, lamp=lamp), (key,), 2)
+        follow(scene([0, -4, 0.4], [0, 0, 0.2], fog=own, floor=floor, emitter=emitter), (key,), 2)
         for own, key in ((shape("cube", fog(radius=0.8)), "sigma_t.sigma"), (known, "sigma_t.value.value"))
     ]
     for ours, truth, what in zip(*(s[:2] for s in seen), ("the radiance", "the derivative"), strict=True):
@@ -169,11 +169,11 @@ def test_surfaces_behind_are_lit_through_the_field() -> None:
 @pytest.mark.statistical
 def test_a_ball_that_scatters_any_number_of_times() -> None:
     """Expected: the means of a homogeneous sphere in its place, which flights see exactly, of images and derivatives."""
-    lamp = {"type": "point", "position": [0.3, -2, 0.2], "intensity": 4.0}
+    emitter = {"type": "point", "position": [0.3, -2, 0.2], "intensity": 4.0}
     own = shape("cube", {**fog(radius=0.8), "albedo": 0.6})
     known = shape("sphere", {"type": "mivol_medium", "sigma_t": 1.5, "scale": SCALE, "albedo": 0.6}, radius=0.8)
     seen = [
-        follow(scene([0, -4, 0.4], [0, 0, 0.2], fog=ball, lamp=lamp), (key,), 4)
+        follow(scene([0, -4, 0.4], [0, 0, 0.2], fog=ball, emitter=emitter), (key,), 4)
         for ball, key in ((own, "sigma_t.sigma"), (known, "sigma_t.value.value"))
     ]
     for ours, truth, what in zip(*(s[:2] for s in seen), ("the radiance", "the derivative"), strict=True):

@@ -29,8 +29,8 @@ def open_direct(scene: mi.Scene):
 def test_light_grid_against_exact_shadows():
     """tau between nodes is wrong by h^2: two nodes a cell leave a quarter of the error of one node in two cells, or less."""
     box, _ = smoke(rough_grid(1, shape=(16, 16, 16)))
-    lamp, _ = sun([0.3, 0.2, -1.0])
-    scene = close_up({"smoke": box, "lamp": lamp})
+    emitter, _ = sun([0.3, 0.2, -1.0])
+    scene = close_up({"smoke": box, "emitter": emitter})
     direct = open_direct(scene)
     with dr.suspend_grad():
         grids = (build_transmittance_grid(direct.media, direct.emitters, cells) for cells in (4, 1))
@@ -48,7 +48,7 @@ def test_light_grid_against_exact_shadows():
 def test_nodes_of_a_light_grid_are_so_many_cells_apart(cells, nodes):
     """At most ``cells`` apart, and in both faces: n cells have ceil(n / cells) steps, and one node more than that."""
     box, _ = smoke(rough_grid(1, shape=(8, 5, 1)))
-    scene = close_up({"smoke": box, "lamp": sun([0.3, 0.2, -1.0])[0]})
+    scene = close_up({"smoke": box, "emitter": sun([0.3, 0.2, -1.0])[0]})
     with dr.suspend_grad():
         direct = open_direct(scene)
         assert build_transmittance_grid(direct.media, direct.emitters, cells).nodes == nodes
@@ -57,8 +57,8 @@ def test_nodes_of_a_light_grid_are_so_many_cells_apart(cells, nodes):
 def test_light_grid_keeps_optical_depth_not_transmittance():
     """Under a sun along an axis tau of a constant grid is linear: interpolated exactly, where T would be 8 % too bright."""
     box, _ = smoke(np.full((4, 4, 4), 2.0, np.float32), to_world=centred(2 * np.eye(3)))
-    lamp, _ = sun([0.0, 0.0, -1.0])
-    scene = close_up({"smoke": box, "lamp": lamp})
+    emitter, _ = sun([0.0, 0.0, -1.0])
+    scene = close_up({"smoke": box, "emitter": emitter})
     with dr.suspend_grad():
         direct = open_direct(scene)
         grid = build_transmittance_grid(direct.media, direct.emitters)
@@ -69,6 +69,6 @@ def test_light_grid_keeps_optical_depth_not_transmittance():
 
 def test_explain_measures_the_light_grid():
     box, _ = smoke(rough_grid(1))
-    lamp, _ = sun([0.3, 0.2, -1.0])
-    text = explain(close_up({"smoke": box, "lamp": lamp}), max_depth=2)
+    emitter, _ = sun([0.3, 0.2, -1.0])
+    text = explain(close_up({"smoke": box, "emitter": emitter}), max_depth=2)
     assert "exact; with deterministic, a light grid" in text and "bias" in text

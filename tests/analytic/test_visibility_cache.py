@@ -32,8 +32,8 @@ TWO = centred(2 * np.eye(3))
 def test_weights_are_those_of_beer(shift, occupied):
     """In a grid of one value light from above is dimmed by the depth of a block's middle, however coarse the grid."""
     box, _ = smoke(np.full(SIZE, 0.8, np.float32), to_world=TWO)
-    lamp, _ = sun([0, 0, -1.0])
-    seen = pencils({"smoke": box, "lamp": lamp}, *aimed(3))
+    emitter, _ = sun([0, 0, -1.0])
+    seen = pencils({"smoke": box, "emitter": emitter}, *aimed(3))
     with dr.suspend_grad():
         needs = find_needs(seen.scene, seen.scene.sensors()[0], survey_scene(seen.scene))
         settings = Settings(max_depth=2)

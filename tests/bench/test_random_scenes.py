@@ -12,7 +12,7 @@ from false_alarms import ALPHA, note
 
 from mivol.bench import agreement
 from mivol.bench.random_scenes import BENCH, QUICK, hard, trials
-from mivol.bench.random_scenes.generate import LAMPS, draw_scene
+from mivol.bench.random_scenes.generate import EMITTERS, draw_scene
 from mivol.bench.random_scenes.trials import try_scene, try_scenes
 from mivol.errors import MivolError
 
@@ -37,7 +37,7 @@ def test_everything_is_drawn(variant_rgb: str) -> None:
     drawn = {feature for seed in range(300) for feature in draw_scene(seed).features}
     wanted = {"null", "dielectric", "roughdielectric", "thindielectric", "mask", "nested", "side by side", "camera inside"}
     wanted |= {"isotropic", "hg", "rayleigh", "tabphase", "blendphase", "homogeneous", "grid", "rgb grid", "white", "depth -1"}
-    assert wanted | set(LAMPS) <= drawn
+    assert wanted | set(EMITTERS) <= drawn
 
 
 def test_a_channel_is_that_of_the_rgb_extinction(variant_rgb: str) -> None:

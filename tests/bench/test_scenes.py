@@ -21,7 +21,7 @@ def test_the_box_holds_its_grid(variant_rgb: str) -> None:
 
 def test_an_emitter_takes_the_place_of_the_sky(variant_rgb: str) -> None:
     made = box_scene(np.zeros((2, 2, 2), np.float32), 8, 0.5, **point_light((1, 2, 3)))
-    assert {"lamp"} == set(made) - {"type", "box", "sensor"}
+    assert {"emitter"} == set(made) - {"type", "box", "sensor"}
     assert made["box"]["interior"]["phase"] == {"type": "isotropic"}
     assert made["box"]["interior"]["albedo"] == 0.5
 
@@ -29,13 +29,13 @@ def test_an_emitter_takes_the_place_of_the_sky(variant_rgb: str) -> None:
 def test_the_sun_gives_a_third_of_the_light(variant_rgb: str) -> None:
     """By the pixels of the map and their solid angles; the sun stands at (0.6, 0.48, 0.64), z up."""
     parts = sun_and_sky(512)
-    picture = np.array(parts["lamp"]["bitmap"], np.float64).mean(axis=-1)
+    picture = np.array(parts["emitter"]["bitmap"], np.float64).mean(axis=-1)
     theta = (np.arange(512) + 0.5) / 512 * np.pi
     light = picture * np.sin(theta)[:, None]
     sun = picture > 100
     assert 0.28 < light[sun].sum() / light.sum() < 0.4
     # what the map sees along its y axis, Mitsuba's upward direction, is at z here
-    up = np.array(parts["lamp"]["to_world"] @ mi.ScalarVector3f(0, 1, 0)).ravel()
+    up = np.array(parts["emitter"]["to_world"] @ mi.ScalarVector3f(0, 1, 0)).ravel()
     assert np.allclose(up, [0, 0, 1], atol=1e-6)
     assert np.median(theta[np.nonzero(sun)[0]]) == pytest.approx(np.arccos(0.64 / np.linalg.norm([0.6, 0.48, 0.64])), abs=0.01)
 

@@ -1,6 +1,6 @@
 """The bench of single scattering: renderers have one mean, the judge of that can say no, and ratios weigh variance and time.
 
-Renders have fixed samples and seeds. Nothing is concluded from times, nor from the mean where a lamp stands in the medium:
+Renders have fixed samples and seeds. Nothing is concluded from times, nor from the mean where an emitter stands in the medium:
 single samples have no bound there.
 """
 
@@ -105,19 +105,19 @@ def test_equal_error_weighs_variance_and_time() -> None:
 
 
 def test_pixels_at_the_emitter_do_not_count(variant_rgb: str) -> None:
-    """The brightest pixel of a thin fog is at the lamp; it and its neighbours are left out, no others."""
+    """The brightest pixel of a thin fog is at the emitter; it and its neighbours are left out, no others."""
     light = bench.LIGHTS["point light inside"]
     scene = mi.load_dict(box_scene(np.full((4, 4, 4), 0.1, np.float32), 24, 0.75, **light.parts()))
     image = np.array(mi.render(scene, integrator=of_depth("mivol", 2), spp=64)).mean(axis=-1)
-    left_out = bench.pixels_from_lamp(scene, light, 24) <= bench.AT_LAMP
+    left_out = bench.pixels_from_emitter(scene, light, 24) <= bench.AT_EMITTER
     assert left_out[np.unravel_index(image.argmax(), image.shape)]
     # a disc of 1.5 pixels' radius holds the centres of 4 to 9 pixels
     assert 4 <= left_out.sum() <= 9
-    assert np.isinf(bench.pixels_from_lamp(scene, light._replace(inside=None), 24)).all()
+    assert np.isinf(bench.pixels_from_emitter(scene, light._replace(inside=None), 24)).all()
 
 
 def test_an_emitter_inside_is_judged_in_thin_matter_away_from_it(variant_rgb: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Ratios are of the volume itself, and pixels up to the lamp count; means are compared in the volume thinned to an
+    """Ratios are of the volume itself, and pixels up to the emitter count; means are compared in the volume thinned to an
     optical depth of 1, in pixels further than a quarter of the picture from it."""
     used, depths, side = {}, [], 16
     monkeypatch.setattr(bench, "gain", lambda slow, fast, counts: used.setdefault("gain", (fast.median, counts)) and {})
@@ -134,10 +134,10 @@ def test_an_emitter_inside_is_judged_in_thin_matter_away_from_it(variant_rgb: st
     bench.contend(np.full((4, 4, 4), 7.0, np.float32), light, replace(TINY, most_pixels=side))
     assert depths[0] > 10
     assert depths[1] == pytest.approx(1, rel=1e-3)
-    away = bench.pixels_from_lamp(mi.load_dict(box_scene(np.ones((2, 2, 2), np.float32), side)), light, side)
+    away = bench.pixels_from_emitter(mi.load_dict(box_scene(np.ones((2, 2, 2), np.float32), side)), light, side)
     (first, counts), (second, fair) = used["gain"], used["z"]
     assert (first, second) == (1, 2)
-    assert bench.AT_LAMP < away[counts].min() < 3
+    assert bench.AT_EMITTER < away[counts].min() < 3
     assert away[fair].min() > side / 4
     assert 0 < fair.sum() < counts.sum()
 

@@ -110,7 +110,7 @@ def test_lighting_by_quadrature_and_without_light():
     ],
 )
 def test_shadows(medium: MediumFacts, emitters: tuple, settings: Settings, choice: str) -> None:
-    """From 300 occupied cells along the axes on they are estimated, but under lamps of one position alone."""
+    """From 300 occupied cells along the axes on they are estimated, but under emitters of one position alone."""
     assert choices.choose_shadows(medium, needs(medium, emitters=emitters), settings).choice == choice
 
 

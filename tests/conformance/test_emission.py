@@ -180,15 +180,15 @@ def test_a_ball_within_a_box():
 
 @pytest.mark.parametrize("boundary", ["box", pytest.param("ball", marks=pytest.mark.slow)])
 def test_an_opaque_surface_occludes_and_is_seen_through(boundary):
-    """A lamp in the field: what is behind it is hidden, what is before it dims it and shines over it."""
+    """An emitter in the field: what is behind it is hidden, what is before it dims it and shines over it."""
     grids = [(rough(i, 0, top, n), PLACE) for i, (top, n) in enumerate(((2, 1), (1, 3), (1, 3)))]
     shape, m = body(twins.Medium(*grids), boundary)
     facing = mi.ScalarTransform4f().look_at([0.1, 0, 0.2], [0.1, 0, 5], [0, 1, 0]).scale(9)
     shine = {"type": "area", "radiance": {"type": "rgb", "value": [2, 3, 1]}}
-    lamp = {"type": "rectangle", "to_world": facing, "emitter": shine}
+    emitter = {"type": "rectangle", "to_world": facing, "emitter": shine}
     o, d = along_z()
     o, d = o[d[:, 2] < 0], d[d[:, 2] < 0]
-    seen = pencils({"box": shape, "lamp": lamp, "sky": colours(B)}, o, d)
+    seen = pencils({"box": shape, "emitter": emitter, "sky": colours(B)}, o, d)
     ends = (0.2 - seen.o[:, 2]) / seen.d[:, 2]
     truth = [twins.cell_radiance(m, *ray, [2, 3, 1], end)[0] for *ray, end in zip(seen.o, seen.d, ends, strict=True)]
     assert np.abs(light(seen) - truth).max() <= 2e-5

@@ -15,7 +15,7 @@ from scattering_scenes import (
     smoke,
 )
 from volpath_scenes import (
-    LAMPS,
+    EMITTERS,
     same,
 )
 
@@ -25,11 +25,11 @@ pytestmark = pytest.mark.usefixtures("variant_rgb")
 @pytest.mark.statistical
 @pytest.mark.parametrize(
     # Several have a constant sky, a point, a sun and an area among them.
-    "name", small.cases(LAMPS, [name for name in LAMPS if name not in ("envmap", "spot", "several")])
+    "name", small.cases(EMITTERS, [name for name in EMITTERS if name not in ("envmap", "several")])
 )
 def test_emitters(name):
     box, _ = smoke(rough_grid(1), name="hg", g=0.4)
-    image, _ = same({"smoke": box, **LAMPS[name]()}, precision=0.02)
+    image, _ = same({"smoke": box, **EMITTERS[name]()}, precision=0.02)
     assert image.mean.min() >= 0
 
 

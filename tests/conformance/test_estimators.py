@@ -44,7 +44,7 @@ def test_an_entry_says_what_it_needs_and_promises(name: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("lamp", "settings", "name"),
+    ("emitter", "settings", "name"),
     [
         ("constant", Settings(max_depth=2), "single_scattering"),
         ("constant", Settings(max_depth=1), "absorption"),
@@ -56,8 +56,8 @@ def test_an_entry_says_what_it_needs_and_promises(name: str) -> None:
         ("point", Settings(max_depth=1, deterministic=True), "absorption"),
     ],
 )
-def test_a_plan_takes_the_answer(variant_rgb: str, lamp: str | None, settings: Settings, name: str) -> None:
-    parts = {"lamp": {"type": lamp, **({"position": [0, 0, 3]} if lamp == "point" else {})}} if lamp else {}
+def test_a_plan_takes_the_answer(variant_rgb: str, emitter: str | None, settings: Settings, name: str) -> None:
+    parts = {"emitter": {"type": emitter, **({"position": [0, 0, 3]} if emitter == "point" else {})}} if emitter else {}
     fog = box_of(medium("homogeneous", 1.0, 0.5), centred(2 * np.eye(3)))
     scene = mi.load_dict({"type": "scene", "fog": fog, "sensor": camera([0, -4, 0], [0, 0, 0], res=4), **parts})
     needs = find_needs(scene, scene.sensors()[0], survey_scene(scene))

@@ -126,15 +126,15 @@ def test_gradient_step():
         assert np.abs(replayed - plain).max() <= 1e-5 * np.abs(plain).max()
 
 
-@pytest.mark.parametrize("lamp", ["sky", pytest.param("bulb", marks=pytest.mark.slow)])
-def test_gradient_step_of_scattered_light(lamp):
+@pytest.mark.parametrize("emitter", ["sky", pytest.param("bulb", marks=pytest.mark.slow)])
+def test_gradient_step_of_scattered_light(emitter):
     """Density, albedo and asymmetry of a medium that turns light once, in one recording: what an ordinary step gives."""
     values = np.random.default_rng(1).uniform(0.1, 1.0, (4, 5, 6, 1)).astype(np.float32)
     interior = medium("mivol_medium", grid_volume("mivol_voxels", values, PLACE), 0.8, phase={"type": "mivol_hg", "g": 0.3})
     bulb = {"type": "point", "position": [1.5, 1.0, 2.0], "intensity": 3.0}
     sensor = camera((2.0, 1.5, 3.0), (0.0, 0.0, 0.0), res=8, fov=45.0)
-    shine = {"sky": sky, "bulb": lambda: bulb}[lamp]()
-    scene = mi.load_dict({"type": "scene", "box": box_of(interior, PLACE), "lamp": shine, "sensor": sensor})
+    shine = {"sky": sky, "bulb": lambda: bulb}[emitter]()
+    scene = mi.load_dict({"type": "scene", "box": box_of(interior, PLACE), "emitter": shine, "sensor": sensor})
     integrator = mi.load_dict({"type": "mivol", "max_depth": 2})
     params = mi.traverse(scene)
     keys = (GRID, "box.interior_medium.albedo.value.value", "box.interior_medium.phase_function.g")

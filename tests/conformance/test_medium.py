@@ -164,10 +164,10 @@ def image_and_derivatives(scene: mi.Scene, values: np.ndarray, more: dict) -> li
 def test_voxels_below_0_count_as_0(name):
     """The same image, gradient and tangent as of a grid with 0 there, and a gradient to leave 0 by; told once."""
     kind, volume, channels, more = GRIDS[name]
-    lamp = {"type": "point", "position": [1.5, 1.2, 2.0], "intensity": 3.0}
+    emitter = {"type": "point", "position": [1.5, 1.2, 2.0], "intensity": 3.0}
     scene = fog(medium(kind, grid_volume(volume, np.ones((5, 4, 6, channels))), 0.6))
     view = camera([0.5, 0.4, 4], [0.5, 0.5, 0.5], 6, fov=15)
-    parts = {"smoke": scene.shapes()[0], "lamp": lamp, "sensor": view}
+    parts = {"smoke": scene.shapes()[0], "emitter": emitter, "sensor": view}
     scene = mi.load_dict({"type": "scene", **parts})
     want = image_and_derivatives(scene, with_holes(name, 0.0), more)
     count = int(HOLES.sum())

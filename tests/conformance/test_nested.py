@@ -84,12 +84,12 @@ def test_aov_shows_the_same_and_has_the_same_derivatives():
 
 @pytest.mark.parametrize("names", [False, True])
 def test_a_nested_camera_may_be_where_the_first_sensor_is_not(names):
-    """``moment`` does not tell which sensor it renders: in ink, looking at a lamp in it; outside, looking away from it."""
+    """``moment`` does not tell which sensor it renders: in ink, looking at an emitter in it; outside, looking away from it."""
     ref = {"type": "ref", "id": "ink"}
     parts = {
         "ink": medium("homogeneous", 0.8) | {"id": "ink"},
         "ball": ball_of(ref, (0, 0, 0), 1.0),
-        "lamp": {"type": "sphere", "center": [-0.5, 0, 0], "radius": 0.2, "emitter": {"type": "area", "radiance": 2.0}},
+        "emitter": {"type": "sphere", "center": [-0.5, 0, 0], "radius": 0.2, "emitter": {"type": "area", "radiance": 2.0}},
         "sky": sky(1.0),
     }
     inside = pencil((0.5, 0, 0), (-1, 0, 0)) | ({"medium": ref} if names else {})

@@ -388,7 +388,7 @@ def test_stock_blend_does_not_number_ours(variant):
 @pytest.mark.statistical
 @pytest.mark.parametrize("name", cases(["table", "mixture", "blend"], ["table", "blend"]))
 def test_same_image_as_stock_under_volpath(name):
-    """Fog lit by a lamp and a sky, several scatterings: stock and ours, pixel by pixel."""
+    """Fog lit by an emitter and a sky, several scatterings: stock and ours, pixel by pixel."""
     mi.set_variant("llvm_ad_rgb")
     means = []
     for given in PAIRS[name]:
@@ -398,7 +398,7 @@ def test_same_image_as_stock_under_volpath(name):
                 "type": "scene",
                 "fog": box_of(fog, np.eye(4)),
                 "sky": sky(0.3),
-                "lamp": {"type": "directional", "direction": [0.6, 0.0, 0.8], "irradiance": 2.0},
+                "emitter": {"type": "directional", "direction": [0.6, 0.0, 0.8], "irradiance": 2.0},
                 "sensor": camera((0.5, 0.5, -3), (0.5, 0.5, 0.5), 4),
             }
         )
@@ -420,7 +420,7 @@ def test_two_media_with_different_phase_functions_in_one_loop():
             shift = np.eye(4)
             shift[0, 3] = 1.5 * place
             parts[name] = box_of(fog, shift)
-        parts["lamp"] = {"type": "point", "position": [1.2, -0.5, 1.5], "intensity": 1.0}
+        parts["emitter"] = {"type": "point", "position": [1.2, -0.5, 1.5], "intensity": 1.0}
         images.append(render(mi.load_dict(parts), {"type": "volpath", "max_depth": 4}, 64))
     # The same random numbers give the same paths to rounding; one in 10^4 that falls on the other side of a choice may differ
     # by a whole sample of a pixel.
@@ -441,9 +441,9 @@ FROZEN = {
 
 def foggy(phase: dict) -> mi.Scene:
     fog = {"type": "homogeneous", "sigma_t": 1.0, "albedo": 0.9, "phase": phase}
-    lamp = {"type": "directional", "direction": [0.6, 0.0, 0.8], "irradiance": 2.0}
+    emitter = {"type": "directional", "direction": [0.6, 0.0, 0.8], "irradiance": 2.0}
     sensor = camera((0.5, 0.5, -3), (0.5, 0.5, 0.5), 4)
-    return mi.load_dict({"type": "scene", "fog": box_of(fog, np.eye(4)), "sky": sky(0.3), "lamp": lamp, "sensor": sensor})
+    return mi.load_dict({"type": "scene", "fog": box_of(fog, np.eye(4)), "sky": sky(0.3), "emitter": emitter, "sensor": sensor})
 
 
 @pytest.mark.parametrize("name", cases(FROZEN, ["hg", "draine", "mixture"]))

@@ -58,16 +58,16 @@ def test_what_mitsuba_has_no_camera_for(variant_rgb: str) -> None:
 
 
 def test_renders_are_photographs(variant_rgb: str, tmp_path: Path) -> None:
-    """A small lamp off the middle: in each photograph the light's centre is where the camera of the file says."""
+    """A small emitter off the middle: in each photograph the light's centre is where the camera of the file says."""
     place = np.array([0.4, -0.2, 0.3])
     cameras = [Camera(intrinsics(60, 60, 25, 30), (64, 48), pose) for pose in ring(3, 3)]
-    lamp = {
+    emitter = {
         "type": "sphere",
         "radius": 0.1,
         "to_world": mi.ScalarTransform4f().translate(place.tolist()),
         "emitter": {"type": "area", "radiance": {"type": "rgb", "value": [3.0, 2.0, 1.0]}},
     }
-    scene = {"type": "scene", "lamp": lamp, **{f"sensor{i}": sensor_of(c) for i, c in enumerate(cameras)}}
+    scene = {"type": "scene", "emitter": emitter, **{f"sensor{i}": sensor_of(c) for i, c in enumerate(cameras)}}
     made = photograph(scene, tmp_path / "set", test=[1], max_depth=1, max_spp=32, progress=False)
     assert [result.path.name for result in made] == ["view_000.exr", "view_001.exr", "view_002.exr"]
     photos = load_photos(tmp_path / "set", split="all")

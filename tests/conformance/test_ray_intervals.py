@@ -55,7 +55,7 @@ INSIDE = {
 
 
 @pytest.mark.statistical
-@pytest.mark.parametrize("where", small.cases(INSIDE, ["fog around a ball"]))
+@pytest.mark.parametrize("where", small.cases(INSIDE, [name for name in INSIDE if name != "a room"]))
 def test_media_that_fill_no_shape_of_their_own(where):
     """Around the camera, around shapes, and between walls: where no boundary ends a homogeneous medium it has no end."""
     ref = {"type": "ref", "id": "fog"}
@@ -76,11 +76,11 @@ def test_fog_in_a_room_that_is_open_on_one_side():
         placed[name]["bsdf"] = {"type": "diffuse", "reflectance": 0.2 + 0.1 * k}
     # The second wall is the one at z = 2: the opening, whose normal shows inwards.
     placed["wall1"]["bsdf"] = {"type": "null"}
-    lamp = square(0, 0.5, -1.9, 0.5, (0, 0.5, 5)) | {"emitter": {"type": "area", "radiance": 5.0}, "exterior": ref}
+    emitter = square(0, 0.5, -1.9, 0.5, (0, 0.5, 5)) | {"emitter": {"type": "area", "radiance": 5.0}, "exterior": ref}
     sensor = scenes.camera((0.6, -0.4, 7.0), (0, 0, 0), res=16, fov=40.0)
-    scene = mi.load_dict({"type": "scene", "fog": FOG, **placed, "lamp": lamp, "sensor": sensor})
+    scene = mi.load_dict({"type": "scene", "fog": FOG, **placed, "emitter": emitter, "sensor": sensor})
     assert {s.class_name() for s in scene.shapes()} == {"Rectangle"}
-    assert_same_images(scene, rounding=5 * LEAK, precision=0.02)  # of the lamp's radiance, the brightest there is
+    assert_same_images(scene, rounding=5 * LEAK, precision=0.02)  # of the emitter's radiance, the brightest there is
 
 
 @pytest.mark.statistical

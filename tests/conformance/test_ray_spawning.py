@@ -41,13 +41,13 @@ def test_fog_is_cut_at_both_planes(kind):
 
 
 def test_what_a_mask_transmits_ends_at_the_same_plane():
-    """A black mask at 2, a lamp at 4.5: in front of it there is the sky of 1, whatever straight rays pass."""
+    """A black mask at 2, an emitter at 4.5: in front of it there is the sky of 1, whatever straight rays pass."""
     turn = mi.ScalarTransform4f()
     mask = {"type": "mask", "opacity": 0.6, "nested": {"type": "diffuse", "reflectance": 0.0}}
     masked = {"type": "rectangle", "to_world": turn.translate([0, 0, 2]), "bsdf": mask}
-    lamp = {"type": "rectangle", "to_world": turn.translate([0, 0, -0.5]), "emitter": {"type": "area", "radiance": 5.0}}
+    emitter = {"type": "rectangle", "to_world": turn.translate([0, 0, -0.5]), "emitter": {"type": "area", "radiance": 5.0}}
     for far, top in ((4.4, 1.0), (4.6, 5.0)):
-        scene = look_down({"mask": masked, "lamp": lamp}, 0.01, far)
+        scene = look_down({"mask": masked, "emitter": emitter}, 0.01, far)
         # 16 pixels of one sample: all pass, or none, with a chance of 0.6^16 = 3e-4 for this seed.
         image = np.array(mi.render(scene, integrator=mi.load_dict(mivol()), spp=1, seed=1))
         assert np.unique(image).tolist() == [0.0, top]

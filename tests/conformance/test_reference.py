@@ -149,7 +149,8 @@ def test_a_reference_without_colours_has_one_channel(variant_rgb, tmp_path):
 
 
 @pytest.mark.statistical
-@pytest.mark.parametrize("form", cases(["rgb", "constvolume", "shared by id"], ["rgb", "constvolume"]))
+@pytest.mark.slow
+@pytest.mark.parametrize("form", ["rgb", "constvolume", "shared by id"])
 def test_every_form_of_rgb_extinction_is_found(variant_rgb, tmp_path, form):
     """A colour, a constvolume of a colour, a medium that two shapes share."""
     colour = {"type": "rgb", "value": [0.2, 0.6, 0.9]}
@@ -393,7 +394,7 @@ def test_doubts_of_all_kinds(variant_rgb):
     for sampler, doubts in (("ldsampler", ["sampler"]), ("independent", [])):
         assert [d.kind for d in trust(mi.load_dict(_sampled_by(sampler))) if d.fatal] == doubts
     for unit, doubts in ((1.0, []), (0.01, ["near emitter"])):
-        assert [d.kind for d in trust(mi.load_dict(_lamp_near_haze(unit))) if d.fatal] == doubts
+        assert [d.kind for d in trust(mi.load_dict(_emitter_near_haze(unit))) if d.fatal] == doubts
 
 
 @pytest.mark.statistical
@@ -451,12 +452,12 @@ def test_doubt_a_sampler_whose_dimensions_depend_on_each_other(variant_rgb):
     assert_same_mean(*(Moments.of(_lit(s, "mivol")) for s in scenes.values()), what="mivol by two samplers")
 
 
-def _lamp_near_haze(unit: float) -> dict:
+def _emitter_near_haze(unit: float) -> dict:
     """A luminous square above a cube of haze, in lengths of ``unit``."""
     place = _t().scale(unit)
-    lamp = {"type": "rectangle", "to_world": place @ _t().translate([0.5, 0.5, 1.5]).rotate([1, 0, 0], 180).scale(0.3)}
+    emitter = {"type": "rectangle", "to_world": place @ _t().translate([0.5, 0.5, 1.5]).rotate([1, 0, 0], 180).scale(0.3)}
     haze = {"type": "homogeneous", "sigma_t": 1.0 / unit, "albedo": 0.8}
-    scene = _scene(haze, place @ _t().translate([0.5, 0.5, 0.5]).scale(0.5), lamp=lamp | {"emitter": {"type": "area"}})
+    scene = _scene(haze, place @ _t().translate([0.5, 0.5, 0.5]).scale(0.5), emitter=emitter | {"emitter": {"type": "area"}})
     look = _t().look_at([0.5 * unit, -3 * unit, 0.5 * unit], [0.5 * unit] * 3, [0, 0, 1]).scale([0.4 * unit, 0.4 * unit, 1])
     scene["sensor"] = scene["sensor"] | {"to_world": look, "near_clip": 1e-3 * unit}
     del scene["sky"]
@@ -466,10 +467,10 @@ def _lamp_near_haze(unit: float) -> dict:
 @pytest.mark.slow
 @pytest.mark.statistical
 def test_doubt_an_emitter_near_a_boundary(variant_rgb):
-    """In a small scene most light of a lamp with a surface is lost; the same scene in another unit is right."""
+    """In a small scene most light of an emitter with a surface is lost; the same scene in another unit is right."""
     found = {}
     for unit in (1.0, 0.01):
-        scene = _lamp_near_haze(unit)
+        scene = _emitter_near_haze(unit)
         found[unit] = [Moments.of(_lit(scene, kind)) for kind in ("volpath", "mivol")]
         assert [d.kind for d in trust(mi.load_dict(scene)) if d.fatal] == ([] if unit == 1 else ["near emitter"])
     (stock, ours), (lost, same) = found[1.0], found[0.01]
@@ -551,8 +552,8 @@ def test_microflakes_are_drawn_from_another_density_than_is_told(variant_rgb, in
 def _fog(values: np.ndarray, **extra) -> dict:
     """The unit cube filled with a white fog and lit by a sun from the camera; extinction (Z, Y, X)."""
     volume = {"type": "gridvolume", "grid": mi.VolumeGrid(values.astype(np.float32)[..., None]), **extra}
-    lamp = {"type": "directional", "direction": [0, 0, 1], "irradiance": 1.0}
-    return _scene({"type": "heterogeneous", "sigma_t": volume, "albedo": 1.0}, sky=lamp)
+    emitter = {"type": "directional", "direction": [0, 0, 1], "irradiance": 1.0}
+    return _scene({"type": "heterogeneous", "sigma_t": volume, "albedo": 1.0}, sky=emitter)
 
 
 @pytest.mark.slow

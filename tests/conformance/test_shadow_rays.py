@@ -9,7 +9,7 @@ from scattering_scenes import (
     point,
 )
 from volpath_scenes import (
-    LAMPS,
+    EMITTERS,
     RED,
     area,
     behind_a_mask,
@@ -23,19 +23,20 @@ pytestmark = pytest.mark.usefixtures("variant_rgb")
 
 
 @pytest.mark.statistical
-@pytest.mark.parametrize("lamp", small.cases(["bulb", "lamp", "sky"], ["lamp", "sky"]))
-def test_shadow_rays_go_on_through_what_is_partly_clear(lamp):
-    """A mask dims them by its transparency, as volpath does, towards all kinds of lamps."""
-    shine = {"bulb": point([1.6, -1.3, 1.7])[0], "lamp": area(1.6, -1.3, 1.7), "sky": LAMPS["envmap"]()["lamp"]}[lamp]
+@pytest.mark.parametrize("emitter", small.cases(["bulb", "emitter", "sky"], ["emitter", "sky"]))
+def test_shadow_rays_go_on_through_what_is_partly_clear(emitter):
+    """A mask dims them by its transparency, as volpath does, towards all kinds of emitters."""
+    sky = EMITTERS["envmap"]()["emitter"]
+    shine = {"bulb": point([1.6, -1.3, 1.7])[0], "emitter": area(1.6, -1.3, 1.7), "sky": sky}[emitter]
     same(behind_a_mask() | {"shine": shine})
 
 
 @pytest.mark.statistical
-@pytest.mark.parametrize("lamp", small.cases(["bulb", "sky"], ["sky"]))
+@pytest.mark.parametrize("emitter", small.cases(["bulb", "sky"], ["sky"]))
 @pytest.mark.parametrize("kind", small.cases(["transmissive", "boundary"], ["boundary"]))
-def test_emitters_that_let_light_pass(kind, lamp):
-    """A luminous mask before another lamp, and a boundary that shines itself: what is behind them is seen through them."""
-    shine = {"bulb": {"bulb": point([1.6, -1.3, 1.7], 40.0)[0]}, "sky": LAMPS["envmap"]()}[lamp]
+def test_emitters_that_let_light_pass(kind, emitter):
+    """A luminous mask before another emitter, and a boundary that shines itself: what is behind them is seen through them."""
+    shine = {"bulb": {"bulb": point([1.6, -1.3, 1.7], 40.0)[0]}, "sky": EMITTERS["envmap"]()}[emitter]
     light = {"emitter": {"type": "area", "radiance": 5.0}}
     if kind == "boundary":
         same({"smoke": grid_in(cube(PLACE)) | light, **shine})

@@ -32,13 +32,13 @@ def test_side_flights_keep_the_mean(lit, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("g", "lamp", "depth", "flies"),
+    ("g", "emitter", "depth", "flies"),
     [(0.8, "sun", 3, True), (0.8, "sun", 2, False), (0.3, "sun", 3, False), (0.8, "point", 3, False)],
 )
-def test_a_plan_takes_them_where_they_pay(g, lamp, depth, flies):
+def test_a_plan_takes_them_where_they_pay(g, emitter, depth, flies):
     """Peaked phase functions, two scatterings, and emitters at infinity."""
-    shine = small.sun([0.3, 0.2, -1.0])[0] if lamp == "sun" else small.point([1.5, 1, 2.0])[0]
-    scene = close_up({"smoke": smoke(rough_grid(7), 0.9, name="hg", g=g)[0], "lamp": shine}, res=2)
+    shine = small.sun([0.3, 0.2, -1.0])[0] if emitter == "sun" else small.point([1.5, 1, 2.0])[0]
+    scene = close_up({"smoke": smoke(rough_grid(7), 0.9, name="hg", g=g)[0], "emitter": shine}, res=2)
     made = plan.make_plan(find_needs(scene, scene.sensors()[0], survey_scene(scene)), Settings(max_depth=depth))
     assert (made.lobe is not None) == flies
     if flies:

@@ -1,4 +1,4 @@
-"""Surfaces among absorbing media keep the shading that Mitsuba gives them: every kind of lamp and BSDF, against volpath."""
+"""Surfaces among absorbing media keep the shading that Mitsuba gives them: every kind of emitter and BSDF, against volpath."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def turn() -> mi.ScalarTransform4f:
 
 
 def room(**more: object) -> dict:
-    """A ball in a volume over a floor; lamps are added."""
+    """A ball in a volume over a floor; emitters are added."""
     values = np.random.default_rng(5).uniform(0, 1, (4, 5, 6, 1)).astype(np.float32)
     return {
         "type": "scene",
@@ -35,7 +35,7 @@ def room(**more: object) -> dict:
     }
 
 
-def lamp(size: float = 1.0) -> dict:
+def emitter(size: float = 1.0) -> dict:
     return {
         "type": "rectangle",
         "to_world": turn().translate([0, 3, 0]).rotate([1, 0, 0], 90).scale(size),
@@ -62,12 +62,12 @@ def rooms() -> dict[str, tuple[dict, int]]:
     return {
         "sky, depth 2": (room(sky=sky()), 2),
         "sky, no limit": (room(sky=sky()), -1),
-        "point": (room(lamp=POINT), 2),
-        "sun, depth 3": (room(lamp=SUN), 3),
-        "spot": (room(lamp=spot), 2),
-        "area, depth 1": (room(lamp=lamp(3), sensor=camera((0.0, -1.0, 4.0), (0.0, 1.5, 0.0), res=8, fov=60.0)), 1),
-        "area, depth 4": (room(lamp=lamp()), 4),
-        "glossy under a wide lamp": (room(lamp=lamp(3), floor=room()["floor"] | {"bsdf": SHINY}), 2),
+        "point": (room(emitter=POINT), 2),
+        "sun, depth 3": (room(emitter=SUN), 3),
+        "spot": (room(emitter=spot), 2),
+        "area, depth 1": (room(emitter=emitter(3), sensor=camera((0.0, -1.0, 4.0), (0.0, 1.5, 0.0), res=8, fov=60.0)), 1),
+        "area, depth 4": (room(emitter=emitter()), 4),
+        "glossy under a wide emitter": (room(emitter=emitter(3), floor=room()["floor"] | {"bsdf": SHINY}), 2),
         "mask, depth 1": (room(sky=sky(), mask=masked), 1),
         "mask, depth 3": (room(sky=sky(), mask=masked), 3),
         "two fogs in spheres": (room(sky=sky(), **del_box, **fogs), 2),
@@ -77,9 +77,9 @@ def rooms() -> dict[str, tuple[dict, int]]:
 
 NAMES = (
     "sky, depth 2", "sky, no limit", "point", "sun, depth 3", "spot", "area, depth 1", "area, depth 4",
-    "glossy under a wide lamp", "mask, depth 1", "mask, depth 3", "two fogs in spheres", "glass full of ink",
+    "glossy under a wide emitter", "mask, depth 1", "mask, depth 3", "two fogs in spheres", "glass full of ink",
 )  # fmt: skip
-FAST = ("sky, no limit", "sun, depth 3", "area, depth 1", "glossy under a wide lamp", "mask, depth 3", "glass full of ink")
+FAST = ("sky, no limit", "glossy under a wide emitter", "mask, depth 3", "glass full of ink")
 
 
 def batches(scene: mi.Scene, kind: str, depth: int, first: int, **more: object) -> Moments:
@@ -101,9 +101,10 @@ def test_surfaces_and_emitters_like_volpath(name):
 
 
 @pytest.mark.statistical
+@pytest.mark.slow
 def test_hidden_emitters():
-    """hide_emitters takes the lamp and the sky out of the picture, not their light off the surfaces."""
-    scene = mi.load_dict(room(sky=sky(), lamp=lamp(3), sensor=camera((0.0, 1.5, 6.0), (0.0, 1.5, 0.0), res=8, fov=70.0)))
+    """hide_emitters takes the emitter and the sky out of the picture, not their light off the surfaces."""
+    scene = mi.load_dict(room(sky=sky(), emitter=emitter(3), sensor=camera((0.0, 1.5, 6.0), (0.0, 1.5, 0.0), res=8, fov=70.0)))
     grey = []
     for hide in (False, True):
         ours, stock = (batches(scene, kind, 2, n, hide_emitters=hide) for kind, n in (("mivol", 0), ("volpath", 500)))
@@ -112,4 +113,4 @@ def test_hidden_emitters():
         assert_precise(ours, 0.02, what="images")
         grey.append(Estimate(*(x[0] for x in ours)))
     shown, hidden = grey
-    assert_apart(shown, hidden, expected=0.4, what="lamps shown and hidden")
+    assert_apart(shown, hidden, expected=0.4, what="emitters shown and hidden")

@@ -34,11 +34,11 @@ def camera(width: int = 4, height: int = 2) -> Camera:
 def test_a_view_stands_beside_its_photograph(tmp_path):
     """Both as sRGB, clipped; on record as held out."""
     (tmp_path / "views").mkdir()
-    photo = Photo("lamp", np.full((2, 4, 3), 0.6, np.float32), None, None, camera(), np.zeros(3))
+    photo = Photo("emitter", np.full((2, 4, 3), 0.6, np.float32), None, None, camera(), np.zeros(3))
     found = photo_outputs.write_view(tmp_path, photo, 7, np.full((2, 4, 3), [1.5, 0.4, -1]))
     assert [(i.path, i.role, i.view, i.held_out, i.quantity) for i in found] == [
-        ("views/007_render.png", "render", "lamp", True, "sRGB value"),
-        ("views/007_reference.png", "reference", "lamp", True, "sRGB value"),
+        ("views/007_render.png", "render", "emitter", True, "sRGB value"),
+        ("views/007_reference.png", "reference", "emitter", True, "sRGB value"),
     ]
     pixels = [np.array(Image.open(tmp_path / image.path))[0, 0].tolist() for image in found]
     assert pixels == [[255, 102, 0], [153, 153, 153]]

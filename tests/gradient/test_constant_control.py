@@ -29,7 +29,10 @@ WHITE = {
 }
 
 
-@pytest.mark.parametrize(("kind", "place"), [(k, "a box") for k in small.KINDS] + [("own", p) for p in WHITE if p != "a box"])
+@pytest.mark.parametrize(
+    ("kind", "place"),
+    small.cases([("stock", "a box"), *(("own", place) for place in WHITE)], [("own", "a box"), ("own", "two boxes")]),
+)
 def test_white_smoke_of_no_density_in_a_constant_sky_has_no_gradient(kind, place):
     """What turns in is what is turned away: 0 in each sample, to rounding of the two (a few EPS of their size)."""
     gradients = []

@@ -268,7 +268,7 @@ def _floor() -> dict:
 @pytest.mark.slow
 @pytest.mark.parametrize("depth", [1, 2, 3])
 def test_surfaces_in_and_behind_the_field(depth):
-    """A ball in the field and a floor behind it, which the field lights at depth 3 as much as a lamp does."""
+    """A ball in the field and a floor behind it, which the field lights at depth 3 as much as an emitter does."""
     turn = mi.ScalarTransform4f().translate([0, -1.2, 0]).rotate([1, 0, 0], -90).scale(5)
     red = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.8, 0.3, 0.2]}}
     ball, floor = {"type": "sphere", "radius": 0.4}, {"type": "rectangle", "to_world": turn}

@@ -36,17 +36,17 @@ def flies(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.statistical
 @pytest.mark.parametrize(
-    ("density", "lamp"),
+    ("density", "emitter"),
     small.cases(
         [("empty", "point"), ("half empty", "point"), ("flat", "point"), ("rough", "sun"), ("dense", "point")],
         [("flat", "point"), ("dense", "point"), ("rough", "sun")],
     ),
 )
-def test_density(flies, density, lamp):
+def test_density(flies, density, emitter):
     """Empty, half empty and flat (density equal to the majorant) are where other estimators are biased."""
-    shine = point([1.5, 1, 2.0]) if lamp == "point" else sun([0.3, 0.2, -1.0])
+    shine = point([1.5, 1, 2.0]) if emitter == "point" else sun([0.3, 0.2, -1.0])
     box, m = smoke(as_float32(DENSITIES[density]()), 0.7, "own", PLACE, "hg", 0.4)
-    seen = pencils({"smoke": box, "lamp": shine[0]}, *aimed(1, 8))
+    seen = pencils({"smoke": box, "emitter": shine[0]}, *aimed(1, 8))
     w, rows = weights(8)
     truth, _ = twins.radiance_gradient(m, [shine[1]], seen.o, seen.d, rows)
     assert_gradient(gradients(seen, GRID, w, 2048), truth[..., None], density, 0.1)
@@ -110,13 +110,13 @@ PARAMETERS = {
     "g": MEDIUM + "phase_function.g",
     "emission": MEDIUM + "emission.data",
     "scale": MEDIUM + "scale",
-    "lamp": "bulb.intensity.value",
+    "emitter": "bulb.intensity.value",
     "floor": "floor.bsdf.reflectance.value",
 }
 
 
 @pytest.mark.parametrize("colour", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["grey", "rgb"])
-@pytest.mark.parametrize("name", small.cases(PARAMETERS, slow=("scale", "floor", "lamp")))
+@pytest.mark.parametrize("name", small.cases(PARAMETERS, slow=("g", "scale", "floor", "emitter")))
 def test_forward_is_the_transpose_of_reverse(name, colour):
     """<J v, w> = <v, J^T w> of one seed: both are sums of the same terms in another order, in float32."""
     scene, key = _everything(colour), PARAMETERS[name]
@@ -162,15 +162,15 @@ def _difference(scene: mi.Scene, key: str, v: np.ndarray, h: float, integrator: 
 ROOMS = {
     "sky": lambda density: {"smoke": smoke(density, 0.75, "own")[0], "sky": scenes.sky(1.0)},
     "sun": lambda density: {"smoke": smoke(density, 0.75, "own", name="hg", g=0.8)[0], "sun": sun([0.3, 0.2, -1.0])[0]},
-    "lamp inside": lambda density: {
+    "emitter inside": lambda density: {
         "smoke": smoke(density, 0.75, "own")[0],
-        "lamp": {"type": "sphere", "center": [0.2, 0.1, 0.3], "radius": 0.2, "emitter": {"type": "area", "radiance": 9.0}},
+        "emitter": {"type": "sphere", "center": [0.2, 0.1, 0.3], "radius": 0.2, "emitter": {"type": "area", "radiance": 9.0}},
     },
     "glass": lambda density: {
         "smoke": ball_of(medium("mivol_medium", grid_volume("mivol_voxels", density, PLACE), 0.75), (0, 0, 0), 0.9)
         | {"bsdf": {"type": "dielectric"}},
         "sky": scenes.sky(0.5),
-        "lamp": {"type": "sphere", "center": [1.2, 0.3, 1.9], "radius": 0.6, "emitter": {"type": "area", "radiance": 9.0}},
+        "emitter": {"type": "sphere", "center": [1.2, 0.3, 1.9], "radius": 0.6, "emitter": {"type": "area", "radiance": 9.0}},
     },
 }
 
@@ -196,7 +196,7 @@ def test_density_by_differences(room, depth):
 
 # -- Side flights --------------------------------------------------------------------------------------------------------
 
-OF_A_SUN = PARAMETERS | {"lamp": "sun.irradiance.value"}
+OF_A_SUN = PARAMETERS | {"emitter": "sun.irradiance.value"}
 
 
 def _in_the_sun() -> mi.Scene:
@@ -207,7 +207,7 @@ def _in_the_sun() -> mi.Scene:
     return close_up({"smoke": box_of(interior, PLACE), "sun": sun([0.3, 0.2, -1.0])[0]}, res=8)
 
 
-@pytest.mark.parametrize("name", ["density", "albedo", "g", "lamp"])
+@pytest.mark.parametrize("name", ["density", "albedo", "g", "emitter"])
 def test_of_side_flights_forward_is_the_transpose_of_reverse(name):
     """As above, to the same bound."""
     scene, key, integrator = _in_the_sun(), OF_A_SUN[name], mi.load_dict(mivol(max_depth=4))
@@ -237,7 +237,7 @@ def test_side_flights_keep_the_mean_of_derivatives(name, monkeypatch):
     assert_precise(difference(with_them, without), 0.1 * np.abs(without.mean), what="derivative")
 
 
-@pytest.mark.parametrize(("name", "depth"), [("emission", 5), ("lamp", 5)])
+@pytest.mark.parametrize(("name", "depth"), [("emission", 5), ("emitter", 5)])
 def test_light_is_linear_in_what_emits(name, depth):
     """The derivative along an emission is the image of that emission alone, sample by sample."""
     scene, key = _everything(), PARAMETERS[name]

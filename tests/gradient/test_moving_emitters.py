@@ -33,8 +33,8 @@ def test_position_of_a_point_light():
     """Smooth where the light is outside: distance, direction and shadow all move."""
     values = rough_grid(10)
     box, m = smoke(values, 0.7, "own", PLACE, "hg", 0.4)
-    lamp = point([1.5, 1, 2.0])
-    seen = pencils({"smoke": box, "lamp": lamp[0]}, *aimed(3, 6))
+    emitter = point([1.5, 1, 2.0])
+    seen = pencils({"smoke": box, "emitter": emitter[0]}, *aimed(3, 6))
     w, rows = weights(6)
     at = np.array([1.5, 1, 2.0])
 
@@ -43,7 +43,7 @@ def test_position_of_a_point_light():
         return rows @ twins.radiance([m], [place], seen.o, seen.d, order=10)[:, 0]
 
     truth = np.array([twin_difference(lambda x, a=a: light(x, a), 0.0) for a in range(3)])
-    assert_gradient(gradients(seen, "lamp.position", w, 2048), truth[:, None], "position", rounding=1e-4)
+    assert_gradient(gradients(seen, "emitter.position", w, 2048), truth[:, None], "position", rounding=1e-4)
 
 
 TURNED = {
@@ -53,7 +53,7 @@ TURNED = {
 
 
 @pytest.mark.statistical
-@pytest.mark.parametrize("kind", TURNED)
+@pytest.mark.parametrize("kind", small.cases(TURNED, ["spot"]))
 def test_direction_of_an_emitter(kind):
     """A sun that turns takes its shadows along; a spot turns its cone only. About an axis across, by an angle [rad]."""
     box, m = smoke(rough_grid(10), 0.7, "own", PLACE, "hg", 0.4)
@@ -65,20 +65,20 @@ def test_direction_of_an_emitter(kind):
         c, s = math.cos(x), math.sin(x)
         return c * axis + s * np.cross(across, axis) + (1 - c) * across * (across @ axis)
 
-    seen = pencils({"smoke": box, "lamp": TURNED[kind](axis)[0]}, *aimed(3, 6))
+    seen = pencils({"smoke": box, "emitter": TURNED[kind](axis)[0]}, *aimed(3, 6))
     w, rows = weights(6)
     known = lambda x: rows @ twins.radiance([m], [TURNED[kind](turned(x))[1]], seen.o, seen.d, order=10)[:, 0]  # noqa: E731
     truth = twin_difference(known, 0.0)
 
     params, integrator = mi.traverse(seen.scene), mi.load_dict(mivol())
-    placed = params["lamp.to_world"]
+    placed = params["emitter.to_world"]
     still, at = mi.AffineTransform4f(placed.matrix), mi.Vector3f(*np.array(placed.matrix)[:3, 3].ravel().tolist())
     found = []
     for seed in range(BATCHES):
         x = mi.Float(0)
         dr.enable_grad(x)
         move = mi.AffineTransform4f().translate(at).rotate(across.tolist(), dr.rad2deg(x)).translate(-at)
-        params["lamp.to_world"] = move @ still
+        params["emitter.to_world"] = move @ still
         params.update()
         image = mi.render(seen.scene, params, integrator=integrator, spp=2048, seed=fresh(seed))
         dr.backward(dr.sum(image * mi.TensorXf(w), axis=None))
@@ -91,18 +91,18 @@ def test_direction_of_an_emitter(kind):
 def test_place_of_an_emitter_over_a_floor(depth):
     """A floor under haze is lit from elsewhere: its distance, its slope and the haze in between; in each of two bounces.
 
-    No lamp in the plane of a face of the haze: there the light has a kink, for rays close to the face leave by it, or along it.
+    No emitter in the plane of a face of the haze: there the light has a kink, for rays close to the face leave by or along it.
     """
     haze = medium("homogeneous", 0.7, 0.6 if depth == 2 else 0.0)
     floor = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, -1.5]).scale(3)}
     wall = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 3, 0]).rotate([1, 0, 0], 90).scale(3)}
-    parts = {"haze": box_of(haze, PLACE), "floor": floor, "wall": wall, "lamp": point([1.6, 1.3, 2.0])[0]}
+    parts = {"haze": box_of(haze, PLACE), "floor": floor, "wall": wall, "emitter": point([1.6, 1.3, 2.0])[0]}
     scene = small.close_up(parts, res=8)
     params, integrator = mi.traverse(scene), mi.load_dict({"type": "mivol", "max_depth": depth})
     along = mi.Vector3f(0.6, -0.3, 0.5)
 
     def picture(x: mi.Float, seed: int) -> mi.Float:
-        params["lamp.position"] = mi.Point3f(1.6, 1.3, 2) + x * along
+        params["emitter.position"] = mi.Point3f(1.6, 1.3, 2) + x * along
         params.update()
         return dr.sum(mi.render(scene, params, integrator=integrator, spp=256, seed=seed, seed_grad=seed + 100), axis=None)
 
@@ -140,25 +140,25 @@ def traced_media() -> dict[str, dict]:
 TRACED = ("an egg", "a ball in its grid", "a ball around its grid", "a ball in a box")
 
 
-@pytest.mark.parametrize("lamp", [(0.3, -0.2, 3.0), (0.05, 0.1, 0.2)])
+@pytest.mark.parametrize("emitter", [(0.3, -0.2, 3.0), (0.05, 0.1, 0.2)])
 @pytest.mark.parametrize("name", TRACED)
-def test_place_of_an_emitter_behind_boundaries_that_are_traced(name, lamp):
-    """What a floor shows has no noise: differences of the same pencils. One lamp is outside, one in the medium."""
+def test_place_of_an_emitter_behind_boundaries_that_are_traced(name, emitter):
+    """What a floor shows has no noise: differences of the same pencils. One emitter is outside, one in the medium."""
     floor = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, -2.2]).scale(3)}
     o = np.column_stack([np.random.default_rng(4).uniform(-0.3, 0.3, (6, 2)), np.full(6, -2.0)])
-    parts = {**traced_media()[name], "floor": floor, "lamp": point(lamp)[0]}
+    parts = {**traced_media()[name], "floor": floor, "emitter": point(emitter)[0]}
     seen = pencils(parts, as_float32(o), as_float32([0, 0, -1]))
     params, integrator, w = mi.traverse(seen.scene), mi.load_dict(mivol()), weights(6)[0]
 
     def shown(x: np.ndarray) -> float:
-        params["lamp.position"] = mi.Point3f(*(np.array(lamp) + x).tolist())
+        params["emitter.position"] = mi.Point3f(*(np.array(emitter) + x).tolist())
         params.update()
         return float((np.array(integrator.render(seen.scene, spp=1), np.float64) * w).sum())
 
     h = 0.004
     truth = [(shown(h * e) - shown(-h * e)) / (2 * h) for e in np.eye(3)]
     shown(np.zeros(3))
-    found = vjp(seen.scene, "lamp.position", w, 1, 0, integrator).ravel()
+    found = vjp(seen.scene, "emitter.position", w, 1, 0, integrator).ravel()
     # A ray along a plane of voxels turns over a kink within h: a share h / voxel of the slope, 1.2e-2 of one ray in six; of the
     # rest truncation is 1e-5 and rounding 1e-7 / h.
     assert np.abs(found - truth).max() <= 3e-3 * np.abs(truth).max()

@@ -28,7 +28,7 @@ def values(channels: int = 1) -> np.ndarray:
 def build(
     channels: int = 1, rfilter: str = "box", crop: bool = False, kind: str = "mivol_medium", lit: bool = True
 ) -> mi.Scene:
-    """A volume with a ball in it over a floor, under a lamp and a sky."""
+    """A volume with a ball in it over a floor, under an emitter and a sky."""
     volume = "mivol_voxels" if kind == "mivol_medium" else "gridvolume"
     parts = {
         "type": "scene",
@@ -44,7 +44,7 @@ def build(
             "to_world": turn().translate([0, -1.2, 0]).rotate([1, 0, 0], -90).scale(5),
         }
         parts["ball"] = {"type": "sphere", "radius": 0.4, "bsdf": GREEN}
-        parts["lamp"] = {
+        parts["emitter"] = {
             "type": "rectangle",
             "to_world": turn().translate([0, 3, 0]).rotate([1, 0, 0], 90),
             "emitter": {"type": "area", "radiance": {"type": "rgb", "value": [4.0, 3.0, 2.0]}},
@@ -93,7 +93,7 @@ CASES = {
 
 
 @pytest.mark.parametrize("passes", [pytest.param(1, marks=pytest.mark.slow), 4])
-@pytest.mark.parametrize("name", cases(CASES, ["depth 1", "rgb, depth 2"]))
+@pytest.mark.parametrize("name", cases(CASES, ["depth 1", "depth 2", "rgb, depth 2", "no surface"]))
 def test_forward_against_reverse(name, passes, monkeypatch):
     """<J v, w> = <v, J^T w> with the same random numbers: no step size at all, whatever the film and the passes."""
     case = dict(CASES[name])
@@ -140,7 +140,7 @@ def test_reverse_against_finite_differences(name):
 OTHERS = [
     ("box.interior_medium.scale", 2),
     ("sky.radiance.value", 1),
-    ("lamp.emitter.radiance.value", 2),
+    ("emitter.emitter.radiance.value", 2),
     ("floor.bsdf.reflectance.value", 2),
     ("floor.bsdf.reflectance.value", 4),
     ("sky.radiance.value", 3),
@@ -149,10 +149,10 @@ OTHERS = [
 
 @pytest.mark.parametrize(
     ("key", "depth"),
-    cases(OTHERS, [("floor.bsdf.reflectance.value", 2), ("sky.radiance.value", 1)]),
+    cases(OTHERS, [("floor.bsdf.reflectance.value", 2), ("sky.radiance.value", 1), ("sky.radiance.value", 3)]),
 )
 def test_other_parameters_against_finite_differences(key, depth):
-    """The scale of a medium, the radiance of lamps and the colour of surfaces have their derivatives too."""
+    """The scale of a medium, the radiance of emitters and the colour of surfaces have their derivatives too."""
     integrator = mi.load_dict({"type": "mivol", "max_depth": depth, "rr_depth": 100})
     scene = build()
     params = mi.traverse(scene)

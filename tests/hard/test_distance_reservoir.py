@@ -24,15 +24,15 @@ pytestmark = pytest.mark.usefixtures("variant_rgb")
 @pytest.mark.statistical
 @pytest.mark.parametrize("peak", [20.0, 2000.0])
 def test_one_dense_voxel(peak):
-    """One voxel 10 or 1000 times denser than the rest, off the rays and between some of them and the lamp: the same law.
+    """One voxel 10 or 1000 times denser than the rest, off the rays and between some of them and the emitter: the same law.
 
     Hard case 31.
     """
     values = rough_grid(6)
     values[-1, -1, -1] = peak
     box, m = smoke(values, 0.8, "own")
-    lamp = point([1.5, 1, 2.0])
-    holds_twin(pencils({"smoke": box, "lamp": lamp[0]}, *aimed(6, 6)), m, lamp[1], quadrature=1e-4, order=16)
+    emitter = point([1.5, 1, 2.0])
+    holds_twin(pencils({"smoke": box, "emitter": emitter[0]}, *aimed(6, 6)), m, emitter[1], quadrature=1e-4, order=16)
 
 
 def test_noise_does_not_follow_the_majorant():
@@ -57,10 +57,10 @@ def test_channels_of_very_different_extinction(ratio):
     """Each channel is its own grey picture: at ratios of 1e4, and with a channel that is vacuum. Hard case 32."""
     values = as_float32(rough_grid(7, 1.0) * np.array(ratio))
     interior = medium("mivol_medium", grid_volume("mivol_voxels", values, PLACE), 0.8, phase={"type": "hg", "g": 0.4})
-    lamp = point([1.5, 1, 2.0])
-    seen = pencils({"smoke": box_of(interior, PLACE), "lamp": lamp[0]}, *aimed(7, 6))
+    emitter = point([1.5, 1, 2.0])
+    seen = pencils({"smoke": box_of(interior, PLACE), "emitter": emitter[0]}, *aimed(7, 6))
     m = twins.Medium(twins.Grid(values, PLACE), float(as_float32(0.8)), twins.hg(0.4))
-    truth = twins.radiance([m], [lamp[1]], seen.o, seen.d)
+    truth = twins.radiance([m], [emitter[1]], seen.o, seen.d)
     found = seen.moments(mivol(), 4096, BATCHES)
     for c in range(3):
         top = truth[:, c].max()

@@ -226,14 +226,14 @@ def test_values_of_unknown_volumes_are_projected():
 
 
 def test_gradient_of_an_image_by_g_at_zero():
-    """Single scattering of a lamp behind thin fog: dL/dg = L 3 cos at g = 0, straight from the closed form of p.
+    """Single scattering of an emitter behind thin fog: dL/dg = L 3 cos at g = 0, straight from the closed form of p.
 
     Hard case 48.
     """
     fog = {"type": "homogeneous", "sigma_t": 0.01, "albedo": 1.0, "phase": {"type": "mivol_hg", "g": 0.0}}
     parts = {
         "box": box_of(fog, np.eye(4)),
-        "lamp": {"type": "directional", "direction": [0.6, 0.0, 0.8], "irradiance": 1.0},
+        "emitter": {"type": "directional", "direction": [0.6, 0.0, 0.8], "irradiance": 1.0},
         "sensor": camera((0.5, 0.5, -40), (0.5, 0.5, 0.5), 2, fov=0.3),
     }
     scene = mi.load_dict({"type": "scene", **parts})

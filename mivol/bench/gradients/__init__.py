@@ -37,7 +37,8 @@ when mivol's volume has the image loss of prbvolpath's last one (the bar; and of
 noise), and the errors of both densities (root mean square over that of the truth).
 
 deep smoke, deep cloud: as smoke, at ``max_depth`` 6; also in directional light, and a cloud of a large-eddy simulation with an
-albedo of 0.999. deep estimators: as estimators, at depth 6 and unlimited; also with a small lamp inside, and in a box of glass.
+albedo of 0.999. deep estimators: as estimators, at depth 6 and unlimited; also with a small emitter inside, and in a box of
+glass.
 deep tutorial: the tutorial as published, at depth 6.
 
 Prints JSON; writes bench_gradients.json and bench_gradients.png.

@@ -10,7 +10,7 @@ import mitsuba as mi
 import numpy as np
 
 from mivol.bench.extinctions import Extinction, les_cloud, smoke
-from mivol.bench.scenes import box_scene, constant_light, directional_light, lamp_inside, milky_glass, of_depth, sun_and_sky
+from mivol.bench.scenes import box_scene, constant_light, directional_light, emitter_inside, milky_glass, of_depth, sun_and_sky
 from mivol.bench.timing import Budget
 
 __all__ = ["ALBEDO", "CONTESTS", "FULL", "OURS", "QUICK", "STOCK", "TABLES", "TUTORIALS", "Light", "Size"]
@@ -46,7 +46,7 @@ class Light:
 
 CONSTANT, SUN, DIRECTIONAL = "constant light", "HG 0.8, sun in a sky", "HG 0.8, directional"
 
-SHONE = {CONSTANT: constant_light, SUN: sun_and_sky, "lamp inside": lamp_inside, "glass": milky_glass}
+SHONE = {CONSTANT: constant_light, SUN: sun_and_sky, "emitter inside": emitter_inside, "glass": milky_glass}
 
 CONTESTS: dict[str, tuple[Callable[[], Extinction], dict[str, Light]]] = {
     "smoke": (smoke, {CONSTANT: Light(constant_light, 60), SUN: Light(sun_and_sky, 30)}),

@@ -84,7 +84,7 @@ def draw_scene(seed: int, channel: int | None = None) -> RandomScene:
     parts: dict = {"type": "scene"}
     parts |= _bodies(draw)
     parts |= _surfaces(draw)
-    parts |= _lamps(draw)
+    parts |= _emitters(draw)
     parts["sensor"] = _camera(draw, parts)
     depth = DEPTHS[draw.rng.integers(len(DEPTHS))]
     draw.features.append(f"depth {depth}")
@@ -180,7 +180,7 @@ def _phase(draw: _Draw) -> dict:
     return phases[draw.one_of({"isotropic": 0.25, "hg": 0.4, "rayleigh": 0.1, "tabphase": 0.1, "blendphase": 0.15})]
 
 
-# -- Surfaces, lamps, camera ----------------------------------------------------------------------------------------------
+# -- Surfaces, emitters, camera ----------------------------------------------------------------------------------------------
 
 
 def _surfaces(draw: _Draw) -> dict:
@@ -201,12 +201,12 @@ def _surfaces(draw: _Draw) -> dict:
     return parts
 
 
-def _lamps(draw: _Draw) -> dict:
-    """A faint sky, so that no scene is black, and one or two lamps."""
+def _emitters(draw: _Draw) -> dict:
+    """A faint sky, so that no scene is black, and one or two emitters."""
     parts: dict = {}
     for k in range(1 if draw.chance(0.6) else 2):
-        kind = draw.one_of({name: 1.0 for name in LAMPS if name not in SKIES or not SKIES & set(draw.features)})
-        parts[f"lamp{k}"] = LAMPS[kind](draw)
+        kind = draw.one_of({name: 1.0 for name in EMITTERS if name not in SKIES or not SKIES & set(draw.features)})
+        parts[f"emitter{k}"] = EMITTERS[kind](draw)
     if not SKIES & set(draw.features):
         parts["sky"] = {"type": "constant", "radiance": 0.2}
     return parts
@@ -232,11 +232,11 @@ def _envmap(draw: _Draw) -> dict:
 
 def _ball(draw: _Draw, inside: bool) -> dict:
     centre = [0.15, 0.1, 0.2] if inside else (2.2 * _direction(draw)).tolist()
-    lamp = {"type": "area", "radiance": draw.colour(1, 6)}
-    return {"type": "sphere", "center": centre, "radius": 0.2 if inside else 0.5, "emitter": lamp}
+    emitter = {"type": "area", "radiance": draw.colour(1, 6)}
+    return {"type": "sphere", "center": centre, "radius": 0.2 if inside else 0.5, "emitter": emitter}
 
 
-LAMPS: dict[str, Callable[[_Draw], dict]] = {
+EMITTERS: dict[str, Callable[[_Draw], dict]] = {
     "constant": lambda draw: {"type": "constant", "radiance": draw.colour(0.2, 1)},
     "envmap": _envmap,
     "directional": lambda draw: {"type": "directional", "direction": (-_direction(draw)).tolist(),

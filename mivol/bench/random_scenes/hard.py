@@ -11,7 +11,7 @@ import numpy as np
 from mivol.bench.bars import say
 from mivol.bench.extinctions import as_dense_as_smoke, smoke, threads_in_space
 from mivol.bench.random_scenes.trials import Size
-from mivol.bench.scenes import box_scene, constant_light, lamp_inside, milky_glass, of_depth, sun_and_sky
+from mivol.bench.scenes import box_scene, constant_light, emitter_inside, milky_glass, of_depth, sun_and_sky
 
 __all__ = ["HARD", "try_hard_scenes"]
 
@@ -39,7 +39,7 @@ HARD: dict[str, Callable[[], dict]] = {
     "colours at ratios of 10,000": lambda: _box_of_colours(),
     "HG 0.99": lambda: box_scene(smoke().values, SIDE, 0.99, **_phase(0.99)()),
     "HG -0.99": lambda: box_scene(smoke().values, SIDE, 0.99, **_phase(-0.99)()),
-    "lamp inside": lambda: box_scene(smoke().values, SIDE, 1.0, **lamp_inside()),
+    "emitter inside": lambda: box_scene(smoke().values, SIDE, 1.0, **emitter_inside()),
     "glass": lambda: box_scene(smoke().values, SIDE, 1.0, **milky_glass()),
     "threads": lambda: box_scene(as_dense_as_smoke(threads_in_space(128)).values, SIDE, 0.75, **sun_and_sky()),
 }
@@ -47,7 +47,7 @@ HARD: dict[str, Callable[[], dict]] = {
 
 
 def _box_of_colours() -> dict:
-    scene = box_scene(np.zeros((2, 2, 2), np.float32), SIDE, 0.99, **lamp_inside())
+    scene = box_scene(np.zeros((2, 2, 2), np.float32), SIDE, 0.99, **emitter_inside())
     scene["box"]["interior"]["sigma_t"]["grid"] = mi.VolumeGrid(_colours())
     return scene
 
