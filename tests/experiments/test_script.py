@@ -131,7 +131,8 @@ def test_scripts_of_the_docs_are_short(path: Path) -> None:
 def test_scripts_of_the_docs_run(variant_rgb: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Ten pictures of a denser cube: its density is found to a tenth, and the light that is put in its place is orange."""
     monkeypatch.chdir(folder)
-    text = SCENE.replace('<emitter type="constant"/>', '<emitter type="constant" id="sky"/>').replace('"tau"', '""')
+    sky = '<emitter type="constant" id="sky"><rgb name="radiance" value="1"/></emitter>'
+    text = SCENE.replace('<emitter type="constant"/>', sky).replace('"tau"', '""')
     sensor = text[text.index("<sensor") : text.index("</sensor>") + 9]
     turned = [sensor.replace("0, 1, 4", f"{4 * np.sin(a):.4f}, 1, {4 * np.cos(a):.4f}") for a in np.linspace(0, 3, 10)]
     (folder / "scene.xml").write_text(text.replace(sensor, "\n".join(turned)))
