@@ -26,9 +26,9 @@ def _colours() -> np.ndarray:
     return values.astype(np.float32)
 
 
-def _phase(g: float) -> Callable[[], dict]:
+def _sun(g: float) -> dict:
     """A sun in a sky, and a phase function that is nearly a line."""
-    return lambda: sun_and_sky() | {"phase": {"type": "hg", "g": g}}
+    return sun_and_sky() | {"phase": {"type": "hg", "g": g}}
 
 
 HARD: dict[str, Callable[[], dict]] = {
@@ -37,8 +37,8 @@ HARD: dict[str, Callable[[], dict]] = {
     "empty box": lambda: box_scene(np.zeros((4, 4, 4), np.float32), SIDE, 0.9, **sun_and_sky()),
     "thin as 1e-12": lambda: box_scene(np.full((4, 4, 4), 1e-12, np.float32), SIDE, 0.9, **sun_and_sky()),
     "colours at ratios of 10,000": lambda: _box_of_colours(),
-    "HG 0.99": lambda: box_scene(smoke().values, SIDE, 0.99, **_phase(0.99)()),
-    "HG -0.99": lambda: box_scene(smoke().values, SIDE, 0.99, **_phase(-0.99)()),
+    "HG 0.99": lambda: box_scene(smoke().values, SIDE, 0.99, **_sun(0.99)),
+    "HG -0.99": lambda: box_scene(smoke().values, SIDE, 0.99, **_sun(-0.99)),
     "emitter inside": lambda: box_scene(smoke().values, SIDE, 1.0, **emitter_inside()),
     "glass": lambda: box_scene(smoke().values, SIDE, 1.0, **milky_glass()),
     "threads": lambda: box_scene(as_dense_as_smoke(threads_in_space(128)).values, SIDE, 0.75, **sun_and_sky()),

@@ -141,9 +141,8 @@ class FlownSegment:
         rest = dlog if self.level is None else dlog - self.dL * self._level
         vjp_optical_depth(media, self.passed, -rest, self.active)
         for body, on in media.bodies_at(hit.body, hit.on & self.segment.scatters):
-            name, sigma = _scattering_part(media, body, ray, hit.t, on)
-            weight = dr.select(on, rest * dr.rcp(sigma + _kappa(media, body)), 0)
-            body.deposit(ray, dr.select(on, hit.t, 0), by_channel(weight, media.channels), on, name)
+            name, weight = _weigh_collision(media, body, ray, hit.t, on)
+            body.deposit(ray, dr.select(on, hit.t, 0), by_channel(dr.select(on, rest * weight, 0), media.channels), on, name)
             if body.view.albedo is None:
                 continue
             with dr.resume_grad():
@@ -167,9 +166,9 @@ class FlownSegment:
         media, ray, hit = self.media, self.segment.ray, self.collision
         change = -jvp_optical_depth(media, self.passed, self.active)
         for body, on in media.bodies_at(hit.body, hit.on & self.segment.scatters):
-            name, sigma = _scattering_part(media, body, ray, hit.t, on)
+            name, weight = _weigh_collision(media, body, ray, hit.t, on)
             own = spectrum(body.tangent_at(ray, dr.select(on, hit.t, 0), media.channels, on, name))
-            change += dr.select(on, own * dr.rcp(sigma + _kappa(media, body)), 0)
+            change += dr.select(on, own * weight, 0)
         return change
 
 
@@ -252,14 +251,13 @@ class ProbeTerm:
 
     def _weight(self, body: Body, on: mi.Bool) -> tuple[str, mi.Spectrum]:
         """The coefficient that the probe is of, and the derivative of the light by it."""
-        name, sigma = _scattering_part(self.media, body, self.probe.ray, self.probe.t, on)
+        name, weight = _weigh_collision(self.media, body, self.probe.ray, self.probe.t, on)
         bracket = self.source
         if body.view.albedo is not None:
             bracket = bracket * dr.detach(eval_albedo(body, self.mei, on))
         if self.level is not None:
             bracket = bracket - self.level
-        kappa = _kappa(self.media, body)
-        return name, self._gain * bracket * kappa * dr.rcp(sigma + kappa)
+        return name, self._gain * bracket * _kappa(self.media, body) * weight
 
     def vjp(self, dL: mi.Spectrum) -> None:
         media, probe = self.media, self.probe
@@ -295,15 +293,15 @@ def weigh_collisions(media: SceneMedia, ray: mi.Ray3f, hit: Collision) -> mi.Spe
     """The weight [length] that derivatives at collisions have: 1 / (sigma + kappa); 0 where there is none."""
     weight = mi.Spectrum(0)
     for body, on in media.bodies_at(hit.body, hit.on):
-        _, sigma = _scattering_part(media, body, ray, hit.t, on)
-        weight = dr.select(on, dr.rcp(sigma + _kappa(media, body)), weight)
+        weight = dr.select(on, _weigh_collision(media, body, ray, hit.t, on)[1], weight)
     return weight
 
 
-def _scattering_part(media: SceneMedia, body: Body, ray: mi.Ray3f, t: mi.Float64, on: mi.Bool) -> tuple[str, mi.Spectrum]:
-    """The name of the coefficient that makes collisions scatter, and its value [1/length] at a point."""
+def _weigh_collision(media: SceneMedia, body: Body, ray: mi.Ray3f, t: mi.Float64, on: mi.Bool) -> tuple[str, mi.Spectrum]:
+    """The name of the coefficient sigma that makes collisions scatter, and 1 / (sigma + kappa) [length] at a point."""
     name = "sigma_s" if body.view.albedo is None else "sigma_"
-    return name, spectrum(body.extinction_at(ray, dr.select(on, t, 0), media.channels, on, name))
+    sigma = spectrum(body.extinction_at(ray, dr.select(on, t, 0), media.channels, on, name))
+    return name, dr.rcp(sigma + _kappa(media, body))
 
 
 def _kappa(media: SceneMedia, body: Body) -> mi.Float:
