@@ -76,6 +76,9 @@ def run_pytest(copy: Path, arguments: Sequence[str], limit: float) -> tuple[int,
     command = [sys.executable, "-m", "pytest", "-q", "-x", "-rfE", "-p", "no:cacheprovider"]
     # The clock runs for one test at a time and ends the process from a thread of its own, whatever a kernel does.
     command += ["-o", f"faulthandler_timeout={limit}", "-o", "faulthandler_exit_on_timeout=true", *arguments]
+    if all("::" in argument for argument in arguments):
+        # Tests that mutations name are few, so the slow ones of them are run too.
+        command += ["-m", "slow or not slow"]
     done = subprocess.run(command, cwd=copy, env=env, capture_output=True, text=True, errors="replace", check=False)
     return done.returncode, done.stdout + done.stderr
 

@@ -237,6 +237,7 @@ def test_camera_inside(boundary):
     assert np.abs(light(seen) - truth).max() <= 2e-5
 
 
+@pytest.mark.slow
 def test_refining_the_grid():
     """The same trilinear field on finer grids, light and extinction: fourth order through all of the integrator."""
     inner = centred(0.9 * np.eye(3))  # within the voxel centres of each: beyond them grids differ

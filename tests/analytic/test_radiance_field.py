@@ -168,6 +168,7 @@ def test_a_rotated_field_looks_as_it_did(variant_rgb: str) -> None:
     assert np.abs(before - see(SphericalGrid.from_dense(density, sh, TO_WORLD), o, -d)[0]).max() > 0.1
 
 
+@pytest.mark.slow
 def test_sparse_is_dense(variant_rgb: str) -> None:
     rng = np.random.default_rng(5)
     density, sh = make((12, 11, 13), basis=9)

@@ -138,6 +138,7 @@ def test_variance_is_as_derived():
 # -- Pictures ----------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.statistical
 @pytest.mark.parametrize("name", cases(["rough", "rgb"], ["rough"]))
 def test_pictures_have_the_same_mean(name):

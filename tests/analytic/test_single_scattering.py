@@ -144,6 +144,7 @@ def test_two_media_shade_each_other():
     check(parts, media, [point([0.3, 0.2, 3.5])], *aimed(11, 10, 1.0, 6.0))
 
 
+@pytest.mark.slow
 @pytest.mark.statistical
 def test_background_shines_through():
     """A grid in a constant sky: what is turned and what is left of the background."""

@@ -146,6 +146,7 @@ def test_a_boundary_that_is_entered_twice() -> None:
     check(tangent[..., 0], -SCALE * 0.8 * seen, "the derivative")
 
 
+@pytest.mark.slow
 @pytest.mark.statistical
 def test_surfaces_behind_are_lit_through_the_field() -> None:
     """Rationale: shadow rays meet the field as camera rays do. Expected: the means of a homogeneous sphere in its place, of
@@ -166,6 +167,7 @@ def test_surfaces_behind_are_lit_through_the_field() -> None:
         assert_same_mean(of_batches(ours[..., 0]), of_batches(truth[..., 0]), what=what)
 
 
+@pytest.mark.slow
 @pytest.mark.statistical
 def test_a_ball_that_scatters_any_number_of_times() -> None:
     """Expected: the means of a homogeneous sphere in its place, which flights see exactly, of images and derivatives."""

@@ -52,6 +52,7 @@ def timings(answer: object) -> list[dict]:
     return [t for v in answer for t in timings(v)] if isinstance(answer, list) else []
 
 
+@pytest.mark.slow
 def test_bars_are_found_in_the_answers_that_they_judge(variant_rgb: str) -> None:
     """Each question is answered with times above 0, and each bar finds its figure; that of 256^3 needs the full size."""
     assert {p.question for p in PROMISES} <= set(QUESTIONS)

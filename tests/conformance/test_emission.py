@@ -145,7 +145,8 @@ def along_z(n: int = 8) -> tuple[np.ndarray, np.ndarray]:
     return as_float32(o), as_float32(d / np.linalg.norm(d, axis=1, keepdims=True))
 
 
-@pytest.mark.parametrize("kinds", ["bt", *(pytest.param(k, marks=pytest.mark.slow) for k in ("bb", "bcb", "tt", "tbt", "cbc"))])
+@pytest.mark.slow
+@pytest.mark.parametrize("kinds", ["bt", "bb", "bcb", "tt", "tbt", "cbc"])
 def test_several_media(kinds):
     """Whatever order media are declared in, and whether they are traced: each dims what is behind it; derivatives too."""
     parts, media = stack(kinds)
@@ -198,6 +199,7 @@ def test_an_opaque_surface_occludes_and_is_seen_through(boundary):
 # -- Variants, recordings ----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_mono():
     """A grey field is any channel of the rgb image; a coloured light is its luminance, with its derivative."""
     m = twins.Medium((rough(1, 0, 2), PLACE), (rough(2, 0, 1, 3), PLACE), (rough(3, 0, 1, 3), PLACE))

@@ -85,6 +85,7 @@ def test_same_image_as_volpath(name):
     assert_same_mean(ours, stock, rounding=6e-4, what=name)
 
 
+@pytest.mark.slow
 @pytest.mark.statistical
 @pytest.mark.parametrize(
     "kind", cases(["independent", "stratified", "multijitter", "ldsampler"], ["independent", "stratified", "ldsampler"])
@@ -102,6 +103,7 @@ def test_split_into_passes(kind, monkeypatch):
     assert_same_mean(whole, split, rounding=1e-5, what=kind)
 
 
+@pytest.mark.slow
 @pytest.mark.statistical
 def test_passes_of_stratified_samples_stay_stratified(monkeypatch):
     """A step across a pixel: n strata leave about n^-1/2 of the variance of n independent samples, whatever the passes."""
@@ -117,6 +119,7 @@ def test_passes_of_stratified_samples_stay_stratified(monkeypatch):
     assert_same_spread(grey["multijitter"], grey["independent"], expected=1 / 3, high=0.75, what="strata")
 
 
+@pytest.mark.slow
 @pytest.mark.statistical
 def test_pixels_are_not_correlated_between_passes(monkeypatch):
     """Each pass draws its own numbers: the variance of the mean falls as 1/passes."""

@@ -193,6 +193,7 @@ SCENES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.statistical
 @pytest.mark.parametrize("name", small.cases(SCENES, slow=[name for name in SCENES if name != "milk in a glass"]))
 def test_scenes_are_those_of_volpath(name):

@@ -100,6 +100,7 @@ def test_scale_that_changes_between_calls():
     assert np.all(np.diff(means) < -0.01)
 
 
+@pytest.mark.slow
 def test_gradient_step():
     """The update of the grid, the render and the reverse pass in one recording."""
     scene, values = build("mivol_medium", True)
@@ -126,7 +127,8 @@ def test_gradient_step():
         assert np.abs(replayed - plain).max() <= 1e-5 * np.abs(plain).max()
 
 
-@pytest.mark.parametrize("emitter", ["sky", pytest.param("bulb", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("emitter", ["sky", "bulb"])
 def test_gradient_step_of_scattered_light(emitter):
     """Density, albedo and asymmetry of a medium that turns light once, in one recording: what an ordinary step gives."""
     values = np.random.default_rng(1).uniform(0.1, 1.0, (4, 5, 6, 1)).astype(np.float32)

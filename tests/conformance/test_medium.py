@@ -196,6 +196,7 @@ def test_what_is_below_0_is_told_once():
     assert np.array_equal(images[0], images[2]) and np.array_equal(images[1], images[2])
 
 
+@pytest.mark.slow
 def test_unclamped_steps_reach_the_truth_through_0():
     """Adam as stock Mitsuba's users write it: voxels that were thrown below 0 come back to what they were."""
     truth = np.full((2, 2, 2, 1), 0.6, np.float32)

@@ -30,6 +30,7 @@ def surfaces_in_smoke() -> mi.Scene:
     return close_up({"smoke": box, "ball": ball, "floor": {"type": "rectangle", "to_world": place}, "sky": light})
 
 
+@pytest.mark.slow
 @pytest.mark.statistical
 def test_moment_has_the_same_mean_and_the_right_second_moment():
     """Welch's t of 8 batches each; the squares come from renders of one sample a pixel, 48 of them in 16 batches."""

@@ -484,6 +484,7 @@ def test_a_new_value_needs_no_new_kernel():
     assert hits[1] == [True]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", cases(["draine", "table", "mixture"], ["draine", "mixture"]))
 def test_gradient_of_a_recording(name):
     """Update, render and reverse pass in one recording, as without one."""

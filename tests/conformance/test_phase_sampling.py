@@ -58,6 +58,7 @@ PHASES = {
 OWN_PHASES = [("hg forward", "own"), ("tabphase", "own"), ("blendphase", "own")]
 
 
+@pytest.mark.slow
 @pytest.mark.statistical
 @pytest.mark.parametrize(
     ("name", "kind"),

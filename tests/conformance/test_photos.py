@@ -673,6 +673,7 @@ def test_no_data_set(tmp_path: Path) -> None:
 # -- Real data ----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_chair(data_dir: Path) -> None:
     """The middle of the scene lies within the chair in every view; the 175 test images that are not there are named."""
     chair = data_dir / "multiview" / "chair"

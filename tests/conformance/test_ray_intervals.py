@@ -54,6 +54,7 @@ INSIDE = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.statistical
 @pytest.mark.parametrize("where", small.cases(INSIDE, [name for name in INSIDE if name != "a room"]))
 def test_media_that_fill_no_shape_of_their_own(where):
@@ -90,6 +91,7 @@ def test_media_in_instances(kind):
     same(lit(instances(interior)))
 
 
+@pytest.mark.slow
 @pytest.mark.statistical
 def test_boundaries_that_are_moved():
     """An integrator that has rendered a scene sees that its box was moved, turned and taken back; volpath judges."""

@@ -109,6 +109,7 @@ def test_absorbing_cube(variant_rgb, tmp_path, integrator, kind):
     assert_same_spread(squares, said, low=0.2, high=2.7, dof=(n, 31 * n), what="squared errors")
 
 
+@pytest.mark.slow
 @pytest.mark.statistical
 def test_rgb_extinction_is_rendered_channel_by_channel(variant_rgb, tmp_path):
     """sigma_t = (2, 6, 9): each channel is its own grey render, where Mitsuba at once is wrong in red: a few paths carry
@@ -182,6 +183,7 @@ def test_published_reference(variant_rgb, tmp_path, data_dir):
     assert_same_mean(Estimate(found.mean, variance / found.spp), theirs, tile=8)
 
 
+@pytest.mark.slow
 @pytest.mark.statistical
 def test_seeds_are_independent(variant_rgb, tmp_path):
     """Two seeds: other noise, same mean; the same seed: the same image."""
@@ -233,6 +235,7 @@ def test_stopped_and_continued_is_the_same(variant_rgb, ctrl_c, tmp_path, monkey
     np.testing.assert_allclose(continued.variance, whole.variance, rtol=1e-4, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_fetched_from_disk_and_made_better(variant_rgb, tmp_path, monkeypatch):
     """Good enough on disk: no batch is rendered. Asked for more: only the missing ones are."""
     scene, path = _scene(_grid(1.5)), tmp_path / "r.exr"
@@ -273,6 +276,7 @@ def test_file_says_what_it_is(variant_rgb, tmp_path):
     assert "volpath (max_depth 2" in made.text and "256 samples" in made.text
 
 
+@pytest.mark.slow
 def test_folder_names_its_files(variant_rgb, tmp_path):
     """In a folder, other scenes, depths and cameras have files of their own."""
     scene = _scene(_grid(1.5))

@@ -35,6 +35,7 @@ def test_camera_inside(shape):
     assert_same_images(scene, rounding=LEAK)
 
 
+@pytest.mark.slow
 @pytest.mark.statistical
 def test_camera_inside_that_names_no_medium():
     """Volpath starts in vacuum then; we find the medium: the picture is that of a sensor that names it."""

@@ -22,6 +22,7 @@ from volpath_scenes import (
 pytestmark = pytest.mark.usefixtures("variant_rgb")
 
 
+@pytest.mark.slow
 @pytest.mark.statistical
 @pytest.mark.parametrize("emitter", small.cases(["bulb", "emitter", "sky"], ["emitter", "sky"]))
 def test_shadow_rays_go_on_through_what_is_partly_clear(emitter):
@@ -31,6 +32,7 @@ def test_shadow_rays_go_on_through_what_is_partly_clear(emitter):
     same(behind_a_mask() | {"shine": shine})
 
 
+@pytest.mark.slow
 @pytest.mark.statistical
 @pytest.mark.parametrize("emitter", small.cases(["bulb", "sky"], ["sky"]))
 @pytest.mark.parametrize("kind", small.cases(["transmissive", "boundary"], ["boundary"]))

@@ -64,6 +64,7 @@ def test_each_coefficient_stands_under_its_own_name():
     assert [p.name for p in view_medium(interior).parts] == ["sigma_a", "sigma_s"]
 
 
+@pytest.mark.slow
 @pytest.mark.statistical
 @pytest.mark.parametrize("name", small.cases(["ref", "sigma_a and sigma_s"], ["sigma_a and sigma_s"]))
 def test_the_derivative_is_the_sum_of_both(name):
@@ -104,6 +105,7 @@ def test_the_derivative_is_the_sum_of_both(name):
         assert_same_mean(found, slopes, rounding=3e-4 * slope, what=mode)
 
 
+@pytest.mark.slow
 def test_a_reference_knows_the_shared_extinction(tmp_path):
     """Its doubts look at it, and where it differs between channels each of them is rendered alone."""
     colours = np.array([0.2, 0.5, 0.9]) * np.ones((2, 2, 2, 1))

@@ -204,6 +204,7 @@ def test_scenes_of_any_size(unit):
     np.testing.assert_allclose(small_one, big, rtol=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.statistical
 def test_hidden_emitters():
     """hide_emitters takes the emitters out of the picture, not their light off the smoke."""
@@ -331,6 +332,7 @@ def test_recordings(kind):
     assert frozen.n_recordings < 4
 
 
+@pytest.mark.slow
 @pytest.mark.statistical
 def test_a_mono_variant():
     """One channel: as volpath in the same variant."""

@@ -47,6 +47,7 @@ def test_parameters_and_their_shapes(variant_rgb: None) -> None:
     assert f"{KEY.rpartition('.')[0]}.scale" not in params
 
 
+@pytest.mark.slow
 def test_a_constant_colour_is_a_constant_source(variant_rgb: None) -> None:
     """C = c (1 - T) + B T for any density: colour 0.5 + 0.282095 k of degree 0, whatever the activation."""
     density, sh = values()
@@ -62,6 +63,7 @@ def test_a_constant_colour_is_a_constant_source(variant_rgb: None) -> None:
         assert np.ptp(alpha) > 0.1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("activation", cases(["none", "relu", "softplus", "exp"], ["none", "relu", "softplus"]))
 def test_derivatives_against_differences(activation: str, variant_rgb: None) -> None:
     """Reverse and forward, of both parameters, against central differences with the same samples, at depth 2 among surfaces."""

@@ -153,6 +153,7 @@ def test_what_is_behind_is_learned(photographs: Path, tmp_path: Path) -> None:
     assert all(np.median(channels[name]) > 0.9 for name in "RGB")
 
 
+@pytest.mark.slow
 def test_a_stopped_fit_goes_on(photographs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Ctrl-C in the middle keeps what was done; the resumed fit ends with all steps, and says nothing twice."""
     path = toml(tmp_path, photographs)

@@ -26,6 +26,7 @@ def test_references_are_cached(variant_rgb, folder: Path, monkeypatch: pytest.Mo
     assert len(list((target / "references").glob("*.exr"))) == 2
 
 
+@pytest.mark.slow
 def test_references_from_files(variant_rgb, folder: Path, capsys: pytest.CaptureFixture) -> None:
     """Photographs (no header) are taken as they are; mivol's own must be of this scene."""
     write_exr(folder / "a.exr", {"": np.full((6, 8, 3), 0.7, "f")})

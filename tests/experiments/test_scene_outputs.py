@@ -32,6 +32,7 @@ def test_images_that_are_compared_may_have_more_samples(variant_rgb, folder: Pat
     assert asked == [32, 4, 32, 32, 32, 32]
 
 
+@pytest.mark.slow
 def test_a_sky_that_was_found_is_an_image(variant_rgb, folder: Path) -> None:
     """Without the columns that Mitsuba's envmap adds: what is written has the shape of what was given, and is read again to
     the same parameter. A soft wall is a prior that needs no neighbours."""

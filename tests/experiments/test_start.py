@@ -13,6 +13,7 @@ from mivol.files import read_volume
 from mivol.validate.metrics import nrmse
 
 
+@pytest.mark.slow
 def test_a_colour_is_looked_for_from_a_start_of_its_own(variant_rgb, folder: Path, capsys: pytest.CaptureFixture) -> None:
     """Each number of what is no grid has its start, and is among the results and curves; steps of 1e-6 leave it there."""
     coloured = '<emitter type="constant" id="sky"><rgb name="radiance" value="0.9, 0.8, 0.7"/></emitter>'

@@ -47,8 +47,9 @@ def test_white_smoke_of_no_density_in_a_constant_sky_has_no_gradient(kind, place
     assert white <= 4e-6 * black
 
 
+@pytest.mark.slow
 @pytest.mark.statistical
-@pytest.mark.parametrize("alone", [True, pytest.param(False, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("alone", [True, False])
 def test_a_ball_under_a_constant_sky(alone):
     """Density in a boundary that is traced, by itself and behind a box that shades it: against differences."""
     interior = medium("mivol_medium", grid_volume("mivol_voxels", 0.2 + rough_grid(1), PLACE), 0.8)

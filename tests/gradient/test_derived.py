@@ -98,6 +98,7 @@ def derivative(parts: dict, key: str, mode: str, updates: bool) -> float:
     return float((np.array(change, dtype=np.float64) * np.array(w)).sum())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", small.cases(MADE, [name for name in MADE if name != "sky"]))
 def test_every_way_of_asking(name):
     """Backward and forward, from the parameter or to the image, with and without params.update(): one number.
@@ -112,6 +113,7 @@ def test_every_way_of_asking(name):
             assert derivative(parts(), key, mode, updates) == pytest.approx(truth, rel=1e-5), (mode, updates)
 
 
+@pytest.mark.slow
 def test_a_spot_is_carried_forward_as_often_as_back():
     """A transform is no array: its matrix is led. Each pass follows another number, over a floor that paths turn at."""
     place = mi.ScalarTransform4f().look_at([1.6, -1.3, 2.5], [0, 0, 0], [0, 0, 1])

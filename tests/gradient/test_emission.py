@@ -143,6 +143,7 @@ def test_several_passes_are_one(end, channels, depth, monkeypatch):
     assert abs(jvps[1].sum() / jvps[0].sum() - 1) < 0.3
 
 
+@pytest.mark.slow
 def test_two_bodies_that_share_their_light():
     """One volume emits in two media: its gradient is that of both."""
     shared = mi.load_dict(grid_volume("mivol_voxels", rough(3, 0.2, 1, 3), centred(4 * np.eye(3))))
@@ -173,6 +174,7 @@ def test_two_bodies_that_share_their_light():
     assert abs((found * v).sum() - (truth * w).sum()) <= 1e-5 * np.abs(truth * w).sum()
 
 
+@pytest.mark.slow
 def test_parameter_of_a_parameter():
     """Volumes whose values are computed from something else: the derivative passes on to that, in both modes."""
     seen = emitting(grids(3))
@@ -214,7 +216,8 @@ def corridor(wall: float) -> twins.Medium:
     return twins.Medium((as_float32(values), CORRIDOR), *light)
 
 
-@pytest.mark.parametrize("depth", [1, pytest.param(3, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("depth", [1, 3])
 @pytest.mark.parametrize("wall", [50.0, 1e6])
 def test_no_phantom_gradient_behind_a_wall(wall, depth):
     """Hidden voxels get their e^-50 (or their 0), where what is left of a subtraction would be 1e-7.

@@ -255,6 +255,7 @@ def test_light_is_linear_in_what_emits(name, depth):
     assert np.abs(tangent - (images[0] - images[1])).max() <= 2e-5 * images[0].max()
 
 
+@pytest.mark.slow
 @pytest.mark.statistical
 def test_albedo_of_zero(monkeypatch):
     """Where nothing scatters yet, light that would is found by probes; the estimator of one scattering never divides by it."""

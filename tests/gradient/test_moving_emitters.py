@@ -52,6 +52,7 @@ TURNED = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.statistical
 @pytest.mark.parametrize("kind", small.cases(TURNED, ["spot"]))
 def test_direction_of_an_emitter(kind):
@@ -86,8 +87,9 @@ def test_direction_of_an_emitter(kind):
     assert_gradient(np.array(found)[:, None], np.array([truth]), kind, rounding=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.statistical
-@pytest.mark.parametrize("depth", [pytest.param(2, marks=pytest.mark.slow), 3])
+@pytest.mark.parametrize("depth", [2, 3])
 def test_place_of_an_emitter_over_a_floor(depth):
     """A floor under haze is lit from elsewhere: its distance, its slope and the haze in between; in each of two bounces.
 

@@ -125,6 +125,7 @@ def test_density_under_a_sky(density, albedo):
     assert_gradient(gradients(seen, GRID, w, 512), truth[..., None], density, rounding=2e-3 if albedo else 2e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.statistical
 def test_constvolume_whose_density_is_its_majorant():
     """The constant extinction of a stock heterogeneous, where prbvolpath is twice too large."""
@@ -145,6 +146,7 @@ def test_constvolume_whose_density_is_its_majorant():
 # -- Several channels, several media, boundaries that are traced ------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.statistical
 @pytest.mark.parametrize("lit", small.cases(["point", "sky"], ["sky"]))
 def test_rgb_extinction(lit):
@@ -167,8 +169,9 @@ LUMINANCE = np.array([0.212671, 0.715160, 0.072169])
 """Of linear sRGB, by which Mitsuba makes one number of three in mono variants."""
 
 
+@pytest.mark.slow
 @pytest.mark.statistical
-@pytest.mark.parametrize("shares", [pytest.param([1.0], id="grey", marks=pytest.mark.slow), pytest.param(LUMINANCE, id="rgb")])
+@pytest.mark.parametrize("shares", [pytest.param([1.0], id="grey"), pytest.param(LUMINANCE, id="rgb")])
 def test_a_mono_variant(shares):
     """One number a sample: density voxel by voxel, and albedo. An rgb grid counts by its luminance, in derivatives too."""
     mi.set_variant("llvm_ad_mono")
@@ -242,6 +245,7 @@ def sums(seen: Pencils, key: str, w: np.ndarray, spp: int, v: object = 1.0) -> n
 EMITTER = lambda: point([1.5, 1, 2.0])  # noqa: E731
 
 
+@pytest.mark.slow
 @pytest.mark.statistical
 def test_homogeneous_extinction_and_albedo():
     emitter = EMITTER()
@@ -309,6 +313,7 @@ def test_absorption_and_scattering():
     scalar(parts, MEDIUM + "sigma_s.value.value", lambda x, o, d: light(a, x, o, d), s)
 
 
+@pytest.mark.slow
 @pytest.mark.statistical
 def test_scattering_grid():
     """sigma_s on a grid, also where it is 0: what turns is its own, not a share of sigma_t."""
@@ -346,6 +351,7 @@ def test_scale():
     scalar(parts, MEDIUM + "scale", light, 1.5)
 
 
+@pytest.mark.slow
 @pytest.mark.statistical
 @pytest.mark.parametrize("g", small.cases([-0.6, 0.0, 0.4, 0.9], [-0.6, 0.0, 0.4]))
 def test_asymmetry_of_the_phase_function(g):
@@ -401,6 +407,7 @@ def test_density_under_a_sky_that_is_not_constant():
     assert_gradient(gradients(seen, GRID, w, 2048), truth[..., None], "panorama", rounding=5e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.statistical
 def test_weight_of_a_blend():
     emitter, values = EMITTER(), rough_grid(8)
@@ -514,6 +521,7 @@ KEYS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("key", small.cases(KEYS, [name for name in KEYS if name != "sigma_t.data"]))
 def test_forward_against_reverse(key):
     """<J v, w> = <v, J^T w> with the same random numbers: no step size and no noise, to float32 sums (1e-5 of the terms)."""
@@ -559,6 +567,7 @@ def test_against_differences_with_common_random_numbers(key, kind):
     assert_precise(m, 0.02 * level.max(), what=key)
 
 
+@pytest.mark.slow
 @pytest.mark.statistical
 def test_seeds_of_picture_and_gradient_are_independent():
     """The gradient of a squared loss through mi.render has the mean 2 (L - r) dL: their noise must not be correlated.

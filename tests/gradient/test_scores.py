@@ -147,6 +147,7 @@ OTHERS = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("key", "depth"),
     cases(OTHERS, [("floor.bsdf.reflectance.value", 2), ("sky.radiance.value", 1), ("sky.radiance.value", 3)]),

@@ -74,6 +74,7 @@ def test_picture_of_no_density():
     assert np.all(np.abs(scenes.render(seen.scene, mivol(), 16) - as_float32(0.7)) <= 4 * EPS)
 
 
+@pytest.mark.slow
 @pytest.mark.statistical
 @pytest.mark.parametrize("kind", small.cases(small.KINDS, ["own"]))
 def test_albedo_0(kind):

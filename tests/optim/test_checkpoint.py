@@ -61,6 +61,7 @@ def test_a_resumed_run_is_bitwise_the_same(one_thread, ctrl_c, tmp_path: Path, n
     assert np.array_equal(np.asarray(resumed.run.reals[KEY]), np.asarray(whole.run.reals[KEY]))
 
 
+@pytest.mark.slow
 def test_a_resumed_run_is_the_same_with_several_threads(two_threads, ctrl_c, tmp_path: Path) -> None:
     """Float sums have no fixed order: 1e-7 per gradient, which Adam's division can turn into 1e-5 of its steps."""
     path = tmp_path / "checkpoint.npz"

@@ -181,6 +181,7 @@ def test_the_measured_noise_is_the_variance(variant_rgb) -> None:
     assert_same_mean(Moments.of(np.array(found)), T * (1 - T) / SPP, what="noise")
 
 
+@pytest.mark.slow
 def test_exact_renders_do_not_pay(variant_rgb) -> None:
     """One render a batch, no noise, and pairs change no bit; noisy renders come in two halves of the samples."""
     for integrator, wanted in (("mivol", [SPP]), ("prbvolpath", [SPP // 2, SPP // 2])):
@@ -253,6 +254,7 @@ def test_who_is_noisy(variant_rgb) -> None:
 # -- What is said -------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.statistical
 def test_said_once_with_its_size(variant_rgb, tmp_path: Path, capsys) -> None:
     """At (T - R)^2 = 0.0227 and T (1 - T) / 8 = 0.031 the noise is 58 % of the loss; both are means over 4096 pixels in one

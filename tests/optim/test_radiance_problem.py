@@ -88,6 +88,7 @@ def test_the_vacuum_around_a_sparse_field_stays_empty(variant_rgb: str, photos: 
     assert np.count_nonzero(density) > 100 and np.count_nonzero(harmonics[:, 0]) > 100
 
 
+@pytest.mark.slow
 def test_backgrounds_that_change_leave_no_white_in_the_air(variant_rgb: str, photos: list[Photo]) -> None:
     batches = RayBatches.of(photos, (1, 2), with_alpha=True)
     fit = fitted(batches, replace(PLAN, random_background=True))
@@ -142,6 +143,7 @@ def test_each_photograph_may_lie_over_its_own_colour(variant_rgb: str, photos: l
     np.testing.assert_array_equal(np.array(kept.whole(1, 2).before).T[0], colours[2])
 
 
+@pytest.mark.slow
 def test_what_is_behind_is_found_too(variant_rgb: str, photos: list[Photo]) -> None:
     """A ball under a sky of two colours, photographs without alpha: the sky is found where rays pass the ball."""
     v, u = np.meshgrid(np.linspace(0, 1, 8), (np.arange(16) + 0.5) / 16, indexing="ij")
