@@ -129,7 +129,8 @@ def _start_candidate(media: SceneMedia, rng: mi.UInt32, width: int) -> Candidate
 
 
 def fill_reservoir(proposal: DistanceProposal) -> MediumVisitor:
-    """The visitor that sums optical depth and offers every piece of a ray to a :class:`Reservoir`.
+    """A visitor of the media along a ray: it sums their optical depth and offers each cell, or constant stretch, as a piece to a
+    :class:`Reservoir`, which keeps one piece a candidate in proportion to the light that it takes.
 
     Cost: as an optical depth, with one exponential and one random number a cell and candidate (measured with one: 1.7 times its
     time).
@@ -270,7 +271,10 @@ def _replace_candidate(old: Candidate, piece: _Piece, weight: mi.Float, total: m
 
 
 def lit_length(sigma: list[mi.Float], length: mi.Float) -> mi.Float:
-    """The part of a region of constant extinction that matters: to the optical depth ``DARK`` of its clearest channel."""
+    """The length [length] over which a constant extinction still lets light through: up to the optical depth ``DARK``.
+
+    Of several channels the one with the smallest positive extinction decides; where all are 0 it is the whole length.
+    """
     least = mi.Float(dr.inf)
     for s in sigma:
         least = dr.select(s > 0, dr.minimum(least, s), least)
@@ -278,7 +282,11 @@ def lit_length(sigma: list[mi.Float], length: mi.Float) -> mi.Float:
 
 
 def _set_probe_sigma(reservoir: Reservoir, probe_sigma: mi.Float | None) -> Reservoir:
-    """Note the probe's extinction of a medium in the candidates that are from it."""
+    """Store the extinction that probes add in this medium with those candidates that were replaced in it.
+
+    A candidate of a medium further in front keeps that medium's value: the extinction is a fixed optical depth over the length
+    of each medium, so it differs from medium to medium.
+    """
     if probe_sigma is None:
         return reservoir
     return replace(

@@ -75,7 +75,11 @@ def tau_by_end(media: SceneMedia, ray_segment: RaySegment, tau: list[mi.Float], 
 def shadow_of_moving(
     media: SceneMedia, ray_segment: RaySegment, tau: list[mi.Float], end: mi.Point3f, active: mi.Bool
 ) -> mi.Spectrum | float:
-    """The number 1 with the derivative of exp(-tau) / exp(-tau) by the end of the shadow ray, where that has a derivative."""
+    """A factor of value 1 that carries the derivative of a shadow ray's transmittance by the place of its end.
+
+    Its derivative is that of log T = -tau, so T times the factor has the value T and the derivative of T. Where the end has no
+    derivative the factor is the number 1, and nothing is walked.
+    """
     if not dr.grad_enabled(end):
         return 1.0
     moved = end - dr.detach(end)

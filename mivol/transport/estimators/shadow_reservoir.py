@@ -47,7 +47,12 @@ class ShadowReservoir:
         return cls(RaySegment(mi.Ray3f(ray), dr.zeros(mi.MediumPtr, n), zero, True, u), dr.zeros(mi.Spectrum, n), zero, zero)
 
     def offer(self, light: DirectLight, chance: mi.Float) -> ShadowReservoir:
-        """Keep one more shadow ray, or the one before; ``chance`` is a number in [0, 1)."""
+        """The reservoir after one more shadow ray: a step of weighted reservoir sampling.
+
+        Args:
+            light: the emitter sample whose shadow ray is offered; its weight is its largest channel.
+            chance: a uniform random number in [0, 1). The new ray is kept where it is below weight / (sum of all weights).
+        """
         weight = dr.select(light.active, dr.max(dr.abs(light.value)), 0)
         total = self.total + weight
         keep, new, old = chance * total < weight, light.ray_segment, self.ray_segment
