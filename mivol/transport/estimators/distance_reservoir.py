@@ -129,8 +129,9 @@ def _start_candidate(media: SceneMedia, rng: mi.UInt32, width: int) -> Candidate
 
 
 def fill_reservoir(proposal: DistanceProposal) -> MediumVisitor:
-    """A visitor of the media along a ray: it sums their optical depth and offers each cell, or constant stretch, as a piece to a
-    :class:`Reservoir`, which keeps one piece a candidate in proportion to the light that it takes.
+    """A visitor of the media along a ray, which sums their optical depth and offers each cell, or constant stretch, as a piece.
+
+    The :class:`Reservoir` keeps one piece a candidate, in proportion to the light that the piece takes.
 
     Cost: as an optical depth, with one exponential and one random number a cell and candidate (measured with one: 1.7 times its
     time).
