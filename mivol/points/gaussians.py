@@ -1,0 +1,169 @@
+"""Three-dimensional Gaussians as NumPy arrays: the model that files hold, fits change and renderers draw.
+
+Conventions. Arrays hold the pre-images of the activations, as published files do, so that what is read can be written again to
+the bit: scales are ``exp(log_scales)``, opacities are ``logistic(opacity_logits)``. Quaternions are (w, x, y, z), of any length
+but 0. ``harmonics`` are coefficients of real spherical harmonics in the basis and order of ``drjit.sh_eval``; the colour seen
+along the unit direction d, from the camera to the mean, is ``max(0, 0.5 + sum_b Y_b(d) k_b)``. Colours are code values (sRGB),
+as in every published file: a renderer composites them as they are.
+
+Source: Kerbl, Kopanas, Leimkuehler, Drettakis, 3D Gaussian Splatting for Real-Time Radiance Field Rendering, 2023, section 4
+and the files that its authors publish.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from mivol.files.source import refusal
+from mivol.shown import briefly
+
+__all__ = ["CONSTANT_HARMONIC", "HIGHEST_DEGREE", "Gaussians", "concatenate", "logit"]
+
+CONSTANT_HARMONIC = 0.5 / np.sqrt(np.pi)
+"""The value of the spherical harmonic of degree 0, everywhere."""
+
+HIGHEST_DEGREE = 3
+"""Of the spherical harmonics of colours: published files have no more."""
+
+WIDTHS = {"means": (3,), "log_scales": (3,), "quaternions": (4,), "opacity_logits": ()}
+"""What each Gaussian has of each array, but for the harmonics."""
+
+
+@briefly
+@dataclass(frozen=True)
+class Gaussians:
+    """N Gaussians; float32, C-contiguous, whatever real arrays are given.
+
+    Attributes:
+        means: (N, 3) centres, world [length].
+        log_scales: (N, 3) logarithms of the standard deviations along the axes of each Gaussian [log length].
+        quaternions: (N, 4) rotations of these axes into the world, (w, x, y, z), of any length but 0.
+        opacity_logits: (N,) logits of the opacity at the centre; +-inf is an opacity of 1 or 0.
+        harmonics: (N, K, 3) coefficients of the colour, K = (degree + 1)^2.
+
+    Raises:
+        MivolError: shapes that do not fit together. Numbers are looked at by :meth:`checked` only.
+    """
+
+    means: np.ndarray
+    log_scales: np.ndarray
+    quaternions: np.ndarray
+    opacity_logits: np.ndarray
+    harmonics: np.ndarray
+
+    def __post_init__(self) -> None:
+        for name in (*WIDTHS, "harmonics"):
+            object.__setattr__(self, name, np.ascontiguousarray(getattr(self, name), np.float32))
+        n = len(self.means) if self.means.ndim else 0
+        for name, width in WIDTHS.items():
+            if getattr(self, name).shape != (n, *width):
+                found = f"{name} of shape {getattr(self, name).shape}"
+                raise refusal("Gaussians", found, f"{(n, *width)} beside means of shape {self.means.shape}", "reshape them")
+        if self.harmonics.shape not in [(n, (d + 1) ** 2, 3) for d in range(HIGHEST_DEGREE + 1)]:
+            raise refusal(
+                "Gaussians",
+                f"harmonics of shape {self.harmonics.shape}",
+                f"({n}, K, 3) with K = 1, 4, 9 or 16",
+                "reshape them, or leave out what lies above degree 3",
+            )
+
+    @property
+    def count(self) -> int:
+        """N."""
+        return len(self.means)
+
+    @property
+    def degree(self) -> int:
+        """Of the spherical harmonics, 0 to 3."""
+        return round(self.harmonics.shape[1] ** 0.5) - 1
+
+    def scales(self) -> np.ndarray:
+        """(N, 3) standard deviations [length]."""
+        return np.exp(self.log_scales)
+
+    def opacities(self) -> np.ndarray:
+        """(N,) opacities at the centres, 0..1."""
+        with np.errstate(over="ignore"):  # exp(-logit) is infinite for an opacity that rounds to 0
+            return 1 / (1 + np.exp(-self.opacity_logits))
+
+    def rotations(self) -> np.ndarray:
+        """(N, 3, 3) rotations; columns are the axes of the Gaussian in the world."""
+        w, x, y, z = (self.quaternions / np.linalg.norm(self.quaternions, axis=1, keepdims=True)).T
+        rows = [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+        return np.ascontiguousarray(np.moveaxis(np.array(rows), 2, 0))
+
+    def covariances(self) -> np.ndarray:
+        """(N, 3, 3) covariance matrices in the world [length^2]."""
+        axes = self.rotations() * self.scales()[:, None, :]
+        return axes @ np.swapaxes(axes, 1, 2)
+
+    def base_colours(self) -> np.ndarray:
+        """(N, 3) mean colours over all directions, code values; not clipped."""
+        return np.float32(0.5) + np.float32(CONSTANT_HARMONIC) * self.harmonics[:, 0]
+
+    def select(self, index: np.ndarray | slice) -> Gaussians:
+        """Some of them: numbers, truth values (N,), or a slice."""
+        return Gaussians(**{name: getattr(self, name)[index] for name in (*WIDTHS, "harmonics")})
+
+    def with_degree(self, degree: int) -> Gaussians:
+        """The same with harmonics up to another degree: what is left out is lost, what is added is 0.
+
+        Raises:
+            MivolError: a degree below 0 or above 3.
+        """
+        if degree not in range(HIGHEST_DEGREE + 1):
+            raise refusal("Gaussians", f"degree {degree}", f"0 to {HIGHEST_DEGREE}", "choose one of those")
+        harmonics = np.zeros((self.count, (degree + 1) ** 2, 3), np.float32)
+        kept = min(harmonics.shape[1], self.harmonics.shape[1])
+        harmonics[:, :kept] = self.harmonics[:, :kept]
+        return Gaussians(self.means, self.log_scales, self.quaternions, self.opacity_logits, harmonics)
+
+    def checked(self, subject: object = "Gaussians") -> Gaussians:
+        """Themselves, if every number can be drawn.
+
+        Args:
+            subject: named in the refusal: the file that they come from.
+
+        Raises:
+            MivolError: NaN; an infinite number, but for a logit; a quaternion of length 0. The first index is named.
+        """
+        for name in ("means", "log_scales", "quaternions", "harmonics"):
+            _refuse_first(subject, ~np.isfinite(getattr(self, name)), f"{name} that are not finite")
+        _refuse_first(subject, np.isnan(self.opacity_logits), "opacity_logits of NaN")
+        _refuse_first(subject, ~np.any(self.quaternions, axis=1), "quaternions of length 0")
+        return self
+
+
+def concatenate(parts: Sequence[Gaussians]) -> Gaussians:
+    """All Gaussians of several sets, in their order; harmonics up to the highest degree among them.
+
+    Raises:
+        MivolError: no set at all.
+    """
+    if not parts:
+        raise refusal("concatenate", "no Gaussians", "at least one set", "give some")
+    degree = max(part.degree for part in parts)
+    same = [part.with_degree(degree) for part in parts]
+    return Gaussians(**{name: np.concatenate([getattr(part, name) for part in same]) for name in (*WIDTHS, "harmonics")})
+
+
+def logit(opacity: np.ndarray) -> np.ndarray:
+    """The pre-image of opacities: log(o / (1 - o)), float64; -inf for 0 and inf for 1."""
+    opacity = np.asarray(opacity, np.float64)
+    with np.errstate(divide="ignore"):
+        return np.log(opacity) - np.log1p(-opacity)
+
+
+def _refuse_first(subject: object, wrong: np.ndarray, what: str) -> None:
+    """Refuse a set in which some numbers are wrong: the first index, and how many Gaussians."""
+    rows = np.flatnonzero(wrong.reshape(len(wrong), -1).any(axis=1)) if wrong.size else np.empty(0, int)
+    if rows.size:
+        found = f"{what} in Gaussian {rows[0]} (the first of {rows.size})"
+        raise refusal(subject, found, "numbers that can be drawn", "remove these Gaussians, or write the file again")
