@@ -1,8 +1,9 @@
 """Differentiable and inverse volume rendering on Mitsuba 3. Importing this needs no variant.
 
 ``mivol.<tab>`` shows what a script needs: scenes (``load_scene``, ``explain``, ``render_reference``), fits (``Problem``,
-``Parameter``, ``optimize`` and optimisers), volumes (``read_volume``, ``write_volume``), photographs (``load_photos``,
-``fit_photographs``, ``load_field``) and tomography (``Projector`` and its geometries). Each is imported when it is first used.
+``Parameter``, ``optimize`` and optimisers), volumes (``read_volume``, ``write_volume``, ``make_procedural``), photographs
+(``load_photos``, ``fit_photographs``, ``load_field``) and tomography (``Projector`` and its geometries). Each is imported when
+it is first used.
 """
 
 from __future__ import annotations
@@ -40,6 +41,7 @@ PUBLIC = {
     "load_field": "fields.spherical_files",
     "load_photos": "photos",
     "load_scene": "scene.load",
+    "make_procedural": "fields.procedural",
     "optimize": "experiments.script",
     "read_volume": "files",
     "render_reference": "validate.reference",

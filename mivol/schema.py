@@ -7,14 +7,14 @@ structs, their tag says which.
 from __future__ import annotations
 
 import re
-from typing import Any, get_args, get_origin, get_type_hints
+from typing import Any, NamedTuple, get_args, get_origin, get_type_hints
 
 import msgspec
 
 from mivol.errors import MivolError
 from mivol.optim.strategy import nearest, of
 
-__all__ = ["check_keys", "describe", "sentence", "structs_in"]
+__all__ = ["Setting", "check_keys", "describe", "sentence", "settings_in", "structs_in"]
 
 
 def check_keys(raw: Any, kind: Any, where: str, name: str) -> None:
@@ -94,22 +94,52 @@ def sentence(raw: Any, message: str) -> str:
     return f"{dotted or 'the file'}{f' = {found!r}' if plain else ''}: {what}"
 
 
-def describe(kind: type, prefix: str = "") -> list[str]:
-    """One line per setting: key, default, unit, meaning; for ``mivol optimize --help``."""
-    lines = []
+class Setting(NamedTuple):
+    """A setting of a file.
+
+    Attributes:
+        key: dotted; an entry of a list has the number 0, and a key of one choice only has its name in brackets.
+        default: as Python writes it; "" where it must be given, and where the setting is a table.
+        unit: "1" for none.
+        meaning: in a line.
+        choices: names that it is chosen from; none where it is not a choice of tables.
+        table: its own settings follow.
+    """
+
+    key: str
+    default: str
+    unit: str
+    meaning: str
+    choices: tuple[str, ...]
+    table: bool
+
+
+def settings_in(kind: type, prefix: str = "") -> list[Setting]:
+    """Every setting of a struct, with those of the tables in it and of the entries of its lists."""
+    found = []
     hints = get_type_hints(kind, include_extras=True)
     for field in msgspec.structs.fields(kind):
         hint, key = hints[field.name], f"{prefix}{field.name}"
         meta = getattr(hint, "__metadata__", (of("1", "one of " + ", ".join(map(str, get_args(hint)))),))[0]
-        structs = structs_in(getattr(hint, "__origin__", hint))
-        if len(structs) == 1 and structs[0].__struct_config__.tag_field is None:
-            lines += describe(structs[0], f"{key}.")
-            continue
-        tags = " | ".join(str(s.__struct_config__.tag) for s in structs)
-        default = "" if field.default is msgspec.NODEFAULT or structs else f" = {field.default!r}"
-        unit = meta.extra["unit"]
-        lines.append(f"{key}{default}{f' [{unit}]' if unit != '1' else ''}: {meta.description}{f' ({tags})' * bool(tags)}")
+        inner = getattr(hint, "__origin__", hint)
+        many = get_origin(inner) is tuple and bool(structs_in(get_args(inner)[0]))
+        structs = structs_in(get_args(inner)[0] if many else inner)
+        default = "" if field.default is msgspec.NODEFAULT or structs else repr(field.default)
+        choices = tuple(str(s.__struct_config__.tag) for s in structs if s.__struct_config__.tag is not None)
+        found.append(Setting(key, default, meta.extra["unit"], meta.description, choices, bool(structs)))
+        key += ".0" * many
         for struct in structs:
             label = struct.__struct_config__.tag
-            lines += describe(struct, f"{key}[{label}]." if label else f"{key}.")
+            found += settings_in(struct, f"{key}[{label}]." if label else f"{key}.")
+    return found
+
+
+def describe(kind: type) -> list[str]:
+    """One line per setting: key, default, unit, meaning; for ``mivol optimize --help``."""
+    lines = []
+    for key, default, unit, meaning, choices, table in settings_in(kind):
+        if not table or choices:
+            value = f" = {default}" if default else ""
+            one_of = f" ({' | '.join(choices)})" if choices else ""
+            lines.append(f"{key}{value}{f' [{unit}]' if unit != '1' else ''}: {meaning}{one_of}")
     return lines

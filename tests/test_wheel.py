@@ -33,3 +33,6 @@ def test_wheel(tmp_path: Path) -> None:
     # SSIM, which fits of photographs are judged by, is no extra (such a line would end with its name).
     assert "Requires-Dist: scikit-image>=0.25" in metadata.splitlines()
     assert "License-Expression: BSD-3-Clause" in metadata
+    # On PyPI no file of the checkout lies beside the description.
+    assert "](docs/" not in metadata
+    assert "/raw/v0.1.0/docs/demo.png)" in metadata

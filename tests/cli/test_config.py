@@ -52,6 +52,7 @@ def test_every_setting_says_what_it_is() -> None:
     lines = describe(config.Experiment)
     assert any(line.startswith("optimiser[adam].beta_1 = 0.9: ") for line in lines)
     assert any(line.startswith("fit.spp = 16 [sample/pixel]: ") for line in lines)
+    assert any(line.startswith("parameter.0.prior.0[tv].weight = 1.0: ") for line in lines)
     assert all(line.partition(": ")[2].strip() for line in lines)
 
 

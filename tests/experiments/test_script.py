@@ -152,6 +152,16 @@ def test_scripts_of_the_docs_run(variant_rgb: str, folder: Path, monkeypatch: py
 
 
 @pytest.mark.slow
+def test_the_first_example_has_a_derivative(variant_rgb: str) -> None:
+    """Before a white sky more smoke of albedo 0.8 darkens the picture: on the whole the derivative is below 0."""
+    made = runpy.run_path(str(SCRIPTS / "gradient.py"))
+    slope = np.array(dr.grad(made["params"]["smoke.interior_medium.sigma_t.data"]))
+    assert slope.shape == (40, 40, 40, 1)
+    assert np.isfinite(slope).all()
+    assert slope.sum() < 0
+
+
+@pytest.mark.slow
 def test_photographs_of_the_docs_become_a_scene(variant_rgb: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Twelve views of a ball, with alpha: the scene shows something other than its floor where the ball is."""
     monkeypatch.chdir(tmp_path)

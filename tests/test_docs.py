@@ -1,0 +1,121 @@
+"""What the pages say holds: links lead somewhere, commands and experiments are taken, the reference is what the code says."""
+
+from __future__ import annotations
+
+import re
+import shlex
+import tomllib
+from pathlib import Path
+
+import pytest
+from script_modules import load
+
+from hatch_build import absolute
+from mivol import config
+from mivol.cli import parser
+
+ROOT = Path(__file__).resolve().parents[1]
+DOCS = ROOT / "docs"
+PAGES = sorted([ROOT / "README.md", ROOT / "CONTRIBUTING.md", *DOCS.rglob("*.md")])
+SCREENS = 90
+"""Lines of the README: two screens of 45."""
+
+
+def name_of(path: Path) -> str:
+    return path.relative_to(ROOT).as_posix()
+
+
+def blocks(path: Path, language: str) -> list[str]:
+    """The code of a page in one language."""
+    return re.findall(rf"^```{language}\n(.*?)^```", path.read_text(), re.MULTILINE | re.DOTALL)
+
+
+def links(text: str) -> list[str]:
+    """Targets of a page's links and pictures that are files."""
+    outside_code = re.sub(r"```.*?```|`[^`\n]*`", "", text, flags=re.DOTALL)
+    return [m for m in re.findall(r"\]\(([^)#\s]+)", outside_code) if not m.startswith(("http://", "https://"))]
+
+
+def commands() -> list[tuple[str, list[str]]]:
+    """Every call of mivol on a line of a shell block, with the page that shows it."""
+    found = []
+    for path in PAGES:
+        for block in blocks(path, "sh"):
+            words = [shlex.split(part, comments=True) for line in block.splitlines() for part in line.split("&&")]
+            found += [(name_of(path), line[1:]) for line in words if line[:1] == ["mivol"]]
+    return found
+
+
+@pytest.mark.parametrize("path", PAGES, ids=name_of)
+def test_links_lead_to_files(path: Path) -> None:
+    assert [target for target in links(path.read_text()) if not (path.parent / target).is_file()] == []
+
+
+def test_links_are_seen() -> None:
+    """The check itself: code and addresses are no links to files, a heading of another page is one to the page."""
+    assert links("![a](b.png) [c](d.md#e) `[x](y)` [f](https://g.h) [i](#j)") == ["b.png", "d.md"]
+
+
+def test_every_page_is_listed() -> None:
+    """Sphinx warns of pages that no table of contents leads to; this needs no Sphinx."""
+    trees = re.findall(r"```\{toctree\}\n(.*?)```", (DOCS / "index.md").read_text(), re.DOTALL)
+    listed = [line for tree in trees for line in tree.splitlines() if line and not line.startswith(":")]
+    pages = [path.relative_to(DOCS).with_suffix("").as_posix() for path in DOCS.rglob("*.md") if "_build" not in path.parts]
+    assert sorted([*listed, "index"]) == sorted(pages)
+
+
+def test_readme_leads_with_a_sentence_a_picture_an_equation_and_two_commands() -> None:
+    """Two screens, the first things first."""
+    text = (ROOT / "README.md").read_text()
+    assert len(text.splitlines()) <= SCREENS
+    sentence, picture, equation = text.split("\n\n")[1:4]
+    assert (sentence.count("."), picture[:2], equation[:2]) == (2, "![", "$$")  # mitsuba-renderer.org has a dot
+    (commands,) = blocks(ROOT / "README.md", "sh")
+    assert [line.split()[0] for line in commands.splitlines()] == ["./scripts/demo", "./scripts/test"]
+
+
+def test_example_of_the_readme_is_a_script_that_is_run() -> None:
+    (code,) = blocks(ROOT / "README.md", "python")
+    assert (DOCS / "scripts" / "gradient.py").read_text().split("\n", 1)[1] == code
+
+
+def test_commands_of_the_pages_are_taken() -> None:
+    """Each parses: a flag or verb that is gone, or misspelt, is an error."""
+    found = commands()
+    assert len(found) > 10
+    for page, words in found:
+        try:
+            parser().parse_args(words)
+        except SystemExit:
+            pytest.fail(f"{page}: mivol {shlex.join(words)} is not taken")
+
+
+def test_experiments_of_the_pages_are_taken() -> None:
+    """Every setting is known and has a value of its domain."""
+    texts = [(path, text) for path in PAGES for text in blocks(path, "toml")]
+    kinds = {type(config.from_dict(tomllib.loads(text), name_of(path))) for path, text in texts}
+    assert kinds == {config.Experiment, config.Scan, config.FieldFit}
+
+
+def test_reference_is_what_the_code_says(variant_rgb: str) -> None:
+    """docs/reference is made by scripts/reference_pages.py --write."""
+    made = load("reference_pages")
+    for name, make in made.PAGES.items():
+        assert made.current(name, make(), False), f"docs/reference/{name}: run scripts/reference_pages.py --write"
+
+
+def test_docstrings_become_tables_and_code(variant_rgb: str) -> None:
+    made = load("reference_pages")
+    doc = "Says ``a``.\n\nArgs:\n    x: first,\n        and more [m].\n\nExample:\n    >>> f(1)\n\nLast."
+    lines = made.documented(doc)
+    assert "Says `a`." in lines[0]
+    assert "| `x` | first, and more [m]. |" in lines
+    assert ">>> f(1)" in lines
+    assert lines[-2] == "Last."
+
+
+def test_links_on_pypi_lead_to_the_repository() -> None:
+    """Pictures to their bytes, files to their pages, addresses and headings stay."""
+    text = "![p](docs/a.png) [l](b.md#c) [h](#d) [w](https://x.y)"
+    made = "![p](https://r/raw/v1/docs/a.png) [l](https://r/blob/v1/b.md#c) [h](#d) [w](https://x.y)"
+    assert absolute(text, "https://r", "v1") == made
