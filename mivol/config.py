@@ -183,6 +183,10 @@ class Table(Section, kw_only=True, tag_field="beam", tag="table"):
     detector: Annotated[tuple[int, int], of("pixel", "(rows, columns) of computed projections")] = (1, 128)
 
 
+class OfData(Section, tag_field="beam", tag="data"):
+    """The geometry that comes with the data; source = "nikon" has one."""
+
+
 class Simulated(Section):
     """Noise of projections that are computed."""
 
@@ -241,6 +245,13 @@ class Stack(Readings, kw_only=True, tag_field="source", tag="stack"):
             raise ValueError("an intensity needs flats and darks, and nothing else takes them: give both, or change reading")
 
 
+class Nikon(Readings, kw_only=True, tag_field="source", tag="nikon"):
+    """A scan of a Nikon (X-Tek) laboratory scanner: settings, and TIFF files beside them [mm]."""
+
+    file: Annotated[str, of("path", ".xtekct; geometry, white level and default grid are its", min_length=1)]
+    angles: Annotated[str, of("path", "list of angles, as _ctdata.txt or .ang; empty: the settings' even steps")] = ""
+
+
 class Grid(Section):
     """Where the voxels lie."""
 
@@ -275,15 +286,21 @@ class Scan(Section):
     """All of a TOML file for tomography: it has a table ``[scan]`` in place of ``[scene]``."""
 
     title: Annotated[str, of("1", "heading of the report", min_length=1)]
-    scan: Annotated[Parallel | Cone | Table, of("1", "beam and detector")]
-    data: Annotated[Ellipsoids | Known | Measured | Stack, of("1", "what was seen")]
-    grid: Annotated[Grid, of("1", "where the voxels lie")]
+    scan: Annotated[Parallel | Cone | Table | OfData, of("1", "beam and detector")]
+    data: Annotated[Ellipsoids | Known | Measured | Stack | Nikon, of("1", "what was seen")]
+    grid: Annotated[Grid | None, of("1", "where the voxels lie; absent: where a Nikon file says")] = None
     solve: Annotated[Solve, of("1", "how it is inverted")] = Solve()
     held_out_every: Annotated[int, of("view", "every so many is predicted, not fitted; 0: none", ge=0)] = 0
     checkpoint_every: Annotated[int, of("iteration", "how often", ge=1)] = 5
     variant: Annotated[str, of("1", "Mitsuba variant", min_length=1)] = "llvm_ad_rgb"
     threads: Annotated[int, of("thread", "threads of the CPU back end; 0: all cores", ge=0)] = 0
     output: Annotated[str, of("path", "run folder, relative to where the command runs", min_length=1)] = "runs/scan"
+
+    def __post_init__(self) -> None:
+        if isinstance(self.scan, OfData) != isinstance(self.data, Nikon):
+            raise ValueError('scan.beam = "data" and data.source = "nikon" go together: give both, or neither')
+        if self.grid is None and not isinstance(self.data, Nikon):
+            raise ValueError('the key "grid" is missing: give it')
 
 
 # -- Photographs --------------------------------------------------------------------------------------------------

@@ -15,7 +15,7 @@ from mivol.experiments.back_end import choose_back_end
 from mivol.experiments.depth import settle_depth
 from mivol.experiments.photo_data import boxed, read_photos
 from mivol.experiments.photo_plan import choices, make_plan, shrunk
-from mivol.experiments.projections import held_out_views, make_data
+from mivol.experiments.projections import beam_of, held_out_views, make_data, make_grid
 from mivol.experiments.references import camera_of, find_sensors, load_experiment_scene, read_references
 from mivol.experiments.scan_fit import make_problem as make_scan_problem
 from mivol.experiments.scene_fit import make_integrator
@@ -27,7 +27,6 @@ from mivol.optim.ray_batches import RayBatches
 from mivol.optim.solvers import METHODS
 from mivol.photos import rectified
 from mivol.scene.explain import Explanation, examine
-from mivol.tomography.geometry import VoxelGrid
 from mivol.tomography.projector import Projector
 
 Say = Callable[[str], None]
@@ -96,11 +95,12 @@ def explain_scan_fit(chosen: Scan, base: Path, say: Say) -> Explanation:
     Raises:
         MivolError: whatever :func:`mivol.experiments.scan_fit.scan_fit` refuses before its first iteration.
     """
-    grid = VoxelGrid(chosen.grid.shape, chosen.grid.voxel_size, chosen.grid.centre)
-    say(f"  grid      {' x '.join(map(str, grid.shape))} voxels of {chosen.grid.voxel_size:g}")
+    grid = make_grid(chosen, base)
+    edges = grid.voxel_size if len(set(grid.voxel_size)) > 1 else grid.voxel_size[:1]
+    say(f"  grid      {' x '.join(map(str, grid.shape))} voxels of {' x '.join(f'{edge:g}' for edge in edges)}")
     data = make_data(chosen, base, grid)
     views, rows, columns = data.y.shape
-    say(f"  scan      {views} views of {rows} x {columns} pixels, {type(chosen.scan).__name__.lower()} beam")
+    say(f"  scan      {views} views of {rows} x {columns} pixels, {beam_of(chosen)}")
     for note in data.notes:
         say(f"  data      {note}")
     held_out = held_out_views(chosen, views)

@@ -9,20 +9,18 @@ from pathlib import Path
 import numpy as np
 
 from mivol import config
-from mivol.config import Cone, Detector, Ellipsoids, Known, Measured, Parallel, Stack, Table
+from mivol.config import Cone, Detector, Ellipsoids, Known, Measured, Nikon, OfData, Parallel, Stack, Table
 from mivol.errors import MivolError
+from mivol.experiments.nikon_scan import nikon_grid, read_nikon_scan
 from mivol.files import read_columns, read_projections, read_stack, read_volume
 from mivol.files.fetch import place_of
 from mivol.shown import briefly
 from mivol.tomography.geometry import ConeBeam, Geometry, ParallelBeam, VoxelGrid
 from mivol.tomography.panel_views import COLUMNS, PanelViews
 from mivol.tomography.phantoms import shepp_logan
-from mivol.tomography.preprocess import Transmission, correct_transmission, line_integrals, normalise_air
+from mivol.tomography.preprocess import Transmission, correct_transmission, line_integrals, normalise_air, of_unknown_noise
 from mivol.tomography.projector import Projector
 from mivol.tomography.rotation_axis import find_axis
-
-UNKNOWN_NOISE = 1e-4
-"""Variance of a transmission of 1 where the noise was not measured: that of 1e4 quanta."""
 
 
 @briefly
@@ -49,6 +47,11 @@ class Projections:
     def digest(self) -> str:
         """SHA-256 of projections and weights."""
         return hashlib.sha256(self.y.tobytes() + self.weights.tobytes()).hexdigest()
+
+
+def beam_of(chosen: config.Scan) -> str:
+    """The kind of beam, for people."""
+    return f"{type(chosen.data if isinstance(chosen.scan, OfData) else chosen.scan).__name__.lower()} beam"
 
 
 def make_geometry(chosen: config.Scan, base: Path) -> Geometry:
@@ -79,13 +82,23 @@ def place_beam(
     return ParallelBeam(angles, detector, wanted.pitch, **offsets)
 
 
+def make_grid(chosen: config.Scan, base: Path) -> VoxelGrid:
+    """Where the voxels lie.
+
+    Raises:
+        MivolError: no table ``grid``, and none in the data.
+    """
+    wanted = chosen.grid
+    return nikon_grid(chosen.data, base) if wanted is None else VoxelGrid(wanted.shape, wanted.voxel_size, wanted.centre)
+
+
 def make_data(chosen: config.Scan, base: Path, grid: VoxelGrid) -> Projections:
     """Projections, measured or computed.
 
     Raises:
         MivolError: files that cannot be read or do not fit, or rays that all miss the grid.
     """
-    if isinstance(chosen.data, Measured | Stack):
+    if isinstance(chosen.data, Measured | Stack | Nikon):
         data = read_measured(chosen, base)
     else:
         geometry = make_geometry(chosen, base)
@@ -151,8 +164,10 @@ def read_measured(chosen: config.Scan, base: Path) -> Projections:
     Raises:
         MivolError: a file that cannot be read, or does not fit the others.
     """
-    wanted, notes = chosen.data, []
-    if isinstance(wanted, Measured):
+    wanted, notes, geometry, angles = chosen.data, [], None, None
+    if isinstance(wanted, Nikon):
+        transmission, geometry, notes = read_nikon_scan(wanted, base)
+    elif isinstance(wanted, Measured):
         scan = read_projections(place_of(base, wanted.file), wanted.group)
         transmission, angles = correct_transmission(scan.projections, scan.flats, scan.darks), scan.angles
     else:
@@ -168,7 +183,8 @@ def read_measured(chosen: config.Scan, base: Path) -> Projections:
     unused = int((weights == 0).sum())
     if unused:
         notes.append(f"{unused} of {weights.size} pixels have no light or no finite reading: they are not used")
-    geometry = place_beam(chosen, base, np.arange(0) if angles is None else angles, y.shape[1:], offset)
+    if geometry is None:
+        geometry = place_beam(chosen, base, np.arange(0) if angles is None else angles, y.shape[1:], offset)
     if geometry.shape != y.shape:
         raise MivolError(f"found {len(y)} projections and a geometry of {geometry.shape[0]} views, expected as many.")
     return Projections(geometry, y, weights, notes=tuple(notes))
@@ -190,9 +206,7 @@ def read_stack_scan(chosen: config.Scan, base: Path) -> tuple[Transmission, np.n
     if wanted.reading == "intensity":
         transmission = correct_transmission(readings, stack(wanted.flats), stack(wanted.darks))
     else:
-        # Of the noise only its form is known: that of quanta, var T ~ T, whose size no solver without a prior asks for.
-        t = np.asarray(readings, float) if wanted.reading == "transmission" else np.exp(-np.asarray(readings, float))
-        transmission = Transmission(t, np.maximum(t, 0.0) * UNKNOWN_NOISE)
+        transmission = of_unknown_noise(np.exp(-readings.astype(float)) if wanted.reading == "line_integral" else readings)
     if isinstance(chosen.scan, Table):
         return transmission, None
     if not wanted.angles:

@@ -15,7 +15,7 @@ from mivol import config
 from mivol.errors import MivolError
 from mivol.experiments.back_end import choose_back_end
 from mivol.experiments.best import BestIterate
-from mivol.experiments.projections import Projections, held_out_views, make_data
+from mivol.experiments.projections import Projections, beam_of, held_out_views, make_data, make_grid
 from mivol.experiments.run_folder import RunFolder
 from mivol.experiments.scan_outputs import write_best, write_outputs
 from mivol.experiments.task import Task
@@ -32,7 +32,7 @@ from mivol.optim.solvers import DIRECT, METHODS
 from mivol.report.page import write_page
 from mivol.report.record import PlanLine, RunRecord
 from mivol.tomography.filtered import feldkamp, filtered_backprojection
-from mivol.tomography.geometry import ParallelBeam, VoxelGrid
+from mivol.tomography.geometry import ParallelBeam
 from mivol.tomography.preprocess import bridge_gaps
 from mivol.tomography.projector import Projector
 from mivol.validate.metrics import nrmse
@@ -58,8 +58,8 @@ def scan_fit(task: Task) -> Path:
     chosen: config.Scan = task.chosen
     choose_back_end(chosen.variant, chosen.threads)
     run = RunFolder(task.folder, new_record(task), task.resume)
-    grid = VoxelGrid(chosen.grid.shape, chosen.grid.voxel_size, chosen.grid.centre)
     with run.at_work():
+        grid = make_grid(chosen, task.base)
         with run.stage("projections"):
             data = make_data(chosen, task.base, grid)
             run.record.notes += data.notes
@@ -86,7 +86,7 @@ def new_record(task: Task) -> RunRecord:
     solver = METHODS[chosen.solve.name]
     return RunRecord.new(
         chosen.title,
-        method=f"{chosen.solve.name} on line integrals of a {type(chosen.scan).__name__.lower()} beam",
+        method=f"{chosen.solve.name} on line integrals of a {beam_of(chosen)}",
         config=config.resolved(chosen),
         command=task.command,
         seeds={"noise": getattr(chosen.data, "seed", 0)},

@@ -35,11 +35,21 @@ def read_stack(path: str | os.PathLike, dataset: str | None = None) -> np.ndarra
     if not files:
         existing_file(path)
     if files[0].suffix.lower() in TIFF:
-        stack = _pages(files)
+        stack = read_images(files)
     elif len(files) > 1:
         raise refusal(path, f"{len(files)} files", "one, or a pattern of TIFF files", "name one of them")
     else:
         stack = read_volume(files[0], dataset).values[..., 0]
+    check_finite(path, stack)
+    return stack
+
+
+def check_finite(path: str | os.PathLike, stack: np.ndarray) -> None:
+    """Refuse readings that are no finite numbers.
+
+    Raises:
+        MivolError: how many, and where the first is.
+    """
     bad = ~np.isfinite(stack)
     if bad.any():
         where = tuple(map(int, np.argwhere(bad)[0]))
@@ -49,10 +59,17 @@ def read_stack(path: str | os.PathLike, dataset: str | None = None) -> np.ndarra
             "finite numbers",
             "write 0 there: a reading of 0 has weight 0",
         )
-    return stack
 
 
-def _pages(files: list[Path]) -> np.ndarray:
+def read_images(files: list[Path]) -> np.ndarray:
+    """All pages of TIFF files, one after the other.
+
+    Returns:
+        (n, rows, cols) float32.
+
+    Raises:
+        MivolError: as :func:`read_stack`.
+    """
     from PIL import Image, ImageSequence, UnidentifiedImageError
 
     pages = []

@@ -25,6 +25,18 @@ class Transmission:
 
 # -- Readings to line integrals -----------------------------------------------------------------------------------------
 
+UNKNOWN_NOISE = 1e-4
+"""Variance of a transmission of 1 where the noise was not measured: that of 1e4 quanta."""
+
+
+def of_unknown_noise(transmission: np.ndarray) -> Transmission:
+    """A transmission of whose noise only the form is known: that of quanta, ``var T ~ T``.
+
+    Its size, ``UNKNOWN_NOISE``, matters to a solver with a prior only.
+    """
+    t = np.asarray(transmission, np.float64)
+    return Transmission(t, np.maximum(t, 0.0) * UNKNOWN_NOISE)
+
 
 def correct_transmission(readings: np.ndarray, flats: np.ndarray, darks: np.ndarray) -> Transmission:
     """Transmission from readings, and its variance from the spread of the flats and darks.

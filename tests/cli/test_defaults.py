@@ -63,7 +63,11 @@ DEFAULTS = {
         "judged": "held_out",
     },
     "config.Rendered": {"spp": 1024, "standard_error": 0.0, "seed": 1, "held_out": ()},
-    "config.Scan": {"held_out_every": 0, "checkpoint_every": 5, "variant": "llvm_ad_rgb", "threads": 0, "output": "runs/scan"},
+    "config.Nikon": {"find_axis": True, "air": 0, "drift": 0, "angles": ""},
+    "config.Scan": {
+        **{"grid": None, "held_out_every": 0},
+        **{"checkpoint_every": 5, "variant": "llvm_ad_rgb", "threads": 0, "output": "runs/scan"},
+    },
     "config.SceneFitSettings": {
         "iterations": 100,
         "spp": 16,

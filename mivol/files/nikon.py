@@ -1,0 +1,187 @@
+"""Scans of Nikon (X-Tek) laboratory CT: an ``.xtekct`` file of settings, and a TIFF file for each projection.
+
+Conventions. Lengths are mm, angles degrees. In the files an image's first row is the highest, and its columns run as someone sees
+them who looks from the detector to the source: both are turned round on reading, as :mod:`mivol.tomography.geometry` has them.
+
+Sources of the format's facts: ``NikonDataReader`` of the Core Imaging Library (University of Manchester and STFC), which takes
+angles from the steps because it found those in ``_ctdata.txt`` and ``.ang`` files to be wrong; the loaders of TIGRE and of
+CCPi-Reconstruction (names of the files, columns of the lists).
+"""
+
+from __future__ import annotations
+
+import configparser
+import math
+import os
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from mivol.files.image_stack import TIFF, check_finite, read_images
+from mivol.files.slices import order_of_numbers
+from mivol.files.source import existing_file, refusal
+
+SECTION = "xtekct"
+
+
+@dataclass(frozen=True, eq=False)
+class NikonScan:
+    """What an ``.xtekct`` file says.
+
+    Attributes:
+        path: of the file.
+        images: a file for each projection.
+        source_to_axis, source_to_detector: [mm].
+        detector: (rows, columns).
+        pitch: distance of pixel centres along (rows, columns) [mm].
+        white_level: reading of a pixel without an object.
+        angles: (views,) how far the sample has turned, clockwise as seen from above [degree].
+        axis_offset: where the rotation axis is, along a detector's columns that are turned round [mm].
+        tilt, roll: of the rotation axis, towards the detector and along it [degree].
+        shape: (Z, Y, X) voxels; None where the file does not say.
+        voxel_size: (x, y, z) [mm].
+        left_out: settings that are not 0 and that nothing here heeds.
+    """
+
+    path: Path
+    images: tuple[Path, ...]
+    source_to_axis: float
+    source_to_detector: float
+    detector: tuple[int, int]
+    pitch: tuple[float, float]
+    white_level: float
+    angles: np.ndarray
+    axis_offset: float
+    tilt: float
+    roll: float
+    shape: tuple[int, int, int] | None
+    voxel_size: tuple[float, float, float]
+    left_out: tuple[str, ...]
+
+
+def read_nikon(path: str | os.PathLike) -> NikonScan:
+    """Read the settings of a scan and find its images.
+
+    The axis is at ``ObjectOffsetX``; older files have it on the detector, at the mean of ``CentreOfRotationTop`` and
+    ``CentreOfRotationBottom``, whose difference is the axis' roll. Angles are ``InitialAngle + AngularStep i``.
+
+    Raises:
+        MivolError: no such file, a key that is missing or no number, another number of images than of projections.
+    """
+    path = existing_file(path)
+    keys = _Keys(path, _section(path))
+    rows, columns = keys.count("DetectorPixelsY"), keys.count("DetectorPixelsX")
+    pitch = keys.length("DetectorPixelSizeY"), keys.length("DetectorPixelSizeX")
+    to_axis, to_detector = keys.length("SrcToObject"), keys.length("SrcToDetector")
+    images, views = _images(path, keys), keys.count("Projections")
+    if len(images) != views:
+        raise refusal(path, f"{len(images)} images for {views} projections", "one for each", "copy the scan again")
+    top, bottom = keys.number("CentreOfRotationTop", 0.0), keys.number("CentreOfRotationBottom", 0.0)
+    offset = keys.number("ObjectOffsetX", (top + bottom) / 2 * to_axis / to_detector)
+    sizes = tuple(keys.number(f"VoxelSize{axis}", 0.0) for axis in "XYZ")
+    counts = tuple(int(keys.number(f"Voxels{axis}", 0)) for axis in "ZYX")
+    heedless = [f"Detector{name}" for name in ("OffsetX", "OffsetY")] + [f"Offset{axis}" for axis in "XYZ"] + ["Scattering"]
+    return NikonScan(
+        path, images, to_axis, to_detector, (rows, columns), pitch, keys.length("WhiteLevel"),
+        keys.number("InitialAngle", 0.0) + keys.number("AngularStep") * np.arange(views),
+        -offset,
+        keys.number("ObjectTilt", 0.0),
+        keys.number("ObjectRoll", -math.degrees(math.atan2(top - bottom, rows * pitch[0]))),
+        counts if min(counts) > 0 and min(sizes) > 0 else None,
+        sizes,
+        tuple(f"{name} = {keys.number(name, 0.0):g}" for name in heedless if keys.number(name, 0.0)),
+    )  # fmt: skip
+
+
+def read_nikon_angles(path: str | os.PathLike, views: int) -> np.ndarray:
+    """Angles [degree] from ``_ctdata.txt`` or an ``.ang`` file: lines that begin with a view's number, then its angle.
+
+    Raises:
+        MivolError: no such file, or another number of angles than ``views``.
+    """
+    path, found = existing_file(path), {}
+    for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
+        words = re.split(r"[\s,:;]+", line.strip())
+        if len(words) > 1 and words[0].isdigit():
+            try:
+                found[int(words[0])] = float(words[1])
+            except ValueError:
+                continue
+    # The second line of _ctdata.txt has numbers of its own (projections, frames, exposure): the last view's line replaces it.
+    numbers = sorted(found)
+    start = 0 if 0 in found else 1
+    wanted = range(start, start + views)
+    if any(number not in found for number in wanted):
+        raise refusal(path, f"{len(numbers)} angles", f"one for each of {views} views, after the view's number", "complete it")
+    return np.array([found[number] for number in wanted])
+
+
+def read_nikon_transmission(scan: NikonScan) -> np.ndarray:
+    """(views, rows, cols) float32 readings over the white level, rows from the lowest, columns as seen from the source.
+
+    Raises:
+        MivolError: an image that cannot be read, or has another size than the detector.
+    """
+    readings = read_images(list(scan.images))
+    if readings.shape[1:] != scan.detector:
+        rows, columns = readings.shape[1:]
+        raise refusal(
+            scan.path, f"images of {rows} x {columns} pixels", "{} x {} as DetectorPixels".format(*scan.detector), "correct it"
+        )
+    check_finite(scan.path, readings)
+    return readings[:, ::-1, ::-1] / np.float32(scan.white_level)
+
+
+def _section(path: Path) -> dict[str, str]:
+    parser = configparser.ConfigParser(strict=False, interpolation=None, allow_no_value=True)
+    try:
+        parser.read_string(path.read_text(encoding="utf-8-sig", errors="replace"))
+    except configparser.Error as error:
+        raise refusal(path, f"no settings ({' '.join(str(error).split())})", "a section [XTekCT]", "copy it again") from None
+    name = next((name for name in parser.sections() if name.lower() == SECTION), None)
+    if name is None:
+        raise refusal(path, f"sections {parser.sections()}", "one that is called XTekCT", "name the .xtekct file of a scan")
+    return dict(parser[name])
+
+
+@dataclass(frozen=True)
+class _Keys:
+    path: Path
+    raw: dict[str, str]
+
+    def text(self, key: str) -> str:
+        return (self.raw.get(key.lower()) or "").strip()
+
+    def number(self, key: str, default: float | None = None) -> float:
+        text = self.text(key)
+        if not text and default is not None:
+            return default
+        try:
+            value = float(text)
+        except ValueError:
+            value = math.nan
+        if not math.isfinite(value):
+            raise refusal(self.path, f"{key} = {text!r}", "a finite number", "correct it")
+        return value
+
+    def length(self, key: str) -> float:
+        value = self.number(key)
+        if value <= 0:
+            raise refusal(self.path, f"{key} = {value:g}", "a number above 0", "correct it")
+        return value
+
+    def count(self, key: str) -> int:
+        value = self.number(key)
+        if value < 1 or value != int(value):
+            raise refusal(self.path, f"{key} = {value:g}", "a whole number above 0", "correct it")
+        return int(value)
+
+
+def _images(path: Path, keys: _Keys) -> tuple[Path, ...]:
+    below = path.parent / keys.text("InputFolderName")
+    folder = below if below.is_dir() else path.parent
+    begins = f"{keys.text('Name')}{keys.text('InputSeparator')}".lower()
+    files = [file for file in folder.iterdir() if file.suffix.lower() in TIFF and file.name.lower().startswith(begins)]
+    return tuple(sorted((file for file in files if file.stem[len(begins) :].strip("_").isdigit()), key=order_of_numbers))
