@@ -183,6 +183,17 @@ class Table(Section, kw_only=True, tag_field="beam", tag="table"):
     detector: Annotated[tuple[int, int], of("pixel", "(rows, columns) of computed projections")] = (1, 128)
 
 
+class Matrices(Section, kw_only=True, tag_field="beam", tag="matrices"):
+    """A point source and a flat detector on any trajectory, as projection matrices: (column, row, 1) ~ P (x, y, z, 1)."""
+
+    file: Annotated[str, of("path", "text, 12 numbers a view: P, 3 x 4, row by row", min_length=1)]
+    detector: Annotated[tuple[int, int], of("pixel", "(rows, columns) of computed projections")] = (1, 128)
+    first_pixel: Annotated[tuple[float, float], of("pixel", "(column, row) that P gives to the middle of the first pixel")] = (
+        0.0,
+        0.0,
+    )
+
+
 class OfData(Section, tag_field="beam", tag="data"):
     """The geometry that comes with the data; source = "nikon" has one."""
 
@@ -286,7 +297,7 @@ class Scan(Section):
     """All of a TOML file for tomography: it has a table ``[scan]`` in place of ``[scene]``."""
 
     title: Annotated[str, of("1", "heading of the report", min_length=1)]
-    scan: Annotated[Parallel | Cone | Table | OfData, of("1", "beam and detector")]
+    scan: Annotated[Parallel | Cone | Table | Matrices | OfData, of("1", "beam and detector")]
     data: Annotated[Ellipsoids | Known | Measured | Stack | Nikon, of("1", "what was seen")]
     grid: Annotated[Grid | None, of("1", "where the voxels lie; absent: where a Nikon file says")] = None
     solve: Annotated[Solve, of("1", "how it is inverted")] = Solve()

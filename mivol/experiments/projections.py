@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from mivol import config
-from mivol.config import Cone, Detector, Ellipsoids, Known, Measured, Nikon, OfData, Parallel, Stack, Table
+from mivol.config import Cone, Detector, Ellipsoids, Known, Matrices, Measured, Nikon, OfData, Parallel, Stack, Table
 from mivol.errors import MivolError
 from mivol.experiments.nikon_scan import nikon_grid, read_nikon_scan
 from mivol.files import read_columns, read_projections, read_stack, read_volume
@@ -19,6 +19,7 @@ from mivol.tomography.geometry import ConeBeam, Geometry, ParallelBeam, VoxelGri
 from mivol.tomography.panel_views import COLUMNS, PanelViews
 from mivol.tomography.phantoms import shepp_logan
 from mivol.tomography.preprocess import Transmission, correct_transmission, line_integrals, normalise_air, of_unknown_noise
+from mivol.tomography.projection_matrices import panels_of_matrices
 from mivol.tomography.projector import Projector
 from mivol.tomography.rotation_axis import find_axis
 
@@ -57,7 +58,7 @@ def beam_of(chosen: config.Scan) -> str:
 def make_geometry(chosen: config.Scan, base: Path) -> Geometry:
     """Beam and detector of computed projections."""
     wanted = chosen.scan
-    angles = np.arange(0) if isinstance(wanted, Table) else evenly(wanted)
+    angles = np.arange(0) if isinstance(wanted, Table | Matrices) else evenly(wanted)
     return place_beam(chosen, base, angles, wanted.detector)
 
 
@@ -73,6 +74,9 @@ def place_beam(
     wanted = chosen.scan
     if isinstance(wanted, Table):
         return PanelViews(read_columns(base / wanted.file, COLUMNS), detector)
+    if isinstance(wanted, Matrices):
+        matrices = read_columns(base / wanted.file, COLUMNS).reshape(-1, 3, 4)
+        return panels_of_matrices(matrices, detector, chosen.grid.centre, wanted.first_pixel)
     offsets = {
         "axis_offset": wanted.axis_offset if axis_offset is None else axis_offset,
         "detector_offset": wanted.detector_offset,
@@ -207,7 +211,7 @@ def read_stack_scan(chosen: config.Scan, base: Path) -> tuple[Transmission, np.n
         transmission = correct_transmission(readings, stack(wanted.flats), stack(wanted.darks))
     else:
         transmission = of_unknown_noise(np.exp(-readings.astype(float)) if wanted.reading == "line_integral" else readings)
-    if isinstance(chosen.scan, Table):
+    if isinstance(chosen.scan, Table | Matrices):
         return transmission, None
     if not wanted.angles:
         return transmission, np.radians(chosen.scan.arc) * np.arange(len(readings)) / len(readings)

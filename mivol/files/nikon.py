@@ -1,7 +1,8 @@
 """Scans of Nikon (X-Tek) laboratory CT: an ``.xtekct`` file of settings, and a TIFF file for each projection.
 
-Conventions. Lengths are mm, angles degrees. In the files an image's first row is the highest, and its columns run as someone sees
-them who looks from the detector to the source: both are turned round on reading, as :mod:`mivol.tomography.geometry` has them.
+Conventions. Lengths are mm, angles degrees. In the files the first row of an image is the highest, and its columns run as they
+are seen by someone who looks from the detector to the source: both are turned round on reading, as
+:mod:`mivol.tomography.geometry` has them.
 
 Sources of the format's facts: ``NikonDataReader`` of the Core Imaging Library (University of Manchester and STFC), which takes
 angles from the steps because it found those in ``_ctdata.txt`` and ``.ang`` files to be wrong; the loaders of TIGRE and of

@@ -63,6 +63,7 @@ DEFAULTS = {
         "judged": "held_out",
     },
     "config.Rendered": {"spp": 1024, "standard_error": 0.0, "seed": 1, "held_out": ()},
+    "config.Matrices": {"detector": (1, 128), "first_pixel": (0.0, 0.0)},
     "config.Nikon": {"find_axis": True, "air": 0, "drift": 0, "angles": ""},
     "config.Scan": {
         **{"grid": None, "held_out_every": 0},
