@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from mivol.points.gaussian_files import read_gaussians, write_gaussians
 from mivol.points.gaussians import Gaussians, concatenate
 
-__all__ = ["Gaussians", "concatenate"]
+__all__ = ["Gaussians", "concatenate", "read_gaussians", "write_gaussians"]

@@ -6,21 +6,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from gaussian_sets import random_gaussians
 
 from mivol.errors import MivolError
 from mivol.points.gaussians import Gaussians, concatenate, logit
-
-
-def random_gaussians(count: int, degree: int, seed: int = 1) -> Gaussians:
-    """Gaussians with nothing special about them."""
-    rng = np.random.default_rng(seed)
-    return Gaussians(
-        rng.uniform(-1, 1, (count, 3)),
-        rng.uniform(-5, -2, (count, 3)),
-        rng.normal(size=(count, 4)),
-        rng.normal(size=count),
-        rng.uniform(-0.5, 0.5, (count, (degree + 1) ** 2, 3)),
-    )
 
 
 def test_a_quarter_turn_about_z_takes_x_to_y() -> None:

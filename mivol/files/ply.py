@@ -1,0 +1,172 @@
+"""Stanford's ``.ply`` as tables: every element that a header lists, by name, in binary of either byte order or in text.
+
+Conventions. Elements stand in the order of the header. What an element would take is counted from the header and compared with
+the bytes that are there before any of it is taken. Properties are single numbers: an element with lists (faces) ends what is
+read, since the length of a row is not known then; it and what follows it are left out. ``read_ply`` of
+:mod:`mivol.files.mesh` reads triangles.
+
+Source: Greg Turk, The PLY Polygon File Format, 1994.
+
+Here: :func:`read_tables`, :func:`is_table`, :func:`write_table`.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from dataclasses import dataclass
+from typing import BinaryIO
+
+import numpy as np
+
+from mivol.files import source
+from mivol.files.source import refusal
+
+__all__ = ["is_table", "read_tables", "write_table"]
+
+LONGEST_HEADER = 1 << 16
+"""Bytes in which a header has to end; those of published files have some 2000."""
+
+TYPES = {
+    **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4", "double": "f8"},
+    **{"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4", "float32": "f4"},
+    **{"float64": "f8"},
+}
+"""Names of types, old and new, and NumPy's."""
+
+ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "="}
+
+
+@dataclass
+class Element:
+    """What a header says of one element: its properties as (name, type), and whether one of them is a list."""
+
+    name: str
+    count: int
+    properties: list[tuple[str, str]]
+    has_lists: bool = False
+
+
+def is_table(head: bytes) -> bool:
+    """Whether these first bytes are those of a ``.ply``."""
+    return re.match(rb"ply\r?\n", head) is not None
+
+
+def read_tables(path: str | os.PathLike) -> dict[str, np.ndarray]:
+    """All elements of a file up to the first that has lists.
+
+    Returns:
+        By name of the element, a structured array (count,) with a field a property, in the types and the order of the file.
+
+    Raises:
+        MivolError: no PLY, a header that does not end or contradicts itself, fewer bytes than it promises, or more where no
+            element with lists follows.
+    """
+    data = source.read_bytes(path)
+    head, body = _split(data, path)
+    form, elements = _header(head, path)
+    return _text_tables(body, elements, path) if form == "ascii" else _binary_tables(body, elements, ORDERS[form], path)
+
+
+def write_table(file: BinaryIO, table: np.ndarray, comment: str = "") -> None:
+    """Write one element ``vertex``, binary and little-endian.
+
+    Args:
+        file: open for writing.
+        table: structured (count,), fields of float32 and unsigned bytes.
+        comment: a line of the header; empty: none.
+    """
+    kinds = {"float32": "float", "uint8": "uchar"}
+    lines = [
+        "ply",
+        "format binary_little_endian 1.0",
+        *([f"comment {comment}"] if comment else []),
+        f"element vertex {len(table)}",
+    ]
+    lines += [f"property {kinds[table.dtype[name].name]} {name}" for name in table.dtype.names]
+    file.write("\n".join([*lines, "end_header", ""]).encode("ascii"))
+    file.write(table.astype(table.dtype.newbyteorder("<"), copy=False).tobytes())
+
+
+def _split(data: bytes, path: object) -> tuple[str, bytes]:
+    """The header, without its last line, and what follows it."""
+    if not is_table(data):
+        raise refusal(path, f"first bytes {data[:8]!r}", "those of a PLY", "name another file")
+    end = re.compile(rb"^end_header\r?\n", re.MULTILINE).search(data, 0, LONGEST_HEADER)
+    if end is None:
+        raise refusal(path, f"no end_header in the first {LONGEST_HEADER} bytes", "one", "copy or write the file again")
+    return data[: end.start()].decode("ascii", errors="replace"), data[end.end() :]
+
+
+def _header(text: str, path: object) -> tuple[str, list[Element]]:
+    """The format, and what is said of each element."""
+    form, elements = "", []
+    for line in text.splitlines()[1:]:
+        match line.split():
+            case [] | ["comment" | "obj_info", *_]:
+                pass
+            case ["format", kind, "1.0"] if kind in ORDERS and not form:
+                form = kind
+            case ["element", name, count] if re.fullmatch(r"\d{1,18}", count, re.ASCII):
+                elements.append(Element(name, int(count), []))
+            case ["property", "list", _, _, _] if elements:
+                elements[-1].has_lists = True
+            case ["property", kind, name] if elements and kind in TYPES:
+                elements[-1].properties.append((name, TYPES[kind]))
+            case _:
+                raise refusal(path, f"the line '{line}' in the header", "a line of a PLY 1.0", "write the file again")
+    if not form:
+        raise refusal(path, "a header without a format", "the line 'format binary_little_endian 1.0'", "write the file again")
+    _check_names(elements, path)
+    return form, elements
+
+
+def _check_names(elements: list[Element], path: object) -> None:
+    for names, what in [([e.name for e in elements], "elements"), *(([p for p, _ in e.properties], e.name) for e in elements)]:
+        twice = next((name for name in names if names.count(name) > 1), None)
+        if twice is not None:
+            raise refusal(path, f"{twice!r} twice among the {what}", "each name once", "write the file again")
+    empty = next((e.name for e in elements if not e.properties and not e.has_lists), None)
+    if empty is not None:
+        raise refusal(path, f"the element {empty!r} without properties", "one at least", "write the file again")
+
+
+def _binary_tables(body: bytes, elements: list[Element], order: str, path: object) -> dict[str, np.ndarray]:
+    tables, at = {}, 0
+    for element in elements:
+        if element.has_lists:
+            return tables
+        dtype = np.dtype([(name, order + kind) for name, kind in element.properties])
+        end = at + element.count * dtype.itemsize
+        _check_size(f"{len(body)} bytes", len(body) - end, f"{end} for {element.count} of {element.name!r}", path)
+        tables[element.name] = np.frombuffer(body, dtype, element.count, at)
+        at = end
+    if at < len(body):
+        raise refusal(path, f"{len(body) - at} bytes after the last element", "none", "copy or write the file again")
+    return tables
+
+
+def _text_tables(body: bytes, elements: list[Element], path: object) -> dict[str, np.ndarray]:
+    """As the binary ones: whole numbers of 32 bits and less are exact in float64, through which they go."""
+    words, tables, at = body.split(), {}, 0
+    for element in elements:
+        if element.has_lists:
+            return tables
+        width = len(element.properties)
+        end = at + element.count * width
+        _check_size(f"{len(words)} numbers", len(words) - end, f"{end} for {element.count} of {element.name!r}", path)
+        rows = source.numbers(b" ".join(words[at:end]), end - at, path).reshape(element.count, width)
+        table = np.empty(element.count, [(name, kind) for name, kind in element.properties])
+        for column, (name, kind) in zip(rows.T, element.properties, strict=True):
+            if kind[0] != "f" and not np.array_equal(column, column.astype(kind)):
+                raise refusal(path, f"numbers that are no {kind} as {name!r}", "numbers of that type", "write the file again")
+            table[name] = column
+        tables[element.name], at = table, end
+    if at < len(words):
+        raise refusal(path, f"{len(words) - at} numbers after the last element", "none", "copy or write the file again")
+    return tables
+
+
+def _check_size(found: str, left: int, expected: str, path: object) -> None:
+    if left < 0:
+        raise refusal(path, found, f"at least {expected}, from the header", "the file is truncated: copy it again")

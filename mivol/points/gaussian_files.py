@@ -1,0 +1,65 @@
+"""One door to files of Gaussians: the suffix chooses the format, and every number is looked at before it is handed on.
+
+Here: :data:`READERS` and :data:`WRITERS` (suffix -> function), :func:`read_gaussians`, :func:`write_gaussians`.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import BinaryIO
+
+from mivol.files.atomic import write_whole
+from mivol.files.ply import read_tables
+from mivol.files.source import existing_file, refusal
+from mivol.points.compressed_ply import gaussians_of_compressed_tables, is_compressed
+from mivol.points.gaussian_ply import gaussians_of_tables, write_gaussian_ply
+from mivol.points.gaussians import Gaussians
+
+__all__ = ["READERS", "WRITERS", "read_gaussians", "write_gaussians"]
+
+
+def _read_ply(path: Path) -> Gaussians:
+    tables = read_tables(path)
+    return (gaussians_of_compressed_tables if is_compressed(tables) else gaussians_of_tables)(tables, path)
+
+
+#: suffix -> reader(path).
+READERS: dict[str, Callable[[Path], Gaussians]] = {".ply": _read_ply}
+
+#: suffix -> writer(file, gaussians).
+WRITERS: dict[str, Callable[[BinaryIO, Gaussians], None]] = {".ply": write_gaussian_ply}
+
+
+def read_gaussians(path: str | os.PathLike) -> Gaussians:
+    """Read Gaussians of any format in :data:`READERS`.
+
+    Raises:
+        MivolError: missing, foreign, truncated or inconsistent file; a suffix that is not known; numbers that cannot be drawn,
+            by the index of the first.
+
+    Example:
+        >>> read_gaussians("point_cloud.ply").degree
+        3
+    """
+    path = existing_file(path)
+    return _chosen(path, READERS)(path).checked(path)
+
+
+def write_gaussians(path: str | os.PathLike, gaussians: Gaussians) -> None:
+    """Write Gaussians, whole or not at all; the suffix chooses the format (:data:`WRITERS`).
+
+    Raises:
+        MivolError: a suffix that is not known, numbers that cannot be drawn, disk full.
+    """
+    path = Path(path)
+    writer = _chosen(path, WRITERS)
+    gaussians.checked(path)
+    write_whole(path, lambda file: writer(file, gaussians))
+
+
+def _chosen(path: Path, table: dict[str, Callable]) -> Callable:
+    if path.suffix.lower() not in table:
+        raise refusal(path, f"the suffix {path.suffix!r}", f"one of {', '.join(table)}", "convert the file or correct its name")
+    return table[path.suffix.lower()]
