@@ -17,7 +17,7 @@ PACKAGE = Path(__file__).resolve().parents[1] / "mivol"
 ORDER = [
     *("errors", "shown", "cite", "threads", "machine", "llvm", "numerics", "space", "files", "photos", "points"),
     *("fields", "phase"),
-    *("transport", "tomography", "scene", "plugins", "optim", "validate", "report", "schema", "config", "doctor"),
+    *("transport", "splatting", "tomography", "scene", "plugins", "optim", "validate", "report", "schema", "config", "doctor"),
     *("experiments", "bench", "cli", "__main__"),
 ]
 INSIDE = {"transport": ["traversal", "media", "estimators", "line_integrals", "path"]}

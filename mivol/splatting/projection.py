@@ -1,0 +1,187 @@
+r"""Gaussians of space as ellipses of the image (EWA splatting), with the derivatives of Dr.Jit.
+
+A Gaussian of mean p and covariance R S S R^T is projected with the perspective linearised at p: with J the (2, 3) derivative of
+the image by space, its image is a Gaussian of covariance
+
+.. math:: C = A A^T + s\,I, \qquad A = J R S, \qquad \alpha(x) = o\,e^{-\frac12 (x-\mu)^T C^{-1} (x-\mu)}
+
+and s [pixel^2] a low-pass filter. det C is computed as |a_1 x a_2|^2 + s (|a_1|^2 + |a_2|^2) + s^2, a sum of positive terms:
+C is never singular, however thin the Gaussian.
+
+Conventions. Arrays of the cloud are flat, one Gaussian after the other; those of splats are one array a component. Colours are
+max(0, 1/2 + sum Y_b k_b), with the basis of ``dr.sh_eval`` and the direction from the camera to the mean.
+
+References: Zwicker et al. 2001 (EWA); Kerbl et al. 2023 (the model); Yu et al. 2024 (mip-splatting: compensated opacity).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from mivol.splatting.view import View
+
+__all__ = ["Cloud", "Filter", "Splats", "project"]
+
+LEAST_COMPENSATION = 1e-12
+"""Squared factor below which the compensated opacity is not derived: with 1e-6 of its opacity no Gaussian is drawn."""
+
+EXP2 = -0.5 / math.log(2)
+"""exp(-q/2) = 2^(EXP2 q)."""
+
+
+@dataclass
+class Cloud:
+    """A cloud of Gaussians, flat: means 3 N, log_scales 3 N, quaternions 4 N, opacity_logits N, harmonics N K 3."""
+
+    means: mi.Float
+    log_scales: mi.Float
+    quaternions: mi.Float
+    opacity_logits: mi.Float
+    harmonics: mi.Float
+
+    def split(self, degree: int) -> Cloud:
+        """The same numbers as lists of components, each an array of N."""
+        index = dr.arange(mi.UInt32, dr.width(self.opacity_logits))
+        flat = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        sizes = _sizes(degree)
+        return Cloud(**{n: [dr.gather(mi.Float, a, index * sizes[n] + c) for c in range(sizes[n])] for n, a in flat.items()})
+
+    def write(self, parts: Cloud) -> None:
+        """Take the numbers of a cloud that is split, or of its derivatives."""
+        for field in dataclasses.fields(self):
+            flat, components = getattr(self, field.name), getattr(parts, field.name)
+            index = dr.arange(mi.UInt32, dr.width(components[0]))
+            for c, value in enumerate(components):
+                dr.scatter(flat, value, index * len(components) + c, mode=dr.ReduceMode.Permute)
+
+
+def _sizes(degree: int) -> dict[str, int]:
+    """Numbers of a Gaussian."""
+    return {"means": 3, "log_scales": 3, "quaternions": 4, "opacity_logits": 1, "harmonics": 3 * (degree + 1) ** 2}
+
+
+@dataclass
+class Filter:
+    """What keeps Gaussians from falling between pixels, and from the camera.
+
+    Attributes:
+        low_pass: s [pixel^2] of this picture.
+        near: least depth of a mean that is drawn [length].
+    """
+
+    low_pass: mi.Float
+    near: mi.Float
+
+
+@dataclass
+class Splats:
+    """Ellipses in the image.
+
+    Attributes:
+        x, y: centre [pixel].
+        xx, xy, yy: of the exponent, alpha = opacity 2^(xx dx^2 + xy dx dy + yy dy^2).
+        opacity: at the centre, in [0, 1].
+        colour: rgb code values, >= 0.
+        depth: along the view [length].
+        drawn: whether it stands in front of the camera, and all its numbers are finite.
+        faulty: NaN among its numbers, or a quaternion of no direction.
+    """
+
+    x: mi.Float
+    y: mi.Float
+    xx: mi.Float
+    xy: mi.Float
+    yy: mi.Float
+    opacity: mi.Float
+    colour: list[mi.Float]
+    depth: mi.Float
+    drawn: mi.Bool
+    faulty: mi.Bool
+
+    def shape(self) -> list[mi.Float]:
+        """The eight numbers that compositing reads first: x, y, xx, xy, yy, opacity, red, green."""
+        return [self.x, self.y, self.xx, self.xy, self.yy, self.opacity, self.colour[0], self.colour[1]]
+
+    def rest(self) -> list[mi.Float]:
+        """The two numbers that it reads beside them: blue, depth."""
+        return [self.colour[2], self.depth]
+
+
+def project(cloud: Cloud, view: View, filtering: Filter, degree: int, compensated: bool) -> Splats:
+    """Project all Gaussians of a cloud.
+
+    Args:
+        cloud: N Gaussians, split.
+        view: who looks.
+        filtering: the low-pass filter and the near plane.
+        degree: of the harmonics.
+        compensated: whether the low-pass filter keeps the integral of alpha (the mip filter), instead of its peak.
+    """
+    mean, log_scale = mi.Point3f(*cloud.means), mi.Vector3f(*cloud.log_scales)
+    w, i, j, k = cloud.quaternions
+    offset = mean - (view.origin + view.shift)
+    right, down, forward = (axis - dr.cross(axis, view.turn) for axis in (view.right, view.down, view.forward))
+    x, y, z = dr.dot(right, offset), dr.dot(down, offset), dr.dot(forward, offset)
+    in_front = z > filtering.near
+    z_inv = dr.rcp(dr.select(in_front, z, 1))
+    plane = mi.Vector2f(x, y) * z_inv
+    bent = dr.clip(plane, view.low, view.high)
+    scale = dr.exp(log_scale)
+    length2 = w * w + i * i + j * j + k * k
+    columns = _rotation(w, i, j, k, dr.rcp(dr.select(length2 > 0, length2, 1)))
+    rows = [view.focal[a] * z_inv * (axis - bent[a] * forward) for a, axis in enumerate((right, down))]
+    first, second = (mi.Vector3f(*[scale[c] * dr.dot(row, columns[c]) for c in range(3)]) for row in rows)
+    xx, xy, yy = dr.dot(first, first), dr.dot(first, second), dr.dot(second, second)
+    sharp = dr.squared_norm(dr.cross(first, second))
+    s = filtering.low_pass
+    det = sharp + s * (xx + yy) + s * s
+    opacity = _logistic(cloud.opacity_logits[0])
+    if compensated:
+        opacity = opacity * dr.sqrt(dr.maximum(sharp * dr.rcp(det), LEAST_COMPENSATION))
+    q = EXP2 * dr.rcp(det)
+    centre = plane * view.focal + view.centre
+    splats = Splats(
+        centre.x,
+        centre.y,
+        q * (yy + s),
+        -2 * q * xy,
+        q * (xx + s),
+        opacity,
+        _colour(cloud.harmonics, dr.normalize(offset), degree),
+        z,
+        in_front,
+        dr.isnan(w + i + j + k) | (length2 == 0),
+    )
+    total = dr.detach(splats.x + splats.y + splats.xx + splats.xy + splats.yy + z)
+    splats.drawn &= dr.isfinite(total) & dr.isfinite(det) & (det > 0)
+    given = dr.detach(mean.x + mean.y + mean.z + log_scale.x + log_scale.y + log_scale.z + opacity + sum(splats.colour))
+    splats.faulty |= dr.isnan(given)
+    return splats
+
+
+def _rotation(w: mi.Float, i: mi.Float, j: mi.Float, k: mi.Float, s: mi.Float) -> list[mi.Vector3f]:
+    """The columns of the rotation of a quaternion, s = 1 / its squared length."""
+    s = 2 * s
+    return [
+        mi.Vector3f(1 - s * (j * j + k * k), s * (i * j + w * k), s * (i * k - w * j)),
+        mi.Vector3f(s * (i * j - w * k), 1 - s * (i * i + k * k), s * (j * k + w * i)),
+        mi.Vector3f(s * (i * k + w * j), s * (j * k - w * i), 1 - s * (i * i + j * j)),
+    ]
+
+
+def _logistic(logit: mi.Float) -> mi.Float:
+    """1 / (1 + exp(-logit)); 0 and 1 at minus and plus infinity, with derivatives of 0."""
+    e = dr.exp(-dr.abs(logit))
+    tail = e * dr.rcp(1 + e)
+    return dr.select(logit < 0, tail, 1 - tail)
+
+
+def _colour(harmonics: list[mi.Float], d: mi.Vector3f, degree: int) -> list[mi.Float]:
+    basis = dr.sh_eval(d, degree)
+    sums = [sum(y * harmonics[3 * b + c] for b, y in enumerate(basis)) for c in range(3)]
+    return [dr.maximum(value + 0.5, 0) for value in sums]

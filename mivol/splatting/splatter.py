@@ -1,0 +1,333 @@
+"""Pictures of Gaussians, and derivatives by everything that a picture depends on: the renderer that fits use.
+
+Conventions. The cloud is given as Dr.Jit tensors by name, as :mod:`mivol.points.gaussians` describes them: "means" (N, 3)
+[length], "log_scales" (N, 3), "quaternions" (N, 4), (w, x, y, z) of any length, "opacity_logits" (N,), "harmonics" (N, K, 3).
+Pictures are (height, width, 4): rgb multiplied by alpha, and alpha; black where nothing is. What stands behind the cloud is
+added as ``rgb + (1 - alpha) background``.
+
+Kernels are recorded once (``dr.freeze``) and launched for any number of Gaussians, any pose and any lists without tracing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mivol.errors import MivolError
+from mivol.machine import available_memory
+from mivol.photos.camera import Camera
+from mivol.splatting.compositing import CHUNK, LANES, PIXELS, Adjoint, Frame, Lists, composite, composite_adjoint
+from mivol.splatting.device_arrays import aligned, kept_aligned
+from mivol.splatting.projection import EXP2, Cloud, Filter, Splats, project
+from mivol.splatting.tile_lists import TILE, Grid, TileLists, check_memory, count_tiles, list_tiles, write_tiles
+from mivol.splatting.view import View, numbers_of
+from mivol.threads import check_one_thread
+
+__all__ = ["Kept", "NAMES", "Splatter", "Statistics"]
+
+NAMES = ("means", "log_scales", "quaternions", "opacity_logits", "harmonics")
+"""The tensors of a cloud."""
+
+ENTRY_BYTES = 4 * (4 + LANES * PIXELS // CHUNK)
+"""Of an entry of a list: itself, what sorting takes, and T of the tile once in ``CHUNK`` entries."""
+
+
+@dataclass(frozen=True, eq=False)
+class Kept:
+    """What a picture keeps for its derivatives; valid until the splatter draws the next one."""
+
+    cloud: Cloud
+    view: mi.Float
+    shapes: Mapping[str, tuple[int, ...]]
+    shape: mi.Float
+    rest: mi.Float
+    lists: Lists
+    frame: Frame
+    chunks: mi.UInt32
+    seen: np.ndarray
+    radius: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Statistics:
+    """What density control asks of a picture.
+
+    Attributes:
+        seen: (N,) bool, listed in at least one tile.
+        d_mean2d: (N,) norm of the derivative by the projected mean [1/pixel].
+        radius: (N,) three standard deviations along the longer axis of the ellipse [pixel]; 0 where it is not seen.
+    """
+
+    seen: np.ndarray
+    d_mean2d: np.ndarray
+    radius: np.ndarray
+
+
+class Splatter:
+    """Draws clouds of Gaussians by tile-based EWA splatting, and takes derivatives back.
+
+    Args:
+        width, height: of the picture [pixel].
+        degree: of the harmonics, 0 to 9.
+        low_pass: variance that is added to every ellipse [pixel^2 of the judged picture].
+        judged_width: width at which pictures are judged [pixel]; the low-pass filter is that of this resolution, so that a
+            fit at a lower one learns no blur. The picture's own by default.
+        compensated: keep the integral of alpha under the low-pass filter (mip-splatting), instead of its peak.
+        depth: give the expected depth, multiplied by alpha, as a channel between rgb and alpha.
+        near: least depth of a mean that is drawn [length]. A Gaussian that reaches across the camera is drawn if its mean is in
+            front of this plane.
+        least_alpha: a splat is skipped in pixels where its alpha is below.
+
+    Raises:
+        MivolError: a size, degree or filter that makes no sense, or a Mitsuba variant that does not compile.
+    """
+
+    def __init__(
+        self,
+        width: int,
+        height: int,
+        degree: int,
+        *,
+        low_pass: float = 0.3,
+        judged_width: int | None = None,
+        compensated: bool = False,
+        depth: bool = False,
+        near: float = 0.01,
+        least_alpha: float = 1 / 255,
+    ) -> None:
+        _check_variant()
+        _check_settings(width, height, degree, low_pass, near, least_alpha)
+        self.size, self.degree, self.depth, self.compensated = (width, height), degree, depth, compensated
+        self.channels = 5 if depth else 4
+        columns, rows = -(-width // TILE), -(-height // TILE)
+        self.n_tiles = columns * rows
+        scale = 1 if judged_width is None else width / judged_width
+        self._filter = Filter(dr.opaque(mi.Float, low_pass * scale**2), dr.opaque(mi.Float, near))
+        self._grid = Grid(dr.opaque(mi.Int32, columns), dr.opaque(mi.Int32, rows), dr.opaque(mi.Float, least_alpha))
+        self._width, self._height = dr.opaque(mi.UInt32, width), dr.opaque(mi.UInt32, height)
+        self._project, self._write = dr.freeze(self._trace_projection), dr.freeze(write_tiles)
+        self._composite = dr.freeze(composite)
+        self._project_adjoint = dr.freeze(self._trace_adjoint)
+
+    def __repr__(self) -> str:
+        return f"Splatter({self.size[0]} x {self.size[1]}, degree {self.degree})"
+
+    def forward(self, reals: Mapping[str, mi.TensorXf], camera: Camera, derivatives: bool = True) -> tuple[mi.TensorXf, Kept]:
+        """Draw a cloud.
+
+        Args:
+            reals: the tensors of the cloud by name; no derivatives are tracked through them.
+            camera: a pinhole of the splatter's size.
+            derivatives: whether :meth:`backward` will be asked; without, less memory is taken.
+
+        Returns:
+            The picture (height, width, 4 or 5), and what its derivatives need.
+
+        Raises:
+            MivolError: tensors of the wrong shape, NaN or a quaternion 0 in them, a camera of another size or with a lens that
+                distorts, or lists that do not fit into memory.
+        """
+        check_one_thread()
+        shapes = _checked_shapes(reals, self.degree)
+        cloud = Cloud(*[kept_aligned(dr.detach(reals[name].array)) for name in NAMES])
+        view = numbers_of(camera, self.size)
+        n = shapes["means"][0]
+        if n == 0:
+            return self._nothing(cloud, view, shapes)
+        shape, rest, depth, faulty, count, radius = self._project(
+            cloud, view, self._filter, self._grid, _blank(8 * n), _blank(2 * n)
+        )
+        _check_faults(np.array(faulty))
+        counts = np.array(count)
+        lists = self._list(shape, np.array(depth), counts)
+        frame = self._frame(lists, derivatives)
+        image, chunks, frame.transmittance = self._composite((shape, rest), lists, self._grid, frame)
+        seen = counts > 0
+        kept = Kept(cloud, view, shapes, shape, rest, lists, frame, chunks, seen, np.where(seen, np.array(radius), 0))
+        return self._tensor(image), kept
+
+    def backward(self, kept: Kept, d_picture: mi.TensorXf) -> tuple[dict[str, mi.TensorXf], Statistics]:
+        """The derivatives of a number L by everything that a picture was made of.
+
+        Args:
+            kept: of :meth:`forward`.
+            d_picture: the derivative of L by each number of the picture, of its shape.
+
+        Returns:
+            The derivatives by name, of the shapes of the cloud's tensors, and under "pose" (6,) those by a small motion of the
+            camera: a rotation vector about its place, in the world's axes [1/rad], and a translation in the world [1/length].
+            And the statistics of the screen.
+
+        Raises:
+            MivolError: a derivative of another shape, or a picture that was drawn without derivatives.
+        """
+        if tuple(d_picture.shape) != (self.size[1], self.size[0], self.channels):
+            raise MivolError(
+                f"Found a derivative of shape {tuple(d_picture.shape)}, expected the picture's "
+                f"{(self.size[1], self.size[0], self.channels)}."
+            )
+        if not kept.frame.remembers:
+            raise MivolError("Found a picture that was drawn with derivatives=False: draw it again with derivatives=True.")
+        n = kept.shapes["means"][0]
+        if n == 0:
+            gradient = {name: dr.zeros(mi.TensorXf, shape) for name, shape in kept.shapes.items()}
+            nothing = np.zeros(0, np.float32)
+            return gradient | {"pose": dr.zeros(mi.TensorXf, (6,))}, Statistics(np.zeros(0, bool), nothing, nothing)
+        adjoint = Adjoint(dr.detach(d_picture.array), kept.chunks, _blank(8 * _capacity(n)), _blank(2 * _capacity(n)))
+        # Not recorded: the copies of the target that each thread adds to are of a size that a recording would hold fast.
+        adjoint = composite_adjoint((kept.shape, kept.rest), kept.lists, self._grid, kept.frame, adjoint)
+        target = Cloud(*[_blank(int(np.prod(kept.shapes[name]))) for name in NAMES])
+        d_cloud, pose, d_mean2d = self._project_adjoint(kept.cloud, kept.view, self._filter, adjoint, target)
+        gradient = {name: mi.TensorXf(getattr(d_cloud, name), kept.shapes[name]) for name in NAMES}
+        gradient["pose"] = mi.TensorXf(np.array([np.array(d).sum(dtype=np.float64) for d in pose], np.float32))
+        return gradient, Statistics(kept.seen, np.array(d_mean2d), kept.radius)
+
+    # -- What is recorded --------------------------------------------------------------------------------------------------
+
+    def _trace_projection(
+        self, cloud: Cloud, view: mi.Float, filtering: Filter, grid: Grid, shape: mi.Float, rest: mi.Float
+    ) -> tuple:
+        splats = project(cloud.split(self.degree), View.of(view), filtering, self.degree, self.compensated)
+        index = dr.arange(mi.UInt32, dr.width(splats.x))
+        drawn = splats.drawn & ~splats.faulty
+        dr.scatter(shape, mi.ArrayXf(splats.shape()), index)
+        dr.scatter(rest, mi.ArrayXf(splats.rest()), index)
+        dr.eval(shape, rest, drawn)
+        return shape, rest, splats.depth, splats.faulty, count_tiles(shape, drawn, grid), _radius(splats)
+
+    def _trace_adjoint(
+        self, cloud: Cloud, view: mi.Float, filtering: Filter, adjoint: Adjoint, target: Cloud
+    ) -> tuple[Cloud, list[mi.Float], mi.Float]:
+        parts, looking = cloud.split(self.degree), View.of(view)
+        # A motion for each Gaussian: Dr.Jit would add up the derivatives by a single one at each step of the formula.
+        nothing = mi.Float(dr.arange(mi.UInt32, dr.width(cloud.opacity_logits)) & 0)
+        looking.turn, looking.shift = mi.Vector3f(nothing), mi.Vector3f(nothing)
+        dr.enable_grad(parts, looking.turn, looking.shift)
+        splats = project(parts, looking, filtering, self.degree, self.compensated)
+        derivatives = _derivatives(splats, adjoint.shape, adjoint.rest)
+        values = [*splats.shape(), *splats.rest()]
+        dr.backward(sum(dr.select(splats.drawn, dr.detach(d) * v, 0) for d, v in zip(derivatives, values, strict=True)))
+        target.write(dr.grad(parts))
+        pose = [*dr.grad(looking.turn), *dr.grad(looking.shift)]
+        return target, pose, dr.sqrt(dr.square(derivatives[0]) + dr.square(derivatives[1]))
+
+    # -- Lists ---------------------------------------------------------------------------------------------------------------
+
+    def _list(self, shape: mi.Float, depth: np.ndarray, counts: np.ndarray) -> Lists:
+        """Lists of all tiles, and the order in which tiles are drawn: the longest first, so that no core ends late."""
+        self._check_room(counts)
+        seen = np.flatnonzero(counts)
+        order = seen[np.argsort(depth[seen], kind="stable")].astype(np.uint32)
+        offsets = np.zeros(len(order) + 1, np.int32)
+        np.cumsum(counts[order], out=offsets[1:])
+        if len(order):
+            target = dr.opaque(mi.Int32, 0, int(offsets[-1]))
+            begins = aligned(offsets[:-1].astype(np.uint32))
+            tiles = self._write(shape, mi.UInt32(aligned(order)), mi.UInt32(begins), target, self._grid)
+            made = list_tiles(np.array(tiles), order, offsets, self.n_tiles)
+        else:
+            made = TileLists(np.zeros(0, np.uint32), np.zeros(self.n_tiles + 1, np.uint32))
+        lengths = np.diff(made.starts)
+        chunks = np.zeros(self.n_tiles + 1, np.uint32)
+        np.cumsum(-(-lengths.astype(np.int64) // CHUNK), out=chunks[1:])
+        tiles = np.argsort(-lengths.astype(np.int64), kind="stable").astype(np.uint32)
+        entries = made.entries if len(made.entries) else np.zeros(1, np.uint32)
+        return Lists(*[mi.UInt32(aligned(a)) for a in (entries, made.starts, chunks, tiles)])
+
+    def _check_room(self, counts: np.ndarray) -> None:
+        total = int(counts.sum(dtype=np.int64))
+        check_memory(total * ENTRY_BYTES, available_memory(), total, f"{int((counts > 0).sum()):,} Gaussians are seen")
+
+    def _frame(self, lists: Lists, derivatives: bool) -> Frame:
+        width, height = self.size
+        n_chunks = int(lists.chunks[self.n_tiles]) if derivatives else 0
+        transmittance = _blank(max(n_chunks, 1) * LANES * PIXELS)
+        image = _blank(width * height * self.channels)
+        return Frame(self._width, self._height, image, transmittance, self.depth, derivatives)
+
+    def _nothing(self, cloud: Cloud, view: mi.Float, shapes: Mapping[str, tuple[int, ...]]) -> tuple[mi.TensorXf, Kept]:
+        """The picture of a cloud without Gaussians."""
+        nothing, empty = mi.Float(), np.zeros(0, np.float32)
+        lists = Lists(mi.UInt32(), mi.UInt32(), mi.UInt32(), mi.UInt32())
+        frame = Frame(self._width, self._height, nothing, nothing, self.depth, True)
+        kept = Kept(cloud, view, shapes, nothing, nothing, lists, frame, mi.UInt32(), np.zeros(0, bool), empty)
+        return dr.zeros(mi.TensorXf, (self.size[1], self.size[0], self.channels)), kept
+
+    def _tensor(self, image: mi.Float) -> mi.TensorXf:
+        return mi.TensorXf(image, (self.size[1], self.size[0], self.channels))
+
+
+def _blank(size: int) -> mi.Float:
+    """Zeros in memory, whose number no kernel knows."""
+    return dr.opaque(mi.Float, 0, size)
+
+
+def _capacity(n: int) -> int:
+    """Gaussians that there is room for where derivatives are added up: the size of this array is part of the kernel."""
+    return max(4096, 1 << (n - 1).bit_length())
+
+
+def _derivatives(splats: Splats, d_shape: mi.Float, d_rest: mi.Float) -> list[mi.Float]:
+    """Derivatives by the ten numbers of each splat, of the sums that compositing has made."""
+    index = dr.arange(mi.UInt32, dr.width(splats.x))
+    x, y, xx, xy, yy, opacity, red, green = dr.gather(mi.ArrayXf, d_shape, index, shape=(8, dr.width(index)))
+    blue, depth = dr.gather(mi.ArrayXf, d_rest, index, shape=(2, dr.width(index)))
+    ln2 = float(np.log(2))
+    a, b, c = (dr.detach(v) for v in (splats.xx, splats.xy, splats.yy))
+    d_x, d_y = -ln2 * (2 * a * x + b * y), -ln2 * (2 * c * y + b * x)
+    return [d_x, d_y, ln2 * xx, ln2 * xy, ln2 * yy, opacity, red, green, blue, depth]
+
+
+def _radius(splats: Splats) -> mi.Float:
+    """Three standard deviations along the longer axis [pixel]."""
+    mean, half = 0.5 * (splats.xx + splats.yy), 0.5 * (splats.xx - splats.yy)
+    # Eigenvalues of the exponent's matrix are EXP2 / variance; the one nearest to 0 belongs to the longer axis.
+    nearest = mean + dr.sqrt(half * half + 0.25 * splats.xy * splats.xy)
+    return 3 * dr.sqrt(EXP2 * dr.rcp(dr.minimum(nearest, -1e-30)))
+
+
+def _check_variant() -> None:
+    if mi.variant() is None or not mi.variant().endswith("_ad_rgb") or mi.variant().startswith("scalar"):
+        raise MivolError(
+            f"Found the variant {mi.variant()}, expected one that compiles: call mi.set_variant('llvm_ad_rgb') or "
+            "'cuda_ad_rgb' first."
+        )
+
+
+def _check_settings(width: int, height: int, degree: int, low_pass: float, near: float, least_alpha: float) -> None:
+    if min(width, height) < 1 or max(width, height) > 1 << 15:
+        raise MivolError(f"Found a picture of {width} x {height} pixels, expected 1 to {1 << 15} along each edge.")
+    if not 0 <= degree <= 9:
+        raise MivolError(f"Found harmonics of degree {degree}, expected 0 to 9.")
+    if not 0 < low_pass < np.inf:
+        raise MivolError(f"Found low_pass = {low_pass:g}, expected a variance above 0 in pixels^2 (0.3 is usual).")
+    if not 0 < near < np.inf:
+        raise MivolError(f"Found near = {near:g}, expected a depth above 0.")
+    if not 0 < least_alpha < 1:
+        raise MivolError(f"Found least_alpha = {least_alpha:g}, expected a number between 0 and 1 (1/255 is usual).")
+
+
+def _checked_shapes(reals: Mapping[str, mi.TensorXf], degree: int) -> dict[str, tuple[int, ...]]:
+    missing = [name for name in NAMES if name not in reals]
+    if missing:
+        raise MivolError(f"Found no tensor {', '.join(missing)} of the cloud, expected {', '.join(NAMES)}.")
+    n = reals["means"].shape[0]
+    expected = {"means": (n, 3), "log_scales": (n, 3), "quaternions": (n, 4), "opacity_logits": (n,)}
+    expected["harmonics"] = (n, (degree + 1) ** 2, 3)
+    for name, shape in expected.items():
+        if tuple(reals[name].shape) != shape:
+            raise MivolError(f"Found {name} of shape {tuple(reals[name].shape)}, expected {shape} for degree {degree}.")
+    return expected
+
+
+def _check_faults(faulty: np.ndarray) -> None:
+    at = np.flatnonzero(faulty)
+    if len(at):
+        raise MivolError(
+            f"Gaussian {at[0]}{f' and {len(at) - 1} others' if len(at) > 1 else ''}: found NaN or a quaternion 0, expected "
+            "numbers and a direction: take these Gaussians out."
+        )

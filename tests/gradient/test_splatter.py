@@ -1,0 +1,93 @@
+"""Pictures of Gaussians and their derivatives, against a picture in float64 that has no tiles and never stops."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import oracle_splats
+import pytest
+from clouds import cloud, looking, tensors
+
+from mivol.splatting import Splatter
+from mivol.splatting.compositing import STOP
+
+WIDTH, HEIGHT = 40, 37
+SIZES = {1: 0.2, 8: 0.05, 50: 0.15}
+"""Gaussians -> their scale: one, a few that hardly meet, many that overlap."""
+
+ROUNDING = 4e-5
+"""Of a derivative, relative to the largest of its kind. A centre of up to 40 pixels is rounded three times, by 40 * 3 * 2^-24 =
+7e-6 pixels. alpha changes with it by d / sigma^2 <= 3.3 / sigma of itself (alpha >= 1/255 ends at 3.3 sigma), and sigma is
+sqrt(0.3) at least: 4e-5. All else is rounded by a few 2^-24."""
+
+STEP = 1e-6
+"""Of central differences in float64: 1e-12 is left out, 1e-10 is rounding."""
+
+
+@pytest.fixture
+def splatter(variant_rgb: str) -> Splatter:
+    return Splatter(WIDTH, HEIGHT, 2, depth=True)
+
+
+def slopes(arrays: dict[str, np.ndarray], weights: np.ndarray, frozen: oracle_splats.Drawn, **options: object) -> dict:
+    """Derivatives of the sum of weights times the picture by twenty numbers of each kind: (index, central difference)."""
+    rng, camera = np.random.default_rng(2), looking(WIDTH, HEIGHT)
+    arrays = {name: value.astype(float) for name, value in arrays.items()}
+
+    def at(motion: np.ndarray) -> float:
+        return (oracle_splats.draw(arrays, oracle_splats.moved(camera, motion), frozen=frozen, **options)[0] * weights).sum()
+
+    found = {"pose": [(j, (at(e) - at(-e)) / (2 * STEP)) for j, e in enumerate(STEP * np.eye(6))]}
+    for name, value in arrays.items():
+        flat, found[name] = value.reshape(-1), []
+        for j in rng.permutation(flat.size)[:20]:
+            before, ends = flat[j], []
+            for side in (1, -1):
+                flat[j] = before + side * STEP
+                ends.append(at(np.zeros(6)))
+            flat[j] = before
+            found[name].append((j, (ends[0] - ends[1]) / (2 * STEP)))
+    return found
+
+
+def compare(splatter: Splatter, n: int, degree: int, **options: object) -> None:
+    """Picture and derivatives of a cloud are those of the oracle."""
+    arrays, camera = cloud(n, degree, SIZES[n], seed=n), looking(WIDTH, HEIGHT)
+    picture, kept = splatter.forward(tensors(arrays), camera)
+    truth, frozen = oracle_splats.draw(arrays, camera, **options)
+    # What is not drawn any more is below STOP times the largest colour or depth.
+    np.testing.assert_allclose(np.array(picture), truth, atol=STOP * truth.max() * 1e-1 + ROUNDING, rtol=0)
+    weights = np.random.default_rng(1).normal(size=truth.shape).astype(np.float32)
+    gradient, _ = splatter.backward(kept, mi.TensorXf(weights))
+    for name, pairs in slopes(arrays, weights, frozen, **options).items():
+        index, slope = np.array(pairs).T
+        found = np.array(gradient[name]).reshape(-1)
+        np.testing.assert_allclose(found[index.astype(int)], slope, rtol=0, atol=ROUNDING * np.abs(found).max(), err_msg=name)
+
+
+def test_pictures_and_derivatives(splatter: Splatter) -> None:
+    """One splatter for all clouds: nothing of the first may be left in its recordings."""
+    for n in SIZES:
+        compare(splatter, n, 2)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("degree", [0, 3])
+def test_pictures_and_derivatives_with_compensated_opacity(variant_rgb: str, degree: int) -> None:
+    splatter = Splatter(WIDTH, HEIGHT, degree, depth=True, compensated=True)
+    for n in SIZES:
+        compare(splatter, n, degree, compensated=True)
+
+
+def test_kernels_are_recorded_once(splatter: Splatter) -> None:
+    """Neither another number of Gaussians, nor another pose, nor other lists compile or record anything."""
+    recorded = (splatter._project, splatter._write, splatter._composite, splatter._project_adjoint)
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        for n, distance in ((60, 1.8), (50, 1.6), (200, 1.7), (333, 2.0)):
+            dr.kernel_history_clear()
+            picture, kept = splatter.forward(tensors(cloud(n, 2, 0.05, seed=n)), looking(WIDTH, HEIGHT, distance))
+            dr.eval(splatter.backward(kept, picture)[0])
+            compiled = [k for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT and not k["cache_hit"]]
+            assert n == 60 or len(compiled) == 0, n
+    assert [f.n_recordings for f in recorded] == [1, 1, 1, 1]
