@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import mitsuba as mi
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from mivol.photos.camera import Camera, intrinsics
 
@@ -28,8 +29,9 @@ def tensors(arrays: dict[str, np.ndarray]) -> dict[str, mi.TensorXf]:
 
 
 def looking(width: int, height: int, distance: float = 1.8, focal: float = 0.9) -> Camera:
-    """A camera on the z axis that looks at the origin, turned a little so that no axis is the world's."""
-    a = 0.1
-    pose = np.array([[np.cos(a), -np.sin(a), 0, 0], [np.sin(a), np.cos(a), 0, 0], [0, 0, 1, distance], [0, 0, 0, 1]])
+    """A camera at a distance from the origin that looks at it, turned so that none of its axes is the world's."""
+    pose = np.eye(4)
+    pose[:3, :3] = Rotation.from_rotvec([0.1, -0.15, 0.2]).as_matrix()
+    pose[:3, 3] = distance * pose[:3, 2]
     K = intrinsics(focal * width, focal * width, 0.48 * width, 0.51 * height)
     return Camera(K, (width, height), pose)
