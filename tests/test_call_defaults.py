@@ -1,4 +1,5 @@
-"""What holds where a call says nothing: numbers and switches that a public function, method or class takes by itself.
+"""What holds where a call says nothing: numbers and switches that a public function, method or class takes by itself, and
+what the flags of each verb of the command are without being given.
 
 Whoever changes one changes the results of every script that is silent about it, and no formula tells that it is wrong. So they
 are recorded, module by module, and ``pytest tests/test_call_defaults.py --record`` records them anew: the change is seen then.
@@ -7,6 +8,7 @@ What is not recorded yet is not judged, and what is gone is left out of the next
 
 from __future__ import annotations
 
+import argparse
 import importlib
 import inspect
 import json
@@ -18,6 +20,7 @@ from types import ModuleType
 import pytest
 
 import mivol
+from mivol.cli import parser
 
 RECORDED = Path(__file__).with_suffix(".json")
 MODULES = sorted(m.name for m in pkgutil.walk_packages(mivol.__path__, "mivol.") if not m.name.endswith("__main__"))
@@ -59,9 +62,19 @@ def defaults_of(name: str) -> dict[str, dict]:
     return {called: plain for called, plain in sorted(found.items()) if plain}
 
 
+def flags() -> dict[str, dict]:
+    """What each flag of each verb is where it is not given, but for those that are nothing then."""
+    (verbs,) = (a for a in parser()._actions if isinstance(a, argparse._SubParsersAction))
+    shown = {
+        name: {a.dest: a.default for a in verb._actions if a.default not in (None, argparse.SUPPRESS)}
+        for name, verb in verbs.choices.items()
+    }
+    return {name: json.loads(json.dumps(plain, default=str)) for name, plain in shown.items() if plain}
+
+
 @pytest.mark.usefixtures("variant_rgb")
 def test_defaults_are_as_recorded(record: bool) -> None:
-    found = {name: defaults_of(name) for name in MODULES}
+    found = {name: defaults_of(name) for name in MODULES} | {"the command": flags()}
     if record:
         text = json.dumps({name: kept for name, kept in found.items() if kept}, indent=1)
         RECORDED.write_text(text + "\n", encoding="utf-8")

@@ -12,7 +12,7 @@ from mivol.scene.build import build_estimators
 from mivol.scene.needs import find_needs
 from mivol.scene.plan import make_plan
 from mivol.scene.survey import survey_scene
-from mivol.transport.estimators.grid_control import CameraOrigins, GridControl, build_grid_control
+from mivol.transport.estimators.grid_control import CameraOrigins, GridControl, build_grid_control, nodes_along
 from mivol.transport.path.settings import Settings
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
@@ -59,3 +59,18 @@ def test_point_light_from_the_corners_of_the_grid():
     between = (1 - share)[:, None] * corners[0, 0] + share[:, None] * corners[0, 1]
     np.testing.assert_allclose(values[0, :, ::5], between, rtol=1e-5)
     assert np.allclose(PLACE @ [0, 0, 0, 1], [-1, -1, -1, 1])
+
+
+def test_nodes_stand_eight_cells_apart():
+    """Two where all cells are within one step, and 33 at most: 31 steps of 8 cells and a last one of 7 need all of them."""
+    assert [nodes_along(n) for n in (1, 7, 8, 15, 16, 247, 254, 255, 256, 1024)] == [2, 2, 3, 3, 4, 32, 33, 33, 33, 33]
+
+
+def test_a_cell_has_the_light_of_its_place():
+    """Three edges and two channels' worth of numbers: a cell is found in z, y, x, from a lower node of -1 on."""
+    res, channels = (2, 4, 3), 3
+    values = np.arange(3 * 5 * 4 * channels, dtype=np.float32).reshape(3, 5, 4, channels)
+    control = GridControl(mi.Float(values.ravel()), res, channels)
+    lower = np.stack(np.meshgrid(*(np.arange(-1, n) for n in res), indexing="ij"), axis=-1).reshape(-1, 3)
+    found = control.at(mi.Vector3i(*lower[:, ::-1].T), mi.Bool(True))
+    assert np.array_equal(np.array(found).T, values.reshape(-1, channels))

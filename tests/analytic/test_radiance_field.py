@@ -12,7 +12,7 @@ from scipy.ndimage import distance_transform_cdt
 
 from mivol.fields.activation import ACTIVATIONS
 from mivol.fields.spherical import SphericalGrid
-from mivol.transport.line_integrals.radiance_field import cells_of, model_of, render
+from mivol.transport.line_integrals.radiance_field import brightest_weights, cells_of, model_of, render
 from mivol.transport.line_integrals.radiance_source import exact
 from mivol.transport.traversal.empty_blocks import REACH
 
@@ -142,6 +142,24 @@ def test_the_background_of_the_same_colour(variant_rgb: str) -> None:
     # L + 0.5 T = 0.5 whatever the density: what is left are roundings of sums of 1.
     assert np.abs(slopes).max() <= 2e-6 * max(np.abs(alone).max(), 1.0)
     assert np.abs(alone).max() > 1e-2
+
+
+def test_the_brightest_weight_of_a_cell(variant_rgb: str) -> None:
+    """T alpha of each cell, behind those that are in front of it; the largest one where rays come from both sides."""
+    field = SphericalGrid.from_dense(np.full((4, 3, 5), 3.0), np.zeros((4, 3, 5, 1, 3)), CUBE)
+    cells, model = cells_of(field), model_of(field)
+    weight = dr.zeros(mi.Float, cells.count)
+    # The outer cells are half as long as the others; a voxel is 1/2 long.
+    tau = 3 * np.array([0.25, 0.5, 0.5, 0.5, 0.25])
+    one_way = np.exp(tau - np.cumsum(tau)) * -np.expm1(-tau)
+    for side, expected in ((-1, one_way), (1, np.maximum(one_way, one_way[::-1]))):
+        rays = rays_of([0.1, 0.1, 3.0 * side], [0.0, 0.0, -1.0 * side])
+        brightest_weights(cells, exact(field, rays.d), model, rays, weight)
+        # x = 0.1 lies in the fourth of six cells, y = 0.1 in the third of four.
+        seen = np.array(weight)[np.array(cells.number).reshape(5, 4, 6)[:, 2, 3]]
+        # Optical depths of 6 at most, known to some 1e-6.
+        np.testing.assert_allclose(seen, expected, rtol=1e-5)
+    assert np.count_nonzero(np.array(weight)) == 5
 
 
 def test_camera_inside(variant_rgb: str) -> None:

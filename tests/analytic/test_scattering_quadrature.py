@@ -73,6 +73,17 @@ def test_absorption_beside_scattering(name):
     assert np.abs(found - truth).max() <= 4e-3 * truth.max()
 
 
+@pytest.mark.parametrize("name", ["fog", "smoke"])
+def test_a_floor_is_seen_through_black_smoke(name):
+    """reflectance / pi irradiance T^2, straight down and straight back: 1.2 optical depths each way."""
+    box, _ = fog(0.6, 0.0) if name == "fog" else smoke(np.full((3, 4, 5, 1), 0.6, np.float32), 0.0)
+    floor = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, -1.5]).scale(4)}
+    floor["bsdf"] = {"type": "diffuse", "reflectance": 0.5}
+    seen = pencils({"smoke": box, "floor": floor, "emitter": sun([0, 0, -1.0])[0]}, [0.2, 0.1, 3.0], [0.0, 0.0, -1.0])
+    # Optical depths of 1.2 to 1e-6 of themselves, twice, and float32 products.
+    np.testing.assert_allclose(image(seen), 0.5 / np.pi * 2 * np.exp(-2.4), rtol=1e-5)
+
+
 def test_two_renders_are_the_same():
     box, _ = smoke(rough_grid(1))
     emitter, _ = point([1.5, 1, 2.0])

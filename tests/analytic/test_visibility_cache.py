@@ -6,6 +6,7 @@ No weight can bias an image, since weights only guide the sampling of distances;
 from __future__ import annotations
 
 import drjit as dr
+import mitsuba as mi
 import numpy as np
 import pytest
 from scattering_scenes import aimed, pencils, smoke, sun
@@ -15,7 +16,7 @@ from mivol.scene.needs import find_needs
 from mivol.scene.plan import make_plan
 from mivol.scene.survey import survey_scene
 from mivol.transport.estimators.emitters import SceneEmitters
-from mivol.transport.estimators.visibility_cache import FLOOR, RAY_FRACTION, build_visibility_cache
+from mivol.transport.estimators.visibility_cache import FLOOR, RAY_FRACTION, VisibilityCache, build_visibility_cache
 from mivol.transport.path.settings import Settings
 from mivol.transport.traversal.coarse_grid import coarsen_grid
 from scenes import centred
@@ -49,3 +50,16 @@ def test_weights_are_those_of_beer(shift, occupied):
     weights = np.array(shade.weights).reshape(blocks)
     # The box is 2 high; the optical depth is known to 2e-6 of itself, and float32 adds a few roundings.
     np.testing.assert_allclose(weights, np.broadcast_to((np.exp(-0.8 * depth) + FLOOR)[:, None, None], blocks), rtol=1e-5)
+
+
+@pytest.mark.parametrize("shift", [0, 1, 2])
+def test_a_cell_has_the_weight_of_its_block(shift):
+    """Cells begin at a lower node of -1 and stand in z, y, x; of two emitters each lane has its own."""
+    blocks = tuple((n >> shift) + 1 for n in SIZE)
+    weights = np.random.default_rng(shift).random((*blocks, 2), dtype=np.float32)
+    cache = VisibilityCache(mi.Float(weights.ravel()), blocks, shift, 2)
+    lower = np.stack(np.meshgrid(*(np.arange(-1, n) for n in SIZE), indexing="ij"), axis=-1).reshape(-1, 3)
+    number = np.arange(len(lower)) % 2
+    found = cache.at(mi.Vector3i(*lower[:, ::-1].T), mi.UInt32(number), mi.Bool(True))
+    z, y, x = (lower.T + 1) >> shift
+    assert np.array_equal(np.array(found), weights[z, y, x, number])

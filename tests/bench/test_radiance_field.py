@@ -22,6 +22,7 @@ from mivol.bench.radiance_field.fits import EVERY, follow, held_out_psnr, our_fi
 from mivol.bench.radiance_field.peer import Peer
 from mivol.bench.radiance_field.steps import ask_memory, our_step, peer_of, peer_step, tasks
 from mivol.bench.radiance_field.views import BOX, between, photographed, rays_of, rays_through, ring, tiled
+from mivol.fields.spherical import SphericalGrid
 from mivol.photos import Camera, Photo, intrinsics
 from mivol.transport.line_integrals.radiance_field import cells_of, model_of, render
 from mivol.transport.line_integrals.radiance_source import bake
@@ -50,6 +51,27 @@ def test_the_peer_sees_the_same_and_derives_the_same(variant_rgb: str) -> None:
         assert np.vdot(a, b) / (np.linalg.norm(a) * np.linalg.norm(b)) > 0.98
         assert np.linalg.norm(a) == pytest.approx(np.linalg.norm(b), rel=0.1)
     dr.sync_thread()
+
+
+def test_the_peer_takes_a_step_for_each_cell(variant_rgb: str) -> None:
+    """Along an axis, where the last step ends on the far face exactly: an optical depth of 0.5 in each of four cells."""
+    density, harmonics = np.full((4, 4, 4, 1), 2.0, np.float32), np.zeros((4, 4, 4, 27), np.float32)
+    harmonics[..., :3] = 0.6 / 0.28209479
+    seen = Peer(mi.TensorXf(density), mi.TensorXf(harmonics)).render(mi.Point3f(0.5, 0.5, [-1.0, 0.0]), mi.Vector3f(0, 0, 1))
+    # Four factors and sums of float32.
+    np.testing.assert_allclose(np.array(seen), 0.6 * (1 - np.exp(-2.0)), rtol=1e-6)
+
+
+def test_rays_without_pinholes_have_the_same_derivatives(variant_rgb: str) -> None:
+    """Where nothing depends on the direction, harmonics of a direction and those that are baked for a pinhole are the same."""
+    density = np.random.default_rng(1).random((5, 6, 4)).astype(np.float32)
+    field = SphericalGrid.from_dense(density, np.zeros((5, 6, 4, 1, 3), np.float32), FIELDS["fog"](TINY)[0].to_world)
+    task = tasks(TINY)["camera"]
+    steps = [our_step(field, each)(0) for each in (task, replace(task, pinholes=None, view=None))]
+    for of_one_point, of_any in zip(*([np.array(slope) for slope in step] for step in steps), strict=True):
+        assert np.abs(of_any).max() > 0
+        # 256 rays in float32, which are added up in any order.
+        np.testing.assert_allclose(of_one_point, of_any, atol=1e-5 * np.abs(of_any).max())
 
 
 @pytest.mark.slow

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from tiny_experiment import PHOTOS, SCENE, refused, run, write_experiment
 
-from mivol.cli import VERBS
+from mivol.cli import VERBS, loading, parse
 from mivol.files import read_exr
 
 
@@ -38,6 +38,19 @@ def test_render_writes_what_mitsuba_renders(variant_rgb, folder: Path, capsys: p
 def test_render_as_png_and_elsewhere(variant_rgb, folder: Path) -> None:
     assert run("render", folder / "scene.xml", "-o", folder / "a.png", "-t", 1) == 0
     assert (folder / "a.png").read_bytes()[:4] == b"\x89PNG"
+
+
+@pytest.mark.parametrize(("flag", "level"), [([], "Warn"), (["-v"], "Debug")])
+def test_messages_of_mitsuba_are_asked_for(monkeypatch: pytest.MonkeyPatch, flag: list[str], level: str) -> None:
+    """Its warnings are shown always, and what it does where it is asked for; the scene is looked for in more folders."""
+    told, folders = [], []
+    for name in ("choose_back_end", "load_scene"):
+        monkeypatch.setattr(loading, name, lambda *asked: asked)
+    monkeypatch.setattr(mi, "set_log_level", told.append)
+    monkeypatch.setattr(mi, "file_resolver", lambda: folders)
+    arguments = parse(["render", "a.xml", "-a", "one;two", "-Dspp=9", *flag])
+    assert loading.load(arguments) == (Path("a.xml"), {"spp": "9"})
+    assert (told, folders) == ([getattr(mi.LogLevel, level)], ["one", "two"])
 
 
 def test_a_variant_without_its_gpu_is_refused(
@@ -96,9 +109,7 @@ def test_reference_is_rendered_and_said(variant_rgb, folder: Path, capsys: pytes
 # -- What render is told ------------------------------------------------------------------------------------------
 
 
-def test_render_by_another_integrator_with_samples_and_seed(
-    variant_rgb, folder: Path, capsys: pytest.CaptureFixture
-) -> None:
+def test_render_by_another_integrator_with_samples_and_seed(variant_rgb, folder: Path, capsys: pytest.CaptureFixture) -> None:
     """The image is Mitsuba's own of that integrator, sample count and seed; what is not ours is named."""
     flags = ["--integrator", "volpath", "--spp", 3, "--seed", 5, "-o", folder / "a.exr"]
     assert run("render", folder / "scene.xml", *flags) == 0

@@ -167,6 +167,39 @@ def test_views_that_are_held_out_have_a_range_where_there_are_two(found, said):
     assert tiles == [(f"{np.mean(found):.1f}", "dB", f"PSNR, held-out views{said}")]
 
 
+COUNTS = {
+    999: ("999", ""),
+    1000: ("1", "k"),
+    999_000: ("999", "k"),
+    10**6: ("1", "M"),
+    1_234_567: ("1.23", "M"),
+    10**9: ("1", "G"),
+}
+
+
+@pytest.mark.parametrize("number", COUNTS)
+def test_counts_have_prefixes_from_their_powers_on(number):
+    assert page_module._count(number) == COUNTS[number]
+
+
+DURATIONS = {
+    0.0123: "12 ms",
+    0.94: "940 ms",
+    0.95: "0.9 s",
+    9.94: "9.9 s",
+    9.95: "10 s",
+    119.4: "119 s",
+    120: "2.0 min",
+    7199: "120.0 min",
+    7200: "2.0 h",
+}
+
+
+@pytest.mark.parametrize("seconds", DURATIONS)
+def test_durations_are_said_in_the_unit_that_suits(seconds):
+    assert page_module._duration(seconds) == DURATIONS[seconds]
+
+
 def test_a_broken_render_has_no_psnr(tmp_path):
     render = np.ones((4, 6))
     render[1, 2] = np.nan

@@ -138,5 +138,8 @@ def test_bad_boxes_and_poses(variant_rgb):
     inside = LookAts(origins=(tuple(CENTER + 0.1),), targets=(tuple(CENTER),))
     with pytest.raises(MivolError, match="give it a fov"):
         inside.sensors_about(BOX)
+    # On the sphere of radius 5 about a flat box: half a turn, which no pinhole sees.
+    with pytest.raises(MivolError, match="give it a fov"):
+        LookAts(origins=((0, 0, 5),), targets=((0, 0, 0),)).sensors_about(np.array([[-3.0, -4, 0], [3, 4, 0]]))
     with pytest.raises(MivolError, match="looks at its own position"):
         LookAts(origins=((1, 1, 1),), targets=((1, 1, 1),), fov=30).sensors_about(BOX)

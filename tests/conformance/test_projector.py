@@ -197,6 +197,17 @@ def test_passes_change_nothing(monkeypatch, cells):
     np.testing.assert_allclose(a.T @ y, expected_back, atol=2e-6 * np.abs(expected_back).max())
 
 
+def test_rays_are_kept_up_to_a_bound(monkeypatch):
+    """Six float32 numbers a ray, whatever the grid holds: kept where they just fit, and set up anew for each product beyond."""
+    x, rays = numbers(*GRID.shape), BEAMS["cone"].shape
+    for short, kept in ((0, True), (1, False)):
+        monkeypatch.setattr(projector_module, "CACHE_BYTES", 4 * 6 * int(np.prod(rays)) - short)
+        a = Projector(BEAMS["cone"], GRID)
+        assert a.shape[0] != a.shape[1]
+        a @ x
+        assert (a._cache is not None) == kept
+
+
 def test_flat_in_flat_out_and_wrong_shapes_are_refused():
     a = Projector(BEAMS["parallel"], GRID)
     x = numbers(*GRID.shape)

@@ -43,6 +43,18 @@ def test_an_example_is_copied_once(tmp_path: Path, capsys: pytest.CaptureFixture
     assert "is there already" in refused(capsys, "demo", "demo", "--into", tmp_path / "mine")
 
 
+def test_compiled_files_stay_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Files of folders in an example's own are copied as well, and what Python compiled of them is not."""
+    for name in ("fit.toml", "data/a.vol", "data/__pycache__/a.pyc", "__pycache__/b.pyc"):
+        path = tmp_path / "scenes" / "demo" / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(name)
+    monkeypatch.setattr(examples, "examples_folder", lambda: tmp_path / "scenes")
+    into = examples.copy_example("demo", tmp_path / "mine").parent
+    found = {str(path.relative_to(into)): path.read_text() for path in into.rglob("*") if path.is_file()}
+    assert found == {name: name for name in ("fit.toml", "data/a.vol")}
+
+
 def test_an_example_runs(variant_rgb: str, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     assert run("demo", "shepp_logan", "-o", tmp_path / "run", *SHORT) == 0
     assert capsys.readouterr().out.strip() == str(tmp_path / "run" / "report.html")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -16,7 +17,7 @@ from mivol.photos import PhotoSurvey
 from mivol.photos.camera import Camera
 from mivol.photos.survey import Frame
 from mivol.report.cameras import plot_cameras
-from mivol.report.figures import Series, plot_curve, plot_error_against_time, plot_image_row, plot_slices, save
+from mivol.report.figures import Series, inline_svg, plot_curve, plot_error_against_time, plot_image_row, plot_slices, save
 
 
 def falling_curve() -> Figure:
@@ -82,3 +83,11 @@ def test_a_picture_has_160_pixels_an_inch(tmp_path: Path) -> None:
     """A curve of 4.4 x 2.75 inches."""
     with Image.open(save(long_curve(), tmp_path / "curve.png")) as image:
         assert image.size == (704, 440)
+
+
+def test_a_figure_in_a_page_has_the_colours_of_the_page() -> None:
+    """Nothing is filled or drawn but in colours of the page's theme: a white ground would stand out on a dark page."""
+    colours = {f"var(--{c})" for c in ("ink", "faint", "rule", "series-0")}
+    text = inline_svg(falling_curve(), 'a "label"')
+    assert set(re.findall(r"(?:fill|stroke): ([^;\"]*)", text)) - {"none"} == colours
+    assert 'aria-label="a &quot;label&quot;"' in text and "<metadata>" not in text

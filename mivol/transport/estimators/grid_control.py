@@ -34,7 +34,7 @@ from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.traversal.interpolation import interpolate
 from mivol.transport.traversal.lattice import Lattice, locate
 
-__all__ = ["CameraOrigins", "GridControl", "build_grid_control", "takes_grid_control"]
+__all__ = ["CameraOrigins", "GridControl", "build_grid_control", "nodes_along", "takes_grid_control"]
 
 
 STEP = 8
@@ -124,7 +124,7 @@ def build_grid_control(direct: DirectLighting, body: Body, origins: CameraOrigin
     Cost: 64 shadow rays for 512 cells at most, and 8 look-ups a cell.
     """
     lattice = body.view.parts[0].lattice
-    nodes = [max(2, min(-(-(n + 1) // STEP) + 1, MOST)) for n in lattice.res]
+    nodes = [nodes_along(n) for n in lattice.res]
     coarse = _light_of_nodes(direct, body, origins, lattice, nodes)
     z, y, x = (r + 1 for r in lattice.res)
     index = dr.arange(mi.UInt32, z * y * x)
@@ -147,6 +147,12 @@ def build_grid_control(direct: DirectLighting, body: Body, origins: CameraOrigin
         dr.scatter(values, row, index * n + c)
     dr.eval(values)
     return GridControl(values, lattice.res, n)
+
+
+def nodes_along(voxels: int) -> int:
+    """Nodes of the coarse lattice along an axis: one every ``STEP`` cells, from face to face, but no more than ``MOST``."""
+    cells = voxels + 1
+    return min(-(-cells // STEP) + 1, MOST)
 
 
 def _light_of_nodes(

@@ -243,7 +243,7 @@ def _add_span(state: _LightSum, span: _Span, least: mi.Float) -> _LightSum:
         count = dr.maximum(count, dr.select(equiangular.finite, dr.ceil(equiangular.angle(mi.Float(span.start), dt) / TURN), 1))
     is_deep = span.on & (thick > MOST * PIECE)
     edges = _in_order(_dark_shares(state.tau, dt, sigma, is_deep))
-    lit = dr.select(least_of(state.tau) < DARK, DEEP * len(edges) + 1, 1)
+    lit = dr.select(least_of(state.tau) < DARK, DEEP * len(edges), 1)
     count = dr.select(is_deep, mi.UInt32(lit), mi.UInt32(dr.clip(count, 1, MOST)))
     return _add_pieces(state, span, is_deep, edges, count)
 
