@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import struct
 from collections.abc import Iterable
 
@@ -107,3 +108,129 @@ def _compressed_row(one: Gaussians, colours: np.ndarray, index: int, ends: list[
         colour = colour << 8 | round(float((colours[index, c] - low[c]) / max(high[c] - low[c], 1e-30)) * 255)
     position, scale = word(one.means[index], *ends[0]), word(one.log_scales[index], *ends[1])
     return struct.pack("<4I", position, rotation, scale, colour << 8 | round(opacity * 255))
+
+
+# -- Niantic's file -----------------------------------------------------------------------------------------------
+
+PARITY_OF_A_HALF_TURN = "+ --+ -++-+ -+--+-+".replace(" ", "")
+"""Signs of the harmonics of degree 0 to 3 under (x, y, z) to (x, -y, -z): - where y and z stand with odd powers together."""
+
+
+def spz_streams(one: Gaussians, version: int) -> list[bytes]:
+    """The six attributes, one number at a time, with y and z turned round."""
+    streams: list[bytes] = [b""] * 6
+    for index in range(one.count):
+        for value, sign in zip(one.means[index], (1, -1, -1), strict=True):
+            streams[0] += round(sign * float(value) * 4096).to_bytes(4, "little", signed=True)[:3]
+        streams[1] += bytes([round(255 / (1 + np.exp(-float(one.opacity_logits[index]))))])
+        streams[2] += bytes(round(min(max((0.5 + 0.15 * float(k)) * 255, 0), 255)) for k in one.harmonics[index, 0])
+        streams[3] += bytes(round((float(s) + 10) * 16) for s in one.log_scales[index])
+        w, x, y, z = one.quaternions[index].astype(np.float64) / np.linalg.norm(one.quaternions[index].astype(np.float64))
+        streams[4] += _spz_rotation((x, -y, -z, w), version)
+        for k in range(1, one.harmonics.shape[1]):
+            sign = 1 if PARITY_OF_A_HALF_TURN[k] == "+" else -1
+            streams[5] += bytes(round(sign * float(value) * 128) + 128 for value in one.harmonics[index, k])
+    return streams
+
+
+def _spz_rotation(q: tuple[float, ...], version: int) -> bytes:
+    if version == 2:
+        return bytes(round((v if q[3] >= 0 else -v) * 127.5 + 127.5) for v in q[:3])
+    largest = max(range(4), key=lambda i: abs(q[i]))
+    word = largest
+    for i in range(4):
+        if i != largest:
+            is_negative = (q[i] < 0) != (q[largest] < 0)
+            word = word << 10 | is_negative << 9 | round(abs(q[i]) * np.sqrt(2) * 511)
+    return struct.pack("<I", word)
+
+
+def spz_bytes(one: Gaussians, version: int) -> bytes:
+    """The file: gzip, or for version 4 Zstandard frames whose one block is raw, as the format allows."""
+    streams = spz_streams(one, version)
+    streams = streams if one.degree else streams[:5]
+    head = struct.pack("<4sIIBBBB", b"NGSP", version, one.count, one.degree, 12, 0, len(streams) if version == 4 else 0)
+    if version < 4:
+        return gzip.compress(head + b"".join(streams))
+    packed = [zstandard_frame(stream) for stream in streams]
+    table = b"".join(struct.pack("<QQ", len(p), len(s)) for p, s in zip(packed, streams, strict=True))
+    return head + struct.pack("<I12x", 32) + table + b"".join(packed)
+
+
+def zstandard_frame(data: bytes) -> bytes:
+    """RFC 8878: magic, a descriptor (one segment, size in 4 bytes), the size, a last raw block of fewer than 2^17 bytes."""
+    return b"\x28\xb5\x2f\xfd\xa0" + struct.pack("<I", len(data)) + (len(data) << 3 | 1).to_bytes(3, "little") + data
+
+
+# -- Viewers' files -----------------------------------------------------------------------------------------------
+
+
+def splat_bytes(one: Gaussians) -> bytes:
+    """antimatter15's file, as its converter writes it."""
+    return b"".join(
+        struct.pack("<6f8B", *_floats(one, index)[:6], *_colour(one, index), *_bytes_of_rotation(one, index))
+        for index in range(one.count)
+    )
+
+
+def _floats(one: Gaussians, index: int) -> tuple[float, ...]:
+    """Mean, scale and unit quaternion."""
+    q = one.quaternions[index].astype(np.float64)
+    return (*one.means[index], *np.exp(one.log_scales[index].astype(np.float64)), *(q / np.linalg.norm(q)))
+
+
+def _colour(one: Gaussians, index: int) -> tuple[int, ...]:
+    """Colour and opacity in bytes."""
+    rgb = (0.5 + 0.28209479177387814 * one.harmonics[index, 0].astype(np.float64)) * 255
+    opacity = 255 / (1 + np.exp(-float(one.opacity_logits[index])))
+    return tuple(round(float(min(max(v, 0), 255))) for v in (*rgb, opacity))
+
+
+def _bytes_of_rotation(one: Gaussians, index: int) -> tuple[int, ...]:
+    return tuple(min(round(128 + 128 * float(v)), 255) for v in _floats(one, index)[6:])
+
+
+def ksplat_bytes(sections: list[Gaussians], level: int) -> bytes:
+    """The viewer's file: a section a set; buckets of four, the last two partly filled, around centres 5 apart."""
+    head = struct.pack(
+        "<BB2xIIIIH2x3fff", 0, 1, len(sections), len(sections), 0, sum(s.count for s in sections), level, 0, 0, 0, -1, 1
+    )
+    heads, bodies = b"", b""
+    for one in sections:
+        full = (one.count - 1) // 4 if one.count > 4 else 0
+        sizes = [4] * full + ([one.count - 4 * full - 1, 1] if one.count > 4 * full + 1 else [one.count - 4 * full])
+        partial = len(sizes) - full
+        numbers = (one.count, one.count + 2, 4, len(sizes), 5.0, 12, 32767, 0, full, partial, one.degree)
+        heads += struct.pack("<IIIIfH2xIIIIH", *numbers).ljust(1024, b"\0")
+        centres = [(5.0 * b, -5.0 * b, 0.0) for b in range(len(sizes))]
+        own = [b for b, size in enumerate(sizes) for _ in range(size)]
+        rows = b"".join(_ksplat_row(one, index, centres[own[index]], level) for index in range(one.count))
+        bodies += struct.pack(f"<{partial}I", *sizes[full:]) + b"".join(struct.pack("<3f", *c) for c in centres)
+        bodies += rows + bytes(2 * (len(rows) // one.count))
+    return head.ljust(4096, b"\0") + heads + bodies
+
+
+def in_buckets(one: Gaussians) -> Gaussians:
+    """The same Gaussians, moved into the buckets that :func:`ksplat_bytes` puts them in."""
+    full = (one.count - 1) // 4 if one.count > 4 else 0
+    sizes = [4] * full + ([one.count - 4 * full - 1, 1] if one.count > 4 * full + 1 else [one.count - 4 * full])
+    own = np.repeat(np.arange(len(sizes)), sizes)
+    moved = one.means + np.stack([5.0 * own, -5.0 * own, 0 * own], axis=1)
+    return Gaussians(moved, one.log_scales, one.quaternions, one.opacity_logits, one.harmonics)
+
+
+def _ksplat_row(one: Gaussians, index: int, centre: tuple[float, ...], level: int) -> bytes:
+    numbers = _floats(one, index)
+    above = [
+        float(one.harmonics[index, k, c])
+        for d in range(1, one.degree + 1)
+        for c in range(3)
+        for k in range(d * d, (d + 1) ** 2)
+    ]
+    form = "f" if level == 0 else "e"
+    position = [round((float(v) - c) / (2.5 / 32767)) + 32767 for v, c in zip(numbers[:3], centre, strict=True)]
+    row = struct.pack("<3f", *numbers[:3]) if level == 0 else struct.pack("<3H", *position)
+    row += struct.pack(f"<7{form}4B", *numbers[3:], *_colour(one, index))
+    if level < 2:
+        return row + struct.pack(f"<{len(above)}{form}", *above)
+    return row + bytes(round((v + 1) / 2 * 255) for v in above)

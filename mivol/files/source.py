@@ -95,7 +95,7 @@ def elements(data: bytes, dtype: np.dtype | str, count: int, path: object, *, of
         fault = "truncated" if held < promised else "longer than its header says"
         raise refusal(
             path,
-            f"{max(held, 0)} bytes of voxel data",
+            f"{max(held, 0)} bytes of data",
             f"{promised} ({count} numbers of {dtype.itemsize} bytes, from the header)",
             f"the file is {fault}: copy it again or correct the header",
         )

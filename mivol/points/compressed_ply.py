@@ -17,8 +17,9 @@ from pathlib import Path
 import numpy as np
 
 from mivol.files.source import refusal
+from mivol.points.byte_codes import completed, harmonics_of_colours
 from mivol.points.gaussian_ply import rest_of_columns
-from mivol.points.gaussians import CONSTANT_HARMONIC, Gaussians, logit
+from mivol.points.gaussians import Gaussians, logit
 
 __all__ = ["gaussians_of_compressed_tables", "is_compressed"]
 
@@ -52,7 +53,7 @@ def gaussians_of_compressed_tables(tables: dict[str, np.ndarray], path: str | os
     colours = steps[:, :3]
     if "min_r" in chunk.dtype.names:
         colours = _between(chunk, COLOURS, box, colours)
-    harmonics = ((colours - 0.5) / CONSTANT_HARMONIC)[:, None]
+    harmonics = harmonics_of_colours(colours)[:, None]
     if "sh" in tables:
         harmonics = np.concatenate([harmonics, _harmonics(rest_of_columns(tables["sh"], path))], axis=1)
     scale_axes = tuple(f"scale_{axis}" for axis in AXES)
@@ -98,14 +99,7 @@ def _between(chunk: np.ndarray, axes: tuple[str, ...], box: np.ndarray, steps: n
 def _quaternions(words: np.ndarray) -> np.ndarray:
     """Unit quaternions of which the largest entry, here positive, was left out; (N, 4)."""
     others = (_unpacked(words & np.uint32((1 << 30) - 1), (2, 10, 10, 10))[:, 1:] - 0.5) * np.sqrt(2)
-    largest = np.sqrt(np.maximum(0, 1 - (others**2).sum(axis=1)))
-    which = (words >> np.uint32(30)).astype(np.int64)
-    rows = np.arange(len(words))
-    quaternions = np.empty((len(words), 4))
-    quaternions[rows, which] = largest
-    for number in range(3):
-        quaternions[rows, number + (which <= number)] = others[:, number]
-    return quaternions
+    return completed(others, (words >> np.uint32(30)).astype(np.int64))
 
 
 def _harmonics(codes: np.ndarray) -> np.ndarray:

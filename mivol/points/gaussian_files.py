@@ -16,6 +16,9 @@ from mivol.files.source import existing_file, refusal
 from mivol.points.compressed_ply import gaussians_of_compressed_tables, is_compressed
 from mivol.points.gaussian_ply import gaussians_of_tables, write_gaussian_ply
 from mivol.points.gaussians import Gaussians
+from mivol.points.ksplat import read_ksplat
+from mivol.points.splat import read_splat
+from mivol.points.spz import read_spz
 
 __all__ = ["READERS", "WRITERS", "read_gaussians", "write_gaussians"]
 
@@ -26,7 +29,12 @@ def _read_ply(path: Path) -> Gaussians:
 
 
 #: suffix -> reader(path).
-READERS: dict[str, Callable[[Path], Gaussians]] = {".ply": _read_ply}
+READERS: dict[str, Callable[[Path], Gaussians]] = {
+    ".ply": _read_ply,
+    ".spz": read_spz,
+    ".splat": read_splat,
+    ".ksplat": read_ksplat,
+}
 
 #: suffix -> writer(file, gaussians).
 WRITERS: dict[str, Callable[[BinaryIO, Gaussians], None]] = {".ply": write_gaussian_ply}
