@@ -68,21 +68,29 @@ class Twin:
         colour = colour + self.offset
         return self.activate(raw), np.maximum(colour, 0) if self.clamp else colour
 
-    def cuts(self, o: np.ndarray, d: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Ray in the lattice, and where it crosses planes through nodes and faces of the box."""
+    def interval(self, o: np.ndarray, d: np.ndarray) -> tuple[float, float]:
+        """Where a ray enters the box and where it leaves it; the second is not above the first where it misses the box."""
+        q, v = self.inverse[:3, :3] @ o + self.inverse[:3, 3], self.inverse[:3, :3] @ d
+        with np.errstate(divide="ignore", invalid="ignore"):
+            faces = np.sort(np.array([-q / v, (1 - q) / v]), axis=0)
+        return max(0.0, np.nanmax(faces[0])), np.nanmin(faces[1])
+
+    def cuts(
+        self, o: np.ndarray, d: np.ndarray, between: tuple[float, float] = (0.0, np.inf)
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Ray in the lattice, and where it crosses planes through nodes and faces of the box, ``between`` two distances."""
         q = (self.inverse[:3, :3] @ o + self.inverse[:3, 3]) * self.n - 0.5
         v = (self.inverse[:3, :3] @ d) * self.n
-        with np.errstate(divide="ignore", invalid="ignore"):
-            faces = np.sort(np.array([(-0.5 - q) / v, (self.n - 0.5 - q) / v]), axis=0)
-        t0, t1 = max(0.0, np.nanmax(faces[0])), np.nanmin(faces[1])
+        t0, t1 = self.interval(o, d)
+        t0, t1 = max(t0, between[0]), min(t1, between[1])
         planes = [(np.arange(self.n[a]) - q[a]) / v[a] for a in range(3) if v[a] != 0]
         inner = np.concatenate(planes)
         return q, v, np.unique(np.concatenate([[t0], inner[(inner > t0) & (inner < t1)], [t1]])) if t1 > t0 else np.empty(0)
 
-    def render(self, o, d, rule="collocation", split=1) -> tuple[np.ndarray, float, float]:
+    def render(self, o, d, rule="collocation", split=1, between=(0.0, np.inf)) -> tuple[np.ndarray, float, float]:
         """Colour, transmittance and distance; ``split`` cuts each cell into equal parts."""
         o, d = np.asarray(o, np.float64), np.asarray(d, np.float64)
-        q, v, t = self.cuts(o, d)
+        q, v, t = self.cuts(o, d, between)
         basis = sh_basis(self.frame @ d, self.sh.shape[3])
         L, T = np.zeros(4), 1.0
         for a, b in itertools.pairwise(t):
@@ -94,4 +102,25 @@ class Twin:
                 tau, f = (dt * at[0][1], 1.0) if rule == "midpoint" else shares(dt, at[0][1], at[1][1])
                 L += T * -np.expm1(-tau) * (f * colours[0] + (1 - f) * colours[-1])
                 T *= np.exp(-tau)
+        return L[:3], T, L[3]
+
+
+class NestedTwin:
+    """Twins in nested boxes, the innermost first: each is seen where none before it is."""
+
+    def __init__(self, levels: list[Twin]):
+        self.levels = levels
+
+    def render(self, o, d) -> tuple[np.ndarray, float, float]:
+        """Colour, transmittance and distance: the ray is cut at all faces, and each part looked up by its middle."""
+        o, d = np.asarray(o, np.float64), np.asarray(d, np.float64)
+        boxes = [twin.interval(o, d) for twin in self.levels]
+        ends = np.unique([t for a, b in boxes if b > a for t in (a, b)])
+        L, T = np.zeros(4), 1.0
+        for a, b in itertools.pairwise(ends):
+            twin = next((w for w, (c, e) in zip(self.levels, boxes, strict=True) if c <= (a + b) / 2 <= e), None)
+            if twin is not None:
+                colour, through, distance = twin.render(o, d, between=(a, b))
+                L += T * np.append(colour, distance)
+                T *= through
         return L[:3], T, L[3]

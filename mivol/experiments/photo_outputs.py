@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -62,7 +61,7 @@ class PhotoOutputs:
         if self.problem.sky is not None:
             write_exr(folder / "sky.exr", {"": self.problem.sky.image()})
         record.tables = [storage(field, folder / "field.npz")]
-        record.volumes.append(write_density(folder, field))
+        record.volumes += [write_density(folder, field.level(number), number) for number in range(field.levels)]
         record.results = {
             "views": float(len(self.photos.views)),
             "iterations": float(self.fit.next),
@@ -127,7 +126,7 @@ def behind(problem: RadianceProblem, photo: Photo) -> NDArray | Sky:
 
 def storage(field: SphericalGrid, path: Path) -> Table:
     """What the field takes, beside grids of the same box that keep every node."""
-    nodes, kept = math.prod(field.res), len(field.listed())
+    nodes, kept = field.places, len(field.listed())
     kinds = {
         "every node: r, g, b and density of 8 bits": 4 * nodes,
         "every node: four numbers": 16 * nodes,
@@ -140,14 +139,15 @@ def storage(field: SphericalGrid, path: Path) -> Table:
     return Table(title="What it takes", head=head, rows=tuple(rows))
 
 
-def write_density(folder: Path, field: SphericalGrid) -> Volume:
-    """The extinction at the nodes, as a grid that other programs read."""
+def write_density(folder: Path, field: SphericalGrid, level: int) -> Volume:
+    """The extinction at the nodes of a level, as a grid that other programs read; the innermost has no number."""
     raw, _ = field.to_dense()
+    name = f"volumes/density{f'-level-{level}' if level else ''}"
     sigma = np.array(field.act.value_and_slope(type(field.density)(raw.ravel()))[0]).reshape(*field.res, 1)
-    write_volume(folder / "volumes/density.vol", sigma, field.to_world)
-    write_volume(folder / "volumes/density.npz", sigma, field.to_world)
+    write_volume(folder / f"{name}.vol", sigma, field.to_world)
+    write_volume(folder / f"{name}.npz", sigma, field.to_world)
     size = tuple(float(edge) for edge in np.abs(np.diag(field.to_world)[:3]))
-    return Volume(path="volumes/density.npz", role="reconstruction", size=size)
+    return Volume(path=f"{name}.npz", role="reconstruction", size=size)
 
 
 def write_view(folder: Path, photo: Photo, number: int, image: NDArray) -> list[Image]:

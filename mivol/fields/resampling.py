@@ -14,7 +14,7 @@ import mitsuba as mi
 import numpy as np
 
 from mivol.errors import MivolError
-from mivol.fields.spherical import SphericalGrid
+from mivol.fields.spherical import SphericalGrid, is_covered
 
 __all__ = ["resample_field"]
 
@@ -25,16 +25,19 @@ def resample_field(old: SphericalGrid, res: tuple[int, int, int], to_world: np.n
     Args:
         old: what is resampled.
         res, to_world: of the new grid, whose axes are those of the old one.
-        keep: (Z, Y, X) of the old grid, bool; a new node is stored where one of the 8 old ones about it is kept.
+        keep: (Z, Y, X) of the old grid, or (levels, Z, Y, X), bool; a new node is stored where one of the 8 old ones about it
+            is kept and, of a nested field, where it is not covered by the level before.
 
     Raises:
         MivolError: axes that differ.
     """
     axes = _Axes.between(old, res, to_world)
-    near = keep[np.ix_(*(axis.nodes.T.reshape(-1) for axis in axes))]
     z, y, x = res
-    kept = np.flatnonzero(near.reshape(z, 2, y, 2, x, 2).any(axis=(1, 3, 5)))
-    density, harmonics = _interpolated(old, axes, np.unravel_index(kept, res))
+    at = np.ix_(*(axis.nodes.T.reshape(-1) for axis in axes))
+    near = [level[at].reshape(z, 2, y, 2, x, 2).any(axis=(1, 3, 5)) for level in keep.reshape(old.levels, *old.res)]
+    kept = np.flatnonzero(near)
+    kept = kept[~np.array(is_covered(mi.UInt32(kept.astype(np.uint32)), res))] if old.levels > 1 else kept
+    density, harmonics = _interpolated(old, axes, np.unravel_index(kept, (old.levels, *res)))
     count = len(kept)
     flat = dr.full(mi.Float, old.act.vacuum, count + 1)
     packed = dr.zeros(mi.Float, (count + 1) * old.width)
@@ -67,7 +70,7 @@ class _Axes:
 
 
 def _interpolated(old: SphericalGrid, axes: list[_Axes], place: tuple) -> tuple[mi.Float, list[mi.Float]]:
-    """Values at new nodes (indices along z, y, x)."""
+    """Values at new nodes (levels, and indices along z, y, x)."""
     rows = np.array(old.node_rows())
     density, harmonics = mi.Float(0), [mi.Float(0)] * old.width
     if len(place[0]) == 0:
@@ -75,9 +78,9 @@ def _interpolated(old: SphericalGrid, axes: list[_Axes], place: tuple) -> tuple[
     for corner in range(8):
         ends = [
             (axis.nodes[corner >> k & 1][i], axis.shares[corner >> k & 1][i])
-            for k, (axis, i) in enumerate(zip(axes, place, strict=True))
+            for k, (axis, i) in enumerate(zip(axes, place[1:], strict=True))
         ]
-        node = np.ravel_multi_index([n for n, _ in ends], old.res)
+        node = np.ravel_multi_index([place[0], *(n for n, _ in ends)], (old.levels, *old.res))
         weight = mi.Float(math.prod(s for _, s in ends))
         row = mi.UInt32(rows[node].astype(np.uint32))
         density = dr.fma(weight, dr.gather(mi.Float, old.density, row), density)

@@ -60,6 +60,23 @@ class Sky:
         """Another light from the same directions."""
         return replace(self, texels=texels)
 
+    def smoothed(self, share: float) -> Sky:
+        """The sky whose texels have gone a share of the way to the mean of their four neighbours.
+
+        Done again and again, it gives texels that no ray ends at the light of those around them.
+        """
+        columns = 2 * self.rows
+        entry = dr.arange(mi.UInt32, dr.width(self.texels))
+        texel, part = entry // TEXEL, entry % TEXEL
+        row, column = mi.Int32(texel // columns), mi.Int32(texel % columns)
+
+        def of(row: mi.Int32, column: mi.Int32) -> mi.Float:
+            at = dr.clip(row, 0, self.rows - 1) * columns + (column + columns) % columns
+            return dr.gather(mi.Float, self.texels, mi.UInt32(at) * TEXEL + part)
+
+        around = of(row - 1, column) + of(row + 1, column) + of(row, column - 1) + of(row, column + 1)
+        return self.with_texels(dr.lerp(self.texels, around / 4, dr.opaque(mi.Float, share)))
+
     def _corners(self, d: mi.Vector3f) -> list[tuple[mi.UInt32, mi.Float]]:
         """The 4 texels about directions, and their shares."""
         columns = 2 * self.rows

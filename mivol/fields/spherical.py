@@ -9,6 +9,14 @@ those in which a camera ray travels (not those of the light), in the grid's own 
 ``to_world`` is taken off, scale and shear are not felt, so a rotated field looks as the field did. The basis is real, in the
 order and with the signs of ``dr.sh_eval`` (those of PlenOctrees, Plenoxels and 3D Gaussian splatting).
 
+Levels. A field may be nested: each level is a grid of the same nodes in a box of twice the extent about the same middle m, and
+holds what lies in its box and not in that of the level before. Level l is level 0 seen from 2^l times as far: the box, the walk
+through it and the size of its numbers are those of level 0,
+
+.. math:: \sigma(x) = 2^{-l} a\big(\rho(y)\big), \qquad y = m + 2^{-l} (x - m),
+
+so that a rate or a prior that suits one level suits all. Nodes are counted level by level.
+
 Storage. Rows, one a node: ``density`` apart from ``harmonics``, whose rows are [basis][rgb], filled up to a multiple of 4. A
 dense grid has a row for each node in Z Y X order; a sparse one lists its ``nodes`` in that order and ends in one more row, the
 vacuum around them.
@@ -20,7 +28,7 @@ factor).
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import drjit as dr
@@ -33,9 +41,12 @@ from mivol.files.notebook import slices_html
 from mivol.shown import briefly
 from mivol.space import check_affine, lattice_from_world
 
-__all__ = ["MAX_DEGREE", "SphericalGrid", "basis_size", "degree_of", "row_width"]
+__all__ = ["MAX_DEGREE", "SphericalGrid", "basis_size", "degree_of", "is_covered", "row_width"]
 
 MAX_DEGREE = 4
+
+HOMOGENEOUS = ("none", "relu")
+"""Activations of nested fields: a density n times as large is an extinction n times as large."""
 
 
 def basis_size(degree: int) -> int:
@@ -60,6 +71,16 @@ def row_width(basis: int) -> int:
     return -(-3 * basis // 4) * 4
 
 
+def is_covered(node: mi.UInt32, res: tuple[int, int, int]) -> mi.Bool:
+    """Whether nodes of nested grids of ``res`` are of no use: all cells about them lie in the box of the level before."""
+    z, y, x = res
+    inside = node >= math.prod(res)
+    for place, n in ((node % x, x), (node // x % y, y), (node // (x * y) % z, z)):
+        # The next node on either side is at most n / 4 from the middle (n - 1) / 2, where the inner box ends.
+        inside &= 2 * dr.abs(2 * mi.Int32(place) - (n - 1)) <= n - 4
+    return inside
+
+
 @briefly
 @dataclass
 class SphericalGrid:
@@ -75,6 +96,7 @@ class SphericalGrid:
         activation: name in ``ACTIVATIONS``.
         offset: added to the sum of the harmonics.
         clamp: whether colours below 0 are shown as 0.
+        levels: boxes that are nested, each of twice the extent; ``res`` and ``to_world`` are those of the innermost.
         links: the row of each node, once :meth:`node_rows` has made it.
     """
 
@@ -87,6 +109,7 @@ class SphericalGrid:
     activation: str = "relu"
     offset: float = 0.5
     clamp: bool = True
+    levels: int = 1
     links: mi.UInt32 | None = None
 
     def _repr_html_(self) -> str:
@@ -95,6 +118,9 @@ class SphericalGrid:
 
     def __post_init__(self) -> None:
         self.to_world = check_affine(self.to_world)
+        if self.levels > 1 and self.activation not in HOMOGENEOUS:
+            known = " or ".join(HOMOGENEOUS)
+            raise MivolError(f"a nested field with the activation {self.activation} was given; {known} are expected.")
         activation_of(self.activation)
         expected = self.rows
         if dr.width(self.density) != expected or dr.width(self.harmonics) != expected * self.width:
@@ -116,7 +142,12 @@ class SphericalGrid:
     @property
     def rows(self) -> int:
         """Number of rows, that of the vacuum included."""
-        return math.prod(self.res) if self.nodes is None else dr.width(self.nodes) + 1
+        return self.places if self.nodes is None else dr.width(self.nodes) + 1
+
+    @property
+    def places(self) -> int:
+        """Number of nodes of all levels, stored or not."""
+        return self.levels * math.prod(self.res)
 
     @property
     def bytes(self) -> int:
@@ -172,6 +203,7 @@ class SphericalGrid:
         activation: str = "relu",
         offset: float = 0.5,
         clamp: bool = True,
+        levels: int = 1,
     ) -> SphericalGrid:
         """Make a field of the values (n,) and (n, basis, 3) at its nodes; a sparse one gets its row of vacuum.
 
@@ -189,7 +221,46 @@ class SphericalGrid:
         rows[: len(density), : 3 * sh.shape[1]] = sh.reshape(len(density), -1)
         flat = np.append(density, np.float32(act.vacuum)) if vacuum else density
         packed = mi.Float(np.ascontiguousarray(flat)), mi.Float(rows.reshape(-1))
-        return cls(tuple(res), to_world, degree, *packed, nodes, activation, offset, clamp)
+        return cls(tuple(res), to_world, degree, *packed, nodes, activation, offset, clamp, levels)
+
+    @classmethod
+    def nested(cls, grids: Sequence[SphericalGrid]) -> SphericalGrid:
+        """One field of grids of one level, the innermost first, each of twice the extent of the one before.
+
+        Raises:
+            MivolError: grids that differ in more than their place and values, or do not nest.
+        """
+        first, stored, values = grids[0], [], []
+        for level, grid in enumerate(grids):
+            same = ("res", "degree", "activation", "offset", "clamp")
+            if grid.levels != 1 or any(getattr(grid, name) != getattr(first, name) for name in same):
+                raise MivolError(f"grid {level} of a nested field is of another kind than the first: give grids of one kind.")
+            if not np.allclose(grid.to_world, first.level_to_world(level), rtol=0, atol=1e-9 * np.abs(grid.to_world).max()):
+                found = f"grid {level} of a nested field is not 2^{level} times the first one about its middle"
+                raise MivolError(f"{found}: place it so.")
+            density, sh = grid.values()
+            values.append((np.float32(density * 2.0**level), sh))
+            stored.append(grid.listed() + level * math.prod(first.res))
+        nodes = mi.UInt32(np.concatenate(stored).astype(np.uint32))
+        rows = [np.concatenate(part) for part in zip(*values, strict=True)]
+        how = first.activation, first.offset, first.clamp
+        return cls.from_rows(first.res, first.to_world, *rows, nodes, *how, len(grids))
+
+    def level(self, number: int) -> SphericalGrid:
+        """A level as a field of its own, in the whole of its box; what the level before covers is not cut out.
+
+        Raises:
+            MivolError: no such level.
+        """
+        if not 0 <= number < self.levels:
+            raise MivolError(f"level {number} of a field of {self.levels} was asked for; count from 0, the innermost.")
+        count, stored = math.prod(self.res), self.listed()
+        own = np.flatnonzero(stored // count == number)
+        density, sh = self.values()
+        nodes = None if self.nodes is None else mi.UInt32((stored[own] % count).astype(np.uint32))
+        scaled = np.float32(density[own] / 2.0**number)
+        how = self.activation, self.offset, self.clamp
+        return self.from_rows(self.res, self.level_to_world(number), scaled, sh[own], nodes, *how)
 
     def values(self) -> tuple[np.ndarray, np.ndarray]:
         """Raw densities (n,) and harmonics (n, basis, 3) at the nodes that have a row."""
@@ -198,7 +269,13 @@ class SphericalGrid:
         return np.array(dr.detach(self.density))[:n], rows[:n, : 3 * self.basis].reshape(n, self.basis, 3)
 
     def to_dense(self) -> tuple[np.ndarray, np.ndarray]:
-        """Raw densities (Z, Y, X) and harmonics (Z, Y, X, basis, 3), with the vacuum where nothing is stored."""
+        """Raw densities (Z, Y, X) and harmonics (Z, Y, X, basis, 3), with the vacuum where nothing is stored.
+
+        Raises:
+            MivolError: a nested field: its levels are grids, and it is none (:meth:`level`).
+        """
+        if self.levels > 1:
+            raise MivolError(f"a field of {self.levels} nested levels is no one grid: take one of its levels.")
         density, sh = self.values()
         if self.nodes is not None:
             where = np.array(self.nodes)
@@ -209,13 +286,13 @@ class SphericalGrid:
         return density.reshape(self.res), sh.reshape(*self.res, self.basis, 3)
 
     def sparse(self, keep: np.ndarray) -> SphericalGrid:
-        """The nodes for which ``keep`` (Z, Y, X) holds, of those that are stored."""
+        """The nodes for which ``keep`` (Z, Y, X), or (levels, Z, Y, X), holds, of those that are stored."""
         stored = self.listed()
         picked = np.flatnonzero(np.asarray(keep, bool).reshape(-1)[stored])
         density, sh = self.values()
         nodes = mi.UInt32(stored[picked].astype(np.uint32))
         return self.from_rows(
-            self.res, self.to_world, density[picked], sh[picked], nodes, self.activation, self.offset, self.clamp
+            self.res, self.to_world, density[picked], sh[picked], nodes, self.activation, self.offset, self.clamp, self.levels
         )
 
     def with_degree(self, degree: int) -> SphericalGrid:
@@ -226,23 +303,36 @@ class SphericalGrid:
         rows = np.zeros((len(sh), basis_size(degree), 3), np.float32)
         shared = min(sh.shape[1], rows.shape[1])
         rows[:, :shared] = sh[:, :shared]
-        return self.from_rows(self.res, self.to_world, density, rows, self.nodes, self.activation, self.offset, self.clamp)
+        how = self.activation, self.offset, self.clamp, self.levels
+        return self.from_rows(self.res, self.to_world, density, rows, self.nodes, *how)
 
     def listed(self) -> np.ndarray:
         """Flat numbers of the nodes that have a row, int64."""
-        return np.arange(math.prod(self.res)) if self.nodes is None else np.array(self.nodes).astype(np.int64)
+        return np.arange(self.places) if self.nodes is None else np.array(self.nodes).astype(np.int64)
 
     def node_rows(self) -> mi.UInt32:
-        """The row of each node of the grid, flat; made once (not inside a loop that is being traced)."""
+        """The row of each node of all levels, flat; made once (not inside a loop that is being traced)."""
         if self.links is None:
-            self.links = dr.arange(mi.UInt32, math.prod(self.res))
+            self.links = dr.arange(mi.UInt32, self.places)
             if self.nodes is not None:
-                self.links = dr.full(mi.UInt32, self.rows - 1, math.prod(self.res))
+                self.links = dr.full(mi.UInt32, self.rows - 1, self.places)
                 dr.scatter(self.links, dr.arange(mi.UInt32, self.rows - 1), self.nodes)
             dr.eval(self.links)
         return self.links
 
     # -- Where it lies -----------------------------------------------------------------------------------------------------
+
+    @property
+    def middle(self) -> np.ndarray:
+        """(3,) of all its boxes."""
+        return self.to_world[:3] @ np.array([0.5, 0.5, 0.5, 1])
+
+    def level_to_world(self, number: int) -> np.ndarray:
+        """(4, 4) float64, the unit cube to the box of a level."""
+        place = self.to_world.copy()
+        place[:3, :3] *= 2.0**number
+        place[:3, 3] = self.middle + 2.0**number * (self.to_world[:3, 3] - self.middle)
+        return place
 
     def own_frame(self) -> np.ndarray:
         """(3, 3) map of world directions to the grid's own frame: the inverse of the polar factor of ``to_world``."""
@@ -261,15 +351,18 @@ class SphericalGrid:
     def viewer(self, points: np.ndarray) -> Callable[[mi.UInt32, mi.UInt32], list[mi.Float]]:
         """The basis for directions from world points (V, 3) to nodes: a function of flat node numbers and of which point."""
         z, y, x = self.res
-        frame = self.own_frame()
+        frame, per_level = self.own_frame(), math.prod(self.res)
         linear = frame @ self.to_world[:3, :3] / np.array([x, y, z], np.float64)
-        # The corner of the box in the own frame, less the point: a difference in float64.
-        start = (frame @ (self.to_world[:3, 3] - np.asarray(points, np.float64)).T).T
+        # The middle of the boxes in the own frame, less the point: a difference in float64.
+        start = (frame @ (self.middle - np.asarray(points, np.float64)).T).T
         starts = mi.Float(np.append(np.float32(start).reshape(-1), np.float32(0)))
         rows = [[dr.opaque(mi.Float, float(v)) for v in row] for row in linear]
 
         def basis(node: mi.UInt32, view: mi.UInt32) -> list[mi.Float]:
-            q = [mi.Float(node % x) + 0.5, mi.Float(node // x % y) + 0.5, mi.Float(node // (x * y)) + 0.5]
+            inner = node % per_level
+            far = mi.Float(mi.UInt32(1) << (node // per_level))
+            places = (inner % x, x), (inner // x % y, y), (inner // (x * y), z)
+            q = [far * (mi.Float(place) + (0.5 - 0.5 * n)) for place, n in places]
             from_point = [dr.gather(mi.Float, starts, view * 3 + a) for a in range(3)]
             d = mi.Vector3f(*(_affine(row, q, s) for row, s in zip(rows, from_point, strict=True)))
             length = dr.norm(d)
@@ -285,6 +378,9 @@ class SphericalGrid:
         z, y, x = self.res
         rows = [[dr.opaque(mi.Float, float(v)) for v in row] for row in lattice_from_world(self.to_world, self.res)]
         q = [_affine(row, p, row[3]) for row in rows]
+        level, scale = self._level_of(q)
+        middles = [0.5 * (n - 1) for n in (x, y, z)]
+        q = [dr.fma(value - middle, scale, middle) for value, middle in zip(q, middles, strict=True)]
         inside = mi.Bool(active)
         pairs = []
         for value, n in zip(q, (x, y, z), strict=True):
@@ -297,7 +393,7 @@ class SphericalGrid:
         for k, wz in pairs[2]:
             for j, wy in pairs[1]:
                 for i, wx in pairs[0]:
-                    row = dr.gather(mi.UInt32, rows, mi.UInt32((k * y + j) * x + i), inside)
+                    row = dr.gather(mi.UInt32, rows, mi.UInt32(((level * z + k) * y + j) * x + i), inside)
                     w = wx * wy * wz
                     sigma = dr.fma(w, dr.gather(mi.Float, self.density, row, inside), sigma)
                     held = dr.gather(mi.ArrayXf, self.harmonics, row, inside, shape=(self.width, 1))
@@ -307,7 +403,17 @@ class SphericalGrid:
         if self.clamp:
             colour = [dr.maximum(c, 0) for c in colour]
         extinction, _ = self.act.value_and_slope(sigma)
-        return dr.select(inside, extinction, 0), mi.Color3f(*(dr.select(inside, c, 0) for c in colour))
+        return dr.select(inside, extinction * scale, 0), mi.Color3f(*(dr.select(inside, c, 0) for c in colour))
+
+    def _level_of(self, q: list[mi.Float]) -> tuple[mi.Int32, mi.Float]:
+        """The innermost level whose box holds points of the lattice, and 2^-level; the last one outside of all."""
+        level = mi.Int32(0)
+        for number in range(self.levels - 1):
+            out = mi.Bool(False)
+            for value, n in zip(q, self.res[::-1], strict=True):
+                out |= dr.abs(value - 0.5 * (n - 1)) > 0.5 * n * 2**number
+            level += dr.select(out, 1, 0)
+        return level, 1 / mi.Float(mi.Int32(1) << level)
 
     def with_values(self, density: mi.Float, harmonics: mi.Float) -> SphericalGrid:
         """The same nodes with other rows."""

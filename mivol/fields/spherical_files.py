@@ -16,7 +16,7 @@ from mivol.files.archive import check_memory, read_archive
 
 __all__ = ["load_field", "save_field"]
 
-FORMAT = "mivol spherical grid 1"
+FORMAT = "mivol spherical grid 2"
 
 SMALL = 2.0**-12
 """Below it the least step of a half float, 2^-24, is more than 2^-12 of the largest value."""
@@ -42,6 +42,7 @@ def save_field(path: str | Path, field: SphericalGrid, half: bool = True) -> Non
     if field.nodes is not None:
         arrays["nodes"] = np.array(field.nodes)
     about = {"format": FORMAT, "activation": field.activation, "offset": field.offset, "clamp": field.clamp}
+    about["levels"] = field.levels
     write_whole(path, lambda file: np.savez_compressed(file, **arrays, **{k: np.array(v) for k, v in about.items()}))
 
 
@@ -69,18 +70,19 @@ def load_field(path: str | Path) -> SphericalGrid:
 
 
 def _of_ours(name: str, arrays: dict[str, np.ndarray]) -> SphericalGrid:
-    needed = {"density", "sh", "res", "to_world", "activation", "offset", "clamp"} - arrays.keys()
+    needed = {"density", "sh", "res", "to_world", "activation", "offset", "clamp", "levels"} - arrays.keys()
     if needed:
         raise MivolError(f"{name} lacks {', '.join(sorted(needed))}; write it again.")
     _check_kinds(name, arrays)
     res = tuple(int(n) for n in arrays["res"])
     nodes = arrays.get("nodes")
-    n, shape = math.prod(res) if nodes is None else len(nodes), arrays["sh"].shape
+    levels = int(arrays["levels"])
+    n, shape = levels * math.prod(res) if nodes is None else len(nodes), arrays["sh"].shape
     if len(res) != 3 or arrays["density"].shape != (n,) or len(shape) != 3 or shape[0] != n or shape[2] != 3:
         found = f"{arrays['density'].shape} densities and {shape} harmonics"
         raise MivolError(f"{name} holds {found} for {n} nodes; write it again.")
     if nodes is not None:
-        _check_nodes(name, nodes, math.prod(res))
+        _check_nodes(name, nodes, levels * math.prod(res))
     return SphericalGrid.from_rows(
         res,
         arrays["to_world"],
@@ -90,12 +92,13 @@ def _of_ours(name: str, arrays: dict[str, np.ndarray]) -> SphericalGrid:
         str(arrays["activation"]),
         float(arrays["offset"]),
         bool(arrays["clamp"]),
+        levels,
     )
 
 
 KINDS = {
     "res": ("iu", (3,)), "to_world": ("f", (4, 4)), "density": ("f", None), "sh": ("f", None), "nodes": ("iu", None),
-    "activation": ("U", ()), "offset": ("fiu", ()), "clamp": ("biu", ()),
+    "activation": ("U", ()), "offset": ("fiu", ()), "clamp": ("biu", ()), "levels": ("iu", ()),
 }  # fmt: skip
 """Of each array the kinds of NumPy types, and the shape where there is one only."""
 
@@ -117,9 +120,10 @@ def _check_kinds(name: str, arrays: dict[str, np.ndarray]) -> None:
             raise MivolError(f"{name} holds {key} of type {array.dtype} and shape {array.shape}; write it again.")
         if array.dtype.kind == "f" and not np.isfinite(array).all():
             raise MivolError(f"{name} holds {key} with values that are not finite; write it again.")
-    res = [int(n) for n in arrays["res"]]
+    res = [int(arrays["levels"]), *(int(n) for n in arrays["res"])]
     if min(res) < 1 or math.prod(res) > MOST_NODES:
-        raise MivolError(f"{name} has a grid of {' x '.join(map(str, res))} nodes; 1 to {MOST_NODES} in all are expected.")
+        found = " x ".join(map(str, res[res[0] == 1 :]))
+        raise MivolError(f"{name} has a grid of {found} nodes; 1 to {MOST_NODES} in all are expected.")
     check_memory(Path(name), 4 * math.prod(res))  # the row of each node, which rays look up
 
 

@@ -36,6 +36,8 @@ def save_svox2(path: Path, field: SphericalGrid) -> None:
         MivolError: a field that svox2 would show otherwise (turned, another activation or offset, no clamp), coefficients
             beyond 65504, disk full.
     """
+    if field.levels > 1:
+        raise refusal(path, f"a field of {field.levels} nested levels", "one grid, as svox2 has", "write .npz")
     box = np.diagonal(field.to_world)[:3]
     shown = (field.activation in ("none", "relu"), field.offset == 0.5, field.clamp)
     if np.count_nonzero(field.to_world[:3, :3] - np.diag(box)) or box.min() <= 0:

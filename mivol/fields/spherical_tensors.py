@@ -41,6 +41,8 @@ def field_from_props(props: mi.Properties) -> tuple[SphericalGrid, mi.TensorXf, 
     field = load_field(str(mi.file_resolver().resolve(props["filename"])))
     how = {n: props.get(n, getattr(field, n)) for n in ("activation", "offset", "clamp")}
     field = SphericalGrid.from_rows(field.res, field.to_world, *field.values(), field.nodes, **how)
+    if field.levels > 1:
+        raise MivolError(f"{props['filename']} is nested; mivol_sh shows one grid: export one of its levels.")
     if "to_world" in props:
         field = replace(field, to_world=_place(props) @ field.to_world)
     values, coefficients = field.values()

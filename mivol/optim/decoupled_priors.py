@@ -21,7 +21,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mivol.fields.spherical import SphericalGrid
+from mivol.fields.spherical import SphericalGrid, is_covered
 from mivol.optim.strategy import Strategy, of
 
 
@@ -30,7 +30,8 @@ class Neighbours:
     """Rows of the nodes around those that have a row.
 
     Attributes:
-        after: UInt32 each, of the next node along x, y and z: the vacuum's where that is not stored, its own at the border.
+        after: UInt32 each, of the next node along x, y and z: the vacuum's where that is not stored, its own at the border and
+            where an inner level covers the next.
         before: of the last node along x, y and z: its own where that is not stored and at the border.
     """
 
@@ -47,7 +48,9 @@ class Neighbours:
         found = cls([], [])
         for stride, n in ((1, x), (x, y), (x * y, z)):
             place = node // stride % n
-            found.after.append(dr.gather(mi.UInt32, rows, dr.select(place < n - 1, node + stride, node)))
+            following = dr.select(place < n - 1, node + stride, node)
+            following = dr.select(is_covered(following, field.res), node, following)
+            found.after.append(dr.gather(mi.UInt32, rows, following))
             before = dr.gather(mi.UInt32, rows, dr.select(place > 0, node - stride, node))
             found.before.append(dr.select(before < dr.width(node), before, own))
         dr.eval(found)

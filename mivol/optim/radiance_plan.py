@@ -67,6 +67,10 @@ class FitPlan:
         occupancy_every: steps after which the map of occupied cells is made anew.
         sky: rows of a map of what is behind the field, learned with it (:mod:`mivol.fields.sky`); 0: the photographs' colour.
         sky_rate: first learning rate of the sky [radiance]; it must lead, or the field fills the box with what is behind.
+        sky_smooth: share of the way that a texel goes to its neighbours in a step, so that none stays as it began.
+        levels: nested boxes, each of twice the extent (:mod:`mivol.fields.spherical`).
+        near: derivatives of what is nearer to a camera than so many medians of the cameras' distances from the box's middle go
+            down with the square of the distance (Philip & Deschaintre 2023); 0: none do.
         random_background: photographs with alpha are seen over another colour each step, so that nothing stands in the air in
             the background's colour.
     """
@@ -91,6 +95,9 @@ class FitPlan:
     occupancy_every: int = 64
     sky: int = 0
     sky_rate: float = 0.1
+    sky_smooth: float = 0.0
+    levels: int = 1
+    near: float = 0.0
     random_background: bool = True
 
     @property
@@ -185,7 +192,7 @@ def bytes_of(plan: FitPlan, stage: Stage, box: np.ndarray, rows: int | None = No
         plan, stage, box: what is asked for.
         rows: nodes that are stored; None to estimate them.
     """
-    nodes = math.prod(place_grid(box, stage.longest)[0])
+    nodes = plan.levels * math.prod(place_grid(box, stage.longest)[0])
     rows = (nodes if stage is plan.stages[0] else int(FILLED * nodes)) if rows is None else rows
     copies = 2 + (dr.thread_count() if dr.backend_v(mi.Float) == dr.JitBackend.LLVM else 0)
     a_row = 12 * (1 + row_width(basis_size(plan.degree))) + 24

@@ -23,9 +23,10 @@ import numpy as np
 from scipy.ndimage import maximum_filter
 
 from mivol.errors import MivolError
+from mivol.fields.activation import activation_of
 from mivol.fields.resampling import resample_field
 from mivol.fields.sky import TEXEL, Sky
-from mivol.fields.spherical import SphericalGrid, basis_size, row_width
+from mivol.fields.spherical import SphericalGrid, basis_size, is_covered, row_width
 from mivol.optim.decoupled_priors import Neighbours, Rows
 from mivol.optim.problem import Reals, Refinement
 from mivol.optim.radiance_plan import FitPlan, place_grid
@@ -76,8 +77,10 @@ class RadianceProblem:
                 raise MivolError("a sky was asked for and the photographs have alpha, which says what is behind: sky = 0.")
             self.sky = Sky.even(self.plan.sky, self.batches.median())
         self.unit = float((self.box[1] - self.box[0]).max()) / 2
+        distances = np.linalg.norm(self.batches.origins - self.box.mean(axis=0), axis=1)
+        self.near = self.plan.near * float(np.median(distances))
         place, degree = place_grid(self.box, self.plan.stages[0].longest), self.plan.degree_at(0)
-        self.field = _fog(*place, degree, self.plan.start / self.unit)
+        self.field = _fog(*place, degree, self.plan.start / self.unit, self.plan.levels)
         self._first_row = 0
         self._look_around()
 
@@ -141,7 +144,7 @@ class RadianceProblem:
             through += self.plan.beta / count * batch.counted * (dr.rcp(T) - dr.rcp(1 - T))
         loss = dr.squared_norm(error) * (1 / 3)
         dr.eval(seen, by, through, loss)
-        backward(self._cells, source, model, seen, RayGradient(by, through))
+        backward(self._cells, source, model, seen, RayGradient(by, through), near=self.near)
         dr.eval(source.slope)
         density, harmonics = fold(self.field, self._cells, source, batch.origins)
         slopes = {"density": self._stored(density), "harmonics": self._stored(harmonics)}
@@ -168,6 +171,8 @@ class RadianceProblem:
             if not prior.is_spatial:
                 arrays[name] = prior.apply(arrays[name], where[name])
         # Evaluated here, or the neighbours that are read next would make the step be taken twice.
+        if self.sky is not None and self.plan.sky_smooth:
+            arrays["sky"] = self.sky.with_texels(arrays["sky"]).smoothed(self.plan.sky_smooth).texels
         dr.eval(arrays)
         for name, prior in self.plan.priors:
             if prior.is_spatial:
@@ -206,7 +211,8 @@ class RadianceProblem:
         self._look_around()
         # Derivatives go with the length of a ray in a voxel.
         shrink = max(old.res) / max(self.field.res)
-        nodes = " x ".join(str(n) for n in self.field.res)
+        counts = self.field.res if old.levels == 1 else (old.levels, *self.field.res)
+        nodes = " x ".join(str(n) for n in counts)
         says = f"refined to {nodes} nodes, of which {self.field.rows - 1} are kept"
         return Refinement(
             self.values(),
@@ -224,7 +230,8 @@ class RadianceProblem:
         self.update_occupancy()
 
     def seen_nodes(self) -> np.ndarray:
-        """Nodes (Z, Y, X) of cells to which some ray of the training views gives the plan's weight, and their neighbours."""
+        """Nodes (levels, Z, Y, X) of cells to which some ray of the training views gives the plan's weight, and their
+        neighbours."""
         cells, model = cells_of(self.field), model_of(self.field, self.plan.stop)
         weight = dr.zeros(mi.Float, max(cells.count, 1))
         shrink = max(self.batches.levels)
@@ -233,7 +240,7 @@ class RadianceProblem:
             brightest_weights(cells, source, model, self.batches.whole(shrink, view).rays, weight)
             dr.eval(weight)
             self.safe_point()
-        return maximum_filter(_nodes_of(self.field, cells, weight >= self.plan.keep_weight), 3)
+        return maximum_filter(_nodes_of(self.field, cells, weight >= self.plan.keep_weight), (1, 3, 3, 3))
 
     # -- On disk ------------------------------------------------------------------------------------------------------
 
@@ -249,7 +256,8 @@ class RadianceProblem:
         self.stage = int(arrays["stage"])
         place, degree = place_grid(self.box, self.plan.stages[self.stage].longest), self.plan.degree_at(self.stage)
         nodes = mi.UInt32(arrays["nodes"]) if "nodes" in arrays else None
-        self.field = SphericalGrid(*place, degree, reals["density"].array, reals["harmonics"].array, nodes)
+        values = reals["density"].array, reals["harmonics"].array
+        self.field = SphericalGrid(*place, degree, *values, nodes, levels=self.plan.levels)
         self.set(reals)
         self._look_around()
 
@@ -265,16 +273,22 @@ def _with_tensors(grid: SphericalGrid, reals: Reals) -> SphericalGrid:
     return grid.with_values(reals["density"].array, reals["harmonics"].array)
 
 
-def _fog(res: tuple[int, int, int], to_world: np.ndarray, degree: int, density: float) -> SphericalGrid:
-    """A thin grey fog that fills the box."""
-    rows = math.prod(res)
-    width = row_width(basis_size(degree))
-    return SphericalGrid(res, to_world, degree, dr.full(mi.Float, density, rows), dr.zeros(mi.Float, rows * width))
+def _fog(res: tuple[int, int, int], to_world: np.ndarray, degree: int, density: float, levels: int) -> SphericalGrid:
+    """A thin grey fog that fills the boxes of all levels."""
+    nodes, width = None, row_width(basis_size(degree))
+    if levels > 1:
+        nodes = dr.compress(~is_covered(dr.arange(mi.UInt32, levels * math.prod(res)), res))
+    rows = math.prod(res) if nodes is None else dr.width(nodes)
+    fog = dr.full(mi.Float, density, rows if nodes is None else rows + 1)
+    if nodes is not None:
+        dr.scatter(fog, mi.Float(activation_of("relu").vacuum), mi.UInt32(rows))
+    dr.eval(fog)
+    return SphericalGrid(res, to_world, degree, fog, dr.zeros(mi.Float, dr.width(fog) * width), nodes, levels=levels)
 
 
 def _nodes_of(field: SphericalGrid, cells: Cells, chosen: mi.Bool) -> np.ndarray:
-    """Nodes (Z, Y, X) of the listed cells that are chosen."""
-    mask = np.zeros(math.prod(field.res), bool)
+    """Nodes (levels, Z, Y, X) of the listed cells that are chosen."""
+    mask = np.zeros(field.places, bool)
     index = dr.compress(chosen)
     if cells.count and dr.width(index):
         keep = dr.zeros(mi.UInt8, field.rows)
@@ -282,4 +296,4 @@ def _nodes_of(field: SphericalGrid, cells: Cells, chosen: mi.Bool) -> np.ndarray
             dr.scatter(keep, mi.UInt8(1), row)
         listed = field.listed()
         mask[listed] = np.array(keep)[: len(listed)] > 0
-    return mask.reshape(field.res)
+    return mask.reshape(field.levels, *field.res)

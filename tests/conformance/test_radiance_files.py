@@ -11,6 +11,7 @@ import pytest
 from mivol.errors import MivolError
 from mivol.fields.spherical import SphericalGrid, degree_of
 from mivol.fields.spherical_files import load_field, save_field
+from mivol.fields.spherical_svox2 import save_svox2
 from mivol.files import archive
 
 CUBE = np.array([[2.0, 0, 0, -1], [0, 2, 0, -1], [0, 0, 2, -1], [0, 0, 0, 1]])
@@ -34,6 +35,19 @@ def test_what_was_saved_is_read(variant_rgb: str, tmp_path: Path, sparse: bool) 
     assert np.array_equal(back.to_world, CUBE) and np.array_equal(back.listed(), field.listed())
     for a, b in zip(back.values(), field.values(), strict=True):
         np.testing.assert_allclose(a, b, rtol=2.0**-11, atol=1e-7)  # the rounding of half floats
+
+
+def test_a_nested_field_is_read_as_it_was_saved(variant_rgb: str, tmp_path: Path) -> None:
+    density, sh = arrays()
+    outer = CUBE * 2
+    outer[3, 3] = 1
+    field = SphericalGrid.nested([SphericalGrid.from_dense(density, sh, place) for place in (CUBE, outer)])
+    save_field(tmp_path / "f.npz", field, half=False)
+    back = load_field(tmp_path / "f.npz")
+    assert back.levels == 2 and np.array_equal(back.listed(), field.listed())
+    assert all(np.array_equal(a, b) for a, b in zip(back.values(), field.values(), strict=True))
+    with pytest.raises(MivolError, match="2 nested levels"):
+        save_svox2(tmp_path / "f.svox2.npz", field)
 
 
 def test_values_that_half_floats_cannot_hold_stay(variant_rgb: str, tmp_path: Path) -> None:

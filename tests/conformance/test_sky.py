@@ -44,3 +44,13 @@ def test_derivatives_of_a_sky(variant_rgb: str) -> None:
 def test_a_sky_of_one_row_is_refused(variant_rgb: str) -> None:
     with pytest.raises(MivolError, match="1 rows .* at least 2"):
         Sky.even(1, 0.5)
+
+
+def test_smoothing_a_sky(variant_rgb: str) -> None:
+    """A share of the way to the mean of four neighbours: across the seam, and at a pole to the row beside it."""
+    image = np.float32(np.random.default_rng(3).random((6, 12, 3)))
+    around = np.roll(image, 1, 1) + np.roll(image, -1, 1)
+    around += np.concatenate([image[:1], image[:-1]]) + np.concatenate([image[1:], image[-1:]])
+    found = Sky.of_image(image).smoothed(0.25).image()
+    # A few roundings of numbers below 4.
+    np.testing.assert_allclose(found, image + 0.25 * (around / 4 - image), atol=1e-6)

@@ -57,17 +57,18 @@ def test_what_a_field_takes(tmp_path, kept):
     assert rows["this field, in memory"] == f"{sparse.bytes / 60:.3g}"
     assert rows["this field, its file"] == f"{(tmp_path / 'field.npz').stat().st_size / 60:.3g}"
     # Two digits of a MiB say nothing of so few bytes; of a thousand times as many they do.
-    big = SimpleNamespace(res=(256, 256, 256), listed=lambda: range(2**20), degree=0, width=4, bytes=3 * 2**20)
+    big = SimpleNamespace(places=256**3, listed=lambda: range(2**20), degree=0, width=4, bytes=3 * 2**20)
     sizes = {name: size for name, size, _ in photo_outputs.storage(big, tmp_path / "field.npz").rows}
     assert sizes["every node: four numbers"] == "256.00 MiB" and sizes["this field, in memory"] == "3.00 MiB"
 
 
 def test_densities_are_written_for_other_programs(tmp_path):
     (tmp_path / "volumes").mkdir()
-    found = photo_outputs.write_density(tmp_path, field())
+    found = photo_outputs.write_density(tmp_path, field(), 0)
     assert (found.path, found.role, found.size) == ("volumes/density.npz", "reconstruction", EDGES)
     for name in ("density.vol", "density.npz"):
         np.testing.assert_allclose(read_volume(tmp_path / "volumes" / name).values.ravel(), 1 + np.arange(60), rtol=1e-6)
+    assert photo_outputs.write_density(tmp_path, field(), 2).path == "volumes/density-level-2.npz"
 
 
 def test_distance_and_normals_are_pictures(tmp_path):

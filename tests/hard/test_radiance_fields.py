@@ -464,7 +464,7 @@ def test_a_ray_stops_in_the_cell_that_hides_enough() -> None:
     # Planes: the outer half voxel, then one voxel after the other.
     planes = 2 / n * (np.arange(n) + 0.5)
     end = planes[planes * sigma > -math.log(stop)][0]
-    assert float(seen.end[0]) == pytest.approx(end, rel=1e-6)
+    assert float(seen.last.t[0]) == pytest.approx(end, rel=1e-6)
     assert float(seen.T[0]) == pytest.approx(math.exp(-sigma * end), rel=1e-5)
     # What is left out is less than stop times the one colour there is.
     assert 0 < 0.5 * -math.expm1(-2 * sigma) - float(seen.colour.x[0]) < 0.5 * stop

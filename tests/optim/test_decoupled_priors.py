@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
 from ball_photos import CUBE
 
-from mivol.fields.spherical import SphericalGrid
+from mivol.fields.spherical import SphericalGrid, is_covered
 from mivol.optim.decoupled_priors import Neighbours, Rows, decay_view_dependence, smooth, sparsify
 
 
@@ -80,3 +81,21 @@ def test_smoothing_however_strong_makes_nothing_new(variant_rgb: str) -> None:
         assert before.min() - 1e-6 <= after.min() and after.max() <= before.max() + 1e-6
         assert after[-1] == before[-1]
     assert np.ptp(after) < 0.2 * np.ptp(before)
+
+
+def test_what_is_covered_is_no_neighbour(variant_rgb: str) -> None:
+    """An outer level ends at the inner box: the differences across it are 0, and no level is beside another in memory only."""
+    n = 8
+    grids = []
+    for level in range(2):
+        place = CUBE * 2.0**level
+        place[3, 3] = 1
+        grids.append(SphericalGrid.from_dense(np.full((n, n, n), 2.0 + 2 * level), np.zeros((n, n, n, 1, 3)), place))
+    field = SphericalGrid.nested(grids)
+    covered = np.array(is_covered(dr.arange(mi.UInt32, field.places), field.res))
+    field = field.sparse(~covered)
+    moved = mi.Float(field.density)
+    smoothed(moved, field, 0.05)
+    # Constants in each level have no variation: nothing moves, not even beside the vacuum that is not stored.
+    np.testing.assert_array_equal(np.array(moved)[:-1], np.array(field.density)[:-1])
+    assert covered.sum() == 2**3

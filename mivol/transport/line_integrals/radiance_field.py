@@ -10,6 +10,9 @@ Conventions. Density and colour are interpolated between nodes; then the activat
 clamped at 0. A source (:mod:`mivol.transport.line_integrals.radiance_source`) reads the corners of a cell. Distance is
 composited as a fourth colour, c = t.
 
+Nested fields are followed piece by piece (:mod:`mivol.transport.traversal.nested_path`), with the same visitors; a single grid
+is a field of one piece.
+
 Derivatives. Let r be the light from behind a cell times the derivative of the loss by it (one number a ray). The sweep goes
 from the last cell that was visited to the first, with r <- S + exp(-tau) r. So r is a sum of what lies behind; it is
 not the difference of the radiance and a prefix, and nothing is divided by a transmittance or an opacity. Nothing is added
@@ -21,7 +24,10 @@ References: Max 1995 (the integral); Fridovich-Keil, Yu et al. 2022 (the model).
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -31,8 +37,9 @@ from mivol.fields.spherical import SphericalGrid
 from mivol.transport.line_integrals.radiance_source import Source
 from mivol.transport.traversal.cell_quadrature import share_opacity
 from mivol.transport.traversal.interpolation import GAUSS, interpolate, weights
-from mivol.transport.traversal.lattice import Segment, clip
-from mivol.transport.traversal.occupied_cells import Cells, CellVisitor, march, reversed_from
+from mivol.transport.traversal.lattice import Segment
+from mivol.transport.traversal.nested_path import Piece, piece_of, pieces
+from mivol.transport.traversal.occupied_cells import Cells, CellVisitor, end_of, march, reversed_from
 
 __all__ = [
     "Model",
@@ -90,7 +97,7 @@ def cells_of(field: SphericalGrid) -> Cells:
             return mi.Bool(True) if field.nodes is None else _any([c != vacuum for c in corners])
         return _any([dr.gather(mi.Float, field.density, c) > below for c in corners])
 
-    return Cells.find(field.res, field.to_world, field.node_rows(), occupied)
+    return Cells.find(field.res, field.to_world, field.node_rows(), occupied, field.levels)
 
 
 def _any(masks: list[mi.Bool]) -> mi.Bool:
@@ -106,6 +113,21 @@ def model_of(field: SphericalGrid, stop: float = 0.0) -> Model:
 
 
 @dataclass
+class Place:
+    """A place on a ray.
+
+    Attributes:
+        piece: number of the piece; -1 where there is no such place.
+        t: distance from the start of the piece [the level's own lengths].
+        cell: the cell there (lower node).
+    """
+
+    piece: mi.Int32
+    t: mi.Float
+    cell: mi.Vector3i
+
+
+@dataclass
 class RenderedRays:
     """The result of a render, and the state from which a sweep back along the rays starts: a fixed number of values a ray.
 
@@ -115,9 +137,9 @@ class RenderedRays:
         distance: expected depth times opacity [length]: divide by 1 - T.
         tau: optical depth, as far as the ray was followed.
         before: optical depth in front of the last cell.
-        start, end: the interval that has extinction [lengths from the start of ``segment``].
-        last: the last cell visited (lower node).
-        segment: the ray in the box.
+        first: the ray's extinction begins there.
+        last: the last cell visited was left there.
+        rays: that were followed.
     """
 
     colour: mi.Color3f
@@ -125,10 +147,9 @@ class RenderedRays:
     distance: mi.Float
     tau: mi.Float
     before: mi.Float
-    start: mi.Float
-    end: mi.Float
-    last: mi.Vector3i
-    segment: Segment
+    first: Place
+    last: Place
+    rays: RayBundle
 
 
 @dataclass
@@ -181,25 +202,60 @@ def render(cells: Cells, source: Source, model: Model, rays: RayBundle, active: 
     Bias: O(h^4) in the size of a cell; at most ``model.stop`` of the brightest colour behind the stop. No variance.
     Cost: 9 packets a visited cell with ``Baked``. Memory: some 20 numbers a ray, nothing a cell.
     """
-    segment = clip(cells, rays.o, rays.d, 0, rays.t_max)
-    state = [mi.Float(0) for _ in range(6)] + [mi.Float(dr.inf)]
+    nowhere = Place(mi.Int32(-1), mi.Float(0), mi.Vector3i(0))
+    state = [*(mi.Float(0) for _ in range(6)), nowhere, nowhere]
 
-    def visit(state: list[mi.Float], here: CellVisitor, on: mi.Bool) -> list[mi.Float]:
-        *light, tau, before, start = state
+    def visit(state: list, here: CellVisitor, on: mi.Bool, number: mi.Int32, piece: Piece) -> list:
+        *light, tau, before, first, last = state
         at = _points(cells, source, model, here, on)
         share = share_opacity(here.dt, *at.sigma)
         T = dr.select(on, dr.exp(-tau), 0)
-        times = _times(segment, here)
+        times = _times(piece.segment, here, piece.scale)
         pairs = [*zip(*at.colour, strict=True), times]
         light = [dr.fma(T, share.sent(a, b), s) for s, (a, b) in zip(light, pairs, strict=True)]
-        some = on & (share.tau > 0)
+        begins = on & (share.tau > 0) & (first.piece < 0)
         before = dr.select(on, tau, before)
         tau = dr.select(on, tau + share.tau, tau)
-        return [*light, tau, before, dr.select(some, dr.minimum(start, here.t), start)]
+        first = Place(dr.select(begins, number, first.piece), dr.select(begins, here.t, first.t), first.cell)
+        return [*light, tau, before, first, last]
 
-    state, last, end = march(cells, segment, visit, state, active, lambda s: s[4] > model.depth)
-    *light, tau, before, start = state
-    return RenderedRays(mi.Color3f(*light[:3]), dr.exp(-tau), light[3], tau, before, start, end, last, segment)
+    def left(state: list, cell: mi.Vector3i, t: mi.Float, number: mi.Int32) -> list:
+        last, moved = state[-1], t > 0
+        there = zip((number, t, cell), (last.piece, last.t, last.cell), strict=True)
+        return [*state[:-1], Place(*(dr.select(moved, new, old) for new, old in there))]
+
+    state = _follow(cells, rays, visit, left, state, mi.Bool(active), lambda s: s[4] > model.depth)
+    *light, tau, before, first, last = state
+    return RenderedRays(mi.Color3f(*light[:3]), dr.exp(-tau), light[3], tau, before, first, last, rays)
+
+
+@dr.syntax
+def _follow(
+    cells: Cells,
+    rays: RayBundle,
+    visit: Callable[[Any, CellVisitor, mi.Bool, mi.Int32, Piece], Any],
+    left: Callable[[Any, mi.Vector3i, mi.Float, mi.Int32], Any],
+    state: Any,
+    active: mi.Bool,
+    until: Callable[[Any], mi.Bool],
+) -> Any:
+    """Visit the occupied cells of all pieces of rays, in order.
+
+    Args:
+        visit: as that of ``march``, with the number of the piece and the piece.
+        left: asked after each piece with the last cell visited and where the ray left it (0: none was visited).
+        until: lanes that need not go on.
+    """
+    count, number = dr.opaque(mi.Int32, pieces(cells)), mi.Int32(0)
+    while dr.hint(active & (number < count), label="pieces"):
+        piece = piece_of(cells, rays.o, rays.d, rays.t_max, number)
+        seen, cell, t = march(
+            cells, piece.segment, partial(visit, number=number, piece=piece), state, active, until, piece.level
+        )
+        state = left(seen, cell, t, number)
+        active &= ~until(state)
+        number += 1
+    return state
 
 
 def brightest_weights(cells: Cells, source: Source, model: Model, rays: RayBundle, weight: mi.Float) -> None:
@@ -207,20 +263,20 @@ def brightest_weights(cells: Cells, source: Source, model: Model, rays: RayBundl
 
     Cost: as :func:`render`, and one write a visited cell.
     """
-    segment = clip(cells, rays.o, rays.d, 0, rays.t_max)
 
-    def visit(tau: mi.Float, here: CellVisitor, on: mi.Bool) -> mi.Float:
+    def visit(tau: mi.Float, here: CellVisitor, on: mi.Bool, number: mi.Int32, piece: Piece) -> mi.Float:
         at = _points(cells, source, model, here, on)
         share = share_opacity(here.dt, *at.sigma)
         dr.scatter_reduce(dr.ReduceOp.Max, weight, dr.exp(-tau) * share.alpha, here.number, on)
         return dr.select(on, tau + share.tau, tau)
 
-    march(cells, segment, visit, mi.Float(0), mi.Bool(True), lambda tau: tau > model.depth)
+    active = dr.full(mi.Bool, True, dr.width(rays.d))
+    _follow(cells, rays, visit, lambda tau, *place: tau, mi.Float(0), active, lambda tau: tau > model.depth)
 
 
-def _times(segment: Segment, here: CellVisitor) -> tuple[mi.Float, mi.Float]:
+def _times(segment: Segment, here: CellVisitor, scale: mi.Float) -> tuple[mi.Float, mi.Float]:
     """Distances of the two points from the ray's origin."""
-    return tuple(segment.t0 + dr.fma(here.dt, g, here.t) for g in (GAUSS, 1 - GAUSS))
+    return tuple(scale * (segment.t0 + dr.fma(here.dt, g, here.t)) for g in (GAUSS, 1 - GAUSS))
 
 
 def backward(
@@ -230,6 +286,7 @@ def backward(
     rendered: RenderedRays,
     by: RayGradient,
     active: mi.Bool = True,
+    near: float = 0.0,
 ) -> None:
     """Add the derivatives of a scalar to those of the field.
 
@@ -238,17 +295,19 @@ def backward(
         rendered: from :func:`render`.
         by: derivatives of the scalar with respect to what was rendered.
         active: lanes to follow.
+        near: [length] derivatives by what is at a distance t below it are multiplied by (t / near)^2. That many more rays meet
+            in a cell so near to a camera, of that one camera; without this, matter grows before the lens. 0: none are.
 
-    Bias: none beyond that of :func:`render`: these are the derivatives of what it computes. Cost: as :func:`render`, and 8
-        packets written a visited cell.
+    Bias: none beyond that of :func:`render` where ``near`` is 0: these are the derivatives of what it computes. Cost: as
+        :func:`render`, and 8 packets written a visited cell.
     """
-    back = reversed_from(rendered.segment, rendered.last, rendered.end, rendered.start)
     by_colour, by_distance = [mi.Float(c) for c in by.colour], mi.Float(by.distance)
+    reach = None if near == 0 else dr.opaque(mi.Float, 1 / near)
     # State: r, the weighted light from behind; optical depth in front of the cell that was passed last; whether the cell ahead
     # is the last one of the ray.
     state = [mi.Float(by.T), mi.Float(rendered.before), mi.Bool(True)]
 
-    def visit(state: list, here: CellVisitor, on: mi.Bool) -> list:
+    def visit(state: list, here: CellVisitor, on: mi.Bool, back: Segment, scale: mi.Float) -> list:
         r, before, is_last = state
         # The points in the order of the ray: the sweep runs the other way.
         here = CellVisitor(here.number, here.points[::-1], here.t, here.dt)
@@ -256,13 +315,15 @@ def backward(
         share = share_opacity(here.dt, *at.sigma)
         before = dr.select(is_last, before, dr.maximum(before - share.tau, 0))
         front = dr.exp(-before)
-        far, near = _times(back, here)
-        ends = [_weigh(by_colour, c) for c in at.colour]
-        ends = [dr.fma(by_distance, t, e) for t, e in zip((_mirror(back, near), _mirror(back, far)), ends, strict=True)]
+        times = [_mirror(back, t, scale) for t in _times(back, here, scale)][::-1]
+        ends = [dr.fma(by_distance, t, _weigh(by_colour, c)) for t, c in zip(times, at.colour, strict=True)]
         slopes = share.slopes(*ends)
         hidden = share.half * share.T * r
         raw = [front * (s - hidden) * k for s, k in zip(slopes, at.sigma_slope, strict=True)]
         parts = [front * w for w in share.weights]
+        if reach is not None:
+            kept = [dr.minimum(dr.square(t * reach), 1) for t in times]
+            raw, parts = ([a * k for a, k in zip(values, kept, strict=True)] for values in (raw, parts))
         w1, w2 = (weights(p) for p in here.points)
         corners_raw = [a * raw[0] + b * raw[1] for a, b in zip(w1, w2, strict=True)]
         corners_colour = []
@@ -273,13 +334,35 @@ def backward(
         r = dr.select(on, share.sent(*ends) + share.T * r, r)
         return [r, dr.select(on, before, state[1]), is_last & ~on]
 
-    march(cells, back, visit, state, mi.Bool(active) & (rendered.end > rendered.start))
+    _follow_back(cells, rendered, visit, state, mi.Bool(active) & (rendered.first.piece >= 0))
+
+
+@dr.syntax
+def _follow_back(cells: Cells, rendered: RenderedRays, visit: Callable, state: Any, active: mi.Bool) -> Any:
+    """Visit the cells of rays from the last one that was visited to where extinction begins.
+
+    Args:
+        visit: as that of ``march``, with the reversed segment and the world's lengths in one of its own.
+    """
+    first, last, rays = rendered.first, rendered.last, rendered.rays
+    number = mi.Int32(last.piece)
+    while dr.hint(active & (number >= first.piece), label="pieces back"):
+        piece = piece_of(cells, rays.o, rays.d, rays.t_max, number)
+        end = end_of(piece.segment)
+        ends = number == last.piece
+        cell, t = dr.select(ends, last.cell, end), dr.select(ends, last.t, piece.segment.length)
+        back = reversed_from(piece.segment, cell, t, dr.select(number == first.piece, first.t, 0))
+        state, _, _ = march(
+            cells, back, partial(visit, back=back, scale=piece.scale), state, active, None, piece.level
+        )
+        number -= 1
+    return state
 
 
 def _weigh(by: list[mi.Float], colour: list[mi.Float]) -> mi.Float:
     return dr.fma(by[0], colour[0], dr.fma(by[1], colour[1], by[2] * colour[2]))
 
 
-def _mirror(back: Segment, t: mi.Float) -> mi.Float:
-    """Distance from the ray's origin of a point that lies ``back.t0 + t`` along the reversed ray."""
-    return 2 * back.t0 - t
+def _mirror(back: Segment, t: mi.Float, scale: mi.Float) -> mi.Float:
+    """Distance from the ray's origin of a point of the reversed ray; ``t`` counts on from where the ray was turned round."""
+    return 2 * scale * back.t0 - t

@@ -19,7 +19,7 @@ import numpy as np
 from mivol.errors import MivolError
 from mivol.space import check_affine, lattice_from_world
 
-__all__ = ["Lattice", "Mask3", "Segment", "clip", "locate", "piece_points", "slab", "split"]
+__all__ = ["Lattice", "Mask3", "Segment", "clip", "locate", "piece_points", "segment_between", "slab", "split"]
 
 
 Mask3 = Any
@@ -119,6 +119,13 @@ def clip(lattice: Lattice, o: mi.Point3f, d: mi.Vector3f, t_min: mi.Float, t_max
     n = lattice.res[::-1]
     high = tuple(k - 0.5 for k in n)
     q, v, t0, t1 = slab(lattice.from_world, (-0.5,) * 3, high, o, d, mi.Float64(t_min), mi.Float64(t_max))
+    return segment_between(q, v, n, t0, t1)
+
+
+def segment_between(
+    q: list[mi.Float64], v: list[mi.Float64], n: tuple[int, int, int], t0: mi.Float64, t1: mi.Float64
+) -> Segment:
+    """The part from t0 to t1 of the line q + t v in a lattice of n nodes (X, Y, Z); of length 0 where t1 <= t0."""
     hit = t1 > t0
     t0 = dr.select(hit, t0, 0)
     cell, frac = mi.Vector3i(), mi.Vector3f()

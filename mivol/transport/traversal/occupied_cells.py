@@ -5,6 +5,10 @@ axis, -1 to N - 1, border nodes are repeated. ``Cells.number`` holds for each ce
 cells; for a cell that is not occupied it holds minus the Chebyshev distance [cells] to the nearest that is, at most REACH. A
 ray may go that far in one step.
 
+Levels. A grid may be one of several nested ones (:mod:`mivol.fields.spherical`): all have the same nodes, and their cells are
+counted one level after the other. A walk goes through one of them; :mod:`mivol.transport.traversal.nested_path` says which
+piece of a ray lies in which.
+
 The search for the next occupied cell is an inner loop of its own. Lanes of a packet then wait for each other in the search,
 where a step costs one read, and visit cells, which costs far more, together.
 
@@ -13,6 +17,7 @@ References: Amanatides & Woo 1987 (the traversal); Cohen & Sheffer 1994 (proximi
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -28,7 +33,7 @@ from mivol.transport.traversal.empty_blocks import REACH, distances
 from mivol.transport.traversal.interpolation import GAUSS
 from mivol.transport.traversal.lattice import Segment
 
-__all__ = ["CellVisitor", "Cells", "march", "reversed_from"]
+__all__ = ["CellVisitor", "Cells", "end_of", "march", "reversed_from"]
 
 
 @dataclass
@@ -39,10 +44,12 @@ class Cells:
         res: nodes (Z, Y, X).
         to_world: (4, 4) float64, unit cube to world.
         count: number of occupied cells.
-        number: Int32 over the (Z + 1) (Y + 1) (X + 1) cells, x fastest: index of the cell in ``corners``, or minus a distance.
+        number: Int32 over the (Z + 1) (Y + 1) (X + 1) cells of each level, x fastest: index of the cell in ``corners``, or
+            minus a distance.
         corners: UInt32, 8 a cell: indices of its nodes in ``rows``; bits 0, 1, 2 of the corner are x, y, z.
         rows: UInt32, the rows of the nodes of listed cells, each once.
-        from_world: (3, 4) map from the world to lattice coordinates.
+        from_world: (3, 4) map from the world to lattice coordinates of the innermost level.
+        levels: nested grids.
     """
 
     res: tuple[int, int, int]
@@ -52,6 +59,12 @@ class Cells:
     corners: mi.UInt32
     rows: mi.UInt32
     from_world: list[list[mi.Float64]]
+    levels: int = 1
+
+    @property
+    def per_level(self) -> int:
+        """Number of cells of a level, occupied or not."""
+        return math.prod(n + 1 for n in self.res)
 
     @classmethod
     def find(
@@ -60,14 +73,16 @@ class Cells:
         to_world: np.ndarray,
         rows: mi.UInt32,
         occupied: Callable[[list[mi.UInt32]], mi.Bool],
+        levels: int = 1,
     ) -> Cells:
         """Find the occupied cells of a grid.
 
         Args:
             res: nodes (Z, Y, X).
             to_world: (4, 4) affine map of the unit cube.
-            rows: the row of each node, flat, x fastest.
+            rows: the row of each node of all levels, flat, x fastest.
             occupied: ``occupied(rows of the 8 corners) -> mask`` of cells to list; called once for all cells.
+            levels: nested grids.
 
         Raises:
             MivolError: more cells than a 32-bit number counts.
@@ -75,9 +90,10 @@ class Cells:
         Cost: 8 reads a cell and what ``occupied`` reads, then 6 REACH reads a cell for the distances.
         """
         z, y, x = res
-        total = (z + 1) * (y + 1) * (x + 1)
+        total = levels * (z + 1) * (y + 1) * (x + 1)
         if total >= 2**31:
-            raise MivolError(f"a grid of {x} x {y} x {z} nodes was given; its cells are counted up to 2^31: split it.")
+            found = f"{levels} x {x} x {y} x {z}" if levels > 1 else f"{x} x {y} x {z}"
+            raise MivolError(f"a grid of {found} nodes was given; its cells are counted up to 2^31: split it.")
         cell = dr.arange(mi.UInt32, total)
         # A mask of one lane stands for all cells.
         listed = dr.compress(occupied(_corner_rows(cell, rows, res)) & dr.full(mi.Bool, True, total))
@@ -96,7 +112,7 @@ class Cells:
         place = [[dr.opaque(mi.Float64, float(v)) for v in row] for row in lattice_from_world(to_world, res)]
         used, corners = _numbered(corners, dr.width(rows))
         dr.eval(number, corners, used)
-        return cls(res, to_world, count, number, corners, used, place)
+        return cls(res, to_world, count, number, corners, used, place, levels)
 
     def nodes(self, number: mi.UInt32, active: mi.Bool) -> list[mi.UInt32]:
         """The 8 corners of listed cells, in ``rows``."""
@@ -118,9 +134,10 @@ def _numbered(rows: mi.UInt32, most: int) -> tuple[mi.UInt32, mi.UInt32]:
 
 
 def _apart(cell: mi.UInt32, res: tuple[int, int, int]) -> tuple[mi.Int32, mi.Int32, mi.Int32]:
-    """Indices along x, y, z of cells from their flat index; index 0 is the outer half voxel."""
-    _, y, x = res
-    return mi.Int32(cell % (x + 1)), mi.Int32(cell // (x + 1) % (y + 1)), mi.Int32(cell // ((x + 1) * (y + 1)))
+    """Indices along x, y, z of cells within their level, from their flat index; index 0 is the outer half voxel."""
+    z, y, x = res
+    across, slab = x + 1, (x + 1) * (y + 1)
+    return mi.Int32(cell % across), mi.Int32(cell // across % (y + 1)), mi.Int32(cell // slab % (z + 1))
 
 
 def _between(place: mi.Int32, n: int) -> tuple[mi.Int32, mi.Int32]:
@@ -132,7 +149,8 @@ def _corner_rows(cell: mi.UInt32, rows: mi.UInt32, res: tuple[int, int, int]) ->
     """Rows of the 8 corners of cells, from their flat index."""
     z, y, x = res
     i, j, k = (_between(a, n) for a, n in zip(_apart(cell, res), (x, y, z), strict=True))
-    return [dr.gather(mi.UInt32, rows, mi.UInt32((c * y + b) * x + a)) for c in k for b in j for a in i]
+    level = mi.Int32(cell // math.prod(n + 1 for n in res)) * z
+    return [dr.gather(mi.UInt32, rows, mi.UInt32(((level + c) * y + b) * x + a)) for c in k for b in j for a in i]
 
 
 @dataclass
@@ -160,6 +178,7 @@ def march(
     state: Any,
     active: mi.Bool = True,
     until: Callable[[Any], mi.Bool] | None = None,
+    level: mi.Int32 | int = 0,
 ) -> tuple[Any, mi.Vector3i, mi.Float]:
     """Visit the occupied cells that a segment crosses, in order.
 
@@ -170,6 +189,7 @@ def march(
         state: any PyTree of Dr.Jit arrays.
         active: lanes to walk.
         until: ``until(state) -> mask`` of lanes that need not go on, asked after each cell; None to walk to the end.
+        level: that the segment lies in, in the level's own lattice coordinates.
 
     Returns:
         The last state, the last cell visited (lower node), and where the ray left it [length from the segment's start].
@@ -185,7 +205,7 @@ def march(
     sign = dr.select(ahead, mi.Vector3i(1), mi.Vector3i(-1))
     stride = sign * mi.Vector3i(1, x + 1, (x + 1) * (y + 1))
     first = segment.cell + 1
-    base = first.x + (x + 1) * (first.y + (y + 1) * first.z)
+    base = first.x + (x + 1) * (first.y + (y + 1) * (first.z + (z + 1) * level))
     most = dr.select(ahead, mi.Vector3i(x, y, z) - first, first)
     entry = dr.select(ahead, segment.frac, 1 - segment.frac)
     speed = dr.abs(segment.d)
@@ -231,6 +251,15 @@ def march(
         if until is not None:
             active &= ~until(state)
     return state, last, left
+
+
+def end_of(segment: Segment) -> mi.Vector3i:
+    """The cell (lower node) in which a segment ends, found in float64: one of the two that a face divides."""
+    cell = mi.Vector3i()
+    for a in range(3):
+        speed = mi.Float64(segment.d[a]) + mi.Float64(segment.d_rest[a])
+        cell[a] = segment.cell[a] + mi.Int32(dr.floor(dr.fma(speed, mi.Float64(segment.length), mi.Float64(segment.frac[a]))))
+    return cell
 
 
 def reversed_from(segment: Segment, cell: mi.Vector3i, t: mi.Float, until: mi.Float) -> Segment:
