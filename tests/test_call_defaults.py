@@ -1,5 +1,5 @@
 """What holds where a call says nothing: numbers and switches that a public function, method or class takes by itself, and
-what the flags of each verb of the command are without being given.
+what the flags of each verb of the command are without being given; and presets and sizes of benches, which are chosen by name.
 
 Whoever changes one changes the results of every script that is silent about it, and no formula tells that it is wrong. So they
 are recorded, module by module, and ``pytest tests/test_call_defaults.py --record`` records them anew: the change is seen then.
@@ -9,6 +9,7 @@ What is not recorded yet is not judged, and what is gone is left out of the next
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import importlib
 import inspect
 import json
@@ -17,6 +18,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
 
+import msgspec
 import pytest
 
 import mivol
@@ -62,6 +64,26 @@ def defaults_of(name: str) -> dict[str, dict]:
     return {called: plain for called, plain in sorted(found.items()) if plain}
 
 
+def settings(value: object) -> object:
+    """A table of settings (a dataclass or structure, or several by name) as JSON holds it; None where it is no such table."""
+    if isinstance(value, dict) and value:
+        tables = {str(name): settings(each) for name, each in value.items()}
+        return tables if None not in tables.values() else None
+    if isinstance(value, type) or not (dataclasses.is_dataclass(value) or isinstance(value, msgspec.Struct)):
+        return None
+    try:
+        return json.loads(json.dumps(msgspec.to_builtins(value)))
+    except (TypeError, ValueError):
+        return None
+
+
+def tables_of(name: str) -> dict[str, object]:
+    """Presets and sizes of a module, by the name of its constant."""
+    constants = {key: value for key, value in vars(importlib.import_module(name)).items() if key.isupper()}
+    found = {key: settings(value) for key, value in constants.items()}
+    return {key: {"table": table} for key, table in sorted(found.items()) if table is not None}
+
+
 def flags() -> dict[str, dict]:
     """What each flag of each verb is where it is not given, but for those that are nothing then."""
     (verbs,) = (a for a in parser()._actions if isinstance(a, argparse._SubParsersAction))
@@ -74,7 +96,7 @@ def flags() -> dict[str, dict]:
 
 @pytest.mark.usefixtures("variant_rgb")
 def test_defaults_are_as_recorded(record: bool) -> None:
-    found = {name: defaults_of(name) for name in MODULES} | {"the command": flags()}
+    found = {name: defaults_of(name) | tables_of(name) for name in MODULES} | {"the command": flags()}
     if record:
         text = json.dumps({name: kept for name, kept in found.items() if kept}, indent=1)
         RECORDED.write_text(text + "\n", encoding="utf-8")

@@ -6,6 +6,7 @@ import math
 from dataclasses import replace
 from pathlib import Path
 
+import mitsuba as mi
 import numpy as np
 import pytest
 
@@ -29,6 +30,15 @@ def test_errors_are_those_of_what_counts() -> None:
     assert found["variance_x_time"] == pytest.approx(27)
     # means of two: variances 1 and 9
     assert found["agreement"]["z"] == pytest.approx(2 / math.sqrt(10))
+
+
+@pytest.mark.parametrize("name", RUNGS)
+def test_only_what_shines_has_no_rival(variant_rgb: str, name: str) -> None:
+    """Mitsuba's own media cannot shine; the others are rendered by both, and none of them has emission."""
+    shines = name == "emission"
+    assert RUNGS[name].rivals("volpath") == (("mivol",) if shines else ("mivol", "volpath"))
+    keys = [key for key, _ in mi.traverse(RUNGS[name].scene(np.full((2, 3, 4), 0.5, np.float32), 4))]
+    assert any("emission" in key for key in keys) == shines
 
 
 @pytest.mark.slow

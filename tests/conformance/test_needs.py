@@ -415,9 +415,12 @@ SENSORS = {
 
 @pytest.mark.parametrize("name", SENSORS)
 def test_a_camera_is_inside_where_its_rays_may_begin_in_a_boundary(name: str) -> None:
-    """A ball of radius 1, which is traced: rays begin at the near plane, up to four times its distance to the side."""
+    """A ball of radius 1, which is traced, with or without a box: rays begin up to four near planes to the side of the eye."""
     make, inside = SENSORS[name]
     fog = medium("homogeneous", 1.0)
-    for shape, expected in ((ball_of(fog, (0, 0, 0), 1.0), inside), (box_of(fog, PLACE), False)):
-        scene = mi.load_dict({"type": "scene", "shape": shape, "sensor": make()})
+    ball, box = ball_of(fog, (0, 0, 0), 1.0), box_of(fog, PLACE)
+    # Equal media would be merged into one, which is traced for both.
+    apart = box_of(medium("homogeneous", 2.0), scenes.centred(2 * np.eye(3), (8, 0, 0)))
+    for shapes, expected in (({"ball": ball}, inside), ({"box": box}, False), ({"ball": ball, "box": apart}, inside)):
+        scene = mi.load_dict({"type": "scene", **shapes, "sensor": make()})
         assert find_needs(scene, scene.sensors()[0], survey_scene(scene)).camera_inside == expected
