@@ -68,7 +68,7 @@ BOXES = {"cameras": lambda photos: photos, "silhouettes": _about_silhouettes}
 
 def notes(photos: Photos, judged: Photos | None = None) -> list[str]:
     """What a reader must know of the photographs."""
-    found = [f"Colours are {photos.space} code values; in a scene mivol_sh shows them as they are."]
+    found = [f"Colours are {photos.space} code values; in a scene mivol_sh shows the radiance that they stand for."]
     if any(space_of(frame.file) == "linear" for frame in photos.survey.frames):
         found.append("The light of OpenEXR photographs was encoded; what is above 1 counts as 1.")
     if judged is not None:

@@ -17,6 +17,9 @@ through it and the size of its numbers are those of level 0,
 
 so that a rate or a prior that suits one level suits all. Nodes are counted level by level.
 
+Colours are what photographs show: code values of sRGB (``space`` is ``srgb``), which rays composite as they are. A field of
+``linear`` radiance is its own light; :func:`radiance_of_codes` makes light of codes, where a scene shows a field among others.
+
 Storage. Rows, one a node: ``density`` apart from ``harmonics``, whose rows are [basis][rgb], filled up to a multiple of 4. A
 dense grid has a row for each node in Z Y X order; a sparse one lists its ``nodes`` in that order and ends in one more row, the
 vacuum around them.
@@ -41,12 +44,15 @@ from mivol.files.notebook import slices_html
 from mivol.shown import briefly
 from mivol.space import check_affine, lattice_from_world
 
-__all__ = ["MAX_DEGREE", "SphericalGrid", "basis_size", "degree_of", "is_covered", "row_width"]
+__all__ = ["MAX_DEGREE", "SPACES", "SphericalGrid", "basis_size", "degree_of", "is_covered", "radiance_of_codes", "row_width"]
 
 MAX_DEGREE = 4
 
 HOMOGENEOUS = ("none", "relu")
 """Activations of nested fields: a density n times as large is an extinction n times as large."""
+
+SPACES = ("srgb", "linear")
+"""What the colours of a field may be, as of photographs (:mod:`mivol.photos.dataset`)."""
 
 
 def basis_size(degree: int) -> int:
@@ -97,6 +103,7 @@ class SphericalGrid:
         offset: added to the sum of the harmonics.
         clamp: whether colours below 0 are shown as 0.
         levels: boxes that are nested, each of twice the extent; ``res`` and ``to_world`` are those of the innermost.
+        space: what colours are: "srgb" (code values, as in photographs) or "linear" (radiance).
         links: the row of each node, once :meth:`node_rows` has made it.
     """
 
@@ -110,6 +117,7 @@ class SphericalGrid:
     offset: float = 0.5
     clamp: bool = True
     levels: int = 1
+    space: str = "srgb"
     links: mi.UInt32 | None = None
 
     def _repr_html_(self) -> str:
@@ -122,6 +130,8 @@ class SphericalGrid:
             known = " or ".join(HOMOGENEOUS)
             raise MivolError(f"a nested field with the activation {self.activation} was given; {known} are expected.")
         activation_of(self.activation)
+        if self.space not in SPACES:
+            raise MivolError(f"the space of a field's colours is {self.space!r}; {' or '.join(SPACES)} is expected.")
         expected = self.rows
         if dr.width(self.density) != expected or dr.width(self.harmonics) != expected * self.width:
             raise MivolError(
@@ -169,6 +179,7 @@ class SphericalGrid:
         activation: str = "relu",
         offset: float = 0.5,
         clamp: bool = True,
+        space: str = "srgb",
     ) -> SphericalGrid:
         """Make a field of arrays.
 
@@ -177,7 +188,7 @@ class SphericalGrid:
             sh: (Z, Y, X, basis, 3).
             to_world: (4, 4) affine map of the unit cube.
             keep: (Z, Y, X) bool, the nodes to store; None for a dense field.
-            activation, offset, clamp: as the attributes.
+            activation, offset, clamp, space: as the attributes.
 
         Raises:
             MivolError: shapes that do not agree, a value that is not finite, or a negative one without an activation.
@@ -190,7 +201,7 @@ class SphericalGrid:
         picked = slice(None) if keep is None else np.flatnonzero(keep)
         nodes = None if keep is None else mi.UInt32(picked.astype(np.uint32))
         flat = density.reshape(-1)[picked], sh.reshape(-1, *sh.shape[3:])[picked]
-        return cls.from_rows(density.shape, to_world, *flat, nodes, activation, offset, clamp)
+        return cls.from_rows(density.shape, to_world, *flat, nodes, activation, offset, clamp, space=space)
 
     @classmethod
     def from_rows(
@@ -204,6 +215,7 @@ class SphericalGrid:
         offset: float = 0.5,
         clamp: bool = True,
         levels: int = 1,
+        space: str = "srgb",
     ) -> SphericalGrid:
         """Make a field of the values (n,) and (n, basis, 3) at its nodes; a sparse one gets its row of vacuum.
 
@@ -221,7 +233,7 @@ class SphericalGrid:
         rows[: len(density), : 3 * sh.shape[1]] = sh.reshape(len(density), -1)
         flat = np.append(density, np.float32(act.vacuum)) if vacuum else density
         packed = mi.Float(np.ascontiguousarray(flat)), mi.Float(rows.reshape(-1))
-        return cls(tuple(res), to_world, degree, *packed, nodes, activation, offset, clamp, levels)
+        return cls(tuple(res), to_world, degree, *packed, nodes, activation, offset, clamp, levels, space)
 
     @classmethod
     def nested(cls, grids: Sequence[SphericalGrid]) -> SphericalGrid:
@@ -232,7 +244,7 @@ class SphericalGrid:
         """
         first, stored, values = grids[0], [], []
         for level, grid in enumerate(grids):
-            same = ("res", "degree", "activation", "offset", "clamp")
+            same = ("res", "degree", "activation", "offset", "clamp", "space")
             if grid.levels != 1 or any(getattr(grid, name) != getattr(first, name) for name in same):
                 raise MivolError(f"grid {level} of a nested field is of another kind than the first: give grids of one kind.")
             if not np.allclose(grid.to_world, first.level_to_world(level), rtol=0, atol=1e-9 * np.abs(grid.to_world).max()):
@@ -244,7 +256,7 @@ class SphericalGrid:
         nodes = mi.UInt32(np.concatenate(stored).astype(np.uint32))
         rows = [np.concatenate(part) for part in zip(*values, strict=True)]
         how = first.activation, first.offset, first.clamp
-        return cls.from_rows(first.res, first.to_world, *rows, nodes, *how, len(grids))
+        return cls.from_rows(first.res, first.to_world, *rows, nodes, *how, len(grids), first.space)
 
     def level(self, number: int) -> SphericalGrid:
         """A level as a field of its own, in the whole of its box; what the level before covers is not cut out.
@@ -260,7 +272,7 @@ class SphericalGrid:
         nodes = None if self.nodes is None else mi.UInt32((stored[own] % count).astype(np.uint32))
         scaled = np.float32(density[own] / 2.0**number)
         how = self.activation, self.offset, self.clamp
-        return self.from_rows(self.res, self.level_to_world(number), scaled, sh[own], nodes, *how)
+        return self.from_rows(self.res, self.level_to_world(number), scaled, sh[own], nodes, *how, space=self.space)
 
     def values(self) -> tuple[np.ndarray, np.ndarray]:
         """Raw densities (n,) and harmonics (n, basis, 3) at the nodes that have a row."""
@@ -291,9 +303,8 @@ class SphericalGrid:
         picked = np.flatnonzero(np.asarray(keep, bool).reshape(-1)[stored])
         density, sh = self.values()
         nodes = mi.UInt32(stored[picked].astype(np.uint32))
-        return self.from_rows(
-            self.res, self.to_world, density[picked], sh[picked], nodes, self.activation, self.offset, self.clamp, self.levels
-        )
+        how = self.activation, self.offset, self.clamp, self.levels, self.space
+        return self.from_rows(self.res, self.to_world, density[picked], sh[picked], nodes, *how)
 
     def with_degree(self, degree: int) -> SphericalGrid:
         """The same field with harmonics up to another degree: new ones are 0, dropped ones are lost."""
@@ -303,7 +314,7 @@ class SphericalGrid:
         rows = np.zeros((len(sh), basis_size(degree), 3), np.float32)
         shared = min(sh.shape[1], rows.shape[1])
         rows[:, :shared] = sh[:, :shared]
-        how = self.activation, self.offset, self.clamp, self.levels
+        how = self.activation, self.offset, self.clamp, self.levels, self.space
         return self.from_rows(self.res, self.to_world, density, rows, self.nodes, *how)
 
     def listed(self) -> np.ndarray:
@@ -415,9 +426,24 @@ class SphericalGrid:
             level += dr.select(out, 1, 0)
         return level, 1 / mi.Float(mi.Int32(1) << level)
 
+    def eval_radiance(self, p: mi.Point3f, d: mi.Vector3f, active: mi.Bool = True) -> mi.Color3f:
+        """Radiance at world points, seen along unit world directions, whatever the colours are stored as; 0 outside the box."""
+        colour = self.eval(p, d, active)[1]
+        return colour if self.space == "linear" else mi.Color3f(*(radiance_of_codes(c) for c in colour))
+
     def with_values(self, density: mi.Float, harmonics: mi.Float) -> SphericalGrid:
         """The same nodes with other rows."""
         return replace(self, density=density, harmonics=harmonics)
+
+
+def radiance_of_codes(code: mi.Float) -> mi.Float:
+    """The light of an sRGB code value: the curve of IEC 61966-2-1, followed on above 1 and, straight, below 0.
+
+    The same curve as :func:`mivol.photos.picture.decode_srgb`, with derivatives.
+    """
+    # The power is taken of the codes that use it only: at 0 its derivative would be right, below it is not a number.
+    bent = dr.power((dr.maximum(code, 0.04045) + 0.055) / 1.055, 2.4)
+    return dr.select(code <= 0.04045, code / 12.92, bent)
 
 
 def _affine(row: list[mi.Float], v: mi.Vector3f, rest: mi.Float) -> mi.Float:

@@ -43,6 +43,7 @@ def save_field(path: str | Path, field: SphericalGrid, half: bool = True) -> Non
         arrays["nodes"] = np.array(field.nodes)
     about = {"format": FORMAT, "activation": field.activation, "offset": field.offset, "clamp": field.clamp}
     about["levels"] = field.levels
+    about["space"] = field.space
     write_whole(path, lambda file: np.savez_compressed(file, **arrays, **{k: np.array(v) for k, v in about.items()}))
 
 
@@ -70,7 +71,7 @@ def load_field(path: str | Path) -> SphericalGrid:
 
 
 def _of_ours(name: str, arrays: dict[str, np.ndarray]) -> SphericalGrid:
-    needed = {"density", "sh", "res", "to_world", "activation", "offset", "clamp", "levels"} - arrays.keys()
+    needed = {"density", "sh", "res", "to_world", "activation", "offset", "clamp", "levels", "space"} - arrays.keys()
     if needed:
         raise MivolError(f"{name} lacks {', '.join(sorted(needed))}; write it again.")
     _check_kinds(name, arrays)
@@ -93,12 +94,14 @@ def _of_ours(name: str, arrays: dict[str, np.ndarray]) -> SphericalGrid:
         float(arrays["offset"]),
         bool(arrays["clamp"]),
         levels,
+        str(arrays["space"]),
     )
 
 
 KINDS = {
     "res": ("iu", (3,)), "to_world": ("f", (4, 4)), "density": ("f", None), "sh": ("f", None), "nodes": ("iu", None),
     "activation": ("U", ()), "offset": ("fiu", ()), "clamp": ("biu", ()), "levels": ("iu", ()),
+    "space": ("U", ()),
 }  # fmt: skip
 """Of each array the kinds of NumPy types, and the shape where there is one only."""
 

@@ -33,8 +33,8 @@ def save_svox2(path: Path, field: SphericalGrid) -> None:
     """Write a checkpoint, whole or not at all; coefficients are rounded to half floats, as svox2 does.
 
     Raises:
-        MivolError: a field that svox2 would show otherwise (turned, another activation or offset, no clamp), coefficients
-            beyond 65504, disk full.
+        MivolError: a field that svox2 would show otherwise (turned, another activation or offset, no clamp, radiance),
+            coefficients beyond 65504, disk full.
     """
     if field.levels > 1:
         raise refusal(path, f"a field of {field.levels} nested levels", "one grid, as svox2 has", "write .npz")
@@ -42,6 +42,8 @@ def save_svox2(path: Path, field: SphericalGrid) -> None:
     shown = (field.activation in ("none", "relu"), field.offset == 0.5, field.clamp)
     if np.count_nonzero(field.to_world[:3, :3] - np.diag(box)) or box.min() <= 0:
         raise refusal(path, "a turned or mirrored field", "an axis-aligned box, as svox2 has", "write .npz")
+    if field.space != "srgb":
+        raise refusal(path, "colours of linear radiance", "code values, as svox2 shows them", "write .npz")
     if not all(shown):
         found = f"activation {field.activation}, offset {field.offset:g}, clamp {field.clamp}"
         raise refusal(path, found, "relu, 0.5 and True, as svox2 shows fields", "write .npz")

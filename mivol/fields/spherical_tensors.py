@@ -20,6 +20,10 @@ from mivol.fields.spherical_files import load_field
 __all__ = ["dense_density", "field_from_props", "with_tensors"]
 
 
+SHOWN = ("activation", "offset", "clamp", "space")
+"""How values are shown: parameters of the plugin, kept in files. Tensors are radiance unless told otherwise."""
+
+
 def field_from_props(props: mi.Properties) -> tuple[SphericalGrid, mi.TensorXf, mi.TensorXf]:
     """Read a field from plugin parameters: ``filename``, or ``density`` and ``sh``; ``to_world`` and how values are shown.
 
@@ -35,14 +39,14 @@ def field_from_props(props: mi.Properties) -> tuple[SphericalGrid, mi.TensorXf, 
         raise MivolError(f"mivol_sh was given {found}; give filename, or density and sh.")
     if tensors:
         density, sh = (props[n] for n in tensors)
-        how = {n: props[n] for n in ("activation", "offset", "clamp") if n in props}
+        how = {"space": "linear"} | {n: props[n] for n in SHOWN if n in props}
         field = SphericalGrid.from_dense(np.array(dr.detach(density)), np.array(dr.detach(sh)), _place(props), **how)
         return field, density, sh
     field = load_field(str(mi.file_resolver().resolve(props["filename"])))
-    how = {n: props.get(n, getattr(field, n)) for n in ("activation", "offset", "clamp")}
-    field = SphericalGrid.from_rows(field.res, field.to_world, *field.values(), field.nodes, **how)
     if field.levels > 1:
         raise MivolError(f"{props['filename']} is nested; mivol_sh shows one grid: export one of its levels.")
+    how = {n: props.get(n, getattr(field, n)) for n in SHOWN}
+    field = SphericalGrid.from_rows(field.res, field.to_world, *field.values(), field.nodes, **how)
     if "to_world" in props:
         field = replace(field, to_world=_place(props) @ field.to_world)
     values, coefficients = field.values()

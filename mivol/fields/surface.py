@@ -18,6 +18,7 @@ import numpy as np
 
 from mivol.errors import MivolError
 from mivol.fields.spherical import SphericalGrid
+from mivol.files import encode_srgb
 from mivol.files.mesh import Mesh
 
 __all__ = ["INVERSES", "level_of", "surface_of"]
@@ -99,4 +100,4 @@ def _colours(field: SphericalGrid, points: np.ndarray, normals: np.ndarray) -> n
     inside = np.clip(points @ inverse[:3, :3].T + inverse[:3, 3], 1e-6, 1 - 1e-6) @ field.to_world[:3, :3].T
     p, d = (np.ascontiguousarray(v.T, np.float32) for v in (inside + field.to_world[:3, 3], -normals))
     _, colour = field.eval(mi.Point3f(*p), mi.Vector3f(*d))
-    return np.clip(np.array(colour).T, 0, 1)
+    return np.clip(np.array(colour).T, 0, 1) if field.space == "srgb" else encode_srgb(np.array(colour).T)

@@ -79,6 +79,8 @@ class SphericalVolume(mi.Volume):
         activation: none, relu, softplus or exp, of the interpolated density. Default relu, or the file's.
         offset: added to colours. Default 0.5, or the file's.
         clamp: show colours below 0 as 0. Default true, or the file's.
+        space: what the colours are: linear (radiance) or srgb (code values, as fits of photographs have them), which are shown
+            as the radiance that they stand for. Default linear, or the file's.
 
     ``density`` and ``sh`` are its parameters; a sparse field has them as (nodes, 1) and (nodes, basis, 3).
     """
@@ -110,14 +112,14 @@ class SphericalVolume(mi.Volume):
         return self.mivol_field.to_world
 
     def eval(self, it: mi.Interaction3f, active: mi.Bool = True) -> mi.Spectrum:
-        colour = self.mivol_field.eval(it.p, -_towards(it), active)[1]
+        colour = self.mivol_field.eval_radiance(it.p, -_towards(it), active)
         return mi.Spectrum(mi.luminance(colour)) if mi.is_monochromatic else mi.Spectrum(colour)
 
     def eval_1(self, it: mi.Interaction3f, active: mi.Bool = True) -> mi.Float:
         return self.mivol_field.eval(it.p, -_towards(it), active)[0]
 
     def eval_3(self, it: mi.Interaction3f, active: mi.Bool = True) -> mi.Vector3f:
-        return mi.Vector3f(self.mivol_field.eval(it.p, -_towards(it), active)[1])
+        return mi.Vector3f(self.mivol_field.eval_radiance(it.p, -_towards(it), active))
 
     def max(self) -> float:
         raise MivolError("a mivol_sh was given as an extinction; give it as the emission of a mivol_medium, and nothing else.")

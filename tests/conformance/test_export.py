@@ -15,7 +15,7 @@ from mivol.fields.export import EXPORTS, export_field
 from mivol.fields.spherical import SphericalGrid
 from mivol.fields.spherical_files import load_field, save_field
 from mivol.fields.surface import INVERSES, level_of, surface_of
-from mivol.files import read_volume
+from mivol.files import encode_srgb, read_volume
 from mivol.files.mesh import Mesh, read_ply, write_mesh
 from scenes import centred, rotation
 
@@ -31,7 +31,9 @@ def nodes(place: np.ndarray, res: tuple[int, int, int] = RES) -> np.ndarray:
     return np.stack(grid[::-1], axis=-1) @ place[:3, :3].T + place[:3, 3]
 
 
-def ball(place: np.ndarray = PLACE, activation: str = "relu", keep: bool = False) -> SphericalGrid:
+def ball(
+    place: np.ndarray = PLACE, activation: str = "relu", keep: bool = False, space: str = "srgb"
+) -> SphericalGrid:
     """A ball of RADIUS about the origin: 10 more extinction than the level 4 for each unit of length inside.
 
     Its degree-1 coefficients make what is seen along -z redder than along +z.
@@ -42,7 +44,7 @@ def ball(place: np.ndarray = PLACE, activation: str = "relu", keep: bool = False
     sh = np.zeros((*RES, 4, 3), np.float32)
     sh[..., 0, :] = (0.0, 0.3, -0.6)
     sh[..., 2, 0] = -0.5
-    return SphericalGrid.from_dense(raw, sh, place, inside > -0.3 if keep else None, activation)
+    return SphericalGrid.from_dense(raw, sh, place, inside > -0.3 if keep else None, activation, space=space)
 
 
 def volume_of(mesh: Mesh) -> float:
@@ -191,6 +193,13 @@ def test_a_checkpoint_of_svox2(variant_rgb: None, tmp_path: Path) -> None:
         assert mine == pytest.approx(theirs, rel=2**-11)
 
 
+def test_meshes_hold_codes_whatever_the_field_holds(variant_rgb: None) -> None:
+    """Viewers show the colours of a mesh as they are: radiance is encoded."""
+    codes, light = (surface_of(ball(space=space)).colours for space in ("srgb", "linear"))
+    np.testing.assert_allclose(light, encode_srgb(codes), atol=1e-6)
+    assert np.ptp(codes) > 0.2
+
+
 @pytest.mark.parametrize(
     ("name", "change", "level", "sentence"),
     [
@@ -201,6 +210,7 @@ def test_a_checkpoint_of_svox2(variant_rgb: None, tmp_path: Path) -> None:
         ("a.ply", {}, 50.0, "no node of the field reaches the extinction 50, only"),
         ("a.vol", {"place": centred(rotation([0.0, 0.0, 1.0], 0.5))}, None, "a rotated, sheared or mirrored to_world"),
         ("a.svox2.npz", {"place": centred(rotation([0.0, 0.0, 1.0], 0.5))}, None, "found a turned or mirrored field"),
+        ("a.svox2.npz", {"space": "linear"}, None, "found colours of linear radiance, expected code values"),
         ("a.svox2.npz", {"activation": "exp"}, None, "found activation exp, offset 0.5, clamp True"),
     ],
 )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import drjit as dr
@@ -10,8 +11,11 @@ import numpy as np
 import pytest
 from scattering_scenes import cases
 
-from mivol.fields.spherical import SphericalGrid
-from mivol.fields.spherical_files import save_field
+from mivol.errors import MivolError
+from mivol.fields.spherical import SphericalGrid, radiance_of_codes
+from mivol.fields.spherical_files import load_field, save_field
+from mivol.files import encode_srgb
+from mivol.photos.picture import decode_srgb
 from scenes import box_of, camera, centred, refused, render, rotation, sky, tensor, transform
 
 PLACE = centred(2 * np.eye(3))
@@ -197,7 +201,7 @@ def test_a_sparse_field_renders_as_the_dense_one(variant_rgb: None, tmp_path: Pa
     density[:, :2], sh[:, :2] = 0, 0
     keep = np.ones(density.shape[:3], bool)
     keep[:, :2] = False
-    dense = SphericalGrid.from_dense(density, sh, PLACE)
+    dense = SphericalGrid.from_dense(density, sh, PLACE, space="linear")
     for half, bound in ((False, 1e-6), (True, 5e-3)):
         save_field(tmp_path / "field.npz", dense.sparse(keep), half=half)
         volume = {"type": "mivol_sh", "filename": str(tmp_path / "field.npz")}
@@ -206,6 +210,53 @@ def test_a_sparse_field_renders_as_the_dense_one(variant_rgb: None, tmp_path: Pa
         packed = render(loaded, {"type": "mivol"}, 4)
         whole = image(field(density=tensor(density), sh=tensor(sh)))
         assert np.abs(packed - whole).max() < bound
+
+
+def grey(codes: list[float], density: float) -> SphericalGrid:
+    """A field of one density, which shows one colour from everywhere."""
+    sh = np.zeros((3, 3, 3, 1, 3), np.float32)
+    sh[...] = (np.array(codes) - 0.5) / 0.28209479
+    return SphericalGrid.from_dense(np.full((3, 3, 3), density, np.float32), sh, PLACE)
+
+
+def test_codes_of_photographs_are_shown_as_the_light_that_they_stand_for(variant_rgb: None, tmp_path: Path) -> None:
+    """A picture of an opaque field, written as a photograph is, has the codes that the field was given.
+
+    At a density of 40 the box, 2 wide, lets through exp(-40) at least where the camera looks at it frontally.
+    """
+    codes = [0.02, 0.5, 0.9]
+    save_field(tmp_path / "field.npz", grey(codes, 40.0), half=False)
+    volume = {"type": "mivol_sh", "filename": str(tmp_path / "field.npz")}
+    shown = {}
+    for name, more in (("file", {}), ("told", {"space": "linear"})):
+        made = box_of({"type": "mivol_medium", "emission": volume | more}, PLACE)
+        whole = scene(made, sensor=camera([0, 0, 4], [0, 0, 0], 12, 20))
+        shown[name] = render(whole, {"type": "mivol"}, 1)[6, 6, :3]
+    np.testing.assert_allclose(encode_srgb(shown["file"]), codes, atol=1e-5)
+    np.testing.assert_allclose(shown["told"], codes, atol=1e-5)
+
+
+def test_light_of_codes_has_the_curve_and_the_slope_of_srgb(variant_rgb: None) -> None:
+    """As the reader of photographs has it; differences of the curve itself are its derivatives, and none is NaN below 0."""
+    codes = np.array([-0.2, 0.0, 0.04, 0.05, 0.5, 1.0, 1.5])
+    x = mi.Float(codes)
+    dr.enable_grad(x)
+    light = radiance_of_codes(x)
+    dr.backward(dr.sum(light))
+    inside = (codes >= 0) & (codes <= 1)
+    np.testing.assert_allclose(np.array(light)[inside], decode_srgb(codes[inside]), rtol=1e-5)
+    slope = np.where(codes <= 0.04045, 1 / 12.92, 2.4 / 1.055 * ((np.maximum(codes, 0.04) + 0.055) / 1.055) ** 1.4)
+    np.testing.assert_allclose(np.array(x.grad), slope, rtol=1e-4)
+
+
+def test_the_space_of_colours_is_kept(variant_rgb: None, tmp_path: Path) -> None:
+    """By files, by what makes a field sparse or gives it another degree; a third space is refused."""
+    field = replace(grey([0.5] * 3, 1.0), space="linear")
+    save_field(tmp_path / "field.npz", field)
+    kept = field.sparse(np.ones((3, 3, 3), bool)), field.with_degree(1), load_field(tmp_path / "field.npz")
+    assert [one.space for one in kept] == ["linear"] * 3
+    with pytest.raises(MivolError, match="'rec709'; srgb or linear"):
+        replace(field, space="rec709")
 
 
 def test_a_mono_variant_shows_the_luminance(variant_rgb: None) -> None:
