@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import importlib
 import warnings
+from typing import TYPE_CHECKING
 
 from . import llvm
 
@@ -52,6 +53,32 @@ PUBLIC = {
     "write_volume": "files",
 }
 """What ``mivol.<name>`` is, and the module below mivol that it comes from."""
+
+if TYPE_CHECKING:  # what type checkers see of PUBLIC, which is imported when it is first used
+    from .experiments.script import Problem as Problem
+    from .experiments.script import fit_photographs as fit_photographs
+    from .experiments.script import optimize as optimize
+    from .fields.procedural import make_procedural as make_procedural
+    from .fields.spherical_files import load_field as load_field
+    from .fields.spherical_files import save_field as save_field
+    from .files import read_volume as read_volume
+    from .files import write_volume as write_volume
+    from .optim.adam import Adam as Adam
+    from .optim.gauss_newton import GaussNewton as GaussNewton
+    from .optim.lbfgs import Lbfgs as Lbfgs
+    from .optim.parameters import Parameter as Parameter
+    from .optim.rmsprop import RMSprop as RMSprop
+    from .photos import load_photos as load_photos
+    from .points import Gaussians as Gaussians
+    from .points import read_gaussians as read_gaussians
+    from .points import write_gaussians as write_gaussians
+    from .scene.explain import explain as explain
+    from .scene.load import load_scene as load_scene
+    from .tomography.geometry import ConeBeam as ConeBeam
+    from .tomography.geometry import ParallelBeam as ParallelBeam
+    from .tomography.geometry import VoxelGrid as VoxelGrid
+    from .tomography.projector import Projector as Projector
+    from .validate.reference import render_reference as render_reference
 
 __all__ = ["MivolError", "__version__", *PUBLIC]
 

@@ -11,4 +11,4 @@ box = {"type": "cube", "to_world": T(field.to_world).translate(0.5).scale(0.5), 
 floor = {"type": "rectangle", "to_world": T().translate([0, 0, -1.1]).scale(3), "bsdf": {"type": "diffuse"}}
 camera = {"type": "perspective", "fov": 40, "to_world": T().look_at([3, 2, 2], [0, 0, 0], [0, 0, 1])}
 parts = {"box": box, "floor": floor, "camera": camera, "light": {"type": "constant"}, "integrator": {"type": "mivol"}}
-mi.util.write_bitmap("scene.exr", mi.render(mi.load_dict({"type": "scene", **parts}), spp=16), write_async=False)
+mi.Bitmap(mi.render(mi.load_dict({"type": "scene", **parts}), spp=16)).write("scene.exr")

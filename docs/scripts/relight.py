@@ -10,4 +10,4 @@ params["cube.interior_medium.albedo.value.value"] = 0.9
 params["sky.radiance.value"] = mi.Color3f(1.0, 0.5, 0.2)
 params.update()
 image = mi.render(scene, sensor=0, integrator=mi.load_dict({"type": "mivol", "max_depth": 6}), spp=64)
-mi.util.write_bitmap("relit.exr", image, write_async=False)
+mi.Bitmap(image).write("relit.exr")

@@ -68,7 +68,7 @@ class Problem(SceneProblem):
         references: Sequence[Reference] | mi.Scene,
         parameters: Sequence[str | Parameter],
         *,
-        loss: Loss | Callable[[mi.TensorXf, mi.TensorXf], Any] = L2(),  # noqa: B008  (frozen)
+        loss: Loss | Callable[[mi.TensorXf, mi.TensorXf], mi.Float | mi.TensorXf] = L2(),  # noqa: B008  (frozen)
         integrator: mi.Integrator | None = None,
         sensors: Sequence[mi.Sensor] | None = None,
         spp: int = 16,
@@ -156,7 +156,7 @@ def optimize(
 def fit_photographs(
     photographs: str | os.PathLike,
     output: str | os.PathLike = "runs/field",
-    settings: Mapping[str, Any] | None = None,
+    settings: Mapping[str, object] | None = None,
     watcher: Watcher | None = None,
 ) -> SphericalGrid:
     """Fit a radiance field to posed photographs; ``field.npz`` and its page lie in the run folder.

@@ -441,8 +441,8 @@ def radiance_of_codes(code: mi.Float) -> mi.Float:
 
     The same curve as :func:`mivol.photos.picture.decode_srgb`, with derivatives.
     """
-    # The power is taken of the codes that use it only: at 0 its derivative would be right, below it is not a number.
-    bent = dr.power((dr.maximum(code, 0.04045) + 0.055) / 1.055, 2.4)
+    # Below -0.055 the power is NaN. It is not selected there, and Dr.Jit takes a derivative of 0 times NaN for 0.
+    bent = dr.power((code + 0.055) / 1.055, 2.4)
     return dr.select(code <= 0.04045, code / 12.92, bent)
 
 

@@ -129,7 +129,7 @@ def write_volume(
     values: np.ndarray,
     to_world: np.ndarray | None = None,
     *,
-    metadata: Mapping[str, Any] | None = None,
+    metadata: Mapping[str, object] | None = None,
     compress: bool = True,
 ) -> None:
     """Write a volume, whole or not at all; the suffix chooses the format (:data:`WRITERS`).

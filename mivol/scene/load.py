@@ -79,7 +79,7 @@ def two_threads() -> Iterator[None]:
 
 
 
-def load_scene(source: SceneSource | mi.Scene, overrides: Mapping[str, Any] | None = None) -> LoadedScene:
+def load_scene(source: SceneSource | mi.Scene, overrides: Mapping[str, object] | None = None) -> LoadedScene:
     """Load a scene.
 
     Args:

@@ -69,7 +69,7 @@ def render_reference(
     sensor: int | dict | mi.Sensor = 0,
     seed: int = 0,
     pass_spp: int | None = None,
-    overrides: Mapping[str, Any] | None = None,
+    overrides: Mapping[str, object] | None = None,
     accept_doubts: bool = False,
     progress: bool = True,
 ) -> ReferenceResult:
