@@ -2,8 +2,8 @@
 
 ``mivol.<tab>`` shows what a script needs: scenes (``load_scene``, ``explain``, ``render_reference``), fits (``Problem``,
 ``Parameter``, ``optimize`` and optimisers), volumes (``read_volume``, ``write_volume``, ``make_procedural``), photographs
-(``load_photos``, ``fit_photographs``, ``load_field``), Gaussians (``read_gaussians``, ``write_gaussians``) and tomography
-(``Projector`` and its geometries). Each is imported when it is first used.
+(``load_photos``, ``fit_photographs``, ``load_field``), Gaussians and points (``read_gaussians``, ``read_points``) and
+tomography (``Projector`` and its geometries). Each is imported when it is first used.
 """
 
 from __future__ import annotations
@@ -34,6 +34,7 @@ PUBLIC = {
     "Lbfgs": "optim.lbfgs",
     "ParallelBeam": "tomography.geometry",
     "Parameter": "optim.parameters",
+    "PointCloud": "points",
     "Problem": "experiments.script",
     "Projector": "tomography.projector",
     "RMSprop": "optim.rmsprop",
@@ -46,10 +47,12 @@ PUBLIC = {
     "make_procedural": "fields.procedural",
     "optimize": "experiments.script",
     "read_gaussians": "points",
+    "read_points": "points",
     "read_volume": "files",
     "render_reference": "validate.reference",
     "save_field": "fields.spherical_files",
     "write_gaussians": "points",
+    "write_points": "points",
     "write_volume": "files",
 }
 """What ``mivol.<name>`` is, and the module below mivol that it comes from."""

@@ -3,7 +3,7 @@
 Every reader takes its bytes from here, so that a missing, empty, truncated or damaged file is refused in the same words
 everywhere: what was found, what was expected, the way out.
 
-Here: :func:`refusal` (the sentence), :func:`existing_file`, :func:`read_bytes`, :func:`elements` (bytes -> array),
+Here: :func:`refusal` (the sentence), :func:`existing_file`, :func:`by_suffix`, :func:`read_bytes`, :func:`elements` (array),
 :func:`numbers` (text -> array), :func:`integers` and :func:`reals` (fields of a header), :func:`inflate` (bounded
 decompression), :func:`choose` and :func:`no_dataset` (which array of a file).
 """
@@ -19,12 +19,15 @@ import sys
 import textwrap
 import warnings
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
 from mivol.errors import MivolError
+
+T = TypeVar("T")
 
 #: Characters of what was found that a refusal quotes; line ends in it become blanks.
 LONGEST_QUOTE = 300
@@ -71,6 +74,17 @@ def read_bytes(path: str | os.PathLike) -> bytes:
         return path.read_bytes()
     except PermissionError as error:
         raise refusal(path, "no permission to read it", "a readable file", "change its permissions") from error
+
+
+def by_suffix(path: Path, table: Mapping[str, T]) -> T:
+    """What a table of suffixes has for a file.
+
+    Raises:
+        MivolError: a suffix that it does not have.
+    """
+    if path.suffix.lower() not in table:
+        raise refusal(path, f"the suffix {path.suffix!r}", f"one of {', '.join(table)}", "convert the file or correct its name")
+    return table[path.suffix.lower()]
 
 
 def elements(data: bytes, dtype: np.dtype | str, count: int, path: object, *, offset: int = 0) -> np.ndarray:

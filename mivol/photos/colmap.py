@@ -21,7 +21,7 @@ from mivol.photos.camera import FLIP, Camera, intrinsics
 from mivol.photos.lens import Lens
 from mivol.photos.listing import Entry, Listing
 
-__all__ = ["CAMERA_MODELS", "find_model", "read_colmap", "rotation"]
+__all__ = ["CAMERA_MODELS", "find_model", "read_colmap", "read_points3d", "rotation"]
 
 MODEL_NUMBERS = (
     *("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "FOV"),
@@ -77,10 +77,25 @@ def read_colmap(path: Path) -> Listing:
     read = READERS[suffix]
     sensors, poses = read.cameras(model / f"cameras{suffix}"), read.images(model / f"images{suffix}")
     points_file = model / f"points3D{suffix}"
-    points = read.points(points_file) if points_file.is_file() else None
+    points = read_points3d(points_file)[0] if points_file.is_file() else None
     base = next((folder for folder in (path, *model.parents[:2]) if (folder / "images").is_dir()), path)
     entries = [_entry(base, pose, sensors, model / f"images{suffix}") for pose in sorted(poses, key=lambda pose: pose.name)]
     return Listing(entries, points)
+
+
+def read_points3d(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """The points of ``points3D.bin`` or ``points3D.txt``.
+
+    Returns:
+        Positions (N, 3) world [length], and colours (N, 3) in 0..255.
+
+    Raises:
+        MivolError: another suffix, a truncated file, text that is not numbers.
+    """
+    if path.suffix not in READERS:
+        raise refusal(path, f"the suffix {path.suffix!r}", f"one of {', '.join(READERS)}", "name COLMAP's points3D")
+    points = READERS[path.suffix].points(path)
+    return points[:, :3], points[:, 3:]
 
 
 def rotation(q: np.ndarray) -> np.ndarray:
@@ -192,9 +207,9 @@ def _images_bin(path: Path) -> list[Pose]:
 def _points_bin(path: Path) -> np.ndarray:
     fields, points = Fields(path), []
     for _ in range(fields.take("Q")[0]):
-        points.append(fields.take("Q3d3Bd")[1:4])
+        points.append(fields.take("Q3d3Bd")[1:7])
         fields.skip(8 * fields.take("Q")[0])
-    return np.array(points).reshape(-1, 3)
+    return np.array(points).reshape(-1, 6)
 
 
 # -- Text ---------------------------------------------------------------------------------------------------------
@@ -230,8 +245,8 @@ def _images_txt(path: Path) -> list[Pose]:
 
 
 def _points_txt(path: Path) -> np.ndarray:
-    rows = [reals(" ".join(line.split()[1:4]), 3, path, f"point {line.split()[0]}") for line in filter(None, _lines(path))]
-    return np.array(rows).reshape(-1, 3)
+    rows = [reals(" ".join(line.split()[1:7]), 6, path, f"point {line.split()[0]}") for line in filter(None, _lines(path))]
+    return np.array(rows).reshape(-1, 6)
 
 
 def _whole(word: str, path: Path) -> int:

@@ -12,7 +12,7 @@ from typing import BinaryIO
 
 from mivol.files.atomic import write_whole
 from mivol.files.ply import read_tables
-from mivol.files.source import existing_file, refusal
+from mivol.files.source import by_suffix, existing_file
 from mivol.points.compressed_ply import gaussians_of_compressed_tables, is_compressed
 from mivol.points.gaussian_ply import gaussians_of_tables, write_gaussian_ply
 from mivol.points.gaussians import Gaussians
@@ -52,7 +52,7 @@ def read_gaussians(path: str | os.PathLike) -> Gaussians:
         3
     """
     path = existing_file(path)
-    return _chosen(path, READERS)(path).checked(path)
+    return by_suffix(path, READERS)(path).checked(path)
 
 
 def write_gaussians(path: str | os.PathLike, gaussians: Gaussians) -> None:
@@ -62,12 +62,6 @@ def write_gaussians(path: str | os.PathLike, gaussians: Gaussians) -> None:
         MivolError: a suffix that is not known, numbers that cannot be drawn, disk full.
     """
     path = Path(path)
-    writer = _chosen(path, WRITERS)
+    writer = by_suffix(path, WRITERS)
     gaussians.checked(path)
     write_whole(path, lambda file: writer(file, gaussians))
-
-
-def _chosen(path: Path, table: dict[str, Callable]) -> Callable:
-    if path.suffix.lower() not in table:
-        raise refusal(path, f"the suffix {path.suffix!r}", f"one of {', '.join(table)}", "convert the file or correct its name")
-    return table[path.suffix.lower()]

@@ -1,0 +1,179 @@
+"""Clouds of points: positions, and colours where there are any; from the files that hold them, and to them.
+
+Conventions. Positions are in the world [length], float64, since surveys count metres from far away. Colours are code values
+0..1. Formats by suffix: ``.ply`` (``x y z``, ``red green blue`` in bytes; also of Gaussians, whose centres these are), ``.npy``
+(N, 3), COLMAP's ``points3D.bin`` and ``points3D.txt``, ``.las`` by the optional package ``laspy``.
+
+Here: :class:`PointCloud`, :func:`read_points`, :func:`write_points`, :data:`CLOUD_READERS`, :data:`CLOUD_WRITERS`.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+
+from mivol.files import ply
+from mivol.files.archive import check_memory
+from mivol.files.atomic import write_whole
+from mivol.files.source import by_suffix, existing_file, refusal
+from mivol.photos.colmap import read_points3d
+from mivol.shown import briefly
+
+__all__ = ["CLOUD_READERS", "CLOUD_WRITERS", "PointCloud", "read_points", "write_points"]
+
+POSITION = ("x", "y", "z")
+COLOUR = ("red", "green", "blue")
+DAMAGE = (ValueError, TypeError, EOFError, SyntaxError, OSError)
+"""What NumPy raises on bytes that are no array of numbers."""
+
+
+@briefly
+@dataclass(frozen=True)
+class PointCloud:
+    """N points.
+
+    Attributes:
+        positions: (N, 3) world [length], float64.
+        colours: (N, 3) code values 0..1, float32; None: none.
+
+    Raises:
+        MivolError: shapes that do not fit together.
+    """
+
+    positions: np.ndarray
+    colours: np.ndarray | None = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "positions", np.ascontiguousarray(self.positions, np.float64))
+        if self.positions.ndim != 2 or self.positions.shape[1] != 3:
+            raise refusal("a cloud of points", f"positions of shape {self.positions.shape}", "(N, 3)", "reshape them")
+        if self.colours is not None:
+            object.__setattr__(self, "colours", np.ascontiguousarray(self.colours, np.float32))
+            if self.colours.shape != self.positions.shape:
+                found = f"colours of shape {self.colours.shape}"
+                raise refusal("a cloud of points", found, f"{self.positions.shape}, as the positions", "reshape them")
+
+    @property
+    def count(self) -> int:
+        """N."""
+        return len(self.positions)
+
+    def checked(self, subject: object = "a cloud of points") -> PointCloud:
+        """Itself, if every number is finite.
+
+        Raises:
+            MivolError: a number is not, by the index of the first point.
+        """
+        for name, values in (("position", self.positions), ("colour", self.colours)):
+            rows = [] if values is None else np.flatnonzero(~np.isfinite(values).all(axis=1))
+            if len(rows):
+                found = f"a {name} that is not finite in point {rows[0]} (the first of {len(rows)})"
+                raise refusal(subject, found, "finite numbers", "remove these points")
+        return self
+
+
+def read_points(path: str | os.PathLike) -> PointCloud:
+    """Read a cloud of any format in :data:`CLOUD_READERS`.
+
+    Raises:
+        MivolError: missing, foreign, truncated or inconsistent file, a suffix that is not known, a number that is not finite,
+            or ``.las`` without ``laspy``.
+    """
+    path = existing_file(path)
+    return by_suffix(path, CLOUD_READERS)(path).checked(path)
+
+
+def write_points(path: str | os.PathLike, cloud: PointCloud) -> None:
+    """Write a cloud, whole or not at all; the suffix chooses the format (:data:`CLOUD_WRITERS`).
+
+    Positions are stored in float32, 24 bits of the distance from the origin; ``.npy`` holds no colours.
+
+    Raises:
+        MivolError: a suffix that is not known, a number that is not finite, disk full.
+    """
+    path = Path(path)
+    writer = by_suffix(path, CLOUD_WRITERS)
+    cloud.checked(path)
+    write_whole(path, lambda file: writer(file, cloud))
+
+
+def _read_ply(path: Path) -> PointCloud:
+    vertex = ply.read_tables(path).get("vertex")
+    held = () if vertex is None else vertex.dtype.names
+    if any(name not in held for name in POSITION):
+        raise refusal(path, "no x, y, z of vertices", "a cloud of points", "convert the file")
+    positions = np.stack([vertex[name] for name in POSITION], axis=1)
+    if any(name not in held for name in COLOUR):
+        return PointCloud(positions)
+    codes = np.stack([vertex[name] for name in COLOUR], axis=1)
+    return PointCloud(positions, codes / 255 if codes.dtype == np.uint8 else codes)
+
+
+def _read_npy(path: Path) -> PointCloud:
+    """The array is mapped first: its shape is known, and no more is there than the file has, before any is taken."""
+    try:
+        mapped = np.load(path, mmap_mode="r", allow_pickle=False)
+    except DAMAGE as error:
+        reason = " ".join(str(error).split())[:200]
+        raise refusal(path, f"a damaged array ({reason})", "a whole .npy of numbers", "write or copy it again") from error
+    if not isinstance(mapped, np.ndarray) or mapped.ndim != 2 or mapped.shape[1] != 3 or mapped.dtype.kind not in "iuf":
+        shape = getattr(mapped, "shape", "an archive")
+        raise refusal(path, f"an array {shape}", "real numbers (N, 3)", "save positions only")
+    check_memory(path, mapped.size * 8)
+    return PointCloud(mapped)
+
+
+def _read_colmap(path: Path) -> PointCloud:
+    positions, codes = read_points3d(path)
+    return PointCloud(positions, codes / 255)
+
+
+def _read_las(path: Path) -> PointCloud:
+    try:
+        import laspy
+    except ImportError as error:
+        way_out = f'pip install "mivol[points]" for laspy, which cannot be imported ({error})'
+        raise refusal(path, "a LAS file", "a format that mivol reads by itself", way_out) from error
+    try:
+        with laspy.open(path) as file:
+            check_memory(path, file.header.point_count * 8 * 6)
+            points = file.read()
+    except (laspy.LaspyException, *DAMAGE) as error:
+        raise refusal(path, f"a damaged LAS file ({error})", "a whole one", "copy it again") from error
+    colours = None
+    if {"red", "green", "blue"} <= set(points.point_format.dimension_names):
+        colours = np.stack([points.red, points.green, points.blue], axis=1) / 65535
+    return PointCloud(np.asarray(points.xyz), colours)
+
+
+def _write_ply(file: BinaryIO, cloud: PointCloud) -> None:
+    fields = [(name, "<f4") for name in POSITION] + [(name, "u1") for name in (() if cloud.colours is None else COLOUR)]
+    table = np.empty(cloud.count, fields)
+    for name, column in zip(POSITION, cloud.positions.T, strict=True):
+        table[name] = column
+    if cloud.colours is not None:
+        for name, column in zip(COLOUR, cloud.colours.T, strict=True):
+            table[name] = np.rint(np.clip(column, 0, 1) * 255)
+    ply.write_table(file, table)
+
+
+def _write_npy(file: BinaryIO, cloud: PointCloud) -> None:
+    np.lib.format.write_array(file, cloud.positions.astype(np.float32), version=(1, 0), allow_pickle=False)
+
+
+#: suffix -> reader(path).
+CLOUD_READERS: dict[str, Callable[[Path], PointCloud]] = {
+    ".ply": _read_ply,
+    ".npy": _read_npy,
+    ".bin": _read_colmap,
+    ".txt": _read_colmap,
+    ".las": _read_las,
+}
+
+#: suffix -> writer(file, cloud).
+CLOUD_WRITERS: dict[str, Callable[[BinaryIO, PointCloud], None]] = {".ply": _write_ply, ".npy": _write_npy}
