@@ -90,6 +90,9 @@ class Sought(Section):
         float | tuple[float, ...] | None, of("unit", "start: one number for all, or each; absent: what the scene holds")
     ] = None
     start_file: Annotated[str, of("path", "volume to start from; empty: start")] = ""
+    start_fit: Annotated[
+        Literal["", "emission"], of("1", "emission: the start is given the shape of an emissive volume fitted to the views")
+    ] = ""
     shape: Annotated[tuple[int, int, int] | None, of("voxel", "(Z, Y, X) of a constant start")] = None
     prior: Annotated[
         tuple[TotalVariation | HuberTotalVariation | Laplacian | Sparse | Bounds, ...], of("1", "what is known before")

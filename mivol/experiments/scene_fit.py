@@ -17,11 +17,12 @@ from mivol.experiments.depth import settle_depth
 from mivol.experiments.references import References, find_references, load_experiment_scene
 from mivol.experiments.run_folder import RunFolder
 from mivol.experiments.scene_outputs import SceneOutputs
-from mivol.experiments.start import Start, make_start
+from mivol.experiments.start import Start, make_start, place_of
 from mivol.experiments.task import Task
 from mivol.experiments.truth import check_truth, make_truth, put
 from mivol.optim.checkpoint import Store
 from mivol.optim.course import Course
+from mivol.optim.emissive_start import find_emissive_start
 from mivol.optim.events import upsample
 from mivol.optim.loop import Fit, begin_fit
 from mivol.optim.parameters import check_names
@@ -71,6 +72,7 @@ def scene_fit(task: Task) -> Path:
             seen = find_references(task, loaded, truth)
         with run.stage("fit"):
             problem = make_problem(chosen, loaded.scene, integrator, starts, seen)
+            run.record.notes += improve_starts(task, run, problem)
             made = plan_of(chosen, problem)
             run.record.plan = depth + lines_of(made)
             run.record.citations += cited(made, run.record.citations)
@@ -89,13 +91,14 @@ def new_record(task: Task) -> RunRecord:
     priors = [prior for sought in chosen.parameter for prior in sought.prior]
     strategies = [chosen.optimiser, chosen.loss, *priors]
     sought = ", ".join(sought.key for sought in chosen.parameter)
+    emission = ["nimier_david_2022"] if any(sought.start_fit for sought in chosen.parameter) else []
     return RunRecord.new(
         chosen.title,
         method=f"{chosen.fit.integrator}, {chosen.optimiser.label()} on {chosen.loss.label()}; looked for: {sought}",
         config=config.resolved(chosen),
         command=task.command,
         seeds={"fit": chosen.seed, "references": getattr(chosen.reference, "seed", 0)},
-        citations=["mitsuba3", "drjit", *dict.fromkeys(key for s in strategies for key in s.cites)],
+        citations=["mitsuba3", "drjit", *emission, *dict.fromkeys(key for s in strategies for key in s.cites)],
     )
 
 
@@ -143,6 +146,25 @@ def make_problem(
     problem = SceneProblem(scene, seen.fitted, parameters, integrator, chosen.loss, **settings)
     problem.set(problem.start())
     return problem
+
+
+def improve_starts(task: Task, run: RunFolder, problem: SceneProblem) -> list[str]:
+    """Put emissive starts into the scene where they are asked for; what was found, in sentences.
+
+    A run that goes on from a checkpoint has its values from there.
+    """
+    chosen: Experiment = task.chosen
+    asked = [sought.key for sought in chosen.parameter if sought.start_fit == "emission"]
+    if task.resume and run.checkpoint.exists():
+        return []
+    notes = []
+    for key in asked:
+        found = find_emissive_start(problem, key, place_of(key, problem.scene), chosen.optimiser, chosen.seed)
+        put(problem.params, key, found.value)
+        problem.set(problem.start())
+        notes.append(f"{key} {found.text}")
+    task.watcher.say(notes)
+    return notes
 
 
 def solve(

@@ -50,6 +50,24 @@ def test_optimize_leaves_a_whole_run_folder(variant_rgb, folder: Path, capsys: p
     assert str(folder) not in page
 
 
+@pytest.mark.slow
+def test_an_emissive_start_is_noted_and_not_made_again(variant_rgb, folder: Path) -> None:
+    """The run begins from another volume than without it, says what was tried, and goes on from its checkpoint, not from there."""
+    plain, shaped = folder / "plain", folder / "shaped"
+    few = ("--set", "fit.iterations=1")
+    emissive = ("--set", 'parameter.0.start_fit="emission"')
+    assert run("optimize", folder / "fit.toml", "-o", plain, *few) == 0
+    assert run("optimize", folder / "fit.toml", "-o", shaped, *few, *emissive) == 0
+    losses = [json.loads((target / "metrics.jsonl").read_text().splitlines()[0])["loss"] for target in (plain, shaped)]
+    assert losses[0] != losses[1]
+    record = json.loads((shaped / "run.json").read_text())
+    assert any("emissive fit of the same views" in note for note in record["notes"])
+    assert "nimier_david_2022" in record["citations"]
+    assert run("optimize", folder / "fit.toml", "-o", shaped, "--set", "fit.iterations=2", *emissive, "--resume") == 0
+    rows = [json.loads(line) for line in (shaped / "metrics.jsonl").read_text().splitlines()]
+    assert rows[0]["loss"] == losses[1] and rows[-1]["iteration"] == 2
+
+
 OPTIMIZE_REFUSED = {
     "misspelt key": (["fit.iteratons=3"], 'did you mean "iterations"'),
     "no views": (["views.count=0"], "views.count = 0"),
