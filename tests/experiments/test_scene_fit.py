@@ -12,6 +12,7 @@ import pytest
 from fit_scene import KEY
 from tiny_experiment import PHOTOS, files_of, refused, run
 
+from mivol.experiments import scene_fit
 from mivol.files import atomic, read_volume
 
 
@@ -51,7 +52,9 @@ def test_optimize_leaves_a_whole_run_folder(variant_rgb, folder: Path, capsys: p
 
 
 @pytest.mark.slow
-def test_an_emissive_start_is_noted_and_not_made_again(variant_rgb, folder: Path) -> None:
+def test_an_emissive_start_is_noted_and_not_made_again(
+    variant_rgb, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The run begins from another volume than without it, says what was tried, and goes on from its checkpoint, not from there."""
     plain, shaped = folder / "plain", folder / "shaped"
     few = ("--set", "fit.iterations=1")
@@ -63,6 +66,7 @@ def test_an_emissive_start_is_noted_and_not_made_again(variant_rgb, folder: Path
     record = json.loads((shaped / "run.json").read_text())
     assert any("emissive fit of the same views" in note for note in record["notes"])
     assert "nimier_david_2022" in record["citations"]
+    monkeypatch.setattr(scene_fit, "find_emissive_start", lambda *given: pytest.fail("the start is made again"))
     assert run("optimize", folder / "fit.toml", "-o", shaped, "--set", "fit.iterations=2", *emissive, "--resume") == 0
     rows = [json.loads(line) for line in (shaped / "metrics.jsonl").read_text().splitlines()]
     assert rows[0]["loss"] == losses[1] and rows[-1]["iteration"] == 2
