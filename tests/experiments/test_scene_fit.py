@@ -55,7 +55,7 @@ def test_optimize_leaves_a_whole_run_folder(variant_rgb, folder: Path, capsys: p
 def test_an_emissive_start_is_noted_and_not_made_again(
     variant_rgb, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The run begins from another volume than without it, says what was tried, and goes on from its checkpoint, not from there."""
+    """The run begins from another volume than without it, says what was tried, and goes on from its checkpoint."""
     plain, shaped = folder / "plain", folder / "shaped"
     few = ("--set", "fit.iterations=1")
     emissive = ("--set", 'parameter.0.start_fit="emission"')
