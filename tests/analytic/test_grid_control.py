@@ -7,11 +7,13 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from scattering_scenes import PLACE, close_up, point, smoke
+from scipy.interpolate import RegularGridInterpolator
 
 from mivol.scene.build import build_estimators
 from mivol.scene.needs import find_needs
 from mivol.scene.plan import make_plan
 from mivol.scene.survey import survey_scene
+from mivol.transport.estimators import grid_control
 from mivol.transport.estimators.grid_control import CameraOrigins, GridControl, build_grid_control, nodes_along
 from mivol.transport.path.settings import Settings
 
@@ -59,6 +61,18 @@ def test_point_light_from_the_corners_of_the_grid():
     between = (1 - share)[:, None] * corners[0, 0] + share[:, None] * corners[0, 1]
     np.testing.assert_allclose(values[0, :, ::5], between, rtol=1e-5)
     assert np.allclose(PLACE @ [0, 0, 0, 1], [-1, -1, -1, 1])
+
+
+def test_point_light_between_nodes_of_three_edges(monkeypatch):
+    """4 x 3 x 4 nodes, two cells apart: the light of each in its place, and trilinear between them."""
+    monkeypatch.setattr(grid_control, "STEP", 2)
+    place, intensity = np.array([4.0, 1.0, 2.5]), 3.0
+    values = np.array(control_of(point(place, intensity)[0]).values).reshape(5, 4, 6)
+    edges = [np.linspace(-1, 1, n) for n in (4, 3, 4)]
+    away = place - np.stack(np.meshgrid(*edges, indexing="ij"), axis=-1)[..., ::-1]
+    nodes = ALBEDO * intensity / (4 * np.pi * (away**2).sum(axis=-1))
+    cells = np.stack(np.meshgrid(*(np.linspace(-1, 1, n) for n in values.shape), indexing="ij"), axis=-1)
+    np.testing.assert_allclose(values, RegularGridInterpolator(edges, nodes)(cells), rtol=1e-5)
 
 
 def test_nodes_stand_eight_cells_apart():

@@ -13,8 +13,13 @@ from mivol.scene.explain import explain
 from mivol.scene.needs import find_needs
 from mivol.scene.plan import make_plan
 from mivol.scene.survey import survey_scene
-from mivol.transport.estimators.transmittance_grid import build_transmittance_grid, measure_transmittance_bias
+from mivol.transport.estimators.transmittance_grid import (
+    TransmittanceGrid,
+    build_transmittance_grid,
+    measure_transmittance_bias,
+)
 from mivol.transport.path.settings import Settings
+from mivol.transport.traversal.lattice import Lattice
 from scenes import centred
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
@@ -55,16 +60,34 @@ def test_nodes_of_a_light_grid_are_so_many_cells_apart(cells, nodes):
 
 
 def test_light_grid_keeps_optical_depth_not_transmittance():
-    """Under a sun along an axis tau of a constant grid is linear: interpolated exactly, where T would be 8 % too bright."""
-    box, _ = smoke(np.full((4, 4, 4), 2.0, np.float32), to_world=centred(2 * np.eye(3)))
-    emitter, _ = sun([0.0, 0.0, -1.0])
-    scene = close_up({"smoke": box, "emitter": emitter})
+    """Under suns along the axes tau of a constant grid is linear: interpolated exactly, where T would be 8 % too bright."""
+    box, _ = smoke(np.full((4, 3, 5), 2.0, np.float32), to_world=centred(2 * np.eye(3)))
+    suns = {f"sun {axis}": sun(-np.eye(3)[axis])[0] for axis in range(3)}
+    scene = close_up({"smoke": box, **suns})
     with dr.suspend_grad():
         direct = open_direct(scene)
         grid = build_transmittance_grid(direct.media, direct.emitters)
         bias, rms = measure_transmittance_bias(direct.media, direct.emitters, grid)
     # Nodes in the faces look from 1e-5 of the box inside, where tau is up to 4e-5 off.
     assert abs(bias) <= rms <= 1e-4
+    nodes = np.stack(np.meshgrid(*(np.linspace(0, 1, n) for n in (5, 4, 6)), indexing="ij"), axis=-1)
+    np.testing.assert_allclose(np.array(grid.tau).reshape(5, 4, 6, 3), 2 * 2 * (1 - nodes[..., ::-1]), atol=5e-5)
+
+
+def test_a_point_has_the_light_of_its_place():
+    """A depth that is linear in x, y and z, for each of two emitters and three channels, at points of a box that leans."""
+    to_world = np.array([[2.0, 0.3, 0, -1], [-0.2, 1.5, 0.1, 0.4], [0, 0.1, 3, 2], [0, 0, 0, 1]])
+    lattice = Lattice(mi.TensorXf(np.zeros((5, 4, 2, 1), np.float32)), to_world)
+    shape, rng = (3, 5, 4), np.random.default_rng(2)
+    slope, level = rng.uniform(0, 1, (2, 3, 3)), rng.uniform(0, 1, (2, 3))
+    nodes = np.stack(np.meshgrid(*(np.linspace(0, 1, n) for n in shape), indexing="ij"), axis=-1)[..., ::-1]
+    tau = np.einsum("zyxa,eca->zyxec", nodes, slope) + level
+    grid = TransmittanceGrid(mi.Float(tau.ravel()), shape, lattice, 2, 3)
+    u, number = rng.random((200, 3)), np.arange(200) % 2
+    p = u @ to_world[:3, :3].T + to_world[:3, 3]
+    found = np.array(grid.transmittance(mi.Point3f(*p.T), mi.UInt32(number), mi.Bool(True)))
+    # Places of float32, 1e-6 of the box, and depths of 4 at most.
+    np.testing.assert_allclose(-np.log(found.T), np.einsum("na,nca->nc", u, slope[number]) + level[number], atol=2e-5)
 
 
 def test_explain_measures_the_light_grid():
