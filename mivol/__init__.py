@@ -2,8 +2,8 @@
 
 ``mivol.<tab>`` shows what a script needs: scenes (``load_scene``, ``explain``, ``render_reference``), fits (``Problem``,
 ``Parameter``, ``optimize`` and optimisers), volumes (``read_volume``, ``write_volume``, ``make_procedural``), photographs
-(``load_photos``, ``fit_photographs``, ``load_field``), Gaussians and points (``read_gaussians``, ``read_points``) and
-tomography (``Projector`` and its geometries). Each is imported when it is first used.
+(``load_photos``, ``fit_photographs``, ``load_field``), Gaussians and points (``read_gaussians``, ``read_points``,
+``Splatter``) and tomography (``Projector`` and its geometries). Each is imported when it is first used.
 """
 
 from __future__ import annotations
@@ -38,6 +38,7 @@ PUBLIC = {
     "Problem": "experiments.script",
     "Projector": "tomography.projector",
     "RMSprop": "optim.rmsprop",
+    "Splatter": "splatting",
     "VoxelGrid": "tomography.geometry",
     "explain": "scene.explain",
     "fit_photographs": "experiments.script",
@@ -77,6 +78,7 @@ if TYPE_CHECKING:  # what type checkers see of PUBLIC, which is imported when it
     from .points import write_gaussians as write_gaussians
     from .scene.explain import explain as explain
     from .scene.load import load_scene as load_scene
+    from .splatting import Splatter as Splatter
     from .tomography.geometry import ConeBeam as ConeBeam
     from .tomography.geometry import ParallelBeam as ParallelBeam
     from .tomography.geometry import VoxelGrid as VoxelGrid

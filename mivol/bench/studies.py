@@ -25,6 +25,7 @@ STUDIES = {
     "depth": "bench_depth",
     "random_scenes": "bench_random_scenes",
     "ladder": "bench_ladder",
+    "points": "bench_points",
 }
 """Module of ``mivol.bench`` -> stem of the JSON that it writes."""
 

@@ -177,6 +177,6 @@ def check_memory(needed: int, available: int | None, entries: int, longest: str)
     """
     if available is not None and needed > available // 2:
         raise MivolError(
-            f"Found {entries:,} entries of splats in tiles, which take {needed / 2**30:.1f} GiB ({longest}); expected at most "
-            f"{available / 2**31:.1f} GiB, half of the memory that is free: use fewer or smaller Gaussians, or a smaller image."
+            f"Found {entries:,} entries of splats in tiles, which take {needed / 2**30:.2g} GiB ({longest}); expected at most "
+            f"{available / 2**31:.2g} GiB, half of the memory that is free: use fewer or smaller Gaussians, or a smaller image."
         )

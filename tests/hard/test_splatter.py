@@ -1,0 +1,207 @@
+"""Clouds that splatting has to survive: opaque and clear, tiny and huge, behind the camera, none at all, too many."""
+
+from __future__ import annotations
+
+import mitsuba as mi
+import numpy as np
+import oracle_splats
+import pytest
+from clouds import cloud, looking, tensors
+
+from mivol.errors import MivolError
+from mivol.photos.camera import Camera, intrinsics
+from mivol.splatting import Splatter
+from mivol.splatting import splatter as module
+from mivol.splatting.compositing import STOP
+
+SIDE = 24
+ROUNDING = 4e-5
+"""As in tests/gradient/test_splatter.py: of a centre's place, times how fast alpha changes with it."""
+
+
+@pytest.fixture
+def splatter(variant_rgb: str) -> Splatter:
+    return Splatter(SIDE, SIDE, 2)
+
+
+@pytest.fixture
+def camera() -> Camera:
+    return looking(SIDE, SIDE)
+
+
+def straight(side: int = SIDE) -> Camera:
+    """A camera one unit of length from the origin, whose axis goes through the centre of a pixel."""
+    pose = np.eye(4)
+    pose[2, 3] = 1.0
+    return Camera(intrinsics(side, side, side / 2 + 0.5, side / 2 + 0.5), (side, side), pose)
+
+
+def stack(opacity_logits: list[float], depths: list[float], scale: float = 0.2) -> dict[str, np.ndarray]:
+    """Round Gaussians one behind the other on the axis of :func:`straight`, of different greys."""
+    n = len(opacity_logits)
+    arrays = cloud(n, 2, scale)
+    arrays["means"] = np.array([[0, 0, -z] for z in depths], np.float32)
+    arrays["log_scales"][:] = np.log(scale)
+    arrays["opacity_logits"] = np.array(opacity_logits, np.float32)
+    arrays["harmonics"][:] = 0
+    arrays["harmonics"][:, 0] = np.linspace(-1, 1, n)[:, None]
+    return arrays
+
+
+def test_derivatives_at_an_opacity_of_one(splatter: Splatter) -> None:
+    """In the pixel where alpha is 1 nothing behind is seen, and yet the derivative by the place of what hides it knows its
+    colour. A logit of 20 is an opacity of 1 in float32; that of 30 behind it is hidden, and hides the third."""
+    arrays = stack([20.0, 30.0, 0.0], [0.0, 0.3, 0.6])
+    picture, kept = splatter.forward(tensors(arrays), straight())
+    truth, frozen = oracle_splats.draw(arrays, straight())
+    truth = truth[..., [0, 1, 2, 4]]
+    np.testing.assert_allclose(np.array(picture), truth, rtol=0, atol=STOP + ROUNDING)
+    assert np.array(picture)[..., 3].max() == 1
+    weights = np.random.default_rng(3).normal(size=truth.shape).astype(np.float32)
+    gradient, _ = splatter.backward(kept, mi.TensorXf(weights))
+    five = np.insert(weights, 3, 0, axis=-1)
+    for name in ("means", "log_scales", "harmonics"):
+        found, slopes = np.array(gradient[name]), []
+        for at in np.ndindex(found.shape):
+            ends = []
+            for side in (1e-6, -1e-6):
+                moved = {key: value.astype(float) for key, value in arrays.items()}
+                moved[name][at] += side
+                ends.append((oracle_splats.draw(moved, straight(), frozen=frozen)[0] * five).sum())
+            slopes.append((ends[0] - ends[1]) / 2e-6)
+        np.testing.assert_allclose(found.ravel(), slopes, rtol=0, atol=ROUNDING * np.abs(slopes).max(), err_msg=name)
+
+
+def test_opacities_of_zero_and_one_by_infinite_logits(splatter: Splatter) -> None:
+    """What is clear leaves no trace; what is opaque is finite in its derivatives."""
+    arrays = stack([-np.inf, np.inf, 0.0], [0.0, 0.3, 0.6])
+    picture, kept = splatter.forward(tensors(arrays), straight())
+    alone, _ = splatter.forward(tensors({name: value[1:] for name, value in arrays.items()}), straight())
+    np.testing.assert_array_equal(np.array(picture), np.array(alone))
+    gradient, statistics = splatter.backward(kept, picture)
+    assert all(np.isfinite(np.array(g)).all() for g in gradient.values())
+    assert not statistics.seen[0]
+    assert statistics.seen[1:].all()
+    assert not np.array(gradient["means"])[0].any()
+
+
+@pytest.mark.parametrize("scale", [1e-6, 1e3])
+def test_tiny_and_huge_scales(splatter: Splatter, camera: Camera, scale: float) -> None:
+    """A tiny Gaussian is as wide as the low-pass filter, a huge one has the alpha of its opacity in every pixel. Centres are
+    rounded as ever; a huge covariance is the sum of squares up to (1e3 * 22 pixels)^2, of which the low-pass loses nothing that
+    is seen: alpha changes by 1e-9 across the picture."""
+    arrays = cloud(20, 2, scale, seed=4)
+    picture, kept = splatter.forward(tensors(arrays), camera)
+    truth, _ = oracle_splats.draw(arrays, camera)
+    np.testing.assert_allclose(np.array(picture), truth[..., [0, 1, 2, 4]], rtol=0, atol=STOP * truth.max() + ROUNDING)
+    gradient, _ = splatter.backward(kept, picture)
+    assert all(np.isfinite(np.array(g)).all() for g in gradient.values())
+
+
+def test_nothing_behind_the_camera_is_drawn(splatter: Splatter, camera: Camera) -> None:
+    """Nor what its mean is in front of the near plane of; what only reaches across the camera is drawn."""
+    arrays = cloud(3, 2, 0.1)
+    forward = camera.forward
+    arrays["means"] = np.float32(camera.origin + np.array([[-0.5], [0.005], [0.05]]) * forward)
+    picture, kept = splatter.forward(tensors(arrays), camera)
+    last, _ = splatter.forward(tensors({name: value[2:] for name, value in arrays.items()}), camera)
+    np.testing.assert_array_equal(np.array(picture), np.array(last))
+    assert np.array(picture)[..., 3].max() > 0
+    gradient, statistics = splatter.backward(kept, picture)
+    assert statistics.seen.tolist() == [False, False, True]
+    assert all(np.isfinite(np.array(g)).all() for g in gradient.values())
+
+
+@pytest.mark.parametrize("n", [0, 3])
+def test_no_gaussian_is_seen(splatter: Splatter, camera: Camera, n: int) -> None:
+    arrays = cloud(n, 2, 0.01)
+    arrays["means"] = np.float32(arrays["means"] + camera.origin - 5 * camera.forward)
+    picture, kept = splatter.forward(tensors(arrays), camera)
+    assert not np.array(picture).any()
+    gradient, statistics = splatter.backward(kept, picture)
+    assert {name: g.shape for name, g in gradient.items()} == {name: v.shape for name, v in arrays.items()} | {"pose": (6,)}
+    assert not any(np.array(g).any() for g in gradient.values())
+    assert statistics.seen.shape == (n,)
+    assert not statistics.seen.any()
+
+
+@pytest.mark.parametrize("name", ["means", "log_scales", "quaternions", "opacity_logits", "harmonics"])
+def test_nan_is_named_by_its_index(splatter: Splatter, camera: Camera, name: str) -> None:
+    arrays = cloud(9, 2, 0.1)
+    arrays[name].reshape(9, -1)[[5, 7], -1] = np.nan
+    with pytest.raises(MivolError, match="Gaussian 5 and 1 others: found NaN"):
+        splatter.forward(tensors(arrays), camera)
+
+
+def test_a_quaternion_of_no_direction_is_refused(splatter: Splatter, camera: Camera) -> None:
+    arrays = cloud(9, 2, 0.1)
+    arrays["quaternions"][4] = 0
+    with pytest.raises(MivolError, match="Gaussian 4: found NaN or a quaternion 0"):
+        splatter.forward(tensors(arrays), camera)
+
+
+def test_lists_that_do_not_fit_are_refused_with_their_size(splatter: Splatter, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Before they are made. Gaussians in one tile take 80 bytes each: an entry, what sorting takes, and T of 64 pixels / 4."""
+    monkeypatch.setattr(module, "available_memory", lambda: 15 << 20)
+    made = []
+    monkeypatch.setattr(splatter, "_write", lambda *args: made.append(args))
+    arrays = {name: np.repeat(value, 10**5, axis=0) for name, value in stack([0.0], [0.0], 1e-4).items()}
+    with pytest.raises(MivolError, match=r"100,000 entries.*take 0\.0075 GiB.*at most 0\.0073 GiB"):
+        splatter.forward(tensors(arrays), straight())
+    assert made == []
+
+
+def test_the_jump_of_a_swap_is_bounded(splatter: Splatter) -> None:
+    """Two Gaussians whose depths are swapped exchange their order: in a pixel that jumps by T a_1 a_2 (c_1 - c_2), no more."""
+    arrays = stack([0.0, 1.0], [0.0, 1e-4])
+    pictures = []
+    for z in (1e-4, -1e-4):
+        arrays["means"][1, 2] = z
+        pictures.append(np.array(splatter.forward(tensors(arrays), straight())[0]).astype(float))
+    jump = np.abs(pictures[0] - pictures[1])
+    alphas = oracle_splats.alphas({k: v.astype(float) for k, v in arrays.items()}, straight(), 0.3)
+    colours = oracle_splats.colours({k: v.astype(float) for k, v in arrays.items()}, straight())
+    bound = alphas.prod(axis=0)[..., None] * np.abs(colours[0] - colours[1])
+    # The place moves by 2e-4 of the distance 1, which changes alpha by less than 4e-4 of itself (q e^-q/2 < 1), and takes it
+    # across 1/255, where it is skipped, in a few pixels.
+    assert (jump[..., :3] <= bound + 1 / 255 + 4e-4).all()
+    assert jump[..., :3].max() > 0.9 * bound.max()
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        (lambda r: {name: v for name, v in r.items() if name != "harmonics"}, "Found no tensor harmonics"),
+        (lambda r: r | {"harmonics": r["harmonics"][:, :4]}, r"Found harmonics of shape \(5, 4, 3\), expected \(5, 9, 3\)"),
+        (lambda r: r | {"quaternions": r["quaternions"][:, :3]}, r"Found quaternions of shape \(5, 3\)"),
+    ],
+)
+def test_tensors_of_the_wrong_shape(splatter: Splatter, camera: Camera, change: object, sentence: str) -> None:
+    with pytest.raises(MivolError, match=sentence):
+        splatter.forward(tensors({k: np.ascontiguousarray(v) for k, v in change(cloud(5, 2, 0.1)).items()}), camera)
+
+
+def test_cameras_and_derivatives_that_do_not_fit(splatter: Splatter, camera: Camera) -> None:
+    reals = tensors(cloud(5, 2, 0.1))
+    with pytest.raises(MivolError, match="found an image of 12 x 24 pixels, expected the splatter's 24 x 24"):
+        splatter.forward(reals, camera.resized((12, SIDE)))
+    picture, kept = splatter.forward(reals, camera, derivatives=False)
+    with pytest.raises(MivolError, match="drawn with derivatives=False"):
+        splatter.backward(kept, picture)
+    with pytest.raises(MivolError, match=r"Found a derivative of shape \(24, 24, 3\)"):
+        splatter.backward(kept, picture[..., :3])
+
+
+@pytest.mark.parametrize(
+    ("settings", "sentence"),
+    [
+        ({"width": 0}, "a picture of 0 x 8 pixels"),
+        ({"degree": 10}, "degree 10, expected 0 to 9"),
+        ({"low_pass": 0.0}, "low_pass = 0"),
+        ({"near": -1.0}, "near = -1"),
+        ({"least_alpha": 1.0}, "least_alpha = 1"),
+    ],
+)
+def test_settings_that_make_no_sense(variant_rgb: str, settings: dict, sentence: str) -> None:
+    with pytest.raises(MivolError, match=sentence):
+        Splatter(**({"width": 8, "height": 8, "degree": 0} | settings))
