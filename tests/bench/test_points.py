@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
+import mitsuba as mi
 import numpy as np
 import pytest
 
@@ -44,3 +46,14 @@ def test_the_peer_draws_the_same_cloud(variant_rgb: str, tmp_path: Path) -> None
     assert np.sqrt(np.mean((ours[:, ::-1] - peers) ** 2)) > 0.15
     points.draw({"peer": answer, "biker": points.measure_biker(points.QUICK)}, tmp_path)
     assert (tmp_path / "bench_points.png").stat().st_size > 10_000
+
+
+@pytest.mark.slow
+def test_the_peers_needles_point_where_ours_do(variant_rgb: str) -> None:
+    """Twelve needles: the pictures differ by 0.015 RMS of 0.14, and by 0.115 where the parts of quaternions are mistaken."""
+    cloud = points.dense_cloud(12, seed=3)
+    cloud = dataclasses.replace(cloud, log_scales=np.log(np.full((12, 3), [0.2, 0.03, 0.03], np.float32)))
+    camera = points.camera_before(np.zeros(3), 1.0, 64)
+    ours = np.array(points.Drawing.of(cloud, camera).forward()(0))[..., :3]
+    peers = np.array(mi.render(points.ellipsoids(cloud, camera), spp=4))
+    assert np.sqrt(np.mean((ours - peers) ** 2)) < 0.03
