@@ -245,6 +245,15 @@ def smoke_export(folder: Path) -> None:
     check((folder / "out.ply").read_bytes().startswith(b"ply"), "out.ply is no PLY")
 
 
+def smoke_convert(folder: Path) -> None:
+    """Points become Gaussians, and what comes of them is explained."""
+    import numpy as np
+
+    np.save(folder / "points.npy", np.eye(4, 3))
+    mivol("convert", "points.npy", "gaussians.ply", "--to", "gaussians")
+    check("4 Gaussians" in mivol("explain", "gaussians.ply"), "four points are not four Gaussians")
+
+
 def smoke_report(folder: Path) -> None:
     """The same page again."""
     page = folder / "photos" / "report.html"
@@ -255,8 +264,8 @@ def smoke_report(folder: Path) -> None:
 
 
 SMOKES: tuple[Callable[[Path], None], ...] = (
-    smoke_doctor, smoke_render, smoke_reference, smoke_explain, smoke_optimize, smoke_export, smoke_report, smoke_demo,
-    smoke_fetch, smoke_validate, smoke_bench,
+    smoke_doctor, smoke_render, smoke_reference, smoke_explain, smoke_optimize, smoke_export, smoke_convert, smoke_report,
+    smoke_demo, smoke_fetch, smoke_validate, smoke_bench,
 )  # fmt: skip
 """In the order in which each finds what it needs."""
 

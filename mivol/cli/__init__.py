@@ -84,7 +84,8 @@ def scene_flags(sub: argparse.ArgumentParser, what: str = "Mitsuba XML") -> None
 
 def explain_flags(sub: argparse.ArgumentParser) -> None:
     """A scene, or a data set with a picture of its cameras."""
-    scene_flags(sub, "Mitsuba XML, an experiment (.toml), or posed photographs: a folder or its transforms.json")
+    kinds = "Mitsuba XML, an experiment (.toml), points or Gaussians (.ply, .spz, ...), or photographs: a folder or its file"
+    scene_flags(sub, kinds)
     sub.add_argument("-o", "--output", type=Path, help="draw the cameras of photographs (.png, .svg)")
     sub.add_argument("--max-depth", type=int, help="longest path asked about; default: that of the scene's integrator")
     aim = "noise of a pixel over the mean radiance; max_depth has to leave out less (default: %(default)s)"
@@ -149,6 +150,17 @@ def export_flags(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("-m", "--mode", default="llvm_ad_rgb", help="variant (default: %(default)s)")
 
 
+def convert_flags(sub: argparse.ArgumentParser) -> None:
+    """From which file to which."""
+    from mivol.points.cloud import CLOUD_READERS, CLOUD_WRITERS
+    from mivol.points.facts import KINDS
+    from mivol.points.gaussian_files import READERS, WRITERS
+
+    sub.add_argument("source", type=Path, help=f"what to read: {', '.join({**READERS, **CLOUD_READERS})}")
+    sub.add_argument("output", type=Path, help=f"what to write: {', '.join({**WRITERS, **CLOUD_WRITERS})}")
+    sub.add_argument("--to", choices=KINDS, help="what to write it as; default: what the source holds, if the format can")
+
+
 def demo_flags(sub: argparse.ArgumentParser) -> None:
     """Which example, and what to do with it."""
     sub.add_argument("name", nargs="?", default="", help="which; without one they are listed")
@@ -194,12 +206,16 @@ def explain(arguments: argparse.Namespace) -> int:
     """What a scene or a fit needs, and what mivol would do: facts, choices, reasons; a small preview says which depth it needs.
 
     Of posed photographs: what there is, what is missing, and where asked for a picture of the cameras and the box that they
-    look at. What is refused is said after the facts, and the exit code is 1.
+    look at. Of points and Gaussians: how many, where, how large and opaque. What is refused is said after the facts, and the
+    exit code is 1.
     """
     from mivol.photos import find_format
+    from mivol.points.facts import is_points_file
 
     if arguments.scene.suffix.lower() == ".toml":
         return explain_experiment(arguments)
+    if is_points_file(arguments.scene):
+        return explain_points(arguments)
     kind = explain_photos if arguments.scene.is_dir() or find_format(arguments.scene) else explain_scene
     return kind(arguments)
 
@@ -222,6 +238,15 @@ def explain_experiment(arguments: argparse.Namespace) -> int:
     said = explain_fit(config.load(arguments.scene), arguments.scene.parent)
     print(said.text)
     return int(bool(said.refusal))
+
+
+def explain_points(arguments: argparse.Namespace) -> int:
+    """Facts of a file of points or Gaussians."""
+    from mivol.points.facts import read_facts
+
+    facts = read_facts(arguments.scene)
+    print(facts.text)
+    return int(bool(facts.refusal))
 
 
 def explain_photos(arguments: argparse.Namespace) -> int:
@@ -303,6 +328,13 @@ def export(arguments: argparse.Namespace) -> None:
     print("\n".join(str(path) for path in export_field(arguments.output, load_field(arguments.field), arguments.level)))
 
 
+def convert(arguments: argparse.Namespace) -> None:
+    """Write the points or Gaussians of a file in another format, or one as the other."""
+    from mivol.points.facts import convert_file
+
+    print(convert_file(arguments.source, arguments.output, arguments.to))
+
+
 def demo(arguments: argparse.Namespace) -> None:
     """Run an example that comes with mivol, list them, or copy one to begin from."""
     from mivol.cli.progress import Terminal
@@ -373,6 +405,7 @@ VERBS: dict[str, tuple[Callable, Callable]] = {
     "optimize": (optimize, optimize_flags),
     "validate": (validate, validate_flags),
     "export": (export, export_flags),
+    "convert": (convert, convert_flags),
     "report": (report, report_flags),
     "fetch": (fetch, fetch_flags),
     "bench": (bench, bench_flags),

@@ -7,7 +7,7 @@ read, since the length of a row is not known then; it and what follows it are le
 
 Source: Greg Turk, The PLY Polygon File Format, 1994.
 
-Here: :func:`read_tables`, :func:`is_table`, :func:`write_table`.
+Here: :func:`read_tables`, :func:`read_layout`, :func:`is_table`, :func:`write_table`.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ import numpy as np
 from mivol.files import source
 from mivol.files.source import refusal
 
-__all__ = ["is_table", "read_tables", "write_table"]
+__all__ = ["is_table", "read_layout", "read_tables", "write_table"]
 
 LONGEST_HEADER = 1 << 16
 """Bytes in which a header has to end; those of published files have some 2000."""
@@ -50,6 +50,17 @@ class Element:
 def is_table(head: bytes) -> bool:
     """Whether these first bytes are those of a ``.ply``."""
     return re.match(rb"ply\r?\n", head) is not None
+
+
+def read_layout(path: str | os.PathLike) -> dict[str, tuple[str, ...]]:
+    """Names of the properties of every element, from the header alone.
+
+    Raises:
+        MivolError: no PLY, or a header that does not end or contradicts itself.
+    """
+    with source.existing_file(path).open("rb") as file:
+        head, _ = _split(file.read(LONGEST_HEADER), path)
+    return {element.name: tuple(name for name, _ in element.properties) for element in _header(head, path)[1]}
 
 
 def read_tables(path: str | os.PathLike) -> dict[str, np.ndarray]:

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from mivol.files.atomic import write_whole
-from mivol.files.ply import read_tables
+from mivol.files.ply import read_layout, read_tables
 from mivol.files.source import by_suffix, existing_file
 from mivol.points.compressed_ply import gaussians_of_compressed_tables, is_compressed
 from mivol.points.gaussian_ply import gaussians_of_tables, write_gaussian_ply
@@ -20,7 +20,7 @@ from mivol.points.ksplat import read_ksplat
 from mivol.points.splat import read_splat
 from mivol.points.spz import read_spz
 
-__all__ = ["READERS", "WRITERS", "read_gaussians", "write_gaussians"]
+__all__ = ["READERS", "WRITERS", "holds_gaussians", "read_gaussians", "write_gaussians"]
 
 
 def _read_ply(path: Path) -> Gaussians:
@@ -38,6 +38,17 @@ READERS: dict[str, Callable[[Path], Gaussians]] = {
 
 #: suffix -> writer(file, gaussians).
 WRITERS: dict[str, Callable[[BinaryIO, Gaussians], None]] = {".ply": write_gaussian_ply}
+
+
+def holds_gaussians(path: Path) -> bool:
+    """Whether a file is of Gaussians: by its suffix, and a ``.ply`` by the properties that its header lists.
+
+    Raises:
+        MivolError: a ``.ply`` whose header cannot be read.
+    """
+    if path.suffix.lower() != ".ply":
+        return path.suffix.lower() in READERS
+    return not {"opacity", "packed_position"}.isdisjoint(read_layout(path).get("vertex", ()))
 
 
 def read_gaussians(path: str | os.PathLike) -> Gaussians:
