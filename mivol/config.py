@@ -325,6 +325,7 @@ class Photographs(Section):
 
     path: Annotated[str, of("path", "folder or file of cameras: Blender, nerfstudio, instant-ngp, COLMAP", min_length=1)]
     scale: Annotated[float, of("1", "of width and height, by exact means over area", gt=0, le=1)] = 1.0
+    largest: Annotated[int | None, of("pixel", "longest edge of any photograph; absent: as scale says")] = None
     background: Annotated[
         str | tuple[float, float, float], of("1", "behind images with alpha: white, black or an rgb triple; empty: no alpha")
     ] = ""
@@ -336,11 +337,13 @@ class Photographs(Section):
     held_out: Annotated[int, of("view", "every so many of the training views is compared, not fitted; 0: none", ge=0)] = 8
     box: Annotated[
         str | tuple[tuple[float, float, float], tuple[float, float, float]],
-        of("1", "where matter may be: cameras (what they look at), silhouettes (of alpha), or two corners [length]"),
+        of("1", "where matter may be: cameras, silhouettes (of alpha), middle (of nested boxes), or two corners [length]"),
     ] = "cameras"
     judged: Annotated[str, of("1", "views to report at the end: held_out, val or test", min_length=1)] = "held_out"
 
     def __post_init__(self) -> None:
+        if self.largest is not None and self.largest < 16:
+            raise ValueError(f"largest is {self.largest}: at least 16 pixels are expected")
         for name in ("background", "behind"):
             colour = getattr(self, name)
             if not isinstance(colour, str) and not all(0 <= c <= 1 for c in colour):  # NaN fails every comparison
@@ -350,7 +353,7 @@ class Photographs(Section):
 class Field(Section):
     """The radiance field and how it is fitted."""
 
-    preset: Annotated[str, of("1", "resolutions, steps, rates and priors: tiny, cpu or gpu", min_length=1)] = "cpu"
+    preset: Annotated[str, of("1", "resolutions, steps, rates and priors: tiny, cpu, capture or gpu", min_length=1)] = "cpu"
     longest: Annotated[int | None, of("voxel", "along the longest edge in the end; absent: the preset's")] = None
     degree: Annotated[int | None, of("1", "of the spherical harmonics; absent: the preset's")] = None
     first_degree: Annotated[int | None, of("1", "of the first stage, raised from there; absent: degree")] = None
@@ -411,6 +414,12 @@ class FieldFit(Section):
 #: Table of the file that tells which experiment it is; without any of them it is one on a scene.
 KINDS: dict[str, type] = {"scan": Scan, "photos": FieldFit}
 
+CAPTURE = {
+    "photos": {"largest": 240, "box": "middle"},
+    "show": {"views": 64},
+}
+"""What a file with ``field.preset = "capture"`` need not say: the size that its grids tell, nested boxes, all views shown."""
+
 #: Settings that change how a run is stored or how fast it is, not what comes out.
 NOT_RESULT = ("output", "threads", "title", "checkpoint_every", "show")
 
@@ -444,11 +453,33 @@ def from_dict(raw: dict[str, Any], name: str = "experiment") -> Experiment | Sca
         MivolError: as :func:`load`; ``name`` begins the sentence.
     """
     kind = next((KINDS[table] for table in KINDS if table in raw), Experiment)
+    raw = _with_capture(raw)
     check_keys(raw, kind, "", name)
     try:
         return msgspec.convert(raw, kind)
     except msgspec.ValidationError as error:
         raise MivolError(f"{name}: {sentence(raw, str(error))}") from None
+
+
+def of_photographs(path: Path, preset: str, changes: Sequence[str] = ()) -> FieldFit:
+    """The experiment of a folder of photographs, or of a file of cameras, that has no file of its own.
+
+    Raises:
+        MivolError: as :func:`load`.
+    """
+    raw = {"title": path.resolve().name, "photos": {"path": str(path)}, "field": {"preset": preset}}
+    for change in changes:
+        apply_change(raw, change)
+    return from_dict(raw, str(path))
+
+
+def _with_capture(raw: dict[str, Any]) -> dict[str, Any]:
+    """Settings with those of ``CAPTURE`` where that is the preset and they are not given."""
+    field = raw.get("field")
+    if "photos" not in raw or not isinstance(field, dict) or field.get("preset") != "capture":
+        return raw
+    given = {table: raw.get(table, {}) for table in CAPTURE}
+    return raw | {name: CAPTURE[name] | held if isinstance(held, dict) else held for name, held in given.items()}
 
 
 def resolved(experiment: Experiment | Scan | FieldFit) -> dict[str, Any]:

@@ -11,6 +11,7 @@ import shlex
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import mivol
 from mivol.cli.interrupts import Signals
@@ -127,7 +128,8 @@ def optimize_flags(sub: argparse.ArgumentParser) -> None:
     lines = ["images:", *describe(config.Experiment), "", "projections:", *describe(config.Scan)]
     lines += ["", "photographs:", *describe(config.FieldFit)]
     sub.epilog = "settings of the file for " + "\n  ".join(line.replace("%", "%%") for line in lines)
-    sub.add_argument("experiment", type=Path, help="TOML file")
+    sub.add_argument("experiment", type=Path, help="TOML file, or posed photographs: a folder or its file of cameras")
+    sub.add_argument("--preset", help="of photographs without a TOML file: capture for a place around the cameras, or cpu, ...")
     sub.add_argument("--set", action="append", default=[], metavar="key=value", help="override a setting of the file")
     sub.add_argument("-o", "--output", type=Path, help="run folder")
     sub.add_argument("--resume", action="store_true", help="continue from the run folder's checkpoint")
@@ -301,14 +303,33 @@ def reference(arguments: argparse.Namespace) -> None:
 
 def optimize(arguments: argparse.Namespace) -> None:
     """Reconstruct a volume from its views; everything that comes of it lies in the run folder."""
-    from mivol import config
     from mivol.cli.progress import Terminal
     from mivol.experiments.runs import run_experiment
     from mivol.experiments.task import Task
 
-    chosen = config.load(arguments.experiment, arguments.set)
+    chosen, base = chosen_of(arguments)
     folder = arguments.output or Path(chosen.output)
-    print(run_experiment(Task(chosen, arguments.experiment.parent, folder, arguments.resume, Terminal(), arguments.command)))
+    print(run_experiment(Task(chosen, base, folder, arguments.resume, Terminal(), arguments.command)))
+
+
+def chosen_of(arguments: argparse.Namespace) -> tuple[Any, Path]:
+    """The experiment of ``mivol optimize``, and the folder that its paths begin at.
+
+    Raises:
+        MivolError: photographs without a preset, a preset with a file, or as ``config.load``.
+    """
+    from mivol import config
+    from mivol.photos import find_format
+
+    path = arguments.experiment
+    if path.is_dir() or (path.suffix.lower() == ".json" and find_format(path)):
+        if arguments.preset is None:
+            raise MivolError(f"{path} holds photographs and no experiment: say how to fit them, --preset capture or cpu.")
+        return config.of_photographs(path, arguments.preset, arguments.set), Path()
+    if arguments.preset is not None:
+        found = f"--preset is for photographs, and {path} is an experiment"
+        raise MivolError(f"{found}: --set field.preset={arguments.preset} changes it.")
+    return config.load(path, arguments.set), path.parent
 
 
 def report(arguments: argparse.Namespace) -> None:

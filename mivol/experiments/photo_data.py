@@ -27,10 +27,11 @@ def read_photos(chosen: FieldFit, base: Path) -> tuple[Photos, Photos | None]:
         raise MivolError(f'photos.box = "{wanted.box}" is unknown: {nearest(wanted.box, list(BOXES))}')
     settings: dict[str, Any] = {
         "scale": wanted.scale,
+        "largest": wanted.largest,
         "background": wanted.background or None,
         "held_out": wanted.held_out,
         "space": "srgb",
-        "box": None if isinstance(wanted.box, str) else np.array(wanted.box, np.float64),
+        "box": SEARCHED.get(wanted.box) if isinstance(wanted.box, str) else np.array(wanted.box, np.float64),
     }
     path = base / wanted.path
     photos = _over(load_photos(path, split="train", **settings), wanted.behind)
@@ -63,7 +64,11 @@ def _about_silhouettes(photos: Photos) -> Photos:
     return replace(photos, survey=replace(photos.survey, box=box, box_from="about what alpha shows", near_far=near_far))
 
 
-BOXES = {"cameras": lambda photos: photos, "silhouettes": _about_silhouettes}
+BOXES = {"cameras": lambda photos: photos, "silhouettes": _about_silhouettes, "middle": lambda photos: photos}
+"""What is made of the box that was found with the photographs, by the word for it."""
+
+SEARCHED = {"middle": "middle"}
+"""Words for a box that ``load_photos`` looks for itself."""
 
 
 def notes(photos: Photos, judged: Photos | None = None) -> list[str]:

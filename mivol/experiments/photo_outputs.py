@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -24,7 +24,7 @@ from mivol.photos.picture import decode_srgb
 from mivol.report.depth import depth_pixels, normal_pixels, normals_of_depth
 from mivol.report.record import Image, Table, Volume
 from mivol.report.video import WITHOUT_FFMPEG, film_suffix, write_video
-from mivol.validate.images import Quality, judge, score
+from mivol.validate.images import METRICS, Quality, colour_fitted, judge, score
 
 FILM_SIZE = 256
 """Longest edge of a film [pixel]."""
@@ -78,15 +78,18 @@ class PhotoOutputs:
         """Judge all views, and keep some of them beside their photographs, with distance and normals of the first."""
         chosen: FieldFit = self.task.chosen
         views, found, images = self.judged.views, [], self.run.record.images
+        fitted = []
         shown = set(np.linspace(0, len(views) - 1, min(chosen.show.views, len(views))).astype(int).tolist())
         for number, photo in enumerate(views):
             seen, quality = compare(self.problem, self.judged, photo, chosen.show.metrics)
             found.append(quality)
+            fitted.append(judge_fitted(seen.image, photo, self.judged.space))
             if number in shown:
                 images += write_view(self.run.path, photo, number, seen.image)
             if number == 0:
                 images += write_geometry(self.run.path, seen, photo.camera, self.judged.near_far)
-        return named(score(found).values)
+        self.run.record.tables.append(table_of_views(views[0].camera, found, fitted))
+        return named(score(found).values) | {"psnr_colour_fitted": float(np.mean(fitted))}
 
     def write_film(self) -> Image:
         """A camera path around the box."""
@@ -112,6 +115,24 @@ def compare(
     seen = render_view(problem.field, photo.camera, behind(problem, photo))
     asked = {"space": judged.space, "mask": photo.mask, "metrics": metrics, "name": photo.name}
     return seen, judge(seen.image, photo.image, **asked)
+
+
+def judge_fitted(image: NDArray, photo: Photo, space: str) -> float:
+    """PSNR [dB] of a view whose colours were fitted to its photograph's."""
+    return judge(colour_fitted(image, photo.image, photo.mask), photo.image, space=space, mask=photo.mask).values["psnr"]
+
+
+def table_of_views(camera: Camera, found: Sequence[Quality], fitted: Sequence[float]) -> Table:
+    """Every judged view with its own figures, the worst one first."""
+    metrics = list(found[0].values)
+    head = ("view", *(METRICS[name].label for name in metrics), "PSNR [dB], colours fitted to the photograph's")
+    rows = [
+        (one.name, *(f"{one.values[name]:.{METRICS[name].digits}f}" for name in metrics), f"{value:.2f}")
+        for one, value in zip(found, fitted, strict=True)
+    ]
+    rows.sort(key=lambda row: float(row[1]))
+    width, height = camera.size
+    return Table(title=f"Judged views, at {width} x {height} pixels, the worst first", head=head, rows=tuple(rows))
 
 
 def named(values: dict[str, float]) -> dict[str, float]:

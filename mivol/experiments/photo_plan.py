@@ -8,7 +8,7 @@ import numpy as np
 
 from mivol.config import FieldFit
 from mivol.errors import MivolError
-from mivol.optim.radiance_plan import PRESETS, FitPlan, memory_of
+from mivol.optim.radiance_plan import FEW, PRESETS, FitPlan, memory_of
 from mivol.optim.ray_batches import RayBatches
 from mivol.optim.strategy import nearest
 from mivol.photos import Photos
@@ -33,14 +33,19 @@ def make_plan(chosen: FieldFit) -> FitPlan:
     plan = replace(plan, **{name: value for name, value in given.items() if value is not None})
     stages = [replace(stage, steps=max(1, round(stage.steps * wanted.effort))) for stage in plan.stages]
     plan = replace(plan, stages=tuple(stages))
+    if wanted.degree is not None:
+        plan = replace(plan, few_degree=None)
     return plan if wanted.longest is None else plan.up_to(wanted.longest)
 
 
 def shrunk(plan: FitPlan, photos: Photos) -> FitPlan:
-    """The plan with photographs as small as its grids can tell: pixels of half a voxel, at the middle of the box."""
+    """The plan for these photographs: as small as its grids can tell (pixels of half a voxel, at the middle of the box), and of
+    a lower degree where they are few."""
     cameras, box = [view.camera for view in photos.views], photos.box
     pixel = np.median([np.linalg.norm(camera.origin - box.mean(axis=0)) / camera.K[0, 0] for camera in cameras])
     least = min(min(camera.size) for camera in cameras)
+    if plan.few_degree is not None and len(photos.views) < FEW:
+        plan = replace(plan, degree=plan.few_degree)
     stages = []
     for one in plan.stages:
         voxel = (box[1] - box[0]).max() / one.longest
@@ -53,13 +58,22 @@ def choices(plan: FitPlan, photos: Photos, batches: RayBatches) -> list[PlanLine
     """What will be done, and why."""
     box = photos.box
     resolutions = ", ".join(str(stage.longest) for stage in plan.stages)
+    width, height = photos.views[0].camera.size
     size = " x ".join(f"{edge:.4g}" for edge in box[1] - box[0])
+    outer = " x ".join(f"{edge * 2 ** (plan.levels - 1):.4g}" for edge in box[1] - box[0])
+    nested = [
+        PlanLine(
+            choice=f"{plan.levels} nested boxes, the largest of {outer}",
+            reason="each has twice the extent of the one before, for what is around; cameras may stand in them",
+        )
+    ]
     return [
         PlanLine(choice=f"{len(photos.views)} photographs, a box of {size}", reason=photos.survey.box_from),
+        *nested[: plan.levels > 1],
         PlanLine(choice=f"grids of {resolutions} nodes along the longest edge", reason="coarse first, to find what is empty"),
         PlanLine(
             choice=f"photographs shrunk by {', '.join(str(stage.shrink) for stage in plan.stages)}",
-            reason="a pixel of half a voxel says as much as four smaller ones",
+            reason=f"a pixel of half a voxel says as much as four smaller ones; they are held at {width} x {height}",
         ),
         PlanLine(choice=f"harmonics of degree {plan.degree}", reason=f"{(plan.degree + 1) ** 2} numbers a colour and node"),
         what_is_behind(plan, photos),

@@ -6,6 +6,7 @@ and what they look at is found by :mod:`mivol.photos.survey`.
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -14,6 +15,7 @@ import numpy as np
 
 from mivol.errors import MivolError
 from mivol.files.source import refusal
+from mivol.machine import available_memory
 from mivol.photos.camera import Camera
 from mivol.photos.picture import read_mask, read_picture, shrink, space_of
 from mivol.photos.survey import Frame, PhotoSurvey, survey_photos
@@ -109,8 +111,10 @@ def load_photos(
     background: Background = None,
     space: str | None = None,
     held_out: int | Sequence[str] = 0,
-    box: np.ndarray | None = None,
+    box: np.ndarray | str | None = None,
     seed: int = 0,
+    largest: int | None = None,
+    limit: int | None = None,
 ) -> Photos:
     """Read a data set of posed photographs.
 
@@ -122,11 +126,14 @@ def load_photos(
             others) or (r, g, b); None where there is no alpha.
         space: "srgb" or "linear", what the values shall be; None: as the files are.
         held_out: every n-th training photograph, or file names (:func:`survey_photos`).
-        box: (2, 3) [length]; None: found.
+        box: (2, 3) [length]; None or "middle": found.
         seed: of random backgrounds.
+        largest: longest edge at which any photograph is held [pixel]; larger ones are shrunk further than ``scale`` says.
+        limit: memory that may be taken [bytes]; None for what the machine has left.
 
     Raises:
-        MivolError: as :func:`survey_photos`; images with alpha and no background or the reverse; NaN; a damaged file.
+        MivolError: as :func:`survey_photos`; more pixels than there is memory for; images with alpha and no background or the
+            reverse; NaN; a damaged file.
 
     Example:
         >>> photos = load_photos("chair", scale=0.25, background="white")
@@ -136,12 +143,38 @@ def load_photos(
     space = _space(space, survey.frames)
     if not 0 < scale <= 1:
         raise refusal("scale", f"{scale}", "a number above 0 and at most 1", "photographs can only be shrunk")
+    if largest is not None:
+        scale = min(scale, largest / max(max(frame.camera.size) for frame in survey.frames))
+    _check_memory(survey, scale, available_memory() if limit is None else limit)
     colours = _backgrounds(background, len(survey.frames), seed)
     views = [_photo(frame, scale, colour, space) for frame, colour in zip(survey.frames, colours, strict=True)]
     return Photos(tuple(views), space, survey)
 
 
 # -- Reading ------------------------------------------------------------------------------------------------------
+
+HELD = 24
+"""Bytes a pixel that is kept: rgb as float32, and once more while a lens' distortion is taken out."""
+
+READ = 64
+"""Bytes a pixel of the one file that is being read: rgb in float32 and float64, and their integral along an axis."""
+
+
+def _check_memory(survey: PhotoSurvey, scale: float, limit: int | None) -> None:
+    """Refuse photographs that do not fit, before any is read.
+
+    Raises:
+        MivolError: with the largest scale that does.
+    """
+    sizes = [math.prod(frame.camera.size) for frame in survey.frames]
+    kept, read = HELD * sum(sizes), READ * max(sizes)
+    if limit is None or kept * scale**2 + read <= limit:
+        return
+    fitting = math.floor(100 * math.sqrt(max(limit - read, 0) / kept)) / 100
+    advice = f"scale={fitting:g} fits" if fitting > 0 else "not even one can be read: shrink the files"
+    found = f"{len(sizes)} photographs at scale {scale:.3g} take about {(kept * scale**2 + read) / 2**30:.2g} GiB"
+    raise MivolError(f"{survey.path}: {found} and {limit / 2**30:.2g} are left; {advice}.")
+
 
 
 def _space(wanted: str | None, frames: Sequence[Frame]) -> str:

@@ -107,7 +107,7 @@ def survey_photos(
     *,
     split: str = "all",
     held_out: int | Sequence[str] = 0,
-    box: np.ndarray | None = None,
+    box: np.ndarray | str | None = None,
 ) -> PhotoSurvey:
     """Cameras, sizes and box of a data set; no pixel is read.
 
@@ -115,7 +115,8 @@ def survey_photos(
         path: folder, or file of cameras.
         split: one of ``SPLITS``: "train" without what is held out, "held_out", "val" and "test" as the data set has them.
         held_out: every n-th of the training photographs that are there, beginning with the first (0: none), or file names.
-        box: (2, 3) [length]; None: from points or cameras (:mod:`mivol.photos.region`).
+        box: (2, 3) [length]; None: from points or cameras (:mod:`mivol.photos.region`); "middle": the innermost of nested
+            boxes, which not every camera has to see.
 
     Raises:
         MivolError: no data set, a split without photographs, cameras that are wrong or look away from the box.
@@ -135,7 +136,8 @@ def survey_photos(
     training = [entry for entry in present if entry.split in ("train", "held_out")]
     looking = [cameras[id(entry)] for entry in training or chosen]
     found, whence = _box(box, listing.points, looking, path)
-    region.check_views([frame.camera for frame in frames], found)
+    if not isinstance(box, str):
+        region.check_views([frame.camera for frame in frames], found)
     near_far = region.near_far_of([*looking, *(frame.camera for frame in frames)], found)
     return PhotoSurvey(path, name, tuple(frames), tuple(absent), found, whence, near_far, listing.points)
 
@@ -200,7 +202,14 @@ def _mask(entry: Entry) -> Path | None:
     return entry.mask
 
 
-def _box(box: np.ndarray | None, points: np.ndarray | None, cameras: Sequence[Camera], path: Path) -> tuple[np.ndarray, str]:
+def _box(
+    box: np.ndarray | str | None, points: np.ndarray | None, cameras: Sequence[Camera], path: Path
+) -> tuple[np.ndarray, str]:
+    if isinstance(box, str):
+        if box != "middle":
+            raise refusal("box", f'"{box}"', '"middle", or two corners', "choose one of those")
+        found = region.middle_box(cameras, path)
+        return found, f"{region.MIDDLE:g} of the cameras' median distance from what they look at, on each side"
     if box is not None:
         return region.check_box(box), "as given"
     if points is not None and len(points) >= region.FEWEST_POINTS:

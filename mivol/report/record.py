@@ -68,6 +68,7 @@ QUANTITIES: dict[str, Quantity] = {
     "nrmse": Quantity("nRMSE of the volume"),
     "psnr": Quantity("PSNR of the fitted views", "dB", log=False),
     "held_out_psnr": Quantity("PSNR of the held-out views", "dB", log=False),
+    "psnr_colour_fitted": Quantity("PSNR of the held-out views, colours fitted", "dB", log=False),
     "few_psnr": Quantity("PSNR of the same few held-out views", "dB", log=False),
     "ssim": Quantity("SSIM of the held-out views", log=False),
     "flip": Quantity("FLIP of the held-out views", log=False),

@@ -21,7 +21,7 @@ from mivol.errors import MivolError
 from mivol.photos.picture import SPACES
 from mivol.validate.metrics import psnr, ssim
 
-__all__ = ["METRICS", "Quality", "Score", "flip", "judge", "quantised", "score"]
+__all__ = ["METRICS", "Quality", "Score", "colour_fitted", "flip", "judge", "quantised", "score"]
 
 
 @dataclass(frozen=True)
@@ -139,6 +139,26 @@ def judge(
     # The error of the pixels that are left out is 0; PSNR is that of the others.
     counted = -10 * np.log10(np.size(mask) / np.count_nonzero(mask))
     return Quality(name, {m: METRICS[m].measure(filled, wanted) + counted * (m == "psnr") for m in metrics})
+
+
+def colour_fitted(image: np.ndarray, truth: np.ndarray, mask: np.ndarray | None = None) -> np.ndarray:
+    """An image whose channels are each a x + b, as near to its photograph as they can be (least squares over what counts).
+
+    A camera that chose another exposure or white balance for a view that was not fitted says nothing of the field; this is what
+    the field is worth without that. It is told beside the PSNR of the image itself, never instead of it.
+
+    Args:
+        image, truth: (H, W, 3).
+        mask: (H, W) bool, False where a pixel does not count.
+    """
+    counts = np.ones(np.shape(truth)[:2], bool) if mask is None else np.asarray(mask, bool)
+    fitted = np.empty(np.shape(image))
+    for channel in range(3):
+        values = np.clip(image[..., channel], 0, 1).astype(np.float64)
+        terms = np.stack([values[counts], np.ones(np.count_nonzero(counts))], axis=1)
+        a, b = np.linalg.lstsq(terms, np.asarray(truth, np.float64)[..., channel][counts], rcond=None)[0]
+        fitted[..., channel] = a * values + b
+    return fitted
 
 
 def score(images: Iterable[Quality]) -> Score:

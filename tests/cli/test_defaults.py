@@ -56,6 +56,7 @@ DEFAULTS = {
     },
     "config.Photographs": {
         "scale": 1.0,
+        "largest": None,
         "background": "",
         "behind": (0.0, 0.0, 0.0),
         "held_out": 8,

@@ -14,6 +14,7 @@ from mivol.fields.spherical_files import save_field
 from mivol.files import read_volume
 from mivol.optim.field_view import FieldView
 from mivol.photos import Camera, Photo, intrinsics
+from mivol.validate.images import Quality
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
 
@@ -84,6 +85,13 @@ def test_distance_and_normals_are_pictures(tmp_path):
 @pytest.mark.parametrize(("given", "expected"), [((64, 32), (64, 32)), ((1024, 512), (256, 128)), ((2048, 1), (256, 1))])
 def test_films_are_small(given, expected):
     assert photo_outputs._small(camera(*given)).size == expected
+
+
+def test_judged_views_are_told_apart_the_worst_first():
+    found = [Quality("a.jpg", {"psnr": 23.456, "ssim": 0.71234}), Quality("b.jpg", {"psnr": 9.0, "ssim": 0.5})]
+    table = photo_outputs.table_of_views(camera(135, 240), found, [24.0, 12.345])
+    assert table.title == "Judged views, at 135 x 240 pixels, the worst first"
+    assert table.rows == (("b.jpg", "9.00", "0.5000", "12.35"), ("a.jpg", "23.46", "0.7123", "24.00"))
 
 
 def test_metrics_have_the_names_of_the_record():

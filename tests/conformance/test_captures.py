@@ -1,0 +1,101 @@
+"""Captures of unbounded places before they are fitted: their box, the size at which they are held, and their settings."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from capture_photos import DISTANCE, SIZE, cameras, capture, write_capture
+
+from mivol import config
+from mivol.cli import main
+from mivol.errors import MivolError
+from mivol.photos import Camera, intrinsics, load_photos, survey_photos
+from mivol.photos.region import MIDDLE, middle_box
+from mivol.validate.images import colour_fitted, judge
+
+
+def test_the_middle_box_is_a_cube_about_what_cameras_look_at() -> None:
+    """Cameras at one distance from the origin, which they look at: half an edge is a share of it."""
+    box = middle_box(cameras(9))
+    np.testing.assert_allclose(box, MIDDLE * DISTANCE * np.array([[-1.0] * 3, [1.0] * 3]), atol=1e-9)
+    far = [*cameras(9), *(Camera(c.K, c.size, _moved(c, 30.0)) for c in cameras(2))]
+    # Two that stand elsewhere do not move the median.
+    np.testing.assert_allclose(middle_box(far), box, atol=1e-9)
+
+
+def _moved(camera: Camera, distance: float) -> np.ndarray:
+    pose = camera.to_world.copy()
+    pose[:3, 3] = -distance * camera.forward
+    return pose
+
+
+def test_cameras_that_stand_where_they_look_have_no_middle_box() -> None:
+    turned = [Camera(intrinsics(9, 9, 4, 4), (8, 8), _moved(camera, 0.0)) for camera in cameras(4)]
+    with pytest.raises(MivolError, match="cameras that all stand in one place"):
+        middle_box(turned)
+
+
+def test_photographs_are_held_at_the_size_that_is_asked_for(tmp_path: Path) -> None:
+    folder = write_capture(tmp_path / "photos", 3)
+    small = load_photos(folder, split="all", largest=16, box="middle")
+    assert [view.image.shape for view in small.views] == [(12, 16, 3)] * 3
+    assert small.views[0].camera.K[0, 0] == pytest.approx(cameras(1)[0].K[0, 0] / 2)
+    np.testing.assert_allclose(small.box, middle_box([view.camera for view in small.views]), atol=1e-6)
+    assert "median distance" in small.survey.box_from
+    # A limit above what there is enlarges nothing, and scale still holds.
+    assert load_photos(folder, split="all", largest=900).views[0].image.shape[1] == SIZE[0]
+    assert load_photos(folder, split="all", largest=900, scale=0.5).views[0].image.shape[1] == SIZE[0] // 2
+
+
+def test_photographs_that_do_not_fit_are_refused_before_one_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = write_capture(tmp_path / "photos", 4)
+    pixels = SIZE[0] * SIZE[1]
+    # 64 bytes a pixel of the one that is read, 24 of each that is kept: at scale 0.5 a quarter of these.
+    limit = 64 * pixels + 24 * pixels * 4 // 4
+    assert len(load_photos(folder, split="all", scale=0.5, limit=limit).views) == 4
+    monkeypatch.setattr("mivol.photos.dataset.read_picture", lambda *_: pytest.fail("a photograph was read"))
+    with pytest.raises(MivolError, match=r"4 photographs at scale 1 take about .* are left; scale=0.5 fits\."):
+        load_photos(folder, split="all", limit=limit)
+    with pytest.raises(MivolError, match="not even one can be read"):
+        load_photos(folder, split="all", limit=pixels)
+
+
+def test_only_one_word_finds_a_box(tmp_path: Path) -> None:
+    with pytest.raises(MivolError, match='"edge"'):
+        survey_photos(write_capture(tmp_path / "photos", 3), box="edge")
+
+
+def test_the_colours_of_a_view_are_fitted_a_channel_at_a_time() -> None:
+    """A render of another exposure and tint is the photograph once its colours are fitted; a mask takes pixels out."""
+    photo = capture(1)[0].image.astype(np.float64)
+    other = np.clip((photo - [0.05, 0.0, 0.1]) / [0.9, 1.3, 1.2], 0, 1)
+    assert judge(other, photo).values["psnr"] < 25
+    # Where nothing was clipped the channels are linear in each other; 8 bits are left of the error.
+    fine = ((other > 0) & (other < 1)).all(axis=-1)
+    fitted = colour_fitted(other, photo, fine)
+    np.testing.assert_allclose(fitted[fine], photo[fine], atol=1e-9)
+    spoilt = np.where(fine[..., None], photo, 0.0)
+    np.testing.assert_allclose(colour_fitted(other, spoilt, fine), fitted, atol=1e-12)
+
+
+def test_a_preset_brings_what_captures_need_and_the_file_overrides_it() -> None:
+    raw = {"title": "a", "photos": {"path": "p"}, "field": {"preset": "capture"}}
+    plain = config.from_dict(raw)
+    assert (plain.photos.largest, plain.photos.box, plain.show.views) == (240, "middle", 64)
+    own = config.from_dict(raw | {"photos": {"path": "p", "largest": 99}, "show": {"views": 2}})
+    assert (own.photos.largest, own.photos.box, own.show.views) == (99, "middle", 2)
+    other = config.from_dict(raw | {"field": {"preset": "cpu"}})
+    assert (other.photos.largest, other.photos.box, other.show.views) == (None, "cameras", 4)
+
+
+def test_a_folder_of_photographs_is_an_experiment(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    folder = write_capture(tmp_path / "my photographs", 3)
+    made = config.of_photographs(folder, "capture", ["field.longest=16"])
+    assert (made.title, made.photos.path, made.field.longest, made.photos.box) == ("my photographs", str(folder), 16, "middle")
+    assert main(["optimize", str(folder)]) == 1
+    assert "--preset capture" in capsys.readouterr().err
+    (tmp_path / "fit.toml").write_text("")
+    assert main(["optimize", "--preset", "cpu", str(tmp_path / "fit.toml")]) == 1
+    assert "--set field.preset=cpu" in capsys.readouterr().err
