@@ -12,9 +12,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from scipy.special import expit
 
-from mivol.photos.camera import Camera
+from mivol.photos.camera import Camera, pixel_centres, rays
 
-__all__ = ["Drawn", "alphas", "draw", "moved", "project"]
+__all__ = ["Drawn", "alphas", "colours", "draw", "moved", "peaks", "project"]
 
 
 @dataclass(frozen=True)
@@ -74,6 +74,19 @@ def alphas(cloud: dict[str, np.ndarray], camera: Camera, low_pass: float, compen
     d = np.stack([x - centre[:, 0, None, None], y - centre[:, 1, None, None]], axis=-1)
     q = np.einsum("nhwi,nij,nhwj->nhw", d, inverse, d)
     return opacity[:, None, None] * np.exp(-0.5 * q)
+
+
+def peaks(cloud: dict[str, np.ndarray], camera: Camera) -> np.ndarray:
+    """(N, height, width) alpha by ray tracing: the largest value of each Gaussian along the ray through a pixel's centre."""
+    o, d = rays(camera, pixel_centres(camera.size))
+    found = []
+    for n, mean in enumerate(cloud["means"]):
+        turn = Rotation.from_quat(cloud["quaternions"][n, [1, 2, 3, 0]]).as_matrix()
+        scale = np.exp(cloud["log_scales"][n])
+        start, way = (o - mean) @ turn / scale, d @ turn / scale
+        nearest = start - (np.sum(start * way, -1) / np.sum(way * way, -1))[..., None] * way
+        found.append(expit(cloud["opacity_logits"][n]) * np.exp(-0.5 * np.sum(nearest**2, -1)))
+    return np.array(found)
 
 
 def colours(cloud: dict[str, np.ndarray], camera: Camera) -> np.ndarray:

@@ -33,7 +33,7 @@ from mivol.bench.questions import Bench
 from mivol.bench.timing import Contestant, Timing, race, ratio_of
 from mivol.photos.camera import Camera, intrinsics
 from mivol.points import Gaussians, read_gaussians
-from mivol.splatting import Splatter
+from mivol.splatting import Splatter, tensors_of
 
 __all__ = ["BENCH", "FULL", "QUICK", "Size", "compare", "dense_cloud", "main"]
 
@@ -102,12 +102,6 @@ def camera_before(centre: np.ndarray, edge: float, side: int, up: float = 1.0) -
     return Camera(intrinsics(FOCAL * side, FOCAL * side, side / 2, side / 2), (side, side), pose)
 
 
-def reals_of(gaussians: Gaussians) -> dict[str, mi.TensorXf]:
-    """As the splatter takes them."""
-    names = ("means", "log_scales", "quaternions", "opacity_logits", "harmonics")
-    return {name: mi.TensorXf(getattr(gaussians, name)) for name in names}
-
-
 class Drawing(NamedTuple):
     """A cloud, the camera before it, and the splatter of its picture."""
 
@@ -117,7 +111,7 @@ class Drawing(NamedTuple):
 
     @classmethod
     def of(cls, gaussians: Gaussians, camera: Camera) -> Drawing:
-        return cls(reals_of(gaussians), camera, Splatter(*camera.size, gaussians.degree))
+        return cls(tensors_of(gaussians), camera, Splatter(*camera.size, gaussians.degree))
 
     def forward(self) -> Contestant:
         """The picture alone."""

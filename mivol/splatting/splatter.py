@@ -20,6 +20,7 @@ import numpy as np
 from mivol.errors import MivolError
 from mivol.machine import available_memory
 from mivol.photos.camera import Camera
+from mivol.points import Gaussians
 from mivol.splatting.compositing import CHUNK, LANES, PIXELS, Adjoint, Frame, Lists, composite, composite_adjoint
 from mivol.splatting.device_arrays import aligned, kept_aligned
 from mivol.splatting.projection import EXP2, Cloud, Filter, Splats, project
@@ -27,7 +28,7 @@ from mivol.splatting.tile_lists import TILE, Grid, TileLists, check_memory, coun
 from mivol.splatting.view import View, numbers_of
 from mivol.threads import check_one_thread
 
-__all__ = ["Kept", "NAMES", "Splatter", "Statistics"]
+__all__ = ["NAMES", "Kept", "Splatter", "Statistics", "tensors_of"]
 
 NAMES = ("means", "log_scales", "quaternions", "opacity_logits", "harmonics")
 """The tensors of a cloud."""
@@ -67,6 +68,11 @@ class Statistics:
     radius: np.ndarray
 
 
+def tensors_of(gaussians: Gaussians) -> dict[str, mi.TensorXf]:
+    """The tensors of a cloud by name, as :meth:`Splatter.forward` takes them."""
+    return {name: mi.TensorXf(getattr(gaussians, name)) for name in NAMES}
+
+
 class Splatter:
     """Draws clouds of Gaussians by tile-based EWA splatting, and takes derivatives back.
 
@@ -84,6 +90,10 @@ class Splatter:
 
     Raises:
         MivolError: a size, degree or filter that makes no sense, or a Mitsuba variant that does not compile.
+
+    Example:
+        >>> gaussians = mivol.read_gaussians("biker.ply")
+        >>> picture, _ = Splatter(800, 800, gaussians.degree).forward(tensors_of(gaussians), camera)
     """
 
     def __init__(

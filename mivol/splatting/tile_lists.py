@@ -22,6 +22,9 @@ __all__ = ["TILE", "Grid", "TileLists", "count_tiles", "list_tiles", "write_tile
 TILE = 8
 """Pixels along the edge of a tile. 4 and 16 are slower."""
 
+MOST_ENTRIES = 1 << 28
+"""Of all lists: T of 64 pixels once in 4 entries is 16 numbers an entry, and places in memory are counted in 32 bits."""
+
 SLACK = 1e-3
 """By how much an ellipse is widened before it is listed [pixel]: far more than its centre and its radii are rounded by."""
 
@@ -173,8 +176,13 @@ def check_memory(needed: int, available: int | None, entries: int, longest: str)
     """Refuse lists that do not fit.
 
     Raises:
-        MivolError: ``needed`` is more than half of what is ``available`` [bytes].
+        MivolError: ``needed`` is more than half of what is ``available`` [bytes], or there are more than MOST_ENTRIES.
     """
+    if entries > MOST_ENTRIES:
+        raise MivolError(
+            f"Found {entries:,} entries of splats in tiles ({longest}), expected at most {MOST_ENTRIES:,}: use fewer or smaller "
+            "Gaussians, or a smaller image."
+        )
     if available is not None and needed > available // 2:
         raise MivolError(
             f"Found {entries:,} entries of splats in tiles, which take {needed / 2**30:.2g} GiB ({longest}); expected at most "

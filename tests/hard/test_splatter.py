@@ -13,6 +13,7 @@ from mivol.photos.camera import Camera, intrinsics
 from mivol.splatting import Splatter
 from mivol.splatting import splatter as module
 from mivol.splatting.compositing import STOP
+from mivol.splatting.tile_lists import check_memory
 
 SIDE = 24
 ROUNDING = 4e-5
@@ -149,6 +150,13 @@ def test_lists_that_do_not_fit_are_refused_with_their_size(splatter: Splatter, m
     with pytest.raises(MivolError, match=r"100,000 entries.*take 0\.0075 GiB.*at most 0\.0073 GiB"):
         splatter.forward(tensors(arrays), straight())
     assert made == []
+
+
+def test_entries_that_32_bits_do_not_count_are_refused() -> None:
+    """Wherever there is memory enough; the last number of entries that fits is not."""
+    check_memory(0, None, 1 << 28, "many")
+    with pytest.raises(MivolError, match="Found 268,435,457 entries"):
+        check_memory(0, None, (1 << 28) + 1, "many")
 
 
 def test_the_jump_of_a_swap_is_bounded(splatter: Splatter) -> None:
