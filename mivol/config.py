@@ -231,6 +231,7 @@ class Readings(Section):
     drift: Annotated[
         int, of("iteration", "how often the drift of the light since the flats is fitted to each pixel; 0: never", ge=0)
     ] = 0
+    saturation: Annotated[float, of("reading", "readings from here on are saturated, not used; inf: none", gt=0)] = INFINITY
 
 
 class Measured(Readings, kw_only=True, tag_field="source", tag="measured"):
@@ -257,6 +258,8 @@ class Stack(Readings, kw_only=True, tag_field="source", tag="stack"):
     def __post_init__(self) -> None:
         if (self.reading == "intensity") != bool(self.flats and self.darks):
             raise ValueError("an intensity needs flats and darks, and nothing else takes them: give both, or change reading")
+        if self.reading != "intensity" and self.saturation < INFINITY:
+            raise ValueError("only readings of an intensity saturate: leave saturation out, or change reading")
 
 
 class Nikon(Readings, kw_only=True, tag_field="source", tag="nikon"):
@@ -286,8 +289,13 @@ class Solve(Section):
     decay: Annotated[float, of("1", "of the relaxation, a sweep", gt=0, le=1)] = 0.99
     window: Annotated[str, of("1", "filter of fbp and fdk: key of mivol.tomography.ramp.WINDOWS", min_length=1)] = "ram-lak"
     cutoff: Annotated[float, of("1", "where the window ends, in parts of the Nyquist frequency", gt=0, le=1)] = 1.0
-    tv: Annotated[float, of("1", "strength of the total variation; 0: none", ge=0)] = 0.0
+    tv: Annotated[float, of("1/length", "strength of the total variation; 0: none", ge=0)] = 0.0
     delta: Annotated[float, of("1/length^2", "slope below which noise is smoothed", gt=0)] = 1e-3
+    tv_unit: Annotated[
+        Literal["length", "noise"],
+        of("1", "noise: tv in parts of what balances the noise, delta of the mean value a voxel; both have no unit then"),
+    ] = "length"
+    discrepancy: Annotated[float, of("1", "stop where the residual is so many times the noise; 0: never", ge=0)] = 0.0
 
     def __post_init__(self) -> None:
         if self.name not in METHODS:

@@ -24,7 +24,7 @@ def read_nikon_scan(wanted: Nikon, base: Path) -> tuple[Transmission, ConeBeam |
     scan = read_nikon(base / wanted.file)
     angles = read_nikon_angles(base / wanted.angles, len(scan.images)) if wanted.angles else scan.angles
     geometry = nikon_geometry(scan, angles)
-    return of_unknown_noise(read_nikon_transmission(scan)), geometry, notes_of(scan, geometry)
+    return of_unknown_noise(read_nikon_transmission(scan, wanted.saturation)), geometry, notes_of(scan, geometry)
 
 
 def notes_of(scan: NikonScan, geometry: ConeBeam | PanelViews) -> list[str]:

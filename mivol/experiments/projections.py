@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -11,14 +11,23 @@ import numpy as np
 from mivol import config
 from mivol.config import Cone, Detector, Ellipsoids, Known, Matrices, Measured, Nikon, OfData, Parallel, Stack, Table
 from mivol.errors import MivolError
-from mivol.experiments.nikon_scan import nikon_grid, read_nikon_scan
-from mivol.files import read_columns, read_projections, read_stack, read_volume
+from mivol.experiments.nikon_scan import nikon_grid
+from mivol.experiments.readings import ScanReadings, note_order, read_scan
+from mivol.files import read_columns, read_volume
 from mivol.files.fetch import place_of
+from mivol.optim.linear_problems import PoissonCounts
+from mivol.optim.solvers import METHODS
 from mivol.shown import briefly
 from mivol.tomography.geometry import ConeBeam, Geometry, ParallelBeam, VoxelGrid
 from mivol.tomography.panel_views import COLUMNS, PanelViews
 from mivol.tomography.phantoms import shepp_logan
-from mivol.tomography.preprocess import Transmission, correct_transmission, line_integrals, normalise_air, of_unknown_noise
+from mivol.tomography.preprocess import (
+    Quanta,
+    count_quanta,
+    find_air,
+    line_integrals,
+    normalise_air,
+)
 from mivol.tomography.projection_matrices import panels_of_matrices
 from mivol.tomography.projector import Projector
 from mivol.tomography.rotation_axis import find_axis
@@ -34,16 +43,18 @@ class Projections:
         y: line integrals (views, rows, cols).
         weights: their inverse variances.
         truth: (Z, Y, X), where known.
-        counts: quanta (views, rows, cols), where noise was simulated.
+        quanta: numbers of quanta, where they are known: simulated, or of readings with flats and darks.
         notes: what was found out on the way.
+        is_noise_known: whether 1 / weights are variances, and not only in proportion to them.
     """
 
     geometry: Geometry
     y: np.ndarray
     weights: np.ndarray
     truth: np.ndarray | None = None
-    counts: np.ndarray | None = None
+    quanta: Quanta | None = None
     notes: tuple[str, ...] = ()
+    is_noise_known: bool = False
 
     def digest(self) -> str:
         """SHA-256 of projections and weights."""
@@ -159,7 +170,8 @@ def add_noise(geometry: Geometry, exact: np.ndarray, truth: np.ndarray, photons:
         return Projections(geometry, exact, np.ones_like(exact), truth)
     counts = np.random.default_rng(seed).poisson(photons * np.exp(-exact)).astype(np.float64)
     y = np.where(counts > 0, -np.log(np.maximum(counts, 1.0) / photons), 0.0)
-    return Projections(geometry, y, counts, truth, counts)
+    quanta = Quanta(counts, photons, 0.0, np.ones(counts.shape, bool))
+    return Projections(geometry, y, counts, truth, quanta, is_noise_known=True)
 
 
 def read_measured(chosen: config.Scan, base: Path) -> Projections:
@@ -168,17 +180,11 @@ def read_measured(chosen: config.Scan, base: Path) -> Projections:
     Raises:
         MivolError: a file that cannot be read, or does not fit the others.
     """
-    wanted, notes, geometry, angles = chosen.data, [], None, None
-    if isinstance(wanted, Nikon):
-        transmission, geometry, notes = read_nikon_scan(wanted, base)
-    elif isinstance(wanted, Measured):
-        scan = read_projections(place_of(base, wanted.file), wanted.group)
-        transmission, angles = correct_transmission(scan.projections, scan.flats, scan.darks), scan.angles
-    else:
-        transmission, angles = read_stack_scan(chosen, base)
+    wanted, found = chosen.data, read_scan(chosen, base)
+    notes, angles = list(found.notes), found.angles
     if angles is not None:
         notes += note_order(angles)
-    y, weights = line_integrals(normalise_air(transmission, wanted.air) if wanted.air else transmission)
+    y, weights = line_integrals(normalise_air(found.transmission, wanted.air) if wanted.air else found.transmission)
     offset = None
     if wanted.find_axis and isinstance(chosen.scan, Parallel):
         axis = find_axis(y, weights, angles)
@@ -187,65 +193,32 @@ def read_measured(chosen: config.Scan, base: Path) -> Projections:
     unused = int((weights == 0).sum())
     if unused:
         notes.append(f"{unused} of {weights.size} pixels have no light or no finite reading: they are not used")
+    geometry = found.geometry
     if geometry is None:
         geometry = place_beam(chosen, base, np.arange(0) if angles is None else angles, y.shape[1:], offset)
     if geometry.shape != y.shape:
         raise MivolError(f"found {len(y)} projections and a geometry of {geometry.shape[0]} views, expected as many.")
-    return Projections(geometry, y, weights, notes=tuple(notes))
+    quanta = quanta_of(chosen, found) if METHODS[chosen.solve.name].problem is PoissonCounts else None
+    return Projections(
+        geometry, y, weights, quanta=quanta, notes=tuple(notes), is_noise_known=found.intensity is not None
+    )
 
 
-def read_stack_scan(chosen: config.Scan, base: Path) -> tuple[Transmission, np.ndarray | None]:
-    """Transmission and angles [rad] (None where a table has the geometry).
-
-    Raises:
-        MivolError: as :func:`read_measured`.
-    """
-    wanted: Stack = chosen.data
-
-    def stack(name: str) -> np.ndarray:
-        values = read_stack(base / name, wanted.dataset or None)
-        return values[:, ::-1] if wanted.first_row == "highest" else values
-
-    readings = stack(wanted.file)
-    if wanted.reading == "intensity":
-        transmission = correct_transmission(readings, stack(wanted.flats), stack(wanted.darks))
-    else:
-        transmission = of_unknown_noise(np.exp(-readings.astype(float)) if wanted.reading == "line_integral" else readings)
-    if isinstance(chosen.scan, Table | Matrices):
-        return transmission, None
-    if not wanted.angles:
-        return transmission, np.radians(chosen.scan.arc) * np.arange(len(readings)) / len(readings)
-    angles = read_columns(base / wanted.angles, 1)[:, 0]
-    if len(angles) != len(readings):
-        raise MivolError(f"{wanted.angles} has {len(angles)} angles for {len(readings)} projections: give one for each.")
-    return transmission, to_radians(angles, wanted.angle_unit)
-
-
-def to_radians(angles: np.ndarray, unit: str) -> np.ndarray:
-    """Angles in radians.
+def quanta_of(chosen: config.Scan, found: ScanReadings) -> Quanta:
+    """Numbers of quanta of a measured scan; where air is named, the light without an object is as bright as it is there.
 
     Raises:
-        MivolError: numbers that are of the other unit: over 8 turns in radians, or 16 views and more within 6.3 degrees.
+        MivolError: data without flats and darks, or with a drift, which only line integrals take.
     """
-    span = float(np.ptp(angles))
-    if unit == "radian" and span > 16 * np.pi:
+    if found.intensity is None or chosen.data.drift:
         raise MivolError(
-            f"the angles span {span:.4g} radians ({span / (2 * np.pi):.0f} turns): they seem to be degrees, set angle_unit."
+            "ml-tr needs counts of quanta, found line integrals, transmissions or a drift: give readings with flats and darks, "
+            "and no data.drift, or choose pcg."
         )
-    if unit == "degree" and len(angles) >= 16 and span <= 2 * np.pi + 1e-3:
-        raise MivolError(f"{len(angles)} views span {span:.4g} degrees: they seem to be radians, set angle_unit.")
-    return np.radians(angles) if unit == "degree" else angles
-
-
-def note_order(angles: np.ndarray) -> list[str]:
-    """A sentence where angles go back and forth, which a scanner rarely does."""
-    steps = np.diff(angles)
-    back = np.flatnonzero(np.sign(steps) * np.sign(np.sum(np.sign(steps))) < 0)
-    if not len(back):
-        return []
-    at = int(back[0])
-    turned = f"view {at + 1} at {np.degrees(angles[at + 1]):.2f} degrees follows view {at} at {np.degrees(angles[at]):.2f}"
-    return [f"the angles turn back {len(back)} times ({turned}): they are taken as they are"]
+    quanta = count_quanta(*found.intensity, chosen.data.saturation)
+    if not chosen.data.air:
+        return quanta
+    return replace(quanta, blank=quanta.blank * find_air(found.transmission.value, chosen.data.air))
 
 
 def held_out_views(chosen: config.Scan, count: int) -> np.ndarray:

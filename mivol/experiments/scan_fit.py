@@ -26,6 +26,7 @@ from mivol.optim.events import Checkpoint
 from mivol.optim.inversion import Inversion, Solve
 from mivol.optim.linear_problems import LeastSquares, PoissonCounts
 from mivol.optim.loop import Fit, begin_fit
+from mivol.optim.noise_scale import noise_norm, tv_of_noise
 from mivol.optim.smoothed_tv import SmoothedTV
 from mivol.optim.solver import State
 from mivol.optim.solvers import DIRECT, METHODS
@@ -71,6 +72,9 @@ def scan_fit(task: Task) -> Path:
             state = solve(task, run, problem, data, best)
             residual = state.residual_norm / norm_of(problem.linear_problem)
             run.record.results = {"iterations": float(state.iteration), "residual": residual}
+            run.record.plan += plan_of_prior(problem.linear_problem.prior, state)
+            if data.is_noise_known:
+                run.record.results["discrepancy"] = state.residual_norm / noise_norm(problem.linear_problem, chosen.solve.name)
             data = without_drift(problem, data, held_out, state)
         with run.stage("images and volumes"):
             write_outputs(run, projector, data, held_out, state.x.reshape(grid.shape))
@@ -98,6 +102,19 @@ def new_record(task: Task) -> RunRecord:
     )
 
 
+def plan_of_prior(prior: SmoothedTV | None, state: State) -> list[PlanLine]:
+    """How strong the prior was, and what it did."""
+    if prior is None:
+        return []
+    share, edges = prior.value(state.x) / abs(state.objective), prior.share_of_edges(state.x)
+    return [
+        PlanLine(
+            choice=f"total variation: strength {prior.strength:.4g} / length, smooth below {prior.delta:.4g} / length^2",
+            reason=f"it is {share:.2%} of the objective in the end, and keeps {edges:.2%} of the slopes as edges",
+        )
+    ]
+
+
 def make_problem(chosen: config.Scan, projector: Projector, data: Projections, held_out: np.ndarray) -> Inversion:
     """What the solver minimises, over the views that are not held out.
 
@@ -106,15 +123,43 @@ def make_problem(chosen: config.Scan, projector: Projector, data: Projections, h
     """
     wanted = chosen.solve
     kept = np.setdiff1d(np.arange(projector.n_views), held_out)
-    prior = SmoothedTV(projector.grid.shape, wanted.tv, wanted.delta, projector.grid.voxel_size) if wanted.tv else None
     a = projector.subset(kept)
+    prior = make_prior(wanted, a, data, kept)
     x0 = start_volume(wanted, a, data, kept)
     if METHODS[wanted.name].problem is LeastSquares:
         least_squares = LeastSquares(a, data.y[kept], data.weights[kept], x0, wanted.nonnegative, prior)
         return Inversion(least_squares, times=times_of(data)[kept] if getattr(chosen.data, "drift", 0) else None)
-    if data.counts is None:
+    if data.quanta is None:
         raise MivolError("ml-tr needs counts of quanta, found line integrals: simulate with photons, or choose pcg.")
-    return Inversion(PoissonCounts(a, data.counts[kept], chosen.data.photons, x0=x0, prior=prior))
+    quanta = data.quanta.of_views(kept)
+    return Inversion(PoissonCounts(a, quanta.counts, quanta.blank, quanta.background, x0, prior, quanta.used))
+
+
+def make_prior(wanted: config.Solve, a: Projector, data: Projections, kept: np.ndarray) -> SmoothedTV | None:
+    """Total variation in the unit that was asked for; None where none was.
+
+    Raises:
+        MivolError: the unit of a noise that is not known.
+    """
+    if not wanted.tv:
+        return None
+    if wanted.tv_unit == "length":
+        return SmoothedTV(a.grid.shape, wanted.tv, wanted.delta, a.grid.voxel_size)
+    check_noise("solve.tv_unit = noise", data)
+    return tv_of_noise(a, data.y[kept], data.weights[kept], wanted.tv, wanted.delta)
+
+
+def check_noise(asked: str, data: Projections) -> None:
+    """Refuse what needs the size of the noise where it is not known.
+
+    Raises:
+        MivolError: it is not.
+    """
+    if not data.is_noise_known:
+        raise MivolError(
+            f"{asked} needs the noise of the projections, which these do not have: give readings with flats and darks, or "
+            "simulate with photons."
+        )
 
 
 def times_of(data: Projections) -> np.ndarray:
@@ -154,6 +199,10 @@ def solve(task: Task, run: RunFolder, problem: Inversion, data: Projections, bes
     store = Store(run.checkpoint, {"data": data.digest(), **config.flat(config.resolved(chosen))}, task.resume)
     wanted = chosen.solve
     shared = {name: getattr(wanted, name) for name in ("subsets", "relaxation", "decay", "window", "cutoff")}
+    noise = noise_norm(problem.linear_problem, wanted.name) if data.is_noise_known else None
+    if wanted.discrepancy:
+        check_noise("solve.discrepancy", data)
+        shared["stop_norm"] = wanted.discrepancy * noise
     settings = Solve(solver=wanted.name, drift=getattr(chosen.data, "drift", 0), **shared)
     fit = begin_fit(problem, settings, course, store=store)
     best.restore()
@@ -162,11 +211,15 @@ def solve(task: Task, run: RunFolder, problem: Inversion, data: Projections, bes
 
         def observe(fit: Fit) -> None:
             errors = errors_of(fit.run.state, problem.linear_problem, data)
+            if noise:
+                errors["discrepancy"] = fit.run.state.residual_norm / noise
             run.append(fit.next, fit.seconds, loss=fit.history[-1]["loss"], **errors)
             best.see(fit.next, errors, {"volume": fit.run.state.x})
             watch(fit)
 
         fit.complete(observe)
+    if fit.run.finished and fit.next < course.iterations:
+        run.record.notes.append(f"stopped after iteration {fit.next} of {course.iterations}: {fit.run.finished}")
     return fit.run.state
 
 
@@ -179,5 +232,5 @@ def errors_of(state: State, task: LeastSquares | PoissonCounts, data: Projection
 def norm_of(task: LeastSquares | PoissonCounts) -> float:
     """|W^(1/2) b|, or the expected norm of Pearson's residuals, sqrt(m)."""
     if isinstance(task, PoissonCounts):
-        return float(np.sqrt(np.size(task.counts)))
+        return float(np.sqrt(np.size(task.counts) if task.used is None else np.sum(task.used)))
     return float(np.sqrt(np.sum(task.weights * task.b**2))) or 1.0

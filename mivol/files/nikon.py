@@ -119,8 +119,10 @@ def read_nikon_angles(path: str | os.PathLike, views: int) -> np.ndarray:
     return np.array([found[number] for number in wanted])
 
 
-def read_nikon_transmission(scan: NikonScan) -> np.ndarray:
+def read_nikon_transmission(scan: NikonScan, saturation: float = math.inf) -> np.ndarray:
     """(views, rows, cols) float32 readings over the white level, rows from the lowest, columns as seen from the source.
+
+    Readings from ``saturation`` on are NaN.
 
     Raises:
         MivolError: an image that cannot be read, or has another size than the detector.
@@ -132,6 +134,7 @@ def read_nikon_transmission(scan: NikonScan) -> np.ndarray:
             scan.path, f"images of {rows} x {columns} pixels", "{} x {} as DetectorPixels".format(*scan.detector), "correct it"
         )
     check_finite(scan.path, readings)
+    readings[readings >= saturation] = np.nan
     return readings[:, ::-1, ::-1] / np.float32(scan.white_level)
 
 

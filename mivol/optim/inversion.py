@@ -75,6 +75,7 @@ class Solve(Optimiser, tag="solve"):
     decay: Annotated[float, of("1", "of the relaxation, a sweep", gt=0, le=1)] = 0.99
     window: Annotated[str, of("1", "key of mivol.tomography.ramp.WINDOWS, for fbp and fdk", min_length=1)] = "ram-lak"
     cutoff: Annotated[float, of("1", "where the window ends, in parts of the Nyquist frequency", gt=0, le=1)] = 1.0
+    stop_norm: Annotated[float, of("1", "stop where the norm of the residual is at most this", ge=0)] = 0.0
 
     def options(self) -> dict[str, object]:
         """What is given to the solver."""
@@ -112,6 +113,8 @@ class SolverRun(Run):
     def _keep(self, state: State | None) -> None:
         self.state = state
         self.reals = {} if state is None else {KEY: state.x}
+        if state is not None and state.residual_norm <= self.settings.stop_norm:
+            self.finished = "the residual is as small as the noise"
 
     def step(self, iteration: int, factor: float) -> float | None:
         """The solver's next iteration; what it minimises, after it.

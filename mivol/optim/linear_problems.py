@@ -64,6 +64,7 @@ class PoissonCounts:
         background: expected quanta that are not the object's (dark, scatter), one number or (m,).
         x0: start, >= 0, or None for 0.
         prior: optional penalty.
+        used: (m,) whether a ray is used, or None for all (dead and saturated pixels are not).
     """
 
     A: Any
@@ -72,9 +73,10 @@ class PoissonCounts:
     background: np.ndarray | float = 0.0
     x0: np.ndarray | None = None
     prior: Penalty | None = None
+    used: np.ndarray | None = None
 
     def __post_init__(self) -> None:
-        check_sizes(self.A, self.x0, counts=self.counts)
+        check_sizes(self.A, self.x0, counts=self.counts, used=self.used)
         if np.min(self.counts) < 0 or np.min(self.blank) <= 0 or np.min(self.background) < 0:
             raise MivolError("Found negative counts or background or a blank of 0, expected counts >= 0 and a blank above 0.")
 

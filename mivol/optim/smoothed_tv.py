@@ -19,7 +19,7 @@ class SmoothedTV:
 
     Args:
         shape: (Z, Y, X).
-        strength: multiplies the sum; its unit makes the whole dimensionless.
+        strength: multiplies the sum [1/length], which makes the whole dimensionless.
         delta: slope [value per length] below which noise is smoothed instead of kept as an edge.
         voxel_size: one number or (x, y, z) [length].
 
@@ -62,6 +62,11 @@ class SmoothedTV:
             total[_part(axis, slice(1, None))] += part
             total[_part(axis, slice(None, -1))] += part
         return (total * self._scale).reshape(-1).astype(x.dtype)
+
+    def share_of_edges(self, x: np.ndarray) -> float:
+        """The share of voxels whose slope is ``delta`` or more: kept as edges, not smoothed as noise."""
+        t = np.sqrt(sum(d * d for d in self._differences(x)))
+        return float(np.mean(t >= self.delta))
 
     @property
     def _spacing(self) -> np.ndarray:

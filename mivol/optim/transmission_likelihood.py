@@ -50,17 +50,18 @@ class _Counts:
     blank: np.ndarray
     background: np.ndarray
     prior: Penalty | None
+    used: np.ndarray | float = 1.0
 
     @classmethod
     def of(cls, problem: PoissonCounts) -> _Counts:
         y = flat(problem.counts, np.float64)
         rates = (np.broadcast_to(np.asarray(v, float).reshape(-1), y.shape) for v in (problem.blank, problem.background))
-        return cls(y, *rates, problem.prior)
+        return cls(y, *rates, problem.prior, 1.0 if problem.used is None else flat(problem.used, np.float64))
 
     def slope(self, line: np.ndarray) -> np.ndarray:
         """h'(l)."""
         mu = self.blank * np.exp(-line)
-        return mu * (self.y / (mu + self.background) - 1.0)
+        return self.used * mu * (self.y / (mu + self.background) - 1.0)
 
     def optimum_curvature(self, line: np.ndarray) -> np.ndarray:
         """Erdogan & Fessler 1999, Eq. 28: ``2 (h(0) - h(l) + l h'(l)) / l^2``, at least 0, and ``h''(0)`` at l = 0."""
@@ -73,13 +74,14 @@ class _Counts:
         # and h''(0), the limit, is off by l h'''/3 only.
         small = line < 1e-3
         l2 = np.where(small, 1.0, line * line)
-        return np.maximum(np.where(small, at_zero, 2.0 * (h0 - h + line * self.slope(line)) / l2), 0.0)
+        # At a ray that is not used the slope is 0 and the rest means nothing.
+        return self.used * np.maximum(np.where(small, at_zero, 2.0 * (h0 - h + line * self.slope(line)) / l2), 0.0)
 
     def state(self, x: np.ndarray, iteration: int, line: np.ndarray) -> State:
         """Where the solver stands with a field whose line integrals are ``line``."""
         expected = self.blank * np.exp(-line.astype(np.float64)) + self.background
         # y log(yhat) -> 0 for y = 0 even where yhat underflows.
         log_expected = np.log(np.maximum(expected, np.finfo(float).tiny))
-        objective = float(np.sum(expected - self.y * log_expected)) + (self.prior.value(x) if self.prior else 0.0)
-        pearson = float(np.sqrt(np.sum((self.y - expected) ** 2 / np.maximum(expected, np.finfo(float).tiny))))
+        objective = float(np.sum(self.used * (expected - self.y * log_expected))) + (self.prior.value(x) if self.prior else 0.0)
+        pearson = float(np.sqrt(np.sum(self.used * (self.y - expected) ** 2 / np.maximum(expected, np.finfo(float).tiny))))
         return State(x, iteration, objective, pearson, {"line": line})

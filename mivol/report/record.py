@@ -64,6 +64,7 @@ class Quantity(NamedTuple):
 QUANTITIES: dict[str, Quantity] = {
     "loss": Quantity("Loss"),
     "residual": Quantity("Residual |Ax − y| / |y|"),
+    "discrepancy": Quantity("Residual over noise, RMS (1: as small as the noise)"),
     "gradient": Quantity("Norm of the gradient"),
     "nrmse": Quantity("nRMSE of the volume"),
     "psnr": Quantity("PSNR of the fitted views", "dB", log=False),

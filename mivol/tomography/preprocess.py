@@ -38,22 +38,44 @@ def of_unknown_noise(transmission: np.ndarray) -> Transmission:
     return Transmission(t, np.maximum(t, 0.0) * UNKNOWN_NOISE)
 
 
-def correct_transmission(readings: np.ndarray, flats: np.ndarray, darks: np.ndarray) -> Transmission:
-    """Transmission from readings, and its variance from the spread of the flats and darks.
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """What flats and darks say of a detector: ``var(reading) = dark_variance + gain (reading - dark)``.
 
-    The detector's noise is taken as ``var(reading) = var_dark + gain (reading - dark)``: read noise, and shot noise whose
-    ``gain`` (variance per unit of signal) follows from the flats, pooled over all pixels. To first order
+    Attributes:
+        dark, light: (rows, cols) mean reading without light, and what light adds to it; ``light`` is NaN at a dead pixel.
+        dark_variance: of a reading without light, pooled over all pixels.
+        gain: reading per quantum, from how much more the flats scatter, pooled over all pixels.
+        n_flats, n_darks: how many there were.
+        saturation: readings from here on are saturated.
+    """
 
-    ``var T = (var(reading) + T^2 var(flat) / n_flats + (1 - T)^2 var(dark) / n_darks) / (flat - dark)^2``.
+    dark: np.ndarray
+    light: np.ndarray
+    dark_variance: float
+    gain: float
+    n_flats: int
+    n_darks: int
+    saturation: float = np.inf
+
+    def signal(self, readings: np.ndarray) -> np.ndarray:
+        """Readings less the dark ones; NaN where a pixel is dead or saturated."""
+        lost = (readings >= self.saturation) | np.isnan(self.light)
+        return np.where(lost, np.nan, readings - self.dark)
+
+
+def calibrate(readings: np.ndarray, flats: np.ndarray, darks: np.ndarray, saturation: float = np.inf) -> Calibration:
+    """Calibrate a detector by its flats and darks. A pixel is dead where its flats are saturated or not above its darks.
 
     Args:
-        readings: (views, rows, cols).
+        readings: (views, rows, cols), for their shape.
         flats: (n_flats, rows, cols), at least 2.
         darks: (n_darks, rows, cols), at least 2.
+        saturation: readings from here on are saturated.
 
-    Raises: MivolError: shapes that do not fit, too few fields, or a pixel whose mean flat is not above its mean dark.
+    Raises:
+        MivolError: shapes that do not fit, too few fields, or as many dead pixels as others.
     """
-    readings, flats, darks = (np.asarray(a, np.float64) for a in (readings, flats, darks))
     if readings.ndim != 3 or not readings.shape[1:] == flats.shape[1:] == darks.shape[1:]:
         raise MivolError(
             f"Found readings {readings.shape}, flats {flats.shape} and darks {darks.shape}, "
@@ -64,17 +86,85 @@ def correct_transmission(readings: np.ndarray, flats: np.ndarray, darks: np.ndar
             f"Found {len(flats)} flats and {len(darks)} darks, expected at least 2 of each: their spread is the noise."
         )
     dark, light = darks.mean(0), flats.mean(0) - darks.mean(0)
-    if not (light > 0).all():
-        pixel = np.unravel_index(int(np.argmin(np.where(np.isfinite(light), light, -np.inf))), light.shape)
-        raise MivolError(f"Found no light at detector pixel {tuple(map(int, pixel))}, expected flats above darks everywhere.")
-    dark_variance = darks.var(0, ddof=1).mean()
-    gain = max(flats.var(0, ddof=1).mean() - dark_variance, 0.0) / light.mean()
-    signal = readings - dark
-    t = signal / light
-    reading_variance = dark_variance + gain * np.maximum(signal, 0.0)
-    flat_variance = dark_variance + gain * light
-    variance = reading_variance + t**2 * flat_variance / len(flats) + (1 - t) ** 2 * dark_variance / len(darks)
-    return Transmission(t, variance / light**2)
+    alive = (light > 0) & (flats < saturation).all(0)
+    if 2 * alive.sum() <= alive.size:
+        pixel = tuple(map(int, np.argwhere(~alive)[0]))
+        raise MivolError(
+            f"Found no light, or too much, at detector pixel {pixel} and at half of all or more, expected flats above darks."
+        )
+    dark_variance = float(darks.var(0, ddof=1)[alive].mean())
+    gain = max(float(flats.var(0, ddof=1)[alive].mean()) - dark_variance, 0.0) / float(light[alive].mean())
+    return Calibration(dark, np.where(alive, light, np.nan), dark_variance, gain, len(flats), len(darks), saturation)
+
+
+def correct_transmission(
+    readings: np.ndarray, flats: np.ndarray, darks: np.ndarray, saturation: float = np.inf
+) -> Transmission:
+    """Transmission from readings, and its variance from the spread of the flats and darks.
+
+    The detector's noise is that of :class:`Calibration`. To first order
+
+    ``var T = (var(reading) + T^2 var(flat) / n_flats + (1 - T)^2 var(dark) / n_darks) / (flat - dark)^2``.
+
+    Dead and saturated pixels are NaN.
+
+    Args, raises: as :func:`calibrate`.
+    """
+    readings, flats, darks = (np.asarray(a, np.float64) for a in (readings, flats, darks))
+    known = calibrate(readings, flats, darks, saturation)
+    signal = known.signal(readings)
+    t = signal / known.light
+    reading_variance = known.dark_variance + known.gain * np.maximum(signal, 0.0)
+    flat_variance = known.dark_variance + known.gain * known.light
+    variance = reading_variance + t**2 * flat_variance / known.n_flats + (1 - t) ** 2 * known.dark_variance / known.n_darks
+    return Transmission(t, variance / known.light**2)
+
+
+@dataclass(frozen=True, eq=False)
+class Quanta:
+    """Numbers of quanta, ``counts ~ Poisson(blank exp(-y) + background)``, for solvers that take no logarithm.
+
+    Attributes:
+        counts: (views, rows, cols); 0 where a pixel is not used.
+        blank: without an object, one number or as ``counts``.
+        background: expected besides them.
+        used: (views, rows, cols); False where a pixel is dead or saturated.
+    """
+
+    counts: np.ndarray
+    blank: np.ndarray | float
+    background: float
+    used: np.ndarray
+
+    def of_views(self, views: np.ndarray) -> Quanta:
+        """Those of some views."""
+        blank = self.blank[views] if isinstance(self.blank, np.ndarray) else self.blank
+        return Quanta(self.counts[views], blank, self.background, self.used[views])
+
+
+def count_quanta(readings: np.ndarray, flats: np.ndarray, darks: np.ndarray, saturation: float = np.inf) -> Quanta:
+    """Quanta from readings: ``(reading - dark) / gain``, with the read noise as a background of as many quanta as its variance.
+
+    Shifted by ``dark_variance / gain^2``, a Poisson number has the mean and the variance of the reading; a sum below 0 counts
+    as 0. A pixel without light keeps its count: no logarithm is taken.
+
+    Args: as :func:`calibrate`.
+
+    Raises:
+        MivolError: as :func:`calibrate`, or flats that scatter no more than darks.
+
+    Reference: Yavuz & Fessler 1998, Med. Image Anal. 2, 369 (shifted Poisson model of precorrected transmission scans).
+    """
+    readings, flats, darks = (np.asarray(a, np.float64) for a in (readings, flats, darks))
+    known = calibrate(readings, flats, darks, saturation)
+    if known.gain <= 0:
+        raise MivolError("found flats that scatter no more than darks, expected quanta's noise: choose pcg.")
+    shift = known.dark_variance / known.gain**2
+    signal = known.signal(readings)
+    used = np.isfinite(signal)
+    counts = np.where(used, np.maximum(signal / known.gain + shift, 0.0), 0.0)
+    blank = np.where(np.isnan(known.light), 1.0, known.light / known.gain)
+    return Quanta(counts, np.broadcast_to(blank, counts.shape), shift, used)
 
 
 def normalise_air(transmission: Transmission, n_columns: int) -> Transmission:
@@ -90,11 +180,29 @@ def normalise_air(transmission: Transmission, n_columns: int) -> Transmission:
     value, columns = transmission.value, transmission.value.shape[2]
     if not 2 <= n_columns <= columns // 2:
         raise MivolError(f"Found {n_columns} air columns, expected 2 to {columns // 2} of {columns}.")
-    left, right = value[..., :n_columns].mean(-1), value[..., -n_columns:].mean(-1)
+    air = find_air(value, n_columns)
+    return replace(transmission, value=value / air, variance=transmission.variance / air**2)
+
+
+def find_air(transmission: np.ndarray, n_columns: int) -> np.ndarray:
+    """(views, rows, cols): the straight line of each row through the mean of its ``n_columns`` at both edges that are finite.
+
+    Raises:
+        MivolError: a row of a view without a finite pixel at an edge.
+    """
+
+    def mean(edge: np.ndarray) -> np.ndarray:
+        seen = np.isfinite(edge)
+        if not seen.any(-1).all():
+            view, row = map(int, np.argwhere(~seen.any(-1))[0])
+            raise MivolError(f"found no usable air pixel at an edge of row {row} of view {view}, expected one: widen data.air.")
+        return np.where(seen, edge, 0.0).sum(-1) / seen.sum(-1)
+
+    columns = transmission.shape[2]
+    left, right = mean(transmission[..., :n_columns]), mean(transmission[..., -n_columns:])
     middle = (n_columns - 1) / 2
     f = (np.arange(columns) - middle) / (columns - 1 - 2 * middle)
-    air = left[..., None] * (1 - f) + right[..., None] * f
-    return replace(transmission, value=value / air, variance=transmission.variance / air**2)
+    return left[..., None] * (1 - f) + right[..., None] * f
 
 
 def line_integrals(transmission: Transmission, n_sigma: float = 3.0) -> tuple[np.ndarray, np.ndarray]:

@@ -1,0 +1,120 @@
+"""Measured projections from files: transmission, what it was taken with, and angles or geometry where the files have them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from mivol import config
+from mivol.config import Matrices, Measured, Nikon, Stack, Table
+from mivol.errors import MivolError
+from mivol.experiments.nikon_scan import read_nikon_scan
+from mivol.files import read_columns, read_projections, read_stack
+from mivol.files.fetch import place_of
+from mivol.shown import briefly
+from mivol.tomography.geometry import Geometry
+from mivol.tomography.preprocess import Transmission, correct_transmission, of_unknown_noise
+
+
+@briefly
+@dataclass(frozen=True, eq=False)
+class ScanReadings:
+    """What the files of a scan hold.
+
+    Attributes:
+        transmission: (views, rows, cols), rows from the lowest.
+        angles: (views,) [rad]; None where they do not matter, or are the geometry's.
+        geometry: where the files have one.
+        intensity: readings, flats and darks, where the files have them.
+        notes: what is to be said of them.
+    """
+
+    transmission: Transmission
+    angles: np.ndarray | None = None
+    geometry: Geometry | None = None
+    intensity: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
+    notes: tuple[str, ...] = ()
+
+
+def read_scan(chosen: config.Scan, base: Path) -> ScanReadings:
+    """Read a measured scan.
+
+    Raises:
+        MivolError: a file that cannot be read, or does not fit the others.
+    """
+    wanted = chosen.data
+    if isinstance(wanted, Nikon):
+        transmission, geometry, notes = read_nikon_scan(wanted, base)
+        return ScanReadings(transmission, geometry=geometry, notes=tuple(notes))
+    if isinstance(wanted, Measured):
+        scan = read_projections(place_of(base, wanted.file), wanted.group)
+        fields = scan.projections, scan.flats, scan.darks
+        return ScanReadings(correct_transmission(*fields, wanted.saturation), scan.angles, intensity=fields)
+    return read_stack_scan(chosen, base)
+
+
+def read_stack_scan(chosen: config.Scan, base: Path) -> ScanReadings:
+    """Read a stack of images or an array.
+
+    Raises:
+        MivolError: as :func:`read_scan`.
+    """
+    wanted: Stack = chosen.data
+
+    def stack(name: str) -> np.ndarray:
+        values = read_stack(base / name, wanted.dataset or None)
+        return values[:, ::-1] if wanted.first_row == "highest" else values
+
+    readings = stack(wanted.file)
+    fields = (readings, stack(wanted.flats), stack(wanted.darks)) if wanted.reading == "intensity" else None
+    if fields:
+        transmission = correct_transmission(*fields, wanted.saturation)
+    else:
+        transmission = of_unknown_noise(np.exp(-readings.astype(float)) if wanted.reading == "line_integral" else readings)
+    return ScanReadings(transmission, read_angles(chosen, base, len(readings)), intensity=fields)
+
+
+def read_angles(chosen: config.Scan, base: Path, views: int) -> np.ndarray | None:
+    """Angles [rad] of a stack: listed, or evenly over the arc; None where a table has the geometry.
+
+    Raises:
+        MivolError: another number of angles than views, or angles of another unit.
+    """
+    wanted: Stack = chosen.data
+    if isinstance(chosen.scan, Table | Matrices):
+        return None
+    if not wanted.angles:
+        return np.radians(chosen.scan.arc) * np.arange(views) / views
+    angles = read_columns(base / wanted.angles, 1)[:, 0]
+    if len(angles) != views:
+        raise MivolError(f"{wanted.angles} has {len(angles)} angles for {views} projections: give one for each.")
+    return to_radians(angles, wanted.angle_unit)
+
+
+def to_radians(angles: np.ndarray, unit: str) -> np.ndarray:
+    """Angles in radians.
+
+    Raises:
+        MivolError: numbers that are of the other unit: over 8 turns in radians, or 16 views and more within 6.3 degrees.
+    """
+    span = float(np.ptp(angles))
+    if unit == "radian" and span > 16 * np.pi:
+        raise MivolError(
+            f"the angles span {span:.4g} radians ({span / (2 * np.pi):.0f} turns): they seem to be degrees, set angle_unit."
+        )
+    if unit == "degree" and len(angles) >= 16 and span <= 2 * np.pi + 1e-3:
+        raise MivolError(f"{len(angles)} views span {span:.4g} degrees: they seem to be radians, set angle_unit.")
+    return np.radians(angles) if unit == "degree" else angles
+
+
+def note_order(angles: np.ndarray) -> list[str]:
+    """A sentence where angles go back and forth, which a scanner rarely does."""
+    steps = np.diff(angles)
+    back = np.flatnonzero(np.sign(steps) * np.sign(np.sum(np.sign(steps))) < 0)
+    if not len(back):
+        return []
+    at = int(back[0])
+    turned = f"view {at + 1} at {np.degrees(angles[at + 1]):.2f} degrees follows view {at} at {np.degrees(angles[at]):.2f}"
+    return [f"the angles turn back {len(back)} times ({turned}): they are taken as they are"]
