@@ -71,12 +71,6 @@ def run_child(
     """
     command = [sys.executable, *(["-I", "-S"] if isolated else ["-P"]), "-c", code, *args]
     return subprocess.run(
-        command,
-        capture_output=True,
-        text=True,
-        errors="replace",
-        timeout=timeout,
-        env=env,
-        stdin=subprocess.DEVNULL,
+        command, capture_output=True, text=True, errors="replace", timeout=timeout, env=env, stdin=subprocess.DEVNULL,
         check=False,
     )

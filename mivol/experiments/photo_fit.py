@@ -76,7 +76,9 @@ def solve(task: Task, run: RunFolder, problem: RadianceProblem, judged: Photos |
     """
     chosen: FieldFit = task.chosen
     plan, every = problem.plan, chosen.show.every
-    store = Store(run.checkpoint, {"photos": problem.batches.digest(), **config.flat(config.resolved(chosen))}, task.resume)
+    store = Store(
+        run.checkpoint, {"photos": problem.batches.digest(), **config.flat(config.resolved(chosen))}, task.resume
+    )
     fit = begin_fit(problem, plan.optimiser, plan.course(Checkpoint(every=chosen.checkpoint_every)), store=store)
     run.begin(fit.next)
     with task.watcher.watch(plan.steps) as watch:

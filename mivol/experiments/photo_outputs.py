@@ -108,7 +108,9 @@ class PhotoOutputs:
         return Image(path=path, role="film", caption=f"{count} views around the box")
 
 
-def compare(problem: RadianceProblem, judged: Photos, photo: Photo, metrics: tuple[str, ...]) -> tuple[FieldView, Quality]:
+def compare(
+    problem: RadianceProblem, judged: Photos, photo: Photo, metrics: tuple[str, ...]
+) -> tuple[FieldView, Quality]:
     """A photograph's view of the field, and how alike they are."""
     seen = render_view(problem.field, photo.camera, behind(problem, photo))
     asked = {"space": judged.space, "mask": photo.mask, "metrics": metrics, "name": photo.name}

@@ -23,7 +23,6 @@ from mivol.scene.sensors import find_sensor
 SAMPLES_PER_PASS = 1 << 21
 COLOURS = {1: ("Y",), 2: ("Y", "A"), 3: ("R", "G", "B"), 4: ("R", "G", "B", "A")}
 
-
 def check_output(path: Path) -> None:
     """Refuse a name that no image can be written to, before hours are spent on the image.
 

@@ -262,7 +262,9 @@ def difference(
 # -- Files --------------------------------------------------------------------------------------------------------
 
 
-def write_verdict(verdict: Verdict, image: Estimate, reference: ReferenceResult, folder: Path, chosen: Validation) -> Verdict:
+def write_verdict(
+    verdict: Verdict, image: Estimate, reference: ReferenceResult, folder: Path, chosen: Validation
+) -> Verdict:
     """``validation.json`` and ``validation.png``; the verdict that names them."""
     # Where neither has any noise, z is drawn as if float32 had rounded the values once.
     error = np.sqrt(np.asarray(image.var) + reference.variance + (6e-8 * max(float(reference.mean.max()), 1e-30)) ** 2)

@@ -196,7 +196,9 @@ def fetch_data(data: DataSet, folder: Path | None = None, watch: Callable[[int],
         ) from None
     found, size = digest_of(partial), partial.stat().st_size
     if size < data.size:
-        raise MivolError(f"{data.url} broke off after {size} of {data.size} bytes: call again, and it goes on from there.")
+        raise MivolError(
+            f"{data.url} broke off after {size} of {data.size} bytes: call again, and it goes on from there."
+        )
     if found != data.sha256:
         partial.unlink()
         raise MivolError(

@@ -28,7 +28,6 @@ class Adam(FirstOrder, tag="adam"):
     beta_1: Annotated[float, of("1", "memory of the gradient", ge=0, lt=1)] = 0.9
     beta_2: Annotated[float, of("1", "memory of its square", ge=0, lt=1)] = 0.999
     epsilon: Annotated[float, of("largest gradient", "gradients well below this hardly move anything", gt=0)] = 1e-6
-
     def begin(self, problem: Differentiable) -> Run:
         return AdamRun(self, problem)
 

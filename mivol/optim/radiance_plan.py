@@ -233,7 +233,6 @@ def memory_of(plan: FitPlan, box: np.ndarray, batches: RayBatches, limit: int | 
     Raises:
         MivolError: more than there is; the largest resolution that fits is said.
     """
-
     def needed(some: FitPlan) -> int:
         return batches.bytes + max(bytes_of(some, stage, box) for stage in some.stages)
 

@@ -79,7 +79,9 @@ class RMSpropRun(Run):
         self.reals, self.squares = refinement.reals, squares
 
 
-def descend(values: mi.Float, squares: mi.Float, slope: mi.Float, rate: float, memory: float) -> tuple[mi.Float, mi.Float]:
+def descend(
+    values: mi.Float, squares: mi.Float, slope: mi.Float, rate: float, memory: float
+) -> tuple[mi.Float, mi.Float]:
     """Values and running means of squared derivatives after a step of ``rate`` where there is a derivative."""
     square = dr.square(slope)
     mean = dr.select(squares == 0, square, dr.fma(memory, squares - square, square))

@@ -250,7 +250,9 @@ class SceneProblem:
         """Sum of all weighted prior energies."""
         return math.fsum(float(p.energy(p.from_reals(dr.detach(reals[p.name])))[0]) for p in self.parameters)
 
-    def through_priors_and_maps(self, reals: Reals, gradients: Reals) -> tuple[float, Reals]:
+    def through_priors_and_maps(
+        self, reals: Reals, gradients: Reals
+    ) -> tuple[float, Reals]:
         """Prior energy, and the gradients by the reals for given gradients by the values."""
         total, by_reals = 0.0, {}
         for p in self.parameters:

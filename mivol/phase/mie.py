@@ -92,7 +92,9 @@ def aerosol(
         raise MivolError(f"geometric_deviation is {geometric_deviation}; a number above 1 is expected.")
     s = np.log(geometric_deviation)
     low, high = _ends_of_lognormal(median_radius, s)
-    return _average(lambda r: np.log(r) - 0.5 * (np.log(r / median_radius) / s) ** 2, low, high, wavelength, index, tolerance)
+    return _average(
+        lambda r: np.log(r) - 0.5 * (np.log(r / median_radius) / s) ** 2, low, high, wavelength, index, tolerance
+    )
 
 
 def _ends_of_lognormal(median: float, s: float) -> tuple[float, float]:

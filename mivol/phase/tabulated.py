@@ -83,12 +83,16 @@ class Lookup:
         left, right = (dr.gather(mi.Float, values, k, active) for k in (i, i + 1))
         return INV_TWO_PI * dr.fma(part, right - left, left) * dr.rcp(integral)
 
-    def sample(self, u: mi.Float, values: mi.Float, integral: mi.Float, cumulative: mi.Float, active: mi.Bool = True) -> Turn:
+    def sample(
+        self, u: mi.Float, values: mi.Float, integral: mi.Float, cumulative: mi.Float, active: mi.Bool = True
+    ) -> Turn:
         """Draw a scattering angle with density :meth:`eval`, by exact inversion: a quadratic equation in each segment."""
         n = len(self.width)
         i = dr.binary_search(0, n, lambda k: dr.gather(mi.Float, cumulative, k, active) <= u)
         i = dr.clip(mi.Int32(i) - 1, 0, n - 1)
-        width, left, right = (dr.gather(mi.Float, a, k, active) for a, k in ((self.width, i), (values, i), (values, i + 1)))
+        width, left, right = (
+            dr.gather(mi.Float, a, k, active) for a, k in ((self.width, i), (values, i), (values, i + 1))
+        )
         area = (u - dr.gather(mi.Float, cumulative, i, active)) * integral
         slope = (right - left) * dr.rcp(width)
         # 2 area / (left + root) is the same as (root - left) / slope, which is 0/0 on a level segment.

@@ -26,7 +26,6 @@ __all__ = ["LoadedScene", "SceneSource", "load_scene"]
 
 SceneSource = str | os.PathLike | Mapping
 
-
 @briefly
 @dataclass(frozen=True)
 class LoadedScene:
@@ -77,6 +76,7 @@ def two_threads() -> Iterator[None]:
     finally:
         if single:
             dr.set_thread_count(1)
+
 
 
 def load_scene(source: SceneSource | mi.Scene, overrides: Mapping[str, object] | None = None) -> LoadedScene:

@@ -180,8 +180,8 @@ def check_memory(needed: int, available: int | None, entries: int, longest: str)
     """
     if entries > MOST_ENTRIES:
         raise MivolError(
-            f"Found {entries:,} entries of splats in tiles ({longest}), expected at most {MOST_ENTRIES:,}: use fewer or smaller "
-            "Gaussians, or a smaller image."
+            f"Found {entries:,} entries of splats in tiles ({longest}), expected at most {MOST_ENTRIES:,}: use fewer or "
+            "smaller Gaussians, or a smaller image."
         )
     if available is not None and needed > available // 2:
         raise MivolError(

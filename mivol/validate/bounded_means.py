@@ -13,7 +13,9 @@ from mivol.validate.statistics import STRICT, Significance
 __all__ = ["assert_same_bounded_mean", "bounded_p_value"]
 
 
-def bounded_p_value(mean: np.ndarray, n: int, truth: np.ndarray, bounds: tuple[float, float] = (0.0, 1.0)) -> np.ndarray:
+def bounded_p_value(
+    mean: np.ndarray, n: int, truth: np.ndarray, bounds: tuple[float, float] = (0.0, 1.0)
+) -> np.ndarray:
     r"""Chance, at most, of a mean of n samples at least as far from the truth, for samples between two bounds.
 
     Hoeffding's first bound: for samples in [0, 1] of expectation p, the mean X of n of them satisfies

@@ -293,7 +293,9 @@ def _render_until(
 
 def _result(setup: _Setup, run: _Run, path: Path, doubts: tuple[Doubt, ...]) -> ReferenceResult:
     m = run.moments
-    return ReferenceResult(m.mean, m.variance_of_mean, m.n, m.n * run.pass_spp, setup.identity, path, doubts, run.seconds)
+    return ReferenceResult(
+        m.mean, m.variance_of_mean, m.n, m.n * run.pass_spp, setup.identity, path, doubts, run.seconds
+    )
 
 
 @contextmanager

@@ -243,7 +243,9 @@ def assert_same_mean(
     )
 
 
-def p_value(a: Estimate, b: Estimate, *, comparisons: int | None = None, tile: int = 1, rounding: float = 0.0) -> float:
+def p_value(
+    a: Estimate, b: Estimate, *, comparisons: int | None = None, tile: int = 1, rounding: float = 0.0
+) -> float:
     """Chance that means that agree differ as much as these do somewhere: the alpha at which :func:`assert_same_mean` turns.
 
     Args: see :func:`assert_same_mean`; many comparisons by Sidak's formula.

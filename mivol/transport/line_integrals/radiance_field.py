@@ -352,7 +352,9 @@ def _follow_back(cells: Cells, rendered: RenderedRays, visit: Callable, state: A
         ends = number == last.piece
         cell, t = dr.select(ends, last.cell, end), dr.select(ends, last.t, piece.segment.length)
         back = reversed_from(piece.segment, cell, t, dr.select(number == first.piece, first.t, 0))
-        state, _, _ = march(cells, back, partial(visit, back=back, scale=piece.scale), state, active, None, piece.level)
+        state, _, _ = march(
+            cells, back, partial(visit, back=back, scale=piece.scale), state, active, None, piece.level
+        )
         number -= 1
     return state
 

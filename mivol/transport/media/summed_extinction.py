@@ -42,7 +42,9 @@ class SummedExtinction:
     def along(self, corners: list, points: list[mi.Vector3f]) -> list[list[mi.Float]]:
         """[channel][point] values at points of a cell (fractions from its near planes), from [read][channel][corner]."""
         pairs = list(zip(corners, self.activations, strict=False))
-        grids = [[[activate(a, interpolate(g[c % len(g)], p)) for g, a in pairs] for p in points] for c in range(self.channels)]
+        grids = [
+            [[activate(a, interpolate(g[c % len(g)], p)) for g, a in pairs] for p in points] for c in range(self.channels)
+        ]
         return [
             [dr.fma(self.scale, sum(s, mi.Float(0)), k) for s in sums] for sums, k in zip(grids, self.constant, strict=True)
         ]
