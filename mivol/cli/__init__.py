@@ -94,8 +94,13 @@ def explain_flags(sub: argparse.ArgumentParser) -> None:
 
 
 def render_flags(sub: argparse.ArgumentParser) -> None:
-    """Mitsuba's own flags for an image."""
-    scene_flags(sub)
+    """Mitsuba's own flags for an image, and the camera of a radiance field."""
+    scene_flags(sub, "Mitsuba XML, or a radiance field (.npz) with --look-at")
+    where = "of a field: where the camera stands, and what it looks at [length]"
+    sub.add_argument("--look-at", type=float, nargs=6, metavar=("x", "y", "z", "to_x", "to_y", "to_z"), help=where)
+    sub.add_argument("--up", type=float, nargs=3, metavar=("x", "y", "z"), default=[0.0, 0.0, 1.0], help="of a field's picture")
+    sub.add_argument("--fov", type=float, default=50.0, help="of a field's picture, across [degree] (default: %(default)s)")
+    sub.add_argument("--size", type=int, nargs=2, metavar=("width", "height"), default=[640, 480], help="of a field's picture")
     sub.add_argument("-s", "--sensor", type=int, default=0, help="number of the sensor")
     sub.add_argument("-o", "--output", type=Path, help="image (.exr or .png); default: the XML's name with .exr")
     sub.add_argument("--integrator", help="in place of the scene's own, with its max_depth: mivol, volpath, ...")
@@ -265,12 +270,25 @@ def explain_photos(arguments: argparse.Namespace) -> int:
 
 
 def render(arguments: argparse.Namespace) -> None:
-    """Render a scene to an image, with the flags of the command ``mitsuba``."""
+    """Render a scene to an image, with the flags of the command ``mitsuba``; or a radiance field, from where one likes."""
     from mivol.cli.loading import load
     from mivol.experiments.render import check_output, choose_integrator, name_of, render_image, write_image
 
     path = arguments.output or arguments.scene.with_suffix(".exr")
     check_output(path)
+    is_field = arguments.scene.suffix.lower() == ".npz"
+    if is_field != (arguments.look_at is not None):
+        wanted = "a radiance field needs --look-at" if is_field else "--look-at is for a radiance field (.npz)"
+        raise MivolError(f"{arguments.scene}: {wanted}; a scene has its own cameras.")
+    if is_field:
+        from mivol.experiments.back_end import set_variant
+        from mivol.experiments.view_field import view_field
+
+        set_variant(arguments.mode)
+        camera = arguments.look_at, arguments.up, arguments.fov, tuple(arguments.size)
+        write_image(path, view_field(arguments.scene, *camera), ["R", "G", "B"])
+        print(path)
+        return
     scene = load(arguments).scene
     integrator = choose_integrator(scene, arguments.integrator)
     if name_of(integrator) != "mivol":
