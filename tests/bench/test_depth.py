@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict, replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -64,6 +65,20 @@ def test_a_table_that_is_off_is_seen(tmp_path: Path) -> None:
     assert (tmp_path / "bench_depth.png").stat().st_size > 20_000
     answer["cells"][7]["error"] -= 0.0066
     assert [bar["met"] for bar in bench.compare("table", answer)] == [True, False]
+
+
+def test_what_is_measured_beside_the_table(variant_rgb: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Smoke in two lights and a cube in one, with an eighth of the lines; a mean depth is that of the medium itself."""
+    halves = np.concatenate([np.full((4, 8, 8), 3.0), np.zeros((4, 8, 8))]).astype(np.float32)
+    monkeypatch.setattr(bench, "smoke", lambda: SimpleNamespace(values=halves))
+    monkeypatch.setattr(bench, "measure", lambda subject, albedo, tau, n: (subject, albedo, tau, n))
+    found = list(bench.measure_beside(replace(bench.QUICK, lines=1 << 10, taus=(1.0, 3.0))))
+    said = [(subject.medium, subject.light, subject.phase, tau, albedo, n) for subject, albedo, tau, n in found]
+    pairs = [("smoke", "constant"), ("smoke", "collimated"), ("cube", "point")]
+    assert said == [(*pair, "isotropic", tau, albedo, 128) for pair in pairs for tau in (1.0, 3.0) for albedo in (0.5, 0.9)]
+    # By lines, of which there are enough for three digits.
+    assert found[-1][0].depth == pytest.approx(bench.CUBE_DEPTH, rel=2e-3)
+    assert found[0][0].depth > 1.5 * bench.CUBE_DEPTH
 
 
 @pytest.mark.slow
