@@ -41,6 +41,34 @@ def test_only_what_shines_has_no_rival(variant_rgb: str, name: str) -> None:
     assert any("emission" in key for key in keys) == shines
 
 
+def test_each_level_has_its_share_of_the_samples_and_seeds_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    """12 samples in all: 12, 3 and 1 (not 0) of them; no seed is used twice."""
+    asked = {}
+
+    def keep(calls: dict, rounds: int, keep: bool) -> None:
+        assert (rounds, keep) == (2, True)
+        asked.update({key: [call(number) for number in range(3)] for key, call in calls.items()})
+
+    monkeypatch.setattr(ladder, "race", keep)
+    size = replace(TINY, budget=Budget(spp=12), levels=(1, 4, 16))
+    ladder._race({name: lambda seed, spp, name=name: (name, seed, spp) for name in ("mivol", "other")}, size)
+    assert {key: {(name, spp) for name, _, spp in calls} for key, calls in asked.items()} == {
+        (name, level): {(name, spp)} for name in ("mivol", "other") for level, spp in ((1, 12), (4, 3), (16, 1))
+    }
+    seeds = [seed for calls in asked.values() for _, seed, _ in calls]
+    assert len(set(seeds)) == len(seeds) == 18 and np.ptp([seed for _, seed, _ in asked["mivol", 4]]) == 2
+
+
+def test_what_is_said_and_judged_of_a_rung() -> None:
+    """A ratio where there is a rival, and a bar for each agreement."""
+    rival = {"variance_x_time": 12.4, "agreement": {"z": 1.0, "z_bound": 4.0}}
+    answer = {name: {"image": rival, "gradient": {} if RUNGS[name].emits else rival} for name in RUNGS}
+    assert ladder.said(answer["emission"]) == "image 12x; gradient alone"
+    bars = ladder.compare("ladder", answer)
+    assert len(bars) == 2 * len(RUNGS) - 1 and all(bar["met"] for bar in bars)
+    assert ladder._root_mean_square(np.array([1.0, -7.0])) == 5
+
+
 @pytest.mark.slow
 def test_every_rung_is_climbed(variant_rgb: str, tmp_path: Path) -> None:
     """Images and gradients of all four models, both methods but for the emission; the pictures are not black."""

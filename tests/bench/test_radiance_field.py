@@ -221,6 +221,44 @@ def test_every_question_is_answered(variant_rgb: str, tmp_path: Path) -> None:
     assert (tmp_path / "bench_radiance_field.png").read_bytes().startswith(b"\x89PNG")
 
 
+def test_pixels_of_the_peer_are_those_of_the_camera(variant_rgb: str) -> None:
+    """What the peer fits, and what it shows, lies where a view has it: rays in the unit cube, colours by row and column."""
+    camera = ring(16, 3)[1]
+    image = np.random.default_rng(0).random((16, 16, 3), dtype=np.float32)
+    o, d, colours = fits.rays_and_colours(Photo("a", image, None, None, camera, np.zeros(3)))
+    origins, directions = rays_through(camera, tiled(16))
+    np.testing.assert_allclose(np.array(o).T, (origins + 1) / 2, atol=1e-6)
+    np.testing.assert_allclose(np.array(d).T, directions, atol=1e-6)
+    np.testing.assert_array_equal(np.array(colours).T, image[tuple(tiled(16).T)])
+
+    class Mirror:
+        def render(self, at: mi.Point3f, along: mi.Vector3f) -> mi.Color3f:
+            assert np.abs(np.array(at) - np.array(o)).max() <= 1e-6 and np.abs(np.array(along) - np.array(d)).max() <= 1e-6
+            return colours
+
+    np.testing.assert_array_equal(fits.view_of_peer(Mirror(), camera), image)
+
+
+def test_the_peer_has_four_stages(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each is refined from the one before, and takes all steps; the newest is the last of those made."""
+    monkeypatch.setattr(fits.dr, "eval", lambda *arrays: None)
+
+    class Stage:
+        density = harmonics = None
+
+        def __init__(self, resolution: int) -> None:
+            self.resolution = resolution
+
+        def refined(self) -> Stage:
+            return Stage(2 * self.resolution)
+
+        def fit(self, views: object, steps: int) -> range:
+            return range(steps)
+
+    made = [Stage(4)]
+    assert [made[-1].resolution for _ in fits.peer_steps(made, [], 3)] == [4] * 3 + [8] * 3 + [16] * 3 + [32] * 3
+
+
 def test_a_stage_of_the_peer_has_twice_the_resolution(variant_rgb: str) -> None:
     refined = Peer.start(4).refined()
     assert (refined.density.shape, refined.harmonics.shape) == ((8, 8, 8, 1), (8, 8, 8, 27))

@@ -34,14 +34,14 @@ def written(folder: Path, y: np.ndarray, held_out: np.ndarray, truth: np.ndarray
 
 
 def test_outputs_of_a_scan(tmp_path: Path) -> None:
-    """Six views of 3 x 5 pixels, of which all but the first are held out: the first four of these are shown."""
-    y = np.arange(90.0, dtype=np.float32).reshape(6, 3, 5)
+    """Six views of 4 x 5 pixels, of which all but the first are held out: the first four of these are shown."""
+    y = np.arange(120.0, dtype=np.float32).reshape(6, 4, 5)
     held_out = np.arange(1, 6)
     record = written(tmp_path, y, held_out, np.arange(24.0).reshape(GRID.shape))
     shown = [(image.view, image.role, image.held_out) for image in record.images]
     names = [("sinogram", False), *((f"view {k}", True) for k in (1, 2, 3, 4))]
     assert shown == [(name, role, kept) for name, kept in names for role in ("render", "reference")]
-    for name, expected in (("sinogram", y[:, 1]), ("view_3", y[3])):
+    for name, expected in (("sinogram", y[:, 2]), ("view_3", y[3])):
         channels, _ = read_exr(tmp_path / "views" / f"{name}.exr")
         np.testing.assert_array_equal(channels["reference.Y"], expected)
         np.testing.assert_array_equal(channels["Y"], 0.5 * expected)
