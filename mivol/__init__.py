@@ -2,8 +2,8 @@
 
 ``mivol.<tab>`` shows what a script needs: scenes (``load_scene``, ``explain``, ``render_reference``), fits (``Problem``,
 ``Parameter``, ``optimize`` and optimisers), volumes (``read_volume``, ``write_volume``, ``make_procedural``), photographs
-(``load_photos``, ``fit_photographs``, ``load_field``), Gaussians and points (``read_gaussians``, ``read_points``,
-``Splatter``) and tomography (``Projector`` and its geometries). Each is imported when it is first used.
+(``load_photos``, ``fit_photographs``, ``fit_gaussians``, ``load_field``), Gaussians and points (``read_gaussians``,
+``read_points``, ``Splatter``) and tomography (``Projector`` and its geometries). Each is imported when it is first used.
 """
 
 from __future__ import annotations
@@ -41,6 +41,7 @@ PUBLIC = {
     "Splatter": "splatting",
     "VoxelGrid": "tomography.geometry",
     "explain": "scene.explain",
+    "fit_gaussians": "experiments.script",
     "fit_photographs": "experiments.script",
     "load_field": "fields.spherical_files",
     "load_photos": "photos",

@@ -103,6 +103,32 @@ CITATIONS: dict[str, Citation] = {
         "CVPR",
         "https://doi.org/10.1109/CVPR52688.2022.00542",
     ),
+    "kerbl_2023": Citation(
+        "B. Kerbl, G. Kopanas, T. Leimkuehler, G. Drettakis",
+        2023,
+        "3D Gaussian Splatting for Real-Time Radiance Field Rendering",
+        "ACM Transactions on Graphics 42(4)",
+        "https://arxiv.org/abs/2308.04079",
+    ),
+    "kheradmand_2024": Citation(
+        "S. Kheradmand, D. Rebain, G. Sharma, W. Sun, Y.-C. Tseng, H. Isack, A. Kar, A. Tagliasacchi, K. M. Yi",
+        2024,
+        "3D Gaussian Splatting as Markov Chain Monte Carlo",
+        "NeurIPS",
+        "https://arxiv.org/abs/2404.09591",
+    ),
+    "zwicker_2001": Citation(
+        "M. Zwicker, H. Pfister, J. van Baar, M. Gross",
+        2001,
+        "EWA Volume Splatting",
+        "IEEE Visualization",
+    ),
+    "wang_2004": Citation(
+        "Z. Wang, A. C. Bovik, H. R. Sheikh, E. P. Simoncelli",
+        2004,
+        "Image Quality Assessment: From Error Visibility to Structural Similarity",
+        "IEEE Transactions on Image Processing 13(4)",
+    ),
     "relu_fields_2022": Citation(
         "A. Karnewar, T. Ritschel, O. Wang, N. J. Mitra",
         2022,

@@ -419,8 +419,49 @@ class FieldFit(Section):
     output: Annotated[str, of("path", "run folder, relative to where the command runs", min_length=1)] = "runs/field"
 
 
+class GaussianSettings(Section):
+    """The Gaussians and how they are fitted."""
+
+    preset: Annotated[str, of("1", "steps, sizes, rates: tiny, minute, minutes or gpu", min_length=1)] = "minute"
+    effort: Annotated[float, of("1", "factor on the preset's steps", gt=0)] = 1.0
+    start: Annotated[int | None, of("1", "Gaussians at first, where no points are known; absent: the preset's")] = None
+    most: Annotated[int | None, of("1", "Gaussians at the end of growth; absent: the preset's")] = None
+    degree: Annotated[int | None, of("1", "of the spherical harmonics; absent: the preset's")] = None
+    control: Annotated[str | None, of("1", "of the density: clone_split or relocation; absent: the preset's")] = None
+    ssim: Annotated[float | None, of("1", "share of SSIM in the loss; absent: the preset's")] = None
+
+    def __post_init__(self) -> None:
+        if not math.isfinite(self.effort):
+            raise ValueError(f"effort is {self.effort}: a finite number above 0 is expected")
+        for name in ("start", "most"):
+            value = getattr(self, name)
+            if value is not None and value < 4:
+                raise ValueError(f"{name} is {value}: at least 4 is expected")
+        if not 0 <= (self.degree or 0) <= 3:
+            raise ValueError(f"degree is {self.degree}: 0 to 3 is expected")
+        if not 0 <= (self.ssim or 0) <= 1:  # NaN fails every comparison
+            raise ValueError(f"ssim is {self.ssim}: a number from 0 to 1 is expected")
+
+
+class GaussianFit(Section):
+    """All of a TOML file that fits Gaussians to photographs: it has a table ``[gaussians]`` in place of ``[field]``."""
+
+    title: Annotated[str, of("1", "heading of the report", min_length=1)]
+    photos: Annotated[Photographs, of("1", "what was seen")]
+    gaussians: Annotated[GaussianSettings, of("1", "what is looked for")]
+    show: Annotated[Shown, of("1", "what is made of it")] = Shown()
+    checkpoint_every: Annotated[int, of("step", "how often", ge=1)] = 500
+    variant: Annotated[str, of("1", "Mitsuba variant", min_length=1)] = "llvm_ad_rgb"
+    seed: Annotated[int, of("1", "root of the fit's random numbers", ge=0)] = 0
+    threads: Annotated[int, of("thread", "threads of the CPU back end; 0: all cores", ge=0)] = 0
+    output: Annotated[str, of("path", "run folder, relative to where the command runs", min_length=1)] = "runs/gaussians"
+
+
+PhotoFit = FieldFit | GaussianFit
+"""A fit of photographs, of either model."""
+
 #: Table of the file that tells which experiment it is; without any of them it is one on a scene.
-KINDS: dict[str, type] = {"scan": Scan, "photos": FieldFit}
+KINDS: dict[str, type] = {"scan": Scan, "gaussians": GaussianFit, "photos": FieldFit}
 
 CAPTURE = {
     "photos": {"largest": 240, "box": "middle"},
@@ -432,7 +473,7 @@ CAPTURE = {
 NOT_RESULT = ("output", "threads", "title", "checkpoint_every", "show")
 
 
-def load(path: str | Path, changes: Sequence[str] = ()) -> Experiment | Scan | FieldFit:
+def load(path: str | Path, changes: Sequence[str] = ()) -> Experiment | Scan | PhotoFit:
     """Read an experiment.
 
     Args:
@@ -454,8 +495,8 @@ def load(path: str | Path, changes: Sequence[str] = ()) -> Experiment | Scan | F
     return from_dict(raw, path.name)
 
 
-def from_dict(raw: dict[str, Any], name: str = "experiment") -> Experiment | Scan | FieldFit:
-    """An experiment from plain dicts and lists; one with a table ``scan`` is tomography, with ``photos`` a radiance field.
+def from_dict(raw: dict[str, Any], name: str = "experiment") -> Experiment | Scan | PhotoFit:
+    """An experiment from plain dicts and lists; its tables tell which it is (``KINDS``).
 
     Raises:
         MivolError: as :func:`load`; ``name`` begins the sentence.
@@ -490,7 +531,7 @@ def _with_capture(raw: dict[str, Any]) -> dict[str, Any]:
     return raw | {name: CAPTURE[name] | held if isinstance(held, dict) else held for name, held in given.items()}
 
 
-def resolved(experiment: Experiment | Scan | FieldFit) -> dict[str, Any]:
+def resolved(experiment: Experiment | Scan | PhotoFit) -> dict[str, Any]:
     """Every setting, defaults included, as plain dicts and lists."""
     return msgspec.to_builtins(experiment)
 

@@ -131,7 +131,7 @@ def optimize_flags(sub: argparse.ArgumentParser) -> None:
     from mivol.schema import describe
 
     lines = ["images:", *describe(config.Experiment), "", "projections:", *describe(config.Scan)]
-    lines += ["", "photographs:", *describe(config.FieldFit)]
+    lines += ["", "photographs:", *describe(config.FieldFit), "", "photographs, to Gaussians:", *describe(config.GaussianFit)]
     sub.epilog = "settings of the file for " + "\n  ".join(line.replace("%", "%%") for line in lines)
     sub.add_argument("experiment", type=Path, help="TOML file, or posed photographs: a folder or its file of cameras")
     sub.add_argument("--preset", help="of photographs without a TOML file: capture for a place around the cameras, or cpu, ...")

@@ -9,10 +9,11 @@ import mitsuba as mi
 import numpy as np
 
 from mivol import config
-from mivol.config import Experiment, FieldFit, Files, Scan
+from mivol.config import Experiment, FieldFit, Files, GaussianFit, PhotoFit, Scan
 from mivol.errors import MivolError
 from mivol.experiments.back_end import choose_back_end
 from mivol.experiments.depth import settle_depth
+from mivol.experiments.gaussian_start import begin, make_gaussian_plan
 from mivol.experiments.photo_data import boxed, read_photos
 from mivol.experiments.photo_plan import choices, make_plan, shrunk
 from mivol.experiments.projections import beam_of, held_out_views, make_data, make_grid
@@ -33,7 +34,7 @@ Say = Callable[[str], None]
 """Takes one line of facts."""
 
 
-def explain_fit(chosen: Experiment | Scan | FieldFit, base: Path) -> Explanation:
+def explain_fit(chosen: Experiment | Scan | PhotoFit, base: Path) -> Explanation:
     """What a fit would do; nothing is rendered, fitted or written.
 
     Args:
@@ -126,4 +127,24 @@ def explain_photo_fit(chosen: FieldFit, base: Path, say: Say) -> Explanation:
     return Explanation(tuple(f"  {one.choice}: {one.reason}" for one in choices(plan, photos, batches)))
 
 
-KINDS = {config.Experiment: explain_scene_fit, config.Scan: explain_scan_fit, config.FieldFit: explain_photo_fit}
+def explain_gaussian_fit(chosen: GaussianFit, base: Path, say: Say) -> Explanation:
+    """Photographs, where Gaussians begin, and plan.
+
+    Raises:
+        MivolError: whatever :func:`mivol.experiments.gaussian_fit.gaussian_fit` refuses before its first step.
+    """
+    asked = make_gaussian_plan(chosen)
+    photos, judged = read_photos(chosen, base)
+    photos = boxed(chosen, photos)
+    say(photos.text)
+    say(f"  judged by {0 if judged is None else len(judged.views)} photographs")
+    begun = begin(chosen, photos, asked)
+    return Explanation(tuple(f"  {one.choice}: {one.reason}" for one in begun.lines))
+
+
+KINDS = {
+    config.Experiment: explain_scene_fit,
+    config.Scan: explain_scan_fit,
+    config.FieldFit: explain_photo_fit,
+    config.GaussianFit: explain_gaussian_fit,
+}

@@ -1,4 +1,4 @@
-"""Photographs that a radiance field is fitted to, those that it is judged by, and the box where matter may be."""
+"""Photographs that are fitted, those that a fit is judged by, and the box where matter may be."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from mivol.config import FieldFit
+from mivol.config import PhotoFit
 from mivol.errors import MivolError
 from mivol.optim.strategy import nearest
 from mivol.photos import Photos, load_photos, silhouette_box
@@ -16,7 +16,7 @@ from mivol.photos.picture import space_of
 from mivol.photos.region import near_far_of
 
 
-def read_photos(chosen: FieldFit, base: Path) -> tuple[Photos, Photos | None]:
+def read_photos(chosen: PhotoFit, base: Path) -> tuple[Photos, Photos | None]:
     """Photographs to fit, and those to judge by.
 
     Raises:
@@ -48,7 +48,7 @@ def _over(photos: Photos, behind: tuple[float, float, float]) -> Photos:
     return replace(photos, views=tuple(replace(view, background=colour) for view in photos.views))
 
 
-def boxed(chosen: FieldFit, photos: Photos) -> Photos:
+def boxed(chosen: PhotoFit, photos: Photos) -> Photos:
     """The photographs with the box where matter may be.
 
     Raises:

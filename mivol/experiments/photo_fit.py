@@ -6,12 +6,14 @@ now and then; ``field.npz`` is the field, ``film/turntable.mp4`` (``.webp`` wher
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from mivol import config
-from mivol.config import FieldFit
+from mivol.config import FieldFit, PhotoFit
 from mivol.experiments.back_end import choose_back_end
 from mivol.experiments.photo_data import boxed, notes, read_photos
 from mivol.experiments.photo_outputs import PhotoOutputs, compare
@@ -26,6 +28,7 @@ from mivol.optim.ray_batches import RayBatches
 from mivol.photos import Photos, rectified
 from mivol.report.page import write_page
 from mivol.report.record import RunRecord
+from mivol.validate.images import Quality
 
 
 def photo_fit(task: Task) -> Path:
@@ -68,13 +71,21 @@ def new_record(task: Task) -> RunRecord:
     )
 
 
-def solve(task: Task, run: RunFolder, problem: RadianceProblem, judged: Photos | None) -> Fit:
+def solve(
+    task: Task, run: RunFolder, problem: Any, judged: Photos | None, compare: Callable[..., tuple[Any, Quality]] = compare
+) -> Fit:
     """All steps, with metrics and checkpoints.
+
+    Args:
+        task, run: the experiment and its folder.
+        problem: a :class:`RadianceProblem` or a :class:`~mivol.optim.gaussian_problem.GaussianProblem`.
+        judged: what the curve shows; None for nothing.
+        compare: as :func:`mivol.experiments.photo_outputs.compare`, of that problem.
 
     Raises:
         MivolError: a checkpoint of another run, or photographs that show nothing in the box.
     """
-    chosen: FieldFit = task.chosen
+    chosen: PhotoFit = task.chosen
     plan, every = problem.plan, chosen.show.every
     store = Store(
         run.checkpoint, {"photos": problem.batches.digest(), **config.flat(config.resolved(chosen))}, task.resume
@@ -86,7 +97,7 @@ def solve(task: Task, run: RunFolder, problem: RadianceProblem, judged: Photos |
         def observe(fit: Fit) -> None:
             if fit.next % every == 0 or fit.next == plan.steps:
                 problem.set(fit.run.reals)
-                run.append(fit.next, fit.seconds, loss=fit.history[-1]["loss"], **judge_few(chosen, problem, judged))
+                run.append(fit.next, fit.seconds, loss=fit.history[-1]["loss"], **judge_few(chosen, problem, judged, compare))
             watch(fit)
 
         fit.complete(observe)
@@ -94,7 +105,9 @@ def solve(task: Task, run: RunFolder, problem: RadianceProblem, judged: Photos |
     return fit
 
 
-def judge_few(chosen: FieldFit, problem: RadianceProblem, judged: Photos | None) -> dict[str, float]:
+def judge_few(
+    chosen: PhotoFit, problem: Any, judged: Photos | None, compare: Callable[..., tuple[Any, Quality]] = compare
+) -> dict[str, float]:
     """Mean PSNR of a fixed set of judged views, spread evenly over them: the points of a curve can be compared.
 
     It is called that of the held-out views where it is that of all of them only.

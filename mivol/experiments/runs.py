@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from mivol import config
+from mivol.experiments.gaussian_fit import gaussian_fit
 from mivol.experiments.photo_fit import photo_fit
 from mivol.experiments.run_folder import CHECKPOINT
 from mivol.experiments.scan_fit import scan_fit
@@ -17,6 +18,7 @@ RUNS: dict[type, Callable[[Task], Path]] = {
     config.Experiment: scene_fit,
     config.Scan: scan_fit,
     config.FieldFit: photo_fit,
+    config.GaussianFit: gaussian_fit,
 }
 """What does an experiment, by the type of its settings."""
 

@@ -1,7 +1,7 @@
 """What a script needs in a line each: a problem from a scene and pictures, its optimisation, a field from photographs.
 
 Conventions. Everything here is made of parts that can be had by themselves (``mivol.optim``, ``mivol.experiments``); nothing is
-printed, and nothing is written but by :func:`fit_photographs`.
+printed, and nothing is written but by :func:`fit_photographs` and :func:`fit_gaussians`.
 """
 
 from __future__ import annotations
@@ -30,10 +30,11 @@ from mivol.optim.optimiser import Optimiser
 from mivol.optim.parameters import Parameter
 from mivol.optim.render_batches import View
 from mivol.optim.scene_problem import SceneProblem
+from mivol.points import Gaussians, read_gaussians
 from mivol.scene.explain import settings_of
 from mivol.scene.load import SceneSource, load_scene
 
-__all__ = ["Problem", "fit_photographs", "optimize"]
+__all__ = ["Problem", "fit_gaussians", "fit_photographs", "optimize"]
 
 Reference: TypeAlias = "np.ndarray | mi.TensorXf | str | os.PathLike[str]"
 """A picture: an array (height, width, channels) of linear radiance, or the OpenEXR file of one."""
@@ -173,14 +174,47 @@ def fit_photographs(
     Example:
         >>> field = mivol.fit_photographs("photographs", "runs/field", {"field.preset": "tiny"})
     """
+    fitted(photographs, output, settings, watcher, {})
+    return load_field(Path(output) / "field.npz")
+
+
+def fit_gaussians(
+    photographs: str | os.PathLike,
+    output: str | os.PathLike = "runs/gaussians",
+    settings: Mapping[str, Any] | None = None,
+    watcher: Watcher | None = None,
+) -> Gaussians:
+    """Fit 3D Gaussians to posed photographs; ``gaussians.ply`` and its page lie in the run folder.
+
+    Args:
+        photographs, output, watcher: as :func:`fit_photographs`.
+        settings: of the TOML file by dotted key, as ``{"gaussians.preset": "tiny", "photos.background": "white"}``.
+
+    Raises:
+        MivolError: what ``mivol optimize`` refuses, in the same words.
+
+    Example:
+        >>> found = mivol.fit_gaussians("photographs", "runs/gaussians", {"gaussians.preset": "tiny"})
+    """
+    fitted(photographs, output, settings, watcher, {"gaussians": {}})
+    return read_gaussians(Path(output) / "gaussians.ply")
+
+
+def fitted(
+    photographs: str | os.PathLike,
+    output: str | os.PathLike,
+    settings: Mapping[str, Any] | None,
+    watcher: Watcher | None,
+    tables: dict[str, Any],
+) -> None:
+    """Do an experiment on photographs that has these tables besides."""
     path = Path(photographs).resolve()
-    raw: dict[str, Any] = {"title": path.stem, "photos": {"path": str(path)}}
+    raw: dict[str, Any] = {"title": path.stem, "photos": {"path": str(path)}, **tables}
     for key, value in (settings or {}).items():
         *tables, last = key.split(".")
         place = raw
         for table in tables:
             place = place.setdefault(table, {})
         place[last] = value
-    chosen = config.from_dict(raw, "fit_photographs")
+    chosen = config.from_dict(raw, "settings")
     run_experiment(Task(chosen, Path(), Path(output), watcher=watcher or Nobody()))
-    return load_field(Path(output) / "field.npz")

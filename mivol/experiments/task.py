@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol, TypeVar
 
-from mivol.config import Experiment, FieldFit, Scan
+from mivol.config import Experiment, PhotoFit, Scan
 from mivol.optim.loop import Fit
 
 T = TypeVar("T")
@@ -55,7 +55,7 @@ class Task:
         command: what was typed, for the record; empty where no command was.
     """
 
-    chosen: Experiment | Scan | FieldFit
+    chosen: Experiment | Scan | PhotoFit
     base: Path
     folder: Path
     resume: bool = False

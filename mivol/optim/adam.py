@@ -12,7 +12,7 @@ import mitsuba as mi
 import numpy as np
 
 from mivol.optim.optimiser import FirstOrder, Run
-from mivol.optim.problem import Differentiable
+from mivol.optim.problem import Differentiable, Refinement
 from mivol.optim.strategy import of
 
 
@@ -28,6 +28,7 @@ class Adam(FirstOrder, tag="adam"):
     beta_1: Annotated[float, of("1", "memory of the gradient", ge=0, lt=1)] = 0.9
     beta_2: Annotated[float, of("1", "memory of its square", ge=0, lt=1)] = 0.999
     epsilon: Annotated[float, of("largest gradient", "gradients well below this hardly move anything", gt=0)] = 1e-6
+
     def begin(self, problem: Differentiable) -> Run:
         return AdamRun(self, problem)
 
@@ -75,3 +76,19 @@ class AdamRun(Run):
         self.adam[name] = reals
         self.adam.reset(name)
         self.scale = 0.0
+
+    def refine(self, refinement: Refinement) -> None:
+        """Both moments are carried over like the reals; the count of steps, by which they are corrected, goes on."""
+        states = {name: self.adam.state[name][3] for name in self.reals}
+        shapes = {name: value.shape for name, value in self.reals.items()}
+        moments = [
+            refinement.carry({name: mi.TensorXf(state[which], shapes[name]) for name, state in states.items()})
+            for which in (1, 2)
+        ]
+        self.reals = dict(refinement.reals)
+        for name, value in self.reals.items():
+            self.adam[name] = value
+            kept, promoted, rate, _ = self.adam.state[name]
+            shrink = refinement.shrinks.get(name, 1.0)
+            first, second = (tensors[name].array * shrink**power for power, tensors in enumerate(moments, 1))
+            self.adam.state[name] = kept, promoted, rate, (states[name][0], first, second, None)

@@ -123,6 +123,23 @@ class UpdateOccupancy(Event, tag="update_occupancy"):
         return ""
 
 
+class ControlDensity(Event, tag="control_density"):
+    """Let a problem have more Gaussians where the pictures need them, and fewer where nobody sees them."""
+
+    every: Annotated[int, of("iteration", "how often", ge=1)] = 100
+    begin: Annotated[int, of("iteration", "before which it is first done", ge=1)] = 500
+    end: Annotated[int, of("iteration", "from which on it is not done", ge=1)] = 15000
+
+    def due(self, iteration: int) -> bool:
+        return self.begin <= iteration < self.end and iteration % self.every == 0
+
+    def apply(self, fit: FitAtWork) -> str:
+        fit.problem.set(fit.run.reals)
+        refinement = fit.problem.control_density(fit.next)
+        fit.run.refine(refinement)
+        return refinement.says
+
+
 class Checkpoint(Event, tag="checkpoint"):
     """Write everything that the next iteration depends on."""
 
@@ -149,7 +166,7 @@ class Evaluate(Event, tag="evaluate"):
         return ""
 
 
-EVENTS = table(Upsample, CoarseToFine, UpdateOccupancy, Checkpoint, Evaluate)
+EVENTS = table(Upsample, CoarseToFine, UpdateOccupancy, ControlDensity, Checkpoint, Evaluate)
 
 
 def in_order(events: tuple[Event, ...]) -> list[Event]:

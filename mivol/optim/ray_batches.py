@@ -105,6 +105,11 @@ class RayBatches:
         """Memory that the pixels take."""
         return sum(dr.width(pixels) for pixels in self._pixels())
 
+    @property
+    def behind(self) -> np.ndarray:
+        """(V, 3) the colour that each photograph lies over."""
+        return np.array(self.lenses).reshape(-1, LENS)[:, 16:]
+
     def _pixels(self) -> list[mi.UInt8]:
         """All that is kept of pixels, in the order of the sizes."""
         levels = [level for _, level in sorted(self.levels.items())]
@@ -144,6 +149,15 @@ class RayBatches:
         column = dr.minimum(tile % across * TILE + within % TILE, width - 1)
         row = dr.minimum(tile // across * TILE + within // TILE, height - 1)
         return self.look_up(shrink, np.array([view]), lane * 0, column, row)
+
+    def picture(self, shrink: int, view: int) -> tuple[list[mi.Float], mi.Float]:
+        """A whole view, pixel by pixel: its channels (rgb and, where it is kept, alpha), and what counts (1 or 0)."""
+        level = self.levels[shrink]
+        width, height = (int(n) for n in level.sizes[view])
+        pixel = dr.arange(mi.UInt32, width * height) + dr.opaque(mi.UInt32, int(level.starts[view]))
+        codes = [dr.gather(mi.UInt8, level.codes, pixel * self.channels + k) for k in range(self.channels)]
+        counted = mi.Float(1) if level.counted is None else mi.Float(dr.gather(mi.UInt8, level.counted, pixel))
+        return [mi.Float(code) * (1 / 255) for code in codes], counted
 
     def digest(self) -> str:
         """A fingerprint of cameras and pixels."""

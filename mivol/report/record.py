@@ -74,6 +74,7 @@ QUANTITIES: dict[str, Quantity] = {
     "ssim": Quantity("SSIM of the held-out views", log=False),
     "flip": Quantity("FLIP of the held-out views", log=False),
     "nodes": Quantity("Nodes that are stored", log=False),
+    "gaussians": Quantity("Gaussians", log=False),
     "bytes": Quantity("Memory of the field", "MiB", log=False),
     "seconds": Quantity("Time", "s"),
     "iterations": Quantity("Iterations", log=False),

@@ -138,7 +138,7 @@ def test_wrong_files(tmp_path: Path) -> None:
 
 def test_the_schema_is_strict() -> None:
     """Every struct that a file can fill refuses unknown fields by itself, too."""
-    seen = [config.Experiment, config.Scan, config.FieldFit]
+    seen = [config.Experiment, config.Scan, config.FieldFit, config.GaussianFit]
     for struct in seen:
         assert struct.__struct_config__.forbid_unknown_fields, struct
         for field in msgspec.structs.fields(struct):

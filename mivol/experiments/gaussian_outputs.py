@@ -1,0 +1,124 @@
+"""What a fit of Gaussians leaves in its folder: the Gaussians, judged views, a film, curves, results."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mivol.config import GaussianFit
+from mivol.experiments.photo_outputs import _small, named, write_view
+from mivol.experiments.run_folder import RunFolder
+from mivol.experiments.task import Task
+from mivol.optim.gaussian_problem import GaussianProblem
+from mivol.optim.loop import Fit
+from mivol.photos import Camera, Photo, Photos, rectified, turntable
+from mivol.points import Gaussians, write_gaussians
+from mivol.report.record import Image, Table
+from mivol.report.video import WITHOUT_FFMPEG, film_suffix, write_video
+from mivol.validate.images import Quality, judge, score
+
+__all__ = ["GaussianOutputs", "compare", "picture_of"]
+
+FILE = "gaussians.ply"
+
+
+@dataclass(frozen=True)
+class GaussianOutputs:
+    """What is written of a fit of Gaussians.
+
+    Attributes:
+        task: the experiment.
+        run: where it is written, and the record that lists it.
+        fit: the fit, done.
+        photos: what was fitted.
+        judged: what it is judged by; None for nothing.
+    """
+
+    task: Task
+    run: RunFolder
+    fit: Fit
+    photos: Photos
+    judged: Photos | None
+
+    @property
+    def problem(self) -> GaussianProblem:
+        """The Gaussians that were found."""
+        return self.fit.problem
+
+    def write(self) -> None:
+        """Write all, and put it and the results on record."""
+        record, found = self.run.record, Gaussians(**self.problem.cloud)
+        self.run.make("views", "film")
+        write_gaussians(self.run.path / FILE, found)
+        record.tables = [storage(found, (self.run.path / FILE).stat().st_size)]
+        record.results = {
+            "views": float(len(self.photos.views)),
+            "iterations": float(self.fit.next),
+            "gaussians": float(found.count),
+        }
+        if self.judged is not None:
+            record.results |= self.write_judged()
+        if self.task.chosen.show.frames:
+            record.images.append(self.write_film())
+        self.run.write_curves()
+
+    def write_judged(self) -> dict[str, float]:
+        """Judge all views, and keep some of them beside their photographs."""
+        chosen: GaussianFit = self.task.chosen
+        views, found = self.judged.views, []
+        shown = set(np.linspace(0, len(views) - 1, min(chosen.show.views, len(views))).astype(int).tolist())
+        for number, photo in enumerate(views):
+            seen, quality = compare(self.problem, self.judged, photo, chosen.show.metrics)
+            found.append(quality)
+            if number in shown:
+                self.run.record.images += write_view(self.run.path, rectified(photo), number, seen)
+        return named(score(found).values)
+
+    def write_film(self) -> Image:
+        """A camera path around the box."""
+        cameras, count = [view.camera for view in self.photos.views], self.task.chosen.show.frames
+        path = f"film/turntable{film_suffix()}"
+        if not path.endswith(".mp4"):
+            self.task.watcher.say([WITHOUT_FFMPEG])
+        behind = self.photos.views[0].background
+
+        def frames() -> Iterator[NDArray[np.uint8]]:
+            for camera in self.task.watcher.track(turntable(cameras, self.photos.box, count), "frames"):
+                smaller = _small(camera)
+                shrink = camera.size[0] / smaller.size[0]
+                seen = picture_of(self.problem, smaller, behind, self.problem.plan.low_pass_at(shrink))
+                yield np.round(np.clip(seen, 0, 1) * 255).astype(np.uint8)
+
+        write_video(self.run.path / path, frames(), fps=count / 4)
+        return Image(path=path, role="film", caption=f"{count} views around the box")
+
+
+def compare(problem: GaussianProblem, judged: Photos, photo: Photo, metrics: tuple[str, ...]) -> tuple[NDArray, Quality]:
+    """A photograph's view of the Gaussians (H, W, 3), and how alike they are; what a lens distorts is rectified first."""
+    photo = rectified(photo)
+    seen = picture_of(problem, photo.camera, photo.background, problem.plan.low_pass)
+    return seen, judge(seen, photo.image, space=judged.space, mask=photo.mask, metrics=metrics, name=photo.name)
+
+
+def picture_of(problem: GaussianProblem, camera: Camera, behind: NDArray, low_pass: float) -> NDArray:
+    """What a pinhole sees of the Gaussians, (H, W, 3) over a colour (3,)."""
+    splatter = problem.splatter_for(camera.size, low_pass)
+    seen = np.array(splatter.forward(problem.values(), camera, derivatives=False)[0])
+    return seen[..., :3] + (1 - seen[..., 3:]) * np.asarray(behind, np.float32)
+
+
+def storage(found: Gaussians, bytes_: int) -> Table:
+    """What the Gaussians take, and what they are like."""
+    opacity, scale = found.opacities(), found.scales()
+    rows = (
+        ("Gaussians", f"{found.count}"),
+        ("harmonics", f"degree {found.degree}"),
+        ("file", f"{bytes_ / 2**20:.2f} MiB"),
+        ("opacity: median", f"{np.median(opacity):.3g}"),
+        ("longest axis: median", f"{np.median(scale.max(axis=1)):.3g}"),
+        ("longest over shortest axis: median", f"{np.median(scale.max(axis=1) / scale.min(axis=1)):.3g}"),
+    )
+    return Table(title="What was found", head=("", ""), rows=rows)

@@ -1,0 +1,94 @@
+"""How Gaussians will be fitted to photographs: where they begin, and the plan of a preset with what the file says otherwise."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+from mivol.config import GaussianFit
+from mivol.errors import MivolError
+from mivol.optim.density_control import Arrays
+from mivol.optim.gaussian_plan import CONTROLS, PRESETS, GaussianPlan, memory_of
+from mivol.optim.gaussian_start import begin_at, places_of
+from mivol.optim.ray_batches import RayBatches
+from mivol.optim.strategy import nearest
+from mivol.photos import Photo, Photos, rectified
+from mivol.report.record import PlanLine
+
+__all__ = ["Begun", "begin", "make_gaussian_plan"]
+
+
+@dataclass(frozen=True)
+class Begun:
+    """What a fit begins with.
+
+    Attributes:
+        views: the photographs, as pinholes saw them.
+        plan: for photographs of their size.
+        batches: the photographs in the sizes of the plan.
+        cloud: the first Gaussians.
+        lines: what will be done, and why.
+    """
+
+    views: tuple[Photo, ...]
+    plan: GaussianPlan
+    batches: RayBatches
+    cloud: Arrays
+    lines: list[PlanLine]
+
+
+def make_gaussian_plan(chosen: GaussianFit) -> GaussianPlan:
+    """The preset with what the file says otherwise.
+
+    Raises:
+        MivolError: an unknown preset or control of the density.
+    """
+    wanted = chosen.gaussians
+    if wanted.preset not in PRESETS:
+        raise MivolError(f'gaussians.preset = "{wanted.preset}" is unknown: {nearest(wanted.preset, list(PRESETS))}')
+    if wanted.control is not None and wanted.control not in CONTROLS:
+        raise MivolError(f'gaussians.control = "{wanted.control}" is unknown: {nearest(wanted.control, list(CONTROLS))}')
+    given = {name: getattr(wanted, name) for name in ("start", "most", "control", "ssim")}
+    plan = replace(PRESETS[wanted.preset], **{name: value for name, value in given.items() if value is not None})
+    if wanted.degree is not None:
+        stages = [replace(stage, degree=min(stage.degree, wanted.degree)) for stage in plan.stages]
+        plan = replace(plan, stages=(*stages[:-1], replace(stages[-1], degree=wanted.degree)))
+    return plan.scaled(wanted.effort)
+
+
+def begin(chosen: GaussianFit, photos: Photos, plan: GaussianPlan) -> Begun:
+    """Photographs, plan and first Gaussians of a fit; memory is counted before it is taken.
+
+    Raises:
+        MivolError: more memory than there is, or no place where Gaussians could begin.
+    """
+    views = tuple(rectified(view) for view in photos.views)
+    longest = max(max(view.camera.size) for view in views)
+    plan = plan.for_edge(longest)
+    places, whence = places_of(photos, plan.start, chosen.seed)
+    pixels = max(view.camera.size[0] * view.camera.size[1] for view in views) // min(s.shrink for s in plan.stages) ** 2
+    channels = 4 if all(view.alpha is not None for view in views) else 3
+    sizes = {stage.shrink for stage in plan.stages}
+    taken = sum(view.image.size // 3 * channels // shrink**2 for view in views for shrink in sizes)
+    memory = memory_of(replace(plan, start=len(places)), taken, pixels)
+    batches = RayBatches.of(views, [stage.shrink for stage in plan.stages])
+    cloud = begin_at(places, views, plan.stages[0].degree)
+    return Begun(views, plan, batches, cloud, choices(plan, photos, len(places), whence, memory))
+
+
+def choices(plan: GaussianPlan, photos: Photos, count: int, whence: str, memory: str) -> list[PlanLine]:
+    """What will be done, and why."""
+    stages = [f"{stage.steps} of photographs shrunk by {stage.shrink}, degree {stage.degree}" for stage in plan.stages]
+    behind = "alpha says what is there" if photos.views[0].alpha is not None else "photos.behind"
+    control = {
+        "clone_split": "divided where the photographs pull most, taken out where they are transparent (Kerbl et al. 2023)",
+        "relocation": "moved from where they are transparent to where others are opaque (Kheradmand et al. 2024)",
+    }[plan.control]
+    return [
+        PlanLine(choice=f"{len(photos.views)} photographs", reason=photos.survey.box_from),
+        PlanLine(choice=f"{count} Gaussians at first", reason=whence),
+        PlanLine(choice=f"up to {max(plan.most, count)} Gaussians", reason=control),
+        PlanLine(choice=f"{plan.steps} steps: {'; '.join(stages)}", reason="small photographs first, one a step"),
+        PlanLine(choice=f"a loss with a share of {plan.ssim:g} of SSIM", reason="absolute error beside it"),
+        PlanLine(choice="what is behind is no part of the Gaussians", reason=behind),
+        PlanLine(choice=memory, reason="counted before it is taken"),
+    ]

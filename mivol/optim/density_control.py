@@ -1,0 +1,193 @@
+"""How many Gaussians there are during a fit, and where: clone, split, prune, reset opacities; or relocate the unused ones.
+
+Conventions. A cloud is a dict of float32 arrays by the names of :mod:`mivol.splatting.splatter` ("means", "log_scales", ...),
+row by row. Nothing is changed in place: a :class:`Change` says which rows there are now, which old row each came from, and of
+which nothing is known, so that what an optimiser has learnt can follow. Choices of rows take the smallest number first at a
+tie.
+
+References: Kerbl et al. 2023 (ACM TOG 42(4), section 5.2, and the released code's constants); Kheradmand et al. 2024 (3D
+Gaussian Splatting as Markov Chain Monte Carlo, NeurIPS: eqs. 9 and 10).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import expit, gammaln, logit
+
+from mivol.errors import MivolError
+
+__all__ = [
+    "Arrays",
+    "Change",
+    "best_rows",
+    "clone_and_split",
+    "grow",
+    "opacity_and_scale_of_copies",
+    "prune",
+    "relocate",
+    "reset_opacities",
+]
+
+Arrays = dict[str, NDArray[np.float32]]
+"""A cloud, or what is known of one, by name; the first axis counts Gaussians."""
+
+SHRINK = 1.6
+"""By how much each of two halves of a Gaussian is smaller (Kerbl et al. 2023)."""
+
+MOST_COPIES = 51
+"""Gaussians at one place that are told apart: the sum below loses its digits beyond (as the published code)."""
+
+
+@dataclass(frozen=True)
+class Change:
+    """A cloud after a change.
+
+    Attributes:
+        cloud: its arrays.
+        parent: (M,) row that each came from.
+        forgets: (M,) bool: what was learnt about the parent does not hold.
+    """
+
+    cloud: Arrays
+    parent: NDArray[np.int64]
+    forgets: NDArray[np.bool_]
+
+    def carry(self, learnt: Arrays) -> Arrays:
+        """What was learnt about the old rows, for the new ones; 0 where nothing is known."""
+        found = {name: array[self.parent] for name, array in learnt.items()}
+        for array in found.values():
+            array[self.forgets] = 0
+        return found
+
+    def then(self, later: Change) -> Change:
+        """This change and another one of its cloud, as one."""
+        return Change(later.cloud, self.parent[later.parent], self.forgets[later.parent] | later.forgets)
+
+
+def unchanged(cloud: Arrays) -> Change:
+    """The cloud as it is."""
+    n = len(cloud["means"])
+    return Change(cloud, np.arange(n), np.zeros(n, bool))
+
+
+def best_rows(score: NDArray, least: float, most: int) -> NDArray[np.int64]:
+    """Rows whose score is at least ``least``, in ascending order: the ``most`` highest where there are more."""
+    rows = np.flatnonzero(score >= least)
+    if len(rows) > most:
+        rows = rows[np.argsort(-score[rows], kind="stable")[: max(most, 0)]]
+    return np.sort(rows)
+
+
+def clone_and_split(cloud: Arrays, rows: NDArray[np.int64], largest_clone: float, rng: np.random.Generator) -> Change:
+    """One more Gaussian for each of some: small ones are doubled, large ones become two that are drawn from them.
+
+    A clone stands where its parent does; their derivatives differ from the next step on, as their moments do. Both halves of a
+    split are drawn from the normal distribution that the Gaussian is, and are smaller by 1.6.
+
+    Args:
+        cloud: N Gaussians.
+        rows: of those that are divided, each once.
+        largest_clone: scale [length] above which a Gaussian is split.
+        rng: where halves stand.
+    """
+    n = len(cloud["means"])
+    is_large = np.exp(cloud["log_scales"][rows].max(axis=1)) > largest_clone
+    clones, split = rows[~is_large], rows[is_large]
+    stays = np.ones(n, bool)
+    stays[split] = False
+    parent = np.concatenate([np.flatnonzero(stays), clones, split, split])
+    made = {name: array[parent] for name, array in cloud.items()}
+    halves = slice(len(parent) - 2 * len(split), len(parent))
+    drawn = rng.standard_normal((2 * len(split), 3)) * np.exp(made["log_scales"][halves])
+    turned = np.einsum("nij,nj->ni", rotations(made["quaternions"][halves]), drawn)
+    made["means"][halves] += turned.astype(np.float32)
+    made["log_scales"][halves] -= np.float32(math.log(SHRINK))
+    return Change(made, parent, np.arange(len(parent)) >= n - len(split))
+
+
+def prune(cloud: Arrays, keep: NDArray[np.bool_]) -> Change:
+    """Only the Gaussians that are kept.
+
+    Raises:
+        MivolError: none is.
+    """
+    parent = np.flatnonzero(keep)
+    if len(parent) == 0:
+        raise MivolError(
+            "no Gaussian is left: all have become transparent. Lower the learning rates, or prune at a smaller opacity."
+        )
+    return Change({name: array[parent] for name, array in cloud.items()}, parent, np.zeros(len(parent), bool))
+
+
+def reset_opacities(cloud: Arrays, highest: float) -> Arrays:
+    """The cloud with opacities of at most ``highest``: Gaussians that are needed become opaque again, others can be pruned."""
+    return {**cloud, "opacity_logits": np.minimum(cloud["opacity_logits"], np.float32(logit(highest)))}
+
+
+def relocate(cloud: Arrays, unused_below: float, rng: np.random.Generator) -> Change:
+    """Move Gaussians that are all but transparent to where others are, drawn in proportion to their opacity.
+
+    Those that share a place are made so that their composite is what stood there (:func:`opacity_and_scale_of_copies`).
+    """
+    opacity = expit(cloud["opacity_logits"].astype(np.float64))
+    unused, used = np.flatnonzero(opacity < unused_below), np.flatnonzero(opacity >= unused_below)
+    if len(unused) == 0 or len(used) == 0:
+        return unchanged(cloud)
+    source = rng.choice(used, len(unused), p=opacity[used] / opacity[used].sum())
+    parent = np.arange(len(opacity))
+    parent[unused] = source
+    return _shared(cloud, parent, unused_below)
+
+
+def grow(cloud: Arrays, count: int, least_opacity: float, rng: np.random.Generator) -> Change:
+    """``count`` more Gaussians where others are, drawn in proportion to their opacity, that change no picture."""
+    opacity = expit(cloud["opacity_logits"].astype(np.float64))
+    source = rng.choice(len(opacity), count, p=opacity / opacity.sum())
+    return _shared(cloud, np.concatenate([np.arange(len(opacity)), source]), least_opacity)
+
+
+def _shared(cloud: Arrays, parent: NDArray[np.int64], least_opacity: float) -> Change:
+    """Rows that are copies of others: what is at a place is divided among all that stand there."""
+    copies = np.minimum(np.bincount(parent, minlength=len(cloud["means"]))[parent], MOST_COPIES)
+    made = {name: array[parent] for name, array in cloud.items()}
+    shares = copies > 1
+    opacity = expit(made["opacity_logits"][shares].astype(np.float64))
+    each, factor = opacity_and_scale_of_copies(opacity, copies[shares])
+    each = np.clip(each, least_opacity, 1 - 2**-23)
+    made["opacity_logits"][shares] = logit(each).astype(np.float32)
+    made["log_scales"][shares] += np.log(factor)[:, None].astype(np.float32)
+    return Change(made, parent, shares)
+
+
+def opacity_and_scale_of_copies(opacity: NDArray, copies: NDArray) -> tuple[NDArray, NDArray]:
+    """Opacity of each of N equal Gaussians that replace one, and the factor on its scale (Kheradmand et al. 2024, eqs. 9, 10).
+
+    Opacities compose to the old one at the middle; the factor keeps the integral of the composite along a line through it.
+
+    Args:
+        opacity: (M,) of the one, in (0, 1).
+        copies: (M,) N, 1 to 51.
+    """
+    each = -np.expm1(np.log1p(-opacity) / copies)
+    total = np.zeros_like(each)
+    for i in range(1, int(copies.max(initial=1)) + 1):
+        k = np.arange(i)
+        binomial = np.exp(gammaln(i) - gammaln(k + 1) - gammaln(i - k))
+        terms = binomial * (-1.0) ** k / np.sqrt(k + 1) * each[:, None] ** (k + 1)
+        total += np.where(i <= copies, terms.sum(axis=1), 0)
+    return each, opacity / total
+
+
+def rotations(quaternions: NDArray) -> NDArray:
+    """(N, 3, 3) rotations of quaternions (w, x, y, z) of any length above 0."""
+    w, x, y, z = (quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)).T.astype(np.float64)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.moveaxis(np.array(rows), 2, 0)

@@ -1,0 +1,365 @@
+"""Gaussians and photographs of what they show as a problem: one whole picture a step, by the tile renderer.
+
+Conventions. The reals are the tensors of :mod:`mivol.splatting.splatter` by name, but for higher harmonics, which are kept
+divided by ``GaussianPlan.sheen``: their rate is smaller by that factor, and all of a tensor has one rate. Colours are code
+values 0..1, as those of the photographs. What a step does is a function of the reals, of the stage, the seed and the step's
+number; what density control does is one of the sums that are kept since it was last done besides.
+
+References: Kerbl et al. 2023 (loss, order of views, density control); Kheradmand et al. 2024 (relocation, noise, priors).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from scipy.special import expit
+
+from mivol.errors import MivolError
+from mivol.optim.density_control import (
+    Arrays,
+    Change,
+    best_rows,
+    clone_and_split,
+    grow,
+    prune,
+    relocate,
+    reset_opacities,
+)
+from mivol.optim.gaussian_plan import CONTROLS, GaussianPlan, extent_of
+from mivol.optim.problem import Reals, Refinement
+from mivol.optim.ray_batches import RayBatches
+from mivol.optim.similarity import PictureShape, difference
+from mivol.optim.strategy import nearest
+from mivol.photos import Camera
+from mivol.splatting import Splatter
+from mivol.splatting.splatter import Statistics
+
+__all__ = ["GaussianProblem"]
+
+RESET_TO = 0.01
+"""Opacity to which all are lowered now and then."""
+
+
+@dataclasses.dataclass
+class GaussianProblem:
+    """Gaussians that are fitted to photographs.
+
+    Attributes:
+        batches: the photographs, in the sizes of the plan.
+        cameras: of the photographs at full size, pinholes.
+        cloud: where the fit begins; what was found after :meth:`set`.
+        plan: how the fit goes.
+        seed: of the order of views, of backgrounds and of what density control draws.
+        safe_point: called between kernels.
+        stage: the stage at work.
+
+    Example:
+        >>> cloud = begin_at(places_of(photos, 5000, 0)[0], photos.views, degree=0)
+        >>> problem = GaussianProblem(RayBatches.of(photos.views, (1, 2)), cameras, cloud, PRESETS["tiny"])
+        >>> reconstruct(problem, problem.plan.optimiser, problem.plan.course())
+    """
+
+    batches: RayBatches
+    cameras: Sequence[Camera]
+    cloud: Arrays
+    plan: GaussianPlan
+    seed: int = 0
+    safe_point: Callable[[], None] = lambda: None
+    stage: int = dataclasses.field(init=False, default=0)
+
+    def __post_init__(self) -> None:
+        if self.plan.control not in CONTROLS:
+            raise MivolError(f'control = "{self.plan.control}" is unknown: {nearest(self.plan.control, list(CONTROLS))}')
+        absent = {stage.shrink for stage in self.plan.stages} - self.batches.levels.keys()
+        if absent:
+            raise MivolError(f"views shrunk by {min(absent)} are asked for; take them over in that size (RayBatches.of).")
+        self.extent = extent_of(self.cameras)
+        if not self.extent > 1e-6 * max(np.abs(camera.origin).max() for camera in self.cameras):
+            raise MivolError("all cameras stand at one place, which tells no distance: Gaussians need views from several.")
+        self.begun_with = len(self.cloud["means"])
+        self._splatters: dict[tuple[int, int, float, int], Splatter] = {}
+        self._shapes: dict[tuple[int, int], PictureShape] = {}
+        self._looks: dict[tuple[int, int], Camera] = {}
+        self._difference = dr.freeze(difference)
+        self.cloud = _of_degree(self.cloud, self.plan.stages[0].degree)
+        self._forget_sums()
+
+    # -- Values -------------------------------------------------------------------------------------------------------
+
+    def start(self) -> Reals:
+        """The reals of the cloud that is there now."""
+        return self._reals_of(self.cloud)
+
+    def values(self) -> Reals:
+        """The cloud as tensors, coefficients as they are."""
+        return {name: mi.TensorXf(array) for name, array in self.cloud.items()}
+
+    def set(self, reals: Reals) -> None:
+        """Take over the cloud of reals."""
+        self.cloud = self._cloud_of(reals)
+
+    def _reals_of(self, cloud: Arrays) -> Reals:
+        return {name: mi.TensorXf(array) for name, array in cloud.items()} | {
+            "harmonics": mi.TensorXf(cloud["harmonics"] / self._shares(cloud["harmonics"].shape[1]))
+        }
+
+    def _cloud_of(self, reals: Reals) -> Arrays:
+        cloud = {name: np.array(value) for name, value in reals.items()}
+        cloud["harmonics"] *= self._shares(cloud["harmonics"].shape[1])
+        return cloud
+
+    def _shares(self, count: int) -> np.ndarray:
+        """(count, 1) of a coefficient, over its real."""
+        return np.array([1.0] + [self.plan.sheen] * (count - 1), np.float32)[:, None]
+
+    def _sheen(self, harmonics: mi.TensorXf) -> mi.TensorXf:
+        """Each number of harmonics times its share: reals to coefficients, and slopes by coefficients to slopes by reals."""
+        index = dr.arange(mi.UInt32, dr.width(harmonics.array)) // 3 % dr.opaque(mi.UInt32, harmonics.shape[1])
+        share = dr.select(index == 0, 1.0, dr.opaque(mi.Float, self.plan.sheen))
+        return mi.TensorXf(harmonics.array * share, harmonics.shape)
+
+    # -- Loss and gradient --------------------------------------------------------------------------------------------
+
+    def loss_and_gradient(self, reals: Reals, iteration: int, views: int = 0) -> tuple[mi.Float, Reals]:
+        """The loss of one view, and its gradient; views take turns in an order that is shuffled each round.
+
+        Raises:
+            MivolError: more than one view a step was asked for.
+        """
+        if views > 1:
+            raise MivolError(f"{views} views a step were asked for; a fit of Gaussians looks at one: leave views out.")
+        round_, at = divmod(iteration, len(self.cameras))
+        view = int(np.random.default_rng((self.seed, 2, round_)).permutation(len(self.cameras))[at])
+        loss, gradient, seen = self.loss_of_view(reals, view, self._background(iteration))
+        self._add_up(seen)
+        if self.plan.control == "relocation":
+            loss, gradient = self._sparse(reals, loss, gradient)
+        return loss, gradient
+
+    def loss_of_view(
+        self, reals: Reals, view: int, background: np.ndarray | None = None
+    ) -> tuple[mi.Float, Reals, Statistics]:
+        """The loss of a view in the size of the stage, its gradient by the reals, and what the screen says of each Gaussian.
+
+        Args:
+            reals: of the cloud.
+            view: its number.
+            background: put behind the photograph and the cloud (3,); None: the photograph's own.
+        """
+        shrink = self.plan.stages[self.stage].shrink
+        camera = self._camera(view, shrink)
+        splatter = self.splatter_for(camera.size, self.plan.low_pass_at(shrink))
+        cloud = {**reals, "harmonics": self._sheen(reals["harmonics"])}
+        picture, kept = splatter.forward(cloud, camera)
+        self.safe_point()
+        seen, target, behind, counted = self._compared(picture, view, shrink, background)
+        loss, slope = self._difference(seen, target, self._shape(camera.size), self.plan.ssim)
+        gradient, statistics = splatter.backward(kept, _slope_of_picture(slope, behind, counted, picture.shape))
+        gradient.pop("pose")
+        gradient["harmonics"] = self._sheen(gradient["harmonics"])
+        # Places on the screen in half edges of the picture, so that a threshold holds for pictures of all sizes.
+        moved = statistics.d_mean2d * (max(camera.size) / 2)
+        return loss, gradient, dataclasses.replace(statistics, d_mean2d=moved)
+
+    def _camera(self, view: int, shrink: int) -> Camera:
+        """The camera of a view at a smaller size; rows and columns that fill no square of pixels are left out."""
+        if (view, shrink) not in self._looks:
+            camera, size = self.cameras[view], tuple(int(n) for n in self.batches.levels[shrink].sizes[view])
+            smaller = np.diag([1 / shrink, 1 / shrink, 1.0]) @ camera.K
+            self._looks[view, shrink] = dataclasses.replace(camera, K=smaller, size=size)
+        return self._looks[view, shrink]
+
+    def splatter_for(self, size: tuple[int, int], low_pass: float) -> Splatter:
+        """The renderer of pictures of a size (width, height), for the degree of the stage; each is made once."""
+        key = (*size, low_pass, self.plan.stages[self.stage].degree)
+        if key not in self._splatters:
+            self._splatters[key] = Splatter(*size, key[-1], low_pass=low_pass)
+        return self._splatters[key]
+
+    def _shape(self, size: tuple[int, int]) -> PictureShape:
+        if size not in self._shapes:
+            self._shapes[size] = PictureShape.of(*size)
+        return self._shapes[size]
+
+    def _background(self, iteration: int) -> np.ndarray | None:
+        random = self.plan.random_background and self.batches.channels == 4
+        return np.random.default_rng((self.seed, 3, iteration)).random(3) if random else None
+
+    def _compared(
+        self, picture: mi.TensorXf, view: int, shrink: int, background: np.ndarray | None
+    ) -> tuple[mi.Float, mi.Float, mi.Float, mi.Float]:
+        """Render and photograph over one background, (H, W, 3) flat and evaluated; the background (3,), and what counts."""
+        codes, counted = self.batches.picture(shrink, view)
+        before = self.batches.behind[view]
+        behind = before if background is None else background
+        colours = [dr.opaque(mi.Float, float(c)) for c in behind]
+        pixels = picture.shape[0] * picture.shape[1]
+        pixel = dr.arange(mi.UInt32, pixels)
+        through = 1 - dr.gather(mi.Float, picture.array, 4 * pixel + 3)
+        seen, target = dr.empty(mi.Float, 3 * pixels), dr.empty(mi.Float, 3 * pixels)
+        for c, colour in enumerate(colours):
+            value = codes[c]
+            if len(codes) == 4:
+                value = value + (1 - codes[3]) * (colour - dr.opaque(mi.Float, float(before[c])))
+            dr.scatter(seen, (dr.gather(mi.Float, picture.array, 4 * pixel + c) + through * colour) * counted, 3 * pixel + c)
+            dr.scatter(target, value * counted, 3 * pixel + c)
+        dr.eval(seen, target)
+        return seen, target, mi.Float(np.asarray(behind, np.float32)), counted
+
+    def _sparse(self, reals: Reals, loss: mi.Float, gradient: Reals) -> tuple[mi.Float, Reals]:
+        """With the priors of relocation: the mean opacity and the mean scale [extent]."""
+        n, weight = reals["means"].shape[0], self.plan.sparsity
+        each = dr.opaque(mi.Float, weight / n)
+        opacity = 1 / (1 + dr.exp(-reals["opacity_logits"].array))
+        scale = dr.exp(reals["log_scales"].array) * dr.opaque(mi.Float, 1 / (3 * self.extent))
+        loss = loss + each * (dr.sum(opacity) + dr.sum(scale))
+        slopes = {"opacity_logits": opacity * (1 - opacity), "log_scales": scale}
+        more = {name: mi.TensorXf(gradient[name].array + each * slope, gradient[name].shape) for name, slope in slopes.items()}
+        return loss, gradient | more
+
+    def rates(self, iteration: int) -> dict[str, float]:
+        """Learning rate of each parameter."""
+        return self.plan.rates(iteration, self.extent)
+
+    def after_step(self, reals: Reals, iteration: int) -> Reals:
+        """The reals; where Gaussians are relocated, transparent ones wander (Kheradmand et al. 2024, eq. 8)."""
+        if self.plan.control != "relocation" or iteration >= self.plan.grows[1] * self.plan.steps:
+            return reals
+        n = reals["means"].shape[0]
+        drawn = np.random.default_rng((self.seed, 4, iteration)).standard_normal((n, 3)).astype(np.float32)
+        size = dr.opaque(mi.Float, self.plan.noise * self.rates(iteration)["means"])
+        return {**reals, "means": _wandered(reals, mi.Float(drawn.ravel()), size)}
+
+    def warning(self) -> str:
+        """Nothing: renders have no noise."""
+        return ""
+
+    # -- Density ------------------------------------------------------------------------------------------------------
+
+    def control_density(self, iteration: int) -> Refinement:
+        """More Gaussians where the pictures ask for them, fewer where nobody sees them; the sums begin anew."""
+        rng = np.random.default_rng((self.seed, 5, iteration))
+        before = len(self.cloud["means"])
+        room = self.plan.count_at(iteration, self.begun_with) - before
+        change = (self._relocated if self.plan.control == "relocation" else self._divided)(room, rng)
+        reset = self.plan.reset_every and iteration % self.plan.reset_every == 0
+        self.cloud = reset_opacities(change.cloud, RESET_TO) if reset else change.cloud
+        self._forget_sums()
+
+        def carry(tensors: Reals) -> Reals:
+            learnt = change.carry({name: np.array(value) for name, value in tensors.items()})
+            if reset:
+                learnt["opacity_logits"][:] = 0
+            return {name: mi.TensorXf(array) for name, array in learnt.items()}
+
+        now = len(self.cloud["means"])
+        says = f"{now} Gaussians, {before} before" + (", all of opacity 0.01 at most" if reset else "")
+        return Refinement(self._reals_of(self.cloud), carry, {}, says)
+
+    def _divided(self, room: int, rng: np.random.Generator) -> Change:
+        """Clone and split where places on the screen are pulled at most; prune what is transparent or too large."""
+        slope = self._slopes / np.maximum(self._times, 1)
+        rows = best_rows(slope, max(self.plan.threshold, np.finfo(np.float32).tiny), room)
+        change = clone_and_split(self.cloud, rows, self.plan.largest_clone * self.extent, rng)
+        cloud = change.cloud
+        keep = expit(cloud["opacity_logits"]) >= self.plan.least_opacity
+        keep &= np.exp(cloud["log_scales"].max(axis=1)) <= self.plan.largest * self.extent
+        return change.then(prune(cloud, keep))
+
+    def _relocated(self, room: int, rng: np.random.Generator) -> Change:
+        """Move what is transparent to where something is, then grow by at most 5 %."""
+        moved = relocate(self.cloud, self.plan.least_opacity, rng)
+        more = min(max(room, 0), max(1, len(self.cloud["means"]) // 20))
+        return moved.then(grow(moved.cloud, more, self.plan.least_opacity, rng)) if more else moved
+
+    def _add_up(self, seen: Statistics) -> None:
+        self._slopes += np.where(seen.seen, seen.d_mean2d, 0)
+        self._times += seen.seen
+
+    def _forget_sums(self) -> None:
+        """Begin to add up anew: the slope of each Gaussian's place on the screen, and how often it was seen."""
+        self._slopes = np.zeros(len(self.cloud["means"]))
+        self._times = np.zeros(len(self.cloud["means"]))
+
+    # -- Stages -------------------------------------------------------------------------------------------------------
+
+    def refine(self, stage: int) -> Refinement:
+        """Go over to photographs of another size, with harmonics of a degree that begin at 0."""
+        self.stage = stage
+        now = self.plan.stages[stage]
+        self.cloud = _of_degree(self.cloud, now.degree)
+
+        def carry(tensors: Reals) -> Reals:
+            learnt = _of_degree({name: np.array(value) for name, value in tensors.items()}, now.degree)
+            return {name: mi.TensorXf(array) for name, array in learnt.items()}
+
+        says = f"photographs shrunk by {now.shrink}, harmonics of degree {now.degree}"
+        return Refinement(self._reals_of(self.cloud), carry, {}, says)
+
+    def update_occupancy(self) -> None:
+        """Nothing is left out of steps but what a camera does not see."""
+
+    # -- On disk ------------------------------------------------------------------------------------------------------
+
+    def pack(self, reals: Reals) -> dict[str, np.ndarray]:
+        """The stage, and the sums since the density was last controlled."""
+        return {"stage": np.array(self.stage), "slopes": self._slopes, "times": self._times}
+
+    def unpack(self, arrays: dict[str, np.ndarray], reals: Reals) -> None:
+        """Go on from what :meth:`pack` gave; plan, photographs and the first cloud must be the same."""
+        self.stage = int(arrays["stage"])
+        self.set(reals)
+        self._slopes, self._times = np.array(arrays["slopes"]), np.array(arrays["times"])
+
+
+def _of_degree(arrays: Arrays, degree: int) -> Arrays:
+    """The arrays with harmonics up to a degree: those beyond are left out, new ones are 0."""
+    harmonics, wanted = arrays["harmonics"], (degree + 1) ** 2
+    made = np.zeros((len(harmonics), wanted, 3), np.float32)
+    shared = min(wanted, harmonics.shape[1])
+    made[:, :shared] = harmonics[:, :shared]
+    return {**arrays, "harmonics": made}
+
+
+def _slope_of_picture(slope: mi.Float, behind: mi.Float, counted: mi.Float, shape: tuple[int, ...]) -> mi.TensorXf:
+    """Derivatives by colour multiplied by alpha, and by alpha, of those by what is seen over a background."""
+    pixel = dr.arange(mi.UInt32, shape[0] * shape[1])
+    dr.eval(slope)
+    made, through = dr.empty(mi.Float, 4 * dr.width(pixel)), mi.Float(0)
+    for c in range(3):
+        one = dr.gather(mi.Float, slope, 3 * pixel + c) * counted
+        through += one * dr.gather(mi.Float, behind, mi.UInt32(c))
+        dr.scatter(made, one, 4 * pixel + c)
+    dr.scatter(made, -through, 4 * pixel + 3)
+    dr.eval(made)
+    return mi.TensorXf(made, shape)
+
+
+STEEPNESS, NEARLY_CLEAR = 100.0, 0.005
+"""How sharply wandering ends where Gaussians are seen, and the opacity about which it does (the published code's)."""
+
+
+def _wandered(reals: Reals, drawn: mi.Float, size: mi.Float) -> mi.TensorXf:
+    """Places moved by normal numbers, shaped as the Gaussians are, where their opacity is all but 0."""
+    index = dr.arange(mi.UInt32, reals["means"].shape[0])
+
+    def rows(array: mi.Float, count: int) -> list[mi.Float]:
+        return [dr.gather(mi.Float, array, count * index + k) for k in range(count)]
+
+    w, x, y, z = rows(reals["quaternions"].array, 4)
+    turn = dr.normalize(mi.Quaternion4f(x, y, z, w))
+    matrix = dr.quat_to_matrix(mi.Matrix3f, turn)
+    variance = dr.exp(2 * mi.Vector3f(*rows(reals["log_scales"].array, 3)))
+    drawn_rows = rows(drawn, 3)
+    along = mi.Vector3f(*(sum(matrix[i, k] * drawn_rows[i] for i in range(3)) for k in range(3)))
+    step = matrix @ (variance * along)
+    opacity = 1 / (1 + dr.exp(-reals["opacity_logits"].array))
+    step *= size / (1 + dr.exp(STEEPNESS * (opacity - NEARLY_CLEAR)))
+    moved = dr.empty(mi.Float, 3 * dr.width(index))
+    for k in range(3):
+        dr.scatter(moved, dr.gather(mi.Float, reals["means"].array, 3 * index + k) + step[k], 3 * index + k)
+    return mi.TensorXf(moved, reals["means"].shape)

@@ -1,0 +1,165 @@
+"""``mivol optimize`` with Gaussians: from a folder of views to a page, stopped and resumed, and what it refuses."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mivol import config
+from mivol.cli import main
+from mivol.experiments.gaussian_start import make_gaussian_plan
+from mivol.files import write_png
+from mivol.optim.gaussian_plan import PRESETS
+from mivol.optim.gaussian_problem import GaussianProblem
+from mivol.optim.gaussian_start import begin_at, places_of
+from mivol.optim.problem import Reals
+from mivol.photos import Camera, intrinsics, load_photos
+from mivol.photos.camera_path import facing
+from mivol.photos.picture import decode_srgb
+from mivol.photos.transforms import write_transforms
+from mivol.points import read_gaussians
+from mivol.splatting import Splatter
+
+SIZE, VIEWS = 40, 14
+
+
+@pytest.fixture(scope="module")
+def photographs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Views with alpha of a ball of opaque Gaussians of many colours, all around it."""
+    import mivol.plugins  # noqa: F401
+
+    mi.set_variant("llvm_ad_rgb")
+    drawn = np.random.default_rng(5).normal(size=(400, 3))
+    cloud = begin_at(0.6 * drawn / np.linalg.norm(drawn, axis=1, keepdims=True), [], 0)
+    cloud["opacity_logits"][:] = 4
+    cloud["log_scales"] -= 0.7
+    cloud["harmonics"][:, 0] = 1.5 * np.sin(4 * cloud["means"])
+    tensors, splatter = {name: mi.TensorXf(array) for name, array in cloud.items()}, Splatter(SIZE, SIZE, 0)
+    folder, cameras = tmp_path_factory.mktemp("photographs"), {}
+    like = Camera(intrinsics(55, 55, SIZE / 2, SIZE / 2), (SIZE, SIZE), np.eye(4))
+    for n in range(VIEWS):
+        turn, height = 2.4 * n, 1.6 * (n + 0.5) / VIEWS - 0.8
+        origin = 3.5 * np.array([*(np.sqrt(1 - height**2) * np.array([np.cos(turn), np.sin(turn)])), height])
+        name = f"view_{n:02d}.png"
+        cameras[name] = facing(like, origin, np.zeros(3), np.array([0, 0, 1.0]), name)
+        seen = np.clip(np.array(splatter.forward(tensors, cameras[name], derivatives=False)[0]), 0, 1)
+        colour = seen[..., :3] / np.maximum(seen[..., 3:], 1e-6)
+        write_png(folder / name, np.concatenate([decode_srgb(np.clip(colour, 0, 1)), seen[..., 3:]], axis=2))
+    write_transforms(folder / "transforms.json", cameras, ["view_03.png", "view_08.png"])
+    return folder
+
+
+def toml(folder: Path, photographs: Path, **changes: object) -> Path:
+    """An experiment of 100 steps."""
+    path = folder / "fit.toml"
+    settings = {"preset": '"tiny"', "effort": 0.2, "start": 150, "most": 300} | changes
+    lines = "\n".join(f"{name} = {value}" for name, value in settings.items())
+    path.write_text(
+        f"""
+        title = "A ball of Gaussians"
+        [photos]
+        path = "{photographs}"
+        background = "white"
+        box = [[-1, -1, -1], [1, 1, 1]]
+        held_out = 0
+        judged = "test"
+        [gaussians]
+        {lines}
+        [show]
+        frames = 3
+        views = 1
+        every = 40
+        """
+    )
+    return path
+
+
+@pytest.mark.slow
+def test_photographs_become_gaussians_and_a_page(photographs: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    """The held-out views are far nearer than a white picture (about 6 dB), and the file holds what the page counts."""
+    assert main(["optimize", str(toml(tmp_path, photographs)), "-o", str(tmp_path / "run")]) == 0
+    said = capsys.readouterr()
+    assert said.out.strip().endswith("report.html")
+    for text in ("where no view sees through", "counted before it is taken", "alpha says what is there"):
+        assert text in said.err
+    record = json.loads((tmp_path / "run/run.json").read_text())
+    assert record["results"]["held_out_psnr"] > 18
+    found = read_gaussians(tmp_path / "run/gaussians.ply")
+    assert found.count == record["results"]["gaussians"]
+    assert found.degree == 1
+    page = (tmp_path / "run/report.html").read_text()
+    for text in ("data:video/mp4;base64,", "What was found", "view_03.png", "Kerbl"):
+        assert text in page
+    rows = [json.loads(line) for line in (tmp_path / "run/metrics.jsonl").read_text().splitlines()]
+    assert [row["iteration"] for row in rows] == [40, 80, 100]
+    assert all({"loss", "held_out_psnr"} <= row.keys() for row in rows)
+
+
+@pytest.mark.slow
+def test_a_stopped_fit_goes_on(photographs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ctrl-C in the middle keeps what was done; the resumed fit begins there and ends with all steps."""
+    path, started = toml(tmp_path, photographs), []
+    whole = GaussianProblem.loss_and_gradient
+
+    def stops(problem: GaussianProblem, reals: Reals, iteration: int, views: int) -> object:
+        if iteration == 45 and not started:
+            raise KeyboardInterrupt
+        return whole(problem, reals, iteration, views)
+
+    def notes(problem: GaussianProblem, reals: Reals, iteration: int, views: int) -> object:
+        started.append(iteration)
+        return whole(problem, reals, iteration, views)
+
+    monkeypatch.setattr(GaussianProblem, "loss_and_gradient", stops)
+    assert main(["optimize", str(path), "-o", str(tmp_path / "run")]) == 130
+    monkeypatch.setattr(GaussianProblem, "loss_and_gradient", notes)
+    assert main(["optimize", str(path), "-o", str(tmp_path / "run"), "--resume"]) == 0
+    assert started == list(range(45, 100))
+    assert main(["optimize", str(path), "-o", str(tmp_path / "run"), "--resume", "--set", "gaussians.degree=2"]) == 1
+
+
+def test_what_the_file_says_overrides_the_preset() -> None:
+    raw = {"title": "x", "photos": {"path": "p"}, "gaussians": {}}
+    assert make_gaussian_plan(config.from_dict(raw)) == PRESETS["minute"]
+    raw["gaussians"] = {"preset": "tiny", "effort": 2.0, "degree": 0, "most": 77, "control": "relocation", "ssim": 0.0}
+    plan = make_gaussian_plan(config.from_dict(raw))
+    assert [stage.degree for stage in plan.stages] == [0, 0]
+    assert plan.steps == 2 * PRESETS["tiny"].steps
+    assert (plan.most, plan.control, plan.ssim, plan.start) == (77, "relocation", 0.0, PRESETS["tiny"].start)
+
+
+@pytest.mark.parametrize(
+    ("setting", "says"),
+    [
+        ('gaussians.preset="minut"', 'gaussians.preset = "minut" is unknown: did you mean "minute"'),
+        ('gaussians.control="mcmc"', 'gaussians.control = "mcmc" is unknown: known are: clone_split, relocation'),
+        ("gaussians.degree=4", "degree is 4: 0 to 3 is expected"),
+        ("gaussians.start=3", "start is 3: at least 4 is expected"),
+        ("gaussians.ssim=1.5", "ssim is 1.5: a number from 0 to 1 is expected"),
+        ("gaussians.effort=inf", "effort is inf: a finite number above 0 is expected"),
+        ("gaussians.most=2000000000", "most = "),
+        ("variant=scalar_rgb", "mivol works in llvm_ad_rgb"),
+    ],
+)
+def test_refusals(photographs: Path, tmp_path: Path, capsys: pytest.CaptureFixture, setting: str, says: str) -> None:
+    path = toml(tmp_path, photographs)
+    assert main(["optimize", str(path), "-o", str(tmp_path / "run"), "--set", setting]) == 1
+    assert says in capsys.readouterr().err.replace("\n", " ")
+
+
+def test_points_begin_where_no_view_sees_through(photographs: Path) -> None:
+    """A ball of radius 0.6, 0.2 more until its rim of Gaussians has an alpha below 1/510, and 0.06 for a pixel; its hull by 14
+    views reaches a fifth further. The corners of the box are 1.7 away, so of 200 points in all of it some lie beyond 1.1."""
+    photos = load_photos(photographs, background="white", box=np.array([[-1.0] * 3, [1.0] * 3]))
+    places, whence = places_of(photos, 200, 0)
+    assert len(places) == 200
+    assert np.linalg.norm(places, axis=1).max() < 1.1
+    assert "where no view sees through" in whence
+    assert np.array_equal(places, places_of(photos, 200, 0)[0])
+    colours = begin_at(places, photos.views, 1)["harmonics"]
+    assert not colours[:, 1:].any()
+    assert colours[:, 0].std() > 0.05
