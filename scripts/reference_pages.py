@@ -167,6 +167,7 @@ def toml_page() -> str:
         "Pictures of a scene (a table `[scene]`)": config.Experiment,
         "Projections (a table `[scan]`)": config.Scan,
         "Photographs (a table `[photos]`)": config.FieldFit,
+        "Gaussians (tables `[photos]` and `[gaussians]`)": config.GaussianFit,
     }
     lines = ["# Settings of an experiment", "", *SETTINGS_HEAD.splitlines(), ""]
     for title, kind in kinds.items():
