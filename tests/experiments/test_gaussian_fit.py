@@ -132,6 +132,15 @@ def test_what_the_file_says_overrides_the_preset() -> None:
     assert (plan.most, plan.control, plan.ssim, plan.start) == (77, "relocation", 0.0, PRESETS["tiny"].start)
 
 
+def test_the_example_is_one_of_gaussians() -> None:
+    """The settings of the still life are read, and name the photographs that the radiance field beside them is fitted to."""
+    folder = Path(__file__).resolve().parents[2] / "scenes/still_life"
+    chosen, field = config.load(folder / "gaussians.toml"), config.load(folder / "fit.toml")
+    assert isinstance(chosen, config.GaussianFit)
+    assert chosen.photos == field.photos
+    assert make_gaussian_plan(chosen) == PRESETS["minute"]
+
+
 @pytest.mark.parametrize(
     ("setting", "says"),
     [
