@@ -3,6 +3,7 @@
     scripts/bench_tomography.py                         128^3, 100 cone-beam views of 128^2 pixels
     scripts/bench_tomography.py --size 256              the size of TIGRE's own tests
     scripts/bench_tomography.py --volume tooth.nrrd     a measured volume as truth besides
+    scripts/bench_tomography.py --beside                slices beside astra-toolbox and scikit-image (tomography_peers)
 
 The geometry is TIGRE's test "configuration 1" (cone beam, 100 views on a full circle). The object is the Shepp-Logan head,
 its projections are sums of ellipsoid chords (float64, no grid), so no operator sees data that it made itself. A measured
@@ -32,6 +33,7 @@ import mivol
 from mivol.bench.bars import say
 from mivol.bench.figures import drawn
 from mivol.bench.timing import Stopwatch
+from mivol.bench.tomography_peers import compare, rows
 from mivol.errors import MivolError
 from mivol.files import read_volume, write_whole_text
 from mivol.optim.linear_problems import LeastSquares
@@ -193,6 +195,7 @@ def parse(argv: Sequence[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--iterations", type=int, default=20)
     parser.add_argument("--phantom", choices=list(SHEPP_LOGAN), default="yu-ye-wang")
     parser.add_argument("--volume", type=Path, help="a volume file to use as truth besides")
+    parser.add_argument("--beside", action="store_true", help="slices beside other programs, and nothing else")
     parser.add_argument("--variant", default="llvm_ad_rgb")
     parser.add_argument("--out", type=Path, default=Path("runs/bench_tomography"))
     return parser.parse_args(argv)
@@ -230,6 +233,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         mi.set_variant(args.variant)
         args.out.mkdir(parents=True, exist_ok=True)
+        if args.beside:
+            print("\n".join(rows(compare())))
+            return 0
         report, curves = measure(args)
         write_whole_text(args.out / "tomography.json", json.dumps(report | {"curves": curves}, indent=2) + "\n")
     except MivolError as error:

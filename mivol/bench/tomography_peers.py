@@ -1,0 +1,188 @@
+"""Solvers of slices beside astra-toolbox and scikit-image: error against processor time, in one run on one machine.
+
+    scripts/bench_tomography.py --beside     needs nothing else; astra-toolbox takes part where it is installed
+
+The object is a slice of the Shepp-Logan head, its projections are exact chords (float64, no grid), with the noise of quanta
+where the kind of data has it: no operator sees data that it made itself. All get the same projections of a parallel beam, whose
+grid and detector have odd numbers of cells, so that every program has the axis in the middle of one. Times are of the processor
+(user and system, all threads), without the set-up of operators, and ours after a first run that compiles; nRMSE is
+|x - truth| / |truth| over the disc inside the grid, outside of which scikit-image finds nothing.
+"""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import time
+import warnings
+from collections.abc import Callable, Iterator
+from typing import NamedTuple
+
+import numpy as np
+
+from mivol.bench.bars import say
+from mivol.optim.linear_problems import LeastSquares
+from mivol.optim.solvers import METHODS
+from mivol.tomography.geometry import ParallelBeam, VoxelGrid
+from mivol.tomography.phantoms import shepp_logan
+from mivol.tomography.projector import Projector
+from mivol.validate.metrics import nrmse
+
+KINDS = {"few views": (30, 0.0), "noisy": (90, 1e4), "many": (360, 1e4)}
+"""Kind of data: views, and quanta a pixel (0: no noise)."""
+
+STEPS = {"cgls": 20, "pcg": 20, "pcg from fbp": 10, "sirt": 60, "sart": 6, "os-sart": 12}
+"""Iterations of ours; those of others are as many."""
+
+
+class Slice(NamedTuple):
+    """One slice and its projections.
+
+    Attributes:
+        beam, grid: lengths in voxels.
+        y, weights: (views, 1, columns).
+        truth: (1, n, n), averages over voxels.
+    """
+
+    beam: ParallelBeam
+    grid: VoxelGrid
+    y: np.ndarray
+    weights: np.ndarray
+    truth: np.ndarray
+
+    def error(self, x: np.ndarray) -> float:
+        """nRMSE over the disc inside the grid."""
+        at = self.grid.axis("x")
+        inside = np.hypot(at[:, None], at) < at[-1]
+        return nrmse(np.reshape(x, self.truth.shape)[0][inside], self.truth[0][inside])
+
+
+class Curve(NamedTuple):
+    """Errors after each step, and the processor's seconds up to it."""
+
+    errors: list[float]
+    seconds: list[float]
+
+
+def make_slice(n: int, views: int, photons: float) -> Slice:
+    """The head across ``n`` voxels (odd), seen by 3/2 as many pixels."""
+    columns = 3 * n // 2 // 2 * 2 + 1
+    grid = VoxelGrid((1, n, n))
+    beam = ParallelBeam(np.arange(views) * np.pi / views, (1, columns))
+    head = shepp_logan("toft-schabel", n / 2)
+    scale = 4.0 / n  # so that 1 across the grid has an optical depth of 4
+    exact = scale * head.project(beam)
+    truth = scale * head.voxelise(VoxelGrid((1, n, n), (1.0, 1.0, 1e-6)), 4)
+    if not photons:
+        return Slice(beam, grid, exact, np.ones_like(exact), truth)
+    counts = np.maximum(np.random.default_rng(0).poisson(photons * np.exp(-exact)), 1.0)
+    return Slice(beam, grid, -np.log(counts / photons), counts / photons, truth)
+
+
+def timed(scan: Slice, states: Iterator[np.ndarray], steps: int) -> Curve:
+    """Take steps; judging is not timed."""
+    errors, seconds, spent = [], [], 0.0
+    for _ in range(steps):
+        start = time.process_time()
+        x = next(states, None)
+        spent += time.process_time() - start
+        if x is None:
+            break
+        errors.append(scan.error(x))
+        seconds.append(spent)
+    return Curve(errors, seconds)
+
+
+def ours(scan: Slice) -> dict[str, Curve]:
+    """Every solver of least squares, and filtered back-projection."""
+    a, found = Projector(scan.beam, scan.grid), {}
+
+    def run(name: str, x0: np.ndarray | None = None) -> Iterator[np.ndarray]:
+        problem = LeastSquares(a, scan.y, scan.weights, x0, nonnegative=name not in ("cgls", "fbp"))
+        return (state.x for state in METHODS[name].run(problem))
+
+    filtered = next(run("fbp"))
+    found["fbp"] = timed(scan, run("fbp"), 1)
+    for name, steps in STEPS.items():
+        solver, start = name.removesuffix(" from fbp"), np.maximum(filtered, 0) if name.endswith("fbp") else None
+        next(run(solver, start))
+        found[name] = timed(scan, run(solver, start), steps)
+    return {f"mivol {name}": curve for name, curve in found.items()}
+
+
+def scikit_image(scan: Slice) -> dict[str, Curve]:
+    """``iradon``, and ``iradon_sart`` swept as often as ours; rows of its images run against y."""
+    from skimage.transform import iradon, iradon_sart
+
+    sinogram, theta, n = scan.y[:, 0].T.copy(), np.degrees(scan.beam.angles), scan.grid.shape[1]
+    margin = (len(sinogram) - n) // 2
+
+    def sweeps() -> Iterator[np.ndarray]:
+        image = None
+        while True:
+            image = iradon_sart(sinogram, theta, image=image)
+            yield image[::-1][margin : margin + n, margin : margin + n]
+
+    filtered = (iradon(sinogram, theta, output_size=n)[::-1] for _ in range(1))
+    return {"scikit-image iradon": timed(scan, filtered, 1), "scikit-image iradon_sart": timed(scan, sweeps(), STEPS["sart"])}
+
+
+def astra_toolbox(scan: Slice) -> dict[str, Curve]:
+    """FBP, CGLS, SIRT and SART of astra-toolbox on the processor; SART's iterations are views, and are counted in sweeps."""
+    astra = importlib.import_module("astra")  # no dependency: only where it is installed
+
+    n, (views, _, columns) = scan.grid.shape[1], scan.beam.shape
+    volume = astra.create_vol_geom(n, n)
+    projector = astra.create_projector("linear", astra.create_proj_geom("parallel", 1.0, columns, scan.beam.angles), volume)
+    sinogram = astra.data2d.create("-sino", astra.create_proj_geom("parallel", 1.0, columns, scan.beam.angles), scan.y[:, 0])
+
+    def run(name: str, each: int) -> Iterator[np.ndarray]:
+        target = astra.data2d.create("-vol", volume, 0.0)
+        settings = astra.astra_dict(name)
+        settings |= {"ProjectorId": projector, "ProjectionDataId": sinogram, "ReconstructionDataId": target}
+        if name in ("SIRT", "SART"):
+            settings["option"] = {"MinConstraint": 0.0}
+        algorithm = astra.algorithm.create(settings)
+        while True:
+            astra.algorithm.run(algorithm, each)
+            yield astra.data2d.get(target)[::-1]
+
+    wanted = {"FBP": (1, 1), "CGLS": (1, STEPS["cgls"]), "SIRT": (1, STEPS["sirt"]), "SART": (views, STEPS["sart"])}
+    return {f"astra {name}": timed(scan, run(name, each), steps) for name, (each, steps) in wanted.items()}
+
+
+PEERS: dict[str, tuple[str, Callable[[Slice], dict[str, Curve]]]] = {
+    "astra-toolbox": ("astra", astra_toolbox),
+    "scikit-image": ("skimage", scikit_image),
+}
+"""Package, its module, and what runs it."""
+
+
+def compare(n: int = 129) -> dict[str, dict[str, Curve]]:
+    """Curves by kind of data and method; who is missing is said."""
+    found: dict[str, dict[str, Curve]] = {}
+    for kind, (views, photons) in KINDS.items():
+        scan = make_slice(n, views, photons)
+        found[kind] = ours(scan)
+        for package, (module, run) in PEERS.items():
+            if importlib.util.find_spec(module) is None:
+                say(f"{package} is not installed: left out")
+                continue
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # of others' code
+                found[kind] |= run(scan)
+    return found
+
+
+def rows(found: dict[str, dict[str, Curve]]) -> list[str]:
+    """A table in Markdown: the least error of each method and kind, after so many steps and seconds."""
+    kinds = list(found)
+    lines = ["| method | " + " | ".join(kinds) + " |", "|---" * (len(kinds) + 1) + "|"]
+    for method in found[kinds[0]]:
+        cells = []
+        for kind in kinds:
+            curve = found[kind][method]
+            best = int(np.argmin(curve.errors))
+            cells.append(f"{curve.errors[best]:.4f} ({best + 1}, {curve.seconds[best]:.2f} s)")
+        lines.append(f"| {method} | " + " | ".join(cells) + " |")
+    return lines
