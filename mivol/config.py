@@ -488,6 +488,8 @@ def load(path: str | Path, changes: Sequence[str] = ()) -> Experiment | Scan | P
         raw = tomllib.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise MivolError(f"found no file {path}: give the path of an experiment in TOML.") from None
+    except RecursionError:
+        raise MivolError(f"{path} nests its values deeper than an experiment does: close its brackets.") from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, IsADirectoryError) as error:
         raise MivolError(f"{path} is not TOML: {error}.") from None
     for change in changes:

@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 
-from mivol.errors import MivolError
 from mivol.files.formats import read_volume
 from mivol.files.slices import order_of_numbers
 from mivol.files.source import existing_file, refusal
@@ -70,16 +69,15 @@ def read_images(files: list[Path]) -> np.ndarray:
     Raises:
         MivolError: as :func:`read_stack`.
     """
-    from PIL import Image, ImageSequence, UnidentifiedImageError
+    from PIL import Image, ImageSequence
 
     pages = []
     for file in files:
+        there = existing_file(file)
         try:
-            with Image.open(existing_file(file)) as image:
+            with Image.open(there) as image:
                 pages += [np.asarray(page, np.float32) for page in ImageSequence.Iterator(image)]
-        except (UnidentifiedImageError, OSError, ValueError, SyntaxError) as error:
-            if isinstance(error, MivolError):
-                raise
+        except Exception as error:  # Pillow raises what its parser stumbles over: a TypeError where there is no width
             raise refusal(file, f"a damaged or foreign file ({error})", "TIFF", "copy it again") from error
     shapes = {page.shape for page in pages}
     if len(shapes) > 1 or len(next(iter(shapes))) != 2:

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from mivol.files.source import refusal
-from mivol.photos.lens import Lens, distort, undistort
+from mivol.photos.lens import LARGEST_TERM, Lens, distort, undistort
 
 __all__ = ["Camera", "directions", "intrinsics", "pixel_centres", "project", "rays"]
 
@@ -48,8 +48,9 @@ class Camera:
     def __post_init__(self) -> None:
         object.__setattr__(self, "K", _checked_intrinsics(self.K, self.size, self.name))
         object.__setattr__(self, "to_world", _checked_pose(self.to_world, self.K, self.size, self.name))
-        if not np.isfinite(dataclasses.astuple(self.distortion)).all():
-            raise refusal(self.name, f"the distortion {self.distortion}", "finite numbers", "correct its coefficients")
+        if not (np.abs(dataclasses.astuple(self.distortion)) <= LARGEST_TERM).all():  # NaN fails every comparison
+            expected = f"finite numbers of at most {LARGEST_TERM:g}"
+            raise refusal(self.name, f"the distortion {self.distortion}", expected, "correct its coefficients")
 
     @property
     def origin(self) -> np.ndarray:

@@ -26,6 +26,13 @@ CONVERGED = 1e-12
 """Residual [1] on the plane at distance 1: 1e-8 pixel at a focal length of 10 000 pixels, and 4 000 times the rounding."""
 
 
+LEAST_TERM = 1e-30
+"""A last coefficient below it moves no ray of any image; dividing by it could overflow."""
+
+LARGEST_TERM = 1e6
+"""Lenses have coefficients of the order of 1; beyond this the fold cannot be found."""
+
+
 @dataclass(frozen=True)
 class Lens:
     """Coefficients of the distortion; all 0: a pinhole."""
@@ -45,7 +52,7 @@ class Lens:
     def fold(self) -> float:
         """Radius r at which the radial part r g(r^2) stops growing: beyond it the image folds back; inf: nowhere."""
         slope = np.polynomial.Polynomial([1, 3 * self.k1, 5 * self.k2, 7 * self.k3, 9 * self.k4])
-        roots = slope.trim().roots()
+        roots = slope.trim(LEAST_TERM).roots()
         real = roots.real[np.abs(roots.imag) < 1e-9 * np.maximum(np.abs(roots), 1e-300)]
         return float(np.sqrt(real[real > 0].min())) if (real > 0).any() else np.inf
 

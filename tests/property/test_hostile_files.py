@@ -1,0 +1,104 @@
+"""Broken files of every format are taken or refused in one sentence: a sample of what scripts/fuzz_files.py reads."""
+
+from __future__ import annotations
+
+import re
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from script_modules import load
+
+from mivol import config
+from mivol.errors import MivolError
+from mivol.files import read_stack
+from mivol.photos import Camera, Lens, intrinsics, load_photos
+
+SAMPLE = 15
+"""Files of each format; the script reads 20,000 in all, in processes of their own."""
+
+fuzz = load("fuzz_files")
+
+
+def raises(error: Exception) -> None:
+    raise error
+
+
+@pytest.mark.parametrize(
+    ("read", "kind"),
+    [
+        (lambda: 3, "taken"),
+        (lambda: raises(MivolError("found a, expected b; do c.")), "refused"),
+        (lambda: raises(MivolError("two\nlines")), "fault"),
+        (lambda: raises(MivolError("x" * 1001)), "fault"),
+        (lambda: raises(ValueError("found a")), "fault"),
+        (lambda: raises(RecursionError("deep")), "fault"),
+    ],
+)
+def test_what_counts_as_a_fault(read, kind: str) -> None:
+    assert fuzz.outcome(read)[0] == kind
+
+
+def test_files_are_broken_by_their_number() -> None:
+    """The same number gives the same file, another one another; most are not the sound file."""
+    sound = bytes(range(200)) * 3
+    made = [fuzz.mutate(sound, np.random.default_rng((1, number))) for number in (0, 0, *range(1, 40))]
+    assert made[0] == made[1]
+    assert len(set(made)) > 35
+    assert sum(one == sound for one in made) < 4
+
+
+def test_a_tiff_without_a_width_is_refused(tmp_path: Path) -> None:
+    """Found by the script: Pillow raised a TypeError. The tag of the width, 256, becomes another."""
+    path = tmp_path / "stack.tif"
+    Image.fromarray(np.eye(8, 9, dtype=np.float32)).save(path)
+    data, tag = path.read_bytes(), struct.pack("<H", 256)
+    (place,) = [m.start() for m in re.finditer(re.escape(tag) + rb"[\x03\x04]\x00\x01\x00\x00\x00\x09", data)]
+    path.write_bytes(data[:place] + struct.pack("<H", 60000) + data[place + 2 :])
+    with pytest.raises(MivolError, match="a damaged or foreign file"):
+        read_stack(path)
+
+
+def test_deep_cameras_are_refused(tmp_path: Path) -> None:
+    """Python's JSON follows brackets by recursion."""
+    (tmp_path / "transforms.json").write_text('{"frames": ' + "[" * 100_000)
+    with pytest.raises(MivolError, match="text that is not JSON"):
+        load_photos(tmp_path)
+
+
+@pytest.mark.parametrize(("coefficient", "sound"), [(1e-320, True), (1e5, True), (1e300, False), (np.nan, False)])
+def test_lenses_that_no_camera_has(coefficient: float, sound: bool) -> None:
+    """A last coefficient of nearly 0 bends nothing, and of a huge one no fold can be found: NumPy raised a LinAlgError."""
+    K = intrinsics(10.0, 10.0, 6.0, 4.0)
+    if sound:
+        assert Camera(K, (12, 8), np.eye(4), Lens(k1=0.1, k4=coefficient)).distortion.fold == np.inf
+        return
+    with pytest.raises(MivolError, match="at most 1e\\+06"):
+        Camera(K, (12, 8), np.eye(4), Lens(k1=0.1, k4=coefficient))
+
+
+def test_deep_experiments_are_refused(tmp_path: Path) -> None:
+    """tomllib follows brackets by recursion."""
+    (tmp_path / "deep.toml").write_text("a = " + "[" * 100_000)
+    with pytest.raises(MivolError, match="nests its values deeper"):
+        config.load(tmp_path / "deep.toml")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [*fuzz.FILES, *fuzz.SETS])
+def test_broken_files_end_in_a_sentence(variant_rgb: str, tmp_path: Path, name: str) -> None:
+    fuzz.write_sound(name, tmp_path)
+    found = [fuzz.outcome(fuzz.case(name, number, 2, tmp_path)[0]) for number in range(SAMPLE)]
+    assert [said for kind, said in found if kind == "fault"] == []
+    assert any(kind == "refused" for kind, _ in found)
+
+
+@pytest.mark.slow
+def test_the_script_names_what_it_found(variant_rgb: str, capsys: pytest.CaptureFixture) -> None:
+    """In a child process, as it reads 20,000: three files, each counted."""
+    assert fuzz.main(["--files", "3", "--only", "vol"]) == 0
+    said = capsys.readouterr().out.splitlines()
+    assert said[0].startswith("vol: 3 files, ")
+    assert said[-1] == "3 files, 0 faults"
