@@ -57,10 +57,11 @@ PUBLIC = {
     "write_points": "points",
     "write_volume": "files",
 }
-"""What ``mivol.<name>`` is, and the module below mivol that it comes from."""
+"""What ``mivol.<name>`` is, and the module below mivol that it comes from; type checkers see the list below."""
 
 if TYPE_CHECKING:  # what type checkers see of PUBLIC, which is imported when it is first used
     from .experiments.script import Problem as Problem
+    from .experiments.script import fit_gaussians as fit_gaussians
     from .experiments.script import fit_photographs as fit_photographs
     from .experiments.script import optimize as optimize
     from .fields.procedural import make_procedural as make_procedural
@@ -75,8 +76,11 @@ if TYPE_CHECKING:  # what type checkers see of PUBLIC, which is imported when it
     from .optim.rmsprop import RMSprop as RMSprop
     from .photos import load_photos as load_photos
     from .points import Gaussians as Gaussians
+    from .points import PointCloud as PointCloud
     from .points import read_gaussians as read_gaussians
+    from .points import read_points as read_points
     from .points import write_gaussians as write_gaussians
+    from .points import write_points as write_points
     from .scene.explain import explain as explain
     from .scene.load import load_scene as load_scene
     from .splatting import Splatter as Splatter
