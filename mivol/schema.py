@@ -7,6 +7,7 @@ structs, their tag says which.
 from __future__ import annotations
 
 import re
+import textwrap
 from typing import Any, NamedTuple, get_args, get_origin, get_type_hints
 
 import msgspec
@@ -15,6 +16,10 @@ from mivol.errors import MivolError
 from mivol.optim.strategy import nearest, of
 
 __all__ = ["Setting", "check_keys", "describe", "sentence", "settings_in", "structs_in"]
+
+
+LONGEST_KEY = 300
+"""Characters of a key that a refusal quotes."""
 
 
 def check_keys(raw: Any, kind: Any, where: str, name: str) -> None:
@@ -34,7 +39,7 @@ def check_keys(raw: Any, kind: Any, where: str, name: str) -> None:
     known = list(struct.__struct_fields__)
     unknown = next((key for key in raw if key not in known and key != tag), None)
     if unknown is not None:
-        dotted = f"{where}.{unknown}".lstrip(".")
+        dotted = textwrap.shorten(f"{where}.{unknown}".lstrip("."), LONGEST_KEY, placeholder="...")
         raise MivolError(f'{name}: unknown key "{dotted}": {nearest(unknown, [*known, *([tag] if tag else [])])}')
     hints = get_type_hints(struct)
     for key, value in raw.items():

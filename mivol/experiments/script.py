@@ -181,7 +181,7 @@ def fit_photographs(
 def fit_gaussians(
     photographs: str | os.PathLike,
     output: str | os.PathLike = "runs/gaussians",
-    settings: Mapping[str, Any] | None = None,
+    settings: Mapping[str, object] | None = None,
     watcher: Watcher | None = None,
 ) -> Gaussians:
     """Fit 3D Gaussians to posed photographs; ``gaussians.ply`` and its page lie in the run folder.

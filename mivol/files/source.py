@@ -54,7 +54,11 @@ def existing_file(path: str | os.PathLike) -> Path:
         MivolError: nothing is there (the nearest name in the folder is offered), a folder is there, or an empty file.
     """
     path = Path(path)
-    if path.is_dir():
+    try:
+        is_folder = path.is_dir()
+    except OSError as error:  # a name that no file can have: headers name other files
+        raise refusal(path.name[:LONGEST_QUOTE], f"a name that is none ({error.strerror})", "a file's", "correct it") from None
+    if is_folder:
         raise refusal(path, "a folder", "a file", "name a file in it (a stack of raw slices is read by read_slices)")
     if not path.is_file():
         raise refusal(path, "nothing there", "an existing file", _nearest(path))

@@ -13,7 +13,7 @@ from script_modules import load
 
 from mivol import config
 from mivol.errors import MivolError
-from mivol.files import read_stack
+from mivol.files import read_stack, read_volume
 from mivol.photos import Camera, Lens, intrinsics, load_photos
 
 SAMPLE = 15
@@ -51,14 +51,27 @@ def test_files_are_broken_by_their_number() -> None:
 
 
 def test_a_tiff_without_a_width_is_refused(tmp_path: Path) -> None:
-    """Found by the script: Pillow raised a TypeError. The tag of the width, 256, becomes another."""
+    """Found by the script: Pillow raised a TypeError at a second page. The tag of the width, 256, becomes another."""
     path = tmp_path / "stack.tif"
-    Image.fromarray(np.eye(8, 9, dtype=np.float32)).save(path)
+    page = Image.fromarray(np.eye(8, 9, dtype=np.float32))
+    page.save(path, save_all=True, append_images=[page])
     data, tag = path.read_bytes(), struct.pack("<H", 256)
-    (place,) = [m.start() for m in re.finditer(re.escape(tag) + rb"[\x03\x04]\x00\x01\x00\x00\x00\x09", data)]
+    _, place = [m.start() for m in re.finditer(re.escape(tag) + rb"[\x03\x04]\x00\x01\x00\x00\x00\x09", data)]
     path.write_bytes(data[:place] + struct.pack("<H", 60000) + data[place + 2 :])
     with pytest.raises(MivolError, match="a damaged or foreign file"):
         read_stack(path)
+
+
+def test_names_and_keys_without_an_end_are_refused(tmp_path: Path) -> None:
+    """A header may name a file as no file can be called, and a key may be as long as its file."""
+    (tmp_path / "a.mhd").write_text(
+        f"ObjectType = Image\nNDims = 3\nDimSize = 1 1 1\nElementType = MET_FLOAT\nElementDataFile = {'A' * 70000}\n"
+    )
+    (tmp_path / "long.toml").write_text("A" * 70000 + " = 1\n")
+    for read, name in ((read_volume, "a.mhd"), (config.load, "long.toml")):
+        with pytest.raises(MivolError) as refused:
+            read(tmp_path / name)
+        assert len(str(refused.value)) <= fuzz.LONGEST
 
 
 def test_deep_cameras_are_refused(tmp_path: Path) -> None:
