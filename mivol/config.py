@@ -8,6 +8,7 @@ to the TOML file. :func:`resolved` is what ``run.json`` keeps.
 from __future__ import annotations
 
 import math
+import textwrap
 import tomllib
 from collections.abc import Sequence
 from pathlib import Path
@@ -33,6 +34,9 @@ from mivol.tomography.ramp import WINDOWS
 from mivol.validate.images import METRICS
 
 INFINITY = math.inf
+
+LONGEST_SENTENCE = 600
+"""Characters of a refusal, which quotes what it found: that may be as long as its file."""
 
 
 class Section(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -509,7 +513,8 @@ def from_dict(raw: dict[str, Any], name: str = "experiment") -> Experiment | Sca
     try:
         return msgspec.convert(raw, kind)
     except msgspec.ValidationError as error:
-        raise MivolError(f"{name}: {sentence(raw, str(error))}") from None
+        said = textwrap.shorten(sentence(raw, str(error)), LONGEST_SENTENCE, placeholder=" ...")
+        raise MivolError(f"{name}: {said}") from None
 
 
 def of_photographs(path: Path, preset: str, changes: Sequence[str] = ()) -> FieldFit:

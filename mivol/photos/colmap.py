@@ -224,8 +224,10 @@ def _lines(path: Path) -> Iterator[str]:
 def _cameras_txt(path: Path) -> dict[int, Sensor]:
     sensors = {}
     for line in filter(None, _lines(path)):
-        number, model, *rest = [*line.split(maxsplit=2), ""][:3]
+        number, model, *rest = [*line.split(maxsplit=2), "", ""][:3]
         values = reals(rest[0], 2 + len(_parameters(path, model)), path, f"camera {number}")
+        if not np.isfinite(values[:2]).all():
+            raise refusal(path, f"an image of {values[0]:g} x {values[1]:g} pixels", "finite numbers", "export the model again")
         sensors[_whole(number, path)] = _sensor(path, model, (int(values[0]), int(values[1])), tuple(values[2:]))
     return sensors
 
@@ -250,7 +252,7 @@ def _points_txt(path: Path) -> np.ndarray:
 
 
 def _whole(word: str, path: Path) -> int:
-    if not word.isdigit():
+    if not word.isdecimal() or len(word) > 18:  # Python refuses to read numbers of thousands of digits
         raise refusal(path, f"the number '{word}'", "a whole number", "export the model again")
     return int(word)
 

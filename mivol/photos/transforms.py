@@ -12,6 +12,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -121,8 +122,18 @@ def _place(file: Path, name: str) -> str:
     return os.path.normpath(file.parent.absolute() / slashed(file.parent, name))
 
 
+LONGEST_NAME = 255
+"""Bytes of a name in a folder: the bound of all common file systems."""
+
+
 def slashed(folder: Path, name: str) -> str:
-    """The name of a file with forward slashes: data sets made on Windows name ``images\\a.png``, which other systems miss."""
+    """The name of a file with forward slashes: data sets made on Windows name ``images\\a.png``, which other systems miss.
+
+    Raises:
+        MivolError: a name longer than file systems have.
+    """
+    if any(len(part.encode(errors="replace")) > LONGEST_NAME for part in re.split(r"[\\/]", name)):
+        raise refusal(folder, f"a photograph with a name of {len(name)} characters", f"at most {LONGEST_NAME}", "correct it")
     return name if "\\" not in name or (folder / name).is_file() else name.replace("\\", "/")
 
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import re
 import struct
 from pathlib import Path
 
 import numpy as np
 import pytest
+from photo_sets import write_colmap
 from PIL import Image
 from script_modules import load
 
@@ -18,6 +20,8 @@ from mivol.photos import Camera, Lens, intrinsics, load_photos
 
 SAMPLE = 15
 """Files of each format; the script reads 20,000 in all, in processes of their own."""
+
+SHEPP_LOGAN = Path(__file__).resolve().parents[2] / "scenes" / "shepp_logan" / "fit.toml"
 
 fuzz = load("fuzz_files")
 
@@ -68,7 +72,8 @@ def test_names_and_keys_without_an_end_are_refused(tmp_path: Path) -> None:
         f"ObjectType = Image\nNDims = 3\nDimSize = 1 1 1\nElementType = MET_FLOAT\nElementDataFile = {'A' * 70000}\n"
     )
     (tmp_path / "long.toml").write_text("A" * 70000 + " = 1\n")
-    for read, name in ((read_volume, "a.mhd"), (config.load, "long.toml")):
+    (tmp_path / "value.toml").write_text(SHEPP_LOGAN.read_text().replace('"pcg"', f'"{"A" * 70000}"'))
+    for read, name in ((read_volume, "a.mhd"), (config.load, "long.toml"), (config.load, "value.toml")):
         with pytest.raises(MivolError) as refused:
             read(tmp_path / name)
         assert len(str(refused.value)) <= fuzz.LONGEST
@@ -81,6 +86,13 @@ def test_deep_cameras_are_refused(tmp_path: Path) -> None:
         load_photos(tmp_path)
 
 
+def test_photographs_with_names_without_an_end_are_refused(tmp_path: Path) -> None:
+    frame = {"file_path": "A" * 3000 + ".png", "transform_matrix": np.eye(4).tolist()}
+    (tmp_path / "transforms.json").write_text(json.dumps({"fl_x": 10.0, "w": 12, "h": 8, "frames": [frame]}))
+    with pytest.raises(MivolError, match="a name of 3004 characters"):
+        load_photos(tmp_path)
+
+
 @pytest.mark.parametrize(("coefficient", "sound"), [(1e-320, True), (1e5, True), (1e300, False), (np.nan, False)])
 def test_lenses_that_no_camera_has(coefficient: float, sound: bool) -> None:
     """A last coefficient of nearly 0 bends nothing, and of a huge one no fold can be found: NumPy raised a LinAlgError."""
@@ -90,6 +102,17 @@ def test_lenses_that_no_camera_has(coefficient: float, sound: bool) -> None:
         return
     with pytest.raises(MivolError, match="at most 1e\\+06"):
         Camera(K, (12, 8), np.eye(4), Lens(k1=0.1, k4=coefficient))
+
+
+@pytest.mark.parametrize(
+    "line", ["1", "1 PINHOLE inf 48 9 9 6 4", "1 PINHOLE 64 nan 9 9 6 4", "9" * 5000 + " PINHOLE 64 48 9 9 6 4"]
+)
+def test_cameras_of_colmap_that_are_refused(tmp_path: Path, line: str) -> None:
+    """Short lines, sizes that are none, numbers that Python does not read."""
+    write_colmap(tmp_path, encoding="txt")
+    (tmp_path / "sparse/0/cameras.txt").write_text(line + "\n")
+    with pytest.raises(MivolError):
+        load_photos(tmp_path)
 
 
 def test_deep_experiments_are_refused(tmp_path: Path) -> None:
