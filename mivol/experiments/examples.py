@@ -52,11 +52,19 @@ class Example:
         says: what it shows.
         stand_in: of the public data that it shows; None where it makes its own.
         photographs: script of its folder that makes the photographs that are fitted; "" for none.
+        folder: where its files lie; "" for a folder of its own name.
+        file: its experiment.
     """
 
     says: str
     stand_in: StandIn | None = None
     photographs: str = ""
+    folder: str = ""
+    file: str = "fit.toml"
+
+    def source(self, name: str) -> Path:
+        """The folder of its files, given its own name."""
+        return examples_folder() / (self.folder or name)
 
 
 def _smoke(setting: str) -> StandIn:
@@ -67,6 +75,9 @@ EXAMPLES: dict[str, Example] = {
     "demo": Example("a tangle of absorbing matter from 16 pictures, about a minute"),
     "shepp_logan": Example("the head phantom of Shepp and Logan from cone-beam projections"),
     "still_life": Example("glossy and matt things from photographs, as a radiance field", photographs="photographs.py"),
+    "gaussians": Example(
+        "the same things as 3D Gaussians", photographs="photographs.py", folder="still_life", file="gaussians.toml"
+    ),
     "smoke": Example("an absorbing smoke from 16 pictures", _smoke("truth.file")),
     "white_smoke": Example("a smoke that scatters, under a white sky", _smoke("truth.file")),
     "lamp": Example("where is the lamp, seen through a smoke that is known?", _smoke("scene.define.volume")),
@@ -105,21 +116,21 @@ def copy_example(name: str, into: Path) -> Path:
         into: folder that is made; the files lie in it.
 
     Returns:
-        Its ``fit.toml``.
+        Its experiment.
 
     Raises:
         MivolError: no such example, or something lies there already.
     """
-    example_named(name)
+    example = example_named(name)
     if into.exists() and (not into.is_dir() or any(into.iterdir())):
         raise MivolError(f'"{into}" is there already: name a folder that is not there yet, or is empty.')
-    source = examples_folder() / name
+    source = example.source(name)
     for path in sorted(source.rglob("*")):
         if path.is_file() and "__pycache__" not in path.parts:
             target = into / path.relative_to(source)
             target.parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(path, target)
-    return into / "fit.toml"
+    return into / example.file
 
 
 def run_example(
@@ -138,9 +149,9 @@ def run_example(
         MivolError: no such example, and whatever its fit refuses.
     """
     example, watcher = example_named(name), watcher or Nobody()
-    source = examples_folder() / name
+    source = example.source(name)
     given = (*prepare(name, example, source, folder, watcher), *changes)
-    chosen = config.load(source / "fit.toml", given)
+    chosen = config.load(source / example.file, given)
     return run_experiment(Task(chosen, source, folder, watcher=watcher, command=command))
 
 

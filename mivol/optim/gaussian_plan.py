@@ -174,8 +174,8 @@ PUBLISHED = {
     "reset_every": 3000,
 }
 """Rates and density control of Kerbl et al. 2023, for 30,000 steps; the others have rates for a tenth of that. Measured on
-held-out training views of the chair at 200 x 200 pixels: after 500 steps 30.3 dB, with the published rates 28.4; after 1250 steps
-33.7 dB, with half the rates 31.3."""
+held-out training views of the chair at 200 x 200 pixels: after 500 steps 30.3 dB, with the published rates 28.4; after 1250
+steps 33.7 dB, with half the rates 31.3."""
 
 PRESETS: dict[str, GaussianPlan] = {
     "tiny": GaussianPlan((SplatStage(64, 150, 0), SplatStage(128, 350, 1)), start=1500, most=4000, every=50),

@@ -17,12 +17,12 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mivol.device_arrays import aligned, kept_aligned
 from mivol.errors import MivolError
 from mivol.machine import available_memory
 from mivol.photos.camera import Camera
 from mivol.points import Gaussians
 from mivol.splatting.compositing import CHUNK, LANES, PIXELS, Adjoint, Frame, Lists, composite, composite_adjoint
-from mivol.splatting.device_arrays import aligned, kept_aligned
 from mivol.splatting.projection import EXP2, Cloud, Filter, Splats, project
 from mivol.splatting.tile_lists import TILE, Grid, TileLists, check_memory, count_tiles, list_tiles, write_tiles
 from mivol.splatting.view import View, numbers_of

@@ -8,9 +8,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mivol.device_arrays import aligned
 from mivol.errors import MivolError
 from mivol.photos.camera import FLIP, Camera
-from mivol.splatting.device_arrays import aligned
 
 __all__ = ["View", "numbers_of"]
 

@@ -20,6 +20,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mivol.device_arrays import aligned
 from mivol.errors import MivolError
 from mivol.threads import check_one_thread
 from mivol.tomography.geometry import Geometry, VoxelGrid
@@ -98,7 +99,7 @@ class Projector:
     def __matmul__(self, x: np.ndarray) -> np.ndarray:
         """Line integrals of ``x``: (Z, Y, X) gives (views, rows, cols), (voxels,) gives (rays,)."""
         x, flat = _as_array(x, self.grid.shape, "voxels")
-        y = np.array(self._project(mi.Float(_aligned(x))))
+        y = np.array(self._project(mi.Float(aligned(x))))
         return y if flat else y.reshape(self.projection_shape)
 
     @property
@@ -207,7 +208,7 @@ class Projector:
             o, d = self._rays(self.views[first : first + views_at_once])
             for start in range(0, len(o), budget):
                 part = slice(start, start + budget)
-                origin, direction = ([mi.Float(_aligned(c)) for c in a[part].T] for a in (o, d))
+                origin, direction = ([mi.Float(aligned(c)) for c in a[part].T] for a in (o, d))
                 yield first * per_view + start, mi.Point3f(*origin), mi.Vector3f(*direction)
 
     def _rays(self, views: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -281,7 +282,7 @@ class Transpose:
     def __matmul__(self, y: np.ndarray) -> np.ndarray:
         """Back-projection of ``y``: (views, rows, cols) gives (Z, Y, X), (rays,) gives (voxels,)."""
         y, flat = _as_array(y, self.T.projection_shape, "rays")
-        x = np.array(self.T._backproject(mi.Float(_aligned(y))))
+        x = np.array(self.T._backproject(mi.Float(aligned(y))))
         return x if flat else x.reshape(self.T.grid.shape)
 
 
@@ -300,18 +301,6 @@ class _Projection(dr.CustomOp):
 
     def name(self) -> str:
         return "projection"
-
-
-def _aligned(a: np.ndarray) -> np.ndarray:
-    """A copy at an address that is a multiple of 64.
-
-    Dr.Jit reads NumPy's memory in place, and compiles a kernel anew for each pattern of aligned and unaligned inputs.
-    """
-    buffer = np.empty(a.nbytes + 64, np.uint8)
-    start = -buffer.ctypes.data % 64
-    aligned = buffer[start : start + a.nbytes].view(a.dtype)
-    aligned[:] = a
-    return aligned
 
 
 def _as_array(a: np.ndarray, shape: tuple[int, ...], what: str) -> tuple[np.ndarray, bool]:

@@ -36,6 +36,7 @@ SCENES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.statistical
 @pytest.mark.parametrize("name", cases(SCENES, ["thick", "grid", "ball in a grid"]))
 def test_alpha_is_what_volpath_draws(name):

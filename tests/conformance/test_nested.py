@@ -66,6 +66,7 @@ def test_moment_of_light_through_media_alone_is_exact():
     np.testing.assert_allclose(nested[7:], nested[3:7] ** 2, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_aov_shows_the_same_and_has_the_same_derivatives():
     scene = surfaces_in_smoke()
     params, inner = mi.traverse(scene), mivol()

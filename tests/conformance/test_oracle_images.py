@@ -361,6 +361,7 @@ def test_surface_in_the_medium_lit_by_a_point_light(kind):
     assert np.array_equal(see(parts, o, d, mivol(max_depth=1)).image, np.zeros((8, 3)))
 
 
+@pytest.mark.slow
 @pytest.mark.statistical
 @pytest.mark.parametrize(("kind", "depth"), cases([("own", 2), ("stock", 3), ("stock", -1)], [("own", 2), ("stock", -1)]))
 def test_corner_in_the_medium_lit_by_the_sky(kind, depth):

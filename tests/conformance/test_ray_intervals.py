@@ -69,6 +69,7 @@ def test_media_that_fill_no_shape_of_their_own(where):
         small.assert_same_whole(moments(silent, mivol(), 32), moments(scene, mivol(), 32, first=500), precision=0.02)
 
 
+@pytest.mark.slow
 @pytest.mark.statistical
 def test_fog_in_a_room_that_is_open_on_one_side():
     """Rectangles bound it, one of them a null one; each wall has a BSDF of its own, so that Mitsuba merges none into a mesh."""
@@ -84,6 +85,7 @@ def test_fog_in_a_room_that_is_open_on_one_side():
     assert_same_images(scene, rounding=5 * LEAK, precision=0.02)  # of the emitter's radiance, the brightest there is
 
 
+@pytest.mark.slow
 @pytest.mark.statistical
 @pytest.mark.parametrize("kind", small.cases(["homogeneous", "grid"], ["grid"]))
 def test_media_in_instances(kind):

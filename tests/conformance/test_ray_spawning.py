@@ -53,6 +53,7 @@ def test_what_a_mask_transmits_ends_at_the_same_plane():
         assert np.unique(image).tolist() == [0.0, top]
 
 
+@pytest.mark.slow
 @pytest.mark.statistical
 def test_the_same_picture_as_volpath():
     """Fog around the camera that scatters, a ball in front of the far plane and one behind it; light comes from beyond.

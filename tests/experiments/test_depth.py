@@ -21,6 +21,7 @@ def whiten(folder: Path, albedo: float) -> None:
     scene.write_text(scene.read_text().replace('name="albedo" value="0"', f'name="albedo" value="{albedo}"'))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("albedo", "noise", "depth"), [(0.0, 0.02, 2), (0.99, 1e-6, -1)])
 def test_the_depth_is_measured_in_the_truth(variant_rgb, folder: Path, albedo: float, noise: float, depth: int) -> None:
     """What only absorbs needs no more than 2, whatever noise is asked for; the start is empty, the truth is not."""

@@ -30,7 +30,8 @@ def test_examples_are_listed_and_are_there(capsys: pytest.CaptureFixture) -> Non
     """Each experiment of the scenes is an example."""
     assert run("demo") == 0
     assert [line.split()[0] for line in capsys.readouterr().out.splitlines()] == list(EXAMPLES)
-    assert {path.parent.name for path in examples_folder().glob("*/fit.toml")} == set(EXAMPLES)
+    assert {path.parent.name for path in examples_folder().glob("*/fit.toml")} <= set(EXAMPLES)
+    assert all((example.source(name) / example.file).is_file() for name, example in EXAMPLES.items())
     assert 'did you mean "smoke"' in refused(capsys, "demo", "smok")
 
 
@@ -41,6 +42,13 @@ def test_an_example_is_copied_once(tmp_path: Path, capsys: pytest.CaptureFixture
         path.name for path in (examples_folder() / "demo").iterdir()
     }
     assert "is there already" in refused(capsys, "demo", "demo", "--into", tmp_path / "mine")
+
+
+def test_two_examples_may_share_a_folder(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    """The Gaussians are of the still life's photographs."""
+    assert run("demo", "gaussians", "--into", tmp_path / "mine") == 0
+    assert capsys.readouterr().out.strip() == str(tmp_path / "mine" / "gaussians.toml")
+    assert (tmp_path / "mine" / "photographs.py").is_file()
 
 
 def test_compiled_files_stay_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

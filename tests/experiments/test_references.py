@@ -12,6 +12,7 @@ from tiny_experiment import SCENE, refused, run
 from mivol.files import write_exr
 
 
+@pytest.mark.slow
 def test_references_are_cached(variant_rgb, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A second fit of the same views renders none again, another truth does; and each row of the metrics is there once."""
     target = folder / "run"

@@ -118,6 +118,7 @@ def test_an_interrupted_scan_is_resumed(variant_rgb, folder: Path, monkeypatch: 
     assert files[0] == files[1]
 
 
+@pytest.mark.slow
 def test_more_iterations_resume_a_run_that_is_done(variant_rgb, folder: Path, capsys: pytest.CaptureFixture) -> None:
     """Four iterations, then two more: every number as if there had been six; fewer than there are is another run. What is on
     record is the command as it was typed, and the last line on the console is what was saved."""

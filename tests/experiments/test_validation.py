@@ -43,6 +43,7 @@ def test_mivol_agrees_with_volpath(variant_rgb, scene: Path, capsys: pytest.Capt
     assert slope["ours"] < 0
 
 
+@pytest.mark.slow
 def test_a_wrong_renderer_is_found(variant_rgb, scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Ours is given half the extinction for a while, and its gradient half the slope."""
     loaded = load_scene(scene)

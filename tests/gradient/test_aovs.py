@@ -140,6 +140,7 @@ def test_forward_against_reverse(name):
     assert np.all(np.abs(jv).max(axis=(0, 1)) > 1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", cases(CASES, (*SLOW, "rgb", "stock", "constant", "wall")))
 def test_forward_against_finite_differences(name):
     # Central differences with common random numbers, extrapolated once (Richardson): what is left is of order h^4, and the

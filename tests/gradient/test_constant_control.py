@@ -29,6 +29,7 @@ WHITE = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "place"),
     small.cases([("stock", "a box"), *(("own", place) for place in WHITE)], [("own", "a box"), ("own", "two boxes")]),

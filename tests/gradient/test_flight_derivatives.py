@@ -207,6 +207,7 @@ def _in_the_sun() -> mi.Scene:
     return close_up({"smoke": box_of(interior, PLACE), "sun": sun([0.3, 0.2, -1.0])[0]}, res=8)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["density", "albedo", "g", "emitter"])
 def test_of_side_flights_forward_is_the_transpose_of_reverse(name):
     """As above, to the same bound."""
@@ -221,6 +222,7 @@ def test_of_side_flights_forward_is_the_transpose_of_reverse(name):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.statistical
 @pytest.mark.parametrize("name", ["density", "albedo", "g"])
 def test_side_flights_keep_the_mean_of_derivatives(name, monkeypatch):

@@ -28,6 +28,7 @@ from scenes import as_float32, box_of, grid_volume, medium
 pytestmark = pytest.mark.usefixtures("variant_rgb")
 
 
+@pytest.mark.slow
 @pytest.mark.statistical
 def test_position_of_a_point_light():
     """Smooth where the light is outside: distance, direction and shadow all move."""

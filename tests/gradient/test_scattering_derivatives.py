@@ -110,6 +110,7 @@ def test_density_under_other_emitters(density, name):
     assert_gradient(gradients(seen, GRID, w, 512), truth[..., None], name)
 
 
+@pytest.mark.slow
 @pytest.mark.statistical
 @pytest.mark.parametrize(
     ("density", "albedo"),

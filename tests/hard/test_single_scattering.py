@@ -48,6 +48,7 @@ def set_grid(scene: mi.Scene, values: np.ndarray, key: str = GRID) -> None:
 # -- Density and albedo at the ends of their domains ---------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.statistical
 @pytest.mark.parametrize("kind", small.cases(small.KINDS, ["stock"]))
 @pytest.mark.parametrize("lit", ["point", "sky"])

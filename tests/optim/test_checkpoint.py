@@ -45,6 +45,7 @@ def fit(optimiser, path: Path | None = None, *, stop_after: int = -1, how: int =
     return reconstruct(small_problem(), optimiser, course, measure=measure, observer=observe, store=store)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", cases(CASES, ["rmsprop", "lbfgs"]))
 def test_a_resumed_run_is_bitwise_the_same(one_thread, ctrl_c, tmp_path: Path, name: str) -> None:
     """Rationale: a state that forgets anything (a moment, a pair, a damping, an event) shows in the next step.

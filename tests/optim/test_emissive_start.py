@@ -65,6 +65,7 @@ def test_views_become_codes_of_one_white(variant_rgb):
     assert np.array_equal(second.image[..., 0], second.image[..., 2])
 
 
+@pytest.mark.slow
 def test_the_factor_has_the_least_loss(variant_rgb, monkeypatch):
     """The density of the emissive fit, of which only the shape counts, is brought to the scale that the views ask for."""
     truth = np.full((2, 2, 2, 1), 0.05)

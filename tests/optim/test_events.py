@@ -7,7 +7,17 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mivol.optim.events import EVENTS, Checkpoint, CoarseToFine, Evaluate, UpdateOccupancy, Upsample, in_order, upsample
+from mivol.optim.events import (
+    EVENTS,
+    Checkpoint,
+    CoarseToFine,
+    ControlDensity,
+    Evaluate,
+    UpdateOccupancy,
+    Upsample,
+    in_order,
+    upsample,
+)
 
 EPS = float(np.finfo(np.float32).eps)
 
@@ -63,5 +73,6 @@ def test_events_are_due_when_they_say(variant_rgb) -> None:
     assert [i for i in range(9) if Evaluate(every=4).due(i)] == [0, 4, 8]
     assert [i for i in range(9) if CoarseToFine(at=(3, 5)).due(i)] == [3, 5]
     assert [i for i in range(9) if UpdateOccupancy(every=4).due(i)] == [4, 8]
-    assert set(EVENTS) == {"upsample", "coarse_to_fine", "update_occupancy", "checkpoint", "evaluate"}
+    assert [i for i in range(9) if ControlDensity(every=2, begin=3, end=8).due(i)] == [4, 6]
+    assert set(EVENTS) == {"upsample", "coarse_to_fine", "update_occupancy", "control_density", "checkpoint", "evaluate"}
     assert isinstance(in_order((Upsample(at=(1,)), Evaluate(), Checkpoint()))[0], Checkpoint)

@@ -37,6 +37,7 @@ def test_a_fit_finds_what_it_did_not_see(variant_rgb: str, photos: list[Photo]) 
     assert np.isnan(seen.depth[0, 0]) and seen.opacity[0, 0] == 0
 
 
+@pytest.mark.slow
 def test_a_finer_stage_goes_on_where_the_last_one_stopped(variant_rgb: str, photos: list[Photo]) -> None:
     """Its first step knows how large derivatives were: begun anew, it would move all that it touches by a whole rate."""
     fit = fitted(RayBatches.of(photos, (1, 2)), replace(PLAN, tv_density=0.0), PLAN.stages[0].steps)
