@@ -41,9 +41,9 @@ class Guards:
         """What to run for a file of the package, round by round, the likeliest and cheapest to notice a fault first.
 
         First the files of tests that are called like it, the tests elsewhere that its mutations name, and those that guard
-        every module; then the rest of the
-        files that hold those tests, and those that import it, MOST_FILES at most; then those of all files in its folder, or all
-        there are where the folder has none. Rounds may be empty; what a later round runs again are single tests of a file.
+        every module; then the rest of the files that hold those tests, and those that import it, MOST_FILES at most; then those
+        of all files in its folder, or all there are where the folder has none; then the slow tests of the files that are called
+        like it or hold those tests. Rounds may be empty; what a later round runs again are single tests of a file.
         """
         named, tests = self.named.get(file, []), self.tests.get(file, [])
         first = [*named, *(t for t in tests if file_of(t) not in named)]
@@ -51,7 +51,9 @@ class Guards:
         first += [t for t in self.everywhere if t not in first]
         near = [f for f in sorted({*self.tests, *self.named}) if Path(f).parent == Path(file).parent]
         around = _once(t for f in near for t in (*map(file_of, self.tests.get(f, [])), *self.named.get(f, [])))
-        return [first, rest, [t for t in around or self.files if t not in (*named, *rest)]]
+        own = _once([*named, *map(file_of, tests)])
+        slow = ["-m", "slow", *own] if own else []
+        return [first, rest, [t for t in around or self.files if t not in (*named, *rest)], slow]
 
 
 def file_of(test: str) -> str:

@@ -8,7 +8,8 @@ failing, an import that breaks does not.
     scripts/mutate.py --sample 12 --seed 7   twelve, drawn by the seed
     scripts/mutate.py --only '*lattice*'     those whose file, test or list matches
     scripts/mutate.py --random 60 --seed 7   not these: 60 faults drawn from the whole package, and the share that the
-                                             tests of their modules notice (faults.py, guards.py, survivors.py)
+                                             tests of their modules notice (faults.py, guards.py, survivors.py); from a part
+                                             of it with --only 'mivol/scene/*'
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from faults import draw_faults, read_package
+from faults import Fault, draw_faults, read_package
 from guards import index_guards
 from survivors import Checkout, judge_all, report
 
@@ -160,34 +161,47 @@ def judge_entries(chosen: list[Mutation], limit: float) -> int:
     return missed
 
 
-def judge_random(count: int, seed: int, jobs: int, limit: float, rounds: int) -> None:
-    """Draw faults from the package and say which of them its tests notice: a measurement, whose reader judges survivors."""
+def draw(only: str, count: int, seed: int) -> list[Fault]:
+    """Faults drawn from the files of the package that match.
+
+    Raises:
+        ValueError: those files have fewer lines to break than faults are asked for.
+    """
+    return draw_faults({file: text for file, text in read_package(ROOT).items() if fnmatch.fnmatch(file, only)}, count, seed)
+
+
+def judge_random(args: argparse.Namespace) -> None:
+    """Draw faults from the package and say which of them its tests notice: a measurement, whose reader judges survivors.
+
+    Raises:
+        ValueError: as :func:`draw`.
+    """
     os.environ.setdefault("MIVOL_DATA", str(ROOT.parent / "shared" / "data"))
     # Each process of tests takes its share of the cores, as tests/conftest.py does for those of pytest-xdist.
-    os.environ["PYTEST_XDIST_WORKER_COUNT"] = str(jobs)
-    faults = draw_faults(read_package(ROOT), count, seed)
+    os.environ["PYTEST_XDIST_WORKER_COUNT"] = str(args.jobs)
+    faults = draw(args.only, args.random, args.seed)
     guards = index_guards(ROOT, [(e.file, e.test) for e in load_entries()])
-    with copies(jobs + 1) as (untouched, *broken):
-        first = Checkout(broken[0], untouched, limit, rounds)
+    with copies(args.jobs + 1) as (untouched, *broken):
+        first = Checkout(broken[0], untouched, args.limit, args.rounds)
         checkouts = [first, *(replace(first, broken=copy) for copy in broken[1:])]
-        report(judge_all(faults, guards, checkouts), count, lambda line: print(line, flush=True))
+        report(judge_all(faults, guards, checkouts), args.random, lambda line: print(line, flush=True))
 
 
 def main(argv: list[str] | None = None) -> int:
     """Judge the chosen entries, 0 where each was noticed; or draw faults, and count those that are noticed."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--only", default="*", metavar="GLOB", help="entries whose file, test or list matches")
+    parser.add_argument("--only", default="*", metavar="GLOB", help="entries whose file, test or list matches; files to break")
     parser.add_argument("--sample", type=int, metavar="N", help="a random choice of so many")
     parser.add_argument("--random", type=int, metavar="N", help="instead of entries, so many faults drawn from the package")
     parser.add_argument("--seed", type=int, default=0, metavar="S", help="of the random choice")
     parser.add_argument("--jobs", type=int, default=2, metavar="J", help="faults of --random that are judged at a time")
-    parser.add_argument("--rounds", type=int, default=3, choices=(1, 2, 3), help="of --random: 2 leave out the tests around")
+    parser.add_argument("--rounds", type=int, default=4, choices=(1, 2, 3, 4), help="of --random: 2 leave out tests around and slow")
     parser.add_argument("--limit", type=float, default=300, metavar="SECONDS", help="time that one test may take")
     args = parser.parse_args(argv)
     if args.random is not None:
         if args.random < 1 or args.jobs < 1:
             parser.error("--random and --jobs take a number of 1 or more")
-        judge_random(args.random, args.seed, args.jobs, args.limit, args.rounds)
+        judge_random(args)
         return 0
     chosen = choose(load_entries(), args.only, args.sample, args.seed)
     if not chosen:

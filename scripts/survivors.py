@@ -1,7 +1,7 @@
 """Break a line of the package at random, run the tests that guard its module, and tell whether one of them noticed.
 
 A fault is killed where a test that is green on the untouched checkout is red twice, or does not end, on the broken one. What
-survives its module's own tests is shown those of the modules in the same folder as well.
+survives its module's own tests is shown those of the modules in the same folder as well, and then its module's slow ones.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class Checkout:
     Attributes:
         broken, untouched: their folders.
         limit: seconds that one test may take before it counts as one that does not end.
-        rounds: how many rounds of :meth:`guards.Guards.rounds` are run: 2 leave out the tests around a module.
+        rounds: how many rounds of :meth:`guards.Guards.rounds` are run: 2 leave out the tests around a module and slow ones.
         green: what is known of tests of the untouched copy; shared by all who judge.
         lock: of ``green``.
     """
@@ -55,7 +55,7 @@ class Checkout:
     broken: Path
     untouched: Path
     limit: float
-    rounds: int = 3
+    rounds: int = 4
     green: dict[str, bool] = field(default_factory=dict)
     lock: Lock = field(default_factory=Lock)
 

@@ -193,11 +193,11 @@ def test_tests_of_a_module_are_found(tmp_path: Path) -> None:
     entries = [("pkg/a.py", "tests/two/test_other.py::t"), ("pkg/a.py", "tests/two/test_more.py::t")] * 2
     index = guards.index_guards(tmp_path, [*entries, entries[1]], package="pkg")
     one, more, other = "tests/one/test_a.py", "tests/two/test_more.py", "tests/two/test_other.py"
-    assert index.rounds("pkg/a.py") == [[one, f"{more}::t", f"{other}::t"], [more, other], []]
-    assert index.rounds("pkg/b.py") == [[], [one, more], [other]]
+    assert index.rounds("pkg/a.py") == [[one, f"{more}::t", f"{other}::t"], [more, other], [], ["-m", "slow", one, more, other]]
+    assert index.rounds("pkg/b.py") == [[], [one, more], [other], []]
     index.importing["pkg/b.py"] = [f"tests/test_{k}.py" for k in range(guards.MOST_FILES + 1)]
     assert index.rounds("pkg/b.py")[1] == index.importing["pkg/b.py"][:-1]
-    assert index.rounds("pkg/room/c.py") == [[], [], [one, more, other]]
+    assert index.rounds("pkg/room/c.py") == [[], [], [one, more, other], []]
     everywhere = [(f"pkg/room{k}/d.py", "tests/test_all.py::t") for k in range(guards.EVERYWHERE)]
     for found, first in ((everywhere, ["tests/test_all.py::t"]), (everywhere[1:], [])):
         assert guards.index_guards(tmp_path, [*entries, *found], package="pkg").rounds("pkg/b.py")[0] == first
@@ -255,6 +255,13 @@ def test_a_test_that_does_not_end_kills(checkout) -> None:
     fault = faults.Fault("halving.py", 2, HALVING.index("/"), "/", "*", "operator")
     index = guards.Guards(named={"halving.py": ["tests/test_halving.py"]})
     assert survivors.judge_fault(hasty, fault, index).test == "a test that does not end"
+
+
+def test_faults_are_drawn_from_a_part_of_the_package() -> None:
+    files = {fault.file for fault in mutate.draw("mivol/phase/*", 40, 3)}
+    assert files and all(file.startswith("mivol/phase/") for file in files)
+    with pytest.raises(ValueError, match=r"40 faults are asked for; [0-9]+ lines can be broken"):
+        mutate.draw("mivol/__init__.py", 40, 3)
 
 
 def test_survivors_are_counted_and_named():
