@@ -195,7 +195,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--random", type=int, metavar="N", help="instead of entries, so many faults drawn from the package")
     parser.add_argument("--seed", type=int, default=0, metavar="S", help="of the random choice")
     parser.add_argument("--jobs", type=int, default=2, metavar="J", help="faults of --random that are judged at a time")
-    parser.add_argument("--rounds", type=int, default=4, choices=(1, 2, 3, 4), help="of --random: 2 leave out tests around and slow")
+    parser.add_argument("--rounds", type=int, default=4, choices=(1, 2, 3, 4), help="of --random: 3 leave out slow tests")
     parser.add_argument("--limit", type=float, default=300, metavar="SECONDS", help="time that one test may take")
     args = parser.parse_args(argv)
     if args.random is not None:

@@ -47,7 +47,7 @@ class Checkout:
     Attributes:
         broken, untouched: their folders.
         limit: seconds that one test may take before it counts as one that does not end.
-        rounds: how many rounds of :meth:`guards.Guards.rounds` are run: 2 leave out the tests around a module and slow ones.
+        rounds: how many rounds of :meth:`guards.Guards.rounds` are run: 3 leave out the slow ones.
         green: what is known of tests of the untouched copy; shared by all who judge.
         lock: of ``green``.
     """
