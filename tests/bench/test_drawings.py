@@ -2,45 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
-from types import ModuleType, SimpleNamespace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from matplotlib import rc_context
-from matplotlib.figure import Figure
+from bench_figures import drawn
 from report.looks import assert_recorded
 
 from mivol.bench import depth, gradients, multiple_scattering, single_scattering, still_life, tomography
 from mivol.bench.depth import TABLED, Cell
 from mivol.bench.gradients.size import CONTESTS, OURS, STOCK
-from mivol.report.figures import STYLE
-
-
-@contextmanager
-def kept(module: ModuleType, found: list[Figure], monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """Keep the figures that a module draws, and write none."""
-
-    @contextmanager
-    def keep(path: Path, width: float, height: float) -> Iterator[Figure]:
-        with rc_context(STYLE):
-            found.append(Figure(figsize=(width, height)))
-            yield found[-1]
-
-    monkeypatch.setattr(module, "drawn", keep)
-    yield
-
-
-def drawn(module: ModuleType, monkeypatch: pytest.MonkeyPatch, *arguments: object) -> Figure:
-    """The one figure of a module's ``draw``."""
-    found: list[Figure] = []
-    with kept(module, found, monkeypatch):
-        module.draw(*arguments)
-    (figure,) = found
-    return figure
 
 
 def contest(names: dict, stocks: tuple[str, ...]) -> dict:

@@ -29,9 +29,7 @@ def write(path: Path, seconds: float, size: str = "quick") -> Path:
     return path
 
 
-def test_changes_are_said_largest_first(
-    tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_changes_are_said_largest_first(tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch) -> None:
     """A study that stands in for the others: it writes a result where it is told to, and hears its flags."""
 
     class Study:
