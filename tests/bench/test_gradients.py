@@ -13,9 +13,10 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from false_alarms import ALPHA, note
+from scipy import stats
 
 from mivol.bench import agreement
-from mivol.bench.gradients import BENCH, QUICK
+from mivol.bench.gradients import BENCH, QUICK, bias, tutorial, variance
 from mivol.bench.gradients.bias import Case, cases, difference, refine, table_row
 from mivol.bench.gradients.size import CONTESTS, OURS, STOCK, TABLES
 from mivol.bench.gradients.subject import compete, subjects
@@ -252,3 +253,227 @@ def test_voxels_are_read_at_their_centres(variant_rgb: str) -> None:
 def test_a_warm_up_takes_one_step_of_each_stage() -> None:
     small = warm_up(replace(QUICK, resolutions=(2, 4, 8), steps=(5, 6, 7), step_spp=(8, 9, 10)))
     assert (small.steps, small.step_spp, small.resolutions) == ((1, 1, 1), (1, 1, 1), (2, 4, 8))
+
+
+def test_each_contestant_has_its_own_seeds(variant_rgb: str) -> None:
+    """Another seed of a size moves them all by 100,000; the first call of a race has the number 0."""
+    calls = []
+    steps = {name: lambda seed, spp, name=name: calls.append((name, seed)) or mi.Float(1) for name in (OURS, STOCK)}
+    compete(steps, Budget(spp=4), 1, seed=3)
+    assert calls == [(OURS, 301_000), (STOCK, 302_000), (STOCK, 302_001), (OURS, 301_001)]
+
+
+def test_contests_of_the_smoke(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two functionals in each light, against the picture of 0.7 of the density; regions at and above 1, between, and at 0."""
+    values = np.array([0.0, 0.5, 1.0, 2.0]).reshape(1, 2, 2)
+    found = SimpleNamespace(values=values, __str__=lambda self: "smoke")
+    lights = {"sun": SimpleNamespace(bar=1), "sky": SimpleNamespace(bar=2)}
+    monkeypatch.setitem(variance.CONTESTS, "smoke", (lambda: found, lights))
+    monkeypatch.setattr(variance, "picture_of", lambda values, size, light: ("picture", values, light))
+    heard, said = [], []
+
+    def both(values: np.ndarray, side: int, light: object) -> dict:
+        of_loss = lambda target, seed, spp: ("loss", light, target, seed, spp)  # noqa: E731
+        return {who: SimpleNamespace(of_mean=(who, side, light), of_loss=of_loss) for who in (OURS, STOCK)}
+
+    def outcome_of(*asked: object) -> dict:
+        heard.append(asked)
+        return {"asked": len(heard)}
+
+    monkeypatch.setattr(variance, "subjects", both)
+    monkeypatch.setattr(variance, "compete", lambda steps, budget, rounds, seed: ((steps, budget, rounds, seed), "spp"))
+    monkeypatch.setattr(variance, "outcome", outcome_of)
+    monkeypatch.setattr(variance, "said", lambda figures: f"{figures['asked']}")
+    monkeypatch.setattr(variance, "say", said.append)
+    size = replace(TINY, seed=5)
+    answer = variance.ask_contest("smoke")(size)
+    assert answer.pop("grid") == str(found)
+    assert answer == {"sun": {"mean": {"asked": 1}, "L2": {"asked": 2}}, "sky": {"mean": {"asked": 3}, "L2": {"asked": 4}}}
+    assert said == ["  sun, mean: 1", "  sun, L2: 2", "  sky, mean: 3", "  sky, L2: 4"]
+    for (race, spp, regions, given, side, contests), name in zip(heard, ("sun", "sun", "sky", "sky"), strict=True):
+        assert (spp, side, contests, race[1:]) == ("spp", size.side, 4, (size.budget, size.rounds, 5)) and given is values
+        chosen = {region: mask.ravel().tolist() for region, mask in regions.items()}
+        assert chosen == {
+            "sigma_t >= 1": [False, False, True, True],
+            "0 < sigma_t < 1": [False, True, False, False],
+            "sigma_t = 0": [True, False, False, False],
+        }
+        assert set(race[0]) == {OURS, STOCK} and lights[name] is not None
+    assert heard[0][0][0][OURS] == (OURS, size.side, lights["sun"])
+    _, light, (_, fainter, at), *rest = heard[3][0][0][STOCK](8, 9)
+    assert (light, at, rest) == (lights["sky"], lights["sky"], [8, 9])
+    assert fainter.tolist() == (0.7 * values).tolist()
+
+
+def test_a_target_is_rendered_with_many_samples(monkeypatch: pytest.MonkeyPatch) -> None:
+    light = SimpleNamespace(scene=lambda values, side: (values, side), integrator=lambda name: name)
+    monkeypatch.setattr(variance.mi, "render", lambda scene, **given: (scene, given))
+    found = variance.picture_of("values", TINY, light)
+    assert found == (("values", TINY.side), {"integrator": OURS, "seed": 77, "spp": TINY.difference_spp})
+
+
+def test_what_is_said_of_a_contest() -> None:
+    dense = {"variance_x_time": 61.6, "z": -1.25, "percent": 0.5, "standard_error_percent": 0.25}
+    rates = {name: {"samples_per_second_median": rate} for name, rate in ((OURS, 2.5e6), (STOCK, 1e6))}
+    line = variance.said({"sigma_t >= 1": dense, "processor_time": 3.0, "time": 2.0} | rates)
+    assert line == f"62x, processor 1.50 (z -1.25, +0.50 % +- 0.25); M samples/s: {OURS} 2.5, {STOCK} 1"
+
+
+def test_a_row_of_the_table_of_bias(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Differences of 3 and 5 in turns, our derivatives of 4 and 2, those of the other of 2 and 4 with a swing of 3 in the empty
+    half; each seed says what it is for."""
+    values, direction = np.array([[[2.0, 0.0]]]), np.array([[[0.0, 1.0]]])
+    swing = np.array([-1.0, 1, -1, 1])
+    slow = Timing({}, [3.0] * 4, [3.0] * 4, list(np.stack([0 * swing, 4 + 3 * swing], 1)))
+    fast = Timing({}, [1.0] * 4, [1.0] * 4, list(np.stack([7 * swing, 4 + swing], 1)))
+    asked, refined = [], []
+    ours = SimpleNamespace(of_mean=lambda seed, spp: asked.append(("derivative", seed, spp)) or [1.0, 6.0])
+    other = SimpleNamespace(of_mean="theirs")
+    monkeypatch.setattr(bias, "subjects", lambda values, side, light: asked.append((values.dtype.name, side, light))
+                        or {OURS: ours, STOCK: other})  # fmt: skip
+    competed = ({OURS: fast, STOCK: slow}, {OURS: 8, STOCK: 2})
+    monkeypatch.setattr(bias, "compete", lambda steps, *rest: asked.append((steps, *rest)) or competed)
+    differ = lambda subject, case, seed, spp: asked.append((subject, seed, spp)) or 3.0 + 2 * (seed % 2)  # noqa: E731
+    monkeypatch.setattr(bias, "difference", differ)
+
+    def refine_by_one(found: list, estimate: object, percent: float, most: int) -> np.ndarray:
+        refined.append((list(found), percent, most))
+        return np.array([*found, estimate(len(found))])
+
+    monkeypatch.setattr(bias, "refine", refine_by_one)
+    size = replace(TINY, table_rounds=4, seed=2, certain_percent=0.5, most_estimates=40)
+    row = table_row(Case(values, direction, 0.1), "light", size, 6)
+    assert asked[:2] == [
+        ("float32", size.table_side, "light"),
+        ({OURS: ours.of_mean, STOCK: "theirs"}, size.table_budget, 4, 2),
+    ]
+    truths = [("derivative", 209_004, 8), *((ours, 205_000 + k, size.difference_spp) for k in range(5))]
+    assert asked[2:] == truths
+    assert refined == [([3.0, 5.0, 3.0, 5.0], 0.5, 40), ([3.0, 5.0, 3.0, 5.0], 0.5, 40)]
+    # four derivatives of 4 -+ 1 and one of 6; five differences of 3, 5, 3, 5, 3
+    assert (row["finite_difference"], row[OURS]["derivative"], row[STOCK]["derivative"]) == pytest.approx((3.8, 4.4, 4.0))
+    assert row["its_standard_error"] == pytest.approx(math.sqrt(1.2 / 5))
+    assert (row[OURS]["bias_percent"], row[STOCK]["bias_percent"]) == pytest.approx((100 * 0.6 / 3.8, 100 * 0.2 / 3.8))
+    assert (row[OURS]["variance"], row[STOCK]["variance"]) == pytest.approx((4 / 3, 12))
+    assert (row[OURS]["spp"], row[STOCK]["spp"], row[OURS]["seconds_median"], row[STOCK]["seconds_median"]) == (8, 2, 1, 3)
+    assert row["variance_x_time"] == pytest.approx(27)
+    still = Timing({}, [1.0] * 4, [1.0] * 4, [np.ones(2)] * 4)
+    monkeypatch.setattr(bias, "compete", lambda *_: ({OURS: still, STOCK: slow}, {OURS: 8, STOCK: 2}))
+    assert table_row(Case(values, direction, 0.1), "light", size)["variance_x_time"] is None
+
+
+def test_tables_of_bias_ask_every_case(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In each light, with the bound on z for all rows of the question."""
+    monkeypatch.setattr(bias, "table_row", lambda case, light, size, rows: (case.values.shape, light, size, rows))
+    monkeypatch.setattr(bias, "said_of_row", lambda row: "said")
+    size = replace(TINY, table_res=3)
+    names = ("density 0", "half empty", "thin", "dense")
+    wanted = {name: {case: ((3, 3, 3), light, size, 4 * len(LIGHTS)) for case in names} for name, light in LIGHTS.items()}
+    assert bias.ask_table("estimators")(size) == wanted
+
+
+def test_the_tutorials_questions(variant_rgb: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """References of the upright smoke over 40 by mivol, checked against volpath; both loops warmed up, then run; seeds by
+    camera."""
+    values = np.arange(24.0, dtype=np.float32).reshape(2, 3, 4)
+    found = SimpleNamespace(values=values, __str__=lambda self: "smoke")
+    heard, rendered, loops = [], [], []
+    monkeypatch.setattr(tutorial, "smoke", lambda: found)
+    monkeypatch.setattr(tutorial, "half_circle", lambda side: [f"camera {k}, {side}" for k in range(2)])
+    monkeypatch.setattr(tutorial, "of_depth", lambda name, depth: f"{name} {depth}")
+    monkeypatch.setattr(tutorial, "tutorial_scene", lambda tensor: np.array(tensor))
+    monkeypatch.setattr(tutorial.mi, "load_dict", lambda scene: scene)
+
+    def render(scene: np.ndarray, sensor: str, integrator: str, spp: int, seed: int) -> mi.Float:
+        rendered.append((sensor, integrator, spp, seed))
+        return mi.Float(seed)
+
+    monkeypatch.setattr(tutorial.mi, "render", render)
+    monkeypatch.setattr(tutorial, "check_references", lambda *asked: heard.append(asked) or "checked")
+
+    def run_loop(name: str, depth: int, judge: tutorial.Judge, size: object) -> list[Run]:
+        loops.append((name, depth, size))
+        heard.append(judge)
+        return [Run([1.0], [2.0], [0.5], [0.25]), Run([1.0, 2.0], [2.0, 3.0], [0.5, 0.4], [0.25, 0.2])]
+
+    monkeypatch.setattr(tutorial, "optimise", run_loop)
+    monkeypatch.setattr(tutorial, "finish", lambda runs: {"runs": runs})
+    said = []
+    monkeypatch.setattr(tutorial, "say", said.append)
+    answer = tutorial.ask_tutorial("tutorial")(TINY)
+    assert rendered == [(f"camera {k}, {TINY.side}", f"{OURS} 2", TINY.reference_spp, k) for k in range(2)]
+    scene, sensors, references, volpath, spp = heard[0]
+    truth = upright(values / 40)
+    assert np.array_equal(scene, truth[..., None]) and [float(r[0]) for r in references] == [0, 1]
+    assert (sensors, volpath, spp) == ([f"camera {k}, {TINY.side}" for k in range(2)], "volpath 2", TINY.check_spp)
+    assert loops == [(name, 2, size) for size in (warm_up(TINY), TINY) for name in (OURS, STOCK)]
+    judge = heard[1]
+    assert (judge.sensors, judge.references, judge.spp) == (sensors, references, TINY.loss_spp)
+    assert np.array_equal(judge.truth, at_voxels(truth, 4))
+    assert answer["grid"] == str(found) and answer["references"] == "checked"
+    assert {name: run.loss for name, run in answer["runs"].items()} == {OURS: [0.5, 0.4], STOCK: [0.5, 0.4]}
+    assert said[:2] == [
+        f"  {OURS}   1:     1.0 s (processor 2.0), loss 0.50000, density 0.250",
+        f"  {OURS}   2:     2.0 s (processor 3.0), loss 0.40000, density 0.200",
+    ]
+
+
+def test_losses_have_no_noise_in_their_mean(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The product of the errors of two renders, summed over cameras, each with seeds of its own."""
+    seeds = []
+
+    def render(scene: str, sensor: str, integrator: str, spp: int, seed: int) -> np.ndarray:
+        seeds.append((sensor, spp, seed))
+        return np.full((2, 2, 3), {"a": 1.0, "b": 5.0}[sensor] + (seed >= 20_000))
+
+    monkeypatch.setattr(tutorial.mi, "render", render)
+    judge = tutorial.Judge(["a", "b"], [np.full((2, 2, 3), 3.0), np.full((2, 2, 3), 2.0)], np.zeros((2, 2, 2)), 7)
+    assert judge.loss("scene", 5, "eye") == -2 * -1 + 3 * 4
+    assert seeds == [("a", 7, 10_005), ("a", 7, 20_005), ("b", 7, 10_105), ("b", 7, 20_105)]
+
+
+def test_references_are_checked_in_eight_batches(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Batches of 2 and 4 in turns, whose mean 3 is known to 1 / sqrt(7), against references of 1 and 2."""
+    seeds = []
+
+    def render(scene: str, sensor: str, integrator: str, spp: int, seed: int) -> np.ndarray:
+        seeds.append(seed)
+        return np.full((2, 2, 3), 3.0 - 1 + 2 * (seed // 100 % 2))
+
+    monkeypatch.setattr(tutorial.mi, "render", render)
+    references = [np.full((2, 2, 3), 1.0), np.full((2, 2, 3), 2.0)]
+    found = tutorial.check_references("scene", ["a", "b"], references, "volpath", 3)
+    assert seeds == [100 * b + k for b in range(8) for k in range(2)]
+    error = math.sqrt(8 / 7 / 8)
+    assert (found["mean"], found["z_against_volpath"]) == pytest.approx((1.5, -1.5 / error))
+    assert found["relative_standard_error"] == pytest.approx(error / 3)
+    assert found["z_bound"] == pytest.approx(stats.t.isf(agreement.FALSE_ALARM / 2, 7), rel=1e-6)
+
+
+@pytest.mark.slow
+def test_the_tutorials_loop_has_two_stages(variant_rgb: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Seeds are the number of the iteration, for each camera; the loss is judged with others in each stage; the second stage
+    has the finer grid and goes on from where the first one was."""
+    seeds, judged, shapes = [], [], []
+    every = mi.render
+
+    def render(*given: object, **asked: object) -> mi.TensorXf:
+        seeds.append((asked["spp"], asked["seed"]))
+        return every(*given, **asked)
+
+    monkeypatch.setattr(tutorial.mi, "render", render)
+    judge = SimpleNamespace(
+        sensors=half_circle(2, 2),
+        references=[dr.full(mi.TensorXf, 0.0, (2, 2, 3))] * 2,
+        loss=lambda scene, seed, eye: judged.append(seed) or 0.5,
+        density_error=lambda values: shapes.append((values.shape, float(values.mean()))) or 0.25,
+    )
+    (*_, run) = optimise(OURS, 2, judge, replace(TINY, resolutions=(2, 4), steps=(2, 1), step_spp=(4, 2)))
+    assert seeds == [(4, 0), (4, 0), (4, 1), (4, 1), (2, 0), (2, 0)]
+    assert judged == [0, 1, 1000]
+    assert [shape for shape, _ in shapes] == [(2, 2, 2), (2, 2, 2), (4, 4, 4)]
+    # Two steps of Adam from 0.002, of its rate or nearly so, and smaller ones later on, all of them up.
+    means = [mean for _, mean in shapes]
+    assert means[0] == pytest.approx(0.042, rel=0.1) and means == sorted(means)
+    assert (run.loss, run.density_error) == ([0.5] * 3, [0.25] * 3)
+    assert len(run.seconds) == len(run.processor) == 3 and run.seconds == sorted(run.seconds)

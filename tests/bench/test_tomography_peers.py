@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import importlib.util
+from collections.abc import Iterator
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from mivol.bench import tomography_peers as peers
-from mivol.tomography.phantoms import random_ellipsoids
+from mivol.tomography.geometry import ParallelBeam, VoxelGrid
+from mivol.tomography.phantoms import random_ellipsoids, shepp_logan
 
-pytestmark = pytest.mark.slow
 
-
+@pytest.mark.slow
 @pytest.mark.parametrize("who", ["mivol", *peers.PEERS])
 def test_everyone_finds_the_object(variant_rgb: str, monkeypatch: pytest.MonkeyPatch, who: str) -> None:
     """Each method's least error is below 0.75, where an empty slice has 1 and one that is upside down, or mirrored, more."""
@@ -35,3 +37,91 @@ def test_everyone_finds_the_object(variant_rgb: str, monkeypatch: pytest.MonkeyP
 def test_the_table_has_the_least_error_of_each() -> None:
     found = {"few": {"a": peers.Curve([0.5, 0.25, 0.3], [1.0, 2.0, 3.0])}, "many": {"a": peers.Curve([0.1], [0.5])}}
     assert peers.rows(found)[2] == "| a | 0.2500 (2, 2.00 s) | 0.1000 (1, 0.50 s) |"
+
+
+@pytest.mark.parametrize("photons", [0.0, 50.0])
+def test_a_slice_and_its_projections(variant_rgb: str, photons: float) -> None:
+    """Chords of the head at 4 / n, so that 1 across the grid has an optical depth of 4; quanta from the seed 0 where the kind
+    of data has noise, their numbers for weights."""
+    scan = peers.make_slice(9, 5, photons)
+    assert (scan.beam.shape, scan.grid.shape, scan.truth.shape) == ((5, 1, 13), (1, 9, 9), (1, 9, 9))
+    assert scan.beam.angles == pytest.approx(np.arange(5) * np.pi / 5)
+    head = shepp_logan("toft-schabel", 4.5)
+    exact = 4 / 9 * head.project(ParallelBeam(np.arange(5) * np.pi / 5, (1, 13)))
+    thin = VoxelGrid((1, 9, 9), (1.0, 1.0, 1e-6))
+    assert np.array_equal(scan.truth, 4 / 9 * head.voxelise(thin, 4))
+    if photons == 0:
+        assert np.array_equal(scan.y, exact) and np.array_equal(scan.weights, np.ones_like(exact))
+        return
+    counts = np.maximum(np.random.default_rng(0).poisson(50 * np.exp(-exact)), 1)
+    assert np.array_equal(scan.y, -np.log(counts / 50)) and np.array_equal(scan.weights, counts / 50)
+
+
+def test_errors_count_inside_the_disc(variant_rgb: str) -> None:
+    """Corners, and what touches the rim, do not count: the disc reaches from the middle to the last column, without it."""
+    truth = np.ones((1, 5, 5))
+    scan = peers.Slice(None, VoxelGrid((1, 5, 5)), None, None, truth)
+    inside = np.array([[0, 0, 0, 0, 0], [0, 1, 1, 1, 0], [0, 1, 1, 1, 0], [0, 1, 1, 1, 0], [0, 0, 0, 0, 0]], bool)
+    assert scan.error(np.where(inside, 1.0, 7.0)) == 0
+    assert scan.error(np.where(inside, 0.0, 1.0).ravel()) == 1
+
+
+def test_steps_are_timed_and_judging_is_not(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each step takes twice as long as the one before; judging takes 100 s; one that ends early has a short curve."""
+    now = [0.0]
+    monkeypatch.setattr(peers.time, "process_time", lambda: now[0])
+
+    def passes(seconds: float, value: float) -> float:
+        now[0] += seconds
+        return value
+
+    scan = type("Scan", (), {"error": lambda self, x: passes(100.0, x / 2)})()
+    states = (passes(2.0**k, float(k)) for k in range(3))
+    assert peers.timed(scan, states, 2) == peers.Curve([0.0, 0.5], [1.0, 3.0])
+    assert peers.timed(scan, iter([]), 2) == peers.Curve([], [])
+
+
+def test_every_method_of_ours_runs_once_before_it_is_timed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The warm run of each takes a step; ours begin at nothing but for the one that begins at the filtered back-projection,
+    of which what is below 0 is cut off; those that know a bound have it."""
+    asked = []
+
+    class Method:
+        def __init__(self, name: str) -> None:
+            self.name = name
+
+        def run(self, problem: tuple) -> Iterator[SimpleNamespace]:
+            asked.append((self.name, problem))
+            return iter([SimpleNamespace(x=np.array([-1.0, 2.0]))] * 99)
+
+    monkeypatch.setattr(peers, "Projector", lambda beam, grid: (beam, grid))
+    monkeypatch.setattr(peers, "LeastSquares", lambda a, y, w, x0, nonnegative: (a, y, w, x0, nonnegative))
+    monkeypatch.setattr(peers, "METHODS", {name: Method(name) for name in ("fbp", "cgls", "pcg", "sirt", "sart", "os-sart")})
+    monkeypatch.setattr(peers, "timed", lambda scan, states, steps: (next(states).tolist(), steps))
+    found = peers.ours(peers.Slice("beam", "grid", "y", "w", None))
+    steps = {"fbp": 1, "cgls": 20, "pcg": 20, "pcg from fbp": 10, "sirt": 60, "sart": 6, "os-sart": 12}
+    assert found == {f"mivol {name}": ([-1.0, 2.0], n) for name, n in steps.items()}
+    twice = [name for name in ("fbp", "cgls", "pcg", "pcg", "sirt", "sart", "os-sart") for _ in range(2)]
+    assert [name for name, _ in asked] == twice
+    for place, (name, (*rest, start, bounded)) in enumerate(asked):
+        assert (rest, bounded) == ([("beam", "grid"), "y", "w"], name not in ("fbp", "cgls"))
+        assert (start is None) == (place not in (6, 7)) and (start is None or start.tolist() == [0, 2])
+
+
+def test_who_is_missing_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Kinds of data in turns, peers that are installed beside ours."""
+    said = []
+    monkeypatch.setattr(peers, "make_slice", lambda n, views, photons: (n, views, photons))
+    monkeypatch.setattr(peers, "ours", lambda scan: {"ours": scan})
+    monkeypatch.setattr(peers, "say", said.append)
+    run = lambda scan: {"theirs": scan}  # noqa: E731
+    monkeypatch.setattr(peers, "PEERS", {"there": ("json", run), "not there": ("no_such_module", run)})
+    found = peers.compare(7)
+    data = {"few views": (7, 30, 0.0), "noisy": (7, 90, 1e4), "many": (7, 360, 1e4)}
+    assert found == {kind: {"ours": scan, "theirs": scan} for kind, scan in data.items()}
+    assert said == ["not there is not installed: left out"] * 3
+
+
+def test_the_table_in_markdown() -> None:
+    found = {"few": {"a": peers.Curve([0.5], [1.0])}, "many": {"a": peers.Curve([0.1], [0.5])}}
+    assert peers.rows(found) == ["| method | few | many |", "|---|---|---|", "| a | 0.5000 (1, 1.00 s) | 0.1000 (1, 0.50 s) |"]
