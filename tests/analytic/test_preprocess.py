@@ -1,0 +1,134 @@
+"""From readings to line integrals, number by number: each formula by hand on a few pixels (float64, rounding only)."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from mivol.errors import MivolError
+from mivol.tomography import preprocess
+from mivol.tomography.preprocess import LightDrift, Transmission
+
+
+def test_noise_of_which_the_form_is_known() -> None:
+    """As of 10,000 quanta; what is darker than nothing has none."""
+    found = preprocess.of_unknown_noise(np.array([[[0.5, -0.1, 2.0]]]))
+    assert found.value.tolist() == [[[0.5, -0.1, 2.0]]] and found.variance.tolist() == [[[0.5e-4, 0.0, 2e-4]]]
+
+
+DARKS = np.array([[[10.0, 11, 10, 10, 10]], [[12, 13, 12, 12, 12]], [[14, 15, 14, 14, 14]]])
+FLATS = np.array([[[100.0, 110, 10, 90, 80]], [[120, 130, 14, 110, 100]]])
+READINGS = np.array([[[50.0, 61, 9, 119, 30]], [[5, 70, 8, 120, 40]]])
+
+
+def test_a_detector_is_calibrated_by_living_pixels() -> None:
+    """Darks of 12 that vary by 4; flats that add 98, 88 and 78 and vary by 200; the second pixel is saturated in a
+    flat, the third is dead."""
+    found = preprocess.calibrate(READINGS, FLATS, DARKS, 120.5)
+    assert found.dark.tolist() == [[12, 13, 12, 12, 12]]
+    np.testing.assert_array_equal(found.light, [[98, np.nan, np.nan, 88, 78]])
+    assert (found.dark_variance, found.gain, found.n_flats, found.n_darks) == (4, pytest.approx(196 / 88), 2, 3)
+
+
+def test_transmission_and_its_variance() -> None:
+    """To first order, with the noise of the detector pooled over its living pixels."""
+    found = preprocess.correct_transmission(READINGS, FLATS, DARKS, 131)
+    dark, light = np.array([12.0, 13, 12, 12]), np.array([98.0, 107, 88, 78])
+    gain = (200 - 4) / light.mean()
+    alive = [0, 1, 3, 4]
+    signal = READINGS[:, 0, alive] - dark
+    t = signal / light
+    read = 4 + gain * np.maximum(signal, 0)
+    variance = (read + t**2 * (4 + gain * light) / 2 + (1 - t) ** 2 * 4 / 3) / light**2
+    np.testing.assert_allclose(found.value[:, 0, alive], t, rtol=1e-14)
+    np.testing.assert_allclose(found.variance[:, 0, alive], variance, rtol=1e-14)
+    assert np.isnan(found.value[:, 0, 2]).all() and np.isnan(found.variance[:, 0, 2]).all()
+    # A reading of exactly the saturation is saturated, and so is a flat.
+    at = preprocess.correct_transmission(READINGS, FLATS - 15, DARKS, 120)
+    assert np.isnan(at.value[:, 0, 3]).tolist() == [False, True]
+    known = preprocess.calibrate(READINGS, FLATS, DARKS, 130)
+    np.testing.assert_array_equal(np.isnan(known.light), [[False, True, True, False, False]])
+    assert known.saturation == 130 and preprocess.calibrate(READINGS, FLATS, DARKS).saturation == np.inf
+
+
+@pytest.mark.parametrize(
+    ("readings", "flats", "darks", "sentence"),
+    [
+        (READINGS[0], FLATS, DARKS, "three stacks"),
+        (READINGS[..., :3], FLATS, DARKS, "three stacks"),
+        (READINGS, FLATS[..., :3], DARKS, "three stacks"),
+        (READINGS, FLATS, DARKS[..., :3], "three stacks"),
+        (READINGS, FLATS[:1], DARKS, "Found 1 flats and 3 darks"),
+        (READINGS, FLATS, DARKS[:1], "Found 2 flats and 1 darks"),
+        (READINGS[..., 1:3], FLATS[..., 1:3], DARKS[..., 1:3], r"at detector pixel \(0, 1\)"),
+    ],
+)
+def test_fields_that_calibrate_nothing(readings: np.ndarray, flats: np.ndarray, darks: np.ndarray, sentence: str) -> None:
+    """As many dead pixels as others are too many; one less are not."""
+    with pytest.raises(MivolError, match=sentence):
+        preprocess.calibrate(readings, flats, darks)
+    preprocess.calibrate(READINGS[..., 1:], FLATS[..., 1:], DARKS[..., 1:])
+
+
+def test_quanta_of_a_pixel() -> None:
+    """(reading - dark) / gain and the read noise in quanta; 0 and 1 where nothing is used."""
+    found = preprocess.count_quanta(READINGS, FLATS, DARKS)
+    gain = 196 / (371 / 4)
+    shift = 4 / gain**2
+    assert found.background == pytest.approx(shift)
+    wanted = np.maximum((READINGS[:, 0] - [12, 13, 12, 12, 12]) / gain + shift, 0)
+    wanted[:, 2] = 0
+    np.testing.assert_allclose(found.counts[:, 0], wanted, rtol=1e-14)
+    np.testing.assert_allclose(found.blank[:, 0], [np.array([98, 107, gain, 88, 78]) / gain] * 2, rtol=1e-14)
+    assert found.used[:, 0].tolist() == [[True, True, False, True, True]] * 2
+    some = found.of_views(np.array([1]))
+    assert (some.counts.tolist(), some.blank.tolist()) == (found.counts[1:].tolist(), found.blank[1:].tolist())
+    assert some.used.tolist() == found.used[1:].tolist() and some.background == found.background
+    assert preprocess.Quanta(found.counts, 3.0, 0.0, found.used).of_views(np.array([0])).blank == 3.0
+
+
+def test_air_is_a_straight_line_through_both_edges() -> None:
+    """Means of 2 and of 4 of the finite pixels in two columns at either edge, between their middles and beyond."""
+    value = np.array([[[1.0, 3, 9, 9, np.nan, 4]]])
+    air = preprocess.find_air(value, 2)
+    np.testing.assert_allclose(air, [[[1.75, 2.25, 2.75, 3.25, 3.75, 4.25]]], rtol=1e-14)
+    found = preprocess.normalise_air(Transmission(value, np.ones_like(value)), 2)
+    np.testing.assert_allclose(found.value, value / air, rtol=1e-14)
+    np.testing.assert_allclose(found.variance, 1 / air**2, rtol=1e-14)
+    assert preprocess.normalise_air(Transmission(value, value), 3).value.shape == value.shape
+    for n in (0, 1, 4):
+        with pytest.raises(MivolError, match=f"Found {n} air columns, expected 2 to 3 of 6"):
+            preprocess.normalise_air(Transmission(value, value), n)
+    dark = np.ones((2, 3, 6))
+    dark[1, 2, :2] = np.nan
+    with pytest.raises(MivolError, match="at an edge of row 2 of view 1"):
+        preprocess.find_air(dark, 2)
+
+
+def test_light_that_is_noise_counts_nothing() -> None:
+    """Three standard deviations are noise, a little more is light; without variance, or not finite, nothing is known."""
+    value = np.array([0.3, 0.3001, 2.0, np.nan, 0.5, 0.5, 0.5])
+    variance = np.array([0.01, 0.01, 0.04, 0.01, np.nan, 0.0, np.inf])
+    y, weights = preprocess.line_integrals(Transmission(value, variance))
+    t = np.array([0.3001, 2.0])
+    np.testing.assert_allclose(y, [0, *-np.log(t), 0, 0, 0, 0], rtol=1e-14)
+    np.testing.assert_allclose(weights, [0, *(t**2 / [0.01, 0.04]), 0, 0, 0, 0], rtol=1e-14)
+    y, _ = preprocess.line_integrals(Transmission(value, variance), 2.0)
+    assert y[0] == pytest.approx(-np.log(0.3))
+
+
+def test_drift_is_a_weighted_line_in_time() -> None:
+    """As NumPy's fit with the roots of the weights; pixels seen once, or at one time, have none."""
+    rng = np.random.default_rng(1)
+    residual, weights, times = rng.normal(size=(5, 1, 4)), rng.uniform(1, 2, (5, 1, 4)), np.array([-2.0, -1, 0.5, 1, 3])
+    weights[1:, 0, 2] = 0
+    weights[:, 0, 3] = 0
+    found = preprocess.fit_light_drift(residual, weights, times)
+    for k in range(2):
+        slope, offset = np.polyfit(times, residual[:, 0, k], 1, w=np.sqrt(weights[:, 0, k]))
+        assert (found.slope[0, k], found.offset[0, k]) == pytest.approx((slope, offset), rel=1e-10)
+    assert found.slope[0, 2:].tolist() == found.offset[0, 2:].tolist() == [0, 0]
+    still = preprocess.fit_light_drift(residual, np.ones_like(weights), np.full(5, 0.1))
+    assert not still.slope.any() and not still.offset.any()
+    moved = LightDrift(np.array([[1.0, 2]]), np.array([[3.0, 4]])).eval(np.array([0.0, 10.0]))
+    assert moved.tolist() == [[[1, 2]], [[31, 42]]]
