@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
 import pytest
+from bench_figures import drawn
 from false_alarms import ALPHA, note
+from scene_numbers import add_up
 
-from mivol.bench import agreement
+from mivol.bench import agreement, random_scenes
+from mivol.bench.agreement import mean_of_rounds
 from mivol.bench.random_scenes import BENCH, QUICK, hard, trials
-from mivol.bench.random_scenes.generate import EMITTERS, draw_scene
+from mivol.bench.random_scenes.generate import EMITTERS, RandomScene, draw_scene
 from mivol.bench.random_scenes.trials import try_scene, try_scenes
 from mivol.errors import MivolError
 
@@ -36,28 +38,11 @@ def test_a_seed_decides_everything(variant_rgb: str) -> None:
     assert one.features != other.features
 
 
-def numbers_of(value: object, name: str = "") -> Iterator[tuple[str, np.ndarray]]:
-    """The numbers of a scene, each with the last name on the way to it."""
-    if isinstance(value, dict):
-        for key, each in value.items():
-            yield from numbers_of(each, key)
-    elif isinstance(value, list | tuple):
-        for each in value:
-            yield from numbers_of(each, name)
-    elif isinstance(value, mi.ScalarTransform4f):
-        yield name, np.array(value.matrix, dtype=np.float64)
-    elif isinstance(value, str):
-        yield (name, np.array(value.split(","), dtype=np.float64)) if "," in value else (value, np.ones(1))
-    elif value is not None:
-        yield name, np.atleast_1d(np.array(value, dtype=np.float64))
-
-
 def test_a_number_means_the_same_scene_tomorrow(variant_rgb: str, record: bool) -> None:
     """A scene that was found wrong is named by its seed: sums of all numbers of 80 scenes, by their names, are as recorded."""
     sums: dict[str, float] = {}
     for seed in range(80):
-        for name, found in numbers_of(draw_scene(seed).parts | {"settings": draw_scene(seed).settings}):
-            sums[name] = sums.get(name, 0.0) + float((found * np.cos(np.arange(found.size)).reshape(found.shape)).sum())
+        add_up(draw_scene(seed).parts | {"settings": draw_scene(seed).settings}, sums)
     if record:
         RECORDED.write_text(json.dumps(dict(sorted(sums.items())), indent=1) + "\n", encoding="utf-8")
     # Numbers of float32 that another processor may round otherwise: 1e-6 of each, of at most 1e5 of them.
@@ -156,3 +141,103 @@ def test_a_fault_of_a_hard_scene_is_counted(variant_rgb: str, monkeypatch: pytes
     found = hard.try_hard_scenes(TINY)
     assert found == {"made up": {"paths": 4, "not_finite": 1, "negative": 2, "brightest": 1.0}}
     assert [row["met"] for row in BENCH.compare("hard", found)] == [False]
+
+
+def test_pictures_have_seeds_of_their_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Those of mivol begin at 1000, those of volpath at 5000; they are kept in float64."""
+    asked = []
+
+    def render(scene: object, integrator: dict, spp: int, seed: int) -> np.ndarray:
+        asked.append((scene, integrator, spp, seed))
+        return np.full((2, 3, 3), seed, np.float32)
+
+    monkeypatch.setattr(trials.mi, "load_dict", lambda parts: parts)
+    monkeypatch.setattr(trials.mi, "render", render)
+    drawn = RandomScene({"type": "scene"}, {"max_depth": 3, "rr_depth": 5})
+    for name, first in (("mivol", 1000), ("volpath", 5000)):
+        found = trials._pictures(drawn, name, 2, 7)
+        assert (found.shape, found.dtype, found[:, 1, 2, 0].tolist()) == ((2, 2, 3, 3), np.float64, [first, first + 1])
+        integrator = {"type": name, "max_depth": 3, "rr_depth": 5}
+        assert asked[-2:] == [(drawn.parts, integrator, 7, first + k) for k in range(2)]
+
+
+@pytest.mark.parametrize("is_rgb", [False, True])
+def test_a_scene_is_judged_by_what_differs_most(monkeypatch: pytest.MonkeyPatch, is_rgb: bool) -> None:
+    """Colours of an rgb extinction are those of the grey scenes of their channels; the bound allows for all comparisons."""
+    rng, heard = np.random.default_rng(4), []
+    ours, noise = rng.uniform(1, 2, (4, 4, 4, 3)), rng.uniform(1, 2, (4, 4, 4, 3))
+    noise[:, 2:, 2:, 1] += 3
+
+    def pictures(drawn: RandomScene, name: str, rounds: int, spp: int) -> np.ndarray:
+        heard.append((drawn.parts["channel"], name, rounds, spp))
+        return ours if name == "mivol" else noise
+
+    monkeypatch.setattr(trials, "draw_scene", lambda seed, c=None: RandomScene({"channel": c}, {}, ["f"], is_rgb))
+    monkeypatch.setattr(trials, "_pictures", pictures)
+    size = replace(TINY, scenes=5, rounds=4, spp=2, stock_spp=3)
+    found = try_scene(9, size)
+    channels = (0, 1, 2) if is_rgb else (None,)
+    assert heard == [(None, "mivol", 4, 2), *((c, "volpath", 4, 3) for c in channels)]
+    one, other = (mean_of_rounds(p[:, 2:, 2:, 1].mean(axis=(1, 2))) for p in (ours, noise))
+    wanted = agreement.compare_means(one, other, 12 * 5)
+    assert found == {"features": ["f"], "not_a_radiance": 0, "mean": pytest.approx(noise.mean()), **wanted}
+    ours[0, 0, 0, 0], ours[0, 0, 0, 1] = 0.0, -1e-30
+    assert try_scene(9, size)["not_a_radiance"] == 1
+
+
+def test_scenes_are_tried_from_the_first_seed_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    said = []
+    monkeypatch.setattr(trials, "try_scene", lambda seed, size: {"seed": seed} | ({"refused": ["no"]} if seed == 8 else {}))
+    monkeypatch.setattr(trials, "said", lambda found: f"{found['seed']}")
+    monkeypatch.setattr(trials, "say", said.append)
+    found = try_scenes(replace(TINY, scenes=3, first=7))
+    assert found == {
+        "scenes": 3, "refusals": {"no": 1}, "trials": {7: {"seed": 7}, 8: {"seed": 8, "refused": ["no"]}, 9: {"seed": 9}},
+    }  # fmt: skip
+    assert said == ["  scene 7: 7", "  scene 8: 8", "  scene 9: 9"]
+
+
+def test_what_is_said_of_a_scene() -> None:
+    found = {"features": ["fog", "sun"], "z": -1.26, "z_bound": 4.02, "not_a_radiance": 0}
+    assert trials.said(found) == "z -1.3 of 4.0: fog, sun"
+    assert trials.said(found | {"z": None, "not_a_radiance": 2}) == "z none, 2 pixels are no radiance: fog, sun"
+    assert trials.said({"features": ["fog"], "refused": ["a", "b"]}) == "refused (a): fog"
+
+
+def test_a_figure_of_the_largest_differences(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Shares of the bounds, of scenes that have one."""
+    judged = {number: {"z": z, "z_bound": 4.0} for number, z in enumerate((-2.0, None, 1.0))}
+    found = judged | {3: {"refused": ["no"]}}
+    figure = drawn(random_scenes, monkeypatch, {"trials": {"trials": found}}, Path())
+    (axes,) = figure.axes
+    bars = {round(p.get_x() + p.get_width() / 2, 3): p.get_height() for p in axes.patches if p.get_height()}
+    assert bars == {0.275: 1, 0.525: 1} and len(axes.patches) == 30
+    assert axes.patches[-1].get_x() + axes.patches[-1].get_width() == pytest.approx(1.5)
+    assert [line.get_xdata()[0] for line in axes.lines] == [1]
+    assert not any(p.get_height() for p in drawn(random_scenes, monkeypatch, {"hard": {}}, Path()).axes[0].patches)
+
+
+def test_bars_of_scenes_and_of_paths() -> None:
+    """No refusal, no sample that is no radiance, and z within its bound."""
+    found = {1: {"z": 3.0, "z_bound": 4.0, "not_a_radiance": 0}, 2: {"z": -5.0, "z_bound": 4.0, "not_a_radiance": 2}}
+    rows = BENCH.compare("trials", {"refusals": {"a": 1, "b": 2}, "trials": found | {3: {"refused": ["a"]}}})
+    assert [(row["value"], row["met"]) for row in rows] == [(3, False), (2, False), (3.0, True), (5.0, False)]
+    faults = {"a": {"not_finite": 1, "negative": 2}, "b": {"not_finite": 0, "negative": 0}}
+    assert [(row["value"], row["met"]) for row in BENCH.compare("hard", faults)] == [(3, False), (0, True)]
+
+
+def test_hard_scenes_are_followed_without_a_limit(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One path a pixel, pictures numbered from 0; the brightest number of all of them."""
+    asked = []
+
+    def render(scene: object, integrator: object, spp: int, seed: int) -> np.ndarray:
+        asked.append((scene, integrator, spp, seed))
+        return np.full((2, 3, 3), [5.0, 2.0, 3.0][seed])
+
+    monkeypatch.setattr(hard, "HARD", {"made up": lambda: "parts"})
+    monkeypatch.setattr(hard, "of_depth", lambda name, depth: (name, depth))
+    monkeypatch.setattr(hard.mi, "load_dict", lambda parts: parts)
+    monkeypatch.setattr(hard.mi, "render", render)
+    found = hard.try_hard_scenes(replace(TINY, hard_pictures=3))
+    assert found == {"made up": {"paths": 18, "not_finite": 0, "negative": 0, "brightest": 5.0}}
+    assert asked == [("parts", ("mivol", -1), 1, k) for k in range(3)]

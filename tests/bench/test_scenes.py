@@ -2,10 +2,19 @@
 
 from __future__ import annotations
 
+import json
+from pathlib import Path
+
 import mitsuba as mi
 import numpy as np
 import pytest
+from scene_numbers import add_up
 
+from mivol.bench import multiple_scattering, single_scattering
+from mivol.bench.extinctions import Extinction
+from mivol.bench.gradients.size import CONTESTS, TABLES
+from mivol.bench.ladder import RUNGS
+from mivol.bench.random_scenes import hard
 from mivol.bench.scenes import box_scene, of_depth, point_light, sun_and_sky
 
 
@@ -43,3 +52,29 @@ def test_the_sun_gives_a_third_of_the_light(variant_rgb: str) -> None:
 def test_integrators_scatter_once_and_are_made_anew(variant_rgb: str) -> None:
     assert of_depth("volpath", 2) is not of_depth("volpath", 2)
     assert "max_depth = 2" in str(of_depth("volpath", 2))
+
+
+RECORDED = Path(__file__).with_suffix(".json")
+
+
+def test_scenes_of_the_benches_are_as_recorded(variant_rgb: str, monkeypatch: pytest.MonkeyPatch, record: bool) -> None:
+    """Sums of all numbers of hard scenes and of the lights of every bench, by their names: published figures are of these."""
+    grids = lambda res: Extinction(np.full((res // 32,) * 3, res / 7, np.float32), "")  # noqa: E731
+    monkeypatch.setattr(hard, "smoke", lambda: grids(64))
+    monkeypatch.setattr(hard, "threads_in_space", grids)
+    monkeypatch.setattr(hard, "as_dense_as_smoke", lambda found: found)
+    scenes = {f"hard: {name}": parts() for name, parts in hard.HARD.items()}
+    scenes |= {f"single scattering: {name}": light.parts() for name, light in single_scattering.LIGHTS.items()}
+    for tables in (TABLES, {name: lights for name, (_, lights) in CONTESTS.items()}, multiple_scattering.CONTESTS):
+        for question, lights in tables.items():
+            scenes |= {f"{question}: {name}": light.parts() for name, light in lights.items()}
+    scenes |= {f"rung: {name}": rung.parts() for name, rung in RUNGS.items()}
+    found = {name: add_up(parts, {}) for name, parts in sorted(scenes.items())}
+    if record:
+        lines = (f" {json.dumps(name)}: {json.dumps(sums)}" for name, sums in found.items())
+        RECORDED.write_text("{\n" + ",\n".join(lines) + "\n}\n", encoding="utf-8")
+    recorded = json.loads(RECORDED.read_text(encoding="utf-8"))
+    assert set(found) == set(recorded)
+    for name, sums in found.items():
+        # Numbers of float32, which another processor may round otherwise.
+        assert sums == pytest.approx(recorded[name], rel=1e-5, abs=1e-6), name

@@ -22,15 +22,17 @@ from matplotlib.image import imread
 
 from mivol.cite import CITATIONS, Citation, citations
 from mivol.errors import MivolError
-from mivol.files import write_exr, write_volume
+from mivol.files import write_exr, write_png, write_volume
 from mivol.report import figures, show
 from mivol.report import page as page_module
 from mivol.report.gallery import ShownView
 from mivol.report.page import headline, write_page
 from mivol.report.record import (
     Image,
+    Machine,
     PlanLine,
     RunRecord,
+    Table,
     Volume,
     append_metrics,
     read_metrics,
@@ -444,3 +446,86 @@ def test_slices_and_rows_as_figures(artefacts):
         figures.plot_slices(truth, truth[1:])
     with pytest.raises(MivolError, match='no row of the metrics has "psnr"'):
         figures.plot_curve([{"iteration": 1.0, "loss": 1.0}], "psnr")
+
+
+PAGE_AS_LOOKED_AT = Path(__file__).with_name("page_of_a_run.txt")
+
+
+def write_run_by_hand(folder: Path) -> Path:
+    """A run of round numbers with all that a page can show: three views (a reference that is known, one held out whose errors
+    are known, one that is a PNG), a slice, a film, two volumes, one with its truth."""
+    ramp = np.linspace(0, 2, 24, dtype=np.float32).reshape(4, 6)
+    bump = np.where(np.arange(24).reshape(4, 6) % 5 == 0, np.float32(0.25), np.float32(0))
+    images = []
+    for name, reference, render, held_out in (
+        ("first", ramp, ramp + bump, False),
+        ("second", ramp[::-1], ramp[::-1] - bump, True),
+    ):
+        pictures = {"reference": reference, "render": render}
+        if held_out:
+            pictures["standard error"] = np.full_like(ramp, 0.0625)
+        for role, values in pictures.items():
+            write_exr(folder / f"{name}_{role[:6]}.exr", {"Y": np.ascontiguousarray(values)})
+            images.append(Image(path=f"{name}_{role[:6]}.exr", role=role, view=name, held_out=held_out, unit="W"))
+    write_png(folder / "slice.png", np.arange(54, dtype=np.uint8).reshape(3, 6, 3))
+    write_png(folder / "shown.png", np.arange(54, dtype=np.uint8).reshape(6, 3, 3))
+    (folder / "film.webp").write_bytes(b"a film")
+    images += [
+        Image(path="shown.png", role="render", view="third", caption="As it is"),
+        Image(path="slice.png", role="slice", caption="A slice"),
+        Image(path="film.webp", role="film", view="around"),
+    ]
+    grid = np.linspace(0, 1, 24, dtype=np.float32).reshape(2, 3, 4, 1)
+    write_volume(folder / "truth.npz", grid)
+    write_volume(folder / "found.npz", grid[::-1])
+    write_volume(folder / "albedo.npz", grid)
+    volumes = [
+        Volume(path="truth.npz", role="truth"),
+        Volume(path="found.npz", role="reconstruction"),
+        Volume(
+            path="albedo.npz", role="reconstruction", quantity="albedo", unit="", size=(4.0, 3.0, 2.0), caption="The albedo"
+        ),
+    ]
+    for k in range(3):
+        append_metrics(folder, iteration=10 * k, seconds=1.5 * k, loss=4.0 / 2**k, psnr=20.0 + k, of_mine=float(k))
+    write_record(
+        RunRecord(
+            title="Every part", machine=Machine(cores=3, memory=15.5, device="A processor"), method="by hand",
+            status="finished",
+            started="2026-01-02T03:04:05Z", command="mivol optimize it.toml",
+            config={"title": "it", "scene": {"views": 3, "spp": None, "film": {"size": [6, 4]}}, "fast": True},
+            versions={"python": "3.11", "mivol": "1.2"}, seeds={"start": 7}, plan=[PlanLine(choice="this", reason="that")],
+            timings={"load": 0.5, "fit": 90.25, "judge": 8.0}, images=images, volumes=volumes,
+            results={"nrmse": 0.03125, "iterations": 20.0, "memory": 1234.5, "my_number": 2.5, "ssim": None},
+            tables=[Table(title="A table", head=("what", "how"), rows=(("a", "1"), ("b", "2")))], notes=["Mind this."],
+            citations=list(CITATIONS)[:2],
+        ),
+        folder,
+    )  # fmt: skip
+    return folder
+
+
+def described(page: Page) -> str:
+    """A page in lines: each tag with its attributes, pictures by their size and sums of their colours; and its words."""
+    lines = []
+    for tag, attributes in page.tags:
+        if tag in ("g", "path", "use", "defs", "clippath", "rect", "style"):
+            continue
+        shown = {key: value for key, value in attributes.items() if tag != "svg" or key == "aria-label"}
+        if str(shown.get("src", "")).startswith("data:image/png"):
+            pixels = decode(shown["src"])
+            shown["src"] = (
+                f"{pixels.shape} {pixels.sum(axis=(0, 1)).tolist()} {pixels[0, 0].tolist()} {pixels[-1, -1].tolist()}"
+            )
+        lines.append(" ".join([tag, *(f"{key}={value}" for key, value in shown.items())]))
+    words = [" ".join(word.split()) for word in page.words]
+    return "\n".join([*lines, "", *(word for word in words if word)]) + "\n"
+
+
+def test_a_page_is_as_it_was_looked_at(tmp_path: Path, record: bool) -> None:
+    """``pytest --record`` records it anew: open the page before, and read the difference."""
+    text = write_page(write_run_by_hand(tmp_path)).read_text(encoding="utf-8")
+    found = described(Page(text))
+    if record:
+        PAGE_AS_LOOKED_AT.write_text(found, encoding="utf-8")
+    assert found.splitlines() == PAGE_AS_LOOKED_AT.read_text(encoding="utf-8").splitlines()
