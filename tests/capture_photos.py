@@ -28,8 +28,8 @@ def colours(points: np.ndarray, wave: float) -> np.ndarray:
 def image_of(camera: Camera) -> np.ndarray:
     """What a camera among the walls sees (height, width, 3)."""
     o, d = rays(camera, pixel_centres(camera.size))
-    with np.errstate(divide="ignore"):
-        wall = o + d * ((WALLS * np.sign(d) - o) / d).min(axis=-1, keepdims=True)
+    with np.errstate(divide="ignore", invalid="ignore"):  # 0 / 0: a ray in the middle plane, which meets no such wall
+        wall = o + d * np.nanmin((WALLS * np.sign(d) - o) / d, axis=-1, keepdims=True)
     along = np.sum(o * d, axis=-1)
     inside = along**2 - np.sum(o * o, axis=-1) + RADIUS**2
     t = -along - np.sqrt(np.maximum(inside, 0))

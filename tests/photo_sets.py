@@ -65,7 +65,8 @@ def write_transforms(folder: Path, settings: dict, size: tuple[int, int] = (12, 
     return folder
 
 
-MODEL_IDS = {"SIMPLE_PINHOLE": 0, "PINHOLE": 1, "SIMPLE_RADIAL": 2, "RADIAL": 3, "OPENCV": 4, "OPENCV_FISHEYE": 5}
+MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "FOV")
+MODEL_IDS = {model: number for number, model in enumerate((*MODELS, "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"))}
 
 COLMAP_CAMERAS = {
     "SIMPLE_PINHOLE": (50.0, 31.0, 22.0),

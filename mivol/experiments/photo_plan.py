@@ -70,6 +70,7 @@ def choices(plan: FitPlan, photos: Photos, batches: RayBatches) -> list[PlanLine
     return [
         PlanLine(choice=f"{len(photos.views)} photographs, a box of {size}", reason=photos.survey.box_from),
         *nested[: plan.levels > 1],
+        *wide_lenses(photos),
         PlanLine(choice=f"grids of {resolutions} nodes along the longest edge", reason="coarse first, to find what is empty"),
         PlanLine(
             choice=f"photographs shrunk by {', '.join(str(stage.shrink) for stage in plan.stages)}",
@@ -80,6 +81,13 @@ def choices(plan: FitPlan, photos: Photos, batches: RayBatches) -> list[PlanLine
         PlanLine(choice=f"rays end at a transmittance of {plan.stop:g}", reason="what is left out is at most that share"),
         PlanLine(choice=memory_of(plan, box, batches), reason="counted before it is taken"),
     ]
+
+
+def wide_lenses(photos: Photos) -> list[PlanLine]:
+    """A line where photographs were taken through lenses without an image plane."""
+    kinds = [type(view.camera.distortion).__name__.lower() for view in photos.views if view.camera.distortion.is_wide]
+    reason = "traced exactly once a lens and size, and looked up: nothing is resampled"
+    return [PlanLine(choice=f"rays of {len(kinds)} {kinds[0]} photographs", reason=reason)] if kinds else []
 
 
 def what_is_behind(plan: FitPlan, photos: Photos) -> PlanLine:

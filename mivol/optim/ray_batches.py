@@ -3,7 +3,8 @@
 Conventions. A batch is square tiles of pixels: neighbours cross the same cells, so their reads and writes meet in the cache,
 and a packet of lanes walks as one. Tiles lie anywhere in a view, all places alike. Smaller sizes are exact means over area;
 where voxels are larger than pixels, a small image says the same with fewer rays. Values are those of the photographs (8-bit
-steps), not decoded. What a mask leaves out has a ray, and counts for nothing.
+steps), not decoded. What a mask leaves out has a ray, and counts for nothing. Rays of pinholes are computed; those of wide
+lenses (:mod:`mivol.photos.wide_lens`) are traced once for each lens and size, and looked up.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ import mitsuba as mi
 import numpy as np
 
 from mivol.errors import MivolError
-from mivol.photos import Photo
+from mivol.photos import Camera, Photo, directions, pixel_centres
 from mivol.transport.line_integrals.radiance_field import RayBundle
 
 TILE = 4
@@ -28,7 +29,7 @@ TILE = 4
 class Level:
     """All views in one size: codes 0..255, [row][column][rgb] or, with alpha, [rgba], one view after the other.
 
-    ``counted`` is 1 or 0 a pixel; None where no photograph has a mask.
+    ``counted`` is 1 or 0 a pixel; None where no photograph has a mask. ``wide``: rays of wide lenses; None where there is none.
     """
 
     codes: mi.UInt8
@@ -36,6 +37,51 @@ class Level:
     sizes: np.ndarray
     starts: np.ndarray
     shrink: int
+    wide: WideRays | None
+
+
+@dataclass
+class WideRays:
+    """Directions through the centres of pixels in the frames of cameras with wide lenses: [row][column][xyz], lens by lens.
+
+    Attributes:
+        directions: of all lenses, each once.
+        starts: (V,) the first pixel of each view's lens; -1 for a pinhole.
+    """
+
+    directions: mi.Float
+    starts: np.ndarray
+
+    @classmethod
+    def of(cls, cameras: Sequence[Camera], sizes: np.ndarray, shrink: int) -> WideRays | None:
+        """The rays of cameras whose images have ``sizes`` (V, 2) when shrunk; None where all are pinholes."""
+        tables, starts, known, count = [], [], {}, 0
+        for camera, (width, height) in zip(cameras, sizes, strict=True):
+            if not camera.distortion.is_wide:
+                starts.append(-1)
+                continue
+            lens = (camera.distortion, camera.K.tobytes(), int(width), int(height))
+            if lens not in known:
+                known[lens] = count
+                tables.append(directions(camera, shrink * pixel_centres((width, height))).astype(np.float32).reshape(-1))
+                count += int(width * height)
+            starts.append(known[lens])
+        return cls(mi.Float(np.concatenate(tables)), np.array(starts, np.int32)) if tables else None
+
+    def turned(self, d: mi.Vector3f, slot: mi.UInt32, views: np.ndarray, pixel: mi.UInt32) -> mi.Vector3f:
+        """Directions ``d`` in the cameras' frames, replaced where the view's lens is wide.
+
+        Args:
+            d: of pinholes.
+            slot: of each ray's view among ``views``.
+            views: numbers of views.
+            pixel: its number in its image.
+        """
+        start = dr.gather(mi.Int32, mi.Int32(self.starts[views]), slot)
+        is_wide = start >= 0
+        at = 3 * (mi.UInt32(dr.maximum(start, 0)) + pixel)
+        traced = mi.Vector3f(*(dr.gather(mi.Float, self.directions, at + k, is_wide) for k in range(3)))
+        return dr.select(is_wide, traced, d)
 
 
 @dataclass
@@ -63,10 +109,10 @@ class RayBatch:
 
 @dataclass
 class RayBatches:
-    """Photographs of pinhole cameras.
+    """Photographs of pinholes and of wide lenses, each of which sees from one point.
 
     Attributes:
-        origins: (V, 3) pinholes.
+        origins: (V, 3) these points.
         levels: sizes, by how much they are shrunk: 1, 2, 4 ...
         channels: 3, or 4 with alpha.
     """
@@ -86,12 +132,12 @@ class RayBatches:
             with_alpha: keep alpha, for backgrounds that change; None: where all photographs have it.
 
         Raises:
-            MivolError: a lens with distortion, or no alpha where it is asked for.
+            MivolError: a lens that distorts the image plane, or no alpha where it is asked for.
         """
         if with_alpha is None:
             with_alpha = all(photo.alpha is not None for photo in photos)
         for photo in photos:
-            if photo.camera.distortion:
+            if photo.camera.distortion and not photo.camera.distortion.is_wide:
                 raise MivolError(f"{photo.name} was taken through a lens with distortion; rectify the photographs first.")
             if with_alpha and photo.alpha is None:
                 raise MivolError(f"{photo.name} has no alpha; its background cannot be replaced: choose none.")
@@ -102,8 +148,9 @@ class RayBatches:
 
     @property
     def bytes(self) -> int:
-        """Memory that the pixels take."""
-        return sum(dr.width(pixels) for pixels in self._pixels())
+        """Memory that the pixels take, and the rays of wide lenses [bytes]."""
+        wide = sum(4 * dr.width(level.wide.directions) for level in self.levels.values() if level.wide is not None)
+        return sum(dr.width(pixels) for pixels in self._pixels()) + wide
 
     @property
     def behind(self) -> np.ndarray:
@@ -162,6 +209,9 @@ class RayBatches:
     def digest(self) -> str:
         """A fingerprint of cameras and pixels."""
         found = hashlib.sha256(np.array(self.lenses).tobytes())
+        for level in self.levels.values():
+            if level.wide is not None:
+                found.update(np.array(level.wide.directions).tobytes())
         for pixels in self._pixels():
             found.update(np.array(pixels).tobytes())
         return found.hexdigest()[:16]
@@ -171,7 +221,8 @@ class RayBatches:
         level = self.levels[shrink]
         table = np.stack([views, level.starts[views], level.sizes[views][:, 0]], axis=1).astype(np.uint32)
         view, start, width = (dr.gather(mi.UInt32, mi.UInt32(np.ascontiguousarray(table[:, k])), slot) for k in range(3))
-        pixel = start + row * width + column
+        within = row * width + column
+        pixel = start + within
         codes = [
             mi.Float(dr.gather(mi.UInt8, level.codes, pixel * self.channels + k)) * (1 / 255) for k in range(self.channels)
         ]
@@ -179,7 +230,11 @@ class RayBatches:
         lens = [dr.gather(mi.Float, self.lenses, view * LENS + k) for k in range(LENS)]
         x = ((mi.Float(column) + 0.5) * level.shrink - lens[2]) * lens[0]
         y = (lens[3] - (mi.Float(row) + 0.5) * level.shrink) * lens[1]
-        d = mi.Vector3f(*(dr.fma(lens[4 + 3 * a], x, dr.fma(lens[5 + 3 * a], y, -lens[6 + 3 * a])) for a in range(3)))
+        if level.wide is None:
+            d = mi.Vector3f(*(dr.fma(lens[4 + 3 * a], x, dr.fma(lens[5 + 3 * a], y, -lens[6 + 3 * a])) for a in range(3)))
+        else:
+            local = level.wide.turned(mi.Vector3f(x, y, -1), slot, views, within)
+            d = mi.Vector3f(*(dr.dot(mi.Vector3f(*lens[4 + 3 * a : 7 + 3 * a]), local) for a in range(3)))
         o = mi.Point3f(lens[13], lens[14], lens[15])
         alpha = codes[3] if self.channels == 4 else mi.Float(1)
         target, before = mi.Color3f(*codes[:3]), mi.Color3f(*lens[16:])
@@ -204,7 +259,9 @@ def _level(photos: Sequence[Photo], shrink: int, with_alpha: bool) -> Level:
     if counts.sum() * 4 >= 2**32:
         raise MivolError(f"{counts.sum()} pixels were given; they are counted up to 2^30: read the photographs smaller.")
     codes = np.concatenate([np.rint(image * 255).astype(np.uint8).reshape(-1) for image in images])
-    return Level(mi.UInt8(codes), _counted(photos, shrink), sizes, np.concatenate([[0], np.cumsum(counts)[:-1]]), shrink)
+    starts = np.concatenate([[0], np.cumsum(counts)[:-1]])
+    wide = WideRays.of([photo.camera for photo in photos], sizes, shrink)
+    return Level(mi.UInt8(codes), _counted(photos, shrink), sizes, starts, shrink, wide)
 
 
 def _counted(photos: Sequence[Photo], shrink: int) -> mi.UInt8 | None:

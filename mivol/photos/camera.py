@@ -14,8 +14,9 @@ import numpy as np
 
 from mivol.files.source import refusal
 from mivol.photos.lens import LARGEST_TERM, Lens, distort, undistort
+from mivol.photos.wide_lens import Fisheye, Panorama
 
-__all__ = ["Camera", "directions", "intrinsics", "pixel_centres", "project", "rays"]
+__all__ = ["Camera", "directions", "field_of_view", "intrinsics", "is_seen", "pixel_centres", "project", "rays"]
 
 PIXELS_LOST = 0.1
 """How far [pixel] a matrix that is not quite a rotation may move the corner of an image."""
@@ -32,7 +33,7 @@ class Camera:
         K: (3, 3) float64 [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] [pixel].
         size: (width, height) [pixel].
         to_world: (4, 4) float64, camera to world; its rotation is made exact.
-        distortion: of the lens.
+        distortion: of the lens; a wide one has no image plane (:mod:`mivol.photos.wide_lens`).
         name: how refusals call it.
 
     Raises:
@@ -42,7 +43,7 @@ class Camera:
     K: np.ndarray
     size: tuple[int, int]
     to_world: np.ndarray
-    distortion: Lens = field(default_factory=Lens)
+    distortion: Lens | Fisheye | Panorama = field(default_factory=Lens)
     name: str = "camera"
 
     def __post_init__(self) -> None:
@@ -82,13 +83,40 @@ def pixel_centres(size: tuple[int, int]) -> np.ndarray:
 def directions(camera: Camera, pixels: np.ndarray) -> np.ndarray:
     """Unit directions (..., 3) in the camera's frame of points (..., 2) of the image; the lens is traced exactly.
 
+    Where a wide lens shows nothing (:func:`is_seen`), those at the rim of its image.
+
     Raises:
         MivolError: a lens that folds back (:func:`mivol.photos.lens.undistort`).
     """
-    plane = (np.asarray(pixels, np.float64) - camera.K[:2, 2]) / camera.K[[0, 1], [0, 1]]
+    plane = _plane(camera, pixels)
+    if camera.distortion.is_wide:
+        return camera.distortion.direction(plane) * FLIP
     plane = undistort(camera.distortion, plane, camera.name)
     d = np.concatenate([plane, np.ones_like(plane[..., :1])], axis=-1) * FLIP
     return d / np.linalg.norm(d, axis=-1, keepdims=True)
+
+
+def is_seen(camera: Camera, pixels: np.ndarray) -> np.ndarray:
+    """(...) bool: whether points (..., 2) show a direction. The corners of a fisheye's image lie outside of its circle."""
+    if not camera.distortion.is_wide:
+        return np.ones(np.shape(pixels)[:-1], bool)
+    return camera.distortion.sees(_plane(camera, pixels))
+
+
+def field_of_view(camera: Camera) -> float:
+    """The angle [degree] that the middle row of the image sees, without distortion where the lens has an image plane."""
+    middle = camera.K[:2, 2]
+    ends = np.array([[0.0, middle[1]], [camera.size[0], middle[1]]])
+    if not camera.distortion.is_wide:
+        return float(np.degrees(np.abs(np.arctan(_plane(camera, ends)[:, 0])).sum()))
+    if isinstance(camera.distortion, Panorama):
+        return float(np.degrees(np.abs(_plane(camera, ends)[:, 0]).sum()))
+    return float(np.degrees(np.arccos(np.clip(camera.distortion.direction(_plane(camera, ends))[:, 2], -1, 1)).sum()))
+
+
+def _plane(camera: Camera, pixels: np.ndarray) -> np.ndarray:
+    """Points (..., 2) of the image in focal lengths from the principal point."""
+    return (np.asarray(pixels, np.float64) - camera.K[:2, 2]) / camera.K[[0, 1], [0, 1]]
 
 
 def rays(camera: Camera, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -117,9 +145,13 @@ def project(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 
     Returns:
         (..., 2) points (x, y) of the image [pixel], and the depth (...) along the view [length]; behind the camera the depth
-        is negative and the point of the image NaN, as it is beyond the fold of the lens.
+        is negative and the point of the image NaN, as it is beyond the fold of the lens. Of a wide lens the depth is the
+        distance, and the point NaN where the lens does not look.
     """
     local = (np.asarray(points, np.float64) - camera.origin) @ camera.to_world[:3, :3] * FLIP
+    if camera.distortion.is_wide:
+        at = camera.distortion.point(local) * camera.K[[0, 1], [0, 1]] + camera.K[:2, 2]
+        return at, np.linalg.norm(local, axis=-1)
     depth = local[..., 2]
     with np.errstate(divide="ignore", invalid="ignore"):
         plane = np.where(depth[..., None] > 0, local[..., :2] / depth[..., None], np.nan)

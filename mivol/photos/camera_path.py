@@ -1,7 +1,8 @@
 """Cameras for a film of what was photographed: around it, or from view to view.
 
-Conventions. Every camera of a path is a pinhole like the first of those given (its size and focal length, without
-distortion, its axis through the middle of the image). A turntable keeps the photographs' mean distance and elevation.
+Conventions. Every camera of a path is a pinhole like the first of those given: its size and focal length (or WIDE degrees,
+where its lens has no image plane), without distortion, its axis through the middle of the image. A turntable keeps the
+photographs' mean distance and elevation.
 """
 
 from __future__ import annotations
@@ -20,6 +21,9 @@ __all__ = ["between", "facing", "turntable"]
 
 ALL_ROUND = np.radians(90)
 """Cameras that leave no larger gap of azimuth than this go all the way round; others are swung between."""
+
+WIDE = 70.0
+"""Field of view [degree] of films of what wide lenses saw: that of a wide photograph, without the stretch of a wider one."""
 
 
 def facing(like: Camera, origin: np.ndarray, target: np.ndarray, up: np.ndarray, name: str = "camera") -> Camera:
@@ -82,6 +86,8 @@ def between(cameras: Sequence[Camera], n: int) -> list[Camera]:
 
 def _pinhole(like: Camera, pose: np.ndarray, name: str) -> Camera:
     f = float(like.K[[0, 1], [0, 1]].max())
+    if like.distortion.is_wide:
+        f = like.size[0] / 2 / np.tan(np.radians(WIDE) / 2)
     return Camera(intrinsics(f, f, like.size[0] / 2, like.size[1] / 2), like.size, pose, Lens(), name)
 
 

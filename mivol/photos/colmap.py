@@ -20,6 +20,7 @@ from mivol.files.source import read_bytes, reals, refusal
 from mivol.photos.camera import FLIP, Camera, intrinsics
 from mivol.photos.lens import Lens
 from mivol.photos.listing import Entry, Listing
+from mivol.photos.wide_lens import Fisheye
 
 __all__ = ["CAMERA_MODELS", "find_model", "read_colmap", "read_points3d", "rotation"]
 
@@ -35,6 +36,9 @@ CAMERA_MODELS: dict[str, tuple[str, ...]] = {
     "SIMPLE_RADIAL": ("f", "cx", "cy", "k1"),
     "RADIAL": ("f", "cx", "cy", "k1", "k2"),
     "OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"),
+    "OPENCV_FISHEYE": ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4"),
+    "SIMPLE_RADIAL_FISHEYE": ("f", "cx", "cy", "k1"),
+    "RADIAL_FISHEYE": ("f", "cx", "cy", "k1", "k2"),
 }
 
 
@@ -44,7 +48,7 @@ class Sensor:
 
     size: tuple[int, int]
     K: np.ndarray
-    lens: Lens
+    lens: Lens | Fisheye
 
 
 @dataclass(frozen=True)
@@ -70,7 +74,7 @@ def read_colmap(path: Path) -> Listing:
     Entries are sorted by name.
 
     Raises:
-        MivolError: a model without radial or pinhole form, a truncated file, text that is not numbers, an unknown camera.
+        MivolError: a camera model not in ``CAMERA_MODELS``, a truncated file, text that is not numbers, an unknown camera.
     """
     model = find_model(path)
     suffix = next(s for s in READERS if (model / f"cameras{s}").is_file() and (model / f"images{s}").is_file())
@@ -125,7 +129,8 @@ def _entry(base: Path, pose: Pose, sensors: dict[int, Sensor], file: Path) -> En
 def _sensor(path: Path, model: str, size: tuple[int, int], parameters: tuple[float, ...]) -> Sensor:
     named = dict(zip(_parameters(path, model), parameters, strict=True))
     fx, fy = named.get("fx", named.get("f")), named.get("fy", named.get("f"))
-    lens = Lens(**{key: value for key, value in named.items() if key in Lens.__dataclass_fields__})
+    kind = Fisheye if model.endswith("FISHEYE") else Lens
+    lens = kind(**{key: value for key, value in named.items() if key in kind.__dataclass_fields__})
     return Sensor(size, intrinsics(fx, fy, named["cx"], named["cy"]), lens)
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from mivol.errors import MivolError
 from mivol.files.source import refusal
 from mivol.machine import available_memory
-from mivol.photos.camera import Camera
+from mivol.photos.camera import Camera, is_seen, pixel_centres
 from mivol.photos.picture import read_mask, read_picture, shrink, space_of
 from mivol.photos.survey import Frame, PhotoSurvey, survey_photos
 from mivol.shown import briefly
@@ -209,6 +209,9 @@ def _photo(frame: Frame, scale: float, background: np.ndarray | None, space: str
         raise refusal(frame.file, "an image with alpha", "a background to put it over", 'set background="white", for instance')
     camera = _shrunk_camera(frame.camera, scale)
     mask = None if frame.mask is None else _read_mask(frame, camera.size)
+    seen = is_seen(camera, pixel_centres(camera.size))
+    if not seen.all():
+        mask = seen if mask is None else mask & seen
     image = shrink(image, camera.size)
     if alpha is not None:
         alpha = shrink(alpha, camera.size)

@@ -44,6 +44,8 @@ class Lens:
     p1: float = 0.0
     p2: float = 0.0
 
+    is_wide = False
+
     def __bool__(self) -> bool:
         """Whether it bends anything."""
         return any(astuple(self))

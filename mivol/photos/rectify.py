@@ -11,6 +11,7 @@ import dataclasses
 
 import numpy as np
 
+from mivol.files.source import refusal
 from mivol.photos.camera import Camera, intrinsics, pixel_centres
 from mivol.photos.dataset import Photo
 from mivol.photos.lens import Lens, distort
@@ -19,17 +20,26 @@ __all__ = ["pinhole_of", "rectified"]
 
 
 def pinhole_of(camera: Camera) -> Camera:
-    """The pinhole with square pixels that stands in for a camera."""
+    """The pinhole with square pixels that stands in for a camera.
+
+    Raises:
+        MivolError: a wide lens, which sees more than a pinhole.
+    """
+    if camera.distortion.is_wide:
+        found = f"a {type(camera.distortion).__name__.lower()}"
+        raise refusal(camera.name, found, "a lens with an image plane", "no pinhole sees what it sees: cut pinholes out of it")
     f = max(camera.K[0, 0], camera.K[1, 1])
     return dataclasses.replace(camera, K=intrinsics(f, f, *camera.K[:2, 2]), distortion=Lens())
 
 
 def rectified(photo: Photo) -> Photo:
-    """A photograph as the pinhole of its camera would have taken it; one of such a pinhole as it is.
+    """A photograph as the pinhole of its camera would have taken it; one of such a pinhole, or of a wide lens, as it is.
 
     Bias: the interpolation is a low-pass of up to a pixel's width.
     """
     camera = photo.camera
+    if camera.distortion.is_wide:
+        return photo
     pinhole = pinhole_of(camera)
     if not camera.distortion and camera.K[0, 0] == camera.K[1, 1]:
         return photo

@@ -11,7 +11,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from mivol.files.source import refusal
-from mivol.photos.camera import Camera, rays
+from mivol.photos.camera import Camera, is_seen, project, rays
+from mivol.photos.wide_lens import Panorama
 
 __all__ = ["box_of_points", "check_box", "check_views", "focus_of", "middle_box", "near_far_of", "shared_box", "views_seeing"]
 
@@ -29,12 +30,12 @@ PARALLEL = 1e-4
 
 
 def focus_of(cameras: Sequence[Camera], name: object = "cameras") -> np.ndarray:
-    """(3,) the point nearest to the axes of all cameras, by least squares.
+    """(3,) the point nearest to the axes of all cameras, by least squares; panoramas, which have none, look at their place.
 
     Raises:
         MivolError: axes that are parallel (or a single view), so that no point is nearest.
     """
-    across = [np.eye(3) - np.outer(c.forward, c.forward) for c in cameras]
+    across = [np.eye(3) - (0 if isinstance(c.distortion, Panorama) else np.outer(c.forward, c.forward)) for c in cameras]
     total = np.sum(across, axis=0)
     if np.linalg.eigvalsh(total)[0] < PARALLEL * len(cameras):
         raise refusal(name, "cameras that all look in one direction", "views that cross", "say where things are with box=")
@@ -132,9 +133,13 @@ def check_views(cameras: Sequence[Camera], box: np.ndarray) -> None:
 
 
 def views_seeing(cameras: Sequence[Camera], points: np.ndarray) -> np.ndarray:
-    """(N,) how many cameras see each of points (N, 3), distortion left out."""
+    """(N,) how many cameras see each of points (N, 3), distortion left out but for wide lenses."""
     count = np.zeros(len(points), int)
     for camera in cameras:
+        if camera.distortion.is_wide:
+            at, _ = project(camera, points)
+            count += ((at >= 0) & (at <= camera.size)).all(axis=1)
+            continue
         x, y, depth = camera.K @ np.diag([1.0, -1.0, -1.0]) @ camera.to_world[:3, :3].T @ (points - camera.origin).T
         inside = (x >= 0) & (x <= camera.size[0] * depth) & (y >= 0) & (y <= camera.size[1] * depth)
         count += inside & (depth > 0)
@@ -148,4 +153,4 @@ def _meets(camera: Camera, box: np.ndarray) -> bool:
     with np.errstate(divide="ignore", invalid="ignore"):
         t = (box[:, None, None] - o) / d
     first, last = np.nanmax(t.min(axis=0), axis=-1), np.nanmin(t.max(axis=0), axis=-1)
-    return bool(((first <= last) & (last > 0)).any())
+    return bool(((first <= last) & (last > 0) & is_seen(camera, pixels)).any())

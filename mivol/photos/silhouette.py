@@ -36,6 +36,9 @@ def silhouette_box(photos: Photos) -> np.ndarray:
     """
     if any(view.alpha is None for view in photos.views):
         raise refusal("silhouette_box", "images without alpha", "alpha in every view", "use the box of the cameras")
+    wide = next((view.name for view in photos.views if view.camera.distortion.is_wide), None)
+    if wide is not None:
+        raise refusal(wide, "a wide lens", "cameras with an image plane for a box about silhouettes", "give the box")
     box = photos.box
     for _ in range(2):
         step = (box[1] - box[0]) / CELLS

@@ -19,7 +19,7 @@ import numpy as np
 from mivol.errors import MivolError
 from mivol.files.source import refusal
 from mivol.photos import region
-from mivol.photos.camera import Camera
+from mivol.photos.camera import Camera, field_of_view
 from mivol.photos.colmap import find_model, read_colmap
 from mivol.photos.listing import UNLISTED, Entry, Listing
 from mivol.photos.picture import picture_size
@@ -88,11 +88,12 @@ class PhotoSurvey:
         cameras = [frame.camera for frame in self.frames]
         sizes = sorted({f"{c.size[0]} x {c.size[1]}" for c in cameras})
         focal = [c.K[0, 0] for c in cameras]
-        lens = "with distortion" if any(c.distortion for c in cameras) else "pinhole"
+        lens = " and ".join(sorted({_lens(c) for c in cameras}))
+        angle = _range([field_of_view(c) for c in cameras])
         counts = ", ".join(f"{n} {split}" for split in (*SPLITS, UNLISTED) if (n := sum(f.split == split for f in self.frames)))
         lines = [
             f"{self.path}: {self.format}, {len(cameras)} photographs ({counts}), {', '.join(sizes)} pixels, {lens}",
-            f"focal length {_range(focal)} pixels, horizontal field of view {_range([_angle(c) for c in cameras])} degrees",
+            f"focal length {_range(focal)} pixels, horizontal field of view {angle} degrees",
             f"box {_corner(self.box[0])} to {_corner(self.box[1])}, {self.box_from}",
             f"near {self.near_far[0]:.4g}, far {self.near_far[1]:.4g}",
         ]
@@ -223,9 +224,10 @@ def _range(values: Sequence[float]) -> str:
     return f"{low:.6g}" if high - low <= 1e-6 * high else f"{low:.6g} to {high:.6g}"
 
 
-def _angle(camera: Camera) -> float:
-    left, right = camera.K[0, 2], camera.size[0] - camera.K[0, 2]
-    return float(np.degrees(np.arctan(left / camera.K[0, 0]) + np.arctan(right / camera.K[0, 0])))
+def _lens(camera: Camera) -> str:
+    if camera.distortion.is_wide:
+        return type(camera.distortion).__name__.lower()
+    return "with distortion" if camera.distortion else "pinhole"
 
 
 def _corner(point: np.ndarray) -> str:

@@ -26,17 +26,28 @@ from mivol.photos.camera import Camera, intrinsics
 from mivol.photos.lens import Lens
 from mivol.photos.listing import UNLISTED, Entry, Listing
 from mivol.photos.picture import SUFFIXES
+from mivol.photos.wide_lens import Fisheye, Panorama
 
 __all__ = ["MODELS", "Settings", "read_blender", "read_transforms", "write_transforms"]
 
 #: files of a Blender data set -> split.
 SPLIT_FILES = {"transforms_train.json": "train", "transforms_val.json": "val", "transforms_test.json": "test"}
 
-#: camera_model -> whether its lens may bend.
-MODELS = {"OPENCV": True, "RADIAL": True, "SIMPLE_RADIAL": True, "PINHOLE": False, "SIMPLE_PINHOLE": False}
+BROWN = tuple(Lens.__dataclass_fields__)
+
+#: camera_model -> its lens, and the coefficients that it may have.
+MODELS: dict[str, tuple[type[Lens | Fisheye | Panorama], tuple[str, ...]]] = {
+    "OPENCV": (Lens, BROWN),
+    "RADIAL": (Lens, BROWN),
+    "SIMPLE_RADIAL": (Lens, BROWN),
+    "PINHOLE": (Lens, ()),
+    "SIMPLE_PINHOLE": (Lens, ()),
+    "OPENCV_FISHEYE": (Fisheye, ("k1", "k2", "k3", "k4")),
+    "EQUIRECTANGULAR": (Panorama, ()),
+}
 
 #: keys that say, if they are set, that a frame was taken by another kind of camera or while it moved.
-OTHER_CAMERAS = ("is_fisheye", "ftheta_p0", "latlong", "equirectangular", "orthographic", "rolling_shutter")
+OTHER_CAMERAS = ("ftheta_p0", "latlong", "equirectangular", "orthographic", "rolling_shutter")
 
 
 def read_blender(path: Path) -> Listing:
@@ -71,13 +82,19 @@ def write_transforms(path: Path, cameras: Mapping[str, Camera], test: Sequence[s
         test: which of the photographs are the test split.
 
     Raises:
-        MivolError: disk full, no such folder.
+        MivolError: disk full, no such folder, or lenses of several kinds.
     """
     frames = [{"file_path": name, **_described(camera)} for name, camera in cameras.items()]
-    table = {"camera_model": "OPENCV", "frames": frames}
+    models = {MODEL_OF[type(camera.distortion)] for camera in cameras.values()}
+    if len(models) > 1:
+        raise refusal(path, f"cameras of the kinds {', '.join(sorted(models))}", "one kind in a file", "write a file for each")
+    table = {"camera_model": models.pop() if models else "OPENCV", "frames": frames}
     if test:
         table |= {"train_filenames": [name for name in cameras if name not in test], "test_filenames": list(test)}
     write_whole_text(path, json.dumps(table, indent=1))
+
+
+MODEL_OF = {Lens: "OPENCV", Fisheye: "OPENCV_FISHEYE", Panorama: "EQUIRECTANGULAR"}
 
 
 def _described(camera: Camera) -> dict[str, Any]:
@@ -145,7 +162,9 @@ def _entry(file: Path, table: Mapping[str, Any], frame: Mapping[str, Any], numbe
     settings = Settings({**table, **frame}, f"{file.name} {name}")
 
     def camera(size: tuple[int, int]) -> Camera:
-        return Camera(settings.intrinsics(size), size, settings.matrix(), settings.lens(), settings.name)
+        lens = settings.lens()
+        K = settings.panorama(size) if isinstance(lens, Panorama) else settings.intrinsics(size)
+        return Camera(K, size, settings.matrix(), lens, settings.name)
 
     mask = settings.values.get("mask_path")
     if not isinstance(mask, str | None):
@@ -217,6 +236,16 @@ class Settings:
         fy = fx if fy is None else fy
         return intrinsics(fx, fy, self.number("cx", size[0] / 2), self.number("cy", size[1] / 2))
 
+    def panorama(self, size: tuple[int, int]) -> np.ndarray:
+        """(3, 3) K of an image of all directions: pixels a radian. Focal lengths that the file gives say nothing more.
+
+        Raises:
+            MivolError: an image that is not twice as wide as high.
+        """
+        if size[0] != 2 * size[1]:
+            raise refusal(self.name, f"a panorama of {size[0]} x {size[1]} pixels", "twice as wide as high", "crop nothing")
+        return intrinsics(size[0] / (2 * np.pi), size[1] / np.pi, size[0] / 2, size[1] / 2)
+
     def _focal(self, length: str, angle: str, pixels: int) -> float | None:
         if length in self.values:
             return self.number(length)
@@ -227,21 +256,24 @@ class Settings:
             raise refusal(self.name, f"{angle} = {radians:g}", "an angle between 0 and pi", "give it in radians")
         return 0.5 * pixels / float(np.tan(radians / 2))
 
-    def lens(self) -> Lens:
-        """The distortion.
+    def lens(self) -> Lens | Fisheye | Panorama:
+        """The lens. ``is_fisheye`` is instant-ngp's word for OPENCV_FISHEYE.
 
         Raises:
-            MivolError: a camera that is not a perspective one with polynomial distortion.
+            MivolError: a camera that is not in ``MODELS``, or coefficients that its lens has not.
         """
-        model = self.values.get("camera_model", "OPENCV")
+        model = self.values.get("camera_model", "OPENCV_FISHEYE" if self.values.get("is_fisheye") else "OPENCV")
         other = next((key for key in OTHER_CAMERAS if self.values.get(key)), None)
-        if model not in MODELS or other:
-            found = f"camera_model {model}" if model not in MODELS else f"{other} = {self.values[other]}"
+        if not isinstance(model, str) or model not in MODELS or other:
+            found = f"{other} = {self.values[other]}" if other else f"camera_model {model}"
             raise refusal(self.name, found, f"one of {', '.join(MODELS)}", "undistort the images first")
-        lens = Lens(**{key: self.number(key) for key in Lens.__dataclass_fields__})
-        if lens and not MODELS[model]:
-            raise refusal(self.name, f"a {model} with distortion", "OPENCV, or no distortion", "correct camera_model")
-        return lens
+        kind, terms = MODELS[model]
+        given = {key: self.number(key) for key in BROWN}
+        extra = next((key for key, value in given.items() if value and key not in terms), None)
+        if extra:
+            allowed = f"only {', '.join(terms)}" if terms else "no distortion"
+            raise refusal(self.name, f"a {model} with {extra} = {given[extra]:g}", allowed, "correct camera_model")
+        return kind(**{key: given[key] for key in terms})
 
     def matrix(self) -> np.ndarray:
         """``transform_matrix`` as it stands.

@@ -58,10 +58,11 @@ def plot_cameras(survey: PhotoSurvey, path: str | Path | None = None) -> Figure:
 
 
 def outline(frame: Frame, length: float) -> NDArray:
-    """(8, 2, 3) the edges of a camera's field of view, ``length`` long along its axis."""
+    """(8, 2, 3) the edges of a camera's field of view, ``length`` long along its axis; of a wide lens 90 degrees of it."""
     camera = frame.camera
     corners = np.array([[0, 0], [camera.size[0], 0], camera.size, [0, camera.size[1]]]) - camera.K[:2, 2]
-    local = np.column_stack([corners / camera.K[[0, 1], [0, 1]] * [1, -1], -np.ones(4)]) * length
+    across = np.sign(corners) if camera.distortion.is_wide else corners / camera.K[[0, 1], [0, 1]]
+    local = np.column_stack([across * [1, -1], -np.ones(4)]) * length
     ends = local @ camera.to_world[:3, :3].T + camera.origin
     sides = [(camera.origin, end) for end in ends]
     return np.array(sides + [(ends[i], ends[(i + 1) % 4]) for i in range(4)])

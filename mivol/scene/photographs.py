@@ -34,8 +34,9 @@ def sensor_of(camera: Camera, near_far: tuple[float, float] = (1e-2, 1e4), *, pi
     """
     (fx, _, cx), (_, fy, cy), _ = camera.K
     if camera.distortion or abs(fx / fy - 1) * max(camera.size) / 2 > PIXELS_LOST:
+        way = "cut pinholes out of it" if camera.distortion.is_wide else "resample it with mivol.photos.rectified"
         found = "a lens with distortion" if camera.distortion else f"focal lengths {fx:.6g} and {fy:.6g}"
-        raise refusal(camera.name, found, "a pinhole with square pixels", "resample it with mivol.photos.rectified")
+        raise refusal(camera.name, found, "a pinhole with square pixels", way)
     width, height = camera.size
     return {
         "type": "perspective",

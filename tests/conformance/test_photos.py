@@ -323,9 +323,7 @@ def test_written_cameras_are_read_the_same(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"camera_model": "OPENCV_FISHEYE"}, "found camera_model OPENCV_FISHEYE, expected one of OPENCV"),
-        ({"is_fisheye": True}, "found is_fisheye"),
-        ({"camera_model": "PINHOLE", "k1": 0.1}, "a PINHOLE with distortion"),
+        ({"camera_model": "PINHOLE", "k1": 0.1}, "a PINHOLE with k1 = 0.1, expected no distortion"),
         ({"k1": float("nan")}, "distortion"),
         ({"fl_x": "long"}, "fl_x = 'long'"),
         ({"fl_x": 0}, "focal lengths 0"),
@@ -457,9 +455,9 @@ def test_colmap_need_not_tell_its_points(tmp_path: Path, encoding: str) -> None:
 
 
 @pytest.mark.parametrize("encoding", ["bin", "txt"])
-def test_colmap_fisheye_is_refused_by_name(tmp_path: Path, encoding: str) -> None:
-    with pytest.raises(MivolError, match="the camera model OPENCV_FISHEYE, expected one of SIMPLE_PINHOLE"):
-        load_photos(write_colmap(tmp_path / "set", "OPENCV_FISHEYE", encoding))
+def test_colmap_lenses_that_are_not_known_are_refused_by_name(tmp_path: Path, encoding: str) -> None:
+    with pytest.raises(MivolError, match="the camera model FULL_OPENCV, expected one of SIMPLE_PINHOLE"):
+        load_photos(write_colmap(tmp_path / "set", "FULL_OPENCV", encoding))
 
 
 @pytest.mark.parametrize(("file", "cut"), [("cameras.bin", 20), ("images.bin", 100), ("images.bin", 76), ("points3D.bin", 30)])
