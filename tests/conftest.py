@@ -54,6 +54,24 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
         metafunc.parametrize("seed", range(rounds))
 
 
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Mark as slow what ``slow_variants.txt`` names: tests that take long, of which a cheaper variant or a neighbour stays.
+
+    Raises:
+        pytest.UsageError: it names a test that its file does not have, so that a test which was renamed is not run by chance.
+    """
+    names = (ROOT / "tests" / "slow_variants.txt").read_text().splitlines()
+    listed, found, rounds = set(names), {item.nodeid for item in items}, config.getoption("--seeds")
+    for item in items:
+        if item.nodeid in listed:
+            item.add_marker(pytest.mark.slow)
+    whole = {item.nodeid.partition("::")[0] for item in items} if not any("::" in arg for arg in config.args) else set()
+    gone = next((name for name in names if name.partition("::")[0] in whole and name not in found), None)
+    if gone is not None and rounds == 1:
+        raise pytest.UsageError(f"tests/slow_variants.txt names {gone}, which is no test: write its new name, or take it out.")
+
+
 def pytest_collection_finish() -> None:
     """What the imports made is not garbage."""
     _collect_new_garbage()
