@@ -1,0 +1,140 @@
+"""What a fit of Gaussians leaves in its folder, from a problem that is made up: which views, which film, which numbers."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from mivol.experiments import gaussian_outputs as outputs
+from mivol.points import Gaussians
+from mivol.validate.images import Quality
+
+
+def cloud(n: int = 3) -> Gaussians:
+    """Opacities of 1/2, 3/4 and 1/4 in turn; axes of 1, 2 and 8, 4, 4 and 4, 3, 1 and 2."""
+    scales = np.array([[1.0, 2, 8], [4, 4, 4], [3, 1, 2]])[:n]
+    return Gaussians(
+        means=np.zeros((n, 3), np.float32),
+        log_scales=np.log(scales).astype(np.float32),
+        quaternions=np.tile(np.float32([1, 0, 0, 0]), (n, 1)),
+        opacity_logits=np.log([1.0, 3.0, 1 / 3][:n]).astype(np.float32),
+        harmonics=np.zeros((n, 4, 3), np.float32),
+    )
+
+
+def test_what_the_gaussians_take() -> None:
+    """Medians of the opacities, of the longest axes, and of these over the shortest ones."""
+    table = outputs.storage(cloud(), 3 * 2**19)
+    assert (table.title, table.head) == ("What was found", ("", ""))
+    assert table.rows == (
+        ("Gaussians", "3"),
+        ("harmonics", "degree 1"),
+        ("file", "1.50 MiB"),
+        ("opacity: median", "0.5"),
+        ("longest axis: median", "4"),
+        ("longest over shortest axis: median", "3"),
+    )
+
+
+def test_a_picture_stands_before_a_colour() -> None:
+    """A quarter of what is seen is the background; the splatter is that of the camera's size and low-pass filter."""
+    seen = np.zeros((2, 3, 4), np.float32)
+    seen[..., :3], seen[..., 3] = 0.5, 0.75
+    asked = []
+
+    def splatter_for(size: tuple, low_pass: float) -> SimpleNamespace:
+        asked.append((size, low_pass))
+        return SimpleNamespace(forward=lambda values, camera, derivatives: (seen, None) if not derivatives else None)
+
+    problem = SimpleNamespace(splatter_for=splatter_for, values=dict)
+    found = outputs.picture_of(problem, SimpleNamespace(size=(3, 2)), np.array([1.0, 0.0, 0.4]), 0.3)
+    np.testing.assert_allclose(found, np.broadcast_to([0.75, 0.5, 0.6], (2, 3, 3)), rtol=1e-6)
+    assert asked == [((3, 2), 0.3)]
+
+
+def fit_of(monkeypatch: pytest.MonkeyPatch, folder: Path, views: int, shown: int, frames: int) -> tuple:
+    """The outputs of a fit to so many views, what they ask of others, and the record."""
+    record = SimpleNamespace(results={}, images=[], tables=[], volumes=[])
+    run = SimpleNamespace(path=folder, record=record, written=[])
+    run.make = lambda *names: [(folder / name).mkdir() for name in names]
+    run.write_curves = lambda: run.written.append("curves")
+    show = SimpleNamespace(views=shown, frames=frames, metrics=("psnr", "ssim"))
+    watcher = SimpleNamespace(said=[], say=lambda lines: watcher.said.extend(lines), track=lambda items, what: iter(items))
+    task = SimpleNamespace(chosen=SimpleNamespace(show=show), watcher=watcher)
+    camera = SimpleNamespace(size=(1600, 1200))
+    photos = SimpleNamespace(
+        views=[SimpleNamespace(camera=camera, background=np.array([0.1, 0.2, 0.3]), name=f"{k}") for k in range(views)],
+        box="box",
+    )
+    plan = SimpleNamespace(low_pass=0.3, low_pass_at=lambda shrink: ("low pass at", shrink))
+    problem = SimpleNamespace(
+        cloud={name: getattr(cloud(), name) for name in outputs.Gaussians.__dataclass_fields__}, plan=plan
+    )
+    monkeypatch.setattr(outputs, "write_gaussians", lambda path, found: path.write_bytes(bytes(100)))
+    monkeypatch.setattr(outputs, "rectified", lambda photo: photo)
+    monkeypatch.setattr(outputs, "write_view", lambda path, photo, number, seen: [(photo.name, number, seen)])
+    monkeypatch.setattr(
+        outputs,
+        "compare",
+        lambda problem, judged, photo, metrics: (f"seen {photo.name}", Quality(photo.name, {metrics[0]: 20.0})),
+    )
+    monkeypatch.setattr(outputs, "named", lambda values: {f"held_out_{name}": value for name, value in values.items()})
+    fit = SimpleNamespace(problem=problem, next=77)
+    return outputs.GaussianOutputs(task, run, fit, photos, photos if shown else None), record, run, watcher
+
+
+@pytest.mark.parametrize(("views", "shown", "numbers"), [(7, 3, [0, 3, 6]), (2, 5, [0, 1]), (4, 1, [0])])
+def test_judged_views_are_spread_over_all(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, views: int, shown: int, numbers: list[int]
+) -> None:
+    """All are judged; as many as are asked for, from the first to the last, are kept beside their photographs."""
+    found, record, run, _ = fit_of(monkeypatch, tmp_path, views, shown, frames=0)
+    found.write()
+    assert record.images == [(f"{k}", k, f"seen {k}") for k in numbers]
+    assert record.results == {"views": views, "iterations": 77.0, "gaussians": 3.0, "held_out_psnr": pytest.approx(20.0)}
+    assert run.written == ["curves"] and record.tables[0].rows[2] == ("file", "0.00 MiB")
+    assert (tmp_path / "views").is_dir() and (tmp_path / "film").is_dir()
+
+
+@pytest.mark.parametrize("suffix", [".mp4", ".webp"])
+def test_a_film_is_made_of_small_pictures(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, suffix: str) -> None:
+    """Eight frames around the box, as bytes, four seconds long, filtered as the smaller picture asks; where it is no mp4 the
+    way to one is said. Without judged views nothing is judged."""
+    found, record, _, watcher = fit_of(monkeypatch, tmp_path, 2, 0, frames=8)
+    asked, films = [], []
+
+    def picture(problem: object, camera: object, behind: np.ndarray, low_pass: tuple) -> np.ndarray:
+        asked.append((camera.size, behind.tolist(), low_pass))
+        return np.array([[[-1.0, 0.5, 2.0]]])
+
+    monkeypatch.setattr(outputs, "film_suffix", lambda: suffix)
+    monkeypatch.setattr(outputs, "turntable", lambda cameras, box, count: cameras[:1] * count if box == "box" else None)
+    monkeypatch.setattr(outputs, "_small", lambda camera: SimpleNamespace(size=(400, 300)))
+    monkeypatch.setattr(outputs, "picture_of", picture)
+    monkeypatch.setattr(outputs, "write_video", lambda path, frames, fps: films.append((path, list(frames), fps)))
+    found.write()
+    ((path, frames, fps),) = films
+    assert path == tmp_path / f"film/turntable{suffix}" and fps == 2
+    assert len(frames) == 8 and frames[0].dtype == np.uint8 and frames[0].tolist() == [[[0, 128, 255]]]
+    assert asked == [((400, 300), [0.1, 0.2, 0.3], ("low pass at", 4.0))] * 8
+    (image,) = record.images
+    assert (image.path, image.role, image.caption) == (f"film/turntable{suffix}", "film", "8 views around the box")
+    assert watcher.said == ([] if suffix == ".mp4" else [outputs.WITHOUT_FFMPEG])
+    assert set(record.results) == {"views", "iterations", "gaussians"}
+
+
+def test_a_view_is_judged_as_a_pinhole_sees_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What a lens distorts is rectified, filtered as in the fit, and judged in the space of the photographs."""
+    photo = SimpleNamespace(camera="bent")
+    flat = SimpleNamespace(camera="flat", background="behind", image="image", mask="mask", name="name")
+    monkeypatch.setattr(outputs, "rectified", lambda given: flat if given is photo else None)
+    monkeypatch.setattr(outputs, "picture_of", lambda *asked: asked)
+    monkeypatch.setattr(outputs, "judge", lambda *given, **named: (given, named))
+    problem = SimpleNamespace(plan=SimpleNamespace(low_pass=0.3))
+    seen, (given, named) = outputs.compare(problem, SimpleNamespace(space="srgb"), photo, ("psnr",))
+    assert seen == (problem, "flat", "behind", 0.3)
+    assert given == (seen, "image")
+    assert named == {"space": "srgb", "mask": "mask", "metrics": ("psnr",), "name": "name"}
