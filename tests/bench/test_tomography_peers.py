@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import importlib.util
+import itertools
+import sys
 from collections.abc import Iterator
 from types import SimpleNamespace
 
@@ -125,3 +127,72 @@ def test_who_is_missing_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_the_table_in_markdown() -> None:
     found = {"few": {"a": peers.Curve([0.5], [1.0])}, "many": {"a": peers.Curve([0.1], [0.5])}}
     assert peers.rows(found) == ["| method | few | many |", "|---|---|---|", "| a | 0.5000 (1, 1.00 s) | 0.1000 (1, 0.50 s) |"]
+
+
+def sliced(views: int = 3) -> peers.Slice:
+    """A slice of 5 x 5 voxels seen by 9 pixels, its projections numbered."""
+    beam = ParallelBeam(np.arange(views) * np.pi / views, (1, 9))
+    return peers.Slice(beam, VoxelGrid((1, 5, 5)), np.arange(9.0 * views).reshape(views, 1, 9), None, np.ones((1, 5, 5)))
+
+
+def test_scikit_image_is_asked_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Rows of its images run against y, and its images are as wide as the detector: what is judged is the middle, turned."""
+    scan, asked = sliced(), []
+    sinogram, theta = scan.y[:, 0].T, [0.0, 60.0, 120.0]
+    image = np.arange(81.0).reshape(9, 9)
+
+    def iradon(given: np.ndarray, angles: np.ndarray, output_size: int) -> np.ndarray:
+        asked.append((given.tolist(), angles.round(9).tolist(), output_size))
+        return np.arange(25.0).reshape(5, 5)
+
+    def iradon_sart(given: np.ndarray, angles: np.ndarray, image: np.ndarray | None) -> np.ndarray:
+        asked.append((given.tolist(), angles.round(9).tolist(), None if image is None else image[0, 0]))
+        return np.arange(81.0).reshape(9, 9) + (0 if image is None else image[0, 0] + 100)
+
+    transform = SimpleNamespace(iradon=iradon, iradon_sart=iradon_sart)
+    monkeypatch.setitem(sys.modules, "skimage", SimpleNamespace(transform=transform))
+    monkeypatch.setitem(sys.modules, "skimage.transform", transform)
+    monkeypatch.setattr(peers, "timed", lambda scan, states, steps: (list(itertools.islice(states, min(steps, 2))), steps))
+    found = peers.scikit_image(scan)
+    (filtered, one), (swept, six) = found["scikit-image iradon"], found["scikit-image iradon_sart"]
+    assert (one, six, len(filtered), len(swept)) == (1, 6, 1, 2)
+    assert np.array_equal(filtered[0], np.arange(25.0).reshape(5, 5)[::-1])
+    assert np.array_equal(swept[0], image[::-1][2:7, 2:7]) and np.array_equal(swept[1], image[::-1][2:7, 2:7] + 100)
+    assert asked == [(sinogram.tolist(), theta, last) for last in (5, None, 0.0)]
+
+
+def test_astra_is_asked_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    """SART's iterations are views, and a sweep is all of them; what is below 0 is cut off where ours is; rows run against y."""
+    scan, ran, made = sliced(), [], []
+    geometry = ("parallel", 1.0, 9, scan.beam.angles.tolist())
+    image = np.arange(25.0).reshape(5, 5)
+
+    def project(kind: str, pitch: float, columns: int, angles: np.ndarray) -> tuple:
+        return kind, pitch, columns, angles.tolist()
+
+    astra = SimpleNamespace(
+        create_vol_geom=lambda rows, columns: ("volume", rows, columns),
+        create_proj_geom=project,
+        create_projector=lambda kind, beam, volume: ("projector", kind, beam, volume),
+        data2d=SimpleNamespace(
+            create=lambda kind, place, data: ("data", kind, place, np.asarray(data).tolist()), get=lambda target: image
+        ),
+        astra_dict=lambda name: {"type": name},
+        algorithm=SimpleNamespace(
+            create=lambda settings: made.append(settings) or len(made), run=lambda *asked: ran.append(asked)
+        ),
+    )
+    monkeypatch.setitem(sys.modules, "astra", astra)
+    monkeypatch.setattr(peers, "timed", lambda scan, states, steps: (next(states).tolist(), steps))
+    found = peers.astra_toolbox(scan)
+    steps = {"FBP": 1, "CGLS": 20, "SIRT": 60, "SART": 6}
+    assert found == {f"astra {name}": (image[::-1].tolist(), n) for name, n in steps.items()}
+    volume = ("volume", 5, 5)
+    common = {
+        "ProjectorId": ("projector", "linear", geometry, volume),
+        "ProjectionDataId": ("data", "-sino", geometry, scan.y[:, 0].tolist()),
+        "ReconstructionDataId": ("data", "-vol", volume, 0.0),
+    }
+    bounded = {"option": {"MinConstraint": 0.0}}
+    assert made == [{"type": name} | common | (bounded if name in ("SIRT", "SART") else {}) for name in steps]
+    assert ran == [(1, 1), (2, 1), (3, 1), (4, 3)]

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import mitsuba as mi
+import numpy as np
 import pytest
 from fit_scene import KEY
 from tiny_experiment import run
@@ -13,7 +15,9 @@ from tiny_experiment import run
 from mivol.errors import MivolError
 from mivol.experiments import validation
 from mivol.experiments.validation import DIFFERS, UNTRUSTED, Validation, validate_scene
+from mivol.optim.seeds import seed_of
 from mivol.scene.load import load_scene
+from mivol.validate.statistics import Significance, z_bound
 from mivol.validate.trust import Doubt
 
 FEW = Validation(spp=64, reference_spp=64, parameters=(KEY,))
@@ -72,9 +76,7 @@ def test_a_wrong_renderer_is_found(variant_rgb, scene: Path, monkeypatch: pytest
     assert not verdict.slopes[0].agrees
 
 
-def test_a_reference_that_cannot_be_trusted_decides_nothing(
-    variant_rgb, scene: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_reference_that_cannot_be_trusted_decides_nothing(variant_rgb, scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(validation, "trust", lambda scene, sensors: [Doubt("rotated", "the grid is turned.")])
     verdict = validate_scene(load_scene(scene), scene.parent / "a", Validation(spp=16, reference_spp=32))
     assert verdict.code == UNTRUSTED
@@ -87,3 +89,119 @@ def test_what_cannot_be_validated_is_refused(variant_rgb, scene: Path) -> None:
         Validation(spp=3)
     with pytest.raises(MivolError, match="no parameter"):
         validate_scene(load_scene(scene), scene.parent / "a", Validation(parameters=("cube.none",)))
+
+
+def slope(ours: float, bound: float = 0.5) -> validation.Slope:
+    """One whose central difference is 2."""
+    return validation.Slope("a.key", ours, 2.0, 0.126, 0.034, bound)
+
+
+def test_slopes_agree_within_their_bound() -> None:
+    assert [slope(x).agrees for x in (1.5, 2.5, 1.49, 2.51)] == [True, True, False, False]
+    assert slope(2.5).text == (
+        "The derivative by a.key along a random direction agrees with central differences: +2.5 and +2, 0.13 of noise and "
+        "0.034 of the step's own."
+    )
+    assert "direction differs from central differences: -3 and +2" in slope(-3.0).text
+
+
+@pytest.mark.parametrize(
+    ("fatal", "image", "slopes", "code", "words"),
+    [
+        ((), True, (), 0, "mivol agrees with"),
+        ((False,), True, (2.0,), 0, "mivol agrees with"),
+        ((), False, (2.0,), 3, "mivol differs from"),
+        ((), True, (2.0, 3.0), 3, "mivol differs from"),
+        ((False, True), True, (2.0,), 4, "so nothing is decided"),
+        ((True,), False, (3.0,), 4, "so nothing is decided"),
+    ],
+)
+def test_a_verdict_is_that_of_all_its_parts(fatal: tuple, image: bool, slopes: tuple, code: int, words: str) -> None:
+    """What cannot be believed decides nothing; one part that differs is enough."""
+    doubts = tuple(SimpleNamespace(fatal=each, sentence="It is odd.") for each in fatal)
+    compared = SimpleNamespace(agrees=image, text="Images.")
+    found = validation.Verdict(compared, 0.0123456, tuple(map(slope, slopes)), doubts, (Path("a.json"), Path("b.png")))
+    assert found.code == code and words in found.words
+    assert found.text.splitlines() == [
+        *["Doubt: It is odd."] * len(fatal), "Images.", "relMSE 0.0123.", *(slope(x).text for x in slopes), found.words,
+        "a.json", "b.png",
+    ]  # fmt: skip
+
+
+def test_renders_are_independent(variant_rgb: str) -> None:
+    """16 renders with seeds of their own, of a sixteenth of the samples each, rounded up; no derivative is followed."""
+    asked = []
+
+    def render(scene: object, camera: object, seed: int, spp: int) -> np.ndarray:
+        asked.append((scene, camera, seed, spp))
+        return np.full((2, 2, 3), float(len(asked)))
+
+    found = validation.render_batches("scene", "camera", SimpleNamespace(render=render), Validation(spp=33, seed=5))
+    assert asked == [("scene", "camera", seed_of(5, validation.IMAGE, batch), 3) for batch in range(16)]
+    assert (found.n, float(found.mean[0, 0, 0])) == (16, 8.5)
+    assert float(found.variance[1, 1, 2]) == pytest.approx(np.var(np.arange(1, 17), ddof=1))
+
+
+def test_a_gradient_is_checked_by_differences(variant_rgb: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Derivatives of 6 -+ 1/10, differences of 0.1 -+ 0.01 of the step and 0.22 of twice the step: 5 and 5.5 of the slope; a
+    sixth of a half is what the step leaves out. Seeds and directions are their own."""
+    values, heard, put_back = np.array([0.0, 1.0, 2.0]), [], []
+    swing = iter(0.1 * (-1.0) ** k for k in range(16))
+    monkeypatch.setattr(validation.mi, "traverse", lambda scene: {"a.key": values})
+    monkeypatch.setattr(validation, "as_tensor", lambda value: value)
+    monkeypatch.setattr(validation, "put", lambda params, key, start: put_back.append((key, start.tolist())))
+
+    def slope_of(scene: object, camera: object, ours: object, key: str, direction: np.ndarray, spp: int, seeds: tuple) -> float:
+        heard.append(("slope", direction, spp, seeds))
+        return 6 + next(swing)
+
+    def difference(*asked: object) -> float:
+        *_, key, start, step, spp, seed = asked
+        heard.append((key, start.tolist(), step, spp, seed))
+        return 0.1 if len(heard) % 3 == 2 else 0.22
+
+    monkeypatch.setattr(validation, "slope_of", slope_of)
+    monkeypatch.setattr(validation, "difference", difference)
+    chosen = Validation(spp=33, seed=5, parameters=("a.key", "b"))
+    level = Significance(1e-3, 2)
+    found = validation.check_gradient("scene", "camera", "ours", "a.key", chosen, level)
+    direction = np.random.default_rng([5, 5]).uniform(0, 2, 3) * values
+    for batch in range(16):
+        seeds = [seed_of(5, validation.GRADIENT, batch, which) for which in range(4)]
+        (_, along, spp, pair), near, far = heard[3 * batch : 3 * batch + 3]
+        assert np.array_equal(along, direction) and (spp, pair) == (3, tuple(seeds[:2]))
+        assert near[:2] == far[:2] == ("a.key", [0.0, 1.0, 2.0]) and near[3:] == (3, seeds[2]) and far[3:] == (3, seeds[3])
+        np.testing.assert_allclose(near[2], 0.02 * direction)
+        np.testing.assert_allclose(far[2], 0.04 * direction)
+    assert put_back == [("a.key", [0.0, 1.0, 2.0])]
+    error = 0.1 * np.sqrt(16 / 15) / 4
+    assert (found.ours, found.differences, found.error) == pytest.approx((6, 5, error))
+    assert found.left_out == pytest.approx(0.5 / 3)
+    assert found.bound == pytest.approx(float(z_bound(level, 15.0)) * error + 0.5 / 3, rel=1e-6)
+    values[:] = 0
+    with pytest.raises(MivolError, match="a.key is 0 everywhere"):
+        validation.check_gradient("scene", "camera", "ours", "a.key", chosen, level)
+
+
+def test_every_parameter_is_checked_at_its_share_of_the_level(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(validation, "check_gradient", lambda *asked: asked[3:])
+    for names in ((), ("a", "b")):
+        chosen = Validation(parameters=names)
+        level = Significance(1e-3, max(len(names), 1))
+        assert validation.check_gradients("scene", "camera", "ours", chosen) == tuple((name, chosen, level) for name in names)
+
+
+def test_a_difference_is_half_of_both_sides(variant_rgb: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A step on, a step back with the same seed, and the values as they were."""
+    placed, asked = [], []
+    monkeypatch.setattr(validation.mi, "traverse", lambda scene: "params")
+    monkeypatch.setattr(validation, "put", lambda params, key, values: placed.append((params, key, values.tolist())))
+
+    def render(scene: object, camera: object, seed: int, spp: int) -> np.ndarray:
+        asked.append((seed, spp))
+        return np.array([[[7.0, 9.0]], [[1.0, 1.0]]][len(asked) - 1])
+
+    integrator = SimpleNamespace(render=render)
+    found = validation.difference("scene", "camera", integrator, "k", np.array([1.0, 2.0]), np.array([0.5, 0.25]), 4, 9)
+    assert found == 3.5 and asked == [(9, 4), (9, 4)]
+    assert placed == [("params", "k", values) for values in ([1.5, 2.25], [0.5, 1.75], [1.0, 2.0])]
