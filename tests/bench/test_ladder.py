@@ -5,10 +5,13 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import mitsuba as mi
 import numpy as np
 import pytest
+from bench_figures import drawn
+from report.looks import assert_recorded
 
 from mivol.bench import ladder
 from mivol.bench.ladder import BENCH, QUICK, RUNGS, climb
@@ -82,3 +85,56 @@ def test_every_rung_is_climbed(variant_rgb: str, tmp_path: Path) -> None:
     assert len(BENCH.compare("ladder", answer)) == 6
     BENCH.draw({"ladder": answer}, tmp_path)
     assert (tmp_path / "bench_ladder.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_rung_is_rendered_and_differentiated(variant_rgb: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its integrators at its depth; all pixels count in an image, and of a gradient the voxels from 1 on, over their mean
+    square; the picture is mivol's mean."""
+    values = np.array([0.5, 1.0, 2.0, 0.0]).reshape(1, 2, 2)
+    heard, asked = [], []
+    rung = replace(RUNGS["multiple scattering"], depth=7)
+    monkeypatch.setattr(ladder.Rung, "scene", lambda self, values, side: ("scene", side))
+    monkeypatch.setattr(ladder, "of_depth", lambda name, depth: (name, depth))
+    monkeypatch.setattr(ladder, "Subject", lambda scene, integrator: SimpleNamespace(of_mean=("step", scene, integrator)))
+    monkeypatch.setattr(ladder.mi, "render", lambda scene, **named: asked.append((scene, named)))
+    monkeypatch.setattr(ladder, "_race", lambda steps, size: steps)
+
+    def figures(timings: dict, size: object, counts: np.ndarray, scale: object) -> tuple:
+        heard.append((timings, counts.tolist(), scale(np.array([3.0, 5.0]))))
+        return {"figures": len(heard)}, np.arange(48.0)
+
+    monkeypatch.setattr(ladder, "_figures", figures)
+    image = ladder._image(rung, values, TINY)
+    assert np.array_equal(image.pop("picture"), np.arange(48.0).reshape(4, 4, 3)) and image == {"figures": 1}
+    assert ladder._gradient(rung, values, TINY) == {"figures": 2}
+    (steps, pixels, mean), (slopes, voxels, root) = heard
+    assert (pixels, mean, voxels, root) == ([True] * 48, 4, [False, True, True, False], pytest.approx(math.sqrt(17)))
+    assert list(steps) == ["mivol", "volpath"]
+    steps["volpath"](3, 5)
+    assert asked == [(("scene", 4), {"integrator": ("volpath", 7), "spp": 5, "seed": 3})]
+    assert slopes == {name: ("step", ("scene", 4), (name, 7)) for name in ("mivol", "prbvolpath")}
+
+
+def test_all_rungs_are_climbed_in_the_smoke(monkeypatch: pytest.MonkeyPatch) -> None:
+    found, said = type("Found", (), {"values": "values", "__str__": lambda self: "grid"})(), []
+    monkeypatch.setattr(ladder, "smoke", lambda: found)
+    monkeypatch.setattr(ladder, "_image", lambda rung, values, size: ("image", rung, values, size))
+    monkeypatch.setattr(ladder, "_gradient", lambda rung, values, size: ("gradient", rung, values, size))
+    monkeypatch.setattr(ladder, "said", lambda answer: answer["image"][1].depth)
+    monkeypatch.setattr(ladder, "say", said.append)
+    assert climb(TINY) == {"grid": "grid"} | {
+        name: {what: (what, rung, "values", TINY) for what in ("image", "gradient")} for name, rung in RUNGS.items()
+    }
+    assert said == [f"  {name}: {rung.depth}" for name, rung in RUNGS.items()]
+
+
+def test_a_figure_of_four_rungs(monkeypatch: pytest.MonkeyPatch, record: bool) -> None:
+    """Pictures up to their brightest hundredth, and errors of both methods where there are two."""
+    rows = lambda k: [{"seconds_median": t, "relative_error": k / t} for t in (0.5, 2.0)]  # noqa: E731
+    answer = {}
+    for k, (name, rung) in enumerate(RUNGS.items(), 1):
+        picture = np.linspace(-0.1, k, 48).reshape(4, 4, 3)
+        answer[name] = {"image": {"mivol": rows(k), "picture": picture}, "gradient": {"mivol": rows(2 * k)}}
+        if not rung.emits:
+            answer[name]["image"]["volpath"], answer[name]["gradient"]["prbvolpath"] = rows(3 * k), rows(4 * k)
+    assert_recorded("bench_ladder", drawn(ladder, monkeypatch, {"ladder": answer}, Path()), record)

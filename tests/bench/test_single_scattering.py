@@ -146,3 +146,115 @@ def test_a_difference_without_noise_is_beyond_every_bound() -> None:
     found = compare_means(Estimate(1.0, 0.0, 5.0), Estimate(2.0, 0.0, 5.0), 1)
     assert found["z"] is None
     assert found["percent"] == pytest.approx(-50)
+
+
+def test_renders_in_turns_have_seeds_of_their_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    """12 samples: 12, 3 and 1 (not 0) by level; seeds tell the size, the place of the integrator, the level and the round."""
+    asked, raced = [], []
+    monkeypatch.setattr(bench, "of_depth", lambda name, depth: (name, depth))
+    monkeypatch.setattr(bench.mi, "render", lambda scene, integrator, spp, seed: asked.append((scene, integrator, spp, seed)))
+    monkeypatch.setattr(bench, "race", lambda calls, rounds, keep: raced.append((rounds, keep)) or calls)
+    calls, spp = bench.render_in_turns("scene", replace(TINY, budget=Budget(spp=12), seed=2), (1, 4, 16), 6)
+    names = ("mivol", "volpath", "prbvolpath")
+    assert raced == [(6, True)]
+    assert spp == {(name, level): n for name in names for level, n in ((1, 12), (4, 3), (16, 1))}
+    for place, name in enumerate(names):
+        for level in (1, 4, 16):
+            calls[name, level](7)
+            assert asked.pop() == ("scene", (name, 6), spp[name, level], 20_000 + 1000 * place + 100 * level + 7)
+    bench.render_in_turns("scene", replace(TINY, budget=Budget(spp=12)), (1,))[0]["volpath", 1](0)
+    assert asked == [("scene", ("volpath", 2), 12, 1100)]
+
+
+def test_a_contest_in_a_sky(variant_rgb: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As wide as asked for, or as the light's picture; pixels that see an optical depth above 0.01; no picture is thinned."""
+    light = bench.LIGHTS["constant light"]._replace(side=6, depth=5)
+    tau = np.where(np.arange(36).reshape(6, 6) < 5, 0.01, 0.02)
+    heard, timings = [], {(name, k): f"{name} {k}" for name in (bench.OURS, *bench.STOCK) for k in (1, 4)}
+    monkeypatch.setattr(bench, "box_scene", lambda values, side, albedo, **parts: (values.max(), side, albedo, set(parts)))
+    monkeypatch.setattr(bench.mi, "load_dict", lambda parts: parts)
+    monkeypatch.setattr(bench, "optical_depths", lambda scene: tau)
+    monkeypatch.setattr(
+        bench, "render_in_turns", lambda *asked: heard.append(asked) or (timings, {key: 10 * key[1] for key in timings})
+    )
+    errors = lambda timing, counts, spp: {"errors of": timing, "pixels": int(counts.sum()), "n": spp}  # noqa: E731
+    monkeypatch.setattr(bench, "errors", errors)
+    monkeypatch.setattr(bench, "gain", lambda slow, fast, counts: {"gain": (slow, fast, int(counts.sum()))})
+    monkeypatch.setattr(bench, "difference", lambda slow, fast, fair: {"z": (slow, fast, int(fair.sum()))})
+    found = bench.contend(fog(), light, TINY, (1, 4))
+    assert heard == [((fog().max(), 6, 0.75, set(light.parts())), TINY, (1, 4), 5)]
+    assert found == {
+        "pixels_that_count": 31,
+        **{
+            name: [{"spp": 10 * k, "errors of": f"{name} {k}", "pixels": 31, "n": 10 * k} for k in (1, 4)]
+            for name in (bench.OURS, *bench.STOCK)
+        },
+        **{
+            f"mivol over {name}": {"gain": (f"{name} 1", "mivol 1", 31), "z": (f"{name} 1", "mivol 1", 31)}
+            for name in bench.STOCK
+        },
+    }
+
+
+def test_errors_of_images() -> None:
+    """Pixels of 2, 4 and 0 that swing by 1, 2 and 0, and one of 100 that does not count: variances 4/3, 16/3 and 0."""
+    swing = np.array([-1.0, 1, -1, 1])
+    images = np.stack([2 + swing, 4 + 2 * swing, 0 * swing, 100 + 9 * swing], axis=1)[:, None]
+    found = bench.errors(fake(images, 2.0), np.array([[True, True, True, False]]), 5)
+    assert found["mean"] == pytest.approx(2)
+    assert found["variance_mean_over_pixels"] == pytest.approx(20 / 9)
+    assert found["variance_median_over_pixels"] == pytest.approx(4 / 3)
+    assert found["relative_error_mean_over_pixels"] == pytest.approx(math.sqrt(20 / 9) / 2)
+    assert found["relative_error_median_over_pixels"] == pytest.approx(math.sqrt(4 / 3) / 2)
+    assert found["samples_per_second_median"] == 10
+
+
+def test_pixels_without_light_in_the_other_count_as_nothing() -> None:
+    """Of three pixels one never saw light in the other's images, one in neither: ratios of 0 and 4, whose median is 2."""
+    swing = np.array([-1.0, 1, -1, 1])
+    slow = np.stack([0 * swing, 2 * swing, 0 * swing], axis=1)[:, None]
+    fast = np.stack([swing, swing, 0 * swing], axis=1)[:, None]
+    got = bench.gain(fake(slow), fake(fast), np.ones((1, 3), bool))
+    assert got["variance_x_time_median_over_pixels"] == 2
+    fast[:, 0, 0] = 0
+    slow[:, 0, 0] = swing
+    assert bench.gain(fake(slow), fake(fast), np.ones((1, 3), bool))["variance_x_time_median_over_pixels"] == math.inf
+
+
+def test_questions_about_volumes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Curves of the smoke only, all lights of each; a line a light."""
+    said = []
+    found = type("Found", (), {"values": "values", "__str__": lambda self: "grid"})()
+    monkeypatch.setattr(bench, "VOLUMES", {name: lambda size: found for name in ("smoke", "CT")})
+    monkeypatch.setattr(bench, "contend", lambda values, light, size, levels: (values, light, size, levels))
+    monkeypatch.setattr(bench, "said", lambda answer: f"{answer[3]}")
+    monkeypatch.setattr(bench, "say", said.append)
+    for volume, levels in (("smoke", TINY.levels), ("CT", (1,))):
+        answer = bench.ask(volume)(TINY)
+        assert answer == {"grid": "grid"} | {name: ("values", light, TINY, levels) for name, light in bench.LIGHTS.items()}
+        assert said[-4:] == [f"  {name}: {levels}" for name in bench.LIGHTS]
+
+
+def test_what_is_said_of_a_contest() -> None:
+    seen = {"mivol": 2.5e6, "volpath": 1e7, "prbvolpath": 1e5}
+    rates = {name: [{"samples_per_second_median": rate}] for name, rate in seen.items()}
+    gains = {
+        f"mivol over {name}": {
+            "variance_x_time_mean_over_pixels": 60.4, "variance_x_time_median_over_pixels": 12.6, "processor_time": 3.0,
+            "time": 2.0, "z": z, "relative_standard_error": 0.00123,
+        }
+        for name, z in (("volpath", 1.234), ("prbvolpath", -0.5))
+    }  # fmt: skip
+    assert bench.said(rates | gains) == (
+        "volpath 60x mean, 13x median, processor 1.50 (z +1.23, 1.2e-03); prbvolpath 60x mean, 13x median, processor 1.50 "
+        "(z -0.50, 1.2e-03); M samples/s: mivol 2.5, volpath 10, prbvolpath 0.1"
+    )
+
+
+def test_optical_depths_are_the_fourth_channel(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = []
+    monkeypatch.setattr(bench.mi, "load_dict", lambda parts: parts)
+    picture = np.arange(20.0).reshape(2, 2, 5)
+    monkeypatch.setattr(bench.mi, "render", lambda *given, **named: asked.append((given, named)) or picture)
+    assert bench.optical_depths("scene").tolist() == [[3, 8], [13, 18]]
+    assert asked == [(("scene",), {"integrator": {"type": "mivol", "max_depth": 1, "aovs": "tau"}, "spp": 64, "seed": 1})]
