@@ -107,14 +107,14 @@ def test_air_is_a_straight_line_through_both_edges() -> None:
 
 def test_light_that_is_noise_counts_nothing() -> None:
     """Three standard deviations are noise, a little more is light; without variance, or not finite, nothing is known."""
-    value = np.array([0.3, 0.3001, 2.0, np.nan, 0.5, 0.5, 0.5])
-    variance = np.array([0.01, 0.01, 0.04, 0.01, np.nan, 0.0, np.inf])
+    value = np.array([0.75, 0.7501, 2.0, np.nan, 0.5, 0.5, 0.5])
+    variance = np.array([0.0625, 0.0625, 0.04, 0.01, np.nan, 0.0, np.inf])
     y, weights = preprocess.line_integrals(Transmission(value, variance))
-    t = np.array([0.3001, 2.0])
+    t = np.array([0.7501, 2.0])
     np.testing.assert_allclose(y, [0, *-np.log(t), 0, 0, 0, 0], rtol=1e-14)
-    np.testing.assert_allclose(weights, [0, *(t**2 / [0.01, 0.04]), 0, 0, 0, 0], rtol=1e-14)
+    np.testing.assert_allclose(weights, [0, *(t**2 / [0.0625, 0.04]), 0, 0, 0, 0], rtol=1e-14)
     y, _ = preprocess.line_integrals(Transmission(value, variance), 2.0)
-    assert y[0] == pytest.approx(-np.log(0.3))
+    assert y[0] == pytest.approx(-np.log(0.75))
 
 
 def test_drift_is_a_weighted_line_in_time() -> None:
