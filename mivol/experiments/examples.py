@@ -43,6 +43,33 @@ class StandIn:
     shape: tuple[int, int, int]
     peak: float
 
+    says = "a procedural volume stands in for it"
+
+    def make(self, folder: Path) -> list[str]:
+        """Write the volume to a folder; the settings that name it."""
+        path = folder.resolve() / f"{self.data}.vol"
+        write_volume(path, make_procedural("tangle", self.shape, 2, self.peak))
+        return [f"{self.setting}={quoted(path)}"]
+
+
+@dataclass(frozen=True)
+class ComputedScan:
+    """What takes the place of a public scan: projections of ellipsoids, computed with noise from the experiment's seed.
+
+    Attributes:
+        data: name of the public set.
+        settings: of the experiment, in place of those of the file.
+    """
+
+    data: str
+    settings: tuple[str, ...]
+
+    says = "exact projections of a phantom, with noise, stand in for it"
+
+    def make(self, folder: Path) -> list[str]:
+        """The settings; nothing is written."""
+        return list(self.settings)
+
 
 @dataclass(frozen=True)
 class Example:
@@ -57,7 +84,7 @@ class Example:
     """
 
     says: str
-    stand_in: StandIn | None = None
+    stand_in: StandIn | ComputedScan | None = None
     photographs: str = ""
     folder: str = ""
     file: str = "fit.toml"
@@ -71,6 +98,21 @@ def _smoke(setting: str) -> StandIn:
     return StandIn("smoke", setting, (53, 45, 44), 1.8)
 
 
+_SLICES = ComputedScan(
+    "tooth_projections",
+    (
+        "scan.views=181",
+        "scan.detector=[2, 190]",
+        "scan.pitch=0.010526316",
+        'data={source="shepp_logan", scale=2.0, photons=1e5}',
+        "grid.shape=[2, 190, 190]",
+        "grid.voxel_size=0.010526316",
+        "solve.tv=0",
+        "solve.iterations=20",
+    ),
+)
+"""As many views as the tooth has and half as many columns; the head fills them."""
+
 EXAMPLES: dict[str, Example] = {
     "demo": Example("a tangle of absorbing matter from 16 pictures, about a minute"),
     "shepp_logan": Example("the head phantom of Shepp and Logan from cone-beam projections"),
@@ -81,7 +123,7 @@ EXAMPLES: dict[str, Example] = {
     "smoke": Example("an absorbing smoke from 16 pictures", _smoke("truth.file")),
     "white_smoke": Example("a smoke that scatters, under a white sky", _smoke("truth.file")),
     "lamp": Example("where is the lamp, seen through a smoke that is known?", _smoke("scene.define.volume")),
-    "tooth": Example("a tooth from synchrotron projections (mivol fetch tooth_projections first)"),
+    "tooth": Example("a tooth from synchrotron projections", _SLICES),
     "cloud": Example("a cloud under sun and sky", StandIn("cloud", "truth.file", (26, 37, 32), 0.12)),
 }
 
@@ -167,13 +209,10 @@ def prepare(name: str, example: Example, source: Path, folder: Path, watcher: Wa
     if example.stand_in is None or find_data(example.stand_in.data) is not None:
         return []
     wanted = example.stand_in
-    path = folder.resolve() / f"{wanted.data}.vol"
-    write_volume(path, make_procedural("tangle", wanted.shape, 2, wanted.peak))
     watcher.say([
-        f'the public data set "{wanted.data}" is not on this machine: a procedural volume stands in for it '
-        f"(mivol fetch {wanted.data} brings it)"
+        f'the public data set "{wanted.data}" is not on this machine: {wanted.says} (mivol fetch {wanted.data} brings it)'
     ])  # fmt: skip
-    return [f"{wanted.setting}={quoted(path)}"]
+    return wanted.make(folder)
 
 
 def quoted(path: Path) -> str:

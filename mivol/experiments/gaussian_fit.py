@@ -12,6 +12,7 @@ from pathlib import Path
 from mivol import config
 from mivol.config import GaussianFit
 from mivol.experiments.back_end import choose_back_end
+from mivol.experiments.best import BestIterate, FilesOfBest
 from mivol.experiments.gaussian_outputs import GaussianOutputs, compare
 from mivol.experiments.gaussian_start import begin, make_gaussian_plan
 from mivol.experiments.photo_data import boxed, notes, read_photos
@@ -19,6 +20,7 @@ from mivol.experiments.photo_fit import solve
 from mivol.experiments.run_folder import RunFolder
 from mivol.experiments.task import Task
 from mivol.optim.gaussian_problem import GaussianProblem
+from mivol.points import Gaussians, write_gaussians
 from mivol.report.page import write_page
 from mivol.report.record import RunRecord
 
@@ -45,12 +47,19 @@ def gaussian_fit(task: Task) -> Path:
         with run.stage("fit"):
             cameras = [view.camera for view in begun.views]
             problem = GaussianProblem(begun.batches, cameras, begun.cloud, begun.plan, chosen.seed)
-            fit = solve(task, run, problem, judged, compare)
+            best = BestIterate(run, best_files(problem))
+            fit = solve(task, run, problem, judged, best, compare)
         with run.stage("images and Gaussians"):
             GaussianOutputs(task, run, fit, photos, judged).write()
     page = write_page(task.folder)
-    task.watcher.say([run.summary()])
+    task.watcher.say([*best.says(), run.summary()])
     return page
+
+
+def best_files(problem: GaussianProblem) -> FilesOfBest:
+    """Where the best Gaussians lie beside the last ones."""
+    name = "gaussians_best.ply"
+    return FilesOfBest((name,), lambda folder: write_gaussians(folder / name, Gaussians(**problem.cloud)))
 
 
 def new_record(task: Task) -> RunRecord:

@@ -15,8 +15,9 @@ import numpy as np
 from mivol import config
 from mivol.config import FieldFit, PhotoFit
 from mivol.experiments.back_end import choose_back_end
+from mivol.experiments.best import BestIterate, FilesOfBest
 from mivol.experiments.photo_data import boxed, notes, read_photos
-from mivol.experiments.photo_outputs import PhotoOutputs, compare
+from mivol.experiments.photo_outputs import PhotoOutputs, compare, save_found
 from mivol.experiments.photo_plan import choices, make_plan, shrunk
 from mivol.experiments.run_folder import RunFolder
 from mivol.experiments.task import Task
@@ -50,11 +51,13 @@ def photo_fit(task: Task) -> Path:
             run.record.plan, run.record.notes = choices(plan, photos, batches), notes(photos, judged)
             task.watcher.say([photos.text, *(f"{one.choice}: {one.reason}" for one in run.record.plan)])
         with run.stage("fit"):
-            fit = solve(task, run, RadianceProblem(batches, photos.box, plan, chosen.seed), judged)
+            problem = RadianceProblem(batches, photos.box, plan, chosen.seed)
+            best = BestIterate(run, best_files(problem))
+            fit = solve(task, run, problem, judged, best)
         with run.stage("images and volumes"):
             PhotoOutputs(task, run, fit, photos, judged).write()
     page = write_page(task.folder)
-    task.watcher.say([run.summary()])
+    task.watcher.say([*best.says(), run.summary()])
     return page
 
 
@@ -71,15 +74,27 @@ def new_record(task: Task) -> RunRecord:
     )
 
 
+def best_files(problem: RadianceProblem) -> FilesOfBest:
+    """Where the best field lies beside the last one, with its sky where there is one."""
+    names = ("field_best.npz", *(["sky_best.exr"] if problem.sky is not None else []))
+    return FilesOfBest(names, lambda folder: save_found(folder, problem, "_best"))
+
+
 def solve(
-    task: Task, run: RunFolder, problem: Any, judged: Photos | None, compare: Callable[..., tuple[Any, Quality]] = compare
+    task: Task,
+    run: RunFolder,
+    problem: Any,
+    judged: Photos | None,
+    best: BestIterate,
+    compare: Callable[..., tuple[Any, Quality]] = compare,
 ) -> Fit:
-    """All steps, with metrics and checkpoints.
+    """All steps, with metrics and checkpoints; the best iterate is kept.
 
     Args:
         task, run: the experiment and its folder.
         problem: a :class:`RadianceProblem` or a :class:`~mivol.optim.gaussian_problem.GaussianProblem`.
         judged: what the curve shows; None for nothing.
+        best: the best iterate so far.
         compare: as :func:`mivol.experiments.photo_outputs.compare`, of that problem.
 
     Raises:
@@ -91,17 +106,21 @@ def solve(
         run.checkpoint, {"photos": problem.batches.digest(), **config.flat(config.resolved(chosen))}, task.resume
     )
     fit = begin_fit(problem, plan.optimiser, plan.course(Checkpoint(every=chosen.checkpoint_every)), store=store)
+    best.restore()
     run.begin(fit.next)
     with task.watcher.watch(plan.steps) as watch:
 
         def observe(fit: Fit) -> None:
             if fit.next % every == 0 or fit.next == plan.steps:
                 problem.set(fit.run.reals)
-                run.append(fit.next, fit.seconds, loss=fit.history[-1]["loss"], **judge_few(chosen, problem, judged, compare))
+                errors = judge_few(chosen, problem, judged, compare)
+                best.see(fit.next, errors)
+                run.append(fit.next, fit.seconds, loss=fit.history[-1]["loss"], **errors)
             watch(fit)
 
         fit.complete(observe)
-    run.record.notes += fit.log
+    best.settle()
+    run.record.notes += fit.log + best.says()
     return fit
 
 

@@ -57,9 +57,7 @@ class PhotoOutputs:
         """Write all, and put it and the results on record."""
         folder, record, field = self.run.path, self.run.record, self.problem.field
         self.run.make("views", "volumes", "film")
-        save_field(folder / "field.npz", field)
-        if self.problem.sky is not None:
-            write_exr(folder / "sky.exr", {"": self.problem.sky.image()})
+        save_found(folder, self.problem)
         record.tables = [storage(field, folder / "field.npz")]
         record.volumes += [write_density(folder, field.level(number), number) for number in range(field.levels)]
         record.results = {
@@ -106,6 +104,13 @@ class PhotoOutputs:
 
         write_video(self.run.path / path, frames(), fps=count / 4)
         return Image(path=path, role="film", caption=f"{count} views around the box")
+
+
+def save_found(folder: Path, problem: RadianceProblem, which: str = "") -> None:
+    """The field that a problem holds, and its sky where there is one, with a word in their names."""
+    save_field(folder / f"field{which}.npz", problem.field)
+    if problem.sky is not None:
+        write_exr(folder / f"sky{which}.exr", {"": problem.sky.image()})
 
 
 def compare(

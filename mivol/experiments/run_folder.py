@@ -7,6 +7,8 @@ What an earlier run recorded stays as it is until another one takes its first st
 
 from __future__ import annotations
 
+import os
+import shutil
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -24,6 +26,7 @@ from mivol.report.record import (
     RunRecord,
     append_metrics,
     read_metrics,
+    read_record,
     rewind_metrics,
     write_record,
 )
@@ -70,7 +73,7 @@ class RunFolder:
         """
         with locked(self.path):
             sweep(self.path)
-            if not (self.path / METRICS).exists():
+            if not self._holds_a_run():
                 self._write()
             try:
                 yield
@@ -96,16 +99,44 @@ class RunFolder:
             self._put_away()
         self._write()
 
+    def _holds_a_run(self) -> bool:
+        """Whether an earlier run has taken a step or has finished here, or was being put away when a process was killed."""
+        there = {name for name in KEPT if (self.path / name).exists()}
+        if there != {RECORD}:
+            return bool(there)
+        with suppress(MivolError):
+            return read_record(self.path).status == "finished"
+        return False
+
     def _put_away(self) -> None:
-        """Move what an earlier run recorded out of the way, so that the two are never mixed and neither is lost."""
-        there = [] if self._has_begun else [name for name in KEPT if (self.path / name).exists()]
-        if not there:
+        """Move what an earlier run recorded to ``earlier/``, so that the two are never mixed and neither is lost.
+
+        The run is in the folder or in ``earlier/`` as a whole whenever the process is killed: it is there twice (hard links,
+        where the file system knows them) before it goes here, its record first. Files without a record were put away before.
+        """
+        if self._has_begun:
             return
-        self.make(EARLIER)
-        for name in KEPT:
-            (self.path / EARLIER / name).unlink(missing_ok=True)
+        coming, going = self.path / f".{EARLIER}.coming", self.path / f".{EARLIER}.going"
+        for stale in (coming, going):
+            shutil.rmtree(stale, ignore_errors=True)
+        there = [name for name in KEPT if (self.path / name).exists()]
+        if RECORD in there:
+            self._copy_to_earlier(there, coming, going)
         for name in there:
-            (self.path / name).replace(self.path / EARLIER / name)
+            (self.path / name).unlink()
+
+    def _copy_to_earlier(self, names: list[str], coming: Path, going: Path) -> None:
+        """Make ``earlier/`` of these files in one rename, by way of two folders that are not there before or afterwards."""
+        coming.mkdir()
+        for name in names:
+            try:
+                os.link(self.path / name, coming / name)
+            except OSError:
+                shutil.copyfile(self.path / name, coming / name)
+        if (self.path / EARLIER).exists():
+            (self.path / EARLIER).rename(going)
+        coming.rename(self.path / EARLIER)
+        shutil.rmtree(going, ignore_errors=True)
 
     def _write(self) -> None:
         write_record(self.record, self.path)

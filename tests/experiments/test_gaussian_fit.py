@@ -11,6 +11,7 @@ import pytest
 
 from mivol import config
 from mivol.cli import main
+from mivol.experiments import photo_fit
 from mivol.experiments.gaussian_start import make_gaussian_plan
 from mivol.files import write_png
 from mivol.optim.gaussian_plan import PRESETS
@@ -97,6 +98,28 @@ def test_photographs_become_gaussians_and_a_page(photographs: Path, tmp_path: Pa
     rows = [json.loads(line) for line in (tmp_path / "run/metrics.jsonl").read_text().splitlines()]
     assert [row["iteration"] for row in rows] == [40, 80, 100]
     assert all({"loss", "held_out_psnr"} <= row.keys() for row in rows)
+
+
+@pytest.mark.slow
+def test_the_best_gaussians_are_kept_beside_the_last(
+    photographs: Path, tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Judged best in the middle: that cloud lies in gaussians_best.ply, which is said and noted."""
+    path, seen = toml(tmp_path, photographs), []
+
+    def judged(chosen: object, problem: GaussianProblem, *others: object) -> dict[str, float]:
+        seen.append(problem.cloud["means"].copy())
+        return {"few_psnr": {2: 25.0}.get(len(seen), 20.0)}
+
+    monkeypatch.setattr(photo_fit, "judge_few", judged)
+    assert main(["optimize", str(path), "-o", str(tmp_path / "run")]) == 0
+    assert len(seen) == 3
+    made = [read_gaussians(tmp_path / f"run/{name}.ply").means for name in ("gaussians_best", "gaussians")]
+    assert [np.array_equal(one, seen[number]) for one in made for number in (1, -1)] == [True, False, False, True]
+    risen, saved = capsys.readouterr().err.strip().splitlines()[-2:]
+    assert "was best at iteration 80, 25 dB, and is 20 dB at the end: gaussians_best.ply holds that iterate" in risen
+    assert risen in json.loads((tmp_path / "run/run.json").read_text())["notes"]
+    assert saved.startswith("saved: ")
 
 
 @pytest.mark.slow

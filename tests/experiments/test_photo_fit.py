@@ -141,6 +141,37 @@ def test_what_a_field_takes_is_told_in_bytes_a_node(tmp_path: Path, variant_rgb:
 
 
 @pytest.mark.slow
+def test_the_best_field_is_kept_beside_the_last(
+    photographs: Path, tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Judged best in the middle: that field lies in field_best.npz, which is said last but one and noted; the last line of
+    the console is what was saved."""
+    path, seen = toml(tmp_path, photographs), []
+
+    def judged(chosen: object, problem: RadianceProblem, *others: object) -> dict[str, float]:
+        seen.append(problem.field.to_dense()[0])
+        return {"few_psnr": {2: 25.0}.get(len(seen), 20.0)}
+
+    monkeypatch.setattr(photo_fit, "judge_few", judged)
+    short = ["--set", "field.effort=0.1", "--set", "show.every=10"]
+    assert main(["optimize", str(path), "-o", str(tmp_path / "run"), *short]) == 0
+    assert len(seen) == 3
+
+    def nearest(name: str) -> int:
+        """Which look saw the field of a file; files hold it in fewer digits."""
+        found = load_field(tmp_path / f"run/{name}.npz").to_dense()[0]
+        return min(range(3), key=lambda i: np.abs(seen[i] - found).max() if seen[i].shape == found.shape else np.inf)
+
+    assert (nearest("field_best"), nearest("field")) == (1, 2)
+    record = json.loads((tmp_path / "run/run.json").read_text())
+    risen, saved = capsys.readouterr().err.strip().splitlines()[-2:]
+    assert "was best at iteration 20, 25 dB, and is 20 dB at the end: field_best.npz holds that iterate" in risen
+    assert risen in record["notes"]
+    assert saved.startswith("saved: ")
+    assert f"PSNR of the held-out views {record['results']['held_out_psnr']:.4g} dB" in saved
+
+
+@pytest.mark.slow
 def test_what_is_behind_is_learned(photographs: Path, tmp_path: Path) -> None:
     """Views over white, said to be over black: a sky finds the white, and is kept as an image beside the field."""
     path = toml(tmp_path, photographs)

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import errno
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from mivol.errors import MivolError
-from mivol.experiments.best import BestIterate
-from mivol.experiments.run_folder import EARLIER, RunFolder
+from mivol.experiments.best import BestIterate, FilesOfBest
+from mivol.experiments.run_folder import EARLIER, KEPT, RunFolder
 from mivol.files.atomic import whole_file
 from mivol.report.record import RunRecord, read_metrics, read_record
 
@@ -81,6 +85,90 @@ def test_curves_of_two_runs_are_never_mixed(tmp_path: Path) -> None:
     assert read_record(run.path / EARLIER).title == "a run"
 
 
+def contents(path: Path) -> dict[str, bytes]:
+    """The files of a folder."""
+    return {file.name: file.read_bytes() for file in path.glob("*") if file.is_file()}
+
+
+class Killed(BaseException):
+    """What no code is to catch."""
+
+
+@contextmanager
+def dying(at: int, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """No change of the disk is made any more from the one with this number on, as after a kill just before it."""
+    made = []
+
+    def counted(change):
+        def changes(*args: object, **named: object) -> object:
+            made.append(change)
+            if len(made) >= at:
+                raise Killed
+            return change(*args, **named)
+
+        return changes
+
+    with monkeypatch.context() as patched:
+        for name in ("link", "mkdir", "rename", "replace", "rmdir", "unlink"):
+            patched.setattr(os, name, counted(getattr(os, name)))
+        yield
+
+
+def refuse_links(source: Path, target: Path) -> None:
+    """What a file system says that knows no links."""
+    raise OSError(errno.EPERM, os.strerror(errno.EPERM), str(source))
+
+
+def begin_another(base: Path, at: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A run that is killed at a change of the disk, or is stopped by an error where there was none of that number."""
+    run = folder(base, "another")
+    with suppress(KeyError), dying(at, monkeypatch), run.at_work():
+        run.begin(0)
+        raise KeyError
+
+
+@pytest.mark.parametrize("has_links", [True, False])
+def test_a_kill_while_a_run_is_put_away_loses_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, has_links: bool) -> None:
+    """Before each change of the disk by the run that begins: the finished one is whole in its place or in earlier/, and the
+    run after that leaves it in earlier/. Rationale: files moved one by one are half here and half there, and the next run
+    took what was left here for all."""
+    if not has_links:
+        monkeypatch.setattr(os, "link", refuse_links)
+    for at in range(1, 100):
+        base = tmp_path / str(at)
+        finished(base)
+        run = finished(base)  # with one in earlier/ already
+        for name in ("checkpoint.npz", "best.npz", "report.html"):
+            (run.path / name).write_text(f"{name} of the finished run")
+        before = {name: (run.path / name).read_bytes() for name in KEPT}
+        try:
+            begin_another(base, at, monkeypatch)
+            break
+        except Killed:
+            pass
+        places = [contents(place) for place in (run.path, run.path / EARLIER)]
+        assert any(before.items() <= place.items() for place in places)
+        third = folder(base, "the third")
+        with third.at_work():
+            third.begin(0)
+            assert read_metrics(third.path) == []
+            assert read_record(third.path).title == "the third"
+        assert contents(run.path / EARLIER) == before
+        assert {path.name for path in run.path.iterdir()} == {"run.json", EARLIER}
+    assert at > 15
+
+
+def test_a_finished_run_without_a_curve_is_left_alone(tmp_path: Path) -> None:
+    """A closed formula takes no steps, and its record is one all the same."""
+    run = folder(tmp_path)
+    with run.at_work():
+        run.begin(0)
+    before = (run.path / "run.json").read_bytes()
+    with pytest.raises(MivolError), folder(tmp_path, "another").at_work():
+        raise MivolError("no such file")
+    assert (run.path / "run.json").read_bytes() == before
+
+
 def test_what_a_killed_run_was_writing_is_swept(tmp_path: Path) -> None:
     """Only names that mivol's writer gives, and the folders in it too; the user's own files are left."""
     run = folder(tmp_path)
@@ -122,6 +210,25 @@ def test_the_best_iterate_is_kept(tmp_path: Path) -> None:
     views.see(0, {"held_out_psnr": 20.0}, {})
     views.see(1, {"held_out_psnr": 25.0}, {})
     assert views.is_newest
+
+
+def test_the_best_iterate_may_be_files(tmp_path: Path) -> None:
+    """Of a field: its files are those of the best iterate, are named where the fit has become worse, else go."""
+    run, now = folder(tmp_path), {"iteration": 0}
+    files = FilesOfBest(("field_best.npz",), lambda where: (where / "field_best.npz").write_text(str(now["iteration"])))
+    best = BestIterate(run, files)
+    for iteration, error in enumerate([20.0, 25.0, 22.0]):
+        now["iteration"] = iteration
+        best.see(iteration, {"few_psnr": error})
+    best.settle()
+    assert (run.path / "field_best.npz").read_text() == "1"
+    assert best.says() == [
+        "PSNR of the same few held-out views was best at iteration 1, 25 dB, and is 22 dB at the end: "
+        "field_best.npz holds that iterate, all else is of the last."
+    ]
+    best.see(3, {"few_psnr": 26.0})
+    best.settle()
+    assert not (run.path / "field_best.npz").exists()
 
 
 def test_the_summary_is_what_was_recorded(tmp_path: Path) -> None:
