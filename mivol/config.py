@@ -299,6 +299,11 @@ class Solve(Section):
         Literal["length", "noise"],
         of("1", "noise: tv in parts of what balances the noise, delta of the mean value a voxel; both have no unit then"),
     ] = "length"
+    storage: Annotated[
+        Literal["auto", "walk", "matrix"],
+        of("1", "matrix: a layer's rows are stored (parallel beams, fans); auto: where they fit and it pays"),
+    ] = "auto"
+    memory: Annotated[float, of("GiB", "most that stored rows may take", gt=0)] = 1.0
     discrepancy: Annotated[float, of("1", "stop where the residual is so many times the noise; 0: never", ge=0)] = 0.0
 
     def __post_init__(self) -> None:

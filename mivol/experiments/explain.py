@@ -19,6 +19,7 @@ from mivol.experiments.photo_plan import choices, make_plan, shrunk
 from mivol.experiments.projections import beam_of, held_out_views, make_data, make_grid
 from mivol.experiments.references import camera_of, find_sensors, load_experiment_scene, read_references
 from mivol.experiments.scan_fit import make_problem as make_scan_problem
+from mivol.experiments.scan_storage import choose_storage
 from mivol.experiments.scene_fit import make_integrator
 from mivol.experiments.start import make_start
 from mivol.experiments.task import Task
@@ -106,7 +107,9 @@ def explain_scan_fit(chosen: Scan, base: Path, say: Say) -> Explanation:
         say(f"  data      {note}")
     held_out = held_out_views(chosen, views)
     say(f"  held out  {len(held_out)} views")
-    make_scan_problem(chosen, Projector(data.geometry, grid), data, held_out)
+    problem = make_scan_problem(chosen, Projector(data.geometry, grid), data, held_out)
+    storage = choose_storage(chosen.solve, problem.linear_problem.A).line
+    say(f"  {storage.choice}, because {storage.reason}")
     solver = METHODS[chosen.solve.name]
     return Explanation((f"  solver    {chosen.solve.name}, {chosen.solve.iterations} iterations: {solver.promises}",))
 

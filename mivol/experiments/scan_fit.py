@@ -18,6 +18,7 @@ from mivol.experiments.best import BestIterate
 from mivol.experiments.projections import Projections, beam_of, held_out_views, make_data, make_grid
 from mivol.experiments.run_folder import RunFolder
 from mivol.experiments.scan_outputs import write_best, write_outputs
+from mivol.experiments.scan_storage import choose_storage
 from mivol.experiments.task import Task
 from mivol.optim.checkpoint import Store
 from mivol.optim.course import Course
@@ -69,6 +70,9 @@ def scan_fit(task: Task) -> Path:
         with run.stage("solve"):
             problem = make_problem(chosen, projector, data, held_out)
             best = BestIterate(run)
+            storage = choose_storage(chosen.solve, problem.linear_problem.A)
+            run.record.plan.append(storage.line)
+            storage.apply(problem)
             state = solve(task, run, problem, data, best)
             residual = state.residual_norm / norm_of(problem.linear_problem)
             run.record.results = {"iterations": float(state.iteration), "residual": residual}

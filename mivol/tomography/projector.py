@@ -99,7 +99,7 @@ class Projector:
     def __matmul__(self, x: np.ndarray) -> np.ndarray:
         """Line integrals of ``x``: (Z, Y, X) gives (views, rows, cols), (voxels,) gives (rays,)."""
         x, flat = _as_array(x, self.grid.shape, "voxels")
-        y = np.array(self._project(mi.Float(aligned(x))))
+        y = self._project_array(x)
         return y if flat else y.reshape(self.projection_shape)
 
     @property
@@ -159,6 +159,14 @@ class Projector:
             return self.integrate(x)
 
         return project
+
+    def _project_array(self, x: np.ndarray) -> np.ndarray:
+        """``A x``, flat."""
+        return np.array(self._project(mi.Float(aligned(x))))
+
+    def _backproject_array(self, y: np.ndarray) -> np.ndarray:
+        """``A^T y``, flat."""
+        return np.array(self._backproject(mi.Float(aligned(y))))
 
     # -- Passes over the rays ---------------------------------------------------------------------------------------------
 
@@ -282,7 +290,7 @@ class Transpose:
     def __matmul__(self, y: np.ndarray) -> np.ndarray:
         """Back-projection of ``y``: (views, rows, cols) gives (Z, Y, X), (rays,) gives (voxels,)."""
         y, flat = _as_array(y, self.T.projection_shape, "rays")
-        x = np.array(self.T._backproject(mi.Float(aligned(y))))
+        x = self.T._backproject_array(y)
         return x if flat else x.reshape(self.T.grid.shape)
 
 

@@ -85,7 +85,7 @@ def test_steps_are_timed_and_judging_is_not(monkeypatch: pytest.MonkeyPatch) -> 
 
 def test_every_method_of_ours_runs_once_before_it_is_timed(monkeypatch: pytest.MonkeyPatch) -> None:
     """The warm run of each takes a step; ours begin at nothing but for the one that begins at the filtered back-projection,
-    of which what is below 0 is cut off; those that know a bound have it."""
+    of which what is below 0 is cut off; those that know a bound have it, and rows are stored for whom the choice says so."""
     asked = []
 
     class Method:
@@ -97,6 +97,12 @@ def test_every_method_of_ours_runs_once_before_it_is_timed(monkeypatch: pytest.M
             return iter([SimpleNamespace(x=np.array([-1.0, 2.0]))] * 99)
 
     monkeypatch.setattr(peers, "Projector", lambda beam, grid: (beam, grid))
+    monkeypatch.setattr(peers, "store", lambda walk: ("stored", *walk))
+    monkeypatch.setattr(
+        peers,
+        "choose_storage",
+        lambda wanted, walk: SimpleNamespace(is_stored=(wanted.name, wanted.iterations) in (("sart", 6), ("os-sart", 12))),
+    )
     monkeypatch.setattr(peers, "LeastSquares", lambda a, y, w, x0, nonnegative: (a, y, w, x0, nonnegative))
     monkeypatch.setattr(peers, "METHODS", {name: Method(name) for name in ("fbp", "cgls", "pcg", "sirt", "sart", "os-sart")})
     monkeypatch.setattr(peers, "timed", lambda scan, states, steps: (next(states).tolist(), steps))
@@ -106,7 +112,8 @@ def test_every_method_of_ours_runs_once_before_it_is_timed(monkeypatch: pytest.M
     twice = [name for name in ("fbp", "cgls", "pcg", "pcg", "sirt", "sart", "os-sart") for _ in range(2)]
     assert [name for name, _ in asked] == twice
     for place, (name, (*rest, start, bounded)) in enumerate(asked):
-        assert (rest, bounded) == ([("beam", "grid"), "y", "w"], name not in ("fbp", "cgls"))
+        a = ("stored", "beam", "grid") if "sart" in name else ("beam", "grid")
+        assert (rest, bounded) == ([a, "y", "w"], name not in ("fbp", "cgls"))
         assert (start is None) == (place not in (6, 7)) and (start is None or start.tolist() == [0, 2])
 
 

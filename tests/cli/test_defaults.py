@@ -84,7 +84,7 @@ DEFAULTS = {
     "config.Solve": {
         **{"name": "pcg", "start": "empty", "iterations": 20, "nonnegative": True, "subsets": 10},
         **{"relaxation": 1.0, "decay": 0.99, "window": "ram-lak", "cutoff": 1.0, "tv": 0.0, "delta": 0.001},
-        **{"tv_unit": "length", "discrepancy": 0.0},
+        **{"tv_unit": "length", "storage": "auto", "memory": 1.0, "discrepancy": 0.0},
     },
     "config.Stack": {
         **{"find_axis": True, "air": 0, "drift": 0, "saturation": math.inf},

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ from mivol.errors import MivolError
 from mivol.experiments import projections, readings
 from mivol.experiments.run_folder import RunFolder
 from mivol.experiments.scan_fit import make_problem
+from mivol.experiments.scan_storage import Storage, choose_storage
 from mivol.files import read_volume, write_volume
 from mivol.tomography.projector import Projector
 from mivol.validate.metrics import nrmse
@@ -206,6 +208,43 @@ def test_a_known_volume_is_projected_by_the_projector(variant_rgb, folder: Path)
     assert np.allclose(data.y, projections.Projector(data.geometry, grid) @ (2 * values[..., 0]))
 
 
+PARALLEL = 'scan={beam="parallel", views=12, detector=[12, 14], pitch=0.2}'
+
+
+def storage_of(folder: Path, **settings: object) -> Storage:
+    chosen = config.load(folder / "fit.toml", [PARALLEL, *(f"solve.{name}={value}" for name, value in settings.items())])
+    grid = projections.make_grid(chosen, folder)
+    return choose_storage(chosen.solve, Projector(projections.make_geometry(chosen, folder), grid))
+
+
+def test_rows_are_stored_where_they_fit_and_pay(variant_rgb, folder: Path) -> None:
+    """12 layers share the rows of 168 lines of 12 voxels: about 40 kB, which pay after two iterations."""
+    found = storage_of(folder, iterations=2)
+    assert found.is_stored
+    assert "shared by the 12 rows of the detector" in found.line.reason
+    assert re.match(r"0\.0\d+ MiB, of at most 1 GiB", found.line.reason)
+    assert not storage_of(folder, storage="walk").is_stored
+    too_large = storage_of(folder, memory=1e-6)
+    assert not too_large.is_stored
+    assert "of at most 1e-06 GiB (solve.memory)" in too_large.line.reason
+    too_few = storage_of(folder, iterations=1)
+    assert not too_few.is_stored
+    assert "1 iterations on 12 rows" in too_few.line.reason
+    assert storage_of(folder, iterations=1, name="sart").is_stored
+    assert not storage_of(folder, name="fbp").is_stored
+
+
+def test_stored_rows_find_what_the_walk_finds(variant_rgb, folder: Path) -> None:
+    """2e-6 a product, times 10 for each of 6 iterations of conjugate gradients; the record says which it was."""
+    found = {}
+    for storage in ("walk", "matrix"):
+        assert run(folder, "--set", PARALLEL, "--set", f"solve.storage={storage}", to=storage) == 0
+        found[storage] = read_volume(folder / storage / "volumes/reconstruction.npz").values
+        plan = json.loads((folder / storage / "run.json").read_text())["plan"]
+        assert any(line["choice"].startswith(f"storage: {'none' if storage == 'walk' else 'the exact'}") for line in plan)
+    assert np.abs(found["matrix"] - found["walk"]).max() < 6 * 10 * 2e-6 * found["walk"].max()
+
+
 def circle_table(views: int) -> np.ndarray:
     """The cone beam of SCAN as a table."""
     panels = projections.ConeBeam(np.arange(views) * 2 * np.pi / views, (1, 1), 6.0, 6.0, 0.2).panels()
@@ -365,6 +404,7 @@ REFUSED = {
     "source inside the object's axis": (["scan.source_to_axis=0"], "> 0"),
     "prior where none is used": (["solve.name=sirt", "solve.tv=1"], "prior"),
     "misspelt window": (["solve.window=han"], 'did you mean "hann"'),
+    "stored rows of a cone": (["solve.storage=matrix"], "solve.storage = matrix cannot be had: only the rays"),
     "filtered back-projection of a cone": (["solve.name=fbp"], "fdk is filtered"),
     "prior beside a direct method": (["solve.name=fdk", "solve.tv=1"], "prior"),
     "subsets beyond the views": (["solve.name=os-sart", "solve.subsets=99"], "99 subsets"),

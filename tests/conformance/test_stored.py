@@ -1,0 +1,145 @@
+"""Stored rows against the float64 twin of the projector, their transpose, their parts, and what they take."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import oracle_projector
+import pytest
+
+from mivol.errors import MivolError
+from mivol.optim.linear_problems import LeastSquares
+from mivol.optim.solvers import SOLVERS
+from mivol.tomography import slice_matrix
+from mivol.tomography.geometry import ConeBeam, ParallelBeam, VoxelGrid
+from mivol.tomography.projector import Projector
+from mivol.tomography.stored import bytes_to_store, is_worth_storing, store
+
+pytestmark = pytest.mark.usefixtures("two_threads")
+
+GRID = VoxelGrid((5, 7, 6), (0.5, 0.4, 0.6), centre=(0.2, -0.3, 0.1))
+ANGLES = np.array([0.0, 0.4, np.pi / 2, 2.5, 4.0])
+BEAMS = {
+    "parallel, rows between layers": ParallelBeam(ANGLES, (7, 9), (0.5, 0.45), axis_offset=0.13, detector_offset=(0.07, -0.2)),
+    "parallel, rows are layers": ParallelBeam(ANGLES, (5, 9), (0.6, 0.45), detector_offset=(0.1, 0.01)),
+    "fan": ConeBeam(ANGLES, (1, 9), 8.0, 13.0, 0.8, axis_offset=-0.2),
+    "fan, source inside": ConeBeam(ANGLES, (1, 9), 0.5, 3.0, 0.4),
+}
+GRIDS = {"anisotropic": GRID, "one voxel": VoxelGrid((1, 1, 1), 2.0), "narrow": VoxelGrid((3, 2, 9), 0.5)}
+
+
+def numbers(*shape: int, seed: int = 1) -> np.ndarray:
+    return np.random.default_rng(seed).normal(size=shape).astype(np.float32)
+
+
+@pytest.mark.parametrize("grid", GRIDS)
+@pytest.mark.parametrize("name", BEAMS)
+def test_stored_pair_is_the_float64_twin(name: str, grid: str) -> None:
+    """2e-6 of sum |A| |x| and |A|^T |y|, as the walk: float32 rounding of entries and of sums of about 20 terms."""
+    beam, grid = BEAMS[name], GRIDS[grid]
+    a, twin = store(Projector(beam, grid)), oracle_projector.system_matrix(beam, grid)
+    x, y = numbers(*grid.shape), numbers(*a.projection_shape, seed=2)
+    forward, backward = a @ x, a.T @ y
+    assert forward.shape == a.projection_shape
+    assert backward.shape == grid.shape
+    assert forward.dtype == backward.dtype == np.float32
+    assert np.abs(forward.ravel() - twin @ x.ravel().astype(float)).max() < 2e-6 * (twin @ np.abs(x.ravel())).max()
+    assert np.abs(backward.ravel() - twin.T @ y.ravel().astype(float)).max() < 2e-6 * (twin.T @ np.abs(y.ravel())).max()
+    assert np.abs(forward).max() > 0.1, "the rays hit the grid"
+
+
+def test_every_view_of_a_finer_grid_is_the_twin() -> None:
+    """Lines along centres and diagonals, and 12 directions between them, through 17^2 voxels; tolerance as above."""
+    grid = VoxelGrid((1, 17, 17))
+    beam = ParallelBeam(np.arange(16) * np.pi / 8, (1, 25))
+    a, twin = store(Projector(beam, grid)), oracle_projector.system_matrix(beam, grid)
+    x, y = np.abs(numbers(*grid.shape)), np.abs(numbers(*a.projection_shape, seed=2))
+    assert np.abs((a @ x).ravel() - twin @ x.ravel().astype(float)).max() < 2e-6 * (twin @ x.ravel()).max()
+    assert np.abs((a.T @ y).ravel() - twin.T @ y.ravel().astype(float)).max() < 2e-6 * (twin.T @ y.ravel()).max()
+
+
+def test_many_layers_are_multiplied_in_parts(seed: int) -> None:
+    """40 layers, of which 32 go at once, in blocks of one view: each layer is what it is alone."""
+    grid = VoxelGrid((40, 4, 3))
+    aside = {"detector_offset": (0.0, 0.1)}  # no line in the plane of a face
+    a = store(Projector(ParallelBeam(ANGLES, (40, 5), **aside), grid))
+    one = oracle_projector.system_matrix(ParallelBeam(ANGLES, (1, 5), **aside), VoxelGrid((1, 4, 3)))
+    x, y = numbers(40, 12, seed=seed), numbers(5, 40, 5, seed=seed + 1)
+    expected = (one @ x.T.astype(float)).reshape(5, 5, 40).transpose(0, 2, 1)
+    np.testing.assert_allclose(a @ x.reshape(grid.shape), expected, atol=2e-6 * np.abs(x).sum(1).max())
+    back = (one.T @ y.transpose(0, 2, 1).reshape(25, 40).astype(float)).T
+    np.testing.assert_allclose((a.T @ y).reshape(40, 12), back, atol=2e-6 * np.abs(y).sum((0, 2)).max())
+
+
+@pytest.mark.parametrize("block", [1, 1 << 19])
+def test_a_subset_is_the_rows_of_its_views(monkeypatch: pytest.MonkeyPatch, block: int) -> None:
+    """In any order, over the borders of blocks (a view each, or all in one), and a subset of a subset."""
+    monkeypatch.setattr(slice_matrix, "BLOCK", block)
+    a = store(Projector(BEAMS["parallel, rows between layers"], GRID))
+    x, y = numbers(*GRID.shape), numbers(3, 7, 9)
+    part = a.subset([4, 0, 1])
+    np.testing.assert_array_equal(part @ x, (a @ x)[[4, 0, 1]])
+    np.testing.assert_array_equal(part.subset([2]) @ x, (a @ x)[[1]])
+    spread = np.zeros(a.projection_shape, np.float32)
+    spread[[4, 0, 1]] = y
+    # Sums in another order: float32 rounding of 3 views of 63 rays.
+    np.testing.assert_allclose(part.T @ y, a.T @ spread, atol=2e-6 * np.abs(y).sum())
+
+
+def test_adjoint_identity(seed: int) -> None:
+    """|<A x, y> - <x, A^T y>| <= 1e-6 |A x| |y|, as the walk's."""
+    a = store(Projector(BEAMS["parallel, rows between layers"], GRID))
+    x, y = numbers(GRID.size, seed=seed), numbers(a.shape[0], seed=seed + 100)
+    ax, aty = (a @ x).astype(float), (a.T @ y).astype(float)
+    assert abs(ax @ y - x @ aty) <= 1e-6 * np.linalg.norm(ax) * np.linalg.norm(y)
+
+
+def test_tensors_go_through_the_stored_rows() -> None:
+    a = store(Projector(BEAMS["fan"], GRID))
+    x, y = numbers(*GRID.shape), numbers(*a.projection_shape)
+    tensor = mi.TensorXf(x)
+    dr.enable_grad(tensor)
+    projections = a.integrate(tensor)
+    np.testing.assert_array_equal(np.array(projections), a @ x)
+    dr.backward(dr.sum(projections * mi.TensorXf(y), axis=None))
+    np.testing.assert_array_equal(np.array(tensor.grad), a.T @ y)
+
+
+@pytest.mark.parametrize("name", ["sart", "pcg"])
+def test_a_solver_finds_what_it_finds_by_walking(name: str) -> None:
+    """Three iterations. Both operators err by 2e-6 at most; an iteration adds such an error, and none of them amplifies it by
+    more than the norm of a step, 1 for SART, and below 10 for CG on so few equations."""
+    beam, grid = ParallelBeam(np.arange(12) * np.pi / 12, (2, 13)), VoxelGrid((2, 9, 9))
+    walk = Projector(beam, grid)
+    b = walk @ np.abs(numbers(*grid.shape))
+    found = []
+    for a in (walk, store(walk)):
+        states = SOLVERS[name].run(LeastSquares(a, b, nonnegative=True))
+        found.append([next(states).x for _ in range(3)][-1])
+    assert np.abs(found[1] - found[0]).max() < 3 * 10 * 2e-6 * found[0].max()
+    assert found[0].max() > 0.5
+
+
+def test_what_storing_takes_is_counted_beforehand() -> None:
+    """An entry more or less where a line begins, ends, or meets the outermost rows: 8 a line of about 150 entries, 5 %."""
+    walk = Projector(ParallelBeam(0.03 + np.arange(20) * np.pi / 20, (3, 65)), VoxelGrid((3, 65, 65)))
+    stored = store(walk)
+    assert bytes_to_store(walk) == pytest.approx(stored.nbytes, rel=0.05)
+    nothing = Projector(BEAMS["parallel, rows are layers"], VoxelGrid((1, 1, 1), centre=(99.0, 99.0, 0.0)))
+    assert bytes_to_store(nothing) == 4 * 45
+
+
+def test_only_rays_in_layers_are_stored() -> None:
+    for beam in (ConeBeam(ANGLES, (2, 9), 8.0, 13.0), ConeBeam(ANGLES, (1, 9), 8.0, 13.0, detector_offset=(0.1, 0.0))):
+        walk = Projector(beam, GRID)
+        assert bytes_to_store(walk) is None
+        with pytest.raises(MivolError, match="rays that do not lie in layers"):
+            store(walk)
+
+
+def test_storing_pays_with_layers_iterations_and_subsets() -> None:
+    assert is_worth_storing(1, 24, False)
+    assert is_worth_storing(24, 1, False)
+    assert not is_worth_storing(1, 23, False)
+    assert is_worth_storing(1, 1, True)
