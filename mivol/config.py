@@ -382,6 +382,9 @@ class Field(Section):
         None
     )
     sky: Annotated[int | None, of("row", "of a map of what is behind the box, learned with the field; 0: none")] = None
+    exposure: Annotated[
+        bool | None, of("1", "gains of each photograph, left out where they agree; absent: the preset's (only capture)")
+    ] = None
     beta: Annotated[float | None, of("1", "asks rays to end in matter or to pass; absent: the preset's")] = None
 
     def __post_init__(self) -> None:

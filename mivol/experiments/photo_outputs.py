@@ -59,6 +59,8 @@ class PhotoOutputs:
         self.run.make("views", "volumes", "film")
         save_found(folder, self.problem)
         record.tables = [storage(field, folder / "field.npz")]
+        if self.problem.has_gains:
+            record.tables.append(table_of_gains([view.name for view in self.photos.views], self.problem.exposure.table()))
         record.volumes += [write_density(folder, field.level(number), number) for number in range(field.levels)]
         record.results = {
             "views": float(len(self.photos.views)),
@@ -138,6 +140,14 @@ def table_of_views(camera: Camera, found: Sequence[Quality], fitted: Sequence[fl
     rows.sort(key=lambda row: float(row[1]))
     width, height = camera.size
     return Table(title=f"Judged views, at {width} x {height} pixels, the worst first", head=head, rows=tuple(rows))
+
+
+def table_of_gains(names: Sequence[str], gains: NDArray) -> Table:
+    """By what the field's colours were multiplied for each photograph (photographs, 3), those far from 1 first."""
+    far = np.argsort(-np.abs(np.log(gains)).max(axis=1), kind="stable")
+    rows = [(names[k], *(f"{gain:.3f}" for gain in gains[k])) for k in far]
+    head = ("photograph", "red", "green", "blue")
+    return Table(title="Gains of the photographs: exposure and white balance", head=head, rows=tuple(rows))
 
 
 def named(values: dict[str, float]) -> dict[str, float]:

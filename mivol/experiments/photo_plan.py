@@ -14,6 +14,11 @@ from mivol.optim.strategy import nearest
 from mivol.photos import Photos
 from mivol.report.record import PlanLine
 
+GAINS = PlanLine(
+    choice="gains of each photograph, where they disagree",
+    reason="cameras that choose their exposure; after the first stage they are left out where photographs agree",
+)
+
 SMALLEST = 16
 """Shortest edge of a photograph that was made smaller [pixel]."""
 
@@ -28,7 +33,7 @@ def make_plan(chosen: FieldFit) -> FitPlan:
     if wanted.preset not in PRESETS:
         raise MivolError(f'field.preset = "{wanted.preset}" is unknown: {nearest(wanted.preset, list(PRESETS))}')
     plan = PRESETS[wanted.preset]
-    names = ("degree", "first_degree", "tv_density", "tv_sh", "sparsity", "matte", "sky", "beta")
+    names = ("degree", "first_degree", "tv_density", "tv_sh", "sparsity", "matte", "sky", "beta", "exposure")
     given = {name: getattr(wanted, name) for name in names}
     plan = replace(plan, **{name: value for name, value in given.items() if value is not None})
     stages = [replace(stage, steps=max(1, round(stage.steps * wanted.effort))) for stage in plan.stages]
@@ -78,6 +83,7 @@ def choices(plan: FitPlan, photos: Photos, batches: RayBatches) -> list[PlanLine
         ),
         PlanLine(choice=f"harmonics of degree {plan.degree}", reason=f"{(plan.degree + 1) ** 2} numbers a colour and node"),
         what_is_behind(plan, photos),
+        *[GAINS][: plan.exposure],
         PlanLine(choice=f"rays end at a transmittance of {plan.stop:g}", reason="what is left out is at most that share"),
         PlanLine(choice=memory_of(plan, box, batches), reason="counted before it is taken"),
     ]

@@ -72,6 +72,7 @@ class FitPlan:
         sky: rows of a map of what is behind the field, learned with it (:mod:`mivol.fields.sky`); 0: the photographs' colour.
         sky_rate: first learning rate of the sky [radiance]; it must lead, or the field fills the box with what is behind.
         sky_smooth: share of the way that a texel goes to its neighbours in a step, so that none stays as it began.
+        exposure: a gain for each channel of each photograph (:mod:`mivol.optim.exposure`), where they disagree.
         levels: nested boxes, each of twice the extent (:mod:`mivol.fields.spherical`).
         near: derivatives of what is nearer to a camera than so many medians of the cameras' distances from the box's middle go
             down with the square of the distance (Philip & Deschaintre 2023); 0: none do.
@@ -101,6 +102,7 @@ class FitPlan:
     sky: int = 0
     sky_rate: float = 0.1
     sky_smooth: float = 0.0
+    exposure: bool = False
     levels: int = 1
     near: float = 0.0
     random_background: bool = True
@@ -165,6 +167,7 @@ PRESETS: dict[str, FitPlan] = {
         sky_smooth=0.05,
         levels=5,
         near=1.0,
+        exposure=True,
     ),
     "gpu": FitPlan(
         (

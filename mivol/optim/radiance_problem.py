@@ -28,6 +28,7 @@ from mivol.fields.resampling import resample_field
 from mivol.fields.sky import TEXEL, Sky
 from mivol.fields.spherical import SphericalGrid, basis_size, is_covered, row_width
 from mivol.optim.decoupled_priors import Neighbours, Rows
+from mivol.optim.exposure import AGREE, RATE, Exposure
 from mivol.optim.problem import Reals, Refinement
 from mivol.optim.radiance_plan import FitPlan, place_grid
 from mivol.optim.ray_batches import RayBatch, RayBatches
@@ -48,6 +49,8 @@ class RadianceProblem:
         safe_point: called between the views that are asked what they see.
         field: what was found so far; a thin fog at first.
         sky: what was found behind it, where the plan asks for that.
+        exposure: gains of the photographs, where the plan asks for them.
+        has_gains: whether they are found; False, and all gains 1, from when photographs were seen to agree.
         stage: the stage at work.
 
     Example:
@@ -63,6 +66,8 @@ class RadianceProblem:
     safe_point: Callable[[], None] = lambda: None
     field: SphericalGrid = dataclasses.field(init=False)
     sky: Sky | None = dataclasses.field(init=False, default=None)
+    exposure: Exposure | None = dataclasses.field(init=False, default=None)
+    has_gains: bool = dataclasses.field(init=False, default=False)
     stage: int = dataclasses.field(init=False, default=0)
 
     def __post_init__(self) -> None:
@@ -76,6 +81,10 @@ class RadianceProblem:
             if self.batches.channels == 4:
                 raise MivolError("a sky was asked for and the photographs have alpha, which says what is behind: sky = 0.")
             self.sky = Sky.even(self.plan.sky, self.batches.median())
+        if self.plan.exposure:
+            if self.batches.channels == 4:
+                raise MivolError("gains were asked for and the photographs have alpha, as renders have: exposure = false.")
+            self.exposure, self.has_gains = Exposure.even(len(self.batches.origins)), True
         self.unit = float((self.box[1] - self.box[0]).max()) / 2
         distances = np.linalg.norm(self.batches.origins - self.box.mean(axis=0), axis=1)
         self.near = self.plan.near * float(np.median(distances))
@@ -93,13 +102,16 @@ class RadianceProblem:
     def values(self) -> Reals:
         """Field and sky as tensors."""
         sky = {} if self.sky is None else {"sky": mi.TensorXf(self.sky.texels, (dr.width(self.sky.texels) // TEXEL, TEXEL))}
-        return _tensors(self.field) | sky
+        gains = {} if self.exposure is None else {"exposure": self.exposure.tensor}
+        return _tensors(self.field) | sky | gains
 
     def set(self, reals: Reals) -> None:
         """Put values into the field and the sky."""
         self.field = _with_tensors(self.field, reals)
         if self.sky is not None:
             self.sky = self.sky.with_texels(reals["sky"].array)
+        if self.exposure is not None:
+            self.exposure = Exposure(reals["exposure"].array)
 
     # -- Loss and gradient --------------------------------------------------------------------------------------------
 
@@ -134,9 +146,12 @@ class RadianceProblem:
         behind = before if background is None else mi.Color3f(*(dr.opaque(mi.Float, float(c)) for c in background))
         behind = behind if self.sky is None else self.sky.seen(batch.rays.d)
         # Where a photograph was transparent, it shows what it is over: put what is behind there instead.
-        error = seen.colour + seen.T * behind - batch.target - (1 - batch.alpha) * (behind - before)
+        gain = self.exposure.of(batch.view) if self.has_gains else mi.Color3f(1)
+        shown = gain * (seen.colour + seen.T * behind)
+        error = shown - batch.target - (1 - batch.alpha) * (behind - before)
         error *= batch.counted
-        by = error * (2 / (3 * count))
+        by_shown = error * (2 / (3 * count))
+        by = by_shown * gain
         through = dr.dot(by, behind)
         if self.plan.beta > 0:
             # Bounded: at 0 and 1 the prior is satisfied, and its derivative infinite.
@@ -148,7 +163,12 @@ class RadianceProblem:
         dr.eval(source.slope)
         density, harmonics = fold(self.field, self._cells, source, batch.origins)
         slopes = {"density": self._stored(density), "harmonics": self._stored(harmonics)}
-        return loss, slopes if self.sky is None else slopes | {"sky": self.sky.slopes(batch.rays.d, by * seen.T)}
+        if self.sky is not None:
+            slopes["sky"] = self.sky.slopes(batch.rays.d, by * seen.T)
+        if self.exposure is not None:
+            by_log = by_shown * shown if self.has_gains else mi.Color3f(0)
+            slopes["exposure"] = self.exposure.slopes(batch.view, by_log)
+        return loss, slopes
 
     def _stored(self, slope: mi.Float) -> mi.Float:
         """Derivatives of the nodes that are stored: the last row of a sparse field is the vacuum around, and stays."""
@@ -161,7 +181,8 @@ class RadianceProblem:
         """Learning rates; those of the density count in half the longest edge of the box."""
         density, sh = self.plan.rates(iteration)
         sky = {} if self.sky is None else {"sky": self.plan.sky_rate * sh / self.plan.sh_rate}
-        return {"density": density / self.unit, "harmonics": sh} | sky
+        gains = {} if self.exposure is None else {"exposure": RATE * sh / self.plan.sh_rate}
+        return {"density": density / self.unit, "harmonics": sh} | sky | gains
 
     def after_step(self, reals: Reals, iteration: int) -> Reals:
         """Move values as the priors ask: by shares of the learning rate, fewer the more photographs there are."""
@@ -170,6 +191,8 @@ class RadianceProblem:
         for name, prior in self.plan.priors:
             if not prior.is_spatial:
                 arrays[name] = prior.apply(arrays[name], where[name])
+        if self.has_gains:
+            arrays["exposure"] = Exposure(arrays["exposure"]).pulled(self.rates(iteration)["exposure"]).logs
         # Evaluated here, or the neighbours that are read next would make the step be taken twice.
         if self.sky is not None and self.plan.sky_smooth:
             arrays["sky"] = self.sky.with_texels(arrays["sky"]).smoothed(self.plan.sky_smooth).texels
@@ -213,13 +236,23 @@ class RadianceProblem:
         shrink = max(old.res) / max(self.field.res)
         counts = self.field.res if old.levels == 1 else (old.levels, *self.field.res)
         nodes = " x ".join(str(n) for n in counts)
-        says = f"refined to {nodes} nodes, of which {self.field.rows - 1} are kept"
+        says = f"refined to {nodes} nodes, of which {self.field.rows - 1} are kept{self._compare_exposures(stage)}"
         return Refinement(
             self.values(),
             lambda tensors: tensors | _tensors(resampled(_with_tensors(old, tensors))),
             {"density": shrink, "harmonics": shrink},
             says,
         )
+
+    def _compare_exposures(self, stage: int) -> str:
+        """Leave out the gains of photographs that agree after the first stage; what was found, for the log."""
+        if not self.has_gains or stage != 1:
+            return ""
+        spread = self.exposure.spread
+        if spread < AGREE:
+            self.exposure, self.has_gains = Exposure.even(len(self.batches.origins)), False
+            return f"; photographs agree in exposure to {spread:.1%}, so gains are left out"
+        return f"; photographs differ in exposure by {spread:.0%}, so each has gains"
 
     def update_occupancy(self) -> None:
         """List the cells that hold anything: the others have neither light nor derivatives."""
@@ -245,15 +278,15 @@ class RadianceProblem:
     # -- On disk ------------------------------------------------------------------------------------------------------
 
     def pack(self, reals: Reals) -> dict[str, np.ndarray]:
-        """The stage, and the nodes that a sparse field has; makes the list of cells anew, as :meth:`unpack` does."""
+        """The stage, whether there are gains, the nodes of a sparse field; makes the list of cells anew, as :meth:`unpack`."""
         self.set(reals)
         self.update_occupancy()
         nodes = {} if self.field.nodes is None else {"nodes": np.array(self.field.nodes)}
-        return {"stage": np.array(self.stage), **nodes}
+        return {"stage": np.array(self.stage), "has_gains": np.array(self.has_gains), **nodes}
 
     def unpack(self, arrays: dict[str, np.ndarray], reals: Reals) -> None:
         """Go on from what :meth:`pack` gave; the plan, the batches and the box must be the same."""
-        self.stage = int(arrays["stage"])
+        self.stage, self.has_gains = int(arrays["stage"]), bool(arrays["has_gains"])
         place, degree = place_grid(self.box, self.plan.stages[self.stage].longest), self.plan.degree_at(self.stage)
         nodes = mi.UInt32(arrays["nodes"]) if "nodes" in arrays else None
         values = reals["density"].array, reals["harmonics"].array

@@ -92,6 +92,7 @@ class RayBatch:
         origins: (V, 3) pinholes of the chosen views.
         rays: in the world.
         slot: of each ray's view among the chosen ones.
+        view: of each ray's view among all.
         target: what the photograph shows.
         alpha: 1 where the photographs have none.
         before: the colour that the photograph lies over.
@@ -101,6 +102,7 @@ class RayBatch:
     origins: np.ndarray
     rays: RayBundle
     slot: mi.UInt32
+    view: mi.UInt32
     target: mi.Color3f
     alpha: mi.Float
     before: mi.Color3f
@@ -238,7 +240,7 @@ class RayBatches:
         o = mi.Point3f(lens[13], lens[14], lens[15])
         alpha = codes[3] if self.channels == 4 else mi.Float(1)
         target, before = mi.Color3f(*codes[:3]), mi.Color3f(*lens[16:])
-        return RayBatch(self.origins[views], RayBundle(o, dr.normalize(d)), slot, target, alpha, before, counted)
+        return RayBatch(self.origins[views], RayBundle(o, dr.normalize(d)), slot, view, target, alpha, before, counted)
 
 
 LENS = 19

@@ -1,0 +1,209 @@
+"""Gains of photographs: their derivatives by a formula, when they are left out, and what they are worth to a fit."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import capture_photos
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from ball_photos import BOX, PLAN
+
+from mivol import config
+from mivol.errors import MivolError
+from mivol.experiments.photo_outputs import table_of_gains
+from mivol.experiments.photo_plan import GAINS, choices, make_plan
+from mivol.optim import radiance_problem
+from mivol.optim.checkpoint import Store
+from mivol.optim.exposure import AGREE, PULL, RATE, Exposure
+from mivol.optim.field_view import render_view
+from mivol.optim.loop import begin_fit
+from mivol.optim.radiance_plan import PRESETS, FitPlan, Stage
+from mivol.optim.radiance_problem import RadianceProblem
+from mivol.optim.ray_batches import RayBatches
+from mivol.photos import Photo
+from mivol.transport.line_integrals.radiance_field import model_of, render
+from mivol.transport.line_integrals.radiance_source import bake
+
+MIDDLE = np.array([[-0.9] * 3, [0.9] * 3])
+"""About the ball of :mod:`capture_photos`."""
+
+SMALL = replace(PRESETS["capture"], stages=(Stage(8, 6, 1, 3, 8), Stage(16, 6, 1, 3, 8)))
+
+
+def logs_of(photographs: int, spread: float, seed: int = 3) -> np.ndarray:
+    """(photographs, 3) logarithms of a mean of 0 and a root mean square of ``spread``."""
+    logs = np.random.default_rng(seed).normal(size=(photographs, 3))
+    logs -= logs.mean(axis=0)
+    return np.float32(logs * spread / np.sqrt(np.mean(logs**2)))
+
+
+def problem_of(plan: FitPlan = SMALL, count: int = 5, uneven: float = 0.0) -> RadianceProblem:
+    return RadianceProblem(RayBatches.of(capture_photos.capture(count, uneven)), MIDDLE, plan)
+
+
+# -- Gains --------------------------------------------------------------------------------------------------------
+
+
+def test_gains_are_pulled_towards_1_and_have_a_mean_of_1(variant_rgb: str) -> None:
+    logs = np.random.default_rng(1).normal(size=(7, 3)).astype(np.float32)
+    found = Exposure(mi.Float(logs.ravel())).pulled(0.3)
+    wanted = (logs - logs.mean(axis=0)) * (1 - 0.3 * PULL)
+    # float32: a mean of seven numbers of up to 3, and two products: a few times 3 x 6e-8.
+    np.testing.assert_allclose(np.array(found.tensor), wanted, atol=1e-6)
+    np.testing.assert_allclose(found.table(), np.exp(wanted), atol=1e-5)
+    assert found.spread == pytest.approx(np.sqrt(np.mean(wanted**2)), rel=1e-6)
+    seen = np.array(found.of(mi.UInt32([6, 2]))).T
+    np.testing.assert_allclose(seen, np.exp(wanted[[6, 2]]), rtol=2e-6)
+    assert np.array_equal(Exposure.even(4).table(), np.ones((4, 3)))
+
+
+def test_derivatives_of_gains_are_those_of_the_squared_error(variant_rgb: str) -> None:
+    """(g s - t)^2, mean over rays and rgb, differentiated by log g in float64 from what the field shows."""
+    problem, logs = problem_of(), logs_of(5, 0.2)
+    problem.exposure = Exposure(mi.Float(logs.ravel()))
+    batch = problem.batches.draw(1, np.array([0, 2, 3]), 5, np.random.default_rng(2))
+    loss, slopes = problem.slopes(batch)
+    source = bake(problem.field, problem._cells, batch.origins, batch.slot)
+    seen = render(problem._cells, source, model_of(problem.field, problem.plan.stop), batch.rays)
+    shown = np.array(seen.colour + seen.T * problem.sky.seen(batch.rays.d), np.float64).T
+    view, target = np.array(batch.view), np.array(batch.target, np.float64).T
+    assert set(view) == {0, 2, 3}
+    error = np.exp(logs[view]) * shown - target
+    # float32 colours of about 1: errors of 1e-6 in a difference, and of a few 1e-7 in the mean over 80 rays of a view.
+    np.testing.assert_allclose(np.array(loss), np.mean(error**2, axis=1), atol=2e-6)
+    wanted = np.zeros((5, 3))
+    np.add.at(wanted, view, 2 / error.size * error * np.exp(logs[view]) * shown)
+    np.testing.assert_allclose(np.array(slopes["exposure"]).reshape(5, 3), wanted, atol=2e-6)
+    assert not wanted[[1, 4]].any() and np.abs(wanted[[0, 2, 3]]).min() > 1e-4
+
+
+def test_a_brighter_photograph_of_a_gain_says_the_same_of_the_field(variant_rgb: str) -> None:
+    """Targets and gains times g: errors are g times as large, and derivatives by the field and the sky g^2 times."""
+    problem, gain = problem_of(), 1.7
+    batch = problem.batches.draw(1, np.array([1, 4]), 6, np.random.default_rng(4))
+    _, before = problem.slopes(batch)
+    problem.exposure = Exposure(dr.full(mi.Float, np.log(gain), 15))
+    _, after = problem.slopes(replace(batch, target=batch.target * gain))
+    for name in ("density", "harmonics", "sky"):
+        wanted = gain**2 * np.array(before[name], np.float64)
+        # Sums of float32 numbers in another order: a few times 6e-8 of the largest.
+        np.testing.assert_allclose(np.array(after[name]), wanted, atol=1e-5 * np.abs(wanted).max())
+        assert np.abs(wanted).max() > 0
+
+
+# -- Whether there are any ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("spread", "said"),
+    [(0.9 * AGREE, "photographs agree in exposure to 3.6%, so gains are left out"), (1.1 * AGREE, "")],
+    ids=["agree", "differ"],
+)
+def test_gains_of_photographs_that_agree_are_left_out(variant_rgb: str, spread: float, said: str) -> None:
+    problem, logs = problem_of(replace(SMALL, stages=(*SMALL.stages, Stage(24, 2)))), logs_of(5, spread)
+    problem.exposure = Exposure(mi.Float(logs.ravel()))
+    refinement = problem.refine(1)
+    assert (said or "photographs differ in exposure by 4%, so each has gains") in refinement.says
+    assert problem.has_gains != bool(said)
+    np.testing.assert_array_equal(np.array(refinement.reals["exposure"]), 0 * logs if said else logs)
+    batch = problem.batches.draw(1, np.array([0, 2]), 5, np.random.default_rng(2))
+    slopes = np.array(problem.slopes(batch)[1]["exposure"])
+    assert slopes.shape == (15,) and slopes.any() != bool(said)
+    reals = problem.values() | {"exposure": mi.TensorXf(logs)}
+    pulled = np.array(problem.after_step(reals, 0)["exposure"])
+    wanted = logs if said else np.array(Exposure(mi.Float(logs.ravel())).pulled(RATE).tensor)
+    np.testing.assert_allclose(pulled, wanted, atol=1e-8)
+    problem.exposure = Exposure(mi.Float(logs.ravel()))
+    assert "exposure" not in problem.refine(2).says and problem.has_gains != bool(said)
+
+
+def test_gains_need_cameras(variant_rgb: str, photos: list[Photo]) -> None:
+    with pytest.raises(MivolError, match="photographs have alpha, as renders have: exposure = false"):
+        RadianceProblem(RayBatches.of(photos[:2], (1, 2)), BOX, replace(PLAN, exposure=True))
+
+
+def test_gains_are_what_the_preset_or_the_file_says() -> None:
+    def plan(preset: str, **settings: object) -> FitPlan:
+        field = config.Field(preset=preset, **settings)
+        return make_plan(type("Chosen", (), {"field": field}))
+
+    assert plan("capture").exposure and not plan("cpu").exposure
+    assert plan("cpu", exposure=True).exposure and not plan("capture", exposure=False).exposure
+    assert problem_rates_fall()
+
+
+def problem_rates_fall() -> bool:
+    """The rate of gains falls with that of the coefficients."""
+    return SMALL.rates(0)[1] == SMALL.sh_rate and RATE * SMALL.rates(SMALL.steps)[1] / SMALL.sh_rate == RATE * SMALL.last
+
+
+def test_a_plan_says_that_there_are_gains(variant_rgb: str) -> None:
+    shown = capture_photos.capture(3)
+    photos = type("Photos", (), {"views": shown, "box": MIDDLE, "survey": type("Survey", (), {"box_from": "as given"})})
+    batches = RayBatches.of(shown)
+    assert GAINS in choices(SMALL, photos, batches)
+    assert GAINS not in choices(replace(SMALL, exposure=False), photos, batches)
+
+
+def test_gains_are_shown_those_far_from_1_first() -> None:
+    table = table_of_gains(["a", "b", "c"], np.array([[1.0, 1.05, 1.0], [0.5, 1.0, 1.0], [1.0, 1.0, 1.3]]))
+    assert table.head == ("photograph", "red", "green", "blue")
+    assert table.rows == (("b", "0.500", "1.000", "1.000"), ("c", "1.000", "1.000", "1.300"), ("a", "1.000", "1.050", "1.000"))
+
+
+# -- Fits ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("agree", [1.0, 0.0], ids=["agree", "differ"])
+def test_a_fit_that_went_on_equals_one_that_did_not_stop(
+    one_thread, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, agree: float
+) -> None:
+    """To the last bit, before and after gains were left out."""
+    monkeypatch.setattr(radiance_problem, "AGREE", agree)
+    batches, path = RayBatches.of(capture_photos.capture(6, 0.3)), tmp_path / "checkpoint.npz"
+
+    def run(store: Store, until: int) -> object:
+        fit = begin_fit(RadianceProblem(batches, MIDDLE, plan), plan.optimiser, plan.course(), store=store)
+        while fit.next < until:
+            fit.advance()
+        return fit
+
+    plan = replace(SMALL, stages=(Stage(8, 10, 1, 3, 8), Stage(16, 10, 1, 3, 8)))
+    for stop in (7, 14):
+        whole = run(Store(path, {}), stop)
+        whole.save()
+        while whole.next < 20:
+            whole.advance()
+        resumed = run(Store(path, {}, resume=True), 20)
+        kept, found = whole.run.pack(), resumed.run.pack()
+        assert kept.keys() == found.keys() and all(np.array_equal(kept[name], found[name]) for name in kept)
+        assert whole.problem.has_gains == resumed.problem.has_gains == kept["reals/exposure"].any() == (agree == 0)
+        assert resumed.log == whole.log
+
+
+@pytest.mark.slow
+def test_gains_are_found_with_the_field(variant_rgb: str) -> None:
+    """Photographs whose gains are spread by exp(0.15): clipping at 1 and the pull take some of that back. Views that were not
+    fitted, of the mean exposure, have 0.54 of the error of a fit without gains; 0.75 allows for runs that differ by a tenth."""
+    plan = replace(PRESETS["capture"], stages=(Stage(16, 60, 1, 8, 32), Stage(32, 90, 1, 8, 32)))
+    gains = np.exp(0.15 * np.random.default_rng(7).normal(size=24))
+    errors = {}
+    for exposure in (False, True):
+        problem = problem_of(replace(plan, exposure=exposure), 24, 0.15)
+        fit = begin_fit(problem, plan.optimiser, replace(plan, exposure=exposure).course())
+        while not fit.is_done:
+            fit.advance()
+        problem.set(fit.run.reals)
+        mean = np.exp(np.mean(np.log(gains)))
+        others = capture_photos.cameras(30)[24:]
+        pairs = [(render_view(problem.field, one, problem.sky).image, mean * capture_photos.image_of(one)) for one in others]
+        errors[exposure] = np.mean([np.square(seen - wanted) for seen, wanted in pairs])
+    assert errors[True] < 0.75 * errors[False]
+    found = np.log(problem.exposure.table()).mean(axis=1)
+    assert np.corrcoef(found, np.log(gains))[0, 1] > 0.8  # 0.93 measured: what is clipped at 1 tells no gain
+    assert any("photographs differ in exposure by" in line for line in fit.log)
