@@ -222,6 +222,9 @@ def test_bars_of_scenes_and_of_paths() -> None:
     found = {1: {"z": 3.0, "z_bound": 4.0, "not_a_radiance": 0}, 2: {"z": -5.0, "z_bound": 4.0, "not_a_radiance": 2}}
     rows = BENCH.compare("trials", {"refusals": {"a": 1, "b": 2}, "trials": found | {3: {"refused": ["a"]}}})
     assert [(row["value"], row["met"]) for row in rows] == [(3, False), (2, False), (3.0, True), (5.0, False)]
+    almost = {"refusals": {"a": 1}, "trials": {1: found[1] | {"not_a_radiance": 1}}}
+    assert [row["met"] for row in BENCH.compare("trials", almost)] == [False, False, True]
+    assert not BENCH.compare("hard", {"a": {"not_finite": 0, "negative": 1}})[0]["met"]
     faults = {"a": {"not_finite": 1, "negative": 2}, "b": {"not_finite": 0, "negative": 0}}
     assert [(row["value"], row["met"]) for row in BENCH.compare("hard", faults)] == [(3, False), (0, True)]
 

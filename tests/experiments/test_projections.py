@@ -1,0 +1,179 @@
+"""What projections are made of: beams, noise, readings, notes, number by number."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from mivol.config import Parallel
+from mivol.errors import MivolError
+from mivol.experiments import projections, readings
+from mivol.experiments.readings import ScanReadings, note_order, to_radians
+from mivol.optim.linear_problems import LeastSquares, PoissonCounts
+from mivol.tomography.preprocess import Quanta, Transmission
+from mivol.tomography.rotation_axis import Axis
+
+
+@pytest.mark.parametrize(("every", "count", "wanted"), [(0, 9, []), (3, 9, [1, 4, 7]), (4, 9, [2, 6]), (2, 3, [1])])
+def test_views_are_held_out_from_the_middle_of_each_step_on(every: int, count: int, wanted: list[int]) -> None:
+    assert projections.held_out_views(SimpleNamespace(held_out_every=every), count).tolist() == wanted
+
+
+def test_some_views_must_be_fitted() -> None:
+    with pytest.raises(MivolError, match="held_out_every = 1 holds out all views"):
+        projections.held_out_views(SimpleNamespace(held_out_every=1), 9)
+
+
+def test_noise_is_that_of_counted_quanta() -> None:
+    """Poisson numbers from the seed; a pixel that counts none has weight 0; without quanta the projections are exact."""
+    exact, truth = np.array([[[0.1, 1.0, 40.0]], [[0.0, 2.0, 3.0]]]), np.zeros(2)
+    found = projections.add_noise("geometry", exact, truth, 50.0, 7)
+    counts = np.random.default_rng(7).poisson(50 * np.exp(-exact))
+    assert counts[0, 0, 2] == 0 and (found.weights == counts).all() and found.is_noise_known
+    assert found.y[0, 0, 2] == 0
+    np.testing.assert_allclose(found.y[counts > 0], -np.log(counts[counts > 0] / 50), rtol=1e-14)
+    quanta = found.quanta
+    assert (quanta.counts == counts).all() and quanta.used.all() and quanta.used.shape == counts.shape
+    assert (quanta.blank, quanta.background, found.geometry) == (50.0, 0.0, "geometry") and found.truth is truth
+    still = projections.add_noise("geometry", exact, truth, 0.0, 7)
+    assert still.y is exact and (still.weights == 1).all() and still.quanta is None and not still.is_noise_known
+
+
+def test_a_digest_is_that_of_projections_and_weights() -> None:
+    one = projections.Projections("g", np.arange(3.0), np.ones(3))
+    assert one.digest() == projections.Projections("h", np.arange(3.0), np.ones(3)).digest()
+    assert one.digest() != projections.Projections("g", np.ones(3), np.arange(3.0)).digest()
+
+
+class FakeGrid:
+    """A grid of 2 x 3 x 4 voxels around (1, 2, 3)."""
+
+    shape, radius, centre = (2, 3, 4), 5.0, (1.0, 2.0, 3.0)
+
+
+@pytest.mark.parametrize(("views", "asked"), [(3, [0, 1, 2]), (15, [0, 2, 4, 6, 8, 10, 12, 14])])
+@pytest.mark.parametrize("seen", [0.0, 1.0])
+def test_some_ray_must_meet_the_grid(views: int, asked: list[int], seen: float) -> None:
+    """Up to eight views are looked at, from the first to the last."""
+    chosen = []
+
+    class Projector:
+        grid, n_views = FakeGrid, views
+
+        def subset(self, some: np.ndarray) -> Projector:
+            chosen.extend(some.tolist())
+            return self
+
+        def __matmul__(self, x: np.ndarray) -> np.ndarray:
+            assert x.shape == (2, 3, 4) and (x == 1).all()
+            return np.array([0.0, seen])
+
+    if seen:
+        projections.check_hits(Projector())
+    else:
+        with pytest.raises(MivolError, match=r"which reaches 5 from \(1.0, 2.0, 3.0\)"):
+            projections.check_hits(Projector())
+    assert chosen == asked
+
+
+def scan(**data: object) -> SimpleNamespace:
+    """The settings of a measured scan in parallel light of 2 x 3 pixels of 1 x 0.5."""
+    data = {"air": 0, "find_axis": False, "drift": 0, "saturation": 99.0} | data
+    beam = Parallel(views=2, detector=(2, 3), pitch=(1.0, 0.5), axis_offset=0.25)
+    return SimpleNamespace(data=SimpleNamespace(**data), scan=beam, solve=SimpleNamespace(name="pcg"))
+
+
+@pytest.fixture
+def measured(monkeypatch: pytest.MonkeyPatch) -> ScanReadings:
+    """Two views of 2 x 3 pixels, one of which no light reaches; readings are known."""
+    value = np.full((2, 2, 3), 0.5)
+    value[1, 0, 2] = -1.0
+    found = ScanReadings(
+        Transmission(value, np.full(value.shape, 1e-4)), np.array([0.0, 1.0]), None, ("r", "f", "d"), ("noted",)
+    )
+    monkeypatch.setattr(projections, "read_scan", lambda chosen, base: found)
+    return found
+
+
+def test_readings_become_line_integrals(measured: ScanReadings, monkeypatch: pytest.MonkeyPatch) -> None:
+    found = projections.read_measured(scan(), Path())
+    np.testing.assert_allclose(found.y.ravel()[:8], np.log(2))
+    assert (found.weights == 0).sum() == 1 and found.y[1, 0, 2] == 0
+    assert found.notes == ("noted", "1 of 12 pixels have no light or no finite reading: they are not used")
+    assert found.is_noise_known and found.quanta is None and found.geometry.axis_offset == 0.25
+    assert found.geometry.angles.tolist() == [0, 1] and found.geometry.pitch == (1.0, 0.5)
+    # Through the middle of air of 0.5 at either edge nothing is left to see.
+    monkeypatch.setattr(projections, "normalise_air", lambda t, n: Transmission(t.value * n, t.variance))
+    np.testing.assert_allclose(projections.read_measured(scan(air=2), Path()).y[0], 0, atol=1e-15)
+
+
+def test_an_axis_that_is_found_takes_the_place_of_the_settings(measured: ScanReadings, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Column 1.75 of three lies 0.75 of a column beyond the middle, and columns are 0.5 wide."""
+    monkeypatch.setattr(projections, "find_axis", lambda y, w, angles: Axis(1.75, 0.125, "some way"))
+    found = projections.read_measured(scan(find_axis=True), Path())
+    assert found.geometry.axis_offset == 0.375
+    assert "rotation axis at column 1.75 +- 0.12 (some way)" in found.notes
+
+
+def test_as_many_views_as_the_geometry_has(measured: ScanReadings, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(projections, "place_beam", lambda *asked: SimpleNamespace(shape=(3, 2, 3)))
+    with pytest.raises(MivolError, match="found 2 projections and a geometry of 3 views"):
+        projections.read_measured(scan(), Path())
+
+
+def test_quanta_are_those_of_the_readings(measured: ScanReadings, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where air is named the light is as bright as it is there; a drift, or no readings, leave none."""
+    blank = np.full((2, 2, 3), 8.0)
+    made = Quanta(np.ones((2, 2, 3)), blank, 0.5, np.ones((2, 2, 3), bool))
+    monkeypatch.setattr(projections, "count_quanta", lambda *asked: made if asked == ("r", "f", "d", 99.0) else None)
+    monkeypatch.setattr(projections, "find_air", lambda value, n: np.full((2, 2, 3), n / 4))
+    assert projections.quanta_of(scan(), measured) is made
+    assert (projections.quanta_of(scan(air=2), measured).blank == 4).all()
+    for chosen, found in ((scan(drift=1), measured), (scan(), ScanReadings(measured.transmission))):
+        with pytest.raises(MivolError, match="ml-tr needs counts of quanta"):
+            projections.quanta_of(chosen, found)
+    problems = {"pcg": SimpleNamespace(problem=LeastSquares), "ml-tr": SimpleNamespace(problem=PoissonCounts)}
+    monkeypatch.setattr(projections, "METHODS", problems)
+    chosen = scan()
+    chosen.solve.name = "ml-tr"
+    assert projections.read_measured(chosen, Path()).quanta is made
+
+
+def test_angles_in_the_wrong_unit_are_noticed() -> None:
+    """Up to 8 turns may be radians; 16 views and more within a turn of 2 pi are no degrees, 15 may be."""
+    turns = np.array([0.0, 16 * np.pi])
+    assert to_radians(turns, "radian") is turns
+    assert to_radians(np.array([0.0, 180.0]), "degree").tolist() == [0, np.pi]
+    with pytest.raises(MivolError, match=r"span 51 radians \(8 turns\)"):
+        to_radians(np.array([0.0, 51.0]), "radian")
+    with pytest.raises(MivolError, match="16 views span 6.283 degrees"):
+        to_radians(np.linspace(0, 2 * np.pi, 16), "degree")
+    to_radians(np.linspace(0, 2 * np.pi, 15), "degree")
+    to_radians(np.linspace(0, 6.3, 16), "degree")
+
+
+def test_angles_that_turn_back_are_noted() -> None:
+    """Against the way that most steps go; equal ones do not turn."""
+    assert (
+        note_order(np.array([0.0, 1.0, 1.0, 2.0])) == note_order(np.array([2.0, 1.0, 0.0])) == note_order(np.array([1.0])) == []
+    )
+    (said,) = note_order(np.radians([0.0, 10, 5, 20, 15, 30]))
+    assert said == ("the angles turn back 2 times (view 2 at 5.00 degrees follows view 1 at 10.00): they are taken as they are")
+    assert "turn back 1 times (view 3 at 2.00" in note_order(np.radians([3.0, 2, 1, 2, 0]))[0]
+
+
+def test_angles_of_a_stack(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Evenly over the arc where none are listed, else those of the file, one a view."""
+    beam = Parallel(views=2, detector=(2, 3), arc=90.0)
+    chosen = SimpleNamespace(data=SimpleNamespace(angles="", angle_unit="degree"), scan=beam)
+    np.testing.assert_allclose(readings.read_angles(chosen, Path(), 3), np.radians([0, 30, 60]))
+    monkeypatch.setattr(
+        readings, "read_columns", lambda path, n: np.array([[10.0], [20.0]]) if (str(path), n) == ("b/a", 1) else 0
+    )
+    chosen.data.angles = "a"
+    np.testing.assert_allclose(readings.read_angles(chosen, Path("b"), 2), np.radians([10, 20]))
+    with pytest.raises(MivolError, match="a has 2 angles for 3 projections"):
+        readings.read_angles(chosen, Path("b"), 3)
