@@ -45,7 +45,8 @@ def test_noise_is_that_of_counted_quanta() -> None:
 def test_a_digest_is_that_of_projections_and_weights() -> None:
     one = projections.Projections("g", np.arange(3.0), np.ones(3))
     assert one.digest() == projections.Projections("h", np.arange(3.0), np.ones(3)).digest()
-    assert one.digest() != projections.Projections("g", np.ones(3), np.arange(3.0)).digest()
+    for y, weights in ((np.ones(3), np.arange(3.0)), (np.ones(3), np.ones(3)), (np.arange(3.0), 2 * np.ones(3))):
+        assert one.digest() != projections.Projections("g", y, weights).digest()
 
 
 class FakeGrid:
