@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -9,7 +11,8 @@ import pytest
 import scenes
 from mivol.scene.readings import is_scattering
 from mivol.scene.survey import SceneSurvey
-from mivol.transport.media.box import box_of_cube
+from mivol.transport.media import read_medium
+from mivol.transport.media.box import Box, box_of_cube
 from mivol.transport.media.read_medium import place_of_grid, view_medium
 from scenes import FRAMES, box_of, grid_volume, medium, refused
 
@@ -74,3 +77,21 @@ def test_a_volume_of_another_kind_is_refused():
     odd = mi.load_dict({"type": "heterogeneous", "sigma_t": {"type": "odd_volume"}, "albedo": 0.0})
     with refused("strange.*gridvolume"):
         view_medium(odd)
+
+
+def test_a_grid_is_placed_once_for_each_boundary(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The same grid in two boundaries has two places, and each is found once."""
+    asked = []
+
+    def place(volume: object, boundary: Box | None) -> np.ndarray:
+        asked.append((volume.ptr, boundary))
+        return np.full((4, 4), len(asked))
+
+    monkeypatch.setattr(read_medium, "place_of_grid", place)
+    one, two = (SimpleNamespace(ptr=number) for number in (1, 2))
+    small, large = Box(np.eye(4)), Box(2 * np.diag([1.0, 1, 1, 0.5]))
+    places: dict = {}
+    calls = [(one, None), (one, small), (one, large), (two, None), (two, small)]
+    for _ in range(2):
+        assert [read_medium._place(v, b, places)[0, 0] for v, b in calls] == [1, 2, 3, 4, 5]
+    assert asked == [(v.ptr, b) for v, b in calls]

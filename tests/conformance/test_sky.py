@@ -54,3 +54,16 @@ def test_smoothing_a_sky(variant_rgb: str) -> None:
     found = Sky.of_image(image).smoothed(0.25).image()
     # A few roundings of numbers below 4.
     np.testing.assert_allclose(found, image + 0.25 * (around / 4 - image), atol=1e-6)
+
+
+def test_corners_of_a_direction_are_texels(variant_rgb: str) -> None:
+    """Four texels that exist, with shares of at least 0 that sum to 1, to two roundings: at the poles and the seam too."""
+    for rows in (2, 5):
+        _, d = some(400)
+        corners = Sky.of_image(np.zeros((rows, 2 * rows, 3), np.float32))._corners(d)
+        texels, shares = (np.array([np.array(pair[k], np.float64) for pair in corners]) for k in (0, 1))
+        assert texels.shape == (4, 400) and (texels >= 0).all() and (texels < 2 * rows * rows).all()
+        assert (shares >= 0).all()
+        np.testing.assert_allclose(shares.sum(axis=0), 1, rtol=0, atol=2.0**-22)
+        above, below = texels[:2] // (2 * rows), texels[2:] // (2 * rows)
+        np.testing.assert_array_equal(below, above + 1)

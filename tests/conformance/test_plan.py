@@ -1,0 +1,119 @@
+"""Plans: how many rays a pass holds, what a gradient takes, and which estimator is asked, from facts that are made up."""
+
+from __future__ import annotations
+
+import math
+from types import SimpleNamespace
+
+import pytest
+
+from mivol.errors import MivolError
+from mivol.scene import plan
+from mivol.scene.facts import MediumFacts
+from mivol.transport.media.grid_integral import PACKED_LIMIT, gradient_bytes
+from mivol.transport.path.settings import Settings
+
+GIB = 2**30
+
+
+def fog(*resolutions: tuple[int, int, int], **more: object) -> MediumFacts:
+    facts = {"kind": "k", "boundary": "a box", "extinction": "grey", "is_scattering": True, "emits": False, "phase": "p"}
+    return MediumFacts("fog", **{**facts, "resolutions": resolutions, "occupied": 0.5, "tau_max": None, **more})
+
+
+def needs(*media: MediumFacts, variant: str = "llvm_ad_rgb", **more: object) -> SimpleNamespace:
+    given = {"emitter_kinds": ("delta",), "parameters": (), "film_samples": 1000, "refractive": (), **more}
+    return SimpleNamespace(media=media, variant=variant, **given)
+
+
+@pytest.mark.parametrize(
+    ("backend", "rays", "steps"), [("llvm", 2**22, 2**29), ("cuda", 2**25, 2**34), ("metal", 2**24, 2**32)]
+)
+def test_a_pass_ends_within_seconds(backend: str, rays: int, steps: int) -> None:
+    """Rays times the cells that one of them may cross, the sum of edges of all grids, stay below a bound."""
+    variant = f"{backend}_ad_rgb"
+    assert plan._pass_rays(needs(variant=variant)) == plan._pass_rays(needs(fog(), variant=variant)) == rays
+    assert plan._pass_rays(needs(fog((10, 20, 30)), variant=variant)) == rays
+    large = fog((500, 1500, 3000), (100, 200, 300)), fog((400, 100, 100))
+    assert plan._pass_rays(needs(*large, variant=variant)) == min(rays, steps // 6200)
+    assert plan._pass_rays(needs(fog((10**5, 10**5, 10**5)), variant=variant)) == steps // 300_000
+
+
+@pytest.mark.parametrize("extinction", ["grey", "rgb"])
+def test_memory_of_a_gradient_is_counted(monkeypatch: pytest.MonkeyPatch, extinction: str) -> None:
+    """Eight bytes a node and channel, and copies of packed corners where there is room for them, on the processor."""
+    channels = 3 if extinction == "rgb" else 1
+    small, large = (8, 9, 10), (2000, 2000, 2000)
+    packed, nodes = gradient_bytes(small, channels), 8 * 9 * 10
+    assert packed <= PACKED_LIMIT < gradient_bytes(large, channels)
+    monkeypatch.setattr(plan, "available_memory", lambda: None)
+    memory, choice = plan._gradient(needs(fog(small, extinction=extinction)))
+    assert memory == packed + 8 * nodes * channels
+    assert choice.choice == f"{memory / 2**20:.1f} MiB beyond the rays (packed corners, one copy a thread)"
+    assert (choice.about, choice.reason) == ("gradient step", "parameters: none asked for yet")
+    elsewhere, _ = plan._gradient(needs(fog(small, extinction=extinction), variant="cuda_ad_rgb"))
+    assert elsewhere == 8 * nodes * channels
+    both, choice = plan._gradient(needs(fog(small, large, extinction=extinction), fog(), parameters=("a", "b")))
+    assert both == memory + 8 * 2000**3 * channels
+    assert "(added to the nodes; packed corners, one copy a thread)" in choice.choice and choice.reason == "parameters: a, b"
+    nothing, choice = plan._gradient(needs(fog()))
+    assert nothing == 0 and choice.choice == "0.0 MiB beyond the rays (no grid)"
+
+
+def test_a_gradient_that_does_not_fit_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where derivatives are asked for, on the processor, and its free memory is known; to the byte."""
+    asked, medium = {"parameters": ("sigma_t",)}, fog((2000, 2000, 2000))
+    memory = 8 * 2000**3
+    monkeypatch.setattr(plan, "available_memory", lambda: memory)
+    assert plan._gradient(needs(medium, **asked))[0] == memory
+    monkeypatch.setattr(plan, "available_memory", lambda: memory - 1)
+    wanted = f"a gradient step would take {memory / GIB:.1f} GiB and {memory / GIB:.1f} GiB are free; lower the resolution"
+    with pytest.raises(MivolError, match=wanted):
+        plan._gradient(needs(medium, **asked))
+    assert plan._gradient(needs(medium))[0] == memory
+    assert plan._gradient(needs(medium, variant="cuda_ad_rgb", **asked))[0] == memory
+    monkeypatch.setattr(plan, "available_memory", lambda: None)
+    assert plan._gradient(needs(medium, **asked))[0] == memory
+
+
+@pytest.mark.parametrize(
+    ("media", "settings", "more", "segment"),
+    [
+        ((fog(),), Settings(max_depth=2), {}, "single_scattering"),
+        ((fog(),), Settings(max_depth=1), {}, "absorption"),
+        ((fog(),), Settings(max_depth=2), {"emitter_kinds": ()}, "absorption"),
+        ((fog(is_scattering=False),), Settings(max_depth=2), {}, "absorption"),
+        ((fog(is_scattering=False), fog()), Settings(max_depth=2), {}, "single_scattering"),
+        ((fog(),), Settings(max_depth=2, deterministic=True), {}, "scattering_quadrature"),
+        ((fog(),), Settings(max_depth=3), {}, "free_flight"),
+        ((fog(),), Settings(max_depth=2), {"refractive": ("glass",)}, "free_flight"),
+        ((fog(), fog(bounded="Ball")), Settings(max_depth=2), {}, "free_flight"),
+        ((fog(bounded="Ball", is_scattering=False), fog(is_scattering=False)), Settings(), {}, "tracked_absorption"),
+        ((fog(emits=True, is_scattering=False), fog(is_scattering=False)), Settings(), {}, "emission"),
+        ((fog(emits=True),), Settings(max_depth=2), {"emitter_kinds": ()}, "free_flight"),
+    ],
+)
+def test_one_estimator_answers(media: tuple, settings: Settings, more: dict, segment: str) -> None:
+    assert plan._segment(needs(*media, **more), settings) == segment
+
+
+def test_a_plan_holds_what_was_chosen(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Grids of few occupied blocks are skipped, shadows of many cells estimated, passes counted upwards."""
+    for name in ("refuse_scattering", "refuse_emission", "refuse_quadrature", "refuse_places", "refuse_bounded"):
+        monkeypatch.setattr(plan, name, lambda *_: None)
+    monkeypatch.setattr(plan, "available_memory", lambda: None)
+    thin, thick = fog((200, 200, 200), occupied=plan.SKIP_BELOW - 1e-9), fog((300, 300, 300), occupied=plan.SKIP_BELOW)
+    homogeneous = fog(occupied=0.0)
+    asked = needs(thin, thick, homogeneous, film_samples=2**24 + 1, emitter_kinds=("extended",), surfaces=("Rectangle",),
+                  boundaries=[SimpleNamespace(box="a box")] * 3, are_emitters_far=False)  # fmt: skip
+    made = plan.make_plan(asked, Settings(max_depth=2))
+    assert made.skips == (True, False, False)
+    assert made.tracks == (False, True, False)
+    assert (made.segment, made.events, made.lobe) == ("single_scattering", 1, None)
+    assert made.pass_rays == min(2**22, 2**29 // 1500)
+    passes = math.ceil((2**24 + 1) / made.pass_rays)
+    said = {choice.about: choice.choice for choice in made.choices}
+    assert said["passes"] == f"{passes} of at most {made.pass_rays} rays"
+    assert [c.choice for c in made.choices if c.about == "empty space in fog"] == ["skipped", "walked"]
+    assert [c.choice for c in made.choices if c.about == "shadows of fog"] == ["exact", "estimated"]
+    assert made.gradient_bytes == plan._gradient(asked)[0]
