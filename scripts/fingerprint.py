@@ -215,6 +215,41 @@ def radiance_field() -> Iterator:
     yield from follow(scene, ("density", "sh"), max_depth=1)
 
 
+def emitters_of_every_kind() -> Iterator:
+    body = medium(grid(rough(17, (8, 8, 9, 3), top=3.0)), grid(rough(18, (8, 8, 9, 3), top=1.0)), HG)
+    panel = mi.ScalarTransform4f().look_at([-1.6, 0.5, 1.5], [0, 0, 0], [0, 0, 1]).scale(0.5)
+    area = {"type": "rectangle", "to_world": panel, "emitter": {"type": "area", "radiance": rgb(9, 6, 2)}}
+    lit = {"emitter": EMITTER, "second": {**EMITTER, "position": [-1.5, -1.4, 0.8]}, "sun": SUN, "area": area, "sky": SKY}
+    scene = {"body": box(body), **lit, "sensor": camera()}
+    yield from follow(scene, ("sigma_t.data", "albedo.data", ".g", "radiance.value", "intensity.value"), max_depth=2)
+
+
+def free_flights() -> Iterator:
+    stock = {"type": "heterogeneous", "albedo": 0.9, "phase": {"type": "hg", "g": 0.3}}
+    place = mi.ScalarTransform4f().translate(-1).scale(2)
+    stock["sigma_t"] = {"type": "gridvolume", "grid": mi.VolumeGrid(np.array(rough(19, (7, 6, 7, 3)))), "to_world": place}
+    fog = {"type": "homogeneous", "sigma_t": 1.5, "albedo": rgb(0.9, 0.5, 0.3)}
+    scene = {
+        "body": box(stock), "ball": ball(fog, (-1.5, 0.2, 0.1), 0.45), "floor": floor(), "emitter": EMITTER, "sky": envmap(),
+        "sensor": camera(),
+    }  # fmt: skip
+    ends = ("sigma_t.data", "sigma_t.value.value", "albedo.value.value", "reflectance.value")
+    yield from follow(scene, ends, max_depth=6, rr_depth=3)
+
+
+def side_flights() -> Iterator:
+    body = medium(grid(rough(20, (7, 7, 7, 1), top=4.0)), rgb(0.95, 0.8, 0.6), {"type": "mivol_hg", "g": 0.8})
+    scene = {"body": box(body), "sun": SUN, "sky": envmap(), "sensor": camera()}
+    yield from follow(scene, ("sigma_t.data", "albedo.value.value", ".g", "irradiance.value"), max_depth=5, rr_depth=3)
+
+
+def white_sky() -> Iterator:
+    first = medium(grid(rough(21, (6, 6, 6, 1))), rgb(0.9, 0.6, 0.3))
+    fog = {"type": "homogeneous", "sigma_t": 1.5, "albedo": 0.5}
+    scene = {"body": box(first), "ball": ball(fog, (-1.5, 0.2, 0.1), 0.45), "sky": SKY, "sensor": camera()}
+    yield from follow(scene, ("sigma_t.data", "sigma_t.value.value", "albedo.value.value"), max_depth=2)
+
+
 def projector() -> Iterator:
     from mivol.tomography.geometry import ConeBeam, VoxelGrid
     from mivol.tomography.projector import Projector
@@ -230,7 +265,8 @@ CASES: dict[str, Callable[[], Iterator[tuple[str, np.ndarray]]]] = {
     case.__name__: case
     for case in (
         absorption, absorption_rgb, constant_light, emitter_and_sky, sun_by_sums, sun_by_sums_in_a_lattice, estimated_shadows,
-        several_media, surfaces, emission, radiance_field, projector,
+        several_media, surfaces, emission, radiance_field, emitters_of_every_kind, free_flights, side_flights, white_sky,
+        projector,
     )
 }  # fmt: skip
 
