@@ -16,6 +16,9 @@ __all__ = ["Guards", "imported_modules", "index_guards"]
 EVERYWHERE = 8
 """A test that mutations in so many folders name looks at every module: it guards those that have no mutation, too."""
 
+SHARED = 3
+"""A file of tests that mutations of so many files of a folder name looks at all of the folder: its slow tests guard that."""
+
 MOST_FILES = 5
 """Files of tests in the second round. Modules that half of the tests import would have most of the suite run otherwise."""
 
@@ -43,7 +46,8 @@ class Guards:
         First the files of tests that are called like it, the tests elsewhere that its mutations name, and those that guard
         every module; then the rest of the files that hold those tests, and those that import it, MOST_FILES at most; then those
         of all files in its folder, or all there are where the folder has none; then the slow tests of the files that are called
-        like it or hold those tests. Rounds may be empty; what a later round runs again are single tests of a file.
+        like it or hold those tests, and of those that SHARED files of its folder name. Rounds may be empty; what a later round
+        runs again are single tests of a file.
         """
         named, tests = self.named.get(file, []), self.tests.get(file, [])
         first = [*named, *(t for t in tests if file_of(t) not in named)]
@@ -51,7 +55,8 @@ class Guards:
         first += [t for t in self.everywhere if t not in first]
         near = [f for f in sorted({*self.tests, *self.named}) if Path(f).parent == Path(file).parent]
         around = _once(t for f in near for t in (*map(file_of, self.tests.get(f, [])), *self.named.get(f, [])))
-        own = _once([*named, *map(file_of, tests)])
+        naming = Counter(test for f in near for test in {file_of(t) for t in self.tests.get(f, [])})
+        own = _once([*named, *map(file_of, tests), *sorted(test for test, count in naming.items() if count >= SHARED)])
         slow = ["-m", "slow", *own] if own else []
         return [first, rest, [t for t in around or self.files if t not in (*named, *rest)], slow]
 

@@ -198,6 +198,9 @@ def test_tests_of_a_module_are_found(tmp_path: Path) -> None:
     index.importing["pkg/b.py"] = [f"tests/test_{k}.py" for k in range(guards.MOST_FILES + 1)]
     assert index.rounds("pkg/b.py")[1] == index.importing["pkg/b.py"][:-1]
     assert index.rounds("pkg/room/c.py") == [[], [], [one, more, other], []]
+    shared = [(f"pkg/{name}.py", "tests/two/test_other.py::slow") for name in ("a", "b", "d")]
+    assert guards.index_guards(tmp_path, shared, package="pkg").rounds("pkg/c.py")[3] == ["-m", "slow", other]
+    assert guards.index_guards(tmp_path, shared[1:], package="pkg").rounds("pkg/c.py")[3] == []
     everywhere = [(f"pkg/room{k}/d.py", "tests/test_all.py::t") for k in range(guards.EVERYWHERE)]
     for found, first in ((everywhere, ["tests/test_all.py::t"]), (everywhere[1:], [])):
         assert guards.index_guards(tmp_path, [*entries, *found], package="pkg").rounds("pkg/b.py")[0] == first
