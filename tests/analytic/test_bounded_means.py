@@ -50,3 +50,9 @@ def test_unseen_transmittance_is_no_alarm():
     assert_same_bounded_mean(unseen, 4096, np.full_like(unseen, 1e-6))
     with pytest.raises(AssertionError, match="p < "):
         assert_same_bounded_mean(unseen, 4096, np.full_like(unseen, 0.01))
+
+
+def test_a_bounded_mean_that_differs_is_named() -> None:
+    assert_same_bounded_mean(np.array([0.5, 0.5]), 1000, 0.5, bounds=(0, 1), what="rays")
+    with pytest.raises(AssertionError, match=r"rays differ at \(1,\): 0.9 for 0.5 after 1000 samples, p < .* 1 of 2 beyond it"):
+        assert_same_bounded_mean(np.array([0.5, 0.9]), 1000, 0.5, bounds=(0, 1), what="rays")

@@ -30,7 +30,6 @@ from mivol.scene.parsing import parse_dict, parse_file
 from mivol.scene.photographs import PIXELS_LOST, sensor_of
 from mivol.scene.refusals import refuse_quadrature
 from mivol.transport.path.settings import Settings
-from mivol.validate.bounded_means import assert_same_bounded_mean
 from mivol.validate.images import judge
 from mivol.validate.reference_file import check_identity
 from mivol.validate.statistics import Estimate, batches_for, p_value
@@ -206,12 +205,6 @@ def test_means_that_cannot_be_compared() -> None:
     for wanted in (0.0, -1.0, np.nan):
         assert refusal_of(batches_for, wanted, 1.0) == f"a bias of {wanted} cannot be looked for; give one above 0."
     assert batches_for(1e9, 1.0) == 1
-
-
-def test_a_bounded_mean_that_differs_is_named() -> None:
-    assert_same_bounded_mean(np.array([0.5, 0.5]), 1000, 0.5, bounds=(0, 1), what="rays")
-    with pytest.raises(AssertionError, match=r"rays differ at \(1,\): 0.9 for 0.5 after 1000 samples, p < .* 1 of 2 beyond it"):
-        assert_same_bounded_mean(np.array([0.5, 0.9]), 1000, 0.5, bounds=(0, 1), what="rays")
 
 
 def test_the_first_key_that_differs_is_named(tmp_path: Path) -> None:
