@@ -18,6 +18,7 @@ from mivol.files.fetch import place_of
 from mivol.optim.linear_problems import PoissonCounts
 from mivol.optim.solvers import METHODS
 from mivol.shown import briefly
+from mivol.tomography.fan_axis import axis_from_fans, offset_of_cone
 from mivol.tomography.geometry import ConeBeam, Geometry, ParallelBeam, VoxelGrid
 from mivol.tomography.panel_views import COLUMNS, PanelViews
 from mivol.tomography.phantoms import shepp_logan
@@ -175,7 +176,7 @@ def add_noise(geometry: Geometry, exact: np.ndarray, truth: np.ndarray, photons:
 
 
 def read_measured(chosen: config.Scan, base: Path) -> Projections:
-    """Readings from files as line integrals with weights; the axis of a parallel beam is found where asked for.
+    """Readings from files as line integrals with weights; the axis of a circular scan is found where asked for.
 
     Raises:
         MivolError: a file that cannot be read, or does not fit the others.
@@ -186,10 +187,9 @@ def read_measured(chosen: config.Scan, base: Path) -> Projections:
         notes += note_order(angles)
     y, weights = line_integrals(normalise_air(found.transmission, wanted.air) if wanted.air else found.transmission)
     offset = None
-    if wanted.find_axis and isinstance(chosen.scan, Parallel):
-        axis = find_axis(y, weights, angles)
-        offset = axis.offset(y.shape[2], float(np.broadcast_to(chosen.scan.pitch, (2,))[1]))
-        notes.append(f"rotation axis at column {axis.column:.2f} +- {axis.uncertainty:.2f} ({axis.method})")
+    if wanted.find_axis and isinstance(chosen.scan, Parallel | Cone):
+        offset, said = look_for_axis(chosen, base, y, weights, angles)
+        notes.append(said)
     unused = int((weights == 0).sum())
     if unused:
         notes.append(f"{unused} of {weights.size} pixels have no light or no finite reading: they are not used")
@@ -202,6 +202,27 @@ def read_measured(chosen: config.Scan, base: Path) -> Projections:
     return Projections(
         geometry, y, weights, quanta=quanta, notes=tuple(notes), is_noise_known=found.intensity is not None
     )
+
+
+def look_for_axis(
+    chosen: config.Scan, base: Path, y: np.ndarray, weights: np.ndarray, angles: np.ndarray
+) -> tuple[float | None, str]:
+    """The ``axis_offset`` of a circular scan [length], and a sentence about it; None where a cone beam does not tell it.
+
+    Raises:
+        MivolError: as :func:`mivol.tomography.rotation_axis.find_axis`, of a parallel beam.
+    """
+    if isinstance(chosen.scan, Parallel):
+        axis = find_axis(y, weights, angles)
+        offset = axis.offset(y.shape[2], float(np.broadcast_to(chosen.scan.pitch, (2,))[1]))
+    else:
+        beam = place_beam(chosen, base, angles, y.shape[1:])
+        try:
+            axis = axis_from_fans(y, weights, beam)
+        except MivolError as error:
+            return None, f"the rotation axis is where scan.axis_offset has it, {beam.axis_offset:g}: {error}"
+        offset = offset_of_cone(axis, beam)
+    return offset, f"rotation axis at column {axis.column:.2f} +- {axis.uncertainty:.2f} ({axis.method})"
 
 
 def quanta_of(chosen: config.Scan, found: ScanReadings) -> Quanta:

@@ -72,7 +72,8 @@ def axis_from_moments(y: np.ndarray, angles: np.ndarray) -> Axis:
     """Find the axis from the shadow's centre of mass, which follows ``c + a cos(theta) + b sin(theta)`` (Ludwig).
 
     Needs the whole object in every view and air at 0: a constant error of the air pulls the centre of mass towards the
-    middle of the detector.
+    middle of the detector. The standard deviation is that of the views' scatter, or of the rows' where that is larger: the
+    flats' errors are the same in all views, and only rows tell them.
 
     Args:
         y: (views, rows, cols) line integrals of a parallel beam.
@@ -83,9 +84,9 @@ def axis_from_moments(y: np.ndarray, angles: np.ndarray) -> Axis:
         raise MivolError("Found a row of a view with no absorption in it, expected an object in every row and view.")
     centres = (y @ np.arange(y.shape[-1])) / mass
     design = np.stack([np.ones_like(angles), np.cos(angles), np.sin(angles)], 1)
-    rows = [_fit_constant(design, centres[:, row]) for row in range(y.shape[1])]
-    column = float(np.mean([c for c, _ in rows]))
-    return Axis(column, float(np.sqrt(np.mean([s**2 for _, s in rows]) / len(rows))), "moments of the shadows")
+    columns, sigmas = np.transpose([_fit_constant(design, centres[:, row]) for row in range(y.shape[1])])
+    variance = max(np.mean(sigmas**2), np.var(columns, ddof=1) if len(columns) > 1 else 0.0) / len(columns)
+    return Axis(float(columns.mean()), float(np.sqrt(variance)), "moments of the shadows")
 
 
 def axis_from_reconstructions(y: np.ndarray, weights: np.ndarray, angles: np.ndarray, start: float, width: float = 2.0) -> Axis:

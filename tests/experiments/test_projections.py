@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from mivol.config import Parallel
+from mivol.config import Cone, Parallel
 from mivol.errors import MivolError
 from mivol.experiments import projections, readings
 from mivol.experiments.readings import ScanReadings, note_order, to_radians
@@ -117,6 +117,24 @@ def test_an_axis_that_is_found_takes_the_place_of_the_settings(measured: ScanRea
     found = projections.read_measured(scan(find_axis=True), Path())
     assert found.geometry.axis_offset == 0.375
     assert "rotation axis at column 1.75 +- 0.12 (some way)" in found.notes
+
+
+def test_the_axis_of_a_cone_takes_the_place_of_the_settings(measured: ScanReadings, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Column 1.75 lies 0.375 beyond the middle, half as far at the axis; where the scan does not tell it, that is said."""
+    chosen = scan(find_axis=True)
+    chosen.scan = Cone(views=2, detector=(2, 3), pitch=(1.0, 0.5), axis_offset=0.25, source_to_axis=4, source_to_detector=8)
+    monkeypatch.setattr(projections, "axis_from_fans", lambda y, w, beam: Axis(1.75, 0.125, "some way"))
+    found = projections.read_measured(chosen, Path())
+    assert found.geometry.axis_offset == 0.1875
+    assert "rotation axis at column 1.75 +- 0.12 (some way)" in found.notes
+
+    def nothing(*_: object) -> None:
+        raise MivolError("found nothing.")
+
+    monkeypatch.setattr(projections, "axis_from_fans", nothing)
+    found = projections.read_measured(chosen, Path())
+    assert found.geometry.axis_offset == 0.25
+    assert "the rotation axis is where scan.axis_offset has it, 0.25: found nothing." in found.notes
 
 
 def test_as_many_views_as_the_geometry_has(measured: ScanReadings, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -295,6 +295,26 @@ def test_cone_beam_data_from_files_need_no_python(variant_rgb, folder: Path, kin
     assert run(folder, *[part for change in changes for part in ("--set", change)]) == 0
 
 
+def test_the_axis_of_cone_data_from_files_is_found(variant_rgb, folder: Path) -> None:
+    """The head, its axis two and a half columns beside the middle, where nobody says so: found to what its note claims.
+
+    A column is 0.1 wide and lies where the axis is, so the offset is that of the note; the two differ by its rounding.
+    """
+    beam = ["scan.views=48", "scan.detector=[2,36]", "scan.pitch=0.1"]
+    data = projections.make_data(
+        config.load(folder / "fit.toml", [*beam, "scan.axis_offset=0.25"]), folder, projections.VoxelGrid((2, 2, 2))
+    )
+    np.save(folder / "y.npy", data.y)
+    asked = config.load(folder / "fit.toml", [*beam, 'data={source="stack", file="y.npy", reading="line_integral"}'])
+    found = projections.make_data(asked, folder, projections.VoxelGrid((2, 2, 2)))
+    (note,) = found.notes
+    said = re.match(r"rotation axis at column (\S+) \+- (\S+) \(rays measured from both ends", note)
+    column, error = map(float, said.groups())
+    assert error < 0.05
+    assert abs(column - 20.0) < 3 * error
+    assert found.geometry.axis_offset == pytest.approx((column - 17.5) * 0.1, abs=0.00051)
+
+
 @pytest.mark.slow
 def test_readings_are_fitted_as_counts(variant_rgb, folder: Path) -> None:
     """ML-TR of raw readings, a tenth of them saturated and a column dead: as near the head as with the quanta themselves.

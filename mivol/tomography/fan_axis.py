@@ -1,0 +1,245 @@
+"""Where the rotation axis of a circular cone-beam scan falls on the detector, from rays that were measured from both ends.
+
+Conventions. ``alpha`` is the angle [rad] between a ray and the central one, positive towards larger columns; the axis is seen
+at ``alpha = epsilon``. In the plane of the source's circle, and in the geometry of :mod:`mivol.tomography.geometry`, the ray
+(theta, alpha) and the ray (theta + pi + 2 epsilon - 2 alpha, 2 epsilon - alpha) are one line, seen from its two ends. Sorted by
+``phi = theta - alpha``, the direction of the line, the two become a projection and its mirror image half a turn away, as in
+parallel light: ``P(phi, alpha) = P(phi + pi, 2 epsilon - alpha)``. What is told is the column of the axis: that the central ray
+meets the detector where ``detector_offset`` says is taken for granted.
+
+References: Parker 1982, Med. Phys. 9, 254 (the two ends of a line); Vo et al. 2014 (mirror images and the axis); White 1980,
+Econometrica 48, 817 (the variance of a least-squares fit from the scatter of its parts).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import interpolate, ndimage
+
+from mivol.errors import MivolError
+from mivol.tomography.geometry import ConeBeam
+from mivol.tomography.preprocess import bridge_gaps
+from mivol.tomography.redundancy import covers, widest_gap
+from mivol.tomography.rotation_axis import Axis
+
+MOST_ROWS, MOST_DIRECTIONS = 4, 360
+"""So many rows and directions of lines are enough: each pair of views of a row alone tells the axis to a part of a column."""
+
+SOME_DIRECTIONS, LEAST_OVERLAP, LEAST_ALIKE = 24, 0.02, 0.5
+"""Of the search for the nearest column: directions that are looked at; the share of all slopes that must be seen twice; the
+correlation of slopes below which the two ends are not alike (1: without noise; noise alone stays below 0.2, where 24
+directions have 5 columns each that are independent)."""
+
+PARTS = 24
+"""The uncertainty comes from how far so many sectors of directions disagree: Student's t of 23 degrees of freedom."""
+
+
+SAMPLED = 0.01
+"""One standard deviation [columns] of what edges between columns and views add: the axis of a head in 60 to 360 views is found
+so far from where it is, at most, when nothing is noisy."""
+
+
+@dataclass(frozen=True, eq=False)
+class Mirrors:
+    """Projections of one row, sorted by the direction of their lines, and those half a turn away.
+
+    Attributes:
+        here, there: (directions, cols) line integrals, smoothed; ``there`` as a spline in the column.
+        weights_here, weights_there: 0 where nothing was measured.
+    """
+
+    here: np.ndarray
+    there: interpolate.CubicSpline
+    weights_here: np.ndarray
+    weights_there: np.ndarray
+
+
+def axis_from_fans(y: np.ndarray, weights: np.ndarray, beam: ConeBeam) -> Axis:
+    """Find the column of the axis for which rays that run along one line, one each way, agree best (weighted least squares).
+
+    The rows next to the plane of the source's circle are used, where the two rays of a line part by half a row at most. Columns
+    are smoothed by at least one column, and by half of what an edge moves between neighbouring views, so that neither the
+    interpolation between columns nor that between views prefers a place of its own. The standard deviation is that of
+    the sum of 24 sectors of directions, from how far their slopes scatter about 0 at the minimum: noise of any law, and errors
+    of the light or of the geometry, are in it.
+
+    Args:
+        y: (views, rows, cols) line integrals.
+        weights: inverse variances of ``y``; 0: not used.
+        beam: angles, distances and pixels; its ``axis_offset`` is not looked at.
+
+    Raises:
+        MivolError: no row near the plane of the circle, no line that was measured twice, or no least misfit.
+    """
+    pairs = [_mirrors(y[:, row], weights[:, row], beam) for row in _rows_in_the_plane(beam)]
+    alpha = _fan_angles(beam)
+    column = _nearest_column(pairs[0], beam, alpha)
+    for width in (2.0, 0.5, 0.5):
+        # Weights of the middle serve all five trials: an overlap that grows with the trial would move the minimum.
+        fixed = [_pair_weights(pair, _mirrored_columns(beam, alpha, column)) for pair in pairs]
+
+        def misfit(trial: float, fixed: list[np.ndarray] = fixed) -> np.ndarray:
+            columns = _mirrored_columns(beam, alpha, trial)
+            return np.sum([_misfit(pair, columns, w) for pair, w in zip(pairs, fixed, strict=True)], axis=0)
+
+        column, sigma = _least_of_parts(misfit, column, width)
+    said = f"rays measured from both ends, {len(pairs)} row" + "s" * (len(pairs) > 1)
+    return Axis(column, float(np.hypot(sigma, SAMPLED)), said)
+
+
+def offset_of_cone(axis: Axis, beam: ConeBeam) -> float:
+    """The ``axis_offset`` of a cone beam whose axis is seen at a column [length]."""
+    return _place(beam, axis.column) * beam.source_to_axis / beam.source_to_detector
+
+
+def _place(beam: ConeBeam, column: float | np.ndarray) -> float | np.ndarray:
+    """Distance of a column from the central ray, on the detector [length]."""
+    return (column - (beam.detector[1] - 1) / 2) * beam.pitch[1] + beam.detector_offset[1]
+
+
+def _fan_angles(beam: ConeBeam) -> np.ndarray:
+    """Alpha of each column."""
+    return np.arctan(_place(beam, np.arange(beam.detector[1])) / beam.source_to_detector)
+
+
+def _mirrored_columns(beam: ConeBeam, alpha: np.ndarray, column: float) -> np.ndarray:
+    """Columns (cols,) that see each column's line from its other end where the axis is at ``column``."""
+    epsilon = np.arctan(_place(beam, column) / beam.source_to_detector)
+    place = beam.source_to_detector * np.tan(2 * epsilon - alpha)
+    return (place - beam.detector_offset[1]) / beam.pitch[1] + (beam.detector[1] - 1) / 2
+
+
+def _rows_in_the_plane(beam: ConeBeam) -> np.ndarray:
+    """Up to MOST_ROWS rows next to the plane of the circle.
+
+    The two rays of a line that rises by ``v / source_to_detector`` cross at the axis; at a distance r they are ``2 r v /
+    source_to_detector`` apart, which must be at most half of a row as wide as the axis sees it.
+    """
+    widest = np.abs(_place(beam, np.array([0, beam.detector[1] - 1]))).max()
+    reach = widest * beam.source_to_axis / beam.source_to_detector
+    limit = max(beam.pitch[0] * beam.source_to_axis / (4 * reach), 0.5 * beam.pitch[0] * (1 + 1e-9))
+    near = np.argsort(np.abs(beam.v), kind="stable")[:MOST_ROWS]
+    near = near[np.abs(beam.v[near]) <= limit]
+    if not len(near):
+        raise MivolError("found no row of the detector in the plane of the source's circle, expected one to find the axis by.")
+    return near
+
+
+def _mirrors(y: np.ndarray, weights: np.ndarray, beam: ConeBeam) -> Mirrors:
+    """A row (views, cols) sorted by direction."""
+    alpha, cols = _fan_angles(beam), beam.detector[1]
+    turn = _Turn.of(bridge_gaps(y[:, None], weights[:, None])[:, 0], weights, beam.angles)
+    phi = np.pi * np.arange(turn.directions) / turn.directions
+    # An edge at the widest ray moves by so many columns from one view to the next.
+    step = np.ptp(alpha) / 2 * (np.pi / turn.directions) * beam.source_to_detector / beam.pitch[1]
+    width = max(1.0, step)
+    sides = [_smooth(*turn.at(phi[:, None] + alpha + half), width) for half in (0.0, np.pi)]
+    (here, weights_here), (there, weights_there) = sides
+    return Mirrors(here, interpolate.CubicSpline(np.arange(cols), there, axis=1), weights_here, weights_there)
+
+
+def _smooth(value: np.ndarray, weights: np.ndarray, was_seen: np.ndarray, width: float) -> tuple[np.ndarray, np.ndarray]:
+    """A Gaussian over so many columns; the weight is 0 where it reaches beyond what was seen."""
+    margin = 2 * min(int(np.ceil(2 * width)), value.shape[1] // 8) + 1
+    whole = ndimage.minimum_filter1d(was_seen.astype(np.uint8), margin, axis=1, mode="constant")
+    return ndimage.gaussian_filter1d(value, width, axis=1, mode="nearest"), np.where(whole, weights, 0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class _Turn:
+    """A row of a scan between its views: a spline in theta, around the circle where views lie all around it."""
+
+    spline: interpolate.CubicSpline
+    theta: np.ndarray
+    weights: np.ndarray
+    is_closed: bool
+    directions: int
+
+    @classmethod
+    def of(cls, y: np.ndarray, weights: np.ndarray, angles: np.ndarray) -> _Turn:
+        """Args: y, weights: (views, cols)."""
+        is_closed = covers(angles, 2 * np.pi)
+        start = 0.0 if is_closed else widest_gap(angles, 2 * np.pi)[1]
+        theta, first = np.unique(np.round(np.mod(angles - start + 1e-9, 2 * np.pi) - 1e-9, 9), return_index=True)
+        y, weights = y[first], weights[first]
+        if len(theta) < 4:
+            raise MivolError(f"found {len(theta)} different view angles, expected at least 4 to find the rotation axis by.")
+        directions = int(min(np.ceil(np.pi / np.median(np.diff(theta))), MOST_DIRECTIONS))
+        theta = theta + start
+        if is_closed:
+            theta = np.append(theta, theta[0] + 2 * np.pi)
+            y, weights = np.concatenate([y, y[:1]]), np.concatenate([weights, weights[:1]])
+        spline = interpolate.CubicSpline(theta, y, bc_type="periodic" if is_closed else "not-a-knot")
+        return cls(spline, theta, weights, is_closed, directions)
+
+    def at(self, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Line integrals, weights, and whether it was seen, of each column at angles (directions, cols) of its own.
+
+        Beyond the views it is what the nearest of them sees, and not seen.
+        """
+        theta = np.mod(theta - self.theta[0] + 1e-9, 2 * np.pi) + self.theta[0] - 1e-9
+        was_seen = theta <= self.theta[-1] + 1e-9
+        beyond = np.where(theta < (self.theta[0] + self.theta[-1]) / 2 + np.pi, self.theta[-1], self.theta[0])
+        theta = np.where(was_seen, theta, beyond)
+        before = np.clip(np.searchsorted(self.theta, theta, side="right") - 1, 0, len(self.theta) - 2)
+        along, columns = theta - self.theta[before], np.arange(theta.shape[1])
+        value = np.zeros_like(theta)
+        for power in self.spline.c:
+            value = value * along + power[before, columns]
+        return value, np.minimum(self.weights[before, columns], self.weights[before + 1, columns]), was_seen
+
+
+def _pair_weights(pair: Mirrors, columns: np.ndarray) -> np.ndarray:
+    """Inverse variances (directions, cols) of the differences of mirrored rays; 0 where one of the two was not measured."""
+    nearest = np.rint(columns).astype(int)
+    inside = (columns >= 0) & (columns <= len(columns) - 1)
+    there = np.where(inside, pair.weights_there[:, np.clip(nearest, 0, len(columns) - 1)], 0.0)
+    both = (pair.weights_here > 0) & (there > 0)
+    return np.where(both, pair.weights_here * there / np.where(both, pair.weights_here + there, 1.0), 0.0)
+
+
+def _misfit(pair: Mirrors, columns: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Weighted squares of the differences of mirrored rays, (sectors,) sums over sectors of directions."""
+    squares = weights * (pair.here - pair.there(np.clip(columns, 0, len(columns) - 1))) ** 2
+    bounds = np.linspace(0, len(squares), min(PARTS, len(squares)) + 1).astype(int)[:-1]
+    return np.add.reduceat(squares.sum(1), bounds)
+
+
+def _nearest_column(pair: Mirrors, beam: ConeBeam, alpha: np.ndarray) -> float:
+    """The whole column about which mirrored slopes are alike most: their correlation where both were measured."""
+    some = slice(None, None, max(1, len(pair.here) // SOME_DIRECTIONS))
+    here, rising = np.gradient(pair.here[some], axis=1), pair.there.derivative()
+    thinned = Mirrors(here, pair.there, pair.weights_here[some], pair.weights_there[some])
+    energy = np.sum(thinned.weights_here * here**2)
+    best, found = -np.inf, 0.0
+    for column in range(len(alpha)):
+        columns = _mirrored_columns(beam, alpha, column)
+        w = _pair_weights(thinned, columns)
+        there = -rising(np.clip(columns, 0, len(alpha) - 1))[some]
+        ours, theirs = np.sum(w * here**2), np.sum(w * there**2)
+        if 2 * min(ours, theirs) <= LEAST_OVERLAP * energy:
+            continue
+        alike = np.sum(w * here * there) / np.sqrt(ours * theirs)
+        best, found = max((best, found), (alike, float(column)))
+    if best < LEAST_ALIKE:
+        raise MivolError("found no lines of a structure that both of their ends show, expected some to find the axis by.")
+    return found
+
+
+def _least_of_parts(misfit: Callable[[float], np.ndarray], centre: float, width: float) -> tuple[float, float]:
+    """(column, standard deviation) of the least of a parabola, fitted to the misfits (sectors,) at five columns.
+
+    The slope of the misfit is a sum over sectors of independent noise; at the minimum it is 0, and the slopes of
+    the sectors scatter about 0 as far as it might have.
+    """
+    offsets = np.linspace(-1.0, 1.0, 5)
+    a, b, _ = np.polyfit(offsets, [misfit(centre + width * o) for o in offsets], 2)
+    if not a.sum() > 0 or abs(b.sum()) > 2 * a.sum():
+        raise MivolError(f"found no column near {centre:.0f} about which rays measured from both ends agree best.")
+    x = -b.sum() / (2 * a.sum())
+    slopes = 2 * a * x + b
+    variance = len(slopes) / (len(slopes) - 1) * np.sum(slopes**2) / (2 * a.sum()) ** 2
+    return float(centre + width * x), float(width * np.sqrt(variance))
