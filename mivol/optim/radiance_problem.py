@@ -67,7 +67,7 @@ class RadianceProblem:
     field: SphericalGrid = dataclasses.field(init=False)
     sky: Sky | None = dataclasses.field(init=False, default=None)
     exposure: Exposure | None = dataclasses.field(init=False, default=None)
-    has_gains: bool = dataclasses.field(init=False, default=False)
+    has_gains: bool = dataclasses.field(init=False)
     stage: int = dataclasses.field(init=False, default=0)
 
     def __post_init__(self) -> None:
@@ -84,7 +84,8 @@ class RadianceProblem:
         if self.plan.exposure:
             if self.batches.channels == 4:
                 raise MivolError("gains were asked for and the photographs have alpha, as renders have: exposure = false.")
-            self.exposure, self.has_gains = Exposure.even(len(self.batches.origins)), True
+            self.exposure = Exposure.even(len(self.batches.origins))
+        self.has_gains = self.plan.exposure
         self.unit = float((self.box[1] - self.box[0]).max()) / 2
         distances = np.linalg.norm(self.batches.origins - self.box.mean(axis=0), axis=1)
         self.near = self.plan.near * float(np.median(distances))

@@ -11,7 +11,17 @@ import pytest
 from bench_figures import drawn
 from report.looks import assert_recorded
 
-from mivol.bench import depth, gradients, multiple_scattering, single_scattering, still_life, tomography
+from mivol.bench import (
+    depth,
+    gradients,
+    multiple_scattering,
+    optical_depth,
+    radiance_field,
+    random_scenes,
+    single_scattering,
+    still_life,
+    tomography,
+)
 from mivol.bench.depth import TABLED, Cell
 from mivol.bench.gradients.size import CONTESTS, OURS, STOCK
 
@@ -79,3 +89,40 @@ def test_tomography(monkeypatch: pytest.MonkeyPatch, record: bool) -> None:
         tomography, monkeypatch, SimpleNamespace(name="head", truth=truth), curves, {"SIRT": truth / 2}, Path("a.png")
     )
     assert_recorded("bench_tomography", figure, record)
+
+
+def test_radiance_field(monkeypatch: pytest.MonkeyPatch, record: bool) -> None:
+    ratios = {kind: {"ratio_of_processor_time": k + 2.0} for k, kind in enumerate(("camera", "pixels", "any"))}
+    curves = {"ours": [(1.0, 20.0), (2.0, 25.0)], "peer": [(10.0, 18.0), (20.0, 23.0)], "peer_psnr": 24.0}
+    answers = {
+        "step": {"fog": ratios, "shell": ratios},
+        "memory": {"peak_bytes": [2**20, 4 * 2**20], "field_bytes": 3 * 2**20, "bytes_per_ray": 100.4},
+        "locality": {name: {"processor_seconds": t, "steps": 100, "psnr": 10 * t} for name, t in (("tiles", 3), ("pixels", 5))},
+        "fit": {"fog": curves},
+    }
+    assert_recorded("bench_radiance_field", drawn(radiance_field, monkeypatch, answers, Path()), record)
+
+
+def test_random_scenes(monkeypatch: pytest.MonkeyPatch, record: bool) -> None:
+    trials = {"1": {"z": -2.0, "z_bound": 4.0}, "2": {"z": None, "z_bound": 4.0}, "3": {"z": 5.0, "z_bound": 4.0}}
+    figure = drawn(random_scenes, monkeypatch, {"trials": {"trials": trials}}, Path())
+    assert_recorded("bench_random_scenes", figure, record)
+
+
+def test_optical_depth(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its figure is one of the reports; what it is given is a series of each peer."""
+    given = []
+    monkeypatch.setattr(optical_depth, "plot_error_against_time", lambda *place, **words: given.append((place, words)))
+    points_of = [{"seconds_median": 2.0, "rms_error": 0.5}, {"seconds_median": 4.0, "rms_error": 0.25}]
+    peers = {"rays": 12345, "grid": "128^3, of floats", "mivol": points_of, "volpath": points_of[:1]}
+    optical_depth.draw({"peers": peers}, Path("a"))
+    (((series, path), words),) = given
+    assert [(s.name, list(s.seconds), list(s.error)) for s in series] == [
+        ("mivol", [2.0, 4.0], [0.5, 0.25]),
+        ("volpath", [2.0], [0.5]),
+    ]
+    assert path == Path("a/bench_optical_depth.png")
+    assert words == {
+        "error": "RMS error of T against float64",
+        "title": "Transmittance of 12,345 rays through the smoke 128^3: error against time",
+    }

@@ -236,11 +236,23 @@ def test_when_ours_is_there_is_read_off_its_own_clock() -> None:
     last, lowest = got["to_the_last_loss_of_prbvolpath"], got["to_its_lowest_loss"]
     assert (last["mivol_after_iterations"], last["sooner"], last["sooner_by_processor_time"]) == (2, 30.0, 40.0)
     assert last["density_errors"] == {OURS: 0.8, STOCK: 0.84}
-    assert (lowest["mivol_after_iterations"], lowest["sooner"]) == (3, 10.0)
+    assert lowest == {
+        "loss": 0.6,
+        "after_iterations": 2,
+        "seconds_of_prbvolpath": 30.0,
+        "mivol_after_iterations": 3,
+        "seconds_of_mivol": 3.0,
+        "sooner": 10.0,
+        "sooner_by_processor_time": 20.0,
+        "density_errors": {OURS: 0.7, STOCK: 0.85},
+    }
     assert got["whole_schedule_is_faster"] == 20.0
     assert got["ends"] == {OURS: {"loss": 0.5, "density_error": 0.7}, STOCK: {"loss": 1.0, "density_error": 0.84}}
     ours.loss = [5.0, 4.0, 3.0]
-    assert finish({OURS: ours, STOCK: theirs})["to_its_lowest_loss"]["sooner"] == 0
+    never = finish({OURS: ours, STOCK: theirs})["to_its_lowest_loss"]
+    assert (never["mivol_after_iterations"], never["sooner"]) == (None, 0)
+    ours.loss = [5.0, 0.6, 0.5]
+    assert finish({OURS: ours, STOCK: theirs})["to_its_lowest_loss"]["mivol_after_iterations"] == 2
 
 
 def test_voxels_are_read_at_their_centres(variant_rgb: str) -> None:

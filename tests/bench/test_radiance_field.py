@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -13,9 +12,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from matplotlib.figure import Figure
 
-from mivol.bench import radiance_field
 from mivol.bench.radiance_field import BENCH, QUICK, fields, fits
 from mivol.bench.radiance_field.fields import FIELDS, centred
 from mivol.bench.radiance_field.fits import EVERY, follow, held_out_psnr, our_fit, peer_fit
@@ -274,43 +271,6 @@ def test_a_step_of_the_peer_goes_to_its_target(variant_rgb: str, target: float) 
     assert np.all(np.sign(np.array(peer.render(o, d)) - before) == np.sign(target))
 
 
-def test_figures_show_the_answers(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """A panel for each question that has one, and for each field of the fits; ratios, bars and curves are where they belong."""
-    kept = []
-
-    @contextmanager
-    def keep(path: Path, width: float, height: float) -> Iterator[Figure]:
-        kept.append((path.name, width, height, Figure()))
-        yield kept[-1][3]
-
-    monkeypatch.setattr(radiance_field, "drawn", keep)
-    ratios = {kind: {"ratio_of_processor_time": k + 2.0} for k, kind in enumerate(("camera", "pixels", "any"))}
-    curves = {"ours": [(1.0, 20.0), (2.0, 25.0)], "peer": [(10.0, 18.0), (20.0, 24.0)], "peer_psnr": 24.0}
-    tiles = {"tiles": {"processor_seconds": 3.0, "steps": 100, "psnr": 30.0}}
-    BENCH.draw(
-        {
-            "step": {"fog": ratios, "shell": ratios},
-            "memory": {"peak_bytes": [2**20, 4 * 2**20], "field_bytes": 3 * 2**20, "bytes_per_ray": 100.4},
-            "locality": tiles,
-            "fit": {"fog": curves, "shell": curves},
-        },
-        tmp_path,
-    )
-    ((name, width, height, figure),) = kept
-    assert (name, width, height) == ("bench_radiance_field.png", 4.2 * 5, 3.6)
-    step, memory, locality, fog, shell = figure.axes
-    lines = [(list(line.get_xdata()), list(line.get_ydata())) for line in step.lines]
-    assert lines[0] == ([2.0, 2.0], [1, 0]) and ([8, 8], [0, 1]) in lines and ([4, 4], [0, 1]) in lines
-    assert [label.get_text() for label in step.get_legend().get_texts()] == ["camera rays", "random pixels", "any rays"]
-    assert step.get_ylim() == (-0.6, 2.5)
-    assert [bar.get_height() for bar in memory.patches] == [1, 4] and list(memory.lines[0].get_ydata()) == [3, 3]
-    assert memory.get_title() == "100 bytes a ray"
-    assert (list(locality.lines[0].get_xdata()), list(locality.lines[0].get_ydata())) == ([30.0], [30.0])
-    for axes, field in ((fog, "fog"), (shell, "shell")):
-        assert axes.get_title() == f"{field}, 7 views"
-        assert [list(line.get_ydata()) for line in axes.lines] == [[20, 25], [18, 24], [24, 24]]
-
-
 @pytest.mark.parametrize(("ours", "ratio"), [([(1.0, 20.0), (2.0, 25.0), (4.0, 30.0)], 10.0), ([(1.0, 20.0)], 0.0)])
 def test_a_fit_is_as_good_as_the_peers_best(monkeypatch: pytest.MonkeyPatch, ours: list, ratio: float) -> None:
     """24 dB, which the peer had after 20 s and lost again; ours is there after 2 s, or never."""
@@ -320,3 +280,17 @@ def test_a_fit_is_as_good_as_the_peers_best(monkeypatch: pytest.MonkeyPatch, our
     monkeypatch.setattr(fits, "peer_fit", lambda *asked: [(10.0, 18.0), (20.0, 24.0), (30.0, 23.0)])
     found = fits.ask_fit(TINY)["fog"]
     assert (found["peer_psnr"], found["ratio"], found["field"]) == (24.0, ratio, "made")
+
+
+def test_the_peer_takes_one_view_after_the_other(variant_rgb: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen = []
+
+    class Watched(Peer):
+        def render(self, o: mi.Point3f, d: mi.Vector3f) -> mi.Color3f:
+            seen.append(float(o.x[0]))
+            return Peer.render(self, o, d)
+
+    start = Peer.start(2)
+    views = [(mi.Point3f(x, 0.5, -1.0), mi.Vector3f(0, 0, 1), mi.Color3f(0.5)) for x in (0.25, 0.5, 0.75)]
+    assert len(list(Watched(start.density, start.harmonics).fit(views, 5))) == 5
+    assert seen == [0.25, 0.5, 0.75, 0.25, 0.5]

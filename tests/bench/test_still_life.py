@@ -99,6 +99,7 @@ def test_a_fit_is_judged_by_held_out_views(variant_rgb, tmp_path):
     white = np.mean([-10 * np.log10(np.mean((1 - photo.image) ** 2)) for photo in held_out])
     assert found["psnr"] > white + 1
     assert (found["degree"], found["views"], len(found["each"])) == (2, 8, 2)
+    assert found["photograph"] is held_out[1].image and found["view"].shape == held_out[1].image.shape
     figures = {"few": {"TV": found, "no TV": found | {"psnr": found["psnr"] - 1}}}
     (bar,) = bench.compare("few", figures["few"])
     assert bar["value"] == pytest.approx(1)

@@ -63,3 +63,11 @@ def test_refusals(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
 def test_the_largest_change_comes_first() -> None:
     before, now = {"size": "q", "a": 1.0, "b": 1.0, "c": 1.0, "d": 0.0}, {"size": "q", "a": 1.2, "b": 0.1, "c": 1.05, "d": 3.0}
     assert studies.changes(before, now) == ["b: 1 -> 0.1 (x 0.1)", "a: 1 -> 1.2 (x 1.2)"]
+
+
+def test_the_runs_own_numbers_are_not_compared() -> None:
+    """Machine, threads, load and bars say nothing of a result; the same words inside a question do."""
+    own = {"machine": {"cores": 2}, "versions": {"a": 1}, "threads": 2, "load_before_and_after": [1], "seconds": 3, "bars": [4]}
+    walk = {"seconds": 2.0, "on": True, "name": "x", "costs": [1, {"machine": 5}]}
+    found = studies.numbers_in(own | {"walk": walk})
+    assert found == [("walk.seconds", 2.0), ("walk.costs.0", 1.0), ("walk.costs.1.machine", 5.0)]

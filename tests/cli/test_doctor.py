@@ -50,3 +50,20 @@ def test_an_unsupported_mitsuba_is_a_fault(monkeypatch: pytest.MonkeyPatch) -> N
     findings = doctor._versions()
     assert [f.subject for f in findings if f.state == doctor.FAULT] == ["Mitsuba"]
     assert not doctor.render_works([*findings, doctor.Finding("llvm_ad_rgb", doctor.OK, "works")])
+
+
+def test_cores_and_memory_are_noted_where_there_is_little(monkeypatch: pytest.MonkeyPatch) -> None:
+    """More processors than the container grants, and less than 2 GiB."""
+    monkeypatch.setattr(doctor.os, "cpu_count", lambda: 8)
+    monkeypatch.setattr(doctor.os, "sched_getaffinity", lambda process: range(4), raising=False)
+    for cores, memory, state in ((4, 2 * 2**30, doctor.OK), (2, 2 * 2**30 - 1, doctor.NOTE)):
+        monkeypatch.setattr(doctor.machine, "cores", lambda cores=cores: cores)
+        monkeypatch.setattr(doctor.machine, "available_memory", lambda memory=memory: memory)
+        first, second = doctor._resources()
+        assert (first.subject, first.state, first.value) == ("cores", state, f"{cores} of 8")
+        assert (second.subject, second.state, second.value) == ("memory", state, "2.0 GiB available")
+        assert bool(first.advice) == bool(second.advice) == (state == doctor.NOTE)
+    assert first.advice == ("Dr.Jit starts 4 threads, the container grants 2: call dr.set_thread_count(2)",)
+    assert second.advice == ("2 GiB are needed for the examples",)
+    monkeypatch.setattr(doctor.machine, "available_memory", lambda: None)
+    assert [finding.subject for finding in doctor._resources()] == ["cores"]

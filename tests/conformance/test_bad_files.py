@@ -6,6 +6,7 @@ BAD is the table: name -> (file name, what makes its bytes, words that the sente
 from __future__ import annotations
 
 import io
+import json
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -14,12 +15,34 @@ import numpy as np
 import pytest
 import volume_files as made
 from conformance.test_files import SFORM, make_exchange
+from PIL import Image
 
 from mivol import files
 from mivol.errors import MivolError
 
 ONE = made.numbered()
 RGB = made.numbered(channels=3)
+
+
+QUOTING = {
+    "npy cut", "npy header cut", "npz cut", "npz damaged member", "nrrd bzip2 damaged", "vti xml cut", "vti zlib damaged",
+}  # fmt: skip
+SENTENCES = Path(__file__).with_suffix(".json")
+
+
+def assert_as_recorded(name: str, message: str, folder: Path, record: bool) -> None:
+    """Compare a sentence with the one that somebody read, or record it anew (``pytest -n 0 --record``): read it before.
+
+    Those that quote another library are left out: another release of it may say it otherwise.
+    """
+    if name in QUOTING:
+        return
+    sentences = json.loads(SENTENCES.read_text(encoding="utf-8"))
+    found = message.replace(str(folder), "FOLDER")
+    if record:
+        sentences[name] = found
+        SENTENCES.write_text(json.dumps(dict(sorted(sentences.items())), indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    assert found == sentences[name]
 
 
 def assert_sentence(message: str, *words: str) -> None:
@@ -103,6 +126,7 @@ BAD: dict[str, tuple[str, Callable[[], bytes], tuple[str, ...]]] = {
         ("more than 48 bytes",),
     ),
     "nrrd text cut": ("a.nrrd", lambda: made.nrrd(ONE, encoding="ascii")[:-5], ("23 numbers", "24")),
+    "nrrd text too long": ("a.nrrd", lambda: made.nrrd(ONE, encoding="ascii") + b" 1", ("25 numbers", "longer than")),
     "nrrd text word": ("a.nrrd", lambda: made.nrrd(ONE, encoding="ascii") + b" word", ("not a number",)),
     "nrrd type": ("a.nrrd", lambda: made.nrrd(ONE, type="block"), ("'block'",)),
     "nrrd encoding": ("a.nrrd", lambda: made.nrrd(ONE).replace(b": raw", b": hex"), ("'hex'", "raw, gzip")),
@@ -204,13 +228,14 @@ BAD: dict[str, tuple[str, Callable[[], bytes], tuple[str, ...]]] = {
 
 
 @pytest.mark.parametrize("name", BAD)
-def test_bad_file(tmp_path: Path, name: str) -> None:
+def test_bad_file(tmp_path: Path, name: str, record: bool) -> None:
     file_name, make, words = BAD[name]
     path = tmp_path / file_name
     path.write_bytes(make())
     with pytest.raises(MivolError) as caught:
         files.read_volume(path)
     assert_sentence(str(caught.value), str(tmp_path), *words)
+    assert_as_recorded(name, str(caught.value), tmp_path, record)
 
 
 def test_missing_file_offers_the_nearest(tmp_path: Path) -> None:
@@ -336,11 +361,12 @@ VALUES: dict[str, tuple[np.ndarray, dict, tuple[str, ...]]] = {
 
 
 @pytest.mark.parametrize("case", VALUES)
-def test_bad_values_are_named(case: str) -> None:
+def test_bad_values_are_named(case: str, tmp_path: Path, record: bool) -> None:
     values, options, words = VALUES[case]
     with pytest.raises(MivolError) as caught:
         files.check_volume(values, name="sigma_t", **options)
     assert_sentence(str(caught.value), "sigma_t: ", *words)
+    assert_as_recorded(f"values, {case}", str(caught.value), tmp_path, record)
 
 
 def test_good_values_pass() -> None:
@@ -378,16 +404,19 @@ EXCHANGE: dict[str, tuple[dict, tuple[str, ...]]] = {
     "angle NaN": ({"theta": np.array([0, 1, np.nan, 2])}, ("nan in theta at (2,)",)),
     "flats of another size": ({"data_white": np.ones((1, 2, 4))}, ("data_white of 2 x 4", "2 x 3")),
     "rank": ({"data": np.ones((4, 6))}, ("shape (4, 6)",)),
+    "projection Inf": ({"data": np.where(np.arange(24) == 23, np.inf, 0).reshape(4, 2, 3)}, ("inf in data at (3, 1, 2)",)),
+    "flat NaN": ({"data_white": np.where(np.arange(12) == 5, np.nan, 1).reshape(2, 2, 3)}, ("nan in data_white at (0, 1, 2)",)),
     "NaN": ({"data_dark": np.full((1, 2, 3), np.nan)}, ("nan in data_dark at (0, 0, 0)",)),
 }
 
 
 @pytest.mark.parametrize("case", EXCHANGE)
-def test_bad_projections(tmp_path: Path, case: str) -> None:
+def test_bad_projections(tmp_path: Path, case: str, record: bool) -> None:
     changes, words = EXCHANGE[case]
     with pytest.raises(MivolError) as caught:
         files.read_projections(make_exchange(tmp_path / "a.h5", **changes))
     assert_sentence(str(caught.value), "a.h5", *words)
+    assert_as_recorded(f"projections, {case}", str(caught.value), tmp_path, record)
 
 
 def test_angles_of_unknown_unit(tmp_path: Path) -> None:
@@ -399,6 +428,21 @@ def test_angles_of_unknown_unit(tmp_path: Path) -> None:
     with pytest.raises(MivolError) as caught:
         files.read_projections(path)
     assert_sentence(str(caught.value), "'gon'", "degrees or radians")
+
+
+def test_pages_of_a_tiff_are_grey_and_of_one_size(tmp_path: Path) -> None:
+    """A page more, wider than the first; two colour pages of one size."""
+    path = tmp_path / "a.tif"
+    first = Image.fromarray(np.zeros((3, 4), np.float32))
+    first.save(path, save_all=True, append_images=[Image.fromarray(np.zeros((3, 5), np.float32))])
+    with pytest.raises(MivolError) as caught:
+        files.read_stack(path)
+    assert_sentence(str(caught.value), "images of shapes [(3, 4), (3, 5)]", "grey images of one size")
+    colour = Image.fromarray(np.zeros((3, 4, 3), np.uint8))
+    colour.save(path, save_all=True, append_images=[colour])
+    with pytest.raises(MivolError) as caught:
+        files.read_stack(path)
+    assert_sentence(str(caught.value), "images of shapes [(3, 4, 3)]", "crop or convert them")
 
 
 def test_hdf5_that_is_none(tmp_path: Path) -> None:
@@ -472,9 +516,10 @@ WRITES: dict[str, tuple[Callable[[Path], None], tuple[str, ...]]] = {
 
 
 @pytest.mark.parametrize("case", WRITES)
-def test_bad_write(tmp_path: Path, case: str) -> None:
+def test_bad_write(tmp_path: Path, case: str, record: bool) -> None:
     write, words = WRITES[case]
     with pytest.raises(MivolError) as caught:
         write(tmp_path)
     assert_sentence(str(caught.value), *words)
+    assert_as_recorded(f"write, {case}", str(caught.value), tmp_path, record)
     assert list(tmp_path.iterdir()) == []

@@ -15,6 +15,7 @@ from PIL import Image
 
 from mivol.errors import MivolError
 from mivol.photos import Camera, between, facing, intrinsics, pixel_centres, project, rays, turntable
+from mivol.report import video
 from mivol.report.depth import depth_pixels, normal_pixels, normals_of_depth
 from mivol.report.video import film_suffix, write_video
 
@@ -40,16 +41,19 @@ def test_facing_puts_the_target_in_the_middle_and_up_upwards() -> None:
         facing(LIKE, np.array([0.0, 0, 2]), np.zeros(3), np.array([0, 0, 1]))
 
 
-def test_turntable_of_a_ring_is_the_ring() -> None:
+@pytest.mark.parametrize("middle", [(0, 0, 0), (5.0, -3.0, 2.0)])
+def test_turntable_of_a_ring_is_the_ring(middle: tuple[float, ...]) -> None:
     """Cameras at distance 4 and height 1 about z: so are those of the turntable, in equal steps all around."""
-    found = turntable(cameras_of(ring(12)), BOX, 5)
-    places = np.array([camera.origin for camera in found])
+    poses = np.array(ring(12))
+    poses[:, :3, 3] += middle
+    found = turntable(cameras_of(list(poses)), BOX + middle, 5)
+    places = np.array([camera.origin for camera in found]) - middle
     np.testing.assert_allclose(places[:, 2], 1, atol=1e-12)
     np.testing.assert_allclose(np.hypot(places[:, 0], places[:, 1]), 4, atol=1e-12)
     steps = np.diff(np.unwrap(np.arctan2(places[:, 1], places[:, 0])))
     np.testing.assert_allclose(np.abs(steps), 2 * np.pi / 5, atol=1e-12)
     for camera in found:
-        np.testing.assert_allclose(project(camera, np.zeros(3))[0], (32, 24), atol=1e-12)
+        np.testing.assert_allclose(project(camera, np.array(middle, float))[0], (32, 24), atol=1e-12)
 
 
 def test_turntable_of_an_arc_swings_over_it() -> None:
@@ -185,3 +189,11 @@ def test_films_that_are_refused(tmp_path: Path) -> None:
         with pytest.raises(MivolError, match=message):
             write_video(tmp_path / name, given, **settings)
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("shape", [(3, 4), (2, 5), (3, 5), (2, 4)])
+def test_frames_of_odd_sizes_repeat_their_last_row_and_column(shape: tuple[int, int]) -> None:
+    frame = np.arange(shape[0] * shape[1] * 3, dtype=np.uint8).reshape(*shape, 3)
+    found = video._even(frame)
+    assert found.flags.c_contiguous
+    np.testing.assert_array_equal(found, np.pad(frame, ((0, shape[0] % 2), (0, shape[1] % 2), (0, 0)), mode="edge"))

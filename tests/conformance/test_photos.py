@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from pathlib import Path
 
@@ -393,6 +394,14 @@ def test_rectified_photograph_is_what_a_pinhole_sees() -> None:
     assert 0.9 < flat.mask.mean() < 1
     np.testing.assert_allclose(flat.alpha, 1)
     assert rectified(flat) is flat
+    # What is masked stays so: each pixel that a masked one has a share in, and no other.
+    assert np.array_equal(rectified(dataclasses.replace(photo, mask=np.ones((48, 64), bool))).mask, flat.mask)
+    mask = np.ones((48, 64), bool)
+    mask[20, 40] = False
+    lost = np.argwhere(flat.mask & ~rectified(dataclasses.replace(photo, mask=mask)).mask)
+    assert 1 <= len(lost) <= 9 and np.ptp(lost, axis=0).max() <= 2
+    back = project(bent, np.array([(lost[:, 1].mean() + 0.5 - 31) / 42, -(lost[:, 0].mean() + 0.5 - 22) / 42, -1.0]))[0]
+    np.testing.assert_allclose(back, (40.5, 20.5), atol=1)
 
 
 def linear_picture(camera: Camera) -> np.ndarray:

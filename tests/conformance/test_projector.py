@@ -197,6 +197,18 @@ def test_passes_change_nothing(monkeypatch, cells):
     np.testing.assert_allclose(a.T @ y, expected_back, atol=2e-6 * np.abs(expected_back).max())
 
 
+@pytest.mark.parametrize(("cells", "rays"), [(1 << 29, 60), (22, 1), (54, 3)])
+def test_rays_of_a_pass(monkeypatch, cells, rays):
+    """As many as fill the voxels of a slice across the longest side once; fewer where they would cross too many cells."""
+    grid = VoxelGrid((3, 5, 7), (0.5, 0.4, 0.6))
+    monkeypatch.setattr(projector_module, "PASS_CELLS", cells)
+    monkeypatch.setattr(projector_module, "PASS_SUM", 4)
+    a = Projector(ParallelBeam(np.radians([0, 90]), (9, 8), 0.1), grid)
+    # 15 voxels a slice, 4 rays each; a ray crosses 3 + 5 + 7 + 3 cells at most.
+    starts = [start for start, *_ in a._set_up_passes()]
+    assert starts == [view * 72 + start for view in (0, 1) for start in range(0, 72, min(rays, 72))]
+
+
 def test_rays_are_kept_up_to_a_bound(monkeypatch):
     """Six float32 numbers a ray, whatever the grid holds: kept where they just fit, and set up anew for each product beyond."""
     x, rays = numbers(*GRID.shape), BEAMS["cone"].shape

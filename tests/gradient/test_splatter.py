@@ -12,6 +12,7 @@ from clouds import cloud, looking, tensors
 from mivol.photos.camera import Camera, intrinsics
 from mivol.splatting import Splatter
 from mivol.splatting.compositing import STOP
+from mivol.splatting.splatter import _capacity
 
 WIDTH, HEIGHT = 40, 37
 SIZES = {1: 0.2, 8: 0.05, 50: 0.15}
@@ -135,3 +136,8 @@ def test_kernels_are_recorded_once(splatter: Splatter) -> None:
             compiled = [k for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT and not k["cache_hit"]]
             assert n == 60 or len(compiled) == 0, n
     assert [f.n_recordings for f in recorded] == [1, 1, 1, 1]
+
+
+def test_room_for_gaussians_is_a_power_of_two() -> None:
+    """So that kernels are compiled anew a few times in a fit, and not with every clone."""
+    assert [_capacity(n) for n in (1, 4096, 4097, 8192, 8193)] == [4096, 4096, 8192, 8192, 16384]
