@@ -13,6 +13,7 @@ from mivol.config import Cone, Detector, Ellipsoids, Known, Matrices, Measured, 
 from mivol.errors import MivolError
 from mivol.experiments.nikon_scan import nikon_grid
 from mivol.experiments.readings import ScanReadings, note_order, read_scan
+from mivol.experiments.row_order import note_rows
 from mivol.files import read_columns, read_volume
 from mivol.files.fetch import place_of
 from mivol.optim.linear_problems import PoissonCounts
@@ -114,14 +115,17 @@ def make_data(chosen: config.Scan, base: Path, grid: VoxelGrid) -> Projections:
     Raises:
         MivolError: files that cannot be read or do not fit, or rays that all miss the grid.
     """
-    if isinstance(chosen.data, Measured | Stack | Nikon):
+    is_measured = isinstance(chosen.data, Measured | Stack | Nikon)
+    if is_measured:
         data = read_measured(chosen, base)
     else:
         geometry = make_geometry(chosen, base)
         exact, truth = SIMULATED[type(chosen.data)](chosen.data, base, geometry, grid)
         data = add_noise(geometry, exact, truth, chosen.data.photons, chosen.data.seed)
     check_hits(Projector(data.geometry, grid))
-    return data
+    if not is_measured:
+        return data
+    return replace(data, notes=(*data.notes, *note_rows(chosen.data, data.geometry, grid, data.y, data.weights)))
 
 
 def check_hits(projector: Projector) -> None:

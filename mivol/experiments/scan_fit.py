@@ -65,6 +65,7 @@ def scan_fit(task: Task) -> Path:
         with run.stage("projections"):
             data = make_data(chosen, task.base, grid)
             run.record.notes += data.notes
+            task.watcher.say(data.notes)
         projector = Projector(data.geometry, grid)
         held_out = held_out_views(chosen, projector.n_views)
         with run.stage("solve"):

@@ -225,7 +225,7 @@ def _nearest_column(pair: Mirrors, beam: ConeBeam, alpha: np.ndarray) -> float:
         alike = np.sum(w * here * there) / np.sqrt(ours * theirs)
         best, found = max((best, found), (alike, float(column)))
     if best < LEAST_ALIKE:
-        raise MivolError("found no lines of a structure that both of their ends show, expected some to find the axis by.")
+        raise MivolError("found no lines of a structure that both of their ends show, expected some: check the angles.")
     return found
 
 
