@@ -139,7 +139,7 @@ def test_only_rays_in_layers_are_stored() -> None:
 
 
 def test_storing_pays_with_layers_iterations_and_subsets() -> None:
-    assert is_worth_storing(1, 24, False)
-    assert is_worth_storing(24, 1, False)
-    assert not is_worth_storing(1, 23, False)
+    assert is_worth_storing(1, 9, False)
+    assert is_worth_storing(9, 1, False)
+    assert not is_worth_storing(1, 8, False)
     assert is_worth_storing(1, 1, True)
