@@ -1,7 +1,7 @@
 """A projector whose matrix is stored: for scans whose rays lie in layers, one layer's rows serve them all.
 
-A walk computes each entry anew in every product. Where a layer's matrix fits into memory, a product reads it: that takes a
-third of a walk's time for one slice and a tenth for sixty-four, and a subset of views is a part of it that costs nothing.
+A walk computes each entry anew in every product. Where a layer's matrix fits into memory, a product reads it: that takes
+half of a walk's time for one slice and a tenth for sixty-four, and a subset of views is a part of it that costs nothing.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ LAYERS_AT_ONCE = 32
 """Columns of one product: 32 floats are two cache lines, and a layer of 256^2 of them fits into a second-level cache."""
 
 PRODUCTS_TO_PAY = 9
-"""Products with A and its transpose, counted a layer, after which storing is paid for: an entry costs about 23 ns of the processor
+"""Products with A and its transpose, counted a layer, after which storing is paid for: an entry takes the processor about 23 ns
 to store, and each pair of products reads it 2.6 ns sooner than a walk finds it (2.2 and 4.8 ns, one layer)."""
 
 Blocks = list[scipy.sparse.csr_array]
