@@ -79,6 +79,7 @@ class Example:
         says: what it shows.
         stand_in: of the public data that it shows; None where it makes its own.
         photographs: script of its folder that makes the photographs that are fitted; "" for none.
+        scan: script of its folder that makes the readings that are fitted, and finds a stand-in itself; "" for none.
         folder: where its files lie; "" for a folder of its own name.
         file: its experiment.
     """
@@ -86,6 +87,7 @@ class Example:
     says: str
     stand_in: StandIn | ComputedScan | None = None
     photographs: str = ""
+    scan: str = ""
     folder: str = ""
     file: str = "fit.toml"
 
@@ -113,8 +115,17 @@ _SLICES = ComputedScan(
 )
 """As many views as the tooth has and half as many columns; the head fills them."""
 
+SCAN_FILES = {
+    "scan.file": "panels.txt",
+    "data.file": "readings.npy",
+    "data.flats": "flats.npy",
+    "data.darks": "darks.npy",
+}
+"""Settings of an example with a ``scan``, and what the script writes for them."""
+
 EXAMPLES: dict[str, Example] = {
     "demo": Example("a tangle of absorbing matter from 16 pictures, about a minute"),
+    "bonsai": Example("a bonsai from readings of a simulated cone-beam scan, its geometry a table", scan="scan.py"),
     "shepp_logan": Example("the head phantom of Shepp and Logan from cone-beam projections"),
     "still_life": Example("glossy and matt things from photographs, as a radiance field", photographs="photographs.py"),
     "gaussians": Example(
@@ -198,7 +209,7 @@ def run_example(
 
 
 def prepare(name: str, example: Example, source: Path, folder: Path, watcher: Watcher) -> list[str]:
-    """What lies ready before an example runs, as changes of its settings: photographs, or a stand-in for public data."""
+    """What lies ready before an example runs, as changes of settings: photographs, readings, or a stand-in for public data."""
     folder.mkdir(parents=True, exist_ok=True)
     if example.photographs:
         photographs = folder.resolve() / "photographs"
@@ -206,6 +217,12 @@ def prepare(name: str, example: Example, source: Path, folder: Path, watcher: Wa
             watcher.say(["making the photographs"])
             run_script(source / example.photographs, ["-o", str(photographs)])
         return [f"photos.path={quoted(photographs)}"]
+    if example.scan:
+        readings = folder.resolve() / "scan"
+        if not (readings / "truth.npz").exists():
+            watcher.say(["making the readings"])
+            run_script(source / example.scan, ["-o", str(readings)])
+        return [f"{setting}={quoted(readings / file)}" for setting, file in SCAN_FILES.items()]
     if example.stand_in is None or find_data(example.stand_in.data) is not None:
         return []
     wanted = example.stand_in

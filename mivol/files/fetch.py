@@ -96,6 +96,15 @@ SETS = (
         "BSD-3-Clause (Kitware)",
     ),
     DataSet(
+        "bonsai",
+        "a CT scan of a bonsai, 256 x 256 x 256",
+        _at("Kitware/vtk-js-datasets/cbdbd91c8b9f161d41fc1ddbb9369e17e20e6344", "data/vti/bonsai.vti"),
+        "ct_mri/bonsai.vti",
+        3376795,
+        "7129989b41b2197a73b68f66b3b889d9dc7ab6ef08dbdcfb61ca9cdf9f0981dc",
+        "BSD-3-Clause (Kitware)",
+    ),
+    DataSet(
         "tooth_projections",
         "181 synchrotron projections of a tooth, with flat and dark fields",
         _at("tomopy/tomopy/2c94ed18a06f7908b018c6f8e43d320f8a8488f2", "source/tomopy/data/tooth.h5"),

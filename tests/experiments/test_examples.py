@@ -91,6 +91,25 @@ def test_a_stand_in_takes_the_place_of_public_data(tmp_path: Path, name: str) ->
     assert examples.prepare(name, example, source, tmp_path / "run", watcher) == []
 
 
+def test_readings_are_made_before_an_example_that_fits_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its script writes into the run folder, once, and the settings name what it wrote."""
+    calls = []
+
+    def make(path: Path, arguments: list[str]) -> None:
+        calls.append(path.name)
+        Path(arguments[-1]).mkdir()
+        (Path(arguments[-1]) / "truth.npz").touch()
+
+    monkeypatch.setattr(examples, "run_script", make)
+    source = examples_folder() / "bonsai"
+    for _ in range(2):
+        changes = examples.prepare("bonsai", EXAMPLES["bonsai"], source, tmp_path / "run", Nobody())
+    chosen = config.load(source / "fit.toml", changes)
+    assert calls == ["scan.py"]
+    named = (chosen.scan.file, chosen.data.file, chosen.data.flats, chosen.data.darks)
+    assert named == tuple(str(tmp_path / "run" / "scan" / n) for n in ("panels.txt", "readings.npy", "flats.npy", "darks.npy"))
+
+
 def test_an_example_of_a_public_scan_runs_without_it(variant_rgb: str, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     """Computed projections take the place of measured ones, which is said; the slices are found all the same."""
     short = ["--set", "scan.detector=[2,48]", "--set", "scan.pitch=0.041666667", "--set", "scan.views=45"]
