@@ -250,6 +250,14 @@ def white_sky() -> Iterator:
     yield from follow(scene, ("sigma_t.data", "sigma_t.value.value", "albedo.value.value"), max_depth=2)
 
 
+def refraction() -> Iterator:
+    fog = {"type": "homogeneous", "sigma_t": 2.0, "albedo": rgb(0.95, 0.8, 0.6), "phase": {"type": "hg", "g": 0.4}}
+    glass = {"type": "sphere", "center": (0.2, -0.1, 0.1), "radius": 0.8, "bsdf": {"type": "dielectric", "int_ior": 1.8}}
+    smoke = ball(medium(0.8, 0.7), (-1.3, 0.2, 0.1), 0.45)
+    scene = {"glass": {**glass, "interior": fog}, "smoke": smoke, "floor": floor(), "sky": envmap(), "sensor": camera()}
+    yield from follow(scene, ("sigma_t.value.value", "albedo.value.value", "reflectance.value"), max_depth=9, rr_depth=1)
+
+
 def projector() -> Iterator:
     from mivol.tomography.geometry import ConeBeam, VoxelGrid
     from mivol.tomography.projector import Projector
@@ -266,7 +274,7 @@ CASES: dict[str, Callable[[], Iterator[tuple[str, np.ndarray]]]] = {
     for case in (
         absorption, absorption_rgb, constant_light, emitter_and_sky, sun_by_sums, sun_by_sums_in_a_lattice, estimated_shadows,
         several_media, surfaces, emission, radiance_field, emitters_of_every_kind, free_flights, side_flights, white_sky,
-        projector,
+        refraction, projector,
     )
 }  # fmt: skip
 

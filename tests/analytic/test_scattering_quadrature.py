@@ -7,6 +7,8 @@ with a kink of its own slope errs by p^2 / 8 of its light: 0.25^2 / 8 = 8e-3; of
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -14,6 +16,7 @@ import oracle_scattering as twins
 import pytest
 from scattering_scenes import PLACE, aimed, close_up, fog, mivol, pencils, point, rough_grid, smoke, spot, sun
 
+from mivol.transport.estimators import scattering_quadrature as quadrature
 from scenes import as_float32, box_of, centred, grid_volume, refused, sky
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
@@ -162,3 +165,32 @@ def test_deep_cells_lose_no_light(name, tau):
     # fourth order of that: 0.25^4 / 4320 (the Gauss rule's), which leaves room for float32 sums of 700 pieces: 700 ulp, 1e-4.
     rounding = 4 * tau * np.spacing(np.float32(0.25)) / 2 / mu
     assert np.abs(found / truth - 1).max() <= 1e-4 + rounding
+
+
+# -- How many pieces ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("sigma", "angle", "least", "pieces"),
+    [
+        (0.01, None, 1, 1),
+        (0.01, None, 3, 3),
+        (2.0, None, 1, 16),  # an optical depth of 4 in pieces of 1/4
+        (0.01, 0.45, 1, 5),  # an angle of 0.45 in turns of 0.1
+        (2.0, 0.45, 1, 16),
+        (0.01, -1.0, 1, 1),  # an emitter at infinity has no angle
+    ],
+)
+def test_a_span_is_cut_by_optical_depth_and_by_angle(
+    monkeypatch: pytest.MonkeyPatch, sigma: float, angle: float | None, least: int, pieces: int
+) -> None:
+    counted = []
+    monkeypatch.setattr(quadrature, "_add_pieces", lambda state, span, is_deep, edges, count: counted.append(count) or state)
+    towards = None
+    if angle is not None:
+        towards = SimpleNamespace(finite=mi.Bool(angle > 0), angle=lambda start, dt: mi.Float(abs(angle)))
+    profile = lambda x: [mi.Float(part * sigma) for part in (0.5, 1.0, 0.25)]  # noqa: E731
+    span = quadrature._Span(mi.Float64(1), mi.Float(2), profile, None, towards, mi.Bool(True))
+    state = quadrature._LightSum([mi.Float(0)] * 3, [mi.Float(1)] * 3, mi.Spectrum(0))
+    quadrature._add_span(state, span, mi.Float(least))
+    assert [int(count[0]) for count in counted] == [pieces]

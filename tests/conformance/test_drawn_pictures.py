@@ -20,6 +20,7 @@ RECORDED = Path(__file__).with_suffix(".json")
 CASES = (
     "constant_light", "emitter_and_sky", "sun_by_sums", "sun_by_sums_in_a_lattice", "estimated_shadows", "several_media",
     "surfaces", "emitters_of_every_kind", "free_flights", "side_flights", "white_sky",
+    "refraction",
 )  # fmt: skip
 
 ROUNDING = 1e-3

@@ -19,6 +19,8 @@ from volpath_scenes import (
     same,
 )
 
+from mivol.transport.estimators.emitters import SceneEmitters
+
 pytestmark = pytest.mark.usefixtures("variant_rgb")
 
 
@@ -43,3 +45,22 @@ def test_no_emitter_at_all():
     dr.enable_grad(params[key])
     dr.backward(dr.mean(mi.render(scene, params, integrator=mi.load_dict(mivol()), spp=4), axis=None))
     assert not np.any(dr.grad(params[key]))
+
+
+def test_what_is_sampled_and_what_is_seen_through() -> None:
+    """A constant sky is hit by chance; a masked panel transmits, an opaque one is hit by directions of the phase function."""
+    panel = {"type": "rectangle", "emitter": {"type": "area", "radiance": 1.0}}
+    masked = {"type": "mask", "opacity": 0.5, "nested": {"type": "diffuse"}}
+    sun = {"type": "directional", "direction": [0, 0, -1]}
+    near = {"type": "point", "position": [0, 1, 2]}
+    scene = mi.load_dict({"type": "scene", "sky": {"type": "constant"}, "a": panel, "b": {**panel, "bsdf": masked}, "sun": sun})
+    found = SceneEmitters(scene)
+    assert sorted(e.class_name() for e in found.sampled) == ["AreaLight", "AreaLight", "DirectionalEmitter"]
+    (seen_through,) = found.transmissive
+    assert seen_through is scene.shapes()[1].emitter() or seen_through is scene.shapes()[0].emitter()
+    assert mi.has_flag(seen_through.get_shape().bsdf().flags(), mi.BSDFFlags.Null)
+    assert found.samples_phase and found.is_near
+    assert sum(found.bounding_ball(k) is None for k in range(3)) == 1
+    for emitter, at_hand in ((sun, False), (near, True), ({**panel, "bsdf": masked}, True)):
+        found = SceneEmitters(mi.load_dict({"type": "scene", "only": emitter}))
+        assert not found.samples_phase and found.is_near == at_hand

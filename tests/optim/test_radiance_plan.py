@@ -10,8 +10,10 @@ import pytest
 from ball_photos import BOX, PLAN
 
 from mivol.errors import MivolError
-from mivol.optim.radiance_plan import PRESETS, FitPlan, Stage, memory_of, place_grid
-from mivol.optim.ray_batches import RayBatches
+from mivol.fields.spherical import basis_size, row_width
+from mivol.optim import radiance_plan
+from mivol.optim.radiance_plan import FILLED, PRESETS, RAY, FitPlan, Stage, bytes_of, memory_of, place_grid
+from mivol.optim.ray_batches import TILE, RayBatches
 from mivol.photos import Photo
 
 
@@ -23,6 +25,25 @@ def test_memory_is_counted_first(variant_rgb: str, photos: list[Photo]) -> None:
         memory_of(PRESETS["gpu"], BOX, views, limit=2 << 30)
     with pytest.raises(MivolError, match="no resolution fits"):
         memory_of(PRESETS["gpu"], BOX, views, limit=1000)
+
+
+@pytest.mark.parametrize("degree", [0, 2])
+def test_bytes_of_a_stage(variant_rgb: str, monkeypatch: pytest.MonkeyPatch, degree: int) -> None:
+    """A row holds density and coefficients (padded to four numbers a channel) three times in float32, and its place; a table
+    of each pinhole is there once, derived once, and once more for each thread that adds to it. Every node has an index."""
+    plan, box = FitPlan((Stage(8, 1, 4, 2, 32), Stage(16, 1, 1, 3, 64)), degree=degree), np.array([[-1.0] * 3, [1.0, 1, 0]])
+    width = row_width(basis_size(degree))
+    found = []
+    for threads in (2, 7):
+        monkeypatch.setattr(radiance_plan.dr, "thread_count", lambda threads=threads: threads)
+        found.append(bytes_of(plan, plan.stages[1], box, rows=1000))
+        nodes = np.prod(place_grid(box, 16)[0])
+        copies = 2 + threads * variant_rgb.startswith("llvm")
+        assert found[-1] == 1000 * (12 * (1 + width) + 24 + 3 * 16 * copies) + 16 * nodes + 3 * 64 * TILE**2 * RAY
+    # The first stage keeps every node, later ones the share that fits have kept.
+    for stage, share in ((plan.stages[0], 1), (plan.stages[1], FILLED)):
+        nodes = int(np.prod(place_grid(box, stage.longest)[0]))
+        assert bytes_of(plan, stage, box) == bytes_of(plan, stage, box, rows=int(share * nodes))
 
 
 TOO_LARGE = [("cpu", 32, 40), ("cpu", 128, 20), ("gpu", 64, 200), ("gpu", 300, 500)]
