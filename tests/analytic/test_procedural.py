@@ -32,7 +32,7 @@ def test_procedural_volumes_are_the_same_object_at_every_resolution() -> None:
 
 
 def test_a_seed_is_the_same_object_on_every_machine() -> None:
-    """Mean, spread, largest value and three voxels, as recorded; elementary functions differ by 1e-15 of them between machines."""
+    """Mean, spread, largest value and three voxels, as recorded; elementary functions differ by 1e-15 between machines."""
     values = make_procedural("tangle", (9, 10, 11), seed=5, peak=2.0)[..., 0]
     found = [values.mean(), values.std(), values.max(), values[4, 5, 6], values[2, 7, 3], values[6, 3, 8]]
     np.testing.assert_allclose(found, [0.08407, 0.23891, 1.84418, 1.44317, 0.5357, 0.00068], atol=1e-5)
