@@ -1,7 +1,7 @@
 """Made-up volumes that look like something: seeded fields for demos and tests, the same numbers on every machine.
 
 Conventions. A recipe maps (points, generator) to values in [0, 1], points (..., 3) as (x, y, z) in the unit cube; it is
-sampled at voxel centres, so every resolution shows the same object. PROCEDURAL lists them. NumPy only.
+sampled at voxel centres, so every resolution shows the same object. PROCEDURAL lists them.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 import numpy as np
+from scipy.spatial import KDTree
 
 from mivol.errors import MivolError
 
@@ -36,10 +37,8 @@ def tube(p: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         np.outer(np.cos(k * s), rng.uniform(-0.26, 0.26, 3)) / k + np.outer(np.sin(k * s), rng.uniform(-0.26, 0.26, 3)) / k
         for k in (1, 2)
     )
-    nearest = np.full(p.shape[:-1], np.inf)
-    for point in curve:
-        nearest = np.minimum(nearest, np.sum((p - point) ** 2, axis=-1))
-    return np.exp(-0.5 * nearest / 0.022**2)
+    nearest, _ = KDTree(curve).query(p)
+    return np.exp(-0.5 * (nearest / 0.022) ** 2)
 
 
 def inside(p: np.ndarray) -> np.ndarray:
