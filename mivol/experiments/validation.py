@@ -216,12 +216,13 @@ def check_gradient(
     direction = np.random.default_rng([chosen.seed, len(key)]).uniform(0.0, 2.0, start.shape) * start
     if not direction.any():
         raise MivolError(f"{key} is 0 everywhere, where a central difference would step below 0: put values into the scene.")
-    spp, slopes, near, far = math.ceil(chosen.spp / BATCHES), Moments.empty(), Moments.empty(), Moments.empty()
+    mean = MeanRadiance(scene, camera, ours, key, math.ceil(chosen.spp / BATCHES))
+    slopes, near, far = Moments.empty(), Moments.empty(), Moments.empty()
     for batch in range(BATCHES):
         seeds = [seed_of(chosen.seed, GRADIENT, batch, which) for which in range(4)]
-        slopes = slopes.add(slope_of(scene, camera, ours, key, direction, spp, (seeds[0], seeds[1])))
-        near = near.add(difference(scene, camera, ours, key, start, STEP * direction, spp, seeds[2]) / STEP)
-        far = far.add(difference(scene, camera, ours, key, start, 2 * STEP * direction, spp, seeds[3]) / (2 * STEP))
+        slopes = slopes.add(mean.slope(direction, seeds[0], seeds[1]))
+        near = near.add(mean.difference(start, STEP * direction, seeds[2]) / STEP)
+        far = far.add(mean.difference(start, 2 * STEP * direction, seeds[3]) / (2 * STEP))
     put(params, key, start)
     g, d = Estimate.of(slopes), Estimate.of(near)
     error = float(np.sqrt(g.var + d.var))
@@ -230,33 +231,44 @@ def check_gradient(
     return Slope(key, float(g.mean), float(d.mean), error, left_out, float(z_bound(level, dof)) * error + left_out)
 
 
-def slope_of(
-    scene: mi.Scene, camera: mi.Sensor, integrator: mi.Integrator, key: str, direction: np.ndarray, spp: int,
-    seeds: tuple[int, int],
-) -> float:  # fmt: skip
-    """d mean radiance / d t of the parameter x + t v, by reverse mode."""
-    params = mi.traverse(scene)
-    dr.enable_grad(params[key])
-    params.update()
-    image = mi.render(scene, params, integrator=integrator, sensor=camera, spp=spp, seed=seeds[0], seed_grad=seeds[1])
-    dr.backward(dr.mean(image, axis=None))
-    gradient = np.array(as_tensor(dr.grad(params[key])), dtype=np.float64)
-    dr.disable_grad(params[key])
-    return float(np.sum(gradient * direction))
+@dataclass(frozen=True)
+class MeanRadiance:
+    """The mean radiance of a render, as a function of one parameter of its scene.
 
+    Attributes:
+        scene, camera, integrator: what is rendered.
+        key: the parameter, as ``mi.traverse`` names it.
+        spp: samples a pixel of one render.
+    """
 
-def difference(
-    scene: mi.Scene, camera: mi.Sensor, integrator: mi.Integrator, key: str, start: np.ndarray, step: np.ndarray, spp: int,
-    seed: int,
-) -> float:  # fmt: skip
-    """Half the difference of the mean radiance a step on and a step back, with the same random numbers."""
-    params, means = mi.traverse(scene), []
-    for sign in (1.0, -1.0):
-        put(params, key, start + sign * step)
-        with dr.suspend_grad():
-            means.append(float(np.mean(np.asarray(integrator.render(scene, camera, seed=seed, spp=spp), np.float64))))
-    put(params, key, start)
-    return (means[0] - means[1]) / 2
+    scene: mi.Scene
+    camera: mi.Sensor
+    integrator: mi.Integrator
+    key: str
+    spp: int
+
+    def slope(self, direction: np.ndarray, seed: int, seed_grad: int) -> float:
+        """d mean / d t of the parameter x + t v, by reverse mode."""
+        params = mi.traverse(self.scene)
+        dr.enable_grad(params[self.key])
+        params.update()
+        how = {"integrator": self.integrator, "sensor": self.camera, "spp": self.spp}
+        image = mi.render(self.scene, params, seed=seed, seed_grad=seed_grad, **how)
+        dr.backward(dr.mean(image, axis=None))
+        gradient = np.array(as_tensor(dr.grad(params[self.key])), dtype=np.float64)
+        dr.disable_grad(params[self.key])
+        return float(np.sum(gradient * direction))
+
+    def difference(self, start: np.ndarray, step: np.ndarray, seed: int) -> float:
+        """Half the difference of the mean a step on and a step back, with the same random numbers."""
+        params, means = mi.traverse(self.scene), []
+        for sign in (1.0, -1.0):
+            put(params, self.key, start + sign * step)
+            with dr.suspend_grad():
+                image = self.integrator.render(self.scene, self.camera, seed=seed, spp=self.spp)
+            means.append(float(np.mean(np.asarray(image), dtype=np.float64)))
+        put(params, self.key, start)
+        return (means[0] - means[1]) / 2
 
 
 # -- Files --------------------------------------------------------------------------------------------------------

@@ -52,7 +52,7 @@ def test_mivol_agrees_with_volpath(variant_rgb, scene: Path, capsys: pytest.Capt
 def test_a_wrong_renderer_is_found(variant_rgb, scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Ours is given half the extinction for a while, and its gradient half the slope."""
     loaded = load_scene(scene)
-    real_image, real_slope = validation.render_batches, validation.slope_of
+    real_image, real_slope = validation.render_batches, validation.MeanRadiance.slope
 
     def halved(scene: mi.Scene, *rest: object) -> object:
         params = mi.traverse(scene)
@@ -70,7 +70,7 @@ def test_a_wrong_renderer_is_found(variant_rgb, scene: Path, monkeypatch: pytest
     assert verdict.code == DIFFERS
     assert not verdict.comparison.agrees
     with monkeypatch.context() as patch:
-        patch.setattr(validation, "slope_of", lambda *given: 0.5 * real_slope(*given))
+        patch.setattr(validation.MeanRadiance, "slope", lambda *given: 0.5 * real_slope(*given))
         verdict = validate_scene(loaded, scene.parent / "a", FEW)
     assert verdict.code == DIFFERS
     assert verdict.comparison.agrees
@@ -152,17 +152,17 @@ def test_a_gradient_is_checked_by_differences(variant_rgb: str, monkeypatch: pyt
     monkeypatch.setattr(validation, "as_tensor", lambda value: value)
     monkeypatch.setattr(validation, "put", lambda params, key, start: put_back.append((key, start.tolist())))
 
-    def slope_of(scene: object, camera: object, ours: object, key: str, direction: np.ndarray, spp: int, seeds: tuple) -> float:
-        heard.append(("slope", direction, spp, seeds))
+    def slope(self: validation.MeanRadiance, direction: np.ndarray, *seeds: int) -> float:
+        assert (self.scene, self.camera, self.integrator) == ("scene", "camera", "ours")
+        heard.append(("slope", direction, self.spp, seeds))
         return 6 + next(swing)
 
-    def difference(*asked: object) -> float:
-        *_, key, start, step, spp, seed = asked
-        heard.append((key, start.tolist(), step, spp, seed))
+    def difference(self: validation.MeanRadiance, start: np.ndarray, step: np.ndarray, seed: int) -> float:
+        heard.append((self.key, start.tolist(), step, self.spp, seed))
         return 0.1 if len(heard) % 3 == 2 else 0.22
 
-    monkeypatch.setattr(validation, "slope_of", slope_of)
-    monkeypatch.setattr(validation, "difference", difference)
+    monkeypatch.setattr(validation.MeanRadiance, "slope", slope)
+    monkeypatch.setattr(validation.MeanRadiance, "difference", difference)
     chosen = Validation(spp=33, seed=5, parameters=("a.key", "b"))
     level = Significance(1e-3, 2)
     found = validation.check_gradient("scene", "camera", "ours", "a.key", chosen, level)
@@ -205,6 +205,7 @@ def test_a_difference_is_half_of_both_sides(variant_rgb: str, monkeypatch: pytes
         return np.array([[[7.0, 9.0]], [[1.0, 1.0]]][len(asked) - 1])
 
     integrator = SimpleNamespace(render=render)
-    found = validation.difference("scene", "camera", integrator, "k", np.array([1.0, 2.0]), np.array([0.5, 0.25]), 4, 9)
+    mean = validation.MeanRadiance("scene", "camera", integrator, "k", 4)
+    found = mean.difference(np.array([1.0, 2.0]), np.array([0.5, 0.25]), 9)
     assert found == 3.5 and asked == [(9, 4), (9, 4)]
     assert placed == [("params", "k", values) for values in ([1.5, 2.25], [0.5, 1.75], [1.0, 2.0])]

@@ -426,17 +426,30 @@ def test_weight_of_a_blend():
 MICROFLAKES = [[0.3, 0.8, 0.2, 0.05, 0.02, -0.03]]
 
 
-@pytest.mark.statistical
-@pytest.mark.parametrize("key", ["phase_function.S.data", "emitter.position"])
-def test_extinction_of_microflakes(key):
-    """Extinction is in proportion to the area that microflakes show to the ray: it changes with matrix and direction.
-
-    Against differences of renders by quadrature, which err by 5e-3 (where shadow rays begin to leave by another face).
-    """
+def of_microflakes() -> mi.Scene:
+    """A medium whose extinction is in proportion to the area that microflakes show to the ray."""
     S = mi.VolumeGrid(np.array(MICROFLAKES, dtype=np.float32).reshape(1, 1, 1, 6))
     phase = {"type": "sggx", "S": {"type": "gridvolume", "grid": S, "raw": True}}
     box = box_of({"type": "mivol_medium", "sigma_a": 0.3, "sigma_s": 0.7, "phase": phase}, PLACE)
-    scene = small.close_up({"smoke": box, "emitter": point([1.5, 1, 2.0])[0]}, res=8)
+    return small.close_up({"smoke": box, "emitter": point([1.5, 1, 2.0])[0]}, res=8)
+
+
+def test_microflakes_forward_against_reverse():
+    """<J v, w> = <v, J^T w> with the same random numbers, as below."""
+    scene, integrator, key = of_microflakes(), mi.load_dict(mivol()), MEDIUM + "phase_function.S.data"
+    rng = np.random.default_rng(3)
+    v, w = rng.uniform(0.2, 1, (1, 1, 1, 6)), rng.uniform(0.2, 1, (8, 8, 3))
+    jv, jtw = jvp(scene, key, v, 8, 5, integrator), vjp(scene, key, w, 8, 5, integrator)
+    assert abs((jv * w).sum() - (jtw * v).sum()) <= 1e-5 * np.abs(jv * w).sum()
+    assert np.abs(jv).max() > 1e-4
+
+
+@pytest.mark.statistical
+@pytest.mark.parametrize("key", ["phase_function.S.data", "emitter.position"])
+def test_extinction_of_microflakes(key):
+    """Extinction changes with matrix and direction: against differences of renders by quadrature, which err by 5e-3 (where
+    shadow rays begin to leave by another face)."""
+    scene = of_microflakes()
     key = key if key.startswith("emitter") else MEDIUM + key
     params, still = mi.traverse(scene), mi.load_dict(mivol(deterministic=True))
     start, kind = np.array(params[key], dtype=np.float64), type(params[key])
