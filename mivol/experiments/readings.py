@@ -51,6 +51,7 @@ def read_scan(chosen: config.Scan, base: Path) -> ScanReadings:
     if isinstance(wanted, Measured):
         scan = read_projections(place_of(base, wanted.file), wanted.group)
         fields = scan.projections, scan.flats, scan.darks
+        check_unit(np.degrees(scan.angles), "degree", "write theta in degrees")
         return ScanReadings(correct_transmission(*fields, wanted.saturation), scan.angles, intensity=fields)
     return read_stack_scan(chosen, base)
 
@@ -97,16 +98,25 @@ def to_radians(angles: np.ndarray, unit: str) -> np.ndarray:
     """Angles in radians.
 
     Raises:
+        MivolError: as :func:`check_unit`.
+    """
+    check_unit(angles, unit, "set angle_unit")
+    return np.radians(angles) if unit == "degree" else angles
+
+
+def check_unit(angles: np.ndarray, unit: str, way_out: str) -> None:
+    """Refuse angles (views,) that are not in degrees, or not in radians.
+
+    Raises:
         MivolError: numbers that are of the other unit: over 8 turns in radians, or 16 views and more within 6.3 degrees.
     """
     span = float(np.ptp(angles))
     if unit == "radian" and span > 16 * np.pi:
         raise MivolError(
-            f"the angles span {span:.4g} radians ({span / (2 * np.pi):.0f} turns): they seem to be degrees, set angle_unit."
+            f"the angles span {span:.4g} radians ({span / (2 * np.pi):.0f} turns): they seem to be degrees, {way_out}."
         )
     if unit == "degree" and len(angles) >= 16 and span <= 2 * np.pi + 1e-3:
-        raise MivolError(f"{len(angles)} views span {span:.4g} degrees: they seem to be radians, set angle_unit.")
-    return np.radians(angles) if unit == "degree" else angles
+        raise MivolError(f"{len(angles)} views span {span:.4g} degrees: they seem to be radians, {way_out}.")
 
 
 def note_order(angles: np.ndarray) -> list[str]:

@@ -32,6 +32,7 @@ from mivol.optim.smoothed_tv import SmoothedTV
 from mivol.optim.solver import State
 from mivol.optim.solvers import DIRECT, METHODS
 from mivol.report.page import write_page
+from mivol.report.preview import is_due, write_preview
 from mivol.report.record import PlanLine, RunRecord
 from mivol.tomography.filtered import feldkamp, filtered_backprojection
 from mivol.tomography.geometry import ParallelBeam
@@ -220,6 +221,9 @@ def solve(task: Task, run: RunFolder, problem: Inversion, data: Projections, bes
                 errors["discrepancy"] = fit.run.state.residual_norm / noise
             run.append(fit.next, fit.seconds, loss=fit.history[-1]["loss"], **errors)
             best.see(fit.next, errors, {"volume": fit.run.state.x})
+            if is_due(fit.next, course.iterations):
+                grid = problem.linear_problem.A.grid
+                write_preview(run.path, fit.run.state.x.reshape(grid.shape), tuple(grid.extent))
             watch(fit)
 
         fit.complete(observe)

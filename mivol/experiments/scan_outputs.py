@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -10,7 +11,7 @@ from mivol.experiments.best import BestIterate
 from mivol.experiments.projections import Projections
 from mivol.experiments.run_folder import RunFolder
 from mivol.files import write_exr, write_volume
-from mivol.report.record import Image, Volume
+from mivol.report.record import LINES, SINOGRAM, Image, Volume
 from mivol.tomography.geometry import VoxelGrid
 from mivol.tomography.projector import Projector
 from mivol.validate.metrics import nrmse
@@ -30,10 +31,13 @@ def write_outputs(run: RunFolder, projector: Projector, data: Projections, held_
     predicted, record = projector @ x, run.record
     record.volumes += write_grids(run.path, projector.grid, x, data.truth)
     middle = data.y.shape[1] // 2
-    record.images += write_pair(run.path, "sinogram", data.y[:, middle], predicted[:, middle], False)
+    noise = noise_of(data)
+    said = f"row {middle + 1} of {data.y.shape[1]}"
+    record.images += write_pair(run.path, SINOGRAM, Pair(data.y[:, middle], predicted[:, middle], noise[:, middle]), said)
     if data.y.shape[1] > 1:
         for view in held_out[:4]:
-            record.images += write_pair(run.path, f"view {view}", data.y[view], predicted[view], True)
+            pair = Pair(*(part[view, ::-1] for part in (data.y, predicted, noise)))
+            record.images += write_pair(run.path, f"view {view}", pair, held_out=True)
     run.write_curves()
     record.results["views"] = float(projector.n_views - len(held_out))
     if data.truth is not None:
@@ -50,13 +54,31 @@ def write_best(run: RunFolder, grid: VoxelGrid, best: BestIterate) -> None:
         write_volume(run.path / "volumes/reconstruction_best.npz", best.read()["volume"].reshape(grid.shape), grid.to_world)
 
 
-def write_pair(folder: Path, name: str, measured: np.ndarray, predicted: np.ndarray, held_out: bool) -> list[Image]:
-    """Measured line integrals beside those of the reconstruction, as layers of one file."""
+class Pair(NamedTuple):
+    """Line integrals of one shape: measured, of the reconstruction, and their standard deviation; NaN where it is not known."""
+
+    measured: np.ndarray
+    predicted: np.ndarray
+    noise: np.ndarray
+
+
+def noise_of(data: Projections) -> np.ndarray:
+    """Standard deviations of line integrals: inf where a pixel is not used, NaN where only their ratios are known."""
+    if not data.is_noise_known:
+        return np.full(data.y.shape, np.nan)
+    with np.errstate(divide="ignore"):
+        return 1 / np.sqrt(data.weights)
+
+
+def write_pair(folder: Path, name: str, pair: Pair, caption: str = "", held_out: bool = False) -> list[Image]:
+    """Measured line integrals beside those of the reconstruction, and their noise, as layers of one file."""
     path = f"views/{name.replace(' ', '_')}.exr"
-    layers = {"Y": predicted.astype(np.float32), "reference.Y": measured.astype(np.float32)}
-    write_exr(folder / path, layers)
+    layers = {"Y": pair.predicted, "reference.Y": pair.measured}
     roles = {"render": "Y", "reference": "reference.Y"}
-    common = {"path": path, "view": name, "held_out": held_out, "quantity": "line integral"}
+    if not np.isnan(pair.noise).any():
+        layers["noise.Y"], roles["standard error"] = pair.noise, "noise.Y"
+    write_exr(folder / path, {layer: values.astype(np.float32) for layer, values in layers.items()})
+    common = {"path": path, "view": name, "held_out": held_out, "quantity": LINES, "caption": caption}
     return [Image(role=role, layer=layer, **common) for role, layer in roles.items()]
 
 
@@ -66,5 +88,5 @@ def write_grids(folder: Path, grid: VoxelGrid, x: np.ndarray, truth: np.ndarray 
     for role, values in {"reconstruction": x, **({"truth": truth} if truth is not None else {})}.items():
         write_volume(folder / f"volumes/{role}.vol", values, grid.to_world)
         write_volume(folder / f"volumes/{role}.npz", values, grid.to_world)
-        found.append(Volume(path=f"volumes/{role}.npz", role=role, size=size))
+        found.append(Volume(path=f"volumes/{role}.npz", role=role, size=size, profiles=True))
     return found

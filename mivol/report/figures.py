@@ -42,6 +42,8 @@ __all__ = [
 
 INK, FAINT, GRID = "#1b1f24", "#5b6470", "#d5d9df"
 SERIES = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
+LEVELS = {"discrepancy": (1.0, "the noise")}
+"""Curves that have a level to reach, and its name."""
 MARKERS = ("o", "s", "^", "D", "v", "P")
 CSS = {INK: "var(--ink)", FAINT: "var(--faint)", GRID: "var(--rule)"} | {
     colour: f"var(--series-{i})" for i, colour in enumerate(SERIES)
@@ -158,8 +160,17 @@ def plot_curve(rows: Sequence[dict], name: str, *, against: str = "iteration") -
         axes.xaxis.set_major_locator(MaxNLocator(6, integer=against == "iteration"))
         end = {"ha": "left", "va": "center", "color": SERIES[0], "weight": "bold", "fontsize": 9.5}
         axes.annotate(f"{y[-1]:.3g}", (x[-1], y[-1]), (6, 0), textcoords="offset points", **end)
+        if name in LEVELS:
+            _level(axes, *LEVELS[name])
         axes.margins(x=0.02, y=0.12)
     return figure
+
+
+def _level(axes: Axes, value: float, name: str) -> None:
+    """A broken line across, which a curve is held against."""
+    axes.axhline(value, color=FAINT, linestyle=(0, (4, 3)), linewidth=1.2)
+    place = {"xycoords": ("axes fraction", "data"), "textcoords": "offset points", "ha": "left", "va": "bottom"}
+    axes.annotate(name, (0.0, value), (4, 2), color=FAINT, fontsize=9, **place)
 
 
 def _log_axis(axis: Axis, values: NDArray) -> None:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from mivol.errors import MivolError
 from mivol.files import layers, read_exr, read_volume
 from mivol.report import show
-from mivol.report.record import Image, Volume
+from mivol.report.record import LINES, Image, Volume
 
 __all__ = ["Bar", "Cut", "Gallery", "Picture", "ShownView", "film_of", "plain_picture", "views_of", "volumes_of"]
 
@@ -158,10 +158,22 @@ def _scales(views: Iterable[dict[str, NDArray]]) -> dict[str, show.Scale]:
 
 
 PANELS = {"reference": "Reference", "render": "Render", "difference": "Render − reference", "z": "z-image"}
+PANELS_OF_LINES = {
+    "reference": "Measured",
+    "render": "Modelled",
+    "difference": "Modelled − measured",
+    "z": "Difference over noise",
+}
+
+
+def _names_of(images: Iterable[Image]) -> dict[str, str]:
+    """What the pictures of a view are called: a line integral is measured, not rendered."""
+    return PANELS_OF_LINES if any(image.quantity == LINES for image in images) else PANELS
 
 
 def _view(name: str, images: dict[str, Image], roles: dict[str, NDArray], scales: dict[str, show.Scale]) -> ShownView:
-    pictures = [_picture(PANELS[role], roles[role], scales.get(role)) for role in PANELS if role in roles]
+    names = _names_of(images.values())
+    pictures = [_picture(names[role], roles[role], scales.get(role)) for role in names if role in roles]
     words = [next((image.caption for image in images.values() if image.caption), "")]
     psnr = None
     if _are_numbers(roles, "reference", "difference"):
@@ -205,10 +217,11 @@ def film_of(folder: Path, image: Image) -> tuple[str, str, bool]:
 
 def _bar_labels(scales: dict[str, show.Scale], image: Image | None) -> list[tuple[str, str]]:
     what = f"{image.quantity} [{image.unit}]" if image and image.unit else image.quantity if image else ""
+    names = _names_of([image] if image else [])
     labels = {
         "reference": f"{what[:1].upper()}{what[1:]}",
-        "difference": "Render − reference",
-        "z": "z = difference / standard error",
+        "difference": names["difference"],
+        "z": names["z"] if names is PANELS_OF_LINES else "z = difference / standard error",
     }
     return [(role, label) for role, label in labels.items() if role in scales]
 
@@ -216,7 +229,9 @@ def _bar_labels(scales: dict[str, show.Scale], image: Image | None) -> list[tupl
 def _bar(scale: show.Scale, label: str) -> Bar:
     stops = show.pixels(np.linspace(scale.low, scale.high, 17)[None, :], scale)[0]
     gradient = ", ".join("#{:02x}{:02x}{:02x}".format(*stop) for stop in stops)
-    return Bar(label, f"{scale.low:.3g}", f"{scale.high:.3g}", gradient)
+    # A percentile between zeros may be 1e-16.
+    low = scale.low if abs(scale.low) > 1e-9 * scale.high else 0.0
+    return Bar(label, f"{low:.3g}", f"{scale.high:.3g}", gradient)
 
 
 # -- Volume -------------------------------------------------------------------------------------------------------------

@@ -23,7 +23,8 @@ from mivol.errors import MivolError
 from mivol.files import write_whole_text
 from mivol.report import figures
 from mivol.report.gallery import Cut, ShownView, film_of, plain_picture, views_of, volumes_of
-from mivol.report.record import QUANTITIES, Quantity, RunRecord, read_metrics, read_record
+from mivol.report.profiles import profiles_of
+from mivol.report.record import LINES, QUANTITIES, SINOGRAM, Quantity, RunRecord, read_metrics, read_record
 
 __all__ = ["PAGE", "headline", "write_page"]
 
@@ -48,15 +49,19 @@ def write_page(folder: str | Path) -> Path:
     folder = Path(folder)
     record, rows = read_record(folder), read_metrics(folder)
     _check_present(folder, record)
-    groups = views_of(folder, record.images)
+    sinograms = [image for image in record.images if image.view == SINOGRAM]
+    groups = views_of(folder, [image for image in record.images if image.view != SINOGRAM])
     volumes = volumes_of(folder, record.volumes)
     facts = {
         "record": record,
         "headline": headline(record, _held_out_psnr(record, groups.rows)),
         "numbers": _numbers(record, groups.rows, volumes),
+        "sinograms": views_of(folder, sinograms),
+        "are_lines": any(image.quantity == LINES for image in record.images),
         "views": groups,
         "shown": SHOWN_VIEWS,
         "volumes": volumes,
+        "profiles": profiles_of(folder, record.volumes),
         "curves": _curves(rows),
         "timings": _timings(record.timings),
         "films": [film_of(folder, image) for image in record.images if image.role == "film"],

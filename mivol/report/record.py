@@ -46,6 +46,10 @@ __all__ = [
 
 RECORD = "run.json"
 METRICS = "metrics.jsonl"
+LINES = "line integral"
+"""The quantity of a projection, which is measured and modelled, not rendered."""
+SINOGRAM = "sinogram"
+"""The view that holds one row of a detector in all views."""
 PACKAGES = ("mivol", "mitsuba", "drjit", "numpy", "scipy", "OpenEXR", "h5py", "msgspec", "matplotlib")
 
 
@@ -65,6 +69,7 @@ QUANTITIES: dict[str, Quantity] = {
     "loss": Quantity("Loss"),
     "residual": Quantity("Residual |Ax − y| / |y|"),
     "discrepancy": Quantity("Residual over noise, RMS (1: as small as the noise)"),
+    "held_out_rms_of_residual_over_noise": Quantity("Residual over noise, RMS of the held-out views"),
     "gradient": Quantity("Norm of the gradient"),
     "nrmse": Quantity("nRMSE of the volume"),
     "psnr": Quantity("PSNR of the fitted views", "dB", log=False),
@@ -122,6 +127,8 @@ class Volume(_Part):
     size: tuple[float, float, float] | None = None
     """World lengths of the box's edges along x, y, z; where missing, those of the file's own ``to_world``."""
     caption: str = ""
+    profiles: bool = False
+    """Whether values along the three lines through its middle are drawn."""
 
 
 class Table(_Part):

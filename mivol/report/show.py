@@ -94,11 +94,16 @@ def _channels(image: NDArray) -> int:
     return 1 if image.ndim == 2 else image.shape[2]
 
 
-def data_uri(rgb: NDArray[np.uint8]) -> str:
-    """The pixels as a PNG inside a ``data:`` address."""
+def png(rgb: NDArray[np.uint8]) -> bytes:
+    """The pixels as a PNG."""
     buffer = io.BytesIO()
     imsave(buffer, rgb, format="png", metadata={"Software": None}, pil_kwargs={"optimize": True})
-    return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode("ascii")
+    return buffer.getvalue()
+
+
+def data_uri(rgb: NDArray[np.uint8]) -> str:
+    """The pixels as a PNG inside a ``data:`` address."""
+    return "data:image/png;base64," + base64.b64encode(png(rgb)).decode("ascii")
 
 
 class Slices(NamedTuple):

@@ -287,6 +287,32 @@ def test_layers_of_one_file_and_a_volume_without_truth(tmp_path):
     assert "voxels, 4 × 3 × 2" in found.text
 
 
+def test_projections_are_measured_and_modelled(tmp_path):
+    """The sinogram stands first, in a section of its own; pictures have the names of a scan, and the volume has profiles."""
+    layers = {"Y": np.full((2, 3), 0.8), "reference.Y": np.full((2, 3), 0.5), "noise.Y": np.full((2, 3), np.inf)}
+    write_exr(tmp_path / "lines.exr", {name: values.astype(np.float32) for name, values in layers.items()})
+    roles = {"render": "Y", "reference": "reference.Y", "standard error": "noise.Y"}
+    images = [
+        Image(path="lines.exr", role=role, layer=layer, view=view, held_out=view != "sinogram", quantity="line integral")
+        for view in ("view 1", "sinogram")
+        for role, layer in roles.items()
+    ]
+    write_volume(tmp_path / "found.npz", np.ones((2, 3, 4, 1), np.float32))
+    volumes = [Volume(path="found.npz", role="reconstruction", profiles=True)]
+    write_record(RunRecord.new("A scan", images=images, volumes=volumes), tmp_path)
+    found = Page(write_page(tmp_path).read_text(encoding="utf-8"))
+    sections = [attributes["id"] for tag, attributes in found.tags if tag == "section" and "id" in attributes]
+    assert sections[:3] == ["sinogram", "views", "volume"]
+    names = [name for name, _ in found.pictures()]
+    assert names[:8] == 2 * ["Measured", "Modelled", "Modelled − measured", "Difference over noise"]
+    assert "Projections that took no part" in found.text and "rendered from viewpoints" not in found.text
+    # A pixel that is not used has noise without bound, and no difference beside it: the middle of the blue-red map.
+    np.testing.assert_array_equal(dict(found.pictures())["Difference over noise"][0, 0], show.pixels(
+        np.zeros((1, 1)), show.Scale("signed", -4.0, 4.0))[0, 0])  # fmt: skip
+    labels = [attributes["aria-label"] for tag, attributes in found.tags if tag == "svg"]
+    assert labels == [f"sigma_t along {axis}" for axis in "xyz"]
+
+
 def test_each_volume_is_shown_beside_its_own_truth(tmp_path):
     """Two grids were found and the truth of the first is known: it is no truth of the second, and neither hides the other."""
     for name, values in {"found": 1.0, "true": 2.0, "albedo": 0.5}.items():

@@ -6,6 +6,7 @@ import json
 import re
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 from false_alarms import assert_same_variance, fresh
@@ -55,6 +56,7 @@ def test_a_scan_leaves_a_whole_run_folder(variant_rgb, folder: Path) -> None:
     assert np.all(np.diff([row["residual"] for row in rows]) < 0)
     assert rows[-1]["nrmse"] < 0.5
     record = json.loads((folder / "run" / "run.json").read_text())
+    assert (folder / "run" / "preview.png").read_bytes()[:4] == b"\x89PNG"
     assert record["status"] == "finished"
     assert record["results"]["views"] == 15
     assert [image["view"] for image in record["images"] if image.get("held_out")] == ["view 3"] * 2 + ["view 9"] * 2 + [
@@ -140,6 +142,7 @@ def test_an_interrupted_scan_is_resumed(variant_rgb, folder: Path, monkeypatch: 
         patch.setattr(RunFolder, "append", stop)
         assert run(folder, *flags, to="cut") == 130
     assert json.loads((folder / "cut" / "run.json").read_text())["status"] == "stopped"
+    assert (folder / "cut" / "preview.png").exists()
     continued = []
     with monkeypatch.context() as patch:
         patch.setattr(RunFolder, "append", lambda run, i, t, **v: (continued.append(i), append(run, i, t, **v)))
@@ -387,8 +390,6 @@ def write_stack(path: Path, values: np.ndarray) -> None:
     if path.suffix == ".npy":
         np.save(path, values)
     elif path.suffix == ".h5":
-        import h5py
-
         with h5py.File(path, "w") as file:
             file["projections"] = values
     else:
@@ -437,6 +438,10 @@ REFUSED = {
         ['data={source="stack", file="y.npy", reading="line_integral", angles="radians.txt"}'],
         "18 views span 5.934 degrees: they seem to be radians",
     ),
+    "radians in Data Exchange": (
+        ['data={source="measured", file="radians.h5"}', 'scan={beam="parallel"}'],
+        "18 views span 5.934 degrees: they seem to be radians, write theta in degrees",
+    ),
     "angles of another scan": (
         ['data={source="stack", file="y.npy", reading="line_integral", angles="few.txt"}'],
         "3 angles for 18 projections",
@@ -476,6 +481,10 @@ def test_scans_that_are_refused(variant_rgb, folder: Path, capsys: pytest.Captur
     np.save(folder / "flats.npy", np.ones((3, 14, 13), "f"))
     np.savetxt(folder / "degrees.txt", 20.0 * np.arange(18))
     np.savetxt(folder / "radians.txt", np.radians(20.0 * np.arange(18)))
+    if case == "radians in Data Exchange":
+        with h5py.File(folder / "radians.h5", "w") as file:
+            file["exchange/data"], file["exchange/theta"] = np.ones((18, 4, 14), "f"), np.radians(20.0 * np.arange(18))
+            file["exchange/data_white"], file["exchange/data_dark"] = 2 * np.ones((2, 4, 14), "f"), np.zeros((2, 4, 14), "f")
     np.savetxt(folder / "few.txt", np.arange(3))
     np.savetxt(folder / "table.txt", circle_table(3))
     assert run(folder, *[part for change in changes for part in ("--set", change)]) == 1

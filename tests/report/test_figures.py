@@ -18,6 +18,7 @@ from mivol.photos.camera import Camera
 from mivol.photos.survey import Frame
 from mivol.report.cameras import plot_cameras
 from mivol.report.figures import Series, inline_svg, plot_curve, plot_error_against_time, plot_image_row, plot_slices, save
+from mivol.report.profiles import line_through_the_middle, plot_profile
 
 
 def falling_curve() -> Figure:
@@ -26,6 +27,15 @@ def falling_curve() -> Figure:
 
 def long_curve() -> Figure:
     return plot_curve([{"iteration": k, "seconds": 0.5 * k, "psnr": 20.0 + k} for k in range(31)], "psnr", against="seconds")
+
+
+def reaching_the_noise() -> Figure:
+    return plot_curve([{"iteration": k, "discrepancy": 1 + 8.0 / 2**k} for k in range(9)], "discrepancy")
+
+
+def profile() -> Figure:
+    found, truth = ramps()
+    return plot_profile({"reconstruction": found, "truth": truth}, "y", (-1.0, 2.0), "sigma_t [1/length]")
 
 
 def methods() -> Figure:
@@ -71,7 +81,7 @@ def cameras() -> Figure:
     return plot_cameras(PhotoSurvey(Path("ring"), "COLMAP", frames, (), box, "points", (1.0, 9.0), np.zeros((1, 3))))
 
 
-DRAWN = [cameras, falling_curve, long_curve, methods, slices, slices_alone, row, row_in_colour]
+DRAWN = [cameras, falling_curve, long_curve, reaching_the_noise, profile, methods, slices, slices_alone, row, row_in_colour]
 
 
 @pytest.mark.parametrize("draw", DRAWN, ids=lambda draw: draw.__name__)
@@ -91,3 +101,14 @@ def test_a_figure_in_a_page_has_the_colours_of_the_page() -> None:
     text = inline_svg(falling_curve(), 'a "label"')
     assert set(re.findall(r"(?:fill|stroke): ([^;\"]*)", text)) - {"none"} == colours
     assert 'aria-label="a &quot;label&quot;"' in text and "<metadata>" not in text
+
+
+def test_profiles_run_through_the_middle_voxel() -> None:
+    """Of 3 x 4 x 5 voxels that is (1, 2, 2), as in the slices; places are the middles of voxels in the box."""
+    values = np.arange(60.0).reshape(3, 4, 5)
+    assert line_through_the_middle(values, "x").tolist() == values[1, 2].tolist()
+    assert line_through_the_middle(values, "y").tolist() == values[1, :, 2].tolist()
+    assert line_through_the_middle(values, "z").tolist() == values[:, 2, 2].tolist()
+    (line, _) = profile().axes[0].lines
+    np.testing.assert_allclose(line.get_xdata(), [-0.75, -0.25, 0.25, 0.75])
+    assert profile().axes[0].get_xlabel() == "y [length]"
