@@ -402,16 +402,30 @@ class Field(Section):
                 raise ValueError(f"{name} is {getattr(self, name)}: a finite number of at least 0 is expected")
 
 
+Keyframe = tuple[float, float, float, float, float, float]
+
+
 class Shown(Section):
     """What is made of a fitted field."""
 
     views: Annotated[int, of("view", "judged views that are shown beside their photographs", ge=0)] = 4
-    frames: Annotated[int, of("frame", "of a turntable film; 0: none", ge=0)] = 60
+    frames: Annotated[int, of("frame", "of a film; 0: none", ge=0)] = 60
+    way: Annotated[
+        Literal["turntable", "views", "keyframes"],
+        of("1", "of the film's camera: around the box, through the photographs' places in their order, or past keyframes"),
+    ] = "turntable"
+    keyframes: Annotated[
+        tuple[Keyframe, ...], of("length", "where the film's camera stands and what it looks at, at least two, in equal times")
+    ] = ()
     every: Annotated[int, of("step", "between two points of the curve of held-out views", ge=1)] = 250
     judged: Annotated[int, of("view", "held-out views in that curve, the same at each point; 0: all", ge=0)] = 4
     metrics: Annotated[tuple[str, ...], of("1", "of the judged views: psnr, ssim, flip", min_length=1)] = ("psnr", "ssim")
 
     def __post_init__(self) -> None:
+        if self.way == "keyframes" and len(self.keyframes) < 2:
+            raise ValueError(f"{len(self.keyframes)} keyframes were given: at least 2 are expected")
+        if self.keyframes and self.way != "keyframes":
+            raise ValueError(f'keyframes were given beside way = "{self.way}": "keyframes" is expected')
         unknown = next((name for name in self.metrics if name not in METRICS), None)
         if unknown is not None:
             raise ValueError(f'unknown metric "{unknown}": {nearest(unknown, list(METRICS))}'.rstrip("."))

@@ -13,6 +13,7 @@ from mivol.config import Experiment, FieldFit, Files, GaussianFit, PhotoFit, Sca
 from mivol.errors import MivolError
 from mivol.experiments.back_end import choose_back_end
 from mivol.experiments.depth import settle_depth
+from mivol.experiments.film import plan_film
 from mivol.experiments.gaussian_start import begin, make_gaussian_plan
 from mivol.experiments.photo_data import boxed, read_photos
 from mivol.experiments.photo_plan import choices, make_plan, shrunk
@@ -125,6 +126,8 @@ def explain_photo_fit(chosen: FieldFit, base: Path, say: Say) -> Explanation:
     photos = boxed(chosen, photos)
     say(photos.text)
     say(f"  judged by {0 if judged is None else len(judged.views)} photographs")
+    for note in plan_film(chosen.show, photos).notes:
+        say(f"  {note}")
     plan = shrunk(asked, photos)
     batches = RayBatches.of([rectified(view) for view in photos.views], [stage.shrink for stage in plan.stages])
     return Explanation(tuple(f"  {one.choice}: {one.reason}" for one in choices(plan, photos, batches)))
@@ -141,6 +144,8 @@ def explain_gaussian_fit(chosen: GaussianFit, base: Path, say: Say) -> Explanati
     photos = boxed(chosen, photos)
     say(photos.text)
     say(f"  judged by {0 if judged is None else len(judged.views)} photographs")
+    for note in plan_film(chosen.show, photos).notes:
+        say(f"  {note}")
     begun = begin(chosen, photos, asked)
     return Explanation(tuple(f"  {one.choice}: {one.reason}" for one in begun.lines))
 

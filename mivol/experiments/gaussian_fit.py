@@ -13,6 +13,7 @@ from mivol import config
 from mivol.config import GaussianFit
 from mivol.experiments.back_end import choose_back_end
 from mivol.experiments.best import BestIterate, FilesOfBest
+from mivol.experiments.film import plan_film
 from mivol.experiments.gaussian_outputs import GaussianOutputs, compare
 from mivol.experiments.gaussian_start import begin, make_gaussian_plan
 from mivol.experiments.photo_data import boxed, notes, read_photos
@@ -41,8 +42,9 @@ def gaussian_fit(task: Task) -> Path:
         with run.stage("photographs"):
             photos, judged = read_photos(chosen, task.base)
             photos = boxed(chosen, photos)
+            film = plan_film(chosen.show, photos)
             begun = begin(chosen, photos, asked)
-            run.record.plan, run.record.notes = begun.lines, notes(photos, judged)
+            run.record.plan, run.record.notes = begun.lines, [*notes(photos, judged), *film.notes]
             task.watcher.say([photos.text, *(f"{one.choice}: {one.reason}" for one in run.record.plan)])
         with run.stage("fit"):
             cameras = [view.camera for view in begun.views]
@@ -50,7 +52,7 @@ def gaussian_fit(task: Task) -> Path:
             best = BestIterate(run, best_files(problem))
             fit = solve(task, run, problem, judged, best, compare)
         with run.stage("images and Gaussians"):
-            GaussianOutputs(task, run, fit, photos, judged).write()
+            GaussianOutputs(task, run, fit, photos, judged, film).write()
     page = write_page(task.folder)
     task.watcher.say([*best.says(), run.summary()])
     return page

@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mivol.config import GaussianFit
-from mivol.experiments.photo_outputs import _small, named, write_view
+from mivol.experiments.film import Film
+from mivol.experiments.photo_outputs import named, write_view
 from mivol.experiments.run_folder import RunFolder
 from mivol.experiments.task import Task
 from mivol.optim.gaussian_problem import GaussianProblem
 from mivol.optim.loop import Fit
-from mivol.photos import Camera, Photo, Photos, rectified, turntable
+from mivol.photos import Camera, Photo, Photos, rectified
 from mivol.points import Gaussians, write_gaussians
 from mivol.report.record import Image, Table
-from mivol.report.video import WITHOUT_FFMPEG, film_suffix, write_video
 from mivol.validate.images import Quality, judge, score
 
 __all__ = ["GaussianOutputs", "compare", "picture_of"]
@@ -35,6 +34,7 @@ class GaussianOutputs:
         fit: the fit, done.
         photos: what was fitted.
         judged: what it is judged by; None for nothing.
+        film: where its camera goes.
     """
 
     task: Task
@@ -42,6 +42,7 @@ class GaussianOutputs:
     fit: Fit
     photos: Photos
     judged: Photos | None
+    film: Film
 
     @property
     def problem(self) -> GaussianProblem:
@@ -61,7 +62,7 @@ class GaussianOutputs:
         }
         if self.judged is not None:
             record.results |= self.write_judged()
-        if self.task.chosen.show.frames:
+        if self.film.cameras:
             record.images.append(self.write_film())
         self.run.write_curves()
 
@@ -78,22 +79,10 @@ class GaussianOutputs:
         return named(score(found).values)
 
     def write_film(self) -> Image:
-        """A camera path around the box."""
-        cameras, count = [view.camera for view in self.photos.views], self.task.chosen.show.frames
-        path = f"film/turntable{film_suffix()}"
-        if not path.endswith(".mp4"):
-            self.task.watcher.say([WITHOUT_FFMPEG])
-        behind = self.photos.views[0].background
-
-        def frames() -> Iterator[NDArray[np.uint8]]:
-            for camera in self.task.watcher.track(turntable(cameras, self.photos.box, count), "frames"):
-                smaller = _small(camera)
-                shrink = camera.size[0] / smaller.size[0]
-                seen = picture_of(self.problem, smaller, behind, self.problem.plan.low_pass_at(shrink))
-                yield np.round(np.clip(seen, 0, 1) * 255).astype(np.uint8)
-
-        write_video(self.run.path / path, frames(), fps=count / 4)
-        return Image(path=path, role="film", caption=f"{count} views around the box")
+        """A camera's way past the Gaussians."""
+        behind, low_pass = self.photos.views[0].background, self.problem.plan.low_pass_at(self.film.shrink)
+        shown = lambda camera: picture_of(self.problem, camera, behind, low_pass)  # noqa: E731
+        return self.film.write(self.run.path, shown, self.task.watcher)
 
 
 def compare(problem: GaussianProblem, judged: Photos, photo: Photo, metrics: tuple[str, ...]) -> tuple[NDArray, Quality]:

@@ -16,6 +16,7 @@ from mivol import config
 from mivol.config import FieldFit, PhotoFit
 from mivol.experiments.back_end import choose_back_end
 from mivol.experiments.best import BestIterate, FilesOfBest
+from mivol.experiments.film import plan_film
 from mivol.experiments.photo_data import boxed, notes, read_photos
 from mivol.experiments.photo_outputs import PhotoOutputs, compare, save_found
 from mivol.experiments.photo_plan import choices, make_plan, shrunk
@@ -46,16 +47,17 @@ def photo_fit(task: Task) -> Path:
         with run.stage("photographs"):
             photos, judged = read_photos(chosen, task.base)
             photos = boxed(chosen, photos)
+            film = plan_film(chosen.show, photos)
             plan = shrunk(asked, photos)
             batches = RayBatches.of([rectified(view) for view in photos.views], [stage.shrink for stage in plan.stages])
-            run.record.plan, run.record.notes = choices(plan, photos, batches), notes(photos, judged)
+            run.record.plan, run.record.notes = choices(plan, photos, batches), [*notes(photos, judged), *film.notes]
             task.watcher.say([photos.text, *(f"{one.choice}: {one.reason}" for one in run.record.plan)])
         with run.stage("fit"):
             problem = RadianceProblem(batches, photos.box, plan, chosen.seed)
             best = BestIterate(run, best_files(problem))
             fit = solve(task, run, problem, judged, best)
         with run.stage("images and volumes"):
-            PhotoOutputs(task, run, fit, photos, judged).write()
+            PhotoOutputs(task, run, fit, photos, judged, film).write()
     page = write_page(task.folder)
     task.watcher.say([*best.says(), run.summary()])
     return page

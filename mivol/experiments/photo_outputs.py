@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mivol.config import FieldFit
+from mivol.experiments.film import Film
 from mivol.experiments.run_folder import RunFolder
 from mivol.experiments.task import Task
 from mivol.fields.sky import Sky
@@ -19,15 +20,11 @@ from mivol.files import write_exr, write_png, write_volume
 from mivol.optim.field_view import FieldView, render_view
 from mivol.optim.loop import Fit
 from mivol.optim.radiance_problem import RadianceProblem
-from mivol.photos import Camera, Photo, Photos, turntable
+from mivol.photos import Camera, Photo, Photos
 from mivol.photos.picture import decode_srgb
 from mivol.report.depth import depth_pixels, normal_pixels, normals_of_depth
 from mivol.report.record import Image, Table, Volume
-from mivol.report.video import WITHOUT_FFMPEG, film_suffix, write_video
 from mivol.validate.images import METRICS, Quality, colour_fitted, judge, score
-
-FILM_SIZE = 256
-"""Longest edge of a film [pixel]."""
 
 
 @dataclass(frozen=True)
@@ -40,6 +37,7 @@ class PhotoOutputs:
         fit: the fit, done.
         photos: what was fitted.
         judged: what it is judged by; None for nothing.
+        film: where its camera goes.
     """
 
     task: Task
@@ -47,6 +45,7 @@ class PhotoOutputs:
     fit: Fit
     photos: Photos
     judged: Photos | None
+    film: Film
 
     @property
     def problem(self) -> RadianceProblem:
@@ -70,7 +69,7 @@ class PhotoOutputs:
         }
         if self.judged is not None:
             record.results |= self.write_judged()
-        if self.task.chosen.show.frames:
+        if self.film.cameras:
             record.images.append(self.write_film())
         self.run.write_curves()
 
@@ -92,20 +91,10 @@ class PhotoOutputs:
         return named(score(found).values) | {"psnr_colour_fitted": float(np.mean(fitted))}
 
     def write_film(self) -> Image:
-        """A camera path around the box."""
-        cameras, count = [view.camera for view in self.photos.views], self.task.chosen.show.frames
-        path = f"film/turntable{film_suffix()}"
-        if not path.endswith(".mp4"):
-            self.task.watcher.say([WITHOUT_FFMPEG])
+        """A camera's way through the field."""
         background = behind(self.problem, self.photos.views[0])
-
-        def frames() -> Iterator[NDArray[np.uint8]]:
-            for camera in self.task.watcher.track(turntable(cameras, self.problem.box, count), "frames"):
-                seen = render_view(self.problem.field, _small(camera), background)
-                yield np.round(np.clip(seen.image, 0, 1) * 255).astype(np.uint8)
-
-        write_video(self.run.path / path, frames(), fps=count / 4)
-        return Image(path=path, role="film", caption=f"{count} views around the box")
+        shown = lambda camera: render_view(self.problem.field, camera, background).image  # noqa: E731
+        return self.film.write(self.run.path, shown, self.task.watcher)
 
 
 def save_found(folder: Path, problem: RadianceProblem, which: str = "") -> None:
@@ -207,9 +196,3 @@ def write_geometry(folder: Path, seen: FieldView, camera: Camera, near_far: tupl
         write_png(folder / f"views/{name}.png", decode_srgb(pixels / 255))
         written.append(Image(path=f"views/{name}.png", role="picture", caption=f"{name} of the first judged view"))
     return written
-
-
-def _small(camera: Camera) -> Camera:
-    """A camera with at most the pixels of a film."""
-    scale = min(1.0, FILM_SIZE / max(camera.size))
-    return camera.resized(tuple(max(1, round(edge * scale)) for edge in camera.size))

@@ -7,7 +7,7 @@ sees, :func:`project` where a point lies in the image.
 from __future__ import annotations
 
 from mivol.photos.camera import Camera, directions, intrinsics, pixel_centres, project, rays
-from mivol.photos.camera_path import between, facing, turntable
+from mivol.photos.camera_path import between, facing, past, turntable
 from mivol.photos.dataset import BACKGROUNDS, Photo, Photos, load_photos
 from mivol.photos.lens import Lens, distort, undistort
 from mivol.photos.rectify import pinhole_of, rectified
@@ -32,6 +32,7 @@ __all__ = [
     "find_format",
     "intrinsics",
     "load_photos",
+    "past",
     "pinhole_of",
     "pixel_centres",
     "project",

@@ -1,4 +1,4 @@
-"""Cameras for a film of what was photographed: around it, or from view to view.
+"""Cameras for a film of what was photographed: around it, from view to view, or past places of one's own.
 
 Conventions. Every camera of a path is a pinhole like the first of those given: its size and focal length (or WIDE degrees,
 where its lens has no image plane), without distortion, its axis through the middle of the image. A turntable keeps the
@@ -17,7 +17,7 @@ from mivol.files.source import refusal
 from mivol.photos.camera import Camera, intrinsics
 from mivol.photos.lens import Lens
 
-__all__ = ["between", "facing", "turntable"]
+__all__ = ["between", "facing", "past", "turntable"]
 
 ALL_ROUND = np.radians(90)
 """Cameras that leave no larger gap of azimuth than this go all the way round; others are swung between."""
@@ -82,6 +82,26 @@ def between(cameras: Sequence[Camera], n: int) -> list[Camera]:
     poses = np.tile(np.eye(4), (n, 1, 1))
     poses[:, :3, :3], poses[:, :3, 3] = turns, places
     return [_pinhole(cameras[0], pose, f"step {i}") for i, pose in enumerate(poses)]
+
+
+def past(cameras: Sequence[Camera], keyframes: Sequence[Sequence[float]], n: int) -> list[Camera]:
+    """n cameras on a smooth way past places of one's own, in equal times; upwards is what is up in the photographs.
+
+    Args:
+        cameras: those of the photographs.
+        keyframes: at least two; where the camera stands and what it looks at, six numbers each [length].
+        n: cameras.
+
+    Raises:
+        MivolError: fewer than two keyframes, numbers that are not finite, cameras without a common upward direction, or a
+            camera that stands where it looks or looks straight up or down.
+    """
+    keys = np.array(keyframes, np.float64).reshape(-1, 6)
+    if len(keys) < 2 or not np.isfinite(keys).all():
+        raise refusal("keyframes", keys.tolist(), "at least two of six finite numbers", "give places and targets")
+    up, times = _mean_up(cameras), np.arange(len(keys))
+    found = CubicSpline(times, keys)(np.linspace(0, len(keys) - 1, n))
+    return [facing(cameras[0], place[:3], place[3:], up, f"step {i}") for i, place in enumerate(found)]
 
 
 def _pinhole(like: Camera, pose: np.ndarray, name: str) -> Camera:

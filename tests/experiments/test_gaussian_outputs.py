@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from mivol.experiments import gaussian_outputs as outputs
+from mivol.experiments.film import Film
 from mivol.points import Gaussians
 from mivol.validate.images import Quality
 
@@ -83,7 +84,8 @@ def fit_of(monkeypatch: pytest.MonkeyPatch, folder: Path, views: int, shown: int
     )
     monkeypatch.setattr(outputs, "named", lambda values: {f"held_out_{name}": value for name, value in values.items()})
     fit = SimpleNamespace(problem=problem, next=77)
-    return outputs.GaussianOutputs(task, run, fit, photos, photos if shown else None), record, run, watcher
+    film = Film(("camera",) * frames, shrink=4.0)
+    return outputs.GaussianOutputs(task, run, fit, photos, photos if shown else None, film), record, run, watcher
 
 
 @pytest.mark.parametrize(("views", "shown", "numbers"), [(7, 3, [0, 3, 6]), (2, 5, [0, 1]), (4, 1, [0])])
@@ -99,31 +101,19 @@ def test_judged_views_are_spread_over_all(
     assert (tmp_path / "views").is_dir() and (tmp_path / "film").is_dir()
 
 
-@pytest.mark.parametrize("suffix", [".mp4", ".webp"])
-def test_a_film_is_made_of_small_pictures(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, suffix: str) -> None:
-    """Eight frames around the box, as bytes, four seconds long, filtered as the smaller picture asks; where it is no mp4 the
-    way to one is said. Without judged views nothing is judged."""
-    found, record, _, watcher = fit_of(monkeypatch, tmp_path, 2, 0, frames=8)
-    asked, films = [], []
-
-    def picture(problem: object, camera: object, behind: np.ndarray, low_pass: tuple) -> np.ndarray:
-        asked.append((camera.size, behind.tolist(), low_pass))
-        return np.array([[[-1.0, 0.5, 2.0]]])
-
-    monkeypatch.setattr(outputs, "film_suffix", lambda: suffix)
-    monkeypatch.setattr(outputs, "turntable", lambda cameras, box, count: cameras[:1] * count if box == "box" else None)
-    monkeypatch.setattr(outputs, "_small", lambda camera: SimpleNamespace(size=(400, 300)))
-    monkeypatch.setattr(outputs, "picture_of", picture)
-    monkeypatch.setattr(outputs, "write_video", lambda path, frames, fps: films.append((path, list(frames), fps)))
+def test_frames_are_filtered_as_the_smaller_picture_asks(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """A film that is four times smaller than the photographs, over the first one's background; without judged views nothing
+    is judged."""
+    found, record, _, _ = fit_of(monkeypatch, tmp_path, 2, 0, frames=8)
+    asked, given = [], []
+    monkeypatch.setattr(outputs, "picture_of", lambda problem, *how: asked.append(how) or "picture")
+    monkeypatch.setattr(Film, "write", lambda film, folder, picture, watcher: given.append(folder) or picture("camera"))
     found.write()
-    ((path, frames, fps),) = films
-    assert path == tmp_path / f"film/turntable{suffix}" and fps == 2
-    assert len(frames) == 8 and frames[0].dtype == np.uint8 and frames[0].tolist() == [[[0, 128, 255]]]
-    assert asked == [((400, 300), [0.1, 0.2, 0.3], ("low pass at", 4.0))] * 8
-    (image,) = record.images
-    assert (image.path, image.role, image.caption) == (f"film/turntable{suffix}", "film", "8 views around the box")
-    assert watcher.said == ([] if suffix == ".mp4" else [outputs.WITHOUT_FFMPEG])
+    ((camera, behind, low_pass),) = asked
+    assert (camera, behind.tolist(), low_pass) == ("camera", [0.1, 0.2, 0.3], ("low pass at", 4.0))
+    assert given == [tmp_path] and record.images == ["picture"]
     assert set(record.results) == {"views", "iterations", "gaussians"}
+
 
 
 def test_a_view_is_judged_as_a_pinhole_sees_it(monkeypatch: pytest.MonkeyPatch) -> None:

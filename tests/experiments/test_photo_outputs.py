@@ -82,11 +82,6 @@ def test_distance_and_normals_are_pictures(tmp_path):
         assert np.array(Image.open(tmp_path / image.path)).shape == (2, 4, 3)
 
 
-@pytest.mark.parametrize(("given", "expected"), [((64, 32), (64, 32)), ((1024, 512), (256, 128)), ((2048, 1), (256, 1))])
-def test_films_are_small(given, expected):
-    assert photo_outputs._small(camera(*given)).size == expected
-
-
 def test_judged_views_are_told_apart_the_worst_first():
     found = [Quality("a.jpg", {"psnr": 23.456, "ssim": 0.71234}), Quality("b.jpg", {"psnr": 9.0, "ssim": 0.5})]
     table = photo_outputs.table_of_views(camera(135, 240), found, [24.0, 12.345])

@@ -1,0 +1,96 @@
+"""The film of a fit of photographs: its camera's way is settled before the fit, its pictures are made after it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mivol.config import Shown
+from mivol.errors import MivolError
+from mivol.experiments.task import Watcher
+from mivol.photos import Camera, Photos, between, past, turntable
+from mivol.report.record import Image
+from mivol.report.video import WITHOUT_FFMPEG, film_suffix, write_video
+
+__all__ = ["Film", "plan_film"]
+
+FILM_SIZE = 256
+"""Longest edge of a film [pixel]."""
+
+SECONDS = 4
+"""Length of a film."""
+
+WAYS = {
+    "turntable": "views around the box",
+    "views": "views through the photographs' places",
+    "keyframes": "views past the keyframes",
+}
+
+
+@dataclass(frozen=True)
+class Film:
+    """Where the camera of a film goes.
+
+    Attributes:
+        cameras: one a picture; none where there is no film.
+        way: key of WAYS.
+        shrink: how many times smaller than the photographs the pictures are.
+        notes: why there is no film although one was asked for.
+    """
+
+    cameras: tuple[Camera, ...]
+    way: str = "turntable"
+    shrink: float = 1.0
+    notes: tuple[str, ...] = ()
+
+    def write(self, folder: Path, picture: Callable[[Camera], NDArray], watcher: Watcher) -> Image:
+        """Make the pictures and write them; says how films become mp4 where they do not.
+
+        Args:
+            folder: run folder; the film lies in ``film/``.
+            picture: (H, W, 3) code values that a camera sees.
+            watcher: who is told how it goes.
+        """
+        path = f"film/{self.way}{film_suffix()}"
+        if not path.endswith(".mp4"):
+            watcher.say([WITHOUT_FFMPEG])
+
+        def frames() -> Iterator[NDArray[np.uint8]]:
+            for camera in watcher.track(self.cameras, "frames"):
+                yield np.round(np.clip(picture(camera), 0, 1) * 255).astype(np.uint8)
+
+        write_video(folder / path, frames(), fps=len(self.cameras) / SECONDS)
+        return Image(path=path, role="film", caption=f"{len(self.cameras)} {WAYS[self.way]}")
+
+
+def plan_film(show: Shown, photos: Photos) -> Film:
+    """Place the cameras of a film, before anything is fitted.
+
+    Raises:
+        MivolError: keyframes that no camera can take. Where photographs have no common upward direction, or there is one
+            alone, a film that nobody described is left out with a note.
+    """
+    if not show.frames:
+        return Film(())
+    cameras = [view.camera for view in photos.views]
+    try:
+        if show.way == "turntable":
+            found = turntable(cameras, photos.box, show.frames)
+        else:
+            found = between(cameras, show.frames) if show.way == "views" else past(cameras, show.keyframes, show.frames)
+    except MivolError as error:
+        if show.way == "keyframes":
+            raise
+        return Film((), notes=(f"There is no film: {error}",))
+    small = tuple(_small(camera) for camera in found)
+    return Film(small, show.way, found[0].size[0] / small[0].size[0])
+
+
+def _small(camera: Camera) -> Camera:
+    """A camera with at most the pixels of a film."""
+    scale = min(1.0, FILM_SIZE / max(camera.size))
+    return camera.resized(tuple(max(1, round(edge * scale)) for edge in camera.size))
