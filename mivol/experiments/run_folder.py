@@ -1,7 +1,8 @@
 """A run's folder while the run is at work: its record is kept true, and no other run writes into it.
 
 Conventions. A run folder holds ``run.json``, ``metrics.jsonl``, ``checkpoint.npz``, ``report.html``, and in folders of their
-own what came of the run: ``views/``, ``volumes/``, ``curves/``, and ``references/`` or ``film/``. Every file is written whole.
+own what came of the run: ``views/``, ``volumes/``, ``curves/``, and ``references/`` or ``film/``; a scan's
+has a ``preview.png`` while it goes on. Every file is written whole.
 What an earlier run recorded stays as it is until another one takes its first step; then it moves to ``earlier/``.
 """
 

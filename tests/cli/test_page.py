@@ -305,6 +305,7 @@ def test_projections_are_measured_and_modelled(tmp_path):
     assert sections[:3] == ["sinogram", "views", "volume"]
     names = [name for name, _ in found.pictures()]
     assert names[:8] == 2 * ["Measured", "Modelled", "Modelled − measured", "Difference over noise"]
+    assert names.count("Measured") == 2
     assert "Projections that took no part" in found.text and "rendered from viewpoints" not in found.text
     # A pixel that is not used has noise without bound, and no difference beside it: the middle of the blue-red map.
     np.testing.assert_array_equal(dict(found.pictures())["Difference over noise"][0, 0], show.pixels(

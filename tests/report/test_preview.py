@@ -30,5 +30,5 @@ def test_three_slices_side_by_side(tmp_path: Path) -> None:
 def test_some_twenty_previews_a_run() -> None:
     """The first and the last iteration, and every twentieth part of the run; of short runs every one."""
     assert [k for k in range(1, 8) if is_due(k, 7)] == [1, 2, 3, 4, 5, 6, 7]
-    assert [k for k in range(1, 64) if is_due(k, 63)] == sorted({1, 63, *range(3, 64, 3)})
+    assert [k for k in range(1, 65) if is_due(k, 64)] == sorted({1, 64, *range(3, 64, 3)})
     assert sum(is_due(k, 5000) for k in range(1, 5001)) == 21
