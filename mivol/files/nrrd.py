@@ -267,6 +267,5 @@ def _place(fields: dict[str, str], spatial: list[int], size: list[int], path: Pa
 
 def _per_axis(fields: dict[str, str], name: str, spatial: list[int], count: int, default: float, path: Path) -> np.ndarray:
     """The numbers of the spatial axes; ``default`` where the file has none or says NaN."""
-    words = fields.get(name, "").split() or ["nan"] * count
-    values = source.reals(" ".join(words), max(len(words), count), path, name)
+    values = source.reals(fields.get(name) or "nan " * count, count, path, name)
     return np.array([default if np.isnan(values[axis]) else values[axis] for axis in spatial])

@@ -140,6 +140,11 @@ BAD: dict[str, tuple[str, Callable[[], bytes], tuple[str, ...]]] = {
         ("4 axes of which 4 are spatial", "kinds"),
     ),
     "nrrd flat": ("a.nrrd", lambda: made.nrrd(ONE, space_directions="(1,0,0) (0,1,0) (1,1,0)"), ("determinant 0",)),
+    "nrrd spacings": (
+        "a.nrrd",
+        lambda: made.nrrd(ONE, space="", space_directions="", space_origin="", spacings="1 2 3 4"),
+        ("'spacings = 1 2 3 4'", "numbers (3)"),
+    ),
     "nrrd 2-vectors": (
         "a.nrrd",
         lambda: made.nrrd(ONE, space_directions="(1,0) (0,1) (1,1)"),

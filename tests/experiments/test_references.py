@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from tiny_experiment import SCENE, refused, run
 
+from mivol.experiments import references
 from mivol.files import write_exr
 
 
@@ -63,3 +65,23 @@ def test_views_of_different_sizes(variant_rgb, folder: Path, capsys: pytest.Capt
     said = refused(capsys, "optimize", folder / "fit.toml", "-o", folder / "run", *flags)
     assert "8 x 5 pixels" in said
     assert "8 x 6" in said
+
+
+@pytest.mark.parametrize(("wanted", "target"), [(0.0, None), (0.25, 0.25)])
+def test_a_reference_is_rendered_as_the_file_says(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, wanted: float, target: float | None
+) -> None:
+    """Each view with the depth of the fit, up to the samples or to the error; an error of 0 is none that is aimed at."""
+    asked, kept = [], []
+    monkeypatch.setattr(references, "render_reference", lambda *how, **settings: asked.append((how, settings)) or made)
+    monkeypatch.setattr(references, "standard_error", lambda found: "its error")
+    made = SimpleNamespace(mean="its mean")
+    chosen = SimpleNamespace(
+        fit=SimpleNamespace(max_depth=7), reference=SimpleNamespace(standard_error=wanted, spp=33, seed=5)
+    )
+    task = SimpleNamespace(chosen=chosen, folder=tmp_path, watcher=SimpleNamespace(track=lambda items, what: iter(items)))
+    references.render_views(SimpleNamespace(add=lambda *view: kept.append(view)), task, "scene", ["a", "b"])
+    settings = {"max_depth": 7, "target_se": target, "max_spp": 33, "seed": 5, "progress": False}
+    assert asked == [(("scene", tmp_path / "references"), {"sensor": view, **settings}) for view in "ab"]
+    assert kept == [(view, "its mean", "its error") for view in "ab"]
+    assert (tmp_path / "references").is_dir()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -141,3 +143,10 @@ def test_kernels_are_recorded_once(splatter: Splatter) -> None:
 def test_room_for_gaussians_is_a_power_of_two() -> None:
     """So that kernels are compiled anew a few times in a fit, and not with every clone."""
     assert [_capacity(n) for n in (1, 4096, 4097, 8192, 8193)] == [4096, 4096, 8192, 8192, 16384]
+
+
+def test_what_light_is_left_is_kept_for_derivatives_alone(splatter: Splatter) -> None:
+    """A number a pixel and chunk of a list; a picture alone keeps those of one chunk."""
+    chunks = mi.UInt32([*range(splatter.n_tiles), 37])
+    widths = [dr.width(splatter._frame(SimpleNamespace(chunks=chunks), asked).transmittance) for asked in (False, True)]
+    assert widths[1] == 37 * widths[0]

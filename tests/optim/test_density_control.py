@@ -116,6 +116,9 @@ def test_copies_compose_to_what_they_replace(opacity: float, copies: int) -> Non
     # Beyond 20 standard deviations there is nothing left in float64.
     area = quad(composite, -20 * factor[0], 20 * factor[0], epsabs=0, epsrel=1e-10, limit=200)[0]
     assert area == pytest.approx(opacity * math.sqrt(2 * math.pi), rel=1e-9)
+    # Beside others that have more copies it is the same.
+    beside = density_control.opacity_and_scale_of_copies(np.array([opacity, 0.5]), np.array([copies, 25]))
+    assert beside[0][0] == each[0] and beside[1][0] == pytest.approx(factor[0], rel=1e-12)
 
 
 def test_unused_gaussians_move_to_used_ones() -> None:

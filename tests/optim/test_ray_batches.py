@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import drjit as dr
 import numpy as np
+import pytest
 
+from mivol.errors import MivolError
 from mivol.optim.ray_batches import TILE, RayBatches
-from mivol.photos import Photo, pixel_centres, rays
+from mivol.photos import Camera, Photo, intrinsics, pixel_centres, rays
 
 
 def test_views_know_their_rays_and_pixels(variant_rgb: str, photos: list[Photo]) -> None:
@@ -22,3 +24,13 @@ def test_views_know_their_rays_and_pixels(variant_rgb: str, photos: list[Photo])
     half = np.array(views.whole(2, 1).rays.d).T[0]
     assert np.abs(half - d[0:2, 0:2].mean(axis=(0, 1))).max() < 1e-3
     assert views.digest() != RayBatches.of(photos[1:4], (1, 2)).digest()
+
+
+def test_a_tile_is_the_smallest_view(variant_rgb: str) -> None:
+    """A view of one tile is taken as it is; at half its size it is refused, with the way out."""
+    camera = Camera(intrinsics(10, 10, TILE / 2, TILE / 2), (TILE, TILE), np.eye(4))
+    photo = Photo("a", np.full((TILE, TILE, 3), 0.5, np.float32), None, None, camera, np.zeros(3, np.float32))
+    batch = RayBatches.of([photo]).draw(1, np.array([0]), 1, np.random.default_rng(0))
+    np.testing.assert_allclose(np.array(batch.target), 0.5, atol=0.5 / 255 + 1e-6)
+    with pytest.raises(MivolError, match=f"a view of {TILE // 2} pixels an edge was given at 1/2; {TILE} are needed"):
+        RayBatches.of([photo], (1, 2))
