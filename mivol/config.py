@@ -284,8 +284,11 @@ class Grid(Section):
 class Solve(Section):
     """How the projections are inverted."""
 
-    name: Annotated[str, of("1", "key of mivol.optim.solvers.METHODS", min_length=1)] = "pcg"
-    start: Annotated[Literal["empty", "filtered"], of("1", "first volume: empty, or by fbp or fdk")] = "empty"
+    name: Annotated[str, of("1", "auto, or a key of mivol.optim.solvers.METHODS", min_length=1)] = "auto"
+    start: Annotated[
+        Literal["empty", "filtered"] | None,
+        of("1", "first volume: empty, or by fbp or fdk; absent: auto begins filtered where the views allow it, others empty"),
+    ] = None
     iterations: Annotated[int, of("iteration", "at most so many", ge=1)] = 20
     nonnegative: Annotated[bool, of("1", "keep every voxel at or above 0")] = True
     subsets: Annotated[int, of("1", "subsets of views, for os-sart", ge=1)] = 10
@@ -293,12 +296,15 @@ class Solve(Section):
     decay: Annotated[float, of("1", "of the relaxation, a sweep", gt=0, le=1)] = 0.99
     window: Annotated[str, of("1", "filter of fbp and fdk: key of mivol.tomography.ramp.WINDOWS", min_length=1)] = "ram-lak"
     cutoff: Annotated[float, of("1", "where the window ends, in parts of the Nyquist frequency", gt=0, le=1)] = 1.0
-    tv: Annotated[float, of("1/length", "strength of the total variation; 0: none", ge=0)] = 0.0
-    delta: Annotated[float, of("1/length^2", "slope below which noise is smoothed", gt=0)] = 1e-3
+    supersampling: Annotated[
+        int | None, of("1", "unknowns along each edge of a voxel, which is their mean; absent: auto takes 2, others 1")
+    ] = None
+    tv: Annotated[float | None, of("tv_unit", "strength of the total variation; absent: auto takes 1, others 0: none")] = None
+    delta: Annotated[float, of("tv_unit", "slope below which noise is smoothed", gt=0)] = 0.1
     tv_unit: Annotated[
         Literal["length", "noise"],
-        of("1", "noise: tv in parts of what balances the noise, delta of the mean value a voxel; both have no unit then"),
-    ] = "length"
+        of("1", "noise: tv in parts of what balances the noise, delta of the mean value a voxel; length: 1/length, 1/length^2"),
+    ] = "noise"
     storage: Annotated[
         Literal["auto", "walk", "matrix"],
         of("1", "matrix: a layer's rows are stored (parallel beams, fans); auto: where they fit and it pays"),
@@ -307,8 +313,13 @@ class Solve(Section):
     discrepancy: Annotated[float, of("1", "stop where the residual is so many times the noise; 0: never", ge=0)] = 0.0
 
     def __post_init__(self) -> None:
-        if self.name not in METHODS:
-            raise ValueError(f'unknown solver "{self.name}": {nearest(self.name, list(METHODS))}'.rstrip("."))
+        if self.name != AUTO and self.name not in METHODS:
+            raise ValueError(f'unknown solver "{self.name}": {nearest(self.name, [AUTO, *METHODS])}'.rstrip("."))
+        # NaN fails every comparison.
+        if self.tv is not None and not self.tv >= 0:
+            raise ValueError(f"tv is {self.tv}: a number from 0 on is expected")
+        if self.supersampling is not None and self.supersampling < 1:
+            raise ValueError(f"supersampling is {self.supersampling}: a whole number from 1 on is expected")
         if self.window not in WINDOWS:
             raise ValueError(f'unknown window "{self.window}": {nearest(self.window, list(WINDOWS))}'.rstrip("."))
 

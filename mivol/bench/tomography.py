@@ -33,7 +33,7 @@ import mivol
 from mivol.bench.bars import say
 from mivol.bench.figures import drawn
 from mivol.bench.timing import Stopwatch
-from mivol.bench.tomography_peers import compare, rows
+from mivol.bench.tomography_peers import compare, ratios, rows
 from mivol.errors import MivolError
 from mivol.files import read_volume, write_whole_text
 from mivol.optim.linear_problems import LeastSquares
@@ -234,7 +234,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         mi.set_variant(args.variant)
         args.out.mkdir(parents=True, exist_ok=True)
         if args.beside:
-            print("\n".join(rows(compare())))
+            found = compare()
+            print("\n".join([*rows(found), "", *ratios(found)]))
             return 0
         report, curves = measure(args)
         write_whole_text(args.out / "tomography.json", json.dumps(report | {"curves": curves}, indent=2) + "\n")

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import mitsuba as mi
+import msgspec
 import numpy as np
 
 from mivol import config
@@ -20,6 +21,7 @@ from mivol.experiments.photo_plan import choices, make_plan, shrunk
 from mivol.experiments.projections import beam_of, held_out_views, make_data, make_grid
 from mivol.experiments.references import camera_of, find_sensors, load_experiment_scene, read_references
 from mivol.experiments.scan_fit import make_problem as make_scan_problem
+from mivol.experiments.scan_fit import settle
 from mivol.experiments.scan_storage import choose_storage
 from mivol.experiments.scene_fit import make_integrator
 from mivol.experiments.start import make_start
@@ -27,10 +29,11 @@ from mivol.experiments.task import Task
 from mivol.experiments.truth import check_truth, make_truth, put
 from mivol.optim.parameters import check_names
 from mivol.optim.ray_batches import RayBatches
-from mivol.optim.solvers import METHODS
 from mivol.photos import rectified
 from mivol.scene.explain import Explanation, examine
+from mivol.tomography.filtered import check_directions
 from mivol.tomography.projector import Projector
+from mivol.tomography.supersampling import subdivide
 
 Say = Callable[[str], None]
 """Takes one line of facts."""
@@ -108,11 +111,19 @@ def explain_scan_fit(chosen: Scan, base: Path, say: Say) -> Explanation:
         say(f"  data      {note}")
     held_out = held_out_views(chosen, views)
     say(f"  held out  {len(held_out)} views")
-    problem = make_scan_problem(chosen, Projector(data.geometry, grid), data, held_out)
+    chosen, lines = settle(chosen, data, grid, held_out)
+    projector = Projector(data.geometry, subdivide(grid, chosen.solve.supersampling, data.geometry))
+    if chosen.solve.start == "filtered":
+        check_directions(projector)
+    # Back-projection alone takes longer than all else here.
+    empty = msgspec.structs.replace(chosen.solve, start="empty")
+    problem = make_scan_problem(msgspec.structs.replace(chosen, solve=empty), projector, data, held_out)
     storage = choose_storage(chosen.solve, problem.linear_problem.A).line
-    say(f"  {storage.choice}, because {storage.reason}")
-    solver = METHODS[chosen.solve.name]
-    return Explanation((f"  solver    {chosen.solve.name}, {chosen.solve.iterations} iterations: {solver.promises}",))
+    for line in (*lines, storage):
+        say(f"  {line.choice}, because {line.reason}")
+    if chosen.solve.tv:
+        say(f"  total variation: {chosen.solve.tv:g} in units of the {chosen.solve.tv_unit}")
+    return Explanation((f"  solver    {chosen.solve.name}, at most {chosen.solve.iterations} iterations",))
 
 
 def explain_photo_fit(chosen: FieldFit, base: Path, say: Say) -> Explanation:

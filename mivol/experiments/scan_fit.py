@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import msgspec
 import numpy as np
 
 from mivol import config
@@ -18,7 +19,9 @@ from mivol.experiments.best import BestIterate
 from mivol.experiments.projections import Projections, beam_of, held_out_views, make_data, make_grid
 from mivol.experiments.run_folder import RunFolder
 from mivol.experiments.scan_outputs import write_best, write_outputs
+from mivol.experiments.scan_prior import check_noise, make_prior, plan_of_prior, settle_noise
 from mivol.experiments.scan_storage import choose_storage
+from mivol.experiments.solver_choice import settle_solver, solver_of, strength_of
 from mivol.experiments.task import Task
 from mivol.optim.checkpoint import Store
 from mivol.optim.course import Course
@@ -27,17 +30,17 @@ from mivol.optim.events import Checkpoint
 from mivol.optim.inversion import Inversion, Solve
 from mivol.optim.linear_problems import LeastSquares, PoissonCounts
 from mivol.optim.loop import Fit, begin_fit
-from mivol.optim.noise_scale import noise_norm, tv_of_noise
-from mivol.optim.smoothed_tv import SmoothedTV
+from mivol.optim.noise_scale import noise_norm
 from mivol.optim.solver import State
 from mivol.optim.solvers import DIRECT, METHODS
 from mivol.report.page import write_page
 from mivol.report.preview import is_due, write_preview
 from mivol.report.record import PlanLine, RunRecord
 from mivol.tomography.filtered import feldkamp, filtered_backprojection
-from mivol.tomography.geometry import ParallelBeam
+from mivol.tomography.geometry import ParallelBeam, VoxelGrid
 from mivol.tomography.preprocess import bridge_gaps
 from mivol.tomography.projector import Projector
+from mivol.tomography.supersampling import subdivide, voxel_means
 from mivol.validate.metrics import nrmse
 
 CITED = {
@@ -67,15 +70,19 @@ def scan_fit(task: Task) -> Path:
             data = make_data(chosen, task.base, grid)
             run.record.notes += data.notes
             task.watcher.say(data.notes)
-        projector = Projector(data.geometry, grid)
-        held_out = held_out_views(chosen, projector.n_views)
+        held_out = held_out_views(chosen, len(data.y))
+        chosen, lines = settle(chosen, data, grid, held_out)
+        task = replace(task, chosen=chosen)
+        run.record.plan += lines
+        projector = Projector(data.geometry, subdivide(grid, chosen.solve.supersampling, data.geometry))
         with run.stage("solve"):
             problem = make_problem(chosen, projector, data, held_out)
             best = BestIterate(run)
             storage = choose_storage(chosen.solve, problem.linear_problem.A)
             run.record.plan.append(storage.line)
             storage.apply(problem)
-            state = solve(task, run, problem, data, best)
+            run.record.plan += settle_noise(problem, chosen.solve, data)
+            state = solve(task, run, problem, data, grid, best)
             residual = state.residual_norm / norm_of(problem.linear_problem)
             run.record.results = {"iterations": float(state.iteration), "residual": residual}
             run.record.plan += plan_of_prior(problem.linear_problem.prior, state)
@@ -83,7 +90,7 @@ def scan_fit(task: Task) -> Path:
                 run.record.results["discrepancy"] = state.residual_norm / noise_norm(problem.linear_problem, chosen.solve.name)
             data = without_drift(problem, data, held_out, state)
         with run.stage("images and volumes"):
-            write_outputs(run, projector, data, held_out, state.x.reshape(grid.shape))
+            write_outputs(run, projector, grid, data, held_out, state.x.reshape(projector.grid.shape))
             write_best(run, grid, best)
     page = write_page(task.folder)
     task.watcher.say([*best.says(), run.summary()])
@@ -93,32 +100,25 @@ def scan_fit(task: Task) -> Path:
 def new_record(task: Task) -> RunRecord:
     """The record of a run that begins."""
     chosen: config.Scan = task.chosen
-    solver = METHODS[chosen.solve.name]
+    name = solver_of(chosen.solve)
     return RunRecord.new(
         chosen.title,
-        method=f"{chosen.solve.name} on line integrals of a {beam_of(chosen)}",
+        method=f"{name} on line integrals of a {beam_of(chosen)}",
         config=config.resolved(chosen),
         command=task.command,
         seeds={"noise": getattr(chosen.data, "seed", 0)},
         plan=[
             PlanLine(choice="projector: exact line integrals and their exact transpose", reason="a matched pair: no bias"),
-            PlanLine(choice=f"solver: {chosen.solve.name}", reason=solver.promises),
         ],
-        citations=["mitsuba3", "drjit", *CITED[chosen.solve.name], *(["rudin_1992", "huber_1964"] if chosen.solve.tv else [])],
+        citations=["mitsuba3", "drjit", *CITED[name], *(["rudin_1992", "huber_1964"] if strength_of(chosen.solve) else [])],
     )
 
 
-def plan_of_prior(prior: SmoothedTV | None, state: State) -> list[PlanLine]:
-    """How strong the prior was, and what it did."""
-    if prior is None:
-        return []
-    share, edges = prior.value(state.x) / abs(state.objective), prior.share_of_edges(state.x)
-    return [
-        PlanLine(
-            choice=f"total variation: strength {prior.strength:.4g} / length, smooth below {prior.delta:.4g} / length^2",
-            reason=f"it is {share:.2%} of the objective in the end, and keeps {edges:.2%} of the slopes as edges",
-        )
-    ]
+def settle(chosen: config.Scan, data: Projections, grid: VoxelGrid, held_out: np.ndarray) -> tuple[config.Scan, list[PlanLine]]:
+    """All settings with what was left open to the solver's table, and why."""
+    kept = np.setdiff1d(np.arange(len(data.y)), held_out)
+    solve, lines = settle_solver(chosen.solve, Projector(data.geometry, grid, kept))
+    return msgspec.structs.replace(chosen, solve=solve), lines
 
 
 def make_problem(chosen: config.Scan, projector: Projector, data: Projections, held_out: np.ndarray) -> Inversion:
@@ -139,33 +139,6 @@ def make_problem(chosen: config.Scan, projector: Projector, data: Projections, h
         raise MivolError("ml-tr needs counts of quanta, found line integrals: simulate with photons, or choose pcg.")
     quanta = data.quanta.of_views(kept)
     return Inversion(PoissonCounts(a, quanta.counts, quanta.blank, quanta.background, x0, prior, quanta.used))
-
-
-def make_prior(wanted: config.Solve, a: Projector, data: Projections, kept: np.ndarray) -> SmoothedTV | None:
-    """Total variation in the unit that was asked for; None where none was.
-
-    Raises:
-        MivolError: the unit of a noise that is not known.
-    """
-    if not wanted.tv:
-        return None
-    if wanted.tv_unit == "length":
-        return SmoothedTV(a.grid.shape, wanted.tv, wanted.delta, a.grid.voxel_size)
-    check_noise("solve.tv_unit = noise", data)
-    return tv_of_noise(a, data.y[kept], data.weights[kept], wanted.tv, wanted.delta)
-
-
-def check_noise(asked: str, data: Projections) -> None:
-    """Refuse what needs the size of the noise where it is not known.
-
-    Raises:
-        MivolError: it is not.
-    """
-    if not data.is_noise_known:
-        raise MivolError(
-            f"{asked} needs the noise of the projections, which these do not have: give readings with flats and darks, or "
-            "simulate with photons."
-        )
 
 
 def times_of(data: Projections) -> np.ndarray:
@@ -194,7 +167,7 @@ def start_volume(wanted: config.Solve, a: Projector, data: Projections, kept: np
     return np.maximum(x, 0) if wanted.nonnegative else x
 
 
-def solve(task: Task, run: RunFolder, problem: Inversion, data: Projections, best: BestIterate) -> State:
+def solve(task: Task, run: RunFolder, problem: Inversion, data: Projections, grid: VoxelGrid, best: BestIterate) -> State:
     """All iterations, with metrics and checkpoints; where the solver stands after them.
 
     Raises:
@@ -202,7 +175,7 @@ def solve(task: Task, run: RunFolder, problem: Inversion, data: Projections, bes
     """
     chosen: config.Scan = task.chosen
     course = Course(chosen.solve.iterations, events=(Checkpoint(every=chosen.checkpoint_every),))
-    store = Store(run.checkpoint, {"data": data.digest(), **config.flat(config.resolved(chosen))}, task.resume)
+    store = Store(run.checkpoint, {"data": data.digest(), **config.flat(run.record.config)}, task.resume)
     wanted = chosen.solve
     shared = {name: getattr(wanted, name) for name in ("subsets", "relaxation", "decay", "window", "cutoff")}
     noise = noise_norm(problem.linear_problem, wanted.name) if data.is_noise_known else None
@@ -216,26 +189,22 @@ def solve(task: Task, run: RunFolder, problem: Inversion, data: Projections, bes
     with task.watcher.watch(course.iterations) as watch:
 
         def observe(fit: Fit) -> None:
-            errors = errors_of(fit.run.state, problem.linear_problem, data)
+            volume = voxel_means(fit.run.state.x.reshape(problem.linear_problem.A.grid.shape), grid.shape)
+            errors = {"residual": fit.run.state.residual_norm / norm_of(problem.linear_problem)}
+            if data.truth is not None:
+                errors["nrmse"] = nrmse(volume, data.truth)
             if noise:
                 errors["discrepancy"] = fit.run.state.residual_norm / noise
             run.append(fit.next, fit.seconds, loss=fit.history[-1]["loss"], **errors)
-            best.see(fit.next, errors, {"volume": fit.run.state.x})
+            best.see(fit.next, errors, {"volume": volume})
             if is_due(fit.next, course.iterations):
-                grid = problem.linear_problem.A.grid
-                write_preview(run.path, fit.run.state.x.reshape(grid.shape), tuple(grid.extent))
+                write_preview(run.path, volume, tuple(grid.extent))
             watch(fit)
 
         fit.complete(observe)
     if fit.run.finished and fit.next < course.iterations:
         run.record.notes.append(f"stopped after iteration {fit.next} of {course.iterations}: {fit.run.finished}")
     return fit.run.state
-
-
-def errors_of(state: State, task: LeastSquares | PoissonCounts, data: Projections) -> dict[str, float]:
-    """The relative residual, and the error of the volume where the truth is known."""
-    errors = {"residual": state.residual_norm / norm_of(task)}
-    return errors if data.truth is None else errors | {"nrmse": nrmse(state.x.reshape(data.truth.shape), data.truth)}
 
 
 def norm_of(task: LeastSquares | PoissonCounts) -> float:

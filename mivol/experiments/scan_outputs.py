@@ -14,22 +14,27 @@ from mivol.files import write_exr, write_volume
 from mivol.report.record import LINES, SINOGRAM, Image, Volume
 from mivol.tomography.geometry import VoxelGrid
 from mivol.tomography.projector import Projector
+from mivol.tomography.supersampling import voxel_means
 from mivol.validate.metrics import nrmse
 
 
-def write_outputs(run: RunFolder, projector: Projector, data: Projections, held_out: np.ndarray, x: np.ndarray) -> None:
+def write_outputs(
+    run: RunFolder, projector: Projector, grid: VoxelGrid, data: Projections, held_out: np.ndarray, x: np.ndarray
+) -> None:
     """Write volume, sinogram, held-out views and curves, and put them and the results on record.
 
     Args:
         run: where it is written; its results have the iterations already.
         projector: of all views.
+        grid: the voxels that were asked for; the projector's may divide them.
         data: what was measured.
         held_out: numbers of the views that were not fitted.
-        x: (Z, Y, X), what was found.
+        x: (Z, Y, X) of the projector's grid, what was found.
     """
     run.make("views", "volumes")
     predicted, record = projector @ x, run.record
-    record.volumes += write_grids(run.path, projector.grid, x, data.truth)
+    volume = voxel_means(x, grid.shape)
+    record.volumes += write_grids(run.path, grid, volume, data.truth)
     middle = data.y.shape[1] // 2
     noise = noise_of(data)
     said = f"row {middle + 1} of {data.y.shape[1]}"
@@ -41,7 +46,7 @@ def write_outputs(run: RunFolder, projector: Projector, data: Projections, held_
     run.write_curves()
     record.results["views"] = float(projector.n_views - len(held_out))
     if data.truth is not None:
-        record.results["nrmse"] = nrmse(x, data.truth)
+        record.results["nrmse"] = nrmse(volume, data.truth)
     if len(held_out):
         z = (data.y - predicted)[held_out] * np.sqrt(data.weights[held_out])
         record.results["held_out_rms_of_residual_over_noise"] = float(np.sqrt(np.mean(z**2)))

@@ -16,7 +16,7 @@ from mivol.tomography.ramp import filter_ramp
 from mivol.tomography.redundancy import angle_steps, covers, full_turn_shares, half_scan_shares, widest_gap
 from mivol.tomography.voxel_driven import pixel_matrices, smear
 
-__all__ = ["feldkamp", "filtered_backprojection"]
+__all__ = ["check_directions", "feldkamp", "filtered_backprojection"]
 
 
 def filtered_backprojection(projector: Projector, y: np.ndarray, window: str = "ram-lak", cutoff: float = 1.0) -> np.ndarray:
@@ -40,6 +40,13 @@ def filtered_backprojection(projector: Projector, y: np.ndarray, window: str = "
     Bias: the ramp stops at the pixels' Nyquist frequency; few views leave streaks. Values are not clipped at 0.
     Cost: four reads a voxel and view.
     """
+    beam, weights = projector.geometry, _parallel_weights(projector)
+    weighted, matrices = _on_both_sides(y * weights[:, None], pixel_matrices(beam, projector.grid, projector.views), beam.u)
+    return smear(matrices, filter_ramp(weighted, beam.pitch[1], window, cutoff), projector.grid, weighted=False)
+
+
+def _parallel_weights(projector: Projector) -> np.ndarray:
+    """Step times share (views, cols) of each ray."""
     beam = projector.geometry
     if not isinstance(beam, ParallelBeam):
         raise MivolError(
@@ -53,11 +60,8 @@ def filtered_backprojection(projector: Projector, y: np.ndarray, window: str = "
             "choose an iterative solver (and give the angles in the unit that is asked for: radians here, degrees in files)."
         )
     if covers(angles, 2 * np.pi):
-        weights = angle_steps(angles, 2 * np.pi)[:, None] * full_turn_shares(u)
-    else:
-        weights = np.broadcast_to(angle_steps(angles, np.pi)[:, None], (len(angles), len(u)))
-    weighted, matrices = _on_both_sides(y * weights[:, None], pixel_matrices(beam, projector.grid, projector.views), u)
-    return smear(matrices, filter_ramp(weighted, beam.pitch[1], window, cutoff), projector.grid, weighted=False)
+        return angle_steps(angles, 2 * np.pi)[:, None] * full_turn_shares(u)
+    return np.broadcast_to(angle_steps(angles, np.pi)[:, None], (len(angles), len(u)))
 
 
 def feldkamp(projector: Projector, y: np.ndarray, window: str = "ram-lak", cutoff: float = 1.0) -> np.ndarray:
@@ -76,23 +80,42 @@ def feldkamp(projector: Projector, y: np.ndarray, window: str = "ram-lak", cutof
     Bias: exact in the source's plane; elsewhere it grows with the cone's angle (Feldkamp 1984).
     Cost: four reads a voxel and view.
     """
-    beam, grid = projector.geometry, projector.grid
+    weights = _circle_weights(projector)
+    beam, grid, scale = projector.geometry, projector.grid, _scale_to_axis(projector.geometry)
+    distance, tau = beam.source_to_axis, beam.axis_offset
+    # From the central ray, on a detector that is scaled down to the axis.
+    p, q = (beam.u + tau) * scale, beam.v * scale
+    cosine = (distance**2 + tau * p) / (distance * np.sqrt(distance**2 + p**2 + q[:, None] ** 2))
+    weighted, matrices = _on_both_sides(y * weights[:, None] * cosine, pixel_matrices(beam, grid, projector.views), p)
+    filtered = filter_ramp(weighted, beam.pitch[1] * scale, window, cutoff)
+    # t of the matrices is the depth over source_to_detector, U the depth over source_to_axis.
+    return smear(matrices, filtered * scale**2, grid, weighted=True)
+
+
+def check_directions(projector: Projector) -> None:
+    """Refuse scans that filtered back-projection does not invert.
+
+    Raises:
+        MivolError: what :func:`filtered_backprojection` of a parallel beam, or :func:`feldkamp` of any other, would raise.
+    """
+    (_parallel_weights if isinstance(projector.geometry, ParallelBeam) else _circle_weights)(projector)
+
+
+def _scale_to_axis(beam: ConeBeam) -> float:
+    return beam.source_to_axis / beam.source_to_detector
+
+
+def _circle_weights(projector: Projector) -> np.ndarray:
+    """Step times share (views, cols) of each ray."""
+    beam = projector.geometry
     if not isinstance(beam, ConeBeam):
         raise MivolError(
             f"Found {type(beam).__name__}, expected a ConeBeam on a circle: fbp is for parallel beams, for any other "
             "trajectory choose an iterative solver."
         )
-    angles, scale = beam.angles[projector.views], beam.source_to_axis / beam.source_to_detector
     distance, tau = beam.source_to_axis, beam.axis_offset
-    # From the central ray, on a detector that is scaled down to the axis.
-    p, q = (beam.u + tau) * scale, beam.v * scale
-    cosine = (distance**2 + tau * p) / (distance * np.sqrt(distance**2 + p**2 + q[:, None] ** 2))
-    gamma = np.arctan2(p, distance) - np.arctan2(tau, distance)
-    weights = cone_weights(angles, gamma, _needed_fan(projector, gamma))
-    weighted, matrices = _on_both_sides(y * weights[:, None] * cosine, pixel_matrices(beam, grid, projector.views), p)
-    filtered = filter_ramp(weighted, beam.pitch[1] * scale, window, cutoff)
-    # t of the matrices is the depth over source_to_detector, U the depth over source_to_axis.
-    return smear(matrices, filtered * scale**2, grid, weighted=True)
+    gamma = np.arctan2((beam.u + tau) * _scale_to_axis(beam), distance) - np.arctan2(tau, distance)
+    return cone_weights(beam.angles[projector.views], gamma, _needed_fan(projector, gamma))
 
 
 def cone_weights(angles: np.ndarray, gamma: np.ndarray, needed: float) -> np.ndarray:

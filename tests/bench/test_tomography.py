@@ -197,9 +197,10 @@ def test_slices_beside_other_programs_are_all_that_is_printed(
 ) -> None:
     monkeypatch.setattr(bench, "compare", lambda: "found")
     monkeypatch.setattr(bench, "rows", lambda found: [found, "twice"])
+    monkeypatch.setattr(bench, "ratios", lambda found: [f"{found} again"])
     monkeypatch.setattr(bench, "measure", None)
     assert bench.main(["--beside", "--out", str(tmp_path / "a" / "b"), "--variant", variant_rgb]) == 0
-    assert capsys.readouterr().out == "found\ntwice\n"
+    assert capsys.readouterr().out == "found\ntwice\n\nfound again\n"
     assert (tmp_path / "a" / "b").is_dir()
     assert bench.main(["--beside", "--out", str(tmp_path / "a" / "b"), "--variant", variant_rgb]) == 0
 

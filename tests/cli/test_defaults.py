@@ -82,9 +82,9 @@ DEFAULTS = {
     "config.Readings": {"find_axis": True, "air": 0, "drift": 0, "saturation": math.inf},
     "config.Simulated": {"photons": 0.0, "seed": 1},
     "config.Solve": {
-        **{"name": "pcg", "start": "empty", "iterations": 20, "nonnegative": True, "subsets": 10},
-        **{"relaxation": 1.0, "decay": 0.99, "window": "ram-lak", "cutoff": 1.0, "tv": 0.0, "delta": 0.001},
-        **{"tv_unit": "length", "storage": "auto", "memory": 1.0, "discrepancy": 0.0},
+        **{"name": "auto", "start": None, "supersampling": None, "iterations": 20, "nonnegative": True, "subsets": 10},
+        **{"relaxation": 1.0, "decay": 0.99, "window": "ram-lak", "cutoff": 1.0, "tv": None, "delta": 0.1},
+        **{"tv_unit": "noise", "storage": "auto", "memory": 1.0, "discrepancy": 0.0},
     },
     "config.Stack": {
         **{"find_axis": True, "air": 0, "drift": 0, "saturation": math.inf},

@@ -32,7 +32,7 @@ def written(
     weights = np.full(y.shape, 4.0)
     weights[..., 0] = 0 if is_noise_known else 4.0
     data = SimpleNamespace(y=y, weights=weights, truth=truth, is_noise_known=is_noise_known)
-    write_outputs(run, Half(), data, held_out, np.arange(24.0, dtype=np.float32).reshape(GRID.shape))
+    write_outputs(run, Half(), GRID, data, held_out, np.arange(24.0, dtype=np.float32).reshape(GRID.shape))
     return record
 
 
