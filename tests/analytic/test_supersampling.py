@@ -46,8 +46,8 @@ def test_means_are_those_of_blocks(geometry: ConeBeam | ParallelBeam) -> None:
 
 
 def test_edges_do_not_ripple_in_finer_unknowns(variant_rgb: str) -> None:
-    """The head from exact chords, 24^3 voxels of 60 views, from FDK: after 16 iterations the voxels' own error is past its least
-    value, by a third and more; the means of halves have a lower one, and keep it to a tenth."""
+    """The head from exact chords, 24^3 voxels of 60 views, from FDK: after 16 iterations the voxels' own error is past its
+    least value, by a third and more; the means of halves have a lower one, and keep it to a tenth."""
     angles = np.arange(60) * np.pi / 30
     beam, grid, head = ConeBeam(angles, (24, 24), 6.0, 6.0, 1 / 8), VoxelGrid((24, 24, 24), 1 / 12), shepp_logan()
     y, truth = head.project(beam), head.voxelise(grid, 4)

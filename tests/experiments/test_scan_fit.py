@@ -219,8 +219,8 @@ def test_a_prior_in_units_of_the_noise_says_what_it_did(variant_rgb, folder: Pat
 
 @pytest.mark.slow
 def test_what_is_left_open_is_chosen_and_said(variant_rgb, folder: Path, capsys: pytest.CaptureFixture) -> None:
-    """By the table of the benchmarks: a lower error than the solver that is named, from the same projections, and as many voxels.
-    Its noise is found; a resumed run goes on from a file that leaves the same open."""
+    """By the table of the benchmarks: a lower error than the solver that is named, and as many voxels. Its noise is
+    found; a resumed run goes on from a file that leaves the same open."""
     assert run(folder, to="named") == 0
     (folder / "fit.toml").write_text(SCAN.replace('name = "pcg", ', ""))
     assert run(folder) == 0

@@ -62,7 +62,8 @@ def test_weights_in_proportion_find_the_same(variant_rgb: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("wanted", "is_noise_known"), [(WANTED, True), (config.Solve(tv=2.0, tv_unit="length"), False), (config.Solve(tv=0.0), False)]
+    ("wanted", "is_noise_known"),
+    [(WANTED, True), (config.Solve(tv=2.0, tv_unit="length"), False), (config.Solve(tv=0.0), False)],
 )
 def test_nothing_is_estimated_where_nothing_is_missing(variant_rgb: str, wanted: config.Solve, is_noise_known: bool) -> None:
     problem, data = problem_of(1.0, wanted, is_noise_known)
