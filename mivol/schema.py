@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 import textwrap
-from typing import Any, NamedTuple, get_args, get_origin, get_type_hints
+from typing import Any, Literal, NamedTuple, get_args, get_origin, get_type_hints
 
 import msgspec
 
@@ -44,7 +44,10 @@ def check_keys(raw: Any, kind: Any, where: str, name: str) -> None:
     hints = get_type_hints(struct)
     for key, value in raw.items():
         if key in hints:
-            check_keys(value, hints[key], f"{where}.{key}".lstrip("."), name)
+            dotted, words = f"{where}.{key}".lstrip("."), words_in(hints[key])
+            if isinstance(value, str) and words and value not in words:
+                raise MivolError(f'{name}: {dotted} = "{value}" is unknown: {nearest(value, list(words))}')
+            check_keys(value, hints[key], dotted, name)
 
 
 def _check_tag(raw: dict[str, Any], tag: str | None, choices: dict[str, type], where: str, name: str) -> None:
@@ -61,6 +64,11 @@ def structs_in(kind: Any) -> list[type]:
     if isinstance(kind, type) and issubclass(kind, msgspec.Struct):
         return [kind]
     return [struct for part in get_args(kind) for struct in structs_in(part)]
+
+
+def words_in(kind: Any) -> tuple[str, ...]:
+    """The words that a value of this type is chosen from; none where it is no choice of words."""
+    return tuple(str(word) for part in (kind, *get_args(kind)) if get_origin(part) is Literal for word in get_args(part))
 
 
 def struct_of(kind: Any, raw: Any) -> type | None:
@@ -107,7 +115,7 @@ class Setting(NamedTuple):
         default: as Python writes it; "" where it must be given, and where the setting is a table.
         unit: "1" for none.
         meaning: in a line.
-        choices: names that it is chosen from; none where it is not a choice of tables.
+        choices: words that it is chosen from, or names of tables; none where it is no choice.
         table: its own settings follow.
     """
 
@@ -130,7 +138,8 @@ def settings_in(kind: type, prefix: str = "") -> list[Setting]:
         many = get_origin(inner) is tuple and bool(structs_in(get_args(inner)[0]))
         structs = structs_in(get_args(inner)[0] if many else inner)
         default = "" if field.default is msgspec.NODEFAULT or structs else repr(field.default)
-        choices = tuple(str(s.__struct_config__.tag) for s in structs if s.__struct_config__.tag is not None)
+        tags = tuple(str(s.__struct_config__.tag) for s in structs if s.__struct_config__.tag is not None)
+        choices = tags or tuple(filter(None, words_in(inner)))
         found.append(Setting(key, default, meta.extra["unit"], meta.description, choices, bool(structs)))
         key += ".0" * many
         for struct in structs:

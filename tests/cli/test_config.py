@@ -14,7 +14,7 @@ from mivol import config
 from mivol.errors import MivolError
 from mivol.optim.gauss_newton import GaussNewton
 from mivol.optim.priors import TotalVariation
-from mivol.schema import describe, structs_in
+from mivol.schema import describe, settings_in, structs_in
 
 ROOT = Path(__file__).resolve().parents[2]
 SMALLEST = """
@@ -144,3 +144,25 @@ def test_the_schema_is_strict() -> None:
         for field in msgspec.structs.fields(struct):
             seen += [s for s in structs_in(getattr(field.type, "__origin__", field.type)) if s not in seen]
     assert len(seen) > 12
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ("show.way=orbit", ('show.way = "orbit" is unknown', "keyframes, turntable, views")),
+        ("show.way=vews", ('show.way = "vews" is unknown: did you mean "views"',)),
+    ],
+)
+def test_a_word_that_is_none_of_a_setting_says_which_there_are(tmp_path: Path, change: str, words: tuple[str, ...]) -> None:
+    path = tmp_path / "fit.toml"
+    path.write_text('title = "A"\n[photos]\npath = "photographs"\n')
+    with pytest.raises(MivolError) as refused:
+        config.load(path, (change,))
+    assert all(each in str(refused.value) for each in words)
+    assert config.load(path, ("show.way=views",)).show.way == "views"
+
+
+def test_settings_say_what_they_are_chosen_from() -> None:
+    choices = {setting.key: setting.choices for setting in settings_in(config.FieldFit)}
+    assert choices["show.way"] == ("turntable", "views", "keyframes") and choices["show.views"] == ()
+    assert "(turntable | views | keyframes)" in next(line for line in describe(config.FieldFit) if line.startswith("show.way"))
