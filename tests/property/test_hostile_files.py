@@ -72,7 +72,8 @@ def test_names_and_keys_without_an_end_are_refused(tmp_path: Path) -> None:
         f"ObjectType = Image\nNDims = 3\nDimSize = 1 1 1\nElementType = MET_FLOAT\nElementDataFile = {'A' * 70000}\n"
     )
     (tmp_path / "long.toml").write_text("A" * 70000 + " = 1\n")
-    (tmp_path / "value.toml").write_text(SHEPP_LOGAN.read_text().replace('"pcg"', f'"{"A" * 70000}"'))
+    named = SHEPP_LOGAN.with_name("cone_128.toml").read_text()
+    (tmp_path / "value.toml").write_text(named.replace('"pcg"', f'"{"A" * 70000}"'))
     for read, name in ((read_volume, "a.mhd"), (config.load, "long.toml"), (config.load, "value.toml")):
         with pytest.raises(MivolError) as refused:
             read(tmp_path / name)
