@@ -95,7 +95,7 @@ def test_a_scan_is_explained(variant_rgb, tmp_path: Path) -> None:
         "data": {"source": "shepp_logan"}, "grid": {"shape": [1, 6, 6], "voxel_size": 0.3}, "solve": {"iterations": 3},
     }  # fmt: skip
     said = explain_fit(config.from_dict(scan), tmp_path)
-    facts = "1 x 6 x 6 voxels of 0.3", "8 views of 1 x 6 pixels, parallel beam", "held out  2 views", "pcg, at most 3 iterations"
+    facts = "1 x 6 x 6 voxels of 0.3", "8 views of 1 x 6 pixels, parallel", "held out  2 views", "pcg, at most 3 iterations"
     for fact in facts:
         assert fact in said.text
     assert said.refusal == ""
