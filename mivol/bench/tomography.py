@@ -4,6 +4,7 @@
     scripts/bench_tomography.py --size 256              the size of TIGRE's own tests
     scripts/bench_tomography.py --volume tooth.nrrd     a measured volume as truth besides
     scripts/bench_tomography.py --beside                slices beside astra-toolbox and scikit-image (tomography_peers)
+    scripts/bench_tomography.py --only volume256        128 cone views through 256^3, time and memory (tomography_volume)
 
 The geometry is TIGRE's test "configuration 1" (cone beam, 100 views on a full circle). The object is the Shepp-Logan head,
 its projections are sums of ellipsoid chords (float64, no grid), so no operator sees data that it made itself. A measured
@@ -34,6 +35,7 @@ from mivol.bench.bars import say
 from mivol.bench.figures import drawn
 from mivol.bench.timing import Stopwatch
 from mivol.bench.tomography_peers import compare, ratios, rows
+from mivol.bench.tomography_volume import measure_volume
 from mivol.errors import MivolError
 from mivol.files import read_volume, write_whole_text
 from mivol.optim.linear_problems import LeastSquares
@@ -196,6 +198,7 @@ def parse(argv: Sequence[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--phantom", choices=list(SHEPP_LOGAN), default="yu-ye-wang")
     parser.add_argument("--volume", type=Path, help="a volume file to use as truth besides")
     parser.add_argument("--beside", action="store_true", help="slices beside other programs, and nothing else")
+    parser.add_argument("--only", choices=["volume256"], help="products with 256^3 voxels, and nothing else")
     parser.add_argument("--variant", default="llvm_ad_rgb")
     parser.add_argument("--out", type=Path, default=Path("runs/bench_tomography"))
     return parser.parse_args(argv)
@@ -236,6 +239,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         if args.beside:
             found = compare()
             print("\n".join([*rows(found), "", *ratios(found)]))
+            return 0
+        if args.only:
+            print(json.dumps(measure_volume(), indent=2))
             return 0
         report, curves = measure(args)
         write_whole_text(args.out / "tomography.json", json.dumps(report | {"curves": curves}, indent=2) + "\n")

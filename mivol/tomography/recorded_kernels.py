@@ -1,0 +1,114 @@
+"""The operators of a scan through a grid, traced once and replayed for any rays and values."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import drjit as dr
+import mitsuba as mi
+
+from mivol.tomography.geometry import VoxelGrid
+from mivol.transport.media.column_integral import (
+    backproject_columns,
+    fold_nodes,
+    integrate_columns,
+    pad_nodes,
+    zero_nodes,
+)
+from mivol.transport.media.grid_integral import Gradient, backproject_segment, integrate_segment
+from mivol.transport.traversal.column_walk import ColumnGrid, Line
+from mivol.transport.traversal.lattice import Lattice, clip, slab
+
+__all__ = ["RecordedKernels"]
+
+Rows = list
+"""``Lattice.from_world``: 3 rows of 4 numbers."""
+
+
+class RecordedKernels:
+    """Both operators through a grid for any rays, traced once and replayed.
+
+    Tracing a walk takes milliseconds, which is more than the walk itself where a subset has a few hundred rays. Dr.Jit records
+    the kernels at the first call (``dr.freeze``) and launches them for any other rays and values without tracing.
+
+    Args:
+        grid: the grid's centre is the origin of the rays.
+    """
+
+    def __init__(self, grid: VoxelGrid) -> None:
+        self.grid = grid
+        self._shape = (*grid.shape, 1)
+        self._from_world = self._lattice_of(dr.zeros(mi.Float, grid.size)).from_world
+        self._record()
+
+    def _record(self) -> None:
+        # A buffer with a copy for each thread is part of the recording of the transpose.
+        self._threads = dr.thread_count()
+        self._integrate, self._backproject = dr.freeze(self._trace_integral), dr.freeze(self._trace_backprojection)
+        self._pad = dr.freeze(lambda values: pad_nodes(values, ColumnGrid(self.grid.shape, 2)))
+        self._columns: dict[str, Callable] = {}
+
+    def _renew(self) -> None:
+        """Record anew where there are other threads than were recorded."""
+        if self._threads != dr.thread_count():
+            self._record()
+
+    def integrate(self, values: mi.Float, empty: mi.UInt8 | None, o: mi.Point3f, d: mi.Vector3f) -> mi.Float:
+        """Line integrals of ``values`` along rays; blocks that are ``empty`` are skipped."""
+        return self._integrate(values, empty, o, d, self._from_world)
+
+    def backproject(self, weight: mi.Float, o: mi.Point3f, d: mi.Vector3f) -> mi.Float:
+        """Sum over rays of ``weight`` times what each voxel adds to them."""
+        self._renew()
+        return self._backproject(weight, o, d, self._from_world)
+
+    def _trace_integral(self, values: mi.Float, empty: mi.UInt8 | None, o: mi.Point3f, d: mi.Vector3f, rows: Rows) -> mi.Float:
+        lattice = Lattice(mi.TensorXf(values, self._shape), None, empty, from_world=rows)
+        return integrate_segment(lattice, values, clip(lattice, o, d, 0, dr.inf))[0]
+
+    def _trace_backprojection(self, weight: mi.Float, o: mi.Point3f, d: mi.Vector3f, rows: Rows) -> mi.Float:
+        lattice = Lattice(mi.TensorXf(dr.zeros(mi.Float, self.grid.size), self._shape), None, from_world=rows)
+        target = Gradient.zeros(lattice)
+        backproject_segment(lattice, target, [weight], clip(lattice, o, d, 0, dr.inf))
+        return target.fold()
+
+    def _lattice_of(self, values: mi.Float) -> Lattice:
+        return Lattice(mi.TensorXf(values, self._shape), VoxelGrid(self.grid.shape, self.grid.voxel_size).to_world)
+
+    # -- Rays that seldom cross one axis --------------------------------------------------------------------------------------
+
+    def pad(self, values: mi.Float) -> mi.Float:
+        """The values with a margin of one node, which :meth:`integrate_columns` reads."""
+        return self._pad(values)
+
+    def integrate_columns(self, padded: mi.Float, o: mi.Point3f, d: mi.Vector3f, along: int) -> mi.Float:
+        """As :meth:`integrate`, for rays that seldom cross the layers of the axis ``along``."""
+        return self._by_columns(f"integrate {along}", self._trace_columns, padded, o, d, along)
+
+    def backproject_columns(self, weight: mi.Float, o: mi.Point3f, d: mi.Vector3f, along: int) -> mi.Float:
+        """As :meth:`backproject`, for rays that seldom cross the layers of the axis ``along``."""
+        return self._by_columns(f"backproject {along}", self._trace_column_sums, weight, o, d, along)
+
+    def _by_columns(self, name: str, trace: Callable, given: mi.Float, o: mi.Point3f, d: mi.Vector3f, along: int) -> mi.Float:
+        self._renew()
+        if name not in self._columns:
+            grid = ColumnGrid(self.grid.shape, along)
+            self._columns[name] = dr.freeze(lambda given, o, d, rows: trace(grid, given, o, d, rows))
+        return self._columns[name](given, o, d, self._from_world)
+
+    def _trace_columns(self, grid: ColumnGrid, padded: mi.Float, o: mi.Point3f, d: mi.Vector3f, rows: Rows) -> mi.Float:
+        return integrate_columns(grid, padded, _line_in(grid, o, d, rows))
+
+    def _trace_column_sums(self, grid: ColumnGrid, weight: mi.Float, o: mi.Point3f, d: mi.Vector3f, rows: Rows) -> mi.Float:
+        target = zero_nodes(grid)
+        backproject_columns(grid, target, weight, _line_in(grid, o, d, rows))
+        return fold_nodes(target, grid)
+
+
+def _line_in(grid: ColumnGrid, o: mi.Point3f, d: mi.Vector3f, rows: Rows) -> Line:
+    """The part of rays inside the box of the grid."""
+    high = tuple(n - 0.5 for n in grid.res[::-1])
+    q, v, t0, t1 = slab(rows, (-0.5,) * 3, high, o, d, mi.Float64(0), mi.Float64(dr.inf))
+    hit = t1 > t0
+    entry = [dr.clip(dr.fma(dr.select(hit, t0, 0), v[a], q[a]), -0.5, high[a]) for a in range(3)]
+    return Line(entry, v, dr.select(hit, t1 - t0, 0))
