@@ -164,8 +164,13 @@ def convert_flags(sub: argparse.ArgumentParser) -> None:
     from mivol.points.gaussian_files import READERS, WRITERS
 
     sub.add_argument("source", type=Path, help=f"what to read: {', '.join({**READERS, **CLOUD_READERS})}")
-    sub.add_argument("output", type=Path, help=f"what to write: {', '.join({**WRITERS, **CLOUD_WRITERS})}")
+    sub.add_argument("output", type=Path, help=f"what to write: {', '.join({**WRITERS, **CLOUD_WRITERS})}, .npz (field)")
     sub.add_argument("--to", choices=KINDS, help="what to write it as; default: what the source holds, if the format can")
+    sub.add_argument("--resolution", type=int, help="of a field: voxels along the longest edge (default: 128)")
+    corners = ("x", "y", "z", "to_x", "to_y", "to_z")
+    held = "of a field [length]; default: three standard deviations of all Gaussians"
+    sub.add_argument("--box", type=float, nargs=6, metavar=corners, help=held)
+    sub.add_argument("-m", "--mode", default="llvm_ad_rgb", help="variant of a field's views (default: %(default)s)")
 
 
 def demo_flags(sub: argparse.ArgumentParser) -> None:
@@ -368,9 +373,23 @@ def export(arguments: argparse.Namespace) -> None:
 
 
 def convert(arguments: argparse.Namespace) -> None:
-    """Write the points or Gaussians of a file in another format, or one as the other."""
+    """Write the points or Gaussians of a file in another format, or one as the other, or as a radiance field.
+
+    A field (.npz) stands in scenes as mivol_sh; what it loses is said in dB, by views of it and of the splatted Gaussians.
+    """
     from mivol.points.facts import convert_file
 
+    is_field = arguments.output.suffix.lower() == ".npz"
+    if is_field and arguments.to is not None:
+        raise MivolError(f"{arguments.output}: a radiance field is written as such; leave out --to {arguments.to}.")
+    if is_field:
+        from mivol.experiments.gaussian_conversion import convert_to_field
+
+        where = 128 if arguments.resolution is None else arguments.resolution, arguments.box, arguments.mode
+        print(convert_to_field(arguments.source, arguments.output, *where))
+        return
+    if arguments.resolution is not None or arguments.box is not None:
+        raise MivolError(f"{arguments.output}: --resolution and --box are for a radiance field (.npz): leave them out.")
     print(convert_file(arguments.source, arguments.output, arguments.to))
 
 

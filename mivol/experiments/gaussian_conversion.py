@@ -1,0 +1,98 @@
+"""Gaussians or points as a radiance field that stands in scenes, and what that loses [dB]: views of both are compared."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from mivol.experiments.back_end import set_variant
+from mivol.fields.gaussian_grid import MOST_OPAQUE, box_of_gaussians, grid_of_gaussians, masses_of_gaussians
+from mivol.fields.spherical import SphericalGrid
+from mivol.fields.spherical_files import load_field, save_field
+from mivol.files.source import existing_file
+from mivol.optim.field_view import render_view
+from mivol.photos import Camera, facing, intrinsics
+from mivol.points.cloud import read_points
+from mivol.points.conversions import gaussians_of_points
+from mivol.points.gaussian_files import holds_gaussians, read_gaussians
+from mivol.points.gaussians import Gaussians
+from mivol.splatting.splatter import Splatter, tensors_of
+from mivol.validate.metrics import psnr
+
+__all__ = ["convert_to_field", "loss_of_field"]
+
+VIEWS = 6
+"""Views that are compared."""
+
+EDGE = 128
+"""Of a view that is compared [pixel]."""
+
+ANGLE = 40.0
+"""Field of view of these views [degree]."""
+
+
+def convert_to_field(source: Path, target: Path, resolution: int, box: Sequence[float] | None, variant: str) -> str:
+    """Write the Gaussians of a file, or points as Gaussians, as a radiance field.
+
+    Args:
+        source: any format of Gaussians or points.
+        target: ends in .npz.
+        resolution: voxels along the longest edge of the box.
+        box: two corners, six numbers [length]; None: what holds three standard deviations of all Gaussians.
+        variant: of Mitsuba, in which views are compared.
+
+    Returns:
+        What was written and what it lost, in lines.
+
+    Raises:
+        MivolError: as the readers, :func:`mivol.fields.gaussian_grid.grid_of_gaussians` and the disk.
+    """
+    existing_file(source)
+    set_variant(variant)
+    cloud = read_gaussians(source) if holds_gaussians(source) else gaussians_of_points(read_points(source))
+    low, high = box_of_gaussians(cloud) if box is None else (np.array(box[:3]), np.array(box[3:]))
+    save_field(target, grid_of_gaussians(cloud, low, high, resolution))
+    field = load_field(target)  # as it will be read: half floats
+    mass = float(field.values()[0].sum(dtype=np.float64) * np.linalg.det(field.to_world[:3, :3]) / math.prod(field.res))
+    lines = [
+        f"{target}: {' x '.join(map(str, field.res[::-1]))} nodes, {field.rows - 1} of them stored, degree {field.degree}",
+        f"{100 * mass / masses_of_gaussians(cloud).sum():.4g} % of the extinction lies in the box",
+        f"{loss_of_field(cloud, field):.1f} dB: views of the field against splatted Gaussians, over black, peak 1",
+    ]
+    capped = int((cloud.opacities() > MOST_OPAQUE).sum())
+    if capped:
+        lines.append(f"{capped} Gaussians of an opacity above {MOST_OPAQUE} were made as opaque as that")
+    return "\n".join(lines)
+
+
+def loss_of_field(cloud: Gaussians, field: SphericalGrid, edge: int = EDGE) -> float:
+    """PSNR of views of a field against splatted Gaussians [dB]: code values over black, the peak is 1.
+
+    Args:
+        cloud: what the field was made of.
+        field: of one level, in code values.
+        edge: of a view [pixel].
+    """
+    splatter, reals = Splatter(edge, edge, cloud.degree), tensors_of(cloud)
+    truth, seen = [], []
+    for camera in cameras_around(field.to_world, edge):
+        truth.append(np.array(splatter.forward(reals, camera, derivatives=False)[0])[..., :3])
+        seen.append(render_view(field, camera, np.zeros(3)).image)
+    return psnr(np.stack(seen), np.stack(truth), 1.0)
+
+
+def cameras_around(to_world: np.ndarray, edge: int) -> list[Camera]:
+    """Square views of the whole of a box from directions that are spread evenly over the sphere (a Fibonacci lattice)."""
+    middle = to_world[:3] @ np.array([0.5, 0.5, 0.5, 1])
+    radius = 0.5 * float(np.linalg.norm(to_world[:3, :3].sum(axis=1)))
+    distance = radius / math.sin(math.radians(ANGLE) / 2)
+    focal = edge / (2 * math.tan(math.radians(ANGLE) / 2))
+    like = Camera(intrinsics(focal, focal, edge / 2, edge / 2), (edge, edge), np.eye(4))
+    height = 1 - (2 * np.arange(VIEWS) + 1) / VIEWS
+    turn = math.pi * (3 - math.sqrt(5)) * np.arange(VIEWS)
+    flat = np.sqrt(1 - height**2)
+    towards = np.stack([flat * np.cos(turn), flat * np.sin(turn), height], axis=1)
+    return [facing(like, middle + distance * one, middle, np.array([0.0, 0, 1])) for one in towards]

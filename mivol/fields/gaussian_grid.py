@@ -1,0 +1,157 @@
+r"""Gaussians that are splatted become a grid of density and harmonics, which stands in a scene as a medium (``mivol_sh``).
+
+Splatting knows an opacity o in the image, a medium an extinction. A Gaussian of extinction with the covariance S and the mass
+m (the integral of the extinction over space [length^2]) has along the line through its centre in the direction d the optical
+depth
+
+.. math:: \tau(d) = \frac{m}{2\pi A(d)}, \qquad A(d) = \sqrt{\det S \; d^T S^{-1} d},
+
+where 2 pi A is the area of its projection. Splatting gives -log(1 - o) in all directions, which no m can give unless S is
+round. The mass chosen here makes it the mean over directions, each weighed by the area that is seen from there:
+
+.. math:: m = -\log(1 - o)\, 2\pi \langle A \rangle, \quad \langle A \rangle = R_G(s_1^2 s_2^2,\, s_1^2 s_3^2,\, s_2^2 s_3^2)
+
+with Carlson's R_G, since the mean projection of an ellipsoid is a quarter of its surface (Cauchy). Without the weight the
+mean would be finite for no flat Gaussian, whose edge is of infinite depth; with it, a flat one is twice as deep seen on its
+face as it was.
+
+Sizes below a voxel. Each covariance is widened by (half a voxel)^2, at the same mass: nothing is lost between nodes, what is
+thinner than a voxel becomes wider and fainter. A Gaussian that lies in the box by ``REACH`` standard deviations is normalised
+over the nodes, so its mass is kept to rounding. Colours are the means of the harmonics, weighed by density; those of
+overlapping Gaussians mix, where splatting shows the nearer one.
+
+Sources: Carlson, Numerical Algorithms 10, 1995 (R_G); Zwicker et al. 2001 (the low-pass filter).
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from scipy.sparse import csr_matrix
+from scipy.special import elliprg
+
+from mivol.errors import MivolError
+from mivol.fields.spherical import SphericalGrid
+from mivol.machine import available_memory
+from mivol.points.gaussians import Gaussians
+
+__all__ = ["MOST_OPAQUE", "box_of_gaussians", "grid_of_gaussians", "masses_of_gaussians"]
+
+MOST_OPAQUE = 0.999
+"""Opacities above it become this one, an optical depth of 6.9: an opacity of 1 would be an infinite extinction."""
+
+REACH = 4.0
+"""Standard deviations along each axis of the grid up to which a Gaussian is written: 2e-4 of it lies beyond."""
+
+PAIRS = 1 << 21
+"""Of a node and a Gaussian that are looked at together, and one Gaussian more, which has no more than there are nodes."""
+
+PAIR_BYTES = 160
+"""That a pair takes while it is weighed: places, weights and their products."""
+
+
+def masses_of_gaussians(gaussians: Gaussians) -> np.ndarray:
+    """(N,) integrals of the extinction over space [length^2], float64; opacities above :data:`MOST_OPAQUE` count as that."""
+    opacity = np.minimum(gaussians.opacities().astype(np.float64), MOST_OPAQUE)
+    a, b, c = (gaussians.scales().astype(np.float64) ** 2).T
+    return -np.log1p(-opacity) * 2 * math.pi * elliprg(a * b, a * c, b * c)
+
+
+def box_of_gaussians(gaussians: Gaussians) -> tuple[np.ndarray, np.ndarray]:
+    """Corners (3,) of the box that holds three standard deviations of all Gaussians [length], float64.
+
+    Raises:
+        MivolError: no Gaussians.
+    """
+    if not gaussians.count:
+        raise MivolError("no Gaussians were given; at least one is expected: there is nothing to put a box around.")
+    spread = 3 * np.sqrt(np.diagonal(gaussians.covariances().astype(np.float64), axis1=1, axis2=2))
+    return (gaussians.means - spread).min(axis=0), (gaussians.means + spread).max(axis=0)
+
+
+def grid_of_gaussians(gaussians: Gaussians, low: np.ndarray, high: np.ndarray, resolution: int) -> SphericalGrid:
+    """Write Gaussians on the nodes of a grid; what reaches out of the box is cut off.
+
+    Args:
+        gaussians: of any degree; their colours are code values, and stay so (``space`` is ``srgb``).
+        low, high: (3,) corners of the box [length].
+        resolution: voxels along its longest edge; they are as near to cubes as whole numbers allow.
+
+    Returns:
+        A sparse field without an activation: extinctions [1/length].
+
+    Raises:
+        MivolError: a box without volume, a resolution below 2, nothing in the box, or more memory than is free, with the
+            resolution that fits.
+    """
+    low, high = np.asarray(low, np.float64), np.asarray(high, np.float64)
+    if not (np.isfinite([low, high]).all() and (high > low).all()) or resolution < 2:
+        found = f"a box from {low.tolist()} to {high.tolist()} of {resolution} voxels"
+        raise MivolError(f"{found} was given; a corner above the other, and at least 2 voxels, are expected.")
+    size = np.maximum(np.rint((high - low) / (high - low).max() * resolution), 2).astype(np.int64)  # x, y, z
+    _check_memory(size, gaussians.harmonics.shape[1], resolution)
+    mass, harmonics = _summed(gaussians, (gaussians.means - low) / (high - low) * size - 0.5, size, (high - low) / size)
+    held = mass > 0
+    if not held.any():
+        raise MivolError("none of the Gaussians reaches into the box; give a box that holds them.")
+    harmonics[held] /= mass[held, None]
+    to_world = np.diag([*(high - low), 1.0])
+    to_world[:3, 3] = low
+    shape = tuple(int(n) for n in size[::-1])
+    density = (mass / np.prod((high - low) / size)).reshape(shape)
+    return SphericalGrid.from_dense(
+        density, harmonics.reshape(*shape, -1, 3), to_world, held.reshape(shape), activation="none", space="srgb"
+    )
+
+
+def _summed(gaussians: Gaussians, centres: np.ndarray, size: np.ndarray, voxel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Masses (nodes,) and harmonics times mass (nodes, 3 K) of all Gaussians, whose centres are in lattice coordinates."""
+    covariances = gaussians.covariances().astype(np.float64) / np.outer(voxel, voxel) + 0.25 * np.eye(3)
+    reach = REACH * np.sqrt(np.diagonal(covariances, axis1=1, axis2=2))
+    first, last = np.ceil(centres - reach).astype(np.int64), np.floor(centres + reach).astype(np.int64)
+    seen = np.flatnonzero(((last >= 0) & (first < size)).all(axis=1) & (gaussians.opacities() > 0))
+    is_whole = ((first >= 0) & (last < size)).all(axis=1)
+    first, last = np.maximum(first, 0), np.minimum(last, size - 1)
+    # What reaches out of the box is normalised by its integral: beyond the box may lie more nodes than there is memory for.
+    integral = (2 * math.pi) ** 1.5 * np.sqrt(np.linalg.det(covariances))
+    sizes = last - first + 1
+    harmonics = gaussians.harmonics.reshape(gaussians.count, -1)
+    rows = np.concatenate([np.ones((gaussians.count, 1)), harmonics], axis=1) * masses_of_gaussians(gaussians)[:, None]
+    sums = np.zeros((int(np.prod(size)), rows.shape[1]))
+    for part in np.split(seen, _cuts(sizes[seen].prod(axis=1))):
+        owner = np.repeat(np.arange(len(part)), sizes[part].prod(axis=1))
+        node = first[part][owner] + _places(sizes[part])
+        away = node - centres[part][owner]
+        weight = np.exp(-0.5 * np.einsum("ni,nij,nj->n", away, np.linalg.inv(covariances[part])[owner], away))
+        weight /= np.where(is_whole[part], np.bincount(owner, weight, len(part)), integral[part])[owner]
+        touched, place = np.unique(node @ np.array([1, size[0], size[0] * size[1]]), return_inverse=True)
+        weights = csr_matrix((weight, (place, owner)), shape=(len(touched), len(part)))
+        sums[touched] += weights @ rows[part]
+    return sums[:, 0], sums[:, 1:]
+
+
+def _places(sizes: np.ndarray) -> np.ndarray:
+    """All places (x, y, z) of boxes of these sizes, one box after the other, each from (0, 0, 0)."""
+    counts = sizes.prod(axis=1)
+    number = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
+    x, y = (np.repeat(sizes[:, axis], counts) for axis in (0, 1))
+    return np.stack([number % x, number // x % y, number // (x * y)], axis=1)
+
+
+def _cuts(pairs: np.ndarray) -> np.ndarray:
+    """Where a list of Gaussians is cut so that no part has much more than ``PAIRS``."""
+    return np.flatnonzero(np.diff(np.cumsum(pairs) // PAIRS)) + 1
+
+
+def _check_memory(size: np.ndarray, basis: int, resolution: int) -> None:
+    """Refuse a grid that does not fit: sums, as much again for the field made of them, and one wide Gaussian's pairs."""
+    pairs = PAIR_BYTES * PAIRS
+    needed = (16 * (1 + 3 * basis) + PAIR_BYTES) * int(np.prod(size)) + pairs
+    free = available_memory()
+    if free is not None and needed > free:
+        fitting = int(resolution * max((free - pairs) / (needed - pairs), 0) ** (1 / 3))
+        raise MivolError(
+            f"A grid of {size[0]} x {size[1]} x {size[2]} nodes and {basis} harmonics takes {needed / 2**30:.1f} GiB, and "
+            f"{free / 2**30:.1f} GiB are free; a resolution of at most {fitting} fits."
+        )
