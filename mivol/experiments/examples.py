@@ -18,7 +18,7 @@ from mivol.experiments.runs import run_experiment
 from mivol.experiments.task import Nobody, Task, Watcher
 from mivol.fields.procedural import make_procedural
 from mivol.files import write_volume
-from mivol.files.fetch import find_data
+from mivol.files.fetch import PREFIX, find_data, place_of
 from mivol.optim.strategy import nearest
 
 __all__ = ["EXAMPLES", "Example", "copy_example", "examples_folder", "list_examples", "run_example"]
@@ -47,9 +47,24 @@ class StandIn:
 
     def make(self, folder: Path) -> list[str]:
         """Write the volume to a folder; the settings that name it."""
+        return [f"{self.setting}={quoted(self.write(folder))}"]
+
+    def write(self, folder: Path) -> Path:
+        """Write the volume to a folder; the path of its file."""
         path = folder.resolve() / f"{self.data}.vol"
         write_volume(path, make_procedural("tangle", self.shape, 2, self.peak))
-        return [f"{self.setting}={quoted(path)}"]
+        return path
+
+    def place(self, named: str, folder: Path) -> Path:
+        """What a script was given: a path, or ``data:NAME``, for which the stand-in is made where the set is not here.
+
+        Raises:
+            MivolError: another set was named, and it has not been fetched.
+        """
+        if named != PREFIX + self.data or find_data(self.data) is not None:
+            return place_of(Path(), named).resolve()
+        print(f'the public data set "{self.data}" is not here: {self.says} (mivol fetch {self.data} brings it)')
+        return self.write(folder)
 
 
 @dataclass(frozen=True)

@@ -13,8 +13,8 @@ import argparse
 from pathlib import Path
 
 import mivol  # noqa: F401  (chooses the LLVM library; call it before the first variant)
+from mivol.experiments.examples import EXAMPLES
 from mivol.files import read_volume, write_volume
-from mivol.files.fetch import place_of
 from mivol.report import figures, show
 from mivol.validate.metrics import psnr
 from mivol.validate.reference import render_reference
@@ -48,7 +48,7 @@ def main() -> None:
     given.output.mkdir(parents=True, exist_ok=True)
     truth = render_reference(
         XML, given.output / "references", max_depth=2, max_spp=given.reference_spp, progress=False,
-        overrides={"volume": place_of(Path(), given.truth).resolve(), "size": given.size},
+        overrides={"volume": EXAMPLES["white_smoke"].stand_in.place(given.truth, given.output), "size": given.size},
     )  # fmt: skip
     found = read_volume(given.volume, frame="unit").values
     write_volume(given.output / "flat.vol", flat(found))

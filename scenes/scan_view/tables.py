@@ -14,14 +14,16 @@ import math
 from pathlib import Path
 
 import mivol  # noqa: F401  (chooses the LLVM library; call it before the first variant)
+from mivol.experiments.examples import StandIn
 from mivol.files import write_png
-from mivol.files.fetch import place_of
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 HERE = Path(__file__).parent
+STAND_IN = StandIn("tooth", "scan", (161, 94, 103), 240.0)
+"""Of the size of the scan, which the camera of the scene looks at, up to the last value of the scene's tables."""
 KEYS = {"opacity": "tooth.interior_medium.sigma_t.table", "colour": "tooth.interior_medium.emission.table"}
 MOST = {"opacity": 0.01, "colour": 0.3}
 """The start's entry at the upper end of the scan's values."""
@@ -73,7 +75,7 @@ def main() -> None:
     mi.set_variant("llvm_ad_rgb")
     given.output.mkdir(parents=True, exist_ok=True)
 
-    scan = str(place_of(Path(), given.scan).resolve())
+    scan = str(STAND_IN.place(given.scan, given.output))
     scene = mi.load_file(str(HERE / "scene.xml"), scan=scan, size=given.size, spp=given.spp)
     truth = {name: np.array(mi.traverse(scene)[key]) for name, key in KEYS.items()}
     before = np.array(mi.render(scene))

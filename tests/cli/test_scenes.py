@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import runpy
 import shutil
 import subprocess
 import sys
@@ -14,6 +15,7 @@ import numpy as np
 import pytest
 
 from mivol.cli import main
+from mivol.fields.procedural import make_procedural
 from mivol.files import read_volume, write_volume
 
 SCENES = Path(__file__).resolve().parents[2] / "scenes"
@@ -167,6 +169,39 @@ def test_fire(tmp_path, data_dir):
     median, most = map(float, re.search(r"luminance ([\d.]+) cd/m2 in the median, ([\d.]+) cd/m2 at most", said).groups())
     assert 10 < median < 80 and 200 < most < 835
     assert (tmp_path / "fire.png").stat().st_size > 1000
+
+
+def test_an_exposure_is_chosen_by_the_brightest_hundredth() -> None:
+    """Radiances of any scale are shown alike: of a hundred and one pixels the second brightest at nine tenths of white."""
+    render = runpy.run_path(str(SCENES / "fire" / "render.py"))
+    image = np.stack([np.linspace(0, 1, 101), np.linspace(0, 0.5, 101), np.zeros(101)], axis=-1)[None]
+    for scale in (1e-3, 40):
+        exposure = render["find_exposure"](scale * image)
+        assert 1 - np.exp(-exposure * scale * 0.99) == pytest.approx(0.9, rel=1e-9)
+
+
+def test_a_made_up_fire_is_hot_in_its_soot() -> None:
+    """The same numbers each time, no hotter than the simulation's 1318 K, extinction wherever light is made."""
+    plume = runpy.run_path(str(SCENES / "fire" / "render.py"))["plume"]
+    (temperature, soot), again = plume(), plume()
+    assert np.array_equal(temperature, again[0]) and np.array_equal(soot, again[1])
+    assert temperature.shape == soot.shape == (21, 41, 81)
+    assert 1000 < temperature.max() <= 1318 and soot[temperature > 800].min() > 1
+
+
+@pytest.mark.slow
+def test_what_stands_in_for_the_data_of_scripts(tmp_path: Path) -> None:
+    """Where nothing was fetched, each script runs to its picture and says in one sentence what it shows."""
+    runs = {
+        "fire": ("--size", 16, "--spp", 4),
+        "scan_view": ("--size", 48, "--spp", 1, "--iterations", 1),
+        "relit_smoke": ("--volume", tmp_path / "found.vol", "--size", 8, "--spp", 4, "--reference-spp", 32),
+    }
+    write_volume(tmp_path / "found.vol", make_procedural("tangle", (53, 45, 44), 2, 1.8))
+    for name, small in runs.items():
+        said = script(name, *small, "-o", tmp_path / name, **NOWHERE)
+        assert len(re.findall("^.*not here: .*stands in for.*$", said, re.MULTILINE)) == 1
+        assert sum(path.stat().st_size > 200 for path in (tmp_path / name).glob("*.png")) > 0
 
 
 @pytest.mark.slow
