@@ -21,6 +21,10 @@ from mivol.report.record import LINES, Image, Volume
 
 __all__ = ["Bar", "Cut", "Gallery", "Picture", "ShownView", "film_of", "plain_picture", "views_of", "volumes_of"]
 
+LAYERS = 16
+LAYER_EDGE = 128
+"""Slices of a volume that a page can be scrolled through, and pixels of an edge: a page stays below a few MB."""
+
 Z_LIMIT = 4.0
 Z_ODD = 3.0
 FILMS = {".mp4": "video/mp4", ".webp": "image/webp", ".gif": "image/gif"}
@@ -68,12 +72,14 @@ class Gallery(NamedTuple):
 
 
 class Cut(NamedTuple):
-    """Slices of one quantity's volumes, one row a plane, and the voxels of the reconstruction along x, y, z."""
+    """Slices of one quantity's volumes, one row a plane, and the voxels of the reconstruction along x, y, z; and slices xy from
+    the lowest to the highest, to be scrolled through, one row a layer (none of a volume of one layer)."""
 
     title: str
     shape: tuple[int, ...]
     rows: list[dict[str, Any]]
     bars: list[Bar]
+    layers: list[dict[str, Any]]
 
 
 def views_of(folder: Path, images: Sequence[Image]) -> Gallery:
@@ -263,7 +269,28 @@ def _cut(folder: Path, by_role: dict[str, Volume]) -> Cut:
     bars = [_bar(values, f"{described.quantity} [{described.unit}]" if described.unit else described.quantity)]
     if "difference" in scales:
         bars.append(_bar(scales["difference"], "Reconstruction − truth"))
-    return Cut(described.caption or described.quantity, data["reconstruction"].values.shape[2::-1], rows, bars)
+    found = data["reconstruction"].values
+    volumes = {role: each.values for role, each in data.items()}
+    if "difference" in cuts:
+        volumes["difference"] = found - volumes["truth"]
+    layers = [_layer(share, volumes, scales, first.aspect["xy"]) for share in _heights(found.shape[0])]
+    return Cut(described.caption or described.quantity, found.shape[2::-1], rows, bars, layers)
+
+
+def _heights(count: int) -> list[float]:
+    """Where the layers of a volume are that can be scrolled through: at most LAYERS, as shares of its height."""
+    return [] if count < 2 else ((np.arange(min(count, LAYERS)) + 0.5) / min(count, LAYERS)).tolist()
+
+
+def _layer(share: float, volumes: dict[str, NDArray], scales: dict[str, show.Scale], aspect: float) -> dict[str, Any]:
+    """The slice xy at a share of the height of each volume, the second axis upwards, at most LAYER_EDGE pixels an edge."""
+    count = volumes["reconstruction"].shape[0]
+    pictures = []
+    for role, values in volumes.items():
+        step = max(1, -(-max(values.shape[1:3]) // LAYER_EDGE))
+        image = values[int(share * values.shape[0]), ::-step, ::step]
+        pictures.append(_picture(role.capitalize(), image, scales[role], aspect))
+    return {"where": f"z = {int(share * count) + 1} of {count}", "pictures": pictures}
 
 
 def _planes(cut: show.Slices, scale: show.Scale) -> dict[str, Any]:

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import base64
+import io
 from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.image import imread
 
-from mivol.report.gallery import Picture, film_of, plain_picture
-from mivol.report.record import Image
+from mivol.files import write_volume
+from mivol.report import show
+from mivol.report.gallery import LAYER_EDGE, LAYERS, Picture, film_of, plain_picture, volumes_of
+from mivol.report.record import Image, Volume
 
 
 @pytest.fixture
@@ -39,3 +44,34 @@ def test_a_film_is_called_by_its_caption_else_its_view(folder: Path, name: str, 
 @pytest.mark.parametrize(("width", "height", "coarse"), [(320, 1, True), (1, 320, True), (321, 1, False), (1, 321, False)])
 def test_pictures_of_320_pixels_and_less_are_coarse(width: int, height: int, coarse: bool) -> None:
     assert Picture("a", "", width, height, width / height).is_coarse == coarse
+
+
+def pixels(picture: Picture) -> np.ndarray:
+    return imread(io.BytesIO(base64.b64decode(picture.uri.partition(",")[2])))[..., :3]
+
+
+def test_a_volume_is_shown_layer_by_layer(tmp_path: Path) -> None:
+    """From the lowest on, the second axis upwards; the truth and the difference beside it, each on the scale of the slices."""
+    truth, found = np.random.default_rng(0).random((2, 3, 4, 5, 1), np.float32)
+    write_volume(tmp_path / "t.npz", truth)
+    write_volume(tmp_path / "r.npz", found)
+    (cut,) = volumes_of(tmp_path, [Volume(path="t.npz", role="truth"), Volume(path="r.npz", role="reconstruction")])
+    assert [layer["where"] for layer in cut.layers] == [f"z = {k} of 3" for k in (1, 2, 3)]
+    scale = show.scale_of(*show.slices(truth).images.values())
+    signed = show.signed_scale(*show.slices(found - truth).images.values())
+    for k, layer in enumerate(cut.layers):
+        assert [p.name for p in layer["pictures"]] == ["Truth", "Reconstruction", "Difference"]
+        wanted = [(truth, scale), (found, scale), (found - truth, signed)]
+        for picture, (values, on) in zip(layer["pictures"], wanted, strict=True):
+            assert np.array_equal(np.round(pixels(picture) * 255), show.pixels(values[k, ::-1], on))
+
+
+def test_large_volumes_show_some_of_their_layers_with_fewer_pixels(tmp_path: Path) -> None:
+    """Each in the middle of its share of the height; a flat volume has no layers to go through."""
+    for name, shape in (("tall", (40, 3, LAYER_EDGE + 1)), ("flat", (1, 3, 3))):
+        write_volume(tmp_path / f"{name}.npz", np.ones(shape, np.float32))
+    tall, flat = (volumes_of(tmp_path, [Volume(path=f"{n}.npz", role="reconstruction")])[0] for n in ("tall", "flat"))
+    assert len(tall.layers) == LAYERS and flat.layers == []
+    assert [layer["where"] for layer in tall.layers[:2]] == ["z = 2 of 40", "z = 4 of 40"]
+    assert tall.layers[-1]["where"] == "z = 39 of 40"
+    assert pixels(tall.layers[0]["pictures"][0]).shape == (2, LAYER_EDGE // 2 + 1, 3)
