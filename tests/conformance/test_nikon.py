@@ -39,6 +39,7 @@ axis_offset = -0.1
 source = "stack"
 file = "turned.npy"
 reading = "transmission"
+find_axis = false
 [grid]
 shape = [7, 8, 9]
 voxel_size = [0.21, 0.22, 0.23]
