@@ -230,7 +230,9 @@ class Known(Simulated, kw_only=True, tag_field="source", tag="volume"):
 class Readings(Section):
     """What measured projections share."""
 
-    find_axis: Annotated[bool, of("1", "find the axis of a parallel or cone beam; false: axis_offset holds")] = True
+    find_axis: Annotated[
+        bool | None, of("1", "find the axis of a parallel or cone beam; absent: where scan.axis_offset is 0; false: it holds")
+    ] = None
     air: Annotated[int, of("pixel", "columns at either edge that see no object; 0: light does not drift", ge=0)] = 0
     drift: Annotated[
         int, of("iteration", "how often the drift of the light since the flats is fitted to each pixel; 0: never", ge=0)

@@ -4,7 +4,9 @@
     scripts/bench_tomography.py --size 256              the size of TIGRE's own tests
     scripts/bench_tomography.py --volume tooth.nrrd     a measured volume as truth besides
     scripts/bench_tomography.py --beside                slices beside astra-toolbox and scikit-image (tomography_peers)
+    scripts/bench_tomography.py --beside tooth          a measured slice beside them (tomography_tooth)
     scripts/bench_tomography.py --only volume256        128 cone views through 256^3, time and memory (tomography_volume)
+    scripts/bench_tomography.py --only parts            what each part of the default solver is worth (tomography_parts)
 
 The geometry is TIGRE's test "configuration 1" (cone beam, 100 views on a full circle). The object is the Shepp-Logan head,
 its projections are sums of ellipsoid chords (float64, no grid), so no operator sees data that it made itself. A measured
@@ -22,7 +24,7 @@ import os
 import platform
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -33,8 +35,10 @@ import numpy as np
 import mivol
 from mivol.bench.bars import say
 from mivol.bench.figures import drawn
-from mivol.bench.timing import Stopwatch
-from mivol.bench.tomography_peers import compare, ratios, rows
+from mivol.bench.timing import Stopwatch, fastest
+from mivol.bench.tomography_parts import measure_parts, rows_of_parts
+from mivol.bench.tomography_peers import compare, ratios, rows, slices_of_the_head
+from mivol.bench.tomography_tooth import slice_of_the_tooth
 from mivol.bench.tomography_volume import measure_volume
 from mivol.errors import MivolError
 from mivol.files import read_volume, write_whole_text
@@ -129,7 +133,7 @@ def costs(scan: Scan) -> dict:
     """Seconds of warm A and A^T, how well the pair matches, and how far A of the true voxels is from the true projections."""
     a, rng = scan.a, np.random.default_rng(0)
     x, y = (rng.normal(size=n).astype(np.float32) for n in a.shape[::-1])
-    forward, back = (fastest(lambda operand=operand, v=v: operand @ v) for operand, v in ((a, x), (a.T, y)))
+    forward, back = (fastest(lambda operand=operand, v=v: operand @ v, time.perf_counter) for operand, v in ((a, x), (a.T, y)))
     return {
         "seconds_A": forward,
         "seconds_AT": back,
@@ -138,16 +142,6 @@ def costs(scan: Scan) -> dict:
         "adjoint_mismatch": adjoint_mismatch(a, x, y),
         "voxels_own_error": float(np.linalg.norm((a @ scan.truth) - scan.y) / np.linalg.norm(scan.y)),
     }
-
-
-def fastest(call: Callable[[], object], times: int = 3) -> float:
-    """Seconds of the fastest of a few calls, the first of which may compile."""
-    seconds = []
-    for _ in range(times):
-        start = time.perf_counter()
-        call()
-        seconds.append(time.perf_counter() - start)
-    return min(seconds)
 
 
 def adjoint_mismatch(a: Projector, x: np.ndarray, y: np.ndarray) -> float:
@@ -197,8 +191,10 @@ def parse(argv: Sequence[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--iterations", type=int, default=20)
     parser.add_argument("--phantom", choices=list(SHEPP_LOGAN), default="yu-ye-wang")
     parser.add_argument("--volume", type=Path, help="a volume file to use as truth besides")
-    parser.add_argument("--beside", action="store_true", help="slices beside other programs, and nothing else")
-    parser.add_argument("--only", choices=["volume256"], help="products with 256^3 voxels, and nothing else")
+    parser.add_argument(
+        "--beside", nargs="?", const="head", choices=["head", "tooth"], help="slices beside other programs, and nothing else"
+    )
+    parser.add_argument("--only", choices=["volume256", "parts"], help="one question, and nothing else")
     parser.add_argument("--variant", default="llvm_ad_rgb")
     parser.add_argument("--out", type=Path, default=Path("runs/bench_tomography"))
     return parser.parse_args(argv)
@@ -237,8 +233,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         mi.set_variant(args.variant)
         args.out.mkdir(parents=True, exist_ok=True)
         if args.beside:
-            found = compare()
+            found = compare(slices_of_the_head() if args.beside == "head" else {"tooth": slice_of_the_tooth()})
             print("\n".join([*rows(found), "", *ratios(found)]))
+            return 0
+        if args.only == "parts":
+            print("\n".join(rows_of_parts(measure_parts())))
             return 0
         if args.only:
             print(json.dumps(measure_volume(), indent=2))

@@ -17,6 +17,7 @@ import importlib.util
 import time
 import warnings
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -60,13 +61,14 @@ PAIRS = (
 """Who is compared with whom at equal error."""
 
 
-class Slice(NamedTuple):
+@dataclass(frozen=True)
+class Slice:
     """One slice and its projections.
 
     Attributes:
         beam, grid: lengths in voxels.
         y, weights: (views, 1, columns); weights are inverse variances where there is noise, else 1.
-        truth: (1, n, n), averages over voxels.
+        truth: (1, n, n), averages over voxels; None where it is not known.
         photons: quanta a pixel without an object; 0: no noise.
     """
 
@@ -74,7 +76,7 @@ class Slice(NamedTuple):
     grid: VoxelGrid
     y: np.ndarray
     weights: np.ndarray
-    truth: np.ndarray
+    truth: np.ndarray | None
     photons: float = 0.0
 
     def error(self, x: np.ndarray) -> float:
@@ -139,9 +141,9 @@ def ours(scan: Slice) -> dict[str, Curve]:
     return {f"mivol {name}": curve for name, curve in found.items()}
 
 
-def default(scan: Slice) -> Iterator[np.ndarray]:
-    """What a file leaves open: ``solve.name = "auto"``."""
-    wanted, _ = settle_solver(config.Solve(), Projector(scan.beam, scan.grid))
+def default(scan: Slice, solve: config.Solve | None = None) -> Iterator[np.ndarray]:
+    """What a file leaves open: ``solve.name = "auto"``, by other settings than none where they are given."""
+    wanted, _ = settle_solver(solve or config.Solve(), Projector(scan.beam, scan.grid))
     walk = Projector(scan.beam, subdivide(scan.grid, wanted.supersampling, scan.beam))
     data, all_views = Projections(scan.beam, scan.y, scan.weights, is_noise_known=scan.photons > 0), np.arange(len(scan.y))
     start, prior = start_volume(wanted, walk, data, all_views), make_prior(wanted, walk, data, all_views)
@@ -215,16 +217,17 @@ PEERS: dict[str, tuple[str, Callable[[Slice], dict[str, Curve]]]] = {
 """Package, its module, and what runs it."""
 
 
-def compare(n: int = 129) -> dict[str, dict[str, Curve]]:
+def compare(scans: dict[str, Slice]) -> dict[str, dict[str, Curve]]:
     """Curves by kind of data and method, times as medians; who is missing is said."""
     runs = [package for package, (module, _) in PEERS.items() if importlib.util.find_spec(module) is not None]
     for package in PEERS.keys() - set(runs):
         say(f"{package} is not installed: left out")
-    found: dict[str, dict[str, Curve]] = {}
-    for kind, (views, photons) in KINDS.items():
-        scan = make_slice(n, views, photons)
-        found[kind] = median([everyone(scan, runs) for _ in range(REPEATS)])
-    return found
+    return {kind: median([everyone(scan, runs) for _ in range(REPEATS)]) for kind, scan in scans.items()}
+
+
+def slices_of_the_head(n: int = 129) -> dict[str, Slice]:
+    """By kind of data."""
+    return {kind: make_slice(n, views, photons) for kind, (views, photons) in KINDS.items()}
 
 
 def everyone(scan: Slice, packages: list[str]) -> dict[str, Curve]:

@@ -19,6 +19,7 @@ from collections.abc import Callable
 import numpy as np
 
 from mivol.bench.bars import say
+from mivol.bench.timing import fastest
 from mivol.tomography.geometry import ConeBeam, Geometry, ParallelBeam, VoxelGrid
 from mivol.tomography.projector import Projector
 
@@ -28,15 +29,10 @@ EVERY = 16
 """Which layers astra-toolbox projects."""
 
 
-def least_seconds(call: Callable[[], object], times: int = 3) -> float:
-    """Processor seconds of the quickest call after a first one, which may compile."""
+def least_seconds(call: Callable[[], object]) -> float:
+    """Processor seconds of the quickest of three calls after a first one, which may compile."""
     call()
-    seconds = []
-    for _ in range(times):
-        start = time.process_time()
-        call()
-        seconds.append(time.process_time() - start)
-    return min(seconds)
+    return fastest(call, time.process_time)
 
 
 def measure_volume(n: int = 256, views: int = 128) -> dict[str, dict[str, float]]:

@@ -18,7 +18,7 @@ from mivol.experiments.film import plan_film
 from mivol.experiments.gaussian_start import begin, make_gaussian_plan
 from mivol.experiments.photo_data import boxed, read_photos
 from mivol.experiments.photo_plan import choices, make_plan, shrunk
-from mivol.experiments.projections import beam_of, held_out_views, make_data, make_grid
+from mivol.experiments.projections import beam_of, fitted_views, held_out_views, make_data, make_grid
 from mivol.experiments.references import camera_of, find_sensors, load_experiment_scene, read_references
 from mivol.experiments.scan_fit import make_problem as make_scan_problem
 from mivol.experiments.scan_fit import settle
@@ -109,15 +109,15 @@ def explain_scan_fit(chosen: Scan, base: Path, say: Say) -> Explanation:
     say(f"  scan      {views} views of {rows} x {columns} pixels, {beam_of(chosen)}")
     for note in data.notes:
         say(f"  data      {note}")
-    held_out = held_out_views(chosen, views)
-    say(f"  held out  {len(held_out)} views")
-    chosen, lines = settle(chosen, data, grid, held_out)
+    kept = fitted_views(held_out_views(chosen, views), views)
+    say(f"  held out  {views - len(kept)} views")
+    chosen, lines = settle(chosen, data, grid, kept)
     projector = Projector(data.geometry, subdivide(grid, chosen.solve.supersampling, data.geometry))
     if chosen.solve.start == "filtered":
         check_directions(projector)
     # Back-projection alone takes longer than all else here.
     empty = msgspec.structs.replace(chosen.solve, start="empty")
-    problem = make_scan_problem(msgspec.structs.replace(chosen, solve=empty), projector, data, held_out)
+    problem = make_scan_problem(msgspec.structs.replace(chosen, solve=empty), projector, data, kept)
     storage = choose_storage(chosen.solve, problem.linear_problem.A).line
     for line in (*lines, storage):
         say(f"  {line.choice}, because {line.reason}")

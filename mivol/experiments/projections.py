@@ -193,9 +193,9 @@ def read_measured(chosen: config.Scan, base: Path) -> Projections:
         notes += note_order(angles)
     y, weights = line_integrals(normalise_air(found.transmission, wanted.air) if wanted.air else found.transmission)
     offset = None
-    if wanted.find_axis and isinstance(chosen.scan, Parallel | Cone):
-        offset, said = look_for_axis(chosen, base, y, weights, angles)
-        notes.append(said)
+    if isinstance(chosen.scan, Parallel | Cone):
+        offset, said = settle_axis(chosen, base, y, weights, angles)
+        notes += said
     unused = int((weights == 0).sum())
     if unused:
         notes.append(f"{unused} of {weights.size} pixels have no light or no finite reading: they are not used")
@@ -206,6 +206,22 @@ def read_measured(chosen: config.Scan, base: Path) -> Projections:
         raise MivolError(f"found {len(y)} projections and a geometry of {geometry.shape[0]} views, expected as many.")
     quanta = quanta_of(chosen, found) if METHODS[solver_of(chosen.solve)].problem is PoissonCounts else None
     return Projections(geometry, y, weights, quanta=quanta, notes=tuple(notes), is_noise_known=found.intensity is not None)
+
+
+def settle_axis(
+    chosen: config.Scan, base: Path, y: np.ndarray, weights: np.ndarray, angles: np.ndarray
+) -> tuple[float | None, list[str]]:
+    """The ``axis_offset`` of a circular scan [length] where it is looked for, else None, and what is said about it.
+
+    An offset in a file holds, unless the file says ``data.find_axis = true`` besides.
+    """
+    wanted, given = chosen.data.find_axis, chosen.scan.axis_offset
+    if wanted or (wanted is None and not given):
+        offset, said = look_for_axis(chosen, base, y, weights, angles)
+        return offset, [said]
+    if wanted is None:
+        return None, [f"the rotation axis is where scan.axis_offset has it, {given:g}: data.find_axis = true looks for it"]
+    return None, []
 
 
 def look_for_axis(
@@ -252,3 +268,8 @@ def held_out_views(chosen: config.Scan, count: int) -> np.ndarray:
     if every == 1:
         raise MivolError("held_out_every = 1 holds out all views, expected some to fit: choose 2 or more, or 0.")
     return np.arange(every // 2, count, every) if every else np.arange(0)
+
+
+def fitted_views(held_out: np.ndarray, count: int) -> np.ndarray:
+    """Numbers of the views that are not held out."""
+    return np.setdiff1d(np.arange(count), held_out)

@@ -16,7 +16,7 @@ from mivol import config
 from mivol.errors import MivolError
 from mivol.experiments.back_end import choose_back_end
 from mivol.experiments.best import BestIterate
-from mivol.experiments.projections import Projections, beam_of, held_out_views, make_data, make_grid
+from mivol.experiments.projections import Projections, beam_of, fitted_views, held_out_views, make_data, make_grid
 from mivol.experiments.run_folder import RunFolder
 from mivol.experiments.scan_outputs import write_best, write_outputs
 from mivol.experiments.scan_prior import check_noise, make_prior, plan_of_prior, settle_noise
@@ -71,12 +71,13 @@ def scan_fit(task: Task) -> Path:
             run.record.notes += data.notes
             task.watcher.say(data.notes)
         held_out = held_out_views(chosen, len(data.y))
-        chosen, lines = settle(chosen, data, grid, held_out)
+        kept = fitted_views(held_out, len(data.y))
+        chosen, lines = settle(chosen, data, grid, kept)
         task = replace(task, chosen=chosen)
         run.record.plan += lines
         projector = Projector(data.geometry, subdivide(grid, chosen.solve.supersampling, data.geometry))
         with run.stage("solve"):
-            problem = make_problem(chosen, projector, data, held_out)
+            problem = make_problem(chosen, projector, data, kept)
             best = BestIterate(run)
             storage = choose_storage(chosen.solve, problem.linear_problem.A)
             run.record.plan.append(storage.line)
@@ -114,21 +115,19 @@ def new_record(task: Task) -> RunRecord:
     )
 
 
-def settle(chosen: config.Scan, data: Projections, grid: VoxelGrid, held_out: np.ndarray) -> tuple[config.Scan, list[PlanLine]]:
+def settle(chosen: config.Scan, data: Projections, grid: VoxelGrid, kept: np.ndarray) -> tuple[config.Scan, list[PlanLine]]:
     """All settings with what was left open to the solver's table, and why."""
-    kept = np.setdiff1d(np.arange(len(data.y)), held_out)
     solve, lines = settle_solver(chosen.solve, Projector(data.geometry, grid, kept))
     return msgspec.structs.replace(chosen, solve=solve), lines
 
 
-def make_problem(chosen: config.Scan, projector: Projector, data: Projections, held_out: np.ndarray) -> Inversion:
-    """What the solver minimises, over the views that are not held out.
+def make_problem(chosen: config.Scan, projector: Projector, data: Projections, kept: np.ndarray) -> Inversion:
+    """What the solver minimises, over the views that are fitted.
 
     Raises:
         MivolError: ML-TR without counts.
     """
     wanted = chosen.solve
-    kept = np.setdiff1d(np.arange(projector.n_views), held_out)
     a = projector.subset(kept)
     prior = make_prior(wanted, a, data, kept)
     x0 = start_volume(wanted, a, data, kept)

@@ -31,6 +31,7 @@ __all__ = [
     "SERIES",
     "STYLE",
     "Series",
+    "empty_figure",
     "inline_svg",
     "plot_curve",
     "plot_error_against_time",
@@ -90,7 +91,7 @@ STYLE = {
 }
 
 
-def _figure(width: float, height: float) -> Figure:
+def empty_figure(width: float, height: float) -> Figure:
     """An empty figure of that many inches with a canvas of its own; call inside ``mpl.rc_context(STYLE)``."""
     figure = Figure(figsize=(width, height))
     FigureCanvasAgg(figure)
@@ -150,7 +151,7 @@ def plot_curve(rows: Sequence[dict], name: str, *, against: str = "iteration") -
     x, y = np.array(points, float).T
     quantity = QUANTITIES.get(name, Quantity(name.replace("_", " ")))
     with mpl.rc_context(STYLE):
-        figure = _figure(4.4, 2.75)
+        figure = empty_figure(4.4, 2.75)
         axes = figure.subplots()
         axes.plot(x, y, color=SERIES[0], marker="o" if len(x) <= 30 else None, markersize=3.5, clip_on=False)
         axes.set_title(quantity.label + (f" [{quantity.unit}]" if quantity.unit else ""))
@@ -214,7 +215,7 @@ def plot_slices(
     values = show.scale_of(*next(iter(rows.values())).images.values())
     signed = show.signed_scale(*rows["difference"].images.values()) if truth is not None else None
     with mpl.rc_context(STYLE):
-        figure = _figure(7.2, 2.5 * len(rows) + 0.3)
+        figure = empty_figure(7.2, 2.5 * len(rows) + 0.3)
         grid = figure.subplots(len(rows), 3, squeeze=False)
         for line, (name, cut) in zip(grid, rows.items(), strict=True):
             scale = signed if name == "difference" else values
@@ -246,7 +247,7 @@ def plot_image_row(reference: NDArray, render: NDArray, standard_error: NDArray 
     if standard_error is not None:
         panels.append(("z", difference / standard_error, show.Scale("signed", -4.0, 4.0)))
     with mpl.rc_context(STYLE):
-        figure = _figure(2.6 * len(panels), 2.9)
+        figure = empty_figure(2.6 * len(panels), 2.9)
         for axes, (name, image, scale) in zip(figure.subplots(1, len(panels)), panels, strict=True):
             _picture(axes, show.pixels(image, scale), image.shape[1] / image.shape[0])
             axes.set_title(name)
@@ -330,7 +331,7 @@ def plot_error_against_time(
     """
     _check_series(series)
     with mpl.rc_context(STYLE):
-        figure = _figure(7.2, 4.4)
+        figure = empty_figure(7.2, 4.4)
         axes = figure.subplots()
         ratios = {s.name: ratio_at_equal_error(series[0], s) for s in series[1:]}
         for i, s in enumerate(series):

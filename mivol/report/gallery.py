@@ -290,7 +290,7 @@ def _layer(share: float, volumes: dict[str, NDArray], scales: dict[str, show.Sca
         step = max(1, -(-max(values.shape[1:3]) // LAYER_EDGE))
         image = values[int(share * values.shape[0]), ::-step, ::step]
         pictures.append(_picture(role.capitalize(), image, scales[role], aspect))
-    return {"where": f"z = {int(share * count) + 1} of {count}", "pictures": pictures}
+    return {"name": "xy", "text": f"z = {int(share * count) + 1} of {count}", "pictures": pictures}
 
 
 def _planes(cut: show.Slices, scale: show.Scale) -> dict[str, Any]:

@@ -12,7 +12,7 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from mivol.files import read_volume
-from mivol.report.figures import SERIES, STYLE, _figure, inline_svg
+from mivol.report.figures import SERIES, STYLE, empty_figure, inline_svg
 from mivol.report.record import Volume
 
 DASHES = {"reconstruction": "solid", "truth": (0, (3, 2))}
@@ -47,7 +47,7 @@ def plot_profile(values: dict[str, NDArray], axis: str, box: tuple[float, float]
         named: the quantity with its unit.
     """
     with mpl.rc_context(STYLE):
-        figure = _figure(4.4, 2.75)
+        figure = empty_figure(4.4, 2.75)
         axes = figure.subplots()
         for role, colour in zip(values, SERIES, strict=False):
             line = line_through_the_middle(values[role], axis)

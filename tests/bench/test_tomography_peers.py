@@ -168,7 +168,7 @@ def test_who_is_missing_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(peers, "say", said.append)
     run = lambda scan: {"theirs": curve(scan)}  # noqa: E731
     monkeypatch.setattr(peers, "PEERS", {"there": ("json", run), "not there": ("no_such_module", run)})
-    found = peers.compare(7)
+    found = peers.compare(peers.slices_of_the_head(7))
     data = {"few views": (7, 30, 0.0), "noisy": (7, 90, 1e4), "many": (7, 360, 1e4)}
     # Three runs of two clocks that tick in turns: the second run of each kind is the middle one.
     assert found == {

@@ -49,7 +49,7 @@ DEFAULTS = {
     "config.Files": {"scene": "", "held_out": ()},
     "config.Grid": {"voxel_size": 1.0, "centre": (0.0, 0.0, 0.0)},
     "config.Known": {"photons": 0.0, "seed": 1, "scale": 1.0},
-    "config.Measured": {"group": "exchange", "find_axis": True, "air": 0, "drift": 0, "saturation": math.inf},
+    "config.Measured": {"group": "exchange", "find_axis": None, "air": 0, "drift": 0, "saturation": math.inf},
     "config.Parallel": {
         **{"views": 90, "arc": 180.0, "detector": (1, 128), "pitch": 1.0},
         **{"detector_offset": (0.0, 0.0), "axis_offset": 0.0},
@@ -65,7 +65,7 @@ DEFAULTS = {
     },
     "config.Rendered": {"spp": 1024, "standard_error": 0.0, "seed": 1, "held_out": ()},
     "config.Matrices": {"detector": (1, 128), "first_pixel": (0.0, 0.0)},
-    "config.Nikon": {"find_axis": True, "air": 0, "drift": 0, "saturation": math.inf, "angles": ""},
+    "config.Nikon": {"find_axis": None, "air": 0, "drift": 0, "saturation": math.inf, "angles": ""},
     "config.Scan": {
         **{"grid": None, "held_out_every": 0},
         **{"checkpoint_every": 5, "variant": "llvm_ad_rgb", "threads": 0, "output": "runs/scan"},
@@ -79,7 +79,7 @@ DEFAULTS = {
         "integrator": "mivol",
     },
     "config.Shown": {"views": 4, "frames": 60, "every": 250, "metrics": ("psnr", "ssim")},
-    "config.Readings": {"find_axis": True, "air": 0, "drift": 0, "saturation": math.inf},
+    "config.Readings": {"find_axis": None, "air": 0, "drift": 0, "saturation": math.inf},
     "config.Simulated": {"photons": 0.0, "seed": 1},
     "config.Solve": {
         **{"name": "auto", "start": None, "supersampling": None, "iterations": 20, "nonnegative": True, "subsets": 10},
@@ -87,7 +87,7 @@ DEFAULTS = {
         **{"tv_unit": "noise", "storage": "auto", "memory": 1.0, "discrepancy": 0.0},
     },
     "config.Stack": {
-        **{"find_axis": True, "air": 0, "drift": 0, "saturation": math.inf},
+        **{"find_axis": None, "air": 0, "drift": 0, "saturation": math.inf},
         **{"dataset": "", "flats": "", "darks": "", "angles": ""},
         **{"angle_unit": "degree", "first_row": "lowest"},
     },

@@ -11,11 +11,14 @@ import subprocess
 import sys
 from pathlib import Path
 
+import mitsuba as mi
 import numpy as np
 import pytest
 
 from mivol.cli import main
+from mivol.fields.gaussian_grid import grid_of_gaussians
 from mivol.fields.procedural import make_procedural
+from mivol.fields.spherical_files import save_field
 from mivol.files import read_volume, write_volume
 
 SCENES = Path(__file__).resolve().parents[2] / "scenes"
@@ -59,6 +62,7 @@ NOWHERE = {"MIVOL_DATA": "", "MIVOL_CACHE": "nowhere"}
 SCRIPTS = {
     "bonsai": "scan.py",
     "fire": "render.py",
+    "fog": "render.py",
     "relit_smoke": "relight.py",
     "scan_view": "tables.py",
     "still_life": "photographs.py",
@@ -194,6 +198,7 @@ def test_what_stands_in_for_the_data_of_scripts(tmp_path: Path) -> None:
     """Where nothing was fetched, each script runs to its picture and says in one sentence what it shows."""
     runs = {
         "fire": ("--size", 16, "--spp", 4),
+        "fog": ("--size", 16, "--spp", 4, "--resolution", 16),
         "scan_view": ("--size", 48, "--spp", 1, "--iterations", 1),
         "relit_smoke": ("--volume", tmp_path / "found.vol", "--size", 8, "--spp", 4, "--reference-spp", 32),
     }
@@ -202,6 +207,26 @@ def test_what_stands_in_for_the_data_of_scripts(tmp_path: Path) -> None:
         said = script(name, *small, "-o", tmp_path / name, **NOWHERE)
         assert len(re.findall("^.*not here: .*stands in for.*$", said, re.MULTILINE)) == 1
         assert sum(path.stat().st_size > 200 for path in (tmp_path / name).glob("*.png")) > 0
+
+
+@pytest.mark.slow
+def test_gaussians_in_fog_cast_a_shadow(tmp_path: Path, variant_rgb: None) -> None:
+    """A ball of splats takes light of the spot from the floor behind it, and next to none from what is seen above it.
+
+    The seeds are fixed and medians are compared. The ratio is 1 where no light is taken, and 0.5 in the shadow (fog before the
+    floor and the sky stay): 0.7 and 0.9 lie between the two.
+    """
+    scene = runpy.run_path(str(SCENES / "fog" / "render.py"))
+    box = np.array(scene["BOX"])
+    save_field(tmp_path / "ball.npz", grid_of_gaussians(scene["ball"](), box[:3], box[3:], 32))
+    shown = scene["load"](tmp_path / "ball.npz", scene["BOX"], width=48, height=32, spp=64)
+    with_them = np.array(mi.render(shown, seed=0)).mean(axis=-1)
+    values = mi.traverse(shown)
+    values["gaussians.interior_medium.emission.density"] *= 0
+    values.update()
+    ratio = with_them / np.array(mi.render(shown, seed=0)).mean(axis=-1)
+    assert np.median(ratio[28:, 30:40]) < 0.7
+    assert 0.9 < np.median(ratio[:8]) < 1.1
 
 
 @pytest.mark.slow

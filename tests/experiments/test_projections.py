@@ -119,6 +119,22 @@ def test_an_axis_that_is_found_takes_the_place_of_the_settings(measured: ScanRea
     assert "rotation axis at column 1.75 +- 0.12 (some way)" in found.notes
 
 
+def test_an_offset_in_the_settings_holds_where_nothing_more_is_said(
+    measured: ScanReadings, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is not looked for then, which is said; without an offset it is."""
+    monkeypatch.setattr(projections, "find_axis", lambda y, w, angles: Axis(1.75, 0.125, "some way"))
+    chosen = scan(find_axis=None)
+    found = projections.read_measured(chosen, Path())
+    assert found.geometry.axis_offset == 0.25
+    assert "the rotation axis is where scan.axis_offset has it, 0.25: data.find_axis = true looks for it" in found.notes
+    chosen.scan = Parallel(views=2, detector=(2, 3), pitch=(1.0, 0.5))
+    assert projections.read_measured(chosen, Path()).geometry.axis_offset == 0.375
+    chosen.data.find_axis = False
+    found = projections.read_measured(chosen, Path())
+    assert found.geometry.axis_offset == 0 and not any("axis" in note for note in found.notes)
+
+
 def test_the_axis_of_a_cone_takes_the_place_of_the_settings(measured: ScanReadings, monkeypatch: pytest.MonkeyPatch) -> None:
     """Column 1.75 lies 0.375 beyond the middle, half as far at the axis; where the scan does not tell it, that is said."""
     chosen = scan(find_axis=True)

@@ -397,7 +397,8 @@ def test_readings_are_fitted_as_counts(variant_rgb, folder: Path) -> None:
     files = 'file="counts.npy", flats="flats.npy", darks="darks.npy"'
     stack = f'data={{source="stack", reading="intensity", {files}, saturation=2e5}}'
     asked = config.load(folder / "fit.toml", [stack, "solve.name=ml-tr"])
-    problem = make_problem(asked, Projector(data.geometry, grid), projections.make_data(asked, folder, grid), np.arange(0))
+    read = projections.make_data(asked, folder, grid)
+    problem = make_problem(asked, Projector(data.geometry, grid), read, np.arange(len(readings)))
     expected = readings < 2e5
     expected[..., 5] = False
     np.testing.assert_array_equal(problem.linear_problem.used, expected)

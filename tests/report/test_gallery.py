@@ -56,7 +56,7 @@ def test_a_volume_is_shown_layer_by_layer(tmp_path: Path) -> None:
     write_volume(tmp_path / "t.npz", truth)
     write_volume(tmp_path / "r.npz", found)
     (cut,) = volumes_of(tmp_path, [Volume(path="t.npz", role="truth"), Volume(path="r.npz", role="reconstruction")])
-    assert [layer["where"] for layer in cut.layers] == [f"z = {k} of 3" for k in (1, 2, 3)]
+    assert [layer["text"] for layer in cut.layers] == [f"z = {k} of 3" for k in (1, 2, 3)]
     scale = show.scale_of(*show.slices(truth).images.values())
     signed = show.signed_scale(*show.slices(found - truth).images.values())
     for k, layer in enumerate(cut.layers):
@@ -72,6 +72,6 @@ def test_large_volumes_show_some_of_their_layers_with_fewer_pixels(tmp_path: Pat
         write_volume(tmp_path / f"{name}.npz", np.ones(shape, np.float32))
     tall, flat = (volumes_of(tmp_path, [Volume(path=f"{n}.npz", role="reconstruction")])[0] for n in ("tall", "flat"))
     assert len(tall.layers) == LAYERS and flat.layers == []
-    assert [layer["where"] for layer in tall.layers[:2]] == ["z = 2 of 40", "z = 4 of 40"]
-    assert tall.layers[-1]["where"] == "z = 39 of 40"
+    assert [layer["text"] for layer in tall.layers[:2]] == ["z = 2 of 40", "z = 4 of 40"]
+    assert tall.layers[-1]["text"] == "z = 39 of 40"
     assert pixels(tall.layers[0]["pictures"][0]).shape == (2, LAYER_EDGE // 2 + 1, 3)

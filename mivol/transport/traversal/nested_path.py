@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from mivol.transport.traversal.lattice import Segment, segment_between, slab
+from mivol.transport.traversal.lattice import Segment, clip, segment_between, slab
 from mivol.transport.traversal.occupied_cells import Cells
 
 __all__ = ["Piece", "pieces", "piece_of"]
@@ -50,6 +50,8 @@ def piece_of(cells: Cells, o: mi.Point3f, d: mi.Vector3f, t_max: mi.Float | floa
         t_max: where the rays end [length]; may be infinite.
         number: of the piece, from 0 in the order of the ray.
     """
+    if cells.levels == 1:
+        return Piece(mi.Int32(0), clip(cells, o, d, mi.Float(0), t_max), mi.Float(1))
     n = cells.res[::-1]
     last = dr.opaque(mi.Int32, cells.levels - 1)
     level = dr.abs(number - last)
