@@ -188,7 +188,7 @@ def _depths(view: MediumView, o: mi.Point3f, d: mi.Vector3f, length: np.ndarray)
     """Optical depth (n, channels) of lines inside a box."""
     total = np.zeros((len(length), 1))
     for part in view.parts:
-        if part.lattice is None:
+        if part.is_constant:
             total = total + length[:, None] * np.array(part.constant, np.float64).ravel()
         else:
             tau = np.array(integrate_tau(part.lattice, o, d, mi.Float(length)), np.float64)
@@ -216,9 +216,9 @@ def mean_albedo(view: MediumView) -> float:
 
 def _mean_value(part: ExactExtinction) -> float:
     """Mean of a part over space, of its highest channel."""
-    values = part.constant if part.lattice is None else part.lattice.values
+    values = part.constant if part.is_constant else part.lattice.values
     host = np.asarray(dr.detach(values), np.float64)
-    return float(host.reshape(-1, part.channels).mean(axis=0).max()) if part.lattice is not None else float(host.max())
+    return float(host.reshape(-1, part.channels).mean(axis=0).max()) if not part.is_constant else float(host.max())
 
 
 def mean_cosine(phase: mi.PhaseFunction, n: int = 1 << 12) -> float:

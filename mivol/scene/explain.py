@@ -220,12 +220,15 @@ def _tables(needs: Needs) -> list[str]:
 
 
 def _depth_two(scene: mi.Scene, needs: Needs) -> list[str]:
-    """Which share of the light that each medium scatters is missing at max_depth 2 (:mod:`mivol.scene.depth_two`)."""
+    """Which share of the light that each medium scatters is missing at max_depth 2 (:mod:`mivol.scene.depth_two`).
+
+    Nothing is said of a bounded medium, whose optical depth is not known.
+    """
     lines = []
     light = "collimated" if "delta" in needs.emitter_kinds else "constant"
     for facts, boundary, view in zip(needs.media, needs.boundaries, needs.views, strict=True):
         box, traced = (boundary.box, None) if boundary.box is not None else (_box_around(scene, boundary.medium), scene)
-        if not facts.is_scattering or box is None:
+        if not facts.is_scattering or facts.bounded or box is None:
             continue
         tau, albedo = scattering_depth(view, box, scene=traced), mean_albedo(view)
         phase = "forward" if mean_cosine(boundary.medium.phase_function()) > 0.4 else "isotropic"

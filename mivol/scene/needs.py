@@ -130,7 +130,7 @@ def _phase_name(phase: mi.PhaseFunction | None) -> str:
 def _tau_max(boundary: Boundary, view: MediumView, reads: list[Reading]) -> float | None:
     """Bound the optical depth through a medium: its largest extinction times the diagonal of its box."""
     bounds = [float(p.majorant[0]) for p in view.parts if not p.exact_line]
-    constants = [float(np.max(np.array(dr.detach(p.constant)))) for p in view.parts if p.exact_line and p.lattice is None]
+    constants = [float(np.max(np.array(dr.detach(p.constant)))) for p in view.parts if p.is_constant]
     if boundary.box is None:
         return None
     corners = boundary.box.corners()

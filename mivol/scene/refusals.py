@@ -117,7 +117,7 @@ def refuse_quadrature(needs: Needs, settings: Settings) -> None:
             f"deterministic is set and the scene has {len(needs.media)} media with {grids} grids of extinction; quadrature is "
             "for one medium whose grids share their cells: leave deterministic out."
         )
-    constant = next((part.name for part in needs.views[0].parts if part.lattice is None), None)
+    constant = next((part.name for part in needs.views[0].parts if part.is_constant), None)
     if settings.shadows == "grid" and constant is not None:
         raise MivolError(
             f"shadows is 'grid' and {constant} of the medium in {needs.media[0].name} is a constant, which may fill more than "

@@ -14,6 +14,7 @@ from false_alarms import Estimate, assert_same_mean
 
 from mivol.errors import MivolError
 from mivol.scene import plan
+from mivol.scene.explain import explain
 
 SIDE, SPP, SKY, SCALE = 12, 256, 0.8, 1.2
 BATCHES = SIDE * SIDE
@@ -212,3 +213,10 @@ def test_a_majorant_that_is_none_is_refused() -> None:
     found = scene([0, -4, 0], [0, 0, 0], fog=shape("cube", fog(slack=float("inf"))))
     with pytest.raises(MivolError, match="the majorant of sigma_t, a Ball, is inf; a finite one is expected"):
         mi.render(found, integrator=mi.load_dict({"type": "mivol", "max_depth": 1}), spp=1)
+
+
+def test_a_plan_is_explained_where_no_optical_depth_is_known() -> None:
+    """What one scattering leaves out is told by the optical depth, of media that have one."""
+    text = explain(scene([0, -4, 0], [0, 0, 0], fog=shape("cube", {**fog(), "albedo": 0.5})), max_depth=2)
+    assert "a bounded Ball" in text
+    assert "one scattering leaves out" not in text

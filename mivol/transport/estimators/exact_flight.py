@@ -47,7 +47,7 @@ def collide_exactly(
     Bias: none, but for extinctions with an activation, which are cubics through four points of a cell. Cost: one walk to the
     collision.
     """
-    if part.lattice is None:
+    if part.is_constant:
         return _in_constant(part, scale, interval, goal, channel)
     return _in_grid(part, scale, interval, goal, channel)
 

@@ -128,7 +128,7 @@ def _by_part(
 ) -> list[mi.Vector3f]:
     """L times the derivative of one part's optical depth without the first term; one vector a channel."""
     ray, end = ray_segment.ray, mi.Float64(ray_segment.length)
-    if part.lattice is None:
+    if part.is_constant:
         value = dr.detach(part.constant)
         each = [value] if part.channels == 1 else [value.x, value.y, value.z]
         leaving = _face(body.rows, (0.0,) * 3, (1.0,) * 3, ray, t1) if body.box is not None else mi.Vector3f(0)

@@ -124,7 +124,7 @@ def _count(lattice: Lattice, shift: int) -> int:
 def _with_grid(media: SceneMedia, lattice: Lattice) -> SceneMedia:
     """The media, with the grid of their only medium replaced."""
     (body,) = media.bodies
-    parts = [p if p.lattice is None else replace(p, lattice=lattice) for p in body.view.parts]
+    parts = [p if p.is_constant else replace(p, lattice=lattice) for p in body.view.parts]
     other, bodies = copy.copy(media), [Body(replace(body.view, parts=parts), body.box)]
     other.boxed, other.traced = (bodies, []) if body.box is not None else ([], bodies)
     return other

@@ -177,7 +177,7 @@ class BodySweep:
     @property
     def _has_constants(self) -> bool:
         """Whether the medium has something outside its grid too, so that no block may be skipped."""
-        return self.body.view.emission_density is not None or any(p.lattice is None for p in self.body.view.parts)
+        return self.body.view.emission_density is not None or any(p.is_constant for p in self.body.view.parts)
 
     @property
     def _reads(self) -> list:

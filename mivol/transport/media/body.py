@@ -191,7 +191,7 @@ class Body:
     def add_to_constants(self, weight: list[mi.Float], active: mi.Bool) -> None:
         """Add ``weight`` (d loss of each channel of the scene) to the gradients of the constants."""
         for part, gradient in zip(self.view.parts, self.gradients, strict=True):
-            if part.lattice is None:
+            if part.is_constant:
                 for c, w in enumerate(for_part(weight, part.channels)):
                     dr.scatter_add(gradient, w, mi.UInt32(c), active)
 
@@ -206,7 +206,7 @@ def flight_parts(parts: list[Extinction]) -> list[ExactExtinction]:
     """The parts that one walk of cells can sum: constants, and grids that share the cells of ``sigma_s`` (or the first)."""
     grids = [p for p in parts if p.lattice is not None]
     lead = next((p for p in grids if p.name == "sigma_s"), grids[0] if grids else None)
-    return [p for p in parts if p.exact_line and (p.lattice is None or share_cells(p.lattice, lead.lattice))]
+    return [p for p in parts if p.is_constant or (p.lattice is not None and share_cells(p.lattice, lead.lattice))]
 
 
 def _sum(parts: Iterable[list[mi.Float]], channels: int) -> list[mi.Float]:

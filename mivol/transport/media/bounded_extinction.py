@@ -35,6 +35,7 @@ class BoundedExtinction:
     scale: mi.Float
     majorant: mi.Float
     exact_line: ClassVar[bool] = False
+    is_constant: ClassVar[bool] = False
     lattice: ClassVar[None] = None
 
     def __post_init__(self) -> None:

@@ -25,6 +25,7 @@ class ConstantExtinction:
     name: str
     constant: mi.Float | mi.Color3f
     exact_line: ClassVar[bool] = True
+    is_constant: ClassVar[bool] = True
     lattice: ClassVar[None] = None
 
     @property

@@ -44,12 +44,14 @@ class Extinction(Protocol):
     Attributes:
         name: ``sigma_t``, ``sigma_a`` or ``sigma_s``.
         exact_line: whether it is an :class:`ExactExtinction`.
+        is_constant: whether it is the same number everywhere in its boundary.
         lattice: the cells that one walk may follow; None where it needs none.
         channels: 1 (grey) or 3 (rgb).
     """
 
     name: str
     exact_line: bool
+    is_constant: bool
     lattice: Lattice | None
     channels: int
 

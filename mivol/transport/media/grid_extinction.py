@@ -29,6 +29,7 @@ class NodeValues:
     name: str
     lattice: Lattice
     exact_line: ClassVar[bool] = True
+    is_constant: ClassVar[bool] = False
 
     @property
     def channels(self) -> int:

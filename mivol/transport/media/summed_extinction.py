@@ -36,7 +36,7 @@ class SummedExtinction:
         self.activations = [None if linear else p.activation for p, _ in pairs if p.lattice is not None]
         self.reads = [Nodes(v, p.channels) for p, v in pairs if p.lattice is not None]
         self.has_constants = len(self.reads) < len(parts)
-        constants = [_as_channels(v, p.channels) for p, v in pairs if p.lattice is None]
+        constants = [_as_channels(v, p.channels) for p, v in pairs if p.is_constant]
         self.constant = [scale * sum((k[c % len(k)] for k in constants), mi.Float(0)) for c in range(self.channels)]
 
     def along(self, corners: list, points: list[mi.Vector3f]) -> list[list[mi.Float]]:
