@@ -32,6 +32,7 @@ from scipy.sparse import csr_matrix
 from scipy.special import elliprg
 
 from mivol.errors import MivolError
+from mivol.fields.box_places import PAIRS, cut_into_parts, places_in_boxes
 from mivol.fields.spherical import SphericalGrid
 from mivol.machine import available_memory
 from mivol.points.gaussians import Gaussians
@@ -43,9 +44,6 @@ MOST_OPAQUE = 0.999
 
 REACH = 4.0
 """Standard deviations along each axis of the grid up to which a Gaussian is written: 2e-4 of it lies beyond."""
-
-PAIRS = 1 << 21
-"""Of a node and a Gaussian that are looked at together, and one Gaussian more, which has no more than there are nodes."""
 
 PAIR_BYTES = 160
 """That a pair takes while it is weighed: places, weights and their products."""
@@ -119,9 +117,9 @@ def _summed(gaussians: Gaussians, centres: np.ndarray, size: np.ndarray, voxel: 
     harmonics = gaussians.harmonics.reshape(gaussians.count, -1)
     rows = np.concatenate([np.ones((gaussians.count, 1)), harmonics], axis=1) * masses_of_gaussians(gaussians)[:, None]
     sums = np.zeros((int(np.prod(size)), rows.shape[1]))
-    for part in np.split(seen, _cuts(sizes[seen].prod(axis=1))):
+    for part in np.split(seen, cut_into_parts(sizes[seen].prod(axis=1))):
         owner = np.repeat(np.arange(len(part)), sizes[part].prod(axis=1))
-        node = first[part][owner] + _places(sizes[part])
+        node = first[part][owner] + places_in_boxes(sizes[part])
         away = node - centres[part][owner]
         weight = np.exp(-0.5 * np.einsum("ni,nij,nj->n", away, np.linalg.inv(covariances[part])[owner], away))
         weight /= np.where(is_whole[part], np.bincount(owner, weight, len(part)), integral[part])[owner]
@@ -129,19 +127,6 @@ def _summed(gaussians: Gaussians, centres: np.ndarray, size: np.ndarray, voxel: 
         weights = csr_matrix((weight, (place, owner)), shape=(len(touched), len(part)))
         sums[touched] += weights @ rows[part]
     return sums[:, 0], sums[:, 1:]
-
-
-def _places(sizes: np.ndarray) -> np.ndarray:
-    """All places (x, y, z) of boxes of these sizes, one box after the other, each from (0, 0, 0)."""
-    counts = sizes.prod(axis=1)
-    number = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
-    x, y = (np.repeat(sizes[:, axis], counts) for axis in (0, 1))
-    return np.stack([number % x, number // x % y, number // (x * y)], axis=1)
-
-
-def _cuts(pairs: np.ndarray) -> np.ndarray:
-    """Where a list of Gaussians is cut so that no part has much more than ``PAIRS``."""
-    return np.flatnonzero(np.diff(np.cumsum(pairs) // PAIRS)) + 1
 
 
 def _check_memory(size: np.ndarray, basis: int, resolution: int) -> None:

@@ -1,4 +1,5 @@
-"""<volume type="mivol_voxels">: a dense grid; "mivol_transfer": one seen through a table; "mivol_sh": a radiance field."""
+"""Volumes: "mivol_voxels", a dense grid; "mivol_transfer", one seen through a table; "mivol_sh", a radiance field;
+"mivol_gaussians", Gaussians that rays are traced through."""
 
 from __future__ import annotations
 
@@ -7,6 +8,7 @@ import mitsuba as mi
 import numpy as np
 
 from mivol.errors import MivolError
+from mivol.fields.gaussians import GaussianField
 from mivol.fields.spherical import SphericalGrid
 from mivol.fields.spherical_tensors import dense_density, field_from_props, with_tensors
 from mivol.fields.transfer import Transfer
@@ -172,6 +174,47 @@ class TransferVolume(VoxelVolume):
         self.mivol_transfer.refresh()
 
 
+class GaussianVolume(mi.Volume):
+    """``<volume type="mivol_gaussians">``: Gaussians that rays are traced through, as a medium's ``sigma_t``.
+
+    Parameters:
+        filename: Gaussians (.ply, .spz, .splat, .ksplat), or
+        means, log_scales, quaternions, opacity_logits: tensors (N, 3), (N, 3), (N, 4) and (N,), as files have them: scales are
+            exp(log_scales), opacities logistic(opacity_logits), quaternions (w, x, y, z) of any length.
+        to_world: places them in the world; opacities stay as they are. Default: where the file has them.
+
+    A ray through a Gaussian loses the share of light that a splat of its opacity would hide there. The tensors are its
+    parameters; colours of a file are not read. The shape that the medium fills should hold them all, and cuts what it does not.
+    """
+
+    def __init__(self, props: mi.Properties) -> None:
+        self.mivol_extinction = GaussianField.from_props(props)
+        props["to_world"] = mi.ScalarTransform4f(self.mivol_extinction.to_world)
+        super().__init__(props)
+
+    def eval(self, it: mi.Interaction3f, active: mi.Bool = True) -> mi.Spectrum:
+        return mi.Spectrum(self.eval_1(it, active))
+
+    def eval_1(self, it: mi.Interaction3f, active: mi.Bool = True) -> mi.Float:
+        return self.mivol_extinction.eval(it.p, _towards(it), mi.Bool(active))[0]
+
+    def max(self) -> float:
+        return max(self.mivol_extinction.bound())
+
+    def channel_count(self) -> int:
+        return 1
+
+    def traverse(self, callback: mi.TraversalCallback) -> None:
+        for name, value in self.mivol_extinction.parameters().items():
+            callback.put(name, value, mi.ParamFlags.Differentiable)
+
+    def parameters_changed(self, keys: list[str]) -> None:
+        self.mivol_extinction.refresh()
+
+    def to_string(self) -> str:
+        return f"mivol_gaussians[{self.mivol_extinction.count}]"
+
+
 def _towards(it: mi.Interaction3f) -> mi.Vector3f:
     """The direction to the eye; up where an interaction has none."""
     wi = getattr(it, "wi", mi.Vector3f(0, 0, 1))
@@ -182,3 +225,4 @@ def _towards(it: mi.Interaction3f) -> mi.Vector3f:
 mi.register_texture("mivol_voxels", VoxelVolume)
 mi.register_texture("mivol_sh", SphericalVolume)
 mi.register_texture("mivol_transfer", TransferVolume)
+mi.register_texture("mivol_gaussians", GaussianVolume)

@@ -99,6 +99,7 @@ def _why_free_flights(needs: Needs, settings: Settings) -> str:
     """What a single scattering on straight segments would leave out."""
     reasons = [f"{m.name} emits beside scattering" for m in needs.media if m.emits]
     reasons += [f"{m.name} is bounded" for m in needs.media if m.bounded]
+    reasons += [f"{m.name} is made of Gaussians" for m in needs.media if m.gaussians]
     reasons += [f"{name} refracts" for name in needs.refractive]
     if settings.scatterings > 1:
         reasons.insert(0, f"an albedo is above 0 and max_depth is {settings.max_depth}")
@@ -179,6 +180,10 @@ def choose_flights(medium: MediumFacts, segment: str) -> Choice | None:
     about = f"flights in {medium.name}"
     if medium.bounded:
         return Choice(about, "delta tracking", "a majorant is known, and no optical depth")
+    if medium.gaussians:
+        return Choice(
+            about, "exact, one in each Gaussian that a ray meets", "the shortest of them is a flight through their sum"
+        )
     if not medium.resolutions:
         return Choice(about, "exact", "its extinction is a constant")
     if medium.extinction == "rgb":

@@ -13,6 +13,7 @@ import mitsuba as mi
 import numpy as np
 
 from mivol.errors import MivolError
+from mivol.fields.gaussians import GaussianField
 from mivol.transport.traversal.lattice import slab
 
 __all__ = ["Coefficients"]
@@ -47,6 +48,9 @@ class Coefficients:
         fields = [n for n in (*given, "emission_density") if is_radiance_field(props.get(n, 0.0))]
         if fields:
             raise MivolError(f"mivol_medium was given a mivol_sh as {fields[0]}; give it as the emission, and nothing else.")
+        elsewhere = [n for n in (*given, "emission", "emission_density") if n != "sigma_t" and _is_made_of_gaussians(props, n)]
+        if elsewhere:
+            raise MivolError(f"mivol_medium was given a mivol_gaussians as {elsewhere[0]}; give it as sigma_t, with an albedo.")
         pair = next((p for p in PAIRS if set(given) <= set(p)), None)
         if pair is None or not given or given == ["albedo"]:
             raise MivolError(
@@ -159,6 +163,10 @@ class Coefficients:
 def is_radiance_field(value: object) -> bool:
     """Whether a volume is a field of density and colour."""
     return hasattr(value, "mivol_field")
+
+
+def _is_made_of_gaussians(props: mi.Properties, name: str) -> bool:
+    return isinstance(getattr(props.get(name, 0.0), "mivol_extinction", None), GaussianField)
 
 
 def _volume(props: mi.Properties, name: str) -> mi.Volume:

@@ -30,8 +30,7 @@ from mivol.errors import MivolError
 from mivol.scene.nesting import extent
 from mivol.transport.media.body import Body
 from mivol.transport.media.box import Box
-from mivol.transport.media.extinction import ExactExtinction
-from mivol.transport.media.grid_integral import integrate_tau
+from mivol.transport.media.extinction import ExactExtinction, RayInterval
 from mivol.transport.media.medium_view import MediumView
 from mivol.transport.media.optical_depth import integrate_optical_depth
 from mivol.transport.media.scene_media import SceneMedia
@@ -188,11 +187,8 @@ def _depths(view: MediumView, o: mi.Point3f, d: mi.Vector3f, length: np.ndarray)
     """Optical depth (n, channels) of lines inside a box."""
     total = np.zeros((len(length), 1))
     for part in view.parts:
-        if part.is_constant:
-            total = total + length[:, None] * np.array(part.constant, np.float64).ravel()
-        else:
-            tau = np.array(integrate_tau(part.lattice, o, d, mi.Float(length)), np.float64)
-            total = total + tau.reshape(-1, len(length)).T
+        line = RayInterval(mi.Ray3f(o, d), mi.Float(0), mi.Float(length), dr.full(mi.Bool, True, len(length)))
+        total = total + np.stack([np.array(tau, np.float64) for tau in part.integrate(line)], axis=-1)
     return total * float(dr.max(view.scale)[0])
 
 

@@ -19,7 +19,7 @@ from mivol.scene.build import build_media
 from mivol.scene.choices import is_lit, shares_cells
 from mivol.scene.depth_preview import measure_depths
 from mivol.scene.depth_two import depth_two_error, mean_albedo, mean_cosine, scattering_depth
-from mivol.scene.facts import Needs
+from mivol.scene.facts import MediumFacts, Needs
 from mivol.scene.needs import find_needs
 from mivol.scene.nesting import bounds
 from mivol.scene.plan import Plan, make_plan
@@ -112,8 +112,7 @@ def examine(
 def _facts(needs: Needs) -> list[str]:
     lines = []
     for m in needs.media:
-        kind = f"a bounded {m.bounded}" if m.bounded else "homogeneous"
-        grids = ", ".join("x".join(map(str, r)) for r in m.resolutions) or kind
+        grids = ", ".join("x".join(map(str, r)) for r in m.resolutions) or _kind_without_grids(m)
         scatters = "scatters" if m.is_scattering else "albedo 0"
         tau = "" if m.tau_max is None else f", optical depth at most {m.tau_max:.3g}"
         lines.append(
@@ -126,6 +125,13 @@ def _facts(needs: Needs) -> list[str]:
         f"  camera    {'may be inside a medium' if needs.start or needs.camera_inside else 'in no traced boundary'}",
         f"  variant   {needs.variant}, {dr.thread_count()} threads",
     ]
+
+
+def _kind_without_grids(medium: MediumFacts) -> str:
+    """What a medium is made of that has no grids."""
+    if medium.gaussians:
+        return f"{medium.gaussians} Gaussians"
+    return f"a bounded {medium.bounded}" if medium.bounded else "homogeneous"
 
 
 def _plain_facts(scene: mi.Scene) -> list[str]:

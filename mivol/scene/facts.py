@@ -48,6 +48,7 @@ class MediumFacts:
         mean_cosine: of its phase function [1], when it was first asked; None where it does not scatter, or where some emitter
             is not at infinity and nothing depends on it.
         bounded: class of a field of which no more than a majorant is known along a ray; None where optical depths are exact.
+        gaussians: how many Gaussians it is made of that rays are traced through; 0 for none.
     """
 
     name: str
@@ -62,6 +63,7 @@ class MediumFacts:
     tau_max: float | None
     unread: bool = False
     bounded: str | None = None
+    gaussians: int = 0
     mean_cosine: float | None = None
 
 

@@ -17,6 +17,7 @@ from mivol.scene.nesting import bounds
 from mivol.scene.parsing import check_variant
 from mivol.scene.readings import Reading, check_light, check_numbers, is_scattering, read_part
 from mivol.scene.survey import AROUND, SceneSurvey, find_around, is_instance, survey_scene
+from mivol.transport.media.gaussian_extinction import GaussianExtinction
 from mivol.transport.media.medium_view import MediumView
 from mivol.transport.media.read_medium import kind_of, view_medium
 
@@ -97,6 +98,7 @@ def _facts(boundary: Boundary, view: MediumView, survey: SceneSurvey, recording:
         "resolutions": tuple(g.res for g in grids),
         "phase": _phase_name(phase),
         "emits": view.emits,
+        "gaussians": sum(p.field.count for p in view.parts if isinstance(p, GaussianExtinction)),
         "bounded": next((type(p.field).__name__ for p in view.parts if not p.exact_line), None),
     }
     if recording:
@@ -130,6 +132,7 @@ def _phase_name(phase: mi.PhaseFunction | None) -> str:
 def _tau_max(boundary: Boundary, view: MediumView, reads: list[Reading]) -> float | None:
     """Bound the optical depth through a medium: its largest extinction times the diagonal of its box."""
     bounds = [float(p.majorant[0]) for p in view.parts if not p.exact_line]
+    bounds += [p.field.bound()[0] for p in view.parts if isinstance(p, GaussianExtinction)]
     constants = [float(np.max(np.array(dr.detach(p.constant)))) for p in view.parts if p.is_constant]
     if boundary.box is None:
         return None

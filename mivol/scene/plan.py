@@ -29,6 +29,7 @@ from mivol.scene.facts import Needs
 from mivol.scene.refusals import (
     refuse_bounded,
     refuse_emission,
+    refuse_gaussians,
     refuse_places,
     refuse_quadrature,
     refuse_scattering,
@@ -80,6 +81,7 @@ def make_plan(needs: Needs, settings: Settings, aovs: tuple[str, ...] = ()) -> P
     refuse_quadrature(needs, settings)
     refuse_places(needs)
     refuse_bounded(needs, settings, aovs)
+    refuse_gaussians(needs, aovs)
     segment = _segment(needs, settings)
     choices = [
         choose_transport(needs, settings, segment),
@@ -113,7 +115,13 @@ def _segment(needs: Needs, settings: Settings) -> str:
     emits, is_bounded = any(m.emits for m in needs.media), any(m.bounded for m in needs.media)
     scatters = (emits or bool(needs.emitter_kinds)) and is_lit(needs, settings)
     question = SegmentQuestion(
-        scatters, emits, settings.deterministic, is_bounded, settings.scatterings, bool(needs.refractive)
+        scatters,
+        emits,
+        settings.deterministic,
+        is_bounded,
+        settings.scatterings,
+        bool(needs.refractive),
+        any(m.gaussians for m in needs.media),
     )
     return choose_segment_estimator(question)
 

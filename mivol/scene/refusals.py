@@ -19,6 +19,7 @@ __all__ = [
     "check_aovs",
     "refuse_bounded",
     "refuse_emission",
+    "refuse_gaussians",
     "refuse_places",
     "refuse_quadrature",
     "refuse_scattering",
@@ -130,7 +131,7 @@ def refuse_bounded(needs: Needs, settings: Settings, aovs: tuple[str, ...]) -> N
     medium = next((m for m in needs.media if m.bounded), None)
     if medium is None:
         return
-    moved = [k for k in needs.parameters if k.endswith((".position", ".to_world"))]
+    moved = _moved_emitters(needs)
     rgb = [m.name for m in needs.media if m.extinction == "rgb"] if is_lit(needs, settings) else []
     reasons = [
         (bool(aovs), f"aovs asks for {', '.join(aovs)}", "leave aovs out"),
@@ -146,3 +147,27 @@ def refuse_bounded(needs: Needs, settings: Settings, aovs: tuple[str, ...]) -> N
                 f"the medium in {medium.name} is a {medium.bounded}, which is bounded (a majorant is known, and no optical "
                 f"depth of a ray), and {what}: {way_out}, or voxelise the field."
             )
+
+
+def refuse_gaussians(needs: Needs, aovs: tuple[str, ...]) -> None:
+    """Refuse what needs the cells of a grid where a medium is made of Gaussians."""
+    medium = next((m for m in needs.media if m.gaussians), None)
+    if medium is None:
+        return
+    moved = _moved_emitters(needs)
+    reasons = [
+        ("depth" in aovs, "aovs asks for depth", "ask for tau and alpha only"),
+        (any(m.emits for m in needs.media), "a medium of its scene emits light", "take the emission out"),
+        (bool(moved), f"the derivative of {', '.join(moved)} was asked for", "take finite differences"),
+    ]
+    for found, what, way_out in reasons:
+        if found:
+            raise MivolError(
+                f"the medium in {medium.name} is made of {medium.gaussians} Gaussians that rays are traced through, "
+                f"and {what}: {way_out}, or convert them to a grid (mivol convert)."
+            )
+
+
+def _moved_emitters(needs: Needs) -> list[str]:
+    """The parameters asked for that say where an emitter is."""
+    return [k for k in needs.parameters if k.endswith((".position", ".to_world"))]

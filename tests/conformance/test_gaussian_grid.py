@@ -8,7 +8,7 @@ import pytest
 from scipy.ndimage import map_coordinates
 
 from mivol.errors import MivolError
-from mivol.fields import gaussian_grid
+from mivol.fields import box_places, gaussian_grid
 from mivol.fields.gaussian_grid import MOST_OPAQUE, box_of_gaussians, grid_of_gaussians, masses_of_gaussians
 from mivol.points.gaussians import Gaussians, concatenate, logit
 
@@ -98,7 +98,7 @@ def test_parts_of_a_set_and_the_set_are_one(monkeypatch: pytest.MonkeyPatch) -> 
     (a, ka), (b, kb) = (grid_of_gaussians(part, *box).to_dense() for part in parts)
     own = np.broadcast_to(parts[0].harmonics, ka[a > 0].shape)
     np.testing.assert_allclose(ka[a > 0], own, rtol=1e-6)
-    monkeypatch.setattr(gaussian_grid, "PAIRS", 100)
+    monkeypatch.setattr(box_places, "PAIRS", 100)
     both, k = grid_of_gaussians(concatenate(parts), *box).to_dense()
     np.testing.assert_allclose(both, a + b, rtol=1e-6)
     np.testing.assert_allclose(k * both[..., None, None], a[..., None, None] * ka + b[..., None, None] * kb, atol=1e-6)

@@ -28,6 +28,7 @@ from mivol.numerics import least_of
 from mivol.transport.estimators.delta_tracking import collide_in_blocks, collide_in_bounded
 from mivol.transport.estimators.exact_flight import collide_exactly
 from mivol.transport.estimators.flight_derivatives import FlownSegment
+from mivol.transport.estimators.gaussian_flight import collide_in_gaussians
 from mivol.transport.estimators.segment import (
     PICTURE,
     Collision,
@@ -42,6 +43,7 @@ from mivol.transport.media.channels import colours, spectrum
 from mivol.transport.media.coefficients import eval_albedo, medium_interaction
 from mivol.transport.media.even_point import draw_even_point
 from mivol.transport.media.extinction import Extinction, RayInterval
+from mivol.transport.media.gaussian_extinction import GaussianExtinction
 from mivol.transport.media.optical_depth import sum_optical_depth
 from mivol.transport.media.ray_intervals import MediumInterval, MediumVisitor, RaySegment, revisit_media, visit_media
 from mivol.transport.media.scene_media import SceneMedia
@@ -176,7 +178,7 @@ def _fly(media: SceneMedia, ray: mi.Ray3f, u: mi.Float, channel: mi.UInt32) -> M
     """The visitor that keeps the first collision along ``ray``."""
     bodies = media.bodies
     # A boundary that is traced may be entered several times, and each time takes a number of its own.
-    first = next((p for b in media.boxed for p in b.view.parts if not _is_tracked(p)), None)
+    first = next((p for b in media.boxed for p in b.view.parts if not _draws_own_numbers(p)), None)
 
     def visit(flight: _Flight, interval: MediumInterval) -> _Flight:
         body, t, index, rng = interval.body, flight.t, flight.body, flight.rng
@@ -188,6 +190,8 @@ def _fly(media: SceneMedia, ray: mi.Ray3f, u: mi.Float, channel: mi.UInt32) -> M
             ahead = RayInterval(ray, t0, t1, interval.active & (t1 > t0))
             if not part.exact_line:
                 hit, rng = collide_in_bounded(part, scale, ahead, rng)
+            elif isinstance(part, GaussianExtinction):
+                hit, rng = collide_in_gaussians(part, scale, ahead, rng)
             elif _is_tracked(part):
                 hit, rng = collide_in_blocks(part, scale, ahead, rng)
             else:
@@ -200,6 +204,11 @@ def _fly(media: SceneMedia, ray: mi.Ray3f, u: mi.Float, channel: mi.UInt32) -> M
         return _Flight(t, index, rng)
 
     return visit
+
+
+def _draws_own_numbers(part: Extinction) -> bool:
+    """Whether flights through a part take any number of random numbers."""
+    return _is_tracked(part) or isinstance(part, GaussianExtinction)
 
 
 def _is_tracked(part: Extinction) -> bool:

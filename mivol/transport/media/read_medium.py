@@ -14,12 +14,14 @@ import mitsuba as mi
 import numpy as np
 
 from mivol.errors import MivolError
+from mivol.fields.gaussians import GaussianField
 from mivol.fields.protocol import BOUNDED, Field
 from mivol.transport.media.activated_grid_extinction import ActivatedGridExtinction
 from mivol.transport.media.bounded_extinction import BoundedExtinction
 from mivol.transport.media.box import Box
 from mivol.transport.media.constant_extinction import ConstantExtinction
 from mivol.transport.media.extinction import Extinction
+from mivol.transport.media.gaussian_extinction import GaussianExtinction
 from mivol.transport.media.grid_extinction import GridExtinction
 from mivol.transport.media.medium_view import MediumView
 from mivol.transport.traversal.lattice import Lattice
@@ -52,7 +54,7 @@ def view_medium(medium: mi.Medium, boundary: Box | None = None, places: dict | N
     places = {} if places is None else places
     scale = mi.Float(params["scale"]) if "scale" in params.properties else mi.Float(1)
     parts = [
-        _bounded_part(name, children[name].mivol_extinction, scale)
+        _field_part(name, children[name].mivol_extinction, scale)
         if hasattr(children[name], "mivol_extinction")
         else _part(name, params, children[name], kind, boundary, places)
         for name in names
@@ -180,18 +182,23 @@ def traverse_medium(medium: mi.Medium) -> mi.SceneParameters:
     return params
 
 
-def _bounded_part(name: str, field: Field, scale: mi.Float) -> BoundedExtinction:
-    """The part of an extinction that a bounded field is.
+def _field_part(name: str, field: Field | GaussianField, scale: mi.Float) -> BoundedExtinction | GaussianExtinction:
+    """The part of an extinction that a field of a shell of ours is.
 
     Raises:
-        MivolError: a field of another kind, a majorant that is none, or a recording, in which no majorant can be read.
+        MivolError: a field of another kind, a majorant that is none, or a recording, in which no majorant can be read, and no
+            Gaussians be listed.
     """
-    if field.line != BOUNDED:
-        raise MivolError(f"{name} is a {type(field).__name__} that declares {field.line!r}; media read {BOUNDED!r} fields.")
-    if dr.flag(dr.JitFlag.FreezingScope):
+    has_lists = isinstance(field, GaussianField)
+    if field.line != BOUNDED and not has_lists:
         raise MivolError(
-            f"{name} is a {type(field).__name__}, whose majorant cannot be read while dr.freeze records: render without it."
+            f"{name} is a {type(field).__name__} that declares {field.line!r}; media read {BOUNDED!r} fields and Gaussians."
         )
+    if dr.flag(dr.JitFlag.FreezingScope):
+        what = "whose cells cannot be listed" if has_lists else "whose majorant cannot be read"
+        raise MivolError(f"{name} is a {type(field).__name__}, {what} while dr.freeze records: render without it.")
+    if has_lists:
+        return GaussianExtinction(name, field, dr.detach(scale))
     majorant = max(field.bound())
     if not 0 <= majorant < np.inf:
         raise MivolError(f"the majorant of {name}, a {type(field).__name__}, is {majorant:.4g}; a finite one is expected.")

@@ -60,6 +60,7 @@ class SegmentQuestion:
         is_bounded: some medium is known by a majorant only.
         scatterings: largest number of scattering events between an emitter and the camera; may be infinite.
         refracts: the boundary of some medium bends or blurs the light that passes it, so that no straight shadow ray does.
+        has_gaussians: some medium is made of Gaussians, in which no cell has a polynomial to draw a distance from.
     """
 
     scatters: bool
@@ -68,11 +69,12 @@ class SegmentQuestion:
     is_bounded: bool = False
     scatterings: float = 1
     refracts: bool = False
+    has_gaussians: bool = False
 
     @property
     def is_single(self) -> bool:
         """Whether straight shadow rays from one scattering event on a segment find all light."""
-        return self.scatterings <= 1 and not (self.emits or self.is_bounded or self.refracts)
+        return self.scatterings <= 1 and not (self.emits or self.is_bounded or self.refracts or self.has_gaussians)
 
 
 @dataclass(frozen=True)
@@ -130,7 +132,7 @@ SEGMENT_ESTIMATORS = {
         lambda choice: SingleScattering(choice.direct, choice.count, choice.visibility_cache),
         lambda asked: asked.scatters and asked.is_single and not asked.deterministic,
         1,
-        "a medium scatters once, none emits or is bounded, and no boundary refracts",
+        "a medium scatters once, none emits, is bounded or made of Gaussians, and no boundary refracts",
         "no bias",
         (
             *("chao_1982", "kulla_2012", "miller_2019", "veach_1995"),
@@ -141,7 +143,7 @@ SEGMENT_ESTIMATORS = {
         lambda choice: FreeFlight(choice.direct.media),
         lambda asked: asked.scatters and not asked.is_single and not asked.deterministic,
         math.inf,
-        "media scatter any number of times, emit beside it, are bounded, or lie behind boundaries that refract",
+        "media scatter any number of times, emit beside it, are bounded or Gaussians, or lie behind boundaries that refract",
         "no bias; variance of one flight a segment",
         (
             *("woodcock_1965", "hofmann_2021", "amanatides_1987", "veach_1995", "wilkie_2014", "miller_2019"),

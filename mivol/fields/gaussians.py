@@ -1,0 +1,212 @@
+"""Gaussians as an extinction that rays are traced through: parameters, rows, and the lists of cells that hold them.
+
+Conventions. Parameters are the pre-images of the activations, as :mod:`mivol.points.gaussians` has them, by the same names:
+"means" (N, 3), "log_scales" (N, 3), "quaternions" (N, 4), "opacity_logits" (N,). The extinction of one along a line is that of
+:mod:`mivol.fields.gaussian_line`; they add up. A Gaussian ends ``REACH`` standard deviations from its mean.
+
+Two things are cut: an opacity above ``MOST_OPAQUE`` counts as that one (1 would be an infinite extinction), a scale below
+``LEAST_SCALE`` of the box as that one (float32 places no ray nearer). Both have no derivative there.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mivol.errors import MivolError
+from mivol.fields.gaussian_cells import CellLists, list_gaussians
+from mivol.fields.gaussian_grid import MOST_OPAQUE
+from mivol.fields.gaussian_line import REACH, ROW, Line, cross, read_row
+from mivol.fields.protocol import EXACT_LINE
+from mivol.points.gaussian_files import read_gaussians
+from mivol.points.gaussians import Gaussians
+from mivol.space import check_affine
+
+__all__ = ["LEAST_SCALE", "NAMES", "GaussianField"]
+
+NAMES = ("means", "log_scales", "quaternions", "opacity_logits")
+"""The parameters of the extinction."""
+
+LEAST_SCALE = 1e-6
+"""Smallest standard deviation, in edges of the box."""
+
+
+class GaussianField:
+    """A sum of Gaussians of extinction [1/length] (:class:`mivol.fields.protocol.Field`).
+
+    Args:
+        tensors: the parameters by name.
+        place: (4, 4) affine map of the Gaussians to the world; their opacities stay as they are.
+
+    Raises:
+        MivolError: parameters that no Gaussian has, by the index of the first, or lists that do not fit into memory.
+
+    Attributes:
+        lists: the Gaussians of each cell.
+        starts, entries: the same as arrays of the device.
+        flat: the rows of all Gaussians, without derivatives, for a scale of 1.
+    """
+
+    line = EXACT_LINE
+    channels = 1
+
+    def __init__(self, tensors: Mapping[str, mi.TensorXf], place: np.ndarray) -> None:
+        self.tensors, self.place = dict(tensors), check_affine(place)
+        self.refresh()
+
+    @classmethod
+    def of(cls, gaussians: Gaussians, place: np.ndarray) -> GaussianField:
+        """The field of some Gaussians, without their colours."""
+        return cls({name: mi.TensorXf(getattr(gaussians, name)) for name in NAMES}, place)
+
+    @classmethod
+    def from_props(cls, props: mi.Properties) -> GaussianField:
+        """Read Gaussians from plugin parameters: ``filename``, or the tensors in :data:`NAMES`; ``to_world``.
+
+        Raises:
+            MivolError: none or both of the sources, half of the tensors, or numbers that no Gaussian has.
+        """
+        place = np.array(props.get("to_world", mi.ScalarTransform4f()).matrix, dtype=np.float64)
+        tensors = [name for name in NAMES if name in props]
+        if ("filename" in props) == bool(tensors) or 0 < len(tensors) < len(NAMES):
+            found = " and ".join([*(["filename"] if "filename" in props else []), *tensors]) or "none of them"
+            raise MivolError(f"mivol_gaussians was given {found}; give filename, or {', '.join(NAMES)}.")
+        if tensors:
+            return cls({name: mi.TensorXf(props[name]) for name in NAMES}, place)
+        return cls.of(read_gaussians(str(mi.file_resolver().resolve(props["filename"]))), place)
+
+    def refresh(self) -> None:
+        """List the Gaussians anew, after parameters have changed. Reads them: not while ``dr.freeze`` records."""
+        values = {name: np.array(dr.detach(self.tensors[name])) for name in NAMES}
+        read = Gaussians(**values, harmonics=np.zeros((len(values["means"]), 1, 3))).checked("Gaussians of a medium")
+        means = read.means.astype(np.float64) @ self.place[:3, :3].T + self.place[:3, 3]
+        self.least_scale = _least_scale(read)
+        scales = np.maximum(read.scales().astype(np.float64), self.least_scale)
+        whitening = np.swapaxes(read.rotations().astype(np.float64), 1, 2) / scales[:, :, None]
+        whitening = whitening @ np.linalg.inv(self.place[:3, :3])
+        self.lists: CellLists = list_gaussians(means, whitening, REACH)
+        depth = -np.log1p(-np.minimum(read.opacities().astype(np.float64), MOST_OPAQUE))
+        # |W omega| is largest along the shortest axis.
+        largest = np.linalg.norm(whitening, ord=2, axis=(1, 2))
+        self._bound = self.lists.largest_sum(depth * largest) / math.sqrt(2 * math.pi)
+        self.starts, self.entries = mi.UInt32(self.lists.starts), mi.UInt32(self.lists.entries)
+        # Mitsuba asks media for their extinction inside of loops, where nothing can be made beforehand.
+        edge, nodes = np.diag(self.to_world)[:3], self.lists.res[::-1]
+        self._low = [dr.opaque(mi.Float, float(x)) for x in self.to_world[:3, 3]]
+        self._pace = [dr.opaque(mi.Float, float(n / x)) for n, x in zip(nodes, edge, strict=True)]
+        with dr.suspend_grad():
+            self.flat = dr.detach(self.rows(mi.Float(1)))
+        dr.eval(self.flat)
+
+    @property
+    def count(self) -> int:
+        """N."""
+        return self.tensors["means"].shape[0]
+
+    @property
+    def to_world(self) -> np.ndarray:
+        """(4, 4) float64, the unit cube to the box that holds all Gaussians."""
+        return self.lists.to_world
+
+    def rows(self, scale: mi.Float) -> mi.Float:
+        """The rows of all Gaussians (:mod:`mivol.fields.gaussian_line`), attached to the parameters and to a medium's scale."""
+        means, log_scales, quaternions = (_columns(self.tensors[name], n) for name, n in zip(NAMES, (3, 3, 4), strict=False))
+        shift = [[mi.Float(float(v)) for v in row] for row in self.place[:3]]
+        mean = [r[0] * means[0] + r[1] * means[1] + r[2] * means[2] + r[3] for r in shift]
+        least = dr.opaque(mi.Float, self.least_scale)
+        step = [dr.rcp(dr.maximum(dr.exp(s), least)) for s in log_scales]
+        back = np.linalg.inv(self.place[:3, :3]).tolist()
+        whitening = [
+            [step[k] * sum(axis[i] * back[i][j] for i in range(3)) for j in range(3)]
+            for k, axis in enumerate(_axes(quaternions))
+        ]
+        opacity = dr.minimum(_logistic(self.tensors["opacity_logits"].array), MOST_OPAQUE)
+        numbers = [*(w for row in whitening for w in row), *mean, opacity, dr.repeat(scale, self.count)]
+        return dr.ravel(mi.ArrayXf([*numbers, *(dr.zeros(mi.Float, self.count) for _ in range(ROW - len(numbers)))]))
+
+    def eval(self, p: mi.Point3f, w: mi.Vector3f, active: mi.Bool) -> list[mi.Float]:
+        """The extinction [1/length] at world points, for light that travels along ``w``; without derivatives."""
+
+        def add(total: mi.Float, line: Line, index: mi.UInt32) -> mi.Float:
+            return total + line.density
+
+        return [self.each_at(mi.Ray3f(p, w), active, dr.zeros(mi.Float, dr.width(p)), add)]
+
+    def each_at(self, ray: mi.Ray3f, active: mi.Bool, state: Any, add: Callable[..., Any]) -> Any:
+        """Visit the Gaussians that may reach the origins of rays: ``add(state, line, index) -> state``."""
+        cell, inside = [], mi.Bool(active)
+        for x, low, pace, n in zip(mi.Point3f(ray.o), self._low, self._pace, self.lists.res[::-1], strict=True):
+            u = (x - low) * pace
+            inside &= (u >= 0) & (u <= n)
+            cell.append(dr.clip(mi.Int32(dr.floor(u + 0.5)), 0, n))
+        return self.each_in(mi.Vector3i(*cell), (ray.o, ray.d), inside, state, add)
+
+    def each_in(
+        self,
+        cell: mi.Vector3i,
+        through: tuple[mi.Point3f, mi.Vector3f],
+        on: mi.Bool,
+        state: Any,
+        add: Callable[..., Any],
+    ) -> Any:
+        """Visit the Gaussians of a cell (each index from 0 to N): ``add(state, line, index) -> state``.
+
+        Args:
+            cell: of each lane.
+            through: a point of a line, and its direction, which the Gaussians see.
+            on: lanes that visit.
+            state: any PyTree of Dr.Jit arrays.
+            add: called once, while the loop is traced; ``line.hits`` tells the lanes that count.
+        """
+        _, y, x = (n + 1 for n in self.lists.res)
+        number = mi.UInt32((cell.z * y + cell.y) * x + cell.x)
+        start, end = (dr.gather(mi.UInt32, self.starts, number + k, on) for k in (0, 1))
+        entries, rows = self.entries, self.flat
+
+        def visit(at: mi.UInt32, state: Any) -> tuple[mi.UInt32, Any]:
+            index = dr.gather(mi.UInt32, entries, at)
+            line = cross(read_row(rows, index), *through)
+            return at + 1, add(state, line, index)
+
+        return dr.while_loop((start, state), lambda at, _: on & (at < end), visit, label="Gaussians of a cell")[1]
+
+    def bound(self) -> list[float]:
+        """An upper bound of the extinction [1/length]: of all that share a cell, each at its mean along its shortest axis."""
+        return [self._bound]
+
+    def parameters(self) -> dict[str, Any]:
+        """The parameters by name."""
+        return self.tensors
+
+
+def _columns(tensor: mi.TensorXf, width: int) -> list[mi.Float]:
+    """The columns of a tensor (N, width)."""
+    index = dr.arange(mi.UInt32, tensor.shape[0]) * width
+    return [dr.gather(mi.Float, tensor.array, index + c) for c in range(width)]
+
+
+def _axes(quaternions: list[mi.Float]) -> list[list[mi.Float]]:
+    """The axes of each Gaussian in the world: columns of its rotation, for quaternions (w, x, y, z) of any length but 0."""
+    inverse = dr.rsqrt(sum((q * q for q in quaternions[1:]), quaternions[0] * quaternions[0]))
+    w, x, y, z = (q * inverse for q in quaternions)
+    return [
+        [1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)],
+        [2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)],
+        [2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)],
+    ]
+
+
+def _logistic(logit: mi.Float) -> mi.Float:
+    """1 / (1 + exp(-x))."""
+    return dr.rcp(1 + dr.exp(-logit))
+
+
+def _least_scale(gaussians: Gaussians) -> float:
+    """The smallest standard deviation that counts, in the Gaussians' own lengths."""
+    spread = REACH * np.sqrt(np.diagonal(gaussians.covariances().astype(np.float64), axis1=1, axis2=2))
+    return LEAST_SCALE * float(((gaussians.means + spread).max(axis=0) - (gaussians.means - spread).min(axis=0)).max())

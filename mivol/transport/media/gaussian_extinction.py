@@ -1,0 +1,171 @@
+"""The extinction of Gaussians: each is met once along a ray, in the cell where the ray enters it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import drjit as dr
+import mitsuba as mi
+
+from mivol.fields.gaussian_line import ROW, SCALE, Line, Slopes, change_of, read_row
+from mivol.fields.gaussians import GaussianField
+from mivol.numerics import greater, lesser
+from mivol.transport.media.extinction import RayInterval
+from mivol.transport.traversal.grid_walk import Cell, walk
+from mivol.transport.traversal.lattice import Lattice, Segment, clip
+
+__all__ = ["GaussianExtinction", "Passage"]
+
+
+@dataclass
+class Passage:
+    """The part of an interval of a ray inside the box of the Gaussians.
+
+    Attributes:
+        segment: in their lattice.
+        o, d: the point where it begins, and its direction; distances are from there [length].
+        active: lanes that have it.
+    """
+
+    segment: Segment
+    o: mi.Point3f
+    d: mi.Vector3f
+    active: mi.Bool
+
+
+@dataclass
+class GaussianExtinction:
+    """A sum of Gaussians, grey (:class:`mivol.transport.media.extinction.ExactExtinction`).
+
+    Attributes:
+        name: ``sigma_t``, ``sigma_a`` or ``sigma_s``.
+        field: the Gaussians.
+        scale: of the medium, without derivatives.
+    """
+
+    name: str
+    field: GaussianField
+    scale: mi.Float
+    exact_line: ClassVar[bool] = True
+    is_constant: ClassVar[bool] = False
+    lattice: ClassVar[None] = None
+    channels: ClassVar[int] = 1
+
+    def __post_init__(self) -> None:
+        self.cells = Lattice(dr.zeros(mi.TensorXf, (*self.field.lists.res, 1)), self.field.to_world)
+
+    def scaled(self, scale: mi.Float) -> mi.Float:
+        return self.field.rows(scale)
+
+    def start_gradient(self) -> mi.Float:
+        return dr.zeros(mi.Float, ROW * self.field.count)
+
+    def deliver(self, scale: mi.Float, gradient: mi.Float) -> mi.Float:
+        dr.eval(gradient)
+        return dr.sum(self.scaled(scale) * gradient)
+
+    def integrate(self, interval: RayInterval, enough: mi.Float | None = None) -> list[mi.Float]:
+        def add(tau: mi.Float, line: Line, index: mi.UInt32, ends: tuple[mi.Float, mi.Float], here: mi.Bool) -> mi.Float:
+            return dr.select(here, tau + line.depth * line.share(*ends), tau)
+
+        until = None if enough is None else lambda tau: tau > enough
+        passage = self.enter(interval)
+        return [self.each_along(passage, dr.zeros(mi.Float, dr.width(passage.d)), add, until)]
+
+    def jvp(self, tangent: mi.Float, interval: RayInterval) -> list[mi.Float]:
+        def add(tau: mi.Float, line: Line, index: mi.UInt32, ends: tuple[mi.Float, mi.Float], here: mi.Bool) -> mi.Float:
+            own = self._push(line, line.share_slopes(*ends), line.depth * line.share(*ends), tangent, index)
+            return dr.select(here, tau + own, tau)
+
+        passage = self.enter(interval)
+        return [self.each_along(passage, dr.zeros(mi.Float, dr.width(passage.d)), add)]
+
+    def vjp(self, gradient: mi.Float, weight: list[mi.Float], interval: RayInterval) -> None:
+        def add(state: tuple, line: Line, index: mi.UInt32, ends: tuple[mi.Float, mi.Float], here: mi.Bool) -> tuple:
+            own = line.depth * line.share(*ends)
+            self._pull(gradient, line, line.share_slopes(*ends), (own, weight[0]), index, here)
+            return state
+
+        self.each_along(self.enter(interval), (), add)
+
+    def eval_at(self, scale: mi.Float, ray: mi.Ray3f, t: mi.Float, active: mi.Bool) -> list[mi.Float]:
+        return [dr.detach(scale) * value for value in self.field.eval(ray(t), ray.d, active)]
+
+    def jvp_at(self, tangent: mi.Float, ray: mi.Ray3f, t: mi.Float, active: mi.Bool) -> list[mi.Float]:
+        def add(total: mi.Float, line: Line, index: mi.UInt32) -> mi.Float:
+            own = self._push(line, line.density_slopes, line.density, tangent, index)
+            return dr.select(line.holds_origin, total + own, total)
+
+        there = mi.Ray3f(ray(t), ray.d)
+        return [self.field.each_at(there, active, dr.zeros(mi.Float, dr.width(there)), add)]
+
+    def vjp_at(self, gradient: mi.Float, weight: list[mi.Float], ray: mi.Ray3f, t: mi.Float, active: mi.Bool) -> None:
+        def add(state: tuple, line: Line, index: mi.UInt32) -> tuple:
+            self._pull(gradient, line, line.density_slopes, (line.density, weight[0]), index, line.holds_origin)
+            return state
+
+        self.field.each_at(mi.Ray3f(ray(t), ray.d), active, (), add)
+
+    def enter(self, interval: RayInterval) -> Passage:
+        """The part of an interval inside the box, seen from where it begins: far from the origin float32 has few digits."""
+        ray = interval.ray
+        segment = clip(self.cells, ray.o, ray.d, interval.t0, interval.t1)
+        there = (dr.fma(segment.start, mi.Float64(v), mi.Float64(x)) for x, v in zip(ray.o, ray.d, strict=True))
+        return Passage(segment, mi.Point3f(*(mi.Float(x) for x in there)), ray.d, interval.active & (segment.length > 0))
+
+    def each_along(
+        self,
+        passage: Passage,
+        state: Any,
+        add: Callable[..., Any],
+        until: Callable[[Any], mi.Bool] | None = None,
+        leave: Callable[[Any, Cell], Any] | None = None,
+    ) -> Any:
+        """Visit once each Gaussian that a passage meets, in the cell where it enters it.
+
+        Args:
+            passage: from :meth:`enter`.
+            state: any PyTree of Dr.Jit arrays.
+            add: ``add(state, line, index, ends, here) -> state``: the distances at which the passage enters the Gaussian and
+                leaves it, and the lanes in which it does. Called once, while the loop is traced.
+            until: ``until(state) -> mask`` of lanes that need not go on, asked after each cell; None to go to the end.
+            leave: ``leave(state, cell) -> state``, after the Gaussians of a cell; None for nothing.
+
+        Cost: a cell asks each Gaussian of its list whether the line comes near, and where.
+        """
+        field, through, length = self.field, (passage.o, passage.d), passage.segment.length
+
+        def visit(state: Any, cell: Cell, on: mi.Bool) -> Any:
+            def meet(state: Any, line: Line, index: mi.UInt32) -> Any:
+                start, end = line.chord
+                ends = greater(start, 0), lesser(end, length)
+                # Cells follow each other without a gap, so the place of entry lies in one of them.
+                here = line.hits & (ends[1] > ends[0]) & (ends[0] >= cell.s) & (ends[0] < cell.s + cell.dt)
+                return add(state, line, index, ends, here)
+
+            state = field.each_in(cell.lower + 1, through, on, state, meet)
+            return state if leave is None else leave(state, cell)
+
+        return walk(self.cells, passage.segment, visit, state, (), passage.active, until)
+
+    def _push(self, line: Line, slopes: Slopes, value: mi.Float, tangent: mi.Float, index: mi.UInt32) -> mi.Float:
+        """The tangent of the scale times a value that has these derivatives."""
+        change = read_row(tangent, index)
+        return self.scale * change_of(line, slopes, change) + value * change[SCALE]
+
+    def _pull(
+        self,
+        gradient: mi.Float,
+        line: Line,
+        slopes: Slopes,
+        value: tuple[mi.Float, mi.Float],
+        index: mi.UInt32,
+        on: mi.Bool,
+    ) -> None:
+        """Add to the gradient of a row: ``value`` is a number with these derivatives, and d loss / d (scale times it)."""
+        own, weight = value
+        entries = [self.scale * weight * slope for slope in slopes.by_row(line)]
+        packet = mi.ArrayXf([*entries, weight * own, *(mi.Float(0) for _ in range(ROW - len(entries) - 1))])
+        dr.scatter_add(gradient, packet, index, on, mode=dr.ReduceMode.Expand)
