@@ -26,6 +26,8 @@ class MivolIntegrator(mi.ad.integrators.common.ADIntegrator):
         shadows: exact; estimated: without bias, from a few look-ups, in pictures (gradients walk every cell); grid: with
             ``deterministic``, looked up in a lattice of optical depths; auto: exact, or estimated where grids are fine. Default
             auto.
+        media_light: how light that media emit finds what scatters it. drawn: points of them are drawn, too; met: by chance;
+            auto: whichever is predicted to reach an error sooner. Default auto.
         aovs: comma list of tau, tau.R, tau.G, tau.B, alpha, depth; appended to the colours in the order named.
     """
 
@@ -36,6 +38,7 @@ class MivolIntegrator(mi.ad.integrators.common.ADIntegrator):
             _read(props, "hide_emitters", False),
             _read(props, "deterministic", False),
             _read(props, "shadows", "auto"),
+            _read(props, "media_light", "auto"),
         )
         self.session = Session(settings, _read(props, "aovs", ""))
         super().__init__(props)

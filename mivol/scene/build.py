@@ -6,10 +6,13 @@ import drjit as dr
 import mitsuba as mi
 
 from mivol.scene.facts import Needs
+from mivol.scene.media_light import find_emitting_boxes
 from mivol.scene.plan import Plan
 from mivol.scene.readings import read_block_ranges, read_coarse, read_empty_distances
 from mivol.scene.survey import SceneSurvey
 from mivol.transport.estimators.direct_lighting import DirectLighting
+from mivol.transport.estimators.emission_sampling import EmissionSampling
+from mivol.transport.estimators.emission_table import EmissionTable
 from mivol.transport.estimators.transmittance_grid import build_transmittance_grid
 from mivol.transport.estimators.visibility_cache import VisibilityCache, build_visibility_cache
 from mivol.transport.media.body import Body
@@ -60,7 +63,15 @@ def build_estimators(
     segment = SEGMENT_ESTIMATORS[plan.segment].make(choice)
     lights_media = segment.ends_in_media and any(kind != "uniform" for kind in needs.emitter_kinds)
     lobe = None if plan.lobe is None else dr.opaque(mi.Float, plan.lobe)
-    return Estimators(direct, segment, lights_surfaces, lights_media, lobe)
+    emission = _draw_emission(scene, media, needs) if plan.draws_emission else None
+    return Estimators(direct, segment, lights_surfaces, lights_media, lobe, emission)
+
+
+def _draw_emission(scene: mi.Scene, media: SceneMedia, needs: Needs) -> EmissionSampling:
+    """The estimator of light of media, by the table that was read of them."""
+    found = needs.media_light
+    table = EmissionTable(find_emitting_boxes(scene, media, needs), found.density, found.cumulative)
+    return EmissionSampling(media, table)
 
 
 def _find_visibility(

@@ -17,6 +17,7 @@ __all__ = [
     "choose_events",
     "choose_flights",
     "choose_lighting",
+    "choose_media_light",
     "choose_shadows",
     "choose_side_flights",
     "choose_skipping",
@@ -217,6 +218,30 @@ def choose_side_flights(needs: Needs, settings: Settings, segment: str) -> tuple
         return None, []
     why = f"emitters are at infinity, and a phase function has a mean cosine of {cosine:.2f}"
     return min(cosine, 0.95), [Choice("side flights", "towards the emitter of the next collision", why)]
+
+
+def choose_media_light(needs: Needs, settings: Settings) -> tuple[bool, list[Choice]]:
+    """Whether light that media emit is drawn where paths scatter."""
+    about = "light of media"
+    if settings.scatterings < 1 or not any(m.emits for m in needs.media):
+        return False, []
+    if not needs.surfaces and not any(m.is_scattering for m in needs.media):
+        return False, []
+    if settings.media_light == "met":
+        return False, [Choice(about, "met by chance", "it was asked for")]
+    found = needs.media_light
+    if found is None:
+        return False, [Choice(about, "met by chance", _why_unread(needs))]
+    draws, gain = settings.media_light == "drawn" or found.gain > 1, f"{found.gain:.2g} times as soon as chance alone"
+    what = "drawn by where they emit, and met by chance" if draws else "met by chance"
+    return draws, [Choice(about, what, f"draws are predicted to reach an error {gain}")]
+
+
+def _why_unread(needs: Needs) -> str:
+    """Why light of media cannot be drawn."""
+    if any(m.unread for m in needs.media):
+        return "where media emit cannot be read while dr.freeze records"
+    return "a medium that emits fills no shape of its own, or shapes are instances"
 
 
 def choose_events(needs: Needs, settings: Settings, segment: str) -> tuple[int, list[Choice]]:

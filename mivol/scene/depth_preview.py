@@ -130,7 +130,7 @@ def _mean_square(lost: NDArray) -> float:
 def _preview(scene: mi.Scene, sensor: mi.Sensor, survey: SceneSurvey, settings: Settings) -> NDArray:
     """Mean radiance of all colours of each cell (batches, cells)."""
     cells = SIDE * SIDE
-    needs = find_needs(scene, sensor, survey, cells * BATCHES * SAMPLES)
+    needs = find_needs(scene, sensor, survey, cells * BATCHES * SAMPLES, settings.may_draw_emission)
     plan = make_plan(needs, settings)
     estimators = build_estimators(scene, needs, plan, settings, survey, pictures=True)
     n = BATCHES * cells * SAMPLES

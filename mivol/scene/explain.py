@@ -97,11 +97,11 @@ def examine(
     """What :func:`explain` says, with the refusal by itself; arguments as there."""
     loaded = scene if isinstance(scene, mi.Scene) else mi.load_file(str(scene))
     eye = find_sensor(loaded, sensor)
+    settings = settings_of(loaded) if max_depth is None else Settings(max_depth=max_depth)
     try:
-        needs = find_needs(loaded, eye, survey_scene(loaded))
+        needs = find_needs(loaded, eye, survey_scene(loaded), reads_emission=settings.may_draw_emission)
     except MivolError as error:
         return Explanation(("facts", *_plain_facts(loaded), *_warnings(loaded)), str(error))
-    settings = settings_of(loaded) if max_depth is None else Settings(max_depth=max_depth)
     facts = ("facts", *_facts(needs), *_warnings(loaded))
     try:
         return Explanation((*facts, *_plan(loaded, eye, needs, settings, noise)))

@@ -9,7 +9,7 @@ import mitsuba as mi
 from mivol.transport.media.box import Box
 from mivol.transport.media.medium_view import MediumView
 
-__all__ = ["Boundary", "MediumFacts", "Needs"]
+__all__ = ["Boundary", "MediaLight", "MediumFacts", "Needs"]
 
 
 @dataclass(frozen=True)
@@ -67,6 +67,20 @@ class MediumFacts:
     mean_cosine: float | None = None
 
 
+@dataclass
+class MediaLight:
+    """What was read of the light that media emit.
+
+    Attributes:
+        density, cumulative: of :class:`mivol.transport.estimators.emission_table.EmissionTable`.
+        gain: how much sooner draws of it reach an error than chance does [1], as predicted.
+    """
+
+    density: mi.Float
+    cumulative: mi.Float
+    gain: float
+
+
 @dataclass(frozen=True)
 class Needs:
     """The facts of a scene that a plan is made from.
@@ -88,6 +102,8 @@ class Needs:
         parameters: keys whose derivatives are asked for.
         places: those of them that are of shapes and sensors.
         film_samples: pixels times samples of the sensor asked about.
+        media_light: what was read of the light that media emit; None where none does, where nothing scatters it, or where it
+            could not be read.
     """
 
     variant: str
@@ -105,3 +121,4 @@ class Needs:
     parameters: tuple[str, ...]
     places: tuple[str, ...]
     film_samples: int
+    media_light: MediaLight | None = None

@@ -7,12 +7,15 @@ been replaced, and never while a function is being recorded by ``dr.freeze``.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from mivol.scene.depth_two import mean_cosine
 from mivol.scene.facts import Boundary, MediumFacts, Needs
+from mivol.scene.media_light import read_media_light
 from mivol.scene.nesting import bounds
 from mivol.scene.parsing import check_variant
 from mivol.scene.readings import Reading, check_light, check_numbers, is_scattering, read_part
@@ -24,7 +27,9 @@ from mivol.transport.media.read_medium import kind_of, view_medium
 __all__ = ["find_needs"]
 
 
-def find_needs(scene: mi.Scene, sensor: mi.Sensor, survey: SceneSurvey | None = None, spp: int = 0) -> Needs:
+def find_needs(
+    scene: mi.Scene, sensor: mi.Sensor, survey: SceneSurvey | None = None, spp: int = 0, reads_emission: bool = True
+) -> Needs:
     """Ask a scene what it needs.
 
     Args:
@@ -32,6 +37,7 @@ def find_needs(scene: mi.Scene, sensor: mi.Sensor, survey: SceneSurvey | None = 
         sensor: the one to render from.
         survey: an earlier survey of the same scene, to save finding what cannot have changed.
         spp: samples a pixel; 0 for the sampler's own count.
+        reads_emission: look at where media emit, so that a plan may draw their light.
 
     Raises:
         MivolError: a variant or a medium that mivol does not render.
@@ -45,7 +51,7 @@ def find_needs(scene: mi.Scene, sensor: mi.Sensor, survey: SceneSurvey | None = 
     params = mi.traverse(scene)
     asked = tuple(k for k, v in params if dr.grad_enabled(v))
     media = tuple(_facts(b, view, survey, recording) for b, view in zip(boundaries, views, strict=True))
-    return Needs(
+    needs = Needs(
         variant=mi.variant(),
         boundaries=boundaries,
         views=views,
@@ -62,6 +68,11 @@ def find_needs(scene: mi.Scene, sensor: mi.Sensor, survey: SceneSurvey | None = 
         places=tuple(k for k in asked if _is_place(k, params.properties[k][2])),
         film_samples=int(np.prod(sensor.film().crop_size())) * (spp or sensor.sampler().sample_count()),
     )
+    scatters = needs.surfaces or any(m.is_scattering for m in media)
+    refused = any(m.bounded or m.gaussians for m in media)
+    if recording or refused or not (reads_emission and scatters and any(m.emits for m in media)):
+        return needs
+    return replace(needs, media_light=read_media_light(scene, sensor, needs, survey))
 
 
 def _is_place(key: str, owner: object) -> bool:

@@ -18,6 +18,7 @@ from mivol.scene.choices import (
     choose_events,
     choose_flights,
     choose_lighting,
+    choose_media_light,
     choose_shadows,
     choose_side_flights,
     choose_skipping,
@@ -28,6 +29,7 @@ from mivol.scene.choices import (
 from mivol.scene.facts import Needs
 from mivol.scene.refusals import (
     refuse_bounded,
+    refuse_draws,
     refuse_emission,
     refuse_gaussians,
     refuse_places,
@@ -56,7 +58,8 @@ class Plan:
     ``segment`` names the estimator of what media add along a segment, in
     :data:`mivol.transport.path.estimators.SEGMENT_ESTIMATORS`; ``events`` how many points of a camera ray scatter in
     pictures; ``pass_rays`` how many rays a pass may hold; ``gradient_bytes`` what a gradient step takes beyond the rays;
-    ``lobe`` the mean cosine of the lobe that side flights are drawn from, None for no side flights.
+    ``lobe`` the mean cosine of the lobe that side flights are drawn from, None for no side flights; ``draws_emission`` whether
+    light that media emit is drawn where paths scatter.
     """
 
     choices: tuple[Choice, ...]
@@ -67,6 +70,7 @@ class Plan:
     pass_rays: int
     gradient_bytes: int
     lobe: float | None = None
+    draws_emission: bool = False
 
 
 def make_plan(needs: Needs, settings: Settings, aovs: tuple[str, ...] = ()) -> Plan:
@@ -82,6 +86,7 @@ def make_plan(needs: Needs, settings: Settings, aovs: tuple[str, ...] = ()) -> P
     refuse_places(needs)
     refuse_bounded(needs, settings, aovs)
     refuse_gaussians(needs, aovs)
+    refuse_draws(needs, settings)
     segment = _segment(needs, settings)
     choices = [
         choose_transport(needs, settings, segment),
@@ -107,7 +112,9 @@ def make_plan(needs: Needs, settings: Settings, aovs: tuple[str, ...] = ()) -> P
     choices.append(choice)
     lobe, why = choose_side_flights(needs, settings, segment)
     choices += why
-    return Plan(tuple(choices), skips, tracks, segment, events, pass_rays, memory, lobe)
+    draws_emission, why = choose_media_light(needs, settings)
+    choices += why
+    return Plan(tuple(choices), skips, tracks, segment, events, pass_rays, memory, lobe, draws_emission)
 
 
 def _segment(needs: Needs, settings: Settings) -> str:

@@ -8,7 +8,7 @@ import mitsuba as mi
 import numpy as np
 
 from mivol.errors import MivolError
-from mivol.scene.choices import is_lit, shares_cells
+from mivol.scene.choices import choose_media_light, is_lit, shares_cells
 from mivol.scene.facts import Needs
 from mivol.transport.line_integrals.aovs import AOVS
 from mivol.transport.media.medium_view import MediumView
@@ -18,6 +18,7 @@ from mivol.transport.path.settings import Settings
 __all__ = [
     "check_aovs",
     "refuse_bounded",
+    "refuse_draws",
     "refuse_emission",
     "refuse_gaussians",
     "refuse_places",
@@ -28,6 +29,10 @@ __all__ = [
 
 SHADOWS = ("auto", "exact", "estimated", "grid")
 """How shadows are found: ``exact``, in a ``grid`` (quadrature) or ``estimated`` (Monte Carlo images); ``auto`` chooses."""
+
+
+MEDIA_LIGHT = ("auto", "drawn", "met")
+"""How light that media emit finds what scatters it: points of them are ``drawn`` too, or it is ``met`` by chance."""
 
 
 def check_aovs(names: str) -> tuple[str, ...]:
@@ -124,6 +129,16 @@ def refuse_quadrature(needs: Needs, settings: Settings) -> None:
             f"shadows is 'grid' and {constant} of the medium in {needs.media[0].name} is a constant, which may fill more than "
             "the cells that shadows are looked up in: set shadows to exact."
         )
+
+
+def refuse_draws(needs: Needs, settings: Settings) -> None:
+    """Refuse draws of light of media where they are asked for and cannot be made."""
+    if settings.media_light not in MEDIA_LIGHT:
+        known = f"{', '.join(MEDIA_LIGHT[:-1])} or {MEDIA_LIGHT[-1]}"
+        raise MivolError(f"media_light is {settings.media_light!r}; {known} is expected.")
+    draws, why = choose_media_light(needs, settings)
+    if settings.media_light == "drawn" and why and not draws:
+        raise MivolError(f"media_light is 'drawn', and {why[0].reason}: leave it at auto.")
 
 
 def refuse_bounded(needs: Needs, settings: Settings, aovs: tuple[str, ...]) -> None:

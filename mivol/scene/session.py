@@ -135,7 +135,7 @@ class Session:
         if self._surveyed is None or not self._surveyed.is_of(parts) or not self._surveyed.survey.is_current:
             self._surveyed = _SurveyedScene(parts, survey_scene(scene))
         survey = self._surveyed.survey
-        needs = find_needs(scene, sensor, survey, spp)
+        needs = find_needs(scene, sensor, survey, spp, self.settings.may_draw_emission)
         plan = make_plan(needs, self.settings, self.aovs)
         return build_estimators(scene, needs, plan, self.settings, survey, pictures), plan
 

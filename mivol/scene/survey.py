@@ -35,6 +35,8 @@ class SceneSurvey:
         places: where grids lie (:func:`mivol.transport.media.read_medium.view_medium`).
         cosines: mean cosines of phase functions, by the name of the medium.
         warned: grids whose values below 0 were told of.
+        media_light: what was read of the light that media emit, with the arrays that it was read of
+            (:mod:`mivol.scene.media_light`); None where nothing was.
     """
 
     boundaries: tuple[Boundary, ...]
@@ -53,6 +55,7 @@ class SceneSurvey:
     numbers: dict = field(default_factory=dict)
     cosines: dict = field(default_factory=dict)
     warned: set = field(default_factory=set)
+    media_light: tuple | None = None
 
     @property
     def is_current(self) -> bool:

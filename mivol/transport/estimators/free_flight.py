@@ -116,6 +116,8 @@ class FreeFlight:
         weight = self._weigh(segment, passed, collision, active)
         emitting = [body for body in media.bodies if body.view.emits]
         emission = self._point_of(segment, passed, emitting, at_emission, chance, active) if emitting else None
+        if segment.emission_weight is not None:
+            emission.gain *= segment.emission_weight
         # What a side flight leaves to probes is found by those of the path itself, and so is the light of the level.
         level = None if segment.is_aside else self.level
         shared = FlownSegment(media, segment, passed, collision, weight, level, emission, active)

@@ -58,6 +58,7 @@ class PathSegment:
         scatters: lanes whose path may scatter once more.
         samples: random numbers that the estimator has drawn; None where it needs none.
         is_aside: a side flight, which the path does not take itself (:mod:`mivol.transport.path.side_flight`).
+        emission_weight: of the light that media emit along it, where that was drawn at its origin too; None for 1.
     """
 
     ray: mi.Ray3f
@@ -66,6 +67,7 @@ class PathSegment:
     scatters: mi.Bool
     samples: Any
     is_aside: bool = False
+    emission_weight: mi.Float | None = None
 
 
 @dataclass

@@ -55,7 +55,7 @@ class Emission:
         passed = RaySegment(segment.ray, segment.medium, end.t)
         composite = integrate_emission(media, passed, active, tangent=purpose == FORWARD)
         shared = _EmittingSegment(media, segment, passed, composite, active)
-        light = SegmentLight(shared, dr.select(active, segment.beta * shared.rows(0), 0), is_replayed=True)
+        light = SegmentLight(shared, dr.select(active, shared.seen * shared.rows(0), 0), is_replayed=True)
         T = transmittance([mi.Float(t) for t in composite.tau[: media.channels]])
         return SegmentEstimate(end, T, light, SegmentTransmittance(shared))
 
@@ -74,6 +74,12 @@ class _EmittingSegment:
     active: mi.Bool
     dL: mi.Spectrum | None = None
 
+    @property
+    def seen(self) -> mi.Spectrum:
+        """What multiplies the light of the media."""
+        weight = self.segment.emission_weight
+        return self.segment.beta if weight is None else self.segment.beta * weight
+
     def rows(self, block: int) -> mi.Spectrum:
         """The light (block 0), or its tangent (block 1)."""
         k = dr.size_v(mi.Spectrum)
@@ -83,10 +89,10 @@ class _EmittingSegment:
         """Do nothing yet: the sweep in :meth:`vjp` finds the derivatives of light and transmittance together."""
 
     def vjp(self, dlog: mi.Spectrum) -> None:
-        vjp_emission(self.media, self.passed, self.composite, self.dL * self.segment.beta, dlog, self.active)
+        vjp_emission(self.media, self.passed, self.composite, self.dL * self.seen, dlog, self.active)
 
     def jvp_light(self) -> mi.Spectrum:
-        return dr.select(self.active, self.segment.beta * self.rows(1), 0)
+        return dr.select(self.active, self.seen * self.rows(1), 0)
 
     def jvp_transmittance(self) -> mi.Spectrum:
         k = dr.size_v(mi.Spectrum)

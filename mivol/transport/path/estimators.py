@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import mitsuba as mi
 
 from mivol.transport.estimators.direct_lighting import DirectLighting
+from mivol.transport.estimators.emission_sampling import EmissionSampling
 from mivol.transport.estimators.free_flight import FreeFlight
 from mivol.transport.estimators.scattering_quadrature import ScatteringQuadrature
 from mivol.transport.estimators.segment import Absorption, SegmentEstimator
@@ -178,6 +179,7 @@ class Estimators:
         lights_media: likewise where a path ends a segment in a medium. Under a constant environment alone it is not so: light
             that is the same from everywhere is found without noise by the paths that escape.
         lobe: mean cosine of the lobe that side flights are drawn from (:mod:`.side_flight`); None for no side flights.
+        emission: draws light of media that emit, where paths scatter; None where they find it by chance.
     """
 
     def __init__(
@@ -187,9 +189,11 @@ class Estimators:
         lights_surfaces: bool,
         lights_media: bool = False,
         lobe: mi.Float | None = None,
+        emission: EmissionSampling | None = None,
     ) -> None:
         self.media, self.direct, self.segment = direct.media, direct, segment
         self.lights_surfaces, self.lights_media, self.lobe = lights_surfaces, lights_media, lobe
+        self.emission = emission
 
     @property
     def estimates_shadows(self) -> bool:
@@ -202,4 +206,5 @@ class Estimators:
 
     def replayed(self) -> Estimators:
         """Estimators of the radiance that a replay subtracts from: without light that is sampled anew for its derivatives."""
-        return Estimators(self.direct, self.segment.replayed(), self.lights_surfaces, self.lights_media, self.lobe)
+        how = self.lights_surfaces, self.lights_media, self.lobe, self.emission
+        return Estimators(self.direct, self.segment.replayed(), *how)

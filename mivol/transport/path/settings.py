@@ -19,6 +19,8 @@ class Settings:
         deterministic: single scattering by quadrature in place of Monte Carlo.
         shadows: with ``deterministic``, ``exact`` or interpolated in a ``grid``; else ``exact`` or ``estimated`` (ratio
             tracking); ``auto`` leaves the choice to the plan.
+        media_light: light that media emit is ``drawn`` where paths scatter, or ``met`` by chance; ``auto`` leaves the choice to
+            the plan.
     """
 
     max_depth: int = 6
@@ -26,6 +28,12 @@ class Settings:
     hide_emitters: bool = False
     deterministic: bool = False
     shadows: str = "auto"
+    media_light: str = "auto"
+
+    @property
+    def may_draw_emission(self) -> bool:
+        """Whether light that media emit may be drawn where paths scatter."""
+        return self.scatterings >= 1 and self.media_light != "met"
 
     @property
     def scatterings(self) -> float:

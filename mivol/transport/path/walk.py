@@ -73,6 +73,8 @@ class Path:
         probe: a point of one of the flights so far, at which derivatives are looked at besides; None for pictures.
         shadow: the shadow ray that is walked back for derivatives; None for pictures, and where paths scatter at surfaces only.
         aim: the emitter sample that was drawn for the next vertex; None where there are no side flights.
+        rival: density [1/sr] of the direction where light of media was drawn at ``last`` too, 0 where it was not; None where it
+            is never drawn.
     """
 
     ray: mi.Ray3f
@@ -92,6 +94,7 @@ class Path:
     probe: Probe | None = None
     shadow: ShadowReservoir | None = None
     aim: Aim | None = None
+    rival: mi.Float | None = None
 
 
 def walk_path(
@@ -163,6 +166,7 @@ def _start(
         score=score,
         sampler=sampler,
         strata=strata,
+        rival=None if estimators.emission is None else dr.zeros(mi.Float, n),
     )
 
 
@@ -228,6 +232,8 @@ def _follow_segment(estimators: Estimators, settings: Settings, limit: int, path
     samples = estimators.segment.draw(path.sampler, may_scatter, path.strata)
     # A copy of the throughput: it is multiplied in place below, and derivatives read the segment's own after that.
     segment = PathSegment(path.ray, path.medium, mi.Spectrum(path.beta), may_scatter, samples)
+    if estimators.emission is not None:
+        segment.emission_weight = estimators.emission.weigh_met(path.last, path.rival, path.ray.d, path.active)
     found = estimators.segment.estimate(segment, path.score.purpose, path.active)
     if found.light is not None:
         path.score = path.score.add(found.light)
@@ -261,6 +267,8 @@ def _scatter(estimators: Estimators, settings: Settings, limit: int, path: Path,
     arrives, sampler = event.at_surface | event.in_medium, path.sampler
     may_scatter = arrives & (path.depth + 1 < limit)
     path = _add_direct_light(estimators, path, event, may_scatter)
+    if estimators.emission is not None:
+        path = _add_light_of_media(estimators, path, event, may_scatter)
     ahead = event.in_medium & (path.depth + 2 < limit)
     if path.aim is not None:
         path, aside, w = _add_side_flight(estimators, path, event, ahead)
@@ -280,6 +288,8 @@ def _scatter(estimators: Estimators, settings: Settings, limit: int, path: Path,
     path.last = dr.select(turned, turn.origin, path.last)
     path.pdf = dr.select(turned, turn.pdf, path.pdf)
     path.delta = dr.select(turned, turn.delta, path.delta)
+    if path.rival is not None:
+        path.rival = dr.select(turned, dr.select(event.in_medium | ~turn.delta, turn.pdf, 0), path.rival)
     path.depth += dr.select(turned, mi.UInt32(1), mi.UInt32(0))
 
     # -- Roulette ------------------------------------------------------------------------------------------------------
@@ -322,4 +332,28 @@ def _add_direct_light(estimators: Estimators, path: Path, event: PathEvent, may_
         return path
     path.score = path.score.add(TrackedTerm(carried, direct.on))
     path.shadow = path.shadow.offer(light, event.chance)
+    return path
+
+
+def _add_light_of_media(estimators: Estimators, path: Path, event: PathEvent, may_scatter: mi.Bool) -> Path:
+    """Light of media that emit, from a point that is drawn in them."""
+    lit, inside = may_scatter & event.in_medium, mi.Spectrum(1)
+    if estimators.media.has_surfaces:
+        lit |= may_scatter & event.at_surface & mi.has_flag(event.si.bsdf(path.ray).flags(), mi.BSDFFlags.Smooth)
+    if event.collision is not None:
+        inside = dr.select(event.in_medium, event.collision.albedo, 1)
+    light = estimators.emission.at_vertex(
+        event.vertex(estimators.media, path.ray),
+        path.beta * inside,
+        path.sampler.next_2d(lit),
+        path.score.purpose != PICTURE,
+        lit,
+        estimators.estimates_shadows,
+    )
+    path.score = path.score.add(light)
+    if path.shadow is not None:
+        path.shadow = path.shadow.offer(light.shadow, light.point.chance)
+    elif path.score.purpose != PICTURE:
+        alone = ShadowReservoir.empty(estimators.media, path.ray).offer(light.shadow, light.point.chance)
+        path.score = path.score.add(ShadowTerm(estimators.media, alone))
     return path

@@ -1,0 +1,136 @@
+"""The table of what media emit: densities of points and of directions, against sums over its cells."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from false_alarms import assert_same_mean
+from media_light_scenes import PLACE, seen
+from scattering_scenes import close_up
+
+from mivol.scene.media_light import find_emitting_boxes
+from mivol.scene.needs import find_needs
+from mivol.transport.estimators.emission_table import CELLS, EVEN, EmissionTable, tabulate_emission
+from mivol.transport.media.body import Body
+from mivol.transport.media.scene_media import SceneMedia
+from mivol.validate.moments import Moments
+from scenes import affine, box_of, grid_volume, medium
+
+pytestmark = pytest.mark.usefixtures("variant_rgb")
+
+N = 1 << 14
+
+
+def table_of(scene: mi.Scene) -> EmissionTable:
+    needs = find_needs(scene, scene.sensors()[0])
+    bodies = [Body(view, boundary.box) for boundary, view in zip(needs.boundaries, needs.views, strict=True)]
+    media = SceneMedia(scene, bodies, has_surfaces=False)
+    return tabulate_emission(find_emitting_boxes(scene, media, needs), media.channels)
+
+
+def numbers(n: int, count: int, seed: int) -> list[mi.Float]:
+    return [mi.Float(row.astype(np.float32)) for row in np.random.default_rng(seed).uniform(0, 1, (count, n))]
+
+
+def two() -> mi.Scene:
+    """A fire, and beside it another of constants in a box of another size, a third as bright in every cell."""
+    far = affine(np.diag([0.5, 0.5, 0.25]), [1.0, 0.2, 0.1])
+    low = medium("mivol_medium", 0.5, 0.0, emission={"type": "rgb", "value": [2.0, 1.0, 0.0]})
+    values = np.ones((2, 2, 2, 1), np.float32)
+    high = medium("mivol_medium", grid_volume("mivol_voxels", values, PLACE), 0.25, emission=6.0)
+    return close_up({"a": box_of(high, PLACE), "b": box_of(low, far)}, res=4)
+
+
+def order(table: EmissionTable) -> list[int]:
+    """Which of the two fires each box is: Mitsuba keeps shapes in an order of its own."""
+    return [0 if box.box.to_world[0, 0] > 0.6 else 1 for box in table.boxes]
+
+
+def test_cells_have_their_share_of_the_power() -> None:
+    """sigma_t (1 - albedo) Le times the volume of a cell, and the even share."""
+    table = table_of(two())
+    which = order(table)
+    power = np.repeat(np.array([1 * 0.75 * 18 * 0.7 * 0.5 * 0.8, 0.5 * 3 * 0.5 * 0.5 * 0.25])[which], CELLS**3)
+    share = (1 - EVEN) * power / power.sum() + EVEN / power.size
+    volume = np.repeat(np.array([0.7 * 0.5 * 0.8, 0.5 * 0.5 * 0.25])[which], CELLS**3) / CELLS**3
+    assert np.array(table.density) == pytest.approx(share / volume, rel=1e-4)
+    assert np.array(table.cumulative) == pytest.approx(np.cumsum(share), rel=1e-4)
+
+
+def test_where_nothing_emits_all_is_even() -> None:
+    scene = close_up({"box": box_of(medium("mivol_medium", 0.0, 0.0, emission=6.0), PLACE)}, res=4)
+    assert np.array(table_of(scene).density) == pytest.approx(1 / (0.7 * 0.5 * 0.8), rel=1e-5)
+
+
+@pytest.mark.statistical
+def test_points_are_drawn_with_their_density() -> None:
+    """The mean of x^k / density over all points is the integral over the boxes."""
+    table = table_of(two())
+    u, *inside = numbers(N, 4, 1)
+    p = np.array(table.draw_place(u, inside)).T
+    near = p[:, 0] < 0.5
+    box = np.where(near, 0, 1)
+    low, size = np.array([[-0.3, -0.2, -0.5], [1.0, 0.2, 0.1]])[box], np.array([[0.7, 0.5, 0.8], [0.5, 0.5, 0.25]])[box]
+    q = (p - low) / size
+    assert (q > -1e-5).all() and (q < 1 + 1e-5).all()
+    cell = np.clip(np.floor(q * CELLS).astype(int), 0, CELLS - 1)
+    number = np.argsort(order(table))[box]
+    density = np.array(table.density)[number * CELLS**3 + (cell[:, 2] * CELLS + cell[:, 1]) * CELLS + cell[:, 0]]
+    found = np.stack([near / density, ~near / density, near * q[:, 0] / density, near * q[:, 1] * q[:, 2] / density], axis=1)
+    truth = [0.28, 0.0625, 0.14, 0.07]
+    assert_same_mean(Moments.of(found), np.array(truth), rounding=1e-5, what="integrals")
+
+
+@pytest.mark.statistical
+def test_dark_cells_are_seldom_drawn() -> None:
+    """The same of a fire whose cells are unlike each other."""
+    table = table_of(seen("over a floor", res=4))
+    u, *inside = numbers(N, 4, 4)
+    q = (np.array(table.draw_place(u, inside)).T - PLACE[:3, 3]) / np.diag(PLACE)[:3]
+    cell = np.clip(np.floor(q * CELLS).astype(int), 0, CELLS - 1)
+    each = np.array(table.density)[(cell[:, 2] * CELLS + cell[:, 1]) * CELLS + cell[:, 0]].astype(np.float64)
+    assert_same_mean(Moments.of(np.stack([1 / each, q[:, 0] / each], axis=1)), [0.28, 0.14], rounding=1e-4, what="integrals")
+
+
+@pytest.mark.parametrize("origin", [(0.1, 0.05, -0.1), (-2.0, 0.3, 0.4)], ids=["inside", "outside"])
+@pytest.mark.statistical
+def test_the_density_of_directions_integrates_to_one(origin: tuple) -> None:
+    """Over the sphere; and each direction that is drawn has one."""
+    table = table_of(seen("over a floor", res=4))
+    o = mi.Point3f(*origin) + dr.zeros(mi.Point3f, N)
+    u, v, w, *rest = numbers(N, 6, 2)
+    pdf = np.array(table.look(o, mi.warp.square_to_uniform_sphere(mi.Point2f(u, v)), dr.full(mi.Bool, True, N)).pdf)
+    assert_same_mean(Moments.of(4 * np.pi * pdf[:, None].astype(np.float64)), np.ones(1), what="integral")
+    d = dr.normalize(table.draw_place(w, rest) - o)
+    assert (np.array(table.look(o, d, dr.full(mi.Bool, True, N)).pdf) > 0).all()
+
+
+@pytest.mark.statistical
+def test_points_of_a_ray_are_drawn_with_their_density() -> None:
+    """The mean of t^k / density is the integral of t^k over what a ray passes of both boxes; light sums the table along it."""
+    table = table_of(two())
+    o, d = mi.Point3f(-1.0, 0.25, 0.15), mi.Vector3f(1, 0, 0)
+    on = dr.full(mi.Bool, True, N)
+    (u,) = numbers(N, 1, 3)
+    line = table.draw_along(o + dr.zeros(mi.Point3f, N), d + dr.zeros(mi.Vector3f, N), u, on)
+    t, density, box = (np.array(v).astype(np.float64) for v in (line.t, line.density, line.box))
+    box = np.array(order(table))[box.astype(int)]
+    inside = np.where(box == 0, (t >= 0.7 - 1e-5) & (t <= 1.4 + 1e-5), (t >= 2 - 1e-5) & (t <= 2.5 + 1e-5))
+    assert inside.all()
+    assert np.ptp((t[box == 0] - 0.7) / (0.7 / CELLS) % 1) > 0.9  # not only the middles of cells
+    found = np.stack([(box == 0) / density, (box == 1) / density, t / density], axis=1)
+    truth = [0.7, 0.5, (1.4**2 - 0.7**2 + 2.5**2 - 2.0**2) / 2]
+    assert_same_mean(Moments.of(found), np.array(truth), rounding=1e-5, what="integrals")
+    seen_along = table.look(o + dr.zeros(mi.Point3f, N), d + dr.zeros(mi.Vector3f, N), on)
+    assert np.array(seen_along.pdf) == pytest.approx(np.array(line.pdf), rel=1e-5)
+    shares = np.array(table.density)[np.argsort(order(table)) * CELLS**3]
+    assert np.array(seen_along.light) == pytest.approx(0.7 * shares[0] + 0.5 * shares[1], rel=1e-5)
+    cubes = [(1.4**3 - 0.7**3) / 3, (2.5**3 - 2.0**3) / 3]
+    assert np.array(line.pdf) == pytest.approx(shares @ cubes, rel=1e-5)
+
+
+def test_a_ray_that_misses_has_no_density() -> None:
+    line = table_of(two()).draw_along(mi.Point3f(-1, 0.25, 3), mi.Vector3f(1, 0, 0), mi.Float([0.1, 0.9]), mi.Bool(True))
+    assert not np.array(line.pdf).any() and not np.array(line.density).any()

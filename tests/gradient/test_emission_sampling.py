@@ -1,0 +1,92 @@
+"""Derivatives of light of media that is drawn where paths scatter."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from false_alarms import Estimate, assert_precise, assert_same_mean, difference, fresh
+from media_light_scenes import drawn, met, seen
+from scattering_gradients import BATCHES, release, watched
+
+from mivol.validate.moments import Moments
+
+pytestmark = pytest.mark.usefixtures("variant_rgb")
+
+FIRE = "fire.interior_medium."
+KEYS = {
+    ("over a floor", "sigma_t"): FIRE + "sigma_t.data",
+    ("over a floor", "emission"): FIRE + "emission.data",
+    ("over a floor", "floor"): "floor.bsdf.reflectance.value",
+    ("in fog", "sigma_t"): FIRE + "sigma_t.data",
+    ("in fog", "emission"): FIRE + "emission.data",
+    ("in fog", "albedo of the fog"): "haze.albedo.value.value",
+    ("in fog", "extinction of the fog"): "haze.sigma_t.value.value",
+    ("by itself", "sigma_t"): FIRE + "sigma_t.data",
+    ("by itself", "albedo"): FIRE + "albedo.data",
+    ("by itself", "emission_density"): FIRE + "emission_density.data",
+    ("by itself", "g"): FIRE + "phase_function.g",
+    ("radiance field", "density"): FIRE + "emission.density",
+    ("radiance field", "colour"): FIRE + "emission.sh",
+    ("balls", "emission"): FIRE + "emission.value.value",
+}
+QUICK = ("over a floor", "sigma_t")
+
+
+CASES = [pytest.param(*case, marks=() if case == QUICK else pytest.mark.slow) for case in KEYS]
+
+
+def _step(scene: mi.Scene, key: str) -> np.ndarray | float:
+    """A direction of one sign."""
+    shape = np.shape(mi.traverse(scene)[key])
+    return np.random.default_rng(2).uniform(0.5, 1.5, shape) if np.prod(shape) > 3 else 1.0
+
+
+def _backward(scene: mi.Scene, key: str, w: np.ndarray, spp: int, seed: int, integrator: dict) -> np.ndarray:
+    """J^T w."""
+    params, variable = watched(scene, key)
+    mi.load_dict(integrator).render_backward(scene, params, mi.TensorXf(np.asarray(w, np.float32)), seed=seed, spp=spp)
+    found = np.array(dr.grad(variable), dtype=np.float64)
+    release(scene, key, variable)
+    return found
+
+
+def _forward(scene: mi.Scene, key: str, v: np.ndarray | float, spp: int, seed: int, integrator: dict) -> np.ndarray:
+    """J v."""
+    params, variable = watched(scene, key)
+    kind = type(variable)
+    dr.set_grad(variable, kind(np.asarray(v, dtype=np.float32)) if np.ndim(v) else kind(float(v)))
+    found = np.array(mi.load_dict(integrator).render_forward(scene, params, seed=seed, spp=spp), dtype=np.float64)
+    release(scene, key, variable)
+    return found
+
+
+@pytest.mark.parametrize(("name", "what"), CASES)
+def test_forward_is_the_transpose_of_reverse(name: str, what: str) -> None:
+    """<J v, w> = <v, J^T w> of one seed: both are sums of the same terms in another order, in float32."""
+    scene, key, integrator = seen(name), KEYS[name, what], drawn(3)
+    w, v, seed = np.random.default_rng(1).uniform(0.5, 1.5, (8, 8, 3)), _step(scene, key), fresh(5)
+    there, back = _forward(scene, key, v, 16, seed, integrator), _backward(scene, key, w, 16, seed, integrator)
+    a, b = np.sum(there * w), np.sum(back * v)
+    # As in test_flight_derivatives: paths of some ten terms each, summed in float32.
+    assert a == pytest.approx(b, abs=1e-4 * max(np.abs(there * w).sum(), np.abs(back * v).sum()))
+    assert a != 0
+
+
+def _along(scene: mi.Scene, key: str, v: np.ndarray | float, integrator: dict, spp: int) -> Estimate:
+    """The derivative of the mean image along v, from independent reverse passes."""
+    w = np.full((8, 8, 3), 1 / 192)
+    found = [np.sum(_backward(scene, key, w, spp, fresh(k), integrator) * v) for k in range(BATCHES)]
+    return Estimate.of(Moments.of(np.array(found)[:, None]))
+
+
+@pytest.mark.statistical
+@pytest.mark.parametrize(("name", "what"), CASES)
+def test_draws_keep_the_mean_of_derivatives(name: str, what: str) -> None:
+    """With draws and by chance."""
+    scene, key = seen(name), KEYS[name, what]
+    v, (few, many) = _step(scene, key), (16, 64) if (name, what) == QUICK else (64, 256)
+    found, truth = _along(scene, key, v, drawn(3), few), _along(scene, key, v, met(3), many)
+    assert_same_mean(found, truth, rounding=1e-5 * np.abs(truth.mean), what="derivative")
+    assert_precise(difference(found, truth), 0.15 * np.abs(truth.mean), what="derivative")
