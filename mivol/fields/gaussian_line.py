@@ -71,7 +71,7 @@ class Line:
         peak: distance of that place from ``o`` [length].
         half: half the length of the chord inside of ``REACH`` [length]; 0 where the line misses.
         opacity: of the Gaussian at its centre [1].
-        falloff: exp(-m^2 / 2).
+        m2: m^2, the squared whitened distance of that place from the mean.
         hits: whether the line comes within ``REACH``.
     """
 
@@ -84,8 +84,13 @@ class Line:
     peak: mi.Float
     half: mi.Float
     opacity: mi.Float
-    falloff: mi.Float
+    m2: mi.Float
     hits: mi.Bool
+
+    @property
+    def falloff(self) -> mi.Float:
+        """exp(-m^2 / 2)."""
+        return dr.exp(-0.5 * self.m2)
 
     @property
     def alpha(self) -> mi.Float:
@@ -179,7 +184,7 @@ def cross(row: list[mi.Float], o: mi.Point3f, d: mi.Vector3f) -> Line:
     m2 = dr.squared_norm(p)
     hits = m2 < REACH**2
     half = dr.select(hits, dr.safe_sqrt(REACH**2 - m2) / speed, 0)
-    return Line(rows, y, mi.Vector3f(d), v, speed, p, peak, half, row[12], dr.exp(-0.5 * m2), hits)
+    return Line(rows, y, mi.Vector3f(d), v, speed, p, peak, half, row[12], m2, hits)
 
 
 def change_of(line: Line, slopes: Slopes, change: list[mi.Float]) -> mi.Float:

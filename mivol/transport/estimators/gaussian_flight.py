@@ -38,16 +38,16 @@ def collide_in_gaussians(
     Returns:
         Distance of the collision on the ray [length], infinite where there is none, and the next state.
 
-    Bias: none but rounding. Cost: one walk to the collision, with a number drawn for each entry of a list.
+    Bias: none but rounding. Cost: one walk to the collision, with a number drawn for each Gaussian that is met.
     """
     passage = part.enter(interval)
 
-    def add(state: tuple, line: Line, index: mi.UInt32, ends: tuple[mi.Float, mi.Float], here: mi.Bool) -> tuple:
+    def add(state: tuple, line: Line, index: mi.UInt32, ends: tuple[mi.Float, mi.Float]) -> tuple:
         nearest, reached, rng = state
         rng, (u,) = draw_pcg32(rng, 1)
         before = line.share_before(ends[0])
         goal = before - dr.log(1 - u) / (scale * line.depth)
-        hits = here & (goal < before + line.share(*ends))
+        hits = goal < before + line.share(*ends)
         own = line.peak + math.sqrt(2) * dr.erfinv(dr.select(hits, 2 * goal - 1, 0)) / line.speed
         # Between its ends: in the tails a share of 1e-7 is a long way.
         own = lesser(greater(own, ends[0]), ends[1])
