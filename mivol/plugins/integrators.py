@@ -27,7 +27,7 @@ class MivolIntegrator(mi.ad.integrators.common.ADIntegrator):
             ``deterministic``, looked up in a lattice of optical depths; auto: exact, or estimated where grids are fine. Default
             auto.
         media_light: how light that media emit finds what scatters it. drawn: points of them are drawn, too; met: by chance;
-            auto: whichever is predicted to reach an error sooner. Default auto.
+            auto: whichever reaches an error sooner in a small preview. Default auto.
         aovs: comma list of tau, tau.R, tau.G, tau.B, alpha, depth; appended to the colours in the order named.
     """
 

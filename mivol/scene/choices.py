@@ -234,7 +234,7 @@ def choose_media_light(needs: Needs, settings: Settings) -> tuple[bool, list[Cho
         return False, [Choice(about, "met by chance", _why_unread(needs))]
     draws, gain = settings.media_light == "drawn" or found.gain > 1, f"{found.gain:.2g} times as soon as chance alone"
     what = "drawn by where they emit, and met by chance" if draws else "met by chance"
-    return draws, [Choice(about, what, f"draws are predicted to reach an error {gain}")]
+    return draws, [Choice(about, what, f"draws reach an error {gain}")]
 
 
 def _why_unread(needs: Needs) -> str:

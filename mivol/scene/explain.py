@@ -19,6 +19,7 @@ from mivol.scene.build import build_media
 from mivol.scene.choices import is_lit, shares_cells
 from mivol.scene.depth_preview import measure_depths
 from mivol.scene.depth_two import depth_two_error, mean_albedo, mean_cosine, scattering_depth
+from mivol.scene.draw_preview import measure_draws
 from mivol.scene.facts import MediumFacts, Needs
 from mivol.scene.needs import find_needs
 from mivol.scene.nesting import bounds
@@ -99,11 +100,14 @@ def examine(
     eye = find_sensor(loaded, sensor)
     settings = settings_of(loaded) if max_depth is None else Settings(max_depth=max_depth)
     try:
-        needs = find_needs(loaded, eye, survey_scene(loaded), reads_emission=settings.may_draw_emission)
+        survey = survey_scene(loaded)
+        needs = find_needs(loaded, eye, survey, reads_emission=settings.may_draw_emission)
     except MivolError as error:
         return Explanation(("facts", *_plain_facts(loaded), *_warnings(loaded)), str(error))
     facts = ("facts", *_facts(needs), *_warnings(loaded))
     try:
+        make_plan(needs, settings)
+        needs = measure_draws(loaded, eye, needs, survey, settings)
         return Explanation((*facts, *_plan(loaded, eye, needs, settings, noise)))
     except MivolError as error:
         return Explanation(facts, str(error))

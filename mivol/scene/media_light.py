@@ -22,6 +22,7 @@ import numpy as np
 
 from mivol.scene.facts import MediaLight, Needs
 from mivol.scene.nesting import bounds
+from mivol.scene.recording import without_collections
 from mivol.scene.survey import AROUND, SceneSurvey, is_instance
 from mivol.transport.estimators.emission_table import EmissionTable, EmittingBox, tabulate_emission
 from mivol.transport.estimators.multiple_importance import power_heuristic
@@ -66,7 +67,7 @@ def read_media_light(scene: mi.Scene, sensor: mi.Sensor, needs: Needs, survey: S
     arrays = [array for box in boxes for array in _arrays_of(box.body.view)]
     state = (*(a.index if dr.is_array_v(a) else a for a in arrays), *(box.box.to_world.tobytes() for box in boxes))
     if survey.media_light is None or survey.media_light[0] != state:
-        with dr.suspend_grad():
+        with without_collections(), dr.suspend_grad():
             table = tabulate_emission(boxes, media.channels)
             scattering = [b for b, facts in zip(bodies, needs.media, strict=True) if facts.is_scattering]
             gain = predict_gain(media, table, sensor, scattering)

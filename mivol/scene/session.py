@@ -14,6 +14,7 @@ import mitsuba as mi
 from mivol.errors import MivolError
 from mivol.scene.build import build_estimators
 from mivol.scene.derived import carry_tangents, recompute_derived
+from mivol.scene.draw_preview import measure_draws
 from mivol.scene.needs import find_needs
 from mivol.scene.plan import Plan, make_plan
 from mivol.scene.recording import without_collections
@@ -136,6 +137,7 @@ class Session:
             self._surveyed = _SurveyedScene(parts, survey_scene(scene))
         survey = self._surveyed.survey
         needs = find_needs(scene, sensor, survey, spp, self.settings.may_draw_emission)
+        needs = measure_draws(scene, sensor, needs, survey, self.settings)
         plan = make_plan(needs, self.settings, self.aovs)
         return build_estimators(scene, needs, plan, self.settings, survey, pictures), plan
 

@@ -37,6 +37,8 @@ class SceneSurvey:
         warned: grids whose values below 0 were told of.
         media_light: what was read of the light that media emit, with the arrays that it was read of
             (:mod:`mivol.scene.media_light`); None where nothing was.
+        gain_of_draws: how much sooner draws of that light reach an error [1] (:mod:`mivol.scene.draw_preview`); None where it
+            was not measured.
     """
 
     boundaries: tuple[Boundary, ...]
@@ -56,6 +58,7 @@ class SceneSurvey:
     cosines: dict = field(default_factory=dict)
     warned: set = field(default_factory=set)
     media_light: tuple | None = None
+    gain_of_draws: float | None = None
 
     @property
     def is_current(self) -> bool:

@@ -10,6 +10,7 @@ from false_alarms import assert_precise, assert_same_mean, difference, over_pixe
 from media_light_scenes import PLACE, SCENES, burning, drawn, floor, met, seen, wall
 from scattering_scenes import assert_same_whole, close_up, moments, pencils, volpath
 
+from mivol.scene.draw_preview import gain_of_draws, measure_draws
 from mivol.scene.explain import explain
 from mivol.scene.media_light import COST
 from mivol.scene.needs import find_needs
@@ -145,10 +146,44 @@ def test_what_draws_gain() -> None:
     assert 0.1 < find_needs(room(), room().sensors()[0]).media_light.gain < 0.9
 
 
+def test_the_gain_is_of_variances_or_of_what_chance_has_missed() -> None:
+    """Cells of variances 4 and 1, and a cell in which chance finds nothing of a light of 1: 16 samples of it weigh 16."""
+    swing = np.tile([-1.0, 1.0], 8) * np.sqrt(15 / 16)
+    drawn_cells = np.stack([5 + swing, 5 + swing, 1 + 0.5 * swing])
+    assert gain_of_draws(5 + 2 * swing[None], drawn_cells[:1]) == pytest.approx(4 / COST)
+    assert gain_of_draws(0 * swing[None], drawn_cells[2:]) == pytest.approx(16 / 0.25 / COST)
+    median = gain_of_draws(np.stack([5 + 2 * swing, 5 + 3 * swing, 0 * swing]), drawn_cells)
+    assert median == pytest.approx(9 / COST)
+    assert gain_of_draws(np.zeros((2, 4)), np.zeros((2, 4))) == 0.0
+
+
+def test_draws_do_not_pay_where_other_light_has_the_noise() -> None:
+    """A lamp in the fog: the prediction knows of the fire only, the preview is asked, once."""
+    lamp = {"type": "spot", "to_world": mi.ScalarTransform4f().look_at([1, 1, 2], [0, 0, 0], [0, 0, 1]), "intensity": 900.0}
+    scenes = seen("in fog"), close_up(SCENES["in fog"]() | {"lamp": lamp}, res=8, fov=45)
+    for scene, pays in zip(scenes, (True, False), strict=True):
+        survey, sensor, settings = survey_scene(scene), scene.sensors()[0], Settings(max_depth=3)
+        needs = find_needs(scene, sensor, survey)
+        assert needs.media_light.gain > 1
+        assert measure_draws(scene, sensor, needs, survey, Settings(max_depth=3, media_light="drawn")) is needs
+        measured = measure_draws(scene, sensor, needs, survey, settings)
+        assert (measured.media_light.gain > 1) == make_plan(measured, settings).draws_emission == pays
+        survey.gain_of_draws = 7.0
+        assert measure_draws(scene, sensor, needs, survey, settings).media_light.gain == 7.0
+
+
+def test_a_render_asks_the_preview() -> None:
+    """Where draws are predicted to pay, and nowhere else."""
+    for scene, asked in ((seen("over a floor", 4), True), (room(), False)):
+        integrator = mi.load_dict(AUTO)
+        mi.render(scene, integrator=integrator, spp=1)
+        assert (integrator.session._surveyed.survey.gain_of_draws is not None) == asked
+
+
 def test_explain_says_how_light_of_media_is_found() -> None:
     said = " ".join(explain(seen("over a floor"), 2).split())
-    assert "light of media drawn by where they emit, and met by chance because draws are predicted to reach an error" in said
-    assert "light of media met by chance because draws are predicted" in " ".join(explain(room(), 2).split())
+    assert "light of media drawn by where they emit, and met by chance because draws reach an error" in said
+    assert "light of media met by chance because draws reach an error" in " ".join(explain(room(), 2).split())
     assert "light of media" not in explain(seen("over a floor"), 1)
 
 
