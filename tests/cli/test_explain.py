@@ -5,11 +5,13 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
 from tiny_experiment import PHOTOS, SCENE, run, write_experiment
 
 from mivol import config
 from mivol.experiments.explain import explain_fit
+from mivol.files import write_volume
 
 
 @pytest.fixture
@@ -54,6 +56,24 @@ def test_a_medium_behind_an_opaque_surface_is_warned_of(variant_rgb, folder: Pat
     assert "the medium of cube lies behind an opaque" in said
     (folder / "scene.xml").write_text(SCENE.replace('<bsdf type="null"/>', '<bsdf type="dielectric"/>'))
     assert "opaque" not in explained(capsys, folder / "scene.xml")[1]
+
+
+def test_the_noise_that_is_asked_for_decides_which_depth_is_enough(
+    variant_rgb, folder: Path, capsys: pytest.CaptureFixture
+) -> None:
+    """In a white smoke of optical depth 4 across, light that scattered often is missed at one pixel in ten thousand, and not at
+    an error as large as the mean."""
+    (folder / "scene.xml").write_text(SCENE.replace('"albedo" value="0"', '"albedo" value="0.9"'))
+    write_volume(folder / "start.vol", np.full((2, 2, 2, 1), 2, np.float32))
+    depths = {}
+    for noise in ("1", "1e-4"):
+        code, said = explained(capsys, folder / "scene.xml", "--noise", noise)
+        assert code == 0
+        found = re.search(r"depth +(\d+|without a limit \(-1\)) is enough", said)
+        assert found is not None
+        depths[noise] = found[1]
+    assert depths["1"] == "2"
+    assert depths["1e-4"] != "2"
 
 
 def test_an_experiment_is_explained_with_its_truth_in_the_scene(

@@ -1,4 +1,4 @@
-"""From a checkout with nothing set up to passing tests in one command, which is quiet and quick the second time."""
+"""From a checkout with nothing set up to passing tests in one command, quiet and quick the second time; and the demo."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 SET_BY_US = ("DRJIT_LIBLLVM_PATH", "PYTHONPATH", "VIRTUAL_ENV", "PYTHON")
+SHORT_DEMO = ("views.width=16", "views.height=16", "reference.spp=32", "fit.iterations=3", "event.0.at=[2]")
 
 
 @pytest.fixture
@@ -51,5 +52,8 @@ def test_two_runs_of_one_command(checkout: Path) -> None:
     assert second.stderr == ""
     after = os.times()
     assert after.children_user + after.children_system - before.children_user - before.children_system < 30
+    demo = run(checkout, "./scripts/demo", *(part for change in SHORT_DEMO for part in ("--set", change)))
+    assert demo.returncode == 0, demo.stderr
+    assert (checkout / "runs" / "demo" / "report.html").is_file()
     doctor = run(checkout, ".venv/bin/mivol", "doctor")
     assert doctor.returncode == 0, doctor.stdout

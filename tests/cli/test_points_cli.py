@@ -28,6 +28,18 @@ def test_convert_writes_what_was_read(tmp_path: Path, capsys: pytest.CaptureFixt
     assert read_points(tmp_path / "c.ply").colours is not None
 
 
+def test_convert_reads_a_laser_scan(tmp_path: Path) -> None:
+    """A LAS file becomes points in NumPy's file: its positions lie on steps of its scale, 1/8, which float32 holds."""
+    laspy = pytest.importorskip("laspy", reason="LAS needs the optional package laspy")
+    header = laspy.LasHeader(point_format=0, version="1.2")
+    header.offsets, header.scales = [0, 0, 0], [0.125, 0.125, 0.125]
+    scan = laspy.LasData(header)
+    scan.x, scan.y, scan.z = positions = np.array([[0.5, 1.25, -3], [2, -0.125, 7.5], [0, 4, 0.25]])
+    scan.write(str(tmp_path / "cloud.las"))
+    assert main(["convert", str(tmp_path / "cloud.las"), str(tmp_path / "cloud.npy")]) == 0
+    assert np.array_equal(read_points(tmp_path / "cloud.npy").positions, positions.T)
+
+
 def test_convert_makes_gaussians_of_points_where_asked(tmp_path: Path) -> None:
     """A PLY may hold either: points stay points where nothing is said."""
     write_points(tmp_path / "a.npy", PointCloud(np.eye(5, 3)[:4]))
