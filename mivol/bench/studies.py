@@ -22,6 +22,7 @@ STUDIES = {
     "tomography": "tomography",
     "radiance_field": "bench_radiance_field",
     "still_life": "bench_still_life",
+    "media_light": "bench_media_light",
     "depth": "bench_depth",
     "random_scenes": "bench_random_scenes",
     "ladder": "bench_ladder",
