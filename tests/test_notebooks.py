@@ -1,0 +1,73 @@
+"""The notebooks of docs/notebooks run from the first cell to the last, and are kept without outputs."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+FOLDER = Path(__file__).resolve().parents[1] / "docs" / "notebooks"
+NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
+
+
+def code_of(path: Path) -> list[str]:
+    """The text of each code cell."""
+    return ["".join(cell["source"]) for cell in json.loads(path.read_text())["cells"] if cell["cell_type"] == "code"]
+
+
+@pytest.fixture
+def no_window(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Figures are drawn into memory, and closed."""
+    import matplotlib.pyplot as plt
+
+    before = plt.get_backend()
+    plt.switch_backend("agg")
+    yield
+    plt.close("all")
+    plt.switch_backend(before)
+
+
+def executed(name: str) -> dict[str, object]:
+    """What a notebook leaves behind: its cells, one after another, in one namespace.
+
+    Each cell is compiled under the notebook's name, so that a traceback says where it stopped.
+    """
+    space: dict[str, object] = {"__name__": "__main__"}
+    for number, code in enumerate(code_of(FOLDER / f"{name}.ipynb"), 1):
+        exec(compile(code, f"{name}.ipynb, code cell {number}", "exec"), space)
+    return space
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_it_is_kept_without_outputs(path: Path) -> None:
+    """A notebook is text that can be compared: no outputs, no counts, cells with names, less than 20 kB."""
+    book = json.loads(path.read_text())
+    assert [cell for cell in book["cells"] if cell.get("outputs") or cell.get("execution_count")] == []
+    assert len({cell["id"] for cell in book["cells"]}) == len(book["cells"])
+    assert path.stat().st_size < 20_000
+
+
+def test_each_is_run() -> None:
+    """A new notebook needs a test below."""
+    assert [path.stem for path in NOTEBOOKS] == ["first_reconstruction", "light_in_a_smoke"]
+
+
+@pytest.mark.slow
+def test_light_in_a_smoke(variant_rgb: str, no_window: None, capsys: pytest.CaptureFixture[str]) -> None:
+    """No ray through the cube is longer than its diagonal; a white sky is given back by what scatters; all is finite."""
+    left = executed("light_in_a_smoke")
+    assert left["image"].min() >= np.exp(-2 * np.sqrt(3)) * (1 - 1e-5)  # float32, a hundred roundings
+    assert left["white"].mean() > left["black"].mean() > 0
+    assert left["slope"].shape == (24, 24, 24) and np.isfinite(left["slope"]).all() and left["slope"].sum() < 0
+    assert "exp(-2 * sqrt(3)) = 0.0313" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_first_reconstruction(variant_rgb: str, no_window: None) -> None:
+    """The fit more than halves the distance to the truth that its start had."""
+    left = executed("first_reconstruction")
+    assert left["found"].shape == left["truth"].shape == (12, 12, 12, 1)
+    assert left["nrmse"] < 0.5 * left["first"]
