@@ -9,7 +9,9 @@ and s [pixel^2] a low-pass filter. det C is computed as |a_1 x a_2|^2 + s (|a_1|
 C is never singular, however thin the Gaussian.
 
 Conventions. Arrays of the cloud are flat, one Gaussian after the other; those of splats are one array a component. Colours are
-max(0, 1/2 + sum Y_b k_b), with the basis of ``dr.sh_eval`` and the direction from the camera to the mean.
+max(0, 1/2 + sum Y_b k_b), with the basis of ``dr.sh_eval`` and the direction from the camera to the mean. Where the sum is
+below -1/2, a channel is black and its derivative by harmonics and direction is 0, as the function's is: a channel that is black
+in all photographs stays so in a fit. Opacity, place and shape keep theirs there.
 
 References: Zwicker et al. 2001 (EWA); Kerbl et al. 2023 (the model); Yu et al. 2024 (mip-splatting: compensated opacity).
 """
@@ -29,6 +31,9 @@ __all__ = ["Cloud", "Filter", "Splats", "project"]
 
 LEAST_COMPENSATION = 1e-12
 """Squared factor below which the compensated opacity is not derived: with 1e-6 of its opacity no Gaussian is drawn."""
+
+LEAST_QUATERNION = 2.0**-100
+"""Largest component below which a quaternion has lost its direction: components of 2^-26 of it are still normal numbers."""
 
 EXP2 = -0.5 / math.log(2)
 """exp(-q/2) = 2^(EXP2 q)."""
@@ -89,7 +94,7 @@ class Splats:
         colour: rgb code values, >= 0.
         depth: along the view [length].
         drawn: whether it stands in front of the camera, and all its numbers are finite.
-        faulty: NaN among its numbers, or a quaternion of no direction.
+        faulty: NaN among its numbers, or a quaternion of no direction: 0 (below 2^-100), or infinite.
     """
 
     x: mi.Float
@@ -123,7 +128,7 @@ def project(cloud: Cloud, view: View, filtering: Filter, degree: int, compensate
         compensated: whether the low-pass filter keeps the integral of alpha (the mip filter), instead of its peak.
     """
     mean, log_scale = mi.Point3f(*cloud.means), mi.Vector3f(*cloud.log_scales)
-    w, i, j, k = cloud.quaternions
+    w, i, j, k, has_direction = _bounded(cloud.quaternions)
     offset = mean - (view.origin + view.shift)
     right, down, forward = (axis - dr.cross(axis, view.turn) for axis in (view.right, view.down, view.forward))
     x, y, z = dr.dot(right, offset), dr.dot(down, offset), dr.dot(forward, offset)
@@ -132,8 +137,7 @@ def project(cloud: Cloud, view: View, filtering: Filter, degree: int, compensate
     plane = mi.Vector2f(x, y) * z_inv
     bent = dr.clip(plane, view.low, view.high)
     scale = dr.exp(log_scale)
-    length2 = w * w + i * i + j * j + k * k
-    columns = _rotation(w, i, j, k, dr.rcp(dr.select(length2 > 0, length2, 1)))
+    columns = _rotation(w, i, j, k, dr.rcp(w * w + i * i + j * j + k * k))
     rows = [view.focal[a] * z_inv * (axis - bent[a] * forward) for a, axis in enumerate((right, down))]
     first, second = (mi.Vector3f(*[scale[c] * dr.dot(row, columns[c]) for c in range(3)]) for row in rows)
     xx, xy, yy = dr.dot(first, first), dr.dot(first, second), dr.dot(second, second)
@@ -155,13 +159,26 @@ def project(cloud: Cloud, view: View, filtering: Filter, degree: int, compensate
         _colour(cloud.harmonics, dr.normalize(offset), degree),
         z,
         in_front,
-        dr.isnan(w + i + j + k) | (length2 == 0),
+        ~has_direction,
     )
     total = dr.detach(splats.x + splats.y + splats.xx + splats.xy + splats.yy + z)
     splats.drawn &= dr.isfinite(total) & dr.isfinite(det) & (det > 0)
     given = dr.detach(mean.x + mean.y + mean.z + log_scale.x + log_scale.y + log_scale.z + opacity + sum(splats.colour))
     splats.faulty |= dr.isnan(given)
     return splats
+
+
+def _bounded(quaternion: list[mi.Float]) -> tuple[mi.Float, mi.Float, mi.Float, mi.Float, mi.Bool]:
+    """A quaternion whose largest component is 1 or -1, and whether it has a direction at all (else it is the identity).
+
+    The squared length of one of 1e-20 is 0 in float32 and that of one of 1e20 is infinite; both have a direction. The factor is
+    a constant for derivatives: a rotation does not depend on the length of its quaternion.
+    """
+    largest = dr.detach(dr.maximum(*[dr.maximum(dr.abs(a), dr.abs(b)) for a, b in (quaternion[:2], quaternion[2:])]))
+    has_direction = (largest >= LEAST_QUATERNION) & dr.isfinite(largest) & ~dr.isnan(dr.detach(sum(quaternion)))
+    factor = dr.rcp(dr.select(has_direction, largest, 1))
+    w, i, j, k = (dr.select(has_direction, factor * v, 1 if n == 0 else 0) for n, v in enumerate(quaternion))
+    return w, i, j, k, has_direction
 
 
 def _rotation(w: mi.Float, i: mi.Float, j: mi.Float, k: mi.Float, s: mi.Float) -> list[mi.Vector3f]:
@@ -176,7 +193,8 @@ def _rotation(w: mi.Float, i: mi.Float, j: mi.Float, k: mi.Float, s: mi.Float) -
 
 def _logistic(logit: mi.Float) -> mi.Float:
     """1 / (1 + exp(-logit)); 0 and 1 at minus and plus infinity, with derivatives of 0."""
-    e = dr.exp(-dr.abs(logit))
+    # Not of dr.abs, whose derivative at 0 is 0: that of an opacity of a half is a quarter.
+    e = dr.exp(dr.select(logit < 0, logit, -logit))
     tail = e * dr.rcp(1 + e)
     return dr.select(logit < 0, tail, 1 - tail)
 

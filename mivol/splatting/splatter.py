@@ -138,8 +138,8 @@ class Splatter:
             The picture (height, width, 4 or 5), and what its derivatives need.
 
         Raises:
-            MivolError: tensors of the wrong shape, NaN or a quaternion 0 in them, a camera of another size or with a lens that
-                distorts, or lists that do not fit into memory.
+            MivolError: tensors of the wrong shape, NaN or a quaternion of no direction in them, a camera of another size or
+                with a lens that distorts, or lists that do not fit into memory.
         """
         check_one_thread()
         shapes = _checked_shapes(reals, self.degree)
@@ -338,6 +338,6 @@ def _check_faults(faulty: np.ndarray) -> None:
     at = np.flatnonzero(faulty)
     if len(at):
         raise MivolError(
-            f"Gaussian {at[0]}{f' and {len(at) - 1} others' if len(at) > 1 else ''}: found NaN or a quaternion 0, expected "
-            "numbers and a direction: take these Gaussians out."
+            f"Gaussian {at[0]}{f' and {len(at) - 1} others' if len(at) > 1 else ''}: found NaN, or a quaternion that is 0 or "
+            "infinite, expected numbers and a direction: take these Gaussians out."
         )

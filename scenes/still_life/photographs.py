@@ -116,7 +116,7 @@ def sky(size: tuple[int, int] = (128, 256)) -> dict:
 
 
 def patches(rng: np.random.Generator, count: int = 9) -> dict:
-    """A cloth of coloured squares."""
+    """A painted cloth: rings, each cut into pieces, since the texture coordinates of a disk are radius and angle."""
     colours = rng.uniform(0.1, 0.6, (count, count, 3)).astype(np.float32)
     return {"type": "bitmap", "bitmap": mi.Bitmap(colours), "raw": True, "filter_type": "nearest"}
 

@@ -137,6 +137,88 @@ def test_nothing_behind_the_camera_is_drawn(splatter: Splatter, camera: Camera) 
     assert all(np.isfinite(np.array(g)).all() for g in gradient.values())
 
 
+def test_layers_without_end(splatter: Splatter) -> None:
+    """Of 200 veils the last is seen, and learns: Mitsuba's ``volprim_rf_basic`` ends a ray after 64 and at a hundredth of its
+    light. The derivative by its colour is Y_0 times its weights, which leave a fiftieth of the light to it."""
+    n = 200
+    arrays = stack([-3.9] * n, [0.002 * k for k in range(n)], scale=0.5)
+    picture, kept = splatter.forward(tensors(arrays), straight())
+    truth, _ = oracle_splats.draw(arrays, straight())
+    np.testing.assert_allclose(np.array(picture), truth[..., [0, 1, 2, 4]], rtol=0, atol=STOP + ROUNDING)
+    alphas = oracle_splats.alphas({k: v.astype(float) for k, v in arrays.items()}, straight(), 0.3)
+    weights = alphas[-1] * (1 - alphas[:-1]).prod(axis=0)
+    found = np.array(splatter.backward(kept, mi.TensorXf(d_red(picture.shape)))[0]["harmonics"])[-1, 0]
+    expected = 0.28209479177387814 * np.where(alphas[-1] >= 1 / 255, weights, 0).sum()
+    # Each of 200 factors of T is rounded by 2^-24, and so is each alpha, a few times.
+    assert found == pytest.approx([expected, 0, 0], rel=200 * 4 * 2**-24, abs=0)
+
+
+@pytest.mark.parametrize("unit", [1e-4, 1.0, 1e4])
+def test_the_unit_of_length_is_free(variant_rgb: str, unit: float) -> None:
+    """Everything times a length, near plane included, is the same picture, and the derivative by places is divided by it.
+    Logarithms of scales up to 12 are rounded by 12 * 2^-24 = 7e-7, and alpha by at most 11 times that (q <= 2 ln 255)."""
+    arrays, camera = cloud(50, 2, 0.15, seed=4), looking(SIDE, SIDE)
+    truth, _ = oracle_splats.draw(arrays, camera)
+    pose = camera.to_world.copy()
+    pose[:3, 3] *= unit
+    splatter = Splatter(SIDE, SIDE, 2, near=0.01 * unit)
+    scaled = arrays | {
+        "means": arrays["means"] * np.float32(unit),
+        "log_scales": arrays["log_scales"] + np.float32(np.log(unit)),
+    }
+    picture, kept = splatter.forward(tensors(scaled), Camera(camera.K, camera.size, pose))
+    np.testing.assert_allclose(np.array(picture), truth[..., [0, 1, 2, 4]], rtol=0, atol=STOP * truth.max() + ROUNDING)
+    found = np.array(splatter.backward(kept, picture)[0]["means"]).astype(float) * unit
+    splatter = Splatter(SIDE, SIDE, 2)
+    picture, kept = splatter.forward(tensors(arrays), camera)
+    expected = np.array(splatter.backward(kept, picture)[0]["means"])
+    np.testing.assert_allclose(found, expected, rtol=0, atol=4 * ROUNDING * np.abs(expected).max())
+
+
+def test_the_camera_inside_gaussians(splatter: Splatter, camera: Camera) -> None:
+    """Means close in front of the camera and beside it, with scales that reach across its plane: drawn, by the linearisation at
+    the border of the picture where they are beyond (its float64 twin has no other). Mitsuba's ``volprim_rf_basic`` drops every
+    Gaussian that a ray begins in. Centres are up to 130 pixels away and rounded three times (2e-5 pixels), and an ellipse is 7
+    pixels wide at least: alpha errs by 3.3 / 7 of that, 1e-5."""
+    rng = np.random.default_rng(7)
+    arrays = cloud(20, 2, 0.2, seed=4)
+    right, down = camera.to_world[:3, 0], -camera.to_world[:3, 1]
+    x, y, z = *rng.uniform(-0.3, 0.3, (2, 20)), rng.uniform(0.05, 0.3, 20)
+    arrays["means"] = np.float32(camera.origin + np.outer(x, right) + np.outer(y, down) + np.outer(z, camera.forward))
+    picture, kept = splatter.forward(tensors(arrays), camera)
+    truth, frozen = oracle_splats.draw(arrays, camera)
+    assert frozen.mask.any(axis=(1, 2)).sum() > 10
+    np.testing.assert_allclose(np.array(picture), truth[..., [0, 1, 2, 4]], rtol=0, atol=STOP * truth.max() + ROUNDING)
+    assert all(np.isfinite(np.array(g)).all() for g in splatter.backward(kept, picture)[0].values())
+
+
+def test_a_black_channel_has_no_derivative_and_the_rest_has(splatter: Splatter) -> None:
+    """Below 0 a colour is 0, and so is its derivative: in the red of a Gaussian and nowhere else. In front of a grey one,
+    opacity and size of what is black in all channels are learnt by what they hide."""
+    arrays = stack([0.0, 1.0], [0.0, 0.3])
+    arrays["harmonics"][0, 0] = [-1.8, -1.7, 0.4]
+    picture, kept = splatter.forward(tensors(arrays), straight())
+    truth, _ = oracle_splats.draw(arrays, straight())
+    np.testing.assert_allclose(np.array(picture), truth[..., [0, 1, 2, 4]], rtol=0, atol=STOP + ROUNDING)
+    gradient, _ = splatter.backward(kept, mi.TensorXf(np.ones(picture.shape, np.float32)))
+    harmonics = np.array(gradient["harmonics"])
+    assert not harmonics[0, :, 0].any()
+    assert harmonics[0, 0, 1:].all()
+    assert harmonics[1, 0].all()
+    arrays["harmonics"][0, 0] = -1.8
+    gradient, _ = splatter.backward(splatter.forward(tensors(arrays), straight())[1], mi.TensorXf(d_red(picture.shape)))
+    assert not np.array(gradient["harmonics"])[0].any()
+    assert np.array(gradient["opacity_logits"])[0] < 0  # at a logit of 0, where |x| has no derivative
+    assert np.array(gradient["log_scales"])[0].any()
+
+
+def d_red(shape: tuple[int, ...]) -> np.ndarray:
+    """The derivative of the sum of the red of a picture."""
+    d_picture = np.zeros(shape, np.float32)
+    d_picture[..., 0] = 1
+    return d_picture
+
+
 @pytest.mark.parametrize("n", [0, 3])
 def test_no_gaussian_is_seen(splatter: Splatter, camera: Camera, n: int) -> None:
     arrays = cloud(n, 2, 0.01)
@@ -158,11 +240,28 @@ def test_nan_is_named_by_its_index(splatter: Splatter, camera: Camera, name: str
         splatter.forward(tensors(arrays), camera)
 
 
-def test_a_quaternion_of_no_direction_is_refused(splatter: Splatter, camera: Camera) -> None:
+@pytest.mark.parametrize("value", [0, 1e-40, np.inf])
+def test_a_quaternion_of_no_direction_is_refused(splatter: Splatter, camera: Camera, value: float) -> None:
     arrays = cloud(9, 2, 0.1)
-    arrays["quaternions"][4] = 0
-    with pytest.raises(MivolError, match="Gaussian 4: found NaN or a quaternion 0"):
+    arrays["quaternions"][4] = value
+    with pytest.raises(MivolError, match="Gaussian 4: found NaN, or a quaternion that is 0 or infinite"):
         splatter.forward(tensors(arrays), camera)
+
+
+@pytest.mark.parametrize("length", [1e-29, 1e-20, 1e20, 1e30])
+def test_quaternions_of_any_length(splatter: Splatter, camera: Camera, length: float) -> None:
+    """A rotation is that of the direction: squares of these lengths are 0 or infinite in float32. Components are rounded by
+    2^-24 of themselves when they are scaled, as all else is. The derivative shrinks as the quaternion grows."""
+    arrays = cloud(20, 2, 0.1, seed=4)
+    arrays["quaternions"] /= np.linalg.norm(arrays["quaternions"], axis=1, keepdims=True)
+    scaled = arrays | {"quaternions": arrays["quaternions"] * np.float32(length)}
+    truth, _ = oracle_splats.draw(arrays, camera)
+    picture, kept = splatter.forward(tensors(scaled), camera)
+    np.testing.assert_allclose(np.array(picture), truth[..., [0, 1, 2, 4]], rtol=0, atol=STOP * truth.max() + ROUNDING)
+    found = np.array(splatter.backward(kept, picture)[0]["quaternions"]).astype(float) * length
+    picture, kept = splatter.forward(tensors(arrays), camera)
+    unit = np.array(splatter.backward(kept, picture)[0]["quaternions"])
+    np.testing.assert_allclose(found, unit, rtol=0, atol=2 * ROUNDING * np.abs(unit).max())
 
 
 def test_lists_that_do_not_fit_are_refused_with_their_size(splatter: Splatter, monkeypatch: pytest.MonkeyPatch) -> None:
