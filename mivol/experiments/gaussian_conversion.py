@@ -33,6 +33,9 @@ EDGE = 128
 ANGLE = 40.0
 """Field of view of these views [degree]."""
 
+JUDGED_FROM = f"{ANGLE:g} degrees wide, from a Fibonacci lattice of directions around the box"
+"""These views in words, for what is printed."""
+
 
 def convert_to_field(source: Path, target: Path, resolution: int, box: Sequence[float] | None, variant: str) -> str:
     """Write the Gaussians of a file, or points as Gaussians, as a radiance field.
@@ -60,7 +63,8 @@ def convert_to_field(source: Path, target: Path, resolution: int, box: Sequence[
     lines = [
         f"{target}: {' x '.join(map(str, field.res[::-1]))} nodes, {field.rows - 1} of them stored, degree {field.degree}",
         f"{100 * mass / masses_of_gaussians(cloud).sum():.4g} % of the extinction lies in the box",
-        f"{loss_of_field(cloud, field):.1f} dB: views of the field against splatted Gaussians, over black, peak 1",
+        f"{loss_of_field(cloud, field):.1f} dB: {VIEWS} views of the field, {EDGE} x {EDGE} pixels each, {JUDGED_FROM}, "
+        "against splatted Gaussians, over black, peak 1",
     ]
     capped = int((cloud.opacities() > MOST_OPAQUE).sum())
     if capped:

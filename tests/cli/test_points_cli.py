@@ -88,6 +88,7 @@ def test_convert_makes_a_field_and_says_its_loss(tmp_path: Path, capsys: pytest.
         assert main(["convert", str(tmp_path / "a.ply"), str(tmp_path / "b.npz"), "--resolution", str(resolution)]) == 0
         written, share, lost = capsys.readouterr().out.splitlines()
         assert f"b.npz: {resolution} x {resolution} x {resolution} nodes" in written and "degree 1" in written
+        assert "6 views of the field, 128 x 128 pixels each, 40 degrees wide, from a Fibonacci lattice" in lost
         assert float(share.split()[0]) == pytest.approx(99, abs=1)  # within three deviations of the outer ones
         loss[resolution] = float(lost.split()[0])
     assert loss[16] > loss[8] + 6
