@@ -36,15 +36,7 @@ def build_media(scene: mi.Scene, needs: Needs, plan: Plan, survey: SceneSurvey) 
             if (tracks or flies) and part.lattice is not None and part.activation is None and not mixes:
                 part.lattice.block_ranges = read_block_ranges(part, survey)
         bodies.append(Body(view, boundary.box, tracks))
-    return SceneMedia(
-        scene,
-        bodies,
-        has_surfaces=bool(needs.surfaces),
-        has_null_transmission=needs.has_null_transmission,
-        start=needs.start,
-        locates_camera=needs.camera_inside and needs.start is None,
-        size=survey.size,
-    )
+    return needs.media_of(scene, bodies, survey.size)
 
 
 def build_estimators(

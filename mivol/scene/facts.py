@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import mitsuba as mi
 
+from mivol.transport.media.body import Body
 from mivol.transport.media.box import Box
 from mivol.transport.media.medium_view import MediumView
+from mivol.transport.media.scene_media import SceneMedia
 
 __all__ = ["Boundary", "MediaLight", "MediumFacts", "Needs"]
 
@@ -122,3 +125,20 @@ class Needs:
     places: tuple[str, ...]
     film_samples: int
     media_light: MediaLight | None = None
+
+    def media_of(self, scene: mi.Scene, bodies: Sequence[Body], size: float) -> SceneMedia:
+        """The media of the scene among its surfaces, as these facts have them.
+
+        Args:
+            bodies: one for each of ``boundaries``, in the same order.
+            size: of the scene [length].
+        """
+        return SceneMedia(
+            scene,
+            bodies,
+            has_surfaces=bool(self.surfaces),
+            has_null_transmission=self.has_null_transmission,
+            start=self.start,
+            locates_camera=self.camera_inside and self.start is None,
+            size=size,
+        )

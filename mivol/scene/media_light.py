@@ -51,15 +51,7 @@ def read_media_light(scene: mi.Scene, sensor: mi.Sensor, needs: Needs, survey: S
         None where the place of some medium that emits is not known: where it fills no shape, or shapes are instances.
     """
     bodies = [Body(view, boundary.box) for boundary, view in zip(needs.boundaries, needs.views, strict=True)]
-    media = SceneMedia(
-        scene,
-        bodies,
-        has_surfaces=bool(needs.surfaces),
-        has_null_transmission=needs.has_null_transmission,
-        start=needs.start,
-        locates_camera=needs.camera_inside and needs.start is None,
-        size=survey.size,
-    )
+    media = needs.media_of(scene, bodies, survey.size)
     boxes = find_emitting_boxes(scene, media, needs)
     if boxes is None:
         return None

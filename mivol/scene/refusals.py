@@ -156,12 +156,8 @@ def refuse_bounded(needs: Needs, settings: Settings, aovs: tuple[str, ...]) -> N
         (any(v.microflakes is not None for v in needs.views), "a medium of its scene has sggx microflakes", "take them out"),
         (bool(moved), f"the derivative of {', '.join(moved)} was asked for", "take finite differences"),
     ]
-    for found, what, way_out in reasons:
-        if found:
-            raise MivolError(
-                f"the medium in {medium.name} is a {medium.bounded}, which is bounded (a majorant is known, and no optical "
-                f"depth of a ray), and {what}: {way_out}, or voxelise the field."
-            )
+    kind = f"is a {medium.bounded}, which is bounded (a majorant is known, and no optical depth of a ray)"
+    _refuse_medium(f"the medium in {medium.name} {kind}", reasons, "voxelise the field")
 
 
 def refuse_gaussians(needs: Needs, aovs: tuple[str, ...]) -> None:
@@ -175,12 +171,15 @@ def refuse_gaussians(needs: Needs, aovs: tuple[str, ...]) -> None:
         (any(m.emits for m in needs.media), "a medium of its scene emits light", "take the emission out"),
         (bool(moved), f"the derivative of {', '.join(moved)} was asked for", "take finite differences"),
     ]
-    for found, what, way_out in reasons:
-        if found:
-            raise MivolError(
-                f"the medium in {medium.name} is made of {medium.gaussians} Gaussians that rays are traced through, "
-                f"and {what}: {way_out}, or convert them to a grid (mivol convert)."
-            )
+    kind = f"is made of {medium.gaussians} Gaussians that rays are traced through"
+    _refuse_medium(f"the medium in {medium.name} {kind}", reasons, "convert them to a grid (mivol convert)")
+
+
+def _refuse_medium(medium: str, reasons: list[tuple[bool, str, str]], other_way: str) -> None:
+    """Refuse for the first of the reasons (does it hold, what was found, the way out) that holds."""
+    for holds, what, way_out in reasons:
+        if holds:
+            raise MivolError(f"{medium}, and {what}: {way_out}, or {other_way}.")
 
 
 def _moved_emitters(needs: Needs) -> list[str]:
