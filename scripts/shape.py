@@ -11,6 +11,7 @@ import ast
 import json
 import statistics
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 __all__ = ["circles", "find_circles", "measure"]
@@ -77,9 +78,14 @@ def _largest(sizes: dict[str, int], least: int) -> dict[str, int]:
     return {name: size for name, size in sorted(sizes.items(), key=lambda item: -item[1]) if size >= least}
 
 
-def find_circles(package: Path) -> list[str]:
+def parse(path: Path) -> ast.Module:
+    """The syntax tree of a file."""
+    return ast.parse(path.read_text(), str(path))
+
+
+def find_circles(package: Path, tree_of: Callable[[Path], ast.Module] = parse) -> list[str]:
     """Modules of a package that can be reached from themselves along imports, those for types alone included."""
-    return _circles_of(package, {path: ast.parse(path.read_text(), str(path)) for path in sorted(package.rglob("*.py"))})
+    return _circles_of(package, {path: tree_of(path) for path in sorted(package.rglob("*.py"))})
 
 
 def _circles_of(package: Path, trees: dict[Path, ast.Module]) -> list[str]:
