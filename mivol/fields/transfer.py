@@ -4,6 +4,7 @@ r"""A scalar field seen through a transfer function: what value is how opaque, a
 
 for a table y of n entries at equal steps of the value s from s_0 to s_1; values beyond them have the entry at the end. Given as
 ``sigma_t`` and as ``emission`` of a ``mivol_medium`` two such fields are the emission-absorption model of scans (Max 1995).
+The scan's gradient may take part: :mod:`mivol.fields.shading`.
 
 Conventions. The scalar grid is (Z, Y, X, 1), voxel centres, clamped borders, and may hold any finite number (Hounsfield
 units are negative in air). It is refined ``refine`` times in each direction, then looked up, and what comes out is a grid like
@@ -22,6 +23,8 @@ import mitsuba as mi
 import numpy as np
 
 from mivol.errors import MivolError
+from mivol.fields.shading import Relief, gradient_grid
+from mivol.fields.table import check_domain, check_table, domain_of, look_up, rows_of
 from mivol.fields.voxels import Voxels
 from mivol.files import read_volume
 
@@ -33,28 +36,36 @@ class Transfer:
 
     Args:
         field: scalar values (Z, Y, X, 1), finite.
-        table: (n, C) entries, n at least 2, C 1 or 3, finite and at least 0.
-        domain: values [of the field] of the first and the last entry.
+        table: (n, C) entries, n at least 2, C 1 or 3, finite and at least 0, and the values [of the field] of the first and
+            the last entry.
         refine: how many nodes stand for a voxel in each direction.
         to_world: (4, 4) affine map of the unit cube to the world.
         name: what the grid is called in a sentence that refuses it.
+        relief: what is made of the field's gradient.
 
     Raises:
         MivolError: a field, a table, a domain or a placement of another kind.
     """
 
     def __init__(
-        self, field: mi.TensorXf, table: mi.TensorXf, domain: tuple[float, float], refine: int, to_world: np.ndarray, name: str
+        self,
+        field: mi.TensorXf,
+        table: tuple[mi.TensorXf, tuple[float, float]],
+        refine: int,
+        to_world: np.ndarray,
+        name: str,
+        relief: Relief = Relief(),  # noqa: B008  (frozen)
     ) -> None:
-        self.name, self.domain, self.refine = name, domain, refine
-        self.field = field if len(field.shape) != 3 else mi.TensorXf(field.array, (*field.shape, 1))
-        self.table = table if len(table.shape) != 1 else mi.TensorXf(table.array, (*table.shape, 1))
+        entries, self.domain = table
+        self.name, self.refine, self.to_world, self.relief = name, refine, to_world, relief
+        self.field = _of_four_axes(field)
+        self.table = entries if len(entries.shape) != 1 else mi.TensorXf(entries.array, (*entries.shape, 1))
         self._check()
         self.voxels = Voxels(self.classified(), to_world, name)
 
     @classmethod
     def from_props(cls, props: mi.Properties) -> Transfer:
-        """Build from plugin parameters: ``filename`` or ``data``; ``table``; ``domain``; ``refine``; ``to_world``.
+        """Build from plugin parameters: ``filename`` or ``data``; ``table``; ``domain``; ``refine``; ``to_world``; a relief's.
 
         Raises:
             MivolError: as the class, or a text that holds other things than numbers.
@@ -66,24 +77,23 @@ class Transfer:
         field = props["data"] if sources == ["data"] else read_volume(_path(props["filename"]), frame="unit").values
         field = _tensor(np.array(field, dtype=np.float32)) if not isinstance(field, mi.TensorXf) else field
         table = props["table"]
-        table = table if isinstance(table, mi.TensorXf) else _tensor(_numbers(table, f"the table of {name}"))
-        values = np.array(dr.detach(field))
-        low, high = (float(np.min(values)), float(np.max(values))) if values.size else (0.0, 0.0)
-        if "domain" in props:
-            ends = _numbers(props["domain"], f"the domain of {name}").ravel().tolist()
-            if len(ends) != 2:
-                raise MivolError(f"the domain of {name} is {props['domain']}; two numbers in rising order are expected.")
-            low, high = ends
+        table = table if isinstance(table, mi.TensorXf) else _tensor(rows_of(table, f"the table of {name}"))
+        domain = domain_of(props["domain"], f"the domain of {name}") if "domain" in props else _range_of(field)
         place = np.array(props.get("to_world", mi.ScalarTransform4f()).matrix, dtype=np.float64)
         refine = props.get("refine", 1)
         if type(refine) is not int:
             raise MivolError(f"refine of {name} is {refine!r}; a whole number of nodes per voxel is expected, at least 1.")
-        return cls(field, table, (low, high), refine, place, name)
+        field = _of_four_axes(field)
+        _check_field(field, name)
+        return cls(field, (table, domain), refine, place, name, Relief.from_props(props, field, place, name))
 
     def classified(self) -> mi.TensorXf:
         """The table's entries at the nodes of the refined grid, (Z, Y, X, C), with derivatives by table and field."""
-        s, res = self._refined()
+        (s,), res = self._refined(self.field)
         rows = self._entries(s)
+        if not self.relief.is_flat:
+            gradient, _ = self._refined(gradient_grid(self.field, self.to_world))
+            rows = self.relief.apply(rows, mi.Vector3f(*gradient), self._places(res))
         flat = rows[0] if len(rows) == 1 else dr.ravel(mi.Vector3f(*rows))
         return mi.TensorXf(flat, (*res, len(rows)))
 
@@ -93,7 +103,7 @@ class Transfer:
         Cost: 9 look-ups a node of the refined grid.
         """
         with dr.suspend_grad():
-            s, res = self._refined()
+            (s,), res = self._refined(self.field)
             values, squares = np.array(s).reshape(res), []
             for axis in range(3):
                 ends = [mi.Float(values.take(range(k, res[axis] - 1 + k), axis).ravel()) for k in (0, 1)]
@@ -105,13 +115,7 @@ class Transfer:
 
     def _entries(self, s: mi.Float) -> list[mi.Float]:
         """The table at scalar values, a list of channels."""
-        n, channels = self.table.shape
-        low, high = self.domain
-        u = dr.clip((s - low) * ((n - 1) / (high - low)), 0, n - 1)
-        i = dr.minimum(mi.UInt32(u), n - 2)
-        f, at = u - mi.Float(i), dr.ravel(self.table)
-        ends = [[dr.gather(mi.Float, at, (i + k) * channels + c) for k in (0, 1)] for c in range(channels)]
-        return [dr.lerp(*pair, f) for pair in ends]
+        return look_up(self.table, self.domain, s)
 
     def refresh(self) -> None:
         """Take over a table or a field that was replaced from outside.
@@ -123,41 +127,49 @@ class Transfer:
             self._check()
         self.voxels.texture.set_tensor(self.classified())
 
-    def _refined(self) -> tuple[mi.Float, tuple[int, int, int]]:
-        """Scalar values at the nodes of the refined grid, and its resolution (Z, Y, X)."""
-        k, (z, y, x) = self.refine, self.field.shape[:3]
+    def _refined(self, grid: mi.TensorXf) -> tuple[list[mi.Float], tuple[int, int, int]]:
+        """A grid (Z, Y, X, C) at the nodes of the refined grid, a list of channels, and its resolution (Z, Y, X)."""
+        k, (z, y, x, channels) = self.refine, grid.shape
         if k == 1:
-            return dr.ravel(self.field), (z, y, x)
-        texture = mi.Texture3f(self.field, use_accel=False, migrate=False)
-        axes = [dr.arange(mi.Float, k * n) for n in (z, y, x)]
-        pz, py, px = dr.meshgrid(*[(a + 0.5) / (k * n) for a, n in zip(axes, (z, y, x), strict=True)], indexing="ij")
-        return texture.eval(mi.Point3f(px, py, pz))[0], (k * z, k * y, k * x)
+            return [dr.ravel(grid)] if channels == 1 else list(dr.unravel(mi.Vector3f, grid.array)), (z, y, x)
+        texture = mi.Texture3f(grid, use_accel=False, migrate=False)
+        return texture.eval(_middles((k * z, k * y, k * x))), (k * z, k * y, k * x)
+
+    def _places(self, res: tuple[int, int, int]) -> mi.Point3f:
+        """The nodes of the refined grid in the world."""
+        return mi.AffineTransform4f(mi.ScalarMatrix4f(self.to_world)) @ _middles(res)
 
     def _check(self) -> None:
-        if len(self.field.shape) != 4 or self.field.shape[3] != 1 or not np.isfinite(np.array(dr.detach(self.field))).all():
-            raise MivolError(
-                f"{self.name} was given a field of shape {tuple(self.field.shape)} (or with NaN in it); (Z, Y, X, 1) finite "
-                "numbers are expected."
-            )
-        rows = np.array(dr.detach(self.table))
-        if rows.ndim != 2 or rows.shape[0] < 2 or rows.shape[1] not in (1, 3) or not (np.isfinite(rows) & (rows >= 0)).all():
-            raise MivolError(
-                f"the table of {self.name} has the shape {rows.shape} and entries from {rows.min(initial=0):.4g}; at least two "
-                "entries of 1 or 3 finite numbers that are not negative are expected: clip them after each step."
-            )
-        low, high = self.domain
-        if not (np.isfinite([low, high]).all() and low < high):
-            raise MivolError(f"the domain of {self.name} is {low:g}, {high:g}; two numbers in rising order are expected.")
+        _check_field(self.field, self.name)
+        check_table(np.array(dr.detach(self.table)), f"the table of {self.name}")
+        check_domain(self.domain, f"the domain of {self.name}")
         if self.refine < 1:
             raise MivolError(f"refine of {self.name} is {self.refine}; a whole number of at least 1 is expected.")
 
 
-def _numbers(text: object, what: str) -> np.ndarray:
-    """Rows between commas, numbers between spaces: (n, C)."""
-    try:
-        return np.array([[float(v) for v in row.split()] for row in str(text).split(",")])
-    except ValueError as error:
-        raise MivolError(f"{what} is {str(text)!r}; rows of numbers are expected, as in '0 0 0, 1 0.5 0.2'.") from error
+def _of_four_axes(field: mi.TensorXf) -> mi.TensorXf:
+    """Scalar values with their axis of one channel."""
+    return field if len(field.shape) != 3 else mi.TensorXf(field.array, (*field.shape, 1))
+
+
+def _range_of(field: mi.TensorXf) -> tuple[float, float]:
+    """The least and the largest value."""
+    values = np.array(dr.detach(field))
+    return (float(np.min(values)), float(np.max(values))) if values.size else (0.0, 0.0)
+
+
+def _middles(res: tuple[int, int, int]) -> mi.Point3f:
+    """The nodes of a grid in the unit cube."""
+    z, y, x = dr.meshgrid(*[(dr.arange(mi.Float, n) + 0.5) / n for n in res], indexing="ij")
+    return mi.Point3f(x, y, z)
+
+
+def _check_field(field: mi.TensorXf, name: str) -> None:
+    if len(field.shape) != 4 or field.shape[3] != 1 or not np.isfinite(np.array(dr.detach(field))).all():
+        raise MivolError(
+            f"{name} was given a field of shape {tuple(field.shape)} (or with NaN in it); (Z, Y, X, 1) finite numbers are "
+            "expected."
+        )
 
 
 def _tensor(values: np.ndarray) -> mi.TensorXf:

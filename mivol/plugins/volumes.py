@@ -155,6 +155,13 @@ class TransferVolume(VoxelVolume):
         domain: values of the first and the last entry, ``-1000, 2000``. Default: those that the grid has.
         refine: nodes that stand for a voxel in each direction. Default 1.
         to_world: places the unit cube.
+        gradient_opacity: factors on the table's entries at equal steps of the gradient's magnitude, ``0, 1``: of an extinction,
+            it leaves boundaries and takes insides away. Default none.
+        gradient_domain: magnitudes [value per length] of the first and the last factor. Default 0 and the largest of the grid.
+        shade: whether an emission is lit by its gradient, as a surface is. Default false.
+        eye: where it is looked at from, ``x, y, z`` in the world; a parameter, for cameras that move.
+        light: where the light stands. Default at the eye.
+        ambient, diffuse, specular, specular_power: of that light. Default 0.1, 0.7, 0.2 and 10, as in VTK.
     """
 
     def __init__(self, props: mi.Properties) -> None:
@@ -162,6 +169,8 @@ class TransferVolume(VoxelVolume):
         self.table, self.scalar = self.mivol_transfer.table, self.mivol_transfer.field
         self.field = self.mivol_transfer.voxels
         self.texture = self.field.texture
+        shading = self.mivol_transfer.relief.shading
+        self.eye = None if shading is None else shading.eye
         props["to_world"] = mi.ScalarTransform4f(self.field.to_world)
         mi.Volume.__init__(self, props)
 
@@ -169,6 +178,8 @@ class TransferVolume(VoxelVolume):
         callback.put("table", self.table, mi.ParamFlags.Differentiable)
         callback.put("scalar", self.scalar, mi.ParamFlags.Differentiable)
         callback.put("data", self.texture.tensor(), mi.ParamFlags.Differentiable)  # what the table makes of it
+        if self.eye is not None:
+            callback.put("eye", self.eye, mi.ParamFlags.NonDifferentiable)
 
     def parameters_changed(self, keys: list[str]) -> None:
         self.mivol_transfer.refresh()

@@ -51,6 +51,11 @@ class Coefficients:
         elsewhere = [n for n in (*given, "emission", "emission_density") if n != "sigma_t" and _is_made_of_gaussians(props, n)]
         if elsewhere:
             raise MivolError(f"mivol_medium was given a mivol_gaussians as {elsewhere[0]}; give it as sigma_t, with an albedo.")
+        shaded = [n for n in given if _is_shaded(props, n)]
+        if shaded:
+            raise MivolError(
+                f"mivol_medium was given a shaded mivol_transfer as {shaded[0]}; shade what it emits (emission) alone."
+            )
         pair = next((p for p in PAIRS if set(given) <= set(p)), None)
         if pair is None or not given or given == ["albedo"]:
             raise MivolError(
@@ -167,6 +172,12 @@ def is_radiance_field(value: object) -> bool:
 
 def _is_made_of_gaussians(props: mi.Properties, name: str) -> bool:
     return isinstance(getattr(props.get(name, 0.0), "mivol_extinction", None), GaussianField)
+
+
+def _is_shaded(props: mi.Properties, name: str) -> bool:
+    """Whether a volume is lit: light is no coefficient."""
+    transfer = getattr(props.get(name, 0.0), "mivol_transfer", None)
+    return transfer is not None and transfer.relief.shading is not None
 
 
 def _volume(props: mi.Properties, name: str) -> mi.Volume:

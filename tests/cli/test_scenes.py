@@ -14,6 +14,7 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 import pytest
+from PIL import Image
 
 from mivol.cli import main
 from mivol.fields.gaussian_grid import grid_of_gaussians
@@ -258,7 +259,10 @@ def test_scan_view(tmp_path, data_dir):
     """Twenty steps of Adam bring the view nearer than the grey ramp that they start from (14 dB)."""
     said = script("scan_view", "--size", 48, "--spp", 8, "--iterations", 20, "-o", tmp_path, MIVOL_DATA=str(data_dir))
     assert float(re.search(r"found: ([\d.]+) dB", said).group(1)) > 22
-    assert (tmp_path / "tooth.png").stat().st_size > 500
+    shown = {name: np.array(Image.open(tmp_path / f"{name}.png")) / 255 for name in ("tooth", "tooth_found")}
+    assert not np.array_equal(shown["tooth"], shown["tooth_found"])
+    # The scan fills some of the picture, on a ground of less than 0.02 (sRGB code 0.15), and enamel is bright.
+    assert 0.05 < np.mean(shown["tooth"].max(axis=-1) > 0.3) < 0.5
 
 
 @pytest.mark.slow

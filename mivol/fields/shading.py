@@ -1,0 +1,199 @@
+r"""A scan lit as if it had surfaces: normals from its gradient, light that they reflect, opacity where values change.
+
+.. math:: c' = c\,(k_a + k_d\,|n \cdot l|) + k_s\,|n \cdot h|^m, \qquad n = \nabla s / |\nabla s|, \qquad
+          h = (l + v) / |l + v|
+
+with c the colour of a table, l the direction to the light and v that to the eye (Levoy 1988, equation 3, without his fading
+with distance). Both sides of a surface are lit. The light is white and stands at the eye unless it has a place of its own;
+matter casts no shadow on matter, and where a scan is constant there is no normal and k_a c is left.
+Opacities may be multiplied by a table of the gradient's magnitude, which leaves boundaries between materials and takes
+their insides away (Levoy 1988; Kindlmann and Durkin 1998).
+
+Conventions. Gradients are central differences at the voxels (one-sided in the outermost layers), linear between them, per
+length of the world: exact for a field that is quadratic in space. The defaults of the coefficients are those of VTK's
+``vtkVolumeProperty``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mivol.errors import MivolError
+from mivol.fields.table import check_domain, check_table, domain_of, look_up, rows_of
+
+__all__ = ["GradientOpacity", "Relief", "Shading", "gradient_grid"]
+
+COEFFICIENTS = {"ambient": 0.1, "diffuse": 0.7, "specular": 0.2, "specular_power": 10.0}
+
+
+@dataclass(frozen=True)
+class Shading:
+    """The light on a scan's surfaces.
+
+    Attributes:
+        eye: where it is looked at from, a point of the world.
+        light: where the light stands, a point of the world; None: at the eye.
+        ambient, diffuse, specular: k_a, k_d and k_s.
+        specular_power: m.
+    """
+
+    eye: mi.Point3f
+    light: mi.Point3f | None
+    ambient: float
+    diffuse: float
+    specular: float
+    specular_power: float
+
+    @classmethod
+    def from_props(cls, props: mi.Properties, name: str) -> Shading | None:
+        """Build from plugin parameters: ``shade``, ``eye``, ``light`` and the coefficients; None where nothing is shaded.
+
+        Raises:
+            MivolError: no eye, or a coefficient that is negative or not finite.
+        """
+        numbers = {key: float(props.get(key, value)) for key, value in COEFFICIENTS.items()}
+        eye, light = (_point(props, key) for key in ("eye", "light"))
+        if not props.get("shade", False):
+            return None
+        if eye is None:
+            raise MivolError(f"{name} is to be shaded and was given no eye; give the place of the camera, or shade = false.")
+        wrong = [f"{key} {value:g}" for key, value in numbers.items() if not 0 <= value < float("inf")]
+        if wrong:
+            raise MivolError(f"{name} was given {', '.join(wrong)}; finite numbers that are not negative are expected.")
+        return cls(eye, light, **numbers)
+
+    def lit(self, colours: list[mi.Float], gradient: mi.Vector3f, p: mi.Point3f) -> list[mi.Float]:
+        """What points reflect; attached to colours, gradient and eye.
+
+        Args:
+            colours: of the points, a list of channels.
+            gradient: of the scan there, per length.
+            p: where they are in the world.
+        """
+        n = _unit(gradient)
+        to_eye = _unit(self.eye - p)
+        to_light = to_eye if self.light is None else _unit(self.light - p)
+        half = _unit(to_light + to_eye)
+        matte = self.ambient + self.diffuse * dr.abs(dr.dot(n, to_light))
+        highlight = self.specular * _power(dr.abs(dr.dot(n, half)), self.specular_power)
+        return [c * matte + highlight for c in colours]
+
+
+@dataclass(frozen=True)
+class GradientOpacity:
+    """Factors on a table's entries by the magnitude of the gradient.
+
+    Attributes:
+        table: (n, 1), factors of at least 0.
+        domain: magnitudes [value of the scan per length] of the first and the last factor.
+    """
+
+    table: mi.TensorXf
+    domain: tuple[float, float]
+
+    @classmethod
+    def from_props(cls, props: mi.Properties, name: str, most: float) -> GradientOpacity | None:
+        """Build from plugin parameters: ``gradient_opacity`` and ``gradient_domain``; None where there is no table.
+
+        Args:
+            props: of the plugin.
+            name: of the plugin in a sentence.
+            most: the largest magnitude of the scan's gradient: where the last factor is, unless a domain is given.
+
+        Raises:
+            MivolError: a table or a domain of another kind.
+        """
+        domain = (0.0, most or 1.0)
+        if "gradient_domain" in props:
+            domain = domain_of(props["gradient_domain"], f"the gradient_domain of {name}")
+        if "gradient_opacity" not in props:
+            return None
+        rows = rows_of(props["gradient_opacity"], f"the gradient_opacity of {name}")
+        check_table(rows, f"the gradient_opacity of {name}", (1,))
+        check_domain(domain, f"the gradient_domain of {name}")
+        return cls(mi.TensorXf(np.ascontiguousarray(rows, dtype=np.float32)), domain)
+
+    def factor(self, gradient: mi.Vector3f) -> mi.Float:
+        """The factor at points of such gradients."""
+        return look_up(self.table, self.domain, dr.norm(gradient))[0]
+
+
+@dataclass(frozen=True)
+class Relief:
+    """What is made of a scan's gradient: factors, light, both or nothing."""
+
+    opacity: GradientOpacity | None = None
+    shading: Shading | None = None
+
+    @classmethod
+    def from_props(cls, props: mi.Properties, field: mi.TensorXf, to_world: np.ndarray, name: str) -> Relief:
+        """Build from the parameters of a plugin that shows a scan (Z, Y, X, 1) in a box of the world.
+
+        Raises:
+            MivolError: as :class:`Shading` and :class:`GradientOpacity`.
+        """
+        needs_most = "gradient_opacity" in props and "gradient_domain" not in props
+        with dr.suspend_grad():
+            most = np.linalg.norm(np.array(gradient_grid(field, to_world)), axis=-1).max() if needs_most else 0.0
+        return cls(GradientOpacity.from_props(props, name, float(most)), Shading.from_props(props, name))
+
+    @property
+    def is_flat(self) -> bool:
+        """Whether the gradient changes nothing."""
+        return self.opacity is None and self.shading is None
+
+    def apply(self, entries: list[mi.Float], gradient: mi.Vector3f, p: mi.Point3f) -> list[mi.Float]:
+        """A table's entries at points of the world, times their factor, and lit."""
+        if self.opacity is not None:
+            factor = self.opacity.factor(gradient)
+            entries = [entry * factor for entry in entries]
+        return entries if self.shading is None else self.shading.lit(entries, gradient, p)
+
+
+def gradient_grid(field: mi.TensorXf, to_world: np.ndarray) -> mi.TensorXf:
+    """The gradient of a scan at its voxels, (Z, Y, X, 3) along x, y and z of the world; attached to the scan.
+
+    Args:
+        field: (Z, Y, X, 1).
+        to_world: (4, 4) affine map of the unit cube to the world.
+    """
+    res, values = field.shape[:3], dr.ravel(field)
+    z, y, x = dr.meshgrid(*(dr.arange(mi.Int32, n) for n in res), indexing="ij")
+    index = {"x": x, "y": y, "z": z}
+    slopes = []
+    for axis, n in zip("xyz", reversed(res), strict=True):
+        ends = [dr.clip(index[axis] + step, 0, n - 1) for step in (-1, 1)]
+        before, after = (dr.gather(mi.Float, values, _flat({**index, axis: end}, res)) for end in ends)
+        # In the unit cube a voxel is 1 / n wide; along an axis of one voxel nothing changes.
+        slopes.append(n * (after - before) / dr.maximum(mi.Float(ends[1] - ends[0]), 1))
+    world = np.linalg.inv(np.asarray(to_world)[:3, :3]).T
+    along = [sum(float(share) * slope for share, slope in zip(row, slopes, strict=True)) for row in world]
+    return mi.TensorXf(dr.ravel(mi.Vector3f(*along)), (*res, 3))
+
+
+def _flat(index: dict[str, mi.Int32], res: tuple[int, ...]) -> mi.UInt32:
+    return mi.UInt32((index["z"] * res[1] + index["y"]) * res[2] + index["x"])
+
+
+def _unit(v: mi.Vector3f) -> mi.Vector3f:
+    """Vectors of length 1; those that vanish stay."""
+    length = dr.norm(v)
+    return v / dr.select(length > 0, length, 1)
+
+
+def _power(x: mi.Float, exponent: float) -> mi.Float:
+    """x^m for x of at least 0, with a slope of 0 at 0; 0^0 is 0, since there is no surface."""
+    return dr.select(x > 0, dr.power(dr.select(x > 0, x, 1), exponent), 0)
+
+
+def _point(props: mi.Properties, key: str) -> mi.Point3f | None:
+    """A point among plugin parameters, not compiled into kernels: cameras move."""
+    if key not in props:
+        return None
+    point = mi.Point3f(*(float(v) for v in np.array(props[key]).ravel()))
+    dr.make_opaque(point)
+    return point
