@@ -105,6 +105,7 @@ class Needs:
         parameters: keys whose derivatives are asked for.
         places: those of them that are of shapes and sensors.
         film_samples: pixels times samples of the sensor asked about.
+        are_samples_independent: its sampler stratifies nothing, so that other random numbers may stand for its own.
         media_light: what was read of the light that media emit; None where none does, where nothing scatters it, or where it
             could not be read.
     """
@@ -124,6 +125,7 @@ class Needs:
     parameters: tuple[str, ...]
     places: tuple[str, ...]
     film_samples: int
+    are_samples_independent: bool = True
     media_light: MediaLight | None = None
 
     def media_of(self, scene: mi.Scene, bodies: Sequence[Body], size: float) -> SceneMedia:

@@ -67,6 +67,7 @@ def find_needs(
         parameters=asked,
         places=tuple(k for k in asked if _is_place(k, params.properties[k][2])),
         film_samples=int(np.prod(sensor.film().crop_size())) * (spp or sensor.sampler().sample_count()),
+        are_samples_independent=sensor.sampler().class_name() == "IndependentSampler",
     )
     scatters = needs.surfaces or any(m.is_scattering for m in media)
     refused = any(m.bounded or m.gaussians for m in media)

@@ -22,6 +22,7 @@ from mivol.scene.choices import (
     choose_shadows,
     choose_side_flights,
     choose_skipping,
+    choose_successive,
     choose_tracing,
     choose_transport,
     is_lit,
@@ -59,7 +60,7 @@ class Plan:
     :data:`mivol.transport.path.estimators.SEGMENT_ESTIMATORS`; ``events`` how many points of a camera ray scatter in
     pictures; ``pass_rays`` how many rays a pass may hold; ``gradient_bytes`` what a gradient step takes beyond the rays;
     ``lobe`` the mean cosine of the lobe that side flights are drawn from, None for no side flights; ``draws_emission`` whether
-    light that media emit is drawn where paths scatter.
+    light that media emit is drawn where paths scatter; ``successive`` how many paths a lane walks one after the other, at most.
     """
 
     choices: tuple[Choice, ...]
@@ -71,6 +72,7 @@ class Plan:
     gradient_bytes: int
     lobe: float | None = None
     draws_emission: bool = False
+    successive: int = 1
 
 
 def make_plan(needs: Needs, settings: Settings, aovs: tuple[str, ...] = ()) -> Plan:
@@ -114,7 +116,9 @@ def make_plan(needs: Needs, settings: Settings, aovs: tuple[str, ...] = ()) -> P
     choices += why
     draws_emission, why = choose_media_light(needs, settings)
     choices += why
-    return Plan(tuple(choices), skips, tracks, segment, events, pass_rays, memory, lobe, draws_emission)
+    successive, why = choose_successive(needs, settings, segment)
+    choices += why
+    return Plan(tuple(choices), skips, tracks, segment, events, pass_rays, memory, lobe, draws_emission, successive)
 
 
 def _segment(needs: Needs, settings: Settings) -> str:

@@ -27,6 +27,7 @@ from mivol.transport.path.film import CameraRays, RenderSamples, adjoint_rays, r
 from mivol.transport.path.level import prepare_derivatives
 from mivol.transport.path.scores import Primal, Replay, Tangent
 from mivol.transport.path.settings import Settings
+from mivol.transport.path.successive import paths_a_lane, walk_successively
 from mivol.transport.path.walk import is_straight, walk_path
 
 __all__ = ["Session"]
@@ -81,7 +82,7 @@ class Session:
         with without_collections(), dr.suspend_grad():
             estimators, plan = self._open(scene, sensor, spp, pictures=True)
             samples = RenderSamples(sensor, seed, spp, plan.pass_rays, estimators.segment.directions)
-            image = record(samples, self.aovs, lambda rays: self._primal(estimators, rays))
+            image = record(samples, self.aovs, lambda rays: self._primal(estimators, rays, plan.successive))
         if evaluate:
             dr.eval(image)
         return image
@@ -141,10 +142,15 @@ class Session:
         plan = make_plan(needs, self.settings, self.aovs)
         return build_estimators(scene, needs, plan, self.settings, survey, pictures), plan
 
-    def _primal(self, estimators: Estimators, rays: CameraRays) -> tuple:
-        score = Primal(_black(rays.ray))
-        score, alpha = walk_path(estimators, self.settings, rays.sampler, rays.ray, score, strata=rays.strata)
-        return score.L, alpha, integrate_aovs(estimators.media, rays.ray, self.aovs)
+    def _primal(self, estimators: Estimators, rays: CameraRays, successive: int) -> tuple:
+        count = paths_a_lane(successive, dr.width(rays.ray))
+        if count > 1:
+            L, alpha = walk_successively(estimators, self.settings, rays.sampler, rays.ray, count)
+        else:
+            score = Primal(_black(rays.ray))
+            score, alpha = walk_path(estimators, self.settings, rays.sampler, rays.ray, score, strata=rays.strata)
+            L = score.L
+        return L, alpha, integrate_aovs(estimators.media, rays.ray, self.aovs)
 
     def _tangent(self, estimators: Estimators, rays: CameraRays) -> tuple:
         prepare_derivatives(estimators, self.settings, rays.ray)

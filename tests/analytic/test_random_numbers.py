@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
 from false_alarms import assert_same_mean, fresh
 
-from mivol.transport.traversal.random_numbers import draw_pcg32, seed_pcg32
+from mivol.transport.traversal.random_numbers import LaneSampler, draw_pcg32, seed_pcg32
 from mivol.validate.moments import Moments
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
@@ -29,3 +30,14 @@ def test_numbers_are_uniform():
     rows = np.vstack([u, np.roll(u[0], 1)]) - 0.5
     pairs = [rows[i] * rows[j] for i in range(5) for j in range(i)]
     assert_same_mean(Moments.of(np.array(pairs).T), what="products")
+
+
+@pytest.mark.statistical
+def test_numbers_of_paths_are_uniform() -> None:
+    """2^16 paths of the same two seeds, 4 numbers each, as above."""
+    sampler = LaneSampler.seeded(mi.UInt32(7 + fresh(0)), mi.UInt32(11), dr.arange(mi.UInt32, 1 << 16))
+    u = np.array([np.array(x, dtype=np.float64) for x in (sampler.next_1d(), *sampler.next_2d(), sampler.next_1d())])
+    rows = np.vstack([u, np.roll(u[0], 1)]) - 0.5
+    pairs = [rows[i] * rows[j] for i in range(5) for j in range(i)]
+    assert_same_mean(Moments.of(np.vstack([u - 1 / 2, u**2 - 1 / 3, pairs]).T), 0, what="numbers, squares, products")
+    assert np.array_equal(np.array(sampler.next_1d(False)), np.array(sampler.next_1d(False)))

@@ -37,10 +37,11 @@ from mivol.transport.path.scores import Primal, Replay, Tangent
 from mivol.transport.path.settings import Settings
 from mivol.transport.path.side_flight import Aim, SideSamples, fly_aside, weigh_aim
 from mivol.transport.path.turn import TurnSamples, sample_turn
+from mivol.transport.traversal.random_numbers import LaneSampler
 from mivol.transport.traversal.ray_spawning import camera_ray
 from mivol.transport.traversal.strata import Strata
 
-__all__ = ["Path", "is_straight", "walk_path"]
+__all__ = ["Path", "alpha_of", "is_straight", "leave_camera", "start_path", "step", "walk_path"]
 
 Score = TypeVar("Score", Primal, Replay, Tangent)
 
@@ -89,7 +90,7 @@ class Path:
     clear: mi.Spectrum
     active: mi.Bool
     score: Any
-    sampler: mi.Sampler
+    sampler: mi.Sampler | LaneSampler
     strata: Strata | None
     probe: Probe | None = None
     shadow: ShadowReservoir | None = None
@@ -124,30 +125,31 @@ def walk_path(
     samples.
     """
     media = estimators.media
-    limit = settings.max_depth if settings.max_depth >= 0 else UNLIMITED
-    path = _start(estimators, camera_ray(ray), score, sampler, strata, mi.Bool(active) & (limit > 0))
-    path.stopped |= not settings.hide_emitters and media.scene.environment() is not None
-    path.medium = media.medium_at(ray)
+    path = start_path(estimators, camera_ray(ray), score, sampler, strata, mi.Bool(active) & (_limit(settings) > 0))
+    path = leave_camera(estimators, settings, path, media.medium_at(ray))
     if is_straight(estimators, settings):
-        path, event = _follow_segment(estimators, settings, limit, path)
+        path, event = _follow_segment(estimators, settings, path)
         path = _add_emission(estimators, settings, path, event)
         path.stopped |= event.at_surface
-        return path.score, _alpha(path.stopped, path.clear)
+        return path.score, alpha_of(path)
     if estimators.segment.ends_in_media and score.purpose != PICTURE:
         path.probe = Probe.none(ray)
         path.shadow = ShadowReservoir.empty(media, ray)
-    if estimators.lobe is not None:
-        path.aim = Aim.none(dr.width(ray))
-    path = _walk_on(estimators, settings, limit, path)
+    path = _walk_on(estimators, settings, path)
     if path.shadow is not None:
         path.score = path.score.add(ShadowTerm(media, path.shadow))
     if path.probe is not None:
-        path.score = path.score.add(_estimate_probe(estimators, settings, limit, path.probe, sampler))
-    return path.score, _alpha(path.stopped, path.clear)
+        path.score = path.score.add(_estimate_probe(estimators, settings, path.probe, sampler))
+    return path.score, alpha_of(path)
 
 
-def _start(
-    estimators: Estimators, ray: mi.Ray3f, score: Score, sampler: mi.Sampler, strata: Strata | None, active: mi.Bool
+def start_path(
+    estimators: Estimators,
+    ray: mi.Ray3f,
+    score: Score,
+    sampler: mi.Sampler | LaneSampler,
+    strata: Strata | None,
+    active: mi.Bool,
 ) -> Path:
     """A path that has not met anything yet, outside all media."""
     n = dr.width(ray)
@@ -170,15 +172,32 @@ def _start(
     )
 
 
-def _walk_on(estimators: Estimators, settings: Settings, limit: int, path: Path) -> Path:
+def leave_camera(estimators: Estimators, settings: Settings, path: Path, medium: mi.MediumPtr) -> Path:
+    """A path that was started, as it leaves a camera in a medium."""
+    path.stopped |= not settings.hide_emitters and estimators.media.scene.environment() is not None
+    path.medium = medium
+    if estimators.lobe is not None:
+        path.aim = Aim.none(dr.width(path.ray))
+    return path
+
+
+def step(estimators: Estimators, settings: Settings, path: Path) -> Path:
+    """Follow a path along its segment and over the event at its end."""
+    path, event = _follow_segment(estimators, settings, path)
+    path = _add_emission(estimators, settings, path, event)
+    return _scatter(estimators, settings, path, event)
+
+
+def _walk_on(estimators: Estimators, settings: Settings, path: Path) -> Path:
     """Follow a path to its end."""
+    return dr.while_loop(
+        state=(path,), cond=lambda p: p.active, body=lambda p: (step(estimators, settings, p),), label="path"
+    )[0]
 
-    def step(path: Path) -> tuple[Path]:
-        path, event = _follow_segment(estimators, settings, limit, path)
-        path = _add_emission(estimators, settings, path, event)
-        return (_scatter(estimators, settings, limit, path, event),)
 
-    return dr.while_loop(state=(path,), cond=lambda p: p.active, body=step, label="path")[0]
+def _limit(settings: Settings) -> int:
+    """Largest path depth, as a number of 32 bits."""
+    return settings.max_depth if settings.max_depth >= 0 else UNLIMITED
 
 
 def _add_side_flight(
@@ -195,27 +214,27 @@ def _add_side_flight(
     return path, samples, flight.to_emitter
 
 
-def _estimate_probe(estimators: Estimators, settings: Settings, limit: int, probe: Probe, sampler: mi.Sampler) -> ProbeTerm:
+def _estimate_probe(estimators: Estimators, settings: Settings, probe: Probe, sampler: mi.Sampler) -> ProbeTerm:
     """Estimate the radiance that is scattered at a probe towards the path, by a path of its own."""
     media, n = estimators.media, dr.width(probe.ray)
     on = probe.weight > 0
     mei = medium_interaction(probe.ray, dr.select(on, probe.t, 0))
     mei.medium = media.medium_of(probe.body, on)
-    path = _start(estimators, probe.ray, Primal(dr.zeros(mi.Spectrum, n)), sampler, None, on)
+    path = start_path(estimators, probe.ray, Primal(dr.zeros(mi.Spectrum, n)), sampler, None, on)
     path.depth = mi.UInt32(probe.depth)
     collision = Collision(mei, dr.full(mi.Spectrum, 1, n), on, probe.t, probe.body)
     event = PathEvent(dr.zeros(mi.SurfaceInteraction3f, n), mi.Float(0), mei.medium, dr.full(mi.Bool, False, n), collision)
-    path = _walk_on(estimators, settings, limit, _scatter(estimators, settings, limit, path, event))
+    path = _walk_on(estimators, settings, _scatter(estimators, settings, path, event))
     return ProbeTerm(media, probe, mei, dr.detach(path.score.L), estimators.segment.level, on)
 
 
-def _alpha(stopped: mi.Bool, clear: mi.Spectrum) -> mi.Float:
+def alpha_of(path: Path) -> mi.Float:
     """What a film's alpha sees of a path: all of it where a surface stopped it, else the opacity of the media.
 
     This is the mean of what ``volpath`` draws from ``max_depth`` 2 on (1 where it finds a point in a medium or on a surface),
     without its noise. At depth 1 ``volpath`` finds no points in media, and its smoke has no alpha; here it has the same one.
     """
-    return dr.select(stopped, 1, 1 - sum(colours(clear)) / dr.size_v(clear))
+    return dr.select(path.stopped, 1, 1 - sum(colours(path.clear)) / dr.size_v(path.clear))
 
 
 def is_straight(estimators: Estimators, settings: Settings) -> bool:
@@ -226,9 +245,9 @@ def is_straight(estimators: Estimators, settings: Settings) -> bool:
     return not media.has_surfaces or (settings.scatterings == 0 and not media.has_null_transmission)
 
 
-def _follow_segment(estimators: Estimators, settings: Settings, limit: int, path: Path) -> tuple[Path, PathEvent]:
+def _follow_segment(estimators: Estimators, settings: Settings, path: Path) -> tuple[Path, PathEvent]:
     """Follow the segment to the next opaque surface: media add a term, and their transmittance is a factor."""
-    may_scatter = path.active & (path.depth + 1 < limit)
+    may_scatter = path.active & (path.depth + 1 < _limit(settings))
     samples = estimators.segment.draw(path.sampler, may_scatter, path.strata)
     # A copy of the throughput: it is multiplied in place below, and derivatives read the segment's own after that.
     segment = PathSegment(path.ray, path.medium, mi.Spectrum(path.beta), may_scatter, samples)
@@ -262,9 +281,10 @@ def _add_emission(estimators: Estimators, settings: Settings, path: Path, event:
     return path
 
 
-def _scatter(estimators: Estimators, settings: Settings, limit: int, path: Path, event: PathEvent) -> Path:
+def _scatter(estimators: Estimators, settings: Settings, path: Path, event: PathEvent) -> Path:
     """Estimate the direct light where the segment has ended, and sample the direction in which the path continues."""
     arrives, sampler = event.at_surface | event.in_medium, path.sampler
+    limit = _limit(settings)
     may_scatter = arrives & (path.depth + 1 < limit)
     path = _add_direct_light(estimators, path, event, may_scatter)
     if estimators.emission is not None:

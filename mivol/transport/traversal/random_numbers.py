@@ -8,10 +8,12 @@ References: O'Neill 2014 (permuted congruential generators, RXS-M-XS 32).
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import drjit as dr
 import mitsuba as mi
 
-__all__ = ["draw_pcg32", "seed_pcg32"]
+__all__ = ["LaneSampler", "draw_pcg32", "seed_pcg32"]
 
 
 def seed_pcg32(u: mi.Float, width: int, number: int = 0) -> mi.UInt32:
@@ -44,3 +46,31 @@ def draw_pcg32(state: mi.UInt32, count: int) -> tuple[mi.UInt32, list[mi.Float]]
         numbers.append((mi.Float(word >> 8) + 0.5) * (1 / (1 << 24)))
         state = state * mi.UInt32(747796405) + mi.UInt32(2891336453)
     return state, numbers
+
+
+@dataclass
+class LaneSampler:
+    """Random numbers of paths that begin at different times: each brings its own generator along.
+
+    Attributes:
+        generator: of 64 bits of state, so that paths of any length do not meet in it.
+    """
+
+    generator: mi.PCG32
+
+    @classmethod
+    def seeded(cls, a: mi.UInt32, b: mi.UInt32, stream: mi.UInt32) -> LaneSampler:
+        """A generator for each lane, by two seeds of 24 bits and the number of its sequence."""
+        state = (mi.UInt64(a) << 32) | mi.UInt64(b)
+        generator = mi.PCG32(size=dr.width(stream))
+        generator.seed(state, mi.UInt64(stream))
+        return cls(generator)
+
+    def next_1d(self, active: mi.Bool = True) -> mi.Float:
+        """A uniform number in [0, 1)."""
+        return self.generator.next_float32(active)
+
+    def next_2d(self, active: mi.Bool = True) -> mi.Point2f:
+        """Two of them."""
+        x = self.next_1d(active)
+        return mi.Point2f(x, self.next_1d(active))
