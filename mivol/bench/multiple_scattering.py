@@ -1,14 +1,20 @@
 """Light that scatters many times: how much sooner does mivol reach an error than Mitsuba's ``volpath`` and ``prbvolpath``?
 
-    scripts/bench_multiple_scattering.py                  # 12 minutes on 2 idle cores
+    scripts/bench_multiple_scattering.py                  # 14 minutes on 2 idle cores
     scripts/bench_multiple_scattering.py --quick          # a minute, small sizes: are the means the same?
     scripts/bench_multiple_scattering.py --only smoke     # one of the volumes
 
 The volumes fill [-1, 1]^3: the smoke of the Mitsuba tutorial at its density (x 40) and at a twentieth of it, the smoke
-upsampled to 256^3, threads in 512^3, a cloud of a large-eddy simulation with an albedo of 0.999, and a white box of an
-optical depth of 64. Albedo 0.75 unless said, ``max_depth`` 6 or unlimited. Everything else is as in
+upsampled to 256^3, threads in 512^3, a cloud of a large-eddy simulation with an albedo of 0.999, a white box of an
+optical depth of 64, and milk in a glass. Albedo 0.75 unless said, ``max_depth`` 6 or unlimited. Everything else is as in
 ``scripts/bench_single_scattering.py``: samples of equal processor time, rounds in turns, variance x time. Bars are on the mean
 over pixels, for unlimited depth on the median: the errors of long paths have heavy tails.
+
+milk: skim milk (rgb, as measured) of 40 mm along an edge in a box of glass, both smooth and refracting, below a large lamp and
+a faint sky, unlimited. Paths find the lamp by chance where they leave the glass, and the weights of ``volpath`` grow without
+bound where extinctions differ between channels: the picture is small (16 x 16), so that each pixel has samples enough to show
+some of that, and means are compared in diluted milk, of an optical depth of 1. ``volpathmis``, whose weights are bounded, takes
+part without a bar.
 
 Prints JSON; writes bench_multiple_scattering.json and bench_multiple_scattering.png.
 """
@@ -24,13 +30,17 @@ from mivol.bench.bars import AT_LEAST, Bar, judge, judge_agreement, say
 from mivol.bench.extinctions import Extinction, as_dense_as_smoke, fine_smoke, les_cloud, smoke, threads_in_space
 from mivol.bench.figures import drawn
 from mivol.bench.questions import Bench
-from mivol.bench.scenes import constant_light, directional_light, sun_and_sky
+from mivol.bench.scenes import constant_light, directional_light, milk_in_a_glass, sun_and_sky
 from mivol.bench.single_scattering import FULL, QUICK, STOCK, Light, Size, contend, draw_errors, said
+from mivol.phase.measured import MeasuredMedium, named_medium
 
 __all__ = ["BENCH", "CONTESTS", "VOLUMES", "main"]
 
 THIN, WHITE_DEPTH = 0.05, 64.0
 """Factor on the density of the smoke; optical depth along an edge of the white box."""
+
+LIQUID, EDGE = "skim milk", 40.0
+"""In the glass; edge of the box [mm]."""
 
 
 def thin_smoke() -> Extinction:
@@ -44,6 +54,17 @@ def white_box() -> Extinction:
     return Extinction(np.full((4, 4, 4), WHITE_DEPTH / 2, np.float32), "made up: constant")
 
 
+def coefficients(liquid: MeasuredMedium) -> tuple[np.ndarray, np.ndarray]:
+    """Extinction [1/length of the scene] and albedo of a liquid, rgb; the box has an edge of 2."""
+    sigma_s, sigma_a = (np.array(x) * EDGE / 2 for x in (liquid.sigma_s, liquid.sigma_a))
+    return sigma_s + sigma_a, sigma_s / (sigma_s + sigma_a)
+
+
+def milk() -> Extinction:
+    """The extinction (3,) of the liquid in the glass."""
+    return Extinction(coefficients(named_medium(LIQUID))[0], f"{LIQUID}, {EDGE:g} mm")
+
+
 VOLUMES: dict[str, Callable[[Size], Extinction]] = {
     "smoke": lambda _: smoke(),
     "thin smoke": lambda _: thin_smoke(),
@@ -51,9 +72,11 @@ VOLUMES: dict[str, Callable[[Size], Extinction]] = {
     "fine smoke": lambda size: fine_smoke(size.fine_res),
     "threads": lambda size: as_dense_as_smoke(threads_in_space(size.sparse_res)),
     "white box": lambda _: white_box(),
+    "milk": lambda _: milk(),
 }
 
 CONSTANT, SUN, DIRECTIONAL = "constant light", "HG 0.8, sun in a sky", "HG 0.8, directional"
+GLASS = "glass, lamp and sky"
 PARTS = {CONSTANT: constant_light, SUN: sun_and_sky, DIRECTIONAL: directional_light}
 
 
@@ -68,6 +91,18 @@ CONTESTS: dict[str, dict[str, Light]] = {
     "fine smoke": {CONSTANT: _light(CONSTANT, 25), SUN: _light(SUN, 25)},
     "threads": {SUN: _light(SUN, 12)},
     "white box": {f"{CONSTANT}, unlimited": _light(CONSTANT, 300, -1, 0.999)},
+    "milk": {
+        f"{GLASS}, unlimited": Light(
+            milk_in_a_glass,
+            10,
+            by_pixel=True,
+            side=16,
+            albedo=tuple(coefficients(named_medium(LIQUID))[1]),
+            depth=-1,
+            peers=(*STOCK, "volpathmis"),
+            has_tails=True,
+        )
+    },
 }
 """Lights of each volume; the bars are on the ratio to ``volpath``."""
 
@@ -88,10 +123,10 @@ def ask(volume: str) -> Callable[[Size], dict]:
 
 
 def compare(volume: str, answer: dict) -> list[Bar]:
-    """Every ratio beside its bar, and every z beside its bound; prbvolpath has no bar."""
+    """Every ratio to volpath beside its bar, and every z beside its bound."""
     rows = []
     for name, light in CONTESTS[volume].items():
-        for stock in STOCK:
+        for stock in light.peers:
             g = answer[name][f"mivol over {stock}"]
             what, ratio = f"{volume}, {name}, {stock}", g[f"variance_x_time_{light.average}_over_pixels"]
             if stock == "volpath":

@@ -7,6 +7,7 @@ the medium's ``phase``.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import mitsuba as mi
 import numpy as np
@@ -18,6 +19,7 @@ __all__ = [
     "constant_light",
     "directional_light",
     "emitter_inside",
+    "milk_in_a_glass",
     "milky_glass",
     "of_depth",
     "perspective",
@@ -45,19 +47,17 @@ def perspective(side: int) -> dict:
     }
 
 
-def box_scene(values: np.ndarray, side: int, albedo: float = 0.0, **more: dict) -> dict:
+def box_scene(values: np.ndarray, side: int, albedo: float | Sequence[float] = 0.0, **more: dict) -> dict:
     """A box that holds an extinction, seen by one of the tutorial's cameras.
 
     Args:
-        values: (Z, Y, X) [1/length].
+        values: (Z, Y, X), or (3,) of a homogeneous medium in rgb [1/length].
         side: of the picture [pixels].
-        albedo: of the medium.
+        albedo: of the medium; rgb where the extinction is.
         more: ``phase`` of the medium, ``bsdf`` of the box; all else are parts of the scene. Without emitters, a sky of
             radiance 1.
     """
-    to_world = mi.ScalarTransform4f(np.float32(TO_WORLD))
-    grid = {"type": "gridvolume", "grid": mi.VolumeGrid(values[..., None]), "raw": True, "to_world": to_world}
-    medium = {"type": "heterogeneous", "sigma_t": grid, "albedo": albedo}
+    medium = liquid(values, albedo) if values.ndim == 1 else grid_medium(values, albedo)
     if "phase" in more:
         medium["phase"] = more.pop("phase")
     bsdf = more.pop("bsdf", {"type": "null"})
@@ -66,6 +66,26 @@ def box_scene(values: np.ndarray, side: int, albedo: float = 0.0, **more: dict) 
         "box": {"type": "cube", "bsdf": bsdf, "interior": medium},
         "sensor": perspective(side),
         **(more or {"sky": {"type": "constant", "radiance": {"type": "uniform", "value": 1.0}}}),
+    }
+
+
+def grid_medium(values: np.ndarray, albedo: float) -> dict:
+    """A medium whose extinction is a grid (Z, Y, X) [1/length]."""
+    to_world = mi.ScalarTransform4f(np.float32(TO_WORLD))
+    grid = {"type": "gridvolume", "grid": mi.VolumeGrid(values[..., None]), "raw": True, "to_world": to_world}
+    return {"type": "heterogeneous", "sigma_t": grid, "albedo": albedo}
+
+
+def liquid(sigma_t: np.ndarray, albedo: Sequence[float]) -> dict:
+    """A homogeneous medium of an extinction (3,) [1/length] and an albedo in rgb."""
+    # Colours of a scene are at most 1; what is above that is a scale.
+    most = float(sigma_t.max())
+    share = {"type": "rgb", "value": [float(x) / most for x in sigma_t]}
+    return {
+        "type": "homogeneous",
+        "sigma_t": share,
+        "scale": most,
+        "albedo": {"type": "rgb", "value": [float(x) for x in albedo]},
     }
 
 
@@ -115,6 +135,14 @@ def milky_glass() -> dict:
     emitter = {"type": "sphere", "center": [1.2, -1.5, 2.2], "radius": 0.6, "emitter": {"type": "area", "radiance": 9.0}}
     sky = {"type": "constant", "radiance": 0.5}
     return {"emitter": emitter, "sky": sky, "phase": {"type": "isotropic"}, "bsdf": {"type": "dielectric"}}
+
+
+def milk_in_a_glass() -> dict:
+    """The light of :func:`milky_glass`; liquid of the index of water in a glass, a twentieth of the box thick on each side."""
+    water, glass, air = 1.333, 1.5, 1.0
+    wall = {"type": "dielectric", "int_ior": glass, "ext_ior": air}
+    outside = {"type": "cube", "to_world": mi.ScalarTransform4f().scale(1.1), "bsdf": wall}
+    return milky_glass() | {"bsdf": {"type": "dielectric", "int_ior": water, "ext_ior": glass}, "glass": outside}
 
 
 def of_depth(name: str, depth: int) -> mi.Integrator:

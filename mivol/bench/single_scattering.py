@@ -135,6 +135,8 @@ class Light(NamedTuple):
         inside: where an emitter stands in the medium.
         albedo: of the medium.
         depth: ``max_depth`` of all integrators; -1 for no limit.
+        peers: Mitsuba's integrators that take part.
+        has_tails: where the means of no number of rounds are normal, so that they are compared in the thinned volume.
     """
 
     parts: Callable[[], dict]
@@ -142,8 +144,10 @@ class Light(NamedTuple):
     by_pixel: bool = False
     side: int = 64
     inside: tuple[float, float, float] | None = None
-    albedo: float = ALBEDO
+    albedo: float | tuple[float, ...] = ALBEDO
     depth: int = 2
+    peers: tuple[str, ...] = STOCK
+    has_tails: bool = False
 
     @property
     def average(self) -> str:
@@ -176,35 +180,40 @@ def contend(values: np.ndarray, light: Light, size: Size, levels: tuple[int, ...
     """Variance and time of each integrator, and what they mean for mivol.
 
     Args:
-        values: (Z, Y, X) extinction of the box.
+        values: (Z, Y, X) extinction of the box, or (3,) of a homogeneous medium in rgb.
         light: emitter and phase function.
         size: pixels, samples and rounds.
         levels: see ``Size.levels``; the first one, 1, is what ratios are of.
     """
     side = min(light.side, size.most_pixels)
     scene = mi.load_dict(box_scene(values, side, light.albedo, **light.parts()))
-    timings, spp = render_in_turns(scene, size, levels, light.depth)
-    tau, away = optical_depths(scene), pixels_from_emitter(scene, light, side)
+    timings, spp = render_in_turns(scene, size, levels, light)
+    tau, away = optical_depths(without_surfaces(values, light, side)), pixels_from_emitter(scene, light, side)
     counts = (tau > SEEN) & (away > AT_EMITTER)
     figures = {"pixels_that_count": int(counts.sum())}
-    for name in (OURS, *STOCK):
+    for name in (OURS, *light.peers):
         figures[name] = [{"spp": spp[name, k]} | errors(timings[name, k], counts, spp[name, k]) for k in levels]
     compared, fair = timings, counts
-    if light.inside is not None:
+    if light.inside is not None or light.has_tails:
         thinned = mi.load_dict(box_scene(values * np.float32(min(1, 1 / tau.max())), side, light.albedo, **light.parts()))
-        compared, _ = render_in_turns(thinned, size, (1,), light.depth)
+        compared, _ = render_in_turns(thinned, size, (1,), light)
         fair = (tau > SEEN) & (away > TRUNCATED * side)
-    for name in STOCK:
+    for name in light.peers:
         ratios = gain(timings[name, 1], timings[OURS, 1], counts)
         figures[f"mivol over {name}"] = ratios | difference(compared[name, 1], compared[OURS, 1], fair)
     return figures
 
 
-def render_in_turns(scene: mi.Scene, size: Size, levels: tuple[int, ...], depth: int = 2) -> tuple[dict, dict]:
+def without_surfaces(values: np.ndarray, light: Light, side: int) -> mi.Scene:
+    """The volume alone, in a boundary that neither bends nor reflects: rays see how much of it lies behind each pixel."""
+    return mi.load_dict(box_scene(values, side, light.albedo))
+
+
+def render_in_turns(scene: mi.Scene, size: Size, levels: tuple[int, ...], light: Light) -> tuple[dict, dict]:
     """Images of all integrators at all levels; timings and samples per pixel by (name, level)."""
     calls, spp = {}, {}
-    for place, name in enumerate((OURS, *STOCK)):
-        integrator = of_depth(name, depth)
+    for place, name in enumerate((OURS, *light.peers)):
+        integrator = of_depth(name, light.depth)
 
         def render(seed: int, n: int, integrator: mi.Integrator = integrator, place: int = place) -> mi.TensorXf:
             return mi.render(scene, integrator=integrator, spp=n, seed=10_000 * size.seed + 1000 * place + seed)
@@ -291,9 +300,10 @@ def ask(volume: str) -> Callable[[Size], dict]:
 
 def said(figures: dict) -> str:
     """One line on a contest."""
-    rates = ", ".join(f"{name} {figures[name][0]['samples_per_second_median'] / 1e6:.3g}" for name in (OURS, *STOCK))
+    peers = [name.removeprefix("mivol over ") for name in figures if name.startswith("mivol over ")]
+    rates = ", ".join(f"{name} {figures[name][0]['samples_per_second_median'] / 1e6:.3g}" for name in (OURS, *peers))
     gains = []
-    for name in STOCK:
+    for name in peers:
         g = figures[f"mivol over {name}"]
         gains.append(
             f"{name} {g['variance_x_time_mean_over_pixels']:.0f}x mean, {g['variance_x_time_median_over_pixels']:.0f}x median, "
@@ -338,7 +348,7 @@ def draw(answers: dict, folder: Path) -> None:
 
 def draw_errors(axes: Axes, figures: dict, light: Light) -> None:
     """Error of a pixel against seconds."""
-    for i, name in enumerate((OURS, *STOCK)):
+    for i, name in enumerate((OURS, *light.peers)):
         rows = figures[name]
         seconds = [row["seconds_median"] for row in rows]
         error = [row[f"relative_error_{light.average}_over_pixels"] for row in rows]

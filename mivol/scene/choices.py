@@ -139,6 +139,9 @@ def choose_lighting(needs: Needs, settings: Settings, segment: str) -> list[Choi
             return [
                 Choice("directions", "one, of the phase function", "light is the same from everywhere: what escapes finds it")
             ]
+        if needs.is_sealed:
+            why = "media lie behind boundaries that refract: emitters are met, and no straight ray finds one"
+            return [Choice("directions", "one, of the phase function", why)]
         what = "to an emitter from each collision, and of the phase function onwards"
         return [Choice("directions", what, "the power heuristic weighs emitters that both can find")]
     if not drawn:
@@ -217,7 +220,7 @@ def choose_shadows(medium: MediumFacts, needs: Needs, settings: Settings) -> Cho
 
 def choose_side_flights(needs: Needs, settings: Settings, segment: str) -> tuple[float | None, list[Choice]]:
     """The mean cosine of the lobe that side flights are drawn from; None for no side flights."""
-    if segment != "free_flight" or settings.scatterings < 2 or not needs.are_emitters_far:
+    if segment != "free_flight" or settings.scatterings < 2 or not needs.are_emitters_far or needs.is_sealed:
         return None, []
     cosine = max((m.mean_cosine for m in needs.media if m.mean_cosine is not None), default=0.0)
     if cosine < PEAKED:

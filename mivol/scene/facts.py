@@ -100,6 +100,8 @@ class Needs:
             ``extended``, of each emitter.
         are_emitters_far: every emitter is at infinity, and one of them is not ``uniform``.
         refractive: names of the boundaries that bend or blur the light that passes them.
+        is_sealed: every medium lies behind such boundaries and no light passes them undeviated; emitters lie outside of them,
+            and paths can hit each. No emitter sample finds light from a point in a medium.
         start: medium that the sensor names.
         camera_inside: the camera may be inside the box around a boundary.
         parameters: keys whose derivatives are asked for.
@@ -120,6 +122,7 @@ class Needs:
     emitter_kinds: tuple[str, ...]
     are_emitters_far: bool
     refractive: tuple[str, ...]
+    is_sealed: bool
     start: mi.Medium | None
     camera_inside: bool
     parameters: tuple[str, ...]

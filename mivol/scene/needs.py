@@ -62,6 +62,7 @@ def find_needs(
         emitter_kinds=survey.emitter_kinds,
         are_emitters_far=survey.are_emitters_far,
         refractive=survey.refractive,
+        is_sealed=survey.is_sealed,
         start=sensor.get_medium(),
         camera_inside=_camera_inside(scene, sensor, survey),
         parameters=asked,

@@ -25,7 +25,7 @@ class SceneSurvey:
     """What does not change while shapes stay where they are, and a cache of what was read of arrays.
 
     Attributes:
-        boundaries, surfaces, has_null_transmission, emitters, emitter_kinds, are_emitters_far, refractive: as in
+        boundaries, surfaces, has_null_transmission, emitters, emitter_kinds, are_emitters_far, refractive, is_sealed: as in
             :class:`mivol.scene.facts.Needs`.
         marks: boundaries, each with what another place would change of it: its vertices or its box.
         size: diagonal of the box around all shapes [length].
@@ -48,6 +48,7 @@ class SceneSurvey:
     emitter_kinds: tuple[str, ...]
     are_emitters_far: bool
     refractive: tuple[str, ...]
+    is_sealed: bool = False
     marks: tuple[tuple[mi.Shape, object], ...] = ()
     size: float = 1.0
     looked_up: set = field(default_factory=set)
@@ -106,6 +107,7 @@ def survey_scene(scene: mi.Scene) -> SceneSurvey:
         kinds,
         _are_far(scene.emitters()),
         tuple(refractive),
+        _are_sealed(boundaries, shapes, scene.emitters()),
         marks,
         extent(scene),
     )
@@ -135,6 +137,24 @@ def _are_far(emitters: list[mi.Emitter]) -> bool:
     """Whether every emitter is at infinity, and one of them is not the same from everywhere."""
     infinite = all(int(e.flags()) & int(mi.EmitterFlags.Infinite) for e in emitters)
     return infinite and any(_emitter_kind(e) != "uniform" for e in emitters)
+
+
+def _are_sealed(boundaries: Sequence[Boundary], shapes: Sequence[mi.Shape], emitters: Sequence[mi.Emitter]) -> bool:
+    """Whether every medium fills shapes that bend all light, outside of which all emitters lie, which paths can hit."""
+    if not boundaries or any(b.shape == AROUND for b in boundaries):
+        return False
+    holders = [s for s in shapes if s.is_medium_transition() and s.interior_medium() is not None]
+    if not all(_bends_all(s) for s in holders) or any(_emitter_kind(e) == "delta" for e in emitters):
+        return False
+    lamps = [box_around(s) for s in shapes if s.is_emitter()]
+    return not any(box_around(s).shares(lamp) for s in holders for lamp in lamps)
+
+
+def _bends_all(shape: mi.Shape) -> bool:
+    """Whether a shape lets light through by refraction alone."""
+    flags = int(shape.bsdf().flags())
+    bends = flags & (int(mi.BSDFFlags.DeltaTransmission) | int(mi.BSDFFlags.GlossyTransmission))
+    return bool(bends) and not flags & (int(mi.BSDFFlags.Null) | int(mi.BSDFFlags.DiffuseTransmission))
 
 
 def _is_bare(shape: mi.Shape) -> bool:

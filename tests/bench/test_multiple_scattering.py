@@ -25,10 +25,20 @@ def test_contests_are_those_of_the_published_table():
         (-1, 0.999, 30),
         *((6, 0.75, bar) for bar in (25, 25, 12)),
         (-1, 0.999, 300),
+        (-1, bench.CONTESTS["milk"]["glass, lamp and sky, unlimited"].albedo, 10),
     ]
     assert all(light.by_pixel == (light.depth < 0) for c in bench.CONTESTS.values() for light in c.values())
     assert bench.white_box().values.max() * 2 == bench.WHITE_DEPTH == 64
     assert np.allclose(bench.thin_smoke().values.max() * 20, bench.smoke().values.max())
+
+
+def test_the_milk_is_the_measured_one() -> None:
+    """Skim milk scatters 0.70, 1.22 and 1.90 times a millimetre and absorbs 0.0014, 0.0025 and 0.0142 times; 40 mm are 2."""
+    scattered, absorbed = np.array([0.7, 1.22, 1.9]) * 20, np.array([0.0014, 0.0025, 0.0142]) * 20
+    (light,) = bench.CONTESTS["milk"].values()
+    np.testing.assert_allclose(bench.milk().values, scattered + absorbed)
+    np.testing.assert_allclose(bench.milk().values * light.albedo, scattered)
+    assert light.peers == ("volpath", "prbvolpath", "volpathmis")
 
 
 @pytest.mark.slow

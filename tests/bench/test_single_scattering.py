@@ -17,7 +17,7 @@ from false_alarms import ALPHA, fresh, note
 from mivol.bench import agreement
 from mivol.bench import single_scattering as bench
 from mivol.bench.agreement import compare_means
-from mivol.bench.scenes import box_scene, of_depth
+from mivol.bench.scenes import box_scene, milk_in_a_glass, of_depth
 from mivol.bench.timing import Budget, Timing
 from mivol.validate.statistics import Estimate
 
@@ -142,6 +142,32 @@ def test_an_emitter_inside_is_judged_in_thin_matter_away_from_it(variant_rgb: st
     assert 0 < fair.sum() < counts.sum()
 
 
+def test_a_volume_behind_glass_counts_where_it_would_be_seen_without(variant_rgb: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Rays end at a surface that bends them: pixels count by the volume alone. Where the light has tails, means are compared in
+    the volume thinned to an optical depth of 1."""
+    used, depths, side = {}, [], 6
+    monkeypatch.setattr(bench, "gain", lambda slow, fast, counts: used.setdefault("gain", counts) is None or {})
+    monkeypatch.setattr(bench, "difference", lambda slow, fast, fair: used.setdefault("z", (fast.median, fair)) and {})
+    rng = np.random.default_rng(0)
+
+    def rendered(scene: mi.Scene, size: object, levels: object, light: bench.Light) -> tuple[dict, dict]:
+        depths.append(mi.traverse(scene)["box.interior_medium.scale"])
+        made = fake(rng.uniform(1, 2, (4, side, side)), len(depths))
+        names = ("mivol", *light.peers)
+        return ({(name, 1): made for name in names}, {(name, 1): 1 for name in names})
+
+    monkeypatch.setattr(bench, "render_in_turns", rendered)
+    light = bench.Light(milk_in_a_glass, 1, side=side, albedo=(0.5, 0.6, 0.7), peers=("volpathmis",), has_tails=True)
+    found = bench.contend(np.array([3.0, 6.0, 9.0]), light, replace(TINY, most_pixels=side))
+    assert "mivol over volpathmis" in found and "mivol over volpath" not in found
+    # seen from 4 away, 45 degrees wide: the box covers the middle of the picture and not all of its corners
+    assert used["gain"][2:4, 2:4].all() and not used["gain"][0, -1]
+    second, fair = used["z"]
+    assert second == 2 and fair[2:4, 2:4].all()
+    # the mean over channels of 6 per unit of length; the longest of the rays that were drawn goes through a little more than 2
+    assert depths[0] == 9 and depths[1] == pytest.approx(9 / (6 * 2.0), rel=0.3)
+
+
 def test_a_difference_without_noise_is_beyond_every_bound() -> None:
     found = compare_means(Estimate(1.0, 0.0, 5.0), Estimate(2.0, 0.0, 5.0), 1)
     assert found["z"] is None
@@ -154,7 +180,9 @@ def test_renders_in_turns_have_seeds_of_their_own(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(bench, "of_depth", lambda name, depth: (name, depth))
     monkeypatch.setattr(bench.mi, "render", lambda scene, integrator, spp, seed: asked.append((scene, integrator, spp, seed)))
     monkeypatch.setattr(bench, "race", lambda calls, rounds, keep: raced.append((rounds, keep)) or calls)
-    calls, spp = bench.render_in_turns("scene", replace(TINY, budget=Budget(spp=12), seed=2), (1, 4, 16), 6)
+    light = bench.LIGHTS["constant light"]
+    size = replace(TINY, budget=Budget(spp=12), seed=2)
+    calls, spp = bench.render_in_turns("scene", size, (1, 4, 16), light._replace(depth=6))
     names = ("mivol", "volpath", "prbvolpath")
     assert raced == [(6, True)]
     assert spp == {(name, level): n for name in names for level, n in ((1, 12), (4, 3), (16, 1))}
@@ -162,8 +190,9 @@ def test_renders_in_turns_have_seeds_of_their_own(monkeypatch: pytest.MonkeyPatc
         for level in (1, 4, 16):
             calls[name, level](7)
             assert asked.pop() == ("scene", (name, 6), spp[name, level], 20_000 + 1000 * place + 100 * level + 7)
-    bench.render_in_turns("scene", replace(TINY, budget=Budget(spp=12)), (1,))[0]["volpath", 1](0)
-    assert asked == [("scene", ("volpath", 2), 12, 1100)]
+    alone = light._replace(peers=("volpathmis",))
+    bench.render_in_turns("scene", replace(TINY, budget=Budget(spp=12)), (1,), alone)[0]["volpathmis", 1](0)
+    assert asked == [("scene", ("volpathmis", 2), 12, 1100)]
 
 
 def test_a_contest_in_a_sky(variant_rgb: str, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -182,7 +211,7 @@ def test_a_contest_in_a_sky(variant_rgb: str, monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr(bench, "gain", lambda slow, fast, counts: {"gain": (slow, fast, int(counts.sum()))})
     monkeypatch.setattr(bench, "difference", lambda slow, fast, fair: {"z": (slow, fast, int(fair.sum()))})
     found = bench.contend(fog(), light, TINY, (1, 4))
-    assert heard == [((fog().max(), 6, 0.75, set(light.parts())), TINY, (1, 4), 5)]
+    assert heard == [((fog().max(), 6, 0.75, set(light.parts())), TINY, (1, 4), light)]
     assert found == {
         "pixels_that_count": 31,
         **{

@@ -22,7 +22,8 @@ def fog(name: str = "fog", **more: object) -> MediumFacts:
 
 
 def needs(*media: MediumFacts, emitters: tuple[str, ...] = ("delta",), **more: object) -> SimpleNamespace:
-    return SimpleNamespace(media=media, emitter_kinds=emitters, surfaces=(), boundaries=(), **more)
+    given = {"surfaces": (), "boundaries": (), "is_sealed": False, **more}
+    return SimpleNamespace(media=media, emitter_kinds=emitters, **given)
 
 
 @pytest.mark.parametrize(
@@ -89,6 +90,14 @@ def test_lighting(emitters: tuple, media: tuple, found: list) -> None:
     chosen = choices.choose_lighting(needs(*media, emitters=emitters), LIT, ONCE)
     assert len(chosen) == len(found)
     assert all(c.about == about and c.choice.startswith(choice) for c, (about, choice) in zip(chosen, found, strict=True))
+
+
+def test_lighting_of_sealed_media():
+    found = lambda kinds, **more: choices.choose_lighting(needs(fog(), emitters=kinds, **more), LIT, FLIGHTS)  # noqa: E731
+    (same,), (drawn,), (met,) = found(("uniform",)), found(("area",)), found(("area",), is_sealed=True)
+    assert same.choice == met.choice == "one, of the phase function"
+    assert same.reason != met.reason and "refract" in met.reason
+    assert drawn.choice.startswith("to an emitter from each collision")
 
 
 def test_lighting_by_quadrature_and_without_light():
@@ -212,3 +221,5 @@ def test_side_flights(cosines: tuple, far: bool, depth: int, segment: str, expec
     asked = needs(*(fog(mean_cosine=c) for c in cosines), are_emitters_far=far)
     found, said = choices.choose_side_flights(asked, Settings(max_depth=depth), segment)
     assert found == expected and len(said) == (expected is not None)
+    asked.is_sealed = True
+    assert choices.choose_side_flights(asked, Settings(max_depth=depth), segment) == (None, [])

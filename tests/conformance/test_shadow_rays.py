@@ -1,11 +1,16 @@
-"""Shadow rays: surfaces and emitters that transmit part of the light undeviated."""
+"""Shadow rays: surfaces and emitters that transmit part of the light undeviated, and rays that end by roulette."""
 
 from __future__ import annotations
 
+import drjit as dr
+import mitsuba as mi
+import numpy as np
 import pytest
 import scattering_scenes as small
+from false_alarms import assert_rate, fresh
 from scattering_scenes import (
     PLACE,
+    close_up,
     point,
 )
 from volpath_scenes import (
@@ -18,6 +23,10 @@ from volpath_scenes import (
     same,
     square,
 )
+
+from mivol.transport.estimators.shadow_rays import SURE_DEPTH, light_through
+from mivol.transport.traversal.random_numbers import seed_pcg32
+from scenes import box_of, grid_volume, media_of, medium
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
 
@@ -45,3 +54,44 @@ def test_emitters_that_let_light_pass(kind, emitter):
         return
     mask = {"type": "mask", "opacity": 0.4, "nested": {"type": "twosided", "nested": RED}}
     same({"smoke": grid_in(cube(PLACE)), "transmissive": square(0.8, -0.65, 0.85, 0.6) | light | {"bsdf": mask}, **shine})
+
+
+# -- Roulette --------------------------------------------------------------------------------------------------------------
+
+N = 1 << 16
+
+
+def through(sigma_t: np.ndarray | float, rng: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Transmittance (N, 3) and optical depth (N, channels) along one ray through [-1, 1]^3, N times."""
+    sigma = grid_volume("mivol_voxels", sigma_t, PLACE) if isinstance(sigma_t, np.ndarray) else sigma_t
+    media = media_of(close_up({"fog": box_of(medium("mivol_medium", sigma, 0.5), PLACE)}, res=1))
+    ray = mi.Ray3f(dr.full(mi.Point3f, 0, N) + mi.Point3f(-2, 0.1, 0.2), mi.Vector3f(1, 0, 0))
+    state = seed_pcg32(mi.Float((0.3 + 0.618 * fresh(0)) % 1), N) if rng else None
+    _, tau, T = light_through(media, ray, dr.zeros(mi.MediumPtr, N), mi.Bool(True), state)
+    return np.array(T, dtype=np.float64).T, np.array(tau).T
+
+
+def test_clear_rays_are_not_played_for():
+    """Up to the depth of SURE_DEPTH the estimate is exact: 0.9 here."""
+    assert np.array_equal(through(0.45, True)[0], through(0.45, False)[0])
+
+
+@pytest.mark.statistical
+@pytest.mark.parametrize("kind", ["grid", "rgb grid", "constant"])
+def test_roulette_keeps_the_mean(kind):
+    """A ray that survives brings exp(-1) in its clearest channel, and less in the others; one that does not brings 0."""
+    values = {"grid": [1.2], "rgb grid": [1.2, 0.9, 3.0]}.get(kind)
+    sigma = 1.2 if values is None else np.tile(np.float32(values), (2, 2, 2, 1))
+    exact, found = through(sigma, False)[0][0], through(sigma, True)[0]
+    lives = found.max(axis=1) > 0
+    np.testing.assert_allclose(found[lives].max(axis=1), np.exp(-SURE_DEPTH), rtol=1e-5)
+    # Hits of an event of known chance: exp(1) times the clearest channel's transmittance.
+    assert_rate(int(lives.sum()), N, float(exact.max()) * np.e)
+    np.testing.assert_allclose(found[lives].mean(axis=0) * exact.max() * np.e, exact, rtol=1e-4)
+
+
+def test_a_ray_that_ends_is_walked_no_further():
+    """In a grid of 32 cells along the ray, of a depth of 64: those that end have gone a few cells, which their depth tells."""
+    _, tau = through(np.full((2, 2, 32, 1), 32.0, np.float32), True)
+    # A cell has a depth of 2, and a limit of 1 + ln(2^24) = 17.6 at most is passed by one cell.
+    assert tau.min() > SURE_DEPTH and tau.max() < 20 and tau.mean() < 5

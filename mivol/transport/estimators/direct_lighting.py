@@ -100,8 +100,7 @@ class DirectLighting:
             u: two numbers in [0, 1).
             attached: keep the derivatives of BSDF or phase function, and emitter.
             active: lanes to estimate.
-            chance: a number in [0, 1) that estimates the shadow, where media are bounded or their block ranges are known;
-                None for an exact one.
+            chance: a number in [0, 1) that estimates the shadow; None for an exact one.
 
         Bias: none. Variance: that of one emitter sample. Cost: one shadow ray.
         """

@@ -67,7 +67,7 @@ class EmissionSampling:
             u: of the cell that is aimed at, and the seed of all other numbers.
             attached: keep the derivatives of BSDF or phase function and emission.
             active: lanes to estimate.
-            estimates: whether the shadow is estimated, where block ranges of grids are known.
+            estimates: whether the shadow is estimated.
 
         Bias: none. Variance: that of one point. Cost: one shadow ray, and a walk of the table.
         """

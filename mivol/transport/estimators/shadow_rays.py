@@ -1,7 +1,10 @@
-"""Shadow rays: the transmittance of media, and of surfaces that transmit part of the light undeviated.
+r"""Shadow rays: the transmittance of media, and of surfaces that transmit part of the light undeviated.
 
-The transmittance is exact, or an unbiased estimate by residual ratio tracking in grids whose block ranges are known
-(:mod:`mivol.transport.estimators.ratio_tracking`).
+The transmittance is exact, or an unbiased estimate: by residual ratio tracking in grids whose block ranges are known
+(:mod:`mivol.transport.estimators.ratio_tracking`), or by Russian roulette along the ray. Beyond an optical depth
+:math:`\tau_0` a ray goes on with the probability :math:`e^{-(\tau - \tau_0)}`, and what arrives is :math:`e^{-\tau_0}`.
+
+References: Arvo & Kirk 1990 (Russian roulette).
 """
 
 from __future__ import annotations
@@ -9,6 +12,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from mivol.numerics import least_of
 from mivol.transport.estimators.majorant_tracking import ratio_tracking
 from mivol.transport.estimators.ratio_tracking import residual_ratio_tracking
 from mivol.transport.media.channels import as_rows, spectrum
@@ -24,11 +28,16 @@ from mivol.transport.media.ray_intervals import (
 from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.traversal.random_numbers import draw_pcg32
 
-__all__ = ["DARK", "estimate_transmittance", "light_through", "shadow_ray"]
+__all__ = ["DARK", "SURE_DEPTH", "estimate_transmittance", "light_through", "shadow_ray"]
 
 
 DARK = 30.0
 """Optical depth beyond which light is neglected: 1e-13 of it is below the rounding of everything that it is added to."""
+
+
+SURE_DEPTH = 1.0
+"""Optical depth up to which roulette lets all shadow rays go on (measured, variance x time of paths of 6 to any number of
+scatterings in cloud and smoke: 1.02 to 1.2 times less than without roulette; 2 and 4 gain less)."""
 
 
 def light_through(
@@ -41,19 +50,25 @@ def light_through(
         ray: world space, unit direction.
         medium: the medium around its origin.
         active: lanes to follow.
-        rng: state of a random number generator; where it is given, and block ranges of some grid are known or some medium is
-            bounded, the transmittance is an unbiased estimate.
+        rng: state of a random number generator; where it is given, the transmittance is an unbiased estimate: by tracking where
+            block ranges of some grid are known or some medium is bounded, else by roulette.
 
     Returns:
-        Where the ray ends; its optical depth [1] for each channel, in a grid at most a little above ``DARK``, or None where the
-        transmittance was estimated; and the transmittance of media and surfaces.
+        Where the ray ends; its optical depth [1] for each channel, or None where tracking estimated the transmittance; and the
+        transmittance of media and surfaces. Where that is 0 the optical depth may be too small, but not below ``SURE_DEPTH``.
     """
-    if rng is not None and (media.estimates_shadows or media.is_bounded):
+    if rng is not None and media.tracks_shadows:
         end, T = estimate_transmittance(media, ray, medium, active, rng, passes_null=True)
         return end, None, T * end.null_transmission
+    enough = DARK if rng is None else SURE_DEPTH - dr.log(draw_pcg32(rng, 1)[1][0])
     zero = [mi.Float(0) for _ in range(media.channels)]
-    end, tau = visit_media(media, ray, medium, sum_optical_depth(DARK), zero, active, passes_null=True)
-    return end, tau, transmittance(tau) * end.null_transmission
+    end, tau = visit_media(media, ray, medium, sum_optical_depth(enough), zero, active, passes_null=True)
+    if rng is None:
+        return end, tau, transmittance(tau) * end.null_transmission
+    # Every channel is divided by the probability of the clearest one, so that weights stay below 1.
+    clearest = least_of(tau)
+    thicker = [t - dr.maximum(clearest - SURE_DEPTH, 0) for t in tau]
+    return end, tau, dr.select(clearest <= enough, transmittance(thicker), 0) * end.null_transmission
 
 
 def estimate_transmittance(

@@ -170,5 +170,6 @@ class SingleScattering:
             tau = revisit_media(media, front, sum_optical_depth(), zero, event.on)
         gain = dr.select(event.on, segment.beta * transmittance(tau) / event.pdf, 0)
         vertex = MediumVertex(media, mei)
-        direct = self.direct.in_medium(vertex, chosen, samples, probes, event.on, estimates=not probes)
+        # Roulette is for paths: the noise of one scattering is small, and that of roulette would show.
+        direct = self.direct.in_medium(vertex, chosen, samples, probes, event.on, not probes and media.tracks_shadows)
         return Scattering(event, mei, gain, direct, sigma_s_at(media, ray, event, mei), samples.which_shadow_ray)

@@ -84,6 +84,11 @@ class SceneMedia:
         return rows if len(rows) == self.channels else [sum(rows[1:], rows[0])]
 
     @property
+    def tracks_shadows(self) -> bool:
+        """Whether tracking estimates transmittance along shadow rays: in bounded fields always."""
+        return self.estimates_shadows or self.is_bounded
+
+    @property
     def estimates_shadows(self) -> bool:
         """Whether the transmittance of some medium may be estimated in pictures, since its blocks are known."""
         return any(b.estimates_shadows for b in self.bodies)

@@ -196,9 +196,9 @@ class Estimators:
         self.emission = emission
 
     @property
-    def estimates_shadows(self) -> bool:
-        """Whether shadow rays of vertices are estimated, which takes a random number."""
-        return self.media.is_bounded or (self.segment.ends_in_media and self.media.estimates_shadows)
+    def draws_shadows(self) -> bool:
+        """Whether shadow rays of vertices are estimated, by tracking or by roulette, which takes a random number."""
+        return self.media.is_bounded or self.segment.ends_in_media
 
     def prepare_derivatives(self, ray: mi.Ray3f) -> None:
         """Find what derivatives along camera rays need beforehand, once for all passes."""

@@ -206,7 +206,7 @@ def _add_side_flight(
     """Draw an emitter sample for the next vertex, and look at it from the end of a side flight."""
     sampler = path.sampler
     u, lobe, flight = sampler.next_2d(active), sampler.next_2d(active), estimators.segment.draw(sampler, active, None)
-    samples = SideSamples(u, lobe, flight, sampler.next_1d(active) if estimators.estimates_shadows else None)
+    samples = SideSamples(u, lobe, flight, sampler.next_1d(active) if estimators.draws_shadows else None)
     flight = fly_aside(estimators, event.collision, path.beta, samples, path.score.purpose, active)
     path.score = path.score.add(flight.light)
     if path.shadow is not None:
@@ -336,7 +336,7 @@ def _add_direct_light(estimators: Estimators, path: Path, event: PathEvent, may_
         lit |= may_scatter & event.in_medium
     if not (estimators.lights_surfaces or estimators.lights_media):
         return path
-    u, chance = sampler.next_2d(lit), sampler.next_1d(lit) if estimators.estimates_shadows else None
+    u, chance = sampler.next_2d(lit), sampler.next_1d(lit) if estimators.draws_shadows else None
     if path.aim is not None:
         u = dr.select(path.aim.on, path.aim.u, u)
     vertex = event.vertex(media, path.ray)
@@ -368,7 +368,7 @@ def _add_light_of_media(estimators: Estimators, path: Path, event: PathEvent, ma
         path.sampler.next_2d(lit),
         path.score.purpose != PICTURE,
         lit,
-        estimators.estimates_shadows,
+        estimators.draws_shadows,
     )
     path.score = path.score.add(light)
     if path.shadow is not None:
