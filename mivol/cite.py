@@ -96,6 +96,13 @@ CITATIONS: dict[str, Citation] = {
         "Interactive path tracing and reconstruction of sparse volumes",
         "Proceedings of the ACM on Computer Graphics and Interactive Techniques 4(1), 5",
     ),
+    "mildenhall_2022": Citation(
+        "B. Mildenhall, P. Hedman, R. Martin-Brualla, P. P. Srinivasan, J. T. Barron",
+        2022,
+        "NeRF in the Dark: High Dynamic Range View Synthesis from Noisy Raw Images",
+        "CVPR",
+        "https://arxiv.org/abs/2111.13679",
+    ),
     "plenoxels_2022": Citation(
         "S. Fridovich-Keil, A. Yu, M. Tancik, Q. Chen, B. Recht, A. Kanazawa",
         2022,

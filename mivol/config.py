@@ -370,6 +370,10 @@ class Photographs(Section):
         of("1", "where matter may be: cameras, silhouettes (of alpha), middle (of nested boxes), or two corners [length]"),
     ] = "cameras"
     judged: Annotated[str, of("1", "views to report at the end: held_out, val or test", min_length=1)] = "held_out"
+    space: Annotated[
+        Literal["srgb", "linear"] | None,
+        of("1", "values that are fitted: srgb (codes) or linear (radiance); absent: what the photographs hold"),
+    ] = None
 
     def __post_init__(self) -> None:
         if self.largest is not None and self.largest < 16:

@@ -17,7 +17,7 @@ from mivol.experiments.depth import settle_depth
 from mivol.experiments.film import plan_film
 from mivol.experiments.gaussian_start import begin, make_gaussian_plan
 from mivol.experiments.photo_data import boxed, read_photos
-from mivol.experiments.photo_plan import choices, make_plan, shrunk
+from mivol.experiments.photo_plan import batches_of, choices, make_plan, shrunk
 from mivol.experiments.projections import beam_of, fitted_views, held_out_views, make_data, make_grid
 from mivol.experiments.references import camera_of, find_sensors, load_experiment_scene, read_references
 from mivol.experiments.scan_fit import make_problem as make_scan_problem
@@ -28,8 +28,6 @@ from mivol.experiments.start import make_start
 from mivol.experiments.task import Task
 from mivol.experiments.truth import check_truth, make_truth, put
 from mivol.optim.parameters import check_names
-from mivol.optim.ray_batches import RayBatches
-from mivol.photos import rectified
 from mivol.scene.explain import Explanation, examine
 from mivol.tomography.filtered import check_directions
 from mivol.tomography.projector import Projector
@@ -140,8 +138,7 @@ def explain_photo_fit(chosen: FieldFit, base: Path, say: Say) -> Explanation:
     for note in plan_film(chosen.show, photos).notes:
         say(f"  {note}")
     plan = shrunk(asked, photos)
-    batches = RayBatches.of([rectified(view) for view in photos.views], [stage.shrink for stage in plan.stages])
-    return Explanation(tuple(f"  {one.choice}: {one.reason}" for one in choices(plan, photos, batches)))
+    return Explanation(tuple(f"  {one.choice}: {one.reason}" for one in choices(plan, photos, batches_of(plan, photos))))
 
 
 def explain_gaussian_fit(chosen: GaussianFit, base: Path, say: Say) -> Explanation:

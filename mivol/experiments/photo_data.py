@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from mivol.config import PhotoFit
+from mivol.config import GaussianFit, PhotoFit
 from mivol.errors import MivolError
+from mivol.optim.colour_scale import EPSILON
 from mivol.optim.strategy import nearest
 from mivol.photos import Photos, load_photos, silhouette_box
 from mivol.photos.picture import space_of
@@ -30,14 +32,43 @@ def read_photos(chosen: PhotoFit, base: Path) -> tuple[Photos, Photos | None]:
         "largest": wanted.largest,
         "background": wanted.background or None,
         "held_out": wanted.held_out,
-        "space": "srgb",
+        "space": wanted.space,
         "box": SEARCHED.get(wanted.box) if isinstance(wanted.box, str) else np.array(wanted.box, np.float64),
     }
+    if isinstance(chosen, GaussianFit):
+        if wanted.space == "linear":
+            raise MivolError('photos.space = "linear" was asked for; Gaussians are fitted to code values: "srgb" is expected.')
+        settings["space"] = "srgb"
     path = base / wanted.path
     photos = _over(load_photos(path, split="train", **settings), wanted.behind)
+    white = white_of(photos) if photos.space == "linear" else 1.0
     if wanted.judged == "held_out" and not wanted.held_out:
-        return photos, None
-    return photos, _over(load_photos(path, split=wanted.judged, **settings), wanted.behind)
+        return exposed(photos, white), None
+    judged = load_photos(path, split=wanted.judged, **settings | {"space": photos.space})
+    return exposed(photos, white), exposed(_over(judged, wanted.behind), white)
+
+
+MIDDLE_GREY = 0.18
+"""What the median of photographs of radiance is shown as, over white (the key of Reinhard et al. 2002)."""
+
+
+def white_of(photos: Photos) -> float:
+    """The radiance that is shown white: a power of 2, by which numbers are divided without a rounding error.
+
+    The median of what is lit (mean of rgb above 0) then lies within a factor of sqrt(2) of ``MIDDLE_GREY``.
+    """
+    levels = np.concatenate([view.image[::2, ::2].mean(axis=2).ravel() for view in photos.views])
+    lit = levels[levels > 0]
+    return 2.0 ** round(math.log2(np.median(lit) / MIDDLE_GREY)) if len(lit) else 1.0
+
+
+def exposed(photos: Photos, white: float) -> Photos:
+    """Photographs whose values are divided by that of white."""
+    if white == 1:
+        return photos
+    by = np.float32(white)
+    views = (replace(view, image=view.image / by, background=view.background / by) for view in photos.views)
+    return replace(photos, views=tuple(views), white=white)
 
 
 def _over(photos: Photos, behind: tuple[float, float, float]) -> Photos:
@@ -73,9 +104,19 @@ SEARCHED = {"middle": "middle"}
 
 def notes(photos: Photos, judged: Photos | None = None) -> list[str]:
     """What a reader must know of the photographs."""
-    found = [f"Colours are {photos.space} code values; in a scene mivol_sh shows the radiance that they stand for."]
-    if any(space_of(frame.file) == "linear" for frame in photos.survey.frames):
-        found.append("The light of OpenEXR photographs was encoded; what is above 1 counts as 1.")
+    if photos.space == "linear":
+        found = [
+            f"Colours are radiance, as in the photographs' files; an error weighs as the slope of log(y + {EPSILON:g}) says "
+            f"(Mildenhall et al. 2022), where y = 1 is the radiance {photos.white:g} and shown white. Pictures, films and "
+            "figures are tone-mapped: the sRGB curve of y, from 0 to 1."
+        ]
+    else:
+        found = ["Colours are srgb code values; in a scene mivol_sh shows the radiance that they stand for."]
+    stored = {space_of(frame.file) for frame in photos.survey.frames}
+    if "linear" in stored and photos.space == "srgb":
+        found.append("The light of photographs of radiance was encoded; what is above 1 counts as 1.")
+    if "srgb" in stored and photos.space == "linear":
+        found.append("Photographs of 8 bits were decoded by the sRGB curve.")
     if judged is not None:
         width, height = judged.views[0].camera.size
         found.append(

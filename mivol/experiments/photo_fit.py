@@ -19,15 +19,14 @@ from mivol.experiments.best import BestIterate, FilesOfBest
 from mivol.experiments.film import plan_film
 from mivol.experiments.photo_data import boxed, notes, read_photos
 from mivol.experiments.photo_outputs import PhotoOutputs, compare, save_found
-from mivol.experiments.photo_plan import choices, make_plan, shrunk
+from mivol.experiments.photo_plan import batches_of, choices, make_plan, shrunk
 from mivol.experiments.run_folder import RunFolder
 from mivol.experiments.task import Task
 from mivol.optim.checkpoint import Store
 from mivol.optim.events import Checkpoint
 from mivol.optim.loop import Fit, begin_fit
 from mivol.optim.radiance_problem import RadianceProblem
-from mivol.optim.ray_batches import RayBatches
-from mivol.photos import Photos, rectified
+from mivol.photos import Photos
 from mivol.report.page import write_page
 from mivol.report.record import RunRecord
 from mivol.validate.images import Quality
@@ -49,12 +48,14 @@ def photo_fit(task: Task) -> Path:
             photos = boxed(chosen, photos)
             film = plan_film(chosen.show, photos)
             plan = shrunk(asked, photos)
-            batches = RayBatches.of([rectified(view) for view in photos.views], [stage.shrink for stage in plan.stages])
+            batches = batches_of(plan, photos)
+            if photos.space == "linear":
+                run.record.citations.append("mildenhall_2022")
             run.record.plan, run.record.notes = choices(plan, photos, batches), [*notes(photos, judged), *film.notes]
             task.watcher.say([photos.text, *(f"{one.choice}: {one.reason}" for one in run.record.plan)])
         with run.stage("fit"):
             problem = RadianceProblem(batches, photos.box, plan, chosen.seed)
-            best = BestIterate(run, best_files(problem))
+            best = BestIterate(run, best_files(problem, photos.white))
             fit = solve(task, run, problem, judged, best)
         with run.stage("images and volumes"):
             PhotoOutputs(task, run, fit, photos, judged, film).write()
@@ -76,10 +77,10 @@ def new_record(task: Task) -> RunRecord:
     )
 
 
-def best_files(problem: RadianceProblem) -> FilesOfBest:
-    """Where the best field lies beside the last one, with its sky where there is one."""
+def best_files(problem: RadianceProblem, white: float) -> FilesOfBest:
+    """Where the best field lies beside the last one, with its sky where there is one, in the photographs' radiance."""
     names = ("field_best.npz", *(["sky_best.exr"] if problem.sky is not None else []))
-    return FilesOfBest(names, lambda folder: save_found(folder, problem, "_best"))
+    return FilesOfBest(names, lambda folder: save_found(folder, problem, "_best", white))
 
 
 def solve(

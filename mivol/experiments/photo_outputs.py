@@ -21,7 +21,7 @@ from mivol.optim.field_view import FieldView, render_view
 from mivol.optim.loop import Fit
 from mivol.optim.radiance_problem import RadianceProblem
 from mivol.photos import Camera, Photo, Photos
-from mivol.photos.picture import decode_srgb
+from mivol.photos.picture import SPACES, decode_srgb
 from mivol.report.depth import depth_pixels, normal_pixels, normals_of_depth
 from mivol.report.record import Image, Table, Volume
 from mivol.validate.images import METRICS, Quality, colour_fitted, judge, score
@@ -56,7 +56,7 @@ class PhotoOutputs:
         """Write all, and put it and the results on record."""
         folder, record, field = self.run.path, self.run.record, self.problem.field
         self.run.make("views", "volumes", "film")
-        save_found(folder, self.problem)
+        save_found(folder, self.problem, white=self.photos.white)
         record.tables = [storage(field, folder / "field.npz")]
         if self.problem.has_gains:
             record.tables.append(table_of_gains([view.name for view in self.photos.views], self.problem.exposure.table()))
@@ -84,7 +84,7 @@ class PhotoOutputs:
             found.append(quality)
             fitted.append(judge_fitted(seen.image, photo, self.judged.space))
             if number in shown:
-                images += write_view(self.run.path, photo, number, seen.image)
+                images += write_view(self.run.path, photo, number, seen.image, self.judged.space)
             if number == 0:
                 images += write_geometry(self.run.path, seen, photo.camera, self.judged.near_far)
         self.run.record.tables.append(table_of_views(views[0].camera, found, fitted))
@@ -93,15 +93,21 @@ class PhotoOutputs:
     def write_film(self) -> Image:
         """A camera's way through the field."""
         background = behind(self.problem, self.photos.views[0])
-        shown = lambda camera: render_view(self.problem.field, camera, background).image  # noqa: E731
+        to_codes = SPACES[self.photos.space, "srgb"]
+        shown = lambda camera: to_codes(render_view(self.problem.field, camera, background).image)  # noqa: E731
         return self.film.write(self.run.path, shown, self.task.watcher)
 
 
-def save_found(folder: Path, problem: RadianceProblem, which: str = "") -> None:
-    """The field that a problem holds, and its sky where there is one, with a word in their names."""
-    save_field(folder / f"field{which}.npz", problem.field)
+def save_found(folder: Path, problem: RadianceProblem, which: str = "", white: float = 1.0) -> None:
+    """The field that a problem holds, and its sky where there is one, with a word in their names.
+
+    Args:
+        folder, problem, which: where, what, and the word.
+        white: by what colours are multiplied: the radiance for which 1 stood in the fit.
+    """
+    save_field(folder / f"field{which}.npz", problem.field.brightened(white))
     if problem.sky is not None:
-        write_exr(folder / f"sky{which}.exr", {"": problem.sky.image()})
+        write_exr(folder / f"sky{which}.exr", {"": white * problem.sky.image()})
 
 
 def compare(
@@ -114,8 +120,9 @@ def compare(
 
 
 def judge_fitted(image: NDArray, photo: Photo, space: str) -> float:
-    """PSNR [dB] of a view whose colours were fitted to its photograph's."""
-    return judge(colour_fitted(image, photo.image, photo.mask), photo.image, space=space, mask=photo.mask).values["psnr"]
+    """PSNR [dB] of a view whose colours, as a screen shows them, were fitted to its photograph's."""
+    shown, wanted = (SPACES[space, "srgb"](values) for values in (image, photo.image))
+    return judge(colour_fitted(shown, wanted, photo.mask), wanted, mask=photo.mask).values["psnr"]
 
 
 def table_of_views(camera: Camera, found: Sequence[Quality], fitted: Sequence[float]) -> Table:
@@ -175,12 +182,12 @@ def write_density(folder: Path, field: SphericalGrid, level: int) -> Volume:
     return Volume(path=f"{name}.npz", role="reconstruction", size=size)
 
 
-def write_view(folder: Path, photo: Photo, number: int, image: NDArray) -> list[Image]:
-    """A render beside its photograph."""
+def write_view(folder: Path, photo: Photo, number: int, image: NDArray, space: str = "srgb") -> list[Image]:
+    """A render beside its photograph, both as a screen shows them."""
     written = []
     for role, values in {"render": image, "reference": photo.image}.items():
         path = f"views/{number:03d}_{role}.png"
-        write_png(folder / path, decode_srgb(np.clip(values, 0, 1)))
+        write_png(folder / path, SPACES[space, "linear"](np.clip(values, 0, 1)))
         written.append(Image(path=path, role=role, view=photo.name, held_out=True, quantity="sRGB value"))
     return written
 

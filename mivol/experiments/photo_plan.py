@@ -11,7 +11,7 @@ from mivol.errors import MivolError
 from mivol.optim.radiance_plan import FEW, PRESETS, FitPlan, memory_of
 from mivol.optim.ray_batches import RayBatches
 from mivol.optim.strategy import nearest
-from mivol.photos import Photos
+from mivol.photos import Photos, rectified
 from mivol.report.record import PlanLine
 
 GAINS = PlanLine(
@@ -41,6 +41,11 @@ def make_plan(chosen: FieldFit) -> FitPlan:
     if wanted.degree is not None:
         plan = replace(plan, few_degree=None)
     return plan if wanted.longest is None else plan.up_to(wanted.longest)
+
+
+def batches_of(plan: FitPlan, photos: Photos) -> RayBatches:
+    """The photographs in the sizes of the plan, without the distortion of lenses that have an image plane."""
+    return RayBatches.of([rectified(view) for view in photos.views], [one.shrink for one in plan.stages], space=photos.space)
 
 
 def shrunk(plan: FitPlan, photos: Photos) -> FitPlan:

@@ -317,6 +317,12 @@ class SphericalGrid:
         how = self.activation, self.offset, self.clamp, self.levels, self.space
         return self.from_rows(self.res, self.to_world, density, rows, self.nodes, *how)
 
+    def brightened(self, factor: float) -> SphericalGrid:
+        """The same field, its colours so many times as bright."""
+        if factor == 1:
+            return self
+        return replace(self, harmonics=self.harmonics * factor, offset=self.offset * factor)
+
     def listed(self) -> np.ndarray:
         """Flat numbers of the nodes that have a row, int64."""
         return np.arange(self.places) if self.nodes is None else np.array(self.nodes).astype(np.int64)

@@ -1,11 +1,13 @@
 """A radiance field and photographs of it as a problem: a sparse grid of density and spherical harmonics, coarse first.
 
-Conventions. A step looks at tiles of a few views; its loss is the squared error of a ray, mean over rgb and rays. Densities are
+Conventions. A step looks at tiles of a few views; its loss is the squared error of a ray, mean over rgb and rays, where the
+photographs hold radiance weighted by the slope of a tone curve (:mod:`mivol.optim.colour_scale`). Densities are
 signed and pass a ReLU after interpolation, so a cell whose corners are all negative is vacuum and costs nothing. A stage begins
 with nodes where the last one's field gave some ray a weight (and their neighbours).
 
-The reals are ``density`` (rows,), ``harmonics`` (rows, width) and, where the plan asks for one, ``sky`` (texels, 4). What a
-step does is a function of them, of the listed cells, the seed and the step's number.
+The reals are ``density`` (rows,), ``harmonics`` (rows, width) and, where the plan asks for one, ``sky`` (texels, 4); radiance
+is there in the scale of :mod:`mivol.optim.colour_scale`. What a step does is a function of them, of the listed cells, the seed
+and the step's number.
 
 References: Fridovich-Keil, Yu et al. 2022 (Plenoxels: model, optimiser, total variation, pruning by weight); Karnewar et al.
 2022 (ReLU after interpolation).
@@ -27,6 +29,7 @@ from mivol.fields.activation import activation_of
 from mivol.fields.resampling import resample_field
 from mivol.fields.sky import TEXEL, Sky
 from mivol.fields.spherical import SphericalGrid, basis_size, is_covered, row_width
+from mivol.optim.colour_scale import SCALES
 from mivol.optim.decoupled_priors import Neighbours, Rows
 from mivol.optim.exposure import AGREE, RATE, Exposure
 from mivol.optim.problem import Reals, Refinement
@@ -86,11 +89,12 @@ class RadianceProblem:
                 raise MivolError("gains were asked for and the photographs have alpha, as renders have: exposure = false.")
             self.exposure = Exposure.even(len(self.batches.origins))
         self.has_gains = self.plan.exposure
+        self.scale = SCALES[self.batches.space]
         self.unit = float((self.box[1] - self.box[0]).max()) / 2
         distances = np.linalg.norm(self.batches.origins - self.box.mean(axis=0), axis=1)
         self.near = self.plan.near * float(np.median(distances))
         place, degree = place_grid(self.box, self.plan.stages[0].longest), self.plan.degree_at(0)
-        self.field = _fog(*place, degree, self.plan.start / self.unit, self.plan.levels)
+        self.field = _fog(*place, degree, self.plan.start / self.unit, self.plan.levels, self.batches.space)
         self._first_row = 0
         self._look_around()
 
@@ -101,23 +105,31 @@ class RadianceProblem:
         return self.values()
 
     def values(self) -> Reals:
-        """Field and sky as tensors."""
-        sky = {} if self.sky is None else {"sky": mi.TensorXf(self.sky.texels, (dr.width(self.sky.texels) // TEXEL, TEXEL))}
-        gains = {} if self.exposure is None else {"exposure": self.exposure.tensor}
-        return _tensors(self.field) | sky | gains
+        """Field and sky as tensors of reals."""
+        found = _tensors(self.field)
+        if self.sky is not None:
+            found["sky"] = mi.TensorXf(self.sky.texels, (dr.width(self.sky.texels) // TEXEL, TEXEL))
+        found |= {name: mi.TensorXf(self.scale.reals_of(found[name].array), found[name].shape) for name in self._colours(found)}
+        return found if self.exposure is None else found | {"exposure": self.exposure.tensor}
+
+    @staticmethod
+    def _colours(reals: Reals) -> list[str]:
+        """Names of the reals that are colours."""
+        return [name for name in ("harmonics", "sky") if name in reals]
 
     def set(self, reals: Reals) -> None:
         """Put values into the field and the sky."""
-        self.field = _with_tensors(self.field, reals)
+        colours = {name: self.scale.colours_of(reals[name].array) for name in self._colours(reals)}
+        self.field = self.field.with_values(reals["density"].array, colours["harmonics"])
         if self.sky is not None:
-            self.sky = self.sky.with_texels(reals["sky"].array)
+            self.sky = self.sky.with_texels(colours["sky"])
         if self.exposure is not None:
             self.exposure = Exposure(reals["exposure"].array)
 
     # -- Loss and gradient --------------------------------------------------------------------------------------------
 
     def loss_and_gradient(self, reals: Reals, iteration: int, views: int = 0) -> tuple[mi.Float, Reals]:
-        """Mean squared error of the rays of an iteration, and its gradient; 0 views: as many as the stage says.
+        """Mean (weighted) squared error of the rays of an iteration, and its gradient; 0 views: as many as the stage says.
 
         Noise: of which pixels were drawn. Bias: that of :func:`mivol.transport.line_integrals.radiance_source.bake`.
         """
@@ -126,6 +138,7 @@ class RadianceProblem:
         rng = np.random.default_rng((self.seed, iteration))
         batch = self.batches.draw(stage.shrink, self.batches.choose(views or stage.views, rng), stage.tiles, rng)
         loss, slopes = self.slopes(batch, self._background(rng))
+        slopes |= {name: self.scale.by_reals(slopes[name], reals[name].array) for name in self._colours(reals)}
         self._first_row = int(rng.integers(dr.width(self._neighbours.after[0])))
         return dr.mean(loss), {name: mi.TensorXf(slopes[name], value.shape) for name, value in reals.items()}
 
@@ -134,7 +147,7 @@ class RadianceProblem:
         return rng.random(3) if random else None
 
     def slopes(self, batch: RayBatch, background: np.ndarray | None = None) -> tuple[mi.Float, dict[str, mi.Float]]:
-        """Squared error of each ray of a batch, mean over rgb, and the derivatives of the mean over rays, by parameter.
+        """Squared error of each ray of a batch, weighted, mean over rgb, and derivatives of the mean over rays, by parameter.
 
         Args:
             batch: rays and what they should see.
@@ -150,8 +163,9 @@ class RadianceProblem:
         gain = self.exposure.of(batch.view) if self.has_gains else mi.Color3f(1)
         shown = gain * (seen.colour + seen.T * behind)
         error = shown - batch.target - (1 - batch.alpha) * (behind - before)
-        error *= batch.counted
-        by_shown = error * (2 / (3 * count))
+        weight = self.scale.weight(shown)
+        error *= batch.counted * weight
+        by_shown = error * weight * (2 / (3 * count))
         by = by_shown * gain
         through = dr.dot(by, behind)
         if self.plan.beta > 0:
@@ -181,9 +195,10 @@ class RadianceProblem:
     def rates(self, iteration: int) -> dict[str, float]:
         """Learning rates; those of the density count in half the longest edge of the box."""
         density, sh = self.plan.rates(iteration)
-        sky = {} if self.sky is None else {"sky": self.plan.sky_rate * sh / self.plan.sh_rate}
-        gains = {} if self.exposure is None else {"exposure": RATE * sh / self.plan.sh_rate}
-        return {"density": density / self.unit, "harmonics": sh} | sky | gains
+        share, colours = sh / self.plan.sh_rate, self.scale.rate
+        sky = {} if self.sky is None else {"sky": colours * self.plan.sky_rate * share}
+        gains = {} if self.exposure is None else {"exposure": RATE * share}
+        return {"density": density / self.unit, "harmonics": colours * sh} | sky | gains
 
     def after_step(self, reals: Reals, iteration: int) -> Reals:
         """Move values as the priors ask: by shares of the learning rate, fewer the more photographs there are."""
@@ -208,7 +223,7 @@ class RadianceProblem:
         density, sh = (rate / len(self.batches.origins) for rate in self.plan.rates(iteration))
         return {
             "density": Rows(1, self._neighbours, density, self.unit, self._first_row),
-            "harmonics": Rows(self.field.width, self._neighbours, sh, 1.0, self._first_row),
+            "harmonics": Rows(self.field.width, self._neighbours, self.scale.rate * sh, 1.0, self._first_row),
         }
 
     def warning(self) -> str:
@@ -291,7 +306,7 @@ class RadianceProblem:
         place, degree = place_grid(self.box, self.plan.stages[self.stage].longest), self.plan.degree_at(self.stage)
         nodes = mi.UInt32(arrays["nodes"]) if "nodes" in arrays else None
         values = reals["density"].array, reals["harmonics"].array
-        self.field = SphericalGrid(*place, degree, *values, nodes, levels=self.plan.levels)
+        self.field = SphericalGrid(*place, degree, *values, nodes, levels=self.plan.levels, space=self.batches.space)
         self.set(reals)
         self._look_around()
 
@@ -307,7 +322,9 @@ def _with_tensors(grid: SphericalGrid, reals: Reals) -> SphericalGrid:
     return grid.with_values(reals["density"].array, reals["harmonics"].array)
 
 
-def _fog(res: tuple[int, int, int], to_world: np.ndarray, degree: int, density: float, levels: int) -> SphericalGrid:
+def _fog(
+    res: tuple[int, int, int], to_world: np.ndarray, degree: int, density: float, levels: int, space: str
+) -> SphericalGrid:
     """A thin grey fog that fills the boxes of all levels."""
     nodes, width = None, row_width(basis_size(degree))
     if levels > 1:
@@ -317,7 +334,8 @@ def _fog(res: tuple[int, int, int], to_world: np.ndarray, degree: int, density: 
     if nodes is not None:
         dr.scatter(fog, mi.Float(activation_of("relu").vacuum), mi.UInt32(rows))
     dr.eval(fog)
-    return SphericalGrid(res, to_world, degree, fog, dr.zeros(mi.Float, dr.width(fog) * width), nodes, levels=levels)
+    colours = dr.zeros(mi.Float, dr.width(fog) * width)
+    return SphericalGrid(res, to_world, degree, fog, colours, nodes, levels=levels, space=space)
 
 
 def _nodes_of(field: SphericalGrid, cells: Cells, chosen: mi.Bool) -> np.ndarray:

@@ -2,9 +2,9 @@
 
 Conventions. A batch is square tiles of pixels: neighbours cross the same cells, so their reads and writes meet in the cache,
 and a packet of lanes walks as one. Tiles lie anywhere in a view, all places alike. Smaller sizes are exact means over area;
-where voxels are larger than pixels, a small image says the same with fewer rays. Values are those of the photographs (8-bit
-steps), not decoded. What a mask leaves out has a ray, and counts for nothing. Rays of pinholes are computed; those of wide
-lenses (:mod:`mivol.photos.wide_lens`) are traced once for each lens and size, and looked up.
+where voxels are larger than pixels, a small image says the same with fewer rays. Values are those of the photographs: codes in
+8-bit steps, not decoded, or radiance. What a mask leaves out has a ray, and counts for nothing. Rays of pinholes are computed;
+those of wide lenses (:mod:`mivol.photos.wide_lens`) are traced once for each lens and size, and looked up.
 """
 
 from __future__ import annotations
@@ -27,17 +27,22 @@ TILE = 4
 
 @dataclass
 class Level:
-    """All views in one size: codes 0..255, [row][column][rgb] or, with alpha, [rgba], one view after the other.
+    """All views in one size: codes 0..255 or radiance, [row][column][rgb] or, with alpha, [rgba], one view after the other.
 
     ``counted`` is 1 or 0 a pixel; None where no photograph has a mask. ``wide``: rays of wide lenses; None where there is none.
     """
 
-    codes: mi.UInt8
+    codes: mi.UInt8 | mi.Float
     counted: mi.UInt8 | None
     sizes: np.ndarray
     starts: np.ndarray
     shrink: int
     wide: WideRays | None
+
+    def values(self, at: mi.UInt32) -> mi.Float:
+        """Numbers of pixels, 0..1 where they are codes."""
+        found = mi.Float(dr.gather(type(self.codes), self.codes, at))
+        return found if dr.is_float_v(self.codes) else found * (1 / 255)
 
 
 @dataclass
@@ -117,21 +122,30 @@ class RayBatches:
         origins: (V, 3) these points.
         levels: sizes, by how much they are shrunk: 1, 2, 4 ...
         channels: 3, or 4 with alpha.
+        space: what their values are, "srgb" (codes) or "linear" (radiance).
     """
 
     origins: np.ndarray
     lenses: mi.Float
     levels: dict[int, Level]
     channels: int
+    space: str = "srgb"
 
     @classmethod
-    def of(cls, photos: Sequence[Photo], shrinks: Sequence[int] = (1,), with_alpha: bool | None = None) -> RayBatches:
+    def of(
+        cls,
+        photos: Sequence[Photo],
+        shrinks: Sequence[int] = (1,),
+        with_alpha: bool | None = None,
+        space: str = "srgb",
+    ) -> RayBatches:
         """Take over photographs.
 
         Args:
             photos: at least one.
             shrinks: sizes to keep, 1 for that of the photographs.
             with_alpha: keep alpha, for backgrounds that change; None: where all photographs have it.
+            space: what the photographs' values are; codes are kept in steps of 8 bits, between 0 and 1.
 
         Raises:
             MivolError: a lens that distorts the image plane, or no alpha where it is asked for.
@@ -144,22 +158,22 @@ class RayBatches:
             if with_alpha and photo.alpha is None:
                 raise MivolError(f"{photo.name} has no alpha; its background cannot be replaced: choose none.")
         lenses = np.array([_lens(photo) for photo in photos], np.float32)
-        levels = {shrink: _level(photos, shrink, with_alpha) for shrink in sorted(set(shrinks))}
+        levels = {shrink: _level(photos, shrink, with_alpha, space) for shrink in sorted(set(shrinks))}
         origins = np.array([photo.camera.origin for photo in photos])
-        return cls(origins, mi.Float(lenses.reshape(-1)), levels, 4 if with_alpha else 3)
+        return cls(origins, mi.Float(lenses.reshape(-1)), levels, 4 if with_alpha else 3, space)
 
     @property
     def bytes(self) -> int:
         """Memory that the pixels take, and the rays of wide lenses [bytes]."""
         wide = sum(4 * dr.width(level.wide.directions) for level in self.levels.values() if level.wide is not None)
-        return sum(dr.width(pixels) for pixels in self._pixels()) + wide
+        return sum(dr.itemsize_v(pixels) * dr.width(pixels) for pixels in self._pixels()) + wide
 
     @property
     def behind(self) -> np.ndarray:
         """(V, 3) the colour that each photograph lies over."""
         return np.array(self.lenses).reshape(-1, LENS)[:, 16:]
 
-    def _pixels(self) -> list[mi.UInt8]:
+    def _pixels(self) -> list[mi.UInt8 | mi.Float]:
         """All that is kept of pixels, in the order of the sizes."""
         levels = [level for _, level in sorted(self.levels.items())]
         return [pixels for level in levels for pixels in (level.codes, level.counted) if pixels is not None]
@@ -169,7 +183,8 @@ class RayBatches:
         level = self.levels[max(self.levels)]
         codes = np.array(level.codes).reshape(-1, self.channels)[:, :3]
         counted = codes if level.counted is None else codes[np.array(level.counted) > 0]
-        return np.median(counted, axis=0) / 255 if len(counted) else np.full(3, 0.5)
+        unit = 255 if self.space == "srgb" else 1
+        return np.median(counted, axis=0) / unit if len(counted) else np.full(3, 0.5)
 
     def choose(self, count: int, rng: np.random.Generator) -> np.ndarray:
         """Numbers of so many views, each at most once, in ascending order; of all where there are fewer."""
@@ -204,9 +219,9 @@ class RayBatches:
         level = self.levels[shrink]
         width, height = (int(n) for n in level.sizes[view])
         pixel = dr.arange(mi.UInt32, width * height) + dr.opaque(mi.UInt32, int(level.starts[view]))
-        codes = [dr.gather(mi.UInt8, level.codes, pixel * self.channels + k) for k in range(self.channels)]
+        channels = [level.values(pixel * self.channels + k) for k in range(self.channels)]
         counted = mi.Float(1) if level.counted is None else mi.Float(dr.gather(mi.UInt8, level.counted, pixel))
-        return [mi.Float(code) * (1 / 255) for code in codes], counted
+        return channels, counted
 
     def digest(self) -> str:
         """A fingerprint of cameras and pixels."""
@@ -225,9 +240,7 @@ class RayBatches:
         view, start, width = (dr.gather(mi.UInt32, mi.UInt32(np.ascontiguousarray(table[:, k])), slot) for k in range(3))
         within = row * width + column
         pixel = start + within
-        codes = [
-            mi.Float(dr.gather(mi.UInt8, level.codes, pixel * self.channels + k)) * (1 / 255) for k in range(self.channels)
-        ]
+        values = [level.values(pixel * self.channels + k) for k in range(self.channels)]
         counted = mi.Float(1) if level.counted is None else mi.Float(dr.gather(mi.UInt8, level.counted, pixel))
         lens = [dr.gather(mi.Float, self.lenses, view * LENS + k) for k in range(LENS)]
         x = ((mi.Float(column) + 0.5) * level.shrink - lens[2]) * lens[0]
@@ -238,8 +251,8 @@ class RayBatches:
             local = level.wide.turned(mi.Vector3f(x, y, -1), slot, views, within)
             d = mi.Vector3f(*(dr.dot(mi.Vector3f(*lens[4 + 3 * a : 7 + 3 * a]), local) for a in range(3)))
         o = mi.Point3f(lens[13], lens[14], lens[15])
-        alpha = codes[3] if self.channels == 4 else mi.Float(1)
-        target, before = mi.Color3f(*codes[:3]), mi.Color3f(*lens[16:])
+        alpha = values[3] if self.channels == 4 else mi.Float(1)
+        target, before = mi.Color3f(*values[:3]), mi.Color3f(*lens[16:])
         return RayBatch(self.origins[views], RayBundle(o, dr.normalize(d)), slot, view, target, alpha, before, counted)
 
 
@@ -252,18 +265,19 @@ def _lens(photo: Photo) -> list[float]:
     return [1 / K[0, 0], 1 / K[1, 1], K[0, 2], K[1, 2], *pose[:3, :3].reshape(-1), *pose[:3, 3], *photo.background]
 
 
-def _level(photos: Sequence[Photo], shrink: int, with_alpha: bool) -> Level:
-    images = [_shrunk(_pixels(photo, with_alpha), shrink) for photo in photos]
+def _level(photos: Sequence[Photo], shrink: int, with_alpha: bool, space: str) -> Level:
+    images = [_shrunk(_pixels(photo, with_alpha, space), shrink) for photo in photos]
     sizes = np.array([image.shape[1::-1] for image in images], np.int64)
     if sizes.min() < TILE:
         raise MivolError(f"a view of {sizes.min()} pixels an edge was given at 1/{shrink}; {TILE} are needed: shrink less.")
     counts = sizes.prod(axis=1)
     if counts.sum() * 4 >= 2**32:
         raise MivolError(f"{counts.sum()} pixels were given; they are counted up to 2^30: read the photographs smaller.")
-    codes = np.concatenate([np.rint(image * 255).astype(np.uint8).reshape(-1) for image in images])
+    steps, kind, number = (255, mi.UInt8, np.uint8) if space == "srgb" else (0, mi.Float, np.float32)
+    codes = np.concatenate([(np.rint(image * steps) if steps else image).astype(number).reshape(-1) for image in images])
     starts = np.concatenate([[0], np.cumsum(counts)[:-1]])
     wide = WideRays.of([photo.camera for photo in photos], sizes, shrink)
-    return Level(mi.UInt8(codes), _counted(photos, shrink), sizes, starts, shrink, wide)
+    return Level(kind(codes), _counted(photos, shrink), sizes, starts, shrink, wide)
 
 
 def _counted(photos: Sequence[Photo], shrink: int) -> mi.UInt8 | None:
@@ -274,8 +288,8 @@ def _counted(photos: Sequence[Photo], shrink: int) -> mi.UInt8 | None:
     return mi.UInt8(np.concatenate([(_shrunk(mask[..., None], shrink) == 1).reshape(-1) for mask in masks]).astype(np.uint8))
 
 
-def _pixels(photo: Photo, with_alpha: bool) -> np.ndarray:
-    image = np.clip(photo.image, 0, 1)
+def _pixels(photo: Photo, with_alpha: bool, space: str) -> np.ndarray:
+    image = np.clip(photo.image, 0, 1) if space == "srgb" else photo.image
     return np.concatenate([image, photo.alpha[..., None]], axis=2) if with_alpha else image
 
 

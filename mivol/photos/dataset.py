@@ -73,13 +73,15 @@ class Photos:
 
     Attributes:
         views: of the split.
-        space: what their values are: "srgb" (code values) or "linear".
+        space: what their values are: "srgb" (code values) or "linear" (radiance).
         survey: what was found before pixels were read.
+        white: of linear values, the radiance of the files for which 1 stands.
     """
 
     views: tuple[Photo, ...]
     space: str
     survey: PhotoSurvey
+    white: float = 1.0
 
     @property
     def box(self) -> np.ndarray:
@@ -181,7 +183,8 @@ def _space(wanted: str | None, frames: Sequence[Frame]) -> str:
     held = {space_of(frame.file): frame.file for frame in frames}
     if wanted is None and len(held) == 2:
         names = " and ".join(file.name for file in held.values())
-        raise refusal(names, "8-bit and OpenEXR images in one set", "one kind of values", 'choose space="srgb" or "linear"')
+        found, advice = "codes of 8 bits and radiance in one set", 'choose space = "srgb" or "linear" for all'
+        raise refusal(names, found, "one kind of values", advice)
     if wanted not in (None, "srgb", "linear"):
         raise refusal("space", f'"{wanted}"', '"srgb" or "linear"', "choose one of those")
     return wanted or next(iter(held))

@@ -230,9 +230,9 @@ def test_what_was_done_to_linear_photographs_is_said(photographs: Path, tmp_path
         write_exr(tmp_path / frame["file_path"], {name: np.full((SIZE, SIZE), 2.0, np.float32) for name in "RGB"})
     said = []
     for folder in (photographs, tmp_path):
-        photos, _ = photo_data.read_photos(config.load(toml(tmp_path, folder)), tmp_path)
+        photos, _ = photo_data.read_photos(config.load(toml(tmp_path, folder), ["photos.space=srgb"]), tmp_path)
         said.append(" ".join(photo_data.notes(photos)))
-    assert ["OpenEXR" in note for note in said] == [False, True]
+    assert ["light of photographs of radiance was encoded" in note for note in said] == [False, True]
     assert all("srgb code values" in note for note in said)
 
 
