@@ -56,7 +56,8 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Mark as slow what ``slow_variants.txt`` names: tests that take long, of which a cheaper variant or a neighbour stays.
+    """Mark as slow what ``slow_variants.txt`` names: tests that take long, of which a cheaper variant or a neighbour stays, and
+    those of the benches and of the mutation runner, on which no result of a user depends.
 
     Raises:
         pytest.UsageError: it names a test that its file does not have, so that a test which was renamed is not run by chance.
