@@ -81,7 +81,7 @@ PARTS = {CONSTANT: constant_light, SUN: sun_and_sky, DIRECTIONAL: directional_li
 
 
 def _light(name: str, bar: float, depth: int = 6, albedo: float = 0.75) -> Light:
-    return Light(PARTS[name], bar, by_pixel=depth < 0, albedo=albedo, depth=depth)
+    return Light(PARTS[name], bar, by_pixel=depth < 0, albedo=albedo, depth=depth, has_tails=depth < 0)
 
 
 CONTESTS: dict[str, dict[str, Light]] = {

@@ -27,7 +27,7 @@ def test_contests_are_those_of_the_published_table():
         (-1, 0.999, 300),
         (-1, bench.CONTESTS["milk"]["glass, lamp and sky, unlimited"].albedo, 10),
     ]
-    assert all(light.by_pixel == (light.depth < 0) for c in bench.CONTESTS.values() for light in c.values())
+    assert all(light.by_pixel == light.has_tails == (light.depth < 0) for c in bench.CONTESTS.values() for light in c.values())
     assert bench.white_box().values.max() * 2 == bench.WHITE_DEPTH == 64
     assert np.allclose(bench.thin_smoke().values.max() * 20, bench.smoke().values.max())
 
