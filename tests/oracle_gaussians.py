@@ -96,3 +96,64 @@ def optical_depth(cloud: Cloud, o: Floats, d: Floats, t0: Floats, t1: Floats, cu
     low, high = ((t[:, None] - line.peak) * line.speed for t in (t0, t1))
     low, high = np.where(cut.starts, -cut.half, low), np.where(cut.ends, cut.half, high)
     return np.where(cut.hits, line.depth * (ndtr(high) - ndtr(low)), 0.0).sum(axis=1)
+
+
+# -- Colours, in the order of peaks ------------------------------------------------------------------------------------------
+
+
+def light_of_codes(code: Floats) -> Floats:
+    """IEC 61966-2-1."""
+    return np.where(code <= 0.04045, code / 12.92, ((np.maximum(code, 0) + 0.055) / 1.055) ** 2.4)
+
+
+def harmonics_along(d: Floats) -> Floats:
+    """(rays, 16) real spherical harmonics up to degree 3 of unit directions, by polynomials and their normalisation."""
+    x, y, z = d.T
+    bands = [
+        (1 / 4, [1 + 0 * x]),
+        (3 / 4, [-y, z, -x]),
+        (15 / 4, [x * y, -y * z, (3 * z * z - 1) / np.sqrt(12), -x * z, (x * x - y * y) / 2]),
+        (
+            7 / 16,
+            [
+                -np.sqrt(5 / 2) * y * (3 * x * x - y * y),
+                np.sqrt(60) * x * y * z,
+                -np.sqrt(3 / 2) * y * (5 * z * z - 1),
+                z * (5 * z * z - 3),
+                -np.sqrt(3 / 2) * x * (5 * z * z - 1),
+                np.sqrt(15) * z * (x * x - y * y),
+                -np.sqrt(5 / 2) * x * (x * x - 3 * y * y),
+            ],
+        ),
+    ]
+    return np.stack([np.sqrt(norm / np.pi) * value for norm, values in bands for value in values], axis=-1)
+
+
+def colours(harmonics: Floats, d: Floats, space: str) -> Floats:
+    """(rays, N, 3) radiances."""
+    codes = np.maximum(0.5 + np.einsum("rb,nbc->rnc", harmonics_along(d)[:, : harmonics.shape[1]], harmonics), 0)
+    return light_of_codes(codes) if space == "srgb" else codes
+
+
+def order_of(cloud: Cloud, o: Floats, d: Floats) -> NDArray[np.int64]:
+    """(rays, N) Gaussians from the nearest peak to the farthest; of the same peak the lower number first."""
+    return np.argsort(see(cloud, o, d).peak, axis=1, kind="stable")
+
+
+def composite(
+    cloud: Cloud,
+    colour: Floats,
+    rays: tuple[Floats, Floats],
+    span: tuple[Floats, Floats],
+    frozen: tuple[NDArray[np.int64], Cut] | None = None,
+    scale: float = 1.0,
+) -> tuple[Floats, Floats]:
+    """(rays, 3) light and (rays,) transmittance of intervals; in the order and with the cut of other Gaussians, if given."""
+    order, cut = frozen or (order_of(cloud, *rays), find_cut(cloud, *rays, *span))
+    line = see(cloud, *rays)
+    low, high = ((t[:, None] - line.peak) * line.speed for t in span)
+    low, high = np.where(cut.starts, -cut.half, low), np.where(cut.ends, cut.half, high)
+    tau = scale * np.where(cut.hits, line.depth * (ndtr(high) - ndtr(low)), 0.0)
+    tau, colour = np.take_along_axis(tau, order, 1), np.take_along_axis(colour, order[..., None], 1)
+    front = np.cumsum(tau, axis=1) - tau
+    return ((np.exp(-front) * -np.expm1(-tau))[..., None] * colour).sum(axis=1), np.exp(-tau.sum(axis=1))

@@ -1,8 +1,14 @@
-"""Gaussians as an extinction that rays are traced through: parameters, rows, and the lists of cells that hold them.
+"""Gaussians that rays are traced through, as an extinction and its colours: parameters, rows, and the cells that list them.
 
 Conventions. Parameters are the pre-images of the activations, as :mod:`mivol.points.gaussians` has them, by the same names:
 "means" (N, 3), "log_scales" (N, 3), "quaternions" (N, 4), "opacity_logits" (N,). The extinction of one along a line is that of
-:mod:`mivol.fields.gaussian_line`; they add up. A Gaussian ends ``REACH`` standard deviations from its mean.
+:mod:`mivol.fields.gaussian_line`; they add up. A Gaussian ends ``REACH`` standard deviations from its mean. "harmonics"
+(N, K, 3), which may be left out, are their colours (:mod:`mivol.fields.gaussian_colour`).
+
+Low-pass. Splatting widens each Gaussian in the image, by 0.3 pixel^2 in published files, and keeps its opacity: a fit has
+Gaussians that are far thinner than that, and looks as it does with the filter. ``blur`` b does the same in space: the
+covariance becomes S + b^2 I. At a distance z from a camera of the focal length f [pixel] that is the filter of the image for
+b = sqrt(0.3) z / f (a 3D filter as in Yu et al., Mip-Splatting, 2024, without their compensation of the opacity).
 
 Two things are cut: an opacity above ``MOST_OPAQUE`` counts as that one (1 would be an infinite extinction), a scale below
 ``LEAST_SCALE`` of the box as that one (float32 places no ray nearer). Both have no derivative there.
@@ -20,17 +26,22 @@ import numpy as np
 
 from mivol.errors import MivolError
 from mivol.fields.gaussian_cells import CellLists, list_gaussians
+from mivol.fields.gaussian_colour import rows_of_harmonics
 from mivol.fields.gaussian_grid import MOST_OPAQUE
 from mivol.fields.gaussian_line import REACH, ROW, Line, cross, read_row
 from mivol.fields.protocol import EXACT_LINE
+from mivol.fields.spherical import SPACES, degree_of, frame_of, turn_by
 from mivol.points.gaussian_files import read_gaussians
 from mivol.points.gaussians import Gaussians
 from mivol.space import check_affine
 
-__all__ = ["LEAST_SCALE", "NAMES", "GaussianField"]
+__all__ = ["HARMONICS", "LEAST_SCALE", "NAMES", "GaussianField"]
 
 NAMES = ("means", "log_scales", "quaternions", "opacity_logits")
 """The parameters of the extinction."""
+
+HARMONICS = "harmonics"
+"""The parameter of the colours."""
 
 LEAST_SCALE = 1e-6
 """Smallest standard deviation, in edges of the box."""
@@ -42,9 +53,12 @@ class GaussianField:
     Args:
         tensors: the parameters by name.
         place: (4, 4) affine map of the Gaussians to the world; their opacities stay as they are.
+        space: what colours are: "srgb" (code values, as in published files) or "linear" (radiance).
+        blur: b, the standard deviation [length of the cloud] by which each is widened.
 
     Raises:
-        MivolError: parameters that no Gaussian has, by the index of the first, or lists that do not fit into memory.
+        MivolError: parameters that no Gaussian has, by the index of the first, lists that do not fit into memory, another
+            space, or a blur below 0.
 
     Attributes:
         lists: the Gaussians of each cell.
@@ -55,38 +69,47 @@ class GaussianField:
     line = EXACT_LINE
     channels = 1
 
-    def __init__(self, tensors: Mapping[str, mi.TensorXf], place: np.ndarray) -> None:
-        self.tensors, self.place = dict(tensors), check_affine(place)
+    def __init__(
+        self, tensors: Mapping[str, mi.TensorXf], place: np.ndarray, space: str = "srgb", blur: float = 0.0
+    ) -> None:
+        if not 0 <= blur < math.inf:
+            raise MivolError(f"the blur of Gaussians is {blur:.4g}; a finite length of at least 0 is expected.")
+        if space not in SPACES:
+            raise MivolError(f"the space of the colours of Gaussians is {space!r}; {' or '.join(SPACES)} is expected.")
+        self.tensors, self.place, self.space, self.blur = dict(tensors), check_affine(place), space, blur
         self.refresh()
 
     @classmethod
-    def of(cls, gaussians: Gaussians, place: np.ndarray) -> GaussianField:
-        """The field of some Gaussians, without their colours."""
-        return cls({name: mi.TensorXf(getattr(gaussians, name)) for name in NAMES}, place)
+    def of(cls, gaussians: Gaussians, place: np.ndarray, space: str = "srgb", blur: float = 0.0) -> GaussianField:
+        """The field of some Gaussians."""
+        return cls({name: mi.TensorXf(getattr(gaussians, name)) for name in (*NAMES, HARMONICS)}, place, space, blur)
 
     @classmethod
     def from_props(cls, props: mi.Properties) -> GaussianField:
-        """Read Gaussians from plugin parameters: ``filename``, or the tensors in :data:`NAMES`; ``to_world``.
+        """Read Gaussians from plugin parameters: ``filename``, or the tensors in :data:`NAMES` (and the harmonics);
+        ``to_world``, ``space`` and ``blur``.
 
         Raises:
             MivolError: none or both of the sources, half of the tensors, or numbers that no Gaussian has.
         """
         place = np.array(props.get("to_world", mi.ScalarTransform4f()).matrix, dtype=np.float64)
-        tensors = [name for name in NAMES if name in props]
-        if ("filename" in props) == bool(tensors) or 0 < len(tensors) < len(NAMES):
+        tensors = [name for name in (*NAMES, HARMONICS) if name in props]
+        shown = props.get("space", "srgb"), float(props.get("blur", 0.0))
+        if ("filename" in props) == bool(tensors) or (tensors and not set(NAMES) <= set(tensors)):
             found = " and ".join([*(["filename"] if "filename" in props else []), *tensors]) or "none of them"
-            raise MivolError(f"mivol_gaussians was given {found}; give filename, or {', '.join(NAMES)}.")
+            raise MivolError(f"mivol_gaussians was given {found}; give filename, or {', '.join(NAMES)} (and {HARMONICS}).")
         if tensors:
-            return cls({name: mi.TensorXf(props[name]) for name in NAMES}, place)
-        return cls.of(read_gaussians(str(mi.file_resolver().resolve(props["filename"]))), place)
+            return cls({name: mi.TensorXf(props[name]) for name in tensors}, place, *shown)
+        return cls.of(read_gaussians(str(mi.file_resolver().resolve(props["filename"]))), place, *shown)
 
     def refresh(self) -> None:
         """List the Gaussians anew, after parameters have changed. Reads them: not while ``dr.freeze`` records."""
-        values = {name: np.array(dr.detach(self.tensors[name])) for name in NAMES}
-        read = Gaussians(**values, harmonics=np.zeros((len(values["means"]), 1, 3))).checked("Gaussians of a medium")
+        values = {name: np.array(dr.detach(tensor)) for name, tensor in self.tensors.items()}
+        values.setdefault(HARMONICS, np.zeros((len(values["means"]), 1, 3), np.float32))
+        read = Gaussians(**values).checked("Gaussians of a medium")
         means = read.means.astype(np.float64) @ self.place[:3, :3].T + self.place[:3, 3]
         self.least_scale = _least_scale(read)
-        scales = np.maximum(read.scales().astype(np.float64), self.least_scale)
+        scales = np.hypot(np.maximum(read.scales().astype(np.float64), self.least_scale), self.blur)
         whitening = np.swapaxes(read.rotations().astype(np.float64), 1, 2) / scales[:, :, None]
         whitening = whitening @ np.linalg.inv(self.place[:3, :3])
         self.lists: CellLists = list_gaussians(means, whitening, REACH)
@@ -119,7 +142,8 @@ class GaussianField:
         shift = [[mi.Float(float(v)) for v in row] for row in self.place[:3]]
         mean = [r[0] * means[0] + r[1] * means[1] + r[2] * means[2] + r[3] for r in shift]
         least = dr.opaque(mi.Float, self.least_scale)
-        step = [dr.rcp(dr.maximum(dr.exp(s), least)) for s in log_scales]
+        scales = [dr.maximum(dr.exp(s), least) for s in log_scales]
+        step = [dr.rcp(dr.sqrt(dr.square(s) + self.blur**2) if self.blur else s) for s in scales]
         back = np.linalg.inv(self.place[:3, :3]).tolist()
         whitening = [
             [step[k] * sum(axis[i] * back[i][j] for i in range(3)) for j in range(3)]
@@ -128,6 +152,24 @@ class GaussianField:
         opacity = dr.minimum(_logistic(self.tensors["opacity_logits"].array), MOST_OPAQUE)
         numbers = [*(w for row in whitening for w in row), *mean, opacity, dr.repeat(scale, self.count)]
         return dr.ravel(mi.ArrayXf([*numbers, *(dr.zeros(mi.Float, self.count) for _ in range(ROW - len(numbers)))]))
+
+    @property
+    def has_colours(self) -> bool:
+        """Whether they were given harmonics."""
+        return HARMONICS in self.tensors
+
+    @property
+    def degree(self) -> int:
+        """Of the harmonics."""
+        return degree_of(self.tensors[HARMONICS].shape[1])
+
+    def colour_rows(self) -> mi.Float:
+        """The harmonics of all Gaussians in blocks (:mod:`mivol.fields.gaussian_colour`), attached to the parameter."""
+        return rows_of_harmonics(self.tensors[HARMONICS], self.degree)
+
+    def harmonics_of(self, d: mi.Vector3f) -> list[mi.Float]:
+        """The basis for unit directions of travel in the world."""
+        return dr.sh_eval(turn_by(frame_of(self.place), d), self.degree)
 
     def eval(self, p: mi.Point3f, w: mi.Vector3f, active: mi.Bool) -> list[mi.Float]:
         """The extinction [1/length] at world points, for light that travels along ``w``; without derivatives."""

@@ -44,7 +44,19 @@ from mivol.files.notebook import slices_html
 from mivol.shown import briefly
 from mivol.space import check_affine, lattice_from_world
 
-__all__ = ["MAX_DEGREE", "SPACES", "SphericalGrid", "basis_size", "degree_of", "is_covered", "radiance_of_codes", "row_width"]
+__all__ = [
+    "MAX_DEGREE",
+    "SPACES",
+    "SphericalGrid",
+    "basis_size",
+    "degree_of",
+    "frame_of",
+    "is_covered",
+    "radiance_of_codes",
+    "row_width",
+    "slope_of_codes",
+    "turn_by",
+]
 
 MAX_DEGREE = 4
 
@@ -353,13 +365,11 @@ class SphericalGrid:
 
     def own_frame(self) -> np.ndarray:
         """(3, 3) map of world directions to the grid's own frame: the inverse of the polar factor of ``to_world``."""
-        left, _, right = np.linalg.svd(self.to_world[:3, :3])
-        return (left @ right).T
+        return frame_of(self.to_world)
 
     def turn(self, d: mi.Vector3f) -> mi.Vector3f:
         """World directions in the grid's own frame."""
-        rows = [[dr.opaque(mi.Float, float(v)) for v in row] for row in self.own_frame()]
-        return mi.Vector3f(*(dr.fma(r[0], d.x, dr.fma(r[1], d.y, r[2] * d.z)) for r in rows))
+        return turn_by(self.own_frame(), d)
 
     def harmonics_of(self, d: mi.Vector3f) -> list[mi.Float]:
         """The basis for unit directions of travel in the world."""
@@ -450,6 +460,23 @@ def radiance_of_codes(code: mi.Float) -> mi.Float:
     # Below -0.055 the power is NaN. It is not selected there, and Dr.Jit takes a derivative of 0 times NaN for 0.
     bent = dr.power((code + 0.055) / 1.055, 2.4)
     return dr.select(code <= 0.04045, code / 12.92, bent)
+
+
+def slope_of_codes(code: mi.Float) -> mi.Float:
+    """The derivative of :func:`radiance_of_codes`."""
+    return dr.select(code <= 0.04045, 1 / 12.92, (2.4 / 1.055) * dr.power((code + 0.055) / 1.055, 1.4))
+
+
+def frame_of(to_world: np.ndarray) -> np.ndarray:
+    """(3, 3) map of world directions to a field's own frame: the inverse of the polar factor of its placement (Higham 1986)."""
+    left, _, right = np.linalg.svd(to_world[:3, :3])
+    return (left @ right).T
+
+
+def turn_by(frame: np.ndarray, d: mi.Vector3f) -> mi.Vector3f:
+    """Directions in another frame."""
+    rows = [[dr.opaque(mi.Float, float(v)) for v in row] for row in frame]
+    return mi.Vector3f(*(dr.fma(r[0], d.x, dr.fma(r[1], d.y, r[2] * d.z)) for r in rows))
 
 
 def _affine(row: list[mi.Float], v: mi.Vector3f, rest: mi.Float) -> mi.Float:

@@ -186,16 +186,23 @@ class TransferVolume(VoxelVolume):
 
 
 class GaussianVolume(mi.Volume):
-    """``<volume type="mivol_gaussians">``: Gaussians that rays are traced through, as a medium's ``sigma_t``.
+    """``<volume type="mivol_gaussians">``: Gaussians that rays are traced through: as a medium's ``emission`` they show their
+    colours, as its ``sigma_t`` they are lit.
 
     Parameters:
         filename: Gaussians (.ply, .spz, .splat, .ksplat), or
         means, log_scales, quaternions, opacity_logits: tensors (N, 3), (N, 3), (N, 4) and (N,), as files have them: scales are
             exp(log_scales), opacities logistic(opacity_logits), quaternions (w, x, y, z) of any length.
+        harmonics: tensor (N, K, 3) beside them, K = 1, 4, 9 or 16 harmonics of the colours. Default none.
         to_world: places them in the world; opacities stay as they are. Default: where the file has them.
+        space: what the colours are: srgb (code values, as fits of photographs have them), which are shown as the radiance that
+            they stand for, or linear (radiance). Default srgb.
+        blur: standard deviation by which each is widened, in the lengths of the file. A fit looks as its splats do with that of
+            their low-pass filter: sqrt(0.3) times the distance, over the focal length of its photographs in pixels. Default 0.
 
-    A ray through a Gaussian loses the share of light that a splat of its opacity would hide there. The tensors are its
-    parameters; colours of a file are not read. The shape that the medium fills should hold them all, and cuts what it does not.
+    A ray through a Gaussian loses the share of light that a splat of its opacity would hide there, and what is shown is
+    composited in the order in which a ray passes their peaks. The tensors are its parameters. The shape that the medium fills
+    should hold them all, and cuts what it does not.
     """
 
     def __init__(self, props: mi.Properties) -> None:

@@ -120,7 +120,13 @@ def choose_emission(needs: Needs, segment: str) -> list[Choice]:
         return []
     if segment == "free_flight":
         return [Choice("emission", "at one point of each flight", f"{', '.join(names)} emit, and light scatters")]
-    return [Choice("emission", "two points a cell, swept from the far end", f"{', '.join(names)} emit")]
+    shown = [m.name for m in needs.media if m.emits and m.gaussians]
+    swept = [name for name in names if name not in shown]
+    choices = [Choice("emission", "two points a cell, swept from the far end", f"{', '.join(swept)} emit")] if swept else []
+    if shown:
+        order = "composited in the order of their peaks along each ray"
+        choices.append(Choice("Gaussians", order, f"{', '.join(shown)} shows their colours"))
+    return choices
 
 
 def choose_lighting(needs: Needs, settings: Settings, segment: str) -> list[Choice]:

@@ -43,14 +43,23 @@ class Coefficients:
             MivolError: both pairs, half of a pair, a negative number, or a radiance field for another thing than the emission.
         """
         given = [n for pair in PAIRS for n in pair if n in props]
-        if is_radiance_field(props.get("emission", 0.0)):
+        if is_radiance_field(props.get("emission", 0.0)) or _is_made_of_gaussians(props, "emission"):
             return cls._of_field(props, given)
         fields = [n for n in (*given, "emission_density") if is_radiance_field(props.get(n, 0.0))]
         if fields:
             raise MivolError(f"mivol_medium was given a mivol_sh as {fields[0]}; give it as the emission, and nothing else.")
-        elsewhere = [n for n in (*given, "emission", "emission_density") if n != "sigma_t" and _is_made_of_gaussians(props, n)]
+        elsewhere = [n for n in (*given, "emission_density") if n != "sigma_t" and _is_made_of_gaussians(props, n)]
         if elsewhere:
-            raise MivolError(f"mivol_medium was given a mivol_gaussians as {elsewhere[0]}; give it as sigma_t, with an albedo.")
+            raise MivolError(
+                f"mivol_medium was given a mivol_gaussians as {elsewhere[0]}; give it as sigma_t, with an albedo, to be lit, "
+                "or as the emission, and nothing else, to show its colours."
+            )
+        lights = [n for n in ("emission", "emission_density") if n in props]
+        if lights and _is_made_of_gaussians(props, "sigma_t"):
+            raise MivolError(
+                f"mivol_medium was given {' and '.join(lights)} beside a sigma_t of mivol_gaussians; give the Gaussians as the "
+                "emission, and nothing else, to show their own colours."
+            )
         shaded = [n for n in given if _is_shaded(props, n)]
         if shaded:
             raise MivolError(
@@ -70,13 +79,16 @@ class Coefficients:
     @classmethod
     def _of_field(cls, props: mi.Properties, given: list[str]) -> Coefficients:
         """A medium that is a radiance field, which has an extinction of its own."""
-        extra = [*given, *(n for n in ("scale", "emission_density") if n in props)]
+        extra, field = [*given, *(n for n in ("scale", "emission_density") if n in props)], props["emission"]
+        kind = "mivol_sh" if is_radiance_field(field) else "mivol_gaussians"
         if extra:
             raise MivolError(
-                f"mivol_medium was given {' and '.join(extra)} beside a mivol_sh, which brings its own extinction; take "
-                f"{'it' if len(extra) == 1 else 'them'} out."
+                f"mivol_medium was given {' and '.join(extra)} beside a {kind} as its emission, which brings its own "
+                f"extinction; take {'it' if len(extra) == 1 else 'them'} out."
             )
-        return cls({}, {"emission": props["emission"]})
+        if kind == "mivol_gaussians" and not field.mivol_extinction.has_colours:
+            raise MivolError("mivol_medium was given Gaussians without colours as its emission; give them harmonics.")
+        return cls({}, {"emission": field})
 
     @property
     def is_field(self) -> bool:

@@ -92,7 +92,8 @@ def _parts_of(medium: mi.Medium) -> list[mi.Object]:
     """The phase function of a medium, and its volumes but for those whose numbers transport reads where they stand."""
     known = traverse_medium(medium).properties
     volumes = {key.partition(".")[0]: node for key, (_, _, node, _) in known.items() if isinstance(node, mi.Volume)}
-    read = [n for n in volumes if n.startswith("sigma_") and f"{n}.table" not in known]
+    stands = [n for n, v in volumes.items() if n.startswith("sigma_") or hasattr(v, "mivol_extinction")]
+    read = [n for n in stands if f"{n}.table" not in known]
     return [medium.phase_function(), *(v for n, v in volumes.items() if n not in read)]
 
 

@@ -168,7 +168,6 @@ def refuse_gaussians(needs: Needs, aovs: tuple[str, ...]) -> None:
     moved = _moved_emitters(needs)
     reasons = [
         ("depth" in aovs, "aovs asks for depth", "ask for tau and alpha only"),
-        (any(m.emits for m in needs.media), "a medium of its scene emits light", "take the emission out"),
         (bool(moved), f"the derivative of {', '.join(moved)} was asked for", "take finite differences"),
     ]
     kind = f"is made of {medium.gaussians} Gaussians that rays are traced through"

@@ -7,9 +7,10 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mivol.transport.line_integrals.body_sweep import BodySweep, transmittance_of
-from mivol.transport.line_integrals.integrand import CellIntegral, LineIntegral
+from mivol.transport.line_integrals.body_sweep import BodySweep
+from mivol.transport.line_integrals.integrand import LineIntegral
 from mivol.transport.media.body import Body
+from mivol.transport.media.compositing import CellIntegral, transmittance_of
 from mivol.transport.media.ray_intervals import MediumInterval, RaySegment
 from mivol.transport.media.scene_media import SceneMedia
 from scenes import box_of, camera, centred, grid_volume, media_of

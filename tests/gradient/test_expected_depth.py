@@ -9,7 +9,7 @@ import pytest
 from aov_gradients import VALUE, mivol, vjp
 
 from mivol.transport.line_integrals import expected_depth
-from mivol.transport.line_integrals.integrand import CellIntegral
+from mivol.transport.media.compositing import CellIntegral
 from scenes import box_of, medium, pencil
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")

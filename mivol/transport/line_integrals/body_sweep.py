@@ -17,27 +17,15 @@ from dataclasses import dataclass, replace
 import drjit as dr
 import mitsuba as mi
 
-from mivol.transport.line_integrals.integrand import CellIntegral, LineIntegral, RayPiece
+from mivol.transport.line_integrals.integrand import LineIntegral, RayPiece
+from mivol.transport.media.compositing import BodyIntegral, CellIntegral, ReverseState, pass_cell, put_in_front, zeros
 from mivol.transport.media.ray_intervals import MediumInterval
 from mivol.transport.media.summed_extinction import SummedExtinction
 from mivol.transport.traversal.grid_walk import Cell, walk
 from mivol.transport.traversal.interpolation import node_weights
 from mivol.transport.traversal.lattice import Lattice, Segment, clip
 
-__all__ = ["BodyIntegral", "BodySweep", "transmittance_of", "zeros"]
-
-
-@dataclass
-class BodyIntegral:
-    """The rows of one medium by itself.
-
-    Attributes:
-        tau: optical depth [1], in float64 since parts of it are subtracted again.
-        N: the sum, as seen from the near end.
-    """
-
-    tau: list[mi.Float64]
-    N: list[mi.Float]
+__all__ = ["BodySweep"]
 
 
 @dataclass
@@ -53,21 +41,6 @@ class _Layout:
     t1: mi.Float64
     lattice: Lattice | None
     segment: Segment | None
-
-
-@dataclass
-class _ReverseState:
-    """State of a reverse sweep.
-
-    Attributes:
-        N: of what has been swept.
-        ahead: optical depth between the camera and the last cell that was passed.
-        constant: derivatives with respect to the constants, so far.
-    """
-
-    N: list[mi.Float]
-    ahead: list[mi.Float64]
-    constant: list[mi.Float]
 
 
 class BodySweep:
@@ -102,15 +75,15 @@ class BodySweep:
         def add_constant(integral: BodyIntegral, a: mi.Float64, b: mi.Float64) -> BodyIntegral:
             site, sigma, integrals = self._constant(a, b)
             if not tangent:
-                return _put_in_front(integral, integrals, [], [])
+                return put_in_front(integral, integrals, [], [])
             changes = [[d] for d in self._rows(self.change.constant)]
-            return _put_in_front(integral, integrals, changes, self.integrand.jvp(site, sigma))
+            return put_in_front(integral, integrals, changes, self.integrand.jvp(site, sigma))
 
         def visit(integral: BodyIntegral, cell: Cell, on: mi.Bool) -> BodyIntegral:
             site, sigma, integrals = self._cell(cell, on)
             if not tangent:
-                return _put_in_front(integral, integrals, [], [])
-            return _put_in_front(integral, integrals, self._changes(cell), self.integrand.jvp(site, sigma))
+                return put_in_front(integral, integrals, [], [])
+            return put_in_front(integral, integrals, self._changes(cell), self.integrand.jvp(site, sigma))
 
         if self._has_constants and layout.lattice is not None:
             integral = add_constant(integral, layout.leave, layout.t1)
@@ -135,19 +108,19 @@ class BodySweep:
         Cost: a walk of the medium, and one packed write of 8 a cell and channel.
         """
         integrand, layout, body = self.integrand, self.layout, self.body
-        sweep = _ReverseState(zeros(mi.Float, integrand.rows), [mi.Float64(a) for a in ahead], zeros(mi.Float, integrand.rows))
+        sweep = ReverseState(zeros(mi.Float, integrand.rows), [mi.Float64(a) for a in ahead], zeros(mi.Float, integrand.rows))
         grids = [p for p in body.view.parts if p.lattice is not None]
         outside: list[tuple] = []
 
-        def add_constant(sweep: _ReverseState, a: mi.Float64, b: mi.Float64) -> _ReverseState:
+        def add_constant(sweep: ReverseState, a: mi.Float64, b: mi.Float64) -> ReverseState:
             site, sigma, integrals = self._constant(a, b)
-            sweep, _, weights = _pass_cell(sweep, integrals, weight, behind)
+            sweep, _, weights = pass_cell(sweep, integrals, weight, behind)
             outside.append((site, sigma, weights))
             return sweep
 
-        def visit(sweep: _ReverseState, cell: Cell, on: mi.Bool) -> _ReverseState:
+        def visit(sweep: ReverseState, cell: Cell, on: mi.Bool) -> ReverseState:
             site, sigma, integrals = self._cell(cell, on)
-            sweep, slopes, weights = _pass_cell(sweep, integrals, weight, behind)
+            sweep, slopes, weights = pass_cell(sweep, integrals, weight, behind)
             integrand.vjp(site, sigma, weights)
             points = self._points(cell)
             corners = [node_weights(p, cell, layout.lattice.res) for p in points]
@@ -229,57 +202,3 @@ def _lay_out(interval: MediumInterval, ray: mi.Ray3f) -> _Layout:
     hit = segment.length > 0
     leave = dr.select(hit, -segment.start, end)
     return _Layout(start, dr.select(hit, -segment.end, end), leave, end, lattice, segment)
-
-
-def _put_in_front(
-    integral: BodyIntegral, integrals: list[CellIntegral], changes: list[list[mi.Float]], jvp: list[mi.Float]
-) -> BodyIntegral:
-    """Composite a cell over what has been swept: it adds its own N and dims the rest.
-
-    Args:
-        integral: what has been swept.
-        integrals: rows of the cell.
-        changes: [row][point] tangents of its extinction; empty where no tangents are followed.
-        jvp: tangent of N of each row from the integrand's other parameters.
-    """
-    tau = [t + mi.Float64(s.tau) for t, s in zip(integral.tau, integrals, strict=False)]
-    N = [dr.fma(s.T, n, s.N) for n, s in zip(integral.N, integrals, strict=False)]
-    for c, (s, change) in enumerate(zip(integrals, changes, strict=False)):
-        dtau, row = _dot(s.dtau, change), len(integrals) + c
-        tau.append(integral.tau[row] + mi.Float64(dtau))
-        N.append(_dot(s.dN, change) + jvp[c] + s.T * (integral.N[row] - dtau * integral.N[c]))
-    return BodyIntegral(tau, N)
-
-
-def _pass_cell(
-    sweep: _ReverseState, integrals: list[CellIntegral], weight: list[mi.Float], behind: list[mi.Float]
-) -> tuple[_ReverseState, list[list[mi.Float]], list[mi.Float]]:
-    """Pass a cell in a reverse sweep.
-
-    Returns:
-        The state, the derivatives with respect to the cell's extinction [row][point], and those with respect to its own N.
-    """
-    ahead = [a - mi.Float64(s.tau) for a, s in zip(sweep.ahead, integrals, strict=True)]
-    weights = [w * transmittance_of(a) for w, a in zip(weight, ahead, strict=True)]
-    slopes = []
-    for s, P, n, b in zip(integrals, weights, sweep.N, behind, strict=True):
-        # More extinction in this cell dims what was swept of this medium, and what lies behind the medium.
-        dims = dr.fma(P * s.T, n, b)
-        slopes.append([dr.fma(P, dN, -dims * dtau) for dN, dtau in zip(s.dN, s.dtau, strict=True)])
-    N = [dr.fma(s.T, n, s.N) for n, s in zip(sweep.N, integrals, strict=True)]
-    constant = [sum(g, total) for total, g in zip(sweep.constant, slopes, strict=True)]
-    return _ReverseState(N, ahead, constant), slopes, weights
-
-
-def transmittance_of(tau: mi.Float64) -> mi.Float:
-    """exp(-tau) of an optical depth [1] in float64, which rounding may have left a little below 0."""
-    return dr.exp(-mi.Float(dr.maximum(tau, 0)))
-
-
-def zeros(kind: type, rows: int) -> list:
-    """A number of zeros of a type, one for each row."""
-    return [kind(0) for _ in range(rows)]
-
-
-def _dot(a: list[mi.Float], b: list[mi.Float]) -> mi.Float:
-    return sum((x * y for x, y in zip(a, b, strict=True)), mi.Float(0))

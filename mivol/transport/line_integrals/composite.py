@@ -2,8 +2,9 @@ r"""Emission-absorption compositing of all media along a ray, with the tangent a
 
 .. math:: N = \sum_i T_1 \cdots T_{i-1} N_i
 
-Each medium is integrated by itself (:mod:`mivol.transport.line_integrals.body_sweep`). Media are disjoint, so the middles of
-their intervals put them in their order along the ray, and the optical depth of those in front dims each of them.
+Each medium is integrated by itself: :mod:`mivol.transport.line_integrals.body_sweep`, or one of Gaussians by
+:mod:`mivol.transport.media.gaussian_sweep`. Media are disjoint, so the middles of their intervals put them in their order along
+the ray, and the optical depth of those in front dims each of them.
 
 Conventions. Media in boxes are integrated once and kept in a list; intervals that are found by tracing come in the order of the
 ray, in a loop, and only their sums are kept. Rows are channels or colours; where tangents are asked for, their rows follow.
@@ -19,8 +20,10 @@ import drjit as dr
 import mitsuba as mi
 
 from mivol.numerics import largest_of, one_minus_exp
-from mivol.transport.line_integrals.body_sweep import BodyIntegral, BodySweep, transmittance_of, zeros
+from mivol.transport.line_integrals.body_sweep import BodySweep
 from mivol.transport.line_integrals.integrand import LineIntegral, check_media
+from mivol.transport.media.compositing import BodyIntegral, transmittance_of, zeros
+from mivol.transport.media.gaussian_sweep import GaussianSweep
 from mivol.transport.media.ray_intervals import MediumInterval, find_boxed_intervals, revisit_media
 
 __all__ = ["Composite", "composite_ray", "vjp_composite"]
@@ -105,13 +108,13 @@ def composite_ray(line: LineIntegral, end: list[mi.Float], tangent: bool = False
     boxes = []
     for interval in find_boxed_intervals(media, ray_segment.ray, ray_segment.length, line.active):
         middle = interval.middle() if len(media.bodies) > 1 else mi.Float64(0)
-        own = BodySweep(line, interval, tangent).integrate(skip)
+        own = sweep_of(line, interval, tangent).integrate(skip)
         boxes.append(_Boxed(interval, middle, own, zeros(mi.Float64, rows), [], zeros(mi.Float, rows)))
 
     def visit_traced(t: _Traced, interval: MediumInterval) -> _Traced:
         if interval.body.box is not None:
             return t
-        own, middle = BodySweep(line, interval, tangent).integrate(skip), interval.middle()
+        own, middle = sweep_of(line, interval, tangent).integrate(skip), interval.middle()
         seen = _dim(_add(t.tau, _tau_in_front(boxes, middle, rows)), own.N, integrand.rows)
         opaque = [one_minus_exp(mi.Float(x)) for x in own.tau[: integrand.rows]]
         means = [dr.select(a > 0, n / dr.select(a > 0, a, 1), 0) for n, a in zip(own.N, opaque, strict=False)]
@@ -133,6 +136,13 @@ def composite_ray(line: LineIntegral, end: list[mi.Float], tangent: bool = False
     if media.traced:
         traced = revisit_media(media, ray_segment, visit_traced, traced, line.active)
     return _order(boxes, traced, end, integrand.rows, rows)
+
+
+def sweep_of(line: LineIntegral, interval: MediumInterval, tangent: bool = False) -> BodySweep | GaussianSweep:
+    """The sweep over one medium."""
+    if interval.body.view.gaussians is None:
+        return BodySweep(line, interval, tangent)
+    return GaussianSweep(interval, line.integrand.rows, tangent)
 
 
 def _order(boxes: list[_Boxed], traced: _Traced, end: list[mi.Float], channels: int, rows: int) -> Composite:
@@ -170,12 +180,12 @@ def vjp_composite(line: LineIntegral, composite: Composite, weight: list[mi.Floa
     for box in composite.boxes:
         ahead = _add(box.front, box.own.tau)
         behind = [dr.fma(w, b, r) for w, b, r in zip(weight, box.behind, rest, strict=True)]
-        BodySweep(line, box.interval).vjp(weight, ahead, behind)
+        sweep_of(line, box.interval).vjp(weight, ahead, behind)
 
     def visit(passed: BodyIntegral, interval: MediumInterval) -> BodyIntegral:
         if interval.body.box is not None:
             return passed
-        sweep, middle = BodySweep(line, interval), interval.middle()
+        sweep, middle = sweep_of(line, interval), interval.middle()
         own = sweep.integrate(False)
         front = _add(passed.tau, _tau_in_front(composite.boxes, middle, integrand.rows))
         ahead, N = _add(front, own.tau), _add(passed.N, _dim(front, own.N, integrand.rows))

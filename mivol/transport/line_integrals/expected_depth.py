@@ -31,7 +31,8 @@ import mitsuba as mi
 
 from mivol.numerics import exp_moments, one_minus_exp
 from mivol.transport.line_integrals.composite import composite_ray, vjp_composite
-from mivol.transport.line_integrals.integrand import CellIntegral, LineIntegral, RayPiece
+from mivol.transport.line_integrals.integrand import LineIntegral, RayPiece
+from mivol.transport.media.compositing import CellIntegral
 from mivol.transport.media.ray_intervals import RaySegment, SegmentEnd
 from mivol.transport.media.scene_media import SceneMedia
 

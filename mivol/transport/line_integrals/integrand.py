@@ -19,28 +19,12 @@ import mitsuba as mi
 
 from mivol.errors import MivolError
 from mivol.transport.media.body import Body
+from mivol.transport.media.compositing import CellIntegral
 from mivol.transport.media.ray_intervals import RaySegment
 from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.media.summed_extinction import share_cells
 
-__all__ = ["CellIntegral", "Integrand", "LineIntegral", "RayPiece", "check_media"]
-
-
-@dataclass
-class CellIntegral:
-    """One row of a cell, as seen from its near end.
-
-    Attributes:
-        tau, T: optical depth and transmittance [1].
-        N: what the cell adds.
-        dtau, dN: derivatives of ``tau`` and ``N`` with respect to the extinction at each point of the integrand.
-    """
-
-    tau: mi.Float
-    T: mi.Float
-    N: mi.Float
-    dtau: list[mi.Float]
-    dN: list[mi.Float]
+__all__ = ["Integrand", "LineIntegral", "RayPiece", "check_media"]
 
 
 @dataclass

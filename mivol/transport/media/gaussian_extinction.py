@@ -9,6 +9,7 @@ from typing import Any, ClassVar
 import drjit as dr
 import mitsuba as mi
 
+from mivol.fields.gaussian_colour import blocks_of
 from mivol.fields.gaussian_line import ROW, SCALE, Line, Slopes, change_of, read_row
 from mivol.fields.gaussians import GaussianField
 from mivol.numerics import greater, lesser
@@ -16,7 +17,7 @@ from mivol.transport.media.extinction import RayInterval
 from mivol.transport.traversal.grid_walk import Cell, walk
 from mivol.transport.traversal.lattice import Lattice, Segment, clip
 
-__all__ = ["GaussianExtinction", "Passage"]
+__all__ = ["GaussianExtinction", "Passage", "add_block"]
 
 
 @dataclass
@@ -43,11 +44,15 @@ class GaussianExtinction:
         name: ``sigma_t``, ``sigma_a`` or ``sigma_s``.
         field: the Gaussians.
         scale: of the medium, without derivatives.
+        shows: whether the medium emits their colours. Tangents and gradients then hold the rows of the harmonics behind those
+            of the extinction, in one array.
+        colours: the rows of the harmonics, without derivatives; None where they are not shown.
     """
 
     name: str
     field: GaussianField
     scale: mi.Float
+    shows: bool = False
     exact_line: ClassVar[bool] = True
     is_constant: ClassVar[bool] = False
     lattice: ClassVar[None] = None
@@ -55,12 +60,22 @@ class GaussianExtinction:
 
     def __post_init__(self) -> None:
         self.cells = Lattice(dr.zeros(mi.TensorXf, (*self.field.lists.res, 1)), self.field.to_world)
+        self.colours = None
+        if self.shows:
+            with dr.suspend_grad():
+                self.colours = dr.detach(self.field.colour_rows())
+
+    @property
+    def blocks(self) -> int:
+        """Blocks of ``ROW`` numbers that the harmonics of one Gaussian take."""
+        return blocks_of(self.field.degree) if self.shows else 0
 
     def scaled(self, scale: mi.Float) -> mi.Float:
-        return self.field.rows(scale)
+        rows = self.field.rows(scale)
+        return dr.concat([rows, self.field.colour_rows()]) if self.shows else rows
 
     def start_gradient(self) -> mi.Float:
-        return dr.zeros(mi.Float, ROW * self.field.count)
+        return dr.zeros(mi.Float, ROW * self.field.count * (1 + self.blocks))
 
     def deliver(self, scale: mi.Float, gradient: mi.Float) -> mi.Float:
         dr.eval(gradient)
@@ -76,7 +91,7 @@ class GaussianExtinction:
 
     def jvp(self, tangent: mi.Float, interval: RayInterval) -> list[mi.Float]:
         def add(tau: mi.Float, line: Line, index: mi.UInt32, ends: tuple[mi.Float, mi.Float]) -> mi.Float:
-            return tau + self._push(line, line.share_slopes(*ends), line.depth * line.share(*ends), tangent, index)
+            return tau + self.push(line, line.share_slopes(*ends), line.depth * line.share(*ends), tangent, index)
 
         passage = self.enter(interval)
         return [self.each_along(passage, dr.zeros(mi.Float, dr.width(passage.d)), add)]
@@ -84,7 +99,7 @@ class GaussianExtinction:
     def vjp(self, gradient: mi.Float, weight: list[mi.Float], interval: RayInterval) -> None:
         def add(state: tuple, line: Line, index: mi.UInt32, ends: tuple[mi.Float, mi.Float]) -> tuple:
             own = line.depth * line.share(*ends)
-            self._pull(gradient, line, line.share_slopes(*ends), (own, weight[0]), index, mi.Bool(True))
+            self.pull(gradient, line, line.share_slopes(*ends), (own, weight[0]), index, mi.Bool(True))
             return state
 
         self.each_along(self.enter(interval), (), add)
@@ -94,7 +109,7 @@ class GaussianExtinction:
 
     def jvp_at(self, tangent: mi.Float, ray: mi.Ray3f, t: mi.Float, active: mi.Bool) -> list[mi.Float]:
         def add(total: mi.Float, line: Line, index: mi.UInt32) -> mi.Float:
-            own = self._push(line, line.density_slopes, line.density, tangent, index)
+            own = self.push(line, line.density_slopes, line.density, tangent, index)
             return dr.select(line.holds_origin, total + own, total)
 
         there = mi.Ray3f(ray(t), ray.d)
@@ -102,7 +117,7 @@ class GaussianExtinction:
 
     def vjp_at(self, gradient: mi.Float, weight: list[mi.Float], ray: mi.Ray3f, t: mi.Float, active: mi.Bool) -> None:
         def add(state: tuple, line: Line, index: mi.UInt32) -> tuple:
-            self._pull(gradient, line, line.density_slopes, (line.density, weight[0]), index, line.holds_origin)
+            self.pull(gradient, line, line.density_slopes, (line.density, weight[0]), index, line.holds_origin)
             return state
 
         self.field.each_at(mi.Ray3f(ray(t), ray.d), active, (), add)
@@ -150,12 +165,12 @@ class GaussianExtinction:
 
         return walk(self.cells, passage.segment, visit, state, (), passage.active, until)
 
-    def _push(self, line: Line, slopes: Slopes, value: mi.Float, tangent: mi.Float, index: mi.UInt32) -> mi.Float:
+    def push(self, line: Line, slopes: Slopes, value: mi.Float, tangent: mi.Float, index: mi.UInt32) -> mi.Float:
         """The tangent of the scale times a value that has these derivatives."""
         change = read_row(tangent, index)
         return self.scale * change_of(line, slopes, change) + value * change[SCALE]
 
-    def _pull(
+    def pull(
         self,
         gradient: mi.Float,
         line: Line,
@@ -167,5 +182,10 @@ class GaussianExtinction:
         """Add to the gradient of a row: ``value`` is a number with these derivatives, and d loss / d (scale times it)."""
         own, weight = value
         entries = [self.scale * weight * slope for slope in slopes.by_row(line)]
-        packet = mi.ArrayXf([*entries, weight * own, *(mi.Float(0) for _ in range(ROW - len(entries) - 1))])
-        dr.scatter_add(gradient, packet, index, on, mode=dr.ReduceMode.Expand)
+        add_block(gradient, [*entries, weight * own], index, on)
+
+
+def add_block(gradient: mi.Float, entries: list[mi.Float], index: mi.UInt32, on: mi.Bool) -> None:
+    """Add numbers, at most ``ROW``, to a block of a gradient."""
+    packet = mi.ArrayXf([*entries, *(mi.Float(0) for _ in range(ROW - len(entries)))])
+    dr.scatter_add(gradient, packet, index, on, mode=dr.ReduceMode.Expand)

@@ -15,6 +15,7 @@ import mitsuba as mi
 
 from mivol.transport.media.box import Box
 from mivol.transport.media.extinction import Extinction
+from mivol.transport.media.gaussian_extinction import GaussianExtinction
 from mivol.transport.traversal.lattice import Lattice
 
 __all__ = ["MediumView"]
@@ -66,7 +67,17 @@ class MediumView:
     @property
     def emits(self) -> bool:
         """Whether the medium is a source of light."""
-        return self.emission is not None or self.emission_density is not None
+        return self.emission is not None or self.emission_density is not None or self.shows_gaussians
+
+    @property
+    def gaussians(self) -> GaussianExtinction | None:
+        """The Gaussians that the medium is made of, which are then its only part; None elsewhere."""
+        return next((part for part in self.parts if isinstance(part, GaussianExtinction)), None)
+
+    @property
+    def shows_gaussians(self) -> bool:
+        """Whether the medium shows the colours of its Gaussians: light in an order along a ray, and no function of place."""
+        return self.gaussians is not None and self.gaussians.shows
 
     @property
     def channels(self) -> int:

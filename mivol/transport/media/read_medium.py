@@ -65,6 +65,8 @@ def view_medium(medium: mi.Medium, boundary: Box | None = None, places: dict | N
     emission_arrays = [v for k, v in params if k.startswith("emission") and k.endswith((".data", ".value.value"))]
     if not parts:
         parts, albedo, emission_arrays = [_part_of_field(emission)], mi.Float(0), []
+        if isinstance(parts[0], GaussianExtinction):
+            emission = None  # their light is in their order along a ray: no function of place has it
     light = [f for f in (emission_density, emission, albedo) if emission is not None or emission_density is not None]
     emission_lattice = _emission_lattice(emission_density, light, boundary, places)
     stock_boxes = {v.ptr: Box(_place(v, boundary, places)) for v in light if _repeats_border(v)}
@@ -115,8 +117,10 @@ def _field(params: mi.SceneParameters, name: str) -> mi.Volume | mi.Float | mi.C
     return None if key is None else params.properties[key][2]
 
 
-def _part_of_field(volume: mi.Volume) -> ActivatedGridExtinction:
-    """The extinction of a medium that is a radiance field: the activation of the density of ``mivol_sh``."""
+def _part_of_field(volume: mi.Volume) -> ActivatedGridExtinction | GaussianExtinction:
+    """The extinction of a medium that is a radiance field: Gaussians, or the activation of the density of ``mivol_sh``."""
+    if hasattr(volume, "mivol_extinction"):
+        return _field_part("emission", volume.mivol_extinction, mi.Float(1), shows=True)
     lattice = Lattice(volume.mivol_density, volume.mivol_to_world)
     return ActivatedGridExtinction("sigma_t", lattice, volume.mivol_field.act)
 
@@ -182,7 +186,9 @@ def traverse_medium(medium: mi.Medium) -> mi.SceneParameters:
     return params
 
 
-def _field_part(name: str, field: Field | GaussianField, scale: mi.Float) -> BoundedExtinction | GaussianExtinction:
+def _field_part(
+    name: str, field: Field | GaussianField, scale: mi.Float, shows: bool = False
+) -> BoundedExtinction | GaussianExtinction:
     """The part of an extinction that a field of a shell of ours is.
 
     Raises:
@@ -198,7 +204,7 @@ def _field_part(name: str, field: Field | GaussianField, scale: mi.Float) -> Bou
         what = "whose cells cannot be listed" if has_lists else "whose majorant cannot be read"
         raise MivolError(f"{name} is a {type(field).__name__}, {what} while dr.freeze records: render without it.")
     if has_lists:
-        return GaussianExtinction(name, field, dr.detach(scale))
+        return GaussianExtinction("sigma_t" if shows else name, field, dr.detach(scale), shows)
     majorant = max(field.bound())
     if not 0 <= majorant < np.inf:
         raise MivolError(f"the majorant of {name}, a {type(field).__name__}, is {majorant:.4g}; a finite one is expected.")

@@ -1,0 +1,69 @@
+r"""Colours of Gaussians as rays see them: rows of harmonics, the light of one along a direction, and its derivative.
+
+.. math:: c(\omega) = L\Big(\max\big(0,\; \tfrac12 + \sum_b Y_b(\omega)\, k_b\big)\Big)
+
+with L the light of a code value where colours are sRGB codes, as in published files, and the number itself where they are
+radiance (``linear``).
+
+Conventions. The direction is that in which the ray travels, in the frame of the cloud: the rotation (and mirror image) of its
+placement is taken off. Splatting takes the direction from the camera to the mean; that of the ray needs no camera, so it
+holds behind glass and in mirrors too. Below a sum of -1/2 a channel is black, with a derivative of 0, as in
+:mod:`mivol.splatting.projection`. A row of harmonics is [basis][rgb], filled up to whole blocks of ``ROW`` numbers, so that a
+block moves as one packet.
+
+Sources: Kerbl et al. 2023 (the model); Moenne-Loccoz et al. 2024 (the direction of the ray).
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from mivol.fields.gaussian_line import ROW, read_row
+from mivol.fields.spherical import basis_size, radiance_of_codes, slope_of_codes
+
+__all__ = ["blocks_of", "colour_along", "colour_slopes", "read_harmonics", "rows_of_harmonics", "seen_channels", "sums_along"]
+
+
+def blocks_of(degree: int) -> int:
+    """Blocks of ``ROW`` numbers that the harmonics of one Gaussian take."""
+    return -(-3 * basis_size(degree) // ROW)
+
+
+def rows_of_harmonics(harmonics: mi.TensorXf, degree: int) -> mi.Float:
+    """The harmonics (N, K, 3) as rows of whole blocks, with their derivatives."""
+    used, width = 3 * basis_size(degree), ROW * blocks_of(degree)
+    if used == width:
+        return harmonics.array
+    index = dr.arange(mi.UInt32, harmonics.shape[0] * width)
+    number, column = index // width, index % width
+    return dr.gather(mi.Float, harmonics.array, number * used + column, column < used)
+
+
+def read_harmonics(rows: mi.Float, first: mi.UInt32, degree: int) -> list[mi.Float]:
+    """The harmonics of one Gaussian, whose blocks begin with number ``first``."""
+    return [value for block in range(blocks_of(degree)) for value in read_row(rows, first + block)]
+
+
+def sums_along(row: list[mi.Float], basis: list[mi.Float]) -> list[mi.Float]:
+    """sum_b Y_b k_b of each channel."""
+    return [sum((y * row[3 * b + c] for b, y in enumerate(basis)), mi.Float(0)) for c in range(3)]
+
+
+def colour_along(row: list[mi.Float], basis: list[mi.Float], space: str) -> list[mi.Float]:
+    """The radiance of red, green and blue that a Gaussian shows."""
+    codes = [dr.maximum(total + 0.5, 0) for total in sums_along(row, basis)]
+    return codes if space == "linear" else [radiance_of_codes(code) for code in codes]
+
+
+def colour_slopes(row: list[mi.Float], basis: list[mi.Float], space: str) -> list[mi.Float]:
+    """Derivatives of :func:`colour_along` by the sums over the harmonics."""
+    codes = [total + 0.5 for total in sums_along(row, basis)]
+    return [dr.select(code > 0, 1 if space == "linear" else slope_of_codes(code), 0) for code in codes]
+
+
+def seen_channels(rows: int) -> list[list[float]]:
+    """Weights of red, green and blue in each of so many rows of light: three, or one of the luminance."""
+    if rows == 3:
+        return [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
+    return [[float(mi.luminance(mi.ScalarColor3f(*(float(a == c) for a in range(3))))) for c in range(3)]]
