@@ -22,7 +22,7 @@ import mitsuba as mi
 from mivol.fields.gaussian_line import ROW, read_row
 from mivol.fields.spherical import basis_size, radiance_of_codes, slope_of_codes
 
-__all__ = ["blocks_of", "colour_along", "colour_slopes", "read_harmonics", "rows_of_harmonics", "seen_channels", "sums_along"]
+__all__ = ["blocks_of", "colour_along", "colour_slopes", "read_harmonics", "rows_of_harmonics", "sums_along"]
 
 
 def blocks_of(degree: int) -> int:
@@ -60,10 +60,3 @@ def colour_slopes(row: list[mi.Float], basis: list[mi.Float], space: str) -> lis
     """Derivatives of :func:`colour_along` by the sums over the harmonics."""
     codes = [total + 0.5 for total in sums_along(row, basis)]
     return [dr.select(code > 0, 1 if space == "linear" else slope_of_codes(code), 0) for code in codes]
-
-
-def seen_channels(rows: int) -> list[list[float]]:
-    """Weights of red, green and blue in each of so many rows of light: three, or one of the luminance."""
-    if rows == 3:
-        return [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
-    return [[float(mi.luminance(mi.ScalarColor3f(*(float(a == c) for a in range(3))))) for c in range(3)]]

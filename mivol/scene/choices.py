@@ -115,17 +115,16 @@ def _why_free_flights(needs: Needs, settings: Settings) -> str:
 
 def choose_emission(needs: Needs, segment: str) -> list[Choice]:
     """How emitted light is summed."""
-    names = [m.name for m in needs.media if m.emits]
-    if not names:
-        return []
-    if segment == "free_flight":
-        return [Choice("emission", "at one point of each flight", f"{', '.join(names)} emit, and light scatters")]
+    choices = []
     shown = [m.name for m in needs.media if m.emits and m.gaussians]
-    swept = [name for name in names if name not in shown]
-    choices = [Choice("emission", "two points a cell, swept from the far end", f"{', '.join(swept)} emit")] if swept else []
     if shown:
-        order = "composited in the order of their peaks along each ray"
-        choices.append(Choice("Gaussians", order, f"{', '.join(shown)} shows their colours"))
+        where = "flight that gets to them" if segment == "free_flight" else "ray"
+        choices.append(Choice("Gaussians", f"in the order of their peaks along each {where}", f"{', '.join(shown)}: colours"))
+    names = ", ".join(m.name for m in needs.media if m.emits and not m.gaussians)
+    if names and segment == "free_flight":
+        choices.append(Choice("emission", "at one point of each flight", f"{names} emit, and light scatters"))
+    elif names:
+        choices.append(Choice("emission", "two points a cell, swept from the far end", f"{names} emit"))
     return choices
 
 
@@ -267,6 +266,8 @@ def _why_unread(needs: Needs) -> str:
     """Why light of media cannot be drawn."""
     if any(m.unread for m in needs.media):
         return "where media emit cannot be read while dr.freeze records"
+    if any(m.gaussians for m in needs.media):
+        return "a medium is made of Gaussians, which are in no table of light"
     return "a medium that emits fills no shape of its own, or shapes are instances"
 
 

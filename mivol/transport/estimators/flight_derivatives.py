@@ -28,6 +28,7 @@ from functools import cached_property
 import drjit as dr
 import mitsuba as mi
 
+from mivol.transport.estimators.gaussian_light import GaussianLight
 from mivol.transport.estimators.segment import Collision, FlightPoint, PathSegment
 from mivol.transport.media.body import Body
 from mivol.transport.media.channels import by_channel, spectrum, tangent_of
@@ -57,7 +58,8 @@ class FlownSegment:
         collision: where it ends in a medium.
         weight: of each channel at its end.
         level: the level b [radiance]; None for 0.
-        emission: where emission was looked at; None where no medium emits.
+        emission: where emission was looked at; None where no medium emits by its place.
+        shown: the light of Gaussians.
         active: lanes that fly.
         dL: d loss / d emission, once it is known.
     """
@@ -69,6 +71,7 @@ class FlownSegment:
     weight: mi.Spectrum
     level: mi.Spectrum | None
     emission: FlightPoint | None
+    shown: GaussianLight
     active: mi.Bool
     dL: mi.Spectrum | None = None
 
@@ -82,26 +85,27 @@ class FlownSegment:
     @property
     def emitted(self) -> mi.Spectrum:
         """The light that media emit along the flight, as the camera sees it."""
-        total = mi.Spectrum(0)
+        total = self.shown.value()
         if self.emission is None:
             return total
         ray, point = self.segment.ray, self.emission.point
         for body, on in self.media.bodies_at(point.body, point.on):
-            if body.view.emits:
+            if _emits_by_place(body):
                 light = self.emission.gain * dr.detach(eval_emission(body, ray, point.t, self.media.channels, on))
-                total = dr.select(on, light, total)
+                total += dr.select(on, light, 0)
         return total
 
     # -- Emission --------------------------------------------------------------------------------------------------------
 
     def vjp_light(self, dL: mi.Spectrum) -> None:
         """Derivatives of the emission, and of the media in front of the point where it was looked at."""
+        self.shown.vjp(dL)
         if self.emission is None:
             return
         media, ray, found = self.media, self.segment.ray, self.emission
         value = mi.Spectrum(0)
         for body, on in media.bodies_at(found.point.body, found.point.on):
-            if not body.view.emits:
+            if not _emits_by_place(body):
                 continue
             with dr.resume_grad():
                 emitted = eval_emission(body, ray, found.point.t, media.channels, on)
@@ -113,13 +117,13 @@ class FlownSegment:
         vjp_optical_depth(media, self._to_emission, -dL * found.gain * value, found.point.on)
 
     def jvp_light(self) -> mi.Spectrum:
-        total = -self._level * self._jvp_extinction
+        total = self.shown.jvp() - self._level * self._jvp_extinction
         if self.emission is None:
             return total
         media, ray, found = self.media, self.segment.ray, self.emission
         value, change = mi.Spectrum(0), mi.Spectrum(0)
         for body, on in media.bodies_at(found.point.body, found.point.on):
-            if not body.view.emits:
+            if not _emits_by_place(body):
                 continue
             with dr.resume_grad():
                 emitted = eval_emission(body, ray, found.point.t, media.channels, on)
@@ -307,6 +311,11 @@ def _weigh_collision(media: SceneMedia, body: Body, ray: mi.Ray3f, t: mi.Float64
 def _kappa(media: SceneMedia, body: Body) -> mi.Float:
     """The extinction that stands for vacuum [1/length]: an optical depth of ``PROBE_TAU`` across the medium."""
     return PROBE_TAU / (media.size if body.edge is None else body.edge)
+
+
+def _emits_by_place(body: Body) -> bool:
+    """Whether a medium emits light that is a function of the place."""
+    return body.view.emits and not body.view.shows_gaussians
 
 
 def _over_albedo(albedo: mi.Spectrum) -> mi.Spectrum:

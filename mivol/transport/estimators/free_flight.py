@@ -11,7 +11,7 @@ weighed by the mean of the densities of all channels (the balance heuristic). In
 of the throughputs as it is, so they stay bounded however long a path is.
 
 Emission is looked at in one point of each flight, drawn evenly over its length t: the mean of t j over all flights is
-:math:`\int T j\,dt`, where there is no extinction too.
+:math:`\int T j\,dt`, where there is no extinction too. Light that Gaussians show is summed (:mod:`.gaussian_light`).
 
 References: Chandrasekhar 1960 (the equation of transfer); Woodcock et al. 1965, Sutton et al. 1999 (flights); Wilkie et al.
 2014, Miller et al. 2019 (channels); Spanier & Gelbard 1969 (the track-length estimator).
@@ -20,6 +20,7 @@ References: Chandrasekhar 1960 (the equation of transfer); Woodcock et al. 1965,
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import drjit as dr
 import mitsuba as mi
@@ -29,6 +30,7 @@ from mivol.transport.estimators.delta_tracking import collide_in_blocks, collide
 from mivol.transport.estimators.exact_flight import collide_exactly
 from mivol.transport.estimators.flight_derivatives import FlownSegment
 from mivol.transport.estimators.gaussian_flight import collide_in_gaussians
+from mivol.transport.estimators.gaussian_light import GaussianLight
 from mivol.transport.estimators.segment import (
     PICTURE,
     Collision,
@@ -113,14 +115,16 @@ class FreeFlight:
             # Derivatives of depths that are not known are looked at in one point of the flight.
             _, (passed.u,) = draw_pcg32(flight.rng, 1)
         collision = self._collision(ray, flight, collides)
-        weight = self._weigh(segment, passed, collision, active)
-        emitting = [body for body in media.bodies if body.view.emits]
+        weight = self._weigh(segment, passed, active, collision)
+        emitting = [body for body in media.bodies if body.view.emits and not body.view.shows_gaussians]
         emission = self._point_of(segment, passed, emitting, at_emission, chance, active) if emitting else None
         if segment.emission_weight is not None:
             emission.gain *= segment.emission_weight
+        weigh = partial(self._weigh, segment, collision=None)
+        shown = GaussianLight(media, segment, (end.t, t), weigh, active)
         # What a side flight leaves to probes is found by those of the path itself, and so is the light of the level.
         level = None if segment.is_aside else self.level
-        shared = FlownSegment(media, segment, passed, collision, weight, level, emission, active)
+        shared = FlownSegment(media, segment, passed, collision, weight, level, emission, shown, active)
         light = SegmentLight(shared, shared.emitted, is_replayed=True)
         probe = self._point_of(segment, passed, media.bodies, at_probe, chance, active) if purpose != PICTURE else None
         return SegmentEstimate(end, weight, light, SegmentTransmittance(shared), collision, probe)
@@ -143,14 +147,14 @@ class FreeFlight:
     def _extinction(self, body: Body, ray: mi.Ray3f, t: mi.Float64, on: mi.Bool, name: str = "sigma_") -> mi.Spectrum:
         return spectrum(body.extinction_at(ray, dr.select(on, t, 0), self.media.channels, on, name))
 
-    def _weigh(self, segment: PathSegment, passed: RaySegment, collision: Collision | None, active: mi.Bool) -> mi.Spectrum:
+    def _weigh(self, segment: PathSegment, passed: RaySegment, active: mi.Bool, collision: Collision | None) -> mi.Spectrum:
         """The value of each channel's flight over the mean density of all of them, weighed by their throughputs.
 
         Args:
             segment: the throughputs.
             passed: the flight.
-            collision: how it ends; None for its probability to get so far.
             active: lanes that fly.
+            collision: how it ends; None for its probability to get so far.
         """
         if self.media.channels == 1:
             return mi.Spectrum(1)
@@ -172,7 +176,7 @@ class FreeFlight:
         """Draw a point evenly from what a flight has passed of some media."""
         point = draw_even_point(self.media, passed, among, u, active)
         front = RaySegment.upto(segment.ray, segment.medium, dr.select(point.on, point.t, 0))
-        gain = segment.beta * self._weigh(segment, front, None, point.on) * point.length
+        gain = segment.beta * self._weigh(segment, front, point.on, None) * point.length
         return FlightPoint(point, gain, chance)
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-__all__ = ["as_rows", "by_channel", "colours", "for_part", "spectrum", "tangent_of"]
+__all__ = ["LUMINANCE", "as_rows", "by_channel", "colours", "for_part", "spectrum", "tangent_of"]
 
 
 LUMINANCE = (0.212671, 0.715160, 0.072169)

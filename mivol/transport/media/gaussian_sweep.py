@@ -23,15 +23,19 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from mivol.fields.gaussian_colour import colour_along, colour_slopes, read_harmonics, seen_channels, sums_along
+from mivol.fields.gaussian_colour import colour_along, colour_slopes, read_harmonics, sums_along
 from mivol.fields.gaussian_line import ROW, Line
 from mivol.numerics import one_minus_exp
+from mivol.transport.media.channels import LUMINANCE
 from mivol.transport.media.compositing import BodyIntegral, CellIntegral, ReverseState, pass_cell, put_in_front, zeros
 from mivol.transport.media.gaussian_extinction import GaussianExtinction, add_block
 from mivol.transport.media.gaussian_order import visit_from_the_far_end
 from mivol.transport.media.ray_intervals import MediumInterval
 
 __all__ = ["GaussianSweep"]
+
+RGB = [(1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)]
+"""Weights of red, green and blue in rows of colours."""
 
 
 @dataclass
@@ -79,7 +83,7 @@ class GaussianSweep:
         self.body, self.interval, self.rows = body, interval, rows
         self.scale = dr.detach(body.view.scale)
         self.change = body.tangents[0] if tangent else None
-        self.channels = seen_channels(self.rows)
+        self.channels = RGB if self.rows == 3 else [LUMINANCE]
         self.basis = self.part.field.harmonics_of(interval.ray.d) if self.part.shows else []
 
     def integrate(self, skip: bool) -> BodyIntegral:
