@@ -367,8 +367,12 @@ class Photographs(Section):
     held_out: Annotated[int, of("view", "every so many of the training views is compared, not fitted; 0: none", ge=0)] = 8
     box: Annotated[
         str | tuple[tuple[float, float, float], tuple[float, float, float]],
-        of("1", "where matter may be: cameras, silhouettes (of alpha), middle (of nested boxes), or two corners [length]"),
-    ] = "cameras"
+        of(
+            "1",
+            "where matter may be: silhouettes (of alpha), cameras (what they look at), middle (of nested boxes), found "
+            "(silhouettes where all photographs have alpha, else cameras), or two corners [length]",
+        ),
+    ] = "found"
     judged: Annotated[str, of("1", "views to report at the end: held_out, val or test", min_length=1)] = "held_out"
     space: Annotated[
         Literal["srgb", "linear"] | None,

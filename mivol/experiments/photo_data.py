@@ -89,13 +89,24 @@ def boxed(chosen: PhotoFit, photos: Photos) -> Photos:
     return BOXES[wanted](photos) if isinstance(wanted, str) else photos
 
 
+def _found(photos: Photos) -> Photos:
+    """About what alpha shows, where all photographs have alpha and an image plane; else what the cameras look at."""
+    has_silhouettes = all(view.alpha is not None and not view.camera.distortion.is_wide for view in photos.views)
+    return _about_silhouettes(photos) if has_silhouettes else photos
+
+
 def _about_silhouettes(photos: Photos) -> Photos:
     box = silhouette_box(photos)
     near_far = near_far_of([view.camera for view in photos.views], box)
     return replace(photos, survey=replace(photos.survey, box=box, box_from="about what alpha shows", near_far=near_far))
 
 
-BOXES = {"cameras": lambda photos: photos, "silhouettes": _about_silhouettes, "middle": lambda photos: photos}
+BOXES = {
+    "found": _found,
+    "cameras": lambda photos: photos,
+    "silhouettes": _about_silhouettes,
+    "middle": lambda photos: photos,
+}
 """What is made of the box that was found with the photographs, by the word for it."""
 
 SEARCHED = {"middle": "middle"}

@@ -48,7 +48,8 @@ def silhouette_box(photos: Photos) -> np.ndarray:
         cells = cells[seen >= SHARE * len(photos.views)]
         cells = _kept(photos.views, cells, float(np.linalg.norm(step)) / 2)
         if len(cells) == 0:
-            raise refusal("silhouette_box", "no place that all views show", "alpha of one thing", "check the cameras")
+            found = "no place that all views show"
+            raise refusal("silhouette_box", found, "alpha of one thing", "check the cameras, or give the box")
         box = np.array([cells.min(axis=0) - step / 2, cells.max(axis=0) + step / 2])
     return box
 

@@ -60,7 +60,7 @@ DEFAULTS = {
         "background": "",
         "behind": (0.0, 0.0, 0.0),
         "held_out": 8,
-        "box": "cameras",
+        "box": "found",
         "judged": "held_out",
     },
     "config.Rendered": {"spp": 1024, "standard_error": 0.0, "seed": 1, "held_out": ()},

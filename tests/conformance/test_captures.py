@@ -87,7 +87,7 @@ def test_a_preset_brings_what_captures_need_and_the_file_overrides_it() -> None:
     own = config.from_dict(raw | {"photos": {"path": "p", "largest": 99}, "show": {"views": 2}})
     assert (own.photos.largest, own.photos.box, own.show.views) == (99, "middle", 2)
     other = config.from_dict(raw | {"field": {"preset": "cpu"}})
-    assert (other.photos.largest, other.photos.box, other.show.views) == (None, "cameras", 4)
+    assert (other.photos.largest, other.photos.box, other.show.views) == (None, "found", 4)
 
 
 def test_a_folder_of_photographs_is_an_experiment(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:

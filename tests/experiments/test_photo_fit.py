@@ -338,3 +338,17 @@ def test_a_box_of_silhouettes_needs_alpha(photographs: Path, tmp_path: Path) -> 
     photos, _ = photo_data.read_photos(chosen, tmp_path)
     with pytest.raises(MivolError, match="alpha"):
         photo_data.boxed(chosen, photos)
+
+
+def test_the_box_is_about_silhouettes_where_all_photographs_have_alpha(photographs: Path, tmp_path: Path) -> None:
+    """Without a word the box is the tight one where it can be, and that of the cameras where one view has no alpha."""
+    chosen = config.load(toml(tmp_path, photographs), ["photos.box=found"])
+    photos, _ = photo_data.read_photos(chosen, tmp_path)
+    assert photo_data.boxed(chosen, photos) is photos
+    cut = [replace(view, alpha=(view.image < 0.99).any(axis=2).astype(np.float32)) for view in photos.views]
+    tight = photo_data.boxed(chosen, replace(photos, views=tuple(cut)))
+    # The ball's radius is 0.6 and no camera is nearer than 2.9 to it; two cells of the second search are 0.1.
+    assert (np.abs(tight.box) > 0.55).all() and (np.abs(tight.box) < 0.75).all() and (np.abs(photos.box) > 0.9).all()
+    assert tight.survey.box_from == "about what alpha shows"
+    mixed = replace(photos, views=(photos.views[0], *cut[1:]))
+    assert photo_data.boxed(chosen, mixed) is mixed
