@@ -363,13 +363,15 @@ def report(arguments: argparse.Namespace) -> None:
 
 
 def export(arguments: argparse.Namespace) -> None:
-    """Write a radiance field as a mesh, as volumes, or for another program."""
+    """Write a radiance field as a mesh, as volumes, as a scene with the sky beside its file, or for another program."""
     from mivol.experiments.back_end import set_variant
+    from mivol.experiments.view_field import sky_beside
     from mivol.fields.export import export_field
     from mivol.fields.spherical_files import load_field
 
     set_variant(arguments.mode)
-    print("\n".join(str(path) for path in export_field(arguments.output, load_field(arguments.field), arguments.level)))
+    field, sky = load_field(arguments.field), sky_beside(arguments.field)
+    print("\n".join(str(path) for path in export_field(arguments.output, field, arguments.level, sky)))
 
 
 def convert(arguments: argparse.Namespace) -> None:

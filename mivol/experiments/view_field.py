@@ -9,9 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from mivol.errors import MivolError
-from mivol.fields.sky import Sky
+from mivol.fields.sky import Sky, read_sky
 from mivol.fields.spherical_files import load_field
-from mivol.files import read_exr
 from mivol.optim.field_view import render_view
 from mivol.photos import Camera, facing, intrinsics
 from mivol.photos.picture import decode_srgb
@@ -34,9 +33,19 @@ def view_field(path: Path, look_at: Sequence[float], up: Sequence[float], fov: f
         MivolError: as :func:`mivol.fields.spherical_files.load_field`, or a camera that cannot be.
     """
     camera = camera_at(look_at, up, fov, size)
-    field, beside = load_field(path), path.with_name(SKY)
-    seen = render_view(field, camera, read_sky(beside) if beside.is_file() else np.zeros(3)).image
+    field, sky = load_field(path), sky_beside(path)
+    seen = render_view(field, camera, np.zeros(3) if sky is None else sky).image
     return np.maximum(seen, 0) if field.space == "linear" else decode_srgb(seen)
+
+
+def sky_beside(path: Path) -> Sky | None:
+    """What a fit learned of what is behind its field, from the file beside the field's; None where there is none.
+
+    Raises:
+        MivolError: as :func:`mivol.fields.sky.read_sky`.
+    """
+    beside = path.with_name(SKY)
+    return read_sky(beside) if beside.is_file() else None
 
 
 def camera_at(look_at: Sequence[float], up: Sequence[float], fov: float, size: tuple[int, int]) -> Camera:
@@ -52,16 +61,3 @@ def camera_at(look_at: Sequence[float], up: Sequence[float], fov: float, size: t
     focal = width / (2 * math.tan(math.radians(fov) / 2))
     like = Camera(intrinsics(focal, focal, width / 2, height / 2), size, np.eye(4))
     return facing(like, np.array(look_at[:3]), np.array(look_at[3:]), np.array(up), "--look-at")
-
-
-def read_sky(path: Path) -> Sky:
-    """A sky that a fit wrote.
-
-    Raises:
-        MivolError: an image that is no sky.
-    """
-    channels, _ = read_exr(path)
-    image = np.stack([channels[name] for name in "RGB"], axis=-1) if {"R", "G", "B"} <= channels.keys() else np.zeros((1, 1, 3))
-    if image.shape[0] < 2 or image.shape[1] != 2 * image.shape[0]:
-        raise MivolError(f"{path} is no sky of R, G and B, twice as wide as high: take it away, or fit the field again.")
-    return Sky.of_image(image)

@@ -9,14 +9,16 @@ middle of their share of u, round about; rows at v = j / (rows - 1), from pole t
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from mivol.errors import MivolError
+from mivol.files import read_exr
 
-__all__ = ["Sky"]
+__all__ = ["Sky", "read_sky"]
 
 TEXEL = 4
 """Numbers a texel: rgb, and one that fills a packet."""
@@ -110,3 +112,16 @@ class Sky:
             packet = mi.ArrayXf([by.x * share, by.y * share, by.z * share, mi.Float(0)])
             dr.scatter_add(total, packet, texel)
         return total
+
+
+def read_sky(path: Path) -> Sky:
+    """A sky that a fit wrote.
+
+    Raises:
+        MivolError: an image that is no sky.
+    """
+    channels, _ = read_exr(path)
+    image = np.stack([channels[name] for name in "RGB"], axis=-1) if {"R", "G", "B"} <= channels.keys() else np.zeros((1, 1, 3))
+    if image.shape[0] < 2 or image.shape[1] != 2 * image.shape[0]:
+        raise MivolError(f"{path} is no sky of R, G and B, twice as wide as high: take it away, or fit the field again.")
+    return Sky.of_image(image)

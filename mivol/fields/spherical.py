@@ -172,6 +172,11 @@ class SphericalGrid:
         return self.levels * math.prod(self.res)
 
     @property
+    def shape(self) -> tuple[int, ...]:
+        """Of values at all nodes: (Z, Y, X), or (levels, Z, Y, X) where the field is nested."""
+        return self.res if self.levels == 1 else (self.levels, *self.res)
+
+    @property
     def bytes(self) -> int:
         """Memory that its values take."""
         return 4 * (self.rows * (1 + self.width) + (0 if self.nodes is None else self.rows - 1))

@@ -37,7 +37,7 @@ def save_svox2(path: Path, field: SphericalGrid) -> None:
             coefficients beyond 65504, disk full.
     """
     if field.levels > 1:
-        raise refusal(path, f"a field of {field.levels} nested levels", "one grid, as svox2 has", "write .npz")
+        raise refusal(path, f"a field of {field.levels} nested levels", "one grid, as svox2 has", "write .npz or .xml")
     box = np.diagonal(field.to_world)[:3]
     shown = (field.activation in ("none", "relu"), field.offset == 0.5, field.clamp)
     if np.count_nonzero(field.to_world[:3, :3] - np.diag(box)) or box.min() <= 0:

@@ -1,7 +1,7 @@
 """A radiance field as tensors that a scene's parameters are made of, and back.
 
-Conventions. ``density`` is (Z, Y, X, 1) and ``sh`` (Z, Y, X, basis, 3) for a dense field, (nodes, 1) and (nodes, basis, 3) for
-a sparse one. Derivatives pass through; what is read from properties has none.
+Conventions. ``density`` is (Z, Y, X, 1) and ``sh`` (Z, Y, X, basis, 3) for a dense field, with the levels first where it is
+nested; (nodes, 1) and (nodes, basis, 3) for a sparse one. Derivatives pass through; what is read from properties has none.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from mivol.errors import MivolError
 from mivol.fields.spherical import SphericalGrid, degree_of, row_width
 from mivol.fields.spherical_files import load_field
 
-__all__ = ["dense_density", "field_from_props", "with_tensors"]
+__all__ = ["dense_densities", "field_from_props", "with_tensors"]
 
 
 SHOWN = ("activation", "offset", "clamp", "space")
@@ -43,14 +43,12 @@ def field_from_props(props: mi.Properties) -> tuple[SphericalGrid, mi.TensorXf, 
         field = SphericalGrid.from_dense(np.array(dr.detach(density)), np.array(dr.detach(sh)), _place(props), **how)
         return field, density, sh
     field = load_field(str(mi.file_resolver().resolve(props["filename"])))
-    if field.levels > 1:
-        raise MivolError(f"{props['filename']} is nested; mivol_sh shows one grid: export one of its levels.")
     how = {n: props.get(n, getattr(field, n)) for n in SHOWN}
-    field = SphericalGrid.from_rows(field.res, field.to_world, *field.values(), field.nodes, **how)
+    field = SphericalGrid.from_rows(field.res, field.to_world, *field.values(), field.nodes, levels=field.levels, **how)
     if "to_world" in props:
         field = replace(field, to_world=_place(props) @ field.to_world)
     values, coefficients = field.values()
-    shape = field.res if field.nodes is None else values.shape
+    shape = field.shape if field.nodes is None else values.shape
     sh = np.ascontiguousarray(coefficients.reshape(*shape, *coefficients.shape[1:]))
     return field, mi.TensorXf(values.reshape(*shape, 1)), mi.TensorXf(sh)
 
@@ -65,7 +63,7 @@ def with_tensors(field: SphericalGrid, density: mi.TensorXf, sh: mi.TensorXf) ->
     Raises:
         MivolError: shapes that are not those of the field.
     """
-    nodes = field.res if field.nodes is None else (dr.width(field.nodes),)
+    nodes = field.shape if field.nodes is None else (dr.width(field.nodes),)
     if tuple(density.shape) != (*nodes, 1) or tuple(sh.shape[:-2]) != nodes or sh.shape[-1] != 3:
         raise MivolError(
             f"density {tuple(density.shape)} and sh {tuple(sh.shape)} were given; {(*nodes, 1)} and {(*nodes, 'basis', 3)} are "
@@ -85,7 +83,15 @@ def with_tensors(field: SphericalGrid, density: mi.TensorXf, sh: mi.TensorXf) ->
     return replace(field, degree=degree_of(basis), density=flat, harmonics=harmonics)
 
 
-def dense_density(field: SphericalGrid) -> mi.TensorXf:
-    """The raw density at every node, (Z, Y, X, 1), with the vacuum where nothing is stored."""
+def dense_densities(field: SphericalGrid) -> list[mi.TensorXf]:
+    """The raw density at every node of each level, (Z, Y, X, 1), with the vacuum where nothing is stored.
+
+    They are those of each level in lengths of the world: 2^-l of what level l stores.
+    """
     values = field.density if field.nodes is None else dr.gather(mi.Float, field.density, field.node_rows())
-    return mi.TensorXf(values, (*field.res, 1))
+    if field.levels > 1:
+        node = dr.arange(mi.UInt32, math.prod(field.res))
+        parts = [dr.gather(mi.Float, values, node + k * dr.width(node)) * 2.0**-k for k in range(field.levels)]
+    else:
+        parts = [values]
+    return [mi.TensorXf(part, (*field.res, 1)) for part in parts]

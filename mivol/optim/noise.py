@@ -29,7 +29,6 @@ from mivol.optim.losses import Loss
 from mivol.scene.readings import is_scattering
 from mivol.scene.session import Session
 from mivol.scene.survey import survey_scene
-from mivol.transport.media.read_medium import view_medium
 
 NOTABLE = 0.05
 """Share of a loss that may be noise before a fit says so."""
@@ -119,7 +118,7 @@ def noise_check(integrator: mi.Integrator, scene: mi.Scene) -> Callable[[], bool
         return lambda: False
 
     def scatters() -> bool:
-        views = ((view_medium(b.medium, b.box, survey.places), b.name) for b in survey.boundaries)
+        views = ((b.view(survey.places), b.name) for b in survey.boundaries)
         return any(is_scattering(view, survey, name) for view, name in views)
 
     return scatters

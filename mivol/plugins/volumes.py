@@ -10,7 +10,7 @@ import numpy as np
 from mivol.errors import MivolError
 from mivol.fields.gaussians import GaussianField
 from mivol.fields.spherical import SphericalGrid
-from mivol.fields.spherical_tensors import dense_density, field_from_props, with_tensors
+from mivol.fields.spherical_tensors import dense_densities, field_from_props, with_tensors
 from mivol.fields.transfer import Transfer
 from mivol.fields.voxels import Voxels
 
@@ -84,19 +84,20 @@ class SphericalVolume(mi.Volume):
         space: what the colours are: linear (radiance) or srgb (code values, as fits of photographs have them), which are shown
             as the radiance that they stand for. Default linear, or the file's.
 
-    ``density`` and ``sh`` are its parameters; a sparse field has them as (nodes, 1) and (nodes, basis, 3).
+    ``density`` and ``sh`` are its parameters; a sparse field has them as (nodes, 1) and (nodes, basis, 3). A nested field fills
+    the box of its outermost level; the medium's shape must be a cube.
     """
 
     def __init__(self, props: mi.Properties) -> None:
         own, self.density, self.sh = field_from_props(props)
         self.mivol_field: SphericalGrid = own
         self.refresh()
-        props["to_world"] = mi.ScalarTransform4f(own.to_world)
+        props["to_world"] = mi.ScalarTransform4f(self.mivol_to_world)
         super().__init__(props)
 
     def refresh(self) -> None:
         self.mivol_field = with_tensors(self.mivol_field, self.density, self.sh)
-        self.dense = dense_density(self.mivol_field)
+        self.dense = dense_densities(self.mivol_field)
         self.seen = self.state()
 
     def state(self) -> tuple[int, ...]:
@@ -104,14 +105,16 @@ class SphericalVolume(mi.Volume):
         return tuple(k for t in (self.density, self.sh) for k in (t.array.index, t.array.index_ad))
 
     @property
-    def mivol_density(self) -> mi.TensorXf:
+    def mivol_densities(self) -> list[mi.TensorXf]:
+        """The density of each level."""
         if self.seen != self.state():  # derivatives may be asked for without an update
             self.refresh()
         return self.dense
 
     @property
     def mivol_to_world(self) -> np.ndarray:
-        return self.mivol_field.to_world
+        """Where all of it lies: the box of the outermost level."""
+        return self.mivol_field.level_to_world(self.mivol_field.levels - 1)
 
     def eval(self, it: mi.Interaction3f, active: mi.Bool = True) -> mi.Spectrum:
         colour = self.mivol_field.eval_radiance(it.p, -_towards(it), active)
@@ -142,7 +145,8 @@ class SphericalVolume(mi.Volume):
     def to_string(self) -> str:
         f = self.mivol_field
         z, y, x = f.res
-        return f"mivol_sh[{x}x{y}x{z}, degree {f.degree}, {f.rows} rows, {f.activation}]"
+        levels = f"{f.levels} levels of " if f.levels > 1 else ""
+        return f"mivol_sh[{levels}{x}x{y}x{z}, degree {f.degree}, {f.rows} rows, {f.activation}]"
 
 
 class TransferVolume(VoxelVolume):

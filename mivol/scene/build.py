@@ -15,7 +15,6 @@ from mivol.transport.estimators.emission_sampling import EmissionSampling
 from mivol.transport.estimators.emission_table import EmissionTable
 from mivol.transport.estimators.transmittance_grid import build_transmittance_grid
 from mivol.transport.estimators.visibility_cache import VisibilityCache, build_visibility_cache
-from mivol.transport.media.body import Body
 from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.path.estimators import SEGMENT_ESTIMATORS, Estimators, SegmentChoice
 from mivol.transport.path.settings import Settings
@@ -35,7 +34,7 @@ def build_media(scene: mi.Scene, needs: Needs, plan: Plan, survey: SceneSurvey) 
             flies = plan.segment == "free_flight" and part.channels == 1
             if (tracks or flies) and part.lattice is not None and part.activation is None and not mixes:
                 part.lattice.block_ranges = read_block_ranges(part, survey)
-        bodies.append(Body(view, boundary.box, tracks))
+        bodies.append(boundary.body(view, tracks))
     return needs.media_of(scene, bodies, survey.size)
 
 

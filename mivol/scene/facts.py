@@ -10,6 +10,7 @@ import mitsuba as mi
 from mivol.transport.media.body import Body
 from mivol.transport.media.box import Box
 from mivol.transport.media.medium_view import MediumView
+from mivol.transport.media.read_medium import view_medium
 from mivol.transport.media.scene_media import SceneMedia
 
 __all__ = ["Boundary", "MediaLight", "MediumFacts", "Needs"]
@@ -24,12 +25,28 @@ class Boundary:
         name: of the shape that it fills.
         shape: class of that shape; ``AROUND`` for a medium that fills none (around other shapes or the camera, in instances).
         box: the shape, where it is a box that no other boundary overlaps; None where it has to be traced.
+        level: of a nested radiance field, each level of which is a medium of its own.
+        hole: the box in which that level is not, for the level before is there; None of all other media.
     """
 
     medium: mi.Medium
     name: str
     shape: str
     box: Box | None
+    level: int = 0
+    hole: Box | None = None
+
+    def view(self, places: dict) -> MediumView:
+        """Its medium as a sum of fields; ``places`` as in :func:`mivol.transport.media.read_medium.view_medium`.
+
+        Raises:
+            MivolError: a medium that mivol does not render.
+        """
+        return view_medium(self.medium, self.box, places, self.level)
+
+    def body(self, view: MediumView, estimates_shadows: bool = False) -> Body:
+        """A view of its medium, where it is."""
+        return Body(view, self.box, estimates_shadows, self.hole)
 
 
 @dataclass(frozen=True)

@@ -50,7 +50,7 @@ def read_media_light(scene: mi.Scene, sensor: mi.Sensor, needs: Needs, survey: S
     Returns:
         None where the place of some medium that emits is not known: where it fills no shape, or shapes are instances.
     """
-    bodies = [Body(view, boundary.box) for boundary, view in zip(needs.boundaries, needs.views, strict=True)]
+    bodies = [boundary.body(view) for boundary, view in zip(needs.boundaries, needs.views, strict=True)]
     media = needs.media_of(scene, bodies, survey.size)
     boxes = find_emitting_boxes(scene, media, needs)
     if boxes is None:

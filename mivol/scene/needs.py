@@ -22,7 +22,7 @@ from mivol.scene.readings import Reading, check_light, check_numbers, is_scatter
 from mivol.scene.survey import AROUND, SceneSurvey, find_around, is_instance, survey_scene
 from mivol.transport.media.gaussian_extinction import GaussianExtinction
 from mivol.transport.media.medium_view import MediumView
-from mivol.transport.media.read_medium import kind_of, view_medium
+from mivol.transport.media.read_medium import kind_of
 
 __all__ = ["find_needs"]
 
@@ -47,7 +47,7 @@ def find_needs(
     recording = bool(dr.flag(dr.JitFlag.FreezingScope))
     start = [] if sensor.get_medium() is None else [sensor.get_medium()]
     boundaries = (*survey.boundaries, *find_around(start, survey.boundaries))
-    views = tuple(view_medium(b.medium, b.box, survey.places) for b in boundaries)
+    views = tuple(b.view(survey.places) for b in boundaries)
     params = mi.traverse(scene)
     asked = tuple(k for k, v in params if dr.grad_enabled(v))
     media = tuple(_facts(b, view, survey, recording) for b, view in zip(boundaries, views, strict=True))

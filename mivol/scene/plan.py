@@ -33,6 +33,7 @@ from mivol.scene.refusals import (
     refuse_draws,
     refuse_emission,
     refuse_gaussians,
+    refuse_nested,
     refuse_places,
     refuse_quadrature,
     refuse_scattering,
@@ -88,6 +89,7 @@ def make_plan(needs: Needs, settings: Settings, aovs: tuple[str, ...] = ()) -> P
     refuse_places(needs)
     refuse_bounded(needs, settings, aovs)
     refuse_gaussians(needs, aovs)
+    refuse_nested(needs)
     refuse_draws(needs, settings)
     segment = _segment(needs, settings)
     choices = [

@@ -21,6 +21,7 @@ __all__ = [
     "refuse_draws",
     "refuse_emission",
     "refuse_gaussians",
+    "refuse_nested",
     "refuse_places",
     "refuse_quadrature",
     "refuse_scattering",
@@ -172,6 +173,17 @@ def refuse_gaussians(needs: Needs, aovs: tuple[str, ...]) -> None:
     ]
     kind = f"is made of {medium.gaussians} Gaussians that rays are traced through"
     _refuse_medium(f"the medium in {medium.name} {kind}", reasons, "convert them to a grid (mivol convert)")
+
+
+def refuse_nested(needs: Needs) -> None:
+    """Refuse derivatives of the place of emitters where a field is nested: no terms of its levels' faces are known."""
+    moved = _moved_emitters(needs)
+    level = next((b.name for b in needs.boundaries if b.hole is not None), None)
+    if moved and level is not None:
+        raise MivolError(
+            f"the derivative of {', '.join(moved)} was asked for and {level} belongs to a nested field, at whose inner faces "
+            "no shadow ray is followed as it turns: take finite differences."
+        )
 
 
 def _refuse_medium(medium: str, reasons: list[tuple[bool, str, str]], other_way: str) -> None:

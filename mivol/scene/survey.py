@@ -12,7 +12,8 @@ from mivol.errors import MivolError
 from mivol.scene.facts import Boundary
 from mivol.scene.nesting import OrientedBox, box_around, extent, nesting_fault
 from mivol.transport.estimators.emitters import UNIFORM
-from mivol.transport.media.box import box_of_cube
+from mivol.transport.media.box import Box, box_of_cube
+from mivol.transport.media.read_medium import nested_field
 
 __all__ = ["AROUND", "SceneSurvey", "find_around", "is_instance", "survey_scene"]
 
@@ -96,7 +97,8 @@ def survey_scene(scene: mi.Scene) -> SceneSurvey:
     fault = None if dr.flag(dr.JitFlag.FreezingScope) else nesting_fault(scene, edges)
     if fault is not None:
         raise MivolError(fault)
-    boundaries += find_around([o for o in mi.traverse(scene).hierarchy if isinstance(o, mi.Medium)], boundaries)
+    around = find_around([o for o in mi.traverse(scene).hierarchy if isinstance(o, mi.Medium)], boundaries)
+    boundaries = [part for boundary in boundaries for part in _levels(boundary)] + around
     kinds = tuple(_emitter_kind(e) for e in scene.emitters())
     marks = tuple((s, _mark(s)) for s in shapes if s.is_medium_transition())
     return SceneSurvey(
@@ -177,4 +179,38 @@ def _boundary(shape: mi.Shape, name: str, boxes: dict[int, OrientedBox]) -> Boun
 def find_around(media: Iterable[mi.Medium], boundaries: Sequence[Boundary]) -> list[Boundary]:
     """The media that fill no shape of their own: a ray learns of them from the exterior of a boundary, or from the sensor."""
     held = {b.medium.ptr for b in boundaries}
-    return [Boundary(m, m.id() or "a medium without an id", AROUND, None) for m in media if m.ptr not in held]
+    found = [Boundary(m, m.id() or "a medium without an id", AROUND, None) for m in media if m.ptr not in held]
+    return [part for boundary in found for part in _levels(boundary)]
+
+
+def _levels(boundary: Boundary) -> list[Boundary]:
+    """A boundary for each level of a nested radiance field; any other one by itself.
+
+    A level fills its own box, as far as the boundary holds that, but for the box of the level before it.
+
+    Raises:
+        MivolError: a nested field in anything but a box.
+    """
+    field = nested_field(boundary.medium)
+    if field is None:
+        return [boundary]
+    if boundary.box is None:
+        raise MivolError(
+            f"the medium in {boundary.name} is a nested field, whose levels are boxes, and {boundary.shape} is none that rays "
+            "are cut to: give it a cube of its own with a null BSDF, which overlaps no other medium's shape."
+        )
+    boxes = [Box(field.level_to_world(level)) for level in range(field.levels)]
+    return [
+        replace(
+            boundary,
+            name=boundary.name if level == 0 else f"{boundary.name} (level {level})",
+            box=box if boundary.box.contains(box.to_world, FITS) else boundary.box,
+            level=level,
+            hole=None if level == 0 else boxes[level - 1],
+        )
+        for level, box in enumerate(boxes)
+    ]
+
+
+FITS = 1e-6
+"""How far a level may stand out of its boundary, in edges: the boundary's vertices are float32."""

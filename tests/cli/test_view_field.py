@@ -9,7 +9,8 @@ import pytest
 
 from mivol.cli import main
 from mivol.errors import MivolError
-from mivol.experiments.view_field import camera_at, read_sky
+from mivol.experiments.view_field import camera_at
+from mivol.fields.sky import read_sky
 from mivol.fields.spherical import SphericalGrid
 from mivol.fields.spherical_files import save_field
 from mivol.files import read_exr, write_exr

@@ -246,6 +246,7 @@ def test_the_verb(variant_rgb: None, tmp_path: Path, capsys: pytest.CaptureFixtu
     for suffix in EXPORTS:
         assert main(["export", str(tmp_path / "field.npz"), str(tmp_path / f"out{suffix}")]) == 0
     names = ("out.npz", "out.svox2.npz", "out.vol", "out-colour.vol", "out.nrrd", "out-colour.nrrd", "out.ply", "out.obj")
+    names += ("out.xml", "out-field.npz")
     assert capsys.readouterr().out.split() == [str(tmp_path / name) for name in names]
     assert main(["export", str(tmp_path / "field.npz"), str(tmp_path / "out.vdb")]) == 1
     assert "OpenVDB" in capsys.readouterr().err

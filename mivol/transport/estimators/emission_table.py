@@ -72,11 +72,8 @@ class EmittingBox:
         """Whether a point lies in the medium, as far as that is known without tracing: its boundary is a box."""
         if self.body.box is None:
             return dr.full(mi.Bool, True, dr.width(p))
-        inside = mi.Bool(True)
-        for row in self.body.rows:
-            local = dr.fma(row[0], mi.Float64(p.x), dr.fma(row[1], mi.Float64(p.y), dr.fma(row[2], mi.Float64(p.z), row[3])))
-            inside &= (local >= 0) & (local <= 1)
-        return inside
+        hole = mi.Bool(False) if self.body.hole is None else _lies_in(self.body.hole_rows, p)
+        return _lies_in(self.body.rows, p) & ~hole
 
     def place(self, cell: mi.Point3f) -> mi.Point3f:
         """A point of the world by its place among the cells."""
@@ -180,6 +177,15 @@ class EmissionTable:
 
             state = walk_box(box.rows, CELLS, ray, visit_cell, state, active)
         return state
+
+
+def _lies_in(rows: list[list[mi.Float64]], p: mi.Point3f) -> mi.Bool:
+    """Whether a point lies in the box that ``rows`` map to the unit cube."""
+    inside = mi.Bool(True)
+    for row in rows:
+        local = dr.fma(row[0], mi.Float64(p.x), dr.fma(row[1], mi.Float64(p.y), dr.fma(row[2], mi.Float64(p.z), row[3])))
+        inside &= (local >= 0) & (local <= 1)
+    return inside
 
 
 def _solid_angle(t0: mi.Float, t1: mi.Float) -> mi.Float:

@@ -37,15 +37,19 @@ class Body:
         exact_parts: the parts whose integral along a ray is known.
         flight_parts: the parts that free flights are drawn from in one walk: constants, and grids that share their cells.
         estimates_shadows: whether shadow rays through grids whose block ranges are known are estimated, and not exact.
+        hole: a box in which the medium is not: a level of a nested field has one. None without.
         cuts_grids: whether the boundary is smaller than what lies in it, so that intervals must be cut to it.
     """
 
-    def __init__(self, view: MediumView, box: Box | None, estimates_shadows: bool = False) -> None:
-        self.view, self.box, self.estimates_shadows = view, box, estimates_shadows
+    def __init__(
+        self, view: MediumView, box: Box | None, estimates_shadows: bool = False, hole: Box | None = None
+    ) -> None:
+        self.view, self.box, self.estimates_shadows, self.hole = view, box, estimates_shadows, hole
         self.cuts_grids = box is not None and (
-            view.emission_density is not None or not all(_fits(part, box) for part in view.parts)
+            hole is not None or view.emission_density is not None or not all(_fits(part, box) for part in view.parts)
         )
         self.rows = box.rows() if box is not None else None
+        self.hole_rows = hole.rows() if hole is not None else None
         self.edge = dr.opaque(mi.Float, box.edge) if box is not None else None
         self.exact_parts = [p for p in view.parts if p.exact_line]
         self.flight_parts = flight_parts(view.parts)

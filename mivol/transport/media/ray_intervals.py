@@ -35,6 +35,10 @@ __all__ = [
 ]
 
 
+UNIT = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
+"""Two corners of the cube that a boundary's rows map it to."""
+
+
 @dataclass
 class SegmentEnd:
     """Where a segment ends: at an opaque surface (``si`` valid), or at the distance asked for.
@@ -99,7 +103,7 @@ class MediumInterval(RayInterval):
         """The interval inside the boundary [length]; the end is not behind the start where it misses it."""
         t0, t1 = mi.Float64(self.t0), mi.Float64(self.t1)
         if self.body.box is not None and not self.body.cuts_grids:
-            _, _, t0, t1 = slab(self.body.rows, (0.0,) * 3, (1.0,) * 3, self.ray.o, self.ray.d, t0, t1)
+            _, _, t0, t1 = slab(self.body.rows, *UNIT, self.ray.o, self.ray.d, t0, t1)
         return t0, t1
 
 
@@ -153,14 +157,19 @@ def find_boxed_intervals(media: SceneMedia, ray: mi.Ray3f, t_end: mi.Float, acti
         active: lanes to cut.
 
     Returns:
-        One interval for each of ``media.boxed``, in their order.
+        One interval for each of ``media.boxed``, in their order; two for one with a hole: before it and behind it.
     """
     found = []
     for body in media.boxed:
         t0, t1 = mi.Float64(0), mi.Float64(t_end)
         if body.cuts_grids:
-            _, _, t0, t1 = slab(body.rows, (0.0,) * 3, (1.0,) * 3, ray.o, ray.d, t0, t1)
-        found.append(MediumInterval(ray, t0, t1, active & (t1 > t0), body))
+            _, _, t0, t1 = slab(body.rows, *UNIT, ray.o, ray.d, t0, t1)
+        ends = [(t0, t1)]
+        if body.hole is not None:
+            _, _, enter, leave = slab(body.hole_rows, *UNIT, ray.o, ray.d, t0, t1)
+            misses = leave <= enter
+            ends = [(t0, dr.select(misses, t1, enter)), (dr.select(misses, t1, leave), t1)]
+        found += [MediumInterval(ray, a, b, active & (b > a), body) for a, b in ends]
     return found
 
 

@@ -16,6 +16,7 @@ import numpy as np
 from mivol.errors import MivolError
 from mivol.fields.gaussians import GaussianField
 from mivol.fields.protocol import BOUNDED, Field
+from mivol.fields.spherical import SphericalGrid
 from mivol.transport.media.activated_grid_extinction import ActivatedGridExtinction
 from mivol.transport.media.bounded_extinction import BoundedExtinction
 from mivol.transport.media.box import Box
@@ -26,13 +27,13 @@ from mivol.transport.media.grid_extinction import GridExtinction
 from mivol.transport.media.medium_view import MediumView
 from mivol.transport.traversal.lattice import Lattice
 
-__all__ = ["children_of", "traverse_medium", "view_medium"]
+__all__ = ["children_of", "nested_field", "traverse_medium", "view_medium"]
 
 
 STOCK = ("HomogeneousMedium", "HeterogeneousMedium")
 
 
-def view_medium(medium: mi.Medium, boundary: Box | None = None, places: dict | None = None) -> MediumView:
+def view_medium(medium: mi.Medium, boundary: Box | None = None, places: dict | None = None, level: int = 0) -> MediumView:
     """View a medium as a sum of fields.
 
     Args:
@@ -41,6 +42,7 @@ def view_medium(medium: mi.Medium, boundary: Box | None = None, places: dict | N
         boundary: the box that bounds it, if it is one. Mitsuba prints the place of a stock grid to 6 digits only; a grid that
             fills its boundary to these digits is put exactly there.
         places: a cache of where grids lie, by volume and boundary, which is added to; None for none.
+        level: of a radiance field that is nested.
 
     Raises:
         MivolError: a medium or a volume of another kind.
@@ -64,7 +66,7 @@ def view_medium(medium: mi.Medium, boundary: Box | None = None, places: dict | N
     emission, emission_density = _field(params, "emission"), _field(params, "emission_density")
     emission_arrays = [v for k, v in params if k.startswith("emission") and k.endswith((".data", ".value.value"))]
     if not parts:
-        parts, albedo, emission_arrays = [_part_of_field(emission)], mi.Float(0), []
+        parts, albedo, emission_arrays = [_part_of_field(emission, level)], mi.Float(0), []
         if isinstance(parts[0], GaussianExtinction):
             emission = None  # their light is in their order along a ray: no function of place has it
     light = [f for f in (emission_density, emission, albedo) if emission is not None or emission_density is not None]
@@ -117,11 +119,11 @@ def _field(params: mi.SceneParameters, name: str) -> mi.Volume | mi.Float | mi.C
     return None if key is None else params.properties[key][2]
 
 
-def _part_of_field(volume: mi.Volume) -> ActivatedGridExtinction | GaussianExtinction:
-    """The extinction of a medium that is a radiance field: Gaussians, or the activation of the density of ``mivol_sh``."""
+def _part_of_field(volume: mi.Volume, level: int) -> ActivatedGridExtinction | GaussianExtinction:
+    """The extinction of a medium that is a radiance field: Gaussians, or the activation of a level of ``mivol_sh``."""
     if hasattr(volume, "mivol_extinction"):
         return _field_part("emission", volume.mivol_extinction, mi.Float(1), shows=True)
-    lattice = Lattice(volume.mivol_density, volume.mivol_to_world)
+    lattice = Lattice(volume.mivol_densities[level], volume.mivol_field.level_to_world(level))
     return ActivatedGridExtinction("sigma_t", lattice, volume.mivol_field.act)
 
 
@@ -170,6 +172,12 @@ def children_of(medium: mi.Medium) -> dict[str, mi.Object]:
 
     medium.traverse(Children())
     return found
+
+
+def nested_field(medium: mi.Medium) -> SphericalGrid | None:
+    """The radiance field that a medium is, where that has more than one level; None of all other media."""
+    field = getattr(children_of(medium).get("emission"), "mivol_field", None)
+    return field if field is not None and field.levels > 1 else None
 
 
 def traverse_medium(medium: mi.Medium) -> mi.SceneParameters:
