@@ -71,6 +71,9 @@ class Rendered(Section, tag_field="source", tag="render"):
     spp: Annotated[int, of("sample/pixel", "most samples per pixel and view", ge=1)] = 1024
     standard_error: Annotated[float, of("radiance", "stop earlier at this RMS error of the mean; 0: never", ge=0)] = 0.0
     seed: Annotated[int, of("1", "root of the references' random numbers", ge=0)] = 1
+    max_depth: Annotated[
+        Annotated[int, msgspec.Meta(ge=-1)] | None, of("1", "as Mitsuba's volpath; -1: unlimited; absent: that of the fit")
+    ] = None
     held_out: Annotated[tuple[int, ...], of("view", "views that are compared but not fitted")] = ()
 
 

@@ -124,8 +124,9 @@ def render_views(seen: References, task: Task, loaded: LoadedScene, sensors: Seq
     chosen, cache = task.chosen, task.folder / "references"
     cache.mkdir(exist_ok=True)
     wanted = chosen.reference
+    depth = chosen.fit.max_depth if wanted.max_depth is None else wanted.max_depth
     settings = {
-        "max_depth": chosen.fit.max_depth, "target_se": wanted.standard_error or None, "max_spp": wanted.spp,
+        "max_depth": depth, "target_se": wanted.standard_error or None, "max_spp": wanted.spp,
         "seed": wanted.seed, "progress": False,
     }  # fmt: skip
     for sensor in task.watcher.track(sensors, "references"):

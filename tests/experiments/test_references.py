@@ -68,20 +68,22 @@ def test_views_of_different_sizes(variant_rgb, folder: Path, capsys: pytest.Capt
 
 
 @pytest.mark.parametrize(("wanted", "target"), [(0.0, None), (0.25, 0.25)])
+@pytest.mark.parametrize(("own", "depth"), [(None, 7), (-1, -1), (0, 0)])
 def test_a_reference_is_rendered_as_the_file_says(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, wanted: float, target: float | None
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, wanted: float, target: float | None, own: int | None, depth: int
 ) -> None:
-    """Each view with the depth of the fit, up to the samples or to the error; an error of 0 is none that is aimed at."""
+    """Each view with its own depth or that of the fit, up to the samples or the error; an error of 0 is none that is aimed at."""
     asked, kept = [], []
     monkeypatch.setattr(references, "render_reference", lambda *how, **settings: asked.append((how, settings)) or made)
     monkeypatch.setattr(references, "standard_error", lambda found: "its error")
     made = SimpleNamespace(mean="its mean")
     chosen = SimpleNamespace(
-        fit=SimpleNamespace(max_depth=7), reference=SimpleNamespace(standard_error=wanted, spp=33, seed=5)
+        fit=SimpleNamespace(max_depth=7),
+        reference=SimpleNamespace(standard_error=wanted, spp=33, seed=5, max_depth=own),
     )
     task = SimpleNamespace(chosen=chosen, folder=tmp_path, watcher=SimpleNamespace(track=lambda items, what: iter(items)))
     references.render_views(SimpleNamespace(add=lambda *view: kept.append(view)), task, "scene", ["a", "b"])
-    settings = {"max_depth": 7, "target_se": target, "max_spp": 33, "seed": 5, "progress": False}
+    settings = {"max_depth": depth, "target_se": target, "max_spp": 33, "seed": 5, "progress": False}
     assert asked == [(("scene", tmp_path / "references"), {"sensor": view, **settings}) for view in "ab"]
     assert kept == [(view, "its mean", "its error") for view in "ab"]
     assert (tmp_path / "references").is_dir()
