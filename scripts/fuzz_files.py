@@ -29,12 +29,9 @@ sys.path.append(str(ROOT / "tests"))
 
 import mivol  # noqa: E402
 
-import h5py  # noqa: E402
 import mitsuba as mi  # noqa: E402
 import numpy as np  # noqa: E402
-from photo_sets import write_blender, write_colmap, write_transforms  # noqa: E402
-from PIL import Image  # noqa: E402
-from volume_files import les, mha, nifti, nrrd, numbered, pbrt, vol, vti, vtk  # noqa: E402
+from sound_files import FILES, SETS  # noqa: E402
 
 BATCH = 700
 """Files a child process reads."""
@@ -49,176 +46,6 @@ LONGEST = 1000
 """Characters of a sentence: of what it found, a refusal quotes no more than 300."""
 
 CHILD = {"capture_output": True, "text": True, "errors": "replace", "timeout": BATCH_SECONDS, "check": False}
-
-Read = Callable[[Path], object]
-
-
-# -- Sound files -----------------------------------------------------------------------------------------------------------
-
-
-def _bytes(data: bytes) -> Callable[[Path], None]:
-    return lambda path: path.write_bytes(data) and None
-
-
-def _projections(path: Path) -> None:
-    with h5py.File(path, "w") as file:
-        rng = np.random.default_rng(0)
-        for name, shape in (("data", (4, 3, 5)), ("data_white", (2, 3, 5)), ("data_dark", (2, 3, 5))):
-            file[f"exchange/{name}"] = rng.integers(1, 999, shape).astype(np.uint16)
-        file["exchange/theta"] = np.linspace(0, 180, 4, endpoint=False)
-
-
-def _hdf5(path: Path) -> None:
-    with h5py.File(path, "w") as file:
-        file["density"] = numbered()[..., 0]
-
-
-def _picture(path: Path) -> None:
-    Image.fromarray(np.random.default_rng(1).integers(0, 256, (8, 12, 4), np.uint8)).save(path)
-
-
-def _field(path: Path) -> None:
-    from mivol.fields.spherical import SphericalGrid
-
-    rng = np.random.default_rng(2)
-    keep = rng.random((3, 4, 5)) < 0.5
-    values = rng.random((3, 4, 5)), rng.normal(0, 1, (3, 4, 5, 4, 3))
-    mivol.save_field(path, SphericalGrid.from_dense(*values, np.eye(4), keep))
-
-
-def _svox2(path: Path) -> None:
-    from mivol.fields.export import export_field
-    from mivol.fields.spherical import SphericalGrid
-
-    rng = np.random.default_rng(3)
-    export_field(path, SphericalGrid.from_dense(rng.random((3, 4, 5)), rng.normal(0, 1, (3, 4, 5, 4, 3)), np.eye(4)))
-
-
-def _mesh(path: Path) -> None:
-    from mivol.files.mesh import Mesh, write_mesh
-
-    points, faces = np.eye(4, 3), np.array([[0, 1, 2], [0, 1, 3]])
-    write_mesh(path, Mesh(points, faces, colours=np.full((4, 3), 0.5)))
-
-
-def _checkpoint(path: Path) -> None:
-    rng = np.random.default_rng(4)
-    np.savez(path, density=rng.random((3, 4)), state=np.array(json.dumps({"iteration": 3})))
-
-
-def _read_field(path: Path) -> object:
-    return mivol.load_field(path)
-
-
-def _read_mesh(path: Path) -> object:
-    from mivol.files.mesh import read_ply
-
-    return read_ply(path)
-
-
-def _read_exr(path: Path) -> object:
-    from mivol.files import read_exr
-
-    return read_exr(path)
-
-
-def _read_projections(path: Path) -> object:
-    from mivol.files import read_projections
-
-    return read_projections(path)
-
-
-def _read_stack(path: Path) -> object:
-    from mivol.files import read_stack
-
-    return read_stack(path)
-
-
-def _read_archive(path: Path) -> object:
-    from mivol.files.archive import read_archive
-
-    return read_archive(path)
-
-
-def _read_columns(path: Path) -> object:
-    from mivol.files import read_columns
-
-    return read_columns(path, 3)
-
-
-def _read_picture(path: Path) -> object:
-    from mivol.photos.picture import read_picture
-
-    return read_picture(path, "srgb")
-
-
-def _read_experiment(path: Path) -> object:
-    from mivol import config
-
-    return config.load(path)
-
-
-def _of(values: np.ndarray) -> list[tuple]:
-    z, y, x, _ = values.shape
-    return [(i, j, k, float(values[k, j, i, 0]), 9.0) for k in range(z) for j in range(y) for i in range(x)]
-
-
-def _volume_writer(path: Path) -> None:
-    mivol.write_volume(path, numbered())
-
-
-def _exr(path: Path) -> None:
-    from mivol.files import write_exr
-
-    write_exr(path, {"": np.random.default_rng(5).random((6, 7, 3)).astype(np.float32)})
-
-
-FILES: dict[str, tuple[str, Callable[[Path], None], Read]] = {
-    "vol": (".vol", _bytes(vol(numbered())), mivol.read_volume),
-    "npy": (".npy", _volume_writer, mivol.read_volume),
-    "npz": (".npz", _volume_writer, mivol.read_volume),
-    "nrrd": (".nrrd", _bytes(nrrd(numbered())), mivol.read_volume),
-    "nrrd gzip": (".nrrd", _bytes(nrrd(numbered(), encoding="gzip")), mivol.read_volume),
-    "metaimage": (".mha", _bytes(mha(numbered())), mivol.read_volume),
-    "nifti": (".nii", _bytes(nifti(numbered())), mivol.read_volume),
-    "vti": (".vti", _bytes(vti(numbered())), mivol.read_volume),
-    "vtk": (".vtk", _bytes(vtk(numbered())), mivol.read_volume),
-    "vtk text": (".vtk", _bytes(vtk(numbered(), binary=False)), mivol.read_volume),
-    "pbrt": (".pbrt", _bytes(pbrt(numbered())), mivol.read_volume),
-    "les": (".txt", _bytes(les(_of(numbered()))), mivol.read_volume),
-    "hdf5": (".h5", _hdf5, mivol.read_volume),
-    "projections": (".h5", _projections, _read_projections),
-    "stack": (".tif", lambda path: Image.fromarray(np.eye(8, 9, dtype=np.float32)).save(path), _read_stack),
-    "exr": (".exr", _exr, _read_exr),
-    "png": (".png", _picture, _read_picture),
-    "jpeg": (".jpg", lambda path: Image.fromarray(np.eye(9, 8, dtype=np.uint8) * 200).save(path), _read_picture),
-    "field": (".npz", _field, _read_field),
-    "svox2": (".svox2.npz", _svox2, _read_field),
-    "mesh": (".ply", _mesh, _read_mesh),
-    "columns": (".txt", _bytes(b"# a table\n1 2 3\n4.5 -6 7e-3\n8 9 10\n"), _read_columns),
-    "checkpoint": (".npz", _checkpoint, _read_archive),
-    "toml": (".toml", lambda path: shutil.copy(ROOT / "scenes/demo/fit.toml", path) and None, _read_experiment),
-    "toml scan": (".toml", lambda path: shutil.copy(ROOT / "scenes/shepp_logan/fit.toml", path) and None, _read_experiment),
-}
-"""Name: suffix, what writes a sound file, what reads it."""
-
-SETS: dict[str, tuple[Callable[[Path], object], tuple[str, ...]]] = {
-    "blender": (
-        lambda folder: write_blender(folder, alpha=False),
-        ("transforms_train.json", "transforms_test.json", "train/r_0.png"),
-    ),
-    "transforms": (lambda folder: write_transforms(folder, {"fl_x": 10.0, "w": 12, "h": 8}), ("transforms.json",)),
-    "colmap": (
-        lambda folder: write_colmap(folder),
-        ("sparse/0/cameras.bin", "sparse/0/images.bin", "sparse/0/points3D.bin"),
-    ),
-    "colmap text": (
-        lambda folder: write_colmap(folder, encoding="txt"),
-        ("sparse/0/cameras.txt", "sparse/0/images.txt", "sparse/0/points3D.txt"),
-    ),
-}
-"""Name: what writes a sound set of photographs, and the files in it that are broken, one at a time."""
-
 
 # -- Mutations -------------------------------------------------------------------------------------------------------------
 
@@ -325,13 +152,13 @@ def case(name: str, number: int, seed: int, folder: Path) -> tuple[Callable[[], 
         broken = folder / f"broken{suffix}"
         broken.write_bytes(mutate(path.read_bytes(), rng))
         return (lambda: read(broken)), broken
-    files = SETS[name][1]
+    _, files, read = SETS[name]
     whole, copy = folder / "sound", folder / "broken"
     shutil.rmtree(copy, ignore_errors=True)
     shutil.copytree(whole, copy)
     broken = copy / files[int(rng.integers(len(files)))]
     broken.write_bytes(mutate(broken.read_bytes(), rng))
-    return (lambda: mivol.load_photos(copy)), broken
+    return (lambda: read(copy)), broken
 
 
 def write_sound(name: str, folder: Path) -> None:
@@ -344,8 +171,9 @@ def write_sound(name: str, folder: Path) -> None:
         return
     whole = folder / "sound"
     whole.mkdir()
-    SETS[name][0](whole)
-    mivol.load_photos(whole)
+    write, _, read = SETS[name]
+    write(whole)
+    read(whole)
 
 
 def read_batch(name: str, first: int, count: int, seed: int, folder: Path) -> None:

@@ -20,7 +20,7 @@ from mivol.errors import MivolError
 from mivol.files.source import refusal
 from mivol.machine import available_memory
 
-__all__ = ["read_archive"]
+__all__ = ["DAMAGE", "check_memory", "read_archive"]
 
 KINDS = "biufU"
 """Kinds of NumPy types that are read: truth values, whole and real numbers, text."""

@@ -8,13 +8,12 @@ lies on the unit cube. Pickled objects are never loaded.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
 
+from mivol.files.archive import read_archive
 from mivol.files.source import choose, no_dataset, refusal
 from mivol.files.volume import VolumeData, as_values
 
@@ -25,15 +24,13 @@ NPZ_MAGIC = b"PK\x03\x04"
 def read_npy(path: Path, dataset: str | None = None) -> VolumeData:
     """Read one array; it lies on the unit cube, for the format says nothing else."""
     no_dataset(path, dataset)
-    with _loaded(path) as array:
-        pass
+    array = _loaded(path)
     return VolumeData(as_values(array, path), np.eye(4), _meta(path, "npy", array))
 
 
 def read_npz(path: Path, dataset: str | None = None) -> VolumeData:
     """Read one array of an archive: ``dataset``, else ``values``, else the only one of rank 3 or 4."""
-    with _loaded(path) as archive:
-        arrays = {name: archive[name] for name in archive.files}
+    arrays = read_archive(path)
     grids = [name for name, array in arrays.items() if array.ndim in (3, 4)]
     name = choose(path, "values" if dataset is None and "values" in grids else dataset, grids)
     meta = _meta(path, "npz", arrays[name]) | {"dataset": name}
@@ -74,12 +71,11 @@ def write_npz_stored(file: BinaryIO, values: np.ndarray, to_world: np.ndarray, m
     np.savez(file, allow_pickle=False, values=values, to_world=to_world, metadata=np.array(json.dumps(metadata)))
 
 
-@contextmanager
-def _loaded(path: Path) -> Iterator[Any]:
-    """What numpy.load gives, while the file is open; any error of its parsers says that the file is damaged."""
+def _loaded(path: Path) -> np.ndarray:
+    """What numpy.load gives; any error of its parsers says that the file is damaged."""
     try:
         with path.open("rb") as file:
-            yield np.load(file, allow_pickle=False)
+            return np.load(file, allow_pickle=False)
     except MemoryError:
         raise
     except Exception as error:

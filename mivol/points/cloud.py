@@ -10,6 +10,7 @@ Here: :class:`PointCloud`, :func:`read_points`, :func:`write_points`, :data:`CLO
 from __future__ import annotations
 
 import os
+import struct
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +19,7 @@ from typing import BinaryIO
 import numpy as np
 
 from mivol.files import ply
-from mivol.files.archive import check_memory
+from mivol.files.archive import DAMAGE, check_memory
 from mivol.files.atomic import write_whole
 from mivol.files.source import by_suffix, existing_file, refusal
 from mivol.photos.colmap import read_points3d
@@ -28,8 +29,10 @@ __all__ = ["CLOUD_READERS", "CLOUD_WRITERS", "PointCloud", "read_points", "write
 
 POSITION = ("x", "y", "z")
 COLOUR = ("red", "green", "blue")
-DAMAGE = (ValueError, TypeError, EOFError, SyntaxError, OSError)
-"""What NumPy raises on bytes that are no array of numbers."""
+VLR_HEAD, EVLR_HEAD = 54, 60
+"""Bytes of the head of a variable length record of LAS, and of an extended one (ASPRS LAS 1.4 R15, sections 2.5 and 2.7)."""
+LAS_HEAD_1_0, LAS_HEAD = 227, 375
+"""Bytes of the header of LAS up to version 1.2, and of version 1.4 (section 2.4)."""
 
 
 @briefly
@@ -140,6 +143,7 @@ def _read_las(path: Path) -> PointCloud:
         way_out = f'pip install "mivol[points]" for laspy, which cannot be imported ({error})'
         raise refusal(path, "a LAS file", "a format that mivol reads by itself", way_out) from error
     try:
+        _check_records(path)
         with laspy.open(path) as file:
             check_memory(path, file.header.point_count * 8 * 6)
             points = file.read()
@@ -149,6 +153,19 @@ def _read_las(path: Path) -> PointCloud:
     if {"red", "green", "blue"} <= set(points.point_format.dimension_names):
         colours = np.stack([points.red, points.green, points.blue], axis=1) / 65535
     return PointCloud(np.asarray(points.xyz), colours)
+
+
+def _check_records(path: Path) -> None:
+    """Refuse more variable length records than the file has room for: laspy would read empty ones for hours."""
+    with path.open("rb") as file:
+        head = file.read(LAS_HEAD)
+    if len(head) < LAS_HEAD_1_0:
+        raise ValueError("it ends in its header")
+    needed = VLR_HEAD * struct.unpack_from("<I", head, 100)[0]
+    if head[24:26] >= b"\x01\x04" and len(head) == LAS_HEAD:
+        needed += EVLR_HEAD * struct.unpack_from("<I", head, 243)[0]
+    if needed > path.stat().st_size:
+        raise ValueError("more variable length records than it has room for")
 
 
 def _write_ply(file: BinaryIO, cloud: PointCloud) -> None:

@@ -120,7 +120,10 @@ def _exr(path: Path, layer: str) -> NDArray:
 
 
 def _png(path: Path) -> NDArray[np.uint8]:
-    pixels = imread(path, format="png")
+    try:
+        pixels = imread(path, format="png")
+    except (OSError, SyntaxError, ValueError) as error:
+        raise MivolError(f"{path.name} is no whole PNG ({error}); restore it, or make the run again.") from error
     rgb = np.repeat(pixels[..., None], 3, axis=2) if pixels.ndim == 2 else pixels[..., :3]
     return np.round(255 * rgb).astype(np.uint8)
 

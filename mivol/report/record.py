@@ -50,6 +50,8 @@ LINES = "line integral"
 """The quantity of a projection, which is measured and modelled, not rendered."""
 SINOGRAM = "sinogram"
 """The view that holds one row of a detector in all views."""
+DAMAGE = (msgspec.DecodeError, UnicodeDecodeError)
+"""What msgspec raises on text that is no JSON of the wanted kind."""
 PACKAGES = ("mivol", "mitsuba", "drjit", "numpy", "scipy", "OpenEXR", "h5py", "msgspec", "matplotlib")
 
 
@@ -241,7 +243,7 @@ def read_record(folder: str | Path) -> RunRecord:
         raise MivolError(f'no {RECORD} in "{Path(folder).name}"; give the folder that `mivol optimize` wrote.')
     try:
         record = msgspec.json.decode(path.read_bytes(), type=RunRecord)
-    except msgspec.DecodeError as error:
+    except DAMAGE as error:
         raise MivolError(f"{RECORD} is not the record of a run: {error}; restore it or make the run again.") from None
     for part in (*record.images, *record.volumes):
         _check_inside(part.path)
@@ -264,10 +266,10 @@ def read_metrics(folder: str | Path) -> list[dict[str, float | None]]:
     path = Path(folder) / METRICS
     if not path.is_file():
         return []
-    *whole, _ = path.read_text(encoding="utf-8").split("\n")
+    *whole, _ = path.read_bytes().split(b"\n")
     try:
         return [msgspec.json.decode(line, type=dict[str, float | None]) for line in whole]
-    except msgspec.DecodeError as error:
+    except DAMAGE as error:
         raise MivolError(f"{METRICS} has a line that is not an object of numbers: {error}; remove that line.") from None
 
 

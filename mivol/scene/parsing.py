@@ -84,6 +84,8 @@ def parse_file(path: Path, overrides: dict[str, str]) -> Any:
         if "unused parameters" in str(error):
             raise MivolError(_unused(path, overrides, str(error))) from None
         raise MivolError(f"{path} cannot be read: {reason_of(error)}") from error
+    except UnicodeDecodeError as error:  # of the text of Mitsuba's own refusal, which quotes the file
+        raise MivolError(f"{path} cannot be read: it names something in bytes that are not UTF-8; correct them.") from error
     return _resolve(parser, config, state, path)
 
 

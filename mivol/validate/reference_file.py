@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,6 +18,7 @@ import numpy as np
 
 import mivol
 from mivol.errors import MivolError
+from mivol.files.archive import read_archive
 from mivol.files.atomic import write_whole
 from mivol.files.exr import read_exr, write_exr
 from mivol.shown import briefly
@@ -104,24 +104,38 @@ def read_reference(path: str | Path, content_hash: str | None = None) -> Referen
         content_hash: of the scene that it must be a reference of; None: any.
 
     Raises:
-        MivolError: not a reference of mivol's, or that of another scene.
+        MivolError: not a reference of mivol's, a damaged one, or that of another scene.
     """
     channels, header = read_exr(path)
     if "mivol_reference" not in header:
         raise MivolError(f"{path} is an image but not a reference of mivol's; make one with mivol reference.")
-    made = json.loads(header["mivol_reference"])
+    try:
+        found = _stored(Path(path), channels, json.loads(header["mivol_reference"]))
+    except (ValueError, TypeError, KeyError, RecursionError) as error:
+        raise MivolError(f"{path} is a damaged reference; delete it, and make it with mivol reference.") from error
+    if content_hash is not None and found.identity["scene"] != content_hash:
+        raise MivolError(_other(Path(path), "scene", found.identity["scene"], content_hash))
+    return found
+
+
+def _identity(made: dict[str, Any]) -> dict[str, Any]:
+    """What an image is of and how it was made; KeyError where the scene or the samples of a pass are missing."""
+    identity = dict(made["identity"])
+    return identity | {"scene": str(identity["scene"]), "pass_spp": int(identity["pass_spp"])}
+
+
+def _stored(path: Path, channels: dict[str, np.ndarray], made: dict[str, Any]) -> ReferenceResult:
+    """A reference of the channels of its file and of what its header says."""
     names = [name for name in ("R", "G", "B", "Y") if name in channels]
-    if content_hash is not None and made["identity"]["scene"] != content_hash:
-        raise MivolError(_other(Path(path), "scene", made["identity"]["scene"], content_hash))
     return ReferenceResult(
         mean=np.stack([channels[n] for n in names], axis=-1).astype(np.float64),
         variance=np.stack([channels[f"variance.{n}"] for n in names], axis=-1).astype(np.float64),
-        batches=made["batches"],
-        spp=made["spp"],
-        identity=made["identity"],
-        path=Path(path),
+        batches=int(made["batches"]),
+        spp=int(made["spp"]),
+        identity=_identity(made),
+        path=path,
         doubts=tuple(Doubt(**d) for d in made["doubts"]),
-        seconds=made["seconds"],
+        seconds=float(made["seconds"]),
     )
 
 
@@ -179,9 +193,11 @@ def read_state(state: Path) -> tuple[dict[str, Any], Moments]:
         MivolError: it is not whole.
     """
     try:
-        with state.open("rb") as file, np.load(file) as stored:
-            return json.loads(str(stored["made"])), Moments(int(stored["n"]), stored["mean"], stored["m2"])
-    except (ValueError, KeyError, OSError, EOFError, zipfile.BadZipFile) as error:
+        stored = read_archive(state)
+        made = json.loads(str(stored["made"]))
+        found = {"identity": _identity(made), "seconds": float(made["seconds"])}
+        return found, Moments(int(stored["n"]), stored["mean"], stored["m2"])
+    except (MivolError, ValueError, TypeError, KeyError, RecursionError) as error:
         raise MivolError(f"{state} is not a whole checkpoint of a reference; delete it to start over.") from error
 
 

@@ -12,11 +12,16 @@ import pytest
 from photo_sets import write_colmap
 from PIL import Image
 from script_modules import load
+from sound_files import FILES, SETS
 
 from mivol import config
 from mivol.errors import MivolError
-from mivol.files import read_stack, read_volume
+from mivol.files import read_stack, read_volume, write_exr, write_volume
 from mivol.photos import Camera, Lens, intrinsics, load_photos
+from mivol.points.cloud import read_points
+from mivol.report.page import write_page
+from mivol.scene.load import load_scene
+from mivol.validate.reference_file import read_reference
 
 SAMPLE = 15
 """Files of each format; the script reads 20,000 in all, in processes of their own."""
@@ -123,8 +128,63 @@ def test_deep_experiments_are_refused(tmp_path: Path) -> None:
         config.load(tmp_path / "deep.toml")
 
 
+def test_records_of_las_without_room_are_refused(tmp_path: Path) -> None:
+    """Found by the script: laspy reads as many empty records as the header says, two thousand million of them."""
+    pytest.importorskip("laspy")
+    path = tmp_path / "a.las"
+    FILES["las"][1](path)
+    data = path.read_bytes()
+    path.write_bytes(data[:100] + struct.pack("<I", 2_000_000_000) + data[104:])
+    with pytest.raises(MivolError, match="more variable length records than it has room for"):
+        read_points(path)
+
+
+def test_a_header_of_a_cloud_that_is_no_python_is_refused(tmp_path: Path) -> None:
+    """Found by the script: a bracket that never closes in the header of an array is an error of Python's tokeniser."""
+    path = tmp_path / "a.npy"
+    np.save(path, np.zeros((4, 3)))
+    path.write_bytes(path.read_bytes().replace(b"}", b"{"))
+    with pytest.raises(MivolError, match="a damaged array"):
+        read_points(path)
+
+
+def test_an_archive_of_a_volume_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A volume goes through the same opener as fields: what it would take is counted before it is taken."""
+    write_volume(tmp_path / "a.npz", np.zeros((32, 32, 32, 1), np.float32))
+    monkeypatch.setattr("mivol.files.archive.available_memory", lambda: 100_000)
+    with pytest.raises(MivolError, match="at most the free memory"):
+        read_volume(tmp_path / "a.npz")
+
+
+@pytest.mark.parametrize("said", ["{", "[]", '{"identity": {}}'])
+def test_a_damaged_reference_is_named(tmp_path: Path, said: str) -> None:
+    """Found by the script: the header is JSON, and may be cut off or tell less than mivol writes."""
+    write_exr(tmp_path / "a.exr", {"": np.zeros((2, 2, 3), np.float32)}, {"mivol_reference": said})
+    with pytest.raises(MivolError, match="a damaged reference"):
+        read_reference(tmp_path / "a.exr")
+
+
+def test_a_scene_of_foreign_bytes_is_refused(variant_rgb: str, tmp_path: Path) -> None:
+    """Found by the script: Mitsuba's refusal quotes the file, and is no text where the file is none."""
+    (tmp_path / "a.xml").write_bytes(b'<scene version="3.0.0"><inte\xaa\x89r name="a"/></scene>')
+    with pytest.raises(MivolError, match="bytes that are not UTF-8"):
+        load_scene(tmp_path / "a.xml")
+
+
+@pytest.mark.parametrize("name", ["run.json", "metrics.jsonl", "a.png"])
+def test_a_page_of_damaged_files_is_refused(tmp_path: Path, name: str) -> None:
+    """Found by the script: bytes that are no UTF-8, and a picture that is none."""
+    SETS["run"][0](tmp_path)
+    path = tmp_path / name
+    path.write_bytes(b"\xff" + path.read_bytes())
+    with pytest.raises(MivolError) as refused:
+        write_page(tmp_path)
+    assert name in str(refused.value)
+    assert "\n" not in str(refused.value)
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("name", [*fuzz.FILES, *fuzz.SETS])
+@pytest.mark.parametrize("name", [*FILES, *SETS])
 def test_broken_files_end_in_a_sentence(variant_rgb: str, tmp_path: Path, name: str) -> None:
     fuzz.write_sound(name, tmp_path)
     found = [fuzz.outcome(fuzz.case(name, number, 2, tmp_path)[0]) for number in range(SAMPLE)]

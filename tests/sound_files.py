@@ -1,0 +1,368 @@
+"""A sound file of every format that is read, and what reads it: what ``scripts/fuzz_files.py`` breaks.
+
+Here: :data:`FILES`, formats of one file; :data:`SETS`, what lies in several files, of which one at a time is broken.
+"""
+
+from __future__ import annotations
+
+import gzip
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import h5py
+import numpy as np
+from gaussian_sets import compressed_bytes, in_buckets, inria_bytes, ksplat_bytes, random_gaussians, splat_bytes, spz_bytes
+from photo_sets import write_blender, write_colmap, write_transforms
+from PIL import Image
+from volume_files import les, meta_head, mha, nifti, nrrd, nrrd_head, numbered, packed, pbrt, vol, vti, vtk
+
+import mivol
+
+ROOT = Path(__file__).resolve().parents[1]
+
+Read = Callable[[Path], object]
+Write = Callable[[Path], object]
+
+
+def _bytes(data: bytes) -> Write:
+    return lambda path: path.write_bytes(data)
+
+
+def _copy(name: str) -> Write:
+    return lambda path: path.write_bytes((ROOT / name).read_bytes())
+
+
+# -- Writers ---------------------------------------------------------------------------------------------------------------
+
+
+def _projections(path: Path) -> None:
+    with h5py.File(path, "w") as file:
+        rng = np.random.default_rng(0)
+        for name, shape in (("data", (4, 3, 5)), ("data_white", (2, 3, 5)), ("data_dark", (2, 3, 5))):
+            file[f"exchange/{name}"] = rng.integers(1, 999, shape).astype(np.uint16)
+        file["exchange/theta"] = np.linspace(0, 180, 4, endpoint=False)
+
+
+def _hdf5(path: Path) -> None:
+    with h5py.File(path, "w") as file:
+        file["density"] = numbered()[..., 0]
+
+
+def _picture(path: Path) -> None:
+    Image.fromarray(np.random.default_rng(1).integers(0, 256, (8, 12, 4), np.uint8)).save(path)
+
+
+def _field(path: Path) -> None:
+    from mivol.fields.spherical import SphericalGrid
+
+    rng = np.random.default_rng(2)
+    keep = rng.random((3, 4, 5)) < 0.5
+    values = rng.random((3, 4, 5)), rng.normal(0, 1, (3, 4, 5, 4, 3))
+    mivol.save_field(path, SphericalGrid.from_dense(*values, np.eye(4), keep))
+
+
+def _svox2(path: Path) -> None:
+    from mivol.fields.export import export_field
+    from mivol.fields.spherical import SphericalGrid
+
+    rng = np.random.default_rng(3)
+    export_field(path, SphericalGrid.from_dense(rng.random((3, 4, 5)), rng.normal(0, 1, (3, 4, 5, 4, 3)), np.eye(4)))
+
+
+def _mesh(path: Path) -> None:
+    from mivol.files.mesh import Mesh, write_mesh
+
+    points, faces = np.eye(4, 3), np.array([[0, 1, 2], [0, 1, 3]])
+    write_mesh(path, Mesh(points, faces, colours=np.full((4, 3), 0.5)))
+
+
+def _checkpoint(path: Path) -> None:
+    rng = np.random.default_rng(4)
+    np.savez(path, density=rng.random((3, 4)), state=np.array(json.dumps({"iteration": 3})))
+
+
+def _volume(path: Path) -> None:
+    mivol.write_volume(path, numbered())
+
+
+def _exr(path: Path) -> None:
+    from mivol.files import write_exr
+
+    write_exr(path, {"": np.random.default_rng(5).random((6, 12, 3)).astype(np.float32)})
+
+
+def _cloud(path: Path) -> None:
+    from mivol.points.cloud import PointCloud, write_points
+
+    rng = np.random.default_rng(6)
+    write_points(path, PointCloud(rng.random((9, 3)), rng.random((9, 3))))
+
+
+def _las(path: Path) -> None:
+    import laspy
+
+    header = laspy.LasHeader(point_format=2, version="1.2")
+    header.scales = np.full(3, 0.001)
+    one = laspy.LasData(header)
+    one.x, one.y, one.z = np.random.default_rng(7).random((3, 9))
+    one.red = one.green = one.blue = np.arange(9) * 1000
+    one.write(path)
+
+
+SCENE = b"""<scene version="3.0.0">
+    <default name="spp" value="4"/>
+    <integrator type="mivol"><integer name="max_depth" value="4"/></integrator>
+    <emitter type="constant"><rgb name="radiance" value="0.5, 0.6, 0.7"/></emitter>
+    <sensor type="perspective">
+        <float name="fov" value="35"/>
+        <transform name="to_world"><lookat origin="0, 1, 4" target="0, 0, 0" up="0, 1, 0"/></transform>
+        <film type="hdrfilm"><integer name="width" value="8"/><integer name="height" value="6"/></film>
+        <sampler type="independent"><integer name="sample_count" value="$spp"/></sampler>
+    </sensor>
+    <shape type="cube" id="cube">
+        <bsdf type="null"/>
+        <medium type="homogeneous" name="interior">
+            <rgb name="albedo" value="0.9, 0.8, 0.7"/><float name="sigma_t" value="1.5"/>
+            <phase type="hg"><float name="g" value="0.3"/></phase>
+        </medium>
+    </shape>
+</scene>"""
+
+IDENTITY = {"scene": "0" * 64, "integrator": "volpath", "max_depth": 2, "channels_alone": False, "pass_spp": 16}
+
+
+def _reference(path: Path) -> None:
+    from mivol.validate.reference_file import ReferenceResult, write_reference
+    from mivol.validate.trust import Doubt
+
+    image = np.random.default_rng(8).random((4, 5, 3))
+    doubts = (Doubt("phase", "Mitsuba samples it with an error of 0.1 %."),)
+    write_reference(ReferenceResult(image, image**2, 4, 64, IDENTITY, path, doubts))
+
+
+def _state(path: Path) -> None:
+    from mivol.validate.moments import Moments
+    from mivol.validate.reference_file import save_state
+
+    save_state(path.with_suffix("").with_suffix(".exr"), IDENTITY, Moments(3, np.ones((4, 5, 3)), np.ones((4, 5, 3))), 1.0)
+
+
+def _detached_nrrd(folder: Path) -> None:
+    (folder / "a.nhdr").write_text(nrrd_head(numbered(), **{"data file": "a.raw"}))
+    (folder / "a.raw").write_bytes(_raw())
+
+
+def _detached_metaimage(folder: Path) -> None:
+    (folder / "a.mhd").write_bytes(meta_head(numbered(), data="a.raw"))
+    (folder / "a.raw").write_bytes(_raw())
+
+
+def _raw() -> bytes:
+    return packed(list(range(24)), "f4")
+
+
+def _nikon(folder: Path) -> None:
+    settings = {
+        **{"Name": "bead", "InputSeparator": "_", "SrcToObject": 20, "SrcToDetector": 50, "DetectorPixelsX": 5},
+        **{"DetectorPixelsY": 4, "DetectorPixelSizeX": 0.5, "DetectorPixelSizeY": 0.6, "WhiteLevel": 60000},
+        **{"Projections": 3, "InitialAngle": 180, "AngularStep": 120},
+    }
+    lines = [f"{key}={value}" for key, value in settings.items()]
+    (folder / "bead.xtekct").write_text("\n".join(["[XTekCT]", *lines, ""]))
+    (folder / "_ctdata.txt").write_text("Projs\tFrames\n3\t1\nProjection\tAngle\n1\t180.0\n2\t300.0\n3\t420.0\n")
+    for number in range(1, 4):
+        Image.fromarray(np.full((4, 5), 1000 * number, np.uint16)).save(folder / f"bead_{number:04d}.tif")
+
+
+def _run(folder: Path) -> None:
+    """A run folder with one picture, one volume and a curve."""
+    from mivol.files import write_png
+    from mivol.report.record import Image as Picture
+    from mivol.report.record import RunRecord, Volume, append_metrics, write_record
+
+    write_png(folder / "a.png", np.full((4, 4, 3), 0.5, np.float32))
+    mivol.write_volume(folder / "a.vol", numbered())
+    shown = {"images": [Picture(path="a.png", role="picture")], "volumes": [Volume(path="a.vol", role="reconstruction")]}
+    write_record(RunRecord.new("a run", method="adam", config={"fit": {"iterations": 4}}, **shown), folder)
+    for iteration in range(3):
+        append_metrics(folder, iteration, 0.1 * iteration, loss=1 / (1 + iteration))
+
+
+# -- Readers ---------------------------------------------------------------------------------------------------------------
+
+
+def _read_mesh(path: Path) -> object:
+    from mivol.files.mesh import read_ply
+
+    return read_ply(path)
+
+
+def _read_exr(path: Path) -> object:
+    from mivol.files import read_exr
+
+    return read_exr(path)
+
+
+def _read_sky(path: Path) -> object:
+    from mivol.experiments.view_field import read_sky
+
+    return read_sky(path)
+
+
+def _read_projections(path: Path) -> object:
+    from mivol.files import read_projections
+
+    return read_projections(path)
+
+
+def _read_stack(path: Path) -> object:
+    from mivol.files import read_stack
+
+    return read_stack(path)
+
+
+def _read_archive(path: Path) -> object:
+    from mivol.files.archive import read_archive
+
+    return read_archive(path)
+
+
+def _read_columns(path: Path) -> object:
+    from mivol.files import read_columns
+
+    return read_columns(path, 3)
+
+
+def _read_picture(path: Path) -> object:
+    from mivol.photos.picture import read_picture
+
+    return read_picture(path, "srgb")
+
+
+def _read_mask(path: Path) -> object:
+    from mivol.photos.picture import read_mask
+
+    return read_mask(path)
+
+
+def _read_experiment(path: Path) -> object:
+    from mivol import config
+
+    return config.load(path)
+
+
+def _read_gaussians(path: Path) -> object:
+    from mivol.points.gaussian_files import read_gaussians
+
+    return read_gaussians(path)
+
+
+def _read_points(path: Path) -> object:
+    from mivol.points.cloud import read_points
+
+    return read_points(path)
+
+
+def _read_reference(path: Path) -> object:
+    from mivol.validate.reference_file import read_reference
+
+    return read_reference(path)
+
+
+def _read_state(path: Path) -> object:
+    from mivol.validate.reference_file import read_state
+
+    return read_state(path)
+
+
+def _read_nikon(folder: Path) -> object:
+    from mivol.files.nikon import read_nikon, read_nikon_angles, read_nikon_transmission
+
+    scan = read_nikon(folder / "bead.xtekct")
+    return read_nikon_angles(folder / "_ctdata.txt", len(scan.angles)), read_nikon_transmission(scan)
+
+
+def _read_run(folder: Path) -> object:
+    from mivol.report.page import write_page
+
+    return write_page(folder)
+
+
+def _of(values: np.ndarray) -> list[tuple]:
+    z, y, x, _ = values.shape
+    return [(i, j, k, float(values[k, j, i, 0]), 9.0) for k in range(z) for j in range(y) for i in range(x)]
+
+
+FILES: dict[str, tuple[str, Write, Read]] = {
+    "vol": (".vol", _bytes(vol(numbered())), mivol.read_volume),
+    "npy": (".npy", _volume, mivol.read_volume),
+    "npz": (".npz", _volume, mivol.read_volume),
+    "nrrd": (".nrrd", _bytes(nrrd(numbered())), mivol.read_volume),
+    "nrrd gzip": (".nrrd", _bytes(nrrd(numbered(), encoding="gzip")), mivol.read_volume),
+    "metaimage": (".mha", _bytes(mha(numbered())), mivol.read_volume),
+    "nifti": (".nii", _bytes(nifti(numbered())), mivol.read_volume),
+    "nifti gzip": (".nii.gz", _bytes(gzip.compress(nifti(numbered()))), mivol.read_volume),
+    "vti": (".vti", _bytes(vti(numbered())), mivol.read_volume),
+    "vtk": (".vtk", _bytes(vtk(numbered())), mivol.read_volume),
+    "vtk text": (".vtk", _bytes(vtk(numbered(), binary=False)), mivol.read_volume),
+    "pbrt": (".pbrt", _bytes(pbrt(numbered())), mivol.read_volume),
+    "les": (".txt", _bytes(les(_of(numbered()))), mivol.read_volume),
+    "hdf5": (".h5", _hdf5, mivol.read_volume),
+    "projections": (".h5", _projections, _read_projections),
+    "stack": (".tif", lambda path: Image.fromarray(np.eye(8, 9, dtype=np.float32)).save(path), _read_stack),
+    "exr": (".exr", _exr, _read_exr),
+    "sky": (".exr", _exr, _read_sky),
+    "png": (".png", _picture, _read_picture),
+    "jpeg": (".jpg", lambda path: Image.fromarray(np.eye(9, 8, dtype=np.uint8) * 200).save(path), _read_picture),
+    "radiance": (".exr", _exr, _read_picture),
+    "mask": (".png", _picture, _read_mask),
+    "field": (".npz", _field, mivol.load_field),
+    "svox2": (".svox2.npz", _svox2, mivol.load_field),
+    "mesh": (".ply", _mesh, _read_mesh),
+    "columns": (".txt", _bytes(b"# a table\n1 2 3\n4.5 -6 7e-3\n8 9 10\n"), _read_columns),
+    "checkpoint": (".npz", _checkpoint, _read_archive),
+    "toml": (".toml", _copy("scenes/demo/fit.toml"), _read_experiment),
+    "toml scan": (".toml", _copy("scenes/shepp_logan/fit.toml"), _read_experiment),
+    "gaussians": (".ply", _bytes(inria_bytes(random_gaussians(5, 1))), _read_gaussians),
+    "compressed gaussians": (".ply", _bytes(compressed_bytes(random_gaussians(5, 0))), _read_gaussians),
+    "spz 2": (".spz", _bytes(spz_bytes(random_gaussians(5, 1), 2)), _read_gaussians),
+    "spz 4": (".spz", _bytes(spz_bytes(random_gaussians(5, 1), 4)), _read_gaussians),
+    "splat": (".splat", _bytes(splat_bytes(random_gaussians(5, 0))), _read_gaussians),
+    "ksplat": (".ksplat", _bytes(ksplat_bytes([in_buckets(random_gaussians(5, 1))], 1)), _read_gaussians),
+    "points": (".ply", _cloud, _read_points),
+    "points npy": (".npy", _cloud, _read_points),
+    "las": (".las", _las, _read_points),
+    "reference": (".exr", _reference, _read_reference),
+    "reference state": (".state.npz", _state, _read_state),
+    "scene": (".xml", _bytes(SCENE), mivol.load_scene),
+}
+"""Name: suffix, what writes a sound file, what reads it."""
+
+SETS: dict[str, tuple[Write, tuple[str, ...], Read]] = {
+    "nrrd detached": (_detached_nrrd, ("a.nhdr", "a.raw"), lambda folder: mivol.read_volume(folder / "a.nhdr")),
+    "metaimage detached": (_detached_metaimage, ("a.mhd", "a.raw"), lambda folder: mivol.read_volume(folder / "a.mhd")),
+    "nikon": (_nikon, ("bead.xtekct", "_ctdata.txt", "bead_0002.tif"), _read_nikon),
+    "run": (_run, ("run.json", "metrics.jsonl", "a.png", "a.vol"), _read_run),
+    "blender": (
+        lambda folder: write_blender(folder, alpha=False),
+        ("transforms_train.json", "transforms_test.json", "train/r_0.png"),
+        mivol.load_photos,
+    ),
+    "transforms": (
+        lambda folder: write_transforms(folder, {"fl_x": 10.0, "w": 12, "h": 8}),
+        ("transforms.json",),
+        mivol.load_photos,
+    ),
+    "colmap": (
+        lambda folder: write_colmap(folder),
+        ("sparse/0/cameras.bin", "sparse/0/images.bin", "sparse/0/points3D.bin"),
+        mivol.load_photos,
+    ),
+    "colmap text": (
+        lambda folder: write_colmap(folder, encoding="txt"),
+        ("sparse/0/cameras.txt", "sparse/0/images.txt", "sparse/0/points3D.txt"),
+        mivol.load_photos,
+    ),
+}
+"""Name: what writes a sound set, the files in it that are broken, one at a time, and what reads it."""
