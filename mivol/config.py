@@ -540,7 +540,7 @@ def load(path: str | Path, changes: Sequence[str] = ()) -> Experiment | Scan | P
         raise MivolError(f"found no file {path}: give the path of an experiment in TOML.") from None
     except RecursionError:
         raise MivolError(f"{path} nests its values deeper than an experiment does: close its brackets.") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, IsADirectoryError) as error:
+    except (ValueError, IsADirectoryError) as error:  # of TOML, of UTF-8, and of numbers of thousands of digits
         raise MivolError(f"{path} is not TOML: {error}.") from None
     for change in changes:
         apply_change(raw, change)
@@ -615,7 +615,7 @@ def apply_change(raw: dict[str, Any], change: str) -> None:
         raise MivolError(f'--set "{change}" is no change: write key.of.setting=value.')
     try:
         value = tomllib.loads(f"value = {text}")["value"]
-    except tomllib.TOMLDecodeError:
+    except ValueError:
         value = text
     *steps, last = dotted.strip().split(".")
     place: Any = raw

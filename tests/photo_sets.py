@@ -39,7 +39,8 @@ def write_blender(folder: Path, train: int = 4, test: int = 2, size: tuple[int, 
         (folder / split).mkdir(parents=True)
         frames = []
         for i, pose in enumerate(ring(count)):
-            Image.fromarray(pixels(*size, i, alpha)).save(folder / split / f"r_{i}.png")
+            seed = i if split == "train" else 100 + i
+            Image.fromarray(pixels(*size, seed, alpha)).save(folder / split / f"r_{i}.png")
             frames.append({"file_path": f"./{split}/r_{i}", "transform_matrix": pose.tolist()})
         table = {"camera_angle_x": 0.8, "frames": frames}
         (folder / f"transforms_{split}.json").write_text(json.dumps(table))

@@ -13,7 +13,8 @@ from mivol.config import GaussianFit, PhotoFit
 from mivol.errors import MivolError
 from mivol.optim.colour_scale import EPSILON
 from mivol.optim.strategy import nearest
-from mivol.photos import Photos, load_photos, silhouette_box
+from mivol.photos import Photos, load_photos, silhouette_box, survey_photos
+from mivol.photos.dataset import check_alpha
 from mivol.photos.picture import space_of
 from mivol.photos.region import near_far_of
 
@@ -44,6 +45,8 @@ def read_photos(chosen: PhotoFit, base: Path) -> tuple[Photos, Photos | None]:
     white = white_of(photos) if photos.space == "linear" else 1.0
     if wanted.judged == "held_out" and not wanted.held_out:
         return exposed(photos, white), None
+    others = survey_photos(path, split=wanted.judged, held_out=wanted.held_out, box=settings["box"])
+    check_alpha([*photos.survey.frames, *others.frames])
     judged = load_photos(path, split=wanted.judged, **settings | {"space": photos.space})
     return exposed(photos, white), exposed(_over(judged, wanted.behind), white)
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from mivol.files.atomic import whole_file, write_whole, write_whole_bytes, write_whole_text
 from mivol.files.columns import read_columns
-from mivol.files.exr import layers, read_exr, write_exr
+from mivol.files.exr import layers, read_exr, read_exr_header, write_exr
 from mivol.files.formats import FORMATS, FRAMES, WRITERS, read_volume, write_volume
 from mivol.files.hdf5 import ProjectionData, read_projections
 from mivol.files.image_stack import read_stack
@@ -37,6 +37,7 @@ __all__ = [
     "layers",
     "read_columns",
     "read_exr",
+    "read_exr_header",
     "read_projections",
     "read_slices",
     "read_stack",

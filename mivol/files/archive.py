@@ -72,6 +72,7 @@ def _array(path: Path, archive: zipfile.ZipFile, name: str, member: zipfile.ZipI
         shape, order, dtype, header = _header(file)
         found = f"an array {name[:80]!r} of type {dtype}"
         if dtype.kind not in KINDS:
+            found = f"Python objects in {name[:80]!r}" if dtype.hasobject else found
             raise refusal(path, found, "numbers, truth values or text", "convert it, and save again")
         size = math.prod(shape) * dtype.itemsize
         if header + size != member.file_size or any(n < 0 for n in shape):

@@ -81,6 +81,25 @@ def read_exr(path: str | os.PathLike) -> tuple[dict[str, np.ndarray], dict[str, 
     return {name: image.astype(np.float32) for name, image in images.items()}, header
 
 
+def read_exr_header(path: str | os.PathLike) -> tuple[tuple[int, int], tuple[str, ...]]:
+    """(width, height) and the names of the channels, before a pixel is read.
+
+    Raises:
+        MivolError: missing, foreign or damaged.
+    """
+    with source.existing_file(path).open("rb") as file:
+        if file.read(len(MAGIC)) != MAGIC:
+            raise refusal(path, "another kind of file (by its first bytes)", "OpenEXR", "name an .exr file")
+    try:
+        header = OpenEXR.File(str(path), header_only=True).header()
+        low, high = (np.asarray(corner, np.int64) for corner in header["dataWindow"])
+        names = tuple(channel.name for channel in header["channels"])
+    except (RuntimeError, ValueError, IndexError, KeyError) as error:
+        raise refusal(path, "a damaged OpenEXR file", "a whole one", "the file is truncated: copy it again") from error
+    width, height = (int(n) for n in high - low + 1)
+    return (width, height), names
+
+
 def layers(channels: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Stack channels into layers: "R", "G", "B" become "" (rows, columns, 3), "a.R" ... become "a"; others stay.
 

@@ -18,7 +18,8 @@ from mivol.files import source
 from mivol.files.source import choose, refusal
 from mivol.files.volume import VolumeData, as_values, frame_from_steps
 
-COLUMNS = "x,y,z,lwc,reff"
+COLUMNS = ("x,y,z,lwc,reff", "i,j,k,lwc,reff")
+"""The line that names the columns, as AT3D's files have it and as its documentation does; both count cells."""
 
 #: Unevenness of the altitudes [of their mean step] that rounding to 1 m leaves at steps of 40 m.
 UNEVEN = 0.03
@@ -29,7 +30,7 @@ LARGEST = 2**30
 
 def is_les(head: bytes) -> bool:
     """Whether the first lines name the columns."""
-    return COLUMNS.encode() in head.replace(b" ", b"")
+    return any(names.encode() in head.replace(b" ", b"") for names in COLUMNS)
 
 
 def read_les(path: Path, dataset: str | None = None) -> VolumeData:
@@ -41,8 +42,8 @@ def read_les(path: Path, dataset: str | None = None) -> VolumeData:
     """
     lines = [line.partition("#")[0].strip() for line in source.read_bytes(path).decode("ascii", "replace").splitlines()]
     lines = [line for line in lines if line]
-    if len(lines) < 4 or lines[3].replace(" ", "") != COLUMNS:
-        raise refusal(path, "another header", f"sizes, spacings, altitudes and '{COLUMNS}'", "correct the file")
+    if len(lines) < 4 or lines[3].replace(" ", "") not in COLUMNS:
+        raise refusal(path, "another header", f"sizes, spacings, altitudes and {' or '.join(COLUMNS)}", "correct the file")
     size = source.integers(lines[0].replace(",", " "), 3, path, "nx,ny,nz")
     dx, dy = source.numbers(lines[1], 2, path)
     altitudes = source.numbers(lines[2], size[2], path)

@@ -106,22 +106,23 @@ def _stored(keys: dict[str, str], local: bytes, dtype: np.dtype, count: int, pat
     name = keys["ElementDataFile"]
     if name.upper() == "LOCAL":
         return _unpack(local, keys, dtype, count, path)
-    files = _data_files(name, local, path)
+    files = _data_files(name, local, count, path)
     if count % len(files):
         raise refusal(path, f"{len(files)} data files", f"a divisor of {count} numbers", "correct the list")
     return np.concatenate([_unpack(source.read_bytes(f), keys, dtype, count // len(files), f) for f in files])
 
 
-def _data_files(name: str, local: bytes, path: Path) -> list[Path]:
+def _data_files(name: str, local: bytes, count: int, path: Path) -> list[Path]:
     words = name.split()
     if words and words[0].upper() == "LIST":
         names = [line.strip() for line in local.decode("utf-8", errors="replace").splitlines() if line.strip()]
     elif len(words) == 4 and "%" in words[0]:
         try:
             first, last, step = (int(word) for word in words[1:])
-            names = [words[0] % number for number in range(first, last + 1, step)]
-        except (ValueError, TypeError) as error:
+            numbers = range(first, last + 1, step)
+        except ValueError as error:
             raise refusal(path, f"'ElementDataFile = {name}'", "pattern, first, last, step", "correct it") from error
+        return source.numbered_files(path, words[0], numbers, count)
     else:
         names = [name]
     if not names or not names[0]:

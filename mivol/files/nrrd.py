@@ -187,23 +187,24 @@ def _packing(fields: dict[str, str], path: Path) -> str:
 def _stored(fields: dict[str, str], listed: list[str], attached: bytes, dtype: np.dtype, count: int, path: Path) -> np.ndarray:
     if "data file" not in fields:
         return _unpack(attached, fields, dtype, count, path)
-    files = _data_files(fields["data file"], listed, path)
+    files = _data_files(fields["data file"], listed, count, path)
     if count % len(files):
         raise refusal(path, f"{len(files)} data files", f"a divisor of {count} numbers", "correct the list")
     parts = [_unpack(source.read_bytes(name), fields, dtype, count // len(files), name) for name in files]
     return np.concatenate(parts)
 
 
-def _data_files(value: str, listed: list[str], path: Path) -> list[Path]:
+def _data_files(value: str, listed: list[str], count: int, path: Path) -> list[Path]:
     words = value.split()
     if words and words[0].upper() == "LIST":
         names = [line.strip() for line in listed if line.strip()]
     elif len(words) in (4, 5) and "%" in words[0]:
         try:
             first, last, step = (int(word) for word in words[1:4])
-            names = [words[0] % number for number in range(first, last + (1 if step > 0 else -1), step)]
-        except (ValueError, TypeError) as error:
+            numbers = range(first, last + (1 if step > 0 else -1), step)
+        except ValueError as error:
             raise refusal(path, f"'data file: {value}'", "pattern, first, last, step", "correct the header") from error
+        return source.numbered_files(path, words[0], numbers, count)
     else:
         names = [value]
     if not names:
@@ -213,8 +214,10 @@ def _data_files(value: str, listed: list[str], path: Path) -> list[Path]:
 
 def _unpack(data: bytes, fields: dict[str, str], dtype: np.dtype, count: int, path: Path) -> np.ndarray:
     line_skip, byte_skip = (source.integers(fields.get(name, "0"), 1, path, name)[0] for name in ("line skip", "byte skip"))
-    for _ in range(line_skip):
-        data = data.partition(b"\n")[2]
+    if not 0 <= line_skip <= data.count(b"\n"):
+        found = f"'line skip: {line_skip}' in a file of fewer lines"
+        raise refusal(path, found, "a skip of lines that are there", "correct the header")
+    data = data.split(b"\n", line_skip)[-1]
     packing = _packing(fields, path)
     if packing == "ascii":
         return source.numbers(data[max(byte_skip, 0) :], count, path)

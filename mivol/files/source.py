@@ -3,9 +3,9 @@
 Every reader takes its bytes from here, so that a missing, empty, truncated or damaged file is refused in the same words
 everywhere: what was found, what was expected, the way out.
 
-Here: :func:`refusal` (the sentence), :func:`existing_file`, :func:`by_suffix`, :func:`read_bytes`, :func:`elements` (array),
-:func:`numbers` (text -> array), :func:`integers` and :func:`reals` (fields of a header), :func:`inflate` (bounded
-decompression), :func:`choose` and :func:`no_dataset` (which array of a file).
+Here: :func:`refusal` (the sentence), :func:`existing_file`, :func:`numbered_files` (a pattern of names), :func:`by_suffix`,
+:func:`read_bytes`, :func:`elements` (array), :func:`numbers` (text -> array), :func:`integers` and :func:`reals` (fields of a
+header), :func:`inflate` (bounded decompression), :func:`choose` and :func:`no_dataset` (which array of a file).
 """
 
 from __future__ import annotations
@@ -65,6 +65,26 @@ def existing_file(path: str | os.PathLike) -> Path:
     if path.stat().st_size == 0:
         raise refusal(path, "an empty file", "data", "copy or write it again")
     return path
+
+
+def numbered_files(header: Path, pattern: str, numbers: range, most: int) -> list[Path]:
+    """Files beside a header whose names hold a number, as ``slice%03d.raw`` of 0, 1, ...; each of them is there.
+
+    Args:
+        header: the file that names them.
+        pattern: a name with one ``%d``, ``%3d`` or ``%03d``.
+        numbers: what is put there.
+        most: how many there may be, since each holds at least one number of ``most``.
+
+    Raises:
+        MivolError: another pattern, no number, more than ``most``, a file that is not there.
+    """
+    if not re.fullmatch(r"[^%]*%\d{0,2}d[^%]*", pattern):
+        raise refusal(header, f"the pattern {pattern!r} of files", "a name with one %d or %03d", "correct the header")
+    if not numbers or numbers[most:]:
+        found = f"files numbered from {numbers.start} to {numbers.stop} in steps of {numbers.step}"
+        raise refusal(header, found, f"1 to {most} files", "correct the header")
+    return [existing_file(header.parent / (pattern % number)) for number in numbers]
 
 
 def read_bytes(path: str | os.PathLike) -> bytes:

@@ -252,6 +252,9 @@ def _images_txt(path: Path) -> list[Pose]:
 
 
 def _points_txt(path: Path) -> np.ndarray:
+    """Rows of position and colour; none of an empty file, which COLMAP's manual asks for where poses are known."""
+    if path.stat().st_size == 0:
+        return np.empty((0, 6))
     rows = [reals(" ".join(line.split()[1:7]), 6, path, f"point {line.split()[0]}") for line in filter(None, _lines(path))]
     return np.array(rows).reshape(-1, 6)
 

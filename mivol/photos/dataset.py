@@ -10,6 +10,7 @@ import math
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -17,11 +18,11 @@ from mivol.errors import MivolError
 from mivol.files.source import refusal
 from mivol.machine import available_memory
 from mivol.photos.camera import Camera, is_seen, pixel_centres
-from mivol.photos.picture import read_mask, read_picture, shrink, space_of
+from mivol.photos.picture import read_header, read_mask, read_picture, shrink, space_of
 from mivol.photos.survey import Frame, PhotoSurvey, survey_photos
 from mivol.shown import briefly
 
-__all__ = ["BACKGROUNDS", "Photo", "Photos", "load_photos"]
+__all__ = ["BACKGROUNDS", "Photo", "Photos", "check_alpha", "load_photos"]
 
 Background = str | Sequence[float] | None
 
@@ -148,6 +149,7 @@ def load_photos(
     if largest is not None:
         scale = min(scale, largest / max(max(frame.camera.size) for frame in survey.frames))
     _check_memory(survey, scale, available_memory() if limit is None else limit)
+    _check_background(check_alpha(survey.frames), background, survey.frames[0].file)
     colours = _backgrounds(background, len(survey.frames), seed)
     views = [_photo(frame, scale, colour, space) for frame, colour in zip(survey.frames, colours, strict=True)]
     return Photos(tuple(views), space, survey)
@@ -179,6 +181,26 @@ def _check_memory(survey: PhotoSurvey, scale: float, limit: int | None) -> None:
 
 
 
+def check_alpha(frames: Sequence[Frame]) -> bool:
+    """Whether photographs have alpha.
+
+    Raises:
+        MivolError: some have and some have not.
+    """
+    kinds = {read_header(frame.file).has_alpha: frame.file for frame in frames}
+    if len(kinds) == 2:
+        found, advice = f"alpha, and none in {kinds[False].name}", "add an opaque alpha to the others, or remove it from all"
+        raise refusal(kinds[True], found, "alpha in all photographs or in none", advice)
+    return next(iter(kinds))
+
+
+def _check_background(has_alpha: bool, background: Background, first: Path) -> None:
+    if has_alpha and background is None:
+        raise refusal(first, "an image with alpha", "a background to put it over", 'set background="white", for instance')
+    if not has_alpha and background is not None:
+        raise _without_alpha(first)
+
+
 def _space(wanted: str | None, frames: Sequence[Frame]) -> str:
     held = {space_of(frame.file): frame.file for frame in frames}
     if wanted is None and len(held) == 2:
@@ -206,10 +228,6 @@ def _backgrounds(background: Background, n: int, seed: int) -> Sequence[np.ndarr
 
 def _photo(frame: Frame, scale: float, background: np.ndarray | None, space: str) -> Photo:
     image, alpha = read_picture(frame.file, space)
-    if alpha is None and background is not None:
-        raise _without_alpha(frame.file)
-    if alpha is not None and background is None:
-        raise refusal(frame.file, "an image with alpha", "a background to put it over", 'set background="white", for instance')
     camera = _shrunk_camera(frame.camera, scale)
     mask = None if frame.mask is None else _read_mask(frame, camera.size)
     seen = is_seen(camera, pixel_centres(camera.size))

@@ -1,32 +1,50 @@
 """The pixels of a photograph: read, shrunk by area, put over a background, in the values that are fitted.
 
-Conventions. Pictures are float32 (rows, columns, 3), the first row on top, alpha (rows, columns) in 0..1. **8-bit files hold
+Conventions. Pictures are float32 (rows, columns, 3), the first row on top, alpha (rows, columns) in 0..1. **PNG and JPEG hold
 sRGB code values 0..1 and OpenEXR files linear light, and each stays what it is unless the other is asked for**
-(:data:`SPACES`); radiance fields of 8-bit photographs are usually fitted to the code values. PNG keeps colour apart from alpha,
+(:data:`SPACES`); radiance fields of such photographs are usually fitted to the code values. PNG keeps colour apart from alpha,
 OpenEXR multiplied by it; here all is multiplied by alpha before it is averaged or put over a background. Averages and
-backgrounds are taken in the values that are fitted, as NeRF's protocol does.
+backgrounds are taken in the values that are fitted, as NeRF's protocol does. PNG of 16 bits a channel is read at full depth.
 
 Reference: IEC 61966-2-1 (the sRGB curve); Porter and Duff 1984 (SIGGRAPH), "over" with multiplied alpha.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from PIL import Image, UnidentifiedImageError
 
-from mivol.files import encode_srgb, read_exr
+from mivol.files import encode_srgb, read_exr, read_exr_header
 from mivol.files.source import existing_file, refusal
 
-__all__ = ["SPACES", "SUFFIXES", "decode_srgb", "picture_size", "read_mask", "read_picture", "shrink", "space_of"]
+__all__ = [
+    "SPACES",
+    "SUFFIXES",
+    "PictureHeader",
+    "decode_srgb",
+    "read_header",
+    "read_mask",
+    "read_picture",
+    "shrink",
+    "space_of",
+]
 
 #: suffixes of photographs, in the order in which a name without one is tried.
 SUFFIXES = (".png", ".jpg", ".jpeg", ".exr")
 
 #: modes of Pillow that hold 8 bits a channel -> what they are read as.
 MODES = {"1": "RGB", "L": "RGB", "LA": "RGBA", "P": "RGBA", "RGB": "RGB", "RGBA": "RGBA", "RGBX": "RGB"}
+
+GREY_16 = ("I;16", "I")
+"""Modes of Pillow, old and new, of a grey PNG of 16 bits."""
+
+ORIENTATION = 0x0112
+"""The tag of EXIF that says how a viewer turns a picture (CIPA DC-008, section 4.6.4): 1 as it is, 6 a quarter turn, ..."""
 
 
 def decode_srgb(code: np.ndarray) -> np.ndarray:
@@ -53,17 +71,33 @@ def space_of(path: Path) -> str:
     return "linear" if path.suffix.lower() == ".exr" else "srgb"
 
 
-def picture_size(path: Path) -> tuple[int, int]:
-    """(width, height) from the header.
+@dataclass(frozen=True)
+class PictureHeader:
+    """What a file says before its pixels are read.
+
+    Attributes:
+        size: (width, height) as the pixels are stored.
+        has_alpha: whether pixels have an opacity.
+        orientation: EXIF's number, 1..8; 1 where it says none.
+    """
+
+    size: tuple[int, int]
+    has_alpha: bool
+    orientation: int = 1
+
+
+def read_header(path: Path) -> PictureHeader:
+    """The header of a photograph.
 
     Raises:
         MivolError: missing or damaged file.
     """
     if path.suffix.lower() == ".exr":
-        rows, columns = next(iter(read_exr(path)[0].values())).shape
-        return columns, rows
+        size, names = read_exr_header(path)
+        return PictureHeader(size, "A" in names)
     with _opened(path) as image:
-        return image.size
+        orientation = image.getexif().get(ORIENTATION, 1) if "exif" in image.info else 1
+        return PictureHeader(image.size, _kind(image) == "RGBA", orientation)
 
 
 def read_picture(path: Path, space: str) -> tuple[np.ndarray, np.ndarray | None]:
@@ -74,10 +108,10 @@ def read_picture(path: Path, space: str) -> tuple[np.ndarray, np.ndarray | None]
         space: "srgb" or "linear", what the values shall be.
 
     Raises:
-        MivolError: a damaged file, more than 8 bits in a PNG, channels that are no picture, NaN.
+        MivolError: a damaged file, grey with alpha of 16 bits, channels that are no picture, NaN.
     """
     stored = space_of(path)
-    colour, alpha = (_read_exr if stored == "linear" else _read_8_bit)(path)
+    colour, alpha = (_read_exr if stored == "linear" else _read_codes)(path)
     if stored == "linear" and alpha is not None:
         if space == "linear":
             return colour, alpha
@@ -124,16 +158,40 @@ def _mean_over_pieces(image: np.ndarray, axis: int, n: int) -> np.ndarray:
     return np.moveaxis(np.diff(at_edges, axis=0) * (n / old), 0, axis)
 
 
-def _read_8_bit(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
-    """Colour not multiplied, and alpha."""
+def _kind(image: Image.Image) -> str:
+    """"RGB" or "RGBA": what a picture of 8 bits a channel is read as."""
+    return "RGB" if image.mode == "P" and "transparency" not in image.info else MODES.get(image.mode, "RGB")
+
+
+def _read_codes(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
+    """Colour not multiplied, and alpha: code values of 8 or 16 bits over the largest."""
     with _opened(path) as image:
-        if image.mode not in MODES:
-            raise refusal(
-                path, f"pixels of the kind {image.mode}", "8 bits a channel, grey or RGB", "convert it, or use OpenEXR"
-            )
-        kind = "RGB" if image.mode == "P" and "transparency" not in image.info else MODES[image.mode]
-        values = np.asarray(_loaded(image, path).convert(kind), np.float32) / np.float32(255)
-    return (values[..., :3], values[..., 3]) if kind == "RGBA" else (values, None)
+        packed = image.tile[0][3] if image.format == "PNG" and image.tile else ""
+        if image.mode in GREY_16:
+            codes = np.asarray(_loaded(image, path), np.float32)
+            return np.repeat(codes[..., None] / np.float32(65535), 3, axis=2), None
+        if packed in ("RGB;16B", "RGBA;16B"):
+            values = _read_16_bit(path, packed)
+        elif image.mode not in MODES or packed == "LA;16B":
+            found = f"pixels of the kind {image.mode}" if image.mode not in MODES else "grey with alpha of 16 bits"
+            raise refusal(path, found, "grey, RGB or RGBA of 8 bits, grey or RGB of 16", "convert it, or use OpenEXR")
+        else:
+            values = np.asarray(_loaded(image, path).convert(_kind(image)), np.float32) / np.float32(255)
+    return (values[..., :3], values[..., 3]) if values.shape[-1] == 4 else (values, None)
+
+
+def _read_16_bit(path: Path, packed: str) -> np.ndarray:
+    """Codes of 16 bits over the largest.
+
+    Pillow keeps the first byte of each number, which is its high one in a PNG. Told that low bytes come first, it keeps the
+    second.
+    """
+    halves = []
+    for order in (packed, packed.replace("16B", "16L")):
+        with _opened(path) as image:
+            image.tile = [(codec, extents, offset, order) for codec, extents, offset, _ in image.tile]
+            halves.append(np.asarray(_loaded(image, path), np.float32))
+    return (256 * halves[0] + halves[1]) / np.float32(65535)
 
 
 def _read_exr(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
@@ -151,11 +209,18 @@ def _read_exr(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
     return colour, alpha
 
 
-def _opened(path: Path) -> Image.Image:
+@contextmanager
+def _opened(path: Path) -> Iterator[Image.Image]:
+    """An image of which the header is read; of any size, since what its pixels take is counted before they are read."""
+    bound, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
     try:
-        return Image.open(existing_file(path))
-    except (UnidentifiedImageError, OSError) as error:
+        image = Image.open(existing_file(path))
+    except (UnidentifiedImageError, OSError, SyntaxError, ValueError) as error:
         raise _damaged(path) from error
+    finally:
+        Image.MAX_IMAGE_PIXELS = bound
+    with image:
+        yield image
 
 
 def _loaded(image: Image.Image, path: Path) -> Image.Image:

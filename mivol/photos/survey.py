@@ -9,8 +9,9 @@ share it.
 from __future__ import annotations
 
 import dataclasses
+import filecmp
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -22,7 +23,7 @@ from mivol.photos import region
 from mivol.photos.camera import Camera, field_of_view
 from mivol.photos.colmap import find_model, read_colmap
 from mivol.photos.listing import UNLISTED, Entry, Listing
-from mivol.photos.picture import picture_size
+from mivol.photos.picture import PictureHeader, read_header
 from mivol.photos.transforms import read_blender, read_transforms
 from mivol.shown import briefly
 
@@ -133,6 +134,8 @@ def survey_photos(
     if not chosen:
         raise _nothing_left(path, split, absent, entries)
     cameras = {id(entry): camera for entry, camera in zip(present, _cameras(present), strict=True)}
+    if split in ("held_out", "val", "test"):
+        _check_unseen(chosen, [entry for entry in present if entry.split == "train"], cameras)
     frames = [Frame(entry.file, cameras[id(entry)], entry.split, _mask(entry)) for entry in chosen]
     training = [entry for entry in present if entry.split in ("train", "held_out")]
     looking = [cameras[id(entry)] for entry in training or chosen]
@@ -186,15 +189,50 @@ def _cameras(entries: Sequence[Entry]) -> list[Camera]:
     """Cameras of photographs whose size is what the file of cameras says, or that of the first of their split."""
     cameras, first = [], {}
     for entry in entries:
-        size = picture_size(entry.file)
+        header = read_header(entry.file)
+        size = header.size
         wanted, whence = (
             (entry.size, "the file of cameras") if entry.size else first.setdefault(entry.split, (size, entry.name))
         )
         if size != wanted:
             found, expected = (f"{w} x {h} pixels" for w, h in (size, wanted))
-            raise refusal(entry.file, found, f"{expected} as {whence}", "scale the image, or correct the cameras")
+            turned = f" (EXIF orientation {header.orientation} turns them)" if header.orientation != 1 else ""
+            advice = "turn the pixels" if turned else "scale the image"
+            raise refusal(entry.file, found + turned, f"{expected} as {whence}", f"{advice}, or correct the cameras")
+        _check_orientation(entry, header)
         cameras.append(entry.camera(size))
     return cameras
+
+
+def _check_orientation(entry: Entry, header: PictureHeader) -> None:
+    """Refuse a picture that viewers turn, unless the cameras are of the pixels as they are stored.
+
+    That shows where the file of cameras gives a size and a quarter turn (5 to 8) would change it.
+
+    Raises:
+        MivolError: it does not show.
+    """
+    is_quarter = header.orientation > 4 and header.size[0] != header.size[1]
+    if header.orientation == 1 or (is_quarter and entry.size is not None):
+        return
+    found = f"EXIF orientation {header.orientation}, by which viewers turn the picture"
+    way_out = "turn the pixels if the cameras were found for upright pictures, else remove the tag"
+    raise refusal(entry.file, found, "pixels as the cameras see them", way_out)
+
+
+def _check_unseen(judged: Sequence[Entry], fitted: Sequence[Entry], cameras: Mapping[int, Camera]) -> None:
+    """Refuse a photograph that is judged and fitted, too: one file, or one picture of one camera under two names.
+
+    Raises:
+        MivolError: the first.
+    """
+    files = {entry.file.resolve(): entry for entry in fitted}
+    seen = {cameras[id(entry)].to_world.tobytes(): entry for entry in fitted}
+    for entry in judged:
+        twin = files.get(entry.file.resolve()) or seen.get(cameras[id(entry)].to_world.tobytes())
+        if twin and (twin.file.samefile(entry.file) or filecmp.cmp(twin.file, entry.file, shallow=False)):
+            found, expected = f"a photograph that is fitted, too, as {twin.name}", f"a {entry.split} view that no fit sees"
+            raise refusal(entry.file, found, expected, "take it out of one list")
 
 
 def _mask(entry: Entry) -> Path | None:

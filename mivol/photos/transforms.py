@@ -108,7 +108,7 @@ def _described(camera: Camera) -> dict[str, Any]:
 def _entries(file: Path, split: str) -> list[Entry]:
     try:
         table = json.loads(read_bytes(file))
-    except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
+    except (ValueError, RecursionError) as error:  # of JSON, of UTF-8, and of numbers of thousands of digits
         raise refusal(file, f"text that is not JSON ({error})", "cameras in JSON", "write it again") from error
     frames = table.get("frames") if isinstance(table, dict) else None
     if not isinstance(frames, list) or not frames:

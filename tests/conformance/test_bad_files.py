@@ -97,7 +97,7 @@ BAD: dict[str, tuple[str, Callable[[], bytes], tuple[str, ...]]] = {
     "npy rank 5": ("a.npy", lambda: npy(ONE[None]), ("shape (1, 2, 3, 4, 1)",)),
     "npy empty": ("a.npy", lambda: npy(ONE[:0]), ("empty array",)),
     "npy beyond float32": ("a.npy", lambda: npy(np.full((2, 2, 2), 1e300)), ("1e+300 at voxel (z=0", "float32")),
-    "npz cut": ("a.npz", lambda: npz(values=ONE)[:-30], ("damaged", "truncated")),
+    "npz cut": ("a.npz", lambda: npz(values=ONE)[:-30], ("damaged archive",)),
     "npz damaged member": ("a.npz", lambda: swapped(npz(values=ONE), b"NUMPY", b"NUMPX"), ("damaged",)),
     "npz several": ("a.npz", lambda: npz(a=ONE, b=ONE), ("2 arrays ('a', 'b')", "dataset=")),
     "npz none": ("a.npz", lambda: npz(a=np.arange(3)), ("0 arrays (none)",)),

@@ -345,6 +345,8 @@ def test_les_by_hand(tmp_path: Path) -> None:
     np.testing.assert_array_equal(volume.values, expected)
     np.testing.assert_allclose((volume.spacing, volume.origin), ((20, 30, 40), (0, 0, 400)), atol=1e-9)
     assert read(tmp_path, "b.csv", data, dataset="reff").values[1, 2, 3] == 10
+    cells_by_their_other_name = read(tmp_path, "c.txt", data.replace(b"x,y,z,lwc", b"i,j,k,lwc"))
+    np.testing.assert_array_equal(cells_by_their_other_name.values, expected)
 
 
 def test_slices_are_in_the_order_of_their_numbers(tmp_path: Path) -> None:

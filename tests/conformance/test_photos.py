@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import math
+import struct
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -44,7 +47,7 @@ from mivol.photos import (
     survey_photos,
     undistort,
 )
-from mivol.photos.picture import decode_srgb, shrink
+from mivol.photos.picture import decode_srgb, read_header, read_picture, shrink
 
 EPS = float(np.finfo(np.float32).eps)
 
@@ -717,3 +720,106 @@ def test_fox_photographs_agree_where_a_stalk_ends(data_dir: Path) -> None:
     t1, t2, gap = np.linalg.solve(np.stack([d1, -d2, across], axis=1), o2 - o1)
     assert min(t1, t2) > 0
     assert abs(gap) / min(t1, t2) * 1375 < 2
+
+
+def png_of_16_bits(codes: np.ndarray) -> bytes:
+    """A PNG of 16 bits a channel, (rows, columns, 3 or 4) uint16, chunk by chunk (W3C PNG, section 5)."""
+    rows, columns, channels = codes.shape
+    head = struct.pack(">IIBBBBB", columns, rows, 16, {3: 2, 4: 6}[channels], 0, 0, 0)
+    lines = b"".join(b"\0" + row.astype(">u2").tobytes() for row in codes)
+    chunks = ((b"IHDR", head), (b"IDAT", zlib.compress(lines)), (b"IEND", b""))
+    packed = (struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data)) for kind, data in chunks)
+    return b"\x89PNG\r\n\x1a\n" + b"".join(packed)
+
+
+@pytest.mark.parametrize("channels", [3, 4])
+def test_png_of_16_bits_is_read_at_full_depth(tmp_path: Path, channels: int) -> None:
+    """Pillow alone keeps the high byte of each number: steps of 1/255. Here only float32 rounds."""
+    codes = np.random.default_rng(3).integers(0, 65536, (3, 5, channels), np.uint16)
+    (tmp_path / "a.png").write_bytes(png_of_16_bits(codes))
+    colour, alpha = read_picture(tmp_path / "a.png", "srgb")
+    wanted = codes / 65535
+    if channels == 4:
+        np.testing.assert_allclose(alpha, wanted[..., 3], rtol=2e-7)
+        wanted = wanted[..., :3] * wanted[..., 3:]
+    np.testing.assert_allclose(colour, wanted, rtol=4e-7)
+
+
+def test_grey_png_of_16_bits_is_read_at_full_depth(tmp_path: Path) -> None:
+    codes = np.arange(15, dtype=np.uint16).reshape(3, 5) * 4001
+    Image.fromarray(codes).save(tmp_path / "a.png")
+    colour, alpha = read_picture(tmp_path / "a.png", "srgb")
+    assert alpha is None
+    np.testing.assert_allclose(colour, np.repeat(codes[..., None] / 65535, 3, axis=2), rtol=2e-7)
+
+
+def turned_by_exif(folder: Path, orientation: int) -> None:
+    """Photographs of 12 x 8 pixels that a viewer turns."""
+    for file in folder.rglob("*.png"):
+        with Image.open(file) as image:
+            tags = image.getexif()
+            tags[0x0112] = orientation
+            image.save(file, exif=tags)
+
+
+def test_pictures_that_viewers_turn(tmp_path: Path) -> None:
+    """Taken where the cameras are of the pixels as they are stored, which their size shows; refused by name elsewhere."""
+    write_transforms(tmp_path, {"fl_x": 10.0, "cx": 6.0, "cy": 4.0})
+    turned_by_exif(tmp_path, 6)
+    assert load_photos(tmp_path).views[0].camera.size == (12, 8)
+    edit(tmp_path / "transforms.json", lambda table: table.update(w=8.0, h=12.0))
+    with pytest.raises(MivolError, match="EXIF orientation 6 turns them"):
+        load_photos(tmp_path)
+    edit(tmp_path / "transforms.json", lambda table: (table.pop("w"), table.pop("h")))
+    with pytest.raises(MivolError, match="EXIF orientation 6, by which viewers turn"):
+        load_photos(tmp_path)
+
+
+def test_a_half_turn_of_exif_does_not_show_in_sizes(tmp_path: Path) -> None:
+    write_transforms(tmp_path, {"fl_x": 10.0, "w": 12, "h": 8})
+    turned_by_exif(tmp_path, 3)
+    with pytest.raises(MivolError, match="EXIF orientation 3, by which viewers turn"):
+        load_photos(tmp_path)
+
+
+@pytest.mark.parametrize("background", [None, "white"])
+def test_mixed_alpha_is_answered_once(tmp_path: Path, background: str | None) -> None:
+    """With a background and without, the sentence is the same and names both kinds; one led to the other before."""
+    write_blender(tmp_path, alpha=True)
+    file = tmp_path / "train" / "r_0.png"
+    with Image.open(file) as image:
+        image.convert("RGB").save(file)
+    with pytest.raises(MivolError, match=r"found alpha, and none in r_0\.png"):
+        load_photos(tmp_path, background=background)
+
+
+def test_a_view_that_is_fitted_and_judged_is_refused(tmp_path: Path) -> None:
+    """By its file, and by its pose and bytes under another name; the fit alone goes on."""
+    write_blender(tmp_path, alpha=False)
+    edit(tmp_path / "transforms_test.json", lambda table: table["frames"][0].update(file_path="./train/r_1"))
+    with pytest.raises(MivolError, match=r"fitted, too, as \./train/r_1"):
+        load_photos(tmp_path, split="test")
+    assert len(load_photos(tmp_path, split="train").views) == 4
+    fitted = json.loads((tmp_path / "transforms_train.json").read_text())["frames"][2] | {"file_path": "./test/r_9"}
+    edit(tmp_path / "transforms_test.json", lambda table: table["frames"].__setitem__(0, fitted))
+    (tmp_path / "test" / "r_9.png").write_bytes((tmp_path / "train" / "r_2.png").read_bytes())
+    with pytest.raises(MivolError, match=r"fitted, too, as \./train/r_2"):
+        load_photos(tmp_path, split="test")
+
+
+def test_an_empty_list_of_points_is_colmaps_own_recipe(tmp_path: Path) -> None:
+    """COLMAP's manual makes an empty points3D.txt where poses are known ("Reconstruct sparse/dense model from known poses")."""
+    write_colmap(tmp_path, encoding="txt")
+    (tmp_path / "sparse/0/points3D.txt").write_bytes(b"")
+    photos = load_photos(tmp_path)
+    assert "cameras look" in photos.survey.box_from
+
+
+def test_photographs_of_any_size_are_surveyed(tmp_path: Path) -> None:
+    """180 million pixels: Pillow refuses them by itself, in an exception of its own; memory is counted here."""
+    write_transforms(tmp_path, {"fl_x": 1e4, "w": 15000, "h": 12000}, n=1)
+    (file,) = tmp_path.rglob("*.png")
+    Image.new("1", (15000, 12000)).save(file)
+    assert read_header(file).size == (15000, 12000)
+    with pytest.raises(MivolError, match="GiB"):
+        load_photos(tmp_path, box=[[-1, -1, -1], [1, 1, 1]], limit=1 << 30)

@@ -13,6 +13,7 @@ from photo_sets import write_colmap
 from PIL import Image
 from script_modules import load
 from sound_files import FILES, SETS
+from volume_files import meta_head, nrrd_head, numbered
 
 from mivol import config
 from mivol.errors import MivolError
@@ -181,6 +182,49 @@ def test_a_page_of_damaged_files_is_refused(tmp_path: Path, name: str) -> None:
         write_page(tmp_path)
     assert name in str(refused.value)
     assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize("listed", ["s%d.raw 0 200000000000 1", "s%099999999d.raw 0 1 1", "s%.0s.raw 0 7 1", "%d%d.raw 0 1 1"])
+def test_patterns_of_files_are_bounded(tmp_path: Path, listed: str) -> None:
+    """A header of 150 bytes named 200 milliards of files, whose names alone fill the memory."""
+    (tmp_path / "s.raw").write_bytes(bytes(4))
+    (tmp_path / "a.nhdr").write_text(nrrd_head(numbered(), **{"data file": listed}))
+    (tmp_path / "a.mhd").write_bytes(meta_head(numbered(), data=listed))
+    for name in ("a.nhdr", "a.mhd"):
+        with pytest.raises(MivolError, match=r"files numbered from|the pattern"):
+            read_volume(tmp_path / name)
+
+
+def test_numbered_files_are_read_in_order(tmp_path: Path) -> None:
+    values = numbered()
+    for k, layer in enumerate(values):
+        (tmp_path / f"s{k:02d}.raw").write_bytes(layer.astype("<f4").tobytes())
+    (tmp_path / "a.nhdr").write_text(nrrd_head(values, **{"data file": "s%02d.raw 0 1 1"}))
+    (tmp_path / "a.mhd").write_bytes(meta_head(values, data="s%02d.raw 0 1 1"))
+    for name in ("a.nhdr", "a.mhd"):
+        np.testing.assert_array_equal(read_volume(tmp_path / name).values, values)
+
+
+@pytest.mark.parametrize(("skip", "sound"), [("2", True), ("99999999999999", False), ("-1", False)])
+def test_lines_that_are_skipped_are_there(tmp_path: Path, skip: str, sound: bool) -> None:
+    values = numbered()
+    (tmp_path / "s.raw").write_bytes(b"one\ntwo\n" + values.astype("<f4").tobytes())
+    (tmp_path / "a.nhdr").write_text(nrrd_head(values, **{"data file": "s.raw", "line skip": skip}))
+    if sound:
+        np.testing.assert_array_equal(read_volume(tmp_path / "a.nhdr").values, values)
+        return
+    with pytest.raises(MivolError, match="line skip"):
+        read_volume(tmp_path / "a.nhdr")
+
+
+def test_numbers_of_thousands_of_digits_are_refused(tmp_path: Path) -> None:
+    """Python refuses to read them, in a ValueError that is none of JSON's or TOML's own."""
+    (tmp_path / "transforms.json").write_text(f'{{"w": {"9" * 5000}}}')
+    (tmp_path / "a.toml").write_text(f"threads = {'9' * 5000}")
+    with pytest.raises(MivolError, match="text that is not JSON"):
+        load_photos(tmp_path)
+    with pytest.raises(MivolError, match="is not TOML"):
+        config.load(tmp_path / "a.toml")
 
 
 @pytest.mark.slow
