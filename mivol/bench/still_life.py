@@ -19,6 +19,7 @@ import importlib.util
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 
@@ -36,7 +37,7 @@ from mivol.optim.ray_batches import RayBatches
 from mivol.photos import Photo, load_photos
 from mivol.validate import images
 
-__all__ = ["BENCH", "FULL", "QUICK", "Size", "ask_degree", "ask_few", "main"]
+__all__ = ["BENCH", "FULL", "QUICK", "Size", "ask_degree", "ask_few", "main", "photographer"]
 
 NO_TV = {"tv_sh": 0.0, "tv_density": 0.0}
 SCENE = CHECKOUT / "scenes" / "still_life" / "photographs.py"
@@ -74,17 +75,27 @@ FULL = Size()
 QUICK = Size("quick", Path("runs/still_life/quick_photographs"), 15, 48, 16, 40, 1, 32, 2)
 
 
-def still_life(size: Size) -> tuple[tuple[Photo, ...], tuple[Photo, ...], np.ndarray]:
-    """Photographs to fit, those held out, and the box; rendered where they are not there yet.
+def photographer() -> ModuleType:
+    """The script that renders the photographs.
 
     Raises:
-        MivolError: the scene's script is not there: mivol was installed without its checkout.
+        MivolError: it is not there: mivol was installed without its checkout.
     """
     if not SCENE.is_file():
         raise MivolError(f"{SCENE} is not there; run this bench from a checkout of mivol, which has the scene.")
     spec = importlib.util.spec_from_file_location("still_life", SCENE)
     made = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(made)
+    return made
+
+
+def still_life(size: Size) -> tuple[tuple[Photo, ...], tuple[Photo, ...], np.ndarray]:
+    """Photographs to fit, those held out, and the box; rendered where they are not there yet.
+
+    Raises:
+        MivolError: as :func:`photographer`.
+    """
+    made = photographer()
     made.make(size.folder, size.views, size.side, size.spp)
     settings = {"background": "white", "space": "srgb", "box": made.BOX}
     return *(load_photos(size.folder, split=split, **settings).views for split in ("train", "test")), made.BOX

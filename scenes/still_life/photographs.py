@@ -1,11 +1,12 @@
 """Photographs of a still life that nobody has to download: glossy and matt things on a plinth, rendered by Mitsuba.
 
-    python scenes/still_life/photographs.py [-o runs/still_life/photographs]
+    python scenes/still_life/photographs.py [--scene still_life] [-o runs/still_life/photographs]
 
 Spheres, cubes and a knot, half of them rough metal or varnish, the others matt, under a sky with four soft lights, so that
-highlights wander as the camera moves. Everything follows from one seed. 75 views from above the horizon, spread evenly over it;
-every fifth is held out and so lies between the others. They are PNGs with alpha beside a ``transforms.json``, as any other data
-set is; the sky is no part of them. All that there is fits into ``BOX``.
+highlights wander as the camera moves. Two more scenes are what no fit is tuned to: `wires` (matt rods, thinner than a voxel of
+1/128) and `glossy` (nothing but metal and varnish). Everything follows from one seed. 75 views from above the horizon, spread
+evenly over it; every fifth is held out and so lies between the others. They are PNGs with alpha beside a ``transforms.json``,
+as any other data set is; the sky is no part of them. All that there is fits into ``BOX``.
 """
 
 from __future__ import annotations
@@ -101,6 +102,39 @@ def still_life(tube: Path) -> dict:
     return things
 
 
+def wires(tube: Path) -> dict:
+    """A bundle of thin matt rods on a stand, which one sees through everywhere; ``tube`` is of no use here."""
+    rng = np.random.default_rng(SEED)
+    things: dict = {"type": "scene", "integrator": {"type": "path", "max_depth": 4, "hide_emitters": True}, "sky": sky()}
+    grey, place = matt((0.45, 0.45, 0.45)), mi.ScalarTransform4f()
+    things["stand"] = {"type": "cylinder", "p0": [0, 0, -0.2], "p1": [0, 0, -0.15], "radius": 0.9, "bsdf": grey}
+    things["top"] = {"type": "disk", "to_world": place.translate([0, 0, -0.15]).scale(0.9), "bsdf": grey}
+    for number in range(48):
+        around, height = rng.uniform(0, 2 * np.pi, 2), (-0.15, rng.uniform(0.2, 0.58))
+        ends = [[r * np.cos(a), r * np.sin(a), z] for r, a, z in zip((0.8, 0.7), around, height, strict=True)]
+        look = matt(rng.uniform(0.1, 0.8, 3))
+        things[f"rod_{number}"] = {"type": "cylinder", "p0": ends[0], "p1": ends[1], "radius": 0.006, "bsdf": look}
+    return things
+
+
+def glossy(tube: Path) -> dict:
+    """The still life with nothing matt in it: the knot, balls, cubes and plinth are metal and varnish of little roughness."""
+    things = still_life(tube)
+    things["stand"]["bsdf"] = things["top"]["bsdf"] = varnish((0.3, 0.27, 0.25), 0.1)
+    looks = [
+        metal((0.9, 0.9, 0.9), 0.08), varnish((0.5, 0.05, 0.05), 0.05), metal((0.95, 0.7, 0.3), 0.1),
+        varnish((0.05, 0.1, 0.5), 0.08), metal((0.8, 0.5, 0.4), 0.12), varnish((0.05, 0.4, 0.1), 0.05),
+    ]  # fmt: skip
+    for name in things:
+        if name.startswith(("sphere_", "cube_")):
+            things[name]["bsdf"] = looks[int(name.rpartition("_")[2])]
+    return things
+
+
+SCENES = {"still_life": still_life, "wires": wires, "glossy": glossy}
+"""Scenes without cameras, by name; each fits into ``BOX``."""
+
+
 def sky(size: tuple[int, int] = (128, 256)) -> dict:
     """A grey sky with soft lights in it, as seen in latitude and longitude; it is no part of the pictures."""
     rows, columns = size
@@ -152,21 +186,21 @@ def cameras(count: int, size: int) -> list[Camera]:
     return [facing(like, place, MIDDLE, np.array([0, 0, 1]), f"view {n}") for n, place in enumerate(places)]
 
 
-def make(folder: Path, views: int = 75, size: int = 128, spp: int = 64) -> list[str]:
+def make(folder: Path, views: int = 75, size: int = 128, spp: int = 64, scene: str = "still_life") -> list[str]:
     """Render the set into ``folder``, or leave what is there if it is the same set; the names of its PNGs."""
     folder.mkdir(parents=True, exist_ok=True)
     write_mesh(folder / "knot.ply", knot())
-    things = still_life(folder / "knot.ply")
+    things = SCENES[scene](folder / "knot.ply")
     looks = {f"view_{number:03d}.png": look for number, look in enumerate(cameras(views, size))}
     names = list(looks)
     shows = what_is_shown(things, list(looks.values()), spp)
     if (folder / "shows.txt").is_file() and (folder / "shows.txt").read_text() == shows:
         return names
     (folder / "shows.txt").unlink(missing_ok=True)
-    scene = mi.load_dict(things)
+    loaded = mi.load_dict(things)
     for number, (name, look) in enumerate(looks.items()):
         sensor = mi.load_dict(sensor_of(look, pixel_format="rgba") | {"sampler": {"type": "multijitter"}})
-        shown = np.array(mi.render(scene, sensor=sensor, spp=spp, seed=SEED + number))
+        shown = np.array(mi.render(loaded, sensor=sensor, spp=spp, seed=SEED + number))
         colour, alpha = shown[..., :3], shown[..., 3:]
         write_png(folder / name, np.concatenate([colour / np.where(alpha > 0, alpha, 1), alpha], axis=2))
     write_transforms(folder / "transforms.json", looks, names[FIRST::EVERY])
@@ -186,7 +220,7 @@ def main() -> None:
     """Render the set and say how well it is known."""
     given = arguments()
     mi.set_variant("llvm_ad_rgb")
-    names = make(given.output, given.views, given.size, given.spp)
+    names = make(given.output, given.views, given.size, given.spp, given.scene)
     print(f"{len(names)} views, {len(names[FIRST::EVERY])} of them held out, in the box {BOX.tolist()}")
     print(given.output)
 
@@ -194,6 +228,7 @@ def main() -> None:
 def arguments() -> argparse.Namespace:
     """The command line."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--scene", choices=SCENES, default="still_life")
     parser.add_argument("--views", type=int, default=75, help="every fifth is held out")
     parser.add_argument("--size", type=int, default=128, help="pixels along a side")
     parser.add_argument("--spp", type=int, default=64, help="samples a pixel")

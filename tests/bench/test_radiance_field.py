@@ -13,7 +13,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mivol.bench.radiance_field import BENCH, QUICK, fields, fits
+from mivol.bench.radiance_field import BENCH, QUICK, fields, fits, photographs
 from mivol.bench.radiance_field.fields import FIELDS, centred
 from mivol.bench.radiance_field.fits import EVERY, follow, held_out_psnr, our_fit, peer_fit
 from mivol.bench.radiance_field.peer import Peer
@@ -207,12 +207,26 @@ def test_rays_are_float32(variant_rgb: str) -> None:
     assert np.array_equal(np.array(made.o).T, BOX.repeat(2, axis=0).astype(np.float32))
 
 
+def test_photographs_that_are_not_here_are_left_out(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    monkeypatch.setattr(photographs, "DATA", tmp_path)
+    assert photographs.ask_photographs(replace(TINY, photo_fits=(("chair", 16),))) == {}
+    assert "chair: left out, its data is not here (MIVOL_DATA" in capsys.readouterr().err
+
+
 @pytest.mark.slow
 def test_every_question_is_answered(variant_rgb: str, tmp_path: Path) -> None:
-    answers = BENCH.ask(tuple(BENCH.questions), TINY)
+    size = replace(TINY, photo_fits=(("wires", 16),), photo_folder=tmp_path / "photographs")
+    answers = BENCH.ask(tuple(BENCH.questions), size)
     assert all(answers["step"]["fog"][kind]["ratio_of_processor_time"] > 0 for kind in ("camera", "pixels", "any"))
     assert set(answers["locality"]) == {"tiles", "pixels"}
     assert answers["fit"]["fog"]["peer_psnr"] > 5
+    found = answers["photographs"]["wires at 16"]
+    assert found["psnr"] > 10 and found["counted_gib"] > 0 and found["held_gib"] > 0
+    # Seconds of a machine that is as fast as this one are those of its threads.
+    threads, rate = dr.thread_count(), found["walk_rays_per_second"]
+    assert found["seconds"] == pytest.approx(found["processor_seconds"] / threads * rate / 25e6)
     assert len(answers.pop("bars")) == 1 + 2 + 1
     BENCH.draw(answers, tmp_path)
     assert (tmp_path / "bench_radiance_field.png").read_bytes().startswith(b"\x89PNG")

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from mivol.bench import still_life as bench
+from mivol.files.mesh import write_mesh
 from mivol.photos import load_photos, project
 from scenes import refused
 
@@ -121,3 +122,16 @@ def test_a_field_sees_directions_and_total_variation_helps(variant_rgb, tmp_path
     answers = bench.BENCH.ask(("degree", "few"), size)
     assert len(answers["bars"]) == 2
     assert all(bar["met"] for bar in answers["bars"]), answers["bars"]
+
+
+def test_the_other_scenes_are_thin_and_glossy(still_life, variant_rgb, tmp_path):
+    """No rod is as thick as a voxel of 1/128 of the box, and nothing that is glossy is matt; both scenes load, in the box."""
+    write_mesh(tmp_path / "knot.ply", still_life.knot())
+    wires, glossy = (still_life.SCENES[name](tmp_path / "knot.ply") for name in ("wires", "glossy"))
+    rods = [thing for name, thing in wires.items() if name.startswith("rod_")]
+    assert len(rods) == 48 and all(2 * rod["radius"] < (still_life.BOX[1] - still_life.BOX[0]).max() / 128 for rod in rods)
+    shapes = [thing for thing in glossy.values() if isinstance(thing, dict) and "bsdf" in thing]
+    assert len(shapes) == 9 and {shape["bsdf"]["type"] for shape in shapes} == {"roughconductor", "roughplastic"}
+    for things in (wires, glossy):
+        box = mi.load_dict(things).bbox()
+        assert (np.array(box.min) >= still_life.BOX[0] - 1e-6).all() and (np.array(box.max) <= still_life.BOX[1] + 1e-6).all()

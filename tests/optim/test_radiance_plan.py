@@ -12,7 +12,7 @@ from ball_photos import BOX, PLAN
 from mivol.errors import MivolError
 from mivol.fields.spherical import basis_size, row_width
 from mivol.optim import radiance_plan
-from mivol.optim.radiance_plan import FILLED, PRESETS, RAY, FitPlan, Stage, bytes_of, memory_of, place_grid
+from mivol.optim.radiance_plan import PRESETS, RAY, SHELL, FitPlan, Stage, bytes_of, memory_of, place_grid
 from mivol.optim.ray_batches import TILE, RayBatches
 from mivol.photos import Photo
 
@@ -40,13 +40,14 @@ def test_bytes_of_a_stage(variant_rgb: str, monkeypatch: pytest.MonkeyPatch, deg
         nodes = np.prod(place_grid(box, 16)[0])
         copies = 2 + threads * variant_rgb.startswith("llvm")
         assert found[-1] == 1000 * (12 * (1 + width) + 24 + 3 * 16 * copies) + 16 * nodes + 3 * 64 * TILE**2 * RAY
-    # The first stage keeps every node, later ones the share that fits have kept.
-    for stage, share in ((plan.stages[0], 1), (plan.stages[1], FILLED)):
+    # The first stage keeps every node, later ones the shell that fits have kept; of a coarse grid that is all.
+    finer = replace(plan, stages=(*plan.stages, Stage(4 * SHELL, 1, 1, 3, 64)))
+    for stage, share in zip(finer.stages, (1, 1, 0.25), strict=True):
         nodes = int(np.prod(place_grid(box, stage.longest)[0]))
-        assert bytes_of(plan, stage, box) == bytes_of(plan, stage, box, rows=int(share * nodes))
+        assert bytes_of(finer, stage, box) == bytes_of(finer, stage, box, rows=int(share * nodes))
 
 
-TOO_LARGE = [("cpu", 32, 40), ("cpu", 128, 20), ("gpu", 64, 200), ("gpu", 300, 500)]
+TOO_LARGE = [("cpu", 36, 40), ("cpu", 128, 100), ("gpu", 64, 300), ("gpu", 300, 500)]
 
 
 @pytest.mark.parametrize(("preset", "longest", "limit"), TOO_LARGE)

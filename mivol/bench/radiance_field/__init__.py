@@ -2,6 +2,7 @@
 
     scripts/bench_radiance_field.py                     # half an hour on 2 idle cores, most of it in the peer
     scripts/bench_radiance_field.py --only step,memory  # 6 minutes
+    scripts/bench_radiance_field.py --only photographs  # a quarter of an hour
     scripts/bench_radiance_field.py --quick             # under two minutes, small sizes: its times mean nothing
 
 The peer is :mod:`mivol.bench.radiance_field.peer`: uniform steps over textures. Fields: a thin shell, a fog that fills the
@@ -38,13 +39,20 @@ from mivol.bench.bars import AT_LEAST, AT_MOST, Bar, judge
 from mivol.bench.figures import drawn, plain_ticks
 from mivol.bench.questions import Bench
 from mivol.bench.radiance_field.fits import ask_fit, ask_locality
+from mivol.bench.radiance_field.photographs import ask_photographs, bars_of
 from mivol.bench.radiance_field.size import FULL, QUICK, Size
 from mivol.bench.radiance_field.steps import ask_memory, ask_step
 from mivol.report.figures import MARKERS, SERIES
 
 __all__ = ["BENCH", "FULL", "QUICK", "Size", "main"]
 
-QUESTIONS = {"step": ask_step, "memory": ask_memory, "locality": ask_locality, "fit": ask_fit}
+QUESTIONS = {
+    "step": ask_step,
+    "memory": ask_memory,
+    "locality": ask_locality,
+    "fit": ask_fit,
+    "photographs": ask_photographs,
+}
 
 STEP_BARS = {"camera": 8, "pixels": 4}
 """How many times the peer's rays a second there must be, for each order of the rays."""
@@ -56,6 +64,8 @@ def compare(question: str, answer: dict) -> list[Bar]:
         return [judge("bytes a ray beyond the grid's", answer["bytes_per_ray"], AT_MOST, 512)]
     if question == "locality":
         return []
+    if question == "photographs":
+        return bars_of(answer)
     if question == "fit":
         return [judge(f"{name}: time to the same PSNR", a["ratio"], AT_LEAST, 10) for name, a in answer.items()]
     return [
@@ -117,7 +127,7 @@ def draw_fit(axes: Axes, answer: dict) -> None:
 
 PANELS = {"step": draw_step, "memory": draw_memory, "locality": draw_locality}
 
-BENCH = Bench("bench_radiance_field", __doc__, QUESTIONS, FULL, QUICK, compare, draw)
+BENCH = Bench("bench_radiance_field", __doc__, QUESTIONS, FULL, QUICK, compare, draw, unasked=("photographs",))
 
 
 def main(argv: Sequence[str] | None = None) -> int:

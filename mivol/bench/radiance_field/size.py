@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 __all__ = ["FULL", "QUICK", "STOP", "Size"]
 
@@ -23,6 +24,11 @@ class Size:
         chair_steps: of the fit that makes the fitted field.
         fit_resolution, fit_side: nodes and pixels of fits.
         fields: names of those that are measured, in :data:`mivol.bench.radiance_field.fields.FIELDS`.
+        photo_fits: data sets of :mod:`mivol.bench.radiance_field.photographs` and nodes along the longest edge.
+        photo_effort: share of the preset's steps.
+        photo_views, photo_side, photo_spp: of made-up data sets: photographs, pixels along an edge, samples a pixel.
+        photo_folder: where those lie; they are made where they are missing.
+        walk_side: rays of the walk that tells the machine's speed are its square.
     """
 
     name: str = "full"
@@ -34,7 +40,36 @@ class Size:
     fit_resolution: int = 128
     fit_side: int = 256
     fields: tuple[str, ...] = ("shell", "fog", "fitted")
+    photo_fits: tuple[tuple[str, int], ...] = (
+        ("chair", 128),
+        ("chair", 256),
+        ("still_life", 128),
+        ("wires", 128),
+        ("glossy", 128),
+    )
+    photo_effort: float = 1.0
+    photo_views: int = 75
+    photo_side: int = 200
+    photo_spp: int = 32
+    photo_folder: Path = Path("runs/photographs")
+    walk_side: int = 1024
 
 
 FULL = Size()
-QUICK = Size("quick", 32, 64, 1, 7, 30, 32, 32)
+QUICK = Size(
+    "quick",
+    32,
+    64,
+    1,
+    7,
+    30,
+    32,
+    32,
+    photo_fits=(("chair", 32), ("wires", 32)),
+    photo_effort=0.03,
+    photo_views=15,
+    photo_side=48,
+    photo_spp=2,
+    photo_folder=Path("runs/quick_photographs"),
+    walk_side=64,
+)
