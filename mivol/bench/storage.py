@@ -8,9 +8,9 @@ near a surface are kept. `--kept` is their share at 128^3; a surface's share hal
 Memory is float32 as mivol.fields.spherical lays it out: rows filled up to a multiple of 4 (degree 0 takes 4 numbers and not
 3), and for a sparse field the list of its nodes and the row of vacuum. Files are half floats, before they are compressed.
 
-The walk reads an index beside that, whatever is kept: a row for each node, a number for each cell, and for each cell near a
-surface the corners of it (mivol.transport.traversal.occupied_cells). It is counted on a ball's surface that keeps as many
-nodes.
+The walk reads an index beside that: two bits for each node and eight for each cell of the box, whatever is kept, and for each
+cell near a surface the corners of it (mivol.transport.traversal.occupied_cells). It is counted on a ball's surface that keeps
+as many nodes.
 
 Quality is that of the runs' held-out views (`mivol optimize` on photographs leaves field.npz and run.json), with what their
 fields take in truth. Prints a table in Markdown, then all of it as JSON.
@@ -67,7 +67,8 @@ def index_bytes(res: Sequence[int], cells: int, rows: int) -> int:
         cells: how many are near a surface.
         rows: different rows at their corners.
     """
-    return 4 * math.prod(res) + 4 * math.prod(n + 1 for n in res) + 4 * 8 * cells + 4 * rows
+    nodes, places = math.prod(res), math.prod(n + 1 for n in res)
+    return 8 * -(-nodes // 32) + 8 * -(-places // 8) + 4 * 8 * cells + 4 * rows
 
 
 def count_cells(keep: np.ndarray) -> tuple[int, int]:

@@ -46,7 +46,7 @@ def resample_field(old: SphericalGrid, res: tuple[int, int, int], to_world: np.n
         dr.scatter(packed, mi.ArrayXf(harmonics), dr.arange(mi.UInt32, count))
     dr.eval(flat, packed)
     nodes = mi.UInt32(kept.astype(np.uint32))
-    return replace(old, res=tuple(res), to_world=to_world, density=flat, harmonics=packed, nodes=nodes, links=None)
+    return replace(old, res=tuple(res), to_world=to_world, density=flat, harmonics=packed, nodes=nodes, listing=None)
 
 
 class _Axes:
@@ -71,7 +71,6 @@ class _Axes:
 
 def _interpolated(old: SphericalGrid, axes: list[_Axes], place: tuple) -> tuple[mi.Float, list[mi.Float]]:
     """Values at new nodes (levels, and indices along z, y, x)."""
-    rows = np.array(old.node_rows())
     density, harmonics = mi.Float(0), [mi.Float(0)] * old.width
     if len(place[0]) == 0:
         return density, harmonics
@@ -82,7 +81,7 @@ def _interpolated(old: SphericalGrid, axes: list[_Axes], place: tuple) -> tuple[
         ]
         node = np.ravel_multi_index([place[0], *(n for n, _ in ends)], (old.levels, *old.res))
         weight = mi.Float(math.prod(s for _, s in ends))
-        row = mi.UInt32(rows[node].astype(np.uint32))
+        row = old.row_of(mi.UInt32(node.astype(np.uint32)))
         density = dr.fma(weight, dr.gather(mi.Float, old.density, row), density)
         values = dr.gather(mi.ArrayXf, old.harmonics, row, shape=(old.width, 1))
         harmonics = [dr.fma(weight, v, h) for v, h in zip(values, harmonics, strict=True)]

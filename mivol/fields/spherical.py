@@ -40,6 +40,7 @@ import numpy as np
 
 from mivol.errors import MivolError
 from mivol.fields.activation import Activation, activation_of
+from mivol.fields.listed_places import ListedPlaces
 from mivol.files.notebook import slices_html
 from mivol.shown import briefly
 from mivol.space import check_affine, lattice_from_world
@@ -116,7 +117,7 @@ class SphericalGrid:
         clamp: whether colours below 0 are shown as 0.
         levels: boxes that are nested, each of twice the extent; ``res`` and ``to_world`` are those of the innermost.
         space: what colours are: "srgb" (code values, as in photographs) or "linear" (radiance).
-        links: the row of each node, once :meth:`node_rows` has made it.
+        listing: what :meth:`listed_places` has made.
     """
 
     res: tuple[int, int, int]
@@ -130,7 +131,7 @@ class SphericalGrid:
     clamp: bool = True
     levels: int = 1
     space: str = "srgb"
-    links: mi.UInt32 | None = None
+    listing: ListedPlaces | None = None
 
     def _repr_html_(self) -> str:
         """Three middle slices of the density, for notebooks."""
@@ -344,15 +345,21 @@ class SphericalGrid:
         """Flat numbers of the nodes that have a row, int64."""
         return np.arange(self.places) if self.nodes is None else np.array(self.nodes).astype(np.int64)
 
-    def node_rows(self) -> mi.UInt32:
-        """The row of each node of all levels, flat; made once (not inside a loop that is being traced)."""
-        if self.links is None:
-            self.links = dr.arange(mi.UInt32, self.places)
-            if self.nodes is not None:
-                self.links = dr.full(mi.UInt32, self.rows - 1, self.places)
-                dr.scatter(self.links, dr.arange(mi.UInt32, self.rows - 1), self.nodes)
-            dr.eval(self.links)
-        return self.links
+    def row_of(self, node: mi.UInt32, active: mi.Bool = True) -> mi.UInt32:
+        """The row of nodes of all levels, by their flat numbers: the vacuum's where a node is not stored.
+
+        What it looks up is made when it is first asked (not inside a loop that is being traced).
+        """
+        if self.nodes is None:
+            return node
+        row, stored = self.listed_places().rank(node, active)
+        return dr.select(stored, row, self.rows - 1)
+
+    def listed_places(self) -> ListedPlaces:
+        """Which nodes have a row, of a sparse field: two bits a node of the box; made once."""
+        if self.listing is None:
+            self.listing = ListedPlaces.of(self.nodes, self.places)
+        return self.listing
 
     # -- Where it lies -----------------------------------------------------------------------------------------------------
 
@@ -420,12 +427,12 @@ class SphericalGrid:
             low = dr.floor(value)
             i = mi.Int32(low)
             pairs.append([(dr.clip(i, 0, n - 1), 1 - (value - low)), (dr.clip(i + 1, 0, n - 1), value - low)])
-        rows, basis = self.node_rows(), self.harmonics_of(d)
+        basis = self.harmonics_of(d)
         sigma, colour = mi.Float(0), [mi.Float(self.offset)] * 3
         for k, wz in pairs[2]:
             for j, wy in pairs[1]:
                 for i, wx in pairs[0]:
-                    row = dr.gather(mi.UInt32, rows, mi.UInt32(((level * z + k) * y + j) * x + i), inside)
+                    row = self.row_of(mi.UInt32(((level * z + k) * y + j) * x + i), inside)
                     w = wx * wy * wz
                     sigma = dr.fma(w, dr.gather(mi.Float, self.density, row, inside), sigma)
                     held = dr.gather(mi.ArrayXf, self.harmonics, row, inside, shape=(self.width, 1))

@@ -88,10 +88,9 @@ def dense_densities(field: SphericalGrid) -> list[mi.TensorXf]:
 
     They are those of each level in lengths of the world: 2^-l of what level l stores.
     """
-    values = field.density if field.nodes is None else dr.gather(mi.Float, field.density, field.node_rows())
-    if field.levels > 1:
-        node = dr.arange(mi.UInt32, math.prod(field.res))
-        parts = [dr.gather(mi.Float, values, node + k * dr.width(node)) * 2.0**-k for k in range(field.levels)]
-    else:
-        parts = [values]
+    if field.nodes is None and field.levels == 1:
+        return [mi.TensorXf(field.density, (*field.res, 1))]
+    node = dr.arange(mi.UInt32, math.prod(field.res))
+    rows = [field.row_of(node + k * dr.width(node)) for k in range(field.levels)]
+    parts = [dr.gather(mi.Float, field.density, row) * 2.0**-k for k, row in enumerate(rows)]
     return [mi.TensorXf(part, (*field.res, 1)) for part in parts]

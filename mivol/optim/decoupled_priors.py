@@ -42,7 +42,6 @@ class Neighbours:
     def of(cls, field: SphericalGrid) -> Neighbours:
         """Look them up."""
         z, y, x = field.res
-        rows = field.node_rows()
         node = mi.UInt32(field.listed().astype(np.uint32))
         own = dr.arange(mi.UInt32, dr.width(node))
         found = cls([], [])
@@ -50,8 +49,8 @@ class Neighbours:
             place = node // stride % n
             following = dr.select(place < n - 1, node + stride, node)
             following = dr.select(is_covered(following, field.res), node, following)
-            found.after.append(dr.gather(mi.UInt32, rows, following))
-            before = dr.gather(mi.UInt32, rows, dr.select(place > 0, node - stride, node))
+            found.after.append(field.row_of(following))
+            before = field.row_of(dr.select(place > 0, node - stride, node))
             found.before.append(dr.select(before < dr.width(node), before, own))
         dr.eval(found)
         return found

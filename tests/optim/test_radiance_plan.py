@@ -39,7 +39,7 @@ def test_bytes_of_a_stage(variant_rgb: str, monkeypatch: pytest.MonkeyPatch, deg
         found.append(bytes_of(plan, plan.stages[1], box, rows=1000))
         nodes = np.prod(place_grid(box, 16)[0])
         copies = 2 + threads * variant_rgb.startswith("llvm")
-        assert found[-1] == 1000 * (12 * (1 + width) + 24 + 3 * 16 * copies) + 16 * nodes + 3 * 64 * TILE**2 * RAY
+        assert found[-1] == 1000 * (12 * (1 + width) + 24 + 3 * 16 * copies) + 6 * nodes + 3 * 64 * TILE**2 * RAY
     # The first stage keeps every node, later ones the shell that fits have kept; of a coarse grid that is all.
     finer = replace(plan, stages=(*plan.stages, Stage(4 * SHELL, 1, 1, 3, 64)))
     for stage, share in zip(finer.stages, (1, 1, 0.25), strict=True):

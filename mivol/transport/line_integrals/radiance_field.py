@@ -97,7 +97,7 @@ def cells_of(field: SphericalGrid) -> Cells:
             return mi.Bool(True) if field.nodes is None else _any([c != vacuum for c in corners])
         return _any([dr.gather(mi.Float, field.density, c) > below for c in corners])
 
-    return Cells.find(field.res, field.to_world, field.node_rows(), occupied, field.levels)
+    return Cells.find(field.res, field.to_world, field.row_of, occupied, field.rows, field.levels)
 
 
 def _any(masks: list[mi.Bool]) -> mi.Bool:

@@ -1,9 +1,9 @@
 """The non-empty cells of a grid, and a walk along rays that visits only these.
 
 Conventions. Cells and nodes are those of :mod:`mivol.transport.traversal.lattice`: a cell lies between two nodes along each
-axis, -1 to N - 1, border nodes are repeated. ``Cells.number`` holds for each cell of the box its index in the list of occupied
-cells; for a cell that is not occupied it holds minus the Chebyshev distance [cells] to the nearest that is, at most REACH. A
-ray may go that far in one step.
+axis, -1 to N - 1, border nodes are repeated. ``Cells.index`` holds for each cell of the box the Chebyshev distance [cells] to
+the nearest occupied one, at most REACH, 0 for those themselves: a ray may go that far in one step. It also knows where an
+occupied cell stands in the list. That takes a byte a cell of the box, and all else goes with the occupied ones.
 
 Levels. A grid may be one of several nested ones (:mod:`mivol.fields.spherical`): all have the same nodes, and their cells are
 counted one level after the other. A walk goes through one of them; :mod:`mivol.transport.traversal.nested_path` says which
@@ -29,7 +29,8 @@ import numpy as np
 from mivol.errors import MivolError
 from mivol.numerics import greater, lesser
 from mivol.space import check_affine, lattice_from_world
-from mivol.transport.traversal.empty_blocks import REACH, distances
+from mivol.transport.traversal.distance_index import DistanceIndex
+from mivol.transport.traversal.empty_blocks import distances
 from mivol.transport.traversal.interpolation import GAUSS
 from mivol.transport.traversal.lattice import Segment
 
@@ -44,8 +45,7 @@ class Cells:
         res: nodes (Z, Y, X).
         to_world: (4, 4) float64, unit cube to world.
         count: number of occupied cells.
-        number: Int32 over the (Z + 1) (Y + 1) (X + 1) cells of each level, x fastest: index of the cell in ``corners``, or
-            minus a distance.
+        index: of the (Z + 1) (Y + 1) (X + 1) cells of each level, x fastest: distances, and which of ``corners`` each is.
         corners: UInt32, 8 a cell: indices of its nodes in ``rows``; bits 0, 1, 2 of the corner are x, y, z.
         rows: UInt32, the rows of the nodes of listed cells, each once.
         from_world: (3, 4) map from the world to lattice coordinates of the innermost level.
@@ -55,7 +55,7 @@ class Cells:
     res: tuple[int, int, int]
     to_world: np.ndarray
     count: int
-    number: mi.Int32
+    index: DistanceIndex
     corners: mi.UInt32
     rows: mi.UInt32
     from_world: list[list[mi.Float64]]
@@ -71,8 +71,9 @@ class Cells:
         cls,
         res: tuple[int, int, int],
         to_world: np.ndarray,
-        rows: mi.UInt32,
+        row_of: Callable[[mi.UInt32], mi.UInt32],
         occupied: Callable[[list[mi.UInt32]], mi.Bool],
+        most: int,
         levels: int = 1,
     ) -> Cells:
         """Find the occupied cells of a grid.
@@ -80,8 +81,9 @@ class Cells:
         Args:
             res: nodes (Z, Y, X).
             to_world: (4, 4) affine map of the unit cube.
-            rows: the row of each node of all levels, flat, x fastest.
+            row_of: the row of nodes of all levels, by their flat numbers, x fastest.
             occupied: ``occupied(rows of the 8 corners) -> mask`` of cells to list; called once for all cells.
+            most: rows that there are.
             levels: nested grids.
 
         Raises:
@@ -96,23 +98,23 @@ class Cells:
             raise MivolError(f"a grid of {found} nodes was given; its cells are counted up to 2^31: split it.")
         cell = dr.arange(mi.UInt32, total)
         # A mask of one lane stands for all cells.
-        listed = dr.compress(occupied(_corner_rows(cell, rows, res)) & dr.full(mi.Bool, True, total))
+        held = occupied(_corner_rows(cell, row_of, res)) & dr.full(mi.Bool, True, total)
+        listed = dr.compress(held)
         count = dr.width(listed)
-        number = dr.full(mi.Int32, -REACH, total)
-        if count:
-            dr.scatter(number, dr.arange(mi.Int32, count), listed)
-            number = dr.select(number >= 0, number, -mi.Int32(distances(number >= 0, tuple(n + 1 for n in res))))
+        far = distances(held, tuple(n + 1 for n in res))
+        del held
+        index = DistanceIndex.of(far)
         # Dr.Jit cannot gather from an array of length 0, not even with all lanes inactive. Where no cell is occupied the arrays
         # hold one cell, to which no number points.
-        named = _corner_rows(listed if count else mi.UInt32(0), rows, res)
+        named = _corner_rows(listed if count else mi.UInt32(0), row_of, res)
         corners = dr.zeros(mi.UInt32, 8 * max(count, 1))
         for q, row in enumerate(named):
             dr.scatter(corners, row, dr.arange(mi.UInt32, max(count, 1)) * 8 + q)
         to_world = check_affine(to_world)
         place = [[dr.opaque(mi.Float64, float(v)) for v in row] for row in lattice_from_world(to_world, res)]
-        used, corners = _numbered(corners, dr.width(rows))
-        dr.eval(number, corners, used)
-        return cls(res, to_world, count, number, corners, used, place, levels)
+        used, corners = _numbered(corners, most)
+        dr.eval(corners, used)
+        return cls(res, to_world, count, index, corners, used, place, levels)
 
     def nodes(self, number: mi.UInt32, active: mi.Bool) -> list[mi.UInt32]:
         """The 8 corners of listed cells, in ``rows``."""
@@ -145,12 +147,14 @@ def _between(place: mi.Int32, n: int) -> tuple[mi.Int32, mi.Int32]:
     return dr.maximum(place - 1, 0), dr.minimum(place, n - 1)
 
 
-def _corner_rows(cell: mi.UInt32, rows: mi.UInt32, res: tuple[int, int, int]) -> list[mi.UInt32]:
+def _corner_rows(
+    cell: mi.UInt32, row_of: Callable[[mi.UInt32], mi.UInt32], res: tuple[int, int, int]
+) -> list[mi.UInt32]:
     """Rows of the 8 corners of cells, from their flat index."""
     z, y, x = res
     i, j, k = (_between(a, n) for a, n in zip(_apart(cell, res), (x, y, z), strict=True))
     level = mi.Int32(cell // math.prod(n + 1 for n in res)) * z
-    return [dr.gather(mi.UInt32, rows, mi.UInt32(((level + c) * y + b) * x + a)) for c in k for b in j for a in i]
+    return [row_of(mi.UInt32(((level + c) * y + b) * x + a)) for c in k for b in j for a in i]
 
 
 @dataclass
@@ -198,7 +202,7 @@ def march(
     Cost: one read a search step, at most X + Y + Z + 3 of them, fewer where all around is empty.
     """
     # -- State: n counts the cells crossed since the first, along each axis ----------------------------------------------
-    number, length = cells.number, segment.length
+    index, length = cells.index, segment.length
     z, y, x = cells.res
     # An axis to which the ray is parallel counts as ahead: its fraction is then used as it is, without a rounding.
     ahead = segment.d >= 0
@@ -220,12 +224,14 @@ def march(
 
     while dr.hint(active, label="march"):
         # -- The next occupied cell --------------------------------------------------------------------------------------
-        found = mi.Int32(0)
+        place, word = mi.UInt32(0), mi.UInt32(0)
         searching = mi.Bool(active)
         while dr.hint(searching, label="search"):
-            found = dr.gather(mi.Int32, number, mi.UInt32(base + n.x * stride.x + n.y * stride.y + n.z * stride.z), searching)
-            searching &= found < 0
-            ends = n - found
+            here = mi.UInt32(base + n.x * stride.x + n.y * stride.y + n.z * stride.z)
+            place = dr.select(searching, here, place)
+            far, word = index.distance(place, active)
+            searching &= far > 0
+            ends = n + mi.Int32(far)
             reach = dr.fma(mi.Vector3f(ends) - entry, pace, never)
             exit = lesser(lesser(reach.x, reach.y), reach.z)
             there = dr.clip(mi.Vector3i(dr.fma(speed, exit, entry)), n, ends - 1)
@@ -242,7 +248,7 @@ def march(
         dt = greater(lesser(exit, length) - t, 0)
         offset = entry - mi.Vector3f(n)
         points = tuple(_natural(dr.fma(speed, dr.fma(dt, g, t), offset), ahead) for g in (GAUSS, 1 - GAUSS))
-        state = visit(state, CellVisitor(mi.UInt32(found), points, t, dt), active)
+        state = visit(state, CellVisitor(index.rank(place, word, active), points, t, dt), active)
         last = dr.select(active, segment.cell + sign * n, last)
         left = dr.select(active, t + dt, left)
         n = dr.select(reach <= exit, n + 1, n)
