@@ -163,14 +163,19 @@ def convert_flags(sub: argparse.ArgumentParser) -> None:
     from mivol.points.facts import KINDS
     from mivol.points.gaussian_files import READERS, WRITERS
 
-    sub.add_argument("source", type=Path, help=f"what to read: {', '.join({**READERS, **CLOUD_READERS})}")
-    sub.add_argument("output", type=Path, help=f"what to write: {', '.join({**WRITERS, **CLOUD_WRITERS})}, .npz (field)")
-    sub.add_argument("--to", choices=KINDS, help="what to write it as; default: what the source holds, if the format can")
-    sub.add_argument("--resolution", type=int, help="of a field: voxels along the longest edge (default: 128)")
+    known = ", ".join({**WRITERS, **CLOUD_WRITERS})
+    sub.add_argument("source", type=Path, help=f"what to read: {', '.join({**READERS, **CLOUD_READERS})}, .npz (field)")
+    sub.add_argument("output", type=Path, help=f"what to write: {known}, .npz (field), .obj (mesh)")
+    kinds = (*KINDS, "field", "mesh")
+    sub.add_argument("--to", choices=kinds, help="what to write it as; default: what the source holds, if the format can")
+    along = "of a field or a mesh: voxels along the longest edge (default: 128); of Gaussians of a field: Gaussians along it"
+    sub.add_argument("--resolution", type=int, help=f"{along} (default: one for two voxels)")
     corners = ("x", "y", "z", "to_x", "to_y", "to_z")
-    held = "of a field [length]; default: three standard deviations of all Gaussians"
+    held = "of a field or a mesh [length]; default: three standard deviations of all Gaussians"
     sub.add_argument("--box", type=float, nargs=6, metavar=corners, help=held)
-    sub.add_argument("-m", "--mode", default="llvm_ad_rgb", help="variant of a field's views (default: %(default)s)")
+    sub.add_argument(
+        "-m", "--mode", default="llvm_ad_rgb", help="variant of the views of a field or a mesh (default: %(default)s)"
+    )
 
 
 def demo_flags(sub: argparse.ArgumentParser) -> None:
@@ -375,24 +380,50 @@ def export(arguments: argparse.Namespace) -> None:
 
 
 def convert(arguments: argparse.Namespace) -> None:
-    """Write the points or Gaussians of a file in another format, or one as the other, or as a radiance field.
+    """Write the points or Gaussians of a file in another format, or one as the other, as a radiance field or as a mesh.
 
-    A field (.npz) stands in scenes as mivol_sh; what it loses is said in dB, by views of it and of the splatted Gaussians.
+    A field (.npz) stands in scenes as mivol_sh, and becomes Gaussians (.ply) again; what either loses is said in dB, by views
+    of the field and of splatted Gaussians. A mesh (.obj, or .ply with --to mesh) is fused from depths of splatted views; how
+    far it lies from them is said.
     """
+    source, target = arguments.source, arguments.output
+    made_of_field, is_field = (path.suffix.lower() == ".npz" for path in (source, target))
+    kind = arguments.to or WRITTEN_AS.get(target.suffix.lower())
+    if is_field != (kind == "field"):
+        raise MivolError(f"{target}: a radiance field is written as .npz, and nothing else is; leave out --to {arguments.to}.")
+    if made_of_field and kind not in (None, "gaussians"):
+        raise MivolError(
+            f"{source}: a radiance field becomes Gaussians (.ply) here; mivol export writes it as a mesh and more."
+        )
+    is_gridded = kind in ("field", "mesh")
+    has_box, has_resolution = arguments.box is not None, arguments.resolution is not None
+    if (has_box and not is_gridded) or (has_resolution and not (is_gridded or made_of_field)):
+        raise MivolError(f"{target}: --resolution and --box are for a radiance field (.npz) or a mesh: leave them out.")
+    print(convert_from_field(arguments) if made_of_field else convert_points(arguments, kind))
+
+
+WRITTEN_AS = {".npz": "field", ".obj": "mesh"}
+"""What files of these suffixes hold."""
+
+
+def convert_from_field(arguments: argparse.Namespace) -> str:
+    """Gaussians of a radiance field; what was written."""
+    from mivol.experiments.gaussian_conversion import convert_to_gaussians
+
+    return convert_to_gaussians(arguments.source, arguments.output, arguments.resolution, arguments.mode)
+
+
+def convert_points(arguments: argparse.Namespace, kind: str | None) -> str:
+    """Points or Gaussians as a file of a kind; what was written."""
+    from mivol.experiments.gaussian_conversion import convert_to_field
+    from mivol.experiments.gaussian_mesh import convert_to_mesh
     from mivol.points.facts import convert_file
 
-    is_field = arguments.output.suffix.lower() == ".npz"
-    if is_field and arguments.to is not None:
-        raise MivolError(f"{arguments.output}: a radiance field is written as such; leave out --to {arguments.to}.")
-    if is_field:
-        from mivol.experiments.gaussian_conversion import convert_to_field
-
-        where = 128 if arguments.resolution is None else arguments.resolution, arguments.box, arguments.mode
-        print(convert_to_field(arguments.source, arguments.output, *where))
-        return
-    if arguments.resolution is not None or arguments.box is not None:
-        raise MivolError(f"{arguments.output}: --resolution and --box are for a radiance field (.npz): leave them out.")
-    print(convert_file(arguments.source, arguments.output, arguments.to))
+    if kind not in ("field", "mesh"):
+        return convert_file(arguments.source, arguments.output, kind)
+    resolution = 128 if arguments.resolution is None else arguments.resolution
+    make = convert_to_field if kind == "field" else convert_to_mesh
+    return make(arguments.source, arguments.output, resolution, arguments.box, arguments.mode)
 
 
 def demo(arguments: argparse.Namespace) -> None:

@@ -1,4 +1,4 @@
-"""Gaussians or points as a radiance field that stands in scenes, and what that loses [dB]: views of both are compared."""
+"""Gaussians or points as a radiance field that stands in scenes, and back; what that loses [dB], by views of both."""
 
 from __future__ import annotations
 
@@ -10,19 +10,20 @@ import numpy as np
 
 from mivol.experiments.back_end import set_variant
 from mivol.fields.gaussian_grid import MOST_OPAQUE, box_of_gaussians, grid_of_gaussians, masses_of_gaussians
+from mivol.fields.grid_gaussians import gaussians_of_grid
 from mivol.fields.spherical import SphericalGrid
 from mivol.fields.spherical_files import load_field, save_field
-from mivol.files.source import existing_file
+from mivol.files.source import by_suffix, existing_file
 from mivol.optim.field_view import render_view
 from mivol.photos import Camera, facing, intrinsics
 from mivol.points.cloud import read_points
 from mivol.points.conversions import gaussians_of_points
-from mivol.points.gaussian_files import holds_gaussians, read_gaussians
+from mivol.points.gaussian_files import WRITERS, holds_gaussians, read_gaussians, write_gaussians
 from mivol.points.gaussians import Gaussians
 from mivol.splatting.splatter import Splatter, tensors_of
 from mivol.validate.metrics import psnr
 
-__all__ = ["convert_to_field", "loss_of_field"]
+__all__ = ["VIEWED", "cameras_around", "convert_to_field", "convert_to_gaussians", "loss_of_field", "read_as_gaussians"]
 
 VIEWS = 6
 """Views that are compared."""
@@ -33,7 +34,9 @@ EDGE = 128
 ANGLE = 40.0
 """Field of view of these views [degree]."""
 
-JUDGED_FROM = f"{ANGLE:g} degrees wide, from a Fibonacci lattice of directions around the box"
+VIEWED = (
+    f"{VIEWS} views, {EDGE} x {EDGE} pixels each, {ANGLE:g} degrees wide, from a Fibonacci lattice of directions around the box"
+)
 """These views in words, for what is printed."""
 
 
@@ -53,9 +56,8 @@ def convert_to_field(source: Path, target: Path, resolution: int, box: Sequence[
     Raises:
         MivolError: as the readers, :func:`mivol.fields.gaussian_grid.grid_of_gaussians` and the disk.
     """
-    existing_file(source)
     set_variant(variant)
-    cloud = read_gaussians(source) if holds_gaussians(source) else gaussians_of_points(read_points(source))
+    cloud = read_as_gaussians(source)
     low, high = box_of_gaussians(cloud) if box is None else (np.array(box[:3]), np.array(box[3:]))
     save_field(target, grid_of_gaussians(cloud, low, high, resolution))
     field = load_field(target)  # as it will be read: half floats
@@ -63,8 +65,7 @@ def convert_to_field(source: Path, target: Path, resolution: int, box: Sequence[
     lines = [
         f"{target}: {' x '.join(map(str, field.res[::-1]))} nodes, {field.rows - 1} of them stored, degree {field.degree}",
         f"{100 * mass / masses_of_gaussians(cloud).sum():.4g} % of the extinction lies in the box",
-        f"{loss_of_field(cloud, field):.1f} dB: {VIEWS} views of the field, {EDGE} x {EDGE} pixels each, {JUDGED_FROM}, "
-        "against splatted Gaussians, over black, peak 1",
+        f"{loss_of_field(cloud, field):.1f} dB between the field and splatted Gaussians: {VIEWED}, over black, peak 1",
     ]
     capped = int((cloud.opacities() > MOST_OPAQUE).sum())
     if capped:
@@ -72,11 +73,50 @@ def convert_to_field(source: Path, target: Path, resolution: int, box: Sequence[
     return "\n".join(lines)
 
 
-def loss_of_field(cloud: Gaussians, field: SphericalGrid, edge: int = EDGE) -> float:
-    """PSNR of views of a field against splatted Gaussians [dB]: code values over black, the peak is 1.
+def convert_to_gaussians(source: Path, target: Path, resolution: int | None, variant: str) -> str:
+    """Write a radiance field as Gaussians.
 
     Args:
-        cloud: what the field was made of.
+        source: field (.npz) of one level.
+        target: ends in .ply.
+        resolution: blocks of voxels along the longest edge of its grid, a Gaussian each; None: of 2 voxels.
+        variant: of Mitsuba, in which views are compared.
+
+    Returns:
+        What was written and what it lost, in lines.
+
+    Raises:
+        MivolError: as :func:`mivol.fields.spherical_files.load_field`, :func:`mivol.fields.grid_gaussians.gaussians_of_grid`
+        and
+            the disk.
+    """
+    by_suffix(target, WRITERS)
+    set_variant(variant)
+    field = load_field(source)
+    made = gaussians_of_grid(field, resolution)
+    write_gaussians(target, made)
+    lines = [f"{target}: {made.count} Gaussians of degree {made.degree}"]
+    if field.space == "linear":
+        return "\n".join([*lines, "their colours are code values of the field's radiance, so views of the two do not compare"])
+    loss = f"{loss_of_field(made, field):.1f} dB between splatted Gaussians and the field: {VIEWED}, over black, peak 1"
+    return "\n".join([*lines, loss])
+
+
+def read_as_gaussians(source: Path) -> Gaussians:
+    """The Gaussians of a file, or one for each of its points.
+
+    Raises:
+        MivolError: as the readers.
+    """
+    existing_file(source)
+    return read_gaussians(source) if holds_gaussians(source) else gaussians_of_points(read_points(source))
+
+
+def loss_of_field(cloud: Gaussians, field: SphericalGrid, edge: int = EDGE) -> float:
+    """PSNR between views of a field and splatted Gaussians [dB]: code values over black, the peak is 1.
+
+    Args:
+        cloud: what the field was made of, or what was made of it.
         field: of one level, in code values.
         edge: of a view [pixel].
     """
@@ -88,15 +128,15 @@ def loss_of_field(cloud: Gaussians, field: SphericalGrid, edge: int = EDGE) -> f
     return psnr(np.stack(seen), np.stack(truth), 1.0)
 
 
-def cameras_around(to_world: np.ndarray, edge: int) -> list[Camera]:
+def cameras_around(to_world: np.ndarray, edge: int, views: int = VIEWS) -> list[Camera]:
     """Square views of the whole of a box from directions that are spread evenly over the sphere (a Fibonacci lattice)."""
     middle = to_world[:3] @ np.array([0.5, 0.5, 0.5, 1])
     radius = 0.5 * float(np.linalg.norm(to_world[:3, :3].sum(axis=1)))
     distance = radius / math.sin(math.radians(ANGLE) / 2)
     focal = edge / (2 * math.tan(math.radians(ANGLE) / 2))
     like = Camera(intrinsics(focal, focal, edge / 2, edge / 2), (edge, edge), np.eye(4))
-    height = 1 - (2 * np.arange(VIEWS) + 1) / VIEWS
-    turn = math.pi * (3 - math.sqrt(5)) * np.arange(VIEWS)
+    height = 1 - (2 * np.arange(views) + 1) / views
+    turn = math.pi * (3 - math.sqrt(5)) * np.arange(views)
     flat = np.sqrt(1 - height**2)
     towards = np.stack([flat * np.cos(turn), flat * np.sin(turn), height], axis=1)
     return [facing(like, middle + distance * one, middle, np.array([0.0, 0, 1])) for one in towards]

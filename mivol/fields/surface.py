@@ -22,7 +22,7 @@ from mivol.fields.spherical import SphericalGrid
 from mivol.files import encode_srgb
 from mivol.files.mesh import Mesh
 
-__all__ = ["INVERSES", "level_of", "surface_of"]
+__all__ = ["INVERSES", "level_of", "mean_normals", "surface_of"]
 
 INVERSES: dict[str, Callable[[float], float]] = {
     "none": lambda sigma: sigma,
@@ -98,7 +98,7 @@ def _surfaces(grid: SphericalGrid, density: np.ndarray, raw: float, inner: np.nd
     points = _world(grid, nodes - 1.0)
     if np.linalg.det(grid.to_world[:3, :3]) < 0:
         faces = faces[:, ::-1]
-    normals = _normals(points, faces)
+    normals = mean_normals(points, faces)
     # Levels overlap by a triangle at the side of a box, so that no gap is seen between them.
     kept = np.ones(len(faces), bool) if closes else _lies_in(grid.to_world, points)[faces].any(axis=1)
     if inner is not None:
@@ -122,7 +122,7 @@ def _world(field: SphericalGrid, nodes: np.ndarray) -> np.ndarray:
     return unit @ field.to_world[:3, :3].T + field.to_world[:3, 3]
 
 
-def _normals(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
+def mean_normals(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Unit means over the triangles at each point, weighted by their areas."""
     a, b, c = (points[faces[:, k]] for k in range(3))
     across = np.cross(b - a, c - a)

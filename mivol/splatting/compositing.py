@@ -43,6 +43,9 @@ LANES = (TILE // BLOCK) ** 2
 
 STOP = 1e-4
 
+HALF = 0.5
+"""T that the median depth crosses."""
+
 
 @dataclass
 class Lists:
@@ -70,6 +73,7 @@ class Frame:
         image: takes rgb, depth where asked for, and alpha of each pixel.
         transmittance: takes T of each lane's pixels at the beginning of each chunk.
         depth: whether the depth is a channel.
+        median: whether that channel is the depth of the splat at which T falls below a half, instead of the mean times alpha.
         remembers: whether T is written down.
     """
 
@@ -78,6 +82,7 @@ class Frame:
     image: mi.Float
     transmittance: mi.Float
     depth: bool
+    median: bool
     remembers: bool
 
 
@@ -198,8 +203,11 @@ def composite(
             for p in range(PIXELS):
                 a, u = print_.alpha[p], 1 - print_.alpha[p]
                 weight = a * clear[p] * most[p]
-                for c in range(channels):
+                for c in range(3 if frame.median else channels):
                     colour[p][c] = dr.fma(weight, tint[c], colour[p][c])
+                if frame.median:
+                    through = clear[p] * most[p]
+                    colour[p][3] = dr.select((through >= HALF) & (through * u < HALF), tint[3], colour[p][3])
                 clear[p], most[p] = clear[p] * dr.maximum(most[p], u), dr.minimum(most[p], u)
         return chunk + 1, clear, most, colour
 

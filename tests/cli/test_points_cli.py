@@ -9,9 +9,10 @@ import pytest
 from gaussian_sets import inria_bytes, random_gaussians, spz_bytes
 
 from mivol.cli import main
+from mivol.files.mesh import read_ply
 from mivol.points.cloud import PointCloud, read_points, write_points
 from mivol.points.gaussian_files import read_gaussians, write_gaussians
-from mivol.points.gaussians import Gaussians
+from mivol.points.gaussians import CONSTANT_HARMONIC, Gaussians
 
 
 def test_convert_writes_what_was_read(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -59,12 +60,17 @@ def test_convert_refuses_a_format_that_it_does_not_write(tmp_path: Path, capsys:
 
 def test_convert_says_which_flags_are_of_fields(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "a.ply").write_bytes(inria_bytes(random_gaussians(2, 0)))
-    for target, flags, said in (
-        ("b.npz", ["--to", "points"], "leave out --to points"),
-        ("b.ply", ["--resolution", "9"], "are for a radiance field"),
-        ("b.ply", ["--box", *"000111"], "are for a radiance field"),
+    for source, target, flags, said in (
+        ("a.ply", "b.npz", ["--to", "points"], "leave out --to points"),
+        ("a.ply", "b.ply", ["--to", "field"], "leave out --to field"),
+        ("a.ply", "b.ply", ["--resolution", "9"], "are for a radiance field"),
+        ("a.ply", "b.ply", ["--box", *"000111"], "are for a radiance field"),
+        ("a.npz", "b.ply", ["--box", *"000111"], "are for a radiance field"),
+        ("a.npz", "b.obj", [], "mivol export writes it as a mesh"),
+        ("a.npz", "b.npy", [], "expected one of .ply"),
+        ("a.ply", "b.stl", ["--to", "mesh"], "expected one of .ply, .obj"),
     ):
-        assert main(["convert", str(tmp_path / "a.ply"), str(tmp_path / target), *flags]) == 1
+        assert main(["convert", str(tmp_path / source), str(tmp_path / target), *flags]) == 1
         assert said in capsys.readouterr().err
         assert not (tmp_path / target).exists()
 
@@ -88,7 +94,7 @@ def test_convert_makes_a_field_and_says_its_loss(tmp_path: Path, capsys: pytest.
         assert main(["convert", str(tmp_path / "a.ply"), str(tmp_path / "b.npz"), "--resolution", str(resolution)]) == 0
         written, share, lost = capsys.readouterr().out.splitlines()
         assert f"b.npz: {resolution} x {resolution} x {resolution} nodes" in written and "degree 1" in written
-        assert "6 views of the field, 128 x 128 pixels each, 40 degrees wide, from a Fibonacci lattice" in lost
+        assert "dB between the field and splatted Gaussians: 6 views, 128 x 128 pixels each, 40 degrees wide, from a" in lost
         assert float(share.split()[0]) == pytest.approx(99, abs=1)  # within three deviations of the outer ones
         loss[resolution] = float(lost.split()[0])
     assert loss[16] > loss[8] + 6
@@ -98,6 +104,50 @@ def test_convert_makes_a_field_and_says_its_loss(tmp_path: Path, capsys: pytest.
     _, share, lost, capped = capsys.readouterr().out.splitlines()
     assert float(share.split()[0]) < 60 and float(lost.split()[0]) < loss[8]
     assert capped == "1 Gaussians of an opacity above 0.999 were made as opaque as that"
+
+
+def ball_of_gaussians(count: int = 1500) -> Gaussians:
+    """Opaque ones on a sphere of radius 1, as wide as their neighbours are far."""
+    height = 1 - (2 * np.arange(count) + 1) / count
+    turn, flat = np.pi * (3 - np.sqrt(5)) * np.arange(count), np.sqrt(1 - height**2)
+    places = np.stack([flat * np.cos(turn), flat * np.sin(turn), height], axis=1)
+    scales = np.full((count, 3), np.log(np.sqrt(4 * np.pi / count) / 2))
+    colours = (places / 4 / CONSTANT_HARMONIC)[:, None]
+    return Gaussians(places, scales, np.tile([1.0, 0, 0, 0], (count, 1)), np.full(count, 4.0), colours)
+
+
+@pytest.mark.slow
+def test_convert_makes_gaussians_of_a_field_and_says_their_loss(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """There and back. Soft balls of 2 voxels: half the resolution widens them from 2 to 2.4 voxels and loses dB; Gaussians of
+    single voxels, which overlap, keep more of them than Gaussians of blocks of 4, which do not."""
+    balls = ball_of_gaussians(60)
+    write_gaussians(tmp_path / "a.ply", balls)
+    assert main(["convert", str(tmp_path / "a.ply"), str(tmp_path / "b.npz"), "--resolution", "24"]) == 0
+    capsys.readouterr()
+    loss, count = {}, {}
+    for resolution in (12, 4):
+        assert main(["convert", str(tmp_path / "b.npz"), str(tmp_path / "c.ply"), "--resolution", str(resolution)]) == 0
+        written, lost = capsys.readouterr().out.splitlines()
+        assert "dB between splatted Gaussians and the field: 6 views, 128 x 128 pixels each" in lost
+        count[resolution], loss[resolution] = read_gaussians(tmp_path / "c.ply").count, float(lost.split()[0])
+        assert f"c.ply: {count[resolution]} Gaussians of degree 0" in written
+    assert count[12] > 4 * count[4] and loss[12] > loss[4] + 3
+
+
+@pytest.mark.slow
+def test_convert_makes_a_mesh_and_says_its_distance(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A sphere. The depth of a splat is that of its mean, and a nearer one hides by its tail: half a voxel of 0.095, with
+    Gaussians of 0.046; the mesh follows such depths, which jump from splat to splat, to a voxel."""
+    write_gaussians(tmp_path / "a.ply", ball_of_gaussians())
+    assert main(["convert", str(tmp_path / "a.ply"), str(tmp_path / "b.ply"), "--to", "mesh", "--resolution", "24"]) == 0
+    written, apart, missed, views = capsys.readouterr().out.splitlines()
+    mesh = read_ply(tmp_path / "b.ply")
+    assert f"b.ply: {len(mesh.points)} points, {len(mesh.faces)} triangles, fused from 64 views" in written
+    radius = np.linalg.norm(mesh.points, axis=1)
+    assert np.abs(np.median(radius) - 1) < 0.095
+    median, most = (float(part.rpartition("(")[2]) for part in apart.split(" voxels)")[:2])
+    assert median < 1.5 and median < most < 3
+    assert float(missed.split()[0]) < 5 and "128 x 128 pixels" in views
 
 
 def test_explain_says_what_gaussians_there_are(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -49,6 +49,22 @@ def stack(opacity_logits: list[float], depths: list[float], scale: float = 0.2) 
     return arrays
 
 
+def test_the_median_depth_is_that_of_the_splat_at_which_half_of_the_light_is_lost(variant_rgb: str) -> None:
+    """Three of opacity 0.4 on the axis: 0.6, 0.36 and 0.216 is left behind them, so half of it is lost at the second.
+
+    Beside the axis, where alpha is below 1 - 0.5^(1/3) = 0.206 of each, more than half gets through all three: 0, as where
+    nothing is.
+    """
+    splatter = Splatter(SIDE, SIDE, 2, median=True)
+    reals = tensors(stack([np.log(0.4 / 0.6)] * 3, [0.0, 0.3, 0.6], scale=0.05))
+    picture, kept = splatter.forward(reals, straight())
+    depth, alpha = np.array(picture)[..., 3], np.array(picture)[..., 4]
+    assert depth[SIDE // 2, SIDE // 2] == pytest.approx(1.3, rel=1e-6)
+    assert (depth[alpha < 0.5 - 1e-6] == 0).all() and (depth[alpha > 0.5 + 1e-6] > 0).all()
+    with pytest.raises(MivolError, match="median depth, which has no derivatives"):
+        splatter.backward(kept, picture)
+
+
 def test_derivatives_at_an_opacity_of_one(splatter: Splatter) -> None:
     """In the pixel where alpha is 1 nothing behind is seen, and yet the derivative by the place of what hides it knows its
     colour. A logit of 20 is an opacity of 1 in float32; that of 30 behind it is hidden, and hides the third."""
