@@ -147,7 +147,7 @@ def _read_las(path: Path) -> PointCloud:
         with laspy.open(path) as file:
             check_memory(path, file.header.point_count * 8 * 6)
             points = file.read()
-    except (laspy.LaspyException, *DAMAGE) as error:
+    except (laspy.LaspyException, MemoryError, *DAMAGE) as error:
         raise refusal(path, f"a damaged LAS file ({error})", "a whole one", "copy it again") from error
     colours = None
     if {"red", "green", "blue"} <= set(points.point_format.dimension_names):

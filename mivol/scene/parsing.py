@@ -28,6 +28,9 @@ __all__ = [
 
 VARIANTS = ("llvm_ad_rgb", "llvm_ad_mono", "cuda_ad_rgb", "cuda_ad_mono")
 
+LONGEST_REASON = 700
+"""Characters of a message of Mitsuba's that are quoted: its lists of plugins and parameters are shorter."""
+
 # Header formats whose voxels lie in a second file: the key of the line that names it.
 DETACHED = {".mhd": "ElementDataFile", ".nhdr": "data file"}
 
@@ -52,8 +55,9 @@ def as_text(value: Any) -> str:
 
 
 def reason_of(error: Exception) -> str:
-    """Mitsuba's message without its source position, in one line."""
-    return " ".join(re.sub(r"^\s*\[[\w.]+:\d+\]\s*", "", str(error)).split())
+    """Mitsuba's message without its source position, in one line that does not quote all of a long file."""
+    text = " ".join(re.sub(r"^\s*\[[\w.]+:\d+\]\s*", "", str(error)).split())
+    return text if len(text) <= LONGEST_REASON else f"{text[:LONGEST_REASON]} ..."
 
 
 @contextmanager
@@ -84,8 +88,6 @@ def parse_file(path: Path, overrides: dict[str, str]) -> Any:
         if "unused parameters" in str(error):
             raise MivolError(_unused(path, overrides, str(error))) from None
         raise MivolError(f"{path} cannot be read: {reason_of(error)}") from error
-    except UnicodeDecodeError as error:  # of the text of Mitsuba's own refusal, which quotes the file
-        raise MivolError(f"{path} cannot be read: it names something in bytes that are not UTF-8; correct them.") from error
     return _resolve(parser, config, state, path)
 
 

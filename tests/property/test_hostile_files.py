@@ -165,11 +165,22 @@ def test_a_damaged_reference_is_named(tmp_path: Path, said: str) -> None:
         read_reference(tmp_path / "a.exr")
 
 
-def test_a_scene_of_foreign_bytes_is_refused(variant_rgb: str, tmp_path: Path) -> None:
-    """Found by the script: Mitsuba's refusal quotes the file, and is no text where the file is none."""
-    (tmp_path / "a.xml").write_bytes(b'<scene version="3.0.0"><inte\xaa\x89r name="a"/></scene>')
+@pytest.mark.parametrize(
+    "inside", [b'<inte\xaa\x89r name="a"/>', b'<emitter type="constant"><string name="\xfd" value="1"/></emitter>']
+)
+def test_a_scene_of_foreign_bytes_is_refused(variant_rgb: str, tmp_path: Path, inside: bytes) -> None:
+    """Found by the script: Mitsuba's refusals and settings quote the file, and are no text where the file is none."""
+    (tmp_path / "a.xml").write_bytes(b'<scene version="3.0.0">' + inside + b"</scene>")
     with pytest.raises(MivolError, match="bytes that are not UTF-8"):
         load_scene(tmp_path / "a.xml")
+
+
+def test_a_scene_of_a_name_without_an_end_is_refused(variant_rgb: str, tmp_path: Path) -> None:
+    """Found by the script: Mitsuba's refusal quotes all of it."""
+    (tmp_path / "a.xml").write_text(f'<scene version="3.0.0" {"A" * 70000}="1"/>')
+    with pytest.raises(MivolError) as refused:
+        load_scene(tmp_path / "a.xml")
+    assert len(str(refused.value).replace(str(tmp_path), "")) <= fuzz.LONGEST
 
 
 @pytest.mark.parametrize("name", ["run.json", "metrics.jsonl", "a.png"])
