@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from mivol.config import GaussianFit
 from mivol.experiments.film import Film
-from mivol.experiments.photo_outputs import named, write_view
+from mivol.experiments.judged_views import JudgedViews, caption_of, said_of
+from mivol.experiments.photo_outputs import named
 from mivol.experiments.run_folder import RunFolder
 from mivol.experiments.task import Task
 from mivol.optim.gaussian_problem import GaussianProblem
@@ -67,15 +68,16 @@ class GaussianOutputs:
         self.run.write_curves()
 
     def write_judged(self) -> dict[str, float]:
-        """Judge all views, and keep some of them beside their photographs."""
+        """Judge all views, and keep them beside their photographs."""
         chosen: GaussianFit = self.task.chosen
         views, found = self.judged.views, []
-        shown = set(np.linspace(0, len(views) - 1, min(chosen.show.views, len(views))).astype(int).tolist())
-        for number, photo in enumerate(views):
+        pictures = JudgedViews(self.run.path, self.judged.space, len(views), chosen.show.views)
+        for photo in views:
             seen, quality = compare(self.problem, self.judged, photo, chosen.show.metrics)
             found.append(quality)
-            if number in shown:
-                self.run.record.images += write_view(self.run.path, rectified(photo), number, seen)
+            pictures.add(rectified(photo), seen, next(iter(quality.values.values())), caption_of(quality))
+        self.run.record.images += pictures.images()
+        self.run.record.judged = said_of(views)
         return named(score(found).values)
 
     def write_film(self) -> Image:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from mivol.config import FieldFit
 from mivol.experiments.film import Film
+from mivol.experiments.judged_views import JudgedViews, caption_of, said_of
 from mivol.experiments.run_folder import RunFolder
 from mivol.experiments.task import Task
 from mivol.fields.sky import Sky
@@ -74,19 +75,20 @@ class PhotoOutputs:
         self.run.write_curves()
 
     def write_judged(self) -> dict[str, float]:
-        """Judge all views, and keep some of them beside their photographs, with distance and normals of the first."""
+        """Judge all views, and keep them beside their photographs, with distance and normals of the first."""
         chosen: FieldFit = self.task.chosen
-        views, found, images = self.judged.views, [], self.run.record.images
-        fitted = []
-        shown = set(np.linspace(0, len(views) - 1, min(chosen.show.views, len(views))).astype(int).tolist())
+        views, found, geometry, fitted = self.judged.views, [], [], []
+        pictures = JudgedViews(self.run.path, self.judged.space, len(views), chosen.show.views)
         for number, photo in enumerate(views):
             seen, quality = compare(self.problem, self.judged, photo, chosen.show.metrics)
             found.append(quality)
             fitted.append(judge_fitted(seen.image, photo, self.judged.space))
-            if number in shown:
-                images += write_view(self.run.path, photo, number, seen.image, self.judged.space)
+            psnr = quality.values.get("psnr", fitted[-1])
+            pictures.add(photo, seen.image, psnr, caption_of(quality, fitted[-1]))
             if number == 0:
-                images += write_geometry(self.run.path, seen, photo.camera, self.judged.near_far)
+                geometry = write_geometry(self.run.path, seen, photo.camera, self.judged.near_far)
+        self.run.record.images += [*pictures.images(), *geometry]
+        self.run.record.judged = said_of(views)
         self.run.record.tables.append(table_of_views(views[0].camera, found, fitted))
         return named(score(found).values) | {"psnr_colour_fitted": float(np.mean(fitted))}
 
@@ -179,17 +181,8 @@ def write_density(folder: Path, field: SphericalGrid, level: int) -> Volume:
     write_volume(folder / f"{name}.vol", sigma, field.to_world)
     write_volume(folder / f"{name}.npz", sigma, field.to_world)
     size = tuple(float(edge) for edge in np.abs(np.diag(field.to_world)[:3]))
-    return Volume(path=f"{name}.npz", role="reconstruction", size=size)
-
-
-def write_view(folder: Path, photo: Photo, number: int, image: NDArray, space: str = "srgb") -> list[Image]:
-    """A render beside its photograph, both as a screen shows them."""
-    written = []
-    for role, values in {"render": image, "reference": photo.image}.items():
-        path = f"views/{number:03d}_{role}.png"
-        write_png(folder / path, SPACES[space, "linear"](np.clip(values, 0, 1)))
-        written.append(Image(path=path, role=role, view=photo.name, held_out=True, quantity="sRGB value"))
-    return written
+    said = f"level {level}, of {2**level} times the extent" if level else ""
+    return Volume(path=f"{name}.npz", role="reconstruction", size=size, caption=said)
 
 
 def write_geometry(folder: Path, seen: FieldView, camera: Camera, near_far: tuple[float, float]) -> list[Image]:

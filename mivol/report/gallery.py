@@ -53,6 +53,7 @@ class ShownView(NamedTuple):
     pictures: list[Picture]
     psnr: float | None
     text: str
+    small: bool = False
 
 
 class Bar(NamedTuple):
@@ -136,7 +137,9 @@ def _check_sizes(view: str, roles: dict[str, NDArray]) -> None:
 
 
 def _add_differences(roles: dict[str, NDArray]) -> None:
-    """Put the difference and the z-image beside a reference and a render of linear values."""
+    """Put the difference and the z-image beside a reference and a render of linear values, an error beside those of pixels."""
+    if {"reference", "render"} <= roles.keys() and roles["reference"].dtype == roles["render"].dtype == np.uint8:
+        roles["error"] = np.abs(roles["render"].astype(float) - roles["reference"]).mean(axis=2) / 255
     if not _are_numbers(roles, "reference", "render"):
         return
     difference = roles["difference"] = roles["render"] - roles["reference"]
@@ -161,12 +164,21 @@ def _scales(views: Iterable[dict[str, NDArray]]) -> dict[str, show.Scale]:
         scales["reference"] = scales["render"] = show.scale_of(*values)
     if differences:
         scales["difference"] = show.signed_scale(*differences)
+    errors = [roles["error"] for roles in views if "error" in roles]
+    if errors:
+        scales["error"] = show.scale_of(*errors)
     if any("z" in roles for roles in views):
         scales["z"] = show.Scale("signed", -Z_LIMIT, Z_LIMIT)
     return scales
 
 
-PANELS = {"reference": "Reference", "render": "Render", "difference": "Render − reference", "z": "z-image"}
+PANELS = {
+    "reference": "Reference",
+    "render": "Render",
+    "difference": "Render − reference",
+    "error": "|Render − reference|",
+    "z": "z-image",
+}
 PANELS_OF_LINES = {
     "reference": "Measured",
     "render": "Modelled",
@@ -191,7 +203,8 @@ def _view(name: str, images: dict[str, Image], roles: dict[str, NDArray], scales
     if "z" in roles:
         words.append(f"|z| > {Z_ODD:g} in {np.mean(np.abs(roles['z']) > Z_ODD):.1%} of the values")
     held_out = any(image.held_out for image in images.values())
-    return ShownView(name, held_out, pictures, psnr, " · ".join(word for word in words if word))
+    small = any(image.small for image in images.values())
+    return ShownView(name, held_out, pictures, psnr, " · ".join(word for word in words if word), small)
 
 
 def _agreement(reference: NDArray, difference: NDArray) -> tuple[float | None, str]:
@@ -230,6 +243,7 @@ def _bar_labels(scales: dict[str, show.Scale], image: Image | None) -> list[tupl
     labels = {
         "reference": f"{what[:1].upper()}{what[1:]}",
         "difference": names["difference"],
+        "error": "|Render − reference|, mean of the colours [code value]",
         "z": names["z"] if names is PANELS_OF_LINES else "z = difference / standard error",
     }
     return [(role, label) for role, label in labels.items() if role in scales]

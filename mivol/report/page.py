@@ -84,13 +84,22 @@ def headline(record: RunRecord, held_out_psnr: Sequence[float] = ()) -> str:
     """
     found = []
     if held_out_psnr:
-        found.append(f"held-out views to {np.mean(held_out_psnr):.1f} dB PSNR")
+        found.append(f"held-out views to {np.mean(held_out_psnr):.1f} dB PSNR{_judged(record)}")
     if record.results.get("nrmse") is not None:
         found.append(f"the volume to an nRMSE of {record.results['nrmse']:.3g}")
     cores = f"{record.machine.cores} core" + ("s" if record.machine.cores != 1 else "")
     seconds = _seconds(record)
     when = f"{VERDICTS[record.status]} {_duration(seconds)}" if seconds else VERDICTS[record.status].rpartition(" ")[0]
     return f"{when} on {cores}" + (": " + ", ".join(found) if found else "") + "."
+
+
+def _judged(record: RunRecord) -> str:
+    """How the PSNR of held-out views was found, where the run judged them itself: how many, at which size, and with which
+    colours."""
+    if not record.judged:
+        return ""
+    fitted = record.results.get("psnr_colour_fitted")
+    return f" ({record.judged}, raw{'' if fitted is None else f'; {fitted:.1f} dB with their colours fitted'})"
 
 
 def _environment() -> jinja2.Environment:
@@ -138,7 +147,8 @@ def _numbers(record: RunRecord, views: Sequence[ShownView], volumes: Sequence[Cu
         tiles.append(_tile("nrmse", record.results["nrmse"]))
     if held_out:
         spread = f" ({min(held_out):.1f} to {max(held_out):.1f})" if len(held_out) > 1 else ""
-        tiles.append((f"{np.mean(held_out):.1f}", "dB", f"PSNR, held-out views{spread}"))
+        said_of = f": {record.judged}, raw" if record.judged else ""
+        tiles.append((f"{np.mean(held_out):.1f}", "dB", f"PSNR, held-out views{spread}{said_of}"))
     if seconds:
         tiles.append((*_duration(seconds).split(" "), "in all"))
     tiles += [_tile(name, value) for name, value in record.results.items() if name not in said]

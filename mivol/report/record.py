@@ -117,6 +117,8 @@ class Image(_Part):
     quantity: str = "radiance"
     unit: str = ""
     caption: str = ""
+    small: bool = False
+    """Whether it is one of many that a page is scrolled through."""
 
 
 class Volume(_Part):
@@ -156,6 +158,8 @@ class RunRecord(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
     title: str
     machine: Machine
     schema: Literal[1] = 1
+    judged: str = ""
+    """By which views the results are judged: how many, and at which size."""
     method: str = ""
     """One line: model, solver, what is optimised."""
     status: Literal["running", "finished", "stopped"] = "running"

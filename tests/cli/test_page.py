@@ -118,6 +118,25 @@ def test_page_loads_nothing(run_folder, page):
     assert all(target.startswith("#") for target in re.findall(r"url\(\s*['\"]?([^)'\"]*)", text))
 
 
+def test_judged_views_are_scrolled_through(tmp_path):
+    """Those that are small, in one frame below the others, each with what is said of it; and how many at which size."""
+    images = []
+    for view in ("large", "one", "two"):
+        for role in ("reference", "render"):
+            write_png(tmp_path / f"{view}_{role}.png", np.full((2, 2, 3), 0.5))
+            said = f"of {view}" if role == "render" else ""
+            here = {"view": view, "held_out": True, "caption": said, "small": view != "large"}
+            images.append(Image(path=f"{view}_{role}.png", role=role, **here))
+    results = {"held_out_psnr": 24.0, "psnr_colour_fitted": 25.0}
+    record = RunRecord.new("Views", images=images, judged="3 views at 2 x 2 pixels", results=results)
+    write_record(record, tmp_path)
+    page = Page(write_page(tmp_path).read_text(encoding="utf-8"))
+    text = page.text.replace("\u00a0", " ").replace("\u2011", "-")
+    assert "The other 2 that were judged" in text and text.count("of one") == 2 and text.count("of two") == 1
+    assert "held-out views to 24.0 dB PSNR (3 views at 2 x 2 pixels, raw; 25.0 dB with their colours fitted)" in text
+    assert "PSNR, held-out views: 3 views at 2 x 2 pixels, raw" in text
+
+
 def test_page_shows_all_that_the_record_names(run_folder, page):
     names = [name for name, _ in page.pictures()]
     assert names.count("Reference") == names.count("Render") == names.count("z-image") == 2

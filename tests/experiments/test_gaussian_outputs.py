@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from mivol.experiments import gaussian_outputs as outputs
+from mivol.experiments import judged_views
 from mivol.experiments.film import Film
 from mivol.points import Gaussians
 from mivol.validate.images import Quality
@@ -69,6 +70,7 @@ def fit_of(monkeypatch: pytest.MonkeyPatch, folder: Path, views: int, shown: int
     photos = SimpleNamespace(
         views=[SimpleNamespace(camera=camera, background=np.array([0.1, 0.2, 0.3]), name=f"{k}") for k in range(views)],
         box="box",
+        space="srgb",
     )
     plan = SimpleNamespace(low_pass=0.3, low_pass_at=lambda shrink: ("low pass at", shrink))
     problem = SimpleNamespace(
@@ -76,7 +78,8 @@ def fit_of(monkeypatch: pytest.MonkeyPatch, folder: Path, views: int, shown: int
     )
     monkeypatch.setattr(outputs, "write_gaussians", lambda path, found: path.write_bytes(bytes(100)))
     monkeypatch.setattr(outputs, "rectified", lambda photo: photo)
-    monkeypatch.setattr(outputs, "write_view", lambda path, photo, number, seen: [(photo.name, number, seen)])
+    written = lambda folder, photo, number, seen, space, caption, edge=None: [(photo.name, seen, caption, edge)]  # noqa: E731
+    monkeypatch.setattr(judged_views, "write_view", written)
     monkeypatch.setattr(
         outputs,
         "compare",
@@ -88,14 +91,17 @@ def fit_of(monkeypatch: pytest.MonkeyPatch, folder: Path, views: int, shown: int
     return outputs.GaussianOutputs(task, run, fit, photos, photos if shown else None, film), record, run, watcher
 
 
-@pytest.mark.parametrize(("views", "shown", "numbers"), [(7, 3, [0, 3, 6]), (2, 5, [0, 1]), (4, 1, [0])])
-def test_judged_views_are_spread_over_all(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, views: int, shown: int, numbers: list[int]
+@pytest.mark.parametrize(("views", "shown", "full"), [(7, 3, [0, 3, 6]), (2, 5, [0, 1]), (4, 1, [0])])
+def test_judged_views_are_kept(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, views: int, shown: int, full: list[int]
 ) -> None:
-    """All are judged; as many as are asked for, from the first to the last, are kept beside their photographs."""
+    """All are judged and kept beside their photographs: as many as are asked for in full, of which the first is the worst."""
     found, record, run, _ = fit_of(monkeypatch, tmp_path, views, shown, frames=0)
     found.write()
-    assert record.images == [(f"{k}", k, f"seen {k}") for k in numbers]
+    assert [(name, seen) for name, seen, _, edge in record.images if edge is None] == [(f"{k}", f"seen {k}") for k in full]
+    assert sorted(name for name, *_ in record.images) == [f"{k}" for k in range(views)]
+    assert record.images[0][2] == f"the worst of {views}: PSNR [dB] 20.00"
+    assert record.judged == f"{views} views at 1600 x 1200 pixels"
     assert record.results == {"views": views, "iterations": 77.0, "gaussians": 3.0, "held_out_psnr": pytest.approx(20.0)}
     assert run.written == ["curves"] and record.tables[0].rows[2] == ("file", "0.00 MiB")
     assert (tmp_path / "views").is_dir() and (tmp_path / "film").is_dir()

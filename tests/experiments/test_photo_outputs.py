@@ -13,7 +13,7 @@ from mivol.fields.spherical import SphericalGrid
 from mivol.fields.spherical_files import save_field
 from mivol.files import read_volume
 from mivol.optim.field_view import FieldView
-from mivol.photos import Camera, Photo, intrinsics
+from mivol.photos import Camera, intrinsics
 from mivol.validate.images import Quality
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
@@ -30,19 +30,6 @@ def field(keep: np.ndarray | None = None) -> SphericalGrid:
 
 def camera(width: int = 4, height: int = 2) -> Camera:
     return Camera(intrinsics(width, height, width, height), (width, height), np.eye(4))
-
-
-def test_a_view_stands_beside_its_photograph(tmp_path):
-    """Both as sRGB, clipped; on record as held out."""
-    (tmp_path / "views").mkdir()
-    photo = Photo("emitter", np.full((2, 4, 3), 0.6, np.float32), None, None, camera(), np.zeros(3))
-    found = photo_outputs.write_view(tmp_path, photo, 7, np.full((2, 4, 3), [1.5, 0.4, -1]))
-    assert [(i.path, i.role, i.view, i.held_out, i.quantity) for i in found] == [
-        ("views/007_render.png", "render", "emitter", True, "sRGB value"),
-        ("views/007_reference.png", "reference", "emitter", True, "sRGB value"),
-    ]
-    pixels = [np.array(Image.open(tmp_path / image.path))[0, 0].tolist() for image in found]
-    assert pixels == [[255, 102, 0], [153, 153, 153]]
 
 
 @pytest.mark.parametrize("kept", [60, 10])
@@ -69,7 +56,9 @@ def test_densities_are_written_for_other_programs(tmp_path):
     assert (found.path, found.role, found.size) == ("volumes/density.npz", "reconstruction", EDGES)
     for name in ("density.vol", "density.npz"):
         np.testing.assert_allclose(read_volume(tmp_path / "volumes" / name).values.ravel(), 1 + np.arange(60), rtol=1e-6)
-    assert photo_outputs.write_density(tmp_path, field(), 2).path == "volumes/density-level-2.npz"
+    outer = photo_outputs.write_density(tmp_path, field(), 2)
+    # A page puts together what has one caption: levels are volumes of their own.
+    assert (outer.path, outer.caption) == ("volumes/density-level-2.npz", "level 2, of 4 times the extent")
 
 
 def test_distance_and_normals_are_pictures(tmp_path):

@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
-from mivol.files import write_volume
+from mivol.files import write_png, write_volume
+from mivol.photos.picture import decode_srgb
 from mivol.report import show
-from mivol.report.gallery import LAYER_EDGE, LAYERS, Picture, film_of, plain_picture, volumes_of
+from mivol.report.gallery import LAYER_EDGE, LAYERS, Picture, film_of, plain_picture, views_of, volumes_of
 from mivol.report.record import Image, Volume
 
 
@@ -75,3 +76,22 @@ def test_large_volumes_show_some_of_their_layers_with_fewer_pixels(tmp_path: Pat
     assert [layer["text"] for layer in tall.layers[:2]] == ["z = 2 of 40", "z = 4 of 40"]
     assert tall.layers[-1]["text"] == "z = 39 of 40"
     assert pixels(tall.layers[0]["pictures"][0]).shape == (2, LAYER_EDGE // 2 + 1, 3)
+
+
+def test_pixels_of_photographs_have_an_error_beside_them(tmp_path: Path) -> None:
+    """Means over the colours of what 8 bits differ by, on one scale of all views, whichever of the two is brighter."""
+    images = []
+    for view, codes in {"a": (51, 102), "b": (102, 51)}.items():
+        for role, code in zip(("reference", "render"), codes, strict=True):
+            values = np.zeros((2, 2, 3))
+            values[0, 0] = code / 255
+            write_png(tmp_path / f"{view}_{role}.png", decode_srgb(values))
+            images.append(Image(path=f"{view}_{role}.png", role=role, view=view, held_out=True, small=view == "b"))
+    gallery = views_of(tmp_path, images)
+    assert [view.small for view in gallery.rows] == [False, True]
+    (bar,) = gallery.bars
+    assert bar.label == "|Render − reference|, mean of the colours [code value]"
+    for view in gallery.rows:
+        assert [picture.name for picture in view.pictures] == ["Reference", "Render", "|Render − reference|"]
+        error = pixels(view.pictures[2])
+        assert error[0, 0, 0] > 0.99 and (error.reshape(-1, 3)[1:] == 0).all()
