@@ -94,13 +94,19 @@ def explain_flags(sub: argparse.ArgumentParser) -> None:
 
 
 def render_flags(sub: argparse.ArgumentParser) -> None:
-    """Mitsuba's own flags for an image, and the camera of a radiance field."""
-    scene_flags(sub, "Mitsuba XML, or a radiance field (.npz) with --look-at")
-    where = "of a field: where the camera stands, and what it looks at [length]"
+    """Mitsuba's own flags for an image, and the camera of a radiance field, of points and of Gaussians."""
+    from mivol.experiments.view_points import DRAWN_AS
+
+    scene_flags(sub, "Mitsuba XML, a radiance field (.npz) with --look-at, or points or Gaussians (.ply, .npy, .spz, ...)")
+    where = "of a field or points: where the camera stands, and what it looks at [length]; default for points: all is seen"
     sub.add_argument("--look-at", type=float, nargs=6, metavar=("x", "y", "z", "to_x", "to_y", "to_z"), help=where)
-    sub.add_argument("--up", type=float, nargs=3, metavar=("x", "y", "z"), default=[0.0, 0.0, 1.0], help="of a field's picture")
-    sub.add_argument("--fov", type=float, default=50.0, help="of a field's picture, across [degree] (default: %(default)s)")
-    sub.add_argument("--size", type=int, nargs=2, metavar=("width", "height"), default=[640, 480], help="of a field's picture")
+    sub.add_argument("--up", type=float, nargs=3, metavar=("x", "y", "z"), default=[0.0, 0.0, 1.0], help="of such a picture")
+    sub.add_argument("--fov", type=float, default=50.0, help="of such a picture, across [degree] (default: %(default)s)")
+    sub.add_argument("--size", type=int, nargs=2, metavar=("width", "height"), default=[640, 480], help="of such a picture")
+    sub.add_argument("--points", choices=DRAWN_AS, default=DRAWN_AS[0], help="what points are drawn as (default: %(default)s)")
+    sizes = "of points: radius, or standard deviation of splats [length]; default: half their distance"
+    sub.add_argument("--radius", type=float, help=sizes)
+    sub.add_argument("--opacity", type=float, default=1.0, help="of points (default: %(default)s)")
     sub.add_argument("-s", "--sensor", type=int, default=0, help="number of the sensor")
     sub.add_argument("-o", "--output", type=Path, help="image (.exr or .png); default: the XML's name with .exr")
     sub.add_argument("--integrator", help="in place of the scene's own, with its max_depth: mivol, volpath, ...")
@@ -280,23 +286,14 @@ def explain_photos(arguments: argparse.Namespace) -> int:
 
 
 def render(arguments: argparse.Namespace) -> None:
-    """Render a scene to an image, with the flags of the command ``mitsuba``; or a radiance field, from where one likes."""
+    """Render a scene to an image, with the flags of the command ``mitsuba``; or a field or points, from where one likes."""
     from mivol.cli.loading import load
     from mivol.experiments.render import check_output, choose_integrator, name_of, render_image, write_image
 
     path = arguments.output or arguments.scene.with_suffix(".exr")
     check_output(path)
-    is_field = arguments.scene.suffix.lower() == ".npz"
-    if is_field != (arguments.look_at is not None):
-        wanted = "a radiance field needs --look-at" if is_field else "--look-at is for a radiance field (.npz)"
-        raise MivolError(f"{arguments.scene}: {wanted}; a scene has its own cameras.")
-    if is_field:
-        from mivol.experiments.back_end import set_variant
-        from mivol.experiments.view_field import view_field
-
-        set_variant(arguments.mode)
-        camera = arguments.look_at, arguments.up, arguments.fov, tuple(arguments.size)
-        write_image(path, view_field(arguments.scene, *camera), ["R", "G", "B"])
+    if own := own_picture(arguments):
+        write_image(path, own(), ["R", "G", "B"])
         print(path)
         return
     scene = load(arguments).scene
@@ -305,6 +302,32 @@ def render(arguments: argparse.Namespace) -> None:
         print(f"rendered by {name_of(integrator)}; --integrator mivol renders with mivol", file=sys.stderr)
     write_image(path, *render_image(scene, arguments.sensor, integrator, arguments.spp, arguments.seed))
     print(path)
+
+
+def own_picture(arguments: argparse.Namespace) -> Callable | None:
+    """What draws a picture of what is no scene: of a radiance field, of points or Gaussians; None: it is a scene.
+
+    Raises:
+        MivolError: a camera for a scene, or none for a field.
+    """
+    from mivol.experiments.back_end import set_variant
+    from mivol.experiments.view_field import view_field
+    from mivol.experiments.view_points import PointLook, view_points
+    from mivol.points.facts import SUFFIXES
+
+    suffix = arguments.scene.suffix.lower()
+    is_field, is_cloud = suffix == ".npz", suffix in SUFFIXES
+    if not is_cloud and is_field != (arguments.look_at is not None):
+        wanted = "a radiance field needs --look-at" if is_field else "--look-at is for a radiance field (.npz) or points"
+        raise MivolError(f"{arguments.scene}: {wanted}; a scene has its own cameras.")
+    look = PointLook(arguments.points, arguments.radius, arguments.opacity)
+    if not is_cloud and look != PointLook():
+        raise MivolError(f"{arguments.scene}: --points, --radius and --opacity are for clouds of points: leave them out.")
+    if not (is_field or is_cloud):
+        return None
+    set_variant(arguments.mode)
+    camera = arguments.look_at, arguments.up, arguments.fov, tuple(arguments.size)
+    return (lambda: view_points(arguments.scene, *camera, look)) if is_cloud else (lambda: view_field(arguments.scene, *camera))
 
 
 def reference(arguments: argparse.Namespace) -> None:

@@ -17,10 +17,13 @@ from mivol.points.conversions import gaussians_of_points, points_of_gaussians
 from mivol.points.gaussian_files import READERS, WRITERS, holds_gaussians, read_gaussians, write_gaussians
 from mivol.points.gaussians import Gaussians
 
-__all__ = ["KINDS", "Facts", "convert_file", "is_points_file", "read_facts"]
+__all__ = ["KINDS", "SUFFIXES", "Facts", "convert_file", "is_points_file", "read_facts"]
 
 KINDS = ("gaussians", "points")
 """What a file can be written as."""
+
+SUFFIXES = READERS.keys() | CLOUD_READERS.keys()
+"""Of files of Gaussians and of points."""
 
 FAINT = 0.05
 """Gaussians of a smaller opacity are counted: they cost time and show little."""
@@ -36,7 +39,7 @@ class Facts:
 
 def is_points_file(path: Path) -> bool:
     """Whether the suffix is one of Gaussians or of points."""
-    return path.is_file() and path.suffix.lower() in READERS.keys() | CLOUD_READERS.keys()
+    return path.is_file() and path.suffix.lower() in SUFFIXES
 
 
 def read_facts(path: Path) -> Facts:

@@ -28,6 +28,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
+from mivol.splatting.projection import EXP2
 from mivol.splatting.tile_lists import TILE, Grid
 
 __all__ = ["CHUNK", "LANES", "PIXELS", "STOP", "Adjoint", "Frame", "Lists", "composite", "composite_adjoint"]
@@ -75,6 +76,7 @@ class Frame:
         depth: whether the depth is a channel.
         median: whether that channel is the depth of the splat at which T falls below a half, instead of the mean times alpha.
         remembers: whether T is written down.
+        discs: whether a splat is the inside of its ellipse of one standard deviation, instead of a Gaussian.
     """
 
     width: mi.UInt32
@@ -84,6 +86,7 @@ class Frame:
     depth: bool
     median: bool
     remembers: bool
+    discs: bool = False
 
 
 @dataclass
@@ -156,16 +159,31 @@ class _Footprint:
     colour: list[mi.Float]
 
     @classmethod
-    def of(cls, shape: mi.Float, index: mi.UInt32, there: mi.Bool, lane: _Lane, grid: Grid) -> _Footprint:
+    def of(cls, shape: mi.Float, index: mi.UInt32, there: mi.Bool, lane: _Lane, grid: Grid, discs: bool) -> _Footprint:
         x, y, xx, xy, yy, opacity, *colour = dr.gather(mi.ArrayXf, shape, index, there, shape=(8, dr.width(index)))
         dx = [mi.Float(lane.x) + (0.5 + p) - x for p in range(BLOCK)]
         dy = [mi.Float(lane.y) + (0.5 + p) - y for p in range(BLOCK)]
         q = [dr.fma(xx * a, a, dr.fma(xy * a, b, yy * b * b)) for b in dy for a in dx]
-        falloff = [dr.exp2(value) for value in q]
+        if discs:
+            slopes = [(2 * xx * a + xy * b, 2 * yy * b + xy * a) for b in dy for a in dx]
+            falloff = [_covered(value, *slope) for value, slope in zip(q, slopes, strict=True)]
+        else:
+            falloff = [dr.exp2(value) for value in q]
         alpha = [opacity * value for value in falloff]
         drawn = [there & (value >= grid.least) for value in alpha]
         alpha = [dr.select(d, value, 0) for d, value in zip(drawn, alpha, strict=True)]
         return cls(dx, dy, xx, xy, yy, opacity, falloff, alpha, drawn, colour)
+
+
+def _covered(q: mi.Float, q_x: mi.Float, q_y: mi.Float) -> mi.Float:
+    """Share of a pixel that the ellipse of one standard deviation covers, to first order in its distance from the border.
+
+    m = sqrt(q / EXP2) is 1 on the border, and (1 - m) / |grad m| the distance from it [pixel]: the share falls from 1 to 0
+    between half a pixel inside and half a pixel outside, as that of a pixel that a straight border cuts along its edges.
+    """
+    m = dr.sqrt(q * (1 / EXP2))
+    slope = dr.sqrt(q_x * q_x + q_y * q_y) * dr.rcp(-2 * EXP2 * dr.maximum(m, 1e-6))
+    return dr.clip(0.5 + (1 - m) * dr.rcp(dr.maximum(slope, 1e-9)), 0, 1)
 
 
 def _rest(rest: mi.Float, index: mi.UInt32, there: mi.Bool, depth: bool) -> list[mi.Float]:
@@ -198,7 +216,7 @@ def composite(
             dr.scatter(frame.transmittance, mi.ArrayXf(_product(clear, most)), lane.transmittance(chunk))
         for k in range(CHUNK):
             index, there = lane.splat(lists, chunk * CHUNK + k)
-            print_ = _Footprint.of(shape, index, there, lane, grid)
+            print_ = _Footprint.of(shape, index, there, lane, grid, frame.discs)
             tint = print_.colour + _rest(rest, index, there, frame.depth)
             for p in range(PIXELS):
                 a, u = print_.alpha[p], 1 - print_.alpha[p]
@@ -248,7 +266,7 @@ def composite_adjoint(splats: tuple[mi.Float, mi.Float], lists: Lists, grid: Gri
         seen = []
         for k in range(CHUNK):
             index, there = lane.splat(lists, chunk * CHUNK + k)
-            print_ = _Footprint.of(shape, index, there, lane, grid)
+            print_ = _Footprint.of(shape, index, there, lane, grid, frame.discs)
             seen.append((index, there, print_, list(t)))
             t = [t[p] * (1 - print_.alpha[p]) for p in range(PIXELS)]
         for index, there, print_, t in reversed(seen):

@@ -84,8 +84,10 @@ class Splatter:
             fit at a lower one learns no blur. The picture's own by default.
         compensated: keep the integral of alpha under the low-pass filter (mip-splatting), instead of its peak.
         depth: give the expected depth, multiplied by alpha, as a channel between rgb and alpha.
-        median: give in its place the depth of the splat at which less than half of the light is left; 0 where more gets through.
-            Such pictures have no derivatives.
+        median: give in its place the depth of the splat at which less than half of the light is left; 0 where more gets
+            through. Such pictures have no derivatives.
+        discs: draw a splat as the inside of its ellipse of one standard deviation, each pixel by the share that it covers of
+            it: a point of a given radius. Such pictures have no derivatives.
         near: least depth of a mean that is drawn [length]. A Gaussian that reaches across the camera is drawn if its mean is in
             front of this plane.
         least_alpha: a splat is skipped in pixels where its alpha is below.
@@ -109,13 +111,14 @@ class Splatter:
         compensated: bool = False,
         depth: bool = False,
         median: bool = False,
+        discs: bool = False,
         near: float = 0.01,
         least_alpha: float = 1 / 255,
     ) -> None:
         _check_variant()
         _check_settings(width, height, degree, low_pass, near, least_alpha)
         self.size, self.degree, self.depth, self.compensated = (width, height), degree, depth or median, compensated
-        self.median = median
+        self.median, self.discs = median, discs
         self.channels = 5 if depth or median else 4
         columns, rows = -(-width // TILE), -(-height // TILE)
         self.n_tiles = columns * rows
@@ -177,15 +180,16 @@ class Splatter:
             And the statistics of the screen.
 
         Raises:
-            MivolError: a derivative of another shape, or a picture that was drawn without derivatives or with a median depth.
+            MivolError: a derivative of another shape, or a picture drawn without derivatives, with a median depth or of discs.
         """
         if tuple(d_picture.shape) != (self.size[1], self.size[0], self.channels):
             raise MivolError(
                 f"Found a derivative of shape {tuple(d_picture.shape)}, expected the picture's "
                 f"{(self.size[1], self.size[0], self.channels)}."
             )
-        if self.median:
-            raise MivolError("Found a picture with the median depth, which has no derivatives: ask for depth=True instead.")
+        if self.median or self.discs:
+            found = "of discs, which have" if self.discs else "with the median depth, which has"
+            raise MivolError(f"Found a picture {found} no derivatives: make a Splatter of Gaussians with depth=True instead.")
         if not kept.frame.remembers:
             raise MivolError("Found a picture that was drawn with derivatives=False: draw it again with derivatives=True.")
         n = kept.shapes["means"][0]
@@ -263,13 +267,13 @@ class Splatter:
         n_chunks = int(lists.chunks[self.n_tiles]) if derivatives else 0
         transmittance = _blank(max(n_chunks, 1) * LANES * PIXELS)
         image = _blank(width * height * self.channels)
-        return Frame(self._width, self._height, image, transmittance, self.depth, self.median, derivatives)
+        return Frame(self._width, self._height, image, transmittance, self.depth, self.median, derivatives, self.discs)
 
     def _nothing(self, cloud: Cloud, view: mi.Float, shapes: Mapping[str, tuple[int, ...]]) -> tuple[mi.TensorXf, Kept]:
         """The picture of a cloud without Gaussians."""
         nothing, empty = mi.Float(), np.zeros(0, np.float32)
         lists = Lists(mi.UInt32(), mi.UInt32(), mi.UInt32(), mi.UInt32())
-        frame = Frame(self._width, self._height, nothing, nothing, self.depth, self.median, True)
+        frame = Frame(self._width, self._height, nothing, nothing, self.depth, self.median, True, self.discs)
         kept = Kept(cloud, view, shapes, nothing, nothing, lists, frame, mi.UInt32(), np.zeros(0, bool), empty)
         return dr.zeros(mi.TensorXf, (self.size[1], self.size[0], self.channels)), kept
 

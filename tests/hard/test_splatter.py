@@ -65,6 +65,47 @@ def test_the_median_depth_is_that_of_the_splat_at_which_half_of_the_light_is_los
         splatter.backward(kept, picture)
 
 
+def disc_picture(radius: float, depth: float = 0.0, beside: float = 0.0, opacity: float = 20.0) -> np.ndarray:
+    """Alpha of one disc of a radius [pixel at the origin] so far behind the origin and so many pixels beside the axis."""
+    arrays = stack([opacity], [depth], scale=radius / SIDE)
+    arrays["means"][0, 0] = beside / SIDE * (1 + depth)
+    splatter = Splatter(SIDE, SIDE, 2, compensated=True, discs=True)
+    return np.array(splatter.forward(tensors(arrays), straight())[0])[..., 3]
+
+
+def test_a_disc_covers_its_area_and_nothing_else(variant_rgb: str) -> None:
+    """Radius 6 pixels, widened to sqrt(36.3) with an opacity of 36 / 36.3: pi 36 pixels in all.
+
+    The share of a pixel is linear in the distance of its centre from the border, and exact only where the border is parallel
+    to an edge: 6 % of a pixel at most, of either sign, in the 2 pi 6 pixels of the border; less than 1 % of the area.
+    """
+    for beside in (0.0, 0.3, 0.5):
+        alpha = disc_picture(6, beside=beside)
+        assert alpha.sum() == pytest.approx(np.pi * 36, rel=0.01)
+        x = np.arange(SIDE) - SIDE // 2
+        away = np.hypot(x[None, :] - beside, x[:, None])
+        np.testing.assert_allclose(alpha[away < 5.5], 36 / 36.3, atol=1e-3)
+        assert (alpha[away > 6.6] == 0).all() and alpha[np.abs(away - 6) < 0.2].min() > 0
+
+
+def test_the_light_of_a_small_disc_falls_with_the_square_of_its_distance(variant_rgb: str) -> None:
+    """Radii of 2 to 0.25 pixels. The smallest is drawn with a radius of 0.6, whose border no pixel sees as straight: a
+    quarter of its area, wherever it lies in a pixel; without the widened radius one pixel or none would show it."""
+    for depth in (0.0, 1.0, 3.0, 7.0):
+        for beside in (0.0, 0.25, 0.5):
+            area = np.pi * (2 / (1 + depth)) ** 2
+            assert disc_picture(2, depth, beside).sum() == pytest.approx(area, rel=0.25), (depth, beside)
+
+
+def test_nearer_discs_hide_those_behind_and_have_no_derivatives(variant_rgb: str) -> None:
+    splatter = Splatter(SIDE, SIDE, 2, discs=True)
+    reals = tensors(stack([20.0, 20.0], [0.3, 0.0], scale=0.2))  # greys of 0.22 behind and 0.78 in front
+    picture, kept = splatter.forward(reals, straight())
+    assert np.array(picture)[SIDE // 2, SIDE // 2, 0] == pytest.approx(0.5 + 0.5 / np.sqrt(np.pi), abs=1e-4)
+    with pytest.raises(MivolError, match="of discs, which have no derivatives"):
+        splatter.backward(kept, picture)
+
+
 def test_derivatives_at_an_opacity_of_one(splatter: Splatter) -> None:
     """In the pixel where alpha is 1 nothing behind is seen, and yet the derivative by the place of what hides it knows its
     colour. A logit of 20 is an opacity of 1 in float32; that of 30 behind it is hidden, and hides the third."""
