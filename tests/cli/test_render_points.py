@@ -29,7 +29,7 @@ def test_a_cloud_is_seen_whole_without_a_camera(tmp_path: Path, drawn_as: str) -
     """Where points stand densely they are lighter; nothing touches the border, where the outermost 1 % may be."""
     two_cores(tmp_path / "cloud.npy")
     out = tmp_path / "picture.png"
-    flags = ["--points", drawn_as, "--radius", "0.04", "--opacity", "0.8", *SMALL]
+    flags = ["--points", drawn_as, "--radius", "0.04", "--opacity", "0.8", "--fov", "30", *SMALL]
     assert main(["render", str(tmp_path / "cloud.npy"), "-o", str(out), *flags]) == 0
     picture = imread(out).astype(float).sum(axis=2)
     assert picture.shape == (32, 48) and picture.max() > 400
