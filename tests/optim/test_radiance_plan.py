@@ -85,6 +85,9 @@ def test_schedules() -> None:
     assert [event.due(step) for event in plan.course().events[:1] for step in (0, 59, 60, 61)] == [False, False, True, False]
     assert plan.rates(0) == pytest.approx((0.1, 0.05))
     assert plan.rates(150) == pytest.approx((0.1, 0.0005))
+    slower = replace(plan, stages=(replace(plan.stages[0], rate=0.25), plan.stages[1]))
+    assert [slower.rates(step)[0] / plan.rates(step)[0] for step in (0, 59, 60, 150)] == pytest.approx([0.25, 0.25, 1, 1])
+    assert [slower.rates(step)[1] == plan.rates(step)[1] for step in (0, 59, 60)] == [True] * 3
     climbing = FitPlan((Stage(8, 1), Stage(16, 1), Stage(32, 1)), degree=2, first_degree=0)
     assert [climbing.degree_at(k) for k in range(3)] == [0, 1, 2]
     assert [replace(climbing, first_degree=None).degree_at(k) for k in range(3)] == [2, 2, 2]
