@@ -1,8 +1,8 @@
-"""The film of a fit of photographs: its camera's way is settled before the fit, its pictures are made after it."""
+"""Films of runs: that of a fit of photographs, whose camera's way is settled before the fit, and that of a volume."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,12 +11,14 @@ from numpy.typing import NDArray
 
 from mivol.config import Shown
 from mivol.errors import MivolError
+from mivol.experiments.run_folder import RunFolder
 from mivol.experiments.task import Watcher
 from mivol.photos import Camera, Photos, between, past, turntable
 from mivol.report.record import Image
 from mivol.report.video import WITHOUT_FFMPEG, film_suffix, write_video
+from mivol.report.volume_film import volume_frames
 
-__all__ = ["Film", "plan_film"]
+__all__ = ["Film", "film_of_volume", "plan_film"]
 
 FILM_SIZE = 256
 """Longest edge of a film [pixel]."""
@@ -88,6 +90,28 @@ def plan_film(show: Shown, photos: Photos) -> Film:
         return Film((), notes=(f"There is no film: {error}",))
     small = tuple(_small(camera) for camera in found)
     return Film(small, show.way, found[0].size[0] / small[0].size[0])
+
+
+def film_of_volume(run: RunFolder, values: NDArray, size: Sequence[float], upright: str, quantity: str) -> list[Image]:
+    """Write a volume as it turns about its upright axis; no film where :func:`volume_frames` has none.
+
+    It is an animated WebP everywhere, which is small: its pictures are grey.
+
+    Args:
+        run: the film lies in its ``film/``.
+        values: (Z, Y, X, C).
+        size: world lengths of the box's edges along x, y, z.
+        upright: "y" or "z".
+        quantity: of the values, for the caption.
+    """
+    frames, largest = volume_frames(values, size, upright)
+    if not frames:
+        return []
+    run.make("film")
+    write_video(run.path / "film/volume.webp", frames, fps=len(frames) / SECONDS)
+    white = f"white is {largest:.3g} ({quantity} times length)"
+    said = f"The volume from {len(frames)} sides: integrals along parallel rays, {white}"
+    return [Image(path="film/volume.webp", role="film", caption=said)]
 
 
 def _small(camera: Camera) -> Camera:

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mivol.experiments.best import BestIterate
+from mivol.experiments.film import film_of_volume
 from mivol.experiments.projections import Projections
 from mivol.experiments.run_folder import RunFolder
 from mivol.files import write_exr, write_volume
@@ -35,6 +36,7 @@ def write_outputs(
     predicted, record = projector @ x, run.record
     volume = voxel_means(x, grid.shape)
     record.volumes += write_grids(run.path, grid, volume, data.truth)
+    record.images += film_of_volume(run, volume[..., None], tuple(float(edge) for edge in grid.extent), "z", "sigma_t")
     middle = data.y.shape[1] // 2
     noise = noise_of(data)
     said = f"row {middle + 1} of {data.y.shape[1]}"

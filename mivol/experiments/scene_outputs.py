@@ -13,6 +13,7 @@ import numpy as np
 
 from mivol.config import Experiment, Sought
 from mivol.experiments.best import BestIterate
+from mivol.experiments.film import film_of_volume
 from mivol.experiments.references import References
 from mivol.experiments.run_folder import RunFolder
 from mivol.experiments.start import edges_of, place_of
@@ -85,7 +86,7 @@ class SceneOutputs:
         return [Image(path=f"{stem}.exr", role=role, layer=layer_of(*part), **about) for role, part in parts.items()]
 
     def write_grid(self, sought: Sought) -> list[Volume]:
-        """A parameter that is a grid, as .npz and .vol where it lies in the scene; the truth beside it.
+        """A parameter that is a grid, as .npz and .vol where it lies in the scene, and as a film; the truth beside it.
 
         A .vol has room for boxes along the axes only: of a turned grid it holds the unit cube, which the scene places.
         """
@@ -105,6 +106,7 @@ class SceneOutputs:
             write_volume(self.run.path / f"{stem}.npz", grid, place, metadata={"key": sought.key, "unit": sought.unit})
             about = {"quantity": quantity, "unit": sought.unit, "size": edges_of(place), "caption": sought.key}
             found.append(Volume(path=f"{stem}.npz", role=role, **about))
+        self.run.record.images += film_of_volume(self.run, value, edges_of(place), "y", quantity)
         if not self.best.is_newest:
             stem = f"volumes/{sought.key.replace('.', '_')}_best"
             write_volume(self.run.path / f"{stem}.npz", self.best.read()[sought.key], place)

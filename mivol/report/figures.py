@@ -147,7 +147,7 @@ def plot_curve(rows: Sequence[dict], name: str, *, against: str = "iteration") -
     """
     points = [(row[against], row[name]) for row in rows if row.get(name) is not None and row.get(against) is not None]
     if not points:
-        raise MivolError(f'no row of the metrics has "{name}"; draw one of those that were recorded.')
+        raise MivolError(f'no row of the metrics has "{name[:80]}"; draw one of those that were recorded.')
     x, y = np.array(points, float).T
     quantity = QUANTITIES.get(name, Quantity(name.replace("_", " ")))
     with mpl.rc_context(STYLE):

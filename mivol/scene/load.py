@@ -100,7 +100,7 @@ def load_scene(source: SceneSource | mi.Scene, overrides: Mapping[str, object] |
         try:
             return _load_file(Path(source), overrides)
         except UnicodeDecodeError as error:  # of Mitsuba's refusals and settings, which quote the file
-            raise MivolError(f"{source} cannot be read: it names something in bytes that are no UTF-8: correct it.") from error
+            raise MivolError(f"{source} cannot be read: it names things in bytes that are not UTF-8; correct them.") from error
     if overrides:
         name = next(iter(overrides))
         raise MivolError(f'override "{name}" was given, but only XML files have parameters; change the scene itself.')
