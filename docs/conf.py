@@ -2,7 +2,11 @@
 
 project = "mivol"
 author = "The mivol authors"
-extensions = ["myst_parser"]
+extensions = ["myst_nb"]
+# Notebooks are kept without outputs. .github/workflows/docs.yml executes them, with -D nb_execution_mode=force.
+nb_execution_mode = "off"
+nb_execution_timeout = 300
+nb_execution_raise_on_error = True
 myst_enable_extensions = ["dollarmath"]
 myst_heading_anchors = 3
 exclude_patterns = ["_build"]

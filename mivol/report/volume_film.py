@@ -1,8 +1,8 @@
 """A volume seen from all sides: its integrals along parallel rays, while it turns about its upright axis.
 
 Conventions. Values are (Z, Y, X, C), sizes world lengths along x, y, z. A picture has the highest layer on top. Rays are
-horizontal, so each layer is projected on its own: a Radon transform, by bilinear samples in steps of the smallest voxel edge. Grey
-is the integral over the largest one of all pictures: black where nothing is.
+horizontal, so each layer is projected on its own: a Radon transform, by bilinear samples in steps of the smallest voxel edge.
+Grey is the integral over the largest one of all pictures: black where nothing is.
 
 Here: :func:`volume_frames`.
 """
