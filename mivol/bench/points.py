@@ -9,9 +9,9 @@ number, harmonics of degree 2; the camera sees the whole cube. The walk of ``ben
 runs in turns with them: "scaled" rates are those of a machine that walks 25 M rays a second. The peer is Mitsuba's
 ``ellipsoids`` with ``volprim_rf_basic``, one ray a pixel, which sorts by where a ray enters an ellipsoid and stops at 64 of
 them; its picture and ours differ by the order, by the ends of the ellipsoids (three standard deviations), by the low-pass
-filter and by places within the pixel. "rays" traces one a pixel through the same cloud, as the extinction of a medium
-(``mivol_gaussians``) before a white sky, in turns with the peer, whose Gaussians are white for it: both show what the cloud
-hides; colours, which the peer sorts for, are not in ours. The biker (152,746 Gaussians) is read from MIVOL_DATA (default
+filter and by places within the pixel. "rays" traces one a pixel through the same cloud, as a medium that shows its colours in
+the order of their peaks (``mivol_gaussians`` as the emission), in turns with the peer, and as the extinction of a medium before
+a white sky, which nothing is sorted for. The biker (152,746 Gaussians) is read from MIVOL_DATA (default
 ../shared/data); where it is missing a cloud of as many takes its place, and the JSON says so. Prints JSON; writes
 bench_points.json and bench_points.png.
 """
@@ -19,7 +19,7 @@ bench_points.json and bench_points.png.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
@@ -33,10 +33,9 @@ from mivol.bench.figures import drawn
 from mivol.bench.optical_depth.work import Work, camera_rays
 from mivol.bench.questions import Bench
 from mivol.bench.timing import Contestant, Timing, race, ratio_of
-from mivol.fields.gaussians import NAMES
+from mivol.fields.gaussians import HARMONICS, NAMES
 from mivol.photos.camera import Camera, intrinsics
 from mivol.points import Gaussians, read_gaussians
-from mivol.points.gaussians import CONSTANT_HARMONIC
 from mivol.splatting import Splatter, tensors_of
 
 __all__ = ["BENCH", "FULL", "QUICK", "Size", "compare", "dense_cloud", "main"]
@@ -198,45 +197,47 @@ def measure_peer(size: Size) -> dict:
 
 
 def measure_rays(size: Size) -> dict:
-    """How many pixels a second are traced through a cloud that hides a white sky, and how many by Mitsuba's ellipsoids?"""
+    """How many pixels a second are traced through a cloud that shows its colours, and how many by Mitsuba's ellipsoids?"""
     n, side = size.peer
     cloud, camera = dense_cloud(n), camera_before(np.zeros(3), 1.0, side)
-    white = replace(cloud, harmonics=np.full((n, 1, 3), 0.5 / CONSTANT_HARMONIC))
-    ours, peers = before_a_sky(cloud, camera), ellipsoids(white, camera)
+    shown, peers = traced_scene(cloud, camera), ellipsoids(cloud, camera)
+    hidden = traced_scene(cloud, camera, as_extinction=True, sky={"type": "constant"})
     timings = race(
         {
             "walk": Work(smoke().values, *camera_rays(size.walk_side)).tau(),
-            "mivol": lambda seed: mi.render(ours, spp=1, seed=seed),
+            "mivol": lambda seed: mi.render(shown, spp=1, seed=seed),
+            "extinction": lambda seed: mi.render(hidden, spp=1, seed=seed),
             "volprim_rf_basic": lambda seed: mi.render(peers, spp=1, seed=seed),
         },
         size.rounds,
         keep=True,
     )
-    walk, traced = timings["walk"], timings["mivol"]
-    hidden = [1 - traced.results[0][..., :3], timings["volprim_rf_basic"].results[0][..., :3]]
+    walk, peer = timings.pop("walk"), timings.pop("volprim_rf_basic")
+    pictures = [timings["mivol"].results[0][..., :3], peer.results[0][..., :3]]
     return {
         "cloud": f"{n:,} at {side}^2",
-        "mivol": traced.report(side**2, "pixels") | scaled(traced, side**2, walk, size),
-        "volprim_rf_basic": timings["volprim_rf_basic"].report(side**2, "pixels"),
-        "mivol_is_faster": ratio_of(timings["volprim_rf_basic"], traced),
-        "mivol_is_faster_by_processor": ratio_of(timings["volprim_rf_basic"], traced, "processor"),
-        "rms_difference": float(np.sqrt(np.mean((hidden[0] - hidden[1]) ** 2))),
-        "mean": float(hidden[0].mean()),
+        **{name: t.report(side**2, "pixels") | scaled(t, side**2, walk, size) for name, t in timings.items()},
+        "volprim_rf_basic": peer.report(side**2, "pixels"),
+        "mivol_is_faster": ratio_of(peer, timings["mivol"]),
+        "mivol_is_faster_by_processor": ratio_of(peer, timings["mivol"], "processor"),
+        "rms_difference": float(np.sqrt(np.mean((pictures[0] - pictures[1]) ** 2))),
+        "mean": float(pictures[0].mean()),
     }
 
 
-def before_a_sky(cloud: Gaussians, camera: Camera) -> mi.Scene:
-    """The cloud as the extinction of a medium that holds all of it, before a white sky."""
-    tensors = {name: mi.TensorXf(getattr(cloud, name)) for name in NAMES}
-    medium = {"type": "mivol_medium", "sigma_t": {"type": "mivol_gaussians", **tensors}}
+def traced_scene(cloud: Gaussians, camera: Camera, as_extinction: bool = False, **more: dict) -> mi.Scene:
+    """The cloud as a medium that holds all of it: with its colours as they are, or as an extinction."""
+    names = NAMES if as_extinction else (*NAMES, HARMONICS)
+    rays = {"type": "mivol_gaussians", "space": "linear", **{name: mi.TensorXf(getattr(cloud, name)) for name in names}}
+    medium = {"type": "mivol_medium", "sigma_t" if as_extinction else "emission": rays}
     place = mi.ScalarTransform4f().scale(2 * float(np.abs(cloud.means).max() + 4 * np.exp(cloud.log_scales.max())))
     return mi.load_dict(
         {
             "type": "scene",
             "integrator": {"type": "mivol", "max_depth": 1},
             "sensor": sensor_of(camera),
-            "sky": {"type": "constant"},
             "cloud": {"type": "cube", "to_world": place, "bsdf": {"type": "null"}, "interior": medium},
+            **more,
         }
     )
 

@@ -1,10 +1,10 @@
-"""Fitted Gaussians in a bank of fog, on a floor, under a spot, beside a ball of steel that shows them once more.
+"""Fitted Gaussians in a bank of fog, on a floor, under a spot, beside a ball of steel and behind one of glass.
 
     mivol demo gaussians                                          # runs/gaussians/gaussians.ply, a minute and a half
     python scenes/fog/render.py [--gaussians FILE --box x y z to_x to_y to_z] [-o runs/fog]
 
-The Gaussians become a radiance field, with the loss printed, and the field is the emission of a medium: it shines by itself and
-takes light of the spot from the fog and from the floor behind it. Without the fitted ones a ball of splats stands in.
+Rays are traced through the Gaussians themselves, which are the emission of a medium: they shine with their own colours and take
+light of the spot from the fog and from the floor behind them. Without the fitted ones a ball of splats stands in.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ import argparse
 from pathlib import Path
 
 import mivol  # noqa: F401  (chooses the LLVM library; call it before the first variant)
-from mivol.experiments.gaussian_conversion import convert_to_field
 from mivol.files import write_exr, write_png
 from mivol.points.gaussian_files import write_gaussians
 from mivol.points.gaussians import Gaussians
@@ -43,16 +42,16 @@ def ball(count: int = 3000, seed: int = 0) -> Gaussians:
     )
 
 
-def load(field: Path, box: tuple[float, ...], **changes: float) -> mi.Scene:
-    """The scene with a field in its place; ``changes`` are defaults of ``scene.xml``."""
+def load(cloud: Path, box: tuple[float, ...], **changes: float) -> mi.Scene:
+    """The scene with Gaussians of a file in their place; ``changes`` are defaults of ``scene.xml``."""
     low, high = np.array(box[:3]), np.array(box[3:])
     middle = dict(zip(("x", "y", "z"), map(float, (low + high) / 2), strict=True))
     half = dict(zip(("wide", "deep", "high"), map(float, (high - low) / 2), strict=True))
-    return mi.load_file(str(XML), field=str(field.resolve()), **middle, **half, **changes)
+    return mi.load_file(str(XML), cloud=str(cloud.resolve()), **middle, **half, **changes)
 
 
 def main() -> None:
-    """Convert, render, write the picture."""
+    """Render, and write the picture."""
     given = arguments()
     mi.set_variant("llvm_ad_rgb")
     given.output.mkdir(parents=True, exist_ok=True)
@@ -61,10 +60,8 @@ def main() -> None:
         print(f"{FITTED} is not here: a ball of splats stands in for it (mivol demo gaussians makes it)")
         source = given.output / "ball.ply"
         write_gaussians(source, ball())
-    field = given.output / "field.npz"
-    print(convert_to_field(source, field, given.resolution, given.box, "llvm_ad_rgb"))
     sizes = {"width": 3 * given.size // 2, "height": given.size}
-    image = np.array(mi.render(load(field, given.box, spp=given.spp, fog=given.fog, **sizes)))
+    image = np.array(mi.render(load(source, given.box, blur=given.blur, spp=given.spp, fog=given.fog, **sizes)))
     write_exr(given.output / "fog.exr", {"": image})
     write_png(given.output / "fog.png", image)
     print(given.output / "fog.png")
@@ -73,12 +70,12 @@ def main() -> None:
 def arguments() -> argparse.Namespace:
     """The command line."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--gaussians", type=Path, default=FITTED, help="any file of Gaussians or points")
+    parser.add_argument("--gaussians", type=Path, default=FITTED, help="any file of Gaussians")
     parser.add_argument("--box", type=float, nargs=6, default=BOX, help="what of it is taken [length]")
-    parser.add_argument("--resolution", type=int, default=128, help="voxels along the longest edge of the box")
+    parser.add_argument("--blur", type=float, default=0.01, help="the fit's low-pass filter, at its distance [length]")
     parser.add_argument("--fog", type=float, default=0.25, help="extinction of the fog [1/length]")
-    parser.add_argument("--size", type=int, default=256, help="height of the picture [pixel]")
-    parser.add_argument("--spp", type=int, default=256, help="samples a pixel")
+    parser.add_argument("--size", type=int, default=192, help="height of the picture [pixel]")
+    parser.add_argument("--spp", type=int, default=128, help="samples a pixel")
     parser.add_argument("-o", "--output", type=Path, default=Path("runs/fog"))
     return parser.parse_args()
 

@@ -187,6 +187,24 @@ def test_a_surface_among_them_hides_what_is_behind_it() -> None:
     np.testing.assert_allclose(render(found, seed=1).reshape(-1, 3), light + 2 * T[:, None], rtol=ROUNDING, atol=ROUNDING)
 
 
+def test_a_mirror_shows_their_other_side() -> None:
+    """At z = -0.1, among them: what is in front of it, and what a ray meets on its way back, from where it is reflected."""
+    gaussians = cloud(40)
+    mirror = {
+        "type": "rectangle",
+        "to_world": mi.ScalarTransform4f().translate([0, 0, -0.1]).scale(1.8),
+        "bsdf": {"type": "conductor", "material": "none"},
+    }
+    found = scene(shown(gaussians), mirror=mirror)
+    o, d = camera_rays(found, 1)
+    end = -(o[:, 2] + 0.1) / d[:, 2]
+    light, T = twin(gaussians, (o, d), end=end)
+    back, _ = twin(gaussians, (o + end[:, None] * d, d * [1, 1, -1]))
+    assert back.max() > 0.1
+    seen = render(found, depth=2, seed=1).reshape(-1, 3)
+    np.testing.assert_allclose(seen, light + T[:, None] * back, rtol=ROUNDING, atol=2 * ROUNDING)
+
+
 def test_other_media_dim_them_and_shine_through_them() -> None:
     """A glowing box in front of them and one behind, all emission and absorption: the sum by hand."""
     gaussians = cloud(20)

@@ -28,8 +28,9 @@ from mivol.transport.traversal.lattice import clip
 
 __all__ = ["visit_from_the_far_end"]
 
-SLOTS = 4
-"""Gaussians of a cell that are sorted at once."""
+SLOTS = 8
+"""Gaussians of a cell that are sorted at once (measured, processor time over that of 8: 10,000 in a dense cloud, 2 peaks a
+cell, 4 slots 1.2, 12 1.1; 10,000 fitted ones, flat and wide, 2 slots 2.6, 4 1.5, 12 and 16 0.9)."""
 
 INSIDE = 1 - 1e-6
 """Share of a passage at which a peak beyond its end is looked for: the last cell holds it, whatever rounding did to its end."""
