@@ -214,7 +214,7 @@ def test_what_stands_in_for_the_data_of_scripts(tmp_path: Path) -> None:
 def test_gaussians_in_fog_cast_a_shadow(tmp_path: Path, variant_rgb: None) -> None:
     """A ball of splats takes light of the spot from the floor behind it, and next to none from what is seen above it.
 
-    The seeds are fixed and medians are compared. The ratio is 1 where no light is taken, and 0.5 in the shadow (fog before the
+    The seeds are fixed and medians are compared. The ratio is 1 where no light is taken, and 0.4 in the shadow (fog before the
     floor and the sky stay): 0.7 and 0.9 lie between the two.
     """
     scene = runpy.run_path(str(SCENES / "fog" / "render.py"))
@@ -225,7 +225,7 @@ def test_gaussians_in_fog_cast_a_shadow(tmp_path: Path, variant_rgb: None) -> No
     values["gaussians.interior_medium.emission.opacity_logits"] -= 40
     values.update()
     ratio = with_them / np.array(mi.render(shown, seed=0)).mean(axis=-1)
-    assert np.median(ratio[28:, 30:40]) < 0.7
+    assert np.median(ratio[18:24, 30:39]) < 0.7
     assert 0.9 < np.median(ratio[:8]) < 1.1
 
 
