@@ -169,6 +169,26 @@ def test_what_rays_lose_is_what_small_splats_hide() -> None:
 # -- Scattering --------------------------------------------------------------------------------------------------------------
 
 
+def test_they_dim_a_medium_that_shines_behind_them() -> None:
+    """A glowing slab behind absorbing Gaussians, with the derivative by their opacities: both by hand."""
+    gaussians, glow = cloud(8), {"type": "mivol_medium", "sigma_t": 0.7, "emission": 0.5}
+    slab = mi.ScalarTransform4f().translate([0, 0, -3]).scale([6, 6, 0.5])
+    found = scene(volume(gaussians), emitter={"type": "cube", "to_world": slab, "bsdf": {"type": "null"}, "interior": glow})
+    o, d = camera_rays(found, 3)
+    shines = 0.5 * -np.expm1(0.7 / d[:, 2])
+    span, twin = (np.zeros(len(o)), np.full(len(o), np.inf)), oracle.Cloud.of(gaussians)
+    value = lambda c: shines * np.exp(-SCALE * oracle.optical_depth(c, o, d, *span, oracle.find_cut(twin, o, d, *span)))  # noqa: E731
+    np.testing.assert_allclose(render(found, seed=3)[..., 0].ravel(), value(twin), rtol=2e-4)
+    params, key = mi.traverse(found), "cloud.interior_medium.sigma_t.opacity_logits"
+    dr.enable_grad(params[key])
+    params.update()
+    ones = mi.TensorXf(np.full((SIDE, SIDE, 3), 1 / 3, np.float32))
+    mi.load_dict({"type": "mivol", "max_depth": 1}).render_backward(found, params, ones, seed=3, spp=1)
+    step = np.full(gaussians.count, 1e-5)
+    truth = (value(twin.moved("opacity_logits", step)) - value(twin.moved("opacity_logits", -step))).sum() / 2e-5
+    assert np.array(dr.grad(params[key])).sum() == pytest.approx(truth, rel=1e-3)
+
+
 def test_white_gaussians_in_a_furnace_cannot_be_seen() -> None:
     """Any extinction, whatever it depends on, that scatters all light: each path brings the sky home."""
     image = render(scene(volume(cloud(20)), albedo=1.0), depth=-1, spp=4, rr_depth=1000)
