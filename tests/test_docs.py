@@ -56,11 +56,16 @@ def test_links_are_seen() -> None:
     assert links("![a](b.png) [c](d.md#e) `[x](y)` [f](https://g.h) [i](#j)") == ["b.png", "d.md"]
 
 
+def _pages() -> list[Path]:
+    """Texts and notebooks of the site."""
+    return [path for path in DOCS.rglob("*") if path.suffix in (".md", ".ipynb") and "_build" not in path.parts]
+
+
 def test_every_page_is_listed() -> None:
     """Sphinx warns of pages that no table of contents leads to; this needs no Sphinx."""
     trees = re.findall(r"```\{toctree\}\n(.*?)```", (DOCS / "index.md").read_text(), re.DOTALL)
     listed = [line for tree in trees for line in tree.splitlines() if line and not line.startswith(":")]
-    pages = [path.relative_to(DOCS).with_suffix("").as_posix() for path in DOCS.rglob("*.md") if "_build" not in path.parts]
+    pages = [path.relative_to(DOCS).with_suffix("").as_posix() for path in _pages()]
     assert sorted([*listed, "index"]) == sorted(pages)
 
 
