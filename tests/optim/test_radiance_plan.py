@@ -47,7 +47,9 @@ def test_bytes_of_a_stage(variant_rgb: str, monkeypatch: pytest.MonkeyPatch, deg
         assert bytes_of(finer, stage, box) == bytes_of(finer, stage, box, rows=int(share * nodes))
 
 
-TOO_LARGE = [("cpu", 36, 40), ("cpu", 128, 100), ("gpu", 64, 300), ("gpu", 300, 500)]
+#: The tables of 16 views make the first stage of the last one the larger.
+PLANS = PRESETS | {"many views first": FitPlan((Stage(64, 1, 1, 16, 64), Stage(128, 1, 1, 2, 64)))}
+TOO_LARGE = [("cpu", 36, 40), ("cpu", 128, 100), ("gpu", 300, 500), ("many views first", 128, 300)]
 
 
 @pytest.mark.parametrize(("preset", "longest", "limit"), TOO_LARGE)
@@ -58,7 +60,7 @@ def test_the_resolution_that_is_said_to_fit_fits(
     views = RayBatches.of(photos[:2])
 
     def memory(nodes: int) -> str:
-        return memory_of(PRESETS[preset].up_to(nodes), BOX, views, limit=limit << 20)
+        return memory_of(PLANS[preset].up_to(nodes), BOX, views, limit=limit << 20)
 
     with pytest.raises(MivolError) as refused:
         memory(longest)
