@@ -26,7 +26,7 @@ from mivol.optim.field_view import render_view
 from mivol.optim.loop import Fit, begin_fit
 from mivol.optim.radiance_plan import bytes_of
 from mivol.optim.radiance_problem import RadianceProblem
-from mivol.photos import Photo, Photos
+from mivol.photos import Photo
 from mivol.validate import images
 
 __all__ = ["ask_photographs", "bars_of"]
@@ -87,10 +87,9 @@ def fitted(folder: Path, longest: int, size: Size) -> dict:
     held = dr.detail.malloc_watermark(dr.backend_v(mi.Float)) - batches.bytes
     walked.append(walk_rate(size))
     rate, last = float(np.mean(walked)), plan.stages[-1]
-    train = Photos(shown.views[:: max(1, len(shown.views) // 8)], shown.space, shown.survey)
     return {
         **seen(problem, judged.views),
-        "train_psnr": seen(problem, train.views)["psnr"],
+        "train_psnr": seen(problem, shown.views[:: max(1, len(shown.views) // 8)])["psnr"],
         "seconds": watch.processor / dr.thread_count() * rate / WALK,
         "processor_seconds": watch.processor,
         "walk_rays_per_second": rate,
@@ -106,9 +105,7 @@ def seen(problem: RadianceProblem, views: tuple[Photo, ...]) -> dict[str, float]
     """PSNR and SSIM of views, each a mean over them."""
     shown = [render_view(problem.field, view.camera, view.background).image for view in views]
     pairs = zip(shown, views, strict=True)
-    return dict(
-        images.score([images.judge(a, b.image, space="srgb", metrics=("psnr", "ssim")) for a, b in pairs]).values
-    )
+    return images.score([images.judge(a, b.image, space="srgb", metrics=("psnr", "ssim")) for a, b in pairs]).values
 
 
 def step_seconds(fit: Fit) -> float:
