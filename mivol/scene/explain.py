@@ -243,7 +243,7 @@ def _depth_two(scene: mi.Scene, needs: Needs) -> list[str]:
         tau, albedo = scattering_depth(view, box, scene=traced), mean_albedo(view)
         phase = "forward" if mean_cosine(boundary.medium.phase_function()) > 0.4 else "isotropic"
         missing = depth_two_error(min(albedo, 1.0), tau, light, phase)
-        warning = "; depth 2 is a poor model of it: raise max_depth" if missing > 0.1 else ""
+        warning = "; depth 2 is a poor model of it: raise max_depth (what fits lose: docs/examples.md)" if missing > 0.1 else ""
         lines.append(
             f"one scattering leaves out {missing:.0%} of the light that {facts.name} scatters (albedo {albedo:.2f}, optical "
             f"depth {tau:.2g}, {light} light, {phase} phase){warning}"

@@ -36,11 +36,12 @@ NAMES = ("sigma_s [1/mm]", "sigma_a [1/mm]", "g")
 
 @dataclass(frozen=True)
 class Photograph:
-    """One image of one channel: (H, W) and the RMS of its noise."""
+    """One image of one channel (H, W), the variance of its pixels, and the RMS of its noise."""
 
     dilution: float
     camera: int
     image: np.ndarray
+    variance: np.ndarray
     noise: float
 
 
@@ -49,25 +50,27 @@ def values(u: np.ndarray) -> np.ndarray:
     return np.array([np.exp(u[0]), np.exp(u[1]), np.tanh(u[2])])
 
 
-def photograph(truth: np.ndarray, dilutions: list[float], channel: int, given: argparse.Namespace) -> list[Photograph]:
-    """What both cameras see of each dilution, by Mitsuba."""
+def photographs_of(
+    xml: Path, truth: np.ndarray, cameras: int, seed: int, given: argparse.Namespace
+) -> list[Photograph]:  # fmt: skip
+    """What the cameras of a scene see of each dilution, by Mitsuba."""
     found = []
-    for c in dilutions:
+    for c in given.dilutions:
         known = {"sigma_s": c * truth[0], "sigma_a": c * truth[1], "g": truth[2], "size": given.size}
-        for camera in range(CAMERAS):
+        for camera in range(cameras):
             made = render_reference(
-                XML, given.output / "references", max_depth=given.max_depth, max_spp=given.photo_spp, sensor=camera,
-                seed=channel, overrides=known, progress=False,
+                xml, given.output / "references", max_depth=given.max_depth, max_spp=given.photo_spp, sensor=camera,
+                seed=seed, overrides=known, progress=False,
             )  # fmt: skip
-            found.append(Photograph(c, camera, made.mean[..., 0], made.standard_error))
+            found.append(Photograph(c, camera, made.mean[..., 0], made.variance[..., 0], made.standard_error))
     return found
 
 
 class Model:
     """Images of one channel, and their derivatives by u, for any dilution."""
 
-    def __init__(self, size: int, spp: int) -> None:
-        self.scene = mi.load_file(str(XML), size=size)
+    def __init__(self, xml: Path, size: int, spp: int) -> None:
+        self.scene = mi.load_file(str(xml), size=size)
         self.params = mi.traverse(self.scene)
         self.params.keep(list(KEYS))
         self.spp = spp
@@ -138,25 +141,31 @@ def main() -> None:
     given.output.mkdir(parents=True, exist_ok=True)
     liquid = named_medium(given.liquid)
     truth = np.array([liquid.sigma_s, liquid.sigma_a, liquid.g]).T
-    model = Model(given.size, given.spp)
+    model = Model(XML, given.size, given.spp)
     start = np.array([np.log(0.05), np.log(0.05), np.arctanh(0.5)])
     found, errors, photographs = np.empty((3, 3)), np.empty((3, 3)), []
     print(f"{given.liquid}, dilutions {given.dilutions}, photographs of depth {given.max_depth}", flush=True)
     for channel, name in enumerate(("red", "green", "blue")):
-        photographs.append(photograph(truth[channel], given.dilutions, channel, given))
+        photographs.append(photographs_of(XML, truth[channel], CAMERAS, channel, given))
         u, error, losses = fit(model, photographs[-1], start, given.iterations)
         found[channel] = values(u)
         errors[channel] = error * [found[channel, 0], found[channel, 1], 1 - found[channel, 2] ** 2]
-        for k, what in enumerate(NAMES):
-            x, s, t = found[channel, k], errors[channel, k], truth[channel, k]
-            # Milks are published with g = 0.
-            off = f"off by {f'{abs(x / t - 1):.2%}' if t else f'{abs(x):.4f}'}, {abs(x - t) / s:.1f} s.e."
-            print(f"{name:5s} {what:15s} {x:9.5f} +- {s:.5f}  truth {t:9.5f}  {off}")
+        print("\n".join(table(name, found[channel], errors[channel], truth[channel])))
         print(f"{name:5s} squared residual, in noise: {losses[0]:.1f} -> {losses[-1]:.3f} in {given.iterations} iterations")
     known = truth != 0
     print(f"largest relative error: {np.abs(found[known] / truth[known] - 1).max():.4f}")
     figures.save(draw(given, model, photographs, found, errors, truth), given.output / "tank.png")
     print(given.output / "tank.png")
+
+
+def table(channel: str, found: np.ndarray, errors: np.ndarray, truth: np.ndarray) -> list[str]:
+    """A line for each coefficient of a channel."""
+    lines = []
+    for what, x, s, t in zip(NAMES, found, errors, truth, strict=True):
+        # Milks are published with g = 0.
+        off = f"off by {f'{abs(x / t - 1):.2%}' if t else f'{abs(x):.4f}'}, {abs(x - t) / s:.1f} s.e."
+        lines.append(f"{channel:5s} {what:15s} {x:9.5f} +- {s:.5f}  truth {t:9.5f}  {off}")
+    return lines
 
 
 def draw(
@@ -170,9 +179,10 @@ def draw(
         left, right = figure.subfigures(1, 2, width_ratios=(2.1 * count, 3.4))
         grid = left.subplots(3, count, squeeze=False)
         for column, dilution in enumerate(given.dilutions):
-            photo = np.stack([photographs[c][CAMERAS * column].image for c in range(3)], axis=-1)
+            first = [next(p.image for p in photos if (p.dilution, p.camera) == (dilution, 0)) for photos in photographs]
+            photo = np.stack(first, axis=-1)
             us = [np.array([np.log(f[0]), np.log(f[1]), np.arctanh(f[2])]) for f in found]
-            image = np.stack([model.image(u, dilution, 0, 7, 4 * given.spp) for u in us], axis=-1)
+            image = np.stack([model.image(u, dilution, 0, 7, given.photo_spp) for u in us], axis=-1)
             scale, difference = show.scale_of(photo), image - photo
             signed = show.Scale("signed", -0.1 * scale.high, 0.1 * scale.high)
             pictures = ((photo, scale), (image, scale), (difference, signed))
