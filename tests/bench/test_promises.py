@@ -39,6 +39,7 @@ RADIANCE_FIELD = {
         {"chair at 256": {"psnr": 31.0, "seconds": 300.0, "counted_gib": 1.6}, "wires at 128": {"psnr": 20.0}},
         [(31, "at least", 31.3, False), (300, "at most", 300, True), (1.6, "at most", 1.5, False)],
     ),
+    "priors": ({}, []),
     "fit": ({"fog": {"ratio": 9.0}, "shell": {"ratio": 10.0}}, [(9, "at least", 10, False), (10, "at least", 10, True)]),
     "step": (
         {"fog": {"camera": {"ratio_of_processor_time": 7.0}, "pixels": {"ratio_of_processor_time": 5.0}}},

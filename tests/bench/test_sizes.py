@@ -31,6 +31,7 @@ FULL = {
         "fields": ("shell", "fog", "fitted"), "photo_effort": 1.0, "photo_views": 75, "photo_side": 200, "photo_spp": 32,
         "photo_fits": (("chair", 128), ("chair", 256), ("still_life", 128), ("wires", 128), ("glossy", 128)),
         "photo_folder": Path("runs/photographs"), "walk_side": 1024,
+        "prior_side": 80, "prior_resolution": 32, "prior_steps": 180, "prior_folds": 3,
     },
     "gradients": {
         "rounds": 8, "side": 64, "budget": Budget(seconds=2.0), "table_rounds": 16, "table_side": 24,
@@ -60,6 +61,7 @@ QUICK = {
         "resolution": 32, "side": 64, "rounds": 1, "steps": 7, "chair_steps": 30, "fit_resolution": 32, "fit_side": 32,
         "photo_fits": (("chair", 32), ("wires", 32)), "photo_effort": 0.03, "photo_views": 15, "photo_side": 48, "photo_spp": 2,
         "photo_folder": Path("runs/quick_photographs"), "walk_side": 64,
+        "prior_side": 16, "prior_resolution": 16, "prior_steps": 6, "prior_folds": 1,
     },
     "gradients": {
         "rounds": 5, "side": 12, "budget": Budget(seconds=0.05), "table_rounds": 8, "table_side": 8,

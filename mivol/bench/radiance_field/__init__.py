@@ -25,6 +25,9 @@ resolution up to 128^3, 105 steps each, one view a step. Ours has 3 stages to th
 step as a view has pixels, from all views, and otherwise what every fit has. The mean PSNR of 4 views between them is followed,
 every 7 steps of either, the clock stopped while it is measured; kernels are compiled before. Printed is the peer's time over
 ours to the best PSNR that the peer reaches.
+
+priors: the preset for captures at a small size, as it is and without each of its priors, on a procedural room and on the fox of
+MIVOL_DATA: mean PSNR of the photographs of each fold, of fits to the others, and what a prior gains over the folds.
 """
 
 from __future__ import annotations
@@ -40,6 +43,7 @@ from mivol.bench.figures import drawn, plain_ticks
 from mivol.bench.questions import Bench
 from mivol.bench.radiance_field.fits import ask_fit, ask_locality
 from mivol.bench.radiance_field.photographs import ask_photographs, bars_of
+from mivol.bench.radiance_field.priors import ask_priors
 from mivol.bench.radiance_field.size import FULL, QUICK, Size
 from mivol.bench.radiance_field.steps import ask_memory, ask_step
 from mivol.report.figures import MARKERS, SERIES
@@ -52,6 +56,7 @@ QUESTIONS = {
     "locality": ask_locality,
     "fit": ask_fit,
     "photographs": ask_photographs,
+    "priors": ask_priors,
 }
 
 STEP_BARS = {"camera": 8, "pixels": 4}
@@ -62,7 +67,7 @@ def compare(question: str, answer: dict) -> list[Bar]:
     """The figures that have a bar."""
     if question == "memory":
         return [judge("bytes a ray beyond the grid's", answer["bytes_per_ray"], AT_MOST, 512)]
-    if question == "locality":
+    if question in ("locality", "priors"):
         return []
     if question == "photographs":
         return bars_of(answer)

@@ -29,6 +29,8 @@ class Size:
         photo_views, photo_side, photo_spp: of made-up data sets: photographs, pixels along an edge, samples a pixel.
         photo_folder: where those lie; they are made where they are missing.
         walk_side: rays of the walk that tells the machine's speed are its square.
+        prior_side: longest edge of the photographs by which priors are judged [pixels].
+        prior_resolution, prior_steps, prior_folds: nodes and steps of the last stage of their fits, and folds.
     """
 
     name: str = "full"
@@ -53,6 +55,10 @@ class Size:
     photo_spp: int = 32
     photo_folder: Path = Path("runs/photographs")
     walk_side: int = 1024
+    prior_side: int = 80
+    prior_resolution: int = 32
+    prior_steps: int = 180
+    prior_folds: int = 3
 
 
 FULL = Size()
@@ -72,4 +78,8 @@ QUICK = Size(
     photo_spp=2,
     photo_folder=Path("runs/quick_photographs"),
     walk_side=64,
+    prior_side=16,
+    prior_resolution=16,
+    prior_steps=6,
+    prior_folds=1,
 )

@@ -1,0 +1,66 @@
+"""The bench of priors: what it fits, what a gain is, and which photographs a fold holds out."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from mivol.bench.radiance_field import QUICK, priors
+from mivol.bench.radiance_field.priors import FOLDS, WITHOUT, ask_priors, captures, gain_of, plan_of
+from mivol.bench.radiance_field.room import RADIUS, WALLS, cameras_of, image_of
+from mivol.optim.radiance_plan import PRESETS
+
+
+def test_a_plan_is_the_preset_but_for_its_size_and_one_prior() -> None:
+    plan, preset = plan_of(QUICK), PRESETS["capture"]
+    assert (plan.tv_density, plan.near, plan.levels, plan.sky, plan.matte) == (
+        preset.tv_density, preset.near, preset.levels, preset.sky, preset.matte,
+    )  # fmt: skip
+    assert plan.degree == preset.few_degree and plan.stages[-1].longest == QUICK.prior_resolution
+    changed = [{n for n in vars(plan) if vars(plan)[n] != vars(without(plan))[n]} for without in WITHOUT.values()]
+    assert changed == [{"tv_density"}, {"tv_sh"}, {"near"}, {"matte"}, {"degree"}]
+
+
+def test_a_gain_is_a_mean_over_folds_with_its_error() -> None:
+    """Differences 1, 2 and 3: a mean of 2, a standard error of 1 / sqrt(3); one fold has none."""
+    assert gain_of([21.0, 23.0, 25.0], [20.0, 21.0, 22.0]) == {"gain": 2.0, "error": pytest.approx(1 / np.sqrt(3))}
+    assert np.isnan(gain_of([21.0], [20.0])["error"])
+
+
+def test_a_fold_is_judged_by_what_it_holds_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    fitted, judged = [], []
+    fit = SimpleNamespace(course=SimpleNamespace(iterations=2), advance=lambda: None, problem=SimpleNamespace(sky=None))
+    monkeypatch.setattr(priors, "begin_radiance_fit", lambda views, box, plan, seed: fitted.append((views, seed)) or fit)
+    monkeypatch.setattr(priors, "newest_field", lambda fit: "field")
+    monkeypatch.setattr(priors, "RayBatches", SimpleNamespace(of=lambda photos, shrinks: list(photos)))
+    monkeypatch.setattr(priors, "held_out_psnr", lambda photos, render: judged.append(list(photos)) or 20.0)
+    monkeypatch.setattr(priors, "captures", lambda size: {"place": (list(range(12)), None)})
+    answer = ask_priors(QUICK)
+    assert len(fitted) == 1 + len(WITHOUT) and fitted[0] == ([k for k in range(12) if k % FOLDS], 0)
+    assert judged[0] == [0, 5, 10]
+    assert answer["place"]["psnr"] == [20.0] and set(answer["place"]["priors"]) == set(WITHOUT)
+
+
+def test_the_fox_is_fitted_where_it_is(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(priors, "DATA", tmp_path)
+    found = captures(QUICK)
+    assert list(found) == ["room"] and len(found["room"][0]) == 25
+    assert found["room"][0][0].image.shape == (12, 16, 3)
+    (tmp_path / "multiview" / "fox").mkdir(parents=True)
+    monkeypatch.setattr(priors, "load_photos", lambda path, largest, box: SimpleNamespace(views=[largest], box=box))
+    monkeypatch.setattr(priors, "rectified", lambda photo: photo)
+    assert captures(QUICK)["fox"] == ([QUICK.prior_side], "middle")
+
+
+def test_the_room_has_a_ball_before_walls() -> None:
+    """In the middle of a picture stands the ball, with the pattern of its surface there; cameras are 2 away, among walls."""
+    camera = cameras_of(3, (64, 48))[1]
+    image = image_of(camera)
+    towards = RADIUS * camera.origin / np.linalg.norm(camera.origin)
+    x, y, z = 3.0 * towards
+    expected = 0.5 + 0.4 * np.array([np.sin(x + 2 * y), np.sin(2 * z - y + 1), np.sin(x - z + 2)])
+    np.testing.assert_allclose(image[23:25, 31:33].mean(axis=(0, 1)), expected, atol=0.02)
+    assert np.linalg.norm(camera.origin) == pytest.approx(2.0) and WALLS > 2
