@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +23,7 @@ from mivol.optim.loop import Fit
 from mivol.optim.radiance_problem import RadianceProblem
 from mivol.photos import Camera, Photo, Photos
 from mivol.photos.picture import SPACES, decode_srgb
+from mivol.report.cameras import plot_cameras
 from mivol.report.depth import depth_pixels, normal_pixels, normals_of_depth
 from mivol.report.record import Image, Table, Volume
 from mivol.validate.images import METRICS, Quality, colour_fitted, judge, score
@@ -72,6 +73,7 @@ class PhotoOutputs:
             record.results |= self.write_judged()
         if self.film.cameras:
             record.images.append(self.write_film())
+        record.images.append(write_cameras(folder, self.photos, self.judged))
         self.run.write_curves()
 
     def write_judged(self) -> dict[str, float]:
@@ -98,6 +100,13 @@ class PhotoOutputs:
         to_codes = SPACES[self.photos.space, "srgb"]
         shown = lambda camera: to_codes(render_view(self.problem.field, camera, background).image)  # noqa: E731
         return self.film.write(self.run.path, shown, self.task.watcher)
+
+
+def write_cameras(folder: Path, photos: Photos, judged: Photos | None) -> Image:
+    """Where the cameras of all photographs stand about the box, as a picture."""
+    frames = photos.survey.frames + (() if judged is None else judged.survey.frames)
+    plot_cameras(replace(photos.survey, frames=frames), folder / "cameras.png")
+    return Image(path="cameras.png", role="picture", caption="Where the cameras stand, and the box where matter may be")
 
 
 def save_found(folder: Path, problem: RadianceProblem, which: str = "", white: float = 1.0) -> None:

@@ -84,6 +84,7 @@ QUANTITIES: dict[str, Quantity] = {
     "gaussians": Quantity("Gaussians", log=False),
     "bytes": Quantity("Memory of the field", "MiB", log=False),
     "seconds": Quantity("Time", "s"),
+    "fit_seconds": Quantity("Time of the fit", "s"),
     "iterations": Quantity("Iterations", log=False),
     "views": Quantity("Views fitted", log=False),
     "memory": Quantity("Peak memory", "MiB", log=False),

@@ -111,7 +111,8 @@ def test_photographs_become_a_field_and_a_page(photographs: Path, tmp_path: Path
     assert record["results"]["nodes"] == len(made.listed())
     page = (tmp_path / "run/report.html").read_text().replace("\u2011", "-").replace("\xa0", " ")
     assert f"held-out views to {record['results']['held_out_psnr']:.1f} dB PSNR" in page
-    for text in ("data:video/mp4;base64,", "distance of the first judged view", "What it takes", "view_3.png"):
+    shown = ("data:video/mp4;base64,", "distance of the first judged view", "Where the cameras stand", "What it takes")
+    for text in (*shown, "view_3.png"):
         assert text in page
     rows = [json.loads(line) for line in (tmp_path / "run/metrics.jsonl").read_text().splitlines()]
     assert rows[-1]["iteration"] == record["results"]["iterations"] == photo_plan.make_plan(config.load(path)).steps
