@@ -472,17 +472,25 @@ class FieldFit(Section):
 class GaussianSettings(Section):
     """The Gaussians and how they are fitted."""
 
-    preset: Annotated[str, of("1", "steps, sizes, rates: tiny, minute, minutes or gpu", min_length=1)] = "minute"
+    preset: Annotated[str, of("1", "steps, sizes, rates: tiny, minute, minutes, fine or gpu", min_length=1)] = "minute"
     effort: Annotated[float, of("1", "factor on the preset's steps", gt=0)] = 1.0
+    minutes: Annotated[
+        float | None, of("min", "as many steps as take about so long on two idle cores; no clock is asked")
+    ] = None
     start: Annotated[int | None, of("1", "Gaussians at first, where no points are known; absent: the preset's")] = None
     most: Annotated[int | None, of("1", "Gaussians at the end of growth; absent: the preset's")] = None
     degree: Annotated[int | None, of("1", "of the spherical harmonics; absent: the preset's")] = None
     control: Annotated[str | None, of("1", "of the density: clone_split or relocation; absent: the preset's")] = None
     ssim: Annotated[float | None, of("1", "share of SSIM in the loss; absent: the preset's")] = None
+    mip: Annotated[bool, of("1", "what is smaller than a pixel keeps its light, so that other sizes look right, too")] = False
+    exposure: Annotated[bool, of("1", "gains of each photograph, of those without alpha")] = False
 
     def __post_init__(self) -> None:
         if not math.isfinite(self.effort):
             raise ValueError(f"effort is {self.effort}: a finite number above 0 is expected")
+        if self.minutes is not None and not (0 < self.minutes < math.inf and self.effort == 1):
+            found = f"minutes is {self.minutes} beside effort {self.effort}"
+            raise ValueError(f"{found}: a finite number above 0, and no effort, are expected")
         for name in ("start", "most"):
             value = getattr(self, name)
             if value is not None and value < 4:

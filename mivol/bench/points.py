@@ -3,6 +3,7 @@
     scripts/bench_points.py                 # 3 minutes on 2 cores
     scripts/bench_points.py --quick         # under a minute, small clouds
     scripts/bench_points.py --only clouds
+    scripts/bench_points.py --only chair    # fits: 3 minutes; chair_minutes and chair_large 5 to 6 each
 
 Clouds are random: means even in a unit cube, scales about a quarter of the mean distance, opacities the logistic of a normal
 number, harmonics of degree 2; the camera sees the whole cube. The walk of ``bench_optical_depth`` through the tutorial's smoke
@@ -30,6 +31,7 @@ import numpy as np
 from mivol.bench.bars import AT_LEAST, AT_MOST, Bar, judge
 from mivol.bench.extinctions import DATA, smoke
 from mivol.bench.figures import drawn
+from mivol.bench.gaussian_fits import Fitted, fit_and_judge
 from mivol.bench.optical_depth.work import Work, camera_rays
 from mivol.bench.questions import Bench
 from mivol.bench.timing import Contestant, Timing, race, ratio_of
@@ -59,6 +61,17 @@ TRACED = 0.14
 """What the project promises of rays through Gaussians, in millions of pixels a second, scaled."""
 
 
+CHAIR = {
+    "chair": Fitted("minute", 1.2, 0.25, (0, 1, 2)),
+    "chair_minutes": Fitted("minutes", 1.0, 0.25, (0,)),
+    "chair_large": Fitted("fine", 0.85, 1.0, (0,)),
+}
+"""Fits of about 1, 5 and 5 minutes, judged at 200, 200 and 800 pixels."""
+
+DECIBELS = {"chair": 34.0, "chair_minutes": 37.0, "chair_large": 31.0}
+"""What the project promises of each seed [dB]."""
+
+
 @dataclass(frozen=True)
 class Size:
     """How much is measured.
@@ -71,6 +84,7 @@ class Size:
         biker_side: pixels along the edge of its picture.
         substitute: Gaussians of the cloud in the place of the biker.
         walk_side: rays of the walk are its square.
+        effort: factor on the steps of fits.
     """
 
     name: str = "full"
@@ -80,10 +94,11 @@ class Size:
     biker_side: int = 800
     substitute: int = 152_746
     walk_side: int = 1024
+    effort: float = 1.0
 
 
 FULL = Size()
-QUICK = Size("quick", 2, ((1000, 64),), (500, 32), 64, 2000, 128)
+QUICK = Size("quick", 2, ((1000, 64),), (500, 32), 64, 2000, 128, 0.02)
 
 
 # -- Clouds and cameras ------------------------------------------------------------------------------------------------------
@@ -288,6 +303,28 @@ def measure_biker(size: Size) -> dict:
     }
 
 
+def measure_chair(size: Size) -> dict:
+    """How many dB have test views of the chair at 200 pixels after a minute, with three seeds?"""
+    return _fit("chair", size)
+
+
+def measure_chair_minutes(size: Size) -> dict:
+    """How many dB have test views of the chair at 200 pixels after five minutes?"""
+    return _fit("chair_minutes", size)
+
+
+def measure_chair_large(size: Size) -> dict:
+    """How many dB have test views of the chair at 800 pixels after five minutes?"""
+    return _fit("chair_large", size)
+
+
+def _fit(name: str, size: Size) -> dict:
+    walk = race({"walk": Work(smoke().values, *camera_rays(size.walk_side)).tau()}, max(3, size.rounds // 2))["walk"]
+    asked = replace(CHAIR[name], effort=CHAIR[name].effort * size.effort)
+    seconds = float(np.median(walk.processor))
+    return fit_and_judge(DATA / "multiview" / "chair", asked, seconds, size.walk_side**2 / WALK)
+
+
 # -- Bars and figure ----------------------------------------------------------------------------------------------------------
 
 
@@ -306,6 +343,9 @@ def compare(question: str, answer: dict) -> list[Bar]:
     if question == "rays":
         what = f"{answer['cloud']}, traced, forward [M pixels/s, scaled]"
         return [judge(what, answer["mivol"]["pixels_per_second_scaled"] / 1e6, AT_LEAST, TRACED)]
+    if question in DECIBELS:
+        seeds, what = answer["seeds"], f"{question}, {answer['pixels'][0]} pixels [dB]"
+        return [judge(f"{what}, seed {seed}", one["psnr"], AT_LEAST, DECIBELS[question]) for seed, one in seeds.items()]
     return [judge("a picture of the biker [s]", answer["seconds_median"], AT_MOST, BIKER_SECONDS)]
 
 
@@ -326,8 +366,16 @@ def draw(answers: dict, folder: Path) -> None:
             ax.axis("off")
 
 
-QUESTIONS = {"clouds": measure_clouds, "peer": measure_peer, "rays": measure_rays, "biker": measure_biker}
-BENCH = Bench("bench_points", __doc__, QUESTIONS, FULL, QUICK, compare, draw)
+QUESTIONS = {
+    "clouds": measure_clouds,
+    "peer": measure_peer,
+    "rays": measure_rays,
+    "biker": measure_biker,
+    "chair": measure_chair,
+    "chair_minutes": measure_chair_minutes,
+    "chair_large": measure_chair_large,
+}
+BENCH = Bench("bench_points", __doc__, QUESTIONS, FULL, QUICK, compare, draw, unasked=tuple(CHAIR))
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from mivol.config import GaussianFit
 from mivol.experiments.film import Film
 from mivol.experiments.judged_views import JudgedViews, caption_of, said_of
-from mivol.experiments.photo_outputs import named
+from mivol.experiments.photo_outputs import judge_fitted, named, table_of_gains
 from mivol.experiments.run_folder import RunFolder
 from mivol.experiments.task import Task
 from mivol.optim.gaussian_problem import GaussianProblem
@@ -56,6 +56,8 @@ class GaussianOutputs:
         self.run.make("views", "film")
         write_gaussians(self.run.path / FILE, found)
         record.tables = [storage(found, (self.run.path / FILE).stat().st_size)]
+        if self.problem.exposure is not None:
+            record.tables.append(table_of_gains([view.name for view in self.photos.views], self.problem.exposure.table()))
         record.results = {
             "views": float(len(self.photos.views)),
             "iterations": float(self.fit.next),
@@ -70,15 +72,17 @@ class GaussianOutputs:
     def write_judged(self) -> dict[str, float]:
         """Judge all views, and keep them beside their photographs."""
         chosen: GaussianFit = self.task.chosen
-        views, found = self.judged.views, []
+        views, found, fitted = self.judged.views, [], []
         pictures = JudgedViews(self.run.path, self.judged.space, len(views), chosen.show.views)
         for photo in views:
             seen, quality = compare(self.problem, self.judged, photo, chosen.show.metrics)
             found.append(quality)
+            if self.problem.exposure is not None:
+                fitted.append(judge_fitted(seen, rectified(photo), self.judged.space))
             pictures.add(rectified(photo), seen, next(iter(quality.values.values())), caption_of(quality))
         self.run.record.images += pictures.images()
         self.run.record.judged = said_of(views)
-        return named(score(found).values)
+        return named(score(found).values) | ({"psnr_colour_fitted": float(np.mean(fitted))} if fitted else {})
 
     def write_film(self) -> Image:
         """A camera's way past the Gaussians."""

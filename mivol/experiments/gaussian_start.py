@@ -48,7 +48,8 @@ def make_gaussian_plan(chosen: GaussianFit) -> GaussianPlan:
     if wanted.control is not None and wanted.control not in CONTROLS:
         raise MivolError(f'gaussians.control = "{wanted.control}" is unknown: {nearest(wanted.control, list(CONTROLS))}')
     given = {name: getattr(wanted, name) for name in ("start", "most", "control", "ssim")}
-    plan = replace(PRESETS[wanted.preset], **{name: value for name, value in given.items() if value is not None})
+    told = {name: value for name, value in given.items() if value is not None}
+    plan = replace(PRESETS[wanted.preset], mip=wanted.mip, exposure=wanted.exposure, **told)
     if wanted.degree is not None:
         stages = [replace(stage, degree=min(stage.degree, wanted.degree)) for stage in plan.stages]
         plan = replace(plan, stages=(*stages[:-1], replace(stages[-1], degree=wanted.degree)))
@@ -65,17 +66,23 @@ def begin(chosen: GaussianFit, photos: Photos, plan: GaussianPlan) -> Begun:
     longest = max(max(view.camera.size) for view in views)
     plan = plan.for_edge(longest)
     places, whence = places_of(photos, plan.start, chosen.seed)
-    pixels = max(view.camera.size[0] * view.camera.size[1] for view in views) // min(s.shrink for s in plan.stages) ** 2
+    largest = max(view.camera.size[0] * view.camera.size[1] for view in views)
+    if chosen.gaussians.minutes is not None:
+        plan = plan.in_minutes(chosen.gaussians.minutes, largest)
+    pixels = largest // min(s.shrink for s in plan.stages) ** 2
     channels = 4 if all(view.alpha is not None for view in views) else 3
     sizes = {stage.shrink for stage in plan.stages}
     taken = sum(view.image.size // 3 * channels // shrink**2 for view in views for shrink in sizes)
     memory = memory_of(replace(plan, start=len(places)), taken, pixels)
     batches = RayBatches.of(views, [stage.shrink for stage in plan.stages])
     cloud = begin_at(places, views, plan.stages[0].degree)
-    return Begun(views, plan, batches, cloud, choices(plan, photos, len(places), whence, memory))
+    return Begun(views, plan, batches, cloud, choices(plan, photos, len(places), whence, memory, plan.minutes(largest)))
 
 
-def choices(plan: GaussianPlan, photos: Photos, count: int, whence: str, memory: str) -> list[PlanLine]:
+GAINS = PlanLine(choice="gains of each photograph", reason="cameras that choose their exposure; pulled towards 1")
+
+
+def choices(plan: GaussianPlan, photos: Photos, count: int, whence: str, memory: str, minutes: float) -> list[PlanLine]:
     """What will be done, and why."""
     stages = [f"{stage.steps} of photographs shrunk by {stage.shrink}, degree {stage.degree}" for stage in plan.stages]
     behind = "alpha says what is there" if photos.views[0].alpha is not None else "photos.behind"
@@ -90,5 +97,7 @@ def choices(plan: GaussianPlan, photos: Photos, count: int, whence: str, memory:
         PlanLine(choice=f"{plan.steps} steps: {'; '.join(stages)}", reason="small photographs first, one a step"),
         PlanLine(choice=f"a loss with a share of {plan.ssim:g} of SSIM", reason="absolute error beside it"),
         PlanLine(choice="what is behind is no part of the Gaussians", reason=behind),
+        *[GAINS][: plan.exposure],
+        PlanLine(choice=f"about {minutes:.2g} minutes", reason="on two idle cores, by the number of steps; no clock ends it"),
         PlanLine(choice=memory, reason="counted before it is taken"),
     ]

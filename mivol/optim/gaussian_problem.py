@@ -29,6 +29,7 @@ from mivol.optim.density_control import (
     relocate,
     reset_opacities,
 )
+from mivol.optim.exposure import Exposure
 from mivol.optim.gaussian_plan import CONTROLS, GaussianPlan, extent_of
 from mivol.optim.problem import Reals, Refinement
 from mivol.optim.ray_batches import RayBatches
@@ -39,6 +40,10 @@ from mivol.splatting import Splatter
 from mivol.splatting.splatter import Statistics
 
 __all__ = ["GaussianProblem"]
+
+TURN = 0.05
+"""By how much the logarithm of a gain may move at first when its photograph is looked at: a gain of 1.5 takes eight turns or
+more."""
 
 RESET_TO = 0.01
 """Opacity to which all are lowered now and then."""
@@ -56,6 +61,7 @@ class GaussianProblem:
         seed: of the order of views, of backgrounds and of what density control draws.
         safe_point: called between kernels.
         stage: the stage at work.
+        exposure: gains of the photographs, where the plan asks for them.
 
     Example:
         >>> cloud = begin_at(places_of(photos, 5000, 0)[0], photos.views, degree=0)
@@ -70,6 +76,7 @@ class GaussianProblem:
     seed: int = 0
     safe_point: Callable[[], None] = lambda: None
     stage: int = dataclasses.field(init=False, default=0)
+    exposure: Exposure | None = dataclasses.field(init=False, default=None)
 
     def __post_init__(self) -> None:
         if self.plan.control not in CONTROLS:
@@ -80,6 +87,10 @@ class GaussianProblem:
         self.extent = extent_of(self.cameras)
         if not self.extent > 1e-6 * max(np.abs(camera.origin).max() for camera in self.cameras):
             raise MivolError("all cameras stand at one place, which tells no distance: Gaussians need views from several.")
+        if self.plan.exposure:
+            if self.batches.channels == 4:
+                raise MivolError("gains were asked for and the photographs have alpha, as renders have: exposure = false.")
+            self.exposure = Exposure.even(len(self.cameras))
         self.begun_with = len(self.cloud["means"])
         self._splatters: dict[tuple[int, int, float, int], Splatter] = {}
         self._shapes: dict[tuple[int, int], PictureShape] = {}
@@ -91,16 +102,21 @@ class GaussianProblem:
     # -- Values -------------------------------------------------------------------------------------------------------
 
     def start(self) -> Reals:
-        """The reals of the cloud that is there now."""
-        return self._reals_of(self.cloud)
+        """The reals of the cloud and of the gains that are there now."""
+        return self._with_gains(self._reals_of(self.cloud))
 
     def values(self) -> Reals:
         """The cloud as tensors, coefficients as they are."""
         return {name: mi.TensorXf(array) for name, array in self.cloud.items()}
 
     def set(self, reals: Reals) -> None:
-        """Take over the cloud of reals."""
-        self.cloud = self._cloud_of(reals)
+        """Take over the cloud and the gains of reals."""
+        if self.exposure is not None:
+            self.exposure = Exposure(reals["exposure"].array)
+        self.cloud = self._cloud_of({name: value for name, value in reals.items() if name != "exposure"})
+
+    def _with_gains(self, reals: Reals) -> Reals:
+        return reals if self.exposure is None else reals | {"exposure": self.exposure.tensor}
 
     def _reals_of(self, cloud: Arrays) -> Reals:
         return {name: mi.TensorXf(array) for name, array in cloud.items()} | {
@@ -156,10 +172,16 @@ class GaussianProblem:
         cloud = {**reals, "harmonics": self._sheen(reals["harmonics"])}
         picture, kept = splatter.forward(cloud, camera)
         self.safe_point()
-        seen, target, behind, counted = self._compared(picture, view, shrink, background)
+        gains = self._gains(reals, view)
+        seen, target, behind, counted = self._compared(picture, view, shrink, background, gains)
         loss, slope = self._difference(seen, target, self._shape(camera.size), self.plan.ssim)
-        gradient, statistics = splatter.backward(kept, _slope_of_picture(slope, behind, counted, picture.shape))
+        gradient, statistics = splatter.backward(kept, _slope_of_picture(slope, behind, counted, gains, picture.shape))
         gradient.pop("pose")
+        if self.exposure is not None:
+            pixel, by_log = dr.arange(mi.UInt32, dr.width(seen) // 3), seen * slope
+            by_log = mi.Color3f(*(dr.sum(dr.gather(mi.Float, by_log, 3 * pixel + c)) for c in range(3)))
+            slopes = self.exposure.slopes(dr.opaque(mi.UInt32, view), by_log)
+            gradient["exposure"] = mi.TensorXf(slopes, reals["exposure"].shape)
         gradient["harmonics"] = self._sheen(gradient["harmonics"])
         # Places on the screen in half edges of the picture, so that a threshold holds for pictures of all sizes.
         moved = statistics.d_mean2d * (max(camera.size) / 2)
@@ -177,7 +199,7 @@ class GaussianProblem:
         """The renderer of pictures of a size (width, height), for the degree of the stage; each is made once."""
         key = (*size, low_pass, self.plan.stages[self.stage].degree)
         if key not in self._splatters:
-            self._splatters[key] = Splatter(*size, key[-1], low_pass=low_pass)
+            self._splatters[key] = Splatter(*size, key[-1], low_pass=low_pass, compensated=self.plan.mip)
         return self._splatters[key]
 
     def _shape(self, size: tuple[int, int]) -> PictureShape:
@@ -189,8 +211,16 @@ class GaussianProblem:
         random = self.plan.random_background and self.batches.channels == 4
         return np.random.default_rng((self.seed, 3, iteration)).random(3) if random else None
 
+    def _gains(self, reals: Reals, view: int) -> mi.Float:
+        """By what the three channels of a view are multiplied, evaluated."""
+        if self.exposure is None:
+            return dr.opaque(mi.Float, 1, 3)
+        gains = dr.exp(dr.gather(mi.Float, reals["exposure"].array, 3 * dr.opaque(mi.UInt32, view) + dr.arange(mi.UInt32, 3)))
+        dr.eval(gains)
+        return gains
+
     def _compared(
-        self, picture: mi.TensorXf, view: int, shrink: int, background: np.ndarray | None
+        self, picture: mi.TensorXf, view: int, shrink: int, background: np.ndarray | None, gains: mi.Float
     ) -> tuple[mi.Float, mi.Float, mi.Float, mi.Float]:
         """Render and photograph over one background, (H, W, 3) flat and evaluated; the background (3,), and what counts."""
         codes, counted = self.batches.picture(shrink, view)
@@ -205,7 +235,8 @@ class GaussianProblem:
             value = codes[c]
             if len(codes) == 4:
                 value = value + (1 - codes[3]) * (colour - dr.opaque(mi.Float, float(before[c])))
-            dr.scatter(seen, (dr.gather(mi.Float, picture.array, 4 * pixel + c) + through * colour) * counted, 3 * pixel + c)
+            shown = dr.gather(mi.Float, picture.array, 4 * pixel + c) + through * colour
+            dr.scatter(seen, shown * dr.gather(mi.Float, gains, mi.UInt32(c)) * counted, 3 * pixel + c)
             dr.scatter(target, value * counted, 3 * pixel + c)
         dr.eval(seen, target)
         return seen, target, mi.Float(np.asarray(behind, np.float32)), counted
@@ -222,11 +253,26 @@ class GaussianProblem:
         return loss, gradient | more
 
     def rates(self, iteration: int) -> dict[str, float]:
-        """Learning rate of each parameter."""
-        return self.plan.rates(iteration, self.extent)
+        """Learning rate of each parameter.
+
+        A gain has a gradient in one step of n, for n photographs: then Adam moves it by up to sqrt(n) of its rate.
+        """
+        found = self.plan.rates(iteration, self.extent)
+        if self.exposure is not None:
+            found["exposure"] = self._turn(iteration) / len(self.cameras) ** 0.5
+        return found
+
+    def _turn(self, iteration: int) -> float:
+        """By how much a gain's logarithm may move when its photograph is looked at."""
+        return TURN * self.plan.end ** (iteration / max(self.plan.steps, 1))
 
     def after_step(self, reals: Reals, iteration: int) -> Reals:
-        """The reals; where Gaussians are relocated, transparent ones wander (Kheradmand et al. 2024, eq. 8)."""
+        """The reals: gains are pulled towards 1; where Gaussians are relocated, transparent ones wander (Kheradmand et al.
+        2024, eq. 8)."""
+        if self.exposure is not None:
+            pulled = Exposure(reals["exposure"].array).pulled(self._turn(iteration) / len(self.cameras))
+            dr.eval(pulled.logs)
+            reals = reals | {"exposure": pulled.tensor}
         if self.plan.control != "relocation" or iteration >= self.plan.grows[1] * self.plan.steps:
             return reals
         n = reals["means"].shape[0]
@@ -251,14 +297,14 @@ class GaussianProblem:
         self._forget_sums()
 
         def carry(tensors: Reals) -> Reals:
-            learnt = change.carry({name: np.array(value) for name, value in tensors.items()})
+            learnt = change.carry({name: np.array(value) for name, value in tensors.items() if name != "exposure"})
             if reset:
                 learnt["opacity_logits"][:] = 0
-            return {name: mi.TensorXf(array) for name, array in learnt.items()}
+            return tensors | {name: mi.TensorXf(array) for name, array in learnt.items()}
 
         now = len(self.cloud["means"])
         says = f"{now} Gaussians, {before} before" + (", all of opacity 0.01 at most" if reset else "")
-        return Refinement(self._reals_of(self.cloud), carry, {}, says)
+        return Refinement(self.start(), carry, {}, says)
 
     def _divided(self, room: int, rng: np.random.Generator) -> Change:
         """Clone and split where places on the screen are pulled at most; prune what is transparent or too large."""
@@ -298,7 +344,7 @@ class GaussianProblem:
             return {name: mi.TensorXf(array) for name, array in learnt.items()}
 
         says = f"photographs shrunk by {now.shrink}, harmonics of degree {now.degree}"
-        return Refinement(self._reals_of(self.cloud), carry, {}, says)
+        return Refinement(self.start(), carry, {}, says)
 
     def update_occupancy(self) -> None:
         """Nothing is left out of steps but what a camera does not see."""
@@ -325,13 +371,15 @@ def _of_degree(arrays: Arrays, degree: int) -> Arrays:
     return {**arrays, "harmonics": made}
 
 
-def _slope_of_picture(slope: mi.Float, behind: mi.Float, counted: mi.Float, shape: tuple[int, ...]) -> mi.TensorXf:
-    """Derivatives by colour multiplied by alpha, and by alpha, of those by what is seen over a background."""
+def _slope_of_picture(
+    slope: mi.Float, behind: mi.Float, counted: mi.Float, gains: mi.Float, shape: tuple[int, ...]
+) -> mi.TensorXf:
+    """Derivatives by colour multiplied by alpha, and by alpha, of those by what is seen over a background, times gains."""
     pixel = dr.arange(mi.UInt32, shape[0] * shape[1])
     dr.eval(slope)
     made, through = dr.empty(mi.Float, 4 * dr.width(pixel)), mi.Float(0)
     for c in range(3):
-        one = dr.gather(mi.Float, slope, 3 * pixel + c) * counted
+        one = dr.gather(mi.Float, slope, 3 * pixel + c) * counted * dr.gather(mi.Float, gains, mi.UInt32(c))
         through += one * dr.gather(mi.Float, behind, mi.UInt32(c))
         dr.scatter(made, one, 4 * pixel + c)
     dr.scatter(made, -through, 4 * pixel + 3)

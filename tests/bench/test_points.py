@@ -34,9 +34,13 @@ def test_promises() -> None:
         "peer": {"mivol_is_faster": 39.0},
         "rays": {"cloud": "10,000 at 200^2", "mivol": {"pixels_per_second_scaled": 0.2e6}},
         "biker": {"seconds_median": 2.1},
+        "chair": {"pixels": [200, 200], "seeds": {"0": {"psnr": 34.1}, "1": {"psnr": 33.9}}},
     }
     judged = [(bar["value"], bar["bar"], bar["met"]) for name, a in answers.items() for bar in points.compare(name, a)]
-    assert judged == [(1.5, 1.7, False), (1.5, 1.3, True), (39, 40, False), (0.2, 0.14, True), (2.1, 2, False)]
+    assert judged == [
+        (1.5, 1.7, False), (1.5, 1.3, True), (39, 40, False), (0.2, 0.14, True),
+        (2.1, 2, False), (34.1, 34, True), (33.9, 34, False),
+    ]
     assert points.compare("clouds", {}) == []
 
 

@@ -148,11 +148,21 @@ def test_a_stopped_fit_goes_on(photographs: Path, tmp_path: Path, monkeypatch: p
 def test_what_the_file_says_overrides_the_preset() -> None:
     raw = {"title": "x", "photos": {"path": "p"}, "gaussians": {}}
     assert make_gaussian_plan(config.from_dict(raw)) == PRESETS["minute"]
-    raw["gaussians"] = {"preset": "tiny", "effort": 2.0, "degree": 0, "most": 77, "control": "relocation", "ssim": 0.0}
+    given = {"preset": "tiny", "effort": 2.0, "degree": 0, "most": 77, "control": "relocation", "ssim": 0.0, "mip": True}
+    raw["gaussians"] = given
     plan = make_gaussian_plan(config.from_dict(raw))
     assert [stage.degree for stage in plan.stages] == [0, 0]
     assert plan.steps == 2 * PRESETS["tiny"].steps
     assert (plan.most, plan.control, plan.ssim, plan.start) == (77, "relocation", 0.0, PRESETS["tiny"].start)
+    assert plan.mip and not plan.exposure
+
+
+def test_minutes_are_said_before_anything_is_fitted(
+    photographs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = toml(tmp_path, photographs, effort=1.0, minutes=0.25)
+    assert main(["explain", str(path)]) == 0
+    assert "about 0.25 minutes" in capsys.readouterr().out
 
 
 def test_the_example_is_one_of_gaussians() -> None:
@@ -173,6 +183,8 @@ def test_the_example_is_one_of_gaussians() -> None:
         ("gaussians.start=3", "start is 3: at least 4 is expected"),
         ("gaussians.ssim=1.5", "ssim is 1.5: a number from 0 to 1 is expected"),
         ("gaussians.effort=inf", "effort is inf: a finite number above 0 is expected"),
+        ("gaussians.minutes=1", "minutes is 1.0 beside effort 0.2"),
+        ("gaussians.exposure=true", "gains were asked for and the photographs have alpha"),
         ("gaussians.most=2000000000", "most = "),
         ("variant=scalar_rgb", "mivol works in llvm_ad_rgb"),
     ],

@@ -74,6 +74,7 @@ def fit_of(monkeypatch: pytest.MonkeyPatch, folder: Path, views: int, shown: int
     )
     plan = SimpleNamespace(low_pass=0.3, low_pass_at=lambda shrink: ("low pass at", shrink))
     problem = SimpleNamespace(
+        exposure=None,
         cloud={name: getattr(cloud(), name) for name in outputs.Gaussians.__dataclass_fields__}, plan=plan
     )
     monkeypatch.setattr(outputs, "write_gaussians", lambda path, found: path.write_bytes(bytes(100)))

@@ -11,7 +11,7 @@ import pytest
 from mivol.errors import MivolError
 from mivol.optim.adam import Adam
 from mivol.optim.events import CoarseToFine, ControlDensity, UpdateOccupancy
-from mivol.optim.gaussian_plan import GaussianPlan, SplatStage, bytes_of, extent_of, memory_of
+from mivol.optim.gaussian_plan import PRESETS, GaussianPlan, SplatStage, bytes_of, extent_of, memory_of
 from mivol.photos import Camera
 
 PLAN = GaussianPlan(
@@ -107,3 +107,14 @@ def test_memory_is_said_and_refused(variant_rgb: str) -> None:
     large = 1 << 40
     with pytest.raises(MivolError, match=r"takes about 1024\.0 GiB and 2\.0 are left; read the photographs smaller"):
         memory_of(PLAN, large, 0, 2 << 30)
+
+
+def test_minutes_become_steps_and_no_clock_is_asked() -> None:
+    """Twice the minutes are twice the steps, larger photographs take fewer, and the plan's own minutes leave it as it is."""
+    plan = PRESETS["minute"].for_edge(200)
+    own = plan.minutes(200 * 200)
+    # 400 steps of (6 + 0.82 x 4.6 + 0.24 x 10) ms and 2000 of (6 + 0.82 x 10 + 0.24 x 40) ms
+    assert own == pytest.approx((400 * 12.2 + 2000 * 23.8) / 60e3, rel=0.01)
+    assert plan.in_minutes(own, 200 * 200) == plan
+    assert plan.in_minutes(2 * own, 200 * 200).steps == 2 * plan.steps
+    assert plan.in_minutes(own, 400 * 400).steps < 0.6 * plan.steps

@@ -19,7 +19,7 @@ from mivol.optim.events import Checkpoint
 from mivol.optim.gaussian_plan import PRESETS, GaussianPlan, SplatStage, bytes_of, extent_of, memory_of
 from mivol.optim.gaussian_problem import GaussianProblem, _wandered
 from mivol.optim.gaussian_start import begin_at
-from mivol.optim.loop import Fit, begin_fit
+from mivol.optim.loop import Fit, begin_fit, reconstruct
 from mivol.optim.ray_batches import RayBatches
 from mivol.photos import Photo
 from mivol.splatting import Splatter
@@ -262,3 +262,49 @@ def test_transparent_gaussians_wander_along_their_shape(variant_rgb: str) -> Non
     expected = 0.1 * sigma @ drawn[0] / (1 + np.exp(100 * (0 - 0.005)))
     np.testing.assert_allclose(found[0], expected, atol=1e-6)
     assert np.abs(found[1]).max() < 1e-12
+
+
+@pytest.mark.slow
+def test_gains_of_photographs_are_found(views: list[Photo]) -> None:
+    """Four views, each photographed twice with opposite logarithms of its gains, spread by 0.2.
+
+    A photograph has 40 turns of up to 0.05, of which the loss's other slopes and the prior (0.2 of each turn, times the
+    logarithm) leave a part; the colours of the Gaussians cannot follow both. More than 0.4 of the logarithms is asked for, in
+    their pattern.
+    """
+    logs = np.random.default_rng(3).normal(0, 0.2, (4, 3))
+    logs = np.concatenate([logs, -logs])
+    twice = [*views[:4], *views[:4]]
+    exposed = [replace(v, image=np.float32(v.image * np.exp(log)), alpha=None) for v, log in zip(twice, logs, strict=True)]
+    plan = replace(PLAN, stages=(SplatStage(20, 320, 0, 2),), exposure=True, every=1000)
+    problem = GaussianProblem(RayBatches.of(exposed, (2,)), [view.camera for view in twice], truth(), plan)
+    reconstruct(problem, plan.optimiser, plan.course())
+    found = np.log(problem.exposure.table())
+    assert np.abs(found.mean(axis=0)).max() < 1e-5
+    assert (found * logs).sum() / (logs**2).sum() > 0.4
+    assert np.corrcoef(found.ravel(), logs.ravel())[0, 1] > 0.9
+
+
+def test_derivatives_by_gains_are_those_of_the_loss(views: list[Photo]) -> None:
+    """Central differences of the loss, which is piecewise smooth in a gain: 1e-2 of it, float32."""
+    plan = replace(PLAN, exposure=True, ssim=0.5)
+    plain = [replace(view, alpha=None) for view in views]
+    problem = GaussianProblem(RayBatches.of(plain, (1, 2)), [v.camera for v in views], truth(), plan)
+    reals = problem.start()
+    logs = np.zeros((len(views), 3), np.float32)
+    logs[2] = [0.3, -0.2, 0.1]
+
+    def loss(change: np.ndarray) -> float:
+        return float(problem.loss_of_view(reals | {"exposure": mi.TensorXf(logs + np.float32(change))}, 2)[0].array[0])
+
+    gradient = np.array(problem.loss_of_view(reals | {"exposure": mi.TensorXf(logs)}, 2)[1]["exposure"])
+    assert not gradient[[0, 1, 3]].any()
+    for channel in range(3):
+        step = np.zeros_like(logs)
+        step[2, channel] = 1e-2
+        assert gradient[2, channel] == pytest.approx((loss(step) - loss(-step)) / 2e-2, rel=1e-2)
+
+
+def test_gains_of_photographs_with_alpha_are_refused(views: list[Photo]) -> None:
+    with pytest.raises(MivolError, match="gains were asked for"):
+        GaussianProblem(RayBatches.of(views, (1, 2)), [v.camera for v in views], truth(), replace(PLAN, exposure=True))
