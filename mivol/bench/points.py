@@ -319,7 +319,7 @@ def measure_chair_large(size: Size) -> dict:
 
 
 def _fit(name: str, size: Size) -> dict:
-    walk = race({"walk": Work(smoke().values, *camera_rays(size.walk_side)).tau()}, max(3, size.rounds // 2))["walk"]
+    walk = race({"walk": Work(smoke().values, *camera_rays(size.walk_side)).tau()}, max(size.rounds, 3))["walk"]
     asked = replace(CHAIR[name], effort=CHAIR[name].effort * size.effort)
     seconds = float(np.median(walk.processor))
     return fit_and_judge(DATA / "multiview" / "chair", asked, seconds, size.walk_side**2 / WALK)
