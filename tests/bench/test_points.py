@@ -309,3 +309,9 @@ def test_every_step_of_the_peer_derives_anew(variant_rgb: str, monkeypatch: pyte
         rounding = 1e-3 * float(np.abs(wanted).max())
         assert one == pytest.approx(wanted, abs=rounding)
         assert two == pytest.approx(wanted, abs=rounding)
+
+
+def test_a_quick_fit_has_fewer_steps(variant_rgb: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    said = lambda folder, asked, *seconds: {"effort": asked.effort, "folder": folder.name}  # noqa: E731
+    monkeypatch.setattr(points, "fit_and_judge", said)
+    assert points.measure_chair(points.QUICK) == {"effort": pytest.approx(1.2 * 0.02), "folder": "chair"}
