@@ -105,7 +105,7 @@ def test_a_plan_holds_what_was_chosen(monkeypatch: pytest.MonkeyPatch) -> None:
     thin, thick = fog((200, 200, 200), occupied=plan.SKIP_BELOW - 1e-9), fog((300, 300, 300), occupied=plan.SKIP_BELOW)
     homogeneous = fog(occupied=0.0)
     asked = needs(thin, thick, homogeneous, film_samples=2**24 + 1, emitter_kinds=("extended",), surfaces=("Rectangle",),
-                  boundaries=[SimpleNamespace(box="a box")] * 3, are_emitters_far=False)  # fmt: skip
+                  boundaries=[SimpleNamespace(box="a box", hole=None)] * 3, are_emitters_far=False)  # fmt: skip
     made = plan.make_plan(asked, Settings(max_depth=2))
     assert made.skips == (True, False, False)
     assert made.tracks == (False, True, False)
