@@ -14,6 +14,7 @@ import numpy as np
 import oracle_gaussians as oracle
 import pytest
 from false_alarms import Estimate, assert_precise, assert_same_mean, fresh
+from gaussian_scenes import SIDE, camera_rays, render
 from scipy.special import logit
 
 from mivol.errors import MivolError
@@ -26,7 +27,7 @@ from mivol.splatting import Splatter, tensors_of
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
 
-SIDE, SKY, SCALE, EYE = 12, 0.8, 1.3, np.array([0.4, 0.3, 5.0])
+SKY, SCALE, EYE = 0.8, 1.3, np.array([0.4, 0.3, 5.0])
 
 POINT = {"type": "point", "position": [1.5, 2.0, 2.5], "intensity": 10.0}
 
@@ -64,21 +65,6 @@ def scene(sigma_t: dict, albedo: object = 0.0, emitter: dict | None = None, fov:
             "sensor": {"type": "perspective", "fov": fov, "to_world": target, "film": film, "sampler": {"type": "independent"}},
         }
     )
-
-
-def render(found: mi.Scene, depth: int = 1, spp: int = 1, seed: int = 0, **more: object) -> np.ndarray:
-    integrator = mi.load_dict({"type": "mivol", "max_depth": depth, **more})
-    return np.array(mi.render(found, integrator=integrator, spp=spp, seed=seed), np.float64)
-
-
-def camera_rays(found: mi.Scene, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """The rays of one sample a pixel with a seed: they do not depend on what they meet."""
-    sampler = found.sensors()[0].sampler().clone()
-    sampler.seed(seed, SIDE * SIDE)
-    index = dr.arange(mi.UInt32, SIDE * SIDE)
-    place = (mi.Vector2f(index % SIDE, index // SIDE) + sampler.next_2d()) / SIDE
-    ray, _ = found.sensors()[0].sample_ray(0.0, 0.5, place, mi.Point2f(0.5))
-    return np.array(ray.o, np.float64).T, np.array(ray.d, np.float64).T
 
 
 # -- Absorption --------------------------------------------------------------------------------------------------------------

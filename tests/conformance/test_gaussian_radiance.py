@@ -14,6 +14,7 @@ import mitsuba as mi
 import numpy as np
 import oracle_gaussians as oracle
 import pytest
+from gaussian_scenes import SIDE, camera_rays, render
 from scipy.special import logit
 
 from mivol.errors import MivolError
@@ -26,7 +27,7 @@ from mivol.splatting import Splatter, tensors_of
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
 
-SIDE, EYE = 12, np.array([0.4, 0.3, 5.0])
+EYE = np.array([0.4, 0.3, 5.0])
 
 ROUNDING = 1e-4
 """Of light in float32, relative to colours of at most 2: a depth of one Gaussian is known to 2e-5
@@ -69,21 +70,6 @@ def scene(medium: dict, sensor: dict | None = None, **more: object) -> mi.Scene:
             **more,
         }
     )
-
-
-def render(found: mi.Scene, depth: int = 1, spp: int = 1, seed: int = 0, **more: object) -> np.ndarray:
-    integrator = mi.load_dict({"type": "mivol", "max_depth": depth, **more})
-    return np.array(mi.render(found, integrator=integrator, spp=spp, seed=seed), np.float64)
-
-
-def camera_rays(found: mi.Scene, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """The rays of one sample a pixel with a seed: they do not depend on what they meet."""
-    sampler = found.sensors()[0].sampler().clone()
-    sampler.seed(seed, SIDE * SIDE)
-    index = dr.arange(mi.UInt32, SIDE * SIDE)
-    place = (mi.Vector2f(index % SIDE, index // SIDE) + sampler.next_2d()) / SIDE
-    ray, _ = found.sensors()[0].sample_ray(0.0, 0.5, place, mi.Point2f(0.5))
-    return np.array(ray.o, np.float64).T, np.array(ray.d, np.float64).T
 
 
 def twin(

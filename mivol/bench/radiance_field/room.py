@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from mivol.photos import Camera, Photo, facing, intrinsics, pixel_centres, rays
 
-__all__ = ["RADIUS", "WALLS", "cameras_of", "image_of", "room"]
+__all__ = ["DISTANCE", "RADIUS", "WALLS", "cameras_of", "image_of", "room"]
 
 RADIUS, WALLS, DISTANCE = 0.5, 6.0, 2.0
 """Of the ball at the origin, half the edge of the cube of walls, and of the cameras from the origin [length]."""
