@@ -13,11 +13,13 @@ Source: Mildenhall et al. 2022 (NeRF in the Dark, eq. 4).
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import ClassVar
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 __all__ = ["SCALES", "Codes", "Radiance"]
 
@@ -53,6 +55,10 @@ class Codes:
         """By what an error is multiplied where the fit shows a colour."""
         return mi.Color3f(1)
 
+    def fog(self, pixels: Callable[[], np.ndarray]) -> np.ndarray:
+        """The colour (3,) of the fog that a fit begins with, of the pixels (N, 3) that it is to explain, if asked."""
+        return np.full(3, 0.5)
+
 
 @dataclass(frozen=True)
 class Radiance:
@@ -72,6 +78,15 @@ class Radiance:
     def by_reals(self, slopes: mi.Float, reals: mi.Float) -> mi.Float:
         """Derivatives by reals, of those by colours."""
         return slopes * dr.cosh(reals)
+
+    def fog(self, pixels: Callable[[], np.ndarray]) -> np.ndarray:
+        """Half of what the brightest hundredth of the pixels has, at most that of codes.
+
+        A fog brighter than all that is seen is taken away before it has learnt a colour, and for good: densities below 0 have
+        no derivative.
+        """
+        found = pixels()
+        return np.minimum(np.quantile(found, 0.99, axis=0) / 2, 0.5) if len(found) else np.full(3, 0.5)
 
     def weight(self, shown: mi.Color3f) -> mi.Color3f:
         """The slope of the tone curve."""

@@ -94,7 +94,8 @@ class RadianceProblem:
         distances = np.linalg.norm(self.batches.origins - self.box.mean(axis=0), axis=1)
         self.near = self.plan.near * float(np.median(distances))
         place, degree = place_grid(self.box, self.plan.stages[0].longest), self.plan.degree_at(0)
-        self.field = _fog(*place, degree, self.plan.start / self.unit, self.plan.levels, self.batches.space)
+        fog = _fog(*place, degree, self.plan.start / self.unit, self.plan.levels, self.batches.space)
+        self.field = _coloured(fog, self.scale.fog(self.batches.pixels))
         self._first_row = 0
         self._look_around()
 
@@ -336,6 +337,13 @@ def _fog(
     dr.eval(fog)
     colours = dr.zeros(mi.Float, dr.width(fog) * width)
     return SphericalGrid(res, to_world, degree, fog, colours, nodes, levels=levels, space=space)
+
+
+def _coloured(fog: SphericalGrid, colour: np.ndarray) -> SphericalGrid:
+    """A fog of one colour (3,) in all directions, whose harmonics are 0."""
+    row = np.zeros(fog.width, np.float32)
+    row[:3] = (colour - fog.offset) * math.sqrt(4 * math.pi)  # the first harmonic is 1 / sqrt(4 pi)
+    return fog.with_values(fog.density, dr.tile(mi.Float(row), dr.width(fog.density)))
 
 
 def _nodes_of(field: SphericalGrid, cells: Cells, chosen: mi.Bool) -> np.ndarray:

@@ -180,11 +180,15 @@ class RayBatches:
 
     def median(self) -> np.ndarray:
         """(3,) the median of each colour over the pixels that count, in the smallest size; grey where none does."""
+        counted = self.pixels()
+        return np.median(counted, axis=0) if len(counted) else np.full(3, 0.5)
+
+    def pixels(self) -> np.ndarray:
+        """(N, 3) the colours of the pixels that count, in the smallest size."""
         level = self.levels[max(self.levels)]
         codes = np.array(level.codes).reshape(-1, self.channels)[:, :3]
         counted = codes if level.counted is None else codes[np.array(level.counted) > 0]
-        unit = 255 if self.space == "srgb" else 1
-        return np.median(counted, axis=0) / unit if len(counted) else np.full(3, 0.5)
+        return counted / (255 if self.space == "srgb" else 1)
 
     def choose(self, count: int, rng: np.random.Generator) -> np.ndarray:
         """Numbers of so many views, each at most once, in ascending order; of all where there are fewer."""

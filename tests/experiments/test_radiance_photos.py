@@ -125,7 +125,7 @@ def test_what_is_found_is_kept_in_the_unit_of_the_files(photographs: Path, tmp_p
 @pytest.mark.slow
 def test_a_fit_of_radiance_is_as_bright_as_its_photographs(photographs: Path, tmp_path: Path) -> None:
     """Where codes would end at white, the median ratio of field and photograph is 1 to a few per cent; the page says it all."""
-    path = toml(tmp_path, photographs, field="effort = 1")
+    path = toml(tmp_path, photographs, field="effort = 1.5")
     _, judged = read(path)
     assert main(["optimize", str(path), "-o", str(tmp_path / "run")]) == 0
     found, ratios = load_field(tmp_path / "run/field.npz"), []

@@ -60,6 +60,29 @@ def test_reals_of_radiance_are_its_logarithm_far_from_0(variant_rgb: str) -> Non
         assert np.array_equal(np.array(same), colours)
 
 
+def test_a_fit_begins_with_a_fog_that_is_not_brighter_than_what_is_seen(variant_rgb: str) -> None:
+    """Half of the brightest hundredth of each colour, at most grey.
+
+    A dim ball before more light is found (43 dB were seen); a fog of 0.5, brighter than both, goes until no matter is left.
+    """
+    dim = np.full((400, 3), 0.25)
+    dim[:2] = 7  # hot pixels
+    scale = SCALES["linear"]
+    np.testing.assert_allclose(scale.fog(lambda: dim * [1, 0.4, 8]), [0.125, 0.05, 0.5])
+    np.testing.assert_allclose(scale.fog(lambda: dim[:0]), 0.5)
+    np.testing.assert_allclose(SCALES["srgb"].fog(lambda: dim), 0.5)
+    shots = [shot(k) for k in range(16)]
+    around = np.float32([0.25, 0.25, 0.25])
+    photos = []
+    for one in shots:
+        alpha = one.alpha[..., None]
+        image = np.float32(alpha * [0.2, 0.02, 0.05] + (1 - alpha) * around)
+        photos.append(replace(one, image=image, alpha=None, background=around))
+    fit = fitted(RayBatches.of(photos[1:], (1, 2), False, "linear"), PLAN)
+    seen = render_view(fit.problem.field, photos[0].camera, around).image
+    assert judge(seen, photos[0].image, space="linear").values["psnr"] > 25
+
+
 def test_an_error_weighs_the_slope_of_the_tone_curve(variant_rgb: str) -> None:
     """The loss of a ray, in float64, from what the field shows and the photographs hold; of a photograph beyond 1, too."""
     photos = [shot(k, 16) for k in range(3)]
