@@ -86,7 +86,7 @@ def at_smoke(found: mi.Scene) -> tuple[DirectLighting, MediumVertex]:
     media = media_of(found)
     fog = media.bodies[0].view.medium
     mei = medium_interaction(mi.Ray3f(mi.Point3f(0, 0, 9), mi.Vector3f(0, 0, -1)), mi.Float(6), fog)
-    return DirectLighting(media), MediumVertex(media, mei)
+    return DirectLighting(media), MediumVertex(media, mei, mi.Point3d(mei.p))
 
 
 def samples() -> EventSamples:

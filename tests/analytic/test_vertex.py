@@ -59,7 +59,7 @@ def test_a_point_of_smoke_scatters_by_its_phase_function(media):
     """Henyey-Greenstein of g = 0.5 where light turns by 0 and by 90 degrees; it stays in its medium, at its place."""
     smoke = media.scene.shapes()[0].interior_medium()
     mei = medium_interaction(mi.Ray3f(mi.Point3f(0), mi.Vector3f(0, 0, -1)), mi.Float(2), smoke)
-    vertex = MediumVertex(media, mei)
+    vertex = MediumVertex(media, mei, mi.Point3d(mei.p))
     for d, expected in ((mi.Vector3f(0, 0, -1), 0.75 / 0.5**3), (mi.Vector3f(1, 0, 0), 0.75 / 1.25**1.5)):
         found = [np.array(vertex.eval(d, mi.Bool(True))).ravel(), np.array(vertex.pdf(d, mi.Bool(True)))]
         for value in found:

@@ -34,6 +34,7 @@ from mivol.transport.media.channels import tangent_of
 from mivol.transport.media.optical_depth import jvp_optical_depth, vjp_optical_depth
 from mivol.transport.media.ray_intervals import RaySegment
 from mivol.transport.media.scene_media import SceneMedia
+from mivol.transport.traversal.fine_ray import FineRay
 from mivol.transport.traversal.random_numbers import seed_pcg32
 
 __all__ = ["DirectLight", "DirectLighting", "DirectSample"]
@@ -179,7 +180,7 @@ class DirectLighting:
         emitters, mei = self.emitters, vertex.interaction
         wo, weight, pdf = sample_phase(self.media, mei, samples.component, samples.direction, active)
         on = active & (pdf > 0)
-        ray = mi.Ray3f(mei.p, wo, dr.inf, mei.time, mei.wavelengths)
+        ray = FineRay.leaving(vertex.place, wo, mei)
         end, _, light = light_through(self.media, ray, mei.medium, on, rng)
         si = end.si
         emitter = si.emitter(self.media.scene, on)

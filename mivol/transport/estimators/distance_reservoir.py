@@ -29,6 +29,7 @@ from mivol.transport.estimators.shadow_rays import DARK
 from mivol.transport.estimators.visibility_cache import VisibilityCache
 from mivol.transport.media.ray_intervals import MediumInterval, MediumVisitor
 from mivol.transport.media.scene_media import SceneMedia
+from mivol.transport.traversal.fine_ray import Ray
 from mivol.transport.traversal.grid_walk import Cell, walk
 from mivol.transport.traversal.interpolation import gauss_points
 from mivol.transport.traversal.lattice import clip, split
@@ -59,7 +60,7 @@ class DistanceProposal:
     """
 
     media: SceneMedia
-    ray: mi.Ray3f
+    ray: Ray
     chosen: ChosenEmitter
     cache: VisibilityCache | None
     probe_depth: float

@@ -19,6 +19,7 @@ from mivol.transport.estimators.distance_reservoir import Candidate, DistancePro
 from mivol.transport.media.body import Body
 from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.traversal.cubic import cubic_at, cubic_integral, cubic_through, invert_cubic_integral
+from mivol.transport.traversal.fine_ray import Ray
 from mivol.transport.traversal.grid_walk import box_nodes, read_nodes
 from mivol.transport.traversal.lattice import piece_points
 from mivol.transport.traversal.random_numbers import draw_pcg32
@@ -97,7 +98,7 @@ def sample_distance(
     )
 
 
-def _curve(media: SceneMedia, ray: mi.Ray3f, candidate: Candidate, on: mi.Bool) -> list[list[mi.Float]]:
+def _curve(media: SceneMedia, ray: Ray, candidate: Candidate, on: mi.Bool) -> list[list[mi.Float]]:
     """The extinction along a piece for each channel: the coefficients of a cubic on [0, 1]."""
     values = [[mi.Float(0) for _ in range(4)] for _ in range(media.channels)]
     for index, body in enumerate(media.bodies):
@@ -107,7 +108,7 @@ def _curve(media: SceneMedia, ray: mi.Ray3f, candidate: Candidate, on: mi.Bool) 
     return [cubic_through(*v) for v in values]
 
 
-def _values_along(media: SceneMedia, body: Body, ray: mi.Ray3f, candidate: Candidate, on: mi.Bool) -> list[list[mi.Float]]:
+def _values_along(media: SceneMedia, body: Body, ray: Ray, candidate: Candidate, on: mi.Bool) -> list[list[mi.Float]]:
     """[channel][point] extinction at 0, 1/3, 2/3 and 1 of a piece, in one medium."""
     extinction = body.extinction(ray, body.flight_parts)
     constant = [[c] * 4 for c in extinction.constant]

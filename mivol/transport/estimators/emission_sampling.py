@@ -28,6 +28,7 @@ from mivol.transport.media.channels import by_channel, spectrum
 from mivol.transport.media.coefficients import emission_slope, eval_emission
 from mivol.transport.media.ray_intervals import RaySegment
 from mivol.transport.media.scene_media import SceneMedia
+from mivol.transport.traversal.fine_ray import FineRay, Ray
 from mivol.transport.traversal.random_numbers import draw_pcg32, seed_pcg32
 
 __all__ = ["EmissionLight", "EmissionSampling", "EmittingPoint"]
@@ -80,7 +81,7 @@ class EmissionSampling:
         weight = power_heuristic(line.pdf, vertex.pdf(d, on)) / dr.select(on, line.pdf * line.density, 1)
         # -- The light that arrives from there ----------------------------------------------------------------------------
         start, medium = vertex.leave(it.p + d * line.t)
-        ray = mi.Ray3f(start, d, dr.select(on, line.t, 0), it.time, mi.Color0f())
+        ray = FineRay.leaving(start, d, it, dr.select(on, line.t, 0))
         end, _, light = light_through(media, ray, medium, on, rng if estimates else None)
         on &= ~end.si.is_valid()
         inside = [(box.body, on & (line.box == k) & _holds(box, ray, end.medium)) for k, box in enumerate(self.table.boxes)]
@@ -93,7 +94,7 @@ class EmissionSampling:
         return EmissionLight(media, point, value, front * f)
 
 
-def _holds(box: EmittingBox, ray: mi.Ray3f, medium: mi.MediumPtr) -> mi.Bool:
+def _holds(box: EmittingBox, ray: Ray, medium: mi.MediumPtr) -> mi.Bool:
     """Whether the end of a ray lies in a medium; ``medium`` is the one that was traced to there."""
     if box.body.box is None:
         return medium == mi.MediumPtr(box.body.view.medium)

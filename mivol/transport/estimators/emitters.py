@@ -11,6 +11,7 @@ import numpy as np
 
 from mivol.transport.estimators.equiangular import EquiangularSampler, equiangular_towards
 from mivol.transport.estimators.event_samples import EventSamples
+from mivol.transport.traversal.fine_ray import Ray
 from mivol.transport.traversal.strata import Strata
 
 __all__ = ["UNIFORM", "ChosenEmitter", "SceneEmitters", "is_among"]
@@ -61,7 +62,7 @@ class SceneEmitters:
             strata,
         )
 
-    def choose(self, ray: mi.Ray3f, u: mi.Float) -> ChosenEmitter:
+    def choose(self, ray: Ray, u: mi.Float) -> ChosenEmitter:
         """Choose one of the ``sampled`` emitters for each lane, with equal probabilities, by a number in [0, 1)."""
         n, width = len(self.sampled), dr.width(ray)
         index = dr.minimum(mi.UInt32(u * n), max(n - 1, 0))

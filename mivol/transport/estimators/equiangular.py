@@ -10,10 +10,12 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
+from mivol.transport.traversal.fine_ray import Ray
+
 __all__ = ["EquiangularSampler", "equiangular_sampler", "equiangular_towards"]
 
 
-def equiangular_sampler(ray: mi.Ray3f, ball: list[mi.Float] | None) -> EquiangularSampler | None:
+def equiangular_sampler(ray: Ray, ball: list[mi.Float] | None) -> EquiangularSampler | None:
     """The sampler towards one emitter, a ball (x, y, z, radius); None where that is at infinity (no ball)."""
     if ball is None:
         return None
@@ -21,9 +23,9 @@ def equiangular_sampler(ray: mi.Ray3f, ball: list[mi.Float] | None) -> Equiangul
     return equiangular_towards(ray, mi.Point3f(x, y, z), dr.square(r), mi.Bool(True))
 
 
-def equiangular_towards(ray: mi.Ray3f, centre: mi.Point3f, radius2: mi.Float, finite: mi.Bool) -> EquiangularSampler:
+def equiangular_towards(ray: Ray, centre: mi.Point3f, radius2: mi.Float, finite: mi.Bool) -> EquiangularSampler:
     """The sampler of rays towards a ball about ``centre``, for the lanes whose emitter is ``finite``."""
-    away = centre - ray.o
+    away = centre - mi.Point3f(ray.o)
     t0 = dr.dot(away, ray.d)
     h2 = dr.squared_norm(away - t0 * ray.d)
     # The distance of the ray from a point light may be 0. It is bounded below by 1e-4 of the distance to the light, so that the

@@ -36,6 +36,7 @@ from mivol.transport.media.coefficients import emission_slope, eval_albedo, eval
 from mivol.transport.media.optical_depth import jvp_optical_depth, vjp_optical_depth
 from mivol.transport.media.ray_intervals import RaySegment
 from mivol.transport.media.scene_media import SceneMedia
+from mivol.transport.traversal.fine_ray import FineRay, Ray
 
 __all__ = ["FlownSegment", "Probe", "ProbeTerm", "weigh_collisions"]
 
@@ -190,7 +191,7 @@ class Probe:
         total: of the weights of all flights.
     """
 
-    ray: mi.Ray3f
+    ray: FineRay
     t: mi.Float64
     body: mi.UInt32
     gain: mi.Spectrum
@@ -199,12 +200,12 @@ class Probe:
     total: mi.Float
 
     @classmethod
-    def none(cls, ray: mi.Ray3f) -> Probe:
+    def none(cls, ray: Ray) -> Probe:
         """No flight yet."""
         n = dr.width(ray)
         zero = dr.zeros(mi.Float, n)
         nothing = dr.zeros(mi.Float64, n), dr.zeros(mi.UInt32, n), dr.zeros(mi.Spectrum, n)
-        return cls(mi.Ray3f(ray), *nothing, dr.zeros(mi.UInt32, n), zero, zero)
+        return cls(FineRay.of(ray), *nothing, dr.zeros(mi.UInt32, n), zero, zero)
 
     def offer(self, segment: PathSegment, found: FlightPoint, depth: mi.UInt32) -> Probe:
         """Keep a point of one more flight, or the one that was kept before."""
@@ -293,7 +294,7 @@ class ProbeTerm:
         return dr.select(dr.detach(albedo) < LEAST_ALBEDO, self._gain * sigma_t * self.source, 0)
 
 
-def weigh_collisions(media: SceneMedia, ray: mi.Ray3f, hit: Collision) -> mi.Spectrum:
+def weigh_collisions(media: SceneMedia, ray: Ray, hit: Collision) -> mi.Spectrum:
     """The weight [length] that derivatives at collisions have: 1 / (sigma + kappa); 0 where there is none."""
     weight = mi.Spectrum(0)
     for body, on in media.bodies_at(hit.body, hit.on):
@@ -301,7 +302,7 @@ def weigh_collisions(media: SceneMedia, ray: mi.Ray3f, hit: Collision) -> mi.Spe
     return weight
 
 
-def _weigh_collision(media: SceneMedia, body: Body, ray: mi.Ray3f, t: mi.Float64, on: mi.Bool) -> tuple[str, mi.Spectrum]:
+def _weigh_collision(media: SceneMedia, body: Body, ray: Ray, t: mi.Float64, on: mi.Bool) -> tuple[str, mi.Spectrum]:
     """The name of the coefficient sigma that makes collisions scatter, and 1 / (sigma + kappa) [length] at a point."""
     name = "sigma_s" if body.view.albedo is None else "sigma_"
     sigma = spectrum(body.extinction_at(ray, dr.select(on, t, 0), media.channels, on, name))
@@ -325,7 +326,7 @@ def _over_albedo(albedo: mi.Spectrum) -> mi.Spectrum:
     return dr.select(large, albedo * dr.rcp(dr.select(large, value, 1)), 0)
 
 
-def _emission_slopes(body: Body, ray: mi.Ray3f, t: mi.Float64, on: mi.Bool) -> list[tuple[str, mi.Spectrum]]:
+def _emission_slopes(body: Body, ray: Ray, t: mi.Float64, on: mi.Bool) -> list[tuple[str, mi.Spectrum]]:
     """The coefficients that emission goes with, and its derivative by each."""
     if body.view.emission is None:
         return []

@@ -49,6 +49,7 @@ from mivol.transport.media.gaussian_extinction import GaussianExtinction
 from mivol.transport.media.optical_depth import sum_optical_depth
 from mivol.transport.media.ray_intervals import MediumInterval, MediumVisitor, RaySegment, revisit_media, visit_media
 from mivol.transport.media.scene_media import SceneMedia
+from mivol.transport.traversal.fine_ray import Ray, point_along
 from mivol.transport.traversal.random_numbers import draw_pcg32, seed_pcg32
 from mivol.transport.traversal.strata import Strata
 
@@ -129,22 +130,23 @@ class FreeFlight:
         probe = self._point_of(segment, passed, media.bodies, at_probe, chance, active) if purpose != PICTURE else None
         return SegmentEstimate(end, weight, light, SegmentTransmittance(shared), collision, probe)
 
-    def _collision(self, ray: mi.Ray3f, flight: _Flight, collides: mi.Bool) -> Collision:
+    def _collision(self, ray: Ray, flight: _Flight, collides: mi.Bool) -> Collision:
         """The point of a collision, and its albedo."""
-        mei, albedo = medium_interaction(ray, dr.select(collides, flight.t, 0)), mi.Spectrum(0)
+        t, albedo = dr.select(collides, flight.t, 0), mi.Spectrum(0)
+        mei = medium_interaction(ray, t)
         mei.medium = self.media.medium_of(flight.body, collides)
         for body, here in self.media.bodies_at(flight.body, collides):
             albedo = dr.select(here, self._albedo(body, ray, flight.t, mei, here), albedo)
-        return Collision(mei, albedo, collides, flight.t, flight.body)
+        return Collision(mei, point_along(ray, t), albedo, collides, flight.t, flight.body)
 
-    def _albedo(self, body: Body, ray: mi.Ray3f, t: mi.Float64, mei: mi.MediumInteraction3f, on: mi.Bool) -> mi.Spectrum:
+    def _albedo(self, body: Body, ray: Ray, t: mi.Float64, mei: mi.MediumInteraction3f, on: mi.Bool) -> mi.Spectrum:
         """sigma_s / sigma_t at a point of a body."""
         if body.view.albedo is not None:
             return dr.detach(eval_albedo(body, mei, on))
         sigma_s, sigma_t = (self._extinction(body, ray, t, on, name) for name in ("sigma_s", "sigma_"))
         return dr.select(sigma_t > 0, sigma_s / dr.select(sigma_t > 0, sigma_t, 1), 0)
 
-    def _extinction(self, body: Body, ray: mi.Ray3f, t: mi.Float64, on: mi.Bool, name: str = "sigma_") -> mi.Spectrum:
+    def _extinction(self, body: Body, ray: Ray, t: mi.Float64, on: mi.Bool, name: str = "sigma_") -> mi.Spectrum:
         return spectrum(body.extinction_at(ray, dr.select(on, t, 0), self.media.channels, on, name))
 
     def _weigh(self, segment: PathSegment, passed: RaySegment, active: mi.Bool, collision: Collision | None) -> mi.Spectrum:
@@ -180,7 +182,7 @@ class FreeFlight:
         return FlightPoint(point, gain, chance)
 
 
-def _fly(media: SceneMedia, ray: mi.Ray3f, u: mi.Float, channel: mi.UInt32) -> MediumVisitor:
+def _fly(media: SceneMedia, ray: Ray, u: mi.Float, channel: mi.UInt32) -> MediumVisitor:
     """The visitor that keeps the first collision along ``ray``."""
     bodies = media.bodies
     # A boundary that is traced may be entered several times, and each time takes a number of its own.

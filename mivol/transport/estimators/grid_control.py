@@ -31,6 +31,7 @@ from mivol.transport.estimators.vertex import MediumVertex
 from mivol.transport.media.body import Body
 from mivol.transport.media.coefficients import eval_albedo
 from mivol.transport.media.scene_media import SceneMedia
+from mivol.transport.traversal.fine_ray import Ray
 from mivol.transport.traversal.interpolation import interpolate
 from mivol.transport.traversal.lattice import Lattice, locate
 
@@ -99,7 +100,7 @@ class GridControl:
         index = mi.UInt32(((lower.z + 1) * (y + 1) + lower.y + 1) * (x + 1) + lower.x + 1) * self.channels
         return [dr.gather(mi.Float, self.values, index + c, active) for c in range(self.channels)]
 
-    def at_point(self, body: Body, ray: mi.Ray3f, t: mi.Float, active: mi.Bool) -> list[mi.Float]:
+    def at_point(self, body: Body, ray: Ray, t: mi.Float, active: mi.Bool) -> list[mi.Float]:
         """S at a point of a ray."""
         cell, _, inside = locate(body.view.parts[0].lattice, ray.o, ray.d, t)
         S = self.at(cell, inside & active)
@@ -177,7 +178,7 @@ def _light_of_nodes(
     ray = mi.Ray3f(p, -mei.wi, dr.inf, mi.Float(0), mi.Color0f())
     chosen = direct.emitters.choose(ray, samples.which_emitter)
     everywhere = dr.full(mi.Bool, True, dr.width(lane))
-    found = direct.in_medium(MediumVertex(direct.media, mei), chosen, samples, False, everywhere)
+    found = direct.in_medium(MediumVertex(direct.media, mei, mi.Point3d(mei.p)), chosen, samples, False, everywhere)
     apart = max(float(np.linalg.norm(lattice.to_world[:3, a])) / (k - 1) for a, k in enumerate((x, y, z)))
     light = sum((_spread(a, apart) for a in found), mi.Spectrum(0))
     dr.eval(light)

@@ -24,6 +24,7 @@ from mivol.transport.media.channels import spectrum
 from mivol.transport.media.extinction import ExactExtinction
 from mivol.transport.media.ray_intervals import OWN_SURFACE, MediumInterval, RaySegment, revisit_media
 from mivol.transport.media.scene_media import SceneMedia
+from mivol.transport.traversal.fine_ray import Ray, point_along, traced
 from mivol.transport.traversal.grid_walk import Cell, Nodes, walk
 from mivol.transport.traversal.interpolation import GAUSS, gauss_points
 from mivol.transport.traversal.lattice import Lattice, Segment, clip
@@ -93,7 +94,7 @@ def _steps(media: SceneMedia, ray_segment: RaySegment, active: mi.Bool) -> list[
     """L times the term of the derivative from boundaries that are traced, one vector a channel."""
     # -- State ------------------------------------------------------------------------------------------------------------
     ray = ray_segment.ray
-    onward = mi.Ray3f(ray)  #                        the ray from the last surface on
+    onward = traced(ray)  #                        the ray from the last surface on
     going = mi.Bool(active)
     total = [dr.zeros(mi.Vector3f, dr.width(ray)) for _ in range(media.channels)]
 
@@ -108,7 +109,7 @@ def _steps(media: SceneMedia, ray_segment: RaySegment, active: mi.Bool) -> list[
 
 
 def _add_step(
-    total: list[mi.Vector3f], media: SceneMedia, ray: mi.Ray3f, hit: mi.SurfaceInteraction3f, t: mi.Float, crosses: mi.Bool
+    total: list[mi.Vector3f], media: SceneMedia, ray: Ray, hit: mi.SurfaceInteraction3f, t: mi.Float, crosses: mi.Bool
 ) -> list[mi.Vector3f]:
     """Add the term of one boundary, from the extinctions a little before and a little behind it."""
     slope = dr.dot(hit.n, ray.d)
@@ -188,10 +189,10 @@ def _slope(c: list[mi.Float], p: mi.Vector3f) -> mi.Vector3f:
     return mi.Vector3f(dx, dy, dz)
 
 
-def _face(rows: list, low: tuple, high: tuple, ray: mi.Ray3f, t: mi.Float64) -> mi.Vector3f:
+def _face(rows: list, low: tuple, high: tuple, ray: Ray, t: mi.Float64) -> mi.Vector3f:
     """n / (n . w) of the face of a box on which a point of a ray lies."""
     best, normal = mi.Float64(dr.inf), mi.Vector3f(0)
-    p = [dr.fma(t, mi.Float64(ray.d[a]), mi.Float64(ray.o[a])) for a in range(3)]
+    p = point_along(ray, t)
     for row, a, b in zip(rows, low, high, strict=True):
         q = dr.fma(row[0], p[0], dr.fma(row[1], p[1], dr.fma(row[2], p[2], row[3])))
         speed = sum(row[k] * mi.Float64(ray.d[k]) for k in range(3))

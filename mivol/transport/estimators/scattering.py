@@ -13,6 +13,7 @@ from mivol.transport.media.body import Body
 from mivol.transport.media.channels import spectrum
 from mivol.transport.media.coefficients import eval_albedo, medium_interaction
 from mivol.transport.media.scene_media import SceneMedia
+from mivol.transport.traversal.fine_ray import Ray
 
 __all__ = ["Scattering", "at_event", "medium_event_interaction", "sigma_s_at", "sigma_t_at"]
 
@@ -43,7 +44,7 @@ class Scattering:
         return self.gain * sum((dr.detach(a.value) for a in self.direct), mi.Spectrum(0))
 
 
-def medium_event_interaction(media: SceneMedia, ray: mi.Ray3f, event: MediumEvent) -> mi.MediumInteraction3f:
+def medium_event_interaction(media: SceneMedia, ray: Ray, event: MediumEvent) -> mi.MediumInteraction3f:
     """An event as the interaction that Mitsuba's phase functions are evaluated at."""
     mei = medium_interaction(ray, event.t)
     mei.medium = media.medium_of(event.body, event.on)
@@ -55,13 +56,13 @@ def at_event(media: SceneMedia, event: MediumEvent) -> list[tuple[Body, mi.Bool]
     return media.bodies_at(event.body, event.on)
 
 
-def sigma_t_at(media: SceneMedia, body: Body, ray: mi.Ray3f, event: MediumEvent, on: mi.Bool) -> mi.Spectrum:
+def sigma_t_at(media: SceneMedia, body: Body, ray: Ray, event: MediumEvent, on: mi.Bool) -> mi.Spectrum:
     """The extinction [1/length] at an event."""
     rows = event.sigma_t if media.is_single else body.extinction_at(ray, event.t, media.channels, on)
     return spectrum(rows)
 
 
-def sigma_s_at(media: SceneMedia, ray: mi.Ray3f, event: MediumEvent, mei: mi.MediumInteraction3f) -> mi.Spectrum:
+def sigma_s_at(media: SceneMedia, ray: Ray, event: MediumEvent, mei: mi.MediumInteraction3f) -> mi.Spectrum:
     """The scattering coefficient [1/length] at an event."""
     total = mi.Spectrum(0)
     for body, on in at_event(media, event):

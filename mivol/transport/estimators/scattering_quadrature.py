@@ -11,9 +11,8 @@ Each cell is cut into pieces of an optical depth of at most ``PIECE``, and of an
 emitter near by; then the cuts are uniform in that angle. A cell that would need more than ``MOST`` pieces is cut only as far as
 light comes: to the optical depth ``DARK`` of each channel.
 
-Shadow rays start at float32 points. With an extinction sigma, the optical depth of the lit layer is therefore off by sigma
-times the rounding of a distance along the camera's ray and of a coordinate: 1 % where 1e5 optical depths lie between
-coordinates that differ by 1.
+A cell's distance from where the ray enters its grid is a float32 number. With an extinction sigma, the optical depth of a lit
+layer is therefore off by sigma times the rounding of that distance: 1 % where 1e5 optical depths lie in front of the layer.
 
 Conventions. One medium, whose grids share their cells. Shadows are exact walks, or interpolated in a transmittance grid.
 
@@ -45,6 +44,7 @@ from mivol.transport.media.coefficients import eval_albedo, medium_interaction
 from mivol.transport.media.optical_depth import transmittance
 from mivol.transport.media.ray_intervals import MediumInterval, RaySegment, visit_media
 from mivol.transport.media.scene_media import SceneMedia
+from mivol.transport.traversal.fine_ray import Ray, point_along
 from mivol.transport.traversal.grid_walk import Cell, walk
 from mivol.transport.traversal.interpolation import GAUSS
 from mivol.transport.traversal.lattice import clip
@@ -178,7 +178,7 @@ class _LitRay:
     """
 
     quadrature: ScatteringQuadrature
-    ray: mi.Ray3f
+    ray: Ray
     number: int
     equiangular: EquiangularSampler | None
 
@@ -226,7 +226,7 @@ class _LitRay:
         direct, weight = emitter.sample_direction(mei, mi.Point2f(0.5), on)
         f, _ = body.view.medium.phase_function().eval_pdf(mi.PhaseFunctionContext(None), mei, direct.d, on)
         if grid is None:
-            _, clear, _, seen = shadow_ray(media, mi.Point3f(mei.p), mei.medium, direct, on)
+            _, clear, _, seen = shadow_ray(media, point_along(self.ray, t), mei.medium, direct, on)
             seen = dr.select(clear, seen, 0)
         else:
             seen = grid.transmittance(mei.p, self.number, on)
@@ -338,7 +338,7 @@ def _add_piece(state: _LightSum, span: _Span, near: mi.Float, far: mi.Float, on:
     return _LightSum(ahead, beyond, state.light + added)
 
 
-def _albedo(media: SceneMedia, body: Body, ray: mi.Ray3f, mei: mi.MediumInteraction3f, on: mi.Bool) -> mi.Spectrum:
+def _albedo(media: SceneMedia, body: Body, ray: Ray, mei: mi.MediumInteraction3f, on: mi.Bool) -> mi.Spectrum:
     """The albedo, or sigma_s / sigma_t where the medium has both coefficients; 0 where its extinction is 0."""
     if body.view.albedo is not None:
         return eval_albedo(body, mei, on)

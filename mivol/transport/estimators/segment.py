@@ -25,6 +25,7 @@ from mivol.transport.media.optical_depth import (
 )
 from mivol.transport.media.ray_intervals import RaySegment, SegmentEnd
 from mivol.transport.media.scene_media import SceneMedia
+from mivol.transport.traversal.fine_ray import Ray
 from mivol.transport.traversal.strata import Strata
 
 __all__ = [
@@ -61,7 +62,7 @@ class PathSegment:
         emission_weight: of the light that media emit along it, where that was drawn at its origin too; None for 1.
     """
 
-    ray: mi.Ray3f
+    ray: Ray
     medium: mi.MediumPtr
     beta: mi.Spectrum
     scatters: mi.Bool
@@ -76,6 +77,7 @@ class Collision:
 
     Attributes:
         mei: the point, and its medium, as Mitsuba's phase functions are evaluated at it.
+        place: the point in float64.
         albedo: probability [1] that it scatters, of each colour.
         on: lanes whose flight ends so; the others reach the end of their segment.
         t: its distance on the ray [length].
@@ -83,6 +85,7 @@ class Collision:
     """
 
     mei: mi.MediumInteraction3f
+    place: mi.Point3d
     albedo: mi.Spectrum
     on: mi.Bool
     t: mi.Float64

@@ -26,6 +26,7 @@ from mivol.transport.media.ray_intervals import (
     visit_media,
 )
 from mivol.transport.media.scene_media import SceneMedia
+from mivol.transport.traversal.fine_ray import FineRay, Ray
 from mivol.transport.traversal.random_numbers import draw_pcg32
 
 __all__ = ["DARK", "SURE_DEPTH", "estimate_transmittance", "light_through", "shadow_ray"]
@@ -41,7 +42,7 @@ scatterings in cloud and smoke: 1.02 to 1.2 times less than without roulette; 2 
 
 
 def light_through(
-    media: SceneMedia, ray: mi.Ray3f, medium: mi.MediumPtr, active: mi.Bool, rng: mi.UInt32 | None = None
+    media: SceneMedia, ray: Ray, medium: mi.MediumPtr, active: mi.Bool, rng: mi.UInt32 | None = None
 ) -> tuple[SegmentEnd, list[mi.Float] | None, mi.Spectrum]:
     """Follow a ray to the first opaque surface, and find its transmittance.
 
@@ -72,7 +73,7 @@ def light_through(
 
 
 def estimate_transmittance(
-    media: SceneMedia, ray: mi.Ray3f, medium: mi.MediumPtr, active: mi.Bool, rng: mi.UInt32, passes_null: bool = False
+    media: SceneMedia, ray: Ray, medium: mi.MediumPtr, active: mi.Bool, rng: mi.UInt32, passes_null: bool = False
 ) -> tuple[SegmentEnd, mi.Spectrum]:
     """Where a ray ends, and an unbiased estimate of the share of light that its media let through; ``rng`` draws it."""
     start = ([mi.Float(1) for _ in range(media.channels)], rng)
@@ -111,7 +112,7 @@ def _estimate_transmittance(interval: MediumInterval, channels: int, rng: mi.UIn
 
 def shadow_ray(
     media: SceneMedia,
-    start: mi.Point3f,
+    start: mi.Point3d,
     medium: mi.MediumPtr,
     direct: mi.DirectionSample3f,
     active: mi.Bool,
@@ -133,8 +134,9 @@ def shadow_ray(
     u = None
     if rng is not None and media.is_bounded:
         rng, (u,) = draw_pcg32(rng, 1)
-    length = dr.norm(direct.p - start)
-    ray = mi.Ray3f(start, dr.normalize(direct.p - start), length, direct.time, mi.Color0f())
+    away = direct.p - mi.Point3f(start)
+    length = dr.norm(away)
+    ray = FineRay.leaving(start, dr.normalize(away), direct, length)
     stop, tau, light = light_through(media, ray, medium, active, rng)
     clear = ~(stop.si.is_valid() & (stop.t < length * OWN_SURFACE))
     return RaySegment(ray, medium, length, True, u), clear, tau, light

@@ -18,6 +18,7 @@ from mivol.transport.estimators.direct_lighting import DirectLight
 from mivol.transport.media.optical_depth import jvp_optical_depth, vjp_optical_depth
 from mivol.transport.media.ray_intervals import RaySegment
 from mivol.transport.media.scene_media import SceneMedia
+from mivol.transport.traversal.fine_ray import FineRay, Ray
 
 __all__ = ["ShadowReservoir", "ShadowTerm"]
 
@@ -39,12 +40,12 @@ class ShadowReservoir:
     total: mi.Float
 
     @classmethod
-    def empty(cls, media: SceneMedia, ray: mi.Ray3f) -> ShadowReservoir:
+    def empty(cls, media: SceneMedia, ray: Ray) -> ShadowReservoir:
         """No shadow ray yet."""
         n = dr.width(ray)
         zero = dr.zeros(mi.Float, n)
         u = zero if media.is_bounded else None
-        return cls(RaySegment(mi.Ray3f(ray), dr.zeros(mi.MediumPtr, n), zero, True, u), dr.zeros(mi.Spectrum, n), zero, zero)
+        return cls(RaySegment(FineRay.of(ray), dr.zeros(mi.MediumPtr, n), zero, True, u), dr.zeros(mi.Spectrum, n), zero, zero)
 
     def offer(self, light: DirectLight, chance: mi.Float) -> ShadowReservoir:
         """The reservoir after one more shadow ray: a step of weighted reservoir sampling.

@@ -44,6 +44,7 @@ from mivol.transport.estimators.vertex import MediumVertex
 from mivol.transport.estimators.visibility_cache import VisibilityCache
 from mivol.transport.media.optical_depth import sum_optical_depth, transmittance
 from mivol.transport.media.ray_intervals import RaySegment, SegmentEnd, revisit_media, visit_media
+from mivol.transport.traversal.fine_ray import point_along
 from mivol.transport.traversal.strata import Strata
 
 __all__ = ["SingleScattering"]
@@ -169,7 +170,7 @@ class SingleScattering:
             zero = [mi.Float(0) for _ in range(media.channels)]
             tau = revisit_media(media, front, sum_optical_depth(), zero, event.on)
         gain = dr.select(event.on, segment.beta * transmittance(tau) / event.pdf, 0)
-        vertex = MediumVertex(media, mei)
+        vertex = MediumVertex(media, mei, point_along(ray, event.t))
         # Roulette is for paths: the noise of one scattering is small, and that of roulette would show.
         direct = self.direct.in_medium(vertex, chosen, samples, probes, event.on, not probes and media.tracks_shadows)
         return Scattering(event, mei, gain, direct, sigma_s_at(media, ray, event, mei), samples.which_shadow_ray)

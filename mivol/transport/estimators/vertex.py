@@ -24,7 +24,7 @@ class Vertex(Protocol):
 
     interaction: mi.Interaction3f
 
-    def leave(self, p: mi.Point3f) -> tuple[mi.Point3f, mi.MediumPtr]:
+    def leave(self, p: mi.Point3f) -> tuple[mi.Point3d, mi.MediumPtr]:
         """The origin of a ray from the vertex towards ``p``, and the medium around that origin."""
 
     def eval(self, d: mi.Vector3f, active: mi.Bool) -> mi.Spectrum:
@@ -50,10 +50,10 @@ class SurfaceVertex:
     bsdf: mi.BSDFPtr
     medium: mi.MediumPtr
 
-    def leave(self, p: mi.Point3f) -> tuple[mi.Point3f, mi.MediumPtr]:
+    def leave(self, p: mi.Point3f) -> tuple[mi.Point3d, mi.MediumPtr]:
         si = self.interaction
         start = spawn_ray(si, p - si.p, self.media.size).o
-        return start, dr.select(si.is_medium_transition(), si.target_medium(p - start), self.medium)
+        return mi.Point3d(start), dr.select(si.is_medium_transition(), si.target_medium(p - start), self.medium)
 
     def eval(self, d: mi.Vector3f, active: mi.Bool) -> mi.Spectrum:
         return self.bsdf.eval(mi.BSDFContext(), self.interaction, self.interaction.to_local(d), active)
@@ -64,18 +64,25 @@ class SurfaceVertex:
 
 @dataclass
 class MediumVertex:
-    """A point of the medium ``interaction.medium``."""
+    """A point of the medium ``interaction.medium``.
+
+    Attributes:
+        media: of the scene.
+        interaction: the point, as Mitsuba's phase functions and emitters see it.
+        place: the point in float64, from which rays leave.
+    """
 
     media: SceneMedia
     interaction: mi.MediumInteraction3f
+    place: mi.Point3d
 
     @property
     def phase(self) -> mi.PhaseFunctionPtr:
         """The phase function there."""
         return self.interaction.medium.phase_function()
 
-    def leave(self, p: mi.Point3f) -> tuple[mi.Point3f, mi.MediumPtr]:
-        return mi.Point3f(self.interaction.p), self.interaction.medium
+    def leave(self, p: mi.Point3f) -> tuple[mi.Point3d, mi.MediumPtr]:
+        return self.place, self.interaction.medium
 
     def eval(self, d: mi.Vector3f, active: mi.Bool) -> mi.Spectrum:
         return self.phase.eval_pdf(phase_context(), self.interaction, d, active)[0]
@@ -106,7 +113,7 @@ class EitherVertex:
         """The point."""
         return dr.select(self.in_medium, mi.Interaction3f(self.medium.interaction), mi.Interaction3f(self.surface.interaction))
 
-    def leave(self, p: mi.Point3f) -> tuple[mi.Point3f, mi.MediumPtr]:
+    def leave(self, p: mi.Point3f) -> tuple[mi.Point3d, mi.MediumPtr]:
         (inside, medium), (outside, around) = self.medium.leave(p), self.surface.leave(p)
         return dr.select(self.in_medium, inside, outside), dr.select(self.in_medium, medium, around)
 

@@ -21,6 +21,7 @@ from mivol.transport.line_integrals.expected_depth import integrate_expected_dep
 from mivol.transport.media.optical_depth import integrate_optical_depth, jvp_rows, vjp_rows
 from mivol.transport.media.ray_intervals import RaySegment, SegmentEnd
 from mivol.transport.media.scene_media import SceneMedia
+from mivol.transport.traversal.fine_ray import Ray
 from mivol.transport.traversal.ray_spawning import camera_ray
 
 __all__ = ["AOVS", "integrate_aovs", "jvp_aovs", "vjp_aovs"]
@@ -46,7 +47,7 @@ class _FirstSegment:
     alpha: list[mi.Float]
 
 
-def integrate_aovs(media: SceneMedia, ray: mi.Ray3f, names: tuple[str, ...], active: mi.Bool = True) -> list[mi.Float]:
+def integrate_aovs(media: SceneMedia, ray: Ray, names: tuple[str, ...], active: mi.Bool = True) -> list[mi.Float]:
     """Integrate AOVs along camera rays.
 
     Args:
@@ -71,7 +72,7 @@ def integrate_aovs(media: SceneMedia, ray: mi.Ray3f, names: tuple[str, ...], act
     return [values[n] if n in values else _weigh(_channel_weights(n, media.channels), rows[_row(n)]) for n in names]
 
 
-def jvp_aovs(media: SceneMedia, ray: mi.Ray3f, names: tuple[str, ...], active: mi.Bool = True) -> list[mi.Float]:
+def jvp_aovs(media: SceneMedia, ray: Ray, names: tuple[str, ...], active: mi.Bool = True) -> list[mi.Float]:
     """Tangents of AOVs, from the parameters' tangents that :meth:`SceneMedia.start_tangent` took.
 
     Args:
@@ -91,7 +92,7 @@ def jvp_aovs(media: SceneMedia, ray: mi.Ray3f, names: tuple[str, ...], active: m
     return [values[n] if n in values else _weigh(_channel_weights(n, media.channels), rows[_row(n)]) for n in names]
 
 
-def vjp_aovs(media: SceneMedia, ray: mi.Ray3f, names: tuple[str, ...], daovs: list[mi.Float], active: mi.Bool = True) -> None:
+def vjp_aovs(media: SceneMedia, ray: Ray, names: tuple[str, ...], daovs: list[mi.Float], active: mi.Bool = True) -> None:
     """Add the derivatives of AOVs, weighted by ``daovs``, to the gradients of the media.
 
     Args:
@@ -114,7 +115,7 @@ def vjp_aovs(media: SceneMedia, ray: mi.Ray3f, names: tuple[str, ...], daovs: li
             vjp_expected_depth(media, first.ray_segment, first.end, depth, d * _inverse(opacity), active)
 
 
-def _find_first_segment(media: SceneMedia, ray: mi.Ray3f, active: mi.Bool) -> _FirstSegment:
+def _find_first_segment(media: SceneMedia, ray: Ray, active: mi.Bool) -> _FirstSegment:
     """Follow rays to the first opaque surface or out of the scene."""
     ray = camera_ray(ray)
     medium = media.medium_at(ray)

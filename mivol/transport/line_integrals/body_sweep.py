@@ -21,6 +21,7 @@ from mivol.transport.line_integrals.integrand import LineIntegral, RayPiece
 from mivol.transport.media.compositing import BodyIntegral, CellIntegral, ReverseState, pass_cell, put_in_front, zeros
 from mivol.transport.media.ray_intervals import MediumInterval
 from mivol.transport.media.summed_extinction import SummedExtinction
+from mivol.transport.traversal.fine_ray import Ray
 from mivol.transport.traversal.grid_walk import Cell, walk
 from mivol.transport.traversal.interpolation import node_weights
 from mivol.transport.traversal.lattice import Lattice, Segment, clip
@@ -193,7 +194,7 @@ class BodySweep:
         return [channels[r % len(channels)] for r in range(self.integrand.rows)]
 
 
-def _lay_out(interval: MediumInterval, ray: mi.Ray3f) -> _Layout:
+def _lay_out(interval: MediumInterval, ray: Ray) -> _Layout:
     lattice = interval.body.view.walked_lattice
     start, end = mi.Float64(interval.t0), mi.Float64(interval.t1)
     if lattice is None:

@@ -23,6 +23,7 @@ from mivol.transport.media.compositing import CellIntegral
 from mivol.transport.media.ray_intervals import RaySegment
 from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.media.summed_extinction import share_cells
+from mivol.transport.traversal.fine_ray import Ray
 
 __all__ = ["Integrand", "LineIntegral", "RayPiece", "check_media"]
 
@@ -40,7 +41,7 @@ class RayPiece:
     """
 
     body: Body
-    ray: mi.Ray3f
+    ray: Ray
     a: mi.Float
     dt: mi.Float
     on: mi.Bool

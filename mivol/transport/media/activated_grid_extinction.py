@@ -12,6 +12,7 @@ from mivol.fields.activation import Activation
 from mivol.transport.media.extinction import RayInterval
 from mivol.transport.media.grid_extinction import NodeValues, clip_interval, interpolate_at
 from mivol.transport.media.grid_integral import ActivatedNodes, Gradient, backproject_activated, integrate_activated
+from mivol.transport.traversal.fine_ray import Ray
 from mivol.transport.traversal.lattice import locate
 
 __all__ = ["ActivatedGridExtinction"]
@@ -40,22 +41,22 @@ class ActivatedGridExtinction(NodeValues):
     def vjp(self, gradient: Gradient, weight: list[mi.Float], interval: RayInterval) -> None:
         backproject_activated(self._nodes(), gradient, weight[0], clip_interval(self.lattice, interval), interval.active)
 
-    def eval_at(self, scale: mi.Float, ray: mi.Ray3f, t: mi.Float, active: mi.Bool) -> list[mi.Float]:
+    def eval_at(self, scale: mi.Float, ray: Ray, t: mi.Float, active: mi.Bool) -> list[mi.Float]:
         (value,) = interpolate_at(self.lattice, dr.detach(self.scaled(scale)), ray, t, active)
         # Outside of the box 0 is read, of which an activation may make a positive extinction.
         inside = locate(self.lattice, ray.o, ray.d, t)[2]
         return [dr.select(inside, self.activation.value_and_slope(value)[0], 0)]
 
-    def jvp_at(self, tangent: mi.Float, ray: mi.Ray3f, t: mi.Float, active: mi.Bool) -> list[mi.Float]:
+    def jvp_at(self, tangent: mi.Float, ray: Ray, t: mi.Float, active: mi.Bool) -> list[mi.Float]:
         return [self._slope(ray, t, active) * row for row in interpolate_at(self.lattice, tangent, ray, t, active)]
 
-    def vjp_at(self, gradient: Gradient, weight: list[mi.Float], ray: mi.Ray3f, t: mi.Float, active: mi.Bool) -> None:
+    def vjp_at(self, gradient: Gradient, weight: list[mi.Float], ray: Ray, t: mi.Float, active: mi.Bool) -> None:
         self.add_at_point(gradient, [self._slope(ray, t, active) * weight[0]], ray, t, active)
 
     def _nodes(self) -> ActivatedNodes:
         return ActivatedNodes(self.lattice, dr.detach(self.values), self.activation)
 
-    def _slope(self, ray: mi.Ray3f, t: mi.Float, active: mi.Bool) -> mi.Float:
+    def _slope(self, ray: Ray, t: mi.Float, active: mi.Bool) -> mi.Float:
         """Derivative of the extinction with respect to the interpolated value, at a point of a ray."""
         (value,) = interpolate_at(self.lattice, dr.detach(self.values), ray, t, active)
         return self.activation.value_and_slope(value)[1]

@@ -23,6 +23,7 @@ from mivol.transport.media.extinction import ExactExtinction, Extinction, RayInt
 from mivol.transport.media.grid_extinction import add_to_cell
 from mivol.transport.media.medium_view import MediumView
 from mivol.transport.media.summed_extinction import SummedExtinction, share_cells
+from mivol.transport.traversal.fine_ray import Ray
 
 __all__ = ["Body", "flight_parts", "is_followed"]
 
@@ -91,7 +92,7 @@ class Body:
         """Tangent of log A, from the tangent of S."""
         return sum((s * t for s, t in zip(self._area_slopes(d), self.microflakes_tangent, strict=True)), mi.Float(0))
 
-    def extinction(self, ray: mi.Ray3f, parts: list[ExactExtinction] | None = None) -> SummedExtinction:
+    def extinction(self, ray: Ray, parts: list[ExactExtinction] | None = None) -> SummedExtinction:
         """The sum of ``parts`` (None: all), whose grids share their cells, along a ray; without derivatives."""
         parts = self.view.parts if parts is None else parts
         return SummedExtinction(parts, [dr.detach(p.values) for p in parts], dr.detach(self.view.scale) * self.area(ray.d))
@@ -145,23 +146,23 @@ class Body:
             if part.exact_line:
                 part.vjp(gradient, for_part(weight, part.channels), interval)
 
-    def tangent_of_part(self, part: Extinction, ray: mi.Ray3f, t: mi.Float, channels: int, active: mi.Bool) -> list[mi.Float]:
+    def tangent_of_part(self, part: Extinction, ray: Ray, t: mi.Float, channels: int, active: mi.Bool) -> list[mi.Float]:
         """Tangent of one part's coefficient [1/length] at a point of a ray."""
         change = next(v for p, v in zip(self.view.parts, self.tangents, strict=True) if p is part)
         return as_rows(part.jvp_at(change, ray, t, active), channels)
 
-    def deposit_in_part(self, part: Extinction, ray: mi.Ray3f, t: mi.Float, weight: list[mi.Float], active: mi.Bool) -> None:
+    def deposit_in_part(self, part: Extinction, ray: Ray, t: mi.Float, weight: list[mi.Float], active: mi.Bool) -> None:
         """Add ``weight`` (d loss / d coefficient of each channel) at a point: the transpose of :meth:`tangent_of_part`."""
         gradient = next(g for p, g in zip(self.view.parts, self.gradients, strict=True) if p is part)
         part.vjp_at(gradient, for_part(weight, part.channels), ray, t, active)
 
-    def extinction_at(self, ray: mi.Ray3f, t: mi.Float, channels: int, active: mi.Bool, name: str = "sigma_") -> list[mi.Float]:
+    def extinction_at(self, ray: Ray, t: mi.Float, channels: int, active: mi.Bool, name: str = "sigma_") -> list[mi.Float]:
         """Coefficient [1/length] of each channel at a point of a ray: of all parts, or of those called ``name``."""
         parts = (p for p in self.view.parts if p.name.startswith(name))
         rows = _sum((part.eval_at(self.view.scale, ray, t, active) for part in parts), channels)
         return [self.area(ray.d) * row for row in rows]
 
-    def tangent_at(self, ray: mi.Ray3f, t: mi.Float, channels: int, active: mi.Bool, name: str = "sigma_") -> list[mi.Float]:
+    def tangent_at(self, ray: Ray, t: mi.Float, channels: int, active: mi.Bool, name: str = "sigma_") -> list[mi.Float]:
         """As :meth:`extinction_at`, of the tangent that :meth:`SceneMedia.start_tangent` took from the parameters."""
         pairs = [(p, v) for p, v in zip(self.view.parts, self.tangents, strict=True) if p.name.startswith(name)]
         rows = _sum((part.jvp_at(change, ray, t, active) for part, change in pairs), channels)
@@ -171,7 +172,7 @@ class Body:
         turned = self._jvp_microflakes(ray.d)
         return [r + s * turned for r, s in zip(rows, self.extinction_at(ray, t, channels, active, name), strict=True)]
 
-    def deposit(self, ray: mi.Ray3f, t: mi.Float, weight: list[mi.Float], active: mi.Bool, name: str = "sigma_") -> None:
+    def deposit(self, ray: Ray, t: mi.Float, weight: list[mi.Float], active: mi.Bool, name: str = "sigma_") -> None:
         """Add ``weight`` (d loss / d coefficient of each channel) at a point of a ray: the transpose of :meth:`tangent_at`."""
         if self.microflakes_gradient is not None:
             self._vjp_microflakes(ray.d, weight, self.extinction_at(ray, t, len(weight), active, name), active)

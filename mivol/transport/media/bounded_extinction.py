@@ -12,6 +12,7 @@ from mivol.fields.protocol import Field
 from mivol.transport.media.box import Box
 from mivol.transport.media.channels import tangent_of
 from mivol.transport.media.extinction import RayInterval
+from mivol.transport.traversal.fine_ray import Ray
 from mivol.transport.traversal.lattice import slab
 
 __all__ = ["BoundedExtinction"]
@@ -62,10 +63,10 @@ class BoundedExtinction:
         _, _, t0, t1 = slab(self._rows, (0.0,) * 3, (1.0,) * 3, ray.o, ray.d, t0, t1)
         return mi.Float(t0), mi.Float(t1)
 
-    def eval_at(self, scale: mi.Float, ray: mi.Ray3f, t: mi.Float, active: mi.Bool) -> list[mi.Float]:
+    def eval_at(self, scale: mi.Float, ray: Ray, t: mi.Float, active: mi.Bool) -> list[mi.Float]:
         return [dr.detach(scale) * value for value in dr.detach(self.field.eval(ray(t), ray.d, active))]
 
-    def jvp_at(self, tangent: mi.Float, ray: mi.Ray3f, t: mi.Float, active: mi.Bool) -> list[mi.Float]:
+    def jvp_at(self, tangent: mi.Float, ray: Ray, t: mi.Float, active: mi.Bool) -> list[mi.Float]:
         with dr.resume_grad():
             values = self.field.eval(ray(t), ray.d, active)
             # One pass for all channels: it clears the edges behind it, which they share.
@@ -73,7 +74,7 @@ class BoundedExtinction:
         pairs = zip(dr.detach(values), changes, strict=True)
         return [dr.select(active, tangent * value + self.scale * change, 0) for value, change in pairs]
 
-    def vjp_at(self, gradient: mi.Float, weight: list[mi.Float], ray: mi.Ray3f, t: mi.Float, active: mi.Bool) -> None:
+    def vjp_at(self, gradient: mi.Float, weight: list[mi.Float], ray: Ray, t: mi.Float, active: mi.Bool) -> None:
         values = dr.detach(self.field.eval(ray(t), ray.d, active))
         by_scale = sum((w * value for w, value in zip(weight, values, strict=True)), mi.Float(0))
         dr.scatter_add(gradient, dr.select(active, by_scale, 0), mi.UInt32(0), active)

@@ -7,15 +7,15 @@ import mitsuba as mi
 
 from mivol.transport.media.body import Body
 from mivol.transport.media.channels import spectrum
+from mivol.transport.traversal.fine_ray import Ray, point_along
 
 __all__ = ["emission_slope", "eval_albedo", "eval_emission", "medium_interaction"]
 
 
-def medium_interaction(ray: mi.Ray3f, t: mi.Float | mi.Float64, medium: mi.Medium | None = None) -> mi.MediumInteraction3f:
+def medium_interaction(ray: Ray, t: mi.Float | mi.Float64, medium: mi.Medium | None = None) -> mi.MediumInteraction3f:
     """A point of a ray as Mitsuba evaluates volumes and phase functions at it, found in float64 and rounded once."""
     mei = dr.zeros(mi.MediumInteraction3f, dr.width(ray))
-    p = [mi.Float(dr.fma(mi.Float64(t), mi.Float64(ray.d[a]), mi.Float64(ray.o[a]))) for a in range(3)]
-    mei.t, mei.p, mei.wi = mi.Float(t), mi.Point3f(*p), -ray.d
+    mei.t, mei.p, mei.wi = mi.Float(t), mi.Point3f(point_along(ray, t)), -ray.d
     mei.sh_frame = mi.Frame3f(mei.wi)
     mei.time, mei.wavelengths = ray.time, ray.wavelengths
     if medium is not None:
@@ -29,7 +29,7 @@ def eval_albedo(body: Body, mei: mi.MediumInteraction3f, on: mi.Bool) -> mi.Spec
     return albedo.eval(mei, on) if isinstance(albedo, mi.Volume) else mi.Spectrum(albedo)
 
 
-def eval_emission(body: Body, ray: mi.Ray3f, t: mi.Float64, channels: int, on: mi.Bool) -> mi.Spectrum:
+def eval_emission(body: Body, ray: Ray, t: mi.Float64, channels: int, on: mi.Bool) -> mi.Spectrum:
     """The light that a body emits at a point of a ray towards its origin [radiance/length].
 
     It carries the derivatives of the emission and of the albedo; those of the extinction are :func:`emission_slope`.
@@ -43,7 +43,7 @@ def eval_emission(body: Body, ray: mi.Ray3f, t: mi.Float64, channels: int, on: m
     return total
 
 
-def emission_slope(body: Body, ray: mi.Ray3f, t: mi.Float64, on: mi.Bool) -> tuple[str, mi.Spectrum]:
+def emission_slope(body: Body, ray: Ray, t: mi.Float64, on: mi.Bool) -> tuple[str, mi.Spectrum]:
     """The coefficient that the ``emission`` of a body goes with, and the derivative of the emitted light by it [radiance]."""
     Le = _at(body, body.view.emission, ray, t, on)
     if body.view.albedo is None:
@@ -51,7 +51,7 @@ def emission_slope(body: Body, ray: mi.Ray3f, t: mi.Float64, on: mi.Bool) -> tup
     return "sigma_", Le * (1 - eval_albedo(body, medium_interaction(ray, t, body.view.medium), on))
 
 
-def _at(body: Body, value: mi.Volume | mi.Float | mi.Color3f, ray: mi.Ray3f, t: mi.Float64, on: mi.Bool) -> mi.Spectrum:
+def _at(body: Body, value: mi.Volume | mi.Float | mi.Color3f, ray: Ray, t: mi.Float64, on: mi.Bool) -> mi.Spectrum:
     if not isinstance(value, mi.Volume):
         return mi.Spectrum(value)
     mei = medium_interaction(ray, dr.select(on, t, 0), body.view.medium)

@@ -9,6 +9,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mivol.transport.media.extinction import RayInterval
+from mivol.transport.traversal.fine_ray import Ray
 
 __all__ = ["ConstantExtinction"]
 
@@ -59,13 +60,13 @@ class ConstantExtinction:
         for c, w in enumerate(weight):
             dr.scatter_add(gradient, dr.select(w != 0, w * length, 0), mi.UInt32(c), interval.active)
 
-    def eval_at(self, scale: mi.Float, ray: mi.Ray3f, t: mi.Float, active: mi.Bool) -> list[mi.Float]:
+    def eval_at(self, scale: mi.Float, ray: Ray, t: mi.Float, active: mi.Bool) -> list[mi.Float]:
         return self._rows(dr.detach(self.scaled(scale)))
 
-    def jvp_at(self, tangent: mi.Float | mi.Color3f, ray: mi.Ray3f, t: mi.Float, active: mi.Bool) -> list[mi.Float]:
+    def jvp_at(self, tangent: mi.Float | mi.Color3f, ray: Ray, t: mi.Float, active: mi.Bool) -> list[mi.Float]:
         return self._rows(tangent)
 
-    def vjp_at(self, gradient: mi.Float, weight: list[mi.Float], ray: mi.Ray3f, t: mi.Float, active: mi.Bool) -> None:
+    def vjp_at(self, gradient: mi.Float, weight: list[mi.Float], ray: Ray, t: mi.Float, active: mi.Bool) -> None:
         for c, w in enumerate(weight):
             dr.scatter_add(gradient, dr.select(active, w, 0), mi.UInt32(c), active)
 

@@ -17,6 +17,7 @@ from typing import Any, Protocol
 
 import mitsuba as mi
 
+from mivol.transport.traversal.fine_ray import Ray
 from mivol.transport.traversal.lattice import Lattice
 
 __all__ = ["ExactExtinction", "Extinction", "RayInterval"]
@@ -32,7 +33,7 @@ class RayInterval:
         active: lanes that have the interval.
     """
 
-    ray: mi.Ray3f
+    ray: Ray
     t0: mi.Float64 | mi.Float
     t1: mi.Float64 | mi.Float
     active: mi.Bool
@@ -64,13 +65,13 @@ class Extinction(Protocol):
     def deliver(self, scale: mi.Float, gradient: Any) -> mi.Float:
         """A scalar whose derivative by the scale and the parameters is what was added to a gradient."""
 
-    def eval_at(self, scale: mi.Float, ray: mi.Ray3f, t: mi.Float, active: mi.Bool) -> list[mi.Float]:
+    def eval_at(self, scale: mi.Float, ray: Ray, t: mi.Float, active: mi.Bool) -> list[mi.Float]:
         """``scale`` times the coefficient [1/length] at a point of a ray; 0 outside of the part."""
 
-    def jvp_at(self, tangent: Any, ray: mi.Ray3f, t: mi.Float, active: mi.Bool) -> list[mi.Float]:
+    def jvp_at(self, tangent: Any, ray: Ray, t: mi.Float, active: mi.Bool) -> list[mi.Float]:
         """Tangent of :meth:`eval_at`."""
 
-    def vjp_at(self, gradient: Any, weight: list[mi.Float], ray: mi.Ray3f, t: mi.Float, active: mi.Bool) -> None:
+    def vjp_at(self, gradient: Any, weight: list[mi.Float], ray: Ray, t: mi.Float, active: mi.Bool) -> None:
         """Add ``weight`` (d loss / d coefficient) at a point of a ray to a gradient: the transpose of :meth:`jvp_at`."""
 
 

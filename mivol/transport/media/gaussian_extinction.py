@@ -14,6 +14,7 @@ from mivol.fields.gaussian_line import ROW, SCALE, Line, Slopes, change_of, read
 from mivol.fields.gaussians import GaussianField
 from mivol.numerics import greater, lesser
 from mivol.transport.media.extinction import RayInterval
+from mivol.transport.traversal.fine_ray import Ray
 from mivol.transport.traversal.grid_walk import Cell, walk
 from mivol.transport.traversal.lattice import Lattice, Segment, clip
 
@@ -104,10 +105,10 @@ class GaussianExtinction:
 
         self.each_along(self.enter(interval), (), add)
 
-    def eval_at(self, scale: mi.Float, ray: mi.Ray3f, t: mi.Float, active: mi.Bool) -> list[mi.Float]:
+    def eval_at(self, scale: mi.Float, ray: Ray, t: mi.Float, active: mi.Bool) -> list[mi.Float]:
         return [dr.detach(scale) * value for value in self.field.eval(ray(t), ray.d, active)]
 
-    def jvp_at(self, tangent: mi.Float, ray: mi.Ray3f, t: mi.Float, active: mi.Bool) -> list[mi.Float]:
+    def jvp_at(self, tangent: mi.Float, ray: Ray, t: mi.Float, active: mi.Bool) -> list[mi.Float]:
         def add(total: mi.Float, line: Line, index: mi.UInt32) -> mi.Float:
             own = self.push(line, line.density_slopes, line.density, tangent, index)
             return dr.select(line.holds_origin, total + own, total)
@@ -115,7 +116,7 @@ class GaussianExtinction:
         there = mi.Ray3f(ray(t), ray.d)
         return [self.field.each_at(there, active, dr.zeros(mi.Float, dr.width(there)), add)]
 
-    def vjp_at(self, gradient: mi.Float, weight: list[mi.Float], ray: mi.Ray3f, t: mi.Float, active: mi.Bool) -> None:
+    def vjp_at(self, gradient: mi.Float, weight: list[mi.Float], ray: Ray, t: mi.Float, active: mi.Bool) -> None:
         def add(state: tuple, line: Line, index: mi.UInt32) -> tuple:
             self.pull(gradient, line, line.density_slopes, (line.density, weight[0]), index, line.holds_origin)
             return state

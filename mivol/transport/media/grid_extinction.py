@@ -10,6 +10,7 @@ import mitsuba as mi
 
 from mivol.transport.media.extinction import RayInterval
 from mivol.transport.media.grid_integral import Gradient, backproject_segment, integrate_segment
+from mivol.transport.traversal.fine_ray import Ray
 from mivol.transport.traversal.grid_walk import box_nodes
 from mivol.transport.traversal.interpolation import interpolate, upward_frac, weights
 from mivol.transport.traversal.lattice import Lattice, Segment, clip, locate
@@ -52,7 +53,7 @@ class NodeValues:
         dr.eval(flat)
         return dr.sum(dr.ravel(self.scaled(scale)) * flat)
 
-    def add_at_point(self, gradient: Gradient, weight: list[mi.Float], ray: mi.Ray3f, t: mi.Float, active: mi.Bool) -> None:
+    def add_at_point(self, gradient: Gradient, weight: list[mi.Float], ray: Ray, t: mi.Float, active: mi.Bool) -> None:
         """Add ``weight`` (d loss / d interpolated value of each channel) at a point of a ray to a gradient of the nodes."""
         cell, frac, inside = locate(self.lattice, ray.o, ray.d, t)
         corners = weights(upward_frac(frac, cell, self.lattice.res))
@@ -81,13 +82,13 @@ class GridExtinction(NodeValues):
     def vjp(self, gradient: Gradient, weight: list[mi.Float], interval: RayInterval) -> None:
         backproject_segment(self.lattice, gradient, weight, clip_interval(self.lattice, interval), interval.active)
 
-    def eval_at(self, scale: mi.Float, ray: mi.Ray3f, t: mi.Float, active: mi.Bool) -> list[mi.Float]:
+    def eval_at(self, scale: mi.Float, ray: Ray, t: mi.Float, active: mi.Bool) -> list[mi.Float]:
         return interpolate_at(self.lattice, dr.detach(self.scaled(scale)), ray, t, active)
 
-    def jvp_at(self, tangent: mi.Float, ray: mi.Ray3f, t: mi.Float, active: mi.Bool) -> list[mi.Float]:
+    def jvp_at(self, tangent: mi.Float, ray: Ray, t: mi.Float, active: mi.Bool) -> list[mi.Float]:
         return interpolate_at(self.lattice, tangent, ray, t, active)
 
-    def vjp_at(self, gradient: Gradient, weight: list[mi.Float], ray: mi.Ray3f, t: mi.Float, active: mi.Bool) -> None:
+    def vjp_at(self, gradient: Gradient, weight: list[mi.Float], ray: Ray, t: mi.Float, active: mi.Bool) -> None:
         self.add_at_point(gradient, weight, ray, t, active)
 
 
@@ -96,7 +97,7 @@ def clip_interval(lattice: Lattice, interval: RayInterval) -> Segment:
     return clip(lattice, interval.ray.o, interval.ray.d, interval.t0, interval.t1)
 
 
-def interpolate_at(lattice: Lattice, values: mi.Float, ray: mi.Ray3f, t: mi.Float, active: mi.Bool) -> list[mi.Float]:
+def interpolate_at(lattice: Lattice, values: mi.Float, ray: Ray, t: mi.Float, active: mi.Bool) -> list[mi.Float]:
     """Each channel of flat node values at a point of a ray; 0 outside the grid's box."""
     cell, frac, inside = locate(lattice, ray.o, ray.d, t)
     upward = dr.full(dr.mask_t(mi.Vector3f), True)

@@ -19,6 +19,7 @@ from mivol.transport.media.ray_intervals import (
     visit_media,
 )
 from mivol.transport.media.scene_media import SceneMedia
+from mivol.transport.traversal.fine_ray import Ray
 
 __all__ = [
     "integrate_optical_depth",
@@ -47,7 +48,7 @@ def sum_optical_depth(enough: float | None = None) -> MediumVisitor:
 
 
 def integrate_optical_depth(
-    media: SceneMedia, ray: mi.Ray3f, medium: mi.MediumPtr, active: mi.Bool
+    media: SceneMedia, ray: Ray, medium: mi.MediumPtr, active: mi.Bool
 ) -> tuple[SegmentEnd, list[mi.Float]]:
     """Integrate the optical depth [1] of each channel to the first opaque surface or to ``ray.maxt``.
 

@@ -10,7 +10,7 @@ points keep their digits.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
@@ -19,6 +19,7 @@ import mitsuba as mi
 from mivol.transport.media.body import Body
 from mivol.transport.media.extinction import RayInterval
 from mivol.transport.media.scene_media import SceneMedia
+from mivol.transport.traversal.fine_ray import FineRay, Ray, traced
 from mivol.transport.traversal.lattice import slab
 from mivol.transport.traversal.ray_spawning import distance_along, spawn_ray
 
@@ -69,16 +70,16 @@ class RaySegment:
             depths are exact.
     """
 
-    ray: mi.Ray3f
+    ray: Ray
     medium: mi.MediumPtr
     length: mi.Float | mi.Float64
     passes_null: bool = False
     u: mi.Float | None = None
 
     @classmethod
-    def upto(cls, ray: mi.Ray3f, medium: mi.MediumPtr, t: mi.Float64) -> RaySegment:
+    def upto(cls, ray: Ray, medium: mi.MediumPtr, t: mi.Float64) -> RaySegment:
         """The first part of a ray, of length ``t``."""
-        return cls(mi.Ray3f(ray.o, ray.d, mi.Float(t), ray.time, ray.wavelengths), medium, t)
+        return cls(replace(FineRay.of(ray), maxt=mi.Float(t)), medium, t)
 
 
 @dataclass
@@ -113,7 +114,7 @@ MediumVisitor = Callable[[Any, MediumInterval], Any]
 
 def visit_media(
     media: SceneMedia,
-    ray: mi.Ray3f,
+    ray: Ray,
     medium: mi.MediumPtr,
     visit: MediumVisitor,
     state: Any,
@@ -147,7 +148,7 @@ def visit_media(
     return end, _visit_boxed(media, ray, end.t, visit, state, active)
 
 
-def find_boxed_intervals(media: SceneMedia, ray: mi.Ray3f, t_end: mi.Float, active: mi.Bool) -> list[MediumInterval]:
+def find_boxed_intervals(media: SceneMedia, ray: Ray, t_end: mi.Float, active: mi.Bool) -> list[MediumInterval]:
     """Find the intervals of the media in boxes between the ray's origin and ``t_end``.
 
     Args:
@@ -173,7 +174,7 @@ def find_boxed_intervals(media: SceneMedia, ray: mi.Ray3f, t_end: mi.Float, acti
     return found
 
 
-def _visit_boxed(media: SceneMedia, ray: mi.Ray3f, t_end: mi.Float, visit: MediumVisitor, state: Any, active: mi.Bool) -> Any:
+def _visit_boxed(media: SceneMedia, ray: Ray, t_end: mi.Float, visit: MediumVisitor, state: Any, active: mi.Bool) -> Any:
     for interval in find_boxed_intervals(media, ray, t_end, active):
         state = visit(state, interval)
     return state
@@ -189,7 +190,7 @@ def revisit_media(media: SceneMedia, ray_segment: RaySegment, visit: MediumVisit
 @dr.syntax
 def _trace(
     media: SceneMedia,
-    ray: mi.Ray3f,
+    ray: Ray,
     medium: mi.MediumPtr,
     visit: MediumVisitor,
     state: Any,
@@ -198,7 +199,7 @@ def _trace(
 ) -> tuple[SegmentEnd, Any]:
     """Trace through transparent surfaces to the first opaque one; visit the media whose boundary is traced."""
     # -- State ------------------------------------------------------------------------------------------------------------
-    onward = mi.Ray3f(ray)  #                        the ray from the last boundary on
+    onward = traced(ray)  #                        the ray from the last boundary on
     medium = mi.MediumPtr(medium)  #                 what surrounds its origin
     t = mi.Float(0)  #                               distance of that origin
     si = dr.zeros(mi.SurfaceInteraction3f, dr.width(ray))

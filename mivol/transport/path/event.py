@@ -46,13 +46,13 @@ class PathEvent:
         """Lanes that have met a medium."""
         return mi.Bool(False) if self.collision is None else self.collision.on
 
-    def vertex(self, media: SceneMedia, ray: mi.Ray3f) -> Vertex:
+    def vertex(self, media: SceneMedia) -> Vertex:
         """The point at which light is scattered."""
         if self.collision is None:
-            return self.surface_vertex(media, ray)
-        inside = MediumVertex(media, self.collision.mei)
-        return EitherVertex(self.surface_vertex(media, ray), inside, self.collision.on) if media.has_surfaces else inside
+            return self.surface_vertex(media)
+        inside = MediumVertex(media, self.collision.mei, self.collision.place)
+        return EitherVertex(self.surface_vertex(media), inside, self.collision.on) if media.has_surfaces else inside
 
-    def surface_vertex(self, media: SceneMedia, ray: mi.Ray3f) -> SurfaceVertex:
+    def surface_vertex(self, media: SceneMedia) -> SurfaceVertex:
         """The point of the surface."""
-        return SurfaceVertex(media, self.si, self.si.bsdf(ray), self.medium)
+        return SurfaceVertex(media, self.si, self.si.bsdf(), self.medium)

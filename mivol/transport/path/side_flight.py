@@ -29,6 +29,7 @@ from mivol.transport.estimators.direct_lighting import DirectLight
 from mivol.transport.estimators.segment import PICTURE, Collision, PathSegment
 from mivol.transport.estimators.vertex import MediumVertex
 from mivol.transport.path.estimators import Estimators
+from mivol.transport.traversal.fine_ray import FineRay
 
 __all__ = ["Aim", "SideFlight", "SideLight", "SideSamples", "fly_aside", "weigh_aim"]
 
@@ -124,15 +125,16 @@ def fly_aside(
     media, mei, attached = estimators.media, collision.mei, purpose != PICTURE
     w = _direction_to_emitter(estimators, mei, samples.emitter, active)
     wo = direction_after(-w, sample_hg(samples.lobe.x, estimators.lobe), samples.lobe.y)
-    vertex = MediumVertex(media, mei)
+    vertex = MediumVertex(media, mei, collision.place)
     f, p = vertex.eval_and_pdf(wo, active)
     reached = beta * collision.albedo * dr.rcp(p + eval_hg(turn_between(-w, wo), estimators.lobe))
-    ray = mi.Ray3f(mei.p, wo, dr.inf, mei.time, mei.wavelengths)
+    ray = FineRay.leaving(collision.place, wo, mei)
     ahead = PathSegment(ray, mei.medium, reached * f, active, samples.flight, is_aside=True)
     flown = estimators.segment.estimate(ahead, purpose, active)
     there = flown.collision
     on = active & there.on
-    direct = estimators.direct.at_vertex(MediumVertex(media, there.mei), samples.emitter, attached, on, samples.chance)
+    end = MediumVertex(media, there.mei, there.place)
+    direct = estimators.direct.at_vertex(end, samples.emitter, attached, on, samples.chance)
     with dr.resume_grad(when=attached):
         if attached:
             f = vertex.eval(wo, active)

@@ -13,6 +13,7 @@ from mivol.transport.estimators.segment import Collision
 from mivol.transport.estimators.vertex import MediumVertex, SurfaceVertex
 from mivol.transport.path.estimators import Estimators
 from mivol.transport.path.event import PathEvent
+from mivol.transport.traversal.fine_ray import FineRay, Ray
 from mivol.transport.traversal.ray_spawning import spawn_ray
 
 __all__ = ["Turn", "TurnSamples", "sample_turn"]
@@ -43,7 +44,7 @@ class Turn:
         factors: the weight with its derivatives.
     """
 
-    ray: mi.Ray3f
+    ray: FineRay
     medium: mi.MediumPtr
     weight: mi.Spectrum
     pdf: mi.Float
@@ -55,7 +56,7 @@ class Turn:
     factors: list[TrackedFactor]
 
 
-def sample_turn(estimators: Estimators, ray: mi.Ray3f, event: PathEvent, samples: TurnSamples, may_scatter: mi.Bool) -> Turn:
+def sample_turn(estimators: Estimators, ray: Ray, event: PathEvent, samples: TurnSamples, may_scatter: mi.Bool) -> Turn:
     """Sample the direction in which a path goes on.
 
     Args:
@@ -77,11 +78,11 @@ def sample_turn(estimators: Estimators, ray: mi.Ray3f, event: PathEvent, samples
 
 
 def _turn_at_surface(
-    estimators: Estimators, ray: mi.Ray3f, event: PathEvent, samples: TurnSamples, may_scatter: mi.Bool
+    estimators: Estimators, ray: Ray, event: PathEvent, samples: TurnSamples, may_scatter: mi.Bool
 ) -> Turn:
     """Sample a direction of the BSDF; the null transmission of a surface leaves the ray as it is."""
     media, si = estimators.media, event.si
-    vertex = event.surface_vertex(media, ray)
+    vertex = event.surface_vertex(media)
     sample, weight = vertex.bsdf.sample(mi.BSDFContext(), si, samples.component, samples.direction, event.at_surface)
     through = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Null)
     # A sampled direction of density 0 has weight 0; its path ends where beta is 0.
@@ -92,7 +93,7 @@ def _turn_at_surface(
     medium = dr.select(si.is_medium_transition(), si.target_medium(onward.d), event.medium)
     delta = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)
     factor = _bsdf_factor(vertex, sample.wo, on & ~through)
-    return Turn(onward, medium, weight, sample.pdf, delta, sample.eta, mi.Interaction3f(si), on, through, [factor])
+    return Turn(FineRay.of(onward), medium, weight, sample.pdf, delta, sample.eta, mi.Interaction3f(si), on, through, [factor])
 
 
 def _turn_in_medium(estimators: Estimators, collision: Collision, samples: TurnSamples, may_scatter: mi.Bool) -> Turn:
@@ -100,9 +101,9 @@ def _turn_in_medium(estimators: Estimators, collision: Collision, samples: TurnS
     media, mei = estimators.media, collision.mei
     on = collision.on & may_scatter
     wo, weight, pdf = sample_phase(media, mei, samples.component, samples.direction, on)
-    ray, n = mi.Ray3f(mei.p, wo, dr.inf, mei.time, mei.wavelengths), dr.width(wo)
+    ray, n = FineRay.leaving(collision.place, wo, mei), dr.width(wo)
     never, alone = dr.full(mi.Bool, False, n), dr.full(mi.Bool, not estimators.lights_media, n)
-    factor = TrackedFactor(lambda: MediumVertex(media, mei).eval(wo, on), on)
+    factor = TrackedFactor(lambda: MediumVertex(media, mei, collision.place).eval(wo, on), on)
     weight = collision.albedo * weight
     return Turn(ray, mei.medium, weight, pdf, alone, mi.Float(1), mi.Interaction3f(mei), on, never, [factor])
 

@@ -37,6 +37,7 @@ from mivol.transport.path.scores import Primal, Replay, Tangent
 from mivol.transport.path.settings import Settings
 from mivol.transport.path.side_flight import Aim, SideSamples, fly_aside, weigh_aim
 from mivol.transport.path.turn import TurnSamples, sample_turn
+from mivol.transport.traversal.fine_ray import FineRay, Ray, point_along
 from mivol.transport.traversal.random_numbers import LaneSampler
 from mivol.transport.traversal.ray_spawning import camera_ray
 from mivol.transport.traversal.strata import Strata
@@ -78,7 +79,7 @@ class Path:
             is never drawn.
     """
 
-    ray: mi.Ray3f
+    ray: FineRay
     medium: mi.MediumPtr
     beta: mi.Spectrum
     eta: mi.Float
@@ -102,7 +103,7 @@ def walk_path(
     estimators: Estimators,
     settings: Settings,
     sampler: mi.Sampler,
-    ray: mi.Ray3f,
+    ray: Ray,
     score: Score,
     active: mi.Bool = True,
     strata: Strata | None = None,
@@ -145,7 +146,7 @@ def walk_path(
 
 def start_path(
     estimators: Estimators,
-    ray: mi.Ray3f,
+    ray: Ray,
     score: Score,
     sampler: mi.Sampler | LaneSampler,
     strata: Strata | None,
@@ -154,7 +155,7 @@ def start_path(
     """A path that has not met anything yet, outside all media."""
     n = dr.width(ray)
     return Path(
-        ray=ray,
+        ray=FineRay.of(ray),
         medium=dr.zeros(mi.MediumPtr, n),
         beta=dr.full(mi.Spectrum, 1, n),
         eta=dr.full(mi.Float, 1, n),
@@ -222,7 +223,7 @@ def _estimate_probe(estimators: Estimators, settings: Settings, probe: Probe, sa
     mei.medium = media.medium_of(probe.body, on)
     path = start_path(estimators, probe.ray, Primal(dr.zeros(mi.Spectrum, n)), sampler, None, on)
     path.depth = mi.UInt32(probe.depth)
-    collision = Collision(mei, dr.full(mi.Spectrum, 1, n), on, probe.t, probe.body)
+    collision = Collision(mei, point_along(probe.ray, probe.t), dr.full(mi.Spectrum, 1, n), on, probe.t, probe.body)
     event = PathEvent(dr.zeros(mi.SurfaceInteraction3f, n), mi.Float(0), mei.medium, dr.full(mi.Bool, False, n), collision)
     path = _walk_on(estimators, settings, _scatter(estimators, settings, path, event))
     return ProbeTerm(media, probe, mei, dr.detach(path.score.L), estimators.segment.level, on)
@@ -330,7 +331,7 @@ def _add_direct_light(estimators: Estimators, path: Path, event: PathEvent, may_
     media, sampler, purpose = estimators.media, path.sampler, path.score.purpose
     lit = mi.Bool(False)
     if estimators.lights_surfaces:
-        smooth = mi.has_flag(event.si.bsdf(path.ray).flags(), mi.BSDFFlags.Smooth)
+        smooth = mi.has_flag(event.si.bsdf().flags(), mi.BSDFFlags.Smooth)
         lit = may_scatter & event.at_surface & smooth
     if estimators.lights_media:
         lit |= may_scatter & event.in_medium
@@ -339,7 +340,7 @@ def _add_direct_light(estimators: Estimators, path: Path, event: PathEvent, may_
     u, chance = sampler.next_2d(lit), sampler.next_1d(lit) if estimators.draws_shadows else None
     if path.aim is not None:
         u = dr.select(path.aim.on, path.aim.u, u)
-    vertex = event.vertex(media, path.ray)
+    vertex = event.vertex(media)
     direct = estimators.direct.at_vertex(vertex, u, purpose != PICTURE, lit, chance)
     with dr.resume_grad(when=purpose != PICTURE):
         carried = path.beta * direct.value
@@ -359,11 +360,11 @@ def _add_light_of_media(estimators: Estimators, path: Path, event: PathEvent, ma
     """Light of media that emit, from a point that is drawn in them."""
     lit, inside = may_scatter & event.in_medium, mi.Spectrum(1)
     if estimators.media.has_surfaces:
-        lit |= may_scatter & event.at_surface & mi.has_flag(event.si.bsdf(path.ray).flags(), mi.BSDFFlags.Smooth)
+        lit |= may_scatter & event.at_surface & mi.has_flag(event.si.bsdf().flags(), mi.BSDFFlags.Smooth)
     if event.collision is not None:
         inside = dr.select(event.in_medium, event.collision.albedo, 1)
     light = estimators.emission.at_vertex(
-        event.vertex(estimators.media, path.ray),
+        event.vertex(estimators.media),
         path.beta * inside,
         path.sampler.next_2d(lit),
         path.score.purpose != PICTURE,

@@ -11,6 +11,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from mivol.transport.traversal.fine_ray import Ray
 from mivol.transport.traversal.lattice import slab
 
 __all__ = ["CellVisitor", "walk_box"]
@@ -20,7 +21,7 @@ CellVisitor = Callable[..., Any]
 """``visit(state, cell, t0, t1, on) -> state``: what to do with the interval of a ray in one cell (x, y, z)."""
 
 
-def walk_box(rows: list[list[mi.Float64]], count: int, ray: mi.Ray3f, visit: CellVisitor, state: Any, active: mi.Bool) -> Any:
+def walk_box(rows: list[list[mi.Float64]], count: int, ray: Ray, visit: CellVisitor, state: Any, active: mi.Bool) -> Any:
     """Visit the cells of a box in the order of a ray that has no end.
 
     Args:

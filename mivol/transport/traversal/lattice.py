@@ -18,6 +18,7 @@ import numpy as np
 
 from mivol.errors import MivolError
 from mivol.space import check_affine, lattice_from_world
+from mivol.transport.traversal.fine_ray import Ray
 
 __all__ = ["Lattice", "Mask3", "Segment", "clip", "locate", "piece_points", "segment_between", "slab", "split"]
 
@@ -165,7 +166,7 @@ def locate(lattice: Lattice, o: mi.Point3f, d: mi.Vector3f, t: mi.Float) -> tupl
 
 
 def piece_points(
-    lattice: Lattice, ray: mi.Ray3f, start: mi.Float64, dt: mi.Float, active: mi.Bool
+    lattice: Lattice, ray: Ray, start: mi.Float64, dt: mi.Float, active: mi.Bool
 ) -> tuple[mi.Vector3i, list[mi.Vector3f], mi.Bool]:
     """Four points of a piece of a ray that lies in one cell, at 0, 1/3, 2/3 and 1 of its length.
 

@@ -5,10 +5,12 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from mivol.transport.traversal.fine_ray import Ray
+
 __all__ = ["camera_ray", "distance_along", "spawn_ray"]
 
 
-def distance_along(ray: mi.Ray3f, hit: mi.SurfaceInteraction3f) -> mi.Float:
+def distance_along(ray: Ray, hit: mi.SurfaceInteraction3f) -> mi.Float:
     """Distance of a hit along the ray that began at the camera.
 
     The lengths of the spawned rays are not summed: each of them starts an epsilon (1e-4 of a length) further on and to the
@@ -17,7 +19,7 @@ def distance_along(ray: mi.Ray3f, hit: mi.SurfaceInteraction3f) -> mi.Float:
     """
     slope = dr.dot(hit.n, ray.d)
     steep = dr.abs(slope) > 1e-2
-    along = hit.p - ray.o
+    along = hit.p - mi.Point3f(ray.o)
     return dr.select(steep, dr.dot(along, hit.n) / dr.select(steep, slope, 1), dr.dot(along, ray.d))
 
 
