@@ -27,6 +27,7 @@ STUDIES = {
     "random_scenes": "bench_random_scenes",
     "ladder": "bench_ladder",
     "points": "bench_points",
+    "representations": "bench_representations",
 }
 """Module of ``mivol.bench`` -> stem of the JSON that it writes."""
 

@@ -34,11 +34,13 @@ def test_an_origin_keeps_its_digits():
 
 
 def test_points_are_found_in_float64_and_rounded_once():
-    t, d = 1e-7, np.float32([0, 0.6, 0.8]).astype(np.float64)
-    there = PLACE + t * d
+    """Origin and step are each less than half a step of float32 at 100, and their sum is more."""
+    t, d, place = 5e-6, np.float32([0, 0.6, 0.8]).astype(np.float64), np.array([1.0, 100 + 3e-6, 100 + 3e-6])
+    there = place + t * d
     # A fused product and sum is rounded once, numpy's twice: one step of float64 apart at most.
-    assert np.abs(numbers(point_along(ray_from(PLACE), mi.Float64(t))) - there).max() <= np.spacing(100.0)
-    assert (numbers(ray_from(PLACE)(mi.Float64(t))) == there.astype(np.float32)).all()
+    assert np.abs(numbers(point_along(ray_from(place), mi.Float64(t))) - there).max() <= np.spacing(100.0)
+    assert (numbers(ray_from(place)(mi.Float64(t))) == there.astype(np.float32)).all()
+    assert (there.astype(np.float32)[1:] > 100).all()
 
 
 def test_mitsuba_traces_from_the_nearest_point():

@@ -22,6 +22,7 @@ BENCHES = {
     "bench_gradients": "gradients",
     "bench_optical_depth": "optical_depth",
     "bench_radiance_field": "radiance_field",
+    "bench_representations": "representations",
     "bench_ladder": "ladder",
     "bench_multiple_scattering": "multiple_scattering",
     "bench_random_scenes": "random_scenes",

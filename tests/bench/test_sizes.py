@@ -21,6 +21,8 @@ from mivol.bench.gradients.subject import SEEDS
 from mivol.bench.radiance_field import STEP_BARS
 from mivol.bench.radiance_field.fits import EVERY
 from mivol.bench.radiance_field.peer import LEARNING_RATE
+from mivol.bench.radiance_field.size import FULL as PHOTOGRAPHS
+from mivol.bench.radiance_field.size import QUICK as QUICK_PHOTOGRAPHS
 from mivol.bench.radiance_field.size import STOP
 from mivol.bench.storage import DEGREES, MODEL, SIZES
 from mivol.bench.timing import Budget
@@ -49,6 +51,9 @@ FULL = {
         "rounds": 8, "most_pixels": 64, "budget": Budget(seconds=0.8), "levels": (1, 4, 16), "fine_res": 256,
         "sparse_res": 512, "seed": 0,
     },
+    "representations": {
+        "photographs": asdict(PHOTOGRAPHS), "edge": 200, "grids": (64, 128), "gaussians": ("minute", "minutes"), "effort": 1.0,
+    },
     "depth": {"lines": 1 << 18, "taus": (0.1, 0.3, 1.0, 3.0, 10.0, 30.0)},
     "still_life": {
         "folder": Path("runs/still_life/photographs"), "views": 75, "side": 128, "longest": 64, "steps": 600, "shrink": 2,
@@ -75,6 +80,9 @@ QUICK = {
     },
     "single_scattering": {
         "most_pixels": 16, "budget": Budget(seconds=0.02), "levels": (1, 4), "fine_res": 48, "sparse_res": 64,
+    },
+    "representations": {
+        "photographs": asdict(QUICK_PHOTOGRAPHS), "edge": 48, "grids": (16,), "gaussians": ("minute",), "effort": 0.02,
     },
     "depth": {"lines": 1 << 14, "taus": (0.1, 1.0, 10.0)},
     "still_life": {

@@ -6,6 +6,7 @@ the tutorial's smoke on all of them: the walk is timed before and after each fit
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import drjit as dr
@@ -23,13 +24,14 @@ from mivol.bench.timing import Stopwatch, race
 from mivol.experiments.photo_data import boxed, read_photos
 from mivol.experiments.photo_plan import batches_of, make_plan, shrunk
 from mivol.optim.field_view import render_view
+from mivol.optim.gaussian_problem import GaussianProblem
 from mivol.optim.loop import Fit, begin_fit
 from mivol.optim.radiance_plan import bytes_of
 from mivol.optim.radiance_problem import RadianceProblem
 from mivol.photos import Photo
 from mivol.validate import images
 
-__all__ = ["ask_photographs", "bars_of"]
+__all__ = ["Finished", "ask_photographs", "bars_of", "finished", "photographs_of"]
 
 LEAST = {
     ("chair", 128): [("psnr", AT_LEAST, 30.2), ("seconds", AT_MOST, 60), ("step_milliseconds", AT_MOST, 70)],
@@ -77,28 +79,55 @@ def fitted(folder: Path, longest: int, size: Size) -> dict:
     shown, judged = read_photos(chosen, Path())
     shown = boxed(chosen, shown)
     plan = shrunk(make_plan(chosen), shown)
-    batches, watch, walked = batches_of(plan, shown), Stopwatch(), [walk_rate(size)]
-    dr.flush_malloc_cache()
-    dr.detail.malloc_clear_statistics()
-    problem = RadianceProblem(batches, shown.box, plan)
-    fit = begin_fit(problem, plan.optimiser, plan.course())
-    with watch:
-        fit.complete()
-    held = dr.detail.malloc_watermark(dr.backend_v(mi.Float)) - batches.bytes
-    walked.append(walk_rate(size))
-    rate, last = float(np.mean(walked)), plan.stages[-1]
+    problem = RadianceProblem(batches_of(plan, shown), shown.box, plan)
+    done, last = finished(problem, size.walk_side), plan.stages[-1]
     return {
         **seen(problem, judged.views),
         "train_psnr": seen(problem, shown.views[:: max(1, len(shown.views) // 8)])["psnr"],
-        "seconds": watch.processor / dr.thread_count() * rate / WALK,
-        "processor_seconds": watch.processor,
-        "walk_rays_per_second": rate,
-        "step_milliseconds": 1e3 * step_seconds(fit),
+        "seconds": done.seconds,
+        "processor_seconds": done.processor,
+        "walk_rays_per_second": done.rate,
+        "step_milliseconds": 1e3 * step_seconds(done.fit),
         "step_rays": 16 * min(last.views, len(shown.views)) * last.tiles,
         "rows": problem.field.rows,
         "counted_gib": bytes_of(plan, last, shown.box, problem.field.rows) / 2**30,
-        "held_gib": held / 2**30,
+        "held_gib": done.held / 2**30,
     }
+
+
+@dataclass(frozen=True)
+class Finished:
+    """A fit that is over.
+
+    Attributes:
+        fit: the fit.
+        processor: time of all threads [s].
+        rate: rays a second that the machine walks.
+        seconds: as the module says.
+        held: most bytes that Dr.Jit held, beyond the photographs.
+    """
+
+    fit: Fit
+    processor: float
+    rate: float
+    held: int
+
+    @property
+    def seconds(self) -> float:
+        return self.processor / dr.thread_count() * self.rate / WALK
+
+
+def finished(problem: RadianceProblem | GaussianProblem, walk_side: int) -> Finished:
+    """Take all steps of a fit, and measure them."""
+    watch, walked = Stopwatch(), [walk_rate(walk_side)]
+    dr.flush_malloc_cache()
+    dr.detail.malloc_clear_statistics()
+    fit = begin_fit(problem, problem.plan.optimiser, problem.plan.course())
+    with watch:
+        fit.complete()
+    held = dr.detail.malloc_watermark(dr.backend_v(mi.Float)) - problem.batches.bytes
+    walked.append(walk_rate(walk_side))
+    return Finished(fit, watch.processor, float(np.mean(walked)), held)
 
 
 def seen(problem: RadianceProblem, views: tuple[Photo, ...]) -> dict[str, float]:
@@ -119,9 +148,9 @@ def step_seconds(fit: Fit) -> float:
     return float(np.median(times))
 
 
-def walk_rate(size: Size) -> float:
-    """Rays a second through the tutorial's smoke on all threads, by processor time."""
-    work = Work(smoke().values, *camera_rays(size.walk_side))
+def walk_rate(side: int) -> float:
+    """Rays a second through the tutorial's smoke on all threads, by processor time; there are ``side`` squared of them."""
+    work = Work(smoke().values, *camera_rays(side))
     walk = race({"walk": work.tau()}, ROUNDS)["walk"]
     return work.n * dr.thread_count() / float(np.median(walk.processor))
 

@@ -1,0 +1,54 @@
+"""The bench of representations: what is fitted to which photographs, and what is counted of it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import drjit as dr
+import numpy as np
+import pytest
+
+from mivol.bench import representations
+from mivol.bench.radiance_field import photographs
+from mivol.bench.representations import BENCH, QUICK
+
+
+def test_the_chair_is_left_out_where_it_is_not(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    monkeypatch.setattr(photographs, "DATA", tmp_path)
+    assert representations.measure_chair(QUICK) == {}
+    assert "chair: left out, its data is not here (MIVOL_DATA" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_all_fits_see_the_same_photographs(variant_rgb: str, tmp_path: Path) -> None:
+    small = replace(QUICK.photographs, photo_folder=tmp_path / "photographs", photo_side=32, photo_views=9)
+    answer = BENCH.ask(("still_life",), replace(QUICK, photographs=small, edge=16))["still_life"]
+    assert set(answer) == {"grid, 16 nodes", "Gaussians, minute"}
+    assert len({found["photograph"].tobytes() for found in answer.values()}) == 1
+    for found in answer.values():
+        # Half the edge of the files, which have 32 pixels.
+        assert found["view"].shape == found["photograph"].shape == (16, 16, 3)
+        assert found["psnr"] > 8
+        assert found["file_mib"] > 0
+        seconds = found["processor_seconds"] / dr.thread_count() * found["walk_rays_per_second"] / 25e6
+        assert found["minutes"] == pytest.approx(seconds / 60)
+    # As published: places, normals, opacity, scales, rotation (14 numbers of 4 bytes), harmonics; a header of less than 4 kB.
+    gaussians = answer["Gaussians, minute"]
+    headers = [gaussians["file_mib"] * 2**20 - 4 * gaussians["count"] * (14 + 3 * (d + 1) ** 2) for d in range(4)]
+    assert any(0 < header < 4096 for header in headers)
+    BENCH.draw({"still_life": answer}, tmp_path)
+    assert (tmp_path / "bench_representations.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_nothing_is_drawn_of_nothing(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    BENCH.draw({"chair": {}}, tmp_path)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_figure_shows_each_view_beside_its_photograph(tmp_path: Path) -> None:
+    one = {"minutes": 1.0, "psnr": 30.0, "view": np.zeros((4, 4, 3)), "photograph": np.ones((4, 4, 3))}
+    BENCH.draw({"still_life": {"grid": one, "Gaussians": one | {"minutes": 2.0}}}, tmp_path)
+    assert (tmp_path / "bench_representations.png").stat().st_size > 5000
