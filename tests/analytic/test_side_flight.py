@@ -40,7 +40,8 @@ def middle() -> tuple[Estimators, Collision]:
     o = mi.Point3f(dr.zeros(mi.Float, N), 0, -0.5)
     ray = mi.Ray3f(o, mi.Vector3f(0, 0, 1), dr.inf, dr.zeros(mi.Float, N), mi.Color0f())
     mei = medium_interaction(ray, mi.Float(0.5), media.scene.shapes()[0].interior_medium())
-    hit = Collision(mei, mi.Point3d(mei.p), mi.Spectrum(ALBEDO), dr.full(mi.Bool, True, N), mi.Float64(0.5), dr.zeros(mi.UInt32, N))
+    on, body = dr.full(mi.Bool, True, N), dr.zeros(mi.UInt32, N)
+    hit = Collision(mei, mi.Point3d(mei.p), mi.Spectrum(ALBEDO), on, mi.Float64(0.5), body)
     return estimators, hit
 
 

@@ -41,8 +41,8 @@ class Bench:
         """Of four lanes; those in the medium have collided 0.5 from the origin."""
         ray, si = self.ray, self.estimators.media.scene.ray_intersect(self.ray)
         on = mi.Bool([False] * 4 if in_medium is None else in_medium)
-        mei = medium_interaction(ray, mi.Float(0.5), self.fog)
-        hit = None if in_medium is None else Collision(mei, mi.Spectrum(ALBEDO), on, mi.Float64(0.5), mi.UInt32(0))
+        mei, t = medium_interaction(ray, mi.Float(0.5), self.fog), mi.Float64(0.5)
+        hit = None if in_medium is None else Collision(mei, mi.Point3d(mei.p), mi.Spectrum(ALBEDO), on, t, mi.UInt32(0))
         around = dr.select(dr.full(mi.Bool, True, 4), mi.MediumPtr(self.fog), None)
         event = PathEvent(si, si.t, around, ~on & si.is_valid(), hit)
         numbers = TurnSamples(mi.Float(component), mi.Point2f(0.3, 0.6))

@@ -11,6 +11,7 @@ from false_alarms import Estimate, assert_same_mean, fresh
 from mivol.transport.estimators.direct_lighting import DirectLight
 from mivol.transport.estimators.shadow_reservoir import ShadowReservoir, ShadowTerm
 from mivol.transport.media.ray_intervals import RaySegment
+from mivol.transport.traversal.fine_ray import FineRay
 from mivol.transport.traversal.random_numbers import draw_pcg32, seed_pcg32
 from scenes import box_of, camera, media_of, medium
 
@@ -36,7 +37,7 @@ def fog() -> object:
 def test_mean_is_the_sum() -> None:
     """The derivative of light L over a length l by a constant extinction is -L l."""
     media, n = fog(), 1 << 14
-    ray = mi.Ray3f(dr.full(mi.Point3f, 0.1, n), mi.Vector3f(0, 0, 1))
+    ray = FineRay.of(mi.Ray3f(dr.full(mi.Point3f, 0.1, n), mi.Vector3f(0, 0, 1)))
     rng, kept = seed_pcg32(mi.Float((0.4 + fresh(0) * 0.6180339887498949) % 1), n), ShadowReservoir.empty(media, ray)
     for light, length in zip(LIGHTS, LENGTHS, strict=True):
         rng, (chance,) = draw_pcg32(rng, 1)

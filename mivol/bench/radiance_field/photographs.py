@@ -114,6 +114,7 @@ class Finished:
 
     @property
     def seconds(self) -> float:
+        """Of the fit, as the module says."""
         return self.processor / dr.thread_count() * self.rate / WALK
 
 

@@ -41,7 +41,7 @@ class FineRay:
     @classmethod
     def leaving(cls, o: mi.Point3d, d: mi.Vector3f, at: mi.Interaction3f, maxt: mi.Float = dr.inf) -> FineRay:
         """A ray that leaves a point, at the time of an interaction there."""
-        return cls(o, d, mi.Float(maxt), mi.Float(at.time), mi.Color0f())
+        return cls(o, mi.Vector3f(d), mi.Float(maxt), mi.Float(at.time), mi.Color0f())
 
     def __call__(self, t: mi.Float | mi.Float64) -> mi.Point3f:
         """The point at a distance [length], rounded once."""
