@@ -32,6 +32,16 @@ def test_contests_are_those_of_the_published_table():
     assert np.allclose(bench.thin_smoke().values.max() * 20, bench.smoke().values.max())
 
 
+def test_samples_take_longer_where_errors_have_heavy_tails():
+    """The variance of 8 samples a pixel misses the tails of volpath in the cloud, and with them half of the ratio."""
+    six, unlimited = bench.CONTESTS["cloud"].values()
+    assert bench.long_enough(QUICK, six) is QUICK
+    longer = bench.long_enough(QUICK, unlimited)
+    assert longer.budget == Budget(seconds=8 * QUICK.budget.seconds)
+    assert longer == replace(QUICK, budget=longer.budget)
+    assert bench.long_enough(TINY, unlimited).budget.spp == 64
+
+
 def test_the_milk_is_the_measured_one() -> None:
     """Skim milk scatters 0.70, 1.22 and 1.90 times a millimetre and absorbs 0.0014, 0.0025 and 0.0142 times; 40 mm are 2."""
     scattered, absorbed = np.array([0.7, 1.22, 1.9]) * 20, np.array([0.0014, 0.0025, 0.0142]) * 20
