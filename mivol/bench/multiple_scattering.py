@@ -1,6 +1,6 @@
 """Light that scatters many times: how much sooner does mivol reach an error than Mitsuba's ``volpath`` and ``prbvolpath``?
 
-    scripts/bench_multiple_scattering.py                  # 18 minutes on 2 idle cores
+    scripts/bench_multiple_scattering.py                  # 25 minutes on 2 idle cores
     scripts/bench_multiple_scattering.py --quick          # a minute, small sizes: are the means the same?
     scripts/bench_multiple_scattering.py --only smoke     # one of the volumes
 
@@ -42,7 +42,7 @@ __all__ = ["BENCH", "CONTESTS", "LONGER", "VOLUMES", "long_enough", "main"]
 THIN, WHITE_DEPTH = 0.05, 64.0
 """Factor on the density of the smoke; optical depth along an edge of the white box."""
 
-LONGER = 8.0
+LONGER = 16.0
 """Factor on the processor time of samples where errors have heavy tails."""
 
 LIQUID, EDGE = "skim milk", 40.0

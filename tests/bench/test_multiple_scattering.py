@@ -37,7 +37,7 @@ def test_samples_take_longer_where_errors_have_heavy_tails():
     six, unlimited = bench.CONTESTS["cloud"].values()
     assert bench.long_enough(QUICK, six) is QUICK
     longer = bench.long_enough(QUICK, unlimited)
-    assert longer.budget == Budget(seconds=8 * QUICK.budget.seconds)
+    assert longer.budget == Budget(seconds=16 * QUICK.budget.seconds)
     assert longer == replace(QUICK, budget=longer.budget)
     assert bench.long_enough(TINY, unlimited).budget.spp == 64
 

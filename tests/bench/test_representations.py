@@ -8,6 +8,7 @@ from pathlib import Path
 import drjit as dr
 import numpy as np
 import pytest
+from bench_figures import drawn
 
 from mivol.bench import representations
 from mivol.bench.radiance_field import photographs
@@ -48,7 +49,10 @@ def test_nothing_is_drawn_of_nothing(monkeypatch: pytest.MonkeyPatch, tmp_path: 
     assert not list(tmp_path.iterdir())
 
 
-def test_a_figure_shows_each_view_beside_its_photograph(tmp_path: Path) -> None:
+def test_a_figure_shows_each_view_beside_its_photograph(monkeypatch: pytest.MonkeyPatch) -> None:
     one = {"minutes": 1.0, "psnr": 30.0, "view": np.zeros((4, 4, 3)), "photograph": np.ones((4, 4, 3))}
-    BENCH.draw({"still_life": {"grid": one, "Gaussians": one | {"minutes": 2.0}}}, tmp_path)
-    assert (tmp_path / "bench_representations.png").stat().st_size > 5000
+    answers = {"still_life": {"grid": one, "Gaussians": one | {"minutes": 2.0, "view": np.full((4, 4, 3), 0.5)}}}
+    axes = drawn(representations, monkeypatch, answers, Path()).axes
+    pictures = {axis.get_title(): float(axis.images[0].get_array().mean()) for axis in axes if axis.images}
+    assert pictures == {"photograph": 1.0, "grid: 30.0 dB": 0.0, "Gaussians: 30.0 dB": 0.5}
+    assert [line.get_xdata()[0] for line in axes[0].lines] == [1.0, 2.0]
