@@ -53,6 +53,6 @@ def test_a_figure_shows_each_view_beside_its_photograph(monkeypatch: pytest.Monk
     one = {"minutes": 1.0, "psnr": 30.0, "view": np.zeros((4, 4, 3)), "photograph": np.ones((4, 4, 3))}
     answers = {"still_life": {"grid": one, "Gaussians": one | {"minutes": 2.0, "view": np.full((4, 4, 3), 0.5)}}}
     axes = drawn(representations, monkeypatch, answers, Path()).axes
-    pictures = {axis.get_title(): float(axis.images[0].get_array().mean()) for axis in axes if axis.images}
+    pictures = {axis.get_title(loc="left"): float(axis.images[0].get_array().mean()) for axis in axes if axis.images}
     assert pictures == {"photograph": 1.0, "grid: 30.0 dB": 0.0, "Gaussians: 30.0 dB": 0.5}
     assert [line.get_xdata()[0] for line in axes[0].lines] == [1.0, 2.0]
