@@ -19,6 +19,9 @@ from mivol.errors import MivolError
 
 USAGE, STOPPED = 2, 130
 
+DESCRIPTION = """Differentiable and inverse volume rendering on Mitsuba 3. Begin with "mivol doctor", which says whether a render
+would work here, and "mivol demo", which lists examples. "mivol VERB --help" says what a verb takes."""
+
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run ``mivol`` with these arguments (by default the process's own).
@@ -53,7 +56,7 @@ def parse(given: Sequence[str]) -> argparse.Namespace:
 
 def parser() -> argparse.ArgumentParser:
     """All verbs and their flags."""
-    top = argparse.ArgumentParser(prog="mivol", description=mivol.__doc__)
+    top = argparse.ArgumentParser(prog="mivol", description=DESCRIPTION)
     top.add_argument("--version", action="version", version=f"mivol {mivol.__version__}")
     verbs = top.add_subparsers(required=True, metavar="verb")
     for name, (verb, flags) in VERBS.items():
@@ -274,11 +277,14 @@ def explain_points(arguments: argparse.Namespace) -> int:
 
 def explain_photos(arguments: argparse.Namespace) -> int:
     """Facts of a data set, and a picture of its cameras where one is asked for."""
+    from mivol.experiments.photo_data import note_on_alpha
     from mivol.photos import survey_photos
     from mivol.report.cameras import plot_cameras
 
     survey = survey_photos(arguments.scene)
     print(survey.text)
+    if note := note_on_alpha(survey):
+        print(note)
     if arguments.output is not None:
         plot_cameras(survey, arguments.output)
         print(arguments.output)

@@ -13,7 +13,7 @@ from mivol.config import GaussianFit, PhotoFit
 from mivol.errors import MivolError
 from mivol.optim.colour_scale import EPSILON
 from mivol.optim.strategy import nearest
-from mivol.photos import Photos, load_photos, silhouette_box, survey_photos
+from mivol.photos import Photos, PhotoSurvey, load_photos, silhouette_box, survey_photos
 from mivol.photos.dataset import check_alpha
 from mivol.photos.picture import space_of
 from mivol.photos.region import near_far_of
@@ -80,6 +80,20 @@ def _over(photos: Photos, behind: tuple[float, float, float]) -> Photos:
         return photos
     colour = np.array(behind, np.float32)
     return replace(photos, views=tuple(replace(view, background=colour) for view in photos.views))
+
+
+def note_on_alpha(survey: PhotoSurvey) -> str:
+    """What alpha in all photographs means for a fit of them; "" where there is none.
+
+    Raises:
+        MivolError: some photographs have alpha and some have not.
+    """
+    if not check_alpha(survey.frames):
+        return ""
+    if any(frame.camera.distortion.is_wide for frame in survey.frames):
+        return "alpha in all photographs: photos.background says what they are put over"
+    box = "a fit takes the box about what alpha shows, unless photos.box says otherwise"
+    return f"alpha in all photographs: photos.background says what they are put over; {box}"
 
 
 def boxed(chosen: PhotoFit, photos: Photos) -> Photos:

@@ -82,16 +82,24 @@ def choices(plan: FitPlan, photos: Photos, batches: RayBatches) -> list[PlanLine
         *nested[: plan.levels > 1],
         *wide_lenses(photos),
         PlanLine(choice=f"grids of {resolutions} nodes along the longest edge", reason="coarse first, to find what is empty"),
-        PlanLine(
-            choice=f"photographs shrunk by {', '.join(str(stage.shrink) for stage in plan.stages)}",
-            reason=f"a pixel of half a voxel says as much as four smaller ones; they are held at {width} x {height}",
-        ),
+        sizes_of(plan, (width, height)),
         PlanLine(choice=f"harmonics of degree {plan.degree}", reason=f"{(plan.degree + 1) ** 2} numbers a colour and node"),
         what_is_behind(plan, photos),
         *[GAINS][: plan.exposure],
         PlanLine(choice=f"rays end at a transmittance of {plan.stop:g}", reason="what is left out is at most that share"),
         PlanLine(choice=memory_of(plan, box, batches), reason="counted before it is taken"),
     ]
+
+
+def sizes_of(plan: FitPlan, held: tuple[int, int]) -> PlanLine:
+    """How large photographs are in each stage, which are held at so many pixels."""
+    width, height = held
+    if all(stage.shrink == 1 for stage in plan.stages):
+        return PlanLine(choice=f"photographs at {width} x {height} in all stages", reason="their pixels are not finer than voxels")
+    return PlanLine(
+        choice=f"photographs shrunk by {', '.join(str(stage.shrink) for stage in plan.stages)} in these stages",
+        reason=f"a pixel of half a voxel says as much as four smaller ones; they are held at {width} x {height}",
+    )
 
 
 def wide_lenses(photos: Photos) -> list[PlanLine]:

@@ -45,7 +45,8 @@ class Problem(SceneProblem):
 
     Args:
         scene: a scene, a dict, or the path of its XML.
-        references: one picture a sensor; or a scene, which is rendered from the same sensors by its own integrator.
+        references: one picture a sensor; or a scene, a dict or the path of its XML, which is rendered from the same sensors
+            by its own integrator.
         parameters: what is looked for: keys of ``mi.traverse(scene)``, or :class:`Parameter` with domain, rate and priors.
         loss: one of ``mivol.optim.losses``, or any function (image, reference) -> one number, of tensors (height, width,
             channels).
@@ -66,7 +67,7 @@ class Problem(SceneProblem):
     def __init__(
         self,
         scene: SceneSource | mi.Scene,
-        references: Sequence[Reference] | mi.Scene,
+        references: Sequence[Reference] | SceneSource | mi.Scene,
         parameters: Sequence[str | Parameter],
         *,
         loss: Loss | Callable[[mi.TensorXf, mi.TensorXf], mi.Float | mi.TensorXf] = L2(),  # noqa: B008  (frozen)
@@ -77,7 +78,7 @@ class Problem(SceneProblem):
     ) -> None:
         loaded = load_scene(scene).scene
         looked_from = list(loaded.sensors() if sensors is None else sensors)
-        sought = [Parameter(one) if isinstance(one, str) else one for one in parameters]
+        sought = make_parameters(parameters)
         views = make_views(references, looked_from)
         super().__init__(loaded, views, sought, integrator or ours_for(loaded), loss, spp, seed=seed)
 
@@ -93,17 +94,47 @@ def ours_for(scene: mi.Scene) -> mi.Integrator:
     return mi.load_dict({"type": "mivol", "max_depth": settings_of(scene).max_depth})
 
 
-def make_views(references: Sequence[Reference] | mi.Scene, sensors: Sequence[mi.Sensor]) -> list[View]:
+def make_parameters(parameters: Sequence[str | Parameter]) -> list[Parameter]:
+    """What is looked for, each with its settings.
+
+    Raises:
+        MivolError: one key without a list about it, or what is neither a key nor a :class:`Parameter`.
+    """
+    if isinstance(parameters, str | Parameter):
+        raise MivolError(f"parameters: found a single {type(parameters).__name__}, expected a list of them; put it in a list.")
+    strange = next((one for one in parameters if not isinstance(one, str | Parameter)), None)
+    if strange is not None:
+        found = type(strange).__name__
+        raise MivolError(f"parameters: found {found} in the list, expected keys of mi.traverse(scene) or mivol.Parameter.")
+    return [Parameter(one) if isinstance(one, str) else one for one in parameters]
+
+
+def scene_of(references: SceneSource | mi.Scene) -> mi.Scene:
+    """The scene that references are rendered of.
+
+    Raises:
+        MivolError: the path of a single picture, which stands in a list, or as :func:`mivol.scene.load.load_scene`.
+    """
+    if isinstance(references, str | os.PathLike) and Path(references).suffix.lower() != ".xml":
+        raise MivolError(
+            f"references: found the single file {references}, expected a list of pictures, one a sensor, or a scene (.xml); "
+            "put it in a list."
+        )
+    return load_scene(references).scene
+
+
+def make_views(references: Sequence[Reference] | SceneSource | mi.Scene, sensors: Sequence[mi.Sensor]) -> list[View]:
     """Sensors with what they saw.
 
     Raises:
-        MivolError: another number of pictures than sensors.
+        MivolError: another number of pictures than sensors, or as :func:`scene_of`.
     """
-    if isinstance(references, mi.Scene):
-        own = references.integrator()
-        integrator = ours_for(references) if own is None or list(own.aov_names()) else own
+    if isinstance(references, str | os.PathLike | Mapping | mi.Scene):
+        scene = scene_of(references)
+        own = scene.integrator()
+        integrator = ours_for(scene) if own is None or list(own.aov_names()) else own
         with dr.suspend_grad():
-            seen = [mi.render(references, sensor=sensor, integrator=integrator, seed=n) for n, sensor in enumerate(sensors)]
+            seen = [mi.render(scene, sensor=sensor, integrator=integrator, seed=n) for n, sensor in enumerate(sensors)]
     else:
         seen = [picture(one) for one in references]
     if len(seen) != len(sensors):

@@ -31,8 +31,8 @@ def read_stack(path: str | os.PathLike, dataset: str | None = None) -> np.ndarra
         MivolError: no such file, not such a stack, images of several sizes, numbers that are not finite.
     """
     files = sorted(Path(path).parent.glob(Path(path).name), key=order_of_numbers)
-    if not files:
-        existing_file(path)
+    if not files or Path(path).is_dir():
+        existing_file(path, in_a_folder=f'name a file in it, or a pattern of TIFF files: "{Path(path).name}/*.tif"')
     if files[0].suffix.lower() in TIFF:
         stack = read_images(files)
     elif len(files) > 1:

@@ -47,8 +47,16 @@ def refusal(subject: object, found: str, expected: str, way_out: str) -> MivolEr
     return MivolError(f"{subject}: found {found}, expected {expected}; {way_out}.")
 
 
-def existing_file(path: str | os.PathLike) -> Path:
+#: the way out of a reader that a folder was given to.
+RAW_SLICES = "name a file in it (a stack of raw slices is read by read_slices)"
+
+
+def existing_file(path: str | os.PathLike, in_a_folder: str = RAW_SLICES) -> Path:
     """The path, if it names a file that holds at least one byte.
+
+    Args:
+        path: what is looked for.
+        in_a_folder: the way out where a folder is there.
 
     Raises:
         MivolError: nothing is there (the nearest name in the folder is offered), a folder is there, or an empty file.
@@ -59,7 +67,7 @@ def existing_file(path: str | os.PathLike) -> Path:
     except OSError as error:  # a name that no file can have: headers name other files
         raise refusal(path.name[:LONGEST_QUOTE], f"a name that is none ({error.strerror})", "a file's", "correct it") from None
     if is_folder:
-        raise refusal(path, "a folder", "a file", "name a file in it (a stack of raw slices is read by read_slices)")
+        raise refusal(path, "a folder", "a file", in_a_folder)
     if not path.is_file():
         raise refusal(path, "nothing there", "an existing file", _nearest(path))
     if path.stat().st_size == 0:

@@ -112,8 +112,10 @@ def as_optimiser(given: Optimiser | mi.ad.Optimizer) -> Optimiser:
     """One of OPTIMISERS as it is, one of ``mi.ad`` as an optimiser.
 
     Raises:
-        MivolError: it is neither.
+        MivolError: it is neither, or a class of which no object was made.
     """
+    if isinstance(given, type):
+        raise MivolError(f"an optimiser is an object, found the class {given.__name__}: call it, as {given.__name__}(...).")
     if hasattr(given, "begin"):
         return given
     if not isinstance(given, mi.ad.Optimizer):

@@ -208,9 +208,19 @@ def begin_fit(
     measure: Measure | None = None,
     store: Store | None = None,
 ) -> Fit:
-    """A fit before its first step, or where its checkpoint has it; arguments as :func:`reconstruct`."""
+    """A fit before its first step, or where its checkpoint has it; arguments as :func:`reconstruct`.
+
+    Raises:
+        MivolError: an optimiser that begins no :class:`mivol.optim.optimiser.Run`.
+    """
     course = course if isinstance(course, Course) else Course(course)
-    return Fit(problem, optimiser.begin(problem), course, measure, store)
+    run = optimiser.begin(problem)
+    if not isinstance(run, Run):
+        raise MivolError(
+            f"{type(optimiser).__name__}.begin gave {type(run).__name__}, expected a mivol.optim.optimiser.Run, which has reals and a "
+            "method step: derive the optimiser's run from it."
+        )
+    return Fit(problem, run, course, measure, store)
 
 
 def reconstruct(

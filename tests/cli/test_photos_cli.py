@@ -37,6 +37,22 @@ def test_explain_says_what_there_is_and_draws_it(tmp_path: Path, capsys: pytest.
         assert image.size[0] > 1000
 
 
+def test_explain_says_what_alpha_means_for_a_fit(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Whose box a fit then takes, where not every photograph can be cut out; a set of both kinds is refused after its facts."""
+    note = "a fit takes the box about what alpha shows"
+    cut, plain = (write_blender(tmp_path / name, alpha=name == "cut") for name in ("cut", "plain"))
+    assert main(["explain", str(cut)]) == main(["explain", str(plain)]) == 0
+    with_alpha, without = capsys.readouterr().out.split(f"{plain}: ")
+    assert note in with_alpha
+    assert "photos.background" in with_alpha
+    assert "alpha" not in without
+    (plain / "train" / "r_1.png").write_bytes((cut / "train" / "r_1.png").read_bytes())
+    assert main(["explain", str(plain)]) == 1
+    said = capsys.readouterr()
+    assert "6 photographs" in said.out
+    assert "expected alpha in all photographs or in none" in said.err
+
+
 def test_explain_draws_nothing_that_was_not_asked_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = write_colmap(tmp_path / "hall", points=np.random.default_rng(0).normal(size=(200, 3)))
     monkeypatch.chdir(tmp_path)

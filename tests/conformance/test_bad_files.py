@@ -258,6 +258,9 @@ def test_folder_for_a_file(tmp_path: Path) -> None:
         with pytest.raises(MivolError) as caught:
             read(tmp_path)
         assert_sentence(str(caught.value), "a folder", "read_slices")
+    with pytest.raises(MivolError) as caught:
+        files.read_stack(tmp_path)
+    assert_sentence(str(caught.value), "a folder", f"{tmp_path.name}/*.tif")
 
 
 def test_dataset_that_is_not_there(tmp_path: Path) -> None:

@@ -88,8 +88,18 @@ def test_references_are_arrays_files_or_a_scene(scene: mi.Scene, folder: Path) -
     (folder / "plain.xml").write_text(SCENE.replace('<string name="aovs" value="tau"/>', ""))
     plain = mi.load_file(str(folder / "plain.xml"))
     problem = Problem(plain, plain, [KEY])
+    (absorbed,) = Problem(plain, plain, [KEY]).views
+    (loaded,) = Problem(plain, folder / "plain.xml", [KEY]).views
+    assert np.array_equal(np.array(loaded.reference), np.array(absorbed.reference))
     # Absorption has no noise but that of the places in a pixel: the scene is its own reference to a few thousandths.
     assert problem.loss_value(problem.start(), 0) < 1e-3
+
+
+class Silent:
+    """An optimiser that begins nothing."""
+
+    def begin(self, problem: Problem) -> None:
+        pass
 
 
 def refuses(sentence: str):
@@ -101,8 +111,18 @@ def test_what_a_script_gets_wrong_is_said(scene: mi.Scene) -> None:
         Problem(scene, [seen(), seen()], [KEY])
     with refuses(r"shape \(6,\), expected \(height, width, channels\)"):
         Problem(scene, [np.zeros(6)], [KEY])
+    with refuses('the single file seen.exr, expected a list of pictures'):
+        Problem(scene, "seen.exr", [KEY])
+    with refuses("found a single str, expected a list"):
+        Problem(scene, [seen()], KEY)
+    with refuses("found int in the list, expected keys"):
+        Problem(scene, [seen()], [3])
     with refuses("found int"):
         Problem(scene, [seen()], [KEY], loss=3)
+    with refuses(r"found the class Adam: call it, as Adam\(\.\.\.\)"):
+        optimize(Problem(scene, [seen()], [KEY]), mivol.Adam, 1)
+    with refuses("Silent.begin gave NoneType, expected a mivol.optim.optimiser.Run"):
+        optimize(Problem(scene, [seen()], [KEY]), Silent(), 1)
     with refuses("found str"):
         optimize(Problem(scene, [seen()], [KEY]), "adam", 1)
     for loss, sentence in (
