@@ -8,9 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mivol.config import GaussianFit
+from mivol.experiments.camera_pictures import pictures_of_photos
 from mivol.experiments.film import Film
 from mivol.experiments.judged_views import JudgedViews, caption_of, said_of
-from mivol.experiments.photo_outputs import judge_fitted, named, table_of_gains
+from mivol.experiments.photo_outputs import judge_fitted, named, table_of_gains, table_of_views
 from mivol.experiments.run_folder import RunFolder
 from mivol.experiments.task import Task
 from mivol.optim.gaussian_problem import GaussianProblem
@@ -67,6 +68,7 @@ class GaussianOutputs:
             record.results |= self.write_judged()
         if self.film.cameras:
             record.images.append(self.write_film())
+        record.images += pictures_of_photos(self.run.path, self.photos, self.judged)
         self.run.write_curves()
 
     def write_judged(self) -> dict[str, float]:
@@ -82,6 +84,7 @@ class GaussianOutputs:
             pictures.add(rectified(photo), seen, next(iter(quality.values.values())), caption_of(quality))
         self.run.record.images += pictures.images()
         self.run.record.judged = said_of(views)
+        self.run.record.tables.append(table_of_views(views[0].camera, found, fitted))
         return named(score(found).values) | ({"psnr_colour_fitted": float(np.mean(fitted))} if fitted else {})
 
     def write_film(self) -> Image:
@@ -113,7 +116,7 @@ def storage(found: Gaussians, bytes_: int) -> Table:
         ("harmonics", f"degree {found.degree}"),
         ("file", f"{bytes_ / 2**20:.2f} MiB"),
         ("opacity: median", f"{np.median(opacity):.3g}"),
-        ("longest axis: median", f"{np.median(scale.max(axis=1)):.3g}"),
+        ("longest axis: median [length]", f"{np.median(scale.max(axis=1)):.3g}"),
         ("longest over shortest axis: median", f"{np.median(scale.max(axis=1) / scale.min(axis=1)):.3g}"),
     )
     return Table(title="What was found", head=("", ""), rows=rows)

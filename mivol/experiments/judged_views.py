@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from mivol.files import write_png
 from mivol.photos import Photo
 from mivol.photos.picture import SPACES
-from mivol.report.record import Image
+from mivol.report.record import CODES, Image
 from mivol.validate.images import METRICS, Quality
 
 __all__ = ["JudgedViews", "caption_of", "said_of", "spread_over", "write_view"]
@@ -31,8 +31,14 @@ def spread_over(count: int, shown: int) -> frozenset[int]:
 
 def caption_of(quality: Quality, fitted: float | None = None) -> str:
     """What is said beside a view: its metrics, and its PSNR [dB] where its colours are fitted to the photograph's first."""
-    found = [f"{METRICS[name].label} {value:.{METRICS[name].digits}f}" for name, value in quality.values.items()]
+    found = [said_as(name, value) for name, value in quality.values.items()]
     return ", ".join(found if fitted is None else [*found, f"{fitted:.2f} dB with its colours fitted"])
+
+
+def said_as(metric: str, value: float) -> str:
+    """A metric's name, value and unit."""
+    label, _, unit = METRICS[metric].label.partition(" [")
+    return f"{label} {value:.{METRICS[metric].digits}f} {unit.rstrip(']')}".rstrip()
 
 
 @dataclass
@@ -110,7 +116,7 @@ def write_view(
         said = caption if role == "render" else ""
         small = edge is not None
         written.append(
-            Image(path=path, role=role, view=photo.name, held_out=True, quantity="sRGB value", caption=said, small=small)
+            Image(path=path, role=role, view=photo.name, held_out=True, quantity=CODES, caption=said, small=small)
         )
     return written
 

@@ -139,7 +139,7 @@ def notes(photos: Photos, judged: Photos | None = None) -> list[str]:
             "figures are tone-mapped: the sRGB curve of y, from 0 to 1."
         ]
     else:
-        found = ["Colours are srgb code values; in a scene mivol_sh shows the radiance that they stand for."]
+        found = ["Colours are srgb code values; in a scene mivol_sh and mivol_gaussians show the radiance that they stand for."]
     stored = {space_of(frame.file) for frame in photos.survey.frames}
     if "linear" in stored and photos.space == "srgb":
         found.append("The light of photographs of radiance was encoded; what is above 1 counts as 1.")

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mivol.config import FieldFit
+from mivol.experiments.camera_pictures import pictures_of_photos
 from mivol.experiments.film import Film
 from mivol.experiments.judged_views import JudgedViews, caption_of, said_of
 from mivol.experiments.run_folder import RunFolder
@@ -23,7 +24,6 @@ from mivol.optim.loop import Fit
 from mivol.optim.radiance_problem import RadianceProblem
 from mivol.photos import Camera, Photo, Photos
 from mivol.photos.picture import SPACES, decode_srgb
-from mivol.report.cameras import plot_cameras
 from mivol.report.depth import depth_pixels, normal_pixels, normals_of_depth
 from mivol.report.record import Image, Table, Volume
 from mivol.validate.images import METRICS, Quality, colour_fitted, judge, score
@@ -73,7 +73,7 @@ class PhotoOutputs:
             record.results |= self.write_judged()
         if self.film.cameras:
             record.images.append(self.write_film())
-        record.images.append(write_cameras(folder, self.photos, self.judged))
+        record.images += pictures_of_photos(folder, self.photos, self.judged)
         self.run.write_curves()
 
     def write_judged(self) -> dict[str, float]:
@@ -100,13 +100,6 @@ class PhotoOutputs:
         to_codes = SPACES[self.photos.space, "srgb"]
         shown = lambda camera: to_codes(render_view(self.problem.field, camera, background).image)  # noqa: E731
         return self.film.write(self.run.path, shown, self.task.watcher)
-
-
-def write_cameras(folder: Path, photos: Photos, judged: Photos | None) -> Image:
-    """Where the cameras of all photographs stand about the box, as a picture."""
-    frames = photos.survey.frames + (() if judged is None else judged.survey.frames)
-    plot_cameras(replace(photos.survey, frames=frames), folder / "cameras.png")
-    return Image(path="cameras.png", role="picture", caption="Where the cameras stand, and the box where matter may be")
 
 
 def save_found(folder: Path, problem: RadianceProblem, which: str = "", white: float = 1.0) -> None:
@@ -136,14 +129,20 @@ def judge_fitted(image: NDArray, photo: Photo, space: str) -> float:
     return judge(colour_fitted(shown, wanted, photo.mask), wanted, mask=photo.mask).values["psnr"]
 
 
-def table_of_views(camera: Camera, found: Sequence[Quality], fitted: Sequence[float]) -> Table:
-    """Every judged view with its own figures, the worst one first."""
+def table_of_views(camera: Camera, found: Sequence[Quality], fitted: Sequence[float] = ()) -> Table:
+    """Every judged view with its own figures, the worst one first.
+
+    Args:
+        camera: of the first view, whose size is said.
+        found: the metrics of each.
+        fitted: PSNR [dB] of each with its colours fitted to the photograph's; none: it is not said.
+    """
     metrics = list(found[0].values)
-    head = ("view", *(METRICS[name].label for name in metrics), "PSNR [dB], colours fitted to the photograph's")
-    rows = [
-        (one.name, *(f"{one.values[name]:.{METRICS[name].digits}f}" for name in metrics), f"{value:.2f}")
-        for one, value in zip(found, fitted, strict=True)
-    ]
+    head = ("view", *(METRICS[name].label for name in metrics))
+    rows = [(one.name, *(f"{one.values[name]:.{METRICS[name].digits}f}" for name in metrics)) for one in found]
+    if fitted:
+        head += ("PSNR [dB], colours fitted to the photograph's",)
+        rows = [(*row, f"{value:.2f}") for row, value in zip(rows, fitted, strict=True)]
     rows.sort(key=lambda row: float(row[1]))
     width, height = camera.size
     return Table(title=f"Judged views, at {width} x {height} pixels, the worst first", head=head, rows=tuple(rows))
@@ -196,12 +195,14 @@ def write_density(folder: Path, field: SphericalGrid, level: int) -> Volume:
 
 def write_geometry(folder: Path, seen: FieldView, camera: Camera, near_far: tuple[float, float]) -> list[Image]:
     """Distance and normals of a view as colours."""
+    near, far = near_far
     pictures = {
-        "distance": depth_pixels(seen.depth, near_far, seen.opacity),
-        "normals": normal_pixels(normals_of_depth(seen.depth, camera), seen.opacity),
+        "distance": (depth_pixels(seen.depth, near_far, seen.opacity), f"from light, {near:.3g} [length], to dark, {far:.3g}"),
+        "normals": (normal_pixels(normals_of_depth(seen.depth, camera), seen.opacity), "x, y, z from -1 to 1 as red, green, blue"),
     }
     written = []
-    for name, pixels in pictures.items():
+    for name, (pixels, scale) in pictures.items():
         write_png(folder / f"views/{name}.png", decode_srgb(pixels / 255))
-        written.append(Image(path=f"views/{name}.png", role="picture", caption=f"{name} of the first judged view"))
+        caption = f"{name} of the first judged view: {scale}"
+        written.append(Image(path=f"views/{name}.png", role="picture", caption=caption))
     return written

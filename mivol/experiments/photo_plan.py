@@ -73,12 +73,12 @@ def choices(plan: FitPlan, photos: Photos, batches: RayBatches) -> list[PlanLine
     outer = " x ".join(f"{edge * 2 ** (plan.levels - 1):.4g}" for edge in box[1] - box[0])
     nested = [
         PlanLine(
-            choice=f"{plan.levels} nested boxes, the largest of {outer}",
+            choice=f"{plan.levels} nested boxes, the largest of {outer} [length]",
             reason="each has twice the extent of the one before, for what is around; cameras may stand in them",
         )
     ]
     return [
-        PlanLine(choice=f"{len(photos.views)} photographs, a box of {size}", reason=photos.survey.box_from),
+        PlanLine(choice=f"{len(photos.views)} photographs, a box of {size} [length]", reason=photos.survey.box_from),
         *nested[: plan.levels > 1],
         *wide_lenses(photos),
         PlanLine(choice=f"grids of {resolutions} nodes along the longest edge", reason="coarse first, to find what is empty"),

@@ -162,7 +162,9 @@ class RunFolder:
         words = []
         for name, value in self.record.results.items():
             quantity = QUANTITIES.get(name, Quantity(name))
-            words += [] if value is None else [f"{quantity.label} {value:.4g} {quantity.unit}".rstrip()]
+            if value is not None:
+                figure = f"{value:.0f}" if float(value).is_integer() else f"{value:.4g}"
+                words.append(f"{quantity.label} {figure} {quantity.unit}".rstrip())
         return f"saved: {', '.join(words)}"
 
     def rewind(self, iteration: int) -> None:

@@ -13,6 +13,7 @@ import numpy as np
 
 from mivol.config import Experiment, Sought
 from mivol.experiments.best import BestIterate
+from mivol.experiments.camera_pictures import pictures_of_views
 from mivol.experiments.film import film_of_volume
 from mivol.experiments.references import References
 from mivol.experiments.run_folder import RunFolder
@@ -60,6 +61,8 @@ class SceneOutputs:
         for sought in self.chosen.parameter:
             record.volumes += self.write_grid(sought)
             record.images += self.write_image(sought.key)
+        views = {"train": self.seen.fitted, "held_out": self.seen.held_out}
+        record.images += pictures_of_views(self.run.path, fit.problem.scene, views)
         self.run.write_curves()
         record.results = {
             **fit.newest_errors(),

@@ -20,20 +20,27 @@ from numpy.typing import NDArray
 from mivol.photos import SPLITS, Frame, PhotoSurvey
 from mivol.report.figures import FAINT, INK, SERIES, STYLE, save
 
-__all__ = ["plot_cameras"]
+__all__ = ["PARTS", "plot_cameras"]
 
 EDGE = 0.12
 """Length of a drawn field of view, as a share of the median distance from the middle of the box."""
 
 MOST_POINTS = 4000
 
+PARTS = ("side", "plan")
+"""Of the picture: from the side, and from above."""
 
-def plot_cameras(survey: PhotoSurvey, path: str | Path | None = None) -> Figure:
+WIDTH = 4.8
+"""Of a part [inch]: its labels are read on a page of 390 pixels."""
+
+
+def plot_cameras(survey: PhotoSurvey, path: str | Path | None = None, part: str | None = None) -> Figure:
     """Cameras, box and points from the side and from above.
 
     Args:
         survey: of :func:`mivol.photos.survey_photos`.
         path: written there (.svg, .png) if given.
+        part: one of PARTS alone; None: both in one figure.
 
     Raises:
         MivolError: another suffix.
@@ -43,15 +50,21 @@ def plot_cameras(survey: PhotoSurvey, path: str | Path | None = None) -> Figure:
     up = int(np.argmax(np.abs(np.mean([f.camera.to_world[:3, 1] for f in survey.frames], axis=0))))
     lines = {split: np.concatenate([outline(f, length) for f in of]) for split, of in _by_split(survey).items()}
     with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(9.6, 4.8))
+        parts = PARTS if part is None else (part,)
+        figure = Figure(figsize=(WIDTH * len(parts), WIDTH))
         FigureCanvasAgg(figure)
         figure.get_layout_engine().set(wspace=0.1)
-        side = figure.add_subplot(1, 2, 1, projection="3d", computed_zorder=False)
-        above = figure.add_subplot(1, 2, 2)
-        _draw_side(side, survey, lines, up)
-        _draw_plan(above, survey, lines, up)
-        figure.suptitle(f"{survey.path.name}: {len(survey.frames)} cameras and the box", x=0.01, ha="left", weight="bold")
-        above.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
+        if "side" in parts:
+            side = figure.add_subplot(1, len(parts), 1, projection="3d", computed_zorder=False)
+            _draw_side(side, survey, lines, up)
+        if "plan" in parts:
+            above = figure.add_subplot(1, len(parts), len(parts))
+            _draw_plan(above, survey, lines, up)
+            beside = {"loc": "upper left", "bbox_to_anchor": (1.0, 1.0)}
+            above.legend(**beside if part is None else {"loc": "best"})
+        if part is None:
+            title = f"{survey.path.name}: {len(survey.frames)} cameras and the box"
+            figure.suptitle(title, x=0.01, ha="left", weight="bold")
     if path is not None:
         save(figure, path)
     return figure

@@ -174,11 +174,16 @@ def _level(axes: Axes, value: float, name: str) -> None:
     axes.annotate(name, (0.0, value), (4, 2), color=FAINT, fontsize=9, **place)
 
 
+NARROW = 5.0
+"""Largest over smallest value, from which two of 1, 2, 5 and their decades surely lie between them: gaps are 2 and 2.5."""
+
+
 def _log_axis(axis: Axis, values: NDArray) -> None:
-    """A log axis with enough labels: decades where there are two or more, else 1-2-5 steps in plain numbers."""
+    """A log axis with enough labels: decades where there are two or more, else 1-2-5 steps in plain numbers, or even steps where
+    fewer than two of those would be seen."""
     getattr(axis.axes, f"set_{axis.axis_name}scale")("log")
-    wide = values.max() >= 100 * values.min()
-    axis.set_major_locator(LogLocator(subs=(1.0,) if wide else (1.0, 2.0, 5.0)))
+    wide, narrow = values.max() >= 100 * values.min(), values.max() < NARROW * values.min()
+    axis.set_major_locator(MaxNLocator(5) if narrow else LogLocator(subs=(1.0,) if wide else (1.0, 2.0, 5.0)))
     axis.set_minor_formatter(NullFormatter())
     axis.set_major_formatter(LogFormatterSciNotation() if wide else (lambda value, _: f"{value:.3g}"))
 

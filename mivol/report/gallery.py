@@ -96,7 +96,7 @@ def views_of(folder: Path, images: Sequence[Image]) -> Gallery:
     scales = _scales(arrays.values())
     rows = [_view(name, by_view[name], roles, scales) for name, roles in arrays.items()]
     rows.sort(key=lambda view: not view.held_out)
-    first = next(iter(images), None)
+    first = next((image for roles in by_view.values() for image in roles.values()), None)
     return Gallery(rows, [_bar(scales[role], label) for role, label in _bar_labels(scales, first)])
 
 
@@ -283,9 +283,10 @@ def _cut(folder: Path, by_role: dict[str, Volume]) -> Cut:
         scales["difference"] = show.signed_scale(*cuts["difference"].images.values())
     rows = [_plane(plane, cuts, scales) for plane in first.images] if len(cuts) > 1 else [_planes(first, values)]
     described = by_role["reconstruction"]
-    bars = [_bar(values, f"{described.quantity} [{described.unit}]" if described.unit else described.quantity)]
+    unit = f" [{described.unit}]" if described.unit else ""
+    bars = [_bar(values, f"{described.quantity}{unit}")]
     if "difference" in scales:
-        bars.append(_bar(scales["difference"], "Reconstruction − truth"))
+        bars.append(_bar(scales["difference"], f"Reconstruction − truth{unit}"))
     found = data["reconstruction"].values
     volumes = {role: each.values for role, each in data.items()}
     if "difference" in cuts:

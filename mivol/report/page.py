@@ -24,7 +24,7 @@ from mivol.files import write_whole_text
 from mivol.report import figures
 from mivol.report.gallery import Cut, ShownView, film_of, plain_picture, views_of, volumes_of
 from mivol.report.profiles import profiles_of
-from mivol.report.record import LINES, QUANTITIES, SINOGRAM, Quantity, RunRecord, read_metrics, read_record
+from mivol.report.record import CODES, LINES, QUANTITIES, SINOGRAM, Quantity, RunRecord, read_metrics, read_record
 
 __all__ = ["PAGE", "headline", "write_page"]
 
@@ -58,6 +58,7 @@ def write_page(folder: str | Path) -> Path:
         "numbers": _numbers(record, groups.rows, volumes),
         "sinograms": views_of(folder, sinograms),
         "are_lines": any(image.quantity == LINES for image in record.images),
+        "are_codes": any(image.quantity == CODES for image in record.images),
         "views": groups,
         "shown": SHOWN_VIEWS,
         "volumes": volumes,
@@ -99,7 +100,7 @@ def _judged(record: RunRecord) -> str:
     if not record.judged:
         return ""
     fitted = record.results.get("psnr_colour_fitted")
-    return f" ({record.judged}, raw{'' if fitted is None else f'; {fitted:.1f} dB with their colours fitted'})"
+    return f" ({record.judged}{'' if fitted is None else f', raw; {fitted:.1f} dB with their colours fitted'})"
 
 
 def _environment() -> jinja2.Environment:
@@ -147,7 +148,8 @@ def _numbers(record: RunRecord, views: Sequence[ShownView], volumes: Sequence[Cu
         tiles.append(_tile("nrmse", record.results["nrmse"]))
     if held_out:
         spread = f" ({min(held_out):.1f} to {max(held_out):.1f})" if len(held_out) > 1 else ""
-        said_of = f": {record.judged}, raw" if record.judged else ""
+        is_raw = record.results.get("psnr_colour_fitted") is not None
+        said_of = f": {record.judged}{', raw' if is_raw else ''}" if record.judged else ""
         tiles.append((f"{np.mean(held_out):.1f}", "dB", f"PSNR, held-out views{spread}{said_of}"))
     if seconds:
         tiles.append((*_duration(seconds).split(" "), "in all"))

@@ -48,6 +48,8 @@ RECORD = "run.json"
 METRICS = "metrics.jsonl"
 LINES = "line integral"
 """The quantity of a projection, which is measured and modelled, not rendered."""
+CODES = "sRGB value"
+"""The quantity of a photograph, and of what is held against it."""
 SINOGRAM = "sinogram"
 """The view that holds one row of a detector in all views."""
 DAMAGE = (msgspec.DecodeError, UnicodeDecodeError)

@@ -107,8 +107,9 @@ def one_view(folder: Path, reference: np.ndarray, render: np.ndarray, **fields) 
 
 
 def test_page_loads_nothing(run_folder, page):
-    """No script, no outside address anywhere but in links that a reader may follow."""
-    assert not {"script", "iframe", "object", "embed", "link", "base"} & {tag for tag, _ in page.tags}
+    """No outside address anywhere but in links that a reader may follow; the script of the slider stands in the page."""
+    assert [attributes for tag, attributes in page.tags if tag == "script"] == [{}]
+    assert not {"iframe", "object", "embed", "link", "base"} & {tag for tag, _ in page.tags}
     for tag, attributes in page.tags:
         for name in ("src", "srcset", "href", "xlink:href", "poster", "data", "action"):
             if name in attributes and tag != "a":
@@ -135,6 +136,31 @@ def test_judged_views_are_scrolled_through(tmp_path):
     assert "The other 2 that were judged" in text and text.count("of one") == 2 and text.count("of two") == 1
     assert "held-out views to 24.0 dB PSNR (3 views at 2 x 2 pixels, raw; 25.0 dB with their colours fitted)" in text
     assert "PSNR, held-out views: 3 views at 2 x 2 pixels, raw" in text
+
+
+@pytest.mark.parametrize(
+    ("quantity", "said"), [("sRGB value", "PSNR is that of sRGB values of 8 bits"), ("radiance", "PSNR takes the reference's")]
+)
+def test_what_psnr_means_is_said(tmp_path, quantity, said):
+    """Of photographs another than of radiance; "raw" stands only beside a figure of colours that were fitted."""
+    write_png(tmp_path / "a.png", np.full((2, 2, 3), 0.5))
+    images = [Image(path="a.png", role=role, view="a", held_out=True, quantity=quantity) for role in ("reference", "render")]
+    record = RunRecord.new("V", images=images, judged="1 view at 2 x 2 pixels", results={"held_out_psnr": 24.0})
+    write_record(record, tmp_path)
+    text = Page(write_page(tmp_path).read_text(encoding="utf-8")).text
+    assert said in text and text.count("PSNR is that of") + text.count("PSNR takes") == 1 and "raw" not in text
+
+
+def test_layers_have_a_slider_that_begins_in_the_middle(page):
+    """It is shown by its script; without one the frame is scrolled, and begins at the same layer."""
+    frame = next(index for index, (_, a) in enumerate(page.tags) if a.get("aria-label", "").startswith("slices along z"))
+    ranges = [attributes for tag, attributes in page.tags if attributes.get("type") == "range"]
+    layers = [a["class"] for tag, a in page.tags[frame:] if tag == "figure" and a.get("class", "").startswith("view")]
+    (slider,) = ranges
+    last, middle = int(slider["max"]), int(slider["value"])
+    assert last > 0 and middle == (last + 1) // 2
+    assert [k for k, name in enumerate(layers) if name == "view first"] == [middle]
+    assert any(tag == "label" and a["class"] == "slide" and "hidden" in a for tag, a in page.tags)
 
 
 def test_page_shows_all_that_the_record_names(run_folder, page):
@@ -318,13 +344,17 @@ def test_projections_are_measured_and_modelled(tmp_path):
     ]
     write_volume(tmp_path / "found.npz", np.ones((2, 3, 4, 1), np.float32))
     volumes = [Volume(path="found.npz", role="reconstruction", profiles=True)]
-    write_record(RunRecord.new("A scan", images=images, volumes=volumes), tmp_path)
+    (tmp_path / "film.mp4").write_bytes(b"mp4")
+    film = Image(path="film.mp4", role="film")
+    write_record(RunRecord.new("A scan", images=[film, *images], volumes=volumes), tmp_path)
     found = Page(write_page(tmp_path).read_text(encoding="utf-8"))
     sections = [attributes["id"] for tag, attributes in found.tags if tag == "section" and "id" in attributes]
     assert sections[:3] == ["sinogram", "views", "volume"]
     names = [name for name, _ in found.pictures()]
     assert names[:8] == 2 * ["Measured", "Modelled", "Modelled − measured", "Difference over noise"]
     assert names.count("Measured") == 2
+    # The film is listed first, and says nothing of the views.
+    assert found.text.count("Line integral") == 2 and "Radiance" not in found.text
     assert "Projections that took no part" in found.text and "rendered from viewpoints" not in found.text
     # A pixel that is not used has noise without bound, and no difference beside it: the middle of the blue-red map.
     np.testing.assert_array_equal(dict(found.pictures())["Difference over noise"][0, 0], show.pixels(

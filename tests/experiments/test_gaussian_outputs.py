@@ -36,7 +36,7 @@ def test_what_the_gaussians_take() -> None:
         ("harmonics", "degree 1"),
         ("file", "1.50 MiB"),
         ("opacity: median", "0.5"),
-        ("longest axis: median", "4"),
+        ("longest axis: median [length]", "4"),
         ("longest over shortest axis: median", "3"),
     )
 
@@ -79,6 +79,7 @@ def fit_of(monkeypatch: pytest.MonkeyPatch, folder: Path, views: int, shown: int
     )
     monkeypatch.setattr(outputs, "write_gaussians", lambda path, found: path.write_bytes(bytes(100)))
     monkeypatch.setattr(outputs, "rectified", lambda photo: photo)
+    monkeypatch.setattr(outputs, "pictures_of_photos", lambda *given: run.written.append(given) or [])
     written = lambda folder, photo, number, seen, space, caption, edge=None: [(photo.name, seen, caption, edge)]  # noqa: E731
     monkeypatch.setattr(judged_views, "write_view", written)
     monkeypatch.setattr(
@@ -101,10 +102,13 @@ def test_judged_views_are_kept(
     found.write()
     assert [(name, seen) for name, seen, _, edge in record.images if edge is None] == [(f"{k}", f"seen {k}") for k in full]
     assert sorted(name for name, *_ in record.images) == [f"{k}" for k in range(views)]
-    assert record.images[0][2] == f"the worst of {views}: PSNR [dB] 20.00"
+    assert record.images[0][2] == f"the worst of {views}: PSNR 20.00 dB"
+    assert record.tables[1].title == "Judged views, at 1600 x 1200 pixels, the worst first"
+    assert set(record.tables[1].rows) == {(f"{k}", "20.00") for k in range(views)}
     assert record.judged == f"{views} views at 1600 x 1200 pixels"
     assert record.results == {"views": views, "iterations": 77.0, "gaussians": 3.0, "held_out_psnr": pytest.approx(20.0)}
-    assert run.written == ["curves"] and record.tables[0].rows[2] == ("file", "0.00 MiB")
+    # The cameras that judge are drawn beside those that were fitted to.
+    assert run.written == [(tmp_path, found.photos, found.judged), "curves"] and record.tables[0].rows[2] == ("file", "0.00 MiB")
     assert (tmp_path / "views").is_dir() and (tmp_path / "film").is_dir()
 
 

@@ -78,8 +78,8 @@ def test_many_views_are_smaller_and_none_are_written_where_none_are_asked_for(tm
 
 def test_what_is_said_of_views() -> None:
     quality = Quality("a", {"psnr": 24.126, "ssim": 0.7781})
-    assert caption_of(quality, 25.3) == "PSNR [dB] 24.13, SSIM 0.7781, 25.30 dB with its colours fitted"
-    assert caption_of(quality) == "PSNR [dB] 24.13, SSIM 0.7781"
+    assert caption_of(quality, 25.3) == "PSNR 24.13 dB, SSIM 0.7781, 25.30 dB with its colours fitted"
+    assert caption_of(quality) == "PSNR 24.13 dB, SSIM 0.7781"
     assert said_of([photo("a")] * 3) == "3 views at 4 x 2 pixels"
     assert said_of([photo("a")]) == "1 view at 4 x 2 pixels"
     assert said_of([photo("a"), photo("b", 6)]) == "2 views at their own sizes"

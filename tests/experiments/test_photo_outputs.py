@@ -66,7 +66,10 @@ def test_distance_and_normals_are_pictures(tmp_path):
     seen = FieldView(np.zeros((2, 4, 3)), np.ones((2, 4)), np.full((2, 4), 1.5))
     found = photo_outputs.write_geometry(tmp_path, seen, camera(), (1.0, 2.0))
     assert [(i.path, i.role) for i in found] == [("views/distance.png", "picture"), ("views/normals.png", "picture")]
-    assert found[0].caption == "distance of the first judged view"
+    assert [i.caption for i in found] == [
+        "distance of the first judged view: from light, 1 [length], to dark, 2",
+        "normals of the first judged view: x, y, z from -1 to 1 as red, green, blue",
+    ]
     for image in found:
         assert np.array(Image.open(tmp_path / image.path)).shape == (2, 4, 3)
 
@@ -76,6 +79,9 @@ def test_judged_views_are_told_apart_the_worst_first():
     table = photo_outputs.table_of_views(camera(135, 240), found, [24.0, 12.345])
     assert table.title == "Judged views, at 135 x 240 pixels, the worst first"
     assert table.rows == (("b.jpg", "9.00", "0.5000", "12.35"), ("a.jpg", "23.46", "0.7123", "24.00"))
+    assert table.head[3] == "PSNR [dB], colours fitted to the photograph's"
+    bare = photo_outputs.table_of_views(camera(135, 240), found)
+    assert bare.head == table.head[:3] and bare.rows == tuple(row[:3] for row in table.rows)
 
 
 def test_metrics_have_the_names_of_the_record():

@@ -235,3 +235,6 @@ def test_the_summary_is_what_was_recorded(tmp_path: Path) -> None:
     run = folder(tmp_path)
     run.record.results = {"held_out_psnr": 30.25, "nrmse": 0.863, "gone": None}
     assert run.summary() == "saved: PSNR of the held-out views 30.25 dB, nRMSE of the volume 0.863"
+    # A count is said to the last digit.
+    run.record.results = {"gaussians": 12345.0}
+    assert run.summary() == "saved: Gaussians 12345"

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from mivol.photos import PhotoSurvey, survey_photos
 from mivol.photos.camera import Camera
 from mivol.photos.survey import Frame
-from mivol.report.cameras import EDGE, MOST_POINTS, outline, plot_cameras
+from mivol.report.cameras import EDGE, MOST_POINTS, PARTS, WIDTH, outline, plot_cameras
 
 TURNS = {"x": [0, 90, 0], "y": [-90, 0, 0], "z": [0, 0, 0]}
 """Angles about x, y and z that take z to an axis."""
@@ -71,6 +71,16 @@ def test_the_side_view_is_in_true_proportions(survey: PhotoSurvey) -> None:
     ratios = side._box_aspect / np.ptp(limits, axis=0)
     np.testing.assert_allclose(ratios / ratios[0], 1)
     assert plan.get_aspect() == 1
+
+
+@pytest.mark.parametrize("part", PARTS)
+def test_a_part_stands_alone(survey: PhotoSurvey, part: str) -> None:
+    """On a page the two stand one below the other, where a figure of both would be too small to read."""
+    (alone,) = plot_cameras(survey, part=part).axes
+    both = plot_cameras(survey).axes[PARTS.index(part)]
+    assert (alone.name, len(alone.lines)) == (both.name, len(both.lines))
+    assert alone.get_subplotspec().get_geometry()[:2] == (1, 1)
+    assert alone.figure.get_size_inches().tolist() == [WIDTH, WIDTH]
 
 
 def test_edges_of_a_view_go_through_the_corners_of_its_film() -> None:

@@ -81,6 +81,14 @@ def cameras() -> Figure:
     return plot_cameras(PhotoSurvey(Path("ring"), "COLMAP", frames, (), box, "points", (1.0, 9.0), np.zeros((1, 3))))
 
 
+@pytest.mark.parametrize("ends", [(0.0574, 0.13), (0.0090, 0.0125), (1.01, 4.9), (2.01, 10.1), (3.0, 299.0)])
+def test_a_log_axis_has_two_labels_at_least(ends: tuple[float, float]) -> None:
+    rows = [{"iteration": k, "seconds": k, "loss": value} for k, value in enumerate(ends)]
+    axes = plot_curve(rows, "loss").axes[0]
+    low, high = axes.get_ylim()
+    assert sum(low <= tick <= high for tick in axes.get_yticks()) >= 2
+
+
 DRAWN = [cameras, falling_curve, long_curve, reaching_the_noise, profile, methods, slices, slices_alone, row, row_in_colour]
 
 

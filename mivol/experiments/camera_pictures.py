@@ -1,0 +1,60 @@
+"""Where the cameras of a run stand, as two pictures of its page: from the side and from above."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import mitsuba as mi
+
+from mivol.optim.render_batches import View
+from mivol.photos import Frame, Photos, PhotoSurvey
+from mivol.report.cameras import PARTS, plot_cameras
+from mivol.report.record import Image
+from mivol.scene.cameras import find_box
+from mivol.scene.photographs import camera_of
+
+__all__ = ["pictures_of_photos", "pictures_of_views"]
+
+CAPTIONS = {
+    "side": "Where the cameras stand, and the box where matter may be",
+    "plan": "The same from above",
+}
+
+
+def pictures_of_photos(folder: Path, photos: Photos, judged: Photos | None) -> list[Image]:
+    """Cameras of all photographs, those that judge among them, about their box.
+
+    Args:
+        folder: of the run, where the pictures are written.
+        photos: what was fitted.
+        judged: what it is judged by; None for nothing.
+    """
+    frames = photos.survey.frames + (() if judged is None else judged.survey.frames)
+    return _pictures(folder, replace(photos.survey, frames=frames))
+
+
+def pictures_of_views(folder: Path, scene: mi.Scene, views: Mapping[str, Sequence[View]]) -> list[Image]:
+    """Cameras of a scene's views about the box of its media; none where no view is of a pinhole.
+
+    Args:
+        folder: of the run, where the pictures are written.
+        scene: what they look at.
+        views: by key of ``mivol.photos.SPLITS``.
+    """
+    frames = tuple(
+        Frame(Path(view.name), camera_of(view.sensor, view.name), split)
+        for split, of in views.items()
+        for view in of
+        if view.sensor.class_name() == "PerspectiveCamera"
+    )
+    if not frames:
+        return []
+    return _pictures(folder, PhotoSurvey(folder, "a scene", frames, (), find_box(scene), "about its media", (0.0, 0.0)))
+
+
+def _pictures(folder: Path, survey: PhotoSurvey) -> list[Image]:
+    for part in PARTS:
+        plot_cameras(survey, folder / f"cameras_{part}.png", part)
+    return [Image(path=f"cameras_{part}.png", role="picture", caption=CAPTIONS[part]) for part in PARTS]
