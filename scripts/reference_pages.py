@@ -195,8 +195,9 @@ def signature(name: str, thing: Callable) -> str:
     plain = [written(p) for p in parameters]
     if any(keywords):
         plain.insert(keywords.index(True), "*")
-    short = f"mivol.{name}({', '.join(plain)})"
-    return short if len(short) <= 100 else f"mivol.{name}(\n" + "".join(f"    {p},\n" for p in plain) + ")"
+    given = "" if inspect.isclass(thing) else f" -> {inspect.signature(thing).return_annotation}"
+    short = f"mivol.{name}({', '.join(plain)}){given}"
+    return short if len(short) <= 100 else f"mivol.{name}(\n" + "".join(f"    {p},\n" for p in plain) + f"){given}"
 
 
 def python_page() -> str:

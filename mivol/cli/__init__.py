@@ -19,8 +19,8 @@ from mivol.errors import MivolError
 
 USAGE, STOPPED = 2, 130
 
-DESCRIPTION = """Differentiable and inverse volume rendering on Mitsuba 3. Begin with "mivol doctor", which says whether a render
-would work here, and "mivol demo", which lists examples. "mivol VERB --help" says what a verb takes."""
+DESCRIPTION = """Differentiable and inverse volume rendering on Mitsuba 3. Begin with "mivol doctor", which says whether a
+render would work here, and "mivol demo", which lists examples. "mivol VERB --help" says what a verb takes."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -95,7 +95,8 @@ def sizes_of(plan: FitPlan, held: tuple[int, int]) -> PlanLine:
     """How large photographs are in each stage, which are held at so many pixels."""
     width, height = held
     if all(stage.shrink == 1 for stage in plan.stages):
-        return PlanLine(choice=f"photographs at {width} x {height} in all stages", reason="their pixels are not finer than voxels")
+        reason = "their pixels are not much finer than voxels"
+        return PlanLine(choice=f"photographs at {width} x {height} in all stages", reason=reason)
     return PlanLine(
         choice=f"photographs shrunk by {', '.join(str(stage.shrink) for stage in plan.stages)} in these stages",
         reason=f"a pixel of half a voxel says as much as four smaller ones; they are held at {width} x {height}",

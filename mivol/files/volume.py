@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
@@ -44,7 +43,7 @@ class VolumeData:
 
     values: np.ndarray
     to_world: np.ndarray
-    meta: dict[str, Any] = dataclasses.field(default_factory=dict)
+    meta: dict[str, object] = dataclasses.field(default_factory=dict)
 
     def _repr_html_(self) -> str:
         """Three middle slices, for notebooks."""

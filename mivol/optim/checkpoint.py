@@ -41,14 +41,14 @@ class Store:
     """
 
     path: Path
-    fingerprint: dict[str, Any]
+    fingerprint: dict[str, object]
     resume: bool = False
 
-    def write(self, arrays: dict[str, np.ndarray], about: dict[str, Any]) -> None:
+    def write(self, arrays: dict[str, np.ndarray], about: dict[str, object]) -> None:
         """Write a checkpoint of this run; refusals as :func:`write`."""
         write(self.path, arrays, {**about, "fingerprint": self.fingerprint})
 
-    def read(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    def read(self) -> tuple[dict[str, np.ndarray], dict[str, object]]:
         """Arrays and ``about`` of the checkpoint; refusals as :func:`read`."""
         return read(self.path, self.fingerprint)
 

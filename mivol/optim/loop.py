@@ -216,9 +216,9 @@ def begin_fit(
     course = course if isinstance(course, Course) else Course(course)
     run = optimiser.begin(problem)
     if not isinstance(run, Run):
+        begun = f"{type(optimiser).__name__}.begin gave {type(run).__name__}"
         raise MivolError(
-            f"{type(optimiser).__name__}.begin gave {type(run).__name__}, expected a mivol.optim.optimiser.Run, which has reals and a "
-            "method step: derive the optimiser's run from it."
+            f"{begun}, expected a mivol.optim.optimiser.Run, which has reals and a method step: derive the run from it."
         )
     return Fit(problem, run, course, measure, store)
 

@@ -66,7 +66,7 @@ def render_reference(
     integrator: str = "volpath",
     rr_depth: int = 5,
     hide_emitters: bool = False,
-    sensor: int | dict | mi.Sensor = 0,
+    sensor: int | Mapping[str, object] | mi.Sensor = 0,
     seed: int = 0,
     pass_spp: int | None = None,
     overrides: Mapping[str, object] | None = None,
@@ -143,7 +143,7 @@ class _Setup:
     pass_spp: int = 0
 
     @staticmethod
-    def of(loaded: LoadedScene, sensor: int | dict | mi.Sensor, method: dict[str, Any], seed: int) -> _Setup:
+    def of(loaded: LoadedScene, sensor: int | Mapping[str, object] | mi.Sensor, method: dict[str, Any], seed: int) -> _Setup:
         """The setup, but for the samples of a pass."""
         look = _sensor(loaded.scene, sensor)
         columns, rows = (int(n) for n in look.film().crop_size())
@@ -204,7 +204,7 @@ class _Setup:
         return np.array(image, dtype=np.float64)[..., : self.shape[2]]
 
 
-def _sensor(scene: mi.Scene, sensor: int | dict | mi.Sensor) -> mi.Sensor:
+def _sensor(scene: mi.Scene, sensor: int | Mapping[str, object] | mi.Sensor) -> mi.Sensor:
     if isinstance(sensor, Mapping):
         return mi.load_dict(dict(sensor))
     return find_sensor(scene, sensor)

@@ -59,7 +59,7 @@ class ReferenceResult:
     variance: np.ndarray
     batches: int
     spp: int
-    identity: dict[str, Any]
+    identity: dict[str, object]
     path: Path
     doubts: tuple[Doubt, ...] = ()
     seconds: float = 0.0
