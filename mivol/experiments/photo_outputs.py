@@ -198,7 +198,10 @@ def write_geometry(folder: Path, seen: FieldView, camera: Camera, near_far: tupl
     near, far = near_far
     pictures = {
         "distance": (depth_pixels(seen.depth, near_far, seen.opacity), f"from light, {near:.3g} [length], to dark, {far:.3g}"),
-        "normals": (normal_pixels(normals_of_depth(seen.depth, camera), seen.opacity), "x, y, z from -1 to 1 as red, green, blue"),
+        "normals": (
+            normal_pixels(normals_of_depth(seen.depth, camera), seen.opacity),
+            "x, y, z from -1 to 1 as red, green, blue",
+        ),
     }
     written = []
     for name, (pixels, scale) in pictures.items():

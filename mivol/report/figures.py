@@ -179,8 +179,10 @@ NARROW = 5.0
 
 
 def _log_axis(axis: Axis, values: NDArray) -> None:
-    """A log axis with enough labels: decades where there are two or more, else 1-2-5 steps in plain numbers, or even steps where
-    fewer than two of those would be seen."""
+    """A log axis with enough labels: decades where there are two or more, else 1-2-5 steps in plain numbers.
+
+    Where fewer than two of those would be seen, steps are even.
+    """
     getattr(axis.axes, f"set_{axis.axis_name}scale")("log")
     wide, narrow = values.max() >= 100 * values.min(), values.max() < NARROW * values.min()
     axis.set_major_locator(MaxNLocator(5) if narrow else LogLocator(subs=(1.0,) if wide else (1.0, 2.0, 5.0)))

@@ -108,7 +108,8 @@ def test_judged_views_are_kept(
     assert record.judged == f"{views} views at 1600 x 1200 pixels"
     assert record.results == {"views": views, "iterations": 77.0, "gaussians": 3.0, "held_out_psnr": pytest.approx(20.0)}
     # The cameras that judge are drawn beside those that were fitted to.
-    assert run.written == [(tmp_path, found.photos, found.judged), "curves"] and record.tables[0].rows[2] == ("file", "0.00 MiB")
+    assert run.written == [(tmp_path, found.photos, found.judged), "curves"]
+    assert record.tables[0].rows[2] == ("file", "0.00 MiB")
     assert (tmp_path / "views").is_dir() and (tmp_path / "film").is_dir()
 
 
