@@ -287,8 +287,9 @@ def test_a_medium_that_only_absorbs_may_go_deeper():
 
 
 SAMPLERS = ("stratified", "multijitter", "orthogonal", "ldsampler")
-SPREAD = {"multijitter": 0.35, "orthogonal": 0.45, "ldsampler": 0.53}
-"""Variance over that of independent samples, measured once; Mitsuba's `stratified` leaves 0.84, too near 1 for 16 renders."""
+SPREAD = {"multijitter": 0.41, "orthogonal": 0.46, "ldsampler": 0.64}
+"""Variance over that of independent samples, a mean over 12 seeds and more; Mitsuba's `stratified` leaves 0.84, too near 1 for so
+few renders."""
 
 
 @pytest.mark.statistical
@@ -306,7 +307,9 @@ def test_samplers(kind):
     for sampler in ("independent", kind):
         sensor = scenes.camera((1.5, -2.5, 1.2), (0, 0, 0), res=8, fov=40.0)
         sensor["sampler"] = {"type": sampler, "sample_count": spp}
-        found[sampler] = moments(mi.load_dict({"type": "scene", **parts, "sensor": sensor}), mivol(), spp)
+        # Ratios spread by 8 % over 16 renders: of that, `ldsampler` is 4 standard deviations from the bound, and 6 over 32.
+        batches = 32 if kind == "ldsampler" else 16
+        found[sampler] = moments(mi.load_dict({"type": "scene", **parts, "sensor": sensor}), mivol(), spp, batches)
     small.assert_same_whole(found["independent"], found[kind], precision=0.02)
     if kind in SPREAD:
         grey = [Estimate(m.mean[..., 0], m.variance_of_mean[..., 0], m.n - 1) for m in (found[kind], found["independent"])]
