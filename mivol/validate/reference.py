@@ -300,10 +300,16 @@ def _result(setup: _Setup, run: _Run, path: Path, doubts: tuple[Doubt, ...]) -> 
 
 @contextmanager
 def _progress(name: str, goal: _Goal) -> Iterator[Callable[[_Run], None]]:
+    """A bar on the error output; where that is no terminal, in notebooks too, a line at the end.
+
+    Bars of rich in a notebook need ipywidgets, and rich complains where they are missing.
+    """
+    from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-    error_column = TextColumn("{task.fields[error]}")
-    with Progress("{task.description}", BarColumn(), MofNCompleteColumn(), error_column, TimeRemainingColumn()) as bar:
+    console = Console(stderr=True)
+    columns = "{task.description}", BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[error]}"), TimeRemainingColumn()
+    with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
         task = bar.add_task(f"reference {name}", total=FEWEST_BATCHES, error="")
 
         def show(run: _Run) -> None:
@@ -318,6 +324,9 @@ def _progress(name: str, goal: _Goal) -> Iterator[Callable[[_Run], None]]:
             bar.update(task, completed=run.moments.n, total=total, error=f"error {reached:.2g}")
 
         yield show
+        if not console.is_terminal:
+            says = bar.tasks[task]
+            console.print(f"{says.description}: {says.completed} batches, {says.fields['error']}", soft_wrap=True, markup=False)
 
 
 # -- What is on disk already ------------------------------------------------------------------------

@@ -264,6 +264,16 @@ def test_target(variant_rgb, tmp_path, relative):
     assert not _small(_scene(_grid(1.5)), tmp_path / "s.exr", target_se=1e-9).reached
 
 
+def test_progress_is_a_line_where_no_bar_can_be_drawn(variant_rgb, tmp_path, monkeypatch, capsys):
+    """In notebooks too: rich draws bars there with ipywidgets, and warns where they are missing, which is an error here."""
+    _small(_scene(_homogeneous()), tmp_path / "a.exr", max_spp=64, progress=True)
+    said = capsys.readouterr()
+    assert said.out == ""
+    assert re.fullmatch(r"reference a: \d+ batches, error [\d.e-]+\n", said.err)
+    monkeypatch.setattr("rich.console._is_jupyter", lambda: True)
+    _small(_scene(_homogeneous()), tmp_path / "b.exr", max_spp=64, progress=True)
+
+
 def test_file_says_what_it_is(variant_rgb, tmp_path):
     """Layers and header."""
     made = _small(_scene(_grid(1.5)), tmp_path / "r.exr")
