@@ -6,6 +6,7 @@ shows public data has a stand-in, a procedural volume from a seed, so that it ru
 
 from __future__ import annotations
 
+import re
 import runpy
 import shutil
 import sys
@@ -25,6 +26,13 @@ __all__ = ["EXAMPLES", "Example", "copy_example", "examples_folder", "list_examp
 
 INSTALLED = Path(__file__).resolve().parents[1] / "examples"
 CHECKOUT = Path(__file__).resolve().parents[2] / "scenes"
+
+
+TEXTS = (".toml", ".xml", ".md", ".py")
+"""Suffixes of an example's files that may name others."""
+
+NEIGHBOUR = re.compile(r"\.\./demo/([\w.]+)")
+"""A file of the example ``demo``, as another one names it."""
 
 
 @dataclass(frozen=True)
@@ -197,8 +205,24 @@ def copy_example(name: str, into: Path) -> Path:
         if path.is_file() and "__pycache__" not in path.parts:
             target = into / path.relative_to(source)
             target.parent.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(path, target)
+            if path.suffix in TEXTS:
+                copy_text(path, target, source, into)
+            else:
+                shutil.copyfile(path, target)
     return into / example.file
+
+
+def copy_text(path: Path, target: Path, source: Path, into: Path) -> None:
+    """Copy a text of an example that lies in ``source`` so that it holds in ``into``.
+
+    What it takes from a neighbour (``../demo/empty.vol``) is copied beside it. Runs are those of this folder, where the
+    example's scripts write, and commands name the copy.
+    """
+    text = path.read_text(encoding="utf-8")
+    for name in NEIGHBOUR.findall(text):
+        shutil.copyfile(source.parent / "demo" / name, into / name)
+    text = NEIGHBOUR.sub(r"\1", text).replace("../../runs/", f"{Path('runs').resolve().as_posix()}/")
+    target.write_text(text.replace(f"scenes/{source.name}/", f"{into.as_posix()}/"), encoding="utf-8")
 
 
 def run_example(

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import pytest
 from tiny_experiment import SCENE, refused, run, write_experiment
 
+import mivol
 from mivol import config
 from mivol.experiments import examples
 from mivol.experiments.examples import EXAMPLES, StandIn, examples_folder
@@ -42,6 +44,23 @@ def test_an_example_is_copied_once(tmp_path: Path, capsys: pytest.CaptureFixture
         path.name for path in (examples_folder() / "demo").iterdir()
     }
     assert "is there already" in refused(capsys, "demo", "demo", "--into", tmp_path / "mine")
+
+
+def test_a_copy_stands_by_itself(variant_rgb: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It names nothing that lay beside it, its runs are those of the folder where its scripts write, its commands name it."""
+    monkeypatch.chdir(tmp_path)
+    named = set()
+    for name in EXAMPLES:
+        into = examples.copy_example(name, Path("copies") / name).parent
+        texts = {path: path.read_text() for path in into.rglob("*") if path.suffix in (".toml", ".xml", ".md")}
+        assert not [path for path, text in texts.items() if "../" in text]
+        named |= {word for text in texts.values() for word in re.findall(r"copies/[\w/]+\.(?:py|toml)", text)}
+        if (into / "scene.xml").exists() and name != "lamp":  # whose scene names the data
+            mivol.load_scene(into / "scene.xml")
+    assert {"copies/smoke/fit.toml", "copies/still_life/photographs.py"} <= named
+    assert [word for word in sorted(named) if not Path(word).is_file()] == []
+    photographs = config.load(Path("copies/still_life/fit.toml")).photos.path
+    assert Path(photographs) == tmp_path / "runs" / "still_life" / "photographs"
 
 
 def test_two_examples_may_share_a_folder(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
