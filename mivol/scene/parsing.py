@@ -31,6 +31,9 @@ VARIANTS = ("llvm_ad_rgb", "llvm_ad_mono", "cuda_ad_rgb", "cuda_ad_mono")
 LONGEST_REASON = 700
 """Characters of a message of Mitsuba's that are quoted: its lists of plugins and parameters are shorter."""
 
+TRACEBACK = re.compile(r"Traceback \(most recent call last\):\n(?:[ \t].*\n)+(?:(?:[\w.]+\.)?MivolError: )?")
+"""A traceback in a text, up to what was raised; the name of a refusal of mivol's belongs to it."""
+
 # Header formats whose voxels lie in a second file: the key of the line that names it.
 DETACHED = {".mhd": "ElementDataFile", ".nhdr": "data file"}
 
@@ -55,8 +58,12 @@ def as_text(value: Any) -> str:
 
 
 def reason_of(error: Exception) -> str:
-    """Mitsuba's message without its source position, in one line that does not quote all of a long file."""
-    text = " ".join(re.sub(r"^\s*\[[\w.]+:\d+\]\s*", "", str(error)).split())
+    """Mitsuba's message without its source position, in one line that does not quote all of a long file.
+
+    Of an error of a plugin in Python, mivol's own among them, Mitsuba quotes the traceback: what the plugin says is at its end.
+    """
+    text = TRACEBACK.sub("", re.sub(r"^\s*\[[\w.]+:\d+\]\s*", "", str(error)))
+    text = " ".join(text.split())
     return text if len(text) <= LONGEST_REASON else f"{text[:LONGEST_REASON]} ..."
 
 

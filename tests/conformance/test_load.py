@@ -112,6 +112,18 @@ def test_refusals(xml, tmp_path):
             load_scene(*arguments)
 
 
+def test_a_plugin_says_what_it_refuses(variant_rgb, tmp_path):
+    """Mitsuba quotes the whole traceback of a plugin in Python, at whose end its sentence is."""
+    grid = '<volume type="mivol_voxels" name="sigma_t"><string name="filename" value="nowhere.nrrd"/></volume>'
+    medium = f'<medium type="heterogeneous" name="interior">{grid}</medium>'
+    (tmp_path / "s.xml").write_text(f'<scene version="3.0.0"><shape type="cube">{medium}</shape></scene>')
+    with pytest.raises(MivolError, match=r"nowhere.nrrd: found nothing there, expected an existing file") as caught:
+        load_scene(tmp_path / "s.xml")
+    assert "Traceback" not in str(caught.value)
+    assert "MivolError" not in str(caught.value)
+    assert 'volume plugin of type "mivol_voxels": ' in str(caught.value)
+
+
 def test_variants_are_checked():
     """A spectral or polarised variant is refused by name."""
     mi.set_variant("scalar_spectral")
