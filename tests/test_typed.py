@@ -20,6 +20,7 @@ from syntax import tree_of
 import mivol
 
 ROOT = Path(__file__).resolve().parents[1]
+USER_SCRIPT = Path(__file__).with_name("user_script.py")
 
 
 def test_type_checkers_see_what_is_public() -> None:
@@ -86,6 +87,12 @@ def test_public_signatures_say_what_they_take(variant_rgb: str) -> None:
     assert {"optimize: return", "Fit: store", "Store: fingerprint", "VolumeData: meta"} <= set(kinds)
 
 
+def test_a_user_script_names_all_that_is_public() -> None:
+    """What mypy reads of a user leaves nothing out."""
+    attributes = {node.attr for node in ast.walk(tree_of(USER_SCRIPT)) if isinstance(node, ast.Attribute)}
+    assert set(mivol.__all__) - attributes == set()
+
+
 @pytest.mark.slow
 def test_scripts_of_the_docs_pass_mypy_strict(tmp_path: Path) -> None:
     """And a mistake in the use of mivol does not: the types are there."""
@@ -95,9 +102,10 @@ def test_scripts_of_the_docs_pass_mypy_strict(tmp_path: Path) -> None:
     # As for users, whose mivol is installed: mypy reports faults of the script only.
     said = {"capture_output": True, "text": True, "timeout": 300, "cwd": tmp_path, "env": {**os.environ, "MYPYPATH": ""}}
     found = {}
-    for name, files in (("docs", sorted((ROOT / "docs" / "scripts").glob("*.py"))), ("wrong", [wrong])):
+    scripts = [*sorted((ROOT / "docs" / "scripts").glob("*.py")), USER_SCRIPT]
+    for name, files in (("right", scripts), ("wrong", [wrong])):
         done = subprocess.run([*command, *map(str, files)], **said)
         assert done.stderr == "", done.stderr
         found[name] = [line for line in done.stdout.splitlines() if ": error: " in line]
-    assert found["docs"] == []
+    assert found["right"] == []
     assert [line.split(":")[1] for line in found["wrong"]] == ["3", "4", "5"]

@@ -32,8 +32,11 @@ class Geometry(Protocol):
     through ``o`` (parallel light), where it is otherwise the half line that starts at ``o``.
     """
 
-    shape: tuple[int, int, int]
-    whole_lines: bool
+    @property
+    def shape(self) -> tuple[int, int, int]: ...
+
+    @property
+    def whole_lines(self) -> bool: ...
 
     def rays(self, views: Sequence[int] | np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]: ...
 
