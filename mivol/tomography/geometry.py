@@ -26,17 +26,17 @@ _Z = np.array([0.0, 0.0, 1.0])
 
 
 class Geometry(Protocol):
-    """What a projector asks of a scanner.
-
-    ``shape`` is (views, rows, columns) of its projections. ``whole_lines`` says that a ray is the whole straight line
-    through ``o`` (parallel light), where it is otherwise the half line that starts at ``o``.
-    """
+    """What a projector asks of a scanner."""
 
     @property
-    def shape(self) -> tuple[int, int, int]: ...
+    def shape(self) -> tuple[int, int, int]:
+        """(views, rows, columns) of its projections."""
+        ...
 
     @property
-    def whole_lines(self) -> bool: ...
+    def whole_lines(self) -> bool:
+        """Whether a ray is the whole straight line through ``o`` (parallel light), and not the half line that starts there."""
+        ...
 
     def rays(self, views: Sequence[int] | np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]: ...
 
