@@ -196,12 +196,10 @@ def write_density(folder: Path, field: SphericalGrid, level: int) -> Volume:
 def write_geometry(folder: Path, seen: FieldView, camera: Camera, near_far: tuple[float, float]) -> list[Image]:
     """Distance and normals of a view as colours."""
     near, far = near_far
+    normals = normals_of_depth(seen.depth, camera)
     pictures = {
         "distance": (depth_pixels(seen.depth, near_far, seen.opacity), f"from light, {near:.3g} [length], to dark, {far:.3g}"),
-        "normals": (
-            normal_pixels(normals_of_depth(seen.depth, camera), seen.opacity),
-            "x, y, z from -1 to 1 as red, green, blue",
-        ),
+        "normals": (normal_pixels(normals, seen.opacity), "x, y, z from -1 to 1 as red, green, blue"),
     }
     written = []
     for name, (pixels, scale) in pictures.items():
