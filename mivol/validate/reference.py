@@ -25,7 +25,7 @@ from mivol.optim.interrupt import Stop
 from mivol.scene.content_hash import content_hash
 from mivol.scene.load import LoadedScene, SceneSource, load_scene
 from mivol.scene.parsing import check_variant
-from mivol.scene.sensors import find_sensor
+from mivol.scene.sensors import check_film, find_sensor
 from mivol.validate.moments import Moments
 from mivol.validate.reference_file import (
     ReferenceResult,
@@ -51,6 +51,9 @@ FEWEST_BATCHES = 32
 
 # Paths in one render, by backend: below a second or so on two cores, so that Ctrl-C acts soon, and enough to fill a GPU.
 PATHS_PER_PASS = {"llvm": 2**18, "cuda": 2**22}
+
+# Bytes a pixel that are kept beside a batch: mean and squares of three channels in float64, and what a batch makes of them.
+KEPT = (2 + 3) * 3 * 8
 
 SECONDS_BETWEEN_CHECKPOINTS = 20.0
 
@@ -82,7 +85,8 @@ def render_reference(
 
     Args:
         scene: path of an XML, dict, scene, or what ``load_scene`` gave.
-        out: an ``.exr`` file, or a folder: the file is then named after the scene and what identifies the reference.
+        out: an ``.exr`` file, or a folder: the file is then named after the scene and what identifies the reference, and made
+            anew where it is damaged (a file that you name is not touched then).
         max_depth: longest path; -1 is unlimited. Always said, since Mitsuba's integrators have different defaults.
         target_se: standard error to reach [radiance]; None: render ``max_spp``.
         relative: ``target_se`` is a fraction of the mean radiance of the image.
@@ -103,8 +107,8 @@ def render_reference(
 
     Raises:
         MivolError: an integrator that is no reference, a scene for which Mitsuba is known to be wrong, a file that is the
-            reference of another scene or was made differently, a film that is not rgb or luminance, a target that cannot be
-            reached by 32 batches, a sample that is not finite.
+            reference of another scene or was made differently, a film that is not rgb or luminance or does not
+            fit into memory, a target that cannot be reached by 32 batches, a sample that is not finite.
     """
     if integrator not in INTEGRATORS:
         raise MivolError(
@@ -114,10 +118,13 @@ def render_reference(
     loaded = scene if isinstance(scene, LoadedScene) else load_scene(scene, overrides)
     method = {"integrator": integrator, "max_depth": max_depth, "rr_depth": rr_depth, "hide_emitters": hide_emitters}
     setup = _Setup.of(loaded, sensor, method, seed)
+    check_film(setup.sensor, KEPT)
     path = destination_of(Path(out), loaded.name, setup.identity)
     doubts = _judge(loaded.scene, setup.sensor, accept_doubts)
     goal = _Goal(target_se, relative, max_spp)
 
+    if path != Path(out):
+        _drop_damaged(path)
     result = _finished(path, setup.identity, goal)
     if result is None:
         setup = setup.with_passes(pass_spp or _stored_pass_spp(path), max_spp)
@@ -330,6 +337,17 @@ def _progress(name: str, goal: _Goal) -> Iterator[Callable[[_Run], None]]:
 
 
 # -- What is on disk already ------------------------------------------------------------------------
+
+
+def _drop_damaged(path: Path) -> None:
+    """Remove what cannot be read from a folder whose files mivol names, so that it is made anew; a warning says so."""
+    for file, read in ((path, read_reference), (state_path(path), read_state)):
+        try:
+            if file.exists():
+                read(file)
+        except MivolError as error:
+            warnings.warn(f"{file.name} is damaged and made anew: {error}", RuntimeWarning, stacklevel=3)
+            file.unlink()
 
 
 def _finished(path: Path, identity: dict[str, Any], goal: _Goal) -> ReferenceResult | None:

@@ -303,6 +303,24 @@ def test_folder_names_its_files(variant_rgb, tmp_path):
 # -- Refusals -------------------------------------------------------------------------------------
 
 
+def test_a_damaged_reference_of_a_cache_is_made_anew(variant_rgb, tmp_path):
+    """In a folder whose files mivol names: what is cut off is said and rendered again, to the same numbers."""
+    made = _small(_scene(_grid(1.5)), tmp_path / "cache")
+    whole = made.path.read_bytes()
+    state = made.path.with_suffix(".state.npz")
+    for damage in (whole[: len(whole) // 2], b""):
+        made.path.write_bytes(damage)
+        state.write_bytes(b"PK\x03\x04 half")
+        with pytest.warns(RuntimeWarning, match="is damaged and made anew"):
+            again = _small(_scene(_grid(1.5)), tmp_path / "cache")
+        np.testing.assert_array_equal(again.mean, made.mean)
+        assert read_reference(made.path).batches == made.batches
+    (tmp_path / "mine.exr").write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(MivolError, match="damaged OpenEXR file"):
+        _small(_scene(_grid(1.5)), tmp_path / "mine.exr")
+    assert (tmp_path / "mine.exr").read_bytes() == whole[: len(whole) // 2]
+
+
 def test_another_scene_is_refused(variant_rgb, tmp_path):
     """The reference of one scene is not that of another, whether whole or begun, and is not overwritten."""
     path = tmp_path / "r.exr"
