@@ -10,7 +10,14 @@ __all__ = ["MivolError", "reveal_refusals"]
 
 
 class MivolError(ValueError):
-    """An input that mivol cannot use; the message is one sentence for the person who gave it."""
+    """An input that mivol cannot use; the message is one sentence for the person who gave it.
+
+    What it quotes may be no text, such as half of a pair of UTF-16 in a name of JSON; that is shown by its number, so that the
+    sentence can be printed.
+    """
+
+    def __str__(self) -> str:
+        return super().__str__().encode("utf-8", "backslashreplace").decode("utf-8")
 
 
 def reveal_refusals(render: Callable[..., Any]) -> Callable[..., Any]:

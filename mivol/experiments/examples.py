@@ -10,6 +10,8 @@ import re
 import runpy
 import shutil
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,6 +21,7 @@ from mivol.experiments.runs import run_experiment
 from mivol.experiments.task import Nobody, Task, Watcher
 from mivol.fields.procedural import make_procedural
 from mivol.files import write_volume
+from mivol.files.atomic import disk_faults
 from mivol.files.fetch import PREFIX, find_data, place_of
 from mivol.optim.strategy import nearest
 
@@ -195,20 +198,21 @@ def copy_example(name: str, into: Path) -> Path:
         Its experiment.
 
     Raises:
-        MivolError: no such example, or something lies there already.
+        MivolError: no such example, something lies there already, or what the system refuses (disk full, ...).
     """
     example = example_named(name)
     if into.exists() and (not into.is_dir() or any(into.iterdir())):
         raise MivolError(f'"{into}" is there already: name a folder that is not there yet, or is empty.')
     source = example.source(name)
-    for path in sorted(source.rglob("*")):
-        if path.is_file() and "__pycache__" not in path.parts:
-            target = into / path.relative_to(source)
-            target.parent.mkdir(parents=True, exist_ok=True)
-            if path.suffix in TEXTS:
-                copy_text(path, target, source, into)
-            else:
-                shutil.copyfile(path, target)
+    with disk_faults(into, "room for the files of the example", " (nothing was left half-written)"), whole_folder(into):
+        for path in sorted(source.rglob("*")):
+            if path.is_file() and "__pycache__" not in path.parts:
+                target = into / path.relative_to(source)
+                target.parent.mkdir(parents=True, exist_ok=True)
+                if path.suffix in TEXTS:
+                    copy_text(path, target, source, into)
+                else:
+                    shutil.copyfile(path, target)
     return into / example.file
 
 
@@ -223,6 +227,16 @@ def copy_text(path: Path, target: Path, source: Path, into: Path) -> None:
         shutil.copyfile(source.parent / "demo" / name, into / name)
     text = NEIGHBOUR.sub(r"\1", text).replace("../../runs/", f"{Path('runs').resolve().as_posix()}/")
     target.write_text(text.replace(f"scenes/{source.name}/", f"{into.as_posix()}/"), encoding="utf-8")
+
+
+@contextmanager
+def whole_folder(path: Path) -> Iterator[None]:
+    """A folder that is filled, or not there: what an error has left of it is removed."""
+    try:
+        yield
+    except BaseException:
+        shutil.rmtree(path, ignore_errors=True)
+        raise
 
 
 def run_example(

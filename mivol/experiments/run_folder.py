@@ -16,7 +16,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from mivol.errors import MivolError
-from mivol.files.atomic import sweep
+from mivol.files.atomic import disk_faults, sweep
 from mivol.files.lock import locked
 from mivol.report import figures
 from mivol.report.record import (
@@ -153,9 +153,14 @@ class RunFolder:
             self.record.timings[name] = time.perf_counter() - start
 
     def make(self, *names: str) -> None:
-        """Make folders in it."""
+        """Make folders in it.
+
+        Raises:
+            MivolError: what the system refuses (disk full, quota, permission ...).
+        """
         for name in names:
-            (self.path / name).mkdir(exist_ok=True)
+            with disk_faults(self.path / name, "room for a folder"):
+                (self.path / name).mkdir(exist_ok=True)
 
     def summary(self) -> str:
         """What was saved, in a line: the results of the record."""

@@ -35,6 +35,27 @@ DISK_FAULTS: dict[int, tuple[str, str]] = {
 
 
 @contextlib.contextmanager
+def disk_faults(path: str | os.PathLike, expected: str, left: str = "") -> Iterator[None]:
+    """Say in a sentence what the system refuses while something is written.
+
+    Args:
+        path: what is written; first in the sentence.
+        expected: what the disk should have had.
+        left: what is left of it, after the way out.
+
+    Raises:
+        MivolError: for what :data:`DISK_FAULTS` knows; other errors pass.
+    """
+    try:
+        yield
+    except OSError as error:
+        if error.errno not in DISK_FAULTS:
+            raise
+        found, way_out = DISK_FAULTS[error.errno]
+        raise MivolError(f"{path}: found {found} while writing, expected {expected}; {way_out}{left}.") from error
+
+
+@contextlib.contextmanager
 def whole_file(path: str | os.PathLike) -> Iterator[Path]:
     """Give a temporary path to write to; on leaving without an error it takes the place of ``path``.
 
@@ -51,17 +72,11 @@ def whole_file(path: str | os.PathLike) -> Iterator[Path]:
     target = _destination(Path(path))
     temporary = target.with_name(f".{target.name}.{secrets.token_hex(4)}.part")
     try:
-        yield temporary
-        _sync(temporary)
-        temporary.replace(target)
-        _sync_folder(target.parent)
-    except OSError as error:
-        if error.errno not in DISK_FAULTS:
-            raise
-        found, way_out = DISK_FAULTS[error.errno]
-        raise MivolError(
-            f"{path}: found {found} while writing, expected room for the whole file; {way_out} (nothing was left half-written)."
-        ) from error
+        with disk_faults(path, "room for the whole file", " (nothing was left half-written)"):
+            yield temporary
+            _sync(temporary)
+            temporary.replace(target)
+            _sync_folder(target.parent)
     finally:
         with contextlib.suppress(OSError):
             temporary.unlink(missing_ok=True)

@@ -24,6 +24,7 @@ import msgspec
 
 from mivol.errors import MivolError
 from mivol.files import write_whole_text
+from mivol.files.atomic import disk_faults
 from mivol.machine import cores
 
 __all__ = [
@@ -258,9 +259,14 @@ def read_record(folder: str | Path) -> RunRecord:
 
 
 def append_metrics(folder: str | Path, iteration: int, seconds: float, **values: float) -> None:
-    """Add one line to ``metrics.jsonl``: the iteration, the seconds since the start, and numbers by name."""
+    """Add one line to ``metrics.jsonl``: the iteration, the seconds since the start, and numbers by name.
+
+    Raises:
+        MivolError: what the system refuses (disk full, quota, permission ...); of half a line nothing is read.
+    """
     row = {"iteration": int(iteration), "seconds": float(seconds)} | {name: float(v) for name, v in values.items()}
-    with (Path(folder) / METRICS).open("a", encoding="utf-8") as file:
+    path = Path(folder) / METRICS
+    with disk_faults(path, "room for another line"), path.open("a", encoding="utf-8") as file:
         file.write(json.dumps(_finite(row), allow_nan=False) + "\n")
 
 

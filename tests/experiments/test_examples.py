@@ -63,6 +63,24 @@ def test_a_copy_stands_by_itself(variant_rgb: str, tmp_path: Path, monkeypatch: 
     assert Path(photographs) == tmp_path / "runs" / "still_life" / "photographs"
 
 
+def test_an_example_is_copied_whole_or_not_at_all(
+    tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A disk that fills up at the second file: nothing is left, one sentence is said, and the next try ends well."""
+    copy, copied = examples.shutil.copyfile, []
+
+    def full(source: Path, target: Path) -> None:
+        copied.append(copy(source, target))
+        if len(copied) == 2:
+            raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(examples.shutil, "copyfile", full)
+        assert "found no space left on the disk" in refused(capsys, "demo", "demo", "--into", tmp_path / "mine")
+    assert not (tmp_path / "mine").exists()
+    assert run("demo", "demo", "--into", tmp_path / "mine") == 0
+
+
 def test_two_examples_may_share_a_folder(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     """The Gaussians are of the still life's photographs."""
     assert run("demo", "gaussians", "--into", tmp_path / "mine") == 0

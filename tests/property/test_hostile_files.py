@@ -129,6 +129,32 @@ def test_deep_experiments_are_refused(tmp_path: Path) -> None:
         config.load(tmp_path / "deep.toml")
 
 
+def test_keys_of_many_parts_are_refused_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """tomllib takes the square of their number as time, so it is not asked; a key of fewer, and a path of dots, are its own."""
+    for text in ("a." * 50_000 + "b = 1", "[" + '"a" . ' * 200 + "b]"):
+        (tmp_path / "deep.toml").write_text(text)
+        with monkeypatch.context() as patch, pytest.raises(MivolError, match="nests its values deeper"):
+            patch.setattr(config.tomllib, "loads", lambda text: pytest.fail("parsed"))
+            config.load(tmp_path / "deep.toml")
+    (tmp_path / "some.toml").write_text("a." * 90 + "b = 1\nscene.file = '" + "../" * 200 + "a.xml'\n")
+    with pytest.raises(MivolError, match='unknown key "a"'):
+        config.load(tmp_path / "some.toml")
+
+
+def test_a_byte_order_mark_of_windows_is_no_part_of_an_experiment(tmp_path: Path) -> None:
+    (tmp_path / "a.toml").write_bytes(b"\xef\xbb\xbf" + SHEPP_LOGAN.with_name("cone_128.toml").read_bytes())
+    assert config.load(tmp_path / "a.toml") == config.load(SHEPP_LOGAN.with_name("cone_128.toml"))
+
+
+def test_a_name_that_is_no_text_can_be_printed(tmp_path: Path) -> None:
+    """Half of a pair of UTF-16 is a name in JSON, and print() raised a UnicodeEncodeError at the refusal."""
+    frame = {"file_path": "\ud800.png", "transform_matrix": np.eye(4).tolist()}
+    (tmp_path / "transforms.json").write_text(json.dumps({"fl_x": 10.0, "w": 12, "h": 8, "frames": [frame]}))
+    with pytest.raises(MivolError) as refused:
+        load_photos(tmp_path)
+    assert rb"\ud800.png" in str(refused.value).encode()
+
+
 def test_records_of_las_without_room_are_refused(tmp_path: Path) -> None:
     """Found by the script: laspy reads as many empty records as the header says, two thousand million of them."""
     pytest.importorskip("laspy")

@@ -1,4 +1,4 @@
-"""What a record says of the machine and of the packages."""
+"""What a record says of the machine and of the packages, and lines of metrics."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from mivol.errors import MivolError
 from mivol.report import record
 
 
@@ -26,3 +27,11 @@ def test_packages_that_are_not_there_are_left_out(monkeypatch: pytest.MonkeyPatc
     found = record.versions()
     assert list(found) == ["python", "system", "numpy"]
     assert found["python"] == platform.python_version() and found["system"].endswith(platform.machine())
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no device that is always full")
+def test_a_line_that_the_disk_has_no_room_for_is_said_by_its_file(tmp_path: Path) -> None:
+    """The system's own error names none."""
+    (tmp_path / "metrics.jsonl").symlink_to("/dev/full")
+    with pytest.raises(MivolError, match=r"metrics\.jsonl: found no space left on the disk while writing, expected room for"):
+        record.append_metrics(tmp_path, 1, 0.1, loss=2.0)
