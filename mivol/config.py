@@ -8,6 +8,7 @@ to the TOML file. :func:`resolved` is what ``run.json`` keeps.
 from __future__ import annotations
 
 import math
+import re
 import textwrap
 import tomllib
 from collections.abc import Sequence
@@ -35,6 +36,12 @@ from mivol.validate.images import METRICS
 
 INFINITY = math.inf
 
+DEEP_KEY = re.compile(r"(?<![\w\"'.-])(?:[\w\"'-]++[ \t]*+\.[ \t]*+){100}")
+"""A hundred names with dots between them; tomllib takes the square of their number as time, a minute for a file of 200 kB."""
+
+Count = Annotated[int, msgspec.Meta(ge=1)]
+"""Voxels or pixels along an edge."""
+
 LONGEST_SENTENCE = 600
 """Characters of a refusal, which quotes what it found: that may be as long as its file."""
 
@@ -56,7 +63,7 @@ class Truth(Section):
     key: Annotated[str, of("1", "key of mi.traverse(scene)", min_length=1)]
     file: Annotated[str, of("path", "volume file; empty: procedural")] = ""
     procedural: Annotated[str, of("1", "key of mivol.fields.procedural.PROCEDURAL; empty: file")] = ""
-    shape: Annotated[tuple[int, int, int], of("voxel", "(Z, Y, X) of a procedural volume")] = (48, 48, 48)
+    shape: Annotated[tuple[Count, Count, Count], of("voxel", "(Z, Y, X) of a procedural volume")] = (48, 48, 48)
     seed: Annotated[int, of("1", "which procedural volume", ge=0)] = 0
     peak: Annotated[float, of("unit of the field", "largest value of a procedural volume", gt=0)] = 1.0
 
@@ -100,7 +107,7 @@ class Sought(Section):
     start_fit: Annotated[
         Literal["", "emission"], of("1", "emission: the start is given the shape of an emissive volume fitted to the views")
     ] = ""
-    shape: Annotated[tuple[int, int, int] | None, of("voxel", "(Z, Y, X) of a constant start")] = None
+    shape: Annotated[tuple[Count, Count, Count] | None, of("voxel", "(Z, Y, X) of a constant start")] = None
     prior: Annotated[
         tuple[TotalVariation | HuberTotalVariation | Laplacian | Sparse | Bounds, ...], of("1", "what is known before")
     ] = ()
@@ -166,7 +173,7 @@ class Detector(Section, tag_field="beam"):
 
     views: Annotated[int, of("view", "number of views, evenly over the arc", ge=1)] = 90
     arc: Annotated[float, of("degree", "angle covered", gt=0, le=360)] = 180.0
-    detector: Annotated[tuple[int, int], of("pixel", "(rows, columns)")] = (1, 128)
+    detector: Annotated[tuple[Count, Count], of("pixel", "(rows, columns)")] = (1, 128)
     pitch: Annotated[float | tuple[float, float], of("length", "distance of pixel centres: one, or of (rows, columns)")] = 1.0
     detector_offset: Annotated[tuple[float, float], of("length", "shift of the detector's middle along (rows, columns)")] = (
         0.0,
@@ -190,14 +197,14 @@ class Table(Section, kw_only=True, tag_field="beam", tag="table"):
     """A point source and a flat detector on any trajectory; of measured projections, the detector's size is the data's."""
 
     file: Annotated[str, of("path", "text, 12 lengths a view: source, detector's middle, steps to next column and row")]
-    detector: Annotated[tuple[int, int], of("pixel", "(rows, columns) of computed projections")] = (1, 128)
+    detector: Annotated[tuple[Count, Count], of("pixel", "(rows, columns) of computed projections")] = (1, 128)
 
 
 class Matrices(Section, kw_only=True, tag_field="beam", tag="matrices"):
     """A point source and a flat detector on any trajectory, as projection matrices: (column, row, 1) ~ P (x, y, z, 1)."""
 
     file: Annotated[str, of("path", "text, 12 numbers a view: P, 3 x 4, row by row", min_length=1)]
-    detector: Annotated[tuple[int, int], of("pixel", "(rows, columns) of computed projections")] = (1, 128)
+    detector: Annotated[tuple[Count, Count], of("pixel", "(rows, columns) of computed projections")] = (1, 128)
     first_pixel: Annotated[tuple[float, float], of("pixel", "(column, row) that P gives to the middle of the first pixel")] = (
         0.0,
         0.0,
@@ -281,7 +288,7 @@ class Nikon(Readings, kw_only=True, tag_field="source", tag="nikon"):
 class Grid(Section):
     """Where the voxels lie."""
 
-    shape: Annotated[tuple[int, int, int], of("voxel", "(Z, Y, X)")]
+    shape: Annotated[tuple[Count, Count, Count], of("voxel", "(Z, Y, X)")]
     voxel_size: Annotated[float | tuple[float, float, float], of("length", "edges of a voxel: one, or (x, y, z)")] = 1.0
     centre: Annotated[tuple[float, float, float], of("length", "(x, y, z) of the box's middle")] = (0.0, 0.0, 0.0)
 
@@ -543,7 +550,10 @@ def load(path: str | Path, changes: Sequence[str] = ()) -> Experiment | Scan | P
     """
     path = Path(path)
     try:
-        raw = tomllib.loads(path.read_text(encoding="utf-8"))
+        text = path.read_text(encoding="utf-8-sig")
+        if DEEP_KEY.search(text):
+            raise RecursionError
+        raw = tomllib.loads(text)
     except FileNotFoundError:
         raise MivolError(f"found no file {path}: give the path of an experiment in TOML.") from None
     except RecursionError:

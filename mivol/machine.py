@@ -10,7 +10,9 @@ import math
 import os
 from pathlib import Path
 
-__all__ = ["available_memory", "cores"]
+from mivol.errors import MivolError
+
+__all__ = ["available_memory", "check_fits", "cores"]
 
 _CGROUP = Path("/sys/fs/cgroup")
 
@@ -54,6 +56,22 @@ def available_memory() -> int | None:
     second = _left_in_group("memory.max", "memory.current", "memory.stat")
     first = _left_in_group("memory/memory.limit_in_bytes", "memory/memory.usage_in_bytes", "memory/memory.stat")
     return int(min(system, second, first))
+
+
+def check_fits(needed: float, what: str, way_out: str) -> None:
+    """Refuse what takes more memory than is left, before any of it is taken.
+
+    Args:
+        needed: bytes.
+        what: subject of the sentence: what takes them.
+        way_out: what to do instead.
+
+    Raises:
+        MivolError: with what is needed, what is free and the way out.
+    """
+    free = available_memory()
+    if free is not None and needed > free:
+        raise MivolError(f"{what} takes {needed / 2**30:,.1f} GiB and {free / 2**30:,.1f} GiB are free: {way_out}.")
 
 
 def _left_in_group(limit: str, usage: str, stat: str) -> float:

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
 import pytest
 from fit_scene import KEY
 
+from mivol import config
 from mivol.cli import main
+from mivol.errors import MivolError
+from mivol.experiments.explain import explain_fit
 from mivol.files import write_exr, write_volume
 
 SCENE = """<scene version="3.0.0">
@@ -79,6 +83,20 @@ def refused(capsys: pytest.CaptureFixture, *arguments: object) -> str:
     assert len(lines) == 1
     assert "Traceback" not in said
     return lines[0]
+
+
+def assert_explained(path: Path, changes: list[str], said: str) -> None:
+    """``explain`` refuses an experiment with changes by the sentence that ``optimize`` said, free memory apart."""
+    try:
+        found = explain_fit(config.load(path, changes), path.parent).refusal
+    except MivolError as error:
+        found = str(error)
+    assert without_memory(found) == without_memory(said.rpartition("mivol: ")[2].rstrip("\n"))
+
+
+def without_memory(sentence: str) -> str:
+    """A sentence without what changes with the memory that is free."""
+    return re.sub(r"[\d.,]+ (?=GiB|fits|are)", "", sentence)
 
 
 def files_of(folder: Path) -> set[str]:

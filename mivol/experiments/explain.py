@@ -1,9 +1,14 @@
-"""What a fit would do, before it does anything: its data, what it looks for, its plan, and every check that it makes itself."""
+"""What a fit would do, before it does anything: its data, what it looks for, its plan, and every check that it makes itself.
+
+Conventions. A fit is begun as it would be, up to its first step; of a scene the derivative of a few views is taken by a sample
+or two a pixel. What only the disk or the run folder can refuse is left to the fit.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import mitsuba as mi
 import msgspec
@@ -19,26 +24,34 @@ from mivol.experiments.gaussian_start import begin, make_gaussian_plan
 from mivol.experiments.photo_data import boxed, read_photos
 from mivol.experiments.photo_plan import batches_of, choices, make_plan, shrunk
 from mivol.experiments.projections import beam_of, fitted_views, held_out_views, make_data, make_grid
-from mivol.experiments.references import camera_of, find_sensors, load_experiment_scene, read_references
+from mivol.experiments.references import (
+    References,
+    camera_of,
+    find_sensors,
+    load_experiment_scene,
+    read_references,
+)
 from mivol.experiments.scan_fit import make_problem as make_scan_problem
-from mivol.experiments.scan_fit import settle
+from mivol.experiments.scan_fit import make_projector, make_solver, noise_of, settle
 from mivol.experiments.scan_storage import choose_storage
-from mivol.experiments.scene_fit import make_integrator
-from mivol.experiments.start import make_start
+from mivol.experiments.scene_fit import make_integrator, make_problem
+from mivol.experiments.start import make_starts
 from mivol.experiments.task import Task
 from mivol.experiments.truth import check_truth, make_truth, put
+from mivol.optim.emissive_start import check_given_start
+from mivol.optim.gaussian_problem import GaussianProblem
 from mivol.optim.parameters import check_names
+from mivol.optim.radiance_problem import RadianceProblem
+from mivol.optim.scene_problem import SceneProblem
 from mivol.scene.explain import Explanation, examine
 from mivol.tomography.filtered import check_directions
-from mivol.tomography.projector import Projector
-from mivol.tomography.supersampling import subdivide
 
 Say = Callable[[str], None]
 """Takes one line of facts."""
 
 
 def explain_fit(chosen: Experiment | Scan | PhotoFit, base: Path) -> Explanation:
-    """What a fit would do; nothing is rendered, fitted or written.
+    """What a fit would do; nothing is fitted or written.
 
     Args:
         chosen: all settings.
@@ -60,7 +73,7 @@ def explain_scene_fit(chosen: Experiment, base: Path, say: Say) -> Explanation:
     """Views, parameters and scene; the scene holds the truth where one is known, else the start.
 
     Raises:
-        MivolError: whatever :func:`mivol.experiments.scene_fit.scene_fit` refuses before its first render.
+        MivolError: whatever :func:`mivol.experiments.scene_fit.scene_fit` refuses up to its first step.
     """
     loaded = load_experiment_scene(chosen, base)
     scene = loaded.scene
@@ -73,17 +86,17 @@ def explain_scene_fit(chosen: Experiment, base: Path, say: Say) -> Explanation:
     chosen = task.chosen
     for line in depth:
         say(f"  depth     {line.choice}, because {line.reason}")
-    make_integrator(chosen)
     check_names([sought.key for sought in chosen.parameter])
-    starts = [make_start(sought, base, scene) for sought in chosen.parameter]
+    starts = make_starts(chosen, base, scene)
     for start in starts:
         low, high = start.parameter.domain
         shape = " x ".join(map(str, start.value.shape))
         mean = float(np.mean(start.value))
         say(f"  sought    {start.parameter.name}: {shape}, in [{low:g}, {high:g}] {start.parameter.unit}, from {mean:.4g}")
     check_truth(chosen)
-    if isinstance(chosen.reference, Files):
-        read_references(chosen, base, loaded, sensors, held_out)
+    is_known = isinstance(chosen.reference, Files)
+    seen = read_references(chosen, base, loaded, sensors, held_out) if is_known else blank_references(sensors, held_out)
+    rehearse(chosen, make_problem(few_samples(chosen), scene, make_integrator(chosen), starts, seen))
     params = mi.traverse(scene)
     for start in starts:
         put(params, start.parameter.name, start.value)
@@ -91,6 +104,38 @@ def explain_scene_fit(chosen: Experiment, base: Path, say: Say) -> Explanation:
         put(params, chosen.truth.key, truth)
     say(f"  holding   {'the truth' if truth is not None else 'the start'}, in what follows")
     return examine(scene, chosen.fit.max_depth, camera_of(sensors[0]))
+
+
+def blank_references(sensors: Sequence[Any], held_out: frozenset[int]) -> References:
+    """White pictures in the places of those that a fit would render."""
+    seen = References(held_out)
+    for sensor in sensors:
+        width, height = camera_of(sensor).film().crop_size()
+        seen.add(sensor, np.ones((int(height), int(width), 1 if "mono" in mi.variant() else 3)))
+    return seen
+
+
+MOST_SAMPLES = 2
+"""Samples a pixel of the derivative that is taken to see whether there is one; a noisy loss takes pairs."""
+
+
+def few_samples(chosen: Experiment) -> Experiment:
+    """The experiment with fewer samples."""
+    fit = msgspec.structs.replace(chosen.fit, spp=min(chosen.fit.spp, MOST_SAMPLES))
+    return msgspec.structs.replace(chosen, fit=fit)
+
+
+def rehearse(chosen: Experiment, problem: SceneProblem) -> None:
+    """Begin a fit as far as nothing is fitted.
+
+    Raises:
+        MivolError: what the optimiser or a first step refuses, or a start that no emissive one can take the place of.
+    """
+    for sought in chosen.parameter:
+        if sought.start_fit == "emission":
+            check_given_start(sought.key, np.asarray(problem.values()[sought.key]))
+    chosen.optimiser.begin(problem)
+    problem.rehearse()
 
 
 def explain_scan_fit(chosen: Scan, base: Path, say: Say) -> Explanation:
@@ -110,13 +155,14 @@ def explain_scan_fit(chosen: Scan, base: Path, say: Say) -> Explanation:
     kept = fitted_views(held_out_views(chosen, views), views)
     say(f"  held out  {views - len(kept)} views")
     chosen, lines = settle(chosen, data, grid, kept)
-    projector = Projector(data.geometry, subdivide(grid, chosen.solve.supersampling, data.geometry))
+    projector = make_projector(chosen, data, grid)
     if chosen.solve.start == "filtered":
         check_directions(projector)
     # Back-projection alone takes longer than all else here.
     empty = msgspec.structs.replace(chosen.solve, start="empty")
     problem = make_scan_problem(msgspec.structs.replace(chosen, solve=empty), projector, data, kept)
     storage = choose_storage(chosen.solve, problem.linear_problem.A).line
+    make_solver(chosen, noise_of(chosen, problem, data)).begin(problem)
     for line in (*lines, storage):
         say(f"  {line.choice}, because {line.reason}")
     if chosen.solve.tv:
@@ -138,7 +184,10 @@ def explain_photo_fit(chosen: FieldFit, base: Path, say: Say) -> Explanation:
     for note in plan_film(chosen.show, photos).notes:
         say(f"  {note}")
     plan = shrunk(asked, photos)
-    return Explanation(tuple(f"  {one.choice}: {one.reason}" for one in choices(plan, photos, batches_of(plan, photos))))
+    batches = batches_of(plan, photos)
+    lines = tuple(f"  {one.choice}: {one.reason}" for one in choices(plan, photos, batches))
+    plan.optimiser.begin(RadianceProblem(batches, photos.box, plan, chosen.seed))
+    return Explanation(lines)
 
 
 def explain_gaussian_fit(chosen: GaussianFit, base: Path, say: Say) -> Explanation:
@@ -155,6 +204,8 @@ def explain_gaussian_fit(chosen: GaussianFit, base: Path, say: Say) -> Explanati
     for note in plan_film(chosen.show, photos).notes:
         say(f"  {note}")
     begun = begin(chosen, photos, asked)
+    plan = begun.plan
+    plan.optimiser.begin(GaussianProblem(begun.batches, [view.camera for view in begun.views], begun.cloud, plan, chosen.seed))
     return Explanation(tuple(f"  {one.choice}: {one.reason}" for one in begun.lines))
 
 

@@ -17,13 +17,15 @@ from mivol.photos import Photos, PhotoSurvey, load_photos, silhouette_box, surve
 from mivol.photos.dataset import check_alpha
 from mivol.photos.picture import space_of
 from mivol.photos.region import near_far_of
+from mivol.validate.images import check_metrics
 
 
 def read_photos(chosen: PhotoFit, base: Path) -> tuple[Photos, Photos | None]:
     """Photographs to fit, and those to judge by.
 
     Raises:
-        MivolError: as :func:`mivol.photos.load_photos`, or neither a box nor one of the words for it.
+        MivolError: as :func:`mivol.photos.load_photos`, metrics that do not judge them, or neither a box nor one of the words
+            for it.
     """
     wanted = chosen.photos
     if isinstance(wanted.box, str) and wanted.box not in BOXES:
@@ -41,13 +43,18 @@ def read_photos(chosen: PhotoFit, base: Path) -> tuple[Photos, Photos | None]:
             raise MivolError('photos.space = "linear" was asked for; Gaussians are fitted to code values: "srgb" is expected.')
         settings["space"] = "srgb"
     path = base / wanted.path
+    surveyed = {"held_out": wanted.held_out, "box": settings["box"]}
+    fitted = survey_photos(path, split="train", **surveyed)
+    is_judged = wanted.judged != "held_out" or wanted.held_out > 0
+    others = survey_photos(path, split=wanted.judged, **surveyed).frames if is_judged else ()
+    # Before any is read: a background that is asked for would be the first of two answers.
+    check_alpha([*fitted.frames, *others])
     photos = _over(load_photos(path, split="train", **settings), wanted.behind)
     white = white_of(photos) if photos.space == "linear" else 1.0
-    if wanted.judged == "held_out" and not wanted.held_out:
+    if not is_judged:
         return exposed(photos, white), None
-    others = survey_photos(path, split=wanted.judged, held_out=wanted.held_out, box=settings["box"])
-    check_alpha([*photos.survey.frames, *others.frames])
     judged = load_photos(path, split=wanted.judged, **settings | {"space": photos.space})
+    check_metrics(chosen.show.metrics, *np.min([view.camera.size for view in judged.views], axis=0))
     return exposed(photos, white), exposed(_over(judged, wanted.behind), white)
 
 

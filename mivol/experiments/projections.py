@@ -14,6 +14,7 @@ from mivol.errors import MivolError
 from mivol.experiments.nikon_scan import nikon_grid
 from mivol.experiments.readings import ScanReadings, note_order, read_scan
 from mivol.experiments.row_order import note_rows
+from mivol.experiments.scan_memory import check_grid, check_rays
 from mivol.experiments.solver_choice import solver_of
 from mivol.files import read_columns, read_volume
 from mivol.files.fetch import place_of
@@ -114,12 +115,14 @@ def make_data(chosen: config.Scan, base: Path, grid: VoxelGrid) -> Projections:
     """Projections, measured or computed.
 
     Raises:
-        MivolError: files that cannot be read or do not fit, or rays that all miss the grid.
+        MivolError: files that cannot be read or do not fit, rays that all miss the grid, or more of them than memory.
     """
     is_measured = isinstance(chosen.data, Measured | Stack | Nikon)
+    check_grid(chosen, grid)
     if is_measured:
         data = read_measured(chosen, base)
     else:
+        check_rays(chosen)
         geometry = make_geometry(chosen, base)
         exact, truth = SIMULATED[type(chosen.data)](chosen.data, base, geometry, grid)
         data = add_noise(geometry, exact, truth, chosen.data.photons, chosen.data.seed)

@@ -19,8 +19,12 @@ from mivol.files import layers, read_exr
 from mivol.files.fetch import PREFIX, place_of
 from mivol.optim.render_batches import View, check_sizes
 from mivol.scene.load import LoadedScene, load_scene
+from mivol.scene.sensors import check_film
 from mivol.validate.reference import render_reference
 from mivol.validate.reference_file import ReferenceResult, read_reference
+
+SEEN = 2 * 3 * 4
+"""Bytes a pixel of a view that a fit keeps: what was seen, in three channels, and its standard error or its batch."""
 
 
 @dataclass
@@ -78,13 +82,14 @@ def find_sensors(chosen: Experiment, scene: mi.Scene) -> tuple[list[Any], frozen
     """All views in their order, and the numbers of those that are held out.
 
     Raises:
-        MivolError: no views, views of several sizes, or held-out views that are not there.
+        MivolError: no views, views of several sizes or more of them than fit into memory, or held-out views that are not there.
     """
     sensors = list(chosen.views.sensors(scene))
     more = list(chosen.held_out.sensors(scene)) if chosen.held_out is not None else []
     check_held_out(chosen.reference.held_out, len(sensors))
     held_out = (*chosen.reference.held_out, *range(len(sensors), len(sensors) + len(more)))
     sensors += more
+    check_film(camera_of(sensors[0]), SEEN * len(sensors))
     check_sizes({f"view {index}": camera_of(sensor) for index, sensor in enumerate(sensors)})
     return sensors, frozenset(held_out)
 
@@ -161,5 +166,18 @@ def read_references(
             made = read_reference(base / name, of)
             seen.add(sensor, made.mean, standard_error(made))
         else:
-            seen.add(sensor, layers(channels)[""][..., :3])
+            seen.add(sensor, colours_of(base / name, layers(channels)))
     return seen
+
+
+def colours_of(path: Path, found: dict[str, np.ndarray]) -> np.ndarray:
+    """What the variant renders, of a picture from a file: colours (height, width, 3), or luminance (height, width, 1).
+
+    Raises:
+        MivolError: it has channels of other names.
+    """
+    name, wanted = ("Y", "Y (luminance)") if "mono" in mi.variant() else ("", "R, G and B")
+    if name not in found:
+        there = ", ".join(one or "R, G, B" for one in sorted(found))
+        raise MivolError(f"{path}: found the channels {there}, expected {wanted}; write the picture with these.")
+    return found[name][..., None] if found[name].ndim == 2 else found[name][..., :3]

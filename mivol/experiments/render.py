@@ -18,9 +18,12 @@ from mivol.files.atomic import check_destination
 from mivol.optim.seeds import seed_of
 from mivol.scene.explain import settings_of
 from mivol.scene.parsing import reason_of
-from mivol.scene.sensors import find_sensor
+from mivol.scene.sensors import check_film, find_sensor
 
 SAMPLES_PER_PASS = 1 << 21
+KEPT = 2 * 4 * 8
+"""Bytes a pixel that are kept beside a pass: the sum of four channels in float64, and the pass as it is added."""
+
 COLOURS = {1: ("Y",), 2: ("Y", "A"), 3: ("R", "G", "B"), 4: ("R", "G", "B", "A")}
 
 def check_output(path: Path) -> None:
@@ -70,12 +73,13 @@ def render_image(
         seed: of the random numbers.
 
     Raises:
-        MivolError: no such sensor, no integrator, or no samples.
+        MivolError: no such sensor, no integrator, no samples, or a film that is larger than the memory.
     """
     integrator, camera = integrator or choose_integrator(scene), find_sensor(scene, sensor)
     spp = camera.sampler().sample_count() if spp is None else spp
     if spp < 1:
         raise MivolError(f"{spp} samples a pixel make no image: give --spp 1 or more.")
+    check_film(camera, KEPT)
     most = max(SAMPLES_PER_PASS // math.prod(int(n) for n in camera.film().crop_size()), 1)
     n = math.ceil(spp / most)
     total = 0.0

@@ -18,6 +18,7 @@ from mivol.experiments.back_end import choose_back_end
 from mivol.experiments.best import BestIterate
 from mivol.experiments.projections import Projections, beam_of, fitted_views, held_out_views, make_data, make_grid
 from mivol.experiments.run_folder import RunFolder
+from mivol.experiments.scan_memory import check_grid
 from mivol.experiments.scan_outputs import write_best, write_outputs
 from mivol.experiments.scan_prior import check_noise, make_prior, plan_of_prior, settle_noise
 from mivol.experiments.scan_storage import choose_storage
@@ -75,7 +76,7 @@ def scan_fit(task: Task) -> Path:
         chosen, lines = settle(chosen, data, grid, kept)
         task = replace(task, chosen=chosen)
         run.record.plan += lines
-        projector = Projector(data.geometry, subdivide(grid, chosen.solve.supersampling, data.geometry))
+        projector = make_projector(chosen, data, grid)
         with run.stage("solve"):
             problem = make_problem(chosen, projector, data, kept)
             best = BestIterate(run)
@@ -119,6 +120,17 @@ def settle(chosen: config.Scan, data: Projections, grid: VoxelGrid, kept: np.nda
     """All settings with what was left open to the solver's table, and why."""
     solve, lines = settle_solver(chosen.solve, Projector(data.geometry, grid, kept))
     return msgspec.structs.replace(chosen, solve=solve), lines
+
+
+def make_projector(chosen: config.Scan, data: Projections, grid: VoxelGrid) -> Projector:
+    """All rays, and the unknowns that they cross.
+
+    Raises:
+        MivolError: more unknowns than the solver can keep in memory.
+    """
+    unknowns = subdivide(grid, chosen.solve.supersampling, data.geometry)
+    check_grid(chosen, unknowns)
+    return Projector(data.geometry, unknowns)
 
 
 def make_problem(chosen: config.Scan, projector: Projector, data: Projections, kept: np.ndarray) -> Inversion:
@@ -175,14 +187,8 @@ def solve(task: Task, run: RunFolder, problem: Inversion, data: Projections, gri
     chosen: config.Scan = task.chosen
     course = Course(chosen.solve.iterations, events=(Checkpoint(every=chosen.checkpoint_every),))
     store = Store(run.checkpoint, {"data": data.digest(), **config.flat(run.record.config)}, task.resume)
-    wanted = chosen.solve
-    shared = {name: getattr(wanted, name) for name in ("subsets", "relaxation", "decay", "window", "cutoff")}
-    noise = noise_norm(problem.linear_problem, wanted.name) if data.is_noise_known else None
-    if wanted.discrepancy:
-        check_noise("solve.discrepancy", data)
-        shared["stop_norm"] = wanted.discrepancy * noise
-    settings = Solve(solver=wanted.name, drift=getattr(chosen.data, "drift", 0), **shared)
-    fit = begin_fit(problem, settings, course, store=store)
+    noise = noise_of(chosen, problem, data)
+    fit = begin_fit(problem, make_solver(chosen, noise), course, store=store)
     best.restore()
     run.begin(fit.next)
     with task.watcher.watch(course.iterations) as watch:
@@ -204,6 +210,26 @@ def solve(task: Task, run: RunFolder, problem: Inversion, data: Projections, gri
     if fit.run.finished and fit.next < course.iterations:
         run.record.notes.append(f"stopped after iteration {fit.next} of {course.iterations}: {fit.run.finished}")
     return fit.run.state
+
+
+def noise_of(chosen: config.Scan, problem: Inversion, data: Projections) -> float | None:
+    """The norm of the residual that noise alone would leave; None where the noise is not known.
+
+    Raises:
+        MivolError: it is not known, and the solver is to stop by it.
+    """
+    if chosen.solve.discrepancy:
+        check_noise("solve.discrepancy", data)
+    return noise_norm(problem.linear_problem, chosen.solve.name) if data.is_noise_known else None
+
+
+def make_solver(chosen: config.Scan, noise: float | None) -> Solve:
+    """The solver with its settings, which stops by the noise where that is asked for."""
+    wanted = chosen.solve
+    shared = {name: getattr(wanted, name) for name in ("subsets", "relaxation", "decay", "window", "cutoff")}
+    if wanted.discrepancy:
+        shared["stop_norm"] = wanted.discrepancy * noise
+    return Solve(solver=wanted.name, drift=getattr(chosen.data, "drift", 0), **shared)
 
 
 def norm_of(task: LeastSquares | PoissonCounts) -> float:

@@ -17,7 +17,7 @@ from mivol.experiments.depth import settle_depth
 from mivol.experiments.references import References, find_references, load_experiment_scene
 from mivol.experiments.run_folder import RunFolder
 from mivol.experiments.scene_outputs import SceneOutputs
-from mivol.experiments.start import Start, make_start, place_of
+from mivol.experiments.start import Start, make_starts, place_of
 from mivol.experiments.task import Task
 from mivol.experiments.truth import check_truth, make_truth, put
 from mivol.optim.checkpoint import Store
@@ -66,7 +66,7 @@ def scene_fit(task: Task) -> Path:
             chosen = task.chosen
             integrator = make_integrator(chosen)
             check_names([sought.key for sought in chosen.parameter])
-            starts = [make_start(sought, task.base, loaded.scene) for sought in chosen.parameter]
+            starts = make_starts(chosen, task.base, loaded.scene)
             check_truth(chosen)
         with run.stage("references"):
             seen = find_references(task, loaded, truth)

@@ -1,7 +1,11 @@
-"""Where a fit of a scene begins: the first value of each parameter, and the place of its grid."""
+"""Where a fit of a scene begins: the first value of each parameter, and the place of its grid.
+
+Conventions. Memory is counted before any of it is taken: of the first grids, and of those that events refine them to.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,12 +14,17 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from mivol.config import Sought
+from mivol.config import Experiment, Sought
 from mivol.errors import MivolError
 from mivol.files import read_volume
 from mivol.files.fetch import place_of as place_in
+from mivol.machine import check_fits
+from mivol.optim.events import Upsample, check_for_grids
 from mivol.optim.parameters import GRID, Parameter, as_tensor, find
 from mivol.transport.media.read_medium import place_of_grid
+
+NUMBER_BYTES = 6 * 4
+"""Of each number that is looked for: value, the scene's copy, real, derivative and two moments of the optimiser."""
 
 
 @dataclass(frozen=True)
@@ -26,11 +35,45 @@ class Start:
     value: np.ndarray
 
 
+def make_starts(chosen: Experiment, base: Path, scene: mi.Scene) -> list[Start]:
+    """All parameters of a fit and where they start; the scene is not changed.
+
+    Raises:
+        MivolError: as :func:`make_start`, grids that will be refined beyond the memory, or none that could be refined.
+    """
+    starts = [make_start(sought, base, scene) for sought in chosen.parameter]
+    grids = [start for start in starts if start.value.ndim == GRID]
+    if any(isinstance(event, Upsample) for event in chosen.event):
+        check_for_grids(len(grids))
+    for start in grids:
+        check_grid(start.parameter.name, refined(start.value.shape, chosen), "let upsample refine less, or start coarser")
+    return starts
+
+
+def refined(shape: Sequence[int], chosen: Experiment) -> tuple[int, ...]:
+    """The shape of a grid after all events of a fit."""
+    factor, last = 1, chosen.fit.iterations
+    for event in chosen.event:
+        if isinstance(event, Upsample):
+            factor *= event.factor ** sum(0 <= iteration < last for iteration in set(event.at))
+    return (*(n * factor for n in shape[:3]), *shape[3:])
+
+
+def check_grid(key: str, shape: Sequence[int], way_out: str) -> None:
+    """Refuse a grid with which a fit would not fit into memory.
+
+    Raises:
+        MivolError: with its shape and what it takes.
+    """
+    said = " x ".join(str(n) for n in shape)
+    check_fits(NUMBER_BYTES * math.prod(shape), f"{key} of {said} numbers, with its derivative and the optimiser,", way_out)
+
+
 def make_start(sought: Sought, base: Path, scene: mi.Scene) -> Start:
     """A parameter and where it starts; the scene is not changed.
 
     Raises:
-        MivolError: no such parameter, a start outside its domain, a file that cannot be read.
+        MivolError: no such parameter, a start outside its domain, a file that cannot be read, or a grid beyond the memory.
     """
     params = mi.traverse(scene)
     now = as_tensor(params[find(sought.key, params)])
@@ -44,6 +87,7 @@ def make_start(sought: Sought, base: Path, scene: mi.Scene) -> Start:
         value = read_volume(place_in(base, sought.start_file)).values
     elif sought.start is not None:
         shape = (*sought.shape, now.shape[3]) if sought.shape else now.shape
+        check_grid(sought.key, shape, "give parameter.shape fewer voxels")
         value = np.full(shape, start_of(sought, shape), dtype=np.float32)
     extent = edges_of(place_of(sought.key, scene))[::-1] if value.ndim >= GRID else (1.0, 1.0, 1.0)
     parameter = Parameter(sought.key, sought.unit, sought.domain, sought.map, sought.lr, extent, sought.prior)

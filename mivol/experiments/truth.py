@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -14,14 +15,18 @@ from mivol.errors import MivolError
 from mivol.fields.procedural import make_procedural
 from mivol.files import read_volume
 from mivol.files.fetch import place_of
+from mivol.machine import check_fits
 from mivol.optim.parameters import find, like
+
+VOXEL_BYTES = 9 * 8
+"""Of a procedural volume while it is made: its places twice, and three numbers that are made of them, in float64."""
 
 
 def make_truth(chosen: Experiment, base: Path, scene: mi.Scene) -> np.ndarray | None:
     """The true volume (Z, Y, X, C), where the experiment knows one.
 
     Raises:
-        MivolError: its key is not in the scene, or its file cannot be read.
+        MivolError: its key is not in the scene, its file cannot be read, or it does not fit into memory.
     """
     if chosen.truth is None:
         return None
@@ -29,6 +34,8 @@ def make_truth(chosen: Experiment, base: Path, scene: mi.Scene) -> np.ndarray | 
     if chosen.truth.file:
         return read_volume(place_of(base, chosen.truth.file)).values
     wanted = chosen.truth
+    said = " x ".join(str(n) for n in wanted.shape)
+    check_fits(VOXEL_BYTES * math.prod(wanted.shape), f"a truth of {said} voxels", "give truth.shape fewer voxels")
     return make_procedural(wanted.procedural, wanted.shape, wanted.seed, wanted.peak)
 
 

@@ -35,13 +35,8 @@ def ordered_subsets_sart(
     Weights: only where they are 0 is heeded (the ray is left out). A prior is refused.
     Cost per iteration: one A and one A^T, and once one A and one A^T more for the sums; memory: ``n_subsets`` fields.
     """
+    check_sweeps(problem, n_subsets, relaxation, decay)
     a = problem.A
-    if problem.prior is not None:
-        raise MivolError(
-            "Found a prior with SIRT or OS-SART, expected none: use pcg or ml-tr, which minimise a penalised objective."
-        )
-    if not 0 < relaxation < 2 or not 0 < decay <= 1:
-        raise MivolError(f"Found relaxation {relaxation} and decay {decay}, expected 0 < relaxation < 2 and 0 < decay <= 1.")
     blocks = _blocks(problem, n_subsets)
     if state is None:
         state = State(first_field(a, problem.x0), 0, np.nan, np.nan)
@@ -56,6 +51,26 @@ def ordered_subsets_sart(
                 x = np.maximum(x, 0)
         state = State(x, state.iteration + 1, norm2 / 2, float(np.sqrt(norm2)))
         yield state
+
+
+def check_sweeps(problem: LeastSquares, n_subsets: int = 1, relaxation: float = 1.0, decay: float = 1.0) -> None:
+    """Refuse what :func:`ordered_subsets_sart` cannot do; arguments as there.
+
+    Raises:
+        MivolError: a prior, steps outside their domain, or subsets that the views cannot be shared out to.
+    """
+    if problem.prior is not None:
+        raise MivolError(
+            "Found a prior with SIRT or OS-SART, expected none: use pcg or ml-tr, which minimise a penalised objective."
+        )
+    if not 0 < relaxation < 2 or not 0 < decay <= 1:
+        raise MivolError(f"Found relaxation {relaxation} and decay {decay}, expected 0 < relaxation < 2 and 0 < decay <= 1.")
+    n_views = getattr(problem.A, "n_views", None)
+    if n_subsets != 1 and (n_views is None or not 1 <= n_subsets <= n_views):
+        raise MivolError(
+            f"Found {n_subsets} subsets of {n_views or 'no'} views, expected at least 1, at most as many as views, "
+            "and an operator with n_views and subset(views)."
+        )
 
 
 def sirt(problem: LeastSquares, state: State | None = None, relaxation: float = 1.0) -> Iterator[State]:
@@ -80,16 +95,7 @@ class _Block:
 def _blocks(problem: LeastSquares, n_subsets: int) -> list[_Block]:
     a = problem.A
     chord = a @ np.ones(a.shape[1], a.dtype)
-    if n_subsets == 1:
-        views = [None]
-    else:
-        n_views = getattr(a, "n_views", None)
-        if n_views is None or not 1 <= n_subsets <= n_views:
-            raise MivolError(
-                f"Found {n_subsets} subsets of {n_views or 'no'} views, expected at least 1, at most as many as views, "
-                "and an operator with n_views and subset(views)."
-            )
-        views = [np.arange(s, n_views, n_subsets) for s in _golden_order(n_subsets)]
+    views = [None] if n_subsets == 1 else [np.arange(s, a.n_views, n_subsets) for s in _golden_order(n_subsets)]
     return [_block(problem, v, chord) for v in views]
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from mivol.errors import MivolError
 from mivol.optim.linear_problems import LeastSquares, dot, flat, times, weights_of
 from mivol.optim.solver import State
-from mivol.tomography.filtered import feldkamp, filtered_backprojection
+from mivol.tomography.filtered import check_circle, check_parallel, feldkamp, filtered_backprojection
 from mivol.tomography.preprocess import bridge_gaps
 from mivol.tomography.projector import Projector
 
@@ -29,10 +29,39 @@ def fdk(problem: LeastSquares, state: State | None = None, window: str = "ram-la
     return _once(feldkamp, problem, state, window, cutoff)
 
 
-def _once(method: Method, problem: LeastSquares, state: State | None, window: str, cutoff: float) -> Iterator[State]:
-    a = problem.A
+def check_fbp(problem: LeastSquares, **options: object) -> None:
+    """Refuse what :func:`fbp` cannot do.
+
+    Raises:
+        MivolError: a prior, another beam, or directions that are missing.
+    """
+    check_prior(problem)
+    check_parallel(problem.A)
+
+
+def check_fdk(problem: LeastSquares, **options: object) -> None:
+    """Refuse what :func:`fdk` cannot do.
+
+    Raises:
+        MivolError: a prior, another trajectory than a circle, or directions that are missing.
+    """
+    check_prior(problem)
+    check_circle(problem.A)
+
+
+def check_prior(problem: LeastSquares) -> None:
+    """Refuse a prior, which a method of one step has no use for.
+
+    Raises:
+        MivolError: there is one.
+    """
     if problem.prior is not None:
         raise MivolError("found a prior with filtered back-projection, expected none: use pcg, or a window and a cutoff.")
+
+
+def _once(method: Method, problem: LeastSquares, state: State | None, window: str, cutoff: float) -> Iterator[State]:
+    a = problem.A
+    check_prior(problem)
     if state is not None:
         return
     y = np.asarray(problem.b, float).reshape(a.projection_shape)

@@ -105,10 +105,7 @@ def find_emissive_start(
     """
     own = problem.start()
     value = np.array(problem.values()[name])
-    if value.ndim != 4:
-        raise MivolError(f"{name} has the shape {value.shape}, an emissive start has that of a grid (Z, Y, X, C): give start.")
-    if not value.mean() > 0:
-        raise MivolError(f"{name} starts from a mean of {value.mean():.4g}, an emissive start scales one above 0: give start.")
+    check_given_start(name, value)
     density = density_of(fit_emission(problem.views, place, seed), place, value.shape[:3])
     if not density.max() > 0:
         raise MivolError(f"the views show nothing in the box of {name}: look at the cameras, or give start instead.")
@@ -118,6 +115,18 @@ def find_emissive_start(
     problem.set(own)
     best = FACTORS[int(np.argmin(losses))]
     return EmissiveStart(best * shape, best, tuple(losses))
+
+
+def check_given_start(name: str, value: np.ndarray) -> None:
+    """Refuse a start that no emissive one can take the place of.
+
+    Raises:
+        MivolError: a parameter that is no grid, or a start that is 0.
+    """
+    if value.ndim != 4:
+        raise MivolError(f"{name} has the shape {value.shape}, an emissive start has that of a grid (Z, Y, X, C): give start.")
+    if not value.mean() > 0:
+        raise MivolError(f"{name} starts from a mean of {value.mean():.4g}, an emissive start scales one above 0: give start.")
 
 
 def fit_emission(views: Sequence[View], place: np.ndarray, seed: int = 0) -> SphericalGrid:

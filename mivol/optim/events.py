@@ -72,6 +72,16 @@ class Event(Strategy, tag="event"):
         raise NotImplementedError
 
 
+def check_for_grids(count: int) -> None:
+    """Refuse to refine parameters of which none is a grid.
+
+    Raises:
+        MivolError: there are none.
+    """
+    if count == 0:
+        raise MivolError("upsample found no grid among the parameters: take the event out.")
+
+
 class Upsample(Event, tag="upsample"):
     """Refine every grid: coarse first, since large structures converge there in few cheap steps."""
 
@@ -83,8 +93,7 @@ class Upsample(Event, tag="upsample"):
 
     def apply(self, fit: FitAtWork) -> str:
         shapes = [self._refine(fit, p) for p in fit.problem.parameters if fit.run.reals[p.name].ndim == 4]
-        if not shapes:
-            raise MivolError("upsample found no grid among the parameters: take the event out.")
+        check_for_grids(len(shapes))
         return "refined to " + ", ".join(" x ".join(str(n) for n in shape) for shape in shapes)
 
     def _refine(self, fit: FitAtWork, parameter: object) -> tuple[int, int, int]:

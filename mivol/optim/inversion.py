@@ -104,6 +104,7 @@ class SolverRun(Run):
     def _go_on(self, state: State | None) -> None:
         method = METHODS[self.settings.solver]
         problem, options = self.problem.linear_problem, self.settings.options()
+        method.check(problem, **options)
         if self.problem.times is not None and self.settings.drift:
             self._states = with_drift(method.run, problem, self.problem.times, self.settings.drift, state, **options)
         else:

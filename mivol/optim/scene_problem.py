@@ -13,7 +13,8 @@ changed until it returns, but ``newest_loss``.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 
 import drjit as dr
@@ -97,10 +98,7 @@ class SceneProblem:
         for p in self.parameters:
             gradient = dr.detach(dr.grad(self.params[p.name]))
             if _is_untouched(gradient):
-                raise MivolError(
-                    f"no derivative leads from the images to {p.name}, which would stay as it is: take it out of the fit, or "
-                    "let the images depend on it (for scattered light set fit.max_depth to 2 or more)."
-                )
+                raise no_derivative(p.name)
             found[p.name] = as_tensor(gradient)
         return found
 
@@ -151,9 +149,10 @@ class SceneProblem:
     def vjp(self, sensor: mi.Sensor, adjoint: mi.TensorXf, seed: int) -> None:
         """Add J^T adjoint of a sensor's image to the gradients of the scene's parameters."""
         for number, spp in enumerate(self.passes(sensor, self.spp)):
-            self.integrator.render_backward(
-                self.scene, self.params, adjoint * (spp / self.spp), sensor, seed_of(seed, number), spp
-            )
+            with derivatives_of(", ".join(p.name for p in self.parameters)):
+                self.integrator.render_backward(
+                    self.scene, self.params, adjoint * (spp / self.spp), sensor, seed_of(seed, number), spp
+                )
             self._finish(self.gradients())
 
     def jvp(self, sensor: mi.Sensor, tangents: Reals, seed: int) -> mi.TensorXf:
@@ -197,6 +196,18 @@ class SceneProblem:
             self.vjp(batch.sensor, compared[-1].adjoint, self.seed_for(iteration, index, ADJOINT))
         energy, gradients = self.through_priors_and_maps(reals, self.gradients())
         return self.remember(compared) + energy, gradients
+
+    def rehearse(self) -> None:
+        """Take the derivative of the first batch, for what a first step would refuse; the scene holds its start afterwards.
+
+        Raises:
+            MivolError: what the integrator or the loss refuses, or images that do not depend on a parameter.
+        """
+        start, batch = self.start(), self.batches[0]
+        self.set(start)
+        compared = self.compare(batch, self.seed_for(0, 0, PRIMAL), len(self.views))
+        self.vjp(batch.sensor, compared.adjoint, self.seed_for(0, 0, ADJOINT))
+        self.set(start)
 
     def rates(self, iteration: int) -> dict[str, float]:
         """Each parameter's own learning rate, the same in all iterations."""
@@ -265,6 +276,29 @@ class SceneProblem:
             by_reals[p.name] = dr.grad(u)
         dr.eval(by_reals)
         return total, by_reals
+
+
+def no_derivative(names: str) -> MivolError:
+    """The refusal of parameters that no image depends on."""
+    return MivolError(
+        f"no derivative leads from the images to {names}, which would stay as it is: take it out of the fit, or let the images "
+        "depend on it (for scattered light set fit.max_depth to 2 or more, for media choose an integrator that sees them)."
+    )
+
+
+@contextmanager
+def derivatives_of(names: str) -> Iterator[None]:
+    """Say in a sentence that an image depends on no parameter at all, which Dr.Jit answers by an error of its own.
+
+    Raises:
+        MivolError: it depends on none.
+    """
+    try:
+        yield
+    except RuntimeError as error:
+        if "does not depend on the input variable" not in str(error):
+            raise
+        raise no_derivative(names) from None
 
 
 def views_of(iteration: int, n_views: int, per_iteration: int, seed: int) -> list[int]:

@@ -45,12 +45,20 @@ class State:
         return cls(arrays["x"], *scalars, memory)
 
 
+def takes_all(problem: object, **options: object) -> None:
+    """The check of a method that has nothing to refuse."""
+
+
 @dataclass(frozen=True)
 class Solver:
-    """A method: ``run(problem, state=None, **options)`` yields states."""
+    """A method: ``run(problem, state=None, **options)`` yields states.
+
+    ``check(problem, **options)`` raises what ``run`` would raise in its first iteration, and computes nothing.
+    """
 
     run: Callable[..., Iterator[State]]
     problem: type
     needs: str
     promises: str
     citation: str
+    check: Callable[..., None] = takes_all

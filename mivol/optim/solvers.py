@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from mivol.optim.algebraic import ordered_subsets_sart, sart, sirt
-from mivol.optim.direct import fbp, fdk
+from mivol.optim.algebraic import check_sweeps, ordered_subsets_sart, sart, sirt
+from mivol.optim.direct import check_fbp, check_fdk, fbp, fdk
 from mivol.optim.linear_problems import LeastSquares, PoissonCounts
 from mivol.optim.projected_cg import cgls, projected_cg
 from mivol.optim.solver import Solver
@@ -31,6 +31,7 @@ SOLVERS: dict[str, Solver] = {
         needs="A with entries >= 0 and its transpose",
         promises="converges to a least-squares solution weighted by 1 / (ray length)",
         citation="Gregor & Benson 2008",
+        check=check_sweeps,
     ),
     "sart": Solver(
         sart,
@@ -38,6 +39,7 @@ SOLVERS: dict[str, Solver] = {
         needs="A with entries >= 0, its transpose, n_views and subset(views)",
         promises="the fastest first sweeps; a limit cycle on inconsistent data, which relaxation and decay shrink",
         citation="Andersen & Kak 1984",
+        check=check_sweeps,
     ),
     "os-sart": Solver(
         ordered_subsets_sart,
@@ -45,6 +47,7 @@ SOLVERS: dict[str, Solver] = {
         needs="A with entries >= 0, its transpose, n_views and subset(views)",
         promises="n_subsets times SIRT's progress at first; a limit cycle on inconsistent data, which decay shrinks",
         citation="Andersen & Kak 1984; Wang & Jiang 2004",
+        check=check_sweeps,
     ),
     "ml-tr": Solver(
         transmission_likelihood,
@@ -63,6 +66,7 @@ DIRECT: dict[str, Solver] = {
         needs="a parallel beam over half a turn or more",
         promises="exact for many views without noise; linear, so that values below 0 stay",
         citation="Kak & Slaney 1988, section 3.3",
+        check=check_fbp,
     ),
     "fdk": Solver(
         fdk,
@@ -70,6 +74,7 @@ DIRECT: dict[str, Solver] = {
         needs="a cone beam on a circle, over half a turn and the fan or more",
         promises="exact in the source's plane for many views without noise; linear, so that values below 0 stay",
         citation="Feldkamp, Davis & Kress 1984; Parker 1982; Wang 2002",
+        check=check_fdk,
     ),
 }
 

@@ -24,7 +24,7 @@ from mivol.scene.facts import MediumFacts, Needs
 from mivol.scene.needs import find_needs
 from mivol.scene.nesting import bounds
 from mivol.scene.plan import Plan, make_plan
-from mivol.scene.sensors import find_sensor
+from mivol.scene.sensors import check_film, find_sensor
 from mivol.scene.survey import survey_scene
 from mivol.transport.estimators.emitters import SceneEmitters
 from mivol.transport.estimators.transmittance_grid import build_transmittance_grid, measure_transmittance_bias
@@ -106,6 +106,7 @@ def examine(
         return Explanation(("facts", *_plain_facts(loaded), *_warnings(loaded)), str(error))
     facts = ("facts", *_facts(needs), *_warnings(loaded))
     try:
+        check_film(eye)
         make_plan(needs, settings)
         needs = measure_draws(loaded, eye, needs, survey, settings)
         return Explanation((*facts, *_plan(loaded, eye, needs, settings, noise)))

@@ -19,7 +19,7 @@ from mivol.scene.needs import find_needs
 from mivol.scene.plan import Plan, make_plan
 from mivol.scene.recording import without_collections
 from mivol.scene.refusals import check_aovs
-from mivol.scene.sensors import find_sensor
+from mivol.scene.sensors import check_film, find_sensor
 from mivol.scene.survey import SceneSurvey, survey_scene
 from mivol.transport.line_integrals.aovs import integrate_aovs, jvp_aovs, vjp_aovs
 from mivol.transport.path.estimators import Estimators
@@ -74,11 +74,11 @@ class Session:
         """Render an image (height, width, colours + AOVs).
 
         Raises:
-            MivolError: what the plan refuses, or ``develop`` false.
+            MivolError: what the plan refuses, a film that is larger than the memory, or ``develop`` false.
         """
         if not develop:
             raise MivolError("develop=False was asked for; mivol returns the developed image: leave it at True.")
-        sensor = find_sensor(scene, sensor)
+        sensor = _sensor_with_room(scene, sensor)
         with without_collections(), dr.suspend_grad():
             estimators, plan = self._open(scene, sensor, spp, pictures=True)
             samples = RenderSamples(sensor, seed, spp, plan.pass_rays, estimators.segment.directions)
@@ -89,7 +89,7 @@ class Session:
 
     def render_forward(self, scene: mi.Scene, sensor: int | mi.Sensor, seed: int, spp: int) -> mi.TensorXf:
         """Render the derivative of an image along the gradients that were set on the parameters."""
-        sensor = find_sensor(scene, sensor)
+        sensor = _sensor_with_room(scene, sensor)
         with without_collections(), dr.suspend_grad(), carry_tangents(scene):
             with dr.resume_grad():
                 estimators, plan = self._open(scene, sensor, spp)
@@ -102,7 +102,7 @@ class Session:
 
         Cost: a render and its replay; memory independent of the samples, beyond those of a pass.
         """
-        sensor = find_sensor(scene, sensor)
+        sensor = _sensor_with_room(scene, sensor)
         with without_collections(), dr.suspend_grad():
             with dr.resume_grad():
                 recompute_derived(scene)
@@ -168,6 +168,13 @@ class Session:
             dr.eval(L)
         walk_path(estimators, self.settings, again, rays.ray, Replay(L, dL), strata=rays.strata)
         vjp_aovs(estimators.media, rays.ray, self.aovs, daovs)
+
+
+def _sensor_with_room(scene: mi.Scene, sensor: int | mi.Sensor) -> mi.Sensor:
+    """The sensor that is rendered, whose pictures fit into memory."""
+    found = find_sensor(scene, sensor)
+    check_film(found)
+    return found
 
 
 def _black(ray: mi.Ray3f) -> mi.Spectrum:

@@ -16,7 +16,7 @@ from mivol.tomography.ramp import filter_ramp
 from mivol.tomography.redundancy import angle_steps, covers, full_turn_shares, half_scan_shares, widest_gap
 from mivol.tomography.voxel_driven import pixel_matrices, smear
 
-__all__ = ["check_directions", "feldkamp", "filtered_backprojection"]
+__all__ = ["check_circle", "check_directions", "check_parallel", "feldkamp", "filtered_backprojection"]
 
 
 def filtered_backprojection(projector: Projector, y: np.ndarray, window: str = "ram-lak", cutoff: float = 1.0) -> np.ndarray:
@@ -98,7 +98,25 @@ def check_directions(projector: Projector) -> None:
     Raises:
         MivolError: what :func:`filtered_backprojection` of a parallel beam, or :func:`feldkamp` of any other, would raise.
     """
-    (_parallel_weights if isinstance(projector.geometry, ParallelBeam) else _circle_weights)(projector)
+    (check_parallel if isinstance(projector.geometry, ParallelBeam) else check_circle)(projector)
+
+
+def check_parallel(projector: Projector) -> None:
+    """Refuse scans that :func:`filtered_backprojection` does not invert.
+
+    Raises:
+        MivolError: another beam, or directions that are missing.
+    """
+    _parallel_weights(projector)
+
+
+def check_circle(projector: Projector) -> None:
+    """Refuse scans that :func:`feldkamp` does not invert.
+
+    Raises:
+        MivolError: as :func:`feldkamp`.
+    """
+    _circle_weights(projector)
 
 
 def _scale_to_axis(beam: ConeBeam) -> float:

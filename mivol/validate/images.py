@@ -19,9 +19,9 @@ import numpy as np
 
 from mivol.errors import MivolError
 from mivol.photos.picture import SPACES
-from mivol.validate.metrics import psnr, ssim
+from mivol.validate.metrics import check_window, psnr, ssim
 
-__all__ = ["METRICS", "Quality", "Score", "colour_fitted", "flip", "judge", "quantised", "score"]
+__all__ = ["METRICS", "Quality", "Score", "check_metrics", "colour_fitted", "flip", "judge", "quantised", "score"]
 
 
 @dataclass(frozen=True)
@@ -64,14 +64,24 @@ def flip(image: np.ndarray, truth: np.ndarray) -> float:
     """Mean FLIP of two sRGB images in 0..1 (H, W, 3), at 67 pixels per degree; 0 for equal images.
 
     Raises:
+        MivolError: as :func:`find_flip`.
+    """
+    evaluate = find_flip()
+    pair = [np.ascontiguousarray(values, np.float32) for values in (truth, image)]
+    return float(evaluate(*pair, "LDR", applyMagma=False, parameters={})[1])
+
+
+def find_flip() -> Callable:
+    """FLIP's own implementation.
+
+    Raises:
         MivolError: flip-evaluator is not installed.
     """
     try:
         from flip_evaluator import evaluate
     except ImportError:
         raise MivolError('FLIP needs flip-evaluator, which is not installed; pip install "mivol[metrics]".') from None
-    pair = [np.ascontiguousarray(values, np.float32) for values in (truth, image)]
-    return float(evaluate(*pair, "LDR", applyMagma=False, parameters={})[1])
+    return evaluate
 
 
 #: name -> metric. PSNR costs nothing, SSIM 0.2 s and FLIP 1 s for an image of 800 x 800 pixels.
@@ -80,6 +90,22 @@ METRICS: dict[str, Metric] = {
     "ssim": Metric(lambda image, truth: ssim(image, truth, 1.0), "SSIM", 4),
     "flip": Metric(flip, "FLIP", 4),
 }
+
+
+def check_metrics(names: Sequence[str], width: int, height: int) -> None:
+    """Refuse metrics that will not judge images of a size, before there is anything to judge.
+
+    Args:
+        names: keys of ``METRICS``.
+        width, height: of the smallest image [pixel].
+
+    Raises:
+        MivolError: images smaller than SSIM's window, or FLIP that is not installed.
+    """
+    if "ssim" in names:
+        check_window(width, height)
+    if "flip" in names:
+        find_flip()
 
 
 def quantised(image: np.ndarray, space: str = "srgb") -> np.ndarray:

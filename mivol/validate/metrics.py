@@ -43,19 +43,35 @@ def nrmse(x: np.ndarray, truth: np.ndarray) -> float:
     return float(np.linalg.norm(np.asarray(x, dtype=np.float64) - truth)) / norm
 
 
+WINDOW = 11
+"""Edge of the window of SSIM [pixel]."""
+
+
+def check_window(width: int, height: int) -> None:
+    """Refuse images that SSIM cannot judge.
+
+    Raises:
+        MivolError: they are smaller than its window.
+    """
+    if min(width, height) < WINDOW:
+        raise MivolError(
+            f"an image of {width} x {height} pixels is smaller than the {WINDOW} pixel window of SSIM: leave ssim out of the "
+            "metrics, or take larger images."
+        )
+
+
 def ssim(image: np.ndarray, truth: np.ndarray, peak: float | None = None) -> float:
     """Structural similarity (Wang et al. 2004, IEEE TIP 13), by scikit-image, mean over channels; 1 for equal images.
 
     The window is the paper's, 11 x 11 pixels with Gaussian weights of standard deviation 1.5, wholly inside the image.
 
     Raises:
-        MivolError: the image is smaller than the window.
+        MivolError: as :func:`check_window`.
     """
     from skimage.metrics import structural_similarity  # slow to import
 
     truth = np.asarray(truth, dtype=np.float64)
-    if min(truth.shape[:2]) < 11:
-        raise MivolError(f"an image of {truth.shape[1]}x{truth.shape[0]} is smaller than the 11 pixel window of SSIM.")
+    check_window(truth.shape[1], truth.shape[0])
     window = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False}
     peak = float(truth.max()) if peak is None else peak
     axis = 2 if truth.ndim == 3 else None

@@ -77,6 +77,20 @@ def test_render_refuses(variant_rgb, folder: Path, capsys: pytest.CaptureFixture
     assert sentence in refused(capsys, "render", *flags, folder / "scene.xml")
 
 
+def test_a_film_beyond_the_memory_is_refused(variant_rgb, folder: Path, capsys: pytest.CaptureFixture) -> None:
+    """By every verb that renders, whatever integrator, before anything is rendered; 100000^2 pixels were tracebacks."""
+    scene, text = folder / "scene.xml", (folder / "scene.xml").read_text()
+    scene.write_text(text.replace('"width" value="8"', '"width" value="100000"').replace('value="6"', 'value="100000"'))
+    renders = [["render", scene], ["render", scene, "--integrator", "volpath"], ["validate", scene, "-o", folder / "judged"]]
+    for command in [*renders, ["reference", scene, "--max-depth", "2", "-o", folder / "a.exr"]]:
+        said = refused(capsys, *command)
+        assert "a film of 100000 x 100000 pixels takes" in said and "give it fewer pixels" in said
+    assert run("explain", scene) == 1
+    facts, _, refusal = capsys.readouterr().out.partition("refused\n")
+    assert "optical depth at most" in facts
+    assert "a film of 100000 x 100000 pixels takes" in refusal
+
+
 def test_a_scene_that_is_not_there(variant_rgb, folder: Path, capsys: pytest.CaptureFixture) -> None:
     assert "no scene file" in refused(capsys, "render", folder / "none.xml")
 

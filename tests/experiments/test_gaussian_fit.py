@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
 import pytest
+from tiny_experiment import assert_explained
 
 from mivol import config
 from mivol.cli import main
@@ -192,7 +194,22 @@ def test_the_example_is_one_of_gaussians() -> None:
 def test_refusals(photographs: Path, tmp_path: Path, capsys: pytest.CaptureFixture, setting: str, says: str) -> None:
     path = toml(tmp_path, photographs)
     assert main(["optimize", str(path), "-o", str(tmp_path / "run"), "--set", setting]) == 1
-    assert says in capsys.readouterr().err.replace("\n", " ")
+    said = capsys.readouterr().err
+    assert says in said.replace("\n", " ")
+    assert_explained(path, [setting], said)
+
+
+def test_photographs_from_one_place_are_refused(photographs: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    """They tell no distance. What the problem itself refuses is said by explain, too."""
+    path = toml(tmp_path, shutil.copytree(photographs, tmp_path / "set"))
+    listed = json.loads((tmp_path / "set/transforms.json").read_text())
+    for frame in listed["frames"]:
+        frame["transform_matrix"] = listed["frames"][0]["transform_matrix"]
+    (tmp_path / "set/transforms.json").write_text(json.dumps(listed))
+    assert main(["optimize", str(path), "-o", str(tmp_path / "run")]) == 1
+    said = capsys.readouterr().err
+    assert "all cameras stand at one place" in said
+    assert_explained(path, [], said)
 
 
 def test_points_begin_where_no_view_sees_through(photographs: Path) -> None:

@@ -10,7 +10,9 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from photo_sets import write_blender
 from PIL import Image
+from tiny_experiment import assert_explained
 
 from mivol import config
 from mivol.cli import main
@@ -328,6 +330,8 @@ def test_each_look_is_at_the_same_views(photographs: Path, tmp_path: Path, monke
         ("photos.background=white", "alpha"),
         ("photos.box=[[1, -1, -1], [-1, 1, 1]]", "low below high"),
         ('show.metrics=["pnsr"]', 'did you mean "psnr"'),
+        ("photos.scale=0.2", "an image of 10 x 10 pixels is smaller than the 11 pixel window of SSIM"),
+        ("field.longest=20000", "a fit with 20000 nodes along an edge takes about"),
     ],
 )
 def test_refusals(photographs: Path, tmp_path: Path, capsys: pytest.CaptureFixture, change: str, said: str) -> None:
@@ -335,6 +339,19 @@ def test_refusals(photographs: Path, tmp_path: Path, capsys: pytest.CaptureFixtu
     refused = capsys.readouterr().err
     assert said in refused
     assert refused.startswith("mivol: ")  # before a step was taken
+    assert_explained(tmp_path / "fit.toml", [change], refused)
+
+
+@pytest.mark.parametrize("background", ["", "white"])
+def test_mixed_alpha_of_a_judged_photograph_is_answered_once(tmp_path: Path, background: str) -> None:
+    """Without a background, that one was asked for first, and the mixture told only then."""
+    write_blender(tmp_path / "set")
+    odd = tmp_path / "set/train/r_0.png"
+    Image.open(odd).convert("RGB").save(odd)
+    judged = ["photos.held_out=8", 'photos.judged="held_out"']
+    chosen = config.load(toml(tmp_path, tmp_path / "set"), [f'photos.background="{background}"', *judged])
+    with pytest.raises(MivolError, match=r"found alpha, and none in r_0\.png"):
+        photo_data.read_photos(chosen, tmp_path)
 
 
 def test_a_box_of_silhouettes_needs_alpha(photographs: Path, tmp_path: Path) -> None:

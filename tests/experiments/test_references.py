@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from tiny_experiment import SCENE, refused, run
 
+from mivol.errors import MivolError
 from mivol.experiments import references
 from mivol.files import write_exr
 
@@ -44,6 +45,19 @@ def test_references_from_files(variant_rgb, folder: Path, capsys: pytest.Capture
     assert "reference of another scene" in said
     right = ["--set", 'reference={source="files", paths=["d.exr"], scene="other.xml"}']
     assert run("optimize", folder / "fit.toml", "-o", folder / "run", *changes, *right) == 0
+
+
+@pytest.mark.parametrize(("variant", "taken", "channels"), [("llvm_ad_rgb", "", 3), ("llvm_ad_mono", "Y", 1)])
+def test_a_photograph_has_what_the_variant_renders(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, variant: str, taken: str, channels: int
+) -> None:
+    """Colours without their alpha, or a luminance; a scene's fit met a KeyError on the other."""
+    monkeypatch.setattr(references.mi, "variant", lambda: variant)
+    held = {"": np.zeros((4, 5, 4)), "Y": np.zeros((4, 5))}
+    assert references.colours_of(tmp_path / "a.exr", held).shape == (4, 5, channels)
+    del held[taken]
+    with pytest.raises(MivolError, match=r"a\.exr: found the channels (R, G, B|Y), expected (R, G and B|Y \(luminance\));"):
+        references.colours_of(tmp_path / "a.exr", held)
 
 
 def test_views_that_are_held_out_come_after_the_others(variant_rgb, folder: Path) -> None:

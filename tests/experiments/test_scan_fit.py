@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from false_alarms import assert_same_variance, fresh
 from scattering_scenes import cases
+from tiny_experiment import assert_explained
 
 from mivol import config
 from mivol.cli import main
@@ -494,6 +495,12 @@ REFUSED = {
     "filtered back-projection of a cone": (["solve.name=fbp"], "fdk is filtered"),
     "prior beside a direct method": (["solve.name=fdk", "solve.tv=1"], "prior"),
     "subsets beyond the views": (["solve.name=os-sart", "solve.subsets=99"], "99 subsets"),
+    "circles of a parallel beam": (['scan={beam="parallel", views=18}', "solve.name=fdk"], "expected a ConeBeam on a circle"),
+    "a grid beyond the memory": (["grid.shape=[20000,20000,20000]"], "of 20000 x 20000 x 20000 unknowns takes"),
+    "unknowns beyond the memory": (["solve.supersampling=1000"], "a reconstruction of 12000 x 12000 x 12000 unknowns takes"),
+    "a panel beyond the memory": (["scan.detector=[100000,100000]"], "a scan of 18 x 100000 x 100000 rays takes"),
+    "views beyond the memory": (["scan.views=2000000000"], "a scan of 2000000000 x 14 x 14 rays takes"),
+    "a grid without voxels": (["grid.shape=[12,0,12]"], "grid.shape.1 = 0"),
 }
 
 
@@ -518,6 +525,7 @@ def test_scans_that_are_refused(variant_rgb, folder: Path, capsys: pytest.Captur
     said = [line for line in capsys.readouterr().err.splitlines() if line.startswith("mivol: ")]
     assert len(said) == 1
     assert sentence in said[0]
+    assert_explained(folder / "fit.toml", changes, said[0])
 
 
 def test_resume_refuses_other_projections(variant_rgb, folder: Path, capsys: pytest.CaptureFixture) -> None:

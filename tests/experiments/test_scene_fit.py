@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from fit_scene import KEY
-from tiny_experiment import PHOTOS, files_of, refused, run
+from tiny_experiment import PHOTOS, assert_explained, files_of, refused, run
 
 from mivol.experiments import scene_fit
-from mivol.files import atomic, read_volume
+from mivol.files import atomic, read_volume, write_exr
 
 
 def test_optimize_leaves_a_whole_run_folder(variant_rgb, folder: Path, capsys: pytest.CaptureFixture) -> None:
@@ -72,6 +72,8 @@ def test_an_emissive_start_is_noted_and_not_made_again(
     assert rows[0]["loss"] == losses[1] and rows[-1]["iteration"] == 2
 
 
+PHOTO = 'reference={{source="files", paths=["a.exr", "b.exr", "{}"]}}'
+
 OPTIMIZE_REFUSED = {
     "misspelt key": (["fit.iteratons=3"], 'did you mean "iterations"'),
     "no views": (["views.count=0"], "views.count = 0"),
@@ -97,6 +99,24 @@ OPTIMIZE_REFUSED = {
         ['parameter=[{key="cube.interior_medium.albedo.value.value", prior=[{name="tv"}]}]'],
         "compares neighbours",
     ),
+    "a photograph of another size": ([PHOTO.format("small.exr")], '"view 2" has shape (4, 4, 3), its sensor 8 x 8 pixels'),
+    "a photograph with a hole": ([PHOTO.format("hole.exr")], "not finite at pixel (row 2, column 3)"),
+    "a photograph without colours": ([PHOTO.format("grey.exr")], "found the channels Y, expected R, G and B"),
+    "a loss that is not squared": (['optimiser={name="gauss_newton"}', 'loss={name="l1"}'], "quadratic in the image"),
+    "an emissive start of nothing": ([f'parameter=[{{key="{KEY}", start=0.0, start_fit="emission"}}]'], "a mean of 0"),
+    "an integrator that sees no media": (['fit.integrator="path"'], "no derivative leads from the images to cube"),
+    "no grid to refine": (
+        ['parameter=[{key="cube.interior_medium.albedo.value.value"}]', 'event=[{name="upsample", at=[1]}]'],
+        "upsample found no grid",
+    ),
+    "a grid beyond the memory": (["parameter.0.shape=[20000,20000,20000]"], "of 20000 x 20000 x 20000 x 1 numbers"),
+    "a grid without voxels": (["parameter.0.shape=[3,0,3]"], "parameter.0.shape.1 = 0"),
+    "a grid refined beyond the memory": (
+        ["fit.iterations=9", 'event=[{name="upsample", at=[0,3,6,8,9], factor=8}]'],
+        "of 12288 x 12288 x 12288 x 1 numbers",
+    ),
+    "a truth beyond the memory": (["truth.shape=[20000,20000,20000]"], "a truth of 20000 x 20000 x 20000 voxels takes"),
+    "views beyond the memory": (["views.width=60000", "views.height=60000"], "a film of 60000 x 60000 pixels takes"),
 }
 
 
@@ -104,7 +124,14 @@ OPTIMIZE_REFUSED = {
 def test_optimize_refuses(variant_rgb, folder: Path, capsys: pytest.CaptureFixture, case: str) -> None:
     changes, sentence = OPTIMIZE_REFUSED[case]
     flags = [part for change in changes for part in ("--set", change)]
-    assert sentence in refused(capsys, "optimize", folder / "fit.toml", "-o", folder / "run", *flags)
+    write_exr(folder / "small.exr", {"": np.full((4, 4, 3), 0.7, "f")})
+    write_exr(folder / "grey.exr", {"Y": np.full((8, 8), 0.7, "f")})
+    hole = np.full((8, 8, 3), 0.7, "f")
+    hole[2, 3] = np.nan
+    write_exr(folder / "hole.exr", {"": hole})
+    said = refused(capsys, "optimize", folder / "fit.toml", "-o", folder / "run", *flags)
+    assert sentence in said
+    assert_explained(folder / "fit.toml", changes, said)
 
 
 def test_disk_full(variant_rgb, folder: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch) -> None:
