@@ -440,7 +440,7 @@ class Shown(Section):
     """What is made of a fitted field."""
 
     views: Annotated[int, of("view", "judged views that are shown beside their photographs", ge=0)] = 4
-    frames: Annotated[int, of("frame", "of a film; 0: none", ge=0)] = 60
+    frames: Annotated[int, of("frame", "of a film; 0: none", ge=0, le=65536)] = 60
     way: Annotated[
         Literal["turntable", "views", "keyframes"],
         of("1", "of the film's camera: around the box, through the photographs' places in their order, or past keyframes"),

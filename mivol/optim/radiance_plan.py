@@ -6,6 +6,7 @@ nothing depends on the unit. ``PRESETS`` lists plans by name.
 
 from __future__ import annotations
 
+import bisect
 import math
 from dataclasses import dataclass, replace
 
@@ -270,8 +271,9 @@ def memory_of(plan: FitPlan, box: np.ndarray, batches: RayBatches, limit: int | 
     if limit is None and dr.backend_v(mi.Float) == dr.JitBackend.LLVM:
         limit = available_memory()
     if limit is not None and most > limit:
-        fitting = next((n for n in range(last.longest - 1, 7, -1) if needed(plan.up_to(n)) <= limit), None)
-        advice = f"longest = {fitting} fits" if fitting else "no resolution fits: read the photographs smaller"
+        # More nodes never take less, so what fits is found by halving: a longest of 2^31 has that many below it.
+        fitting = 7 + bisect.bisect_right(range(8, last.longest), limit, key=lambda n: needed(plan.up_to(n)))
+        advice = f"longest = {fitting} fits" if fitting > 7 else "no resolution fits: read the photographs smaller"
         taken, left = f"{most / 2**30:.1f} GiB", f"{limit / 2**30:.1f}"
         raise MivolError(f"a fit with {last.longest} nodes along an edge takes about {taken} and {left} are left; {advice}.")
     first = bytes_of(plan, plan.stages[0], box)

@@ -28,7 +28,7 @@ def _setting(unit: str, meaning: str, **domain: float) -> msgspec.Meta:
 
 
 Pixels = Annotated[int, _setting("pixel", "image size along one side", ge=1, le=65536)]
-Count = Annotated[int, _setting("1", "number of views", ge=1)]
+Count = Annotated[int, _setting("1", "number of views", ge=1, le=65536)]
 Degrees = Annotated[float, _setting("degree", "angle")]
 
 

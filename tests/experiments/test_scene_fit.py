@@ -12,6 +12,8 @@ import pytest
 from fit_scene import KEY
 from tiny_experiment import PHOTOS, assert_explained, files_of, refused, run
 
+from mivol import config
+from mivol.errors import MivolError
 from mivol.experiments import scene_fit
 from mivol.files import atomic, read_volume, write_exr
 
@@ -132,6 +134,13 @@ def test_optimize_refuses(variant_rgb, folder: Path, capsys: pytest.CaptureFixtu
     said = refused(capsys, "optimize", folder / "fit.toml", "-o", folder / "run", *flags)
     assert sentence in said
     assert_explained(folder / "fit.toml", changes, said)
+
+
+def test_more_views_than_can_be_listed_are_refused(folder: Path) -> None:
+    """Two milliards of cameras filled the memory before anything was counted."""
+    assert config.load(folder / "fit.toml", ["views.count=65536"]).views.count == 65536
+    with pytest.raises(MivolError, match="views.count = 65537: expected `int` <= 65536"):
+        config.load(folder / "fit.toml", ["views.count=65537"])
 
 
 def test_disk_full(variant_rgb, folder: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch) -> None:
