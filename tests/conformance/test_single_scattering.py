@@ -288,8 +288,8 @@ def test_a_medium_that_only_absorbs_may_go_deeper():
 
 SAMPLERS = ("stratified", "multijitter", "orthogonal", "ldsampler")
 SPREAD = {"multijitter": 0.41, "orthogonal": 0.46, "ldsampler": 0.64}
-"""Variance over that of independent samples, a mean over 12 seeds and more; Mitsuba's `stratified` leaves 0.84, too near 1 for so
-few renders."""
+"""Variance over that of independent samples, a mean over 12 seeds and more; Mitsuba's `stratified` leaves 0.84, too near 1 for
+so few renders."""
 
 
 @pytest.mark.statistical
