@@ -40,7 +40,7 @@ PUBLIC = {
     "RMSprop": "optim.rmsprop",
     "Splatter": "splatting",
     "VoxelGrid": "tomography.geometry",
-    "explain": "scene.explain",
+    "explain": "experiments.script",
     "fit_gaussians": "experiments.script",
     "fit_photographs": "experiments.script",
     "load_field": "fields.spherical_files",
@@ -61,6 +61,7 @@ PUBLIC = {
 
 if TYPE_CHECKING:  # what type checkers see of PUBLIC, which is imported when it is first used
     from .experiments.script import Problem as Problem
+    from .experiments.script import explain as explain
     from .experiments.script import fit_gaussians as fit_gaussians
     from .experiments.script import fit_photographs as fit_photographs
     from .experiments.script import optimize as optimize
@@ -81,7 +82,6 @@ if TYPE_CHECKING:  # what type checkers see of PUBLIC, which is imported when it
     from .points import read_points as read_points
     from .points import write_gaussians as write_gaussians
     from .points import write_points as write_points
-    from .scene.explain import explain as explain
     from .scene.load import load_scene as load_scene
     from .splatting import Splatter as Splatter
     from .tomography.geometry import ConeBeam as ConeBeam

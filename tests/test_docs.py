@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import ast
+import importlib
 import re
 import shlex
 import tomllib
 from pathlib import Path
+from typing import Any
 
 import pytest
 from script_modules import load
 
+import mivol
 from hatch_build import absolute
 from mivol import config
 from mivol.bench.studies import STUDIES
@@ -120,6 +124,21 @@ def test_readme_leads_with_a_sentence_a_picture_an_equation_and_two_commands() -
 def test_example_of_the_readme_is_a_script_that_is_run() -> None:
     (code,) = blocks(ROOT / "README.md", "python")
     assert (DOCS / "scripts" / "gradient.py").read_text().split("\n", 1)[1] == code
+
+
+def test_code_of_the_tutorials_holds(variant_rgb: str) -> None:
+    """What it imports is there; the projector's lines, which need no files, run."""
+    code = [text for path in PAGES if path.parent.name == "tutorials" for text in blocks(path, "python")]
+    assert len(code) > 2
+    for node in (node for text in code for node in ast.walk(ast.parse(text))):
+        if isinstance(node, ast.ImportFrom) and node.module.startswith("mivol"):
+            assert not [a.name for a in node.names if not hasattr(importlib.import_module(node.module), a.name)], node.module
+        if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "mivol":
+            assert node.attr in mivol.PUBLIC
+    held: dict[str, Any] = {}
+    exec(next(text for text in code if "Projector" in text), held)
+    assert held["y"].shape == (60, 1, 64)
+    assert held["back"].shape == held["x"].shape
 
 
 def test_commands_of_the_pages_are_taken() -> None:

@@ -31,10 +31,10 @@ from mivol.optim.parameters import Parameter
 from mivol.optim.render_batches import View
 from mivol.optim.scene_problem import SceneProblem
 from mivol.points import Gaussians, read_gaussians
-from mivol.scene.explain import settings_of
+from mivol.scene.explain import examine, settings_of
 from mivol.scene.load import SceneSource, load_scene
 
-__all__ = ["Problem", "fit_gaussians", "fit_photographs", "optimize"]
+__all__ = ["Problem", "explain", "fit_gaussians", "fit_photographs", "optimize"]
 
 Reference: TypeAlias = "np.ndarray | mi.TensorXf | str | os.PathLike[str]"
 """A picture: an array (height, width, channels) of linear radiance, or the OpenEXR file of one."""
@@ -183,6 +183,31 @@ def optimize(
         KeyboardInterrupt: Ctrl-C; the scene holds what was found so far.
     """
     return reconstruct(problem, as_optimiser(optimiser or Adam()), iterations, measure=measure, observer=observer)
+
+
+def explain(
+    scene: SceneSource | mi.Scene,
+    max_depth: int | None = None,
+    sensor: int | mi.Sensor = 0,
+    noise: float | None = None,
+) -> str:
+    """Say what a scene needs and what will be done about it, before more than a small preview is rendered.
+
+    Args:
+        scene: a scene, a dict, or the path of its XML.
+        max_depth: of the integrator asked about; None: that of the scene's own integrator, with its other settings.
+        sensor: the sensor asked about, or its number.
+        noise: measure which ``max_depth`` leaves out less than this noise of a pixel, over the mean radiance
+            (:mod:`mivol.scene.depth_preview`); None to measure nothing.
+
+    Returns:
+        Facts, choices with their reasons, and at the end what is refused, where something is.
+
+    Raises:
+        MivolError: as :func:`mivol.scene.load.load_scene`.
+    """
+    loaded = scene if isinstance(scene, mi.Scene) else load_scene(scene).scene
+    return examine(loaded, max_depth, sensor, noise).text
 
 
 def fit_photographs(

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
-from pathlib import Path
 
 import drjit as dr
 import mitsuba as mi
@@ -33,7 +32,7 @@ from mivol.transport.media.read_medium import traverse_medium
 from mivol.transport.path.estimators import SEGMENT_ESTIMATORS
 from mivol.transport.path.settings import Settings
 
-__all__ = ["Explanation", "examine", "explain", "settings_of"]
+__all__ = ["Explanation", "examine", "settings_of"]
 
 UNLIMITED = 0xFFFFFFFF
 """The depth that Mitsuba's integrators print for -1."""
@@ -68,48 +67,32 @@ class Explanation:
         return "\n".join([*self.lines, *(["refused", f"  {self.refusal}"] if self.refusal else [])])
 
 
-def explain(
-    scene: mi.Scene | str | Path,
-    max_depth: int | None = None,
-    sensor: int | mi.Sensor = 0,
-    noise: float | None = None,
-) -> str:
-    """Say what a scene needs and what will be done about it, before more than a small preview is rendered.
-
-    Args:
-        scene: a loaded scene, or the path of its XML.
-        max_depth: of the integrator asked about; None: that of the scene's own integrator, with its other settings.
-        sensor: the sensor asked about, or its number.
-        noise: measure which ``max_depth`` leaves out less than this noise of a pixel, over the mean radiance
-            (:mod:`mivol.scene.depth_preview`); None to measure nothing.
-
-    Returns:
-        Facts, choices with their reasons, and at the end what is refused, where something is.
-    """
-    return examine(scene, max_depth, sensor, noise).text
-
-
 def examine(
-    scene: mi.Scene | str | Path,
+    scene: mi.Scene,
     max_depth: int | None = None,
     sensor: int | mi.Sensor = 0,
     noise: float | None = None,
 ) -> Explanation:
-    """What :func:`explain` says, with the refusal by itself; arguments as there."""
-    loaded = scene if isinstance(scene, mi.Scene) else mi.load_file(str(scene))
-    eye = find_sensor(loaded, sensor)
-    settings = settings_of(loaded) if max_depth is None else Settings(max_depth=max_depth)
+    """What a scene needs and what will be done about it, before more than a small preview is rendered.
+
+    Arguments as those of :func:`mivol.experiments.script.explain`.
+
+    Returns:
+        Facts, choices with their reasons, and by itself what is refused, where something is.
+    """
+    eye = find_sensor(scene, sensor)
+    settings = settings_of(scene) if max_depth is None else Settings(max_depth=max_depth)
     try:
-        survey = survey_scene(loaded)
-        needs = find_needs(loaded, eye, survey, reads_emission=settings.may_draw_emission)
+        survey = survey_scene(scene)
+        needs = find_needs(scene, eye, survey, reads_emission=settings.may_draw_emission)
     except MivolError as error:
-        return Explanation(("facts", *_plain_facts(loaded), *_warnings(loaded)), str(error))
-    facts = ("facts", *_facts(needs), *_warnings(loaded))
+        return Explanation(("facts", *_plain_facts(scene), *_warnings(scene)), str(error))
+    facts = ("facts", *_facts(needs), *_warnings(scene))
     try:
         check_film(eye)
         make_plan(needs, settings)
-        needs = measure_draws(loaded, eye, needs, survey, settings)
-        return Explanation((*facts, *_plan(loaded, eye, needs, settings, noise)))
+        needs = measure_draws(scene, eye, needs, survey, settings)
+        return Explanation((*facts, *_plan(scene, eye, needs, settings, noise)))
     except MivolError as error:
         return Explanation(facts, str(error))
 

@@ -109,7 +109,8 @@ def load_scene(source: SceneSource | mi.Scene, overrides: Mapping[str, object] |
     if isinstance(source, mi.Scene):
         digest, obstacle = _try_hash(lambda: hash_object(source))
         return LoadedScene(source, "scene", "object", (), digest, obstacle)
-    raise MivolError(f"a scene is a path, a dict or a mitsuba.Scene, not {type(source).__name__}.")
+    way_out = ": give its .scene" if isinstance(source, LoadedScene) else ""
+    raise MivolError(f"a scene is a path, a dict or a mitsuba.Scene, not {type(source).__name__}{way_out}.")
 
 
 # -- Loading --------------------------------------------------------------------------------------

@@ -106,7 +106,7 @@ def _floor(part: ExactExtinction, survey: SceneSurvey, name: str) -> mi.Float:
         warnings.warn(
             f"{int((values < 0).sum())} of {values.size} values of {part.name} of the medium in {name} are below 0, the least "
             f"{values.min():.3g}: they count as 0, with the derivative at 0; add params[key] = dr.maximum(params[key], 0) "
-            "after each step or filter (this is said once).",
+            "after each step or filter, or give mivol.Parameter(key, domain=(0, ...)) (this is said once).",
             RuntimeWarning,
             stacklevel=2,
         )

@@ -12,9 +12,9 @@ from false_alarms import assert_same_mean, assert_within, fresh
 from scattering_scenes import close_up
 from scipy import stats
 
+from mivol.experiments.script import explain
 from mivol.scene import depth_two
 from mivol.scene.depth_two import ALBEDOS, TABLES, TAUS, depth_two_error, draw_lines, mean_cosine, scattering_depth
-from mivol.scene.explain import explain
 from mivol.transport.media.box import Box
 from mivol.transport.media.read_medium import view_medium
 from mivol.validate.moments import Moments

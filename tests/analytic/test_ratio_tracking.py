@@ -14,7 +14,7 @@ from false_alarms import assert_same_mean, assert_within, fresh
 from scattering_scenes import PLACE, aimed, assert_same_images, cases, close_up, mivol, point, rough_grid, smoke, sun
 
 import scenes
-from mivol.scene.explain import explain
+from mivol.experiments.script import explain
 from mivol.transport.estimators import ratio_tracking
 from mivol.transport.estimators.ratio_tracking import residual_ratio_tracking
 from mivol.transport.media.grid_integral import integrate_segment

@@ -13,8 +13,8 @@ import pytest
 from false_alarms import Estimate, assert_same_mean
 
 from mivol.errors import MivolError
+from mivol.experiments.script import explain
 from mivol.scene import plan
-from mivol.scene.explain import explain
 
 SIDE, SPP, SKY, SCALE = 12, 256, 0.8, 1.2
 BATCHES = SIDE * SIDE

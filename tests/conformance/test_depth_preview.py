@@ -6,8 +6,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from mivol.experiments.script import explain
 from mivol.scene.depth_preview import DEPTHS, DepthAnswer, LeftOut, leaves_out, measure_depths
-from mivol.scene.explain import explain
 from mivol.transport.path.settings import Settings
 from scenes import box_of, camera, centred, medium, sky
 

@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mivol.scene.explain import explain
+from mivol.experiments.script import explain
 from scenes import ball_of, box_of, camera, centred, grid_volume, medium
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")

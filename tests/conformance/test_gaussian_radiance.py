@@ -18,11 +18,11 @@ from gaussian_scenes import SIDE, camera_rays, render
 from scipy.special import logit
 
 from mivol.errors import MivolError
+from mivol.experiments.script import explain
 from mivol.fields.gaussians import HARMONICS, NAMES, GaussianField
 from mivol.photos.camera import Camera, intrinsics
 from mivol.points import write_gaussians
 from mivol.points.gaussians import Gaussians
-from mivol.scene.explain import explain
 from mivol.splatting import Splatter, tensors_of
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")

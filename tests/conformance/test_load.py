@@ -106,6 +106,7 @@ def test_refusals(xml, tmp_path):
         ((_described(), {"scale": 1}), "only XML files have parameters"),
         ((load_scene(xml).scene, {"scale": 1}), "only XML files have parameters"),
         ((3,), "not int"),
+        ((load_scene(xml),), r"not LoadedScene: give its \.scene"),
     ]
     for arguments, words in cases:
         with pytest.raises(MivolError, match=words):

@@ -10,8 +10,8 @@ from false_alarms import assert_precise, assert_same_mean, difference, over_pixe
 from media_light_scenes import PLACE, SCENES, burning, drawn, floor, met, seen, wall
 from scattering_scenes import assert_same_whole, close_up, moments, pencils, volpath
 
+from mivol.experiments.script import explain
 from mivol.scene.draw_preview import gain_of_draws, measure_draws
-from mivol.scene.explain import explain
 from mivol.scene.media_light import COST
 from mivol.scene.needs import find_needs
 from mivol.scene.plan import make_plan

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 import scenes
+from mivol.experiments.script import explain
 from mivol.scene import plan
-from mivol.scene.explain import explain
 from mivol.scene.needs import find_needs
 from mivol.scene.nesting import nesting_fault
 from mivol.scene.plan import make_plan

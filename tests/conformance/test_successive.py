@@ -11,7 +11,7 @@ import pytest
 from false_alarms import assert_precise, assert_same_mean, difference, over_pixels
 from scattering_scenes import PLACE, close_up, mivol, moments, rough_grid, smoke, sun
 
-from mivol.scene.explain import explain
+from mivol.experiments.script import explain
 from mivol.scene.needs import find_needs
 from mivol.scene.plan import make_plan
 from mivol.scene.session import Session

@@ -11,7 +11,7 @@ from emission_scenes import PLACE, B, aimed, changes, colours, find, gradients, 
 from oracle import box_interval, to_lattice, trilinear
 from scipy.ndimage import gaussian_filter
 
-from mivol.scene.explain import explain
+from mivol.experiments.script import explain
 from scenes import as_float32, box_of, tensor, transform
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
