@@ -1,7 +1,7 @@
 """The command ``mivol``: each verb is one call per arrow of the scene's way to an image, a volume or a page.
 
-Conventions. What mivol refuses, a full disk and Ctrl-C become one sentence on the error output and an exit code that is
-not 0; only a mistake of the program itself shows a traceback. Slow imports wait for the verb that needs them.
+Conventions. What mivol refuses, a full disk or memory and Ctrl-C become one sentence on the error output and an exit code that
+is not 0; only a mistake of the program itself shows a traceback. Slow imports wait for the verb that needs them.
 """
 
 from __future__ import annotations
@@ -37,10 +37,17 @@ def main(argv: Sequence[str] | None = None) -> int:
         if signals.are_behind(error):
             print("mivol: stopped; what was finished is kept.", file=sys.stderr)
             return STOPPED
-        if not isinstance(error, MivolError | OSError):
+        if not isinstance(error, MivolError | OSError | MemoryError):
             raise
-        print(f"mivol: {error}", file=sys.stderr)
+        print(f"mivol: {sentence_of(error)}", file=sys.stderr)
         return 1
+
+
+def sentence_of(error: MivolError | OSError | MemoryError) -> str:
+    """What is said of an error that is no mistake of the program."""
+    if isinstance(error, MemoryError):
+        return f"the memory does not suffice ({error or 'nothing more is known'}): take fewer voxels, pixels or views."
+    return str(error)
 
 
 def parse(given: Sequence[str]) -> argparse.Namespace:

@@ -91,6 +91,19 @@ def test_a_film_beyond_the_memory_is_refused(variant_rgb, folder: Path, capsys: 
     assert "a film of 100000 x 100000 pixels takes" in refusal
 
 
+def test_memory_that_runs_out_is_a_sentence(
+    folder: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where no count had foreseen it: NumPy's own words, and no traceback."""
+
+    def full(*given: object) -> None:
+        raise MemoryError("Unable to allocate 58.2 TiB")
+
+    monkeypatch.setattr("mivol.report.page.write_page", full)
+    said = refused(capsys, "report", folder)
+    assert said == "mivol: the memory does not suffice (Unable to allocate 58.2 TiB): take fewer voxels, pixels or views."
+
+
 def test_a_scene_that_is_not_there(variant_rgb, folder: Path, capsys: pytest.CaptureFixture) -> None:
     assert "no scene file" in refused(capsys, "render", folder / "none.xml")
 
