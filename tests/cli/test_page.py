@@ -138,6 +138,14 @@ def test_judged_views_are_scrolled_through(tmp_path):
     assert "PSNR, held-out views: 3 views at 2 x 2 pixels, raw" in text
 
 
+def test_views_beyond_four_are_folded(tmp_path):
+    """The first four are seen at once; all others are one click away."""
+    write_png(tmp_path / "a.png", np.full((2, 2, 3), 0.5))
+    images = [Image(path="a.png", role="reference", view=f"view {k}", held_out=True) for k in range(6)]
+    write_record(RunRecord.new("V", images=images), tmp_path)
+    assert "2 more views" in Page(write_page(tmp_path).read_text(encoding="utf-8")).text
+
+
 @pytest.mark.parametrize(
     ("quantity", "said"), [("sRGB value", "PSNR is that of sRGB values of 8 bits"), ("radiance", "PSNR takes the reference's")]
 )
