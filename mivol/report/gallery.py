@@ -25,6 +25,9 @@ LAYERS = 16
 LAYER_EDGE = 128
 """Slices of a volume that a page can be scrolled through, and pixels of an edge: a page stays below a few MB."""
 
+WIDEST = 8.0
+"""Longer over shorter edge of a picture: two rows of a detector would be a line otherwise. Longer ones are stretched to it."""
+
 Z_LIMIT = 4.0
 Z_ODD = 3.0
 FILMS = {".mp4": "video/mp4", ".webp": "image/webp", ".gif": "image/gif"}
@@ -222,7 +225,9 @@ def _agreement(reference: NDArray, difference: NDArray) -> tuple[float | None, s
 def _picture(name: str, image: NDArray, scale: show.Scale | None, aspect: float | None = None) -> Picture:
     rgb = image if image.dtype == np.uint8 else show.pixels(image, scale or show.scale_of(image))
     height, width = rgb.shape[:2]
-    return Picture(name, show.data_uri(rgb), width, height, aspect or width / height)
+    true = aspect or width / height
+    shown = min(max(true, 1 / WIDEST), WIDEST)
+    return Picture(name if shown == true else f"{name}, stretched", show.data_uri(rgb), width, height, shown)
 
 
 def plain_picture(folder: Path, image: Image) -> Picture:

@@ -47,6 +47,17 @@ def test_pictures_of_320_pixels_and_less_are_coarse(width: int, height: int, coa
     assert Picture("a", "", width, height, width / height).is_coarse == coarse
 
 
+@pytest.mark.parametrize(
+    ("shape", "name", "aspect"),
+    [((1, 8), "p", 8.0), ((1, 9), "p, stretched", 8.0), ((8, 1), "p", 1 / 8), ((90, 2), "p, stretched", 1 / 8)],
+)
+def test_a_picture_of_few_rows_is_stretched_and_says_so(tmp_path: Path, shape: tuple, name: str, aspect: float) -> None:
+    """Two rows of a detector of 640 columns would be a line of a pixel or two on a page."""
+    np.save(tmp_path / "p.npy", np.zeros(shape))
+    found = plain_picture(tmp_path, Image(path="p.npy", role="picture"))
+    assert (found.name, found.aspect, found.width, found.height) == (name, aspect, *shape[::-1])
+
+
 def pixels(picture: Picture) -> np.ndarray:
     return imread(io.BytesIO(base64.b64decode(picture.uri.partition(",")[2])))[..., :3]
 
