@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import json
 import re
 import shlex
 import tomllib
@@ -10,6 +11,7 @@ from pathlib import Path
 
 import pytest
 from printed import commands_of, commands_of_pages
+from script_modules import load
 from syntax import tree_of
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -42,8 +44,9 @@ def is_there(runner: str) -> bool:
 def test_every_printed_command_is_run_or_it_is_said_why_not() -> None:
     """Rationale: a command that nothing runs breaks unseen. Expected: the pages and the table name the same commands."""
     printed = commands_of_pages(ROOT)
-    assert not TABLE["run"].keys() & TABLE["not_run"].keys()
-    known = TABLE["run"].keys() | TABLE["not_run"].keys()
+    commands = [command for table in TABLE.values() for command in table]
+    known = set(commands)
+    assert len(known) == len(commands), "some are in two tables"
     assert {command: printed[command] for command in printed.keys() - known} == {}, "nothing is said to run these"
     assert known - printed.keys() == set(), "these are printed nowhere: take them out of printed_commands.toml"
 
@@ -58,8 +61,32 @@ def test_who_runs_it_is_there(command: str) -> None:
         assert [word for word in telling(command) if word not in text] == []
 
 
+def test_long_commands_are_run_by_a_script(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capfd: pytest.CaptureFixture
+) -> None:
+    """As they are printed, with the programs of the checkout; one that fails ends the script with 1."""
+    script = load("long_commands")
+    assert script.main(["--list"]) == 0
+    assert capfd.readouterr().out.splitlines() == list(TABLE["long"])
+    table = tmp_path / "printed_commands.toml"
+    table.write_text("""[long]
+"python -c 'print(6 * 7)'" = "Short."
+"python -c 'raise SystemExit(3)'" = "Short."
+""")
+    monkeypatch.setattr(script, "TABLE", table)
+    assert script.main(["--only", "*print*"]) == 0
+    said = capfd.readouterr()
+    assert "42" in said.err and [one["exit_code"] for one in json.loads(said.out).values()] == [0]
+    assert script.main([]) == 1
+    assert [one["exit_code"] for one in json.loads(capfd.readouterr().out).values()] == [0, 3]
+    with pytest.raises(SystemExit):
+        script.main(["--only", "nothing"])
+    assert "matches 'nothing'" in capfd.readouterr().err
+
+
 def test_reasons_are_sentences() -> None:
-    assert [why for why in TABLE["not_run"].values() if not (why.endswith(".") and len(why.split()) > 4)] == []
+    reasons = [*TABLE["long"].values(), *TABLE["not_run"].values()]
+    assert [why for why in reasons if not (why.endswith(".") and len(why.split()) > 4)] == []
 
 
 def test_commands_are_seen() -> None:

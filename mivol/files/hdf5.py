@@ -60,8 +60,9 @@ class ProjectionData:
 def read_hdf5(path: Path, dataset: str | None = None) -> VolumeData:
     """Read one dataset (Z, Y, X) or (Z, Y, X, C); it lies on the unit cube, for HDF5 says nothing else."""
     with _opened(path) as file:
-        name = choose(path, dataset.strip("/") if dataset else None, _grids(file))
-        array = np.asarray(file[name])
+        grids = _grids(file)
+        name = choose(path, dataset.strip("/") if dataset else None, list(grids))
+        array = np.asarray(file[grids[name]])
     meta = {"path": str(path), "format": "hdf5", "dtype": str(array.dtype), "space": None, "dataset": name}
     return VolumeData(as_values(array, path), np.eye(4), meta)
 
@@ -141,19 +142,21 @@ def _opened(path: Path) -> Iterator[Any]:
         ) from error
 
 
-def _grids(file: Any) -> list[str]:
-    names: list[str] = []
+def _grids(file: Any) -> dict[str, str | bytes]:
+    """The arrays of 3 or 4 dimensions: their names as text, and as the file has them (bytes where they are not UTF-8)."""
+    names: list[str | bytes] = []
     file.visititems(lambda name, item: names.append(name) if getattr(item, "ndim", 0) in (3, 4) else None)
-    return names
+    return {_text(name): name for name in names}
 
 
 def _dataset(file: Any, path: Path, group: str, name: str) -> Any:
     full = f"{group}/{name}"
     if full not in file or not hasattr(file[full], "shape"):
-        there = sorted(file[group].keys()) if group in file and hasattr(file[group], "keys") else sorted(file.keys())
+        holder = file[group] if group in file and hasattr(file[group], "keys") else file
+        there = sorted(map(_text, holder.keys()))
         raise refusal(path, f"no dataset {full} (there: {', '.join(there)})", "one", "name another group or add it")
     return file[full]
 
 
 def _text(value: Any) -> str:
-    return value.decode() if isinstance(value, bytes) else str(value)
+    return value.decode("utf-8", "replace") if isinstance(value, bytes) else str(value)

@@ -394,6 +394,26 @@ def test_hdf5_volume_by_name(tmp_path: Path) -> None:
     assert_volume(files.read_volume(tmp_path / "a.h5", "/exchange/data_white"), made.numbered(channels=3), np.eye(4))
 
 
+def test_names_and_units_of_hdf5_that_are_no_text(tmp_path: Path) -> None:
+    """Bytes that are not UTF-8: a unit is read with what stands for them, and a list of names can be printed."""
+    import h5py
+
+    path = make_exchange(tmp_path / "a.h5", data_white=None)
+    with h5py.File(path, "a") as file:
+        file["exchange/data"].attrs["units"] = np.bytes_(b"counts \xff")
+        file[b"exchange/\xfe"] = np.ones(3)
+    with pytest.raises(MivolError, match="no dataset exchange/data_white") as caught:
+        files.read_projections(path)
+    assert str(caught.value).encode()
+    make_exchange(path)
+    with h5py.File(path, "a") as file:
+        file["exchange/data"].attrs["units"] = np.bytes_(b"counts \xff")
+    assert files.read_projections(path).meta["unit"] == "counts \ufffd"
+    with h5py.File(tmp_path / "b.h5", "w") as file:
+        file[b"grid \xfe"] = made.numbered()[..., 0]
+    assert files.read_volume(tmp_path / "b.h5").meta["dataset"] == "grid \ufffd"
+
+
 # -- Frames and round trips -----------------------------------------------------------------------------------------
 
 
