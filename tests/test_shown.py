@@ -19,7 +19,7 @@ from tiny_experiment import write_experiment
 import mivol
 from mivol.experiments.script import Problem, optimize
 from mivol.files import VolumeData
-from mivol.shown import brief, briefly, curve_html
+from mivol.shown import EDGE, GAP, brief, briefly, curve_html, pairs_html
 
 SHORT = 400
 """Letters of a line that a person reads."""
@@ -100,3 +100,38 @@ def test_curves_leave_out_what_is_not_finite() -> None:
     assert re.findall(r"[\d.]+,[\d.]+", text.split('points="')[1].split('"')[0]) == ["0.0,100.0", "213.3,50.0", "320.0,0.0"]
     assert "a &lt; b" in text
     assert "<svg" not in curve_html([1.0], "one point is no curve")
+
+
+def pictures_of(text: str) -> list[np.ndarray]:
+    """The pictures of a HTML text, (H, W, 3)."""
+    return [np.array(Image.open(io.BytesIO(base64.b64decode(data)))) for data in re.findall(r"base64,([^\"]+)", text)]
+
+
+def test_a_view_is_shown_beside_its_render() -> None:
+    """White is the largest value seen; half of it is the code 188 of sRGB; a single channel is grey."""
+    seen = np.full((2, 4, 1), 0.5, np.float32)
+    seen[0, 0] = 2.0
+    rendered = np.full((2, 4, 1), 1.0, np.float32)
+    rendered[1, 3] = np.nan
+    text = pairs_html([("left <1>", seen, rendered)])
+    (picture,) = pictures_of(text)
+    assert "left &lt;1&gt;: seen, rendered" in text
+    assert picture.shape == (EDGE // 2, 2 * EDGE + GAP, 3)
+    assert picture[0, 0].tolist() == [255] * 3
+    # 0.25 and 0.5 of white in sRGB: 137 and 188.
+    assert picture[-1, 0].tolist() == [137] * 3
+    assert picture[0, EDGE + GAP].tolist() == [188] * 3
+    assert picture[-1, -1].tolist() == [0] * 3
+    assert pairs_html([]) == ""
+
+
+def test_a_fit_shows_the_first_views_with_what_was_found(variant_rgb: str, tmp_path: Path) -> None:
+    fit = objects(tmp_path)["fit"]
+    text = fit._repr_html_()
+    (picture,) = pictures_of(text)
+    assert "<svg" in text
+    # The reference is one number everywhere, and the largest: white.
+    assert (picture[:, :EDGE] == 255).all()
+    assert picture[:, EDGE + GAP :].min() < 255
+    fit.problem.views = tuple(fit.problem.views) * 5
+    assert len(pictures_of(fit._repr_html_())) == 3

@@ -23,7 +23,7 @@ from mivol.optim.interrupt import Stop
 from mivol.optim.optimiser import Optimiser, Run
 from mivol.optim.problem import Problem
 from mivol.optim.schedules import Constant
-from mivol.shown import curve_html
+from mivol.shown import curve_html, pairs_html
 from mivol.threads import check_one_thread
 
 KEPT = ("next", "events_done", "history", "measures", "log", "warned", "seconds")
@@ -76,8 +76,13 @@ class Fit:
         return f"Fit({self.next} of {self.course.iterations} iterations in {self.seconds:.1f} s{figures})"
 
     def _repr_html_(self) -> str:
-        """The loss against the iteration, for notebooks."""
-        return curve_html([row["loss"] for row in self.history], repr(self))
+        """For notebooks: the loss against the iteration and, where the problem can show them, views of what was found."""
+        pictures = getattr(self.problem, "pictures", None)
+        shown = ""
+        if pictures is not None:
+            self.problem.set(self.run.reals)
+            shown = pairs_html(pictures())
+        return curve_html([row["loss"] for row in self.history], repr(self)) + shown
 
     @property
     def is_done(self) -> bool:

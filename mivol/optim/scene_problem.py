@@ -146,6 +146,11 @@ class SceneProblem:
             self._finish(total)
         return total / spp
 
+    def pictures(self, most: int = 3) -> list[tuple[str, np.ndarray, np.ndarray]]:
+        """The first views, for notebooks: the name of each, what was seen, and a render of what the scene holds now."""
+        seen = self.views[:most]
+        return [(view.name, np.array(view.reference), np.array(self.render(view.sensor, self.seed))) for view in seen]
+
     def vjp(self, sensor: mi.Sensor, adjoint: mi.TensorXf, seed: int) -> None:
         """Add J^T adjoint of a sensor's image to the gradients of the scene's parameters."""
         for number, spp in enumerate(self.passes(sensor, self.spp)):
