@@ -17,7 +17,7 @@ from collections.abc import Mapping
 
 from .errors import MivolError
 
-__all__ = ["check_one_thread", "run_child"]
+__all__ = ["check_one_thread", "run_child", "set_thread_count"]
 
 _owner: threading.Thread | None = None
 _pid = os.getpid()
@@ -47,6 +47,17 @@ def check_one_thread() -> None:
             f"two of them lose gradients silently: hand the work to {_owner.name!r} (a queue of NumPy arrays), or to a "
             "process of its own."
         )
+
+
+def set_thread_count(count: int) -> None:
+    """Give Dr.Jit so many threads, once the kernels that still run have ended.
+
+    A pool whose size changes under running kernels has crashed a process (seen once, in a run of the tests).
+    """
+    import drjit as dr  # loads LLVM, which mivol.llvm has to choose before
+
+    dr.sync_thread()
+    dr.set_thread_count(count)
 
 
 def run_child(

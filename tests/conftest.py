@@ -22,6 +22,7 @@ import mitsuba as mi
 import pytest
 
 from mivol import machine
+from mivol.threads import set_thread_count
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -115,7 +116,7 @@ def variant_rgb(request: pytest.FixtureRequest) -> str:
 @pytest.fixture
 def two_threads(variant_rgb: str) -> None:
     """The pool has two threads at least, as a user's has: both add to one gradient; Mitsuba reads an EXR with the second."""
-    drjit.set_thread_count(max(2, drjit.thread_count()))
+    set_thread_count(max(2, drjit.thread_count()))
 
 
 @pytest.fixture(scope="session")
@@ -150,4 +151,4 @@ def _same_threads() -> Iterator[None]:
     threads = drjit.thread_count()
     yield
     if drjit.thread_count() != threads:
-        drjit.set_thread_count(threads)
+        set_thread_count(threads)

@@ -277,3 +277,13 @@ def test_search_knows_where_each_system_keeps_libraries(
     assert set(FAKED[system]) <= found
     own = {"env/lib/libLLVM.so.20.1", "env/lib/libLLVM.dylib"}
     assert found - set(FAKED[system]) <= own
+
+
+def test_the_pool_changes_once_its_kernels_have_ended(monkeypatch: pytest.MonkeyPatch) -> None:
+    import drjit as dr
+
+    done: list[object] = []
+    monkeypatch.setattr(dr, "sync_thread", lambda: done.append("ended"))
+    monkeypatch.setattr(dr, "set_thread_count", done.append)
+    threads.set_thread_count(3)
+    assert done == ["ended", 3]

@@ -7,7 +7,7 @@ import mitsuba as mi
 
 from mivol.errors import MivolError
 from mivol.scene.parsing import check_variant
-from mivol.threads import check_one_thread
+from mivol.threads import check_one_thread, set_thread_count
 
 
 def choose_back_end(variant: str, threads: int = 0) -> None:
@@ -45,4 +45,4 @@ def set_threads(count: int) -> None:
     if count < 0:
         raise MivolError(f"found {count} threads, expected 0 (all cores) or more: correct -t.")
     if count:
-        dr.set_thread_count(count)
+        set_thread_count(count)

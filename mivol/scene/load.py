@@ -21,6 +21,7 @@ from mivol.scene.content_hash import hash_object, hash_state
 from mivol.scene.explain import examine
 from mivol.scene.parsing import as_text, check_variant, named_files, parse_dict, parse_file, reason_of, resolving_beside
 from mivol.shown import briefly, text_html
+from mivol.threads import set_thread_count
 
 __all__ = ["LoadedScene", "SceneSource", "load_scene"]
 
@@ -70,12 +71,12 @@ def two_threads() -> Iterator[None]:
     """
     single = mi.variant().startswith("llvm") and dr.thread_count() == 1
     if single:
-        dr.set_thread_count(2)
+        set_thread_count(2)
     try:
         yield
     finally:
         if single:
-            dr.set_thread_count(1)
+            set_thread_count(1)
 
 
 

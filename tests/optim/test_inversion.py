@@ -64,8 +64,11 @@ def test_defaults():
 
 
 def test_a_fit_ends_where_its_solver_has_arrived(variant_rgb):
-    """Before the iterations that it was given are done; what did not happen is not in its history."""
-    one = Inversion(LeastSquares(Views(np.array([[2.0]]), 1), np.array([4.0])))
+    """Before the iterations that it was given are done; what did not happen is not in its history.
+
+    Two measurements of one number contradict each other, so that a residual is left where no direction lowers it.
+    """
+    one = Inversion(LeastSquares(Views(np.array([[1.0], [1.0]]), 1), np.array([1.0, 3.0])))
     fit = reconstruct(one, Solve(), Course(iterations=9))
     assert 1 <= fit.next < 9 and len(fit.history) == fit.next and fit.is_done
     assert one.values()["x"] == pytest.approx([2.0])
