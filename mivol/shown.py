@@ -5,19 +5,14 @@ Conventions. HTML is self-contained and has no script; text in it is escaped.
 
 from __future__ import annotations
 
-import base64
 import dataclasses
 import html
-import io
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TypeVar
 
-import numpy as np
-from PIL import Image
-
-__all__ = ["brief", "briefly", "curve_html", "pairs_html", "text_html"]
+__all__ = ["brief", "briefly", "curve_html", "text_html"]
 
 T = TypeVar("T")
 
@@ -26,9 +21,6 @@ FEW = 4
 
 WIDTH, HEIGHT = 320, 100
 """Of a curve [pixel]."""
-
-EDGE, GAP = 160, 4
-"""Longest edge of a picture, and between pictures [pixel]."""
 
 
 def brief(value: object) -> str:
@@ -86,40 +78,3 @@ def curve_html(values: Sequence[float], says: str) -> str:
         f'<polyline points="{points}" fill="none" stroke="currentColor" stroke-width="1.5"/></svg>'
     )
     return f"{picture}{text_html(says)}"
-
-
-def pairs_html(pairs: Sequence[tuple[str, np.ndarray, np.ndarray]]) -> str:
-    """Views, each as what was seen beside what is rendered of it, with its name below; nothing where there are none.
-
-    Args:
-        pairs: of each view its name, and two images (H, W, 1 or 3) of radiance. Both are shown as a screen does, with the
-            largest value that was seen as white; what is not finite is black.
-    """
-    return "".join(_pair_html(*pair) for pair in pairs)
-
-
-def _pair_html(name: str, seen: np.ndarray, rendered: np.ndarray) -> str:
-    white = float(np.nan_to_num(seen, posinf=0.0).max()) or 1.0
-    pictures = [_picture(image, white) for image in (seen, rendered)]
-    width, height = pictures[0].size
-    whole = Image.new("RGB", (2 * width + GAP, height), "white")
-    for left, picture in zip((0, width + GAP), pictures, strict=True):
-        whole.paste(picture, (left, 0))
-    file = io.BytesIO()
-    whole.save(file, "PNG")
-    data = base64.b64encode(file.getvalue()).decode()
-    title = html.escape(f"{name}: seen, rendered")
-    return f'<img alt="{title}" title="{title}" src="data:image/png;base64,{data}"/>{text_html(f"{name}: seen, rendered")}'
-
-
-def _picture(image: np.ndarray, white: float) -> Image.Image:
-    """An image in sRGB, small ones with their pixels repeated."""
-    values = np.clip(np.nan_to_num(np.asarray(image, np.float64), posinf=0.0, neginf=0.0)[..., :3] / white, 0, 1)
-    # IEC 61966-2-1, the transfer function of sRGB.
-    codes = np.where(values <= 0.0031308, 12.92 * values, 1.055 * values ** (1 / 2.4) - 0.055)
-    if codes.shape[-1] < 3:
-        codes = np.repeat(codes[..., :1], 3, axis=2)
-    picture = Image.fromarray(np.round(255 * codes).astype(np.uint8))
-    factor = EDGE / max(picture.size)
-    how = Image.Resampling.NEAREST if factor > 1 else Image.Resampling.BOX
-    return picture.resize(tuple(max(1, round(edge * factor)) for edge in picture.size), how)

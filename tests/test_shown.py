@@ -19,7 +19,8 @@ from tiny_experiment import write_experiment
 import mivol
 from mivol.experiments.script import Problem, optimize
 from mivol.files import VolumeData
-from mivol.shown import EDGE, GAP, brief, briefly, curve_html, pairs_html
+from mivol.files.notebook import EDGE, GAP, pairs_html
+from mivol.shown import brief, briefly, curve_html
 
 SHORT = 400
 """Letters of a line that a person reads."""

@@ -10,7 +10,7 @@ optical depth of 64, and milk in a glass. Albedo 0.75 unless said, ``max_depth``
 ``scripts/bench_single_scattering.py``: samples of equal processor time, rounds in turns, variance x time. Bars are on the mean
 over pixels, for unlimited depth on the median: the errors of long paths have heavy tails. There samples take ``LONGER`` times
 as long, since the variance of a few samples misses the tails, and most of all those of the method that has the fewest: in the
-cloud the median ratio to ``volpath`` is 21 with 8 of its samples a pixel, 39 with 32 and 50 with 128, the mean 67 with each.
+cloud the median ratio to ``volpath`` is 21 with 8 of its samples a pixel, 39 with 32 and 50 with 128, the mean 65 to 67.
 
 milk: skim milk (rgb, as measured) of 40 mm along an edge in a box of glass, both smooth and refracting, below a large lamp and
 a faint sky, unlimited. Paths find the lamp by chance where they leave the glass, and the weights of ``volpath`` grow without

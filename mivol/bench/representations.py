@@ -38,7 +38,7 @@ from mivol.experiments.photo_plan import batches_of, make_plan, shrunk
 from mivol.optim.field_view import render_view
 from mivol.optim.gaussian_problem import GaussianProblem
 from mivol.optim.radiance_problem import RadianceProblem
-from mivol.photos import Photo, Photos, load_photos
+from mivol.photos import Photo, Photos, survey_photos
 from mivol.points import Gaussians, write_gaussians
 from mivol.validate import images
 
@@ -118,7 +118,7 @@ def _fit_and_judge(folder: Path, settings: dict, size: Size) -> dict:
         the figure the middle view and its photograph.
     """
     photos = {"path": str(folder), "background": "white", "judged": "test", "held_out": 0}
-    edge = max(load_photos(folder, split="test", background="white").views[0].camera.size)
+    edge = max(survey_photos(folder, split="test").frames[0].camera.size)
     photos["scale"] = min(size.edge / edge, 1.0)
     chosen = config.from_dict({"title": folder.name, "photos": photos, **settings})
     shown, judged = read_photos(chosen, Path())

@@ -16,6 +16,7 @@ from dataclasses import dataclass, field
 import mitsuba as mi
 
 from mivol.errors import MivolError
+from mivol.files.notebook import pairs_html
 from mivol.optim.checkpoint import Store
 from mivol.optim.course import Course
 from mivol.optim.events import Event, in_order
@@ -23,7 +24,7 @@ from mivol.optim.interrupt import Stop
 from mivol.optim.optimiser import Optimiser, Run
 from mivol.optim.problem import Problem
 from mivol.optim.schedules import Constant
-from mivol.shown import curve_html, pairs_html
+from mivol.shown import curve_html
 from mivol.threads import check_one_thread
 
 KEPT = ("next", "events_done", "history", "measures", "log", "warned", "seconds")

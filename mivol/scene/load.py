@@ -19,7 +19,16 @@ import mitsuba as mi
 from mivol.errors import MivolError
 from mivol.scene.content_hash import hash_object, hash_state
 from mivol.scene.explain import examine
-from mivol.scene.parsing import as_text, check_variant, named_files, parse_dict, parse_file, reason_of, resolving_beside
+from mivol.scene.parsing import (
+    NO_TEXT,
+    as_text,
+    check_variant,
+    named_files,
+    parse_dict,
+    parse_file,
+    reason_of,
+    resolving_beside,
+)
 from mivol.shown import briefly, text_html
 from mivol.threads import set_thread_count
 
@@ -101,7 +110,7 @@ def load_scene(source: SceneSource | mi.Scene, overrides: Mapping[str, object] |
         try:
             return _load_file(Path(source), overrides)
         except UnicodeDecodeError as error:  # of Mitsuba's refusals and settings, which quote the file
-            raise MivolError(f"{source} cannot be read: it names things in bytes that are not UTF-8; correct them.") from error
+            raise MivolError(f"{source} cannot be read: {NO_TEXT}.") from error
     if overrides:
         name = next(iter(overrides))
         raise MivolError(f'override "{name}" was given, but only XML files have parameters; change the scene itself.')

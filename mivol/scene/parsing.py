@@ -14,6 +14,7 @@ import mitsuba as mi
 from mivol.errors import MivolError
 
 __all__ = [
+    "NO_TEXT",
     "VARIANTS",
     "as_text",
     "check_variant",
@@ -30,6 +31,9 @@ VARIANTS = ("llvm_ad_rgb", "llvm_ad_mono", "cuda_ad_rgb", "cuda_ad_mono")
 
 LONGEST_REASON = 700
 """Characters of a message of Mitsuba's that are quoted: its lists of plugins and parameters are shorter."""
+
+NO_TEXT = "it names things in bytes that are not UTF-8; correct them"
+"""What is wrong with a file that Mitsuba quotes in a refusal that is no text."""
 
 TRACEBACK = re.compile(r"Traceback \(most recent call last\):\n(?:[ \t].*\n)+(?:(?:[\w.]+\.)?MivolError: )?")
 """A traceback in a text, up to what was raised; the name of a refusal of mivol's belongs to it."""
@@ -61,9 +65,10 @@ def reason_of(error: Exception) -> str:
     """Mitsuba's message without its source position, in one line that does not quote all of a long file.
 
     Of an error of a plugin in Python, mivol's own among them, Mitsuba quotes the traceback: what the plugin says is at its end.
+    A message that is no UTF-8 is lost in Python 3.11.2 (later ones raise UnicodeDecodeError in its place).
     """
     text = TRACEBACK.sub("", re.sub(r"^\s*\[[\w.]+:\d+\]\s*", "", str(error)))
-    text = " ".join(text.split())
+    text = " ".join(text.split()) or NO_TEXT
     return text if len(text) <= LONGEST_REASON else f"{text[:LONGEST_REASON]} ..."
 
 

@@ -12,6 +12,7 @@ import pytest
 from mivol.errors import MivolError
 from mivol.scene.content_hash import content_hash
 from mivol.scene.load import load_scene
+from mivol.scene.parsing import NO_TEXT, reason_of
 from mivol.threads import run_child
 
 INCLUDED = """<scene version="3.0.0">
@@ -123,6 +124,13 @@ def test_a_plugin_says_what_it_refuses(variant_rgb, tmp_path):
     assert "Traceback" not in str(caught.value)
     assert "MivolError" not in str(caught.value)
     assert 'volume plugin of type "mivol_voxels": ' in str(caught.value)
+
+
+def test_a_refusal_that_is_no_text_says_so() -> None:
+    """Python 3.11.2 drops a message of Mitsuba's that quotes bytes that are not UTF-8."""
+    assert reason_of(RuntimeError("")) == NO_TEXT
+    assert reason_of(RuntimeError("  [a.cpp:1] ")) == NO_TEXT
+    assert reason_of(RuntimeError("[a.cpp:1] no such plugin")) == "no such plugin"
 
 
 def test_variants_are_checked():

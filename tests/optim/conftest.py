@@ -12,6 +12,7 @@ from ball_photos import ball, photo
 from small_scan import Views, small_scan
 
 from mivol.photos import Photo
+from mivol.threads import set_thread_count
 
 
 @pytest.fixture(scope="session")
@@ -25,9 +26,9 @@ def photos() -> list[Photo]:
 def one_thread(variant_rgb: str) -> Iterator[None]:
     """One Dr.Jit thread: sums have a fixed order."""
     before = dr.thread_count()
-    dr.set_thread_count(1)
+    set_thread_count(1)
     yield
-    dr.set_thread_count(before)
+    set_thread_count(before)
 
 
 @pytest.fixture(scope="session")

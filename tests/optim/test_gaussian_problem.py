@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -67,15 +65,6 @@ def problem_of(views: list[Photo], plan: GaussianPlan = PLAN, count: int = 150, 
 def fit_of(views: list[Photo], plan: GaussianPlan = PLAN, store: Store | None = None) -> Fit:
     problem = problem_of(views, plan)
     return begin_fit(problem, plan.optimiser, plan.course(Checkpoint(every=1000)), store=store)
-
-
-@pytest.fixture
-def one_thread(variant_rgb: str) -> Iterator[None]:
-    """One Dr.Jit thread: sums have a fixed order."""
-    before = dr.thread_count()
-    dr.set_thread_count(1)
-    yield
-    dr.set_thread_count(before)
 
 
 @pytest.mark.parametrize(("ssim", "behind"), [(0.2, (0.0, 0.0, 0.0)), (0.0, (0.2, 0.7, 0.4))])
