@@ -34,7 +34,7 @@ from mivol.config import FieldFit, GaussianFit
 from mivol.experiments import gaussian_outputs, photo_outputs
 from mivol.experiments.gaussian_start import begin, make_gaussian_plan
 from mivol.experiments.photo_data import boxed, read_photos
-from mivol.experiments.photo_plan import batches_of, make_plan, shrunk
+from mivol.experiments.photo_plan import batches_of, make_plan, suited
 from mivol.optim.field_view import render_view
 from mivol.optim.gaussian_problem import GaussianProblem
 from mivol.optim.radiance_problem import RadianceProblem
@@ -155,7 +155,7 @@ def _fit_and_judge(folder: Path, settings: dict, size: Size) -> dict:
 
 def _fit_grid(chosen: FieldFit, photos: Photos) -> tuple[RadianceProblem, Callable[[], Found]]:
     """The fit of a grid, and what it has found once it is over."""
-    plan = shrunk(make_plan(chosen), photos)
+    plan = suited(make_plan(chosen), photos)
     problem = RadianceProblem(batches_of(plan, photos), photos.box, plan)
 
     def found() -> Found:

@@ -22,7 +22,7 @@ from mivol.experiments.depth import settle_depth
 from mivol.experiments.film import plan_film
 from mivol.experiments.gaussian_start import begin, make_gaussian_plan
 from mivol.experiments.photo_data import boxed, read_photos
-from mivol.experiments.photo_plan import batches_of, choices, make_plan, shrunk
+from mivol.experiments.photo_plan import batches_of, choices, make_plan, suited
 from mivol.experiments.projections import beam_of, fitted_views, held_out_views, make_data, make_grid
 from mivol.experiments.references import (
     References,
@@ -183,7 +183,7 @@ def explain_photo_fit(chosen: FieldFit, base: Path, say: Say) -> Explanation:
     say(f"  judged by {0 if judged is None else len(judged.views)} photographs")
     for note in plan_film(chosen.show, photos).notes:
         say(f"  {note}")
-    plan = shrunk(asked, photos)
+    plan = suited(asked, photos)
     batches = batches_of(plan, photos)
     lines = tuple(f"  {one.choice}: {one.reason}" for one in choices(plan, photos, batches))
     plan.optimiser.begin(RadianceProblem(batches, photos.box, plan, chosen.seed))

@@ -19,7 +19,7 @@ from mivol.experiments.best import BestIterate, FilesOfBest
 from mivol.experiments.film import plan_film
 from mivol.experiments.photo_data import boxed, notes, read_photos
 from mivol.experiments.photo_outputs import PhotoOutputs, compare, save_found
-from mivol.experiments.photo_plan import batches_of, choices, make_plan, shrunk
+from mivol.experiments.photo_plan import batches_of, choices, make_plan, suited
 from mivol.experiments.run_folder import RunFolder
 from mivol.experiments.task import Task
 from mivol.optim.checkpoint import Store
@@ -47,7 +47,7 @@ def photo_fit(task: Task) -> Path:
             photos, judged = read_photos(chosen, task.base)
             photos = boxed(chosen, photos)
             film = plan_film(chosen.show, photos)
-            plan = shrunk(asked, photos)
+            plan = suited(asked, photos)
             batches = batches_of(plan, photos)
             if photos.space == "linear":
                 run.record.citations.append("mildenhall_2022")

@@ -8,7 +8,7 @@ import numpy as np
 
 from mivol.config import FieldFit
 from mivol.errors import MivolError
-from mivol.optim.radiance_plan import FEW, PRESETS, FitPlan, memory_of
+from mivol.optim.radiance_plan import FEW, PRESETS, FitPlan, Stage, memory_of, stretched
 from mivol.optim.ray_batches import RayBatches
 from mivol.optim.strategy import nearest
 from mivol.photos import Photos, rectified
@@ -21,6 +21,9 @@ GAINS = PlanLine(
 
 SMALLEST = 16
 """Shortest edge of a photograph that was made smaller [pixel]."""
+
+VOXEL = 2
+"""Pixels along a voxel, as seen from the median camera: photographs are not made smaller than that, nor boxes finer."""
 
 
 def make_plan(chosen: FieldFit) -> FitPlan:
@@ -40,7 +43,7 @@ def make_plan(chosen: FieldFit) -> FitPlan:
     plan = replace(plan, stages=tuple(stages))
     if wanted.degree is not None:
         plan = replace(plan, few_degree=None)
-    return plan if wanted.longest is None else plan.up_to(wanted.longest)
+    return plan if wanted.longest is None else replace(plan.up_to(wanted.longest), cubic=False)
 
 
 def batches_of(plan: FitPlan, photos: Photos) -> RayBatches:
@@ -48,20 +51,27 @@ def batches_of(plan: FitPlan, photos: Photos) -> RayBatches:
     return RayBatches.of([rectified(view) for view in photos.views], [one.shrink for one in plan.stages], space=photos.space)
 
 
-def shrunk(plan: FitPlan, photos: Photos) -> FitPlan:
-    """The plan for these photographs: as small as its grids can tell (pixels of half a voxel, at the middle of the box), and of
-    a lower degree where they are few."""
+def suited(plan: FitPlan, photos: Photos) -> FitPlan:
+    """The plan for these photographs.
+
+    Grids of a plan for cubes have as many nodes in a box that is none, though voxels are not smaller than two pixels for that.
+    Photographs are as small as the grids can tell (pixels of half a voxel, at the middle of the box), and the degree is lower
+    where they are few.
+    """
     cameras, box = [view.camera for view in photos.views], photos.box
     pixel = np.median([np.linalg.norm(camera.origin - box.mean(axis=0)) / camera.K[0, 0] for camera in cameras])
     least = min(min(camera.size) for camera in cameras)
+    edge = float((box[1] - box[0]).max())
+
+    def suited_stage(stage: Stage) -> Stage:
+        wanted = min(stretched(stage.longest, box), int(edge / (VOXEL * pixel))) if plan.cubic else 0
+        longest = max(stage.longest, wanted)
+        finest = max(1.0, min(edge / longest / (VOXEL * pixel), least / SMALLEST))
+        return replace(stage, longest=longest, shrink=2 ** int(np.log2(finest)))
+
     if plan.few_degree is not None and len(photos.views) < FEW:
         plan = replace(plan, degree=plan.few_degree)
-    stages = []
-    for one in plan.stages:
-        voxel = (box[1] - box[0]).max() / one.longest
-        finest = max(1.0, min(0.5 * voxel / pixel, least / SMALLEST))
-        stages.append(replace(one, shrink=2 ** int(np.log2(finest))))
-    return replace(plan, stages=tuple(stages))
+    return replace(plan, stages=tuple(suited_stage(stage) for stage in plan.stages))
 
 
 def choices(plan: FitPlan, photos: Photos, batches: RayBatches) -> list[PlanLine]:

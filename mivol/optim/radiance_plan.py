@@ -32,7 +32,7 @@ class Stage:
     """Some steps on a grid of one resolution.
 
     Attributes:
-        longest: nodes along the longest edge of the box; voxels are cubes.
+        longest: nodes along the longest edge of the box; voxels are cubes. Where the plan says ``cubic``, along that of a cube.
         steps: how many.
         shrink: edge of the squares of pixels whose means are looked at: where voxels are larger than pixels, a mean says the
             same with fewer rays.
@@ -83,6 +83,8 @@ class FitPlan:
         levels: nested boxes, each of twice the extent (:mod:`mivol.fields.spherical`).
         near: derivatives of what is nearer to a camera than so many medians of the cameras' distances from the box's middle go
             down with the square of the distance (Philip & Deschaintre 2023); 0: none do.
+        cubic: a box that is no cube gets as many nodes in all as its stages have in a cube, for memory and time go with them
+            (:func:`stretched`); False: ``longest`` is meant as it stands.
         random_background: photographs with alpha are seen over another colour each step, so that nothing stands in the air in
             the background's colour.
     """
@@ -112,6 +114,7 @@ class FitPlan:
     exposure: bool = False
     levels: int = 1
     near: float = 0.0
+    cubic: bool = True
     random_background: bool = True
 
     @property
@@ -217,6 +220,12 @@ def place_grid(box: np.ndarray, longest: int) -> tuple[tuple[int, int, int], np.
     to_world = np.diag([*(counts * h), 1.0])
     to_world[:3, 3] = box.mean(axis=0) - counts * h / 2
     return (int(counts[2]), int(counts[1]), int(counts[0])), to_world
+
+
+def stretched(longest: int, box: np.ndarray) -> int:
+    """Nodes along the longest edge of a box (2, 3) that has as many in all as a cube with ``longest`` along each edge."""
+    edges = box[1] - box[0]
+    return round(longest * edges.max() / float(np.cbrt(edges.prod())))
 
 
 NESTED_FILLED = 0.4

@@ -23,7 +23,7 @@ from mivol.fields.spherical_files import load_field
 from mivol.files import read_exr, write_exr, write_png
 from mivol.optim.field_view import render_view
 from mivol.optim.problem import Reals
-from mivol.optim.radiance_plan import PRESETS, FitPlan, Stage
+from mivol.optim.radiance_plan import PRESETS, FitPlan, Stage, stretched
 from mivol.optim.radiance_problem import RadianceProblem
 from mivol.photos import Camera, intrinsics
 from mivol.photos.camera_path import facing
@@ -263,7 +263,23 @@ def test_photographs_are_shrunk_to_half_a_voxel(photographs: Path, tmp_path: Pat
     chosen = config.load(toml(tmp_path, photographs))
     photos, _ = photo_data.read_photos(chosen, tmp_path)
     plan = FitPlan((Stage(4, 1), Stage(8, 1), Stage(16, 1, shrink=4)))
-    assert [stage.shrink for stage in photo_plan.shrunk(plan, photos).stages] == [2, 2, 1]
+    assert [stage.shrink for stage in photo_plan.suited(plan, photos).stages] == [2, 2, 1]
+
+
+def test_a_long_box_has_as_many_nodes_as_a_cube(photographs: Path, tmp_path: Path) -> None:
+    """A box of 2 x 0.5 x 0.25 with 8 nodes along it has 8 x 2 x 1; with 8 / (2^-2 2^-3)^(1/3) = 25.4 it has 8^3.
+
+    Voxels are no smaller than two pixels of 0.058 for that: 17 along 2; and as they are where a file says so.
+    """
+    chosen = config.load(toml(tmp_path, photographs))
+    photos, _ = photo_data.read_photos(chosen, tmp_path)
+    slab = np.array([[-1, -0.25, -0.125], [1, 0.25, 0.125]])
+    assert stretched(8, slab) == 25 and stretched(8, photos.box) == 8
+    long = replace(photos, survey=replace(photos.survey, box=slab))
+    plan = FitPlan((Stage(4, 1), Stage(8, 1), Stage(40, 1)))
+    assert [stage.longest for stage in photo_plan.suited(plan, long).stages] == [13, 17, 40]
+    assert [stage.longest for stage in photo_plan.suited(replace(plan, cubic=False), long).stages] == [4, 8, 40]
+    assert not photo_plan.make_plan(config.load(toml(tmp_path, photographs), ["field.longest=26"])).cubic
 
 
 def test_cameras_side_by_side_look_at_the_box_that_is_given(photographs: Path, tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ from mivol.errors import MivolError
 from mivol.experiments.judged_views import write_view
 from mivol.experiments.photo_data import MIDDLE_GREY, exposed, notes, read_photos
 from mivol.experiments.photo_outputs import judge_fitted, save_found
-from mivol.experiments.photo_plan import batches_of, make_plan, shrunk
+from mivol.experiments.photo_plan import batches_of, make_plan, suited
 from mivol.fields.sky import Sky
 from mivol.fields.spherical import SphericalGrid
 from mivol.fields.spherical_files import load_field
@@ -103,7 +103,7 @@ def test_what_is_found_is_kept_in_the_unit_of_the_files(photographs: Path, tmp_p
     """The field and its sky are brightened; a view beside its photograph is tone-mapped."""
     path = toml(tmp_path, photographs, field="sky = 8")
     photos, judged = read(path)
-    plan = shrunk(make_plan(config.load(path)), photos)
+    plan = suited(make_plan(config.load(path)), photos)
     problem = RadianceProblem(batches_of(plan, photos), photos.box, plan)
     problem.sky = Sky.even(8, 0.75)
     save_found(tmp_path, problem, "_best", photos.white)

@@ -22,7 +22,7 @@ from mivol.bench.radiance_field.size import Size
 from mivol.bench.still_life import photographer
 from mivol.bench.timing import Stopwatch, race
 from mivol.experiments.photo_data import boxed, read_photos
-from mivol.experiments.photo_plan import batches_of, make_plan, shrunk
+from mivol.experiments.photo_plan import batches_of, make_plan, suited
 from mivol.optim.field_view import render_view
 from mivol.optim.gaussian_problem import GaussianProblem
 from mivol.optim.loop import Fit, begin_fit
@@ -66,7 +66,7 @@ def photographs_of(name: str, size: Size) -> Path | None:
 
 
 def fitted(folder: Path, longest: int, size: Size) -> dict:
-    """Fit a data set as ``mivol optimize`` does, and measure.
+    """Fit a data set as ``mivol optimize`` does, to as many nodes as a cube with ``longest`` along each edge has, and measure.
 
     Returns:
         ``psnr`` [dB] and ``ssim`` of the test views, ``train_psnr`` of some that were fitted; ``seconds`` as the module says,
@@ -74,11 +74,11 @@ def fitted(folder: Path, longest: int, size: Size) -> dict:
         ``step_rays``; ``counted_gib`` by the plan for the rows kept, and ``held_gib`` by Dr.Jit, both beyond the photographs.
     """
     photos = {"path": str(folder), "background": "white", "judged": "test", "held_out": 0}
-    field = {"longest": longest, "effort": size.photo_effort}
+    field = {"effort": size.photo_effort}
     chosen = config.from_dict({"title": folder.name, "photos": photos, "field": field})
     shown, judged = read_photos(chosen, Path())
     shown = boxed(chosen, shown)
-    plan = shrunk(make_plan(chosen), shown)
+    plan = suited(make_plan(chosen).up_to(longest), shown)
     problem = RadianceProblem(batches_of(plan, shown), shown.box, plan)
     done, last = finished(problem, size.walk_side), plan.stages[-1]
     return {

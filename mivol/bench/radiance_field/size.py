@@ -24,7 +24,7 @@ class Size:
         chair_steps: of the fit that makes the fitted field.
         fit_resolution, fit_side: nodes and pixels of fits.
         fields: names of those that are measured, in :data:`mivol.bench.radiance_field.fields.FIELDS`.
-        photo_fits: data sets of :mod:`mivol.bench.radiance_field.photographs` and nodes along the longest edge.
+        photo_fits: data sets of :mod:`mivol.bench.radiance_field.photographs` and nodes along an edge of a cube with as many.
         photo_effort: share of the preset's steps.
         photo_views, photo_side, photo_spp: of made-up data sets: photographs, pixels along an edge, samples a pixel.
         photo_folder: where those lie; they are made where they are missing.
