@@ -96,7 +96,7 @@ class Sought(Section):
     """A parameter that is looked for."""
 
     key: Annotated[str, of("1", "key of mi.traverse(scene)", min_length=1)]
-    unit: Annotated[str, of("1", "unit of the value, for labels")] = "1/length"
+    unit: Annotated[str, of("1", "unit of the value, for labels; empty: that which its key tells")] = ""
     domain: Annotated[tuple[float, float], of("unit", "smallest and largest value")] = (0.0, INFINITY)
     map: Annotated[str, of("1", "what the optimiser moves: key of MAPS")] = "identity"
     lr: Annotated[float, of("unit", "typical change per step, in the map's reals", gt=0)] = 0.1

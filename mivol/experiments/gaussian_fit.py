@@ -74,5 +74,6 @@ def new_record(task: Task) -> RunRecord:
         config=config.resolved(chosen),
         command=task.command,
         seeds={"fit": chosen.seed},
+        units={"loss": "1"},
         citations=["mitsuba3", "drjit", "kerbl_2023", "zwicker_2001", "wang_2004"] + ["kheradmand_2024"] * relocates,
     )

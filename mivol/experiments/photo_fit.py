@@ -73,6 +73,7 @@ def new_record(task: Task) -> RunRecord:
         config=config.resolved(chosen),
         command=task.command,
         seeds={"fit": chosen.seed},
+        units={"loss": "1"},
         citations=["mitsuba3", "drjit", "plenoxels_2022", "relu_fields_2022", "max_1995"],
     )
 

@@ -197,8 +197,9 @@ def write_geometry(folder: Path, seen: FieldView, camera: Camera, near_far: tupl
     """Distance and normals of a view as colours."""
     near, far = near_far
     normals = normals_of_depth(seen.depth, camera)
+    distances = f"from light, {near:.3g} [length], to dark, {far:.3g} [length]"
     pictures = {
-        "distance": (depth_pixels(seen.depth, near_far, seen.opacity), f"from light, {near:.3g} [length], to dark, {far:.3g}"),
+        "distance": (depth_pixels(seen.depth, near_far, seen.opacity), distances),
         "normals": (normal_pixels(normals, seen.opacity), "x, y, z from -1 to 1 as red, green, blue"),
     }
     written = []

@@ -21,11 +21,10 @@ from mivol.files.lock import locked
 from mivol.report import figures
 from mivol.report.record import (
     METRICS,
-    QUANTITIES,
     RECORD,
-    Quantity,
     RunRecord,
     append_metrics,
+    quantity_of,
     read_metrics,
     read_record,
     rewind_metrics,
@@ -166,10 +165,10 @@ class RunFolder:
         """What was saved, in a line: the results of the record."""
         words = []
         for name, value in self.record.results.items():
-            quantity = QUANTITIES.get(name, Quantity(name))
+            quantity = quantity_of(name, self.record.units)
             if value is not None:
                 figure = f"{value:.0f}" if float(value).is_integer() else f"{value:.4g}"
-                words.append(f"{quantity.label} {figure} {quantity.unit}".rstrip())
+                words.append(f"{quantity.label} {figure} {quantity.beside}".rstrip())
         return f"saved: {', '.join(words)}"
 
     def rewind(self, iteration: int) -> None:
@@ -186,4 +185,4 @@ class RunFolder:
         rows = read_metrics(self.path)
         names = {name for row in rows for name, value in row.items() if value is not None} - {"iteration", "seconds"}
         for name in sorted(names):
-            figures.save(figures.plot_curve(rows, name), self.path / "curves" / f"{name}.png")
+            figures.save(figures.plot_curve(rows, name, units=self.record.units), self.path / "curves" / f"{name}.png")

@@ -109,6 +109,7 @@ def new_record(task: Task) -> RunRecord:
         config=config.resolved(chosen),
         command=task.command,
         seeds={"noise": getattr(chosen.data, "seed", 0)},
+        units={"loss": "1"},
         plan=[
             PlanLine(choice="projector: exact line integrals and their exact transpose", reason="a matched pair: no bias"),
         ],

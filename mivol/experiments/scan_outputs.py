@@ -85,7 +85,7 @@ def write_pair(folder: Path, name: str, pair: Pair, caption: str = "", held_out:
     if not np.isnan(pair.noise).any():
         layers["noise.Y"], roles["standard error"] = pair.noise, "noise.Y"
     write_exr(folder / path, {layer: values.astype(np.float32) for layer, values in layers.items()})
-    common = {"path": path, "view": name, "held_out": held_out, "quantity": LINES, "caption": caption}
+    common = {"path": path, "view": name, "held_out": held_out, "quantity": LINES, "unit": "1", "caption": caption}
     return [Image(role=role, layer=layer, **common) for role, layer in roles.items()]
 
 

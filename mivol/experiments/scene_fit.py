@@ -72,6 +72,7 @@ def scene_fit(task: Task) -> Path:
             seen = find_references(task, loaded, truth)
         with run.stage("fit"):
             problem = make_problem(chosen, loaded.scene, integrator, starts, seen)
+            run.record.units = units(chosen, problem)
             run.record.notes += improve_starts(task, run, problem)
             made = plan_of(chosen, problem)
             run.record.plan = depth + lines_of(made)
@@ -240,3 +241,9 @@ def numbers(problem: SceneProblem) -> dict[str, float]:
     """Each number of the parameters that are no grids or images, by key and place, as the scene holds it now."""
     values = {name: np.asarray(value) for name, value in problem.values().items() if value.ndim == 1}
     return {f"{name}[{i}]": float(x) for name, value in values.items() for i, x in enumerate(value)}
+
+
+def units(chosen: Experiment, problem: SceneProblem) -> dict[str, str]:
+    """Units of the loss and of each of those numbers."""
+    known = {parameter.name: parameter.unit for parameter in problem.parameters}
+    return {"loss": chosen.loss.unit} | {name: known[name.rpartition("[")[0]] for name in numbers(problem)}

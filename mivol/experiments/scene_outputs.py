@@ -18,6 +18,7 @@ from mivol.experiments.film import film_of_volume
 from mivol.experiments.references import References
 from mivol.experiments.run_folder import RunFolder
 from mivol.experiments.start import edges_of, place_of
+from mivol.experiments.units import unit_of
 from mivol.files import write_exr, write_png, write_volume
 from mivol.optim.loop import Fit
 from mivol.optim.parameters import GRID
@@ -106,8 +107,8 @@ class SceneOutputs:
         for role, grid in grids.items():
             stem = f"volumes/{sought.key.replace('.', '_')}_{role}"
             write_volume(self.run.path / f"{stem}.vol", grid, place if is_along_axes else np.eye(4))
-            write_volume(self.run.path / f"{stem}.npz", grid, place, metadata={"key": sought.key, "unit": sought.unit})
-            about = {"quantity": quantity, "unit": sought.unit, "size": edges_of(place), "caption": sought.key}
+            write_volume(self.run.path / f"{stem}.npz", grid, place, metadata={"key": sought.key, "unit": unit_of(sought)})
+            about = {"quantity": quantity, "unit": unit_of(sought), "size": edges_of(place), "caption": sought.key}
             found.append(Volume(path=f"{stem}.npz", role=role, **about))
         self.run.record.images += film_of_volume(self.run, value, edges_of(place), "y", quantity)
         if not self.best.is_newest:

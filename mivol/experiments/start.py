@@ -16,6 +16,7 @@ import numpy as np
 
 from mivol.config import Experiment, Sought
 from mivol.errors import MivolError
+from mivol.experiments.units import unit_of
 from mivol.files import read_volume
 from mivol.files.fetch import place_of as place_in
 from mivol.machine import check_fits
@@ -90,7 +91,7 @@ def make_start(sought: Sought, base: Path, scene: mi.Scene) -> Start:
         check_grid(sought.key, shape, "give parameter.shape fewer voxels")
         value = np.full(shape, start_of(sought, shape), dtype=np.float32)
     extent = edges_of(place_of(sought.key, scene))[::-1] if value.ndim >= GRID else (1.0, 1.0, 1.0)
-    parameter = Parameter(sought.key, sought.unit, sought.domain, sought.map, sought.lr, extent, sought.prior)
+    parameter = Parameter(sought.key, unit_of(sought), sought.domain, sought.map, sought.lr, extent, sought.prior)
     parameter.to_reals(mi.TensorXf(np.ascontiguousarray(value)))
     return Start(parameter, value)
 

@@ -22,10 +22,11 @@ class Loss(Strategy, tag="loss"):
     """A penalty per pixel and channel.
 
     ``is_squared`` tells that it is W/2 r^2: then pairs take the render's noise out exactly, and its gradient, carried
-    back by samples of its own, has no bias in any case.
+    back by samples of its own, has no bias in any case. ``unit`` is that of a penalty, for labels ("": not known).
     """
 
     is_squared: ClassVar[bool] = False
+    unit: ClassVar[str] = ""
 
     pairs: Annotated[bool, of("1", "take the noise of renders out of the loss, by two renders of half the samples")] = False
 
@@ -70,6 +71,8 @@ def check_shapes(image: mi.TensorXf, reference: mi.TensorXf) -> None:
 class L1(Loss, tag="l1"):
     """|r|: the median of noisy references; robust against outliers."""
 
+    unit = "radiance"
+
     def penalty(self, image: mi.TensorXf, reference: mi.TensorXf) -> mi.TensorXf:
         return dr.abs(image - reference)
 
@@ -78,6 +81,7 @@ class L2(Loss, tag="l2"):
     """r^2: the mean of noisy references; maximum likelihood for equal Gaussian noise."""
 
     is_squared = True
+    unit = "radiance²"
 
     def penalty(self, image: mi.TensorXf, reference: mi.TensorXf) -> mi.TensorXf:
         return dr.square(image - reference)
@@ -95,6 +99,7 @@ class RelativeL2(Loss, tag="relative_l2"):
     """
 
     is_squared = True
+    unit = "1"
 
     floor: Annotated[float, of("radiance", "pixels darker than this count as if they were this bright", gt=0)] = 1e-2
 
@@ -112,6 +117,7 @@ class Huber(Loss, tag="huber"):
     """
 
     cites = ("huber_1964",)
+    unit = "radiance²"
 
     delta: Annotated[float, of("radiance", "residual at which the parabola goes over into a line", gt=0)] = 0.1
 
@@ -137,6 +143,8 @@ class Log(Loss, tag="log"):
     constant noise of ``floor``: saturated pixels count for nothing, and so do negative ones. Pixels brighter than the
     light are negative optical depths, and are kept. Source: Elbakri and Fessler 2002, IEEE TMI 21(2).
     """
+
+    unit = "1"
 
     floor: Annotated[float, of("radiance", "noise of a pixel; below it the log goes on as its tangent", gt=0)] = 1e-3
 

@@ -122,7 +122,7 @@ def _draw_side(axes: Axes, survey: PhotoSurvey, lines: dict[str, NDArray], up: i
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
     axes.set_box_aspect(high - low)
     for name, axis in zip(order, (axes.xaxis, axes.yaxis, axes.zaxis), strict=True):
-        axis.set_label_text("xyz"[name])
+        axis.set_label_text(f"{'xyz'[name]} [length]")
         axis.set_major_locator(MaxNLocator(4))
     axes.view_init(22, -60)
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -25,7 +25,7 @@ from numpy.typing import ArrayLike, NDArray
 from mivol.errors import MivolError
 from mivol.files import write_whole
 from mivol.report import show
-from mivol.report.record import QUANTITIES, Quantity
+from mivol.report.record import quantity_of
 
 __all__ = [
     "SERIES",
@@ -134,13 +134,16 @@ def _escape(text: str) -> str:
     return text.replace("&", "&amp;").replace('"', "&quot;").replace("<", "&lt;")
 
 
-def plot_curve(rows: Sequence[dict], name: str, *, against: str = "iteration") -> Figure:
+def plot_curve(
+    rows: Sequence[dict], name: str, *, against: str = "iteration", units: Mapping[str, str] | None = None
+) -> Figure:
     """One quantity of ``metrics.jsonl`` against iterations or seconds, its last value written at its end.
 
     Args:
         rows: rows of :func:`mivol.report.record.read_metrics`; those without a number are left out.
         name: which number.
         against: ``iteration`` or ``seconds``.
+        units: of :class:`mivol.report.record.RunRecord`.
 
     Raises:
         MivolError: no row has that number.
@@ -149,7 +152,7 @@ def plot_curve(rows: Sequence[dict], name: str, *, against: str = "iteration") -
     if not points:
         raise MivolError(f'no row of the metrics has "{name[:80]}"; draw one of those that were recorded.')
     x, y = np.array(points, float).T
-    quantity = QUANTITIES.get(name, Quantity(name.replace("_", " ")))
+    quantity = quantity_of(name, units or {})
     with mpl.rc_context(STYLE):
         figure = empty_figure(4.4, 2.75)
         axes = figure.subplots()

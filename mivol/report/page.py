@@ -24,7 +24,7 @@ from mivol.files import write_whole_text
 from mivol.report import figures
 from mivol.report.gallery import Cut, ShownView, film_of, plain_picture, views_of, volumes_of
 from mivol.report.profiles import profiles_of
-from mivol.report.record import CODES, LINES, QUANTITIES, SINOGRAM, Quantity, RunRecord, read_metrics, read_record
+from mivol.report.record import CODES, LINES, QUANTITIES, SINOGRAM, RunRecord, quantity_of, read_metrics, read_record
 
 __all__ = ["PAGE", "headline", "write_page"]
 
@@ -63,7 +63,7 @@ def write_page(folder: str | Path) -> Path:
         "shown": SHOWN_VIEWS,
         "volumes": volumes,
         "profiles": profiles_of(folder, record.volumes),
-        "curves": _curves(rows),
+        "curves": _curves(rows, record.units),
         "timings": _timings(record.timings),
         "films": [film_of(folder, image) for image in record.images if image.role == "film"],
         "others": [plain_picture(folder, image) for image in record.images if image.role in ("slice", "picture")],
@@ -145,7 +145,7 @@ def _numbers(record: RunRecord, views: Sequence[ShownView], volumes: Sequence[Cu
     held_out = _held_out_psnr(record, views)
     seconds, said, tiles = _seconds(record), ("nrmse", "held_out_psnr", "seconds"), []
     if record.results.get("nrmse") is not None:
-        tiles.append(_tile("nrmse", record.results["nrmse"]))
+        tiles.append(_tile("nrmse", record.results["nrmse"], record.units))
     if held_out:
         spread = f" ({min(held_out):.1f} to {max(held_out):.1f})" if len(held_out) > 1 else ""
         is_raw = record.results.get("psnr_colour_fitted") is not None
@@ -153,25 +153,27 @@ def _numbers(record: RunRecord, views: Sequence[ShownView], volumes: Sequence[Cu
         tiles.append((f"{np.mean(held_out):.1f}", "dB", f"PSNR, held-out views{spread}{said_of}"))
     if seconds:
         tiles.append((*_duration(seconds).split(" "), "in all"))
-    tiles += [_tile(name, value) for name, value in record.results.items() if name not in said]
+    tiles += [_tile(name, value, record.units) for name, value in record.results.items() if name not in said]
     shapes = dict.fromkeys(volume.shape for volume in volumes)
     tiles += [(*_count(math.prod(shape)), f"voxels, {_times(shape)}") for shape in shapes]
     return tiles
 
 
-def _tile(name: str, value: float | None) -> tuple[str, str, str]:
-    quantity = QUANTITIES.get(name, Quantity(name.replace("_", " ")))
+def _tile(name: str, value: float | None, units: dict[str, str]) -> tuple[str, str, str]:
+    quantity = quantity_of(name, units)
     if value is None:
         return "–", "", quantity.label
-    return (f"{value:,.0f}" if float(value).is_integer() else f"{value:.3g}"), quantity.unit, quantity.label
+    return (f"{value:,.0f}" if float(value).is_integer() else f"{value:.3g}"), quantity.beside, quantity.label
 
 
-def _curves(rows: Sequence[dict]) -> list[str]:
+def _curves(rows: Sequence[dict], units: dict[str, str]) -> list[str]:
     """Curves of every number in the metrics: known ones first, then the others by name."""
     names = {name for row in rows for name, value in row.items() if value is not None} - {"iteration", "seconds"}
     ordered = [name for name in QUANTITIES if name in names] + sorted(names - set(QUANTITIES))
-    labels = {name: QUANTITIES.get(name, Quantity(name)).label for name in ordered}
-    return [figures.inline_svg(figures.plot_curve(rows, n), f"{labels[n]} against iterations") for n in ordered]
+    return [
+        figures.inline_svg(figures.plot_curve(rows, name, units=units), f"{quantity_of(name, units).label} against iterations")
+        for name in ordered
+    ]
 
 
 def _seconds(record: RunRecord) -> float:

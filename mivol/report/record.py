@@ -15,6 +15,7 @@ import json
 import math
 import platform
 import re
+from collections.abc import Mapping
 from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path, PurePosixPath
@@ -38,6 +39,7 @@ __all__ = [
     "Volume",
     "append_metrics",
     "describe_machine",
+    "quantity_of",
     "read_metrics",
     "read_record",
     "rewind_metrics",
@@ -69,6 +71,11 @@ class Quantity(NamedTuple):
     unit: str = ""
     log: bool = True
 
+    @property
+    def beside(self) -> str:
+        """The unit as it stands beside a figure: [1] is a pure number, "" a count, a ratio that the label names, or unknown."""
+        return "[1]" if self.unit == "1" else self.unit
+
 
 QUANTITIES: dict[str, Quantity] = {
     "loss": Quantity("Loss"),
@@ -92,6 +99,17 @@ QUANTITIES: dict[str, Quantity] = {
     "views": Quantity("Views fitted", log=False),
     "memory": Quantity("Peak memory", "MiB", log=False),
 }
+
+
+def quantity_of(name: str, units: Mapping[str, str]) -> Quantity:
+    """How a number is named and printed: by ``QUANTITIES``, with the unit that a run has for it.
+
+    Numbers that a run alone has a unit for keep their names, which are keys of a scene, and even steps.
+    """
+    known = QUANTITIES.get(name)
+    if known is None:
+        return Quantity(name, units[name], log=False) if name in units else Quantity(name.replace("_", " "))
+    return known._replace(unit=units.get(name, known.unit))
 
 
 class _Part(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
@@ -177,7 +195,9 @@ class RunRecord(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
     timings: dict[str, float] = {}
     """Seconds by stage, in order; the stages do not overlap."""
     results: dict[str, float | None] = {}
-    """Final numbers; names of :data:`QUANTITIES` are printed with their labels and units."""
+    """Final numbers; names of :data:`QUANTITIES` are printed with their labels."""
+    units: dict[str, str] = {}
+    """Units of numbers of ``results`` and ``metrics.jsonl`` that depend on what was fitted; "1" is a pure number."""
     images: list[Image] = []
     volumes: list[Volume] = []
     tables: list[Table] = []

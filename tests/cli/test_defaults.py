@@ -93,7 +93,7 @@ DEFAULTS = {
     },
     "config.Table": {"detector": (1, 128)},
     "config.Sought": {
-        "unit": "1/length",
+        "unit": "",
         "domain": (0.0, math.inf),
         "map": "identity",
         "lr": 0.1,

@@ -39,7 +39,7 @@ def test_up_is_up_and_the_picture_is_right_handed(survey: PhotoSurvey, up: str, 
     """Cameras stand on a ring about the axis that is up. Seen from the side it is vertical; the plan shows the others."""
     stands = turned(survey, up)
     side, plan = plot_cameras(stands).axes
-    assert [side.get_xlabel(), side.get_ylabel(), side.get_zlabel()] == ["xyz"[k] for k in order]
+    assert [side.get_xlabel(), side.get_ylabel(), side.get_zlabel()] == [f"{'xyz'[k]} [length]" for k in order]
     assert plan.get_title(loc="left") == f"from above ({up} is up)"
     assert (plan.get_xlabel(), plan.get_ylabel()) == tuple(f"{'xyz'[k]} [length]" for k in order[:2])
     assert np.linalg.det(np.eye(3)[list(order)]) == 1

@@ -29,6 +29,19 @@ def test_packages_that_are_not_there_are_left_out(monkeypatch: pytest.MonkeyPatc
     assert found["python"] == platform.python_version() and found["system"].endswith(platform.machine())
 
 
+def test_a_number_has_the_unit_that_its_run_knows() -> None:
+    """Known names keep their labels. A parameter keeps its key, and even steps; what nobody knows is named in plain words."""
+    units = {"loss": "radiance²", "lamp_1.position[0]": "length", "g[0]": "1"}
+    loss, place, g, other, psnr = (
+        record.quantity_of(name, units) for name in ("loss", "lamp_1.position[0]", "g[0]", "my_number", "psnr")
+    )
+    assert loss == record.QUANTITIES["loss"]._replace(unit="radiance²")
+    assert (place, place.beside) == (record.Quantity("lamp_1.position[0]", "length", log=False), "length")
+    assert (g.unit, g.beside) == ("1", "[1]")
+    assert (other, other.beside) == (record.Quantity("my number"), "")
+    assert psnr == record.QUANTITIES["psnr"]
+
+
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no device that is always full")
 def test_a_line_that_the_disk_has_no_room_for_is_said_by_its_file(tmp_path: Path) -> None:
     """The system's own error names none."""
