@@ -1,4 +1,4 @@
-"""Where the cameras of a run stand, as two pictures of its page: from the side and from above."""
+"""Where the cameras or the scanner of a run stand, as two pictures of its page: from the side and from above."""
 
 from __future__ import annotations
 
@@ -7,15 +7,18 @@ from dataclasses import replace
 from pathlib import Path
 
 import mitsuba as mi
+from numpy.typing import NDArray
 
 from mivol.optim.render_batches import View
 from mivol.photos import Frame, Photos, PhotoSurvey
 from mivol.report.cameras import PARTS, plot_cameras
 from mivol.report.record import Image
+from mivol.report.scanner import plot_scanner, shown_views
 from mivol.scene.cameras import find_box
 from mivol.scene.photographs import camera_of
+from mivol.tomography.geometry import FlatDetector, VoxelGrid
 
-__all__ = ["pictures_of_photos", "pictures_of_views"]
+__all__ = ["pictures_of_photos", "pictures_of_scan", "pictures_of_views"]
 
 CAPTIONS = {
     "side": "Where the cameras stand, and the box where matter may be",
@@ -52,6 +55,27 @@ def pictures_of_views(folder: Path, scene: mi.Scene, views: Mapping[str, Sequenc
     if not frames:
         return []
     return _pictures(folder, PhotoSurvey(folder, "a scene", frames, (), find_box(scene), "about its media", (0.0, 0.0)))
+
+
+def pictures_of_scan(folder: Path, geometry: FlatDetector, grid: VoxelGrid, held_out: NDArray) -> list[Image]:
+    """Sources and detectors of a scanner about the voxels.
+
+    Args:
+        folder: of the run, where the pictures are written.
+        geometry: with all views.
+        grid: the voxels.
+        held_out: numbers of the views that were not fitted.
+    """
+    for part in PARTS:
+        plot_scanner(geometry, grid, held_out, folder / f"scanner_{part}.png", part)
+    count = geometry.shape[0]
+    shown = sum(map(len, shown_views(count, held_out)))
+    what = "Which way the light goes" if geometry.whole_lines else "Where the source stands"
+    captions = {
+        "side": f"{what} in {f'{shown} of ' * (shown < count)}{count} views, some detectors, and the box of the voxels",
+        "plan": CAPTIONS["plan"],
+    }
+    return [Image(path=f"scanner_{part}.png", role="picture", caption=captions[part]) for part in PARTS]
 
 
 def _pictures(folder: Path, survey: PhotoSurvey) -> list[Image]:

@@ -22,7 +22,7 @@ from mivol.optim.linear_problems import PoissonCounts
 from mivol.optim.solvers import METHODS
 from mivol.shown import briefly
 from mivol.tomography.fan_axis import axis_from_fans, offset_of_cone
-from mivol.tomography.geometry import ConeBeam, Geometry, ParallelBeam, VoxelGrid
+from mivol.tomography.geometry import ConeBeam, FlatDetector, ParallelBeam, VoxelGrid
 from mivol.tomography.panel_views import COLUMNS, PanelViews
 from mivol.tomography.phantoms import shepp_logan
 from mivol.tomography.preprocess import (
@@ -52,7 +52,7 @@ class Projections:
         is_noise_known: whether 1 / weights are variances, and not only in proportion to them.
     """
 
-    geometry: Geometry
+    geometry: FlatDetector
     y: np.ndarray
     weights: np.ndarray
     truth: np.ndarray | None = None
@@ -70,7 +70,7 @@ def beam_of(chosen: config.Scan) -> str:
     return f"{type(chosen.data if isinstance(chosen.scan, OfData) else chosen.scan).__name__.lower()} beam"
 
 
-def make_geometry(chosen: config.Scan, base: Path) -> Geometry:
+def make_geometry(chosen: config.Scan, base: Path) -> FlatDetector:
     """Beam and detector of computed projections."""
     wanted = chosen.scan
     angles = np.arange(0) if isinstance(wanted, Table | Matrices) else evenly(wanted)
@@ -84,7 +84,7 @@ def evenly(wanted: Detector) -> np.ndarray:
 
 def place_beam(
     chosen: config.Scan, base: Path, angles: np.ndarray, detector: tuple[int, int], axis_offset: float | None = None
-) -> Geometry:
+) -> FlatDetector:
     """The beam that was asked for, with these angles [rad] and pixels; a found ``axis_offset`` replaces the file's."""
     wanted = chosen.scan
     if isinstance(wanted, Table):
@@ -148,14 +148,16 @@ def check_hits(projector: Projector) -> None:
     )
 
 
-def project_ellipsoids(wanted: Ellipsoids, base: Path, geometry: Geometry, grid: VoxelGrid) -> tuple[np.ndarray, np.ndarray]:
+def project_ellipsoids(
+    wanted: Ellipsoids, base: Path, geometry: FlatDetector, grid: VoxelGrid
+) -> tuple[np.ndarray, np.ndarray]:
     """Exact chords, and the phantom averaged over voxels."""
     phantom = shepp_logan(wanted.table, wanted.half_width)
     # Two sub-points an edge err by 0.06 of a head of 128^3, four by 0.015: less than what is judged by them.
     return wanted.scale * phantom.project(geometry), wanted.scale * phantom.voxelise(grid, 4)
 
 
-def project_volume(wanted: Known, base: Path, geometry: Geometry, grid: VoxelGrid) -> tuple[np.ndarray, np.ndarray]:
+def project_volume(wanted: Known, base: Path, geometry: FlatDetector, grid: VoxelGrid) -> tuple[np.ndarray, np.ndarray]:
     """Line integrals of a volume file, and the volume.
 
     Raises:
@@ -171,7 +173,7 @@ def project_volume(wanted: Known, base: Path, geometry: Geometry, grid: VoxelGri
 SIMULATED = {Ellipsoids: project_ellipsoids, Known: project_volume}
 
 
-def add_noise(geometry: Geometry, exact: np.ndarray, truth: np.ndarray, photons: float, seed: int) -> Projections:
+def add_noise(geometry: FlatDetector, exact: np.ndarray, truth: np.ndarray, photons: float, seed: int) -> Projections:
     """Line integrals of Poisson counts, weighted by 1 / var y = counts; without photons the exact ones.
 
     A pixel without a single quantum has no logarithm: y = 0 and weight 0.

@@ -14,7 +14,7 @@ from mivol.experiments.nikon_scan import read_nikon_scan
 from mivol.files import read_columns, read_projections, read_stack
 from mivol.files.fetch import place_of
 from mivol.shown import briefly
-from mivol.tomography.geometry import Geometry
+from mivol.tomography.geometry import FlatDetector
 from mivol.tomography.preprocess import Transmission, correct_transmission, of_unknown_noise
 
 
@@ -33,7 +33,7 @@ class ScanReadings:
 
     transmission: Transmission
     angles: np.ndarray | None = None
-    geometry: Geometry | None = None
+    geometry: FlatDetector | None = None
     intensity: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
     notes: tuple[str, ...] = ()
 

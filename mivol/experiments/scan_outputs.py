@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mivol.experiments.best import BestIterate
+from mivol.experiments.camera_pictures import pictures_of_scan
 from mivol.experiments.film import film_of_volume
 from mivol.experiments.projections import Projections
 from mivol.experiments.run_folder import RunFolder
@@ -45,6 +46,7 @@ def write_outputs(
         for view in held_out[:4]:
             pair = Pair(*(part[view, ::-1] for part in (data.y, predicted, noise)))
             record.images += write_pair(run.path, f"view {view}", pair, held_out=True)
+    record.images += pictures_of_scan(run.path, data.geometry, grid, held_out)
     run.write_curves()
     record.results["views"] = float(projector.n_views - len(held_out))
     if data.truth is not None:

@@ -10,7 +10,7 @@ import pytest
 
 from mivol.experiments.scan_outputs import write_outputs
 from mivol.files import read_exr, read_volume
-from mivol.tomography.geometry import VoxelGrid
+from mivol.tomography.geometry import ParallelBeam, VoxelGrid
 
 GRID = VoxelGrid((2, 3, 4), (0.5, 0.25, 0.75))
 
@@ -31,7 +31,8 @@ def written(
 
     weights = np.full(y.shape, 4.0)
     weights[..., 0] = 0 if is_noise_known else 4.0
-    data = SimpleNamespace(y=y, weights=weights, truth=truth, is_noise_known=is_noise_known)
+    beam = ParallelBeam(np.arange(len(y)) / len(y), y.shape[1:])
+    data = SimpleNamespace(y=y, weights=weights, truth=truth, is_noise_known=is_noise_known, geometry=beam)
     write_outputs(run, Half(), GRID, data, held_out, np.arange(24.0, dtype=np.float32).reshape(GRID.shape))
     return record
 
@@ -41,14 +42,19 @@ def test_outputs_of_a_scan(tmp_path: Path) -> None:
     y = np.arange(120.0, dtype=np.float32).reshape(6, 4, 5)
     held_out = np.arange(1, 6)
     record = written(tmp_path, y, held_out, np.arange(24.0).reshape(GRID.shape))
-    shown = [(image.view, image.role, image.held_out) for image in record.images]
+    *views, side, plan = record.images
+    assert [(image.path, image.role) for image in (side, plan)] == [
+        ("scanner_side.png", "picture"),
+        ("scanner_plan.png", "picture"),
+    ]
+    shown = [(image.view, image.role, image.held_out) for image in views]
     names = [("sinogram", False), *((f"view {k}", True) for k in (1, 2, 3, 4))]
     assert shown == [(name, role, kept) for name, kept in names for role in ("render", "reference")]
     for name, expected in (("sinogram", y[:, 2]), ("view_3", y[3, ::-1])):
         channels, _ = read_exr(tmp_path / "views" / f"{name}.exr")
         np.testing.assert_array_equal(channels["reference.Y"], expected)
         np.testing.assert_array_equal(channels["Y"], 0.5 * expected)
-    assert {image.caption for image in record.images} == {"row 3 of 4", ""}
+    assert {image.caption for image in views} == {"row 3 of 4", ""}
     assert all(volume.profiles for volume in record.volumes)
     # A residual of half of what was measured, over a noise of 1/2.
     assert record.results == {
@@ -65,12 +71,12 @@ def test_outputs_of_a_scan(tmp_path: Path) -> None:
 def test_a_single_row_is_the_sinogram(tmp_path: Path) -> None:
     """Views of one row are shown as the sinogram alone; without a truth or views held out nothing is said of them."""
     record = written(tmp_path, np.ones((4, 1, 5), np.float32), np.arange(0), None)
-    assert {image.view for image in record.images} == {"sinogram"}
+    assert {image.view for image in record.images if image.role != "picture"} == {"sinogram"}
     assert record.results == {"views": 4.0}
     assert [volume.role for volume in record.volumes] == ["reconstruction"]
     (tmp_path / "held out").mkdir()
     record = written(tmp_path / "held out", np.ones((4, 1, 5), np.float32), np.arange(1), None)
-    assert {image.view for image in record.images} == {"sinogram"}
+    assert {image.view for image in record.images if image.role != "picture"} == {"sinogram"}
 
 
 def test_noise_that_is_known_stands_beside_the_lines(tmp_path: Path) -> None:
