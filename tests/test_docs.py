@@ -190,3 +190,15 @@ def test_theory_says_what_each_name_computes() -> None:
     assert len(chosen) > 20
     assert [name for name in chosen if f"`{name}`" not in text] == []
     assert [study for study in STUDIES if f"`{study}`" not in text] == []
+
+
+@pytest.mark.parametrize("path", [*sorted(DOCS.rglob("*.md")), *sorted(DOCS.rglob("*.ipynb"))], ids=name_of)
+def test_fractions_have_braces(path: Path) -> None:
+    """What makes MathML of the formulas takes both digits of "frac12" for the numerator, without a warning."""
+    assert re.findall(r"frac\s*\d\S*", path.read_text()) == []
+
+
+def test_formulas_need_no_script() -> None:
+    """The pages are built with MathML; a build that makes a warning of one fails (docs.yml)."""
+    assert re.search(r'^html_math_renderer = "mathml"$', (DOCS / "conf.py").read_text(), re.MULTILINE)
+    assert "sphinx -W" in (ROOT / ".github" / "workflows" / "docs.yml").read_text()
