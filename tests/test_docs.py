@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import importlib
+import json
 import re
 import shlex
 import tomllib
@@ -30,6 +31,10 @@ SCREENS = 2 * 1000
 """Height of two screens [pixel]."""
 COLUMN, LETTER, LINE = 948, 7.3, 24
 """Of a page as GitHub shows it in a window of 1280 pixels: width of its text, of a letter, and height of a line [pixel]."""
+
+WIDEST = 106
+"""Letters of a line of code in a page of docs/ as it is shown in a window of 1280 pixels (docs/_static/wide.css), as measured
+in Chromium."""
 
 
 def name_of(path: Path) -> str:
@@ -202,3 +207,21 @@ def test_formulas_need_no_script() -> None:
     """The pages are built with MathML; a build that makes a warning of one fails (docs.yml)."""
     assert re.search(r'^html_math_renderer = "mathml"$', (DOCS / "conf.py").read_text(), re.MULTILINE)
     assert "sphinx -W" in (ROOT / ".github" / "workflows" / "docs.yml").read_text()
+
+
+def code_of(path: Path) -> list[str]:
+    """Lines of code that a page shows: of blocks, of cells, or all of a script."""
+    if path.suffix == ".ipynb":
+        cells = [cell["source"] for cell in json.loads(path.read_text())["cells"] if cell["cell_type"] == "code"]
+        return [line for source in cells for line in "".join(source).splitlines()]
+    if path.suffix == ".py":
+        return path.read_text().splitlines()
+    return [
+        line for _, block in re.findall(r"^```(.*)\n(.*?)^```", path.read_text(), re.M | re.S) for line in block.splitlines()
+    ]
+
+
+@pytest.mark.parametrize("path", [*_pages(), *sorted((DOCS / "scripts").glob("*.py"))], ids=name_of)
+def test_code_is_seen_whole(path: Path) -> None:
+    """In a window of 1280 pixels: longer lines would have to be scrolled."""
+    assert [line for line in code_of(path) if len(line) > WIDEST] == []
