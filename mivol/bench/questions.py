@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -21,11 +22,23 @@ from mivol.errors import MivolError
 from mivol.files import write_whole_text
 from mivol.report.record import describe_machine, versions
 
-__all__ = ["Bench", "Question"]
+__all__ = ["Bench", "Expected", "Question", "called"]
 
 Question = Callable[[object], dict]
 """Takes a size, returns an answer for the JSON; the first line of its docstring is what is asked. NumPy arrays in an answer
 are for its figure: the JSON leaves them out."""
+
+
+class Expected(NamedTuple):
+    """What a JSON of the same kind holds: the same values under some keys, and an answer to one of the questions at least."""
+
+    same: dict[str, object]
+    questions: tuple[str, ...]
+
+
+def called(script: str) -> str:
+    """How a bench is called: by its script, where that is what runs, else by the verb."""
+    return f"{script}.py" if Path(sys.argv[0]).stem == script else f"mivol bench {script.removeprefix('bench_')}"
 
 
 @dataclass(frozen=True)
@@ -70,7 +83,7 @@ class Bench:
         try:
             found = self.measure(args)
         except MivolError as error:
-            say(f"{self.name}: {error}")
+            say(f"{called(self.name)}: {error}")
             return 1
         if beyond := means_that_differ(found["bars"]):
             say(f"the means differ ({'; '.join(beyond)}): the ratios mean nothing")
@@ -90,11 +103,16 @@ class Bench:
         sys.stdout.write(text)
         return figures
 
+    def expected(self, argv: Sequence[str]) -> Expected:
+        """What the JSON of these arguments will hold; the process ends where they are wrong."""
+        args = self.parse(argv)
+        return Expected({"size": (self.quick if args.quick else self.full).name}, tuple(args.only.split(",")))
+
     def parse(self, argv: Sequence[str] | None = None) -> argparse.Namespace:
         """The command line; the process ends where it asks what is no question."""
         default = [q for q in self.questions if q not in self.unasked]
         parser = argparse.ArgumentParser(
-            prog=f"{self.name}.py", description=self.doc, formatter_class=argparse.RawDescriptionHelpFormatter
+            prog=called(self.name), description=self.doc, formatter_class=argparse.RawDescriptionHelpFormatter
         )
         parser.add_argument("--quick", action="store_true", help="small sizes, for CI: its times mean nothing")
         parser.add_argument("--only", default=",".join(default), help=f"questions to ask, of {','.join(self.questions)}")

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from mivol.bench.bars import say
+from mivol.bench.questions import Expected
 from mivol.errors import MivolError
 from mivol.optim.strategy import nearest
 
@@ -51,16 +52,39 @@ def run_study(name: str, argv: Sequence[str], older: Path | None = None) -> int:
         older: a JSON that the study wrote before: what has changed since is said.
 
     Raises:
-        MivolError: no such study, or an older result that cannot be read or is of another size.
+        MivolError: no such study, or an older result that cannot be read or is of another kind; before anything is measured.
     """
     if name not in STUDIES:
         raise MivolError(f'there is no study "{name}": {nearest(name, list(STUDIES))}')
-    before = read_result(older) if older is not None else None
-    code = importlib.import_module(f"mivol.bench.{name}").main(list(argv))
+    study = importlib.import_module(f"mivol.bench.{name}")
+    before = None
+    if older is not None:
+        before = read_result(older)
+        check_kind(name, before, study.BENCH.expected(argv) if hasattr(study, "BENCH") else study.expected(argv))
+    code = study.main(list(argv))
     if before is not None and code == 0:
         now = read_result(folder_of(name, argv) / f"{STUDIES[name]}.json")
         say("\n".join(changes(before, now)) or f"no figure has changed by {NOTABLE:.0%} or more")
     return code
+
+
+def check_kind(name: str, before: dict, expected: Expected) -> None:
+    """Refuse an older result of another study, of other questions or of another size.
+
+    Raises:
+        MivolError: what it is, and what will be measured.
+    """
+    if not any(question in before for question in expected.questions):
+        raise MivolError(
+            f"the older result answers none of the questions of {name} that are asked ({', '.join(expected.questions)}): "
+            f"give the JSON that mivol bench {name} wrote."
+        )
+    for key, value in expected.same.items():
+        if before.get(key) != value:
+            raise MivolError(
+                f"the older result is of the {key} {before.get(key)} and this one {value}: "
+                "compare like with like, by the flags that it was made with."
+            )
 
 
 def folder_of(name: str, argv: Sequence[str]) -> Path:
@@ -85,16 +109,7 @@ def read_result(path: Path) -> dict:
 
 
 def changes(before: dict, now: dict) -> list[str]:
-    """Figures that differ by ``NOTABLE`` or more, the largest change first; figures that only one result has are left out.
-
-    Raises:
-        MivolError: the results are of different sizes.
-    """
-    if before.get("size") != now.get("size"):
-        raise MivolError(
-            f"the older result is of the size {before.get('size')} and this one {now.get('size')}: compare like with like "
-            "(--quick or not)."
-        )
+    """Figures that differ by ``NOTABLE`` or more, the largest change first; figures that only one result has are left out."""
     old, new = dict(numbers_in(before)), dict(numbers_in(now))
     ratios = {key: new[key] / old[key] for key in new if key in old and old[key] * new[key] > 0}
     notable = [key for key, ratio in ratios.items() if abs(ratio - 1) >= NOTABLE]

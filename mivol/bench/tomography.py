@@ -35,6 +35,7 @@ import numpy as np
 import mivol
 from mivol.bench.bars import say
 from mivol.bench.figures import drawn
+from mivol.bench.questions import Expected, called
 from mivol.bench.timing import Stopwatch, fastest
 from mivol.bench.tomography_parts import measure_parts, rows_of_parts
 from mivol.bench.tomography_peers import compare, ratios, rows, slices_of_the_head
@@ -50,7 +51,10 @@ from mivol.tomography.phantoms import SHEPP_LOGAN, shepp_logan
 from mivol.tomography.projector import Projector
 from mivol.validate.metrics import nrmse
 
-__all__ = ["Scan", "adjoint_mismatch", "costs", "main", "methods", "reconstruct", "scan_of_head", "scan_of_volume", "table"]
+__all__ = [
+    "Scan", "adjoint_mismatch", "costs", "expected", "main", "methods", "reconstruct", "scan_of_head", "scan_of_volume",
+    "table",
+]  # fmt: skip
 
 REPORTED = (5, 10, 20)
 BAR = 0.2
@@ -184,8 +188,9 @@ def table(curves: dict) -> dict:
 def parse(argv: Sequence[str] | None = None) -> argparse.Namespace:
     """The command line."""
     parser = argparse.ArgumentParser(
-        prog="bench_tomography.py", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+        prog=called("bench_tomography"), description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
+    parser.add_argument("--quick", action="store_true", help="32^3 from 24 views, for CI: its times mean nothing")
     parser.add_argument("--size", type=int, default=128, help="voxels along an edge, pixels along a detector's (128)")
     parser.add_argument("--views", type=int, default=100)
     parser.add_argument("--iterations", type=int, default=20)
@@ -197,7 +202,22 @@ def parse(argv: Sequence[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--only", choices=["volume256", "parts"], help="one question, and nothing else")
     parser.add_argument("--variant", default="llvm_ad_rgb")
     parser.add_argument("--out", type=Path, default=Path("runs/bench_tomography"))
-    return parser.parse_args(argv)
+    args = parser.parse_args(argv)
+    if args.quick:
+        args.size, args.views, args.iterations = 32, 24, 5
+    return args
+
+
+def expected(argv: Sequence[str]) -> Expected:
+    """What the JSON of these arguments will hold.
+
+    Raises:
+        MivolError: they ask for what is printed only.
+    """
+    args = parse(argv)
+    if args.beside or args.only:
+        raise MivolError("--beside and --only print and write no JSON: leave --compare out, or these.")
+    return Expected({"grid": [args.size] * 3, "projections": [args.views, args.size, args.size]}, ("nrmse",))
 
 
 def measure(args: argparse.Namespace) -> tuple[dict, dict]:
@@ -245,7 +265,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         report, curves = measure(args)
         write_whole_text(args.out / "tomography.json", json.dumps(report | {"curves": curves}, indent=2) + "\n")
     except MivolError as error:
-        print(f"bench_tomography: {error}", file=sys.stderr)
+        print(f"{called('bench_tomography')}: {error}", file=sys.stderr)
         return 1
     print(json.dumps(report, indent=2))
     return 0

@@ -100,12 +100,14 @@ def test_missed_bars_are_said_and_differing_means_end_with_1(
 
 def test_refusals(variant_rgb: str, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     """A question that is none ends the command line; what a question refuses becomes one sentence."""
+    assert TOY.expected(["--quick"]) == ({"size": "quick"}, ("height",))
+    assert TOY.expected(["--only", "width,height"]) == ({"size": "full"}, ("width", "height"))
     with pytest.raises(SystemExit) as ended:
         TOY.run(["--only", "height,depth"])
     assert ended.value.code == 2
     assert "--only: depth is not a question; known are height, width" in capsys.readouterr().err
     assert TOY.run(["--quick", "--only", "width", "--out", str(tmp_path), "--variant", variant_rgb]) == 1
-    assert "toy: it has no width; ask for its height." in capsys.readouterr().err
+    assert "mivol bench toy: it has no width; ask for its height." in capsys.readouterr().err
 
 
 def test_arrays_are_for_the_figure() -> None:
@@ -113,7 +115,7 @@ def test_arrays_are_for_the_figure() -> None:
 
 
 @pytest.mark.parametrize("script", BENCHES)
-def test_scripts_only_call_their_module(script: str, capsys: pytest.CaptureFixture) -> None:
+def test_scripts_only_call_their_module(script: str, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch) -> None:
     """The script imports main and ends with what it returns; ``--help`` prints what the module says of itself."""
     module = __import__(f"mivol.bench.{BENCHES[script]}", fromlist=["main"])
     text = (ROOT / "scripts" / f"{script}.py").read_text()
@@ -121,6 +123,7 @@ def test_scripts_only_call_their_module(script: str, capsys: pytest.CaptureFixtu
     assert text.endswith(
         f'import sys\n\nfrom mivol.bench.{BENCHES[script]} import main\n\nif __name__ == "__main__":\n    sys.exit(main())\n'
     )
+    monkeypatch.setattr(sys, "argv", [f"scripts/{script}.py"])
     with pytest.raises(SystemExit) as ended:
         module.main(["--help"])
     assert ended.value.code == 0

@@ -5,11 +5,13 @@ from __future__ import annotations
 import importlib
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from tiny_experiment import refused, run
 
-from mivol.bench import studies
+from mivol.bench import studies, tomography
+from mivol.bench.questions import Expected
 from mivol.errors import MivolError
 
 
@@ -33,12 +35,16 @@ def test_changes_are_said_largest_first(tmp_path: Path, capsys: pytest.CaptureFi
     """A study that stands in for the others: it writes a result where it is told to, and hears its flags."""
 
     class Study:
+        BENCH = SimpleNamespace(expected=lambda argv: Expected({"size": "quick"}, ("walk", "run")))
+
         @staticmethod
         def main(argv: list[str]) -> int:
+            ran.append(argv)
             assert argv[:2] == ["--quick", "--out"]
             write(Path(argv[2]) / "bench_depth.json", 4.0)
             return 0
 
+    ran: list[list[str]] = []
     monkeypatch.setattr(importlib, "import_module", lambda name: Study)
     old = write(tmp_path / "old.json", 2.0)
     assert run("bench", "depth", "--quick", "--compare", old, "--out", tmp_path) == 0
@@ -46,10 +52,13 @@ def test_changes_are_said_largest_first(tmp_path: Path, capsys: pytest.CaptureFi
     write(old, 4.1)
     assert run("bench", "depth", "--quick", "--compare", old, "--out", tmp_path) == 0
     assert "no figure has changed by 10% or more" in capsys.readouterr().err
+    ran.clear()
     write(old, 2.0, "full")
-    assert "of the size full and this one quick" in refused(
-        capsys, "bench", "depth", "--quick", "--compare", old, "--out", tmp_path
-    )
+    flags = ["bench", "depth", "--quick", "--compare", old, "--out", tmp_path]
+    assert "of the size full and this one quick" in refused(capsys, *flags)
+    old.write_text('{"size": "quick", "swim": {}}')
+    assert "none of the questions of depth that are asked (walk, run)" in refused(capsys, *flags)
+    assert ran == []
 
 
 def test_refusals(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
@@ -71,3 +80,21 @@ def test_the_runs_own_numbers_are_not_compared() -> None:
     walk = {"seconds": 2.0, "on": True, "name": "x", "costs": [1, {"machine": 5}]}
     found = studies.numbers_in(own | {"walk": walk})
     assert found == [("walk.seconds", 2.0), ("walk.costs.0", 1.0), ("walk.costs.1.machine", 5.0)]
+
+
+def test_tomography_says_what_it_writes(variant_rgb: str) -> None:
+    """Its grid and its projections are its size; what it prints only cannot be compared."""
+    for flags in (["--size", "32", "--views", "24"], ["--quick"]):
+        found = tomography.expected(flags)
+        assert found == ({"grid": [32, 32, 32], "projections": [24, 32, 32]}, ("nrmse",))
+    for flags in (["--beside"], ["--only", "parts"]):
+        with pytest.raises(MivolError, match="write no JSON"):
+            tomography.expected(flags)
+
+
+def test_wrong_flags_name_the_verb(capsys: pytest.CaptureFixture) -> None:
+    """And not the script that would do the same."""
+    for name in studies.STUDIES:
+        with pytest.raises(SystemExit):
+            run("bench", name, "--wrong")
+        assert capsys.readouterr().err.startswith(f"usage: mivol bench {name} [-h]")

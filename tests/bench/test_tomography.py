@@ -90,8 +90,8 @@ def test_main_writes_what_it_prints(
 def test_sizes_that_are_not_given() -> None:
     """Those of the published table."""
     assert vars(bench.parse([])) == {
-        "size": 128, "views": 100, "iterations": 20, "phantom": "yu-ye-wang", "volume": None, "beside": None, "only": None,
-        "variant": "llvm_ad_rgb", "out": Path("runs/bench_tomography"),
+        "quick": False, "size": 128, "views": 100, "iterations": 20, "phantom": "yu-ye-wang", "volume": None, "beside": None,
+        "only": None, "variant": "llvm_ad_rgb", "out": Path("runs/bench_tomography"),
     }  # fmt: skip
 
 
