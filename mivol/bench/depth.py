@@ -230,9 +230,9 @@ def draw(answers: dict, folder: Path) -> None:
             panels[0, 0].plot([], [], marker, color="gray", mfc="none", ms=8, label=label)
         panels[0, 0].legend(fontsize=8)
         for axes in panels[1]:
-            axes.set_xlabel("optical depth as scattered light sees it")
+            axes.set_xlabel("optical depth as scattered light sees it [1]")
         for axes in panels[:, 0]:
-            axes.set_ylabel("scattered light that max_depth 2 leaves out")
+            axes.set_ylabel("share of scattered light left out by depth 2 [1]")
 
 
 def draw_table(axes: Axes, cells: list[Cell], light: str, phase: str) -> None:

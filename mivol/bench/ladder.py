@@ -198,8 +198,8 @@ def draw(answers: dict, folder: Path) -> None:
             pixels = answer[name]["image"]["picture"]
             picture.imshow(np.clip(pixels / np.quantile(pixels, 0.99), 0, 1) ** (1 / 2.2), interpolation="nearest")
             picture.set(title=name, xticks=[], yticks=[])
-            _draw_errors(image, answer[name]["image"], "volpath", "error of a pixel" if k == 0 else "")
-            _draw_errors(gradient, answer[name]["gradient"], "prbvolpath", "error of a voxel's gradient" if k == 0 else "")
+            _draw_errors(image, answer[name]["image"], "volpath", "relative error of a pixel [1]" if k == 0 else "")
+            _draw_errors(gradient, answer[name]["gradient"], "prbvolpath", "relative error of a slope [1]" if k == 0 else "")
 
 
 def _draw_errors(axes: Axes, figures: dict, stock: str, what: str) -> None:

@@ -200,7 +200,7 @@ def draw(answers: dict, folder: Path) -> None:
         for line, (question, answer) in zip(figure.subplots(len(rows), columns, squeeze=False), rows, strict=True):
             for name, found in answer.items():
                 line[0].plot(found["minutes"], found["psnr"], "o", label=name)
-            line[0].set_xlabel("minutes")
+            line[0].set_xlabel("time [min]")
             line[0].set_ylabel("PSNR [dB]")
             line[0].set_title(question)
             line[0].legend(fontsize=7)

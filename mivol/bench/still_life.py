@@ -163,6 +163,10 @@ def compare(question: str, answer: dict) -> list[Bar]:
     return [judge("dB of total variation over none, few views", psnr["TV"] - psnr["no TV"], AT_LEAST, 0)]
 
 
+BRIGHTEST = 0.25
+"""Error that the figure shows in the brightest colour."""
+
+
 def draw(answers: dict, folder: Path) -> None:
     """A held-out view: the photograph, and each fit with what it misses."""
     shown = [(question, name, found) for question, fits in answers.items() for name, found in fits.items()]
@@ -170,12 +174,15 @@ def draw(answers: dict, folder: Path) -> None:
         axes = figure.subplots(2, len(shown) + 1, squeeze=False)
         axes[0, 0].imshow(shown[0][2]["photograph"])
         axes[0, 0].set_title("photograph", fontsize=9)
+        scale = f"black 0, yellow {BRIGHTEST:g} and more\n[code value, white is 1]"
+        says = f"errors, mean of the colours:\n{scale};\nnumbers above are PSNR"
+        axes[1, 0].text(0, 1, says, transform=axes[1, 0].transAxes, va="top", fontsize=8)
         for column, (question, name, found) in enumerate(shown, 1):
             few = f", {found['views']} views" if question == "few" else ""
             axes[0, column].imshow(np.clip(found["view"], 0, 1))
             axes[0, column].set_title(f"{name}{few}: {found['psnr']:.1f} dB", fontsize=9)
             error = np.abs(found["view"] - found["photograph"]).mean(axis=2)
-            axes[1, column].imshow(error, cmap="magma", vmin=0, vmax=0.25)
+            axes[1, column].imshow(error, cmap="magma", vmin=0, vmax=BRIGHTEST)
         for one in axes.flat:
             one.set_axis_off()
 

@@ -31,10 +31,11 @@ from typing import NamedTuple
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from matplotlib.ticker import MaxNLocator
 
 import mivol
 from mivol.bench.bars import say
-from mivol.bench.figures import drawn
+from mivol.bench.figures import drawn, plain_ticks
 from mivol.bench.questions import Expected, called
 from mivol.bench.timing import Stopwatch, fastest
 from mivol.bench.tomography_parts import measure_parts, rows_of_parts
@@ -161,9 +162,11 @@ def draw(scan: Scan, curves: dict, volumes: dict, path: Path) -> None:
         for label, curve in curves.items():
             axes[0, 0].plot(range(1, len(curve["nrmse"]) + 1), curve["nrmse"], "o-", ms=3, label=label)
             axes[0, 1].plot(curve["seconds"], curve["nrmse"], "o-", ms=3, label=label)
-        for ax, what in zip(axes[0], ("iteration", "seconds"), strict=False):
+        for ax, what in zip(axes[0], ("iteration", "time [s]"), strict=False):
             ax.axhline(BAR, color="gray", ls=":", label="accepted in TIGRE's tests")
-            ax.set(xlabel=what, ylabel="nRMSE", yscale="log")
+            ax.set(xlabel=what, ylabel="nRMSE [1]", yscale="log")
+            plain_ticks(ax.yaxis, "")
+            ax.xaxis.set_major_locator(MaxNLocator(6, integer=what == "iteration"))
         axes[0, 0].legend()
         k, top = scan.truth.shape[0] * 3 // 8, float(np.percentile(scan.truth, 99.9)) * 0.6
         shown = {"truth": scan.truth} | volumes
@@ -173,7 +176,9 @@ def draw(scan: Scan, curves: dict, volumes: dict, path: Path) -> None:
             if volume is not None:
                 ax.imshow(volume[k], cmap="gray", vmin=0, vmax=top, origin="lower")
                 ax.set_title(label)
-        figure.suptitle(f"{scan.name}, {'x'.join(map(str, scan.truth.shape))}")
+        shape = " x ".join(map(str, scan.truth.shape))
+        title = f"{scan.name}, {shape}; slices: black is 0, white {top:.3g} [1/length]"
+        figure.suptitle(title, x=0.01, ha="left", weight="bold")
 
 
 def table(curves: dict) -> dict:
@@ -217,7 +222,7 @@ def expected(argv: Sequence[str]) -> Expected:
     args = parse(argv)
     if args.beside or args.only:
         raise MivolError("--beside and --only print and write no JSON: leave --compare out, or these.")
-    return Expected({"grid": [args.size] * 3, "projections": [args.views, args.size, args.size]}, ("nrmse",))
+    return Expected({"grid": [args.size] * 3, "projections": [args.views, *[args.size] * 2]}, ("nrmse",))
 
 
 def measure(args: argparse.Namespace) -> tuple[dict, dict]:

@@ -278,10 +278,8 @@ def write_verdict(
     verdict: Verdict, image: Estimate, reference: ReferenceResult, folder: Path, chosen: Validation
 ) -> Verdict:
     """``validation.json`` and ``validation.png``; the verdict that names them."""
-    # Where neither has any noise, z is drawn as if float32 had rounded the values once.
-    error = np.sqrt(np.asarray(image.var) + reference.variance + (6e-8 * max(float(reference.mean.max()), 1e-30)) ** 2)
-    picture = figures.save(figures.plot_image_row(reference.mean, image.mean, error), folder / "validation.png")
     compared = verdict.comparison
+    picture = figures.save(figures.plot_image_row(reference.mean, image.mean, compared.z), folder / "validation.png")
     about = {
         "verdict": verdict.words,
         "code": verdict.code,

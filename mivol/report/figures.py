@@ -238,30 +238,33 @@ def plot_slices(
     return figure
 
 
-def plot_image_row(reference: NDArray, render: NDArray, standard_error: NDArray | None = None, *, unit: str = "") -> Figure:
-    """Reference, render, signed difference, and the z-image where the standard error of the reference is known.
+def plot_image_row(reference: NDArray, render: NDArray, z: NDArray | None = None, *, unit: str = "") -> Figure:
+    """Reference, render, signed difference, and the z-image where there is one.
 
     Args:
         reference: (height, width[, C]).
         render: the same shape.
-        standard_error: the same shape, above 0; z = difference / standard_error.
+        z: the same shape, the difference in standard errors.
         unit: of the values.
     """
+    label = f"radiance [{unit}]" if unit else "radiance"
     difference = np.asarray(render, float) - np.asarray(reference, float)
     values = show.scale_of(reference)
     panels = [
         ("reference", reference, values),
         ("render", render, values),
-        ("render - reference", difference, show.signed_scale(difference)),
+        ("render − reference", difference, show.signed_scale(difference)),
     ]
-    if standard_error is not None:
-        panels.append(("z", difference / standard_error, show.Scale("signed", -4.0, 4.0)))
+    if z is not None:
+        panels.append(("z", z, show.Scale("signed", -4.0, 4.0)))
     with mpl.rc_context(STYLE):
         figure = empty_figure(2.6 * len(panels), 2.9)
         for axes, (name, image, scale) in zip(figure.subplots(1, len(panels)), panels, strict=True):
             _picture(axes, show.pixels(image, scale), image.shape[1] / image.shape[0])
             axes.set_title(name)
-            _bar(figure, [axes], scale, "difference / standard error" if name == "z" else unit, below=True)
+            if scale.kind == "colour":
+                axes.set_xlabel(f"{label}: white is {scale.high:.3g}")
+            _bar(figure, [axes], scale, "difference / standard error" if name == "z" else label, below=True)
     return figure
 
 

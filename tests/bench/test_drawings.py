@@ -14,6 +14,7 @@ from report.looks import assert_recorded
 from mivol.bench import (
     depth,
     gradients,
+    media_light,
     multiple_scattering,
     optical_depth,
     radiance_field,
@@ -72,6 +73,13 @@ def test_depth(monkeypatch: pytest.MonkeyPatch, record: bool) -> None:
     beside = [Cell(*place, "isotropic", 0.5, 2.0, 1.0, 2.0, 0.2 + 0.1 * k, 0.01, 1.0) for k, place in enumerate(depth.MARKS)]
     answers = {"table": {"cells": [asdict(c) for c in cells]}, "beside": {"cells": [asdict(c) for c in beside]}}
     assert_recorded("bench_depth", drawn(depth, monkeypatch, answers, Path()), record)
+
+
+def test_media_light(monkeypatch: pytest.MonkeyPatch, record: bool) -> None:
+    """A ratio of 0 has no logarithm: its number stands where a bar would begin."""
+    ratios = {"fire": 0.0, "fog": 37.2, "room": 0.998}
+    answers = {name: {"variance_x_time_median_over_pixels": ratio} for name, ratio in ratios.items()}
+    assert_recorded("bench_media_light", drawn(media_light, monkeypatch, answers, Path()), record)
 
 
 def test_still_life(monkeypatch: pytest.MonkeyPatch, record: bool) -> None:

@@ -528,7 +528,7 @@ def test_slices_and_rows_as_figures(artefacts):
     truth = rng.random((6, 8, 10))
     figures.save(figures.plot_slices(truth + 0.1, truth, size=(1, 0.8, 0.6)), artefacts / "slices.png")
     image = rng.random((8, 8, 3))
-    figures.save(figures.plot_image_row(image, image + 0.1, np.full_like(image, 0.05)), artefacts / "row.png")
+    figures.save(figures.plot_image_row(image, image + 0.1, np.full_like(image, 2.0)), artefacts / "row.png")
     with pytest.raises(MivolError, match="differ in shape"):
         figures.plot_slices(truth, truth[1:])
     with pytest.raises(MivolError, match='no row of the metrics has "psnr"'):

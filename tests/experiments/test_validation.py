@@ -48,6 +48,17 @@ def test_mivol_agrees_with_volpath(variant_rgb, scene: Path, capsys: pytest.Capt
     assert slope["ours"] < 0
 
 
+def test_the_picture_shows_what_was_judged(variant_rgb, scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its z is that of the verdict: where a reference has not seen a path, its noise is not 0."""
+    drawn = []
+    row = validation.figures.plot_image_row
+    monkeypatch.setattr(validation.figures, "plot_image_row", lambda *given: drawn.append(given) or row(*given))
+    verdict = validate_scene(load_scene(scene), scene.parent / "a", Validation(spp=16, reference_spp=64))
+    ((reference, image, z),) = drawn
+    np.testing.assert_array_equal(z, verdict.comparison.z)
+    assert reference.shape == image.shape == z.shape
+
+
 @pytest.mark.slow
 def test_a_wrong_renderer_is_found(variant_rgb, scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Ours is given half the extinction for a while, and its gradient half the slope."""

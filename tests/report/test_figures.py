@@ -65,7 +65,7 @@ def slices_alone() -> Figure:
 
 def row() -> Figure:
     reference = ramps()[0][0]
-    return plot_image_row(reference, reference[:, ::-1], np.full_like(reference, 0.1), unit="W")
+    return plot_image_row(reference, reference[:, ::-1], (reference[:, ::-1] - reference) / 0.1, unit="W")
 
 
 def row_in_colour() -> Figure:

@@ -149,7 +149,8 @@ def draw_estimators(axes: Axes, answer: dict) -> None:
     axes.set_xscale("symlog", linthresh=1)
     axes.set(yticks=range(len(names)), yticklabels=[f"{case}, {light}" for light, case in reversed(names)])
     axes.set(title="Bias against finite differences", xlabel="bias [%], 3 standard errors")
-    axes.legend()
+    axes.set_ylim(-0.5, len(names) + 0.3)
+    axes.legend(loc="upper left", ncols=2)
 
 
 def draw_tutorial(axes: Axes, question: str, answer: dict) -> None:
@@ -158,7 +159,7 @@ def draw_tutorial(axes: Axes, question: str, answer: dict) -> None:
         run = answer["runs"][name]
         axes.loglog(run["seconds"], np.maximum(run["loss"], 1e-9), marker=MARKERS[i], markersize=3, color=SERIES[i], label=name)
     axes.set(title=f"Mitsuba's tutorial at depth {TUTORIALS[question][0]}")
-    axes.set(xlabel="time [s]", ylabel="image loss, without noise")
+    axes.set(xlabel="time [s]", ylabel="image loss, without noise [radiance²]")
     axes.legend()
 
 

@@ -125,9 +125,9 @@ def draw_fit(axes: Axes, answer: dict) -> None:
     ((name, curves),) = answer.items()
     for i, (who, label) in enumerate((("ours", "mivol"), ("peer", "tutorial's method"))):
         axes.semilogx(*zip(*curves[who], strict=True), marker=MARKERS[i], markersize=3, color=SERIES[i], label=label)
-    axes.axhline(curves["peer_psnr"], color=SERIES[1], linestyle="--", linewidth=1.2)
+    axes.axhline(curves["peer_psnr"], color=SERIES[1], linestyle="--", linewidth=1.2, label="its best")
     axes.set(title=f"{name}, 7 views", xlabel="time [s]", ylabel="held-out PSNR [dB]")
-    axes.legend(loc="lower right")
+    axes.legend()
 
 
 PANELS = {"step": draw_step, "memory": draw_memory, "locality": draw_locality}

@@ -22,6 +22,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from matplotlib.ticker import MaxNLocator
 
 from mivol.bench.bars import AT_MOST, Bar, judge, judge_agreement
 from mivol.bench.figures import drawn
@@ -54,8 +55,10 @@ def draw(answers: dict, folder: Path) -> None:
     with drawn(folder / "bench_random_scenes.png", 5, 4) as figure:
         axes = figure.subplots()
         axes.hist(shares, bins=np.linspace(0, 1.5, 31), color=SERIES[0])
-        axes.axvline(1, color=SERIES[1], linestyle="--")
-        axes.set(title="Random scenes against volpath", xlabel="largest |z| of 12 means, over its bound", ylabel="scenes")
+        axes.axvline(1, color=SERIES[1], linestyle="--", label="the bound")
+        axes.set(title="Random scenes against volpath", xlabel="largest |z| of 12 means, over its bound [1]", ylabel="scenes")
+        axes.yaxis.set_major_locator(MaxNLocator(6, integer=True))
+        axes.legend()
 
 
 BENCH = Bench("bench_random_scenes", __doc__, {"trials": try_scenes, "hard": try_hard_scenes}, FULL, QUICK, compare, draw)
