@@ -78,14 +78,14 @@ class VoxelGrid:
     centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
-        shape = tuple(int(n) for n in np.atleast_1d(self.shape))
-        if len(shape) != 3 or min(shape) < 1:
+        shape = _counts(self.shape)
+        if len(shape) != 3:
             raise MivolError(f"Found a grid shape {self.shape}, expected three counts (Z, Y, X), each at least 1.")
-        size = np.broadcast_to(np.asarray(self.voxel_size, float), (3,))
-        if not (np.isfinite(size).all() and (size > 0).all()):
+        size = _lengths(self.voxel_size, 3)
+        if len(size) != 3 or not (size > 0).all():
             raise MivolError(f"Found a voxel size {self.voxel_size}, expected positive lengths: one, or (x, y, z).")
-        centre = np.asarray(self.centre, float)
-        if centre.shape != (3,) or not np.isfinite(centre).all():
+        centre = _finite(self.centre)
+        if centre.shape != (3,):
             raise MivolError(f"Found a grid centre {self.centre}, expected a finite position (x, y, z).")
         object.__setattr__(self, "shape", shape)
         object.__setattr__(self, "voxel_size", tuple(map(float, size)))
@@ -239,7 +239,8 @@ class ConeBeam:
     whole_lines: bool = field(default=False, init=False)
 
     def __post_init__(self) -> None:
-        if not 0 < self.source_to_axis < np.inf or not 0 < self.source_to_detector < np.inf:
+        lengths = _finite([self.source_to_axis, self.source_to_detector])
+        if lengths.shape != (2,) or not (lengths > 0).all():
             raise MivolError(
                 f"Found {self.source_to_axis} from source to axis and {self.source_to_detector} from source to "
                 "detector, expected positive lengths."
@@ -301,18 +302,18 @@ def cone_beam_of_tigre(n: int = 256, n_views: int = 100) -> tuple[ConeBeam, Voxe
 
 
 def _freeze_detector(beam: ParallelBeam | ConeBeam) -> None:
-    angles = np.array(beam.angles, float).reshape(-1)
-    if len(angles) == 0 or not np.isfinite(angles).all():
-        raise MivolError(f"Found {len(angles)} view angles, expected at least one, all finite, in radians.")
-    detector = tuple(int(n) for n in np.atleast_1d(beam.detector))
-    if len(detector) != 2 or min(detector) < 1:
+    angles = _finite(beam.angles).reshape(-1)
+    if len(angles) == 0:
+        raise MivolError(f"Found the view angles {beam.angles!r:.60}, expected at least one, all finite, in radians.")
+    detector = _counts(beam.detector)
+    if len(detector) != 2:
         raise MivolError(f"Found a detector of {beam.detector} pixels, expected (rows, columns), each at least 1.")
-    pitch = np.broadcast_to(np.asarray(beam.pitch, float), (2,))
-    if not (np.isfinite(pitch).all() and (pitch > 0).all()):
+    pitch = _lengths(beam.pitch, 2)
+    if len(pitch) != 2 or not (pitch > 0).all():
         raise MivolError(f"Found a pixel pitch {beam.pitch}, expected positive lengths: one, or (along v, along u).")
-    offsets = np.array([beam.axis_offset, *beam.detector_offset], float)
-    if offsets.shape != (3,) or not np.isfinite(offsets).all():
-        raise MivolError(f"Found offsets {offsets.tolist()} of axis and detector (v, u), expected three finite lengths.")
+    offsets = [beam.axis_offset, *np.atleast_1d(beam.detector_offset).tolist()]
+    if _finite(offsets).shape != (3,):
+        raise MivolError(f"Found offsets {offsets} of axis and detector (v, u), expected three finite lengths.")
     object.__setattr__(beam, "angles", _frozen(angles))
     object.__setattr__(beam, "detector", detector)
     object.__setattr__(beam, "pitch", tuple(map(float, pitch)))
@@ -322,13 +323,40 @@ def view_index(views: Sequence[int] | np.ndarray | None, n_views: int) -> np.nda
     """Numbers of views as an array: all of them for None.
 
     Raises:
-        MivolError: a number from 0 to ``n_views`` - 1 is expected.
+        MivolError: numbers from 0 to ``n_views`` - 1 are expected, in a row.
     """
-    index = np.arange(n_views) if views is None else np.atleast_1d(np.asarray(views, int))
+    if views is None:
+        return np.arange(n_views)
+    found = np.atleast_1d(_finite(views))
+    index = found.astype(int)
+    is_empty = hasattr(views, "__len__") and len(views) == 0
+    if found.ndim != 1 or (index != found).any() or (found.size == 0 and not is_empty):
+        raise MivolError(f"Found {views!r:.80} for views, expected whole numbers in a row, from 0 to {n_views - 1}.")
     wrong = index[(index < 0) | (index >= n_views)]
     if len(wrong):
         raise MivolError(f"Found view {wrong[0]}, expected views from 0 to {n_views - 1}.")
     return index
+
+
+def _finite(given: object) -> np.ndarray:
+    """Numbers in float64; none where it is no numbers, or some are not finite."""
+    try:
+        found = np.array(given, float)
+    except (TypeError, ValueError):
+        return np.empty(0)
+    return found if np.isfinite(found).all() else np.empty(0)
+
+
+def _lengths(given: object, count: int) -> np.ndarray:
+    """One number for all, or as many as there are; none where it is something else."""
+    found = _finite(given)
+    return np.broadcast_to(found, (count,)) if found.shape in ((), (1,), (count,)) else np.empty(0)
+
+
+def _counts(given: object) -> tuple[int, ...]:
+    """Whole numbers of at least 1; none where some are not."""
+    found = np.atleast_1d(_finite(given))
+    return tuple(found.astype(int).tolist()) if found.ndim == 1 and (found % 1 == 0).all() and (found >= 1).all() else ()
 
 
 def _frame(angles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

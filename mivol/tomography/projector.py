@@ -23,7 +23,7 @@ import numpy as np
 from mivol.device_arrays import aligned
 from mivol.errors import MivolError
 from mivol.threads import check_one_thread
-from mivol.tomography.geometry import Geometry, VoxelGrid
+from mivol.tomography.geometry import Geometry, VoxelGrid, view_index
 from mivol.tomography.ray_order import order_rays
 from mivol.tomography.recorded_kernels import RecordedKernels
 from mivol.transport.traversal.empty_blocks import find_empty_distances
@@ -76,6 +76,23 @@ class RayPass(NamedTuple):
         return dr.width(self.o) == count and not self.is_ordered
 
 
+def check_kinds(geometry: object, grid: object) -> None:
+    """Refuse what is no scanner, and what is no place for voxels.
+
+    Raises:
+        MivolError: with what it is.
+    """
+    if not all(hasattr(geometry, name) for name in ("rays", "whole_lines", "shape")):
+        raise MivolError(
+            f"Found {type(geometry).__name__} for the geometry, expected where the rays run: mivol.ParallelBeam(angles, (rows, "
+            "columns), pitch), mivol.ConeBeam, or rays of your own."
+        )
+    if not isinstance(grid, VoxelGrid):
+        raise MivolError(
+            f"Found {type(grid).__name__} for the grid, expected where the voxels lie: mivol.VoxelGrid((Z, Y, X), voxel_size)."
+        )
+
+
 class Projector:
     """Line integrals of a grid along the rays of a scan, and their transpose.
 
@@ -112,10 +129,11 @@ class Projector:
                 "'cuda_ad_rgb' first."
             )
         check_one_thread()
+        check_kinds(geometry, grid)
         self.geometry, self.grid = geometry, grid
-        self.views = np.arange(geometry.shape[0]) if views is None else np.atleast_1d(np.asarray(views, int))
-        if len(self.views) == 0 or self.views.min() < 0 or self.views.max() >= geometry.shape[0]:
-            raise MivolError(f"Found views {self.views.tolist()[:5]}, expected some from 0 to {geometry.shape[0] - 1}.")
+        self.views = view_index(views, geometry.shape[0])
+        if len(self.views) == 0:
+            raise MivolError(f"Found no views, expected some from 0 to {geometry.shape[0] - 1}.")
         self.n_views = len(self.views)
         self.projection_shape = (self.n_views, *geometry.shape[1:])
         self.shape = (int(np.prod(self.projection_shape)), grid.size)
@@ -326,7 +344,11 @@ class _Projection(dr.CustomOp):
 
 def _as_array(a: np.ndarray, shape: tuple[int, ...], what: str) -> tuple[np.ndarray, bool]:
     """(flat float32 array, whether it was flat)."""
-    a = np.asarray(a)
+    try:
+        a = np.asarray(a)
+    except ValueError:
+        said = f"Found rows of different lengths, expected {shape} or flat, one number for each of the {what}."
+        raise MivolError(said) from None
     flat = a.shape == (int(np.prod(shape)),)
     if not flat and a.shape != shape:
         raise MivolError(f"Found an array of shape {a.shape}, expected {shape} or flat, one number for each of the {what}.")

@@ -112,16 +112,25 @@ def cone(**change: object) -> ConeBeam:
 @pytest.mark.parametrize(
     ("make", "sentence"),
     [
-        *[(lambda x=x: cone(source_to_axis=x), "expected positive lengths") for x in (0, -1, np.inf, np.nan)],
+        *[
+            (lambda x=x: cone(source_to_axis=x), "expected positive lengths")
+            for x in (0, -1, np.inf, np.nan, "a", None, [1, 2])
+        ],
         *[(lambda x=x: cone(source_to_detector=x), "expected positive lengths") for x in (0, -1, np.inf, np.nan)],
-        *[(lambda x=x: cone(pitch=x), "pixel pitch") for x in (0, (1, -1), (0, 1), np.inf, np.nan)],
-        *[(lambda x=x: cone(angles=x), "view angles") for x in ([], [np.nan], [0, np.inf])],
-        *[(lambda x=x: cone(detector=x), r"expected \(rows, columns\)") for x in ((2,), (2, 0), (0, 2), (1, 2, 3))],
-        *[(lambda x=x: cone(detector_offset=x), "Found offsets") for x in ((0,), (0, np.nan), (np.inf, 0))],
+        *[(lambda x=x: cone(pitch=x), "pixel pitch") for x in (0, (1, -1), (0, 1), np.inf, np.nan, "a", (1, 1, 1))],
+        *[(lambda x=x: cone(angles=x), "view angles") for x in ([], [np.nan], [0, np.inf], None, "a")],
+        *[
+            (lambda x=x: cone(detector=x), r"expected \(rows, columns\)")
+            for x in ((2,), (2, 0), (0, 2), (1, 2, 3), 2, "22", None, (2, 1.5))
+        ],
+        *[(lambda x=x: cone(detector_offset=x), "Found offsets") for x in ((0,), (0, np.nan), (np.inf, 0), None, "aa", 0)],
         (lambda: cone(axis_offset=np.inf), "Found offsets"),
-        *[(lambda x=x: VoxelGrid(x), "grid shape") for x in ((2, 2), (2, 2, 0), (0, 2, 2), (1, 1, 1, 1))],
-        *[(lambda x=x: VoxelGrid((1, 1, 1), x), "voxel size") for x in (0, (1, 1, -1), np.inf, np.nan)],
-        *[(lambda x=x: VoxelGrid((1, 1, 1), 1, x), "grid centre") for x in ((0, 0), (0, 0, np.nan), (np.inf, 0, 0))],
+        *[
+            (lambda x=x: VoxelGrid(x), "grid shape")
+            for x in ((2, 2), (2, 2, 0), (0, 2, 2), (1, 1, 1, 1), (2, 1.5, 2), 2, None, [[1, 2, 3]])
+        ],
+        *[(lambda x=x: VoxelGrid((1, 1, 1), x), "voxel size") for x in (0, (1, 1, -1), np.inf, np.nan, "a", (1, 2))],
+        *[(lambda x=x: VoxelGrid((1, 1, 1), 1, x), "grid centre") for x in ((0, 0), (0, 0, np.nan), (np.inf, 0, 0), "a", None)],
         (lambda: PencilRays([0, 0, 0], [1, 0, 0]), "two equal arrays"),
         (lambda: PencilRays([[0, 0]], [[1, 0]]), "two equal arrays"),
         (lambda: PencilRays(np.zeros((2, 3)), np.ones((1, 3))), "two equal arrays"),
@@ -131,6 +140,10 @@ def cone(**change: object) -> ConeBeam:
         (lambda: PencilRays(np.zeros((2, 3)), [[np.inf, 0, 0], [1, 0, 0]]), "index 0"),
         (lambda: cone().rays([0, 1]), "Found view 1, expected views from 0 to 0"),
         (lambda: cone().rays(-1), "Found view -1, expected views from 0 to 0"),
+        *[
+            (lambda x=x: cone().rays(x), "expected whole numbers in a row")
+            for x in ("all", [0.5], [[0]], [np.nan], [[0], [0, 0]])
+        ],
     ],
 )
 def test_what_is_no_geometry_is_refused(make: Callable, sentence: str) -> None:

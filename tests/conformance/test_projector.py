@@ -356,3 +356,25 @@ def test_scalar_variants_are_refused():
     mi.set_variant("scalar_rgb")
     with pytest.raises(MivolError, match="a variant|expected one that compiles"):
         Projector(BEAMS["cone"], GRID)
+
+
+@pytest.mark.parametrize(
+    ("given", "sentence"),
+    [
+        ((BEAMS["parallel"], (1, 64, 64)), r"Found tuple for the grid, expected where the voxels lie: mivol.VoxelGrid"),
+        ((BEAMS["parallel"], np.zeros((1, 64, 64))), "Found ndarray for the grid"),
+        ((GRID, BEAMS["parallel"]), "Found VoxelGrid for the geometry, expected where the rays run"),
+        ((np.linspace(0, 3, 8), GRID), "Found ndarray for the geometry"),
+        ((None, GRID), "Found NoneType for the geometry"),
+        ((BEAMS["parallel"], GRID, []), "Found no views"),
+    ],
+)
+def test_what_is_no_scan_is_refused(variant_rgb: str, given: tuple, sentence: str) -> None:
+    """Arrays where a place of voxels or of rays is expected, the two in the wrong order, or no view."""
+    with pytest.raises(MivolError, match=sentence):
+        Projector(*given)
+
+
+def test_rows_of_different_lengths_are_no_volume(variant_rgb: str) -> None:
+    with pytest.raises(MivolError, match="Found rows of different lengths"):
+        Projector(BEAMS["parallel"], GRID) @ [[1.0], [2.0, 3.0]]
