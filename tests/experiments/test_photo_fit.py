@@ -256,14 +256,14 @@ def test_what_is_taken_to_be_behind_is_said(photographs: Path, tmp_path: Path) -
 
 
 def test_photographs_are_shrunk_to_half_a_voxel(photographs: Path, tmp_path: Path) -> None:
-    """Pixels of 3.5 / 60 = 0.058 at the ball: half a voxel of 2 / 4 holds 4, of 2 / 8 two, of 2 / 16 one.
+    """Pixels of 3.5 / 60 = 0.058 at the ball: half a voxel of 2 / 4 holds 4.3, of 2 / 8 two, of 2 / 11 1.6, of 2 / 13 1.3.
 
-    Of 48 pixels at least 16 stay, so 4 becomes 2.
+    The nearest power of two is taken, in octaves: 2 for 1.6 and 1 for 1.3. Of 48 pixels at least 16 stay, so 4 becomes 2.
     """
     chosen = config.load(toml(tmp_path, photographs))
     photos, _ = photo_data.read_photos(chosen, tmp_path)
-    plan = FitPlan((Stage(4, 1), Stage(8, 1), Stage(16, 1, shrink=4)))
-    assert [stage.shrink for stage in photo_plan.suited(plan, photos).stages] == [2, 2, 1]
+    plan = FitPlan((Stage(4, 1), Stage(8, 1), Stage(11, 1), Stage(13, 1, shrink=4)))
+    assert [stage.shrink for stage in photo_plan.suited(plan, photos).stages] == [2, 2, 2, 1]
 
 
 def test_a_long_box_has_as_many_nodes_as_a_cube(photographs: Path, tmp_path: Path) -> None:
