@@ -92,7 +92,7 @@ class GaussianProblem:
                 raise MivolError("gains were asked for and the photographs have alpha, as renders have: exposure = false.")
             self.exposure = Exposure.even(len(self.cameras))
         self.begun_with = len(self.cloud["means"])
-        self._splatters: dict[tuple[int, int, float, int], Splatter] = {}
+        self._splatters: dict[tuple[int, int, float, float, int], Splatter] = {}
         self._shapes: dict[tuple[int, int], PictureShape] = {}
         self._looks: dict[tuple[int, int], Camera] = {}
         self._difference = dr.freeze(difference)
@@ -132,12 +132,6 @@ class GaussianProblem:
         """(count, 1) of a coefficient, over its real."""
         return np.array([1.0] + [self.plan.sheen] * (count - 1), np.float32)[:, None]
 
-    def _sheen(self, harmonics: mi.TensorXf) -> mi.TensorXf:
-        """Each number of harmonics times its share: reals to coefficients, and slopes by coefficients to slopes by reals."""
-        index = dr.arange(mi.UInt32, dr.width(harmonics.array)) // 3 % dr.opaque(mi.UInt32, harmonics.shape[1])
-        share = dr.select(index == 0, 1.0, dr.opaque(mi.Float, self.plan.sheen))
-        return mi.TensorXf(harmonics.array * share, harmonics.shape)
-
     # -- Loss and gradient --------------------------------------------------------------------------------------------
 
     def loss_and_gradient(self, reals: Reals, iteration: int, views: int = 0) -> tuple[mi.Float, Reals]:
@@ -168,9 +162,8 @@ class GaussianProblem:
         """
         shrink = self.plan.stages[self.stage].shrink
         camera = self._camera(view, shrink)
-        splatter = self.splatter_for(camera.size, self.plan.low_pass_at(shrink))
-        cloud = {**reals, "harmonics": self._sheen(reals["harmonics"])}
-        picture, kept = splatter.forward(cloud, camera)
+        splatter = self.splatter_for(camera.size, self.plan.low_pass_at(shrink), self.plan.sheen)
+        picture, kept = splatter.forward(reals, camera)
         self.safe_point()
         gains = self._gains(reals, view)
         seen, target, behind, counted = self._compared(picture, view, shrink, background, gains)
@@ -182,7 +175,6 @@ class GaussianProblem:
             by_log = mi.Color3f(*(dr.sum(dr.gather(mi.Float, by_log, 3 * pixel + c)) for c in range(3)))
             slopes = self.exposure.slopes(dr.opaque(mi.UInt32, view), by_log)
             gradient["exposure"] = mi.TensorXf(slopes, reals["exposure"].shape)
-        gradient["harmonics"] = self._sheen(gradient["harmonics"])
         # Places on the screen in half edges of the picture, so that a threshold holds for pictures of all sizes.
         moved = statistics.d_mean2d * (max(camera.size) / 2)
         return loss, gradient, dataclasses.replace(statistics, d_mean2d=moved)
@@ -195,11 +187,18 @@ class GaussianProblem:
             self._looks[view, shrink] = dataclasses.replace(camera, K=smaller, size=size)
         return self._looks[view, shrink]
 
-    def splatter_for(self, size: tuple[int, int], low_pass: float) -> Splatter:
-        """The renderer of pictures of a size (width, height), for the degree of the stage; each is made once."""
-        key = (*size, low_pass, self.plan.stages[self.stage].degree)
+    def splatter_for(self, size: tuple[int, int], low_pass: float, sheen: float = 1.0) -> Splatter:
+        """The renderer of pictures of a size (width, height), for the degree of the stage; each is made once.
+
+        Args:
+            size: of the picture [pixel].
+            low_pass: variance of the filter [pixel^2].
+            sheen: the plan's for reals; 1 for clouds whose coefficients are as they are.
+        """
+        key = (*size, low_pass, sheen, self.plan.stages[self.stage].degree)
         if key not in self._splatters:
-            self._splatters[key] = Splatter(*size, key[-1], low_pass=low_pass, compensated=self.plan.mip)
+            settings = {"low_pass": low_pass, "sheen": sheen, "compensated": self.plan.mip}
+            self._splatters[key] = Splatter(*size, key[-1], **settings)
         return self._splatters[key]
 
     def _shape(self, size: tuple[int, int]) -> PictureShape:

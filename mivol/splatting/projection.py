@@ -51,18 +51,30 @@ class Cloud:
 
     def split(self, degree: int) -> Cloud:
         """The same numbers as lists of components, each an array of N."""
-        index = dr.arange(mi.UInt32, dr.width(self.opacity_logits))
+        count = dr.width(self.opacity_logits)
         flat = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
-        sizes = _sizes(degree)
-        return Cloud(**{n: [dr.gather(mi.Float, a, index * sizes[n] + c) for c in range(sizes[n])] for n, a in flat.items()})
+        return Cloud(**{name: _columns(flat[name], size, count) for name, size in _sizes(degree).items()})
 
     def write(self, parts: Cloud) -> None:
         """Take the numbers of a cloud that is split, or of its derivatives."""
         for field in dataclasses.fields(self):
             flat, components = getattr(self, field.name), getattr(parts, field.name)
-            index = dr.arange(mi.UInt32, dr.width(components[0]))
-            for c, value in enumerate(components):
-                dr.scatter(flat, value, index * len(components) + c, mode=dr.ReduceMode.Permute)
+            index, side = dr.arange(mi.UInt32, dr.width(components[0])), _packet(len(components))
+            for c in range(0, len(components), side):
+                at = index * (len(components) // side) + c // side
+                dr.scatter(flat, mi.ArrayXf(components[c : c + side]), at, mode=dr.ReduceMode.Permute)
+
+
+def _columns(flat: mi.Float, size: int, count: int) -> list[mi.Float]:
+    """The components of a table of ``count`` rows of ``size`` numbers, each an array."""
+    index, side = dr.arange(mi.UInt32, count), _packet(size)
+    found = [dr.gather(mi.ArrayXf, flat, index * (size // side) + c, shape=(side, count)) for c in range(size // side)]
+    return [value for packet in found for value in packet]
+
+
+def _packet(size: int) -> int:
+    """How many neighbours of a row are read and written at once: the largest power of two that divides it, up to 16."""
+    return math.gcd(size, 16)
 
 
 def _sizes(degree: int) -> dict[str, int]:
@@ -72,15 +84,17 @@ def _sizes(degree: int) -> dict[str, int]:
 
 @dataclass
 class Filter:
-    """What keeps Gaussians from falling between pixels, and from the camera.
+    """What is taken of a cloud into a picture.
 
     Attributes:
         low_pass: s [pixel^2] of this picture.
         near: least depth of a mean that is drawn [length].
+        sheen: factor on all harmonics but the constant one.
     """
 
     low_pass: mi.Float
     near: mi.Float
+    sheen: mi.Float
 
 
 @dataclass
@@ -156,7 +170,7 @@ def project(cloud: Cloud, view: View, filtering: Filter, degree: int, compensate
         -2 * q * xy,
         q * (xx + s),
         opacity,
-        _colour(cloud.harmonics, dr.normalize(offset), degree),
+        _colour(cloud.harmonics, dr.normalize(offset), degree, filtering.sheen),
         z,
         in_front,
         ~has_direction,
@@ -199,7 +213,7 @@ def _logistic(logit: mi.Float) -> mi.Float:
     return dr.select(logit < 0, tail, 1 - tail)
 
 
-def _colour(harmonics: list[mi.Float], d: mi.Vector3f, degree: int) -> list[mi.Float]:
-    basis = dr.sh_eval(d, degree)
+def _colour(harmonics: list[mi.Float], d: mi.Vector3f, degree: int, sheen: mi.Float) -> list[mi.Float]:
+    basis = [sheen * y if b else y for b, y in enumerate(dr.sh_eval(d, degree))]
     sums = [sum(y * harmonics[3 * b + c] for b, y in enumerate(basis)) for c in range(3)]
     return [dr.maximum(value + 0.5, 0) for value in sums]

@@ -24,7 +24,7 @@ from mivol.photos.camera import Camera
 from mivol.points import Gaussians
 from mivol.splatting.compositing import CHUNK, LANES, PIXELS, Adjoint, Frame, Lists, composite, composite_adjoint
 from mivol.splatting.projection import EXP2, Cloud, Filter, Splats, project
-from mivol.splatting.tile_lists import TILE, Grid, TileLists, check_memory, count_tiles, list_tiles, write_tiles
+from mivol.splatting.tile_lists import TILE, Grid, TileLists, check_memory, count_tiles, list_tiles, nearest_first, write_tiles
 from mivol.splatting.view import View, numbers_of
 from mivol.threads import check_one_thread
 
@@ -90,6 +90,8 @@ class Splatter:
             it: a point of a given radius. Such pictures have no derivatives.
         near: least depth of a mean that is drawn [length]. A Gaussian that reaches across the camera is drawn if its mean is in
             front of this plane.
+        sheen: factor on all harmonics but the constant one. A fit that keeps those divided by it gives them a learning rate
+            that is smaller by as much.
         least_alpha: a splat is skipped in pixels where its alpha is below.
 
     Raises:
@@ -113,17 +115,18 @@ class Splatter:
         median: bool = False,
         discs: bool = False,
         near: float = 0.01,
+        sheen: float = 1.0,
         least_alpha: float = 1 / 255,
     ) -> None:
         _check_variant()
-        _check_settings(width, height, degree, low_pass, near, least_alpha)
+        _check_settings(width, height, degree, low_pass, near, sheen, least_alpha)
         self.size, self.degree, self.depth, self.compensated = (width, height), degree, depth or median, compensated
         self.median, self.discs = median, discs
         self.channels = 5 if depth or median else 4
         columns, rows = -(-width // TILE), -(-height // TILE)
         self.n_tiles = columns * rows
         scale = 1 if judged_width is None else width / judged_width
-        self._filter = Filter(dr.opaque(mi.Float, low_pass * scale**2), dr.opaque(mi.Float, near))
+        self._filter = Filter(*(dr.opaque(mi.Float, value) for value in (low_pass * scale**2, near, sheen)))
         self._grid = Grid(dr.opaque(mi.Int32, columns), dr.opaque(mi.Int32, rows), dr.opaque(mi.Float, least_alpha))
         self._width, self._height = dr.opaque(mi.UInt32, width), dr.opaque(mi.UInt32, height)
         self._project, self._write = dr.freeze(self._trace_projection), dr.freeze(write_tiles)
@@ -240,8 +243,7 @@ class Splatter:
     def _list(self, shape: mi.Float, depth: np.ndarray, counts: np.ndarray) -> Lists:
         """Lists of all tiles, and the order in which tiles are drawn: the longest first, so that no core ends late."""
         self._check_room(counts)
-        seen = np.flatnonzero(counts)
-        order = seen[np.argsort(depth[seen], kind="stable")].astype(np.uint32)
+        order = nearest_first(depth, np.flatnonzero(counts))
         offsets = np.zeros(len(order) + 1, np.int32)
         np.cumsum(counts[order], out=offsets[1:])
         if len(order):
@@ -318,7 +320,9 @@ def _check_variant() -> None:
         )
 
 
-def _check_settings(width: int, height: int, degree: int, low_pass: float, near: float, least_alpha: float) -> None:
+def _check_settings(
+    width: int, height: int, degree: int, low_pass: float, near: float, sheen: float, least_alpha: float
+) -> None:
     if min(width, height) < 1 or max(width, height) > 1 << 15:
         raise MivolError(f"Found a picture of {width} x {height} pixels, expected 1 to {1 << 15} along each edge.")
     if not 0 <= degree <= 9:
@@ -327,6 +331,8 @@ def _check_settings(width: int, height: int, degree: int, low_pass: float, near:
         raise MivolError(f"Found low_pass = {low_pass:g}, expected a variance above 0 in pixels^2 (0.3 is usual).")
     if not 0 < near < np.inf:
         raise MivolError(f"Found near = {near:g}, expected a depth above 0.")
+    if not 0 < sheen < np.inf:
+        raise MivolError(f"Found sheen = {sheen:g}, expected a factor above 0 (1 takes harmonics as they are).")
     if not 0 < least_alpha < 1:
         raise MivolError(f"Found least_alpha = {least_alpha:g}, expected a number between 0 and 1 (1/255 is usual).")
 

@@ -127,6 +127,27 @@ def test_pictures_and_derivatives_with_compensated_opacity(variant_rgb: str, deg
         compare(splatter, n, degree, compensated=True)
 
 
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_a_factor_on_higher_harmonics(variant_rgb: str, degree: int) -> None:
+    """A cloud drawn with the factor is the one whose higher harmonics are smaller by it, and so are their derivatives larger.
+
+    Tables of 3, 12, 27 and 48 numbers a Gaussian are read one, four, one and sixteen at a time. A product is rounded once more.
+    """
+    arrays, camera, sheen = cloud(8, degree, SIZES[8], seed=8), looking(WIDTH, HEIGHT), 0.3
+    factor = np.array([1.0] + [sheen] * ((degree + 1) ** 2 - 1), np.float32)[:, None]
+    smaller = {**arrays, "harmonics": arrays["harmonics"] * factor}
+    found = []
+    for given, splatter in ((arrays, Splatter(WIDTH, HEIGHT, degree, sheen=sheen)), (smaller, Splatter(WIDTH, HEIGHT, degree))):
+        picture, kept = splatter.forward(tensors(given), camera)
+        weights = np.random.default_rng(1).normal(size=picture.shape).astype(np.float32)
+        found.append((np.array(picture), splatter.backward(kept, mi.TensorXf(weights))[0]))
+    (picture, gradient), (plain, slopes) = found
+    np.testing.assert_allclose(picture, plain, rtol=0, atol=1e-6 * plain.max())
+    for name in arrays:
+        expected = np.array(slopes[name]) * (factor if name == "harmonics" else 1)
+        np.testing.assert_allclose(np.array(gradient[name]), expected, rtol=0, atol=ROUNDING * np.abs(expected).max())
+
+
 def test_kernels_are_recorded_once(splatter: Splatter) -> None:
     """Neither another number of Gaussians, nor another pose, nor other lists compile or record anything."""
     recorded = (splatter._project, splatter._write, splatter._composite, splatter._project_adjoint)

@@ -13,7 +13,7 @@ from mivol.photos.camera import Camera, intrinsics
 from mivol.splatting import Splatter
 from mivol.splatting import splatter as module
 from mivol.splatting.compositing import STOP
-from mivol.splatting.tile_lists import check_memory
+from mivol.splatting.tile_lists import check_memory, nearest_first
 
 SIDE = 24
 ROUNDING = 4e-5
@@ -339,6 +339,14 @@ def test_entries_that_32_bits_do_not_count_are_refused() -> None:
         check_memory(0, None, (1 << 28) + 1, "many")
 
 
+def test_splats_are_in_order_of_depth_and_of_their_number_at_a_tie() -> None:
+    """Depths of many orders of magnitude, each three times, of which every other row is asked for."""
+    depth = np.tile(10.0 ** np.random.default_rng(0).uniform(-2, 20, 500), 3).astype(np.float32)
+    rows = np.arange(0, len(depth), 2)
+    expected = rows[np.lexsort((rows, depth[rows]))]
+    assert np.array_equal(nearest_first(depth, rows), expected)
+
+
 def test_the_jump_of_a_swap_is_bounded(splatter: Splatter) -> None:
     """Two Gaussians whose depths are swapped exchange their order: in a pixel that jumps by T a_1 a_2 (c_1 - c_2), no more."""
     arrays = stack([0.0, 1.0], [0.0, 1e-4])
@@ -387,6 +395,7 @@ def test_cameras_and_derivatives_that_do_not_fit(splatter: Splatter, camera: Cam
         ({"degree": 10}, "degree 10, expected 0 to 9"),
         ({"low_pass": 0.0}, "low_pass = 0"),
         ({"near": -1.0}, "near = -1"),
+        ({"sheen": 0.0}, "sheen = 0"),
         ({"least_alpha": 1.0}, "least_alpha = 1"),
     ],
 )

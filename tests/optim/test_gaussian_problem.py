@@ -81,8 +81,8 @@ def test_the_gradient_is_that_of_the_loss(
     """
     plan = replace(PLAN, stages=(SplatStage(40, 1, 1, 1),), ssim=ssim)
     problem = problem_of(views, plan, 6)
-    smooth = Splatter(SIDE, SIDE, 1, least_alpha=1e-6)
-    monkeypatch.setattr(problem, "splatter_for", lambda size, low_pass: smooth)
+    smooth = Splatter(SIDE, SIDE, 1, least_alpha=1e-6, sheen=plan.sheen)
+    monkeypatch.setattr(problem, "splatter_for", lambda size, low_pass, sheen: smooth)
     reals, rng = problem.start(), np.random.default_rng(4)
     shape = reals["harmonics"].shape
     reals["harmonics"] += mi.TensorXf(rng.normal(0, 0.3, shape).astype(np.float32))
@@ -101,6 +101,20 @@ def test_the_gradient_is_that_of_the_loss(
             assert np.array_equal(*map(np.argsort, depths))
         expected = (moved[0] - moved[1]) / (2 * step)
         assert float((np.array(gradient[name]) * way).sum()) == pytest.approx(expected, rel=0.01), name
+
+
+def test_the_rate_of_higher_harmonics_changes_no_picture(variant_rgb: str, views: list[Photo]) -> None:
+    """One cloud whose reals are kept in two units: the loss is the same to the rounding of a mean of float32 numbers (1e-6),
+    and slopes by reals are those by coefficients, times the unit. Harmonics of 0.3 move the loss by far more."""
+    found = []
+    for sheen in (1.0, 0.25):
+        problem = problem_of(views, replace(PLAN, stages=(SplatStage(40, 1, 1, 1),), sheen=sheen), 20)
+        problem.cloud["harmonics"][:, 1:] = np.random.default_rng(3).normal(0, 0.3, (20, 3, 3))
+        loss, gradient, _ = problem.loss_of_view(problem.start(), 2)
+        found.append((float(loss[0]), np.array(gradient["harmonics"]) / np.array([1, sheen, sheen, sheen])[:, None]))
+    (loss, slopes), (other, others) = found
+    assert other == pytest.approx(loss, rel=1e-6)
+    np.testing.assert_allclose(others, slopes, rtol=0, atol=1e-5 * np.abs(slopes).max())
 
 
 def test_a_fit_lowers_the_loss(variant_rgb: str, views: list[Photo]) -> None:
