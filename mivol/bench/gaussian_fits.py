@@ -21,12 +21,12 @@ from mivol.optim.gaussian_problem import GaussianProblem
 from mivol.optim.gaussian_start import begin_at, places_of
 from mivol.optim.loop import reconstruct
 from mivol.optim.ray_batches import RayBatches
-from mivol.photos import Photo, load_photos, silhouette_box
+from mivol.photos import Photo, Photos, load_photos, silhouette_box
 from mivol.points import Gaussians
 from mivol.splatting import Splatter, tensors_of
 from mivol.validate import images
 
-__all__ = ["Fitted", "fit_and_judge"]
+__all__ = ["Fitted", "asked_of", "fit_and_judge", "fitted", "photographs", "psnr_of"]
 
 
 @dataclass(frozen=True)
@@ -61,22 +61,13 @@ def fit_and_judge(folder: Path, asked: Fitted, seconds_of_walk: float, reference
     Raises:
         MivolError: no such folder.
     """
-    if not folder.is_dir():
-        raise MivolError(f"{folder} is not there: set MIVOL_DATA to the folder that holds multiview/chair.")
-    settings = {"scale": asked.scale, "background": "white", "space": "srgb"}
-    photos = load_photos(folder, split="train", **settings)
-    photos = replace(photos, survey=replace(photos.survey, box=silhouette_box(photos)))
-    judged = load_photos(folder, split="test", **settings).views
-    plan = PRESETS[asked.preset].scaled(asked.effort).for_edge(max(photos.views[0].camera.size))
+    photos, plan = photographs(folder, asked), asked_of(asked)
+    judged = load_photos(folder, split="test", scale=asked.scale, background="white", space="srgb").views
     found = {}
     for seed in asked.seeds:
         watch = Stopwatch()
         with watch:
-            places, _ = places_of(photos, plan.start, seed)
-            batches = RayBatches.of(photos.views, [stage.shrink for stage in plan.stages])
-            start = begin_at(places, photos.views, plan.stages[0].degree)
-            problem = GaussianProblem(batches, [view.camera for view in photos.views], start, plan, seed)
-            reconstruct(problem, plan.optimiser, plan.course())
+            problem = fitted(photos, plan, seed)
         minutes = watch.processor / seconds_of_walk * reference_seconds / 60
         psnr = psnr_of(Gaussians(**problem.cloud), judged, plan)
         say(f"  {asked.preset} x {asked.effort:g}, seed {seed}: {psnr:.2f} dB in {minutes:.2f} minutes")
@@ -85,9 +76,38 @@ def fit_and_judge(folder: Path, asked: Fitted, seconds_of_walk: float, reference
     return {"pixels": [width, height], "views": len(judged), "steps": plan.steps, "seeds": found}
 
 
+def photographs(folder: Path, asked: Fitted) -> Photos:
+    """The photographs that are fitted, over white, with the box about what alpha shows.
+
+    Raises:
+        MivolError: no such folder.
+    """
+    if not folder.is_dir():
+        raise MivolError(f"{folder} is not there: set MIVOL_DATA to the folder that holds multiview/chair.")
+    photos = load_photos(folder, split="train", scale=asked.scale, background="white", space="srgb")
+    return replace(photos, survey=replace(photos.survey, box=silhouette_box(photos)))
+
+
+def asked_of(asked: Fitted) -> GaussianPlan:
+    """The preset with the steps that are asked for."""
+    return PRESETS[asked.preset].scaled(asked.effort)
+
+
+def fitted(photos: Photos, plan: GaussianPlan, seed: int) -> GaussianProblem:
+    """A fit of photographs by a plan, done."""
+    plan = plan.for_edge(max(photos.views[0].camera.size))
+    places, _ = places_of(photos, plan.start, seed)
+    batches = RayBatches.of(photos.views, [stage.shrink for stage in plan.stages])
+    start = begin_at(places, photos.views, plan.stages[0].degree)
+    problem = GaussianProblem(batches, [view.camera for view in photos.views], start, plan, seed)
+    reconstruct(problem, plan.optimiser, plan.course())
+    return problem
+
+
 def psnr_of(cloud: Gaussians, judged: Sequence[Photo], plan: GaussianPlan) -> float:
-    """Mean PSNR [dB] of Gaussians against photographs of one size."""
-    splatter, reals = Splatter(*judged[0].camera.size, cloud.degree, low_pass=plan.low_pass), tensors_of(cloud)
+    """Mean PSNR [dB] of Gaussians against photographs of one size, with the filter of the plan at that size."""
+    settings = {"low_pass": plan.low_pass, "compensated": plan.mip}
+    splatter, reals = Splatter(*judged[0].camera.size, cloud.degree, **settings), tensors_of(cloud)
     qualities = []
     for photo in judged:
         seen = np.array(splatter.forward(reals, photo.camera, derivatives=False)[0])

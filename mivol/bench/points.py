@@ -4,6 +4,7 @@
     scripts/bench_points.py --quick         # under a minute, small clouds
     scripts/bench_points.py --only clouds
     scripts/bench_points.py --only chair    # fits: 3 minutes; chair_minutes and chair_large 5 to 6 each
+    scripts/bench_points.py --only mip,exposure    # what two choices of a fit bring: 3 minutes
 
 Clouds are random: means even in a unit cube, scales about a quarter of the mean distance, opacities the logistic of a normal
 number, harmonics of degree 2; the camera sees the whole cube. The walk of ``bench_optical_depth`` through the tutorial's smoke
@@ -31,6 +32,7 @@ import numpy as np
 from mivol.bench.bars import AT_LEAST, AT_MOST, Bar, judge
 from mivol.bench.extinctions import DATA, smoke
 from mivol.bench.figures import drawn
+from mivol.bench.gaussian_choices import exposure_gain, mip_gain
 from mivol.bench.gaussian_fits import Fitted, fit_and_judge
 from mivol.bench.optical_depth.work import Work, camera_rays
 from mivol.bench.questions import Bench
@@ -67,6 +69,12 @@ CHAIR = {
     "chair_large": Fitted("fine", 0.85, 1.0, (0,)),
 }
 """Fits of about 1, 5 and 5 minutes, judged at 200, 200 and 800 pixels."""
+
+MIP, JUDGED_AT = Fitted("minute", 0.5, 0.25, (0,)), (0.125, 0.25, 1.0)
+"""A fit at 200 pixels, judged at 100, 200 and 800."""
+
+EXPOSURE, EVERY = Fitted("minute", 0.5, 0.125, (0,)), 8
+"""A fit of photographs of 135 x 240 pixels, all but every eighth."""
 
 DECIBELS = {"chair": 34.0, "chair_minutes": 37.0, "chair_large": 31.0}
 """What the project promises of each seed [dB]."""
@@ -318,6 +326,16 @@ def measure_chair_large(size: Size) -> dict:
     return _fit("chair_large", size)
 
 
+def measure_mip(size: Size) -> dict:
+    """How many dB do test views of the chair gain by the mip filter, at the size of the fit and at others?"""
+    return mip_gain(DATA / "multiview" / "chair", replace(MIP, effort=MIP.effort * size.effort), JUDGED_AT)
+
+
+def measure_exposure(size: Size) -> dict:
+    """How many dB do held-out photographs of the fox gain by a gain for each?"""
+    return exposure_gain(DATA / "multiview" / "fox", replace(EXPOSURE, effort=EXPOSURE.effort * size.effort), EVERY)
+
+
 def _fit(name: str, size: Size) -> dict:
     walk = race({"walk": Work(smoke().values, *camera_rays(size.walk_side)).tau()}, max(size.rounds, 3))["walk"]
     asked = replace(CHAIR[name], effort=CHAIR[name].effort * size.effort)
@@ -346,7 +364,9 @@ def compare(question: str, answer: dict) -> list[Bar]:
     if question in DECIBELS:
         seeds, what = answer["seeds"], f"{question}, {answer['pixels'][0]} pixels [dB]"
         return [judge(f"{what}, seed {seed}", one["psnr"], AT_LEAST, DECIBELS[question]) for seed, one in seeds.items()]
-    return [judge("a picture of the biker [s]", answer["seconds_median"], AT_MOST, BIKER_SECONDS)]
+    if question == "biker":
+        return [judge("a picture of the biker [s]", answer["seconds_median"], AT_MOST, BIKER_SECONDS)]
+    return []
 
 
 def draw(answers: dict, folder: Path) -> None:
@@ -374,8 +394,10 @@ QUESTIONS = {
     "chair": measure_chair,
     "chair_minutes": measure_chair_minutes,
     "chair_large": measure_chair_large,
+    "mip": measure_mip,
+    "exposure": measure_exposure,
 }
-BENCH = Bench("bench_points", __doc__, QUESTIONS, FULL, QUICK, compare, draw, unasked=tuple(CHAIR))
+BENCH = Bench("bench_points", __doc__, QUESTIONS, FULL, QUICK, compare, draw, unasked=(*CHAIR, "mip", "exposure"))
 
 
 def main(argv: Sequence[str] | None = None) -> int:
