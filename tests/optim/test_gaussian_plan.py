@@ -113,8 +113,8 @@ def test_minutes_become_steps_and_no_clock_is_asked() -> None:
     """Twice the minutes are twice the steps, larger photographs take fewer, and the plan's own minutes leave it as it is."""
     plan = PRESETS["minute"].for_edge(200)
     own = plan.minutes(200 * 200)
-    # 400 steps of (6 + 0.82 x 4.6 + 0.24 x 10) ms and 2000 of (6 + 0.82 x 10 + 0.24 x 40) ms
-    assert own == pytest.approx((400 * 12.2 + 2000 * 23.8) / 60e3, rel=0.01)
+    # 400 steps of (5 + 0.75 x 4.6 + 0.23 x 10) ms and 2000 of (5 + 0.75 x 10 + 0.23 x 40) ms
+    assert own == pytest.approx((400 * 10.75 + 2000 * 21.7) / 60e3, rel=0.01)
     assert plan.in_minutes(own, 200 * 200) == plan
     assert plan.in_minutes(2 * own, 200 * 200).steps == 2 * plan.steps
     assert plan.in_minutes(own, 400 * 400).steps < 0.6 * plan.steps

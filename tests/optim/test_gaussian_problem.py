@@ -24,9 +24,10 @@ from mivol.splatting import Splatter
 
 SIDE, WHITE = 40, np.ones(3, np.float32)
 
-PLAN = GaussianPlan(
-    (SplatStage(20, 12, 0, 2), SplatStage(40, 28, 1, 1)), start=150, most=220, every=8, grows=(0.1, 0.8), end=0.5
-)
+STEPS = SplatStage(20, 12, 0, 2), SplatStage(40, 28, 1, 1)
+RATES = {"end": 0.5, "place": 1.6e-3, "place_end": 1.6e-5}
+PLAN = GaussianPlan(STEPS, start=150, most=220, every=8, grows=(0.1, 0.8), **RATES)
+"""Few steps, so that places move fast."""
 
 
 def places(count: int, seed: int = 0) -> np.ndarray:
