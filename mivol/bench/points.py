@@ -65,7 +65,7 @@ TRACED = 0.14
 
 CHAIR = {
     "chair": Fitted("minute", 1.2, 0.25, (0, 1, 2)),
-    "chair_minutes": Fitted("minutes", 1.0, 0.25, (0,)),
+    "chair_minutes": Fitted("minutes", 1.15, 0.25, (0,)),
     "chair_large": Fitted("fine", 0.85, 1.0, (0,)),
 }
 """Fits of about 1, 5 and 5 minutes, judged at 200, 200 and 800 pixels."""
