@@ -18,13 +18,16 @@ __all__ = [
     "box_scene",
     "constant_light",
     "directional_light",
+    "directions_of_map",
     "emitter_inside",
+    "glass_under_a_sky",
     "milk_in_a_glass",
     "milky_glass",
     "of_depth",
     "perspective",
     "point_light",
     "sun_and_sky",
+    "sun_before_the_camera",
 ]
 
 
@@ -106,16 +109,44 @@ def sun_and_sky(height: int = 128) -> dict:
     Args:
         height: of the environment map [pixels].
     """
+    d = directions_of_map(height)
+    sky = (0.25 + 0.15 * d[..., 2:]) * np.array([0.8, 1.0, 1.3])
+    sun = d @ np.array([0.48, 0.6, 0.64]) > math.cos(math.radians(2.0))
+    picture = np.where(sun[..., None], np.array([420.0, 390.0, 330.0]), sky)
+    return _sky_of(picture) | {"phase": {"type": "hg", "g": 0.8}}
+
+
+def sun_before_the_camera(height: int = 128) -> dict:
+    """A sun of 4 degrees' radius, 35 degrees off where the camera looks, in a sky that is nearly black; HG g = 0.8.
+
+    Args:
+        height: of the environment map [pixels].
+    """
+    d = directions_of_map(height)
+    sun = d @ np.array([-0.253, 0.778, 0.574]) > math.cos(math.radians(4.0))
+    return _sky_of(np.where(sun[..., None], np.array([105.0, 97.0, 82.0]), 0.01)) | {"phase": {"type": "hg", "g": 0.8}}
+
+
+def glass_under_a_sky(height: int = 16) -> dict:
+    """A box of smooth glass under a sky that brightens upwards, isotropic scattering.
+
+    Args:
+        height: of the environment map [pixels].
+    """
+    picture = (1 + 0.5 * directions_of_map(height)[..., 2:]) * np.array([0.8, 1.0, 1.2])
+    return _sky_of(picture) | {"phase": {"type": "isotropic"}, "bsdf": {"type": "dielectric"}}
+
+
+def directions_of_map(height: int) -> np.ndarray:
+    """World directions (H, 2 H, 3) of the pixels of an environment map that :func:`_sky_of` places, z up."""
     theta, phi = np.meshgrid((np.arange(height) + 0.5) / height * np.pi, np.arange(2 * height) / height * np.pi, indexing="ij")
-    up = np.cos(theta)
-    d = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), up], axis=-1)
-    sky = (0.25 + 0.15 * up)[..., None] * np.array([0.8, 1.0, 1.3])
-    sun = d @ np.array([0.6, 0.48, 0.64]) > math.cos(math.radians(2.0))
-    picture = np.where(sun[..., None], np.array([420.0, 390.0, 330.0]), sky).astype(np.float32)
-    # Mitsuba's maps have y up, the benches z.
+    return np.stack([np.sin(theta) * np.sin(phi), np.sin(theta) * np.cos(phi), np.cos(theta)], axis=-1)
+
+
+def _sky_of(picture: np.ndarray) -> dict:
+    """An environment map (H, 2 H, 3). Mitsuba's maps have y up, the benches z."""
     turned = mi.ScalarTransform4f().rotate([1, 0, 0], 90)
-    emitter = {"type": "envmap", "bitmap": mi.Bitmap(picture), "to_world": turned}
-    return {"emitter": emitter, "phase": {"type": "hg", "g": 0.8}}
+    return {"emitter": {"type": "envmap", "bitmap": mi.Bitmap(picture.astype(np.float32)), "to_world": turned}}
 
 
 def directional_light() -> dict:
@@ -145,9 +176,9 @@ def milk_in_a_glass() -> dict:
     return milky_glass() | {"bsdf": {"type": "dielectric", "int_ior": water, "ext_ior": glass}, "glass": outside}
 
 
-def of_depth(name: str, depth: int) -> mi.Integrator:
+def of_depth(name: str, depth: int, hide_emitters: bool = False) -> mi.Integrator:
     """That integrator with this ``max_depth``, made anew for each scene: ``prbvolpath`` keeps flags of the first scene it sees.
 
     Roulette begins at depth 64 for all, beyond which a path of an unlimited one hardly counts in scenes that absorb.
     """
-    return mi.load_dict({"type": name, "max_depth": depth, "rr_depth": 64})
+    return mi.load_dict({"type": name, "max_depth": depth, "rr_depth": 64, "hide_emitters": hide_emitters})

@@ -363,7 +363,7 @@ def test_a_row_of_the_table_of_bias(monkeypatch: pytest.MonkeyPatch) -> None:
     assert asked[2:] == truths
     assert refined == [([3.0, 5.0, 3.0, 5.0], 0.5, 40), ([3.0, 5.0, 3.0, 5.0], 0.5, 40)]
     # four derivatives of 4 -+ 1 and one of 6; five differences of 3, 5, 3, 5, 3
-    assert (row["finite_difference"], row[OURS]["derivative"], row[STOCK]["derivative"]) == pytest.approx((3.8, 4.4, 4.0))
+    assert (row["truth"], row[OURS]["derivative"], row[STOCK]["derivative"]) == pytest.approx((3.8, 4.4, 4.0))
     assert row["its_standard_error"] == pytest.approx(math.sqrt(1.2 / 5))
     assert (row[OURS]["bias_percent"], row[STOCK]["bias_percent"]) == pytest.approx((100 * 0.6 / 3.8, 100 * 0.2 / 3.8))
     assert (row[OURS]["variance"], row[STOCK]["variance"]) == pytest.approx((4 / 3, 12))
@@ -374,6 +374,17 @@ def test_a_row_of_the_table_of_bias(monkeypatch: pytest.MonkeyPatch) -> None:
     assert table_row(Case(values, direction, 0.1), "light", size)["variance_x_time"] is None
 
 
+def test_truth_is_a_difference_or_the_twins(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A case with a step is a difference of our pictures; one without is for the twin."""
+    monkeypatch.setattr(bias, "difference", lambda *asked: ("difference", *asked))
+    twin = lambda *asked: SimpleNamespace(derivative=lambda seed, spp: ("twin", *asked, seed, spp))  # noqa: E731
+    monkeypatch.setattr(bias, "Twin", twin)
+    stepped, smooth = Case("values", "direction", 0.1), Case("values", "direction")
+    assert bias.truth_of(stepped, "light", "ours", TINY)(7) == ("difference", "ours", stepped, 7, TINY.difference_spp)
+    found = bias.truth_of(smooth, "light", "ours", TINY)(7)
+    assert found == ("twin", "values", "direction", TINY.table_side, "light", 7, TINY.difference_spp)
+
+
 def test_tables_of_bias_ask_every_case(monkeypatch: pytest.MonkeyPatch) -> None:
     """In each light, with the bound on z for all rows of the question."""
     monkeypatch.setattr(bias, "table_row", lambda case, light, size, rows: (case.values.shape, light, size, rows))
@@ -382,6 +393,9 @@ def test_tables_of_bias_ask_every_case(monkeypatch: pytest.MonkeyPatch) -> None:
     names = ("density 0", "half empty", "thin", "dense")
     wanted = {name: {case: ((3, 3, 3), light, size, 4 * len(LIGHTS)) for case in names} for name, light in LIGHTS.items()}
     assert bias.ask_table("estimators")(size) == wanted
+    deep, two = TABLES["deep estimators"], ("half empty", "dense")
+    wanted = {name: {case: ((3, 3, 3), light, size, 2 * len(deep)) for case in two} for name, light in deep.items()}
+    assert bias.ask_table("deep estimators")(size) == wanted
 
 
 def test_the_tutorials_questions(variant_rgb: str, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,4 +1,4 @@
-"""Bias and variance of gradients where estimators differ, against finite differences with common random numbers."""
+"""Bias and variance of gradients where estimators differ, against finite differences with common random numbers or the twin."""
 
 from __future__ import annotations
 
@@ -12,20 +12,21 @@ from mivol.bench.agreement import compare_means, finite, mean_of_rounds, number
 from mivol.bench.bars import say
 from mivol.bench.gradients.size import OURS, STOCK, TABLES, Light, Size
 from mivol.bench.gradients.subject import SEEDS, Subject, along, compete, subjects, variance_over
+from mivol.bench.gradients.twin import Twin
 from mivol.bench.timing import ratio_of
 from mivol.validate.moments import Moments
 from mivol.validate.statistics import Estimate
 
-__all__ = ["Case", "cases", "difference", "ask_table", "refine", "table_row"]
+__all__ = ["Case", "cases", "deep_cases", "difference", "ask_table", "refine", "table_row", "truth_of"]
 
 
 @dataclass(frozen=True)
 class Case:
-    """Densities (Z, Y, X), a direction to change them in, and the step of a finite difference along it."""
+    """Densities (Z, Y, X), a direction to change them in, and the step of a finite difference along it; 0 for the twin."""
 
     values: np.ndarray
     direction: np.ndarray
-    step: float
+    step: float = 0.0
 
 
 def cases(res: int) -> dict[str, Case]:
@@ -43,6 +44,18 @@ def cases(res: int) -> dict[str, Case]:
         "half empty": Case(np.where(left, 0, 4 * noise), np.where(left, 1.0, 0.0), 0.02),
         "thin": Case(0.05 * noise, 0.05 * noise, 0.1),
         "dense": Case(10 * noise, 10 * noise, 0.05),
+    }
+
+
+def deep_cases(res: int) -> dict[str, Case]:
+    """Where paths scatter often: an empty half, by which alone the derivative is taken, beside an optical depth of about 1; and
+    an optical depth of about 6, by the density itself. In both the derivative is far from 0 in all lights.
+    """
+    noise = np.random.default_rng(1).uniform(0.5, 1.5, (res,) * 3)
+    left = np.broadcast_to(np.arange(res) < res // 2, (res,) * 3)
+    return {
+        "half empty": Case(np.where(left, 0, noise), np.where(left, 1.0, 0.0)),
+        "dense": Case(3 * noise, 3 * noise),
     }
 
 
@@ -80,13 +93,22 @@ def ask_table(question: str) -> Callable[[Size], dict]:
         answer = {}
         for name, light in lights.items():
             answer[name] = {}
-            for which, case in cases(size.table_res).items():
-                answer[name][which] = row = table_row(case, light, size, len(lights) * len(cases(2)))
+            asked = (cases if light.depth == 2 else deep_cases)(size.table_res)
+            for which, case in asked.items():
+                answer[name][which] = row = table_row(case, light, size, len(lights) * len(asked))
                 say(f"  {name}, {which}: {said_of_row(row)}")
         return answer
 
-    measure.__doc__ = "Bias and variance of free flights (prbvolpath) and of ours, at density 0, half empty, thin and dense."
+    measure.__doc__ = "Bias and variance of free flights (prbvolpath) and of ours, at density 0 and where there is much."
     return measure
+
+
+def truth_of(case: Case, light: Light, ours: Subject, size: Size) -> Callable[[int], float]:
+    """Estimates of the derivative from their seeds: finite differences of our pictures, or the twin's."""
+    if case.step:
+        return lambda seed: difference(ours, case, seed, size.difference_spp)
+    twin = Twin(case.values, case.direction, size.table_side, light)
+    return lambda seed: twin.derivative(seed, size.difference_spp)
 
 
 def table_row(case: Case, light: Light, size: Size, rows: int = 1) -> dict:
@@ -100,13 +122,15 @@ def table_row(case: Case, light: Light, size: Size, rows: int = 1) -> dict:
     def derivative(k: int) -> float:
         return float(np.array(both[OURS].of_mean(first + 9000 + k, spp[OURS]), np.float64) @ v)
 
+    estimate = truth_of(case, light, both[OURS], size)
+
     def differ(k: int) -> float:
-        return difference(both[OURS], case, first + 5000 + k, size.difference_spp)
+        return estimate(first + 5000 + k)
 
     known = {"percent": size.certain_percent, "most": size.most_estimates}
     derivatives[OURS] = refine(derivatives[OURS], derivative, **known)
     truth = mean_of_rounds(refine([differ(k) for k in range(size.table_rounds)], differ, **known))
-    row = {"finite_difference": truth.mean, "its_standard_error": math.sqrt(truth.var)}
+    row = {"truth": truth.mean, "its_standard_error": math.sqrt(truth.var)}
     for name, timing in timings.items():
         row[name] = figures_of(derivatives[name], truth, rows) | {
             "variance": variance_over(timing, case.direction > 0),
@@ -119,7 +143,7 @@ def table_row(case: Case, light: Light, size: Size, rows: int = 1) -> dict:
 
 
 def figures_of(derivatives: np.ndarray, truth: Estimate, rows: int) -> dict:
-    """Derivatives (rounds,) of one estimator against the finite difference."""
+    """Derivatives (rounds,) of one estimator against the truth."""
     found = compare_means(mean_of_rounds(derivatives), truth, 2 * rows)
     return {
         "derivative": float(derivatives.mean()),
@@ -131,7 +155,7 @@ def figures_of(derivatives: np.ndarray, truth: Estimate, rows: int) -> dict:
 
 def said_of_row(row: dict) -> str:
     """One line of the table."""
-    parts = [f"finite difference {row['finite_difference']:.4g} +- {row['its_standard_error']:.1g}"]
+    parts = [f"truth {row['truth']:.4g} +- {row['its_standard_error']:.1g}"]
     for name in (STOCK, OURS):
         r = row[name]
         parts.append(

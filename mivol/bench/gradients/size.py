@@ -4,13 +4,22 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import mitsuba as mi
 import numpy as np
 
 from mivol.bench.extinctions import Extinction, les_cloud, smoke
-from mivol.bench.scenes import box_scene, constant_light, directional_light, emitter_inside, milky_glass, of_depth, sun_and_sky
+from mivol.bench.scenes import (
+    box_scene,
+    constant_light,
+    directional_light,
+    emitter_inside,
+    glass_under_a_sky,
+    of_depth,
+    sun_and_sky,
+    sun_before_the_camera,
+)
 from mivol.bench.timing import Budget
 
 __all__ = ["ALBEDO", "CONTESTS", "FULL", "OURS", "QUICK", "STOCK", "TABLES", "TUTORIALS", "Light", "Size"]
@@ -28,12 +37,16 @@ class Light:
         bar: how many times sooner mivol's gradient has to be as exact.
         depth: ``max_depth``.
         albedo: of the medium.
+        drawn: whether the twin draws emitter samples at collisions; elsewhere light is found by chance alone.
+        hidden: ``hide_emitters``.
     """
 
     parts: Callable[[], dict]
     bar: float = math.nan
     depth: int = 2
     albedo: float = ALBEDO
+    drawn: bool = False
+    hidden: bool = False
 
     def scene(self, values: np.ndarray, side: int) -> mi.Scene:
         """The box around extinctions (Z, Y, X), seen in a picture of that size [pixels]."""
@@ -41,12 +54,19 @@ class Light:
 
     def integrator(self, name: str) -> mi.Integrator:
         """That integrator at this depth."""
-        return of_depth(name, self.depth)
+        return of_depth(name, self.depth, self.hidden)
 
 
 CONSTANT, SUN, DIRECTIONAL = "constant light", "HG 0.8, sun in a sky", "HG 0.8, directional"
 
-SHONE = {CONSTANT: constant_light, SUN: sun_and_sky, "emitter inside": emitter_inside, "glass": milky_glass}
+SHONE = {
+    CONSTANT: Light(constant_light),
+    "HG 0.8, sun before the camera": Light(sun_before_the_camera, drawn=True),
+    "emitter inside": Light(emitter_inside, drawn=True, hidden=True),
+    "glass": Light(glass_under_a_sky),
+}
+"""Lights in which the derivative of a picture's mean does not nearly cancel, so that its relative error is soon known. The ball
+of light is hidden from the camera: seen directly, the few pixels that it fills would have most of the noise."""
 
 CONTESTS: dict[str, tuple[Callable[[], Extinction], dict[str, Light]]] = {
     "smoke": (smoke, {CONSTANT: Light(constant_light, 60), SUN: Light(sun_and_sky, 30)}),
@@ -65,12 +85,12 @@ CONTESTS: dict[str, tuple[Callable[[], Extinction], dict[str, Light]]] = {
 TABLES: dict[str, dict[str, Light]] = {
     "estimators": {CONSTANT: Light(constant_light), SUN: Light(sun_and_sky)},
     "deep estimators": {
-        f"{name}, {'depth 6' if depth > 0 else 'unlimited'}": Light(parts, depth=depth)
+        f"{name}, {'depth 6' if depth > 0 else 'unlimited'}": replace(light, depth=depth)
         for depth in (6, -1)
-        for name, parts in SHONE.items()
+        for name, light in SHONE.items()
     },
 }
-"""Lights in which estimators are compared with finite differences, by question."""
+"""Lights in which estimators are compared with finite differences, or with the twin, by question."""
 
 TUTORIALS: dict[str, tuple[int, float, float]] = {"tutorial": (2, 20, math.nan), "deep tutorial": (6, 60, 30)}
 """``max_depth`` of the tutorial, and how many times sooner mivol has to have prbvolpath's last and its lowest loss."""

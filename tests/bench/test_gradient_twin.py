@@ -1,0 +1,97 @@
+"""The twin that judges gradients of long paths: its light is that of ``volpath``, its derivative that of its light."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from false_alarms import assert_precise, assert_same_mean, fresh, over_pixels
+
+from mivol.bench.gradients import twin
+from mivol.bench.gradients.bias import deep_cases
+from mivol.bench.gradients.size import CONSTANT, SHONE, TABLES, Light
+from mivol.bench.gradients.twin import Twin
+from mivol.validate.moments import Moments
+
+SIDE = 6
+NOISE = np.random.default_rng(2).uniform(0.5, 1.5, (3, 4, 5))
+UNLIMITED = {name: replace(light, depth=-1) for name, light in SHONE.items()}
+
+
+def means(values: np.ndarray, light: Light, seed: int, spp: int) -> tuple[float, float]:
+    """Light and derivative of one set of paths; the density itself is the direction."""
+    made = Twin(values, values, SIDE, light)
+    found, derivative, _ = made.paths(seed, spp)
+    return float(np.mean(np.array(found, np.float64))), float(np.mean(np.array(derivative, np.float64)))
+
+
+@pytest.mark.parametrize("name", SHONE)
+def test_the_derivative_is_that_of_the_same_paths(variant_rgb: str, name: str) -> None:
+    """Up to a quarter of the majorant collisions are as likely whatever the extinction is: equal seeds give the same paths, and
+    light is a smooth function of the extinction. With n <= 5 scatterings and about as many points looked at in between, it is
+    a polynomial of degree 10 or so in a factor of it; a difference over 2 % errs by less than 10^3 / 6 0.02^2 = 7 %, one of
+    fourth order by 10^5 / 30 0.02^4 = 0.1 %. Sums of float32 are divided by 0.12: 6e-8 of a mean that is at most 20 times as
+    large as its derivative."""
+    values, h, light = 0.08 * NOISE, 0.02, replace(SHONE[name], depth=6)
+    at = {s: means((1 + s * h) * values, light, 3, 256)[0] for s in (-2, -1, 1, 2)}
+    found = means(values, light, 3, 256)[1]
+    assert found == pytest.approx((8 * (at[1] - at[-1]) - (at[2] - at[-2])) / (12 * h), rel=2e-3)
+    assert abs(found) > 1e-3 * at[1]
+
+
+@pytest.mark.statistical
+@pytest.mark.parametrize("name", TABLES["deep estimators"])
+def test_its_light_is_that_of_volpath(variant_rgb: str, name: str) -> None:
+    """Half the box is empty, the other one has an optical depth of 3."""
+    light = TABLES["deep estimators"][name]
+    values = np.where(np.arange(5) < 2, 0, 3 * NOISE)
+    ours = Twin(values, values, SIDE, light)
+    theirs = light.integrator("volpath")
+    paths = np.concatenate([np.array(ours.paths(fresh(k), 512)[0], np.float64) for k in range(4)])
+    images = [np.array(mi.render(ours.scene, integrator=theirs, spp=256, seed=fresh(100 + k)), np.float64) for k in range(16)]
+    light_of_theirs = over_pixels(Moments.of(np.array(images).mean(axis=-1, keepdims=True)))
+    assert_precise(light_of_theirs, 0.02 * light_of_theirs.mean)
+    assert_same_mean(light_of_theirs, Moments.of(paths))
+
+
+@pytest.mark.parametrize("depth", [6, -1])
+def test_white_smoke_in_a_furnace(variant_rgb: str, depth: int) -> None:
+    """Paths of unlimited depth leave with the weight 1, each of them, where collisions are as likely as the extinction says;
+    those of depth 6 do or end inside."""
+    light = replace(SHONE[CONSTANT], depth=depth, albedo=1.0)
+    made = Twin(3 * NOISE, NOISE, SIDE, light)
+    found = np.array(made.paths(1, 64)[0])
+    # The weight is a product of quotients that are 1 but for a few roundings each.
+    np.testing.assert_allclose(found[found > 0], 1, rtol=1e-4)
+    assert (found > 0).all() == (depth < 0)
+
+
+def test_the_level_takes_noise_and_no_light(variant_rgb: str) -> None:
+    """In a furnace the light of a path is its weight, so that nothing is left; without the level the mean of 9216 derivatives
+    whose deviation is about 1 would be some 0.01."""
+    light = replace(SHONE[CONSTANT], depth=-1, albedo=1.0)
+    made = Twin(3 * NOISE, NOISE, SIDE, light)
+    raw = np.array(made.paths(5, 256)[1], np.float64)
+    found = [made.derivative(10 + k, 256) for k in range(3)]
+    assert np.std(raw) > 0.3
+    # Weights are 1 but for their roundings, and so is the level.
+    assert np.max(np.abs(found)) < 1e-5
+
+
+def test_nothing_of_the_twin_is_walked_by_mivol(variant_rgb: str) -> None:
+    """It imports what says what a light is, and no transport."""
+    assert not [name for name, value in vars(twin).items() if "mivol.transport" in str(getattr(value, "__module__", ""))]
+
+
+def test_deep_cases_change_where_they_say() -> None:
+    """The empty half alone, and the density itself."""
+    found = deep_cases(8)
+    half, dense = found["half empty"], found["dense"]
+    left = np.arange(8) < 4
+    assert (half.values[..., left] == 0).all() and (half.direction[..., left] == 1).all()
+    assert (half.direction[..., ~left] == 0).all()
+    np.testing.assert_allclose(half.values[..., ~left] * 3, dense.values[..., ~left], rtol=1e-15)
+    assert dense.values.min() >= 1.5 and dense.values.max() <= 4.5 and (dense.direction == dense.values).all()
+    assert half.step == dense.step == 0
