@@ -37,6 +37,7 @@ TINY = replace(
     table_side=6,
     table_budget=Budget(spp=64),
     table_res=4,
+    derivative_spp=64,
     difference_spp=64,
     reference_spp=16,
     check_spp=2,
@@ -339,7 +340,7 @@ def test_a_row_of_the_table_of_bias(monkeypatch: pytest.MonkeyPatch) -> None:
     slow = Timing({}, [3.0] * 4, [3.0] * 4, list(np.stack([0 * swing, 4 + 3 * swing], 1)))
     fast = Timing({}, [1.0] * 4, [1.0] * 4, list(np.stack([7 * swing, 4 + swing], 1)))
     asked, refined = [], []
-    ours = SimpleNamespace(of_mean=lambda seed, spp: asked.append(("derivative", seed, spp)) or [1.0, 6.0])
+    ours = SimpleNamespace(of_mean=lambda seed, spp: asked.append(("derivative", seed, spp)) or [1.0, 4.0 + seed % 2])
     other = SimpleNamespace(of_mean="theirs")
     monkeypatch.setattr(bias, "subjects", lambda values, side, light: asked.append((values.dtype.name, side, light))
                         or {OURS: ours, STOCK: other})  # fmt: skip
@@ -359,10 +360,10 @@ def test_a_row_of_the_table_of_bias(monkeypatch: pytest.MonkeyPatch) -> None:
         ("float32", size.table_side, "light"),
         ({OURS: ours.of_mean, STOCK: "theirs"}, size.table_budget, 4, 2),
     ]
-    truths = [("derivative", 209_004, 8), *((ours, 205_000 + k, size.difference_spp) for k in range(5))]
-    assert asked[2:] == truths
-    assert refined == [([3.0, 5.0, 3.0, 5.0], 0.5, 40), ([3.0, 5.0, 3.0, 5.0], 0.5, 40)]
-    # four derivatives of 4 -+ 1 and one of 6; five differences of 3, 5, 3, 5, 3
+    ours_asked = [("derivative", 209_000 + k, size.derivative_spp) for k in range(5)]
+    assert asked[2:] == [*ours_asked, *((ours, 205_000 + k, size.difference_spp) for k in range(5))]
+    assert refined == [([4.0, 5.0, 4.0, 5.0], 0.5, 40), ([3.0, 5.0, 3.0, 5.0], 0.5, 40)]
+    # five derivatives of 4, 5, 4, 5, 4; five differences of 3, 5, 3, 5, 3
     assert (row["truth"], row[OURS]["derivative"], row[STOCK]["derivative"]) == pytest.approx((3.8, 4.4, 4.0))
     assert row["its_standard_error"] == pytest.approx(math.sqrt(1.2 / 5))
     assert (row[OURS]["bias_percent"], row[STOCK]["bias_percent"]) == pytest.approx((100 * 0.6 / 3.8, 100 * 0.2 / 3.8))

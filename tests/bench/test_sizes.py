@@ -37,9 +37,9 @@ FULL = {
     },
     "gradients": {
         "rounds": 8, "side": 64, "budget": Budget(seconds=2.0), "table_rounds": 16, "table_side": 24,
-        "table_budget": Budget(seconds=0.4), "table_res": 16, "difference_spp": 1024, "certain_percent": 0.06,
-        "most_estimates": 750, "reference_spp": 4096, "check_spp": 4, "loss_spp": 32, "resolutions": (16, 64),
-        "steps": (20, 20), "step_spp": (8, 64), "seed": 0,
+        "table_budget": Budget(seconds=0.4), "table_res": 16, "derivative_spp": 256, "difference_spp": 1024,
+        "certain_percent": 0.06, "most_estimates": 750, "reference_spp": 4096, "check_spp": 4, "loss_spp": 32,
+        "resolutions": (16, 64), "steps": (20, 20), "step_spp": (8, 64), "seed": 0,
     },
     "optical_depth": {
         "rounds": 7, "walk_side": 1024, "image_side": 256, "image_spp": 16, "exact_pixels": 192, "exact_rays": 4096,
@@ -70,7 +70,8 @@ QUICK = {
     },
     "gradients": {
         "rounds": 5, "side": 12, "budget": Budget(seconds=0.05), "table_rounds": 8, "table_side": 8,
-        "table_budget": Budget(seconds=0.05), "table_res": 6, "difference_spp": 256, "certain_percent": math.inf,
+        "table_budget": Budget(seconds=0.05), "table_res": 6, "derivative_spp": 64, "difference_spp": 256,
+        "certain_percent": math.inf,
         "reference_spp": 256, "check_spp": 4, "loss_spp": 16, "resolutions": (4, 8), "steps": (2, 2), "step_spp": (2, 4),
     },
     "optical_depth": {
@@ -104,7 +105,8 @@ def test_what_is_promised():
     """Bars, and the media that they are measured in."""
     assert STEP_BARS == {"camera": 8, "pixels": 4} and STOP == 1e-4
     bars = {question: [light.bar for light in lights.values()] for question, (_, lights) in CONTESTS.items()}
-    assert bars == {"smoke": [60, 30], "deep smoke": [100, 100, 35], "deep cloud": [80]} and ALBEDO == 0.75
+    deep = {"deep smoke": [100, 100, 35], "deep fine smoke": [40, 20], "deep cloud": [80]}
+    assert bars == {"smoke": [60, 30]} | deep and ALBEDO == 0.75
     assert TUTORIALS["tutorial"][:2] == (2, 20) and TUTORIALS["deep tutorial"] == (6, 60, 30)
     assert (SIZES, DEGREES, MODEL) == ((128, 256, 512, 1024), (0, 1, 2, 3), 64)
     assert FULL["depth"]["taus"] == TAUS and SEED == 0 and BESIDE_ALBEDOS == (0.5, 0.9) and CUBE_DEPTH == 0.8966336

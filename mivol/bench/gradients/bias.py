@@ -120,7 +120,7 @@ def table_row(case: Case, light: Light, size: Size, rows: int = 1) -> dict:
     first, v = SEEDS * size.seed, case.direction.ravel()
 
     def derivative(k: int) -> float:
-        return float(np.array(both[OURS].of_mean(first + 9000 + k, spp[OURS]), np.float64) @ v)
+        return float(np.array(both[OURS].of_mean(first + 9000 + k, size.derivative_spp), np.float64) @ v)
 
     estimate = truth_of(case, light, both[OURS], size)
 
@@ -128,8 +128,9 @@ def table_row(case: Case, light: Light, size: Size, rows: int = 1) -> dict:
         return estimate(first + 5000 + k)
 
     known = {"percent": size.certain_percent, "most": size.most_estimates}
-    derivatives[OURS] = refine(derivatives[OURS], derivative, **known)
-    truth = mean_of_rounds(refine([differ(k) for k in range(size.table_rounds)], differ, **known))
+    begun = range(size.table_rounds)
+    derivatives[OURS] = refine([derivative(k) for k in begun], derivative, **known)
+    truth = mean_of_rounds(refine([differ(k) for k in begun], differ, **known))
     row = {"truth": truth.mean, "its_standard_error": math.sqrt(truth.var)}
     for name, timing in timings.items():
         row[name] = figures_of(derivatives[name], truth, rows) | {

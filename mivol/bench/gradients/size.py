@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 import mitsuba as mi
 import numpy as np
 
-from mivol.bench.extinctions import Extinction, les_cloud, smoke
+from mivol.bench.extinctions import Extinction, fine_smoke, les_cloud, smoke
 from mivol.bench.scenes import (
     box_scene,
     constant_light,
@@ -78,6 +78,7 @@ CONTESTS: dict[str, tuple[Callable[[], Extinction], dict[str, Light]]] = {
             DIRECTIONAL: Light(directional_light, 35, 6),
         },
     ),
+    "deep fine smoke": (lambda: fine_smoke(128), {CONSTANT: Light(constant_light, 40, 6), SUN: Light(sun_and_sky, 20, 6)}),
     "deep cloud": (les_cloud, {SUN: Light(sun_and_sky, 80, 6, 0.999)}),
 }
 """Volumes and lights in which variance x time is compared, by question."""
@@ -104,7 +105,8 @@ class Size:
         name: for the JSON.
         rounds, side, budget: gradients of the smoke: how many, of how large a picture [pixels], samples of one gradient.
         table_rounds, table_side, table_budget, table_res: the same for the table of biases, and its voxels along an edge.
-        difference_spp: samples per pixel of each picture of a finite difference.
+        derivative_spp: samples per pixel of each of our derivatives in that table.
+        difference_spp: samples per pixel of each picture of a finite difference, and of each derivative of the twin.
         certain_percent: how well the means of the table have to be known.
         most_estimates: of which such a mean is made at most.
         reference_spp, check_spp, loss_spp: samples of the tutorial's references, of those by volpath, of its image loss.
@@ -120,6 +122,7 @@ class Size:
     table_side: int = 24
     table_budget: Budget = field(default=Budget(seconds=0.4))
     table_res: int = 16
+    derivative_spp: int = 256
     difference_spp: int = 1024
     certain_percent: float = 0.06
     most_estimates: int = 750
@@ -142,6 +145,7 @@ QUICK = Size(
     table_side=8,
     table_budget=Budget(seconds=0.05),
     table_res=6,
+    derivative_spp=64,
     difference_spp=256,
     certain_percent=math.inf,
     reference_spp=256,
