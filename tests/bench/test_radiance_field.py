@@ -211,13 +211,13 @@ def test_photographs_that_are_not_here_are_left_out(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:
     monkeypatch.setattr(photographs, "DATA", tmp_path)
-    assert photographs.ask_photographs(replace(TINY, photo_fits=(("chair", 16),))) == {}
+    assert photographs.ask_photographs(replace(TINY, photo_fits=(("chair", 16, 0.03),))) == {}
     assert "chair: left out, its data is not here (MIVOL_DATA" in capsys.readouterr().err
 
 
 @pytest.mark.slow
 def test_every_question_is_answered(variant_rgb: str, tmp_path: Path) -> None:
-    size = replace(TINY, photo_fits=(("wires", 16),), photo_folder=tmp_path / "photographs")
+    size = replace(TINY, photo_fits=(("wires", 16, 0.03),), photo_folder=tmp_path / "photographs")
     answers = BENCH.ask(tuple(BENCH.questions), size)
     assert all(answers["step"]["fog"][kind]["ratio_of_processor_time"] > 0 for kind in ("camera", "pixels", "any"))
     assert set(answers["locality"]) == {"tiles", "pixels"}

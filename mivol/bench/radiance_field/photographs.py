@@ -46,12 +46,12 @@ ROUNDS = 8
 def ask_photographs(size: Size) -> dict:
     """What do held-out views look like, after how long, and what does a fit hold?"""
     answer = {}
-    for name, longest in size.photo_fits:
+    for name, longest, effort in size.photo_fits:
         folder = photographs_of(name, size)
         if folder is None:
             say(f"  {name}: left out, its data is not here (MIVOL_DATA names the folder)")
             continue
-        found = answer[f"{name} at {longest}"] = fitted(folder, longest, size)
+        found = answer[f"{name} at {longest}"] = fitted(folder, longest, effort, size)
         say(f"  {name} at {longest}: {found['psnr']:.2f} dB, {found['seconds']:.0f} s, {found['counted_gib']:.2f} GiB")
     return answer
 
@@ -65,7 +65,7 @@ def photographs_of(name: str, size: Size) -> Path | None:
     return size.photo_folder / name
 
 
-def fitted(folder: Path, longest: int, size: Size) -> dict:
+def fitted(folder: Path, longest: int, effort: float, size: Size) -> dict:
     """Fit a data set as ``mivol optimize`` does, to as many nodes as a cube with ``longest`` along each edge has, and measure.
 
     Returns:
@@ -74,8 +74,7 @@ def fitted(folder: Path, longest: int, size: Size) -> dict:
         ``step_rays``; ``counted_gib`` by the plan for the rows kept, and ``held_gib`` by Dr.Jit, both beyond the photographs.
     """
     photos = {"path": str(folder), "background": "white", "judged": "test", "held_out": 0}
-    field = {"effort": size.photo_effort}
-    chosen = config.from_dict({"title": folder.name, "photos": photos, "field": field})
+    chosen = config.from_dict({"title": folder.name, "photos": photos, "field": {"effort": effort}})
     shown, judged = read_photos(chosen, Path())
     shown = boxed(chosen, shown)
     plan = suited(make_plan(chosen).up_to(longest), shown)

@@ -24,8 +24,8 @@ class Size:
         chair_steps: of the fit that makes the fitted field.
         fit_resolution, fit_side: nodes and pixels of fits.
         fields: names of those that are measured, in :data:`mivol.bench.radiance_field.fields.FIELDS`.
-        photo_fits: data sets of :mod:`mivol.bench.radiance_field.photographs` and nodes along an edge of a cube with as many.
-        photo_effort: share of the preset's steps.
+        photo_fits: data sets of :mod:`mivol.bench.radiance_field.photographs`, nodes along an edge of a cube with as many, and
+            the share of the preset's steps.
         photo_views, photo_side, photo_spp: of made-up data sets: photographs, pixels along an edge, samples a pixel.
         photo_folder: where those lie; they are made where they are missing.
         walk_side: rays of the walk that tells the machine's speed are its square.
@@ -42,14 +42,13 @@ class Size:
     fit_resolution: int = 128
     fit_side: int = 256
     fields: tuple[str, ...] = ("shell", "fog", "fitted")
-    photo_fits: tuple[tuple[str, int], ...] = (
-        ("chair", 128),
-        ("chair", 256),
-        ("still_life", 128),
-        ("wires", 128),
-        ("glossy", 128),
+    photo_fits: tuple[tuple[str, int, float], ...] = (
+        ("chair", 128, 1.0),
+        ("chair", 256, 1.38),
+        ("still_life", 128, 1.0),
+        ("wires", 128, 1.0),
+        ("glossy", 128, 1.0),
     )
-    photo_effort: float = 1.0
     photo_views: int = 75
     photo_side: int = 200
     photo_spp: int = 32
@@ -71,8 +70,7 @@ QUICK = Size(
     30,
     32,
     32,
-    photo_fits=(("chair", 32), ("wires", 32)),
-    photo_effort=0.03,
+    photo_fits=(("chair", 32, 0.03), ("wires", 32, 0.03)),
     photo_views=15,
     photo_side=48,
     photo_spp=2,
