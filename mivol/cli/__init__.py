@@ -472,9 +472,8 @@ def demo(arguments: argparse.Namespace) -> None:
     elif arguments.into is not None:
         print(copy_example(arguments.name, arguments.into))
     else:
-        folder = arguments.output or Path("runs") / arguments.name
         settings = {"changes": tuple(arguments.set), "watcher": Terminal(), "command": arguments.command}
-        print(run_example(arguments.name, folder, **settings))
+        print(run_example(arguments.name, arguments.output, **settings))
 
 
 def fetch(arguments: argparse.Namespace) -> None:

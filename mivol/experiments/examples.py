@@ -240,13 +240,13 @@ def whole_folder(path: Path) -> Iterator[None]:
 
 
 def run_example(
-    name: str, folder: Path, *, changes: tuple[str, ...] = (), watcher: Watcher | None = None, command: str = ""
+    name: str, folder: Path | None, *, changes: tuple[str, ...] = (), watcher: Watcher | None = None, command: str = ""
 ) -> Path:
     """Run an example; the page.
 
     Args:
         name: key of ``EXAMPLES``.
-        folder: run folder.
+        folder: run folder; None: the ``output`` of the changes, else runs/NAME.
         changes: settings as ``--set`` takes them.
         watcher: who is told how it goes.
         command: what was typed, for the record.
@@ -256,6 +256,11 @@ def run_example(
     """
     example, watcher = example_named(name), watcher or Nobody()
     source = example.source(name)
+    # Before anything is made for it: what the changes ask for may be refused.
+    wanted = config.load(source / example.file, changes).output
+    if folder is None:
+        sets_output = any(change.partition("=")[0].strip() == "output" for change in changes)
+        folder = Path(wanted if sets_output else f"runs/{name}")
     given = (*prepare(name, example, source, folder, watcher), *changes)
     chosen = config.load(source / example.file, given)
     return run_experiment(Task(chosen, source, folder, watcher=watcher, command=command))

@@ -108,6 +108,34 @@ def test_an_example_runs(variant_rgb: str, tmp_path: Path, capsys: pytest.Captur
     assert record["command"].startswith("mivol demo shepp_logan")
 
 
+@pytest.mark.parametrize(
+    ("given", "changes", "folder"),
+    [
+        (None, (), "runs/still_life"),
+        (None, ("output=mine/one",), "mine/one"),
+        (None, ("title=output",), "runs/still_life"),
+        (None, (" output = 'runs/here'",), "runs/here"),
+        (Path("told"), ("output=mine/one",), "told"),
+    ],
+)
+def test_where_an_example_runs(
+    monkeypatch: pytest.MonkeyPatch, given: Path | None, changes: tuple[str, ...], folder: str
+) -> None:
+    """-o, else --set output=..., else runs/NAME; what it needs is made there."""
+    made: list[Path] = []
+    monkeypatch.setattr(examples, "prepare", lambda name, example, source, folder, watcher: made.append(folder) or [])
+    monkeypatch.setattr(examples, "run_experiment", lambda task: task.folder)
+    assert examples.run_example("still_life", given, changes=changes) == made[0] == Path(folder)
+
+
+def test_a_wrong_change_of_an_example_is_refused_before_anything_is_made(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert "output" in refused(capsys, "demo", "lamp", "--set", "output=3")
+    assert list(tmp_path.iterdir()) == []
+
+
 @pytest.mark.parametrize("name", [name for name, example in EXAMPLES.items() if isinstance(example.stand_in, StandIn)])
 def test_a_stand_in_takes_the_place_of_public_data(tmp_path: Path, name: str) -> None:
     """Where the data is not there the settings name a seeded volume of its shape; where it is, they are left alone."""
