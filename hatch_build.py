@@ -12,12 +12,15 @@ from hatchling.metadata.plugin.interface import MetadataHookInterface
 
 LINK = re.compile(r"(!?)(\[[^\]]*\])\((?!https?://|#)([^)]+)\)")
 """A Markdown link or picture whose target is a file of the repository."""
+PICTURE = re.compile(r'(<img src=")(?!https?://)([^"]+)')
+"""The same of a picture that has a width."""
 
 
 def absolute(text: str, repository: str, ref: str) -> str:
     """Links to files become links to them in the repository, pictures become links to their bytes."""
     kinds = {"!": "raw", "": "blob"}
-    return LINK.sub(lambda m: f"{m[1]}{m[2]}({repository}/{kinds[m[1]]}/{ref}/{m[3]})", text)
+    text = LINK.sub(lambda m: f"{m[1]}{m[2]}({repository}/{kinds[m[1]]}/{ref}/{m[3]})", text)
+    return PICTURE.sub(lambda m: f"{m[1]}{repository}/raw/{ref}/{m[2]}", text)
 
 
 class Readme(MetadataHookInterface):

@@ -39,7 +39,7 @@ def main(folder: Path, out: Path) -> None:
         ("a slice of the true volume", volume["truth"][middle], top),
         ("the slice, reconstructed", volume["reconstruction"][middle], top),
     ]
-    figure = Figure(figsize=(10, 2.85), constrained_layout=True)
+    figure = Figure(figsize=(10, 2.67), constrained_layout=True)
     FigureCanvasAgg(figure)
     for axes, (title, pixels, high) in zip(figure.subplots(1, 4), panels, strict=True):
         axes.imshow(pixels, cmap="gray" if high == 1.0 else "magma", vmin=0, vmax=high, interpolation="nearest")

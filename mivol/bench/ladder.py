@@ -189,26 +189,29 @@ def compare(question: str, answer: dict) -> list[Bar]:
 
 
 def draw(answers: dict, folder: Path) -> None:
-    """A column for each model: its picture, and the errors of images and gradients."""
+    """A column for each model: its picture, and the errors of images and gradients. Low, as the README has room for it."""
     (answer,) = answers.values()
-    with drawn(folder / "bench_ladder.png", 3.3 * len(RUNGS), 8.6) as figure:
-        rows = figure.subplots(3, len(RUNGS), height_ratios=(1, 1, 1))
+    with drawn(folder / "bench_ladder.png", 2.2 * len(RUNGS), 4.2) as figure:
+        rows = figure.subplots(3, len(RUNGS), height_ratios=(1, 1.1, 1.1))
         for k, name in enumerate(RUNGS):
             picture, image, gradient = (row[k] for row in rows)
             pixels = answer[name]["image"]["picture"]
             picture.imshow(np.clip(pixels / np.quantile(pixels, 0.99), 0, 1) ** (1 / 2.2), interpolation="nearest")
-            picture.set(title=name, xticks=[], yticks=[])
-            _draw_errors(image, answer[name]["image"], "volpath", "relative error of a pixel [1]" if k == 0 else "")
-            _draw_errors(gradient, answer[name]["gradient"], "prbvolpath", "relative error of a slope [1]" if k == 0 else "")
+            picture.set_axis_off()
+            picture.set_title(name, loc="center")
+            _draw_errors(image, answer[name]["image"], "volpath")
+            _draw_errors(gradient, answer[name]["gradient"], "prbvolpath")
+            gradient.set_xlabel("time [s], warm")
+        for axes, what in zip(rows[1:, 0], ("image", "gradient"), strict=True):
+            axes.set_ylabel(f"error of {what} [1]")
+            axes.legend()
 
 
-def _draw_errors(axes: Axes, figures: dict, stock: str, what: str) -> None:
+def _draw_errors(axes: Axes, figures: dict, stock: str) -> None:
     for i, name in enumerate((OURS, stock)):
         if name in figures:
             seconds, error = ([row[key] for row in figures[name]] for key in ("seconds_median", "relative_error"))
             axes.loglog(seconds, error, marker=MARKERS[i], color=SERIES[i], label=name)
-    axes.set(xlabel="time [s], warm", ylabel=what)
-    axes.legend()
     plain_ticks(axes.xaxis, "")
     plain_ticks(axes.yaxis, "")
 
