@@ -19,6 +19,7 @@ from tempfile import TemporaryDirectory
 
 import drjit as dr
 import numpy as np
+from matplotlib.ticker import MaxNLocator
 
 from mivol import config
 from mivol.bench.bars import Bar, say
@@ -201,6 +202,7 @@ def draw(answers: dict, folder: Path) -> None:
             for name, found in answer.items():
                 line[0].plot(found["minutes"], found["psnr"], "o", label=name)
             line[0].set_xlabel("time [min]")
+            line[0].xaxis.set_major_locator(MaxNLocator(3, prune="both"))
             line[0].set_ylabel("PSNR [dB]")
             line[0].set_title(question)
             line[0].legend(fontsize=7)

@@ -56,3 +56,5 @@ def test_a_figure_shows_each_view_beside_its_photograph(monkeypatch: pytest.Monk
     pictures = {axis.get_title(loc="left"): float(axis.images[0].get_array().mean()) for axis in axes if axis.images}
     assert pictures == {"photograph": 1.0, "grid: 30.0 dB": 0.0, "Gaussians: 30.0 dB": 0.5}
     assert [line.get_xdata()[0] for line in axes[0].lines] == [1.0, 2.0]
+    # Labels of four digits have room beside each other.
+    assert len(axes[0].get_xticks()) <= 4
