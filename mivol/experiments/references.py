@@ -140,12 +140,8 @@ def render_views(seen: References, task: Task, loaded: LoadedScene, sensors: Seq
 
 
 def standard_error(made: ReferenceResult) -> np.ndarray:
-    """Of each pixel's mean, with room for what was never sampled.
-
-    Where n samples of a pixel all saw the light, their variance is 0, but an event of probability 1/n may have been
-    missed: (brightest pixel / n)^2 is added to the variance.
-    """
-    return np.sqrt(made.variance + (made.mean.max() / made.spp) ** 2)
+    """Of each pixel's mean, with room for what was never sampled."""
+    return np.sqrt(made.variance_with_unseen(float(made.mean.max())))
 
 
 def read_references(

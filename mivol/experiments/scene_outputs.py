@@ -1,11 +1,13 @@
 """What a fit of a scene leaves in its folder: each view beside its reference, volumes, images, curves and results.
 
-Conventions. ``views/`` has one OpenEXR file a view, with the layers ``reference`` and ``standard_error`` beside the render,
-and PNGs; ``volumes/`` has ``.vol`` and ``.npz``; ``images/`` has textures and skies that were looked for.
+Conventions. ``views/`` has one OpenEXR file a view, with the layers ``reference`` and ``standard_error`` (of their difference,
+where that of the reference is known) beside the render, and PNGs; ``volumes/`` has ``.vol`` and ``.npz``; ``images/`` has
+textures and skies that were looked for.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import mitsuba as mi
@@ -25,6 +27,7 @@ from mivol.optim.parameters import GRID
 from mivol.optim.render_batches import View
 from mivol.optim.seeds import FINAL, seed_of
 from mivol.report.record import Image, Volume
+from mivol.validate.moments import BATCHES, Moments
 
 
 @dataclass(frozen=True)
@@ -58,7 +61,7 @@ class SceneOutputs:
             )
         record.notes += fit.log + ([f"stopped early: {fit.run.finished}"] if fit.run.finished else []) + self.best.says()
         for number, view in enumerate((*self.seen.fitted, *self.seen.held_out)):
-            record.images += self.write_view(view, seed_of(self.chosen.seed, 0, number, FINAL))
+            record.images += self.write_view(view, number)
         for sought in self.chosen.parameter:
             record.volumes += self.write_grid(sought)
             record.images += self.write_image(sought.key)
@@ -73,12 +76,25 @@ class SceneOutputs:
             "fit_seconds": fit.seconds,
         }
 
-    def write_view(self, view: View, seed: int) -> list[Image]:
+    def render_last(self, view: View, number: int) -> tuple[np.ndarray, np.ndarray | None]:
+        """The render of a view, and the standard error of its difference from the reference; None where only one is known.
+
+        The render's own noise counts: where no path of the reference saw a light that the render did see, at the edge of
+        what is lit, it is the larger part. It is known from ``BATCHES`` renders of a sample or more.
+        """
+        render, spp = self.fit.problem.render, self.chosen.fit.spp_shown or self.chosen.fit.spp
+        seed, error = (self.chosen.seed, 0, number, FINAL), self.seen.standard_errors.get(view.name)
+        if error is None:
+            return np.asarray(render(view.sensor, seed_of(*seed), spp)), None
+        share = math.ceil(spp / BATCHES)
+        batches = Moments.of_each(render(view.sensor, seed_of(*seed, batch), share) for batch in range(BATCHES))
+        return batches.mean.astype(np.float32), np.sqrt(np.square(error) + batches.variance_of_mean).astype(np.float32)
+
+    def write_view(self, view: View, number: int) -> list[Image]:
         """One view: the render beside its reference."""
         stem = f"views/{view.name.replace(' ', '_')}"
-        image = np.asarray(self.fit.problem.render(view.sensor, seed, self.chosen.fit.spp_shown or None))
+        image, error = self.render_last(view, number)
         reference = np.asarray(view.reference)
-        error = self.seen.standard_errors.get(view.name)
         parts = {"render": ("", image), "reference": ("reference", reference)}
         if error is not None:
             parts["standard error"] = "standard_error", error

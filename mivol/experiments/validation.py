@@ -28,7 +28,7 @@ from mivol.scene.explain import settings_of
 from mivol.scene.load import LoadedScene
 from mivol.scene.sensors import find_sensor
 from mivol.validate.compare import Comparison, compare
-from mivol.validate.moments import Moments
+from mivol.validate.moments import BATCHES, Moments
 from mivol.validate.reference import render_reference
 from mivol.validate.reference_file import ReferenceResult
 from mivol.validate.statistics import Estimate, Significance, effective_dof, z_bound
@@ -36,9 +36,6 @@ from mivol.validate.trust import Doubt, trust
 
 AGREES, DIFFERS, UNTRUSTED = 0, 3, 4
 """Exit codes."""
-
-BATCHES = 16
-"""Independent renders behind each of our means: their standard error is known to 1 / sqrt(2 * 15) = 18 %."""
 
 ALPHA = 1e-3
 """Chance that a right renderer is called wrong, by the image and by the gradients each."""
@@ -189,12 +186,10 @@ def validate_scene(loaded: LoadedScene, folder: Path, chosen: Validation) -> Ver
 
 def render_batches(scene: mi.Scene, camera: mi.Sensor, integrator: mi.Integrator, chosen: Validation) -> Moments:
     """Independent renders of the colour channels."""
-    spp, found = math.ceil(chosen.spp / BATCHES), Moments.empty()
-    for batch in range(BATCHES):
-        with dr.suspend_grad():
-            image = integrator.render(scene, camera, seed=seed_of(chosen.seed, IMAGE, batch), spp=spp)
-        found = found.add(np.asarray(image)) if batch else Moments.of(np.asarray(image)[None])
-    return found
+    spp = math.ceil(chosen.spp / BATCHES)
+    with dr.suspend_grad():
+        seeds = (seed_of(chosen.seed, IMAGE, batch) for batch in range(BATCHES))
+        return Moments.of_each(integrator.render(scene, camera, seed=seed, spp=spp) for seed in seeds)
 
 
 # -- Gradients ----------------------------------------------------------------------------------------------------

@@ -127,7 +127,7 @@ class Image(_Part):
     """An image of the run: ``.exr``, ``.npy`` of linear values (height, width[, 1 or 3]); ``.png``, ``.mp4`` shown as they are.
 
     Images of one ``view`` belong together: its ``reference`` and ``render`` are shown beside their difference, with a
-    z-image (difference over standard error) where the reference's ``standard error`` is there.
+    z-image (difference over standard error) where the difference's ``standard error`` is there.
     """
 
     path: str

@@ -82,9 +82,8 @@ def compare(
         image: (H, W, C), with the variance of its own mean; 0 where it is exact.
         reference: what ``render_reference`` gave, or ``read_reference`` (which refuses the reference of another scene).
         alpha: chance that images of equal mean are said to differ.
-        samples_seen: largest value of one sample [radiance], for instance the background's. A pixel whose few bright
-            samples were never seen has an estimated variance of 0; with this it has at least that of one sample in all,
-            (samples_seen / spp)^2. 0: as estimated.
+        samples_seen: largest value of one sample [radiance], for instance the background's: what the samples of a pixel may
+            have missed is then allowed for, see :meth:`ReferenceResult.variance_with_unseen`. 0: as estimated.
         rounding: see :func:`mivol.validate.statistics.z_image`.
         correlated: see :func:`mivol.validate.statistics.bias`; 3: the channels share their paths, the filter is a box.
 
@@ -94,7 +93,7 @@ def compare(
     mean = np.asarray(image.mean, dtype=np.float64)
     if mean.shape != reference.mean.shape:
         raise MivolError(f"an image of shape {mean.shape} cannot be compared with a reference of {reference.mean.shape}.")
-    var = np.maximum(reference.variance, (samples_seen / reference.spp) ** 2)
+    var = reference.variance_with_unseen(samples_seen) if samples_seen else reference.variance
     truth, dof = Estimate(reference.mean, var, reference.batches - 1), reference.batches - 1
     difference = bias(image, truth, alpha=alpha / 2, correlated=correlated)
     dark = not reference.mean.any()

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.ndimage import uniform_filter
 
 import mivol
 from mivol.errors import MivolError
@@ -69,6 +70,22 @@ class ReferenceResult:
     def standard_error(self) -> float:
         """Root mean square over pixels and channels of the standard error of the mean [radiance]."""
         return float(np.sqrt(self.variance.mean()))
+
+    def variance_with_unseen(self, brightest: float) -> np.ndarray:
+        """Variance of the mean, with room for light that the samples of a pixel met too seldom, or never.
+
+        Where no path of a pixel met a faint light, its estimated variance is 0; where few did, variance and mean are too small
+        together. The pixels around it met that light by other chances: the variance is at least the mean of 3 x 3 pixels, and
+        that of one sample in all, (brightest / spp)^2.
+
+        Args:
+            brightest: largest value of one sample [radiance].
+
+        Returns:
+            (H, W, C) [radiance^2].
+        """
+        around = uniform_filter(np.asarray(self.variance, dtype=np.float64), size=(3, 3, 1), mode="nearest")
+        return np.maximum(np.maximum(self.variance, around), (brightest / self.spp) ** 2)
 
     @property
     def relative_error(self) -> float:

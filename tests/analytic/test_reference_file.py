@@ -32,3 +32,13 @@ def test_a_paragraph_tells_how_it_was_made():
         expected.replace("all channels at once", "each channel alone").replace("of the mean", "of the mean, above the target")
         + " Doubt: Why."
     )
+
+
+def test_what_a_pixel_has_not_seen_is_known_from_those_around_it():
+    """Variances of 0, 9 and 0 in three columns: 3 around the edges (whose neighbour outside repeats them), 9 where it is seen;
+    channels apart. Where there is nothing around, one sample of 64 among 2048."""
+    columns = np.zeros((3, 3, 2))
+    columns[:, 1, 0] = 9.0
+    found = replace(FOUND, mean=columns, variance=columns)
+    np.testing.assert_allclose(found.variance_with_unseen(64.0)[..., 0], [[3.0, 9.0, 3.0]] * 3, rtol=1e-12)
+    np.testing.assert_allclose(found.variance_with_unseen(64.0)[..., 1], 1 / 1024)

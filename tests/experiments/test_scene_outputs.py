@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import json
+import math
+from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import mitsuba as mi
 import numpy as np
@@ -12,13 +15,16 @@ from fit_scene import KEY
 from tiny_experiment import FIT, SCENE, TRUTH, run
 
 from mivol.config import Sought
+from mivol.experiments.scene_outputs import SceneOutputs
 from mivol.experiments.start import make_start
 from mivol.files import read_exr, read_volume, write_exr
 from mivol.optim.scene_problem import SceneProblem
+from mivol.optim.seeds import FINAL, seed_of
 
 
 def test_images_that_are_compared_may_have_more_samples(variant_rgb, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Four samples in each image of the fit, 32 in what is compared with held-out views and in what is kept."""
+    """Four samples in each image of the fit, 32 in what is compared with held-out views and in what is kept, of which the
+    noise is found from 16 renders of two."""
     asked, render = [], SceneProblem.render
 
     def listen(self: SceneProblem, sensor: mi.Sensor, seed: int, spp: int | None = None) -> mi.TensorXf:
@@ -29,7 +35,36 @@ def test_images_that_are_compared_may_have_more_samples(variant_rgb, folder: Pat
     flags = ["--set", "fit.spp=4", "--set", "fit.spp_shown=32", "--set", "fit.iterations=1"]
     assert run("optimize", folder / "fit.toml", "-o", folder / "run", *flags) == 0
     # An evaluation, the step, an evaluation, and three views that are kept.
-    assert asked == [32, 4, 32, 32, 32, 32]
+    assert asked == [32, 4, 32, *[2] * 16 * 3]
+
+
+def outputs_of(render: Callable[[str, int, int], np.ndarray], errors: dict[str, np.ndarray]) -> SceneOutputs:
+    """Those of a fit whose views are rendered so, with known standard errors of their references."""
+    chosen = SimpleNamespace(seed=3, fit=SimpleNamespace(spp=40, spp_shown=0))
+    fit = SimpleNamespace(problem=SimpleNamespace(render=render))
+    return SceneOutputs(chosen, None, fit, SimpleNamespace(standard_errors=errors), None, None)
+
+
+def test_what_only_the_render_saw_is_in_its_noise() -> None:
+    """Two pixels that no path of the reference has lit: the render sees a light of 16 in one of its 16 batches of 3 samples, by
+    chance, in one pixel, and always 1 in the other. A mean of 1 each; variance (15^2 + 15) / 15 / 16 = 1 in the one, 0 in the
+    other: with a reference known to 0.1 (brightest pixel over samples) that is z = 0.995, which is nothing, and z = 10."""
+    asked = []
+
+    def render(sensor: str, seed: int, spp: int) -> np.ndarray:
+        asked.append((seed, spp))
+        return np.array([16.0 if len(asked) == 5 else 0.0, 1.0])
+
+    image, error = outputs_of(render, {"v": np.full(2, 0.1)}).render_last(SimpleNamespace(name="v", sensor="s"), 0)
+    np.testing.assert_allclose(image / error, [1 / math.sqrt(1.01), 10], rtol=1e-6)
+    assert [spp for _, spp in asked] == [3] * 16 and len({seed for seed, _ in asked}) == 16
+
+
+def test_a_reference_of_unknown_noise_has_one_render_beside_it() -> None:
+    asked = []
+    outputs = outputs_of(lambda *given: asked.append(given) or np.zeros(2), {})
+    assert outputs.render_last(SimpleNamespace(name="v", sensor="s"), 7)[1] is None
+    assert asked == [("s", seed_of(3, 0, 7, FINAL), 40)]
 
 
 @pytest.mark.slow
