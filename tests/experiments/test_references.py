@@ -106,7 +106,7 @@ def test_a_reference_is_rendered_as_the_file_says(
 
 
 def test_a_faint_light_that_a_reference_has_missed_is_no_difference() -> None:
-    """The edge of a smoke under a lamp, as it was seen: 256 samples of 0.8, one in 50 of which meets the smoke, a mean of 0.016.
+    """The edge of a smoke under a lamp, as it was seen: 256 samples of 0.8, one in 50 of which meets the smoke, mean 0.016.
     A pixel whose samples all missed it (chance 0.6 %) stood 0.016 n / (brightest mean) = 9.5 standard errors off. Its 8
     neighbours hold 41 events in the mean: z is beyond 5 where they hold 9 or fewer, of a chance of 1e-8.
     """
