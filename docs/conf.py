@@ -14,6 +14,8 @@ nb_execution_timeout = 300
 nb_execution_raise_on_error = True
 myst_enable_extensions = ["dollarmath"]
 myst_heading_anchors = 3
+# A flag outside of code, --look-at, is copied as it stands.
+smartquotes = False
 exclude_patterns = ["_build"]
 html_math_renderer = "mathml"
 html_theme = "furo"

@@ -115,7 +115,9 @@ def flag_rows(sub: argparse.ArgumentParser) -> list[tuple[str, str]]:
         if action.dest == "help":
             continue
         names = ", ".join(action.option_strings) or action.dest
-        value = "" if action.nargs == 0 or not action.option_strings else f" {action.metavar or action.dest.upper()}"
+        named = action.metavar or action.dest.upper()
+        named = named if isinstance(named, str) else " ".join(named)
+        value = "" if action.nargs == 0 or not action.option_strings else f" {named}"
         rows.append((f"`{names}{value}`", (action.help or "") % {"default": action.default}))
     return rows
 

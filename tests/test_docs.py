@@ -183,6 +183,12 @@ def test_reference_is_what_the_code_says(variant_rgb: str) -> None:
         assert made.current(name, make(), False), f"docs/reference/{name}: run scripts/reference_pages.py --write"
 
 
+def test_flags_are_shown_as_they_are_typed() -> None:
+    """Several values of a flag by their names, and no dash in the place of two hyphens."""
+    assert "| `--up x y z` |" in (DOCS / "reference" / "command_line.md").read_text()
+    assert re.search(r"^smartquotes = False$", (DOCS / "conf.py").read_text(), re.MULTILINE)
+
+
 def test_docstrings_become_tables_and_code(variant_rgb: str) -> None:
     made = load("reference_pages")
     doc = "Says ``a``.\n\nArgs:\n    x: first,\n        and more [m].\n\nExample:\n    >>> f(1)\n\nLast."
