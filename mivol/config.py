@@ -126,7 +126,7 @@ class SceneFitSettings(Section):
 
     iterations: Annotated[int, of("iteration", "at most so many", ge=1)] = 100
     spp: Annotated[int, of("sample/pixel", "samples of an image and of its derivative", ge=1)] = 16
-    spp_shown: Annotated[int, of("sample/pixel", "samples of images that are compared or kept; 0: as spp", ge=0)] = 0
+    spp_shown: Annotated[int, of("sample/pixel", "of images kept, 16 or more for z-images; 0: as spp", ge=0)] = 0
     samples_per_pass: Annotated[int, of("sample", "most samples in one kernel: Ctrl-C waits for one", ge=1)] = 1 << 20
     max_depth: Annotated[
         Annotated[int, msgspec.Meta(ge=-1)] | str, of("1", "as Mitsuba's volpath; -1: unlimited; auto: measured")
@@ -479,7 +479,7 @@ class FieldFit(Section):
 class GaussianSettings(Section):
     """The Gaussians and how they are fitted."""
 
-    preset: Annotated[str, of("1", "steps, sizes, rates: tiny, minute, minutes, fine or gpu", min_length=1)] = "minute"
+    preset: Annotated[str, of("1", "steps, sizes, rates: tiny, minute, minutes, fine, finest or gpu", min_length=1)] = "minute"
     effort: Annotated[float, of("1", "factor on the preset's steps", gt=0)] = 1.0
     minutes: Annotated[
         float | None, of("min", "as many steps as take about so long on two idle cores; no clock is asked")

@@ -208,12 +208,16 @@ PRESETS: dict[str, GaussianPlan] = {
     "fine": GaussianPlan(
         (SplatStage(100, 500, 0), SplatStage(200, 3000, 2), SplatStage(400, 3000, 3)), start=6000, most=30_000
     ),
+    "finest": GaussianPlan(
+        (SplatStage(100, 500, 0), SplatStage(200, 3000, 2), SplatStage(400, 3500, 3), SplatStage(800, 1500, 3)), 6000, 50_000
+    ),
     "gpu": GaussianPlan(
         (SplatStage(200, 1000, 0), SplatStage(400, 2000, 2), SplatStage(800, 27_000, 3)), 100_000, 400_000, **PUBLISHED
     ),
 }
 """``tiny`` takes seconds, ``minute`` and ``minutes`` one and five on two idle cores, ``fine`` about as long as ``minutes``, for
-photographs of 400 pixels and more; ``gpu`` has the published steps (not measured)."""
+photographs of 400 pixels and more, ``finest`` ten to twenty, for 800 and more; ``gpu`` has the published steps (not
+measured)."""
 
 
 def extent_of(cameras: Sequence[Camera]) -> float:

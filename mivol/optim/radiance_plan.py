@@ -147,8 +147,15 @@ class FitPlan:
         return Course(self.steps, events=(CoarseToFine(at=self.begins), UpdateOccupancy(every=self.occupancy_every), *more))
 
     def up_to(self, longest: int) -> FitPlan:
-        """The plan that ends with so many nodes along the longest edge; stages that are coarser stay."""
+        """The plan that ends with so many nodes along the longest edge; stages that are coarser stay.
+
+        Where all are, the last of them takes half its steps: it is to find what is empty, and where colours begin (the chair
+        with the nodes of 256^3, in a like time: 31.29 dB with 1159 and 1159 steps of the last two stages, 31.40 with 500 and
+        1400).
+        """
         coarser = [stage for stage in self.stages if stage.longest < longest]
+        if len(coarser) == len(self.stages):
+            coarser[-1] = replace(coarser[-1], steps=max(1, coarser[-1].steps // 2))
         return replace(self, stages=(*coarser, replace(self.stages[-1], longest=longest)))
 
     def degree_at(self, number: int) -> int:

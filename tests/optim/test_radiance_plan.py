@@ -81,6 +81,13 @@ def test_grids_have_cubic_voxels_and_cover_the_box(variant_rgb: str) -> None:
     np.testing.assert_allclose(place[:3, 3], [0, -0.05, -0.025], atol=1e-12)
 
 
+def test_a_stage_that_is_not_the_last_any_more_takes_half_its_steps() -> None:
+    plan = FitPlan((Stage(8, 10), Stage(16, 31)))
+    assert [(stage.longest, stage.steps) for stage in plan.up_to(40).stages] == [(8, 10), (16, 15), (40, 31)]
+    assert [(stage.longest, stage.steps) for stage in plan.up_to(12).stages] == [(8, 10), (12, 31)]
+    assert plan.up_to(16) == plan
+
+
 def test_schedules() -> None:
     plan = replace(PLAN, delay=0.1, last=0.01)
     assert (plan.begins, plan.steps) == ((60,), 150)
