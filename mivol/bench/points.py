@@ -65,7 +65,7 @@ TRACED = 0.14
 
 CHAIR = {
     "chair": Fitted("minute", 1.2, 0.25, (0, 1, 2)),
-    "chair_minutes": Fitted("minutes", 1.15, 0.25, (0, 1, 2)),
+    "chair_minutes": Fitted("minutes", 1.0, 0.25, (0, 1, 2)),
     "chair_large": Fitted("fine", 0.85, 1.0, (0,)),
     "chair_finest": Fitted("finest", 1.0, 1.0, (0,)),
 }

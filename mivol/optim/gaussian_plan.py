@@ -204,7 +204,7 @@ PUBLISHED = {
 PRESETS: dict[str, GaussianPlan] = {
     "tiny": GaussianPlan((SplatStage(64, 150, 0), SplatStage(128, 350, 1)), 1500, 4000, every=50, place=8e-4, place_end=8e-6),
     "minute": GaussianPlan((SplatStage(100, 400, 0), SplatStage(200, 2000, 2)), start=4000, most=10_000, every=50),
-    "minutes": GaussianPlan((SplatStage(100, 800, 0), SplatStage(200, 7000, 3)), start=6000, most=25_000),
+    "minutes": GaussianPlan((SplatStage(100, 800, 0), SplatStage(200, 7000, 3)), start=8000, most=35_000),
     "fine": GaussianPlan(
         (SplatStage(100, 500, 0), SplatStage(200, 3000, 2), SplatStage(400, 3000, 3)), start=6000, most=30_000
     ),
