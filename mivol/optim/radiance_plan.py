@@ -180,7 +180,7 @@ PRESETS: dict[str, FitPlan] = {
         (
             Stage(32, 130, 4, tiles=256, rate=1 / 4),
             Stage(64, 195, 4, tiles=512, rate=1 / 2),
-            Stage(128, 840, 2, tiles=1024),
+            Stage(128, 700, 2, tiles=1024),
         ),
         density_rate=60.0,
         sh_rate=0.1,
