@@ -20,7 +20,6 @@ from mivol.experiments.gaussian_outputs import compare
 from mivol.experiments.gaussian_start import begin, make_gaussian_plan
 from mivol.experiments.photo_data import boxed, read_photos
 from mivol.experiments.photo_outputs import judge_fitted
-from mivol.optim.gaussian_problem import GaussianProblem
 from mivol.optim.loop import reconstruct
 from mivol.photos import load_photos, rectified
 from mivol.points import Gaussians
@@ -80,8 +79,7 @@ def exposure_gain(folder: Path, asked: Fitted, held_out: int) -> dict:
         chosen = config.from_dict({"title": folder.name, "photos": data, "gaussians": settings, "seed": asked.seeds[0]})
         photos, judged = read_photos(chosen, Path())
         begun = begin(chosen, boxed(chosen, photos), make_gaussian_plan(chosen))
-        cameras = [view.camera for view in begun.views]
-        problem = GaussianProblem(begun.batches, cameras, begun.cloud, begun.plan, chosen.seed)
+        problem = begun.problem(chosen.seed)
         reconstruct(problem, begun.plan.optimiser, begun.plan.course())
         seen = [compare(problem, judged, photo, ("psnr",)) for photo in judged.views]
         raw = [quality.values["psnr"] for _, quality in seen]
@@ -94,6 +92,6 @@ def exposure_gain(folder: Path, asked: Fitted, held_out: int) -> dict:
             "gains": [float(gains.min()), float(gains.max())],
         }
         width, height = judged.views[0].camera.size
-        counts = {"pixels": [width, height], "fitted": len(cameras), "judged": len(raw), "steps": begun.plan.steps}
+        counts = {"pixels": [width, height], "fitted": len(begun.views), "judged": len(raw), "steps": begun.plan.steps}
         say(f"  {name} gains: {answer[name]['psnr']:.2f} dB, {answer[name]['psnr_colour_fitted']:.2f} dB with fitted colours")
     return answer | counts

@@ -172,7 +172,7 @@ def _fit_grid(chosen: FieldFit, photos: Photos) -> tuple[RadianceProblem, Callab
 def _fit_gaussians(chosen: GaussianFit, photos: Photos) -> tuple[GaussianProblem, Callable[[], Found]]:
     """The fit of Gaussians, and what it has found once it is over."""
     begun = begin(chosen, photos, make_gaussian_plan(chosen))
-    problem = GaussianProblem(begun.batches, [view.camera for view in begun.views], begun.cloud, begun.plan, chosen.seed)
+    problem = begun.problem(chosen.seed)
     low_pass = begun.plan.low_pass
 
     def found() -> Found:

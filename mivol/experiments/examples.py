@@ -257,10 +257,8 @@ def run_example(
     example, watcher = example_named(name), watcher or Nobody()
     source = example.source(name)
     # Before anything is made for it: what the changes ask for may be refused.
-    wanted = config.load(source / example.file, changes).output
-    if folder is None:
-        sets_output = any(change.partition("=")[0].strip() == "output" for change in changes)
-        folder = Path(wanted if sets_output else f"runs/{name}")
+    wanted = config.load(source / example.file, (f"output=runs/{name}", *changes)).output
+    folder = folder or Path(wanted)
     given = (*prepare(name, example, source, folder, watcher), *changes)
     chosen = config.load(source / example.file, given)
     return run_experiment(Task(chosen, source, folder, watcher=watcher, command=command))

@@ -39,7 +39,6 @@ from mivol.experiments.start import make_starts
 from mivol.experiments.task import Task
 from mivol.experiments.truth import check_truth, make_truth, put
 from mivol.optim.emissive_start import check_given_start
-from mivol.optim.gaussian_problem import GaussianProblem
 from mivol.optim.parameters import check_names
 from mivol.optim.radiance_problem import RadianceProblem
 from mivol.optim.scene_problem import SceneProblem
@@ -204,8 +203,7 @@ def explain_gaussian_fit(chosen: GaussianFit, base: Path, say: Say) -> Explanati
     for note in plan_film(chosen.show, photos).notes:
         say(f"  {note}")
     begun = begin(chosen, photos, asked)
-    plan = begun.plan
-    plan.optimiser.begin(GaussianProblem(begun.batches, [view.camera for view in begun.views], begun.cloud, plan, chosen.seed))
+    begun.plan.optimiser.begin(begun.problem(chosen.seed))
     return Explanation(tuple(f"  {one.choice}: {one.reason}" for one in begun.lines))
 
 

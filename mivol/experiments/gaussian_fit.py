@@ -47,8 +47,7 @@ def gaussian_fit(task: Task) -> Path:
             run.record.plan, run.record.notes = begun.lines, [*notes(photos, judged), *film.notes]
             task.watcher.say([photos.text, *(f"{one.choice}: {one.reason}" for one in run.record.plan)])
         with run.stage("fit"):
-            cameras = [view.camera for view in begun.views]
-            problem = GaussianProblem(begun.batches, cameras, begun.cloud, begun.plan, chosen.seed)
+            problem = begun.problem(chosen.seed)
             best = BestIterate(run, best_files(problem))
             fit = solve(task, run, problem, judged, best, compare)
         with run.stage("images and Gaussians"):

@@ -8,6 +8,7 @@ from mivol.config import GaussianFit
 from mivol.errors import MivolError
 from mivol.optim.density_control import Arrays
 from mivol.optim.gaussian_plan import CONTROLS, PRESETS, GaussianPlan, memory_of
+from mivol.optim.gaussian_problem import GaussianProblem
 from mivol.optim.gaussian_start import begin_at, places_of
 from mivol.optim.ray_batches import RayBatches
 from mivol.optim.strategy import nearest
@@ -34,6 +35,10 @@ class Begun:
     batches: RayBatches
     cloud: Arrays
     lines: list[PlanLine]
+
+    def problem(self, seed: int) -> GaussianProblem:
+        """What is fitted, before its first step; ``seed``: of the views and the places that are drawn."""
+        return GaussianProblem(self.batches, [view.camera for view in self.views], self.cloud, self.plan, seed)
 
 
 def make_gaussian_plan(chosen: GaussianFit) -> GaussianPlan:

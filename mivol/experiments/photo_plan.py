@@ -66,14 +66,15 @@ def suited(plan: FitPlan, photos: Photos) -> FitPlan:
     edge = float((box[1] - box[0]).max())
 
     def suited_stage(stage: Stage) -> Stage:
-        wanted = min(stretched(stage.longest, box), int(edge / (VOXEL * pixel))) if plan.cubic else 0
-        longest = max(stage.longest, wanted)
+        longest = stage.longest
+        if plan.cubic:
+            longest = max(longest, min(stretched(longest, box), int(edge / (VOXEL * pixel))))
         halvings = min(round(np.log2(edge / longest / (VOXEL * pixel))), int(np.log2(least / SMALLEST)))
         return replace(stage, longest=longest, shrink=2 ** max(halvings, 0))
 
     if plan.few_degree is not None and len(photos.views) < FEW:
         plan = replace(plan, degree=plan.few_degree)
-    return replace(plan, stages=tuple(suited_stage(stage) for stage in plan.stages))
+    return replace(plan, stages=tuple(suited_stage(stage) for stage in plan.stages), cubic=False)
 
 
 def choices(plan: FitPlan, photos: Photos, batches: RayBatches) -> list[PlanLine]:

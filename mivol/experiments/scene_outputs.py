@@ -120,11 +120,12 @@ class SceneOutputs:
         if self.truth is not None and self.chosen.truth.key == sought.key:
             grids["truth"] = self.truth
         found = []
+        unit = unit_of(sought)
         for role, grid in grids.items():
             stem = f"volumes/{sought.key.replace('.', '_')}_{role}"
             write_volume(self.run.path / f"{stem}.vol", grid, place if is_along_axes else np.eye(4))
-            write_volume(self.run.path / f"{stem}.npz", grid, place, metadata={"key": sought.key, "unit": unit_of(sought)})
-            about = {"quantity": quantity, "unit": unit_of(sought), "size": edges_of(place), "caption": sought.key}
+            write_volume(self.run.path / f"{stem}.npz", grid, place, metadata={"key": sought.key, "unit": unit})
+            about = {"quantity": quantity, "unit": unit, "size": edges_of(place), "caption": sought.key}
             found.append(Volume(path=f"{stem}.npz", role=role, **about))
         self.run.record.images += film_of_volume(self.run, value, edges_of(place), "y", quantity)
         if not self.best.is_newest:

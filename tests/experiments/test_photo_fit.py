@@ -278,6 +278,7 @@ def test_a_long_box_has_as_many_nodes_as_a_cube(photographs: Path, tmp_path: Pat
     long = replace(photos, survey=replace(photos.survey, box=slab))
     plan = FitPlan((Stage(4, 1), Stage(8, 1), Stage(40, 1)))
     assert [stage.longest for stage in photo_plan.suited(plan, long).stages] == [13, 17, 40]
+    assert photo_plan.suited(photo_plan.suited(plan, long), long) == photo_plan.suited(plan, long)
     assert [stage.longest for stage in photo_plan.suited(replace(plan, cubic=False), long).stages] == [4, 8, 40]
     assert not photo_plan.make_plan(config.load(toml(tmp_path, photographs), ["field.longest=26"])).cubic
 
