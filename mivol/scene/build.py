@@ -52,10 +52,12 @@ def build_estimators(
                 choice.transmittance_grid = build_transmittance_grid(media, direct.emitters)
     lights_surfaces = bool(needs.surfaces) and settings.scatterings >= 1
     segment = SEGMENT_ESTIMATORS[plan.segment].make(choice)
-    lights_media = segment.ends_in_media and not needs.is_sealed and any(kind != "uniform" for kind in needs.emitter_kinds)
+    is_even = all(kind == "uniform" for kind in needs.emitter_kinds)
+    lights_media = segment.ends_in_media and not needs.is_sealed and not is_even
     lobe = None if plan.lobe is None else dr.opaque(mi.Float, plan.lobe)
     emission = _draw_emission(scene, media, needs) if plan.draws_emission else None
-    return Estimators(direct, segment, lights_surfaces, lights_media, lobe, emission)
+    long_paths_count = is_even or any(medium.emits for medium in needs.media)
+    return Estimators(direct, segment, lights_surfaces, lights_media, lobe, emission, long_paths_count)
 
 
 def _draw_emission(scene: mi.Scene, media: SceneMedia, needs: Needs) -> EmissionSampling:

@@ -1,9 +1,12 @@
-"""Media behind boundaries that refract: no straight ray finds an emitter, so none is sent."""
+"""Media behind boundaries that refract: no straight ray finds an emitter, so none is sent; and roulette of long paths."""
 
 from __future__ import annotations
 
 import mitsuba as mi
+import numpy as np
 import pytest
+from false_alarms import assert_precise, assert_same_mean, over_pixels
+from scattering_scenes import moments
 
 import scenes
 from mivol.scene.build import build_estimators
@@ -11,6 +14,7 @@ from mivol.scene.needs import find_needs
 from mivol.scene.plan import make_plan
 from mivol.scene.survey import survey_scene
 from mivol.transport.path.settings import Settings
+from mivol.transport.path.walk import LONG
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
 
@@ -68,3 +72,61 @@ def test_media_around_shapes_are_not_sealed() -> None:
     milk = mi.load_dict({"type": "homogeneous", "sigma_t": 2.0, "albedo": 0.9})
     bubble = ball(0.0, bsdf=GLASS, exterior=milk, interior={"type": "homogeneous", "sigma_t": 1.0})
     assert not survey_scene(mi.load_dict({"type": "scene", "bubble": bubble, "sky": scenes.sky()})).is_sealed
+
+
+# -- Roulette of long paths ------------------------------------------------------------------------------------------------
+
+WAIT = 100
+"""``rr_depth`` of the furnace."""
+
+
+def furnace(sky: dict, interior: dict | None = None) -> mi.Scene:
+    """A white ball of a mean free path of a sixteenth of its radius, behind a boundary whose index is that of air, in light of 1 from everywhere."""
+    milk = {"type": "homogeneous", "sigma_t": 16.0, "albedo": 1.0}
+    matched = {"type": "dielectric", "int_ior": 1.0, "ext_ior": 1.0}
+    eye = scenes.camera((0.0, 0.0, 6.0), (0.0, 0.0, 0.0), res=64, fov=12.0)
+    parts = {"ball": {"type": "sphere", "bsdf": matched, "interior": interior or milk}, "sky": sky, "sensor": eye}
+    return mi.load_dict({"type": "scene", **parts})
+
+
+def panorama() -> dict:
+    """A sky of 1 whose every direction is looked up, so that no plan knows that they are the same."""
+    return {"type": "envmap", "bitmap": mi.Bitmap(np.ones((4, 8, 3), np.float32))}
+
+
+UNLIMITED = {"type": "mivol", "max_depth": -1, "rr_depth": WAIT}
+
+
+def test_roulette_spares_long_paths_in_even_light() -> None:
+    """Every path that escapes brings 1; at the surface roulette ends those that have scattered ``rr_depth`` times with a chance
+    of 0.05, and nothing else does."""
+    light = scenes.render(furnace(scenes.sky()), UNLIMITED, 1, seed=3)[..., 0].ravel()
+    ends = np.array([0, 1, 1 / 0.95])
+    assert np.abs(light[:, None] - ends).min(axis=1).max() < 1e-4  # some thousand factors of 1 +- 6e-8
+    assert (light > 1.02).mean() > 0.05
+
+
+def test_roulette_ends_long_paths_in_light_that_has_a_place() -> None:
+    """A path of n > LONG scatterings brings sqrt(n / LONG): an n that is whole to its rounding, and some are twice LONG."""
+    light = scenes.render(furnace(panorama()), UNLIMITED, 1, seed=3)[..., 0].ravel()
+    raised = light[light > 1.06] * 0.95
+    n = raised**2 * LONG
+    assert np.abs(n - np.round(n)).max() < 0.2  # n up to some 1000, of relative error 1e-4
+    assert n.min() > LONG
+    assert n.max() > 2 * LONG
+
+
+@pytest.mark.statistical
+def test_roulette_of_long_paths_keeps_the_mean() -> None:
+    found = over_pixels(moments(furnace(panorama()), UNLIMITED, 4))
+    assert_same_mean(found, 1.0, rounding=1e-4, what="radiance")
+    assert_precise(found, 0.02, what="radiance")
+
+
+def test_roulette_spares_long_paths_where_media_emit() -> None:
+    """The light of a path grows with its length: none is worth less than what it has cost."""
+    glow = {"type": "mivol_medium", "sigma_t": 16.0, "albedo": 1.0, "emission": 1.0}
+    scene = furnace(panorama(), glow)
+    survey, settings = survey_scene(scene), Settings(max_depth=-1)
+    needs = find_needs(scene, scene.sensors()[0], survey)
+    assert build_estimators(scene, needs, make_plan(needs, settings), settings, survey, True).long_paths_count

@@ -180,6 +180,8 @@ class Estimators:
             that is the same from everywhere is found without noise by the paths that escape.
         lobe: mean cosine of the lobe that side flights are drawn from (:mod:`.side_flight`); None for no side flights.
         emission: draws light of media that emit, where paths scatter; None where they find it by chance.
+        long_paths_count: long paths have as much light as short ones, where it is the same from everywhere, or more, where
+            media emit; roulette spares them.
     """
 
     def __init__(
@@ -190,10 +192,11 @@ class Estimators:
         lights_media: bool = False,
         lobe: mi.Float | None = None,
         emission: EmissionSampling | None = None,
+        long_paths_count: bool = False,
     ) -> None:
         self.media, self.direct, self.segment = direct.media, direct, segment
         self.lights_surfaces, self.lights_media, self.lobe = lights_surfaces, lights_media, lobe
-        self.emission = emission
+        self.emission, self.long_paths_count = emission, long_paths_count
 
     @property
     def draws_shadows(self) -> bool:
@@ -206,5 +209,5 @@ class Estimators:
 
     def replayed(self) -> Estimators:
         """Estimators of the radiance that a replay subtracts from: without light that is sampled anew for its derivatives."""
-        how = self.lights_surfaces, self.lights_media, self.lobe, self.emission
+        how = self.lights_surfaces, self.lights_media, self.lobe, self.emission, self.long_paths_count
         return Estimators(self.direct, self.segment.replayed(), *how)
