@@ -81,7 +81,10 @@ WAIT = 100
 
 
 def furnace(sky: dict, interior: dict | None = None) -> mi.Scene:
-    """A white ball of a mean free path of a sixteenth of its radius, behind a boundary whose index is that of air, in light of 1 from everywhere."""
+    """A white ball of a mean free path of a sixteenth of its radius, in light of 1 from everywhere.
+
+    The index of refraction of its boundary is that of air.
+    """
     milk = {"type": "homogeneous", "sigma_t": 16.0, "albedo": 1.0}
     matched = {"type": "dielectric", "int_ior": 1.0, "ext_ior": 1.0}
     eye = scenes.camera((0.0, 0.0, 6.0), (0.0, 0.0, 0.0), res=64, fov=12.0)
