@@ -1,6 +1,6 @@
 """How many views does a smoke need? The fit of scenes/white_smoke from 5 to 50 of them, each at the same cost.
 
-    python scenes/white_smoke/views.py [--counts 5 10 20 50] [-o runs/white_smoke_views]
+    python scenes/white_smoke/views.py [--counts 5 16 50] [-o runs/white_smoke_views]
 
 Every fit is `mivol optimize scenes/white_smoke/fit.toml` with another number of views; each is measured on the same four views
 that none has seen. Iterations draw four views each, so that fifty cost what five do.
@@ -107,7 +107,7 @@ def put(axes: mpl.axes.Axes, rgb: np.ndarray, text: str) -> None:
 def arguments() -> argparse.Namespace:
     """The command line."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--counts", type=int, nargs="+", default=[5, 10, 20, 50], help="numbers of views")
+    parser.add_argument("--counts", type=int, nargs="+", default=[5, 16, 50], help="numbers of views")
     parser.add_argument("--size", type=int, default=64, help="pixels along a side")
     parser.add_argument("--iterations", type=int, default=200)
     parser.add_argument("-o", "--output", type=Path, default=Path("runs/white_smoke_views"))
