@@ -24,7 +24,7 @@ def means(values: np.ndarray, light: Light, seed: int, spp: int) -> tuple[float,
     """Light and derivative of one set of paths; the density itself is the direction."""
     made = Twin(values, values, SIDE, light)
     found, derivative, _ = made.paths(seed, spp)
-    return float(np.mean(np.array(found, np.float64))), float(np.mean(np.array(derivative, np.float64)))
+    return float(found.mean()), float(derivative.mean())
 
 
 @pytest.mark.parametrize("name", SHONE)
@@ -49,7 +49,7 @@ def test_its_light_is_that_of_volpath(variant_rgb: str, name: str) -> None:
     values = np.where(np.arange(5) < 2, 0, 3 * NOISE)
     ours = Twin(values, values, SIDE, light)
     theirs = light.integrator("volpath")
-    paths = np.concatenate([np.array(ours.paths(fresh(k), 512)[0], np.float64) for k in range(4)])
+    paths = np.concatenate([ours.paths(fresh(k), 512)[0] for k in range(4)])
     images = [np.array(mi.render(ours.scene, integrator=theirs, spp=256, seed=fresh(100 + k)), np.float64) for k in range(16)]
     light_of_theirs = over_pixels(Moments.of(np.array(images).mean(axis=-1, keepdims=True)))
     assert_precise(light_of_theirs, 0.02 * light_of_theirs.mean)
@@ -62,22 +62,42 @@ def test_white_smoke_in_a_furnace(variant_rgb: str, depth: int) -> None:
     those of depth 6 do or end inside."""
     light = replace(SHONE[CONSTANT], depth=depth, albedo=1.0)
     made = Twin(3 * NOISE, NOISE, SIDE, light)
-    found = np.array(made.paths(1, 64)[0])
+    found = made.paths(1, 64)[0]
     # The weight is a product of quotients that are 1 but for a few roundings each.
     np.testing.assert_allclose(found[found > 0], 1, rtol=1e-4)
     assert (found > 0).all() == (depth < 0)
 
 
-def test_the_level_takes_noise_and_no_light(variant_rgb: str) -> None:
-    """In a furnace the light of a path is its weight, so that nothing is left; without the level the mean of 9216 derivatives
+def test_levels_take_noise_and_no_light(variant_rgb: str) -> None:
+    """In a furnace the light of a path is its weight, so that nothing is left; without levels the mean of 9216 derivatives
     whose deviation is about 1 would be some 0.01."""
     light = replace(SHONE[CONSTANT], depth=-1, albedo=1.0)
     made = Twin(3 * NOISE, NOISE, SIDE, light)
-    raw = np.array(made.paths(5, 256)[1], np.float64)
+    raw = made.paths(5, 256)[1]
     found = [made.derivative(10 + k, 256) for k in range(3)]
     assert np.std(raw) > 0.3
-    # Weights are 1 but for their roundings, and so is the level.
+    # Weights are 1 but for their roundings, and so is the sum of the levels.
     assert np.max(np.abs(found)) < 1e-5
+
+
+@pytest.mark.statistical
+def test_what_takes_the_noise_has_the_mean_0(variant_rgb: str) -> None:
+    """After each number of scatterings, in glass, where paths are long and half of the box is empty."""
+    made = Twin(np.where(np.arange(5) < 2, 0, 3 * NOISE), NOISE, SIDE, UNLIMITED["glass"])
+    _, _, idle = made.paths(fresh(9), 4096)
+    for row in idle:
+        assert_same_mean(Moments.of(row), 0.0)
+
+
+def test_levels_of_each_number_of_scatterings_take_more_noise(variant_rgb: str) -> None:
+    """In constant light, half of the box empty: they leave two thirds of the variance that the end of a path alone leaves."""
+    empty = np.broadcast_to(np.arange(5) < 2, NOISE.shape)
+    made = Twin(np.where(empty, 0, NOISE), np.where(empty, 1.0, 0.0), SIDE, UNLIMITED[CONSTANT])
+    levels = made._choose_levels(3, 512)
+    _, found, idle = made.paths(4, 512)
+    alone = np.cov(found, idle[0])
+    left = alone[0, 0] - alone[0, 1] ** 2 / alone[1, 1]
+    assert np.var(found - levels @ idle) < 0.8 * left
 
 
 def test_nothing_of_the_twin_is_walked_by_mivol(variant_rgb: str) -> None:

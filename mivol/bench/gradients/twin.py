@@ -11,7 +11,9 @@ Emitters are looked at through as much of the box as lies between, by ratio trac
 is no step whose size matters, nothing is divided by sigma, so it may be 0, and nothing is walked back. All that it shares with
 :mod:`mivol` is Mitsuba: shapes, emitters, BSDFs and phase functions.
 
-The weight at the end of a path has the mean 1 whatever sigma is, so its derivative has the mean 0 and takes part of the noise.
+The weight at the end of a path has the mean 1 whatever sigma is, so its derivative has the mean 0. So has w g', whatever is
+known of the path so far: it is summed over the flights after each number of scatterings, times what albedo and BSDFs have left.
+Multiples of these sums are subtracted, those that leave the least variance in paths of their own (a regression).
 
 References: Woodcock et al. 1965, Novak et al. 2014 (tracking with weights); Veach 1997 (multiple importance sampling).
 """
@@ -37,13 +39,26 @@ SELDOM = 0.4
 FAINTEST = 0.5
 """Largest extinction for which the majorant is chosen, at least [1/length]: where nothing is, P needs collisions to happen."""
 
+AHEAD = 12
+"""Numbers of scatterings whose flights have sums of their own; the last is of all later ones."""
+
 SURE = 4
 """Scatterings that every path survives; after these absorption ends paths of unlimited depth."""
 
 
 @dataclass
 class _Path:
-    """The state of paths: ``w`` and ``dw`` are the weight and its derivative, ``a`` what albedo and BSDFs leave."""
+    """The state of paths.
+
+    Attributes:
+        rng, ray, on: random numbers, the ray ahead, lanes that go on.
+        w, dw: the weight and its derivative.
+        a: what albedo and BSDFs leave.
+        light, derivative: found so far.
+        depth: number of scatterings.
+        pdf, delta, last: of the direction, and where it was sampled.
+        idle: sums of a w g' after each number of scatterings.
+    """
 
     rng: mi.PCG32
     ray: mi.Ray3f
@@ -56,6 +71,7 @@ class _Path:
     pdf: mi.Float
     delta: mi.Bool
     last: mi.Interaction3f
+    idle: list[mi.Float]
     on: mi.Bool
 
     @classmethod
@@ -64,7 +80,8 @@ class _Path:
         n = dr.width(ray)
         zero, one, on = dr.zeros(mi.Float, n), dr.full(mi.Float, 1, n), dr.full(mi.Bool, True, n)
         last = dr.zeros(mi.Interaction3f, n)
-        return cls(rng, mi.Ray3f(ray), one, zero, one, zero, zero, dr.zeros(mi.UInt32, n), one, on, last, mi.Bool(on))
+        idle = [mi.Float(zero) for _ in range(AHEAD)]
+        return cls(rng, mi.Ray3f(ray), one, zero, one, zero, zero, dr.zeros(mi.UInt32, n), one, on, last, idle, mi.Bool(on))
 
 
 class Twin:
@@ -85,17 +102,17 @@ class Twin:
         self.least = min(LEAST, SELDOM / self.majorant)
         both = np.stack([values, direction], axis=-1).astype(np.float32)
         self.field = mi.Texture3f(mi.TensorXf(both), wrap_mode=dr.WrapMode.Clamp)
-        self.level: float | None = None
+        self.levels: np.ndarray | None = None
 
     def derivative(self, seed: int, spp: int) -> float:
         """An unbiased estimate from this many samples a pixel."""
-        if self.level is None:
-            self.level = self._choose_level(seed + 50_000, spp)
-        _, found, end = self.paths(seed, spp)
-        return float(np.mean(np.array(found, np.float64) - self.level * np.array(end, np.float64)))
+        if self.levels is None:
+            self.levels = self._choose_levels(seed + 50_000, spp)
+        _, found, idle = self.paths(seed, spp)
+        return float(found.mean() - self.levels @ idle.mean(axis=1))
 
-    def paths(self, seed: int, spp: int) -> tuple[mi.Float, mi.Float, mi.Float]:
-        """The light of each path, its derivative, and the derivative of the weight at its end."""
+    def paths(self, seed: int, spp: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The light of each path (N,), its derivative (N,), and what has the mean 0 (1 + AHEAD, N)."""
         sensor = self.scene.sensors()[0]
         width, height = sensor.film().size()
         # Streams of PCG32 that are numbered in a row resemble each other: a hash of the number is their state.
@@ -104,13 +121,14 @@ class Twin:
         ray, _ = sensor.sample_ray(0, 0, mi.Point2f(rng.next_float32(), rng.next_float32()), mi.Point2f(0.5))
         path = _Path.start(ray, rng)
         (path,) = dr.while_loop((path,), cond=lambda p: p.on, body=lambda p: (self._step(p),), label="twin")
-        return path.light, path.derivative, path.dw
+        light, derivative, *idle = (np.array(x, np.float64) for x in (path.light, path.derivative, path.dw, *path.idle))
+        return light, derivative, np.stack(idle)
 
-    def _choose_level(self, seed: int, spp: int) -> float:
-        """The multiple of what has the mean 0 that leaves the least noise, from paths of their own."""
-        _, found, end = (np.array(x, np.float64) for x in self.paths(seed, spp))
-        spread = np.cov(found, end)
-        return float(spread[0, 1] / spread[1, 1]) if spread[1, 1] > 0 else 0.0
+    def _choose_levels(self, seed: int, spp: int) -> np.ndarray:
+        """The multiples of what has the mean 0 that leave the least noise, from paths of their own."""
+        _, found, idle = self.paths(seed, spp)
+        found, idle = found - found.mean(), idle - idle.mean(axis=1, keepdims=True)
+        return np.linalg.lstsq(idle @ idle.T, idle @ found, rcond=1e-10)[0]
 
     def _step(self, p: _Path) -> _Path:
         """To the next collision or surface, and over it."""
@@ -139,7 +157,9 @@ class Twin:
         ray, most = p.ray, self.majorant
         inside = p.on & (dr.max(dr.abs(ray.o + 1e-3 * ray.d)) < 1)
 
-        def body(rng: mi.PCG32, t: mi.Float, w: mi.Float, dw: mi.Float, hit: mi.Bool, go: mi.Bool) -> tuple:
+        def body(
+            rng: mi.PCG32, t: mi.Float, w: mi.Float, dw: mi.Float, idle: mi.Float, hit: mi.Bool, go: mi.Bool
+        ) -> tuple:
             t = t - dr.log(1 - rng.next_float32()) / most
             go = go & (t < end)
             sigma, rate = self._at(ray.o + t * ray.d)
@@ -147,11 +167,14 @@ class Twin:
             real = go & (rng.next_float32() < chance)
             g = dr.select(real, sigma / most / chance, (1 - sigma / most) / (1 - chance))
             dg = dr.select(real, rate / most / chance, -rate / most / (1 - chance))
-            dw = dr.select(go, dw * g + w * dg, dw)
-            return rng, t, dr.select(go, w * g, w), dw, hit | real, go & ~real
+            dw, idle = dr.select(go, dw * g + w * dg, dw), idle + dr.select(go, w * dg, 0)
+            return rng, t, dr.select(go, w * g, w), dw, idle, hit | real, go & ~real
 
-        state = (p.rng, dr.zeros(mi.Float, dr.width(ray)), p.w, p.dw, inside & False, inside)
-        p.rng, t, p.w, p.dw, hit, _ = dr.while_loop(state, lambda *s: s[-1], body, label="flight")
+        zero = dr.zeros(mi.Float, dr.width(ray))
+        state = (p.rng, zero, p.w, p.dw, mi.Float(zero), inside & False, inside)
+        p.rng, t, p.w, p.dw, idle, hit, _ = dr.while_loop(state, lambda *s: s[-1], body, label="flight")
+        here = dr.minimum(p.depth, AHEAD - 1)
+        p.idle = [found + dr.select(here == k, p.a * idle, 0) for k, found in enumerate(p.idle)]
         return p, t, hit
 
     def _add_emission(self, p: _Path, si: mi.SurfaceInteraction3f, shown: mi.Bool) -> _Path:
