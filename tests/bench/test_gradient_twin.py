@@ -94,8 +94,8 @@ def test_levels_of_each_number_of_scatterings_take_more_noise(variant_rgb: str) 
     of them alone 0.73."""
     empty = np.broadcast_to(np.arange(5) < 2, NOISE.shape)
     made = Twin(np.where(empty, 0, NOISE), np.where(empty, 1.0, 0.0), SIDE, UNLIMITED[CONSTANT])
-    levels = made._choose_levels(3, 512)
-    _, found, idle = made.paths(4, 512)
+    levels = made._choose_levels(3, 4096)
+    _, found, idle = made.paths(4, 4096)
     alone = np.cov(found, idle[0])
     left = alone[0, 0] - alone[0, 1] ** 2 / alone[1, 1]
     assert np.var(found - levels @ idle) < 0.68 * left
