@@ -398,6 +398,10 @@ class Photographs(Section):
                 raise ValueError(f"{name} is {list(colour)}: three numbers from 0 to 1 are expected, codes of 8 bits over 255")
 
 
+MOST_LEVELS = 12
+"""Nested boxes that may be asked for: the largest is then 2048 times the innermost."""
+
+
 class Field(Section):
     """The radiance field and how it is fitted."""
 
@@ -412,6 +416,12 @@ class Field(Section):
     matte: Annotated[float | None, of("photograph", "colours that change little with the direction; absent: the preset's")] = (
         None
     )
+    depth: Annotated[
+        float | None, of("1", "weight of the distances that a model's points tell; absent: the preset's (only capture)")
+    ] = None
+    levels: Annotated[
+        int | None, of("1", "nested boxes; absent: the preset's (1, capture 5), fewer where a model's points need no more")
+    ] = None
     sky: Annotated[int | None, of("row", "of a map of what is behind the box, learned with the field; 0: none")] = None
     exposure: Annotated[
         bool | None, of("1", "gains of each photograph, left out where they agree; absent: the preset's (only capture)")
@@ -428,7 +438,9 @@ class Field(Section):
             raise ValueError(f"sky is {self.sky}: 0, or 2 to 4096 rows are expected")
         if self.longest is not None and self.longest < 8:
             raise ValueError(f"longest is {self.longest}: at least 8 is expected")
-        for name in ("tv_density", "tv_sh", "sparsity", "matte", "beta"):
+        if self.levels is not None and not 1 <= self.levels <= MOST_LEVELS:
+            raise ValueError(f"levels is {self.levels}: 1 to {MOST_LEVELS} is expected")
+        for name in ("tv_density", "tv_sh", "sparsity", "matte", "depth", "beta"):
             if not 0 <= (getattr(self, name) or 0) < math.inf:  # NaN fails every comparison
                 raise ValueError(f"{name} is {getattr(self, name)}: a finite number of at least 0 is expected")
 

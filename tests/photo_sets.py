@@ -86,9 +86,17 @@ def colmap_pose(pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def write_colmap(
-    folder: Path, model: str = "OPENCV", encoding: str = "bin", n: int = 4, points: np.ndarray | None = None
+    folder: Path,
+    model: str = "OPENCV",
+    encoding: str = "bin",
+    n: int = 4,
+    points: np.ndarray | None = None,
+    tracks: list[tuple[int, ...]] | None = None,
 ) -> Path:
-    """A sparse model of n views on a ring, 64 x 48 pixels, each with two image points; image numbers run backwards."""
+    """A sparse model of n views on a ring, 64 x 48 pixels, each with two image points; image numbers run backwards.
+
+    Points were found in the images 1 and 2, or in those of ``tracks``.
+    """
     (folder / "images").mkdir(parents=True)
     (folder / "sparse" / "0").mkdir(parents=True)
     for i in range(n):
@@ -96,11 +104,11 @@ def write_colmap(
     poses = [colmap_pose(pose) for pose in ring(n)]
     points = np.zeros((0, 3)) if points is None else points
     write = {"bin": _write_colmap_bin, "txt": _write_colmap_txt}[encoding]
-    write(folder / "sparse" / "0", model, poses, points)
+    write(folder / "sparse" / "0", model, poses, points, tracks or [(1, 2)] * len(points))
     return folder
 
 
-def _write_colmap_bin(folder: Path, model: str, poses: list, points: np.ndarray) -> None:
+def _write_colmap_bin(folder: Path, model: str, poses: list, points: np.ndarray, tracks: list) -> None:
     parameters = COLMAP_CAMERAS.get(model, (50.0, 50.0, 31.0, 22.0, 0, 0, 0, 0))
     camera = struct.pack(f"<QiiQQ{len(parameters)}d", 1, 7, MODEL_IDS[model], 64, 48, *parameters)
     (folder / "cameras.bin").write_bytes(camera)
@@ -110,12 +118,13 @@ def _write_colmap_bin(folder: Path, model: str, poses: list, points: np.ndarray)
         images += struct.pack("<Q", 2) + 2 * struct.pack("<ddq", 1.5, 2.5, -1)
     (folder / "images.bin").write_bytes(images)
     cloud = struct.pack("<Q", len(points))
-    for i, point in enumerate(points):
-        cloud += struct.pack("<Q3d3BdQ", i, *point, 1, 2, 3, 0.5, 2) + struct.pack("<4i", 1, 0, 2, 1)
+    for i, (point, track) in enumerate(zip(points, tracks, strict=True)):
+        cloud += struct.pack("<Q3d3BdQ", i, *point, 1, 2, 3, 0.5, len(track))
+        cloud += b"".join(struct.pack("<2i", image, k) for k, image in enumerate(track))
     (folder / "points3D.bin").write_bytes(cloud)
 
 
-def _write_colmap_txt(folder: Path, model: str, poses: list, points: np.ndarray) -> None:
+def _write_colmap_txt(folder: Path, model: str, poses: list, points: np.ndarray, tracks: list) -> None:
     parameters = " ".join(map(repr, COLMAP_CAMERAS.get(model, (50.0, 50.0, 31.0, 22.0, 0, 0, 0, 0))))
     (folder / "cameras.txt").write_text(f"# Camera list\n7 {model} 64 48 {parameters}\n")
     lines = ["# Image list with two lines of data per image:"]
@@ -123,5 +132,6 @@ def _write_colmap_txt(folder: Path, model: str, poses: list, points: np.ndarray)
         numbers = " ".join(repr(float(v)) for v in [*q, *t])
         lines += [f"{i + 1} {numbers} 7 a view {i}.png", "1.5 2.5 -1" if i % 2 else ""]
     (folder / "images.txt").write_text("\n".join(lines) + "\n")
-    rows = [f"{i} {x!r} {y!r} {z!r} 1 2 3 0.5 1 0 2 1" for i, (x, y, z) in enumerate(points.tolist())]
+    ends = [" ".join(f"{image} {k}" for k, image in enumerate(track)) for track in tracks]
+    rows = [f"{i} {x!r} {y!r} {z!r} 1 2 3 0.5 {ends[i]}" for i, (x, y, z) in enumerate(points.tolist())]
     (folder / "points3D.txt").write_text("\n".join(["# 3D point list", *rows]) + "\n")

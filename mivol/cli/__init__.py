@@ -97,7 +97,9 @@ def explain_flags(sub: argparse.ArgumentParser) -> None:
     """A scene, or a data set with a picture of its cameras."""
     kinds = "Mitsuba XML, an experiment (.toml), points or Gaussians (.ply, .spz, ...), or photographs: a folder or its file"
     scene_flags(sub, kinds)
-    sub.add_argument("-o", "--output", type=Path, help="draw the cameras of photographs (.png, .svg)")
+    sub.add_argument("-o", "--output", type=Path, help="draw the cameras of photographs, and the boxes (.png, .svg)")
+    sub.add_argument("--preset", help="of photographs: what mivol optimize --preset would do with them; capture, cpu, ...")
+    sub.add_argument("--set", action="append", default=[], metavar="key=value", help="override a setting of such a fit")
     sub.add_argument("--max-depth", type=int, help="longest path asked about; default: that of the scene's integrator")
     aim = "noise of a pixel over the mean radiance; max_depth has to leave out less (default: %(default)s)"
     sub.add_argument("--noise", type=float, default=0.02, help=aim)
@@ -245,7 +247,9 @@ def explain(arguments: argparse.Namespace) -> int:
     from mivol.photos import find_format
     from mivol.points.facts import is_points_file
 
-    if arguments.scene.suffix.lower() == ".toml":
+    if arguments.set and arguments.preset is None and arguments.scene.suffix.lower() != ".toml":
+        raise MivolError(f"--set is for fits, and {arguments.scene} is none: give --preset, or the file of an experiment.")
+    if arguments.scene.suffix.lower() == ".toml" or arguments.preset is not None:
         return explain_experiment(arguments)
     if is_points_file(arguments.scene):
         return explain_points(arguments)
@@ -265,10 +269,9 @@ def explain_scene(arguments: argparse.Namespace) -> int:
 
 def explain_experiment(arguments: argparse.Namespace) -> int:
     """Facts, choices, reasons of a fit, with every check that it would make."""
-    from mivol import config
     from mivol.experiments.explain import explain_fit
 
-    said = explain_fit(config.load(arguments.scene), arguments.scene.parent)
+    said = explain_fit(*chosen_of(arguments.scene, arguments), arguments.output)
     print(said.text)
     return int(bool(said.refusal))
 
@@ -292,6 +295,7 @@ def explain_photos(arguments: argparse.Namespace) -> int:
     print(survey.text)
     if note := note_on_alpha(survey):
         print(note)
+    print("--preset capture says what a fit of a place around the cameras would do, --preset cpu what one of a thing would")
     if arguments.output is not None:
         plot_cameras(survey, arguments.output)
         print(arguments.output)
@@ -371,13 +375,13 @@ def optimize(arguments: argparse.Namespace) -> None:
     from mivol.experiments.runs import run_experiment
     from mivol.experiments.task import Task
 
-    chosen, base = chosen_of(arguments)
+    chosen, base = chosen_of(arguments.experiment, arguments)
     folder = arguments.output or Path(chosen.output)
     print(run_experiment(Task(chosen, base, folder, arguments.resume, Terminal(), arguments.command)))
 
 
-def chosen_of(arguments: argparse.Namespace) -> tuple[Any, Path]:
-    """The experiment of ``mivol optimize``, and the folder that its paths begin at.
+def chosen_of(path: Path, arguments: argparse.Namespace) -> tuple[Any, Path]:
+    """The experiment of a file or of photographs, with --preset and --set, and the folder that its paths begin at.
 
     Raises:
         MivolError: photographs without a preset, a preset with a file, or as ``config.load``.
@@ -385,14 +389,15 @@ def chosen_of(arguments: argparse.Namespace) -> tuple[Any, Path]:
     from mivol import config
     from mivol.photos import find_format
 
-    path = arguments.experiment
     if path.is_dir() or (path.suffix.lower() == ".json" and find_format(path)):
         if arguments.preset is None:
             raise MivolError(f"{path} holds photographs and no experiment: say how to fit them, --preset capture or cpu.")
         return config.of_photographs(path, arguments.preset, arguments.set), Path()
     if arguments.preset is not None:
-        found = f"--preset is for photographs, and {path} is an experiment"
-        raise MivolError(f"{found}: --set field.preset={arguments.preset} changes it.")
+        is_experiment = path.suffix.lower() == ".toml"
+        found = f"--preset is for photographs, and {path} {'is an experiment' if is_experiment else 'holds none'}"
+        advice = f"--set field.preset={arguments.preset} changes it" if is_experiment else "leave it out"
+        raise MivolError(f"{found}: {advice}.")
     return config.load(path, arguments.set), path.parent
 
 

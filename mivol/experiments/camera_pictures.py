@@ -11,31 +11,38 @@ from numpy.typing import NDArray
 
 from mivol.optim.render_batches import View
 from mivol.photos import Frame, Photos, PhotoSurvey
-from mivol.report.cameras import PARTS, plot_cameras
+from mivol.report.cameras import PARTS, parts_of, plot_cameras
 from mivol.report.record import Image
 from mivol.report.scanner import plot_scanner, shown_views
 from mivol.scene.cameras import find_box
 from mivol.scene.photographs import camera_of
 from mivol.tomography.geometry import FlatDetector, VoxelGrid
 
-__all__ = ["pictures_of_photos", "pictures_of_scan", "pictures_of_views"]
+__all__ = ["pictures_of_photos", "pictures_of_scan", "pictures_of_views", "survey_of"]
 
 CAPTIONS = {
     "side": "Where the cameras stand, and the box where matter may be",
     "plan": "The same from above",
+    "far": "All nested boxes from above",
 }
 
 
-def pictures_of_photos(folder: Path, photos: Photos, judged: Photos | None) -> list[Image]:
-    """Cameras of all photographs, those that judge among them, about their box.
+def pictures_of_photos(folder: Path, photos: Photos, judged: Photos | None, levels: int = 1) -> list[Image]:
+    """Cameras of all photographs, those that judge among them, about their boxes.
 
     Args:
         folder: of the run, where the pictures are written.
         photos: what was fitted.
         judged: what it is judged by; None for nothing.
+        levels: nested boxes that were fitted.
     """
+    return _pictures(folder, survey_of(photos, judged, levels))
+
+
+def survey_of(photos: Photos, judged: Photos | None, levels: int) -> PhotoSurvey:
+    """What is drawn of a fit: the cameras of all its photographs, and so many nested boxes."""
     frames = photos.survey.frames + (() if judged is None else judged.survey.frames)
-    return _pictures(folder, replace(photos.survey, frames=frames))
+    return replace(photos.survey, frames=frames, levels=levels)
 
 
 def pictures_of_views(folder: Path, scene: mi.Scene, views: Mapping[str, Sequence[View]]) -> list[Image]:
@@ -79,6 +86,7 @@ def pictures_of_scan(folder: Path, geometry: FlatDetector, grid: VoxelGrid, held
 
 
 def _pictures(folder: Path, survey: PhotoSurvey) -> list[Image]:
-    for part in PARTS:
+    parts = parts_of(survey)
+    for part in parts:
         plot_cameras(survey, folder / f"cameras_{part}.png", part)
-    return [Image(path=f"cameras_{part}.png", role="picture", caption=CAPTIONS[part]) for part in PARTS]
+    return [Image(path=f"cameras_{part}.png", role="picture", caption=CAPTIONS[part]) for part in parts]

@@ -18,6 +18,7 @@ from mivol import config
 from mivol.config import Experiment, FieldFit, Files, GaussianFit, PhotoFit, Scan
 from mivol.errors import MivolError
 from mivol.experiments.back_end import choose_back_end
+from mivol.experiments.camera_pictures import survey_of
 from mivol.experiments.depth import settle_depth
 from mivol.experiments.film import plan_film
 from mivol.experiments.gaussian_start import begin, make_gaussian_plan
@@ -42,6 +43,8 @@ from mivol.optim.emissive_start import check_given_start
 from mivol.optim.parameters import check_names
 from mivol.optim.radiance_problem import RadianceProblem
 from mivol.optim.scene_problem import SceneProblem
+from mivol.photos import Photos
+from mivol.report.cameras import plot_cameras
 from mivol.scene.explain import Explanation, examine
 from mivol.tomography.filtered import check_directions
 
@@ -49,20 +52,24 @@ Say = Callable[[str], None]
 """Takes one line of facts."""
 
 
-def explain_fit(chosen: Experiment | Scan | PhotoFit, base: Path) -> Explanation:
-    """What a fit would do; nothing is fitted or written.
+def explain_fit(chosen: Experiment | Scan | PhotoFit, base: Path, picture: Path | None = None) -> Explanation:
+    """What a fit would do; nothing is fitted, and nothing written but a picture.
 
     Args:
         chosen: all settings.
         base: folder that the paths in them are relative to.
+        picture: where the cameras of photographs and the boxes are drawn (.png, .svg); None: nowhere.
 
     Returns:
         Facts as far as they were found, and what is refused, where something is.
     """
     lines = [f"experiment  {chosen.title}"]
     try:
+        if picture is not None and not isinstance(chosen, PhotoFit):
+            raise MivolError(f"{picture} was asked for, and only cameras of photographs are drawn: leave out --output.")
         choose_back_end(chosen.variant, chosen.threads)
-        found = KINDS[type(chosen)](chosen, base, lines.append)
+        drawing = {} if picture is None else {"picture": picture}
+        found = KINDS[type(chosen)](chosen, base, lines.append, **drawing)
     except MivolError as error:
         return Explanation(tuple(lines), str(error))
     return Explanation((*lines, *found.lines), found.refusal)
@@ -169,8 +176,8 @@ def explain_scan_fit(chosen: Scan, base: Path, say: Say) -> Explanation:
     return Explanation((f"  solver    {chosen.solve.name}, at most {chosen.solve.iterations} iterations",))
 
 
-def explain_photo_fit(chosen: FieldFit, base: Path, say: Say) -> Explanation:
-    """Photographs, box and plan.
+def explain_photo_fit(chosen: FieldFit, base: Path, say: Say, picture: Path | None = None) -> Explanation:
+    """Photographs, boxes and plan.
 
     Raises:
         MivolError: whatever :func:`mivol.experiments.photo_fit.photo_fit` refuses before its first step.
@@ -184,12 +191,21 @@ def explain_photo_fit(chosen: FieldFit, base: Path, say: Say) -> Explanation:
         say(f"  {note}")
     plan = suited(asked, photos)
     batches = batches_of(plan, photos)
-    lines = tuple(f"  {one.choice}: {one.reason}" for one in choices(plan, photos, batches))
+    for one in choices(plan, photos, batches):
+        say(f"  {one.choice}: {one.reason}")
     plan.optimiser.begin(RadianceProblem(batches, photos.box, plan, chosen.seed))
-    return Explanation(lines)
+    return Explanation(drawn(photos, judged, plan.levels, picture))
 
 
-def explain_gaussian_fit(chosen: GaussianFit, base: Path, say: Say) -> Explanation:
+def drawn(photos: Photos, judged: Photos | None, levels: int, picture: Path | None) -> tuple[str, ...]:
+    """A line with the picture of cameras and boxes, where one is asked for."""
+    if picture is None:
+        return ()
+    plot_cameras(survey_of(photos, judged, levels), picture)
+    return (str(picture),)
+
+
+def explain_gaussian_fit(chosen: GaussianFit, base: Path, say: Say, picture: Path | None = None) -> Explanation:
     """Photographs, where Gaussians begin, and plan.
 
     Raises:
@@ -203,8 +219,10 @@ def explain_gaussian_fit(chosen: GaussianFit, base: Path, say: Say) -> Explanati
     for note in plan_film(chosen.show, photos).notes:
         say(f"  {note}")
     begun = begin(chosen, photos, asked)
+    for one in begun.lines:
+        say(f"  {one.choice}: {one.reason}")
     begun.plan.optimiser.begin(begun.problem(chosen.seed))
-    return Explanation(tuple(f"  {one.choice}: {one.reason}" for one in begun.lines))
+    return Explanation(drawn(photos, judged, 1, picture))
 
 
 KINDS = {

@@ -73,7 +73,7 @@ class PhotoOutputs:
             record.results |= self.write_judged()
         if self.film.cameras:
             record.images.append(self.write_film())
-        record.images += pictures_of_photos(folder, self.photos, self.judged)
+        record.images += pictures_of_photos(folder, self.photos, self.judged, field.levels)
         self.run.write_curves()
 
     def write_judged(self) -> dict[str, float]:

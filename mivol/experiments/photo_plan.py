@@ -12,6 +12,7 @@ from mivol.optim.radiance_plan import FEW, PRESETS, FitPlan, Stage, memory_of, s
 from mivol.optim.ray_batches import RayBatches
 from mivol.optim.strategy import nearest
 from mivol.photos import Photos, rectified
+from mivol.photos.region import FEWEST_POINTS, levels_holding, nested, within
 from mivol.report.record import PlanLine
 
 GAINS = PlanLine(
@@ -38,13 +39,15 @@ def make_plan(chosen: FieldFit) -> FitPlan:
     if wanted.preset not in PRESETS:
         raise MivolError(f'field.preset = "{wanted.preset}" is unknown: {nearest(wanted.preset, list(PRESETS))}')
     plan = PRESETS[wanted.preset]
-    names = ("degree", "first_degree", "tv_density", "tv_sh", "sparsity", "matte", "sky", "beta", "exposure")
+    names = ("degree", "first_degree", "tv_density", "tv_sh", "sparsity", "matte", "depth", "sky", "beta", "exposure")
     given = {name: getattr(wanted, name) for name in names}
     plan = replace(plan, **{name: value for name, value in given.items() if value is not None})
     stages = [replace(stage, steps=max(1, round(stage.steps * wanted.effort))) for stage in plan.stages]
     plan = replace(plan, stages=tuple(stages))
     if wanted.degree is not None:
         plan = replace(plan, few_degree=None)
+    if wanted.levels is not None:
+        plan = replace(plan, levels=wanted.levels, fewer_levels=False)
     return plan if wanted.longest is None else replace(plan.up_to(wanted.longest), cubic=False)
 
 
@@ -57,8 +60,8 @@ def suited(plan: FitPlan, photos: Photos) -> FitPlan:
     """The plan for these photographs.
 
     Grids of a plan for cubes have as many nodes in a box that is none, though voxels are not smaller than two pixels for that.
-    Photographs are as small as the grids can tell (pixels of about half a voxel, at the middle of the box), and the degree is
-    lower where they are few.
+    Photographs are as small as the grids can tell (pixels of about half a voxel, at the middle of the box), the degree is
+    lower where they are few, and there are no more nested boxes than the points of a reconstruction need.
     """
     cameras, box = [view.camera for view in photos.views], photos.box
     pixel = np.median([np.linalg.norm(camera.origin - box.mean(axis=0)) / camera.K[0, 0] for camera in cameras])
@@ -74,25 +77,31 @@ def suited(plan: FitPlan, photos: Photos) -> FitPlan:
 
     if plan.few_degree is not None and len(photos.views) < FEW:
         plan = replace(plan, degree=plan.few_degree)
+    points = photos.survey.points
+    if plan.fewer_levels and points is not None and len(points) >= FEWEST_POINTS:
+        plan = replace(plan, levels=levels_holding(box, points, plan.levels))
     return replace(plan, stages=tuple(suited_stage(stage) for stage in plan.stages), cubic=False)
 
 
 def choices(plan: FitPlan, photos: Photos, batches: RayBatches) -> list[PlanLine]:
     """What will be done, and why."""
-    box = photos.box
+    box, origins = photos.box, np.array([view.camera.origin for view in photos.views])
     resolutions = ", ".join(str(stage.longest) for stage in plan.stages)
     width, height = photos.views[0].camera.size
     size = " x ".join(f"{edge:.4g}" for edge in box[1] - box[0])
     outer = " x ".join(f"{edge * 2 ** (plan.levels - 1):.4g}" for edge in box[1] - box[0])
-    nested = [
+    nested_boxes = [
         PlanLine(
             choice=f"{plan.levels} nested boxes, the largest of {outer} [length]",
-            reason="each has twice the extent of the one before, for what is around; cameras may stand in them",
+            reason=f"each has twice the extent of the one before, for what is around; "
+            f"{len(within(origins, box))} of {len(origins)} cameras stand in the innermost",
         )
     ]
     return [
         PlanLine(choice=f"{len(photos.views)} photographs, a box of {size} [length]", reason=photos.survey.box_from),
-        *nested[: plan.levels > 1],
+        *nested_boxes[: plan.levels > 1],
+        *left_out(plan, photos),
+        *near_cameras(plan, origins, box),
         *wide_lenses(photos),
         PlanLine(choice=f"grids of {resolutions} nodes along the longest edge", reason="coarse first, to find what is empty"),
         sizes_of(plan, (width, height)),
@@ -102,6 +111,23 @@ def choices(plan: FitPlan, photos: Photos, batches: RayBatches) -> list[PlanLine
         PlanLine(choice=f"rays end at a transmittance of {plan.stop:g}", reason="what is left out is at most that share"),
         PlanLine(choice=memory_of(plan, box, batches), reason="counted before it is taken"),
     ]
+
+
+def left_out(plan: FitPlan, photos: Photos) -> list[PlanLine]:
+    """A line where points of a reconstruction lie beyond the boxes."""
+    points = photos.survey.points
+    if points is None or (beyond := len(points) - len(within(points, nested(photos.box, plan.levels)[-1]))) == 0:
+        return []
+    box = "the largest box" if plan.levels > 1 else "the box"
+    reason = f"they lie beyond {box}, where {'the sky is' if plan.sky else 'nothing can be'}"
+    return [PlanLine(choice=f"{beyond} of {len(points)} points of the reconstruction left out", reason=reason)]
+
+
+def near_cameras(plan: FitPlan, origins: np.ndarray, box: np.ndarray) -> list[PlanLine]:
+    """A line where derivatives fall towards cameras at ``origins``."""
+    reach = plan.reach(origins, box)
+    choice = f"derivatives nearer to a camera than {reach:.4g} [length] fall with the square of the distance"
+    return [PlanLine(choice=choice, reason="else matter grows before the lenses")] if reach else []
 
 
 def sizes_of(plan: FitPlan, held: tuple[int, int]) -> PlanLine:

@@ -71,6 +71,8 @@ class FitPlan:
         sparsity: Cauchy prior on the density, in photographs.
         matte: coefficients beyond the constant fall by this / V times their learning rate a step [1 / radiance]: what few
             photographs say about directions is soon more than there is.
+        depth: weight of what the points of a reconstruction say of distances (:mod:`mivol.optim.sightings`) beside the mean
+            squared error, where there are any.
         beta: of log T + log(1 - T), which asks rays to end in matter or to pass; mean over the rays.
         stop: a ray ends at this transmittance; what is left out is at most that share of the brightest colour.
         keep_weight: a node is kept where some ray gives a cell of it this weight.
@@ -81,6 +83,7 @@ class FitPlan:
         sky_smooth: share of the way that a texel goes to its neighbours in a step, so that none stays as it began.
         exposure: a gain for each channel of each photograph (:mod:`mivol.optim.exposure`), where they disagree.
         levels: nested boxes, each of twice the extent (:mod:`mivol.fields.spherical`).
+        fewer_levels: only as many of them as the points of a reconstruction need, where these are known.
         near: derivatives of what is nearer to a camera than so many medians of the cameras' distances from the box's middle go
             down with the square of the distance (Philip & Deschaintre 2023); 0: none do.
         cubic: a box that is no cube gets as many nodes in all as its stages have in a cube, for memory and time go with them
@@ -103,6 +106,7 @@ class FitPlan:
     tv_share: float = 1 / 16
     sparsity: float = 0.0
     matte: float = 12.0
+    depth: float = 0.0
     beta: float = 0.0
     stop: float = 1e-3
     keep_weight: float = 0.01
@@ -113,6 +117,7 @@ class FitPlan:
     sky_smooth: float = 0.0
     exposure: bool = False
     levels: int = 1
+    fewer_levels: bool = True
     near: float = 0.0
     cubic: bool = True
     random_background: bool = True
@@ -158,6 +163,10 @@ class FitPlan:
             coarser[-1] = replace(coarser[-1], steps=max(1, coarser[-1].steps // 2))
         return replace(self, stages=(*coarser, replace(self.stages[-1], longest=longest)))
 
+    def reach(self, origins: np.ndarray, box: np.ndarray) -> float:
+        """The distance from a camera below which derivatives fall [length], of cameras at ``origins`` (V, 3)."""
+        return self.near * float(np.median(np.linalg.norm(origins - box.mean(axis=0), axis=1)))
+
     def degree_at(self, number: int) -> int:
         """The degree of the harmonics in a stage."""
         if self.first_degree is None or len(self.stages) == 1:
@@ -192,6 +201,7 @@ PRESETS: dict[str, FitPlan] = {
         tv_share=1 / 8,
         stop=1e-4,
         sky=32,
+        depth=0.003,
         sky_smooth=0.05,
         levels=5,
         near=1.0,

@@ -35,8 +35,17 @@ from mivol.optim.exposure import AGREE, RATE, Exposure
 from mivol.optim.problem import Reals, Refinement
 from mivol.optim.radiance_plan import FitPlan, place_grid
 from mivol.optim.ray_batches import RayBatch, RayBatches
-from mivol.transport.line_integrals.radiance_field import RayGradient, backward, brightest_weights, cells_of, model_of, render
-from mivol.transport.line_integrals.radiance_source import bake, fold
+from mivol.optim.sightings import Sightings, by_transmittance, draw_sightings
+from mivol.transport.line_integrals.radiance_field import (
+    Model,
+    RayGradient,
+    backward,
+    brightest_weights,
+    cells_of,
+    model_of,
+    render,
+)
+from mivol.transport.line_integrals.radiance_source import Baked, bake, fold
 from mivol.transport.traversal.occupied_cells import Cells
 
 
@@ -91,8 +100,7 @@ class RadianceProblem:
         self.has_gains = self.plan.exposure
         self.scale = SCALES[self.batches.space]
         self.unit = float((self.box[1] - self.box[0]).max()) / 2
-        distances = np.linalg.norm(self.batches.origins - self.box.mean(axis=0), axis=1)
-        self.near = self.plan.near * float(np.median(distances))
+        self.near = self.plan.reach(self.batches.origins, self.box)
         place, degree = place_grid(self.box, self.plan.stages[0].longest), self.plan.degree_at(0)
         fog = _fog(*place, degree, self.plan.start / self.unit, self.plan.levels, self.batches.space)
         self.field = _coloured(fog, self.scale.fog(self.batches.pixels))
@@ -137,8 +145,9 @@ class RadianceProblem:
         self.set(reals)
         stage = self.plan.stages[self.stage]
         rng = np.random.default_rng((self.seed, iteration))
-        batch = self.batches.draw(stage.shrink, self.batches.choose(views or stage.views, rng), stage.tiles, rng)
-        loss, slopes = self.slopes(batch, self._background(rng))
+        chosen = self.batches.choose(views or stage.views, rng)
+        batch = self.batches.draw(stage.shrink, chosen, stage.tiles, rng)
+        loss, slopes = self.slopes(batch, self._background(rng), self._sightings(chosen, iteration))
         slopes |= {name: self.scale.by_reals(slopes[name], reals[name].array) for name in self._colours(reals)}
         self._first_row = int(rng.integers(dr.width(self._neighbours.after[0])))
         return dr.mean(loss), {name: mi.TensorXf(slopes[name], value.shape) for name, value in reals.items()}
@@ -147,12 +156,23 @@ class RadianceProblem:
         random = self.plan.random_background and self.batches.channels == 4
         return rng.random(3) if random else None
 
-    def slopes(self, batch: RayBatch, background: np.ndarray | None = None) -> tuple[mi.Float, dict[str, mi.Float]]:
+    def _sightings(self, chosen: np.ndarray, iteration: int) -> Sightings | None:
+        """Points that were found in the chosen views, where the plan asks for them."""
+        if not (self.plan.depth and self.batches.points):
+            return None
+        voxel, rng = 2 * self.unit / self.plan.stages[self.stage].longest, np.random.default_rng((self.seed, iteration, 1))
+        points = [self.batches.points[view] for view in chosen]
+        return draw_sightings(points, self.batches.origins[chosen], self.box, self.plan.levels, voxel, rng)
+
+    def slopes(
+        self, batch: RayBatch, background: np.ndarray | None = None, sightings: Sightings | None = None
+    ) -> tuple[mi.Float, dict[str, mi.Float]]:
         """Squared error of each ray of a batch, weighted, mean over rgb, and derivatives of the mean over rays, by parameter.
 
         Args:
             batch: rays and what they should see.
             background: put behind all photographs (3,); None: each has its own.
+            sightings: points of the same views; the plan's weight times their energy is in the derivatives only.
         """
         source = bake(self.field, self._cells, batch.origins, batch.slot, slope=True)
         model, count = model_of(self.field, self.plan.stop), dr.width(batch.slot)
@@ -176,6 +196,8 @@ class RadianceProblem:
         loss = dr.squared_norm(error) * (1 / 3)
         dr.eval(seen, by, through, loss)
         backward(self._cells, source, model, seen, RayGradient(by, through), near=self.near)
+        if sightings is not None:
+            self._add_sightings(source, model, sightings)
         dr.eval(source.slope)
         density, harmonics = fold(self.field, self._cells, source, batch.origins)
         slopes = {"density": self._stored(density), "harmonics": self._stored(harmonics)}
@@ -185,6 +207,15 @@ class RadianceProblem:
             by_log = by_shown * shown if self.has_gains else mi.Color3f(0)
             slopes["exposure"] = self.exposure.slopes(batch.view, by_log)
         return loss, slopes
+
+    def _add_sightings(self, source: Baked, model: Model, sightings: Sightings) -> None:
+        """Add the derivatives of the energy of points to those of the field."""
+        # Densities are the same in the table of any pinhole.
+        source = dataclasses.replace(source, first=mi.UInt32(0))
+        seen = render(self._cells, source, model, sightings.rays)
+        by = RayGradient(mi.Color3f(0), self.plan.depth * by_transmittance(seen.T, sightings.count))
+        dr.eval(seen, by)
+        backward(self._cells, source, model, seen, by, near=self.near)
 
     def _stored(self, slope: mi.Float) -> mi.Float:
         """Derivatives of the nodes that are stored: the last row of a sparse field is the vacuum around, and stays."""

@@ -123,6 +123,7 @@ class RayBatches:
         levels: sizes, by how much they are shrunk: 1, 2, 4 ...
         channels: 3, or 4 with alpha.
         space: what their values are, "srgb" (codes) or "linear" (radiance).
+        points: (K, 3) for each photograph, those of a reconstruction that were found in it [length]; empty where none is known.
     """
 
     origins: np.ndarray
@@ -130,6 +131,7 @@ class RayBatches:
     levels: dict[int, Level]
     channels: int
     space: str = "srgb"
+    points: tuple[np.ndarray, ...] = ()
 
     @classmethod
     def of(
@@ -160,7 +162,9 @@ class RayBatches:
         lenses = np.array([_lens(photo) for photo in photos], np.float32)
         levels = {shrink: _level(photos, shrink, with_alpha, space) for shrink in sorted(set(shrinks))}
         origins = np.array([photo.camera.origin for photo in photos])
-        return cls(origins, mi.Float(lenses.reshape(-1)), levels, 4 if with_alpha else 3, space)
+        points = tuple(np.zeros((0, 3)) if photo.points is None else photo.points for photo in photos)
+        known = points if any(map(len, points)) else ()
+        return cls(origins, mi.Float(lenses.reshape(-1)), levels, 4 if with_alpha else 3, space, known)
 
     @property
     def bytes(self) -> int:
@@ -228,13 +232,15 @@ class RayBatches:
         return channels, counted
 
     def digest(self) -> str:
-        """A fingerprint of cameras and pixels."""
+        """A fingerprint of cameras, pixels and points."""
         found = hashlib.sha256(np.array(self.lenses).tobytes())
         for level in self.levels.values():
             if level.wide is not None:
                 found.update(np.array(level.wide.directions).tobytes())
         for pixels in self._pixels():
             found.update(np.array(pixels).tobytes())
+        for points in self.points:
+            found.update(points.tobytes())
         return found.hexdigest()[:16]
 
     def look_up(self, shrink: int, views: np.ndarray, slot: mi.UInt32, column: mi.UInt32, row: mi.UInt32) -> RayBatch:

@@ -53,11 +53,34 @@ class Sensor:
 
 @dataclass(frozen=True)
 class Pose:
-    """One entry of COLMAP's images: its name, camera number, and camera to world in our axes."""
+    """One entry of COLMAP's images: its name, camera number, camera to world in our axes, and its own number."""
 
     name: str
     camera: int
     to_world: np.ndarray
+    number: int
+
+
+@dataclass(frozen=True)
+class Points:
+    """COLMAP's points.
+
+    Attributes:
+        rows: (N, 6) places in the world [length], and colours in 0..255.
+        tracks: numbers of the images in which each was found, N arrays.
+    """
+
+    rows: np.ndarray
+    tracks: list[np.ndarray]
+
+    def seen_by(self) -> dict[int, np.ndarray]:
+        """Number of an image -> places (K, 3) of the points that were found in it."""
+        images = np.concatenate([np.zeros(0, int), *self.tracks])
+        places = self.rows[np.repeat(np.arange(len(self.tracks)), [len(track) for track in self.tracks]), :3]
+        order = np.argsort(images, kind="stable")
+        numbers, starts = np.unique(images[order], return_index=True)
+        parts = np.split(places[order], starts[1:]) if len(numbers) else []
+        return dict(zip(numbers.tolist(), parts, strict=True))
 
 
 def find_model(path: Path) -> Path | None:
@@ -81,10 +104,14 @@ def read_colmap(path: Path) -> Listing:
     read = READERS[suffix]
     sensors, poses = read.cameras(model / f"cameras{suffix}"), read.images(model / f"images{suffix}")
     points_file = model / f"points3D{suffix}"
-    points = read_points3d(points_file)[0] if points_file.is_file() else None
+    points = read.points(points_file) if points_file.is_file() else None
+    seen = {} if points is None else points.seen_by()
     base = next((folder for folder in (path, *model.parents[:2]) if (folder / "images").is_dir()), path)
-    entries = [_entry(base, pose, sensors, model / f"images{suffix}") for pose in sorted(poses, key=lambda pose: pose.name)]
-    return Listing(entries, points)
+    file = model / f"images{suffix}"
+    entries = [
+        _entry(base, pose, sensors, file, seen.get(pose.number)) for pose in sorted(poses, key=lambda pose: pose.name)
+    ]
+    return Listing(entries, None if points is None else points.rows[:, :3])
 
 
 def read_points3d(path: Path) -> tuple[np.ndarray, np.ndarray]:
@@ -98,8 +125,8 @@ def read_points3d(path: Path) -> tuple[np.ndarray, np.ndarray]:
     """
     if path.suffix not in READERS:
         raise refusal(path, f"the suffix {path.suffix!r}", f"one of {', '.join(READERS)}", "name COLMAP's points3D")
-    points = READERS[path.suffix].points(path)
-    return points[:, :3], points[:, 3:]
+    rows = READERS[path.suffix].points(path).rows
+    return rows[:, :3], rows[:, 3:]
 
 
 def rotation(q: np.ndarray) -> np.ndarray:
@@ -114,7 +141,7 @@ def rotation(q: np.ndarray) -> np.ndarray:
     )
 
 
-def _entry(base: Path, pose: Pose, sensors: dict[int, Sensor], file: Path) -> Entry:
+def _entry(base: Path, pose: Pose, sensors: dict[int, Sensor], file: Path, points: np.ndarray | None) -> Entry:
     if pose.camera not in sensors:
         raise refusal(file, f"{pose.name} taken by camera {pose.camera}", "a camera of the model", "export the model again")
     sensor = sensors[pose.camera]
@@ -123,7 +150,8 @@ def _entry(base: Path, pose: Pose, sensors: dict[int, Sensor], file: Path) -> En
         return Camera(sensor.K, size, pose.to_world, sensor.lens, f"{file.name} {pose.name}")
 
     mask = base / "masks" / f"{pose.name}.png"
-    return Entry(pose.name, base / "images" / pose.name, camera, "train", sensor.size, mask if mask.is_file() else None)
+    image = base / "images" / pose.name
+    return Entry(pose.name, image, camera, "train", sensor.size, mask if mask.is_file() else None, points)
 
 
 def _sensor(path: Path, model: str, size: tuple[int, int], parameters: tuple[float, ...]) -> Sensor:
@@ -203,18 +231,20 @@ def _cameras_bin(path: Path) -> dict[int, Sensor]:
 def _images_bin(path: Path) -> list[Pose]:
     fields, poses = Fields(path), []
     for _ in range(fields.take("Q")[0]):
-        _, *pose, camera = fields.take("I7dI")
-        poses.append(Pose(fields.word(), camera, _to_world(pose[:4], pose[4:])))
+        number, *pose, camera = fields.take("I7dI")
+        poses.append(Pose(fields.word(), camera, _to_world(pose[:4], pose[4:]), number))
         fields.skip(24 * fields.take("Q")[0])
     return poses
 
 
-def _points_bin(path: Path) -> np.ndarray:
-    fields, points = Fields(path), []
+def _points_bin(path: Path) -> Points:
+    fields, rows, tracks = Fields(path), [], []
     for _ in range(fields.take("Q")[0]):
-        points.append(fields.take("Q3d3Bd")[1:7])
-        fields.skip(8 * fields.take("Q")[0])
-    return np.array(points).reshape(-1, 6)
+        rows.append(fields.take("Q3d3Bd")[1:7])
+        length = fields.take("Q")[0]
+        fields.skip(8 * length)
+        tracks.append(np.frombuffer(fields.data, "<u4", 2 * length, fields.at - 8 * length)[::2].astype(int))
+    return Points(np.array(rows).reshape(-1, 6), tracks)
 
 
 # -- Text ---------------------------------------------------------------------------------------------------------
@@ -246,17 +276,21 @@ def _images_txt(path: Path) -> list[Pose]:
         if len(words) != 10:
             raise refusal(path, f"the line '{line}'", "number, quaternion, translation, camera, name", "export it again")
         pose = reals(" ".join(words[1:8]), 7, path, words[9])
-        poses.append(Pose(words[9], _whole(words[8], path), _to_world(pose[:4], pose[4:])))
+        poses.append(Pose(words[9], _whole(words[8], path), _to_world(pose[:4], pose[4:]), _whole(words[0], path)))
         next(lines, None)
     return poses
 
 
-def _points_txt(path: Path) -> np.ndarray:
-    """Rows of position and colour; none of an empty file, which COLMAP's manual asks for where poses are known."""
+def _points_txt(path: Path) -> Points:
+    """Points; none of an empty file, which COLMAP's manual asks for where poses are known."""
     if path.stat().st_size == 0:
-        return np.empty((0, 6))
-    rows = [reals(" ".join(line.split()[1:7]), 6, path, f"point {line.split()[0]}") for line in filter(None, _lines(path))]
-    return np.array(rows).reshape(-1, 6)
+        return Points(np.empty((0, 6)), [])
+    rows, tracks = [], []
+    for line in filter(None, _lines(path)):
+        words = line.split()
+        rows.append(reals(" ".join(words[1:7]), 6, path, f"point {words[0]}"))
+        tracks.append(np.array([_whole(word, path) for word in words[8::2]], int))
+    return Points(np.array(rows).reshape(-1, 6), tracks)
 
 
 def _whole(word: str, path: Path) -> int:
@@ -271,7 +305,7 @@ class Reader:
 
     cameras: Callable[[Path], dict[int, Sensor]]
     images: Callable[[Path], list[Pose]]
-    points: Callable[[Path], np.ndarray]
+    points: Callable[[Path], Points]
 
 
 #: suffix -> reader; binary first, as COLMAP does.

@@ -47,6 +47,7 @@ class Photo:
         mask: (H, W) bool, False where a pixel counts for nothing; None: all count.
         camera: of these pixels.
         background: (3,) float32 colour behind it.
+        points: (K, 3) those of a sparse reconstruction that were found in it [length]; None where that is not known.
     """
 
     name: str
@@ -55,6 +56,7 @@ class Photo:
     mask: np.ndarray | None
     camera: Camera
     background: np.ndarray
+    points: np.ndarray | None = None
 
     def over(self, colour: np.ndarray) -> np.ndarray:
         """(H, W, 3) the image over another background, (3,) or (H, W, 3).
@@ -238,7 +240,7 @@ def _photo(frame: Frame, scale: float, background: np.ndarray | None, space: str
         alpha = shrink(alpha, camera.size)
         image += (1 - alpha[..., None]) * background
     behind = np.zeros(3, np.float32) if background is None else background
-    return Photo(frame.file.name, image, alpha, mask, camera, behind)
+    return Photo(frame.file.name, image, alpha, mask, camera, behind, frame.points)
 
 
 def _shrunk_camera(camera: Camera, scale: float) -> Camera:

@@ -27,6 +27,7 @@ class Entry:
         split: "train", "test", "val" or ``UNLISTED``.
         size: (width, height) that the file of cameras says [pixel]; None: all of the split have one size.
         mask: where its mask should lie, if it has one.
+        points: (K, 3) those of a sparse reconstruction that were found in it [length]; None where that is not known.
     """
 
     name: str
@@ -35,6 +36,7 @@ class Entry:
     split: str = "train"
     size: tuple[int, int] | None = None
     mask: Path | None = None
+    points: np.ndarray | None = None
 
 
 @dataclass(frozen=True)

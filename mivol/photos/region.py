@@ -6,6 +6,7 @@ of view without distortion.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -14,13 +15,19 @@ from mivol.files.source import refusal
 from mivol.photos.camera import Camera, is_seen, project, rays
 from mivol.photos.wide_lens import Panorama
 
-__all__ = ["box_of_points", "check_box", "check_views", "focus_of", "middle_box", "near_far_of", "shared_box", "views_seeing"]
+__all__ = [
+    *("box_of_points", "check_box", "check_views", "focus_of", "levels_holding", "middle_box", "near_far_of", "nested"),
+    *("shared_box", "views_seeing", "within"),
+]
 
 SHARE = 0.9
 """Share of the views that must see a point for it to count."""
 
 CELLS = 32
 """Points along each axis at which views are counted, twice: the box is known to 1/32 of itself."""
+
+HELD = 0.99
+"""Share of the points of a reconstruction that nested boxes hold: some of its points lie anywhere."""
 
 FEWEST_POINTS = 100
 """Fewer points of a reconstruction say nothing of a box."""
@@ -83,6 +90,23 @@ def middle_box(cameras: Sequence[Camera], name: object = "cameras") -> np.ndarra
         found = "cameras that all stand in one place"
         raise refusal(name, found, "views from several places", "say where things are with box=")
     return np.array([focus - half, focus + half])
+
+
+def nested(box: np.ndarray, levels: int) -> list[np.ndarray]:
+    """Boxes (2, 3) of the same middle, each of twice the extent of the one before."""
+    middle = box.mean(axis=0)
+    return [middle + 2**level * (box - middle) for level in range(levels)]
+
+
+def levels_holding(box: np.ndarray, points: np.ndarray, most: int) -> int:
+    """The fewest nested boxes that hold ``HELD`` of points (N, 3), and ``most`` where that many do not."""
+    out = 2 * np.abs((points - box.mean(axis=0)) / (box[1] - box[0])).max(axis=1)
+    return min(most, 1 + max(0, math.ceil(math.log2(np.percentile(out, 100 * HELD)))))
+
+
+def within(points: np.ndarray, box: np.ndarray) -> np.ndarray:
+    """Those of points (N, 3) that lie in a box."""
+    return points[((points >= box[0]) & (points <= box[1])).all(axis=1)]
 
 
 def box_of_points(points: np.ndarray, share: float = 0.98, margin: float = 0.05) -> np.ndarray:

@@ -50,12 +50,14 @@ FORMATS: dict[str, Format] = {
 
 @dataclass(frozen=True)
 class Frame:
-    """A photograph that is there: its file, camera, mask and split; no pixel is read yet."""
+    """A photograph that is there: its file, camera, mask and split, and the points (K, 3) [length] of a reconstruction that
+    were found in it, where they are known; no pixel is read yet."""
 
     file: Path
     camera: Camera
     split: str
     mask: Path | None = None
+    points: np.ndarray | None = None
 
 
 @briefly
@@ -72,6 +74,7 @@ class PhotoSurvey:
         box_from: where the box comes from, for people.
         near_far: distances from the cameras between which all of the box lies [length].
         points: (N, 3) of a sparse reconstruction, or None.
+        levels: nested boxes of a fit, of which ``box`` is the innermost; 1: the box alone.
     """
 
     path: Path
@@ -82,6 +85,7 @@ class PhotoSurvey:
     box_from: str
     near_far: tuple[float, float]
     points: np.ndarray | None = None
+    levels: int = 1
 
     @property
     def text(self) -> str:
@@ -136,7 +140,7 @@ def survey_photos(
     cameras = {id(entry): camera for entry, camera in zip(present, _cameras(present), strict=True)}
     if split in ("held_out", "val", "test"):
         _check_unseen(chosen, [entry for entry in present if entry.split == "train"], cameras)
-    frames = [Frame(entry.file, cameras[id(entry)], entry.split, _mask(entry)) for entry in chosen]
+    frames = [Frame(entry.file, cameras[id(entry)], entry.split, _mask(entry), entry.points) for entry in chosen]
     training = [entry for entry in present if entry.split in ("train", "held_out")]
     looking = [cameras[id(entry)] for entry in training or chosen]
     found, whence = _box(box, listing.points, looking, path)

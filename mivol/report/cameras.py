@@ -1,7 +1,8 @@
 """What stands about a box, as a picture: the cameras of a data set, or the source and the detector of a scanner.
 
 Conventions. Colours say the split. A camera is its pinhole and the four edges of its field of view; the plan is seen from
-above, where up is the axis of the world that is nearest to the cameras' mean upward direction.
+above, where up is the axis of the world that is nearest to the cameras' mean upward direction. Of nested boxes the first two
+parts show those that reach as far as what stands about them, and a third part shows all.
 """
 
 from __future__ import annotations
@@ -19,9 +20,10 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from mivol.photos import SPLITS, Frame, PhotoSurvey
+from mivol.photos.region import nested, within
 from mivol.report.figures import FAINT, INK, SERIES, STYLE, save
 
-__all__ = ["EDGE", "PARTS", "Stage", "Strokes", "plot_cameras", "plot_stage", "pyramid", "rectangle"]
+__all__ = ["EDGE", "FAR", "PARTS", "Stage", "Strokes", "parts_of", "plot_cameras", "plot_stage", "pyramid", "rectangle"]
 
 EDGE = 0.12
 """Length of a drawn field of view, as a share of the median distance from the middle of the box."""
@@ -33,6 +35,9 @@ LOW = 0.15
 
 PARTS = ("side", "plan")
 """Of the picture: from the side, and from above."""
+
+FAR = "far"
+"""The part that shows all of nested boxes from above, where the others do not."""
 
 WIDTH = 4.8
 """Of a part [inch]: its labels are read on a page of 390 pixels."""
@@ -52,28 +57,48 @@ class Stage(NamedTuple):
     Attributes:
         strokes: cameras, or what else stands about the box.
         box: (2, 3) its low and high corner [length].
-        points: (N, 3) in it.
+        points: (N, 3) in it, or in the largest of the boxes.
         up: which axis of the world is up.
+        levels: nested boxes, the first of which is ``box``.
     """
 
     strokes: list[Strokes]
     box: NDArray
     points: NDArray
     up: int
+    levels: int = 1
+
+    @property
+    def near(self) -> int:
+        """How many of the boxes it takes to hold all that stands about them; all of them where none does."""
+        ends = np.concatenate([strokes.edges.reshape(-1, 3) for strokes in self.strokes])
+        boxes = nested(self.box, self.levels)
+        return next((n for n, box in enumerate(boxes, 1) if len(within(ends, box)) == len(ends)), self.levels)
+
+    @property
+    def parts(self) -> tuple[str, ...]:
+        """Of the picture: ``PARTS``, and ``FAR`` where these do not show all boxes."""
+        return PARTS if self.near == self.levels else (*PARTS, FAR)
+
+
+def parts_of(survey: PhotoSurvey) -> tuple[str, ...]:
+    """The parts of the picture of a data set."""
+    return stage_of(survey).parts
 
 
 def plot_cameras(survey: PhotoSurvey, path: str | Path | None = None, part: str | None = None) -> Figure:
-    """Cameras, box and points from the side and from above.
+    """Cameras, boxes and points from the side and from above.
 
     Args:
         survey: of :func:`mivol.photos.survey_photos`.
         path: written there (.svg, .png) if given.
-        part: one of PARTS alone; None: both in one figure.
+        part: one of :func:`parts_of` alone; None: all of them in one figure.
 
     Raises:
         MivolError: another suffix.
     """
-    return plot_stage(stage_of(survey), f"{survey.path.name}: {len(survey.frames)} cameras and the box", path, part)
+    boxes = "the box" if survey.levels == 1 else f"{survey.levels} nested boxes"
+    return plot_stage(stage_of(survey), f"{survey.path.name}: {len(survey.frames)} cameras and {boxes}", path, part)
 
 
 def stage_of(survey: PhotoSurvey) -> Stage:
@@ -85,7 +110,7 @@ def stage_of(survey: PhotoSurvey) -> Stage:
         Strokes(split, _colour(split), np.concatenate([outline(f, length) for f in of]))
         for split, of in _by_split(survey).items()
     ]
-    return Stage(strokes, survey.box, _points(survey), up)
+    return Stage(strokes, survey.box, _points(survey), up, survey.levels)
 
 
 def plot_stage(stage: Stage, title: str, path: str | Path | None = None, part: str | None = None) -> Figure:
@@ -93,27 +118,27 @@ def plot_stage(stage: Stage, title: str, path: str | Path | None = None, part: s
 
     Args:
         stage: what is drawn.
-        title: of a figure of both parts.
+        title: of a figure of all parts.
         path: written there (.svg, .png) if given.
-        part: one of PARTS alone; None: both in one figure.
+        part: one of PARTS, or FAR, alone; None: all that it takes in one figure.
 
     Raises:
         MivolError: another suffix.
     """
     with mpl.rc_context(STYLE):
-        parts = PARTS if part is None else (part,)
+        parts = stage.parts if part is None else (part,)
         figure = Figure(figsize=(WIDTH * len(parts), WIDTH))
         FigureCanvasAgg(figure)
         figure.get_layout_engine().set(wspace=0.1)
-        if "side" in parts:
-            _draw_side(figure.add_subplot(1, len(parts), 1, projection="3d", computed_zorder=False), stage)
-        if "plan" in parts:
-            above = figure.add_subplot(1, len(parts), len(parts))
-            _draw_plan(above, stage)
-        if part == "plan":
+        for number, name in enumerate(parts, 1):
+            if name == "side":
+                _draw_side(figure.add_subplot(1, len(parts), number, projection="3d", computed_zorder=False), stage)
+            else:
+                _draw_plan(figure.add_subplot(1, len(parts), number), stage, stage.levels if name == FAR else stage.near)
+        if part in ("plan", FAR):
             figure.legend(loc="outside lower left", ncols=2)
         if part is None:
-            above.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
+            figure.axes[-1].legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
             figure.suptitle(title, x=0.01, ha="left", weight="bold")
     if path is not None:
         save(figure, path)
@@ -164,18 +189,21 @@ def _colour(split: str) -> str:
 def _points(survey: PhotoSurvey) -> NDArray:
     if survey.points is None:
         return np.empty((0, 3))
-    inside = ((survey.points >= survey.box[0]) & (survey.points <= survey.box[1])).all(axis=1)
-    points = survey.points[inside]
+    points = within(survey.points, nested(survey.box, survey.levels)[-1])
     return points[:: max(1, len(points) // MOST_POINTS)]
 
 
 def _draw_side(axes: Axes, stage: Stage) -> None:
-    order = _order(stage.up)
+    order, boxes = _order(stage.up), nested(stage.box, stage.near)
     for strokes in stage.strokes:
         axes.plot(*_pen(strokes.edges)[order], color=strokes.colour, linewidth=0.7, alpha=0.8)
-    axes.plot(*_pen(box_edges(stage.box))[order], color=INK, linewidth=1.3)
-    axes.scatter(*stage.points[:, order].T, s=0.3, color=FAINT, linewidths=0)
-    everything = np.concatenate([*(strokes.edges.reshape(-1, 3) for strokes in stage.strokes), stage.box])[:, order]
+    for number, box in enumerate(boxes):
+        axes.plot(*_pen(box_edges(box))[order], **_line_of(number))
+    everything = np.concatenate([*(strokes.edges.reshape(-1, 3) for strokes in stage.strokes), boxes[-1]])
+    # Of three dimensions matplotlib cuts nothing off at the frame.
+    points = within(stage.points, np.array([everything.min(axis=0), everything.max(axis=0)]))
+    axes.scatter(*points[:, order].T, s=0.3, color=FAINT, linewidths=0)
+    everything = everything[:, order]
     low, high = everything.min(axis=0), everything.max(axis=0)
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
     axes.set_box_aspect(high - low)
@@ -185,15 +213,26 @@ def _draw_side(axes: Axes, stage: Stage) -> None:
     axes.view_init(22, -60)
 
 
-def _draw_plan(axes: Axes, stage: Stage) -> None:
+def _draw_plan(axes: Axes, stage: Stage, levels: int) -> None:
+    """From above, with so many of the boxes."""
     first, second, up = _order(stage.up)
     for strokes in stage.strokes:
         pen = _pen(strokes.edges)[[first, second]]
         axes.plot(*pen, color=strokes.colour, linewidth=0.7, alpha=0.8, label=strokes.label)
-    axes.plot(*_pen(box_edges(stage.box))[[first, second]], color=INK, linewidth=1.3, label="box")
-    axes.scatter(*stage.points[:, [first, second]].T, s=0.3, color=FAINT, linewidths=0)
+    boxes = nested(stage.box, levels)
+    for number, box in enumerate(boxes):
+        label = ("box" if levels == 1 else "innermost box") if number == 0 else "larger boxes" if number == 1 else None
+        axes.plot(*_pen(box_edges(box))[[first, second]], **_line_of(number), label=label)
+    shown = within(stage.points, boxes[-1])[:, [first, second]]
+    axes.scatter(*shown.T, s=0.3, color=FAINT, linewidths=0)
     axes.set_aspect("equal", adjustable="datalim")
-    axes.set(title=f"from above ({'xyz'[up]} is up)", xlabel=f"{'xyz'[first]} [length]", ylabel=f"{'xyz'[second]} [length]")
+    what = "from above" if levels == stage.near else "all boxes from above"
+    axes.set(title=f"{what} ({'xyz'[up]} is up)", xlabel=f"{'xyz'[first]} [length]", ylabel=f"{'xyz'[second]} [length]")
+
+
+def _line_of(number: int) -> dict:
+    """How a nested box is drawn."""
+    return {"color": INK, "linewidth": 1.3 if number == 0 else 0.6}
 
 
 def _order(up: int) -> list[int]:

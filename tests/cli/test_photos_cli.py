@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
 import pytest
+from capture_photos import write_capture
 from photo_sets import write_blender, write_colmap
 from PIL import Image
+from tiny_experiment import write_experiment
 
 from mivol.cli import main
 from mivol.photos import survey_photos
@@ -51,6 +54,43 @@ def test_explain_says_what_alpha_means_for_a_fit(tmp_path: Path, capsys: pytest.
     said = capsys.readouterr()
     assert "6 photographs" in said.out
     assert "expected alpha in all photographs or in none" in said.err
+
+
+def test_explain_says_what_a_fit_would_do_and_draws_its_boxes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """As the command of the fit, without a file; what is held out is drawn too."""
+    folder, picture = write_capture(tmp_path / "photos", 9), tmp_path / "cameras.png"
+    assert main(["explain", str(folder), "-o", str(picture)]) == 0
+    with Image.open(picture) as image:
+        plain = image.size
+    assert "--preset capture" in capsys.readouterr().out
+    few = ["--preset", "capture", "--set", "field.longest=16"]
+    assert main(["explain", *few, str(folder), "-o", str(picture)]) == 0
+    said = capsys.readouterr().out
+    for fact in ("judged by 2 photographs", "5 nested boxes", "cameras stand in the innermost", "16 nodes", str(picture)):
+        assert fact in said
+    with Image.open(picture) as image:
+        assert image.size == (plain[0] // 2 * 3, plain[1])
+
+
+REFUSED = {
+    "a scene with a preset": (["--preset", "cpu", "scene.xml"], "scene.xml holds none: leave it out"),
+    "a scene with settings": (["--set", "field.sky=8", "scene.xml"], "--set is for fits, and .*scene.xml is none"),
+    "an experiment with a preset": (["--preset", "cpu", "fit.toml"], "--set field.preset=cpu changes it"),
+    "a picture of no cameras": (["fit.toml", "-o", "cameras.png"], "only cameras of photographs are drawn"),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_explain_refuses_what_does_not_go_together(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], name: str
+) -> None:
+    arguments, sentence = REFUSED[name]
+    monkeypatch.chdir(tmp_path)
+    write_experiment(tmp_path)
+    assert main(["explain", *arguments]) == 1
+    said = capsys.readouterr()
+    assert re.search(sentence, said.out + said.err)
+    assert not (tmp_path / "cameras.png").exists()
 
 
 def test_explain_draws_nothing_that_was_not_asked_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -13,7 +13,7 @@ from mivol.bench.radiance_field.room import DISTANCE
 from mivol.cli import main
 from mivol.errors import MivolError
 from mivol.photos import Camera, intrinsics, load_photos, survey_photos
-from mivol.photos.region import MIDDLE, middle_box
+from mivol.photos.region import MIDDLE, levels_holding, middle_box, nested, within
 from mivol.validate.images import colour_fitted, judge
 
 
@@ -24,6 +24,18 @@ def test_the_middle_box_is_a_cube_about_what_cameras_look_at() -> None:
     far = [*cameras(9), *(Camera(c.K, c.size, _moved(c, 30.0)) for c in cameras(2))]
     # Two that stand elsewhere do not move the median.
     np.testing.assert_allclose(middle_box(far), box, atol=1e-9)
+
+
+def test_nested_boxes_are_as_many_as_hold_nearly_all_points() -> None:
+    """Of 200 points one in a hundred may lie anywhere: here two do. The others lie in a box that is one way half as long."""
+    box = np.array([[-1.0, -1, -0.5], [1, 1, 0.5]]) + 3
+    assert [b.tolist() for b in nested(box, 3)] == [box.tolist(), (2 * box - 3).tolist(), (4 * box - 9).tolist()]
+    wild = np.array([[500.0, 0, 0], [0, 0, 999]])
+    for reach, levels in ((0.4, 1), (0.99, 1), (1.01, 2), (1.99, 2), (2.01, 3), (7.9, 4), (8.1, 5), (40, 5)):
+        points = np.concatenate([np.tile([3.0, 3, 3 + 0.5 * reach], (99, 1)), np.tile([3 - reach / 2, 3, 3], (199, 1)), wild])
+        assert levels_holding(box, points, 5) == levels, reach
+    points = np.concatenate([box, box + np.array([0, 0, 0.01]), box - np.array([0, 0, 0.01])])
+    np.testing.assert_array_equal(within(points, box), [*box, points[2], points[5]])
 
 
 def _moved(camera: Camera, distance: float) -> np.ndarray:

@@ -460,6 +460,19 @@ def test_colmap_points_make_the_box_without_outliers(tmp_path: Path, encoding: s
 
 
 @pytest.mark.parametrize("encoding", ["bin", "txt"])
+def test_colmap_tells_in_which_photographs_points_were_found(tmp_path: Path, encoding: str) -> None:
+    """Points go with the numbers of images, and these run backwards through the views; a photograph without any has none."""
+    cloud, tracks = np.random.default_rng(6).normal(size=(5, 3)), [(2, 3), (2,), (), (3, 2, 3), (2,)]
+    folder = write_colmap(tmp_path / "set", "PINHOLE", encoding, points=cloud, tracks=tracks)
+    named = {frame.file.name: frame for frame in survey_photos(folder, box=[[-9] * 3, [9] * 3]).frames}
+    np.testing.assert_array_equal(named["a view 1.png"].points, cloud[[0, 1, 3, 4]])
+    np.testing.assert_array_equal(named["a view 2.png"].points, cloud[[0, 3, 3]])
+    assert named["a view 0.png"].points is None
+    views = {view.name: view for view in load_photos(folder, box=[[-9] * 3, [9] * 3]).views}
+    np.testing.assert_array_equal(views["a view 2.png"].points, named["a view 2.png"].points)
+
+
+@pytest.mark.parametrize("encoding", ["bin", "txt"])
 def test_colmap_need_not_tell_its_points(tmp_path: Path, encoding: str) -> None:
     folder = write_colmap(tmp_path / "set", "PINHOLE", encoding)
     (folder / "sparse" / "0" / f"points3D.{encoding}").unlink()

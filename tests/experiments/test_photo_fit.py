@@ -283,6 +283,36 @@ def test_a_long_box_has_as_many_nodes_as_a_cube(photographs: Path, tmp_path: Pat
     assert not photo_plan.make_plan(config.load(toml(tmp_path, photographs), ["field.longest=26"])).cubic
 
 
+def test_nested_boxes_are_those_that_points_need(photographs: Path, tmp_path: Path) -> None:
+    """Points up to 3 half edges from the middle need 3 boxes of 5; the plan says what is left out, and where cameras stand."""
+    chosen = config.load(toml(tmp_path, photographs))
+    photos, _ = photo_data.read_photos(chosen, tmp_path)
+    half = (photos.box[1] - photos.box[0]) / 2
+    points = photos.box.mean(axis=0) + half * np.concatenate([np.tile([0, 3, 0], (997, 1)), np.tile([0, 0, 4.5], (3, 1))])
+    plan = replace(photo_plan.make_plan(chosen), levels=5, near=1.0)
+    assert photo_plan.suited(plan, photos).levels == 5
+
+    def said(points: np.ndarray, plan: FitPlan) -> str:
+        known = replace(photos, survey=replace(photos.survey, points=points))
+        fitting = photo_plan.suited(plan, known)
+        lines = photo_plan.choices(fitting, known, photo_plan.batches_of(fitting, known))
+        return "\n".join(f"{line.choice}: {line.reason}" for line in lines)
+
+    text = said(points, plan)
+    assert "3 nested boxes" in text and f"0 of {len(photos.views)} cameras stand in the innermost" in text
+    assert "3 of 1000 points of the reconstruction left out: they lie beyond the largest box, where nothing can be" in text
+    distances = [np.linalg.norm(view.camera.origin - photos.box.mean(axis=0)) for view in photos.views]
+    assert f"nearer to a camera than {np.median(distances):.4g} [length]" in text
+    assert "5 nested boxes" in said(points[:99], plan) and "5 nested boxes" in said(points, replace(plan, fewer_levels=False))
+    one = said(points, replace(plan, levels=1, near=0.0, sky=8))
+    assert "1000 of 1000 points" in one and "beyond the box, where the sky is" in one
+    assert "nested" not in one and "nearer to a camera" not in one
+    told = photo_plan.make_plan(config.load(toml(tmp_path, photographs), ["field.levels=2", "field.depth=0.5"]))
+    assert (told.levels, told.fewer_levels, told.depth) == (2, False, 0.5)
+    with pytest.raises(MivolError, match="levels is 13: 1 to 12 is expected"):
+        config.load(toml(tmp_path, photographs), ["field.levels=13"])
+
+
 def test_cameras_side_by_side_look_at_the_box_that_is_given(photographs: Path, tmp_path: Path) -> None:
     """Views of one direction have no box of their own; the file's stands in for it, and cameras that miss it are refused."""
     table = json.loads((photographs / "transforms.json").read_text())

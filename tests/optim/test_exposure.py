@@ -143,7 +143,8 @@ def problem_rates_fall() -> bool:
 
 def test_a_plan_says_that_there_are_gains(variant_rgb: str) -> None:
     shown = capture_photos.capture(3)
-    photos = type("Photos", (), {"views": shown, "box": MIDDLE, "survey": type("Survey", (), {"box_from": "as given"})})
+    survey = type("Survey", (), {"box_from": "as given", "points": None})
+    photos = type("Photos", (), {"views": shown, "box": MIDDLE, "survey": survey})
     batches = RayBatches.of(shown)
     assert GAINS in choices(SMALL, photos, batches)
     assert GAINS not in choices(replace(SMALL, exposure=False), photos, batches)

@@ -7,13 +7,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.axes import Axes
 from photo_sets import write_blender
 from scipy.spatial.transform import Rotation
 
 from mivol.photos import PhotoSurvey, survey_photos
 from mivol.photos.camera import Camera
 from mivol.photos.survey import Frame
-from mivol.report.cameras import EDGE, MOST_POINTS, PARTS, WIDTH, outline, plot_cameras
+from mivol.report.cameras import EDGE, FAR, MOST_POINTS, PARTS, WIDTH, outline, parts_of, plot_cameras
+from mivol.report.figures import INK
 
 TURNS = {"x": [0, 90, 0], "y": [-90, 0, 0], "z": [0, 0, 0]}
 """Angles about x, y and z that take z to an axis."""
@@ -113,3 +115,38 @@ def test_points_in_the_box_are_shown_up_to_a_number(survey: PhotoSurvey, many: i
     points = np.asarray(plan.collections[0].get_offsets())
     np.testing.assert_allclose(points, grid[:: many // shown, :2])
     np.testing.assert_allclose(np.transpose(side.collections[0]._offsets3d), grid[:: many // shown])
+
+
+CUBE = np.array([[-1.5] * 3, [1.5] * 3])
+"""Cameras stand 4 away from its middle, on a ring 1 above it, and look inwards: the second box does not hold them, the third
+(6 to each side) does."""
+
+
+def edges_of(axes: Axes) -> list[float]:
+    """Half the edge of each box that is drawn from above."""
+    return [float(np.nanmax(line.get_xdata())) for line in axes.lines if line.get_color() == INK]
+
+
+def test_nested_boxes_are_shown_as_far_as_the_cameras_stand_and_once_all_of_them(survey: PhotoSurvey) -> None:
+    """Points are shown in the boxes that a part shows; of three dimensions nothing is cut off at the frame."""
+    points = np.array([[0.0, 0, 0], [5.0, 0, 0], [20, 0, 0], [30, 0, 0]])
+    nested = replace(survey, box=CUBE, levels=5, points=points)
+    side, plan, far = plot_cameras(nested).axes
+    assert parts_of(nested) == (*PARTS, FAR) and parts_of(survey) == PARTS
+    assert (edges_of(plan), edges_of(far)) == ([1.5, 3, 6], [1.5, 3, 6, 12, 24])
+    assert [line.get_linewidth() for line in far.lines[-5:]] == [1.3, 0.6, 0.6, 0.6, 0.6]
+    assert far.get_title(loc="left").startswith("all boxes") and plan.get_title(loc="left").startswith("from above")
+    assert [len(axes.collections[0].get_offsets()) for axes in (plan, far)] == [2, 3]
+    assert len(side.collections[0]._offsets3d[0]) == 2 and side.get_xlim() == (-6, 6)
+    shown = [text.get_text() for text in far.get_legend().get_texts()]
+    assert shown[-2:] == ["innermost box", "larger boxes"] and nested.path.name in plan.figure.get_suptitle()
+    assert "5 nested boxes" in plan.figure.get_suptitle()
+    (alone,) = plot_cameras(nested, part=FAR).axes
+    assert edges_of(alone) == edges_of(far) and len(alone.figure.legends) == 1
+
+
+def test_boxes_that_all_reach_no_farther_than_the_cameras_need_no_part_of_their_own(survey: PhotoSurvey) -> None:
+    """Two hold none of the cameras, three hold all: either way the first parts show every box."""
+    for levels in (2, 3):
+        found = replace(survey, box=CUBE, levels=levels)
+        assert parts_of(found) == PARTS and len(edges_of(plot_cameras(found).axes[1])) == levels

@@ -2,22 +2,24 @@
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
 from mivol.bench.bars import say
 from mivol.bench.extinctions import DATA
 from mivol.bench.radiance_field.fits import held_out_psnr
-from mivol.bench.radiance_field.room import room
+from mivol.bench.radiance_field.reconstruction import write_room
 from mivol.bench.radiance_field.size import Size
 from mivol.optim.field_view import render_view
 from mivol.optim.radiance_fit import begin_radiance_fit, newest_field
 from mivol.optim.radiance_plan import PRESETS, FitPlan, Stage
 from mivol.optim.ray_batches import RayBatches
-from mivol.photos import Photo, load_photos, rectified
-from mivol.photos.region import middle_box
+from mivol.photos import Photo, Photos, load_photos, rectified
+from mivol.photos.region import levels_holding
 
 __all__ = ["WITHOUT", "ask_priors", "captures", "gain_of", "plan_of"]
 
@@ -29,6 +31,7 @@ WITHOUT: dict[str, Callable[[FitPlan], FitPlan]] = {
     "total variation of the colours": lambda plan: replace(plan, tv_sh=0.0),
     "gradients that fall near a camera": lambda plan: replace(plan, near=0.0),
     "decay of what goes with the direction": lambda plan: replace(plan, matte=0.0),
+    "distances of a model's points": lambda plan: replace(plan, depth=0.0),
     "degree 1 and not 2": lambda plan: replace(plan, degree=2),
 }
 """A prior -> the plan without it."""
@@ -41,15 +44,23 @@ def plan_of(size: Size) -> FitPlan:
     return replace(preset, stages=stages, degree=preset.few_degree, exposure=False)
 
 
-def captures(size: Size) -> dict[str, tuple[Sequence[Photo], np.ndarray]]:
-    """Photographs and their boxes: of a procedural room and, where the data folder has it, of the fox."""
-    made = room(25, (size.prior_side, size.prior_side * 3 // 4))
-    found = {"room": (made, middle_box([photo.camera for photo in made]))}
+def captures(size: Size) -> dict[str, Photos]:
+    """Photographs with the points of a reconstruction: of a procedural room and, where the data folder has it, of the fox."""
+    with tempfile.TemporaryDirectory() as folder:
+        made = write_room(Path(folder) / "room", 25, (size.prior_side, size.prior_side * 3 // 4))
+        found = {"room": load_photos(made, box="middle")}
     path = DATA / "multiview" / "fox"
     if path.is_dir():
-        photos = load_photos(path, largest=size.prior_side, box="middle")
-        found["fox"] = [rectified(photo) for photo in photos.views], photos.box
+        found["fox"] = load_photos(path, largest=size.prior_side, box="middle")
     return found
+
+
+def suited_to(plan: FitPlan, loaded: Photos) -> FitPlan:
+    """The plan with as many nested boxes as the points of a reconstruction need, as a fit has them."""
+    points = loaded.survey.points
+    if points is None:
+        return plan
+    return replace(plan, levels=levels_holding(loaded.box, points, plan.levels))
 
 
 def judge_plan(plan: FitPlan, photos: Sequence[Photo], box: np.ndarray, fold: int) -> float:
@@ -70,8 +81,10 @@ def gain_of(with_it: Sequence[float], without: Sequence[float]) -> dict[str, flo
 
 def ask_priors(size: Size) -> dict:
     """How much worse is the preset for captures without each of its priors?"""
-    answer, plan = {}, plan_of(size)
-    for name, (photos, box) in captures(size).items():
+    answer = {}
+    for name, loaded in captures(size).items():
+        plan = suited_to(plan_of(size), loaded)
+        photos, box = [rectified(photo) for photo in loaded.views], loaded.box
         folds = range(size.prior_folds)
         whole = [judge_plan(plan, photos, box, fold) for fold in folds]
         answer[name] = {"psnr": whole, "priors": {}}

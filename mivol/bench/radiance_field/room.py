@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from mivol.photos import Camera, Photo, facing, intrinsics, pixel_centres, rays
 
-__all__ = ["DISTANCE", "RADIUS", "WALLS", "cameras_of", "image_of", "room"]
+__all__ = ["DISTANCE", "RADIUS", "WALLS", "cameras_of", "distance_of", "image_of", "room"]
 
 RADIUS, WALLS, DISTANCE = 0.5, 6.0, 2.0
 """Of the ball at the origin, half the edge of the cube of walls, and of the cameras from the origin [length]."""
@@ -19,15 +19,21 @@ def colours(points: NDArray, wave: float) -> NDArray:
     return 0.5 + 0.4 * np.stack([np.sin(x + 2 * y), np.sin(2 * z - y + 1), np.sin(x - z + 2)], axis=-1)
 
 
+def distance_of(o: NDArray, d: NDArray) -> NDArray:
+    """How far rays (..., 3) from among the walls go, to the ball or to a wall [length]."""
+    with np.errstate(divide="ignore", invalid="ignore"):  # 0 / 0: a ray in the middle plane, which meets no such wall
+        wall = np.nanmin((WALLS * np.sign(d) - o) / d, axis=-1)
+    along = np.sum(o * d, axis=-1)
+    inside = along**2 - np.sum(o * o, axis=-1) + RADIUS**2
+    return np.where(inside > 0, -along - np.sqrt(np.maximum(inside, 0)), wall)
+
+
 def image_of(camera: Camera) -> NDArray:
     """What a camera among the walls sees (height, width, 3)."""
     o, d = rays(camera, pixel_centres(camera.size))
-    with np.errstate(divide="ignore", invalid="ignore"):  # 0 / 0: a ray in the middle plane, which meets no such wall
-        wall = o + d * np.nanmin((WALLS * np.sign(d) - o) / d, axis=-1, keepdims=True)
-    along = np.sum(o * d, axis=-1)
-    inside = along**2 - np.sum(o * o, axis=-1) + RADIUS**2
-    t = -along - np.sqrt(np.maximum(inside, 0))
-    return np.where((inside > 0)[..., None], colours(o + d * t[..., None], 3.0), colours(wall, 0.25))
+    at = o + d * distance_of(o, d)[..., None]
+    is_ball = np.linalg.norm(at, axis=-1, keepdims=True) < 2 * RADIUS
+    return np.where(is_ball, colours(at, 3.0), colours(at, 0.25))
 
 
 def cameras_of(count: int, size: tuple[int, int]) -> list[Camera]:

@@ -1,0 +1,100 @@
+"""Points of a reconstruction: what is drawn of them, the derivatives of their energy, and a fit that they help."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from ball_photos import BOX, PLAN
+
+from mivol.optim.radiance_problem import RadianceProblem
+from mivol.optim.ray_batches import RayBatches
+from mivol.optim.sightings import EACH, OFF, WRONG, Sightings, by_transmittance, draw_sightings
+from mivol.photos import Photo
+
+VOXEL = 0.1
+
+
+def ends_of(sightings: Sightings) -> tuple[np.ndarray, np.ndarray]:
+    """Where the rays end, (2, count, 3), and how far that is."""
+    o, d, t = (np.array(a) for a in (sightings.rays.o, sightings.rays.d, sightings.rays.t_max))
+    return (o + d * t).T.reshape(2, sightings.count, 3), t.reshape(2, sightings.count)
+
+
+def test_points_are_rays_that_end_before_and_behind_them(variant_rgb: str) -> None:
+    """By a voxel of the box in which they lie, of twice the edge in the next one, and by a share of their distance; points
+    beyond all boxes are not drawn, nor are those of a photograph that has none."""
+    near, far, beyond = np.array([[0.5, 0, 0.9]]), np.array([[1.0, -1.5, 0]]), np.array([[0, 0, 2.1]])
+    origins = np.array([[3.0, 0, 0], [0, 4, 0], [0, 0, 5], [9, 9, 9]])
+    points = [near, far, beyond, np.zeros((0, 3))]
+    found = draw_sightings(points, origins, BOX, 2, VOXEL, np.random.default_rng(0))
+    assert found.count == 2 * EACH
+    ends, t = ends_of(found)
+    for slot, point, voxel in ((0, near, VOXEL), (1, far, 2 * VOXEL)):
+        own = np.arange(found.count) // EACH == slot
+        away = point[0] - origins[slot]
+        d = np.linalg.norm(away)
+        off = (voxel + OFF * d) * np.array([[-1.0], [1.0]])
+        np.testing.assert_allclose(t[:, own] - d, np.broadcast_to(off, (2, own.sum())), atol=1e-5)
+        np.testing.assert_allclose(ends[:, own] - point, np.repeat((off * away / d)[:, None], own.sum(), axis=1), atol=1e-5)
+    assert draw_sightings(points[2:], origins[2:], BOX, 2, VOXEL, np.random.default_rng(0)) is None
+
+
+def energy(T: np.ndarray) -> float:
+    """The mean of E over points, of transmittances before (first half) and behind them."""
+    before, behind = T.reshape(2, -1)
+    return float(np.mean(-np.log((1 - WRONG) * (before - behind) + WRONG)))
+
+
+def test_slopes_of_the_energy_by_transmittances(variant_rgb: str) -> None:
+    T = np.array([1.0, 0.9, 0.5, 0.2, 1.0, 0.1, 0.5, 0.0])
+    found = np.array(by_transmittance(mi.Float(T), 4))
+    step = 1e-5
+    expected = [(energy(T + step * e) - energy(T - step * e)) / (2 * step) for e in np.eye(8)]
+    # Central differences are off by h^2 / 6 times the third derivative, below 2 (0.95 / 0.05)^3 / 4: 6e-8; float32 by 2^-23.
+    np.testing.assert_allclose(found, expected, rtol=1e-5)
+
+
+@pytest.fixture
+def sighted(photos: list[Photo]) -> list[Photo]:
+    """Four of the photographs, in which points of the ball's middle plane were found."""
+    rng = np.random.default_rng(5)
+    return [replace(photo, points=np.column_stack([rng.uniform(-0.5, 0.5, (9, 2)), np.zeros(9)])) for photo in photos[:4]]
+
+
+def test_derivatives_of_a_fog_are_those_of_a_closed_form(variant_rgb: str, sighted: list[Photo]) -> None:
+    """A fog is even, so that the sum over all nodes is the derivative by its one density s: T = exp(-s l)."""
+    problem = RadianceProblem(RayBatches.of(sighted, (1, 2)), BOX, replace(PLAN, depth=0.7))
+    chosen = np.arange(4)
+    batch = problem.batches.draw(2, chosen, 4, np.random.default_rng(0))
+    drawn = problem._sightings(chosen, 3)
+    with_points, without = (problem.slopes(batch, None, points)[1] for points in (drawn, None))
+    found = {name: np.array(with_points[name], np.float64) - np.array(without[name]) for name in without}
+    assert not found["harmonics"].any()
+    ends, t = ends_of(drawn)
+    o = np.array(drawn.rays.o).T.reshape(2, -1, 3)
+    with np.errstate(divide="ignore"):
+        planes = (BOX[:, None, None] - o) / ((ends - o) / t[..., None])
+    inside = t - planes.min(axis=0).max(axis=-1)
+    s = PLAN.start / problem.unit
+    before, behind = np.exp(-s * inside)
+    by_s = -(1 - WRONG) * (-inside[0] * before + inside[1] * behind) / ((1 - WRONG) * (before - behind) + WRONG)
+    # Sums of some thousand numbers of float32 of both signs.
+    np.testing.assert_allclose(found["density"].sum(), 0.7 * by_s.mean(), rtol=1e-4)
+
+
+def test_points_change_a_fit_only_where_they_are_asked_for(one_thread: None, photos: list[Photo], sighted: list[Photo]) -> None:
+    def slope(some: list[Photo], depth: float) -> np.ndarray:
+        problem = RadianceProblem(RayBatches.of(some, (1, 2)), BOX, replace(PLAN, depth=depth))
+        return np.array(problem.loss_and_gradient(problem.start(), 0)[1]["density"])
+
+    # Nothing is walked for a weight of 0.
+    plain, asked = (RadianceProblem(RayBatches.of(sighted, (1, 2)), BOX, replace(PLAN, depth=d)) for d in (0, 0.1))
+    assert plain._sightings(np.arange(4), 0) is None and asked._sightings(np.arange(4), 0).count == 4 * EACH
+    without = slope(photos[:4], 0.1)
+    np.testing.assert_array_equal(slope(sighted, 0.0), without)
+    assert np.abs(slope(sighted, 0.1) - without).max() > 0
+    digests = {RayBatches.of(some, (1,)).digest() for some in (photos[:4], sighted)}
+    assert len(digests) == 2
