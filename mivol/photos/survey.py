@@ -100,7 +100,7 @@ class PhotoSurvey:
             f"{self.path}: {self.format}, {len(cameras)} photographs ({counts}), {', '.join(sizes)} pixels, {lens}",
             f"focal length {_range(focal)} pixels, horizontal field of view {angle} degrees",
             f"box {_corner(self.box[0])} to {_corner(self.box[1])}, {self.box_from}",
-            f"near {self.near_far[0]:.4g}, far {self.near_far[1]:.4g}",
+            f"near {self.near_far[0]:.4g}, far {self.near_far[1]:.4g} from the cameras",
         ]
         if self.skipped:
             named = ", ".join(self.skipped[:5]) + (" ..." if len(self.skipped) > 5 else "")

@@ -23,7 +23,7 @@ def test_a_plan_is_the_preset_but_for_its_size_and_one_prior() -> None:
     )  # fmt: skip
     assert plan.degree == preset.few_degree and plan.stages[-1].longest == QUICK.prior_resolution
     changed = [{n for n in vars(plan) if vars(plan)[n] != vars(without(plan))[n]} for without in WITHOUT.values()]
-    assert changed == [{"tv_density"}, {"tv_sh"}, {"near"}, {"matte"}, {"depth"}, {"degree"}]
+    assert changed == [{"tv_density"}, {"tv_sh"}, {"near"}, {"matte"}, {"depth"}, {"degree"}, {"first_degree"}]
 
 
 def test_a_gain_is_a_mean_over_folds_with_its_error() -> None:

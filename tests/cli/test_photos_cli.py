@@ -72,6 +72,15 @@ def test_explain_says_what_a_fit_would_do_and_draws_its_boxes(tmp_path: Path, ca
         assert image.size == (plain[0] // 2 * 3, plain[1])
 
 
+def test_explain_draws_the_cameras_of_a_fit_of_gaussians(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_capture(tmp_path / "photos", 9)
+    (tmp_path / "fit.toml").write_text('title = "a"\n[photos]\npath = "photos"\n[gaussians]\npreset = "tiny"\n')
+    assert main(["explain", str(tmp_path / "fit.toml"), "-o", str(tmp_path / "cameras.png")]) == 0
+    said = capsys.readouterr().out.splitlines()
+    assert said[-1] == str(tmp_path / "cameras.png") and any("Gaussians at first" in line for line in said)
+    assert (tmp_path / "cameras.png").is_file()
+
+
 REFUSED = {
     "a scene with a preset": (["--preset", "cpu", "scene.xml"], "scene.xml holds none: leave it out"),
     "a scene with settings": (["--set", "field.sky=8", "scene.xml"], "--set is for fits, and .*scene.xml is none"),

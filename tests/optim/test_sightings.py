@@ -7,12 +7,14 @@ from dataclasses import replace
 import mitsuba as mi
 import numpy as np
 import pytest
-from ball_photos import BOX, PLAN
+from ball_photos import BOX, PLAN, fitted
 
 from mivol.optim.radiance_problem import RadianceProblem
 from mivol.optim.ray_batches import RayBatches
 from mivol.optim.sightings import EACH, OFF, WRONG, Sightings, by_transmittance, draw_sightings
 from mivol.photos import Photo
+from mivol.transport.line_integrals.radiance_field import cells_of, model_of, render
+from mivol.transport.line_integrals.radiance_source import exact
 
 VOXEL = 0.1
 
@@ -83,6 +85,25 @@ def test_derivatives_of_a_fog_are_those_of_a_closed_form(variant_rgb: str, sight
     by_s = -(1 - WRONG) * (-inside[0] * before + inside[1] * behind) / ((1 - WRONG) * (before - behind) + WRONG)
     # Sums of some thousand numbers of float32 of both signs.
     np.testing.assert_allclose(found["density"].sum(), 0.7 * by_s.mean(), rtol=1e-4)
+
+
+def test_rays_of_a_fit_end_nearer_to_the_points_that_it_was_told(variant_rgb: str, photos: list[Photo]) -> None:
+    """Three views, and points of the ball's surface that face them: more of the light of a ray comes from about its point."""
+    rng, few = np.random.default_rng(4), []
+    for photo in photos[:3]:
+        own = rng.normal(size=(40, 3))
+        own *= 0.6 / np.linalg.norm(own, axis=1, keepdims=True)
+        few.append(replace(photo, points=own[own @ photo.camera.origin > 0.3]))
+    ended = []
+    for depth in (0.0, 0.01):
+        plan = replace(PLAN, stages=PLAN.stages[:1], depth=depth)
+        problem = fitted(RayBatches.of(few, (2,)), plan).problem
+        points, origins = problem.batches.points, problem.batches.origins
+        drawn = draw_sightings(points, origins, BOX, 1, 2 / 12, np.random.default_rng(0))
+        cells = cells_of(problem.field)
+        T = np.array(render(cells, exact(problem.field, drawn.rays.d), model_of(problem.field), drawn.rays).T)
+        ended.append(np.mean(T[: drawn.count] - T[drawn.count :]))
+    assert ended[1] > ended[0]
 
 
 def test_points_change_a_fit_only_where_they_are_asked_for(one_thread: None, photos: list[Photo], sighted: list[Photo]) -> None:

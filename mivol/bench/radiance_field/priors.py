@@ -33,6 +33,7 @@ WITHOUT: dict[str, Callable[[FitPlan], FitPlan]] = {
     "decay of what goes with the direction": lambda plan: replace(plan, matte=0.0),
     "distances of a model's points": lambda plan: replace(plan, depth=0.0),
     "degree 1 and not 2": lambda plan: replace(plan, degree=2),
+    "degree 1 from the first stage on, not raised from 0": lambda plan: replace(plan, first_degree=0),
 }
 """A prior -> the plan without it."""
 

@@ -57,7 +57,7 @@ class Size:
     prior_side: int = 80
     prior_resolution: int = 32
     prior_steps: int = 180
-    prior_folds: int = 3
+    prior_folds: int = 5
 
 
 FULL = Size()
