@@ -71,15 +71,16 @@ def draw_sightings(
     slot = np.repeat(np.arange(len(drawn)), [len(own) for own in drawn])
     places = np.concatenate(drawn)
     out = np.abs((places - box.mean(axis=0)) / (box[1] - box[0])).max(axis=1) * 2
-    kept = out <= 2 ** (levels - 1)
-    if not kept.any():
-        return None
-    slot, places = slot[kept], places[kept]
     away = places - origins[slot]
     d = np.linalg.norm(away, axis=1)
+    # A ray to a point where the photograph was taken has no direction.
+    kept = (out <= 2 ** (levels - 1)) & (d > 0)
+    if not kept.any():
+        return None
+    away, d, o = away[kept], d[kept], origins[slot[kept]]
     off = voxel * 2 ** np.ceil(np.log2(np.maximum(out[kept], 1))) + OFF * d
     twice = np.tile(np.arange(len(d)), 2)
-    o, towards = mi.Point3f(*_columns(origins[slot][twice])), mi.Vector3f(*_columns((away / d[:, None])[twice]))
+    o, towards = mi.Point3f(*_columns(o[twice])), mi.Vector3f(*_columns((away / d[:, None])[twice]))
     ends = _real(np.concatenate([np.maximum(d - off, 0), d + off]))
     return Sightings(RayBundle(o, towards, ends), len(d))
 

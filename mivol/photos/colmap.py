@@ -97,14 +97,15 @@ def read_colmap(path: Path) -> Listing:
     Entries are sorted by name.
 
     Raises:
-        MivolError: a camera model not in ``CAMERA_MODELS``, a truncated file, text that is not numbers, an unknown camera.
+        MivolError: a camera model not in ``CAMERA_MODELS``, a truncated file, text that is not numbers, an unknown camera, a
+            point that is nowhere.
     """
     model = find_model(path)
     suffix = next(s for s in READERS if (model / f"cameras{s}").is_file() and (model / f"images{s}").is_file())
     read = READERS[suffix]
     sensors, poses = read.cameras(model / f"cameras{suffix}"), read.images(model / f"images{suffix}")
     points_file = model / f"points3D{suffix}"
-    points = read.points(points_file) if points_file.is_file() else None
+    points = _checked(read.points(points_file), points_file) if points_file.is_file() else None
     seen = {} if points is None else points.seen_by()
     base = next((folder for folder in (path, *model.parents[:2]) if (folder / "images").is_dir()), path)
     file = model / f"images{suffix}"
@@ -139,6 +140,13 @@ def rotation(q: np.ndarray) -> np.ndarray:
             [2 * (x * z - w * y), 2 * (y * z + w * x), w * w - x * x - y * y + z * z],
         ]
     )
+
+
+def _checked(points: Points, file: Path) -> Points:
+    if not np.isfinite(points.rows).all():
+        number = int(np.argmin(np.isfinite(points.rows).all(axis=1)))
+        raise refusal(file, f"point {number} at {points.rows[number, :3].tolist()}", "finite numbers", "export the model again")
+    return points
 
 
 def _entry(base: Path, pose: Pose, sensors: dict[int, Sensor], file: Path, points: np.ndarray | None) -> Entry:

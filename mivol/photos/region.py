@@ -101,7 +101,7 @@ def nested(box: np.ndarray, levels: int) -> list[np.ndarray]:
 def levels_holding(box: np.ndarray, points: np.ndarray, most: int) -> int:
     """The fewest nested boxes that hold ``HELD`` of points (N, 3), and ``most`` where that many do not."""
     out = 2 * np.abs((points - box.mean(axis=0)) / (box[1] - box[0])).max(axis=1)
-    return min(most, 1 + max(0, math.ceil(math.log2(np.percentile(out, 100 * HELD)))))
+    return min(most, 1 + math.ceil(math.log2(max(1.0, np.percentile(out, 100 * HELD)))))
 
 
 def within(points: np.ndarray, box: np.ndarray) -> np.ndarray:

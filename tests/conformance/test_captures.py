@@ -34,6 +34,7 @@ def test_nested_boxes_are_as_many_as_hold_nearly_all_points() -> None:
     for reach, levels in ((0.4, 1), (0.99, 1), (1.01, 2), (1.99, 2), (2.01, 3), (7.9, 4), (8.1, 5), (40, 5)):
         points = np.concatenate([np.tile([3.0, 3, 3 + 0.5 * reach], (99, 1)), np.tile([3 - reach / 2, 3, 3], (199, 1)), wild])
         assert levels_holding(box, points, 5) == levels, reach
+    assert levels_holding(box, np.array([[3.0, 3, 3]]), 5) == 1
     points = np.concatenate([box, box + np.array([0, 0, 0.01]), box - np.array([0, 0, 0.01])])
     np.testing.assert_array_equal(within(points, box), [*box, points[2], points[5]])
 

@@ -473,6 +473,13 @@ def test_colmap_tells_in_which_photographs_points_were_found(tmp_path: Path, enc
 
 
 @pytest.mark.parametrize("encoding", ["bin", "txt"])
+def test_points_of_colmap_that_are_nowhere_are_refused(tmp_path: Path, encoding: str) -> None:
+    folder = write_colmap(tmp_path / "set", "PINHOLE", encoding, points=np.array([[0.0, 0, 0], [1, np.nan, 2]]))
+    with pytest.raises(MivolError, match=rf"points3D.{encoding}: found .*nan"):
+        survey_photos(folder, box=[[-9] * 3, [9] * 3])
+
+
+@pytest.mark.parametrize("encoding", ["bin", "txt"])
 def test_colmap_need_not_tell_its_points(tmp_path: Path, encoding: str) -> None:
     folder = write_colmap(tmp_path / "set", "PINHOLE", encoding)
     (folder / "sparse" / "0" / f"points3D.{encoding}").unlink()

@@ -42,6 +42,8 @@ def test_points_are_rays_that_end_before_and_behind_them(variant_rgb: str) -> No
         np.testing.assert_allclose(t[:, own] - d, np.broadcast_to(off, (2, own.sum())), atol=1e-5)
         np.testing.assert_allclose(ends[:, own] - point, np.repeat((off * away / d)[:, None], own.sum(), axis=1), atol=1e-5)
     assert draw_sightings(points[2:], origins[2:], BOX, 2, VOXEL, np.random.default_rng(0)) is None
+    # A ray to where the photograph was taken has no direction.
+    assert draw_sightings([near], near, BOX, 2, VOXEL, np.random.default_rng(0)) is None
 
 
 def energy(T: np.ndarray) -> float:
