@@ -101,6 +101,7 @@ def choices(plan: FitPlan, photos: Photos, batches: RayBatches) -> list[PlanLine
         PlanLine(choice=f"{len(photos.views)} photographs, a box of {size} [length]", reason=photos.survey.box_from),
         *nested_boxes[: plan.levels > 1],
         *left_out(plan, photos),
+        *distances_told(plan, batches),
         *near_cameras(plan, origins, box),
         *wide_lenses(photos),
         PlanLine(choice=f"grids of {resolutions} nodes along the longest edge", reason="coarse first, to find what is empty"),
@@ -121,6 +122,13 @@ def left_out(plan: FitPlan, photos: Photos) -> list[PlanLine]:
     box = "the largest box" if plan.levels > 1 else "the box"
     reason = f"they lie beyond {box}, where {'the sky is' if plan.sky else 'nothing can be'}"
     return [PlanLine(choice=f"{beyond} of {len(points)} points of the reconstruction left out", reason=reason)]
+
+
+def distances_told(plan: FitPlan, batches: RayBatches) -> list[PlanLine]:
+    """A line where points of a reconstruction say how far things are."""
+    found = sum(map(len, batches.points))
+    choice = f"{found} points that photographs found say where their rays end, with a weight of {plan.depth:g}"
+    return [PlanLine(choice=choice, reason="a model of COLMAP names them; field.depth")] if plan.depth and found else []
 
 
 def near_cameras(plan: FitPlan, origins: np.ndarray, box: np.ndarray) -> list[PlanLine]:

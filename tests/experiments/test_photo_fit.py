@@ -304,6 +304,11 @@ def test_nested_boxes_are_those_that_points_need(photographs: Path, tmp_path: Pa
     distances = [np.linalg.norm(view.camera.origin - photos.box.mean(axis=0)) for view in photos.views]
     assert f"nearer to a camera than {np.median(distances):.4g} [length]" in text
     assert "5 nested boxes" in said(points[:99], plan) and "5 nested boxes" in said(points, replace(plan, fewer_levels=False))
+    seen = replace(photos, views=tuple(replace(view, points=points[:7]) for view in photos.views))
+    batches = photo_plan.batches_of(plan, seen)
+    lines = [line.choice for line in photo_plan.choices(replace(plan, depth=0.5), seen, batches)]
+    assert f"{7 * len(photos.views)} points that photographs found say where their rays end, with a weight of 0.5" in lines
+    assert photo_plan.distances_told(plan, batches) == []
     one = said(points, replace(plan, levels=1, near=0.0, sky=8))
     assert "1000 of 1000 points" in one and "beyond the box, where the sky is" in one
     assert "nested" not in one and "nearer to a camera" not in one
