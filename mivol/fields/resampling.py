@@ -53,8 +53,11 @@ class _Axes:
     """Along one axis, the two old nodes about each new one and their shares, (2, n)."""
 
     def __init__(self, q: np.ndarray, n: int) -> None:
+        whole = np.rint(q)
+        q = np.where(np.abs(q - whole) < 1e-9 * n, whole, q)
         low = np.floor(q)
-        self.nodes = np.clip(np.stack([low, low + 1]).astype(int), 0, n - 1)
+        # Twice the same where a new node lies on an old one: the next one is not about it.
+        self.nodes = np.clip(np.stack([low, np.ceil(q)]).astype(int), 0, n - 1)
         self.shares = np.stack([1 - (q - low), q - low]).astype(np.float32)
 
     @classmethod

@@ -66,6 +66,7 @@ class Rows:
         rate: learning rate over the number of photographs, times ``unit``: what one photograph is worth in a step.
         unit: values times this have no unit.
         first: the row at which a prior begins that looks at a share of them.
+        step: number of the step after which it acts.
     """
 
     width: int
@@ -73,6 +74,7 @@ class Rows:
     rate: float
     unit: float
     first: int
+    step: int = 0
 
 
 class DecoupledPrior(Strategy, tag="decoupled prior"):
@@ -88,16 +90,22 @@ class DecoupledPrior(Strategy, tag="decoupled prior"):
 
 
 class Smoothness(DecoupledPrior, tag="smoothness"):
-    """Total variation over a share of the rows at a time. Source: Rudin, Osher and Fatemi 1992."""
+    """Total variation over a share of the rows at a time. Source: Rudin, Osher and Fatemi 1992.
+
+    To look at a share of the rows copies all of them: every few steps, at as many shares at once, says the same for less.
+    """
 
     is_spatial = True
     cites = ("rudin_1992",)
 
-    share: Annotated[float, of("1", "of the rows that a step looks at", gt=0, le=1)] = 1 / 8
+    share: Annotated[float, of("1", "of the rows that are looked at, a step", gt=0, le=1)] = 1 / 8
+    every: Annotated[int, of("step", "from one look to the next, which takes the shares of all between", ge=1)] = 1
 
     def apply(self, values: mi.Float, rows: Rows) -> mi.Float:
+        if rows.step % self.every:
+            return values
         moved = mi.Float(values)
-        smooth(moved, rows, self.weight, self.share)
+        smooth(moved, rows, self.every * self.weight, min(self.every * self.share, 1))
         return moved
 
 

@@ -112,10 +112,35 @@ class CoarseToFine(Event, tag="coarse_to_fine"):
         return iteration in self.at
 
     def apply(self, fit: FitAtWork) -> str:
-        fit.problem.set(fit.run.reals)
-        refinement = fit.problem.refine(1 + self.at.index(fit.next))
-        fit.run.refine(refinement)
-        return refinement.says
+        return _go_over(fit, 1 + self.at.index(fit.next))
+
+
+class DropUnseen(Event, tag="drop_unseen"):
+    """Go on without the unknowns of a stage that nothing sees: what is left takes less time and memory."""
+
+    at: Annotated[tuple[int, ...], of("iteration", "before which iterations")]
+
+    def due(self, iteration: int) -> bool:
+        return iteration in self.at
+
+    def apply(self, fit: FitAtWork) -> str:
+        return _go_over(fit, fit.problem.stage)
+
+
+def _go_over(fit: FitAtWork, stage: int) -> str:
+    """Begin a stage, or the one at work anew; what it says.
+
+    Dr.Jit keeps arrays that were let go for others of their size, rounded up to a power of two. Those of the last steps are of
+    no use to what comes between, nor those to the next steps.
+    """
+    dr.flush_malloc_cache()
+    fit.problem.set(fit.run.reals)
+    refinement = fit.problem.refine(stage)
+    fit.run.refine(refinement)
+    says = refinement.says
+    del refinement  # holds the old unknowns
+    dr.flush_malloc_cache()
+    return says
 
 
 class UpdateOccupancy(Event, tag="update_occupancy"):
@@ -175,7 +200,7 @@ class Evaluate(Event, tag="evaluate"):
         return ""
 
 
-EVENTS = table(Upsample, CoarseToFine, UpdateOccupancy, ControlDensity, Checkpoint, Evaluate)
+EVENTS = table(Upsample, CoarseToFine, DropUnseen, UpdateOccupancy, ControlDensity, Checkpoint, Evaluate)
 
 
 def in_order(events: tuple[Event, ...]) -> list[Event]:

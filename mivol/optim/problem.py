@@ -96,10 +96,13 @@ class Refinement:
 
 
 class Staged(Differentiable, Protocol):
-    """What :class:`~mivol.optim.events.CoarseToFine` and :class:`~mivol.optim.events.UpdateOccupancy` ask for besides."""
+    """What :class:`~mivol.optim.events.CoarseToFine`, ``DropUnseen`` and ``UpdateOccupancy`` ask for besides."""
 
     def refine(self, stage: int) -> Refinement:
-        """Begin a stage, with the model at the newest reals; the problem has the stage's unknowns from here on."""
+        """Begin a stage, with the model at the newest reals; the problem has the stage's unknowns from here on.
+
+        The stage at work is begun again, without what is not seen.
+        """
 
     def update_occupancy(self) -> None:
         """Look again for what can be left out of the next steps without changing them."""

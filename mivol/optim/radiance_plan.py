@@ -19,7 +19,7 @@ from mivol.fields.spherical import basis_size, row_width
 from mivol.machine import available_memory
 from mivol.optim.course import Course
 from mivol.optim.decoupled_priors import DecoupledPrior, Smoothness, Sparsity, ViewDependence
-from mivol.optim.events import CoarseToFine, Event, UpdateOccupancy
+from mivol.optim.events import CoarseToFine, DropUnseen, Event, UpdateOccupancy
 from mivol.optim.ray_batches import TILE, RayBatches
 from mivol.optim.rmsprop import RMSprop
 
@@ -67,7 +67,8 @@ class FitPlan:
         memory: of the running mean of squared derivatives.
         tv_density, tv_sh: total variation of the density and of the coefficients, in photographs: how many of them, all asking
             for the same, it takes to hold against it. With V photographs a step goes this / V of a learning rate.
-        tv_share: share of the rows that a step's total variation looks at.
+        tv_share: share of the rows that total variation looks at, a step.
+        tv_every: steps from one look to the next, which takes the shares of all between.
         sparsity: Cauchy prior on the density, in photographs.
         matte: coefficients beyond the constant fall by this / V times their learning rate a step [1 / radiance]: what few
             photographs say about directions is soon more than there is.
@@ -78,6 +79,8 @@ class FitPlan:
         keep_weight: a node is kept where some ray gives a cell of it this weight.
         start: the first density, times half the longest edge.
         occupancy_every: steps after which the map of occupied cells is made anew.
+        drop: share of the last stage's steps after which nodes are left out that no view sees, nor a neighbour of theirs, by
+            ``keep_weight``; 0: none are. A stage begins with nodes two voxels beyond what the last one saw.
         sky: rows of a map of what is behind the field, learned with it (:mod:`mivol.fields.sky`); 0: the photographs' colour.
         sky_rate: first learning rate of the sky [radiance]; it must lead, or the field fills the box with what is behind.
         sky_smooth: share of the way that a texel goes to its neighbours in a step, so that none stays as it began.
@@ -104,6 +107,7 @@ class FitPlan:
     tv_density: float = 0.1
     tv_sh: float = 1.0
     tv_share: float = 1 / 16
+    tv_every: int = 4
     sparsity: float = 0.0
     matte: float = 12.0
     depth: float = 0.0
@@ -112,6 +116,7 @@ class FitPlan:
     keep_weight: float = 0.01
     start: float = 0.1
     occupancy_every: int = 64
+    drop: float = 0.0
     sky: int = 0
     sky_rate: float = 0.1
     sky_smooth: float = 0.0
@@ -133,6 +138,12 @@ class FitPlan:
         return tuple(int(n) for n in np.cumsum([stage.steps for stage in self.stages])[:-1])
 
     @property
+    def drops(self) -> tuple[int, ...]:
+        """Steps before which unseen nodes are left out."""
+        last = self.stages[-1].steps
+        return (self.steps - last + max(1, round(self.drop * last)),) if self.drop > 0 else ()
+
+    @property
     def optimiser(self) -> RMSprop:
         """What takes the steps."""
         return RMSprop(memory=self.memory)
@@ -143,13 +154,14 @@ class FitPlan:
         return (
             ("density", Sparsity(weight=self.sparsity)),
             ("harmonics", ViewDependence(weight=self.matte)),
-            ("density", Smoothness(weight=self.tv_density, share=self.tv_share)),
-            ("harmonics", Smoothness(weight=self.tv_sh, share=self.tv_share)),
+            ("density", Smoothness(weight=self.tv_density, share=self.tv_share, every=self.tv_every)),
+            ("harmonics", Smoothness(weight=self.tv_sh, share=self.tv_share, every=self.tv_every)),
         )
 
     def course(self, *more: Event) -> Course:
         """All steps, with the stages, the surveys and what else is to happen between them."""
-        return Course(self.steps, events=(CoarseToFine(at=self.begins), UpdateOccupancy(every=self.occupancy_every), *more))
+        between = CoarseToFine(at=self.begins), DropUnseen(at=self.drops), UpdateOccupancy(every=self.occupancy_every)
+        return Course(self.steps, events=(*between, *more))
 
     def up_to(self, longest: int) -> FitPlan:
         """The plan that ends with so many nodes along the longest edge; stages that are coarser stay.
@@ -193,6 +205,7 @@ PRESETS: dict[str, FitPlan] = {
         ),
         density_rate=60.0,
         sh_rate=0.1,
+        drop=1 / 4,
     ),
     "capture": FitPlan(
         (Stage(32, 150, 1, 8, 64), Stage(64, 450, 1, 8, 128)),

@@ -3,7 +3,7 @@
 Conventions. A step looks at tiles of a few views; its loss is the squared error of a ray, mean over rgb and rays, where the
 photographs hold radiance weighted by the slope of a tone curve (:mod:`mivol.optim.colour_scale`). Densities are
 signed and pass a ReLU after interpolation, so a cell whose corners are all negative is vacuum and costs nothing. A stage begins
-with nodes where the last one's field gave some ray a weight (and their neighbours).
+with the nodes of cells about those to which the last one's field gave some ray a weight.
 
 The reals are ``density`` (rows,), ``harmonics`` (rows, width) and, where the plan asks for one, ``sky`` (texels, 4); radiance
 is there in the scale of :mod:`mivol.optim.colour_scale`. What a step does is a function of them, of the listed cells, the seed
@@ -254,8 +254,8 @@ class RadianceProblem:
         """Where priors act in an iteration, by parameter."""
         density, sh = (rate / len(self.batches.origins) for rate in self.plan.rates(iteration))
         return {
-            "density": Rows(1, self._neighbours, density, self.unit, self._first_row),
-            "harmonics": Rows(self.field.width, self._neighbours, self.scale.rate * sh, 1.0, self._first_row),
+            "density": Rows(1, self._neighbours, density, self.unit, self._first_row, iteration),
+            "harmonics": Rows(self.field.width, self._neighbours, self.scale.rate * sh, 1.0, self._first_row, iteration),
         }
 
     def warning(self) -> str:
@@ -265,14 +265,17 @@ class RadianceProblem:
     # -- Stages -------------------------------------------------------------------------------------------------------
 
     def refine(self, stage: int) -> Refinement:
-        """Go over to the nodes of a finer stage, where the field is seen now.
+        """Go over to the nodes of a finer stage, or to those of the stage at work, where the field is seen now.
 
         Raises:
             MivolError: nothing is seen.
         """
-        keep, old = self.seen_nodes(), self.field
+        begins, keep, old = stage != self.stage, self.seen_nodes(), self.field
         if not keep.any():
             raise MivolError("no view sees anything in the box: check the box, the cameras and the background.")
+        if not begins:
+            # What is seen may move by a voxel. Finer nodes are stored in all cells around a kept one: two voxels as it is.
+            keep = maximum_filter(keep, (1, 3, 3, 3))
         place, degree = place_grid(self.box, self.plan.stages[stage].longest), self.plan.degree_at(stage)
 
         def resampled(grid: SphericalGrid) -> SphericalGrid:
@@ -284,7 +287,8 @@ class RadianceProblem:
         shrink = max(old.res) / max(self.field.res)
         counts = self.field.res if old.levels == 1 else (old.levels, *self.field.res)
         nodes = " x ".join(str(n) for n in counts)
-        says = f"refined to {nodes} nodes, of which {self.field.rows - 1} are kept{self._compare_exposures(stage)}"
+        kept = f"{nodes} nodes, of which {self.field.rows - 1} are kept"
+        says = f"refined to {kept}{self._compare_exposures(stage)}" if begins else f"unseen nodes left out: {kept}"
         return Refinement(
             self.values(),
             lambda tensors: tensors | _tensors(resampled(_with_tensors(old, tensors))),
@@ -311,8 +315,7 @@ class RadianceProblem:
         self.update_occupancy()
 
     def seen_nodes(self) -> np.ndarray:
-        """Nodes (levels, Z, Y, X) of cells to which some ray of the training views gives the plan's weight, and their
-        neighbours."""
+        """Nodes (levels, Z, Y, X) of cells to which some ray of the training views gives the plan's weight."""
         cells, model = cells_of(self.field), model_of(self.field, self.plan.stop)
         weight = dr.zeros(mi.Float, max(cells.count, 1))
         shrink = max(self.batches.levels)
@@ -321,7 +324,7 @@ class RadianceProblem:
             brightest_weights(cells, source, model, self.batches.whole(shrink, view).rays, weight)
             dr.eval(weight)
             self.safe_point()
-        return maximum_filter(_nodes_of(self.field, cells, weight >= self.plan.keep_weight), (1, 3, 3, 3))
+        return _nodes_of(self.field, cells, weight >= self.plan.keep_weight)
 
     # -- On disk ------------------------------------------------------------------------------------------------------
 

@@ -44,6 +44,7 @@ class RMSpropRun(Run):
         loss, slopes = self.problem.loss_and_gradient(self.reals, iteration, self.settings.views)
         rates = self.problem.rates(iteration)
         reals, squares = self._moved(slopes, {name: rate * factor for name, rate in rates.items()})
+        del slopes  # as large as the reals, and of no more use
         # Squares and reals are sums of the same terms: scheduled here, they are evaluated in the kernels of the reals.
         dr.schedule(squares)
         reals = self.problem.after_step(reals, iteration)

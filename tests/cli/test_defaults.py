@@ -105,7 +105,7 @@ DEFAULTS = {
     "config.Truth": {"file": "", "procedural": "", "shape": (48, 48, 48), "seed": 0, "peak": 1.0},
     "optim.adam.Adam": {"views": 0, "beta_1": 0.9, "beta_2": 0.999, "epsilon": 1e-06},
     "optim.decoupled_priors.DecoupledPrior": {"weight": 1.0},
-    "optim.decoupled_priors.Smoothness": {"weight": 1.0, "share": 0.125},
+    "optim.decoupled_priors.Smoothness": {"weight": 1.0, "share": 0.125, "every": 1},
     "optim.decoupled_priors.Sparsity": {"weight": 1.0},
     "optim.decoupled_priors.ViewDependence": {"weight": 1.0},
     "optim.events.Checkpoint": {"every": 10},

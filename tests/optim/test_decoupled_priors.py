@@ -9,7 +9,7 @@ import pytest
 from ball_photos import CUBE
 
 from mivol.fields.spherical import SphericalGrid, is_covered
-from mivol.optim.decoupled_priors import Neighbours, Rows, decay_view_dependence, smooth, sparsify
+from mivol.optim.decoupled_priors import Neighbours, Rows, Smoothness, decay_view_dependence, smooth, sparsify
 
 
 def smoothed(values: mi.Float, field: SphericalGrid, amount: float, share: float = 1.0, first: int = 7) -> None:
@@ -81,6 +81,23 @@ def test_smoothing_however_strong_makes_nothing_new(variant_rgb: str) -> None:
         assert before.min() - 1e-6 <= after.min() and after.max() <= before.max() + 1e-6
         assert after[-1] == before[-1]
     assert np.ptp(after) < 0.2 * np.ptp(before)
+
+
+def test_smoothing_every_few_steps_looks_at_all_their_shares(variant_rgb: str) -> None:
+    """A row is moved as far by one look at four shares as by a look at one; between two looks nothing moves."""
+    density = np.random.default_rng(3).normal(size=(4, 4, 8)).astype(np.float32)
+    field = SphericalGrid.from_dense(density, np.zeros((4, 4, 8, 1, 3)), CUBE)
+    around = Neighbours.of(field)
+    often, seldom = Smoothness(share=1 / 8), Smoothness(share=1 / 8, every=4)
+    looks = [Rows(1, around, 0.05, 1.0, first, 8) for first in (7, 23, 39, 55)]
+    moved = np.array(seldom.apply(field.density, looks[0]))
+    shares = [np.array(often.apply(field.density, look)) for look in looks]
+    expected = density.reshape(-1) + sum(share - density.reshape(-1) for share in shares)
+    # Each row is in one share; sums of float32 numbers of order 1.
+    np.testing.assert_allclose(moved, expected, rtol=0, atol=1e-6)
+    assert np.count_nonzero(moved != density.reshape(-1)) > 0.9 * len(moved) / 2
+    resting = Rows(1, around, 0.05, 1.0, 7, 9)
+    np.testing.assert_array_equal(np.array(seldom.apply(field.density, resting)), density.reshape(-1))
 
 
 def test_what_is_covered_is_no_neighbour(variant_rgb: str) -> None:

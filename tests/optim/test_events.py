@@ -12,6 +12,7 @@ from mivol.optim.events import (
     Checkpoint,
     CoarseToFine,
     ControlDensity,
+    DropUnseen,
     Evaluate,
     UpdateOccupancy,
     Upsample,
@@ -72,7 +73,9 @@ def test_events_are_due_when_they_say(variant_rgb) -> None:
     assert [i for i in range(9) if Checkpoint(every=4).due(i)] == [4, 8]
     assert [i for i in range(9) if Evaluate(every=4).due(i)] == [0, 4, 8]
     assert [i for i in range(9) if CoarseToFine(at=(3, 5)).due(i)] == [3, 5]
+    assert [i for i in range(9) if DropUnseen(at=(3, 5)).due(i)] == [3, 5]
     assert [i for i in range(9) if UpdateOccupancy(every=4).due(i)] == [4, 8]
     assert [i for i in range(9) if ControlDensity(every=2, begin=3, end=8).due(i)] == [4, 6]
-    assert set(EVENTS) == {"upsample", "coarse_to_fine", "update_occupancy", "control_density", "checkpoint", "evaluate"}
+    names = {"upsample", "coarse_to_fine", "drop_unseen", "update_occupancy", "control_density", "checkpoint", "evaluate"}
+    assert set(EVENTS) == names
     assert isinstance(in_order((Upsample(at=(1,)), Evaluate(), Checkpoint()))[0], Checkpoint)

@@ -92,6 +92,9 @@ def test_schedules() -> None:
     plan = replace(PLAN, delay=0.1, last=0.01)
     assert (plan.begins, plan.steps) == ((60,), 150)
     assert [event.due(step) for event in plan.course().events[:1] for step in (0, 59, 60, 61)] == [False, False, True, False]
+    assert (plan.drops, replace(plan, drop=0.1).drops, replace(plan, drop=1e-6).drops) == ((), (69,), (61,))
+    dropping = replace(plan, drop=0.1).course().events[1]
+    assert [step for step in range(150) if dropping.due(step)] == [69]
     assert plan.rates(0) == pytest.approx((0.1, 0.05))
     assert plan.rates(150) == pytest.approx((0.1, 0.0005))
     slower = replace(plan, stages=(replace(plan.stages[0], rate=0.25), plan.stages[1]))

@@ -5,10 +5,12 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
 from ball_photos import BOX, PLAN, WHITE, ball, camera, error_of, fitted
+from scipy.ndimage import maximum_filter
 
 from mivol.errors import MivolError
 from mivol.fields.sky import Sky
@@ -71,6 +73,36 @@ def test_a_fit_that_went_on_equals_one_that_did_not_stop(one_thread, photos: lis
     assert all(np.array_equal(kept[name], found[name]) for name in kept)
     assert [row["loss"] for row in resumed.history] == [row["loss"] for row in whole.history]
     assert resumed.log == whole.log
+
+
+def test_unseen_nodes_are_left_out(variant_rgb: str, photos: list[Photo]) -> None:
+    """What is left are the nodes of seen cells and their neighbours, with the values and the squares that they had; Dr.Jit
+    holds nothing back of what was there before."""
+    fit = fitted(RayBatches.of(photos, (1, 2)), replace(PLAN, drop=1 / 9), 70)
+    problem = fit.problem
+    before, squares = problem.field, np.array(fit.run.squares["density"])
+    stored = np.zeros(before.places, bool)
+    stored[before.listed()] = True
+    expected = stored & maximum_filter(problem.seen_nodes()[0], 3).reshape(-1)
+    dropping = fit.course.events[1]
+    assert dropping.due(70)
+    says = dropping.apply(fit)
+    dr.sync_thread()
+    dr.detail.malloc_clear_statistics()
+    held = dr.detail.malloc_watermark(dr.backend_v(mi.Float))
+    dr.flush_malloc_cache()
+    dr.detail.malloc_clear_statistics()
+    # Bytes of single numbers may have come and gone.
+    assert held - dr.detail.malloc_watermark(dr.backend_v(mi.Float)) < 1 << 16
+    after = problem.field
+    np.testing.assert_array_equal(after.listed(), np.flatnonzero(expected))
+    assert says == f"unseen nodes left out: 24 x 24 x 24 nodes, of which {after.rows - 1} are kept"
+    assert 100 < after.rows < 0.9 * before.rows
+    kept = expected[stored]
+    for old, new in zip(before.values(), after.values(), strict=True):
+        np.testing.assert_array_equal(new, old[kept])
+    np.testing.assert_array_equal(np.array(fit.run.squares["density"])[:-1], squares[:-1][kept])
+    fit.advance()
 
 
 def test_the_vacuum_around_a_sparse_field_stays_empty(variant_rgb: str, photos: list[Photo]) -> None:
