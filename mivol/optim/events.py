@@ -56,7 +56,9 @@ def upsample(field: mi.TensorXf, shape: tuple[int, int, int]) -> mi.TensorXf:
     fine = np.asarray(dr.resample(field, (*shape, field.shape[3]), filter="linear"), dtype=np.float64)
     mass = np.asarray(field, dtype=np.float64).mean(axis=(0, 1, 2))
     found = fine.mean(axis=(0, 1, 2))
-    factor = np.divide(mass, found, out=np.ones_like(mass), where=np.abs(found) > 1e-12 * np.abs(fine).max(initial=0.0))
+    # Of each channel by its own values: an albedo may stand beside a density that is 1e15 times as small.
+    largest = np.abs(fine).max(axis=(0, 1, 2), initial=0.0)
+    factor = np.divide(mass, found, out=np.ones_like(mass), where=np.abs(found) > 1e-12 * largest)
     return mi.TensorXf((fine * factor).astype(np.float32))
 
 

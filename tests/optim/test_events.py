@@ -47,6 +47,14 @@ def test_upsampling_conserves_mass(old: tuple[int, ...], new: tuple[int, ...], c
     assert fine.min(initial=0.0) >= 0.0
 
 
+def test_a_channel_that_is_far_smaller_keeps_its_mass_too(variant_rgb) -> None:
+    """Three voxels become one, in which linear interpolation alone leaves more than a third of the last."""
+    field = np.zeros((1, 1, 3, 2), np.float32)
+    field[0, 0, 2] = 1e-16, 1.0
+    fine = np.asarray(upsample(mi.TensorXf(field), (1, 1, 1)), np.float64)
+    np.testing.assert_allclose(fine[0, 0, 0], field[0, 0, 2] / 3, rtol=EPS)
+
+
 def test_no_overshoot(variant_rgb) -> None:
     """A step stays between its levels, but for the factor that restores the mass, which is 1 for a step by symmetry.
 
