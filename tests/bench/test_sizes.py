@@ -35,7 +35,7 @@ FULL = {
             ("chair", 128, 1.0), ("chair", 256, 1.72), ("still_life", 128, 1.0), ("wires", 128, 1.0), ("glossy", 128, 1.0),
         ),
         "photo_folder": Path("runs/photographs"), "walk_side": 1024,
-        "prior_side": 80, "prior_resolution": 32, "prior_steps": 180, "prior_folds": 3,
+        "prior_side": 80, "prior_resolution": 32, "prior_steps": 180, "prior_folds": 5,
     },
     "gradients": {
         "rounds": 8, "side": 64, "budget": Budget(seconds=2.0), "table_rounds": 16, "table_side": 24,
