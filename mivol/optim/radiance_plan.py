@@ -263,8 +263,8 @@ NESTED_FILLED = 0.4
 
 SHELL = 50
 """Nodes of a finer stage that are taken to be kept, before it is known, for each node of a slice of its box: what is seen is a
-shell, so its share of a grid falls as the edge grows (the chair in the box of its silhouettes: 39, 45 and 56 at 64, 128 and 256
-nodes)."""
+shell, so its share of a grid falls as the edge grows (the chair in the box of its silhouettes: 30, 38 and 52 at 64, 128 and 256
+nodes, the last after short stages)."""
 
 INDEX = 6
 """Bytes a node of the box that its index takes while it is made (5.3 measured at 512^3; 1.25 of them stay)."""
