@@ -23,7 +23,18 @@ from mivol.photos import SPLITS, Frame, PhotoSurvey
 from mivol.photos.region import nested, within
 from mivol.report.figures import FAINT, INK, SERIES, STYLE, save
 
-__all__ = ["EDGE", "FAR", "PARTS", "Stage", "Strokes", "parts_of", "plot_cameras", "plot_stage", "pyramid", "rectangle"]
+__all__ = [
+    "EDGE",
+    "FAR",
+    "PARTS",
+    "Arrangement",
+    "Strokes",
+    "parts_of",
+    "plot_arrangement",
+    "plot_cameras",
+    "pyramid",
+    "rectangle",
+]
 
 EDGE = 0.12
 """Length of a drawn field of view, as a share of the median distance from the middle of the box."""
@@ -51,7 +62,7 @@ class Strokes(NamedTuple):
     edges: NDArray
 
 
-class Stage(NamedTuple):
+class Arrangement(NamedTuple):
     """What is drawn.
 
     Attributes:
@@ -83,7 +94,7 @@ class Stage(NamedTuple):
 
 def parts_of(survey: PhotoSurvey) -> tuple[str, ...]:
     """The parts of the picture of a data set."""
-    return stage_of(survey).parts
+    return arrangement_of(survey).parts
 
 
 def plot_cameras(survey: PhotoSurvey, path: str | Path | None = None, part: str | None = None) -> Figure:
@@ -98,10 +109,10 @@ def plot_cameras(survey: PhotoSurvey, path: str | Path | None = None, part: str 
         MivolError: another suffix.
     """
     boxes = "the box" if survey.levels == 1 else f"{survey.levels} nested boxes"
-    return plot_stage(stage_of(survey), f"{survey.path.name}: {len(survey.frames)} cameras and {boxes}", path, part)
+    return plot_arrangement(arrangement_of(survey), f"{survey.path.name}: {len(survey.frames)} cameras and {boxes}", path, part)
 
 
-def stage_of(survey: PhotoSurvey) -> Stage:
+def arrangement_of(survey: PhotoSurvey) -> Arrangement:
     """The cameras of a data set about their box, a colour a split."""
     middle = survey.box.mean(axis=0)
     length = EDGE * float(np.median([np.linalg.norm(f.camera.origin - middle) for f in survey.frames]))
@@ -110,14 +121,14 @@ def stage_of(survey: PhotoSurvey) -> Stage:
         Strokes(split, _colour(split), np.concatenate([outline(f, length) for f in of]))
         for split, of in _by_split(survey).items()
     ]
-    return Stage(strokes, survey.box, _points(survey), up, survey.levels)
+    return Arrangement(strokes, survey.box, _points(survey), up, survey.levels)
 
 
-def plot_stage(stage: Stage, title: str, path: str | Path | None = None, part: str | None = None) -> Figure:
-    """A stage from the side and from above.
+def plot_arrangement(arranged: Arrangement, title: str, path: str | Path | None = None, part: str | None = None) -> Figure:
+    """An arrangement from the side and from above.
 
     Args:
-        stage: what is drawn.
+        arranged: what is drawn.
         title: of a figure of all parts.
         path: written there (.svg, .png) if given.
         part: one of PARTS, or FAR, alone; None: all that it takes in one figure.
@@ -126,15 +137,16 @@ def plot_stage(stage: Stage, title: str, path: str | Path | None = None, part: s
         MivolError: another suffix.
     """
     with mpl.rc_context(STYLE):
-        parts = stage.parts if part is None else (part,)
+        parts = arranged.parts if part is None else (part,)
         figure = Figure(figsize=(WIDTH * len(parts), WIDTH))
         FigureCanvasAgg(figure)
         figure.get_layout_engine().set(wspace=0.1)
         for number, name in enumerate(parts, 1):
             if name == "side":
-                _draw_side(figure.add_subplot(1, len(parts), number, projection="3d", computed_zorder=False), stage)
+                _draw_side(figure.add_subplot(1, len(parts), number, projection="3d", computed_zorder=False), arranged)
             else:
-                _draw_plan(figure.add_subplot(1, len(parts), number), stage, stage.levels if name == FAR else stage.near)
+                levels = arranged.levels if name == FAR else arranged.near
+                _draw_plan(figure.add_subplot(1, len(parts), number), arranged, levels)
         if part in ("plan", FAR):
             figure.legend(loc="outside lower left", ncols=2)
         if part is None:
@@ -193,15 +205,15 @@ def _points(survey: PhotoSurvey) -> NDArray:
     return points[:: max(1, len(points) // MOST_POINTS)]
 
 
-def _draw_side(axes: Axes, stage: Stage) -> None:
-    order, boxes = _order(stage.up), nested(stage.box, stage.near)
-    for strokes in stage.strokes:
+def _draw_side(axes: Axes, arranged: Arrangement) -> None:
+    order, boxes = _order(arranged.up), nested(arranged.box, arranged.near)
+    for strokes in arranged.strokes:
         axes.plot(*_pen(strokes.edges)[order], color=strokes.colour, linewidth=0.7, alpha=0.8)
     for number, box in enumerate(boxes):
         axes.plot(*_pen(box_edges(box))[order], **_line_of(number))
-    everything = np.concatenate([*(strokes.edges.reshape(-1, 3) for strokes in stage.strokes), boxes[-1]])
+    everything = np.concatenate([*(strokes.edges.reshape(-1, 3) for strokes in arranged.strokes), boxes[-1]])
     # Of three dimensions matplotlib cuts nothing off at the frame.
-    points = within(stage.points, np.array([everything.min(axis=0), everything.max(axis=0)]))
+    points = within(arranged.points, np.array([everything.min(axis=0), everything.max(axis=0)]))
     axes.scatter(*points[:, order].T, s=0.3, color=FAINT, linewidths=0)
     everything = everything[:, order]
     low, high = everything.min(axis=0), everything.max(axis=0)
@@ -213,20 +225,20 @@ def _draw_side(axes: Axes, stage: Stage) -> None:
     axes.view_init(22, -60)
 
 
-def _draw_plan(axes: Axes, stage: Stage, levels: int) -> None:
+def _draw_plan(axes: Axes, arranged: Arrangement, levels: int) -> None:
     """From above, with so many of the boxes."""
-    first, second, up = _order(stage.up)
-    for strokes in stage.strokes:
+    first, second, up = _order(arranged.up)
+    for strokes in arranged.strokes:
         pen = _pen(strokes.edges)[[first, second]]
         axes.plot(*pen, color=strokes.colour, linewidth=0.7, alpha=0.8, label=strokes.label)
-    boxes = nested(stage.box, levels)
+    boxes = nested(arranged.box, levels)
     for number, box in enumerate(boxes):
         label = ("box" if levels == 1 else "innermost box") if number == 0 else "larger boxes" if number == 1 else None
         axes.plot(*_pen(box_edges(box))[[first, second]], **_line_of(number), label=label)
-    shown = within(stage.points, boxes[-1])[:, [first, second]]
+    shown = within(arranged.points, boxes[-1])[:, [first, second]]
     axes.scatter(*shown.T, s=0.3, color=FAINT, linewidths=0)
     axes.set_aspect("equal", adjustable="datalim")
-    what = "from above" if levels == stage.near else "all boxes from above"
+    what = "from above" if levels == arranged.near else "all boxes from above"
     axes.set(title=f"{what} ({'xyz'[up]} is up)", xlabel=f"{'xyz'[first]} [length]", ylabel=f"{'xyz'[second]} [length]")
 
 

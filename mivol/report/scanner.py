@@ -14,7 +14,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from mivol.report.cameras import EDGE, Stage, Strokes, plot_stage, pyramid, rectangle
+from mivol.report.cameras import EDGE, Arrangement, Strokes, plot_arrangement, pyramid, rectangle
 from mivol.report.figures import FAINT, SERIES
 from mivol.tomography.geometry import FlatDetector, VoxelGrid
 
@@ -70,7 +70,8 @@ def plot_scanner(
     ]
     up = int(np.argmax(np.abs(geometry.panels().along_v.mean(axis=0))))
     box = np.asarray(grid.centre) + np.outer([-0.5, 0.5], grid.extent)
-    return plot_stage(Stage(strokes, box, np.empty((0, 3)), up), f"{count} views and the box of the voxels", path, part)
+    arranged = Arrangement(strokes, box, np.empty((0, 3)), up)
+    return plot_arrangement(arranged, f"{count} views and the box of the voxels", path, part)
 
 
 def shown_views(count: int, held_out: NDArray) -> tuple[NDArray, NDArray]:
