@@ -32,7 +32,7 @@ FULL = {
         "resolution": 128, "side": 256, "rounds": 3, "steps": 105, "chair_steps": 800, "fit_resolution": 128, "fit_side": 256,
         "fields": ("shell", "fog", "fitted"), "photo_views": 75, "photo_side": 200, "photo_spp": 32,
         "photo_fits": (
-            ("chair", 128, 1.0), ("chair", 256, 1.72), ("still_life", 128, 1.0), ("wires", 128, 1.0), ("glossy", 128, 1.0),
+            ("chair", 128, 1.0), ("chair", 256, 1.9), ("still_life", 128, 1.0), ("wires", 128, 1.0), ("glossy", 128, 1.0),
         ),
         "photo_folder": Path("runs/photographs"), "walk_side": 1024,
         "prior_side": 80, "prior_resolution": 32, "prior_steps": 180, "prior_folds": 5,

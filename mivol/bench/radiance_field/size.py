@@ -44,7 +44,7 @@ class Size:
     fields: tuple[str, ...] = ("shell", "fog", "fitted")
     photo_fits: tuple[tuple[str, int, float], ...] = (
         ("chair", 128, 1.0),
-        ("chair", 256, 1.72),
+        ("chair", 256, 1.9),
         ("still_life", 128, 1.0),
         ("wires", 128, 1.0),
         ("glossy", 128, 1.0),
