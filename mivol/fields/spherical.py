@@ -38,7 +38,6 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mivol.device_arrays import aligned
 from mivol.errors import MivolError
 from mivol.fields.activation import Activation, activation_of
 from mivol.fields.listed_places import ListedPlaces
@@ -49,7 +48,6 @@ from mivol.space import check_affine, lattice_from_world
 __all__ = [
     "MAX_DEGREE",
     "SPACES",
-    "Pinholes",
     "SphericalGrid",
     "basis_size",
     "degree_of",
@@ -100,19 +98,6 @@ def is_covered(node: mi.UInt32, res: tuple[int, int, int]) -> mi.Bool:
         # The next node on either side is at most n / 4 from the middle (n - 1) / 2, where the inner box ends.
         inside &= 2 * dr.abs(2 * mi.Int32(place) - (n - 1)) <= n - 4
     return inside
-
-
-@dataclass
-class Pinholes:
-    """Points from which a field is seen.
-
-    Attributes:
-        starts: the way from each of them to the middle of the field's boxes, in the field's own frame, x y z [length]; and a 0.
-        count: how many there are.
-    """
-
-    starts: mi.Float
-    count: int
 
 
 @briefly
@@ -402,18 +387,14 @@ class SphericalGrid:
         """The basis for unit directions of travel in the world."""
         return dr.sh_eval(self.turn(d), self.degree)
 
-    def pinholes(self, points: np.ndarray) -> Pinholes:
-        """World points (V, 3) from which the field is seen."""
-        # A difference in float64.
-        start = (self.own_frame() @ (self.middle - np.asarray(points, np.float64)).T).T
-        return Pinholes(mi.Float(aligned(np.append(np.float32(start).reshape(-1), np.float32(0)))), len(points))
-
-    def viewer(self, points: Pinholes) -> Callable[[mi.UInt32, mi.UInt32], list[mi.Float]]:
-        """The basis for directions from points to nodes: a function of flat node numbers and of which point."""
+    def viewer(self, points: np.ndarray) -> Callable[[mi.UInt32, mi.UInt32], list[mi.Float]]:
+        """The basis for directions from world points (V, 3) to nodes: a function of flat node numbers and of which point."""
         z, y, x = self.res
         frame, per_level = self.own_frame(), math.prod(self.res)
         linear = frame @ self.to_world[:3, :3] / np.array([x, y, z], np.float64)
-        starts = points.starts
+        # The middle of the boxes in the own frame, less the point: a difference in float64.
+        start = (frame @ (self.middle - np.asarray(points, np.float64)).T).T
+        starts = mi.Float(np.append(np.float32(start).reshape(-1), np.float32(0)))
         rows = [[dr.opaque(mi.Float, float(v)) for v in row] for row in linear]
 
         def basis(node: mi.UInt32, view: mi.UInt32) -> list[mi.Float]:

@@ -35,9 +35,9 @@ from mivol.optim.exposure import AGREE, RATE, Exposure
 from mivol.optim.problem import Reals, Refinement
 from mivol.optim.radiance_plan import FitPlan, place_grid
 from mivol.optim.ray_batches import RayBatch, RayBatches
-from mivol.optim.recorded_walks import RecordedWalks
 from mivol.optim.sightings import Sightings, by_transmittance, draw_sightings
 from mivol.transport.line_integrals.radiance_field import (
+    Model,
     RayGradient,
     backward,
     brightest_weights,
@@ -45,7 +45,7 @@ from mivol.transport.line_integrals.radiance_field import (
     model_of,
     render,
 )
-from mivol.transport.line_integrals.radiance_source import bake, fold, table_of
+from mivol.transport.line_integrals.radiance_source import Baked, bake, fold
 from mivol.transport.traversal.occupied_cells import Cells
 
 
@@ -174,8 +174,9 @@ class RadianceProblem:
             background: put behind all photographs (3,); None: each has its own.
             sightings: points of the same views; the plan's weight times their energy is in the derivatives only.
         """
-        walks, count = self._walks_of(batch), dr.width(batch.slot)
-        table, seen = walks.there(self.field, batch)
+        source = bake(self.field, self._cells, batch.origins, batch.slot, slope=True)
+        model, count = model_of(self.field, self.plan.stop), dr.width(batch.slot)
+        seen = render(self._cells, source, model, batch.rays)
         before = batch.before
         behind = before if background is None else mi.Color3f(*(dr.opaque(mi.Float, float(c)) for c in background))
         behind = behind if self.sky is None else self.sky.seen(batch.rays.d)
@@ -193,10 +194,12 @@ class RadianceProblem:
             T = dr.clip(seen.T, 0.01, 0.99)
             through += self.plan.beta / count * batch.counted * (dr.rcp(T) - dr.rcp(1 - T))
         loss = dr.squared_norm(error) * (1 / 3)
-        dr.eval(by, through, loss)
-        density, harmonics = walks.back(self.field, batch, table, seen, RayGradient(by, through))
+        dr.eval(seen, by, through, loss)
+        backward(self._cells, source, model, seen, RayGradient(by, through), near=self.near)
         if sightings is not None:
-            density += self._slopes_of(sightings, table, batch.origins)
+            self._add_sightings(source, model, sightings)
+        dr.eval(source.slope)
+        density, harmonics = fold(self.field, self._cells, source, batch.origins)
         slopes = {"density": self._stored(density), "harmonics": self._stored(harmonics)}
         if self.sky is not None:
             slopes["sky"] = self.sky.slopes(batch.rays.d, by * seen.T)
@@ -205,29 +208,14 @@ class RadianceProblem:
             slopes["exposure"] = self.exposure.slopes(batch.view, by_log)
         return loss, slopes
 
-    def _slopes_of(self, sightings: Sightings, table: mi.Float, origins: np.ndarray) -> mi.Float:
-        """Derivatives of the energy of points by the densities of the field.
-
-        Args:
-            sightings: the points.
-            table: what pinholes see of each node; densities are the same in the table of any of them.
-            origins: (V, 3) of the pinholes.
-        """
-        source, model = table_of(self._cells, table, mi.UInt32(0), slope=True), model_of(self.field, self.plan.stop)
+    def _add_sightings(self, source: Baked, model: Model, sightings: Sightings) -> None:
+        """Add the derivatives of the energy of points to those of the field."""
+        # Densities are the same in the table of any pinhole.
+        source = dataclasses.replace(source, first=mi.UInt32(0))
         seen = render(self._cells, source, model, sightings.rays)
         by = RayGradient(mi.Color3f(0), self.plan.depth * by_transmittance(seen.T, sightings.count))
         dr.eval(seen, by)
         backward(self._cells, source, model, seen, by, near=self.near)
-        dr.eval(source.slope)
-        return fold(self.field, self._cells, source, origins[:1])[0]
-
-    def _walks_of(self, batch: RayBatch) -> RecordedWalks:
-        """The walks of such a batch, recorded anew where there are other cells or numbers."""
-        if self._walks is None or not self._walks.suits(batch):
-            model = model_of(self.field, self.plan.stop)
-            counts = len(batch.origins), dr.width(batch.slot)
-            self._walks = RecordedWalks(self.field, self._cells, model, self.near, *counts)
-        return self._walks
 
     def _stored(self, slope: mi.Float) -> mi.Float:
         """Derivatives of the nodes that are stored: the last row of a sparse field is the vacuum around, and stays."""
@@ -320,7 +308,7 @@ class RadianceProblem:
 
     def update_occupancy(self) -> None:
         """List the cells that hold anything: the others have neither light nor derivatives."""
-        self._cells, self._walks = cells_of(self.field), None
+        self._cells = cells_of(self.field)
 
     def _look_around(self) -> None:
         self._neighbours = Neighbours.of(self.field)

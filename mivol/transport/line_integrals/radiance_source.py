@@ -19,10 +19,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mivol.fields.spherical import Pinholes, SphericalGrid, row_width
+from mivol.fields.spherical import SphericalGrid, row_width
 from mivol.transport.traversal.occupied_cells import Cells
 
-__all__ = ["Baked", "Colours", "Exact", "Source", "bake", "exact", "fold", "table_of"]
+__all__ = ["Baked", "Colours", "Exact", "Source", "bake", "exact", "fold"]
 
 
 Colours = list
@@ -122,13 +122,13 @@ def _add_packet(target: mi.Float, values: Sequence[mi.Float], row: mi.UInt32, on
     dr.scatter_add(target, value, row, on, mode=mode)
 
 
-def bake(field: SphericalGrid, cells: Cells, points: np.ndarray | Pinholes, view: mi.UInt32, slope: bool = False) -> Baked:
+def bake(field: SphericalGrid, cells: Cells, points: np.ndarray, view: mi.UInt32, slope: bool = False) -> Baked:
     """Sum the harmonics of each node in the directions from pinholes.
 
     Args:
         field: the radiance field.
         cells: its occupied cells; other nodes are left out.
-        points: the pinholes, (V, 3) in the world or as the field has them.
+        points: (V, 3) world, the pinholes.
         view: the index of each ray's pinhole.
         slope: whether derivatives will be computed.
 
@@ -136,26 +136,17 @@ def bake(field: SphericalGrid, cells: Cells, points: np.ndarray | Pinholes, view
         with their trilinear weights, are that of the ray to first order.
     Cost: the field is read once, and 4 numbers a node and pinhole are written.
     """
-    points = _pinholes(field, points)
-    table = dr.zeros(mi.Float, 4 * dr.width(cells.rows) * points.count)
+    table = dr.zeros(mi.Float, 4 * dr.width(cells.rows) * len(points))
     _bake(field, cells.rows, table, points)
-    return table_of(cells, table, view, slope)
-
-
-def table_of(cells: Cells, table: mi.Float, view: mi.UInt32, slope: bool) -> Baked:
-    """What :func:`bake` has filled, for rays of the pinholes ``view``; ``slope``: with room for derivatives, which are 0."""
-    return Baked(table, view * _count(cells.rows), dr.zeros(mi.Float, _roomy(dr.width(table))) if slope else None)
-
-
-def _pinholes(field: SphericalGrid, points: np.ndarray | Pinholes) -> Pinholes:
-    return points if isinstance(points, Pinholes) else field.pinholes(points)
+    first = view * _count(cells.rows)
+    return Baked(table, first, dr.zeros(mi.Float, _roomy(dr.width(table))) if slope else None)
 
 
 @dr.syntax
-def _bake(field: SphericalGrid, rows: mi.UInt32, table: mi.Float, points: Pinholes) -> None:
+def _bake(field: SphericalGrid, rows: mi.UInt32, table: mi.Float, points: np.ndarray) -> None:
     """Fill the blocks of a table, in a loop, so that the field is read once and one kernel serves any number of pinholes."""
     number, node, seen_from = dr.arange(mi.UInt32, dr.width(rows)), _node(field, rows), field.viewer(points)
-    pinholes, count = dr.opaque(mi.UInt32, points.count), _count(rows)
+    pinholes, count = dr.opaque(mi.UInt32, len(points)), _count(rows)
     raw = dr.gather(mi.Float, field.density, rows)
     values = dr.gather(mi.ArrayXf, field.harmonics, rows, shape=(field.width, 1))
     v = mi.UInt32(0)
@@ -183,23 +174,23 @@ def _node(field: SphericalGrid, row: mi.UInt32) -> mi.UInt32:
     return row if field.nodes is None else dr.gather(mi.UInt32, field.nodes, row, row < field.rows - 1)
 
 
-def fold(field: SphericalGrid, cells: Cells, baked: Baked, points: np.ndarray | Pinholes) -> tuple[mi.Float, mi.Float]:
+def fold(field: SphericalGrid, cells: Cells, baked: Baked, points: np.ndarray) -> tuple[mi.Float, mi.Float]:
     """Derivatives with respect to the rows of a field, from those with respect to its baked table: the transpose of
     :func:`bake`.
 
     Returns:
         Those of ``density`` and of ``harmonics``.
     """
-    return _over_pinholes(field, cells.rows, baked.slope, _pinholes(field, points))
+    return _over_pinholes(field, cells.rows, baked.slope, points)
 
 
 @dr.syntax
-def _over_pinholes(field: SphericalGrid, rows: mi.UInt32, nodes: mi.Float, points: Pinholes) -> tuple[mi.Float, mi.Float]:
+def _over_pinholes(field: SphericalGrid, rows: mi.UInt32, nodes: mi.Float, points: np.ndarray) -> tuple[mi.Float, mi.Float]:
     """Sum the derivatives of all pinholes, in a loop, so that one kernel serves any number of them."""
     number = dr.arange(mi.UInt32, dr.width(rows))
     node = _node(field, rows)
     seen_from = field.viewer(points)
-    pinholes, count, width = dr.opaque(mi.UInt32, points.count), _count(rows), field.width
+    pinholes, count, width = dr.opaque(mi.UInt32, len(points)), _count(rows), field.width
     packet = mi.ArrayXf([mi.Float(0)] * 4)
     raw = dr.zeros(mi.Float, dr.width(rows))
     harmonics = [dr.zeros(mi.Float, dr.width(rows)) for _ in range(width)]
