@@ -75,8 +75,8 @@ def suited(plan: FitPlan, photos: Photos) -> FitPlan:
         halvings = min(round(np.log2(edge / longest / (VOXEL * pixel))), int(np.log2(least / SMALLEST)))
         return replace(stage, longest=longest, shrink=2 ** max(halvings, 0))
 
-    if plan.few_degree is not None and len(photos.views) < FEW:
-        plan = replace(plan, degree=plan.few_degree)
+    if len(photos.views) < FEW:
+        plan = replace(plan, tv_every=1, degree=plan.degree if plan.few_degree is None else plan.few_degree)
     points = photos.survey.points
     if plan.fewer_levels and points is not None and len(points) >= FEWEST_POINTS:
         plan = replace(plan, levels=levels_holding(box, points, plan.levels))

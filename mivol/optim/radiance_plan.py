@@ -68,7 +68,8 @@ class FitPlan:
         tv_density, tv_sh: total variation of the density and of the coefficients, in photographs: how many of them, all asking
             for the same, it takes to hold against it. With V photographs a step goes this / V of a learning rate.
         tv_share: share of the rows that total variation looks at, a step.
-        tv_every: steps from one look to the next, which takes the shares of all between.
+        tv_every: steps from one look to the next, which takes the shares of all between: 1 where there are fewer than ``FEW``
+            photographs, for a look moves values by this / V times the weight in learning rates, and must stay below one.
         sparsity: Cauchy prior on the density, in photographs.
         matte: coefficients beyond the constant fall by this / V times their learning rate a step [1 / radiance]: what few
             photographs say about directions is soon more than there is.
@@ -107,7 +108,7 @@ class FitPlan:
     tv_density: float = 0.1
     tv_sh: float = 1.0
     tv_share: float = 1 / 16
-    tv_every: int = 4
+    tv_every: int = 1
     sparsity: float = 0.0
     matte: float = 12.0
     depth: float = 0.0
@@ -205,6 +206,7 @@ PRESETS: dict[str, FitPlan] = {
         ),
         density_rate=60.0,
         sh_rate=0.1,
+        tv_every=4,
         drop=1 / 4,
     ),
     "capture": FitPlan(

@@ -23,7 +23,7 @@ from mivol.fields.spherical_files import load_field
 from mivol.files import read_exr, write_exr, write_png
 from mivol.optim.field_view import render_view
 from mivol.optim.problem import Reals
-from mivol.optim.radiance_plan import PRESETS, FitPlan, Stage, stretched
+from mivol.optim.radiance_plan import FEW, PRESETS, FitPlan, Stage, stretched
 from mivol.optim.radiance_problem import RadianceProblem
 from mivol.photos import Camera, intrinsics
 from mivol.photos.camera_path import facing
@@ -281,6 +281,17 @@ def test_a_long_box_has_as_many_nodes_as_a_cube(photographs: Path, tmp_path: Pat
     assert photo_plan.suited(photo_plan.suited(plan, long), long) == photo_plan.suited(plan, long)
     assert [stage.longest for stage in photo_plan.suited(replace(plan, cubic=False), long).stages] == [4, 8, 40]
     assert not photo_plan.make_plan(config.load(toml(tmp_path, photographs), ["field.longest=26"])).cubic
+
+
+def test_few_photographs_are_smoothed_each_step(photographs: Path, tmp_path: Path) -> None:
+    """Many are looked at every fourth step, where one move would be several learning rates of a few."""
+    chosen = config.load(toml(tmp_path, photographs), ["field.preset=cpu"])
+    photos, _ = photo_data.read_photos(chosen, tmp_path)
+    plan = photo_plan.make_plan(chosen)
+    assert plan.tv_every == 4 and len(photos.views) < FEW
+    assert photo_plan.suited(plan, photos).tv_every == 1
+    many = replace(photos, views=photos.views * (FEW // len(photos.views) + 1))
+    assert photo_plan.suited(plan, many).tv_every == 4
 
 
 def test_nested_boxes_are_those_that_points_need(photographs: Path, tmp_path: Path) -> None:
