@@ -77,10 +77,16 @@ def suited(plan: FitPlan, photos: Photos) -> FitPlan:
 
     if len(photos.views) < FEW:
         plan = replace(plan, tv_every=1, degree=plan.degree if plan.few_degree is None else plan.few_degree)
-    points = photos.survey.points
-    if plan.fewer_levels and points is not None and len(points) >= FEWEST_POINTS:
-        plan = replace(plan, levels=levels_holding(box, points, plan.levels))
+    plan = with_levels_needed(plan, photos)
     return replace(plan, stages=tuple(suited_stage(stage) for stage in plan.stages), cubic=False)
+
+
+def with_levels_needed(plan: FitPlan, photos: Photos) -> FitPlan:
+    """The plan with no more nested boxes than the points of a reconstruction need, where there are enough of these."""
+    points = photos.survey.points
+    if not plan.fewer_levels or points is None or len(points) < FEWEST_POINTS:
+        return plan
+    return replace(plan, levels=levels_holding(photos.box, points, plan.levels))
 
 
 def choices(plan: FitPlan, photos: Photos, batches: RayBatches) -> list[PlanLine]:
@@ -89,7 +95,8 @@ def choices(plan: FitPlan, photos: Photos, batches: RayBatches) -> list[PlanLine
     resolutions = ", ".join(str(stage.longest) for stage in plan.stages)
     width, height = photos.views[0].camera.size
     size = " x ".join(f"{edge:.4g}" for edge in box[1] - box[0])
-    outer = " x ".join(f"{edge * 2 ** (plan.levels - 1):.4g}" for edge in box[1] - box[0])
+    largest = nested(box, plan.levels)[-1]
+    outer = " x ".join(f"{edge:.4g}" for edge in largest[1] - largest[0])
     nested_boxes = [
         PlanLine(
             choice=f"{plan.levels} nested boxes, the largest of {outer} [length]",

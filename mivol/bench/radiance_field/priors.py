@@ -14,12 +14,12 @@ from mivol.bench.extinctions import DATA
 from mivol.bench.radiance_field.fits import held_out_psnr
 from mivol.bench.radiance_field.reconstruction import write_room
 from mivol.bench.radiance_field.size import Size
+from mivol.experiments.photo_plan import with_levels_needed
 from mivol.optim.field_view import render_view
 from mivol.optim.radiance_fit import begin_radiance_fit, newest_field
 from mivol.optim.radiance_plan import PRESETS, FitPlan, Stage
 from mivol.optim.ray_batches import RayBatches
 from mivol.photos import Photo, Photos, load_photos, rectified
-from mivol.photos.region import levels_holding
 
 __all__ = ["WITHOUT", "ask_priors", "captures", "gain_of", "plan_of"]
 
@@ -56,14 +56,6 @@ def captures(size: Size) -> dict[str, Photos]:
     return found
 
 
-def suited_to(plan: FitPlan, loaded: Photos) -> FitPlan:
-    """The plan with as many nested boxes as the points of a reconstruction need, as a fit has them."""
-    points = loaded.survey.points
-    if points is None:
-        return plan
-    return replace(plan, levels=levels_holding(loaded.box, points, plan.levels))
-
-
 def judge_plan(plan: FitPlan, photos: Sequence[Photo], box: np.ndarray, fold: int) -> float:
     """Mean PSNR [dB] of the photographs of a fold, of a fit to all others; the fold is the seed too."""
     kept = [photo for k, photo in enumerate(photos) if k % FOLDS != fold]
@@ -84,7 +76,7 @@ def ask_priors(size: Size) -> dict:
     """How much worse is the preset for captures without each of its priors?"""
     answer = {}
     for name, loaded in captures(size).items():
-        plan = suited_to(plan_of(size), loaded)
+        plan = with_levels_needed(plan_of(size), loaded)
         photos, box = [rectified(photo) for photo in loaded.views], loaded.box
         folds = range(size.prior_folds)
         whole = [judge_plan(plan, photos, box, fold) for fold in folds]
