@@ -37,7 +37,7 @@ from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.traversal.fine_ray import FineRay
 from mivol.transport.traversal.random_numbers import seed_pcg32
 
-__all__ = ["DirectLight", "DirectLighting", "DirectSample"]
+__all__ = ["DirectLight", "DirectLighting", "DirectSample", "DistantAim", "EmitterAim"]
 
 
 @dataclass
@@ -76,6 +76,42 @@ class EmitterAim:
     has_alternative: mi.Bool | bool
 
 
+@dataclass
+class DistantAim:
+    """A direction that was sampled towards an emitter at infinity: it is the same from every point.
+
+    Attributes:
+        d: the direction; 0 where the emitter has no light to sample.
+        dist: beyond all of the scene [length].
+        pdf: its density [1/sr].
+        delta: whether that is a delta function.
+        weight: radiance over ``pdf``.
+        emitter: the emitter.
+        u: the random numbers of the direction.
+    """
+
+    d: mi.Vector3f
+    dist: mi.Float
+    pdf: mi.Float
+    delta: mi.Bool
+    weight: mi.Spectrum
+    emitter: mi.EmitterPtr
+    u: mi.Point2f
+
+    @classmethod
+    def of(cls, aim: EmitterAim) -> DistantAim:
+        """What is the same from every point."""
+        direct = aim.direct
+        return cls(direct.d, direct.dist, direct.pdf, direct.delta, aim.weight, aim.emitter, aim.u)
+
+    def seen_from(self, it: mi.Interaction3f) -> EmitterAim:
+        """The sample of a point."""
+        direct = dr.zeros(mi.DirectionSample3f, dr.width(self.d))
+        direct.p, direct.n, direct.d, direct.dist = mi.Point3f(it.p) + self.dist * self.d, -self.d, self.d, self.dist
+        direct.pdf, direct.delta, direct.emitter, direct.time = self.pdf, self.delta, self.emitter, it.time
+        return EmitterAim(direct, self.weight, self.emitter, self.u, 1, True)
+
+
 class DirectLighting:
     """The estimator of direct lighting at surfaces and in media.
 
@@ -91,14 +127,19 @@ class DirectLighting:
         """The emitters of the scene, read when media first scatter their light; at surfaces Mitsuba chooses the emitter."""
         return SceneEmitters(self.media.scene)
 
+    def aim(self, it: mi.Interaction3f, u: mi.Point2f, active: mi.Bool) -> EmitterAim:
+        """Sample a direction towards an emitter from a point, by two numbers in [0, 1)."""
+        direct, weight = self.media.scene.sample_emitter_direction(it, u, False, active)
+        return EmitterAim(direct, weight, direct.emitter, u, 1, True)
+
     def at_vertex(
-        self, vertex: Vertex, u: mi.Point2f, attached: bool, active: mi.Bool, chance: mi.Float | None = None
+        self, vertex: Vertex, aim: EmitterAim, attached: bool, active: mi.Bool, chance: mi.Float | None = None
     ) -> DirectSample:
         """Estimate direct light at a vertex of a path by one emitter sample; the path's next segment is the other sample.
 
         Args:
             vertex: the point.
-            u: two numbers in [0, 1).
+            aim: the emitter sample.
             attached: keep the derivatives of BSDF or phase function, and emitter.
             active: lanes to estimate.
             chance: a number in [0, 1) that estimates the shadow; None for an exact one.
@@ -106,8 +147,6 @@ class DirectLighting:
         Bias: none. Variance: that of one emitter sample. Cost: one shadow ray.
         """
         rng = None if chance is None else seed_pcg32(chance, dr.width(active))
-        direct, weight = self.media.scene.sample_emitter_direction(vertex.interaction, u, False, active)
-        aim = EmitterAim(direct, weight, direct.emitter, u, 1, True)
         return self._emitter_sample(vertex, aim, attached, active, rng)
 
     def in_medium(
@@ -168,6 +207,9 @@ class DirectLighting:
                 moved = follow_emitter(aim.emitter, it, aim.u, direct, on)
                 source = aim.emitter.eval_direction(it, moved, on) / direct.pdf
                 source = source * shadow_of_moving(self.media, ray_segment, tau, moved.p, on)
+                if not dr.grad_enabled(source, moved):
+                    # What was computed for derivatives only is dropped from the kernel: emitters are looked at once.
+                    source, moved = aim.weight, direct
             # Where the density is 0 the source is infinite; the lanes are not active, but 0 * inf in their derivative would be
             # NaN.
             value = dr.select(on, dim * vertex.eval(moved.d, on) * dr.select(direct.pdf > 0, source, 0), 0)

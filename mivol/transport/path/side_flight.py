@@ -25,7 +25,7 @@ import mitsuba as mi
 from mivol.phase.hg import eval_hg, sample_hg
 from mivol.phase.turn import direction_after, turn_between
 from mivol.transport.estimators.contribution import Factor, TrackedTerm
-from mivol.transport.estimators.direct_lighting import DirectLight
+from mivol.transport.estimators.direct_lighting import DirectLight, DistantAim
 from mivol.transport.estimators.segment import PICTURE, Collision, PathSegment
 from mivol.transport.estimators.vertex import MediumVertex
 from mivol.transport.path.estimators import Estimators
@@ -39,26 +39,18 @@ class Aim:
     """The emitter sample that the next vertex takes.
 
     Attributes:
-        u: its random numbers.
-        weight: of the direct light there.
-        on: lanes that have one; the others draw their own, of weight 1.
+        sample: it.
+        weight: of the direct light there, in a medium.
     """
 
-    u: mi.Point2f
+    sample: DistantAim
     weight: mi.Float
-    on: mi.Bool
-
-    @classmethod
-    def none(cls, width: int) -> Aim:
-        """No aim yet."""
-        return cls(dr.zeros(mi.Point2f, width), dr.full(mi.Float, 1, width), dr.full(mi.Bool, False, width))
 
 
 @dataclass
 class SideSamples:
-    """The random numbers of a side flight: of the emitter, of the lobe, and of the flight."""
+    """The random numbers of a side flight: of the lobe, of the flight, and of the shadow at its end."""
 
-    emitter: mi.Point2f
     lobe: mi.Point2f
     flight: tuple[mi.Float, mi.Float]
     chance: mi.Float | None
@@ -92,20 +84,24 @@ class SideFlight:
     """A side flight.
 
     Attributes:
-        to_emitter: the direction of the emitter sample that the next vertex takes too.
         light: that it finds.
         shadow: the shadow ray at its end.
         chance: for derivatives, a number in [0, 1) by which one of a path's shadow rays is kept; None for pictures.
     """
 
-    to_emitter: mi.Vector3f
     light: SideLight
     shadow: DirectLight
     chance: mi.Float | None
 
 
 def fly_aside(
-    estimators: Estimators, collision: Collision, beta: mi.Spectrum, samples: SideSamples, purpose: str, active: mi.Bool
+    estimators: Estimators,
+    collision: Collision,
+    beta: mi.Spectrum,
+    aim: DistantAim,
+    samples: SideSamples,
+    purpose: str,
+    active: mi.Bool,
 ) -> SideFlight:
     """Estimate the light that scatters twice by a side flight.
 
@@ -113,6 +109,7 @@ def fly_aside(
         estimators: of the render; their ``lobe`` is the mean cosine of the lobe.
         collision: the vertex that the flight leaves.
         beta: throughput to there.
+        aim: the emitter sample, which the next vertex takes too.
         samples: random numbers.
         purpose: PICTURE, or that of derivatives, which keeps the values attached.
         active: lanes whose path may scatter here and once more.
@@ -123,7 +120,7 @@ def fly_aside(
     Cost: one flight and one shadow ray.
     """
     media, mei, attached = estimators.media, collision.mei, purpose != PICTURE
-    w = _direction_to_emitter(estimators, mei, samples.emitter, active)
+    w = _direction_to_emitter(aim)
     wo = direction_after(-w, sample_hg(samples.lobe.x, estimators.lobe), samples.lobe.y)
     vertex = MediumVertex(media, mei, collision.place)
     f, p = vertex.eval_and_pdf(wo, active)
@@ -134,26 +131,25 @@ def fly_aside(
     there = flown.collision
     on = active & there.on
     end = MediumVertex(media, there.mei, there.place)
-    direct = estimators.direct.at_vertex(end, samples.emitter, attached, on, samples.chance)
+    direct = estimators.direct.at_vertex(end, aim.seen_from(there.mei), attached, on, samples.chance)
     with dr.resume_grad(when=attached):
         if attached:
             f = vertex.eval(wo, active)
         value = reached * f * (flown.T * there.albedo) * direct.value
     lit = on & direct.on
     chance = None if flown.probe is None else flown.probe.chance
-    return SideFlight(w, SideLight(value, flown.transmittance, lit), DirectLight(media, direct.ray_segment, value, lit), chance)
+    return SideFlight(SideLight(value, flown.transmittance, lit), DirectLight(media, direct.ray_segment, value, lit), chance)
 
 
-def weigh_aim(estimators: Estimators, w: mi.Vector3f, u: mi.Point2f, wo: mi.Vector3f, p: mi.Float, active: mi.Bool) -> Aim:
-    """The aim of the next vertex at an emitter in the direction ``w``, which the numbers ``u`` sample there too.
+def weigh_aim(estimators: Estimators, sample: DistantAim, wo: mi.Vector3f, p: mi.Float, active: mi.Bool) -> Aim:
+    """The aim of the next vertex; ``active`` lanes have made a side flight for it.
 
     The path leaves this vertex in the direction ``wo``, of density ``p``.
     """
-    q = eval_hg(turn_between(-w, wo), estimators.lobe)
-    return Aim(u, dr.select(active, p * dr.rcp(p + q), 1), active)
+    q = eval_hg(turn_between(-_direction_to_emitter(sample), wo), estimators.lobe)
+    return Aim(sample, dr.select(active, p * dr.rcp(p + q), 1))
 
 
-def _direction_to_emitter(estimators: Estimators, mei: mi.MediumInteraction3f, u: mi.Point2f, active: mi.Bool) -> mi.Vector3f:
-    direct, _ = estimators.media.scene.sample_emitter_direction(mi.Interaction3f(mei), u, False, active)
+def _direction_to_emitter(aim: DistantAim) -> mi.Vector3f:
     # Where an emitter has no light to sample, the direction is 0; its light is 0, whatever the lobe is about.
-    return dr.select(dr.squared_norm(direct.d) > 0.5, direct.d, mi.Vector3f(0, 0, 1))
+    return dr.select(dr.squared_norm(aim.d) > 0.5, aim.d, mi.Vector3f(0, 0, 1))

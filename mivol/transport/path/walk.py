@@ -24,7 +24,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mivol.transport.estimators.contribution import TrackedTerm
-from mivol.transport.estimators.direct_lighting import DirectLight
+from mivol.transport.estimators.direct_lighting import DirectLight, DistantAim
 from mivol.transport.estimators.flight_derivatives import Probe, ProbeTerm
 from mivol.transport.estimators.multiple_importance import power_heuristic
 from mivol.transport.estimators.segment import PICTURE, Collision, PathSegment
@@ -81,7 +81,7 @@ class Path:
         sampler, strata: random numbers.
         probe: a point of one of the flights so far, at which derivatives are looked at besides; None for pictures.
         shadow: the shadow ray that is walked back for derivatives; None for pictures, and where paths scatter at surfaces only.
-        aim: the emitter sample that was drawn for the next vertex; None where there are no side flights.
+        aim: the emitter sample that the next vertex takes; None where there are no side flights, and each draws its own.
         rival: density [1/sr] of the direction where light of media was drawn at ``last`` too, 0 where it was not; None where it
             is never drawn.
     """
@@ -185,8 +185,15 @@ def leave_camera(estimators: Estimators, settings: Settings, path: Path, medium:
     path.stopped |= not settings.hide_emitters and estimators.media.scene.environment() is not None
     path.medium = medium
     if estimators.lobe is not None:
-        path.aim = Aim.none(dr.width(path.ray))
+        path.aim = Aim(_draw_emitter(estimators, path.ray, path.sampler, path.active), dr.full(mi.Float, 1, dr.width(path.ray)))
     return path
+
+
+def _draw_emitter(estimators: Estimators, ray: FineRay, sampler: mi.Sampler | LaneSampler, active: mi.Bool) -> DistantAim:
+    """An emitter sample for a vertex that lies ahead; emitters are at infinity, so that any point will do."""
+    it = dr.zeros(mi.Interaction3f, dr.width(ray))
+    it.p, it.time, it.wavelengths = mi.Point3f(ray.o), ray.time, ray.wavelengths
+    return DistantAim.of(estimators.direct.aim(it, sampler.next_2d(active), active))
 
 
 def step(estimators: Estimators, settings: Settings, path: Path) -> Path:
@@ -208,18 +215,16 @@ def _limit(settings: Settings) -> int:
     return settings.max_depth if settings.max_depth >= 0 else UNLIMITED
 
 
-def _add_side_flight(
-    estimators: Estimators, path: Path, event: PathEvent, active: mi.Bool
-) -> tuple[Path, SideSamples, mi.Vector3f]:
-    """Draw an emitter sample for the next vertex, and look at it from the end of a side flight."""
+def _add_side_flight(estimators: Estimators, path: Path, event: PathEvent, aim: DistantAim, active: mi.Bool) -> Path:
+    """Look at the emitter sample of the next vertex from the end of a side flight."""
     sampler = path.sampler
-    u, lobe, flight = sampler.next_2d(active), sampler.next_2d(active), estimators.segment.draw(sampler, active, None)
-    samples = SideSamples(u, lobe, flight, sampler.next_1d(active) if estimators.draws_shadows else None)
-    flight = fly_aside(estimators, event.collision, path.beta, samples, path.score.purpose, active)
+    lobe, flight = sampler.next_2d(active), estimators.segment.draw(sampler, active, None)
+    samples = SideSamples(lobe, flight, sampler.next_1d(active) if estimators.draws_shadows else None)
+    flight = fly_aside(estimators, event.collision, path.beta, aim, samples, path.score.purpose, active)
     path.score = path.score.add(flight.light)
     if path.shadow is not None:
         path.shadow = path.shadow.offer(flight.shadow, flight.chance)
-    return path, samples, flight.to_emitter
+    return path
 
 
 def _estimate_probe(estimators: Estimators, settings: Settings, probe: Probe, sampler: mi.Sampler) -> ProbeTerm:
@@ -299,7 +304,8 @@ def _scatter(estimators: Estimators, settings: Settings, path: Path, event: Path
         path = _add_light_of_media(estimators, path, event, may_scatter)
     ahead = event.in_medium & (path.depth + 2 < limit)
     if path.aim is not None:
-        path, aside, w = _add_side_flight(estimators, path, event, ahead)
+        aim = _draw_emitter(estimators, path.ray, sampler, arrives)
+        path = _add_side_flight(estimators, path, event, aim, ahead)
 
     # -- The direction the path takes -----------------------------------------------------------------------------------------
     u1, u2 = sampler.next_1d(arrives), sampler.next_2d(arrives)
@@ -308,7 +314,7 @@ def _scatter(estimators: Estimators, settings: Settings, path: Path, event: Path
     for factor in turn.factors:
         path.score = path.score.scale(factor)
     if path.aim is not None:
-        path.aim = weigh_aim(estimators, w, aside.emitter, turn.ray.d, turn.pdf, ahead & turn.on)
+        path.aim = weigh_aim(estimators, aim, turn.ray.d, turn.pdf, ahead & turn.on)
     path.beta *= dr.select(turn.on, turn.weight, 0)
     path.eta *= dr.select(turn.on, turn.eta, 1)
     path.ray, path.medium = turn.ray, dr.select(turn.on, turn.medium, path.medium)
@@ -345,11 +351,13 @@ def _add_direct_light(estimators: Estimators, path: Path, event: PathEvent, may_
         lit |= may_scatter & event.in_medium
     if not (estimators.lights_surfaces or estimators.lights_media):
         return path
-    u, chance = sampler.next_2d(lit), sampler.next_1d(lit) if estimators.draws_shadows else None
-    if path.aim is not None:
-        u = dr.select(path.aim.on, path.aim.u, u)
     vertex = event.vertex(media)
-    direct = estimators.direct.at_vertex(vertex, u, purpose != PICTURE, lit, chance)
+    if path.aim is None:
+        aim = estimators.direct.aim(vertex.interaction, sampler.next_2d(lit), lit)
+    else:
+        aim = path.aim.sample.seen_from(vertex.interaction)
+    chance = sampler.next_1d(lit) if estimators.draws_shadows else None
+    direct = estimators.direct.at_vertex(vertex, aim, purpose != PICTURE, lit, chance)
     with dr.resume_grad(when=purpose != PICTURE):
         carried = path.beta * direct.value
         if event.collision is not None:
