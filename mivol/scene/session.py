@@ -153,14 +153,14 @@ class Session:
         return L, alpha, integrate_aovs(estimators.media, rays.ray, self.aovs)
 
     def _tangent(self, estimators: Estimators, rays: CameraRays) -> tuple:
-        prepare_derivatives(estimators, self.settings, rays.ray)
+        prepare_derivatives(estimators, self.settings, rays.ray, rays.on_film)
         black = _black(rays.ray)
         score = Tangent(black, black)
         score, _ = walk_path(estimators, self.settings, rays.sampler, rays.ray, score, strata=rays.strata)
         return score.dL, dr.zeros(mi.Float, dr.width(black)), jvp_aovs(estimators.media, rays.ray, self.aovs)
 
     def _replay(self, estimators: Estimators, rays: CameraRays, dL: mi.Spectrum, daovs: list[mi.Float]) -> None:
-        prepare_derivatives(estimators, self.settings, rays.ray)
+        prepare_derivatives(estimators, self.settings, rays.ray, rays.on_film)
         again, L = rays.sampler.clone(), None
         if not is_straight(estimators, self.settings):
             known = Primal(_black(rays.ray))

@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mivol.transport.estimators.direct_lighting import DirectLight, DirectLighting
+from mivol.transport.estimators.direct_lighting import DirectLight, DirectLighting, DistantAim
 from mivol.transport.estimators.event_samples import EventSamples
 from mivol.transport.estimators.vertex import MediumVertex, SurfaceVertex
 from mivol.transport.media.coefficients import medium_interaction
@@ -31,6 +31,14 @@ def emitter(z: float = FAR, power: float = POWER) -> dict:
     return {"type": "point", "position": [0, 0, z], "intensity": power}
 
 
+def sun_of(kind: str) -> dict:
+    """An emitter at infinity."""
+    if kind == "directional":
+        return {"type": "directional", "direction": [0.3, 0.4, -1], "irradiance": 2.0}
+    picture = np.random.default_rng(1).uniform(0.1, 2, (8, 16, 3)).astype(np.float32)
+    return {"type": "envmap", "bitmap": mi.Bitmap(picture)}
+
+
 def at_wall(found: mi.Scene) -> tuple[DirectLighting, SurfaceVertex]:
     media = media_of(found)
     ray = mi.Ray3f(mi.Point3f(0, 0, 0.5), mi.Vector3f(0, 0, -1))
@@ -42,7 +50,8 @@ def test_a_wall_under_a_emitter():
     """reflectance / pi I / r^2 exp(-tau); nothing in a lane that is off."""
     direct, vertex = at_wall(scene(emitter=emitter()))
     with dr.suspend_grad():
-        found, off = (direct.at_vertex(vertex, mi.Point2f(0.5), False, mi.Bool(on)) for on in (True, False))
+        aim = direct.aim(vertex.interaction, mi.Point2f(0.5), mi.Bool(True))
+        found, off = (direct.at_vertex(vertex, aim, False, mi.Bool(on)) for on in (True, False))
     # Rays start a little above the wall: 1e-5 of a scene of 20, and the emitter is that much nearer.
     assert np.array(found.value).ravel() == pytest.approx([0.5 / np.pi * POWER / FAR**2 * np.exp(-DEPTH)] * 3, rel=1e-3)
     assert found.on[0] and not off.on[0] and not np.array(off.value).any()
@@ -60,7 +69,8 @@ def test_a_shadow_ray_has_the_derivative_of_its_optical_depth():
     dr.enable_grad(tracked)
     dr.set_grad(tracked, 0.5)
     with dr.suspend_grad():
-        sample = direct.at_vertex(vertex, mi.Point2f(0.5), False, mi.Bool(True))
+        aim = direct.aim(vertex.interaction, mi.Point2f(0.5), mi.Bool(True))
+        sample = direct.at_vertex(vertex, aim, False, mi.Bool(True))
 
     def term() -> DirectLight:
         """In a lane that receives the light, and in one that does not."""
@@ -118,3 +128,21 @@ def test_a_point_of_smoke_under_a_sky():
         (sample,) = direct.in_medium(vertex, chosen, upward, False, mi.Bool(True))
     passed = np.exp(-DEPTH / abs(sample.ray_segment.ray.d.z[0])) if sample.ray_segment.ray.d.z[0] < 0 else 1.0
     np.testing.assert_allclose(np.array(sample.value).ravel(), [0.7 * passed] * 3, rtol=ROUNDING)
+
+
+@pytest.mark.parametrize("kind", ["envmap", "directional"])
+def test_a_sample_at_infinity_is_the_same_from_everywhere(kind):
+    """Direction, density and light of a sample that was drawn far outside are those that a point inside draws; it ends outside."""
+    media = media_of(scene(emitter=sun_of(kind)))
+    far, near = dr.zeros(mi.Interaction3f, 64), dr.zeros(mi.Interaction3f, 64)
+    far.p, near.p = mi.Point3f(300, -200, 100), mi.Point3f(0.1, 0.2, 0.3)
+    u, on = mi.Point2f(np.random.default_rng(0).uniform(size=(2, 64)).astype(np.float32)), dr.full(mi.Bool, True, 64)
+    direct = DirectLighting(media)
+    moved, drawn = DistantAim.of(direct.aim(far, u, on)).seen_from(near), direct.aim(near, u, on)
+    for name in ("d", "pdf", "delta"):
+        np.testing.assert_array_equal(np.array(getattr(moved.direct, name)), np.array(getattr(drawn.direct, name)))
+    np.testing.assert_array_equal(np.array(moved.weight), np.array(drawn.weight))
+    ahead = np.array(moved.direct.p - near.p) / np.array(moved.direct.dist)
+    np.testing.assert_allclose(ahead, np.array(drawn.direct.d), rtol=0, atol=4 * ROUNDING)
+    box = media.scene.bbox()
+    assert np.all(np.linalg.norm(np.array(moved.direct.p - box.center()), axis=0) > np.linalg.norm(box.extents()) / 2)

@@ -33,7 +33,7 @@ def media(variant_rgb: str) -> SceneMedia:
 def segment() -> PathSegment:
     """Two lanes through the middle of it, of which the second has ended before."""
     ray = mi.Ray3f(mi.Point3f(0, 0, mi.Float(-3, -3)), mi.Vector3f(0, 0, 1), dr.inf, mi.Float(0), mi.Color0f())
-    return PathSegment(ray, dr.zeros(mi.MediumPtr, 2), mi.Spectrum(*BETA.tolist()), mi.Bool(True), None)
+    return PathSegment(ray, dr.zeros(mi.MediumPtr, 2), mi.Spectrum(*BETA.tolist()), mi.Bool(True), None, mi.UInt32(0))
 
 
 ON = (True, False)

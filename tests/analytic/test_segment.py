@@ -66,7 +66,7 @@ def test_absorption_is_beers_law_with_its_derivatives():
     dr.set_grad(params[KEY], 0.25)
     media = media_of(scene)
     ray = mi.Ray3f(mi.Point3f(0, 0, -3), mi.Vector3f(0, 0, 1), dr.inf, mi.Float(0), mi.Color0f())
-    segment = PathSegment(ray, mi.MediumPtr(None), mi.Spectrum(1), mi.Bool(True), None)
+    segment = PathSegment(ray, mi.MediumPtr(None), mi.Spectrum(1), mi.Bool(True), None, mi.UInt32(0))
     media.start_tangent()
     with dr.suspend_grad():
         found = Absorption(media).estimate(segment, PICTURE, mi.Bool(True))

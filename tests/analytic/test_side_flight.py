@@ -15,7 +15,7 @@ import pytest
 from false_alarms import assert_same_mean, fresh
 from oracle_phase import gauss, hg
 
-from mivol.transport.estimators.direct_lighting import DirectLighting
+from mivol.transport.estimators.direct_lighting import DirectLighting, DistantAim
 from mivol.transport.estimators.free_flight import FreeFlight
 from mivol.transport.estimators.segment import PICTURE, Collision
 from mivol.transport.media.coefficients import medium_interaction
@@ -54,9 +54,12 @@ def test_light_at_the_end_of_a_side_flight():
     estimators, hit = middle()
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(fresh(1), N)
-    samples = SideSamples(sampler.next_2d(), sampler.next_2d(), (sampler.next_1d(), sampler.next_1d()), None)
+    samples = SideSamples(sampler.next_2d(), (sampler.next_1d(), sampler.next_1d()), None)
     with dr.suspend_grad():
-        found = fly_aside(estimators, hit, mi.Spectrum(0.5, 1, 2), samples, PICTURE, dr.arange(mi.UInt32, N) > 0)
+        aim = DistantAim.of(estimators.direct.aim(hit.mei, mi.Point2f(0.5), hit.on))
+        found = fly_aside(
+            estimators, hit, mi.Spectrum(0.5, 1, 2), mi.UInt32(0), aim, samples, PICTURE, dr.arange(mi.UInt32, N) > 0
+        )
     value = np.array(found.light.value, np.float64)
     (c, wc), (t, wt) = gauss(64), gauss(64)
     t, wt = 0.5 * (t + 1), 0.5 * wt
@@ -70,14 +73,13 @@ def test_light_at_the_end_of_a_side_flight():
 
 
 def test_the_next_vertex_counts_by_the_balance_heuristic():
-    """p / (p + q) where the path goes on, 1 where it draws an emitter sample of its own; the numbers are handed on."""
-    estimators, _ = middle()
+    """p / (p + q) where a side flight was made, 1 elsewhere; the emitter sample is handed on."""
+    estimators, hit = middle()
     c = np.linspace(-1, 1, N)
     wo = mi.Vector3f(mi.Float(np.sqrt(1 - c**2)), 0, mi.Float(c))
-    on, u = dr.arange(mi.UInt32, N) > 9, mi.Point2f(0.25, 0.75)
-    aim = weigh_aim(estimators, mi.Vector3f(0, 0, 1), u, wo, mi.Float(of_cosine(c, G)), on)
+    sample = DistantAim.of(estimators.direct.aim(hit.mei, mi.Point2f(0.5), hit.on))
+    aim = weigh_aim(estimators, sample, wo, mi.Float(of_cosine(c, G)), dr.arange(mi.UInt32, N) > 9)
     expected = of_cosine(c, G) / (of_cosine(c, G) + of_cosine(c, LOBE))
     # The cosine is rounded to 2^-24 twice, and the relative slope of HG by it is 3 g / (1 - g)^2 = 60 at most.
     np.testing.assert_allclose(np.array(aim.weight)[10:], expected[10:], rtol=60 * 2.0**-23)
-    assert np.all(np.array(aim.weight)[:10] == 1) and np.array_equal(np.array(aim.on), np.array(on))
-    assert aim.u is u
+    assert np.all(np.array(aim.weight)[:10] == 1) and aim.sample is sample

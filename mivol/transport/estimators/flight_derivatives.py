@@ -38,7 +38,7 @@ from mivol.transport.media.ray_intervals import RaySegment
 from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.traversal.fine_ray import FineRay, Ray
 
-__all__ = ["FlownSegment", "Probe", "ProbeTerm", "weigh_collisions"]
+__all__ = ["FlownSegment", "Level", "Probe", "ProbeTerm", "Probes", "weigh_collisions"]
 
 
 PROBE_TAU = 0.6
@@ -46,6 +46,23 @@ PROBE_TAU = 0.6
 
 LEAST_ALBEDO = 0.1
 """Albedo below which derivatives by it come from probes; L / albedo is at most 10 times L above it."""
+
+
+@dataclass
+class Level:
+    """The level b that derivatives of flights are taken from.
+
+    Attributes:
+        first: of flights before a path has scattered [radiance], one a lane.
+        later: of the others [radiance].
+    """
+
+    first: mi.Spectrum
+    later: mi.Spectrum
+
+    def at(self, depth: mi.UInt32) -> mi.Spectrum:
+        """That of flights after so many scatterings."""
+        return dr.select(depth == 0, self.first, self.later)
 
 
 @dataclass
@@ -58,7 +75,7 @@ class FlownSegment:
         passed: the ray to the end of the flight.
         collision: where it ends in a medium.
         weight: of each channel at its end.
-        level: the level b [radiance]; None for 0.
+        level: the level b; None for 0.
         emission: where emission was looked at; None where no medium emits by its place.
         shown: the light of Gaussians.
         active: lanes that fly.
@@ -70,7 +87,7 @@ class FlownSegment:
     passed: RaySegment
     collision: Collision
     weight: mi.Spectrum
-    level: mi.Spectrum | None
+    level: Level | None
     emission: FlightPoint | None
     shown: GaussianLight
     active: mi.Bool
@@ -81,7 +98,7 @@ class FlownSegment:
         """Light of the level as the camera sees it at the end of the flight; 0 where the path may not scatter any more."""
         if self.level is None:
             return mi.Spectrum(0)
-        return dr.select(self.segment.scatters, self.segment.beta * self.weight * self.level, 0)
+        return dr.select(self.segment.scatters, self.segment.beta * self.weight * self.level.at(self.segment.depth), 0)
 
     @property
     def emitted(self) -> mi.Spectrum:
@@ -207,10 +224,10 @@ class Probe:
         nothing = dr.zeros(mi.Float64, n), dr.zeros(mi.UInt32, n), dr.zeros(mi.Spectrum, n)
         return cls(FineRay.of(ray), *nothing, dr.zeros(mi.UInt32, n), zero, zero)
 
-    def offer(self, segment: PathSegment, found: FlightPoint, depth: mi.UInt32) -> Probe:
+    def offer(self, segment: PathSegment, found: FlightPoint, on: mi.Bool) -> Probe:
         """Keep a point of one more flight, or the one that was kept before."""
         point, gain = found.point, found.gain
-        weight = dr.select(point.on & segment.scatters, dr.max(gain), 0)
+        weight = dr.select(point.on & segment.scatters & on, dr.max(gain), 0)
         total = self.total + weight
         keep = found.chance * total < weight
         return Probe(
@@ -218,10 +235,33 @@ class Probe:
             dr.select(keep, point.t, self.t),
             dr.select(keep, point.body, self.body),
             dr.select(keep, gain, self.gain),
-            dr.select(keep, depth, self.depth),
+            dr.select(keep, segment.depth, self.depth),
             dr.select(keep, weight, self.weight),
             total,
         )
+
+
+@dataclass
+class Probes:
+    """The probes of a path: one of its flights before it has scattered, and one of those after that.
+
+    Flights after a scattering are few beside the first ones of all paths that pass the media, and have more than half of the
+    noise: with one probe for both, variance x time over all voxels was 1.2 to 1.4 times as large under a sun or a lamp, and the
+    same in even light.
+    """
+
+    first: Probe
+    later: Probe
+
+    @classmethod
+    def none(cls, ray: Ray) -> Probes:
+        """No flight yet."""
+        return cls(Probe.none(ray), Probe.none(ray))
+
+    def offer(self, segment: PathSegment, found: FlightPoint) -> Probes:
+        """The probes after one more flight."""
+        first = segment.depth == 0
+        return Probes(self.first.offer(segment, found, first), self.later.offer(segment, found, ~first))
 
 
 @dataclass
@@ -233,7 +273,7 @@ class ProbeTerm:
         probe: the probe.
         mei: its point.
         source: an estimate of the in-scattered radiance there.
-        level: the level b [radiance]; None for 0.
+        level: the level b; None for 0.
         on: lanes that have one.
     """
 
@@ -241,7 +281,7 @@ class ProbeTerm:
     probe: Probe
     mei: mi.MediumInteraction3f
     source: mi.Spectrum
-    level: mi.Spectrum | None
+    level: Level | None
     on: mi.Bool
     is_replayed = True
 
@@ -261,7 +301,7 @@ class ProbeTerm:
         if body.view.albedo is not None:
             bracket = bracket * dr.detach(eval_albedo(body, self.mei, on))
         if self.level is not None:
-            bracket = bracket - self.level
+            bracket = bracket - self.level.at(self.probe.depth)
         return name, self._gain * bracket * _kappa(self.media, body) * weight
 
     def vjp(self, dL: mi.Spectrum) -> None:

@@ -28,7 +28,7 @@ import mitsuba as mi
 from mivol.numerics import least_of
 from mivol.transport.estimators.delta_tracking import collide_in_blocks, collide_in_bounded
 from mivol.transport.estimators.exact_flight import collide_exactly
-from mivol.transport.estimators.flight_derivatives import FlownSegment
+from mivol.transport.estimators.flight_derivatives import FlownSegment, Level
 from mivol.transport.estimators.gaussian_flight import collide_in_gaussians
 from mivol.transport.estimators.gaussian_light import GaussianLight
 from mivol.transport.estimators.segment import (
@@ -78,7 +78,7 @@ class FreeFlight:
         media: of the scene.
 
     Attributes:
-        level: the level that derivatives are taken from [radiance] (:mod:`.flight_derivatives`); None for 0.
+        level: the level that derivatives are taken from (:mod:`.flight_derivatives`); None for 0.
 
     Bias: none. Variance: that of one flight a segment. Cost: a walk of each medium to the first collision; where an extinction
     is rgb or a medium emits, one more to there.
@@ -89,7 +89,7 @@ class FreeFlight:
 
     def __init__(self, media: SceneMedia) -> None:
         self.media = media
-        self.level: mi.Spectrum | None = None
+        self.level: Level | None = None
 
     def draw(self, sampler: mi.Sampler, active: mi.Bool, strata: Strata | None) -> tuple[mi.Float, mi.Float]:
         """The number of the flight, and one that seeds the generator of all others: in every lane, since all of them fly."""

@@ -58,6 +58,7 @@ class PathSegment:
         beta: throughput of the path to there.
         scatters: lanes whose path may scatter once more.
         samples: random numbers that the estimator has drawn; None where it needs none.
+        depth: number of scattering events of the path so far.
         is_aside: a side flight, which the path does not take itself (:mod:`mivol.transport.path.side_flight`).
         emission_weight: of the light that media emit along it, where that was drawn at its origin too; None for 1.
     """
@@ -67,6 +68,7 @@ class PathSegment:
     beta: mi.Spectrum
     scatters: mi.Bool
     samples: Any
+    depth: mi.UInt32
     is_aside: bool = False
     emission_weight: mi.Float | None = None
 

@@ -58,6 +58,7 @@ class CameraRays:
         ray: world space.
         weight: the sensor's importance.
         position: of the sample on the film [pixel].
+        on_film: that position as a share of the crop [1]; in [0, 1) but for samples beside it that a wide filter asks for.
         strata: the stratum that each lane draws directions from; None where lanes have none.
     """
 
@@ -65,6 +66,7 @@ class CameraRays:
     ray: mi.RayDifferential3f
     weight: mi.Spectrum
     position: mi.Point2f
+    on_film: mi.Point2f
     strata: Strata | None = None
 
 
@@ -166,10 +168,11 @@ def _camera_rays(samples: RenderSamples, sampler: mi.Sampler, count: int, per_pa
     time = mi.Float(sensor.shutter_open())
     if sensor.shutter_open_time() > 0:
         time += sampler.next_1d() * sensor.shutter_open_time()
-    ray, weight = sensor.sample_ray_differential(time, mi.Float(0), dr.fma(position, scale, offset), aperture)
+    on_film = dr.fma(position, scale, offset)
+    ray, weight = sensor.sample_ray_differential(time, mi.Float(0), on_film, aperture)
     # A box filter gives a sample to its pixel, whatever its position in it.
     place = mi.Vector2f(pixel) if film.rfilter().is_box_filter() else position
-    return CameraRays(sampler, ray, weight, place, strata)
+    return CameraRays(sampler, ray, weight, place, mi.Point2f(on_film), strata)
 
 
 def record(samples: RenderSamples, names: list[str], sample: Sample) -> mi.TensorXf:

@@ -98,6 +98,7 @@ def fly_aside(
     estimators: Estimators,
     collision: Collision,
     beta: mi.Spectrum,
+    depth: mi.UInt32,
     aim: DistantAim,
     samples: SideSamples,
     purpose: str,
@@ -109,6 +110,7 @@ def fly_aside(
         estimators: of the render; their ``lobe`` is the mean cosine of the lobe.
         collision: the vertex that the flight leaves.
         beta: throughput to there.
+        depth: number of scattering events before it.
         aim: the emitter sample, which the next vertex takes too.
         samples: random numbers.
         purpose: PICTURE, or that of derivatives, which keeps the values attached.
@@ -126,7 +128,7 @@ def fly_aside(
     f, p = vertex.eval_and_pdf(wo, active)
     reached = beta * collision.albedo * dr.rcp(p + eval_hg(turn_between(-w, wo), estimators.lobe))
     ray = FineRay.leaving(collision.place, wo, mei)
-    ahead = PathSegment(ray, mei.medium, reached * f, active, samples.flight, is_aside=True)
+    ahead = PathSegment(ray, mei.medium, reached * f, active, samples.flight, depth, is_aside=True)
     flown = estimators.segment.estimate(ahead, purpose, active)
     there = flown.collision
     on = active & there.on

@@ -25,7 +25,7 @@ import mitsuba as mi
 
 from mivol.transport.estimators.contribution import TrackedTerm
 from mivol.transport.estimators.direct_lighting import DirectLight, DistantAim
-from mivol.transport.estimators.flight_derivatives import Probe, ProbeTerm
+from mivol.transport.estimators.flight_derivatives import Probe, Probes, ProbeTerm
 from mivol.transport.estimators.multiple_importance import power_heuristic
 from mivol.transport.estimators.segment import PICTURE, Collision, PathSegment
 from mivol.transport.estimators.shadow_reservoir import ShadowReservoir, ShadowTerm
@@ -79,7 +79,7 @@ class Path:
         active: lanes that go on.
         score: :mod:`mivol.transport.path.scores`.
         sampler, strata: random numbers.
-        probe: a point of one of the flights so far, at which derivatives are looked at besides; None for pictures.
+        probes: points of the flights so far, at which derivatives are looked at besides; None for pictures.
         shadow: the shadow ray that is walked back for derivatives; None for pictures, and where paths scatter at surfaces only.
         aim: the emitter sample that the next vertex takes; None where there are no side flights, and each draws its own.
         rival: density [1/sr] of the direction where light of media was drawn at ``last`` too, 0 where it was not; None where it
@@ -100,7 +100,7 @@ class Path:
     score: Any
     sampler: mi.Sampler | LaneSampler
     strata: Strata | None
-    probe: Probe | None = None
+    probes: Probes | None = None
     shadow: ShadowReservoir | None = None
     aim: Aim | None = None
     rival: mi.Float | None = None
@@ -141,13 +141,14 @@ def walk_path(
         path.stopped |= event.at_surface
         return path.score, alpha_of(path)
     if estimators.segment.ends_in_media and score.purpose != PICTURE:
-        path.probe = Probe.none(ray)
+        path.probes = Probes.none(ray)
         path.shadow = ShadowReservoir.empty(media, ray)
     path = _walk_on(estimators, settings, path)
     if path.shadow is not None:
         path.score = path.score.add(ShadowTerm(media, path.shadow))
-    if path.probe is not None:
-        path.score = path.score.add(_estimate_probe(estimators, settings, path.probe, sampler))
+    if path.probes is not None:
+        for probe in (path.probes.first, path.probes.later):
+            path.score = path.score.add(_estimate_probe(estimators, settings, probe, sampler))
     return path.score, alpha_of(path)
 
 
@@ -220,7 +221,7 @@ def _add_side_flight(estimators: Estimators, path: Path, event: PathEvent, aim: 
     sampler = path.sampler
     lobe, flight = sampler.next_2d(active), estimators.segment.draw(sampler, active, None)
     samples = SideSamples(lobe, flight, sampler.next_1d(active) if estimators.draws_shadows else None)
-    flight = fly_aside(estimators, event.collision, path.beta, aim, samples, path.score.purpose, active)
+    flight = fly_aside(estimators, event.collision, path.beta, path.depth, aim, samples, path.score.purpose, active)
     path.score = path.score.add(flight.light)
     if path.shadow is not None:
         path.shadow = path.shadow.offer(flight.shadow, flight.chance)
@@ -263,7 +264,7 @@ def _follow_segment(estimators: Estimators, settings: Settings, path: Path) -> t
     may_scatter = path.active & (path.depth + 1 < _limit(settings))
     samples = estimators.segment.draw(path.sampler, may_scatter, path.strata)
     # A copy of the throughput: it is multiplied in place below, and derivatives read the segment's own after that.
-    segment = PathSegment(path.ray, path.medium, mi.Spectrum(path.beta), may_scatter, samples)
+    segment = PathSegment(path.ray, path.medium, mi.Spectrum(path.beta), may_scatter, samples, mi.UInt32(path.depth))
     if estimators.emission is not None:
         segment.emission_weight = estimators.emission.weigh_met(path.last, path.rival, path.ray.d, path.active)
     found = estimators.segment.estimate(segment, path.score.purpose, path.active)
@@ -271,7 +272,7 @@ def _follow_segment(estimators: Estimators, settings: Settings, path: Path) -> t
         path.score = path.score.add(found.light)
     path.score = path.score.scale(found.transmittance)
     if found.probe is not None:
-        path.probe = path.probe.offer(segment, found.probe, path.depth)
+        path.probes = path.probes.offer(segment, found.probe)
     path.beta *= found.T
     path.clear *= found.T
     path.medium = found.end.medium
