@@ -139,7 +139,7 @@ def test_a_sample_at_infinity_is_the_same_from_everywhere(kind):
     u, on = mi.Point2f(np.random.default_rng(0).uniform(size=(2, 64)).astype(np.float32)), dr.full(mi.Bool, True, 64)
     direct = DirectLighting(media)
     moved, drawn = DistantAim.of(direct.aim(far, u, on)).seen_from(near), direct.aim(near, u, on)
-    for name in ("d", "pdf", "delta"):
+    for name in ("d", "pdf", "delta", "uv"):
         np.testing.assert_array_equal(np.array(getattr(moved.direct, name)), np.array(getattr(drawn.direct, name)))
     np.testing.assert_array_equal(np.array(moved.weight), np.array(drawn.weight))
     ahead = np.array(moved.direct.p - near.p) / np.array(moved.direct.dist)

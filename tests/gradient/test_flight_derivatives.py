@@ -10,7 +10,7 @@ import oracle_scattering as twins
 import pytest
 import scattering_scenes as small
 from false_alarms import assert_precise, assert_same_mean, difference, fresh
-from scattering_gradients import BATCHES, DENSITIES, GRID, assert_gradient, gradients, release, watched, weights
+from scattering_gradients import BATCHES, DENSITIES, GRID, assert_gradient, gradients, release, vjp, watched, weights
 from scattering_scenes import PLACE, aimed, close_up, mivol, pencils, point, rough_grid, smoke, sun
 
 import scenes
@@ -220,6 +220,19 @@ def test_of_side_flights_forward_is_the_transpose_of_reverse(name):
     assert np.sum(there * w) == pytest.approx(
         np.sum(back * v), abs=1e-4 * max(np.abs(there * w).sum(), np.abs(back * v).sum())
     )
+
+
+def test_of_side_flights_light_is_linear_in_a_sky():
+    """The derivative along the sky itself is the picture of the same seed: sums of the same terms in another order, in float32."""
+    light = np.random.default_rng(3).uniform(0.1, 1, (8, 16, 3)).astype(np.float32)
+    light[2, 5] = 200
+    interior = medium("mivol_medium", 1.5, 0.8, phase={"type": "mivol_hg", "g": 0.8})
+    scene = close_up({"smoke": box_of(interior, PLACE), "sky": {"type": "envmap", "bitmap": mi.Bitmap(light)}}, res=8)
+    integrator, w = mi.load_dict(mivol(max_depth=4)), np.random.default_rng(1).uniform(0.5, 1.5, (8, 8, 3))
+    seen = np.array(mi.render(scene, integrator=integrator, seed=fresh(4), spp=16), np.float64)
+    start = np.array(mi.traverse(scene)["sky.data"], np.float64)
+    found = vjp(scene, "sky.data", w, 16, fresh(4), integrator)
+    assert np.sum(found.reshape(start.shape) * start) == pytest.approx(np.sum(w * seen), rel=1e-4)
 
 
 @pytest.mark.slow

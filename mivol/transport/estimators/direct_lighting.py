@@ -83,6 +83,7 @@ class DistantAim:
     Attributes:
         d: the direction; 0 where the emitter has no light to sample.
         dist: beyond all of the scene [length].
+        uv: where the emitter has its texture.
         pdf: its density [1/sr].
         delta: whether that is a delta function.
         weight: radiance over ``pdf``.
@@ -92,6 +93,7 @@ class DistantAim:
 
     d: mi.Vector3f
     dist: mi.Float
+    uv: mi.Point2f
     pdf: mi.Float
     delta: mi.Bool
     weight: mi.Spectrum
@@ -102,13 +104,14 @@ class DistantAim:
     def of(cls, aim: EmitterAim) -> DistantAim:
         """What is the same from every point."""
         direct = aim.direct
-        return cls(direct.d, direct.dist, direct.pdf, direct.delta, aim.weight, aim.emitter, aim.u)
+        return cls(direct.d, direct.dist, direct.uv, direct.pdf, direct.delta, aim.weight, aim.emitter, aim.u)
 
     def seen_from(self, it: mi.Interaction3f) -> EmitterAim:
         """The sample of a point."""
         direct = dr.zeros(mi.DirectionSample3f, dr.width(self.d))
         direct.p, direct.n, direct.d, direct.dist = mi.Point3f(it.p) + self.dist * self.d, -self.d, self.d, self.dist
-        direct.pdf, direct.delta, direct.emitter, direct.time = self.pdf, self.delta, self.emitter, it.time
+        direct.pdf, direct.delta, direct.emitter = self.pdf, self.delta, self.emitter
+        direct.uv, direct.time = self.uv, it.time
         return EmitterAim(direct, self.weight, self.emitter, self.u, 1, True)
 
 
