@@ -223,7 +223,7 @@ def test_of_side_flights_forward_is_the_transpose_of_reverse(name):
 
 
 def test_of_side_flights_light_is_linear_in_a_sky():
-    """The derivative along the sky itself is the picture of the same seed: sums of the same terms in another order, in float32."""
+    """The derivative along the sky itself is the picture of the same seed, to float32 sums in another order."""
     light = np.random.default_rng(3).uniform(0.1, 1, (8, 16, 3)).astype(np.float32)
     light[2, 5] = 200
     interior = medium("mivol_medium", 1.5, 0.8, phase={"type": "mivol_hg", "g": 0.8})
