@@ -3,6 +3,8 @@ furnaces that no density changes, and differences of renders."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -14,10 +16,14 @@ from scattering_gradients import BATCHES, DENSITIES, GRID, assert_gradient, grad
 from scattering_scenes import PLACE, aimed, close_up, mivol, pencils, point, rough_grid, smoke, sun
 
 import scenes
+from mivol.bench.gradients.size import Light
+from mivol.bench.gradients.subject import Subject
+from mivol.bench.gradients.twin import Twin
+from mivol.bench.scenes import box_scene, constant_light
 from mivol.scene import plan
 from mivol.validate.moments import Moments
 from mivol.validate.statistics import Estimate
-from scenes import as_float32, ball_of, box_of, grid_volume, medium
+from scenes import as_float32, ball_of, box_of, camera, grid_volume, medium
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
 
@@ -192,6 +198,33 @@ def test_density_by_differences(room, depth):
     truth = _difference(scene, GRID, density, 0.05, integrator, 4096)
     assert_same_mean(found, truth, rounding=2e-3 * np.abs(truth.mean), what="derivative")
     assert_precise(difference(found, truth), 0.1 * np.abs(truth.mean) + 1e-4, what="derivative")
+
+
+@dataclass(frozen=True)
+class _Aside(Light):
+    """A camera that looks at the dense half of a box only."""
+
+    def scene(self, values: np.ndarray, side: int) -> mi.Scene:
+        parts = box_scene(values, side, self.albedo, **self.parts())
+        parts["sensor"] = camera((-0.5, 0.0, 6.0), (-0.5, 0.0, 0.0), res=side, fov=5.0)
+        return mi.load_dict(parts)
+
+
+@pytest.mark.statistical
+def test_what_no_camera_ray_meets():
+    """The empty half beside what is seen: light comes through it after a scattering, so that later probes alone find it.
+
+    Beside a path tracer that carries the derivative forward.
+    """
+    left = np.broadcast_to(np.arange(8) < 4, (8, 8, 8))
+    values, direction = np.where(left, 2.0, 0), np.where(left, 0.0, 1.0)
+    light = _Aside(constant_light, depth=4)
+    subject, twin = Subject(light.scene(np.float32(values), 8), light.integrator("mivol")), Twin(values, direction, 8, light)
+    found = [float(np.array(subject.of_mean(fresh(k), 512), np.float64) @ direction.ravel()) for k in range(BATCHES)]
+    truth = [twin.derivative(fresh(100 + k), 256) for k in range(BATCHES)]
+    found, truth = (Estimate.of(Moments.of(np.array(x)[:, None])) for x in (found, truth))
+    assert_same_mean(found, truth, rounding=1e-6, what="derivative")
+    assert_precise(difference(found, truth), 0.1 * np.abs(truth.mean), what="derivative")
 
 
 # -- Side flights --------------------------------------------------------------------------------------------------------
