@@ -14,7 +14,7 @@ import scenes
 from mivol.scene import plan
 from mivol.transport.estimators import free_flight
 from mivol.validate.moments import Moments
-from scenes import ball_of, box_of, centred, grid_volume, medium
+from scenes import as_float32, ball_of, box_of, centred, grid_volume, medium
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
 
@@ -47,6 +47,19 @@ def test_white_furnace(top):
     scene = close_up({"smoke": smoke(rough_grid(2, top), 1.0, name="hg", g=0.6)[0], "sky": scenes.sky(1.0)}, res=8)
     image = scenes.render(scene, unlimited(), 4, seed=fresh(1))
     assert np.abs(image - 1).max() <= 1e-5
+
+
+@pytest.mark.statistical
+def test_absorption_and_scattering_are_a_density_and_an_albedo():
+    """The same smoke by sigma_a and sigma_s, and by sigma_t and an albedo of 0.6."""
+    density = rough_grid(4, 2.0)
+    parts = {f"sigma_{k}": grid_volume("mivol_voxels", as_float32(c * density), PLACE) for k, c in (("a", 0.4), ("s", 0.6))}
+    found = []
+    for box in (smoke(density, 0.6, "own")[0], box_of({"type": "mivol_medium", **parts}, PLACE)):
+        scene = close_up({"smoke": box, "bulb": point([1.5, 1, 2.0])[0], "sky": scenes.sky(0.2)}, res=8)
+        found.append(over_pixels(small.moments(scene, mivol(max_depth=4), 256, first=300 * len(found))))
+    assert_same_mean(*found, rounding=1e-6, what="radiance")
+    assert_precise(difference(*found), 0.02 * found[0].mean, what="radiance")
 
 
 def test_roulette_spares_paths_that_lose_little():

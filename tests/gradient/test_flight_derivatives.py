@@ -21,6 +21,10 @@ from mivol.bench.gradients.subject import Subject
 from mivol.bench.gradients.twin import Twin
 from mivol.bench.scenes import box_scene, constant_light
 from mivol.scene import plan
+from mivol.transport.estimators.flight_derivatives import Probes
+from mivol.transport.estimators.segment import FlightPoint, PathSegment
+from mivol.transport.media.even_point import EvenPoint
+from mivol.transport.traversal.fine_ray import FineRay
 from mivol.validate.moments import Moments
 from mivol.validate.statistics import Estimate
 from scenes import as_float32, ball_of, box_of, camera, grid_volume, medium
@@ -225,6 +229,28 @@ def test_what_no_camera_ray_meets():
     found, truth = (Estimate.of(Moments.of(np.array(x)[:, None])) for x in (found, truth))
     assert_same_mean(found, truth, rounding=1e-6, what="derivative")
     assert_precise(difference(found, truth), 0.1 * np.abs(truth.mean), what="derivative")
+
+
+def test_probes_are_kept_in_proportion_to_their_gain():
+    """Before a scattering the first flight alone; after it flights of gains 1 and 3, kept in 1/4 and 3/4 of evenly spread
+    lanes, which stand for 4 together. Flights that may not scatter any more, and lanes without a point, are not kept."""
+    n, never = 64, dr.full(mi.Bool, False, 64)
+    ray = FineRay.of(mi.Ray3f(mi.Point3f(dr.zeros(mi.Float, n), 0, 0), mi.Vector3f(0, 0, 1)))
+    on, zero = ~never, dr.zeros(mi.UInt32, n)
+
+    def offered(probes: Probes, t: float, gain: float, depth: int, scatters: mi.Bool = on, found: mi.Bool = on) -> Probes:
+        segment = PathSegment(ray, dr.zeros(mi.MediumPtr, n), mi.Spectrum(1), scatters, None, zero + depth)
+        point = EvenPoint(dr.full(mi.Float64, t, n), dr.full(mi.Float, 1, n), zero, found)
+        return probes.offer(segment, FlightPoint(point, dr.full(mi.Spectrum, gain, n), (dr.arange(mi.Float, n) + 0.5) / n))
+
+    probes = offered(Probes.none(ray), 7.0, 2.0, 0)
+    for t, gain, *lanes in ((1.0, 1.0), (2.0, 3.0), (3.0, 100.0, never), (4.0, 100.0, on, never)):
+        probes = offered(probes, t, gain, 1, *lanes)
+    assert np.all(np.array(probes.first.t) == 7) and np.all(np.array(probes.first.total) == 2)
+    second = np.array(probes.later.t) == 2
+    assert second.sum() == 3 * n // 4 and np.all(np.array(probes.later.t)[~second] == 1)
+    assert np.all(np.array(probes.later.total) == 4) and np.all(np.array(probes.later.weight) == np.where(second, 3, 1))
+    assert np.all(np.array(probes.later.depth) == 1)
 
 
 # -- Side flights --------------------------------------------------------------------------------------------------------
