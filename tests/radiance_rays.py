@@ -60,4 +60,4 @@ def derive(field: SphericalGrid, o, d, colour, T=0.0, distance=0.0, stop=0.0):
     source, model = exact(field, rays.d, slope=True), model_of(field, stop)
     seen = render(cells, source, model, rays)
     backward(cells, source, model, seen, RayGradient(mi.Color3f(*colour), T, distance))
-    return field.with_values(source.density_slope, source.harmonics_slope).values()
+    return field.with_values(*source.slopes()).values()

@@ -38,6 +38,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mivol.device_arrays import aligned
 from mivol.errors import MivolError
 from mivol.fields.activation import Activation, activation_of
 from mivol.fields.listed_places import ListedPlaces
@@ -250,7 +251,8 @@ class SphericalGrid:
         rows = np.zeros((len(density) + vacuum, width), np.float32)
         rows[: len(density), : 3 * sh.shape[1]] = sh.reshape(len(density), -1)
         flat = np.append(density, np.float32(act.vacuum)) if vacuum else density
-        packed = mi.Float(np.ascontiguousarray(flat)), mi.Float(rows.reshape(-1))
+        # Dr.Jit reads NumPy's memory in place, and rows as packets only where it is aligned.
+        packed = mi.Float(aligned(np.ascontiguousarray(flat))), mi.Float(aligned(rows.reshape(-1)))
         return cls(tuple(res), to_world, degree, *packed, nodes, activation, offset, clamp, levels, space)
 
     @classmethod

@@ -221,7 +221,7 @@ def test_near_derivatives_are_scaled_and_far_ones_are_not() -> None:
         source = exact(field, rays.d, slope=True)
         seen = render(cells, source, model_of(field), rays)
         backward(cells, source, model_of(field), seen, RayGradient(mi.Color3f(1, 1, 1)), near=near)
-        return float(np.sum(np.float64(source.density_slope)))
+        return float(np.sum(np.float64(source.slopes()[0])))
 
     # d L / d sigma = integral of 0.5 x 3 over t from 0 to 2, less 1e-3 of it for what is hidden; with t^2 / near^2 below near.
     assert slope(0.0) == pytest.approx(3.0, rel=2e-3)

@@ -218,7 +218,7 @@ def test_a_ray_that_ends_inside_a_cell() -> None:
     sent = np.outer(-np.expm1(-sigma * L), np.full(3, 0.5 + Y0))
     np.testing.assert_allclose(np.array(seen.colour).T, sent, atol=tolerance)
     backward(cells, source, model, seen, RayGradient(mi.Color3f(0), 1.0))
-    assert np.array(source.density_slope, np.float64).sum() == pytest.approx(-np.sum(L * np.exp(-sigma * L)), rel=1e-5)
+    assert np.array(source.slopes()[0], np.float64).sum() == pytest.approx(-np.sum(L * np.exp(-sigma * L)), rel=1e-5)
     share = L / whole
     assert all(kind.any() for kind in (share == 0, share == 1, (share > 0) & (share < 1)))
 
@@ -390,7 +390,7 @@ def test_memory_goes_with_what_is_there() -> None:
     ray = rays_of([3, 0, 0], [-1, 0, 0])
     slopes = exact(field, ray.d, slope=True)
     held = [field.density, field.harmonics] * 2  # the values and the optimiser's squares
-    held += [slopes.density_slope, slopes.harmonics_slope, field.nodes]
+    held += [slopes.table, slopes.slope, *slopes.slopes(), field.nodes]
     held += [cells.corners, cells.rows, tables.table, tables.slope]
     taken = sum(dr.width(a) * dr.itemsize_v(a) for a in held) + field.listed_places().bytes + cells.index.bytes
     assert field.bytes == 4 * ((len(nodes) + 1) * 29 + len(nodes))

@@ -62,7 +62,7 @@ def our_step(field: SphericalGrid, task: Task) -> Callable[[int], list[mi.Float]
         seen = render(cells, source, model, task.rays)
         dr.eval(seen)
         backward(cells, source, model, seen, RayGradient(2 * seen.colour))
-        return list(fold(field, cells, source, task.pinholes)) if baked else [source.density_slope, source.harmonics_slope]
+        return list(fold(field, cells, source, task.pinholes)) if baked else list(source.slopes())
 
     return step
 

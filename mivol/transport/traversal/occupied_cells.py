@@ -166,12 +166,25 @@ class CellVisitor:
         points: the two Gauss points, as fractions along the grid's own axes, in the order in which the ray meets them.
         t: length walked before the cell [length].
         dt: length in the cell [length].
+        along: the points, as fractions along each axis in the sense of the ray.
+        cell: the lower node of the cell.
+        level: that the cell lies in.
+        ahead: for each axis whether the ray runs upwards along it.
+        entered: the axis whose face the ray has come through from the cell that was visited before; -1 where it has come from
+            another cell, or along an edge.
+        leaves: the axis whose face the ray leaves through; the first of them at an edge.
     """
 
     number: mi.UInt32
     points: tuple[mi.Vector3f, mi.Vector3f]
     t: mi.Float
     dt: mi.Float
+    along: tuple[mi.Vector3f, mi.Vector3f]
+    cell: mi.Vector3i
+    level: mi.Int32 | int
+    ahead: Any
+    entered: mi.Int32
+    leaves: mi.Int32
 
 
 @dr.syntax
@@ -220,6 +233,7 @@ def march(
     active = mi.Bool(active) & (length > 0)
     n = mi.Vector3i(0)
     t = mi.Float(0)
+    entered = mi.Int32(-1)
     last, left = mi.Vector3i(segment.cell), mi.Float(0)
 
     while dr.hint(active, label="march"):
@@ -238,6 +252,7 @@ def march(
             there = dr.select(reach <= exit, ends, there)
             t = dr.select(searching, exit, t)
             n = dr.select(searching, there, n)
+            entered = dr.select(searching, -1, entered)
             inside = (exit < length) & dr.all(there <= most)
             active &= inside | ~searching
             searching &= inside
@@ -247,11 +262,17 @@ def march(
         exit = lesser(lesser(reach.x, reach.y), reach.z)
         dt = greater(lesser(exit, length) - t, 0)
         offset = entry - mi.Vector3f(n)
-        points = tuple(_natural(dr.fma(speed, dr.fma(dt, g, t), offset), ahead) for g in (GAUSS, 1 - GAUSS))
-        state = visit(state, CellVisitor(index.rank(place, word, active), points, t, dt), active)
-        last = dr.select(active, segment.cell + sign * n, last)
+        along = tuple(dr.clip(dr.fma(speed, dr.fma(dt, g, t), offset), 0, 1) for g in (GAUSS, 1 - GAUSS))
+        points = tuple(dr.select(ahead, p, 1 - p) for p in along)
+        through = reach <= exit
+        leaves = dr.select(through.x, 0, dr.select(through.y, 1, mi.Int32(2)))
+        cell = segment.cell + sign * n
+        here = CellVisitor(index.rank(place, word, active), points, t, dt, along, cell, level, ahead, entered, leaves)
+        state = visit(state, here, active)
+        last = dr.select(active, cell, last)
         left = dr.select(active, t + dt, left)
-        n = dr.select(reach <= exit, n + 1, n)
+        n = dr.select(through, n + 1, n)
+        entered = dr.select(dr.count(through) == 1, leaves, -1)
         t = exit
         active &= (exit < length) & dr.all(n <= most)
         if until is not None:
@@ -273,9 +294,3 @@ def reversed_from(segment: Segment, cell: mi.Vector3i, t: mi.Float, until: mi.Fl
     planes = mi.Vector3f(cell - segment.cell)
     frac = dr.clip(dr.fma(segment.d, t, segment.frac - planes), 0, 1)
     return Segment(cell, frac, -segment.d, -segment.d_rest, segment.t0 + t, t - until)
-
-
-def _natural(frac: mi.Vector3f, ahead: Any) -> mi.Vector3f:
-    """Fractions along the grid's own axes, of fractions along the ray."""
-    frac = dr.clip(frac, 0, 1)
-    return dr.select(ahead, frac, 1 - frac)
