@@ -13,7 +13,7 @@ step: forward and backward, the same 65,536 rays for both, in turns; ratios of p
 moves least), with the clock's beside them. camera: the pixels of one view; pixels: drawn at random from 8 views, as the
 tutorial's loader draws them; any: random origins and directions. The first two share pinholes, so their harmonics are summed
 once a node and pinhole, and that is counted. Rays of the third share nothing; no photographs have such rays, and no bar is set
-for them: in a fog they cost what the peer's cost, 28 numbers at each corner of a cell, from anywhere in memory.
+for them: each reads 28 numbers at every corner, from anywhere in memory, and carries those of a face on to the next cell.
 
 memory: the most that Dr.Jit held during a gradient step, for N and 4 N rays: what a ray costs is its own state.
 
