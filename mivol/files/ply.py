@@ -22,7 +22,10 @@ import numpy as np
 from mivol.files import source
 from mivol.files.source import refusal
 
-__all__ = ["is_table", "read_layout", "read_tables", "write_table"]
+__all__ = ["POSITION", "is_table", "positions_of", "read_layout", "read_tables", "read_vertices", "write_table"]
+
+POSITION = ("x", "y", "z")
+"""Properties of a vertex that has a place."""
 
 LONGEST_HEADER = 1 << 16
 """Bytes in which a header has to end; those of published files have some 2000."""
@@ -77,6 +80,23 @@ def read_tables(path: str | os.PathLike) -> dict[str, np.ndarray]:
     head, body = _split(data, path)
     form, elements = _header(head, path)
     return _text_tables(body, elements, path) if form == "ascii" else _binary_tables(body, elements, ORDERS[form], path)
+
+
+def read_vertices(path: str | os.PathLike) -> np.ndarray:
+    """The table of vertices of a file, which has x, y and z.
+
+    Raises:
+        MivolError: as :func:`read_tables`; no vertices, or none with a place.
+    """
+    vertex = read_tables(path).get("vertex")
+    if vertex is None or any(name not in vertex.dtype.names for name in POSITION):
+        raise refusal(path, "no x, y, z of vertices", "a cloud of points", "convert the file")
+    return vertex
+
+
+def positions_of(vertex: np.ndarray) -> np.ndarray:
+    """(N, 3) x, y, z of a table of vertices."""
+    return np.stack([vertex[name] for name in POSITION], axis=1)
 
 
 def write_table(file: BinaryIO, table: np.ndarray, comment: str = "") -> None:

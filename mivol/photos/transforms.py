@@ -4,7 +4,7 @@ Conventions. ``transform_matrix`` is camera to world with our axes (:mod:`mivol.
 horizontal angle [radian]; focal lengths and principal points count pixels from the upper left corner, as COLMAP's do.
 ``train_filenames``, ``val_filenames`` and ``test_filenames`` divide the set; where there is a list to train on, what no list
 names is left alone, as are settings that only place a scene in another program's unit cube (``aabb_scale``, ``scale``,
-``offset``).
+``offset``). ``ply_file_path`` names points of a sparse reconstruction, in the frame of the cameras.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 
 from mivol.files.atomic import write_whole_text
+from mivol.files.ply import positions_of, read_vertices
 from mivol.files.source import read_bytes, refusal
 from mivol.photos.camera import Camera, intrinsics
 from mivol.photos.lens import Lens
@@ -59,7 +60,7 @@ def read_blender(path: Path) -> Listing:
     entries = []
     for name, split in SPLIT_FILES.items():
         if (path / name).is_file():
-            entries += _entries(path / name, split)
+            entries += _entries(path / name, _table(path / name), split)
     return Listing(entries)
 
 
@@ -67,10 +68,11 @@ def read_transforms(path: Path) -> Listing:
     """One JSON file, or the folder of a ``transforms.json``.
 
     Raises:
-        MivolError: no JSON, no frames, or a frame without file or transform.
+        MivolError: no JSON, no frames, a frame without file or transform, or points that it names and that are not there.
     """
     file = path / "transforms.json" if path.is_dir() else path
-    return Listing(_entries(file, "train"))
+    table = _table(file)
+    return Listing(_entries(file, table, "train"), _points(file, table))
 
 
 def write_transforms(path: Path, cameras: Mapping[str, Camera], test: Sequence[str] = ()) -> None:
@@ -105,7 +107,7 @@ def _described(camera: Camera) -> dict[str, Any]:
     return {**numbers, **lens, "transform_matrix": camera.to_world.tolist()}
 
 
-def _entries(file: Path, split: str) -> list[Entry]:
+def _table(file: Path) -> dict[str, Any]:
     try:
         table = json.loads(read_bytes(file))
     except (ValueError, RecursionError) as error:  # of JSON, of UTF-8, and of numbers of thousands of digits
@@ -113,8 +115,29 @@ def _entries(file: Path, split: str) -> list[Entry]:
     frames = table.get("frames") if isinstance(table, dict) else None
     if not isinstance(frames, list) or not frames:
         raise refusal(file, "no list of frames", "a key frames with one entry per photograph", "write it again")
+    return table
+
+
+def _points(file: Path, table: Mapping[str, Any]) -> np.ndarray | None:
+    """(N, 3) the points that a file of cameras names [length]; None where it names none."""
+    name = table.get("ply_file_path")
+    if not name:
+        return None
+    if not isinstance(name, str):
+        raise refusal(file, f"ply_file_path = {name!r}", "the name of a file", "correct it")
+    path = file.parent / slashed(file.parent, name)
+    if not path.is_file():
+        raise refusal(file, f"ply_file_path = {name!r}, which is not there", "a file of points", "add it, or remove the key")
+    points = np.asarray(positions_of(read_vertices(path)), np.float64)
+    if not np.isfinite(points).all():
+        number = int(np.argmin(np.isfinite(points).all(axis=1)))
+        raise refusal(path, f"point {number} at {points[number].tolist()}", "finite numbers", "remove this point")
+    return points
+
+
+def _entries(file: Path, table: Mapping[str, Any], split: str) -> list[Entry]:
     listed = _listed(file, table)
-    entries = [_entry(file, table, frame, number, split) for number, frame in enumerate(frames)]
+    entries = [_entry(file, table, frame, number, split) for number, frame in enumerate(table["frames"])]
     rest = UNLISTED if "train" in listed.values() else split
     return [dataclasses.replace(entry, split=listed.get(_place(file, entry.name), rest)) for entry in entries]
 

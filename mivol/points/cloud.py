@@ -27,7 +27,6 @@ from mivol.shown import briefly
 
 __all__ = ["CLOUD_READERS", "CLOUD_WRITERS", "PointCloud", "read_points", "write_points"]
 
-POSITION = ("x", "y", "z")
 COLOUR = ("red", "green", "blue")
 VLR_HEAD, EVLR_HEAD = 54, 60
 """Bytes of the head of a variable length record of LAS, and of an extended one (ASPRS LAS 1.4 R15, sections 2.5 and 2.7)."""
@@ -106,12 +105,9 @@ def write_points(path: str | os.PathLike, cloud: PointCloud) -> None:
 
 
 def _read_ply(path: Path) -> PointCloud:
-    vertex = ply.read_tables(path).get("vertex")
-    held = () if vertex is None else vertex.dtype.names
-    if any(name not in held for name in POSITION):
-        raise refusal(path, "no x, y, z of vertices", "a cloud of points", "convert the file")
-    positions = np.stack([vertex[name] for name in POSITION], axis=1)
-    if any(name not in held for name in COLOUR):
+    vertex = ply.read_vertices(path)
+    positions = ply.positions_of(vertex)
+    if any(name not in vertex.dtype.names for name in COLOUR):
         return PointCloud(positions)
     codes = np.stack([vertex[name] for name in COLOUR], axis=1)
     return PointCloud(positions, codes / 255 if codes.dtype == np.uint8 else codes)
@@ -169,9 +165,9 @@ def _check_records(path: Path) -> None:
 
 
 def _write_ply(file: BinaryIO, cloud: PointCloud) -> None:
-    fields = [(name, "<f4") for name in POSITION] + [(name, "u1") for name in (() if cloud.colours is None else COLOUR)]
+    fields = [(name, "<f4") for name in ply.POSITION] + [(name, "u1") for name in (() if cloud.colours is None else COLOUR)]
     table = np.empty(cloud.count, fields)
-    for name, column in zip(POSITION, cloud.positions.T, strict=True):
+    for name, column in zip(ply.POSITION, cloud.positions.T, strict=True):
         table[name] = column
     if cloud.colours is not None:
         for name, column in zip(COLOUR, cloud.colours.T, strict=True):

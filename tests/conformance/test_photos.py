@@ -284,6 +284,40 @@ def test_lists_of_splits_are_of_files_however_they_are_written(tmp_path: Path, p
     assert "4 photographs (2 train, 1 test, 1 in no list)" in survey_photos(folder).text
 
 
+PLY = "ply\nformat ascii 1.0\nelement vertex {}\n{}end_header\n{}"
+PLACES = "".join(f"property float {axis}\n" for axis in "xyz") + "property uchar red\n"
+
+
+def test_transforms_name_points_in_the_frame_of_their_cameras(tmp_path: Path) -> None:
+    """nerfstudio's ``ply_file_path``, written on Windows; without the key no points are known."""
+    points = np.random.default_rng(0).normal(size=(300, 3)).round(4)
+    folder = write_transforms(tmp_path / "set", {"fl_x": 20, "ply_file_path": "sparse\\sparse_pc.ply"})
+    (folder / "sparse").mkdir()
+    rows = "".join("{} {} {} 7\n".format(*point) for point in points)
+    (folder / "sparse" / "sparse_pc.ply").write_text(PLY.format(300, PLACES, rows))
+    found = survey_photos(folder)
+    np.testing.assert_array_equal(found.points, points.astype(np.float32))
+    assert "points" in found.box_from
+    assert survey_photos(write_transforms(tmp_path / "other", {"fl_x": 20})).points is None
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        (3, None, "transforms.json: found ply_file_path = 3"),
+        ("none.ply", None, "ply_file_path = 'none.ply', which is not there, expected a file of points; add it, or remove"),
+        ("a.ply", PLY.format(1, "property float x\n", "1\n"), "a.ply: found no x, y, z of vertices"),
+        ("a.ply", PLY.format(2, PLACES, "1 2 3 7\n1 nan 3 7\n"), "a.ply: found point 1 at .*nan"),
+    ],
+)
+def test_points_that_cannot_be_read_are_refused(tmp_path: Path, name: object, text: str | None, message: str) -> None:
+    folder = write_transforms(tmp_path / "set", {"fl_x": 20, "ply_file_path": name})
+    if text is not None:
+        (folder / str(name)).write_text(text)
+    with pytest.raises(MivolError, match=message):
+        survey_photos(folder)
+
+
 def test_names_of_another_system_are_found(tmp_path: Path) -> None:
     """A data set that was written on Windows: backslashes in frames and lists lead to the same files."""
     folder = write_transforms(tmp_path / "set", {"fl_x": 20, "test_filenames": ["images\\0002.png"]})
