@@ -13,8 +13,8 @@ References: Sloan 2008, 2013 (the basis of ``dr.sh_eval``); Fridovich-Keil, Yu e
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Any, Protocol
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, Protocol
 
 import drjit as dr
 import mitsuba as mi
@@ -52,7 +52,15 @@ class Source(Protocol):
     """Reads density and colour at the corners of cells, and takes their derivatives.
 
     What a ray carries from cell to cell is any PyTree, and belongs to the source: a ray starts with that of :meth:`start`.
+
+    Attributes:
+        gains_by_order: whether reads take so long that rays are worth sorting.
     """
+
+    gains_by_order: ClassVar[bool]
+
+    def of_lanes(self, which: mi.UInt32) -> Source:
+        """The source for these of its lanes, with the same derivative."""
 
     def start(self, slope: bool = False) -> Any:
         """What rays carry that have met no cell; ``slope``: for :meth:`add`."""
@@ -82,9 +90,14 @@ class Baked:
         slope: the derivative, laid out as ``table``; None where none is computed.
     """
 
+    gains_by_order: ClassVar[bool] = False
+
     table: mi.Float
     first: mi.UInt32
     slope: mi.Float | None = None
+
+    def of_lanes(self, which: mi.UInt32) -> Baked:
+        return replace(self, first=dr.gather(mi.UInt32, self.first, which))
 
     def start(self, slope: bool = False) -> list:
         return []
@@ -122,10 +135,16 @@ class Exact:
         slope: the derivative, laid out as ``table``; None where none is computed.
     """
 
+    gains_by_order: ClassVar[bool] = True
+
     field: SphericalGrid
     table: mi.Float
     basis: list[mi.Float]
     slope: mi.Float | None = None
+
+    def of_lanes(self, which: mi.UInt32) -> Exact:
+        dr.eval(self.basis)
+        return replace(self, basis=[dr.gather(mi.Float, y, which) for y in self.basis])
 
     def start(self, slope: bool = False) -> Face | Sums:
         return Sums() if slope else Face()
