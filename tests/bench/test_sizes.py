@@ -105,7 +105,7 @@ def test_sizes_are_those_of_the_published_figures(name: str) -> None:
 
 def test_what_is_promised():
     """Bars, and the media that they are measured in."""
-    assert STEP_BARS == {"camera": 8, "pixels": 4} and STOP == 1e-4
+    assert STEP_BARS == {"camera": 8, "pixels": 4, "any": 4} and STOP == 1e-4
     bars = {question: [light.bar for light in lights.values()] for question, (_, lights) in CONTESTS.items()}
     deep = {"deep smoke": [100, 100, 35], "deep fine smoke": [40, 20], "deep cloud": [80]}
     assert bars == {"smoke": [60, 30]} | deep and ALBEDO == 0.75

@@ -12,8 +12,8 @@ a made-up object, and the JSON says so). All are 128^3 nodes of harmonics of deg
 step: forward and backward, the same 65,536 rays for both, in turns; ratios of processor time (which other work on the machine
 moves least), with the clock's beside them. camera: the pixels of one view; pixels: drawn at random from 8 views, as the
 tutorial's loader draws them; any: random origins and directions. The first two share pinholes, so their harmonics are summed
-once a node and pinhole, and that is counted. Rays of the third share nothing; no photographs have such rays, and no bar is set
-for them: each reads 28 numbers at every corner, from anywhere in memory, and carries those of a face on to the next cell.
+once a node and pinhole, and that is counted. Rays of the third share nothing: each reads 28 numbers at every corner, from
+anywhere in memory, and carries those of a face on to the next cell; they are sorted first, which is counted.
 
 memory: the most that Dr.Jit held during a gradient step, for N and 4 N rays: what a ray costs is its own state.
 
@@ -59,7 +59,7 @@ QUESTIONS = {
     "priors": ask_priors,
 }
 
-STEP_BARS = {"camera": 8, "pixels": 4}
+STEP_BARS = {"camera": 8, "pixels": 4, "any": 4}
 """How many times the peer's rays a second there must be, for each order of the rays."""
 
 
@@ -92,11 +92,10 @@ def draw(answers: dict, folder: Path) -> None:
 def draw_step(axes: Axes, answer: dict) -> None:
     """How many times the peer's rays a second, for each order of the rays."""
     rows = np.arange(len(answer))[::-1]
-    for i, kind in enumerate(("camera", "pixels", "any")):
+    for i, (kind, bar) in enumerate(STEP_BARS.items()):
         ratios = [a[kind]["ratio_of_processor_time"] for a in answer.values()]
         axes.semilogx(ratios, rows, MARKERS[i], color=SERIES[i], label=f"{kind} rays" if kind != "pixels" else "random pixels")
-        if kind in STEP_BARS:
-            axes.axvline(STEP_BARS[kind], color=SERIES[i], linestyle="--", linewidth=1.2)
+        axes.axvline(bar, color=SERIES[i], linestyle="--", linewidth=1.2)
     axes.set(yticks=rows, yticklabels=list(answer), ylim=(-0.6, len(rows) + 0.5))
     axes.set(title="Rays a second over the peer's", xlabel="forward and backward (lines: the bars)")
     plain_ticks(axes.xaxis, "×")
