@@ -19,7 +19,7 @@ import numpy as np
 from mivol.files.source import read_bytes, reals, refusal
 from mivol.photos.camera import FLIP, Camera, intrinsics
 from mivol.photos.lens import Lens
-from mivol.photos.listing import Entry, Listing
+from mivol.photos.listing import Entry, Listing, check_points
 from mivol.photos.wide_lens import Fisheye
 
 __all__ = ["CAMERA_MODELS", "find_model", "read_colmap", "read_points3d", "rotation"]
@@ -105,7 +105,9 @@ def read_colmap(path: Path) -> Listing:
     read = READERS[suffix]
     sensors, poses = read.cameras(model / f"cameras{suffix}"), read.images(model / f"images{suffix}")
     points_file = model / f"points3D{suffix}"
-    points = _checked(read.points(points_file), points_file) if points_file.is_file() else None
+    points = read.points(points_file) if points_file.is_file() else None
+    if points is not None:
+        check_points(points.rows, points_file, "export the model again")
     seen = {} if points is None else points.seen_by()
     base = next((folder for folder in (path, *model.parents[:2]) if (folder / "images").is_dir()), path)
     file = model / f"images{suffix}"
@@ -140,13 +142,6 @@ def rotation(q: np.ndarray) -> np.ndarray:
             [2 * (x * z - w * y), 2 * (y * z + w * x), w * w - x * x - y * y + z * z],
         ]
     )
-
-
-def _checked(points: Points, file: Path) -> Points:
-    if not np.isfinite(points.rows).all():
-        number = int(np.argmin(np.isfinite(points.rows).all(axis=1)))
-        raise refusal(file, f"point {number} at {points.rows[number, :3].tolist()}", "finite numbers", "export the model again")
-    return points
 
 
 def _entry(base: Path, pose: Pose, sensors: dict[int, Sensor], file: Path, points: np.ndarray | None) -> Entry:

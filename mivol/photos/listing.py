@@ -8,9 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
+from mivol.files.source import refusal
 from mivol.photos.camera import Camera
 
-__all__ = ["UNLISTED", "Entry", "Listing"]
+__all__ = ["UNLISTED", "Entry", "Listing", "check_points"]
 
 UNLISTED = "in no list"
 """The split of photographs that a data set's own lists leave out."""
@@ -50,3 +51,14 @@ class Listing:
 
     entries: list[Entry]
     points: np.ndarray | None = None
+
+
+def check_points(rows: np.ndarray, file: Path, way_out: str) -> None:
+    """Refuse points (N, 3 or more) of which some number is not finite.
+
+    Raises:
+        MivolError: by the first of them.
+    """
+    if not np.isfinite(rows).all():
+        number = int(np.argmin(np.isfinite(rows).all(axis=1)))
+        raise refusal(file, f"point {number} at {rows[number, :3].tolist()}", "finite numbers", way_out)

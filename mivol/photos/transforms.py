@@ -25,7 +25,7 @@ from mivol.files.ply import positions_of, read_vertices
 from mivol.files.source import read_bytes, refusal
 from mivol.photos.camera import Camera, intrinsics
 from mivol.photos.lens import Lens
-from mivol.photos.listing import UNLISTED, Entry, Listing
+from mivol.photos.listing import UNLISTED, Entry, Listing, check_points
 from mivol.photos.picture import SUFFIXES
 from mivol.photos.wide_lens import Fisheye, Panorama
 
@@ -129,9 +129,7 @@ def _points(file: Path, table: Mapping[str, Any]) -> np.ndarray | None:
     if not path.is_file():
         raise refusal(file, f"ply_file_path = {name!r}, which is not there", "a file of points", "add it, or remove the key")
     points = np.asarray(positions_of(read_vertices(path)), np.float64)
-    if not np.isfinite(points).all():
-        number = int(np.argmin(np.isfinite(points).all(axis=1)))
-        raise refusal(path, f"point {number} at {points[number].tolist()}", "finite numbers", "remove this point")
+    check_points(points, path, "remove this point")
     return points
 
 
