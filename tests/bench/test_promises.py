@@ -42,8 +42,8 @@ RADIANCE_FIELD = {
     "priors": ({}, []),
     "fit": ({"fog": {"ratio": 9.0}, "shell": {"ratio": 10.0}}, [(9, "at least", 10, False), (10, "at least", 10, True)]),
     "step": (
-        {"fog": {"camera": {"ratio_of_processor_time": 7.0}, "pixels": {"ratio_of_processor_time": 5.0}}},
-        [(7, "at least", 8, False), (5, "at least", 4, True)],
+        {"fog": {kind: {"ratio_of_processor_time": r} for kind, r in (("camera", 7.0), ("pixels", 5.0), ("any", 3.0))}},
+        [(7, "at least", 8, False), (5, "at least", 4, True), (3, "at least", 4, False)],
     ),
 }
 
