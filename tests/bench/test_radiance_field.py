@@ -227,7 +227,7 @@ def test_every_question_is_answered(variant_rgb: str, tmp_path: Path) -> None:
     # Seconds of a machine that is as fast as this one are those of its threads.
     threads, rate = dr.thread_count(), found["walk_rays_per_second"]
     assert found["seconds"] == pytest.approx(found["processor_seconds"] / threads * rate / 25e6)
-    assert len(answers.pop("bars")) == 1 + 2 + 1
+    assert len(answers.pop("bars")) == 3 + 1 + 1
     BENCH.draw(answers, tmp_path)
     assert (tmp_path / "bench_radiance_field.png").read_bytes().startswith(b"\x89PNG")
 
