@@ -33,8 +33,9 @@ __all__ = ["Twin"]
 ABOVE, LEAST, MOST = 1.1, 0.25, 0.95
 """The majorant over the largest extinction; bounds of P."""
 
-SELDOM = 0.4
-"""Collisions [1/length] that happen where nothing is: each more of them would let weights grow."""
+SELDOM = 0.2
+"""Collisions [1/length] that happen where nothing is: each more of them would let weights grow. (Glass whose box has an empty
+half, unlimited depth, in which light is caught by reflection: an estimate's standard deviation is 4 % at 0.4, 1 % below.)"""
 
 FAINTEST = 0.5
 """Largest extinction for which the majorant is chosen, at least [1/length]: where nothing is, P needs collisions to happen."""
