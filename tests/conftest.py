@@ -145,6 +145,12 @@ def artefacts(request: pytest.FixtureRequest) -> Path:
     return folder
 
 
+@pytest.fixture
+def whole_paths(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Derivatives replay the very paths of a picture, or of forward derivatives, of their seed: paths have no branches."""
+    monkeypatch.setattr("mivol.scene.plan.choose_branches", lambda *_: (False, []))
+
+
 @pytest.fixture(autouse=True)
 def _same_threads() -> Iterator[None]:
     """Forget how many threads a test asked for: with one left over, Mitsuba waits for ever for a second, to read an EXR."""

@@ -12,6 +12,7 @@ from mivol.transport.path.settings import Settings
 __all__ = [
     "SKIP_BELOW",
     "Choice",
+    "choose_branches",
     "choose_channels",
     "choose_emission",
     "choose_events",
@@ -243,6 +244,14 @@ def choose_successive(needs: Needs, settings: Settings, segment: str) -> tuple[i
         return 1, [Choice(about, "one path each", "the sampler has numbers for one path a lane")]
     many = f"up to {SUCCESSIVE} paths one after the other"
     return SUCCESSIVE, [Choice(about, many, "their lengths differ, and lanes would wait for the longest of their neighbours")]
+
+
+def choose_branches(needs: Needs, settings: Settings, segment: str) -> tuple[bool, list[Choice]]:
+    """Whether paths branch where they first collide, for derivatives."""
+    if segment != "free_flight" or settings.scatterings < 1 or not needs.are_samples_independent:
+        return False, []
+    why = "most noise of derivatives is that of paths that collide, and few camera rays may do so"
+    return True, [Choice("derivatives", "paths branch where they first collide", why)]
 
 
 def choose_media_light(needs: Needs, settings: Settings) -> tuple[bool, list[Choice]]:

@@ -13,6 +13,7 @@ from mivol.machine import available_memory
 from mivol.scene.choices import (
     SKIP_BELOW,
     Choice,
+    choose_branches,
     choose_channels,
     choose_emission,
     choose_events,
@@ -61,7 +62,8 @@ class Plan:
     :data:`mivol.transport.path.estimators.SEGMENT_ESTIMATORS`; ``events`` how many points of a camera ray scatter in
     pictures; ``pass_rays`` how many rays a pass may hold; ``gradient_bytes`` what a gradient step takes beyond the rays;
     ``lobe`` the mean cosine of the lobe that side flights are drawn from, None for no side flights; ``draws_emission`` whether
-    light that media emit is drawn where paths scatter; ``successive`` how many paths a lane walks one after the other, at most.
+    light that media emit is drawn where paths scatter; ``successive`` how many paths a lane walks one after the other, at most;
+    ``branches`` whether paths branch at their first collision for derivatives.
     """
 
     choices: tuple[Choice, ...]
@@ -74,6 +76,7 @@ class Plan:
     lobe: float | None = None
     draws_emission: bool = False
     successive: int = 1
+    branches: bool = False
 
 
 def make_plan(needs: Needs, settings: Settings, aovs: tuple[str, ...] = ()) -> Plan:
@@ -120,7 +123,9 @@ def make_plan(needs: Needs, settings: Settings, aovs: tuple[str, ...] = ()) -> P
     choices += why
     successive, why = choose_successive(needs, settings, segment)
     choices += why
-    return Plan(tuple(choices), skips, tracks, segment, events, pass_rays, memory, lobe, draws_emission, successive)
+    branches, why = choose_branches(needs, settings, segment)
+    choices += why
+    return Plan(tuple(choices), skips, tracks, segment, events, pass_rays, memory, lobe, draws_emission, successive, branches)
 
 
 def _segment(needs: Needs, settings: Settings) -> str:

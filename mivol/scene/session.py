@@ -22,6 +22,7 @@ from mivol.scene.refusals import check_aovs
 from mivol.scene.sensors import check_film, find_sensor
 from mivol.scene.survey import SceneSurvey, survey_scene
 from mivol.transport.line_integrals.aovs import integrate_aovs, jvp_aovs, vjp_aovs
+from mivol.transport.path.branches import replay_branches
 from mivol.transport.path.estimators import Estimators
 from mivol.transport.path.film import CameraRays, RenderSamples, adjoint_rays, record
 from mivol.transport.path.level import prepare_derivatives
@@ -114,7 +115,7 @@ class Session:
             # only once.
             with dr.isolate_grad():
                 for rays, dL, daovs in adjoint_rays(samples, self.aovs, grad_in):
-                    self._replay(estimators, rays, dL, daovs)
+                    self._replay(estimators, rays, dL, daovs, plan.branches)
                     dr.eval()
             with dr.resume_grad():
                 media.deliver_gradients()
@@ -159,15 +160,24 @@ class Session:
         score, _ = walk_path(estimators, self.settings, rays.sampler, rays.ray, score, strata=rays.strata)
         return score.dL, dr.zeros(mi.Float, dr.width(black)), jvp_aovs(estimators.media, rays.ray, self.aovs)
 
-    def _replay(self, estimators: Estimators, rays: CameraRays, dL: mi.Spectrum, daovs: list[mi.Float]) -> None:
+    def _replay(
+        self, estimators: Estimators, rays: CameraRays, dL: mi.Spectrum, daovs: list[mi.Float], branches: bool
+    ) -> None:
         prepare_derivatives(estimators, self.settings, rays.ray, rays.on_film)
+        # Branches are counted, which a recording of Dr.Jit cannot do.
+        if branches and not dr.flag(dr.JitFlag.FreezingScope):
+            replay_branches(estimators, self.settings, rays, dL)
+        else:
+            self._replay_whole(estimators, rays, dL)
+        vjp_aovs(estimators.media, rays.ray, self.aovs, daovs)
+
+    def _replay_whole(self, estimators: Estimators, rays: CameraRays, dL: mi.Spectrum) -> None:
         again, L = rays.sampler.clone(), None
         if not is_straight(estimators, self.settings):
             known = Primal(_black(rays.ray))
             L = walk_path(estimators.replayed(), self.settings, rays.sampler, rays.ray, known, strata=rays.strata)[0].L
             dr.eval(L)
         walk_path(estimators, self.settings, again, rays.ray, Replay(L, dL), strata=rays.strata)
-        vjp_aovs(estimators.media, rays.ray, self.aovs, daovs)
 
 
 def _sensor_with_room(scene: mi.Scene, sensor: int | mi.Sensor) -> mi.Sensor:

@@ -21,6 +21,7 @@ from mivol.transport.estimators.segment import PICTURE, Collision
 from mivol.transport.media.coefficients import medium_interaction
 from mivol.transport.path.estimators import Estimators
 from mivol.transport.path.side_flight import SideSamples, fly_aside, weigh_aim
+from mivol.transport.traversal.random_numbers import draw_state
 from mivol.validate.moments import Moments
 from scenes import ball_of, camera, media_of, medium
 
@@ -54,7 +55,7 @@ def test_light_at_the_end_of_a_side_flight():
     estimators, hit = middle()
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(fresh(1), N)
-    samples = SideSamples(sampler.next_2d(), (sampler.next_1d(), sampler.next_1d()), None)
+    samples = SideSamples(sampler.next_2d(), (sampler.next_1d(), draw_state(sampler)), None)
     with dr.suspend_grad():
         aim = DistantAim.of(estimators.direct.aim(hit.mei, mi.Point2f(0.5), hit.on))
         found = fly_aside(

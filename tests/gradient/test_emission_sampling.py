@@ -63,7 +63,7 @@ def _forward(scene: mi.Scene, key: str, v: np.ndarray | float, spp: int, seed: i
 
 
 @pytest.mark.parametrize(("name", "what"), CASES)
-def test_forward_is_the_transpose_of_reverse(name: str, what: str) -> None:
+def test_forward_is_the_transpose_of_reverse(name: str, what: str, whole_paths: None) -> None:
     """<J v, w> = <v, J^T w> of one seed: both are sums of the same terms in another order, in float32."""
     scene, key, integrator = seen(name), KEYS[name, what], drawn(3)
     w, v, seed = np.random.default_rng(1).uniform(0.5, 1.5, (8, 8, 3)), _step(scene, key), fresh(5)

@@ -21,7 +21,7 @@ from mivol.bench.gradients.subject import Subject
 from mivol.bench.gradients.twin import Twin
 from mivol.bench.scenes import box_scene, constant_light
 from mivol.scene import plan
-from mivol.transport.estimators.flight_derivatives import Probes
+from mivol.transport.estimators.flight_derivatives import Probe, Probes
 from mivol.transport.estimators.segment import FlightPoint, PathSegment
 from mivol.transport.media.even_point import EvenPoint
 from mivol.transport.traversal.fine_ray import FineRay
@@ -127,7 +127,7 @@ PARAMETERS = {
 
 @pytest.mark.parametrize("colour", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["grey", "rgb"])
 @pytest.mark.parametrize("name", small.cases(PARAMETERS, slow=("g", "scale", "floor", "emitter")))
-def test_forward_is_the_transpose_of_reverse(name, colour):
+def test_forward_is_the_transpose_of_reverse(name, colour, whole_paths):
     """<J v, w> = <v, J^T w> of one seed: both are sums of the same terms in another order, in float32."""
     scene, key = _everything(colour), PARAMETERS[name]
     integrator = mi.load_dict(mivol(max_depth=5, rr_depth=3))
@@ -243,7 +243,7 @@ def test_probes_are_kept_in_proportion_to_their_gain():
         point = EvenPoint(dr.full(mi.Float64, t, n), dr.full(mi.Float, 1, n), zero, found)
         return probes.offer(segment, FlightPoint(point, dr.full(mi.Spectrum, gain, n), (dr.arange(mi.Float, n) + 0.5) / n))
 
-    probes = offered(Probes.none(ray), 7.0, 2.0, 0)
+    probes = offered(Probes(Probe.none(ray), Probe.none(ray)), 7.0, 2.0, 0)
     for t, gain, *lanes in ((1.0, 1.0), (2.0, 3.0), (3.0, 100.0, never), (4.0, 100.0, on, never)):
         probes = offered(probes, t, gain, 1, *lanes)
     assert np.all(np.array(probes.first.t) == 7) and np.all(np.array(probes.first.total) == 2)
@@ -268,7 +268,7 @@ def _in_the_sun() -> mi.Scene:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["density", "albedo", "g", "emitter"])
-def test_of_side_flights_forward_is_the_transpose_of_reverse(name):
+def test_of_side_flights_forward_is_the_transpose_of_reverse(name, whole_paths):
     """As above, to the same bound."""
     scene, key, integrator = _in_the_sun(), OF_A_SUN[name], mi.load_dict(mivol(max_depth=4))
     w = np.random.default_rng(1).uniform(0.5, 1.5, (8, 8, 3))
@@ -281,7 +281,7 @@ def test_of_side_flights_forward_is_the_transpose_of_reverse(name):
     )
 
 
-def test_of_side_flights_light_is_linear_in_a_sky():
+def test_of_side_flights_light_is_linear_in_a_sky(whole_paths):
     """The derivative along the sky itself is the picture of the same seed, to float32 sums in another order."""
     light = np.random.default_rng(3).uniform(0.1, 1, (8, 16, 3)).astype(np.float32)
     light[2, 5] = 200

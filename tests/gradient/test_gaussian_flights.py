@@ -68,7 +68,7 @@ def forward(scene: mi.Scene, v: dict[str, np.ndarray], spp: int, seed: int, inte
 
 
 @pytest.mark.slow
-def test_forward_is_the_transpose_of_reverse() -> None:
+def test_forward_is_the_transpose_of_reverse(whole_paths: None) -> None:
     """<J v, w> = <v, J^T w> of one seed: both are sums of the same terms in another order, in float32."""
     scene = close_up(parts(0.8, bulb=point([1.7, -0.6, 2.4])[0], sky=scenes.sky(0.3)), res=8)
     integrator, seed = mi.load_dict(mivol(max_depth=5, rr_depth=3)), fresh(5)

@@ -128,7 +128,7 @@ def backward(found: mi.Scene, values: dict, weight: np.ndarray, depth: int, spp:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("nested", [False, True])
-def test_forward_is_the_transpose_of_reverse(nested: bool) -> None:
+def test_forward_is_the_transpose_of_reverse(nested: bool, whole_paths: None) -> None:
     """<J v, w> = <v, J^T w> of one seed: both are sums of the same terms in another order, in float32."""
     found, rng, seed = scene(0.8, nested), np.random.default_rng(1), fresh(7)
     values, w = followed(found), rng.uniform(0.5, 1.5, (SIDE, SIDE, 3))

@@ -136,7 +136,7 @@ class DirectLighting:
         return EmitterAim(direct, weight, direct.emitter, u, 1, True)
 
     def at_vertex(
-        self, vertex: Vertex, aim: EmitterAim, attached: bool, active: mi.Bool, chance: mi.Float | None = None
+        self, vertex: Vertex, aim: EmitterAim, attached: bool, active: mi.Bool, rng: mi.UInt32 | None = None
     ) -> DirectSample:
         """Estimate direct light at a vertex of a path by one emitter sample; the path's next segment is the other sample.
 
@@ -145,11 +145,10 @@ class DirectLighting:
             aim: the emitter sample.
             attached: keep the derivatives of BSDF or phase function, and emitter.
             active: lanes to estimate.
-            chance: a number in [0, 1) that estimates the shadow; None for an exact one.
+            rng: of the tracker that estimates the shadow; None for an exact one.
 
         Bias: none. Variance: that of one emitter sample. Cost: one shadow ray.
         """
-        rng = None if chance is None else seed_pcg32(chance, dr.width(active))
         return self._emitter_sample(vertex, aim, attached, active, rng)
 
     def in_medium(

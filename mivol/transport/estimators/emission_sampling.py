@@ -29,7 +29,7 @@ from mivol.transport.media.coefficients import emission_slope, eval_emission
 from mivol.transport.media.ray_intervals import RaySegment
 from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.traversal.fine_ray import FineRay, Ray
-from mivol.transport.traversal.random_numbers import draw_pcg32, seed_pcg32
+from mivol.transport.traversal.random_numbers import draw_pcg32
 
 __all__ = ["EmissionLight", "EmissionSampling", "EmittingPoint"]
 
@@ -58,14 +58,20 @@ class EmissionSampling:
         return dr.select(on, power_heuristic(rival, self.table.look(last.p, d, on).pdf), 1)
 
     def at_vertex(
-        self, vertex: Vertex, carried: mi.Spectrum, u: mi.Point2f, attached: bool, active: mi.Bool, estimates: bool
+        self,
+        vertex: Vertex,
+        carried: mi.Spectrum,
+        samples: tuple[mi.Float, mi.UInt32],
+        attached: bool,
+        active: mi.Bool,
+        estimates: bool,
     ) -> EmissionLight:
         """Estimate the light of media at a vertex of a path by one point of them.
 
         Args:
             vertex: the point of the path.
             carried: throughput to there, times the albedo in a medium.
-            u: of the cell that is aimed at, and the seed of all other numbers.
+            samples: the number of the cell that is aimed at, and the generator of all others.
             attached: keep the derivatives of BSDF or phase function and emission.
             active: lanes to estimate.
             estimates: whether the shadow is estimated.
@@ -73,8 +79,9 @@ class EmissionSampling:
         Bias: none. Variance: that of one point. Cost: one shadow ray, and a walk of the table.
         """
         media, it = self.media, vertex.interaction
-        rng, (*place, along, chance) = draw_pcg32(seed_pcg32(u.y, dr.width(active)), 5)
-        d = dr.normalize(self.table.draw_place(u.x, place) - it.p)
+        u, rng = samples
+        rng, (*place, along, chance) = draw_pcg32(rng, 5)
+        d = dr.normalize(self.table.draw_place(u, place) - it.p)
         line = self.table.draw_along(it.p, d, along, active)
         f = dr.detach(vertex.eval(d, active))
         on = active & (line.pdf > 0) & (line.density > 0) & dr.any(f != 0)

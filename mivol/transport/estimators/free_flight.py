@@ -50,10 +50,10 @@ from mivol.transport.media.optical_depth import sum_optical_depth
 from mivol.transport.media.ray_intervals import MediumInterval, MediumVisitor, RaySegment, revisit_media, visit_media
 from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.traversal.fine_ray import Ray, point_along
-from mivol.transport.traversal.random_numbers import draw_pcg32, seed_pcg32
+from mivol.transport.traversal.random_numbers import LaneSampler, draw_pcg32, draw_state
 from mivol.transport.traversal.strata import Strata
 
-__all__ = ["FreeFlight"]
+__all__ = ["FreeFlight", "collision_at"]
 
 
 @dataclass
@@ -91,9 +91,11 @@ class FreeFlight:
         self.media = media
         self.level: Level | None = None
 
-    def draw(self, sampler: mi.Sampler, active: mi.Bool, strata: Strata | None) -> tuple[mi.Float, mi.Float]:
-        """The number of the flight, and one that seeds the generator of all others: in every lane, since all of them fly."""
-        return sampler.next_1d(), sampler.next_1d()
+    def draw(
+        self, sampler: mi.Sampler | LaneSampler, active: mi.Bool, strata: Strata | None
+    ) -> tuple[mi.Float, mi.UInt32]:
+        """The number of the flight, and the generator of all others: in every lane, since all of them fly."""
+        return sampler.next_1d(), draw_state(sampler)
 
     def prepare_derivatives(self, ray: mi.Ray3f) -> None:
         """The level b is found by the path, which knows how to estimate radiance."""
@@ -104,8 +106,8 @@ class FreeFlight:
 
     def estimate(self, segment: PathSegment, purpose: str, active: mi.Bool) -> SegmentEstimate:
         media, ray, width = self.media, segment.ray, dr.width(segment.ray)
-        u, seed = segment.samples
-        rng, (pick, at_emission, at_probe, chance) = draw_pcg32(seed_pcg32(seed, width), 4)
+        u, rng = segment.samples
+        rng, (pick, at_emission, at_probe, chance) = draw_pcg32(rng, 4)
         channel = _draw_channel(segment.beta, pick) if media.channels > 1 else mi.UInt32(0)
         start = _Flight(dr.full(mi.Float64, dr.inf, width), dr.zeros(mi.UInt32, width), rng)
         end, flight = visit_media(media, ray, segment.medium, _fly(media, ray, u, channel), start, active)
@@ -115,7 +117,7 @@ class FreeFlight:
         if media.is_bounded:
             # Derivatives of depths that are not known are looked at in one point of the flight.
             _, (passed.u,) = draw_pcg32(flight.rng, 1)
-        collision = self._collision(ray, flight, collides)
+        collision = collision_at(media, ray, flight.t, flight.body, collides)
         weight = self._weigh(segment, passed, active, collision)
         emitting = [body for body in media.bodies if body.view.emits and not body.view.shows_gaussians]
         emission = self._point_of(segment, passed, emitting, at_emission, chance, active) if emitting else None
@@ -129,25 +131,6 @@ class FreeFlight:
         light = SegmentLight(shared, shared.emitted, is_replayed=True)
         probe = self._point_of(segment, passed, media.bodies, at_probe, chance, active) if purpose != PICTURE else None
         return SegmentEstimate(end, weight, light, SegmentTransmittance(shared), collision, probe)
-
-    def _collision(self, ray: Ray, flight: _Flight, collides: mi.Bool) -> Collision:
-        """The point of a collision, and its albedo."""
-        t, albedo = dr.select(collides, flight.t, 0), mi.Spectrum(0)
-        mei = medium_interaction(ray, t)
-        mei.medium = self.media.medium_of(flight.body, collides)
-        for body, here in self.media.bodies_at(flight.body, collides):
-            albedo = dr.select(here, self._albedo(body, ray, flight.t, mei, here), albedo)
-        return Collision(mei, point_along(ray, t), albedo, collides, flight.t, flight.body)
-
-    def _albedo(self, body: Body, ray: Ray, t: mi.Float64, mei: mi.MediumInteraction3f, on: mi.Bool) -> mi.Spectrum:
-        """sigma_s / sigma_t at a point of a body."""
-        if body.view.albedo is not None:
-            return dr.detach(eval_albedo(body, mei, on))
-        sigma_s, sigma_t = (self._extinction(body, ray, t, on, name) for name in ("sigma_s", "sigma_"))
-        return dr.select(sigma_t > 0, sigma_s / dr.select(sigma_t > 0, sigma_t, 1), 0)
-
-    def _extinction(self, body: Body, ray: Ray, t: mi.Float64, on: mi.Bool, name: str = "sigma_") -> mi.Spectrum:
-        return spectrum(body.extinction_at(ray, dr.select(on, t, 0), self.media.channels, on, name))
 
     def _weigh(self, segment: PathSegment, passed: RaySegment, active: mi.Bool, collision: Collision | None) -> mi.Spectrum:
         """The value of each channel's flight over the mean density of all of them, weighed by their throughputs.
@@ -167,7 +150,7 @@ class FreeFlight:
         value = spectrum([dr.exp(least - row) for row in tau])
         hits = [] if collision is None else self.media.bodies_at(collision.body, collision.on)
         for body, here in hits:
-            value = dr.select(here, value * self._extinction(body, segment.ray, collision.t, here), value)
+            value = dr.select(here, value * _extinction(self.media, body, segment.ray, collision.t, here), value)
         shares = _shares(segment.beta)
         density = sum((p * v for p, v in zip(shares, colours(value), strict=True)), mi.Float(0))
         return dr.select(density > 0, value / dr.select(density > 0, density, 1), 0)
@@ -180,6 +163,28 @@ class FreeFlight:
         front = RaySegment.upto(segment.ray, segment.medium, dr.select(point.on, point.t, 0))
         gain = segment.beta * self._weigh(segment, front, point.on, None) * point.length
         return FlightPoint(point, gain, chance)
+
+
+def collision_at(media: SceneMedia, ray: Ray, t: mi.Float64, body: mi.UInt32, on: mi.Bool) -> Collision:
+    """The collision of a ray with the medium of a number, at a distance [length] that counts where lanes are ``on``."""
+    at, albedo = dr.select(on, t, 0), mi.Spectrum(0)
+    mei = medium_interaction(ray, at)
+    mei.medium = media.medium_of(body, on)
+    for other, here in media.bodies_at(body, on):
+        albedo = dr.select(here, _albedo(media, other, ray, t, mei, here), albedo)
+    return Collision(mei, point_along(ray, at), albedo, on, t, body)
+
+
+def _albedo(media: SceneMedia, body: Body, ray: Ray, t: mi.Float64, mei: mi.MediumInteraction3f, on: mi.Bool) -> mi.Spectrum:
+    """sigma_s / sigma_t at a point of a body."""
+    if body.view.albedo is not None:
+        return dr.detach(eval_albedo(body, mei, on))
+    sigma_s, sigma_t = (_extinction(media, body, ray, t, on, name) for name in ("sigma_s", "sigma_"))
+    return dr.select(sigma_t > 0, sigma_s / dr.select(sigma_t > 0, sigma_t, 1), 0)
+
+
+def _extinction(media: SceneMedia, body: Body, ray: Ray, t: mi.Float64, on: mi.Bool, name: str = "sigma_") -> mi.Spectrum:
+    return spectrum(body.extinction_at(ray, dr.select(on, t, 0), media.channels, on, name))
 
 
 def _fly(media: SceneMedia, ray: Ray, u: mi.Float, channel: mi.UInt32) -> MediumVisitor:

@@ -49,11 +49,11 @@ class Aim:
 
 @dataclass
 class SideSamples:
-    """The random numbers of a side flight: of the lobe, of the flight, and of the shadow at its end."""
+    """The random numbers of a side flight: of the lobe, of the flight, and the generator of the shadow at its end."""
 
     lobe: mi.Point2f
-    flight: tuple[mi.Float, mi.Float]
-    chance: mi.Float | None
+    flight: tuple[mi.Float, mi.UInt32]
+    shadow: mi.UInt32 | None
 
 
 class SideLight(TrackedTerm):
@@ -133,7 +133,7 @@ def fly_aside(
     there = flown.collision
     on = active & there.on
     end = MediumVertex(media, there.mei, there.place)
-    direct = estimators.direct.at_vertex(end, aim.seen_from(there.mei), attached, on, samples.chance)
+    direct = estimators.direct.at_vertex(end, aim.seen_from(there.mei), attached, on, samples.shadow)
     with dr.resume_grad(when=attached):
         if attached:
             f = vertex.eval(wo, active)

@@ -17,7 +17,7 @@ References: radiative backpropagation by replaying paths: Vicini et al. 2021.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
 import drjit as dr
@@ -26,6 +26,7 @@ import mitsuba as mi
 from mivol.transport.estimators.contribution import TrackedTerm
 from mivol.transport.estimators.direct_lighting import DirectLight, DistantAim
 from mivol.transport.estimators.flight_derivatives import Probe, Probes, ProbeTerm
+from mivol.transport.estimators.free_flight import collision_at
 from mivol.transport.estimators.multiple_importance import power_heuristic
 from mivol.transport.estimators.segment import PICTURE, Collision, PathSegment
 from mivol.transport.estimators.shadow_reservoir import ShadowReservoir, ShadowTerm
@@ -38,11 +39,22 @@ from mivol.transport.path.settings import Settings
 from mivol.transport.path.side_flight import Aim, SideSamples, fly_aside, weigh_aim
 from mivol.transport.path.turn import TurnSamples, sample_turn
 from mivol.transport.traversal.fine_ray import FineRay, Ray, point_along
-from mivol.transport.traversal.random_numbers import LaneSampler
+from mivol.transport.traversal.random_numbers import LaneSampler, draw_state
 from mivol.transport.traversal.ray_spawning import camera_ray
 from mivol.transport.traversal.strata import Strata
 
-__all__ = ["Path", "alpha_of", "is_straight", "leave_camera", "start_path", "step", "walk_path"]
+__all__ = [
+    "Landing",
+    "Path",
+    "alpha_of",
+    "is_straight",
+    "leave_camera",
+    "start_path",
+    "step",
+    "walk_branch",
+    "walk_path",
+    "walk_stem",
+]
 
 Score = TypeVar("Score", Primal, Replay, Tangent)
 
@@ -106,6 +118,25 @@ class Path:
     rival: mi.Float | None = None
 
 
+@dataclass
+class Landing:
+    """Where paths have first collided, on their first segment.
+
+    Attributes:
+        ray: of the camera.
+        t: distance of the collision [length].
+        body: index of the medium.
+        beta: throughput to there.
+        on: lanes that have collided.
+    """
+
+    ray: FineRay
+    t: mi.Float64
+    body: mi.UInt32
+    beta: mi.Spectrum
+    on: mi.Bool
+
+
 def walk_path(
     estimators: Estimators,
     settings: Settings,
@@ -132,24 +163,97 @@ def walk_path(
     Bias: that of the segment estimator. Variance: none at depth 1 beyond the pixel's own; at surfaces, that of emitter and BSDF
     samples.
     """
-    media = estimators.media
-    path = start_path(estimators, camera_ray(ray), score, sampler, strata, mi.Bool(active) & (_limit(settings) > 0))
-    path = leave_camera(estimators, settings, path, media.medium_at(ray))
+    path = _begin(estimators, settings, sampler, ray, score, active, strata)
     if is_straight(estimators, settings):
         path, event = _follow_segment(estimators, settings, path)
         path = _add_emission(estimators, settings, path, event)
         path.stopped |= event.at_surface
         return path.score, alpha_of(path)
-    if estimators.segment.ends_in_media and score.purpose != PICTURE:
-        path.probes = Probes.none(ray)
-        path.shadow = ShadowReservoir.empty(media, ray)
-    path = _walk_on(estimators, settings, path)
-    if path.shadow is not None:
-        path.score = path.score.add(ShadowTerm(media, path.shadow))
-    if path.probes is not None:
-        for probe in (path.probes.first, path.probes.later):
-            path.score = path.score.add(_estimate_probe(estimators, settings, probe, sampler))
+    path = _add_kept(estimators, settings, _walk_on(estimators, settings, _keep_some(estimators, path, "first", "later")))
     return path.score, alpha_of(path)
+
+
+def walk_stem(
+    estimators: Estimators, settings: Settings, sampler: mi.Sampler, ray: Ray, score: Score
+) -> tuple[Score, Landing]:
+    """Walk a path from the camera, but no further than to a collision on its first segment.
+
+    Args:
+        estimators: whose segments end in media; the rest as of :func:`walk_path`.
+
+    Returns:
+        The score, and where such paths have collided: :func:`walk_branch` walks them on from there.
+    """
+    goes_on = estimators.media.has_surfaces
+    kept = ("first", "later") if goes_on else ("first",)
+    path = _keep_some(estimators, _begin(estimators, settings, sampler, ray, score), *kept)
+    path, event = _follow_segment(estimators, settings, path)
+    path = _add_emission(estimators, settings, path, event)
+    hit = event.collision
+    landing = Landing(path.ray, hit.t, hit.body, mi.Spectrum(path.beta), hit.on)
+    if goes_on:
+        beside = replace(event, collision=replace(hit, on=dr.full(mi.Bool, False, dr.width(ray))))
+        path = _walk_on(estimators, settings, _scatter(estimators, settings, path, beside))
+    return _add_kept(estimators, settings, path).score, landing
+
+
+def walk_branch(
+    estimators: Estimators, settings: Settings, sampler: LaneSampler, landing: Landing, score: Score
+) -> tuple[Score, mi.UInt32]:
+    """Walk a path on from where it first collided, to its end.
+
+    Args:
+        estimators, settings, score: as of :func:`walk_path`.
+        sampler: independent of the path to there.
+        landing: where the path collided.
+
+    Returns:
+        The score, and how often the path has scattered.
+    """
+    path = start_path(estimators, landing.ray, score, sampler, None, mi.Bool(landing.on))
+    path.beta = mi.Spectrum(landing.beta)
+    path = _aim_first(estimators, _keep_some(estimators, path, "later"))
+    hit = collision_at(estimators.media, landing.ray, landing.t, landing.body, landing.on)
+    path = _walk_on(estimators, settings, _scatter(estimators, settings, path, _in_medium(hit, sampler.next_1d())))
+    return _add_kept(estimators, settings, path).score, path.depth
+
+
+def _begin(
+    estimators: Estimators,
+    settings: Settings,
+    sampler: mi.Sampler,
+    ray: Ray,
+    score: Score,
+    active: mi.Bool = True,
+    strata: Strata | None = None,
+) -> Path:
+    """A path that leaves the camera."""
+    path = start_path(estimators, camera_ray(ray), score, sampler, strata, mi.Bool(active) & (_limit(settings) > 0))
+    return leave_camera(estimators, settings, path, estimators.media.medium_at(ray))
+
+
+def _keep_some(estimators: Estimators, path: Path, *which: str) -> Path:
+    """For derivatives of paths that scatter in media, a path that keeps some of its points and shadow rays.
+
+    Args:
+        which: "first": a point before it scatters; "later": another one, and a shadow ray, after that.
+    """
+    if not estimators.segment.ends_in_media or path.score.purpose == PICTURE:
+        return path
+    path.probes = Probes(*(Probe.none(path.ray) if name in which else None for name in ("first", "later")))
+    if "later" in which:
+        path.shadow = ShadowReservoir.empty(estimators.media, path.ray)
+    return path
+
+
+def _add_kept(estimators: Estimators, settings: Settings, path: Path) -> Path:
+    """Add the derivatives that kept points and shadow rays find, at the end of a path."""
+    if path.shadow is not None:
+        path.score = path.score.add(ShadowTerm(estimators.media, path.shadow))
+    if path.probes is not None:
+        for probe in path.probes.kept:
+            path.score = path.score.add(_estimate_probe(estimators, settings, probe, path.sampler))
+    return path
 
 
 def start_path(
@@ -185,6 +289,11 @@ def leave_camera(estimators: Estimators, settings: Settings, path: Path, medium:
     """A path that was started, as it leaves a camera in a medium."""
     path.stopped |= not settings.hide_emitters and estimators.media.scene.environment() is not None
     path.medium = medium
+    return _aim_first(estimators, path)
+
+
+def _aim_first(estimators: Estimators, path: Path) -> Path:
+    """Draw the emitter sample of the first vertex, where vertices are given theirs beforehand."""
     if estimators.lobe is not None:
         path.aim = Aim(_draw_emitter(estimators, path.ray, path.sampler, path.active), dr.full(mi.Float, 1, dr.width(path.ray)))
     return path
@@ -220,7 +329,7 @@ def _add_side_flight(estimators: Estimators, path: Path, event: PathEvent, aim: 
     """Look at the emitter sample of the next vertex from the end of a side flight."""
     sampler = path.sampler
     lobe, flight = sampler.next_2d(active), estimators.segment.draw(sampler, active, None)
-    samples = SideSamples(lobe, flight, sampler.next_1d(active) if estimators.draws_shadows else None)
+    samples = SideSamples(lobe, flight, draw_state(sampler, active) if estimators.draws_shadows else None)
     flight = fly_aside(estimators, event.collision, path.beta, path.depth, aim, samples, path.score.purpose, active)
     path.score = path.score.add(flight.light)
     if path.shadow is not None:
@@ -237,9 +346,15 @@ def _estimate_probe(estimators: Estimators, settings: Settings, probe: Probe, sa
     path = start_path(estimators, probe.ray, Primal(dr.zeros(mi.Spectrum, n)), sampler, None, on)
     path.depth = mi.UInt32(probe.depth)
     collision = Collision(mei, point_along(probe.ray, probe.t), dr.full(mi.Spectrum, 1, n), on, probe.t, probe.body)
-    event = PathEvent(dr.zeros(mi.SurfaceInteraction3f, n), mi.Float(0), mei.medium, dr.full(mi.Bool, False, n), collision)
-    path = _walk_on(estimators, settings, _scatter(estimators, settings, path, event))
+    path = _walk_on(estimators, settings, _scatter(estimators, settings, path, _in_medium(collision)))
     return ProbeTerm(media, probe, mei, dr.detach(path.score.L), estimators.segment.level, on)
+
+
+def _in_medium(collision: Collision, chance: mi.Float | None = None) -> PathEvent:
+    """The event of a collision that a path begins with."""
+    n = dr.width(collision.on)
+    nothing = dr.zeros(mi.SurfaceInteraction3f, n), mi.Float(0), collision.mei.medium, dr.full(mi.Bool, False, n)
+    return PathEvent(*nothing, collision, chance)
 
 
 def alpha_of(path: Path) -> mi.Float:
@@ -357,8 +472,8 @@ def _add_direct_light(estimators: Estimators, path: Path, event: PathEvent, may_
         aim = estimators.direct.aim(vertex.interaction, sampler.next_2d(lit), lit)
     else:
         aim = path.aim.sample.seen_from(vertex.interaction)
-    chance = sampler.next_1d(lit) if estimators.draws_shadows else None
-    direct = estimators.direct.at_vertex(vertex, aim, purpose != PICTURE, lit, chance)
+    rng = draw_state(sampler, lit) if estimators.draws_shadows else None
+    direct = estimators.direct.at_vertex(vertex, aim, purpose != PICTURE, lit, rng)
     with dr.resume_grad(when=purpose != PICTURE):
         carried = path.beta * direct.value
         if event.collision is not None:
@@ -383,7 +498,7 @@ def _add_light_of_media(estimators: Estimators, path: Path, event: PathEvent, ma
     light = estimators.emission.at_vertex(
         event.vertex(estimators.media),
         path.beta * inside,
-        path.sampler.next_2d(lit),
+        (path.sampler.next_1d(lit), draw_state(path.sampler, lit)),
         path.score.purpose != PICTURE,
         lit,
         estimators.draws_shadows,

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-__all__ = ["LaneSampler", "draw_pcg32", "seed_pcg32"]
+__all__ = ["LaneSampler", "draw_pcg32", "draw_state", "seed_pcg32"]
 
 
 def seed_pcg32(u: mi.Float, width: int, number: int = 0) -> mi.UInt32:
@@ -70,7 +70,24 @@ class LaneSampler:
         """A uniform number in [0, 1)."""
         return self.generator.next_float32(active)
 
+    def next_state(self, active: mi.Bool = True) -> mi.UInt32:
+        """The state of another generator."""
+        return self.generator.next_uint32(active)
+
     def next_2d(self, active: mi.Bool = True) -> mi.Point2f:
         """Two of them."""
         x = self.next_1d(active)
         return mi.Point2f(x, self.next_1d(active))
+
+
+def draw_state(sampler: mi.Sampler | LaneSampler, active: mi.Bool = True) -> mi.UInt32:
+    """The state of a generator for each lane.
+
+    Of a ``LaneSampler`` it has 32 bits of its own and does not depend on the number of the lane, so that a path may be walked
+    again in another one. A number of Mitsuba's samplers has 24 bits, too few to tell millions of lanes apart: the number of the
+    lane helps.
+    """
+    if isinstance(sampler, LaneSampler):
+        return sampler.next_state(active)
+    u = sampler.next_1d(active)
+    return seed_pcg32(u, dr.width(u))
