@@ -88,6 +88,7 @@ def back(scene: mi.Scene, key: str, spp: int, seed: int, depth: int = 5) -> np.n
 def replays(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, np.ndarray, np.ndarray, np.ndarray]]:
     """Of each replay its name, the light that it began with and what it left of it, and d loss by that, a row a channel."""
     seen: list[tuple] = []
+    monkeypatch.setattr(branches, "BALANCE", 4.0)  # most camera rays of these scenes collide: two branches and more
 
     def watch(name: str) -> None:
         walk = getattr(branches, name)
@@ -115,8 +116,9 @@ def test_a_replay_finds_the_light_that_was_found(name: str, replays: list) -> No
     assert len(np.unique(light[0])) > 100
     # Some 20 terms of a path are subtracted one by one.
     assert np.abs(rest).max() <= 20 * 2**-24 * np.abs(light).max()
-    k = count_branches(whole.shape[1], light.shape[1])
-    assert light.shape[1] % k == 0
+    stems = np.count_nonzero(left.sum(axis=0) > 20 * 2**-24 * whole.max())
+    k = round(light.shape[1] / stems)
+    assert k in (2, 3, 4)
     np.testing.assert_allclose(left.sum(axis=1), light.sum(axis=1) / k, rtol=1e-5)
 
 
