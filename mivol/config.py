@@ -413,9 +413,10 @@ class Field(Section):
     tv_density: Annotated[float | None, of("photograph", "total variation of the density; absent: the preset's")] = None
     tv_sh: Annotated[float | None, of("photograph", "total variation of the colours; absent: the preset's")] = None
     sparsity: Annotated[float | None, of("photograph", "of the density; absent: the preset's")] = None
-    matte: Annotated[float | None, of("photograph", "colours that change little with the direction; absent: the preset's")] = (
-        None
-    )
+    matte: Annotated[
+        float | None,
+        of("photograph", "colours that change little with the direction; absent: the preset's (capture of less than 50: 0)"),
+    ] = None
     depth: Annotated[
         float | None, of("1", "weight of the distances that a model's points tell; absent: the preset's (only capture)")
     ] = None

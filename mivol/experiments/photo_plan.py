@@ -46,6 +46,8 @@ def make_plan(chosen: FieldFit) -> FitPlan:
     plan = replace(plan, stages=tuple(stages))
     if wanted.degree is not None:
         plan = replace(plan, few_degree=None)
+    if wanted.matte is not None:
+        plan = replace(plan, few_matte=None)
     if wanted.levels is not None:
         plan = replace(plan, levels=wanted.levels, fewer_levels=False)
     return plan if wanted.longest is None else replace(plan.up_to(wanted.longest), cubic=False)
@@ -76,9 +78,16 @@ def suited(plan: FitPlan, photos: Photos) -> FitPlan:
         return replace(stage, longest=longest, shrink=2 ** max(halvings, 0))
 
     if len(photos.views) < FEW:
-        plan = replace(plan, tv_every=1, degree=plan.degree if plan.few_degree is None else plan.few_degree)
+        plan = of_few(plan)
     plan = with_levels_needed(plan, photos)
     return replace(plan, stages=tuple(suited_stage(stage) for stage in plan.stages), cubic=False)
+
+
+def of_few(plan: FitPlan) -> FitPlan:
+    """The plan for fewer than ``FEW`` photographs."""
+    degree = plan.degree if plan.few_degree is None else plan.few_degree
+    matte = plan.matte if plan.few_matte is None else plan.few_matte
+    return replace(plan, tv_every=1, degree=degree, matte=matte)
 
 
 def with_levels_needed(plan: FitPlan, photos: Photos) -> FitPlan:

@@ -71,8 +71,10 @@ class FitPlan:
         tv_every: steps from one look to the next, which takes the shares of all between: 1 where there are fewer than ``FEW``
             photographs, for a look moves values by this / V times the weight in learning rates, and must stay below one.
         sparsity: Cauchy prior on the density, in photographs.
-        matte: coefficients beyond the constant fall by this / V times their learning rate a step [1 / radiance]: what few
-            photographs say about directions is soon more than there is.
+        matte: coefficients beyond the constant fall by this / V times their learning rate a step [1 / radiance]: what
+            photographs say about directions is soon more than there is (a room in 52 photographs: 39.2 dB, without 38.2).
+        few_matte: the same where there are fewer than ``FEW`` photographs; None: ``matte`` too. Few gain
+            nothing by it (20 photographs of the fox, and of a room: 23.4 and 28.3 dB with 12, 23.4 and 31.7 with 0).
         depth: weight of what the points of a reconstruction say of distances (:mod:`mivol.optim.sightings`) beside the mean
             squared error, where there are any.
         beta: of log T + log(1 - T), which asks rays to end in matter or to pass; mean over the rays.
@@ -111,6 +113,7 @@ class FitPlan:
     tv_every: int = 1
     sparsity: float = 0.0
     matte: float = 12.0
+    few_matte: float | None = None
     depth: float = 0.0
     beta: float = 0.0
     stop: float = 1e-3
@@ -212,6 +215,7 @@ PRESETS: dict[str, FitPlan] = {
     "capture": FitPlan(
         (Stage(32, 150, 1, 8, 64), Stage(64, 450, 1, 8, 128)),
         few_degree=1,
+        few_matte=0.0,
         tv_density=1.0,
         tv_share=1 / 8,
         stop=1e-4,

@@ -19,7 +19,7 @@ from mivol.photos import project, rays
 def test_a_plan_is_the_preset_but_for_its_size_and_one_prior() -> None:
     plan, preset = plan_of(QUICK), PRESETS["capture"]
     assert (plan.tv_density, plan.near, plan.levels, plan.sky, plan.matte) == (
-        preset.tv_density, preset.near, preset.levels, preset.sky, preset.matte,
+        preset.tv_density, preset.near, preset.levels, preset.sky, preset.few_matte,
     )  # fmt: skip
     assert plan.degree == preset.few_degree and plan.stages[-1].longest == QUICK.prior_resolution
     changed = [{n for n in vars(plan) if vars(plan)[n] != vars(without(plan))[n]} for without in WITHOUT.values()]

@@ -294,6 +294,23 @@ def test_few_photographs_are_smoothed_each_step(photographs: Path, tmp_path: Pat
     assert photo_plan.suited(plan, many).tv_every == 4
 
 
+def test_colours_of_few_photographs_do_not_decay(photographs: Path, tmp_path: Path) -> None:
+    """The preset for captures asks few for less than many, of the degree too; what the file says holds for both."""
+    chosen = config.load(toml(tmp_path, photographs))
+    photos, _ = photo_data.read_photos(chosen, tmp_path)
+    many = replace(photos, views=photos.views * (FEW // len(photos.views) + 1))
+
+    def found(**field: float) -> list[tuple[float, int]]:
+        raw = {"title": "x", "photos": {"path": "p"}, "field": {"preset": "capture", **field}}
+        plan = photo_plan.make_plan(config.from_dict(raw))
+        return [(one.matte, one.degree) for one in (photo_plan.suited(plan, photos), photo_plan.suited(plan, many))]
+
+    assert found() == [(0, 1), (12, 2)]
+    assert found(matte=3.0) == [(3, 1), (3, 2)]
+    assert found(degree=2) == [(0, 2), (12, 2)]
+    assert found(preset="cpu") == [(12, 2), (12, 2)]
+
+
 def test_nested_boxes_are_those_that_points_need(photographs: Path, tmp_path: Path) -> None:
     """Points up to 3 half edges from the middle need 3 boxes of 5; the plan says what is left out, and where cameras stand."""
     chosen = config.load(toml(tmp_path, photographs))

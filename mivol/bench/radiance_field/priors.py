@@ -14,7 +14,7 @@ from mivol.bench.extinctions import DATA
 from mivol.bench.radiance_field.fits import held_out_psnr
 from mivol.bench.radiance_field.reconstruction import write_room
 from mivol.bench.radiance_field.size import Size
-from mivol.experiments.photo_plan import with_levels_needed
+from mivol.experiments.photo_plan import of_few, with_levels_needed
 from mivol.optim.field_view import render_view
 from mivol.optim.radiance_fit import begin_radiance_fit, newest_field
 from mivol.optim.radiance_plan import PRESETS, FitPlan, Stage
@@ -30,19 +30,19 @@ WITHOUT: dict[str, Callable[[FitPlan], FitPlan]] = {
     "total variation of the density": lambda plan: replace(plan, tv_density=0.0),
     "total variation of the colours": lambda plan: replace(plan, tv_sh=0.0),
     "gradients that fall near a camera": lambda plan: replace(plan, near=0.0),
-    "decay of what goes with the direction": lambda plan: replace(plan, matte=0.0),
+    "no decay of what goes with the direction": lambda plan: replace(plan, matte=PRESETS["capture"].matte),
     "distances of a model's points": lambda plan: replace(plan, depth=0.0),
     "degree 1 and not 2": lambda plan: replace(plan, degree=2),
     "degree 1 from the first stage on, not raised from 0": lambda plan: replace(plan, first_degree=0),
 }
-"""A prior -> the plan without it."""
+"""A prior, or a choice, -> the plan without it."""
 
 
 def plan_of(size: Size) -> FitPlan:
     """The preset for captures, of few photographs, at a small size."""
-    preset, n = PRESETS["capture"], size.prior_resolution
+    preset, n = of_few(PRESETS["capture"]), size.prior_resolution
     stages = Stage(n // 2, size.prior_steps // 3, 1, 8, 16), Stage(n, size.prior_steps, 1, 8, 48)
-    return replace(preset, stages=stages, degree=preset.few_degree, exposure=False)
+    return replace(preset, stages=stages, exposure=False)
 
 
 def captures(size: Size) -> dict[str, Photos]:
