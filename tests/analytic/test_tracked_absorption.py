@@ -170,7 +170,7 @@ def test_surfaces_behind_are_lit_through_the_field() -> None:
 
 @pytest.mark.slow
 @pytest.mark.statistical
-def test_a_ball_that_scatters_any_number_of_times() -> None:
+def test_a_ball_that_scatters_any_number_of_times(whole_paths: None) -> None:
     """Expected: the means of a homogeneous sphere in its place, which flights see exactly, of images and derivatives."""
     emitter = {"type": "point", "position": [0.3, -2, 0.2], "intensity": 4.0}
     own = shape("cube", {**fog(radius=0.8), "albedo": 0.6})

@@ -34,8 +34,9 @@ def test_collections_are_put_off_for_a_while() -> None:
 
 @pytest.mark.parametrize("way", ["picture", "reverse", "forward"])
 def test_paths_are_recorded_without_them(variant_rgb: str, monkeypatch: pytest.MonkeyPatch, way: str) -> None:
-    seen, walk = [], session.walk_path
-    monkeypatch.setattr(session, "walk_path", lambda *a, **k: seen.append(gc.isenabled()) or walk(*a, **k))
+    seen, name = [], "replay_branches" if way == "reverse" else "walk_path"
+    walk = getattr(session, name)
+    monkeypatch.setattr(session, name, lambda *a, **k: seen.append(gc.isenabled()) or walk(*a, **k))
     scene = close_up({"smoke": smoke(rough_grid(1), 0.5)[0], "sky": scenes.sky(1.0)}, res=2)
     params, integrator = mi.traverse(scene), mi.load_dict(mivol(max_depth=3))
     if way != "picture":
