@@ -35,7 +35,8 @@ ABOVE, LEAST, MOST = 1.1, 0.25, 0.95
 
 SELDOM = 0.2
 """Collisions [1/length] that happen where nothing is: each more of them would let weights grow. (Glass whose box has an empty
-half, unlimited depth, in which light is caught by reflection: an estimate's standard deviation is 4 % at 0.4, 1 % below.)"""
+half, unlimited depth: light that is caught by reflection flies through emptiness for as long as it runs along it, and weights
+grow with all of that way. Most estimates differ by 1 %, by 4 % at 0.4, and a few are far off whatever the number.)"""
 
 FAINTEST = 0.5
 """Largest extinction for which the majorant is chosen, at least [1/length]: where nothing is, P needs collisions to happen."""
