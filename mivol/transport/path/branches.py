@@ -19,7 +19,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TypeVar
 
 import drjit as dr
 import mitsuba as mi
@@ -28,13 +27,12 @@ from mivol.transport.path.estimators import Estimators
 from mivol.transport.path.film import CameraRays
 from mivol.transport.path.scores import Primal, Replay
 from mivol.transport.path.settings import Settings
+from mivol.transport.path.successive import values_at
 from mivol.transport.path.walk import Landing, walk_branch, walk_stem
 from mivol.transport.traversal.fine_ray import FineRay
-from mivol.transport.traversal.random_numbers import LaneSampler
+from mivol.transport.traversal.random_numbers import LaneSampler, draw_seeds
 
 __all__ = ["count_branches", "replay_branches"]
-
-T = TypeVar("T")
 
 MOST = 4
 """Branches of a path."""
@@ -62,7 +60,7 @@ def replay_branches(estimators: Estimators, settings: Settings, rays: CameraRays
         dL: d loss / d radiance of each ray.
     """
     n, sampler = dr.width(rays.ray), rays.sampler
-    seeds = tuple(mi.UInt32(sampler.next_1d() * (1 << 24)) for _ in range(2))
+    seeds = draw_seeds(sampler)
     again, replayed = sampler.clone(), estimators.replayed()
     stems, landing = walk_stem(replayed, settings, sampler, rays.ray, Primal(dr.zeros(mi.Spectrum, n)))
     dr.eval(seeds, stems.L, landing)
@@ -126,14 +124,9 @@ class _Branches:
 def _gather_landing(landing: Landing, index: mi.UInt32) -> Landing:
     """The collisions with these numbers."""
     ray = landing.ray
-    o, d, maxt, time = (_at(values, index) for values in (ray.o, ray.d, ray.maxt, ray.time))
-    t, body, beta, on = (_at(values, index) for values in (landing.t, landing.body, landing.beta, landing.on))
+    o, d, maxt, time = (values_at(values, index) for values in (ray.o, ray.d, ray.maxt, ray.time))
+    t, body, beta, on = (values_at(values, index) for values in (landing.t, landing.body, landing.beta, landing.on))
     return Landing(FineRay(o, d, maxt, time, ray.wavelengths), t, body, beta, on)
-
-
-def _at(values: T, index: mi.UInt32) -> T:
-    """The values with these numbers; what is the same for all is not gathered."""
-    return dr.gather(type(values), values, index) if dr.width(values) > 1 else values
 
 
 def _by_length(depth: mi.UInt32) -> mi.UInt32:

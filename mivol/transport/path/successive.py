@@ -21,10 +21,10 @@ from mivol.transport.path.estimators import Estimators
 from mivol.transport.path.scores import Primal
 from mivol.transport.path.settings import Settings
 from mivol.transport.path.walk import Path, alpha_of, leave_camera, start_path, step
-from mivol.transport.traversal.random_numbers import LaneSampler
+from mivol.transport.traversal.random_numbers import LaneSampler, draw_seeds
 from mivol.transport.traversal.ray_spawning import camera_ray
 
-__all__ = ["paths_a_lane", "walk_successively"]
+__all__ = ["paths_a_lane", "values_at", "walk_successively"]
 
 T = TypeVar("T")
 
@@ -49,10 +49,10 @@ class _Departure:
 
     def of(self, index: mi.UInt32, active: mi.Bool) -> tuple[mi.Ray3f, mi.MediumPtr, LaneSampler]:
         """The departures with these numbers."""
-        o, d, maxt, time = (_at(value, index, active) for value in (self.ray.o, self.ray.d, self.ray.maxt, self.ray.time))
-        seeds = [_at(seed, index, active) for seed in self.seeds]
+        o, d, maxt, time = (values_at(value, index, active) for value in (self.ray.o, self.ray.d, self.ray.maxt, self.ray.time))
+        seeds = [values_at(seed, index, active) for seed in self.seeds]
         ray = mi.Ray3f(o, d, maxt, time, self.ray.wavelengths)
-        return ray, _at(self.medium, index, active), LaneSampler.seeded(*seeds, index)
+        return ray, values_at(self.medium, index, active), LaneSampler.seeded(*seeds, index)
 
 
 def paths_a_lane(most: int, paths: int) -> int:
@@ -79,7 +79,7 @@ def walk_successively(
     """
     n = dr.width(ray)
     lanes, per_lane = -(-n // count), dr.opaque(mi.UInt32, count)
-    seeds = (mi.UInt32(sampler.next_1d() * (1 << 24)), mi.UInt32(sampler.next_1d() * (1 << 24)))
+    seeds = draw_seeds(sampler)
     departure = _Departure(camera_ray(ray), estimators.media.medium_at(ray), seeds)
     L, alpha = dr.zeros(mi.Spectrum, n), dr.zeros(mi.Float, n)
     dr.eval(departure, L, alpha)
@@ -106,6 +106,6 @@ def walk_successively(
     return L, alpha
 
 
-def _at(values: T, index: mi.UInt32, active: mi.Bool) -> T:
+def values_at(values: T, index: mi.UInt32, active: mi.Bool = True) -> T:
     """The values at an index; what is the same for all is not gathered."""
     return dr.gather(type(values), values, index, active) if dr.width(values) > 1 else values

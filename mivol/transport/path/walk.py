@@ -163,7 +163,8 @@ def walk_path(
     Bias: that of the segment estimator. Variance: none at depth 1 beyond the pixel's own; at surfaces, that of emitter and BSDF
     samples.
     """
-    path = _begin(estimators, settings, sampler, ray, score, active, strata)
+    path = start_path(estimators, camera_ray(ray), score, sampler, strata, mi.Bool(active) & (_limit(settings) > 0))
+    path = leave_camera(estimators, settings, path, estimators.media.medium_at(ray))
     if is_straight(estimators, settings):
         path, event = _follow_segment(estimators, settings, path)
         path = _add_emission(estimators, settings, path, event)
@@ -186,7 +187,8 @@ def walk_stem(
     """
     goes_on = estimators.media.has_surfaces
     kept = ("first", "later") if goes_on else ("first",)
-    path = _keep_some(estimators, _begin(estimators, settings, sampler, ray, score), *kept)
+    path = start_path(estimators, camera_ray(ray), score, sampler, None, dr.full(mi.Bool, True, dr.width(ray)))
+    path = _keep_some(estimators, leave_camera(estimators, settings, path, estimators.media.medium_at(ray)), *kept)
     path, event = _follow_segment(estimators, settings, path)
     path = _add_emission(estimators, settings, path, event)
     hit = event.collision
@@ -216,20 +218,6 @@ def walk_branch(
     hit = collision_at(estimators.media, landing.ray, landing.t, landing.body, landing.on)
     path = _walk_on(estimators, settings, _scatter(estimators, settings, path, _in_medium(hit, sampler.next_1d())))
     return _add_kept(estimators, settings, path).score, path.depth
-
-
-def _begin(
-    estimators: Estimators,
-    settings: Settings,
-    sampler: mi.Sampler,
-    ray: Ray,
-    score: Score,
-    active: mi.Bool = True,
-    strata: Strata | None = None,
-) -> Path:
-    """A path that leaves the camera."""
-    path = start_path(estimators, camera_ray(ray), score, sampler, strata, mi.Bool(active) & (_limit(settings) > 0))
-    return leave_camera(estimators, settings, path, estimators.media.medium_at(ray))
 
 
 def _keep_some(estimators: Estimators, path: Path, *which: str) -> Path:

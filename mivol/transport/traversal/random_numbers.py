@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-__all__ = ["LaneSampler", "draw_pcg32", "draw_state", "seed_pcg32"]
+__all__ = ["LaneSampler", "draw_pcg32", "draw_seeds", "draw_state", "seed_pcg32"]
 
 
 def seed_pcg32(u: mi.Float, width: int, number: int = 0) -> mi.UInt32:
@@ -91,3 +91,8 @@ def draw_state(sampler: mi.Sampler | LaneSampler, active: mi.Bool = True) -> mi.
         return sampler.next_state(active)
     u = sampler.next_1d(active)
     return seed_pcg32(u, dr.width(u))
+
+
+def draw_seeds(sampler: mi.Sampler) -> tuple[mi.UInt32, mi.UInt32]:
+    """Two seeds of 24 bits for each lane, of a ``LaneSampler``."""
+    return mi.UInt32(sampler.next_1d() * (1 << 24)), mi.UInt32(sampler.next_1d() * (1 << 24))
