@@ -14,7 +14,8 @@ at a boundary); a cloud of a large-eddy simulation.
 Equal error. The error of an unbiased estimate falls with the root of the time, so variance x time is a number of the method
 alone. Each integrator gets the samples per pixel (a power of two) that take 0.8 s of processor time; then all render in turns,
 warm, in 8 rounds, every render with another seed. Of the 8 images each pixel has its variance (mean over the channels); time is
-the ratio of two renders of one round, median over the rounds. Printed are
+the ratio of two renders of one round by processor time, which a busy machine moves less than the clock, median over the rounds.
+Printed are
 
     variance x time, mean over pixels      ratio of the means of the variances, times the ratio of times
     variance x time, median over pixels    median of the ratios of the variances, times the ratio of times
@@ -23,7 +24,7 @@ The bar is on the first, but for point lights, near which the mean does not exis
 small, so that each pixel has samples enough to show the long tail of its variance (from 32 samples ``volpath`` seems to have
 half the variance that it shows in 500). Only pixels that see the medium count (a mean optical depth above 0.01), and none
 within a pixel and a half of an emitter inside it. A pixel in which the other integrator found no light in 8 images counts as a
-ratio of 0. Beside the time on the wall stands that of the processors (``processor_time``), which a busy machine moves less.
+ratio of 0. Beside each ratio stands what it is by the clock, as a share.
 
 Equality. Beside every ratio stands z: the difference of the means over those pixels in standard errors, with the relative
 standard error, which says how small a bias it could have seen. Where an emitter stands inside, most of the mean comes from
@@ -259,12 +260,12 @@ def errors(timing: Timing, counts: np.ndarray, spp: int) -> dict:
 def gain(slow: Timing, fast: Timing, counts: np.ndarray) -> dict:
     """How much more variance x time one needs."""
     a, b = (Moments.of(np.array(t.results)).variance.mean(axis=-1)[counts] for t in (slow, fast))
-    time = ratio_of(slow, fast)
+    time = ratio_of(slow, fast, "processor")
     with np.errstate(divide="ignore", invalid="ignore"):
         by_pixel = np.median((a / b)[(a > 0) | (b > 0)])
     return {
-        "time": time,
-        "processor_time": ratio_of(slow, fast, "processor"),
+        "time": ratio_of(slow, fast),
+        "processor_time": time,
         "variance_x_time_mean_over_pixels": float(a.mean() / b.mean() * time),
         "variance_x_time_median_over_pixels": float(by_pixel * time),
     }
@@ -307,7 +308,7 @@ def said(figures: dict) -> str:
         g = figures[f"mivol over {name}"]
         gains.append(
             f"{name} {g['variance_x_time_mean_over_pixels']:.0f}x mean, {g['variance_x_time_median_over_pixels']:.0f}x median, "
-            f"processor {g['processor_time'] / g['time']:.2f} "
+            f"by the clock {g['time'] / g['processor_time']:.2f} of that "
             f"(z {number(g['z']):+.2f}, {number(g['relative_standard_error']):.1e})"
         )
     return f"{'; '.join(gains)}; M samples/s: {rates}"

@@ -148,11 +148,12 @@ def _samples_for(render: Callable[[int, int], object], seconds: float) -> int:
     spp = LEAST_SAMPLES
     taken(spp)
     while True:
-        # The smaller of two: the other may have compiled a kernel, or made what is kept for a scene.
+        # The smaller of two: the other may have compiled a kernel, or made what is kept for a scene. Only the last step is by
+        # this time alone, since a part of it does not grow with the samples.
         least = min(taken(spp), taken(spp))
-        if least > seconds / 8 or spp >= MOST_SAMPLES:
-            return int(np.clip(2.0 ** np.floor(np.log2(spp * seconds / least)), LEAST_SAMPLES, MOST_SAMPLES))
-        spp *= 8
+        if least > seconds / 2 or spp >= MOST_SAMPLES:
+            return spp
+        spp = min(spp * (8 if least < seconds / 32 else 2), MOST_SAMPLES)
 
 
 @dataclass

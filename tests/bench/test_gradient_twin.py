@@ -114,9 +114,22 @@ def test_nothing_of_the_twin_is_walked_by_mivol(variant_rgb: str) -> None:
     assert not [name for name, value in vars(twin).items() if "mivol.transport" in str(getattr(value, "__module__", ""))]
 
 
+def test_light_that_is_caught_for_ever_meets_no_emptiness() -> None:
+    """A thin half in the place of the empty one, a quarter of the other's mean; not where paths end after six segments."""
+    caught = Light(dict, depth=-1, catches=True)
+    found = deep_cases(8, caught)
+    assert list(found) == ["half thin", "dense"]
+    assert (found["half thin"].values[..., :4] == 0.25).all()
+    assert found["half thin"].values[..., 4:].mean() == pytest.approx(1, abs=0.05)
+    for other in (replace(caught, depth=6), replace(caught, catches=False)):
+        assert list(deep_cases(8, other)) == ["half empty", "dense"]
+    deep = TABLES["deep estimators"]
+    assert [name for name in deep if deep[name].catches] == ["glass, depth 6", "glass, unlimited"]
+
+
 def test_deep_cases_change_where_they_say() -> None:
     """The empty half alone, and the density itself."""
-    found = deep_cases(8)
+    found = deep_cases(8, Light(dict))
     half, dense = found["half empty"], found["dense"]
     left = np.arange(8) < 4
     assert (half.values[..., left] == 0).all() and (half.direction[..., left] == 1).all()

@@ -56,14 +56,16 @@ def test_ratios_are_medians_of_rounds() -> None:
     assert report["rays_per_second_best"] == 40
 
 
-@pytest.mark.parametrize(("a_sample", "expected"), [(0.01, 64), (1.0, 4), (1e-9, 4096)])
-def test_samples_for_a_time(monkeypatch: pytest.MonkeyPatch, variant_rgb: str, a_sample: float, expected: int) -> None:
-    """The largest power of two that takes 1 s by a clock of ours, between 4 and 4096."""
+@pytest.mark.parametrize(("a_sample", "a_call", "expected"), [(0.01, 0, 64), (1.0, 0, 4), (1e-9, 0, 4096), (0.012, 0.1, 64)])
+def test_samples_for_a_time(
+    monkeypatch: pytest.MonkeyPatch, variant_rgb: str, a_sample: float, a_call: float, expected: int
+) -> None:
+    """The largest power of two that takes 1 s by a clock of ours, between 4 and 4096, what every call costs anyway included."""
     now = [0.0]
     monkeypatch.setattr(timing.time, "process_time", lambda: now[0])
 
     def render(seed: int, spp: int) -> mi.Float:
-        now[0] += a_sample * spp
+        now[0] += a_call + a_sample * spp
         return mi.Float(0)
 
     assert Budget(seconds=1.0).samples(render) == expected

@@ -15,11 +15,11 @@ smoke: the Mitsuba tutorial's smoke at its density (x 40), in constant light, an
 gradients: of a linear functional of the picture, its mean (a call of ``render_backward``), and of an L2 loss, the mean squared
 difference to the picture of 0.7 of the density (a whole step: ``mi.render``, loss, ``dr.backward``). Both methods get the
 samples that take the same processor time (a power of two per pixel) and run in turns, 8 rounds, every one with another seed;
-printed is the sum over voxels of their variances over the 8 gradients, times the time: over the voxels with sigma_t >= 1 (the
-bars), and over those between 0 and 1 and those at 0, where the ratio says little since ``prbvolpath`` is biased there. Beside
-the ratio stands z: the derivative along sigma_t itself, summed over those voxels, in standard errors of its difference. If it
-is beyond its bound for sigma_t >= 1 (false alarm in one run in 1000, Student's t), the ratio means nothing and the script ends
-with status 1.
+printed is the sum over voxels of their variances over the 8 gradients, times the processor time: over the voxels with
+sigma_t >= 1 (the bars), and over those between 0 and 1 and those at 0, where the ratio says little since ``prbvolpath`` is
+biased there. Beside the ratio stands z: the derivative along sigma_t itself, summed over those voxels, in standard errors of
+its difference. If it is beyond its bound for sigma_t >= 1 (false alarm in one run in 1000, Student's t), the ratio means
+nothing and the script ends with status 1.
 
 estimators: bias and variance of both estimators where they differ: density 0, half empty, thin, dense (16^3 voxels). The
 derivative of the picture's mean along a fixed direction in the space of voxels (thin, dense: the density itself; density 0:
@@ -39,13 +39,15 @@ when mivol's volume has the image loss of prbvolpath's last one (the bar; and of
 noise), and the errors of both densities (root mean square over that of the truth).
 
 deep smoke, deep cloud: as smoke, at ``max_depth`` 6; also in directional light, and a cloud of a large-eddy simulation with an
-albedo of 0.999. deep fine smoke: the smoke upsampled to 128^3. deep tutorial: the tutorial as published, at depth 6.
+albedo of 0.999, in 48 rounds: the variance of prbvolpath has heavy tails there. deep fine smoke: the smoke upsampled to 128^3.
+deep tutorial: the tutorial as published, at depth 6.
 
 deep estimators: as estimators, at depth 6 and unlimited; also with a small emitter inside, and in a box of glass. Finite
 differences of pictures in which paths scatter often would take days: a collision more or less changes a path, and that noise is
 divided by the step. So the truth is a path tracer of the bench's own, which carries the derivative forward and shares no code
 with the integrators (mivol.bench.gradients.twin). The sun is alone and stands before the camera, the emitter inside is hidden
-from it: elsewhere what scatters in and what is taken away nearly cancel.
+from it: elsewhere what scatters in and what is taken away nearly cancel. In glass, unlimited, the half that is empty
+elsewhere is thin: no mean is known where caught light runs along emptiness.
 
 Prints JSON; writes bench_gradients.json and bench_gradients.png.
 """

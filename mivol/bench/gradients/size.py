@@ -39,6 +39,8 @@ class Light:
         albedo: of the medium.
         drawn: whether the twin draws emitter samples at collisions; elsewhere light is found by chance alone.
         hidden: ``hide_emitters``.
+        catches: whether the boundary of the medium reflects all light of some directions, so that it stays within.
+        rounds: how many times as many rounds it takes to know variances as well as those of the other lights.
     """
 
     parts: Callable[[], dict]
@@ -47,6 +49,8 @@ class Light:
     albedo: float = ALBEDO
     drawn: bool = False
     hidden: bool = False
+    catches: bool = False
+    rounds: int = 1
 
     def scene(self, values: np.ndarray, side: int) -> mi.Scene:
         """The box around extinctions (Z, Y, X), seen in a picture of that size [pixels]."""
@@ -63,7 +67,7 @@ SHONE = {
     CONSTANT: Light(constant_light),
     "HG 0.8, sun before the camera": Light(sun_before_the_camera, drawn=True),
     "emitter inside": Light(emitter_inside, drawn=True, hidden=True),
-    "glass": Light(glass_under_a_sky),
+    "glass": Light(glass_under_a_sky, catches=True),
 }
 """Lights in which the derivative of a picture's mean does not nearly cancel, so that its relative error is soon known. The ball
 of light is hidden from the camera: seen directly, the few pixels that it fills would have most of the noise."""
@@ -79,7 +83,7 @@ CONTESTS: dict[str, tuple[Callable[[], Extinction], dict[str, Light]]] = {
         },
     ),
     "deep fine smoke": (lambda: fine_smoke(128), {CONSTANT: Light(constant_light, 40, 6), SUN: Light(sun_and_sky, 20, 6)}),
-    "deep cloud": (les_cloud, {SUN: Light(sun_and_sky, 80, 6, 0.999)}),
+    "deep cloud": (les_cloud, {SUN: Light(sun_and_sky, 80, 6, 0.999, rounds=6)}),
 }
 """Volumes and lights in which variance x time is compared, by question."""
 

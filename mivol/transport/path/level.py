@@ -65,15 +65,20 @@ def _find_level(estimators: Estimators, settings: Settings, ray: mi.Ray3f, on_fi
     n = dr.width(ray)
     count = min(max(n // SHARE, FEWEST), MOST)
     index = mi.UInt32(dr.arange(mi.UInt64, count) * n // count)
-    some, tile = camera_ray(dr.gather(mi.Ray3f, mi.Ray3f(ray), index)), _tile_of(on_film)
+    rays, tile = mi.Ray3f(ray), _tile_of(on_film)
+    # What is gathered from has to be evaluated: at once, not each number of a ray by a kernel of its own.
+    dr.eval(rays, tile)
+    some = camera_ray(dr.gather(mi.Ray3f, rays, index))
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(SEED, count)
     collision = _fly_first(estimators, sampler.clone(), some)
     path = walk_path(estimators, settings, sampler, some, Primal(dr.zeros(mi.Spectrum, count)))[0]
     # Behind a boundary that refracts no first flight collides; the mean of all rays is then as good a guess as any.
     weight = dr.select(dr.any(collision.on), dr.square(weigh_collisions(media, some, collision)), 1)
-    seen, at = dr.detach(path.L), dr.gather(mi.UInt32, tile, index)
-    pairs = [_mean_of_tiles(L, w, at) for L, w in zip(colours(seen), colours(dr.detach(weight)), strict=True)]
+    seen, weight, at = dr.detach(path.L), dr.detach(weight), dr.gather(mi.UInt32, tile, index)
+    # Each sum would walk the paths again.
+    dr.eval(seen, weight)
+    pairs = [_mean_of_tiles(L, w, at) for L, w in zip(colours(seen), colours(weight), strict=True)]
     first = mi.Spectrum(*(dr.gather(mi.Float, tiles, tile) for _, tiles in pairs))
     level = Level(first, mi.Spectrum(*(mean for mean, _ in pairs)))
     dr.eval(level)
