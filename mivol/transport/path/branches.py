@@ -22,6 +22,7 @@ from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from mivol.transport.path.estimators import Estimators
 from mivol.transport.path.film import CameraRays
@@ -41,8 +42,8 @@ BALANCE = 0.6
 """(B a) / (A b), times the share of stems that collide: for a share of 0.17 two branches, for more than 0.27 one. (Smoke and a
 cloud of that share: three have the least variance x time over voxels with sigma_t >= 1, one over empty voxels.)"""
 
-LENGTHS = (1, 2, 3, 4, 5, 7, 9, 13, 17, 25, 33, 49, 65, 97, 129)
-"""Numbers of scatterings at which the next class of lengths begins."""
+LONGEST = np.uint16(0xFFFF)
+"""Scatterings of a path, as far as its place in the order of lengths goes."""
 
 
 def count_branches(stems: int, collided: int) -> int:
@@ -131,7 +132,6 @@ def _gather_landing(landing: Landing, index: mi.UInt32) -> Landing:
 
 def _by_length(depth: mi.UInt32) -> mi.UInt32:
     """The numbers of paths in the order of their lengths, the longest first."""
-    starts = (0, *LENGTHS)
-    ends = (*LENGTHS, 1 << 31)
-    classes = [dr.compress((depth >= start) & (depth < end)) for start, end in zip(starts, ends, strict=True)]
-    return dr.concat([found for found in reversed(classes) if dr.width(found) > 0])
+    # Numbers of 16 bits are sorted in a time that is linear in their count; longer paths are too few to be told apart.
+    shortness = LONGEST - np.minimum(depth.numpy(), LONGEST).astype(np.uint16)
+    return mi.UInt32(np.argsort(shortness, kind="stable"))
