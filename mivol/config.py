@@ -405,7 +405,7 @@ MOST_LEVELS = 12
 class Field(Section):
     """The radiance field and how it is fitted."""
 
-    preset: Annotated[str, of("1", "resolutions, steps, rates and priors: tiny, cpu, capture or gpu", min_length=1)] = "cpu"
+    preset: Annotated[str, of("1", "nodes, steps, rates and priors: tiny, cpu, fine, capture or gpu", min_length=1)] = "cpu"
     longest: Annotated[int | None, of("voxel", "along the longest edge in the end; absent: the preset's")] = None
     degree: Annotated[int | None, of("1", "of the spherical harmonics; absent: the preset's")] = None
     first_degree: Annotated[int | None, of("1", "of the first stage, raised from there; absent: degree")] = None

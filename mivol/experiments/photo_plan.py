@@ -23,10 +23,8 @@ GAINS = PlanLine(
 SMALLEST = 16
 """Shortest edge of a photograph that was made smaller [pixel]."""
 
-VOXEL = 2
-"""Pixels along a voxel, seen from the median camera: what photographs are made smaller to, within a factor of sqrt(2), and no
-box is finer. With 1.2, 2.3 and 4.7 of them training views of the chair that were held out came to 30.9, 31.6 and 31.0 dB in as
-many steps (128 nodes along the box)."""
+FEWEST = 16
+"""Nodes along an edge that a preset has in any case, though voxels are smaller than pixels then."""
 
 
 def make_plan(chosen: FieldFit) -> FitPlan:
@@ -61,9 +59,10 @@ def batches_of(plan: FitPlan, photos: Photos) -> RayBatches:
 def suited(plan: FitPlan, photos: Photos) -> FitPlan:
     """The plan for these photographs.
 
-    Grids of a plan for cubes have as many nodes in a box that is none, though voxels are not smaller than two pixels for that.
-    Photographs are as small as the grids can tell (pixels of about half a voxel, at the middle of the box), the degree is
-    lower where they are few, and there are no more nested boxes than the points of a reconstruction need.
+    Grids of a plan for cubes have as many nodes in a box that is none, though voxels are not smaller than the plan's for that,
+    and never smaller than a pixel. Photographs are as small as the grids can tell, by the plan's pixels along a voxel at the
+    middle of the box, the degree is lower where they are few, and there are no more nested boxes than the points of a
+    reconstruction need.
     """
     cameras, box = [view.camera for view in photos.views], photos.box
     pixel = np.median([np.linalg.norm(camera.origin - box.mean(axis=0)) / camera.K[0, 0] for camera in cameras])
@@ -73,8 +72,9 @@ def suited(plan: FitPlan, photos: Photos) -> FitPlan:
     def suited_stage(stage: Stage) -> Stage:
         longest = stage.longest
         if plan.cubic:
-            longest = max(longest, min(stretched(longest, box), int(edge / (VOXEL * pixel))))
-        halvings = min(round(np.log2(edge / longest / (VOXEL * pixel))), int(np.log2(least / SMALLEST)))
+            longest = max(longest, min(stretched(longest, box), int(edge / (plan.voxel * pixel))))
+            longest = min(longest, max(int(edge / pixel), FEWEST))
+        halvings = min(round(np.log2(edge / longest / (plan.voxel * pixel))), int(np.log2(least / SMALLEST)))
         return replace(stage, longest=longest, shrink=2 ** max(halvings, 0))
 
     if len(photos.views) < FEW:

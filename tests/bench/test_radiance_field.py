@@ -17,6 +17,7 @@ from mivol.bench.radiance_field import BENCH, QUICK, fields, fits, photographs
 from mivol.bench.radiance_field.fields import FIELDS, centred
 from mivol.bench.radiance_field.fits import EVERY, follow, held_out_psnr, our_fit, peer_fit
 from mivol.bench.radiance_field.peer import Peer
+from mivol.bench.radiance_field.size import PhotoFit
 from mivol.bench.radiance_field.steps import ask_memory, our_step, peer_of, peer_step, tasks
 from mivol.bench.radiance_field.views import BOX, between, photographed, rays_of, rays_through, ring, tiled
 from mivol.fields.spherical import SphericalGrid
@@ -211,17 +212,37 @@ def test_photographs_that_are_not_here_are_left_out(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:
     monkeypatch.setattr(photographs, "DATA", tmp_path)
-    assert photographs.ask_photographs(replace(TINY, photo_fits=(("chair", 16, 0.03),))) == {}
+    assert photographs.ask_photographs(replace(TINY, photo_fits=(PhotoFit("chair", 16, 0.03),))) == {}
     assert "chair: left out, its data is not here (MIVOL_DATA" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("asked", "longest", "steps"), [
+    (PhotoFit("shell", 64, 0.1), [32, 64], [13, 70]),
+    (PhotoFit("shell", effort=0.1, preset="tiny"), [24, 48], [10, 20]),
+])  # fmt: skip
+def test_a_fit_has_the_nodes_that_it_asks_for(
+    monkeypatch: pytest.MonkeyPatch, asked: PhotoFit, longest: list[int], steps: list[int]
+) -> None:
+    """Of the preset's effort, up to as many nodes; or those of the preset."""
+    asked_of = []
+    monkeypatch.setattr(photographs, "read_photos", lambda chosen, folder: ("shown", "judged"))
+    monkeypatch.setattr(photographs, "boxed", lambda chosen, shown: shown)
+    monkeypatch.setattr(photographs, "suited", lambda plan, shown: asked_of.append(plan) or 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        photographs.fitted(Path("shell"), asked, TINY)
+    (plan,) = asked_of
+    assert ([stage.longest for stage in plan.stages], [stage.steps for stage in plan.stages]) == (longest, steps)
 
 
 @pytest.mark.slow
 def test_every_question_is_answered(variant_rgb: str, tmp_path: Path) -> None:
-    size = replace(TINY, photo_fits=(("wires", 16, 0.03),), photo_folder=tmp_path / "photographs")
+    asked = (PhotoFit("wires", 16, 0.03), PhotoFit("wires", effort=0.01, preset="tiny"))
+    size = replace(TINY, photo_fits=asked, photo_folder=tmp_path / "photographs")
     answers = BENCH.ask(tuple(BENCH.questions), size)
     assert all(answers["step"]["fog"][kind]["ratio_of_processor_time"] > 0 for kind in ("camera", "pixels", "any"))
     assert set(answers["locality"]) == {"tiles", "pixels"}
     assert answers["fit"]["fog"]["peer_psnr"] > 5
+    assert set(answers["photographs"]) == {"wires at 16", "wires, tiny"}
     found = answers["photographs"]["wires at 16"]
     assert found["psnr"] > 10 and found["counted_gib"] > 0 and found["held_gib"] > 0
     # Seconds of a machine that is as fast as this one are those of its threads.

@@ -32,7 +32,9 @@ FULL = {
         "resolution": 128, "side": 256, "rounds": 3, "steps": 105, "chair_steps": 800, "fit_resolution": 128, "fit_side": 256,
         "fields": ("shell", "fog", "fitted"), "photo_views": 75, "photo_side": 200, "photo_spp": 32,
         "photo_fits": (
-            ("chair", 128, 1.0), ("chair", 256, 1.9), ("still_life", 128, 1.0), ("wires", 128, 1.0), ("glossy", 128, 1.0),
+            ("chair", 128, 1.0, "cpu"), ("chair", 256, 1.9, "cpu"), ("chair", None, 1.0, "fine"),
+            *((name, 128, 1.0, "cpu") for name in ("still_life", "wires", "glossy")),
+            *((name, None, 1.0, "fine") for name in ("still_life", "wires", "glossy")),
         ),
         "photo_folder": Path("runs/photographs"), "walk_side": 1024,
         "prior_side": 80, "prior_resolution": 32, "prior_steps": 180, "prior_folds": 5,
@@ -66,7 +68,8 @@ FULL = {
 QUICK = {
     "radiance_field": {
         "resolution": 32, "side": 64, "rounds": 1, "steps": 7, "chair_steps": 30, "fit_resolution": 32, "fit_side": 32,
-        "photo_fits": (("chair", 32, 0.03), ("wires", 32, 0.03)), "photo_views": 15, "photo_side": 48, "photo_spp": 2,
+        "photo_fits": (("chair", 32, 0.03, "cpu"), ("wires", 32, 0.03, "cpu")),
+        "photo_views": 15, "photo_side": 48, "photo_spp": 2,
         "photo_folder": Path("runs/quick_photographs"), "walk_side": 64,
         "prior_side": 16, "prior_resolution": 16, "prior_steps": 6, "prior_folds": 1,
     },

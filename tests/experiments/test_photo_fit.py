@@ -269,7 +269,8 @@ def test_photographs_are_shrunk_to_half_a_voxel(photographs: Path, tmp_path: Pat
 def test_a_long_box_has_as_many_nodes_as_a_cube(photographs: Path, tmp_path: Path) -> None:
     """A box of 2 x 0.5 x 0.25 with 8 nodes along it has 8 x 2 x 1; with 8 / (2^-2 2^-3)^(1/3) = 25.4 it has 8^3.
 
-    Voxels are no smaller than two pixels of 0.058 for that: 17 along 2; and as they are where a file says so.
+    Voxels are no smaller than two pixels of 0.058 for that (17 along 2), or what the plan says (one and a half: 22); never
+    smaller than a pixel (34), for a few nodes more than that (16); and as they are where a file says so.
     """
     chosen = config.load(toml(tmp_path, photographs))
     photos, _ = photo_data.read_photos(chosen, tmp_path)
@@ -277,7 +278,12 @@ def test_a_long_box_has_as_many_nodes_as_a_cube(photographs: Path, tmp_path: Pat
     assert stretched(8, slab) == 25 and stretched(8, photos.box) == 8
     long = replace(photos, survey=replace(photos.survey, box=slab))
     plan = FitPlan((Stage(4, 1), Stage(8, 1), Stage(40, 1)))
-    assert [stage.longest for stage in photo_plan.suited(plan, long).stages] == [13, 17, 40]
+    assert [stage.longest for stage in photo_plan.suited(plan, long).stages] == [13, 17, 34]
+    assert [stage.longest for stage in photo_plan.suited(replace(plan, voxel=1.5), long).stages] == [13, 22, 34]
+    quarter = np.diag([0.25, 0.25, 1])
+    cameras = [replace(view.camera, K=quarter @ view.camera.K) for view in long.views]
+    far = replace(long, views=tuple(replace(v, camera=c) for v, c in zip(long.views, cameras, strict=True)))
+    assert [stage.longest for stage in photo_plan.suited(plan, far).stages] == [4, 8, 16]
     assert photo_plan.suited(photo_plan.suited(plan, long), long) == photo_plan.suited(plan, long)
     assert [stage.longest for stage in photo_plan.suited(replace(plan, cubic=False), long).stages] == [4, 8, 40]
     assert not photo_plan.make_plan(config.load(toml(tmp_path, photographs), ["field.longest=26"])).cubic

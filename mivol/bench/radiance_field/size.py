@@ -4,11 +4,31 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 __all__ = ["FULL", "QUICK", "STOP", "Size"]
 
 STOP = 1e-4
 """Transmittance at which our rays end; the peer's end at 0."""
+
+
+class PhotoFit(NamedTuple):
+    """A fit to a data set of photographs.
+
+    Attributes:
+        name: of the data set.
+        longest: nodes along an edge of a cube with as many; None: the preset's.
+        effort: share of the preset's steps.
+        preset: the preset.
+    """
+
+    name: str
+    longest: int | None = None
+    effort: float = 1.0
+    preset: str = "cpu"
+
+    def __str__(self) -> str:
+        return f"{self.name} at {self.longest}" if self.longest else f"{self.name}, {self.preset}"
 
 
 @dataclass(frozen=True)
@@ -24,8 +44,7 @@ class Size:
         chair_steps: of the fit that makes the fitted field.
         fit_resolution, fit_side: nodes and pixels of fits.
         fields: names of those that are measured, in :data:`mivol.bench.radiance_field.fields.FIELDS`.
-        photo_fits: data sets of :mod:`mivol.bench.radiance_field.photographs`, nodes along an edge of a cube with as many, and
-            the share of the preset's steps.
+        photo_fits: fits of :mod:`mivol.bench.radiance_field.photographs`.
         photo_views, photo_side, photo_spp: of made-up data sets: photographs, pixels along an edge, samples a pixel.
         photo_folder: where those lie; they are made where they are missing.
         walk_side: rays of the walk that tells the machine's speed are its square.
@@ -42,12 +61,16 @@ class Size:
     fit_resolution: int = 128
     fit_side: int = 256
     fields: tuple[str, ...] = ("shell", "fog", "fitted")
-    photo_fits: tuple[tuple[str, int, float], ...] = (
-        ("chair", 128, 1.0),
-        ("chair", 256, 1.9),
-        ("still_life", 128, 1.0),
-        ("wires", 128, 1.0),
-        ("glossy", 128, 1.0),
+    photo_fits: tuple[PhotoFit, ...] = (
+        PhotoFit("chair", 128),
+        PhotoFit("chair", 256, 1.9),
+        PhotoFit("chair", preset="fine"),
+        PhotoFit("still_life", 128),
+        PhotoFit("wires", 128),
+        PhotoFit("glossy", 128),
+        PhotoFit("still_life", preset="fine"),
+        PhotoFit("wires", preset="fine"),
+        PhotoFit("glossy", preset="fine"),
     )
     photo_views: int = 75
     photo_side: int = 200
@@ -70,7 +93,7 @@ QUICK = Size(
     30,
     32,
     32,
-    photo_fits=(("chair", 32, 0.03), ("wires", 32, 0.03)),
+    photo_fits=(PhotoFit("chair", 32, 0.03), PhotoFit("wires", 32, 0.03)),
     photo_views=15,
     photo_side=48,
     photo_spp=2,
