@@ -162,7 +162,7 @@ def sizes_of(plan: FitPlan, held: tuple[int, int]) -> PlanLine:
         return PlanLine(choice=f"photographs at {width} x {height} in all stages", reason=reason)
     return PlanLine(
         choice=f"photographs shrunk by {', '.join(str(stage.shrink) for stage in plan.stages)} in these stages",
-        reason=f"a pixel of half a voxel says as much as four smaller ones; they are held at {width} x {height}",
+        reason=f"voxels of these stages are too large to tell smaller pixels; they are held at {width} x {height}",
     )
 
 

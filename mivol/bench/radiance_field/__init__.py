@@ -1,8 +1,8 @@
 """How fast are a radiance field's rays and their derivatives, and how much sooner is a fit done, beside Mitsuba's tutorial?
 
-    scripts/bench_radiance_field.py                     # half an hour on 2 idle cores, most of it in the peer
+    scripts/bench_radiance_field.py                     # an hour on 2 idle cores, most of it in photographs and the peer
     scripts/bench_radiance_field.py --only step,memory  # 6 minutes
-    scripts/bench_radiance_field.py --only photographs  # a quarter of an hour
+    scripts/bench_radiance_field.py --only photographs  # 40 minutes, half of them for one fit
     scripts/bench_radiance_field.py --quick             # under two minutes, small sizes: its times mean nothing
 
 The peer is :mod:`mivol.bench.radiance_field.peer`: uniform steps over textures. Fields: a thin shell, a fog that fills the
