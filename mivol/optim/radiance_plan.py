@@ -256,8 +256,9 @@ PRESETS: dict[str, FitPlan] = {
         )
     ),
 }
-"""``tiny`` takes seconds, ``cpu`` a minute on two cores, ``fine`` twenty; ``capture`` takes minutes too and is for photographs
-of a place without bounds; ``gpu`` has the resolutions of Plenoxels (256, then 512; not measured).
+"""``tiny`` takes seconds, ``cpu`` a minute on two cores, ``fine`` twenty, for many sharp photographs (it learns the noise of
+others); ``capture`` takes minutes too and is for photographs of a place without bounds; ``gpu`` has the resolutions of
+Plenoxels (256, then 512; not measured).
 
 Rates and priors were chosen on views held out of the chair's training split (32^3 and 64^3), on the still life from 12 and
 60 views and on seven views of the three fields of scripts/bench_radiance_field. The delay is what few views need most: from
