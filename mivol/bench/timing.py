@@ -148,8 +148,8 @@ def _samples_for(render: Callable[[int, int], object], seconds: float) -> int:
     spp = LEAST_SAMPLES
     taken(spp)
     while True:
-        # The smaller of two: the other may have compiled a kernel, or made what is kept for a scene. Only the last step is by
-        # this time alone, since a part of it does not grow with the samples.
+        # The smaller of two: the other may have compiled a kernel, or made what is kept for a scene. A part of
+        # what they take does not grow with the samples, so the last step is a small one.
         least = min(taken(spp), taken(spp))
         if least > seconds / 2 or spp >= MOST_SAMPLES:
             return spp

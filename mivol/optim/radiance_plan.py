@@ -203,34 +203,33 @@ class FitPlan:
         return stage.rate * self.density_rate * self.last**share * rise, self.sh_rate * self.last**share
 
 
+MINUTE = FitPlan(
+    (
+        Stage(32, 130, 4, tiles=256, rate=1 / 4),
+        Stage(64, 195, 4, tiles=512, rate=1 / 2),
+        Stage(128, 700, 2, tiles=1024),
+    ),
+    density_rate=60.0,
+    sh_rate=0.1,
+    tv_sh=0.2,
+    tv_every=4,
+    drop=1 / 4,
+)
+"""The preset ``cpu``."""
+
 PRESETS: dict[str, FitPlan] = {
     "tiny": FitPlan((Stage(24, 100, 4, tiles=128), Stage(48, 200, 2, tiles=256))),
-    "cpu": FitPlan(
-        (
-            Stage(32, 130, 4, tiles=256, rate=1 / 4),
-            Stage(64, 195, 4, tiles=512, rate=1 / 2),
-            Stage(128, 700, 2, tiles=1024),
-        ),
-        density_rate=60.0,
-        sh_rate=0.1,
-        tv_sh=0.2,
-        tv_every=4,
-        drop=1 / 4,
-    ),
-    "fine": FitPlan(
-        (
+    "cpu": MINUTE,
+    "fine": replace(
+        MINUTE,
+        stages=(
             Stage(32, 150, 4, tiles=256, rate=1 / 4),
             Stage(64, 250, 4, tiles=512, rate=1 / 2),
             Stage(128, 400, 2, tiles=1024),
             Stage(256, 600, 1, tiles=1024),
             Stage(352, 2600, 1, tiles=1024),
         ),
-        density_rate=60.0,
-        sh_rate=0.1,
         last=0.006,
-        tv_sh=0.2,
-        tv_every=4,
-        drop=1 / 4,
         voxel=4 / 3,
     ),
     "capture": FitPlan(

@@ -2,7 +2,7 @@
 
     scripts/bench_radiance_field.py                     # an hour on 2 idle cores, most of it in photographs and the peer
     scripts/bench_radiance_field.py --only step,memory  # 6 minutes
-    scripts/bench_radiance_field.py --only photographs  # 40 minutes, half of them for one fit
+    scripts/bench_radiance_field.py --only photographs  # 40 minutes, a third of them for one fit
     scripts/bench_radiance_field.py --quick             # under two minutes, small sizes: its times mean nothing
 
 The peer is :mod:`mivol.bench.radiance_field.peer`: uniform steps over textures. Fields: a thin shell, a fog that fills the

@@ -52,7 +52,7 @@ def ask_photographs(size: Size) -> dict:
         if folder is None:
             say(f"  {asked.name}: left out, its data is not here (MIVOL_DATA names the folder)")
             continue
-        found = answer[f"{asked}"] = fitted(folder, asked, size)
+        found = answer[str(asked)] = fitted(folder, asked, size)
         say(f"  {asked}: {found['psnr']:.2f} dB, {found['seconds']:.0f} s, {found['counted_gib']:.2f} GiB")
     return answer
 
