@@ -12,7 +12,7 @@ import importlib
 import warnings
 from typing import TYPE_CHECKING
 
-from . import llvm
+from . import cuda, llvm
 
 llvm.ensure()
 
@@ -105,12 +105,14 @@ def __dir__() -> list[str]:
 
 def _on_variant_change(old: str | None, new: str) -> None:
     llvm.check_backend(new)
+    cuda.spill_to_local_memory(new)
     importlib.reload(plugins)
 
 
 mi.detail.add_variant_callback(_on_variant_change)
 mi.render = mi.util.render = reveal_refusals(mi.render)
 
+cuda.spill_to_local_memory()
 try:
     llvm.check_backend()
 except llvm.LlvmError as error:

@@ -114,6 +114,13 @@ def variant_rgb(request: pytest.FixtureRequest) -> str:
 
 
 @pytest.fixture
+def cpu_back_end(variant_rgb: str) -> None:
+    """The test is of what a GPU does otherwise: sums in one order, tables and walks that pay on few cores only."""
+    if not variant_rgb.startswith("llvm"):
+        pytest.skip(f"{variant_rgb} does this otherwise: the test is of the CPU back end")
+
+
+@pytest.fixture
 def two_threads(variant_rgb: str) -> None:
     """The pool has two threads at least, as a user's has: both add to one gradient; Mitsuba reads an EXR with the second."""
     set_thread_count(max(2, drjit.thread_count()))

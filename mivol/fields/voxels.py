@@ -46,6 +46,7 @@ class Voxels:
         self.to_world = check_affine(to_world, f"to_world of {name}")
         tensor = values if isinstance(values, mi.TensorXf) else mi.TensorXf(np.ascontiguousarray(values, dtype=np.float32))
         check_volume(np.array(dr.detach(tensor)), name=name, minimum=None if signed else 0.0)
+        # Never a texture of a GPU's hardware: its weights have 8 bits.
         self.texture = mi.Texture3f(tensor, use_accel=False, migrate=False)
         to_local = np.linalg.inv(self.to_world) if to_local is None else to_local
         self.to_local = mi.ScalarAffineTransform4f(mi.ScalarMatrix4f(to_local), mi.ScalarMatrix4f(self.to_world.T))
@@ -86,14 +87,35 @@ class Voxels:
         return values.reshape((*values.shape[:3], -1)), place
 
     @property
+    def recorded(self) -> mi.Texture3f | None:
+        """What a plugin shows to ``dr.freeze``, which finds arrays among a plugin's own attributes only.
+
+        None on a GPU: Dr.Jit 1.5 then takes memory that nothing was written to for the handle of a hardware texture, which this
+        one has not, and the process is aborted ("unknown variable"; ``Texture::traverse_1_cb_ro``).
+        """
+        return self.texture if dr.backend_v(mi.Float) == dr.JitBackend.LLVM else None
+
+    @property
+    def tensor(self) -> mi.TensorXf:
+        """The values, (Z, Y, X, C).
+
+        Raises:
+            MivolError: ``dr.freeze`` records, and cannot follow them.
+        """
+        if self.recorded is None and dr.flag(dr.JitFlag.FreezingScope):
+            advice = "render without it, use llvm_ad_rgb, or a gridvolume of Mitsuba's"
+            raise MivolError(f"dr.freeze records {self.name} in {mi.variant()}, and cannot follow its values there: {advice}.")
+        return self.texture.tensor()
+
+    @property
     def channels(self) -> int:
         """Number of values at each voxel."""
-        return self.texture.tensor().shape[3]
+        return self.tensor.shape[3]
 
     @property
     def res(self) -> tuple[int, int, int]:
         """Resolution (Z, Y, X)."""
-        return tuple(self.texture.tensor().shape[:3])
+        return tuple(self.tensor.shape[:3])
 
     def eval(self, p: mi.Point3f, w: mi.Vector3f | None = None, active: mi.Bool = True) -> list[mi.Float]:
         """Values at world points, one entry a channel; 0 outside the box. The direction ``w`` changes nothing."""
@@ -112,11 +134,11 @@ class Voxels:
 
     def parameters(self) -> dict[str, mi.TensorXf]:
         """The tensor of the voxels, ``data``."""
-        return {"data": self.texture.tensor()}
+        return {"data": self.tensor}
 
     def bound(self) -> list[float]:
         """Largest value of each channel."""
-        values = np.array(dr.detach(self.texture.tensor()))
+        values = np.array(dr.detach(self.tensor))
         return [float(v) for v in values.reshape(-1, self.channels).max(axis=0)]
 
     def corners(self) -> np.ndarray:
@@ -137,7 +159,7 @@ class Voxels:
         if dr.flag(dr.JitFlag.FreezingScope):
             # A recording cannot read values.
             return
-        check_volume(np.array(dr.detach(self.texture.tensor())), name=self.name, minimum=None)
+        check_volume(np.array(dr.detach(self.tensor)), name=self.name, minimum=None)
 
     def __repr__(self) -> str:
         z, y, x = self.res

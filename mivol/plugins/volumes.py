@@ -27,7 +27,7 @@ class VoxelVolume(mi.Volume):
 
     def __init__(self, props: mi.Properties) -> None:
         self.field = Voxels.from_props(props)
-        self.texture = self.field.texture  # dr.freeze finds arrays among a plugin's own attributes only
+        self.texture = self.field.recorded
         props["to_world"] = mi.ScalarTransform4f(self.field.to_world)
         super().__init__(props)
 
@@ -172,7 +172,7 @@ class TransferVolume(VoxelVolume):
         self.mivol_transfer = Transfer.from_props(props)
         self.table, self.scalar = self.mivol_transfer.table, self.mivol_transfer.field
         self.field = self.mivol_transfer.voxels
-        self.texture = self.field.texture
+        self.texture = self.field.recorded
         shading = self.mivol_transfer.relief.shading
         self.eye = None if shading is None else shading.eye
         props["to_world"] = mi.ScalarTransform4f(self.field.to_world)
@@ -181,7 +181,7 @@ class TransferVolume(VoxelVolume):
     def traverse(self, callback: mi.TraversalCallback) -> None:
         callback.put("table", self.table, mi.ParamFlags.Differentiable)
         callback.put("scalar", self.scalar, mi.ParamFlags.Differentiable)
-        callback.put("data", self.texture.tensor(), mi.ParamFlags.Differentiable)  # what the table makes of it
+        callback.put("data", self.field.tensor, mi.ParamFlags.Differentiable)  # what the table makes of it
         if self.eye is not None:
             callback.put("eye", self.eye, mi.ParamFlags.NonDifferentiable)
 

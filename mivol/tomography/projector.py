@@ -190,7 +190,7 @@ class Projector:
     def to_torch(self) -> Callable[[torch.Tensor], torch.Tensor]:
         """The projector as a differentiable PyTorch function from (Z, Y, X) to (views, rows, cols), through ``dr.wrap``.
 
-        Raises: MivolError: PyTorch is not installed.
+        Raises: MivolError: PyTorch is not installed; later, a tensor that is not where the variant computes.
 
         Example:
             >>> project = A.to_torch()
@@ -205,7 +205,15 @@ class Projector:
         def project(x: mi.TensorXf) -> mi.TensorXf:
             return self.integrate(x)
 
-        return project
+        place = "cpu" if dr.backend_v(mi.Float) == dr.JitBackend.LLVM else "cuda"
+
+        def checked(x: torch.Tensor) -> torch.Tensor:
+            if x.device.type != place:
+                advice = f'expected one on {place}, where {mi.variant()} computes: give x.to("{place}")'
+                raise MivolError(f"Found a tensor on {x.device.type}, {advice}.")
+            return project(x)
+
+        return checked
 
     def _project_array(self, x: np.ndarray) -> np.ndarray:
         """``A x``, flat."""

@@ -199,7 +199,7 @@ def test_what_is_not_asked_for_is_not_read() -> None:
     assert integrator.session._surveyed.survey.media_light is not None
 
 
-def test_the_table_follows_the_medium() -> None:
+def test_the_table_follows_the_medium(variant_rgb: str) -> None:
     """A new array is read, an old one is not read again."""
     scene = seen("over a floor", 4)
     survey, sensor = survey_scene(scene), scene.sensors()[0]
@@ -212,7 +212,10 @@ def test_the_table_follows_the_medium() -> None:
     second = find_needs(scene, sensor, survey).media_light
     assert not np.allclose(np.array(second.density), np.array(first.density))
     again = find_needs(scene, sensor, survey_scene(scene)).media_light
-    assert np.array_equal(np.array(second.density), np.array(again.density)) and second.gain == again.gain
+    # Sums of a GPU have no fixed order: a few roundings.
+    rtol = 0 if variant_rgb.startswith("llvm") else 1e-6
+    np.testing.assert_allclose(np.array(second.density), np.array(again.density), rtol=rtol)
+    assert second.gain == pytest.approx(again.gain, rel=rtol, abs=0)
 
 
 def test_what_cannot_be_drawn_is_refused_or_met() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import oracle_projector
@@ -70,13 +71,13 @@ def test_walk_between_columns_is_the_float64_twin(monkeypatch, shape, along):
 
 
 @pytest.mark.parametrize(("name", "along"), [("parallel", 2), ("cone", 2), ("pencil", None)])
-def test_rays_of_a_scanner_seldom_cross_the_axis_of_rotation(name, along):
-    """Rays of random directions cross each axis as often."""
+def test_rays_of_a_scanner_seldom_cross_the_axis_of_rotation(cpu_back_end, name, along):
+    """Rays of random directions cross each axis as often. Walks by columns are the CPU's."""
     assert Projector(BEAMS[name], VoxelGrid((7, 7, 7), 0.4))._along == along
 
 
 @pytest.mark.parametrize(("filled", "by_columns"), [(16, True), (5, False)])
-def test_what_is_mostly_empty_is_skipped(filled, by_columns):
+def test_what_is_mostly_empty_is_skipped(cpu_back_end, filled, by_columns):
     """A cube of 16 voxels in 16 leaves no block empty, one of 5 has 8 of 125 blocks of 4 cells."""
     grid = VoxelGrid((16, 16, 16), 1.0)
     a = Projector(ParallelBeam(np.arange(30) * 0.1, (16, 16)), grid)
@@ -199,7 +200,6 @@ def test_subset_compiles_nothing():
     Few rays take the walk of any ray, many that between columns. Each is traced once for all subsets: one recording of each
     operator of each walk.
     """
-    import drjit as dr
 
     def kernels(a: Projector) -> set[str]:
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
@@ -215,12 +215,12 @@ def test_subset_compiles_nothing():
     for other in (a.subset([1, 4]), a.subset([3]), cone.subset([2])):
         assert kernels(other) == few
     recorded = (a._kernels._integrate, a._kernels._backproject, *a._kernels._columns.values())
-    assert [kernel.n_recordings for kernel in recorded] == [1, 1, 1, 1]
+    on_gpu = dr.backend_v(mi.Float) != dr.JitBackend.LLVM  # walks no columns: rays of many views skip what is empty instead
+    assert [kernel.n_recordings for kernel in recorded] == ([2, 1] if on_gpu else [1, 1, 1, 1])
 
 
 def test_threads_may_change():
     """The transpose has a copy of its sums for each thread: more threads than it was recorded with are no danger."""
-    import drjit as dr
 
     before, y = dr.thread_count(), numbers(*BEAMS["cone"].shape)
     try:
@@ -303,7 +303,6 @@ def test_scipy_solves_with_it():
 
 
 def test_forward_and_reverse_mode_are_the_pair():
-    import drjit as dr
 
     a = Projector(BEAMS["cone"], GRID)
     x, tangent, y = numbers(*GRID.shape), numbers(*GRID.shape, seed=3), numbers(*a.projection_shape, seed=4)
@@ -319,15 +318,18 @@ def test_forward_and_reverse_mode_are_the_pair():
         a.integrate(mi.TensorXf(x.ravel(), (7, 5, 6)))
 
 
-def test_torch_differentiates_through_it():
+def test_torch_differentiates_through_it(variant_rgb):
     torch = pytest.importorskip("torch", reason="PyTorch is not installed: the torch bridge is not tested")
     a = Projector(BEAMS["parallel"], GRID)
     x, y = numbers(*GRID.shape), numbers(*a.projection_shape, seed=4)
-    tensor = torch.tensor(x, requires_grad=True)
+    device = "cpu" if variant_rgb.startswith("llvm") else "cuda"
+    tensor = torch.tensor(x, requires_grad=True, device=device)
     projected = a.to_torch()(tensor)
-    np.testing.assert_array_equal(projected.detach().numpy(), a @ x)
-    (projected * torch.tensor(y)).sum().backward()
-    np.testing.assert_allclose(tensor.grad.numpy(), a.T @ y, atol=1e-5)
+    np.testing.assert_array_equal(projected.detach().cpu().numpy(), a @ x)
+    (projected * torch.tensor(y, device=device)).sum().backward()
+    np.testing.assert_allclose(tensor.grad.cpu().numpy(), a.T @ y, atol=1e-5)
+    with pytest.raises(MivolError, match=f"a tensor on meta, expected one on {device}"):
+        a.to_torch()(tensor.to("meta"))
 
 
 def test_without_torch_the_bridge_says_so(monkeypatch):

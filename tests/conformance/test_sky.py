@@ -25,9 +25,11 @@ def test_a_sky_is_an_envmap_of_mitsuba(variant_rgb: str) -> None:
     si = mi.SurfaceInteraction3f()
     si.wi = -d
     # Bilinear weights move by 1e-7 of an angle times 16 columns, and by acos near the poles: sqrt(1e-7) = 3e-4 of a row.
-    np.testing.assert_allclose(np.array(Sky.of_image(image).seen(d)), np.array(light.eval(si)), atol=1e-3)
-    inner = np.abs(np.array(d.y)) < 0.99
-    np.testing.assert_allclose(np.array(Sky.of_image(image).seen(d))[:, inner], np.array(light.eval(si))[:, inner], atol=1e-5)
+    # On a GPU an envmap is a texture whose weights have 8 bits: two of them, each known to 1/512.
+    by_texture = 0 if variant_rgb.startswith("llvm") else 2 / 512
+    seen, expected, inner = np.array(Sky.of_image(image).seen(d)), np.array(light.eval(si)), np.abs(np.array(d.y)) < 0.99
+    np.testing.assert_allclose(seen, expected, atol=1e-3 + by_texture)
+    np.testing.assert_allclose(seen[:, inner], expected[:, inner], atol=1e-5 + by_texture)
 
 
 def test_derivatives_of_a_sky(variant_rgb: str) -> None:

@@ -190,7 +190,9 @@ def test_a_million_rays_into_few_voxels(seed, shape):
         u = np.clip(o[:, 1:] * 2 - 0.5, 0, 1)
         exact = 0.5 * np.array([[(1 - u[:, 1]) @ (1 - u[:, 0]), (1 - u[:, 1]) @ u[:, 0]],
                                 [u[:, 1] @ (1 - u[:, 0]), u[:, 1] @ u[:, 0]]])
-        assert np.allclose(row, exact[:, :, None], rtol=1e-5, atol=0)
+        # A GPU adds each term to the sum itself: 1e6 roundings of at most 6e-8 of it spread by 2e-5, in no fixed order.
+        rtol = 1e-5 if mi.variant().startswith("llvm") else 1e-4
+        assert np.allclose(row, exact[:, :, None], rtol=rtol, atol=0)
 
 
 def test_rays_with_gradients_are_refused(seed):

@@ -170,7 +170,7 @@ def test_the_same_twice():
     assert np.array_equal(whole[100:117], tau_fast(values, np.eye(4), o[100:117], d[100:117]))
 
 
-def test_gradients_bitwise_with_one_thread(two_threads):
+def test_gradients_bitwise_with_one_thread(cpu_back_end, two_threads):
     """Hard case 43."""
     rng = np.random.default_rng(34)
     o, d = random_rays(rng, np.eye(4), 100_000)

@@ -23,7 +23,7 @@ def photos() -> list[Photo]:
 
 
 @pytest.fixture
-def one_thread(variant_rgb: str) -> Iterator[None]:
+def one_thread(cpu_back_end: None) -> Iterator[None]:
     """One Dr.Jit thread: sums have a fixed order."""
     before = dr.thread_count()
     set_thread_count(1)

@@ -38,7 +38,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from mivol.numerics import exp_moments, one_minus_exp, phi1
+from mivol.numerics import exp_moments, lesser, one_minus_exp, phi1, reciprocal
 from mivol.transport.traversal.interpolation import GAUSS
 
 __all__ = ["DensityWeights", "OpacityShares", "share_opacity", "weigh_emission_density"]
@@ -96,13 +96,14 @@ def share_opacity(dt: mi.Float, sigma1: mi.Float, sigma2: mi.Float) -> OpacitySh
     half, total = 0.5 * dt, sigma1 + sigma2
     tau = half * total
     x = dr.minimum(tau * (1 / math.sqrt(3)), STEEP)
-    r = x * dr.rcp(x + 2)
+    r = x * reciprocal(x + 2)
     q = dr.fma(x, dr.fma(x, dr.fma(r, 1 / 3, 0.5), 1), 1)
     first = sigma1 * q
     both = first + sigma2
     some = both > 0
-    inverse = dr.rcp(dr.select(some, both, 1))
-    f = dr.select(some, first * inverse, 0.5)
+    inverse = reciprocal(dr.select(some, both, 1))
+    # A GPU's reciprocals err by an ulp or two: a weight 1 - f must not become negative.
+    f = dr.select(some, lesser(first * inverse, 1), 0.5)
     scale = phi1(tau) * dr.select(some, total * inverse, 1)
     growth = half * (1 / math.sqrt(3)) * (1 + x + (2 / 3) * dr.square(r) * (3 + x))  # dq / d sigma, for either point
     lean = (scale * dr.fma(sigma1, growth, q) * (1 - f), -scale * f * (1 - sigma2 * growth / q))
@@ -133,7 +134,7 @@ def weigh_emission_density(dt: mi.Float, sigma1: mi.Float, sigma2: mi.Float) -> 
     """
     tau, lean = 0.5 * dt * (sigma1 + sigma2), (0.5 * math.sqrt(3)) * dt * (sigma2 - sigma1)
     E = exp_moments(tau)
-    inverse = dr.rcp(E[0])
+    inverse = reciprocal(E[0])
     e = [m * inverse for m in E]
     twice = e[2] - 2 * e[3] + e[4]
     total = E[0] * (1 + lean * (e[1] - e[2] + 0.5 * lean * twice))
