@@ -13,11 +13,12 @@ import os
 import subprocess
 import sys
 import threading
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 
 from .errors import MivolError
 
-__all__ = ["check_one_thread", "run_child", "set_thread_count"]
+__all__ = ["check_one_thread", "owner_waits", "run_child", "set_thread_count"]
 
 _owner: threading.Thread | None = None
 _pid = os.getpid()
@@ -47,6 +48,18 @@ def check_one_thread() -> None:
             f"two of them lose gradients silently: hand the work to {_owner.name!r} (a queue of NumPy arrays), or to a "
             "process of its own."
         )
+
+
+@contextmanager
+def owner_waits() -> Iterator[None]:
+    """The thread that uses Dr.Jit waits for the calling one, as it does for PyTorch's, which differentiate on a GPU: for a
+    while the caller is the one. What the owner launched has to be done (``dr.sync_thread``)."""
+    global _owner
+    before, _owner = _owner, threading.current_thread()
+    try:
+        yield
+    finally:
+        _owner = before
 
 
 def set_thread_count(count: int) -> None:

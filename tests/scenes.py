@@ -71,6 +71,12 @@ def tensor(values: np.ndarray) -> mi.TensorXf:
     return mi.TensorXf(np.ascontiguousarray(values[..., None] if values.ndim == 3 else values))
 
 
+def skip_recorded_grids_on_a_gpu() -> None:
+    """There ``dr.freeze`` does not record a grid of our own, which is refused (:attr:`mivol.fields.voxels.Voxels.recorded`)."""
+    if not mi.variant().startswith("llvm"):
+        pytest.skip("mivol_voxels is not recorded on a GPU")
+
+
 def to_lanes(o: np.ndarray, d: np.ndarray) -> tuple[mi.Point3f, mi.Vector3f]:
     """Rays (n, 3) as Dr.Jit lanes."""
     columns = [np.ascontiguousarray(np.atleast_2d(x).T, dtype=np.float32) for x in (o, d)]

@@ -222,6 +222,24 @@ def test_one_thread_owns_drjit(monkeypatch: pytest.MonkeyPatch) -> None:
     threads.check_one_thread()
 
 
+def test_an_owner_that_waits_lends_drjit(monkeypatch: pytest.MonkeyPatch) -> None:
+    """For a while: the owner has it again afterwards."""
+    monkeypatch.setattr(threads, "_owner", None)
+    threads.check_one_thread()
+    owners: list[threading.Thread | None] = []
+
+    def differentiate() -> None:
+        with threads.owner_waits():
+            threads.check_one_thread()
+            owners.append(threads._owner)
+        owners.append(threads._owner)
+
+    helper = threading.Thread(target=differentiate)
+    helper.start()
+    helper.join()
+    assert owners == [helper, threading.current_thread()]
+
+
 def test_the_next_thread_may_follow_one_that_ended(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(threads, "_owner", None)
     first = threading.Thread(target=threads.check_one_thread)

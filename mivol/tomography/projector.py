@@ -22,7 +22,7 @@ import numpy as np
 
 from mivol.device_arrays import aligned
 from mivol.errors import MivolError
-from mivol.threads import check_one_thread
+from mivol.threads import check_one_thread, owner_waits
 from mivol.tomography.geometry import Geometry, VoxelGrid, view_index
 from mivol.tomography.ray_order import order_rays
 from mivol.tomography.recorded_kernels import RecordedKernels
@@ -183,9 +183,12 @@ class Projector:
         Returns:
             (views, rows, cols).
         """
+        return self._apply(_Projection, values)
+
+    def _apply(self, operation: type[_Projection], values: mi.TensorXf) -> mi.TensorXf:
         if tuple(values.shape) != self.grid.shape:
             raise MivolError(f"Found a tensor of shape {tuple(values.shape)}, expected the grid's {self.grid.shape}.")
-        return mi.TensorXf(dr.custom(_Projection, values.array, self), self.projection_shape)
+        return mi.TensorXf(dr.custom(operation, values.array, self), self.projection_shape)
 
     def to_torch(self) -> Callable[[torch.Tensor], torch.Tensor]:
         """The projector as a differentiable PyTorch function from (Z, Y, X) to (views, rows, cols), through ``dr.wrap``.
@@ -203,7 +206,7 @@ class Projector:
 
         @dr.wrap(source="torch", target="drjit")
         def project(x: mi.TensorXf) -> mi.TensorXf:
-            return self.integrate(x)
+            return self._apply(_ProjectionOfTorch, x)
 
         place = "cpu" if dr.backend_v(mi.Float) == dr.JitBackend.LLVM else "cuda"
 
@@ -348,6 +351,20 @@ class _Projection(dr.CustomOp):
 
     def name(self) -> str:
         return "projection"
+
+
+class _ProjectionOfTorch(_Projection):
+    """The same for PyTorch, whose own threads ask for derivatives on a GPU, while the one that asked them waits."""
+
+    def eval(self, values: mi.Float, projector: Projector) -> mi.Float:
+        y = super().eval(values, projector)
+        dr.eval(y)
+        dr.sync_thread()
+        return y
+
+    def backward(self) -> None:
+        with owner_waits():
+            super().backward()
 
 
 def _as_array(a: np.ndarray, shape: tuple[int, ...], what: str) -> tuple[np.ndarray, bool]:

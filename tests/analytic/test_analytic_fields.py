@@ -143,7 +143,8 @@ def test_direction_length_does_not_matter_and_empty_segments_are_zero():
         o, d, t0, t1 = rays(5, seed=3)
         tau = field.optical_depth(o, d, t0, t1)
         # 32 eps of rounding in t |d|, times slopes of up to about 40 per unit, and in the sums of depths of up to 300.
-        np.testing.assert_allclose(field.optical_depth(o, d / 7, 7 * t0, 7 * t1), tau, rtol=32 * 2.3e-16, atol=32 * 40 * 2.3e-16)
+        rounding = 32 * 2.3e-16
+        np.testing.assert_allclose(field.optical_depth(o, d / 7, 7 * t0, 7 * t1), tau, rtol=rounding, atol=40 * rounding)
         assert np.all(field.optical_depth(o, d, t1, t0) == 0)
 
 

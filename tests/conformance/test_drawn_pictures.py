@@ -38,7 +38,7 @@ def sketch(values: np.ndarray) -> list[float]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", CASES)
-def test_a_seed_means_the_same_picture_tomorrow(variant_rgb: str, name: str, record: bool, monkeypatch) -> None:
+def test_a_seed_means_the_same_picture_tomorrow(cpu_back_end: None, name: str, record: bool, monkeypatch) -> None:
     fingerprint = load("fingerprint")
     monkeypatch.setattr(fingerprint, "RES", 6)
     monkeypatch.setattr(fingerprint, "SPP", 2)

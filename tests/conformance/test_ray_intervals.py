@@ -109,4 +109,6 @@ def test_boundaries_that_are_moved():
         assert_same_images(scene, rounding=LEAK, ours=ours)
     params[key] = mi.Float(there.ravel())
     params.update()
-    np.testing.assert_array_equal(np.array(mi.render(scene, integrator=ours, spp=16)), first)
+    # A GPU adds the samples of a pixel in no fixed order.
+    rtol = 0 if mi.variant().startswith("llvm") else 1e-6
+    np.testing.assert_allclose(np.array(mi.render(scene, integrator=ours, spp=16)), first, rtol=rtol)

@@ -21,7 +21,7 @@ from mivol.transport.path.scores import Replay
 from mivol.transport.path.settings import Settings
 from mivol.validate.moments import Moments
 from mivol.validate.statistics import Estimate
-from scenes import ball_of, box_of, camera, grid_volume, medium, sky
+from scenes import ball_of, box_of, camera, grid_volume, medium, skip_recorded_grids_on_a_gpu, sky
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
 
@@ -206,6 +206,7 @@ def test_they_keep_the_mean(name: str, key: str, depth: int, monkeypatch: pytest
 @pytest.mark.slow
 def test_a_recording_walks_whole_paths(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of a camera that moves its seed: what an ordinary step finds without branches."""
+    skip_recorded_grids_on_a_gpu()
     values = rough_grid(4, 3.0).astype(np.float32)
     interior = medium("mivol_medium", grid_volume("mivol_voxels", values, PLACE), 0.8)
     sensor = camera((2.0, 1.5, 3.0), (0.0, 0.0, 0.0), res=8, fov=45.0)
