@@ -367,13 +367,14 @@ class Photographs(Section):
     scale: Annotated[float, of("1", "of width and height, by exact means over area", gt=0, le=1)] = 1.0
     largest: Annotated[int | None, of("pixel", "longest edge of any photograph; absent: as scale says")] = None
     background: Annotated[
-        str | tuple[float, float, float], of("1", "behind images with alpha: white, black or an rgb triple; empty: no alpha")
+        str | tuple[float, float, float],
+        of(
+            "1",
+            "where nothing is, white, black or an rgb triple; of images with alpha also random (a colour for each), of those "
+            "without also sky (learned with the field) or nested (boxes of twice the extent each, and a sky); empty: no alpha, "
+            "and what the preset has, else black",
+        ),
     ] = ""
-    behind: Annotated[tuple[float, float, float], of("1", "colour that images without alpha show where nothing is")] = (
-        0.0,
-        0.0,
-        0.0,
-    )
     held_out: Annotated[int, of("view", "every so many of the training views is compared, not fitted; 0: none", ge=0)] = 8
     box: Annotated[
         str | tuple[tuple[float, float, float], tuple[float, float, float]],
@@ -392,10 +393,9 @@ class Photographs(Section):
     def __post_init__(self) -> None:
         if self.largest is not None and self.largest < 16:
             raise ValueError(f"largest is {self.largest}: at least 16 pixels are expected")
-        for name in ("background", "behind"):
-            colour = getattr(self, name)
-            if not isinstance(colour, str) and not all(0 <= c <= 1 for c in colour):  # NaN fails every comparison
-                raise ValueError(f"{name} is {list(colour)}: three numbers from 0 to 1 are expected, codes of 8 bits over 255")
+        colour = self.background
+        if not isinstance(colour, str) and not all(0 <= c <= 1 for c in colour):  # NaN fails every comparison
+            raise ValueError(f"background is {list(colour)}: three numbers from 0 to 1 are expected, codes of 8 bits over 255")
 
 
 MOST_LEVELS = 12

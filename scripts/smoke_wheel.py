@@ -117,7 +117,7 @@ solve = { name = "pcg", iterations = 3 }
 """
 
 PHOTO_FIT = """title = "a ball"
-photos = { path = "photographs", behind = [1, 1, 1], box = [[-1, -1, -1], [1, 1, 1]], held_out = 6, space = "srgb" }
+photos = { path = "photographs", background = "white", box = [[-1, -1, -1], [1, 1, 1]], held_out = 6, space = "srgb" }
 field = { preset = "tiny", longest = 12, degree = 0, effort = 0.2 }
 show = { frames = 3, views = 1 }
 """

@@ -90,7 +90,7 @@ GAINS = PlanLine(choice="gains of each photograph", reason="cameras that choose 
 def choices(plan: GaussianPlan, photos: Photos, count: int, whence: str, memory: str, minutes: float) -> list[PlanLine]:
     """What will be done, and why."""
     stages = [f"{stage.steps} of photographs shrunk by {stage.shrink}, degree {stage.degree}" for stage in plan.stages]
-    behind = "alpha says what is there" if photos.views[0].alpha is not None else "photos.behind"
+    behind = "alpha says what is there" if photos.views[0].alpha is not None else "photos.background"
     control = {
         "clone_split": "divided where the photographs pull most, taken out where they are transparent (Kerbl et al. 2023)",
         "relocation": "moved from where they are transparent to where others are opaque (Kheradmand et al. 2024)",

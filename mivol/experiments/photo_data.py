@@ -11,10 +11,11 @@ import numpy as np
 
 from mivol.config import GaussianFit, PhotoFit
 from mivol.errors import MivolError
+from mivol.experiments.photo_plan import LEARNED
 from mivol.optim.colour_scale import EPSILON
 from mivol.optim.strategy import nearest
 from mivol.photos import Photos, PhotoSurvey, load_photos, silhouette_box, survey_photos
-from mivol.photos.dataset import check_alpha
+from mivol.photos.dataset import BACKGROUNDS, check_alpha
 from mivol.photos.picture import space_of
 from mivol.photos.region import near_far_of
 from mivol.validate.images import check_metrics
@@ -24,19 +25,19 @@ def read_photos(chosen: PhotoFit, base: Path) -> tuple[Photos, Photos | None]:
     """Photographs to fit, and those to judge by.
 
     Raises:
-        MivolError: as :func:`mivol.photos.load_photos`, metrics that do not judge them, or neither a box nor one of the words
-            for it.
+        MivolError: as :func:`mivol.photos.load_photos`, metrics that do not judge them, or neither a box (a background) nor
+            one of the words for it.
     """
     wanted = chosen.photos
     if isinstance(wanted.box, str) and wanted.box not in BOXES:
         raise MivolError(f'photos.box = "{wanted.box}" is unknown: {nearest(wanted.box, list(BOXES))}')
+    box = "middle" if wanted.background == "nested" and wanted.box == "found" else wanted.box
     settings: dict[str, Any] = {
         "scale": wanted.scale,
         "largest": wanted.largest,
-        "background": wanted.background or None,
         "held_out": wanted.held_out,
         "space": wanted.space,
-        "box": SEARCHED.get(wanted.box) if isinstance(wanted.box, str) else np.array(wanted.box, np.float64),
+        "box": SEARCHED.get(box) if isinstance(box, str) else np.array(box, np.float64),
     }
     if isinstance(chosen, GaussianFit):
         if wanted.space == "linear":
@@ -48,14 +49,36 @@ def read_photos(chosen: PhotoFit, base: Path) -> tuple[Photos, Photos | None]:
     is_judged = wanted.judged != "held_out" or wanted.held_out > 0
     others = survey_photos(path, split=wanted.judged, **surveyed).frames if is_judged else ()
     # Before any is read: a background that is asked for would be the first of two answers.
-    check_alpha([*fitted.frames, *others])
-    photos = _over(load_photos(path, split="train", **settings), wanted.behind)
+    has_alpha = check_alpha([*fitted.frames, *others])
+    check_background(chosen, has_alpha)
+    if has_alpha:
+        settings["background"] = wanted.background or None
+    photos = _over(load_photos(path, split="train", **settings), wanted.background)
     white = white_of(photos) if photos.space == "linear" else 1.0
     if not is_judged:
         return exposed(photos, white), None
     judged = load_photos(path, split=wanted.judged, **settings | {"space": photos.space})
     check_metrics(chosen.show.metrics, *np.min([view.camera.size for view in judged.views], axis=0))
-    return exposed(photos, white), exposed(_over(judged, wanted.behind), white)
+    return exposed(photos, white), exposed(_over(judged, wanted.background), white)
+
+
+def check_background(chosen: PhotoFit, has_alpha: bool) -> None:
+    """Refuse a word for what is behind that is none, or none for photographs of this kind.
+
+    Raises:
+        MivolError: with the words that are.
+    """
+    word = chosen.photos.background
+    learned = [] if isinstance(chosen, GaussianFit) else list(LEARNED)
+    known = list(BACKGROUNDS) if has_alpha else ["white", "black", *learned]
+    if not isinstance(word, str) or word in ("", *known):
+        return
+    if word not in (*BACKGROUNDS, *LEARNED):
+        raise MivolError(f'photos.background = "{word}" is unknown: {nearest(word, known)}')
+    kind = "photographs with alpha" if has_alpha else "photographs without alpha"
+    if word in LEARNED and isinstance(chosen, GaussianFit):
+        kind = "Gaussians"
+    raise MivolError(f'photos.background = "{word}" is not for {kind}: {", ".join(known)} or an rgb triple is expected.')
 
 
 MIDDLE_GREY = 0.18
@@ -81,11 +104,11 @@ def exposed(photos: Photos, white: float) -> Photos:
     return replace(photos, views=tuple(views), white=white)
 
 
-def _over(photos: Photos, behind: tuple[float, float, float]) -> Photos:
+def _over(photos: Photos, background: str | tuple[float, float, float]) -> Photos:
     """Photographs that show a colour where nothing is; those with alpha were put over theirs."""
     if photos.views[0].alpha is not None:
         return photos
-    colour = np.array(behind, np.float32)
+    colour = np.full(3, background == "white", np.float32) if isinstance(background, str) else np.array(background, np.float32)
     return replace(photos, views=tuple(replace(view, background=colour) for view in photos.views))
 
 

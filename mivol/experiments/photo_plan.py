@@ -27,6 +27,10 @@ FEWEST = 16
 """Nodes along an edge that a preset has in any case, though voxels are smaller than pixels then."""
 
 
+LEARNED = {"sky": ("sky", "sky_smooth"), "nested": ("sky", "sky_smooth", "levels", "near")}
+"""What the plan takes from the preset ``capture``, by the word for what is behind."""
+
+
 def make_plan(chosen: FieldFit) -> FitPlan:
     """The preset with what the file says otherwise.
 
@@ -36,7 +40,7 @@ def make_plan(chosen: FieldFit) -> FitPlan:
     wanted = chosen.field
     if wanted.preset not in PRESETS:
         raise MivolError(f'field.preset = "{wanted.preset}" is unknown: {nearest(wanted.preset, list(PRESETS))}')
-    plan = PRESETS[wanted.preset]
+    plan = with_background(PRESETS[wanted.preset], chosen.photos.background)
     names = ("degree", "first_degree", "tv_density", "tv_sh", "sparsity", "matte", "depth", "sky", "beta", "exposure")
     given = {name: getattr(wanted, name) for name in names}
     plan = replace(plan, **{name: value for name, value in given.items() if value is not None})
@@ -49,6 +53,14 @@ def make_plan(chosen: FieldFit) -> FitPlan:
     if wanted.levels is not None:
         plan = replace(plan, levels=wanted.levels, fewer_levels=False)
     return plan if wanted.longest is None else replace(plan.up_to(wanted.longest), cubic=False)
+
+
+def with_background(plan: FitPlan, background: str | tuple[float, float, float]) -> FitPlan:
+    """The plan that learns what is behind, or does not, as the word for it says; the preset's where there is none."""
+    if background == "":
+        return plan
+    names = LEARNED.get(background, ()) if isinstance(background, str) else ()
+    return replace(plan, **{"sky": 0} | {name: getattr(PRESETS["capture"], name) for name in names})
 
 
 def batches_of(plan: FitPlan, photos: Photos) -> RayBatches:
@@ -184,5 +196,5 @@ def what_is_behind(plan: FitPlan, photos: Photos) -> PlanLine:
         "(" + ", ".join(f"{c:.2g}" for c in colour) + ")"
         for colour in (np.median(np.concatenate(edges), axis=0), photos.views[0].background)
     )
-    reason = f"photos.behind; the edges of the photographs show {most} mostly, and field.sky would learn it"
+    reason = f'photos.background; the edges of the photographs show {most} mostly, and "sky" would learn it'
     return PlanLine(choice=f"the colour {believed} behind the box", reason=reason)

@@ -58,7 +58,6 @@ DEFAULTS = {
         "scale": 1.0,
         "largest": None,
         "background": "",
-        "behind": (0.0, 0.0, 0.0),
         "held_out": 8,
         "box": "found",
         "judged": "held_out",

@@ -188,6 +188,7 @@ def test_the_example_is_one_of_gaussians() -> None:
         ("gaussians.minutes=1", "minutes is 1.0 beside effort 0.2"),
         ("gaussians.exposure=true", "gains were asked for and the photographs have alpha"),
         ("gaussians.most=2000000000", "most = "),
+        ("photos.background=sky", 'photos.background = "sky" is not for Gaussians: white, black, random or an rgb triple'),
         ("variant=scalar_rgb", "mivol works in llvm_ad_rgb"),
     ],
 )

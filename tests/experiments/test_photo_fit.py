@@ -75,7 +75,7 @@ def toml(folder: Path, photographs: Path, more: str = "") -> Path:
         checkpoint_every = 10
         [photos]
         path = "{photographs}"
-        behind = [1, 1, 1]
+        background = "white"
         box = [[-1, -1, -1], [1, 1, 1]]
         held_out = 0
         judged = "test"
@@ -102,7 +102,7 @@ def test_photographs_become_a_field_and_a_page(photographs: Path, tmp_path: Path
     assert printed.out.strip().endswith("report.html")
     before, _, after = printed.err.partition(" iterations in ")
     assert "loss" in after
-    for text in ("box (-1, -1, -1) to (1, 1, 1), as given", "behind the box: photos.behind", "near 1.", "MiB: photographs"):
+    for text in ("box (-1, -1, -1) to (1, 1, 1), as given", "behind the box: photos.background", "near 1.", "MiB: photographs"):
         assert text in before
     record = json.loads((tmp_path / "run/run.json").read_text())
     # A white picture would have 9 dB, a grey ball 15.
@@ -182,7 +182,7 @@ def test_the_best_field_is_kept_beside_the_last(
 def test_what_is_behind_is_learned(photographs: Path, tmp_path: Path) -> None:
     """Views over white, said to be over black: a sky finds the white, and is kept as an image beside the field."""
     path = toml(tmp_path, photographs)
-    more = ["--set", "photos.behind=[0, 0, 0]", "--set", "field.sky=4"]
+    more = ["--set", "photos.background=black", "--set", "field.sky=4"]
     assert main(["optimize", str(path), "-o", str(tmp_path / "run"), *more]) == 0
     record = json.loads((tmp_path / "run/run.json").read_text())
     assert record["results"]["held_out_psnr"] > 22
@@ -244,7 +244,7 @@ def test_what_was_done_to_linear_photographs_is_said(photographs: Path, tmp_path
 
 def test_what_is_taken_to_be_behind_is_said(photographs: Path, tmp_path: Path) -> None:
     """The ball fills the middle of each view: its edges are white, whatever colour the file says is behind it."""
-    chosen = config.load(toml(tmp_path, photographs), ["photos.behind=[0, 0.5, 0]"])
+    chosen = config.load(toml(tmp_path, photographs), ["photos.background=[0, 0.5, 0]"])
     photos, _ = photo_data.read_photos(chosen, tmp_path)
     plan = photo_plan.make_plan(chosen)
     said = photo_plan.what_is_behind(plan, photos)
@@ -253,6 +253,62 @@ def test_what_is_taken_to_be_behind_is_said(photographs: Path, tmp_path: Path) -
     assert "sky of 8 rows" in photo_plan.what_is_behind(replace(plan, sky=8), photos).choice
     clear = replace(photos, views=tuple(replace(v, alpha=np.ones((SIZE, SIZE))) for v in photos.views))
     assert "alpha" in photo_plan.what_is_behind(plan, clear).reason
+
+
+@pytest.mark.parametrize(
+    ("background", "preset", "levels", "sky"),
+    [("", "tiny", 1, 0), ("sky", "tiny", 1, 32), ("nested", "tiny", 5, 32), ("white", "tiny", 1, 0), ("", "capture", 5, 32),
+     ("sky", "capture", 5, 32), ("black", "capture", 5, 0), ("nested", "capture", 5, 32)],
+)  # fmt: skip
+def test_what_is_behind_has_a_name(
+    photographs: Path, tmp_path: Path, background: str, preset: str, levels: int, sky: int
+) -> None:
+    """A name says what is learned; a number of rows or of boxes that is given counts all the same."""
+    named = [f'photos.background="{background}"']
+    chosen = config.load(toml(tmp_path, photographs), [f"field.preset={preset}", *named])
+    plan = photo_plan.make_plan(chosen)
+    assert (plan.levels, plan.sky, plan.near > 0) == (levels, sky, levels > 1)
+    given = config.load(toml(tmp_path, photographs), [f"field.preset={preset}", "field.sky=6", "field.levels=2", *named])
+    assert (photo_plan.make_plan(given).levels, photo_plan.make_plan(given).sky) == (2, 6)
+    colour = [1.0] * 3 if background == "white" else [0.0] * 3
+    photos, judged = photo_data.read_photos(chosen, tmp_path)
+    assert judged is not None
+    for view in (*photos.views, *judged.views):
+        assert view.background.tolist() == colour
+
+
+def test_nested_boxes_by_name_begin_between_the_cameras(photographs: Path, tmp_path: Path) -> None:
+    """As those of the preset for captures, where no box is given."""
+    found = []
+    for change in ("photos.background=nested", "photos.box=middle"):
+        path = toml(tmp_path, photographs)
+        path.write_text(path.read_text().replace("box = [[-1, -1, -1], [1, 1, 1]]", ""))
+        found.append(photo_data.read_photos(config.load(path, [change]), tmp_path)[0].box)
+    assert np.array_equal(*found) and not np.array_equal(found[0], [[-1] * 3, [1] * 3])
+
+
+@pytest.mark.parametrize(
+    ("background", "said"),
+    [("sky", "is not for photographs with alpha: white, black, random or an rgb triple"), ("skies", "is unknown")],
+)
+def test_what_alpha_shows_has_no_sky(tmp_path: Path, background: str, said: str) -> None:
+    write_blender(tmp_path / "set")
+    chosen = config.load(toml(tmp_path, tmp_path / "set"), [f"photos.background={background}"])
+    with pytest.raises(MivolError, match=said):
+        photo_data.read_photos(chosen, tmp_path)
+
+
+def test_random_backgrounds_have_a_colour_a_photograph(tmp_path: Path) -> None:
+    """Of photographs that are fitted, and of those that judge."""
+    write_blender(tmp_path / "set")
+    chosen = config.load(toml(tmp_path, tmp_path / "set"), ["photos.background=random", 'show.metrics=["psnr"]'])
+    photos, judged = photo_data.read_photos(chosen, tmp_path)
+    assert judged is not None
+    for views in (photos.views, judged.views):
+        assert len({tuple(view.background) for view in views}) == len(views) > 1
+    view = photos.views[0]
+    at = view.alpha == 0
+    assert at.any() and np.array_equal(view.image[at], np.broadcast_to(view.background, view.image[at].shape))
 
 
 def test_photographs_are_shrunk_to_half_a_voxel(photographs: Path, tmp_path: Path) -> None:
@@ -404,7 +460,9 @@ def test_each_look_is_at_the_same_views(photographs: Path, tmp_path: Path, monke
         ("field.matte=inf", "matte is inf: a finite number"),
         ("field.effort=inf", "effort is inf: a finite number"),
         ("photos.background=[255, 255, 255]", "background is [255.0, 255.0, 255.0]: three numbers from 0 to 1"),
-        ("photos.behind=[0, nan, 0]", "from 0 to 1"),
+        ("photos.background=[0, nan, 0]", "from 0 to 1"),
+        ("photos.background=whit", 'did you mean "white"'),
+        ("photos.background=random", "is not for photographs without alpha: white, black, sky, nested or an rgb triple"),
         ("field.sky=30000", "2 to 4096 rows"),
         ("field.first_degree=5", "0 to 4"),
         ("field.sky=1", "0, or 2 to 4096 rows"),
@@ -413,7 +471,6 @@ def test_each_look_is_at_the_same_views(photographs: Path, tmp_path: Path, monke
         ("variant=scalar_rgb", "mivol works in llvm_ad_rgb"),
         ("photos.judged=val", "val"),
         ("photos.backgroud=white", 'did you mean "background"'),
-        ("photos.background=white", "alpha"),
         ("photos.box=[[1, -1, -1], [-1, 1, 1]]", "low below high"),
         ('show.metrics=["pnsr"]', 'did you mean "psnr"'),
         ("photos.scale=0.2", "an image of 10 x 10 pixels is smaller than the 11 pixel window of SSIM"),

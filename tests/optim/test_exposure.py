@@ -128,8 +128,7 @@ def test_gains_need_cameras(variant_rgb: str, photos: list[Photo]) -> None:
 
 def test_gains_are_what_the_preset_or_the_file_says() -> None:
     def plan(preset: str, **settings: object) -> FitPlan:
-        field = config.Field(preset=preset, **settings)
-        return make_plan(type("Chosen", (), {"field": field}))
+        return make_plan(config.from_dict({"title": "x", "photos": {"path": "x"}, "field": {"preset": preset, **settings}}))
 
     assert plan("capture").exposure and not plan("cpu").exposure
     assert plan("cpu", exposure=True).exposure and not plan("capture", exposure=False).exposure
