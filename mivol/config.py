@@ -389,6 +389,10 @@ class Photographs(Section):
         Literal["srgb", "linear"] | None,
         of("1", "values that are fitted: srgb (codes) or linear (radiance); absent: what the photographs hold"),
     ] = None
+    stored: Annotated[
+        Literal["srgb", "linear"] | None,
+        of("1", "what PNG and JPEG hold; absent: linear where a PNG says so (gAMA 1), else srgb; OpenEXR is linear"),
+    ] = None
 
     def __post_init__(self) -> None:
         if self.largest is not None and self.largest < 16:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import struct
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -135,3 +136,14 @@ def _write_colmap_txt(folder: Path, model: str, poses: list, points: np.ndarray,
     ends = [" ".join(f"{image} {k}" for k, image in enumerate(track)) for track in tracks]
     rows = [f"{i} {x!r} {y!r} {z!r} 1 2 3 0.5 {ends[i]}" for i, (x, y, z) in enumerate(points.tolist())]
     (folder / "points3D.txt").write_text("\n".join(["# 3D point list", *rows]) + "\n")
+
+
+def png_of_16_bits(codes: np.ndarray, gamma: int | None = None) -> bytes:
+    """A PNG of 16 bits a channel, (rows, columns, 3 or 4) uint16, chunk by chunk (W3C PNG, section 5); ``gamma`` x 100,000."""
+    rows, columns, channels = codes.shape
+    head = struct.pack(">IIBBBBB", columns, rows, 16, {3: 2, 4: 6}[channels], 0, 0, 0)
+    lines = b"".join(b"\0" + row.astype(">u2").tobytes() for row in codes)
+    said = [] if gamma is None else [(b"gAMA", struct.pack(">I", gamma))]
+    chunks = ((b"IHDR", head), *said, (b"IDAT", zlib.compress(lines)), (b"IEND", b""))
+    packed = (struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data)) for kind, data in chunks)
+    return b"\x89PNG\r\n\x1a\n" + b"".join(packed)

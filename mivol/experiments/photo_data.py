@@ -16,7 +16,6 @@ from mivol.optim.colour_scale import EPSILON
 from mivol.optim.strategy import nearest
 from mivol.photos import Photos, PhotoSurvey, load_photos, silhouette_box, survey_photos
 from mivol.photos.dataset import BACKGROUNDS, check_alpha
-from mivol.photos.picture import space_of
 from mivol.photos.region import near_far_of
 from mivol.validate.images import check_metrics
 
@@ -37,6 +36,7 @@ def read_photos(chosen: PhotoFit, base: Path) -> tuple[Photos, Photos | None]:
         "largest": wanted.largest,
         "held_out": wanted.held_out,
         "space": wanted.space,
+        "stored": wanted.stored,
         "box": SEARCHED.get(box) if isinstance(box, str) else np.array(box, np.float64),
     }
     if isinstance(chosen, GaussianFit):
@@ -170,11 +170,10 @@ def notes(photos: Photos, judged: Photos | None = None) -> list[str]:
         ]
     else:
         found = ["Colours are srgb code values; in a scene mivol_sh and mivol_gaussians show the radiance that they stand for."]
-    stored = {space_of(frame.file) for frame in photos.survey.frames}
-    if "linear" in stored and photos.space == "srgb":
+    if "linear" in photos.stored and photos.space == "srgb":
         found.append("The light of photographs of radiance was encoded; what is above 1 counts as 1.")
-    if "srgb" in stored and photos.space == "linear":
-        found.append("Photographs of 8 bits were decoded by the sRGB curve.")
+    if "srgb" in photos.stored and photos.space == "linear":
+        found.append("Code values were decoded by the sRGB curve.")
     if judged is not None:
         width, height = judged.views[0].camera.size
         found.append(

@@ -79,12 +79,14 @@ class Photos:
         space: what their values are: "srgb" (code values) or "linear" (radiance).
         survey: what was found before pixels were read.
         white: of linear values, the radiance of the files for which 1 stands.
+        stored: what the values of the files are, of these two.
     """
 
     views: tuple[Photo, ...]
     space: str
     survey: PhotoSurvey
     white: float = 1.0
+    stored: frozenset[str] = frozenset({"srgb"})
 
     @property
     def box(self) -> np.ndarray:
@@ -115,6 +117,7 @@ def load_photos(
     scale: float = 1.0,
     background: Background = None,
     space: str | None = None,
+    stored: str | None = None,
     held_out: int | Sequence[str] = 0,
     box: np.ndarray | str | None = None,
     seed: int = 0,
@@ -130,6 +133,7 @@ def load_photos(
         background: behind images with alpha: "white", "black", "random" (a colour for each view; :meth:`Photo.over` for
             others) or (r, g, b); None where there is no alpha.
         space: "srgb" or "linear", what the values shall be; None: as the files are.
+        stored: "srgb" or "linear", what those of PNG and JPEG are; None: linear where a PNG says so, else srgb.
         held_out: every n-th training photograph, or file names (:func:`survey_photos`).
         box: (2, 3) [length]; None or "middle": found.
         seed: of random backgrounds.
@@ -145,7 +149,8 @@ def load_photos(
         >>> o, d = rays(photos.views[0].camera, pixel_centres(photos.views[0].camera.size))
     """
     survey = survey_photos(path, split=split, held_out=held_out, box=box)
-    space = _space(space, survey.frames)
+    held = _spaces(survey.frames, stored)
+    space = _space(space, held)
     if not 0 < scale <= 1:
         raise refusal("scale", f"{scale}", "a number above 0 and at most 1", "photographs can only be shrunk")
     if largest is not None:
@@ -153,8 +158,8 @@ def load_photos(
     _check_memory(survey, scale, available_memory() if limit is None else limit)
     _check_background(check_alpha(survey.frames), background, survey.frames[0].file)
     colours = _backgrounds(background, len(survey.frames), seed)
-    views = [_photo(frame, scale, colour, space) for frame, colour in zip(survey.frames, colours, strict=True)]
-    return Photos(tuple(views), space, survey)
+    views = [_photo(frame, scale, colour, (space, stored)) for frame, colour in zip(survey.frames, colours, strict=True)]
+    return Photos(tuple(views), space, survey, stored=frozenset(held))
 
 
 # -- Reading ------------------------------------------------------------------------------------------------------
@@ -203,15 +208,24 @@ def _check_background(has_alpha: bool, background: Background, first: Path) -> N
         raise _without_alpha(first)
 
 
-def _space(wanted: str | None, frames: Sequence[Frame]) -> str:
-    held = {space_of(frame.file): frame.file for frame in frames}
+def _spaces(frames: Sequence[Frame], stored: str | None) -> dict[str, Path]:
+    """What the values of files are, each with one of them."""
+    _check_space("stored", stored)
+    return {space_of(frame.file, stored): frame.file for frame in frames}
+
+
+def _space(wanted: str | None, held: dict[str, Path]) -> str:
     if wanted is None and len(held) == 2:
         names = " and ".join(file.name for file in held.values())
-        found, advice = "codes of 8 bits and radiance in one set", 'choose space = "srgb" or "linear" for all'
+        found, advice = "codes and radiance in one set", 'choose space = "srgb" or "linear" for all'
         raise refusal(names, found, "one kind of values", advice)
-    if wanted not in (None, "srgb", "linear"):
-        raise refusal("space", f'"{wanted}"', '"srgb" or "linear"', "choose one of those")
+    _check_space("space", wanted)
     return wanted or next(iter(held))
+
+
+def _check_space(name: str, value: str | None) -> None:
+    if value not in (None, "srgb", "linear"):
+        raise refusal(name, f'"{value}"', '"srgb" or "linear"', "choose one of those")
 
 
 def _backgrounds(background: Background, n: int, seed: int) -> Sequence[np.ndarray | None]:
@@ -228,8 +242,9 @@ def _backgrounds(background: Background, n: int, seed: int) -> Sequence[np.ndarr
     return np.broadcast_to(colour, (n, 3))
 
 
-def _photo(frame: Frame, scale: float, background: np.ndarray | None, space: str) -> Photo:
-    image, alpha = read_picture(frame.file, space)
+def _photo(frame: Frame, scale: float, background: np.ndarray | None, spaces: tuple[str, str | None]) -> Photo:
+    """Read one, whose values shall be, and in its file are, what ``spaces`` says."""
+    image, alpha = read_picture(frame.file, *spaces)
     camera = _shrunk_camera(frame.camera, scale)
     mask = None if frame.mask is None else _read_mask(frame, camera.size)
     seen = is_seen(camera, pixel_centres(camera.size))

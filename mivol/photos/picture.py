@@ -2,11 +2,13 @@
 
 Conventions. Pictures are float32 (rows, columns, 3), the first row on top, alpha (rows, columns) in 0..1. **PNG and JPEG hold
 sRGB code values 0..1 and OpenEXR files linear light, and each stays what it is unless the other is asked for**
-(:data:`SPACES`); radiance fields of such photographs are usually fitted to the code values. PNG keeps colour apart from alpha,
-OpenEXR multiplied by it; here all is multiplied by alpha before it is averaged or put over a background. Averages and
-backgrounds are taken in the values that are fitted, as NeRF's protocol does. PNG of 16 bits a channel is read at full depth.
+(:data:`SPACES`); radiance fields of such photographs are usually fitted to the code values. A PNG whose gAMA chunk says 1 holds
+linear light, and so do files of which the caller says it. PNG keeps colour apart from alpha, OpenEXR multiplied by it; here
+all is multiplied by alpha before it is averaged or put over a background. Averages and backgrounds are taken in the values that
+are fitted, as NeRF's protocol does. PNG of 16 bits a channel is read at full depth.
 
-Reference: IEC 61966-2-1 (the sRGB curve); Porter and Duff 1984 (SIGGRAPH), "over" with multiplied alpha.
+References: IEC 61966-2-1 (the sRGB curve); W3C PNG, section 11.3.2.2 (gAMA); Porter and Duff 1984 (SIGGRAPH), "over" with
+multiplied alpha.
 """
 
 from __future__ import annotations
@@ -66,9 +68,21 @@ SPACES: dict[tuple[str, str], Callable[[np.ndarray], np.ndarray]] = {
 }
 
 
-def space_of(path: Path) -> str:
-    """What the values of a file are, by its suffix: "linear" (OpenEXR) or "srgb"."""
-    return "linear" if path.suffix.lower() == ".exr" else "srgb"
+def space_of(path: Path, stored: str | None = None) -> str:
+    """What the values of a file are: "linear" (OpenEXR, and a PNG that says so) or "srgb".
+
+    Args:
+        stored: what the caller says of PNG and JPEG.
+
+    Raises:
+        MivolError: missing or damaged file.
+    """
+    if path.suffix.lower() == ".exr":
+        return "linear"
+    if stored is not None:
+        return stored
+    with _opened(path) as image:
+        return "linear" if image.info.get("gamma") == 1 else "srgb"
 
 
 @dataclass(frozen=True)
@@ -100,19 +114,20 @@ def read_header(path: Path) -> PictureHeader:
         return PictureHeader(image.size, _kind(image) == "RGBA", orientation)
 
 
-def read_picture(path: Path, space: str) -> tuple[np.ndarray, np.ndarray | None]:
+def read_picture(path: Path, space: str, stored: str | None = None) -> tuple[np.ndarray, np.ndarray | None]:
     """Colour multiplied by alpha (rows, columns, 3), and alpha (rows, columns) or None where the file has none.
 
     Args:
         path: PNG, JPEG or OpenEXR.
         space: "srgb" or "linear", what the values shall be.
+        stored: what those of a PNG or JPEG are; None: as :func:`space_of` says.
 
     Raises:
         MivolError: a damaged file, grey with alpha of 16 bits, channels that are no picture, NaN.
     """
-    stored = space_of(path)
-    colour, alpha = (_read_exr if stored == "linear" else _read_codes)(path)
-    if stored == "linear" and alpha is not None:
+    is_exr, stored = path.suffix.lower() == ".exr", space_of(path, stored)
+    colour, alpha = (_read_exr if is_exr else _read_codes)(path)
+    if is_exr and alpha is not None:
         if space == "linear":
             return colour, alpha
         colour = colour / np.where(alpha > 0, alpha, 1)[..., None]

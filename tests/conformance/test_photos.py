@@ -5,8 +5,6 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-import struct
-import zlib
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +15,7 @@ from photo_sets import (
     edit,
     look_at,
     pixels,
+    png_of_16_bits,
     ring,
     write_blender,
     write_colmap,
@@ -717,6 +716,7 @@ def test_images_of_two_sizes_in_one_blender_set_are_refused(blender: Path) -> No
         ({"background": "pink"}, "background: found"),
         ({"background": (1, 2)}, "three finite numbers"),
         ({"space": "hsv"}, "space: found"),
+        ({"stored": "hsv"}, "stored: found"),
         ({"held_out": 1}, "held_out: found 1"),
         ({"held_out": ["r_9.png"]}, 'no training photograph "r_9.png"'),
         ({"box": [[0, 0, 0], [0, 1, 1]]}, "low below high"),
@@ -774,16 +774,6 @@ def test_fox_photographs_agree_where_a_stalk_ends(data_dir: Path) -> None:
     t1, t2, gap = np.linalg.solve(np.stack([d1, -d2, across], axis=1), o2 - o1)
     assert min(t1, t2) > 0
     assert abs(gap) / min(t1, t2) * 1375 < 2
-
-
-def png_of_16_bits(codes: np.ndarray) -> bytes:
-    """A PNG of 16 bits a channel, (rows, columns, 3 or 4) uint16, chunk by chunk (W3C PNG, section 5)."""
-    rows, columns, channels = codes.shape
-    head = struct.pack(">IIBBBBB", columns, rows, 16, {3: 2, 4: 6}[channels], 0, 0, 0)
-    lines = b"".join(b"\0" + row.astype(">u2").tobytes() for row in codes)
-    chunks = ((b"IHDR", head), (b"IDAT", zlib.compress(lines)), (b"IEND", b""))
-    packed = (struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data)) for kind, data in chunks)
-    return b"\x89PNG\r\n\x1a\n" + b"".join(packed)
 
 
 @pytest.mark.parametrize("channels", [3, 4])

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from ball_photos import camera
+from photo_sets import png_of_16_bits
 from PIL import Image
 
 from mivol import config
@@ -142,6 +143,24 @@ def test_a_fit_of_radiance_is_as_bright_as_its_photographs(photographs: Path, tm
     assert "NeRF in the Dark" in (tmp_path / "run/report.html").read_text()
 
 
+@pytest.mark.parametrize("said_by", ["the file", "the setting"])
+def test_png_of_16_bits_may_hold_radiance(tmp_path: Path, said_by: str) -> None:
+    """Radiance as a raw converter writes it: the numbers over the largest, exposed as those of OpenEXR are."""
+    cameras, codes = {f"{k}.png": camera(k) for k in range(3)}, np.full((48, 48, 3), [3000, 600, 120], np.uint16)
+    for name in cameras:
+        (tmp_path / name).write_bytes(png_of_16_bits(codes, gamma=100_000 if said_by == "the file" else None))
+    write_transforms(tmp_path / "transforms.json", cameras, ["2.png"])
+    photos, judged = read(toml(tmp_path, tmp_path, "" if said_by == "the file" else 'stored = "linear"'))
+    assert photos.space == judged.space == "linear" and photos.stored == {"linear"}
+    for view in (*photos.views, *judged.views):
+        np.testing.assert_allclose(view.image[7, 7] * photos.white, codes[0, 0] / 65535, rtol=1e-6)
+    photos, _ = read(toml(tmp_path, tmp_path, 'stored = "linear"\nspace = "srgb"'))
+    np.testing.assert_allclose(photos.views[0].image[7, 7], encode_srgb(codes[0, 0] / 65535), rtol=1e-5)
+    photos, _ = read(toml(tmp_path, tmp_path, 'stored = "srgb"'))
+    np.testing.assert_allclose(photos.views[0].image[7, 7], codes[0, 0] / 65535, rtol=1e-6)
+    assert photos.space == "srgb" and photos.white == 1
+
+
 def test_codes_and_radiance_in_one_set_are_refused(photographs: Path, tmp_path: Path) -> None:
     """One sentence with the key that settles it; with it, either kind is made of the other."""
     cameras = {"a.exr": camera(0), "b.png": camera(1), "c.exr": camera(2)}
@@ -149,7 +168,7 @@ def test_codes_and_radiance_in_one_set_are_refused(photographs: Path, tmp_path: 
         image = np.full((48, 48, 3), [0.5, 0.25, 2.0], np.float32)
         write_exr(tmp_path / name, {"": image}) if name.endswith("exr") else write_png(tmp_path / name, image)
     write_transforms(tmp_path / "transforms.json", cameras, ["c.exr"])
-    with pytest.raises(MivolError, match='b.png: found codes of 8 bits and radiance in one set, .*; choose space = "srgb" or'):
+    with pytest.raises(MivolError, match='b.png: found codes and radiance in one set, .*; choose space = "srgb" or'):
         read(toml(tmp_path, tmp_path))
     photos, _ = read(toml(tmp_path, tmp_path, 'space = "srgb"'))
     for view in photos.views:
@@ -158,7 +177,7 @@ def test_codes_and_radiance_in_one_set_are_refused(photographs: Path, tmp_path: 
     photos, judged = read(toml(tmp_path, tmp_path, 'space = "linear"'))
     np.testing.assert_allclose(photos.views[1].image[7, 7] * photos.white, [0.5, 0.25, 1], atol=0.005)
     np.testing.assert_allclose(judged.views[0].image[7, 7] * judged.white, [0.5, 0.25, 2], rtol=1e-6)
-    assert any("8 bits were decoded" in note for note in notes(photos))
+    assert any("Code values were decoded" in note for note in notes(photos))
 
 
 def test_gaussians_are_fitted_to_codes(photographs: Path, tmp_path: Path) -> None:
