@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -9,7 +10,7 @@ import numpy as np
 from mivol.config import FieldFit
 from mivol.errors import MivolError
 from mivol.optim.radiance_plan import FEW, PRESETS, FitPlan, Stage, memory_of, stretched
-from mivol.optim.ray_batches import RayBatches
+from mivol.optim.ray_batches import TILE, RayBatches
 from mivol.optim.strategy import nearest
 from mivol.photos import Photos, rectified
 from mivol.photos.region import FEWEST_POINTS, levels_holding, nested, within
@@ -45,7 +46,7 @@ def make_plan(chosen: FieldFit) -> FitPlan:
     given = {name: getattr(wanted, name) for name in names}
     plan = replace(plan, **{name: value for name, value in given.items() if value is not None})
     stages = [replace(stage, steps=max(1, round(stage.steps * wanted.effort))) for stage in plan.stages]
-    plan = replace(plan, stages=tuple(stages))
+    plan = replace(plan, stages=tuple(stages), epochs=plan.epochs * wanted.effort)
     if wanted.degree is not None:
         plan = replace(plan, few_degree=None)
     if wanted.matte is not None:
@@ -73,12 +74,12 @@ def suited(plan: FitPlan, photos: Photos) -> FitPlan:
 
     Grids of a plan for cubes have as many nodes in a box that is none, though voxels are not smaller than the plan's for that,
     and never smaller than a pixel. Photographs are as small as the grids can tell, by the plan's pixels along a voxel at the
-    middle of the box, the degree is lower where they are few, and there are no more nested boxes than the points of a
-    reconstruction need.
+    middle of the box, stages take no more steps than their pixels are worth, the degree is lower where photographs are few, and
+    there are no more nested boxes than the points of a reconstruction need.
     """
     cameras, box = [view.camera for view in photos.views], photos.box
     pixel = np.median([np.linalg.norm(camera.origin - box.mean(axis=0)) / camera.K[0, 0] for camera in cameras])
-    least = min(min(camera.size) for camera in cameras)
+    least, pixels = min(min(camera.size) for camera in cameras), sum(math.prod(camera.size) for camera in cameras)
     edge = float((box[1] - box[0]).max())
 
     def suited_stage(stage: Stage) -> Stage:
@@ -87,7 +88,9 @@ def suited(plan: FitPlan, photos: Photos) -> FitPlan:
             longest = max(longest, min(stretched(longest, box), int(edge / (plan.voxel * pixel))))
             longest = min(longest, max(int(edge / pixel), FEWEST))
         halvings = min(round(np.log2(edge / longest / (plan.voxel * pixel))), int(np.log2(least / SMALLEST)))
-        return replace(stage, longest=longest, shrink=2 ** max(halvings, 0))
+        shrink = 2 ** max(halvings, 0)
+        worth = plan.epochs * pixels / shrink**2 / (min(stage.views, len(cameras)) * stage.tiles * TILE**2)
+        return replace(stage, longest=longest, shrink=shrink, steps=max(1, int(min(stage.steps, worth))))
 
     if len(photos.views) < FEW:
         plan = of_few(plan)

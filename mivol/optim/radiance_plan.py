@@ -97,6 +97,8 @@ class FitPlan:
             chair came to 30.9, 31.6 and 31.0 dB in as many steps; fits that take longer gain by finer ones.)
         cubic: a box that is no cube gets as many nodes in all as its stages have in a cube, for memory and time go with them
             (:func:`stretched`); False: ``longest`` is meant as it stands.
+        epochs: times that a stage looks at each pixel of its photographs, at most: few and small ones take fewer steps, since
+            with more their noise is learned (EPOCHS_TABLE).
         random_background: photographs with alpha are seen over another colour each step, so that nothing stands in the air in
             the background's colour.
     """
@@ -133,6 +135,7 @@ class FitPlan:
     near: float = 0.0
     voxel: float = 2.0
     cubic: bool = True
+    epochs: float = math.inf
     random_background: bool = True
 
     @property
@@ -231,6 +234,7 @@ PRESETS: dict[str, FitPlan] = {
         ),
         last=0.006,
         voxel=4 / 3,
+        epochs=8.0,
     ),
     "capture": FitPlan(
         (Stage(32, 150, 1, 8, 64), Stage(64, 450, 1, 8, 128)),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -320,6 +321,19 @@ def test_photographs_are_shrunk_to_half_a_voxel(photographs: Path, tmp_path: Pat
     photos, _ = photo_data.read_photos(chosen, tmp_path)
     plan = FitPlan((Stage(4, 1), Stage(8, 1), Stage(11, 1), Stage(13, 1, shrink=4)))
     assert [stage.shrink for stage in photo_plan.suited(plan, photos).stages] == [2, 2, 2, 1]
+
+
+def test_stages_look_at_each_pixel_so_often_at_most(photographs: Path, tmp_path: Path) -> None:
+    """2 epochs of V photographs: of 24 x 24 by 2 tiles of 16 pixels of 3 of them, and of 48 x 48 by one tile of each."""
+    photos, _ = photo_data.read_photos(config.load(toml(tmp_path, photographs)), tmp_path)
+    count = len(photos.views)
+    stages = Stage(11, 10_000, views=3, tiles=2), Stage(13, 10_000, views=1000, tiles=1), Stage(13, 5, views=1, tiles=1)
+    plan = FitPlan(stages, epochs=2.0)
+    expected = [2 * count * 24**2 // 96, 2 * 48**2 // 16, 5]
+    assert [stage.steps for stage in photo_plan.suited(plan, photos).stages] == expected
+    assert [stage.steps for stage in photo_plan.suited(FitPlan(stages), photos).stages] == [10_000, 10_000, 5]
+    asked = photo_plan.make_plan(config.load(toml(tmp_path, photographs), ["field.preset=fine", "field.effort=3"]))
+    assert asked.epochs == 3 * PRESETS["fine"].epochs < math.inf  # who asks for more gets more
 
 
 def test_a_long_box_has_as_many_nodes_as_a_cube(photographs: Path, tmp_path: Path) -> None:
