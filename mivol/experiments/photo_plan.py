@@ -136,6 +136,7 @@ def choices(plan: FitPlan, photos: Photos, batches: RayBatches) -> list[PlanLine
         *near_cameras(plan, origins, box),
         *wide_lenses(photos),
         PlanLine(choice=f"grids of {resolutions} nodes along the longest edge", reason="coarse first, to find what is empty"),
+        steps_of(plan),
         sizes_of(plan, (width, height)),
         PlanLine(choice=f"harmonics of degree {plan.degree}", reason=f"{(plan.degree + 1) ** 2} numbers a colour and node"),
         what_is_behind(plan, photos),
@@ -167,6 +168,15 @@ def near_cameras(plan: FitPlan, origins: np.ndarray, box: np.ndarray) -> list[Pl
     reach = plan.reach(origins, box)
     choice = f"derivatives nearer to a camera than {reach:.4g} [length] fall with the square of the distance"
     return [PlanLine(choice=choice, reason="else matter grows before the lenses")] if reach else []
+
+
+def steps_of(plan: FitPlan) -> PlanLine:
+    """How many steps the stages take, and what bounds them."""
+    steps = ", ".join(str(stage.steps) for stage in plan.stages)
+    reason = "field.effort"
+    if plan.epochs < math.inf:
+        reason = f"{reason}; no pixel is looked at more than {plan.epochs:g} times a stage, or noise is learned"
+    return PlanLine(choice=f"{steps} steps in these stages", reason=reason)
 
 
 def sizes_of(plan: FitPlan, held: tuple[int, int]) -> PlanLine:

@@ -334,6 +334,8 @@ def test_stages_look_at_each_pixel_so_often_at_most(photographs: Path, tmp_path:
     assert [stage.steps for stage in photo_plan.suited(FitPlan(stages), photos).stages] == [10_000, 10_000, 5]
     asked = photo_plan.make_plan(config.load(toml(tmp_path, photographs), ["field.preset=fine", "field.effort=3"]))
     assert asked.epochs == 3 * PRESETS["fine"].epochs < math.inf  # who asks for more gets more
+    assert "no pixel is looked at more than 2 times a stage" in photo_plan.steps_of(plan).reason
+    assert photo_plan.steps_of(FitPlan(stages)).reason == "field.effort"
 
 
 def test_a_long_box_has_as_many_nodes_as_a_cube(photographs: Path, tmp_path: Path) -> None:
