@@ -324,17 +324,19 @@ def test_photographs_are_shrunk_to_half_a_voxel(photographs: Path, tmp_path: Pat
 
 
 def test_stages_look_at_each_pixel_so_often_at_most(photographs: Path, tmp_path: Path) -> None:
-    """2 epochs of V photographs: of 24 x 24 by 2 tiles of 16 pixels of 3 of them, and of 48 x 48 by one tile of each."""
+    """20 epochs of V photographs: of 24 x 24 by 2 tiles of 16 pixels of 3 of them, and of 48 x 48 by one tile of each."""
     photos, _ = photo_data.read_photos(config.load(toml(tmp_path, photographs)), tmp_path)
     count = len(photos.views)
     stages = Stage(11, 10_000, views=3, tiles=2), Stage(13, 10_000, views=1000, tiles=1), Stage(13, 5, views=1, tiles=1)
-    plan = FitPlan(stages, epochs=2.0)
-    expected = [2 * count * 24**2 // 96, 2 * 48**2 // 16, 5]
+    plan = FitPlan(stages, epochs=20.0)
+    expected = [20 * count * 24**2 // 96, 20 * 48**2 // 16, 5]
     assert [stage.steps for stage in photo_plan.suited(plan, photos).stages] == expected
+    few = photo_plan.suited(replace(plan, epochs=0.1), photos)
+    assert [stage.steps for stage in few.stages] == [photo_plan.FEWEST_STEPS, photo_plan.FEWEST_STEPS, 5]
     assert [stage.steps for stage in photo_plan.suited(FitPlan(stages), photos).stages] == [10_000, 10_000, 5]
     asked = photo_plan.make_plan(config.load(toml(tmp_path, photographs), ["field.preset=fine", "field.effort=3"]))
     assert asked.epochs == 3 * PRESETS["fine"].epochs < math.inf  # who asks for more gets more
-    assert "no pixel is looked at more than 2 times a stage" in photo_plan.steps_of(plan).reason
+    assert "no pixel is looked at more than 20 times a stage" in photo_plan.steps_of(plan).reason
     assert photo_plan.steps_of(FitPlan(stages)).reason == "field.effort"
 
 
