@@ -28,9 +28,10 @@ FEWEST = 16
 """Nodes along an edge that a preset has in any case, though voxels are smaller than pixels then."""
 
 
-FEWEST_STEPS = 300
-"""Steps that a stage takes in any case, if it has as many: with fewer a field does not get to where photographs put it (12 of
-wires: 26.3 dB in 58 steps a stage, 30.2 in 234, 29.1 in 700; 25 of glossy things: 28.0 in 122, 28.5 in 305)."""
+FEWEST_STEPS = 230
+"""Steps of the last stage in any case, if it has as many; stages before it look as often at each pixel. With fewer a field does
+not get to where photographs put it (12 of wires, views held out of them: 25.3 dB in 58 steps, 29.4 in 234, 29.0 in 300, and
+27.6 where each stage has 300)."""
 
 LEARNED = {"sky": ("sky", "sky_smooth"), "nested": ("sky", "sky_smooth", "levels", "near")}
 """What the plan takes from the preset ``capture``, by the word for what is behind."""
@@ -93,13 +94,18 @@ def suited(plan: FitPlan, photos: Photos) -> FitPlan:
             longest = min(longest, max(int(edge / pixel), FEWEST))
         halvings = min(round(np.log2(edge / longest / (plan.voxel * pixel))), int(np.log2(least / SMALLEST)))
         shrink = 2 ** max(halvings, 0)
-        worth = plan.epochs * pixels / shrink**2 / (min(stage.views, len(cameras)) * stage.tiles * TILE**2)
-        return replace(stage, longest=longest, shrink=shrink, steps=int(min(stage.steps, max(worth, FEWEST_STEPS))))
+        return replace(stage, longest=longest, shrink=shrink)
+
+    def steps_an_epoch(stage: Stage) -> float:
+        return pixels / stage.shrink**2 / (min(stage.views, len(cameras)) * stage.tiles * TILE**2)
 
     if len(photos.views) < FEW:
         plan = of_few(plan)
     plan = with_levels_needed(plan, photos)
-    return replace(plan, stages=tuple(suited_stage(stage) for stage in plan.stages), cubic=False)
+    stages = [suited_stage(stage) for stage in plan.stages]
+    epochs = max(plan.epochs, FEWEST_STEPS / steps_an_epoch(stages[-1]))
+    stages = [replace(stage, steps=max(1, int(min(stage.steps, epochs * steps_an_epoch(stage))))) for stage in stages]
+    return replace(plan, stages=tuple(stages), cubic=False)
 
 
 def of_few(plan: FitPlan) -> FitPlan:
@@ -179,7 +185,7 @@ def steps_of(plan: FitPlan) -> PlanLine:
     steps = ", ".join(str(stage.steps) for stage in plan.stages)
     reason = "field.effort"
     if plan.epochs < math.inf:
-        reason += f"; beyond {FEWEST_STEPS} no pixel is looked at more than {plan.epochs:g} times a stage, or noise is learned"
+        reason += f"; in more than {FEWEST_STEPS} no pixel is looked at over {plan.epochs:g} times, or noise is learned"
     return PlanLine(choice=f"{steps} steps in these stages", reason=reason)
 
 
