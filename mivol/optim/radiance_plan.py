@@ -98,8 +98,8 @@ class FitPlan:
         cubic: a box that is no cube gets as many nodes in all as its stages have in a cube, for memory and time go with them
             (:func:`stretched`); False: ``longest`` is meant as it stands.
         epochs: times that a stage looks at each pixel of its photographs, at most: few and small ones take fewer steps (230
-            in the last at least), or they are learned by heart (three made-up scenes, 60 photographs of 200 pixels, with 4, 8, 16
-            and 70: 32.5, 33.2, 32.8 and 31.7 dB).
+            in the last at least), or they are learned by heart (three made-up scenes, 60 photographs of 200 pixels, with 4, 8,
+            16 and 70: 32.5, 33.2, 32.8 and 31.7 dB).
         random_background: photographs with alpha are seen over another colour each step, so that nothing stands in the air in
             the background's colour.
     """

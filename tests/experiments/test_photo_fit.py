@@ -331,8 +331,9 @@ def test_stages_look_at_each_pixel_so_often_at_most(photographs: Path, tmp_path:
     plan = FitPlan(stages, epochs=20.0)
     expected = [20 * count * 24**2 // 96, 20 * 48**2 // 16, 5]
     assert [stage.steps for stage in photo_plan.suited(plan, photos).stages] == expected
-    few = photo_plan.suited(replace(plan, stages=stages[:2], epochs=0.1), photos)  # N steps of the last are N / 144 epochs
-    assert [stage.steps for stage in few.stages] == [photo_plan.FEWEST_STEPS * count * 24**2 // (96 * 144), photo_plan.FEWEST_STEPS]
+    few, least = photo_plan.suited(replace(plan, stages=stages[:2], epochs=0.1), photos), photo_plan.FEWEST_STEPS
+    # So many steps of the last stage look at each pixel least / 144 times.
+    assert [stage.steps for stage in few.stages] == [least * count * 24**2 // (96 * 144), least]
     assert [stage.steps for stage in photo_plan.suited(FitPlan(stages), photos).stages] == [10_000, 10_000, 5]
     asked = photo_plan.make_plan(config.load(toml(tmp_path, photographs), ["field.preset=fine", "field.effort=3"]))
     assert asked.epochs == 3 * PRESETS["fine"].epochs < math.inf  # who asks for more gets more
