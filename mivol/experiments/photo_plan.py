@@ -27,7 +27,6 @@ SMALLEST = 16
 FEWEST = 16
 """Nodes along an edge that a preset has in any case, though voxels are smaller than pixels then."""
 
-
 FEWEST_STEPS = 230
 """Steps of the last stage in any case, if it has as many; stages before it look as often at each pixel. With fewer a field does
 not get to where photographs put it (12 of wires, views held out of them: 25.3 dB in 58 steps, 29.4 in 234, 29.0 in 300, and
@@ -93,8 +92,7 @@ def suited(plan: FitPlan, photos: Photos) -> FitPlan:
             longest = max(longest, min(stretched(longest, box), int(edge / (plan.voxel * pixel))))
             longest = min(longest, max(int(edge / pixel), FEWEST))
         halvings = min(round(np.log2(edge / longest / (plan.voxel * pixel))), int(np.log2(least / SMALLEST)))
-        shrink = 2 ** max(halvings, 0)
-        return replace(stage, longest=longest, shrink=shrink)
+        return replace(stage, longest=longest, shrink=2 ** max(halvings, 0))
 
     def steps_an_epoch(stage: Stage) -> float:
         return pixels / stage.shrink**2 / (min(stage.views, len(cameras)) * stage.tiles * TILE**2)
