@@ -158,7 +158,7 @@ class FitPlan:
     @property
     def optimiser(self) -> RMSprop:
         """What takes the steps."""
-        return RMSprop(memory=self.memory)
+        return RMSprop(memory=self.memory, half=True)
 
     @property
     def priors(self) -> tuple[tuple[str, DecoupledPrior], ...]:
@@ -311,18 +311,29 @@ def filled_of(plan: FitPlan, stage: Stage) -> float:
 
 
 def bytes_of(plan: FitPlan, stage: Stage, box: np.ndarray, rows: int | None = None) -> int:
-    """Memory of a stage [bytes]: values, derivatives and the optimiser's squares, tables of pinholes, cells, rays.
+    """Memory of a stage as Dr.Jit holds it [bytes]: reals, tables of pinholes, neighbours, cells, rays.
+
+    The end of a step has the most of what is as large as the reals: values and their means in half precision, both before and
+    after the step, and derivatives. A table of pinholes is there with its derivative and, on the CPU, that of each thread.
 
     Args:
         plan, stage, box: what is asked for.
-        rows: nodes that are stored; None to estimate them.
+        rows: nodes that are stored; None to estimate them. About as many cells are listed.
     """
     nodes = plan.levels * math.prod(place_grid(box, stage.longest)[0])
     rows = (nodes if stage is plan.stages[0] else int(filled_of(plan, stage) * nodes)) if rows is None else rows
-    copies = 2 + (dr.thread_count() if dr.backend_v(mi.Float) == dr.JitBackend.LLVM else 0)
-    a_row = 12 * (1 + row_width(basis_size(plan.degree))) + 24
-    a_row += stage.views * 16 * copies
-    return int(rows * a_row + INDEX * nodes + stage.views * stage.tiles * TILE**2 * RAY)
+    width = row_width(basis_size(plan.degree))
+    reals = sum(3 * held(4 * n) + 2 * held(2 * n) for n in (rows, rows * width))
+    table = 16 * rows * stage.views
+    threads = dr.thread_count() if dr.backend_v(mi.Float) == dr.JitBackend.LLVM else 0
+    tables = 2 * held(table) + held(threads * table)
+    places = 6 * held(4 * rows) + held(32 * rows)
+    return reals + tables + places + INDEX * nodes + stage.views * stage.tiles * TILE**2 * RAY
+
+
+def held(count: int) -> int:
+    """Bytes that Dr.Jit takes for an array of so many: the next power of two."""
+    return 1 << (count - 1).bit_length() if count else 0
 
 
 def memory_of(plan: FitPlan, box: np.ndarray, batches: RayBatches, limit: int | None = None) -> str:

@@ -234,7 +234,9 @@ class RadianceProblem:
 
     def after_step(self, reals: Reals, iteration: int) -> Reals:
         """Move values as the priors ask: by shares of the learning rate, fewer the more photographs there are."""
-        arrays = {name: value.array for name, value in reals.items()}
+        shapes = {name: value.shape for name, value in reals.items()}
+        # Taken out: a step that is not evaluated yet holds the gradient, which is as large as the reals.
+        arrays = {name: reals.pop(name).array for name in shapes}
         where = self._rows(iteration)
         for name, prior in self.plan.priors:
             if not prior.is_spatial:
@@ -248,7 +250,7 @@ class RadianceProblem:
         for name, prior in self.plan.priors:
             if prior.is_spatial:
                 arrays[name] = prior.apply(arrays[name], where[name])
-        return {name: mi.TensorXf(array, reals[name].shape) for name, array in arrays.items()}
+        return {name: mi.TensorXf(array, shapes[name]) for name, array in arrays.items()}
 
     def _rows(self, iteration: int) -> dict[str, Rows]:
         """Where priors act in an iteration, by parameter."""
@@ -282,6 +284,8 @@ class RadianceProblem:
             return resample_field(grid, *place, keep).with_degree(degree)
 
         self.field, self.stage = resampled(old), stage
+        # Of the old field only the places of its nodes are of use from here on; zeros that are not evaluated take no memory.
+        old = old.with_values(dr.zeros(mi.Float, old.rows), dr.zeros(mi.Float, old.rows * old.width))
         self._look_around()
         # Derivatives go with the length of a ray in a voxel.
         shrink = max(old.res) / max(self.field.res)
@@ -308,6 +312,7 @@ class RadianceProblem:
 
     def update_occupancy(self) -> None:
         """List the cells that hold anything: the others have neither light nor derivatives."""
+        self._cells = None  # as large as what is made, and of no more use
         self._cells = cells_of(self.field)
 
     def _look_around(self) -> None:

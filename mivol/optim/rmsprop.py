@@ -14,9 +14,21 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mivol.errors import MivolError
 from mivol.optim.optimiser import FirstOrder, Run
 from mivol.optim.problem import Differentiable, Reals, Refinement
 from mivol.optim.strategy import of
+
+UNIT = 64.0
+"""Fourth roots are held times this. A half has 11 bits from 2^-14 to 2^16, and fewer down to 2^-24: derivatives whose root mean
+square is between 1e-12 and 1e6 [loss / real] keep their precision, from 1e-18 on they are known, and smaller ones are 0."""
+
+LARGEST = 65504.0
+"""The largest half. Larger roots are held as this: steps against derivatives above 1e6 are longer than the rate, not 0."""
+
+LONGEST_MEMORY = 0.98
+"""The longest memory of means that are held in halves. These are rounded by at most 4 x 2^-11 = 0.2 % a step; with a longer
+memory the 1 - memory that a step adds would not be ten times as much, and means would stay where they were."""
 
 
 class RMSprop(FirstOrder, tag="rmsprop"):
@@ -27,18 +39,29 @@ class RMSprop(FirstOrder, tag="rmsprop"):
     """
 
     memory: Annotated[float, of("1", "of the running mean of squared derivatives", ge=0, lt=1)] = 0.95
+    half: Annotated[bool, of("1", "these means take half the memory, as fourth roots in half precision")] = False
 
     def begin(self, problem: Differentiable) -> Run:
+        """Start from the values that the problem holds.
+
+        Raises:
+            MivolError: a memory too long for means in half precision.
+        """
+        if self.half and self.memory > LONGEST_MEMORY:
+            raise MivolError(
+                f"means in half precision were asked for with a memory of {self.memory:g}, which they would not follow: "
+                f"at most {LONGEST_MEMORY:g} is expected, or half = false."
+            )
         return RMSpropRun(self, problem)
 
 
 class RMSpropRun(Run):
-    """State: the reals, and the running means of their squared derivatives (0: there was none yet)."""
+    """State: the reals, and the running means of their squared derivatives (0: there was none yet) as they are held."""
 
     def __init__(self, settings: RMSprop, problem: Differentiable) -> None:
         super().__init__(problem)
         self.settings = settings
-        self.squares = {name: dr.zeros(mi.TensorXf, value.shape) for name, value in self.reals.items()}
+        self.squares = {name: self._held(dr.zeros(mi.TensorXf, value.shape)) for name, value in self.reals.items()}
 
     def step(self, iteration: int, factor: float) -> float | mi.Float:
         loss, slopes = self.problem.loss_and_gradient(self.reals, iteration, self.settings.views)
@@ -56,28 +79,56 @@ class RMSpropRun(Run):
         """Reals and squares after a step down slopes."""
         reals, squares = {}, {}
         for name, value in self.reals.items():
-            known, slope = self.squares[name].array, slopes[name].array
+            known, slope = self._known(self.squares[name]).array, slopes[name].array
             moved = descend(value.array, known, slope, rates[name], self.settings.memory)
-            reals[name], squares[name] = (mi.TensorXf(array, value.shape) for array in moved)
+            reals[name], means = (mi.TensorXf(array, value.shape) for array in moved)
+            squares[name] = self._held(means)
         return reals, squares
 
+    def _held(self, means: mi.TensorXf) -> mi.TensorXf | mi.TensorXf16:
+        return halved(means) if self.settings.half else means
+
+    def _known(self, held: mi.TensorXf | mi.TensorXf16) -> mi.TensorXf:
+        return from_halves(held) if self.settings.half else held
+
     def pack(self) -> dict[str, np.ndarray]:
-        return super().pack() | {f"squares/{name}": np.array(value) for name, value in self.squares.items()}
+        return super().pack() | {f"{self._key}/{name}": np.array(value) for name, value in self.squares.items()}
 
     def unpack(self, arrays: dict[str, np.ndarray]) -> None:
         super().unpack(arrays)
-        self.squares = {name: mi.TensorXf(arrays[f"squares/{name}"]) for name in self.reals}
+        tensor = mi.TensorXf16 if self.settings.half else mi.TensorXf
+        self.squares = {name: tensor(arrays[f"{self._key}/{name}"]) for name in self.reals}
+
+    @property
+    def _key(self) -> str:
+        return "roots" if self.settings.half else "squares"
 
     def replace(self, name: str, reals: mi.TensorXf) -> None:
         super().replace(name, reals)
-        self.squares = {**self.squares, name: dr.zeros(mi.TensorXf, reals.shape)}
+        self.squares = {**self.squares, name: self._held(dr.zeros(mi.TensorXf, reals.shape))}
 
     def refine(self, refinement: Refinement) -> None:
-        """Squares are carried over like the reals: without them the first step would move every number by a whole rate."""
-        squares = refinement.carry(self.squares)
+        """Squares are carried over like the reals: without them the first step would move every number by a whole rate.
+
+        The old reals are let go first: means are as large while they are carried over.
+        """
+        self.reals = refinement.reals
+        means = refinement.carry({name: self._known(held) for name, held in self.squares.items()})
         for name, shrink in refinement.shrinks.items():
-            squares[name] = mi.TensorXf(squares[name].array * dr.opaque(mi.Float, shrink**2), squares[name].shape)
-        self.reals, self.squares = refinement.reals, squares
+            means[name] = mi.TensorXf(means[name].array * dr.opaque(mi.Float, shrink**2), means[name].shape)
+        self.squares = {name: self._held(mean) for name, mean in means.items()}
+        dr.eval(self.squares)
+
+
+def halved(means: mi.TensorXf) -> mi.TensorXf16:
+    """Running means as fourth roots in half precision, which have the range for it (``UNIT``)."""
+    roots = dr.minimum(UNIT * dr.sqrt(dr.sqrt(means.array)), LARGEST)
+    return mi.TensorXf16(mi.Float16(roots), means.shape)
+
+
+def from_halves(roots: mi.TensorXf16) -> mi.TensorXf:
+    """Running means from what :func:`halved` gave, to 0.2 % of each."""
+    return mi.TensorXf(dr.square(dr.square(mi.Float(roots.array) * (1 / UNIT))), roots.shape)
 
 
 def descend(

@@ -130,7 +130,7 @@ DEFAULTS = {
     "optim.priors.Prior": {"weight": 1.0},
     "optim.priors.Sparse": {"weight": 1.0, "knee": 0.001},
     "optim.priors.TotalVariation": {"weight": 1.0, "edge": 0.01},
-    "optim.rmsprop.RMSprop": {"views": 0, "memory": 0.95},
+    "optim.rmsprop.RMSprop": {"views": 0, "memory": 0.95, "half": False},
     "optim.schedules.Cosine": {"final": 0.0},
     "optim.schedules.Exponential": {"final": 0.1, "delay": 0},
     "optim.schedules.Step": {"at": (0.75, 0.85, 0.95), "ratio": 0.5},

@@ -275,9 +275,9 @@ def test_a_fit_goes_on_from_an_opaque_field() -> None:
     fit = begin_fit(problem, plan.optimiser, plan.course())
     fit.advance()
     state = fit.run.pack()
-    assert set(state) == {"reals/density", "reals/harmonics", "squares/density", "squares/harmonics"}
+    assert set(state) == {"reals/density", "reals/harmonics", "roots/density", "roots/harmonics"}
     assert all(np.isfinite(array).all() for array in state.values())
-    assert np.any(state["squares/density"] > 0) and np.any(state["squares/harmonics"] > 0)
+    assert np.any(state["roots/density"] > 0) and np.any(state["roots/harmonics"] > 0)
 
 
 # -- 5: colours --------------------------------------------------------------------------------------------------------

@@ -27,7 +27,13 @@ from mivol.optim.scene_problem import SceneProblem
 
 ITERATIONS = 6
 EVENTS = (Upsample(at=(2,)), Evaluate(every=3))
-CASES = {"adam": Adam(views=2), "rmsprop": RMSprop(views=1), "lbfgs": Lbfgs(), "gauss_newton": GaussNewton(inner=2)}
+CASES = {
+    "adam": Adam(views=2),
+    "rmsprop": RMSprop(views=1),
+    "halves": RMSprop(half=True),
+    "lbfgs": Lbfgs(),
+    "gauss_newton": GaussNewton(inner=2),
+}
 
 
 def fit(optimiser, path: Path | None = None, *, stop_after: int = -1, how: int = signal.SIGINT, resume: bool = False) -> Fit:

@@ -96,7 +96,7 @@ def fit(optimiser: Optimiser, store: Store | None = None, stop_after: int = -1) 
     return reconstruct(Network(), optimiser, course, observer=observe, store=store)
 
 
-@pytest.mark.parametrize("optimiser", [Adam(), RMSprop()], ids=["adam", "rmsprop"])
+@pytest.mark.parametrize("optimiser", [Adam(), RMSprop(), RMSprop(half=True)], ids=["adam", "rmsprop", "halves"])
 def test_another_problem_is_fitted_refined_and_resumed(one_thread, ctrl_c, tmp_path: Path, optimiser: Optimiser) -> None:
     """Expected: the loss falls to a tenth and does not jump where units are split (the function is the same there, and a step
     changes the loss by less than half); a run stopped in the second stage goes on to the last bit."""

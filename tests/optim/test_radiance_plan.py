@@ -12,7 +12,7 @@ from ball_photos import BOX, PLAN
 from mivol.errors import MivolError
 from mivol.fields.spherical import basis_size, row_width
 from mivol.optim import radiance_plan
-from mivol.optim.radiance_plan import PRESETS, RAY, SHELL, FitPlan, Stage, bytes_of, memory_of, place_grid
+from mivol.optim.radiance_plan import PRESETS, RAY, SHELL, FitPlan, Stage, bytes_of, held, memory_of, place_grid
 from mivol.optim.ray_batches import TILE, RayBatches
 from mivol.photos import Photo
 
@@ -27,19 +27,25 @@ def test_memory_is_counted_first(variant_rgb: str, photos: list[Photo]) -> None:
         memory_of(PRESETS["gpu"], BOX, views, limit=1000)
 
 
+def test_an_array_takes_a_power_of_two() -> None:
+    assert [held(n) for n in (0, 1, 2, 3, 4, 5, 1 << 20, (1 << 20) + 1)] == [0, 1, 2, 4, 4, 8, 1 << 20, 1 << 21]
+
+
 @pytest.mark.parametrize("degree", [0, 2])
 def test_bytes_of_a_stage(variant_rgb: str, monkeypatch: pytest.MonkeyPatch, degree: int) -> None:
-    """A row holds density and coefficients (padded to four numbers a channel) three times in float32, and its place; a table
-    of each pinhole is there once, derived once, and once more for each thread that adds to it. Every node has an index."""
+    """Density and coefficients (padded to four numbers) are there three times in float32, their squares twice in halves; a
+    table of each pinhole is there once, derived once, and once more for each thread that adds to it. A row has six neighbours
+    and a cell, every node an index."""
     plan, box = FitPlan((Stage(8, 1, 4, 2, 32), Stage(16, 1, 1, 3, 64)), degree=degree), np.array([[-1.0] * 3, [1.0, 1, 0]])
-    width = row_width(basis_size(degree))
-    found = []
-    for threads in (2, 7):
+    # Powers of two are held as they are: 2^10 rows with two views, of which a table takes 2^15 bytes.
+    coefficients, nodes = 4 if degree == 0 else 32, np.prod(place_grid(box, 16)[0])
+    assert held(row_width(basis_size(degree))) == coefficients
+    for threads in (2, 8):
         monkeypatch.setattr(radiance_plan.dr, "thread_count", lambda threads=threads: threads)
-        found.append(bytes_of(plan, plan.stages[1], box, rows=1000))
-        nodes = np.prod(place_grid(box, 16)[0])
+        found = bytes_of(plan, replace(plan.stages[1], views=2), box, rows=1024)
         copies = 2 + threads * variant_rgb.startswith("llvm")
-        assert found[-1] == 1000 * (12 * (1 + width) + 24 + 3 * 16 * copies) + 6 * nodes + 3 * 64 * TILE**2 * RAY
+        lists = 1024 * (6 * 4 + 8 * 4) + 6 * nodes
+        assert found == 1024 * 16 * (1 + coefficients) + copies * 2**15 + lists + 2 * 64 * TILE**2 * RAY
     # The first stage keeps every node, later ones the shell that fits have kept; of a coarse grid that is all.
     finer = replace(plan, stages=(*plan.stages, Stage(4 * SHELL, 1, 1, 3, 64)))
     for stage, share in zip(finer.stages, (1, 1, 0.25), strict=True):

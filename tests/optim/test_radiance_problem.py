@@ -17,7 +17,7 @@ from mivol.fields.sky import Sky
 from mivol.optim.checkpoint import Store
 from mivol.optim.field_view import render_view
 from mivol.optim.loop import Fit, begin_fit, reconstruct
-from mivol.optim.radiance_plan import Stage
+from mivol.optim.radiance_plan import Stage, bytes_of
 from mivol.optim.radiance_problem import RadianceProblem
 from mivol.optim.ray_batches import TILE, RayBatches
 from mivol.photos import Lens, Photo
@@ -69,10 +69,50 @@ def test_a_fit_that_went_on_equals_one_that_did_not_stop(one_thread, photos: lis
     assert (resumed.next, resumed.problem.field.degree) == (steps, int(steps > 10))
     resumed = fitted(batches, plan, 20, resumed)
     kept, found = whole.run.pack(), resumed.run.pack()
-    assert kept.keys() == found.keys() == {"reals/density", "reals/harmonics", "squares/density", "squares/harmonics"}
+    assert kept.keys() == found.keys() == {"reals/density", "reals/harmonics", "roots/density", "roots/harmonics"}
     assert all(np.array_equal(kept[name], found[name]) for name in kept)
     assert [row["loss"] for row in resumed.history] == [row["loss"] for row in whole.history]
     assert resumed.log == whole.log
+
+
+@pytest.mark.parametrize(("longest", "views"), [(48, 4), (64, 2)])
+def test_steps_take_the_memory_that_is_counted(
+    variant_rgb: str, cpu_back_end: None, photos: list[Photo], longest: int, views: int
+) -> None:
+    """Not more, and more than half: a block that is let go may serve for something else, which is counted as another."""
+    plan = replace(PLAN, stages=(Stage(longest, 9, 1, views, 32),), degree=2, tv_every=4)
+    batches = RayBatches.of(photos)
+
+    def most() -> int:
+        dr.sync_thread()
+        return dr.detail.malloc_watermark(dr.backend_v(mi.Float))
+
+    dr.sync_thread()
+    dr.flush_malloc_cache()
+    dr.detail.malloc_clear_statistics()
+    before, fit = most(), begin_fit(RadianceProblem(batches, BOX, plan), plan.optimiser, plan.course())
+    # What the map of the first fog took is of no use to the steps.
+    dr.flush_malloc_cache()
+    dr.detail.malloc_clear_statistics()
+    fit.complete()
+    counted = bytes_of(plan, plan.stages[0], BOX, fit.problem.field.rows)
+    assert counted / 2 < most() - before < counted
+
+
+def test_leaving_nodes_out_takes_no_more_memory_than_steps(variant_rgb: str, cpu_back_end: None, photos: list[Photo]) -> None:
+    """Though reals and their means are there of old and new nodes, of which most are kept here."""
+    plan = replace(PLAN, stages=(Stage(64, 9, 1, 2, 32),), degree=2, keep_weight=0.0, drop=1 / 3)
+    fit = fitted(RayBatches.of(photos), plan, 3)
+    rows, dropping = fit.problem.field.rows, fit.course.events[1]
+    dr.sync_thread()
+    dr.flush_malloc_cache()
+    dr.detail.malloc_clear_statistics()
+    assert dropping.due(3)
+    dropping.apply(fit)
+    dr.sync_thread()
+    held = dr.detail.malloc_watermark(dr.backend_v(mi.Float))
+    assert 0.7 * rows < fit.problem.field.rows < rows
+    assert held < bytes_of(plan, plan.stages[0], BOX, rows)
 
 
 def test_unseen_nodes_are_left_out(variant_rgb: str, photos: list[Photo]) -> None:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import mitsuba as mi
 import numpy as np
+import pytest
 
-from mivol.optim.rmsprop import descend
+from mivol.errors import MivolError
+from mivol.optim.rmsprop import LARGEST, LONGEST_MEMORY, RMSprop, descend, from_halves, halved
 
 
 def test_steps_are_those_of_the_formula(variant_rgb: str) -> None:
@@ -28,3 +30,37 @@ def test_what_has_no_derivative_stays_and_is_not_forgotten(variant_rgb: str) -> 
     moved, known = descend(values, squares, mi.Float(0, 0, 2), 0.5, 0.9)
     assert np.array(moved).tolist() == [1, 2, 2.5]
     assert np.array(known).tolist() == [0, 4, 4]
+
+
+def test_every_half_is_a_mean_and_comes_back(variant_rgb: str) -> None:
+    """What was held is held again as it was, so what has no derivative is not worn away; 0 stays 0."""
+    halves = np.arange(0x7C00, dtype=np.uint16).view(np.float16)
+    means = from_halves(mi.TensorXf16(halves))
+    known = np.array(means)
+    assert known[0] == 0 and (np.diff(known) > 0).all() and np.isfinite(known).all()
+    assert (np.array(halved(means)) == halves).all()
+
+
+def test_means_in_halves_are_off_by_a_fifth_of_a_percent(variant_rgb: str) -> None:
+    """Half a unit in the last of 11 bits, four times; the roundings of float32 add less than 2^-19."""
+    means = np.geomspace(1e-24, 1e12, 20001).astype(np.float32)
+    found = np.array(from_halves(halved(mi.TensorXf(means)))) / means.astype(np.float64)
+    assert np.abs(found - 1).max() < (1 + 2**-11) ** 4 - 1 + 2**-19
+    largest = np.array(halved(mi.TensorXf(np.float32([1e20, 3e38]))))
+    assert (largest == LARGEST).all()
+
+
+def test_means_in_halves_follow(variant_rgb: str) -> None:
+    """With the longest memory a mean goes from 100 to 1 as derivatives do, but for the 2^-9 / (1 - memory) of it by which
+    rounding can hold it; with a hundred times that memory it would not move at all, and longer ones are refused."""
+
+    def after(memory: float) -> float:
+        held = halved(mi.TensorXf([100.0], (1,)))
+        for _ in range(1000):
+            held = halved(mi.TensorXf(descend(mi.Float(0), from_halves(held).array, mi.Float(1), 0.1, memory)[1], (1,)))
+        return float(from_halves(held).array[0])
+
+    assert after(LONGEST_MEMORY) == pytest.approx(1, rel=2**-9 / (1 - LONGEST_MEMORY) * 1.1)
+    assert after(1 - (1 - LONGEST_MEMORY) / 100) == pytest.approx(100, rel=2**-9)
+    with pytest.raises(MivolError, match=r"memory of 0.999, which they would not follow: at most 0.98 is expected, or half = "):
+        RMSprop(memory=0.999, half=True).begin(None)

@@ -107,14 +107,14 @@ class Cells:
         # Dr.Jit cannot gather from an array of length 0, not even with all lanes inactive. Where no cell is occupied the arrays
         # hold one cell, to which no number points.
         named = _corner_rows(listed if count else mi.UInt32(0), row_of, res)
+        used, place = _numbered(named, most)
         corners = dr.zeros(mi.UInt32, 8 * max(count, 1))
         for q, row in enumerate(named):
-            dr.scatter(corners, row, dr.arange(mi.UInt32, max(count, 1)) * 8 + q)
+            dr.scatter(corners, dr.gather(mi.UInt32, place, row), dr.arange(mi.UInt32, max(count, 1)) * 8 + q)
         to_world = check_affine(to_world)
-        place = [[dr.opaque(mi.Float64, float(v)) for v in row] for row in lattice_from_world(to_world, res)]
-        used, corners = _numbered(corners, most)
+        to_lattice = [[dr.opaque(mi.Float64, float(v)) for v in row] for row in lattice_from_world(to_world, res)]
         dr.eval(corners, used)
-        return cls(res, to_world, count, index, corners, used, place, levels)
+        return cls(res, to_world, count, index, corners, used, to_lattice, levels)
 
     def nodes(self, number: mi.UInt32, active: mi.Bool) -> list[mi.UInt32]:
         """The 8 corners of listed cells, in ``rows``."""
@@ -125,14 +125,15 @@ class Cells:
         return [dr.gather(mi.UInt32, self.rows, node, active) for node in self.nodes(number, active)]
 
 
-def _numbered(rows: mi.UInt32, most: int) -> tuple[mi.UInt32, mi.UInt32]:
-    """The distinct numbers among ``rows`` (each at most ``most``), ascending, and the index of each row among them."""
+def _numbered(rows: list[mi.UInt32], most: int) -> tuple[mi.UInt32, mi.UInt32]:
+    """The distinct numbers among ``rows`` (each at most ``most``), ascending, and for each number its index among them."""
     used = dr.zeros(mi.UInt8, most + 1)
-    dr.scatter(used, mi.UInt8(1), rows)
+    for row in rows:
+        dr.scatter(used, mi.UInt8(1), row)
     different = dr.compress(used > 0)
     place = dr.zeros(mi.UInt32, most + 1)
     dr.scatter(place, dr.arange(mi.UInt32, dr.width(different)), different)
-    return different, dr.gather(mi.UInt32, place, rows)
+    return different, place
 
 
 def _apart(cell: mi.UInt32, res: tuple[int, int, int]) -> tuple[mi.Int32, mi.Int32, mi.Int32]:
