@@ -8,9 +8,9 @@ near a surface are kept. `--kept` is their share at 128^3; a surface's share hal
 Memory is float32 as mivol.fields.spherical lays it out: rows filled up to a multiple of 4 (degree 0 takes 4 numbers and not
 3), and for a sparse field the list of its nodes and the row of vacuum. Files are half floats, before they are compressed.
 
-The walk reads an index beside that: two bits for each node and eight for each cell of the box, whatever is kept, and for each
-cell near a surface the corners of it (mivol.transport.traversal.occupied_cells). It is counted on a ball's surface that keeps
-as many nodes.
+The walk reads an index beside that: two bits for each node and half a bit for each cell of the box, whatever is kept, twelve
+bytes for each brick of 4^3 cells near a surface, and for each such cell the corners of it
+(mivol.transport.traversal.occupied_cells). It is counted on a ball's surface that keeps as many nodes.
 
 Quality is that of the runs' held-out views (`mivol optimize` on photographs leaves field.npz and run.json), with what their
 fields take in truth. Prints a table in Markdown, then all of it as JSON.
@@ -59,25 +59,28 @@ def file_bytes(kept: int, degree: int, *, sparse: bool) -> int:
     return 2 * kept * (1 + 3 * basis_size(degree)) + 4 * kept * sparse
 
 
-def index_bytes(res: Sequence[int], cells: int, rows: int) -> int:
+def index_bytes(res: Sequence[int], cells: int, rows: int, bricks: int) -> int:
     """What the walk reads beside the values.
 
     Args:
         res: nodes along the axes.
         cells: how many are near a surface.
         rows: different rows at their corners.
+        bricks: of 4^3 cells, that hold one of these.
     """
-    nodes, places = math.prod(res), math.prod(n + 1 for n in res)
-    return 8 * -(-nodes // 32) + 8 * -(-places // 8) + 4 * 8 * cells + 4 * rows
+    nodes, all_bricks = math.prod(res), math.prod(-(-(n + 1) // 4) for n in res)
+    return 8 * -(-nodes // 32) + 4 * all_bricks + 12 * bricks + 4 * 8 * cells + 4 * rows
 
 
-def count_cells(keep: np.ndarray) -> tuple[int, int]:
-    """Cells that touch a node of ``keep`` (Z, Y, X), and the rows at their corners: the nodes kept, and the vacuum."""
+def count_cells(keep: np.ndarray) -> tuple[int, int, int]:
+    """Cells that touch a node of ``keep`` (Z, Y, X), the rows at their corners (the nodes kept, and the vacuum), and their
+    bricks."""
     beyond = np.pad(keep, 1, mode="edge")
     cells = np.zeros([n + 1 for n in keep.shape], bool)
     for k in range(8):
         cells |= beyond[tuple(slice((k >> a) & 1, n + 1 + ((k >> a) & 1)) for a, n in enumerate(keep.shape))]
-    return int(cells.sum()), int(keep.sum() + (keep.any() and not keep.all()))
+    bricks = {tuple(place) for place in np.argwhere(cells) >> 2}
+    return int(cells.sum()), int(keep.sum() + (keep.any() and not keep.all())), len(bricks)
 
 
 # -- Table ----------------------------------------------------------------------------------------------------------------
@@ -130,11 +133,11 @@ def kinds(kept: float) -> list[Kind]:
 def index_kind(kept: float) -> Kind:
     """The index, in memory only: counted at MODEL where the surface is as many voxels thick."""
     thin = shell(kept * SIZES[0] / MODEL)
-    listed, rows = (count / thin.sum() for count in count_cells(thin))
+    each = np.array(count_cells(thin)) / thin.sum()
     scenes = {}
     for n in SIZES:
         near = kept * SIZES[0] / n * n**3
-        scenes[n] = (index_bytes((n, n, n), round(listed * near), round(rows * near)), 0)
+        scenes[n] = (index_bytes((n, n, n), *(round(count * near) for count in each)), 0)
     return Kind("beside it: the walk's index", (scenes[SIZES[0]][0] / SIZES[0] ** 3, 0), scenes)
 
 

@@ -32,10 +32,7 @@ def resample_field(old: SphericalGrid, res: tuple[int, int, int], to_world: np.n
         MivolError: axes that differ.
     """
     axes = _Axes.between(old, res, to_world)
-    z, y, x = res
-    at = np.ix_(*(axis.nodes.T.reshape(-1) for axis in axes))
-    near = [level[at].reshape(z, 2, y, 2, x, 2).any(axis=(1, 3, 5)) for level in keep.reshape(old.levels, *old.res)]
-    kept = np.flatnonzero(near)
+    kept = np.flatnonzero([_near(level, axes) for level in keep.reshape(old.levels, *old.res)])
     kept = kept[~np.array(is_covered(mi.UInt32(kept.astype(np.uint32)), res))] if old.levels > 1 else kept
     density, harmonics = _interpolated(old, axes, np.unravel_index(kept, (old.levels, *res)))
     count = len(kept)
@@ -47,6 +44,14 @@ def resample_field(old: SphericalGrid, res: tuple[int, int, int], to_world: np.n
     dr.eval(flat, packed)
     nodes = mi.UInt32(kept.astype(np.uint32))
     return replace(old, res=tuple(res), to_world=to_world, density=flat, harmonics=packed, nodes=nodes, listing=None)
+
+
+def _near(keep: np.ndarray, axes: list[_Axes]) -> np.ndarray:
+    """Whether new nodes (Z, Y, X) have a kept one among the 8 old ones about them; one axis at a time, for memory."""
+    for a, axis in enumerate(axes):
+        low, high = axis.nodes
+        keep = keep.take(low, a) | keep.take(high, a)
+    return keep
 
 
 class _Axes:

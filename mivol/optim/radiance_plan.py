@@ -298,8 +298,8 @@ SHELL = 50
 shell, so its share of a grid falls as the edge grows (the chair in the box of its silhouettes: 30, 38 and 52 at 64, 128 and 256
 nodes, the last after short stages)."""
 
-INDEX = 6
-"""Bytes a node of the box that its index takes while it is made (5.3 measured at 512^3; 1.25 of them stay)."""
+INDEX = 90
+"""Bytes a row while its cells are listed, beside what stays of them (56 to 98 measured: the chair, the fox, a shell, a fog)."""
 
 RAY = 256
 """Bytes a ray: its state and what it saw (128 measured), its target, and what is in flight."""
@@ -314,7 +314,8 @@ def bytes_of(plan: FitPlan, stage: Stage, box: np.ndarray, rows: int | None = No
     """Memory of a stage as Dr.Jit holds it [bytes]: reals, tables of pinholes, neighbours, cells, rays.
 
     The end of a step has the most of what is as large as the reals: values and their means in half precision, both before and
-    after the step, and derivatives. A table of pinholes is there with its derivative and, on the CPU, that of each thread.
+    after the step, and derivatives. A table of pinholes is there with its derivative and, on the CPU, that of each thread. The
+    index of rows and cells takes half a byte a node of the box.
 
     Args:
         plan, stage, box: what is asked for.
@@ -328,7 +329,7 @@ def bytes_of(plan: FitPlan, stage: Stage, box: np.ndarray, rows: int | None = No
     threads = dr.thread_count() if dr.backend_v(mi.Float) == dr.JitBackend.LLVM else 0
     tables = 2 * held(table) + held(threads * table)
     places = 6 * held(4 * rows) + held(32 * rows)
-    return reals + tables + places + INDEX * nodes + stage.views * stage.tiles * TILE**2 * RAY
+    return reals + tables + places + INDEX * rows + nodes // 2 + stage.views * stage.tiles * TILE**2 * RAY
 
 
 def held(count: int) -> int:

@@ -8,13 +8,11 @@ import numpy as np
 import pytest
 from oracle_radiance import Twin
 from radiance_rays import CUBE, TO_WORLD, aim, derive, make, rays_of, see
-from scipy.ndimage import distance_transform_cdt
 
 from mivol.fields.activation import ACTIVATIONS
 from mivol.fields.spherical import SphericalGrid
 from mivol.transport.line_integrals.radiance_field import brightest_weights, cells_of, model_of, render
 from mivol.transport.line_integrals.radiance_source import exact
-from mivol.transport.traversal.empty_blocks import REACH
 from mivol.transport.traversal.occupied_cells import Cells
 
 
@@ -157,7 +155,7 @@ def test_the_brightest_weight_of_a_cell(variant_rgb: str) -> None:
         rays = rays_of([0.1, 0.1, 3.0 * side], [0.0, 0.0, -1.0 * side])
         brightest_weights(cells, exact(field, rays.d), model, rays, weight)
         # x = 0.1 lies in the fourth of six cells, y = 0.1 in the third of four.
-        seen = np.array(weight)[index_of(cells)[1].reshape(5, 4, 6)[:, 2, 3]]
+        seen = np.array(weight)[numbers_of(cells)[:, 2, 3]]
         # Optical depths of 6 at most, known to some 1e-6.
         np.testing.assert_allclose(seen, expected, rtol=1e-5)
     assert np.count_nonzero(np.array(weight)) == 5
@@ -212,27 +210,27 @@ def test_a_ray_that_stops_early_errs_by_what_it_leaves(variant_rgb: str) -> None
     assert np.abs(see(field, o, d)[0] - see(field, o, d, stop=0.05)[0]).max() <= 0.05 * brightest
 
 
-def index_of(cells: Cells) -> tuple[np.ndarray, np.ndarray]:
-    """Of each cell of the box its distance to the nearest listed one, and its place in the list, which only these have."""
-    place = dr.arange(mi.UInt32, cells.per_level * cells.levels)
-    distance, word = cells.index.distance(place, mi.Bool(True))
-    return np.array(distance), np.array(cells.index.rank(place, word, mi.Bool(True)))
+def numbers_of(cells: Cells) -> np.ndarray:
+    """Of each cell (Z, Y, X) its place in the list, which only listed ones have."""
+    z, y, x = (mi.Int32(a.ravel().astype(np.int32)) for a in np.indices([n + 1 for n in cells.res]))
+    cell, every = mi.Vector3i(x, y, z), mi.Bool(True)
+    brick, free = cells.index.look(cell, 0, mi.Array3b(True), every)
+    return np.array(cells.index.rank(cell, dr.select(free.x == 0, brick, 0), every)).reshape([n + 1 for n in cells.res])
 
 
-def test_cells_know_the_way_to_the_next(variant_rgb: str) -> None:
+@pytest.mark.parametrize("sparse", [False, True])
+def test_cells_with_matter_are_listed(variant_rgb: str, sparse: bool) -> None:
     density, sh = make((30, 21, 25), basis=1)
     density = np.where(np.random.default_rng(1).random(density.shape) < 3e-4, 1, -1)
-    cells = cells_of(SphericalGrid.from_dense(density, sh, CUBE))
-    distance, rank = (a.reshape(31, 22, 26) for a in index_of(cells))
+    field = SphericalGrid.from_dense(density, sh, CUBE)
+    cells = cells_of(field.sparse(density > 0) if sparse else field)
     padded = np.pad(density > 0, 1, mode="edge")
-    occupied = np.zeros(distance.shape, bool)
+    occupied = np.zeros((31, 22, 26), bool)
     for corner in range(8):
         z, y, x = corner >> 2, corner >> 1 & 1, corner & 1
         occupied |= padded[z : z + 31, y : y + 22, x : x + 26]
     assert cells.count == occupied.sum() > 0
-    assert np.array_equal(rank[occupied], np.arange(cells.count))
-    far = distance_transform_cdt(~occupied, "chessboard")
-    assert np.array_equal(distance, np.minimum(far, REACH))
+    assert sorted(numbers_of(cells)[occupied]) == list(range(cells.count))
 
 
 def test_an_empty_field_shows_nothing(variant_rgb: str) -> None:

@@ -55,10 +55,10 @@ def test_the_index_is_what_the_walk_reads(variant_rgb, share: float) -> None:
     keep = np.random.default_rng(1).random(RES) <= share
     made = field(0, keep)
     cells = cells_of(made)
-    listed, rows = storage.count_cells(keep)
+    listed, rows, bricks = storage.count_cells(keep)
     assert (cells.count, dr.width(cells.rows)) == (listed, rows)
     index = made.listed_places().bytes + cells.index.bytes + held(cells.corners, cells.rows)
-    assert index == storage.index_bytes(RES, listed, rows)
+    assert index == storage.index_bytes(RES, listed, rows, bricks)
 
 
 def test_the_lecture_counts_4_gigabytes() -> None:
@@ -74,13 +74,15 @@ def test_the_lecture_counts_4_gigabytes() -> None:
 
 
 def test_the_index_grows_with_the_surface() -> None:
-    """A quarter of a byte a node, one a cell of the grid, 32 a listed cell and 4 a row, of which a surface has as at 64^3."""
+    """A quarter of a byte a node, 4 a brick of the grid and 12 a brick with a listed cell, 32 a listed cell and 4 a row, of
+    which a surface has as at 64^3."""
     shell = storage.shell(0.1 * 128 / 64)
-    listed, rows = (count / shell.sum() for count in storage.count_cells(shell))
+    listed, rows, bricks = (count / shell.sum() for count in storage.count_cells(shell))
     found = storage.kinds(0.1)[-1]
     for n in (128, 1024):
         near = 0.1 * 128 / n * n**3
-        expected = n**3 // 4 + 8 * -(-((n + 1) ** 3) // 8) + 32 * round(listed * near) + 4 * round(rows * near)
+        expected = n**3 // 4 + 4 * (n // 4 + 1) ** 3 + 12 * round(bricks * near)
+        expected += 32 * round(listed * near) + 4 * round(rows * near)
         assert found.scenes[n] == (expected, 0)
     assert found.per_cell == (found.scenes[128][0] / 128**3, 0)
     assert [kind.sparse for kind in storage.kinds(0.1)] == [False] * 6 + [True] * 4 + [False]

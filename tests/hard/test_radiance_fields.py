@@ -176,9 +176,9 @@ def test_only_occupied_cells_are_visited() -> None:
     assert (visited(even(-1.0), *aim(20, CUBE)) == 0).all()
 
 
-@pytest.mark.parametrize(("density", "reads"), [(-1.0, math.ceil(61 / REACH)), (1.0, 61)])
+@pytest.mark.parametrize(("density", "reads"), [(-1.0, math.ceil(61 / (4 * REACH))), (1.0, 61)])
 def test_an_empty_box_is_left_in_leaps(density: float, reads: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Reads of the map of cells along a row of 60 voxels: one a cell where it is full, one in 15 cells where it is empty.
+    """Reads of the map of bricks along a row of 60 voxels: one a cell where it is full, one in 15 bricks where it is empty.
 
     Defect 2.
     """
@@ -188,7 +188,7 @@ def test_an_empty_box_is_left_in_leaps(density: float, reads: int, monkeypatch: 
     gather, count = dr.gather, []
 
     def counted(kind, source, *rest, **more):
-        if kind is mi.UInt32 and source.index == cells.index.words.index:
+        if kind is mi.UInt32 and source.index == cells.index.bricks.index:
             count.append(1)
         return gather(kind, source, *rest, **more)
 

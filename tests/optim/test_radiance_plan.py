@@ -34,8 +34,8 @@ def test_an_array_takes_a_power_of_two() -> None:
 @pytest.mark.parametrize("degree", [0, 2])
 def test_bytes_of_a_stage(variant_rgb: str, monkeypatch: pytest.MonkeyPatch, degree: int) -> None:
     """Density and coefficients (padded to four numbers) are there three times in float32, their squares twice in halves; a
-    table of each pinhole is there once, derived once, and once more for each thread that adds to it. A row has six neighbours
-    and a cell, every node an index."""
+    table of each pinhole is there once, derived once, and once more for each thread that adds to it. A row has six neighbours,
+    a cell and what it takes to list it, a node half a byte."""
     plan, box = FitPlan((Stage(8, 1, 4, 2, 32), Stage(16, 1, 1, 3, 64)), degree=degree), np.array([[-1.0] * 3, [1.0, 1, 0]])
     # Powers of two are held as they are: 2^10 rows with two views, of which a table takes 2^15 bytes.
     coefficients, nodes = 4 if degree == 0 else 32, np.prod(place_grid(box, 16)[0])
@@ -44,7 +44,7 @@ def test_bytes_of_a_stage(variant_rgb: str, monkeypatch: pytest.MonkeyPatch, deg
         monkeypatch.setattr(radiance_plan.dr, "thread_count", lambda threads=threads: threads)
         found = bytes_of(plan, replace(plan.stages[1], views=2), box, rows=1024)
         copies = 2 + threads * variant_rgb.startswith("llvm")
-        lists = 1024 * (6 * 4 + 8 * 4) + 6 * nodes
+        lists = 1024 * (6 * 4 + 8 * 4 + 90) + nodes // 2
         assert found == 1024 * 16 * (1 + coefficients) + copies * 2**15 + lists + 2 * 64 * TILE**2 * RAY
     # The first stage keeps every node, later ones the shell that fits have kept; of a coarse grid that is all.
     finer = replace(plan, stages=(*plan.stages, Stage(4 * SHELL, 1, 1, 3, 64)))

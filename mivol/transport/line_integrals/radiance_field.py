@@ -89,7 +89,10 @@ class Model:
 
 
 def cells_of(field: SphericalGrid) -> Cells:
-    """The cells of a field that have light or a derivative; skipping the others changes nothing."""
+    """The cells of a field that have light or a derivative; skipping the others changes nothing.
+
+    A cell whose corners are not stored is vacuum.
+    """
     below = field.act.empty_below
     vacuum = field.rows - 1
 
@@ -98,7 +101,7 @@ def cells_of(field: SphericalGrid) -> Cells:
             return mi.Bool(True) if field.nodes is None else _any([c != vacuum for c in corners])
         return _any([dr.gather(mi.Float, field.density, c) > below for c in corners])
 
-    return Cells.find(field.res, field.to_world, field.row_of, occupied, field.rows, field.levels)
+    return Cells.find(field.res, field.to_world, field.row_of, occupied, field.rows, field.levels, field.nodes)
 
 
 def _any(masks: list[mi.Bool]) -> mi.Bool:

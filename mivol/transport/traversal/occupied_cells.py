@@ -1,9 +1,9 @@
 """The non-empty cells of a grid, and a walk along rays that visits only these.
 
 Conventions. Cells and nodes are those of :mod:`mivol.transport.traversal.lattice`: a cell lies between two nodes along each
-axis, -1 to N - 1, border nodes are repeated. ``Cells.index`` holds for each cell of the box the Chebyshev distance [cells] to
-the nearest occupied one, at most REACH, 0 for those themselves: a ray may go that far in one step. It also knows where an
-occupied cell stands in the list. That takes a byte a cell of the box, and all else goes with the occupied ones.
+axis, -1 to N - 1, border nodes are repeated. ``Cells.index`` tells of each cell of the box whether it is occupied and where it
+stands in the list, or how far a ray may go from there in one step. That takes four bytes for 64 cells of the box, and all else
+goes with the occupied ones.
 
 Levels. A grid may be one of several nested ones (:mod:`mivol.fields.spherical`): all have the same nodes, and their cells are
 counted one level after the other. A walk goes through one of them; :mod:`mivol.transport.traversal.nested_path` says which
@@ -29,8 +29,7 @@ import numpy as np
 from mivol.errors import MivolError
 from mivol.numerics import greater, lesser
 from mivol.space import check_affine, lattice_from_world
-from mivol.transport.traversal.distance_index import DistanceIndex
-from mivol.transport.traversal.empty_blocks import distances
+from mivol.transport.traversal.cell_index import CellIndex
 from mivol.transport.traversal.interpolation import GAUSS
 from mivol.transport.traversal.lattice import Segment
 
@@ -45,7 +44,7 @@ class Cells:
         res: nodes (Z, Y, X).
         to_world: (4, 4) float64, unit cube to world.
         count: number of occupied cells.
-        index: of the (Z + 1) (Y + 1) (X + 1) cells of each level, x fastest: distances, and which of ``corners`` each is.
+        index: of the (Z + 1) (Y + 1) (X + 1) cells of each level: which of ``corners`` each is, and ways through empty ones.
         corners: UInt32, 8 a cell: indices of its nodes in ``rows``; bits 0, 1, 2 of the corner are x, y, z.
         rows: UInt32, the rows of the nodes of listed cells, each once.
         from_world: (3, 4) map from the world to lattice coordinates of the innermost level.
@@ -55,7 +54,7 @@ class Cells:
     res: tuple[int, int, int]
     to_world: np.ndarray
     count: int
-    index: DistanceIndex
+    index: CellIndex
     corners: mi.UInt32
     rows: mi.UInt32
     from_world: list[list[mi.Float64]]
@@ -75,6 +74,7 @@ class Cells:
         occupied: Callable[[list[mi.UInt32]], mi.Bool],
         most: int,
         levels: int = 1,
+        stored: mi.UInt32 | None = None,
     ) -> Cells:
         """Find the occupied cells of a grid.
 
@@ -82,28 +82,23 @@ class Cells:
             res: nodes (Z, Y, X).
             to_world: (4, 4) affine map of the unit cube.
             row_of: the row of nodes of all levels, by their flat numbers, x fastest.
-            occupied: ``occupied(rows of the 8 corners) -> mask`` of cells to list; called once for all cells.
+            occupied: ``occupied(rows of the 8 corners) -> mask`` of cells to list; called once.
             most: rows that there are.
             levels: nested grids.
+            stored: flat numbers of all nodes that may make a cell occupied; None for any.
 
         Raises:
             MivolError: more cells than a 32-bit number counts.
 
-        Cost: 8 reads a cell and what ``occupied`` reads, then 6 REACH reads a cell for the distances.
+        Cost: 8 reads and what ``occupied`` reads for each cell of the bricks of 4^3 cells at ``stored`` nodes.
         """
         z, y, x = res
         total = levels * (z + 1) * (y + 1) * (x + 1)
         if total >= 2**31:
             found = f"{levels} x {x} x {y} x {z}" if levels > 1 else f"{x} x {y} x {z}"
             raise MivolError(f"a grid of {found} nodes was given; its cells are counted up to 2^31: split it.")
-        cell = dr.arange(mi.UInt32, total)
-        # A mask of one lane stands for all cells.
-        held = occupied(_corner_rows(cell, row_of, res)) & dr.full(mi.Bool, True, total)
-        listed = dr.compress(held)
+        index, listed = CellIndex.find(res, levels, lambda cell: occupied(_corner_rows(cell, row_of, res)), stored)
         count = dr.width(listed)
-        far = distances(held, tuple(n + 1 for n in res))
-        del held
-        index = DistanceIndex.of(far)
         # Dr.Jit cannot gather from an array of length 0, not even with all lanes inactive. Where no cell is occupied the arrays
         # hold one cell, to which no number points.
         named = _corner_rows(listed if count else mi.UInt32(0), row_of, res)
@@ -213,7 +208,7 @@ def march(
         The last state, the last cell visited (lower node), and where the ray left it [length from the segment's start].
 
     Error: positions are off by at most 2^-23 (X + Y + Z) of a cell.
-    Cost: one read a search step, at most X + Y + Z + 3 of them, fewer where all around is empty.
+    Cost: two reads a search step, at most X + Y + Z + 3 of them, fewer where all around is empty.
     """
     # -- State: n counts the cells crossed since the first, along each axis ----------------------------------------------
     index, length = cells.index, segment.length
@@ -221,9 +216,7 @@ def march(
     # An axis to which the ray is parallel counts as ahead: its fraction is then used as it is, without a rounding.
     ahead = segment.d >= 0
     sign = dr.select(ahead, mi.Vector3i(1), mi.Vector3i(-1))
-    stride = sign * mi.Vector3i(1, x + 1, (x + 1) * (y + 1))
     first = segment.cell + 1
-    base = first.x + (x + 1) * (first.y + (y + 1) * (first.z + (z + 1) * level))
     most = dr.select(ahead, mi.Vector3i(x, y, z) - first, first)
     entry = dr.select(ahead, segment.frac, 1 - segment.frac)
     speed = dr.abs(segment.d)
@@ -239,14 +232,12 @@ def march(
 
     while dr.hint(active, label="march"):
         # -- The next occupied cell --------------------------------------------------------------------------------------
-        place, word = mi.UInt32(0), mi.UInt32(0)
+        brick = mi.UInt32(0)
         searching = mi.Bool(active)
         while dr.hint(searching, label="search"):
-            here = mi.UInt32(base + n.x * stride.x + n.y * stride.y + n.z * stride.z)
-            place = dr.select(searching, here, place)
-            far, word = index.distance(place, active)
-            searching &= far > 0
-            ends = n + mi.Int32(far)
+            brick, free = index.look(first + sign * n, level, ahead, searching)
+            searching &= free.x > 0
+            ends = n + free
             reach = dr.fma(mi.Vector3f(ends) - entry, pace, never)
             exit = lesser(lesser(reach.x, reach.y), reach.z)
             there = dr.clip(mi.Vector3i(dr.fma(speed, exit, entry)), n, ends - 1)
@@ -267,8 +258,8 @@ def march(
         points = tuple(dr.select(ahead, p, 1 - p) for p in along)
         through = reach <= exit
         leaves = dr.select(through.x, 0, dr.select(through.y, 1, mi.Int32(2)))
-        cell = segment.cell + sign * n
-        here = CellVisitor(index.rank(place, word, active), points, t, dt, along, cell, level, ahead, entered, leaves)
+        cell, number = segment.cell + sign * n, index.rank(first + sign * n, brick, active)
+        here = CellVisitor(number, points, t, dt, along, cell, level, ahead, entered, leaves)
         state = visit(state, here, active)
         last = dr.select(active, cell, last)
         left = dr.select(active, t + dt, left)

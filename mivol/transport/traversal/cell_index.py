@@ -1,0 +1,178 @@
+"""Which cells of a grid are listed, where a listed one stands in its list, and how far around a cell none is.
+
+Conventions. Cells (0 to N along an axis of N nodes) lie in bricks of 4 x 4 x 4. A brick that holds a listed cell has a number
+and a bit for each of its cells; any other has only its Chebyshev distance [bricks] to the nearest that does. So what is kept
+goes with the bricks around listed cells, and four bytes for 64 cells of the box. Listed cells are numbered brick by brick, and
+in one by the bits: the number of a cell (its rank) is the number of listed cells before its brick, which is stored, and the
+count of the bits below its own.
+
+References: Cohen & Sheffer 1994 (distances that a ray may skip); Jacobson 1989 (the rank of a bit in constant time).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from mivol.transport.traversal.empty_blocks import BLOCK, SHIFT, count_blocks, distances
+
+__all__ = ["CellIndex"]
+
+FILLED = 1 << 31
+"""Set in the entry of a brick that has a number."""
+
+CELLS = BLOCK**3
+"""Cells of a brick: the bits of two words."""
+
+
+@dataclass
+class CellIndex:
+    """The listed cells of nested grids of one resolution.
+
+    Attributes:
+        counts: bricks (Z, Y, X) of a level.
+        bricks: UInt32, of each brick of all levels: its distance, or ``FILLED`` and its number.
+        bits: UInt32, two for each brick that has a number: of its cells with z of 0, 1 and of 2, 3, x fastest.
+        before: UInt32, for each of these how many listed cells are before it.
+    """
+
+    counts: tuple[int, int, int]
+    bricks: mi.UInt32
+    bits: mi.UInt32
+    before: mi.UInt32
+
+    @property
+    def bytes(self) -> int:
+        """Memory that it takes."""
+        return 4 * (dr.width(self.bricks) + dr.width(self.bits) + dr.width(self.before))
+
+    @classmethod
+    def find(
+        cls,
+        res: tuple[int, int, int],
+        levels: int,
+        is_listed: Callable[[mi.UInt32], mi.Bool],
+        nodes: mi.UInt32 | None = None,
+    ) -> tuple[CellIndex, mi.UInt32]:
+        """The index, and the listed cells in the order of their numbers.
+
+        Args:
+            res: nodes (Z, Y, X).
+            levels: nested grids.
+            is_listed: of cells, by their flat numbers: x fastest, levels slowest.
+            nodes: flat numbers of all nodes that listed cells have among their corners; None for any.
+
+        Cost: one question a cell of the bricks at these nodes.
+        """
+        counts = tuple(count_blocks(n) for n in res)
+        total = levels * math.prod(counts)
+        # Where there is no node the brick of the first one is asked about: Dr.Jit has no arithmetic for arrays of length 0.
+        nodes = mi.UInt32(0) if nodes is not None and dr.width(nodes) == 0 else nodes
+        asked = dr.arange(mi.UInt32, total) if nodes is None else _bricks_at(nodes, res, counts, total)
+        lane = dr.arange(mi.UInt32, CELLS * dr.width(asked))
+        cell, is_inside = _cell_of(dr.gather(mi.UInt32, asked, lane // CELLS), lane % CELLS, res, counts)
+        is_held = is_listed(cell) & is_inside
+        dr.eval(is_held, cell)
+        listed = dr.gather(mi.UInt32, cell, dr.compress(is_held))
+        words = dr.block_sum(dr.select(is_held, mi.UInt32(1) << (lane & 31), 0), 32)
+        low, high = (dr.gather(mi.UInt32, words, 2 * dr.arange(mi.UInt32, dr.width(asked)) + k) for k in (0, 1))
+        before = dr.prefix_sum(dr.popcnt(low) + dr.popcnt(high))
+        filled = dr.compress((low | high) != 0)
+        count = dr.width(filled)
+        if count == 0:
+            # Dr.Jit cannot gather from an array of length 0, not even with all lanes inactive.
+            far = distances(dr.zeros(mi.Bool, total), counts)
+            return cls(counts, mi.UInt32(far), dr.zeros(mi.UInt32, 2), dr.zeros(mi.UInt32, 1)), listed
+        place, is_filled, bits = dr.gather(mi.UInt32, asked, filled), dr.zeros(mi.UInt8, total), dr.zeros(mi.UInt32, 2 * count)
+        dr.scatter(is_filled, mi.UInt8(1), place)
+        dr.scatter(bits, mi.ArrayXu([dr.gather(mi.UInt32, word, filled) for word in (low, high)]), dr.arange(mi.UInt32, count))
+        bricks = mi.UInt32(distances(is_filled > 0, counts))
+        dr.scatter(bricks, dr.arange(mi.UInt32, count) | FILLED, place)
+        index = cls(counts, bricks, bits, dr.gather(mi.UInt32, before, filled))
+        dr.eval(index, listed)
+        return index, listed
+
+    def look(
+        self, cell: mi.Vector3i, level: mi.Int32 | int, ahead: mi.Array3b, active: mi.Bool
+    ) -> tuple[mi.UInt32, mi.Vector3i]:
+        """The number of the brick of cells, and how many cells a ray may cross along each axis, its own among them.
+
+        Args:
+            cell: along x, y and z, from 0.
+            level: that it lies in.
+            ahead: whether the ray runs upwards along each axis.
+            active: lanes that look.
+
+        Returns:
+            The number has no meaning where the brick has none; 0 cells along all axes where the cell is listed.
+        """
+        z, y, x = self.counts
+        place = cell >> SHIFT
+        at = mi.UInt32(place.x + x * (place.y + y * (place.z + z * level)))
+        entry = dr.gather(mi.UInt32, self.bricks, at, active)
+        is_filled = entry >= FILLED
+        number = entry & (FILLED - 1)
+        low, high = dr.gather(mi.ArrayXu, self.bits, number, active & is_filled, shape=(2, 1))
+        bits = dr.select((cell.z & 2) == 0, low, high)
+        here = mi.Int32(1 - ((bits >> _bit(cell)) & 1))
+        inside = cell & (BLOCK - 1)
+        within = dr.select(ahead, BLOCK - inside, inside + 1)
+        is_free = ~is_filled | _is_free(low, high, inside, ahead)
+        distance = mi.Int32(dr.select(is_filled, 1, entry))
+        return number, dr.select(is_free, within + BLOCK * (distance - 1), here)
+
+    def rank(self, cell: mi.Vector3i, number: mi.UInt32, active: mi.Bool) -> mi.UInt32:
+        """The number of listed cells, from that of their brick."""
+        low, high = dr.gather(mi.ArrayXu, self.bits, number, active, shape=(2, 1))
+        before = dr.gather(mi.UInt32, self.before, number, active)
+        below = (mi.UInt32(1) << _bit(cell)) - 1
+        is_low = (cell.z & 2) == 0
+        return before + dr.popcnt(dr.select(is_low, low & below, low)) + dr.popcnt(dr.select(is_low, 0, high & below))
+
+
+def _bit(cell: mi.Vector3i) -> mi.UInt32:
+    """The bit of a cell in the word that has it."""
+    return mi.UInt32((cell.x & 3) | (cell.y & 3) << 2 | (cell.z & 1) << 4)
+
+
+def _is_free(low: mi.UInt32, high: mi.UInt32, inside: mi.Vector3i, ahead: mi.Array3b) -> mi.Bool:
+    """Whether bricks hold no listed cell from cells on along all axes, where a ray may still go."""
+    i, j, k = (mi.UInt32(a) for a in inside)
+    row = dr.select(ahead.x, (0xF << i) & 0xF, mi.UInt32(0xF) >> (3 - i)) * 0x11111111
+    rows = dr.select(ahead.y, (0xFFFF << (4 * j)) & 0xFFFF, mi.UInt32(0xFFFF) >> (12 - 4 * j)) * 0x00010001
+    every, second = mi.UInt32(0xFFFFFFFF), 16 * (k & 1)
+    planes, beyond = dr.select(ahead.z, every << second, every >> (16 - second)), dr.select(ahead.z, every, 0)
+    is_low = k < 2
+    seen = dr.select(is_low, low & planes, low & ~beyond) | dr.select(is_low, high & beyond, high & planes)
+    return (seen & row & rows) == 0
+
+
+def _bricks_at(nodes: mi.UInt32, res: tuple[int, int, int], counts: tuple[int, int, int], total: int) -> mi.UInt32:
+    """The bricks, ascending, that hold a cell of which some of the nodes is a corner."""
+    (z, y, x), (b_z, b_y, b_x) = res, counts
+    level = nodes // (x * y * z)
+    i, j, k = nodes % x, nodes // x % y, nodes // (x * y) % z
+    near = dr.zeros(mi.UInt8, total)
+    # Node i is a corner of the cells i and i + 1.
+    for corner in range(8):
+        a, c, e = ((n + (corner >> axis & 1)) >> SHIFT for axis, n in enumerate((i, j, k)))
+        dr.scatter(near, mi.UInt8(1), a + b_x * (c + b_y * (e + b_z * level)))
+    return dr.compress(near > 0)
+
+
+def _cell_of(
+    brick: mi.UInt32, bit: mi.UInt32, res: tuple[int, int, int], counts: tuple[int, int, int]
+) -> tuple[mi.UInt32, mi.Bool]:
+    """Flat numbers of cells, some cell's of the grid where they lie beyond it, and whether they do not."""
+    (z, y, x), (b_z, b_y, b_x) = res, counts
+    i = brick % b_x * BLOCK + (bit & 3)
+    j = brick // b_x % b_y * BLOCK + (bit >> 2 & 3)
+    k = brick // (b_x * b_y) % b_z * BLOCK + (bit >> 4)
+    level = brick // (b_x * b_y * b_z)
+    is_inside = (i <= x) & (j <= y) & (k <= z)
+    i, j, k = dr.minimum(i, x), dr.minimum(j, y), dr.minimum(k, z)
+    return i + (x + 1) * (j + (y + 1) * (k + (z + 1) * level)), is_inside
