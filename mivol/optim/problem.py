@@ -73,7 +73,7 @@ class Differentiable(Problem, Protocol):
         """What becomes of the reals of a step: on to their domain, and moved by priors that act apart from the gradient.
 
         Args:
-            reals: of the step; the problem may take them out, for as long as they are there the gradient is in memory.
+            reals: of the step; the problem may take them out: while the dictionary holds them, the gradient is in memory.
             iteration: that of the newest :meth:`loss_and_gradient`.
         """
 

@@ -21,7 +21,8 @@ from mivol.optim.strategy import of
 
 UNIT = 64.0
 """Fourth roots are held times this. A half has 11 bits from 2^-14 to 2^16, and fewer down to 2^-24: derivatives whose root mean
-square is between 1e-12 and 1e6 [loss / real] keep their precision, from 1e-18 on they are known, and smaller ones are 0."""
+square is between 1e-12 and 1e6 [loss / real] keep their precision, and from 1e-18 on they are known. Smaller ones are
+forgotten: the next such derivative moves its number by a whole rate, as the first does."""
 
 LARGEST = 65504.0
 """The largest half. Larger roots are held as this: steps against derivatives above 1e6 are longer than the rate, not 0."""
