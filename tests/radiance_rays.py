@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 
@@ -16,6 +17,7 @@ from mivol.transport.line_integrals.radiance_field import (
     render,
 )
 from mivol.transport.line_integrals.radiance_source import bake, exact
+from mivol.transport.traversal.cell_index import CellIndex
 
 TO_WORLD = np.array([[2.0, 0.3, 0.0, -1.2], [-0.2, 1.5, 0.1, -0.7], [0.0, 0.1, 2.5, -1.3], [0, 0, 0, 1]])
 """Rotated a little, sheared and of three lengths."""
@@ -61,3 +63,12 @@ def derive(field: SphericalGrid, o, d, colour, T=0.0, distance=0.0, stop=0.0):
     seen = render(cells, source, model, rays)
     backward(cells, source, model, seen, RayGradient(mi.Color3f(*colour), T, distance))
     return field.with_values(*source.slopes()).values()
+
+
+def looked(index: CellIndex, shape: tuple[int, ...], ahead: tuple[bool, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """Ways (levels, Z, Y, X, 3: x, y, z) from all cells, and their numbers."""
+    level, z, y, x = (mi.Int32(a.ravel().astype(np.int32)) for a in np.indices(shape))
+    cell, every = mi.Vector3i(x, y, z), mi.Bool(True)
+    brick, free = index.look(cell, level, mi.Array3b(*ahead), every)
+    number = index.rank(cell, dr.select(free.x == 0, brick, 0), every)
+    return np.array(free).T.reshape(*shape, 3), np.array(number).reshape(shape)

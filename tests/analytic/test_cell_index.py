@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from radiance_rays import looked
 from scipy.ndimage import distance_transform_cdt
 
 from mivol.transport.traversal.cell_index import CellIndex
@@ -28,15 +29,6 @@ def chosen(levels: int, share: float = 0.01) -> np.ndarray:
     is_listed[:, 9:] = False
     is_listed[0, 4:6, 5:9, 6:13] = True
     return is_listed
-
-
-def looked(index: CellIndex, shape: tuple[int, ...], ahead: tuple[bool, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Ways (levels, Z, Y, X, 3: x, y, z) from all cells, and their numbers."""
-    level, z, y, x = (mi.Int32(a.ravel().astype(np.int32)) for a in np.indices(shape))
-    cell, every = mi.Vector3i(x, y, z), mi.Bool(True)
-    brick, free = index.look(cell, level, mi.Array3b(*ahead), every)
-    number = index.rank(cell, dr.select(free.x == 0, brick, 0), every)
-    return np.array(free).T.reshape(*shape, 3), np.array(number).reshape(shape)
 
 
 @pytest.mark.parametrize("levels", [1, 2])

@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from oracle_radiance import Twin
-from radiance_rays import CUBE, TO_WORLD, aim, derive, make, rays_of, see
+from radiance_rays import CUBE, TO_WORLD, aim, derive, looked, make, rays_of, see
 
 from mivol.fields.activation import ACTIVATIONS
 from mivol.fields.spherical import SphericalGrid
@@ -212,10 +212,7 @@ def test_a_ray_that_stops_early_errs_by_what_it_leaves(variant_rgb: str) -> None
 
 def numbers_of(cells: Cells) -> np.ndarray:
     """Of each cell (Z, Y, X) its place in the list, which only listed ones have."""
-    z, y, x = (mi.Int32(a.ravel().astype(np.int32)) for a in np.indices([n + 1 for n in cells.res]))
-    cell, every = mi.Vector3i(x, y, z), mi.Bool(True)
-    brick, free = cells.index.look(cell, 0, mi.Array3b(True), every)
-    return np.array(cells.index.rank(cell, dr.select(free.x == 0, brick, 0), every)).reshape([n + 1 for n in cells.res])
+    return looked(cells.index, (1, *(n + 1 for n in cells.res)), (True, True, True))[1][0]
 
 
 @pytest.mark.parametrize("sparse", [False, True])

@@ -75,6 +75,19 @@ def test_a_fit_that_went_on_equals_one_that_did_not_stop(one_thread, photos: lis
     assert resumed.log == whole.log
 
 
+def give_back() -> None:
+    """Let Dr.Jit give back the memory that it keeps for later, and forget how much it held."""
+    dr.sync_thread()
+    dr.flush_malloc_cache()
+    dr.detail.malloc_clear_statistics()
+
+
+def most_held() -> int:
+    """Most bytes that Dr.Jit held since."""
+    dr.sync_thread()
+    return dr.detail.malloc_watermark(dr.backend_v(mi.Float))
+
+
 @pytest.mark.parametrize(("longest", "views"), [(48, 4), (64, 2)])
 def test_steps_take_the_memory_that_is_counted(
     variant_rgb: str, cpu_back_end: None, photos: list[Photo], longest: int, views: int
@@ -83,20 +96,13 @@ def test_steps_take_the_memory_that_is_counted(
     plan = replace(PLAN, stages=(Stage(longest, 9, 1, views, 32),), degree=2, tv_every=4)
     batches = RayBatches.of(photos)
 
-    def most() -> int:
-        dr.sync_thread()
-        return dr.detail.malloc_watermark(dr.backend_v(mi.Float))
-
-    dr.sync_thread()
-    dr.flush_malloc_cache()
-    dr.detail.malloc_clear_statistics()
-    before, fit = most(), begin_fit(RadianceProblem(batches, BOX, plan), plan.optimiser, plan.course())
+    give_back()
+    before, fit = most_held(), begin_fit(RadianceProblem(batches, BOX, plan), plan.optimiser, plan.course())
     # What the map of the first fog took is of no use to the steps.
-    dr.flush_malloc_cache()
-    dr.detail.malloc_clear_statistics()
+    give_back()
     fit.complete()
     counted = bytes_of(plan, plan.stages[0], BOX, fit.problem.field.rows)
-    assert counted / 2 < most() - before < counted
+    assert counted / 2 < most_held() - before < counted
 
 
 def test_leaving_nodes_out_takes_no_more_memory_than_steps(variant_rgb: str, cpu_back_end: None, photos: list[Photo]) -> None:
@@ -104,13 +110,10 @@ def test_leaving_nodes_out_takes_no_more_memory_than_steps(variant_rgb: str, cpu
     plan = replace(PLAN, stages=(Stage(64, 9, 1, 2, 32),), degree=2, keep_weight=0.0, drop=1 / 3)
     fit = fitted(RayBatches.of(photos), plan, 3)
     rows, dropping = fit.problem.field.rows, fit.course.events[1]
-    dr.sync_thread()
-    dr.flush_malloc_cache()
-    dr.detail.malloc_clear_statistics()
+    give_back()
     assert dropping.due(3)
     dropping.apply(fit)
-    dr.sync_thread()
-    held = dr.detail.malloc_watermark(dr.backend_v(mi.Float))
+    held = most_held()
     assert 0.7 * rows < fit.problem.field.rows < rows
     assert held < bytes_of(plan, plan.stages[0], BOX, rows)
 
@@ -129,11 +132,10 @@ def test_unseen_nodes_are_left_out(variant_rgb: str, photos: list[Photo]) -> Non
     says = dropping.apply(fit)
     dr.sync_thread()
     dr.detail.malloc_clear_statistics()
-    held = dr.detail.malloc_watermark(dr.backend_v(mi.Float))
-    dr.flush_malloc_cache()
-    dr.detail.malloc_clear_statistics()
+    held = most_held()
+    give_back()
     # Bytes of single numbers may have come and gone.
-    assert held - dr.detail.malloc_watermark(dr.backend_v(mi.Float)) < 1 << 16
+    assert held - most_held() < 1 << 16
     after = problem.field
     np.testing.assert_array_equal(after.listed(), np.flatnonzero(expected))
     assert says == f"unseen nodes left out: 24 x 24 x 24 nodes, of which {after.rows - 1} are kept"

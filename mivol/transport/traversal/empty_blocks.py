@@ -35,8 +35,8 @@ BLOCK = 1 << SHIFT
 """Edge of a block, in cells (measured on threads in a grid of 512^3: an edge of 2 is no faster)."""
 
 REACH = 15
-"""Largest distance that is stored [blocks, or cells]; what is further counts as so far. In an empty box of 128^3 cells a ray
-takes 10 steps with it."""
+"""Largest distance that is stored [blocks]; what is further counts as so far. In an empty box of 128^3 cells a ray takes 3
+steps with it."""
 
 
 def block_bounds(values: mi.TensorXf) -> mi.Float:
@@ -129,7 +129,7 @@ def empty_block_distances(bounds: mi.Float, res: tuple[int, int, int]) -> mi.UIn
 
 
 def distances(occupied: mi.Bool, counts: tuple[int, int, int]) -> mi.UInt8:
-    """The Chebyshev distance of each of (Z, Y, X) blocks or cells from the nearest occupied one, at most ``REACH``.
+    """The Chebyshev distance of each of (Z, Y, X) blocks from the nearest occupied one, at most ``REACH``.
 
     Cost: 6 ``REACH`` look-ups each at most, one axis after the other.
     """

@@ -60,11 +60,6 @@ class Cells:
     from_world: list[list[mi.Float64]]
     levels: int = 1
 
-    @property
-    def per_level(self) -> int:
-        """Number of cells of a level, occupied or not."""
-        return math.prod(n + 1 for n in self.res)
-
     @classmethod
     def find(
         cls,
@@ -258,8 +253,8 @@ def march(
         points = tuple(dr.select(ahead, p, 1 - p) for p in along)
         through = reach <= exit
         leaves = dr.select(through.x, 0, dr.select(through.y, 1, mi.Int32(2)))
-        cell, number = segment.cell + sign * n, index.rank(first + sign * n, brick, active)
-        here = CellVisitor(number, points, t, dt, along, cell, level, ahead, entered, leaves)
+        cell = segment.cell + sign * n
+        here = CellVisitor(index.rank(cell + 1, brick, active), points, t, dt, along, cell, level, ahead, entered, leaves)
         state = visit(state, here, active)
         last = dr.select(active, cell, last)
         left = dr.select(active, t + dt, left)
