@@ -1,26 +1,19 @@
-"""Which tests guard a module: those that its mutations name, those named like it, those that import it.
+"""Which tests guard a module: the files of tests named like the module, those that import it, and the tests of its mutations.
 
-Nothing is written down for this: the file names of the tests, their imports and the entries of tests/mutations say it.
+Nothing is written down for this: file names, imports and the entries of tests/mutations say it.
 """
 
 from __future__ import annotations
 
 import ast
-from collections import Counter, defaultdict
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
-__all__ = ["Guards", "imported_modules", "index_guards"]
+__all__ = ["Guards", "index_guards"]
 
-EVERYWHERE = 8
-"""A test that mutations in so many folders name looks at every module: it guards those that have no mutation, too."""
-
-SHARED = 3
-"""A file of tests that mutations of so many files of a folder name looks at all of the folder: its slow tests guard that."""
-
-MOST_FILES = 5
-"""Files of tests in the second round. Modules that half of the tests import would have most of the suite run otherwise."""
+MOST_FILES = 6
+"""Files of tests in the second round. Half of the tests import some modules; all of those would be most of the suite."""
 
 
 @dataclass
@@ -28,37 +21,36 @@ class Guards:
     """Tests by module.
 
     Attributes:
-        tests: the tests of the mutations of each file of the package, those of most mutations first.
-        named, importing: files of tests that are called like a file, or import it, those that import the fewest first.
-        everywhere: tests that guard every module.
+        tests: the tests that the mutations of a file name.
+        named: the files of tests that are named like a file.
+        importing: the files of tests that import a file, directly or through another module, the nearest first.
         files: every file of tests.
     """
 
     tests: dict[str, list[str]] = field(default_factory=dict)
     named: dict[str, list[str]] = field(default_factory=dict)
     importing: dict[str, list[str]] = field(default_factory=dict)
-    everywhere: list[str] = field(default_factory=list)
     files: list[str] = field(default_factory=list)
 
     def rounds(self, file: str) -> list[list[str]]:
-        """What to run for a file of the package, round by round, the likeliest and cheapest to notice a fault first.
+        """The arguments of pytest for a fault in a file, round by round, the likeliest and cheapest tests first.
 
-        First the files of tests that are called like it, the tests elsewhere that its mutations name, and those that guard
-        every module; then the rest of the files that hold those tests, and those that import it, MOST_FILES at most; then those
-        of all files in its folder, or all there are where the folder has none; then the slow tests of the files that are called
-        like it or hold those tests, and of those that SHARED files of its folder name. Rounds may be empty; what a later round
-        runs again are single tests of a file.
+        1. the files of tests named like the file, and the single tests that its mutations name;
+        2. the rest of the files that hold those tests, and the nearest files that import it, MOST_FILES in all;
+        3. the tests of the other modules in its folder, and as many importing files again; without either, all tests;
+        4. the slow tests of rounds 1 and 2.
+
+        A round may be empty.
         """
-        named, tests = self.named.get(file, []), self.tests.get(file, [])
+        named, tests, importing = self.named.get(file, []), self.tests.get(file, []), self.importing.get(file, [])
         first = [*named, *(t for t in tests if file_of(t) not in named)]
-        rest = [t for t in _once([*map(file_of, tests), *self.importing.get(file, [])]) if t not in named][:MOST_FILES]
-        first += [t for t in self.everywhere if t not in first]
+        second = [t for t in _unique([*map(file_of, tests), *importing]) if t not in named][:MOST_FILES]
         near = [f for f in sorted({*self.tests, *self.named}) if Path(f).parent == Path(file).parent]
-        around = _once(t for f in near for t in (*map(file_of, self.tests.get(f, [])), *self.named.get(f, [])))
-        naming = Counter(test for f in near for test in {file_of(t) for t in self.tests.get(f, [])})
-        own = _once([*named, *map(file_of, tests), *sorted(test for test, count in naming.items() if count >= SHARED)])
-        slow = ["-m", "slow", *own] if own else []
-        return [first, rest, [t for t in around or self.files if t not in (*named, *rest)], slow]
+        around = _unique(t for f in near for t in (*self.named.get(f, []), *map(file_of, self.tests.get(f, []))))
+        around += [t for t in importing[: 2 * MOST_FILES] if t not in around]
+        third = [t for t in around or self.files if t not in (*named, *second)]
+        own = _unique([*named, *second])
+        return [first, second, third, ["-m", "slow", *own] if own else []]
 
 
 def file_of(test: str) -> str:
@@ -66,7 +58,7 @@ def file_of(test: str) -> str:
     return test.partition("::")[0]
 
 
-def _once(tests: Iterable[str]) -> list[str]:
+def _unique(tests: Iterable[str]) -> list[str]:
     return list(dict.fromkeys(tests))
 
 
@@ -78,40 +70,65 @@ def index_guards(root: Path, entries: Iterable[tuple[str, str]], package: str = 
         entries: (file of the package, test that guards it) pairs.
         package: the folder of the package.
     """
-    modules = {_module(path.relative_to(root)): str(path.relative_to(root)) for path in sorted((root / package).rglob("*.py"))}
-    entries, counts = list(entries), defaultdict(Counter)
+    modules = {_module(p.relative_to(root)): str(p.relative_to(root)) for p in sorted((root / package).rglob("*.py"))}
+    helpers = {p.stem: str(p.relative_to(root)) for p in sorted((root / "tests").glob("*.py"))}
+    names = modules | helpers
+    names |= {
+        name: file for m, f in modules.items() if Path(f).stem == "__init__" for name, file in _exports(root / f, m, names)
+    }
+    imports = {file: _files_of(root / file, names) for file in (*modules.values(), *helpers.values())}
+    guards = Guards()
     for file, test in entries:
-        counts[file][test] += 1
-    guards = Guards(tests={file: [test for test, _ in found.most_common()] for file, found in counts.items()})
-    folders = defaultdict(set)
-    for file, test in entries:
-        folders[test].add(Path(file).parent)
-    guards.everywhere = sorted(test for test, found in folders.items() if len(found) >= EVERYWHERE)
-    reads = {}
+        if test not in guards.tests.setdefault(file, []):
+            guards.tests[file].append(test)
+    reached = {}
     for path in sorted((root / "tests").rglob("test_*.py")):
         name = str(path.relative_to(root))
         guards.files.append(name)
-        reads[name] = {modules[m] for m in imported_modules(path.read_text()) if m in modules}
+        reached[name] = _distances(_files_of(path, names), imports)
         for file in modules.values():
             if path.stem.removeprefix("test_") == Path(file).stem:
                 guards.named.setdefault(file, []).append(name)
-    for name in sorted(reads, key=lambda n: (len(reads[n]), n)):
-        for file in reads[name]:
+    # Among tests equally far from a module, those that reach the fewest modules are about it rather than about the whole.
+    for name in sorted(reached, key=lambda name: (len(reached[name]), name)):
+        for file in reached[name].keys() & set(modules.values()):
             guards.importing.setdefault(file, []).append(name)
+    for file, tests in guards.importing.items():
+        tests.sort(key=lambda name: reached[name][file])
     return guards
+
+
+def _distances(start: set[str], imports: dict[str, set[str]]) -> dict[str, int]:
+    """The number of imports between a test and each file that the test reaches."""
+    found, front, distance = {}, set(start), 0
+    while front:
+        found |= dict.fromkeys(front, distance)
+        front = {f for file in front for f in imports[file]} - set(found)
+        distance += 1
+    return found
+
+
+def _exports(path: Path, package: str, names: dict[str, str]) -> Iterator[tuple[str, str]]:
+    """The (dotted name, file that defines it) pairs of what a package imports to pass on."""
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.ImportFrom) and node.module and not node.level and node.module in names:
+            yield from ((f"{package}.{alias.asname or alias.name}", names[node.module]) for alias in node.names)
+
+
+def _files_of(path: Path, names: dict[str, str]) -> set[str]:
+    """The files that a file imports; a name that a package only passes on counts as imported from where it is defined."""
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            found |= {names[alias.name] for alias in node.names if alias.name in names}
+        elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
+            dotted = (f"{node.module}.{alias.name}" for alias in node.names)
+            found |= {
+                names[name] if name in names else names[node.module] for name in dotted if name in names or node.module in names
+            }
+    return found
 
 
 def _module(path: Path) -> str:
     parts = path.with_suffix("").parts
     return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
-
-
-def imported_modules(source: str) -> set[str]:
-    """The modules that a file may import: of ``from a import b`` both ``a`` and ``a.b``."""
-    found = set()
-    for node in ast.walk(ast.parse(source)):
-        if isinstance(node, ast.Import):
-            found |= {alias.name for alias in node.names}
-        elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
-            found |= {node.module} | {f"{node.module}.{alias.name}" for alias in node.names}
-    return found
