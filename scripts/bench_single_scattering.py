@@ -1,12 +1,12 @@
 #!/usr/bin/env python3
 """Light that scatters once: how much sooner does mivol reach an error than Mitsuba's ``volpath`` and ``prbvolpath``?
 
-See ``scripts/bench_single_scattering.py --help``; everything is in :mod:`mivol.bench.single_scattering`.
+See ``scripts/bench_single_scattering.py --help``; everything is in :mod:`mivol.bench.studies.single_scattering`.
 """
 
 import sys
 
-from mivol.bench.single_scattering import main
+from mivol.bench.studies.single_scattering import main
 
 if __name__ == "__main__":
     sys.exit(main())

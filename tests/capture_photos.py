@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mivol.bench.radiance_field.room import cameras_of, image_of
+from mivol.bench.studies.radiance_field.room import cameras_of, image_of
 from mivol.files import write_png
 from mivol.photos import Camera, Photo
 from mivol.photos.picture import decode_srgb

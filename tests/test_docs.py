@@ -18,7 +18,7 @@ from script_modules import load
 import mivol
 from hatch_build import absolute
 from mivol import config
-from mivol.bench.studies import STUDIES
+from mivol.bench.harness.catalogue import STUDIES
 from mivol.cli import parser
 from mivol.optim.losses import LOSSES
 from mivol.optim.optimisers import OPTIMISERS

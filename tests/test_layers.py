@@ -78,7 +78,7 @@ def test_nothing_imports_the_benches() -> None:
     found = [
         name for path, room in rooms.items() if room != "bench" for name, _ in imported(path) if "mivol.bench" in name
     ]
-    assert set(found) == {"mivol.bench.studies.list_studies", "mivol.bench.studies.run_study"}
+    assert set(found) == {"mivol.bench.harness.catalogue.list_studies", "mivol.bench.harness.catalogue.run_study"}
 
 
 def test_imports_point_up_inside_a_room() -> None:

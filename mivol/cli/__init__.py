@@ -512,7 +512,7 @@ def validate(arguments: argparse.Namespace) -> int:
 
 def bench(arguments: argparse.Namespace) -> int:
     """Run a bench: a question about speed or accuracy beside what else could be used; JSON, a figure and its bars."""
-    from mivol.bench.studies import list_studies, run_study
+    from mivol.bench.harness.catalogue import list_studies, run_study
 
     if not arguments.study:
         print(list_studies())

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from mivol.bench.agreement import FALSE_ALARM, compare_means, finite, mean_of_pixels, mean_of_rounds, number
+from mivol.bench.harness.agreement import FALSE_ALARM, compare_means, finite, mean_of_pixels, mean_of_rounds, number
 from mivol.validate.statistics import Estimate
 
 

@@ -6,7 +6,7 @@ import json
 
 import pytest
 
-from mivol.bench.bars import AT_LEAST, AT_MOST, judge, judge_agreement, means_that_differ
+from mivol.bench.harness.bars import AT_LEAST, AT_MOST, judge, judge_agreement, means_that_differ
 
 
 def test_a_bar_that_is_reached_is_met() -> None:

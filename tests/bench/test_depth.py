@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from false_alarms import Estimate, assert_same_mean, assert_same_variance, fresh
 
-from mivol.bench import depth as bench
+from mivol.bench.studies import depth as bench
 from mivol.scene import depth_two
 from mivol.scene.depth_two import ALBEDOS, TABLES, TAUS
 from mivol.validate.moments import Moments

@@ -11,7 +11,7 @@ import pytest
 from bench_figures import drawn
 from report.looks import assert_recorded
 
-from mivol.bench import (
+from mivol.bench.studies import (
     depth,
     gradients,
     media_light,
@@ -23,8 +23,8 @@ from mivol.bench import (
     still_life,
     tomography,
 )
-from mivol.bench.depth import TABLED, Cell
-from mivol.bench.gradients.size import CONTESTS, OURS, STOCK
+from mivol.bench.studies.depth import TABLED, Cell
+from mivol.bench.studies.gradients.size import CONTESTS, OURS, STOCK
 
 
 def contest(names: dict, stocks: tuple[str, ...]) -> dict:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from mivol.bench.figures import drawn, plain_ticks
+from mivol.bench.harness.figures import drawn, plain_ticks
 from mivol.report.figures import STYLE
 
 

@@ -13,8 +13,8 @@ import pytest
 from ball_photos import camera
 from PIL import Image
 
-from mivol.bench import gaussian_choices, points
-from mivol.bench.gaussian_fits import Fitted, psnr_of
+from mivol.bench.studies import gaussian_choices, points
+from mivol.bench.studies.gaussian_fits import Fitted, psnr_of
 from mivol.errors import MivolError
 from mivol.optim.gaussian_plan import PRESETS, GaussianPlan
 from mivol.optim.gaussian_start import begin_at

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from ball_photos import camera
 
-from mivol.bench.gaussian_fits import Fitted, fit_and_judge, psnr_of
+from mivol.bench.studies.gaussian_fits import Fitted, fit_and_judge, psnr_of
 from mivol.errors import MivolError
 from mivol.optim.gaussian_plan import PRESETS
 from mivol.optim.gaussian_start import begin_at

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from false_alarms import assert_precise, assert_same_mean, fresh, over_pixels
 
-from mivol.bench.gradients import twin
-from mivol.bench.gradients.bias import deep_cases
-from mivol.bench.gradients.size import CONSTANT, SHONE, TABLES, Light
-from mivol.bench.gradients.twin import Twin
+from mivol.bench.studies.gradients import twin
+from mivol.bench.studies.gradients.bias import deep_cases
+from mivol.bench.studies.gradients.size import CONSTANT, SHONE, TABLES, Light
+from mivol.bench.studies.gradients.twin import Twin
 from mivol.validate.moments import Moments
 
 SIDE = 6

@@ -15,14 +15,23 @@ import pytest
 from false_alarms import ALPHA, note
 from scipy import stats
 
-from mivol.bench import agreement
-from mivol.bench.gradients import BENCH, QUICK, bias, tutorial, variance
-from mivol.bench.gradients.bias import Case, cases, difference, refine, table_row
-from mivol.bench.gradients.size import CONTESTS, OURS, STOCK, TABLES
-from mivol.bench.gradients.subject import compete, subjects
-from mivol.bench.gradients.tutorial import Run, at_voxels, finish, half_circle, measure_tutorial, optimise, upright, warm_up
-from mivol.bench.gradients.variance import measure_contest, outcome
-from mivol.bench.timing import Budget, Timing
+from mivol.bench.harness import agreement
+from mivol.bench.harness.timing import Budget, Timing
+from mivol.bench.studies.gradients import BENCH, QUICK, bias, tutorial, variance
+from mivol.bench.studies.gradients.bias import Case, cases, difference, refine, table_row
+from mivol.bench.studies.gradients.size import CONTESTS, OURS, STOCK, TABLES
+from mivol.bench.studies.gradients.subject import compete, subjects
+from mivol.bench.studies.gradients.tutorial import (
+    Run,
+    at_voxels,
+    finish,
+    half_circle,
+    measure_tutorial,
+    optimise,
+    upright,
+    warm_up,
+)
+from mivol.bench.studies.gradients.variance import measure_contest, outcome
 from mivol.files import read_volume
 
 LIGHTS = TABLES["estimators"]

@@ -13,9 +13,9 @@ import pytest
 from bench_figures import drawn
 from report.looks import assert_recorded
 
-from mivol.bench import ladder
-from mivol.bench.ladder import BENCH, QUICK, RUNGS, climb
-from mivol.bench.timing import Budget, Timing
+from mivol.bench.harness.timing import Budget, Timing
+from mivol.bench.studies import ladder
+from mivol.bench.studies.ladder import BENCH, QUICK, RUNGS, climb
 
 TINY = replace(QUICK, side=4, rounds=2, budget=Budget(spp=2), levels=(1, 2))
 

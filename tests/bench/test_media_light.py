@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mivol.bench.media_light import BARS, BENCH, QUICK, media_scene, unseen
-from mivol.bench.timing import Budget
+from mivol.bench.harness.timing import Budget
+from mivol.bench.studies.media_light import BARS, BENCH, QUICK, media_scene, unseen
 
 TINY = replace(QUICK, most_pixels=6, rounds=2, budget=Budget(spp=2))
 

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from false_alarms import ALPHA, fresh, note
 
-from mivol.bench import agreement
-from mivol.bench import multiple_scattering as bench
-from mivol.bench.single_scattering import QUICK
-from mivol.bench.timing import Budget
+from mivol.bench.harness import agreement
+from mivol.bench.harness.timing import Budget
+from mivol.bench.studies import multiple_scattering as bench
+from mivol.bench.studies.single_scattering import QUICK
 
 TINY = replace(QUICK, rounds=6, most_pixels=8, budget=Budget(spp=64))
 

@@ -18,13 +18,13 @@ from false_alarms import assert_same_bounded_mean
 from oracle import tau_scale, tau_twin
 
 from mivol.bench.extinctions import TO_WORLD
-from mivol.bench.optical_depth import BENCH, PROMISES, QUESTIONS, QUICK, accuracy, cost
-from mivol.bench.optical_depth.accuracy import measure_accuracy, measure_image
-from mivol.bench.optical_depth.cost import gradient_step, measure_grids, measure_memory, measure_reverse, measure_walk
-from mivol.bench.optical_depth.peers import by_tracking, by_volpath, delta, measure_peers, ratio
-from mivol.bench.optical_depth.twin import exact_tau
-from mivol.bench.optical_depth.work import Work, camera_rays, rays_across, shuffled
-from mivol.bench.timing import Timing
+from mivol.bench.harness.timing import Timing
+from mivol.bench.studies.optical_depth import BENCH, PROMISES, QUESTIONS, QUICK, accuracy, cost
+from mivol.bench.studies.optical_depth.accuracy import measure_accuracy, measure_image
+from mivol.bench.studies.optical_depth.cost import gradient_step, measure_grids, measure_memory, measure_reverse, measure_walk
+from mivol.bench.studies.optical_depth.peers import by_tracking, by_volpath, delta, measure_peers, ratio
+from mivol.bench.studies.optical_depth.twin import exact_tau
+from mivol.bench.studies.optical_depth.work import Work, camera_rays, rays_across, shuffled
 from mivol.report.figures import SERIES
 
 METHODS = ("mivol", "volpath", "ratio tracking", "delta tracking", "marching", "drjit.dda.integrate")

@@ -13,8 +13,8 @@ import pytest
 from bench_figures import drawn, kept
 from report.looks import assert_recorded
 
-from mivol.bench import points
-from mivol.bench.timing import Timing
+from mivol.bench.harness.timing import Timing
+from mivol.bench.studies import points
 
 
 def test_rates_are_scaled_round_by_round() -> None:
@@ -38,8 +38,13 @@ def test_promises() -> None:
     }
     judged = [(bar["value"], bar["bar"], bar["met"]) for name, a in answers.items() for bar in points.compare(name, a)]
     assert judged == [
-        (1.5, 1.7, False), (1.5, 1.3, True), (39, 40, False), (0.2, 0.14, True),
-        (2.1, 2, False), (34.1, 34, True), (33.9, 34, False),
+        (1.5, 1.7, False),
+        (1.5, 1.3, True),
+        (39, 40, False),
+        (0.2, 0.14, True),
+        (2.1, 2, False),
+        (34.1, 34, True),
+        (33.9, 34, False),
     ]
     assert points.compare("clouds", {}) == []
 
@@ -95,7 +100,7 @@ def test_the_camera_stands_before_the_cloud(up: float) -> None:
 
 
 class Asked:
-    """In the place of :func:`mivol.bench.timing.race`: remembers who runs, and returns made-up paces."""
+    """In the place of :func:`mivol.bench.harness.timing.race`: remembers who runs, and returns made-up paces."""
 
     def __init__(self, *timings: dict[str, Timing]) -> None:
         self.timings, self.heard = list(timings), []

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from mivol.bench import bars, depth, gradients, optical_depth, radiance_field
-from mivol.bench.gradients.size import CONTESTS, OURS
-from mivol.bench.questions import Bench
+from mivol.bench.harness import bars
+from mivol.bench.harness.study import Bench
+from mivol.bench.studies import depth, gradients, optical_depth, radiance_field
+from mivol.bench.studies.gradients.size import CONTESTS, OURS
 
 
 def judged(bench: Bench, question: str, answer: dict) -> list[tuple]:
@@ -43,8 +44,12 @@ RADIANCE_FIELD = {
             "wires, fine": {"psnr": 20.0},
         },
         [
-            (31, "at least", 31.3, False), (300, "at most", 300, True), (1.6, "at most", 1.5, False),
-            (32, "at least", 32, True), (1201, "at most", 1200, False), (3, "at most", 16, True),
+            (31, "at least", 31.3, False),
+            (300, "at most", 300, True),
+            (1.6, "at most", 1.5, False),
+            (32, "at least", 32, True),
+            (1201, "at most", 1200, False),
+            (3, "at most", 16, True),
         ],
     ),
     "priors": ({}, []),

@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mivol.bench.bars import AT_LEAST, judge, judge_agreement
-from mivol.bench.figures import drawn
-from mivol.bench.questions import Bench, without_arrays
+from mivol.bench.harness.bars import AT_LEAST, judge, judge_agreement
+from mivol.bench.harness.figures import drawn
+from mivol.bench.harness.study import Bench, without_arrays
 from mivol.errors import MivolError
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -117,11 +117,11 @@ def test_arrays_are_for_the_figure() -> None:
 @pytest.mark.parametrize("script", BENCHES)
 def test_scripts_only_call_their_module(script: str, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch) -> None:
     """The script imports main and ends with what it returns; ``--help`` prints what the module says of itself."""
-    module = __import__(f"mivol.bench.{BENCHES[script]}", fromlist=["main"])
+    module = __import__(f"mivol.bench.studies.{BENCHES[script]}", fromlist=["main"])
     text = (ROOT / "scripts" / f"{script}.py").read_text()
     assert text.startswith(f'#!/usr/bin/env python3\n"""{module.__doc__.splitlines()[0]}')
     assert text.endswith(
-        f'import sys\n\nfrom mivol.bench.{BENCHES[script]} import main\n\nif __name__ == "__main__":\n    sys.exit(main())\n'
+        f'import sys\n\nfrom mivol.bench.studies.{BENCHES[script]} import main\n\nif __name__ == "__main__":\n    sys.exit(main())\n'
     )
     monkeypatch.setattr(sys, "argv", [f"scripts/{script}.py"])
     with pytest.raises(SystemExit) as ended:

@@ -13,13 +13,13 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mivol.bench.radiance_field import BENCH, QUICK, fields, fits, photographs
-from mivol.bench.radiance_field.fields import FIELDS, centred
-from mivol.bench.radiance_field.fits import EVERY, follow, held_out_psnr, our_fit, peer_fit
-from mivol.bench.radiance_field.peer import Peer
-from mivol.bench.radiance_field.size import PhotoFit
-from mivol.bench.radiance_field.steps import ask_memory, our_step, peer_of, peer_step, tasks
-from mivol.bench.radiance_field.views import BOX, between, photographed, rays_of, rays_through, ring, tiled
+from mivol.bench.studies.radiance_field import BENCH, QUICK, fields, fits, photographs
+from mivol.bench.studies.radiance_field.fields import FIELDS, centred
+from mivol.bench.studies.radiance_field.fits import EVERY, follow, held_out_psnr, our_fit, peer_fit
+from mivol.bench.studies.radiance_field.peer import Peer
+from mivol.bench.studies.radiance_field.size import PhotoFit
+from mivol.bench.studies.radiance_field.steps import ask_memory, our_step, peer_of, peer_step, tasks
+from mivol.bench.studies.radiance_field.views import BOX, between, photographed, rays_of, rays_through, ring, tiled
 from mivol.fields.spherical import SphericalGrid
 from mivol.photos import Camera, Photo, intrinsics
 from mivol.transport.line_integrals.radiance_field import cells_of, model_of, render

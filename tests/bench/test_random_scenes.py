@@ -13,11 +13,12 @@ from bench_figures import drawn
 from false_alarms import ALPHA, note
 from scene_numbers import add_up
 
-from mivol.bench import agreement, random_scenes
-from mivol.bench.agreement import mean_of_rounds
-from mivol.bench.random_scenes import BENCH, QUICK, hard, trials
-from mivol.bench.random_scenes.generate import EMITTERS, RandomScene, draw_scene
-from mivol.bench.random_scenes.trials import try_scene, try_scenes
+from mivol.bench.harness import agreement
+from mivol.bench.harness.agreement import mean_of_rounds
+from mivol.bench.studies import random_scenes
+from mivol.bench.studies.random_scenes import BENCH, QUICK, hard, trials
+from mivol.bench.studies.random_scenes.generate import EMITTERS, RandomScene, draw_scene
+from mivol.bench.studies.random_scenes.trials import try_scene, try_scenes
 from mivol.errors import MivolError
 
 RECORDED = Path(__file__).with_suffix(".json")

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from bench_figures import drawn
 
-from mivol.bench import representations
-from mivol.bench.radiance_field import photographs
-from mivol.bench.representations import BENCH, QUICK
+from mivol.bench.studies import representations
+from mivol.bench.studies.radiance_field import photographs
+from mivol.bench.studies.representations import BENCH, QUICK
 
 
 def test_the_chair_is_left_out_where_it_is_not(

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from scene_numbers import add_up
 
-from mivol.bench import multiple_scattering, single_scattering
 from mivol.bench.extinctions import Extinction
-from mivol.bench.gradients.size import CONTESTS, TABLES
-from mivol.bench.ladder import RUNGS
-from mivol.bench.random_scenes import hard
 from mivol.bench.scenes import box_scene, of_depth, point_light, sun_and_sky
+from mivol.bench.studies import multiple_scattering, single_scattering
+from mivol.bench.studies.gradients.size import CONTESTS, TABLES
+from mivol.bench.studies.ladder import RUNGS
+from mivol.bench.studies.random_scenes import hard
 
 
 def test_the_box_holds_its_grid(variant_rgb: str) -> None:

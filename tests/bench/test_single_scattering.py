@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 from false_alarms import ALPHA, fresh, note
 
-from mivol.bench import agreement
-from mivol.bench import single_scattering as bench
-from mivol.bench.agreement import compare_means
+from mivol.bench.harness import agreement
+from mivol.bench.harness.agreement import compare_means
+from mivol.bench.harness.timing import Budget, Timing
 from mivol.bench.scenes import box_scene, milk_in_a_glass, of_depth
-from mivol.bench.timing import Budget, Timing
+from mivol.bench.studies import single_scattering as bench
 from mivol.validate.statistics import Estimate
 
 TINY = replace(bench.QUICK, rounds=6, most_pixels=8, budget=Budget(spp=64))

@@ -13,19 +13,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mivol.bench import agreement, single_scattering, still_life, tomography
-from mivol.bench.depth import BESIDE_ALBEDOS, CUBE_DEPTH, SEED, TAUS, UNIT
 from mivol.bench.extinctions import TUTORIAL_SCALE
-from mivol.bench.gradients.size import ALBEDO, CONTESTS, TUTORIALS
-from mivol.bench.gradients.subject import SEEDS
-from mivol.bench.radiance_field import STEP_BARS
-from mivol.bench.radiance_field.fits import EVERY
-from mivol.bench.radiance_field.peer import LEARNING_RATE
-from mivol.bench.radiance_field.size import FULL as PHOTOGRAPHS
-from mivol.bench.radiance_field.size import QUICK as QUICK_PHOTOGRAPHS
-from mivol.bench.radiance_field.size import STOP
-from mivol.bench.storage import DEGREES, MODEL, SIZES
-from mivol.bench.timing import Budget
+from mivol.bench.harness import agreement
+from mivol.bench.harness.timing import Budget
+from mivol.bench.studies import single_scattering, still_life, tomography
+from mivol.bench.studies.depth import BESIDE_ALBEDOS, CUBE_DEPTH, SEED, TAUS, UNIT
+from mivol.bench.studies.gradients.size import ALBEDO, CONTESTS, TUTORIALS
+from mivol.bench.studies.gradients.subject import SEEDS
+from mivol.bench.studies.radiance_field import STEP_BARS
+from mivol.bench.studies.radiance_field.fits import EVERY
+from mivol.bench.studies.radiance_field.peer import LEARNING_RATE
+from mivol.bench.studies.radiance_field.size import FULL as PHOTOGRAPHS
+from mivol.bench.studies.radiance_field.size import QUICK as QUICK_PHOTOGRAPHS
+from mivol.bench.studies.radiance_field.size import STOP
+from mivol.bench.studies.storage import DEGREES, MODEL, SIZES
 
 FULL = {
     "radiance_field": {
@@ -101,7 +102,7 @@ QUICK = {
 
 @pytest.mark.parametrize("name", FULL)
 def test_sizes_are_those_of_the_published_figures(name: str) -> None:
-    bench = importlib.import_module(f"mivol.bench.{name}").BENCH
+    bench = importlib.import_module(f"mivol.bench.studies.{name}").BENCH
     assert asdict(bench.full) == {"name": "full", **FULL[name]}
     assert asdict(bench.quick) == {"name": "quick", **FULL[name], **QUICK[name]}
 

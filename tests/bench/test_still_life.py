@@ -11,7 +11,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mivol.bench import still_life as bench
+from mivol.bench.studies import still_life as bench
 from mivol.files.mesh import write_mesh
 from mivol.photos import load_photos, project
 from scenes import refused

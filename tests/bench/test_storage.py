@@ -12,7 +12,7 @@ import drjit as dr
 import numpy as np
 import pytest
 
-from mivol.bench import storage
+from mivol.bench.studies import storage
 from mivol.fields.spherical import SphericalGrid
 from mivol.fields.spherical_files import save_field
 from mivol.transport.line_integrals.radiance_field import cells_of

@@ -10,8 +10,9 @@ from types import SimpleNamespace
 import pytest
 from tiny_experiment import refused, run
 
-from mivol.bench import studies, tomography
-from mivol.bench.questions import Expected
+from mivol.bench.harness import catalogue as studies
+from mivol.bench.harness.study import Expected
+from mivol.bench.studies import tomography
 from mivol.errors import MivolError
 
 

@@ -9,8 +9,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mivol.bench import timing
-from mivol.bench.timing import Budget, Stopwatch, Timing, race, ratio_of
+from mivol.bench.harness import timing
+from mivol.bench.harness.timing import Budget, Stopwatch, Timing, race, ratio_of
 
 
 def test_contestants_take_turns(variant_rgb: str) -> None:

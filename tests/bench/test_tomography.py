@@ -10,7 +10,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mivol.bench import tomography as bench
+from mivol.bench.studies import tomography as bench
 from mivol.files import write_volume
 from mivol.tomography.geometry import VoxelGrid
 from mivol.tomography.phantoms import shepp_logan

@@ -6,8 +6,8 @@ from itertools import islice
 
 import pytest
 
-from mivol.bench import tomography, tomography_parts
-from mivol.bench.tomography_peers import default, make_slice
+from mivol.bench.studies import tomography, tomography_parts
+from mivol.bench.studies.tomography_peers import default, make_slice
 
 
 @pytest.mark.slow

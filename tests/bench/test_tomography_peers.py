@@ -11,7 +11,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from mivol.bench import tomography_peers as peers
+from mivol.bench.studies import tomography_peers as peers
 from mivol.tomography.geometry import ParallelBeam, VoxelGrid
 from mivol.tomography.phantoms import random_ellipsoids, shepp_logan
 

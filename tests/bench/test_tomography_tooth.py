@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mivol.bench.tomography_tooth import MeasuredSlice, centred, slice_of_the_tooth
+from mivol.bench.studies.tomography_tooth import MeasuredSlice, centred, slice_of_the_tooth
 from mivol.tomography.filtered import filtered_backprojection
 from mivol.tomography.geometry import ParallelBeam, VoxelGrid
 from mivol.tomography.projector import Projector

@@ -7,7 +7,7 @@ import json
 import numpy as np
 import pytest
 
-from mivol.bench import tomography, tomography_volume
+from mivol.bench.studies import tomography, tomography_volume
 
 
 def test_both_beams_are_measured(monkeypatch: pytest.MonkeyPatch, variant_rgb: str, capsys: pytest.CaptureFixture) -> None:

@@ -16,10 +16,10 @@ from scattering_gradients import BATCHES, DENSITIES, GRID, assert_gradient, grad
 from scattering_scenes import PLACE, aimed, close_up, mivol, pencils, point, rough_grid, smoke, sun
 
 import scenes
-from mivol.bench.gradients.size import Light
-from mivol.bench.gradients.subject import Subject
-from mivol.bench.gradients.twin import Twin
 from mivol.bench.scenes import box_scene, constant_light
+from mivol.bench.studies.gradients.size import Light
+from mivol.bench.studies.gradients.subject import Subject
+from mivol.bench.studies.gradients.twin import Twin
 from mivol.scene import plan
 from mivol.transport.estimators.flight_derivatives import Probe, Probes
 from mivol.transport.estimators.segment import FlightPoint, PathSegment

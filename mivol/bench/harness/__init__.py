@@ -1,0 +1,1 @@
+"""What all studies share: contestants in rounds, budgets, bars, the command line, JSON and figures."""
