@@ -121,7 +121,8 @@ def test_scripts_only_call_their_module(script: str, capsys: pytest.CaptureFixtu
     text = (ROOT / "scripts" / f"{script}.py").read_text()
     assert text.startswith(f'#!/usr/bin/env python3\n"""{module.__doc__.splitlines()[0]}')
     assert text.endswith(
-        f'import sys\n\nfrom mivol.bench.studies.{BENCHES[script]} import main\n\nif __name__ == "__main__":\n    sys.exit(main())\n'
+        f'import sys\n\nfrom mivol.bench.studies.{BENCHES[script]} import main\n\n'
+        'if __name__ == "__main__":\n    sys.exit(main())\n'
     )
     monkeypatch.setattr(sys, "argv", [f"scripts/{script}.py"])
     with pytest.raises(SystemExit) as ended:

@@ -2,8 +2,8 @@
 
     scripts/bench_tomography.py --only parts     half a minute on 2 cores
 
-Slices, projections and the error are those of :mod:`mivol.bench.studies.tomography_peers`; two more kinds of data show what fewer
-quanta change. Every row is pcg on voxels at or above 0, after 20 iterations.
+Slices, projections and the error are those of :mod:`mivol.bench.studies.tomography_peers`; two more kinds of data show what
+fewer quanta change. Every row is pcg on voxels at or above 0, after 20 iterations.
 """
 
 from __future__ import annotations

@@ -45,8 +45,8 @@ deep tutorial: the tutorial as published, at depth 6.
 deep estimators: as estimators, at depth 6 and unlimited; also with a small emitter inside, and in a box of glass. Finite
 differences of pictures in which paths scatter often would take days: a collision more or less changes a path, and that noise is
 divided by the step. So the truth is a path tracer of the bench's own, which carries the derivative forward and shares no code
-with the integrators (mivol.bench.studies.gradients.twin). The sun is alone and stands before the camera, the emitter inside is hidden
-from it: elsewhere what scatters in and what is taken away nearly cancel. In glass, unlimited, the half that is empty
+with the integrators (mivol.bench.studies.gradients.twin). The sun is alone and stands before the camera, the emitter inside is
+hidden from it: elsewhere what scatters in and what is taken away nearly cancel. In glass, unlimited, the half that is empty
 elsewhere is thin: no mean is known where caught light runs along emptiness.
 
 Prints JSON; writes bench_gradients.json and bench_gradients.png.
