@@ -6,8 +6,8 @@
     scripts/bench_radiance_field.py --quick             # under two minutes, small sizes: its times mean nothing
 
 The peer is :mod:`mivol.bench.studies.radiance_field.peer`: uniform steps over textures. Fields: a thin shell, a fog that fills
-the box, and a fitted scene (the chair of NeRF's synthetic scenes from MIVOL_DATA, fitted here for a minute; without data, views of
-a made-up object, and the JSON says so). All are 128^3 nodes of harmonics of degree 2 in [-1, 1]^3.
+the box, and a fitted scene (the chair of NeRF's synthetic scenes from MIVOL_DATA, fitted here for a minute; without data, views
+of a made-up object, and the JSON says so). All are 128^3 nodes of harmonics of degree 2 in [-1, 1]^3.
 
 step: forward and backward, the same 65,536 rays for both, in turns; ratios of processor time (which other work on the machine
 moves least), with the clock's beside them. camera: the pixels of one view; pixels: drawn at random from 8 views, as the
