@@ -8,7 +8,7 @@ trials: scenes drawn by a seed (:mod:`mivol.bench.studies.random_scenes.generate
 in boxes and balls, one, two, or one inside the other, behind boundaries that let light pass, bend it or blur it; phase
 functions, emitters, surfaces; ``max_depth`` from 2 to unlimited. Each is rendered 16 times by mivol and by volpath (an rgb
 extinction one channel at a time), 12 x 12 pixels, 64 samples; the means of each quarter and colour are compared by Student's
-t, with a chance of 1 in 1000 that any of all comparisons fails where the means are equal. Refusals are counted by their sentence.
+t, with a chance of 1 in 1000 that any of all comparisons fails where the means are equal. Refusals are counted by sentence.
 
 hard: a box of an optical depth of 64, voxels of 2000, vacuum, colours at ratios of 10,000, nearly straight phase functions,
 glass, an emitter inside: 1e8 paths and more of unlimited depth, one a pixel, none of which may be negative, infinite or NaN.
