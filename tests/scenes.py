@@ -231,7 +231,7 @@ def media_of(scene: mi.Scene) -> object:
     from mivol.scene.needs import find_needs
     from mivol.scene.plan import make_plan
     from mivol.scene.survey import survey_scene
-    from mivol.transport.path.settings import Settings
+    from mivol.transport.path.estimators import Settings
 
     survey = survey_scene(scene)
     needs = find_needs(scene, scene.sensors()[0], survey)

@@ -50,7 +50,7 @@ def untyped(function: Function) -> list[str]:
 
 @cache
 def said_in(room: Path) -> set[str]:
-    """Names of the methods that some class in a folder documents: a protocol says it once for all that follow it."""
+    """Names of the methods that some class in a folder documents: a protocol says it once for its classes, in inner folders too."""
     trees = [tree_of(path) for path in room.glob("*.py")]
     classes = [node for tree in trees for node in tree.body if isinstance(node, ast.ClassDef)]
     return {n.name for node in classes for n in node.body if isinstance(n, Function) and ast.get_docstring(n)}
@@ -59,7 +59,7 @@ def said_in(room: Path) -> set[str]:
 def unsaid(path: Path) -> list[str]:
     """What a module leaves without a docstring or a type. Methods of the Mitsuba shells are excused: their names and arguments
     are Mitsuba's."""
-    said = said_in(path.parent)
+    said = set().union(*(said_in(folder) for folder in path.parents if PACKAGE in folder.parents))
     tree = tree_of(path)
     shell = path.parent.name == "plugins"
     faults = [] if ast.get_docstring(tree) or not tree.body else ["no docstring"]

@@ -15,7 +15,7 @@ from mivol.experiments.truth import holding
 from mivol.report.record import PlanLine
 from mivol.scene.depth_preview import measure_depths
 from mivol.scene.load import LoadedScene
-from mivol.transport.path.settings import Settings
+from mivol.transport.path.estimators import Settings
 
 __all__ = ["settle_depth"]
 

@@ -35,8 +35,7 @@ from mivol.scene.load import LoadedScene
 from mivol.scene.needs import find_needs
 from mivol.scene.plan import Plan, make_plan
 from mivol.scene.survey import survey_scene
-from mivol.transport.path.estimators import SEGMENT_ESTIMATORS
-from mivol.transport.path.settings import Settings
+from mivol.transport.path.estimators import SEGMENT_ESTIMATORS, Settings
 from mivol.validate.metrics import nrmse, psnr
 
 

@@ -8,7 +8,7 @@ import mitsuba as mi
 
 from mivol.errors import MivolError
 from mivol.scene.session import Session
-from mivol.transport.path.settings import Settings
+from mivol.transport.path.estimators import Settings
 
 
 class MivolIntegrator(mi.ad.integrators.common.ADIntegrator):

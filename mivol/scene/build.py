@@ -10,14 +10,15 @@ from mivol.scene.media_light import find_emitting_boxes
 from mivol.scene.plan import Plan
 from mivol.scene.readings import read_block_ranges, read_coarse, read_empty_distances
 from mivol.scene.survey import SceneSurvey
-from mivol.transport.estimators.direct_lighting import DirectLighting
-from mivol.transport.estimators.emission_sampling import EmissionSampling
-from mivol.transport.estimators.emission_table import EmissionTable
-from mivol.transport.estimators.transmittance_grid import build_transmittance_grid
-from mivol.transport.estimators.visibility_cache import VisibilityCache, build_visibility_cache
+from mivol.transport.estimators.lighting.direct_lighting import DirectLighting
+from mivol.transport.estimators.lighting.emission_sampling import EmissionSampling, EmissionTable
+from mivol.transport.estimators.single_scattering.shadow_tables import (
+    VisibilityCache,
+    build_transmittance_grid,
+    build_visibility_cache,
+)
 from mivol.transport.media.scene_media import SceneMedia
-from mivol.transport.path.estimators import SEGMENT_ESTIMATORS, Estimators, SegmentChoice
-from mivol.transport.path.settings import Settings
+from mivol.transport.path.estimators import SEGMENT_ESTIMATORS, Estimators, SegmentChoice, Settings
 
 __all__ = ["build_estimators", "build_media"]
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from mivol.scene.facts import MediumFacts, Needs
 from mivol.transport.media.body import flight_parts
-from mivol.transport.path.settings import Settings
+from mivol.transport.path.estimators import Settings
 
 __all__ = [
     "SKIP_BELOW",

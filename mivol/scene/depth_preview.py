@@ -25,8 +25,8 @@ from mivol.scene.build import build_estimators
 from mivol.scene.needs import find_needs
 from mivol.scene.plan import make_plan
 from mivol.scene.survey import SceneSurvey, survey_scene
-from mivol.transport.path.scores import Primal
-from mivol.transport.path.settings import Settings
+from mivol.transport.estimators.scores import Primal
+from mivol.transport.path.estimators import Settings
 from mivol.transport.path.walk import walk_path
 
 __all__ = ["DEPTHS", "NOISE", "DepthAnswer", "LeftOut", "leaves_out", "measure_depths"]

@@ -25,8 +25,8 @@ from mivol.scene.media_light import COST
 from mivol.scene.plan import make_plan
 from mivol.scene.recording import without_collections
 from mivol.scene.survey import SceneSurvey
-from mivol.transport.path.scores import Primal
-from mivol.transport.path.settings import Settings
+from mivol.transport.estimators.scores import Primal
+from mivol.transport.path.estimators import Settings
 from mivol.transport.path.walk import walk_path
 
 __all__ = ["gain_of_draws", "measure_draws"]

@@ -25,12 +25,14 @@ from mivol.scene.nesting import bounds
 from mivol.scene.plan import Plan, make_plan
 from mivol.scene.sensors import check_film, find_sensor
 from mivol.scene.survey import survey_scene
-from mivol.transport.estimators.emitters import SceneEmitters
-from mivol.transport.estimators.transmittance_grid import build_transmittance_grid, measure_transmittance_bias
+from mivol.transport.estimators.lighting.emitters import SceneEmitters
+from mivol.transport.estimators.single_scattering.shadow_tables import (
+    build_transmittance_grid,
+    measure_transmittance_bias,
+)
 from mivol.transport.media.box import Box
 from mivol.transport.media.read_medium import traverse_medium
-from mivol.transport.path.estimators import SEGMENT_ESTIMATORS
-from mivol.transport.path.settings import Settings
+from mivol.transport.path.estimators import SEGMENT_ESTIMATORS, Settings
 
 __all__ = ["Explanation", "examine", "settings_of"]
 

@@ -92,7 +92,7 @@ class MediaLight:
     """What was read of the light that media emit.
 
     Attributes:
-        density, cumulative: of :class:`mivol.transport.estimators.emission_table.EmissionTable`.
+        density, cumulative: of :class:`mivol.transport.estimators.lighting.emission_sampling.EmissionTable`.
         gain: how much sooner draws of it reach an error than chance does [1], as predicted.
     """
 

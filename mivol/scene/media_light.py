@@ -1,10 +1,10 @@
 r"""Is light of media better drawn, or met by chance?  Asked of a coarse table of what they emit, before anything is rendered.
 
 Light that a medium emits reaches what scatters it in two ways: the path happens to pass through the medium, or a point of it is
-drawn (:mod:`mivol.transport.estimators.emission_sampling`). A fire over a floor is seldom met, and draws pay. In a room that
-glows evenly nearly every path meets the same light, and draws add noise and time. So both are compared: at points that the
-camera sees, directions are drawn either way, and the light along them is summed from the table. With the variances V over the
-directions of a point, the gain is
+drawn (:mod:`mivol.transport.estimators.lighting.emission_sampling`). A fire over a floor is seldom met, and draws pay. In a
+room that glows evenly nearly every path meets the same light, and draws add noise and time. So both are compared: at points
+that the camera sees, directions are drawn either way, and the light along them is summed from the table. With the variances V
+over the directions of a point, the gain is
 
 .. math:: g = \frac{\sum_x V_{chance}(x)}{c\,\sum_x V_{drawn}(x)}
 
@@ -24,8 +24,8 @@ from mivol.scene.facts import MediaLight, Needs
 from mivol.scene.nesting import bounds
 from mivol.scene.recording import without_collections
 from mivol.scene.survey import AROUND, SceneSurvey, is_instance
-from mivol.transport.estimators.emission_table import EmissionTable, EmittingBox, tabulate_emission
-from mivol.transport.estimators.multiple_importance import power_heuristic
+from mivol.transport.estimators.lighting.direct_lighting import power_heuristic
+from mivol.transport.estimators.lighting.emission_sampling import EmissionTable, EmittingBox, tabulate_emission
 from mivol.transport.media.body import Body
 from mivol.transport.media.box import Box
 from mivol.transport.media.even_point import draw_even_point

@@ -40,8 +40,7 @@ from mivol.scene.refusals import (
     refuse_scattering,
 )
 from mivol.transport.media.grid_integral import PACKED_LIMIT, gradient_bytes
-from mivol.transport.path.estimators import SegmentQuestion, choose_segment_estimator
-from mivol.transport.path.settings import Settings
+from mivol.transport.path.estimators import SegmentQuestion, Settings, choose_segment_estimator
 
 __all__ = ["Plan", "make_plan"]
 

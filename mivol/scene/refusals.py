@@ -13,7 +13,7 @@ from mivol.scene.facts import Needs
 from mivol.transport.line_integrals.aovs import AOVS
 from mivol.transport.media.medium_view import MediumView
 from mivol.transport.media.summed_extinction import share_cells
-from mivol.transport.path.settings import Settings
+from mivol.transport.path.estimators import Settings
 
 __all__ = [
     "check_aovs",

@@ -21,13 +21,11 @@ from mivol.scene.recording import without_collections
 from mivol.scene.refusals import check_aovs
 from mivol.scene.sensors import check_film, find_sensor
 from mivol.scene.survey import SceneSurvey, survey_scene
+from mivol.transport.estimators.scores import Primal, Replay, Tangent
 from mivol.transport.line_integrals.aovs import integrate_aovs, jvp_aovs, vjp_aovs
-from mivol.transport.path.branches import replay_branches
-from mivol.transport.path.estimators import Estimators
+from mivol.transport.path.derivatives import prepare_derivatives, replay_branches
+from mivol.transport.path.estimators import Estimators, Settings
 from mivol.transport.path.film import CameraRays, RenderSamples, adjoint_rays, record
-from mivol.transport.path.level import prepare_derivatives
-from mivol.transport.path.scores import Primal, Replay, Tangent
-from mivol.transport.path.settings import Settings
 from mivol.transport.path.successive import paths_a_lane, walk_successively
 from mivol.transport.path.walk import is_straight, walk_path
 

@@ -11,7 +11,7 @@ import mitsuba as mi
 from mivol.errors import MivolError
 from mivol.scene.facts import Boundary
 from mivol.scene.nesting import OrientedBox, box_around, extent, nesting_fault
-from mivol.transport.estimators.emitters import UNIFORM
+from mivol.transport.estimators.lighting.emitters import UNIFORM
 from mivol.transport.media.box import Box, box_of_cube
 from mivol.transport.media.read_medium import nested_field
 

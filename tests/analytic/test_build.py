@@ -12,7 +12,7 @@ from mivol.scene.build import build_media
 from mivol.scene.needs import find_needs
 from mivol.scene.plan import make_plan
 from mivol.scene.survey import survey_scene
-from mivol.transport.path.settings import Settings
+from mivol.transport.path.estimators import Settings
 from scenes import sky
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")

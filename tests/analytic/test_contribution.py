@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mivol.transport.estimators.contribution import TrackedFactor, TrackedTerm
+from mivol.transport.estimators.scores import TrackedFactor, TrackedTerm
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
 

@@ -9,8 +9,12 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mivol.transport.estimators.control_sweep import ControlSweep, Probe, Tracks
-from mivol.transport.estimators.grid_control import GridControl
+from mivol.transport.estimators.single_scattering.control_variates import (
+    ControlSweep,
+    GridControl,
+    Probe,
+    Tracks,
+)
 from mivol.transport.media.ray_intervals import RaySegment
 from mivol.transport.media.scene_media import SceneMedia
 from scenes import as_float32, box_of, camera, grid_volume, media_of, medium

@@ -15,7 +15,7 @@ from false_alarms import assert_rate, assert_same_mean, fresh
 from oracle import tau_twin, to_lattice, trilinear
 from scattering_scenes import PLACE, rough_grid
 
-from mivol.transport.estimators.delta_tracking import collide_in_blocks, collide_in_bounded
+from mivol.transport.estimators.flights.tracking import collide_in_blocks, collide_in_bounded
 from mivol.transport.media.bounded_extinction import BoundedExtinction
 from mivol.transport.media.extinction import RayInterval
 from mivol.transport.media.grid_extinction import GridExtinction

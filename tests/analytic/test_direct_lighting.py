@@ -7,9 +7,9 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mivol.transport.estimators.direct_lighting import DirectLight, DirectLighting, DistantAim
-from mivol.transport.estimators.event_samples import EventSamples
-from mivol.transport.estimators.vertex import MediumVertex, SurfaceVertex
+from mivol.transport.estimators.lighting.direct_lighting import DirectLight, DirectLighting, DistantAim
+from mivol.transport.estimators.lighting.emitters import EventSamples
+from mivol.transport.estimators.lighting.vertex import MediumVertex, SurfaceVertex
 from mivol.transport.media.coefficients import medium_interaction
 from scenes import box_of, camera, centred, media_of, medium, sky
 

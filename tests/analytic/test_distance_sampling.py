@@ -12,10 +12,9 @@ from mivol.scene.build import build_media
 from mivol.scene.needs import find_needs
 from mivol.scene.plan import make_plan
 from mivol.scene.survey import survey_scene
-from mivol.transport.estimators.distance_reservoir import Candidate, DistanceProposal
-from mivol.transport.estimators.distance_sampling import sample_distance
-from mivol.transport.estimators.emitters import ChosenEmitter
-from mivol.transport.path.settings import Settings
+from mivol.transport.estimators.lighting.emitters import ChosenEmitter
+from mivol.transport.estimators.single_scattering.distance_sampling import Candidate, DistanceProposal, sample_distance
+from mivol.transport.path.estimators import Settings
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
 

@@ -12,7 +12,7 @@ from scattering_scenes import close_up
 
 from mivol.scene.media_light import find_emitting_boxes
 from mivol.scene.needs import find_needs
-from mivol.transport.estimators.emission_table import CELLS, EVEN, EmissionTable, tabulate_emission
+from mivol.transport.estimators.lighting.emission_sampling import CELLS, EVEN, EmissionTable, tabulate_emission
 from mivol.transport.media.body import Body
 from mivol.transport.media.scene_media import SceneMedia
 from mivol.validate.moments import Moments

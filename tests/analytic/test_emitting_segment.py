@@ -7,7 +7,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mivol.transport.estimators.segment import FORWARD, PICTURE, REVERSE, PathSegment
+from mivol.transport.estimators.scores import FORWARD, PICTURE, REVERSE
+from mivol.transport.estimators.segment import PathSegment
 from mivol.transport.line_integrals.emitting_segment import Emission
 from mivol.transport.media.scene_media import SceneMedia
 from scenes import box_of, camera, centred, media_of

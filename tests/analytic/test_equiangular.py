@@ -11,7 +11,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mivol.transport.estimators.equiangular import EquiangularSampler, equiangular_sampler
+from mivol.transport.estimators.lighting.emitters import EquiangularSampler, equiangular_sampler
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
 

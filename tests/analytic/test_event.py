@@ -7,8 +7,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from mivol.transport.estimators.lighting.vertex import EitherVertex, MediumVertex
 from mivol.transport.estimators.segment import Collision, SegmentEstimate
-from mivol.transport.estimators.vertex import EitherVertex, MediumVertex
 from mivol.transport.media.coefficients import medium_interaction
 from mivol.transport.media.ray_intervals import SegmentEnd
 from mivol.transport.media.scene_media import SceneMedia

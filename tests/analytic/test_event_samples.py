@@ -6,7 +6,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mivol.transport.estimators.event_samples import EventSamples
+from mivol.transport.estimators.lighting.emitters import EventSamples
 from mivol.transport.traversal.strata import Strata
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")

@@ -13,7 +13,7 @@ from scipy.special import logit
 from mivol.fields import gaussian_cells
 from mivol.fields.gaussians import GaussianField
 from mivol.points.gaussians import Gaussians
-from mivol.transport.estimators.gaussian_flight import collide_in_gaussians
+from mivol.transport.estimators.flights.regular_tracking import collide_in_gaussians
 from mivol.transport.media.extinction import RayInterval
 from mivol.transport.media.gaussian_extinction import GaussianExtinction
 from mivol.transport.traversal.random_numbers import seed_pcg32

@@ -12,9 +12,9 @@ from mivol.scene.build import build_estimators
 from mivol.scene.needs import find_needs
 from mivol.scene.plan import make_plan
 from mivol.scene.survey import survey_scene
-from mivol.transport.estimators.flight_derivatives import Level
-from mivol.transport.path.level import prepare_derivatives
-from mivol.transport.path.settings import Settings
+from mivol.transport.estimators.flights.flight_derivatives import Level
+from mivol.transport.path.derivatives import prepare_derivatives
+from mivol.transport.path.estimators import Settings
 from scenes import box_of, camera, medium, sky
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")

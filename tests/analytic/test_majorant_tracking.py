@@ -9,8 +9,7 @@ import pytest
 from bounded_ball import Ball
 from false_alarms import Estimate, assert_same_mean, fresh
 
-from mivol.transport.estimators.majorant_tracking import ratio_tracking
-from mivol.transport.estimators.ratio_tracking import LOOKUP_RATE
+from mivol.transport.estimators.flights.tracking import LOOKUP_RATE, ratio_tracking
 from mivol.transport.media.bounded_extinction import BoundedExtinction
 from mivol.transport.media.extinction import RayInterval
 from mivol.transport.traversal.random_numbers import seed_pcg32

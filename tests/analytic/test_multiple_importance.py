@@ -6,7 +6,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mivol.transport.estimators.multiple_importance import power_heuristic
+from mivol.transport.estimators.lighting.direct_lighting import power_heuristic
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
 

@@ -9,8 +9,14 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mivol.transport.estimators.distance_sampling import MediumEvent
-from mivol.transport.estimators.scattering import Scattering, at_event, medium_event_interaction, sigma_s_at, sigma_t_at
+from mivol.transport.estimators.single_scattering.distance_sampling import MediumEvent
+from mivol.transport.estimators.single_scattering.scattering_derivatives import (
+    Scattering,
+    at_event,
+    medium_event_interaction,
+    sigma_s_at,
+    sigma_t_at,
+)
 from mivol.transport.media.scene_media import SceneMedia
 from scenes import box_of, camera, centred, media_of, medium
 

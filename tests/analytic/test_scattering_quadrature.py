@@ -16,7 +16,7 @@ import oracle_scattering as twins
 import pytest
 from scattering_scenes import PLACE, aimed, close_up, fog, mivol, pencils, point, rough_grid, smoke, spot, sun
 
-from mivol.transport.estimators import scattering_quadrature as quadrature
+from mivol.transport.estimators.single_scattering import scattering_quadrature as quadrature
 from scenes import as_float32, box_of, centred, grid_volume, refused, sky
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")

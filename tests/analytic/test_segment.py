@@ -7,7 +7,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mivol.transport.estimators.segment import PICTURE, Absorption, PathSegment, SegmentLight, SegmentTransmittance
+from mivol.transport.estimators.scores import PICTURE
+from mivol.transport.estimators.segment import Absorption, PathSegment, SegmentLight, SegmentTransmittance
 from scenes import box_of, camera, centred, media_of, medium
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")

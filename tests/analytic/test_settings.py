@@ -7,7 +7,7 @@ import math
 import mitsuba as mi
 import pytest
 
-from mivol.transport.path.settings import Settings
+from mivol.transport.path.estimators import Settings
 
 
 @pytest.mark.parametrize(("depth", "scatterings"), [(-1, math.inf), (0, 0), (1, 0), (2, 1), (6, 5)])

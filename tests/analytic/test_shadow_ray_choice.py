@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mivol.transport.estimators.scattering_derivatives import _choose_shadow_ray
+from mivol.transport.estimators.single_scattering.scattering_derivatives import _choose_shadow_ray
 from mivol.transport.media.ray_intervals import RaySegment
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
@@ -30,9 +30,7 @@ def test_each_has_its_light_as_probability() -> None:
     )
     ray, value, on = _choose_shadow_ray(probe)
     assert np.array(ray.ray.o.x).tolist() == [1, 1, 2, 2] and np.array(ray.length).tolist() == [11, 11, 12, 12]
-    np.testing.assert_allclose(
-        np.array(value).T, [[2 / 3, 4 / 3, 2]] * 2 + [[1, 1, 2]] * 2, rtol=2.0**-21
-    )  # three roundings
+    np.testing.assert_allclose(np.array(value).T, [[2 / 3, 4 / 3, 2]] * 2 + [[1, 1, 2]] * 2, rtol=2.0**-21)  # three roundings
     assert np.array(on).tolist() == [True, True, True, False]
     dark = SimpleNamespace(chance=mi.Float([0.2, 0.8]), direct=[shadow_ray(x, [0, 0, 0], [True] * 2) for x in (1.0, 2.0)])
     _, value, on = _choose_shadow_ray(dark)

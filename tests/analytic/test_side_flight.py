@@ -15,9 +15,10 @@ import pytest
 from false_alarms import assert_same_mean, fresh
 from oracle_phase import gauss, hg
 
-from mivol.transport.estimators.direct_lighting import DirectLighting, DistantAim
-from mivol.transport.estimators.free_flight import FreeFlight
-from mivol.transport.estimators.segment import PICTURE, Collision
+from mivol.transport.estimators.flights.free_flight import FreeFlight
+from mivol.transport.estimators.lighting.direct_lighting import DirectLighting, DistantAim
+from mivol.transport.estimators.scores import PICTURE
+from mivol.transport.estimators.segment import Collision
 from mivol.transport.media.coefficients import medium_interaction
 from mivol.transport.path.estimators import Estimators
 from mivol.transport.path.side_flight import SideSamples, fly_aside, weigh_aim

@@ -13,12 +13,12 @@ from mivol.scene.build import build_estimators
 from mivol.scene.needs import find_needs
 from mivol.scene.plan import make_plan
 from mivol.scene.survey import survey_scene
-from mivol.transport.estimators.transmittance_grid import (
+from mivol.transport.estimators.single_scattering.shadow_tables import (
     TransmittanceGrid,
     build_transmittance_grid,
     measure_transmittance_bias,
 )
-from mivol.transport.path.settings import Settings
+from mivol.transport.path.estimators import Settings
 from mivol.transport.traversal.lattice import Lattice
 from scenes import centred
 

@@ -8,7 +8,7 @@ import pytest
 
 from mivol.scene import choices
 from mivol.scene.facts import MediumFacts
-from mivol.transport.path.settings import Settings
+from mivol.transport.path.estimators import Settings
 
 LIT = Settings(max_depth=2)
 GRID = ((10, 20, 30),)

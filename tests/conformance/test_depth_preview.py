@@ -8,7 +8,7 @@ import pytest
 
 from mivol.experiments.script import explain
 from mivol.scene.depth_preview import DEPTHS, DepthAnswer, LeftOut, leaves_out, measure_depths
-from mivol.transport.path.settings import Settings
+from mivol.transport.path.estimators import Settings
 from scenes import box_of, camera, centred, medium, sky
 
 PLACE = centred(2 * np.eye(3))

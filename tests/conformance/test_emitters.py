@@ -19,7 +19,7 @@ from volpath_scenes import (
     same,
 )
 
-from mivol.transport.estimators.emitters import SceneEmitters
+from mivol.transport.estimators.lighting.emitters import SceneEmitters
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
 
@@ -27,7 +27,8 @@ pytestmark = pytest.mark.usefixtures("variant_rgb")
 @pytest.mark.statistical
 @pytest.mark.parametrize(
     # Several have a constant sky, a point, a sun and an area among them.
-    "name", small.cases(EMITTERS, [name for name in EMITTERS if name not in ("envmap", "several")])
+    "name",
+    small.cases(EMITTERS, [name for name in EMITTERS if name not in ("envmap", "several")]),
 )
 def test_emitters(name):
     box, _ = smoke(rough_grid(1), name="hg", g=0.4)

@@ -13,8 +13,7 @@ from mivol.cite import citations
 from mivol.scene.needs import find_needs
 from mivol.scene.plan import make_plan
 from mivol.scene.survey import survey_scene
-from mivol.transport.path.estimators import SEGMENT_ESTIMATORS, SegmentQuestion, choose_segment_estimator
-from mivol.transport.path.settings import Settings
+from mivol.transport.path.estimators import SEGMENT_ESTIMATORS, SegmentQuestion, Settings, choose_segment_estimator
 from scenes import box_of, camera, centred, medium
 
 TURNS = ((1, False), (1, True), (2, False), (math.inf, False), (math.inf, True))

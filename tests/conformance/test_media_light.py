@@ -16,7 +16,7 @@ from mivol.scene.media_light import COST
 from mivol.scene.needs import find_needs
 from mivol.scene.plan import make_plan
 from mivol.scene.survey import survey_scene
-from mivol.transport.path.settings import Settings
+from mivol.transport.path.estimators import Settings
 from scenes import ball_of, box_of, centred, medium, refused, render, skip_recorded_grids_on_a_gpu, sky, tensor
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")

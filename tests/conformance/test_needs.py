@@ -16,7 +16,7 @@ from mivol.scene.needs import find_needs
 from mivol.scene.nesting import nesting_fault
 from mivol.scene.plan import make_plan
 from mivol.scene.survey import survey_scene
-from mivol.transport.path.settings import Settings
+from mivol.transport.path.estimators import Settings
 from scenes import ball_of, box_of, camera, film, grid_volume, medium, refused, sky
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")

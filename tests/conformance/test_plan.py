@@ -11,7 +11,7 @@ from mivol.errors import MivolError
 from mivol.scene import plan
 from mivol.scene.facts import MediumFacts
 from mivol.transport.media.grid_integral import PACKED_LIMIT, gradient_bytes
-from mivol.transport.path.settings import Settings
+from mivol.transport.path.estimators import Settings
 
 GIB = 2**30
 

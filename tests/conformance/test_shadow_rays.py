@@ -24,7 +24,7 @@ from volpath_scenes import (
     square,
 )
 
-from mivol.transport.estimators.shadow_rays import SURE_DEPTH, light_through
+from mivol.transport.estimators.lighting.shadow_rays import SURE_DEPTH, light_through
 from mivol.transport.traversal.random_numbers import seed_pcg32
 from scenes import box_of, grid_volume, media_of, medium
 

@@ -12,7 +12,7 @@ from scattering_scenes import close_up, mivol, rough_grid, smoke
 from mivol.scene import plan
 from mivol.scene.needs import find_needs
 from mivol.scene.survey import survey_scene
-from mivol.transport.path.settings import Settings
+from mivol.transport.path.estimators import Settings
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
 

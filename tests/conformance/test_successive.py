@@ -16,8 +16,8 @@ from mivol.scene.needs import find_needs
 from mivol.scene.plan import make_plan
 from mivol.scene.session import Session
 from mivol.transport.path import successive
+from mivol.transport.path.estimators import Settings
 from mivol.transport.path.film import RenderSamples, film_passes
-from mivol.transport.path.settings import Settings
 from mivol.transport.path.successive import paths_a_lane, walk_successively
 from scenes import box_of, medium, sky
 
@@ -48,7 +48,7 @@ def test_a_path_does_not_depend_on_the_others_of_its_lane(monkeypatch: pytest.Mo
 
     Walks in grids and the roulette of shadow rays draw numbers by their lane: the fog is even, and no shadow ray ends early.
     """
-    monkeypatch.setattr("mivol.transport.estimators.shadow_rays.SURE_DEPTH", 1e9)
+    monkeypatch.setattr("mivol.transport.estimators.lighting.shadow_rays.SURE_DEPTH", 1e9)
     scene = peaked(even=True)
     alone = radiance(scene, 1)
     assert len(np.unique(alone[0])) > 90  # of 192 paths most find the sun

@@ -29,7 +29,7 @@ from mivol.scene.cameras import Ring, rig_from
 from mivol.scene.parsing import parse_dict, parse_file
 from mivol.scene.photographs import PIXELS_LOST, sensor_of
 from mivol.scene.refusals import refuse_quadrature
-from mivol.transport.path.settings import Settings
+from mivol.transport.path.estimators import Settings
 from mivol.validate.images import judge
 from mivol.validate.reference_file import check_identity
 from mivol.validate.statistics import Estimate, batches_for, p_value
@@ -166,6 +166,7 @@ def test_rigs() -> None:
 
 def test_a_sensor_has_square_pixels() -> None:
     """Focal lengths may differ by what no pixel of the picture sees, and no more."""
+
     def camera(ratio: float) -> Camera:
         return Camera(np.array([[50.0 * ratio, 0, 20], [0, 50, 10], [0, 0, 1]]), (40, 20), np.eye(4), name="eye")
 

@@ -21,7 +21,7 @@ from mivol.bench.studies.gradients.size import Light
 from mivol.bench.studies.gradients.subject import Subject
 from mivol.bench.studies.gradients.twin import Twin
 from mivol.scene import plan
-from mivol.transport.estimators.flight_derivatives import Probe, Probes
+from mivol.transport.estimators.flights.flight_derivatives import Probe, Probes
 from mivol.transport.estimators.segment import FlightPoint, PathSegment
 from mivol.transport.media.even_point import EvenPoint
 from mivol.transport.traversal.fine_ray import FineRay
@@ -276,9 +276,7 @@ def test_of_side_flights_forward_is_the_transpose_of_reverse(name, whole_paths):
     v = np.random.default_rng(2).uniform(0.5, 1.5, np.shape(params[key])) if np.size(params[key]) > 3 else 1.0
     seed = fresh(5)
     there, back = _forward(scene, key, v, 16, seed, integrator), _backward(scene, key, w, 16, seed, integrator)
-    assert np.sum(there * w) == pytest.approx(
-        np.sum(back * v), abs=1e-4 * max(np.abs(there * w).sum(), np.abs(back * v).sum())
-    )
+    assert np.sum(there * w) == pytest.approx(np.sum(back * v), abs=1e-4 * max(np.abs(there * w).sum(), np.abs(back * v).sum()))
 
 
 def test_of_side_flights_light_is_linear_in_a_sky(whole_paths):

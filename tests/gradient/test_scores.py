@@ -202,8 +202,8 @@ def test_replay_counts_down_to_zero():
     from mivol.scene.build import build_estimators
     from mivol.scene.needs import find_needs
     from mivol.scene.survey import survey_scene
-    from mivol.transport.path.scores import Primal, Replay
-    from mivol.transport.path.settings import Settings
+    from mivol.transport.estimators.scores import Primal, Replay
+    from mivol.transport.path.estimators import Settings
     from mivol.transport.path.walk import walk_path
 
     scene = build()

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from false_alarms import Estimate, assert_same_mean, fresh
 
-from mivol.transport.estimators.direct_lighting import DirectLight
-from mivol.transport.estimators.shadow_reservoir import ShadowReservoir, ShadowTerm
+from mivol.transport.estimators.flights.flight_derivatives import ShadowReservoir, ShadowTerm
+from mivol.transport.estimators.lighting.direct_lighting import DirectLight
 from mivol.transport.media.ray_intervals import RaySegment
 from mivol.transport.traversal.fine_ray import FineRay
 from mivol.transport.traversal.random_numbers import draw_pcg32, seed_pcg32

@@ -12,9 +12,14 @@ from hard_scattering import BATCHES, holds_twin
 from scattering_scenes import PLACE, aimed, mivol, pencils, point, rough_grid, smoke, sun
 
 import scenes
-from mivol.transport.estimators.distance_reservoir import DistanceProposal, fill_reservoir, lit_length, start_reservoir
-from mivol.transport.estimators.emitters import ChosenEmitter
-from mivol.transport.estimators.shadow_rays import DARK
+from mivol.transport.estimators.lighting.emitters import ChosenEmitter
+from mivol.transport.estimators.lighting.shadow_rays import DARK
+from mivol.transport.estimators.single_scattering.distance_sampling import (
+    DistanceProposal,
+    fill_reservoir,
+    lit_length,
+    start_reservoir,
+)
 from mivol.transport.media.ray_intervals import visit_media
 from scenes import as_float32, box_of, grid_volume, media_of, medium
 

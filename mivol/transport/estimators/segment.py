@@ -4,7 +4,7 @@ r"""The protocol of segment estimators: light that media add along a path segmen
 
 A segment runs from one event to the next: an opaque surface or, for estimators that end segments in media, a collision. A
 :class:`SegmentEstimator` computes its light: none (:class:`Absorption`), single scattering, or emission. Light and
-transmittance carry their derivatives as a term and a factor (:mod:`.contribution`). Where one walk of the cells gives the
+transmittance carry their derivatives as a term and a factor (:mod:`.scores`). Where one walk of the cells gives the
 derivatives of both, they share a :class:`SharedSegment`; the walk reports the term first, then the factor.
 """
 
@@ -13,9 +13,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, Protocol
 
+import drjit as dr
 import mitsuba as mi
 
-from mivol.transport.estimators.contribution import Factor, Term
+from mivol.transport.estimators.lighting.shadow_rays import estimate_transmittance
+from mivol.transport.estimators.scores import Factor, Term
 from mivol.transport.media.even_point import EvenPoint
 from mivol.transport.media.optical_depth import (
     integrate_optical_depth,
@@ -26,12 +28,10 @@ from mivol.transport.media.optical_depth import (
 from mivol.transport.media.ray_intervals import RaySegment, SegmentEnd
 from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.traversal.fine_ray import Ray
+from mivol.transport.traversal.random_numbers import draw_pcg32, seed_pcg32
 from mivol.transport.traversal.strata import Strata
 
 __all__ = [
-    "FORWARD",
-    "PICTURE",
-    "REVERSE",
     "Absorption",
     "Collision",
     "FlightPoint",
@@ -42,10 +42,8 @@ __all__ = [
     "SegmentTransmittance",
     "SharedSegment",
     "Transmittance",
+    "TrackedAbsorption",
 ]
-
-PICTURE, REVERSE, FORWARD = "picture", "reverse", "forward"
-"""Purposes of a walk: the radiance, the gradients of its parameters, or its tangent."""
 
 
 @dataclass
@@ -251,3 +249,43 @@ class SegmentTransmittance:
 
     def jvp(self) -> mi.Spectrum:
         return self.shared.jvp_transmittance()
+
+
+class TrackedAbsorption:
+    """The segment estimator for media that only absorb, of which some are known by a majorant only.
+
+    Args:
+        media: of the scene.
+
+    Bias: none, of the radiance and of its derivatives. Variance: that of ratio tracking, and of one point for derivatives.
+    Cost: one walk of each exact medium; look-ups in proportion to the majorants of the others.
+    """
+
+    directions = "none"
+    ends_in_media = False
+
+    def __init__(self, media: SceneMedia) -> None:
+        self.media = media
+
+    def draw(self, sampler: mi.Sampler, active: mi.Bool, strata: Strata | None) -> mi.Float:
+        """One number in every lane.
+
+        Not in ``active`` lanes only, which are those that may scatter once more: a sampler does not advance in the others, and
+        would give them the same number at each segment.
+        """
+        return sampler.next_1d()
+
+    def estimate(self, segment: PathSegment, purpose: str, active: mi.Bool) -> SegmentEstimate:
+        width = dr.width(segment.ray)
+        rng = seed_pcg32(segment.samples, width)
+        end, T = estimate_transmittance(self.media, segment.ray, segment.medium, active, rng)
+        _, (u,) = draw_pcg32(seed_pcg32(segment.samples, width, 1), 1)
+        passed = RaySegment(segment.ray, segment.medium, end.t, u=u)
+        return SegmentEstimate(end, T, None, Transmittance(self.media, passed, active))
+
+    def prepare_derivatives(self, ray: mi.Ray3f) -> None:
+        """Nothing is needed."""
+
+    def replayed(self) -> TrackedAbsorption:
+        """This estimator: a replay draws the same numbers, and finds the same transmittance again."""
+        return self

@@ -8,13 +8,8 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from mivol.transport.estimators.segment import (
-    FORWARD,
-    PathSegment,
-    SegmentEstimate,
-    SegmentLight,
-    SegmentTransmittance,
-)
+from mivol.transport.estimators.scores import FORWARD
+from mivol.transport.estimators.segment import PathSegment, SegmentEstimate, SegmentLight, SegmentTransmittance
 from mivol.transport.line_integrals.composite import Composite
 from mivol.transport.line_integrals.emission import integrate_emission, vjp_emission
 from mivol.transport.media.channels import spectrum

@@ -12,15 +12,16 @@ from dataclasses import dataclass
 
 import mitsuba as mi
 
-from mivol.transport.estimators.direct_lighting import DirectLighting
-from mivol.transport.estimators.emission_sampling import EmissionSampling
-from mivol.transport.estimators.free_flight import FreeFlight
-from mivol.transport.estimators.scattering_quadrature import ScatteringQuadrature
-from mivol.transport.estimators.segment import Absorption, SegmentEstimator
-from mivol.transport.estimators.single_scattering import SingleScattering
-from mivol.transport.estimators.tracked_absorption import TrackedAbsorption
-from mivol.transport.estimators.transmittance_grid import TransmittanceGrid
-from mivol.transport.estimators.visibility_cache import VisibilityCache
+from mivol.transport.estimators.flights.free_flight import FreeFlight
+from mivol.transport.estimators.lighting.direct_lighting import DirectLighting
+from mivol.transport.estimators.lighting.emission_sampling import EmissionSampling
+from mivol.transport.estimators.segment import Absorption, SegmentEstimator, TrackedAbsorption
+from mivol.transport.estimators.single_scattering.scattering_quadrature import ScatteringQuadrature
+from mivol.transport.estimators.single_scattering.shadow_tables import (
+    TransmittanceGrid,
+    VisibilityCache,
+)
+from mivol.transport.estimators.single_scattering.single_scattering import SingleScattering
 from mivol.transport.line_integrals.emitting_segment import Emission
 
 __all__ = [
@@ -30,6 +31,7 @@ __all__ = [
     "SegmentEntry",
     "SegmentQuestion",
     "choose_segment_estimator",
+    "Settings",
 ]
 
 
@@ -211,3 +213,36 @@ class Estimators:
         """Estimators of the radiance that a replay subtracts from: without light that is sampled anew for its derivatives."""
         how = self.lights_surfaces, self.lights_media, self.lobe, self.emission, self.long_paths_count
         return Estimators(self.direct, self.segment.replayed(), *how)
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How long a path may be, and how scattered light is computed.
+
+    Attributes:
+        max_depth: largest path depth, counted as in ``volpath``; -1 for no limit.
+        rr_depth: depth from which Russian roulette may end a path.
+        hide_emitters: emitters are not seen directly by the camera.
+        deterministic: single scattering by quadrature in place of Monte Carlo.
+        shadows: with ``deterministic``, ``exact`` or interpolated in a ``grid``; else ``exact`` or ``estimated`` (ratio
+            tracking); ``auto`` leaves the choice to the plan.
+        media_light: light that media emit is ``drawn`` where paths scatter, or ``met`` by chance; ``auto`` leaves the choice to
+            the plan.
+    """
+
+    max_depth: int = 6
+    rr_depth: int = 5
+    hide_emitters: bool = False
+    deterministic: bool = False
+    shadows: str = "auto"
+    media_light: str = "auto"
+
+    @property
+    def may_draw_emission(self) -> bool:
+        """Whether light that media emit may be drawn where paths scatter."""
+        return self.scatterings >= 1 and self.media_light != "met"
+
+    @property
+    def scatterings(self) -> float:
+        """Largest number of scattering events between an emitter and the camera, on surfaces and in media; may be infinite."""
+        return math.inf if self.max_depth < 0 else max(self.max_depth - 1, 0)

@@ -10,7 +10,7 @@ Emitters are at infinity here, so that w is as probable at x' as at x.
 
 For derivatives a side flight is walked back like the path's own flights, and its shadow ray is offered to the path's reservoir.
 The light that is missed where there is no extinction is found by the probes of the path alone
-(:mod:`mivol.transport.estimators.flight_derivatives`), since their points are drawn without those weights.
+(:mod:`mivol.transport.estimators.flights.flight_derivatives`), since their points are drawn without those weights.
 
 Source: the balance heuristic of Veach & Guibas 1995, applied to next-event estimation with a direction drawn one vertex early.
 """
@@ -24,10 +24,10 @@ import mitsuba as mi
 
 from mivol.phase.hg import eval_hg, sample_hg
 from mivol.phase.turn import direction_after, turn_between
-from mivol.transport.estimators.contribution import Factor, TrackedTerm
-from mivol.transport.estimators.direct_lighting import DirectLight, DistantAim
-from mivol.transport.estimators.segment import PICTURE, Collision, PathSegment
-from mivol.transport.estimators.vertex import MediumVertex
+from mivol.transport.estimators.lighting.direct_lighting import DirectLight, DistantAim
+from mivol.transport.estimators.lighting.vertex import MediumVertex
+from mivol.transport.estimators.scores import PICTURE, Factor, TrackedTerm
+from mivol.transport.estimators.segment import Collision, PathSegment
 from mivol.transport.path.estimators import Estimators
 from mivol.transport.traversal.fine_ray import FineRay
 

@@ -17,9 +17,8 @@ from typing import TypeVar
 import drjit as dr
 import mitsuba as mi
 
-from mivol.transport.path.estimators import Estimators
-from mivol.transport.path.scores import Primal
-from mivol.transport.path.settings import Settings
+from mivol.transport.estimators.scores import Primal
+from mivol.transport.path.estimators import Estimators, Settings
 from mivol.transport.path.walk import Path, alpha_of, leave_camera, start_path, step
 from mivol.transport.traversal.random_numbers import LaneSampler, draw_seeds
 from mivol.transport.traversal.ray_spawning import camera_ray

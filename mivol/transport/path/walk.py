@@ -6,7 +6,7 @@ A path runs in straight segments from one event to the next: to an opaque surfac
 has chosen ends segments in media, to a collision. The estimator also finds what media add and transmit along a segment. At an
 event, direct light is estimated by one emitter sample (next-event estimation) and one sample of the BSDF or phase function,
 combined by the power heuristic (Veach 1997, Eq. 9.13). The walk is the same for radiance, gradients and tangents; a score
-decides what is made of it (:mod:`mivol.transport.path.scores`).
+decides what is made of it (:mod:`mivol.transport.estimators.scores`).
 
 Conventions. ``max_depth`` counts as in ``volpath``: 1 is emitters seen through media, each scattering adds 1, -1 is no
 limit. Boundaries with a ``null`` BSDF do not count. Media that are bounded by boxes are cut by slab tests; the acceleration
@@ -23,21 +23,16 @@ from typing import Any, TypeVar
 import drjit as dr
 import mitsuba as mi
 
-from mivol.transport.estimators.contribution import TrackedTerm
-from mivol.transport.estimators.direct_lighting import DirectLight, DistantAim
-from mivol.transport.estimators.flight_derivatives import Probe, Probes, ProbeTerm
-from mivol.transport.estimators.free_flight import collision_at
-from mivol.transport.estimators.multiple_importance import power_heuristic
-from mivol.transport.estimators.segment import PICTURE, Collision, PathSegment
-from mivol.transport.estimators.shadow_reservoir import ShadowReservoir, ShadowTerm
+from mivol.transport.estimators.flights.flight_derivatives import Probe, Probes, ProbeTerm, ShadowReservoir, ShadowTerm
+from mivol.transport.estimators.flights.free_flight import collision_at
+from mivol.transport.estimators.lighting.direct_lighting import DirectLight, DistantAim, power_heuristic
+from mivol.transport.estimators.scores import PICTURE, Primal, Replay, Tangent, TrackedTerm
+from mivol.transport.estimators.segment import Collision, PathSegment
 from mivol.transport.media.channels import colours
 from mivol.transport.media.coefficients import medium_interaction
-from mivol.transport.path.estimators import Estimators
-from mivol.transport.path.event import PathEvent
-from mivol.transport.path.scores import Primal, Replay, Tangent
-from mivol.transport.path.settings import Settings
+from mivol.transport.path.estimators import Estimators, Settings
+from mivol.transport.path.event import PathEvent, TurnSamples, sample_turn
 from mivol.transport.path.side_flight import Aim, SideSamples, fly_aside, weigh_aim
-from mivol.transport.path.turn import TurnSamples, sample_turn
 from mivol.transport.traversal.fine_ray import FineRay, Ray, point_along
 from mivol.transport.traversal.random_numbers import LaneSampler, draw_state
 from mivol.transport.traversal.ray_spawning import camera_ray
@@ -89,7 +84,7 @@ class Path:
         stopped: whether a surface stopped or turned the path, for the film's alpha.
         clear: transmittance of the media up to there, for the film's alpha.
         active: lanes that go on.
-        score: :mod:`mivol.transport.path.scores`.
+        score: :mod:`mivol.transport.estimators.scores`.
         sampler, strata: random numbers.
         probes: points of the flights so far, at which derivatives are looked at besides; None for pictures.
         shadow: the shadow ray that is walked back for derivatives; None for pictures, and where paths scatter at surfaces only.
@@ -153,7 +148,7 @@ def walk_path(
         settings: depth, roulette, hidden emitters.
         sampler: three 2D and two 1D numbers a surface, and what the segment estimator draws.
         ray: world space, unit direction.
-        score: :mod:`mivol.transport.path.scores`.
+        score: :mod:`mivol.transport.estimators.scores`.
         active: lanes to walk.
         strata: the stratum that each lane draws directions in media from.
 
@@ -174,9 +169,7 @@ def walk_path(
     return path.score, alpha_of(path)
 
 
-def walk_stem(
-    estimators: Estimators, settings: Settings, sampler: mi.Sampler, ray: Ray, score: Score
-) -> tuple[Score, Landing]:
+def walk_stem(estimators: Estimators, settings: Settings, sampler: mi.Sampler, ray: Ray, score: Score) -> tuple[Score, Landing]:
     """Walk a path from the camera, but no further than to a collision on its first segment.
 
     Args:
@@ -303,9 +296,9 @@ def step(estimators: Estimators, settings: Settings, path: Path) -> Path:
 
 def _walk_on(estimators: Estimators, settings: Settings, path: Path) -> Path:
     """Follow a path to its end."""
-    return dr.while_loop(
-        state=(path,), cond=lambda p: p.active, body=lambda p: (step(estimators, settings, p),), label="path"
-    )[0]
+    return dr.while_loop(state=(path,), cond=lambda p: p.active, body=lambda p: (step(estimators, settings, p),), label="path")[
+        0
+    ]
 
 
 def _limit(settings: Settings) -> int:

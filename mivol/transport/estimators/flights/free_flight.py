@@ -1,0 +1,239 @@
+r"""Free flights: a path flies to its first collision with the media, where it may scatter, or to the end of its segment.
+
+.. math:: L = \int_0^D T(t) \left( \sigma_s L_s + j \right) dt + T(D)\, L_{behind}, \qquad p(t) = \sigma_t(t)\,T(t)
+
+Each part of an extinction is flown through on its own, and the shortest of the flights is that of their sum, since collisions
+with different parts are independent. So media need no order along the ray, and an exact part may stand beside one that is
+tracked.
+
+Where an extinction is rgb, one channel is drawn for the flight in proportion to the path's throughput, and both outcomes are
+weighed by the mean of the densities of all channels (the balance heuristic). In a medium of albedo 1 the weights leave the sum
+of the throughputs as it is, so they stay bounded however long a path is.
+
+Emission is looked at in one point of each flight, drawn evenly over its length t: the mean of t j over all flights is
+:math:`\int T j\,dt`, where there is no extinction too. Light that Gaussians show is summed (:mod:`.gaussian_light`).
+
+References: Chandrasekhar 1960 (the equation of transfer); Woodcock et al. 1965, Sutton et al. 1999 (flights); Wilkie et al.
+2014, Miller et al. 2019 (channels); Spanier & Gelbard 1969 (the track-length estimator).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+
+import drjit as dr
+import mitsuba as mi
+
+from mivol.numerics import least_of
+from mivol.transport.estimators.flights.flight_derivatives import FlownSegment, Level
+from mivol.transport.estimators.flights.gaussian_light import GaussianLight
+from mivol.transport.estimators.flights.regular_tracking import collide_exactly, collide_in_gaussians
+from mivol.transport.estimators.flights.tracking import collide_in_blocks, collide_in_bounded
+from mivol.transport.estimators.scores import PICTURE
+from mivol.transport.estimators.segment import (
+    Collision,
+    FlightPoint,
+    PathSegment,
+    SegmentEstimate,
+    SegmentLight,
+    SegmentTransmittance,
+)
+from mivol.transport.media.body import Body
+from mivol.transport.media.channels import colours, spectrum
+from mivol.transport.media.coefficients import eval_albedo, medium_interaction
+from mivol.transport.media.even_point import draw_even_point
+from mivol.transport.media.extinction import Extinction, RayInterval
+from mivol.transport.media.gaussian_extinction import GaussianExtinction
+from mivol.transport.media.optical_depth import sum_optical_depth
+from mivol.transport.media.ray_intervals import MediumInterval, MediumVisitor, RaySegment, revisit_media, visit_media
+from mivol.transport.media.scene_media import SceneMedia
+from mivol.transport.traversal.fine_ray import Ray, point_along
+from mivol.transport.traversal.random_numbers import LaneSampler, draw_pcg32, draw_state
+from mivol.transport.traversal.strata import Strata
+
+__all__ = ["FreeFlight", "collision_at"]
+
+
+@dataclass
+class _Flight:
+    """The state of flights: the first collision found so far.
+
+    Attributes:
+        t: its distance on the ray [length]; infinite where there is none.
+        body: index of its medium.
+        rng: state of the generator that all further numbers come from.
+    """
+
+    t: mi.Float64
+    body: mi.UInt32
+    rng: mi.UInt32
+
+
+class FreeFlight:
+    """The segment estimator of paths that scatter in media any number of times.
+
+    Args:
+        media: of the scene.
+
+    Attributes:
+        level: the level that derivatives are taken from (:mod:`.flight_derivatives`); None for 0.
+
+    Bias: none. Variance: that of one flight a segment. Cost: a walk of each medium to the first collision; where an extinction
+    is rgb or a medium emits, one more to there.
+    """
+
+    directions = "spread"
+    ends_in_media = True
+
+    def __init__(self, media: SceneMedia) -> None:
+        self.media = media
+        self.level: Level | None = None
+
+    def draw(self, sampler: mi.Sampler | LaneSampler, active: mi.Bool, strata: Strata | None) -> tuple[mi.Float, mi.UInt32]:
+        """The number of the flight, and the generator of all others: in every lane, since all of them fly."""
+        return sampler.next_1d(), draw_state(sampler)
+
+    def prepare_derivatives(self, ray: mi.Ray3f) -> None:
+        """The level b is found by the path, which knows how to estimate radiance."""
+
+    def replayed(self) -> FreeFlight:
+        """A replay makes the same flights."""
+        return self
+
+    def estimate(self, segment: PathSegment, purpose: str, active: mi.Bool) -> SegmentEstimate:
+        media, ray, width = self.media, segment.ray, dr.width(segment.ray)
+        u, rng = segment.samples
+        rng, (pick, at_emission, at_probe, chance) = draw_pcg32(rng, 4)
+        channel = _draw_channel(segment.beta, pick) if media.channels > 1 else mi.UInt32(0)
+        start = _Flight(dr.full(mi.Float64, dr.inf, width), dr.zeros(mi.UInt32, width), rng)
+        end, flight = visit_media(media, ray, segment.medium, _fly(media, ray, u, channel), start, active)
+        collides = active & (flight.t < mi.Float64(end.t))
+        t = dr.select(collides, flight.t, mi.Float64(end.t))
+        passed = RaySegment.upto(ray, segment.medium, t)
+        if media.is_bounded:
+            # Derivatives of depths that are not known are looked at in one point of the flight.
+            _, (passed.u,) = draw_pcg32(flight.rng, 1)
+        collision = collision_at(media, ray, flight.t, flight.body, collides)
+        weight = self._weigh(segment, passed, active, collision)
+        emitting = [body for body in media.bodies if body.view.emits and not body.view.shows_gaussians]
+        emission = self._point_of(segment, passed, emitting, at_emission, chance, active) if emitting else None
+        if segment.emission_weight is not None:
+            emission.gain *= segment.emission_weight
+        weigh = partial(self._weigh, segment, collision=None)
+        shown = GaussianLight(media, segment, (end.t, t), weigh, active)
+        # What a side flight leaves to probes is found by those of the path itself, and so is the light of the level.
+        level = None if segment.is_aside else self.level
+        shared = FlownSegment(media, segment, passed, collision, weight, level, emission, shown, active)
+        light = SegmentLight(shared, shared.emitted, is_replayed=True)
+        probe = self._point_of(segment, passed, media.bodies, at_probe, chance, active) if purpose != PICTURE else None
+        return SegmentEstimate(end, weight, light, SegmentTransmittance(shared), collision, probe)
+
+    def _weigh(self, segment: PathSegment, passed: RaySegment, active: mi.Bool, collision: Collision | None) -> mi.Spectrum:
+        """The value of each channel's flight over the mean density of all of them, weighed by their throughputs.
+
+        Args:
+            segment: the throughputs.
+            passed: the flight.
+            active: lanes that fly.
+            collision: how it ends; None for its probability to get so far.
+        """
+        if self.media.channels == 1:
+            return mi.Spectrum(1)
+        zero = [mi.Float(0) for _ in range(self.media.channels)]
+        tau = revisit_media(self.media, passed, sum_optical_depth(), zero, active)
+        # Only ratios of transmittances count, and the largest of them is made 1.
+        least = least_of(tau)
+        value = spectrum([dr.exp(least - row) for row in tau])
+        hits = [] if collision is None else self.media.bodies_at(collision.body, collision.on)
+        for body, here in hits:
+            value = dr.select(here, value * _extinction(self.media, body, segment.ray, collision.t, here), value)
+        shares = _shares(segment.beta)
+        density = sum((p * v for p, v in zip(shares, colours(value), strict=True)), mi.Float(0))
+        return dr.select(density > 0, value / dr.select(density > 0, density, 1), 0)
+
+    def _point_of(
+        self, segment: PathSegment, passed: RaySegment, among: list[Body], u: mi.Float, chance: mi.Float, active: mi.Bool
+    ) -> FlightPoint:
+        """Draw a point evenly from what a flight has passed of some media."""
+        point = draw_even_point(self.media, passed, among, u, active)
+        front = RaySegment.upto(segment.ray, segment.medium, dr.select(point.on, point.t, 0))
+        gain = segment.beta * self._weigh(segment, front, point.on, None) * point.length
+        return FlightPoint(point, gain, chance)
+
+
+def collision_at(media: SceneMedia, ray: Ray, t: mi.Float64, body: mi.UInt32, on: mi.Bool) -> Collision:
+    """The collision of a ray with the medium of a number, at a distance [length] that counts where lanes are ``on``."""
+    at, albedo = dr.select(on, t, 0), mi.Spectrum(0)
+    mei = medium_interaction(ray, at)
+    mei.medium = media.medium_of(body, on)
+    for other, here in media.bodies_at(body, on):
+        albedo = dr.select(here, _albedo(media, other, ray, t, mei, here), albedo)
+    return Collision(mei, point_along(ray, at), albedo, on, t, body)
+
+
+def _albedo(media: SceneMedia, body: Body, ray: Ray, t: mi.Float64, mei: mi.MediumInteraction3f, on: mi.Bool) -> mi.Spectrum:
+    """sigma_s / sigma_t at a point of a body."""
+    if body.view.albedo is not None:
+        return dr.detach(eval_albedo(body, mei, on))
+    sigma_s, sigma_t = (_extinction(media, body, ray, t, on, name) for name in ("sigma_s", "sigma_"))
+    return dr.select(sigma_t > 0, sigma_s / dr.select(sigma_t > 0, sigma_t, 1), 0)
+
+
+def _extinction(media: SceneMedia, body: Body, ray: Ray, t: mi.Float64, on: mi.Bool, name: str = "sigma_") -> mi.Spectrum:
+    return spectrum(body.extinction_at(ray, dr.select(on, t, 0), media.channels, on, name))
+
+
+def _fly(media: SceneMedia, ray: Ray, u: mi.Float, channel: mi.UInt32) -> MediumVisitor:
+    """The visitor that keeps the first collision along ``ray``."""
+    bodies = media.bodies
+    # A boundary that is traced may be entered several times, and each time takes a number of its own.
+    first = next((p for b in media.boxed for p in b.view.parts if not _draws_own_numbers(p)), None)
+
+    def visit(flight: _Flight, interval: MediumInterval) -> _Flight:
+        body, t, index, rng = interval.body, flight.t, flight.body, flight.rng
+        number = next(k for k, other in enumerate(bodies) if other is body)
+        scale = dr.detach(body.view.scale) * body.area(ray.d)
+        for part in body.view.parts:
+            # What lies behind the first collision so far is not flown through.
+            t0, t1 = mi.Float64(interval.t0), dr.minimum(mi.Float64(interval.t1), t)
+            ahead = RayInterval(ray, t0, t1, interval.active & (t1 > t0))
+            if not part.exact_line:
+                hit, rng = collide_in_bounded(part, scale, ahead, rng)
+            elif isinstance(part, GaussianExtinction):
+                hit, rng = collide_in_gaussians(part, scale, ahead, rng)
+            elif _is_tracked(part):
+                hit, rng = collide_in_blocks(part, scale, ahead, rng)
+            else:
+                rng, (other,) = draw_pcg32(rng, 1)
+                # The sampler's own number, which may be stratified, is the flight of the first part.
+                goal = -dr.log(1 - u if part is first else other)
+                hit = collide_exactly(part, scale, ahead, goal, channel)
+            nearer = ahead.active & (hit < t)
+            t, index = dr.select(nearer, hit, t), dr.select(nearer, mi.UInt32(number), index)
+        return _Flight(t, index, rng)
+
+    return visit
+
+
+def _draws_own_numbers(part: Extinction) -> bool:
+    """Whether flights through a part take any number of random numbers."""
+    return _is_tracked(part) or isinstance(part, GaussianExtinction)
+
+
+def _is_tracked(part: Extinction) -> bool:
+    """Whether flights through a part are drawn by delta tracking."""
+    return not part.exact_line or (part.lattice is not None and part.lattice.block_ranges is not None and part.channels == 1)
+
+
+def _shares(beta: mi.Spectrum) -> list[mi.Float]:
+    """The probability of each channel: its share of the throughput."""
+    rows = [dr.abs(row) for row in colours(beta)]
+    total = sum(rows[1:], rows[0])
+    return [dr.select(total > 0, row / dr.select(total > 0, total, 1), 1 / len(rows)) for row in rows]
+
+
+def _draw_channel(beta: mi.Spectrum, u: mi.Float) -> mi.UInt32:
+    """A channel in proportion to the throughput."""
+    first, second, _ = _shares(beta)
+    return dr.select(u < first, mi.UInt32(0), dr.select(u < first + second, mi.UInt32(1), mi.UInt32(2)))

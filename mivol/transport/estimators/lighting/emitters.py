@@ -1,0 +1,240 @@
+"""The emitters of a scene: which of them are sampled by direction, which by the phase function, and the choice of one."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mivol.transport.traversal.fine_ray import Ray
+from mivol.transport.traversal.strata import Strata
+
+__all__ = [
+    "UNIFORM",
+    "ChosenEmitter",
+    "SceneEmitters",
+    "is_among",
+    "EventSamples",
+    "EquiangularSampler",
+    "equiangular_sampler",
+    "equiangular_towards",
+]
+
+
+UNIFORM = "ConstantBackgroundEmitter"
+"""Mitsuba's class of an environment that is the same in all directions; phase samples alone find its light."""
+
+
+class SceneEmitters:
+    """The emitters of a scene, and by which samples their light is found.
+
+    Args:
+        scene: Mitsuba's scene.
+
+    Attributes:
+        sampled: emitters that next-event estimation chooses from with equal probabilities: all but a constant environment.
+        transmissive: emitters on surfaces that transmit part of the light undeviated.
+        samples_phase: directions are drawn from the phase function too, since they can hit some emitter.
+        is_near: some emitter has a finite distance.
+    """
+
+    def __init__(self, scene: mi.Scene) -> None:
+        emitters = scene.emitters()
+        delta = int(mi.EmitterFlags.Delta)
+        self.sampled = [e for e in emitters if e.class_name() != UNIFORM]
+        self.transmissive = [e for e in self.sampled if _is_transmissive(e)]
+        opaque = [e for e in emitters if not any(e is emitter for emitter in self.transmissive)]
+        self.samples_phase = any(not int(e.flags()) & delta for e in opaque)
+        balls = [_ball(e) for e in self.sampled]
+        self.is_near = any(b is not None for b in balls)
+        self._balls = [None if b is None else [dr.opaque(mi.Float, v) for v in b] for b in balls]
+
+    def bounding_ball(self, number: int) -> list[mi.Float] | None:
+        """Centre and radius of one of the ``sampled`` emitters; None for one at infinity."""
+        return self._balls[number]
+
+    def draw_samples(self, sampler: mi.Sampler, active: mi.Bool, strata: Strata | None = None) -> EventSamples:
+        """Draw the random numbers of one scattering event from a sampler."""
+        return EventSamples(
+            sampler.next_1d(active),
+            sampler.next_2d(active),
+            sampler.next_1d(active),
+            sampler.next_2d(active),
+            sampler.next_1d(active),
+            sampler.next_2d(active),
+            sampler.next_1d(active),
+            strata,
+        )
+
+    def choose(self, ray: Ray, u: mi.Float) -> ChosenEmitter:
+        """Choose one of the ``sampled`` emitters for each lane, with equal probabilities, by a number in [0, 1)."""
+        n, width = len(self.sampled), dr.width(ray)
+        index = dr.minimum(mi.UInt32(u * n), max(n - 1, 0))
+        emitter = dr.zeros(mi.EmitterPtr, width)
+        centre, radius2, finite = mi.Point3f(0), mi.Float(0), mi.Bool(False)
+        for k, (candidate, ball) in enumerate(zip(self.sampled, self._balls, strict=True)):
+            here = index == k
+            emitter = dr.select(here, mi.EmitterPtr(candidate), emitter)
+            if ball is not None:
+                x, y, z, r = ball
+                centre = dr.select(here, mi.Point3f(x, y, z), centre)
+                radius2, finite = dr.select(here, dr.square(r), radius2), here | finite
+        return ChosenEmitter(index, emitter, equiangular_towards(ray, centre, radius2, finite) if self.is_near else None)
+
+
+def _is_transmissive(emitter: mi.Emitter) -> bool:
+    shape = emitter.get_shape()
+    return shape is not None and mi.has_flag(shape.bsdf().flags(), mi.BSDFFlags.Null)
+
+
+def _ball(emitter: mi.Emitter) -> list[float] | None:
+    """Centre of an emitter's bounding box, and the root mean square distance of points in it; None for one at infinity."""
+    box = emitter.get_shape().bbox() if emitter.get_shape() is not None else emitter.bbox()
+    low, high = np.array(box.min, dtype=np.float64), np.array(box.max, dtype=np.float64)
+    if emitter.is_environment() or not np.isfinite([low, high]).all() or (high < low).any():
+        return None
+    return [*((low + high) / 2), float(np.linalg.norm(high - low) / math.sqrt(12))]
+
+
+def is_among(emitters: list[mi.Emitter], emitter: mi.EmitterPtr) -> mi.Bool:
+    """Whether the emitter of each lane is one of a list."""
+    found = mi.Bool(False)
+    for candidate in emitters:
+        found |= emitter == mi.EmitterPtr(candidate)
+    return found
+
+
+@dataclass
+class ChosenEmitter:
+    """The emitter that was chosen for each lane.
+
+    Attributes:
+        number: its index among the sampled ones.
+        emitter: Mitsuba's object.
+        equiangular: sampler of distances seen from it; None where all emitters are at infinity.
+    """
+
+    number: mi.UInt32
+    emitter: mi.EmitterPtr
+    equiangular: EquiangularSampler | None
+
+
+@dataclass
+class EventSamples:
+    """The random numbers of one scattering event, uniform in [0, 1).
+
+    Attributes:
+        piece: seeds the reservoir that keeps a piece of the ray.
+        inside: technique of distance sampling, and the distance in the piece.
+        which_emitter: the emitter.
+        emitter: point or direction on it.
+        component: component of the phase function.
+        direction: direction of the phase sample.
+        which_shadow_ray: the shadow ray whose derivative is computed.
+        strata: strata that directions are drawn from; None for the whole square.
+    """
+
+    piece: mi.Float
+    inside: mi.Point2f
+    which_emitter: mi.Float
+    emitter: mi.Point2f
+    component: mi.Float
+    direction: mi.Point2f
+    which_shadow_ray: mi.Float
+    strata: Strata | None = None
+
+    def part(self, number: mi.UInt32, count: int) -> EventSamples:
+        """The numbers of one of ``count`` events on a ray.
+
+        They are those of the first event, shifted by an additive recurrence; directions are stratified over the events.
+        """
+        if count == 1:
+            return self.aim(self.emitter, self.direction)
+        # Additive recurrences with the generalised golden ratios have low discrepancy in one and two dimensions (Roberts 2018).
+        k, across = mi.Float(number), max(a for a in range(1, int(count**0.5) + 1) if count % a == 0)
+        part = Strata(number, across, count // across)
+
+        def one(u: mi.Float) -> mi.Float:
+            return _wrap(dr.fma(k, 0.6180339887, u))
+
+        def two(u: mi.Point2f) -> mi.Point2f:
+            return mi.Point2f(_wrap(dr.fma(k, 0.7548776662, u.x)), _wrap(dr.fma(k, 0.5698402910, u.y)))
+
+        moved = EventSamples(
+            self.piece,
+            two(self.inside),
+            self.which_emitter,
+            self.emitter,
+            one(self.component),
+            self.direction,
+            one(self.which_shadow_ray),
+            self.strata,
+        )
+        return moved.aim(part.jitter(two(self.emitter)), part.jitter(two(self.direction)))
+
+    def aim(self, emitter: mi.Point2f, direction: mi.Point2f) -> EventSamples:
+        """The same numbers with others for directions, which are moved into their strata."""
+        if self.strata is not None:
+            emitter, direction = self.strata.jitter(emitter), self.strata.jitter(direction)
+        return replace(self, emitter=emitter, direction=direction, strata=None)
+
+
+def _wrap(x: mi.Float) -> mi.Float:
+    return x - dr.floor(x)
+
+
+def equiangular_sampler(ray: Ray, ball: list[mi.Float] | None) -> EquiangularSampler | None:
+    """The sampler towards one emitter, a ball (x, y, z, radius); None where that is at infinity (no ball)."""
+    if ball is None:
+        return None
+    x, y, z, r = ball
+    return equiangular_towards(ray, mi.Point3f(x, y, z), dr.square(r), mi.Bool(True))
+
+
+def equiangular_towards(ray: Ray, centre: mi.Point3f, radius2: mi.Float, finite: mi.Bool) -> EquiangularSampler:
+    """The sampler of rays towards a ball about ``centre``, for the lanes whose emitter is ``finite``."""
+    away = centre - mi.Point3f(ray.o)
+    t0 = dr.dot(away, ray.d)
+    h2 = dr.squared_norm(away - t0 * ray.d)
+    # The distance of the ray from a point light may be 0. It is bounded below by 1e-4 of the distance to the light, so that the
+    # angle stays in the range of float32. That changes the density only, and with it the variance, but no mean.
+    rho = dr.sqrt(h2 + radius2 + 1e-8 * dr.squared_norm(away) + 1e-30)
+    return EquiangularSampler(t0, dr.select(finite, rho, 1), finite)
+
+
+@dataclass
+class EquiangularSampler:
+    """Equiangular sampling towards one emitter.
+
+    Attributes:
+        t0: distance along the ray at which the emitter is nearest [length].
+        rho: distance from the ray to the emitter there [length].
+        finite: lanes whose emitter is not at infinity; in the others ``t0`` and ``rho`` mean nothing.
+    """
+
+    t0: mi.Float
+    rho: mi.Float
+    finite: mi.Bool
+
+    def angle(self, a: mi.Float, dt: mi.Float) -> mi.Float:
+        """The angle [rad] under which [a, a + dt] is seen; a difference of two arctangents would cancel to 0 far away."""
+        near, far = a - self.t0, (a - self.t0) + dt
+        return dr.atan2(self.rho * dt, dr.fma(near, far, dr.square(self.rho)))
+
+    def mean(self, a: mi.Float, dt: mi.Float) -> mi.Float:
+        """Mean of 1 / (rho^2 + (t - t0)^2) over [a, a + dt]; 1 where the emitter is at infinity."""
+        return dr.select(self.finite, self.angle(a, dt) * dr.rcp(self.rho * dt), 1)
+
+    def sample(self, a: mi.Float, dt: mi.Float, u: mi.Float) -> mi.Float:
+        """Distance from ``a`` [length] at the fraction ``u`` of the angle, by the addition theorem of the tangent."""
+        x = (a - self.t0) / self.rho
+        sin, cos = dr.sincos(u * self.angle(a, dt))
+        return dr.clip(self.rho * sin * dr.fma(x, x, 1) / dr.fma(-x, sin, cos), 0, dt)
+
+    def density(self, a: mi.Float, dt: mi.Float, t: mi.Float) -> mi.Float:
+        """Density of :meth:`sample` at a distance ``t`` from ``a`` [1/length]."""
+        r2 = dr.square(self.rho) + dr.square((a - self.t0) + t)
+        return self.rho * dr.rcp(r2 * self.angle(a, dt))

@@ -1,0 +1,1 @@
+"""Light that is scattered once in media, along one segment."""

@@ -1,0 +1,184 @@
+r"""Single scattering along a path segment: Monte Carlo integration of the in-scattered radiance.
+
+.. math:: L = \int_0^D T(t)\,\sigma_s(x_t)\,L_d(x_t, \omega)\,dt \approx \frac{T \sigma_s L_d}{p(t)}
+
+Conventions. The segment is walked once, for its optical depth and for the points at which light is scattered. The weight of a
+point is T L_d / p, the radiance at the camera for a scattering coefficient of 1: the light is ``sigma_s * weight``, and its
+derivative with respect to sigma_s is the weight itself, so nothing is divided by an extinction or by an albedo that may be 0.
+
+References: the equation of transfer with the in-scattered radiance of one order (Chandrasekhar 1960).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from mivol.transport.estimators.lighting.direct_lighting import DirectLighting
+from mivol.transport.estimators.lighting.emitters import EventSamples
+from mivol.transport.estimators.lighting.vertex import MediumVertex
+from mivol.transport.estimators.scores import PICTURE, TrackedTerm
+from mivol.transport.estimators.segment import (
+    Absorption,
+    PathSegment,
+    SegmentEstimate,
+    SegmentLight,
+    SegmentTransmittance,
+    Transmittance,
+)
+from mivol.transport.estimators.single_scattering.control_variates import (
+    CameraOrigins,
+    GridControl,
+    build_grid_control,
+    find_constant_control,
+    takes_grid_control,
+)
+from mivol.transport.estimators.single_scattering.distance_sampling import (
+    Candidate,
+    DistanceProposal,
+    Reservoir,
+    fill_reservoir,
+    sample_distance,
+    start_reservoir,
+)
+from mivol.transport.estimators.single_scattering.scattering_derivatives import (
+    ScatteredSegment,
+    Scattering,
+    medium_event_interaction,
+    sigma_s_at,
+)
+from mivol.transport.estimators.single_scattering.shadow_tables import VisibilityCache
+from mivol.transport.media.optical_depth import sum_optical_depth, transmittance
+from mivol.transport.media.ray_intervals import RaySegment, SegmentEnd, revisit_media, visit_media
+from mivol.transport.traversal.fine_ray import point_along
+from mivol.transport.traversal.strata import Strata
+
+__all__ = ["SingleScattering"]
+
+
+PROBE_DEPTH = 4.0
+"""Optical depth that a probe for derivatives adds over a medium (measured: the variance is flat between 2 and 8)."""
+
+
+@dataclass
+class _Flight:
+    """A segment that has been walked for one emitter.
+
+    Attributes:
+        end: where it ends.
+        reservoir: the candidates of scattering points.
+        proposal: that the reservoir was filled with.
+    """
+
+    end: SegmentEnd
+    reservoir: Reservoir
+    proposal: DistanceProposal
+
+
+class SingleScattering:
+    """The segment estimator of single scattering, at points drawn by weighted reservoir sampling.
+
+    Args:
+        direct: estimator of direct lighting at a point.
+        count: scattering points on a segment, in images; derivatives have one.
+        visibility_cache: rough visibility of emitters, which distances in images are drawn by; None for none.
+
+    Bias: none.
+    Variance: that of the distance, of one direction to an emitter and of one of the phase function; the points of a segment
+        share the emitter. It need not be finite near a point light.
+    Cost: one walk of the segment, and one of each shadow ray; where several media lie along a ray, one walk to each point.
+    """
+
+    ends_in_media = False
+
+    def __init__(self, direct: DirectLighting, count: int = 1, visibility_cache: VisibilityCache | None = None) -> None:
+        self.direct, self.media, self.emitters = direct, direct.media, direct.emitters
+        self.count, self.visibility_cache = count, visibility_cache
+        self.grid_control: GridControl | None = None
+        self.constant_control: mi.Spectrum | None = None
+
+    @property
+    def directions(self) -> str:
+        """Layout of the film's lanes: strata over tiles of pixels pay for phase samples, and not for small emitters."""
+        return "tiled" if self.emitters.samples_phase else "spread"
+
+    def draw(self, sampler: mi.Sampler, active: mi.Bool, strata: Strata | None) -> EventSamples:
+        return self.emitters.draw_samples(sampler, active, strata)
+
+    def prepare_derivatives(self, ray: mi.Ray3f) -> None:
+        """Find a control variate for the derivatives along camera rays; later calls keep the first one."""
+        if takes_grid_control(self.media):
+            if self.grid_control is None:
+                self.grid_control = build_grid_control(self.direct, self.media.bodies[0], CameraOrigins.of(ray))
+        elif self.constant_control is None:
+            self.constant_control = find_constant_control(self.media)
+
+    def replayed(self) -> Absorption:
+        return Absorption(self.media, drawn_by=self)
+
+    def estimate(self, segment: PathSegment, purpose: str, active: mi.Bool) -> SegmentEstimate:
+        if purpose == PICTURE:
+            return self._picture(segment, active)
+        flight = self._walk(segment, 1, PROBE_DEPTH, active)
+        samples = segment.samples.part(mi.UInt32(0), 1)
+        found = self._scatter(segment, flight, flight.reservoir.candidates[0], samples, active)
+        tau, controls = flight.reservoir.tau, (self.grid_control, self.constant_control)
+        shared = ScatteredSegment(self.media, segment, flight.end, tau, found, *controls, active)
+        light = SegmentLight(shared, dr.select(found.event.on, found.sigma_s * found.weight, 0), is_replayed=False)
+        return SegmentEstimate(flight.end, transmittance(tau), light, SegmentTransmittance(shared))
+
+    def _picture(self, segment: PathSegment, active: mi.Bool) -> SegmentEstimate:
+        """The mean of ``count`` points, without derivatives."""
+        count, width = self.count, dr.width(segment.ray)
+        flight = self._walk(segment, count, 0.0, active)
+
+        def light_of(number: mi.UInt32) -> mi.Spectrum:
+            candidate, samples = flight.reservoir.of(number), segment.samples.part(number, count)
+            found = self._scatter(segment, flight, candidate, samples, active)
+            return dr.select(found.event.on, found.sigma_s * found.weight, 0)
+
+        if count == 1:
+            light = light_of(mi.UInt32(0))
+        else:
+            _, light = dr.while_loop(
+                state=(dr.zeros(mi.UInt32, width), dr.zeros(mi.Spectrum, width)),
+                cond=lambda number, light: number < count,
+                body=lambda number, light: (number + 1, light + light_of(number)),
+                label="points that scatter",
+            )
+            light *= 1 / count
+        passed = RaySegment(segment.ray, segment.medium, flight.end.t)
+        term = TrackedTerm(light, active)
+        T = transmittance(flight.reservoir.tau)
+        return SegmentEstimate(flight.end, T, term, Transmittance(self.media, passed, active))
+
+    def _walk(self, segment: PathSegment, count: int, probe_depth: float, active: mi.Bool) -> _Flight:
+        """Choose an emitter, walk the segment to its end, and fill a reservoir with candidates of scattering points."""
+        ray, samples = segment.ray, segment.samples
+        chosen = self.emitters.choose(ray, samples.which_emitter)
+        reservoir = start_reservoir(self.media, samples.piece, dr.width(ray), count)
+        proposal = DistanceProposal(self.media, ray, chosen, self.visibility_cache, probe_depth)
+        end, reservoir = visit_media(self.media, ray, segment.medium, fill_reservoir(proposal), reservoir, active)
+        return _Flight(end, reservoir, proposal)
+
+    def _scatter(
+        self, segment: PathSegment, flight: _Flight, candidate: Candidate, samples: EventSamples, active: mi.Bool
+    ) -> Scattering:
+        """Draw a scattering point in a candidate, and estimate the direct light there."""
+        media, ray, proposal = self.media, segment.ray, flight.proposal
+        chosen, probes = proposal.chosen, proposal.probe_depth > 0
+        on = active & segment.scatters
+        event = sample_distance(proposal, candidate, flight.reservoir.total, samples.inside, on)
+        mei = medium_event_interaction(media, ray, event)
+        tau = event.tau
+        if not media.is_single:
+            front = RaySegment.upto(ray, segment.medium, event.t)
+            zero = [mi.Float(0) for _ in range(media.channels)]
+            tau = revisit_media(media, front, sum_optical_depth(), zero, event.on)
+        gain = dr.select(event.on, segment.beta * transmittance(tau) / event.pdf, 0)
+        vertex = MediumVertex(media, mei, point_along(ray, event.t))
+        # Roulette is for paths: the noise of one scattering is small, and that of roulette would show.
+        direct = self.direct.in_medium(vertex, chosen, samples, probes, event.on, not probes and media.tracks_shadows)
+        return Scattering(event, mei, gain, direct, sigma_s_at(media, ray, event, mei), samples.which_shadow_ray)

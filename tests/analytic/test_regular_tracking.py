@@ -1,0 +1,116 @@
+r"""The first collision with one part of an extinction: the optical depth to it is the one asked for, by the float64 twin.
+
+Bounds. Depths of walks are exact to BOUND of tau_scale. In the cell of the collision a cubic is inverted, to 1.4e-4 of the
+largest extinction times the length of the piece (derived in test_cubic.py), which is a cell's diagonal at most.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from hard_rays import BOUND
+from oracle import tau_scale, tau_twin
+from scattering_scenes import PLACE, aimed, rough_grid
+
+from mivol.fields.activation import activation_of
+from mivol.transport.estimators.flights.regular_tracking import collide_exactly
+from mivol.transport.media.activated_grid_extinction import ActivatedGridExtinction
+from mivol.transport.media.constant_extinction import ConstantExtinction
+from mivol.transport.media.extinction import ExactExtinction, RayInterval
+from mivol.transport.media.grid_extinction import GridExtinction
+from scenes import as_float32, make_lattice, to_lanes
+
+pytestmark = pytest.mark.usefixtures("variant_rgb")
+
+N, SCALE = 96, 1.5
+ROUNDING = 4 * 2.0**-23
+
+
+def rays(o: np.ndarray, d: np.ndarray) -> mi.Ray3f:
+    return mi.Ray3f(*to_lanes(o, d))
+
+
+def goals(seed: int = 1) -> np.ndarray:
+    """Optical depths of free flights."""
+    return as_float32(-np.log(np.random.default_rng(seed).uniform(0, 1, N)))
+
+
+def fly(
+    part: ExactExtinction, ray: mi.Ray3f, t0: object, t1: object, goal: np.ndarray, channel: object = 0, on: bool = True
+) -> np.ndarray:
+    ends = [mi.Float64(x) if np.ndim(x) else mi.Float64(float(x)) for x in (t0, t1)]
+    interval = RayInterval(ray, *ends, mi.Bool(on))
+    with dr.suspend_grad():
+        return np.array(collide_exactly(part, mi.Float(SCALE), interval, mi.Float(goal), mi.UInt32(channel)))
+
+
+@pytest.mark.parametrize("case", ["all of the ray", "part of the ray", "rgb", "empty blocks skipped"])
+def test_the_depth_to_a_collision_is_the_goal(case):
+    """Where the interval has more than the goal; where it has less there is none. ``rgb`` follows one channel a lane."""
+    (o, d), goal = aimed(3, N), goals()
+    t0, t1, channel = np.zeros(N), np.full(N, np.inf), np.zeros(N, int)
+    values = rough_grid(1)
+    if case == "part of the ray":
+        # The rays come from a distance of 3, and the box is within 1.8 of its middle: they begin and end in it.
+        t0, t1 = as_float32(np.random.default_rng(2).uniform([[2], [3]], [[3], [5]], (2, N)))
+    elif case == "rgb":
+        values, channel = rough_grid(1, 1.0) * as_float32([0.3, 2.0, 6.0]), np.arange(N) % 3
+    elif case == "empty blocks skipped":
+        values = rough_grid(1, 9.0, (5, 4, 24))
+        values[..., 3:21, :] = 0
+    part = GridExtinction("sigma_t", make_lattice(values, PLACE, skip=case == "empty blocks skipped"))
+    t = fly(part, rays(o, d), t0, t1, goal, channel)
+    of = np.arange(N), channel
+    whole = SCALE * tau_twin(values, PLACE, o, d, t0, t1)[of]
+    diagonal = np.linalg.norm(2 / np.array(values.shape[:3]))
+    allowed = SCALE * (BOUND * tau_scale(values, PLACE, o, d, t0, t1)[of] + 1.4e-4 * diagonal * values.max())
+    met = np.isfinite(t)
+    assert 0.2 < met.mean() < 0.9
+    assert np.all(met[whole > goal + allowed]) and not met[whole < goal - allowed].any()
+    reached = SCALE * tau_twin(values, PLACE, o, d, t0, np.where(met, t, 0))[of]
+    np.testing.assert_array_less(np.abs(reached - goal)[met], allowed[met])
+    assert np.all((t >= t0)[met]) and np.all((t <= t1)[met])
+
+
+def test_constants_are_left_after_the_goal_over_the_extinction():
+    """t0 + goal / (scale sigma), up to the end of the interval; vacuum and lanes that are off have no collision."""
+    ray, goal = rays(np.zeros((1, 3)), np.float64([[0, 0, 1]])), np.array([0.25, 1.0, 4.0])
+    grey = ConstantExtinction("sigma_t", mi.Float(0.5))
+    expected = 2 + goal / (SCALE * 0.5)
+    np.testing.assert_allclose(fly(grey, ray, 2, np.inf, goal), expected, rtol=ROUNDING)
+    assert np.isfinite(fly(grey, ray, 2, 4, goal)).tolist() == [True, True, False]
+    assert np.isinf(fly(grey, ray, 2, np.inf, goal, on=False)).all()
+    assert np.isinf(fly(ConstantExtinction("sigma_t", mi.Float(0)), ray, 2, np.inf, goal)).all()
+    rgb = ConstantExtinction("sigma_t", mi.Color3f(0, 0.5, 4))
+    found = fly(rgb, ray, 2, np.inf, np.float64([1, 1, 1]), np.arange(3))
+    np.testing.assert_allclose(found, [np.inf, 2 + 1 / (SCALE * 0.5), 2 + 1 / (SCALE * 4)], rtol=ROUNDING)
+
+
+def test_an_activation_makes_the_extinction():
+    """exp of the logarithm of 2: an extinction of 2 between 1 and 2, and none outside, where exp of 0 would be 1."""
+    values = np.full((2, 3, 2, 1), np.log(2))
+    part = ActivatedGridExtinction("sigma_t", make_lattice(values, np.eye(4)), activation_of("exp"))
+    goal = np.array([0.3, 1.5, 2.9, 3.1])
+    found = fly(part, rays(np.float64([[-1, 0.4, 0.3]]), np.float64([[1, 0, 0]])), 0, np.inf, goal)
+    # An exponential of a few roundings, and a goal and a distance of about 2.
+    np.testing.assert_allclose(found, [1.1, 1.5, 1 + 2.9 / 3, np.inf], rtol=2 * ROUNDING)
+
+
+def test_lanes_that_are_off_do_not_collide_with_a_grid():
+    part = GridExtinction("sigma_t", make_lattice(rough_grid(1), PLACE))
+    assert np.isinf(fly(part, rays(*aimed(3, N)), 0, np.inf, np.full(N, 1e-3), on=False)).all()
+
+
+def test_a_mono_variant_flies_through_the_luminance():
+    """Of extinctions of 0.2, 1 and 3 in the channels: 0.9742, as Mitsuba weighs them (ITU-R BT.709)."""
+    try:
+        mi.set_variant("llvm_ad_mono")
+        values = np.broadcast_to([0.2, 1.0, 3.0], (2, 2, 2, 3))
+        part = GridExtinction("sigma_t", make_lattice(values, np.eye(4)))
+        t = fly(part, rays(np.float64([[-1, 0.4, 0.3]]), np.float64([[1, 0, 0]])), 0, np.inf, np.array([0.3, 1.0]))
+    finally:
+        mi.set_variant("llvm_ad_rgb")
+    sigma = 0.212671 * 0.2 + 0.715160 * 1.0 + 0.072169 * 3.0
+    np.testing.assert_allclose(t, 1 + np.array([0.3, 1.0]) / (SCALE * sigma), rtol=2 * ROUNDING)

@@ -1,0 +1,70 @@
+"""Weights of a visibility cache, against Beer's law.
+
+No weight can bias an image, since weights only guide the sampling of distances; here it is tested that they are right.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from scattering_scenes import aimed, pencils, smoke, sun
+
+from mivol.scene.build import build_media
+from mivol.scene.needs import find_needs
+from mivol.scene.plan import make_plan
+from mivol.scene.survey import survey_scene
+from mivol.transport.estimators.lighting.emitters import SceneEmitters
+from mivol.transport.estimators.single_scattering.shadow_tables import (
+    FLOOR,
+    RAY_FRACTION,
+    VisibilityCache,
+    build_visibility_cache,
+)
+from mivol.transport.path.estimators import Settings
+from mivol.transport.traversal.coarse_grid import coarsen_grid
+from scenes import centred
+
+pytestmark = pytest.mark.usefixtures("variant_rgb")
+
+SIZE = (9, 14, 11)
+
+TWO = centred(2 * np.eye(3))
+
+
+@pytest.mark.parametrize("occupied", [None, 1.0])
+@pytest.mark.parametrize("shift", [0, 1, 2, 3])
+def test_weights_are_those_of_beer(shift, occupied):
+    """In a grid of one value light from above is dimmed by the depth of a block's middle, however coarse the grid."""
+    box, _ = smoke(np.full(SIZE, 0.8, np.float32), to_world=TWO)
+    emitter, _ = sun([0, 0, -1.0])
+    seen = pencils({"smoke": box, "emitter": emitter}, *aimed(3))
+    with dr.suspend_grad():
+        needs = find_needs(seen.scene, seen.scene.sensors()[0], survey_scene(seen.scene))
+        settings = Settings(max_depth=2)
+        media = build_media(seen.scene, needs, make_plan(needs, settings), survey_scene(seen.scene))
+        blocks = np.array([(n >> shift) + 1 for n in SIZE])
+        # As many rays as ask for this lattice and for none that is finer.
+        shade = build_visibility_cache(
+            media, SceneEmitters(seen.scene), int(np.ceil(1.001 * blocks.prod() / RAY_FRACTION)), occupied, coarsen_grid
+        )
+    assert shade.blocks == tuple(blocks)
+    middle = ((np.arange(blocks[0]) << shift) + 0.5 * (1 << shift) - 0.5) / SIZE[0]
+    depth = 2 * (1 - np.clip(middle, 0.25 / SIZE[0], 1 - 0.25 / SIZE[0]))
+    weights = np.array(shade.weights).reshape(blocks)
+    # The box is 2 high; the optical depth is known to 2e-6 of itself, and float32 adds a few roundings.
+    np.testing.assert_allclose(weights, np.broadcast_to((np.exp(-0.8 * depth) + FLOOR)[:, None, None], blocks), rtol=1e-5)
+
+
+@pytest.mark.parametrize("shift", [0, 1, 2])
+def test_a_cell_has_the_weight_of_its_block(shift):
+    """Cells begin at a lower node of -1 and stand in z, y, x; of two emitters each lane has its own."""
+    blocks = tuple((n >> shift) + 1 for n in SIZE)
+    weights = np.random.default_rng(shift).random((*blocks, 2), dtype=np.float32)
+    cache = VisibilityCache(mi.Float(weights.ravel()), blocks, shift, 2)
+    lower = np.stack(np.meshgrid(*(np.arange(-1, n) for n in SIZE), indexing="ij"), axis=-1).reshape(-1, 3)
+    number = np.arange(len(lower)) % 2
+    found = cache.at(mi.Vector3i(*lower[:, ::-1].T), mi.UInt32(number), mi.Bool(True))
+    z, y, x = (lower.T + 1) >> shift
+    assert np.array_equal(np.array(found), weights[z, y, x, number])

@@ -1,0 +1,195 @@
+"""Transmittance from a few look-ups: its mean, its variance and what the blocks of a grid hold, against exact walks.
+
+Every estimate lies in [0, 1], so its variance is T (1 - T) at most, whatever its distribution: Bernstein's inequality then
+bounds the error of a mean of R of them by sqrt(2 v q / R) + q / (3 R) but for a chance of 2 exp(-q).
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from false_alarms import assert_same_mean, assert_within, fresh
+from scattering_scenes import PLACE, aimed, assert_same_images, cases, close_up, mivol, point, rough_grid, smoke, sun
+
+import scenes
+from mivol.experiments.script import explain
+from mivol.transport.estimators.flights import tracking
+from mivol.transport.estimators.flights.tracking import residual_ratio_tracking
+from mivol.transport.media.grid_integral import integrate_segment
+from mivol.transport.traversal.block_ranges import find_block_ranges
+from mivol.transport.traversal.lattice import Lattice, clip
+from mivol.transport.traversal.random_numbers import seed_pcg32
+from mivol.validate.moments import Moments
+from scenes import as_float32, refused
+
+pytestmark = pytest.mark.usefixtures("variant_rgb")
+
+Q = 25.0
+"""2 exp(-25) = 3e-11: the chance of each of the means that are compared here, some 100 in a test."""
+
+RAYS, REPEATS = 32, 8192
+
+
+def steps(shape: tuple[int, ...], top: float) -> np.ndarray:
+    """0 or ``top``, in cubes of three voxels: every edge is sharp."""
+    z, y, x = np.indices(shape) // 3
+    return as_float32(top * ((x + y + z) % 2))[..., None]
+
+
+def one_dense(shape: tuple[int, ...], top: float) -> np.ndarray:
+    values = np.zeros((*shape, 1), np.float32)
+    values[shape[0] // 2, shape[1] // 2, shape[2] // 2] = top
+    return values
+
+
+FIELDS = {
+    "rough": lambda: rough_grid(1, 4.0, (17, 21, 30)),
+    "edges": lambda: steps((20, 19, 18), 3.0),
+    "empty": lambda: np.zeros((12, 12, 12, 1), np.float32),
+    "one voxel": lambda: np.full((1, 1, 1, 1), 0.7, np.float32),
+    "a sheet of voxels": lambda: rough_grid(2, 2.0, (1, 9, 33)),
+    "one dense voxel": lambda: one_dense((16, 16, 16), 500.0),
+    "tau 1e-3": lambda: rough_grid(3, 1e-3, (12, 10, 9)),
+    "tau 1e3": lambda: rough_grid(4, 2e3, (12, 10, 9)),
+    "rgb": lambda: rough_grid(5, 1.0, (18, 9, 10)) * as_float32([0.2, 2.0, 6.0]),
+}
+
+
+def grid(values: np.ndarray, shift: int | None = None) -> Lattice:
+    lattice = Lattice(mi.TensorXf(np.ascontiguousarray(values)), np.array(PLACE))
+    lattice.block_ranges = find_block_ranges(lattice.values, shift)
+    return lattice
+
+
+def start(number: float) -> mi.Float:
+    """What generators are seeded with, of this round of seeds: a number in [0, 1)."""
+    return mi.Float((number + fresh(0) * 0.6180339887498949) % 1)
+
+
+def estimates(lattice: Lattice, scale: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
+    """[channel, repeat, ray] estimates along random rays, and [channel, ray] exact transmittances in float64."""
+    o, d = (np.tile(v, (REPEATS, 1)).T for v in aimed(7, RAYS))
+    o, d = mi.Point3f(o), mi.Vector3f(d)
+    n, segment = RAYS * REPEATS, clip(lattice, o, d, 0, dr.inf)
+    found, _ = residual_ratio_tracking(lattice, segment, mi.Float(scale), seed_pcg32(start(0.3), n), mi.Bool(True))
+    exact = integrate_segment(lattice, lattice.values.array, segment)
+    T = [np.exp(-scale * np.array(t, dtype=np.float64)[:RAYS]) for t in exact]
+    return np.array([np.array(f, dtype=np.float64).reshape(REPEATS, RAYS) for f in found]), np.array(T)
+
+
+def bound(variance: np.ndarray, count: int) -> np.ndarray:
+    """Of the error of a mean of `count` estimates of a `variance` of at most this, but for a chance of 2 exp(-Q)."""
+    return np.sqrt(2 * variance * Q / count) + Q / (3 * count)
+
+
+def assert_means(found: np.ndarray, T: np.ndarray, variance: np.ndarray, count: int) -> None:
+    # Exact walks err by 2e-6 of the optical depth, which is T tau <= 0.4 of the transmittance.
+    chance = 2 * np.exp(-Q) * np.size(found)
+    assert_within(found - T, bound(variance, count) + 1e-6, chance=chance, what="transmittances")
+
+
+@pytest.mark.statistical
+@pytest.mark.parametrize("name", cases(FIELDS, ["empty", "one voxel", "a sheet of voxels", "one dense voxel", "tau 1e-3"]))
+def test_estimates_have_the_exact_mean(name):
+    """Of each ray, and of all rays together, which tells a bias sqrt(32) times smaller. Hard case 1."""
+    found, T = estimates(grid(FIELDS[name]()))
+    assert found.min() >= 0 and found.max() <= 1
+    variance = T * (1 - T)
+    assert_means(found.mean(axis=1), T, variance, REPEATS)
+    assert_means(found.mean(axis=(1, 2)), T.mean(axis=1), variance.mean(axis=1), RAYS * REPEATS)
+
+
+@pytest.mark.statistical
+def test_a_scale_counts():
+    found, T = estimates(grid(FIELDS["rough"]()), scale=0.4)
+    assert_means(found.mean(axis=1), T, T * (1 - T), REPEATS)
+
+
+def test_nothing_is_noisy_where_nothing_varies():
+    """Blocks of one value are known without a look: the estimate is exact, to rounding."""
+    found, T = estimates(grid(np.full((9, 9, 9, 1), 0.5, np.float32)))
+    # 30 steps, each of which rounds an optical depth of 1 by 6e-8.
+    assert np.allclose(found, T[:, None], rtol=5e-6)
+
+
+@pytest.mark.statistical
+def test_variance_is_as_derived():
+    """T^2 (exp(int E(c - m)^2 / (kappa (M - m)) dt) - 1) along the x axis, through one block whose values rise along x."""
+    values = np.zeros((7, 7, 7, 1), np.float32)
+    values[..., 0] = 0.1 + 0.15 * np.arange(7)
+    lattice, n = grid(values, shift=3), 1 << 19
+    o = mi.Point3f(dr.full(mi.Float, -2, n), mi.Float(0), mi.Float(0))
+    segment = clip(lattice, o, mi.Vector3f(1, 0, 0), 0, dr.inf)
+    found, _ = residual_ratio_tracking(lattice, segment, mi.Float(1), seed_pcg32(start(0.7), n), mi.Bool(True))
+    found = np.array(found[0], dtype=np.float64)
+    f = (np.arange(1000) + 0.5) / 1000
+    low, high = values[0, 0, :-1, 0] - 0.1, values[0, 0, 1:, 0] - 0.1
+    # Two half voxels at the ends, of constant value; 2 / 7 of a length a cell.
+    square = np.mean((1 - f) * low[:, None] ** 2 + f * high[:, None] ** 2, axis=1).sum() + 0.5 * (low[0] ** 2 + high[-1] ** 2)
+    T = np.exp(-values[0, 0, :, 0].sum() * 2 / 7)
+    variance = T**2 * np.expm1(square * 2 / 7 / (tracking.LOOKUP_RATE * 0.9))
+    assert T > 3 * tracking.FAINT * 0.9
+    # The midpoints of the square's integral err by 1e-6, optical depths of 1 by 2e-6.
+    assert_same_mean(Moments.of((found - T) ** 2), variance, rounding=1e-5 * variance, what="variances")
+
+
+# -- Pictures ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+@pytest.mark.statistical
+@pytest.mark.parametrize("name", cases(["rough", "rgb"], ["rough"]))
+def test_pictures_have_the_same_mean(name):
+    """A sky and an emitter, exact and estimated shadows."""
+    parts = {"smoke": smoke(FIELDS[name]() * 0.5, name="hg", g=0.4)[0], "bulb": point([1.5, -1.2, 1.6])[0]}
+    scene = close_up({**parts, "sky": scenes.sky(0.3)}, res=8)
+    one, other = mivol(shadows="estimated"), mivol(shadows="exact")
+    assert_same_images(scene, (64, 64), ours=one, stock=other)
+    # Of one seed the two differ by the estimates alone, which err by per cents: they are not exact shadows by another name.
+    image, exact = (scenes.render(scene, shadows, 4, seed=1) for shadows in (one, other))
+    assert np.abs(image - exact).max() > 1e-3 * exact.max()
+
+
+def test_gradients_have_exact_shadows():
+    """The same numbers but for the order of sums, whatever shadows pictures have; estimates would move them by per cents."""
+    scene = close_up({"smoke": smoke(rough_grid(1))[0], "sky": scenes.sky(0.3)}, res=4)
+    params, key, found = mi.traverse(scene), "smoke.interior_medium.sigma_t.data", []
+    for shadows in ("exact", "estimated"):
+        dr.enable_grad(params[key])
+        integrator = mi.load_dict(mivol(shadows=shadows))
+        integrator.render_backward(scene, params, mi.TensorXf(np.ones((4, 4, 3), np.float32)), seed=3, spp=4)
+        found.append(np.array(dr.grad(params[key])))
+        dr.disable_grad(params[key])
+    assert np.allclose(*found, rtol=1e-4, atol=1e-6)
+
+
+def test_fine_grids_are_looked_up():
+    """The plan says which shadows are estimated, and why."""
+    emitter, fine = scenes.sky(0.3), np.full((160, 160, 8, 1), 0.1, np.float32)
+    coarse, dense = (explain(close_up({"smoke": smoke(v)[0], "sky": emitter}, res=4), 2) for v in (fine[::8, ::8], fine))
+    assert "shadows of smoke" in coarse and "estimated" not in coarse
+    assert "estimated" in dense and "328 occupied cells" in dense
+    sparse = fine.copy()
+    sparse[8:] = 0
+    assert "estimated" not in explain(close_up({"smoke": smoke(sparse)[0], "sky": emitter}, res=4), 2)
+
+
+def test_one_grid_beside_fog_is_estimated():
+    """Shadows of a scene are estimated where some medium has blocks, and noise tells: both pictures have the same seed."""
+    fog = scenes.ball_of(scenes.medium("homogeneous", 0.5), (4, 0, 0), 0.5)
+    scene = close_up({"smoke": smoke(rough_grid(1))[0], "fog": fog, "sun": sun([0.3, 0.2, -1.0])[0]}, res=4)
+    exact, estimated = (
+        np.array(mi.render(scene, integrator=mi.load_dict(mivol(shadows=shadows)), spp=4, seed=1))
+        for shadows in ("exact", "estimated")
+    )
+    assert np.abs(estimated - exact).max() > 1e-3 * exact.max()
+
+
+def test_words_for_shadows():
+    scene = close_up({"smoke": smoke(rough_grid(1))[0], "sky": scenes.sky(0.3)}, res=4)
+    with refused("auto, exact, estimated or grid"):
+        mi.render(scene, integrator=mi.load_dict(mivol(shadows="soft")), spp=1)
+    with refused("estimates are noise"):
+        mi.render(scene, integrator=mi.load_dict(mivol(shadows="estimated", deterministic=True)), spp=1)

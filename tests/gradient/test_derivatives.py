@@ -1,0 +1,230 @@
+"""Paths that branch where they first collide: replays find the light that was found, and means are those of whole paths."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from false_alarms import assert_precise, assert_same_mean, difference, fresh
+from scattering_gradients import BATCHES, release, watched
+from scattering_scenes import PLACE, cases, close_up, mivol, rough_grid, sun
+
+from mivol.experiments.script import explain
+from mivol.scene import plan
+from mivol.scene.needs import find_needs
+from mivol.transport.estimators.scores import Replay
+from mivol.transport.path import derivatives
+from mivol.transport.path.derivatives import count_branches
+from mivol.transport.path.estimators import Settings
+from mivol.validate.moments import Moments
+from mivol.validate.statistics import Estimate
+from scenes import ball_of, box_of, camera, grid_volume, medium, skip_recorded_grids_on_a_gpu, sky
+
+pytestmark = pytest.mark.usefixtures("variant_rgb")
+
+MEDIUM = "smoke.interior_medium."
+KEYS = {
+    "density": MEDIUM + "sigma_t.data",
+    "albedo": MEDIUM + "albedo.data",
+    "g": MEDIUM + "phase_function.g",
+    "sun": "sun.irradiance.value",
+    "floor": "floor.bsdf.reflectance.value",
+}
+
+
+def smoky(density: np.ndarray | None = None, **parts: dict) -> mi.Scene:
+    """Peaked smoke under the sun that many camera rays miss or pass."""
+    density = rough_grid(4, 3.0) * (np.arange(6) < 3)[None, None, :, None] if density is None else density
+    albedo = grid_volume("mivol_voxels", 0.9 * rough_grid(5, 1.0, (3, 3, 3)), PLACE)
+    interior = medium("mivol_medium", grid_volume("mivol_voxels", density, PLACE), albedo, phase={"type": "mivol_hg", "g": 0.8})
+    return close_up({"smoke": box_of(interior, PLACE), "sun": sun([0.3, 0.2, -1.0])[0], **parts}, res=8)
+
+
+def floor() -> dict:
+    down = mi.ScalarTransform4f().translate([0, 0, -1.3]).scale(3)
+    return {"type": "rectangle", "to_world": down, "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.6}}}
+
+
+def coloured() -> mi.Scene:
+    """Each flight draws a channel."""
+    density = rough_grid(4, 3.0)
+    return smoky(np.concatenate([density, 0.2 * density, 2 * density], axis=-1), lit=sky(0.3))
+
+
+def burning() -> mi.Scene:
+    """A medium emits beside a floor, and its light is drawn where paths scatter."""
+    interior = medium(
+        "mivol_medium",
+        grid_volume("mivol_voxels", rough_grid(4, 3.0), PLACE),
+        0.7,
+        emission=grid_volume("mivol_voxels", rough_grid(6, 1.0, (3, 3, 3)), PLACE),
+    )
+    return close_up({"smoke": box_of(interior, PLACE), "floor": floor()}, res=8)
+
+
+def glassy() -> mi.Scene:
+    """Behind a boundary that refracts, beside a box: a path may collide on its first segment, or after it was bent."""
+    ball = ball_of(medium("mivol_medium", 1.5, 0.8), (0.3, 1.7, 0.4), 0.5) | {"bsdf": {"type": "dielectric", "int_ior": 1.3}}
+    return smoky(ball=ball, lit=sky(0.3))
+
+
+SCENES = {"sun": smoky, "floor": lambda: smoky(floor=floor()), "rgb": coloured, "fire": burning, "glass": glassy}
+
+
+def back(scene: mi.Scene, key: str, spp: int, seed: int, depth: int = 5) -> np.ndarray:
+    """The derivative of the mean image."""
+    params, variable = watched(scene, key)
+    w = mi.TensorXf(np.full((8, 8, 3), 1 / 192, dtype=np.float32))
+    mi.load_dict(mivol(max_depth=depth, rr_depth=3)).render_backward(scene, params, w, seed=seed, spp=spp)
+    found = np.array(dr.grad(variable), dtype=np.float64)
+    release(scene, key, variable)
+    return found
+
+
+@pytest.fixture
+def replays(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, np.ndarray, np.ndarray, np.ndarray]]:
+    """Of each replay its name, the light that it began with and what it left of it, and d loss by that, a row a channel."""
+    seen: list[tuple] = []
+    monkeypatch.setattr(derivatives, "BALANCE", 4.0)  # most camera rays of these scenes collide: two branches and more
+
+    def watch(name: str) -> None:
+        walk = getattr(derivatives, name)
+
+        def watched_walk(*args: object) -> tuple:
+            score, rest = walk(*args)
+            if isinstance(score, Replay):
+                dr.eval(score.L)
+                seen.append((name, np.array(args[-1].L), np.array(score.L), np.array(args[-1].dL)))
+            return score, rest
+
+        monkeypatch.setattr(derivatives, name, watched_walk)
+
+    watch("walk_stem")
+    watch("walk_branch")
+    return seen
+
+
+@pytest.mark.parametrize("name", cases(SCENES, slow=("rgb", "fire", "glass")))
+def test_a_replay_finds_the_light_that_was_found(name: str, replays: list) -> None:
+    """Branches in another order, which leave nothing of it but rounding; stems leave the mean light of their branches."""
+    back(SCENES[name](), KEYS["density"], 16, fresh(3), depth=7)
+    (first, whole, left, _), (second, light, rest, _) = replays
+    assert (first, second) == ("walk_stem", "walk_branch")
+    assert len(np.unique(light[0])) > 100
+    # Some 20 terms of a path are subtracted one by one.
+    assert np.abs(rest).max() <= 20 * 2**-24 * np.abs(light).max()
+    stems = np.count_nonzero(left.sum(axis=0) > 20 * 2**-24 * whole.max())
+    k = round(light.shape[1] / stems)
+    assert k in (2, 3, 4)
+    np.testing.assert_allclose(left.sum(axis=1), light.sum(axis=1) / k, rtol=1e-5)
+
+
+@pytest.mark.parametrize("depth", [3, 6])
+def test_light_is_linear_in_the_sun(depth: int, replays: list) -> None:
+    """The derivative by the sun, times the sun, is the light of all stems: to float32 sums in another order."""
+    scene = smoky()
+    bright = float(np.mean(mi.traverse(scene)[KEYS["sun"]]))
+    found = bright * np.sum(back(scene, KEYS["sun"], 16, fresh(3), depth))
+    _, light, _, dL = replays[0]
+    assert found == pytest.approx(np.sum(light * dL), rel=1e-4)
+
+
+def test_branches_of_a_stem_differ(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Their random numbers do, and those of any two stems."""
+    made = []
+    real = derivatives._Branches.of.__func__
+    monkeypatch.setattr(derivatives._Branches, "of", classmethod(lambda cls, *args: made.append(real(cls, *args)) or made[0]))
+    monkeypatch.setattr(derivatives, "BALANCE", 100.0)
+    back(smoky(), KEYS["density"], 64, fresh(3))
+    stem, seeds = np.array(made[0].stem), np.array(made[0].seeds[:2])
+    assert np.array_equal(np.unique(stem, return_counts=True)[1], np.full(len(stem) // 4, 4))
+    assert np.unique(seeds, axis=1).shape[1] == seeds.shape[1]
+
+
+def test_branches_walk_side_by_side_by_their_length() -> None:
+    """The longest first; those of one length, or longer than 16 bits can say, in the order that they had, and each once."""
+    depth = np.array([3, 1, 200, 3, 0, 12, 70_000, 11, 65_536, 5000])
+    order = np.array(derivatives._by_length(mi.UInt32(depth)))
+    assert order.tolist() == [6, 8, 9, 2, 5, 7, 0, 3, 1, 4]
+
+
+@pytest.mark.parametrize(("collided", "count"), [(1000, 1), (260, 2), (100, 2), (90, 3), (20, 4), (1, 4)])
+def test_the_fewer_paths_collide_the_more_branches_they_have(collided: int, count: int) -> None:
+    """sqrt(0.6 / share), to the nearest, at most four: never more branches than stems."""
+    assert count_branches(1000, collided) == count
+    assert count * collided <= 1000
+
+
+def test_where_no_path_collides_probes_are_alone(replays: list) -> None:
+    """A density of 0 has no branches, and derivatives all the same."""
+    found = back(smoky(np.zeros((4, 5, 6, 1))), KEYS["density"], 64, fresh(3))
+    assert [name for name, *_ in replays] == ["walk_stem"]
+    assert np.abs(found).max() > 0
+
+
+def test_a_plan_takes_them_where_paths_fly_freely(monkeypatch: pytest.MonkeyPatch) -> None:
+    """And where a sampler has numbers without strata; pictures and recordings have none."""
+    scene = smoky()
+    facts = find_needs(scene, scene.sensors()[0])
+    choose = lambda facts, depth, segment="free_flight": plan.choose_branches(facts, Settings(max_depth=depth), segment)[0]  # noqa: E731
+    assert choose(facts, 3) and choose(facts, -1)
+    assert not choose(facts, 1) and not choose(facts, 3, "single_scattering")
+    assert not choose(replace(facts, are_samples_independent=False), 3)
+    assert "paths branch where they first collide" in explain(scene, 6)
+
+
+@pytest.mark.slow
+@pytest.mark.statistical
+@pytest.mark.parametrize(
+    ("name", "key", "depth"),
+    [("sun", "density", 4), ("sun", "albedo", 4), ("sun", "g", 4), ("sun", "density", -1), ("floor", "floor", 4),
+     ("rgb", "density", 4), ("fire", "density", 4), ("glass", "density", -1)],
+)  # fmt: skip
+def test_they_keep_the_mean(name: str, key: str, depth: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of derivatives by whole paths, along a random direction in the upper half."""
+    scene = SCENES[name]()
+    shape = np.shape(mi.traverse(scene)[KEYS[key]])
+    v = np.random.default_rng(2).uniform(0.5, 1.5, shape) if len(shape) == 4 else np.ones(shape)
+    if len(shape) == 4:
+        v[: shape[0] // 2] = 0
+
+    def along(spp: int) -> Estimate:
+        found = [np.sum(back(scene, KEYS[key], spp, fresh(k), depth) * v) for k in range(BATCHES)]
+        return Estimate.of(Moments.of(np.array(found)[:, None]))
+
+    monkeypatch.setattr(derivatives, "BALANCE", 2.0)
+    found = along(512)
+    monkeypatch.setattr(plan, "choose_branches", lambda *_: (False, []))
+    whole = along(1024)
+    assert_same_mean(found, whole, rounding=1e-4 * np.abs(whole.mean), what="derivative")
+    assert_precise(difference(found, whole), 0.1 * np.abs(whole.mean), what="derivative")
+
+
+@pytest.mark.slow
+def test_a_recording_walks_whole_paths(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a camera that moves its seed: what an ordinary step finds without branches."""
+    skip_recorded_grids_on_a_gpu()
+    values = rough_grid(4, 3.0).astype(np.float32)
+    interior = medium("mivol_medium", grid_volume("mivol_voxels", values, PLACE), 0.8)
+    sensor = camera((2.0, 1.5, 3.0), (0.0, 0.0, 0.0), res=8, fov=45.0)
+    scene = mi.load_dict({"type": "scene", "smoke": box_of(interior, PLACE), "lit": sky(1.0), "sensor": sensor})
+    integrator, params = mi.load_dict(mivol(max_depth=4)), mi.traverse(scene)
+
+    def step(scene: mi.Scene, integrator: mi.Integrator, params: mi.SceneParameters, x: mi.TensorXf, seed: mi.UInt32):
+        dr.enable_grad(x)
+        params[KEYS["density"]] = x
+        params.update()
+        dr.backward(dr.mean(dr.square(mi.render(scene, params, integrator=integrator, spp=16, seed=seed)), axis=None))
+        return dr.grad(x)
+
+    mi.render(scene, integrator=integrator, spp=1)  # a recording knows what was read before
+    frozen = dr.freeze(step)
+    replayed = [np.array(frozen(scene, integrator, params, mi.TensorXf(values), mi.UInt32(call))) for call in range(3)]
+    monkeypatch.setattr(plan, "choose_branches", lambda *_: (False, []))
+    for call, found in enumerate(replayed):
+        plain = np.array(step(scene, integrator, params, mi.TensorXf(values), mi.UInt32(call)))
+        # The order of sums over threads is not fixed: float32 sums of some ten thousand terms.
+        assert np.abs(found - plain).max() <= 1e-4 * np.abs(plain).max()
