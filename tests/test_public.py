@@ -50,7 +50,7 @@ def untyped(function: Function) -> list[str]:
 
 @cache
 def said_in(room: Path) -> set[str]:
-    """Names of the methods that some class in a folder documents: a protocol says it once for its classes, in inner folders too."""
+    """Names of the methods that some class in a folder documents: a protocol says it once, also for inner folders."""
     trees = [tree_of(path) for path in room.glob("*.py")]
     classes = [node for tree in trees for node in tree.body if isinstance(node, ast.ClassDef)]
     return {n.name for node in classes for n in node.body if isinstance(n, Function) and ast.get_docstring(n)}
