@@ -14,7 +14,7 @@ from pathlib import Path
 
 import mivol  # noqa: F401  (chooses LLVM before anything loads it)
 from mivol.files import layers, read_exr, read_volume
-from mivol.report import figures, show
+from mivol.report import figures, pixel_scale
 from mivol.report.record import RunRecord, read_metrics, read_record
 from mivol.validate.metrics import psnr
 
@@ -48,20 +48,20 @@ def noise_of(folder: Path, record: RunRecord, name: str, reference: np.ndarray) 
 
 def show_views(rows: list[list[Axes]], views: list[tuple[str, np.ndarray, np.ndarray]]) -> None:
     """A row for each view: reference, prediction, difference."""
-    scale = show.scale_of(*(reference for _, reference, _ in views))
-    signed = show.Scale("signed", -0.2 * scale.high, 0.2 * scale.high)
+    scale = pixel_scale.scale_of(*(reference for _, reference, _ in views))
+    signed = pixel_scale.Scale("signed", -0.2 * scale.high, 0.2 * scale.high)
     for row, (_, reference, render) in zip(rows, views, strict=True):
         texts = ("not seen (Mitsuba)", f"predicted, {psnr(render, reference):.1f} dB", f"difference, ±{0.2 * scale.high:.2g}")
         pictures = ((reference, scale), (render, scale), (render - reference, signed))
         for axes, (image, how), text in zip(row, pictures, texts, strict=True):
-            put(axes, show.pixels(image, how), text)
+            put(axes, pixel_scale.pixels(image, how), text)
 
 
 def show_slices(grid: dict[str, Axes], folder: Path, record: RunRecord) -> None:
     """The slice of truth and reconstruction."""
     plane = "xz" if record.config["views"].get("up") == "z" else "xy"
     grids = {v.role: (read_volume(folder / v.path).values, v.size) for v in record.volumes}
-    cuts = {role: show.slices(*grids[role]) for role in ("truth", "reconstruction")}
+    cuts = {role: pixel_scale.slices(*grids[role]) for role in ("truth", "reconstruction")}
     top = float(cuts["truth"].images[plane].max())
     for role, cut in cuts.items():
         image = mpl.colormaps["magma"](np.clip(cut.images[plane][..., 0] / top, 0, 1))

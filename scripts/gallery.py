@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import mivol  # noqa: F401  (chooses LLVM before anything loads it)
-from mivol.report.gallery import Picture, views_of, volumes_of
+from mivol.report.page_images import Picture, views_of, volumes_of
 from mivol.report.record import read_record
 
 from PIL import Image

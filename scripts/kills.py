@@ -34,7 +34,7 @@ from typing import Any
 
 from mivol import cli, threads
 from mivol.files import read_exr, write_volume
-from mivol.files.archive import read_archive
+from mivol.files.npy import read_archive
 
 import numpy as np
 

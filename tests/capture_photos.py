@@ -9,7 +9,7 @@ import numpy as np
 from mivol.bench.studies.radiance_field.room import cameras_of, image_of
 from mivol.files import write_png
 from mivol.photos import Camera, Photo
-from mivol.photos.picture import decode_srgb
+from mivol.photos.photo_file import decode_srgb
 from mivol.photos.transforms import write_transforms
 
 SIZE = (32, 24)

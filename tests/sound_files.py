@@ -223,7 +223,7 @@ def _read_stack(path: Path) -> object:
 
 
 def _read_archive(path: Path) -> object:
-    from mivol.files.archive import read_archive
+    from mivol.files.npy import read_archive
 
     return read_archive(path)
 
@@ -235,13 +235,13 @@ def _read_columns(path: Path) -> object:
 
 
 def _read_picture(path: Path) -> object:
-    from mivol.photos.picture import read_picture
+    from mivol.photos.photo_file import read_picture
 
     return read_picture(path, "srgb")
 
 
 def _read_mask(path: Path) -> object:
-    from mivol.photos.picture import read_mask
+    from mivol.photos.photo_file import read_mask
 
     return read_mask(path)
 

@@ -15,8 +15,7 @@ from mivol.experiments.run_folder import RunFolder
 from mivol.experiments.task import Watcher
 from mivol.photos import Camera, Photos, between, past, turntable
 from mivol.report.record import Image
-from mivol.report.video import WITHOUT_FFMPEG, film_suffix, write_video
-from mivol.report.volume_film import volume_frames
+from mivol.report.video import WITHOUT_FFMPEG, film_suffix, volume_frames, write_video
 
 __all__ = ["Film", "film_of_volume", "plan_film"]
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from mivol.files import write_png
 from mivol.photos import Photo
-from mivol.photos.picture import SPACES
+from mivol.photos.photo_file import SPACES
 from mivol.report.record import CODES, Image
 from mivol.validate.images import METRICS, Quality
 

@@ -23,8 +23,8 @@ from mivol.optim.field_view import FieldView, render_view
 from mivol.optim.loop import Fit
 from mivol.optim.radiance_problem import RadianceProblem
 from mivol.photos import Camera, Photo, Photos
-from mivol.photos.picture import SPACES, decode_srgb
-from mivol.report.depth import depth_pixels, normal_pixels, normals_of_depth
+from mivol.photos.photo_file import SPACES, decode_srgb
+from mivol.report.pixel_scale import depth_pixels, normal_pixels, normals_of_depth
 from mivol.report.record import Image, Table, Volume
 from mivol.validate.images import METRICS, Quality, colour_fitted, judge, score
 

@@ -16,8 +16,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from mivol.errors import MivolError
-from mivol.files.atomic import disk_faults, sweep
-from mivol.files.lock import locked
+from mivol.files.atomic import disk_faults, locked, sweep
 from mivol.report import figures
 from mivol.report.record import (
     METRICS,

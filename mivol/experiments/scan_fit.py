@@ -35,7 +35,7 @@ from mivol.optim.noise_scale import noise_norm
 from mivol.optim.solver import State
 from mivol.optim.solvers import DIRECT, METHODS
 from mivol.report.page import write_page
-from mivol.report.preview import is_due, write_preview
+from mivol.report.pixel_scale import is_due, write_preview
 from mivol.report.record import PlanLine, RunRecord
 from mivol.tomography.filtered import feldkamp, filtered_backprojection
 from mivol.tomography.geometry import ParallelBeam, VoxelGrid

@@ -13,7 +13,7 @@ from mivol.fields.sky import Sky, read_sky
 from mivol.fields.spherical_files import load_field
 from mivol.optim.field_view import render_view
 from mivol.photos import Camera, facing, intrinsics
-from mivol.photos.picture import decode_srgb
+from mivol.photos.photo_file import decode_srgb
 
 SKY = "sky.exr"
 """What a fit writes beside its field, where it learned what is behind."""

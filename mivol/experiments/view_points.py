@@ -14,7 +14,7 @@ from mivol.errors import MivolError
 from mivol.experiments.view_field import camera_at
 from mivol.files.source import existing_file
 from mivol.photos import Camera
-from mivol.photos.picture import decode_srgb
+from mivol.photos.photo_file import decode_srgb
 from mivol.points.cloud import PointCloud, read_points
 from mivol.points.conversions import gaussians_of_points
 from mivol.points.gaussian_files import holds_gaussians, read_gaussians

@@ -14,7 +14,7 @@ from mivol.fields.sky import Sky
 from mivol.fields.spherical import SphericalGrid
 from mivol.fields.spherical_files import save_field
 from mivol.files import write_exr, write_whole
-from mivol.photos.picture import decode_srgb
+from mivol.photos.photo_file import decode_srgb
 
 __all__ = ["write_scene"]
 

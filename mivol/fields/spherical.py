@@ -469,7 +469,7 @@ class SphericalGrid:
 def radiance_of_codes(code: mi.Float) -> mi.Float:
     """The light of an sRGB code value: the curve of IEC 61966-2-1, followed on above 1 and, straight, below 0.
 
-    The same curve as :func:`mivol.photos.picture.decode_srgb`, with derivatives.
+    The same curve as :func:`mivol.photos.photo_file.decode_srgb`, with derivatives.
     """
     # Below -0.055 the power is NaN. It is not selected there, and Dr.Jit takes a derivative of 0 times NaN for 0.
     bent = dr.power((code + 0.055) / 1.055, 2.4)

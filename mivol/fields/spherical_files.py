@@ -12,7 +12,7 @@ from mivol.errors import MivolError
 from mivol.fields.spherical import SphericalGrid
 from mivol.fields.spherical_svox2 import read_svox2
 from mivol.files import write_whole
-from mivol.files.archive import check_memory, read_archive
+from mivol.files.npy import check_memory, read_archive
 
 __all__ = ["load_field", "save_field"]
 

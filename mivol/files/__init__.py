@@ -6,13 +6,11 @@ Needs no Mitsuba. Grids are float32 (Z, Y, X, C) at voxel centres over the unit 
 from __future__ import annotations
 
 from mivol.files.atomic import whole_file, write_whole, write_whole_bytes, write_whole_text
-from mivol.files.columns import read_columns
-from mivol.files.exr import layers, read_exr, read_exr_header, write_exr
 from mivol.files.formats import FORMATS, FRAMES, WRITERS, read_volume, write_volume
 from mivol.files.hdf5 import ProjectionData, read_projections
-from mivol.files.image_stack import read_stack
-from mivol.files.png import encode_srgb, write_png
-from mivol.files.slices import read_slices
+from mivol.files.image_files import encode_srgb, layers, read_exr, read_exr_header, write_exr, write_png
+from mivol.files.image_stack import read_slices, read_stack
+from mivol.files.source import read_columns
 from mivol.files.volume import (
     VolumeData,
     check_frame,

@@ -20,8 +20,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mivol.files.image_stack import TIFF, check_finite, read_images
-from mivol.files.slices import order_of_numbers
+from mivol.files.image_stack import TIFF, check_finite, order_of_numbers, read_images
 from mivol.files.source import existing_file, refusal
 
 SECTION = "xtekct"

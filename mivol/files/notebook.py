@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 from PIL import Image
 
-from mivol.files.png import encode_srgb
+from mivol.files.image_files import encode_srgb
 from mivol.shown import text_html
 
 __all__ = ["pairs_html", "slices_html"]

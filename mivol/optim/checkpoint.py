@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 
 from mivol.errors import MivolError
-from mivol.files.archive import read_archive
 from mivol.files.atomic import write_whole
+from mivol.files.npy import read_archive
 
 ABOUT = "about"
 

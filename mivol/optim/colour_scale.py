@@ -94,4 +94,4 @@ class Radiance:
 
 
 SCALES: dict[str, Codes | Radiance] = {"srgb": Codes(), "linear": Radiance()}
-"""By what the values of photographs are (:data:`mivol.photos.picture.SPACES`)."""
+"""By what the values of photographs are (:data:`mivol.photos.photo_file.SPACES`)."""

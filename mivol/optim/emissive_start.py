@@ -30,7 +30,7 @@ from scipy.ndimage import map_coordinates
 
 from mivol.errors import MivolError
 from mivol.fields.spherical import SphericalGrid
-from mivol.files.png import encode_srgb
+from mivol.files.image_files import encode_srgb
 from mivol.optim.loop import begin_fit
 from mivol.optim.optimiser import Optimiser
 from mivol.optim.radiance_fit import begin_radiance_fit, newest_field

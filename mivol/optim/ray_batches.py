@@ -4,7 +4,7 @@ Conventions. A batch is square tiles of pixels: neighbours cross the same cells,
 and a packet of lanes walks as one. Tiles lie anywhere in a view, all places alike. Smaller sizes are exact means over area;
 where voxels are larger than pixels, a small image says the same with fewer rays. Values are those of the photographs: codes in
 8-bit steps, not decoded, or radiance. What a mask leaves out has a ray, and counts for nothing. Rays of pinholes are computed;
-those of wide lenses (:mod:`mivol.photos.wide_lens`) are traced once for each lens and size, and looked up.
+those of wide lenses (:mod:`mivol.photos.lens`) are traced once for each lens and size, and looked up.
 """
 
 from __future__ import annotations

@@ -8,9 +8,8 @@ from __future__ import annotations
 
 from mivol.photos.camera import Camera, directions, intrinsics, pixel_centres, project, rays
 from mivol.photos.camera_path import between, facing, past, turntable
-from mivol.photos.dataset import BACKGROUNDS, Photo, Photos, load_photos
+from mivol.photos.dataset import BACKGROUNDS, Photo, Photos, load_photos, pinhole_of, rectified
 from mivol.photos.lens import Lens, distort, undistort
-from mivol.photos.rectify import pinhole_of, rectified
 from mivol.photos.silhouette import silhouette_box
 from mivol.photos.survey import FORMATS, SPLITS, Frame, PhotoSurvey, find_format, survey_photos
 from mivol.photos.transforms import write_transforms

@@ -13,8 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from mivol.files.source import refusal
-from mivol.photos.lens import LARGEST_TERM, Lens, distort, undistort
-from mivol.photos.wide_lens import Fisheye, Panorama
+from mivol.photos.lens import LARGEST_TERM, Fisheye, Lens, Panorama, distort, undistort
 
 __all__ = ["Camera", "directions", "field_of_view", "intrinsics", "is_seen", "pixel_centres", "project", "rays"]
 
@@ -33,7 +32,7 @@ class Camera:
         K: (3, 3) float64 [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] [pixel].
         size: (width, height) [pixel].
         to_world: (4, 4) float64, camera to world; its rotation is made exact.
-        distortion: of the lens; a wide one has no image plane (:mod:`mivol.photos.wide_lens`).
+        distortion: of the lens; a wide one has no image plane (:mod:`mivol.photos.lens`).
         name: how refusals call it.
 
     Raises:

@@ -18,9 +18,8 @@ import numpy as np
 
 from mivol.files.source import read_bytes, reals, refusal
 from mivol.photos.camera import FLIP, Camera, intrinsics
-from mivol.photos.lens import Lens
+from mivol.photos.lens import Fisheye, Lens
 from mivol.photos.listing import Entry, Listing, check_points
-from mivol.photos.wide_lens import Fisheye
 
 __all__ = ["CAMERA_MODELS", "find_model", "read_colmap", "read_points3d", "rotation"]
 

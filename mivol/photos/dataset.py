@@ -1,11 +1,12 @@
 """Posed photographs: the images of a data set with their cameras, at one size and in one colour space.
 
-Conventions. Cameras as in :mod:`mivol.photos.camera`, pixels as in :mod:`mivol.photos.picture`; which photographs there are
+Conventions. Cameras as in :mod:`mivol.photos.camera`, pixels as in :mod:`mivol.photos.photo_file`; which photographs there are
 and what they look at is found by :mod:`mivol.photos.survey`.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import os
 from collections.abc import Callable, Sequence
@@ -17,12 +18,13 @@ import numpy as np
 from mivol.errors import MivolError
 from mivol.files.source import refusal
 from mivol.machine import available_memory
-from mivol.photos.camera import Camera, is_seen, pixel_centres
-from mivol.photos.picture import read_header, read_mask, read_picture, shrink, space_of
+from mivol.photos.camera import Camera, intrinsics, is_seen, pixel_centres
+from mivol.photos.lens import Lens, distort
+from mivol.photos.photo_file import read_header, read_mask, read_picture, shrink, space_of
 from mivol.photos.survey import Frame, PhotoSurvey, survey_photos
 from mivol.shown import briefly
 
-__all__ = ["BACKGROUNDS", "Photo", "Photos", "check_alpha", "load_photos"]
+__all__ = ["BACKGROUNDS", "Photo", "Photos", "check_alpha", "load_photos", "pinhole_of", "rectified"]
 
 Background = str | Sequence[float] | None
 
@@ -187,7 +189,6 @@ def _check_memory(survey: PhotoSurvey, scale: float, limit: int | None) -> None:
     raise MivolError(f"{survey.path}: {found} and {limit / 2**30:.2g} are left; {advice}.")
 
 
-
 def check_alpha(frames: Sequence[Frame]) -> bool:
     """Whether photographs have alpha.
 
@@ -274,3 +275,51 @@ def _read_mask(frame: Frame, size: tuple[int, int]) -> np.ndarray:
 
 def _without_alpha(name: object) -> MivolError:
     return refusal(name, "an image without alpha", "alpha, since a background is asked for", "leave background away")
+
+
+def pinhole_of(camera: Camera) -> Camera:
+    """The pinhole with square pixels that stands in for a camera.
+
+    Raises:
+        MivolError: a wide lens, which sees more than a pinhole.
+    """
+    if camera.distortion.is_wide:
+        found = f"a {type(camera.distortion).__name__.lower()}"
+        raise refusal(camera.name, found, "a lens with an image plane", "no pinhole sees what it sees: cut pinholes out of it")
+    f = max(camera.K[0, 0], camera.K[1, 1])
+    return dataclasses.replace(camera, K=intrinsics(f, f, *camera.K[:2, 2]), distortion=Lens())
+
+
+def rectified(photo: Photo) -> Photo:
+    """A photograph as the pinhole of its camera would have taken it; one of such a pinhole, or of a wide lens, as it is.
+
+    Bias: the interpolation is a low-pass of up to a pixel's width.
+    """
+    camera = photo.camera
+    if camera.distortion.is_wide:
+        return photo
+    pinhole = pinhole_of(camera)
+    if not camera.distortion and camera.K[0, 0] == camera.K[1, 1]:
+        return photo
+    plane = (pixel_centres(camera.size) - pinhole.K[:2, 2]) / pinhole.K[0, 0]
+    at = distort(camera.distortion, plane) * camera.K[[0, 1], [0, 1]] + camera.K[:2, 2]
+    seen = ((at >= 0) & (at <= camera.size)).all(axis=-1) & (np.linalg.norm(plane, axis=-1) <= camera.distortion.fold)
+    at = np.where(seen[..., None], at, 0.5)
+    if photo.mask is not None:
+        seen &= _interpolated(photo.mask.astype(np.float32), at) == 1
+    alpha = None if photo.alpha is None else _interpolated(photo.alpha, at)
+    return dataclasses.replace(photo, image=_interpolated(photo.image, at), alpha=alpha, mask=seen, camera=pinhole)
+
+
+def _interpolated(image: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """Linear interpolation between pixel centres at points (H, W, 2); constant beyond the outermost centres."""
+    last = np.array(image.shape[1::-1]) - 1
+    place = np.clip(at - 0.5, 0, last)
+    low = np.minimum(place.astype(int), np.maximum(last - 1, 0))
+    x, y = np.moveaxis((place - low).astype(np.float32), -1, 0)
+    if image.ndim == 3:
+        x, y = x[..., None], y[..., None]
+    (i, j), (i1, j1) = (low[..., 1], low[..., 0]), np.moveaxis(np.minimum(low + 1, last)[..., ::-1], -1, 0)
+    top = image[i, j] + x * (image[i, j1] - image[i, j])
+    bottom = image[i1, j] + x * (image[i1, j1] - image[i1, j])
+    return top + y * (bottom - top)

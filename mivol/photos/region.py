@@ -13,7 +13,7 @@ import numpy as np
 
 from mivol.files.source import refusal
 from mivol.photos.camera import Camera, is_seen, project, rays
-from mivol.photos.wide_lens import Panorama
+from mivol.photos.lens import Panorama
 
 __all__ = [
     *("box_of_points", "check_box", "check_views", "focus_of", "levels_holding", "middle_box", "near_far_of", "nested"),

@@ -23,7 +23,7 @@ from mivol.photos import region
 from mivol.photos.camera import Camera, field_of_view
 from mivol.photos.colmap import find_model, read_colmap
 from mivol.photos.listing import UNLISTED, Entry, Listing
-from mivol.photos.picture import PictureHeader, read_header
+from mivol.photos.photo_file import PictureHeader, read_header
 from mivol.photos.transforms import read_blender, read_transforms
 from mivol.shown import briefly
 

@@ -24,10 +24,9 @@ from mivol.files.atomic import write_whole_text
 from mivol.files.ply import positions_of, read_vertices
 from mivol.files.source import read_bytes, refusal
 from mivol.photos.camera import Camera, intrinsics
-from mivol.photos.lens import Lens
+from mivol.photos.lens import Fisheye, Lens, Panorama
 from mivol.photos.listing import UNLISTED, Entry, Listing, check_points
-from mivol.photos.picture import SUFFIXES
-from mivol.photos.wide_lens import Fisheye, Panorama
+from mivol.photos.photo_file import SUFFIXES
 
 __all__ = ["MODELS", "Settings", "read_blender", "read_transforms", "write_transforms"]
 

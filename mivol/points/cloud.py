@@ -19,8 +19,8 @@ from typing import BinaryIO
 import numpy as np
 
 from mivol.files import ply
-from mivol.files.archive import DAMAGE, check_memory
 from mivol.files.atomic import write_whole
+from mivol.files.npy import DAMAGE, check_memory
 from mivol.files.source import by_suffix, existing_file, refusal
 from mivol.photos.colmap import read_points3d
 from mivol.shown import briefly

@@ -20,7 +20,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mivol.files.archive import check_memory
+from mivol.files.npy import check_memory
 from mivol.files.source import CODECS, elements, inflate, read_bytes, refusal
 from mivol.points.byte_codes import completed, logits_of_bytes
 from mivol.points.gaussians import HIGHEST_DEGREE, Gaussians

@@ -23,9 +23,9 @@ from matplotlib.ticker import LogFormatterSciNotation, LogLocator, MaxNLocator, 
 from numpy.typing import ArrayLike, NDArray
 
 from mivol.errors import MivolError
-from mivol.files import write_whole
-from mivol.report import show
-from mivol.report.record import quantity_of
+from mivol.files import read_volume, write_whole
+from mivol.report import pixel_scale
+from mivol.report.record import Volume, quantity_of
 
 __all__ = [
     "SERIES",
@@ -213,24 +213,24 @@ def plot_slices(
     Raises:
         MivolError: shapes that differ.
     """
-    rows = {"reconstruction": show.slices(reconstruction, size)}
+    rows = {"reconstruction": pixel_scale.slices(reconstruction, size)}
     if truth is not None:
         if np.shape(truth) != np.shape(reconstruction):
             raise MivolError(
                 f"truth {np.shape(truth)} and reconstruction {np.shape(reconstruction)} differ in shape; "
                 "resample one to the other."
             )
-        rows = {"truth": show.slices(truth, size)} | rows
-        rows["difference"] = show.slices(np.asarray(reconstruction, float) - np.asarray(truth, float), size)
-    values = show.scale_of(*next(iter(rows.values())).images.values())
-    signed = show.signed_scale(*rows["difference"].images.values()) if truth is not None else None
+        rows = {"truth": pixel_scale.slices(truth, size)} | rows
+        rows["difference"] = pixel_scale.slices(np.asarray(reconstruction, float) - np.asarray(truth, float), size)
+    values = pixel_scale.scale_of(*next(iter(rows.values())).images.values())
+    signed = pixel_scale.signed_scale(*rows["difference"].images.values()) if truth is not None else None
     with mpl.rc_context(STYLE):
         figure = empty_figure(7.2, 2.5 * len(rows) + 0.3)
         grid = figure.subplots(len(rows), 3, squeeze=False)
         for line, (name, cut) in zip(grid, rows.items(), strict=True):
             scale = signed if name == "difference" else values
             for axes, plane in zip(line, cut.images, strict=True):
-                _picture(axes, show.pixels(cut.images[plane], scale), cut.aspect[plane])
+                _picture(axes, pixel_scale.pixels(cut.images[plane], scale), cut.aspect[plane])
                 axes.set_xlabel(f"{plane[0]} →  at {cut.where[plane]}", labelpad=2)
                 axes.set_ylabel(f"{plane[1]} →", labelpad=2)
             line[0].set_title(name)
@@ -249,18 +249,18 @@ def plot_image_row(reference: NDArray, render: NDArray, z: NDArray | None = None
     """
     label = f"radiance [{unit}]" if unit else "radiance"
     difference = np.asarray(render, float) - np.asarray(reference, float)
-    values = show.scale_of(reference)
+    values = pixel_scale.scale_of(reference)
     panels = [
         ("reference", reference, values),
         ("render", render, values),
-        ("render − reference", difference, show.signed_scale(difference)),
+        ("render − reference", difference, pixel_scale.signed_scale(difference)),
     ]
     if z is not None:
-        panels.append(("z", z, show.Scale("signed", -4.0, 4.0)))
+        panels.append(("z", z, pixel_scale.Scale("signed", -4.0, 4.0)))
     with mpl.rc_context(STYLE):
         figure = empty_figure(2.6 * len(panels), 2.9)
         for axes, (name, image, scale) in zip(figure.subplots(1, len(panels)), panels, strict=True):
-            _picture(axes, show.pixels(image, scale), image.shape[1] / image.shape[0])
+            _picture(axes, pixel_scale.pixels(image, scale), image.shape[1] / image.shape[0])
             axes.set_title(name)
             if scale.kind == "colour":
                 axes.set_xlabel(f"{label}: white is {scale.high:.3g}")
@@ -275,11 +275,11 @@ def _picture(axes: Axes, rgb: NDArray[np.uint8], aspect: float) -> None:
     axes.spines[:].set(visible=True, color=GRID)
 
 
-def _bar(figure: Figure, axes: Sequence[Axes], scale: show.Scale, label: str, below: bool = False) -> None:
+def _bar(figure: Figure, axes: Sequence[Axes], scale: pixel_scale.Scale, label: str, below: bool = False) -> None:
     if scale.kind == "colour":
         return
     mappable = mpl.cm.ScalarMappable(
-        mpl.colors.Normalize(scale.low, scale.high), show.SIGNED if scale.kind == "signed" else "gray"
+        mpl.colors.Normalize(scale.low, scale.high), pixel_scale.SIGNED if scale.kind == "signed" else "gray"
     )
     bar = figure.colorbar(
         mappable, ax=list(axes), location="bottom" if below else "right", fraction=0.05, pad=0.03, aspect=24, label=label
@@ -408,3 +408,56 @@ def _check_series(series: Sequence[Series]) -> None:
         both = np.array([np.ravel(s.seconds), np.ravel(s.error)], float)
         if both.size == 0 or not (np.isfinite(both) & (both > 0)).all():
             raise MivolError(f'"{s.name}" has a time or an error that is not finite and above 0; leave them out.')
+
+
+DASHES = {"reconstruction": "solid", "truth": (0, (3, 2))}
+
+
+def profiles_of(folder: Path, volumes: Sequence[Volume]) -> list[str]:
+    """Curves along x, y and z, as SVG, of the volumes that are to be drawn so.
+
+    Raises:
+        MivolError: a file that cannot be read.
+    """
+    wanted = {volume.role: volume for volume in volumes if volume.profiles}
+    if "reconstruction" not in wanted:
+        return []
+    read = {role: read_volume(folder / wanted[role].path) for role in DASHES if role in wanted}
+    values = {role: volume.values[..., 0] for role, volume in read.items()}
+    place, about = read["reconstruction"].to_world, wanted["reconstruction"]
+    named = f"{about.quantity} [{about.unit}]"
+    return [
+        inline_svg(plot_profile(values, axis, (place[i, 3], place[i, i]), named), f"{about.quantity} along {axis}")
+        for i, axis in enumerate("xyz")
+    ]
+
+
+def plot_profile(values: dict[str, NDArray], axis: str, box: tuple[float, float], named: str) -> Figure:
+    """One line through the middle voxel.
+
+    Args:
+        values: (Z, Y, X) by role.
+        axis: ``x``, ``y`` or ``z``.
+        box: where the box begins along it, and its edge [length].
+        named: the quantity with its unit.
+    """
+    with mpl.rc_context(STYLE):
+        figure = empty_figure(4.4, 2.75)
+        axes = figure.subplots()
+        for role, colour in zip(values, SERIES, strict=False):
+            line = line_through_the_middle(values[role], axis)
+            at = box[0] + (np.arange(len(line)) + 0.5) * box[1] / len(line)
+            axes.plot(at, line, color=colour, label=role, linestyle=DASHES[role], linewidth=1.5)
+        axes.set_title(named)
+        axes.set_xlabel(f"{axis} [length]")
+        axes.xaxis.set_major_locator(MaxNLocator(6))
+        axes.margins(x=0.02, y=0.08)
+        if len(values) > 1:
+            axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2, fontsize=8.5, borderaxespad=0.2)
+    return figure
+
+
+def line_through_the_middle(values: NDArray, axis: str) -> NDArray:
+    """The voxels along an axis through the one in the middle of (Z, Y, X)."""
+    z, y, x = (n // 2 for n in values.shape)
+    return {"x": values[z, y, :], "y": values[z, :, x], "z": values[:, y, x]}[axis]

@@ -22,8 +22,8 @@ from mivol.cite import citations
 from mivol.errors import MivolError
 from mivol.files import write_whole_text
 from mivol.report import figures
-from mivol.report.gallery import Cut, ShownView, film_of, plain_picture, views_of, volumes_of
-from mivol.report.profiles import profiles_of
+from mivol.report.figures import profiles_of
+from mivol.report.page_images import Cut, ShownView, film_of, plain_picture, views_of, volumes_of
 from mivol.report.record import CODES, LINES, QUANTITIES, SINOGRAM, RunRecord, quantity_of, read_metrics, read_record
 
 __all__ = ["PAGE", "headline", "write_page"]

@@ -70,7 +70,7 @@ def numbers_of(camera: Camera, size: tuple[int, int]) -> mi.Float:
     if camera.distortion:
         raise MivolError(
             f"{camera.name}: found a lens that distorts, expected a pinhole, since Gaussians are splatted as ellipses: "
-            f"{'cut pinholes out of it' if camera.distortion.is_wide else 'rectify the photographs (mivol.photos.rectify)'}."
+            f"{'cut pinholes out of it' if camera.distortion.is_wide else 'rectify the photographs (mivol.photos.dataset)'}."
         )
     axes = camera.to_world[:3, :3] * FLIP
     focal, centre = camera.K[[0, 1], [0, 1]], camera.K[:2, 2]

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mivol.errors import MivolError
-from mivol.photos.picture import SPACES
+from mivol.photos.photo_file import SPACES
 from mivol.validate.metrics import check_window, psnr, ssim
 
 __all__ = ["METRICS", "Quality", "Score", "check_metrics", "colour_fitted", "flip", "judge", "quantised", "score"]

@@ -19,9 +19,9 @@ from scipy.ndimage import uniform_filter
 
 import mivol
 from mivol.errors import MivolError
-from mivol.files.archive import read_archive
 from mivol.files.atomic import write_whole
-from mivol.files.exr import read_exr, write_exr
+from mivol.files.image_files import read_exr, write_exr
+from mivol.files.npy import read_archive
 from mivol.shown import briefly
 from mivol.validate.moments import Moments
 from mivol.validate.trust import Doubt

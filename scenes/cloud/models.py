@@ -22,7 +22,7 @@ from mivol.experiments.examples import EXAMPLES
 from mivol.files import layers, read_exr, read_volume
 from mivol.optim.events import upsample
 from mivol.phase.mie import water_droplets
-from mivol.report import figures, show
+from mivol.report import figures, pixel_scale
 from mivol.report.record import RunRecord, read_record
 from mivol.validate.metrics import nrmse
 
@@ -125,13 +125,13 @@ def draw(folder: Path, records: dict[str, RunRecord]) -> mpl.figure.Figure:
         above, below = figure.subfigures(2, 1, height_ratios=(3, 2))
         views, maps = above.subplots(2, len(records) + 1)
         first = next(iter(records))
-        scale, top = show.scale_of(seen(folder / first, records[first])[0]), columns(volumes(folder / first, records[first])[0])
+        scale, top = pixel_scale.scale_of(seen(folder / first, records[first])[0]), columns(volumes(folder / first, records[first])[0])
         shown = [("truth", seen(folder / first, records[first])[0], top)]
         for name, record in records.items():
             text = MODELS[name][0].replace(", ", ",\n")
             shown.append((text, seen(folder / name, record)[1], columns(volumes(folder / name, record)[1])))
         for column, (text, view, depths) in enumerate(shown):
-            views[column].imshow(show.pixels(view, scale))
+            views[column].imshow(pixel_scale.pixels(view, scale))
             views[column].set_title(text, fontsize=9, weight="normal")
             maps[column].imshow(depths, vmin=0, vmax=top.max(), cmap="magma", origin="lower")
             views[column].set_axis_off()

@@ -15,7 +15,7 @@ from pathlib import Path
 import mivol  # noqa: F401  (chooses the LLVM library; call it before the first variant)
 from mivol.experiments.examples import EXAMPLES
 from mivol.files import read_volume, write_volume
-from mivol.report import figures, show
+from mivol.report import figures, pixel_scale
 from mivol.validate.metrics import psnr
 from mivol.validate.reference import render_reference
 
@@ -63,15 +63,15 @@ def main() -> None:
 
 def draw(reference: np.ndarray, images: dict[str, np.ndarray]) -> mpl.figure.Figure:
     """The true smoke, and under it nothing; each render, and under it its difference."""
-    scale = show.scale_of(reference)
-    signed = show.Scale("signed", -0.25 * scale.high, 0.25 * scale.high)
+    scale = pixel_scale.scale_of(reference)
+    signed = pixel_scale.Scale("signed", -0.25 * scale.high, 0.25 * scale.high)
     with mpl.rc_context(figures.STYLE):
         figure = mpl.figure.Figure(figsize=(8.4, 6.0))
         grid = figure.subplots(2, 3)
-        put(grid[0, 0], show.pixels(reference, scale), "true smoke (volpath)")
+        put(grid[0, 0], pixel_scale.pixels(reference, scale), "true smoke (volpath)")
         for column, (name, image) in enumerate(images.items(), 1):
-            put(grid[0, column], show.pixels(image, scale), f"{name}, {psnr(image, reference):.1f} dB")
-            put(grid[1, column], show.pixels(image - reference, signed), f"difference, ±{signed.high:.2g}")
+            put(grid[0, column], pixel_scale.pixels(image, scale), f"{name}, {psnr(image, reference):.1f} dB")
+            put(grid[1, column], pixel_scale.pixels(image - reference, signed), f"difference, ±{signed.high:.2g}")
         grid[1, 0].set_axis_off()
     return figure
 

@@ -14,7 +14,7 @@ from pathlib import Path
 import mivol  # noqa: F401  (chooses the LLVM library; call it before the first variant)
 from mivol.cli import main as mivol_main
 from mivol.files import layers, read_exr, read_volume
-from mivol.report import figures, show
+from mivol.report import figures, pixel_scale
 from mivol.report.record import RunRecord, read_record
 
 import matplotlib as mpl
@@ -62,13 +62,13 @@ def draw(folder: Path, records: dict[int, RunRecord]) -> mpl.figure.Figure:
         views, slices = above.subplots(2, columns)
         first = next(iter(records))
         reference, _ = images(folder / f"{first}_views", records[first])
-        scale = show.scale_of(reference)
+        scale = pixel_scale.scale_of(reference)
         top = float(middle(folder / f"{first}_views", records[first], "truth").max())
-        put(views[0], show.pixels(reference, scale), "a view not seen")
+        put(views[0], pixel_scale.pixels(reference, scale), "a view not seen")
         put(slices[0], hot(middle(folder / f"{first}_views", records[first], "truth"), top), "slice of the truth")
         for column, (count, record) in enumerate(records.items(), 1):
             home = folder / f"{count}_views"
-            put(views[column], show.pixels(images(home, record)[1], scale), f"from {count} views")
+            put(views[column], pixel_scale.pixels(images(home, record)[1], scale), f"from {count} views")
             put(slices[column], hot(middle(home, record, "reconstruction"), top), f"{count} views")
         names = {"held_out_psnr": "held-out PSNR [dB]", "nrmse": "nRMSE of the volume"}
         for number, (axes, (key, label)) in enumerate(zip(below.subplots(1, 2), names.items(), strict=True)):
@@ -89,7 +89,7 @@ def images(home: Path, record: RunRecord) -> tuple[np.ndarray, np.ndarray]:
 def middle(home: Path, record: RunRecord, role: str) -> np.ndarray:
     """The slice z = middle of the truth or the reconstruction."""
     path = next(volume.path for volume in record.volumes if volume.role == role)
-    return show.slices(read_volume(home / path).values).images["xy"][..., 0]
+    return pixel_scale.slices(read_volume(home / path).values).images["xy"][..., 0]
 
 
 def hot(values: np.ndarray, top: float) -> np.ndarray:

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from mivol.errors import MivolError
-from mivol.files import archive
-from mivol.files.archive import read_archive
+from mivol.files import npy
+from mivol.files.npy import read_archive
 
 
 def test_what_was_saved_is_read(tmp_path: Path) -> None:
@@ -36,8 +36,8 @@ def test_what_does_not_fit_is_not_inflated(tmp_path: Path, monkeypatch: pytest.M
     """A megabyte of zeros in a kilobyte, where half of it is free: refused by what the archive says, before it is unpacked."""
     np.savez_compressed(tmp_path / "a.npz", a=np.zeros(2**17))
     assert (tmp_path / "a.npz").stat().st_size < 4096
-    monkeypatch.setattr(archive, "available_memory", lambda: 2**19)
-    monkeypatch.setattr(archive, "_array", lambda *given: pytest.fail("unpacked"))
+    monkeypatch.setattr(npy, "available_memory", lambda: 2**19)
+    monkeypatch.setattr(npy, "_array", lambda *given: pytest.fail("unpacked"))
     with pytest.raises(MivolError, match="at most the free memory"):
         read_archive(tmp_path / "a.npz")
 

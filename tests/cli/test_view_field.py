@@ -15,7 +15,7 @@ from mivol.fields.spherical import SphericalGrid
 from mivol.fields.spherical_files import save_field
 from mivol.files import read_exr, write_exr
 from mivol.photos import project
-from mivol.photos.picture import decode_srgb
+from mivol.photos.photo_file import decode_srgb
 
 Y0 = 0.28209479177387814
 

@@ -16,7 +16,7 @@ from PIL import Image
 from mivol.errors import MivolError
 from mivol.photos import Camera, between, facing, intrinsics, pixel_centres, project, rays, turntable
 from mivol.report import video
-from mivol.report.depth import depth_pixels, normal_pixels, normals_of_depth
+from mivol.report.pixel_scale import depth_pixels, normal_pixels, normals_of_depth
 from mivol.report.video import film_suffix, write_video
 
 LIKE = Camera(intrinsics(90, 100, 30, 20), (64, 48), np.eye(4))

@@ -21,7 +21,7 @@ from mivol.fields.spherical import SphericalGrid
 from mivol.fields.spherical_files import save_field
 from mivol.fields.surface import surface_of
 from mivol.files import read_exr, read_volume, write_exr
-from mivol.photos.picture import decode_srgb
+from mivol.photos.photo_file import decode_srgb
 from mivol.scene.load import load_scene
 from mivol.transport.line_integrals.radiance_field import cells_of, model_of, render
 from mivol.transport.line_integrals.radiance_source import exact

@@ -46,7 +46,7 @@ from mivol.photos import (
     survey_photos,
     undistort,
 )
-from mivol.photos.picture import decode_srgb, read_header, read_picture, shrink
+from mivol.photos.photo_file import decode_srgb, read_header, read_picture, shrink
 
 EPS = float(np.finfo(np.float32).eps)
 

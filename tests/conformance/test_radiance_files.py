@@ -12,7 +12,7 @@ from mivol.errors import MivolError
 from mivol.fields.spherical import SphericalGrid, degree_of
 from mivol.fields.spherical_files import load_field, save_field
 from mivol.fields.spherical_svox2 import save_svox2
-from mivol.files import archive
+from mivol.files import npy
 
 CUBE = np.array([[2.0, 0, 0, -1], [0, 2, 0, -1], [0, 0, 2, -1], [0, 0, 0, 1]])
 
@@ -149,7 +149,7 @@ def test_hostile_fields_are_refused(variant_rgb: str, tmp_path: Path, monkeypatc
     with np.load(tmp_path / "f.npz") as stored:
         held = dict(stored)
     np.savez(tmp_path / "f.npz", **held | change)
-    monkeypatch.setattr(archive, "available_memory", lambda: 2**33)
+    monkeypatch.setattr(npy, "available_memory", lambda: 2**33)
     with pytest.raises(MivolError, match=said):
         load_field(tmp_path / "f.npz")
 

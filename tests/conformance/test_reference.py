@@ -26,7 +26,7 @@ from scattering_scenes import cases
 from scipy import stats
 
 from mivol.errors import MivolError
-from mivol.files.exr import read_exr, write_exr
+from mivol.files.image_files import read_exr, write_exr
 from mivol.scene.cameras import Ring
 from mivol.validate import reference
 from mivol.validate.compare import compare

@@ -15,7 +15,7 @@ from mivol.errors import MivolError
 from mivol.fields.spherical import SphericalGrid, radiance_of_codes
 from mivol.fields.spherical_files import load_field, save_field
 from mivol.files import encode_srgb
-from mivol.photos.picture import decode_srgb
+from mivol.photos.photo_file import decode_srgb
 from scenes import box_of, camera, centred, refused, render, rotation, sky, tensor, transform
 
 PLACE = centred(2 * np.eye(3))

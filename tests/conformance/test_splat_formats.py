@@ -130,7 +130,7 @@ def test_hostile_spz_ends_in_a_sentence(read: Read, name: str) -> None:
 
 def test_an_spz_larger_than_memory_is_refused_before_it_is_taken(read: Read, monkeypatch: pytest.MonkeyPatch) -> None:
     """Its 2^32 - 1 Gaussians would take 29 bytes each."""
-    monkeypatch.setattr("mivol.files.archive.available_memory", lambda: 2**30)
+    monkeypatch.setattr("mivol.files.npy.available_memory", lambda: 2**30)
     with pytest.raises(MivolError, match=r"arrays of 116\.0 GiB, expected at most the free memory, 1\.0 GiB"):
         read(gzip.compress(changed(PLAIN, 8, b"\xff\xff\xff\xff")), ".spz")
 

@@ -21,11 +21,11 @@ from mivol.optim.ray_batches import RayBatches
 from mivol.photos import Camera, Lens, Photo, load_photos, pixel_centres, project, rays, rectified, survey_photos, turntable
 from mivol.photos.camera import directions, field_of_view, intrinsics, is_seen
 from mivol.photos.camera_path import WIDE
-from mivol.photos.rectify import pinhole_of
+from mivol.photos.dataset import pinhole_of
+from mivol.photos.lens import Fisheye, Panorama
 from mivol.photos.region import focus_of, views_seeing
 from mivol.photos.silhouette import silhouette_box
 from mivol.photos.transforms import write_transforms as write_cameras
-from mivol.photos.wide_lens import Fisheye, Panorama
 from mivol.report.cameras import outline
 from mivol.scene.photographs import sensor_of
 from mivol.splatting.view import numbers_of

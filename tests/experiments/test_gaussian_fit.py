@@ -22,7 +22,7 @@ from mivol.optim.gaussian_start import begin_at, places_of
 from mivol.optim.problem import Reals
 from mivol.photos import Camera, intrinsics, load_photos
 from mivol.photos.camera_path import facing
-from mivol.photos.picture import decode_srgb
+from mivol.photos.photo_file import decode_srgb
 from mivol.photos.transforms import write_transforms
 from mivol.points import read_gaussians
 from mivol.splatting import Splatter

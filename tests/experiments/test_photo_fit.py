@@ -28,7 +28,7 @@ from mivol.optim.radiance_plan import FEW, PRESETS, FitPlan, Stage, stretched
 from mivol.optim.radiance_problem import RadianceProblem
 from mivol.photos import Camera, intrinsics
 from mivol.photos.camera_path import facing
-from mivol.photos.picture import decode_srgb
+from mivol.photos.photo_file import decode_srgb
 from mivol.photos.transforms import write_transforms
 from mivol.validate.images import judge
 

@@ -178,7 +178,7 @@ def test_a_header_of_a_cloud_that_is_no_python_is_refused(tmp_path: Path) -> Non
 def test_an_archive_of_a_volume_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A volume goes through the same opener as fields: what it would take is counted before it is taken."""
     write_volume(tmp_path / "a.npz", np.zeros((32, 32, 32, 1), np.float32))
-    monkeypatch.setattr("mivol.files.archive.available_memory", lambda: 100_000)
+    monkeypatch.setattr("mivol.files.npy.available_memory", lambda: 100_000)
     with pytest.raises(MivolError, match="at most the free memory"):
         read_volume(tmp_path / "a.npz")
 

@@ -17,8 +17,17 @@ from mivol.photos import PhotoSurvey
 from mivol.photos.camera import Camera
 from mivol.photos.survey import Frame
 from mivol.report.cameras import plot_cameras
-from mivol.report.figures import Series, inline_svg, plot_curve, plot_error_against_time, plot_image_row, plot_slices, save
-from mivol.report.profiles import line_through_the_middle, plot_profile
+from mivol.report.figures import (
+    Series,
+    inline_svg,
+    line_through_the_middle,
+    plot_curve,
+    plot_error_against_time,
+    plot_image_row,
+    plot_profile,
+    plot_slices,
+    save,
+)
 
 
 def falling_curve() -> Figure:

@@ -11,9 +11,9 @@ import pytest
 from matplotlib.image import imread
 
 from mivol.files import write_png, write_volume
-from mivol.photos.picture import decode_srgb
-from mivol.report import show
-from mivol.report.gallery import LAYER_EDGE, LAYERS, Picture, film_of, plain_picture, views_of, volumes_of
+from mivol.photos.photo_file import decode_srgb
+from mivol.report import pixel_scale
+from mivol.report.page_images import LAYER_EDGE, LAYERS, Picture, film_of, plain_picture, views_of, volumes_of
 from mivol.report.record import Image, Volume
 
 
@@ -69,13 +69,13 @@ def test_a_volume_is_shown_layer_by_layer(tmp_path: Path) -> None:
     write_volume(tmp_path / "r.npz", found)
     (cut,) = volumes_of(tmp_path, [Volume(path="t.npz", role="truth"), Volume(path="r.npz", role="reconstruction")])
     assert [layer["text"] for layer in cut.layers] == [f"z = {k} of 3" for k in (1, 2, 3)]
-    scale = show.scale_of(*show.slices(truth).images.values())
-    signed = show.signed_scale(*show.slices(found - truth).images.values())
+    scale = pixel_scale.scale_of(*pixel_scale.slices(truth).images.values())
+    signed = pixel_scale.signed_scale(*pixel_scale.slices(found - truth).images.values())
     for k, layer in enumerate(cut.layers):
         assert [p.name for p in layer["pictures"]] == ["Truth", "Reconstruction", "Difference"]
         wanted = [(truth, scale), (found, scale), (found - truth, signed)]
         for picture, (values, on) in zip(layer["pictures"], wanted, strict=True):
-            assert np.array_equal(np.round(pixels(picture) * 255), show.pixels(values[k, ::-1], on))
+            assert np.array_equal(np.round(pixels(picture) * 255), pixel_scale.pixels(values[k, ::-1], on))
 
 
 def test_large_volumes_show_some_of_their_layers_with_fewer_pixels(tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.image import imread
 
-from mivol.report.preview import EDGE, GAP, is_due, write_preview
+from mivol.report.pixel_scale import EDGE, GAP, is_due, write_preview
 
 
 def test_three_slices_side_by_side(tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ from mivol.experiments.film import film_of_volume
 from mivol.experiments.run_folder import RunFolder
 from mivol.report.page import write_page
 from mivol.report.record import RunRecord, write_record
-from mivol.report.volume_film import FEWEST_LAYERS, volume_frames
+from mivol.report.video import FEWEST_LAYERS, volume_frames
 
 SIDE = 16
 

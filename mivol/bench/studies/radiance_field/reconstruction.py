@@ -17,7 +17,7 @@ from mivol.bench.studies.radiance_field.room import distance_of, room
 from mivol.files import write_png
 from mivol.photos import Camera, project, rays
 from mivol.photos.camera import FLIP
-from mivol.photos.picture import decode_srgb
+from mivol.photos.photo_file import decode_srgb
 
 __all__ = ["points_of", "write_room"]
 

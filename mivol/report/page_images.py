@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from mivol.errors import MivolError
 from mivol.files import layers, read_exr, read_volume
-from mivol.report import show
+from mivol.report import pixel_scale
 from mivol.report.record import LINES, Image, Volume
 
 __all__ = ["Bar", "Cut", "Gallery", "Picture", "ShownView", "film_of", "plain_picture", "views_of", "volumes_of"]
@@ -156,7 +156,7 @@ def _are_numbers(roles: dict[str, NDArray], *names: str) -> bool:
     return all(name in roles and roles[name].dtype != np.uint8 for name in names)
 
 
-def _scales(views: Iterable[dict[str, NDArray]]) -> dict[str, show.Scale]:
+def _scales(views: Iterable[dict[str, NDArray]]) -> dict[str, pixel_scale.Scale]:
     """Scales by role, each shared by all views: values from the references, differences symmetric, z fixed."""
     views = [{role: image for role, image in roles.items() if _are_numbers(roles, role)} for roles in views]
     shown = [roles.get("reference", roles.get("render")) for roles in views]
@@ -164,14 +164,14 @@ def _scales(views: Iterable[dict[str, NDArray]]) -> dict[str, show.Scale]:
     differences = [roles["difference"] for roles in views if "difference" in roles]
     scales = {}
     if values:
-        scales["reference"] = scales["render"] = show.scale_of(*values)
+        scales["reference"] = scales["render"] = pixel_scale.scale_of(*values)
     if differences:
-        scales["difference"] = show.signed_scale(*differences)
+        scales["difference"] = pixel_scale.signed_scale(*differences)
     errors = [roles["error"] for roles in views if "error" in roles]
     if errors:
-        scales["error"] = show.scale_of(*errors)
+        scales["error"] = pixel_scale.scale_of(*errors)
     if any("z" in roles for roles in views):
-        scales["z"] = show.Scale("signed", -Z_LIMIT, Z_LIMIT)
+        scales["z"] = pixel_scale.Scale("signed", -Z_LIMIT, Z_LIMIT)
     return scales
 
 
@@ -195,7 +195,7 @@ def _names_of(images: Iterable[Image]) -> dict[str, str]:
     return PANELS_OF_LINES if any(image.quantity == LINES for image in images) else PANELS
 
 
-def _view(name: str, images: dict[str, Image], roles: dict[str, NDArray], scales: dict[str, show.Scale]) -> ShownView:
+def _view(name: str, images: dict[str, Image], roles: dict[str, NDArray], scales: dict[str, pixel_scale.Scale]) -> ShownView:
     names = _names_of(images.values())
     pictures = [_picture(names[role], roles[role], scales.get(role)) for role in names if role in roles]
     words = [next((image.caption for image in images.values() if image.caption), "")]
@@ -222,12 +222,12 @@ def _agreement(reference: NDArray, difference: NDArray) -> tuple[float | None, s
     return psnr, f"PSNR {psnr:.1f} dB · nRMSE {np.sqrt(mse / power):.3g}"
 
 
-def _picture(name: str, image: NDArray, scale: show.Scale | None, aspect: float | None = None) -> Picture:
-    rgb = image if image.dtype == np.uint8 else show.pixels(image, scale or show.scale_of(image))
+def _picture(name: str, image: NDArray, scale: pixel_scale.Scale | None, aspect: float | None = None) -> Picture:
+    rgb = image if image.dtype == np.uint8 else pixel_scale.pixels(image, scale or pixel_scale.scale_of(image))
     height, width = rgb.shape[:2]
     true = aspect or width / height
     shown = min(max(true, 1 / WIDEST), WIDEST)
-    return Picture(name if shown == true else f"{name}, stretched", show.data_uri(rgb), width, height, shown)
+    return Picture(name if shown == true else f"{name}, stretched", pixel_scale.data_uri(rgb), width, height, shown)
 
 
 def plain_picture(folder: Path, image: Image) -> Picture:
@@ -242,7 +242,7 @@ def film_of(folder: Path, image: Image) -> tuple[str, str, bool]:
     return image.caption or image.view, f"data:{kind};base64,{coded}", kind.startswith("image/")
 
 
-def _bar_labels(scales: dict[str, show.Scale], image: Image | None) -> list[tuple[str, str]]:
+def _bar_labels(scales: dict[str, pixel_scale.Scale], image: Image | None) -> list[tuple[str, str]]:
     what = f"{image.quantity} [{image.unit}]" if image and image.unit else image.quantity if image else ""
     names = _names_of([image] if image else [])
     labels = {
@@ -254,8 +254,8 @@ def _bar_labels(scales: dict[str, show.Scale], image: Image | None) -> list[tupl
     return [(role, label) for role, label in labels.items() if role in scales]
 
 
-def _bar(scale: show.Scale, label: str) -> Bar:
-    stops = show.pixels(np.linspace(scale.low, scale.high, 17)[None, :], scale)[0]
+def _bar(scale: pixel_scale.Scale, label: str) -> Bar:
+    stops = pixel_scale.pixels(np.linspace(scale.low, scale.high, 17)[None, :], scale)[0]
     gradient = ", ".join("#{:02x}{:02x}{:02x}".format(*stop) for stop in stops)
     # A percentile between zeros may be 1e-16.
     low = scale.low if abs(scale.low) > 1e-9 * scale.high else 0.0
@@ -277,15 +277,15 @@ def _cut(folder: Path, by_role: dict[str, Volume]) -> Cut:
     """Slices of the truth, the reconstruction and their difference, one row a plane."""
     data = {role: read_volume(folder / by_role[role].path) for role in ("truth", "reconstruction") if role in by_role}
     size = by_role["reconstruction"].size or tuple(np.linalg.norm(data["reconstruction"].to_world[:3, :3], axis=0))
-    cuts = {role: show.slices(found.values, size) for role, found in data.items()}
+    cuts = {role: pixel_scale.slices(found.values, size) for role, found in data.items()}
     if len(cuts) == 2 and data["truth"].values.shape == data["reconstruction"].values.shape:
         truth, found = cuts["truth"].images, cuts["reconstruction"]
         cuts["difference"] = found._replace(images={p: image - truth[p] for p, image in found.images.items()})
     first = next(iter(cuts.values()))
-    values = show.scale_of(*first.images.values())
+    values = pixel_scale.scale_of(*first.images.values())
     scales = {"truth": values, "reconstruction": values}
     if "difference" in cuts:
-        scales["difference"] = show.signed_scale(*cuts["difference"].images.values())
+        scales["difference"] = pixel_scale.signed_scale(*cuts["difference"].images.values())
     rows = [_plane(plane, cuts, scales) for plane in first.images] if len(cuts) > 1 else [_planes(first, values)]
     described = by_role["reconstruction"]
     unit = f" [{described.unit}]" if described.unit else ""
@@ -305,7 +305,7 @@ def _heights(count: int) -> list[float]:
     return [] if count < 2 else ((np.arange(min(count, LAYERS)) + 0.5) / min(count, LAYERS)).tolist()
 
 
-def _layer(share: float, volumes: dict[str, NDArray], scales: dict[str, show.Scale], aspect: float) -> dict[str, Any]:
+def _layer(share: float, volumes: dict[str, NDArray], scales: dict[str, pixel_scale.Scale], aspect: float) -> dict[str, Any]:
     """The slice xy at a share of the height of each volume, the second axis upwards, at most LAYER_EDGE pixels an edge."""
     count = volumes["reconstruction"].shape[0]
     pictures = []
@@ -316,12 +316,12 @@ def _layer(share: float, volumes: dict[str, NDArray], scales: dict[str, show.Sca
     return {"name": "xy", "text": f"z = {int(share * count) + 1} of {count}", "pictures": pictures}
 
 
-def _planes(cut: show.Slices, scale: show.Scale) -> dict[str, Any]:
+def _planes(cut: pixel_scale.Slices, scale: pixel_scale.Scale) -> dict[str, Any]:
     """The three planes of one volume side by side."""
     pictures = [_picture(f"{p}, {cut.where[p]}", image, scale, cut.aspect[p]) for p, image in cut.images.items()]
     return {"plane": "", "where": "", "pictures": pictures}
 
 
-def _plane(plane: str, cuts: dict[str, show.Slices], scales: dict[str, show.Scale]) -> dict[str, Any]:
+def _plane(plane: str, cuts: dict[str, pixel_scale.Slices], scales: dict[str, pixel_scale.Scale]) -> dict[str, Any]:
     pictures = [_picture(role.capitalize(), cut.images[plane], scales[role], cut.aspect[plane]) for role, cut in cuts.items()]
     return {"plane": plane, "where": cuts["reconstruction"].where[plane], "pictures": pictures}

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import base64
 import io
+from pathlib import Path
 from typing import NamedTuple
 
 import matplotlib as mpl
@@ -19,8 +20,23 @@ from numpy.typing import NDArray
 
 from mivol.errors import MivolError
 from mivol.files import encode_srgb
+from mivol.files.atomic import write_whole_bytes
+from mivol.photos import Camera, pixel_centres, rays
 
-__all__ = ["SIGNED", "Scale", "Slices", "data_uri", "pixels", "scale_of", "signed_scale", "slices"]
+__all__ = [
+    "SIGNED",
+    "Scale",
+    "Slices",
+    "data_uri",
+    "pixels",
+    "scale_of",
+    "signed_scale",
+    "slices",
+    "COLOURS",
+    "depth_pixels",
+    "normal_pixels",
+    "normals_of_depth",
+]
 
 SIGNED = "RdBu_r"
 BROKEN = (255, 0, 255)
@@ -136,3 +152,100 @@ def slices(grid: NDArray, size: tuple[float, float, float] | None = None) -> Sli
     missing = dict(zip(PLANES, "zyx", strict=True))
     where = {p: f"{missing[p]} = {middle[axis] + 1} of {grid.shape[axis]}" for p, axis in PLANES.items()}
     return Slices(images, where, {"xy": x / y, "xz": x / z, "yz": y / z})
+
+
+COLOURS = "viridis_r"
+
+
+def depth_pixels(distance: NDArray, near_far: tuple[float, float], opacity: NDArray | None = None) -> NDArray[np.uint8]:
+    """Distances as colours (H, W, 3), mixed with white by the opacity.
+
+    Args:
+        distance: (H, W) [length]; what is not finite is white.
+        near_far: distances that are lightest and darkest.
+        opacity: (H, W) in 0..1; None: 1.
+
+    Raises:
+        MivolError: another shape, or near not below far.
+    """
+    _check_plane(distance)
+    near, far = near_far
+    if not near < far:
+        raise MivolError(f"distances are coloured between {near} and {far}; near must be below far.")
+    there = np.isfinite(distance)
+    share = np.clip((np.where(there, distance, far) - near) / (far - near), 0, 1)
+    return _over_white(mpl.colormaps[COLOURS](share)[..., :3], there, opacity)
+
+
+def normals_of_depth(distance: NDArray, camera: Camera) -> NDArray:
+    """Unit normals (H, W, 3) in the world of the surface that a picture of distances is of, towards the camera.
+
+    The surface is differentiated between neighbouring pixels (central differences inside, one-sided at the border), so that
+    an edge in the distance is a wall there. NaN where a neighbour is not finite.
+
+    Raises:
+        MivolError: another size than the camera's.
+    """
+    _check_plane(distance)
+    if distance.shape != camera.size[::-1]:
+        raise MivolError(f"distances of shape {distance.shape} were not seen by a camera of {camera.size[::-1]} pixels.")
+    origin, direction = rays(camera, pixel_centres(camera.size))
+    points = origin + distance[..., None] * direction
+    normal = np.cross(np.gradient(points, axis=0), np.gradient(points, axis=1))
+    with np.errstate(invalid="ignore"):
+        normal = normal / np.linalg.norm(normal, axis=-1, keepdims=True)
+    return np.where(np.sum(normal * direction, axis=-1, keepdims=True) > 0, -normal, normal)
+
+
+def normal_pixels(normals: NDArray, opacity: NDArray | None = None) -> NDArray[np.uint8]:
+    """Unit normals (H, W, 3) as colours, mixed with white by the opacity (H, W); NaN is white."""
+    there = np.isfinite(normals).all(axis=-1)
+    return _over_white((1 + np.where(there[..., None], normals, 0)) / 2, there, opacity)
+
+
+def _check_plane(distance: NDArray) -> None:
+    if np.ndim(distance) != 2 or min(np.shape(distance)) < 2:
+        raise MivolError(f"a picture of distances has shape {np.shape(distance)}; give (height, width), at least 2 x 2.")
+
+
+def _over_white(colour: NDArray, there: NDArray, opacity: NDArray | None) -> NDArray[np.uint8]:
+    a = np.where(there, 1.0 if opacity is None else np.clip(opacity, 0, 1), 0.0)[..., None]
+    return np.round(255 * (a * colour + 1 - a)).astype(np.uint8)
+
+
+PREVIEW = "preview.png"
+EDGE, GAP = 320, 8
+"""Pixels of the box's longest edge, and between two slices."""
+
+
+def is_due(iteration: int, iterations: int) -> bool:
+    """Whether a preview is written after an iteration: the first and the last one, and some twenty between."""
+    return iteration in (1, iterations) or iteration % max(1, iterations // 20) == 0
+
+
+def write_preview(folder: Path, volume: NDArray, size: tuple[float, float, float]) -> Path:
+    """Write ``preview.png`` whole: the middle slices xy, xz and yz side by side, on one grey scale, second axis upwards.
+
+    Args:
+        folder: of the run.
+        volume: (Z, Y, X).
+        size: lengths of the box's edges along x, y, z; the longest is EDGE pixels.
+    """
+    cut = slices(volume, size)
+    scale = scale_of(*cut.images.values())
+    edges = dict(zip("xyz", np.maximum(1, np.rint(EDGE * np.array(size) / max(size))).astype(int), strict=True))
+    parts = [_resized(pixels(image, scale), edges[plane[1]], edges[plane[0]]) for plane, image in cut.images.items()]
+    height = max(part.shape[0] for part in parts)
+    paper = np.full((height, sum(part.shape[1] for part in parts) + 2 * GAP, 3), 255, np.uint8)
+    left = 0
+    for part in parts:
+        paper[height - part.shape[0] :, left : left + part.shape[1]] = part
+        left += part.shape[1] + GAP
+    write_whole_bytes(folder / PREVIEW, png(paper))
+    return folder / PREVIEW
+
+
+def _resized(rgb: NDArray[np.uint8], height: int, width: int) -> NDArray[np.uint8]:
+    """The nearest pixels."""
+    rows, columns = ((np.arange(n) + 0.5) * have // n for n, have in zip((height, width), rgb.shape, strict=False))
+    return rgb[rows.astype(int)[:, None], columns.astype(int)]
