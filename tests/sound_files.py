@@ -235,9 +235,9 @@ def _read_columns(path: Path) -> object:
 
 
 def _read_picture(path: Path) -> object:
-    from mivol.photos.photo_file import read_picture
+    from mivol.photos.photo_file import read_photo
 
-    return read_picture(path, "srgb")
+    return read_photo(path, "srgb")
 
 
 def _read_mask(path: Path) -> object:

@@ -10,7 +10,7 @@ import mitsuba as mi
 from numpy.typing import NDArray
 
 from mivol.optim.render_batches import View
-from mivol.photos import Frame, Photos, PhotoSurvey
+from mivol.photos import PhotoFrame, Photos, PhotoSurvey
 from mivol.report.cameras import PARTS, parts_of, plot_cameras
 from mivol.report.record import Image
 from mivol.report.scanner import plot_scanner, shown_views
@@ -54,7 +54,7 @@ def pictures_of_views(folder: Path, scene: mi.Scene, views: Mapping[str, Sequenc
         views: by key of ``mivol.photos.SPLITS``.
     """
     frames = tuple(
-        Frame(Path(view.name), camera_of(view.sensor, view.name), split)
+        PhotoFrame(Path(view.name), camera_of(view.sensor, view.name), split)
         for split, of in views.items()
         for view in of
         if view.sensor.class_name() == "PerspectiveCamera"

@@ -13,7 +13,7 @@ from mivol.config import Shown
 from mivol.errors import MivolError
 from mivol.experiments.run_folder import RunFolder
 from mivol.experiments.task import Watcher
-from mivol.photos import Camera, Photos, between, past, turntable
+from mivol.photos import Camera, Photos, follow_keyframes, interpolate_cameras, turntable
 from mivol.report.record import Image
 from mivol.report.video import WITHOUT_FFMPEG, film_suffix, volume_frames, write_video
 
@@ -81,8 +81,10 @@ def plan_film(show: Shown, photos: Photos) -> Film:
     try:
         if show.way == "turntable":
             found = turntable(cameras, photos.box, show.frames)
+        elif show.way == "views":
+            found = interpolate_cameras(cameras, show.frames)
         else:
-            found = between(cameras, show.frames) if show.way == "views" else past(cameras, show.keyframes, show.frames)
+            found = follow_keyframes(cameras, show.keyframes, show.frames)
     except MivolError as error:
         if show.way == "keyframes":
             raise

@@ -15,7 +15,7 @@ from mivol.fields.spherical import SphericalGrid
 from mivol.fields.spherical_files import load_field, save_field
 from mivol.files.source import by_suffix, existing_file
 from mivol.optim.field_view import render_view
-from mivol.photos import Camera, facing, intrinsics
+from mivol.photos import Camera, aim_camera, intrinsics
 from mivol.points.cloud import read_points
 from mivol.points.conversions import gaussians_of_points
 from mivol.points.gaussian_files import WRITERS, holds_gaussians, read_gaussians, write_gaussians
@@ -139,4 +139,4 @@ def cameras_around(to_world: np.ndarray, edge: int, views: int = VIEWS) -> list[
     turn = math.pi * (3 - math.sqrt(5)) * np.arange(views)
     flat = np.sqrt(1 - height**2)
     towards = np.stack([flat * np.cos(turn), flat * np.sin(turn), height], axis=1)
-    return [facing(like, middle + distance * one, middle, np.array([0.0, 0, 1])) for one in towards]
+    return [aim_camera(like, middle + distance * one, middle, np.array([0.0, 0, 1])) for one in towards]

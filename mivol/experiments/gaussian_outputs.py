@@ -16,7 +16,7 @@ from mivol.experiments.run_folder import RunFolder
 from mivol.experiments.task import Task
 from mivol.optim.gaussian_problem import GaussianProblem
 from mivol.optim.loop import Fit
-from mivol.photos import Camera, Photo, Photos, rectified
+from mivol.photos import Camera, Photo, Photos, rectify
 from mivol.points import Gaussians, write_gaussians
 from mivol.report.record import Image, Table
 from mivol.validate.images import Quality, judge, score
@@ -80,8 +80,8 @@ class GaussianOutputs:
             seen, quality = compare(self.problem, self.judged, photo, chosen.show.metrics)
             found.append(quality)
             if self.problem.exposure is not None:
-                fitted.append(judge_fitted(seen, rectified(photo), self.judged.space))
-            pictures.add(rectified(photo), seen, next(iter(quality.values.values())), caption_of(quality))
+                fitted.append(judge_fitted(seen, rectify(photo), self.judged.space))
+            pictures.add(rectify(photo), seen, next(iter(quality.values.values())), caption_of(quality))
         self.run.record.images += pictures.images()
         self.run.record.judged = said_of(views)
         self.run.record.tables.append(table_of_views(views[0].camera, found, fitted))
@@ -96,7 +96,7 @@ class GaussianOutputs:
 
 def compare(problem: GaussianProblem, judged: Photos, photo: Photo, metrics: tuple[str, ...]) -> tuple[NDArray, Quality]:
     """A photograph's view of the Gaussians (H, W, 3), and how alike they are; what a lens distorts is rectified first."""
-    photo = rectified(photo)
+    photo = rectify(photo)
     seen = picture_of(problem, photo.camera, photo.background, problem.plan.low_pass)
     return seen, judge(seen, photo.image, space=judged.space, mask=photo.mask, metrics=metrics, name=photo.name)
 

@@ -12,7 +12,7 @@ from mivol.optim.gaussian_problem import GaussianProblem
 from mivol.optim.gaussian_start import begin_at, places_of
 from mivol.optim.ray_batches import RayBatches
 from mivol.optim.strategy import nearest
-from mivol.photos import Photo, Photos, rectified
+from mivol.photos import Photo, Photos, rectify
 from mivol.report.record import PlanLine
 
 __all__ = ["Begun", "begin", "make_gaussian_plan"]
@@ -67,7 +67,7 @@ def begin(chosen: GaussianFit, photos: Photos, plan: GaussianPlan) -> Begun:
     Raises:
         MivolError: more memory than there is, or no place where Gaussians could begin.
     """
-    views = tuple(rectified(view) for view in photos.views)
+    views = tuple(rectify(view) for view in photos.views)
     longest = max(max(view.camera.size) for view in views)
     plan = plan.for_edge(longest)
     places, whence = places_of(photos, plan.start, chosen.seed)

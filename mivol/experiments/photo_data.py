@@ -14,9 +14,9 @@ from mivol.errors import MivolError
 from mivol.experiments.photo_plan import LEARNED
 from mivol.optim.colour_scale import EPSILON
 from mivol.optim.strategy import nearest
-from mivol.photos import Photos, PhotoSurvey, load_photos, silhouette_box, survey_photos
+from mivol.photos import Photos, PhotoSurvey, load_photos, survey_photos
 from mivol.photos.dataset import BACKGROUNDS, check_alpha
-from mivol.photos.region import near_far_of
+from mivol.photos.region import near_and_far
 from mivol.validate.images import check_metrics
 
 
@@ -130,7 +130,7 @@ def boxed(chosen: PhotoFit, photos: Photos) -> Photos:
     """The photographs with the box where matter may be.
 
     Raises:
-        MivolError: as :func:`mivol.photos.silhouette_box`.
+        MivolError: as :func:`mivol.photos.region.silhouette_box`.
     """
     wanted = chosen.photos.box
     return BOXES[wanted](photos) if isinstance(wanted, str) else photos
@@ -143,8 +143,8 @@ def _found(photos: Photos) -> Photos:
 
 
 def _about_silhouettes(photos: Photos) -> Photos:
-    box = silhouette_box(photos)
-    near_far = near_far_of([view.camera for view in photos.views], box)
+    box = photos.silhouette_box()
+    near_far = near_and_far([view.camera for view in photos.views], box)
     return replace(photos, survey=replace(photos.survey, box=box, box_from="about what alpha shows", near_far=near_far))
 
 

@@ -12,8 +12,8 @@ from mivol.errors import MivolError
 from mivol.optim.radiance_plan import FEW, PRESETS, FitPlan, Stage, memory_of, stretched
 from mivol.optim.ray_batches import TILE, RayBatches
 from mivol.optim.strategy import nearest
-from mivol.photos import Photos, rectified
-from mivol.photos.region import FEWEST_POINTS, levels_holding, nested, within
+from mivol.photos import Photos, rectify
+from mivol.photos.region import FEWEST_POINTS, count_levels, nested_boxes, points_in_box
 from mivol.report.record import PlanLine
 
 GAINS = PlanLine(
@@ -70,7 +70,7 @@ def with_background(plan: FitPlan, background: str | tuple[float, float, float])
 
 def batches_of(plan: FitPlan, photos: Photos) -> RayBatches:
     """The photographs in the sizes of the plan, without the distortion of lenses that have an image plane."""
-    return RayBatches.of([rectified(view) for view in photos.views], [one.shrink for one in plan.stages], space=photos.space)
+    return RayBatches.of([rectify(view) for view in photos.views], [one.shrink for one in plan.stages], space=photos.space)
 
 
 def suited(plan: FitPlan, photos: Photos) -> FitPlan:
@@ -118,7 +118,7 @@ def with_levels_needed(plan: FitPlan, photos: Photos) -> FitPlan:
     points = photos.survey.points
     if not plan.fewer_levels or points is None or len(points) < FEWEST_POINTS:
         return plan
-    return replace(plan, levels=levels_holding(photos.box, points, plan.levels))
+    return replace(plan, levels=count_levels(photos.box, points, plan.levels))
 
 
 def choices(plan: FitPlan, photos: Photos, batches: RayBatches) -> list[PlanLine]:
@@ -127,18 +127,18 @@ def choices(plan: FitPlan, photos: Photos, batches: RayBatches) -> list[PlanLine
     resolutions = ", ".join(str(stage.longest) for stage in plan.stages)
     width, height = photos.views[0].camera.size
     size = " x ".join(f"{edge:.4g}" for edge in box[1] - box[0])
-    largest = nested(box, plan.levels)[-1]
+    largest = nested_boxes(box, plan.levels)[-1]
     outer = " x ".join(f"{edge:.4g}" for edge in largest[1] - largest[0])
-    nested_boxes = [
+    outer_boxes = [
         PlanLine(
             choice=f"{plan.levels} nested boxes, the largest of {outer} [length]",
             reason=f"each has twice the extent of the one before, for what is around; "
-            f"{len(within(origins, box))} of {len(origins)} cameras stand in the innermost",
+            f"{len(points_in_box(origins, box))} of {len(origins)} cameras stand in the innermost",
         )
     ]
     return [
         PlanLine(choice=f"{len(photos.views)} photographs, a box of {size} [length]", reason=photos.survey.box_from),
-        *nested_boxes[: plan.levels > 1],
+        *outer_boxes[: plan.levels > 1],
         *left_out(plan, photos),
         *distances_told(plan, batches),
         *near_cameras(plan, origins, box),
@@ -157,7 +157,7 @@ def choices(plan: FitPlan, photos: Photos, batches: RayBatches) -> list[PlanLine
 def left_out(plan: FitPlan, photos: Photos) -> list[PlanLine]:
     """A line where points of a reconstruction lie beyond the boxes."""
     points = photos.survey.points
-    if points is None or (beyond := len(points) - len(within(points, nested(photos.box, plan.levels)[-1]))) == 0:
+    if points is None or (beyond := len(points) - len(points_in_box(points, nested_boxes(photos.box, plan.levels)[-1]))) == 0:
         return []
     box = "the largest box" if plan.levels > 1 else "the box"
     reason = f"they lie beyond {box}, where {'the sky is' if plan.sky else 'nothing can be'}"

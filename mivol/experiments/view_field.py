@@ -12,7 +12,7 @@ from mivol.errors import MivolError
 from mivol.fields.sky import Sky, read_sky
 from mivol.fields.spherical_files import load_field
 from mivol.optim.field_view import render_view
-from mivol.photos import Camera, facing, intrinsics
+from mivol.photos import Camera, aim_camera, intrinsics
 from mivol.photos.photo_file import decode_srgb
 
 SKY = "sky.exr"
@@ -60,4 +60,4 @@ def camera_at(look_at: Sequence[float], up: Sequence[float], fov: float, size: t
     width, height = size
     focal = width / (2 * math.tan(math.radians(fov) / 2))
     like = Camera(intrinsics(focal, focal, width / 2, height / 2), size, np.eye(4))
-    return facing(like, np.array(look_at[:3]), np.array(look_at[3:]), np.array(up), "--look-at")
+    return aim_camera(like, np.array(look_at[:3]), np.array(look_at[3:]), np.array(up), "--look-at")

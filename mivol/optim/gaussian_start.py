@@ -15,7 +15,7 @@ from scipy.special import logit
 from mivol.errors import MivolError
 from mivol.optim.density_control import Arrays
 from mivol.photos import Photo, Photos, project
-from mivol.photos.region import FEWEST_POINTS, views_seeing
+from mivol.photos.region import FEWEST_POINTS, count_views
 
 __all__ = ["begin_at", "places_of"]
 
@@ -89,7 +89,7 @@ def begin_at(places: np.ndarray, views: Sequence[Photo], degree: int) -> Arrays:
 
 def _may_be_matter(views: Sequence[Photo], points: np.ndarray) -> np.ndarray:
     """Points (N, 3) that enough views see, and none of them where it is transparent."""
-    kept = views_seeing([view.camera for view in views], points) >= SHARE * len(views)
+    kept = count_views([view.camera for view in views], points) >= SHARE * len(views)
     for view in views:
         seen, row, column = _looked_up(view, points)
         kept &= ~seen | (view.alpha[row, column] > 0)

@@ -7,11 +7,10 @@ sees, :func:`project` where a point lies in the image.
 from __future__ import annotations
 
 from mivol.photos.camera import Camera, directions, intrinsics, pixel_centres, project, rays
-from mivol.photos.camera_path import between, facing, past, turntable
-from mivol.photos.dataset import BACKGROUNDS, Photo, Photos, load_photos, pinhole_of, rectified
+from mivol.photos.camera_path import aim_camera, follow_keyframes, interpolate_cameras, turntable
+from mivol.photos.dataset import BACKGROUNDS, Photo, Photos, load_photos, rectify, to_pinhole
 from mivol.photos.lens import Lens, distort, undistort
-from mivol.photos.silhouette import silhouette_box
-from mivol.photos.survey import FORMATS, SPLITS, Frame, PhotoSurvey, find_format, survey_photos
+from mivol.photos.survey import FORMATS, SPLITS, PhotoFrame, PhotoSurvey, find_format, survey_photos
 from mivol.photos.transforms import write_transforms
 
 __all__ = [
@@ -19,25 +18,24 @@ __all__ = [
     "FORMATS",
     "SPLITS",
     "Camera",
-    "Frame",
+    "PhotoFrame",
     "Lens",
     "Photo",
     "Photos",
     "PhotoSurvey",
-    "between",
+    "interpolate_cameras",
     "directions",
     "distort",
-    "facing",
+    "aim_camera",
     "find_format",
     "intrinsics",
     "load_photos",
-    "past",
-    "pinhole_of",
+    "follow_keyframes",
+    "to_pinhole",
     "pixel_centres",
     "project",
     "rays",
-    "rectified",
-    "silhouette_box",
+    "rectify",
     "survey_photos",
     "turntable",
     "undistort",

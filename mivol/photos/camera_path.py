@@ -17,7 +17,7 @@ from mivol.files.source import refusal
 from mivol.photos.camera import Camera, intrinsics
 from mivol.photos.lens import Lens
 
-__all__ = ["between", "facing", "past", "turntable"]
+__all__ = ["interpolate_cameras", "aim_camera", "follow_keyframes", "turntable"]
 
 ALL_ROUND = np.radians(90)
 """Cameras that leave no larger gap of azimuth than this go all the way round; others are swung between."""
@@ -26,7 +26,7 @@ WIDE = 70.0
 """Field of view [degree] of films of what wide lenses saw: that of a wide photograph, without the stretch of a wider one."""
 
 
-def facing(like: Camera, origin: np.ndarray, target: np.ndarray, up: np.ndarray, name: str = "camera") -> Camera:
+def aim_camera(like: Camera, origin: np.ndarray, target: np.ndarray, up: np.ndarray, name: str = "camera") -> Camera:
     """A pinhole like another camera that stands at ``origin`` and looks at ``target``, with ``up`` upwards in the image.
 
     Raises:
@@ -61,14 +61,14 @@ def turntable(cameras: Sequence[Camera], box: np.ndarray, n: int) -> list[Camera
     radius = float(np.linalg.norm(along, axis=0).mean())
     azimuths = _azimuths(np.arctan2(along[1], along[0]), n)
     return [
-        facing(
+        aim_camera(
             cameras[0], middle + radius * (np.cos(a) * side + np.sin(a) * ahead) + height.mean() * up, middle, up, f"turn {i}"
         )
         for i, a in enumerate(azimuths)
     ]
 
 
-def between(cameras: Sequence[Camera], n: int) -> list[Camera]:
+def interpolate_cameras(cameras: Sequence[Camera], n: int) -> list[Camera]:
     """n cameras on a smooth way from the first to the last of at least two, through all of them, in equal times.
 
     Raises:
@@ -84,7 +84,7 @@ def between(cameras: Sequence[Camera], n: int) -> list[Camera]:
     return [_pinhole(cameras[0], pose, f"step {i}") for i, pose in enumerate(poses)]
 
 
-def past(cameras: Sequence[Camera], keyframes: Sequence[Sequence[float]], n: int) -> list[Camera]:
+def follow_keyframes(cameras: Sequence[Camera], keyframes: Sequence[Sequence[float]], n: int) -> list[Camera]:
     """n cameras on a smooth way past places of one's own, in equal times; upwards is what is up in the photographs.
 
     Args:
@@ -101,7 +101,7 @@ def past(cameras: Sequence[Camera], keyframes: Sequence[Sequence[float]], n: int
         raise refusal("keyframes", keys.tolist(), "at least two of six finite numbers", "give places and targets")
     up, times = _mean_up(cameras), np.arange(len(keys))
     found = CubicSpline(times, keys)(np.linspace(0, len(keys) - 1, n))
-    return [facing(cameras[0], place[:3], place[3:], up, f"step {i}") for i, place in enumerate(found)]
+    return [aim_camera(cameras[0], place[:3], place[3:], up, f"step {i}") for i, place in enumerate(found)]
 
 
 def _pinhole(like: Camera, pose: np.ndarray, name: str) -> Camera:

@@ -110,9 +110,7 @@ def read_colmap(path: Path) -> Listing:
     seen = {} if points is None else points.seen_by()
     base = next((folder for folder in (path, *model.parents[:2]) if (folder / "images").is_dir()), path)
     file = model / f"images{suffix}"
-    entries = [
-        _entry(base, pose, sensors, file, seen.get(pose.number)) for pose in sorted(poses, key=lambda pose: pose.name)
-    ]
+    entries = [_entry(base, pose, sensors, file, seen.get(pose.number)) for pose in sorted(poses, key=lambda pose: pose.name)]
     return Listing(entries, None if points is None else points.rows[:, :3])
 
 

@@ -20,11 +20,12 @@ from mivol.files.source import refusal
 from mivol.machine import available_memory
 from mivol.photos.camera import Camera, intrinsics, is_seen, pixel_centres
 from mivol.photos.lens import Lens, distort
-from mivol.photos.photo_file import read_header, read_mask, read_picture, shrink, space_of
-from mivol.photos.survey import Frame, PhotoSurvey, survey_photos
+from mivol.photos.photo_file import find_colour_space, read_mask, read_photo, read_photo_header, shrink
+from mivol.photos.region import silhouette_box
+from mivol.photos.survey import PhotoFrame, PhotoSurvey, survey_photos
 from mivol.shown import briefly
 
-__all__ = ["BACKGROUNDS", "Photo", "Photos", "check_alpha", "load_photos", "pinhole_of", "rectified"]
+__all__ = ["BACKGROUNDS", "Photo", "Photos", "check_alpha", "load_photos", "to_pinhole", "rectify"]
 
 Background = str | Sequence[float] | None
 
@@ -94,6 +95,15 @@ class Photos:
     def box(self) -> np.ndarray:
         """(2, 3) what is looked at [length]."""
         return self.survey.box
+
+    def silhouette_box(self) -> np.ndarray:
+        """Return the box (2, 3) around the region that no view shows as transparent [length].
+
+        Raises:
+            MivolError: as :func:`mivol.photos.region.silhouette_box`.
+        """
+        cameras, alphas = [view.camera for view in self.views], [view.alpha for view in self.views]
+        return silhouette_box(cameras, alphas, self.box)
 
     @property
     def near_far(self) -> tuple[float, float]:
@@ -189,13 +199,13 @@ def _check_memory(survey: PhotoSurvey, scale: float, limit: int | None) -> None:
     raise MivolError(f"{survey.path}: {found} and {limit / 2**30:.2g} are left; {advice}.")
 
 
-def check_alpha(frames: Sequence[Frame]) -> bool:
+def check_alpha(frames: Sequence[PhotoFrame]) -> bool:
     """Whether photographs have alpha.
 
     Raises:
         MivolError: some have and some have not.
     """
-    kinds = {read_header(frame.file).has_alpha: frame.file for frame in frames}
+    kinds = {read_photo_header(frame.file).has_alpha: frame.file for frame in frames}
     if len(kinds) == 2:
         found, advice = f"alpha, and none in {kinds[False].name}", "add an opaque alpha to the others, or remove it from all"
         raise refusal(kinds[True], found, "alpha in all photographs or in none", advice)
@@ -209,10 +219,10 @@ def _check_background(has_alpha: bool, background: Background, first: Path) -> N
         raise _without_alpha(first)
 
 
-def _spaces(frames: Sequence[Frame], stored: str | None) -> dict[str, Path]:
+def _spaces(frames: Sequence[PhotoFrame], stored: str | None) -> dict[str, Path]:
     """What the values of files are, each with one of them."""
     _check_space("stored", stored)
-    return {space_of(frame.file, stored): frame.file for frame in frames}
+    return {find_colour_space(frame.file, stored): frame.file for frame in frames}
 
 
 def _space(wanted: str | None, held: dict[str, Path]) -> str:
@@ -243,9 +253,9 @@ def _backgrounds(background: Background, n: int, seed: int) -> Sequence[np.ndarr
     return np.broadcast_to(colour, (n, 3))
 
 
-def _photo(frame: Frame, scale: float, background: np.ndarray | None, spaces: tuple[str, str | None]) -> Photo:
+def _photo(frame: PhotoFrame, scale: float, background: np.ndarray | None, spaces: tuple[str, str | None]) -> Photo:
     """Read one, whose values shall be, and in its file are, what ``spaces`` says."""
-    image, alpha = read_picture(frame.file, *spaces)
+    image, alpha = read_photo(frame.file, *spaces)
     camera = _shrunk_camera(frame.camera, scale)
     mask = None if frame.mask is None else _read_mask(frame, camera.size)
     seen = is_seen(camera, pixel_centres(camera.size))
@@ -264,7 +274,7 @@ def _shrunk_camera(camera: Camera, scale: float) -> Camera:
     return camera.resized((width, height))
 
 
-def _read_mask(frame: Frame, size: tuple[int, int]) -> np.ndarray:
+def _read_mask(frame: PhotoFrame, size: tuple[int, int]) -> np.ndarray:
     """A shrunk pixel counts where all that it is the mean of count."""
     mask = read_mask(frame.mask)
     if mask.shape != frame.camera.size[::-1]:
@@ -277,7 +287,7 @@ def _without_alpha(name: object) -> MivolError:
     return refusal(name, "an image without alpha", "alpha, since a background is asked for", "leave background away")
 
 
-def pinhole_of(camera: Camera) -> Camera:
+def to_pinhole(camera: Camera) -> Camera:
     """The pinhole with square pixels that stands in for a camera.
 
     Raises:
@@ -290,7 +300,7 @@ def pinhole_of(camera: Camera) -> Camera:
     return dataclasses.replace(camera, K=intrinsics(f, f, *camera.K[:2, 2]), distortion=Lens())
 
 
-def rectified(photo: Photo) -> Photo:
+def rectify(photo: Photo) -> Photo:
     """A photograph as the pinhole of its camera would have taken it; one of such a pinhole, or of a wide lens, as it is.
 
     Bias: the interpolation is a low-pass of up to a pixel's width.
@@ -298,7 +308,7 @@ def rectified(photo: Photo) -> Photo:
     camera = photo.camera
     if camera.distortion.is_wide:
         return photo
-    pinhole = pinhole_of(camera)
+    pinhole = to_pinhole(camera)
     if not camera.distortion and camera.K[0, 0] == camera.K[1, 1]:
         return photo
     plane = (pixel_centres(camera.size) - pinhole.K[:2, 2]) / pinhole.K[0, 0]

@@ -27,13 +27,13 @@ from mivol.files.source import existing_file, refusal
 __all__ = [
     "SPACES",
     "SUFFIXES",
-    "PictureHeader",
+    "PhotoHeader",
     "decode_srgb",
-    "read_header",
+    "read_photo_header",
     "read_mask",
-    "read_picture",
+    "read_photo",
     "shrink",
-    "space_of",
+    "find_colour_space",
 ]
 
 #: suffixes of photographs, in the order in which a name without one is tried.
@@ -68,7 +68,7 @@ SPACES: dict[tuple[str, str], Callable[[np.ndarray], np.ndarray]] = {
 }
 
 
-def space_of(path: Path, stored: str | None = None) -> str:
+def find_colour_space(path: Path, stored: str | None = None) -> str:
     """What the values of a file are: "linear" (OpenEXR, and a PNG that says so) or "srgb".
 
     Args:
@@ -86,7 +86,7 @@ def space_of(path: Path, stored: str | None = None) -> str:
 
 
 @dataclass(frozen=True)
-class PictureHeader:
+class PhotoHeader:
     """What a file says before its pixels are read.
 
     Attributes:
@@ -100,7 +100,7 @@ class PictureHeader:
     orientation: int = 1
 
 
-def read_header(path: Path) -> PictureHeader:
+def read_photo_header(path: Path) -> PhotoHeader:
     """The header of a photograph.
 
     Raises:
@@ -108,24 +108,24 @@ def read_header(path: Path) -> PictureHeader:
     """
     if path.suffix.lower() == ".exr":
         size, names = read_exr_header(path)
-        return PictureHeader(size, "A" in names)
+        return PhotoHeader(size, "A" in names)
     with _opened(path) as image:
         orientation = image.getexif().get(ORIENTATION, 1) if "exif" in image.info else 1
-        return PictureHeader(image.size, _kind(image) == "RGBA", orientation)
+        return PhotoHeader(image.size, _kind(image) == "RGBA", orientation)
 
 
-def read_picture(path: Path, space: str, stored: str | None = None) -> tuple[np.ndarray, np.ndarray | None]:
+def read_photo(path: Path, space: str, stored: str | None = None) -> tuple[np.ndarray, np.ndarray | None]:
     """Colour multiplied by alpha (rows, columns, 3), and alpha (rows, columns) or None where the file has none.
 
     Args:
         path: PNG, JPEG or OpenEXR.
         space: "srgb" or "linear", what the values shall be.
-        stored: what those of a PNG or JPEG are; None: as :func:`space_of` says.
+        stored: what those of a PNG or JPEG are; None: as :func:`find_colour_space` says.
 
     Raises:
         MivolError: a damaged file, grey with alpha of 16 bits, channels that are no picture, NaN.
     """
-    is_exr, stored = path.suffix.lower() == ".exr", space_of(path, stored)
+    is_exr, stored = path.suffix.lower() == ".exr", find_colour_space(path, stored)
     colour, alpha = (_read_exr if is_exr else _read_codes)(path)
     if is_exr and alpha is not None:
         if space == "linear":
@@ -174,7 +174,7 @@ def _mean_over_pieces(image: np.ndarray, axis: int, n: int) -> np.ndarray:
 
 
 def _kind(image: Image.Image) -> str:
-    """"RGB" or "RGBA": what a picture of 8 bits a channel is read as."""
+    """ "RGB" or "RGBA": what a picture of 8 bits a channel is read as."""
     return "RGB" if image.mode == "P" and "transparency" not in image.info else MODES.get(image.mode, "RGB")
 
 

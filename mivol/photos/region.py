@@ -1,7 +1,9 @@
-"""What the cameras look at: a box, and between which distances their rays are inside it.
+"""The box that the cameras of photographs look at.
 
-Conventions. A box is (2, 3) float64, low and high corner [length]. Nothing here reads a pixel: a lens only counts by its field
-of view without distortion.
+Conventions. A box is (2, 3) float64: its low and its high corner [length]. No function here reads a pixel, and only
+:func:`silhouette_box` needs the alpha of the photographs. Distortion is left out, except for wide lenses.
+
+Source of the box of silhouettes: Laurentini 1994 (IEEE PAMI 16), the visual hull; here only the box of the hull.
 """
 
 from __future__ import annotations
@@ -10,167 +12,142 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.ndimage import maximum_filter
 
 from mivol.files.source import refusal
-from mivol.photos.camera import Camera, is_seen, project, rays
+from mivol.photos.camera import FLIP, Camera, is_seen, project, rays
 from mivol.photos.lens import Panorama
 
 __all__ = [
-    *("box_of_points", "check_box", "check_views", "focus_of", "levels_holding", "middle_box", "near_far_of", "nested"),
-    *("shared_box", "views_seeing", "within"),
+    *("FEWEST_POINTS", "MIDDLE", "VIEW_SHARE", "box_of_points", "check_box", "check_views", "count_levels", "count_views"),
+    *("find_focus", "middle_box", "near_and_far", "nested_boxes", "points_in_box", "shared_box", "silhouette_box"),
 ]
 
-SHARE = 0.9
-"""Share of the views that must see a point for it to count."""
+SEARCHES = 2
+"""Searches of a box, the second one in the box that the first one found."""
 
-CELLS = 32
-"""Points along each axis at which views are counted, twice: the box is known to 1/32 of itself."""
+VIEW_SHARE = 0.9
+"""Share of the views that must see a point of the shared region."""
 
-HELD = 0.99
-"""Share of the points of a reconstruction that nested boxes hold: some of its points lie anywhere."""
+VIEW_CELLS = 32
+"""Cells along each axis in a search for the shared region, which is then known to 1/32 of its size."""
+
+SILHOUETTE_SHARE = 0.5
+"""Share of the views that must see the centre of a cell; cells seen by fewer views do not belong to the subject."""
+
+SILHOUETTE_CELLS = 40
+"""Cells along each axis in a search for silhouettes."""
+
+POINT_SHARE = 0.99
+"""Share of the points of a reconstruction inside nested boxes: a few points are far outliers."""
 
 FEWEST_POINTS = 100
-"""Fewer points of a reconstruction say nothing of a box."""
+"""Smallest reconstruction [points] from which a box is taken."""
 
 PARALLEL = 1e-4
-"""Smallest sum of squared sines, per view, of the axes with the direction they have in common: about 0.6 degrees."""
+"""Smallest mean squared sine of the angle between the optical axes and their common direction: about 0.6 degrees."""
+
+MIDDLE = 0.45
+"""Half the edge of the innermost box of a capture [median distance of the cameras from their focus].
+
+0.4 to 0.5 were best on photographs of one room; the larger boxes hold the rest.
+"""
 
 
-def focus_of(cameras: Sequence[Camera], name: object = "cameras") -> np.ndarray:
-    """(3,) the point nearest to the axes of all cameras, by least squares; panoramas, which have none, look at their place.
+# -- Boxes from cameras -------------------------------------------------------------------------------------------
+
+
+def find_focus(cameras: Sequence[Camera], name: object = "cameras") -> np.ndarray:
+    """Return the point (3,) nearest to the optical axes of all cameras, by least squares.
+
+    A panorama has no optical axis, so its own position takes the place of the axis.
 
     Raises:
-        MivolError: axes that are parallel (or a single view), so that no point is nearest.
+        MivolError: parallel axes or a single view, for which no point is nearest.
     """
     across = [np.eye(3) - (0 if isinstance(c.distortion, Panorama) else np.outer(c.forward, c.forward)) for c in cameras]
     total = np.sum(across, axis=0)
     if np.linalg.eigvalsh(total)[0] < PARALLEL * len(cameras):
-        raise refusal(name, "cameras that all look in one direction", "views that cross", "say where things are with box=")
+        raise refusal(name, "cameras that all look in one direction", "views that cross", "give the box with box=")
     return np.linalg.solve(total, np.sum([a @ c.origin for a, c in zip(across, cameras, strict=True)], axis=0))
 
 
 def shared_box(cameras: Sequence[Camera], name: object = "cameras") -> np.ndarray:
-    """The box about the region that most views share.
+    """Return the box around the region shared by most views.
 
-    A point counts where at least ``SHARE`` of the views see it, and where it is nearer to the point that the cameras look at
-    (:func:`focus_of`) than the median camera: frustums have no end of their own.
+    The region holds the points seen by at least ``VIEW_SHARE`` of the views and nearer to the focus (:func:`find_focus`)
+    than the median camera. The second condition bounds the region, because viewing frustums are infinite.
 
     Raises:
-        MivolError: parallel cameras, or views that share nothing.
+        MivolError: parallel cameras, or views without a shared region.
     """
-    focus = focus_of(cameras, name)
+    focus = find_focus(cameras, name)
     reach = float(np.median([np.linalg.norm(c.origin - focus) for c in cameras]))
     box = np.array([focus - reach, focus + reach])
-    for _ in range(2):
-        step = (box[1] - box[0]) / CELLS
-        points = np.stack(np.meshgrid(*[b + s * (np.arange(CELLS) + 0.5) for b, s in zip(box[0], step, strict=True)]), -1)
-        points = points.reshape(-1, 3)
+    for _ in range(SEARCHES):
+        step = (box[1] - box[0]) / VIEW_CELLS
+        points = _cell_centres(box, VIEW_CELLS)
         points = points[np.linalg.norm(points - focus, axis=1) <= reach]
-        seen = points[views_seeing(cameras, points) >= SHARE * len(cameras)]
-        if len(seen) == 0:
-            raise refusal(name, "views that share no region", "cameras that look at one thing", "give its place with box=")
-        box = np.array([seen.min(axis=0) - step, seen.max(axis=0) + step])
+        shared = points[count_views(cameras, points) >= VIEW_SHARE * len(cameras)]
+        if len(shared) == 0:
+            raise refusal(name, "views without a shared region", "cameras around one subject", "give the box with box=")
+        box = np.array([shared.min(axis=0) - step, shared.max(axis=0) + step])
     return box + np.array([step / 2, -step / 2])
 
 
-MIDDLE = 0.45
-"""Half the edge of the innermost box of a capture, in medians of the cameras' distances from what they look at: 0.4 to 0.5 were
-best on photographs of one room; the levels around it hold the rest."""
-
-
 def middle_box(cameras: Sequence[Camera], name: object = "cameras") -> np.ndarray:
-    """The cube about what cameras look at, from which nested boxes begin; they may stand in it or in those around it.
+    """Return the innermost of nested boxes: a cube around the focus of the cameras, which may stand inside it.
 
     Raises:
-        MivolError: parallel cameras, or cameras that all stand where they look.
+        MivolError: parallel cameras, or cameras that all stand at their focus.
     """
-    focus = focus_of(cameras, name)
+    focus = find_focus(cameras, name)
     half = MIDDLE * float(np.median([np.linalg.norm(c.origin - focus) for c in cameras]))
     if not half > 0:
-        found = "cameras that all stand in one place"
-        raise refusal(name, found, "views from several places", "say where things are with box=")
+        raise refusal(name, "cameras that all stand in one place", "views from several places", "give the box with box=")
     return np.array([focus - half, focus + half])
 
 
-def nested(box: np.ndarray, levels: int) -> list[np.ndarray]:
-    """Boxes (2, 3) of the same middle, each of twice the extent of the one before."""
-    middle = box.mean(axis=0)
-    return [middle + 2**level * (box - middle) for level in range(levels)]
-
-
-def levels_holding(box: np.ndarray, points: np.ndarray, most: int) -> int:
-    """The fewest nested boxes that hold ``HELD`` of points (N, 3), and ``most`` where that many do not."""
-    out = 2 * np.abs((points - box.mean(axis=0)) / (box[1] - box[0])).max(axis=1)
-    return min(most, 1 + math.ceil(math.log2(max(1.0, np.percentile(out, 100 * HELD)))))
-
-
-def within(points: np.ndarray, box: np.ndarray) -> np.ndarray:
-    """Those of points (N, 3) that lie in a box."""
-    return points[((points >= box[0]) & (points <= box[1])).all(axis=1)]
-
-
-def box_of_points(points: np.ndarray, share: float = 0.98, margin: float = 0.05) -> np.ndarray:
-    """The box that holds the middle ``share`` of points (N, 3) along each axis, and ``margin`` of its size more on each side.
-
-    Points of a sparse reconstruction have far outliers; percentiles do not see them.
-    """
-    cut = 50 * (1 - share)
-    low, high = np.percentile(points, [cut, 100 - cut], axis=0)
-    return np.array([low - margin * (high - low), high + margin * (high - low)])
-
-
-def near_far_of(cameras: Sequence[Camera], box: np.ndarray) -> tuple[float, float]:
-    """The smallest and the largest distance of any point of the box from any camera [length]; 0 from inside it."""
+def near_and_far(cameras: Sequence[Camera], box: np.ndarray) -> tuple[float, float]:
+    """Return the smallest and the largest distance between a camera and a point of the box [length]; 0 from inside."""
     origins = np.array([c.origin for c in cameras])
     near = np.linalg.norm(np.clip(origins, *box) - origins, axis=1).min()
     far = np.linalg.norm(np.maximum(np.abs(origins - box[0]), np.abs(origins - box[1])), axis=1).max()
     return float(near), float(far)
 
 
-def check_box(box: np.ndarray, name: object = "box") -> np.ndarray:
-    """The box as (2, 3) float64.
-
-    Raises:
-        MivolError: another shape, a value that is not finite, or no volume.
-    """
-    found = np.asarray(box, np.float64)
-    if found.shape != (2, 3) or not np.isfinite(found).all() or not (found[0] < found[1]).all():
-        raise refusal(name, f"the box {found.tolist()}", "[low, high] with low below high along x, y, z", "correct box=")
-    return found
-
-
-def check_views(cameras: Sequence[Camera], box: np.ndarray) -> None:
-    """Refuse cameras none of whose rays meet the box; 17 x 17 rays of each are tried, the corners among them.
-
-    Raises:
-        MivolError: with the names of the first of them.
-    """
-    away = [camera.name for camera in cameras if not _meets(camera, box)]
-    if away:
-        names = ", ".join(away[:3]) + (f" and {len(away) - 3} more" if len(away) > 3 else "")
-        raise refusal(
-            names,
-            f"{len(away)} of {len(cameras)} cameras looking away from the box {np.round(box, 3).tolist()}",
-            "views of it",
-            "give another box, or take these views out",
-        )
-
-
-def views_seeing(cameras: Sequence[Camera], points: np.ndarray) -> np.ndarray:
-    """(N,) how many cameras see each of points (N, 3), distortion left out but for wide lenses."""
+def count_views(cameras: Sequence[Camera], points: np.ndarray) -> np.ndarray:
+    """Return for each of the points (N, 3) the number of cameras that see it (N,). Only wide lenses are distorted."""
     count = np.zeros(len(points), int)
     for camera in cameras:
         if camera.distortion.is_wide:
-            at, _ = project(camera, points)
-            count += ((at >= 0) & (at <= camera.size)).all(axis=1)
+            pixels, _ = project(camera, points)
+            count += ((pixels >= 0) & (pixels <= camera.size)).all(axis=1)
             continue
-        x, y, depth = camera.K @ np.diag([1.0, -1.0, -1.0]) @ camera.to_world[:3, :3].T @ (points - camera.origin).T
+        x, y, depth = camera.K @ np.diag(FLIP) @ camera.to_world[:3, :3].T @ (points - camera.origin).T
         inside = (x >= 0) & (x <= camera.size[0] * depth) & (y >= 0) & (y <= camera.size[1] * depth)
         count += inside & (depth > 0)
     return count
 
 
-def _meets(camera: Camera, box: np.ndarray) -> bool:
+def check_views(cameras: Sequence[Camera], box: np.ndarray) -> None:
+    """Refuse cameras without a ray through the box. 17 x 17 rays of each camera are tried, its corners included.
+
+    Raises:
+        MivolError: names the first three of these cameras.
+    """
+    missing = [camera.name for camera in cameras if not _meets_box(camera, box)]
+    if missing:
+        names = ", ".join(missing[:3]) + (f" and {len(missing) - 3} more" if len(missing) > 3 else "")
+        raise refusal(
+            names,
+            f"{len(missing)} of {len(cameras)} cameras looking away from the box {np.round(box, 3).tolist()}",
+            "views of the box",
+            "give another box, or remove these views",
+        )
+
+
+def _meets_box(camera: Camera, box: np.ndarray) -> bool:
     across = np.linspace(0, 1, 17)
     pixels = np.stack(np.meshgrid(across * camera.size[0], across * camera.size[1]), axis=-1)
     o, d = rays(camera, pixels)
@@ -178,3 +155,102 @@ def _meets(camera: Camera, box: np.ndarray) -> bool:
         t = (box[:, None, None] - o) / d
     first, last = np.nanmax(t.min(axis=0), axis=-1), np.nanmin(t.max(axis=0), axis=-1)
     return bool(((first <= last) & (last > 0) & is_seen(camera, pixels)).any())
+
+
+def _cell_centres(box: np.ndarray, n: int) -> np.ndarray:
+    """Centres (n^3, 3) of the n x n x n cells of a box."""
+    axes = [low + step * (np.arange(n) + 0.5) for low, step in zip(box[0], (box[1] - box[0]) / n, strict=True)]
+    return np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 3)
+
+
+# -- Boxes from points, and nested boxes --------------------------------------------------------------------------
+
+
+def box_of_points(points: np.ndarray, share: float = 0.98, margin: float = 0.05) -> np.ndarray:
+    """Return the box of the middle ``share`` of points (N, 3) along each axis, enlarged by ``margin`` on each side.
+
+    Percentiles are used because sparse reconstructions have far outliers.
+    """
+    cut = 50 * (1 - share)
+    low, high = np.percentile(points, [cut, 100 - cut], axis=0)
+    return np.array([low - margin * (high - low), high + margin * (high - low)])
+
+
+def check_box(box: np.ndarray, name: object = "box") -> np.ndarray:
+    """Return the box as (2, 3) float64.
+
+    Raises:
+        MivolError: another shape, a value that is not finite, or no volume.
+    """
+    corners = np.asarray(box, np.float64)
+    if corners.shape != (2, 3) or not np.isfinite(corners).all() or not (corners[0] < corners[1]).all():
+        raise refusal(name, f"the box {corners.tolist()}", "[low, high] with low below high along x, y, z", "correct box=")
+    return corners
+
+
+def nested_boxes(box: np.ndarray, levels: int) -> list[np.ndarray]:
+    """Return ``levels`` boxes (2, 3) around one centre; each is twice as large as the previous box."""
+    middle = box.mean(axis=0)
+    return [middle + 2**level * (box - middle) for level in range(levels)]
+
+
+def count_levels(box: np.ndarray, points: np.ndarray, most: int) -> int:
+    """Return the smallest number of nested boxes holding ``POINT_SHARE`` of the points (N, 3), at most ``most``."""
+    radius = 2 * np.abs((points - box.mean(axis=0)) / (box[1] - box[0])).max(axis=1)
+    return min(most, 1 + math.ceil(math.log2(max(1.0, np.percentile(radius, 100 * POINT_SHARE)))))
+
+
+def points_in_box(points: np.ndarray, box: np.ndarray) -> np.ndarray:
+    """Return the points (N, 3) inside a box."""
+    return points[((points >= box[0]) & (points <= box[1])).all(axis=1)]
+
+
+# -- Box of silhouettes -------------------------------------------------------------------------------------------
+
+
+def silhouette_box(cameras: Sequence[Camera], alphas: Sequence[np.ndarray | None], box: np.ndarray) -> np.ndarray:
+    """Return the box (2, 3) around all cells that every view shows as opaque.
+
+    A cell is empty if one view has alpha 0 in all pixels covered by the cell's bounding sphere. Cells with content are
+    therefore kept, and the box is one or two cells too large on each side. Half of the views must see a cell.
+
+    Args:
+        cameras: one for each view, with pinholes or lenses that distort a plane.
+        alphas: opacity (H, W) of each view.
+        box: (2, 3) where the search begins [length].
+
+    Raises:
+        MivolError: a view without alpha, a wide lens, or no cell left.
+    """
+    if any(alpha is None for alpha in alphas):
+        raise refusal("silhouette_box", "images without alpha", "alpha in every view", "use the box of the cameras")
+    wide = next((camera.name for camera in cameras if camera.distortion.is_wide), None)
+    if wide is not None:
+        raise refusal(wide, "a wide lens", "cameras with an image plane for a box about silhouettes", "give the box")
+    for _ in range(SEARCHES):
+        step = (box[1] - box[0]) / SILHOUETTE_CELLS
+        cells = _cell_centres(box, SILHOUETTE_CELLS)
+        cells = cells[count_views(cameras, cells) >= SILHOUETTE_SHARE * len(cameras)]
+        for camera, alpha in zip(cameras, alphas, strict=True):
+            cells = _opaque_cells(camera, alpha, cells, float(np.linalg.norm(step)) / 2)
+        if len(cells) == 0:
+            found = "no region that is opaque in all views"
+            raise refusal("silhouette_box", found, "alpha of one subject", "check the cameras, or give the box")
+        box = np.array([cells.min(axis=0) - step / 2, cells.max(axis=0) + step / 2])
+    return box
+
+
+def _opaque_cells(camera: Camera, alpha: np.ndarray, cells: np.ndarray, radius: float) -> np.ndarray:
+    """Return the cells (N, 3) that the view does not show as empty: outside the image, or near a pixel with alpha."""
+    x, depth = project(camera, cells)
+    nearest = float(np.min(depth[depth > 0], initial=np.inf))
+    if nearest <= 2 * radius:
+        return cells
+    # A sphere of radius r at depth z extends at most f r / (z - r) / cos(view angle) from the image of its centre. One
+    # more pixel allows for a lens, which magnifies towards the border.
+    slope = np.hypot(*np.maximum(camera.K[:2, 2], camera.size - camera.K[:2, 2])) / camera.K[0, 0]
+    pixels = int(np.ceil(camera.K[:2, :2].max() * radius * np.sqrt(1 + slope**2) / (nearest - radius))) + 1
+    near = maximum_filter(alpha > 0, size=2 * pixels + 1)
+    inside = (depth > 0) & ((x >= 0) & (x < camera.size)).all(axis=1)
+    column, row = np.where(inside[:, None], x, 0).astype(int).T
+    return cells[~inside | near[row, column]]

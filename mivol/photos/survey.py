@@ -23,11 +23,11 @@ from mivol.photos import region
 from mivol.photos.camera import Camera, field_of_view
 from mivol.photos.colmap import find_model, read_colmap
 from mivol.photos.listing import UNLISTED, Entry, Listing
-from mivol.photos.photo_file import PictureHeader, read_header
+from mivol.photos.photo_file import PhotoHeader, read_photo_header
 from mivol.photos.transforms import read_blender, read_transforms
 from mivol.shown import briefly
 
-__all__ = ["FORMATS", "SPLITS", "Format", "Frame", "PhotoSurvey", "find_format", "survey_photos"]
+__all__ = ["FORMATS", "SPLITS", "Format", "PhotoFrame", "PhotoSurvey", "find_format", "survey_photos"]
 
 SPLITS = ("train", "held_out", "val", "test", "all")
 
@@ -49,7 +49,7 @@ FORMATS: dict[str, Format] = {
 
 
 @dataclass(frozen=True)
-class Frame:
+class PhotoFrame:
     """A photograph that is there: its file, camera, mask and split, and the points (K, 3) [length] of a reconstruction that
     were found in it, where they are known; no pixel is read yet."""
 
@@ -79,7 +79,7 @@ class PhotoSurvey:
 
     path: Path
     format: str
-    frames: tuple[Frame, ...]
+    frames: tuple[PhotoFrame, ...]
     skipped: tuple[str, ...]
     box: np.ndarray
     box_from: str
@@ -140,13 +140,13 @@ def survey_photos(
     cameras = {id(entry): camera for entry, camera in zip(present, _cameras(present), strict=True)}
     if split in ("held_out", "val", "test"):
         _check_unseen(chosen, [entry for entry in present if entry.split == "train"], cameras)
-    frames = [Frame(entry.file, cameras[id(entry)], entry.split, _mask(entry), entry.points) for entry in chosen]
+    frames = [PhotoFrame(entry.file, cameras[id(entry)], entry.split, _mask(entry), entry.points) for entry in chosen]
     training = [entry for entry in present if entry.split in ("train", "held_out")]
     looking = [cameras[id(entry)] for entry in training or chosen]
     found, whence = _box(box, listing.points, looking, path)
     if not isinstance(box, str):
         region.check_views([frame.camera for frame in frames], found)
-    near_far = region.near_far_of([*looking, *(frame.camera for frame in frames)], found)
+    near_far = region.near_and_far([*looking, *(frame.camera for frame in frames)], found)
     return PhotoSurvey(path, name, tuple(frames), tuple(absent), found, whence, near_far, listing.points)
 
 
@@ -193,7 +193,7 @@ def _cameras(entries: Sequence[Entry]) -> list[Camera]:
     """Cameras of photographs whose size is what the file of cameras says, or that of the first of their split."""
     cameras, first = [], {}
     for entry in entries:
-        header = read_header(entry.file)
+        header = read_photo_header(entry.file)
         size = header.size
         wanted, whence = (
             (entry.size, "the file of cameras") if entry.size else first.setdefault(entry.split, (size, entry.name))
@@ -208,7 +208,7 @@ def _cameras(entries: Sequence[Entry]) -> list[Camera]:
     return cameras
 
 
-def _check_orientation(entry: Entry, header: PictureHeader) -> None:
+def _check_orientation(entry: Entry, header: PhotoHeader) -> None:
     """Refuse a picture that viewers turn, unless the cameras are of the pixels as they are stored.
 
     That shows where the file of cameras gives a size and a quarter turn (5 to 8) would change it.
@@ -257,7 +257,7 @@ def _box(
         return region.check_box(box), "as given"
     if points is not None and len(points) >= region.FEWEST_POINTS:
         return region.box_of_points(points), f"98 % of {len(points)} points and 5 % more on each side"
-    share = f"where at least {100 * region.SHARE:.0f} % of {len(cameras)} cameras look"
+    share = f"where at least {100 * region.VIEW_SHARE:.0f} % of {len(cameras)} cameras look"
     return region.shared_box(cameras, path), share
 
 

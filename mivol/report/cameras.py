@@ -19,8 +19,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from mivol.photos import SPLITS, Frame, PhotoSurvey
-from mivol.photos.region import nested, within
+from mivol.photos import SPLITS, PhotoFrame, PhotoSurvey
+from mivol.photos.region import nested_boxes, points_in_box
 from mivol.report.figures import FAINT, INK, SERIES, STYLE, save
 
 __all__ = [
@@ -83,8 +83,8 @@ class Arrangement(NamedTuple):
     def near(self) -> int:
         """How many of the boxes it takes to hold all that stands about them; all of them where none does."""
         ends = np.concatenate([strokes.edges.reshape(-1, 3) for strokes in self.strokes])
-        boxes = nested(self.box, self.levels)
-        return next((n for n, box in enumerate(boxes, 1) if len(within(ends, box)) == len(ends)), self.levels)
+        boxes = nested_boxes(self.box, self.levels)
+        return next((n for n, box in enumerate(boxes, 1) if len(points_in_box(ends, box)) == len(ends)), self.levels)
 
     @property
     def parts(self) -> tuple[str, ...]:
@@ -157,7 +157,7 @@ def plot_arrangement(arranged: Arrangement, title: str, path: str | Path | None 
     return figure
 
 
-def outline(frame: Frame, length: float) -> NDArray:
+def outline(frame: PhotoFrame, length: float) -> NDArray:
     """(8, 2, 3) the edges of a camera's field of view, ``length`` long along its axis; of a wide lens 90 degrees of it."""
     camera = frame.camera
     corners = np.array([[0, 0], [camera.size[0], 0], camera.size, [0, camera.size[1]]]) - camera.K[:2, 2]
@@ -189,7 +189,7 @@ def _pen(edges: NDArray) -> NDArray:
     return np.concatenate([edges, lifted], axis=1).reshape(-1, 3).T
 
 
-def _by_split(survey: PhotoSurvey) -> dict[str, list[Frame]]:
+def _by_split(survey: PhotoSurvey) -> dict[str, list[PhotoFrame]]:
     found = {split: [frame for frame in survey.frames if frame.split == split] for split in SPLITS}
     return {split: frames for split, frames in found.items() if frames}
 
@@ -201,19 +201,19 @@ def _colour(split: str) -> str:
 def _points(survey: PhotoSurvey) -> NDArray:
     if survey.points is None:
         return np.empty((0, 3))
-    points = within(survey.points, nested(survey.box, survey.levels)[-1])
+    points = points_in_box(survey.points, nested_boxes(survey.box, survey.levels)[-1])
     return points[:: max(1, len(points) // MOST_POINTS)]
 
 
 def _draw_side(axes: Axes, arranged: Arrangement) -> None:
-    order, boxes = _order(arranged.up), nested(arranged.box, arranged.near)
+    order, boxes = _order(arranged.up), nested_boxes(arranged.box, arranged.near)
     for strokes in arranged.strokes:
         axes.plot(*_pen(strokes.edges)[order], color=strokes.colour, linewidth=0.7, alpha=0.8)
     for number, box in enumerate(boxes):
         axes.plot(*_pen(box_edges(box))[order], **_line_of(number))
     everything = np.concatenate([*(strokes.edges.reshape(-1, 3) for strokes in arranged.strokes), boxes[-1]])
     # Of three dimensions matplotlib cuts nothing off at the frame.
-    points = within(arranged.points, np.array([everything.min(axis=0), everything.max(axis=0)]))
+    points = points_in_box(arranged.points, np.array([everything.min(axis=0), everything.max(axis=0)]))
     axes.scatter(*points[:, order].T, s=0.3, color=FAINT, linewidths=0)
     everything = everything[:, order]
     low, high = everything.min(axis=0), everything.max(axis=0)
@@ -231,11 +231,11 @@ def _draw_plan(axes: Axes, arranged: Arrangement, levels: int) -> None:
     for strokes in arranged.strokes:
         pen = _pen(strokes.edges)[[first, second]]
         axes.plot(*pen, color=strokes.colour, linewidth=0.7, alpha=0.8, label=strokes.label)
-    boxes = nested(arranged.box, levels)
+    boxes = nested_boxes(arranged.box, levels)
     for number, box in enumerate(boxes):
         label = ("box" if levels == 1 else "innermost box") if number == 0 else "larger boxes" if number == 1 else None
         axes.plot(*_pen(box_edges(box))[[first, second]], **_line_of(number), label=label)
-    shown = within(arranged.points, boxes[-1])[:, [first, second]]
+    shown = points_in_box(arranged.points, boxes[-1])[:, [first, second]]
     axes.scatter(*shown.T, s=0.3, color=FAINT, linewidths=0)
     axes.set_aspect("equal", adjustable="datalim")
     what = "from above" if levels == arranged.near else "all boxes from above"

@@ -25,7 +25,7 @@ def sensor_of(camera: Camera, near_far: tuple[float, float] = (1e-2, 1e4), *, pi
     """A perspective sensor with a box filter, for ``mitsuba.load_dict``.
 
     Args:
-        camera: a pinhole with square pixels (:func:`mivol.photos.rectified` makes one).
+        camera: a pinhole with square pixels (:func:`mivol.photos.rectify` makes one).
         near_far: clipping distances [length].
         pixel_format: of the film.
 
@@ -34,7 +34,7 @@ def sensor_of(camera: Camera, near_far: tuple[float, float] = (1e-2, 1e4), *, pi
     """
     (fx, _, cx), (_, fy, cy), _ = camera.K
     if camera.distortion or abs(fx / fy - 1) * max(camera.size) / 2 > PIXELS_LOST:
-        way = "cut pinholes out of it" if camera.distortion.is_wide else "resample it with mivol.photos.rectified"
+        way = "cut pinholes out of it" if camera.distortion.is_wide else "resample it with mivol.photos.rectify"
         found = "a lens with distortion" if camera.distortion else f"focal lengths {fx:.6g} and {fy:.6g}"
         raise refusal(camera.name, found, "a pinhole with square pixels", way)
     width, height = camera.size

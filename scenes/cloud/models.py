@@ -125,7 +125,8 @@ def draw(folder: Path, records: dict[str, RunRecord]) -> mpl.figure.Figure:
         above, below = figure.subfigures(2, 1, height_ratios=(3, 2))
         views, maps = above.subplots(2, len(records) + 1)
         first = next(iter(records))
-        scale, top = pixel_scale.scale_of(seen(folder / first, records[first])[0]), columns(volumes(folder / first, records[first])[0])
+        scale = pixel_scale.scale_of(seen(folder / first, records[first])[0])
+        top = columns(volumes(folder / first, records[first])[0])
         shown = [("truth", seen(folder / first, records[first])[0], top)]
         for name, record in records.items():
             text = MODELS[name][0].replace(", ", ",\n")

@@ -20,7 +20,7 @@ import mivol  # noqa: F401  (chooses the LLVM library; call it before the first 
 from mivol.files import write_png, write_whole_text
 from mivol.files.mesh import Mesh, write_mesh
 from mivol.photos import Camera, intrinsics
-from mivol.photos.camera_path import facing
+from mivol.photos.camera_path import aim_camera
 from mivol.photos.transforms import write_transforms
 from mivol.scene.content_hash import content_hash
 from mivol.scene.photographs import sensor_of
@@ -183,7 +183,7 @@ def cameras(count: int, size: int) -> list[Camera]:
     azimuth = np.pi * (3 - np.sqrt(5)) * np.arange(count)
     flat = np.sqrt(1 - height**2)
     places = MIDDLE + DISTANCE * np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), height], axis=1)
-    return [facing(like, place, MIDDLE, np.array([0, 0, 1]), f"view {n}") for n, place in enumerate(places)]
+    return [aim_camera(like, place, MIDDLE, np.array([0, 0, 1]), f"view {n}") for n, place in enumerate(places)]
 
 
 def make(folder: Path, views: int = 75, size: int = 128, spp: int = 64, scene: str = "still_life") -> list[str]:

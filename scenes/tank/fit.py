@@ -20,7 +20,7 @@ from pathlib import Path
 
 import mivol  # noqa: F401  (chooses the LLVM library; call it before the first variant)
 from mivol.phase.measured import named_medium
-from mivol.report import figures
+from mivol.report import figures, pixel_scale
 from mivol.validate.reference import render_reference
 
 import drjit as dr
@@ -183,11 +183,11 @@ def draw(
             photo = np.stack(first, axis=-1)
             us = [np.array([np.log(f[0]), np.log(f[1]), np.arctanh(f[2])]) for f in found]
             image = np.stack([model.image(u, dilution, 0, 7, given.photo_spp) for u in us], axis=-1)
-            scale, difference = pixels.scale_of(photo), image - photo
-            signed = pixels.Scale("signed", -0.1 * scale.high, 0.1 * scale.high)
+            scale, difference = pixel_scale.scale_of(photo), image - photo
+            signed = pixel_scale.Scale("signed", -0.1 * scale.high, 0.1 * scale.high)
             pictures = ((photo, scale), (image, scale), (difference, signed))
             for row, (pixels, how) in enumerate(pictures):
-                grid[row, column].imshow(pixels.pixels(pixels, how))
+                grid[row, column].imshow(pixel_scale.pixels(pixels, how))
                 grid[row, column].set_axis_off()
             grid[0, column].set_title(f"1 : {1 / dilution - 1:g} in water")
         for row, text in enumerate(("photograph (volpath)", "fitted (mivol)", "difference, ±10 %")):

@@ -13,7 +13,7 @@ from mivol.bench.studies.radiance_field.room import DISTANCE
 from mivol.cli import main
 from mivol.errors import MivolError
 from mivol.photos import Camera, intrinsics, load_photos, survey_photos
-from mivol.photos.region import MIDDLE, levels_holding, middle_box, nested, within
+from mivol.photos.region import MIDDLE, count_levels, middle_box, nested_boxes, points_in_box
 from mivol.validate.images import colour_fitted, judge
 
 
@@ -29,14 +29,14 @@ def test_the_middle_box_is_a_cube_about_what_cameras_look_at() -> None:
 def test_nested_boxes_are_as_many_as_hold_nearly_all_points() -> None:
     """Of 200 points one in a hundred may lie anywhere: here two do. The others lie in a box that is one way half as long."""
     box = np.array([[-1.0, -1, -0.5], [1, 1, 0.5]]) + 3
-    assert [b.tolist() for b in nested(box, 3)] == [box.tolist(), (2 * box - 3).tolist(), (4 * box - 9).tolist()]
+    assert [b.tolist() for b in nested_boxes(box, 3)] == [box.tolist(), (2 * box - 3).tolist(), (4 * box - 9).tolist()]
     wild = np.array([[500.0, 0, 0], [0, 0, 999]])
     for reach, levels in ((0.4, 1), (0.99, 1), (1.01, 2), (1.99, 2), (2.01, 3), (7.9, 4), (8.1, 5), (40, 5)):
         points = np.concatenate([np.tile([3.0, 3, 3 + 0.5 * reach], (99, 1)), np.tile([3 - reach / 2, 3, 3], (199, 1)), wild])
-        assert levels_holding(box, points, 5) == levels, reach
-    assert levels_holding(box, np.array([[3.0, 3, 3]]), 5) == 1
+        assert count_levels(box, points, 5) == levels, reach
+    assert count_levels(box, np.array([[3.0, 3, 3]]), 5) == 1
     points = np.concatenate([box, box + np.array([0, 0, 0.01]), box - np.array([0, 0, 0.01])])
-    np.testing.assert_array_equal(within(points, box), [*box, points[2], points[5]])
+    np.testing.assert_array_equal(points_in_box(points, box), [*box, points[2], points[5]])
 
 
 def _moved(camera: Camera, distance: float) -> np.ndarray:
@@ -69,7 +69,7 @@ def test_photographs_that_do_not_fit_are_refused_before_one_is_read(tmp_path: Pa
     # 64 bytes a pixel of the one that is read, 24 of each that is kept: at scale 0.5 a quarter of these.
     limit = 64 * pixels + 24 * pixels * 4 // 4
     assert len(load_photos(folder, split="all", scale=0.5, limit=limit).views) == 4
-    monkeypatch.setattr("mivol.photos.dataset.read_picture", lambda *_: pytest.fail("a photograph was read"))
+    monkeypatch.setattr("mivol.photos.dataset.read_photo", lambda *_: pytest.fail("a photograph was read"))
     with pytest.raises(MivolError, match=r"4 photographs at scale 1 take about .* are left; scale=0.5 fits\."):
         load_photos(folder, split="all", limit=limit)
     with pytest.raises(MivolError, match="not even one can be read"):

@@ -14,7 +14,7 @@ from photo_sets import look_at, ring
 from PIL import Image
 
 from mivol.errors import MivolError
-from mivol.photos import Camera, between, facing, intrinsics, pixel_centres, project, rays, turntable
+from mivol.photos import Camera, aim_camera, interpolate_cameras, intrinsics, pixel_centres, project, rays, turntable
 from mivol.report import video
 from mivol.report.pixel_scale import depth_pixels, normal_pixels, normals_of_depth
 from mivol.report.video import film_suffix, write_video
@@ -32,13 +32,13 @@ def cameras_of(poses: list[np.ndarray]) -> list[Camera]:
 
 
 def test_facing_puts_the_target_in_the_middle_and_up_upwards() -> None:
-    camera = facing(LIKE, np.array([3.0, 1, 2]), np.array([0.5, 0, 0]), np.array([0, 0, 1]))
+    camera = aim_camera(LIKE, np.array([3.0, 1, 2]), np.array([0.5, 0, 0]), np.array([0, 0, 1]))
     np.testing.assert_allclose(project(camera, np.array([0.5, 0, 0]))[0], (32, 24), atol=1e-12)
     x, y = project(camera, np.array([0.5, 0, 0.1]))[0]
     assert x == pytest.approx(32, abs=1e-12) and y < 24
     assert camera.K[0, 0] == camera.K[1, 1] == 100
     with pytest.raises(MivolError, match="its own upward direction"):
-        facing(LIKE, np.array([0.0, 0, 2]), np.zeros(3), np.array([0, 0, 1]))
+        aim_camera(LIKE, np.array([0.0, 0, 2]), np.zeros(3), np.array([0, 0, 1]))
 
 
 @pytest.mark.parametrize("middle", [(0, 0, 0), (5.0, -3.0, 2.0)])
@@ -67,12 +67,12 @@ def test_turntable_of_an_arc_swings_over_it() -> None:
 
 def test_a_way_between_views_goes_through_them() -> None:
     given = cameras_of(ring(4))
-    found = between(given, 7)
+    found = interpolate_cameras(given, 7)
     for camera, wanted in zip(found[::2], given, strict=True):
         np.testing.assert_allclose(camera.to_world, wanted.to_world, atol=1e-9)
-    np.testing.assert_allclose(between(given[:2], 3)[2].to_world, given[1].to_world, atol=1e-9)
+    np.testing.assert_allclose(interpolate_cameras(given[:2], 3)[2].to_world, given[1].to_world, atol=1e-9)
     with pytest.raises(MivolError, match="found 1 cameras"):
-        between(given[:1], 5)
+        interpolate_cameras(given[:1], 5)
 
 
 def test_no_common_up() -> None:

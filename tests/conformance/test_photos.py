@@ -31,22 +31,18 @@ from mivol.photos import (
     Camera,
     Lens,
     Photo,
-    Photos,
-    PhotoSurvey,
     distort,
     intrinsics,
     load_photos,
     pixel_centres,
     project,
     rays,
-    rectified,
+    rectify,
     region,
-    silhouette,
-    silhouette_box,
     survey_photos,
     undistort,
 )
-from mivol.photos.photo_file import decode_srgb, read_header, read_picture, shrink
+from mivol.photos.photo_file import decode_srgb, read_photo, read_photo_header, shrink
 
 EPS = float(np.finfo(np.float32).eps)
 
@@ -212,12 +208,12 @@ def test_box_of_cameras_about_a_sphere() -> None:
     places = rng.normal(size=(200, 3))
     places *= 4 / np.linalg.norm(places, axis=1, keepdims=True)
     cameras = [Camera(intrinsics(100, 100, 40, 40), (80, 80), look_at(place)) for place in places]
-    np.testing.assert_allclose(region.focus_of(cameras), 0, atol=1e-12)
+    np.testing.assert_allclose(region.find_focus(cameras), 0, atol=1e-12)
     radius = 4 * math.sin(math.atan(0.4))  # 1.486
     box = region.shared_box(cameras)
     # The region is the ball's hull by planes, cut by 90 % of the views: a bound from both sides, one cell (1/32) included.
     assert (np.abs(box) > radius * (1 - 1 / 16)).all() and (np.abs(box) < 1.25 * radius).all()
-    near, far = region.near_far_of(cameras, box)
+    near, far = region.near_and_far(cameras, box)
     distances = [np.linalg.norm(np.clip(p, *box) - p) for p in places]
     assert near == pytest.approx(min(distances)) and far < 4 + np.linalg.norm(box, axis=1).max()
 
@@ -422,19 +418,19 @@ def test_rectified_photograph_is_what_a_pinhole_sees() -> None:
     """A picture that is linear in the direction has the same values for the pinhole, wherever a pixel was there to see it."""
     bent = Camera(intrinsics(40, 42, 31, 22), (64, 48), np.eye(4), Lens(**LENS))
     photo = Photo("p", linear_picture(bent), np.ones((48, 64), np.float32), None, bent, np.zeros(3, np.float32))
-    flat = rectified(photo)
+    flat = rectify(photo)
     assert not flat.camera.distortion and flat.camera.K[0, 0] == flat.camera.K[1, 1] == 42
     inner = np.s_[4:-4, 4:-4]
     # Linear interpolation of a function with second derivative c over a pixel: c/8 a dimension; measured 2e-5 here.
     np.testing.assert_allclose(flat.image[inner], linear_picture(flat.camera)[inner], atol=1e-4)
     assert 0.9 < flat.mask.mean() < 1
     np.testing.assert_allclose(flat.alpha, 1)
-    assert rectified(flat) is flat
+    assert rectify(flat) is flat
     # What is masked stays so: each pixel that a masked one has a share in, and no other.
-    assert np.array_equal(rectified(dataclasses.replace(photo, mask=np.ones((48, 64), bool))).mask, flat.mask)
+    assert np.array_equal(rectify(dataclasses.replace(photo, mask=np.ones((48, 64), bool))).mask, flat.mask)
     mask = np.ones((48, 64), bool)
     mask[20, 40] = False
-    lost = np.argwhere(flat.mask & ~rectified(dataclasses.replace(photo, mask=mask)).mask)
+    lost = np.argwhere(flat.mask & ~rectify(dataclasses.replace(photo, mask=mask)).mask)
     assert 1 <= len(lost) <= 9 and np.ptp(lost, axis=0).max() <= 2
     back = project(bent, np.array([(lost[:, 1].mean() + 0.5 - 31) / 42, -(lost[:, 0].mean() + 0.5 - 22) / 42, -1.0]))[0]
     np.testing.assert_allclose(back, (40.5, 20.5), atol=1)
@@ -574,16 +570,15 @@ def test_colmap_masks_and_wrong_size(tmp_path: Path) -> None:
 def test_silhouette_box_holds_the_thing_and_little_more() -> None:
     """An ellipsoid seen by 12 cameras, each with the exact outline."""
     radii = np.array([0.5, 0.3, 0.4])
-    views = []
+    cameras, alphas = [], []
     for place in np.random.default_rng(8).normal(size=(12, 3)):
         camera = Camera(intrinsics(150, 150, 64, 64), (128, 128), look_at(4 * place / np.linalg.norm(place)))
         o, d = rays(camera, pixel_centres(camera.size))
         o, d = o / radii, d / radii
         hit = np.sum(o * d, -1) ** 2 >= np.sum(d * d, -1) * (np.sum(o * o, -1) - 1)
-        views.append(Photo("v", np.zeros((*hit.shape, 3), np.float32), hit.astype(np.float32), None, camera, np.zeros(3)))
-    cameras = [view.camera for view in views]
-    survey = PhotoSurvey(Path(), "", (), (), region.shared_box(cameras), "", (0, 1))
-    box = silhouette_box(Photos(tuple(views), "srgb", survey))
+        cameras.append(camera)
+        alphas.append(hit.astype(np.float32))
+    box = region.silhouette_box(cameras, alphas, region.shared_box(cameras))
     assert (box[0] <= -radii).all() and (box[1] >= radii).all()
     # Two cells of the second search, each 1/40 of at most twice the thing, and the hull of 12 views around it.
     assert (np.abs(box) < 1.3 * radii + 0.05).all()
@@ -592,12 +587,10 @@ def test_silhouette_box_holds_the_thing_and_little_more() -> None:
 def test_silhouettes_are_looked_through_twice(monkeypatch: pytest.MonkeyPatch) -> None:
     """A search of the whole box, and one of what it left: each costs a projection of all cells to every view."""
     camera = Camera(intrinsics(16, 16, 8, 8), (16, 16), look_at(np.array([0.0, -4, 0])))
-    view = Photo("v", np.zeros((16, 16, 3), np.float32), np.ones((16, 16), np.float32), None, camera, np.zeros(3))
-    survey = PhotoSurvey(Path(), "", (), (), np.array([[-1.0] * 3, [1.0] * 3]), "", (0, 1))
-    searched, see = [], silhouette.views_seeing
-    monkeypatch.setattr(silhouette, "views_seeing", lambda cameras, cells: searched.append(len(cells)) or see(cameras, cells))
-    silhouette_box(Photos((view,), "srgb", survey))
-    assert searched == [silhouette.CELLS**3] * 2
+    searched, count = [], region.count_views
+    monkeypatch.setattr(region, "count_views", lambda cameras, cells: searched.append(len(cells)) or count(cameras, cells))
+    region.silhouette_box([camera], [np.ones((16, 16), np.float32)], np.array([[-1.0] * 3, [1.0] * 3]))
+    assert searched == [region.SILHOUETTE_CELLS**3] * 2
 
 
 def test_a_cell_is_kept_for_the_last_pixel_that_its_sphere_covers() -> None:
@@ -612,8 +605,7 @@ def test_a_cell_is_kept_for_the_last_pixel_that_its_sphere_covers() -> None:
     assert int(end[0]) - int(place[0]) == 8
     alpha = np.zeros((8, 128), np.float32)
     alpha[int(end[1]), int(end[0])] = 1
-    view = Photo("v", np.zeros((8, 128, 3), np.float32), alpha, None, camera, np.zeros(3))
-    assert len(silhouette._kept([view], cell[None], radius)) == 1
+    assert len(region._opaque_cells(camera, alpha, cell[None], radius)) == 1
 
 
 def test_parallel_cameras_have_no_focus(blender: Path) -> None:
@@ -781,7 +773,7 @@ def test_png_of_16_bits_is_read_at_full_depth(tmp_path: Path, channels: int) -> 
     """Pillow alone keeps the high byte of each number: steps of 1/255. Here only float32 rounds."""
     codes = np.random.default_rng(3).integers(0, 65536, (3, 5, channels), np.uint16)
     (tmp_path / "a.png").write_bytes(png_of_16_bits(codes))
-    colour, alpha = read_picture(tmp_path / "a.png", "srgb")
+    colour, alpha = read_photo(tmp_path / "a.png", "srgb")
     wanted = codes / 65535
     if channels == 4:
         np.testing.assert_allclose(alpha, wanted[..., 3], rtol=2e-7)
@@ -792,7 +784,7 @@ def test_png_of_16_bits_is_read_at_full_depth(tmp_path: Path, channels: int) -> 
 def test_grey_png_of_16_bits_is_read_at_full_depth(tmp_path: Path) -> None:
     codes = np.arange(15, dtype=np.uint16).reshape(3, 5) * 4001
     Image.fromarray(codes).save(tmp_path / "a.png")
-    colour, alpha = read_picture(tmp_path / "a.png", "srgb")
+    colour, alpha = read_photo(tmp_path / "a.png", "srgb")
     assert alpha is None
     np.testing.assert_allclose(colour, np.repeat(codes[..., None] / 65535, 3, axis=2), rtol=2e-7)
 
@@ -864,6 +856,6 @@ def test_photographs_of_any_size_are_surveyed(tmp_path: Path) -> None:
     write_transforms(tmp_path, {"fl_x": 1e4, "w": 15000, "h": 12000}, n=1)
     (file,) = tmp_path.rglob("*.png")
     Image.new("1", (15000, 12000)).save(file)
-    assert read_header(file).size == (15000, 12000)
+    assert read_photo_header(file).size == (15000, 12000)
     with pytest.raises(MivolError, match="GiB"):
         load_photos(tmp_path, box=[[-1, -1, -1], [1, 1, 1]], limit=1 << 30)

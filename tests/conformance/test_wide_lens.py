@@ -18,13 +18,12 @@ from mivol.optim.loop import reconstruct
 from mivol.optim.radiance_plan import PRESETS, Stage
 from mivol.optim.radiance_problem import RadianceProblem
 from mivol.optim.ray_batches import RayBatches
-from mivol.photos import Camera, Lens, Photo, load_photos, pixel_centres, project, rays, rectified, survey_photos, turntable
+from mivol.photos import Camera, Lens, Photo, load_photos, pixel_centres, project, rays, rectify, survey_photos, turntable
 from mivol.photos.camera import directions, field_of_view, intrinsics, is_seen
 from mivol.photos.camera_path import WIDE
-from mivol.photos.dataset import pinhole_of
+from mivol.photos.dataset import to_pinhole
 from mivol.photos.lens import Fisheye, Panorama
-from mivol.photos.region import focus_of, views_seeing
-from mivol.photos.silhouette import silhouette_box
+from mivol.photos.region import count_views, find_focus, silhouette_box
 from mivol.photos.transforms import write_transforms as write_cameras
 from mivol.report.cameras import outline
 from mivol.scene.photographs import sensor_of
@@ -103,7 +102,7 @@ def test_points_are_seen_where_their_rays_come_from(camera: Camera) -> None:
     np.testing.assert_allclose(np.linalg.norm(d, axis=-1), 1, atol=1e-15)
     half = camera.resized(tuple(n // 2 for n in camera.size))
     np.testing.assert_allclose(rays(half, pixel / 2)[1], d, atol=1e-13)
-    assert (views_seeing([camera, camera], o + 2.5 * d) == 2).all()
+    assert (count_views([camera, camera], o + 2.5 * d) == 2).all()
 
 
 def test_fields_of_view() -> None:
@@ -118,9 +117,9 @@ def test_fields_of_view() -> None:
 
 def test_what_fisheyes_look_at_is_what_pinholes_would() -> None:
     pinholes = [Camera(intrinsics(50, 50, 24, 24), (48, 48), pose) for pose in ring(5)]
-    np.testing.assert_allclose(focus_of([replace(c, distortion=LENS) for c in pinholes]), focus_of(pinholes), atol=1e-14)
+    np.testing.assert_allclose(find_focus([replace(c, distortion=LENS) for c in pinholes]), find_focus(pinholes), atol=1e-14)
     around = [panorama(pose=pose) for pose in ring(5)]
-    np.testing.assert_allclose(focus_of(around), np.mean([c.origin for c in around], axis=0), atol=1e-14)
+    np.testing.assert_allclose(find_focus(around), np.mean([c.origin for c in around], axis=0), atol=1e-14)
 
 
 def test_films_of_wide_lenses_are_of_pinholes() -> None:
@@ -252,16 +251,15 @@ def by_tiles(camera: Camera, shrink: int) -> np.ndarray:
 def test_what_needs_an_image_plane_refuses_by_name(variant_rgb: str) -> None:
     camera = fisheye()
     with pytest.raises(MivolError, match="fish: found a fisheye, expected a lens with an image plane"):
-        pinhole_of(camera)
+        to_pinhole(camera)
     with pytest.raises(MivolError, match="fish: .*cut pinholes out of it"):
         sensor_of(camera)
     with pytest.raises(MivolError, match="fish: .*cut pinholes out of it"):
         numbers_of(camera, camera.size)
     shown = photo(camera)
-    assert rectified(shown) is shown
-    views = (replace(shown, alpha=np.ones((48, 48), np.float32)),)
+    assert rectify(shown) is shown
     with pytest.raises(MivolError, match="fish: found a wide lens, expected cameras with an image plane"):
-        silhouette_box(type("Photos", (), {"views": views, "box": None}))
+        silhouette_box([camera], [np.ones((48, 48), np.float32)], np.zeros((2, 3)))
 
 
 def test_a_plan_says_that_rays_are_traced() -> None:

@@ -21,7 +21,7 @@ from mivol.optim.gaussian_problem import GaussianProblem
 from mivol.optim.gaussian_start import begin_at, places_of
 from mivol.optim.problem import Reals
 from mivol.photos import Camera, intrinsics, load_photos
-from mivol.photos.camera_path import facing
+from mivol.photos.camera_path import aim_camera
 from mivol.photos.photo_file import decode_srgb
 from mivol.photos.transforms import write_transforms
 from mivol.points import read_gaussians
@@ -48,7 +48,7 @@ def photographs(tmp_path_factory: pytest.TempPathFactory) -> Path:
         turn, height = 2.4 * n, 1.6 * (n + 0.5) / VIEWS - 0.8
         origin = 3.5 * np.array([*(np.sqrt(1 - height**2) * np.array([np.cos(turn), np.sin(turn)])), height])
         name = f"view_{n:02d}.png"
-        cameras[name] = facing(like, origin, np.zeros(3), np.array([0, 0, 1.0]), name)
+        cameras[name] = aim_camera(like, origin, np.zeros(3), np.array([0, 0, 1.0]), name)
         seen = np.clip(np.array(splatter.forward(tensors, cameras[name], derivatives=False)[0]), 0, 1)
         colour = seen[..., :3] / np.maximum(seen[..., 3:], 1e-6)
         write_png(folder / name, np.concatenate([decode_srgb(np.clip(colour, 0, 1)), seen[..., 3:]], axis=2))

@@ -27,7 +27,7 @@ from mivol.optim.problem import Reals
 from mivol.optim.radiance_plan import FEW, PRESETS, FitPlan, Stage, stretched
 from mivol.optim.radiance_problem import RadianceProblem
 from mivol.photos import Camera, intrinsics
-from mivol.photos.camera_path import facing
+from mivol.photos.camera_path import aim_camera
 from mivol.photos.photo_file import decode_srgb
 from mivol.photos.transforms import write_transforms
 from mivol.validate.images import judge
@@ -61,7 +61,7 @@ def photographs(tmp_path_factory: pytest.TempPathFactory) -> Path:
         turn, height = 2.4 * n, 2 * (n + 0.5) / VIEWS - 1
         origin = 3.5 * np.array([*(np.sqrt(1 - height**2) * np.array([np.cos(turn), np.sin(turn)])), height])
         name = f"view_{n}.png"
-        cameras[name] = facing(like, origin, np.zeros(3), np.array([0, 0, 1.0]), name)
+        cameras[name] = aim_camera(like, origin, np.zeros(3), np.array([0, 0, 1.0]), name)
         image = render_view(truth, cameras[name], np.ones(3)).image
         write_png(folder / name, decode_srgb(np.clip(image, 0, 1)))
     write_transforms(folder / "transforms.json", cameras, ["view_3.png", "view_8.png"])

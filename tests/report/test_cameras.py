@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from mivol.photos import PhotoSurvey, survey_photos
 from mivol.photos.camera import Camera
-from mivol.photos.survey import Frame
+from mivol.photos.survey import PhotoFrame
 from mivol.report.cameras import EDGE, FAR, MOST_POINTS, PARTS, WIDTH, outline, parts_of, plot_cameras
 from mivol.report.figures import INK
 
@@ -90,7 +90,7 @@ def test_edges_of_a_view_go_through_the_corners_of_its_film() -> None:
     pose = np.eye(4)
     pose[:3, 3] = 1, 2, 3
     camera = Camera(np.array([[20.0, 0, 7], [0, 10, 3], [0, 0, 1]]), (12, 8), pose)
-    edges = outline(Frame(Path("a.png"), camera, "train"), 2.0)
+    edges = outline(PhotoFrame(Path("a.png"), camera, "train"), 2.0)
     corners = np.array([1, 2, 3]) + 2 * np.array([[-0.35, 0.3, -1], [0.25, 0.3, -1], [0.25, -0.5, -1], [-0.35, -0.5, -1]])
     np.testing.assert_allclose(edges[:4], np.stack([np.tile([1.0, 2, 3], (4, 1)), corners], axis=1))
     np.testing.assert_allclose(edges[4:], np.stack([corners, np.roll(corners, -1, axis=0)], axis=1))

@@ -15,7 +15,7 @@ from report.looks import assert_recorded
 
 from mivol.photos import PhotoSurvey
 from mivol.photos.camera import Camera
-from mivol.photos.survey import Frame
+from mivol.photos.survey import PhotoFrame
 from mivol.report.cameras import plot_cameras
 from mivol.report.figures import (
     Series,
@@ -85,7 +85,7 @@ def row_in_colour() -> Figure:
 def cameras() -> Figure:
     views = [Camera(np.array([[20.0, 0, 6], [0, 20, 4], [0, 0, 1]]), (12, 8), pose) for pose in ring(5)]
     splits = ("train", "held_out", "val", "test", "train")
-    frames = tuple(Frame(Path(f"{k}.png"), view, split) for k, (view, split) in enumerate(zip(views, splits, strict=True)))
+    frames = tuple(PhotoFrame(Path(f"{k}.png"), view, split) for k, (view, split) in enumerate(zip(views, splits, strict=True)))
     box = np.array([[-1.0, -1, -1], [1, 1, 1]])
     return plot_cameras(PhotoSurvey(Path("ring"), "COLMAP", frames, (), box, "points", (1.0, 9.0), np.zeros((1, 3))))
 

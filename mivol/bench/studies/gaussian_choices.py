@@ -21,7 +21,7 @@ from mivol.experiments.gaussian_start import begin, make_gaussian_plan
 from mivol.experiments.photo_data import boxed, read_photos
 from mivol.experiments.photo_outputs import judge_fitted
 from mivol.optim.loop import reconstruct
-from mivol.photos import load_photos, rectified
+from mivol.photos import load_photos, rectify
 from mivol.points import Gaussians
 
 __all__ = ["exposure_gain", "mip_gain"]
@@ -84,7 +84,7 @@ def exposure_gain(folder: Path, asked: Fitted, held_out: int) -> dict:
         seen = [compare(problem, judged, photo, ("psnr",)) for photo in judged.views]
         raw = [quality.values["psnr"] for _, quality in seen]
         pairs = zip(seen, judged.views, strict=True)
-        adjusted = [judge_fitted(picture, rectified(photo), judged.space) for (picture, _), photo in pairs]
+        adjusted = [judge_fitted(picture, rectify(photo), judged.space) for (picture, _), photo in pairs]
         gains = problem.exposure.table() if problem.exposure is not None else np.ones(1)
         answer[name] = {
             "psnr": float(np.mean(raw)),

@@ -21,7 +21,7 @@ from mivol.optim.gaussian_problem import GaussianProblem
 from mivol.optim.gaussian_start import begin_at, places_of
 from mivol.optim.loop import reconstruct
 from mivol.optim.ray_batches import RayBatches
-from mivol.photos import Photo, Photos, load_photos, silhouette_box
+from mivol.photos import Photo, Photos, load_photos
 from mivol.points import Gaussians
 from mivol.splatting import Splatter, tensors_of
 from mivol.validate import images
@@ -85,7 +85,7 @@ def photographs(folder: Path, asked: Fitted) -> Photos:
     if not folder.is_dir():
         raise MivolError(f"{folder} is not there: set MIVOL_DATA to the folder that holds multiview/chair.")
     photos = load_photos(folder, split="train", scale=asked.scale, background="white", space="srgb")
-    return replace(photos, survey=replace(photos.survey, box=silhouette_box(photos)))
+    return replace(photos, survey=replace(photos.survey, box=photos.silhouette_box()))
 
 
 def asked_of(asked: Fitted) -> GaussianPlan:

@@ -15,7 +15,7 @@ from mivol.optim.loop import reconstruct
 from mivol.optim.radiance_plan import FitPlan, Stage
 from mivol.optim.radiance_problem import RadianceProblem
 from mivol.optim.ray_batches import RayBatches
-from mivol.photos import load_photos, silhouette_box
+from mivol.photos import load_photos
 
 __all__ = ["FIELDS", "field_of"]
 
@@ -63,7 +63,7 @@ def fitted(size: Size) -> tuple[SphericalGrid, str]:
     path = DATA / "multiview" / "chair"
     if path.is_dir():
         photos = load_photos(path, split="train", background="white", scale=0.5)
-        views, box, origin = RayBatches.of(photos.views, (1, 2, 4)), silhouette_box(photos), "NeRF's chair"
+        views, box, origin = RayBatches.of(photos.views, (1, 2, 4)), photos.silhouette_box(), "NeRF's chair"
     else:
         photos = photographed(shell(size)[0], ring(size.side, 24))
         views, box, origin = RayBatches.of(photos, (1, 2, 4)), BOX, "views of the shell (no data folder)"

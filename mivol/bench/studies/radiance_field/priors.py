@@ -19,7 +19,7 @@ from mivol.optim.field_view import render_view
 from mivol.optim.radiance_fit import begin_radiance_fit, newest_field
 from mivol.optim.radiance_plan import PRESETS, FitPlan, Stage
 from mivol.optim.ray_batches import RayBatches
-from mivol.photos import Photo, Photos, load_photos, rectified
+from mivol.photos import Photo, Photos, load_photos, rectify
 
 __all__ = ["WITHOUT", "ask_priors", "captures", "gain_of", "plan_of"]
 
@@ -77,7 +77,7 @@ def ask_priors(size: Size) -> dict:
     answer = {}
     for name, loaded in captures(size).items():
         plan = with_levels_needed(plan_of(size), loaded)
-        photos, box = [rectified(photo) for photo in loaded.views], loaded.box
+        photos, box = [rectify(photo) for photo in loaded.views], loaded.box
         folds = range(size.prior_folds)
         whole = [judge_plan(plan, photos, box, fold) for fold in folds]
         answer[name] = {"psnr": whole, "priors": {}}

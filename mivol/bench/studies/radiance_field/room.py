@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from mivol.photos import Camera, Photo, facing, intrinsics, pixel_centres, rays
+from mivol.photos import Camera, Photo, aim_camera, intrinsics, pixel_centres, rays
 
 __all__ = ["DISTANCE", "RADIUS", "WALLS", "cameras_of", "distance_of", "image_of", "room"]
 
@@ -43,7 +43,7 @@ def cameras_of(count: int, size: tuple[int, int]) -> list[Camera]:
     for k in range(count):
         turn, rise = 2.4 * k, 0.6 * np.sin(1.7 * k)
         origin = DISTANCE * np.array([np.cos(turn) * np.cos(rise), np.sin(turn) * np.cos(rise), np.sin(rise)])
-        made.append(facing(like, origin, np.zeros(3), np.array([0.0, 0.0, 1.0]), f"view_{k:02d}.png"))
+        made.append(aim_camera(like, origin, np.zeros(3), np.array([0.0, 0.0, 1.0]), f"view_{k:02d}.png"))
     return made
 
 

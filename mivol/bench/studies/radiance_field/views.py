@@ -11,7 +11,7 @@ import numpy as np
 from mivol.fields.spherical import SphericalGrid
 from mivol.optim.field_view import render_view
 from mivol.photos import Camera, Photo, intrinsics, pixel_centres, rays
-from mivol.photos.camera_path import facing
+from mivol.photos.camera_path import aim_camera
 from mivol.transport.line_integrals.radiance_field import RayBundle
 
 __all__ = ["BOX", "between", "camera", "photographed", "rays_of", "rays_through", "ring", "tiled"]
@@ -25,7 +25,7 @@ def camera(k: float, of: int, side: int) -> Camera:
     angle = 2 * np.pi * k / of
     like = Camera(intrinsics(1.2 * side, 1.2 * side, side / 2, side / 2), (side, side), np.eye(4))
     origin = np.array([3 * np.cos(angle), 3 * np.sin(angle), 0.9])
-    return facing(like, origin, np.zeros(3), np.array([0.0, 0, 1]), f"camera {k}")
+    return aim_camera(like, origin, np.zeros(3), np.array([0.0, 0, 1]), f"camera {k}")
 
 
 def ring(side: int, count: int = 7) -> list[Camera]:
