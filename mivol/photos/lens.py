@@ -53,10 +53,7 @@ class Lens:
     @property
     def fold(self) -> float:
         """Radius r at which the radial part r g(r^2) stops growing: beyond it the image folds back; inf: nowhere."""
-        slope = np.polynomial.Polynomial([1, 3 * self.k1, 5 * self.k2, 7 * self.k3, 9 * self.k4])
-        roots = slope.trim(LEAST_TERM).roots()
-        real = roots.real[np.abs(roots.imag) < 1e-9 * np.maximum(np.abs(roots), 1e-300)]
-        return float(np.sqrt(real[real > 0].min())) if (real > 0).any() else np.inf
+        return _fold_radius(self.k1, self.k2, self.k3, self.k4)
 
 
 def distort(lens: Lens, xy: np.ndarray) -> np.ndarray:
@@ -104,6 +101,14 @@ def undistort(lens: Lens, xy: np.ndarray, name: object = "lens") -> np.ndarray:
     return found
 
 
+def _fold_radius(k1: float, k2: float, k3: float, k4: float) -> float:
+    """The smallest r > 0 at which r (1 + k1 r^2 + k2 r^4 + k3 r^6 + k4 r^8) stops growing; infinite if it always grows."""
+    slope = np.polynomial.Polynomial([1, 3 * k1, 5 * k2, 7 * k3, 9 * k4])
+    roots = slope.trim(LEAST_TERM).roots()
+    squares = roots.real[(np.abs(roots.imag) < 1e-9 * np.maximum(np.abs(roots), 1e-300)) & (roots.real > 0)]
+    return float(np.sqrt(squares.min(initial=np.inf)))
+
+
 def _gain(lens: Lens, r2: np.ndarray) -> np.ndarray:
     return 1 + r2 * (lens.k1 + r2 * (lens.k2 + r2 * (lens.k3 + r2 * lens.k4)))
 
@@ -141,10 +146,7 @@ class Fisheye:
     @property
     def widest(self) -> float:
         """The angle from the axis up to which the image grows, at most pi; what would lie beyond is not in the image."""
-        slope = np.polynomial.Polynomial([1, 3 * self.k1, 5 * self.k2, 7 * self.k3, 9 * self.k4])
-        roots = slope.trim(1e-30).roots()
-        squares = roots.real[(np.abs(roots.imag) < 1e-9 * np.maximum(np.abs(roots), 1e-300)) & (roots.real > 0)]
-        return float(min(np.pi, np.sqrt(squares.min(initial=np.inf))))
+        return min(np.pi, _fold_radius(self.k1, self.k2, self.k3, self.k4))
 
     def radius(self, theta: np.ndarray) -> np.ndarray:
         """Distance from the middle of the image, in focal lengths, of directions at angles from the axis [radian]."""
