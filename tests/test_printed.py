@@ -1,96 +1,127 @@
-"""Every command that a page prints is run by somebody, or it is said why not: ``printed_commands.toml``."""
+"""The commands that the pages print can be typed: their verbs, flags, names and files exist."""
 
 from __future__ import annotations
 
-import ast
-import json
+import contextlib
+import importlib
+import io
 import re
 import shlex
 import tomllib
+from collections.abc import Callable, Iterator
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
-from printed import commands_of, commands_of_pages
-from script_modules import load
-from syntax import tree_of
+
+from mivol.bench.studies import STUDIES
+from mivol.cli import VERBS
+from mivol.cli import parser as mivol_parser
+from mivol.experiments.examples import EXAMPLES
+from mivol.files.fetch import DATA
 
 ROOT = Path(__file__).resolve().parents[1]
-TABLE: dict[str, dict[str, str]] = tomllib.loads((ROOT / "tests" / "printed_commands.toml").read_text())
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
+PROGRAMS = ("mivol", "python", ".venv/bin/python", "pip", "pytest", "colmap")
+"""The first words of commands that are not scripts of the checkout."""
 
 
-def telling(command: str) -> list[str]:
-    """What whoever runs a command cannot do without: the verb of mivol, long flags, names of examples and benches."""
+def split_line(line: str) -> Iterator[list[str]]:
+    """The words of each command of a line, without comments. Prose, prompts and the bare name of a program are no commands."""
+    for part in line.strip().split("&&"):
+        with contextlib.suppress(ValueError):
+            words = shlex.split(part, comments=True)
+            if words and (words[0].startswith(("./", "scripts/")) or (words[0] in PROGRAMS and len(words) > 1)):
+                yield words
+
+
+def find_commands(page: str) -> list[str]:
+    """The commands of a page in Markdown: lines of shell blocks, indented lines and inline code, each once."""
+    blocks = re.findall(r"^```sh\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
+    lines = [line for block in blocks for line in block.splitlines()]
+    prose = re.sub(r"^```.*?^```", "", page, flags=re.MULTILINE | re.DOTALL)
+    lines += [line for line in prose.splitlines() if line.startswith("    ")]
+    lines += [" ".join(code.split()) for code in re.findall(r"`([^`]+)`", prose)]
+    return list(dict.fromkeys(shlex.join(words) for line in lines for words in split_line(line)))
+
+
+def find_faults(command: str) -> list[str]:
+    """The words of a command that name nothing: an empty list for a command that can be typed."""
     words = shlex.split(command)
-    verb = [words[1]] if words[0] == "mivol" else words[3:4] if words[1:3] == ["-m", "mivol"] else []
-    flags = [word for word in words if word.startswith("--")]
-    named = [word for word in words[2:3] if verb and verb[0] in ("demo", "bench")]
-    folders = [match[1] for word in words if (match := re.match(r"scenes/(\w+)/", word))]
-    return [*verb, *flags, *(n for n in named if n[:2] != "--"), *folders]
+    program, *rest = words if words[0] not in ("python", ".venv/bin/python") else words[1:]
+    if program == "-m":
+        program, *rest = rest
+    missing = [word for word in words if word.startswith(("scenes/", "scripts/", "./")) and not any(ROOT.glob(word))]
+    if missing:
+        return missing
+    if program == "mivol":
+        return _faults_of_verb(*rest)
+    if program == "pip":
+        extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+        named = [name for word in rest for group in re.findall(r"^(?:mivol|\.)\[(.*)\]$", word) for name in group.split(",")]
+        return [name for name in named if name not in extras]
+    if program.endswith(".py") and (ROOT / program).is_file():
+        text = _text_of_flags(ROOT / program)
+        only = [name for word, value in pairwise(rest) if word == "--only" for name in value.split(",")]
+        questions = only if "mivol.bench" in (ROOT / program).read_text() else []
+        return [word for word in (*_flags(rest), *questions) if not re.search(rf"(?<![\w-]){re.escape(word)}(?![\w-])", text)]
+    return []
 
 
-def is_there(runner: str) -> bool:
-    """Is there such a test, section of CI or text of a workflow?"""
-    file, _, name = runner.partition("::")
-    path = ROOT / file
-    if not path.is_file():
-        return False
-    if path.suffix == ".py":
-        return any(isinstance(node, ast.FunctionDef) and node.name == name for node in tree_of(path).body)
-    if file == ".ci/run":
-        return re.search(rf"^section {re.escape(name)} ", path.read_text(), re.MULTILINE) is not None
-    return name in path.read_text()
+def _flags(words: list[str] | tuple[str, ...]) -> list[str]:
+    return [word.partition("=")[0] for word in words if re.match(r"--?[a-zA-Z]", word)]
 
 
-def test_every_printed_command_is_run_or_it_is_said_why_not() -> None:
-    """Rationale: a command that nothing runs breaks unseen. Expected: the pages and the table name the same commands."""
-    printed = commands_of_pages(ROOT)
-    commands = [command for table in TABLE.values() for command in table]
-    known = set(commands)
-    assert len(known) == len(commands), "some are in two tables"
-    assert {command: printed[command] for command in printed.keys() - known} == {}, "nothing is said to run these"
-    assert known - printed.keys() == set(), "these are printed nowhere: take them out of printed_commands.toml"
+def _faults_of_verb(verb: str, *rest: str) -> list[str]:
+    """Flags that a verb does not take, and unknown names of examples, benches and data sets; capitals stand for any name."""
+    if verb not in VERBS:
+        return [] if verb.isupper() else [verb]
+    known = {"demo": EXAMPLES, "bench": STUDIES, "fetch": DATA}.get(verb, rest)
+    unknown = [name for name in rest[:1] if not name.startswith("-") and name not in known and not name.isupper()]
+    help_text = _help_of(lambda: mivol_parser().parse_args([verb, "--help"]))
+    return unknown + [flag for flag in _flags(rest) if not re.search(rf"(?<![\w-]){flag}(?![\w-])", help_text)]
 
 
-@pytest.mark.parametrize("command", TABLE["run"])
-def test_who_runs_it_is_there(command: str) -> None:
-    """The test or section exists; the file of a test holds the verb, the flags and the example that the command names."""
-    runner = TABLE["run"][command]
-    assert is_there(runner), f"{command}: there is no {runner}"
-    if runner.startswith("tests/"):
-        text = (ROOT / runner.partition("::")[0]).read_text()
-        assert [word for word in telling(command) if word not in text] == []
+def _text_of_flags(script: Path) -> str:
+    """The help of the bench that a script calls; else the script itself."""
+    text = script.read_text()
+    bench = re.search(r"^from (mivol\.bench\.\w+) import main$", text, re.MULTILINE)
+    return _help_of(lambda: importlib.import_module(bench[1]).main(["--help"])) if bench else text
 
 
-def test_long_commands_are_run_by_a_script(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capfd: pytest.CaptureFixture
-) -> None:
-    """As they are printed, with the programs of the checkout; one that fails ends the script with 1."""
-    script = load("long_commands")
-    assert script.main(["--list"]) == 0
-    assert capfd.readouterr().out.splitlines() == list(TABLE["long"])
-    table = tmp_path / "printed_commands.toml"
-    table.write_text("""[long]
-"python -c 'print(6 * 7)'" = "Short."
-"python -c 'raise SystemExit(3)'" = "Short."
-""")
-    monkeypatch.setattr(script, "TABLE", table)
-    assert script.main(["--only", "*print*"]) == 0
-    said = capfd.readouterr()
-    assert "42" in said.err and [one["exit_code"] for one in json.loads(said.out).values()] == [0]
-    assert script.main([]) == 1
-    assert [one["exit_code"] for one in json.loads(capfd.readouterr().out).values()] == [0, 3]
-    with pytest.raises(SystemExit):
-        script.main(["--only", "nothing"])
-    assert "matches 'nothing'" in capfd.readouterr().err
+def _help_of(call: Callable) -> str:
+    with contextlib.redirect_stdout(io.StringIO()) as said, contextlib.suppress(SystemExit):
+        call()
+    return said.getvalue()
 
 
-def test_reasons_are_sentences() -> None:
-    reasons = [*TABLE["long"].values(), *TABLE["not_run"].values()]
-    assert [why for why in reasons if not (why.endswith(".") and len(why.split()) > 4)] == []
+@pytest.mark.parametrize("page", PAGES, ids=lambda path: path.relative_to(ROOT).as_posix())
+def test_commands_of_a_page_can_be_typed(page: Path) -> None:
+    assert {command: faults for command in find_commands(page.read_text()) if (faults := find_faults(command))} == {}
 
 
-def test_commands_are_seen() -> None:
-    """Blocks of a shell, indented lines and inline code count; comments, other languages, names and files do not."""
+@pytest.mark.parametrize(
+    ("command", "fault"),
+    [
+        ("mivol optimise fit.toml", "optimise"),
+        ("mivol optimize fit.toml --resum", "--resum"),
+        ("mivol optimize scenes/smoke/fits.toml", "scenes/smoke/fits.toml"),
+        ("python -m mivol demo smok", "smok"),
+        ("mivol bench optical_depths", "optical_depths"),
+        ("mivol fetch toot", "toot"),
+        ("scripts/bench_pints.py", "scripts/bench_pints.py"),
+        ("scripts/bench_points.py --onl chair", "--onl"),
+        ("scripts/bench_points.py --only chairs", "chairs"),
+        ("python scenes/bonsai/scan.py --slices", "--slices"),
+        ("pip install '.[llvn]'", "llvn"),
+    ],
+)
+def test_a_word_that_names_nothing_is_found(command: str, fault: str) -> None:
+    assert find_faults(command) == [fault]
+
+
+def test_commands_are_lines_of_shell_blocks_indented_lines_and_inline_code() -> None:
+    """Comments, other languages, names and files are none."""
     page = """Call `mivol explain a.xml`, `mivol`, `mivol.load`, `a.py`, `scripts/x.py`.
 
 ```sh
@@ -105,23 +136,7 @@ cd elsewhere
     python = "scripts/no.py"
 ```
 """
-    assert commands_of(page) == [
+    assert find_commands(page) == [
         *("./scripts/demo", "mivol fetch a", "mivol fetch b", "python -m venv .venv", "pip install x"),
         *("mivol explain a.xml", "scripts/x.py"),
     ]
-
-
-def test_words_that_tell() -> None:
-    assert telling("mivol demo smoke --into here") == ["demo", "--into", "smoke"]
-    assert telling("python scenes/tank/fit.py --slice") == ["--slice", "tank"]
-
-
-def test_a_runner_that_is_gone_is_seen() -> None:
-    assert is_there("tests/test_printed.py::test_words_that_tell")
-    gone = [
-        "tests/test_printed.py::test_x",
-        "tests/none.py::test_x",
-        ".ci/run::slo",
-        ".github/workflows/docs.yml::no such step",
-    ]
-    assert [runner for runner in gone if is_there(runner)] == []
