@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from mivol.bench.studies import STUDIES
+from mivol.bench.harness.catalogue import STUDIES
 from mivol.cli import VERBS
 from mivol.cli import parser as mivol_parser
 from mivol.experiments.examples import EXAMPLES
@@ -85,7 +85,7 @@ def _faults_of_verb(verb: str, *rest: str) -> list[str]:
 def _text_of_flags(script: Path) -> str:
     """The help of the bench that a script calls; else the script itself."""
     text = script.read_text()
-    bench = re.search(r"^from (mivol\.bench\.\w+) import main$", text, re.MULTILINE)
+    bench = re.search(r"^from (mivol\.bench[.\w]*) import main$", text, re.MULTILINE)
     return _help_of(lambda: importlib.import_module(bench[1]).main(["--help"])) if bench else text
 
 
