@@ -27,17 +27,17 @@ from .errors import MivolError, reveal_refusals  # noqa: E402
 __version__ = "0.1.0"
 
 PUBLIC = {
-    "Adam": "optim.adam",
+    "Adam": "optim.first_order",
     "ConeBeam": "tomography.geometry",
-    "GaussNewton": "optim.gauss_newton",
+    "GaussNewton": "optim.second_order",
     "Gaussians": "points",
-    "Lbfgs": "optim.lbfgs",
+    "Lbfgs": "optim.second_order",
     "ParallelBeam": "tomography.geometry",
     "Parameter": "optim.parameters",
     "PointCloud": "points",
     "Problem": "experiments.script",
     "Projector": "tomography.projector",
-    "RMSprop": "optim.rmsprop",
+    "RMSprop": "optim.first_order",
     "Splatter": "splatting",
     "VoxelGrid": "tomography.geometry",
     "explain": "experiments.script",
@@ -70,11 +70,11 @@ if TYPE_CHECKING:  # what type checkers see of PUBLIC, which is imported when it
     from .fields.spherical_files import save_field as save_field
     from .files import read_volume as read_volume
     from .files import write_volume as write_volume
-    from .optim.adam import Adam as Adam
-    from .optim.gauss_newton import GaussNewton as GaussNewton
-    from .optim.lbfgs import Lbfgs as Lbfgs
+    from .optim.first_order import Adam as Adam
+    from .optim.first_order import RMSprop as RMSprop
     from .optim.parameters import Parameter as Parameter
-    from .optim.rmsprop import RMSprop as RMSprop
+    from .optim.second_order import GaussNewton as GaussNewton
+    from .optim.second_order import Lbfgs as Lbfgs
     from .photos import load_photos as load_photos
     from .points import Gaussians as Gaussians
     from .points import PointCloud as PointCloud

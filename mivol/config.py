@@ -18,16 +18,14 @@ from typing import Annotated, Any, Literal
 import msgspec
 
 from mivol.errors import MivolError
-from mivol.optim.adam import Adam
 from mivol.optim.events import Checkpoint, Evaluate, Upsample
-from mivol.optim.gauss_newton import GaussNewton
-from mivol.optim.lbfgs import Lbfgs
+from mivol.optim.first_order import Adam, RMSprop
 from mivol.optim.losses import L1, L2, Huber, Log, RelativeL2
 from mivol.optim.parameters import MAPS
 from mivol.optim.priors import Bounds, HuberTotalVariation, Laplacian, Sparse, TotalVariation
-from mivol.optim.rmsprop import RMSprop
+from mivol.optim.projections.solvers import METHODS
 from mivol.optim.schedules import Constant, Cosine, Exponential, Step
-from mivol.optim.solvers import METHODS
+from mivol.optim.second_order import GaussNewton, Lbfgs
 from mivol.optim.strategy import nearest, of
 from mivol.scene.cameras import Hemisphere, LookAts, Ring, SceneSensors
 from mivol.schema import check_keys, sentence
@@ -296,7 +294,7 @@ class Grid(Section):
 class Solve(Section):
     """How the projections are inverted."""
 
-    name: Annotated[str, of("1", "auto, or a key of mivol.optim.solvers.METHODS", min_length=1)] = "auto"
+    name: Annotated[str, of("1", "auto, or a key of mivol.optim.projections.solvers.METHODS", min_length=1)] = "auto"
     start: Annotated[
         Literal["empty", "filtered"] | None,
         of("1", "first volume: empty, or by fbp or fdk; absent: auto begins filtered where the views allow it, others empty"),

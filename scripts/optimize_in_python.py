@@ -6,12 +6,12 @@ from pathlib import Path
 
 import mivol  # noqa: F401  (chooses the LLVM library; call it before the first variant)
 from mivol.fields.procedural import make_procedural
-from mivol.optim.gauss_newton import GaussNewton
 from mivol.optim.loop import reconstruct
 from mivol.optim.parameters import Parameter
 from mivol.optim.priors import HuberTotalVariation
-from mivol.optim.render_batches import View
-from mivol.optim.scene_problem import SceneProblem
+from mivol.optim.scenes.scene_problem import SceneProblem
+from mivol.optim.scenes.views import View
+from mivol.optim.second_order import GaussNewton
 from mivol.scene.cameras import Hemisphere
 
 import mitsuba as mi

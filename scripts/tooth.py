@@ -20,9 +20,9 @@ from pathlib import Path
 
 import mivol
 from mivol.files import ProjectionData, read_projections, whole_file, write_whole_text
-from mivol.optim.linear_problems import LeastSquares
-from mivol.optim.smoothed_tv import SmoothedTV
-from mivol.optim.solvers import SOLVERS
+from mivol.optim.projections.linear_problems import LeastSquares
+from mivol.optim.projections.smoothed_tv import SmoothedTV
+from mivol.optim.projections.solvers import SOLVERS
 from mivol.tomography.geometry import ParallelBeam, VoxelGrid
 from mivol.tomography.preprocess import LightDrift, correct_transmission, fit_light_drift, line_integrals, normalise_air
 from mivol.tomography.projector import Projector

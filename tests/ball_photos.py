@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from mivol.fields.spherical import SphericalGrid
-from mivol.optim.field_view import render_view
 from mivol.optim.loop import Fit, begin_fit
-from mivol.optim.radiance_plan import FitPlan, Stage
-from mivol.optim.radiance_problem import RadianceProblem
-from mivol.optim.ray_batches import RayBatches
+from mivol.optim.photographs.field_view import render_view
+from mivol.optim.photographs.radiance_plan import FitPlan, Stage
+from mivol.optim.photographs.radiance_problem import RadianceProblem
+from mivol.optim.photographs.ray_batches import RayBatches
 from mivol.photos import Camera, Photo
 from mivol.photos.camera import intrinsics
 

@@ -6,8 +6,8 @@ import mitsuba as mi
 import numpy as np
 
 from mivol.optim.parameters import Parameter
-from mivol.optim.render_batches import View
-from mivol.optim.scene_problem import SceneProblem
+from mivol.optim.scenes.scene_problem import SceneProblem
+from mivol.optim.scenes.views import View
 
 KEY = "cube.interior_medium.sigma_t.data"
 

@@ -21,8 +21,8 @@ from mivol import config
 from mivol.bench.harness.catalogue import STUDIES
 from mivol.cli import parser
 from mivol.optim.losses import LOSSES
-from mivol.optim.optimisers import OPTIMISERS
-from mivol.optim.solvers import METHODS
+from mivol.optim.optimizers import OPTIMISERS
+from mivol.optim.projections.solvers import METHODS
 from mivol.transport.path.estimators import SEGMENT_ESTIMATORS
 
 ROOT = Path(__file__).resolve().parents[1]

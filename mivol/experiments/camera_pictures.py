@@ -9,7 +9,7 @@ from pathlib import Path
 import mitsuba as mi
 from numpy.typing import NDArray
 
-from mivol.optim.render_batches import View
+from mivol.optim.scenes.views import View
 from mivol.photos import PhotoFrame, Photos, PhotoSurvey
 from mivol.report.cameras import PARTS, parts_of, plot_cameras
 from mivol.report.record import Image

@@ -39,10 +39,10 @@ from mivol.experiments.scene_fit import make_integrator, make_problem
 from mivol.experiments.start import make_starts
 from mivol.experiments.task import Task
 from mivol.experiments.truth import check_truth, make_truth, put
-from mivol.optim.emissive_start import check_given_start
 from mivol.optim.parameters import check_names
-from mivol.optim.radiance_problem import RadianceProblem
-from mivol.optim.scene_problem import SceneProblem
+from mivol.optim.photographs.radiance_problem import RadianceProblem
+from mivol.optim.scenes.emissive_start import check_given_start
+from mivol.optim.scenes.scene_problem import SceneProblem
 from mivol.photos import Photos
 from mivol.report.cameras import plot_cameras
 from mivol.scene.explain import Explanation, examine

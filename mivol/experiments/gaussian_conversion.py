@@ -14,7 +14,7 @@ from mivol.fields.grid_gaussians import gaussians_of_grid
 from mivol.fields.spherical import SphericalGrid
 from mivol.fields.spherical_files import load_field, save_field
 from mivol.files.source import by_suffix, existing_file
-from mivol.optim.field_view import render_view
+from mivol.optim.photographs.field_view import render_view
 from mivol.photos import Camera, aim_camera, intrinsics
 from mivol.points.cloud import read_points
 from mivol.points.conversions import gaussians_of_points

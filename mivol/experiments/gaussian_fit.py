@@ -20,7 +20,7 @@ from mivol.experiments.photo_data import boxed, notes, read_photos
 from mivol.experiments.photo_fit import solve
 from mivol.experiments.run_folder import RunFolder
 from mivol.experiments.task import Task
-from mivol.optim.gaussian_problem import GaussianProblem
+from mivol.optim.gaussians.gaussian_problem import GaussianProblem
 from mivol.points import Gaussians, write_gaussians
 from mivol.report.page import write_page
 from mivol.report.record import RunRecord

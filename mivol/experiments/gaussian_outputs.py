@@ -14,7 +14,7 @@ from mivol.experiments.judged_views import JudgedViews, caption_of, said_of
 from mivol.experiments.photo_outputs import judge_fitted, named, table_of_gains, table_of_views
 from mivol.experiments.run_folder import RunFolder
 from mivol.experiments.task import Task
-from mivol.optim.gaussian_problem import GaussianProblem
+from mivol.optim.gaussians.gaussian_problem import GaussianProblem
 from mivol.optim.loop import Fit
 from mivol.photos import Camera, Photo, Photos, rectify
 from mivol.points import Gaussians, write_gaussians

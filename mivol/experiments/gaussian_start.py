@@ -6,11 +6,11 @@ from dataclasses import dataclass, replace
 
 from mivol.config import GaussianFit
 from mivol.errors import MivolError
-from mivol.optim.density_control import Arrays
-from mivol.optim.gaussian_plan import CONTROLS, PRESETS, GaussianPlan, memory_of
-from mivol.optim.gaussian_problem import GaussianProblem
-from mivol.optim.gaussian_start import begin_at, places_of
-from mivol.optim.ray_batches import RayBatches
+from mivol.optim.gaussians.density_control import Arrays
+from mivol.optim.gaussians.gaussian_plan import CONTROLS, PRESETS, GaussianPlan, memory_of
+from mivol.optim.gaussians.gaussian_problem import GaussianProblem
+from mivol.optim.gaussians.gaussian_start import begin_at, places_of
+from mivol.optim.photographs.ray_batches import RayBatches
 from mivol.optim.strategy import nearest
 from mivol.photos import Photo, Photos, rectify
 from mivol.report.record import PlanLine

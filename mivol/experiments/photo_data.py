@@ -12,7 +12,7 @@ import numpy as np
 from mivol.config import GaussianFit, PhotoFit
 from mivol.errors import MivolError
 from mivol.experiments.photo_plan import LEARNED
-from mivol.optim.colour_scale import EPSILON
+from mivol.optim.photographs.colour_scale import EPSILON
 from mivol.optim.strategy import nearest
 from mivol.photos import Photos, PhotoSurvey, load_photos, survey_photos
 from mivol.photos.dataset import BACKGROUNDS, check_alpha

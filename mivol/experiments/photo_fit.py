@@ -25,7 +25,7 @@ from mivol.experiments.task import Task
 from mivol.optim.checkpoint import Store
 from mivol.optim.events import Checkpoint
 from mivol.optim.loop import Fit, begin_fit
-from mivol.optim.radiance_problem import RadianceProblem
+from mivol.optim.photographs.radiance_problem import RadianceProblem
 from mivol.photos import Photos
 from mivol.report.page import write_page
 from mivol.report.record import RunRecord
@@ -96,7 +96,7 @@ def solve(
 
     Args:
         task, run: the experiment and its folder.
-        problem: a :class:`RadianceProblem` or a :class:`~mivol.optim.gaussian_problem.GaussianProblem`.
+        problem: a :class:`RadianceProblem` or a :class:`~mivol.optim.gaussians.gaussian_problem.GaussianProblem`.
         judged: what the curve shows; None for nothing.
         best: the best iterate so far.
         compare: as :func:`mivol.experiments.photo_outputs.compare`, of that problem.

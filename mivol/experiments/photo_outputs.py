@@ -19,9 +19,9 @@ from mivol.fields.sky import Sky
 from mivol.fields.spherical import SphericalGrid
 from mivol.fields.spherical_files import save_field
 from mivol.files import write_exr, write_png, write_volume
-from mivol.optim.field_view import FieldView, render_view
 from mivol.optim.loop import Fit
-from mivol.optim.radiance_problem import RadianceProblem
+from mivol.optim.photographs.field_view import FieldView, render_view
+from mivol.optim.photographs.radiance_problem import RadianceProblem
 from mivol.photos import Camera, Photo, Photos
 from mivol.photos.photo_file import SPACES, decode_srgb
 from mivol.report.pixel_scale import depth_pixels, normal_pixels, normals_of_depth

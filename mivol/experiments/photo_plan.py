@@ -9,8 +9,8 @@ import numpy as np
 
 from mivol.config import FieldFit
 from mivol.errors import MivolError
-from mivol.optim.radiance_plan import FEW, PRESETS, FitPlan, Stage, memory_of, stretched
-from mivol.optim.ray_batches import TILE, RayBatches
+from mivol.optim.photographs.radiance_plan import FEW, PRESETS, FitPlan, Stage, memory_of, stretched
+from mivol.optim.photographs.ray_batches import TILE, RayBatches
 from mivol.optim.strategy import nearest
 from mivol.photos import Photos, rectify
 from mivol.photos.region import FEWEST_POINTS, count_levels, nested_boxes, points_in_box

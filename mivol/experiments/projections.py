@@ -18,8 +18,8 @@ from mivol.experiments.scan_memory import check_grid, check_rays
 from mivol.experiments.solver_choice import solver_of
 from mivol.files import read_columns, read_volume
 from mivol.files.fetch import place_of
-from mivol.optim.linear_problems import PoissonCounts
-from mivol.optim.solvers import METHODS
+from mivol.optim.projections.linear_problems import PoissonCounts
+from mivol.optim.projections.solvers import METHODS
 from mivol.shown import briefly
 from mivol.tomography.fan_axis import axis_from_fans, offset_of_cone
 from mivol.tomography.geometry import ConeBeam, FlatDetector, ParallelBeam, VoxelGrid

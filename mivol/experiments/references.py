@@ -17,7 +17,7 @@ from mivol.experiments.task import Task
 from mivol.experiments.truth import holding
 from mivol.files import layers, read_exr
 from mivol.files.fetch import PREFIX, place_of
-from mivol.optim.render_batches import View, check_sizes
+from mivol.optim.scenes.views import View, check_sizes
 from mivol.scene.load import LoadedScene, load_scene
 from mivol.scene.sensors import check_film
 from mivol.validate.reference import render_reference

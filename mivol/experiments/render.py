@@ -15,7 +15,7 @@ import numpy as np
 from mivol.errors import MivolError
 from mivol.files import write_exr, write_png
 from mivol.files.atomic import check_destination
-from mivol.optim.seeds import seed_of
+from mivol.optim.scenes.views import seed_of
 from mivol.scene.explain import settings_of
 from mivol.scene.parsing import reason_of
 from mivol.scene.sensors import check_film, find_sensor

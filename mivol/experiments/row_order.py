@@ -14,8 +14,8 @@ import numpy as np
 
 from mivol import config
 from mivol.config import Stack
-from mivol.optim.linear_problems import LeastSquares
-from mivol.optim.solvers import SOLVERS
+from mivol.optim.projections.linear_problems import LeastSquares
+from mivol.optim.projections.solvers import SOLVERS
 from mivol.tomography.geometry import ConeBeam, FlatDetector, ParallelBeam, VoxelGrid
 from mivol.tomography.panel_views import PanelViews
 from mivol.tomography.projector import Projector

@@ -25,15 +25,11 @@ from mivol.experiments.scan_storage import choose_storage
 from mivol.experiments.solver_choice import settle_solver, solver_of, strength_of
 from mivol.experiments.task import Task
 from mivol.optim.checkpoint import Store
-from mivol.optim.course import Course
-from mivol.optim.drifting_light import fit_drift
 from mivol.optim.events import Checkpoint
-from mivol.optim.inversion import Inversion, Solve
-from mivol.optim.linear_problems import LeastSquares, PoissonCounts
-from mivol.optim.loop import Fit, begin_fit
-from mivol.optim.noise_scale import noise_norm
-from mivol.optim.solver import State
-from mivol.optim.solvers import DIRECT, METHODS
+from mivol.optim.loop import Course, Fit, begin_fit
+from mivol.optim.projections.inversion import Inversion, Solve, fit_drift
+from mivol.optim.projections.linear_problems import LeastSquares, PoissonCounts, State, noise_norm
+from mivol.optim.projections.solvers import DIRECT, METHODS
 from mivol.report.page import write_page
 from mivol.report.pixel_scale import is_due, write_preview
 from mivol.report.record import PlanLine, RunRecord

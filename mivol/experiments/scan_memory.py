@@ -7,7 +7,7 @@ import math
 from mivol import config
 from mivol.experiments.solver_choice import solver_of
 from mivol.machine import check_fits
-from mivol.optim.solvers import DIRECT
+from mivol.optim.projections.solvers import DIRECT
 from mivol.tomography.geometry import VoxelGrid
 
 __all__ = ["check_grid", "check_rays"]

@@ -10,11 +10,10 @@ import numpy as np
 from mivol import config
 from mivol.errors import MivolError
 from mivol.experiments.projections import Projections
-from mivol.optim.inversion import Inversion
-from mivol.optim.noise_scale import noise_norm, tv_of_noise
-from mivol.optim.projected_cg import projected_cg
-from mivol.optim.smoothed_tv import SmoothedTV
-from mivol.optim.solver import State
+from mivol.optim.projections.inversion import Inversion
+from mivol.optim.projections.iterative import projected_cg
+from mivol.optim.projections.linear_problems import State, noise_norm
+from mivol.optim.projections.smoothed_tv import SmoothedTV, tv_of_noise
 from mivol.report.record import PlanLine
 from mivol.tomography.projector import Projector
 

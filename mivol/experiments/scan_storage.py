@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 
 from mivol import config
 from mivol.errors import MivolError
-from mivol.optim.inversion import Inversion
-from mivol.optim.solvers import DIRECT
+from mivol.optim.projections.inversion import Inversion
+from mivol.optim.projections.solvers import DIRECT
 from mivol.report.record import PlanLine
 from mivol.tomography.projector import Projector
 from mivol.tomography.stored import bytes_to_store, is_worth_storing, store

@@ -21,14 +21,12 @@ from mivol.experiments.start import Start, make_starts, place_of
 from mivol.experiments.task import Task
 from mivol.experiments.truth import check_truth, make_truth, put
 from mivol.optim.checkpoint import Store
-from mivol.optim.course import Course
-from mivol.optim.emissive_start import find_emissive_start
 from mivol.optim.events import upsample
-from mivol.optim.loop import Fit, begin_fit
+from mivol.optim.loop import Course, Fit, begin_fit
 from mivol.optim.parameters import check_names
-from mivol.optim.render_batches import RenderBatch, make_batches
-from mivol.optim.scene_problem import SceneProblem
-from mivol.optim.seeds import HELD_OUT, seed_of
+from mivol.optim.scenes.emissive_start import find_emissive_start
+from mivol.optim.scenes.scene_problem import SceneProblem
+from mivol.optim.scenes.views import HELD_OUT, RenderBatch, make_batches, seed_of
 from mivol.report.page import write_page
 from mivol.report.record import PlanLine, RunRecord
 from mivol.scene.load import LoadedScene

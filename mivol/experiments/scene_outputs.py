@@ -24,8 +24,7 @@ from mivol.experiments.units import unit_of
 from mivol.files import write_exr, write_png, write_volume
 from mivol.optim.loop import Fit
 from mivol.optim.parameters import GRID
-from mivol.optim.render_batches import View
-from mivol.optim.seeds import FINAL, seed_of
+from mivol.optim.scenes.views import FINAL, View, seed_of
 from mivol.report.record import Image, Volume
 from mivol.validate.moments import BATCHES, Moments
 

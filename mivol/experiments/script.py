@@ -22,14 +22,14 @@ from mivol.experiments.task import Nobody, Task, Watcher
 from mivol.fields.spherical import SphericalGrid
 from mivol.fields.spherical_files import load_field
 from mivol.files import layers, read_exr
-from mivol.optim.adam import Adam
-from mivol.optim.given import as_optimiser
+from mivol.optim.first_order import Adam
 from mivol.optim.loop import Fit, Measure, reconstruct
 from mivol.optim.losses import L2, Loss
-from mivol.optim.optimiser import Optimiser
+from mivol.optim.optimizer import Optimiser
+from mivol.optim.optimizers import as_optimiser
 from mivol.optim.parameters import Parameter
-from mivol.optim.render_batches import View
-from mivol.optim.scene_problem import SceneProblem
+from mivol.optim.scenes.scene_problem import SceneProblem
+from mivol.optim.scenes.views import View
 from mivol.points import Gaussians, read_gaussians
 from mivol.scene.explain import examine, settings_of
 from mivol.scene.load import SceneSource, load_scene

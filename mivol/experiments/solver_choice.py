@@ -12,7 +12,7 @@ import msgspec
 from mivol import config
 from mivol.config import AUTO
 from mivol.errors import MivolError
-from mivol.optim.solvers import METHODS
+from mivol.optim.projections.solvers import METHODS
 from mivol.report.record import PlanLine
 from mivol.tomography.filtered import check_directions
 from mivol.tomography.projector import Projector

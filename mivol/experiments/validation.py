@@ -22,7 +22,7 @@ from mivol.errors import MivolError
 from mivol.experiments.truth import put
 from mivol.files import write_whole_text
 from mivol.optim.parameters import as_tensor, find
-from mivol.optim.seeds import seed_of
+from mivol.optim.scenes.views import seed_of
 from mivol.report import figures
 from mivol.scene.explain import settings_of
 from mivol.scene.load import LoadedScene

@@ -11,7 +11,7 @@ import numpy as np
 from mivol.errors import MivolError
 from mivol.fields.sky import Sky, read_sky
 from mivol.fields.spherical_files import load_field
-from mivol.optim.field_view import render_view
+from mivol.optim.photographs.field_view import render_view
 from mivol.photos import Camera, aim_camera, intrinsics
 from mivol.photos.photo_file import decode_srgb
 

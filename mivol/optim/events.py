@@ -13,7 +13,7 @@ import mitsuba as mi
 import numpy as np
 
 from mivol.errors import MivolError
-from mivol.optim.optimiser import Run
+from mivol.optim.optimizer import Run
 from mivol.optim.problem import Problem
 from mivol.optim.strategy import Strategy, of, table
 

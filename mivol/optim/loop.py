@@ -18,12 +18,11 @@ import mitsuba as mi
 from mivol.errors import MivolError
 from mivol.files.notebook import pairs_html
 from mivol.optim.checkpoint import Store
-from mivol.optim.course import Course
 from mivol.optim.events import Event, in_order
 from mivol.optim.interrupt import Stop
-from mivol.optim.optimiser import Optimiser, Run
+from mivol.optim.optimizer import Optimiser, Run
 from mivol.optim.problem import Problem
-from mivol.optim.schedules import Constant
+from mivol.optim.schedules import Constant, Schedule
 from mivol.shown import curve_html
 from mivol.threads import check_one_thread
 
@@ -32,6 +31,21 @@ KEPT = ("next", "events_done", "history", "measures", "log", "warned", "seconds"
 
 Measure = Callable[[Problem], dict[str, float]]
 """Errors by name, of what a problem holds."""
+
+
+@dataclass(frozen=True)
+class Course:
+    """What a fit goes through.
+
+    Attributes:
+        iterations: at most so many.
+        schedule: factor on the learning rates.
+        events: what happens between iterations.
+    """
+
+    iterations: int
+    schedule: Schedule = field(default_factory=Constant)
+    events: tuple[Event, ...] = ()
 
 
 @dataclass(repr=False)
@@ -217,14 +231,14 @@ def begin_fit(
     """A fit before its first step, or where its checkpoint has it; arguments as :func:`reconstruct`.
 
     Raises:
-        MivolError: an optimiser that begins no :class:`mivol.optim.optimiser.Run`.
+        MivolError: an optimiser that begins no :class:`mivol.optim.optimizer.Run`.
     """
     course = course if isinstance(course, Course) else Course(course)
     run = optimiser.begin(problem)
     if not isinstance(run, Run):
         begun = f"{type(optimiser).__name__}.begin gave {type(run).__name__}"
         raise MivolError(
-            f"{begun}, expected a mivol.optim.optimiser.Run, which has reals and a method step: derive the run from it."
+            f"{begun}, expected a mivol.optim.optimizer.Run, which has reals and a method step: derive the run from it."
         )
     return Fit(problem, run, course, measure, store)
 

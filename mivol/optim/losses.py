@@ -1,15 +1,16 @@
-"""How far an image is from what was measured: one number per pixel and channel, averaged.
+"""Difference between an image and its reference: one penalty per pixel and channel, averaged.
 
-Conventions. Images are tensors (height, width, channels) of radiance; the residual is ``image - reference``. A loss is
-the mean of its penalty over pixels and channels, so that it does not change with the size of the sensor. Penalties are
-differentiable through Dr.Jit in ``image`` and take their weights from ``reference`` only. LOSSES lists them. The noise of
-a render is part of any of them unless ``pairs`` takes it out (:mod:`mivol.optim.noise`).
+Conventions. Images are tensors (height, width, channels) of radiance; the residual is ``image - reference``. A loss is the mean
+penalty over pixels and channels, independent of the size of the sensor. Penalties are differentiable through Dr.Jit in
+``image``; weights depend on ``reference`` only. LOSSES lists the losses that a file can name. The noise of a render adds to
+every loss unless ``pairs`` removes it (:mod:`mivol.optim.scenes.render_noise`).
 """
 
 from __future__ import annotations
 
 import math
-from typing import Annotated, ClassVar
+from collections.abc import Callable
+from typing import Annotated, Any, ClassVar
 
 import drjit as dr
 import mitsuba as mi
@@ -155,3 +156,47 @@ class Log(Loss, tag="log"):
 
 
 LOSSES = table(L1, L2, RelativeL2, Huber, Log)
+
+
+class GivenLoss(Loss, tag="given", kw_only=True):
+    """A function (image, reference) -> number, of one view at a time: it may look at neighbours, which views side by side would
+    give it wrong ones of.
+
+    Both are tensors (height, width, channels); the number is differentiable through Dr.Jit in ``image``.
+    """
+
+    function: Callable[[mi.TensorXf, mi.TensorXf], Any]
+
+    def __call__(self, image: mi.TensorXf, reference: mi.TensorXf) -> mi.Float:
+        """The function's number.
+
+        Raises:
+            MivolError: image and reference differ in shape, or it gives something else, or nothing that depends on the image.
+        """
+        check_shapes(image, reference)
+        value = self.function(image, reference)
+        name = getattr(self.function, "__name__", type(self.function).__name__)
+        if not dr.is_array_v(value) or dr.width(value) != 1 or not dr.is_float_v(value):
+            size = f" of shape {tuple(value.shape)}" if hasattr(value, "shape") else ""
+            raise MivolError(
+                f'the loss "{name}" gave a {type(value).__name__}{size}, expected one number that Dr.Jit holds: end it with '
+                "dr.mean(..., axis=None)."
+            )
+        if dr.grad_enabled(image) and not dr.grad_enabled(value):
+            raise MivolError(
+                f'no derivative leads from the loss "{name}" to the image: compute it by Dr.Jit, without detach or NumPy.'
+            )
+        return value.array if dr.is_tensor_v(value) else value
+
+
+def as_loss(given: Loss | Callable[[mi.TensorXf, mi.TensorXf], Any]) -> Loss:
+    """One of LOSSES as it is, any other function of two images as a loss.
+
+    Raises:
+        MivolError: it cannot be called.
+    """
+    if isinstance(given, Loss):
+        return given
+    if not callable(given):
+        raise MivolError(f"a loss is one of mivol's or a function of image and reference, found {type(given).__name__}.")
+    return GivenLoss(function=given)

@@ -7,8 +7,8 @@ import itertools
 import numpy as np
 import pytest
 
-from mivol.optim.linear_problems import LeastSquares
-from mivol.optim.projected_cg import projected_cg
+from mivol.optim.projections.iterative import projected_cg
+from mivol.optim.projections.linear_problems import LeastSquares
 from mivol.tomography.filtered import feldkamp
 from mivol.tomography.geometry import ConeBeam, ParallelBeam, VoxelGrid
 from mivol.tomography.phantoms import shepp_logan

@@ -16,8 +16,8 @@ from PIL import Image
 from mivol.bench.studies import gaussian_choices, points
 from mivol.bench.studies.gaussian_fits import Fitted, psnr_of
 from mivol.errors import MivolError
-from mivol.optim.gaussian_plan import PRESETS, GaussianPlan
-from mivol.optim.gaussian_start import begin_at
+from mivol.optim.gaussians.gaussian_plan import PRESETS, GaussianPlan
+from mivol.optim.gaussians.gaussian_start import begin_at
 from mivol.photos import Photo, Photos
 from mivol.photos.transforms import write_transforms
 from mivol.points import Gaussians

@@ -11,8 +11,8 @@ from ball_photos import camera
 
 from mivol.bench.studies.gaussian_fits import Fitted, fit_and_judge, psnr_of
 from mivol.errors import MivolError
-from mivol.optim.gaussian_plan import PRESETS
-from mivol.optim.gaussian_start import begin_at
+from mivol.optim.gaussians.gaussian_plan import PRESETS
+from mivol.optim.gaussians.gaussian_start import begin_at
 from mivol.photos import Photo
 from mivol.points import Gaussians
 from mivol.splatting import Splatter, tensors_of

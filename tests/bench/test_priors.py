@@ -12,7 +12,7 @@ from mivol.bench.studies.radiance_field import QUICK, priors
 from mivol.bench.studies.radiance_field.priors import FOLDS, WITHOUT, ask_priors, captures, gain_of, plan_of
 from mivol.bench.studies.radiance_field.reconstruction import FEWEST, WILD, points_of
 from mivol.bench.studies.radiance_field.room import RADIUS, WALLS, cameras_of, distance_of, image_of
-from mivol.optim.radiance_plan import PRESETS
+from mivol.optim.photographs.radiance_plan import PRESETS
 from mivol.photos import project, rays
 
 

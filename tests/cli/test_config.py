@@ -12,8 +12,8 @@ import pytest
 
 from mivol import config
 from mivol.errors import MivolError
-from mivol.optim.gauss_newton import GaussNewton
 from mivol.optim.priors import TotalVariation
+from mivol.optim.second_order import GaussNewton
 from mivol.schema import describe, settings_in, structs_in
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -9,8 +9,8 @@ import msgspec
 import pytest
 
 from mivol.config import Experiment
-from mivol.optim.adam import Adam
 from mivol.optim.events import Checkpoint, Evaluate
+from mivol.optim.first_order import Adam
 from mivol.optim.losses import L2
 from mivol.optim.schedules import Constant
 

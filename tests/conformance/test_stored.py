@@ -9,8 +9,8 @@ import oracle_projector
 import pytest
 
 from mivol.errors import MivolError
-from mivol.optim.linear_problems import LeastSquares
-from mivol.optim.solvers import SOLVERS
+from mivol.optim.projections.linear_problems import LeastSquares
+from mivol.optim.projections.solvers import SOLVERS
 from mivol.tomography import slice_matrix
 from mivol.tomography.geometry import ConeBeam, ParallelBeam, VoxelGrid
 from mivol.tomography.projector import Projector

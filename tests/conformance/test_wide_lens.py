@@ -13,11 +13,11 @@ from photo_sets import COLMAP_CAMERAS, look_at, ring, write_colmap, write_transf
 
 from mivol.errors import MivolError
 from mivol.experiments.photo_plan import wide_lenses
-from mivol.optim.field_view import render_view
 from mivol.optim.loop import reconstruct
-from mivol.optim.radiance_plan import PRESETS, Stage
-from mivol.optim.radiance_problem import RadianceProblem
-from mivol.optim.ray_batches import RayBatches
+from mivol.optim.photographs.field_view import render_view
+from mivol.optim.photographs.radiance_plan import PRESETS, Stage
+from mivol.optim.photographs.radiance_problem import RadianceProblem
+from mivol.optim.photographs.ray_batches import RayBatches
 from mivol.photos import Camera, Lens, Photo, load_photos, pixel_centres, project, rays, rectify, survey_photos, turntable
 from mivol.photos.camera import directions, field_of_view, intrinsics, is_seen
 from mivol.photos.camera_path import WIDE

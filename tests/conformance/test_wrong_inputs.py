@@ -16,10 +16,10 @@ from mivol.fields.procedural import make_procedural
 from mivol.fields.spherical import SphericalGrid
 from mivol.fields.spherical_files import MOST_NODES, _check_kinds, _of_ours
 from mivol.fields.spherical_tensors import with_tensors
-from mivol.optim.direct import fdk
 from mivol.optim.events import Upsample
 from mivol.optim.losses import L2, LOSSES, Huber
 from mivol.optim.parameters import Parameter
+from mivol.optim.projections.solvers import fdk
 from mivol.optim.strategy import choose, table
 from mivol.phase.draine import droplets
 from mivol.phase.measured import NAMES, named_medium

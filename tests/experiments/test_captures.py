@@ -12,11 +12,11 @@ from capture_photos import capture, write_capture
 
 from mivol.cli import main
 from mivol.fields.spherical_files import load_field
-from mivol.optim.field_view import render_view
 from mivol.optim.loop import begin_fit
-from mivol.optim.radiance_plan import PRESETS, FitPlan, Stage
-from mivol.optim.radiance_problem import RadianceProblem
-from mivol.optim.ray_batches import RayBatches
+from mivol.optim.photographs.field_view import render_view
+from mivol.optim.photographs.radiance_plan import PRESETS, FitPlan, Stage
+from mivol.optim.photographs.radiance_problem import RadianceProblem
+from mivol.optim.photographs.ray_batches import RayBatches
 from mivol.photos.region import middle_box
 from mivol.validate.images import judge
 

@@ -16,9 +16,9 @@ from mivol.cli import main
 from mivol.experiments import photo_fit
 from mivol.experiments.gaussian_start import make_gaussian_plan
 from mivol.files import write_png
-from mivol.optim.gaussian_plan import PRESETS
-from mivol.optim.gaussian_problem import GaussianProblem
-from mivol.optim.gaussian_start import begin_at, places_of
+from mivol.optim.gaussians.gaussian_plan import PRESETS
+from mivol.optim.gaussians.gaussian_problem import GaussianProblem
+from mivol.optim.gaussians.gaussian_start import begin_at, places_of
 from mivol.optim.problem import Reals
 from mivol.photos import Camera, intrinsics, load_photos
 from mivol.photos.camera_path import aim_camera

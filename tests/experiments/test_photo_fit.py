@@ -22,10 +22,10 @@ from mivol.experiments import photo_data, photo_fit, photo_outputs, photo_plan
 from mivol.fields.spherical import SphericalGrid
 from mivol.fields.spherical_files import load_field
 from mivol.files import read_exr, write_exr, write_png
-from mivol.optim.field_view import render_view
+from mivol.optim.photographs.field_view import render_view
+from mivol.optim.photographs.radiance_plan import FEW, PRESETS, FitPlan, Stage, stretched
+from mivol.optim.photographs.radiance_problem import RadianceProblem
 from mivol.optim.problem import Reals
-from mivol.optim.radiance_plan import FEW, PRESETS, FitPlan, Stage, stretched
-from mivol.optim.radiance_problem import RadianceProblem
 from mivol.photos import Camera, intrinsics
 from mivol.photos.camera_path import aim_camera
 from mivol.photos.photo_file import decode_srgb

@@ -12,7 +12,7 @@ from mivol.experiments import photo_outputs
 from mivol.fields.spherical import SphericalGrid
 from mivol.fields.spherical_files import save_field
 from mivol.files import read_volume
-from mivol.optim.field_view import FieldView
+from mivol.optim.photographs.field_view import FieldView
 from mivol.photos import Camera, intrinsics
 from mivol.validate.images import Quality
 

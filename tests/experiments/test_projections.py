@@ -12,7 +12,7 @@ from mivol.config import Cone, Parallel
 from mivol.errors import MivolError
 from mivol.experiments import projections, readings
 from mivol.experiments.readings import ScanReadings, note_order, to_radians
-from mivol.optim.linear_problems import LeastSquares, PoissonCounts
+from mivol.optim.projections.linear_problems import LeastSquares, PoissonCounts
 from mivol.tomography.preprocess import Quanta, Transmission
 from mivol.tomography.rotation_axis import Axis
 

@@ -23,8 +23,8 @@ from mivol.fields.sky import Sky
 from mivol.fields.spherical import SphericalGrid
 from mivol.fields.spherical_files import load_field
 from mivol.files import encode_srgb, read_exr, write_exr, write_png
-from mivol.optim.field_view import render_view
-from mivol.optim.radiance_problem import RadianceProblem
+from mivol.optim.photographs.field_view import render_view
+from mivol.optim.photographs.radiance_problem import RadianceProblem
 from mivol.photos.transforms import write_transforms
 from mivol.validate.images import judge
 

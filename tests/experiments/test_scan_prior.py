@@ -11,10 +11,10 @@ import pytest
 from mivol import config
 from mivol.experiments.projections import Projections
 from mivol.experiments.scan_prior import PLAIN_ITERATIONS, make_prior, settle_noise
-from mivol.optim.inversion import Inversion
-from mivol.optim.linear_problems import LeastSquares
-from mivol.optim.noise_scale import tv_of_noise
-from mivol.optim.projected_cg import projected_cg
+from mivol.optim.projections.inversion import Inversion
+from mivol.optim.projections.iterative import projected_cg
+from mivol.optim.projections.linear_problems import LeastSquares
+from mivol.optim.projections.smoothed_tv import tv_of_noise
 from mivol.tomography.geometry import ParallelBeam, VoxelGrid
 from mivol.tomography.phantoms import shepp_logan
 from mivol.tomography.projector import Projector

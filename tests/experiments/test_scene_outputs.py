@@ -18,8 +18,8 @@ from mivol.config import Sought
 from mivol.experiments.scene_outputs import SceneOutputs
 from mivol.experiments.start import make_start
 from mivol.files import read_exr, read_volume, write_exr
-from mivol.optim.scene_problem import SceneProblem
-from mivol.optim.seeds import FINAL, seed_of
+from mivol.optim.scenes.scene_problem import SceneProblem
+from mivol.optim.scenes.views import FINAL, seed_of
 
 
 def test_images_that_are_compared_may_have_more_samples(variant_rgb, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -121,7 +121,7 @@ def test_what_a_script_gets_wrong_is_said(scene: mi.Scene) -> None:
         Problem(scene, [seen()], [KEY], loss=3)
     with refuses(r"found the class Adam: call it, as Adam\(\.\.\.\)"):
         optimize(Problem(scene, [seen()], [KEY]), mivol.Adam, 1)
-    with refuses("Silent.begin gave NoneType, expected a mivol.optim.optimiser.Run"):
+    with refuses("Silent.begin gave NoneType, expected a mivol.optim.optimizer.Run"):
         optimize(Problem(scene, [seen()], [KEY]), Silent(), 1)
     with refuses("found str"):
         optimize(Problem(scene, [seen()], [KEY]), "adam", 1)

@@ -16,7 +16,7 @@ from tiny_experiment import run
 from mivol.errors import MivolError
 from mivol.experiments import validation
 from mivol.experiments.validation import DIFFERS, UNTRUSTED, Validation, validate_scene
-from mivol.optim.seeds import seed_of
+from mivol.optim.scenes.views import seed_of
 from mivol.scene.load import load_scene
 from mivol.validate.statistics import Significance
 from mivol.validate.trust import Doubt

@@ -45,11 +45,11 @@ from scipy.special import lpmv
 
 from mivol.fields.activation import ACTIVATIONS
 from mivol.fields.spherical import MAX_DEGREE, SphericalGrid, basis_size
-from mivol.optim.field_view import render_view
 from mivol.optim.loop import begin_fit, reconstruct
-from mivol.optim.radiance_plan import PRESETS, FitPlan, Stage
-from mivol.optim.radiance_problem import RadianceProblem
-from mivol.optim.ray_batches import TILE, RayBatches
+from mivol.optim.photographs.field_view import render_view
+from mivol.optim.photographs.radiance_plan import PRESETS, FitPlan, Stage
+from mivol.optim.photographs.radiance_problem import RadianceProblem
+from mivol.optim.photographs.ray_batches import TILE, RayBatches
 from mivol.photos import Camera, Photo, pixel_centres, rays
 from mivol.photos.camera import intrinsics
 from mivol.transport.line_integrals.radiance_field import RayGradient, backward, cells_of, model_of, render

@@ -6,7 +6,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mivol.optim.adam import Adam
+from mivol.optim.first_order import Adam
 from mivol.optim.problem import Refinement
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")

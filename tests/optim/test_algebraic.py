@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from small_scan import run
 
-from mivol.optim.linear_problems import LeastSquares
+from mivol.optim.projections.linear_problems import LeastSquares
 
 
 @pytest.mark.parametrize("name", ["sirt", "os-sart"])

@@ -14,16 +14,13 @@ from scattering_scenes import cases
 from mivol.errors import MivolError
 from mivol.files import atomic
 from mivol.optim import checkpoint
-from mivol.optim.adam import Adam
 from mivol.optim.checkpoint import Store
-from mivol.optim.course import Course
 from mivol.optim.events import Checkpoint, Evaluate, Upsample
-from mivol.optim.gauss_newton import GaussNewton
+from mivol.optim.first_order import Adam, RMSprop
 from mivol.optim.interrupt import Interrupted
-from mivol.optim.lbfgs import Lbfgs
-from mivol.optim.loop import Fit, reconstruct
-from mivol.optim.rmsprop import RMSprop
-from mivol.optim.scene_problem import SceneProblem
+from mivol.optim.loop import Course, Fit, reconstruct
+from mivol.optim.scenes.scene_problem import SceneProblem
+from mivol.optim.second_order import GaussNewton, Lbfgs
 
 ITERATIONS = 6
 EVENTS = (Upsample(at=(2,)), Evaluate(every=3))

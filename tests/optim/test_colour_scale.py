@@ -10,10 +10,10 @@ import pytest
 from ball_photos import BOX, CUBE, PLAN, camera, fitted
 
 from mivol.fields.spherical import SphericalGrid
-from mivol.optim.colour_scale import EPSILON, SCALES
-from mivol.optim.field_view import render_view
-from mivol.optim.radiance_problem import RadianceProblem
-from mivol.optim.ray_batches import RayBatches
+from mivol.optim.photographs.colour_scale import EPSILON, SCALES
+from mivol.optim.photographs.field_view import render_view
+from mivol.optim.photographs.radiance_problem import RadianceProblem
+from mivol.optim.photographs.ray_batches import RayBatches
 from mivol.photos import Photo
 from mivol.transport.line_integrals.radiance_field import model_of, render
 from mivol.transport.line_integrals.radiance_source import bake

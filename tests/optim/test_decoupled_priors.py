@@ -9,7 +9,7 @@ import pytest
 from ball_photos import CUBE
 
 from mivol.fields.spherical import SphericalGrid, is_covered
-from mivol.optim.decoupled_priors import Neighbours, Rows, Smoothness, decay_view_dependence, smooth, sparsify
+from mivol.optim.priors import Neighbours, Rows, Smoothness, decay_view_dependence, smooth, sparsify
 
 
 def smoothed(values: mi.Float, field: SphericalGrid, amount: float, share: float = 1.0, first: int = 7) -> None:

@@ -10,8 +10,8 @@ from scipy.integrate import quad
 from scipy.special import expit, logit
 
 from mivol.errors import MivolError
-from mivol.optim import density_control
-from mivol.optim.density_control import Arrays
+from mivol.optim.gaussians import density_control
+from mivol.optim.gaussians.density_control import Arrays
 
 
 def cloud(n: int = 6, seed: int = 0) -> Arrays:

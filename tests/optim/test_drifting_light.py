@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 from small_scan import VIEWS
 
-from mivol.optim.drifting_light import fit_drift, with_drift
-from mivol.optim.linear_problems import LeastSquares
-from mivol.optim.solver import State
-from mivol.optim.solvers import SOLVERS
+from mivol.optim.projections.inversion import fit_drift, with_drift
+from mivol.optim.projections.linear_problems import LeastSquares, State
+from mivol.optim.projections.solvers import SOLVERS
 
 TIMES = np.linspace(-1.0, 1.0, VIEWS)
 

@@ -9,12 +9,12 @@ from fit_scene import KEY, absorbing_scene, camera, frontal, views_of_truth
 
 from mivol.errors import MivolError
 from mivol.fields.spherical import SphericalGrid
-from mivol.optim import emissive_start
-from mivol.optim.adam import Adam
-from mivol.optim.emissive_start import FACTORS, LEAST, PARTS, density_of, find_emissive_start, photographed
+from mivol.optim.first_order import Adam
 from mivol.optim.parameters import Parameter
-from mivol.optim.render_batches import View
-from mivol.optim.scene_problem import SceneProblem
+from mivol.optim.scenes import emissive_start
+from mivol.optim.scenes.emissive_start import FACTORS, LEAST, PARTS, density_of, find_emissive_start, photographed
+from mivol.optim.scenes.scene_problem import SceneProblem
+from mivol.optim.scenes.views import View
 
 PLACE = np.array([[2.0, 0, 0, -1], [0, 2, 0, -1], [0, 0, 2, -1], [0, 0, 0, 1]])
 

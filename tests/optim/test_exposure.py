@@ -16,14 +16,14 @@ from mivol import config
 from mivol.errors import MivolError
 from mivol.experiments.photo_outputs import table_of_gains
 from mivol.experiments.photo_plan import GAINS, choices, make_plan
-from mivol.optim import radiance_problem
 from mivol.optim.checkpoint import Store
-from mivol.optim.exposure import AGREE, PULL, RATE, Exposure
-from mivol.optim.field_view import render_view
 from mivol.optim.loop import begin_fit
-from mivol.optim.radiance_plan import PRESETS, FitPlan, Stage
-from mivol.optim.radiance_problem import RadianceProblem
-from mivol.optim.ray_batches import RayBatches
+from mivol.optim.photographs import radiance_problem
+from mivol.optim.photographs.exposure import AGREE, PULL, RATE, Exposure
+from mivol.optim.photographs.field_view import render_view
+from mivol.optim.photographs.radiance_plan import PRESETS, FitPlan, Stage
+from mivol.optim.photographs.radiance_problem import RadianceProblem
+from mivol.optim.photographs.ray_batches import RayBatches
 from mivol.photos import Photo
 from mivol.transport.line_integrals.radiance_field import model_of, render
 from mivol.transport.line_integrals.radiance_source import bake

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from mivol.errors import MivolError
-from mivol.optim.adam import Adam
 from mivol.optim.events import CoarseToFine, ControlDensity, UpdateOccupancy
-from mivol.optim.gaussian_plan import PRESETS, GaussianPlan, SplatStage, bytes_of, extent_of, memory_of
+from mivol.optim.first_order import Adam
+from mivol.optim.gaussians.gaussian_plan import PRESETS, GaussianPlan, SplatStage, bytes_of, extent_of, memory_of
 from mivol.photos import Camera
 
 PLAN = GaussianPlan(

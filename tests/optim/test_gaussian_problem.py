@@ -12,13 +12,13 @@ from ball_photos import camera
 
 from mivol.errors import MivolError
 from mivol.optim.checkpoint import Store
-from mivol.optim.density_control import Arrays, rotations
 from mivol.optim.events import Checkpoint
-from mivol.optim.gaussian_plan import PRESETS, GaussianPlan, SplatStage, bytes_of, extent_of, memory_of
-from mivol.optim.gaussian_problem import GaussianProblem, _wandered
-from mivol.optim.gaussian_start import begin_at
+from mivol.optim.gaussians.density_control import Arrays, rotations
+from mivol.optim.gaussians.gaussian_plan import PRESETS, GaussianPlan, SplatStage, bytes_of, extent_of, memory_of
+from mivol.optim.gaussians.gaussian_problem import GaussianProblem, _wandered
+from mivol.optim.gaussians.gaussian_start import begin_at
 from mivol.optim.loop import Fit, begin_fit, reconstruct
-from mivol.optim.ray_batches import RayBatches
+from mivol.optim.photographs.ray_batches import RayBatches
 from mivol.photos import Photo
 from mivol.splatting import Splatter
 

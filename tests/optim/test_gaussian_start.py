@@ -10,7 +10,7 @@ import pytest
 from ball_photos import camera
 
 from mivol.errors import MivolError
-from mivol.optim.gaussian_start import begin_at, places_of
+from mivol.optim.gaussians.gaussian_start import begin_at, places_of
 from mivol.photos import Photo, project
 
 BOX = np.array([[-0.5, -0.4, -0.3], [0.5, 0.6, 0.7]])

@@ -7,10 +7,9 @@ import pytest
 from small_scan import Views, run
 
 from mivol.errors import MivolError
-from mivol.optim.course import Course
-from mivol.optim.inversion import Inversion, Solve
-from mivol.optim.linear_problems import LeastSquares
-from mivol.optim.loop import reconstruct
+from mivol.optim.loop import Course, reconstruct
+from mivol.optim.projections.inversion import Inversion, Solve
+from mivol.optim.projections.linear_problems import LeastSquares
 
 
 def inversion(scan: tuple[Views, np.ndarray, np.ndarray], **more: object) -> Inversion:

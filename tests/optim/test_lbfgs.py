@@ -8,7 +8,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mivol.optim.lbfgs import Lbfgs, LbfgsRun, two_loops
+from mivol.optim.second_order import Lbfgs, LbfgsRun, two_loops
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
 

@@ -7,8 +7,8 @@ import pytest
 from small_scan import GRID, run
 
 from mivol.errors import MivolError
-from mivol.optim.linear_problems import LeastSquares, PoissonCounts
-from mivol.optim.smoothed_tv import SmoothedTV
+from mivol.optim.projections.linear_problems import LeastSquares, PoissonCounts
+from mivol.optim.projections.smoothed_tv import SmoothedTV
 
 
 @pytest.mark.parametrize(

@@ -14,23 +14,18 @@ from false_alarms import assert_precise, assert_same_mean, fresh
 from fit_scene import KEY, absorbing_scene, camera, film, frontal, small_problem
 
 from mivol.errors import MivolError
-from mivol.optim.adam import Adam
-from mivol.optim.course import Course
 from mivol.optim.events import Evaluate, Upsample
-from mivol.optim.gauss_newton import GaussNewton, Linearised, conjugate_gradients
+from mivol.optim.first_order import Adam, RMSprop
 from mivol.optim.interrupt import Interrupted, Stop
-from mivol.optim.lbfgs import Lbfgs, two_loops
-from mivol.optim.loop import reconstruct
+from mivol.optim.loop import Course, reconstruct
 from mivol.optim.losses import Huber, Log
-from mivol.optim.optimisers import OPTIMISERS
-from mivol.optim.packing import Packing
+from mivol.optim.optimizers import OPTIMISERS
 from mivol.optim.parameters import Parameter
 from mivol.optim.priors import Laplacian, TotalVariation
-from mivol.optim.render_batches import View, make_batches
-from mivol.optim.rmsprop import RMSprop
-from mivol.optim.scene_problem import SceneProblem, views_of
+from mivol.optim.scenes.scene_problem import SceneProblem, views_of
+from mivol.optim.scenes.views import View, make_batches, seed_of
 from mivol.optim.schedules import Cosine
-from mivol.optim.seeds import seed_of
+from mivol.optim.second_order import GaussNewton, Lbfgs, Linearised, Packing, conjugate_gradients, two_loops
 from mivol.validate.moments import Moments
 
 EPS = float(np.finfo(np.float32).eps)

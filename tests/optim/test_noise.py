@@ -16,16 +16,15 @@ from scipy import stats
 from mivol import config
 from mivol.cli.progress import Display
 from mivol.errors import MivolError
-from mivol.optim.adam import Adam
 from mivol.optim.checkpoint import Store
-from mivol.optim.gauss_newton import Linearised
+from mivol.optim.first_order import Adam
 from mivol.optim.loop import reconstruct
 from mivol.optim.losses import L1, L2, LOSSES, Huber, Log, RelativeL2
-from mivol.optim.noise import compare, halves_of, noise_check, warning
-from mivol.optim.packing import Packing
 from mivol.optim.parameters import Parameter
-from mivol.optim.render_batches import View
-from mivol.optim.scene_problem import SceneProblem
+from mivol.optim.scenes.render_noise import compare, halves_of, noise_check, warning
+from mivol.optim.scenes.scene_problem import SceneProblem
+from mivol.optim.scenes.views import View
+from mivol.optim.second_order import Linearised, Packing
 from mivol.validate.moments import Moments
 
 SIGMA, SEEN, SPP = 0.4, 0.6, 8

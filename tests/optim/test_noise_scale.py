@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mivol.optim.linear_problems import LeastSquares, PoissonCounts
-from mivol.optim.noise_scale import noise_norm, tv_of_noise
+from mivol.optim.projections.linear_problems import LeastSquares, PoissonCounts, noise_norm
+from mivol.optim.projections.smoothed_tv import tv_of_noise
 from mivol.tomography.geometry import ParallelBeam, VoxelGrid
 from mivol.tomography.projector import Projector
 

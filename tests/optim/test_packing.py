@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from mivol.optim.packing import search
+from mivol.optim.second_order import search
 
 OPEN = SimpleNamespace(project=lambda x: x)
 

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from mivol.errors import MivolError
-from mivol.optim.decoupled_priors import DecoupledPrior
-from mivol.optim.priors import PRIORS, Bounds, HuberTotalVariation, Laplacian, Sparse, TotalVariation
+from mivol.optim.priors import PRIORS, Bounds, DecoupledPrior, HuberTotalVariation, Laplacian, Sparse, TotalVariation
 
 SPACING = (0.5, 0.25, 0.2)
 CHOSEN = [

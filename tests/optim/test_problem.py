@@ -13,15 +13,13 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mivol.optim.adam import Adam
 from mivol.optim.checkpoint import Store
-from mivol.optim.course import Course
 from mivol.optim.events import CoarseToFine
+from mivol.optim.first_order import Adam, RMSprop
 from mivol.optim.interrupt import Interrupted
-from mivol.optim.loop import Fit, reconstruct
-from mivol.optim.optimiser import Optimiser
+from mivol.optim.loop import Course, Fit, reconstruct
+from mivol.optim.optimizer import Optimiser
 from mivol.optim.problem import Reals, Refinement
-from mivol.optim.rmsprop import RMSprop
 from mivol.optim.schedules import Cosine
 
 X = np.linspace(-1, 1, 64, dtype=np.float32)

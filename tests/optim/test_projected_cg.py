@@ -9,8 +9,8 @@ import scipy.sparse
 import scipy.sparse.linalg
 from small_scan import GRID, VIEWS, Views, problem_for, run
 
-from mivol.optim.linear_problems import LeastSquares
-from mivol.optim.smoothed_tv import SmoothedTV
+from mivol.optim.projections.linear_problems import LeastSquares
+from mivol.optim.projections.smoothed_tv import SmoothedTV
 
 
 def test_pcg_is_scipys_cg_on_the_normal_equations(scan):

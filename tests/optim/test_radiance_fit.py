@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from ball_photos import BOX, PLAN
 
-from mivol.optim.radiance_fit import begin_radiance_fit, newest_field
-from mivol.optim.ray_batches import RayBatches
+from mivol.optim.photographs.radiance_problem import begin_radiance_fit, newest_field
+from mivol.optim.photographs.ray_batches import RayBatches
 from mivol.photos import Photo
 
 

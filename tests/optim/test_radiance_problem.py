@@ -15,11 +15,11 @@ from scipy.ndimage import maximum_filter
 from mivol.errors import MivolError
 from mivol.fields.sky import Sky
 from mivol.optim.checkpoint import Store
-from mivol.optim.field_view import render_view
 from mivol.optim.loop import Fit, begin_fit, reconstruct
-from mivol.optim.radiance_plan import Stage, bytes_of
-from mivol.optim.radiance_problem import RadianceProblem
-from mivol.optim.ray_batches import TILE, RayBatches
+from mivol.optim.photographs.field_view import render_view
+from mivol.optim.photographs.radiance_plan import Stage, bytes_of
+from mivol.optim.photographs.radiance_problem import RadianceProblem
+from mivol.optim.photographs.ray_batches import TILE, RayBatches
 from mivol.photos import Lens, Photo
 from mivol.transport.line_integrals.radiance_field import cells_of, model_of, render
 from mivol.transport.line_integrals.radiance_source import bake

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from mivol.errors import MivolError
-from mivol.optim.ray_batches import TILE, RayBatches
+from mivol.optim.photographs.ray_batches import TILE, RayBatches
 from mivol.photos import Camera, Photo, intrinsics, pixel_centres, rays
 
 

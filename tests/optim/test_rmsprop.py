@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from mivol.errors import MivolError
-from mivol.optim.rmsprop import LARGEST, LONGEST_MEMORY, RMSprop, descend, from_halves, halved
+from mivol.optim.first_order import LARGEST, LONGEST_MEMORY, RMSprop, descend, from_halves, halved
 
 
 def test_steps_are_those_of_the_formula(variant_rgb: str) -> None:

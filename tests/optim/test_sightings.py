@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from ball_photos import BOX, PLAN, fitted
 
-from mivol.optim.radiance_problem import RadianceProblem
-from mivol.optim.ray_batches import RayBatches
-from mivol.optim.sightings import EACH, OFF, WRONG, Sightings, by_transmittance, draw_sightings
+from mivol.optim.photographs.depth_supervision import EACH, OFF, WRONG, Sightings, by_transmittance, draw_sightings
+from mivol.optim.photographs.radiance_problem import RadianceProblem
+from mivol.optim.photographs.ray_batches import RayBatches
 from mivol.photos import Photo
 from mivol.transport.line_integrals.radiance_field import cells_of, model_of, render
 from mivol.transport.line_integrals.radiance_source import exact

@@ -9,7 +9,7 @@ import pytest
 from scipy.ndimage import correlate1d
 from skimage.metrics import structural_similarity
 
-from mivol.optim.similarity import C1, C2, WEIGHTS, PictureShape, difference, similarity
+from mivol.optim.gaussians.image_difference import C1, C2, WEIGHTS, PictureShape, difference, similarity
 
 HEIGHT, WIDTH = 14, 17
 

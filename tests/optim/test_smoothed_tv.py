@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mivol.optim.smoothed_tv import SmoothedTV
+from mivol.optim.projections.smoothed_tv import SmoothedTV
 
 
 def test_prior_derivatives_and_majorisers():

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from small_scan import problem_for, run
 
-from mivol.optim.solver import State
-from mivol.optim.solvers import SOLVERS
+from mivol.optim.projections.linear_problems import State
+from mivol.optim.projections.solvers import SOLVERS
 
 
 @pytest.mark.parametrize("name", SOLVERS)

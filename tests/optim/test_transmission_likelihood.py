@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from small_scan import GRID, Views, problem_for, run
 
-from mivol.optim.linear_problems import PoissonCounts
-from mivol.optim.smoothed_tv import SmoothedTV
-from mivol.optim.transmission_likelihood import _Counts
+from mivol.optim.projections.iterative import _Counts
+from mivol.optim.projections.linear_problems import PoissonCounts
+from mivol.optim.projections.smoothed_tv import SmoothedTV
 
 
 @pytest.mark.parametrize("background", [0.0, 5.0])

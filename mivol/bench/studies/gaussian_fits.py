@@ -16,11 +16,11 @@ import numpy as np
 from mivol.bench.harness.bars import say
 from mivol.bench.harness.timing import Stopwatch
 from mivol.errors import MivolError
-from mivol.optim.gaussian_plan import PRESETS, GaussianPlan
-from mivol.optim.gaussian_problem import GaussianProblem
-from mivol.optim.gaussian_start import begin_at, places_of
+from mivol.optim.gaussians.gaussian_plan import PRESETS, GaussianPlan
+from mivol.optim.gaussians.gaussian_problem import GaussianProblem
+from mivol.optim.gaussians.gaussian_start import begin_at, places_of
 from mivol.optim.loop import reconstruct
-from mivol.optim.ray_batches import RayBatches
+from mivol.optim.photographs.ray_batches import RayBatches
 from mivol.photos import Photo, Photos, load_photos
 from mivol.points import Gaussians
 from mivol.splatting import Splatter, tensors_of

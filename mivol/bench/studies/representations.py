@@ -36,9 +36,9 @@ from mivol.experiments import gaussian_outputs, photo_outputs
 from mivol.experiments.gaussian_start import begin, make_gaussian_plan
 from mivol.experiments.photo_data import boxed, read_photos
 from mivol.experiments.photo_plan import batches_of, make_plan, suited
-from mivol.optim.field_view import render_view
-from mivol.optim.gaussian_problem import GaussianProblem
-from mivol.optim.radiance_problem import RadianceProblem
+from mivol.optim.gaussians.gaussian_problem import GaussianProblem
+from mivol.optim.photographs.field_view import render_view
+from mivol.optim.photographs.radiance_problem import RadianceProblem
 from mivol.photos import Photo, Photos, survey_photos
 from mivol.points import Gaussians, write_gaussians
 from mivol.validate import images

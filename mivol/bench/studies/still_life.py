@@ -29,11 +29,11 @@ from mivol.bench.harness.figures import drawn
 from mivol.bench.harness.study import Bench
 from mivol.bench.harness.timing import Stopwatch
 from mivol.errors import MivolError
-from mivol.optim.field_view import render_view
 from mivol.optim.loop import reconstruct
-from mivol.optim.radiance_plan import FitPlan, Stage
-from mivol.optim.radiance_problem import RadianceProblem
-from mivol.optim.ray_batches import RayBatches
+from mivol.optim.photographs.field_view import render_view
+from mivol.optim.photographs.radiance_plan import FitPlan, Stage
+from mivol.optim.photographs.radiance_problem import RadianceProblem
+from mivol.optim.photographs.ray_batches import RayBatches
 from mivol.photos import Photo, load_photos
 from mivol.validate import images
 
@@ -109,7 +109,7 @@ def fit(photos: Sequence[Photo], held_out: Sequence[Photo], box: np.ndarray, siz
         box: (2, 3) what is looked at.
         size: nodes, steps, rays.
         degree: of the harmonics.
-        priors: fields of :class:`mivol.optim.radiance_plan.FitPlan`.
+        priors: fields of :class:`mivol.optim.photographs.radiance_plan.FitPlan`.
 
     Returns:
         PSNR [dB] of the held-out views, nodes, processor time; and for the figure the middle one of them and its render.

@@ -44,9 +44,9 @@ from mivol.bench.studies.tomography_tooth import slice_of_the_tooth
 from mivol.bench.studies.tomography_volume import measure_volume
 from mivol.errors import MivolError
 from mivol.files import read_volume, write_whole_text
-from mivol.optim.linear_problems import LeastSquares
-from mivol.optim.smoothed_tv import SmoothedTV
-from mivol.optim.solvers import SOLVERS
+from mivol.optim.projections.linear_problems import LeastSquares
+from mivol.optim.projections.smoothed_tv import SmoothedTV
+from mivol.optim.projections.solvers import SOLVERS
 from mivol.tomography.geometry import ConeBeam, VoxelGrid, cone_beam_of_tigre
 from mivol.tomography.phantoms import SHEPP_LOGAN, shepp_logan
 from mivol.tomography.projector import Projector

@@ -29,9 +29,9 @@ from mivol.experiments.scan_fit import start_volume
 from mivol.experiments.scan_prior import make_prior, settle_noise
 from mivol.experiments.scan_storage import choose_storage
 from mivol.experiments.solver_choice import settle_solver
-from mivol.optim.inversion import Inversion
-from mivol.optim.linear_problems import LeastSquares, PoissonCounts
-from mivol.optim.solvers import METHODS
+from mivol.optim.projections.inversion import Inversion
+from mivol.optim.projections.linear_problems import LeastSquares, PoissonCounts
+from mivol.optim.projections.solvers import METHODS
 from mivol.tomography.filtered import filtered_backprojection
 from mivol.tomography.geometry import ParallelBeam, VoxelGrid
 from mivol.tomography.phantoms import shepp_logan

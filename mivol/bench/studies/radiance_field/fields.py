@@ -12,9 +12,9 @@ from mivol.bench.studies.radiance_field.size import Size
 from mivol.bench.studies.radiance_field.views import BOX, photographed, ring
 from mivol.fields.spherical import SphericalGrid
 from mivol.optim.loop import reconstruct
-from mivol.optim.radiance_plan import FitPlan, Stage
-from mivol.optim.radiance_problem import RadianceProblem
-from mivol.optim.ray_batches import RayBatches
+from mivol.optim.photographs.radiance_plan import FitPlan, Stage
+from mivol.optim.photographs.radiance_problem import RadianceProblem
+from mivol.optim.photographs.ray_batches import RayBatches
 from mivol.photos import load_photos
 
 __all__ = ["FIELDS", "field_of"]

@@ -16,11 +16,11 @@ from mivol.bench.studies.radiance_field.peer import Peer
 from mivol.bench.studies.radiance_field.size import STOP, Size
 from mivol.bench.studies.radiance_field.views import BLACK, BOX, between, photographed, rays_of, rays_through, ring, tiled
 from mivol.fields.spherical import SphericalGrid
-from mivol.optim.field_view import render_view
 from mivol.optim.loop import Fit
-from mivol.optim.radiance_fit import begin_radiance_fit, newest_field
-from mivol.optim.radiance_plan import FitPlan, Stage
-from mivol.optim.ray_batches import TILE, RayBatch, RayBatches
+from mivol.optim.photographs.field_view import render_view
+from mivol.optim.photographs.radiance_plan import FitPlan, Stage
+from mivol.optim.photographs.radiance_problem import begin_radiance_fit, newest_field
+from mivol.optim.photographs.ray_batches import TILE, RayBatch, RayBatches
 from mivol.photos import Camera, Photo
 from mivol.validate.metrics import psnr
 

@@ -23,11 +23,11 @@ from mivol.bench.studies.radiance_field.size import PhotoFit, Size
 from mivol.bench.studies.still_life import photographer
 from mivol.experiments.photo_data import boxed, read_photos
 from mivol.experiments.photo_plan import batches_of, make_plan, suited
-from mivol.optim.field_view import render_view
-from mivol.optim.gaussian_problem import GaussianProblem
+from mivol.optim.gaussians.gaussian_problem import GaussianProblem
 from mivol.optim.loop import Fit, begin_fit
-from mivol.optim.radiance_plan import bytes_of
-from mivol.optim.radiance_problem import RadianceProblem
+from mivol.optim.photographs.field_view import render_view
+from mivol.optim.photographs.radiance_plan import bytes_of
+from mivol.optim.photographs.radiance_problem import RadianceProblem
 from mivol.photos import Photo
 from mivol.validate import images
 

@@ -15,10 +15,10 @@ from mivol.bench.studies.radiance_field.fits import held_out_psnr
 from mivol.bench.studies.radiance_field.reconstruction import write_room
 from mivol.bench.studies.radiance_field.size import Size
 from mivol.experiments.photo_plan import of_few, with_levels_needed
-from mivol.optim.field_view import render_view
-from mivol.optim.radiance_fit import begin_radiance_fit, newest_field
-from mivol.optim.radiance_plan import PRESETS, FitPlan, Stage
-from mivol.optim.ray_batches import RayBatches
+from mivol.optim.photographs.field_view import render_view
+from mivol.optim.photographs.radiance_plan import PRESETS, FitPlan, Stage
+from mivol.optim.photographs.radiance_problem import begin_radiance_fit, newest_field
+from mivol.optim.photographs.ray_batches import RayBatches
 from mivol.photos import Photo, Photos, load_photos, rectify
 
 __all__ = ["WITHOUT", "ask_priors", "captures", "gain_of", "plan_of"]

@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 
 from mivol.fields.spherical import SphericalGrid
-from mivol.optim.field_view import render_view
+from mivol.optim.photographs.field_view import render_view
 from mivol.photos import Camera, Photo, intrinsics, pixel_centres, rays
 from mivol.photos.camera_path import aim_camera
 from mivol.transport.line_integrals.radiance_field import RayBundle

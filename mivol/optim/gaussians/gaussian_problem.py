@@ -19,7 +19,7 @@ import numpy as np
 from scipy.special import expit
 
 from mivol.errors import MivolError
-from mivol.optim.density_control import (
+from mivol.optim.gaussians.density_control import (
     Arrays,
     Change,
     best_rows,
@@ -29,11 +29,11 @@ from mivol.optim.density_control import (
     relocate,
     reset_opacities,
 )
-from mivol.optim.exposure import Exposure
-from mivol.optim.gaussian_plan import CONTROLS, GaussianPlan, extent_of
+from mivol.optim.gaussians.gaussian_plan import CONTROLS, GaussianPlan, extent_of
+from mivol.optim.gaussians.image_difference import PictureShape, difference
+from mivol.optim.photographs.exposure import Exposure
+from mivol.optim.photographs.ray_batches import RayBatches
 from mivol.optim.problem import Reals, Refinement
-from mivol.optim.ray_batches import RayBatches
-from mivol.optim.similarity import PictureShape, difference
 from mivol.optim.strategy import nearest
 from mivol.photos import Camera
 from mivol.splatting import Splatter
@@ -150,9 +150,7 @@ class GaussianProblem:
             loss, gradient = self._sparse(reals, loss, gradient)
         return loss, gradient
 
-    def loss_of_view(
-        self, reals: Reals, view: int, background: np.ndarray | None = None
-    ) -> tuple[mi.Float, Reals, Statistics]:
+    def loss_of_view(self, reals: Reals, view: int, background: np.ndarray | None = None) -> tuple[mi.Float, Reals, Statistics]:
         """The loss of a view in the size of the stage, its gradient by the reals, and what the screen says of each Gaussian.
 
         Args:

@@ -22,13 +22,21 @@ import mitsuba as mi
 import numpy as np
 
 from mivol.errors import MivolError
-from mivol.optim.given import GivenLoss, as_loss
-from mivol.optim.losses import L2, Loss
-from mivol.optim.noise import Compared, compare, halves_of, noise_check, warning
+from mivol.optim.losses import L2, GivenLoss, Loss, as_loss
 from mivol.optim.parameters import Parameter, as_tensor, check_names, find, like
 from mivol.optim.problem import Reals
-from mivol.optim.render_batches import RenderBatch, View, check_views, make_batches, pixels, single_batches
-from mivol.optim.seeds import ADJOINT, PRIMAL, seed_of
+from mivol.optim.scenes.render_noise import Compared, compare, halves_of, noise_check, warning
+from mivol.optim.scenes.views import (
+    ADJOINT,
+    PRIMAL,
+    RenderBatch,
+    View,
+    check_views,
+    make_batches,
+    pixels,
+    seed_of,
+    single_batches,
+)
 
 
 @dataclass(repr=False)
@@ -40,7 +48,7 @@ class SceneProblem:
         views: all of one size.
         parameters: what is looked for.
         integrator: differentiable; None takes the scene's own.
-        loss: one of LOSSES, or any function of image and reference (:class:`mivol.optim.given.GivenLoss`).
+        loss: one of LOSSES, or any function of image and reference (:class:`mivol.optim.losses.GivenLoss`).
         spp: samples per pixel of an image, and of its derivative.
         samples_per_pass: most samples in one kernel.
         seed: root of all random numbers.
@@ -188,7 +196,7 @@ class SceneProblem:
 
         The seeds of image and derivative differ: an estimate of d(I^2) = 2 I dI from one set of samples is biased.
         Noise: of the integrator; none for media that only absorb, beyond the pixel filter's. What it does to the loss:
-        :func:`mivol.optim.noise.compare`.
+        :func:`mivol.optim.scenes.render_noise.compare`.
         """
         batches = self.batches
         if views:
@@ -266,9 +274,7 @@ class SceneProblem:
         """Sum of all weighted prior energies."""
         return math.fsum(float(p.energy(p.from_reals(dr.detach(reals[p.name])))[0]) for p in self.parameters)
 
-    def through_priors_and_maps(
-        self, reals: Reals, gradients: Reals
-    ) -> tuple[float, Reals]:
+    def through_priors_and_maps(self, reals: Reals, gradients: Reals) -> tuple[float, Reals]:
         """Prior energy, and the gradients by the reals for given gradients by the values."""
         total, by_reals = 0.0, {}
         for p in self.parameters:

@@ -1,8 +1,7 @@
-"""Losses and optimisers that a script brings along: any function of two images, any ``mi.ad`` optimiser."""
+"""Optimizers by name, and the adapter for the optimizers of ``mi.ad``."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import drjit as dr
@@ -10,42 +9,13 @@ import mitsuba as mi
 import numpy as np
 
 from mivol.errors import MivolError
-from mivol.optim.losses import Loss, check_shapes
-from mivol.optim.optimiser import Optimiser, Run
+from mivol.optim.first_order import Adam, RMSprop
+from mivol.optim.optimizer import Optimiser, Run
 from mivol.optim.problem import Differentiable
+from mivol.optim.second_order import GaussNewton, Lbfgs
+from mivol.optim.strategy import table
 
-__all__ = ["GivenLoss", "GivenOptimiser", "as_loss", "as_optimiser"]
-
-
-class GivenLoss(Loss, tag="given", kw_only=True):
-    """A function (image, reference) -> number, of one view at a time: it may look at neighbours, which views side by side would
-    give it wrong ones of.
-
-    Both are tensors (height, width, channels); the number is differentiable through Dr.Jit in ``image``.
-    """
-
-    function: Callable[[mi.TensorXf, mi.TensorXf], Any]
-
-    def __call__(self, image: mi.TensorXf, reference: mi.TensorXf) -> mi.Float:
-        """The function's number.
-
-        Raises:
-            MivolError: image and reference differ in shape, or it gives something else, or nothing that depends on the image.
-        """
-        check_shapes(image, reference)
-        value = self.function(image, reference)
-        name = getattr(self.function, "__name__", type(self.function).__name__)
-        if not dr.is_array_v(value) or dr.width(value) != 1 or not dr.is_float_v(value):
-            size = f" of shape {tuple(value.shape)}" if hasattr(value, "shape") else ""
-            raise MivolError(
-                f'the loss "{name}" gave a {type(value).__name__}{size}, expected one number that Dr.Jit holds: end it with '
-                "dr.mean(..., axis=None)."
-            )
-        if dr.grad_enabled(image) and not dr.grad_enabled(value):
-            raise MivolError(
-                f'no derivative leads from the loss "{name}" to the image: compute it by Dr.Jit, without detach or NumPy.'
-            )
-        return value.array if dr.is_tensor_v(value) else value
+OPTIMISERS = table(Adam, RMSprop, Lbfgs, GaussNewton)
 
 
 class GivenOptimiser(Optimiser, tag="given", kw_only=True):
@@ -93,19 +63,6 @@ class GivenRun(Run):
         super().replace(name, reals)
         self.optimiser[name] = reals
         self.optimiser.reset(name)
-
-
-def as_loss(given: Loss | Callable[[mi.TensorXf, mi.TensorXf], Any]) -> Loss:
-    """One of LOSSES as it is, any other function of two images as a loss.
-
-    Raises:
-        MivolError: it cannot be called.
-    """
-    if isinstance(given, Loss):
-        return given
-    if not callable(given):
-        raise MivolError(f"a loss is one of mivol's or a function of image and reference, found {type(given).__name__}.")
-    return GivenLoss(function=given)
 
 
 def as_optimiser(given: Optimiser | mi.ad.Optimizer) -> Optimiser:

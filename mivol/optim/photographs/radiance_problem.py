@@ -1,13 +1,13 @@
 """A radiance field and photographs of it as a problem: a sparse grid of density and spherical harmonics, coarse first.
 
 Conventions. A step looks at tiles of a few views; its loss is the squared error of a ray, mean over rgb and rays, where the
-photographs hold radiance weighted by the slope of a tone curve (:mod:`mivol.optim.colour_scale`). Densities are
+photographs hold radiance weighted by the slope of a tone curve (:mod:`mivol.optim.photographs.colour_scale`). Densities are
 signed and pass a ReLU after interpolation, so a cell whose corners are all negative is vacuum and costs nothing. A stage begins
 with the nodes of cells about those to which the last one's field gave some ray a weight.
 
 The reals are ``density`` (rows,), ``harmonics`` (rows, width) and, where the plan asks for one, ``sky`` (texels, 4); radiance
-is there in the scale of :mod:`mivol.optim.colour_scale`. What a step does is a function of them, of the listed cells, the seed
-and the step's number.
+is there in the scale of :mod:`mivol.optim.photographs.colour_scale`. What a step does is a function of them, of the listed
+cells, the seed and the step's number.
 
 References: Fridovich-Keil, Yu et al. 2022 (Plenoxels: model, optimiser, total variation, pruning by weight); Karnewar et al.
 2022 (ReLU after interpolation).
@@ -29,13 +29,14 @@ from mivol.fields.activation import activation_of
 from mivol.fields.resampling import resample_field
 from mivol.fields.sky import TEXEL, Sky
 from mivol.fields.spherical import SphericalGrid, basis_size, is_covered, row_width
-from mivol.optim.colour_scale import SCALES
-from mivol.optim.decoupled_priors import Neighbours, Rows
-from mivol.optim.exposure import AGREE, RATE, Exposure
+from mivol.optim.loop import Fit, begin_fit
+from mivol.optim.photographs.colour_scale import SCALES
+from mivol.optim.photographs.depth_supervision import Sightings, by_transmittance, draw_sightings
+from mivol.optim.photographs.exposure import AGREE, RATE, Exposure
+from mivol.optim.photographs.radiance_plan import FitPlan, place_grid
+from mivol.optim.photographs.ray_batches import RayBatch, RayBatches
+from mivol.optim.priors import Neighbours, Rows
 from mivol.optim.problem import Reals, Refinement
-from mivol.optim.radiance_plan import FitPlan, place_grid
-from mivol.optim.ray_batches import RayBatch, RayBatches
-from mivol.optim.sightings import Sightings, by_transmittance, draw_sightings
 from mivol.transport.line_integrals.radiance_field import (
     Model,
     RayGradient,
@@ -396,3 +397,30 @@ def _nodes_of(field: SphericalGrid, cells: Cells, chosen: mi.Bool) -> np.ndarray
         listed = field.listed()
         mask[listed] = np.array(keep)[: len(listed)] > 0
     return mask.reshape(field.levels, *field.res)
+
+
+def begin_radiance_fit(batches: RayBatches, box: np.ndarray, plan: FitPlan, seed: int = 0) -> Fit:
+    """A fit before its first step, for those who take the steps themselves.
+
+    Args:
+        batches: what is looked at.
+        box: (2, 3) [length], where the field may be.
+        plan: how the fit goes.
+        seed: of the rays.
+
+    Raises:
+        MivolError: as :class:`mivol.optim.photographs.radiance_problem.RadianceProblem`.
+
+    Example:
+        >>> fit = begin_radiance_fit(RayBatches.of(photos.views, (1, 2, 4)), photos.box, PRESETS["cpu"])
+        >>> while not fit.is_done:
+        ...     fit.advance()
+        >>> field = newest_field(fit)
+    """
+    return begin_fit(RadianceProblem(batches, box, plan, seed), plan.optimiser, plan.course())
+
+
+def newest_field(fit: Fit) -> SphericalGrid:
+    """The field of a fit after its newest step; the problem holds it as that step found it."""
+    fit.problem.set(fit.run.reals)
+    return fit.problem.field

@@ -1,8 +1,8 @@
-"""Many views, few renders: views of one size side by side in one image.
+"""Views of a scene, rendered several at a time, with independent seeds.
 
-Conventions. A :class:`View` is a sensor with what it saw, (height, width, channels); a :class:`RenderBatch` is one render, of a
-view or of several side by side (Mitsuba's ``batch`` sensor). Tracing and starting a kernel costs as much for one small
-view as for twenty; only views whose pixels do not reach over their border (box filter) are put side by side.
+Conventions. A :class:`View` is a sensor with its reference image (height, width, channels). A :class:`RenderBatch` renders
+one view or several views side by side (Mitsuba's ``batch`` sensor). Tracing and launching a kernel costs as much for one
+small view as for twenty. Only views with a box filter are put side by side, since their samples count for one pixel each.
 """
 
 from __future__ import annotations
@@ -16,6 +16,14 @@ import numpy as np
 
 from mivol.errors import MivolError
 from mivol.shown import briefly
+
+PRIMAL, ADJOINT, HELD_OUT, FINAL = range(4)
+"""Purposes: an image of a fit, its derivative, an evaluation, an image that is kept."""
+
+
+def seed_of(*key: int) -> int:
+    """A 32-bit seed from integers: SeedSequence mixes them, so that neighbours share nothing."""
+    return int(np.random.SeedSequence(key).generate_state(1)[0])
 
 
 @briefly

@@ -17,11 +17,11 @@ import numpy as np
 from mivol.errors import MivolError
 from mivol.fields.spherical import basis_size, row_width
 from mivol.machine import available_memory
-from mivol.optim.course import Course
-from mivol.optim.decoupled_priors import DecoupledPrior, Smoothness, Sparsity, ViewDependence
 from mivol.optim.events import CoarseToFine, DropUnseen, Event, UpdateOccupancy
-from mivol.optim.ray_batches import TILE, RayBatches
-from mivol.optim.rmsprop import RMSprop
+from mivol.optim.first_order import RMSprop
+from mivol.optim.loop import Course
+from mivol.optim.photographs.ray_batches import TILE, RayBatches
+from mivol.optim.priors import DecoupledPrior, Smoothness, Sparsity, ViewDependence
 
 FEW = 50
 """Photographs below which colours that go with the direction are more than they tell (SH 1 against 2: 23.9 and 23.2 dB)."""
@@ -75,8 +75,8 @@ class FitPlan:
             photographs say about directions is soon more than there is (a room in 52 photographs: 39.2 dB, without 38.2).
         few_matte: the same where there are fewer than ``FEW`` photographs; None: ``matte`` too. Few gain
             nothing by it (20 photographs of the fox, and of a room: 23.4 and 28.3 dB with 12, 23.4 and 31.7 with 0).
-        depth: weight of what the points of a reconstruction say of distances (:mod:`mivol.optim.sightings`) beside the mean
-            squared error, where there are any.
+        depth: weight of the distances to the points of a reconstruction (:mod:`mivol.optim.photographs.depth_supervision`),
+            beside the mean squared error.
         beta: of log T + log(1 - T), which asks rays to end in matter or to pass; mean over the rays.
         stop: a ray ends at this transmittance; what is left out is at most that share of the brightest colour.
         keep_weight: a node is kept where some ray gives a cell of it this weight.
@@ -87,7 +87,7 @@ class FitPlan:
         sky: rows of a map of what is behind the field, learned with it (:mod:`mivol.fields.sky`); 0: the photographs' colour.
         sky_rate: first learning rate of the sky [radiance]; it must lead, or the field fills the box with what is behind.
         sky_smooth: share of the way that a texel goes to its neighbours in a step, so that none stays as it began.
-        exposure: a gain for each channel of each photograph (:mod:`mivol.optim.exposure`), where they disagree.
+        exposure: a gain for each channel of each photograph (:mod:`mivol.optim.photographs.exposure`), where they disagree.
         levels: nested boxes, each of twice the extent (:mod:`mivol.fields.spherical`).
         fewer_levels: only as many of them as the points of a reconstruction need, where these are known.
         near: derivatives of what is nearer to a camera than so many medians of the cameras' distances from the box's middle go
@@ -347,6 +347,7 @@ def memory_of(plan: FitPlan, box: np.ndarray, batches: RayBatches, limit: int | 
     Raises:
         MivolError: more than there is; the largest resolution that fits is said.
     """
+
     def needed(some: FitPlan) -> int:
         return batches.bytes + max(bytes_of(some, stage, box) for stage in some.stages)
 

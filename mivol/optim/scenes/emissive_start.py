@@ -32,12 +32,12 @@ from mivol.errors import MivolError
 from mivol.fields.spherical import SphericalGrid
 from mivol.files.image_files import encode_srgb
 from mivol.optim.loop import begin_fit
-from mivol.optim.optimiser import Optimiser
-from mivol.optim.radiance_fit import begin_radiance_fit, newest_field
-from mivol.optim.radiance_plan import FitPlan, Stage
-from mivol.optim.ray_batches import RayBatches
-from mivol.optim.render_batches import View
-from mivol.optim.scene_problem import SceneProblem
+from mivol.optim.optimizer import Optimiser
+from mivol.optim.photographs.radiance_plan import FitPlan, Stage
+from mivol.optim.photographs.radiance_problem import begin_radiance_fit, newest_field
+from mivol.optim.photographs.ray_batches import RayBatches
+from mivol.optim.scenes.scene_problem import SceneProblem
+from mivol.optim.scenes.views import View
 from mivol.photos import Photo
 from mivol.scene.photographs import camera_of
 

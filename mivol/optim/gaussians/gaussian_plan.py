@@ -19,9 +19,9 @@ import numpy as np
 
 from mivol.errors import MivolError
 from mivol.machine import available_memory
-from mivol.optim.adam import Adam
-from mivol.optim.course import Course
 from mivol.optim.events import CoarseToFine, ControlDensity, Event
+from mivol.optim.first_order import Adam
+from mivol.optim.loop import Course
 from mivol.photos import Camera
 
 __all__ = ["CONTROLS", "PRESETS", "GaussianPlan", "SplatStage", "bytes_of", "extent_of", "memory_of"]
@@ -68,7 +68,7 @@ class GaussianPlan:
         mip: whether what is smaller than a pixel keeps its light (Yu et al. 2024), instead of its opacity: such a set may be
         seen at
             other sizes than it was fitted at, by renderers that do the same.
-        exposure: a gain for each channel of each photograph (:mod:`mivol.optim.exposure`).
+        exposure: a gain for each channel of each photograph (:mod:`mivol.optim.photographs.exposure`).
         random_background: photographs with alpha are seen over another colour each step.
         place, place_end: first and last rate of places [extent], with a geometric course between them.
         scale, turn, opacity, colour: rates of log-scales, quaternions, opacity logits and constant coefficients.

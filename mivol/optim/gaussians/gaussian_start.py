@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 from scipy.special import logit
 
 from mivol.errors import MivolError
-from mivol.optim.density_control import Arrays
+from mivol.optim.gaussians.density_control import Arrays
 from mivol.photos import Photo, Photos, project
 from mivol.photos.region import FEWEST_POINTS, count_views
 

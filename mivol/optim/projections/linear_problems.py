@@ -1,13 +1,20 @@
-"""Problems of line integrals: least squares, and the likelihood of counts, each with a penalty where one is wanted.
+"""Problems of line integrals and the state of their solvers: least squares, and the likelihood of counts.
 
 Conventions. The operator A maps voxels (n,) to rays (m,), both flat; ``A.shape`` is (m, n). ``b`` are line integrals
-(dimensionless), ``weights`` their inverse variances (0: the ray is not used), x the field (1/length). Vectors keep the
-operator's dtype, sums are float64 and are formed in a fixed order, so a run is bitwise repeatable where the operator is.
+(dimensionless), ``weights`` their inverse variances (0 excludes a ray), x the field (1/length). Vectors keep the operator's
+dtype. Sums are float64 in a fixed order, so a run is bitwise repeatable if the operator is.
+
+A solver is a generator. It yields one :class:`State` per iteration, without end or until nothing improves, so the caller
+controls progress, checkpoints and stopping. Arrays of a state are never overwritten, and ``run(problem, state=saved)``
+continues an interrupted run.
+
+References: Morozov 1966 (discrepancy principle).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 import numpy as np
@@ -133,3 +140,72 @@ def inverse(v: np.ndarray) -> np.ndarray:
     """1 / v, and 0 where v is below 1e-6 of the largest: such rays and voxels are only grazed, and are left alone."""
     floor = 1e-6 * float(np.max(v, initial=0.0))
     return np.where(v > floor, 1.0 / np.where(v > floor, v, 1.0), 0.0).astype(v.dtype)
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """Where a solver stands after an iteration.
+
+    Args:
+        x: (n,) the field.
+        iteration: iterations done.
+        objective: value of what the solver minimises, at ``x``; for SIRT and OS-SART half the squared residual.
+        residual_norm: ``|W^(1/2) (b - A x)|``; for OS-SART of the residuals as each subset met them, before its update.
+        memory: what else the solver must know to go on.
+    """
+
+    x: np.ndarray
+    iteration: int
+    objective: float
+    residual_norm: float
+    memory: dict[str, np.ndarray] = field(default_factory=dict)
+
+    def to_arrays(self) -> dict[str, np.ndarray]:
+        """All of the state by name, for ``np.savez``."""
+        scalars = {"iteration": self.iteration, "objective": self.objective, "residual_norm": self.residual_norm}
+        arrays = {"x": self.x, **{name: np.asarray(value) for name, value in scalars.items()}}
+        return arrays | {f"memory.{name}": value for name, value in self.memory.items()}
+
+    @classmethod
+    def from_arrays(cls, arrays: dict[str, np.ndarray]) -> State:
+        """The state that :meth:`to_arrays` gave."""
+        memory = {name.removeprefix("memory."): arrays[name] for name in arrays if name.startswith("memory.")}
+        scalars = int(arrays["iteration"]), float(arrays["objective"]), float(arrays["residual_norm"])
+        return cls(arrays["x"], *scalars, memory)
+
+
+def takes_all(problem: object, **options: object) -> None:
+    """The check of a method that has nothing to refuse."""
+
+
+@dataclass(frozen=True)
+class Solver:
+    """A method: ``run(problem, state=None, **options)`` yields states.
+
+    ``check(problem, **options)`` raises what ``run`` would raise in its first iteration, and computes nothing.
+    """
+
+    run: Callable[..., Iterator[State]]
+    problem: type
+    needs: str
+    promises: str
+    citation: str
+    check: Callable[..., None] = takes_all
+
+
+UNWEIGHTED = ("sirt", "sart", "os-sart")
+"""Solvers whose residual has no weights."""
+
+
+def noise_norm(problem: LeastSquares | PoissonCounts, solver: str) -> float:
+    """The norm that a solver's ``residual_norm`` has where the volume is the true one.
+
+    The square of a weighted residual ``r sqrt(w)``, and of Pearson's, has a mean of 1 at each ray that is used; without
+    weights the variances are left, ``sum 1 / w``.
+    """
+    if isinstance(problem, PoissonCounts):
+        return float(np.sqrt(np.size(problem.counts) if problem.used is None else np.sum(problem.used)))
+    if problem.weights is None:
+        return float(np.sqrt(np.size(problem.b)))
+    used = problem.weights[problem.weights > 0].astype(np.float64)
+    return float(np.sqrt(np.sum(1.0 / used) if solver in UNWEIGHTED else used.size))

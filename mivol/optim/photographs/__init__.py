@@ -1,0 +1,1 @@
+"""Fits of radiance fields to photographs."""

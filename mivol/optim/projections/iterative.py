@@ -1,0 +1,300 @@
+"""Iterative solvers of line integrals: conjugate gradients, algebraic reconstruction, maximum likelihood of counts.
+
+References: Hestenes & Stiefel 1952 and Paige & Saunders 1982 (CGLS); Polak & Ribiere 1969; Bertsekas 1982 (projected descent
+with a diagonal metric); Andersen & Kak 1984 (SART); Gregor & Benson 2008 (SIRT); Wang & Jiang 2004 (ordered subsets); Nuyts et
+al. 1998, Phys. Med. Biol. 43, 729 (ML-TR); Erdogan & Fessler 1999, Phys. Med. Biol. 44, 2835 (separable surrogates, optimum
+curvature).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from mivol.errors import MivolError
+from mivol.optim.projections.linear_problems import (
+    LeastSquares,
+    Penalty,
+    PoissonCounts,
+    State,
+    dot,
+    first_field,
+    flat,
+    inverse,
+    times,
+    weights_of,
+)
+
+
+def ordered_subsets_sart(
+    problem: LeastSquares, state: State | None = None, n_subsets: int = 10, relaxation: float = 1.0, decay: float = 0.99
+) -> Iterator[State]:
+    """Simultaneous algebraic reconstruction over subsets of views, one sweep of all subsets per iteration.
+
+    ``x <- P(x + lambda C_s A_s^T R_s (b_s - A_s x))`` with ``R_s = 1 / (A_s 1)``, ``C_s = 1 / (A_s^T 1)``, lambda
+    falling by ``decay`` after each sweep, and P the projection on x >= 0 where asked for. Subset s holds every
+    ``n_subsets``-th view, and the subsets come in golden-section order, so that successive ones look from far apart.
+    One subset is SIRT.
+
+    Args:
+        n_subsets: 1 to the number of views.
+        relaxation: lambda of the first sweep, in (0, 2).
+        decay: in (0, 1]; below 1 the limit cycle of inconsistent data shrinks, and the method stops short of
+            convergence.
+
+    Weights: only where they are 0 is heeded (the ray is left out). A prior is refused.
+    Cost per iteration: one A and one A^T, and once one A and one A^T more for the sums; memory: ``n_subsets`` fields.
+    """
+    check_sweeps(problem, n_subsets, relaxation, decay)
+    a = problem.A
+    blocks = _blocks(problem, n_subsets)
+    if state is None:
+        state = State(first_field(a, problem.x0), 0, np.nan, np.nan)
+    while True:
+        x, norm2 = state.x, 0.0
+        strength = np.asarray(relaxation * decay**state.iteration, x.dtype)
+        for block in blocks:
+            r = (block.b - block.a @ x) * block.used
+            norm2 += dot(r, r)
+            x = x + strength * block.per_voxel * (block.a.T @ (block.per_ray * r))
+            if problem.nonnegative:
+                x = np.maximum(x, 0)
+        state = State(x, state.iteration + 1, norm2 / 2, float(np.sqrt(norm2)))
+        yield state
+
+
+def check_sweeps(problem: LeastSquares, n_subsets: int = 1, relaxation: float = 1.0, decay: float = 1.0) -> None:
+    """Refuse what :func:`ordered_subsets_sart` cannot do; arguments as there.
+
+    Raises:
+        MivolError: a prior, steps outside their domain, or subsets that the views cannot be shared out to.
+    """
+    if problem.prior is not None:
+        raise MivolError(
+            "Found a prior with SIRT or OS-SART, expected none: use pcg or ml-tr, which minimise a penalised objective."
+        )
+    if not 0 < relaxation < 2 or not 0 < decay <= 1:
+        raise MivolError(f"Found relaxation {relaxation} and decay {decay}, expected 0 < relaxation < 2 and 0 < decay <= 1.")
+    n_views = getattr(problem.A, "n_views", None)
+    if n_subsets != 1 and (n_views is None or not 1 <= n_subsets <= n_views):
+        raise MivolError(
+            f"Found {n_subsets} subsets of {n_views or 'no'} views, expected at least 1, at most as many as views, "
+            "and an operator with n_views and subset(views)."
+        )
+
+
+def sirt(problem: LeastSquares, state: State | None = None, relaxation: float = 1.0) -> Iterator[State]:
+    """One subset, and a relaxation that stays."""
+    return ordered_subsets_sart(problem, state, 1, relaxation, 1.0)
+
+
+def sart(problem: LeastSquares, state: State | None = None, relaxation: float = 1.0, decay: float = 0.99) -> Iterator[State]:
+    """A subset for each view, as Andersen and Kak have it; one sweep over all views per iteration."""
+    return ordered_subsets_sart(problem, state, getattr(problem.A, "n_views", 1), relaxation, decay)
+
+
+@dataclass(frozen=True, eq=False)
+class _Block:
+    a: Any
+    b: np.ndarray
+    used: np.ndarray
+    per_ray: np.ndarray
+    per_voxel: np.ndarray
+
+
+def _blocks(problem: LeastSquares, n_subsets: int) -> list[_Block]:
+    a = problem.A
+    chord = a @ np.ones(a.shape[1], a.dtype)
+    views = [None] if n_subsets == 1 else [np.arange(s, a.n_views, n_subsets) for s in _golden_order(n_subsets)]
+    return [_block(problem, v, chord) for v in views]
+
+
+def _block(problem: LeastSquares, views: np.ndarray | None, chord: np.ndarray) -> _Block:
+    a = problem.A if views is None else problem.A.subset(views)
+
+    def part(data: np.ndarray) -> np.ndarray:
+        rays = flat(data, a.dtype)
+        return rays if views is None else rays.reshape(problem.A.n_views, -1)[views].reshape(-1)
+
+    used = np.ones(a.shape[0], a.dtype) if problem.weights is None else (part(problem.weights) > 0).astype(a.dtype)
+    per_ray = used * inverse(part(chord))
+    return _Block(a, part(problem.b), used, per_ray, inverse(a.T @ used))
+
+
+def _golden_order(n: int) -> np.ndarray:
+    """A permutation of 0..n-1 whose neighbours are far apart."""
+    return np.argsort(np.argsort(np.arange(n) * (np.sqrt(5) - 1) / 2 % 1.0))
+
+
+def projected_cg(problem: LeastSquares, state: State | None = None, precondition: bool = True) -> Iterator[State]:
+    """Preconditioned conjugate gradients on the (weighted, penalised) least squares.
+
+    Without bounds and prior this is linear CG (CGLS where not preconditioned). With them it is Polak-Ribiere CG on the
+    voxels that are free (x > 0, or pushed up by the gradient); a step that would leave the domain is bent back on to it
+    (projected) and followed to the minimum of the majoriser along the bent direction; where a bent direction does not
+    lead down the diagonally scaled gradient replaces it, whose projection always does. The objective therefore never
+    rises.
+
+    Preconditioner: ``diag(A^T W A 1 + separable majoriser of the prior)^-1`` (SQS). Voxels that no ray sees stay at
+        ``x0``.
+    Cost per iteration: one A and one A^T, one A more where a step is bent.
+    """
+    a = problem.A
+    weights = weights_of(problem)
+    data_diagonal = a.T @ times(weights, a @ np.ones(a.shape[1], a.dtype)) if precondition else None
+    if state is None:
+        x = first_field(a, problem.x0)
+        if problem.nonnegative:
+            x = np.maximum(x, 0)
+        r = flat(problem.b, a.dtype) - a @ x
+        state = _ls_state(problem, x, 0, r, {"residual": r})
+    while True:
+        found = _direction(problem, state, data_diagonal, weights)
+        if found is None:
+            return
+        direction, downhill, memory = found
+        g = memory["gradient"]
+        step = _descend(problem, weights, state.x, g, direction) or _descend(problem, weights, state.x, g, downhill)
+        if step is None:
+            return
+        x, r = state.x + step[0], state.memory["residual"] - step[1]
+        if problem.nonnegative:
+            x = np.maximum(x, 0)  # rounding only: the step ends in the domain
+        state = _ls_state(problem, x, state.iteration + 1, r, {"residual": r, **memory})
+        yield state
+
+
+def _direction(
+    problem: LeastSquares, state: State, data_diagonal: np.ndarray | None, weights: np.ndarray | None
+) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]] | None:
+    """The conjugate direction, the scaled downhill one, and what the next direction must know; None at the minimum."""
+    x, old, prior = state.x, state.memory, problem.prior
+    g = -(problem.A.T @ times(weights, old["residual"]))
+    if prior:
+        g = g + prior.gradient(x)
+    free = (x > 0) | (g < 0) if problem.nonnegative else None
+    z = g
+    if data_diagonal is not None:
+        z = g * inverse(data_diagonal if not prior else data_diagonal + prior.separable(x))
+    z = z if free is None else z * free
+    gz = dot(g, z)
+    if not gz > 0:
+        return None
+    direction = -z
+    if "direction" in old:
+        beta = max(0.0, (gz - dot(old["gradient"], z)) / float(old["gz"]))
+        direction = direction + np.asarray(beta, x.dtype) * (old["direction"] if free is None else old["direction"] * free)
+    return direction, -z, {"direction": direction, "gradient": g, "gz": np.asarray(gz)}
+
+
+def _descend(
+    problem: LeastSquares, weights: np.ndarray | None, x: np.ndarray, g: np.ndarray, direction: np.ndarray
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """(step, A step) to the minimum along ``direction``, bent on to the domain; None where it does not lead down."""
+
+    def minimum(d: np.ndarray) -> tuple[float, np.ndarray] | None:
+        image = problem.A @ d
+        curvature = dot(image, times(weights, image)) + (problem.prior.curvature(x, d) if problem.prior else 0.0)
+        slope = dot(g, d)
+        return (-slope / curvature, image) if slope < 0 and curvature > 0 else None
+
+    found = minimum(direction)
+    if found is None:
+        return None
+    step = np.asarray(found[0], x.dtype) * direction
+    if not problem.nonnegative or (x + step).min() >= 0:
+        return step, np.asarray(found[0], x.dtype) * found[1]
+    bent = np.maximum(x + step, 0) - x
+    found = minimum(bent)
+    if found is None:
+        return None
+    # Beyond length 1 the bent step could leave the domain again.
+    length = np.asarray(min(1.0, found[0]), x.dtype)
+    return length * bent, length * found[1]
+
+
+def cgls(problem: LeastSquares, state: State | None = None) -> Iterator[State]:
+    """The same without a preconditioner."""
+    return projected_cg(problem, state, precondition=False)
+
+
+def _ls_state(problem: LeastSquares, x: np.ndarray, iteration: int, r: np.ndarray, memory: dict) -> State:
+    norm2 = dot(r, times(weights_of(problem), r))
+    penalty = problem.prior.value(x) if problem.prior else 0.0
+    return State(x, iteration, norm2 / 2 + penalty, float(np.sqrt(norm2)), memory)
+
+
+def transmission_likelihood(problem: PoissonCounts, state: State | None = None) -> Iterator[State]:
+    """Maximum likelihood of transmission counts (ML-TR) with Erdogan and Fessler's optimum curvatures.
+
+    ``x <- max(0, x - grad / (A^T(c . A 1) + separable majoriser of the prior))`` with the gradient ``A^T(mu (y / yhat
+    - 1))``, ``mu = blank e^-l``, ``yhat = mu + background``, ``l = A x`` and per ray the smallest curvature c whose
+    parabola at l lies above the negative log-likelihood for all l >= 0. Nuyts' ML-TR is the same with c = mu, which
+    may overshoot. The objective never rises. ``objective`` is the sum of ``yhat - y log yhat`` (and the prior);
+    ``residual_norm`` is Pearson's ``|(y - yhat) / sqrt(yhat)|``.
+
+    Cost per iteration: one A and two A^T.
+    """
+    a, prior = problem.A, problem.prior
+    counts = _Counts.of(problem)
+    chord = a @ np.ones(a.shape[1], a.dtype)
+    if state is None:
+        x = np.maximum(first_field(a, problem.x0), 0)
+        state = counts.state(x, 0, a @ x)
+    while True:
+        x, line = state.x, state.memory["line"].astype(np.float64)
+        gradient = a.T @ counts.slope(line).astype(a.dtype)
+        bound = a.T @ (counts.optimum_curvature(line) * chord).astype(a.dtype)
+        if prior:
+            gradient, bound = gradient + prior.gradient(x), bound + prior.separable(x)
+        x = np.maximum(x - gradient * inverse(bound), 0)
+        state = counts.state(x, state.iteration + 1, a @ x)
+        yield state
+
+
+@dataclass(frozen=True, eq=False)
+class _Counts:
+    """Counts of rays, float64 (m,), and the negative log-likelihood h(l) of a ray's line integral l."""
+
+    y: np.ndarray
+    blank: np.ndarray
+    background: np.ndarray
+    prior: Penalty | None
+    used: np.ndarray | float = 1.0
+
+    @classmethod
+    def of(cls, problem: PoissonCounts) -> _Counts:
+        y = flat(problem.counts, np.float64)
+        rates = (np.broadcast_to(np.asarray(v, float).reshape(-1), y.shape) for v in (problem.blank, problem.background))
+        return cls(y, *rates, problem.prior, 1.0 if problem.used is None else flat(problem.used, np.float64))
+
+    def slope(self, line: np.ndarray) -> np.ndarray:
+        """h'(l)."""
+        mu = self.blank * np.exp(-line)
+        return self.used * mu * (self.y / (mu + self.background) - 1.0)
+
+    def optimum_curvature(self, line: np.ndarray) -> np.ndarray:
+        """Erdogan & Fessler 1999, Eq. 28: ``2 (h(0) - h(l) + l h'(l)) / l^2``, at least 0, and ``h''(0)`` at l = 0."""
+        y, blank, background = self.y, self.blank, self.background
+        mu = blank * np.exp(-line)
+        h0 = blank + background - y * np.log(blank + background)
+        h = mu + background - y * np.log(mu + background)
+        at_zero = blank * (1.0 - y * background / (blank + background) ** 2)
+        # The bracket is of order l^2 h'' and its terms of order h: below l = 1e-3 less than 9 digits of float64 are left,
+        # and h''(0), the limit, is off by l h'''/3 only.
+        small = line < 1e-3
+        l2 = np.where(small, 1.0, line * line)
+        # At a ray that is not used the slope is 0 and the rest means nothing.
+        return self.used * np.maximum(np.where(small, at_zero, 2.0 * (h0 - h + line * self.slope(line)) / l2), 0.0)
+
+    def state(self, x: np.ndarray, iteration: int, line: np.ndarray) -> State:
+        """Where the solver stands with a field whose line integrals are ``line``."""
+        expected = self.blank * np.exp(-line.astype(np.float64)) + self.background
+        # y log(yhat) -> 0 for y = 0 even where yhat underflows.
+        log_expected = np.log(np.maximum(expected, np.finfo(float).tiny))
+        objective = float(np.sum(self.used * (expected - self.y * log_expected))) + (self.prior.value(x) if self.prior else 0.0)
+        pearson = float(np.sqrt(np.sum(self.used * (self.y - expected) ** 2 / np.maximum(expected, np.finfo(float).tiny))))
+        return State(x, iteration, objective, pearson, {"line": line})

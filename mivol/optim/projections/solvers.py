@@ -1,0 +1,155 @@
+"""Solvers of line integrals by name: iterative solvers, and filtered back-projection in the same form.
+
+Conventions. Iterative solvers take any operator with ``@`` and ``.T``. Filtered back-projection needs the geometry of the scan.
+It bridges pixels of weight 0, ignores all other weights, and clips nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+
+import numpy as np
+
+from mivol.errors import MivolError
+from mivol.optim.projections.iterative import (
+    cgls,
+    check_sweeps,
+    ordered_subsets_sart,
+    projected_cg,
+    sart,
+    sirt,
+    transmission_likelihood,
+)
+from mivol.optim.projections.linear_problems import LeastSquares, PoissonCounts, Solver, State, dot, flat, times, weights_of
+from mivol.tomography.filtered import check_circle, check_parallel, feldkamp, filtered_backprojection
+from mivol.tomography.preprocess import bridge_gaps
+from mivol.tomography.projector import Projector
+
+Method = Callable[[Projector, np.ndarray, str, float], np.ndarray]
+
+
+def fbp(problem: LeastSquares, state: State | None = None, window: str = "ram-lak", cutoff: float = 1.0) -> Iterator[State]:
+    """:func:`~mivol.tomography.filtered.filtered_backprojection` of a parallel beam: one state, and no more."""
+    return _once(filtered_backprojection, problem, state, window, cutoff)
+
+
+def fdk(problem: LeastSquares, state: State | None = None, window: str = "ram-lak", cutoff: float = 1.0) -> Iterator[State]:
+    """:func:`~mivol.tomography.filtered.feldkamp` of a circular cone beam: one state, and no more."""
+    return _once(feldkamp, problem, state, window, cutoff)
+
+
+def check_fbp(problem: LeastSquares, **options: object) -> None:
+    """Refuse what :func:`fbp` cannot do.
+
+    Raises:
+        MivolError: a prior, another beam, or directions that are missing.
+    """
+    check_prior(problem)
+    check_parallel(problem.A)
+
+
+def check_fdk(problem: LeastSquares, **options: object) -> None:
+    """Refuse what :func:`fdk` cannot do.
+
+    Raises:
+        MivolError: a prior, another trajectory than a circle, or directions that are missing.
+    """
+    check_prior(problem)
+    check_circle(problem.A)
+
+
+def check_prior(problem: LeastSquares) -> None:
+    """Refuse a prior, which a method of one step has no use for.
+
+    Raises:
+        MivolError: there is one.
+    """
+    if problem.prior is not None:
+        raise MivolError("found a prior with filtered back-projection, expected none: use pcg, or a window and a cutoff.")
+
+
+def _once(method: Method, problem: LeastSquares, state: State | None, window: str, cutoff: float) -> Iterator[State]:
+    a = problem.A
+    check_prior(problem)
+    if state is not None:
+        return
+    y = np.asarray(problem.b, float).reshape(a.projection_shape)
+    if problem.weights is not None:
+        y = bridge_gaps(y, np.reshape(problem.weights, a.projection_shape))
+    x = method(a, y, window, cutoff).reshape(-1)
+    r = flat(problem.b, a.dtype) - a @ x
+    norm2 = dot(r, times(weights_of(problem), r))
+    yield State(x, 1, norm2 / 2, float(np.sqrt(norm2)))
+
+
+#: Iterative methods by name. ``run(problem, state=None, **options)``.
+SOLVERS: dict[str, Solver] = {
+    "pcg": Solver(
+        projected_cg,
+        LeastSquares,
+        needs="A and its exact transpose; weights, x >= 0 and a prior if wanted",
+        promises="the objective never rises; without bounds and prior, the least error in the energy norm at each step",
+        citation="Hestenes & Stiefel 1952; Polak & Ribiere 1969; Bertsekas 1982; preconditioner Erdogan & Fessler 1999",
+    ),
+    "cgls": Solver(
+        cgls,
+        LeastSquares,
+        needs="A and its exact transpose",
+        promises="the least residual over the Krylov space of each iteration; stopping early regularises",
+        citation="Hestenes & Stiefel 1952; Paige & Saunders 1982",
+    ),
+    "sirt": Solver(
+        sirt,
+        LeastSquares,
+        needs="A with entries >= 0 and its transpose",
+        promises="converges to a least-squares solution weighted by 1 / (ray length)",
+        citation="Gregor & Benson 2008",
+        check=check_sweeps,
+    ),
+    "sart": Solver(
+        sart,
+        LeastSquares,
+        needs="A with entries >= 0, its transpose, n_views and subset(views)",
+        promises="the fastest first sweeps; a limit cycle on inconsistent data, which relaxation and decay shrink",
+        citation="Andersen & Kak 1984",
+        check=check_sweeps,
+    ),
+    "os-sart": Solver(
+        ordered_subsets_sart,
+        LeastSquares,
+        needs="A with entries >= 0, its transpose, n_views and subset(views)",
+        promises="n_subsets times SIRT's progress at first; a limit cycle on inconsistent data, which decay shrinks",
+        citation="Andersen & Kak 1984; Wang & Jiang 2004",
+        check=check_sweeps,
+    ),
+    "ml-tr": Solver(
+        transmission_likelihood,
+        PoissonCounts,
+        needs="A with entries >= 0 and its transpose; counts, blank and background in quanta",
+        promises="the negative log-likelihood never rises; x >= 0; no logarithm of a count is taken",
+        citation="Nuyts et al. 1998; Erdogan & Fessler 1999",
+    ),
+}
+
+#: Methods of one step. ``run(problem, state=None, window=..., cutoff=...)``; the problem's operator is a projector.
+DIRECT: dict[str, Solver] = {
+    "fbp": Solver(
+        fbp,
+        LeastSquares,
+        needs="a parallel beam over half a turn or more",
+        promises="exact for many views without noise; linear, so that values below 0 stay",
+        citation="Kak & Slaney 1988, section 3.3",
+        check=check_fbp,
+    ),
+    "fdk": Solver(
+        fdk,
+        LeastSquares,
+        needs="a cone beam on a circle, over half a turn and the fan or more",
+        promises="exact in the source's plane for many views without noise; linear, so that values below 0 stay",
+        citation="Feldkamp, Davis & Kress 1984; Parker 1982; Wang 2002",
+        check=check_fdk,
+    ),
+}
+
+METHODS: dict[str, Solver] = SOLVERS | DIRECT
+"""What a file may ask for."""

@@ -1,0 +1,1 @@
+"""Fits of scenes to images rendered by Mitsuba's integrators."""

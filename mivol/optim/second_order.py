@@ -1,0 +1,296 @@
+r"""Optimizers that use curvature: L-BFGS and Gauss-Newton, each with bounds and a projected line search.
+
+Conventions. All reals form one float64 vector, each parameter in units of its learning rate (:class:`Packing`). Every iteration
+renders with the same random numbers.
+
+A filtered pixel averages transmittance, not optical depth. Absorption is therefore linear only along a single ray, since -log
+of a pixel mean is not the mean of -log. Gauss-Newton linearises the pixel mean:
+
+.. math:: (J^T W J + R'' + \mu D)\, p = -(J^T W r + R'), \qquad u \leftarrow P(u + \alpha p),
+
+J v and J^T w come from forward and reverse mode of the integrator, and D = diag(J^T W J 1).
+
+References: Nocedal and Wright 2006; Bertsekas 1982; Erdogan and Fessler 1999; Hestenes and Stiefel 1952.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Annotated
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mivol.optim.optimizer import Optimiser, Run
+from mivol.optim.parameters import Parameter
+from mivol.optim.problem import Reals
+from mivol.optim.scenes.scene_problem import SceneProblem
+from mivol.optim.scenes.views import ADJOINT, PRIMAL
+from mivol.optim.strategy import of
+
+
+class Packing:
+    """All reals as one float64 vector, each parameter in units of its learning rate, and back."""
+
+    def __init__(self, problem: SceneProblem, reals: Reals) -> None:
+        self.parts = [(p.name, p.lr, tuple(reals[p.name].shape)) for p in problem.parameters]
+        self.low = self._repeat([p.bounds()[0] / p.lr for p in problem.parameters])
+        self.high = self._repeat([p.bounds()[1] / p.lr for p in problem.parameters])
+
+    def _repeat(self, ends: list[float]) -> np.ndarray:
+        return np.concatenate([np.full(int(np.prod(s)), e) for e, (_, _, s) in zip(ends, self.parts, strict=True)])
+
+    def vector(self, tensors: Reals, power: int = -1) -> np.ndarray:
+        """Tensors -> vector; ``power`` -1 for points, +1 for gradients."""
+        flat = [np.asarray(tensors[name]).ravel().astype(np.float64) * lr**power for name, lr, _ in self.parts]
+        return np.concatenate(flat)
+
+    def tensors(self, vector: np.ndarray, power: int = 1) -> Reals:
+        """Vector -> tensors; ``power`` +1 for points, -1 for gradients."""
+        parts, start = {}, 0
+        for name, lr, shape in self.parts:
+            size = int(np.prod(shape))
+            part = vector[start : start + size] * lr**power
+            parts[name] = mi.TensorXf(part.astype(np.float32).reshape(shape))
+            start += size
+        return parts
+
+    def project(self, x: np.ndarray) -> np.ndarray:
+        """The nearest point inside the bounds."""
+        return np.clip(x, self.low, self.high)
+
+    def free(self, x: np.ndarray, g: np.ndarray) -> np.ndarray:
+        """False where a bound is met and the gradient presses against it (Bertsekas 1982, Eq. 32)."""
+        return ~(((x <= self.low) & (g > 0.0)) | ((x >= self.high) & (g < 0.0)))
+
+
+def search(
+    value: Callable[[np.ndarray], float], packing: Packing, x: np.ndarray, f: float, g: np.ndarray, p: np.ndarray
+) -> tuple[np.ndarray, float]:
+    """Armijo's rule along the projected path P(x + alpha p), alpha = 1, 1/2, 1/4, ... 2^-9.
+
+    Returns:
+        The first point with f(new) <= f + 1e-4 g.(new - x), and alpha; (x, 0) where none has it.
+
+    References: Bertsekas 1982, SIAM J. Control Optim. 20(2), Eq. 37.
+    """
+    for halving in range(10):
+        alpha = 0.5**halving
+        new = packing.project(x + alpha * p)
+        if value(new) <= f + 1e-4 * float(g @ (new - x)):
+            return new, alpha
+    return x, 0.0
+
+
+class Lbfgs(Optimiser, tag="lbfgs"):
+    """Limited-memory BFGS on the free variables, with a projected line search and the same samples in every iteration.
+
+    SciPy's L-BFGS-B keeps its memory between iterations where no checkpoint can reach it; hence these forty lines.
+    Source: Nocedal and Wright 2006, Algorithm 7.4 (two loops); bounds: Bertsekas 1982.
+    """
+
+    cites = ("liu_1989",)
+
+    memory: Annotated[int, of("pair", "steps remembered", ge=1, le=100)] = 10
+
+    def begin(self, problem: SceneProblem) -> Run:
+        return LbfgsRun(self, problem)
+
+
+class LbfgsRun(Run):
+    """State: the reals, and the pairs (step, change of gradient)."""
+
+    def __init__(self, settings: Lbfgs, problem: SceneProblem) -> None:
+        super().__init__(problem)
+        self.settings = settings
+        self.steps: list[np.ndarray] = []
+        self.changes: list[np.ndarray] = []
+        self.last: tuple[np.ndarray, np.ndarray] | None = None
+
+    def step(self, iteration: int, factor: float) -> float:
+        packing = Packing(self.problem, self.reals)
+        loss, gradients = self.problem.loss_and_gradient(self.reals, 0)
+        x, g = packing.vector(self.reals), packing.vector(gradients, 1)
+        steps, changes = self._remember(x, g)
+        free = packing.free(x, g)
+        p = -two_loops(g * free, [s * free for s in steps], [y * free for y in changes]) * factor
+        if not g @ p < 0.0:
+            p = -g * free / max(np.abs(g * free).max(), 1e-300)
+        new, alpha = search(lambda z: self.problem.loss_value(packing.tensors(z), 0), packing, x, loss, g, p)
+        if alpha == 0.0 or not p.any():
+            # The remembered curvature misled the search: forget it once, and give up where it is not to blame.
+            self.finished = "" if steps else "no step lowers the loss"
+            steps, changes, x, g = [], [], None, None
+        self.steps, self.changes, self.last = steps, changes, None if x is None else (x, g)
+        self.reals = packing.tensors(new)
+        return loss
+
+    def _remember(self, x: np.ndarray, g: np.ndarray) -> tuple[list[np.ndarray], list[np.ndarray]]:
+        """The pairs with the newest one, if its curvature is positive beyond rounding."""
+        if self.last is None:
+            return self.steps, self.changes
+        s, y = x - self.last[0], g - self.last[1]
+        if not s @ y > 1e-10 * np.linalg.norm(s) * np.linalg.norm(y):
+            return self.steps, self.changes
+        keep = self.settings.memory
+        return [*self.steps, s][-keep:], [*self.changes, y][-keep:]
+
+    def pack(self) -> dict[str, np.ndarray]:
+        arrays = super().pack() | {"pairs": np.array([self.steps, self.changes])}
+        return arrays if self.last is None else arrays | {"last": np.array(self.last)}
+
+    def unpack(self, arrays: dict[str, np.ndarray]) -> None:
+        super().unpack(arrays)
+        self.steps, self.changes = (list(half) for half in arrays["pairs"])
+        self.last = tuple(arrays["last"]) if "last" in arrays else None
+
+    def replace(self, name: str, reals: mi.TensorXf) -> None:
+        super().replace(name, reals)
+        self.steps, self.changes, self.last = [], [], None
+
+
+def two_loops(g: np.ndarray, steps: list[np.ndarray], changes: list[np.ndarray]) -> np.ndarray:
+    """H g for the limited-memory inverse Hessian H; without pairs, g scaled so that its largest entry is 1."""
+    pairs = [(s, y, 1.0 / (s @ y)) for s, y in zip(steps, changes, strict=True) if s @ y > 0.0]
+    if not pairs:
+        return g / max(np.abs(g).max(), 1e-300)
+    q, weights = g.copy(), []
+    for s, y, rho in reversed(pairs):
+        weights.append(rho * (s @ q))
+        q -= weights[-1] * y
+    s, y, _ = pairs[-1]
+    q *= (s @ y) / (y @ y)
+    for (s, y, rho), weight in zip(pairs, reversed(weights), strict=True):
+        q += s * (weight - rho * (y @ q))
+    return q
+
+
+class GaussNewton(Optimiser, tag="gauss_newton"):
+    """Gauss-Newton on pixel means, conjugate gradients inside, Levenberg-Marquardt damping, projection onto the bounds.
+
+    Source: Nocedal and Wright 2006, sections 10.3 and 7.1; D is the separable surrogate of Erdogan and Fessler 1999,
+    Eq. 21, exact for media that only absorb, whose J has one sign.
+    """
+
+    cites = ("hestenes_1952", "erdogan_1999")
+
+    inner: Annotated[int, of("iteration", "conjugate-gradient steps per linearisation", ge=1)] = 6
+    damping: Annotated[float, of("1", "first mu, relative to D", ge=0)] = 1e-3
+
+    def begin(self, problem: SceneProblem) -> Run:
+        return GaussNewtonRun(self, problem)
+
+
+class GaussNewtonRun(Run):
+    """State: the reals and the damping. Image, J and J^T use the same samples in every iteration: one set of them, and
+    another for the gradient where light is sampled."""
+
+    def __init__(self, settings: GaussNewton, problem: SceneProblem) -> None:
+        super().__init__(problem)
+        self.settings = settings
+        self.damping = settings.damping
+        self.weights = [problem.loss.weight(batch.reference) for batch in problem.batches]
+
+    def step(self, iteration: int, factor: float) -> float:
+        packing = Packing(self.problem, self.reals)
+        linear = Linearised(self.problem, self.reals, self.weights, packing)
+        x, g = packing.vector(self.reals), linear.gradient
+        free = packing.free(x, g)
+        diagonal = np.abs(linear.curvature(np.ones_like(x)))
+        # A voxel that no ray meets has no curvature and no gradient: the floor keeps it where it is, not at 0 / 0.
+        diagonal = np.maximum(diagonal, 1e-6 * diagonal.max() + 1e-300)
+        p = conjugate_gradients(
+            lambda v: free * (linear.curvature(free * v) + self.damping * diagonal * v),
+            -g * free, diagonal, self.settings.inner,
+        )  # fmt: skip
+        new, alpha = search(lambda z: self.problem.loss_value(packing.tensors(z), 0), packing, x, linear.loss, g, factor * p)
+        self.damping = self.damping / 3.0 if alpha == 1.0 else max(4.0 * self.damping, 1e-6)
+        self.finished = "no step lowers the loss" if self.damping > 1e6 or not p.any() else ""
+        self.reals = packing.tensors(new)
+        return linear.loss
+
+    def pack(self) -> dict[str, np.ndarray]:
+        return super().pack() | {"damping": np.array(self.damping)}
+
+    def unpack(self, arrays: dict[str, np.ndarray]) -> None:
+        super().unpack(arrays)
+        self.damping = float(arrays["damping"])
+
+
+class Linearised:
+    """The problem around one point: loss, gradient, and products with J^T W J + R''.
+
+    Attributes:
+        loss: f(u).
+        gradient: by the vector of ``packing``.
+    """
+
+    def __init__(self, problem: SceneProblem, reals: Reals, weights: list[mi.TensorXf], packing: Packing) -> None:
+        self.problem, self.reals, self.weights, self.packing = problem, reals, weights, packing
+        self.seeds = [problem.seed_for(0, index, PRIMAL) for index in range(len(problem.batches))]
+        self.slopes = {p.name: slope(p, reals[p.name]) for p in problem.parameters}
+        problem.set(reals)
+        compared = []
+        for index, (batch, seed) in enumerate(zip(problem.batches, self.seeds, strict=True)):
+            compared.append(problem.compare(batch, seed, len(problem.views)))
+            # The noise of an image and of a derivative from the same samples is correlated: that would bias J^T W r.
+            own = problem.seed_for(0, index, ADJOINT) if problem.noisy else seed
+            problem.vjp(batch.sensor, compared[-1].adjoint, own)
+        energy, gradients = problem.through_priors_and_maps(reals, problem.gradients())
+        self.loss = problem.remember(compared) + energy
+        self.gradient = packing.vector(gradients, 1)
+
+    def curvature(self, v: np.ndarray) -> np.ndarray:
+        """(J^T W J + R'') v."""
+        direction = {k: t * self.slopes[k] for k, t in self.packing.tensors(v).items()}
+        images = self._jvp(direction)
+        self.problem.set(self.reals)
+        for batch, weight, seed, image in zip(self.problem.batches, self.weights, self.seeds, images, strict=True):
+            share = batch.n_views / len(self.problem.views) / len(image.array)
+            self.problem.vjp(batch.sensor, weight * image * share, seed)
+        product = self.problem.gradients()
+        for p in self.problem.parameters:
+            value = dr.detach(p.from_reals(self.reals[p.name]))
+            for prior in p.priors:
+                product[p.name] += prior.curvature(value, direction[p.name], p.spacing(value.shape))
+        return self.packing.vector({k: t * self.slopes[k] for k, t in product.items()}, 1)
+
+    def _jvp(self, direction: Reals) -> list[mi.TensorXf]:
+        self.problem.set(self.reals)
+        pairs = zip(self.problem.batches, self.seeds, strict=True)
+        return [self.problem.jvp(batch.sensor, direction, seed) for batch, seed in pairs]
+
+
+def slope(parameter: Parameter, u: mi.TensorXf) -> mi.TensorXf:
+    """dx/du of a parameter's map, entry by entry."""
+    u = mi.TensorXf(dr.detach(u))
+    dr.enable_grad(u)
+    dr.backward(dr.sum(parameter.from_reals(u).array))
+    return dr.grad(u)
+
+
+def conjugate_gradients(
+    apply: Callable[[np.ndarray], np.ndarray], b: np.ndarray, diagonal: np.ndarray, iterations: int
+) -> np.ndarray:
+    """x with A x = b for A >= 0, Jacobi-preconditioned, from 0; stops early where the residual is rounding.
+
+    References: Hestenes and Stiefel 1952; Nocedal and Wright 2006, Algorithm 5.3.
+    """
+    x, r = np.zeros_like(b), b.copy()
+    z = r / diagonal
+    d, rz = z.copy(), float(r @ z)
+    stop = 1e-12 * rz
+    for _ in range(iterations):
+        if rz <= stop:
+            break
+        image = apply(d)
+        bend = float(d @ image)
+        if bend <= 0.0:
+            break
+        x += rz / bend * d
+        r -= rz / bend * image
+        z = r / diagonal
+        rz, before = float(r @ z), rz
+        d = z + rz / before * d
+    return x
