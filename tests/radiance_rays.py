@@ -17,7 +17,7 @@ from mivol.transport.line_integrals.radiance_field import (
     render,
 )
 from mivol.transport.line_integrals.radiance_source import bake, exact
-from mivol.transport.traversal.cell_index import CellIndex
+from mivol.transport.traversal.occupied_cells import CellIndex
 
 TO_WORLD = np.array([[2.0, 0.3, 0.0, -1.2], [-0.2, 1.5, 0.1, -0.7], [0.0, 0.1, 2.5, -1.3], [0, 0, 0, 1]])
 """Rotated a little, sheared and of three lengths."""

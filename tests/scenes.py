@@ -91,7 +91,7 @@ def from_lanes(tau: object) -> np.ndarray:
 
 def make_lattice(values: np.ndarray | mi.TensorXf, to_world: np.ndarray, skip: bool = False) -> object:
     """A lattice of the fast path, with or without the gaps that let it skip empty blocks."""
-    from mivol.transport.traversal.empty_blocks import find_empty_distances
+    from mivol.transport.traversal.grid_blocks import find_empty_distances
     from mivol.transport.traversal.lattice import Lattice
 
     values = values if isinstance(values, mi.TensorXf) else tensor(values)

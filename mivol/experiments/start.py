@@ -22,7 +22,7 @@ from mivol.files.fetch import place_of as place_in
 from mivol.machine import check_fits
 from mivol.optim.events import Upsample, check_for_grids
 from mivol.optim.parameters import GRID, Parameter, as_tensor, find
-from mivol.transport.media.read_medium import place_of_grid
+from mivol.transport.media.medium_view import place_of_grid
 
 NUMBER_BYTES = 6 * 4
 """Of each number that is looked for: value, the scene's copy, real, derivative and two moments of the optimiser."""

@@ -15,13 +15,10 @@ import mitsuba as mi
 import numpy as np
 
 from mivol.errors import MivolError
+from mivol.phase.closed_forms import eval_draine, eval_hg, eval_rayleigh, sample_draine, sample_hg, sample_rayleigh
 from mivol.phase.domain import DOMAINS
-from mivol.phase.draine import eval_draine, sample_draine
-from mivol.phase.hg import eval_hg, sample_hg
 from mivol.phase.mixture import choose_lobe, shares_of
-from mivol.phase.rayleigh import eval_rayleigh, sample_rayleigh
-from mivol.phase.table import Table, check_values
-from mivol.phase.tabulated import Lookup
+from mivol.phase.table import Lookup, Table, check_values
 from mivol.phase.turn import Turn, direction_after, turn_between
 
 VALUES_OF_VOLUMES = ("data", "value.value")

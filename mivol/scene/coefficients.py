@@ -14,7 +14,7 @@ import numpy as np
 
 from mivol.errors import MivolError
 from mivol.fields.gaussians import GaussianField
-from mivol.transport.traversal.lattice import slab
+from mivol.transport.traversal.box import slab
 
 __all__ = ["Coefficients"]
 

@@ -29,11 +29,11 @@ import numpy as np
 from mivol.errors import MivolError
 from mivol.scene.nesting import extent
 from mivol.transport.media.body import Body
-from mivol.transport.media.box import Box
 from mivol.transport.media.extinction import ExactExtinction, RayInterval
 from mivol.transport.media.medium_view import MediumView
 from mivol.transport.media.optical_depth import integrate_optical_depth
 from mivol.transport.media.scene_media import SceneMedia
+from mivol.transport.traversal.box import Box
 
 __all__ = ["ALBEDOS", "TABLES", "TAUS", "depth_two_error", "draw_lines", "mean_albedo", "mean_cosine", "scattering_depth"]
 

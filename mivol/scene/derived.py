@@ -16,7 +16,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from mivol.transport.media.read_medium import traverse_medium
+from mivol.transport.media.medium_view import traverse_medium
 
 __all__ = ["carry_tangents", "recompute_derived"]
 

@@ -30,9 +30,9 @@ from mivol.transport.estimators.single_scattering.shadow_tables import (
     build_transmittance_grid,
     measure_transmittance_bias,
 )
-from mivol.transport.media.box import Box
-from mivol.transport.media.read_medium import traverse_medium
+from mivol.transport.media.medium_view import traverse_medium
 from mivol.transport.path.estimators import SEGMENT_ESTIMATORS, Settings
+from mivol.transport.traversal.box import Box
 
 __all__ = ["Explanation", "examine", "settings_of"]
 

@@ -8,10 +8,9 @@ from dataclasses import dataclass
 import mitsuba as mi
 
 from mivol.transport.media.body import Body
-from mivol.transport.media.box import Box
-from mivol.transport.media.medium_view import MediumView
-from mivol.transport.media.read_medium import view_medium
+from mivol.transport.media.medium_view import MediumView, view_medium
 from mivol.transport.media.scene_media import SceneMedia
+from mivol.transport.traversal.box import Box
 
 __all__ = ["Boundary", "MediaLight", "MediumFacts", "Needs"]
 
@@ -37,7 +36,7 @@ class Boundary:
     hole: Box | None = None
 
     def view(self, places: dict) -> MediumView:
-        """Its medium as a sum of fields; ``places`` as in :func:`mivol.transport.media.read_medium.view_medium`.
+        """Its medium as a sum of fields; ``places`` as in :func:`mivol.transport.media.medium_view.view_medium`.
 
         Raises:
             MivolError: a medium that mivol does not render.

@@ -27,12 +27,11 @@ from mivol.scene.survey import AROUND, SceneSurvey, is_instance
 from mivol.transport.estimators.lighting.direct_lighting import power_heuristic
 from mivol.transport.estimators.lighting.emission_sampling import EmissionTable, EmittingBox, tabulate_emission
 from mivol.transport.media.body import Body
-from mivol.transport.media.box import Box
-from mivol.transport.media.even_point import draw_even_point
-from mivol.transport.media.medium_view import MediumView
+from mivol.transport.media.drawn_points import draw_even_point
+from mivol.transport.media.medium_view import MediumView, traverse_medium
 from mivol.transport.media.ray_intervals import RaySegment, visit_media
-from mivol.transport.media.read_medium import traverse_medium
 from mivol.transport.media.scene_media import SceneMedia
+from mivol.transport.traversal.box import Box
 
 __all__ = ["find_emitting_boxes", "predict_gain", "read_media_light"]
 

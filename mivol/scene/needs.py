@@ -21,8 +21,7 @@ from mivol.scene.parsing import check_variant
 from mivol.scene.readings import Reading, check_light, check_numbers, is_scattering, read_part
 from mivol.scene.survey import AROUND, SceneSurvey, find_around, is_instance, survey_scene
 from mivol.transport.media.gaussian_extinction import GaussianExtinction
-from mivol.transport.media.medium_view import MediumView
-from mivol.transport.media.read_medium import kind_of
+from mivol.transport.media.medium_view import MediumView, kind_of
 
 __all__ = ["find_needs"]
 

@@ -16,8 +16,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mivol.transport.media.box import box_of_cube
-from mivol.transport.traversal.ray_spawning import spawn_ray
+from mivol.transport.traversal.box import box_of_cube
+from mivol.transport.traversal.rays import spawn_ray
 
 __all__ = ["OrientedBox", "bounds", "box_around", "extent", "nesting_fault"]
 

@@ -22,9 +22,14 @@ from mivol.scene.coefficients import check_constant
 from mivol.scene.survey import SceneSurvey
 from mivol.transport.media.extinction import ExactExtinction
 from mivol.transport.media.medium_view import MediumView
-from mivol.transport.traversal.block_ranges import BlockRanges, find_block_ranges
-from mivol.transport.traversal.coarse_grid import CoarseGrid, coarsen_grid
-from mivol.transport.traversal.empty_blocks import block_bounds, empty_block_distances
+from mivol.transport.traversal.grid_blocks import (
+    BlockRanges,
+    CoarseGrid,
+    block_bounds,
+    coarsen_grid,
+    empty_block_distances,
+    find_block_ranges,
+)
 from mivol.transport.traversal.grid_walk import box_nodes
 from mivol.transport.traversal.interpolation import interpolate
 from mivol.transport.traversal.lattice import Lattice, locate

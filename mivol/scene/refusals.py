@@ -11,8 +11,8 @@ from mivol.errors import MivolError
 from mivol.scene.choices import choose_media_light, is_lit, shares_cells
 from mivol.scene.facts import Needs
 from mivol.transport.line_integrals.aovs import AOVS
+from mivol.transport.media.grid_extinction import share_cells
 from mivol.transport.media.medium_view import MediumView
-from mivol.transport.media.summed_extinction import share_cells
 from mivol.transport.path.estimators import Settings
 
 __all__ = [

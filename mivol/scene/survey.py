@@ -12,8 +12,8 @@ from mivol.errors import MivolError
 from mivol.scene.facts import Boundary
 from mivol.scene.nesting import OrientedBox, box_around, extent, nesting_fault
 from mivol.transport.estimators.lighting.emitters import UNIFORM
-from mivol.transport.media.box import Box, box_of_cube
-from mivol.transport.media.read_medium import nested_field
+from mivol.transport.media.medium_view import nested_field
+from mivol.transport.traversal.box import Box, box_of_cube
 
 __all__ = ["AROUND", "SceneSurvey", "find_around", "is_instance", "survey_scene"]
 
@@ -33,7 +33,7 @@ class SceneSurvey:
         looked_up: stock grids whose look-up was compared with mivol's, by pointer.
         scatters: whether each medium scattered when it was last read, by name.
         values, numbers: what was read of arrays and of constants (:mod:`mivol.scene.readings`).
-        places: where grids lie (:func:`mivol.transport.media.read_medium.view_medium`).
+        places: where grids lie (:func:`mivol.transport.media.medium_view.view_medium`).
         cosines: mean cosines of phase functions, by the name of the medium.
         warned: grids whose values below 0 were told of.
         media_light: what was read of the light that media emit, with the arrays that it was read of

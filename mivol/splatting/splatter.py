@@ -23,9 +23,8 @@ from mivol.machine import available_memory
 from mivol.photos.camera import Camera
 from mivol.points import Gaussians
 from mivol.splatting.compositing import CHUNK, LANES, PIXELS, Adjoint, Frame, Lists, composite, composite_adjoint
-from mivol.splatting.projection import EXP2, Cloud, Filter, Splats, project
+from mivol.splatting.projection import EXP2, Cloud, Filter, Splats, View, numbers_of, project
 from mivol.splatting.tile_lists import TILE, Grid, TileLists, check_memory, count_tiles, list_tiles, nearest_first, write_tiles
-from mivol.splatting.view import View, numbers_of
 from mivol.threads import check_one_thread
 
 __all__ = ["NAMES", "Kept", "Splatter", "Statistics", "tensors_of"]

@@ -26,7 +26,7 @@ from mivol.threads import check_one_thread, owner_waits
 from mivol.tomography.geometry import Geometry, VoxelGrid, view_index
 from mivol.tomography.ray_order import order_rays
 from mivol.tomography.recorded_kernels import RecordedKernels
-from mivol.transport.traversal.empty_blocks import find_empty_distances
+from mivol.transport.traversal.grid_blocks import find_empty_distances
 
 if TYPE_CHECKING:
     import scipy.sparse.linalg

@@ -9,6 +9,8 @@ import mitsuba as mi
 
 from mivol.tomography.geometry import VoxelGrid
 from mivol.transport.media.column_integral import (
+    ColumnGrid,
+    Line,
     backproject_columns,
     fold_nodes,
     integrate_columns,
@@ -16,8 +18,8 @@ from mivol.transport.media.column_integral import (
     zero_nodes,
 )
 from mivol.transport.media.grid_integral import Gradient, backproject_segment, integrate_segment
-from mivol.transport.traversal.column_walk import ColumnGrid, Line
-from mivol.transport.traversal.lattice import Lattice, clip, slab
+from mivol.transport.traversal.box import slab
+from mivol.transport.traversal.lattice import Lattice, clip
 
 __all__ = ["RecordedKernels"]
 

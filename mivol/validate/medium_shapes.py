@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import mitsuba as mi
 import numpy as np
 
-from mivol.transport.media.read_medium import children_of, kind_of, traverse_medium
+from mivol.transport.media.medium_view import children_of, kind_of, traverse_medium
 
 __all__ = ["ON_FACE", "RESTART", "MediumShape", "number", "read_medium_shape"]
 

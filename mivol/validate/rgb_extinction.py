@@ -14,7 +14,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from mivol.transport.media.read_medium import traverse_medium
+from mivol.transport.media.medium_view import traverse_medium
 
 __all__ = ["RgbExtinction", "find_rgb_extinctions", "with_channel"]
 

@@ -6,7 +6,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mivol.transport.media.box import Box, box_of_cube
+from mivol.transport.traversal.box import Box, box_of_cube
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
 

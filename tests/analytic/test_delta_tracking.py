@@ -16,10 +16,9 @@ from oracle import tau_twin, to_lattice, trilinear
 from scattering_scenes import PLACE, rough_grid
 
 from mivol.transport.estimators.flights.tracking import collide_in_blocks, collide_in_bounded
-from mivol.transport.media.bounded_extinction import BoundedExtinction
-from mivol.transport.media.extinction import RayInterval
+from mivol.transport.media.extinction import BoundedExtinction, RayInterval
 from mivol.transport.media.grid_extinction import GridExtinction
-from mivol.transport.traversal.block_ranges import find_block_ranges
+from mivol.transport.traversal.grid_blocks import find_block_ranges
 from mivol.transport.traversal.random_numbers import draw_pcg32, seed_pcg32
 from mivol.validate.moments import Moments
 from scenes import as_float32, make_lattice

@@ -15,8 +15,8 @@ from scipy import stats
 from mivol.experiments.script import explain
 from mivol.scene import depth_two
 from mivol.scene.depth_two import ALBEDOS, TABLES, TAUS, depth_two_error, draw_lines, mean_cosine, scattering_depth
-from mivol.transport.media.box import Box
-from mivol.transport.media.read_medium import view_medium
+from mivol.transport.media.medium_view import view_medium
+from mivol.transport.traversal.box import Box
 from mivol.validate.moments import Moments
 from scenes import FRAMES, affine, ball_of, medium, refused, rotation
 

@@ -10,7 +10,7 @@ import pytest
 from mivol.transport.estimators.lighting.direct_lighting import DirectLight, DirectLighting, DistantAim
 from mivol.transport.estimators.lighting.emitters import EventSamples
 from mivol.transport.estimators.lighting.vertex import MediumVertex, SurfaceVertex
-from mivol.transport.media.coefficients import medium_interaction
+from mivol.transport.media.body import medium_interaction
 from scenes import box_of, camera, centred, media_of, medium, sky
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")

@@ -9,11 +9,11 @@ import pytest
 
 from mivol.transport.estimators.lighting.vertex import EitherVertex, MediumVertex
 from mivol.transport.estimators.segment import Collision, SegmentEstimate
-from mivol.transport.media.coefficients import medium_interaction
+from mivol.transport.media.body import medium_interaction
 from mivol.transport.media.ray_intervals import SegmentEnd
 from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.path.event import PathEvent
-from mivol.transport.traversal.fine_ray import point_along
+from mivol.transport.traversal.rays import point_along
 from scenes import box_of, camera, media_of, medium
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")

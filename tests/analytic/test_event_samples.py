@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from mivol.transport.estimators.lighting.emitters import EventSamples
-from mivol.transport.traversal.strata import Strata
+from mivol.transport.traversal.random_numbers import Strata
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
 

@@ -11,7 +11,7 @@ import pytest
 from mivol.errors import MivolError
 from mivol.transport.line_integrals.integrand import check_media
 from mivol.transport.media.body import Body
-from mivol.transport.media.constant_extinction import ConstantExtinction
+from mivol.transport.media.extinction import ConstantExtinction
 from mivol.transport.media.grid_extinction import GridExtinction
 from mivol.transport.media.medium_view import MediumView
 from mivol.transport.traversal.lattice import Lattice

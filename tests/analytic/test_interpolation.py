@@ -6,7 +6,16 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mivol.transport.traversal.interpolation import interpolate, upward_frac, weights
+from mivol.transport.traversal.interpolation import (
+    cubic_at,
+    cubic_integral,
+    cubic_through,
+    interpolate,
+    invert_cubic_integral,
+    upward_frac,
+    weights,
+)
+from scenes import as_float32
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
 
@@ -41,3 +50,80 @@ def test_the_outer_half_voxel_has_one_node():
     lower = mi.Vector3i(mi.Int32(-1, 0, 1), mi.Int32(-1, 1, 2), mi.Int32(-1, 2, 3))
     found = np.array(upward_frac(mi.Vector3f(0.25), lower, (4, 3, 2)))
     np.testing.assert_array_equal(found, [[1, 0.25, 0]] * 3)
+
+
+N, DT = 4096, 0.7
+OF_VALUE, OF_INTEGRAL = 666 * 2.0**-24, (666 + 444) * 2.0**-24
+THIRDS = np.arange(4) / 3
+
+
+def curves(least: float = 0.0) -> np.ndarray:
+    """Values (4, N) at 0, 1/3, 2/3, 1 of products of linear functions between numbers from ``least`` to 1, times up to 4."""
+    ends = np.random.default_rng(1).uniform(least, 1, (2, 3, N))
+    values = np.prod(ends[0] + THIRDS[:, None, None] * (ends[1] - ends[0]), axis=1)
+    return as_float32(4 * values * np.random.default_rng(2).uniform(0.1, 1, N))
+
+
+def exact(values: np.ndarray) -> np.ndarray:
+    """Coefficients (4, N) of the cubics through values, from the constant on."""
+    return np.linalg.solve(THIRDS[:, None] ** np.arange(4), values)
+
+
+def depth(values: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """The integral from 0 to x."""
+    return DT * sum(c * x ** (k + 1) / (k + 1) for k, c in enumerate(exact(values)))
+
+
+def lanes(values: np.ndarray) -> list[mi.Float]:
+    return cubic_through(*(mi.Float(row) for row in values))
+
+
+def inverted(values: np.ndarray, u: np.ndarray) -> np.ndarray:
+    """Where the integral is ``u`` of the whole."""
+    curve = lanes(values)
+    whole = cubic_integral(curve, mi.Float(DT), mi.Float(1))
+    return np.array(invert_cubic_integral(curve, mi.Float(DT), mi.Float(u) * whole, whole), np.float64)
+
+
+def test_values_and_integrals_are_those_of_the_cubic():
+    values, x = curves(), as_float32(np.random.default_rng(3).uniform(0, 1, N))
+    curve, top = lanes(values), values.max(axis=0)
+    found = np.array(cubic_at(curve, mi.Float(x)))
+    np.testing.assert_array_less(np.abs(found - sum(c * x**k for k, c in enumerate(exact(values)))), OF_VALUE * top)
+    found = np.array(cubic_integral(curve, mi.Float(DT), mi.Float(x)))
+    np.testing.assert_array_less(np.abs(found - depth(values, x)), OF_INTEGRAL * DT * top)
+
+
+def test_no_integral_is_negative():
+    """Of F x^3 from 0 to 1e-4 little is left but the rounding of its coefficients, which are 0 on paper."""
+    values = as_float32(np.random.default_rng(4).uniform(1, 2, N) * THIRDS[:, None] ** 3)
+    assert np.array(cubic_integral(lanes(values), mi.Float(1), mi.Float(1e-4))).min() == 0
+
+
+def test_the_inverse_reaches_its_goal():
+    """Where the extinction is at least 0.001 of its largest, Newton's steps end at the rounding of the integral and of x."""
+    values, u = curves(least=0.1), as_float32(np.random.default_rng(5).uniform(0, 1, N))
+    off, top = np.abs(depth(values, inverted(values, u)) - u * depth(values, 1)), values.max(axis=0)
+    np.testing.assert_array_less(off, (2 * OF_INTEGRAL + 2.0**-24) * DT * top)
+
+
+@pytest.mark.parametrize("at", ["start", "end"])
+def test_an_extinction_that_vanishes_at_an_end(at):
+    """F x^3, whose integral is the fourth power.
+
+    Newton's steps from above make the error v of x^4 at most (3/4)^4 v. The first step is a bisection, to x^4 <= 1/16 at small
+    u; of the seven others at most one ends below the root: 0.316^6 / 16 = 6.3e-5 of the whole.
+    """
+    u = as_float32((np.arange(N) + 0.5) / N)
+    values = as_float32(3 * np.broadcast_to(THIRDS[:, None] if at == "start" else 1 - THIRDS[:, None], (4, N)) ** 3)
+    off = np.abs(depth(values, inverted(values, u)) / depth(values, 1) - u)
+    np.testing.assert_array_less(off, 0.75**24 / 16 + 4 * OF_INTEGRAL)
+
+
+def test_goals_at_the_ends_and_a_flat_extinction():
+    """Nothing is reached at 0, everything at 1; x is the share of the whole where the extinction is the same everywhere."""
+    flat, u = np.full((4, 3), 2.0), np.array([0.0, 0.25, 1.0])
+    # Coefficients of a constant cancel to 2^-24 of 111 F, and so do those of the integral.
+    np.testing.assert_allclose(inverted(flat, u), u, atol=OF_INTEGRAL)
+    sloped = np.broadcast_to(1 + THIRDS[:, None], (4, 3))
+    np.testing.assert_allclose(inverted(sloped, u)[[0, 2]], [0, 1], atol=OF_INTEGRAL)

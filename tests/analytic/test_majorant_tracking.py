@@ -10,8 +10,7 @@ from bounded_ball import Ball
 from false_alarms import Estimate, assert_same_mean, fresh
 
 from mivol.transport.estimators.flights.tracking import LOOKUP_RATE, ratio_tracking
-from mivol.transport.media.bounded_extinction import BoundedExtinction
-from mivol.transport.media.extinction import RayInterval
+from mivol.transport.media.extinction import BoundedExtinction, RayInterval
 from mivol.transport.traversal.random_numbers import seed_pcg32
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")

@@ -10,9 +10,7 @@ import numpy as np
 import pytest
 from phase_angles import EPS, cosines_of, integrals, lanes, uniforms
 
-from mivol.phase.draine import eval_draine, mean_cosine, sample_draine
-from mivol.phase.hg import sample_hg
-from mivol.phase.rayleigh import eval_rayleigh, sample_rayleigh
+from mivol.phase.closed_forms import eval_draine, eval_rayleigh, mean_cosine, sample_draine, sample_hg, sample_rayleigh
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
 

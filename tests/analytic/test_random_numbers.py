@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from false_alarms import assert_same_mean, fresh
 
-from mivol.transport.traversal.random_numbers import LaneSampler, draw_pcg32, seed_pcg32
+from mivol.transport.traversal.random_numbers import LaneSampler, Strata, draw_pcg32, seed_pcg32
 from mivol.validate.moments import Moments
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
@@ -41,3 +41,11 @@ def test_numbers_of_paths_are_uniform() -> None:
     pairs = [rows[i] * rows[j] for i in range(5) for j in range(i)]
     assert_same_mean(Moments.of(np.vstack([u - 1 / 2, u**2 - 1 / 3, pairs]).T), 0, what="numbers, squares, products")
     assert np.array_equal(np.array(sampler.next_1d(False)), np.array(sampler.next_1d(False)))
+
+
+def test_each_lane_stays_in_its_cell():
+    """Cell k of 3 by 2 holds the points (k % 3 + u) / 3, (k // 3 + v) / 2."""
+    u, v = np.random.default_rng(4).uniform(0, 1, (2, 6)).astype(np.float32)
+    found = Strata(dr.arange(mi.UInt32, 6), 3, 2).jitter(mi.Point2f(mi.Float(u), mi.Float(v)))
+    k = np.arange(6)
+    np.testing.assert_allclose(np.array(found), [(k % 3 + u) / 3, (k // 3 + v) / 2], atol=2.0**-23)

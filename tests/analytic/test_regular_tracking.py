@@ -16,10 +16,8 @@ from scattering_scenes import PLACE, aimed, rough_grid
 
 from mivol.fields.activation import activation_of
 from mivol.transport.estimators.flights.regular_tracking import collide_exactly
-from mivol.transport.media.activated_grid_extinction import ActivatedGridExtinction
-from mivol.transport.media.constant_extinction import ConstantExtinction
-from mivol.transport.media.extinction import ExactExtinction, RayInterval
-from mivol.transport.media.grid_extinction import GridExtinction
+from mivol.transport.media.extinction import ConstantExtinction, ExactExtinction, RayInterval
+from mivol.transport.media.grid_extinction import ActivatedGridExtinction, GridExtinction
 from scenes import as_float32, make_lattice, to_lanes
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")

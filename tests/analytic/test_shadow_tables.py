@@ -23,7 +23,7 @@ from mivol.transport.estimators.single_scattering.shadow_tables import (
     build_visibility_cache,
 )
 from mivol.transport.path.estimators import Settings
-from mivol.transport.traversal.coarse_grid import coarsen_grid
+from mivol.transport.traversal.grid_blocks import coarsen_grid
 from scenes import centred
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")

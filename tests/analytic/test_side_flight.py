@@ -19,7 +19,7 @@ from mivol.transport.estimators.flights.free_flight import FreeFlight
 from mivol.transport.estimators.lighting.direct_lighting import DirectLighting, DistantAim
 from mivol.transport.estimators.scores import PICTURE
 from mivol.transport.estimators.segment import Collision
-from mivol.transport.media.coefficients import medium_interaction
+from mivol.transport.media.body import medium_interaction
 from mivol.transport.path.estimators import Estimators
 from mivol.transport.path.side_flight import SideSamples, fly_aside, weigh_aim
 from mivol.transport.traversal.random_numbers import draw_state

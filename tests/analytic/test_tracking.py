@@ -18,7 +18,7 @@ from mivol.experiments.script import explain
 from mivol.transport.estimators.flights import tracking
 from mivol.transport.estimators.flights.tracking import residual_ratio_tracking
 from mivol.transport.media.grid_integral import integrate_segment
-from mivol.transport.traversal.block_ranges import find_block_ranges
+from mivol.transport.traversal.grid_blocks import find_block_ranges
 from mivol.transport.traversal.lattice import Lattice, clip
 from mivol.transport.traversal.random_numbers import seed_pcg32
 from mivol.validate.moments import Moments

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from mivol.transport.estimators.lighting.vertex import MediumVertex, SurfaceVertex
-from mivol.transport.media.coefficients import medium_interaction
+from mivol.transport.media.body import medium_interaction
 from mivol.transport.media.scene_media import SceneMedia
 from scenes import camera, media_of, medium
 

@@ -8,13 +8,12 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from bounded_ball import Ball
 
 from mivol.fields.activation import activation_of
-from mivol.transport.media.activated_grid_extinction import ActivatedGridExtinction
-from mivol.transport.media.constant_extinction import ConstantExtinction
-from mivol.transport.media.extinction import ExactExtinction, RayInterval
-from mivol.transport.media.grid_extinction import GridExtinction
-from mivol.transport.traversal.empty_blocks import block_bounds, empty_block_distances
+from mivol.transport.media.extinction import BoundedExtinction, ConstantExtinction, ExactExtinction, RayInterval
+from mivol.transport.media.grid_extinction import ActivatedGridExtinction, GridExtinction
+from mivol.transport.traversal.grid_blocks import block_bounds, empty_block_distances
 from mivol.transport.traversal.lattice import Lattice
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
@@ -101,3 +100,90 @@ def test_derivatives_are_transposes(name: str, where: str) -> None:
     terms = np.abs(jvp * w).sum() + np.abs(v * vjp).sum()
     assert np.abs(jvp).max() > 0.01
     assert abs((jvp * w).sum() - (v * vjp).sum()) < 1e-6 * terms
+
+
+def coloured() -> ConstantExtinction:
+    return ConstantExtinction("sigma_t", mi.Color3f(0.5, 0.0, 2.0))
+
+
+def intervals() -> RayInterval:
+    """Four of a ray: one of length 3, one that is not active, one that ends before it begins, one without end."""
+    ray = mi.Ray3f(mi.Point3f(0), mi.Vector3f(0, 0, 1))
+    return RayInterval(ray, mi.Float(1, 1, 3, 1), mi.Float(4, 4, 2, dr.inf), mi.Bool(True, False, True, True))
+
+
+def test_optical_depth_is_the_value_times_the_length():
+    found = np.array(coloured().integrate(intervals()))
+    np.testing.assert_array_equal(found, [[1.5, 0, 0, np.inf], [0, 0, 0, 0], [6, 0, 0, np.inf]])
+
+
+def test_an_interval_without_end_has_no_derivative():
+    part = coloured()
+    np.testing.assert_array_equal(np.array(part.jvp(mi.Color3f(1, 2, 4), intervals()))[:, [0, 3]], [[3, 0], [6, 0], [12, 0]])
+    gradient = part.start_gradient()
+    part.vjp(gradient, [mi.Float(1, 1, 1, 5), mi.Float(0), mi.Float(2)], intervals())
+    np.testing.assert_array_equal(np.array(gradient), [3, 0, 6])
+
+
+def test_a_point_has_the_value_times_the_scale():
+    ray, t, active = intervals().ray, intervals().t0, intervals().active
+    part, scale = coloured(), mi.Float(4)
+    assert part.channels == 3 and ConstantExtinction("sigma_t", mi.Float(1)).channels == 1
+    np.testing.assert_array_equal(np.array(part.eval_at(scale, ray, t, active)).ravel(), [2, 0, 8])
+    gradient = part.start_gradient()
+    part.vjp_at(gradient, [mi.Float(1, 2, 4, 8), mi.Float(1), mi.Float(0)], ray, t, active)
+    np.testing.assert_array_equal(np.array(gradient), [13, 3, 0])
+
+
+def test_a_gradient_is_delivered_to_the_value_and_to_the_scale():
+    part, scale = coloured(), mi.Float(4)
+    dr.enable_grad(part.constant, scale)
+    dr.backward(part.deliver(scale, mi.Float(1, 2, 4)))
+    np.testing.assert_array_equal(np.array(dr.grad(part.constant)).ravel(), [4, 8, 16])
+    assert dr.grad(scale)[0] == 0.5 * 1 + 2.0 * 4
+
+
+def ball(*sigma: float, scale: float = 2.0) -> BoundedExtinction:
+    """Of radius 1, about (0, 0, 2)."""
+    value = mi.Color3f(*sigma) if len(sigma) == 3 else mi.Float(*sigma)
+    return BoundedExtinction("sigma_t", Ball(value, 1.0, (0, 0, 2)), mi.Float(scale), mi.Float(max(sigma)))
+
+
+def upward(x: float = 0.0) -> mi.Ray3f:
+    return mi.Ray3f(mi.Point3f(x, 0, 0), mi.Vector3f(0, 0, 1))
+
+
+def test_the_interval_is_that_of_the_box():
+    """A ray at x = 0.9 crosses the box where it hardly meets the ball; one at 1.1 misses both."""
+    part = ball(1.5)
+    on = mi.Bool(True)
+    begin, end = part.clip(RayInterval(upward(0.9), mi.Float(0, 2, 0), mi.Float(dr.inf, dr.inf, 2.5), on))
+    np.testing.assert_array_equal([np.array(begin), np.array(end)], [[1, 2, 1], [3, 3, 2.5]])
+    begin, end = part.clip(RayInterval(upward(1.1), mi.Float(0), mi.Float(dr.inf), on))
+    assert not begin[0] < end[0]
+
+
+def test_values_in_and_out_of_the_ball():
+    found = ball(1.5, 0.5, 0.25).eval_at(mi.Float(4), upward(), mi.Float(0.5, 2, 3.5), mi.Bool(True))
+    np.testing.assert_array_equal(np.array(found), [[0, 6, 0], [0, 2, 0], [0, 1, 0]])
+
+
+def test_a_tangent_is_that_of_the_scale_and_that_of_the_field():
+    part = ball(1.5)
+    dr.enable_grad(part.field.sigma)
+    dr.set_grad(part.field.sigma, 0.5)
+    with dr.suspend_grad():
+        found = part.jvp_at(mi.Float(0.25), upward(), mi.Float(2, 2, 0.5), mi.Bool(True, False, True))
+    np.testing.assert_array_equal(np.array(found), [[0.25 * 1.5 + 2 * 0.5, 0, 0]])
+
+
+def test_a_gradient_reaches_the_scale_and_the_field():
+    part, scale = ball(1.5, 0.5, 0.25), mi.Float(2)
+    dr.enable_grad(part.field.sigma, scale)
+    gradient = part.start_gradient()
+    with dr.suspend_grad():
+        weight = [mi.Float(1, 1), mi.Float(2, 2), mi.Float(4, 4)]
+        part.vjp_at(gradient, weight, upward(), mi.Float(2, 2), mi.Bool(True, False))
+    np.testing.assert_array_equal(np.array(dr.grad(part.field.sigma)).ravel(), [2, 4, 8])
+    dr.backward(part.deliver(scale, gradient))
+    assert dr.grad(scale)[0] == 1.5 + 2 * 0.5 + 4 * 0.25

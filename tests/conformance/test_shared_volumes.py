@@ -10,7 +10,7 @@ import scattering_scenes as small
 from false_alarms import assert_precise, assert_same_mean, difference, fresh
 from scattering_scenes import PLACE, assert_same_images, close_up, mivol, point, rough_grid
 
-from mivol.transport.media.read_medium import traverse_medium, view_medium
+from mivol.transport.media.medium_view import traverse_medium, view_medium
 from mivol.validate.moments import Moments
 from mivol.validate.reference import render_reference
 from scenes import box_of, centred, grid_volume, medium, sky, transform
@@ -29,9 +29,7 @@ def stock() -> dict:
 
 def constants(*sizes: float) -> list[dict]:
     """Boxes of one number in different places: Mitsuba merges the textures in them."""
-    return [
-        {"type": "constvolume", "value": 0.7, "to_world": transform(centred(size * np.eye(3)))} for size in sizes
-    ]
+    return [{"type": "constvolume", "value": 0.7, "to_world": transform(centred(size * np.eye(3)))} for size in sizes]
 
 
 MEDIA = {

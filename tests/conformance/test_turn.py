@@ -10,7 +10,7 @@ import pytest
 from mivol.transport.estimators.flights.free_flight import FreeFlight
 from mivol.transport.estimators.lighting.direct_lighting import DirectLighting
 from mivol.transport.estimators.segment import Collision
-from mivol.transport.media.coefficients import medium_interaction
+from mivol.transport.media.body import medium_interaction
 from mivol.transport.path.estimators import Estimators
 from mivol.transport.path.event import PathEvent, Turn, TurnSamples, sample_turn
 from scenes import camera, media_of, medium

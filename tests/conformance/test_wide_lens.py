@@ -27,7 +27,7 @@ from mivol.photos.region import count_views, find_focus, silhouette_box
 from mivol.photos.transforms import write_transforms as write_cameras
 from mivol.report.cameras import outline
 from mivol.scene.photographs import sensor_of
-from mivol.splatting.view import numbers_of
+from mivol.splatting.projection import numbers_of
 
 LENS = Fisheye(-0.01, 0.0005, 0.00002, 0.000001)
 """Of the size of what calibrations of fisheyes give. Its slope, 1 - 0.03 t^2 + 0.0025 t^4 and more, is above 0 at any t."""

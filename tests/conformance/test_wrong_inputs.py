@@ -21,7 +21,7 @@ from mivol.optim.losses import L2, LOSSES, Huber
 from mivol.optim.parameters import Parameter
 from mivol.optim.projections.solvers import fdk
 from mivol.optim.strategy import choose, table
-from mivol.phase.draine import droplets
+from mivol.phase.closed_forms import droplets
 from mivol.phase.measured import NAMES, named_medium
 from mivol.phase.table import Table
 from mivol.photos import Camera

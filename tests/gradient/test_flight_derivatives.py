@@ -23,8 +23,8 @@ from mivol.bench.studies.gradients.twin import Twin
 from mivol.scene import plan
 from mivol.transport.estimators.flights.flight_derivatives import Probe, Probes
 from mivol.transport.estimators.segment import FlightPoint, PathSegment
-from mivol.transport.media.even_point import EvenPoint
-from mivol.transport.traversal.fine_ray import FineRay
+from mivol.transport.media.drawn_points import EvenPoint
+from mivol.transport.traversal.rays import FineRay
 from mivol.validate.moments import Moments
 from mivol.validate.statistics import Estimate
 from scenes import as_float32, ball_of, box_of, camera, grid_volume, medium

@@ -8,11 +8,9 @@ import numpy as np
 import oracle_phase as oracle
 import pytest
 
-from mivol.phase.draine import eval_draine
-from mivol.phase.hg import eval_hg
+from mivol.phase.closed_forms import eval_draine, eval_hg
 from mivol.phase.mixture import shares_of
-from mivol.phase.table import Table
-from mivol.phase.tabulated import Lookup
+from mivol.phase.table import Lookup, Table
 from mivol.phase.turn import Turn, turn_between
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")

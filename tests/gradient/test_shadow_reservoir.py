@@ -11,8 +11,8 @@ from false_alarms import Estimate, assert_same_mean, fresh
 from mivol.transport.estimators.flights.flight_derivatives import ShadowReservoir, ShadowTerm
 from mivol.transport.estimators.lighting.direct_lighting import DirectLight
 from mivol.transport.media.ray_intervals import RaySegment
-from mivol.transport.traversal.fine_ray import FineRay
 from mivol.transport.traversal.random_numbers import draw_pcg32, seed_pcg32
+from mivol.transport.traversal.rays import FineRay
 from scenes import box_of, camera, media_of, medium
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")

@@ -54,9 +54,9 @@ from mivol.photos import Camera, Photo, pixel_centres, rays
 from mivol.photos.camera import intrinsics
 from mivol.transport.line_integrals.radiance_field import RayGradient, backward, cells_of, model_of, render
 from mivol.transport.line_integrals.radiance_source import bake, exact
-from mivol.transport.traversal.empty_blocks import REACH
+from mivol.transport.traversal.grid_blocks import REACH
 from mivol.transport.traversal.lattice import clip
-from mivol.transport.traversal.occupied_cells import march
+from mivol.transport.traversal.occupied_walk import march
 from scenes import box_of, tensor, transform
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")

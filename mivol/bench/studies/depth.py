@@ -33,8 +33,8 @@ from mivol.bench.harness.bars import AT_MOST, Bar, judge, say
 from mivol.bench.harness.figures import drawn
 from mivol.bench.harness.study import Bench
 from mivol.scene.depth_two import ALBEDOS, TAUS, depth_two_error, draw_lines, scattering_depth
-from mivol.transport.media.box import Box
-from mivol.transport.media.read_medium import view_medium
+from mivol.transport.media.medium_view import view_medium
+from mivol.transport.traversal.box import Box
 
 __all__ = ["BENCH", "FULL", "QUICK", "Cell", "Size", "Subject", "left_out", "main", "measure", "table_lines", "tabled_cube"]
 

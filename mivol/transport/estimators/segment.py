@@ -18,7 +18,7 @@ import mitsuba as mi
 
 from mivol.transport.estimators.lighting.shadow_rays import estimate_transmittance
 from mivol.transport.estimators.scores import Factor, Term
-from mivol.transport.media.even_point import EvenPoint
+from mivol.transport.media.drawn_points import EvenPoint
 from mivol.transport.media.optical_depth import (
     integrate_optical_depth,
     jvp_optical_depth,
@@ -27,9 +27,8 @@ from mivol.transport.media.optical_depth import (
 )
 from mivol.transport.media.ray_intervals import RaySegment, SegmentEnd
 from mivol.transport.media.scene_media import SceneMedia
-from mivol.transport.traversal.fine_ray import Ray
-from mivol.transport.traversal.random_numbers import draw_pcg32, seed_pcg32
-from mivol.transport.traversal.strata import Strata
+from mivol.transport.traversal.random_numbers import Strata, draw_pcg32, seed_pcg32
+from mivol.transport.traversal.rays import Ray
 
 __all__ = [
     "Absorption",

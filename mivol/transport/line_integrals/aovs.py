@@ -21,8 +21,7 @@ from mivol.transport.line_integrals.expected_depth import integrate_expected_dep
 from mivol.transport.media.optical_depth import integrate_optical_depth, jvp_rows, vjp_rows
 from mivol.transport.media.ray_intervals import RaySegment, SegmentEnd
 from mivol.transport.media.scene_media import SceneMedia
-from mivol.transport.traversal.fine_ray import Ray
-from mivol.transport.traversal.ray_spawning import camera_ray
+from mivol.transport.traversal.rays import Ray, camera_ray
 
 __all__ = ["AOVS", "integrate_aovs", "jvp_aovs", "vjp_aovs"]
 

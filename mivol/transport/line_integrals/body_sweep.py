@@ -19,12 +19,12 @@ import mitsuba as mi
 
 from mivol.transport.line_integrals.integrand import LineIntegral, RayPiece
 from mivol.transport.media.compositing import BodyIntegral, CellIntegral, ReverseState, pass_cell, put_in_front, zeros
+from mivol.transport.media.grid_extinction import SummedExtinction
 from mivol.transport.media.ray_intervals import MediumInterval
-from mivol.transport.media.summed_extinction import SummedExtinction
-from mivol.transport.traversal.fine_ray import Ray
 from mivol.transport.traversal.grid_walk import Cell, walk
 from mivol.transport.traversal.interpolation import node_weights
 from mivol.transport.traversal.lattice import Lattice, Segment, clip
+from mivol.transport.traversal.rays import Ray
 
 __all__ = ["BodySweep"]
 

@@ -14,7 +14,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from mivol.transport.traversal.occupied_cells import CellVisitor
+from mivol.transport.traversal.occupied_walk import CellVisitor
 
 __all__ = ["CellCorners", "Face", "Sums", "read_corners"]
 
@@ -156,9 +156,7 @@ def _read_where(elsewhere: mi.Bool, read: Callable[[mi.Bool], Face], face: Face)
 
 
 @dr.syntax
-def _write_twice(
-    write: Callable, rows: list, values: list, more_rows: list, more: list, on: mi.Bool, again: mi.Bool
-) -> None:
+def _write_twice(write: Callable, rows: list, values: list, more_rows: list, more: list, on: mi.Bool, again: mi.Bool) -> None:
     """Write four corners, and four more where rays have some: a loop of one turn in most packets."""
     on, again = mi.Bool(on), mi.Bool(again)
     while dr.hint(on, label="corners"):

@@ -24,8 +24,8 @@ import mitsuba as mi
 
 from mivol.transport.line_integrals.composite import Composite, composite_ray, vjp_composite
 from mivol.transport.line_integrals.integrand import LineIntegral, RayPiece
+from mivol.transport.media.body import medium_interaction
 from mivol.transport.media.channels import by_channel, spectrum, tangent_of
-from mivol.transport.media.coefficients import medium_interaction
 from mivol.transport.media.compositing import CellIntegral
 from mivol.transport.media.ray_intervals import RaySegment
 from mivol.transport.media.scene_media import SceneMedia

@@ -16,7 +16,7 @@ from mivol.transport.media.channels import spectrum
 from mivol.transport.media.optical_depth import transmittance
 from mivol.transport.media.ray_intervals import RaySegment, visit_media
 from mivol.transport.media.scene_media import SceneMedia
-from mivol.transport.traversal.strata import Strata
+from mivol.transport.traversal.random_numbers import Strata
 
 __all__ = ["Emission"]
 

@@ -20,10 +20,10 @@ import mitsuba as mi
 from mivol.errors import MivolError
 from mivol.transport.media.body import Body
 from mivol.transport.media.compositing import CellIntegral
+from mivol.transport.media.grid_extinction import share_cells
 from mivol.transport.media.ray_intervals import RaySegment
 from mivol.transport.media.scene_media import SceneMedia
-from mivol.transport.media.summed_extinction import share_cells
-from mivol.transport.traversal.fine_ray import Ray
+from mivol.transport.traversal.rays import Ray
 
 __all__ = ["Integrand", "LineIntegral", "RayPiece", "check_media"]
 

@@ -10,8 +10,8 @@ Conventions. Density and colour are interpolated between nodes; then the activat
 clamped at 0. A source (:mod:`mivol.transport.line_integrals.radiance_source`) reads the corners of a cell. Distance is
 composited as a fourth colour, c = t.
 
-Nested fields are followed piece by piece (:mod:`mivol.transport.traversal.nested_path`), with the same visitors; a single grid
-is one piece, and has no loop over pieces.
+Nested fields are followed piece by piece (:mod:`mivol.transport.traversal.occupied_walk`), with the same visitors; a single
+grid is one piece, and has no loop over pieces.
 
 Derivatives. Let r be the light from behind a cell times the derivative of the loss by it (one number a ray). The sweep goes
 from the last cell that was visited to the first, with r <- S + exp(-tau) r. So r is a sum of what lies behind; it is
@@ -39,8 +39,8 @@ from mivol.transport.traversal.cell_quadrature import share_opacity
 from mivol.transport.traversal.interpolation import GAUSS, interpolate, weights
 from mivol.transport.traversal.lattice import Segment
 from mivol.transport.traversal.neighbour_rays import RayOrder
-from mivol.transport.traversal.nested_path import Piece, piece_of, pieces
-from mivol.transport.traversal.occupied_cells import Cells, CellVisitor, end_of, march, reversed_from
+from mivol.transport.traversal.occupied_cells import Cells
+from mivol.transport.traversal.occupied_walk import CellVisitor, Piece, end_of, march, piece_of, pieces, reversed_from
 
 __all__ = [
     "Model",
@@ -422,9 +422,7 @@ def _follow_pieces_back(cells: Cells, rendered: RenderedRays, visit: Callable, s
         ends = number == last.piece
         cell, t = dr.select(ends, rendered.cell, end), dr.select(ends, last.t, piece.segment.length)
         back = reversed_from(piece.segment, cell, t, dr.select(number == first.piece, first.t, 0))
-        state, _, _ = march(
-            cells, back, partial(visit, back=back, scale=piece.scale), state, active, None, piece.level
-        )
+        state, _, _ = march(cells, back, partial(visit, back=back, scale=piece.scale), state, active, None, piece.level)
         number -= 1
     return state
 

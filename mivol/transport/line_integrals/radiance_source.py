@@ -22,7 +22,8 @@ import numpy as np
 
 from mivol.fields.spherical import SphericalGrid
 from mivol.transport.line_integrals.carried_face import CellCorners, Face, Sums, read_corners
-from mivol.transport.traversal.occupied_cells import Cells, CellVisitor
+from mivol.transport.traversal.occupied_cells import Cells
+from mivol.transport.traversal.occupied_walk import CellVisitor
 
 __all__ = ["Baked", "CellValues", "Colours", "Exact", "Source", "bake", "exact", "fold"]
 

@@ -13,14 +13,18 @@ parameters behind the part are found through: ``jvp`` multiplies by the derivati
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, ClassVar, Protocol
 
+import drjit as dr
 import mitsuba as mi
 
-from mivol.transport.traversal.fine_ray import Ray
+from mivol.fields.protocol import Field
+from mivol.transport.media.channels import tangent_of
+from mivol.transport.traversal.box import Box, slab
 from mivol.transport.traversal.lattice import Lattice
+from mivol.transport.traversal.rays import Ray
 
-__all__ = ["ExactExtinction", "Extinction", "RayInterval"]
+__all__ = ["ExactExtinction", "Extinction", "RayInterval", "ConstantExtinction", "BoundedExtinction"]
 
 
 @dataclass
@@ -86,3 +90,140 @@ class ExactExtinction(Extinction, Protocol):
 
     def vjp(self, gradient: Any, weight: list[mi.Float], interval: RayInterval) -> None:
         """Add ``weight`` (d loss / d tau) times the interval to a gradient: the transpose of :meth:`jvp`."""
+
+
+@dataclass
+class ConstantExtinction:
+    """A number, grey or rgb (:class:`mivol.transport.media.extinction.ExactExtinction`).
+
+    Attributes:
+        name: ``sigma_t``, ``sigma_a`` or ``sigma_s``.
+        constant: its value [1/length], with its derivatives.
+    """
+
+    name: str
+    constant: mi.Float | mi.Color3f
+    exact_line: ClassVar[bool] = True
+    is_constant: ClassVar[bool] = True
+    lattice: ClassVar[None] = None
+
+    @property
+    def channels(self) -> int:
+        """1 (grey) or 3 (rgb)."""
+        return 3 if dr.size_v(self.constant) == 3 else 1
+
+    @property
+    def values(self) -> mi.Float | mi.Color3f:
+        """The number."""
+        return self.constant
+
+    def scaled(self, scale: mi.Float) -> mi.Float | mi.Color3f:
+        return scale * self.constant
+
+    def start_gradient(self) -> mi.Float:
+        return dr.zeros(mi.Float, self.channels)
+
+    def deliver(self, scale: mi.Float, gradient: mi.Float) -> mi.Float:
+        dr.eval(gradient)
+        return dr.sum(dr.ravel(self.scaled(scale)) * gradient)
+
+    def integrate(self, interval: RayInterval, enough: mi.Float | None = None) -> list[mi.Float]:
+        return self._along(dr.detach(self.constant), _length(interval))
+
+    def jvp(self, tangent: mi.Float | mi.Color3f, interval: RayInterval) -> list[mi.Float]:
+        return self._along(tangent, _finite(_length(interval)))
+
+    def vjp(self, gradient: mi.Float, weight: list[mi.Float], interval: RayInterval) -> None:
+        length = _finite(_length(interval))
+        for c, w in enumerate(weight):
+            dr.scatter_add(gradient, dr.select(w != 0, w * length, 0), mi.UInt32(c), interval.active)
+
+    def eval_at(self, scale: mi.Float, ray: Ray, t: mi.Float, active: mi.Bool) -> list[mi.Float]:
+        return self._rows(dr.detach(self.scaled(scale)))
+
+    def jvp_at(self, tangent: mi.Float | mi.Color3f, ray: Ray, t: mi.Float, active: mi.Bool) -> list[mi.Float]:
+        return self._rows(tangent)
+
+    def vjp_at(self, gradient: mi.Float, weight: list[mi.Float], ray: Ray, t: mi.Float, active: mi.Bool) -> None:
+        for c, w in enumerate(weight):
+            dr.scatter_add(gradient, dr.select(active, w, 0), mi.UInt32(c), active)
+
+    def _along(self, value: mi.Float | mi.Color3f, length: mi.Float) -> list[mi.Float]:
+        # A ray that never leaves a medium has infinite length: 0 * inf would be NaN.
+        return [dr.select(v != 0, v * length, 0) for v in self._rows(value)]
+
+    def _rows(self, value: mi.Float | mi.Color3f) -> list[mi.Float]:
+        # A grey value is taken whole: the index of a Dr.Jit array reads it, and bakes it into the kernel.
+        return [value] if self.channels == 1 else [value.x, value.y, value.z]
+
+
+def _length(interval: RayInterval) -> mi.Float:
+    return dr.select(interval.active & (interval.t1 > interval.t0), mi.Float(interval.t1 - interval.t0), 0)
+
+
+def _finite(length: mi.Float) -> mi.Float:
+    """A length for derivatives: 0 for an interval without end, whose transmittance stays 0 whatever the constant is."""
+    return dr.select(length < 1e30, length, 0)
+
+
+@dataclass
+class BoundedExtinction:
+    """A field of unknown line integrals (:class:`mivol.transport.media.extinction.Extinction`).
+
+    Its gradient is that of the medium's scale; those of the field's parameters are with Dr.Jit.
+
+    Attributes:
+        name: ``sigma_t``, ``sigma_a`` or ``sigma_s``.
+        field: its values [1/length] for a scale of 1.
+        scale: of the medium, without derivatives.
+        majorant: the field's largest value [1/length] in any channel; an opaque array, so that kernels do not depend on it.
+    """
+
+    name: str
+    field: Field
+    scale: mi.Float
+    majorant: mi.Float
+    exact_line: ClassVar[bool] = False
+    is_constant: ClassVar[bool] = False
+    lattice: ClassVar[None] = None
+
+    def __post_init__(self) -> None:
+        self._rows = Box(self.field.to_world).rows()
+
+    @property
+    def channels(self) -> int:
+        """1 (grey) or 3 (rgb)."""
+        return self.field.channels
+
+    def scaled(self, scale: mi.Float) -> mi.Float:
+        return scale
+
+    def start_gradient(self) -> mi.Float:
+        return dr.zeros(mi.Float, 1)
+
+    def deliver(self, scale: mi.Float, gradient: mi.Float) -> mi.Float:
+        dr.eval(gradient)
+        return dr.sum(scale * gradient)
+
+    def clip(self, interval: RayInterval) -> tuple[mi.Float, mi.Float]:
+        """The part [t0, t1] of an interval of a ray that lies in the field's box; t1 <= t0 where there is none."""
+        ray, t0, t1 = interval.ray, mi.Float64(interval.t0), mi.Float64(interval.t1)
+        _, _, t0, t1 = slab(self._rows, (0.0,) * 3, (1.0,) * 3, ray.o, ray.d, t0, t1)
+        return mi.Float(t0), mi.Float(t1)
+
+    def eval_at(self, scale: mi.Float, ray: Ray, t: mi.Float, active: mi.Bool) -> list[mi.Float]:
+        return [dr.detach(scale) * value for value in dr.detach(self.field.eval(ray(t), ray.d, active))]
+
+    def jvp_at(self, tangent: mi.Float, ray: Ray, t: mi.Float, active: mi.Bool) -> list[mi.Float]:
+        with dr.resume_grad():
+            values = self.field.eval(ray(t), ray.d, active)
+            # One pass for all channels: it clears the edges behind it, which they share.
+            changes = tangent_of(mi.Color3f(*values)) if self.channels == 3 else [tangent_of(values[0])]
+        pairs = zip(dr.detach(values), changes, strict=True)
+        return [dr.select(active, tangent * value + self.scale * change, 0) for value, change in pairs]
+
+    def vjp_at(self, gradient: mi.Float, weight: list[mi.Float], ray: Ray, t: mi.Float, active: mi.Bool) -> None:
+        values = dr.detach(self.field.eval(ray(t), ray.d, active))
+        by_scale = sum((w * value for w, value in zip(weight, values, strict=True)), mi.Float(0))
+        dr.scatter_add(gradient, dr.select(active, by_scale, 0), mi.UInt32(0), active)
+        self.field.accumulate(ray(t), ray.d, [self.scale * w for w in weight], active)

@@ -14,9 +14,9 @@ from mivol.fields.gaussian_line import ROW, SCALE, Line, Slopes, change_of, read
 from mivol.fields.gaussians import GaussianField
 from mivol.numerics import greater, lesser
 from mivol.transport.media.extinction import RayInterval
-from mivol.transport.traversal.fine_ray import Ray
 from mivol.transport.traversal.grid_walk import Cell, walk
 from mivol.transport.traversal.lattice import Lattice, Segment, clip
+from mivol.transport.traversal.rays import Ray
 
 __all__ = ["GaussianExtinction", "Passage", "add_block"]
 

@@ -7,15 +7,34 @@ from typing import ClassVar
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
-from mivol.transport.media.extinction import RayInterval
-from mivol.transport.media.grid_integral import Gradient, backproject_segment, integrate_segment
-from mivol.transport.traversal.fine_ray import Ray
-from mivol.transport.traversal.grid_walk import box_nodes
+from mivol.fields.activation import Activation
+from mivol.transport.media.extinction import ExactExtinction, RayInterval
+from mivol.transport.media.grid_integral import (
+    ActivatedNodes,
+    Gradient,
+    backproject_activated,
+    backproject_segment,
+    integrate_activated,
+    integrate_segment,
+)
+from mivol.transport.traversal.grid_walk import Nodes, box_nodes
 from mivol.transport.traversal.interpolation import interpolate, upward_frac, weights
 from mivol.transport.traversal.lattice import Lattice, Segment, clip, locate
+from mivol.transport.traversal.rays import Ray
 
-__all__ = ["GridExtinction", "NodeValues", "add_to_cell", "clip_interval", "interpolate_at"]
+__all__ = [
+    "GridExtinction",
+    "NodeValues",
+    "add_to_cell",
+    "clip_interval",
+    "interpolate_at",
+    "ActivatedGridExtinction",
+    "SummedExtinction",
+    "activate",
+    "share_cells",
+]
 
 
 @dataclass
@@ -117,3 +136,95 @@ def add_to_cell(gradient: Gradient, lower: mi.Vector3i, terms: list[tuple], acti
     for c in range(gradient.channels):
         values = [sum(w[c] * corners[q] for w, corners in terms) for q in range(8)]
         gradient.add_at(c, lower, values, active)
+
+
+@dataclass
+class ActivatedGridExtinction(NodeValues):
+    """A grey grid seen through an activation (:class:`mivol.transport.media.extinction.ExactExtinction`).
+
+    It is alone in its medium, whose scale is 1. The integral is a quadrature (:func:`.grid_integral.integrate_activated`).
+
+    Attributes:
+        activation: what makes an extinction [1/length] of an interpolated value.
+    """
+
+    activation: Activation
+    volume: ClassVar[None] = None
+
+    def integrate(self, interval: RayInterval, enough: mi.Float | None = None) -> list[mi.Float]:
+        return integrate_activated(self._nodes(), clip_interval(self.lattice, interval), interval.active, enough)
+
+    def jvp(self, tangent: mi.Float, interval: RayInterval) -> list[mi.Float]:
+        nodes = replace(self._nodes(), lattice=replace(self.lattice, empty_distances=None))
+        return integrate_activated(nodes, clip_interval(nodes.lattice, interval), interval.active, None, tangent)
+
+    def vjp(self, gradient: Gradient, weight: list[mi.Float], interval: RayInterval) -> None:
+        backproject_activated(self._nodes(), gradient, weight[0], clip_interval(self.lattice, interval), interval.active)
+
+    def eval_at(self, scale: mi.Float, ray: Ray, t: mi.Float, active: mi.Bool) -> list[mi.Float]:
+        (value,) = interpolate_at(self.lattice, dr.detach(self.scaled(scale)), ray, t, active)
+        # Outside of the box 0 is read, of which an activation may make a positive extinction.
+        inside = locate(self.lattice, ray.o, ray.d, t)[2]
+        return [dr.select(inside, self.activation.value_and_slope(value)[0], 0)]
+
+    def jvp_at(self, tangent: mi.Float, ray: Ray, t: mi.Float, active: mi.Bool) -> list[mi.Float]:
+        return [self._slope(ray, t, active) * row for row in interpolate_at(self.lattice, tangent, ray, t, active)]
+
+    def vjp_at(self, gradient: Gradient, weight: list[mi.Float], ray: Ray, t: mi.Float, active: mi.Bool) -> None:
+        self.add_at_point(gradient, [self._slope(ray, t, active) * weight[0]], ray, t, active)
+
+    def _nodes(self) -> ActivatedNodes:
+        return ActivatedNodes(self.lattice, dr.detach(self.values), self.activation)
+
+    def _slope(self, ray: Ray, t: mi.Float, active: mi.Bool) -> mi.Float:
+        """Derivative of the extinction with respect to the interpolated value, at a point of a ray."""
+        (value,) = interpolate_at(self.lattice, dr.detach(self.values), ray, t, active)
+        return self.activation.value_and_slope(value)[1]
+
+
+class SummedExtinction:
+    """The sum of the parts of an extinction for each channel: in a cell of their grids, and outside the grids.
+
+    Args:
+        parts: constants, and grids that share their cells.
+        values: node values or constant of each part.
+        scale: factor on the sum.
+        linear: whether the values are tangents, which no activation is applied to.
+    """
+
+    def __init__(self, parts: list[ExactExtinction], values: list, scale: mi.Float, linear: bool = False) -> None:
+        self.channels, self.scale = max(p.channels for p in parts), scale
+        pairs = list(zip(parts, values, strict=True))
+        self.activations = [None if linear else p.activation for p, _ in pairs if p.lattice is not None]
+        self.reads = [Nodes(v, p.channels) for p, v in pairs if p.lattice is not None]
+        self.has_constants = len(self.reads) < len(parts)
+        constants = [_as_channels(v, p.channels) for p, v in pairs if p.is_constant]
+        self.constant = [scale * sum((k[c % len(k)] for k in constants), mi.Float(0)) for c in range(self.channels)]
+
+    def along(self, corners: list, points: list[mi.Vector3f]) -> list[list[mi.Float]]:
+        """[channel][point] values at points of a cell (fractions from its near planes), from [read][channel][corner]."""
+        pairs = list(zip(corners, self.activations, strict=False))
+        grids = [[[activate(a, interpolate(g[c % len(g)], p)) for g, a in pairs] for p in points] for c in range(self.channels)]
+        return [
+            [dr.fma(self.scale, sum(s, mi.Float(0)), k) for s in sums] for sums, k in zip(grids, self.constant, strict=True)
+        ]
+
+    def slopes(self, corners: list, points: list[mi.Vector3f]) -> list[mi.Float] | None:
+        """Slope of the activation at points of a cell; None without one. A radiance field is the only part of its medium."""
+        if not any(self.activations):
+            return None
+        return [self.activations[0].value_and_slope(interpolate(corners[0][0], p))[1] for p in points]
+
+
+def share_cells(a: Lattice, b: Lattice) -> bool:
+    """Whether two grids have the same resolution and place."""
+    return a.res == b.res and np.array_equal(a.to_world, b.to_world)
+
+
+def activate(activation: Activation | None, value: mi.Float) -> mi.Float:
+    """The extinction of an interpolated value: the value itself without an activation."""
+    return value if activation is None else activation.value_and_slope(value)[0]
+
+
+def _as_channels(value: mi.Float | mi.Color3f, channels: int) -> list[mi.Float]:
+    return [value.x, value.y, value.z] if channels == 3 else [mi.Float(value)]

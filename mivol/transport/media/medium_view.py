@@ -9,16 +9,24 @@ stores no grid and two grids need not share a resolution.
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, field
 
+import drjit as dr
 import mitsuba as mi
+import numpy as np
 
-from mivol.transport.media.box import Box
-from mivol.transport.media.extinction import Extinction
+from mivol.errors import MivolError
+from mivol.fields.gaussians import GaussianField
+from mivol.fields.protocol import BOUNDED, Field
+from mivol.fields.spherical import SphericalGrid
+from mivol.transport.media.extinction import BoundedExtinction, ConstantExtinction, Extinction
 from mivol.transport.media.gaussian_extinction import GaussianExtinction
+from mivol.transport.media.grid_extinction import ActivatedGridExtinction, GridExtinction
+from mivol.transport.traversal.box import Box
 from mivol.transport.traversal.lattice import Lattice
 
-__all__ = ["MediumView"]
+__all__ = ["MediumView", "children_of", "nested_field", "traverse_medium", "view_medium"]
 
 
 @dataclass
@@ -88,3 +96,254 @@ class MediumView:
     def walked_lattice(self) -> Lattice | None:
         """The grid whose cells a sweep follows; None where everything is a constant."""
         return next((p.lattice for p in self.parts if p.lattice is not None), self.emission_lattice)
+
+
+STOCK = ("HomogeneousMedium", "HeterogeneousMedium")
+
+
+def view_medium(medium: mi.Medium, boundary: Box | None = None, places: dict | None = None, level: int = 0) -> MediumView:
+    """View a medium as a sum of fields.
+
+    Args:
+        medium: ``mivol_medium``, ``homogeneous`` or ``heterogeneous`` (over ``gridvolume``, ``constvolume`` or
+            ``mivol_voxels``).
+        boundary: the box that bounds it, if it is one. Mitsuba prints the place of a stock grid to 6 digits only; a grid that
+            fills its boundary to these digits is put exactly there.
+        places: a cache of where grids lie, by volume and boundary, which is added to; None for none.
+        level: of a radiance field that is nested.
+
+    Raises:
+        MivolError: a medium or a volume of another kind.
+    """
+    kind = kind_of(medium)
+    params = traverse_medium(medium)
+    if kind not in (*STOCK, "mivol_medium"):
+        raise MivolError(f"a medium of type {kind} was found; mivol renders mivol_medium, homogeneous and heterogeneous media.")
+    children = children_of(medium)
+    names = [n for n in ("sigma_t", "sigma_a", "sigma_s") if n in children]
+    places = {} if places is None else places
+    scale = mi.Float(params["scale"]) if "scale" in params.properties else mi.Float(1)
+    parts = [
+        _field_part(name, children[name].mivol_extinction, scale)
+        if hasattr(children[name], "mivol_extinction")
+        else _part(name, params, children[name], kind, boundary, places)
+        for name in names
+    ]
+    albedo_arrays = [v for k, v in params if k.startswith("sigma_s." if "sigma_s" in names else "albedo.")]
+    albedo = _field(params, "albedo") if "sigma_s" not in names else None
+    emission, emission_density = _field(params, "emission"), _field(params, "emission_density")
+    emission_arrays = [v for k, v in params if k.startswith("emission") and k.endswith((".data", ".value.value"))]
+    if not parts:
+        parts, albedo, emission_arrays = [_part_of_field(emission, level)], mi.Float(0), []
+        if isinstance(parts[0], GaussianExtinction):
+            emission = None  # their light is in their order along a ray: no function of place has it
+    light = [f for f in (emission_density, emission, albedo) if emission is not None or emission_density is not None]
+    emission_lattice = _emission_lattice(emission_density, light, boundary, places)
+    stock_boxes = {v.ptr: Box(_place(v, boundary, places)) for v in light if _repeats_border(v)}
+    numbers = {k.partition(".")[0]: v for k, v in params if k in ("scale", *(f"{n}.value.value" for n in names))}
+    return MediumView(
+        medium,
+        parts,
+        scale,
+        albedo_arrays,
+        albedo,
+        _read_microflakes(medium),
+        emission,
+        emission_density,
+        emission_lattice,
+        emission_arrays,
+        stock_boxes,
+        numbers,
+    )
+
+
+def _read_microflakes(medium: mi.Medium) -> list[mi.Float] | None:
+    """The matrix S of the microflakes of a medium with an ``sggx`` phase function; None for all others.
+
+    Raises:
+        MivolError: a matrix that varies in space.
+    """
+    phase = medium.phase_function()
+    # In a blend or a mixture Mitsuba lets microflakes scatter light, but leaves the extinction independent of direction.
+    if phase is None or phase.class_name() != "SGGXPhaseFunction":
+        return None
+    flat = dr.ravel(next(v for k, v in mi.traverse(phase) if k.startswith("S.")))
+    rows = [dr.gather(mi.Float, flat, mi.UInt32(c)) for c in range(6)]
+    if not dr.flag(dr.JitFlag.FreezingScope):
+        host = np.array(dr.detach(flat)).reshape(-1, 6)
+        if not (host == host[0]).all():
+            raise MivolError(
+                f"the sggx phase function of a medium varies over its {len(host)} voxels; an extinction that "
+                "depends on the direction is exact for one S everywhere: give S as a gridvolume of one voxel."
+            )
+    return rows
+
+
+def _field(params: mi.SceneParameters, name: str) -> mi.Volume | mi.Float | mi.Color3f | None:
+    """The coefficient of a medium under a name: a constant with its gradient, or a volume; None where there is none."""
+    if f"{name}.value.value" in params.properties:
+        return params[f"{name}.value.value"]
+    key = next((k for k in params.properties if k.startswith(name + ".")), None)
+    return None if key is None else params.properties[key][2]
+
+
+def _part_of_field(volume: mi.Volume, level: int) -> ActivatedGridExtinction | GaussianExtinction:
+    """The extinction of a medium that is a radiance field: Gaussians, or the activation of a level of ``mivol_sh``."""
+    if hasattr(volume, "mivol_extinction"):
+        return _field_part("emission", volume.mivol_extinction, mi.Float(1), shows=True)
+    lattice = Lattice(volume.mivol_densities[level], volume.mivol_field.level_to_world(level))
+    return ActivatedGridExtinction("sigma_t", lattice, volume.mivol_field.act)
+
+
+def _emission_lattice(emission_density: object, others: list, boundary: Box | None, places: dict) -> Lattice | None:
+    """The grid of the emission density, else the finest of other fields, as a lattice of zeros; None without a grid."""
+    grids = [v for v in others if _is_grid(v)]
+    lead = (
+        emission_density if _is_grid(emission_density) else max(grids, key=lambda v: int(np.prod(v.resolution())), default=None)
+    )
+    if lead is None:
+        return None
+    x, y, z = (int(n) for n in lead.resolution())
+    return Lattice(dr.zeros(mi.TensorXf, (z, y, x, 1)), _place(lead, boundary, places))
+
+
+def _is_grid(volume: object) -> bool:
+    return isinstance(volume, mi.Volume) and volume.class_name() != "ConstVolume"
+
+
+def _repeats_border(volume: object) -> bool:
+    """Whether a volume repeats its border outside its own box, as stock grids do."""
+    return _is_grid(volume) and not hasattr(volume, "mivol_to_world")
+
+
+def _place(volume: mi.Volume, boundary: Box | None, places: dict) -> np.ndarray:
+    """Where a grid lies (4x4, unit cube to world), from the cache ``places`` or by :func:`place_of_grid`."""
+    key = (volume.ptr, None if boundary is None else boundary.to_world.tobytes())
+    if key not in places:
+        places[key] = place_of_grid(volume, boundary)
+    return places[key]
+
+
+def kind_of(medium: mi.Medium) -> str:
+    """Name of a medium's class; ``mivol_medium`` for ours (Mitsuba calls every Python class by its base)."""
+    return "mivol_medium" if hasattr(medium, "coefficients") else medium.class_name()
+
+
+def children_of(medium: mi.Medium) -> dict[str, mi.Object]:
+    """The volumes and the phase function of a medium, by name; one object may stand under several names."""
+    found = {}
+
+    class Children(mi.TraversalCallback):  # in here, since Mitsuba has no such class before a variant is set
+        def put(self, name: str, value: object, flags: int, cpptype: object = None) -> None:
+            if isinstance(value, mi.Object):
+                found[name] = value
+
+    medium.traverse(Children())
+    return found
+
+
+def nested_field(medium: mi.Medium) -> SphericalGrid | None:
+    """The radiance field that a medium is, where that has more than one level; None of all other media."""
+    field = getattr(children_of(medium).get("emission"), "mivol_field", None)
+    return field if field is not None and field.levels > 1 else None
+
+
+def traverse_medium(medium: mi.Medium) -> mi.SceneParameters:
+    """The parameters of a medium, each coefficient under its own name.
+
+    ``mi.traverse`` visits an object once: a volume that is both ``sigma_t`` and ``albedo`` (by a ``ref``, or because Mitsuba
+    merges equal objects of a scene) it lists under one of the names, and here it is listed under both.
+    """
+    params = mi.traverse(medium)
+    for name, child in children_of(medium).items():
+        own = mi.traverse(child)
+        params.properties |= {f"{name}.{key}": entry for key, entry in own.properties.items()}
+        params.hierarchy |= {node: entry for node, entry in own.hierarchy.items() if node not in params.hierarchy}
+    return params
+
+
+def _field_part(
+    name: str, field: Field | GaussianField, scale: mi.Float, shows: bool = False
+) -> BoundedExtinction | GaussianExtinction:
+    """The part of an extinction that a field of a shell of ours is.
+
+    Raises:
+        MivolError: a field of another kind, a majorant that is none, or a recording, in which no majorant can be read, and no
+            Gaussians be listed.
+    """
+    has_lists = isinstance(field, GaussianField)
+    if field.line != BOUNDED and not has_lists:
+        raise MivolError(
+            f"{name} is a {type(field).__name__} that declares {field.line!r}; media read {BOUNDED!r} fields and Gaussians."
+        )
+    if dr.flag(dr.JitFlag.FreezingScope):
+        what = "whose cells cannot be listed" if has_lists else "whose majorant cannot be read"
+        raise MivolError(f"{name} is a {type(field).__name__}, {what} while dr.freeze records: render without it.")
+    if has_lists:
+        return GaussianExtinction("sigma_t" if shows else name, field, dr.detach(scale), shows)
+    majorant = max(field.bound())
+    if not 0 <= majorant < np.inf:
+        raise MivolError(f"the majorant of {name}, a {type(field).__name__}, is {majorant:.4g}; a finite one is expected.")
+    return BoundedExtinction(name, field, dr.detach(scale), dr.opaque(mi.Float, majorant))
+
+
+def _part(
+    name: str, params: mi.SceneParameters, volume: mi.Volume, kind: str, boundary: Box | None, places: dict
+) -> Extinction:
+    """The part of an extinction under ``name`` among a medium's parameters."""
+    grid, constant = f"{name}.data", f"{name}.value.value"
+    if grid in params.properties:
+        lattice = Lattice(_tensor(params[grid]), _place(volume, boundary, places))
+        return GridExtinction(name, lattice, volume if volume.class_name() == "GridVolume" else None)
+    if constant not in params.properties:
+        found = sorted(k for k in params.properties if k.startswith(name + "."))
+        raise MivolError(
+            f"{name} of a {kind} has the parameters {found}; a number, an rgb triple, a constvolume, a gridvolume or "
+            "mivol_voxels is expected."
+        )
+    value = params[constant]
+    if kind != "HeterogeneousMedium":  # a stock heterogeneous fills the box of its constvolume only
+        return ConstantExtinction(name, value)
+    channels = [value[c] for c in range(dr.size_v(value))] if dr.size_v(value) == 3 else [mi.Float(value)]
+    values = mi.TensorXf(dr.ravel(mi.Color3f(*channels)) if len(channels) == 3 else channels[0], (1, 1, 1, len(channels)))
+    if volume.ptr not in places:
+        places[volume.ptr] = place_of_grid(volume)
+    return GridExtinction(name, Lattice(values, places[volume.ptr]))
+
+
+def _tensor(values: mi.TensorXf) -> mi.TensorXf:
+    """Grid values as (Z, Y, X, C)."""
+    return values if len(values.shape) == 4 else mi.TensorXf(values.array, (*values.shape, 1))
+
+
+def place_of_grid(volume: mi.Volume, boundary: Box | None = None) -> np.ndarray:
+    """Find where a grid volume lies: the (4, 4) float64 map of the unit cube to the world.
+
+    A ``mivol_voxels`` hands its own map out. A stock ``gridvolume`` only prints its transform, to 6 digits, and returns its
+    bounding box, in float32. The two together are exact for boxes along the axes. A turned grid is exact where it fills its
+    boundary, and elsewhere right to 5e-6 of its size.
+    """
+    if hasattr(volume, "mivol_to_world"):
+        return volume.mivol_to_world
+    text = str(volume)
+    rows = re.search(r"inverse_transpose=\[\[(.*?)\]\]", text, re.S).group(1)
+    place = np.array([[float(v) for v in row.split(",")] for row in re.split(r"\],\s*\[", rows)]).T
+    box = volume.bbox()
+    low, high = np.array(box.min, dtype=np.float64), np.array(box.max, dtype=np.float64)
+    place[:3, :3] *= ((high - low) / np.abs(place[:3, :3]).sum(axis=1))[:, None]
+    place[:3, 3] = (low + high - place[:3, :3].sum(axis=1)) / 2
+    place[3] = (0, 0, 0, 1)
+    if boundary is not None and boundary.matches(place, 1e-5):
+        return _same_axes(boundary.to_world, place)
+    return place
+
+
+def _same_axes(exact: np.ndarray, rough: np.ndarray) -> np.ndarray:
+    """The exact box, with its axes in the order and the direction of those of the rough one."""
+    edges = exact[:3, :3]
+    permutation = np.linalg.solve(edges, rough[:3, :3])  # of the axes, with signs, to the digits of ``rough``
+    axes = edges @ np.round(permutation)
+    centre = exact[:3, 3] + edges.sum(axis=1) / 2
+    place = np.eye(4)
+    place[:3, :3], place[:3, 3] = axes, centre - axes.sum(axis=1) / 2
+    return place

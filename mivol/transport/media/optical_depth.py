@@ -19,7 +19,7 @@ from mivol.transport.media.ray_intervals import (
     visit_media,
 )
 from mivol.transport.media.scene_media import SceneMedia
-from mivol.transport.traversal.fine_ray import Ray
+from mivol.transport.traversal.rays import Ray
 
 __all__ = [
     "integrate_optical_depth",

@@ -19,9 +19,8 @@ import mitsuba as mi
 from mivol.transport.media.body import Body
 from mivol.transport.media.extinction import RayInterval
 from mivol.transport.media.scene_media import SceneMedia
-from mivol.transport.traversal.fine_ray import FineRay, Ray, traced
-from mivol.transport.traversal.lattice import slab
-from mivol.transport.traversal.ray_spawning import distance_along, spawn_ray
+from mivol.transport.traversal.box import slab
+from mivol.transport.traversal.rays import FineRay, Ray, distance_along, spawn_ray, traced
 
 __all__ = [
     "OWN_SURFACE",

@@ -10,7 +10,7 @@ import mitsuba as mi
 
 from mivol.transport.media.body import Body, is_followed
 from mivol.transport.media.channels import as_rows
-from mivol.transport.traversal.ray_spawning import spawn_ray
+from mivol.transport.traversal.rays import spawn_ray
 
 __all__ = ["SceneMedia"]
 

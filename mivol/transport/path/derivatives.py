@@ -32,9 +32,8 @@ from mivol.transport.path.estimators import Estimators, Settings
 from mivol.transport.path.film import CameraRays
 from mivol.transport.path.successive import values_at
 from mivol.transport.path.walk import Landing, walk_branch, walk_path, walk_stem
-from mivol.transport.traversal.fine_ray import FineRay
 from mivol.transport.traversal.random_numbers import LaneSampler, draw_seeds
-from mivol.transport.traversal.ray_spawning import camera_ray
+from mivol.transport.traversal.rays import FineRay, camera_ray
 
 __all__ = ["count_branches", "replay_branches", "prepare_derivatives"]
 

@@ -12,8 +12,7 @@ from mivol.transport.estimators.scores import TrackedFactor
 from mivol.transport.estimators.segment import Collision, SegmentEstimate
 from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.path.estimators import Estimators
-from mivol.transport.traversal.fine_ray import FineRay, Ray
-from mivol.transport.traversal.ray_spawning import spawn_ray
+from mivol.transport.traversal.rays import FineRay, Ray, spawn_ray
 
 __all__ = ["PathEvent", "Turn", "TurnSamples", "sample_turn"]
 

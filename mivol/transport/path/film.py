@@ -16,7 +16,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mivol.errors import MivolError
-from mivol.transport.traversal.strata import Strata
+from mivol.transport.traversal.random_numbers import Strata
 
 __all__ = ["CameraRays", "RenderSamples", "adjoint_rays", "film_passes", "record"]
 

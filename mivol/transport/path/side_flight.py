@@ -22,14 +22,14 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from mivol.phase.hg import eval_hg, sample_hg
+from mivol.phase.closed_forms import eval_hg, sample_hg
 from mivol.phase.turn import direction_after, turn_between
 from mivol.transport.estimators.lighting.direct_lighting import DirectLight, DistantAim
 from mivol.transport.estimators.lighting.vertex import MediumVertex
 from mivol.transport.estimators.scores import PICTURE, Factor, TrackedTerm
 from mivol.transport.estimators.segment import Collision, PathSegment
 from mivol.transport.path.estimators import Estimators
-from mivol.transport.traversal.fine_ray import FineRay
+from mivol.transport.traversal.rays import FineRay
 
 __all__ = ["Aim", "SideFlight", "SideLight", "SideSamples", "fly_aside", "weigh_aim"]
 

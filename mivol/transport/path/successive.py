@@ -21,7 +21,7 @@ from mivol.transport.estimators.scores import Primal
 from mivol.transport.path.estimators import Estimators, Settings
 from mivol.transport.path.walk import Path, alpha_of, leave_camera, start_path, step
 from mivol.transport.traversal.random_numbers import LaneSampler, draw_seeds
-from mivol.transport.traversal.ray_spawning import camera_ray
+from mivol.transport.traversal.rays import camera_ray
 
 __all__ = ["paths_a_lane", "values_at", "walk_successively"]
 

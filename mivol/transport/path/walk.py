@@ -28,15 +28,13 @@ from mivol.transport.estimators.flights.free_flight import collision_at
 from mivol.transport.estimators.lighting.direct_lighting import DirectLight, DistantAim, power_heuristic
 from mivol.transport.estimators.scores import PICTURE, Primal, Replay, Tangent, TrackedTerm
 from mivol.transport.estimators.segment import Collision, PathSegment
+from mivol.transport.media.body import medium_interaction
 from mivol.transport.media.channels import colours
-from mivol.transport.media.coefficients import medium_interaction
 from mivol.transport.path.estimators import Estimators, Settings
 from mivol.transport.path.event import PathEvent, TurnSamples, sample_turn
 from mivol.transport.path.side_flight import Aim, SideSamples, fly_aside, weigh_aim
-from mivol.transport.traversal.fine_ray import FineRay, Ray, point_along
-from mivol.transport.traversal.random_numbers import LaneSampler, draw_state
-from mivol.transport.traversal.ray_spawning import camera_ray
-from mivol.transport.traversal.strata import Strata
+from mivol.transport.traversal.random_numbers import LaneSampler, Strata, draw_state
+from mivol.transport.traversal.rays import FineRay, Ray, camera_ray, point_along
 
 __all__ = [
     "Landing",

@@ -18,9 +18,10 @@ import numpy as np
 
 from mivol.errors import MivolError
 from mivol.space import check_affine, lattice_from_world
-from mivol.transport.traversal.fine_ray import Ray
+from mivol.transport.traversal.box import slab
+from mivol.transport.traversal.rays import Ray
 
-__all__ = ["Lattice", "Mask3", "Segment", "clip", "locate", "piece_points", "segment_between", "slab", "split"]
+__all__ = ["Lattice", "Mask3", "Segment", "clip", "locate", "piece_points", "segment_between", "split"]
 
 
 Mask3 = Any
@@ -35,8 +36,8 @@ class Lattice:
         values: TensorXf (Z, Y, X, C), at voxel centres.
         to_world: (4, 4) float64, unit cube to world.
         empty_distances: how far each block of cells is from the nearest that holds anything, or None where no block is to be
-            skipped (:mod:`mivol.transport.traversal.empty_blocks`).
-        block_ranges: :class:`mivol.transport.traversal.block_ranges.BlockRanges`, or None where every cell is walked.
+            skipped (:mod:`mivol.transport.traversal.grid_blocks`).
+        block_ranges: :class:`mivol.transport.traversal.grid_blocks.BlockRanges`, or None where every cell is walked.
         from_world: (3, 4) map from the world to lattice coordinates, made where it is not given.
     """
 
@@ -186,36 +187,3 @@ def piece_points(
     cell, frac = segment.cell + shift, segment.frac - mi.Vector3f(shift)
     points = [dr.clip(dr.fma(along, k / 3, frac), 0, 1) for k in range(4)]
     return cell, points, active & (segment.length > 0)
-
-
-def slab(
-    rows: list, low: tuple, high: tuple, o: mi.Point3f, d: mi.Vector3f, t0: mi.Float64, t1: mi.Float64
-) -> tuple[list[mi.Float64], list[mi.Float64], mi.Float64, mi.Float64]:
-    """Cut [t0, t1] of a ray to a box, in float64 (the slab test of Kay & Kajiya 1986).
-
-    Args:
-        rows: (3, 4) map from the world to the box's coordinates.
-        low, high: the box there.
-        o, d: world ray.
-        t0, t1: the interval of the ray to cut [length].
-
-    Returns:
-        The ray's origin and direction in the box's coordinates, and the interval inside; t1 <= t0 where there is none.
-    """
-    f64 = mi.Float64
-    o, d = [f64(o[a]) for a in range(3)], [f64(d[a]) for a in range(3)]
-    q, v = [], []
-    for a, row in enumerate(rows):
-        q.append(dr.fma(row[0], o[0], dr.fma(row[1], o[1], dr.fma(row[2], o[2], row[3]))))
-        v.append(dr.fma(row[0], d[0], dr.fma(row[1], d[1], row[2] * d[2])))
-        parallel = v[a] == 0
-        inv = 1 / dr.select(parallel, 1, v[a])
-        near, far = (low[a] - q[a]) * inv, (high[a] - q[a]) * inv
-        # A ray parallel to two faces lies between them along all its length or nowhere; the products with 1 / 0 would be NaN.
-        # In the plane of a face it counts as outside.
-        inside = (q[a] > low[a]) & (q[a] < high[a])
-        t0 = dr.select(parallel, dr.select(inside, t0, dr.inf), dr.maximum(t0, dr.minimum(near, far)))
-        t1 = dr.select(parallel, t1, dr.minimum(t1, dr.maximum(near, far)))
-    # The comparison is false for NaN, so rays with NaN get an empty interval; so do directions of length 0, whose interval
-    # would be infinite.
-    return q, v, t0, dr.select((t1 > t0) & dr.isfinite(t1 - t0), t1, t0)

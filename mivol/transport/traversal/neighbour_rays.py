@@ -13,7 +13,7 @@ import mitsuba as mi
 import numpy as np
 
 from mivol.device_arrays import aligned
-from mivol.transport.traversal.lattice import slab
+from mivol.transport.traversal.box import slab
 from mivol.transport.traversal.occupied_cells import Cells
 
 __all__ = ["FEWEST", "RayOrder"]

@@ -6,7 +6,7 @@ stands in the list, or how far a ray may go from there in one step. That takes f
 goes with the occupied ones.
 
 Levels. A grid may be one of several nested ones (:mod:`mivol.fields.spherical`): all have the same nodes, and their cells are
-counted one level after the other. A walk goes through one of them; :mod:`mivol.transport.traversal.nested_path` says which
+counted one level after the other. A walk goes through one of them; :mod:`mivol.transport.traversal.occupied_walk` says which
 piece of a ray lies in which.
 
 The search for the next occupied cell is an inner loop of its own. Lanes of a packet then wait for each other in the search,
@@ -20,20 +20,16 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from mivol.errors import MivolError
-from mivol.numerics import greater, lesser
 from mivol.space import check_affine, lattice_from_world
-from mivol.transport.traversal.cell_index import CellIndex
-from mivol.transport.traversal.interpolation import GAUSS
-from mivol.transport.traversal.lattice import Segment
+from mivol.transport.traversal.grid_blocks import BLOCK, SHIFT, count_blocks, distances
 
-__all__ = ["CellVisitor", "Cells", "end_of", "march", "reversed_from"]
+__all__ = ["Cells", "CellIndex"]
 
 
 @dataclass
@@ -138,9 +134,7 @@ def _between(place: mi.Int32, n: int) -> tuple[mi.Int32, mi.Int32]:
     return dr.maximum(place - 1, 0), dr.minimum(place, n - 1)
 
 
-def _corner_rows(
-    cell: mi.UInt32, row_of: Callable[[mi.UInt32], mi.UInt32], res: tuple[int, int, int]
-) -> list[mi.UInt32]:
+def _corner_rows(cell: mi.UInt32, row_of: Callable[[mi.UInt32], mi.UInt32], res: tuple[int, int, int]) -> list[mi.UInt32]:
     """Rows of the 8 corners of cells, from their flat index."""
     z, y, x = res
     i, j, k = (_between(a, n) for a, n in zip(_apart(cell, res), (x, y, z), strict=True))
@@ -148,136 +142,157 @@ def _corner_rows(
     return [row_of(mi.UInt32(((level + c) * y + b) * x + a)) for c in k for b in j for a in i]
 
 
+FILLED = 1 << 31
+"""Set in the entry of a brick that has a number."""
+
+CELLS = BLOCK**3
+"""Cells of a brick: the bits of two words."""
+
+
 @dataclass
-class CellVisitor:
-    """What a visitor is told of one occupied cell.
+class CellIndex:
+    """The listed cells of nested grids of one resolution.
 
     Attributes:
-        number: index in the list of occupied cells.
-        points: the two Gauss points, as fractions along the grid's own axes, in the order in which the ray meets them.
-        t: length walked before the cell [length].
-        dt: length in the cell [length].
-        along: the points, as fractions along each axis in the sense of the ray.
-        cell: the lower node of the cell.
-        level: that the cell lies in.
-        ahead: for each axis whether the ray runs upwards along it.
-        entered: the axis whose face the ray has come through from the cell that was visited before; -1 where it has come from
-            another cell, or along an edge.
-        leaves: the axis whose face the ray leaves through; the first of them at an edge.
+        counts: bricks (Z, Y, X) of a level.
+        bricks: UInt32, of each brick of all levels: its distance, or ``FILLED`` and its number.
+        bits: UInt32, two for each brick that has a number: of its cells with z of 0, 1 and of 2, 3, x fastest.
+        before: UInt32, for each of these how many listed cells are before it.
     """
 
-    number: mi.UInt32
-    points: tuple[mi.Vector3f, mi.Vector3f]
-    t: mi.Float
-    dt: mi.Float
-    along: tuple[mi.Vector3f, mi.Vector3f]
-    cell: mi.Vector3i
-    level: mi.Int32 | int
-    ahead: Any
-    entered: mi.Int32
-    leaves: mi.Int32
+    counts: tuple[int, int, int]
+    bricks: mi.UInt32
+    bits: mi.UInt32
+    before: mi.UInt32
+
+    @property
+    def bytes(self) -> int:
+        """Memory that it takes."""
+        return 4 * (dr.width(self.bricks) + dr.width(self.bits) + dr.width(self.before))
+
+    @classmethod
+    def find(
+        cls,
+        res: tuple[int, int, int],
+        levels: int,
+        is_listed: Callable[[mi.UInt32], mi.Bool],
+        nodes: mi.UInt32 | None = None,
+    ) -> tuple[CellIndex, mi.UInt32]:
+        """The index, and the listed cells in the order of their numbers.
+
+        Args:
+            res: nodes (Z, Y, X).
+            levels: nested grids.
+            is_listed: of cells, by their flat numbers: x fastest, levels slowest.
+            nodes: flat numbers of all nodes that listed cells have among their corners; None for any.
+
+        Cost: one question a cell of the bricks at these nodes.
+        """
+        counts = tuple(count_blocks(n) for n in res)
+        total = levels * math.prod(counts)
+        # Where there is no node the brick of the first one is asked about: Dr.Jit has no arithmetic for arrays of length 0.
+        nodes = mi.UInt32(0) if nodes is not None and dr.width(nodes) == 0 else nodes
+        asked = dr.arange(mi.UInt32, total) if nodes is None else _bricks_at(nodes, res, counts, total)
+        lane = dr.arange(mi.UInt32, CELLS * dr.width(asked))
+        cell, is_inside = _cell_of(dr.gather(mi.UInt32, asked, lane // CELLS), lane % CELLS, res, counts)
+        is_held = is_listed(cell) & is_inside
+        dr.eval(is_held, cell)
+        listed = dr.gather(mi.UInt32, cell, dr.compress(is_held))
+        words = dr.block_sum(dr.select(is_held, mi.UInt32(1) << (lane & 31), 0), 32)
+        low, high = (dr.gather(mi.UInt32, words, 2 * dr.arange(mi.UInt32, dr.width(asked)) + k) for k in (0, 1))
+        before = dr.prefix_sum(dr.popcnt(low) + dr.popcnt(high))
+        filled = dr.compress((low | high) != 0)
+        count = dr.width(filled)
+        if count == 0:
+            # Dr.Jit cannot gather from an array of length 0, not even with all lanes inactive.
+            far = distances(dr.zeros(mi.Bool, total), counts)
+            return cls(counts, mi.UInt32(far), dr.zeros(mi.UInt32, 2), dr.zeros(mi.UInt32, 1)), listed
+        place, is_filled, bits = dr.gather(mi.UInt32, asked, filled), dr.zeros(mi.UInt8, total), dr.zeros(mi.UInt32, 2 * count)
+        dr.scatter(is_filled, mi.UInt8(1), place)
+        dr.scatter(bits, mi.ArrayXu([dr.gather(mi.UInt32, word, filled) for word in (low, high)]), dr.arange(mi.UInt32, count))
+        bricks = mi.UInt32(distances(is_filled > 0, counts))
+        dr.scatter(bricks, dr.arange(mi.UInt32, count) | FILLED, place)
+        index = cls(counts, bricks, bits, dr.gather(mi.UInt32, before, filled))
+        dr.eval(index, listed)
+        return index, listed
+
+    def look(
+        self, cell: mi.Vector3i, level: mi.Int32 | int, ahead: mi.Array3b, active: mi.Bool
+    ) -> tuple[mi.UInt32, mi.Vector3i]:
+        """The number of the brick of cells, and how many cells a ray may cross along each axis, its own among them.
+
+        Args:
+            cell: along x, y and z, from 0.
+            level: that it lies in.
+            ahead: whether the ray runs upwards along each axis.
+            active: lanes that look.
+
+        Returns:
+            The number has no meaning where the brick has none; 0 cells along all axes where the cell is listed.
+        """
+        z, y, x = self.counts
+        place = cell >> SHIFT
+        at = mi.UInt32(place.x + x * (place.y + y * (place.z + z * level)))
+        entry = dr.gather(mi.UInt32, self.bricks, at, active)
+        is_filled = entry >= FILLED
+        number = entry & (FILLED - 1)
+        low, high = dr.gather(mi.ArrayXu, self.bits, number, active & is_filled, shape=(2, 1))
+        bits = dr.select((cell.z & 2) == 0, low, high)
+        here = mi.Int32(1 - ((bits >> _bit(cell)) & 1))
+        inside = cell & (BLOCK - 1)
+        within = dr.select(ahead, BLOCK - inside, inside + 1)
+        is_free = ~is_filled | _is_free(low, high, inside, ahead)
+        distance = mi.Int32(dr.select(is_filled, 1, entry))
+        return number, dr.select(is_free, within + BLOCK * (distance - 1), here)
+
+    def rank(self, cell: mi.Vector3i, number: mi.UInt32, active: mi.Bool) -> mi.UInt32:
+        """The number of listed cells, from that of their brick."""
+        low, high = dr.gather(mi.ArrayXu, self.bits, number, active, shape=(2, 1))
+        before = dr.gather(mi.UInt32, self.before, number, active)
+        below = (mi.UInt32(1) << _bit(cell)) - 1
+        is_low = (cell.z & 2) == 0
+        return before + dr.popcnt(dr.select(is_low, low & below, low)) + dr.popcnt(dr.select(is_low, 0, high & below))
 
 
-@dr.syntax
-def march(
-    cells: Cells,
-    segment: Segment,
-    visit: Callable[[Any, CellVisitor, mi.Bool], Any],
-    state: Any,
-    active: mi.Bool = True,
-    until: Callable[[Any], mi.Bool] | None = None,
-    level: mi.Int32 | int = 0,
-) -> tuple[Any, mi.Vector3i, mi.Float]:
-    """Visit the occupied cells that a segment crosses, in order.
-
-    Args:
-        cells: the list.
-        segment: from :func:`mivol.transport.traversal.lattice.clip`, or :func:`reversed_from`.
-        visit: ``visit(state, here, active) -> state``, called once, while the loop is traced.
-        state: any PyTree of Dr.Jit arrays.
-        active: lanes to walk.
-        until: ``until(state) -> mask`` of lanes that need not go on, asked after each cell; None to walk to the end.
-        level: that the segment lies in, in the level's own lattice coordinates.
-
-    Returns:
-        The last state, the last cell visited (lower node), and where the ray left it [length from the segment's start].
-
-    Error: positions are off by at most 2^-23 (X + Y + Z) of a cell.
-    Cost: two reads a search step, at most X + Y + Z + 3 of them, fewer where all around is empty.
-    """
-    # -- State: n counts the cells crossed since the first, along each axis ----------------------------------------------
-    index, length = cells.index, segment.length
-    z, y, x = cells.res
-    # An axis to which the ray is parallel counts as ahead: its fraction is then used as it is, without a rounding.
-    ahead = segment.d >= 0
-    sign = dr.select(ahead, mi.Vector3i(1), mi.Vector3i(-1))
-    first = segment.cell + 1
-    most = dr.select(ahead, mi.Vector3i(x, y, z) - first, first)
-    entry = dr.select(ahead, segment.frac, 1 - segment.frac)
-    speed = dr.abs(segment.d)
-    still = speed < 1e-30
-    pace = dr.select(still, 0, dr.rcp(speed))
-    never = dr.select(still, mi.Vector3f(1e30), 0)
-
-    active = mi.Bool(active) & (length > 0)
-    n = mi.Vector3i(0)
-    t = mi.Float(0)
-    entered = mi.Int32(-1)
-    last, left = mi.Vector3i(segment.cell), mi.Float(0)
-
-    while dr.hint(active, label="march"):
-        # -- The next occupied cell --------------------------------------------------------------------------------------
-        brick = mi.UInt32(0)
-        searching = mi.Bool(active)
-        while dr.hint(searching, label="search"):
-            brick, free = index.look(first + sign * n, level, ahead, searching)
-            searching &= free.x > 0
-            ends = n + free
-            reach = dr.fma(mi.Vector3f(ends) - entry, pace, never)
-            exit = lesser(lesser(reach.x, reach.y), reach.z)
-            there = dr.clip(mi.Vector3i(dr.fma(speed, exit, entry)), n, ends - 1)
-            there = dr.select(reach <= exit, ends, there)
-            t = dr.select(searching, exit, t)
-            n = dr.select(searching, there, n)
-            entered = dr.select(searching, -1, entered)
-            inside = (exit < length) & dr.all(there <= most)
-            active &= inside | ~searching
-            searching &= inside
-
-        # -- Visit it, and leave it ----------------------------------------------------------------------------------------
-        reach = dr.fma(mi.Vector3f(n + 1) - entry, pace, never)
-        exit = lesser(lesser(reach.x, reach.y), reach.z)
-        dt = greater(lesser(exit, length) - t, 0)
-        offset = entry - mi.Vector3f(n)
-        along = tuple(dr.clip(dr.fma(speed, dr.fma(dt, g, t), offset), 0, 1) for g in (GAUSS, 1 - GAUSS))
-        points = tuple(dr.select(ahead, p, 1 - p) for p in along)
-        through = reach <= exit
-        leaves = dr.select(through.x, 0, dr.select(through.y, 1, mi.Int32(2)))
-        cell = segment.cell + sign * n
-        here = CellVisitor(index.rank(cell + 1, brick, active), points, t, dt, along, cell, level, ahead, entered, leaves)
-        state = visit(state, here, active)
-        last = dr.select(active, cell, last)
-        left = dr.select(active, t + dt, left)
-        n = dr.select(through, n + 1, n)
-        entered = dr.select(dr.count(through) == 1, leaves, -1)
-        t = exit
-        active &= (exit < length) & dr.all(n <= most)
-        if until is not None:
-            active &= ~until(state)
-    return state, last, left
+def _bit(cell: mi.Vector3i) -> mi.UInt32:
+    """The bit of a cell in the word that has it."""
+    return mi.UInt32((cell.x & 3) | (cell.y & 3) << 2 | (cell.z & 1) << 4)
 
 
-def end_of(segment: Segment) -> mi.Vector3i:
-    """The cell (lower node) in which a segment ends, found in float64: one of the two that a face divides."""
-    cell = mi.Vector3i()
-    for a in range(3):
-        speed = mi.Float64(segment.d[a]) + mi.Float64(segment.d_rest[a])
-        cell[a] = segment.cell[a] + mi.Int32(dr.floor(dr.fma(speed, mi.Float64(segment.length), mi.Float64(segment.frac[a]))))
-    return cell
+def _is_free(low: mi.UInt32, high: mi.UInt32, inside: mi.Vector3i, ahead: mi.Array3b) -> mi.Bool:
+    """Whether bricks hold no listed cell from cells on along all axes, where a ray may still go."""
+    i, j, k = (mi.UInt32(a) for a in inside)
+    row = dr.select(ahead.x, (0xF << i) & 0xF, mi.UInt32(0xF) >> (3 - i)) * 0x11111111
+    rows = dr.select(ahead.y, (0xFFFF << (4 * j)) & 0xFFFF, mi.UInt32(0xFFFF) >> (12 - 4 * j)) * 0x00010001
+    every, second = mi.UInt32(0xFFFFFFFF), 16 * (k & 1)
+    planes, beyond = dr.select(ahead.z, every << second, every >> (16 - second)), dr.select(ahead.z, every, 0)
+    is_low = k < 2
+    seen = dr.select(is_low, low & planes, low & ~beyond) | dr.select(is_low, high & beyond, high & planes)
+    return (seen & row & rows) == 0
 
 
-def reversed_from(segment: Segment, cell: mi.Vector3i, t: mi.Float, until: mi.Float) -> Segment:
-    """The reversed segment from the point in ``cell`` at ``t`` back to ``until`` [lengths from the start of ``segment``]."""
-    planes = mi.Vector3f(cell - segment.cell)
-    frac = dr.clip(dr.fma(segment.d, t, segment.frac - planes), 0, 1)
-    return Segment(cell, frac, -segment.d, -segment.d_rest, segment.t0 + t, t - until)
+def _bricks_at(nodes: mi.UInt32, res: tuple[int, int, int], counts: tuple[int, int, int], total: int) -> mi.UInt32:
+    """The bricks, ascending, that hold a cell of which some of the nodes is a corner."""
+    (z, y, x), (b_z, b_y, b_x) = res, counts
+    level = nodes // (x * y * z)
+    i, j, k = nodes % x, nodes // x % y, nodes // (x * y) % z
+    near = dr.zeros(mi.UInt8, total)
+    # Node i is a corner of the cells i and i + 1.
+    for corner in range(8):
+        a, c, e = ((n + (corner >> axis & 1)) >> SHIFT for axis, n in enumerate((i, j, k)))
+        dr.scatter(near, mi.UInt8(1), a + b_x * (c + b_y * (e + b_z * level)))
+    return dr.compress(near > 0)
+
+
+def _cell_of(
+    brick: mi.UInt32, bit: mi.UInt32, res: tuple[int, int, int], counts: tuple[int, int, int]
+) -> tuple[mi.UInt32, mi.Bool]:
+    """Flat numbers of cells, some cell's of the grid where they lie beyond it, and whether they do not."""
+    (z, y, x), (b_z, b_y, b_x) = res, counts
+    i = brick % b_x * BLOCK + (bit & 3)
+    j = brick // b_x % b_y * BLOCK + (bit >> 2 & 3)
+    k = brick // (b_x * b_y) % b_z * BLOCK + (bit >> 4)
+    level = brick // (b_x * b_y * b_z)
+    is_inside = (i <= x) & (j <= y) & (k <= z)
+    i, j, k = dr.minimum(i, x), dr.minimum(j, y), dr.minimum(k, z)
+    return i + (x + 1) * (j + (y + 1) * (k + (z + 1) * level)), is_inside

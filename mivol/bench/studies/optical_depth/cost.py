@@ -17,7 +17,7 @@ from mivol.bench.studies.optical_depth.peers import by_drjit_dda, inside_box, pa
 from mivol.bench.studies.optical_depth.size import Size
 from mivol.bench.studies.optical_depth.work import Work, camera_rays, shuffled
 from mivol.transport.media.grid_integral import Gradient, backproject_segment, integrate_tau
-from mivol.transport.traversal.empty_blocks import block_bounds
+from mivol.transport.traversal.grid_blocks import block_bounds
 from mivol.transport.traversal.grid_walk import walk
 from mivol.transport.traversal.lattice import Lattice, clip
 

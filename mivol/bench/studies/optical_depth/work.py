@@ -12,7 +12,7 @@ from mivol.bench.extinctions import TO_WORLD
 from mivol.bench.harness.timing import Contestant
 from mivol.bench.scenes import perspective
 from mivol.transport.media.grid_integral import integrate_tau
-from mivol.transport.traversal.empty_blocks import find_empty_distances
+from mivol.transport.traversal.grid_blocks import find_empty_distances
 from mivol.transport.traversal.lattice import Lattice
 
 __all__ = ["Work", "camera_rays", "rays_across", "shuffled"]

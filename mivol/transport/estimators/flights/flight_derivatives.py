@@ -31,13 +31,12 @@ import mitsuba as mi
 from mivol.transport.estimators.flights.gaussian_light import GaussianLight
 from mivol.transport.estimators.lighting.direct_lighting import DirectLight
 from mivol.transport.estimators.segment import Collision, FlightPoint, PathSegment
-from mivol.transport.media.body import Body
+from mivol.transport.media.body import Body, emission_slope, eval_albedo, eval_emission
 from mivol.transport.media.channels import by_channel, spectrum, tangent_of
-from mivol.transport.media.coefficients import emission_slope, eval_albedo, eval_emission
 from mivol.transport.media.optical_depth import jvp_optical_depth, vjp_optical_depth
 from mivol.transport.media.ray_intervals import RaySegment
 from mivol.transport.media.scene_media import SceneMedia
-from mivol.transport.traversal.fine_ray import FineRay, Ray
+from mivol.transport.traversal.rays import FineRay, Ray
 
 __all__ = [
     "FlownSegment",

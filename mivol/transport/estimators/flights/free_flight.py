@@ -39,18 +39,16 @@ from mivol.transport.estimators.segment import (
     SegmentLight,
     SegmentTransmittance,
 )
-from mivol.transport.media.body import Body
+from mivol.transport.media.body import Body, eval_albedo, medium_interaction
 from mivol.transport.media.channels import colours, spectrum
-from mivol.transport.media.coefficients import eval_albedo, medium_interaction
-from mivol.transport.media.even_point import draw_even_point
+from mivol.transport.media.drawn_points import draw_even_point
 from mivol.transport.media.extinction import Extinction, RayInterval
 from mivol.transport.media.gaussian_extinction import GaussianExtinction
 from mivol.transport.media.optical_depth import sum_optical_depth
 from mivol.transport.media.ray_intervals import MediumInterval, MediumVisitor, RaySegment, revisit_media, visit_media
 from mivol.transport.media.scene_media import SceneMedia
-from mivol.transport.traversal.fine_ray import Ray, point_along
-from mivol.transport.traversal.random_numbers import LaneSampler, draw_pcg32, draw_state
-from mivol.transport.traversal.strata import Strata
+from mivol.transport.traversal.random_numbers import LaneSampler, Strata, draw_pcg32, draw_state
+from mivol.transport.traversal.rays import Ray, point_along
 
 __all__ = ["FreeFlight", "collision_at"]
 

@@ -20,11 +20,15 @@ from mivol.numerics import greater, lesser
 from mivol.transport.media.channels import as_rows
 from mivol.transport.media.extinction import ExactExtinction, RayInterval
 from mivol.transport.media.gaussian_extinction import GaussianExtinction
-from mivol.transport.media.grid_extinction import clip_interval
-from mivol.transport.media.summed_extinction import activate
-from mivol.transport.traversal.cubic import cubic_integral, cubic_through, invert_cubic_integral
+from mivol.transport.media.grid_extinction import activate, clip_interval
 from mivol.transport.traversal.grid_walk import Cell, Nodes, box_nodes, read_nodes, walk
-from mivol.transport.traversal.interpolation import gauss_points, interpolate
+from mivol.transport.traversal.interpolation import (
+    cubic_integral,
+    cubic_through,
+    gauss_points,
+    interpolate,
+    invert_cubic_integral,
+)
 from mivol.transport.traversal.lattice import piece_points
 from mivol.transport.traversal.random_numbers import draw_pcg32
 

@@ -22,8 +22,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mivol.numerics import largest_of
-from mivol.transport.media.bounded_extinction import BoundedExtinction
-from mivol.transport.media.extinction import RayInterval
+from mivol.transport.media.extinction import BoundedExtinction, RayInterval
 from mivol.transport.media.grid_extinction import GridExtinction, clip_interval
 from mivol.transport.traversal.grid_walk import Cell, walk
 from mivol.transport.traversal.lattice import Lattice, Segment

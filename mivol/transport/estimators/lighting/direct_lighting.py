@@ -31,8 +31,8 @@ from mivol.transport.media.channels import tangent_of
 from mivol.transport.media.optical_depth import jvp_optical_depth, vjp_optical_depth
 from mivol.transport.media.ray_intervals import RaySegment
 from mivol.transport.media.scene_media import SceneMedia
-from mivol.transport.traversal.fine_ray import FineRay
 from mivol.transport.traversal.random_numbers import seed_pcg32
+from mivol.transport.traversal.rays import FineRay
 
 __all__ = ["DirectLight", "DirectLighting", "DirectSample", "DistantAim", "EmitterAim", "power_heuristic"]
 

@@ -25,15 +25,14 @@ from mivol.transport.estimators.lighting.direct_lighting import DirectLight, pow
 from mivol.transport.estimators.lighting.shadow_rays import light_through
 from mivol.transport.estimators.lighting.vertex import Vertex
 from mivol.transport.estimators.scores import TrackedTerm
-from mivol.transport.media.body import Body
-from mivol.transport.media.box import Box
+from mivol.transport.media.body import Body, emission_slope, eval_emission
 from mivol.transport.media.channels import by_channel, colours, spectrum
-from mivol.transport.media.coefficients import emission_slope, eval_emission
 from mivol.transport.media.ray_intervals import RaySegment
 from mivol.transport.media.scene_media import SceneMedia
-from mivol.transport.traversal.box_walk import walk_box
-from mivol.transport.traversal.fine_ray import FineRay, Ray
+from mivol.transport.traversal.box import Box
+from mivol.transport.traversal.grid_walk import walk_box
 from mivol.transport.traversal.random_numbers import draw_pcg32
+from mivol.transport.traversal.rays import FineRay, Ray
 
 __all__ = [
     "EmissionLight",

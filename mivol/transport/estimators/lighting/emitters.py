@@ -9,8 +9,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mivol.transport.traversal.fine_ray import Ray
-from mivol.transport.traversal.strata import Strata
+from mivol.transport.traversal.random_numbers import Strata
+from mivol.transport.traversal.rays import Ray
 
 __all__ = [
     "UNIFORM",

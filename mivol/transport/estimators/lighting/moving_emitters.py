@@ -24,11 +24,10 @@ from mivol.transport.media.channels import spectrum
 from mivol.transport.media.extinction import ExactExtinction
 from mivol.transport.media.ray_intervals import OWN_SURFACE, MediumInterval, RaySegment, revisit_media
 from mivol.transport.media.scene_media import SceneMedia
-from mivol.transport.traversal.fine_ray import Ray, point_along, traced
 from mivol.transport.traversal.grid_walk import Cell, Nodes, walk
 from mivol.transport.traversal.interpolation import GAUSS, gauss_points
 from mivol.transport.traversal.lattice import Lattice, Segment, clip
-from mivol.transport.traversal.ray_spawning import distance_along, spawn_ray
+from mivol.transport.traversal.rays import Ray, distance_along, point_along, spawn_ray, traced
 
 __all__ = ["follow_emitter", "shadow_of_moving", "tau_by_end"]
 

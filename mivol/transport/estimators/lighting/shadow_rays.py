@@ -25,8 +25,8 @@ from mivol.transport.media.ray_intervals import (
     visit_media,
 )
 from mivol.transport.media.scene_media import SceneMedia
-from mivol.transport.traversal.fine_ray import FineRay, Ray
 from mivol.transport.traversal.random_numbers import draw_pcg32
+from mivol.transport.traversal.rays import FineRay, Ray
 
 __all__ = ["DARK", "SURE_DEPTH", "estimate_transmittance", "light_through", "shadow_ray"]
 

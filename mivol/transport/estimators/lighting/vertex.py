@@ -14,7 +14,7 @@ import mitsuba as mi
 
 from mivol.phase.turn import INV_FOUR_PI
 from mivol.transport.media.scene_media import SceneMedia
-from mivol.transport.traversal.ray_spawning import spawn_ray
+from mivol.transport.traversal.rays import spawn_ray
 
 __all__ = ["EitherVertex", "MediumVertex", "SurfaceVertex", "Vertex", "phase_context", "phase_pdf", "sample_phase"]
 

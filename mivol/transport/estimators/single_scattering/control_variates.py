@@ -29,14 +29,13 @@ from mivol.transport.estimators.lighting.direct_lighting import DirectLighting, 
 from mivol.transport.estimators.lighting.emitters import UNIFORM, EventSamples
 from mivol.transport.estimators.lighting.vertex import MediumVertex
 from mivol.transport.estimators.single_scattering.distance_sampling import taken_light
-from mivol.transport.media.body import Body
-from mivol.transport.media.coefficients import eval_albedo
+from mivol.transport.media.body import Body, eval_albedo
 from mivol.transport.media.ray_intervals import MediumInterval, RaySegment, find_boxed_intervals
 from mivol.transport.media.scene_media import SceneMedia
-from mivol.transport.traversal.fine_ray import Ray
 from mivol.transport.traversal.grid_walk import Cell, Nodes, box_nodes, read_nodes, walk
 from mivol.transport.traversal.interpolation import GAUSS, gauss_points, interpolate, node_weights, upward_frac, weights
 from mivol.transport.traversal.lattice import Lattice, clip, locate
+from mivol.transport.traversal.rays import Ray
 
 __all__ = [
     "CameraOrigins",

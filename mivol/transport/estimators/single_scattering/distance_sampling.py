@@ -21,12 +21,11 @@ from mivol.transport.estimators.single_scattering.shadow_tables import Visibilit
 from mivol.transport.media.body import Body
 from mivol.transport.media.ray_intervals import MediumInterval, MediumVisitor
 from mivol.transport.media.scene_media import SceneMedia
-from mivol.transport.traversal.cubic import cubic_at, cubic_integral, cubic_through, invert_cubic_integral
-from mivol.transport.traversal.fine_ray import Ray
 from mivol.transport.traversal.grid_walk import Cell, box_nodes, read_nodes, walk
-from mivol.transport.traversal.interpolation import gauss_points
+from mivol.transport.traversal.interpolation import cubic_at, cubic_integral, cubic_through, gauss_points, invert_cubic_integral
 from mivol.transport.traversal.lattice import clip, piece_points, split
 from mivol.transport.traversal.random_numbers import draw_pcg32, seed_pcg32
+from mivol.transport.traversal.rays import Ray
 
 __all__ = [
     "MediumEvent",

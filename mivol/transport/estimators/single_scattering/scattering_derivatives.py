@@ -30,13 +30,12 @@ from mivol.transport.estimators.single_scattering.control_variates import (
     Tracks,
 )
 from mivol.transport.estimators.single_scattering.distance_sampling import MediumEvent
-from mivol.transport.media.body import Body
+from mivol.transport.media.body import Body, eval_albedo, medium_interaction
 from mivol.transport.media.channels import by_channel, colours, spectrum, tangent_of
-from mivol.transport.media.coefficients import eval_albedo, medium_interaction
 from mivol.transport.media.optical_depth import jvp_optical_depth, transmittance, vjp_optical_depth
 from mivol.transport.media.ray_intervals import RaySegment, SegmentEnd
 from mivol.transport.media.scene_media import SceneMedia
-from mivol.transport.traversal.fine_ray import Ray
+from mivol.transport.traversal.rays import Ray
 
 __all__ = ["ScatteredSegment", "Scattering", "at_event", "medium_event_interaction", "sigma_s_at", "sigma_t_at"]
 

@@ -37,17 +37,16 @@ from mivol.transport.estimators.segment import Absorption, PathSegment, SegmentE
 from mivol.transport.estimators.single_scattering.distance_sampling import lit_length
 from mivol.transport.estimators.single_scattering.shadow_tables import TransmittanceGrid
 from mivol.transport.estimators.single_scattering.single_scattering import SingleScattering
-from mivol.transport.media.body import Body
+from mivol.transport.media.body import Body, eval_albedo, medium_interaction
 from mivol.transport.media.channels import spectrum
-from mivol.transport.media.coefficients import eval_albedo, medium_interaction
 from mivol.transport.media.optical_depth import transmittance
 from mivol.transport.media.ray_intervals import MediumInterval, RaySegment, visit_media
 from mivol.transport.media.scene_media import SceneMedia
-from mivol.transport.traversal.fine_ray import Ray, point_along
 from mivol.transport.traversal.grid_walk import Cell, walk
 from mivol.transport.traversal.interpolation import GAUSS
 from mivol.transport.traversal.lattice import clip
-from mivol.transport.traversal.strata import Strata
+from mivol.transport.traversal.random_numbers import Strata
+from mivol.transport.traversal.rays import Ray, point_along
 
 __all__ = ["ScatteringQuadrature"]
 

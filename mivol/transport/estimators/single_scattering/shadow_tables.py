@@ -22,7 +22,7 @@ from mivol.transport.estimators.lighting.shadow_rays import DARK, shadow_ray
 from mivol.transport.media.body import Body
 from mivol.transport.media.channels import spectrum
 from mivol.transport.media.scene_media import SceneMedia
-from mivol.transport.traversal.coarse_grid import CoarseGrid
+from mivol.transport.traversal.grid_blocks import CoarseGrid
 from mivol.transport.traversal.interpolation import interpolate
 from mivol.transport.traversal.lattice import Lattice
 

@@ -52,8 +52,8 @@ from mivol.transport.estimators.single_scattering.scattering_derivatives import 
 from mivol.transport.estimators.single_scattering.shadow_tables import VisibilityCache
 from mivol.transport.media.optical_depth import sum_optical_depth, transmittance
 from mivol.transport.media.ray_intervals import RaySegment, SegmentEnd, revisit_media, visit_media
-from mivol.transport.traversal.fine_ray import point_along
-from mivol.transport.traversal.strata import Strata
+from mivol.transport.traversal.random_numbers import Strata
+from mivol.transport.traversal.rays import point_along
 
 __all__ = ["SingleScattering"]
 

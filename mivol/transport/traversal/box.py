@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-__all__ = ["Box", "box_of_cube"]
+__all__ = ["Box", "box_of_cube", "slab"]
 
 
 @dataclass
@@ -60,3 +60,36 @@ def box_of_cube(shape: mi.Shape) -> Box:
 
 def _vertices(shape: mi.Shape) -> np.ndarray:
     return np.array(mi.traverse(shape)["vertex_positions"], dtype=np.float64).reshape(-1, 3)
+
+
+def slab(
+    rows: list, low: tuple, high: tuple, o: mi.Point3f, d: mi.Vector3f, t0: mi.Float64, t1: mi.Float64
+) -> tuple[list[mi.Float64], list[mi.Float64], mi.Float64, mi.Float64]:
+    """Cut [t0, t1] of a ray to a box, in float64 (the slab test of Kay & Kajiya 1986).
+
+    Args:
+        rows: (3, 4) map from the world to the box's coordinates.
+        low, high: the box there.
+        o, d: world ray.
+        t0, t1: the interval of the ray to cut [length].
+
+    Returns:
+        The ray's origin and direction in the box's coordinates, and the interval inside; t1 <= t0 where there is none.
+    """
+    f64 = mi.Float64
+    o, d = [f64(o[a]) for a in range(3)], [f64(d[a]) for a in range(3)]
+    q, v = [], []
+    for a, row in enumerate(rows):
+        q.append(dr.fma(row[0], o[0], dr.fma(row[1], o[1], dr.fma(row[2], o[2], row[3]))))
+        v.append(dr.fma(row[0], d[0], dr.fma(row[1], d[1], row[2] * d[2])))
+        parallel = v[a] == 0
+        inv = 1 / dr.select(parallel, 1, v[a])
+        near, far = (low[a] - q[a]) * inv, (high[a] - q[a]) * inv
+        # A ray parallel to two faces lies between them along all its length or nowhere; the products with 1 / 0 would be NaN.
+        # In the plane of a face it counts as outside.
+        inside = (q[a] > low[a]) & (q[a] < high[a])
+        t0 = dr.select(parallel, dr.select(inside, t0, dr.inf), dr.maximum(t0, dr.minimum(near, far)))
+        t1 = dr.select(parallel, t1, dr.minimum(t1, dr.maximum(near, far)))
+    # The comparison is false for NaN, so rays with NaN get an empty interval; so do directions of length 0, whose interval
+    # would be infinite.
+    return q, v, t0, dr.select((t1 > t0) & dr.isfinite(t1 - t0), t1, t0)

@@ -9,7 +9,7 @@ from radiance_rays import CUBE
 
 from mivol.fields.spherical import SphericalGrid
 from mivol.transport.line_integrals.radiance_field import cells_of
-from mivol.transport.traversal.nested_path import piece_of, pieces
+from mivol.transport.traversal.occupied_walk import piece_of, pieces
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
 

@@ -1,0 +1,208 @@
+"""TODO: one sentence."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from mivol.numerics import greater, lesser
+from mivol.transport.traversal.box import slab
+from mivol.transport.traversal.interpolation import GAUSS
+from mivol.transport.traversal.lattice import Segment, clip, segment_between
+from mivol.transport.traversal.occupied_cells import Cells
+
+__all__ = ["CellVisitor", "march", "end_of", "reversed_from", "Piece", "pieces", "piece_of"]
+
+
+@dataclass
+class CellVisitor:
+    """What a visitor is told of one occupied cell.
+
+    Attributes:
+        number: index in the list of occupied cells.
+        points: the two Gauss points, as fractions along the grid's own axes, in the order in which the ray meets them.
+        t: length walked before the cell [length].
+        dt: length in the cell [length].
+        along: the points, as fractions along each axis in the sense of the ray.
+        cell: the lower node of the cell.
+        level: that the cell lies in.
+        ahead: for each axis whether the ray runs upwards along it.
+        entered: the axis whose face the ray has come through from the cell that was visited before; -1 where it has come from
+            another cell, or along an edge.
+        leaves: the axis whose face the ray leaves through; the first of them at an edge.
+    """
+
+    number: mi.UInt32
+    points: tuple[mi.Vector3f, mi.Vector3f]
+    t: mi.Float
+    dt: mi.Float
+    along: tuple[mi.Vector3f, mi.Vector3f]
+    cell: mi.Vector3i
+    level: mi.Int32 | int
+    ahead: Any
+    entered: mi.Int32
+    leaves: mi.Int32
+
+
+@dr.syntax
+def march(
+    cells: Cells,
+    segment: Segment,
+    visit: Callable[[Any, CellVisitor, mi.Bool], Any],
+    state: Any,
+    active: mi.Bool = True,
+    until: Callable[[Any], mi.Bool] | None = None,
+    level: mi.Int32 | int = 0,
+) -> tuple[Any, mi.Vector3i, mi.Float]:
+    """Visit the occupied cells that a segment crosses, in order.
+
+    Args:
+        cells: the list.
+        segment: from :func:`mivol.transport.traversal.lattice.clip`, or :func:`reversed_from`.
+        visit: ``visit(state, here, active) -> state``, called once, while the loop is traced.
+        state: any PyTree of Dr.Jit arrays.
+        active: lanes to walk.
+        until: ``until(state) -> mask`` of lanes that need not go on, asked after each cell; None to walk to the end.
+        level: that the segment lies in, in the level's own lattice coordinates.
+
+    Returns:
+        The last state, the last cell visited (lower node), and where the ray left it [length from the segment's start].
+
+    Error: positions are off by at most 2^-23 (X + Y + Z) of a cell.
+    Cost: two reads a search step, at most X + Y + Z + 3 of them, fewer where all around is empty.
+    """
+    # -- State: n counts the cells crossed since the first, along each axis ----------------------------------------------
+    index, length = cells.index, segment.length
+    z, y, x = cells.res
+    # An axis to which the ray is parallel counts as ahead: its fraction is then used as it is, without a rounding.
+    ahead = segment.d >= 0
+    sign = dr.select(ahead, mi.Vector3i(1), mi.Vector3i(-1))
+    first = segment.cell + 1
+    most = dr.select(ahead, mi.Vector3i(x, y, z) - first, first)
+    entry = dr.select(ahead, segment.frac, 1 - segment.frac)
+    speed = dr.abs(segment.d)
+    still = speed < 1e-30
+    pace = dr.select(still, 0, dr.rcp(speed))
+    never = dr.select(still, mi.Vector3f(1e30), 0)
+
+    active = mi.Bool(active) & (length > 0)
+    n = mi.Vector3i(0)
+    t = mi.Float(0)
+    entered = mi.Int32(-1)
+    last, left = mi.Vector3i(segment.cell), mi.Float(0)
+
+    while dr.hint(active, label="march"):
+        # -- The next occupied cell --------------------------------------------------------------------------------------
+        brick = mi.UInt32(0)
+        searching = mi.Bool(active)
+        while dr.hint(searching, label="search"):
+            brick, free = index.look(first + sign * n, level, ahead, searching)
+            searching &= free.x > 0
+            ends = n + free
+            reach = dr.fma(mi.Vector3f(ends) - entry, pace, never)
+            exit = lesser(lesser(reach.x, reach.y), reach.z)
+            there = dr.clip(mi.Vector3i(dr.fma(speed, exit, entry)), n, ends - 1)
+            there = dr.select(reach <= exit, ends, there)
+            t = dr.select(searching, exit, t)
+            n = dr.select(searching, there, n)
+            entered = dr.select(searching, -1, entered)
+            inside = (exit < length) & dr.all(there <= most)
+            active &= inside | ~searching
+            searching &= inside
+
+        # -- Visit it, and leave it ----------------------------------------------------------------------------------------
+        reach = dr.fma(mi.Vector3f(n + 1) - entry, pace, never)
+        exit = lesser(lesser(reach.x, reach.y), reach.z)
+        dt = greater(lesser(exit, length) - t, 0)
+        offset = entry - mi.Vector3f(n)
+        along = tuple(dr.clip(dr.fma(speed, dr.fma(dt, g, t), offset), 0, 1) for g in (GAUSS, 1 - GAUSS))
+        points = tuple(dr.select(ahead, p, 1 - p) for p in along)
+        through = reach <= exit
+        leaves = dr.select(through.x, 0, dr.select(through.y, 1, mi.Int32(2)))
+        cell = segment.cell + sign * n
+        here = CellVisitor(index.rank(cell + 1, brick, active), points, t, dt, along, cell, level, ahead, entered, leaves)
+        state = visit(state, here, active)
+        last = dr.select(active, cell, last)
+        left = dr.select(active, t + dt, left)
+        n = dr.select(through, n + 1, n)
+        entered = dr.select(dr.count(through) == 1, leaves, -1)
+        t = exit
+        active &= (exit < length) & dr.all(n <= most)
+        if until is not None:
+            active &= ~until(state)
+    return state, last, left
+
+
+def end_of(segment: Segment) -> mi.Vector3i:
+    """The cell (lower node) in which a segment ends, found in float64: one of the two that a face divides."""
+    cell = mi.Vector3i()
+    for a in range(3):
+        speed = mi.Float64(segment.d[a]) + mi.Float64(segment.d_rest[a])
+        cell[a] = segment.cell[a] + mi.Int32(dr.floor(dr.fma(speed, mi.Float64(segment.length), mi.Float64(segment.frac[a]))))
+    return cell
+
+
+def reversed_from(segment: Segment, cell: mi.Vector3i, t: mi.Float, until: mi.Float) -> Segment:
+    """The reversed segment from the point in ``cell`` at ``t`` back to ``until`` [lengths from the start of ``segment``]."""
+    planes = mi.Vector3f(cell - segment.cell)
+    frac = dr.clip(dr.fma(segment.d, t, segment.frac - planes), 0, 1)
+    return Segment(cell, frac, -segment.d, -segment.d_rest, segment.t0 + t, t - until)
+
+
+@dataclass
+class Piece:
+    """The part of a ray in the box of one level and not in that of the level before.
+
+    Attributes:
+        level: counted from the innermost, 0.
+        segment: in the level's own lattice and lengths; its length is 0 where the ray has no such part.
+        scale: own lengths times this are lengths of the world: 2^level.
+    """
+
+    level: mi.Int32
+    segment: Segment
+    scale: mi.Float
+
+
+def pieces(cells: Cells) -> int:
+    """Number of pieces that a ray through nested boxes may have."""
+    return 2 * cells.levels - 1
+
+
+def piece_of(cells: Cells, o: mi.Point3f, d: mi.Vector3f, t_max: mi.Float | float, number: mi.Int32) -> Piece:
+    """A piece of rays.
+
+    Args:
+        cells: whose place and levels they cross.
+        o, d: world rays, |d| = 1.
+        t_max: where the rays end [length]; may be infinite.
+        number: of the piece, from 0 in the order of the ray.
+    """
+    if cells.levels == 1:
+        return Piece(mi.Int32(0), clip(cells, o, d, mi.Float(0), t_max), mi.Float(1))
+    n = cells.res[::-1]
+    last = dr.opaque(mi.Int32, cells.levels - 1)
+    level = dr.abs(number - last)
+    size = mi.Float64(mi.Int32(1) << level)
+    shrink = 1 / size
+    middle = [0.5 * (k - 1) for k in n]
+    f64 = mi.Float64
+    # The ray's origin as seen from the middle at 2^-level of its distance; the direction is the same in own lengths.
+    place = []
+    for row, m in zip(cells.from_world, middle, strict=True):
+        q = dr.fma(row[0], f64(o[0]), dr.fma(row[1], f64(o[1]), dr.fma(row[2], f64(o[2]), row[3])))
+        place.append(dr.fma(q - m, shrink, m))
+    speed = [dr.fma(row[0], f64(d[0]), dr.fma(row[1], f64(d[1]), row[2] * f64(d[2]))) for row in cells.from_world]
+    own = [[f64(a == b) for b in range(3)] + [f64(0)] for a in range(3)]
+    q, v, start, end = slab(own, (-0.5,) * 3, tuple(k - 0.5 for k in n), place, speed, f64(0), f64(t_max) * shrink)
+    inner = [tuple(m + sign * 0.25 * k for m, k in zip(middle, n, strict=True)) for sign in (-1, 1)]
+    _, _, entry, leave = slab(own, *inner, place, speed, start, end)
+    crosses = leave > entry
+    inwards, outwards = number < last, number > last
+    t0 = dr.select(outwards, dr.select(crosses, leave, end), start)
+    t1 = dr.select(inwards & crosses, entry, end)
+    return Piece(level, segment_between(q, v, n, t0, t1), mi.Float(size))
