@@ -13,7 +13,7 @@ import argparse
 from pathlib import Path
 
 import mivol  # noqa: F401  (chooses LLVM before anything loads it)
-from mivol.files import layers, read_exr, read_volume
+from mivol.files import read_exr, read_volume, stack_layers
 from mivol.report import figures, pixel_scale
 from mivol.report.record import RunRecord, read_metrics, read_record
 from mivol.validate.metrics import psnr
@@ -32,7 +32,7 @@ def held_out(folder: Path, record: RunRecord) -> list[tuple[str, np.ndarray, np.
     found = []
     for name in names:
         path = next(i.path for i in record.images if i.view == name and i.role == "render")
-        parts = layers(read_exr(folder / path)[0])
+        parts = stack_layers(read_exr(folder / path)[0])
         found.append((name, parts["reference"], parts[""]))
     return found
 
@@ -42,26 +42,26 @@ def noise_of(folder: Path, record: RunRecord, name: str, reference: np.ndarray) 
     path = next((i.path for i in record.images if i.view == name and i.role == "standard error"), None)
     if path is None:
         return ""
-    error = layers(read_exr(folder / path)[0])["standard_error"]
+    error = stack_layers(read_exr(folder / path)[0])["standard_error"]
     return f" (the truth itself would have {20 * np.log10(reference.max() / np.sqrt(np.mean(np.square(error)))):.1f} dB)"
 
 
 def show_views(rows: list[list[Axes]], views: list[tuple[str, np.ndarray, np.ndarray]]) -> None:
     """A row for each view: reference, prediction, difference."""
-    scale = pixel_scale.scale_of(*(reference for _, reference, _ in views))
+    scale = pixel_scale.shared_scale(*(reference for _, reference, _ in views))
     signed = pixel_scale.Scale("signed", -0.2 * scale.high, 0.2 * scale.high)
     for row, (_, reference, render) in zip(rows, views, strict=True):
         texts = ("not seen (Mitsuba)", f"predicted, {psnr(render, reference):.1f} dB", f"difference, ±{0.2 * scale.high:.2g}")
         pictures = ((reference, scale), (render, scale), (render - reference, signed))
         for axes, (image, how), text in zip(row, pictures, texts, strict=True):
-            put(axes, pixel_scale.pixels(image, how), text)
+            put(axes, pixel_scale.to_pixels(image, how), text)
 
 
 def show_slices(grid: dict[str, Axes], folder: Path, record: RunRecord) -> None:
     """The slice of truth and reconstruction."""
     plane = "xz" if record.config["views"].get("up") == "z" else "xy"
     grids = {v.role: (read_volume(folder / v.path).values, v.size) for v in record.volumes}
-    cuts = {role: pixel_scale.slices(*grids[role]) for role in ("truth", "reconstruction")}
+    cuts = {role: pixel_scale.middle_slices(*grids[role]) for role in ("truth", "reconstruction")}
     top = float(cuts["truth"].images[plane].max())
     for role, cut in cuts.items():
         image = mpl.colormaps["magma"](np.clip(cut.images[plane][..., 0] / top, 0, 1))
@@ -122,7 +122,7 @@ def main(folder: Path, out: Path, truth: list[float]) -> None:
         else:
             show_slices(grid, folder, record)
         show_curve(grid["curve"], rows)
-    figures.save(figure, out)
+    figures.save_figure(figure, out)
 
 
 if __name__ == "__main__":

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import mivol  # noqa: F401  (chooses LLVM before anything loads it)
 from mivol.files import read_exr, read_volume
-from mivol.report.figures import save
+from mivol.report.figures import save_figure
 from mivol.report.record import read_record
 
 import numpy as np
@@ -46,7 +46,7 @@ def main(folder: Path, out: Path) -> None:
         axes.set_title(title, fontsize=9, loc="left")
         axes.set_axis_off()
     out.parent.mkdir(exist_ok=True)
-    save(figure, out)
+    save_figure(figure, out)
 
 
 if __name__ == "__main__":

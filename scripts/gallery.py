@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import mivol  # noqa: F401  (chooses LLVM before anything loads it)
-from mivol.report.page_images import Picture, views_of, volumes_of
+from mivol.report.page_images import PageImage, make_view_rows, make_volume_views
 from mivol.report.record import read_record
 
 from PIL import Image
@@ -48,13 +48,13 @@ def drawn(name: str) -> Callable[[Path], list[Image.Image]]:
 def compared(folder: Path) -> list[Image.Image]:
     """What a run's first judged view was and is, and the same of a slice of its volume where the truth is known."""
     record = read_record(folder)
-    views = views_of(folder, [image for image in record.images if image.view and image.held_out]).rows
+    views = make_view_rows(folder, [image for image in record.images if image.view and image.held_out]).rows
     rows = [views[0].pictures[:2]] if views else []
-    rows += [cut.rows[1]["pictures"][:2] for cut in volumes_of(folder, record.volumes)[:1] if len(cut.rows) > 1]
+    rows += [cut.rows[1]["pictures"][:2] for cut in make_volume_views(folder, record.volumes)[:1] if len(cut.rows) > 1]
     return [decoded(picture) for row in rows for picture in row]
 
 
-def decoded(picture: Picture) -> Image.Image:
+def decoded(picture: PageImage) -> Image.Image:
     """A picture of a page as pixels, in its proportions."""
     image = Image.open(io.BytesIO(base64.b64decode(picture.uri.partition(",")[2]))).convert("RGB")
     return image.resize((max(1, round(image.height * picture.aspect)), image.height), Image.Resampling.NEAREST)

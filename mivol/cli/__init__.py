@@ -483,12 +483,12 @@ def demo(arguments: argparse.Namespace) -> None:
 
 def fetch(arguments: argparse.Namespace) -> None:
     """Bring public data that the examples show from its public address, checked and kept in a cache."""
-    from mivol.files.fetch import DATA, data_named, fetch_data
+    from mivol.files.fetch import DATA, fetch_data, find_data_set
 
     if not arguments.name:
         print("\n".join(data.text for data in DATA.values()))
         return
-    data = data_named(arguments.name)
+    data = find_data_set(arguments.name)
     print(data.text, file=sys.stderr)
     print(fetch_data(data, arguments.into))
 

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from mivol.optim.scenes.views import View
 from mivol.photos import PhotoFrame, Photos, PhotoSurvey
-from mivol.report.cameras import PARTS, parts_of, plot_cameras
+from mivol.report.cameras import PARTS, list_parts, plot_cameras
 from mivol.report.record import Image
-from mivol.report.scanner import plot_scanner, shown_views
+from mivol.report.scanner import plot_scanner, select_views
 from mivol.scene.cameras import find_box
 from mivol.scene.photographs import camera_of
 from mivol.tomography.geometry import FlatDetector, VoxelGrid
@@ -76,7 +76,7 @@ def pictures_of_scan(folder: Path, geometry: FlatDetector, grid: VoxelGrid, held
     for part in PARTS:
         plot_scanner(geometry, grid, held_out, folder / f"scanner_{part}.png", part)
     count = geometry.shape[0]
-    shown = sum(map(len, shown_views(count, held_out)))
+    shown = sum(map(len, select_views(count, held_out)))
     what = "Which way the light goes" if geometry.whole_lines else "Where the source stands"
     captions = {
         "side": f"{what} in {f'{shown} of ' * (shown < count)}{count} views, some detectors, and the box of the voxels",
@@ -86,7 +86,7 @@ def pictures_of_scan(folder: Path, geometry: FlatDetector, grid: VoxelGrid, held
 
 
 def _pictures(folder: Path, survey: PhotoSurvey) -> list[Image]:
-    parts = parts_of(survey)
+    parts = list_parts(survey)
     for part in parts:
         plot_cameras(survey, folder / f"cameras_{part}.png", part)
     return [Image(path=f"cameras_{part}.png", role="picture", caption=CAPTIONS[part]) for part in parts]

@@ -22,7 +22,7 @@ from mivol.experiments.task import Nobody, Task, Watcher
 from mivol.fields.procedural import make_procedural
 from mivol.files import write_volume
 from mivol.files.atomic import disk_faults
-from mivol.files.fetch import PREFIX, find_data, place_of
+from mivol.files.fetch import PREFIX, find_local_file, resolve_path
 from mivol.optim.strategy import nearest
 
 __all__ = ["EXAMPLES", "Example", "copy_example", "examples_folder", "list_examples", "run_example"]
@@ -72,8 +72,8 @@ class StandIn:
         Raises:
             MivolError: another set was named, and it has not been fetched.
         """
-        if named != PREFIX + self.data or find_data(self.data) is not None:
-            return place_of(Path(), named).resolve()
+        if named != PREFIX + self.data or find_local_file(self.data) is not None:
+            return resolve_path(Path(), named).resolve()
         print(f'the public data set "{self.data}" is not here: {self.says} (mivol fetch {self.data} brings it)')
         return self.write(folder)
 
@@ -279,7 +279,7 @@ def prepare(name: str, example: Example, source: Path, folder: Path, watcher: Wa
             watcher.say(["making the readings"])
             run_script(source / example.scan, ["-o", str(readings)])
         return [f"{setting}={quoted(readings / file)}" for setting, file in SCAN_FILES.items()]
-    if example.stand_in is None or find_data(example.stand_in.data) is not None:
+    if example.stand_in is None or find_local_file(example.stand_in.data) is not None:
         return []
     wanted = example.stand_in
     watcher.say([

@@ -15,7 +15,7 @@ from mivol.experiments.run_folder import RunFolder
 from mivol.experiments.task import Watcher
 from mivol.photos import Camera, Photos, follow_keyframes, interpolate_cameras, turntable
 from mivol.report.record import Image
-from mivol.report.video import WITHOUT_FFMPEG, film_suffix, volume_frames, write_video
+from mivol.report.video import NO_FFMPEG_NOTE, film_suffix, volume_frames, write_video
 
 __all__ = ["Film", "film_of_volume", "plan_film"]
 
@@ -58,7 +58,7 @@ class Film:
         """
         path = f"film/{self.way}{film_suffix()}"
         if not path.endswith(".mp4"):
-            watcher.say([WITHOUT_FFMPEG])
+            watcher.say([NO_FFMPEG_NOTE])
 
         def frames() -> Iterator[NDArray[np.uint8]]:
             for camera in watcher.track(self.cameras, "frames"):

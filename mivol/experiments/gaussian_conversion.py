@@ -90,7 +90,7 @@ def convert_to_gaussians(source: Path, target: Path, resolution: int | None, var
         and
             the disk.
     """
-    by_suffix(target, WRITERS)
+    select_by_suffix(target, WRITERS)
     set_variant(variant)
     field = load_field(source)
     made = gaussians_of_grid(field, resolution)
@@ -108,7 +108,7 @@ def read_as_gaussians(source: Path) -> Gaussians:
     Raises:
         MivolError: as the readers.
     """
-    existing_file(source)
+    check_file(source)
     return read_gaussians(source) if holds_gaussians(source) else gaussians_of_points(read_points(source))
 
 

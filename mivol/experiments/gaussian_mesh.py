@@ -15,7 +15,7 @@ from mivol.experiments.gaussian_conversion import EDGE, VIEWED, cameras_around, 
 from mivol.fields.depth_fusion import DepthView, fuse_depths
 from mivol.fields.gaussian_grid import box_of_gaussians
 from mivol.files.mesh import MESH_WRITERS, Mesh, write_mesh
-from mivol.files.source import by_suffix
+from mivol.files.source import select_by_suffix
 from mivol.photos import Camera, pixel_centres, rays
 from mivol.points.gaussians import Gaussians
 from mivol.splatting.splatter import Splatter, tensors_of
@@ -45,7 +45,7 @@ def convert_to_mesh(source: Path, target: Path, resolution: int, box: Sequence[f
     Raises:
         MivolError: as the readers, :func:`mivol.fields.depth_fusion.fuse_depths` and the disk.
     """
-    by_suffix(target, MESH_WRITERS)
+    select_by_suffix(target, MESH_WRITERS)
     set_variant(variant)
     cloud = read_as_gaussians(source)
     low, high = box_of_gaussians(cloud) if box is None else (np.array(box[:3]), np.array(box[3:]))

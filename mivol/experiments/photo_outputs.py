@@ -24,7 +24,7 @@ from mivol.optim.photographs.field_view import FieldView, render_view
 from mivol.optim.photographs.radiance_problem import RadianceProblem
 from mivol.photos import Camera, Photo, Photos
 from mivol.photos.photo_file import SPACES, decode_srgb
-from mivol.report.pixel_scale import depth_pixels, normal_pixels, normals_of_depth
+from mivol.report.pixel_scale import depth_pixels, normal_pixels, normals_from_depth
 from mivol.report.record import Image, Table, Volume
 from mivol.validate.images import METRICS, Quality, colour_fitted, judge, score
 
@@ -196,7 +196,7 @@ def write_density(folder: Path, field: SphericalGrid, level: int) -> Volume:
 def write_geometry(folder: Path, seen: FieldView, camera: Camera, near_far: tuple[float, float]) -> list[Image]:
     """Distance and normals of a view as colours."""
     near, far = near_far
-    normals = normals_of_depth(seen.depth, camera)
+    normals = normals_from_depth(seen.depth, camera)
     distances = f"from light, {near:.3g} [length], to dark, {far:.3g} [length]"
     pictures = {
         "distance": (depth_pixels(seen.depth, near_far, seen.opacity), distances),

@@ -163,7 +163,7 @@ def project_volume(wanted: Known, base: Path, geometry: FlatDetector, grid: Voxe
     Raises:
         MivolError: it has several channels or another shape than the grid.
     """
-    values = read_volume(place_of(base, wanted.file)).values
+    values = read_volume(resolve_path(base, wanted.file)).values
     if values.shape != (*grid.shape, 1):
         raise MivolError(f"{wanted.file} has shape {values.shape}, grid.shape is {grid.shape} of one channel: make them equal.")
     truth = wanted.scale * values[..., 0]

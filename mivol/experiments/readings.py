@@ -12,7 +12,7 @@ from mivol.config import Matrices, Measured, Nikon, Stack, Table
 from mivol.errors import MivolError
 from mivol.experiments.nikon_scan import read_nikon_scan
 from mivol.files import read_columns, read_projections, read_stack
-from mivol.files.fetch import place_of
+from mivol.files.fetch import resolve_path
 from mivol.shown import briefly
 from mivol.tomography.geometry import FlatDetector
 from mivol.tomography.preprocess import Transmission, correct_transmission, of_unknown_noise
@@ -49,7 +49,7 @@ def read_scan(chosen: config.Scan, base: Path) -> ScanReadings:
         transmission, geometry, notes = read_nikon_scan(wanted, base)
         return ScanReadings(transmission, geometry=geometry, notes=tuple(notes))
     if isinstance(wanted, Measured):
-        scan = read_projections(place_of(base, wanted.file), wanted.group)
+        scan = read_projections(resolve_path(base, wanted.file), wanted.group)
         fields = scan.projections, scan.flats, scan.darks
         check_unit(np.degrees(scan.angles), "degree", "write theta in degrees")
         return ScanReadings(correct_transmission(*fields, wanted.saturation), scan.angles, intensity=fields)

@@ -15,7 +15,7 @@ from mivol.config import Experiment, Files
 from mivol.errors import MivolError
 from mivol.experiments.task import Task
 from mivol.experiments.truth import holding
-from mivol.files import layers, read_exr
+from mivol.files import stack_layers, read_exr
 from mivol.files.fetch import PREFIX, place_of
 from mivol.optim.scenes.views import View, check_sizes
 from mivol.scene.load import LoadedScene, load_scene
@@ -102,7 +102,7 @@ def load_experiment_scene(chosen: Experiment, base: Path) -> LoadedScene:
     """
     given = chosen.scene.define.items()
     is_data = {key: isinstance(value, str) and value.startswith(PREFIX) for key, value in given}
-    defines = {key: str(place_of(base, value)) if is_data[key] else value for key, value in given}
+    defines = {key: str(resolve_path(base, value)) if is_data[key] else value for key, value in given}
     return load_scene(base / chosen.scene.file, defines)
 
 
@@ -162,7 +162,7 @@ def read_references(
             made = read_reference(base / name, of)
             seen.add(sensor, made.mean, standard_error(made))
         else:
-            seen.add(sensor, colours_of(base / name, layers(channels)))
+            seen.add(sensor, colours_of(base / name, stack_layers(channels)))
     return seen
 
 

@@ -16,14 +16,14 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from mivol.errors import MivolError
-from mivol.files.atomic import disk_faults, locked, sweep
+from mivol.files.atomic import disk_faults, lock_folder, remove_temporaries
 from mivol.report import figures
 from mivol.report.record import (
     METRICS,
     RECORD,
     RunRecord,
     append_metrics,
-    quantity_of,
+    find_quantity,
     read_metrics,
     read_record,
     rewind_metrics,
@@ -70,8 +70,8 @@ class RunFolder:
         Raises:
             MivolError: another run is at work in the folder.
         """
-        with locked(self.path):
-            sweep(self.path)
+        with lock_folder(self.path):
+            remove_temporaries(self.path)
             if not self._holds_a_run():
                 self._write()
             try:
@@ -164,7 +164,7 @@ class RunFolder:
         """What was saved, in a line: the results of the record."""
         words = []
         for name, value in self.record.results.items():
-            quantity = quantity_of(name, self.record.units)
+            quantity = find_quantity(name, self.record.units)
             if value is not None:
                 figure = f"{value:.0f}" if float(value).is_integer() else f"{value:.4g}"
                 words.append(f"{quantity.label} {figure} {quantity.beside}".rstrip())
@@ -184,4 +184,4 @@ class RunFolder:
         rows = read_metrics(self.path)
         names = {name for row in rows for name, value in row.items() if value is not None} - {"iteration", "seconds"}
         for name in sorted(names):
-            figures.save(figures.plot_curve(rows, name, units=self.record.units), self.path / "curves" / f"{name}.png")
+            figures.save_figure(figures.plot_curve(rows, name, units=self.record.units), self.path / "curves" / f"{name}.png")

@@ -31,7 +31,7 @@ from mivol.optim.projections.inversion import Inversion, Solve, fit_drift
 from mivol.optim.projections.linear_problems import LeastSquares, PoissonCounts, State, noise_norm
 from mivol.optim.projections.solvers import DIRECT, METHODS
 from mivol.report.page import write_page
-from mivol.report.pixel_scale import is_due, write_preview
+from mivol.report.pixel_scale import is_preview_due, write_preview
 from mivol.report.record import PlanLine, RunRecord
 from mivol.tomography.filtered import feldkamp, filtered_backprojection
 from mivol.tomography.geometry import ParallelBeam, VoxelGrid
@@ -199,7 +199,7 @@ def solve(task: Task, run: RunFolder, problem: Inversion, data: Projections, gri
                 errors["discrepancy"] = fit.run.state.residual_norm / noise
             run.append(fit.next, fit.seconds, loss=fit.history[-1]["loss"], **errors)
             best.see(fit.next, errors, {"volume": volume})
-            if is_due(fit.next, course.iterations):
+            if is_preview_due(fit.next, course.iterations):
                 write_preview(run.path, volume, tuple(grid.extent))
             watch(fit)
 

@@ -21,7 +21,7 @@ from mivol.experiments.runs import run_experiment
 from mivol.experiments.task import Nobody, Task, Watcher
 from mivol.fields.spherical import SphericalGrid
 from mivol.fields.spherical_files import load_field
-from mivol.files import layers, read_exr
+from mivol.files import stack_layers, read_exr
 from mivol.optim.first_order import Adam
 from mivol.optim.loop import Fit, Measure, reconstruct
 from mivol.optim.losses import L2, Loss
@@ -149,7 +149,7 @@ def picture(reference: Reference) -> mi.TensorXf:
         MivolError: a file that cannot be read, or an array that is no picture.
     """
     if isinstance(reference, str | os.PathLike):
-        values = layers(read_exr(Path(reference))[0])[""][..., :3]
+        values = stack_layers(read_exr(Path(reference))[0])[""][..., :3]
     else:
         values = np.asarray(reference, dtype=np.float32)
     values = values[..., None] if values.ndim == 2 else values

@@ -18,7 +18,7 @@ from mivol.config import Experiment, Sought
 from mivol.errors import MivolError
 from mivol.experiments.units import unit_of
 from mivol.files import read_volume
-from mivol.files.fetch import place_of as place_in
+from mivol.files.fetch import resolve_path as place_in
 from mivol.machine import check_fits
 from mivol.optim.events import Upsample, check_for_grids
 from mivol.optim.parameters import GRID, Parameter, as_tensor, find

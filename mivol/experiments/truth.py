@@ -14,7 +14,7 @@ from mivol.config import Experiment
 from mivol.errors import MivolError
 from mivol.fields.procedural import make_procedural
 from mivol.files import read_volume
-from mivol.files.fetch import place_of
+from mivol.files.fetch import resolve_path
 from mivol.machine import check_fits
 from mivol.optim.parameters import find, like
 
@@ -32,7 +32,7 @@ def make_truth(chosen: Experiment, base: Path, scene: mi.Scene) -> np.ndarray | 
         return None
     find(chosen.truth.key, mi.traverse(scene))
     if chosen.truth.file:
-        return read_volume(place_of(base, chosen.truth.file)).values
+        return read_volume(resolve_path(base, chosen.truth.file)).values
     wanted = chosen.truth
     said = " x ".join(str(n) for n in wanted.shape)
     check_fits(VOXEL_BYTES * math.prod(wanted.shape), f"a truth of {said} voxels", "give truth.shape fewer voxels")

@@ -274,7 +274,7 @@ def write_verdict(
 ) -> Verdict:
     """``validation.json`` and ``validation.png``; the verdict that names them."""
     compared = verdict.comparison
-    picture = figures.save(figures.plot_image_row(reference.mean, image.mean, compared.z), folder / "validation.png")
+    picture = figures.save_figure(figures.plot_image_row(reference.mean, image.mean, compared.z), folder / "validation.png")
     about = {
         "verdict": verdict.words,
         "code": verdict.code,

@@ -12,7 +12,7 @@ import numpy as np
 
 from mivol.errors import MivolError
 from mivol.experiments.view_field import camera_at
-from mivol.files.source import existing_file
+from mivol.files.source import check_file
 from mivol.photos import Camera
 from mivol.photos.photo_file import decode_srgb
 from mivol.points.cloud import PointCloud, read_points
@@ -76,7 +76,7 @@ def view_points(
     Raises:
         MivolError: as the readers, a camera that cannot be, or a look for Gaussians.
     """
-    is_cloud = not holds_gaussians(existing_file(path))
+    is_cloud = not holds_gaussians(check_file(path))
     if not is_cloud and look != PointLook():
         raise MivolError(f"{path} holds Gaussians, which have shapes of their own: leave out how points are drawn.")
     held = gaussians_for(read_points(path), look) if is_cloud else read_gaussians(path)

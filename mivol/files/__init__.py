@@ -8,7 +8,7 @@ from __future__ import annotations
 from mivol.files.atomic import whole_file, write_whole, write_whole_bytes, write_whole_text
 from mivol.files.formats import FORMATS, FRAMES, WRITERS, read_volume, write_volume
 from mivol.files.hdf5 import ProjectionData, read_projections
-from mivol.files.image_files import encode_srgb, layers, read_exr, read_exr_header, write_exr, write_png
+from mivol.files.image_files import encode_srgb, read_exr, read_exr_header, stack_layers, write_exr, write_png
 from mivol.files.image_stack import read_slices, read_stack
 from mivol.files.source import read_columns
 from mivol.files.volume import (
@@ -17,7 +17,7 @@ from mivol.files.volume import (
     check_volume,
     frame_from_box,
     frame_from_steps,
-    in_space,
+    to_space,
 )
 
 __all__ = [
@@ -31,8 +31,8 @@ __all__ = [
     "encode_srgb",
     "frame_from_box",
     "frame_from_steps",
-    "in_space",
-    "layers",
+    "to_space",
+    "stack_layers",
     "read_columns",
     "read_exr",
     "read_exr_header",

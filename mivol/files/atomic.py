@@ -5,7 +5,7 @@ is hidden and ends in ``.part``; it is removed whatever goes wrong, Ctrl-C inclu
 file it points to is replaced and the link stays.
 
 Here: :func:`whole_file` (for writers that want a path), :func:`write_whole` (for writers that want a binary file),
-:func:`write_whole_bytes`, :func:`write_whole_text`; :func:`sweep` removes what a killed process has left of its own.
+:func:`write_whole_bytes`, :func:`write_whole_text`; :func:`remove_temporaries` cleans up after killed processes.
 """
 
 from __future__ import annotations
@@ -113,7 +113,7 @@ def write_whole_text(path: str | os.PathLike, text: str) -> None:
 _TEMPORARY = re.compile(r"\..+\.[0-9a-f]{8}\.part")
 
 
-def sweep(folder: Path) -> list[Path]:
+def remove_temporaries(folder: Path) -> list[Path]:
     """Remove the temporaries of killed processes from a folder and the folders in it; call it where nobody else writes.
 
     Returns:
@@ -166,7 +166,7 @@ LOCK = ".lock"
 
 
 @contextmanager
-def locked(folder: Path) -> Iterator[None]:
+def lock_folder(folder: Path) -> Iterator[None]:
     """Hold a folder for this process; the system lets go of it however the process ends.
 
     Where the file system knows no locks (some network disks) nothing is held, and nothing is refused.

@@ -20,7 +20,7 @@ from pathlib import Path
 
 from mivol.errors import MivolError
 
-__all__ = ["DATA", "PREFIX", "DataSet", "cache_folder", "fetch_data", "find_data", "place_of"]
+__all__ = ["DATA", "PREFIX", "DataSet", "cache_folder", "fetch_data", "find_local_file", "resolve_path"]
 
 PREFIX = "data:"
 """With what a path begins that names a set."""
@@ -129,7 +129,7 @@ def cache_folder() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME") or home / ".cache") / "mivol"
 
 
-def data_named(name: str) -> DataSet:
+def find_data_set(name: str) -> DataSet:
     """The set of that name.
 
     Raises:
@@ -142,18 +142,18 @@ def data_named(name: str) -> DataSet:
     return DATA[name]
 
 
-def find_data(name: str) -> Path | None:
+def find_local_file(name: str) -> Path | None:
     """The file of a set, where it is on this machine; None where it is not.
 
     Raises:
         MivolError: there is no set of that name.
     """
-    data = data_named(name)
+    data = find_data_set(name)
     folders = [Path(folder) for folder in (os.environ.get("MIVOL_DATA"), cache_folder()) if folder]
     return next((folder / data.path for folder in folders if (folder / data.path).is_file()), None)
 
 
-def place_of(base: Path, named: str) -> Path:
+def resolve_path(base: Path, named: str) -> Path:
     """What an experiment names: a path relative to its file, or ``data:NAME``.
 
     Raises:
@@ -162,11 +162,11 @@ def place_of(base: Path, named: str) -> Path:
     if not named.startswith(PREFIX):
         return base / named
     name = named.removeprefix(PREFIX)
-    found = find_data(name)
+    found = find_local_file(name)
     if found is None:
         raise MivolError(
             f'the data set "{name}" is not on this machine: mivol fetch {name} brings it '
-            f"({data_named(name).size / 2**20:.2f} MiB), or name a file of your own in place of {named}."
+            f"({find_data_set(name).size / 2**20:.2f} MiB), or name a file of your own in place of {named}."
         )
     return found
 
@@ -190,7 +190,7 @@ def fetch_data(data: DataSet, folder: Path | None = None, watch: Callable[[int],
             the bytes are not those that the set had.
     """
     target = (folder or cache_folder()) / data.path
-    if target.is_file() and digest_of(target) == data.sha256:
+    if target.is_file() and hash_file(target) == data.sha256:
         return target
     target.parent.mkdir(parents=True, exist_ok=True)
     partial = target.with_name(f"{target.name}.partial")
@@ -203,7 +203,7 @@ def fetch_data(data: DataSet, folder: Path | None = None, watch: Callable[[int],
             f"{data.url} could not be fetched ({reason}) after {there} of {data.size} bytes: call again, and it goes on from "
             "there."
         ) from None
-    found, size = digest_of(partial), partial.stat().st_size
+    found, size = hash_file(partial), partial.stat().st_size
     if size < data.size:
         raise MivolError(
             f"{data.url} broke off after {size} of {data.size} bytes: call again, and it goes on from there."
@@ -238,7 +238,7 @@ def _read(answer: HTTPResponse) -> bytes:
     return answer.read1(CHUNK)
 
 
-def digest_of(path: Path) -> str:
+def hash_file(path: Path) -> str:
     """SHA-256 of a file."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()

@@ -17,8 +17,8 @@ import numpy as np
 
 from mivol.files import hdf5, les, metaimage, nifti, npy, nrrd, pbrt, vol, vti, vtk_legacy
 from mivol.files.atomic import write_whole
-from mivol.files.source import existing_file, refusal
-from mivol.files.volume import VolumeData, as_values, check_frame
+from mivol.files.source import check_file, refusal
+from mivol.files.volume import VolumeData, check_frame, to_values
 
 #: How many first bytes a format is recognised by.
 HEAD = 4096
@@ -104,7 +104,7 @@ def read_volume(path: str | os.PathLike, dataset: str | None = None, *, frame: s
         >>> read_volume("tooth.nrrd").values.shape
         (161, 94, 103, 1)
     """
-    path = existing_file(path)
+    path = check_file(path)
     if frame not in FRAMES:
         raise refusal("read_volume", f"frame={frame!r}", f"one of {', '.join(FRAMES)}", "choose one of those")
     suffix = _suffix(path, FORMATS)
@@ -146,7 +146,7 @@ def write_volume(
     """
     path = Path(path)
     writer = (WRITERS if compress else STORED_WRITERS)[_suffix(path, WRITERS)]
-    values = as_values(values, path)
+    values = to_values(values, path)
     to_world = np.eye(4) if to_world is None else np.array(to_world, np.float64)
     check_frame(to_world, path)
     write_whole(path, lambda file: writer(file, values, to_world, dict(metadata or {})))

@@ -20,8 +20,8 @@ from typing import Any
 import numpy as np
 
 from mivol.errors import MivolError
-from mivol.files.source import choose, existing_file, refusal
-from mivol.files.volume import VolumeData, as_values
+from mivol.files.source import check_file, refusal, select_dataset
+from mivol.files.volume import VolumeData, to_values
 from mivol.shown import briefly
 
 MAGIC = b"\x89HDF\r\n\x1a\n"
@@ -61,10 +61,10 @@ def read_hdf5(path: Path, dataset: str | None = None) -> VolumeData:
     """Read one dataset (Z, Y, X) or (Z, Y, X, C); it lies on the unit cube, for HDF5 says nothing else."""
     with _opened(path) as file:
         grids = _grids(file)
-        name = choose(path, dataset.strip("/") if dataset else None, list(grids))
+        name = select_dataset(path, dataset.strip("/") if dataset else None, list(grids))
         array = np.asarray(file[grids[name]])
     meta = {"path": str(path), "format": "hdf5", "dtype": str(array.dtype), "space": None, "dataset": name}
-    return VolumeData(as_values(array, path), np.eye(4), meta)
+    return VolumeData(to_values(array, path), np.eye(4), meta)
 
 
 def read_projections(path: str | os.PathLike, group: str = "exchange") -> ProjectionData:
@@ -78,11 +78,11 @@ def read_projections(path: str | os.PathLike, group: str = "exchange") -> Projec
         MivolError: no HDF5 file, h5py is not installed, a dataset missing, shapes that do not agree, angles that are
             not finite, counts with NaN or Inf.
     """
-    path = existing_file(path)
+    path = check_file(path)
     with _opened(path) as file:
         data = _dataset(file, path, group, "data")
         projections, flats, darks = (
-            as_values(np.asarray(_dataset(file, path, group, name)), f"{path}:{group}/{name}")[..., 0]
+            to_values(np.asarray(_dataset(file, path, group, name)), f"{path}:{group}/{name}")[..., 0]
             for name in ("data", "data_white", "data_dark")
         )
         theta = _dataset(file, path, group, "theta")

@@ -58,7 +58,7 @@ def read_exr(path: str | os.PathLike) -> tuple[dict[str, np.ndarray], dict[str, 
 
     Returns:
         name -> float32 (rows, columns), with the names of the file ("R", "variance.R" ...), and the header's
-        attributes. :func:`layers` stacks the channels again.
+        attributes. :func:`stack_layers` stacks the channels again.
 
     Raises:
         MivolError: missing, foreign, truncated, several parts, deep or subsampled pixels.
@@ -88,7 +88,7 @@ def read_exr_header(path: str | os.PathLike) -> tuple[tuple[int, int], tuple[str
     Raises:
         MivolError: missing, foreign or damaged.
     """
-    with source.existing_file(path).open("rb") as file:
+    with source.check_file(path).open("rb") as file:
         if file.read(len(MAGIC)) != MAGIC:
             raise refusal(path, "another kind of file (by its first bytes)", "OpenEXR", "name an .exr file")
     try:
@@ -101,7 +101,7 @@ def read_exr_header(path: str | os.PathLike) -> tuple[tuple[int, int], tuple[str
     return (width, height), names
 
 
-def layers(channels: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+def stack_layers(channels: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Stack channels into layers: "R", "G", "B" become "" (rows, columns, 3), "a.R" ... become "a"; others stay.
 
     Args:

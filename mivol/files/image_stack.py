@@ -14,8 +14,8 @@ import numpy as np
 
 from mivol.files import source
 from mivol.files.formats import read_volume
-from mivol.files.source import existing_file, refusal
-from mivol.files.volume import VolumeData, as_values, check_frame, frame_from_steps
+from mivol.files.source import check_file, refusal
+from mivol.files.volume import VolumeData, check_frame, frame_from_steps, to_values
 
 TIFF = (".tif", ".tiff")
 
@@ -33,9 +33,9 @@ def read_stack(path: str | os.PathLike, dataset: str | None = None) -> np.ndarra
     Raises:
         MivolError: no such file, not such a stack, images of several sizes, numbers that are not finite.
     """
-    files = sorted(Path(path).parent.glob(Path(path).name), key=order_of_numbers)
+    files = sorted(Path(path).parent.glob(Path(path).name), key=natural_order)
     if not files or Path(path).is_dir():
-        existing_file(path, in_a_folder=f'name a file in it, or a pattern of TIFF files: "{Path(path).name}/*.tif"')
+        check_file(path, in_a_folder=f'name a file in it, or a pattern of TIFF files: "{Path(path).name}/*.tif"')
     if files[0].suffix.lower() in TIFF:
         stack = read_images(files)
     elif len(files) > 1:
@@ -76,7 +76,7 @@ def read_images(files: list[Path]) -> np.ndarray:
 
     pages = []
     for file in files:
-        there = existing_file(file)
+        there = check_file(file)
         try:
             with Image.open(there) as image:
                 pages += [np.asarray(page, np.float32) for page in ImageSequence.Iterator(image)]
@@ -121,14 +121,14 @@ def read_slices(
     folder = Path(folder)
     if not folder.is_dir():
         raise refusal(folder, "no folder", "a folder of raw slices", "check the path")
-    files = sorted((name for name in folder.glob(pattern) if name.is_file()), key=order_of_numbers)
+    files = sorted((name for name in folder.glob(pattern) if name.is_file()), key=natural_order)
     if not files:
         raise refusal(folder, f"no file that fits {pattern!r}", "at least one slice", "give another pattern")
     rows, columns = shape
     if min(rows, columns) < 1:
         raise refusal(folder, f"a slice shape of {shape}", "at least 1 x 1", "give (rows, columns)")
-    slices = [source.elements(source.read_bytes(f), dtype, rows * columns, f, offset=skip) for f in files]
-    values = as_values(np.stack(slices).reshape(len(files), rows, columns), folder)
+    slices = [source.parse_elements(source.read_bytes(f), dtype, rows * columns, f, offset=skip) for f in files]
+    values = to_values(np.stack(slices).reshape(len(files), rows, columns), folder)
     to_world = frame_from_steps((columns, rows, len(files)), np.diag(spacing), origin)
     check_frame(to_world, folder)
     meta = {
@@ -141,6 +141,6 @@ def read_slices(
     return VolumeData(values, to_world, meta)
 
 
-def order_of_numbers(path: Path) -> tuple:
+def natural_order(path: Path) -> tuple:
     """Numbers in a name compare as numbers: pieces alternate text, number, text ..."""
     return tuple(int(piece) if piece.isdigit() else piece for piece in re.split(r"(\d+)", path.name))

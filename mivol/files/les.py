@@ -15,8 +15,8 @@ from pathlib import Path
 import numpy as np
 
 from mivol.files import source
-from mivol.files.source import choose, refusal
-from mivol.files.volume import VolumeData, as_values, frame_from_steps
+from mivol.files.source import refusal, select_dataset
+from mivol.files.volume import VolumeData, frame_from_steps, to_values
 
 COLUMNS = ("x,y,z,lwc,reff", "i,j,k,lwc,reff")
 """The line that names the columns, as AT3D's files have it and as its documentation does; both count cells."""
@@ -44,26 +44,26 @@ def read_les(path: Path, dataset: str | None = None) -> VolumeData:
     lines = [line for line in lines if line]
     if len(lines) < 4 or lines[3].replace(" ", "") not in COLUMNS:
         raise refusal(path, "another header", f"sizes, spacings, altitudes and {' or '.join(COLUMNS)}", "correct the file")
-    size = source.integers(lines[0].replace(",", " "), 3, path, "nx,ny,nz")
-    dx, dy = source.numbers(lines[1], 2, path)
-    altitudes = source.numbers(lines[2], size[2], path)
+    size = source.parse_integers(lines[0].replace(",", " "), 3, path, "nx,ny,nz")
+    dx, dy = source.parse_numbers(lines[1], 2, path)
+    altitudes = source.parse_numbers(lines[2], size[2], path)
     dz = np.diff(altitudes)
     if size[2] > 1 and np.ptp(dz) > UNEVEN * dz.mean():
         raise refusal(path, "altitudes of uneven steps", "an even grid", "resample the file first")
-    cells = source.numbers(",".join(lines[4:]), 5 * (len(lines) - 4), path).reshape(-1, 5)
+    cells = source.parse_numbers(",".join(lines[4:]), 5 * (len(lines) - 4), path).reshape(-1, 5)
     if min(size) < 1 or math.prod(size) > LARGEST:
         raise refusal(path, f"a grid of {size}", f"1 to {LARGEST} cells", "correct the second line")
     index = cells[:, :3].astype(int)
     if (index < 0).any() or (index >= size).any():
         raise refusal(path, f"the cell {index[(index >= size).any(1)][:1].tolist()}", f"within {size}", "correct it")
     fields = {"extinction": _extinction(cells, path), "lwc": cells[:, 3], "reff": cells[:, 4]}
-    name = choose(path, dataset or "extinction", list(fields))
+    name = select_dataset(path, dataset or "extinction", list(fields))
     grid = np.zeros(size[::-1])
     grid[index[:, 2], index[:, 1], index[:, 0]] = fields[name]
     spacing = 1e3 * np.array([dx, dy, dz.mean() if size[2] > 1 else dx])
     to_world = frame_from_steps(size, np.diag(spacing), (0.0, 0.0, 1e3 * altitudes[0]))
     meta = {"path": str(path), "format": "les", "dtype": "text", "space": None, "dataset": name, "unit": "m"}
-    return VolumeData(as_values(grid, path), to_world, meta)
+    return VolumeData(to_values(grid, path), to_world, meta)
 
 
 def _extinction(cells: np.ndarray, path: Path) -> np.ndarray:

@@ -85,8 +85,8 @@ def read_ply(path: str | os.PathLike) -> Mesh:
     if not end or not head.startswith(PLY_HEAD.encode()) or names not in kinds or counts.keys() != {"vertex", "face"}:
         raise refusal(path, "another layout", "a binary mesh as mivol writes it", "convert it")
     n, kind = counts["vertex"], kinds[names]
-    points = source.elements(body[: n * kind.itemsize], kind, n, path)
-    faces = source.elements(body[n * kind.itemsize :], FACE, counts["face"], path)
+    points = source.parse_elements(body[: n * kind.itemsize], kind, n, path)
+    faces = source.parse_elements(body[n * kind.itemsize :], FACE, counts["face"], path)
     held = {"points": "xyz", "normals": ("nx", "ny", "nz"), "colours": ("red", "green", "blue")}
     arrays = {k: np.stack([points[c] for c in v], axis=1) for k, v in held.items() if v[0] in kind.names}
     if "colours" in arrays:

@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 
 from mivol.files import source
-from mivol.files.source import no_dataset, refusal
-from mivol.files.volume import VolumeData, as_values, frame_from_steps
+from mivol.files.source import refusal, refuse_dataset
+from mivol.files.volume import VolumeData, frame_from_steps, to_values
 
 TYPES: dict[str, str] = {
     "MET_CHAR": "i1",
@@ -40,7 +40,7 @@ def read_metaimage(path: Path, dataset: str | None = None) -> VolumeData:
     Raises:
         MivolError: a key missing or not understood, or sizes that do not fit the data.
     """
-    no_dataset(path, dataset)
+    refuse_dataset(path, dataset)
     keys, local = _header(source.read_bytes(path), path)
     if _integers(keys, path, "NDims", 1) != [3]:
         raise refusal(path, f"NDims {keys['NDims']}", "3", "convert it to 3D")
@@ -50,7 +50,7 @@ def read_metaimage(path: Path, dataset: str | None = None) -> VolumeData:
         raise refusal(path, f"DimSize {keys['DimSize']} of {channels} channels", "sizes above 0", "correct the header")
     dtype = _dtype(keys, path)
     stored = _stored(keys, local, dtype, size[0] * size[1] * size[2] * channels, path)
-    values = as_values(stored.reshape(*size[::-1], channels), path)
+    values = to_values(stored.reshape(*size[::-1], channels), path)
     meta = {"path": str(path), "format": "metaimage", "dtype": str(dtype), "space": "LPS", "header": keys}
     return VolumeData(values, frame_from_steps(size, *_place(keys, path)), meta)
 
@@ -76,13 +76,13 @@ def _header(data: bytes, path: Path) -> tuple[dict[str, str], bytes]:
 def _integers(keys: dict[str, str], path: Path, name: str, count: int, default: str | None = None) -> list[int]:
     if name not in keys and default is None:
         raise refusal(path, f"no key {name}", "one in the MetaImage header", f"add '{name} = ...'")
-    return source.integers(keys.get(name, default), count, path, name)
+    return source.parse_integers(keys.get(name, default), count, path, name)
 
 
 def _floats(keys: dict[str, str], path: Path, names: tuple[str, ...], default: str) -> np.ndarray:
     """As many numbers as ``default`` has, under the first of ``names`` that is there."""
     name = next((name for name in names if name in keys), names[0])
-    return source.reals(keys.get(name, default), len(default.split()), path, name)
+    return source.parse_reals(keys.get(name, default), len(default.split()), path, name)
 
 
 def _truth(keys: dict[str, str], path: Path, *names: str) -> bool:
@@ -133,11 +133,11 @@ def _data_files(name: str, local: bytes, count: int, path: Path) -> list[Path]:
 def _unpack(data: bytes, keys: dict[str, str], dtype: np.dtype, count: int, path: Path) -> np.ndarray:
     (skip,) = _integers(keys, path, "HeaderSize", 1, default="0")
     if "BinaryData" in keys and not _truth(keys, path, "BinaryData"):
-        return source.numbers(data, count, path)
+        return source.parse_numbers(data, count, path)
     if _truth(keys, path, "CompressedData"):
-        data = source.inflate(data[max(skip, 0) :], "zlib", count * dtype.itemsize, path)
+        data = source.decompress(data[max(skip, 0) :], "zlib", count * dtype.itemsize, path)
         skip = 0
-    return source.elements(data, dtype, count, path, offset=len(data) - count * dtype.itemsize if skip < 0 else skip)
+    return source.parse_elements(data, dtype, count, path, offset=len(data) - count * dtype.itemsize if skip < 0 else skip)
 
 
 def _place(keys: dict[str, str], path: Path) -> tuple[np.ndarray, np.ndarray]:

@@ -18,8 +18,8 @@ from typing import NamedTuple
 import numpy as np
 
 from mivol.files import source
-from mivol.files.source import no_dataset, refusal
-from mivol.files.volume import VolumeData, as_values, frame_from_steps
+from mivol.files.source import refusal, refuse_dataset
+from mivol.files.volume import VolumeData, frame_from_steps, to_values
 
 TYPES: dict[int, str] = {
     2: "u1",
@@ -103,7 +103,7 @@ def read_nifti(path: Path, dataset: str | None = None) -> VolumeData:
     Raises:
         MivolError: truncated, a type that is not a real number, several time steps, no usable place.
     """
-    no_dataset(path, dataset)
+    refuse_dataset(path, dataset)
     data = source.read_bytes(path)
     head = _peek(data) if data[:2] == b"\x1f\x8b" else data
     layout, order = _layout(head)
@@ -124,7 +124,7 @@ def read_nifti(path: Path, dataset: str | None = None) -> VolumeData:
         "place": form,
         "unit": UNITS.get(fields["units"][0] & 7, "unknown"),
     }
-    return VolumeData(as_values(grid, path), frame_from_steps(size, steps, origin), meta)
+    return VolumeData(to_values(grid, path), frame_from_steps(size, steps, origin), meta)
 
 
 def _stored(data: bytes, offset: float, header: int, dtype: np.dtype, shape: list[int], path: Path) -> np.ndarray:
@@ -133,8 +133,8 @@ def _stored(data: bytes, offset: float, header: int, dtype: np.dtype, shape: lis
         raise refusal(path, f"vox_offset {offset}", f"0 to {LARGEST_OFFSET}", "correct the header")
     first, count = max(int(offset), header), math.prod(shape)
     if data[:2] == b"\x1f\x8b":
-        data = source.inflate(data, "gzip", first + count * dtype.itemsize, path)
-    return source.elements(data, dtype, count, path, offset=first)
+        data = source.decompress(data, "gzip", first + count * dtype.itemsize, path)
+    return source.parse_elements(data, dtype, count, path, offset=first)
 
 
 def _peek(data: bytes) -> bytes:

@@ -20,8 +20,8 @@ from pathlib import Path
 
 import numpy as np
 
-from mivol.files.image_stack import TIFF, check_finite, order_of_numbers, read_images
-from mivol.files.source import existing_file, refusal
+from mivol.files.image_stack import TIFF, check_finite, natural_order, read_images
+from mivol.files.source import check_file, refusal
 
 SECTION = "xtekct"
 
@@ -70,7 +70,7 @@ def read_nikon(path: str | os.PathLike) -> NikonScan:
     Raises:
         MivolError: no such file, a key that is missing or no number, another number of images than of projections.
     """
-    path = existing_file(path)
+    path = check_file(path)
     keys = _Keys(path, _section(path))
     rows, columns = keys.count("DetectorPixelsY"), keys.count("DetectorPixelsX")
     pitch = keys.length("DetectorPixelSizeY"), keys.length("DetectorPixelSizeX")
@@ -101,7 +101,7 @@ def read_nikon_angles(path: str | os.PathLike, views: int) -> np.ndarray:
     Raises:
         MivolError: no such file, or another number of angles than ``views``.
     """
-    path, found = existing_file(path), {}
+    path, found = check_file(path), {}
     for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
         words = re.split(r"[\s,:;]+", line.strip())
         if len(words) > 1 and words[0].isdigit():
@@ -187,4 +187,4 @@ def _images(path: Path, keys: _Keys) -> tuple[Path, ...]:
     folder = below if below.is_dir() else path.parent
     begins = f"{keys.text('Name')}{keys.text('InputSeparator')}".lower()
     files = [file for file in folder.iterdir() if file.suffix.lower() in TIFF and file.name.lower().startswith(begins)]
-    return tuple(sorted((file for file in files if file.stem[len(begins) :].strip("_").isdigit()), key=order_of_numbers))
+    return tuple(sorted((file for file in files if file.stem[len(begins) :].strip("_").isdigit()), key=natural_order))

@@ -19,8 +19,8 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from mivol.errors import MivolError
-from mivol.files.source import choose, no_dataset, refusal
-from mivol.files.volume import VolumeData, as_values
+from mivol.files.source import refusal, refuse_dataset, select_dataset
+from mivol.files.volume import VolumeData, to_values
 from mivol.machine import available_memory
 
 NPY_MAGIC = b"\x93NUMPY"
@@ -29,16 +29,16 @@ NPZ_MAGIC = b"PK\x03\x04"
 
 def read_npy(path: Path, dataset: str | None = None) -> VolumeData:
     """Read one array; it lies on the unit cube, for the format says nothing else."""
-    no_dataset(path, dataset)
+    refuse_dataset(path, dataset)
     array = _loaded(path)
-    return VolumeData(as_values(array, path), np.eye(4), _meta(path, "npy", array))
+    return VolumeData(to_values(array, path), np.eye(4), _meta(path, "npy", array))
 
 
 def read_npz(path: Path, dataset: str | None = None) -> VolumeData:
     """Read one array of an archive: ``dataset``, else ``values``, else the only one of rank 3 or 4."""
     arrays = read_archive(path)
     grids = [name for name, array in arrays.items() if array.ndim in (3, 4)]
-    name = choose(path, "values" if dataset is None and "values" in grids else dataset, grids)
+    name = select_dataset(path, "values" if dataset is None and "values" in grids else dataset, grids)
     meta = _meta(path, "npz", arrays[name]) | {"dataset": name}
     to_world = np.eye(4)
     if "to_world" in arrays:
@@ -46,7 +46,7 @@ def read_npz(path: Path, dataset: str | None = None) -> VolumeData:
     if "metadata" in arrays:
         meta["metadata"] = _metadata(arrays["metadata"], path)
         meta["space"] = meta["metadata"].get("space")
-    return VolumeData(as_values(arrays[name], path), to_world, meta)
+    return VolumeData(to_values(arrays[name], path), to_world, meta)
 
 
 def write_npy(file: BinaryIO, values: np.ndarray, to_world: np.ndarray, metadata: dict[str, Any]) -> None:

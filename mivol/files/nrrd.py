@@ -19,8 +19,8 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from mivol.files import source
-from mivol.files.source import no_dataset, refusal
-from mivol.files.volume import VolumeData, as_values, frame_from_steps
+from mivol.files.source import refusal, refuse_dataset
+from mivol.files.volume import VolumeData, frame_from_steps, to_values
 
 MAGIC = b"NRRD000"
 
@@ -84,11 +84,11 @@ def read_nrrd(path: Path, dataset: str | None = None) -> VolumeData:
     Raises:
         MivolError: a field missing or not understood, sizes that do not fit the data, axes that cannot be told apart.
     """
-    no_dataset(path, dataset)
+    refuse_dataset(path, dataset)
     fields, comments, attached = _header(source.read_bytes(path), path)
     words = _field(fields, "sizes", path)
-    sizes = source.integers(words, max(len(words.split()), 1), path, "sizes")
-    if [len(sizes)] != source.integers(_field(fields, "dimension", path), 1, path, "dimension") or min(sizes) < 1:
+    sizes = source.parse_integers(words, max(len(words.split()), 1), path, "sizes")
+    if [len(sizes)] != source.parse_integers(_field(fields, "dimension", path), 1, path, "dimension") or min(sizes) < 1:
         raise refusal(path, f"sizes {sizes}", f"{fields['dimension']} sizes above 0", "correct the header")
     dtype = _dtype(fields, path)
     stored = _stored(fields, comments, attached, dtype, math.prod(sizes), path)
@@ -103,7 +103,7 @@ def read_nrrd(path: Path, dataset: str | None = None) -> VolumeData:
         "space": SPACES.get(fields.get("space", "").lower()),
         "header": fields,
     }
-    return VolumeData(as_values(grid, path), frame_from_steps(size, steps, origin), meta)
+    return VolumeData(to_values(grid, path), frame_from_steps(size, steps, origin), meta)
 
 
 def write_nrrd(file: BinaryIO, values: np.ndarray, to_world: np.ndarray, metadata: dict[str, Any]) -> None:
@@ -213,18 +213,19 @@ def _data_files(value: str, listed: list[str], count: int, path: Path) -> list[P
 
 
 def _unpack(data: bytes, fields: dict[str, str], dtype: np.dtype, count: int, path: Path) -> np.ndarray:
-    line_skip, byte_skip = (source.integers(fields.get(name, "0"), 1, path, name)[0] for name in ("line skip", "byte skip"))
+    (line_skip,) = source.parse_integers(fields.get("line skip", "0"), 1, path, "line skip")
+    (byte_skip,) = source.parse_integers(fields.get("byte skip", "0"), 1, path, "byte skip")
     if not 0 <= line_skip <= data.count(b"\n"):
         found = f"'line skip: {line_skip}' in a file of fewer lines"
         raise refusal(path, found, "a skip of lines that are there", "correct the header")
     data = data.split(b"\n", line_skip)[-1]
     packing = _packing(fields, path)
     if packing == "ascii":
-        return source.numbers(data[max(byte_skip, 0) :], count, path)
+        return source.parse_numbers(data[max(byte_skip, 0) :], count, path)
     promised = count * dtype.itemsize
     if packing != "raw":
-        data = source.inflate(data, packing, max(byte_skip, 0) + promised, path)
-    return source.elements(data, dtype, count, path, offset=len(data) - promised if byte_skip < 0 else byte_skip)
+        data = source.decompress(data, packing, max(byte_skip, 0) + promised, path)
+    return source.parse_elements(data, dtype, count, path, offset=len(data) - promised if byte_skip < 0 else byte_skip)
 
 
 def _axes(fields: dict[str, str], sizes: list[int], path: Path) -> tuple[list[int], list[int]]:
@@ -250,12 +251,12 @@ def _axes(fields: dict[str, str], sizes: list[int], path: Path) -> tuple[list[in
 def _vectors(fields: dict[str, str], path: Path) -> list[np.ndarray | None]:
     text = fields["space directions"]
     found = re.findall(r"none|\(([^)]*)\)", text)
-    return [source.reals(inner, 3, path, "space directions") if inner else None for inner in found]
+    return [source.parse_reals(inner, 3, path, "space directions") if inner else None for inner in found]
 
 
 def _place(fields: dict[str, str], spatial: list[int], size: list[int], path: Path) -> tuple[np.ndarray, np.ndarray]:
     """Steps (3, 3) and the first voxel's centre (3,)."""
-    origin = source.reals(fields.get("space origin", "(0,0,0)").strip("() "), 3, path, "space origin")
+    origin = source.parse_reals(fields.get("space origin", "(0,0,0)").strip("() "), 3, path, "space origin")
     if "space directions" in fields:
         return np.array([vector for vector in _vectors(fields, path) if vector is not None]).T, origin
     count = max(spatial) + 1
@@ -270,5 +271,5 @@ def _place(fields: dict[str, str], spatial: list[int], size: list[int], path: Pa
 
 def _per_axis(fields: dict[str, str], name: str, spatial: list[int], count: int, default: float, path: Path) -> np.ndarray:
     """The numbers of the spatial axes; ``default`` where the file has none or says NaN."""
-    values = source.reals(fields.get(name) or "nan " * count, count, path, name)
+    values = source.parse_reals(fields.get(name) or "nan " * count, count, path, name)
     return np.array([default if np.isnan(values[axis]) else values[axis] for axis in spatial])

@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 
 from mivol.files import source
-from mivol.files.source import no_dataset, refusal
-from mivol.files.volume import VolumeData, as_values, frame_from_box
+from mivol.files.source import refusal, refuse_dataset
+from mivol.files.volume import VolumeData, frame_from_box, to_values
 
 PARAMETER = re.compile(r'"(integer|point|float)\s+(nx|ny|nz|p0|p1|density)"\s*(?:\[([^\]]*)(\]?)|(-?\d+))')
 
@@ -31,7 +31,7 @@ def read_pbrt(path: Path, dataset: str | None = None) -> VolumeData:
     Raises:
         MivolError: a parameter missing, a list that breaks off, or a count of densities that does not fit nx ny nz.
     """
-    no_dataset(path, dataset)
+    refuse_dataset(path, dataset)
     text = source.read_bytes(path).decode("ascii", errors="replace")
     found: dict[str, str] = {}
     for match in PARAMETER.finditer(text):
@@ -42,10 +42,10 @@ def read_pbrt(path: Path, dataset: str | None = None) -> VolumeData:
     missing = [name for name in ("nx", "ny", "nz", "p0", "p1", "density") if name not in found]
     if missing:
         raise refusal(path, f"no {', '.join(missing)}", "nx, ny, nz, p0, p1 and density", "add them to the Volume")
-    size = [source.integers(found[name], 1, path, name)[0] for name in ("nx", "ny", "nz")]
+    size = [source.parse_integers(found[name], 1, path, name)[0] for name in ("nx", "ny", "nz")]
     if min(size) < 1:
         raise refusal(path, f"sizes {size}", "at least 1 each", "correct nx, ny, nz")
-    density = source.numbers(found["density"], size[0] * size[1] * size[2], path)
-    to_world = frame_from_box(source.numbers(found["p0"], 3, path), source.numbers(found["p1"], 3, path))
+    density = source.parse_numbers(found["density"], size[0] * size[1] * size[2], path)
+    to_world = frame_from_box(source.parse_numbers(found["p0"], 3, path), source.parse_numbers(found["p1"], 3, path))
     meta = {"path": str(path), "format": "pbrt", "dtype": "text", "space": None}
-    return VolumeData(as_values(np.reshape(density, size[::-1]), path), to_world, meta)
+    return VolumeData(to_values(np.reshape(density, size[::-1]), path), to_world, meta)

@@ -7,7 +7,7 @@ read, since the length of a row is not known then; it and what follows it are le
 
 Source: Greg Turk, The PLY Polygon File Format, 1994.
 
-Here: :func:`read_tables`, :func:`read_layout`, :func:`is_table`, :func:`write_table`.
+Here: :func:`read_tables`, :func:`read_layout`, :func:`is_ply`, :func:`write_table`.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ import numpy as np
 from mivol.files import source
 from mivol.files.source import refusal
 
-__all__ = ["POSITION", "is_table", "positions_of", "read_layout", "read_tables", "read_vertices", "write_table"]
+__all__ = ["POSITION", "is_ply", "vertex_positions", "read_layout", "read_tables", "read_vertices", "write_table"]
 
 POSITION = ("x", "y", "z")
 """Properties of a vertex that has a place."""
@@ -50,7 +50,7 @@ class Element:
     has_lists: bool = False
 
 
-def is_table(head: bytes) -> bool:
+def is_ply(head: bytes) -> bool:
     """Whether these first bytes are those of a ``.ply``."""
     return re.match(rb"ply\r?\n", head) is not None
 
@@ -61,7 +61,7 @@ def read_layout(path: str | os.PathLike) -> dict[str, tuple[str, ...]]:
     Raises:
         MivolError: no PLY, or a header that does not end or contradicts itself.
     """
-    with source.existing_file(path).open("rb") as file:
+    with source.check_file(path).open("rb") as file:
         head, _ = _split(file.read(LONGEST_HEADER), path)
     return {element.name: tuple(name for name, _ in element.properties) for element in _header(head, path)[1]}
 
@@ -94,7 +94,7 @@ def read_vertices(path: str | os.PathLike) -> np.ndarray:
     return vertex
 
 
-def positions_of(vertex: np.ndarray) -> np.ndarray:
+def vertex_positions(vertex: np.ndarray) -> np.ndarray:
     """(N, 3) x, y, z of a table of vertices."""
     return np.stack([vertex[name] for name in POSITION], axis=1)
 
@@ -121,7 +121,7 @@ def write_table(file: BinaryIO, table: np.ndarray, comment: str = "") -> None:
 
 def _split(data: bytes, path: object) -> tuple[str, bytes]:
     """The header, without its last line, and what follows it."""
-    if not is_table(data):
+    if not is_ply(data):
         raise refusal(path, f"first bytes {data[:8]!r}", "those of a PLY", "name another file")
     end = re.compile(rb"^end_header\r?\n", re.MULTILINE).search(data, 0, LONGEST_HEADER)
     if end is None:
@@ -186,7 +186,7 @@ def _text_tables(body: bytes, elements: list[Element], path: object) -> dict[str
         width = len(element.properties)
         end = at + element.count * width
         _check_size(f"{len(words)} numbers", len(words) - end, f"{end} for {element.count} of {element.name!r}", path)
-        rows = source.numbers(b" ".join(words[at:end]), end - at, path).reshape(element.count, width)
+        rows = source.parse_numbers(b" ".join(words[at:end]), end - at, path).reshape(element.count, width)
         table = np.empty(element.count, [(name, kind) for name, kind in element.properties])
         for column, (name, kind) in zip(rows.T, element.properties, strict=True):
             if kind[0] != "f" and not np.array_equal(column, column.astype(kind)):

@@ -2,10 +2,6 @@
 
 Every reader takes its bytes from here, so that a missing, empty, truncated or damaged file is refused in the same words
 everywhere: what was found, what was expected, the way out.
-
-Here: :func:`refusal` (the sentence), :func:`existing_file`, :func:`numbered_files` (a pattern of names), :func:`by_suffix`,
-:func:`read_bytes`, :func:`elements` (array), :func:`numbers` (text -> array), :func:`integers` and :func:`reals` (fields of a
-header), :func:`inflate` (bounded decompression), :func:`choose` and :func:`no_dataset` (which array of a file).
 """
 
 from __future__ import annotations
@@ -51,7 +47,7 @@ def refusal(subject: object, found: str, expected: str, way_out: str) -> MivolEr
 RAW_SLICES = "name a file in it (a stack of raw slices is read by read_slices)"
 
 
-def existing_file(path: str | os.PathLike, in_a_folder: str = RAW_SLICES) -> Path:
+def check_file(path: str | os.PathLike, in_a_folder: str = RAW_SLICES) -> Path:
     """The path, if it names a file that holds at least one byte.
 
     Args:
@@ -92,23 +88,23 @@ def numbered_files(header: Path, pattern: str, numbers: range, most: int) -> lis
     if not numbers or numbers[most:]:
         found = f"files numbered from {numbers.start} to {numbers.stop} in steps of {numbers.step}"
         raise refusal(header, found, f"1 to {most} files", "correct the header")
-    return [existing_file(header.parent / (pattern % number)) for number in numbers]
+    return [check_file(header.parent / (pattern % number)) for number in numbers]
 
 
 def read_bytes(path: str | os.PathLike) -> bytes:
     """All bytes of an existing, non-empty file.
 
     Raises:
-        MivolError: as :func:`existing_file`, or the file may not be read.
+        MivolError: as :func:`check_file`, or the file may not be read.
     """
-    path = existing_file(path)
+    path = check_file(path)
     try:
         return path.read_bytes()
     except PermissionError as error:
         raise refusal(path, "no permission to read it", "a readable file", "change its permissions") from error
 
 
-def by_suffix(path: Path, table: Mapping[str, T]) -> T:
+def select_by_suffix(path: Path, table: Mapping[str, T]) -> T:
     """What a table of suffixes has for a file.
 
     Raises:
@@ -119,7 +115,7 @@ def by_suffix(path: Path, table: Mapping[str, T]) -> T:
     return table[path.suffix.lower()]
 
 
-def elements(data: bytes, dtype: np.dtype | str, count: int, path: object, *, offset: int = 0) -> np.ndarray:
+def parse_elements(data: bytes, dtype: np.dtype | str, count: int, path: object, *, offset: int = 0) -> np.ndarray:
     """The ``count`` numbers that fill ``data`` from byte ``offset`` to its end, exactly.
 
     Args:
@@ -148,7 +144,7 @@ def elements(data: bytes, dtype: np.dtype | str, count: int, path: object, *, of
     return np.frombuffer(data, dtype, count, offset)
 
 
-def numbers(text: bytes | str, count: int, path: object) -> np.ndarray:
+def parse_numbers(text: bytes | str, count: int, path: object) -> np.ndarray:
     """The ``count`` numbers written in ``text``, separated by white space or commas, as float64 (count,).
 
     Raises:
@@ -168,7 +164,7 @@ def numbers(text: bytes | str, count: int, path: object) -> np.ndarray:
     return values
 
 
-def integers(text: str, count: int, path: object, name: str) -> list[int]:
+def parse_integers(text: str, count: int, path: object, name: str) -> list[int]:
     """The ``count`` whole numbers in ``text``, separated by white space.
 
     Args:
@@ -186,18 +182,18 @@ def integers(text: str, count: int, path: object, name: str) -> list[int]:
     return [int(word) for word in words]
 
 
-def reals(text: str, count: int, path: object, name: str) -> np.ndarray:
+def parse_reals(text: str, count: int, path: object, name: str) -> np.ndarray:
     """The ``count`` numbers in ``text``, separated by white space or commas, as float64 (count,).
 
-    As :func:`numbers`, for a field of a header: arguments and refusal as :func:`integers`.
+    As :func:`parse_numbers`, for a field of a header: arguments and refusal as :func:`parse_integers`.
     """
     try:
-        return numbers(text, count, path)
+        return parse_numbers(text, count, path)
     except MivolError as error:
         raise refusal(path, f"'{name} = {text.strip()}'", f"numbers ({count})", "correct the header") from error
 
 
-def inflate(data: bytes, codec: str, limit: int, path: object) -> bytes:
+def decompress(data: bytes, codec: str, limit: int, path: object) -> bytes:
     """Decompress all of ``data``, never to more than ``limit`` bytes (the header's promise bounds the memory).
 
     Concatenated streams (several gzip members) are joined; zero padding after the last one is skipped.
@@ -234,7 +230,7 @@ def inflate(data: bytes, codec: str, limit: int, path: object) -> bytes:
     return b"".join(pieces)
 
 
-def choose(path: object, dataset: str | None, names: Sequence[str]) -> str:
+def select_dataset(path: object, dataset: str | None, names: Sequence[str]) -> str:
     """Which of several arrays to read: the one asked for, or the only one.
 
     Raises:
@@ -252,7 +248,7 @@ def choose(path: object, dataset: str | None, names: Sequence[str]) -> str:
     return dataset
 
 
-def no_dataset(path: object, dataset: str | None) -> None:
+def refuse_dataset(path: object, dataset: str | None) -> None:
     """Refuse a dataset name where the format holds one unnamed array.
 
     Raises:
@@ -276,7 +272,7 @@ def read_columns(path: str | os.PathLike, count: int) -> np.ndarray:
     Raises:
         MivolError: no such file, a line of another length, text that is no number, a number that is not finite, no line.
     """
-    path = existing_file(path)
+    path = check_file(path)
     rows = []
     for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), 1):
         words = line.replace(",", " ").split()

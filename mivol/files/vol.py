@@ -15,8 +15,8 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from mivol.files import source
-from mivol.files.source import no_dataset, refusal
-from mivol.files.volume import VolumeData, as_values, frame_from_box
+from mivol.files.source import refusal, refuse_dataset
+from mivol.files.volume import VolumeData, frame_from_box, to_values
 
 MAGIC = b"VOL"
 VERSION = 3
@@ -32,7 +32,7 @@ def read_vol(path: Path, dataset: str | None = None) -> VolumeData:
     Raises:
         MivolError: truncated or too long, another version or encoding, sizes below 1.
     """
-    no_dataset(path, dataset)
+    refuse_dataset(path, dataset)
     data = source.read_bytes(path)
     if len(data) < HEADER.size:
         raise refusal(path, f"{len(data)} bytes", f"a header of {HEADER.size}", "the file is truncated: copy it again")
@@ -49,8 +49,8 @@ def read_vol(path: Path, dataset: str | None = None) -> VolumeData:
     if min(nx, ny, nz, channels) < 1:
         raise refusal(path, f"{nx} x {ny} x {nz} voxels of {channels} channels", "at least 1 each", "write the file again")
     dtype, factor = ENCODINGS[encoding]
-    stored = source.elements(data, dtype, nx * ny * nz * channels, path, offset=HEADER.size)
-    values = as_values(stored.reshape(nz, ny, nx, channels), path)
+    stored = source.parse_elements(data, dtype, nx * ny * nz * channels, path, offset=HEADER.size)
+    values = to_values(stored.reshape(nz, ny, nx, channels), path)
     if factor != 1:
         values *= np.float32(factor)
     meta = {"path": str(path), "format": "vol", "dtype": str(stored.dtype), "space": None, "encoding": encoding}

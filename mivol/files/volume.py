@@ -6,7 +6,7 @@ float64 takes local (x, y, z, 1) to the file's own physical frame, columns first
 the *centre* of voxel (0, 0, 0), as in NRRD, MetaImage, NIfTI and VTK, so the unit cube begins half a voxel before it.
 
 Here: :class:`VolumeData`, frames (:func:`frame_from_steps`, :func:`frame_from_box`, :func:`check_frame`,
-:func:`in_space`), values (:func:`as_values`, :func:`check_volume`).
+:func:`to_space`), values (:func:`to_values`, :func:`check_volume`).
 """
 
 from __future__ import annotations
@@ -130,7 +130,7 @@ def check_frame(to_world: np.ndarray, name: object) -> None:
         )
 
 
-def in_space(volume: VolumeData, space: str) -> VolumeData:
+def to_space(volume: VolumeData, space: str) -> VolumeData:
     """The same volume with its world frame renamed: NIfTI counts x to the right and y forwards (RAS), NRRD of medical
     origin and MetaImage to the left and backwards (LPS).
 
@@ -154,7 +154,7 @@ def in_space(volume: VolumeData, space: str) -> VolumeData:
     return dataclasses.replace(volume, to_world=np.diag([*signs, 1.0]) @ volume.to_world, meta={**volume.meta, "space": space})
 
 
-def as_values(array: np.ndarray, path: object) -> np.ndarray:
+def to_values(array: np.ndarray, path: object) -> np.ndarray:
     """An array (Z, Y, X) or (Z, Y, X, C) of any real type as float32 (Z, Y, X, C), C-contiguous.
 
     Integers above 2^24 are rounded to the nearest float32.

@@ -20,8 +20,8 @@ from pathlib import Path
 import numpy as np
 
 from mivol.files import source
-from mivol.files.source import choose, refusal
-from mivol.files.volume import VolumeData, as_values, frame_from_steps
+from mivol.files.source import refusal, select_dataset
+from mivol.files.volume import VolumeData, frame_from_steps, to_values
 
 TYPES: dict[str, str] = {
     "Int8": "i1",
@@ -58,12 +58,12 @@ def read_vti(path: Path, dataset: str | None = None) -> VolumeData:
     if len(pieces) != 1:
         raise refusal(path, f"{len(pieces)} pieces", "one", "write the file again in one piece")
     words = pieces[0].get("Extent") or image.get("WholeExtent", "")
-    extent = np.array(source.integers(words, 6, path, "Extent")).reshape(3, 2)
+    extent = np.array(source.parse_integers(words, 6, path, "Extent")).reshape(3, 2)
     node, is_cell = _array(pieces[0], dataset, path)
     size = (extent[:, 1] - extent[:, 0] + (0 if is_cell else 1)).tolist()
     if min(size) < 1:
         raise refusal(path, f"the extent {extent.ravel().tolist()}", "at least one voxel", "write the file again")
-    (channels,) = source.integers(node.get("NumberOfComponents", "1"), 1, path, "NumberOfComponents")
+    (channels,) = source.parse_integers(node.get("NumberOfComponents", "1"), 1, path, "NumberOfComponents")
     if channels < 1:
         raise refusal(path, f"{channels} components", "at least 1", "write the file again")
     stored = _decode(node, root, appended, encoding, size[0] * size[1] * size[2] * channels, path)
@@ -76,7 +76,7 @@ def read_vti(path: Path, dataset: str | None = None) -> VolumeData:
         "dataset": node.get("Name"),
         "centering": "cell" if is_cell else "point",
     }
-    values = as_values(stored.reshape(*size[::-1], channels), path)
+    values = to_values(stored.reshape(*size[::-1], channels), path)
     return VolumeData(values, frame_from_steps(size, steps, origin), meta)
 
 
@@ -105,13 +105,13 @@ def _array(piece: ElementTree.Element, dataset: str | None, path: Path) -> tuple
             active = active or group.get("Scalars")
             for node in group.findall("DataArray"):
                 found.setdefault(node.get("Name", ""), (node, kind == "CellData"))
-    return found[choose(path, active if dataset is None and active in found else dataset, list(found))]
+    return found[select_dataset(path, active if dataset is None and active in found else dataset, list(found))]
 
 
 def _place(image: ElementTree.Element, first: np.ndarray, path: Path) -> tuple[np.ndarray, np.ndarray]:
-    spacing = source.reals(image.get("Spacing", "1 1 1"), 3, path, "Spacing")
-    origin = source.reals(image.get("Origin", "0 0 0"), 3, path, "Origin")
-    direction = source.reals(image.get("Direction", "1 0 0 0 1 0 0 0 1"), 9, path, "Direction")
+    spacing = source.parse_reals(image.get("Spacing", "1 1 1"), 3, path, "Spacing")
+    origin = source.parse_reals(image.get("Origin", "0 0 0"), 3, path, "Origin")
+    direction = source.parse_reals(image.get("Direction", "1 0 0 0 1 0 0 0 1"), 9, path, "Direction")
     steps = direction.reshape(3, 3) * spacing
     return steps, origin + steps @ first
 
@@ -130,11 +130,11 @@ def _decode(
     dtype = np.dtype(TYPES[node.get("type")]).newbyteorder(order)
     kind = node.get("format")
     if kind == "ascii":
-        return source.numbers(node.text or "", count, path).astype(dtype)
+        return source.parse_numbers(node.text or "", count, path).astype(dtype)
     if kind == "binary":
         stream, coded = "".join((node.text or "").split()).encode(), "base64"
     elif kind == "appended":
-        (offset,) = source.integers(node.get("offset", ""), 1, path, "offset")
+        (offset,) = source.parse_integers(node.get("offset", ""), 1, path, "offset")
         stream, coded = appended[max(offset, 0) :], encoding
     else:
         raise refusal(path, f"the format {kind!r}", "ascii, binary or appended", "write the file again")
@@ -145,7 +145,7 @@ def _decode(
         raise refusal(path, f"the header_type {header_type}", " or ".join(HEADER_TYPES), "write the file again")
     word = np.dtype(HEADER_TYPES[header_type]).newbyteorder(order)
     block = _block(STREAMS[coded](stream, path), word, root.get("compressor"), count * dtype.itemsize, path)
-    return source.elements(block, dtype, count, path)
+    return source.parse_elements(block, dtype, count, path)
 
 
 def _block(take: Take, word: np.dtype, compressor: str | None, promised: int, path: Path) -> bytes:
@@ -173,7 +173,7 @@ def _block(take: Take, word: np.dtype, compressor: str | None, promised: int, pa
         )
     packed = words(blocks)
     codec = COMPRESSORS[compressor]
-    return b"".join(source.inflate(take(length), codec, size, path) for length in packed)
+    return b"".join(source.decompress(take(length), codec, size, path) for length in packed)
 
 
 def _broken(path: Path) -> Exception:

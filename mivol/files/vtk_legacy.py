@@ -15,8 +15,8 @@ from pathlib import Path
 import numpy as np
 
 from mivol.files import source
-from mivol.files.source import choose, refusal
-from mivol.files.volume import VolumeData, as_values, frame_from_steps
+from mivol.files.source import refusal, select_dataset
+from mivol.files.volume import VolumeData, frame_from_steps, to_values
 
 MAGIC = b"# vtk DataFile"
 
@@ -61,12 +61,12 @@ class _Cursor:
             return self._take_text(count)
         block = self.data[self.at : self.at + count * dtype.itemsize]
         self.at += len(block)
-        return source.elements(block, dtype, count, self.path)
+        return source.parse_elements(block, dtype, count, self.path)
 
     def _take_text(self, count: int) -> np.ndarray:
         words = self.data[self.at :].split(None, count)
         self.at = len(self.data) - len(words[count]) if len(words) > count else len(self.data)
-        return source.numbers(b" ".join(words[:count]), count, self.path)
+        return source.parse_numbers(b" ".join(words[:count]), count, self.path)
 
     def skip_metadata(self) -> None:
         """Pass over lines up to the next blank one."""
@@ -82,9 +82,9 @@ def read_vtk(path: Path, dataset: str | None = None) -> VolumeData:
     """
     cursor = _Cursor(source.read_bytes(path), path)
     keys = _head(cursor)
-    points = source.integers(" ".join(keys.get("DIMENSIONS", [])), 3, path, "DIMENSIONS")
+    points = source.parse_integers(" ".join(keys.get("DIMENSIONS", [])), 3, path, "DIMENSIONS")
     arrays = _arrays(cursor, points)
-    name = choose(path, dataset, list(arrays))
+    name = select_dataset(path, dataset, list(arrays))
     array, is_cell = arrays[name]
     size = [number - is_cell for number in points]
     steps = np.diag(_floats(keys, path, "SPACING", "ASPECT_RATIO"))
@@ -97,7 +97,7 @@ def read_vtk(path: Path, dataset: str | None = None) -> VolumeData:
         "dataset": name,
         "centering": "cell" if is_cell else "point",
     }
-    values = as_values(array.reshape(*size[::-1], -1), path)
+    values = to_values(array.reshape(*size[::-1], -1), path)
     return VolumeData(values, frame_from_steps(size, steps, origin), meta)
 
 
@@ -126,7 +126,7 @@ def _head(cursor: _Cursor) -> dict[str, list[str]]:
 def _floats(keys: dict[str, list[str]], path: Path, *names: str) -> np.ndarray:
     """The three numbers under the first of ``names`` that is there."""
     name = next((name for name in names if name in keys), names[0])
-    return source.reals(" ".join(keys.get(name, [])), 3, path, name)
+    return source.parse_reals(" ".join(keys.get(name, [])), 3, path, name)
 
 
 def _arrays(cursor: _Cursor, points: list[int]) -> dict[str, tuple[np.ndarray, bool]]:

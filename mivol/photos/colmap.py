@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from mivol.files.source import read_bytes, reals, refusal
+from mivol.files.source import parse_reals, read_bytes, refusal
 from mivol.photos.camera import FLIP, Camera, intrinsics
 from mivol.photos.lens import Fisheye, Lens
 from mivol.photos.listing import Entry, Listing, check_points
@@ -260,7 +260,7 @@ def _cameras_txt(path: Path) -> dict[int, Sensor]:
     sensors = {}
     for line in filter(None, _lines(path)):
         number, model, *rest = [*line.split(maxsplit=2), "", ""][:3]
-        values = reals(rest[0], 2 + len(_parameters(path, model)), path, f"camera {number}")
+        values = parse_reals(rest[0], 2 + len(_parameters(path, model)), path, f"camera {number}")
         if not np.isfinite(values[:2]).all():
             raise refusal(path, f"an image of {values[0]:g} x {values[1]:g} pixels", "finite numbers", "export the model again")
         sensors[_whole(number, path)] = _sensor(path, model, (int(values[0]), int(values[1])), tuple(values[2:]))
@@ -275,7 +275,7 @@ def _images_txt(path: Path) -> list[Pose]:
         words = line.split(maxsplit=9)
         if len(words) != 10:
             raise refusal(path, f"the line '{line}'", "number, quaternion, translation, camera, name", "export it again")
-        pose = reals(" ".join(words[1:8]), 7, path, words[9])
+        pose = parse_reals(" ".join(words[1:8]), 7, path, words[9])
         poses.append(Pose(words[9], _whole(words[8], path), _to_world(pose[:4], pose[4:]), _whole(words[0], path)))
         next(lines, None)
     return poses
@@ -288,7 +288,7 @@ def _points_txt(path: Path) -> Points:
     rows, tracks = [], []
     for line in filter(None, _lines(path)):
         words = line.split()
-        rows.append(reals(" ".join(words[1:7]), 6, path, f"point {words[0]}"))
+        rows.append(parse_reals(" ".join(words[1:7]), 6, path, f"point {words[0]}"))
         tracks.append(np.array([_whole(word, path) for word in words[8::2]], int))
     return Points(np.array(rows).reshape(-1, 6), tracks)
 

@@ -22,7 +22,7 @@ import numpy as np
 from PIL import Image, UnidentifiedImageError
 
 from mivol.files import encode_srgb, read_exr, read_exr_header
-from mivol.files.source import existing_file, refusal
+from mivol.files.source import check_file, refusal
 
 __all__ = [
     "SPACES",
@@ -229,7 +229,7 @@ def _opened(path: Path) -> Iterator[Image.Image]:
     """An image of which the header is read; of any size, since what its pixels take is counted before they are read."""
     bound, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
     try:
-        image = Image.open(existing_file(path))
+        image = Image.open(check_file(path))
     except (UnidentifiedImageError, OSError, SyntaxError, ValueError) as error:
         raise _damaged(path) from error
     finally:

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from mivol.files.atomic import write_whole_text
-from mivol.files.ply import positions_of, read_vertices
+from mivol.files.ply import read_vertices, vertex_positions
 from mivol.files.source import read_bytes, refusal
 from mivol.photos.camera import Camera, intrinsics
 from mivol.photos.lens import Fisheye, Lens, Panorama
@@ -127,7 +127,7 @@ def _points(file: Path, table: Mapping[str, Any]) -> np.ndarray | None:
     path = file.parent / slashed(file.parent, name)
     if not path.is_file():
         raise refusal(file, f"ply_file_path = {name!r}, which is not there", "a file of points", "add it, or remove the key")
-    points = np.asarray(positions_of(read_vertices(path)), np.float64)
+    points = np.asarray(vertex_positions(read_vertices(path)), np.float64)
     check_points(points, path, "remove this point")
     return points
 

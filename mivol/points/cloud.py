@@ -21,7 +21,7 @@ import numpy as np
 from mivol.files import ply
 from mivol.files.atomic import write_whole
 from mivol.files.npy import DAMAGE, check_memory
-from mivol.files.source import by_suffix, existing_file, refusal
+from mivol.files.source import check_file, refusal, select_by_suffix
 from mivol.photos.colmap import read_points3d
 from mivol.shown import briefly
 
@@ -86,8 +86,8 @@ def read_points(path: str | os.PathLike) -> PointCloud:
         MivolError: missing, foreign, truncated or inconsistent file, a suffix that is not known, a number that is not finite,
             or ``.las`` without ``laspy``.
     """
-    path = existing_file(path)
-    return by_suffix(path, CLOUD_READERS)(path).checked(path)
+    path = check_file(path)
+    return select_by_suffix(path, CLOUD_READERS)(path).checked(path)
 
 
 def write_points(path: str | os.PathLike, cloud: PointCloud) -> None:
@@ -99,14 +99,14 @@ def write_points(path: str | os.PathLike, cloud: PointCloud) -> None:
         MivolError: a suffix that is not known, a number that is not finite, disk full.
     """
     path = Path(path)
-    writer = by_suffix(path, CLOUD_WRITERS)
+    writer = select_by_suffix(path, CLOUD_WRITERS)
     cloud.checked(path)
     write_whole(path, lambda file: writer(file, cloud))
 
 
 def _read_ply(path: Path) -> PointCloud:
     vertex = ply.read_vertices(path)
-    positions = ply.positions_of(vertex)
+    positions = ply.vertex_positions(vertex)
     if any(name not in vertex.dtype.names for name in COLOUR):
         return PointCloud(positions)
     codes = np.stack([vertex[name] for name in COLOUR], axis=1)

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from mivol.errors import MivolError
-from mivol.files.source import by_suffix, existing_file, refusal
+from mivol.files.source import check_file, refusal, select_by_suffix
 from mivol.points.cloud import CLOUD_READERS, CLOUD_WRITERS, PointCloud, read_points, write_points
 from mivol.points.conversions import gaussians_of_points, points_of_gaussians
 from mivol.points.gaussian_files import READERS, WRITERS, holds_gaussians, read_gaussians, write_gaussians
@@ -48,11 +48,11 @@ def read_facts(path: Path) -> Facts:
     Raises:
         MivolError: the file cannot be read at all.
     """
-    path = existing_file(path)
+    path = check_file(path)
     if holds_gaussians(path):
-        held, lines = by_suffix(path, READERS)(path), _gaussian_lines
+        held, lines = select_by_suffix(path, READERS)(path), _gaussian_lines
     else:
-        held, lines = by_suffix(path, CLOUD_READERS)(path), _cloud_lines
+        held, lines = select_by_suffix(path, CLOUD_READERS)(path), _cloud_lines
     try:
         held.checked(path)
         refused = ""
@@ -77,9 +77,9 @@ def convert_file(source: Path, target: Path, kind: str | None = None) -> str:
     """
     if kind not in (None, *KINDS):
         raise refusal("convert_file", f"kind={kind!r}", f"one of {', '.join(KINDS)}", "choose one of those")
-    existing_file(source)
+    check_file(source)
     has_gaussians = holds_gaussians(source)
-    by_suffix(target, {**CLOUD_WRITERS, **WRITERS})
+    select_by_suffix(target, {**CLOUD_WRITERS, **WRITERS})
     kind = kind or ("gaussians" if has_gaussians and target.suffix.lower() in WRITERS else "points")
     held = read_gaussians(source) if has_gaussians else read_points(source)
     if kind == "gaussians":

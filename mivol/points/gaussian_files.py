@@ -12,7 +12,7 @@ from typing import BinaryIO
 
 from mivol.files.atomic import write_whole
 from mivol.files.ply import read_layout, read_tables
-from mivol.files.source import by_suffix, existing_file
+from mivol.files.source import check_file, select_by_suffix
 from mivol.points.compressed_ply import gaussians_of_compressed_tables, is_compressed
 from mivol.points.gaussian_ply import gaussians_of_tables, write_gaussian_ply
 from mivol.points.gaussians import Gaussians
@@ -62,8 +62,8 @@ def read_gaussians(path: str | os.PathLike) -> Gaussians:
         >>> read_gaussians("point_cloud.ply").degree
         3
     """
-    path = existing_file(path)
-    return by_suffix(path, READERS)(path).checked(path)
+    path = check_file(path)
+    return select_by_suffix(path, READERS)(path).checked(path)
 
 
 def write_gaussians(path: str | os.PathLike, gaussians: Gaussians) -> None:
@@ -73,6 +73,6 @@ def write_gaussians(path: str | os.PathLike, gaussians: Gaussians) -> None:
         MivolError: a suffix that is not known, numbers that cannot be drawn, disk full.
     """
     path = Path(path)
-    writer = by_suffix(path, WRITERS)
+    writer = select_by_suffix(path, WRITERS)
     gaussians.checked(path)
     write_whole(path, lambda file: writer(file, gaussians))

@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from mivol.files.npy import check_memory
-from mivol.files.source import CODECS, elements, inflate, read_bytes, refusal
+from mivol.files.source import CODECS, decompress, parse_elements, read_bytes, refusal
 from mivol.points.byte_codes import completed, logits_of_bytes
 from mivol.points.gaussians import HIGHEST_DEGREE, Gaussians
 
@@ -101,8 +101,8 @@ def _slices(data: bytes, header: Header, path: Path) -> list[np.ndarray]:
     """The attributes of version 2 or 3, as bytes."""
     sizes = header.sizes()
     if data.startswith(GZIP):
-        data = inflate(data, "gzip", HEAD.size + sum(sizes), path)
-    body = elements(data, "u1", sum(sizes), path, offset=HEAD.size)
+        data = decompress(data, "gzip", HEAD.size + sum(sizes), path)
+    body = parse_elements(data, "u1", sum(sizes), path, offset=HEAD.size)
     return np.split(body, np.cumsum(sizes)[:-1])
 
 
@@ -119,13 +119,13 @@ def _streams(data: bytes, header: Header, path: Path) -> list[np.ndarray]:
         if unpacked != size or packed > len(data) - at:
             found = f"stream {number} of {packed} bytes, {unpacked} unpacked"
             raise refusal(path, found, f"{size} unpacked, of {len(data) - at} that are left", "copy or write the file again")
-        attributes.append(elements(_unpack(data[at : at + packed], size, path), "u1", size, path))
+        attributes.append(parse_elements(_unpack(data[at : at + packed], size, path), "u1", size, path))
         at += packed
     return attributes if header.degree else [*attributes, np.empty(0, np.uint8)]
 
 
 def _unpack(data: bytes, size: int, path: Path) -> bytes:
-    """One Zstandard stream, never more than ``size`` bytes and one, by which :func:`elements` sees that there are more."""
+    """Decompress one Zstandard stream to at most ``size`` + 1 bytes; :func:`parse_elements` refuses the additional byte."""
     try:
         import zstandard
     except ImportError as error:

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from mivol.photos import SPLITS, PhotoFrame, PhotoSurvey
 from mivol.photos.region import nested_boxes, points_in_box
-from mivol.report.figures import FAINT, INK, SERIES, STYLE, save
+from mivol.report.figures import FAINT, INK, SERIES, STYLE, save_figure
 
 __all__ = [
     "EDGE",
@@ -29,7 +29,7 @@ __all__ = [
     "PARTS",
     "Arrangement",
     "Strokes",
-    "parts_of",
+    "list_parts",
     "plot_arrangement",
     "plot_cameras",
     "pyramid",
@@ -92,7 +92,7 @@ class Arrangement(NamedTuple):
         return PARTS if self.near == self.levels else (*PARTS, FAR)
 
 
-def parts_of(survey: PhotoSurvey) -> tuple[str, ...]:
+def list_parts(survey: PhotoSurvey) -> tuple[str, ...]:
     """The parts of the picture of a data set."""
     return arrangement_of(survey).parts
 
@@ -103,7 +103,7 @@ def plot_cameras(survey: PhotoSurvey, path: str | Path | None = None, part: str 
     Args:
         survey: of :func:`mivol.photos.survey_photos`.
         path: written there (.svg, .png) if given.
-        part: one of :func:`parts_of` alone; None: all of them in one figure.
+        part: one of :func:`list_parts` alone; None: all of them in one figure.
 
     Raises:
         MivolError: another suffix.
@@ -153,7 +153,7 @@ def plot_arrangement(arranged: Arrangement, title: str, path: str | Path | None 
             figure.axes[-1].legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
             figure.suptitle(title, x=0.01, ha="left", weight="bold")
     if path is not None:
-        save(figure, path)
+        save_figure(figure, path)
     return figure
 
 

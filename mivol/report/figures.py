@@ -1,6 +1,6 @@
 """Figures that are read, not admired: one style, units on every axis, colours that survive colour blindness.
 
-Conventions. A ``plot_*`` function returns a matplotlib figure; :func:`save` writes it (.svg or .png, whole or not at
+Conventions. A ``plot_*`` function returns a matplotlib figure; :func:`save_figure` writes it (.svg or .png, whole or not at
 all). Nothing here touches pyplot's global state. Series take the colours of Okabe and Ito in order. An
 :func:`inline_svg` follows the light or dark theme of the page it stands in: its colours are the page's CSS variables.
 """
@@ -25,7 +25,7 @@ from numpy.typing import ArrayLike, NDArray
 from mivol.errors import MivolError
 from mivol.files import read_volume, write_whole
 from mivol.report import pixel_scale
-from mivol.report.record import Volume, quantity_of
+from mivol.report.record import Volume, find_quantity
 
 __all__ = [
     "SERIES",
@@ -38,7 +38,7 @@ __all__ = [
     "plot_image_row",
     "plot_slices",
     "ratio_at_equal_error",
-    "save",
+    "save_figure",
 ]
 
 INK, FAINT, GRID = "#1b1f24", "#5b6470", "#d5d9df"
@@ -98,7 +98,7 @@ def empty_figure(width: float, height: float) -> Figure:
     return figure
 
 
-def save(figure: Figure, path: str | Path) -> Path:
+def save_figure(figure: Figure, path: str | Path) -> Path:
     """Write a figure as .svg or .png, whole or not at all.
 
     Raises:
@@ -152,7 +152,7 @@ def plot_curve(
     if not points:
         raise MivolError(f'no row of the metrics has "{name[:80]}"; draw one of those that were recorded.')
     x, y = np.array(points, float).T
-    quantity = quantity_of(name, units or {})
+    quantity = find_quantity(name, units or {})
     with mpl.rc_context(STYLE):
         figure = empty_figure(4.4, 2.75)
         axes = figure.subplots()
@@ -213,16 +213,16 @@ def plot_slices(
     Raises:
         MivolError: shapes that differ.
     """
-    rows = {"reconstruction": pixel_scale.slices(reconstruction, size)}
+    rows = {"reconstruction": pixel_scale.middle_slices(reconstruction, size)}
     if truth is not None:
         if np.shape(truth) != np.shape(reconstruction):
             raise MivolError(
                 f"truth {np.shape(truth)} and reconstruction {np.shape(reconstruction)} differ in shape; "
                 "resample one to the other."
             )
-        rows = {"truth": pixel_scale.slices(truth, size)} | rows
-        rows["difference"] = pixel_scale.slices(np.asarray(reconstruction, float) - np.asarray(truth, float), size)
-    values = pixel_scale.scale_of(*next(iter(rows.values())).images.values())
+        rows = {"truth": pixel_scale.middle_slices(truth, size)} | rows
+        rows["difference"] = pixel_scale.middle_slices(np.asarray(reconstruction, float) - np.asarray(truth, float), size)
+    values = pixel_scale.shared_scale(*next(iter(rows.values())).images.values())
     signed = pixel_scale.signed_scale(*rows["difference"].images.values()) if truth is not None else None
     with mpl.rc_context(STYLE):
         figure = empty_figure(7.2, 2.5 * len(rows) + 0.3)
@@ -230,7 +230,7 @@ def plot_slices(
         for line, (name, cut) in zip(grid, rows.items(), strict=True):
             scale = signed if name == "difference" else values
             for axes, plane in zip(line, cut.images, strict=True):
-                _picture(axes, pixel_scale.pixels(cut.images[plane], scale), cut.aspect[plane])
+                _picture(axes, pixel_scale.to_pixels(cut.images[plane], scale), cut.aspect[plane])
                 axes.set_xlabel(f"{plane[0]} →  at {cut.where[plane]}", labelpad=2)
                 axes.set_ylabel(f"{plane[1]} →", labelpad=2)
             line[0].set_title(name)
@@ -249,7 +249,7 @@ def plot_image_row(reference: NDArray, render: NDArray, z: NDArray | None = None
     """
     label = f"radiance [{unit}]" if unit else "radiance"
     difference = np.asarray(render, float) - np.asarray(reference, float)
-    values = pixel_scale.scale_of(reference)
+    values = pixel_scale.shared_scale(reference)
     panels = [
         ("reference", reference, values),
         ("render", render, values),
@@ -260,7 +260,7 @@ def plot_image_row(reference: NDArray, render: NDArray, z: NDArray | None = None
     with mpl.rc_context(STYLE):
         figure = empty_figure(2.6 * len(panels), 2.9)
         for axes, (name, image, scale) in zip(figure.subplots(1, len(panels)), panels, strict=True):
-            _picture(axes, pixel_scale.pixels(image, scale), image.shape[1] / image.shape[0])
+            _picture(axes, pixel_scale.to_pixels(image, scale), image.shape[1] / image.shape[0])
             axes.set_title(name)
             if scale.kind == "colour":
                 axes.set_xlabel(f"{label}: white is {scale.high:.3g}")
@@ -368,7 +368,7 @@ def plot_error_against_time(
         axes.margins(0.06, 0.08)
         axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), labelspacing=0.9, handlelength=1.6)
     if path is not None:
-        save(figure, path)
+        save_figure(figure, path)
     return figure
 
 
@@ -413,7 +413,7 @@ def _check_series(series: Sequence[Series]) -> None:
 DASHES = {"reconstruction": "solid", "truth": (0, (3, 2))}
 
 
-def profiles_of(folder: Path, volumes: Sequence[Volume]) -> list[str]:
+def draw_profiles(folder: Path, volumes: Sequence[Volume]) -> list[str]:
     """Curves along x, y and z, as SVG, of the volumes that are to be drawn so.
 
     Raises:
@@ -445,7 +445,7 @@ def plot_profile(values: dict[str, NDArray], axis: str, box: tuple[float, float]
         figure = empty_figure(4.4, 2.75)
         axes = figure.subplots()
         for role, colour in zip(values, SERIES, strict=False):
-            line = line_through_the_middle(values[role], axis)
+            line = central_line(values[role], axis)
             at = box[0] + (np.arange(len(line)) + 0.5) * box[1] / len(line)
             axes.plot(at, line, color=colour, label=role, linestyle=DASHES[role], linewidth=1.5)
         axes.set_title(named)
@@ -457,7 +457,7 @@ def plot_profile(values: dict[str, NDArray], axis: str, box: tuple[float, float]
     return figure
 
 
-def line_through_the_middle(values: NDArray, axis: str) -> NDArray:
+def central_line(values: NDArray, axis: str) -> NDArray:
     """The voxels along an axis through the one in the middle of (Z, Y, X)."""
     z, y, x = (n // 2 for n in values.shape)
     return {"x": values[z, y, :], "y": values[z, :, x], "z": values[:, y, x]}[axis]

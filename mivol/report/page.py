@@ -22,9 +22,9 @@ from mivol.cite import citations
 from mivol.errors import MivolError
 from mivol.files import write_whole_text
 from mivol.report import figures
-from mivol.report.figures import profiles_of
-from mivol.report.page_images import Cut, ShownView, film_of, plain_picture, views_of, volumes_of
-from mivol.report.record import CODES, LINES, QUANTITIES, SINOGRAM, RunRecord, quantity_of, read_metrics, read_record
+from mivol.report.figures import draw_profiles
+from mivol.report.page_images import ViewRow, VolumeView, encode_film, encode_image, make_view_rows, make_volume_views
+from mivol.report.record import CODES, LINES, QUANTITIES, SINOGRAM, RunRecord, find_quantity, read_metrics, read_record
 
 __all__ = ["PAGE", "headline", "write_page"]
 
@@ -50,23 +50,23 @@ def write_page(folder: str | Path) -> Path:
     record, rows = read_record(folder), read_metrics(folder)
     _check_present(folder, record)
     sinograms = [image for image in record.images if image.view == SINOGRAM]
-    groups = views_of(folder, [image for image in record.images if image.view != SINOGRAM])
-    volumes = volumes_of(folder, record.volumes)
+    groups = make_view_rows(folder, [image for image in record.images if image.view != SINOGRAM])
+    volumes = make_volume_views(folder, record.volumes)
     facts = {
         "record": record,
         "headline": headline(record, _held_out_psnr(record, groups.rows)),
         "numbers": _numbers(record, groups.rows, volumes),
-        "sinograms": views_of(folder, sinograms),
+        "sinograms": make_view_rows(folder, sinograms),
         "are_lines": any(image.quantity == LINES for image in record.images),
         "are_codes": any(image.quantity == CODES for image in record.images),
         "views": groups,
         "shown": SHOWN_VIEWS,
         "volumes": volumes,
-        "profiles": profiles_of(folder, record.volumes),
+        "profiles": draw_profiles(folder, record.volumes),
         "curves": _curves(rows, record.units),
         "timings": _timings(record.timings),
-        "films": [film_of(folder, image) for image in record.images if image.role == "film"],
-        "others": [plain_picture(folder, image) for image in record.images if image.role in ("slice", "picture")],
+        "films": [encode_film(folder, image) for image in record.images if image.role == "film"],
+        "others": [encode_image(folder, image) for image in record.images if image.role in ("slice", "picture")],
         "config": _toml(record.config),
         "citations": citations(record.citations),
         "theme": figures.CSS,
@@ -132,7 +132,7 @@ def _check_present(folder: Path, record: RunRecord) -> None:
 # -- Numbers, curves, times, settings -----------------------------------------------------------------------------------
 
 
-def _held_out_psnr(record: RunRecord, views: Sequence[ShownView]) -> list[float]:
+def _held_out_psnr(record: RunRecord, views: Sequence[ViewRow]) -> list[float]:
     """PSNR of the views that were not fitted: of those that are shown, or the mean of all that the run has judged itself."""
     judged = record.results.get("held_out_psnr")
     if judged is not None:
@@ -140,7 +140,7 @@ def _held_out_psnr(record: RunRecord, views: Sequence[ShownView]) -> list[float]
     return [view.psnr for view in views if view.held_out and view.psnr is not None]
 
 
-def _numbers(record: RunRecord, views: Sequence[ShownView], volumes: Sequence[Cut]) -> list[tuple[str, str, str]]:
+def _numbers(record: RunRecord, views: Sequence[ViewRow], volumes: Sequence[VolumeView]) -> list[tuple[str, str, str]]:
     """Tiles under the headline: value, unit, label."""
     held_out = _held_out_psnr(record, views)
     seconds, said, tiles = _seconds(record), ("nrmse", "held_out_psnr", "seconds"), []
@@ -160,7 +160,7 @@ def _numbers(record: RunRecord, views: Sequence[ShownView], volumes: Sequence[Cu
 
 
 def _tile(name: str, value: float | None, units: dict[str, str]) -> tuple[str, str, str]:
-    quantity = quantity_of(name, units)
+    quantity = find_quantity(name, units)
     if value is None:
         return "–", "", quantity.label
     return (f"{value:,.0f}" if float(value).is_integer() else f"{value:.3g}"), quantity.beside, quantity.label
@@ -170,10 +170,8 @@ def _curves(rows: Sequence[dict], units: dict[str, str]) -> list[str]:
     """Curves of every number in the metrics: known ones first, then the others by name."""
     names = {name for row in rows for name, value in row.items() if value is not None} - {"iteration", "seconds"}
     ordered = [name for name in QUANTITIES if name in names] + sorted(names - set(QUANTITIES))
-    return [
-        figures.inline_svg(figures.plot_curve(rows, name, units=units), f"{quantity_of(name, units).label} against iterations")
-        for name in ordered
-    ]
+    labels = {name: f"{find_quantity(name, units).label} against iterations" for name in ordered}
+    return [figures.inline_svg(figures.plot_curve(rows, name, units=units), label) for name, label in labels.items()]
 
 
 def _seconds(record: RunRecord) -> float:

@@ -15,11 +15,14 @@ from matplotlib.image import imread
 from numpy.typing import NDArray
 
 from mivol.errors import MivolError
-from mivol.files import layers, read_exr, read_volume
+from mivol.files import read_exr, read_volume, stack_layers
 from mivol.report import pixel_scale
 from mivol.report.record import LINES, Image, Volume
 
-__all__ = ["Bar", "Cut", "Gallery", "Picture", "ShownView", "film_of", "plain_picture", "views_of", "volumes_of"]
+__all__ = [
+    *("ColourBar", "PageImage", "ViewRow", "ViewRows", "VolumeView"),
+    *("encode_film", "encode_image", "make_view_rows", "make_volume_views"),
+]
 
 LAYERS = 16
 LAYER_EDGE = 128
@@ -33,7 +36,7 @@ Z_ODD = 3.0
 FILMS = {".mp4": "video/mp4", ".webp": "image/webp", ".gif": "image/gif"}
 
 
-class Picture(NamedTuple):
+class PageImage(NamedTuple):
     """One picture of the page: a PNG as an address, its size in pixels and its width over height in the world."""
 
     name: str
@@ -48,18 +51,18 @@ class Picture(NamedTuple):
         return max(self.width, self.height) <= 320
 
 
-class ShownView(NamedTuple):
+class ViewRow(NamedTuple):
     """A row of pictures of one view with its numbers."""
 
     name: str
     held_out: bool
-    pictures: list[Picture]
+    pictures: list[PageImage]
     psnr: float | None
     text: str
     small: bool = False
 
 
-class Bar(NamedTuple):
+class ColourBar(NamedTuple):
     """A colour bar: what it measures, its ends, and its CSS gradient."""
 
     label: str
@@ -68,25 +71,25 @@ class Bar(NamedTuple):
     gradient: str
 
 
-class Gallery(NamedTuple):
+class ViewRows(NamedTuple):
     """Views that share scales."""
 
-    rows: list[ShownView]
-    bars: list[Bar]
+    rows: list[ViewRow]
+    bars: list[ColourBar]
 
 
-class Cut(NamedTuple):
+class VolumeView(NamedTuple):
     """Slices of one quantity's volumes, one row a plane, and the voxels of the reconstruction along x, y, z; and slices xy from
     the lowest to the highest, to be scrolled through, one row a layer (none of a volume of one layer)."""
 
     title: str
     shape: tuple[int, ...]
     rows: list[dict[str, Any]]
-    bars: list[Bar]
+    bars: list[ColourBar]
     layers: list[dict[str, Any]]
 
 
-def views_of(folder: Path, images: Sequence[Image]) -> Gallery:
+def make_view_rows(folder: Path, images: Sequence[Image]) -> ViewRows:
     """Views that have a reference or a render, held-out ones first, all on the same scales."""
     by_view: dict[str, dict[str, Image]] = {}
     for image in images:
@@ -100,7 +103,7 @@ def views_of(folder: Path, images: Sequence[Image]) -> Gallery:
     rows = [_view(name, by_view[name], roles, scales) for name, roles in arrays.items()]
     rows.sort(key=lambda view: not view.held_out)
     first = next((image for roles in by_view.values() for image in roles.values()), None)
-    return Gallery(rows, [_bar(scales[role], label) for role, label in _bar_labels(scales, first)])
+    return ViewRows(rows, [_bar(scales[role], label) for role, label in _bar_labels(scales, first)])
 
 
 def _load(folder: Path, image: Image) -> NDArray:
@@ -114,7 +117,7 @@ def _load(folder: Path, image: Image) -> NDArray:
 
 
 def _exr(path: Path, layer: str) -> NDArray:
-    stacked = layers(read_exr(path)[0])
+    stacked = stack_layers(read_exr(path)[0])
     wanted = [layer] if layer else ["", "Y", *(stacked if len(stacked) == 1 else ())]
     name = next((name for name in wanted if name in stacked), None)
     if name is None:
@@ -164,12 +167,12 @@ def _scales(views: Iterable[dict[str, NDArray]]) -> dict[str, pixel_scale.Scale]
     differences = [roles["difference"] for roles in views if "difference" in roles]
     scales = {}
     if values:
-        scales["reference"] = scales["render"] = pixel_scale.scale_of(*values)
+        scales["reference"] = scales["render"] = pixel_scale.shared_scale(*values)
     if differences:
         scales["difference"] = pixel_scale.signed_scale(*differences)
     errors = [roles["error"] for roles in views if "error" in roles]
     if errors:
-        scales["error"] = pixel_scale.scale_of(*errors)
+        scales["error"] = pixel_scale.shared_scale(*errors)
     if any("z" in roles for roles in views):
         scales["z"] = pixel_scale.Scale("signed", -Z_LIMIT, Z_LIMIT)
     return scales
@@ -195,7 +198,7 @@ def _names_of(images: Iterable[Image]) -> dict[str, str]:
     return PANELS_OF_LINES if any(image.quantity == LINES for image in images) else PANELS
 
 
-def _view(name: str, images: dict[str, Image], roles: dict[str, NDArray], scales: dict[str, pixel_scale.Scale]) -> ShownView:
+def _view(name: str, images: dict[str, Image], roles: dict[str, NDArray], scales: dict[str, pixel_scale.Scale]) -> ViewRow:
     names = _names_of(images.values())
     pictures = [_picture(names[role], roles[role], scales.get(role)) for role in names if role in roles]
     words = [next((image.caption for image in images.values() if image.caption), "")]
@@ -207,7 +210,7 @@ def _view(name: str, images: dict[str, Image], roles: dict[str, NDArray], scales
         words.append(f"|z| > {Z_ODD:g} in {np.mean(np.abs(roles['z']) > Z_ODD):.1%} of the values")
     held_out = any(image.held_out for image in images.values())
     small = any(image.small for image in images.values())
-    return ShownView(name, held_out, pictures, psnr, " · ".join(word for word in words if word), small)
+    return ViewRow(name, held_out, pictures, psnr, " · ".join(word for word in words if word), small)
 
 
 def _agreement(reference: NDArray, difference: NDArray) -> tuple[float | None, str]:
@@ -222,20 +225,20 @@ def _agreement(reference: NDArray, difference: NDArray) -> tuple[float | None, s
     return psnr, f"PSNR {psnr:.1f} dB · nRMSE {np.sqrt(mse / power):.3g}"
 
 
-def _picture(name: str, image: NDArray, scale: pixel_scale.Scale | None, aspect: float | None = None) -> Picture:
-    rgb = image if image.dtype == np.uint8 else pixel_scale.pixels(image, scale or pixel_scale.scale_of(image))
+def _picture(name: str, image: NDArray, scale: pixel_scale.Scale | None, aspect: float | None = None) -> PageImage:
+    rgb = image if image.dtype == np.uint8 else pixel_scale.to_pixels(image, scale or pixel_scale.shared_scale(image))
     height, width = rgb.shape[:2]
     true = aspect or width / height
     shown = min(max(true, 1 / WIDEST), WIDEST)
-    return Picture(name if shown == true else f"{name}, stretched", pixel_scale.data_uri(rgb), width, height, shown)
+    return PageImage(name if shown == true else f"{name}, stretched", pixel_scale.data_uri(rgb), width, height, shown)
 
 
-def plain_picture(folder: Path, image: Image) -> Picture:
+def encode_image(folder: Path, image: Image) -> PageImage:
     """An image that stands alone, with a scale of its own."""
     return _picture(image.caption or image.view or Path(image.path).stem, _load(folder, image), None)
 
 
-def film_of(folder: Path, image: Image) -> tuple[str, str, bool]:
+def encode_film(folder: Path, image: Image) -> tuple[str, str, bool]:
     """The caption of a film, the film as an address, and whether it is an animated image."""
     coded = base64.b64encode((folder / image.path).read_bytes()).decode()
     kind = FILMS[Path(image.path).suffix]
@@ -254,18 +257,18 @@ def _bar_labels(scales: dict[str, pixel_scale.Scale], image: Image | None) -> li
     return [(role, label) for role, label in labels.items() if role in scales]
 
 
-def _bar(scale: pixel_scale.Scale, label: str) -> Bar:
-    stops = pixel_scale.pixels(np.linspace(scale.low, scale.high, 17)[None, :], scale)[0]
+def _bar(scale: pixel_scale.Scale, label: str) -> ColourBar:
+    stops = pixel_scale.to_pixels(np.linspace(scale.low, scale.high, 17)[None, :], scale)[0]
     gradient = ", ".join("#{:02x}{:02x}{:02x}".format(*stop) for stop in stops)
     # A percentile between zeros may be 1e-16.
     low = scale.low if abs(scale.low) > 1e-9 * scale.high else 0.0
-    return Bar(label, f"{low:.3g}", f"{scale.high:.3g}", gradient)
+    return ColourBar(label, f"{low:.3g}", f"{scale.high:.3g}", gradient)
 
 
 # -- Volume -------------------------------------------------------------------------------------------------------------
 
 
-def volumes_of(folder: Path, volumes: Sequence[Volume]) -> list[Cut]:
+def make_volume_views(folder: Path, volumes: Sequence[Volume]) -> list[VolumeView]:
     """Slices of every volume that was reconstructed: those of one caption and quantity belong together."""
     groups: dict[tuple[str, str], dict[str, Volume]] = {}
     for volume in volumes:
@@ -273,16 +276,16 @@ def volumes_of(folder: Path, volumes: Sequence[Volume]) -> list[Cut]:
     return [_cut(folder, group) for group in groups.values() if "reconstruction" in group]
 
 
-def _cut(folder: Path, by_role: dict[str, Volume]) -> Cut:
+def _cut(folder: Path, by_role: dict[str, Volume]) -> VolumeView:
     """Slices of the truth, the reconstruction and their difference, one row a plane."""
     data = {role: read_volume(folder / by_role[role].path) for role in ("truth", "reconstruction") if role in by_role}
     size = by_role["reconstruction"].size or tuple(np.linalg.norm(data["reconstruction"].to_world[:3, :3], axis=0))
-    cuts = {role: pixel_scale.slices(found.values, size) for role, found in data.items()}
+    cuts = {role: pixel_scale.middle_slices(found.values, size) for role, found in data.items()}
     if len(cuts) == 2 and data["truth"].values.shape == data["reconstruction"].values.shape:
         truth, found = cuts["truth"].images, cuts["reconstruction"]
         cuts["difference"] = found._replace(images={p: image - truth[p] for p, image in found.images.items()})
     first = next(iter(cuts.values()))
-    values = pixel_scale.scale_of(*first.images.values())
+    values = pixel_scale.shared_scale(*first.images.values())
     scales = {"truth": values, "reconstruction": values}
     if "difference" in cuts:
         scales["difference"] = pixel_scale.signed_scale(*cuts["difference"].images.values())
@@ -297,7 +300,7 @@ def _cut(folder: Path, by_role: dict[str, Volume]) -> Cut:
     if "difference" in cuts:
         volumes["difference"] = found - volumes["truth"]
     layers = [_layer(share, volumes, scales, first.aspect["xy"]) for share in _heights(found.shape[0])]
-    return Cut(described.caption or described.quantity, found.shape[2::-1], rows, bars, layers)
+    return VolumeView(described.caption or described.quantity, found.shape[2::-1], rows, bars, layers)
 
 
 def _heights(count: int) -> list[float]:

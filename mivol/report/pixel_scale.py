@@ -28,14 +28,14 @@ __all__ = [
     "Scale",
     "Slices",
     "data_uri",
-    "pixels",
-    "scale_of",
+    "to_pixels",
+    "shared_scale",
     "signed_scale",
-    "slices",
+    "middle_slices",
     "COLOURS",
     "depth_pixels",
     "normal_pixels",
-    "normals_of_depth",
+    "normals_from_depth",
 ]
 
 SIGNED = "RdBu_r"
@@ -51,7 +51,7 @@ class Scale(NamedTuple):
     high: float
 
 
-def scale_of(*images: NDArray, low: float | None = 0.0, kind: str | None = None, percentile: float = 99.8) -> Scale:
+def shared_scale(*images: NDArray, low: float | None = 0.0, kind: str | None = None, percentile: float = 99.8) -> Scale:
     """One scale for several images: from ``low`` (their smallest value if None) to their given percentile.
 
     The percentile, and not the maximum, so that one firefly does not turn the rest black.
@@ -72,7 +72,7 @@ def signed_scale(*images: NDArray, percentile: float = 99.8) -> Scale:
     return Scale("signed", -limit if limit else -1.0, limit or 1.0)
 
 
-def pixels(image: NDArray, scale: Scale) -> NDArray[np.uint8]:
+def to_pixels(image: NDArray, scale: Scale) -> NDArray[np.uint8]:
     """The image in 8 bits on ``scale``.
 
     Raises:
@@ -110,7 +110,7 @@ def _channels(image: NDArray) -> int:
     return 1 if image.ndim == 2 else image.shape[2]
 
 
-def png(rgb: NDArray[np.uint8]) -> bytes:
+def encode_png(rgb: NDArray[np.uint8]) -> bytes:
     """The pixels as a PNG."""
     buffer = io.BytesIO()
     imsave(buffer, rgb, format="png", metadata={"Software": None}, pil_kwargs={"optimize": True})
@@ -119,7 +119,7 @@ def png(rgb: NDArray[np.uint8]) -> bytes:
 
 def data_uri(rgb: NDArray[np.uint8]) -> str:
     """The pixels as a PNG inside a ``data:`` address."""
-    return "data:image/png;base64," + base64.b64encode(png(rgb)).decode("ascii")
+    return "data:image/png;base64," + base64.b64encode(encode_png(rgb)).decode("ascii")
 
 
 class Slices(NamedTuple):
@@ -130,7 +130,7 @@ class Slices(NamedTuple):
     aspect: dict[str, float]
 
 
-def slices(grid: NDArray, size: tuple[float, float, float] | None = None) -> Slices:
+def middle_slices(grid: NDArray, size: tuple[float, float, float] | None = None) -> Slices:
     """The three orthogonal slices through the middle of a grid.
 
     Args:
@@ -177,7 +177,7 @@ def depth_pixels(distance: NDArray, near_far: tuple[float, float], opacity: NDAr
     return _over_white(mpl.colormaps[COLOURS](share)[..., :3], there, opacity)
 
 
-def normals_of_depth(distance: NDArray, camera: Camera) -> NDArray:
+def normals_from_depth(distance: NDArray, camera: Camera) -> NDArray:
     """Unit normals (H, W, 3) in the world of the surface that a picture of distances is of, towards the camera.
 
     The surface is differentiated between neighbouring pixels (central differences inside, one-sided at the border), so that
@@ -218,7 +218,7 @@ EDGE, GAP = 320, 8
 """Pixels of the box's longest edge, and between two slices."""
 
 
-def is_due(iteration: int, iterations: int) -> bool:
+def is_preview_due(iteration: int, iterations: int) -> bool:
     """Whether a preview is written after an iteration: the first and the last one, and some twenty between."""
     return iteration in (1, iterations) or iteration % max(1, iterations // 20) == 0
 
@@ -231,17 +231,17 @@ def write_preview(folder: Path, volume: NDArray, size: tuple[float, float, float
         volume: (Z, Y, X).
         size: lengths of the box's edges along x, y, z; the longest is EDGE pixels.
     """
-    cut = slices(volume, size)
-    scale = scale_of(*cut.images.values())
+    cut = middle_slices(volume, size)
+    scale = shared_scale(*cut.images.values())
     edges = dict(zip("xyz", np.maximum(1, np.rint(EDGE * np.array(size) / max(size))).astype(int), strict=True))
-    parts = [_resized(pixels(image, scale), edges[plane[1]], edges[plane[0]]) for plane, image in cut.images.items()]
+    parts = [_resized(to_pixels(image, scale), edges[plane[1]], edges[plane[0]]) for plane, image in cut.images.items()]
     height = max(part.shape[0] for part in parts)
     paper = np.full((height, sum(part.shape[1] for part in parts) + 2 * GAP, 3), 255, np.uint8)
     left = 0
     for part in parts:
         paper[height - part.shape[0] :, left : left + part.shape[1]] = part
         left += part.shape[1] + GAP
-    write_whole_bytes(folder / PREVIEW, png(paper))
+    write_whole_bytes(folder / PREVIEW, encode_png(paper))
     return folder / PREVIEW
 
 

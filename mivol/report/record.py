@@ -39,11 +39,11 @@ __all__ = [
     "Volume",
     "append_metrics",
     "describe_machine",
-    "quantity_of",
+    "find_quantity",
     "read_metrics",
     "read_record",
     "rewind_metrics",
-    "versions",
+    "package_versions",
     "write_record",
 ]
 
@@ -101,7 +101,7 @@ QUANTITIES: dict[str, Quantity] = {
 }
 
 
-def quantity_of(name: str, units: Mapping[str, str]) -> Quantity:
+def find_quantity(name: str, units: Mapping[str, str]) -> Quantity:
     """How a number is named and printed: by ``QUANTITIES``, with the unit that a run has for it.
 
     Numbers that a run alone has a unit for keep their names, which are keys of a scene, and even steps.
@@ -210,10 +210,10 @@ class RunRecord(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
     def new(cls, title: str, *, device: str = "", **fields: Any) -> RunRecord:
         """A record of a run that starts now, on this machine, with the versions that are installed."""
         now = datetime.now(UTC).isoformat(timespec="seconds").replace("+00:00", "Z")
-        return cls(title=title, machine=describe_machine(device), versions=versions(), started=now, **fields)
+        return cls(title=title, machine=describe_machine(device), versions=package_versions(), started=now, **fields)
 
 
-def versions() -> dict[str, str]:
+def package_versions() -> dict[str, str]:
     """Versions of Python, the system and the packages that results depend on; those not installed are left out."""
     found = {"python": platform.python_version(), "system": f"{platform.system()} {platform.machine()}"}
     for package in PACKAGES:

@@ -18,7 +18,7 @@ from mivol.report.cameras import EDGE, Arrangement, Strokes, plot_arrangement, p
 from mivol.report.figures import FAINT, SERIES
 from mivol.tomography.geometry import FlatDetector, VoxelGrid
 
-__all__ = ["MOST_VIEWS", "plot_scanner", "shown_views"]
+__all__ = ["MOST_VIEWS", "plot_scanner", "select_views"]
 
 MOST_VIEWS = 60
 """That are drawn of those that were fitted, and of those held out."""
@@ -59,11 +59,11 @@ def plot_scanner(
     """
     count = geometry.shape[0]
     strokes = [
-        Strokes(label, colour, marks(geometry, views, grid))
-        for label, colour, views in zip((FITTED, HELD_OUT), SERIES, shown_views(count, held_out), strict=False)
+        Strokes(label, colour, make_markers(geometry, views, grid))
+        for label, colour, views in zip((FITTED, HELD_OUT), SERIES, select_views(count, held_out), strict=False)
         if len(views)
     ]
-    some = beams_of(geometry, _spread(np.arange(count), DETECTORS), grid)
+    some = make_beams(geometry, _spread(np.arange(count), DETECTORS), grid)
     strokes += [
         Strokes(DETECTOR, SERIES[2], np.concatenate([rectangle(corners) for corners in some.ends])),
         Strokes(FIRST, FAINT, np.stack([some.begins[0], some.ends[0]], axis=1)),
@@ -74,7 +74,7 @@ def plot_scanner(
     return plot_arrangement(arranged, f"{count} views and the box of the voxels", path, part)
 
 
-def shown_views(count: int, held_out: NDArray) -> tuple[NDArray, NDArray]:
+def select_views(count: int, held_out: NDArray) -> tuple[NDArray, NDArray]:
     """Numbers of the views that are drawn, spread evenly over those that were fitted and over those held out."""
     return _spread(np.setdiff1d(np.arange(count), held_out), MOST_VIEWS), _spread(np.asarray(held_out, int), MOST_VIEWS)
 
@@ -83,7 +83,7 @@ def _spread(numbers: NDArray, most: int) -> NDArray:
     return numbers if len(numbers) <= most else numbers[np.arange(most) * len(numbers) // most]
 
 
-def beams_of(geometry: FlatDetector, views: NDArray, grid: VoxelGrid) -> Beams:
+def make_beams(geometry: FlatDetector, views: NDArray, grid: VoxelGrid) -> Beams:
     """Beams of some views, with the corners of the detector in turn."""
     panels = geometry.panels(views)
     _, rows, columns = geometry.shape
@@ -97,9 +97,9 @@ def beams_of(geometry: FlatDetector, views: NDArray, grid: VoxelGrid) -> Beams:
     return Beams(corners + middle - reach, corners + middle + reach)
 
 
-def marks(geometry: FlatDetector, views: NDArray, grid: VoxelGrid) -> NDArray:
+def make_markers(geometry: FlatDetector, views: NDArray, grid: VoxelGrid) -> NDArray:
     """(8 views, 2, 3) a pyramid for each view, as long as EDGE of the median distance from the middle of the voxels."""
-    begins, ends = beams_of(geometry, views, grid)
+    begins, ends = make_beams(geometry, views, grid)
     apex, along = begins.mean(axis=1, keepdims=True), (ends - begins).mean(axis=1, keepdims=True)
     length = EDGE * np.median(np.linalg.norm(apex[:, 0] - grid.centre, axis=1))
     if not geometry.whole_lines:

@@ -20,7 +20,7 @@ from scipy.sparse import csr_matrix
 from mivol.errors import MivolError
 from mivol.files import whole_file
 
-__all__ = ["WITHOUT_FFMPEG", "WRITERS", "film_suffix", "write_video", "FEWEST_LAYERS", "volume_frames"]
+__all__ = ["NO_FFMPEG_NOTE", "WRITERS", "film_suffix", "write_video", "FEWEST_LAYERS", "volume_frames"]
 
 Frames = Iterator[NDArray[np.uint8]]
 
@@ -28,7 +28,7 @@ QUALITY = "18"
 """H.264's constant rate factor: 0 is lossless, 18 looks it."""
 
 
-WITHOUT_FFMPEG = 'imageio-ffmpeg is not installed, so films are written as .webp: pip install "mivol[video]" makes them .mp4.'
+NO_FFMPEG_NOTE = 'imageio-ffmpeg is not installed, so films are written as .webp: pip install "mivol[video]" makes them .mp4.'
 """What to say where :func:`film_suffix` is not .mp4."""
 
 

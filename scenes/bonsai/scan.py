@@ -80,14 +80,14 @@ def panels(edge: int, views: int, columns: int, off: float = 1.5) -> list[Panel]
 
 def load_object(name: str) -> np.ndarray:
     """The object as extinction [1/length], float64, even numbers of voxels, in the order (Z, Y, X)."""
-    if name.startswith(PREFIX) and find_data(name.removeprefix(PREFIX)) is None:
+    if name.startswith(PREFIX) and find_local_file(name.removeprefix(PREFIX)) is None:
         known = name.removeprefix(PREFIX)
         print(
             f'the data set "{known}" is not on this machine: a procedural volume stands in (mivol fetch {known}, or MIVOL_DATA)'
         )
         values = make_procedural("tangle", (64, 64, 64), 2, 1.0)[..., 0]
     else:
-        values = np.moveaxis(read_volume(place_of(Path(), name)).values[..., 0], 1, 0)  # y is up in the file
+        values = np.moveaxis(read_volume(resolve_path(Path(), name)).values[..., 0], 1, 0)  # y is up in the file
     values = values[tuple(slice(0, n // 2 * 2) for n in values.shape)].astype(float)
     at = [np.arange(n) - (n - 1) / 2 for n in values.shape]
     air = np.hypot(at[1][:, None], at[2]) > min(values.shape[1:]) / 2 - 1

@@ -19,7 +19,7 @@ from pathlib import Path
 import mivol  # noqa: F401  (chooses the LLVM library; call it before the first variant)
 from mivol.cli import main as mivol_main
 from mivol.experiments.examples import EXAMPLES
-from mivol.files import layers, read_exr, read_volume
+from mivol.files import read_exr, read_volume, stack_layers
 from mivol.optim.events import upsample
 from mivol.phase.mie import water_droplets
 from mivol.report import figures, pixel_scale
@@ -92,7 +92,7 @@ def columns(values: np.ndarray) -> np.ndarray:
 
 def seen(home: Path, record: RunRecord) -> tuple[np.ndarray, np.ndarray]:
     """The first view that was held out, and what the fit shows of it."""
-    parts = layers(read_exr(home / next(image.path for image in record.images if image.held_out))[0])
+    parts = stack_layers(read_exr(home / next(image.path for image in record.images if image.held_out))[0])
     return parts["reference"], parts[""]
 
 
@@ -114,7 +114,7 @@ def main() -> None:
             f"{MODELS[name][0]}: {r['held_out_psnr']:.2f} dB on views not seen, nRMSE of the volume {r['nrmse']:.3f}, "
             f"optical depth of columns {r['columns']:.3f}, {r['fit_seconds']:.0f} s"
         )
-    figures.save(draw(given.output, records), given.output / "models.png")
+    figures.save_figure(draw(given.output, records), given.output / "models.png")
     print(given.output / "models.png")
 
 
@@ -125,14 +125,14 @@ def draw(folder: Path, records: dict[str, RunRecord]) -> mpl.figure.Figure:
         above, below = figure.subfigures(2, 1, height_ratios=(3, 2))
         views, maps = above.subplots(2, len(records) + 1)
         first = next(iter(records))
-        scale = pixel_scale.scale_of(seen(folder / first, records[first])[0])
+        scale = pixel_scale.shared_scale(seen(folder / first, records[first])[0])
         top = columns(volumes(folder / first, records[first])[0])
         shown = [("truth", seen(folder / first, records[first])[0], top)]
         for name, record in records.items():
             text = MODELS[name][0].replace(", ", ",\n")
             shown.append((text, seen(folder / name, record)[1], columns(volumes(folder / name, record)[1])))
         for column, (text, view, depths) in enumerate(shown):
-            views[column].imshow(pixel_scale.pixels(view, scale))
+            views[column].imshow(pixel_scale.to_pixels(view, scale))
             views[column].set_title(text, fontsize=9, weight="normal")
             maps[column].imshow(depths, vmin=0, vmax=top.max(), cmap="magma", origin="lower")
             views[column].set_axis_off()

@@ -57,21 +57,21 @@ def main() -> None:
     print(f"reference: standard error {truth.standard_error:.2g}, no render can be nearer to it than {ceiling:.1f} dB")
     for name, image in images.items():
         print(f"{name}: {psnr(image, truth.mean):.2f} dB")
-    figures.save(draw(truth.mean, images), given.output / "relit_smoke.png")
+    figures.save_figure(draw(truth.mean, images), given.output / "relit_smoke.png")
     print(given.output / "relit_smoke.png")
 
 
 def draw(reference: np.ndarray, images: dict[str, np.ndarray]) -> mpl.figure.Figure:
     """The true smoke, and under it nothing; each render, and under it its difference."""
-    scale = pixel_scale.scale_of(reference)
+    scale = pixel_scale.shared_scale(reference)
     signed = pixel_scale.Scale("signed", -0.25 * scale.high, 0.25 * scale.high)
     with mpl.rc_context(figures.STYLE):
         figure = mpl.figure.Figure(figsize=(8.4, 6.0))
         grid = figure.subplots(2, 3)
-        put(grid[0, 0], pixel_scale.pixels(reference, scale), "true smoke (volpath)")
+        put(grid[0, 0], pixel_scale.to_pixels(reference, scale), "true smoke (volpath)")
         for column, (name, image) in enumerate(images.items(), 1):
-            put(grid[0, column], pixel_scale.pixels(image, scale), f"{name}, {psnr(image, reference):.1f} dB")
-            put(grid[1, column], pixel_scale.pixels(image - reference, signed), f"difference, ±{signed.high:.2g}")
+            put(grid[0, column], pixel_scale.to_pixels(image, scale), f"{name}, {psnr(image, reference):.1f} dB")
+            put(grid[1, column], pixel_scale.to_pixels(image - reference, signed), f"difference, ±{signed.high:.2g}")
         grid[1, 0].set_axis_off()
     return figure
 

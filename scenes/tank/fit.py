@@ -154,7 +154,7 @@ def main() -> None:
         print(f"{name:5s} squared residual, in noise: {losses[0]:.1f} -> {losses[-1]:.3f} in {given.iterations} iterations")
     known = truth != 0
     print(f"largest relative error: {np.abs(found[known] / truth[known] - 1).max():.4f}")
-    figures.save(draw(given, model, photographs, found, errors, truth), given.output / "tank.png")
+    figures.save_figure(draw(given, model, photographs, found, errors, truth), given.output / "tank.png")
     print(given.output / "tank.png")
 
 
@@ -183,11 +183,11 @@ def draw(
             photo = np.stack(first, axis=-1)
             us = [np.array([np.log(f[0]), np.log(f[1]), np.arctanh(f[2])]) for f in found]
             image = np.stack([model.image(u, dilution, 0, 7, given.photo_spp) for u in us], axis=-1)
-            scale, difference = pixel_scale.scale_of(photo), image - photo
+            scale, difference = pixel_scale.shared_scale(photo), image - photo
             signed = pixel_scale.Scale("signed", -0.1 * scale.high, 0.1 * scale.high)
             pictures = ((photo, scale), (image, scale), (difference, signed))
             for row, (pixels, how) in enumerate(pictures):
-                grid[row, column].imshow(pixel_scale.pixels(pixels, how))
+                grid[row, column].imshow(pixel_scale.to_pixels(pixels, how))
                 grid[row, column].set_axis_off()
             grid[0, column].set_title(f"1 : {1 / dilution - 1:g} in water")
         for row, text in enumerate(("photograph (volpath)", "fitted (mivol)", "difference, ±10 %")):

@@ -145,7 +145,7 @@ def main() -> None:
         print("\n".join(table(name, found[channel], errors[channel], truth[channel])), flush=True)
     known = truth != 0
     print(f"largest relative error: {np.abs(found[known] / truth[known] - 1).max():.4f}")
-    figures.save(draw(given, model, photographs, found, errors, truth), given.output / "tank.png")
+    figures.save_figure(draw(given, model, photographs, found, errors, truth), given.output / "tank.png")
     print(given.output / "tank.png")
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import mivol  # noqa: F401  (chooses the LLVM library; call it before the first variant)
 from mivol.cli import main as mivol_main
-from mivol.files import layers, read_exr, read_volume
+from mivol.files import read_exr, read_volume, stack_layers
 from mivol.report import figures, pixel_scale
 from mivol.report.record import RunRecord, read_record
 
@@ -49,7 +49,7 @@ def main() -> None:
             f"{count:3d} views: {found['held_out_psnr']:.2f} dB on views not seen, nRMSE of the volume {found['nrmse']:.3f}, "
             f"{found['fit_seconds']:.0f} s"
         )
-    figures.save(draw(given.output, records), given.output / "views.png")
+    figures.save_figure(draw(given.output, records), given.output / "views.png")
     print(given.output / "views.png")
 
 
@@ -62,13 +62,13 @@ def draw(folder: Path, records: dict[int, RunRecord]) -> mpl.figure.Figure:
         views, slices = above.subplots(2, columns)
         first = next(iter(records))
         reference, _ = images(folder / f"{first}_views", records[first])
-        scale = pixel_scale.scale_of(reference)
+        scale = pixel_scale.shared_scale(reference)
         top = float(middle(folder / f"{first}_views", records[first], "truth").max())
-        put(views[0], pixel_scale.pixels(reference, scale), "a view not seen")
+        put(views[0], pixel_scale.to_pixels(reference, scale), "a view not seen")
         put(slices[0], hot(middle(folder / f"{first}_views", records[first], "truth"), top), "slice of the truth")
         for column, (count, record) in enumerate(records.items(), 1):
             home = folder / f"{count}_views"
-            put(views[column], pixel_scale.pixels(images(home, record)[1], scale), f"from {count} views")
+            put(views[column], pixel_scale.to_pixels(images(home, record)[1], scale), f"from {count} views")
             put(slices[column], hot(middle(home, record, "reconstruction"), top), f"{count} views")
         names = {"held_out_psnr": "held-out PSNR [dB]", "nrmse": "nRMSE of the volume"}
         for number, (axes, (key, label)) in enumerate(zip(below.subplots(1, 2), names.items(), strict=True)):
@@ -82,14 +82,14 @@ def draw(folder: Path, records: dict[int, RunRecord]) -> mpl.figure.Figure:
 def images(home: Path, record: RunRecord) -> tuple[np.ndarray, np.ndarray]:
     """Reference and render of the first view that was held out."""
     path = next(image.path for image in record.images if image.held_out)
-    parts = layers(read_exr(home / path)[0])
+    parts = stack_layers(read_exr(home / path)[0])
     return parts["reference"], parts[""]
 
 
 def middle(home: Path, record: RunRecord, role: str) -> np.ndarray:
     """The slice z = middle of the truth or the reconstruction."""
     path = next(volume.path for volume in record.volumes if volume.role == role)
-    return pixel_scale.slices(read_volume(home / path).values).images["xy"][..., 0]
+    return pixel_scale.middle_slices(read_volume(home / path).values).images["xy"][..., 0]
 
 
 def hot(values: np.ndarray, top: float) -> np.ndarray:

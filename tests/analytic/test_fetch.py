@@ -16,7 +16,7 @@ import pytest
 
 from mivol.errors import MivolError
 from mivol.files import fetch
-from mivol.files.fetch import DATA, DataSet, cache_folder, fetch_data, find_data, place_of
+from mivol.files.fetch import DATA, DataSet, cache_folder, fetch_data, find_local_file, resolve_path
 
 BODY = bytes(range(256)) * 1024
 
@@ -150,18 +150,18 @@ def test_a_server_that_is_not_there_is_one_sentence(server: Server, data: DataSe
 def test_a_path_may_name_a_set(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("MIVOL_DATA", raising=False)
     monkeypatch.setenv("MIVOL_CACHE", str(tmp_path / "cache"))
-    assert place_of(tmp_path, "a.vol") == tmp_path / "a.vol"
-    assert find_data("smoke") is None
+    assert resolve_path(tmp_path, "a.vol") == tmp_path / "a.vol"
+    assert find_local_file("smoke") is None
     with pytest.raises(MivolError, match="mivol fetch smoke brings it"):
-        place_of(tmp_path, "data:smoke")
+        resolve_path(tmp_path, "data:smoke")
     with pytest.raises(MivolError, match='did you mean "smoke"'):
-        place_of(tmp_path, "data:smok")
+        resolve_path(tmp_path, "data:smok")
     for variable, folder in (("MIVOL_CACHE", "cache"), ("MIVOL_DATA", "beside")):
         monkeypatch.setenv(variable, str(tmp_path / folder))
         there = tmp_path / folder / DATA["smoke"].path
         there.parent.mkdir(parents=True)
         there.touch()
-        assert place_of(tmp_path, "data:smoke") == there
+        assert resolve_path(tmp_path, "data:smoke") == there
 
 
 def test_the_cache_is_where_the_system_keeps_caches(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

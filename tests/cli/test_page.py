@@ -26,7 +26,7 @@ from mivol.files import write_exr, write_png, write_volume
 from mivol.report import figures, pixel_scale
 from mivol.report import page as page_module
 from mivol.report.page import headline, write_page
-from mivol.report.page_images import ShownView
+from mivol.report.page_images import ViewRow
 from mivol.report.record import (
     Image,
     Machine,
@@ -217,7 +217,7 @@ def test_numbers_of_a_view_on_paper(tmp_path):
 
 @pytest.mark.parametrize(("found", "said"), [([30.0], ""), ([30.0, 31.26], " (30.0 to 31.3)")], ids=["one", "two"])
 def test_views_that_are_held_out_have_a_range_where_there_are_two(found, said):
-    views = [ShownView(str(k), True, [], psnr, "") for k, psnr in enumerate(found)]
+    views = [ViewRow(str(k), True, [], psnr, "") for k, psnr in enumerate(found)]
     tiles = page_module._numbers(RunRecord.new("A run"), views, [])
     assert tiles == [(f"{np.mean(found):.1f}", "dB", f"PSNR, held-out views{said}")]
 
@@ -297,24 +297,24 @@ def test_slices_point_up_and_right():
     """Voxel (x 3, y 1, z 2) of (4, 3, 5) voxels lies in each middle slice where its coordinates say."""
     grid = np.zeros((5, 3, 4))
     grid[2, 1, 3] = 1
-    cut = pixel_scale.slices(grid)
+    cut = pixel_scale.middle_slices(grid)
     assert np.argwhere(cut.images["xy"]).tolist() == [[1, 3]]
     assert cut.images["xz"].shape == (5, 4) and np.argwhere(cut.images["xz"]).tolist() == [[2, 3]]
     assert cut.where == {"xy": "z = 3 of 5", "xz": "y = 2 of 3", "yz": "x = 3 of 4"}
     low = np.zeros((5, 3, 4))
     low[0, 1, 2] = 1
-    assert np.argwhere(pixel_scale.slices(low).images["yz"]).tolist() == [[4, 1]]
-    assert pixel_scale.slices(grid, (2.0, 1.0, 4.0)).aspect == {"xy": 2.0, "xz": 0.5, "yz": 0.25}
+    assert np.argwhere(pixel_scale.middle_slices(low).images["yz"]).tolist() == [[4, 1]]
+    assert pixel_scale.middle_slices(grid, (2.0, 1.0, 4.0)).aspect == {"xy": 2.0, "xz": 0.5, "yz": 0.25}
 
 
 def test_pixels_that_are_not_finite_are_seen():
     image = np.array([[0.0, np.nan], [1.0, np.inf]])
-    rgb = pixel_scale.pixels(image, pixel_scale.scale_of(image))
+    rgb = pixel_scale.to_pixels(image, pixel_scale.shared_scale(image))
     assert rgb[0, 1].tolist() == rgb[1, 1].tolist() == [255, 0, 255]
     assert rgb[0, 0].tolist() == [0, 0, 0] and rgb[1, 0].tolist() == [255, 255, 255]
     colour = np.zeros((1, 2, 3))
     colour[0, 1, 2] = np.nan
-    rgb = pixel_scale.pixels(colour, pixel_scale.Scale("grey", 0.0, 1.0))
+    rgb = pixel_scale.to_pixels(colour, pixel_scale.Scale("grey", 0.0, 1.0))
     assert rgb[0].tolist() == [[0, 0, 0], [255, 0, 255]]
 
 
@@ -332,7 +332,7 @@ def test_layers_of_one_file_and_a_volume_without_truth(tmp_path):
     volumes = [Volume(path="sigma_t.npz", role="reconstruction")]
     write_record(RunRecord.new("Layers", images=images, volumes=volumes), tmp_path)
     found = Page(write_page(tmp_path).read_text(encoding="utf-8"))
-    expected = pixel_scale.pixels(np.array([[3.0]]), pixel_scale.Scale("signed", -4.0, 4.0))[0, 0]
+    expected = pixel_scale.to_pixels(np.array([[3.0]]), pixel_scale.Scale("signed", -4.0, 4.0))[0, 0]
     # float32 moves z by 1e-6 of 8, at most one of the map's 256 entries, which are under 5 levels apart.
     assert np.abs(dict(found.pictures())["z-image"][0, 0] - expected).max() <= 5
     planes = [attributes for tag, attributes in found.tags if tag == "img" and attributes["alt"].startswith(("xy", "xz"))]
@@ -365,7 +365,7 @@ def test_projections_are_measured_and_modelled(tmp_path):
     assert found.text.count("Line integral") == 2 and "Radiance" not in found.text
     assert "Projections that took no part" in found.text and "rendered from viewpoints" not in found.text
     # A pixel that is not used has noise without bound, and no difference beside it: the middle of the blue-red map.
-    np.testing.assert_array_equal(dict(found.pictures())["Difference over noise"][0, 0], pixel_scale.pixels(
+    np.testing.assert_array_equal(dict(found.pictures())["Difference over noise"][0, 0], pixel_scale.to_pixels(
         np.zeros((1, 1)), pixel_scale.Scale("signed", -4.0, 4.0))[0, 0])  # fmt: skip
     labels = [attributes["aria-label"] for tag, attributes in found.tags if tag == "svg"]
     assert labels == [f"sigma_t along {axis}" for axis in "xyz"]
@@ -526,9 +526,9 @@ def test_figures_are_written_whole_or_refused(tmp_path, artefacts):
 def test_slices_and_rows_as_figures(artefacts):
     rng = np.random.default_rng(5)
     truth = rng.random((6, 8, 10))
-    figures.save(figures.plot_slices(truth + 0.1, truth, size=(1, 0.8, 0.6)), artefacts / "slices.png")
+    figures.save_figure(figures.plot_slices(truth + 0.1, truth, size=(1, 0.8, 0.6)), artefacts / "slices.png")
     image = rng.random((8, 8, 3))
-    figures.save(figures.plot_image_row(image, image + 0.1, np.full_like(image, 2.0)), artefacts / "row.png")
+    figures.save_figure(figures.plot_image_row(image, image + 0.1, np.full_like(image, 2.0)), artefacts / "row.png")
     with pytest.raises(MivolError, match="differ in shape"):
         figures.plot_slices(truth, truth[1:])
     with pytest.raises(MivolError, match='no row of the metrics has "psnr"'):

@@ -519,7 +519,7 @@ WRITES: dict[str, tuple[Callable[[Path], None], tuple[str, ...]]] = {
     "png NaN": (lambda p: files.write_png(p / "a.png", np.array([[0, np.nan]])), ("NaN at row 0, column 1",)),
     "png channels": (lambda p: files.write_png(p / "a.png", np.ones((2, 2, 2))), ("2 channels", "1, 3 or 4")),
     "png rank": (lambda p: files.write_png(p / "a.png", np.ones(3)), ("(3,)",)),
-    "frame unknown": (lambda p: files.in_space(files.VolumeData(ONE, np.eye(4)), "RAS"), ("None", "RAS, LPS")),
+    "frame unknown": (lambda p: files.to_space(files.VolumeData(ONE, np.eye(4)), "RAS"), ("None", "RAS, LPS")),
 }
 
 

@@ -276,7 +276,7 @@ def test_ras_and_lps_agree(tmp_path: Path) -> None:
     """The same head in NIfTI and in MetaImage lies in the same place once both frames have one name."""
     ras = read(tmp_path, "a.nii", made.nifti(made.numbered(), version=2, sform=SFORM))
     lps = read(tmp_path, "a.mha", made.mha(made.numbered(), Offset="-10 -20 30", TransformMatrix="-1 0 0 0 -1 0 0 0 1"))
-    np.testing.assert_allclose(files.in_space(lps, "RAS").to_world, ras.to_world, atol=1e-12)
+    np.testing.assert_allclose(files.to_space(lps, "RAS").to_world, ras.to_world, atol=1e-12)
     assert np.abs(lps.to_world - ras.to_world).max() > 1
 
 
@@ -478,7 +478,7 @@ def test_exr_round_trip_with_layers_and_header(tmp_path: Path) -> None:
     channels, read_header = files.read_exr(tmp_path / "a.exr")
     assert set(channels) == {"R", "G", "B", "tau", *(f"variance.{letter}" for letter in "RGBA")}
     assert all(channel.dtype == np.float32 for channel in channels.values())
-    stacked = files.layers(channels)
+    stacked = files.stack_layers(channels)
     np.testing.assert_array_equal(stacked[""], picture[:, ::-1].astype(np.float32))
     np.testing.assert_array_equal(stacked["variance"], variance.astype(np.float32))
     np.testing.assert_array_equal(stacked["tau"], tau.astype(np.float32))
@@ -496,7 +496,7 @@ def test_exr_is_read_by_mitsuba_and_back(tmp_path: Path, two_threads: None) -> N
     np.testing.assert_array_equal(np.array(seen["<root>"]), picture)
     np.testing.assert_array_equal(np.array(seen["variance"]), variance)
     mi.Bitmap(picture).write(str(tmp_path / "b.exr"))
-    np.testing.assert_array_equal(files.layers(files.read_exr(tmp_path / "b.exr")[0])[""], picture)
+    np.testing.assert_array_equal(files.stack_layers(files.read_exr(tmp_path / "b.exr")[0])[""], picture)
 
 
 def test_png_is_srgb(tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ from PIL import Image
 from mivol.errors import MivolError
 from mivol.photos import Camera, aim_camera, interpolate_cameras, intrinsics, pixel_centres, project, rays, turntable
 from mivol.report import video
-from mivol.report.pixel_scale import depth_pixels, normal_pixels, normals_of_depth
+from mivol.report.pixel_scale import depth_pixels, normal_pixels, normals_from_depth
 from mivol.report.video import film_suffix, write_video
 
 LIKE = Camera(intrinsics(90, 100, 30, 20), (64, 48), np.eye(4))
@@ -91,7 +91,7 @@ def test_normals_of_a_sphere(artefacts: Path) -> None:
     with np.errstate(invalid="ignore"):
         distance = -b - np.sqrt(b**2 - np.sum(o * o, axis=-1) + 0.25)
     there = np.isfinite(distance)
-    normals = normals_of_depth(distance, camera)
+    normals = normals_from_depth(distance, camera)
     inner = np.isfinite(normals).all(axis=-1) & (np.sum(normals * d, axis=-1) < -0.3)
     truth = 2 * (o + distance[..., None] * d)
     # Central differences of z = sqrt(1 - x^2) err by h^2/6 z''' = h^2/(2 z^5) in slope, h^2/(2 z^3) in angle: with pixels of
@@ -116,7 +116,7 @@ def test_colours_of_distances() -> None:
         with pytest.raises(MivolError, match=message):
             depth_pixels(np.ones(shape), span)
     with pytest.raises(MivolError, match="not seen by a camera"):
-        normals_of_depth(np.ones((5, 5)), LIKE)
+        normals_from_depth(np.ones((5, 5)), LIKE)
 
 
 # -- Films --------------------------------------------------------------------------------------------------------

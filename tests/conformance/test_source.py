@@ -21,19 +21,19 @@ def test_streams_are_joined_up_to_the_limit(codec: str) -> None:
     """Exactly as much as the header promises is taken, and not a byte more; a promise beyond all memory is one, too."""
     packed = PACK[codec](DATA)
     for limit in (len(DATA), 2**70):
-        assert source.inflate(packed, codec, limit, PATH) == DATA
+        assert source.decompress(packed, codec, limit, PATH) == DATA
     with pytest.raises(MivolError, match=f"more than {len(DATA) - 1} bytes after decompression"):
-        source.inflate(packed, codec, len(DATA) - 1, PATH)
-    assert source.inflate(packed + packed + b"\0" * 8, codec, 2 * len(DATA), PATH) == 2 * DATA
+        source.decompress(packed, codec, len(DATA) - 1, PATH)
+    assert source.decompress(packed + packed + b"\0" * 8, codec, 2 * len(DATA), PATH) == 2 * DATA
     with pytest.raises(MivolError, match="more than"):
-        source.inflate(packed + packed, codec, 2 * len(DATA) - 1, PATH)
+        source.decompress(packed + packed, codec, 2 * len(DATA) - 1, PATH)
 
 
 def test_damaged_streams_are_refused() -> None:
     with pytest.raises(MivolError, match="damaged gzip data"):
-        source.inflate(b"nothing of that kind", "gzip", 100, PATH)
+        source.decompress(b"nothing of that kind", "gzip", 100, PATH)
     with pytest.raises(MivolError):
-        source.inflate(gzip.compress(DATA)[:-20], "gzip", len(DATA), PATH)
+        source.decompress(gzip.compress(DATA)[:-20], "gzip", len(DATA), PATH)
 
 
 def test_the_nearest_name_is_offered_where_one_is_near(tmp_path: Path) -> None:
@@ -46,16 +46,16 @@ def test_the_nearest_name_is_offered_where_one_is_near(tmp_path: Path) -> None:
         with pytest.raises(MivolError, match=way_out):
             source.read_bytes(tmp_path / name)
     names = ["density", "temperature"]
-    assert source.choose(PATH, "density", names) == "density" and source.choose(PATH, None, ["one"]) == "one"
+    assert source.select_dataset(PATH, "density", names) == "density" and source.select_dataset(PATH, None, ["one"]) == "one"
     for asked, way_out in {
         "densty": "did you mean 'density'",
         "qqqq": "choose one of those",
         None: r"2 arrays \('density', 'temperature'\).*dataset=",
     }.items():
         with pytest.raises(MivolError, match=way_out):
-            source.choose(PATH, asked, names)
+            source.select_dataset(PATH, asked, names)
     with pytest.raises(MivolError, match="0 arrays"):
-        source.choose(PATH, None, [])
-    source.no_dataset(PATH, None)
+        source.select_dataset(PATH, None, [])
+    source.refuse_dataset(PATH, None)
     with pytest.raises(MivolError, match="leave it out"):
-        source.no_dataset(PATH, "density")
+        source.refuse_dataset(PATH, "density")

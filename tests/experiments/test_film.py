@@ -95,4 +95,4 @@ def test_a_film_is_four_seconds_long(monkeypatch: pytest.MonkeyPatch, tmp_path: 
     assert [frame.tolist() for frame in frames] == [[[[0, round(0.125 * 255 * k), 255]]] for k in range(8)]
     assert frames[0].dtype == np.uint8
     assert (image.path, image.role, image.caption) == (f"film/views{suffix}", "film", "8 views through the photographs' places")
-    assert said == ([] if suffix == ".mp4" else [film_module.WITHOUT_FFMPEG])
+    assert said == ([] if suffix == ".mp4" else [film_module.NO_FFMPEG_NOTE])

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from mivol.photos import PhotoSurvey, survey_photos
 from mivol.photos.camera import Camera
 from mivol.photos.survey import PhotoFrame
-from mivol.report.cameras import EDGE, FAR, MOST_POINTS, PARTS, WIDTH, outline, parts_of, plot_cameras
+from mivol.report.cameras import EDGE, FAR, MOST_POINTS, PARTS, WIDTH, list_parts, outline, plot_cameras
 from mivol.report.figures import INK
 
 TURNS = {"x": [0, 90, 0], "y": [-90, 0, 0], "z": [0, 0, 0]}
@@ -132,7 +132,7 @@ def test_nested_boxes_are_shown_as_far_as_the_cameras_stand_and_once_all_of_them
     points = np.array([[0.0, 0, 0], [5.0, 0, 0], [20, 0, 0], [30, 0, 0]])
     nested = replace(survey, box=CUBE, levels=5, points=points)
     side, plan, far = plot_cameras(nested).axes
-    assert parts_of(nested) == (*PARTS, FAR) and parts_of(survey) == PARTS
+    assert list_parts(nested) == (*PARTS, FAR) and list_parts(survey) == PARTS
     assert (edges_of(plan), edges_of(far)) == ([1.5, 3, 6], [1.5, 3, 6, 12, 24])
     assert [line.get_linewidth() for line in far.lines[-5:]] == [1.3, 0.6, 0.6, 0.6, 0.6]
     assert far.get_title(loc="left").startswith("all boxes") and plan.get_title(loc="left").startswith("from above")
@@ -149,4 +149,4 @@ def test_boxes_that_all_reach_no_farther_than_the_cameras_need_no_part_of_their_
     """Two hold none of the cameras, three hold all: either way the first parts show every box."""
     for levels in (2, 3):
         found = replace(survey, box=CUBE, levels=levels)
-        assert parts_of(found) == PARTS and len(edges_of(plot_cameras(found).axes[1])) == levels
+        assert list_parts(found) == PARTS and len(edges_of(plot_cameras(found).axes[1])) == levels

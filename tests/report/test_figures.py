@@ -19,14 +19,14 @@ from mivol.photos.survey import PhotoFrame
 from mivol.report.cameras import plot_cameras
 from mivol.report.figures import (
     Series,
+    central_line,
     inline_svg,
-    line_through_the_middle,
     plot_curve,
     plot_error_against_time,
     plot_image_row,
     plot_profile,
     plot_slices,
-    save,
+    save_figure,
 )
 
 
@@ -108,7 +108,7 @@ def test_a_figure_looks_as_recorded(draw: Callable[[], Figure], record: bool) ->
 
 def test_a_picture_has_160_pixels_an_inch(tmp_path: Path) -> None:
     """A curve of 4.4 x 2.75 inches."""
-    with Image.open(save(long_curve(), tmp_path / "curve.png")) as image:
+    with Image.open(save_figure(long_curve(), tmp_path / "curve.png")) as image:
         assert image.size == (704, 440)
 
 
@@ -123,9 +123,9 @@ def test_a_figure_in_a_page_has_the_colours_of_the_page() -> None:
 def test_profiles_run_through_the_middle_voxel() -> None:
     """Of 3 x 4 x 5 voxels that is (1, 2, 2), as in the slices; places are the middles of voxels in the box."""
     values = np.arange(60.0).reshape(3, 4, 5)
-    assert line_through_the_middle(values, "x").tolist() == values[1, 2].tolist()
-    assert line_through_the_middle(values, "y").tolist() == values[1, :, 2].tolist()
-    assert line_through_the_middle(values, "z").tolist() == values[:, 2, 2].tolist()
+    assert central_line(values, "x").tolist() == values[1, 2].tolist()
+    assert central_line(values, "y").tolist() == values[1, :, 2].tolist()
+    assert central_line(values, "z").tolist() == values[:, 2, 2].tolist()
     (line, _) = profile().axes[0].lines
     np.testing.assert_allclose(line.get_xdata(), [-0.75, -0.25, 0.25, 0.75])
     assert profile().axes[0].get_xlabel() == "y [length]"

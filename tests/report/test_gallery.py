@@ -13,7 +13,7 @@ from matplotlib.image import imread
 from mivol.files import write_png, write_volume
 from mivol.photos.photo_file import decode_srgb
 from mivol.report import pixel_scale
-from mivol.report.page_images import LAYER_EDGE, LAYERS, Picture, film_of, plain_picture, views_of, volumes_of
+from mivol.report.page_images import LAYER_EDGE, LAYERS, PageImage, encode_film, encode_image, make_view_rows, make_volume_views
 from mivol.report.record import Image, Volume
 
 
@@ -31,20 +31,20 @@ def folder(tmp_path: Path) -> Path:
     ids=["caption", "view", "file"],
 )
 def test_a_picture_is_called_by_its_caption_else_its_view_else_its_file(folder: Path, said: dict, name: str) -> None:
-    found = plain_picture(folder, Image(path="ramp.npy", role="picture", **said))
+    found = encode_image(folder, Image(path="ramp.npy", role="picture", **said))
     assert (found.name, found.width, found.height, found.aspect) == (name, 4, 3, 4 / 3)
 
 
 @pytest.mark.parametrize(("name", "kind", "animated"), [("film.mp4", "video/mp4", False), ("film.gif", "image/gif", True)])
 def test_a_film_is_called_by_its_caption_else_its_view(folder: Path, name: str, kind: str, animated: bool) -> None:
-    caption, uri, is_image = film_of(folder, Image(path=name, role="film", caption="Round", view="v"))
+    caption, uri, is_image = encode_film(folder, Image(path=name, role="film", caption="Round", view="v"))
     assert (caption, is_image) == ("Round", animated) and uri.startswith(f"data:{kind};base64,")
-    assert film_of(folder, Image(path=name, role="film", view="v"))[0] == "v"
+    assert encode_film(folder, Image(path=name, role="film", view="v"))[0] == "v"
 
 
 @pytest.mark.parametrize(("width", "height", "coarse"), [(320, 1, True), (1, 320, True), (321, 1, False), (1, 321, False)])
 def test_pictures_of_320_pixels_and_less_are_coarse(width: int, height: int, coarse: bool) -> None:
-    assert Picture("a", "", width, height, width / height).is_coarse == coarse
+    assert PageImage("a", "", width, height, width / height).is_coarse == coarse
 
 
 @pytest.mark.parametrize(
@@ -54,11 +54,11 @@ def test_pictures_of_320_pixels_and_less_are_coarse(width: int, height: int, coa
 def test_a_picture_of_few_rows_is_stretched_and_says_so(tmp_path: Path, shape: tuple, name: str, aspect: float) -> None:
     """Two rows of a detector of 640 columns would be a line of a pixel or two on a page."""
     np.save(tmp_path / "p.npy", np.zeros(shape))
-    found = plain_picture(tmp_path, Image(path="p.npy", role="picture"))
+    found = encode_image(tmp_path, Image(path="p.npy", role="picture"))
     assert (found.name, found.aspect, found.width, found.height) == (name, aspect, *shape[::-1])
 
 
-def pixels(picture: Picture) -> np.ndarray:
+def pixels(picture: PageImage) -> np.ndarray:
     return imread(io.BytesIO(base64.b64decode(picture.uri.partition(",")[2])))[..., :3]
 
 
@@ -67,22 +67,22 @@ def test_a_volume_is_shown_layer_by_layer(tmp_path: Path) -> None:
     truth, found = np.random.default_rng(0).random((2, 3, 4, 5, 1), np.float32)
     write_volume(tmp_path / "t.npz", truth)
     write_volume(tmp_path / "r.npz", found)
-    (cut,) = volumes_of(tmp_path, [Volume(path="t.npz", role="truth"), Volume(path="r.npz", role="reconstruction")])
+    (cut,) = make_volume_views(tmp_path, [Volume(path="t.npz", role="truth"), Volume(path="r.npz", role="reconstruction")])
     assert [layer["text"] for layer in cut.layers] == [f"z = {k} of 3" for k in (1, 2, 3)]
-    scale = pixel_scale.scale_of(*pixel_scale.slices(truth).images.values())
-    signed = pixel_scale.signed_scale(*pixel_scale.slices(found - truth).images.values())
+    scale = pixel_scale.shared_scale(*pixel_scale.middle_slices(truth).images.values())
+    signed = pixel_scale.signed_scale(*pixel_scale.middle_slices(found - truth).images.values())
     for k, layer in enumerate(cut.layers):
         assert [p.name for p in layer["pictures"]] == ["Truth", "Reconstruction", "Difference"]
         wanted = [(truth, scale), (found, scale), (found - truth, signed)]
         for picture, (values, on) in zip(layer["pictures"], wanted, strict=True):
-            assert np.array_equal(np.round(pixels(picture) * 255), pixel_scale.pixels(values[k, ::-1], on))
+            assert np.array_equal(np.round(pixels(picture) * 255), pixel_scale.to_pixels(values[k, ::-1], on))
 
 
 def test_large_volumes_show_some_of_their_layers_with_fewer_pixels(tmp_path: Path) -> None:
     """Each in the middle of its share of the height; a flat volume has no layers to go through."""
     for name, shape in (("tall", (40, 3, LAYER_EDGE + 1)), ("flat", (1, 3, 3))):
         write_volume(tmp_path / f"{name}.npz", np.ones(shape, np.float32))
-    tall, flat = (volumes_of(tmp_path, [Volume(path=f"{n}.npz", role="reconstruction")])[0] for n in ("tall", "flat"))
+    tall, flat = (make_volume_views(tmp_path, [Volume(path=f"{n}.npz", role="reconstruction")])[0] for n in ("tall", "flat"))
     assert len(tall.layers) == LAYERS and flat.layers == []
     assert [layer["text"] for layer in tall.layers[:2]] == ["z = 2 of 40", "z = 4 of 40"]
     assert tall.layers[-1]["text"] == "z = 39 of 40"
@@ -98,7 +98,7 @@ def test_pixels_of_photographs_have_an_error_beside_them(tmp_path: Path) -> None
             values[0, 0] = code / 255
             write_png(tmp_path / f"{view}_{role}.png", decode_srgb(values))
             images.append(Image(path=f"{view}_{role}.png", role=role, view=view, held_out=True, small=view == "b"))
-    gallery = views_of(tmp_path, images)
+    gallery = make_view_rows(tmp_path, images)
     assert [view.small for view in gallery.rows] == [False, True]
     (bar,) = gallery.bars
     assert bar.label == "|Render − reference|, mean of the colours [code value]"

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.image import imread
 
-from mivol.report.pixel_scale import EDGE, GAP, is_due, write_preview
+from mivol.report.pixel_scale import EDGE, GAP, is_preview_due, write_preview
 
 
 def test_three_slices_side_by_side(tmp_path: Path) -> None:
@@ -29,6 +29,6 @@ def test_three_slices_side_by_side(tmp_path: Path) -> None:
 
 def test_some_twenty_previews_a_run() -> None:
     """The first and the last iteration, and every twentieth part of the run; of short runs every one."""
-    assert [k for k in range(1, 8) if is_due(k, 7)] == [1, 2, 3, 4, 5, 6, 7]
-    assert [k for k in range(1, 65) if is_due(k, 64)] == sorted({1, 64, *range(3, 64, 3)})
-    assert sum(is_due(k, 5000) for k in range(1, 5001)) == 21
+    assert [k for k in range(1, 8) if is_preview_due(k, 7)] == [1, 2, 3, 4, 5, 6, 7]
+    assert [k for k in range(1, 65) if is_preview_due(k, 64)] == sorted({1, 64, *range(3, 64, 3)})
+    assert sum(is_preview_due(k, 5000) for k in range(1, 5001)) == 21

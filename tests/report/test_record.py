@@ -24,7 +24,7 @@ def test_a_machine_is_described_by_what_the_system_tells(monkeypatch: pytest.Mon
 
 def test_packages_that_are_not_there_are_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(record, "PACKAGES", ("numpy", "no-such-package"))
-    found = record.versions()
+    found = record.package_versions()
     assert list(found) == ["python", "system", "numpy"]
     assert found["python"] == platform.python_version() and found["system"].endswith(platform.machine())
 
@@ -33,7 +33,7 @@ def test_a_number_has_the_unit_that_its_run_knows() -> None:
     """Known names keep their labels. A parameter keeps its key, and even steps; what nobody knows is named in plain words."""
     units = {"loss": "radiance²", "lamp_1.position[0]": "length", "g[0]": "1"}
     loss, place, g, other, psnr = (
-        record.quantity_of(name, units) for name in ("loss", "lamp_1.position[0]", "g[0]", "my_number", "psnr")
+        record.find_quantity(name, units) for name in ("loss", "lamp_1.position[0]", "g[0]", "my_number", "psnr")
     )
     assert loss == record.QUANTITIES["loss"]._replace(unit="radiance²")
     assert (place, place.beside) == (record.Quantity("lamp_1.position[0]", "length", log=False), "length")

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from mivol.experiments.camera_pictures import pictures_of_scan
 from mivol.report.cameras import EDGE
-from mivol.report.scanner import AWAY, DETECTORS, HEAD, MOST_VIEWS, plot_scanner, shown_views
+from mivol.report.scanner import AWAY, DETECTORS, HEAD, MOST_VIEWS, plot_scanner, select_views
 from mivol.tomography.geometry import ConeBeam, ParallelBeam, VoxelGrid
 from mivol.tomography.panel_views import PanelViews
 
@@ -116,7 +116,7 @@ def test_up_is_along_the_columns_of_the_detector() -> None:
 def test_of_many_views_some_are_drawn(count: int, every: int) -> None:
     """Spread evenly, the first of each kind among them."""
     held_out = np.arange(0, count, every)
-    for shown, kind in zip(shown_views(count, held_out), (np.setdiff1d(np.arange(count), held_out), held_out), strict=True):
+    for shown, kind in zip(select_views(count, held_out), (np.setdiff1d(np.arange(count), held_out), held_out), strict=True):
         assert len(shown) == min(len(kind), MOST_VIEWS)
         assert shown[0] == kind[0] and np.isin(shown, kind).all()
         assert np.ptp(np.diff(shown)) <= every

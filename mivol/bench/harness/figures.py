@@ -12,7 +12,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-from mivol.report.figures import STYLE, save
+from mivol.report.figures import STYLE, save_figure
 
 __all__ = ["drawn", "plain_ticks"]
 
@@ -24,7 +24,7 @@ def drawn(path: Path, width: float, height: float) -> Iterator[Figure]:
         figure = Figure(figsize=(width, height))
         FigureCanvasAgg(figure)
         yield figure
-    save(figure, path)
+    save_figure(figure, path)
 
 
 def plain_ticks(axis: Axis, unit: str) -> None:

@@ -20,7 +20,7 @@ import numpy as np
 from mivol.bench.harness.bars import Bar, means_that_differ, say
 from mivol.errors import MivolError
 from mivol.files import write_whole_text
-from mivol.report.record import describe_machine, versions
+from mivol.report.record import describe_machine, package_versions
 
 __all__ = ["Bench", "Expected", "Question", "called"]
 
@@ -129,7 +129,7 @@ def header(size: str, variant: str, load: float | None, start: float) -> dict:
     return {
         "size": size,
         "machine": msgspec.to_builtins(describe_machine()),
-        "versions": versions(),
+        "versions": package_versions(),
         "variant": variant,
         "threads": dr.thread_count(),
         "load_before_and_after": [load, load_of_machine()],
