@@ -292,7 +292,7 @@ def explain_photos(arguments: argparse.Namespace) -> int:
     from mivol.report.cameras import plot_cameras
 
     survey = survey_photos(arguments.scene)
-    print(survey.text)
+    print(survey.describe())
     if note := note_on_alpha(survey):
         print(note)
     print("--preset capture says what a fit of a place around the cameras would do, --preset cpu what one of a thing would")
@@ -486,10 +486,10 @@ def fetch(arguments: argparse.Namespace) -> None:
     from mivol.files.fetch import DATA, fetch_data, find_data_set
 
     if not arguments.name:
-        print("\n".join(data.text for data in DATA.values()))
+        print("\n".join(data.describe() for data in DATA.values()))
         return
     data = find_data_set(arguments.name)
-    print(data.text, file=sys.stderr)
+    print(data.describe(), file=sys.stderr)
     print(fetch_data(data, arguments.into))
 
 

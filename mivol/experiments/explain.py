@@ -185,7 +185,7 @@ def explain_photo_fit(chosen: FieldFit, base: Path, say: Say, picture: Path | No
     asked = make_plan(chosen)
     photos, judged = read_photos(chosen, base)
     photos = boxed(chosen, photos)
-    say(photos.text)
+    say(photos.describe())
     say(f"  judged by {0 if judged is None else len(judged.views)} photographs")
     for note in plan_film(chosen.show, photos).notes:
         say(f"  {note}")
@@ -214,7 +214,7 @@ def explain_gaussian_fit(chosen: GaussianFit, base: Path, say: Say, picture: Pat
     asked = make_gaussian_plan(chosen)
     photos, judged = read_photos(chosen, base)
     photos = boxed(chosen, photos)
-    say(photos.text)
+    say(photos.describe())
     say(f"  judged by {0 if judged is None else len(judged.views)} photographs")
     for note in plan_film(chosen.show, photos).notes:
         say(f"  {note}")

@@ -45,7 +45,7 @@ def gaussian_fit(task: Task) -> Path:
             film = plan_film(chosen.show, photos)
             begun = begin(chosen, photos, asked)
             run.record.plan, run.record.notes = begun.lines, [*notes(photos, judged), *film.notes]
-            task.watcher.say([photos.text, *(f"{one.choice}: {one.reason}" for one in run.record.plan)])
+            task.watcher.say([photos.describe(), *(f"{one.choice}: {one.reason}" for one in run.record.plan)])
         with run.stage("fit"):
             problem = begun.problem(chosen.seed)
             best = BestIterate(run, best_files(problem))

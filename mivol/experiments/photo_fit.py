@@ -52,7 +52,7 @@ def photo_fit(task: Task) -> Path:
             if photos.space == "linear":
                 run.record.citations.append("mildenhall_2022")
             run.record.plan, run.record.notes = choices(plan, photos, batches), [*notes(photos, judged), *film.notes]
-            task.watcher.say([photos.text, *(f"{one.choice}: {one.reason}" for one in run.record.plan)])
+            task.watcher.say([photos.describe(), *(f"{one.choice}: {one.reason}" for one in run.record.plan)])
         with run.stage("fit"):
             problem = RadianceProblem(batches, photos.box, plan, chosen.seed)
             best = BestIterate(run, best_files(problem, photos.white))

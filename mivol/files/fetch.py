@@ -54,9 +54,8 @@ class DataSet:
     sha256: str
     licence: str
 
-    @property
-    def text(self) -> str:
-        """A line about it."""
+    def describe(self) -> str:
+        """Describe the data set in a line."""
         return f"{self.name}: {self.says}, {self.size / 2**20:.2f} MiB; licence: {self.licence}; {self.url}"
 
 

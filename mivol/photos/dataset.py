@@ -115,11 +115,10 @@ class Photos:
         """Names of photographs that are not there."""
         return self.survey.skipped
 
-    @property
-    def text(self) -> str:
-        """A paragraph of facts."""
+    def describe(self) -> str:
+        """Describe the photographs in a paragraph."""
         width, height = self.views[0].camera.size
-        return f"{self.survey.text}\nread as {width} x {height} pixels of {self.space} values"
+        return f"{self.survey.describe()}\nread as {width} x {height} pixels of {self.space} values"
 
 
 def load_photos(

@@ -87,9 +87,8 @@ class PhotoSurvey:
     points: np.ndarray | None = None
     levels: int = 1
 
-    @property
-    def text(self) -> str:
-        """A paragraph of facts."""
+    def describe(self) -> str:
+        """Describe the data set in a paragraph."""
         cameras = [frame.camera for frame in self.frames]
         sizes = sorted({f"{c.size[0]} x {c.size[1]}" for c in cameras})
         focal = [c.K[0, 0] for c in cameras]

@@ -182,7 +182,7 @@ def test_a_set_is_one_file_at_one_commit(name: str) -> None:
     one = DATA[name]
     assert one.url.startswith("https://raw.githubusercontent.com/")
     assert any(len(part) == 40 and set(part) <= set("0123456789abcdef") for part in one.url.split("/"))
-    assert one.licence in one.text
+    assert one.licence in one.describe()
 
 
 @pytest.mark.parametrize("name", DATA)

@@ -168,7 +168,7 @@ def test_missing_photographs_are_skipped_by_name(blender: Path) -> None:
     photos = load_photos(blender, background="white")
     assert photos.skipped == ("./train/r_1",)
     assert [view.name for view in photos.views] == ["r_0.png", "r_2.png", "r_3.png"]
-    assert "./train/r_1" in photos.text
+    assert "./train/r_1" in photos.describe()
 
 
 def test_held_out_photographs_are_neither_trained_on_nor_lost(blender: Path) -> None:
@@ -276,7 +276,7 @@ def test_lists_of_splits_are_of_files_however_they_are_written(tmp_path: Path, p
     folder = write_transforms(tmp_path / "set", {"fl_x": 20, "train_filenames": names, "test_filenames": names[2:]})
     assert [view.name for view in load_photos(folder).views] == ["0000.png", "0001.png"]
     assert [view.name for view in load_photos(folder, split="test").views] == ["0002.png"]
-    assert "4 photographs (2 train, 1 test, 1 in no list)" in survey_photos(folder).text
+    assert "4 photographs (2 train, 1 test, 1 in no list)" in survey_photos(folder).describe()
 
 
 PLY = "ply\nformat ascii 1.0\nelement vertex {}\n{}end_header\n{}"
@@ -485,7 +485,7 @@ def test_colmap_points_make_the_box_without_outliers(tmp_path: Path, encoding: s
     np.testing.assert_array_equal(survey.points, cloud)
     # The 1st and 99th percentiles of uniform numbers lie within 0.05 of +-0.99 (5 standard deviations), plus 5 % of 2.
     np.testing.assert_allclose(survey.box, [[-1.08] * 3, [1.08] * 3], atol=0.06)
-    assert "1000 points" in survey.text
+    assert "1000 points" in survey.describe()
 
 
 @pytest.mark.parametrize("encoding", ["bin", "txt"])
@@ -748,7 +748,7 @@ def test_fox(data_dir: Path) -> None:
     """25 of 67 photographs are there; each pixel's ray goes back through the lens to its pixel."""
     survey = survey_photos(data_dir / "multiview" / "fox")
     assert len(survey.frames) == 25 and len(survey.skipped) == 42
-    assert survey.skipped[0] == "images/0002.jpg" and "images/0002.jpg" in survey.text
+    assert survey.skipped[0] == "images/0002.jpg" and "images/0002.jpg" in survey.describe()
     for frame in survey.frames[::8]:
         pixel = pixel_centres(frame.camera.size)[::37, ::31]
         o, d = rays(frame.camera, pixel)

@@ -154,7 +154,7 @@ def test_colmap_fisheyes(
     camera = survey.frames[1].camera
     assert camera.distortion == lens
     np.testing.assert_array_equal(camera.K, intrinsics(50, parameters[1] if model.startswith("OPENCV") else 50, 31, 22))
-    assert "48 pixels, fisheye" in survey.text
+    assert "48 pixels, fisheye" in survey.describe()
 
 
 def test_cameras_of_nerfstudio_and_instant_ngp(tmp_path: Path) -> None:
