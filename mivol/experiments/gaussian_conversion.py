@@ -13,7 +13,7 @@ from mivol.fields.gaussian_grid import MOST_OPAQUE, box_of_gaussians, grid_of_ga
 from mivol.fields.grid_gaussians import gaussians_of_grid
 from mivol.fields.spherical import SphericalGrid
 from mivol.fields.spherical_files import load_field, save_field
-from mivol.files.source import by_suffix, existing_file
+from mivol.files.source import check_file, select_by_suffix
 from mivol.optim.photographs.field_view import render_view
 from mivol.photos import Camera, aim_camera, intrinsics
 from mivol.points.cloud import read_points

@@ -17,7 +17,7 @@ from mivol.experiments.row_order import note_rows
 from mivol.experiments.scan_memory import check_grid, check_rays
 from mivol.experiments.solver_choice import solver_of
 from mivol.files import read_columns, read_volume
-from mivol.files.fetch import place_of
+from mivol.files.fetch import resolve_path
 from mivol.optim.projections.linear_problems import PoissonCounts
 from mivol.optim.projections.solvers import METHODS
 from mivol.shown import briefly

@@ -15,8 +15,8 @@ from mivol.config import Experiment, Files
 from mivol.errors import MivolError
 from mivol.experiments.task import Task
 from mivol.experiments.truth import holding
-from mivol.files import stack_layers, read_exr
-from mivol.files.fetch import PREFIX, place_of
+from mivol.files import read_exr, stack_layers
+from mivol.files.fetch import PREFIX, resolve_path
 from mivol.optim.scenes.views import View, check_sizes
 from mivol.scene.load import LoadedScene, load_scene
 from mivol.scene.sensors import check_film

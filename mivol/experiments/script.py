@@ -21,7 +21,7 @@ from mivol.experiments.runs import run_experiment
 from mivol.experiments.task import Nobody, Task, Watcher
 from mivol.fields.spherical import SphericalGrid
 from mivol.fields.spherical_files import load_field
-from mivol.files import stack_layers, read_exr
+from mivol.files import read_exr, stack_layers
 from mivol.optim.first_order import Adam
 from mivol.optim.loop import Fit, Measure, reconstruct
 from mivol.optim.losses import L2, Loss
