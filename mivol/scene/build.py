@@ -58,7 +58,7 @@ def build_estimators(
     lobe = None if plan.lobe is None else dr.opaque(mi.Float, plan.lobe)
     emission = _draw_emission(scene, media, needs) if plan.draws_emission else None
     long_paths_count = is_even or any(medium.emits for medium in needs.media)
-    return Estimators(direct, segment, lights_surfaces, lights_media, lobe, emission, long_paths_count)
+    return Estimators(direct, segment, settings, lights_surfaces, lights_media, lobe, emission, long_paths_count)
 
 
 def _draw_emission(scene: mi.Scene, media: SceneMedia, needs: Needs) -> EmissionSampling:

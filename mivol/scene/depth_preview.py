@@ -141,6 +141,6 @@ def _preview(scene: mi.Scene, sensor: mi.Sensor, survey: SceneSurvey, settings: 
     aperture = sampler.next_2d() if sensor.needs_aperture_sample() else mi.Point2f(0)
     time = mi.Float(sensor.shutter_open())
     ray, weight = sensor.sample_ray_differential(time, mi.Float(0), mi.Point2f(place), aperture)
-    score, _ = walk_path(estimators, settings, sampler, ray, Primal(dr.zeros(mi.Spectrum, n)))
+    score, _ = walk_path(estimators, sampler, ray, Primal(dr.zeros(mi.Spectrum, n)))
     seen = np.array(score.L * weight, np.float64).reshape(-1, n).mean(axis=0)
     return seen.reshape(BATCHES, cells, SAMPLES).mean(axis=2)

@@ -76,5 +76,5 @@ def _preview(scene: mi.Scene, sensor: mi.Sensor, needs: Needs, survey: SceneSurv
     cell = dr.arange(mi.UInt32, n) // SAMPLES
     place = (mi.Point2f(cell % SIDE, cell // SIDE) + 0.5) / SIDE
     ray, weight = sensor.sample_ray_differential(mi.Float(sensor.shutter_open()), mi.Float(0.5), place, mi.Point2f(0.5))
-    score, _ = walk_path(estimators, settings, sampler, ray, Primal(dr.zeros(mi.Spectrum, n)))
+    score, _ = walk_path(estimators, sampler, ray, Primal(dr.zeros(mi.Spectrum, n)))
     return np.array(score.L * weight, np.float64).reshape(-1, n).mean(axis=0).reshape(cells, SAMPLES)

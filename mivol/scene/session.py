@@ -126,7 +126,7 @@ class Session:
             named = [sensor.get_medium() for sensor in scene.sensors()]
             media.start = named[0] if all(medium is named[0] for medium in named) else None
             media.locates_camera = bool(media.traced)
-            score, alpha = walk_path(estimators, self.settings, sampler, ray, Primal(_black(ray)), active)
+            score, alpha = walk_path(estimators, sampler, ray, Primal(_black(ray)), active)
             # To an integrator that nests this one alpha is a mask, whether something is seen: it is drawn with that chance.
             return score.L, sampler.next_1d(active) < alpha, integrate_aovs(media, ray, self.aovs, active)
 
@@ -144,38 +144,38 @@ class Session:
     def _primal(self, estimators: Estimators, rays: CameraRays, successive: int) -> tuple:
         count = paths_a_lane(successive, dr.width(rays.ray))
         if count > 1:
-            L, alpha = walk_successively(estimators, self.settings, rays.sampler, rays.ray, count)
+            L, alpha = walk_successively(estimators, rays.sampler, rays.ray, count)
         else:
             score = Primal(_black(rays.ray))
-            score, alpha = walk_path(estimators, self.settings, rays.sampler, rays.ray, score, strata=rays.strata)
+            score, alpha = walk_path(estimators, rays.sampler, rays.ray, score, strata=rays.strata)
             L = score.L
         return L, alpha, integrate_aovs(estimators.media, rays.ray, self.aovs)
 
     def _tangent(self, estimators: Estimators, rays: CameraRays) -> tuple:
-        prepare_derivatives(estimators, self.settings, rays.ray, rays.on_film)
+        prepare_derivatives(estimators, rays.ray, rays.on_film)
         black = _black(rays.ray)
         score = Tangent(black, black)
-        score, _ = walk_path(estimators, self.settings, rays.sampler, rays.ray, score, strata=rays.strata)
+        score, _ = walk_path(estimators, rays.sampler, rays.ray, score, strata=rays.strata)
         return score.dL, dr.zeros(mi.Float, dr.width(black)), jvp_aovs(estimators.media, rays.ray, self.aovs)
 
     def _replay(
         self, estimators: Estimators, rays: CameraRays, dL: mi.Spectrum, daovs: list[mi.Float], branches: bool
     ) -> None:
-        prepare_derivatives(estimators, self.settings, rays.ray, rays.on_film)
+        prepare_derivatives(estimators, rays.ray, rays.on_film)
         # Branches are counted, which a recording of Dr.Jit cannot do.
         if branches and not dr.flag(dr.JitFlag.FreezingScope):
-            replay_branches(estimators, self.settings, rays, dL)
+            replay_branches(estimators, rays, dL)
         else:
             self._replay_whole(estimators, rays, dL)
         vjp_aovs(estimators.media, rays.ray, self.aovs, daovs)
 
     def _replay_whole(self, estimators: Estimators, rays: CameraRays, dL: mi.Spectrum) -> None:
         again, L = rays.sampler.clone(), None
-        if not is_straight(estimators, self.settings):
+        if not is_straight(estimators):
             known = Primal(_black(rays.ray))
-            L = walk_path(estimators.replayed(), self.settings, rays.sampler, rays.ray, known, strata=rays.strata)[0].L
+            L = walk_path(estimators.replayed(), rays.sampler, rays.ray, known, strata=rays.strata)[0].L
             dr.eval(L)
-        walk_path(estimators, self.settings, again, rays.ray, Replay(L, dL), strata=rays.strata)
+        walk_path(estimators, again, rays.ray, Replay(L, dL), strata=rays.strata)
 
 
 def _sensor_with_room(scene: mi.Scene, sensor: int | mi.Sensor) -> mi.Sensor:

@@ -44,7 +44,7 @@ def levels_of(
         plan = make_plan(needs, settings)
         assert plan.segment == "free_flight"
         estimators = build_estimators(scene, needs, plan, settings, survey, pictures=False)
-        prepare_derivatives(estimators, settings, ray, mi.Point2f(mi.Float(seen[: len(at)]), 0.5))
+        prepare_derivatives(estimators, ray, mi.Point2f(mi.Float(seen[: len(at)]), 0.5))
     return estimators.segment.level
 
 

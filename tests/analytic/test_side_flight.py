@@ -20,7 +20,7 @@ from mivol.transport.estimators.lighting.direct_lighting import DirectLighting, 
 from mivol.transport.estimators.scores import PICTURE
 from mivol.transport.estimators.segment import Collision
 from mivol.transport.media.body import medium_interaction
-from mivol.transport.path.estimators import Estimators
+from mivol.transport.path.estimators import Estimators, Settings
 from mivol.transport.path.side_flight import SideSamples, fly_aside, weigh_aim
 from mivol.transport.traversal.random_numbers import draw_state
 from mivol.validate.moments import Moments
@@ -38,7 +38,7 @@ def middle() -> tuple[Estimators, Collision]:
     scene = mi.load_dict({"type": "scene", "fog": ball_of(fog, (0, 0, 0), 1.0), "sun": sun,
                           "sensor": camera([0, -1, 4], [0, 0, 0])})  # fmt: skip
     media = media_of(scene)
-    estimators = Estimators(DirectLighting(media), FreeFlight(media), False, True, mi.Float(LOBE))
+    estimators = Estimators(DirectLighting(media), FreeFlight(media), Settings(), False, True, mi.Float(LOBE))
     o = mi.Point3f(dr.zeros(mi.Float, N), 0, -0.5)
     ray = mi.Ray3f(o, mi.Vector3f(0, 0, 1), dr.inf, dr.zeros(mi.Float, N), mi.Color0f())
     mei = medium_interaction(ray, mi.Float(0.5), media.scene.shapes()[0].interior_medium())

@@ -32,7 +32,7 @@ def radiance(scene: mi.Scene, count: int) -> np.ndarray:
     with dr.suspend_grad():
         estimators, _ = session._open(scene, sensor, 3, pictures=True)
         rays = next(film_passes(RenderSamples(sensor, 5, 3, 1 << 20)))
-        L, alpha = walk_successively(estimators, session.settings, rays.sampler, rays.ray, count)
+        L, alpha = walk_successively(estimators, rays.sampler, rays.ray, count)
     return np.array([*L, alpha])
 
 

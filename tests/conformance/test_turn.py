@@ -11,7 +11,7 @@ from mivol.transport.estimators.flights.free_flight import FreeFlight
 from mivol.transport.estimators.lighting.direct_lighting import DirectLighting
 from mivol.transport.estimators.segment import Collision
 from mivol.transport.media.body import medium_interaction
-from mivol.transport.path.estimators import Estimators
+from mivol.transport.path.estimators import Estimators, Settings
 from mivol.transport.path.event import PathEvent, Turn, TurnSamples, sample_turn
 from scenes import camera, media_of, medium
 
@@ -32,7 +32,7 @@ class Bench:
         self.fog = mi.load_dict(medium("homogeneous", 0.5, phase={"type": "hg", "g": G}))
         wall = {"type": "rectangle", "bsdf": bsdf}
         media = media_of(mi.load_dict({"type": "scene", "wall": wall, "sensor": camera([0, -1, 4], [0, 0, 0])}))
-        self.estimators = Estimators(DirectLighting(media), FreeFlight(media), True, lights_media)
+        self.estimators = Estimators(DirectLighting(media), FreeFlight(media), Settings(), True, lights_media)
         zero = dr.zeros(mi.Float, 4)
         self.ray = mi.Ray3f(mi.Point3f(zero, 0, 2), mi.Vector3f(0, 0, -1), mi.Float(7), zero, mi.Color0f())
 

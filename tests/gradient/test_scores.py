@@ -218,11 +218,11 @@ def test_replay_counts_down_to_zero():
     ray, _ = sensor.sample_ray(0, 0, position, mi.Point2f(0.5))
     with dr.suspend_grad():
         sampler.seed(3, n)
-        L = walk_path(estimators, settings, sampler, ray, Primal(dr.zeros(mi.Spectrum, n)))[0].L
+        L = walk_path(estimators, sampler, ray, Primal(dr.zeros(mi.Spectrum, n)))[0].L
         dr.eval(L)
         sampler.seed(3, n)
         estimators.media.start_gradients()
-        left = walk_path(estimators, settings, sampler, ray, Replay(L, dr.zeros(mi.Spectrum, n)))[0].L
+        left = walk_path(estimators, sampler, ray, Replay(L, dr.zeros(mi.Spectrum, n)))[0].L
     # Five additions and subtractions of float32 numbers of the size of L.
     assert np.abs(np.array(left)).max() <= 1e-6 * np.abs(np.array(L)).max()
     assert np.array(L).max() > 0.5

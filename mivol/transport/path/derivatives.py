@@ -28,10 +28,9 @@ from mivol.transport.estimators.flights.flight_derivatives import Level, weigh_c
 from mivol.transport.estimators.scores import PICTURE, Primal, Replay
 from mivol.transport.estimators.segment import Collision, PathSegment
 from mivol.transport.media.channels import colours
-from mivol.transport.path.estimators import Estimators, Settings
+from mivol.transport.path.estimators import Estimators
 from mivol.transport.path.film import CameraRays
-from mivol.transport.path.successive import values_at
-from mivol.transport.path.walk import Landing, walk_branch, walk_path, walk_stem
+from mivol.transport.path.walk import Landing, gather_lanes, walk_branch, walk_path, walk_stem
 from mivol.transport.traversal.random_numbers import LaneSampler, draw_seeds
 from mivol.transport.traversal.rays import FineRay, camera_ray
 
@@ -53,37 +52,36 @@ def count_branches(stems: int, collided: int) -> int:
     return min(MOST_BRANCHES, max(1, round(math.sqrt(BALANCE * stems / collided))))
 
 
-def replay_branches(estimators: Estimators, settings: Settings, rays: CameraRays, dL: mi.Spectrum) -> None:
+def replay_branches(estimators: Estimators, rays: CameraRays, dL: mi.Spectrum) -> None:
     """Add the derivatives of the radiance along camera rays to gradients.
 
     Args:
         estimators: whose segments end in media, prepared for derivatives along these rays.
-        settings: depth, roulette, hidden emitters.
         rays: of a sampler whose numbers are independent.
         dL: d loss / d radiance of each ray.
     """
     n, sampler = dr.width(rays.ray), rays.sampler
     seeds = draw_seeds(sampler)
     again, replayed = sampler.clone(), estimators.replayed()
-    stems, landing = walk_stem(replayed, settings, sampler, rays.ray, Primal(dr.zeros(mi.Spectrum, n)))
+    stems, landing = walk_stem(replayed, sampler, rays.ray, Primal(dr.zeros(mi.Spectrum, n)))
     dr.eval(seeds, stems.L, landing)
     collided = dr.compress(landing.on)
     if (count := dr.width(collided)) == 0:
-        walk_stem(estimators, settings, again, rays.ray, Replay(stems.L, dL))
+        walk_stem(estimators, again, rays.ray, Replay(stems.L, dL))
         return
     k = count_branches(n, count)
     share, branches = dr.opaque(mi.Float, 1 / k), _Branches.of(landing, collided, seeds, k)
-    found, depth = branches.walk(replayed, settings, Primal(dr.zeros(mi.Spectrum, count * k)))
+    found, depth = branches.walk(replayed, Primal(dr.zeros(mi.Spectrum, count * k)))
     dr.eval(found.L, depth)
     for total, one in zip(stems.L, found.L, strict=True):
         dr.scatter_add(total, one * share, branches.stem)
-    walk_stem(estimators, settings, again, rays.ray, Replay(stems.L, dL))
+    walk_stem(estimators, again, rays.ray, Replay(stems.L, dL))
     level = estimators.segment.level
     estimators.segment.level = None if level is None else level.of_branches
     order = _by_length(depth)
     branches = branches.at(order)
     L, dL = dr.gather(mi.Spectrum, found.L, order), dr.gather(mi.Spectrum, dL, branches.stem)
-    branches.walk(estimators, settings, Replay(L, dL * share))
+    branches.walk(estimators, Replay(L, dL * share))
 
 
 @dataclass
@@ -119,16 +117,16 @@ class _Branches:
         dr.eval(found)
         return found
 
-    def walk(self, estimators: Estimators, settings: Settings, score: Primal | Replay) -> tuple[Primal | Replay, mi.UInt32]:
+    def walk(self, estimators: Estimators, score: Primal | Replay) -> tuple[Primal | Replay, mi.UInt32]:
         """Walk them to their ends; the score, and how often each has scattered."""
-        return walk_branch(estimators, settings, LaneSampler.seeded(*self.seeds), self.landing, score)
+        return walk_branch(estimators, LaneSampler.seeded(*self.seeds), self.landing, score)
 
 
 def _gather_landing(landing: Landing, index: mi.UInt32) -> Landing:
     """The collisions with these numbers."""
     ray = landing.ray
-    o, d, maxt, time = (values_at(values, index) for values in (ray.o, ray.d, ray.maxt, ray.time))
-    t, body, beta, on = (values_at(values, index) for values in (landing.t, landing.body, landing.beta, landing.on))
+    o, d, maxt, time = (gather_lanes(values, index) for values in (ray.o, ray.d, ray.maxt, ray.time))
+    t, body, beta, on = (gather_lanes(values, index) for values in (landing.t, landing.body, landing.beta, landing.on))
     return Landing(FineRay(o, d, maxt, time, ray.wavelengths), t, body, beta, on)
 
 
@@ -156,22 +154,21 @@ SEED = 0x1E7E1
 """Of those paths. They are independent of the paths of a render, or the level would bias its derivatives."""
 
 
-def prepare_derivatives(estimators: Estimators, settings: Settings, ray: mi.Ray3f, on_film: mi.Point2f) -> None:
+def prepare_derivatives(estimators: Estimators, ray: mi.Ray3f, on_film: mi.Point2f) -> None:
     """Find what derivatives along the camera rays of a pass need beforehand.
 
     Args:
         estimators: of the render.
-        settings: depth, roulette, hidden emitters.
         ray: the camera rays of the pass.
         on_film: where they lie on the film, as shares of it.
     """
-    estimators.prepare_derivatives(ray)
     segment = estimators.segment
+    segment.prepare_derivatives(ray)
     if segment.ends_in_media:
-        segment.level = _find_level(estimators, settings, ray, on_film)
+        segment.level = _find_level(estimators, ray, on_film)
 
 
-def _find_level(estimators: Estimators, settings: Settings, ray: mi.Ray3f, on_film: mi.Point2f) -> Level | None:
+def _find_level(estimators: Estimators, ray: mi.Ray3f, on_film: mi.Point2f) -> Level | None:
     """The mean radiance that flights of camera rays find where they collide, each weighed as its derivative is, squared: the
     level at which the derivatives at collisions have the least noise. First flights have a level for each tile of the film.
 
@@ -194,7 +191,7 @@ def _find_level(estimators: Estimators, settings: Settings, ray: mi.Ray3f, on_fi
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(SEED, count)
     collision = _fly_first(estimators, sampler.clone(), some)
-    path = walk_path(estimators, settings, sampler, some, Primal(dr.zeros(mi.Spectrum, count)))[0]
+    path = walk_path(estimators, sampler, some, Primal(dr.zeros(mi.Spectrum, count)))[0]
     # Behind a boundary that refracts no first flight collides; the mean of all rays is then as good a guess as any.
     weight = dr.select(dr.any(collision.on), dr.square(weigh_collisions(media, some, collision)), 1)
     seen, weight, at = dr.detach(path.L), dr.detach(weight), dr.gather(mi.UInt32, tile, index)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import mitsuba as mi
 
@@ -23,6 +23,7 @@ from mivol.transport.estimators.single_scattering.shadow_tables import (
 )
 from mivol.transport.estimators.single_scattering.single_scattering import SingleScattering
 from mivol.transport.line_integrals.emitting_segment import Emission
+from mivol.transport.media.scene_media import SceneMedia
 
 __all__ = [
     "SEGMENT_ESTIMATORS",
@@ -33,6 +34,47 @@ __all__ = [
     "choose_segment_estimator",
     "Settings",
 ]
+
+
+UNLIMITED = 0xFFFFFFFF
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How long a path may be, and how scattered light is computed.
+
+    Attributes:
+        max_depth: largest path depth, counted as in ``volpath``; -1 for no limit.
+        rr_depth: depth from which Russian roulette may end a path.
+        hide_emitters: emitters are not seen directly by the camera.
+        deterministic: single scattering by quadrature in place of Monte Carlo.
+        shadows: with ``deterministic``, ``exact`` or interpolated in a ``grid``; else ``exact`` or ``estimated`` (ratio
+            tracking); ``auto`` leaves the choice to the plan.
+        media_light: light that media emit is ``drawn`` where paths scatter, or ``met`` by chance; ``auto`` leaves the choice to
+            the plan.
+    """
+
+    max_depth: int = 6
+    rr_depth: int = 5
+    hide_emitters: bool = False
+    deterministic: bool = False
+    shadows: str = "auto"
+    media_light: str = "auto"
+
+    @property
+    def depth_limit(self) -> int:
+        """Largest path depth, as a number of 32 bits."""
+        return self.max_depth if self.max_depth >= 0 else UNLIMITED
+
+    @property
+    def may_draw_emission(self) -> bool:
+        """Whether light that media emit may be drawn where paths scatter."""
+        return self.scatterings >= 1 and self.media_light != "met"
+
+    @property
+    def scatterings(self) -> float:
+        """Largest number of scattering events between an emitter and the camera, on surfaces and in media; may be infinite."""
+        return math.inf if self.max_depth < 0 else max(self.max_depth - 1, 0)
 
 
 @dataclass
@@ -170,12 +212,14 @@ def choose_segment_estimator(asked: SegmentQuestion) -> str | None:
     return next((name for name, entry in SEGMENT_ESTIMATORS.items() if entry.answers(asked)), None)
 
 
+@dataclass
 class Estimators:
-    """The estimators of one render.
+    """The estimators of one render, and its settings.
 
-    Args:
+    Attributes:
         direct: the estimator of direct lighting, at surfaces and in media.
         segment: the estimator of what media add and transmit along a segment.
+        settings: depth, roulette, hidden emitters.
         lights_surfaces: some surface scatters light, so that emitters are hit by emitter samples and by BSDF samples, which are
             combined by multiple importance sampling.
         lights_media: likewise where a path ends a segment in a medium. Under a constant environment alone it is not so: light
@@ -184,65 +228,25 @@ class Estimators:
         emission: draws light of media that emit, where paths scatter; None where they find it by chance.
         long_paths_count: long paths have as much light as short ones, where it is the same from everywhere, or more, where
             media emit; roulette spares them.
+        media: of the scene.
+        draws_shadows: shadow rays of vertices are estimated, by tracking or by roulette, which takes a random number.
     """
 
-    def __init__(
-        self,
-        direct: DirectLighting,
-        segment: SegmentEstimator,
-        lights_surfaces: bool,
-        lights_media: bool = False,
-        lobe: mi.Float | None = None,
-        emission: EmissionSampling | None = None,
-        long_paths_count: bool = False,
-    ) -> None:
-        self.media, self.direct, self.segment = direct.media, direct, segment
-        self.lights_surfaces, self.lights_media, self.lobe = lights_surfaces, lights_media, lobe
-        self.emission, self.long_paths_count = emission, long_paths_count
+    direct: DirectLighting
+    segment: SegmentEstimator
+    settings: Settings
+    lights_surfaces: bool
+    lights_media: bool = False
+    lobe: mi.Float | None = None
+    emission: EmissionSampling | None = None
+    long_paths_count: bool = False
+    media: SceneMedia = field(init=False)
+    draws_shadows: bool = field(init=False)
 
-    @property
-    def draws_shadows(self) -> bool:
-        """Whether shadow rays of vertices are estimated, by tracking or by roulette, which takes a random number."""
-        return self.media.is_bounded or self.segment.ends_in_media
-
-    def prepare_derivatives(self, ray: mi.Ray3f) -> None:
-        """Find what derivatives along camera rays need beforehand, once for all passes."""
-        self.segment.prepare_derivatives(ray)
+    def __post_init__(self) -> None:
+        self.media = self.direct.media
+        self.draws_shadows = self.media.is_bounded or self.segment.ends_in_media
 
     def replayed(self) -> Estimators:
         """Estimators of the radiance that a replay subtracts from: without light that is sampled anew for its derivatives."""
-        how = self.lights_surfaces, self.lights_media, self.lobe, self.emission, self.long_paths_count
-        return Estimators(self.direct, self.segment.replayed(), *how)
-
-
-@dataclass(frozen=True)
-class Settings:
-    """How long a path may be, and how scattered light is computed.
-
-    Attributes:
-        max_depth: largest path depth, counted as in ``volpath``; -1 for no limit.
-        rr_depth: depth from which Russian roulette may end a path.
-        hide_emitters: emitters are not seen directly by the camera.
-        deterministic: single scattering by quadrature in place of Monte Carlo.
-        shadows: with ``deterministic``, ``exact`` or interpolated in a ``grid``; else ``exact`` or ``estimated`` (ratio
-            tracking); ``auto`` leaves the choice to the plan.
-        media_light: light that media emit is ``drawn`` where paths scatter, or ``met`` by chance; ``auto`` leaves the choice to
-            the plan.
-    """
-
-    max_depth: int = 6
-    rr_depth: int = 5
-    hide_emitters: bool = False
-    deterministic: bool = False
-    shadows: str = "auto"
-    media_light: str = "auto"
-
-    @property
-    def may_draw_emission(self) -> bool:
-        """Whether light that media emit may be drawn where paths scatter."""
-        return self.scatterings >= 1 and self.media_light != "met"
-
-    @property
-    def scatterings(self) -> float:
-        """Largest number of scattering events between an emitter and the camera, on surfaces and in media; may be infinite."""
-        return math.inf if self.max_depth < 0 else max(self.max_depth - 1, 0)
+        return replace(self, segment=self.segment.replayed())

@@ -12,20 +12,17 @@ References: Novák et al. 2010 (path regeneration); O'Neill 2014 (generators).
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TypeVar
 
 import drjit as dr
 import mitsuba as mi
 
 from mivol.transport.estimators.scores import Primal
-from mivol.transport.path.estimators import Estimators, Settings
-from mivol.transport.path.walk import Path, alpha_of, leave_camera, start_path, step
+from mivol.transport.path.estimators import Estimators
+from mivol.transport.path.walk import Path, alpha_of, gather_lanes, leave_camera, start_path, step
 from mivol.transport.traversal.random_numbers import LaneSampler, draw_seeds
 from mivol.transport.traversal.rays import camera_ray
 
-__all__ = ["paths_a_lane", "values_at", "walk_successively"]
-
-T = TypeVar("T")
+__all__ = ["paths_a_lane", "walk_successively"]
 
 LANES = {"llvm": 1 << 13, "cuda": 1 << 20, "metal": 1 << 20}
 """Fewest lanes. Dr.Jit deals them out to the threads of a CPU by packets, of which these are 512 at least; a GPU holds
@@ -48,10 +45,11 @@ class _Departure:
 
     def of(self, index: mi.UInt32, active: mi.Bool) -> tuple[mi.Ray3f, mi.MediumPtr, LaneSampler]:
         """The departures with these numbers."""
-        o, d, maxt, time = (values_at(value, index, active) for value in (self.ray.o, self.ray.d, self.ray.maxt, self.ray.time))
-        seeds = [values_at(seed, index, active) for seed in self.seeds]
-        ray = mi.Ray3f(o, d, maxt, time, self.ray.wavelengths)
-        return ray, values_at(self.medium, index, active), LaneSampler.seeded(*seeds, index)
+        ray = self.ray
+        o, d, maxt, time = (gather_lanes(values, index, active) for values in (ray.o, ray.d, ray.maxt, ray.time))
+        seeds = [gather_lanes(seed, index, active) for seed in self.seeds]
+        ray = mi.Ray3f(o, d, maxt, time, ray.wavelengths)
+        return ray, gather_lanes(self.medium, index, active), LaneSampler.seeded(*seeds, index)
 
 
 def paths_a_lane(most: int, paths: int) -> int:
@@ -60,13 +58,11 @@ def paths_a_lane(most: int, paths: int) -> int:
     return max(1, min(most, paths // LANES[backend]))
 
 
-def walk_successively(
-    estimators: Estimators, settings: Settings, sampler: mi.Sampler, ray: mi.Ray3f, count: int
-) -> tuple[mi.Spectrum, mi.Float]:
+def walk_successively(estimators: Estimators, sampler: mi.Sampler, ray: mi.Ray3f, count: int) -> tuple[mi.Spectrum, mi.Float]:
     """Walk paths from the camera, ``count`` one after the other in each lane.
 
     Args:
-        estimators, settings: as of :func:`mivol.transport.path.walk.walk_path`.
+        estimators: as of :func:`mivol.transport.path.walk.walk_path`.
         sampler: two numbers a path, which seed the path's own.
         ray: world space, unit direction, one for each path.
         count: paths of a lane.
@@ -88,10 +84,10 @@ def walk_successively(
     def start(index: mi.UInt32, active: mi.Bool) -> Path:
         ray, medium, sampler = departure.of(index, active)
         path = start_path(estimators, ray, Primal(dr.zeros(mi.Spectrum, lanes)), sampler, None, active)
-        return leave_camera(estimators, settings, path, medium)
+        return leave_camera(estimators, path, medium)
 
     def walk_on(path: Path, index: mi.UInt32) -> tuple[Path, mi.UInt32]:
-        path = step(estimators, settings, path)
+        path = step(estimators, path)
         ended = ~path.active
         dr.scatter(L, path.score.L, index, ended)
         dr.scatter(alpha, alpha_of(path), index, ended)
@@ -103,8 +99,3 @@ def walk_successively(
     )
     dr.eval(L, alpha)
     return L, alpha
-
-
-def values_at(values: T, index: mi.UInt32, active: mi.Bool = True) -> T:
-    """The values at an index; what is the same for all is not gathered."""
-    return dr.gather(type(values), values, index, active) if dr.width(values) > 1 else values

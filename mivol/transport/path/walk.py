@@ -30,7 +30,7 @@ from mivol.transport.estimators.scores import PICTURE, Primal, Replay, Tangent, 
 from mivol.transport.estimators.segment import Collision, PathSegment
 from mivol.transport.media.body import medium_interaction
 from mivol.transport.media.channels import colours
-from mivol.transport.path.estimators import Estimators, Settings
+from mivol.transport.path.estimators import Estimators
 from mivol.transport.path.event import PathEvent, TurnSamples, sample_turn
 from mivol.transport.path.side_flight import Aim, SideSamples, fly_aside, weigh_aim
 from mivol.transport.traversal.random_numbers import LaneSampler, Strata, draw_state
@@ -40,6 +40,7 @@ __all__ = [
     "Landing",
     "Path",
     "alpha_of",
+    "gather_lanes",
     "is_straight",
     "leave_camera",
     "start_path",
@@ -49,9 +50,8 @@ __all__ = [
     "walk_stem",
 ]
 
+T = TypeVar("T")
 Score = TypeVar("Score", Primal, Replay, Tangent)
-
-UNLIMITED = 0xFFFFFFFF
 
 SURE = 0.5
 """Throughput down to which a path in a medium surely goes on (variance x time, measured at 1, 1/2 and 1/4: in a white box of
@@ -132,7 +132,6 @@ class Landing:
 
 def walk_path(
     estimators: Estimators,
-    settings: Settings,
     sampler: mi.Sampler,
     ray: Ray,
     score: Score,
@@ -143,7 +142,6 @@ def walk_path(
 
     Args:
         estimators: of light along segments and at surfaces; they know the scene and its media.
-        settings: depth, roulette, hidden emitters.
         sampler: three 2D and two 1D numbers a surface, and what the segment estimator draws.
         ray: world space, unit direction.
         score: :mod:`mivol.transport.estimators.scores`.
@@ -156,18 +154,19 @@ def walk_path(
     Bias: that of the segment estimator. Variance: none at depth 1 beyond the pixel's own; at surfaces, that of emitter and BSDF
     samples.
     """
-    path = start_path(estimators, camera_ray(ray), score, sampler, strata, mi.Bool(active) & (_limit(settings) > 0))
-    path = leave_camera(estimators, settings, path, estimators.media.medium_at(ray))
-    if is_straight(estimators, settings):
-        path, event = _follow_segment(estimators, settings, path)
-        path = _add_emission(estimators, settings, path, event)
+    active = mi.Bool(active) & (estimators.settings.depth_limit > 0)
+    path = start_path(estimators, camera_ray(ray), score, sampler, strata, active)
+    path = leave_camera(estimators, path, estimators.media.medium_at(ray))
+    if is_straight(estimators):
+        path, event = _follow_segment(estimators, path)
+        path = _add_emission(estimators, path, event)
         path.stopped |= event.at_surface
         return path.score, alpha_of(path)
-    path = _add_kept(estimators, settings, _walk_on(estimators, settings, _keep_some(estimators, path, "first", "later")))
+    path = _add_kept(estimators, _walk_on(estimators, _keep_some(estimators, path, "first", "later")))
     return path.score, alpha_of(path)
 
 
-def walk_stem(estimators: Estimators, settings: Settings, sampler: mi.Sampler, ray: Ray, score: Score) -> tuple[Score, Landing]:
+def walk_stem(estimators: Estimators, sampler: mi.Sampler, ray: Ray, score: Score) -> tuple[Score, Landing]:
     """Walk a path from the camera, but no further than to a collision on its first segment.
 
     Args:
@@ -179,24 +178,22 @@ def walk_stem(estimators: Estimators, settings: Settings, sampler: mi.Sampler, r
     goes_on = estimators.media.has_surfaces
     kept = ("first", "later") if goes_on else ("first",)
     path = start_path(estimators, camera_ray(ray), score, sampler, None, dr.full(mi.Bool, True, dr.width(ray)))
-    path = _keep_some(estimators, leave_camera(estimators, settings, path, estimators.media.medium_at(ray)), *kept)
-    path, event = _follow_segment(estimators, settings, path)
-    path = _add_emission(estimators, settings, path, event)
+    path = _keep_some(estimators, leave_camera(estimators, path, estimators.media.medium_at(ray)), *kept)
+    path, event = _follow_segment(estimators, path)
+    path = _add_emission(estimators, path, event)
     hit = event.collision
     landing = Landing(path.ray, hit.t, hit.body, mi.Spectrum(path.beta), hit.on)
     if goes_on:
         beside = replace(event, collision=replace(hit, on=dr.full(mi.Bool, False, dr.width(ray))))
-        path = _walk_on(estimators, settings, _scatter(estimators, settings, path, beside))
-    return _add_kept(estimators, settings, path).score, landing
+        path = _walk_on(estimators, _scatter(estimators, path, beside))
+    return _add_kept(estimators, path).score, landing
 
 
-def walk_branch(
-    estimators: Estimators, settings: Settings, sampler: LaneSampler, landing: Landing, score: Score
-) -> tuple[Score, mi.UInt32]:
+def walk_branch(estimators: Estimators, sampler: LaneSampler, landing: Landing, score: Score) -> tuple[Score, mi.UInt32]:
     """Walk a path on from where it first collided, to its end.
 
     Args:
-        estimators, settings, score: as of :func:`walk_path`.
+        estimators, score: as of :func:`walk_path`.
         sampler: independent of the path to there.
         landing: where the path collided.
 
@@ -207,8 +204,8 @@ def walk_branch(
     path.beta = mi.Spectrum(landing.beta)
     path = _aim_first(estimators, _keep_some(estimators, path, "later"))
     hit = collision_at(estimators.media, landing.ray, landing.t, landing.body, landing.on)
-    path = _walk_on(estimators, settings, _scatter(estimators, settings, path, _in_medium(hit, sampler.next_1d())))
-    return _add_kept(estimators, settings, path).score, path.depth
+    path = _walk_on(estimators, _scatter(estimators, path, _in_medium(hit, sampler.next_1d())))
+    return _add_kept(estimators, path).score, path.depth
 
 
 def _keep_some(estimators: Estimators, path: Path, *which: str) -> Path:
@@ -225,13 +222,13 @@ def _keep_some(estimators: Estimators, path: Path, *which: str) -> Path:
     return path
 
 
-def _add_kept(estimators: Estimators, settings: Settings, path: Path) -> Path:
+def _add_kept(estimators: Estimators, path: Path) -> Path:
     """Add the derivatives that kept points and shadow rays find, at the end of a path."""
     if path.shadow is not None:
         path.score = path.score.add(ShadowTerm(estimators.media, path.shadow))
     if path.probes is not None:
         for probe in path.probes.kept:
-            path.score = path.score.add(_estimate_probe(estimators, settings, probe, path.sampler))
+            path.score = path.score.add(_estimate_probe(estimators, probe, path.sampler))
     return path
 
 
@@ -264,9 +261,9 @@ def start_path(
     )
 
 
-def leave_camera(estimators: Estimators, settings: Settings, path: Path, medium: mi.MediumPtr) -> Path:
+def leave_camera(estimators: Estimators, path: Path, medium: mi.MediumPtr) -> Path:
     """A path that was started, as it leaves a camera in a medium."""
-    path.stopped |= not settings.hide_emitters and estimators.media.scene.environment() is not None
+    path.stopped |= not estimators.settings.hide_emitters and estimators.media.scene.environment() is not None
     path.medium = medium
     return _aim_first(estimators, path)
 
@@ -285,23 +282,16 @@ def _draw_emitter(estimators: Estimators, ray: FineRay, sampler: mi.Sampler | La
     return DistantAim.of(estimators.direct.aim(it, sampler.next_2d(active), active))
 
 
-def step(estimators: Estimators, settings: Settings, path: Path) -> Path:
+def step(estimators: Estimators, path: Path) -> Path:
     """Follow a path along its segment and over the event at its end."""
-    path, event = _follow_segment(estimators, settings, path)
-    path = _add_emission(estimators, settings, path, event)
-    return _scatter(estimators, settings, path, event)
+    path, event = _follow_segment(estimators, path)
+    path = _add_emission(estimators, path, event)
+    return _scatter(estimators, path, event)
 
 
-def _walk_on(estimators: Estimators, settings: Settings, path: Path) -> Path:
+def _walk_on(estimators: Estimators, path: Path) -> Path:
     """Follow a path to its end."""
-    return dr.while_loop(state=(path,), cond=lambda p: p.active, body=lambda p: (step(estimators, settings, p),), label="path")[
-        0
-    ]
-
-
-def _limit(settings: Settings) -> int:
-    """Largest path depth, as a number of 32 bits."""
-    return settings.max_depth if settings.max_depth >= 0 else UNLIMITED
+    return dr.while_loop(state=(path,), cond=lambda p: p.active, body=lambda p: (step(estimators, p),), label="path")[0]
 
 
 def _add_side_flight(estimators: Estimators, path: Path, event: PathEvent, aim: DistantAim, active: mi.Bool) -> Path:
@@ -316,7 +306,7 @@ def _add_side_flight(estimators: Estimators, path: Path, event: PathEvent, aim: 
     return path
 
 
-def _estimate_probe(estimators: Estimators, settings: Settings, probe: Probe, sampler: mi.Sampler) -> ProbeTerm:
+def _estimate_probe(estimators: Estimators, probe: Probe, sampler: mi.Sampler) -> ProbeTerm:
     """Estimate the radiance that is scattered at a probe towards the path, by a path of its own."""
     media, n = estimators.media, dr.width(probe.ray)
     on = probe.weight > 0
@@ -325,7 +315,7 @@ def _estimate_probe(estimators: Estimators, settings: Settings, probe: Probe, sa
     path = start_path(estimators, probe.ray, Primal(dr.zeros(mi.Spectrum, n)), sampler, None, on)
     path.depth = mi.UInt32(probe.depth)
     collision = Collision(mei, point_along(probe.ray, probe.t), dr.full(mi.Spectrum, 1, n), on, probe.t, probe.body)
-    path = _walk_on(estimators, settings, _scatter(estimators, settings, path, _in_medium(collision)))
+    path = _walk_on(estimators, _scatter(estimators, path, _in_medium(collision)))
     return ProbeTerm(media, probe, mei, dr.detach(path.score.L), estimators.segment.level, on)
 
 
@@ -345,17 +335,17 @@ def alpha_of(path: Path) -> mi.Float:
     return dr.select(path.stopped, 1, 1 - sum(colours(path.clear)) / dr.size_v(path.clear))
 
 
-def is_straight(estimators: Estimators, settings: Settings) -> bool:
+def is_straight(estimators: Estimators) -> bool:
     """Whether every path has one segment: there are no surfaces, or the depth is at most 1 and none of them transmits light."""
     media = estimators.media
     if estimators.segment.ends_in_media:
         return False
-    return not media.has_surfaces or (settings.scatterings == 0 and not media.has_null_transmission)
+    return not media.has_surfaces or (estimators.settings.scatterings == 0 and not media.has_null_transmission)
 
 
-def _follow_segment(estimators: Estimators, settings: Settings, path: Path) -> tuple[Path, PathEvent]:
+def _follow_segment(estimators: Estimators, path: Path) -> tuple[Path, PathEvent]:
     """Follow the segment to the next opaque surface: media add a term, and their transmittance is a factor."""
-    may_scatter = path.active & (path.depth + 1 < _limit(settings))
+    may_scatter = path.active & (path.depth + 1 < estimators.settings.depth_limit)
     samples = estimators.segment.draw(path.sampler, may_scatter, path.strata)
     # A copy of the throughput: it is multiplied in place below, and derivatives read the segment's own after that.
     segment = PathSegment(path.ray, path.medium, mi.Spectrum(path.beta), may_scatter, samples, mi.UInt32(path.depth))
@@ -373,10 +363,10 @@ def _follow_segment(estimators: Estimators, settings: Settings, path: Path) -> t
     return path, PathEvent.of(found, path.active)
 
 
-def _add_emission(estimators: Estimators, settings: Settings, path: Path, event: PathEvent) -> Path:
+def _add_emission(estimators: Estimators, path: Path, event: PathEvent) -> Path:
     """Add the emission of the surface, or of the environment, towards the path."""
     scene, si = estimators.media.scene, event.si
-    shown = path.active & ~event.in_medium & ~((path.depth == 0) & settings.hide_emitters)
+    shown = path.active & ~event.in_medium & ~((path.depth == 0) & estimators.settings.hide_emitters)
     emitter = si.emitter(scene, shown)
     w_mis = mi.Float(1)
     if estimators.lights_surfaces or estimators.lights_media:
@@ -389,10 +379,10 @@ def _add_emission(estimators: Estimators, settings: Settings, path: Path, event:
     return path
 
 
-def _scatter(estimators: Estimators, settings: Settings, path: Path, event: PathEvent) -> Path:
+def _scatter(estimators: Estimators, path: Path, event: PathEvent) -> Path:
     """Estimate the direct light where the segment has ended, and sample the direction in which the path continues."""
     arrives, sampler = event.at_surface | event.in_medium, path.sampler
-    limit = _limit(settings)
+    limit = estimators.settings.depth_limit
     may_scatter = arrives & (path.depth + 1 < limit)
     path = _add_direct_light(estimators, path, event, may_scatter)
     if estimators.emission is not None:
@@ -428,7 +418,7 @@ def _scatter(estimators: Estimators, settings: Settings, path: Path, event: Path
         spared = mi.Float(SURE) if estimators.long_paths_count else dr.maximum(SURE, dr.sqrt(path.depth / LONG))
         sure, most = dr.select(event.in_medium, spared, sure), dr.select(event.in_medium, 1, most)
     q = dr.minimum(dr.max(path.beta) * dr.square(path.eta) / sure, most)
-    late = path.depth >= settings.rr_depth
+    late = path.depth >= estimators.settings.rr_depth
     survives = ~late | (sampler.next_1d(turn.on) < q)
     path.beta = dr.select(late, path.beta * dr.rcp(dr.maximum(q, 1e-30)), path.beta)
     path.active = turn.on & survives & dr.any(path.beta != 0)
@@ -489,3 +479,8 @@ def _add_light_of_media(estimators: Estimators, path: Path, event: PathEvent, ma
         alone = ShadowReservoir.empty(estimators.media, path.ray).offer(light.shadow, light.point.chance)
         path.score = path.score.add(ShadowTerm(estimators.media, alone))
     return path
+
+
+def gather_lanes(values: T, index: mi.UInt32, active: mi.Bool = True) -> T:
+    """Gather values of lanes; a value that all lanes share stays as it is."""
+    return dr.gather(type(values), values, index, active) if dr.width(values) > 1 else values

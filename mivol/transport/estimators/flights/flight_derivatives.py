@@ -91,7 +91,7 @@ class FlownSegment:
         weight: of each channel at its end.
         level: the level b; None for 0.
         emission: where emission was looked at; None where no medium emits by its place.
-        shown: the light of Gaussians.
+        shown: the light of Gaussians; None where no medium shows any.
         active: lanes that fly.
         dL: d loss / d emission, once it is known.
     """
@@ -103,7 +103,7 @@ class FlownSegment:
     weight: mi.Spectrum
     level: Level | None
     emission: FlightPoint | None
-    shown: GaussianLight
+    shown: GaussianLight | None
     active: mi.Bool
     dL: mi.Spectrum | None = None
 
@@ -117,7 +117,7 @@ class FlownSegment:
     @property
     def emitted(self) -> mi.Spectrum:
         """The light that media emit along the flight, as the camera sees it."""
-        total = self.shown.value()
+        total = mi.Spectrum(0) if self.shown is None else self.shown.value()
         if self.emission is None:
             return total
         ray, point = self.segment.ray, self.emission.point
@@ -131,7 +131,8 @@ class FlownSegment:
 
     def vjp_light(self, dL: mi.Spectrum) -> None:
         """Derivatives of the emission, and of the media in front of the point where it was looked at."""
-        self.shown.vjp(dL)
+        if self.shown is not None:
+            self.shown.vjp(dL)
         if self.emission is None:
             return
         media, ray, found = self.media, self.segment.ray, self.emission
@@ -149,7 +150,9 @@ class FlownSegment:
         vjp_optical_depth(media, self._to_emission, -dL * found.gain * value, found.point.on)
 
     def jvp_light(self) -> mi.Spectrum:
-        total = self.shown.jvp() - self._level * self._jvp_extinction
+        total = -self._level * self._jvp_extinction
+        if self.shown is not None:
+            total += self.shown.jvp()
         if self.emission is None:
             return total
         media, ray, found = self.media, self.segment.ray, self.emission

@@ -118,8 +118,10 @@ class FreeFlight:
         emission = self._point_of(segment, passed, emitting, at_emission, chance, active) if emitting else None
         if segment.emission_weight is not None:
             emission.gain *= segment.emission_weight
-        weigh = partial(self._weigh, segment, collision=None)
-        shown = GaussianLight(media, segment, (end.t, t), weigh, active)
+        shown = None
+        if any(body.view.shows_gaussians for body in media.bodies):
+            weigh = partial(self._weigh, segment, collision=None)
+            shown = GaussianLight(media, segment, (end.t, t), weigh, active)
         # What a side flight leaves to probes is found by those of the path itself, and so is the light of the level.
         level = None if segment.is_aside else self.level
         shared = FlownSegment(media, segment, passed, collision, weight, level, emission, shown, active)

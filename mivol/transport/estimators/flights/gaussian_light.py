@@ -109,8 +109,6 @@ class GaussianLight:
 
     def _visit(self, add: Callable, state: object) -> object:
         """Visit each place where the flight enters Gaussians that are shown."""
-        if not any(body.view.shows_gaussians for body in self.media.bodies):
-            return state
 
         def visit(state: object, interval: MediumInterval) -> object:
             if not interval.body.view.shows_gaussians:

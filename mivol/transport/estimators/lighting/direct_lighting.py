@@ -146,7 +146,32 @@ class DirectLighting:
 
         Bias: none. Variance: that of one emitter sample. Cost: one shadow ray.
         """
-        return self._emitter_sample(vertex, aim, attached, active, rng)
+        direct, it = aim.direct, vertex.interaction
+        on = active & (direct.pdf > 0)
+        start, medium = vertex.leave(direct.p)
+        ray_segment, clear, tau, light = shadow_ray(self.media, start, medium, direct, on, rng)
+        on &= clear
+        w_mis = mi.Float(1)
+        if aim.has_alternative is not False:
+            pdf = direct.pdf / aim.count
+            w_mis = dr.select(direct.delta | ~mi.Bool(aim.has_alternative), 1, power_heuristic(pdf, vertex.pdf(direct.d, on)))
+        dim = light * (w_mis * aim.count)
+        with dr.resume_grad(when=attached):
+            source, moved = aim.weight, direct
+            if attached:
+                placed, _ = aim.emitter.sample_direction(it, aim.u, on)
+                if dr.grad_enabled(placed.p):
+                    moved = follow_emitter(placed, direct)
+                source = aim.emitter.eval_direction(it, moved, on) / direct.pdf
+                if dr.grad_enabled(moved.p):
+                    source = source * shadow_of_moving(self.media, ray_segment, tau, moved.p, on)
+                if not dr.grad_enabled(source, moved):
+                    # What was computed for derivatives only is dropped from the kernel: emitters are looked at once.
+                    source, moved = aim.weight, direct
+            # Where the density is 0 the source is infinite; the lanes are not active, but 0 * inf in their derivative would be
+            # NaN.
+            value = dr.select(on, dim * vertex.eval(moved.d, on) * dr.select(direct.pdf > 0, source, 0), 0)
+        return DirectSample(ray_segment, value, on)
 
     def in_medium(
         self,
@@ -181,38 +206,10 @@ class DirectLighting:
             direct, weight = chosen.emitter.sample_direction(mei, samples.emitter, active)
             weighed = ~is_among(self.emitters.transmissive, chosen.emitter) if self.emitters.samples_phase else False
             aim = EmitterAim(direct, weight, chosen.emitter, samples.emitter, len(self.emitters.sampled), weighed)
-            found.append(self._emitter_sample(vertex, aim, attached, active, one))
+            found.append(self.at_vertex(vertex, aim, attached, active, one))
         if self.emitters.samples_phase:
             found.append(self._phase_sample(vertex, samples, attached, active, two))
         return found
-
-    def _emitter_sample(
-        self, vertex: Vertex, aim: EmitterAim, attached: bool, active: mi.Bool, rng: mi.UInt32 | None = None
-    ) -> DirectSample:
-        """Light from a direction that was sampled towards an emitter."""
-        direct, it = aim.direct, vertex.interaction
-        on = active & (direct.pdf > 0)
-        start, medium = vertex.leave(direct.p)
-        ray_segment, clear, tau, light = shadow_ray(self.media, start, medium, direct, on, rng)
-        on &= clear
-        w_mis = mi.Float(1)
-        if aim.has_alternative is not False:
-            pdf = direct.pdf / aim.count
-            w_mis = dr.select(direct.delta | ~mi.Bool(aim.has_alternative), 1, power_heuristic(pdf, vertex.pdf(direct.d, on)))
-        dim = light * (w_mis * aim.count)
-        with dr.resume_grad(when=attached):
-            source, moved = aim.weight, direct
-            if attached:
-                moved = follow_emitter(aim.emitter, it, aim.u, direct, on)
-                source = aim.emitter.eval_direction(it, moved, on) / direct.pdf
-                source = source * shadow_of_moving(self.media, ray_segment, tau, moved.p, on)
-                if not dr.grad_enabled(source, moved):
-                    # What was computed for derivatives only is dropped from the kernel: emitters are looked at once.
-                    source, moved = aim.weight, direct
-            # Where the density is 0 the source is infinite; the lanes are not active, but 0 * inf in their derivative would be
-            # NaN.
-            value = dr.select(on, dim * vertex.eval(moved.d, on) * dr.select(direct.pdf > 0, source, 0), 0)
-        return DirectSample(ray_segment, value, on)
 
     def _phase_sample(
         self, vertex: MediumVertex, samples: EventSamples, attached: bool, active: mi.Bool, rng: mi.UInt32 | None

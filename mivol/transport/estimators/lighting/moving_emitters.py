@@ -74,14 +74,11 @@ def tau_by_end(media: SceneMedia, ray_segment: RaySegment, tau: list[mi.Float], 
 
 def shadow_of_moving(
     media: SceneMedia, ray_segment: RaySegment, tau: list[mi.Float], end: mi.Point3f, active: mi.Bool
-) -> mi.Spectrum | float:
+) -> mi.Spectrum:
     """A factor of value 1 that carries the derivative of a shadow ray's transmittance by the place of its end.
 
-    Its derivative is that of log T = -tau, so T times the factor has the value T and the derivative of T. Where the end has no
-    derivative the factor is the number 1, and nothing is walked.
+    Its derivative is that of log T = -tau, so T times the factor has the value T and the derivative of T.
     """
-    if not dr.grad_enabled(end):
-        return 1.0
     moved = end - dr.detach(end)
     with dr.suspend_grad():
         slopes = tau_by_end(media, ray_segment, tau, active)
@@ -203,15 +200,15 @@ def _face(rows: list, low: tuple, high: tuple, ray: Ray, t: mi.Float64) -> mi.Ve
     return normal
 
 
-def follow_emitter(
-    emitter: mi.EmitterPtr, it: mi.Interaction3f, u: mi.Point2f, direct: mi.DirectionSample3f, active: mi.Bool
-) -> mi.DirectionSample3f:
-    """The sample of an emitter of one position or direction, with its derivative by that; other samples stay as they are."""
-    moved, _ = emitter.sample_direction(it, u, active)
-    if not dr.grad_enabled(moved.p):
-        return direct
-    moved.p = dr.select(direct.delta, moved.p, direct.p)
-    moved.d = dr.select(direct.delta, moved.d, direct.d)
-    moved.dist = dr.select(direct.delta, moved.dist, direct.dist)
-    moved.n, moved.uv, moved.pdf, moved.emitter = direct.n, direct.uv, direct.pdf, direct.emitter
-    return moved
+def follow_emitter(placed: mi.DirectionSample3f, direct: mi.DirectionSample3f) -> mi.DirectionSample3f:
+    """A sample of an emitter of one position or direction, with its derivative by that; other samples stay as they are.
+
+    Args:
+        placed: the emitter sample, drawn again with the same numbers, attached to the emitter's position or direction.
+        direct: the sample itself.
+    """
+    placed.p = dr.select(direct.delta, placed.p, direct.p)
+    placed.d = dr.select(direct.delta, placed.d, direct.d)
+    placed.dist = dr.select(direct.delta, placed.dist, direct.dist)
+    placed.n, placed.uv, placed.pdf, placed.emitter = direct.n, direct.uv, direct.pdf, direct.emitter
+    return placed

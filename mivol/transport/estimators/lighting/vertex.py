@@ -16,7 +16,7 @@ from mivol.phase.turn import INV_FOUR_PI
 from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.traversal.rays import spawn_ray
 
-__all__ = ["EitherVertex", "MediumVertex", "SurfaceVertex", "Vertex", "phase_context", "phase_pdf", "sample_phase"]
+__all__ = ["EitherVertex", "MediumVertex", "SurfaceVertex", "Vertex", "phase_pdf", "sample_phase"]
 
 
 class Vertex(Protocol):
@@ -85,7 +85,7 @@ class MediumVertex:
         return self.place, self.interaction.medium
 
     def eval(self, d: mi.Vector3f, active: mi.Bool) -> mi.Spectrum:
-        return self.phase.eval_pdf(phase_context(), self.interaction, d, active)[0]
+        return self.phase.eval_pdf(mi.PhaseFunctionContext(None), self.interaction, d, active)[0]
 
     def eval_and_pdf(self, d: mi.Vector3f, active: mi.Bool) -> tuple[mi.Spectrum, mi.Float]:
         """Both, without derivatives."""
@@ -148,11 +148,11 @@ def sample_phase(
         The direction, value over density [1], and density [1/sr].
     """
     phase = mei.medium.phase_function()
-    wo, weight, pdf = phase.sample(phase_context(), mei, component, direction, active)
+    wo, weight, pdf = phase.sample(mi.PhaseFunctionContext(None), mei, component, direction, active)
     if media.has_microflakes:
         even = _has_microflakes(phase)
         wo = dr.select(even, mi.warp.square_to_uniform_sphere(direction), wo)
-        f, _ = phase.eval_pdf(phase_context(), mei, wo, active & even)
+        f, _ = phase.eval_pdf(mi.PhaseFunctionContext(None), mei, wo, active & even)
         weight, pdf = dr.select(even, f / INV_FOUR_PI, weight), dr.select(even, INV_FOUR_PI, pdf)
     return wo, weight, pdf
 
@@ -161,14 +161,9 @@ def phase_pdf(
     media: SceneMedia, phase: mi.PhaseFunctionPtr, mei: mi.MediumInteraction3f, d: mi.Vector3f, active: mi.Bool
 ) -> mi.Float:
     """Density [1/sr] of the direction ``d`` in :func:`sample_phase`."""
-    _, pdf = phase.eval_pdf(phase_context(), mei, d, active)
+    _, pdf = phase.eval_pdf(mi.PhaseFunctionContext(None), mei, d, active)
     return dr.select(_has_microflakes(phase), INV_FOUR_PI, pdf) if media.has_microflakes else pdf
 
 
 def _has_microflakes(phase: mi.PhaseFunctionPtr) -> mi.Bool:
     return (phase.flags() & mi.UInt32(int(mi.PhaseFunctionFlags.Microflake))) != 0
-
-
-def phase_context() -> mi.PhaseFunctionContext:
-    """The context that asks a phase function for all of its components."""
-    return mi.PhaseFunctionContext(None)
