@@ -57,21 +57,22 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Mark as slow what ``slow_variants.txt`` names: tests that take long, of which a cheaper variant or a neighbour stays, and
-    those of the benches and of the mutation runner, on which no result of a user depends.
+    """Mark the variants of ``slow_for`` as slow.
 
     Raises:
-        pytest.UsageError: it names a test that its file does not have, so that a test which was renamed is not run by chance.
+        pytest.UsageError: a test has no such variant. One that was renamed would run in every suite without a word.
     """
-    names = (ROOT / "tests" / "slow_variants.txt").read_text().splitlines()
-    listed, found, rounds = set(names), {item.nodeid for item in items}, config.getoption("--seeds")
+    unmatched: dict[str, set[str]] = {}
     for item in items:
-        if item.nodeid in listed:
-            item.add_marker(pytest.mark.slow)
-    whole = {item.nodeid.partition("::")[0] for item in items} if not any("::" in arg for arg in config.args) else set()
-    gone = next((name for name in names if name.partition("::")[0] in whole and name not in found), None)
-    if gone is not None and rounds == 1:
-        raise pytest.UsageError(f"tests/slow_variants.txt names {gone}, which is no test: write its new name, or take it out.")
+        if marker := item.get_closest_marker("slow_for"):
+            test, _, variant = item.nodeid.partition("[")
+            left = unmatched.setdefault(test, set(marker.args))
+            if variant[:-1] in marker.args:
+                item.add_marker(pytest.mark.slow)
+                left.discard(variant[:-1])
+    is_whole = not any("::" in arg for arg in config.args) and config.getoption("--seeds") == 1
+    if is_whole and (gone := {test: ids for test, ids in unmatched.items() if ids}):
+        raise pytest.UsageError(f"slow_for names variants that do not exist: {gone}")
 
 
 def pytest_collection_finish() -> None:

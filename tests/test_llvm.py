@@ -44,6 +44,7 @@ def library(path: Path, major: int) -> Path:
     return file
 
 
+@pytest.mark.slow
 def test_import_chooses_the_best_library_before_drjit() -> None:
     code, out, err = child("import mivol, drjit; print(drjit.detail.llvm_version()[0])\n" + SWITCH)
     assert code == 0, err
@@ -65,9 +66,7 @@ def test_import_needs_no_library_and_never_fails() -> None:
 
 def test_users_choice_is_not_overridden() -> None:
     chosen = llvm.rank(llvm.find_libraries())[0].path
-    code, out, err = child(
-        "import mivol, os; print(os.environ['DRJIT_LIBLLVM_PATH'], mivol.llvm.origin())", str(chosen)
-    )
+    code, out, err = child("import mivol, os; print(os.environ['DRJIT_LIBLLVM_PATH'], mivol.llvm.origin())", str(chosen))
     assert code == 0, err
     assert out == f"{chosen} {llvm.BY_USER}"
 
@@ -94,13 +93,13 @@ def test_missing_library_lets_the_next_variant_serve() -> None:
     assert out == "scalar_rgb"
 
 
+@pytest.mark.slow
 @needs_old
 def test_llvm_15_is_stopped_before_it_aborts() -> None:
     code, out, _ = child("import mivol, mitsuba as mi; mi.set_variant('llvm_ad_rgb')", str(OLD))
     assert code == 1
     code, out, err = child(
-        "import mivol, mitsuba as mi\n"
-        "try:\n    mi.set_variant('llvm_ad_rgb')\nexcept ImportError as error:\n    print(error)",
+        "import mivol, mitsuba as mi\ntry:\n    mi.set_variant('llvm_ad_rgb')\nexcept ImportError as error:\n    print(error)",
         str(OLD),
     )
     assert code == 0, err
@@ -112,13 +111,13 @@ def test_llvm_15_is_stopped_before_it_aborts() -> None:
 def test_llvm_15_does_abort_without_the_guard() -> None:
     """The reason for all this: should it ever stop being true, OLDEST can be lowered."""
     code, _, _ = child(
-        "import mitsuba as mi; mi.set_variant('llvm_ad_rgb'); import drjit as dr\n"
-        "print(dr.minimum(dr.arange(mi.Float, 8), 3))",
+        "import mitsuba as mi; mi.set_variant('llvm_ad_rgb'); import drjit as dr\nprint(dr.minimum(dr.arange(mi.Float, 8), 3))",
         str(OLD),
     )
     assert code < 0
 
 
+@pytest.mark.slow
 @needs_old
 def test_variant_set_before_mivol_is_imported() -> None:
     """Import does not fail; it warns, and the check that renders make raises and says what to import first."""
@@ -279,9 +278,7 @@ FAKED = {
 
 
 @pytest.mark.parametrize("system", FAKED)
-def test_search_knows_where_each_system_keeps_libraries(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, system: str
-) -> None:
+def test_search_knows_where_each_system_keeps_libraries(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, system: str) -> None:
     """A tree as that system has it: every library in it is found, and nothing of the other systems'."""
     for names in FAKED.values():
         for name in names:

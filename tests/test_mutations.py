@@ -86,6 +86,7 @@ def bare_pytest(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PYTEST_DISABLE_PLUGIN_AUTOLOAD", "1")
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("bare_pytest")
 def test_the_runner_tells_red_from_green(tmp_path: Path) -> None:
     """A test that sees a mutation and one that does not, in a checkout of two files."""
@@ -153,6 +154,7 @@ def test_what_can_be_broken_and_what_cannot():
     assert {f.kind for f in found} == {"operator", "function", "sign", "constant", "index", "condition"}
 
 
+@pytest.mark.slow
 def test_a_room_can_be_broken_in_many_places_and_each_fault_is_one():
     """Of 20 drawn faults each parses, changes the program, and leaves all but one line's text as it was."""
     drawn = faults.draw_faults(ROOM, 20, seed=11)
@@ -246,6 +248,7 @@ def checkout(tmp_path: Path, bare_pytest: None) -> object:
     return survivors.Checkout(tmp_path / "broken", tmp_path / "untouched", 60.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("old", "new", "killer"), [("/", "*", "tests/test_halving.py::test_half"), ("<", "<=", "")])
 def test_a_fault_is_killed_by_a_test_that_is_green_without_it(checkout, old: str, new: str, killer: str) -> None:
     """9 is returned for 9 by either comparison: that fault is no fault. A test that is red anyway kills nothing."""
@@ -257,12 +260,14 @@ def test_a_fault_is_killed_by_a_test_that_is_green_without_it(checkout, old: str
     assert (checkout.broken / "halving.py").read_text() == HALVING
 
 
+@pytest.mark.slow
 def test_a_fault_that_nothing_can_be_imported_with_is_killed(checkout) -> None:
     fault = faults.Fault("halving.py", 1, 0, "def half(x):", "half = 1 +\\\n", "operator")
     index = guards.Guards(named={"halving.py": ["tests/test_halving.py"]})
     assert survivors.judge_fault(checkout, fault, index).killed
 
 
+@pytest.mark.slow
 def test_a_test_that_is_red_by_chance_kills_nothing(checkout) -> None:
     """It fails where it is run for the first time, in the broken copy, and in no later run."""
     mark = checkout.broken / "mark"

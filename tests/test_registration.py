@@ -46,6 +46,7 @@ def said(copy: Path, code: str) -> list[str]:
     return done.stdout.split("\n")[:-1]
 
 
+@pytest.mark.slow_for("mitsuba first", "mivol first")
 @pytest.mark.parametrize("order", ORDERS.values(), ids=ORDERS.keys())
 def test_each_variant_gets_its_plugins(copy: Path, order: str) -> None:
     """Scalar variants get none; no shell runs before there is a variant, out of order, or twice for one switch."""

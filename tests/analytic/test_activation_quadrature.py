@@ -112,6 +112,7 @@ def printed(name: str) -> list[float]:
     return [float(number) for number in row.replace("/", " ").split()[1:]]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ACTIVATIONS)
 def test_errors_are_those_of_the_table(variant_rgb: str, work: Work, name: str) -> None:
     row, order = [], 0.0

@@ -185,6 +185,7 @@ NAMES = [
 ]
 
 
+@pytest.mark.slow_for("box-rgb")
 @pytest.mark.parametrize(("boundary", "extinction"), NAMES)
 def test_constant_source(boundary, extinction):
     """C = Le (1 - T) + B T to rounding; of c = B nothing remains but B, and no gradient. Hard case 38."""
@@ -211,9 +212,7 @@ def test_medium_that_never_ends():
     ball = ball_of(fog, [50, 0, 0], 1.0)
     o, d = [[0, 0, 0.0]], [[0, 0.6, 0.8]]
     seen = pencils({"ball": ball, "sky": colours(B)}, o, d)
-    scene = mi.load_dict(
-        {"type": "scene", "ball": ball, "sky": colours(B), "sensor": _inside(o[0], d[0])}
-    )
+    scene = mi.load_dict({"type": "scene", "ball": ball, "sky": colours(B), "sensor": _inside(o[0], d[0])})
     assert light(scene)[0, 0] == pytest.approx(LE + j / np.float32(0.6), rel=4 * EPS)
     assert light(seen)[0] == pytest.approx(B)
 
@@ -224,6 +223,7 @@ def _inside(o, d) -> dict:
     return pencil(o, d) | {"medium": {"type": "ref", "id": "fog"}}
 
 
+@pytest.mark.slow_for("ball")
 @pytest.mark.parametrize("boundary", ["box", "ball"])
 def test_camera_inside(boundary):
     """What lies behind the camera neither dims nor adds, in a box and in a boundary that is traced. Hard case 45."""
@@ -279,6 +279,7 @@ def test_zero_density():
     assert light(vacuum) == pytest.approx(B + LE * length[:, None], rel=8 * EPS, abs=4e-6)
 
 
+@pytest.mark.slow_for("1e-08")
 @pytest.mark.parametrize("tau", [1e-8, 1e-3, 1.0, 1e3, 1e6])
 def test_gradients_are_finite_at_any_optical_depth(tau):
     """Cells of an optical depth from 1e-8 to 1e6, empty ones between them: no NaN, no infinity, and C between its sources.

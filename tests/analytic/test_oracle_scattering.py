@@ -153,6 +153,7 @@ EMITTERS = {
 }
 
 
+@pytest.mark.slow_for("False-sky", "True-sky")
 @pytest.mark.parametrize("name", EMITTERS)
 @pytest.mark.parametrize("empty", [False, True])
 def test_gradient_is_the_difference(name, empty):
@@ -205,6 +206,7 @@ JUDGED = {
 }
 
 
+@pytest.mark.slow_for("point, grid, hg")
 @pytest.mark.statistical
 @pytest.mark.parametrize("name", small.cases(JUDGED, [name for name in JUDGED if name != "point, grid, hg"]))
 def test_twins_against_volpath(variant_rgb, name):

@@ -16,6 +16,7 @@ from mivol.transport.line_integrals.radiance_source import exact
 from mivol.transport.traversal.occupied_cells import Cells
 
 
+@pytest.mark.slow_for("none")
 @pytest.mark.parametrize("activation", ACTIVATIONS)
 def test_agrees_with_the_twin(variant_rgb: str, activation: str) -> None:
     density, sh = make()
@@ -96,6 +97,7 @@ def test_fourth_order_and_ten_times_nearer_than_midpoints(variant_rgb: str) -> N
     assert all(m > 10 * max(e, 2e-7) for e, m in zip(errors[2:], midpoints[2:], strict=True))
 
 
+@pytest.mark.slow_for("1e-08")
 @pytest.mark.parametrize("tau", [1e-8, 1e-4, 1.0, 87.0, 1e4, 1e6])
 def test_constant_colour_and_no_nan_at_any_depth(variant_rgb: str, tau: float) -> None:
     density, sh = make(basis=1)

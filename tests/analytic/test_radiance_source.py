@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import mitsuba as mi
 import numpy as np
+import pytest
 from radiance_rays import CUBE, TO_WORLD, make, rays_of, see
 
 from mivol.fields.spherical import SphericalGrid
@@ -44,6 +45,7 @@ def test_pinhole_derivatives_are_those_of_what_a_pinhole_sees(variant_rgb: str) 
         assert abs((ends[1] - ends[0]) / (2 * step) - expected) <= 5e-3 * expected
 
 
+@pytest.mark.slow
 def test_a_pinhole_table_converges_to_exact_directions(variant_rgb: str) -> None:
     pinhole = np.array([2.5, 1.5, 2.0])
     differences = []

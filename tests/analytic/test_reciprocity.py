@@ -29,6 +29,7 @@ def swapped(shape: dict, looks: list[float], travels: list[float], depth: int) -
     return Estimate.of(Moments.of(np.array(means)[:, None]))
 
 
+@pytest.mark.slow
 @pytest.mark.statistical
 @pytest.mark.parametrize("depth", [2, -1])
 def test_camera_and_emitter_change_places(variant_rgb: str, depth: int) -> None:

@@ -60,6 +60,7 @@ def test_homogeneous(emitters, sigma_t):
 SCATTERERS = {"numbers": (0.4, 0.9), "grids": ("grid", "grid"), "haze": (0.4, "grid"), "soot": ("grid", 0.5)}
 
 
+@pytest.mark.slow_for("grids", "haze", "soot")
 @pytest.mark.parametrize("name", SCATTERERS)
 def test_absorption_beside_scattering(name):
     """What turns is sigma_s; a constant fills its box around the grid, too."""
@@ -79,6 +80,7 @@ def test_absorption_beside_scattering(name):
 FAINT = 1e-7
 
 
+@pytest.mark.slow_for("smoke")
 @pytest.mark.parametrize("name", ["fog", "smoke"])
 def test_a_floor_is_seen_through_dark_smoke(name):
     """reflectance / pi irradiance T^2, straight down and straight back: 1.2 optical depths each way. Smoke of no albedo at all
@@ -98,6 +100,7 @@ def test_two_renders_are_the_same():
     assert np.array_equal(image(seen), image(seen))
 
 
+@pytest.mark.slow
 def test_gradients_are_drawn():
     """A deterministic image has the derivative of the image that is drawn: the same integrator makes it."""
     box, _ = smoke(rough_grid(1))

@@ -48,6 +48,7 @@ EMITTERS = {
 PHASES = {"isotropic": ("isotropic", 0.0), "hg": ("hg", 0.6), "backward": ("hg", -0.4), "rayleigh": ("rayleigh", 0.0)}
 
 
+@pytest.mark.slow_for("point outside-own", "spot inside-own", "spot outside-own", "three-own", "three-stock")
 @pytest.mark.statistical
 @pytest.mark.parametrize(
     ("emitters", "kind"),
@@ -61,6 +62,7 @@ def test_grid_and_emitters(emitters, kind):
     check({"smoke": box}, [m], EMITTERS[emitters](), *aimed(1))
 
 
+@pytest.mark.slow_for("hg")
 @pytest.mark.statistical
 @pytest.mark.parametrize("name", small.cases(PHASES, ["isotropic", "backward"]))
 def test_phase_functions(name):
@@ -87,6 +89,7 @@ def test_frames(name):
     check({"smoke": box}, [m], [point(middle + size * np.array([1.0, 3, 2]))], as_float32(middle + size * o), d)
 
 
+@pytest.mark.slow_for("stock")
 @pytest.mark.statistical
 @pytest.mark.parametrize("kind", small.KINDS)
 def test_albedo_grid(kind):
@@ -191,6 +194,7 @@ def test_thin_limit(name):
     assert_precise(m, 0.01 * answer)
 
 
+@pytest.mark.slow_for("grid-0.6-0.9")
 @pytest.mark.statistical
 @pytest.mark.parametrize(("mu", "mu0"), [(0.6, 0.9), (0.9, 0.6), (0.7, 0.7), (1.0, 1.0)])
 @pytest.mark.parametrize("kind", ["homogeneous", "grid"])
@@ -217,6 +221,7 @@ def test_collimated_slab(mu, mu0, kind):
     assert_precise(m, 0.01 * truth)
 
 
+@pytest.mark.slow_for("grid")
 @pytest.mark.statistical
 @pytest.mark.parametrize("kind", ["homogeneous", "grid"])
 def test_cube_lit_from_above_seen_from_the_side(kind):

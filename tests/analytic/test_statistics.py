@@ -82,6 +82,7 @@ def test_false_alarms_of_known_variance(seed):
     assert_rate(hits, runs, 0.05)
 
 
+@pytest.mark.slow_for("0-4")
 @pytest.mark.statistical
 @pytest.mark.parametrize("n", [4, 12])
 def test_false_alarms_of_estimated_variance(seed, n):

@@ -45,6 +45,7 @@ def test_means_are_those_of_blocks(geometry: ConeBeam | ParallelBeam) -> None:
     assert np.array_equal(voxel_means(expected, GRID.shape), expected)
 
 
+@pytest.mark.slow
 def test_edges_do_not_ripple_in_finer_unknowns(variant_rgb: str) -> None:
     """The head from exact chords, 24^3 voxels of 60 views, from FDK: after 16 iterations the voxels' own error is past its
     least value, by a third and more; the means of halves have a lower one, and keep it to a tenth."""

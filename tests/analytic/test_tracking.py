@@ -90,6 +90,7 @@ def assert_means(found: np.ndarray, T: np.ndarray, variance: np.ndarray, count: 
     assert_within(found - T, bound(variance, count) + 1e-6, chance=chance, what="transmittances")
 
 
+@pytest.mark.slow_for("rgb")
 @pytest.mark.statistical
 @pytest.mark.parametrize("name", cases(FIELDS, ["empty", "one voxel", "a sheet of voxels", "one dense voxel", "tau 1e-3"]))
 def test_estimates_have_the_exact_mean(name):

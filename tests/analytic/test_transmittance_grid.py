@@ -31,6 +31,7 @@ def open_direct(scene: mi.Scene):
     return build_estimators(scene, needs, make_plan(needs, settings), settings, survey, pictures=True).direct
 
 
+@pytest.mark.slow
 def test_light_grid_against_exact_shadows():
     """tau between nodes is wrong by h^2: two nodes a cell leave a quarter of the error of one node in two cells, or less."""
     box, _ = smoke(rough_grid(1, shape=(16, 16, 16)))

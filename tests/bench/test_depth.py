@@ -19,6 +19,7 @@ ROUNDING = 5e-4
 """Of a table of three digits."""
 
 
+@pytest.mark.slow
 @pytest.mark.statistical
 @pytest.mark.parametrize("light", ["constant", "collimated"])
 def test_a_cell_is_measured_again(variant_rgb: str, light: str, seed: int) -> None:
@@ -52,6 +53,7 @@ def test_the_table_is_printed_as_the_module_holds_it() -> None:
     assert "\n".join(bench.table_lines(cells)) in Path(depth_two.__file__).read_text()
 
 
+@pytest.mark.slow
 def test_a_table_that_is_off_is_seen(tmp_path: Path) -> None:
     """Cells that are the table meet their bars and are drawn; one that is off by six of its standard errors does not."""
     size = replace(bench.QUICK, taus=TAUS)

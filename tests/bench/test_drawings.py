@@ -39,6 +39,7 @@ def contest(names: dict, stocks: tuple[str, ...]) -> dict:
     return answer
 
 
+@pytest.mark.slow
 def test_single_scattering(monkeypatch: pytest.MonkeyPatch, record: bool) -> None:
     answer = contest(single_scattering.LIGHTS, single_scattering.STOCK)
     figure = drawn(single_scattering, monkeypatch, {"smoke": answer, "cloud": answer}, Path())

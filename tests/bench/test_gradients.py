@@ -78,6 +78,7 @@ def test_density_0_tells_a_biased_estimator_from_ours(variant_rgb: str) -> None:
     assert row[OURS]["spp"] == 64
 
 
+@pytest.mark.slow
 def test_gradients_of_a_mean_and_of_a_loss(variant_rgb: str) -> None:
     """Against the picture less 3, the derivative of the squared difference is 6 times that of the mean. The sum over voxels is
     known to a few percent by 64 samples of 16 pixels, and its seeds are fixed: 4 to 8 tells it from 1, 3 and 12."""
@@ -221,6 +222,7 @@ def test_the_tutorials_cameras_stand_on_half_a_circle(variant_rgb: str) -> None:
         assert tuple(sensor.film().size()) == (4, 4)
 
 
+@pytest.mark.slow
 def test_the_tutorials_loop_follows_its_references(variant_rgb: str) -> None:
     """Matter takes more of the constant light than it scatters: a first step of Adam, of its rate, thins the smoke where the
     reference is brighter and thickens it where that is darker."""

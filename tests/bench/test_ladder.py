@@ -128,6 +128,7 @@ def test_all_rungs_are_climbed_in_the_smoke(monkeypatch: pytest.MonkeyPatch) -> 
     assert said == [f"  {name}: {rung.depth}" for name, rung in RUNGS.items()]
 
 
+@pytest.mark.slow
 def test_a_figure_of_four_rungs(monkeypatch: pytest.MonkeyPatch, record: bool) -> None:
     """Pictures up to their brightest hundredth, and errors of both methods where there are two."""
     rows = lambda k: [{"seconds_median": t, "relative_error": k / t} for t in (0.5, 2.0)]  # noqa: E731

@@ -13,6 +13,7 @@ from mivol.bench.studies.media_light import BARS, BENCH, QUICK, media_scene, uns
 TINY = replace(QUICK, most_pixels=6, rounds=2, budget=Budget(spp=2))
 
 
+@pytest.mark.slow
 def test_what_counts_does_not_see_the_medium(variant_rgb: str) -> None:
     """A fire is in the middle of its picture; a room is seen everywhere, and all of it counts."""
     dark = unseen(media_scene("fire", 12))

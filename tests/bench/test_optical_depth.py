@@ -69,6 +69,7 @@ def test_bars_are_found_in_the_answers_that_they_judge(variant_rgb: str) -> None
         assert [bar["figure"] for bar in BENCH.compare(name, answer)] == [p.figure for p in PROMISES if p.question == name]
 
 
+@pytest.mark.slow
 def test_error_of_optical_depths(variant_rgb: str) -> None:
     """It is rounding, the same on every machine, so the bar decides; empty rays have an optical depth of 0 exactly."""
     answer = measure_accuracy(TINY)
@@ -84,6 +85,7 @@ def test_memory_of_a_gradient_step(variant_rgb: str) -> None:
     assert bar["met"], bar
 
 
+@pytest.mark.slow
 def test_exact_peers_are_exact_and_marching_is_of_second_order(variant_rgb: str, tmp_path) -> None:
     """A peer that computes something else would make every ratio of times meaningless."""
     peers = measure_peers(TINY)
@@ -116,6 +118,7 @@ def test_random_peers_have_the_exact_mean(variant_rgb: str, seed: int) -> None:
         assert_same_bounded_mean(mean, side * side * spp, truth.mean(), what=name)
 
 
+@pytest.mark.slow
 def test_walks_count_what_they_cross(variant_rgb: str) -> None:
     """Where most blocks are empty most cells are not visited: a jump over a block is a step that visits none. The counts do
     not depend on the order of rays."""
@@ -277,6 +280,7 @@ def test_the_walk_is_asked_in_two_orders(variant_rgb: str, monkeypatch: pytest.M
     assert answer == {"grid": "grid", "rays": 9, "share_of_rays_in_the_box": 0.25} | reports
 
 
+@pytest.mark.slow
 def test_a_gradient_of_a_render_takes_turns_with_the_render(variant_rgb: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """The step derives the mean of the picture by the voxels, anew in each call."""
     caught = {}

@@ -156,6 +156,7 @@ def test_clouds_are_drawn_in_turns_with_the_walk(monkeypatch: pytest.MonkeyPatch
         assert found[name] == paces(seconds[name], seconds[name]).report(pixels, "pixels") | scaled
 
 
+@pytest.mark.slow_for("2-3")
 @pytest.mark.parametrize(("rounds", "times"), [(2, 3), (9, 4)])
 def test_what_is_said_of_the_peer(
     variant_rgb: str, monkeypatch: pytest.MonkeyPatch, drawings: list, rounds: int, times: int
@@ -210,6 +211,7 @@ def test_the_peer_is_told_the_same_cloud(variant_rgb: str, monkeypatch: pytest.M
     assert (parts["type"], held["type"]) == ("scene", "ellipsoids")
 
 
+@pytest.mark.slow
 def test_what_is_said_of_rays(variant_rgb: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """What both show, and the rate of what is hidden; a walk of 10,000 rays in 0.4 ms has the pace that is scaled to."""
     results = {"mivol": np.full((4, 4, 3), 0.25), "volprim_rf_basic": np.full((4, 4, 4), 0.5)}

@@ -121,7 +121,7 @@ def test_scripts_only_call_their_module(script: str, capsys: pytest.CaptureFixtu
     text = (ROOT / "scripts" / f"{script}.py").read_text()
     assert text.startswith(f'#!/usr/bin/env python3\n"""{module.__doc__.splitlines()[0]}')
     assert text.endswith(
-        f'import sys\n\nfrom mivol.bench.studies.{BENCHES[script]} import main\n\n'
+        f"import sys\n\nfrom mivol.bench.studies.{BENCHES[script]} import main\n\n"
         'if __name__ == "__main__":\n    sys.exit(main())\n'
     )
     monkeypatch.setattr(sys, "argv", [f"scripts/{script}.py"])
@@ -133,6 +133,7 @@ def test_scripts_only_call_their_module(script: str, capsys: pytest.CaptureFixtu
     assert module.__doc__.splitlines()[0] in printed
 
 
+@pytest.mark.slow
 def test_a_script_runs() -> None:
     """One of them as a process, in the environment of the tests: its exit code is main's."""
     command = [sys.executable, str(ROOT / "scripts" / "storage.py"), "--runs", str(ROOT / "nowhere")]

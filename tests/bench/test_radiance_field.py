@@ -28,6 +28,7 @@ from mivol.transport.line_integrals.radiance_source import bake
 TINY = replace(QUICK, resolution=8, side=16, steps=EVERY, fit_resolution=8, fit_side=16, chair_steps=8, fields=("fog",))
 
 
+@pytest.mark.slow
 def test_the_peer_sees_the_same_and_derives_the_same(variant_rgb: str) -> None:
     field, _ = FIELDS["fog"](QUICK)
     density, sh = field.to_dense()
@@ -60,6 +61,7 @@ def test_the_peer_takes_a_step_for_each_cell(variant_rgb: str) -> None:
     np.testing.assert_allclose(np.array(seen), 0.6 * (1 - np.exp(-2.0)), rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_rays_without_pinholes_have_the_same_derivatives(variant_rgb: str) -> None:
     """Where nothing depends on the direction, harmonics of a direction and those that are baked for a pinhole are the same."""
     density = np.random.default_rng(1).random((5, 6, 4)).astype(np.float32)
@@ -171,6 +173,7 @@ def test_pixels_are_drawn_anywhere(variant_rgb: str) -> None:
     assert np.median(steps[0]) > 3 * np.median(steps[1])
 
 
+@pytest.mark.slow
 def test_memory_a_ray(variant_rgb: str) -> None:
     (bar,) = BENCH.compare("memory", ask_memory(replace(TINY, fields=("shell",), side=64)))
     assert bar["met"], bar
@@ -296,6 +299,7 @@ def test_a_stage_of_the_peer_has_twice_the_resolution(variant_rgb: str) -> None:
     assert (refined.density.shape, refined.harmonics.shape) == ((8, 8, 8, 1), (8, 8, 8, 27))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("target", [2.0, -2.0])
 def test_a_step_of_the_peer_goes_to_its_target(variant_rgb: str, target: float) -> None:
     """It gets brighter where the target is, and darker where that is."""
@@ -317,6 +321,7 @@ def test_a_fit_is_as_good_as_the_peers_best(monkeypatch: pytest.MonkeyPatch, our
     assert (found["peer_psnr"], found["ratio"], found["field"]) == (24.0, ratio, "made")
 
 
+@pytest.mark.slow
 def test_the_peer_takes_one_view_after_the_other(variant_rgb: str, monkeypatch: pytest.MonkeyPatch) -> None:
     seen = []
 

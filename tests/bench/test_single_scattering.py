@@ -59,6 +59,7 @@ def test_renderers_agree_in_a_sky(variant_rgb: str, tmp_path, monkeypatch: pytes
     assert (tmp_path / "bench_single_scattering.png").read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", bench.LIGHTS)
 def test_every_light_lights_the_medium(variant_rgb: str, name: str) -> None:
     scene = mi.load_dict(box_scene(fog(), 8, bench.ALBEDO, **bench.LIGHTS[name].parts()))
@@ -104,6 +105,7 @@ def test_equal_error_weighs_variance_and_time() -> None:
     assert got["variance_x_time_median_over_pixels"] == pytest.approx(12)
 
 
+@pytest.mark.slow
 def test_pixels_at_the_emitter_do_not_count(variant_rgb: str) -> None:
     """The brightest pixel of a thin fog is at the emitter; it and its neighbours are left out, no others."""
     light = bench.LIGHTS["point light inside"]

@@ -28,6 +28,7 @@ def still_life() -> ModuleType:
     return module
 
 
+@pytest.mark.slow
 def test_photographs_of_the_still_life(still_life, variant_rgb, tmp_path):
     """The metal cube's upper face changes with the view, the matt one's does not; each is where the camera says.
 
@@ -65,6 +66,7 @@ def test_the_box_holds_all_of_the_still_life(still_life, variant_rgb, tmp_path):
     assert (high <= still_life.BOX[1] + 1e-6).all()
 
 
+@pytest.mark.slow
 def test_what_is_there_is_not_rendered_again(still_life, variant_rgb, tmp_path, monkeypatch):
     """The same set is left alone; with other samples, or half done, it is made anew. Pictures are grey by their samples."""
     monkeypatch.setattr(mi, "render", lambda scene, sensor, spp, seed: np.full((24, 24, 4), spp / 16, np.float32))

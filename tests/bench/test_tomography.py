@@ -24,6 +24,7 @@ def head(request: pytest.FixtureRequest) -> bench.Scan:
     return bench.scan_of_head("yu-ye-wang", 16, 24)
 
 
+@pytest.mark.slow
 def test_every_method_nears_the_truth(variant_rgb: str, head: bench.Scan) -> None:
     """The error of each falls below that of 0, which is 1, within four iterations, and its volume has that error."""
     curves, volumes = bench.reconstruct(head, 4)
@@ -69,6 +70,7 @@ def test_a_volume_is_projected_at_twice_the_resolution(variant_rgb: str, tmp_pat
     assert scan.y.max() > 1
 
 
+@pytest.mark.slow
 def test_main_writes_what_it_prints(
     variant_rgb: str, tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -11,6 +11,7 @@ from mivol import doctor, llvm
 OLD = Path("/usr/lib/x86_64-linux-gnu/libLLVM-15.so.1")
 
 
+@pytest.mark.slow
 def test_report_of_this_machine(capsys: pytest.CaptureFixture[str]) -> None:
     """The suite runs here, so a render works here."""
     assert doctor.main([]) == 0

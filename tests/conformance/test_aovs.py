@@ -121,6 +121,9 @@ SCENES = {
 }
 
 
+@pytest.mark.slow_for(
+    "grid and constant-False", "grid in a ball-False", "rgb-False", "two boxes, the near one last, and balls-False"
+)
 @pytest.mark.parametrize("walled", [False, True])
 @pytest.mark.parametrize("name", SCENES)
 def test_depth_and_alpha_against_the_twin(name, walled):
@@ -264,6 +267,7 @@ def kernels(aovs, backward=False):
         return "".join(k["ir"].getvalue() for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT)
 
 
+@pytest.mark.slow_for("True-expected1")
 @pytest.mark.parametrize(("backward", "expected"), [(False, (1, 2, 3)), (True, (2, 4, 7))])
 def test_nothing_runs_that_was_not_asked_for(backward, expected, monkeypatch):
     # Walks are the loops of this scene. Without AOVs there is the radiance's, and its replay; tau and alpha share one, and its

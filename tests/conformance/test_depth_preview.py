@@ -47,6 +47,7 @@ def test_the_smallest_depth_below_the_noise_is_enough() -> None:
 FOGS = [(1.0, 0.0, 1e-6, 2), (0.02, 0.5, 0.01, 2), (5.0, 0.95, 0.02, -1)]
 
 
+@pytest.mark.slow_for("0.02-0.5-0.01-2")
 @pytest.mark.parametrize(("sigma", "albedo", "noise", "depth"), FOGS)
 def test_fog_needs_the_depth_it_is_known_to_need(variant_rgb, sigma: float, albedo: float, noise: float, depth: int) -> None:
     """Fog that does not scatter, thin fog (what scatters twice is below albedo^2 tau^2 = 4e-4), and fog as dense as a cloud."""

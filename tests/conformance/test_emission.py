@@ -52,6 +52,7 @@ EPS = 2.0**-23
 # -- One medium --------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow_for("stretched-gridvolume")
 @pytest.mark.parametrize("kind", ["mivol_voxels", "gridvolume"])
 @pytest.mark.parametrize("frame", ["stretched", pytest.param("sheared", marks=pytest.mark.slow)])
 def test_grids_in_any_frame(kind, frame):
@@ -73,6 +74,7 @@ def test_light_on_other_cells_than_the_extinction():
     assert np.abs(light(seen) - twins.cell_radiance(m, seen.o, seen.d, B)).max() <= 4e-6
 
 
+@pytest.mark.slow_for("gridvolume")
 @pytest.mark.parametrize("kind", ["mivol_voxels", "gridvolume"])
 def test_light_is_vacuum_outside_its_grid(kind):
     """In a larger boundary of constant extinction: a stock grid would repeat its border for ever."""
@@ -190,6 +192,7 @@ def test_a_ball_within_a_box():
     assert np.abs(light(seen) - truth).max() <= 2e-5
 
 
+@pytest.mark.slow_for("box")
 @pytest.mark.parametrize("boundary", ["box", pytest.param("ball", marks=pytest.mark.slow)])
 def test_an_opaque_surface_occludes_and_is_seen_through(boundary):
     """An emitter in the field: what is behind it is hidden, what is before it dims it and shines over it."""
@@ -303,6 +306,7 @@ def test_emission_density_in_other_cells_is_refused():
     assert np.isfinite(shoot(picture(interior(twins.Medium(0.5, 0.0, (rough(2, 0, 1, 3), PLACE)))))).all()
 
 
+@pytest.mark.slow_for("mivol_voxels")
 @pytest.mark.parametrize("kind", ["mivol_voxels", "gridvolume"])
 def test_an_albedo_alone_brings_the_cells(kind):
     """Nothing else is a grid: the same light as through an extinction of the same values on the albedo's own cells."""
@@ -330,6 +334,7 @@ def test_an_albedo_that_varies_within_the_cells_is_refused():
     assert np.isfinite(shoot(picture(interior(twins.Medium(sigma, 0.0, 0.0, albedo))))).all()
 
 
+@pytest.mark.slow_for("gridvolume")
 @pytest.mark.parametrize("kind", ["mivol_voxels", "gridvolume"])
 def test_a_source_that_varies_within_the_cells_is_refused(kind):
     """Two points of a cell would miss it: 16^3 voxels of noise in an extinction of 2^3 are seen with an error of 8 %."""

@@ -24,6 +24,7 @@ from mivol.transport.estimators.lighting.emitters import SceneEmitters
 pytestmark = pytest.mark.usefixtures("variant_rgb")
 
 
+@pytest.mark.slow_for("envmap", "several")
 @pytest.mark.statistical
 @pytest.mark.parametrize(
     # Several have a constant sky, a point, a sun and an area among them.

@@ -54,6 +54,7 @@ def numbers(rows: list[mi.Float]) -> np.ndarray:
     return np.array([np.broadcast_to(np.array(row, np.float64), RAYS) for row in rows])
 
 
+@pytest.mark.slow_for("an rgb grid")
 @pytest.mark.parametrize("name", [name for name in KINDS if "relu" not in name])
 def test_an_optical_depth_is_the_sum_of_the_values_on_its_way(name: str) -> None:
     part, (ray, t0, t1), n = KINDS[name](), rays(), 4000

@@ -283,6 +283,7 @@ def test_ras_and_lps_agree(tmp_path: Path) -> None:
 # -- VTK ------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow_for("ascii-lzma", "base64-lzma", "inline-lzma")
 @pytest.mark.parametrize("compressor", [None, "zlib", "lzma"])
 @pytest.mark.parametrize("mode", ["ascii", "inline", "base64", "raw"])
 def test_vti_by_hand(tmp_path: Path, compressor: str | None, mode: str) -> None:
@@ -597,6 +598,7 @@ else:
 """
 
 
+@pytest.mark.slow_for(".exr", ".npz", ".nrrd", ".png", ".vol")
 @pytest.mark.skipif(sys.platform == "win32", reason="needs the resource module of POSIX")
 @pytest.mark.parametrize("suffix", [".vol", ".npy", ".npz", ".nrrd", ".exr", ".png"])
 def test_every_writer_notices_that_the_system_stops_it(tmp_path: Path, suffix: str) -> None:
@@ -628,6 +630,7 @@ REAL = {
 }
 
 
+@pytest.mark.slow_for("ct_mri/bonsai.vti")
 @pytest.mark.parametrize("name", REAL)
 def test_real_volume(data_dir: Path, name: str) -> None:
     """Ranges and spacings are quoted with 4 to 5 digits."""

@@ -71,6 +71,7 @@ CAMERAS = {
 }
 
 
+@pytest.mark.slow_for("crop", "luminance", "thin lens")
 @pytest.mark.statistical
 @pytest.mark.parametrize(
     "name", cases(CAMERAS, ["perspective", "gaussian filter", "lanczos filter", "orthographic", "rgba", "border"])

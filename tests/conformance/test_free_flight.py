@@ -101,6 +101,7 @@ def half_space(albedo: float) -> mi.Scene:
     return mi.load_dict({"type": "scene", **parts})
 
 
+@pytest.mark.slow_for("0.5")
 @pytest.mark.statistical
 @pytest.mark.parametrize(
     "albedo", [0.5, 0.9, pytest.param(0.99, marks=pytest.mark.slow), pytest.param(0.999, marks=pytest.mark.slow)]
@@ -137,6 +138,7 @@ def test_slab_of_van_de_hulst(behind, truth):
 # -- One scattering, against the twin -----------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow_for("grid", "rgb")
 @pytest.mark.statistical
 @pytest.mark.parametrize("kind", ["grid", "fog", "rgb"])
 def test_one_scattering_is_that_of_the_twin(flies, kind):

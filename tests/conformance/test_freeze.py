@@ -40,6 +40,7 @@ def times(values: np.ndarray, factor: float) -> mi.TensorXf:
     return grid
 
 
+@pytest.mark.slow_for("heterogeneous-True-3", "mivol_medium-True-3")
 @pytest.mark.parametrize("depth", [1, 3])
 @pytest.mark.parametrize("floor", [False, True])
 @pytest.mark.parametrize("kind", ["heterogeneous", "mivol_medium"])
@@ -66,6 +67,7 @@ def test_values_that_change_between_calls(kind, floor, depth):
     assert frozen.n_recordings < 6
 
 
+@pytest.mark.slow_for("heterogeneous")
 @pytest.mark.parametrize("kind", ["heterogeneous", "mivol_medium"])
 def test_light_that_scatters_many_times(kind):
     """The majorants of a grid are made in the recording, also of an array that an ordinary render has read before."""

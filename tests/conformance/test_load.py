@@ -143,6 +143,7 @@ def test_variants_are_checked():
         mi.set_variant("llvm_ad_rgb")
 
 
+@pytest.mark.slow
 def test_exr_is_read_with_one_thread(two_threads, tmp_path):
     """Mitsuba 3.9.1 waits for ever for a second thread of the pool (also with taskset); in a child that can be killed, after
     ten minutes: it takes a second, and a hang has no end."""
@@ -220,6 +221,7 @@ def test_hash_of_an_object(variant_rgb):
     assert load_scene(scene).content_hash != start
 
 
+@pytest.mark.slow
 def test_hash_is_the_same_in_another_process(variant_rgb, xml):
     """Nothing in it depends on addresses, on the seed of Python's own hash, or on the order of a set."""
     code = (

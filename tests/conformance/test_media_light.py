@@ -70,6 +70,7 @@ def test_no_light_passes_a_roof() -> None:
     assert not under.any() and above.all()
 
 
+@pytest.mark.slow
 @pytest.mark.statistical
 def test_isothermal_furnace() -> None:
     """What absorbs and glows like its surroundings cannot be seen, nor can a white wall in it."""
@@ -90,6 +91,7 @@ def _cases() -> list:
     ]
 
 
+@pytest.mark.slow_for("over a floor-3")
 @pytest.mark.statistical
 @pytest.mark.parametrize(("name", "depth"), _cases())
 def test_draws_keep_the_mean(name: str, depth: int) -> None:
@@ -157,6 +159,7 @@ def test_the_gain_is_of_variances_or_of_what_chance_has_missed() -> None:
     assert gain_of_draws(np.zeros((2, 4)), np.zeros((2, 4))) == 0.0
 
 
+@pytest.mark.slow
 def test_draws_do_not_pay_where_other_light_has_the_noise() -> None:
     """A lamp in the fog: the prediction knows of the fire only, the preview is asked, once."""
     lamp = {"type": "spot", "to_world": mi.ScalarTransform4f().look_at([1, 1, 2], [0, 0, 0], [0, 0, 1]), "intensity": 900.0}
@@ -172,6 +175,7 @@ def test_draws_do_not_pay_where_other_light_has_the_noise() -> None:
         assert measure_draws(scene, sensor, needs, survey, settings).media_light.gain == 7.0
 
 
+@pytest.mark.slow
 def test_a_render_asks_the_preview() -> None:
     """Where draws are predicted to pay, and nowhere else."""
     for scene, asked in ((seen("over a floor", 4), True), (room(), False)):
@@ -187,6 +191,7 @@ def test_explain_says_how_light_of_media_is_found() -> None:
     assert "light of media" not in explain(seen("over a floor"), 1)
 
 
+@pytest.mark.slow
 def test_what_is_not_asked_for_is_not_read() -> None:
     """At depth 1, where nothing scatters, and where light is to be met by chance."""
     lonely = close_up({"fire": box_of(burning(), PLACE)}, res=4)
@@ -218,6 +223,7 @@ def test_the_table_follows_the_medium(variant_rgb: str) -> None:
     assert second.gain == pytest.approx(again.gain, rel=rtol, abs=0)
 
 
+@pytest.mark.slow
 def test_what_cannot_be_drawn_is_refused_or_met() -> None:
     """An unknown word; a medium around the camera, which fills no shape; a recording."""
     with refused("media_light is 'sampled'; auto, drawn or met is expected"):

@@ -160,6 +160,7 @@ def image_and_derivatives(scene: mi.Scene, values: np.ndarray, more: dict) -> li
     return [np.array(image), gradient, np.array(dr.forward_to(mi.render(scene, params, integrator=integrator, spp=4, seed=3)))]
 
 
+@pytest.mark.slow_for("grey, ours", "grey, stock", "shadows by blocks")
 @pytest.mark.parametrize("name", cases(GRIDS, ["rgb, ours", "deterministic"]))
 def test_voxels_below_0_count_as_0(name):
     """The same image, gradient and tangent as of a grid with 0 there, and a gradient to leave 0 by; told once."""

@@ -88,6 +88,7 @@ LONE = np.pad(values(), ((50, 50), (50, 50), (50, 50), (0, 0)))
 ROW = np.random.default_rng(2).uniform(0.1, 1, (1, 1, 90, 1))
 
 
+@pytest.mark.slow_for("rgb-nearest")
 @pytest.mark.parametrize("more", [{"filter_type": "nearest"}, {"wrap_mode": "repeat"}], ids=["nearest", "repeat"])
 @pytest.mark.parametrize("voxels", [values(), values(3), ROW, LONE], ids=["grey", "rgb", "a row", "few of many"])
 def test_grids_that_are_looked_up_otherwise_are_refused(voxels, more):

@@ -136,8 +136,10 @@ def chords(seen, interval):
 def test_homogeneous_box(name):
     to_world = as_float32(unmirrored(FRAMES[name]))
     size = np.linalg.norm(to_world[:3, :3] @ np.ones(3))
-    seen = see({"sky": sky(), "box": box_of(medium("homogeneous", 0.7), to_world)},
-               *aimed_rays(1, to_world[:3] @ [0.5, 0.5, 0.5, 1], size / 4, away=8))
+    seen = see(
+        {"sky": sky(), "box": box_of(medium("homogeneous", 0.7), to_world)},
+        *aimed_rays(1, to_world[:3] @ [0.5, 0.5, 0.5, 1], size / 4, away=8),
+    )
     chord = chords(seen, lambda o, d: box_interval(to_world, o, d))
     assert chord.max() > 0
     # The box is the one that Mitsuba's cube holds: its float32 matrix, found in float64.
@@ -161,6 +163,7 @@ def test_grid_in_any_frame(kind, name):
     assert_grid_is_seen(see(in_frame(kind, values, to_world), o, d), values, to_world)
 
 
+@pytest.mark.slow_for("stock")
 @pytest.mark.parametrize("kind", KINDS)
 def test_rgb_extinction(kind):
     to_world, values = as_float32(FRAMES["rotated"]), random_grid(4, 3)
@@ -212,8 +215,10 @@ def test_several_media_along_a_ray(kinds):
 def test_many_equal_media_along_a_ray(shapes):
     # Mitsuba's loader makes one object of media that are equal: each boundary must still count once. And there are more
     # of them than max_depth: boundaries are not scattering.
-    build = {"sphere": lambda fog, middle: ball_of(fog, middle, 1.0),
-             "cube": lambda fog, middle: box_of(fog, centred(2 * np.eye(3), middle))}
+    build = {
+        "sphere": lambda fog, middle: ball_of(fog, middle, 1.0),
+        "cube": lambda fog, middle: box_of(fog, centred(2 * np.eye(3), middle)),
+    }
     parts = {"sky": sky()}
     for i in range(12):
         shape = shapes.split()[i % len(shapes.split())]
@@ -315,6 +320,7 @@ def wall(height, bsdf=None, **more):
     return shape if bsdf is None else {**shape, "bsdf": bsdf}
 
 
+@pytest.mark.slow_for("-0.21-own", "-0.21-stock")
 @pytest.mark.parametrize(
     ("height", "kind"),
     cases(
@@ -426,6 +432,7 @@ def test_same_mean_as_volpath(name):
     assert_same_bounded_mean(grey.mean(), spp * grey.size, np.clip(ours[..., 0], 0, 1).mean(), what=name + ", mean")
 
 
+@pytest.mark.slow_for("own")
 @pytest.mark.statistical
 @pytest.mark.parametrize("kind", cases(KINDS, ["stock"]))
 def test_pixel_means_of_a_camera(kind):

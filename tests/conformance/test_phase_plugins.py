@@ -385,6 +385,7 @@ def test_stock_blend_does_not_number_ours(variant):
     assert mi.load_dict({"type": "mivol_mixture", **lobes}).component_count() == 2
 
 
+@pytest.mark.slow_for("mixture")
 @pytest.mark.statistical
 @pytest.mark.parametrize("name", cases(["table", "mixture", "blend"], ["table", "blend"]))
 def test_same_image_as_stock_under_volpath(name):
@@ -446,6 +447,7 @@ def foggy(phase: dict) -> mi.Scene:
     return mi.load_dict({"type": "scene", "fog": box_of(fog, np.eye(4)), "sky": sky(0.3), "emitter": emitter, "sensor": sensor})
 
 
+@pytest.mark.slow_for("table")
 @pytest.mark.parametrize("name", cases(FROZEN, ["hg", "draine", "mixture"]))
 def test_a_recording_follows_parameters(name):
     """Each call gives the image of an ordinary render, to the last bit, with fewer recordings than calls."""

@@ -78,6 +78,7 @@ def test_phase_functions(name, kind):
     same({"smoke": box_of(interior, PLACE), **emitters, "bulb": point([1.5, -1.2, 1.6], 1.5)[0]})
 
 
+@pytest.mark.slow_for("a mixture", "alone")
 @pytest.mark.statistical
 @pytest.mark.parametrize("inside", small.cases(["alone", "a blend", "a mixture"], ["a blend"]))
 def test_microflakes_in_a_sky(inside):

@@ -57,6 +57,7 @@ def test_what_mitsuba_has_no_camera_for(variant_rgb: str) -> None:
         camera_of(mi.load_dict({"type": "orthographic"}))
 
 
+@pytest.mark.slow
 def test_renders_are_photographs(variant_rgb: str, tmp_path: Path) -> None:
     """A small emitter off the middle: in each photograph the light's centre is where the camera of the file says."""
     place = np.array([0.4, -0.2, 0.3])

@@ -111,6 +111,7 @@ def test_switching_variants_in_one_process():
         assert np.array_equal(reference.setdefault(name, image), image)
 
 
+@pytest.mark.slow_for("llvm_ad_mono-import mivol; mi.set_variant('{0}')", "llvm_ad_mono-mi.set_variant('{0}'); import mivol")
 @pytest.mark.parametrize("order", ["import mivol; mi.set_variant('{0}')", "mi.set_variant('{0}'); import mivol"])
 @pytest.mark.parametrize("name", ["scalar_rgb", "llvm_ad_mono"])
 def test_import_in_any_order(order, name):
@@ -167,6 +168,7 @@ def test_vacuum_outside_the_box(variant, channels):
     assert np.all(values[np.all(np.abs(u - 0.5) < 0.4999, axis=1)] > 0.99)
 
 
+@pytest.mark.slow_for("llvm_ad_rgb-rotated")
 @pytest.mark.parametrize("frame", [pytest.param("unit", marks=pytest.mark.slow), "rotated"])
 def test_same_picture_as_gridvolume_under_stock_medium_and_volpath(variant, frame):
     # Same numbers, same random numbers, same paths: the pictures differ at most by the order of float sums in a pixel.
@@ -233,6 +235,7 @@ def test_scale_is_differentiable(variant):
     assert params.flags(key) & mi.ParamFlags.NonDifferentiable == 0
 
 
+@pytest.mark.slow_for("llvm_ad_rgb")
 def test_update_of_the_data_is_seen(variant):
     parts = {
         "smoke": box_of(medium("mivol_medium", grid_volume("mivol_voxels", grid(6))), np.eye(4)),
@@ -253,6 +256,7 @@ def test_update_of_the_data_is_seen(variant):
         assert np.array_equal(render(scene, {"type": "mivol"}, 4), expected)
 
 
+@pytest.mark.slow_for("llvm_ad_mono")
 def test_gradients_arrive_at_stock_keys(variant):
     # d image / d sigma_t of a constant grid along rays of length about 1: -T, in sum over the voxels.
     for kind, volume in (("heterogeneous", "gridvolume"), ("mivol_medium", "mivol_voxels")):
@@ -288,8 +292,10 @@ def test_medium_wants_one_pair_of_coefficients(variant, given, named):
 def test_absorption_and_scattering_are_the_same_medium(variant):
     sensor = camera([0.5, 0.4, 4], [0.5, 0.5, 0.5], 4, fov=5)
     images = []
-    for given in ({"sigma_t": grid_volume("mivol_voxels", grid(7)), "albedo": 0.0},
-                  {"sigma_a": grid_volume("mivol_voxels", grid(7)), "sigma_s": 0.0}):
+    for given in (
+        {"sigma_t": grid_volume("mivol_voxels", grid(7)), "albedo": 0.0},
+        {"sigma_a": grid_volume("mivol_voxels", grid(7)), "sigma_s": 0.0},
+    ):
         smoke = box_of({"type": "mivol_medium", **given}, np.eye(4))
         scene = mi.load_dict({"type": "scene", "smoke": smoke, "sky": sky(), "sensor": sensor})
         images.append(render(scene, {"type": "mivol"}, 16))

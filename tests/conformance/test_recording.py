@@ -32,6 +32,7 @@ def test_collections_are_put_off_for_a_while() -> None:
         gc.enable()
 
 
+@pytest.mark.slow_for("forward", "reverse")
 @pytest.mark.parametrize("way", ["picture", "reverse", "forward"])
 def test_paths_are_recorded_without_them(variant_rgb: str, monkeypatch: pytest.MonkeyPatch, way: str) -> None:
     seen, name = [], "replay_branches" if way == "reverse" else "walk_path"

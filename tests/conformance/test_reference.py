@@ -83,6 +83,7 @@ def _estimate(found: ReferenceResult) -> Estimate:
 # -- Right where the answer is known ---------------------------------------------------------------
 
 
+@pytest.mark.slow_for("volpathmis-homogeneous")
 @pytest.mark.statistical
 @pytest.mark.parametrize(
     ("integrator", "kind"),
@@ -216,6 +217,7 @@ def _fall_over() -> None:
     raise MemoryError("killed")
 
 
+@pytest.mark.slow_for("crash")
 @pytest.mark.parametrize("how", [lambda: os.kill(os.getpid(), signal.SIGINT), _fall_over], ids=["ctrl-c", "crash"])
 def test_stopped_and_continued_is_the_same(variant_rgb, ctrl_c, tmp_path, monkeypatch, how):
     """Stopped in batch 7, nothing that was finished is rendered again, and the image is that of a run that never stopped."""
@@ -253,6 +255,7 @@ def test_fetched_from_disk_and_made_better(variant_rgb, tmp_path, monkeypatch):
     assert better.spp == 512 and better.standard_error < 0.9 * made.standard_error
 
 
+@pytest.mark.slow_for("True")
 @pytest.mark.parametrize("relative", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_target(variant_rgb, tmp_path, relative):
     """Stops once the error is small enough; says so where the samples ran out first."""

@@ -23,6 +23,7 @@ from scenes import ball_of, box_of
 pytestmark = pytest.mark.usefixtures("variant_rgb")
 
 
+@pytest.mark.slow_for("ball")
 @pytest.mark.statistical
 @pytest.mark.parametrize("shape", small.cases(["box", "ball"], ["box"]))
 def test_camera_inside(shape):

@@ -47,6 +47,7 @@ MEDIA = {
 }
 
 
+@pytest.mark.slow_for("sigma_a and sigma_s")
 @pytest.mark.statistical
 @pytest.mark.parametrize("name", small.cases(MEDIA, ["ref", "equal", "ref, own"]))
 def test_the_same_picture_as_volpath(name):

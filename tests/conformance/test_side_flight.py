@@ -17,6 +17,7 @@ from mivol.transport.path.estimators import Settings
 pytestmark = pytest.mark.usefixtures("variant_rgb")
 
 
+@pytest.mark.slow_for("sun")
 @pytest.mark.statistical
 @pytest.mark.parametrize("lit", small.cases(["sun", "sky"], slow=("sky",)))
 def test_side_flights_keep_the_mean(lit, monkeypatch):

@@ -135,6 +135,7 @@ PLACES = {
 FAST_PLACES = ("turned", "two balls", "surfaces")
 
 
+@pytest.mark.slow_for("surfaces", "two balls")
 @pytest.mark.statistical
 @pytest.mark.parametrize("name", small.cases(PLACES, [name for name in PLACES if name not in FAST_PLACES]))
 def test_places(name):
@@ -194,6 +195,7 @@ def _world(unit: float) -> dict:
     }
 
 
+@pytest.mark.slow_for("0.0078125")
 @pytest.mark.parametrize("unit", [2.0**-7, 2.0**-14])
 def test_scenes_of_any_size(unit):
     """Lengths in another unit: the same image. Mitsuba starts rays 1e-4 behind a surface, whatever the scene's size."""
@@ -292,6 +294,7 @@ SPREAD = {"multijitter": 0.41, "orthogonal": 0.46, "ldsampler": 0.64}
 so few renders."""
 
 
+@pytest.mark.slow_for("multijitter")
 @pytest.mark.statistical
 @pytest.mark.parametrize("kind", small.cases(SAMPLERS, [name for name in SAMPLERS if name != "multijitter"]))
 def test_samplers(kind):
@@ -316,6 +319,7 @@ def test_samplers(kind):
         assert_same_spread(*grey, expected=SPREAD[kind], high=0.9, what=kind)
 
 
+@pytest.mark.slow_for("own")
 @pytest.mark.parametrize("kind", small.KINDS)
 def test_recordings(kind):
     """A function recorded by dr.freeze shows what an ordinary render shows, also after values have changed."""

@@ -137,6 +137,7 @@ def test_the_colour_of_a_node(variant_rgb: None) -> None:
     assert abs(loaded.eval_1(mei)[0] - max(density[3, 1, 2, 0], 0)) < 1e-5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("aov", ["tau", "depth"])
 def test_aovs_have_derivatives(aov: str, variant_rgb: None) -> None:
     """The optical depth and the mean distance are those of the extinction after the activation, forwards and backwards."""
@@ -176,6 +177,7 @@ def test_turning_the_field_turns_its_look(variant_rgb: None) -> None:
     assert np.abs(without - here).max() > 0.05
 
 
+@pytest.mark.slow
 def test_a_surface_hides_what_is_behind_it_and_is_seen_through_the_field(variant_rgb: None) -> None:
     wall = {
         "type": "rectangle",

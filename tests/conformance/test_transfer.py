@@ -57,6 +57,7 @@ def truth(values: np.ndarray, o: np.ndarray, d: np.ndarray, n: int = 20000) -> n
     return (T[:-1] * -np.expm1(-tau) * looked_up(COLOUR, s)).sum(0) + T[-1] * B
 
 
+@pytest.mark.slow
 def test_refinement_converges_to_the_model():
     """A table with kinks, of which a voxel passes one or two, classified on grids of 1, 3 and 7 nodes a voxel.
 
@@ -90,6 +91,7 @@ def test_a_table_of_nothing_departs_by_nothing():
     assert volume.mivol_transfer.departure() == 0
 
 
+@pytest.mark.slow
 def test_derivatives_by_table_and_scan():
     """Opacity and colour are optimisable, and so are the values that they are of."""
     seen, rng = view(scan(), 3), np.random.default_rng(1)

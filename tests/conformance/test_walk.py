@@ -88,6 +88,7 @@ def batches(scene: mi.Scene, kind: str, depth: int, first: int, **more: object) 
     return Moments.of(np.stack([np.array(mi.render(scene, integrator=integrator, spp=96, seed=s)) for s in seeds]))
 
 
+@pytest.mark.slow_for("glossy under a wide emitter", "mask, depth 3", "sky, no limit")
 @pytest.mark.statistical
 @pytest.mark.parametrize("name", cases(NAMES, [name for name in NAMES if name not in FAST]))
 def test_surfaces_and_emitters_like_volpath(name):

@@ -136,6 +136,7 @@ def test_a_wrong_change_of_an_example_is_refused_before_anything_is_made(
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow_for("lamp", "smoke", "white_smoke")
 @pytest.mark.parametrize("name", [name for name, example in EXAMPLES.items() if isinstance(example.stand_in, StandIn)])
 def test_a_stand_in_takes_the_place_of_public_data(tmp_path: Path, name: str) -> None:
     """Where the data is not there the settings name a seeded volume of its shape; where it is, they are left alone."""
@@ -175,6 +176,7 @@ def test_readings_are_made_before_an_example_that_fits_them(tmp_path: Path, monk
     assert named == tuple(str(tmp_path / "run" / "scan" / n) for n in ("panels.txt", "readings.npy", "flats.npy", "darks.npy"))
 
 
+@pytest.mark.slow
 def test_an_example_of_a_public_scan_runs_without_it(variant_rgb: str, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     """Computed projections take the place of measured ones, which is said; the slices are found all the same."""
     short = ["--set", "scan.detector=[2,48]", "--set", "scan.pitch=0.041666667", "--set", "scan.views=45"]

@@ -176,6 +176,7 @@ def test_the_example_is_one_of_gaussians() -> None:
     assert make_gaussian_plan(chosen) == PRESETS["minute"]
 
 
+@pytest.mark.slow_for('gaussians.preset="minut"-gaussians.preset = "minut" is unknown: did you mean "minute"')
 @pytest.mark.parametrize(
     ("setting", "says"),
     [

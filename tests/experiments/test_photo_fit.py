@@ -95,6 +95,7 @@ def toml(folder: Path, photographs: Path, more: str = "") -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_photographs_become_a_field_and_a_page(photographs: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     """The field is as good on views that it has not seen as the ball's edge, a pixel wide, lets a grid of 24 be."""
     path = toml(tmp_path, photographs)
@@ -125,6 +126,7 @@ def test_photographs_become_a_field_and_a_page(photographs: Path, tmp_path: Path
     assert all({"loss", "held_out_psnr"} <= row.keys() for row in rows)
 
 
+@pytest.mark.slow
 def test_a_film_without_ffmpeg_is_an_animated_image(
     photographs: Path, tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:

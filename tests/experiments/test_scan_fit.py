@@ -68,6 +68,7 @@ def test_a_scan_leaves_a_whole_run_folder(variant_rgb, folder: Path) -> None:
     assert np.allclose(read_volume(folder / "run" / "volumes" / "truth.npz").to_world[:3, 3], -1)
 
 
+@pytest.mark.slow_for("ml-tr", "os-sart", "sart")
 @pytest.mark.parametrize("solver", cases(["pcg", "cgls", "sirt", "sart", "os-sart", "ml-tr"], ["pcg", "cgls", "sirt"]))
 def test_every_solver_is_reached_by_name(variant_rgb, folder: Path, solver: str) -> None:
     """And lowers the error of the volume well below that of an empty one, which is 1."""
@@ -76,6 +77,7 @@ def test_every_solver_is_reached_by_name(variant_rgb, folder: Path, solver: str)
     assert rows_of(folder)[-1]["nrmse"] < 0.75
 
 
+@pytest.mark.slow
 def test_direct_methods_are_reached_by_name(variant_rgb, folder: Path) -> None:
     """FDK of 15 views, smoothed, is well below an empty volume; it ends after its one step, and has nothing to resume."""
     changes = ["--set", "solve.name=fdk", "--set", "solve.window=hann"]
@@ -89,6 +91,7 @@ def test_direct_methods_are_reached_by_name(variant_rgb, folder: Path) -> None:
     assert "feldkamp_1984" in record["citations"]
 
 
+@pytest.mark.slow_for("ml-tr", "sirt")
 @pytest.mark.parametrize("solver", cases(["pcg", "sirt", "ml-tr"], ["pcg"]))
 def test_solvers_start_where_fdk_ends(variant_rgb, folder: Path, solver: str) -> None:
     """One iteration from FDK has a lower error than one from nothing."""
@@ -174,6 +177,7 @@ def test_more_iterations_resume_a_run_that_is_done(variant_rgb, folder: Path, ca
     assert "solve.iterations is 6 there and 3 here" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_rise_is_flagged_and_the_best_volume_kept(variant_rgb, folder: Path, capsys: pytest.CaptureFixture) -> None:
     """100 quanta a pixel are a noise of 10 %: conjugate gradients without bounds fit it after a few iterations."""
     noisy = ["data.photons=100", "solve.iterations=12", "solve.nonnegative=false"]
@@ -190,6 +194,7 @@ def test_a_rise_is_flagged_and_the_best_volume_kept(variant_rgb, folder: Path, c
     assert np.isclose(np.linalg.norm(difference) / np.linalg.norm(volumes["truth"]), errors[lowest], rtol=1e-6)
 
 
+@pytest.mark.slow_for("ml-tr", "sirt")
 @pytest.mark.parametrize("solver", cases(["pcg", "sirt", "ml-tr"], ["pcg"]))
 def test_a_solver_stops_at_the_noise(variant_rgb, folder: Path, solver: str) -> None:
     """The first residual that is at most 1.5 times the noise is the last, again after --resume, and the page says so.
@@ -210,6 +215,7 @@ def test_a_solver_stops_at_the_noise(variant_rgb, folder: Path, solver: str) -> 
     assert len(rows_of(folder)) == len(over)
 
 
+@pytest.mark.slow
 def test_a_prior_in_units_of_the_noise_says_what_it_did(variant_rgb, folder: Path) -> None:
     changes = ["data.photons=200", "solve.tv=1", "solve.delta=0.1", "solve.tv_unit=noise"]
     assert run(folder, *[part for change in changes for part in ("--set", change)]) == 0
@@ -297,6 +303,7 @@ def test_rows_are_stored_where_they_fit_and_pay(variant_rgb, folder: Path) -> No
     assert not storage_of(folder, name="fbp").is_stored
 
 
+@pytest.mark.slow
 def test_stored_rows_find_what_the_walk_finds(variant_rgb, folder: Path) -> None:
     """2e-6 a product, times 10 for each of 6 iterations of conjugate gradients; the record says which it was."""
     found = {}
@@ -314,6 +321,7 @@ def circle_table(views: int) -> np.ndarray:
     return np.hstack([panels.source, panels.corner, panels.along_u, panels.along_v])
 
 
+@pytest.mark.slow
 def test_a_table_of_views_is_the_beam_that_it_lists(variant_rgb, folder: Path) -> None:
     """Chords along the rays of the table are those of the circular cone beam, and a helix is a table like any other."""
     np.savetxt(folder / "table.txt", circle_table(18), header="source, middle, step u, step v")
@@ -330,6 +338,7 @@ def test_a_table_of_views_is_the_beam_that_it_lists(variant_rgb, folder: Path) -
     assert rows_of(folder)[-1]["nrmse"] < 0.5
 
 
+@pytest.mark.slow_for("npy", "tif")
 @pytest.mark.parametrize("kind", ["npy", "tif", "h5"])
 def test_cone_beam_data_from_files_need_no_python(variant_rgb, folder: Path, kind: str) -> None:
     """Counts with flats and darks, first row at the top, in a table's geometry: the line integrals that made the counts.

@@ -54,9 +54,7 @@ def test_optimize_leaves_a_whole_run_folder(variant_rgb, folder: Path, capsys: p
 
 
 @pytest.mark.slow
-def test_an_emissive_start_is_noted_and_not_made_again(
-    variant_rgb, folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_emissive_start_is_noted_and_not_made_again(variant_rgb, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The run begins from another volume than without it, says what was tried, and goes on from its checkpoint."""
     plain, shaped = folder / "plain", folder / "shaped"
     few = ("--set", "fit.iterations=1")
@@ -225,6 +223,7 @@ def test_a_run_that_is_done_may_be_resumed(variant_rgb, folder: Path) -> None:
     assert (folder / "run" / "metrics.jsonl").read_text() == metrics
 
 
+@pytest.mark.slow
 def test_a_stretched_schedule_is_said(variant_rgb, folder: Path) -> None:
     """A run goes on with more iterations; where the schedule knew how many there would be, the record says what that means."""
     flags = ["optimize", folder / "fit.toml", "-o", folder / "run", *PHOTOS, "--set", 'schedule={name="cosine", final=0.5}']

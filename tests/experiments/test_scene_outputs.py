@@ -22,6 +22,7 @@ from mivol.optim.scenes.scene_problem import SceneProblem
 from mivol.optim.scenes.views import FINAL, seed_of
 
 
+@pytest.mark.slow
 def test_images_that_are_compared_may_have_more_samples(variant_rgb, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Four samples in each image of the fit, 32 in what is compared with held-out views and in what is kept, of which the
     noise is found from 16 renders of two."""
@@ -88,6 +89,7 @@ def test_a_sky_that_was_found_is_an_image(variant_rgb, folder: Path) -> None:
     assert "sky.data as found" in (folder / "run" / "report.html").read_text()
 
 
+@pytest.mark.slow
 def test_volumes_lie_where_the_scene_has_them(variant_rgb, folder: Path) -> None:
     """A grid that is turned, beside another medium: its file and its priors know its own box, not that around all media.
     A .vol has no room for turned boxes and holds the unit cube. 1e-5: Mitsuba prints the place of a stock grid to 6 digits."""

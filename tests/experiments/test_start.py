@@ -28,6 +28,7 @@ def test_a_colour_is_looked_for_from_a_start_of_its_own(variant_rgb, folder: Pat
     assert "starts from 2 numbers and has 3" in refused(capsys, *flags, "--set", sought.replace(", 0.125", ""))
 
 
+@pytest.mark.slow
 def test_the_fit_does_not_start_at_the_truth(variant_rgb, folder: Path) -> None:
     """Without a start of its own the fit begins where the scene's file says, whatever the references showed: its first
     error is that of 0.25 everywhere, and not 0."""

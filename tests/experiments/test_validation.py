@@ -30,6 +30,7 @@ def scene(folder: Path) -> Path:
     return folder / "scene.xml"
 
 
+@pytest.mark.slow
 def test_mivol_agrees_with_volpath(variant_rgb, scene: Path, capsys: pytest.CaptureFixture) -> None:
     """An absorbing cube, where both are right: the seeds are fixed, and with them there is no false alarm."""
     target = scene.parent / "validation"

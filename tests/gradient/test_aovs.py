@@ -126,6 +126,7 @@ def jvp(scene: mi.Scene, integrator: mi.Integrator, v: dict[str, np.ndarray], sp
     return image[..., 3:]
 
 
+@pytest.mark.slow_for("boxes and balls", "grid and constant", "grid", "rgb", "stock", "traced grid and constant", "wall")
 @pytest.mark.parametrize("name", cases(CASES, SLOW))
 def test_forward_against_reverse(name):
     # <J v, w> = <v, J^T w>: both sides are float32 sums of the same numbers, in another order.
@@ -172,6 +173,7 @@ def test_forward_against_finite_differences(name):
 # -- One ray along a column of voxels -----------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("passes", [1, 3])
 @pytest.mark.parametrize("rfilter", ["box", "gaussian"])
 def test_through_mi_render_with_a_crop(passes, rfilter, monkeypatch):

@@ -61,6 +61,7 @@ BALL = {"type": "sphere", "center": [0.5, 0.5, 0.5], "radius": 0.9}
 """A boundary that has to be traced and holds the whole unit cube."""
 
 
+@pytest.mark.slow_for("traced-hidden behind a rise", "traced-hidden")
 @pytest.mark.parametrize("name", PROFILES)
 @pytest.mark.parametrize("boundary", [None, BALL], ids=["box", "traced"])
 def test_every_voxel_has_its_gradient(name, boundary):
@@ -77,6 +78,7 @@ def test_every_voxel_has_its_gradient(name, boundary):
     assert not name.startswith("hidden") or np.abs(got[-1]) < 1e-20
 
 
+@pytest.mark.slow_for("ball")
 @pytest.mark.parametrize("shape", ["box", "ball"])
 def test_media_hidden_behind_another(shape):
     # A homogeneous medium of optical depth 50 hides two more: d depth / d sigma = T (m' - ...) with T = e^-50. Of boxes it

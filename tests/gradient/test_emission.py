@@ -66,6 +66,7 @@ CASES = {
 SLOW = ("three channels", "stock", "constant extinction, gridded light")
 
 
+@pytest.mark.slow_for("constants in a traced ball", "one channel", "sigma_a and sigma_s")
 @pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow if n in SLOW else ()) for n in CASES])
 def test_every_coefficient(name):
     """J v = differences, and <J^T w, v> = <w, differences>, for each parameter by itself."""
@@ -87,6 +88,7 @@ def test_every_coefficient(name):
     assert abs(both - (jv * weight).sum()) <= 2e-6 * sum(np.abs(found[end] * v).sum() for end, v in along.items())
 
 
+@pytest.mark.slow_for("gridvolume")
 @pytest.mark.parametrize("kind", [pytest.param("mivol_voxels", marks=pytest.mark.slow), "gridvolume"])
 def test_a_texture_need_not_be_told(kind):
     """dr.enable_grad without params.update() leaves a texture without the derivative, which it must have all the same."""
@@ -123,6 +125,7 @@ PASSES = [
 ]
 
 
+@pytest.mark.slow_for("emission.data-3-1")
 @pytest.mark.parametrize(("end", "channels", "depth"), PASSES)
 def test_several_passes_are_one(end, channels, depth, monkeypatch):
     """A grid of three channels is padded inside its texture: its edge to the parameter can be passed but once."""
@@ -228,9 +231,7 @@ def test_no_phantom_gradient_behind_a_wall(wall, depth):
     """
     medium, bright = corridor(wall), np.full(3, 5.0)
     more = {"floor": _floor()} if depth == 3 else {}
-    seen = pencils(
-        {"box": box_of(interior(medium), CORRIDOR), "sky": colours(bright), **more}, [[-5, 0.1, 0.1]], [[1, 0, 0]]
-    )
+    seen = pencils({"box": box_of(interior(medium), CORRIDOR), "sky": colours(bright), **more}, [[-5, 0.1, 0.1]], [[1, 0, 0]])
     found = gradients(seen, ["sigma_t.data", "emission.data", "emission_density.data"], np.ones((1, 3)), max_depth=depth)
     if wall > 100:
         for g in found:

@@ -62,6 +62,7 @@ def _forward(scene: mi.Scene, key: str, v: np.ndarray | float, spp: int, seed: i
     return found
 
 
+@pytest.mark.slow_for("over a floor-sigma_t")
 @pytest.mark.parametrize(("name", "what"), CASES)
 def test_forward_is_the_transpose_of_reverse(name: str, what: str, whole_paths: None) -> None:
     """<J v, w> = <v, J^T w> of one seed: both are sums of the same terms in another order, in float32."""
@@ -81,6 +82,7 @@ def _along(scene: mi.Scene, key: str, v: np.ndarray | float, integrator: dict, s
     return Estimate.of(Moments.of(np.array(found)[:, None]))
 
 
+@pytest.mark.slow_for("over a floor-sigma_t")
 @pytest.mark.statistical
 @pytest.mark.parametrize(("name", "what"), CASES)
 def test_draws_keep_the_mean_of_derivatives(name: str, what: str) -> None:

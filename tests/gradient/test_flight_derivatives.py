@@ -44,6 +44,7 @@ def flies(monkeypatch: pytest.MonkeyPatch) -> None:
 # -- One scattering, against the twin -----------------------------------------------------------------------------------
 
 
+@pytest.mark.slow_for("empty-point", "half empty-point")
 @pytest.mark.statistical
 @pytest.mark.parametrize(
     ("density", "emitter"),
@@ -84,6 +85,7 @@ def _forward(scene: mi.Scene, key: str, v: np.ndarray, spp: int, seed: int, inte
     return found
 
 
+@pytest.mark.slow_for("0.0")
 @pytest.mark.parametrize("g", [0.0, 0.6])
 def test_a_white_furnace_has_no_derivative(g):
     """Light at the end of a flight is that of the level, and so is the light that a probe finds, sample by sample."""
@@ -125,6 +127,7 @@ PARAMETERS = {
 }
 
 
+@pytest.mark.slow_for("albedo-grey", "density-grey", "emission-grey")
 @pytest.mark.parametrize("colour", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["grey", "rgb"])
 @pytest.mark.parametrize("name", small.cases(PARAMETERS, slow=("g", "scale", "floor", "emitter")))
 def test_forward_is_the_transpose_of_reverse(name, colour, whole_paths):
@@ -309,6 +312,7 @@ def test_side_flights_keep_the_mean_of_derivatives(name, monkeypatch):
     assert_precise(difference(with_them, without), 0.1 * np.abs(without.mean), what="derivative")
 
 
+@pytest.mark.slow_for("emission-5")
 @pytest.mark.parametrize(("name", "depth"), [("emission", 5), ("emitter", 5)])
 def test_light_is_linear_in_what_emits(name, depth):
     """The derivative along an emission is the image of that emission alone, sample by sample."""

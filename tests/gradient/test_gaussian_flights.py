@@ -83,6 +83,7 @@ def test_forward_is_the_transpose_of_reverse(whole_paths: None) -> None:
     assert np.sum(there * w) == pytest.approx(terms.sum(), abs=1e-4 * size)
 
 
+@pytest.mark.slow
 def test_a_white_furnace_has_no_derivative() -> None:
     """No place, turn, size or opacity of white Gaussians is seen in light that is the same from everywhere."""
     scene = close_up(parts(1.0, sky=scenes.sky(1.0)), res=8)

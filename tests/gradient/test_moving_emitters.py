@@ -143,6 +143,13 @@ def traced_media() -> dict[str, dict]:
 TRACED = ("an egg", "a ball in its grid", "a ball around its grid", "a ball in a box")
 
 
+@pytest.mark.slow_for(
+    "a ball around its grid-emitter1",
+    "a ball in a box-emitter0",
+    "a ball in a box-emitter1",
+    "an egg-emitter0",
+    "an egg-emitter1",
+)
 @pytest.mark.parametrize("emitter", [(0.3, -0.2, 3.0), (0.05, 0.1, 0.2)])
 @pytest.mark.parametrize("name", TRACED)
 def test_place_of_an_emitter_behind_boundaries_that_are_traced(name, emitter):

@@ -74,6 +74,7 @@ def lit_smoke(density: str, emitter: tuple, kind: str = "own", albedo: float = 0
 STOCK = [("empty", "stock"), ("flat", "stock"), ("rough", "stock")]
 
 
+@pytest.mark.slow_for("empty-own", "empty-stock", "rough-own")
 @pytest.mark.statistical
 @pytest.mark.parametrize(
     ("density", "kind"),
@@ -94,6 +95,7 @@ def test_density_under_a_point_light(density, kind):
 LIT = [("rough", "point inside"), ("rough", "sun")]
 
 
+@pytest.mark.slow_for("rough-point inside", "rough-sun")
 @pytest.mark.statistical
 @pytest.mark.parametrize(
     ("density", "name"),
@@ -262,6 +264,7 @@ def test_homogeneous_extinction_and_albedo():
     scalar(parts, MEDIUM + "albedo.value.value", by_albedo, 0.7)
 
 
+@pytest.mark.slow_for("0.7-stock")
 @pytest.mark.statistical
 @pytest.mark.parametrize(
     ("albedo", "kind"),
@@ -280,6 +283,7 @@ def test_albedo(albedo, kind):
     scalar(parts, MEDIUM + "albedo.value.value", light, albedo)
 
 
+@pytest.mark.slow_for("own-0.0", "stock-1.0")
 @pytest.mark.statistical
 @pytest.mark.parametrize(
     ("kind", "top"), small.cases([(k, t) for k in small.KINDS for t in (0.0, 1.0)], [("stock", 0.0), ("own", 1.0)])
@@ -299,6 +303,7 @@ def test_albedo_grid(kind, top):
     assert_gradient(gradients(seen, MEDIUM + "albedo.data", w, 512), truth[..., None], "albedo")
 
 
+@pytest.mark.slow
 @pytest.mark.statistical
 def test_absorption_and_scattering():
     """sigma_a dims, sigma_s turns and dims; both numbers of one medium."""
@@ -340,6 +345,7 @@ def test_scattering_grid():
     assert_gradient(along, np.array([twin_difference(light, 0.0)]), "sigma_s")
 
 
+@pytest.mark.slow
 @pytest.mark.statistical
 def test_scale():
     emitter, values = EMITTER(), rough_grid(6)
@@ -434,6 +440,7 @@ def of_microflakes() -> mi.Scene:
     return small.close_up({"smoke": box, "emitter": point([1.5, 1, 2.0])[0]}, res=8)
 
 
+@pytest.mark.slow
 def test_microflakes_forward_against_reverse():
     """<J v, w> = <v, J^T w> with the same random numbers, as below."""
     scene, integrator, key = of_microflakes(), mi.load_dict(mivol()), MEDIUM + "phase_function.S.data"
@@ -444,6 +451,7 @@ def test_microflakes_forward_against_reverse():
     assert np.abs(jv).max() > 1e-4
 
 
+@pytest.mark.slow
 @pytest.mark.statistical
 @pytest.mark.parametrize("key", ["phase_function.S.data", "emitter.position"])
 def test_extinction_of_microflakes(key):
@@ -469,6 +477,7 @@ def test_extinction_of_microflakes(key):
 # -- Emitters ------------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow_for("point-intensity")
 @pytest.mark.statistical
 @pytest.mark.parametrize(
     ("name", "key"),

@@ -92,6 +92,7 @@ CASES = {
 }
 
 
+@pytest.mark.slow_for("depth 4, wide filter-4", "no limit, crop-4", "stock, depth 3, crop, wide filter-4")
 @pytest.mark.parametrize("passes", [pytest.param(1, marks=pytest.mark.slow), 4])
 @pytest.mark.parametrize("name", cases(CASES, ["depth 1", "depth 2", "rgb, depth 2", "no surface"]))
 def test_forward_against_reverse(name, passes, monkeypatch):
@@ -112,6 +113,7 @@ def test_forward_against_reverse(name, passes, monkeypatch):
     assert np.abs(jv).max() > 0.01
 
 
+@pytest.mark.slow_for("no limit, crop", "rgb, depth 2")
 @pytest.mark.parametrize("name", cases(CASES, ["depth 1", "depth 2"]))
 def test_reverse_against_finite_differences(name):
     """Central differences with common random numbers; error h^2 f'''/6 plus rounding 1e-7/h."""

@@ -56,6 +56,7 @@ def test_noise_does_not_follow_the_majorant():
     assert np.allclose(*images, rtol=1e-5, atol=0)
 
 
+@pytest.mark.slow_for("ratio1", "ratio2")
 @pytest.mark.statistical
 @pytest.mark.parametrize("ratio", [(1e-3, 1.0, 10.0), (0.0, 1.0, 2.0), (8.0, 8.0, 8e-4)])
 def test_channels_of_very_different_extinction(ratio):

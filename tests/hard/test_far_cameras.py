@@ -46,6 +46,7 @@ def half_space(name: str, sigma: float, away: float, beside: bool = False):
     return pencils(parts, np.array([0.45, 0.4, 0]) - away * VIEW, VIEW)
 
 
+@pytest.mark.slow_for("both-100000.0-30.7")
 @pytest.mark.parametrize("away", [30.7, 300.7])
 @pytest.mark.parametrize("sigma", [1e5, 1e6])
 @pytest.mark.parametrize("name", PARTS)
@@ -56,6 +57,7 @@ def test_quadrature(name, sigma, away):
     assert np.abs(found / TRUTH - 1).max() <= 1e-4
 
 
+@pytest.mark.slow_for("both-beside another", "grid-beside another")
 @pytest.mark.statistical
 @pytest.mark.parametrize("beside", [False, True], ids=["alone", "beside another"])
 @pytest.mark.parametrize("name", PARTS)
@@ -121,6 +123,7 @@ def test_paths_far_from_the_origin_of_the_world(phase):
     assert_same_mean(far, near, rounding=1e-5 * near.mean.mean(), what="rays")
 
 
+@pytest.mark.slow_for("grid")
 @pytest.mark.parametrize("name", ["homogeneous", "grid"])
 def test_derivative_of_the_extinction(name):
     """None: what is lit nearer to the face is what is dimmed behind it. Each half of it is as large as the light."""

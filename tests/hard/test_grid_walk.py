@@ -67,6 +67,7 @@ def test_in_a_coordinate_plane():
         assert_tau(values, np.eye(4), o, d)
 
 
+@pytest.mark.slow_for("-1e-45", "1e-30", "1e-38")
 @pytest.mark.parametrize("tiny", [1e-7, 1e-16, -1e-16, 1e-30, 1e-38, -1e-38, 1e-41, -1e-45])
 def test_nearly_axis_aligned(tiny):
     """Hard case 10."""
@@ -191,6 +192,7 @@ def lattice_step(n):
     return n * EPS / 2
 
 
+@pytest.mark.slow_for("filled0")
 @pytest.mark.parametrize("filled", [slice(250, 256), slice(255, 256)])
 def test_the_end_is_where_it_is_after_256_cells(filled):
     """Rationale: a wall, or the box, ends a ray in the only filled cells, after 250 empty ones.

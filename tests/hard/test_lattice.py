@@ -141,6 +141,7 @@ def test_empty_or_flat_grids_are_refused(shape):
         Lattice(mi.TensorXf(np.ones(shape, dtype=np.float32)), np.eye(4))
 
 
+@pytest.mark.slow_for("shape2", "shape4", "shape5", "shape6")
 @pytest.mark.parametrize("shape", [(1, 1, 1), (1, 1, 7), (1, 7, 1), (7, 1, 1), (1, 5, 6), (5, 1, 6), (5, 6, 1)])
 def test_single_voxels(shape):
     """Hard case 18."""

@@ -51,6 +51,7 @@ def test_any_optical_depth(power):
 # -- 13, 14, 45: where the ray begins and ends ------------------------------------------------------------------------
 
 
+@pytest.mark.slow_for("True")
 @pytest.mark.parametrize("skip", [False, True])
 def test_where_the_segment_ends(skip):
     """Hard case 14."""
@@ -103,6 +104,7 @@ def test_camera_inside_a_dense_medium(sigma):
 # -- 18, 19, 20, 22, 50: grids ----------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow_for("17")
 @pytest.mark.parametrize("n", [2, 3, 17])
 def test_checkerboard(n):
     """Hard case 19."""
@@ -187,6 +189,7 @@ def test_gradients_bitwise_with_one_thread(cpu_back_end, two_threads):
     assert np.all(np.abs(several[0] - one[0]) <= 1e-5 * one[0])
 
 
+@pytest.mark.slow_for("True")
 @pytest.mark.parametrize("skip", [False, True])
 def test_256_cubed_against_the_twin(skip):
     """Hard case 52."""

@@ -226,6 +226,7 @@ def test_a_ray_that_ends_inside_a_cell() -> None:
 # -- 4: transmittances that underflow ----------------------------------------------------------------------------------
 
 
+@pytest.mark.slow_for("3000.0")
 @pytest.mark.parametrize("most", [3e3, 1e5])
 def test_no_nan_where_transmittance_underflows(most: float) -> None:
     """A random grid 16^3, optical depths up to 190 and 6000 a step: derivatives of fields and of scenes, against the twin.
@@ -283,6 +284,7 @@ def test_a_fit_goes_on_from_an_opaque_field() -> None:
 # -- 5: colours --------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow_for("10.0-True")
 @pytest.mark.parametrize(("sh", "clamp"), [(10.0, True), (0.3, True), (-2.0, True), (-2.0, False)])
 def test_colours_keep_their_derivatives(sh: float, clamp: bool) -> None:
     """Above 1 as between 0 and 1: Y_0 alpha; below 0, where black is shown, the density still knows the background.
@@ -310,6 +312,7 @@ def test_colours_keep_their_derivatives(sh: float, clamp: bool) -> None:
 # -- 6: densities below 0 ------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow_for("exp", "softplus")
 @pytest.mark.parametrize("name", ["relu", "softplus", "exp"])
 def test_negative_densities(name: str) -> None:
     """Softplus and exp have an extinction and a derivative everywhere; a ReLU has neither below 0, and a fit begins above.
@@ -439,6 +442,7 @@ def harmonics(d: np.ndarray, degree: int) -> np.ndarray:
     return np.stack(found, axis=1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("degree", range(MAX_DEGREE + 1))
 def test_any_degree(degree: int) -> None:
     """0.5 + Y . k from opaque matter of the same coefficients everywhere, and the same after a degree is added. Defect 9."""
@@ -510,6 +514,7 @@ def test_photographs_of_different_sizes_without_jitter() -> None:
 # -- 16: a camera inside ------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_camera_inside_sees_nothing_behind_it() -> None:
     """Matter behind the camera only: radiance 0, alpha 0 and no derivative, exactly; turned round it is all there.
 

@@ -128,6 +128,7 @@ def test_albedo_grid_outside_its_domain(value, kind):
         scenes.render(seen.scene, mivol(), 1)
 
 
+@pytest.mark.slow_for("nan-own", "nan-stock")
 @pytest.mark.parametrize("kind", small.KINDS)
 @pytest.mark.parametrize("value", [math.nan, math.inf])
 def test_density_that_is_no_number(value, kind):
@@ -151,6 +152,7 @@ def test_density_that_is_no_number(value, kind):
 # -- Majorants, of which there are none ----------------------------------------------------------------------------------
 
 
+@pytest.mark.slow_for("own")
 @pytest.mark.statistical
 @pytest.mark.parametrize("kind", small.cases(small.KINDS, ["stock"]))
 def test_density_that_has_grown(kind):
@@ -173,6 +175,7 @@ def test_density_that_has_grown(kind):
 # -- Emitters: inside, far away, along the ray ---------------------------------------------------------------------------------
 
 
+@pytest.mark.slow_for("0.001")
 @pytest.mark.statistical
 @pytest.mark.parametrize("h", [1e-3, 0.03, 0.4])
 def test_point_light_beside_the_ray(h):
@@ -185,6 +188,7 @@ def test_point_light_beside_the_ray(h):
     holds_twin(seen, m, emitter[1], level=2e-5 + 1e-7 / h, precision=0.02)
 
 
+@pytest.mark.slow_for("grid")
 @pytest.mark.statistical
 @pytest.mark.parametrize("kind", ["grid", "homogeneous"])
 def test_point_light_on_the_ray(kind):
@@ -200,6 +204,7 @@ def test_point_light_on_the_ray(kind):
     holds_twin(pencils({"smoke": box, "emitter": emitter[0]}, o[1:], [1.0, 0, 0]), m, emitter[1])
 
 
+@pytest.mark.slow_for("face", "node")
 @pytest.mark.statistical
 @pytest.mark.parametrize("where", ["node", "face", "edge", "border"])
 def test_point_light_at_a_special_place(where):
@@ -218,6 +223,7 @@ def test_point_light_at_a_special_place(where):
     holds_twin(pencils({"smoke": box, "emitter": emitter[0]}, *aimed(9, 5)), m, emitter[1], spp=4096)
 
 
+@pytest.mark.slow_for("1000.0")
 @pytest.mark.statistical
 @pytest.mark.parametrize("away", [1e3, 1e5])
 def test_point_light_far_away_is_a_sun(away):
@@ -234,6 +240,7 @@ def test_point_light_far_away_is_a_sun(away):
     holds_twin(seen, m, twins.Directional(-towards, 2.0), level=2e-5 + 8 / away)
 
 
+@pytest.mark.slow_for("0.0-grid")
 @pytest.mark.statistical
 @pytest.mark.parametrize("kind", ["grid", "homogeneous"])
 @pytest.mark.parametrize("tilt", [0.0, 1e-6, 1e-3])
@@ -253,6 +260,7 @@ def test_light_along_the_camera_ray(tilt, kind):
     assert_same_mean(found, truth, rounding=1e-5 * truth.max())
 
 
+@pytest.mark.slow_for("direction0")
 @pytest.mark.statistical
 @pytest.mark.parametrize("direction", [[0, 0, -1.0], [0, -1.0, 0], [1.0, 0, 0]])
 def test_shadow_rays_along_the_faces_of_cells(direction):
@@ -288,6 +296,7 @@ def test_no_light_is_lost_where_shadow_rays_start():
 # -- Depth ---------------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow_for("grid")
 @pytest.mark.statistical
 @pytest.mark.parametrize("kind", ["grid", "homogeneous"])
 def test_depth_2_is_one_scattering(kind):

@@ -276,6 +276,7 @@ def d_red(shape: tuple[int, ...]) -> np.ndarray:
     return d_picture
 
 
+@pytest.mark.slow_for("3")
 @pytest.mark.parametrize("n", [0, 3])
 def test_no_gaussian_is_seen(splatter: Splatter, camera: Camera, n: int) -> None:
     arrays = cloud(n, 2, 0.01)

@@ -76,6 +76,7 @@ def test_a_resumed_run_is_the_same_with_several_threads(two_threads, ctrl_c, tmp
     assert np.allclose(np.asarray(resumed.run.reals[KEY]), np.asarray(whole.run.reals[KEY]), rtol=1e-5, atol=1e-5)
 
 
+@pytest.mark.slow_for("after an event")
 @pytest.mark.parametrize("iteration", [2, 3], ids=["after an event", "plain"])
 def test_a_signal_in_the_middle_of_an_iteration_loses_nothing(one_thread, ctrl_c, tmp_path: Path, iteration: int) -> None:
     """The signal comes in the render of an iteration: that iteration is done again from where it began, its events not."""

@@ -83,6 +83,7 @@ def test_the_factor_has_the_least_loss(variant_rgb, monkeypatch):
     assert "4 times" in found.text
 
 
+@pytest.mark.slow
 def test_no_value_is_0(variant_rgb, monkeypatch):
     """Where the emissive volume is empty the start is a thousandth of the mean: maps to the logarithm have no 0."""
     shape = np.zeros((2, 2, 2))

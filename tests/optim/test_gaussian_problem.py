@@ -68,6 +68,7 @@ def fit_of(views: list[Photo], plan: GaussianPlan = PLAN, store: Store | None = 
     return begin_fit(problem, plan.optimiser, plan.course(Checkpoint(every=1000)), store=store)
 
 
+@pytest.mark.slow_for("0.2-behind0")
 @pytest.mark.parametrize(("ssim", "behind"), [(0.2, (0.0, 0.0, 0.0)), (0.0, (0.2, 0.7, 0.4))])
 def test_the_gradient_is_that_of_the_loss(
     variant_rgb: str, views: list[Photo], monkeypatch: pytest.MonkeyPatch, ssim: float, behind: tuple[float, ...]

@@ -52,6 +52,7 @@ def two_cubes(start: float) -> mi.Scene:
     return mi.load_dict(scene, optimize=False)  # else equal cubes, and their media, become one
 
 
+@pytest.mark.slow_for("adam", "rmsprop")
 @pytest.mark.parametrize("name", OPTIMISERS)
 def test_finds_a_known_optimum(variant_rgb, name: str) -> None:
     """Two unknown extinctions, each seen through a chord of 2: I = exp(-2 sigma), wanted 0.7 and 0.2, from 0.35."""
@@ -92,6 +93,7 @@ def test_gradient_is_that_of_the_loss(variant_rgb) -> None:
     assert abs(linear.gradient @ v - expected) <= 1e-3 * np.linalg.norm(linear.gradient) * np.linalg.norm(v)
 
 
+@pytest.mark.slow
 def test_gradient_of_a_sky(variant_rgb) -> None:
     """Mitsuba's envmap puts another array in the place of the one it was given: the derivative is that by the given one.
 
@@ -200,6 +202,7 @@ def test_passes_sum_to_the_samples(variant_rgb) -> None:
     assert max(problem.passes(sensor, 10)) - min(problem.passes(sensor, 10)) <= 1
 
 
+@pytest.mark.slow
 @pytest.mark.statistical
 def test_a_nonlinear_loss_does_not_see_the_passes(variant_rgb) -> None:
     """Parallel rays through a constant cube: each sample is exp(-2 sigma), so loss and gradient are known whatever the
@@ -264,6 +267,7 @@ def test_views_with_wide_filters_are_rendered_one_by_one(variant_rgb) -> None:
 # -- The loop -----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_coarse_to_fine_keeps_the_image(variant_rgb) -> None:
     """Refining conserves the mass; the loss right after it stays within a factor of the loss before, far below the
     start, and the result lies on the fine grid."""

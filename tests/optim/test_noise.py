@@ -210,6 +210,7 @@ class Counting:
         return getattr(self.integrator, name)
 
 
+@pytest.mark.slow
 def test_gauss_newton_carries_noise_back_by_other_samples(variant_rgb) -> None:
     """Seeds of J^T differ from the image's where there is noise, and are the image's where there is none."""
     for integrator, same in (("mivol", True), ("prbvolpath", False)):
@@ -273,6 +274,7 @@ def test_said_once_with_its_size(variant_rgb, tmp_path: Path, capsys) -> None:
     assert reconstruct(cube_problem(size=64), Adam(), 5, store=Store(path, {}, resume=True)).log == [line]
 
 
+@pytest.mark.slow
 def test_nothing_is_said_of_exact_renders_and_of_pairs(variant_rgb) -> None:
     assert reconstruct(cube_problem("mivol"), Adam(), 2).log == []
     assert reconstruct(cube_problem(loss=L2(pairs=True)), Adam(), 2).log == []

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from ball_photos import BOX, PLAN
 
 from mivol.optim.photographs.radiance_problem import begin_radiance_fit, newest_field
@@ -10,6 +11,7 @@ from mivol.optim.photographs.ray_batches import RayBatches
 from mivol.photos import Photo
 
 
+@pytest.mark.slow
 def test_the_field_is_that_of_the_newest_step(variant_rgb: str, photos: list[Photo]) -> None:
     fit = begin_radiance_fit(RayBatches.of(photos[:4], (1, 2)), BOX, PLAN)
     before = np.array(newest_field(fit).density)

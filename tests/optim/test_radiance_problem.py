@@ -25,6 +25,7 @@ from mivol.transport.line_integrals.radiance_field import cells_of, model_of, re
 from mivol.transport.line_integrals.radiance_source import bake
 
 
+@pytest.mark.slow
 def test_a_fit_finds_what_it_did_not_see(variant_rgb: str, photos: list[Photo]) -> None:
     # Total variation of an eighth of the rows a step: of a sixteenth, so few steps leave the surface 2.02 voxels deep.
     fit = fitted(RayBatches.of(photos, (1, 2)), replace(PLAN, tv_share=1 / 8))
@@ -53,6 +54,7 @@ def test_a_finer_stage_goes_on_where_the_last_one_stopped(variant_rgb: str, phot
     assert 0 < np.median(moved[moved > 0]) < 0.5 * PLAN.rates(PLAN.stages[0].steps)[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("steps", [9, 14], ids=["first stage", "second stage"])
 def test_a_fit_that_went_on_equals_one_that_did_not_stop(one_thread, photos: list[Photo], tmp_path: Path, steps: int) -> None:
     """With one thread every value and every mean square is equal to the last bit, and what is forgotten shows in it."""

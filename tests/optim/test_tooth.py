@@ -156,6 +156,7 @@ def test_unusable_fields_are_refused(change, sentence):
 # -- Axis -------------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.statistical
 @pytest.mark.usefixtures("variant_rgb")
 def test_axis_is_found_three_ways(simulated):
