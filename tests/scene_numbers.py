@@ -1,4 +1,4 @@
-"""All numbers of a scene's dictionary, added up by their names: a scene that is as it was has the same sums."""
+"""Sums of all numbers of the dictionary of a scene, by name: equal scenes have equal sums."""
 
 from __future__ import annotations
 

