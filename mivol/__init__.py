@@ -43,7 +43,7 @@ PUBLIC = {
     "explain": "experiments.script",
     "fit_gaussians": "experiments.script",
     "fit_photographs": "experiments.script",
-    "load_field": "fields.spherical_files",
+    "load_field": "fields.field_archives",
     "load_photos": "photos",
     "load_scene": "scene.load",
     "make_procedural": "fields.procedural",
@@ -52,7 +52,7 @@ PUBLIC = {
     "read_points": "points",
     "read_volume": "files",
     "render_reference": "validate.reference",
-    "save_field": "fields.spherical_files",
+    "save_field": "fields.field_archives",
     "write_gaussians": "points",
     "write_points": "points",
     "write_volume": "files",
@@ -60,14 +60,15 @@ PUBLIC = {
 """What ``mivol.<name>`` is, and the module below mivol that it comes from; type checkers see the list below."""
 
 if TYPE_CHECKING:  # what type checkers see of PUBLIC, which is imported when it is first used
+    from mivol.fields.field_archives import load_field as load_field
+    from mivol.fields.field_archives import save_field as save_field
+
     from .experiments.script import Problem as Problem
     from .experiments.script import explain as explain
     from .experiments.script import fit_gaussians as fit_gaussians
     from .experiments.script import fit_photographs as fit_photographs
     from .experiments.script import optimize as optimize
     from .fields.procedural import make_procedural as make_procedural
-    from .fields.spherical_files import load_field as load_field
-    from .fields.spherical_files import save_field as save_field
     from .files import read_volume as read_volume
     from .files import write_volume as write_volume
     from .optim.first_order import Adam as Adam

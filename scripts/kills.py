@@ -392,8 +392,8 @@ def make_fields(folder: Path) -> int:
     import mitsuba as mi
 
     mi.set_variant("llvm_ad_rgb")
-    from mivol.fields.spherical import SphericalGrid
-    from mivol.fields.spherical_files import save_field
+    from mivol.fields.field_archives import save_field
+    from mivol.fields.spherical_grid import SphericalGrid
 
     rng = np.random.default_rng(2)
     for name in ("field", "other"):

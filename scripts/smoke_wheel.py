@@ -237,7 +237,7 @@ def smoke_optimize(folder: Path) -> None:
 
 def smoke_export(folder: Path) -> None:
     """Every kind of file that a radiance field becomes."""
-    from mivol.fields.export import EXPORTS
+    from mivol.fields.field_files import EXPORTS
 
     for suffix in EXPORTS:
         for path in mivol("export", "photos/field.npz", f"out{suffix}").split():

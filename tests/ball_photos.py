@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from mivol.fields.spherical import SphericalGrid
+from mivol.fields.spherical_grid import SphericalGrid
 from mivol.optim.loop import Fit, begin_fit
 from mivol.optim.photographs.field_view import render_view
 from mivol.optim.photographs.radiance_plan import FitPlan, Stage

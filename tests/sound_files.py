@@ -54,7 +54,7 @@ def _picture(path: Path) -> None:
 
 
 def _field(path: Path) -> None:
-    from mivol.fields.spherical import SphericalGrid
+    from mivol.fields.spherical_grid import SphericalGrid
 
     rng = np.random.default_rng(2)
     keep = rng.random((3, 4, 5)) < 0.5
@@ -63,8 +63,8 @@ def _field(path: Path) -> None:
 
 
 def _svox2(path: Path) -> None:
-    from mivol.fields.export import export_field
-    from mivol.fields.spherical import SphericalGrid
+    from mivol.fields.field_files import export_field
+    from mivol.fields.spherical_grid import SphericalGrid
 
     rng = np.random.default_rng(3)
     export_field(path, SphericalGrid.from_dense(rng.random((3, 4, 5)), rng.normal(0, 1, (3, 4, 5, 4, 3)), np.eye(4)))
@@ -205,7 +205,7 @@ def _read_exr(path: Path) -> object:
 
 
 def _read_sky(path: Path) -> object:
-    from mivol.experiments.view_field import read_sky
+    from mivol.fields.sky import read_sky
 
     return read_sky(path)
 

@@ -165,7 +165,7 @@ def report_flags(sub: argparse.ArgumentParser) -> None:
 
 def export_flags(sub: argparse.ArgumentParser) -> None:
     """Flags of a field that becomes a file of another program."""
-    from mivol.fields.export import EXPORTS
+    from mivol.fields.field_files import EXPORTS
 
     known = ", ".join(f"{suffix} ({kind.name})" for suffix, kind in EXPORTS.items())
     sub.add_argument("field", type=Path, help="radiance field (.npz): mivol's, or a checkpoint of svox2")
@@ -178,8 +178,8 @@ def export_flags(sub: argparse.ArgumentParser) -> None:
 def convert_flags(sub: argparse.ArgumentParser) -> None:
     """From which file to which."""
     from mivol.points.cloud import CLOUD_READERS, CLOUD_WRITERS
-    from mivol.points.facts import KINDS
     from mivol.points.gaussian_files import READERS, WRITERS
+    from mivol.points.summary import KINDS
 
     known = ", ".join({**WRITERS, **CLOUD_WRITERS})
     sub.add_argument("source", type=Path, help=f"what to read: {', '.join({**READERS, **CLOUD_READERS})}, .npz (field)")
@@ -245,7 +245,7 @@ def explain(arguments: argparse.Namespace) -> int:
     exit code is 1.
     """
     from mivol.photos import find_format
-    from mivol.points.facts import is_points_file
+    from mivol.points.summary import is_points_file
 
     if arguments.set and arguments.preset is None and arguments.scene.suffix.lower() != ".toml":
         raise MivolError(f"--set is for fits, and {arguments.scene} is none: give --preset, or the file of an experiment.")
@@ -278,7 +278,7 @@ def explain_experiment(arguments: argparse.Namespace) -> int:
 
 def explain_points(arguments: argparse.Namespace) -> int:
     """Facts of a file of points or Gaussians."""
-    from mivol.points.facts import read_facts
+    from mivol.points.summary import read_facts
 
     facts = read_facts(arguments.scene)
     print(facts.text)
@@ -330,7 +330,7 @@ def own_picture(arguments: argparse.Namespace) -> Callable | None:
     from mivol.experiments.back_end import set_variant
     from mivol.experiments.view_field import view_field
     from mivol.experiments.view_points import PointLook, view_points
-    from mivol.points.facts import SUFFIXES
+    from mivol.points.summary import SUFFIXES
 
     suffix = arguments.scene.suffix.lower()
     is_field, is_cloud = suffix == ".npz", suffix in SUFFIXES
@@ -412,8 +412,8 @@ def export(arguments: argparse.Namespace) -> None:
     """Write a radiance field as a mesh, as volumes, as a scene with the sky beside its file, or for another program."""
     from mivol.experiments.back_end import set_variant
     from mivol.experiments.view_field import sky_beside
-    from mivol.fields.export import export_field
-    from mivol.fields.spherical_files import load_field
+    from mivol.fields.field_archives import load_field
+    from mivol.fields.field_files import export_field
 
     set_variant(arguments.mode)
     field, sky = load_field(arguments.field), sky_beside(arguments.field)
@@ -458,7 +458,7 @@ def convert_points(arguments: argparse.Namespace, kind: str | None) -> str:
     """Points or Gaussians as a file of a kind; what was written."""
     from mivol.experiments.gaussian_conversion import convert_to_field
     from mivol.experiments.gaussian_mesh import convert_to_mesh
-    from mivol.points.facts import convert_file
+    from mivol.points.summary import convert_file
 
     if kind not in ("field", "mesh"):
         return convert_file(arguments.source, arguments.output, kind)

@@ -9,10 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from mivol.experiments.back_end import set_variant
-from mivol.fields.gaussian_grid import MOST_OPAQUE, box_of_gaussians, grid_of_gaussians, masses_of_gaussians
-from mivol.fields.grid_gaussians import gaussians_of_grid
-from mivol.fields.spherical import SphericalGrid
-from mivol.fields.spherical_files import load_field, save_field
+from mivol.fields.field_archives import load_field, save_field
+from mivol.fields.gaussian_grid import MOST_OPAQUE, box_of_gaussians, gaussians_of_grid, grid_of_gaussians, masses_of_gaussians
+from mivol.fields.spherical_grid import SphericalGrid
 from mivol.files.source import check_file, select_by_suffix
 from mivol.optim.photographs.field_view import render_view
 from mivol.photos import Camera, aim_camera, intrinsics

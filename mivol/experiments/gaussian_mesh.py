@@ -12,8 +12,8 @@ import numpy as np
 
 from mivol.experiments.back_end import set_variant
 from mivol.experiments.gaussian_conversion import EDGE, VIEWED, cameras_around, read_as_gaussians
-from mivol.fields.depth_fusion import DepthView, fuse_depths
 from mivol.fields.gaussian_grid import box_of_gaussians
+from mivol.fields.surfaces import DepthView, fuse_depths
 from mivol.files.mesh import MESH_WRITERS, Mesh, write_mesh
 from mivol.files.source import select_by_suffix
 from mivol.photos import Camera, pixel_centres, rays
@@ -43,7 +43,7 @@ def convert_to_mesh(source: Path, target: Path, resolution: int, box: Sequence[f
         What was written and what it lost, in lines.
 
     Raises:
-        MivolError: as the readers, :func:`mivol.fields.depth_fusion.fuse_depths` and the disk.
+        MivolError: as the readers, :func:`mivol.fields.surfaces.fuse_depths` and the disk.
     """
     select_by_suffix(target, MESH_WRITERS)
     set_variant(variant)
@@ -71,7 +71,7 @@ def mesh_of_gaussians(cloud: Gaussians, low: np.ndarray, high: np.ndarray, resol
         resolution: voxels along its longest edge.
 
     Raises:
-        MivolError: as :func:`mivol.fields.depth_fusion.fuse_depths`.
+        MivolError: as :func:`mivol.fields.surfaces.fuse_depths`.
     """
     return fuse_depths(_seen(cloud, cameras_around(placed(low, high), FINENESS * resolution, FUSED)), low, high, resolution)
 

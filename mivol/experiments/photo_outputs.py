@@ -15,9 +15,9 @@ from mivol.experiments.film import Film
 from mivol.experiments.judged_views import JudgedViews, caption_of, said_of
 from mivol.experiments.run_folder import RunFolder
 from mivol.experiments.task import Task
+from mivol.fields.field_archives import save_field
 from mivol.fields.sky import Sky
-from mivol.fields.spherical import SphericalGrid
-from mivol.fields.spherical_files import save_field
+from mivol.fields.spherical_grid import SphericalGrid
 from mivol.files import write_exr, write_png, write_volume
 from mivol.optim.loop import Fit
 from mivol.optim.photographs.field_view import FieldView, render_view

@@ -19,8 +19,8 @@ from mivol import config
 from mivol.errors import MivolError
 from mivol.experiments.runs import run_experiment
 from mivol.experiments.task import Nobody, Task, Watcher
-from mivol.fields.spherical import SphericalGrid
-from mivol.fields.spherical_files import load_field
+from mivol.fields.field_archives import load_field
+from mivol.fields.spherical_grid import SphericalGrid
 from mivol.files import read_exr, stack_layers
 from mivol.optim.first_order import Adam
 from mivol.optim.loop import Fit, Measure, reconstruct

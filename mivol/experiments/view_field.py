@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from mivol.errors import MivolError
+from mivol.fields.field_archives import load_field
 from mivol.fields.sky import Sky, read_sky
-from mivol.fields.spherical_files import load_field
 from mivol.optim.photographs.field_view import render_view
 from mivol.photos import Camera, aim_camera, intrinsics
 from mivol.photos.photo_file import decode_srgb

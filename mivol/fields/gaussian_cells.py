@@ -13,10 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from mivol.errors import MivolError
-from mivol.fields.box_places import PAIRS, cut_into_parts, places_in_boxes
 from mivol.machine import available_memory
 
-__all__ = ["CellLists", "list_gaussians"]
+__all__ = ["CellLists", "list_gaussians", "PAIRS", "cut_into_parts", "places_in_boxes"]
 
 CELLS = 1.0
 """Cells for each Gaussian: 22^3 for 10,000 (measured on a dense cloud of as many: line integrals take the same time from 0.4 to
@@ -127,3 +126,20 @@ def _check_memory(counts: np.ndarray) -> None:
             f"{len(counts)} Gaussians reach into {counts.mean():.0f} cells each; their lists take {needed / 2**30:.1f} GiB, "
             f"where {free / 2**30:.1f} GiB are free: remove the widest of them, which reaches into {counts.max()} cells."
         )
+
+
+PAIRS = 1 << 21
+"""Places of all boxes that are listed together, and one box more, which has no more than there are nodes."""
+
+
+def places_in_boxes(sizes: np.ndarray) -> np.ndarray:
+    """All places (x, y, z) of boxes of these sizes (n, 3), one box after the other, each from (0, 0, 0)."""
+    counts = sizes.prod(axis=1)
+    number = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
+    x, y = (np.repeat(sizes[:, axis], counts) for axis in (0, 1))
+    return np.stack([number % x, number // x % y, number // (x * y)], axis=1)
+
+
+def cut_into_parts(counts: np.ndarray) -> np.ndarray:
+    """Where a list of boxes of so many places is cut so that no part has much more than ``PAIRS``."""
+    return np.flatnonzero(np.diff(np.cumsum(counts) // PAIRS)) + 1

@@ -14,7 +14,7 @@ import mitsuba as mi
 import numpy as np
 
 from mivol.errors import MivolError
-from mivol.fields.spherical import SphericalGrid, is_covered
+from mivol.fields.spherical_grid import SphericalGrid, is_covered
 
 __all__ = ["resample_field"]
 

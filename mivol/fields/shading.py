@@ -23,9 +23,8 @@ import mitsuba as mi
 import numpy as np
 
 from mivol.errors import MivolError
-from mivol.fields.table import check_domain, check_table, domain_of, look_up, rows_of
 
-__all__ = ["GradientOpacity", "Relief", "Shading", "gradient_grid"]
+__all__ = ["Shading", "gradient_grid"]
 
 COEFFICIENTS = {"ambient": 0.1, "diffuse": 0.7, "specular": 0.2, "specular_power": 10.0}
 
@@ -81,77 +80,6 @@ class Shading:
         matte = self.ambient + self.diffuse * dr.abs(dr.dot(n, to_light))
         highlight = self.specular * _power(dr.abs(dr.dot(n, half)), self.specular_power)
         return [c * matte + highlight for c in colours]
-
-
-@dataclass(frozen=True)
-class GradientOpacity:
-    """Factors on a table's entries by the magnitude of the gradient.
-
-    Attributes:
-        table: (n, 1), factors of at least 0.
-        domain: magnitudes [value of the scan per length] of the first and the last factor.
-    """
-
-    table: mi.TensorXf
-    domain: tuple[float, float]
-
-    @classmethod
-    def from_props(cls, props: mi.Properties, name: str, most: float) -> GradientOpacity | None:
-        """Build from plugin parameters: ``gradient_opacity`` and ``gradient_domain``; None where there is no table.
-
-        Args:
-            props: of the plugin.
-            name: of the plugin in a sentence.
-            most: the largest magnitude of the scan's gradient: where the last factor is, unless a domain is given.
-
-        Raises:
-            MivolError: a table or a domain of another kind.
-        """
-        domain = (0.0, most or 1.0)
-        if "gradient_domain" in props:
-            domain = domain_of(props["gradient_domain"], f"the gradient_domain of {name}")
-        if "gradient_opacity" not in props:
-            return None
-        rows = rows_of(props["gradient_opacity"], f"the gradient_opacity of {name}")
-        check_table(rows, f"the gradient_opacity of {name}", (1,))
-        check_domain(domain, f"the gradient_domain of {name}")
-        return cls(mi.TensorXf(np.ascontiguousarray(rows, dtype=np.float32)), domain)
-
-    def factor(self, gradient: mi.Vector3f) -> mi.Float:
-        """The factor at points of such gradients."""
-        return look_up(self.table, self.domain, dr.norm(gradient))[0]
-
-
-@dataclass(frozen=True)
-class Relief:
-    """What is made of a scan's gradient: factors, light, both or nothing."""
-
-    opacity: GradientOpacity | None = None
-    shading: Shading | None = None
-
-    @classmethod
-    def from_props(cls, props: mi.Properties, field: mi.TensorXf, to_world: np.ndarray, name: str) -> Relief:
-        """Build from the parameters of a plugin that shows a scan (Z, Y, X, 1) in a box of the world.
-
-        Raises:
-            MivolError: as :class:`Shading` and :class:`GradientOpacity`.
-        """
-        needs_most = "gradient_opacity" in props and "gradient_domain" not in props
-        with dr.suspend_grad():
-            most = np.linalg.norm(np.array(gradient_grid(field, to_world)), axis=-1).max() if needs_most else 0.0
-        return cls(GradientOpacity.from_props(props, name, float(most)), Shading.from_props(props, name))
-
-    @property
-    def is_flat(self) -> bool:
-        """Whether the gradient changes nothing."""
-        return self.opacity is None and self.shading is None
-
-    def apply(self, entries: list[mi.Float], gradient: mi.Vector3f, p: mi.Point3f) -> list[mi.Float]:
-        """A table's entries at points of the world, times their factor, and lit."""
-        if self.opacity is not None:
-            factor = self.opacity.factor(gradient)
-            entries = [entry * factor for entry in entries]
-        return entries if self.shading is None else self.shading.lit(entries, gradient, p)
 
 
 def gradient_grid(field: mi.TensorXf, to_world: np.ndarray) -> mi.TensorXf:

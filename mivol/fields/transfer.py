@@ -18,17 +18,153 @@ An odd number keeps the scan's own nodes, where it has its peaks. Cost: memory g
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from mivol.errors import MivolError
-from mivol.fields.shading import Relief, gradient_grid
-from mivol.fields.table import check_domain, check_table, domain_of, look_up, rows_of
+from mivol.fields.shading import Shading, gradient_grid
 from mivol.fields.voxels import Voxels
 from mivol.files import read_volume
 
-__all__ = ["Transfer"]
+__all__ = ["Transfer", "check_domain", "check_table", "domain_of", "look_up", "rows_of", "GradientOpacity", "Relief"]
+
+
+def look_up(table: mi.TensorXf, domain: tuple[float, float], s: mi.Float) -> list[mi.Float]:
+    """The table at values s, a list of channels; attached to both."""
+    n, channels = table.shape
+    low, high = domain
+    u = dr.clip((s - low) * ((n - 1) / (high - low)), 0, n - 1)
+    i = dr.minimum(mi.UInt32(u), n - 2)
+    f, at = u - mi.Float(i), dr.ravel(table)
+    ends = [[dr.gather(mi.Float, at, (i + k) * channels + c) for k in (0, 1)] for c in range(channels)]
+    return [dr.lerp(*pair, f) for pair in ends]
+
+
+def rows_of(text: object, what: str) -> np.ndarray:
+    """Rows between commas, numbers between spaces: (n, C).
+
+    Raises:
+        MivolError: other things than numbers.
+    """
+    try:
+        return np.array([[float(v) for v in row.split()] for row in str(text).split(",")])
+    except ValueError as error:
+        raise MivolError(f"{what} is {str(text)!r}; rows of numbers are expected, as in '0 0 0, 1 0.5 0.2'.") from error
+
+
+def domain_of(text: object, what: str) -> tuple[float, float]:
+    """The two ends of a domain.
+
+    Raises:
+        MivolError: other things than two numbers.
+    """
+    ends = rows_of(text, what).ravel().tolist()
+    if len(ends) != 2:
+        raise MivolError(f"{what} is {text}; two numbers in rising order are expected.")
+    return ends[0], ends[1]
+
+
+def check_table(rows: np.ndarray, what: str, channels: tuple[int, ...] = (1, 3)) -> None:
+    """Refuse what is no table.
+
+    Args:
+        rows: (n, C).
+        what: the table's name in a sentence.
+        channels: how many numbers an entry may have.
+
+    Raises:
+        MivolError: fewer than two entries, another number of channels, entries that are negative or not finite.
+    """
+    if rows.ndim != 2 or rows.shape[0] < 2 or rows.shape[1] not in channels or not (np.isfinite(rows) & (rows >= 0)).all():
+        raise MivolError(
+            f"{what} has the shape {rows.shape} and entries from {rows.min(initial=0):.4g}; at least two entries of "
+            f"{' or '.join(map(str, channels))} finite numbers that are not negative are expected: clip them after each step."
+        )
+
+
+def check_domain(domain: tuple[float, float], what: str) -> None:
+    """Refuse ends that are not finite or not in rising order.
+
+    Raises:
+        MivolError: such ends.
+    """
+    low, high = domain
+    if not (np.isfinite([low, high]).all() and low < high):
+        raise MivolError(f"{what} is {low:g}, {high:g}; two numbers in rising order are expected.")
+
+
+@dataclass(frozen=True)
+class GradientOpacity:
+    """Factors on a table's entries by the magnitude of the gradient.
+
+    Attributes:
+        table: (n, 1), factors of at least 0.
+        domain: magnitudes [value of the scan per length] of the first and the last factor.
+    """
+
+    table: mi.TensorXf
+    domain: tuple[float, float]
+
+    @classmethod
+    def from_props(cls, props: mi.Properties, name: str, most: float) -> GradientOpacity | None:
+        """Build from plugin parameters: ``gradient_opacity`` and ``gradient_domain``; None where there is no table.
+
+        Args:
+            props: of the plugin.
+            name: of the plugin in a sentence.
+            most: the largest magnitude of the scan's gradient: where the last factor is, unless a domain is given.
+
+        Raises:
+            MivolError: a table or a domain of another kind.
+        """
+        domain = (0.0, most or 1.0)
+        if "gradient_domain" in props:
+            domain = domain_of(props["gradient_domain"], f"the gradient_domain of {name}")
+        if "gradient_opacity" not in props:
+            return None
+        rows = rows_of(props["gradient_opacity"], f"the gradient_opacity of {name}")
+        check_table(rows, f"the gradient_opacity of {name}", (1,))
+        check_domain(domain, f"the gradient_domain of {name}")
+        return cls(mi.TensorXf(np.ascontiguousarray(rows, dtype=np.float32)), domain)
+
+    def factor(self, gradient: mi.Vector3f) -> mi.Float:
+        """The factor at points of such gradients."""
+        return look_up(self.table, self.domain, dr.norm(gradient))[0]
+
+
+@dataclass(frozen=True)
+class Relief:
+    """What is made of a scan's gradient: factors, light, both or nothing."""
+
+    opacity: GradientOpacity | None = None
+    shading: Shading | None = None
+
+    @classmethod
+    def from_props(cls, props: mi.Properties, field: mi.TensorXf, to_world: np.ndarray, name: str) -> Relief:
+        """Build from the parameters of a plugin that shows a scan (Z, Y, X, 1) in a box of the world.
+
+        Raises:
+            MivolError: as :class:`Shading` and :class:`GradientOpacity`.
+        """
+        needs_most = "gradient_opacity" in props and "gradient_domain" not in props
+        with dr.suspend_grad():
+            most = np.linalg.norm(np.array(gradient_grid(field, to_world)), axis=-1).max() if needs_most else 0.0
+        return cls(GradientOpacity.from_props(props, name, float(most)), Shading.from_props(props, name))
+
+    @property
+    def is_flat(self) -> bool:
+        """Whether the gradient changes nothing."""
+        return self.opacity is None and self.shading is None
+
+    def apply(self, entries: list[mi.Float], gradient: mi.Vector3f, p: mi.Point3f) -> list[mi.Float]:
+        """A table's entries at points of the world, times their factor, and lit."""
+        if self.opacity is not None:
+            factor = self.opacity.factor(gradient)
+            entries = [entry * factor for entry in entries]
+        return entries if self.shading is None else self.shading.lit(entries, gradient, p)
 
 
 class Transfer:
@@ -54,7 +190,7 @@ class Transfer:
         refine: int,
         to_world: np.ndarray,
         name: str,
-        relief: Relief = Relief(),  # noqa: B008  (frozen)
+        relief: Relief = Relief(),
     ) -> None:
         entries, self.domain = table
         self.name, self.refine, self.to_world, self.relief = name, refine, to_world, relief

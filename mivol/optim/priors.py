@@ -26,7 +26,7 @@ import mitsuba as mi
 import numpy as np
 
 from mivol.errors import MivolError
-from mivol.fields.spherical import SphericalGrid, is_covered
+from mivol.fields.spherical_grid import SphericalGrid, is_covered
 from mivol.optim.strategy import Strategy, of, table
 
 Spacing = tuple[float, float, float]

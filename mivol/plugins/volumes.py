@@ -8,9 +8,9 @@ import mitsuba as mi
 import numpy as np
 
 from mivol.errors import MivolError
-from mivol.fields.gaussians import GaussianField
-from mivol.fields.spherical import SphericalGrid
-from mivol.fields.spherical_tensors import dense_densities, field_from_props, with_tensors
+from mivol.fields.field_files import field_from_props
+from mivol.fields.gaussian_field import GaussianField
+from mivol.fields.spherical_grid import SphericalGrid, dense_densities, with_tensors
 from mivol.fields.transfer import Transfer
 from mivol.fields.voxels import Voxels
 

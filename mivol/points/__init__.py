@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from mivol.points.cloud import PointCloud, read_points, write_points
-from mivol.points.conversions import gaussians_of_points, points_of_gaussians
-from mivol.points.density import density_of_points, sample_points
+from mivol.points.conversions import density_of_points, gaussians_of_points, points_of_gaussians, sample_points
 from mivol.points.gaussian_files import read_gaussians, write_gaussians
 from mivol.points.gaussians import Gaussians, concatenate
 

@@ -1,19 +1,106 @@
-"""Points to Gaussians and back.
+"""Points to a density on a grid, and points drawn from a grid.
 
-Source: Kerbl et al. 2023, section 5.1: Gaussians begin as balls as wide as the three nearest neighbours are away.
+Conventions. Grids are (Z, Y, X) at voxel centres over the unit cube, which ``to_world`` places (:mod:`mivol.space`). A density
+is mass per volume [1/length^3], so that its sum times the volume of a voxel is the mass.
 """
 
 from __future__ import annotations
+
+import itertools
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from mivol.files.source import refusal
-from mivol.points.byte_codes import harmonics_of_colours
 from mivol.points.cloud import PointCloud
-from mivol.points.gaussians import Gaussians, logit
+from mivol.points.gaussians import Gaussians, harmonics_of_colours, logit
+from mivol.space import check_affine, lattice_from_world
 
-__all__ = ["gaussians_of_points", "points_of_gaussians"]
+__all__ = ["density_of_points", "sample_points", "gaussians_of_points", "points_of_gaussians"]
+
+
+def density_of_points(
+    positions: np.ndarray, resolution: tuple[int, int, int], to_world: np.ndarray, masses: np.ndarray | None = None
+) -> np.ndarray:
+    """The density of points on a grid: each gives its mass to the eight voxel centres around it by trilinear weights.
+
+    Within half a voxel of a face the weights of centres that would lie outside go to those inside: the mass is kept there too,
+    and everywhere else the centre of mass is kept as well.
+
+    Args:
+        positions: (N, 3) world [length].
+        resolution: (Z, Y, X) of the grid.
+        to_world: (4, 4) unit cube to world.
+        masses: (N,); None: 1 each.
+
+    Returns:
+        (Z, Y, X) float64 [mass / length^3].
+
+    Raises:
+        MivolError: a point outside the box, by the index of the first; shapes that do not fit together.
+
+    Source: Hockney, Eastwood, Computer Simulation Using Particles, 1988 (cloud in cell).
+    """
+    positions = np.asarray(positions, np.float64)
+    masses = np.ones(len(positions)) if masses is None else np.asarray(masses, np.float64)
+    if positions.ndim != 2 or positions.shape[1:] != (3,) or masses.shape != positions.shape[:1]:
+        found = f"positions of shape {positions.shape} and masses of shape {masses.shape}"
+        raise refusal("density_of_points", found, "(N, 3) and (N,)", "reshape them")
+    to_lattice = lattice_from_world(to_world, resolution)
+    q = positions @ to_lattice[:, :3].T + to_lattice[:, 3]
+    size = np.array(resolution[::-1])
+    # A point on a face may be rounded out of the box: by some 2^-50 of the lattice's coordinates.
+    outside = np.flatnonzero(~((q >= -0.5 - 1e-9 * size) & (q <= size - 0.5 + 1e-9 * size)).all(axis=1))
+    if outside.size:
+        found = f"point {outside[0]} outside the box (the first of {outside.size})"
+        raise refusal("density_of_points", found, "points inside", "enlarge the box, or leave these points out")
+    low = np.floor(q)
+    far = q - low
+    mass = np.zeros(np.prod(resolution))
+    for corner in itertools.product((0, 1), repeat=3):
+        node = np.clip(low + corner, 0, size - 1).astype(np.int64)
+        weight = np.where(corner, far, 1 - far).prod(axis=1) * masses
+        mass += np.bincount((node[:, 2] * size[1] + node[:, 1]) * size[0] + node[:, 0], weight, len(mass))
+    return mass.reshape(resolution) / _voxel_volume(resolution, to_world)
+
+
+def sample_points(density: np.ndarray, to_world: np.ndarray, count: int, seed: int) -> np.ndarray:
+    """Points drawn from a density that is constant in each voxel.
+
+    Voxels are drawn systematically (one random number shifts ``count`` equal steps of the cumulated mass), so that each holds
+    its share of the points to less than one; a point lies anywhere in its voxel with the same probability.
+
+    Args:
+        density: (Z, Y, X), not below 0.
+        to_world: (4, 4) unit cube to world.
+        count: how many.
+        seed: of the random numbers.
+
+    Returns:
+        (count, 3) world [length], float64, in random order.
+
+    Raises:
+        MivolError: another shape, a density that is negative or not finite, or one without mass.
+    """
+    density = np.asarray(density, np.float64)
+    if density.ndim != 3 or not np.isfinite(density).all() or (density < 0).any() or not density.any():
+        found = f"a density of shape {density.shape}, from {density.min(initial=0)} to {density.max(initial=0)}"
+        raise refusal("sample_points", found, "(Z, Y, X), not below 0, with mass", "clip it, or give another")
+    rng = np.random.default_rng(seed)
+    cumulated = np.cumsum(density.ravel())
+    steps = (np.arange(count) + rng.uniform()) * (cumulated[-1] / count)
+    last = np.flatnonzero(density.ravel())[-1]  # rounding may take the last step to the end of the mass, and beyond its voxel
+    voxels = rng.permutation(np.minimum(np.searchsorted(cumulated, steps, side="right"), last))
+    corner = np.stack(np.unravel_index(voxels, density.shape), axis=1)[:, ::-1]
+    unit = (corner + rng.uniform(size=(count, 3))) / np.array(density.shape[::-1])
+    m = check_affine(to_world)
+    return unit @ m[:3, :3].T + m[:3, 3]
+
+
+def _voxel_volume(resolution: tuple[int, int, int], to_world: np.ndarray) -> float:
+    """[length^3]."""
+    return float(abs(np.linalg.det(check_affine(to_world)[:3, :3])) / np.prod(resolution))
+
 
 NEIGHBOURS = 3
 

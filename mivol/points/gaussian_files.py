@@ -13,11 +13,9 @@ from typing import BinaryIO
 from mivol.files.atomic import write_whole
 from mivol.files.ply import read_layout, read_tables
 from mivol.files.source import check_file, select_by_suffix
-from mivol.points.compressed_ply import gaussians_of_compressed_tables, is_compressed
-from mivol.points.gaussian_ply import gaussians_of_tables, write_gaussian_ply
+from mivol.points.gaussian_ply import gaussians_of_compressed_tables, gaussians_of_tables, is_compressed, write_gaussian_ply
 from mivol.points.gaussians import Gaussians
-from mivol.points.ksplat import read_ksplat
-from mivol.points.splat import read_splat
+from mivol.points.splat import read_ksplat, read_splat
 from mivol.points.spz import read_spz
 
 __all__ = ["READERS", "WRITERS", "holds_gaussians", "read_gaussians", "write_gaussians"]

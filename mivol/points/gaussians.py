@@ -20,7 +20,17 @@ import numpy as np
 from mivol.files.source import refusal
 from mivol.shown import briefly
 
-__all__ = ["CONSTANT_HARMONIC", "HIGHEST_DEGREE", "Gaussians", "concatenate", "logit"]
+__all__ = [
+    "CONSTANT_HARMONIC",
+    "HIGHEST_DEGREE",
+    "Gaussians",
+    "concatenate",
+    "logit",
+    "completed",
+    "harmonics_of_colours",
+    "logits_of_bytes",
+    "logs_of_scales",
+]
 
 CONSTANT_HARMONIC = 0.5 / np.sqrt(np.pi)
 """The value of the spherical harmonic of degree 0, everywhere."""
@@ -167,3 +177,37 @@ def _refuse_first(subject: object, wrong: np.ndarray, what: str) -> None:
     if rows.size:
         found = f"{what} in Gaussian {rows[0]} (the first of {rows.size})"
         raise refusal(subject, found, "numbers that can be drawn", "remove these Gaussians, or write the file again")
+
+
+def logits_of_bytes(codes: np.ndarray) -> np.ndarray:
+    """Logits of opacities in 0..255."""
+    return logit(codes / 255)
+
+
+def harmonics_of_colours(colours: np.ndarray) -> np.ndarray:
+    """Coefficients of degree 0 of colours in 0..1."""
+    return (colours - 0.5) / CONSTANT_HARMONIC
+
+
+def logs_of_scales(scales: np.ndarray) -> np.ndarray:
+    """Logarithms; of a scale that is not above 0 -inf or NaN, which is refused by its index when the Gaussians are checked."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.log(np.asarray(scales, np.float64))
+
+
+def completed(others: np.ndarray, which: np.ndarray) -> np.ndarray:
+    """Unit quaternions of which one entry, not below 0, was left out.
+
+    Args:
+        others: (N, 3) the entries that are there, in their order.
+        which: (N,) the number of the one that is not.
+
+    Returns:
+        (N, 4).
+    """
+    rows = np.arange(len(others))
+    quaternions = np.empty((len(others), 4))
+    quaternions[rows, which] = np.sqrt(np.maximum(0, 1 - (others**2).sum(axis=1)))
+    for number in range(3):
+        quaternions[rows, number + (which <= number)] = others[:, number]
+    return quaternions

@@ -1,22 +1,155 @@
-"""The ``.splat`` of antimatter15's viewer: 32 bytes a Gaussian, no header, colours without harmonics.
+"""The ``.ksplat`` of the viewer GaussianSplats3D: sections of Gaussians, positions in buckets where they are compressed.
 
-Conventions. Position and scale in float32, colour and opacity in a byte each, the unit quaternion (w, x, y, z) as 128 + 128 q
-in a byte each.
+Conventions. A header of 4096 bytes and one of 1024 a section, then the sections. Level 0 holds float32; levels 1 and 2 hold
+positions in 16 bits around the centre of a bucket and scales and rotations in half precision; harmonics are float32, half
+precision, or bytes between two ends. Colour and opacity are bytes, quaternions (w, x, y, z). Harmonics stand by degree, in each
+by colour. Full buckets come first, each of the same number of Gaussians; a table says how many the others hold.
 
-Source: the open-source viewer antimatter15/splat (MIT licence).
+Source: the open-source viewer mkkellogg/GaussianSplats3D (MIT licence), formats up to 0.1.
 """
 
 from __future__ import annotations
 
+import struct
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from mivol.files.source import read_bytes, refusal
-from mivol.points.byte_codes import harmonics_of_colours, logits_of_bytes, logs_of_scales
-from mivol.points.gaussians import Gaussians
+from mivol.points.gaussians import HIGHEST_DEGREE, Gaussians, concatenate, harmonics_of_colours, logits_of_bytes, logs_of_scales
 
-__all__ = ["read_splat"]
+__all__ = ["read_ksplat", "read_splat"]
+
+HEAD, SECTION_HEAD = 4096, 1024
+NUMBERS = {0: ("<f4", "<f4", "<f4"), 1: ("<u2", "<f2", "<f2"), 2: ("<u2", "<f2", "u1")}
+"""Level -> types of positions, of scales and rotations, of harmonics."""
+
+CENTRE = 12
+"""Bytes of the centre of a bucket."""
+
+WIDEST_HARMONIC = 1.5
+"""Ends of harmonics in bytes where the header says none."""
+
+COARSEST = 32767
+"""Steps of half a bucket where the header says none."""
+
+
+@dataclass(frozen=True)
+class Section:
+    """What the header of a section says; counts are of Gaussians, sizes of bytes."""
+
+    count: int
+    capacity: int
+    bucket_capacity: int
+    buckets: int
+    bucket_size: float
+    bucket_storage: int
+    steps: int
+    full: int
+    partial: int
+    degree: int
+
+    def storage(self) -> int:
+        """Bytes of the table of partly filled buckets and of the buckets' centres."""
+        return 4 * self.partial + self.bucket_storage * self.buckets
+
+
+def read_ksplat(path: Path) -> Gaussians:
+    """Read a file.
+
+    Raises:
+        MivolError: another version or level, counts that contradict each other, a truncated file.
+    """
+    data = read_bytes(path)
+    if len(data) < HEAD:
+        raise refusal(path, f"{len(data)} bytes", f"a header of {HEAD}", "the file is truncated: copy it again")
+    major, minor, sections, count, level = struct.unpack_from("<BB2xI8xIH", data)
+    if (major, minor) != (0, 1) or level not in NUMBERS:
+        found = f"version {major}.{minor}, level {level}"
+        raise refusal(path, found, f"version 0.1 and a level of {tuple(NUMBERS)}", "write it again with a newer program")
+    low, high = struct.unpack_from("<ff", data, 36)
+    ends = (low or -WIDEST_HARMONIC, high or WIDEST_HARMONIC)
+    at = HEAD + SECTION_HEAD * sections
+    if at > len(data):
+        raise refusal(path, f"{sections} sections in {len(data)} bytes", f"{at} bytes at least", "copy the file again")
+    parts = []
+    for number in range(sections):
+        section = _section(data, HEAD + SECTION_HEAD * number, path)
+        record = _record(level, section.degree)
+        end = at + section.storage() + record.itemsize * section.capacity
+        if end > len(data):
+            raise refusal(path, f"{len(data)} bytes", f"{end} for section {number}", "the file is truncated: copy it again")
+        table = np.frombuffer(data, record, section.count, at + section.storage())
+        parts.append(_gaussians(table, _offsets(data, at, section, path) if level else None, ends))
+        at = end
+    held = sum(part.count for part in parts)
+    if held != count or not parts:
+        raise refusal(path, f"{held} Gaussians in {len(parts)} sections", f"{count}, from the header", "write the file again")
+    return concatenate(parts)
+
+
+def _section(data: bytes, at: int, path: Path) -> Section:
+    fields = struct.unpack_from("<IIIIfH2xI4xIIH", data, at)
+    section = Section(*fields[:6], fields[6] or COARSEST, *fields[7:])
+    wrong = (
+        section.count > section.capacity or section.degree > HIGHEST_DEGREE or section.full + section.partial > section.buckets
+    )
+    if wrong or (section.buckets and section.bucket_storage != 12):
+        found = f"{section}".removeprefix("Section")
+        raise refusal(path, f"a section of {found}", "numbers that fit together", "write the file again")
+    return section
+
+
+def _record(level: int, degree: int) -> np.dtype:
+    """What a Gaussian takes."""
+    position, number, harmonic = NUMBERS[level]
+    fields = [("mean", position, 3), ("scale", number, 3), ("quaternion", number, 4), ("colour", "u1", 3), ("opacity", "u1")]
+    return np.dtype([*fields, ("harmonics", harmonic, 3 * ((degree + 1) ** 2 - 1))])
+
+
+def _offsets(data: bytes, at: int, section: Section, path: Path) -> tuple[np.ndarray, float, int]:
+    """The centre of each Gaussian's bucket (N, 3), the length of a step, and how many steps are half a bucket."""
+    partial = np.frombuffer(data, "<u4", section.partial, at)
+    centres = np.frombuffer(data, "<f4", 3 * section.buckets, at + 4 * section.partial).reshape(-1, 3)
+    held = np.concatenate([np.full(section.full, section.bucket_capacity, np.uint64), partial.astype(np.uint64)])
+    if held.sum(dtype=object) != section.count:
+        found = f"{held.sum(dtype=object)} Gaussians in buckets"
+        raise refusal(path, found, f"{section.count}, from the section", "write the file again")
+    return (
+        centres[np.repeat(np.arange(len(held)), held.astype(np.int64))],
+        section.bucket_size / 2 / section.steps,
+        section.steps,
+    )
+
+
+def _gaussians(table: np.ndarray, offsets: tuple[np.ndarray, float, int] | None, ends: tuple[float, float]) -> Gaussians:
+    means = table["mean"].astype(np.float64)
+    if offsets is not None:
+        centres, step, middle = offsets
+        means = (means - middle) * step + centres
+    constant = harmonics_of_colours(table["colour"] / 255)[:, None]
+    return Gaussians(
+        means,
+        logs_of_scales(table["scale"]),
+        table["quaternion"],
+        logits_of_bytes(table["opacity"]),
+        np.concatenate([constant, _harmonics(table["harmonics"], ends)], axis=1),
+    )
+
+
+def _harmonics(stored: np.ndarray, ends: tuple[float, float]) -> np.ndarray:
+    """Coefficients above degree 0, (N, K - 1, 3): in the file degree by degree, in each colour by colour."""
+    values = stored.astype(np.float64)
+    if stored.dtype == np.uint8:
+        values = ends[0] + values / 255 * (ends[1] - ends[0])
+    bands, at = [np.empty((len(values), 0, 3))], 0
+    while at < values.shape[1]:
+        width = 2 * len(bands) + 1
+        bands.append(np.swapaxes(values[:, at : at + 3 * width].reshape(-1, 3, width), 1, 2))
+        at += 3 * width
+    return np.concatenate(bands, axis=1)
+
 
 RECORD = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("colour", "u1", 3), ("opacity", "u1"), ("quaternion", "u1", 4)])
 

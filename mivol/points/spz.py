@@ -22,8 +22,7 @@ import numpy as np
 
 from mivol.files.npy import check_memory
 from mivol.files.source import CODECS, decompress, parse_elements, read_bytes, refusal
-from mivol.points.byte_codes import completed, logits_of_bytes
-from mivol.points.gaussians import HIGHEST_DEGREE, Gaussians
+from mivol.points.gaussians import HIGHEST_DEGREE, Gaussians, completed, logits_of_bytes
 
 __all__ = ["read_spz"]
 
@@ -125,7 +124,7 @@ def _streams(data: bytes, header: Header, path: Path) -> list[np.ndarray]:
 
 
 def _unpack(data: bytes, size: int, path: Path) -> bytes:
-    """Decompress one Zstandard stream to at most ``size`` + 1 bytes; :func:`parse_elements` refuses the additional byte."""
+    """Decompress a Zstandard stream to at most ``size + 1`` bytes; the extra byte reveals excess data."""
     try:
         import zstandard
     except ImportError as error:

@@ -13,7 +13,7 @@ import mitsuba as mi
 import numpy as np
 
 from mivol.errors import MivolError
-from mivol.fields.gaussians import GaussianField
+from mivol.fields.gaussian_field import GaussianField
 from mivol.transport.traversal.box import slab
 
 __all__ = ["Coefficients"]

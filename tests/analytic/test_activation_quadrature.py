@@ -16,7 +16,7 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 
 from mivol.fields import activation
 from mivol.fields.activation import ACTIVATIONS
-from mivol.fields.spherical import SphericalGrid
+from mivol.fields.spherical_grid import SphericalGrid
 
 N, RAYS = 16, 150
 DEPTHS = (0.01, 0.1, 1.0, 10.0)

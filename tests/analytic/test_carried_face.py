@@ -9,7 +9,7 @@ import pytest
 from radiance_rays import CUBE, TO_WORLD, aim, derive, make, rays_of, see
 
 from mivol.device_arrays import ALIGNMENT
-from mivol.fields.spherical import SphericalGrid
+from mivol.fields.spherical_grid import SphericalGrid
 from mivol.transport.line_integrals.radiance_field import RayGradient, backward, cells_of, model_of, render
 from mivol.transport.line_integrals.radiance_source import Exact, exact
 from mivol.transport.traversal.occupied_cells import Cells

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import oracle_emission as twins
@@ -12,8 +13,12 @@ from emission_scenes import BOUNDARIES, LE, PLACE, B, aimed, colours, emitting, 
 from oracle import GAUSS_2, box_interval, corner_weights, quadrature_points, trilinear
 from scipy.special import erf
 
+from mivol.transport.estimators.scores import FORWARD, PICTURE, REVERSE
+from mivol.transport.estimators.segment import PathSegment
+from mivol.transport.line_integrals.emission import Emission
+from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.traversal.cell_quadrature import share_opacity, weigh_emission_density
-from scenes import as_float32, ball_of, box_of, centred
+from scenes import as_float32, ball_of, box_of, camera, centred, media_of
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
 
@@ -294,3 +299,58 @@ def test_gradients_are_finite_at_any_optical_depth(tau):
     found = gradients(seen, ["sigma_t.data", "emission.data", "emission_density.data"], np.ones_like(C))
     for g in found:
         assert np.isfinite(g).all() and np.abs(g).max() > 0
+
+
+SIGMA, SOURCE, BETA = np.array([0.5, 1.0, 2.0]), np.array([1.0, 3.0, 0.5]), np.array([0.5, 0.25, 2.0])
+T = np.exp(-SIGMA)
+ROUNDING = 8 * 2.0**-23
+CHANGE = np.array([1.0, -2.0, 0.5])
+
+
+@pytest.fixture
+def media(variant_rgb: str) -> SceneMedia:
+    """A unit cube."""
+    sigma_t, emission = ({"type": "constvolume", "value": {"type": "rgb", "value": v.tolist()}} for v in (SIGMA, SOURCE))
+    fog = {"type": "mivol_medium", "sigma_t": sigma_t, "emission": emission}
+    return media_of(
+        mi.load_dict({"type": "scene", "box": box_of(fog, centred(np.eye(3))), "sensor": camera([0, -4, 0], [0, 0, 0])})
+    )
+
+
+def segment() -> PathSegment:
+    """Two lanes through the middle of it, of which the second has ended before."""
+    ray = mi.Ray3f(mi.Point3f(0, 0, mi.Float(-3, -3)), mi.Vector3f(0, 0, 1), dr.inf, mi.Float(0), mi.Color0f())
+    return PathSegment(ray, dr.zeros(mi.MediumPtr, 2), mi.Spectrum(*BETA.tolist()), mi.Bool(True), None, mi.UInt32(0))
+
+
+ON = (True, False)
+
+
+def test_light_and_transmittance(media):
+    with dr.suspend_grad():
+        found = Emission(media).estimate(segment(), PICTURE, mi.Bool(*ON))
+    light = BETA * SOURCE * (1 - T)
+    np.testing.assert_allclose(np.array(found.light.value), np.c_[light, np.zeros(3)], rtol=ROUNDING)
+    np.testing.assert_allclose(np.array(found.T)[:, 0], T, rtol=ROUNDING)
+    assert found.light.is_replayed and not np.array(found.end.si.is_valid()).any()
+
+
+def test_tangents(media):
+    """Le T sigma' of the light, and -sigma' of log T."""
+    media.bodies[0].tangents = [mi.Color3f(*CHANGE.tolist())]
+    with dr.suspend_grad():
+        found = Emission(media).estimate(segment(), FORWARD, mi.Bool(*ON))
+        light, log = np.array(found.light.jvp()), np.array(found.transmittance.jvp())
+    np.testing.assert_allclose(light, np.c_[BETA * SOURCE * T * CHANGE, np.zeros(3)], rtol=ROUNDING)
+    np.testing.assert_allclose(log, np.c_[-CHANGE, np.zeros(3)], rtol=ROUNDING)
+
+
+def test_gradients(media):
+    """Of the light, reported first, and of log T: beta Le T dL - dlog."""
+    media.start_gradients()
+    dL, dlog = np.array([2.0, -1.0, 4.0]), np.array([0.25, 0.5, 1.0])
+    with dr.suspend_grad():
+        found = Emission(media).estimate(segment(), REVERSE, mi.Bool(*ON))
+        found.light.vjp(mi.Spectrum(*dL.tolist()))
+        found.transmittance.vjp(mi.Spectrum(*dlog.tolist()))
+    np.testing.assert_allclose(np.array(media.bodies[0].gradients[0]), BETA * SOURCE * T * dL - dlog, atol=ROUNDING)

@@ -12,7 +12,7 @@ import pytest
 from scipy.integrate import quad
 from scipy.special import logit
 
-from mivol.fields.gaussians import NAMES, GaussianField
+from mivol.fields.gaussian_field import NAMES, GaussianField
 from mivol.points.gaussians import Gaussians
 from mivol.transport.media.extinction import RayInterval
 from mivol.transport.media.gaussian_extinction import GaussianExtinction

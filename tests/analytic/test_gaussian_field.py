@@ -10,8 +10,8 @@ import pytest
 from gaussian_sets import random_gaussians
 
 from mivol.errors import MivolError
+from mivol.fields.gaussian_field import LEAST_SCALE, NAMES, GaussianField
 from mivol.fields.gaussian_line import ROW, SCALE
-from mivol.fields.gaussians import LEAST_SCALE, NAMES, GaussianField
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
 

@@ -11,7 +11,7 @@ from false_alarms import Estimate, assert_precise, assert_same_mean, fresh
 from scipy.special import logit
 
 from mivol.fields import gaussian_cells
-from mivol.fields.gaussians import GaussianField
+from mivol.fields.gaussian_field import GaussianField
 from mivol.points.gaussians import Gaussians
 from mivol.transport.estimators.flights.regular_tracking import collide_in_gaussians
 from mivol.transport.media.extinction import RayInterval

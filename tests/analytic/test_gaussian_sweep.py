@@ -11,8 +11,8 @@ import oracle_gaussians as oracle
 import pytest
 from gaussian_sets import random_gaussians
 
+from mivol.fields.gaussian_field import GaussianField
 from mivol.fields.gaussian_line import Line
-from mivol.fields.gaussians import GaussianField
 from mivol.points.gaussians import Gaussians
 from mivol.transport.media.extinction import RayInterval
 from mivol.transport.media.gaussian_extinction import GaussianExtinction

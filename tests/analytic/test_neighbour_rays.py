@@ -11,7 +11,7 @@ import pytest
 from radiance_rays import CUBE, TO_WORLD, aim, make, rays_of
 
 from mivol.device_arrays import ALIGNMENT
-from mivol.fields.spherical import SphericalGrid
+from mivol.fields.spherical_grid import SphericalGrid
 from mivol.transport.line_integrals.radiance_field import (
     RayBundle,
     RayGradient,

@@ -10,7 +10,7 @@ from oracle_radiance import NestedTwin, Twin, sh_basis
 from radiance_rays import CUBE, TO_WORLD, derive, followed, make, rays_of, see
 
 from mivol.errors import MivolError
-from mivol.fields.spherical import SphericalGrid, is_covered
+from mivol.fields.spherical_grid import SphericalGrid, is_covered
 from mivol.transport.line_integrals.radiance_field import RayGradient, backward, cells_of, model_of, render
 from mivol.transport.line_integrals.radiance_source import bake, exact, fold
 

@@ -11,7 +11,7 @@ import pytest
 from radiance_rays import looked, rays_of
 from scipy.ndimage import distance_transform_cdt
 
-from mivol.fields.spherical import SphericalGrid
+from mivol.fields.spherical_grid import SphericalGrid
 from mivol.transport.line_integrals.radiance_field import cells_of
 from mivol.transport.traversal.grid_blocks import REACH
 from mivol.transport.traversal.lattice import clip

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from radiance_rays import CUBE
 
-from mivol.fields.spherical import SphericalGrid
+from mivol.fields.spherical_grid import SphericalGrid
 from mivol.transport.line_integrals.radiance_field import cells_of
 from mivol.transport.traversal.occupied_walk import piece_of, pieces
 

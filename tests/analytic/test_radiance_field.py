@@ -10,7 +10,7 @@ from oracle_radiance import Twin
 from radiance_rays import CUBE, TO_WORLD, aim, derive, looked, make, rays_of, see
 
 from mivol.fields.activation import ACTIVATIONS
-from mivol.fields.spherical import SphericalGrid
+from mivol.fields.spherical_grid import SphericalGrid
 from mivol.transport.line_integrals.radiance_field import brightest_weights, cells_of, model_of, render
 from mivol.transport.line_integrals.radiance_source import exact
 from mivol.transport.traversal.occupied_cells import Cells

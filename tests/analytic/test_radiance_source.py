@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from radiance_rays import CUBE, TO_WORLD, make, rays_of, see
 
-from mivol.fields.spherical import SphericalGrid
+from mivol.fields.spherical_grid import SphericalGrid
 from mivol.transport.line_integrals.radiance_field import RayGradient, backward, cells_of, model_of, render
 from mivol.transport.line_integrals.radiance_source import bake, fold
 

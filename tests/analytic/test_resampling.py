@@ -8,7 +8,7 @@ from ball_photos import CUBE
 
 from mivol.errors import MivolError
 from mivol.fields.resampling import resample_field
-from mivol.fields.spherical import SphericalGrid
+from mivol.fields.spherical_grid import SphericalGrid
 
 
 def test_a_field_on_finer_nodes_is_the_same_field(variant_rgb: str) -> None:

@@ -20,7 +20,7 @@ from mivol.bench.studies.radiance_field.peer import Peer
 from mivol.bench.studies.radiance_field.size import PhotoFit
 from mivol.bench.studies.radiance_field.steps import ask_memory, our_step, peer_of, peer_step, tasks
 from mivol.bench.studies.radiance_field.views import BOX, between, photographed, rays_of, rays_through, ring, tiled
-from mivol.fields.spherical import SphericalGrid
+from mivol.fields.spherical_grid import SphericalGrid
 from mivol.photos import Camera, Photo, intrinsics
 from mivol.transport.line_integrals.radiance_field import cells_of, model_of, render
 from mivol.transport.line_integrals.radiance_source import bake

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from mivol.bench.studies import storage
-from mivol.fields.spherical import SphericalGrid
-from mivol.fields.spherical_files import save_field
+from mivol.fields.field_archives import save_field
+from mivol.fields.spherical_grid import SphericalGrid
 from mivol.transport.line_integrals.radiance_field import cells_of
 
 RES = (5, 6, 7)

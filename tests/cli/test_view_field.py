@@ -10,9 +10,9 @@ import pytest
 from mivol.cli import main
 from mivol.errors import MivolError
 from mivol.experiments.view_field import camera_at
+from mivol.fields.field_archives import save_field
 from mivol.fields.sky import read_sky
-from mivol.fields.spherical import SphericalGrid
-from mivol.fields.spherical_files import save_field
+from mivol.fields.spherical_grid import SphericalGrid
 from mivol.files import read_exr, write_exr
 from mivol.photos import project
 from mivol.photos.photo_file import decode_srgb

@@ -13,7 +13,7 @@ import wide_cameras
 from gaussian_scenes import SIDE, camera_rays, render
 from scipy.special import logit
 
-from mivol.fields.gaussians import HARMONICS, NAMES
+from mivol.fields.gaussian_field import HARMONICS, NAMES
 from mivol.points.gaussians import Gaussians
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")

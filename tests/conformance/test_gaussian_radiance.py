@@ -19,7 +19,7 @@ from scipy.special import logit
 
 from mivol.errors import MivolError
 from mivol.experiments.script import explain
-from mivol.fields.gaussians import HARMONICS, NAMES, GaussianField
+from mivol.fields.gaussian_field import HARMONICS, NAMES, GaussianField
 from mivol.photos.camera import Camera, intrinsics
 from mivol.points import write_gaussians
 from mivol.points.gaussians import Gaussians

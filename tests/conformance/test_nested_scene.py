@@ -14,12 +14,11 @@ from scattering_scenes import moments
 
 from mivol.cli import main
 from mivol.errors import MivolError
-from mivol.fields.export import export_field
-from mivol.fields.scene_file import write_scene
+from mivol.fields.field_archives import save_field
+from mivol.fields.field_files import export_field, write_scene
 from mivol.fields.sky import Sky
-from mivol.fields.spherical import SphericalGrid
-from mivol.fields.spherical_files import save_field
-from mivol.fields.surface import surface_of
+from mivol.fields.spherical_grid import SphericalGrid
+from mivol.fields.surfaces import surface_of
 from mivol.files import read_exr, read_volume, write_exr
 from mivol.photos.photo_file import decode_srgb
 from mivol.scene.load import load_scene

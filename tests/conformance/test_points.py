@@ -11,8 +11,7 @@ from gaussian_sets import inria_bytes, ply_bytes, random_gaussians
 
 from mivol.errors import MivolError
 from mivol.points.cloud import PointCloud, read_points, write_points
-from mivol.points.conversions import gaussians_of_points, points_of_gaussians
-from mivol.points.density import density_of_points, sample_points
+from mivol.points.conversions import density_of_points, gaussians_of_points, points_of_gaussians, sample_points
 
 BOX = np.array([[2.0, 0.5, 0, -1], [0, 3, 0, 4], [0, 0, 1.5, 2], [0, 0, 0, 1]])
 """Unit cube to world: a sheared box of volume 9."""

@@ -12,8 +12,9 @@ import pytest
 from scattering_scenes import cases
 
 from mivol.errors import MivolError
-from mivol.fields.spherical import SphericalGrid, radiance_of_codes
-from mivol.fields.spherical_files import load_field, save_field
+from mivol.fields.field_archives import load_field, save_field
+from mivol.fields.harmonics import radiance_of_codes
+from mivol.fields.spherical_grid import SphericalGrid
 from mivol.files import encode_srgb
 from mivol.photos.photo_file import decode_srgb
 from scenes import box_of, camera, centred, refused, render, rotation, sky, tensor, transform

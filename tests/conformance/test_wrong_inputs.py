@@ -12,10 +12,9 @@ import pytest
 from mivol.errors import MivolError
 from mivol.fields.activation import ACTIVATIONS, activation_of
 from mivol.fields.analytic import ExponentialAtmosphere
+from mivol.fields.field_archives import MOST_NODES, _check_own_arrays, _of_ours
 from mivol.fields.procedural import make_procedural
-from mivol.fields.spherical import SphericalGrid
-from mivol.fields.spherical_files import MOST_NODES, _check_kinds, _of_ours
-from mivol.fields.spherical_tensors import with_tensors
+from mivol.fields.spherical_grid import SphericalGrid, with_tensors
 from mivol.optim.events import Upsample
 from mivol.optim.losses import L2, LOSSES, Huber
 from mivol.optim.parameters import Parameter
@@ -25,9 +24,10 @@ from mivol.phase.closed_forms import droplets
 from mivol.phase.measured import NAMES, named_medium
 from mivol.phase.table import Table
 from mivol.photos import Camera
+from mivol.photos.camera import PIXELS_LOST
 from mivol.scene.cameras import Ring, rig_from
 from mivol.scene.parsing import parse_dict, parse_file
-from mivol.scene.photographs import PIXELS_LOST, sensor_of
+from mivol.scene.photographs import sensor_of
 from mivol.scene.refusals import refuse_quadrature
 from mivol.transport.path.estimators import Settings
 from mivol.validate.images import judge
@@ -139,7 +139,7 @@ def test_harmonics_of_a_file_belong_to_its_nodes(sh: tuple[int, ...]) -> None:
     says = refusal_of(_of_ours, "f", arrays(sh=np.zeros(sh, np.float32)))
     assert says == f"f holds (8,) densities and {sh} harmonics for 8 nodes; write it again."
     large = arrays(res=(2048, 2048, 1024))
-    assert refusal_of(_check_kinds, "f", large).startswith("f has a grid of 2048 x 2048 x 1024 nodes;")
+    assert refusal_of(_check_own_arrays, "f", large).startswith("f has a grid of 2048 x 2048 x 1024 nodes;")
 
 
 # -- Scenes ------------------------------------------------------------------------------------------------------------

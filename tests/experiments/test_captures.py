@@ -11,7 +11,7 @@ import pytest
 from capture_photos import capture, write_capture
 
 from mivol.cli import main
-from mivol.fields.spherical_files import load_field
+from mivol.fields.field_archives import load_field
 from mivol.optim.loop import begin_fit
 from mivol.optim.photographs.field_view import render_view
 from mivol.optim.photographs.radiance_plan import PRESETS, FitPlan, Stage

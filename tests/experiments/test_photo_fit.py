@@ -19,8 +19,8 @@ from mivol import config
 from mivol.cli import main
 from mivol.errors import MivolError
 from mivol.experiments import photo_data, photo_fit, photo_outputs, photo_plan
-from mivol.fields.spherical import SphericalGrid
-from mivol.fields.spherical_files import load_field
+from mivol.fields.field_archives import load_field
+from mivol.fields.spherical_grid import SphericalGrid
 from mivol.files import read_exr, write_exr, write_png
 from mivol.optim.photographs.field_view import render_view
 from mivol.optim.photographs.radiance_plan import FEW, PRESETS, FitPlan, Stage, stretched

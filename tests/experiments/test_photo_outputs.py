@@ -9,8 +9,8 @@ import pytest
 from PIL import Image
 
 from mivol.experiments import photo_outputs
-from mivol.fields.spherical import SphericalGrid
-from mivol.fields.spherical_files import save_field
+from mivol.fields.field_archives import save_field
+from mivol.fields.spherical_grid import SphericalGrid
 from mivol.files import read_volume
 from mivol.optim.photographs.field_view import FieldView
 from mivol.photos import Camera, intrinsics

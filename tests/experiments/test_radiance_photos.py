@@ -19,9 +19,9 @@ from mivol.experiments.judged_views import write_view
 from mivol.experiments.photo_data import MIDDLE_GREY, exposed, notes, read_photos
 from mivol.experiments.photo_outputs import judge_fitted, save_found
 from mivol.experiments.photo_plan import batches_of, make_plan, suited
+from mivol.fields.field_archives import load_field
 from mivol.fields.sky import Sky
-from mivol.fields.spherical import SphericalGrid
-from mivol.fields.spherical_files import load_field
+from mivol.fields.spherical_grid import SphericalGrid
 from mivol.files import encode_srgb, read_exr, write_exr, write_png
 from mivol.optim.photographs.field_view import render_view
 from mivol.optim.photographs.radiance_problem import RadianceProblem

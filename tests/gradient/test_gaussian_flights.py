@@ -12,7 +12,7 @@ from scattering_scenes import close_up, mivol, point
 from scipy.special import logit
 
 import scenes
-from mivol.fields.gaussians import NAMES
+from mivol.fields.gaussian_field import NAMES
 from mivol.validate.moments import Moments
 from mivol.validate.statistics import Estimate
 

@@ -13,7 +13,7 @@ import pytest
 from false_alarms import assert_precise, assert_same_mean, fresh
 from scipy.special import logit
 
-from mivol.fields.gaussians import HARMONICS, NAMES
+from mivol.fields.gaussian_field import HARMONICS, NAMES
 from mivol.points.gaussians import CONSTANT_HARMONIC
 from mivol.validate.moments import Moments
 from mivol.validate.statistics import Estimate

@@ -44,7 +44,8 @@ from scattering_scenes import Pencils, pencils
 from scipy.special import lpmv
 
 from mivol.fields.activation import ACTIVATIONS
-from mivol.fields.spherical import MAX_DEGREE, SphericalGrid, basis_size
+from mivol.fields.harmonics import MAX_DEGREE, basis_size
+from mivol.fields.spherical_grid import SphericalGrid
 from mivol.optim.loop import begin_fit, reconstruct
 from mivol.optim.photographs.field_view import render_view
 from mivol.optim.photographs.radiance_plan import PRESETS, FitPlan, Stage

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from ball_photos import BOX, CUBE, PLAN, camera, fitted
 
-from mivol.fields.spherical import SphericalGrid
+from mivol.fields.spherical_grid import SphericalGrid
 from mivol.optim.photographs.colour_scale import EPSILON, SCALES
 from mivol.optim.photographs.field_view import render_view
 from mivol.optim.photographs.radiance_problem import RadianceProblem

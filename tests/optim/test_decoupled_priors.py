@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from ball_photos import CUBE
 
-from mivol.fields.spherical import SphericalGrid, is_covered
+from mivol.fields.spherical_grid import SphericalGrid, is_covered
 from mivol.optim.priors import Neighbours, Rows, Smoothness, decay_view_dependence, smooth, sparsify
 
 

@@ -8,7 +8,7 @@ import pytest
 from fit_scene import KEY, absorbing_scene, camera, frontal, views_of_truth
 
 from mivol.errors import MivolError
-from mivol.fields.spherical import SphericalGrid
+from mivol.fields.spherical_grid import SphericalGrid
 from mivol.optim.first_order import Adam
 from mivol.optim.parameters import Parameter
 from mivol.optim.scenes import emissive_start

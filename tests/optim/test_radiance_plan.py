@@ -10,7 +10,7 @@ import pytest
 from ball_photos import BOX, PLAN
 
 from mivol.errors import MivolError
-from mivol.fields.spherical import basis_size, row_width
+from mivol.fields.harmonics import basis_size, row_width
 from mivol.optim.photographs import radiance_plan
 from mivol.optim.photographs.radiance_plan import PRESETS, RAY, SHELL, FitPlan, Stage, bytes_of, held, memory_of, place_grid
 from mivol.optim.photographs.ray_batches import TILE, RayBatches

@@ -37,7 +37,7 @@ from mivol.bench.harness.timing import Contestant, Timing, race, ratio_of
 from mivol.bench.studies.gaussian_choices import exposure_gain, mip_gain
 from mivol.bench.studies.gaussian_fits import Fitted, fit_and_judge
 from mivol.bench.studies.optical_depth.work import Work, camera_rays
-from mivol.fields.gaussians import HARMONICS, NAMES
+from mivol.fields.gaussian_field import HARMONICS, NAMES
 from mivol.photos.camera import Camera, intrinsics
 from mivol.points import Gaussians, read_gaussians
 from mivol.splatting import Splatter, tensors_of

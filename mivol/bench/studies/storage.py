@@ -5,8 +5,8 @@
 The lecture's own count is 4 bytes a cell, 8 bits each of r, g, b and density: 4 GiB at 1024^3, one colour for all directions.
 Below it: four numbers of 32 bits (16 on disk), harmonics of degree 0 to 3 on a dense grid, and the same where only the nodes
 near a surface are kept. `--kept` is their share at 128^3; a surface's share halves with each doubling of the resolution.
-Memory is float32 as mivol.fields.spherical lays it out: rows filled up to a multiple of 4 (degree 0 takes 4 numbers and not
-3), and for a sparse field the list of its nodes and the row of vacuum. Files are half floats, before they are compressed.
+Memory is float32 as mivol.fields.spherical_grid lays it out: rows filled up to a multiple of 4 (degree 0 takes 4 numbers and
+not 3), and for a sparse field the list of its nodes and the row of vacuum. Files are half floats, before they are compressed.
 
 The walk reads an index beside that: two bits for each node and half a bit for each cell of the box, whatever is kept, twelve
 bytes for each brick of 4^3 cells near a surface, and for each such cell the corners of it
@@ -29,7 +29,7 @@ from pathlib import Path
 import numpy as np
 
 from mivol.errors import MivolError
-from mivol.fields.spherical import basis_size, row_width
+from mivol.fields.harmonics import basis_size, row_width
 
 __all__ = ["Fitted", "Kind", "count_cells", "dense_bytes", "file_bytes", "index_bytes", "kinds", "main", "sparse_bytes"]
 

@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 
 from mivol.fields.sky import Sky
-from mivol.fields.spherical import SphericalGrid
+from mivol.fields.spherical_grid import SphericalGrid
 from mivol.photos import Camera, pixel_centres, rays
 from mivol.transport.line_integrals.radiance_field import RayBundle, cells_of, model_of, render
 from mivol.transport.line_integrals.radiance_source import bake

@@ -15,7 +15,7 @@ import mitsuba as mi
 import numpy as np
 
 from mivol.errors import MivolError
-from mivol.fields.spherical import basis_size, row_width
+from mivol.fields.harmonics import basis_size, row_width
 from mivol.machine import available_memory
 from mivol.optim.events import CoarseToFine, DropUnseen, Event, UpdateOccupancy
 from mivol.optim.first_order import RMSprop

@@ -26,9 +26,10 @@ from scipy.ndimage import maximum_filter
 
 from mivol.errors import MivolError
 from mivol.fields.activation import activation_of
+from mivol.fields.harmonics import basis_size, row_width
 from mivol.fields.resampling import resample_field
 from mivol.fields.sky import TEXEL, Sky
-from mivol.fields.spherical import SphericalGrid, basis_size, is_covered, row_width
+from mivol.fields.spherical_grid import SphericalGrid, is_covered
 from mivol.optim.loop import Fit, begin_fit
 from mivol.optim.photographs.colour_scale import SCALES
 from mivol.optim.photographs.depth_supervision import Sightings, by_transmittance, draw_sightings

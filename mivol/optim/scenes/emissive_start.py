@@ -29,7 +29,7 @@ import numpy as np
 from scipy.ndimage import map_coordinates
 
 from mivol.errors import MivolError
-from mivol.fields.spherical import SphericalGrid
+from mivol.fields.spherical_grid import SphericalGrid
 from mivol.files.image_files import encode_srgb
 from mivol.optim.loop import begin_fit
 from mivol.optim.optimizer import Optimiser

@@ -17,22 +17,26 @@ References: Max 1995 (the emission-absorption integral).
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import drjit as dr
 import mitsuba as mi
 
+from mivol.transport.estimators.scores import FORWARD
+from mivol.transport.estimators.segment import PathSegment, SegmentEstimate, SegmentLight, SegmentTransmittance
 from mivol.transport.line_integrals.composite import Composite, composite_ray, vjp_composite
 from mivol.transport.line_integrals.integrand import LineIntegral, RayPiece
 from mivol.transport.media.body import medium_interaction
 from mivol.transport.media.channels import by_channel, spectrum, tangent_of
 from mivol.transport.media.compositing import CellIntegral
-from mivol.transport.media.ray_intervals import RaySegment
+from mivol.transport.media.optical_depth import transmittance
+from mivol.transport.media.ray_intervals import RaySegment, visit_media
 from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.traversal.cell_quadrature import share_opacity, weigh_emission_density
 from mivol.transport.traversal.interpolation import GAUSS
+from mivol.transport.traversal.random_numbers import Strata
 
-__all__ = ["integrate_emission", "vjp_emission"]
+__all__ = ["integrate_emission", "vjp_emission", "Emission"]
 
 
 BLACK = 1000.0
@@ -57,7 +61,7 @@ def integrate_emission(media: SceneMedia, ray_segment: RaySegment, active: mi.Bo
     Bias: of the order dt^4 of a cell; none for a constant source function. Cost: a walk of each medium and two look-ups of
         its emission a cell.
     """
-    line = LineIntegral(media, _Emission.of(media), ray_segment, active)
+    line = LineIntegral(media, _EmissionIntegrand.of(media), ray_segment, active)
     return composite_ray(line, [mi.Float(0)] * line.integrand.rows, tangent, skip=not tangent)
 
 
@@ -76,13 +80,13 @@ def vjp_emission(
         weight: d loss / d light of each colour, at the origin of the ray.
         behind: d loss / d log T of each colour: the derivative times the light from behind the ray, as the camera sees it.
     """
-    line = LineIntegral(media, _Emission.of(media), ray_segment, active)
+    line = LineIntegral(media, _EmissionIntegrand.of(media), ray_segment, active)
     rows, rest = ([v[c] for c in range(line.integrand.rows)] for v in (weight, behind))
     vjp_composite(line, composite, rows, rest)
 
 
 @dataclass
-class _Emission:
+class _EmissionIntegrand:
     """The integrand of emitted light: a row for each colour, over ``channels`` of extinction."""
 
     rows: int
@@ -92,7 +96,7 @@ class _Emission:
     way_out: ClassVar[str] = "take its emission out"
 
     @classmethod
-    def of(cls, media: SceneMedia) -> _Emission:
+    def of(cls, media: SceneMedia) -> _EmissionIntegrand:
         return cls(dr.size_v(mi.Spectrum), media.channels)
 
     def cell(self, site: RayPiece, sigma: list[list[mi.Float]]) -> list[CellIntegral]:
@@ -266,3 +270,77 @@ def _evaluate(field: mi.Volume | mi.Float | mi.Color3f, site: RayPiece, t: mi.Fl
 def _by_point(pairs: list[tuple[mi.Float, mi.Float]]) -> list[mi.Spectrum]:
     """A spectrum for each of the two points, from the (first, second) pair of each channel."""
     return [spectrum([pair[q] for pair in pairs]) for q in range(2)]
+
+
+class Emission:
+    """The segment estimator for media that emit and absorb, without scattering.
+
+    Bias and cost: as :func:`mivol.transport.line_integrals.emission.integrate_emission`. Variance: none.
+    """
+
+    directions = "none"
+    ends_in_media = False
+
+    def __init__(self, media: SceneMedia) -> None:
+        self.media = media
+
+    def draw(self, sampler: mi.Sampler, active: mi.Bool, strata: Strata | None) -> Any:
+        """Draw nothing: the estimate is deterministic."""
+
+    def prepare_derivatives(self, ray: mi.Ray3f) -> None:
+        """Nothing is needed."""
+
+    def replayed(self) -> Emission:
+        """The light of emission is met again by a replay."""
+        return self
+
+    def estimate(self, segment: PathSegment, purpose: str, active: mi.Bool) -> SegmentEstimate:
+        """Follow a segment to its end and sum its emission, for the purpose PICTURE, REVERSE or FORWARD."""
+        media = self.media
+        end, _ = visit_media(media, segment.ray, segment.medium, lambda state, _: state, mi.Float(0), active)
+        passed = RaySegment(segment.ray, segment.medium, end.t)
+        composite = integrate_emission(media, passed, active, tangent=purpose == FORWARD)
+        shared = _EmittingSegment(media, segment, passed, composite, active)
+        light = SegmentLight(shared, dr.select(active, shared.seen * shared.rows(0), 0), is_replayed=True)
+        T = transmittance([mi.Float(t) for t in composite.tau[: media.channels]])
+        return SegmentEstimate(end, T, light, SegmentTransmittance(shared))
+
+
+@dataclass
+class _EmittingSegment:
+    """A segment with its composite: the derivatives of its light and of its transmittance (a ``SharedSegment``).
+
+    The rows of the composite are the light of each colour; those of its tangent follow, where it is asked for.
+    """
+
+    media: SceneMedia
+    segment: PathSegment
+    passed: RaySegment
+    composite: Composite
+    active: mi.Bool
+    dL: mi.Spectrum | None = None
+
+    @property
+    def seen(self) -> mi.Spectrum:
+        """What multiplies the light of the media."""
+        weight = self.segment.emission_weight
+        return self.segment.beta if weight is None else self.segment.beta * weight
+
+    def rows(self, block: int) -> mi.Spectrum:
+        """The light (block 0), or its tangent (block 1)."""
+        k = dr.size_v(mi.Spectrum)
+        return mi.Spectrum(*self.composite.N[block * k : (block + 1) * k])
+
+    def vjp_light(self, dL: mi.Spectrum) -> None:
+        """Do nothing yet: the sweep in :meth:`vjp` finds the derivatives of light and transmittance together."""
+
+    def vjp(self, dlog: mi.Spectrum) -> None:
+        vjp_emission(self.media, self.passed, self.composite, self.dL * self.seen, dlog, self.active)
+
+    def jvp_light(self) -> mi.Spectrum:
+        return dr.select(self.active, self.seen * self.rows(1), 0)
+
+    def jvp_transmittance(self) -> mi.Spectrum:
+        k = dr.size_v(mi.Spectrum)
+        dtau = spectrum([mi.Float(t) for t in self.composite.tau[k : k + self.media.channels]])
+        return -dr.select(self.active, dtau, 0)

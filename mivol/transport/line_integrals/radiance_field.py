@@ -33,7 +33,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mivol.fields.activation import Activation
-from mivol.fields.spherical import SphericalGrid
+from mivol.fields.spherical_grid import SphericalGrid
 from mivol.transport.line_integrals.radiance_source import CellValues, Source
 from mivol.transport.traversal.cell_quadrature import share_opacity
 from mivol.transport.traversal.interpolation import GAUSS, interpolate, weights

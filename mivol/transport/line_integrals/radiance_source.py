@@ -20,7 +20,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mivol.fields.spherical import SphericalGrid
+from mivol.fields.spherical_grid import SphericalGrid
 from mivol.transport.line_integrals.carried_face import CellCorners, Face, Sums, read_corners
 from mivol.transport.traversal.occupied_cells import Cells
 from mivol.transport.traversal.occupied_walk import CellVisitor

@@ -9,9 +9,9 @@ from typing import Any, ClassVar
 import drjit as dr
 import mitsuba as mi
 
-from mivol.fields.gaussian_colour import blocks_of
+from mivol.fields.gaussian_field import GaussianField
 from mivol.fields.gaussian_line import ROW, SCALE, Line, Slopes, change_of, read_row
-from mivol.fields.gaussians import GaussianField
+from mivol.fields.harmonics import blocks_of
 from mivol.numerics import greater, lesser
 from mivol.transport.media.extinction import RayInterval
 from mivol.transport.traversal.grid_walk import Cell, walk

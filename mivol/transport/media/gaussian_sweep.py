@@ -25,8 +25,8 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from mivol.fields.gaussian_colour import colour_along, colour_slopes, read_harmonics, sums_along
 from mivol.fields.gaussian_line import ROW, Line, cross, read_row
+from mivol.fields.harmonics import colour_along, colour_slopes, read_harmonics, sums_along
 from mivol.numerics import greater, lesser, one_minus_exp
 from mivol.transport.media.channels import LUMINANCE
 from mivol.transport.media.compositing import BodyIntegral, CellIntegral, ReverseState, pass_cell, put_in_front, zeros

@@ -17,9 +17,9 @@ import mitsuba as mi
 import numpy as np
 
 from mivol.errors import MivolError
-from mivol.fields.gaussians import GaussianField
+from mivol.fields.gaussian_field import GaussianField
 from mivol.fields.protocol import BOUNDED, Field
-from mivol.fields.spherical import SphericalGrid
+from mivol.fields.spherical_grid import SphericalGrid
 from mivol.transport.media.extinction import BoundedExtinction, ConstantExtinction, Extinction
 from mivol.transport.media.gaussian_extinction import GaussianExtinction
 from mivol.transport.media.grid_extinction import ActivatedGridExtinction, GridExtinction

@@ -10,7 +10,7 @@ import numpy as np
 from mivol.bench.extinctions import DATA, TO_WORLD
 from mivol.bench.studies.radiance_field.size import Size
 from mivol.bench.studies.radiance_field.views import BOX, photographed, ring
-from mivol.fields.spherical import SphericalGrid
+from mivol.fields.spherical_grid import SphericalGrid
 from mivol.optim.loop import reconstruct
 from mivol.optim.photographs.radiance_plan import FitPlan, Stage
 from mivol.optim.photographs.radiance_problem import RadianceProblem

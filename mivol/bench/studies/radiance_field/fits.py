@@ -15,7 +15,7 @@ from mivol.bench.studies.radiance_field.fields import field_of
 from mivol.bench.studies.radiance_field.peer import Peer
 from mivol.bench.studies.radiance_field.size import STOP, Size
 from mivol.bench.studies.radiance_field.views import BLACK, BOX, between, photographed, rays_of, rays_through, ring, tiled
-from mivol.fields.spherical import SphericalGrid
+from mivol.fields.spherical_grid import SphericalGrid
 from mivol.optim.loop import Fit
 from mivol.optim.photographs.field_view import render_view
 from mivol.optim.photographs.radiance_plan import FitPlan, Stage

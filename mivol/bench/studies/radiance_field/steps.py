@@ -16,7 +16,7 @@ from mivol.bench.studies.radiance_field.fields import field_of
 from mivol.bench.studies.radiance_field.peer import Peer
 from mivol.bench.studies.radiance_field.size import STOP, Size
 from mivol.bench.studies.radiance_field.views import camera, rays_of, rays_through, ring, tiled
-from mivol.fields.spherical import SphericalGrid
+from mivol.fields.spherical_grid import SphericalGrid
 from mivol.transport.line_integrals.radiance_field import RayBundle, RayGradient, backward, cells_of, model_of, render
 from mivol.transport.line_integrals.radiance_source import bake, exact, fold
 

@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mivol.fields.spherical import SphericalGrid
+from mivol.fields.spherical_grid import SphericalGrid
 from mivol.optim.photographs.field_view import render_view
 from mivol.photos import Camera, Photo, intrinsics, pixel_centres, rays
 from mivol.photos.camera_path import aim_camera

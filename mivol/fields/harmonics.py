@@ -16,13 +16,88 @@ Sources: Kerbl et al. 2023 (the model); Moenne-Loccoz et al. 2024 (the direction
 
 from __future__ import annotations
 
+import math
+
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
+from mivol.errors import MivolError
 from mivol.fields.gaussian_line import ROW, read_row
-from mivol.fields.spherical import basis_size, radiance_of_codes, slope_of_codes
 
-__all__ = ["blocks_of", "colour_along", "colour_slopes", "read_harmonics", "rows_of_harmonics", "sums_along"]
+__all__ = [
+    "blocks_of",
+    "colour_along",
+    "colour_slopes",
+    "read_harmonics",
+    "rows_of_harmonics",
+    "sums_along",
+    "MAX_DEGREE",
+    "SPACES",
+    "basis_size",
+    "degree_of",
+    "row_width",
+    "radiance_of_codes",
+    "slope_of_codes",
+    "frame_of",
+    "turn_by",
+]
+
+
+MAX_DEGREE = 4
+
+
+SPACES = ("srgb", "linear")
+"""What the colours of a field may be, as of photographs (:mod:`mivol.photos.dataset`)."""
+
+
+def basis_size(degree: int) -> int:
+    """Number of harmonics up to a degree."""
+    return (degree + 1) ** 2
+
+
+def degree_of(basis: int) -> int:
+    """The degree of so many harmonics.
+
+    Raises:
+        MivolError: not 1, 4, 9, 16 or 25.
+    """
+    degree = math.isqrt(max(basis, 0)) - 1
+    if degree < 0 or degree > MAX_DEGREE or basis_size(degree) != basis:
+        raise MivolError(f"{basis} harmonics were given; 1, 4, 9, 16 or 25 (degrees 0 to {MAX_DEGREE}) are expected.")
+    return degree
+
+
+def row_width(basis: int) -> int:
+    """Numbers of a row of harmonics: 3 for each, filled up to a multiple of 4, so that rows move as packets."""
+    return -(-3 * basis // 4) * 4
+
+
+def radiance_of_codes(code: mi.Float) -> mi.Float:
+    """The light of an sRGB code value: the curve of IEC 61966-2-1, followed on above 1 and, straight, below 0.
+
+    The same curve as :func:`mivol.photos.photo_file.decode_srgb`, with derivatives.
+    """
+    # Below -0.055 the power is NaN. It is not selected there, and Dr.Jit takes a derivative of 0 times NaN for 0.
+    bent = dr.power((code + 0.055) / 1.055, 2.4)
+    return dr.select(code <= 0.04045, code / 12.92, bent)
+
+
+def slope_of_codes(code: mi.Float) -> mi.Float:
+    """The derivative of :func:`radiance_of_codes`."""
+    return dr.select(code <= 0.04045, 1 / 12.92, (2.4 / 1.055) * dr.power((code + 0.055) / 1.055, 1.4))
+
+
+def frame_of(to_world: np.ndarray) -> np.ndarray:
+    """(3, 3) map of world directions to a field's own frame: the inverse of the polar factor of its placement (Higham 1986)."""
+    left, _, right = np.linalg.svd(to_world[:3, :3])
+    return (left @ right).T
+
+
+def turn_by(frame: np.ndarray, d: mi.Vector3f) -> mi.Vector3f:
+    """Directions in another frame."""
+    rows = [[dr.opaque(mi.Float, float(v)) for v in row] for row in frame]
+    return mi.Vector3f(*(dr.fma(r[0], d.x, dr.fma(r[1], d.y, r[2] * d.z)) for r in rows))
 
 
 def blocks_of(degree: int) -> int:

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from mivol.errors import MivolError
-from mivol.fields.spherical import SphericalGrid, degree_of
-from mivol.fields.spherical_files import load_field, save_field
-from mivol.fields.spherical_svox2 import save_svox2
+from mivol.fields.field_archives import load_field, save_field, save_svox2
+from mivol.fields.harmonics import degree_of
+from mivol.fields.spherical_grid import SphericalGrid
 from mivol.files import npy
 
 CUBE = np.array([[2.0, 0, 0, -1], [0, 2, 0, -1], [0, 0, 2, -1], [0, 0, 0, 1]])

@@ -3,7 +3,7 @@
 Conventions. Parameters are the pre-images of the activations, as :mod:`mivol.points.gaussians` has them, by the same names:
 "means" (N, 3), "log_scales" (N, 3), "quaternions" (N, 4), "opacity_logits" (N,). The extinction of one along a line is that of
 :mod:`mivol.fields.gaussian_line`; they add up. A Gaussian ends ``REACH`` standard deviations from its mean. "harmonics"
-(N, K, 3), which may be left out, are their colours (:mod:`mivol.fields.gaussian_colour`).
+(N, K, 3), which may be left out, are their colours (:mod:`mivol.fields.harmonics`).
 
 Low-pass. Splatting widens each Gaussian in the image, by 0.3 pixel^2 in published files, and keeps its opacity: a fit has
 Gaussians that are far thinner than that, and looks as it does with the filter. ``blur`` b does the same in space: the
@@ -26,11 +26,10 @@ import numpy as np
 
 from mivol.errors import MivolError
 from mivol.fields.gaussian_cells import CellLists, list_gaussians
-from mivol.fields.gaussian_colour import rows_of_harmonics
 from mivol.fields.gaussian_grid import MOST_OPAQUE
 from mivol.fields.gaussian_line import REACH, ROW, Line, cross, read_row
+from mivol.fields.harmonics import SPACES, degree_of, frame_of, rows_of_harmonics, turn_by
 from mivol.fields.protocol import EXACT_LINE
-from mivol.fields.spherical import SPACES, degree_of, frame_of, turn_by
 from mivol.points.gaussian_files import read_gaussians
 from mivol.points.gaussians import Gaussians
 from mivol.space import check_affine
@@ -69,9 +68,7 @@ class GaussianField:
     line = EXACT_LINE
     channels = 1
 
-    def __init__(
-        self, tensors: Mapping[str, mi.TensorXf], place: np.ndarray, space: str = "srgb", blur: float = 0.0
-    ) -> None:
+    def __init__(self, tensors: Mapping[str, mi.TensorXf], place: np.ndarray, space: str = "srgb", blur: float = 0.0) -> None:
         if not 0 <= blur < math.inf:
             raise MivolError(f"the blur of Gaussians is {blur:.4g}; a finite length of at least 0 is expected.")
         if space not in SPACES:
@@ -164,7 +161,7 @@ class GaussianField:
         return degree_of(self.tensors[HARMONICS].shape[1])
 
     def colour_rows(self) -> mi.Float:
-        """The harmonics of all Gaussians in blocks (:mod:`mivol.fields.gaussian_colour`), attached to the parameter."""
+        """The harmonics of all Gaussians in blocks (:mod:`mivol.fields.harmonics`), attached to the parameter."""
         return rows_of_harmonics(self.tensors[HARMONICS], self.degree)
 
     def harmonics_of(self, d: mi.Vector3f) -> list[mi.Float]:

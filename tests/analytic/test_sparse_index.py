@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mivol.fields.listed_places import ListedPlaces
+from mivol.fields.sparse_index import ListedPlaces
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
 

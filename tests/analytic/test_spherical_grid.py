@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from mivol.errors import MivolError
-from mivol.fields.spherical import basis_size, degree_of, row_width
+from mivol.fields.harmonics import basis_size, degree_of, row_width
 
 
 @pytest.mark.parametrize(("degree", "basis", "width"), [(0, 1, 4), (1, 4, 12), (2, 9, 28), (3, 16, 48), (4, 25, 76)])

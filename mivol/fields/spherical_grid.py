@@ -41,54 +41,17 @@ import numpy as np
 from mivol.device_arrays import aligned
 from mivol.errors import MivolError
 from mivol.fields.activation import Activation, activation_of
-from mivol.fields.listed_places import ListedPlaces
+from mivol.fields.harmonics import SPACES, basis_size, degree_of, frame_of, radiance_of_codes, row_width, turn_by
+from mivol.fields.sparse_index import ListedPlaces
 from mivol.files.notebook import slices_html
 from mivol.shown import briefly
 from mivol.space import check_affine, lattice_from_world
 
-__all__ = [
-    "MAX_DEGREE",
-    "SPACES",
-    "SphericalGrid",
-    "basis_size",
-    "degree_of",
-    "frame_of",
-    "is_covered",
-    "radiance_of_codes",
-    "row_width",
-    "slope_of_codes",
-    "turn_by",
-]
+__all__ = ["SphericalGrid", "is_covered", "with_tensors", "dense_densities"]
 
-MAX_DEGREE = 4
 
 HOMOGENEOUS = ("none", "relu")
 """Activations of nested fields: a density n times as large is an extinction n times as large."""
-
-SPACES = ("srgb", "linear")
-"""What the colours of a field may be, as of photographs (:mod:`mivol.photos.dataset`)."""
-
-
-def basis_size(degree: int) -> int:
-    """Number of harmonics up to a degree."""
-    return (degree + 1) ** 2
-
-
-def degree_of(basis: int) -> int:
-    """The degree of so many harmonics.
-
-    Raises:
-        MivolError: not 1, 4, 9, 16 or 25.
-    """
-    degree = math.isqrt(max(basis, 0)) - 1
-    if degree < 0 or degree > MAX_DEGREE or basis_size(degree) != basis:
-        raise MivolError(f"{basis} harmonics were given; 1, 4, 9, 16 or 25 (degrees 0 to {MAX_DEGREE}) are expected.")
-    return degree
-
-
-def row_width(basis: int) -> int:
-    """Numbers of a row of harmonics: 3 for each, filled up to a multiple of 4, so that rows move as packets."""
-    return -(-3 * basis // 4) * 4
 
 
 def is_covered(node: mi.UInt32, res: tuple[int, int, int]) -> mi.Bool:
@@ -466,32 +429,44 @@ class SphericalGrid:
         return replace(self, density=density, harmonics=harmonics)
 
 
-def radiance_of_codes(code: mi.Float) -> mi.Float:
-    """The light of an sRGB code value: the curve of IEC 61966-2-1, followed on above 1 and, straight, below 0.
-
-    The same curve as :func:`mivol.photos.photo_file.decode_srgb`, with derivatives.
-    """
-    # Below -0.055 the power is NaN. It is not selected there, and Dr.Jit takes a derivative of 0 times NaN for 0.
-    bent = dr.power((code + 0.055) / 1.055, 2.4)
-    return dr.select(code <= 0.04045, code / 12.92, bent)
-
-
-def slope_of_codes(code: mi.Float) -> mi.Float:
-    """The derivative of :func:`radiance_of_codes`."""
-    return dr.select(code <= 0.04045, 1 / 12.92, (2.4 / 1.055) * dr.power((code + 0.055) / 1.055, 1.4))
-
-
-def frame_of(to_world: np.ndarray) -> np.ndarray:
-    """(3, 3) map of world directions to a field's own frame: the inverse of the polar factor of its placement (Higham 1986)."""
-    left, _, right = np.linalg.svd(to_world[:3, :3])
-    return (left @ right).T
-
-
-def turn_by(frame: np.ndarray, d: mi.Vector3f) -> mi.Vector3f:
-    """Directions in another frame."""
-    rows = [[dr.opaque(mi.Float, float(v)) for v in row] for row in frame]
-    return mi.Vector3f(*(dr.fma(r[0], d.x, dr.fma(r[1], d.y, r[2] * d.z)) for r in rows))
-
-
 def _affine(row: list[mi.Float], v: mi.Vector3f, rest: mi.Float) -> mi.Float:
     return dr.fma(row[0], v[0], dr.fma(row[1], v[1], dr.fma(row[2], v[2], rest)))
+
+
+def with_tensors(field: SphericalGrid, density: mi.TensorXf, sh: mi.TensorXf) -> SphericalGrid:
+    """The same field with other values; ``sh`` may have another degree.
+
+    Raises:
+        MivolError: shapes that are not those of the field.
+    """
+    nodes = field.shape if field.nodes is None else (dr.width(field.nodes),)
+    if tuple(density.shape) != (*nodes, 1) or tuple(sh.shape[:-2]) != nodes or sh.shape[-1] != 3:
+        raise MivolError(
+            f"density {tuple(density.shape)} and sh {tuple(sh.shape)} were given; {(*nodes, 1)} and {(*nodes, 'basis', 3)} are "
+            "expected."
+        )
+    basis = sh.shape[-2]
+    count, width = math.prod(nodes), row_width(basis)
+    vacuum = field.nodes is not None
+    flat = density.array
+    if vacuum:
+        row = dr.arange(mi.UInt32, count + 1)
+        flat = dr.select(row < count, dr.gather(mi.Float, flat, dr.minimum(row, count - 1)), field.act.vacuum)
+    entry = dr.arange(mi.UInt32, (count + vacuum) * width)
+    row, column = entry // width, entry % width
+    held = (row < count) & (column < 3 * basis)
+    harmonics = dr.gather(mi.Float, sh.array, row * (3 * basis) + column, held)
+    return replace(field, degree=degree_of(basis), density=flat, harmonics=harmonics)
+
+
+def dense_densities(field: SphericalGrid) -> list[mi.TensorXf]:
+    """The raw density at every node of each level, (Z, Y, X, 1), with the vacuum where nothing is stored.
+
+    They are those of each level in lengths of the world: 2^-l of what level l stores.
+    """
+    if field.nodes is None and field.levels == 1:
+        return [mi.TensorXf(field.density, (*field.res, 1))]
+    node = dr.arange(mi.UInt32, math.prod(field.res))
+    rows = [field.row_of(node + k * dr.width(node)) for k in range(field.levels)]
+    parts = [dr.gather(mi.Float, field.density, row) * 2.0**-k for k, row in enumerate(rows)]
+    return [mi.TensorXf(part, (*field.res, 1)) for part in parts]

@@ -11,10 +11,10 @@ import pytest
 from mivol.cli import main
 from mivol.errors import MivolError
 from mivol.fields.activation import ACTIVATIONS
-from mivol.fields.export import EXPORTS, export_field
-from mivol.fields.spherical import SphericalGrid
-from mivol.fields.spherical_files import load_field, save_field
-from mivol.fields.surface import INVERSES, level_of, surface_of
+from mivol.fields.field_archives import load_field, save_field
+from mivol.fields.field_files import EXPORTS, export_field
+from mivol.fields.spherical_grid import SphericalGrid
+from mivol.fields.surfaces import INVERSES, level_of, surface_of
 from mivol.files import encode_srgb, read_volume
 from mivol.files.mesh import Mesh, read_ply, write_mesh
 from scenes import centred, rotation
