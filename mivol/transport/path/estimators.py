@@ -22,7 +22,7 @@ from mivol.transport.estimators.single_scattering.shadow_tables import (
     VisibilityCache,
 )
 from mivol.transport.estimators.single_scattering.single_scattering import SingleScattering
-from mivol.transport.line_integrals.emitting_segment import Emission
+from mivol.transport.line_integrals.emission import Emission
 from mivol.transport.media.scene_media import SceneMedia
 
 __all__ = [
