@@ -8,7 +8,7 @@ failing, an import that breaks does not.
     scripts/mutate.py --sample 12 --seed 7   twelve, drawn by the seed
     scripts/mutate.py --only '*lattice*'     those whose file, test or list matches
     scripts/mutate.py --random 60 --seed 7   not these: 60 faults drawn from the whole package, and the share that the
-                                             tests of their modules notice (faults.py, guards.py, survivors.py); from a part
+                                             tests of their modules notice (the folder mutation/); from a part
                                              of it with --only 'mivol/scene/*'
 """
 
@@ -30,9 +30,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from faults import Fault, draw_faults, read_package
-from guards import index_guards
-from survivors import Checkout, judge_all, report
+from mutation.faults import Fault, draw_faults, read_package
+from mutation.guards import index_guards
+from mutation.survivors import Checkout, judge_all, report
 
 ROOT = Path(__file__).resolve().parents[1]
 LEFT_OUT = (".git", ".venv", "runs", "__pycache__", ".pytest_cache", ".ruff_cache", ".hypothesis", "dist", "build")

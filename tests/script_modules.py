@@ -1,4 +1,4 @@
-"""The scripts as modules, for tests of what they share."""
+"""Scripts as modules, for tests of their parts."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ import sys
 from pathlib import Path
 from types import ModuleType
 
-SCRIPTS = Path(__file__).resolve().parents[1] / "scripts"
+ROOT = Path(__file__).resolve().parents[1]
+FOLDERS = (ROOT / "scripts", ROOT / ".ci")
 
 
 def load(name: str) -> ModuleType:
-    """A script as a module; scripts find what they share beside them."""
-    if str(SCRIPTS) not in sys.path:
-        sys.path.append(str(SCRIPTS))
+    """A script of scripts/ or .ci/ as a module; it imports its neighbours by their names."""
+    sys.path.extend(str(folder) for folder in FOLDERS if str(folder) not in sys.path)
     return importlib.import_module(name)

@@ -1,4 +1,4 @@
-"""A sound file of every format that is read, and what reads it: what ``scripts/fuzz_files.py`` breaks.
+"""A sound file of every format that is read, and what reads it: what ``.ci/fuzz_files.py`` breaks.
 
 Here: :data:`FILES`, formats of one file; :data:`SETS`, what lies in several files, of which one at a time is broken.
 """

@@ -7,10 +7,8 @@ from collections.abc import Callable, Iterable
 from functools import cache
 from pathlib import Path
 
-from script_modules import load
+import shape
 from syntax import tree_of
-
-shape = load("shape")
 
 PACKAGE = Path(__file__).resolve().parents[1] / "mivol"
 ORDER = [
@@ -75,9 +73,7 @@ def test_imports_point_up() -> None:
 def test_nothing_imports_the_benches() -> None:
     """They measure mivol; nothing that a user runs needs them, but the verb that runs them."""
     rooms = {path: room_of(path) for path in MODULES}
-    found = [
-        name for path, room in rooms.items() if room != "bench" for name, _ in imported(path) if "mivol.bench" in name
-    ]
+    found = [name for path, room in rooms.items() if room != "bench" for name, _ in imported(path) if "mivol.bench" in name]
     assert set(found) == {"mivol.bench.harness.catalogue.list_studies", "mivol.bench.harness.catalogue.run_study"}
 
 

@@ -16,7 +16,7 @@ from syntax import tree_of
 
 ROOT = Path(__file__).resolve().parents[1]
 
-mutate, faults, guards, survivors = map(load, ("mutate", "faults", "guards", "survivors"))
+mutate, faults, guards, survivors = map(load, ("mutate", "mutation.faults", "mutation.guards", "mutation.survivors"))
 ENTRIES = mutate.load_entries()
 
 MOST_ENTRIES, LEAST_IN_ROOM = 400, 8

@@ -31,7 +31,7 @@ def split_line(line: str) -> Iterator[list[str]]:
     for part in line.strip().split("&&"):
         with contextlib.suppress(ValueError):
             words = shlex.split(part, comments=True)
-            if words and (words[0].startswith(("./", "scripts/")) or (words[0] in PROGRAMS and len(words) > 1)):
+            if words and (words[0].startswith(("./", ".ci/", "scripts/")) or (words[0] in PROGRAMS and len(words) > 1)):
                 yield words
 
 
@@ -51,7 +51,7 @@ def find_faults(command: str) -> list[str]:
     program, *rest = words if words[0] not in ("python", ".venv/bin/python") else words[1:]
     if program == "-m":
         program, *rest = rest
-    missing = [word for word in words if word.startswith(("scenes/", "scripts/", "./")) and not any(ROOT.glob(word))]
+    missing = [word for word in words if word.startswith(("scenes/", "scripts/", ".ci/", "./")) and not any(ROOT.glob(word))]
     if missing:
         return missing
     if program == "mivol":

@@ -1,12 +1,10 @@
-"""The figures of scripts/shape.py, on a package small enough to count by hand."""
+"""The figures of tests/shape.py, on a package small enough to count by hand."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-from script_modules import load
-
-shape = load("shape")
+import shape
 
 
 def test_figures_of_a_small_package(tmp_path: Path) -> None:

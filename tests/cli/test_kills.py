@@ -1,4 +1,4 @@
-"""Killed at any moment and on a full disk: nothing half-written, nothing lost; scripts/kills.py does more of it."""
+"""Killed at any moment and on a full disk: nothing half-written, nothing lost; .ci/kills.py does more of it."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ VERBS = ("reference", "export", "convert")
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="processes are forked after their imports")
 def test_killed_verbs_lose_nothing() -> None:
     """One kill and one full disk of each of these verbs; the moments are the script's own, drawn by its seed."""
-    command = [sys.executable, str(ROOT / "scripts" / "kills.py"), *VERBS, "--kills", "1", "--full-disks", "1"]
+    command = [sys.executable, str(ROOT / ".ci" / "kills.py"), *VERBS, "--kills", "1", "--full-disks", "1"]
     done = subprocess.run(
         command, capture_output=True, text=True, timeout=600, check=False, env={**os.environ, "PYTHONPATH": str(ROOT)}
     )

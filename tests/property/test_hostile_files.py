@@ -1,4 +1,4 @@
-"""Broken files of every format are taken or refused in one sentence: a sample of what scripts/fuzz_files.py reads."""
+"""Broken files of every format are taken or refused in one sentence: a sample of what .ci/fuzz_files.py reads."""
 
 from __future__ import annotations
 

@@ -4,8 +4,8 @@ The wheel is installed with its extra ``llvm`` and no other, as ``pip install "m
 its own, with the versions of constraints.txt. There this script runs once more, on scenes and photographs of a few pixels
 that it makes itself: each verb must end with the exit code, the files and the sentences that are written down here.
 
-    scripts/smoke_wheel.py                  all of it, about two minutes with pip's cache
-    scripts/smoke_wheel.py --wheel W.whl    of a wheel that is built already
+    .ci/smoke_wheel.py                  all of it, about two minutes with pip's cache
+    .ci/smoke_wheel.py --wheel W.whl    of a wheel that is built already
 """
 
 from __future__ import annotations

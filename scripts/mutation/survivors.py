@@ -18,8 +18,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from threading import Lock
 
-from faults import Fault
-from guards import Guards
+from mutation.faults import Fault
+from mutation.guards import Guards
 
 __all__ = ["Checkout", "Verdict", "judge_all", "judge_fault", "report", "run_pytest"]
 

@@ -4,10 +4,10 @@ A reader may take a broken file (a changed voxel is a voxel) or refuse it by a M
 fault: another exception, many lines or more than 1000 characters, a crash, a hang. Files are read in child processes with
 a bound on memory and time, so that a crash names its file.
 
-    scripts/fuzz_files.py                        20,000 files: about an hour of one core
-    scripts/fuzz_files.py --files 300 --seed 7   fewer
-    scripts/fuzz_files.py --only nrrd,colmap     of some formats
-    scripts/fuzz_files.py --keep broken          keep the files that showed a fault there
+    .ci/fuzz_files.py                        20,000 files: about an hour of one core
+    .ci/fuzz_files.py --files 300 --seed 7   fewer
+    .ci/fuzz_files.py --only nrrd,colmap     of some formats
+    .ci/fuzz_files.py --keep broken          keep the files that showed a fault there
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Kill each writing verb at random moments, and fill its disk: nothing is half-written, nothing lost, the next try succeeds.
 
-    scripts/kills.py [VERB ...] [--kills 100] [--full-disks 20] [--seed 0]
+    .ci/kills.py [VERB ...] [--kills 100] [--full-disks 20] [--seed 0]
 
 Between two changes of the disk a killed process leaves the same files whenever it dies, so moments are counted by changes (a
 file opened for writing, renamed or removed, a folder made) rather than by the clock. Every change has two moments: before it,

@@ -1,0 +1,1 @@
+"""What ``scripts/mutate.py --random`` draws, which tests it runs, and how it judges them."""
