@@ -322,6 +322,11 @@ class Solve(Section):
     memory: Annotated[float, of("GiB", "most that stored rows may take", gt=0)] = 1.0
     discrepancy: Annotated[float, of("1", "stop where the residual is so many times the noise; 0: never", ge=0)] = 0.0
 
+    @property
+    def solver(self) -> str:
+        """Key of ``mivol.optim.solvers.METHODS``; "auto" stands for pcg."""
+        return "pcg" if self.name == AUTO else self.name
+
     def __post_init__(self) -> None:
         if self.name != AUTO and self.name not in METHODS:
             raise ValueError(f'unknown solver "{self.name}": {nearest(self.name, [AUTO, *METHODS])}'.rstrip("."))

@@ -107,7 +107,7 @@ def explain_flags(sub: argparse.ArgumentParser) -> None:
 
 def render_flags(sub: argparse.ArgumentParser) -> None:
     """Mitsuba's own flags for an image, and the camera of a radiance field, of points and of Gaussians."""
-    from mivol.experiments.view_points import DRAWN_AS
+    from mivol.experiments.render import DRAWN_AS
 
     scene_flags(sub, "Mitsuba XML, a radiance field (.npz) with --look-at, or points or Gaussians (.ply, .npy, .spz, ...)")
     where = "of a field or points: where the camera stands, and what it looks at [length]; default for points: all is seen"
@@ -328,8 +328,7 @@ def own_picture(arguments: argparse.Namespace) -> Callable | None:
         MivolError: a camera for a scene, or none for a field.
     """
     from mivol.experiments.back_end import set_variant
-    from mivol.experiments.view_field import view_field
-    from mivol.experiments.view_points import PointLook, view_points
+    from mivol.experiments.render import PointLook, view_field, view_points
     from mivol.points.summary import SUFFIXES
 
     suffix = arguments.scene.suffix.lower()
@@ -411,7 +410,7 @@ def report(arguments: argparse.Namespace) -> None:
 def export(arguments: argparse.Namespace) -> None:
     """Write a radiance field as a mesh, as volumes, as a scene with the sky beside its file, or for another program."""
     from mivol.experiments.back_end import set_variant
-    from mivol.experiments.view_field import sky_beside
+    from mivol.experiments.render import sky_beside
     from mivol.fields.field_archives import load_field
     from mivol.fields.field_files import export_field
 
@@ -456,8 +455,7 @@ def convert_from_field(arguments: argparse.Namespace) -> str:
 
 def convert_points(arguments: argparse.Namespace, kind: str | None) -> str:
     """Points or Gaussians as a file of a kind; what was written."""
-    from mivol.experiments.gaussian_conversion import convert_to_field
-    from mivol.experiments.gaussian_mesh import convert_to_mesh
+    from mivol.experiments.gaussian_conversion import convert_to_field, convert_to_mesh
     from mivol.points.summary import convert_file
 
     if kind not in ("field", "mesh"):

@@ -19,26 +19,27 @@ from mivol.config import Experiment, FieldFit, Files, GaussianFit, PhotoFit, Sca
 from mivol.errors import MivolError
 from mivol.experiments.back_end import choose_back_end
 from mivol.experiments.camera_pictures import survey_of
-from mivol.experiments.depth import settle_depth
+from mivol.experiments.field_plan import batches_of, choices, make_plan, suited
 from mivol.experiments.film import plan_film
 from mivol.experiments.gaussian_start import begin, make_gaussian_plan
 from mivol.experiments.photo_data import boxed, read_photos
-from mivol.experiments.photo_plan import batches_of, choices, make_plan, suited
 from mivol.experiments.projections import beam_of, fitted_views, held_out_views, make_data, make_grid
 from mivol.experiments.references import (
     References,
     camera_of,
+    check_truth,
     find_sensors,
     load_experiment_scene,
+    make_truth,
+    put,
     read_references,
 )
 from mivol.experiments.scan_fit import make_problem as make_scan_problem
 from mivol.experiments.scan_fit import make_projector, make_solver, noise_of, settle
-from mivol.experiments.scan_storage import choose_storage
-from mivol.experiments.scene_fit import make_integrator, make_problem
+from mivol.experiments.scene_fit import make_integrator, make_problem, settle_depth
+from mivol.experiments.solver_choice import check_grid, choose_storage
 from mivol.experiments.start import make_starts
 from mivol.experiments.task import Task
-from mivol.experiments.truth import check_truth, make_truth, put
 from mivol.optim.parameters import check_names
 from mivol.optim.photographs.radiance_problem import RadianceProblem
 from mivol.optim.scenes.emissive_start import check_given_start
@@ -153,6 +154,7 @@ def explain_scan_fit(chosen: Scan, base: Path, say: Say) -> Explanation:
     grid = make_grid(chosen, base)
     edges = grid.voxel_size if len(set(grid.voxel_size)) > 1 else grid.voxel_size[:1]
     say(f"  grid      {' x '.join(map(str, grid.shape))} voxels of {' x '.join(f'{edge:g}' for edge in edges)}")
+    check_grid(chosen, grid)
     data = make_data(chosen, base, grid)
     views, rows, columns = data.y.shape
     say(f"  scan      {views} views of {rows} x {columns} pixels, {beam_of(chosen)}")

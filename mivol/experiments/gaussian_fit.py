@@ -12,13 +12,12 @@ from pathlib import Path
 from mivol import config
 from mivol.config import GaussianFit
 from mivol.experiments.back_end import choose_back_end
-from mivol.experiments.best import BestIterate, FilesOfBest
 from mivol.experiments.film import plan_film
 from mivol.experiments.gaussian_outputs import GaussianOutputs, compare
 from mivol.experiments.gaussian_start import begin, make_gaussian_plan
 from mivol.experiments.photo_data import boxed, notes, read_photos
 from mivol.experiments.photo_fit import solve
-from mivol.experiments.run_folder import RunFolder
+from mivol.experiments.run_folder import BestIterate, FilesOfBest, RunFolder
 from mivol.experiments.task import Task
 from mivol.optim.gaussians.gaussian_problem import GaussianProblem
 from mivol.points import Gaussians, write_gaussians

@@ -115,9 +115,7 @@ def write_view(
         write_png(folder / path, SPACES["srgb", "linear"](codes if edge is None else _shrunk(codes, edge)))
         said = caption if role == "render" else ""
         small = edge is not None
-        written.append(
-            Image(path=path, role=role, view=photo.name, held_out=True, quantity=CODES, caption=said, small=small)
-        )
+        written.append(Image(path=path, role=role, view=photo.name, held_out=True, quantity=CODES, caption=said, small=small))
     return written
 
 

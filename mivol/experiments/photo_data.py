@@ -11,7 +11,7 @@ import numpy as np
 
 from mivol.config import GaussianFit, PhotoFit
 from mivol.errors import MivolError
-from mivol.experiments.photo_plan import LEARNED
+from mivol.experiments.field_plan import LEARNED
 from mivol.optim.photographs.colour_scale import EPSILON
 from mivol.optim.strategy import nearest
 from mivol.photos import Photos, PhotoSurvey, load_photos, survey_photos

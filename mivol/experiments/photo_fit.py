@@ -15,12 +15,11 @@ import numpy as np
 from mivol import config
 from mivol.config import FieldFit, PhotoFit
 from mivol.experiments.back_end import choose_back_end
-from mivol.experiments.best import BestIterate, FilesOfBest
+from mivol.experiments.field_plan import batches_of, choices, make_plan, suited
 from mivol.experiments.film import plan_film
 from mivol.experiments.photo_data import boxed, notes, read_photos
 from mivol.experiments.photo_outputs import PhotoOutputs, compare, save_found
-from mivol.experiments.photo_plan import batches_of, choices, make_plan, suited
-from mivol.experiments.run_folder import RunFolder
+from mivol.experiments.run_folder import BestIterate, FilesOfBest, RunFolder
 from mivol.experiments.task import Task
 from mivol.optim.checkpoint import Store
 from mivol.optim.events import Checkpoint
@@ -106,9 +105,7 @@ def solve(
     """
     chosen: PhotoFit = task.chosen
     plan, every = problem.plan, chosen.show.every
-    store = Store(
-        run.checkpoint, {"photos": problem.batches.digest(), **config.flat(config.resolved(chosen))}, task.resume
-    )
+    store = Store(run.checkpoint, {"photos": problem.batches.digest(), **config.flat(config.resolved(chosen))}, task.resume)
     fit = begin_fit(problem, plan.optimiser, plan.course(Checkpoint(every=chosen.checkpoint_every)), store=store)
     best.restore()
     run.begin(fit.next)

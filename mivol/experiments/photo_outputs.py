@@ -114,9 +114,7 @@ def save_found(folder: Path, problem: RadianceProblem, which: str = "", white: f
         write_exr(folder / f"sky{which}.exr", {"": white * problem.sky.image()})
 
 
-def compare(
-    problem: RadianceProblem, judged: Photos, photo: Photo, metrics: tuple[str, ...]
-) -> tuple[FieldView, Quality]:
+def compare(problem: RadianceProblem, judged: Photos, photo: Photo, metrics: tuple[str, ...]) -> tuple[FieldView, Quality]:
     """A photograph's view of the field, and how alike they are."""
     seen = render_view(problem.field, photo.camera, behind(problem, photo))
     asked = {"space": judged.space, "mask": photo.mask, "metrics": metrics, "name": photo.name}

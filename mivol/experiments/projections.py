@@ -11,13 +11,11 @@ import numpy as np
 from mivol import config
 from mivol.config import Cone, Detector, Ellipsoids, Known, Matrices, Measured, Nikon, OfData, Parallel, Stack, Table
 from mivol.errors import MivolError
-from mivol.experiments.nikon_scan import nikon_grid
-from mivol.experiments.readings import ScanReadings, note_order, read_scan
+from mivol.experiments.readings import ScanReadings, nikon_grid, note_order, read_scan
 from mivol.experiments.row_order import note_rows
-from mivol.experiments.scan_memory import check_grid, check_rays
-from mivol.experiments.solver_choice import solver_of
 from mivol.files import read_columns, read_volume
 from mivol.files.fetch import resolve_path
+from mivol.machine import check_fits
 from mivol.optim.projections.linear_problems import PoissonCounts
 from mivol.optim.projections.solvers import METHODS
 from mivol.shown import briefly
@@ -35,6 +33,9 @@ from mivol.tomography.preprocess import (
 from mivol.tomography.projection_matrices import panels_of_matrices
 from mivol.tomography.projector import Projector
 from mivol.tomography.rotation_axis import find_axis
+
+RAY_BYTES = 3 * 8
+"""Of a ray of a computed scan: what is exact, what is seen of it and its weight, in float64."""
 
 
 @briefly
@@ -118,7 +119,6 @@ def make_data(chosen: config.Scan, base: Path, grid: VoxelGrid) -> Projections:
         MivolError: files that cannot be read or do not fit, rays that all miss the grid, or more of them than memory.
     """
     is_measured = isinstance(chosen.data, Measured | Stack | Nikon)
-    check_grid(chosen, grid)
     if is_measured:
         data = read_measured(chosen, base)
     else:
@@ -130,6 +130,18 @@ def make_data(chosen: config.Scan, base: Path, grid: VoxelGrid) -> Projections:
     if not is_measured:
         return data
     return replace(data, notes=(*data.notes, *note_rows(chosen.data, data.geometry, grid, data.y, data.weights)))
+
+
+def check_rays(chosen: config.Scan) -> None:
+    """Refuse a computed scan of more rays than can be kept; of a table of views, one view is counted.
+
+    Raises:
+        MivolError: with how many there are.
+    """
+    rows, columns = chosen.scan.detector
+    views = getattr(chosen.scan, "views", 1)
+    what = f"a scan of {views} x {rows} x {columns} rays"
+    check_fits(RAY_BYTES * views * rows * columns, what, "give scan.detector or scan.views fewer of them")
 
 
 def check_hits(projector: Projector) -> None:
@@ -209,7 +221,7 @@ def read_measured(chosen: config.Scan, base: Path) -> Projections:
         geometry = place_beam(chosen, base, np.arange(0) if angles is None else angles, y.shape[1:], offset)
     if geometry.shape != y.shape:
         raise MivolError(f"found {len(y)} projections and a geometry of {geometry.shape[0]} views, expected as many.")
-    quanta = quanta_of(chosen, found) if METHODS[solver_of(chosen.solve)].problem is PoissonCounts else None
+    quanta = quanta_of(chosen, found) if METHODS[chosen.solve.solver].problem is PoissonCounts else None
     return Projections(geometry, y, weights, quanta=quanta, notes=tuple(notes), is_noise_known=found.intensity is not None)
 
 

@@ -10,11 +10,14 @@ import numpy as np
 from mivol import config
 from mivol.config import Matrices, Measured, Nikon, Stack, Table
 from mivol.errors import MivolError
-from mivol.experiments.nikon_scan import read_nikon_scan
 from mivol.files import read_columns, read_projections, read_stack
 from mivol.files.fetch import resolve_path
+from mivol.files.nikon import NikonScan, read_nikon, read_nikon_angles, read_nikon_transmission
+from mivol.files.source import refusal
 from mivol.shown import briefly
-from mivol.tomography.geometry import FlatDetector
+from mivol.tomography.geometry import ConeBeam, FlatDetector, VoxelGrid
+from mivol.tomography.nikon import nikon_geometry
+from mivol.tomography.panel_views import PanelViews
 from mivol.tomography.preprocess import Transmission, correct_transmission, of_unknown_noise
 
 
@@ -128,3 +131,37 @@ def note_order(angles: np.ndarray) -> list[str]:
     at = int(back[0])
     turned = f"view {at + 1} at {np.degrees(angles[at + 1]):.2f} degrees follows view {at} at {np.degrees(angles[at]):.2f}"
     return [f"the angles turn back {len(back)} times ({turned}): they are taken as they are"]
+
+
+def read_nikon_scan(wanted: Nikon, base: Path) -> tuple[Transmission, ConeBeam | PanelViews, list[str]]:
+    """Transmission, geometry, and notes.
+
+    Raises:
+        MivolError: as :mod:`mivol.files.nikon`.
+    """
+    scan = read_nikon(base / wanted.file)
+    angles = read_nikon_angles(base / wanted.angles, len(scan.images)) if wanted.angles else scan.angles
+    geometry = nikon_geometry(scan, angles)
+    return of_unknown_noise(read_nikon_transmission(scan, wanted.saturation)), geometry, notes_of(scan, geometry)
+
+
+def notes_of(scan: NikonScan, geometry: ConeBeam | PanelViews) -> list[str]:
+    """Sentences about what the settings hold beyond a circle."""
+    notes = []
+    if isinstance(geometry, PanelViews):
+        notes.append(f"the rotation axis is tilted by {scan.tilt:g} and rolled by {scan.roll:g} degrees: z runs along it")
+    if scan.left_out:
+        notes.append(f"not heeded: {', '.join(scan.left_out)}")
+    return notes
+
+
+def nikon_grid(wanted: Nikon, base: Path) -> VoxelGrid:
+    """The voxels of the settings, about the middle of the axis.
+
+    Raises:
+        MivolError: there are none.
+    """
+    scan = read_nikon(base / wanted.file)
+    if scan.shape is None:
+        raise refusal(scan.path, "no VoxelsX, Y, Z and VoxelSizeX, Y, Z above 0", "a grid", "give a table [grid]")
+    return VoxelGrid(scan.shape, np.asarray(scan.voxel_size))

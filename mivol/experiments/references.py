@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+import math
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -14,9 +16,11 @@ import numpy as np
 from mivol.config import Experiment, Files
 from mivol.errors import MivolError
 from mivol.experiments.task import Task
-from mivol.experiments.truth import holding
-from mivol.files import read_exr, stack_layers
+from mivol.fields.procedural import make_procedural
+from mivol.files import read_exr, read_volume, stack_layers
 from mivol.files.fetch import PREFIX, resolve_path
+from mivol.machine import check_fits
+from mivol.optim.parameters import find, like
 from mivol.optim.scenes.views import View, check_sizes
 from mivol.scene.load import LoadedScene, load_scene
 from mivol.scene.sensors import check_film
@@ -177,3 +181,56 @@ def colours_of(path: Path, found: dict[str, np.ndarray]) -> np.ndarray:
         there = ", ".join(one or "R, G, B" for one in sorted(found))
         raise MivolError(f"{path}: found the channels {there}, expected {wanted}; write the picture with these.")
     return found[name][..., None] if found[name].ndim == 2 else found[name][..., :3]
+
+
+VOXEL_BYTES = 9 * 8
+"""Of a procedural volume while it is made: its places twice, and three numbers that are made of them, in float64."""
+
+
+def make_truth(chosen: Experiment, base: Path, scene: mi.Scene) -> np.ndarray | None:
+    """The true volume (Z, Y, X, C), where the experiment knows one.
+
+    Raises:
+        MivolError: its key is not in the scene, its file cannot be read, or it does not fit into memory.
+    """
+    if chosen.truth is None:
+        return None
+    find(chosen.truth.key, mi.traverse(scene))
+    if chosen.truth.file:
+        return read_volume(resolve_path(base, chosen.truth.file)).values
+    wanted = chosen.truth
+    said = " x ".join(str(n) for n in wanted.shape)
+    check_fits(VOXEL_BYTES * math.prod(wanted.shape), f"a truth of {said} voxels", "give truth.shape fewer voxels")
+    return make_procedural(wanted.procedural, wanted.shape, wanted.seed, wanted.peak)
+
+
+def check_truth(chosen: Experiment) -> None:
+    """Refuse a truth of a parameter that is not fitted: references would show it, and renders what the scene holds.
+
+    Raises:
+        MivolError: with its key.
+    """
+    if chosen.truth is not None and chosen.truth.key not in [sought.key for sought in chosen.parameter]:
+        raise MivolError(
+            f"truth.key is {chosen.truth.key}, which is no parameter of the fit, so the references would show another volume "
+            "than the renders: look for it too, or put what is known into the scene (scene.define) and take the truth out."
+        )
+
+
+@contextmanager
+def holding(scene: mi.Scene, key: str, values: np.ndarray) -> Iterator[None]:
+    """The scene with other values of one parameter, for a while."""
+    params = mi.traverse(scene)
+    before = type(params[key])(params[key])
+    put(params, key, values)
+    try:
+        yield
+    finally:
+        params[key] = before
+        params.update()
+
+
+def put(params: mi.SceneParameters, key: str, values: np.ndarray) -> None:
+    """Set a parameter, in the type that the scene gives it."""
+    params[key] = like(mi.TensorXf(np.ascontiguousarray(values, dtype=np.float32)), params[key])
+    params.update()

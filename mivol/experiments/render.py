@@ -7,24 +7,39 @@ channels keep the names that Mitsuba gives them, with AOVs after the colour.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
+import matplotlib as mpl
 import mitsuba as mi
 import numpy as np
 
 from mivol.errors import MivolError
+from mivol.fields.field_archives import load_field
+from mivol.fields.sky import Sky, read_sky
 from mivol.files import write_exr, write_png
 from mivol.files.atomic import check_destination
+from mivol.files.source import check_file
+from mivol.optim.photographs.field_view import render_view
 from mivol.optim.scenes.views import seed_of
+from mivol.photos import Camera, aim_camera, intrinsics
+from mivol.photos.photo_file import decode_srgb
+from mivol.points.cloud import PointCloud, read_points
+from mivol.points.conversions import gaussians_of_points
+from mivol.points.gaussian_files import holds_gaussians, read_gaussians
+from mivol.points.gaussians import Gaussians
 from mivol.scene.explain import settings_of
 from mivol.scene.parsing import reason_of
 from mivol.scene.sensors import check_film, find_sensor
+from mivol.splatting import Splatter, tensors_of
 
 SAMPLES_PER_PASS = 1 << 21
 KEPT = 2 * 4 * 8
 """Bytes a pixel that are kept beside a pass: the sum of four channels in float64, and the pass as it is added."""
 
 COLOURS = {1: ("Y",), 2: ("Y", "A"), 3: ("R", "G", "B"), 4: ("R", "G", "B", "A")}
+
 
 def check_output(path: Path) -> None:
     """Refuse a name that no image can be written to, before hours are spent on the image.
@@ -103,3 +118,146 @@ def write_image(path: Path, image: np.ndarray, names: list[str]) -> None:
         colours = [number for number, name in enumerate(names) if name in "RGBY"]
         return write_png(path, image[..., colours])
     return write_exr(path, {name: image[..., number].astype(np.float32) for number, name in enumerate(names)})
+
+
+SKY_FILE = "sky.exr"
+"""What a fit writes beside its field, where it learned what is behind."""
+
+
+def view_field(path: Path, look_at: Sequence[float], up: Sequence[float], fov: float, size: tuple[int, int]) -> np.ndarray:
+    """What a pinhole sees of a field, over the sky beside its file or black: linear light (height, width, 3).
+
+    Args:
+        path: the field.
+        look_at: where the camera stands and what it looks at, six numbers [length].
+        up: the direction that is upwards in the picture, three numbers.
+        fov: horizontal field of view [degree].
+        size: (width, height) [pixel].
+
+    Raises:
+        MivolError: as :func:`mivol.fields.spherical_files.load_field`, or a camera that cannot be.
+    """
+    camera = camera_at(look_at, up, fov, size)
+    field, sky = load_field(path), sky_beside(path)
+    seen = render_view(field, camera, np.zeros(3) if sky is None else sky).image
+    return np.maximum(seen, 0) if field.space == "linear" else decode_srgb(seen)
+
+
+def sky_beside(path: Path) -> Sky | None:
+    """What a fit learned of what is behind its field, from the file beside the field's; None where there is none.
+
+    Raises:
+        MivolError: as :func:`mivol.fields.sky.read_sky`.
+    """
+    beside = path.with_name(SKY_FILE)
+    return read_sky(beside) if beside.is_file() else None
+
+
+def camera_at(look_at: Sequence[float], up: Sequence[float], fov: float, size: tuple[int, int]) -> Camera:
+    """The camera of :func:`view_field`.
+
+    Raises:
+        MivolError: a view along ``up``, numbers that are not finite, or an angle or a size that no pinhole has.
+    """
+    if not np.isfinite([*look_at, *up]).all() or not 0 < fov < 180 or min(size) < 1:
+        found = f"--look-at {list(look_at)} --up {list(up)} --fov {fov:g} --size {list(size)}"
+        raise MivolError(f"{found} is no camera: give finite numbers, an angle between 0 and 180 and at least one pixel.")
+    width, height = size
+    focal = width / (2 * math.tan(math.radians(fov) / 2))
+    like = Camera(intrinsics(focal, focal, width / 2, height / 2), size, np.eye(4))
+    return aim_camera(like, np.array(look_at[:3]), np.array(look_at[3:]), np.array(up), "--look-at")
+
+
+DRAWN_AS = ("discs", "splats")
+"""What a point can be drawn as: a disc that faces the camera, or a Gaussian (EWA splatting, Zwicker et al. 2001)."""
+
+FROM = (1.0, -1.5, 0.7)
+"""Direction from the middle of a cloud to the camera where none was given; z is up."""
+
+SHARE = 0.01
+"""Of the points, by which a cloud may reach out of its picture at either end of each axis."""
+
+
+@dataclass(frozen=True)
+class PointLook:
+    """How points are drawn.
+
+    Attributes:
+        drawn_as: one of :data:`DRAWN_AS`.
+        radius: of a disc, or standard deviation of a splat [length]; None: half the median distance to the nearest points.
+        opacity: of a point, above 0 and up to 1.
+
+    Raises:
+        MivolError: a number outside its domain.
+    """
+
+    drawn_as: str = "discs"
+    radius: float | None = None
+    opacity: float = 1.0
+
+    def __post_init__(self) -> None:
+        if not 0.03 <= self.opacity <= 1:
+            raise MivolError(f"points of opacity {self.opacity:g} were asked for; 0.03 to 1 is expected: choose one of those.")
+        if self.radius is not None and not 0 < self.radius < math.inf:
+            raise MivolError(f"points of radius {self.radius:g} were asked for; a length above 0 is expected.")
+
+
+def view_points(
+    path: Path, look_at: Sequence[float] | None, up: Sequence[float], fov: float, size: tuple[int, int], look: PointLook
+) -> np.ndarray:
+    """What a pinhole sees of points or Gaussians over black: linear light (height, width, 3).
+
+    Points are sorted by depth and composited front to back. What is smaller than a pixel covers a share of it, so that a
+    point's light goes with the inverse square of its distance, however far it is.
+
+    Args:
+        path: any format of points or Gaussians; points without colours take theirs from how densely they stand.
+        look_at: where the camera stands and what it looks at, six numbers [length]; None: from where nearly all is seen.
+        up: the direction that is upwards in the picture, three numbers.
+        fov: horizontal field of view [degree].
+        size: (width, height) [pixel].
+        look: of points; Gaussians have their own sizes and opacities.
+
+    Raises:
+        MivolError: as the readers, a camera that cannot be, or a look for Gaussians.
+    """
+    is_cloud = not holds_gaussians(check_file(path))
+    if not is_cloud and look != PointLook():
+        raise MivolError(f"{path} holds Gaussians, which have shapes of their own: leave out how points are drawn.")
+    held = gaussians_for(read_points(path), look) if is_cloud else read_gaussians(path)
+    camera = camera_at(look_at or whole_view(held.means, up, fov, size), up, fov, size)
+    return decode_srgb(picture_of(held, camera, is_cloud, is_cloud and look.drawn_as == "discs"))
+
+
+def gaussians_for(cloud: PointCloud, look: PointLook) -> Gaussians:
+    """Round Gaussians of one radius at the points; those without colours are coloured by how densely they stand."""
+    made = gaussians_of_points(cloud, look.opacity)
+    if cloud.colours is None:
+        made = gaussians_of_points(replace(cloud, colours=by_density(made.scales()[:, 0])), look.opacity)
+    radius = 0.5 * float(np.median(made.scales())) if look.radius is None else look.radius
+    return replace(made, log_scales=np.full((made.count, 3), math.log(radius)))
+
+
+def by_density(distances: np.ndarray) -> np.ndarray:
+    """(N, 3) colours of points by the logarithms of their distances to others: light where they stand densely."""
+    height = -np.log(distances.astype(np.float64))
+    low, high = np.quantile(height, [SHARE, 1 - SHARE])
+    return mpl.colormaps[COLOUR_MAP]((height - low) / max(high - low, 1e-12))[:, :3]
+
+
+COLOUR_MAP = "magma"
+
+
+def whole_view(places: np.ndarray, up: Sequence[float], fov: float, size: tuple[int, int]) -> list[float]:
+    """Where a camera stands that sees a ball about the middle 98 % of places along each axis, and the ball's middle."""
+    low, high = np.quantile(places.astype(np.float64), [SHARE, 1 - SHARE], axis=0)
+    middle, radius = (low + high) / 2, max(float(np.linalg.norm(high - low)) / 2, 1e-6)
+    half = min(math.radians(fov) / 2, math.atan(math.tan(math.radians(fov) / 2) * size[1] / size[0]))
+    towards = np.array(FROM) / np.linalg.norm(FROM)
+    return [*(middle + towards * radius / math.sin(half)), *middle]
+
+
+def picture_of(held: Gaussians, camera: Camera, compensated: bool, discs: bool) -> np.ndarray:
+    """(height, width, 3) code values over black."""
+    splatter = Splatter(*camera.size, held.degree, compensated=compensated, discs=discs)
+    return np.array(splatter.forward(tensors_of(held), camera, derivatives=False)[0])[..., :3]

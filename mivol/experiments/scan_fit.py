@@ -15,14 +15,19 @@ import numpy as np
 from mivol import config
 from mivol.errors import MivolError
 from mivol.experiments.back_end import choose_back_end
-from mivol.experiments.best import BestIterate
 from mivol.experiments.projections import Projections, beam_of, fitted_views, held_out_views, make_data, make_grid
-from mivol.experiments.run_folder import RunFolder
-from mivol.experiments.scan_memory import check_grid
+from mivol.experiments.run_folder import BestIterate, RunFolder
 from mivol.experiments.scan_outputs import write_best, write_outputs
-from mivol.experiments.scan_prior import check_noise, make_prior, plan_of_prior, settle_noise
-from mivol.experiments.scan_storage import choose_storage
-from mivol.experiments.solver_choice import settle_solver, solver_of, strength_of
+from mivol.experiments.solver_choice import (
+    check_grid,
+    check_noise,
+    choose_storage,
+    make_prior,
+    plan_of_prior,
+    settle_noise,
+    settle_solver,
+    strength_of,
+)
 from mivol.experiments.task import Task
 from mivol.optim.checkpoint import Store
 from mivol.optim.events import Checkpoint
@@ -64,6 +69,7 @@ def scan_fit(task: Task) -> Path:
     with run.at_work():
         grid = make_grid(chosen, task.base)
         with run.stage("projections"):
+            check_grid(chosen, grid)
             data = make_data(chosen, task.base, grid)
             run.record.notes += data.notes
             task.watcher.say(data.notes)
@@ -98,7 +104,7 @@ def scan_fit(task: Task) -> Path:
 def new_record(task: Task) -> RunRecord:
     """The record of a run that begins."""
     chosen: config.Scan = task.chosen
-    name = solver_of(chosen.solve)
+    name = chosen.solve.solver
     return RunRecord.new(
         chosen.title,
         method=f"{name} on line integrals of a {beam_of(chosen)}",

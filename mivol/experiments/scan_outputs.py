@@ -7,11 +7,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mivol.experiments.best import BestIterate
 from mivol.experiments.camera_pictures import pictures_of_scan
 from mivol.experiments.film import film_of_volume
 from mivol.experiments.projections import Projections
-from mivol.experiments.run_folder import RunFolder
+from mivol.experiments.run_folder import BestIterate, RunFolder
 from mivol.files import write_exr, write_volume
 from mivol.report.record import LINES, SINOGRAM, Image, Volume
 from mivol.tomography.geometry import VoxelGrid

@@ -3,23 +3,32 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
 
 import mitsuba as mi
+import msgspec
 import numpy as np
 
 from mivol import config
-from mivol.config import Experiment
+from mivol.config import AUTO, Experiment, Rendered
 from mivol.errors import MivolError
 from mivol.experiments.back_end import choose_back_end
-from mivol.experiments.best import BestIterate
-from mivol.experiments.depth import settle_depth
-from mivol.experiments.references import References, find_references, load_experiment_scene
-from mivol.experiments.run_folder import RunFolder
+from mivol.experiments.references import (
+    References,
+    camera_of,
+    check_truth,
+    find_references,
+    holding,
+    load_experiment_scene,
+    make_truth,
+    put,
+)
+from mivol.experiments.run_folder import BestIterate, RunFolder
 from mivol.experiments.scene_outputs import SceneOutputs
 from mivol.experiments.start import Start, make_starts, place_of
 from mivol.experiments.task import Task
-from mivol.experiments.truth import check_truth, make_truth, put
 from mivol.optim.checkpoint import Store
 from mivol.optim.events import upsample
 from mivol.optim.loop import Course, Fit, begin_fit
@@ -29,6 +38,7 @@ from mivol.optim.scenes.scene_problem import SceneProblem
 from mivol.optim.scenes.views import HELD_OUT, RenderBatch, make_batches, seed_of
 from mivol.report.page import write_page
 from mivol.report.record import PlanLine, RunRecord
+from mivol.scene.depth_preview import measure_depths
 from mivol.scene.load import LoadedScene
 from mivol.scene.needs import find_needs
 from mivol.scene.plan import Plan, make_plan
@@ -244,3 +254,27 @@ def units(chosen: Experiment, problem: SceneProblem) -> dict[str, str]:
     """Units of the loss and of each of those numbers."""
     known = {parameter.name: parameter.unit for parameter in problem.parameters}
     return {"loss": chosen.loss.unit} | {name: known[name.rpartition("[")[0]] for name in numbers(problem)}
+
+
+def settle_depth(task: Task, loaded: LoadedScene, truth: np.ndarray | None) -> tuple[Task, list[PlanLine]]:
+    """Put a number in the place of ``max_depth = "auto"``.
+
+    The depth is measured from the first view, in the scene that renders the references. Where the references are files and the
+    truth is not known, nothing can be measured, and paths have no limit.
+
+    Returns:
+        The task with a number, and why it is that one; the task itself where it has one.
+    """
+    chosen: Experiment = task.chosen
+    if chosen.fit.max_depth != AUTO:
+        return task, []
+    if truth is None and not isinstance(chosen.reference, Rendered):
+        depth, reason = -1, "the references are files, and what they show is not known"
+    else:
+        with nullcontext() if truth is None else holding(loaded.scene, chosen.truth.key, truth):
+            sensor = camera_of(next(iter(chosen.views.sensors(loaded.scene))))
+            answer = measure_depths(loaded.scene, sensor, Settings(), chosen.fit.noise)
+        depth, reason = answer.depth, answer.reason
+    fit = msgspec.structs.replace(chosen.fit, max_depth=depth)
+    settled = replace(task, chosen=msgspec.structs.replace(chosen, fit=fit))
+    return settled, [PlanLine(choice=f"max_depth: {depth}", reason=reason)]

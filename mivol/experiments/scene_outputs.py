@@ -14,13 +14,11 @@ import mitsuba as mi
 import numpy as np
 
 from mivol.config import Experiment, Sought
-from mivol.experiments.best import BestIterate
 from mivol.experiments.camera_pictures import pictures_of_views
 from mivol.experiments.film import film_of_volume
 from mivol.experiments.references import References
-from mivol.experiments.run_folder import RunFolder
-from mivol.experiments.start import edges_of, place_of
-from mivol.experiments.units import unit_of
+from mivol.experiments.run_folder import BestIterate, RunFolder
+from mivol.experiments.start import edges_of, place_of, unit_of
 from mivol.files import write_exr, write_png, write_volume
 from mivol.optim.loop import Fit
 from mivol.optim.parameters import GRID

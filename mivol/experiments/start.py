@@ -16,7 +16,6 @@ import numpy as np
 
 from mivol.config import Experiment, Sought
 from mivol.errors import MivolError
-from mivol.experiments.units import unit_of
 from mivol.files import read_volume
 from mivol.files.fetch import resolve_path as place_in
 from mivol.machine import check_fits
@@ -116,3 +115,26 @@ def place_of(key: str, scene: mi.Scene) -> np.ndarray:
 def edges_of(place: np.ndarray) -> tuple[float, float, float]:
     """Lengths (x, y, z) of the edges of a grid's box."""
     return tuple(float(edge) for edge in np.linalg.norm(place[:3, :3], axis=0))
+
+
+UNITS = {
+    "sigma_t": "1/length",
+    "sigma_a": "1/length",
+    "sigma_s": "1/length",
+    "albedo": "1",
+    "g": "1",
+    "position": "length",
+    "radiance": "radiance",
+    "irradiance": "radiance sr",
+    "intensity": "radiance length²",
+    "reflectance": "1",
+    "alpha": "1",
+    "scale": "1",
+}
+"""By the words of a key of ``mi.traverse(scene)``. Mitsuba's extinction is ``scale`` times ``sigma_t``, its sky ``scale`` times
+``data``: one of the two has the unit."""
+
+
+def unit_of(sought: Sought) -> str:
+    """The unit of a parameter: the experiment's, else that of the last word of the key that has one, else ""."""
+    return sought.unit or next((UNITS[word] for word in reversed(sought.key.split(".")) if word in UNITS), "")

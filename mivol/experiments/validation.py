@@ -19,7 +19,7 @@ import mitsuba as mi
 import numpy as np
 
 from mivol.errors import MivolError
-from mivol.experiments.truth import put
+from mivol.experiments.references import put
 from mivol.files import write_whole_text
 from mivol.optim.parameters import as_tensor, find
 from mivol.optim.scenes.views import seed_of
@@ -269,9 +269,7 @@ class MeanRadiance:
 # -- Files --------------------------------------------------------------------------------------------------------
 
 
-def write_verdict(
-    verdict: Verdict, image: Estimate, reference: ReferenceResult, folder: Path, chosen: Validation
-) -> Verdict:
+def write_verdict(verdict: Verdict, image: Estimate, reference: ReferenceResult, folder: Path, chosen: Validation) -> Verdict:
     """``validation.json`` and ``validation.png``; the verdict that names them."""
     compared = verdict.comparison
     picture = figures.save_figure(figures.plot_image_row(reference.mean, image.mean, compared.z), folder / "validation.png")

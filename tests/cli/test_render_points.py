@@ -10,7 +10,7 @@ from gaussian_sets import random_gaussians
 from skimage.io import imread
 
 from mivol.cli import main
-from mivol.experiments.view_points import whole_view
+from mivol.experiments.render import whole_view
 from mivol.points.cloud import PointCloud, write_points
 from mivol.points.gaussian_files import write_gaussians
 

@@ -9,7 +9,7 @@ import pytest
 
 from mivol.cli import main
 from mivol.errors import MivolError
-from mivol.experiments.view_field import camera_at
+from mivol.experiments.render import camera_at
 from mivol.fields.field_archives import save_field
 from mivol.fields.sky import read_sky
 from mivol.fields.spherical_grid import SphericalGrid

@@ -74,8 +74,7 @@ def fit_of(monkeypatch: pytest.MonkeyPatch, folder: Path, views: int, shown: int
     )
     plan = SimpleNamespace(low_pass=0.3, low_pass_at=lambda shrink: ("low pass at", shrink))
     problem = SimpleNamespace(
-        exposure=None,
-        cloud={name: getattr(cloud(), name) for name in outputs.Gaussians.__dataclass_fields__}, plan=plan
+        exposure=None, cloud={name: getattr(cloud(), name) for name in outputs.Gaussians.__dataclass_fields__}, plan=plan
     )
     monkeypatch.setattr(outputs, "write_gaussians", lambda path, found: path.write_bytes(bytes(100)))
     monkeypatch.setattr(outputs, "rectified", lambda photo: photo)
@@ -125,7 +124,6 @@ def test_frames_are_filtered_as_the_smaller_picture_asks(monkeypatch: pytest.Mon
     assert (camera, behind.tolist(), low_pass) == ("camera", [0.1, 0.2, 0.3], ("low pass at", 4.0))
     assert given == [tmp_path] and record.images == ["picture"]
     assert set(record.results) == {"views", "iterations", "gaussians"}
-
 
 
 def test_a_view_is_judged_as_a_pinhole_sees_it(monkeypatch: pytest.MonkeyPatch) -> None:

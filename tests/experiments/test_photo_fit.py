@@ -18,7 +18,7 @@ from tiny_experiment import assert_explained
 from mivol import config
 from mivol.cli import main
 from mivol.errors import MivolError
-from mivol.experiments import photo_data, photo_fit, photo_outputs, photo_plan
+from mivol.experiments import field_plan, photo_data, photo_fit, photo_outputs
 from mivol.fields.field_archives import load_field
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.files import read_exr, write_exr, write_png
@@ -122,7 +122,7 @@ def test_photographs_become_a_field_and_a_page(photographs: Path, tmp_path: Path
     for text in (*shown, "view_3.png"):
         assert text in page
     rows = [json.loads(line) for line in (tmp_path / "run/metrics.jsonl").read_text().splitlines()]
-    assert rows[-1]["iteration"] == record["results"]["iterations"] == photo_plan.make_plan(config.load(path)).steps
+    assert rows[-1]["iteration"] == record["results"]["iterations"] == field_plan.make_plan(config.load(path)).steps
     assert all({"loss", "held_out_psnr"} <= row.keys() for row in rows)
 
 
@@ -222,12 +222,12 @@ def test_a_stopped_fit_goes_on(photographs: Path, tmp_path: Path, monkeypatch: p
 
 def test_what_the_file_says_overrides_the_preset(tmp_path: Path) -> None:
     raw = {"title": "x", "photos": {"path": "p"}}
-    assert photo_plan.make_plan(config.from_dict(raw)) == PRESETS["cpu"]
+    assert field_plan.make_plan(config.from_dict(raw)) == PRESETS["cpu"]
     raw["field"] = {"preset": "cpu", "longest": 40, "degree": 1, "effort": 0.5, "tv_sh": 1e-3}
-    plan = photo_plan.make_plan(config.from_dict(raw))
+    plan = field_plan.make_plan(config.from_dict(raw))
     assert [stage.longest for stage in plan.stages] == [32, 40]
     raw["field"]["longest"] = 200
-    assert [stage.longest for stage in photo_plan.make_plan(config.from_dict(raw)).stages] == [32, 64, 128, 200]
+    assert [stage.longest for stage in field_plan.make_plan(config.from_dict(raw)).stages] == [32, 64, 128, 200]
     assert plan.stages[0].steps == round(PRESETS["cpu"].stages[0].steps / 2)
     assert (plan.degree, plan.tv_sh, plan.tv_density) == (1, 1e-3, PRESETS["cpu"].tv_density)
 
@@ -249,13 +249,13 @@ def test_what_is_taken_to_be_behind_is_said(photographs: Path, tmp_path: Path) -
     """The ball fills the middle of each view: its edges are white, whatever colour the file says is behind it."""
     chosen = config.load(toml(tmp_path, photographs), ["photos.background=[0, 0.5, 0]"])
     photos, _ = photo_data.read_photos(chosen, tmp_path)
-    plan = photo_plan.make_plan(chosen)
-    said = photo_plan.what_is_behind(plan, photos)
+    plan = field_plan.make_plan(chosen)
+    said = field_plan.what_is_behind(plan, photos)
     assert said.choice == "the colour (0, 0.5, 0) behind the box"
     assert "edges of the photographs show (1, 1, 1) mostly" in said.reason
-    assert "sky of 8 rows" in photo_plan.what_is_behind(replace(plan, sky=8), photos).choice
+    assert "sky of 8 rows" in field_plan.what_is_behind(replace(plan, sky=8), photos).choice
     clear = replace(photos, views=tuple(replace(v, alpha=np.ones((SIZE, SIZE))) for v in photos.views))
-    assert "alpha" in photo_plan.what_is_behind(plan, clear).reason
+    assert "alpha" in field_plan.what_is_behind(plan, clear).reason
 
 
 @pytest.mark.parametrize(
@@ -269,10 +269,10 @@ def test_what_is_behind_has_a_name(
     """A name says what is learned; a number of rows or of boxes that is given counts all the same."""
     named = [f'photos.background="{background}"']
     chosen = config.load(toml(tmp_path, photographs), [f"field.preset={preset}", *named])
-    plan = photo_plan.make_plan(chosen)
+    plan = field_plan.make_plan(chosen)
     assert (plan.levels, plan.sky, plan.near > 0) == (levels, sky, levels > 1)
     given = config.load(toml(tmp_path, photographs), [f"field.preset={preset}", "field.sky=6", "field.levels=2", *named])
-    assert (photo_plan.make_plan(given).levels, photo_plan.make_plan(given).sky) == (2, 6)
+    assert (field_plan.make_plan(given).levels, field_plan.make_plan(given).sky) == (2, 6)
     colour = [1.0] * 3 if background == "white" else [0.0] * 3
     photos, judged = photo_data.read_photos(chosen, tmp_path)
     assert judged is not None
@@ -322,7 +322,7 @@ def test_photographs_are_shrunk_to_half_a_voxel(photographs: Path, tmp_path: Pat
     chosen = config.load(toml(tmp_path, photographs))
     photos, _ = photo_data.read_photos(chosen, tmp_path)
     plan = FitPlan((Stage(4, 1), Stage(8, 1), Stage(11, 1), Stage(13, 1, shrink=4)))
-    assert [stage.shrink for stage in photo_plan.suited(plan, photos).stages] == [2, 2, 2, 1]
+    assert [stage.shrink for stage in field_plan.suited(plan, photos).stages] == [2, 2, 2, 1]
 
 
 def test_stages_look_at_each_pixel_so_often_at_most(photographs: Path, tmp_path: Path) -> None:
@@ -332,15 +332,15 @@ def test_stages_look_at_each_pixel_so_often_at_most(photographs: Path, tmp_path:
     stages = Stage(11, 10_000, views=3, tiles=2), Stage(13, 10_000, views=1000, tiles=1), Stage(13, 5, views=1, tiles=1)
     plan = FitPlan(stages, epochs=20.0)
     expected = [20 * count * 24**2 // 96, 20 * 48**2 // 16, 5]
-    assert [stage.steps for stage in photo_plan.suited(plan, photos).stages] == expected
-    few, least = photo_plan.suited(replace(plan, stages=stages[:2], epochs=0.1), photos), photo_plan.FEWEST_STEPS
+    assert [stage.steps for stage in field_plan.suited(plan, photos).stages] == expected
+    few, least = field_plan.suited(replace(plan, stages=stages[:2], epochs=0.1), photos), field_plan.FEWEST_STEPS
     # So many steps of the last stage look at each pixel least / 144 times.
     assert [stage.steps for stage in few.stages] == [least * count * 24**2 // (96 * 144), least]
-    assert [stage.steps for stage in photo_plan.suited(FitPlan(stages), photos).stages] == [10_000, 10_000, 5]
-    asked = photo_plan.make_plan(config.load(toml(tmp_path, photographs), ["field.preset=fine", "field.effort=3"]))
+    assert [stage.steps for stage in field_plan.suited(FitPlan(stages), photos).stages] == [10_000, 10_000, 5]
+    asked = field_plan.make_plan(config.load(toml(tmp_path, photographs), ["field.preset=fine", "field.effort=3"]))
     assert asked.epochs == 3 * PRESETS["fine"].epochs < math.inf  # who asks for more gets more
-    assert "no pixel is looked at over 20 times" in photo_plan.steps_of(plan).reason
-    assert photo_plan.steps_of(FitPlan(stages)).reason == "field.effort"
+    assert "no pixel is looked at over 20 times" in field_plan.steps_of(plan).reason
+    assert field_plan.steps_of(FitPlan(stages)).reason == "field.effort"
 
 
 def test_a_long_box_has_as_many_nodes_as_a_cube(photographs: Path, tmp_path: Path) -> None:
@@ -355,26 +355,26 @@ def test_a_long_box_has_as_many_nodes_as_a_cube(photographs: Path, tmp_path: Pat
     assert stretched(8, slab) == 25 and stretched(8, photos.box) == 8
     long = replace(photos, survey=replace(photos.survey, box=slab))
     plan = FitPlan((Stage(4, 1), Stage(8, 1), Stage(40, 1)))
-    assert [stage.longest for stage in photo_plan.suited(plan, long).stages] == [13, 17, 34]
-    assert [stage.longest for stage in photo_plan.suited(replace(plan, voxel=1.5), long).stages] == [13, 22, 34]
+    assert [stage.longest for stage in field_plan.suited(plan, long).stages] == [13, 17, 34]
+    assert [stage.longest for stage in field_plan.suited(replace(plan, voxel=1.5), long).stages] == [13, 22, 34]
     quarter = np.diag([0.25, 0.25, 1])
     cameras = [replace(view.camera, K=quarter @ view.camera.K) for view in long.views]
     far = replace(long, views=tuple(replace(v, camera=c) for v, c in zip(long.views, cameras, strict=True)))
-    assert [stage.longest for stage in photo_plan.suited(plan, far).stages] == [4, 8, 16]
-    assert photo_plan.suited(photo_plan.suited(plan, long), long) == photo_plan.suited(plan, long)
-    assert [stage.longest for stage in photo_plan.suited(replace(plan, cubic=False), long).stages] == [4, 8, 40]
-    assert not photo_plan.make_plan(config.load(toml(tmp_path, photographs), ["field.longest=26"])).cubic
+    assert [stage.longest for stage in field_plan.suited(plan, far).stages] == [4, 8, 16]
+    assert field_plan.suited(field_plan.suited(plan, long), long) == field_plan.suited(plan, long)
+    assert [stage.longest for stage in field_plan.suited(replace(plan, cubic=False), long).stages] == [4, 8, 40]
+    assert not field_plan.make_plan(config.load(toml(tmp_path, photographs), ["field.longest=26"])).cubic
 
 
 def test_few_photographs_are_smoothed_each_step(photographs: Path, tmp_path: Path) -> None:
     """Many are looked at every fourth step, where one move would be several learning rates of a few."""
     chosen = config.load(toml(tmp_path, photographs), ["field.preset=cpu"])
     photos, _ = photo_data.read_photos(chosen, tmp_path)
-    plan = photo_plan.make_plan(chosen)
+    plan = field_plan.make_plan(chosen)
     assert plan.tv_every == 4 and len(photos.views) < FEW
-    assert photo_plan.suited(plan, photos).tv_every == 1
+    assert field_plan.suited(plan, photos).tv_every == 1
     many = replace(photos, views=photos.views * (FEW // len(photos.views) + 1))
-    assert photo_plan.suited(plan, many).tv_every == 4
+    assert field_plan.suited(plan, many).tv_every == 4
 
 
 def test_colours_of_few_photographs_do_not_decay(photographs: Path, tmp_path: Path) -> None:
@@ -385,8 +385,8 @@ def test_colours_of_few_photographs_do_not_decay(photographs: Path, tmp_path: Pa
 
     def found(**field: float) -> list[tuple[float, int]]:
         raw = {"title": "x", "photos": {"path": "p"}, "field": {"preset": "capture", **field}}
-        plan = photo_plan.make_plan(config.from_dict(raw))
-        return [(one.matte, one.degree) for one in (photo_plan.suited(plan, photos), photo_plan.suited(plan, many))]
+        plan = field_plan.make_plan(config.from_dict(raw))
+        return [(one.matte, one.degree) for one in (field_plan.suited(plan, photos), field_plan.suited(plan, many))]
 
     assert found() == [(0, 1), (12, 2)]
     assert found(matte=3.0) == [(3, 1), (3, 2)]
@@ -400,13 +400,13 @@ def test_nested_boxes_are_those_that_points_need(photographs: Path, tmp_path: Pa
     photos, _ = photo_data.read_photos(chosen, tmp_path)
     half = (photos.box[1] - photos.box[0]) / 2
     points = photos.box.mean(axis=0) + half * np.concatenate([np.tile([0, 3, 0], (997, 1)), np.tile([0, 0, 4.5], (3, 1))])
-    plan = replace(photo_plan.make_plan(chosen), levels=5, near=1.0)
-    assert photo_plan.suited(plan, photos).levels == 5
+    plan = replace(field_plan.make_plan(chosen), levels=5, near=1.0)
+    assert field_plan.suited(plan, photos).levels == 5
 
     def said(points: np.ndarray, plan: FitPlan) -> str:
         known = replace(photos, survey=replace(photos.survey, points=points))
-        fitting = photo_plan.suited(plan, known)
-        lines = photo_plan.choices(fitting, known, photo_plan.batches_of(fitting, known))
+        fitting = field_plan.suited(plan, known)
+        lines = field_plan.choices(fitting, known, field_plan.batches_of(fitting, known))
         return "\n".join(f"{line.choice}: {line.reason}" for line in lines)
 
     text = said(points, plan)
@@ -416,14 +416,14 @@ def test_nested_boxes_are_those_that_points_need(photographs: Path, tmp_path: Pa
     assert f"nearer to a camera than {np.median(distances):.4g} [length]" in text
     assert "5 nested boxes" in said(points[:99], plan) and "5 nested boxes" in said(points, replace(plan, fewer_levels=False))
     seen = replace(photos, views=tuple(replace(view, points=points[:7]) for view in photos.views))
-    batches = photo_plan.batches_of(plan, seen)
-    lines = [line.choice for line in photo_plan.choices(replace(plan, depth=0.5), seen, batches)]
+    batches = field_plan.batches_of(plan, seen)
+    lines = [line.choice for line in field_plan.choices(replace(plan, depth=0.5), seen, batches)]
     assert f"{7 * len(photos.views)} points that photographs found say where their rays end, with a weight of 0.5" in lines
-    assert photo_plan.distances_told(plan, batches) == []
+    assert field_plan.distances_told(plan, batches) == []
     one = said(points, replace(plan, levels=1, near=0.0, sky=8))
     assert "1000 of 1000 points" in one and "beyond the box, where the sky is" in one
     assert "nested" not in one and "nearer to a camera" not in one
-    told = photo_plan.make_plan(config.load(toml(tmp_path, photographs), ["field.levels=2", "field.depth=0.5"]))
+    told = field_plan.make_plan(config.load(toml(tmp_path, photographs), ["field.levels=2", "field.depth=0.5"]))
     assert (told.levels, told.fewer_levels, told.depth) == (2, False, 0.5)
     with pytest.raises(MivolError, match="levels is 13: 1 to 12 is expected"):
         config.load(toml(tmp_path, photographs), ["field.levels=13"])

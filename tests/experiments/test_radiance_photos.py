@@ -15,10 +15,10 @@ from PIL import Image
 from mivol import config
 from mivol.cli import main
 from mivol.errors import MivolError
+from mivol.experiments.field_plan import batches_of, make_plan, suited
 from mivol.experiments.judged_views import write_view
 from mivol.experiments.photo_data import MIDDLE_GREY, exposed, notes, read_photos
 from mivol.experiments.photo_outputs import judge_fitted, save_found
-from mivol.experiments.photo_plan import batches_of, make_plan, suited
 from mivol.fields.field_archives import load_field
 from mivol.fields.sky import Sky
 from mivol.fields.spherical_grid import SphericalGrid

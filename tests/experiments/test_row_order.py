@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from mivol import config
 from mivol.config import Measured, Stack
 from mivol.experiments import projections, row_order
 from mivol.tomography.geometry import ConeBeam, ParallelBeam, VoxelGrid
@@ -107,5 +108,5 @@ def test_measured_projections_are_looked_at(monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.setattr(projections, "Projector", lambda *asked: None)
     monkeypatch.setattr(projections, "check_hits", lambda projector: None)
     monkeypatch.setattr(projections, "note_rows", lambda *asked: [f"{asked[1]} upside down"])
-    chosen = SimpleNamespace(data=STACK, solve=SimpleNamespace(name="pcg"))
+    chosen = SimpleNamespace(data=STACK, solve=config.Solve("pcg"))
     assert projections.make_data(chosen, Path(), GRID).notes == ("noted", "geometry upside down")

@@ -11,9 +11,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from mivol import config
 from mivol.errors import MivolError
-from mivol.experiments.best import BestIterate, FilesOfBest
-from mivol.experiments.run_folder import EARLIER, KEPT, RunFolder
+from mivol.experiments.run_folder import EARLIER, KEPT, BestIterate, FilesOfBest, RunFolder
+from mivol.experiments.runs import run_experiment
+from mivol.experiments.task import Nobody, Task
 from mivol.files.atomic import whole_file
 from mivol.report.record import RunRecord, read_metrics, read_record
 
@@ -238,3 +240,20 @@ def test_the_summary_is_what_was_recorded(tmp_path: Path) -> None:
     # A count is said to the last digit.
     run.record.results = {"gaussians": 12345.0}
     assert run.summary() == "saved: Gaussians 12345"
+
+
+SCAN = {
+    "title": "unwatched",
+    "threads": 1,
+    "scan": {"beam": "parallel", "views": 4, "detector": [1, 6], "pitch": 0.5},
+    "data": {"source": "shepp_logan"},
+    "grid": {"shape": [1, 6, 6], "voxel_size": 0.33333333},
+    "solve": {"name": "pcg", "iterations": 2},
+}
+
+
+def test_a_run_needs_nobody_who_watches(variant_rgb: str, tmp_path: Path) -> None:
+    assert list(Nobody().track([3, 4], "items")) == [3, 4]
+    page = run_experiment(Task(config.from_dict(SCAN), tmp_path, tmp_path / "run"))
+    assert page == tmp_path / "run" / "report.html"
+    assert len((tmp_path / "run" / "metrics.jsonl").read_text().splitlines()) == 2

@@ -19,7 +19,7 @@ from mivol.errors import MivolError
 from mivol.experiments import projections, readings, scan_fit
 from mivol.experiments.run_folder import RunFolder
 from mivol.experiments.scan_fit import make_problem
-from mivol.experiments.scan_storage import Storage, choose_storage
+from mivol.experiments.solver_choice import Storage, choose_storage
 from mivol.files import read_volume, write_volume
 from mivol.tomography.projector import Projector
 from mivol.validate.metrics import nrmse

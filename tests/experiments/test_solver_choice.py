@@ -2,13 +2,22 @@
 
 from __future__ import annotations
 
+import itertools
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from mivol import config
 from mivol.experiments import solver_choice
-from mivol.experiments.solver_choice import settle_solver, solver_of, strength_of
+from mivol.experiments.projections import Projections
+from mivol.experiments.solver_choice import PLAIN_ITERATIONS, make_prior, settle_noise, settle_solver, strength_of
+from mivol.optim.projections.inversion import Inversion
+from mivol.optim.projections.iterative import projected_cg
+from mivol.optim.projections.linear_problems import LeastSquares
+from mivol.optim.projections.smoothed_tv import tv_of_noise
 from mivol.tomography.geometry import ConeBeam, Geometry, ParallelBeam, VoxelGrid
+from mivol.tomography.phantoms import shepp_logan
 from mivol.tomography.projector import Projector
 
 GRID = VoxelGrid((2, 6, 6))
@@ -72,4 +81,63 @@ def test_the_prior_that_is_meant() -> None:
     assert strength_of(config.Solve()) == 1
     assert strength_of(config.Solve(tv_unit="length")) == strength_of(config.Solve("pcg")) == 0
     assert strength_of(config.Solve(tv=0.25)) == strength_of(config.Solve("pcg", tv=0.25)) == 0.25
-    assert (solver_of(config.Solve()), solver_of(config.Solve("ml-tr"))) == ("pcg", "ml-tr")
+    assert (config.Solve().solver, config.Solve("ml-tr").solver) == ("pcg", "ml-tr")
+
+
+COARSE_GRID = VoxelGrid((1, 16, 16), 1 / 8)
+BEAM = ParallelBeam(np.arange(20) * np.pi / 20, (1, 20), 1 / 8)
+
+
+def problem_of(weight: float, wanted: config.Solve, is_noise_known: bool = False) -> tuple[Inversion, Projections]:
+    a, y = Projector(BEAM, COARSE_GRID), shepp_logan().project(BEAM)
+    data = Projections(BEAM, y, np.full(y.shape, weight), is_noise_known=is_noise_known)
+    prior = make_prior(wanted, a, data, np.arange(20))
+    return Inversion(LeastSquares(a, y, data.weights, nonnegative=True, prior=prior)), data
+
+
+WANTED = config.Solve(start="filtered", tv=2.0, delta=0.5)
+
+
+def test_the_noise_is_what_plain_iterations_leave(variant_rgb: str) -> None:
+    """The prior is as strong as that of noise of the found size, for weights that know it; the solver goes on from there."""
+    problem, data = problem_of(1.0, WANTED)
+    plain = replace(problem.linear_problem, prior=None)
+    *_, state = itertools.islice(projected_cg(plain), PLAIN_ITERATIONS["filtered"])
+    (line,) = settle_noise(problem, WANTED, data)
+    left = state.residual_norm / np.sqrt(data.y.size)
+    # Threads add up in any order: five iterations end within 1e-4 of each other; the line has four digits.
+    assert line.choice.endswith("times what the weights say")
+    assert float(line.choice.split()[1]) == pytest.approx(left, rel=1e-3)
+    assert np.abs(problem.linear_problem.x0 - state.x).max() < 1e-4 * state.x.max()
+    # Least squares of weights 1 are those of 1 / left^2, times left^2.
+    known = tv_of_noise(plain.A, data.y, data.weights / left**2, 2.0, 0.5)
+    assert problem.linear_problem.prior.strength == pytest.approx(left**2 * known.strength, rel=1e-3)
+    assert problem.linear_problem.prior.delta == pytest.approx(known.delta, rel=1e-5)
+
+
+def test_weights_in_proportion_find_the_same(variant_rgb: str) -> None:
+    """Weights 9 times as large make all of the objective 9 times as large: the strength too."""
+    strengths = []
+    for weight in (1.0, 9.0):
+        problem, data = problem_of(weight, WANTED)
+        settle_noise(problem, WANTED, data)
+        strengths.append(problem.linear_problem.prior.strength)
+    # Iterates differ by rounding of float32, 1e-6 of a residual that is a hundredth of the projections.
+    assert strengths[1] == pytest.approx(9 * strengths[0], rel=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("wanted", "is_noise_known"),
+    [(WANTED, True), (config.Solve(tv=2.0, tv_unit="length"), False), (config.Solve(tv=0.0), False)],
+)
+def test_nothing_is_estimated_where_nothing_is_missing(variant_rgb: str, wanted: config.Solve, is_noise_known: bool) -> None:
+    problem, data = problem_of(1.0, wanted, is_noise_known)
+    before = problem.linear_problem
+    assert settle_noise(problem, wanted, data) == []
+    assert problem.linear_problem is before
+
+
+def test_projections_of_nothing_leave_no_noise(variant_rgb: str) -> None:
+    problem, data = problem_of(1.0, WANTED)
+    problem.linear_problem = replace(problem.linear_problem, b=0 * data.y)
+    assert settle_noise(problem, WANTED, data) == []

@@ -33,9 +33,9 @@ from mivol.bench.studies.radiance_field.size import QUICK as QUICK_PHOTOGRAPHS
 from mivol.bench.studies.radiance_field.size import Size as PhotoSize
 from mivol.config import FieldFit, GaussianFit
 from mivol.experiments import gaussian_outputs, photo_outputs
+from mivol.experiments.field_plan import batches_of, make_plan, suited
 from mivol.experiments.gaussian_start import begin, make_gaussian_plan
 from mivol.experiments.photo_data import boxed, read_photos
-from mivol.experiments.photo_plan import batches_of, make_plan, suited
 from mivol.optim.gaussians.gaussian_problem import GaussianProblem
 from mivol.optim.photographs.field_view import render_view
 from mivol.optim.photographs.radiance_problem import RadianceProblem

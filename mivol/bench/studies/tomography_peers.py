@@ -26,9 +26,7 @@ from mivol import config
 from mivol.bench.harness.bars import say
 from mivol.experiments.projections import Projections
 from mivol.experiments.scan_fit import start_volume
-from mivol.experiments.scan_prior import make_prior, settle_noise
-from mivol.experiments.scan_storage import choose_storage
-from mivol.experiments.solver_choice import settle_solver
+from mivol.experiments.solver_choice import choose_storage, make_prior, settle_noise, settle_solver
 from mivol.optim.projections.inversion import Inversion
 from mivol.optim.projections.linear_problems import LeastSquares, PoissonCounts
 from mivol.optim.projections.solvers import METHODS

@@ -21,8 +21,8 @@ from mivol.bench.studies.optical_depth.work import Work, camera_rays
 from mivol.bench.studies.points import WALK
 from mivol.bench.studies.radiance_field.size import PhotoFit, Size
 from mivol.bench.studies.still_life import photographer
+from mivol.experiments.field_plan import batches_of, make_plan, suited
 from mivol.experiments.photo_data import boxed, read_photos
-from mivol.experiments.photo_plan import batches_of, make_plan, suited
 from mivol.optim.gaussians.gaussian_problem import GaussianProblem
 from mivol.optim.loop import Fit, begin_fit
 from mivol.optim.photographs.field_view import render_view

@@ -14,7 +14,7 @@ from mivol.bench.harness.bars import say
 from mivol.bench.studies.radiance_field.fits import held_out_psnr
 from mivol.bench.studies.radiance_field.reconstruction import write_room
 from mivol.bench.studies.radiance_field.size import Size
-from mivol.experiments.photo_plan import of_few, with_levels_needed
+from mivol.experiments.field_plan import of_few, with_levels_needed
 from mivol.optim.photographs.field_view import render_view
 from mivol.optim.photographs.radiance_plan import PRESETS, FitPlan, Stage
 from mivol.optim.photographs.radiance_problem import begin_radiance_fit, newest_field
