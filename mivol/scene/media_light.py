@@ -29,7 +29,7 @@ from mivol.transport.estimators.lighting.emission_sampling import EmissionTable,
 from mivol.transport.media.body import Body
 from mivol.transport.media.drawn_points import draw_even_point
 from mivol.transport.media.medium_view import MediumView, traverse_medium
-from mivol.transport.media.ray_intervals import RaySegment, visit_media
+from mivol.transport.media.ray_intervals import RaySegment, find_end
 from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.traversal.box import Box
 
@@ -137,7 +137,7 @@ def predict_gain(media: SceneMedia, table: EmissionTable, sensor: mi.Sensor, sca
     ray, _ = sensor.sample_ray(0.0, sampler.next_1d(), film, sampler.next_2d())
     ray = mi.Ray3f(ray)
     on = dr.full(mi.Bool, True, SIDE**2)
-    end, _ = visit_media(media, ray, media.medium_at(ray), lambda state, _: state, mi.Float(0), on)
+    end = find_end(media, ray, media.medium_at(ray), on)
     chance = drawn = 0.0
     if media.has_surfaces:
         si = end.si

@@ -20,7 +20,6 @@ from mivol.transport.estimators.single_scattering.distance_sampling import (
     lit_length,
     start_reservoir,
 )
-from mivol.transport.media.ray_intervals import visit_media
 from scenes import as_float32, box_of, grid_volume, media_of, medium
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
@@ -111,7 +110,7 @@ def test_a_probe_is_spread_over_the_grid_alone():
         ray = mi.Ray3f(mi.Point3f(0.1, 0.2, -5 + dr.zeros(mi.Float, n)), mi.Vector3f(0, 0, 1))
         proposal = DistanceProposal(media, ray, ChosenEmitter(mi.UInt32(0), None, None), None, 0.7)
         start = start_reservoir(media, mi.Float((np.arange(n) + 0.5) / n), n)
-        _, reservoir = visit_media(media, ray, media.medium_at(ray), fill_reservoir(proposal), start, mi.Bool(True))
+        _, reservoir = fill_reservoir(proposal, media.medium_at(ray), start, mi.Bool(True))
     (kept,) = reservoir.candidates
     # The length of the grid comes from two slabs in float32.
     np.testing.assert_allclose(np.array(kept.probe_sigma), 0.7, rtol=1e-5)

@@ -30,7 +30,7 @@ from mivol.transport.media.body import medium_interaction
 from mivol.transport.media.channels import by_channel, spectrum, tangent_of
 from mivol.transport.media.compositing import CellIntegral
 from mivol.transport.media.optical_depth import transmittance
-from mivol.transport.media.ray_intervals import RaySegment, visit_media
+from mivol.transport.media.ray_intervals import RaySegment, find_end
 from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.traversal.cell_quadrature import share_opacity, weigh_emission_density
 from mivol.transport.traversal.interpolation import GAUSS
@@ -297,7 +297,7 @@ class Emission:
     def estimate(self, segment: PathSegment, purpose: str, active: mi.Bool) -> SegmentEstimate:
         """Follow a segment to its end and sum its emission, for the purpose PICTURE, REVERSE or FORWARD."""
         media = self.media
-        end, _ = visit_media(media, segment.ray, segment.medium, lambda state, _: state, mi.Float(0), active)
+        end = find_end(media, segment.ray, segment.medium, active)
         passed = RaySegment(segment.ray, segment.medium, end.t)
         composite = integrate_emission(media, passed, active, tangent=purpose == FORWARD)
         shared = _EmittingSegment(media, segment, passed, composite, active)

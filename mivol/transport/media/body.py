@@ -10,7 +10,6 @@ References: Heitz et al. 2015, Eq. 6 (the projected area).
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from typing import Any
 
 import drjit as dr
@@ -128,14 +127,19 @@ class Body:
         parts = self.view.parts if parts is None else parts
         scale = dr.detach(self.view.scale) * self.area(interval.ray.d)
         bound = None if enough is None else enough / scale
-        rows = _sum((part.integrate(interval, bound) for part in parts), channels)
-        return [scale * tau for tau in rows]
+        total = [mi.Float(0) for _ in range(channels)]
+        for part in parts:
+            total = _add(total, as_rows(part.integrate(interval, bound), channels))
+        return [scale * tau for tau in total]
 
     def tangent(self, interval: RayInterval, channels: int) -> list[mi.Float]:
         """Derivative of the optical depth of the exact parts along the tangent that :meth:`SceneMedia.start_tangent` took."""
         pairs = [(p, v) for p, v in zip(self.view.parts, self.tangents, strict=True) if p.exact_line]
         area = self.area(interval.ray.d)
-        rows = [area * row for row in _sum((part.jvp(change, interval) for part, change in pairs), channels)]
+        total = [mi.Float(0) for _ in range(channels)]
+        for part, change in pairs:
+            total = _add(total, as_rows(part.jvp(change, interval), channels))
+        rows = [area * row for row in total]
         if self.microflakes_tangent is None:
             return rows
         turned = self._jvp_microflakes(interval.ray.d)
@@ -163,15 +167,19 @@ class Body:
 
     def extinction_at(self, ray: Ray, t: mi.Float, channels: int, active: mi.Bool, name: str = "sigma_") -> list[mi.Float]:
         """Coefficient [1/length] of each channel at a point of a ray: of all parts, or of those called ``name``."""
-        parts = (p for p in self.view.parts if p.name.startswith(name))
-        rows = _sum((part.eval_at(self.view.scale, ray, t, active) for part in parts), channels)
-        return [self.area(ray.d) * row for row in rows]
+        total = [mi.Float(0) for _ in range(channels)]
+        for part in self.view.parts:
+            if part.name.startswith(name):
+                total = _add(total, as_rows(part.eval_at(self.view.scale, ray, t, active), channels))
+        return [self.area(ray.d) * row for row in total]
 
     def tangent_at(self, ray: Ray, t: mi.Float, channels: int, active: mi.Bool, name: str = "sigma_") -> list[mi.Float]:
         """As :meth:`extinction_at`, of the tangent that :meth:`SceneMedia.start_tangent` took from the parameters."""
-        pairs = [(p, v) for p, v in zip(self.view.parts, self.tangents, strict=True) if p.name.startswith(name)]
-        rows = _sum((part.jvp_at(change, ray, t, active) for part, change in pairs), channels)
-        rows = [self.area(ray.d) * row for row in rows]
+        total = [mi.Float(0) for _ in range(channels)]
+        for part, change in zip(self.view.parts, self.tangents, strict=True):
+            if part.name.startswith(name):
+                total = _add(total, as_rows(part.jvp_at(change, ray, t, active), channels))
+        rows = [self.area(ray.d) * row for row in total]
         if self.microflakes_tangent is None:
             return rows
         turned = self._jvp_microflakes(ray.d)
@@ -219,12 +227,8 @@ def flight_parts(parts: list[Extinction]) -> list[ExactExtinction]:
     return [p for p in parts if p.is_constant or (p.lattice is not None and share_cells(p.lattice, lead.lattice))]
 
 
-def _sum(parts: Iterable[list[mi.Float]], channels: int) -> list[mi.Float]:
-    """The sum of rows of grey and rgb parts, for each channel of the scene."""
-    total = [mi.Float(0) for _ in range(channels)]
-    for rows in parts:
-        total = [t + r for t, r in zip(total, as_rows(rows, channels), strict=True)]
-    return total
+def _add(a: list[mi.Float], b: list[mi.Float]) -> list[mi.Float]:
+    return [x + y for x, y in zip(a, b, strict=True)]
 
 
 def _fits(part: Extinction, box: Box) -> bool:

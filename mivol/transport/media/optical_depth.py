@@ -12,7 +12,6 @@ from mivol.transport.media.channels import by_channel, spectrum
 from mivol.transport.media.drawn_points import DrawnPoint, bounded_parts, draw_in, start_points
 from mivol.transport.media.ray_intervals import (
     MediumInterval,
-    MediumVisitor,
     RaySegment,
     SegmentEnd,
     revisit_media,
@@ -25,38 +24,51 @@ __all__ = [
     "integrate_optical_depth",
     "jvp_optical_depth",
     "jvp_rows",
-    "sum_optical_depth",
+    "segment_optical_depth",
     "transmittance",
     "vjp_optical_depth",
     "vjp_rows",
 ]
 
 
-def sum_optical_depth(enough: float | None = None) -> MediumVisitor:
-    """The visitor that sums the optical depth of each channel along a ray.
-
-    Args:
-        enough: a walk of a grid may stop where the grid's own optical depth exceeds this in every channel; None to walk to the
-            end.
-    """
-
-    def visit(tau: list[mi.Float], interval: MediumInterval) -> list[mi.Float]:
-        own = interval.body.optical_depth(interval, len(tau), None, enough)
-        return [t + d for t, d in zip(tau, own, strict=True)]
-
-    return visit
-
-
 def integrate_optical_depth(
-    media: SceneMedia, ray: Ray, medium: mi.MediumPtr, active: mi.Bool
+    media: SceneMedia,
+    ray: Ray,
+    medium: mi.MediumPtr,
+    active: mi.Bool,
+    enough: float | mi.Float | None = None,
+    passes_null: bool = False,
 ) -> tuple[SegmentEnd, list[mi.Float]]:
     """Integrate the optical depth [1] of each channel to the first opaque surface or to ``ray.maxt``.
 
+    Args:
+        media: media and surfaces of the scene.
+        ray: world space, unit direction.
+        medium: the medium around the origin of the ray.
+        active: lanes to follow.
+        enough: the walk of a grid may stop where the optical depth of the grid exceeds this number in every channel; None to
+            walk to the end.
+        passes_null: as of :func:`.ray_intervals.visit_media`.
+
     Returns:
-        Where the ray ends, and the optical depth to there.
+        The end of the ray, and the optical depth to there.
     """
-    zero = [mi.Float(0) for _ in range(media.channels)]
-    return visit_media(media, ray, medium, sum_optical_depth(), zero, active)
+
+    def add(tau: list[mi.Float], interval: MediumInterval) -> list[mi.Float]:
+        own = interval.body.optical_depth(interval, media.channels, None, enough)
+        return [t + d for t, d in zip(tau, own, strict=True)]
+
+    return visit_media(media, ray, medium, add, [mi.Float(0) for _ in range(media.channels)], active, passes_null)
+
+
+def segment_optical_depth(media: SceneMedia, segment: RaySegment, active: mi.Bool) -> list[mi.Float]:
+    """Integrate the optical depth [1] of each channel over a segment of known length."""
+
+    def add(tau: list[mi.Float], interval: MediumInterval) -> list[mi.Float]:
+        own = interval.body.optical_depth(interval, media.channels)
+        return [t + d for t, d in zip(tau, own, strict=True)]
+
+    return revisit_media(media, segment, add, [mi.Float(0) for _ in range(media.channels)], active)
 
 
 def transmittance(tau: list[mi.Float]) -> mi.Spectrum:

@@ -25,10 +25,10 @@ from mivol.transport.traversal.rays import FineRay, Ray, distance_along, spawn_r
 __all__ = [
     "OWN_SURFACE",
     "MediumInterval",
-    "MediumVisitor",
     "RaySegment",
     "SegmentEnd",
     "find_boxed_intervals",
+    "find_end",
     "is_transparent",
     "revisit_media",
     "visit_media",
@@ -107,44 +107,53 @@ class MediumInterval(RayInterval):
         return t0, t1
 
 
-MediumVisitor = Callable[[Any, MediumInterval], Any]
-"""``visit(state, interval) -> state``: what to do with the interval of a ray in one medium."""
-
-
 def visit_media(
     media: SceneMedia,
     ray: Ray,
     medium: mi.MediumPtr,
-    visit: MediumVisitor,
+    visit: Callable[[Any, MediumInterval], Any],
     state: Any,
     active: mi.Bool,
     passes_null: bool = False,
 ) -> tuple[SegmentEnd, Any]:
     """Follow a ray to the first opaque surface or to ``ray.maxt``, and visit each medium on the way.
 
-    Media in boxes come after the others and in no order, so a visitor must compute something that does not depend on it, such
-    as a sum.
+    Media behind traced boundaries come first, in the order of the ray. Media in boxes follow in no order, so ``visit`` must
+    compute a result that does not depend on the order, such as a sum.
 
     Args:
-        media: of the scene.
+        media: media and surfaces of the scene.
         ray: world space, unit direction.
-        medium: the medium around its origin.
-        visit: :data:`MediumVisitor`.
+        medium: the medium around the origin of the ray.
+        visit: ``visit(state, interval) -> state``.
         state: any PyTree of Dr.Jit arrays.
         active: lanes to follow.
-        passes_null: the ray continues through surfaces that transmit part of the light undeviated (a shadow ray);
-            ``null_transmission`` of the result is how much.
+        passes_null: whether the ray continues through surfaces that transmit part of the light undeviated (a shadow ray);
+            ``null_transmission`` of the result is the transmitted fraction.
 
     Returns:
-        Where the ray ends, and the last state.
+        The end of the ray, and the last state.
     """
-    if media.traces:
-        end, state = _trace(media, ray, medium, visit, state, active, passes_null and media.has_null_transmission)
-    else:
-        si = dr.zeros(mi.SurfaceInteraction3f, dr.width(ray))
-        si.wi, si.wavelengths, si.time = -ray.d, ray.wavelengths, ray.time
-        end = SegmentEnd(si, mi.Float(ray.maxt), medium, 1.0)
-    return end, _visit_boxed(media, ray, end.t, visit, state, active)
+    end, state = _trace(media, ray, medium, visit, state, active, passes_null)
+    for interval in find_boxed_intervals(media, ray, end.t, active):
+        state = visit(state, interval)
+    return end, state
+
+
+def revisit_media(
+    media: SceneMedia, segment: RaySegment, visit: Callable[[Any, MediumInterval], Any], state: Any, active: mi.Bool
+) -> Any:
+    """Visit the media of a segment of known length; only boundaries that are no boxes are traced again."""
+    if media.traced:
+        return visit_media(media, segment.ray, segment.medium, visit, state, active, segment.passes_null)[1]
+    for interval in find_boxed_intervals(media, segment.ray, segment.length, active):
+        state = visit(state, interval)
+    return state
+
+
+def find_end(media: SceneMedia, ray: Ray, medium: mi.MediumPtr, active: mi.Bool) -> SegmentEnd:
+    """Follow a ray to the first opaque surface or to ``ray.maxt``, without a visit to the media on the way."""
+    return _trace(media, ray, medium, lambda state, _: state, (), active, False)[0]
 
 
 def find_boxed_intervals(media: SceneMedia, ray: Ray, t_end: mi.Float, active: mi.Bool) -> list[MediumInterval]:
@@ -173,36 +182,27 @@ def find_boxed_intervals(media: SceneMedia, ray: Ray, t_end: mi.Float, active: m
     return found
 
 
-def _visit_boxed(media: SceneMedia, ray: Ray, t_end: mi.Float, visit: MediumVisitor, state: Any, active: mi.Bool) -> Any:
-    for interval in find_boxed_intervals(media, ray, t_end, active):
-        state = visit(state, interval)
-    return state
-
-
-def revisit_media(media: SceneMedia, ray_segment: RaySegment, visit: MediumVisitor, state: Any, active: mi.Bool) -> Any:
-    """Visit the media of a segment whose end is known; rays are traced again only where boundaries have to be traced."""
-    if not media.traced:
-        return _visit_boxed(media, ray_segment.ray, ray_segment.length, visit, state, active)
-    return visit_media(media, ray_segment.ray, ray_segment.medium, visit, state, active, ray_segment.passes_null)[1]
-
-
 @dr.syntax
 def _trace(
     media: SceneMedia,
     ray: Ray,
     medium: mi.MediumPtr,
-    visit: MediumVisitor,
+    visit: Callable[[Any, MediumInterval], Any],
     state: Any,
     active: mi.Bool,
     passes_null: bool,
 ) -> tuple[SegmentEnd, Any]:
     """Trace through transparent surfaces to the first opaque one; visit the media whose boundary is traced."""
+    si = dr.zeros(mi.SurfaceInteraction3f, dr.width(ray))
+    si.wi, si.wavelengths, si.time = -ray.d, ray.wavelengths, ray.time
+    if dr.hint(not media.traces, mode="scalar"):
+        return SegmentEnd(si, mi.Float(ray.maxt), medium, 1.0), state
+    passes_null &= media.has_null_transmission
+
     # -- State ------------------------------------------------------------------------------------------------------------
     onward = traced(ray)  #                        the ray from the last boundary on
     medium = mi.MediumPtr(medium)  #                 what surrounds its origin
     t = mi.Float(0)  #                               distance of that origin
-    si = dr.zeros(mi.SurfaceInteraction3f, dr.width(ray))
-    si.wi, si.wavelengths, si.time = -ray.d, ray.wavelengths, ray.time
     going = mi.Bool(active)
     null_transmission = dr.full(mi.Spectrum, 1, dr.width(ray)) if passes_null else 1.0
 
@@ -214,7 +214,9 @@ def _trace(
         # -- The medium on this side of the surface fills the interval --------------------------------------------------------
         transition = found & hit.is_medium_transition()
         medium = dr.select(transition, hit.target_medium(-ray.d), medium)
-        state = _visit_traced(media, medium, visit, state, RayInterval(ray, t, t_hit, going))
+        for body in media.traced:
+            on = going & (medium == mi.MediumPtr(body.view.medium))
+            state = visit(state, MediumInterval(ray, t, t_hit, on, body))
 
         # -- Go on through what is transparent ------------------------------------------------------------------------------
         clear = found & is_transparent(hit)
@@ -231,15 +233,6 @@ def _trace(
         onward.maxt = ray.maxt - t_hit
         going &= clear
     return SegmentEnd(si, t, medium, null_transmission), state
-
-
-def _visit_traced(media: SceneMedia, medium: mi.MediumPtr, visit: MediumVisitor, state: Any, interval: RayInterval) -> Any:
-    """Visit each medium with the lanes in which it is ``medium``, the one that fills an interval."""
-    ray, t0, t1 = interval.ray, interval.t0, interval.t1
-    for body in media.traced:
-        on = interval.active & (medium == mi.MediumPtr(body.view.medium))
-        state = visit(state, MediumInterval(ray, t0, t1, on, body))
-    return state
 
 
 def is_transparent(si: mi.SurfaceInteraction3f) -> mi.Bool:

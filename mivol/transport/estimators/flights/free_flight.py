@@ -44,8 +44,8 @@ from mivol.transport.media.channels import colours, spectrum
 from mivol.transport.media.drawn_points import draw_even_point
 from mivol.transport.media.extinction import Extinction, RayInterval
 from mivol.transport.media.gaussian_extinction import GaussianExtinction
-from mivol.transport.media.optical_depth import sum_optical_depth
-from mivol.transport.media.ray_intervals import MediumInterval, MediumVisitor, RaySegment, revisit_media, visit_media
+from mivol.transport.media.optical_depth import segment_optical_depth
+from mivol.transport.media.ray_intervals import MediumInterval, RaySegment, SegmentEnd, visit_media
 from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.traversal.random_numbers import LaneSampler, Strata, draw_pcg32, draw_state
 from mivol.transport.traversal.rays import Ray, point_along
@@ -100,12 +100,11 @@ class FreeFlight:
         return self
 
     def estimate(self, segment: PathSegment, purpose: str, active: mi.Bool) -> SegmentEstimate:
-        media, ray, width = self.media, segment.ray, dr.width(segment.ray)
+        media, ray = self.media, segment.ray
         u, rng = segment.samples
         rng, (pick, at_emission, at_probe, chance) = draw_pcg32(rng, 4)
         channel = _draw_channel(segment.beta, pick) if media.channels > 1 else mi.UInt32(0)
-        start = _Flight(dr.full(mi.Float64, dr.inf, width), dr.zeros(mi.UInt32, width), rng)
-        end, flight = visit_media(media, ray, segment.medium, _fly(media, ray, u, channel), start, active)
+        end, flight = _fly(media, ray, segment.medium, u, channel, rng, active)
         collides = active & (flight.t < mi.Float64(end.t))
         t = dr.select(collides, flight.t, mi.Float64(end.t))
         passed = RaySegment.upto(ray, segment.medium, t)
@@ -140,8 +139,7 @@ class FreeFlight:
         """
         if self.media.channels == 1:
             return mi.Spectrum(1)
-        zero = [mi.Float(0) for _ in range(self.media.channels)]
-        tau = revisit_media(self.media, passed, sum_optical_depth(), zero, active)
+        tau = segment_optical_depth(self.media, passed, active)
         # Only ratios of transmittances count, and the largest of them is made 1.
         least = least_of(tau)
         value = spectrum([dr.exp(least - row) for row in tau])
@@ -184,8 +182,10 @@ def _extinction(media: SceneMedia, body: Body, ray: Ray, t: mi.Float64, on: mi.B
     return spectrum(body.extinction_at(ray, dr.select(on, t, 0), media.channels, on, name))
 
 
-def _fly(media: SceneMedia, ray: Ray, u: mi.Float, channel: mi.UInt32) -> MediumVisitor:
-    """The visitor that keeps the first collision along ``ray``."""
+def _fly(
+    media: SceneMedia, ray: Ray, medium: mi.MediumPtr, u: mi.Float, channel: mi.UInt32, rng: mi.UInt32, active: mi.Bool
+) -> tuple[SegmentEnd, _Flight]:
+    """Follow a ray to the first opaque surface, and find the first collision on the way."""
     bodies = media.bodies
     # A boundary that is traced may be entered several times, and each time takes a number of its own.
     first = next((p for b in media.boxed for p in b.view.parts if not _draws_own_numbers(p)), None)
@@ -213,7 +213,9 @@ def _fly(media: SceneMedia, ray: Ray, u: mi.Float, channel: mi.UInt32) -> Medium
             t, index = dr.select(nearer, hit, t), dr.select(nearer, mi.UInt32(number), index)
         return _Flight(t, index, rng)
 
-    return visit
+    width = dr.width(ray)
+    start = _Flight(dr.full(mi.Float64, dr.inf, width), dr.zeros(mi.UInt32, width), rng)
+    return visit_media(media, ray, medium, visit, start, active)
 
 
 def _draws_own_numbers(part: Extinction) -> bool:

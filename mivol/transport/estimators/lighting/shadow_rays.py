@@ -16,7 +16,7 @@ from mivol.numerics import least_of
 from mivol.transport.estimators.flights.tracking import ratio_tracking, residual_ratio_tracking
 from mivol.transport.media.channels import as_rows, spectrum
 from mivol.transport.media.grid_extinction import clip_interval
-from mivol.transport.media.optical_depth import sum_optical_depth, transmittance
+from mivol.transport.media.optical_depth import integrate_optical_depth, transmittance
 from mivol.transport.media.ray_intervals import (
     OWN_SURFACE,
     MediumInterval,
@@ -61,8 +61,7 @@ def light_through(
         end, T = estimate_transmittance(media, ray, medium, active, rng, passes_null=True)
         return end, None, T * end.null_transmission
     enough = DARK if rng is None else SURE_DEPTH - dr.log(draw_pcg32(rng, 1)[1][0])
-    zero = [mi.Float(0) for _ in range(media.channels)]
-    end, tau = visit_media(media, ray, medium, sum_optical_depth(enough), zero, active, passes_null=True)
+    end, tau = integrate_optical_depth(media, ray, medium, active, enough, passes_null=True)
     if rng is None:
         return end, tau, transmittance(tau) * end.null_transmission
     # Every channel is divided by the probability of the clearest one, so that weights stay below 1.

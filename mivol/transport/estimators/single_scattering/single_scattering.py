@@ -50,8 +50,8 @@ from mivol.transport.estimators.single_scattering.scattering_derivatives import 
     sigma_s_at,
 )
 from mivol.transport.estimators.single_scattering.shadow_tables import VisibilityCache
-from mivol.transport.media.optical_depth import sum_optical_depth, transmittance
-from mivol.transport.media.ray_intervals import RaySegment, SegmentEnd, revisit_media, visit_media
+from mivol.transport.media.optical_depth import segment_optical_depth, transmittance
+from mivol.transport.media.ray_intervals import RaySegment, SegmentEnd
 from mivol.transport.traversal.random_numbers import Strata
 from mivol.transport.traversal.rays import point_along
 
@@ -160,7 +160,7 @@ class SingleScattering:
         chosen = self.emitters.choose(ray, samples.which_emitter)
         reservoir = start_reservoir(self.media, samples.piece, dr.width(ray), count)
         proposal = DistanceProposal(self.media, ray, chosen, self.visibility_cache, probe_depth)
-        end, reservoir = visit_media(self.media, ray, segment.medium, fill_reservoir(proposal), reservoir, active)
+        end, reservoir = fill_reservoir(proposal, segment.medium, reservoir, active)
         return _Flight(end, reservoir, proposal)
 
     def _scatter(
@@ -175,8 +175,7 @@ class SingleScattering:
         tau = event.tau
         if not media.is_single:
             front = RaySegment.upto(ray, segment.medium, event.t)
-            zero = [mi.Float(0) for _ in range(media.channels)]
-            tau = revisit_media(media, front, sum_optical_depth(), zero, event.on)
+            tau = segment_optical_depth(media, front, event.on)
         gain = dr.select(event.on, segment.beta * transmittance(tau) / event.pdf, 0)
         vertex = MediumVertex(media, mei, point_along(ray, event.t))
         # Roulette is for paths: the noise of one scattering is small, and that of roulette would show.
