@@ -60,8 +60,8 @@ PUBLIC = {
 """What ``mivol.<name>`` is, and the module below mivol that it comes from; type checkers see the list below."""
 
 if TYPE_CHECKING:  # what type checkers see of PUBLIC, which is imported when it is first used
-    from mivol.fields.field_archives import load_field as load_field
-    from mivol.fields.field_archives import save_field as save_field
+    from .fields.field_archives import load_field as load_field
+    from .fields.field_archives import save_field as save_field
 
     from .experiments.script import Problem as Problem
     from .experiments.script import explain as explain
