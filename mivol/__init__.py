@@ -60,14 +60,13 @@ PUBLIC = {
 """What ``mivol.<name>`` is, and the module below mivol that it comes from; type checkers see the list below."""
 
 if TYPE_CHECKING:  # what type checkers see of PUBLIC, which is imported when it is first used
-    from .fields.field_archives import load_field as load_field
-    from .fields.field_archives import save_field as save_field
-
     from .experiments.script import Problem as Problem
     from .experiments.script import explain as explain
     from .experiments.script import fit_gaussians as fit_gaussians
     from .experiments.script import fit_photographs as fit_photographs
     from .experiments.script import optimize as optimize
+    from .fields.field_archives import load_field as load_field
+    from .fields.field_archives import save_field as save_field
     from .fields.procedural import make_procedural as make_procedural
     from .files import read_volume as read_volume
     from .files import write_volume as write_volume
