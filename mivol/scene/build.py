@@ -18,7 +18,7 @@ from mivol.transport.estimators.single_scattering.shadow_tables import (
     build_visibility_cache,
 )
 from mivol.transport.media.scene_media import SceneMedia
-from mivol.transport.path.estimators import SEGMENT_ESTIMATORS, Estimators, SegmentChoice, Settings
+from mivol.transport.path.estimators import SEGMENT_ESTIMATORS, Estimators, SegmentInputs, Settings
 
 __all__ = ["build_estimators", "build_media"]
 
@@ -45,7 +45,7 @@ def build_estimators(
     """Build the estimators that the plan has chosen, for pictures or for derivatives."""
     media = build_media(scene, needs, plan, survey)
     direct = DirectLighting(media)
-    choice = SegmentChoice(direct, plan.events)
+    choice = SegmentInputs(direct, plan.events)
     if plan.segment in ("single_scattering", "scattering_quadrature"):
         with dr.suspend_grad():
             choice.visibility_cache = _find_visibility(direct, needs, plan, survey, pictures)

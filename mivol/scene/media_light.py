@@ -174,8 +174,8 @@ def _noise(table: EmissionTable, p: mi.Point3f, normal: mi.Vector3f | None, on: 
 
     u, warp = sampler.next_2d(), mi.warp
     around = warp.square_to_uniform_sphere(u) if frame is None else frame.to_world(warp.square_to_cosine_hemisphere(u))
-    towards = dr.normalize(table.draw_place(sampler.next_1d(), [sampler.next_1d() for _ in range(3)]) - p)
-    met, aimed = (table.look(p, d, on) for d in (around, towards))
+    towards = dr.normalize(table.sample_point(sampler.next_1d(), [sampler.next_1d() for _ in range(3)]) - p)
+    met, aimed = (table.integrate_density(p, d, on) for d in (around, towards))
     a, b = own(around), own(towards)
     met_weighed = met.light * power_heuristic(a, met.pdf)
     drawn = dr.select(aimed.pdf > 0, b * aimed.light / aimed.pdf * power_heuristic(aimed.pdf, b), 0)

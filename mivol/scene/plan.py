@@ -40,7 +40,7 @@ from mivol.scene.refusals import (
     refuse_scattering,
 )
 from mivol.transport.media.grid_integral import PACKED_LIMIT, gradient_bytes
-from mivol.transport.path.estimators import SegmentQuestion, Settings, choose_segment_estimator
+from mivol.transport.path.estimators import SegmentNeeds, Settings, choose_segment_estimator
 
 __all__ = ["Plan", "make_plan"]
 
@@ -131,7 +131,7 @@ def _segment(needs: Needs, settings: Settings) -> str:
     """Name of the estimator of what media add along a segment; what no estimator answers has been refused."""
     emits, is_bounded = any(m.emits for m in needs.media), any(m.bounded for m in needs.media)
     scatters = (emits or bool(needs.emitter_kinds)) and is_lit(needs, settings)
-    question = SegmentQuestion(
+    question = SegmentNeeds(
         scatters,
         emits,
         settings.deterministic,

@@ -25,9 +25,9 @@ from mivol.transport.estimators.scores import Primal, Replay, Tangent
 from mivol.transport.line_integrals.aovs import integrate_aovs, jvp_aovs, vjp_aovs
 from mivol.transport.path.derivatives import prepare_derivatives, replay_branches
 from mivol.transport.path.estimators import Estimators, Settings
-from mivol.transport.path.film import CameraRays, RenderSamples, adjoint_rays, record
-from mivol.transport.path.successive import paths_a_lane, walk_successively
-from mivol.transport.path.walk import is_straight, walk_path
+from mivol.transport.path.film import CameraRays, RenderSamples, adjoint_rays, render_on_film
+from mivol.transport.path.successive import paths_per_lane, walk_successively
+from mivol.transport.path.walk import has_one_segment, walk_path
 
 __all__ = ["Session"]
 
@@ -81,7 +81,7 @@ class Session:
         with without_collections(), dr.suspend_grad():
             estimators, plan = self._open(scene, sensor, spp, pictures=True)
             samples = RenderSamples(sensor, seed, spp, plan.pass_rays, estimators.segment.directions)
-            image = record(samples, self.aovs, lambda rays: self._primal(estimators, rays, plan.successive))
+            image = render_on_film(samples, self.aovs, lambda rays: self._primal(estimators, rays, plan.successive))
         if evaluate:
             dr.eval(image)
         return image
@@ -94,7 +94,7 @@ class Session:
                 estimators, plan = self._open(scene, sensor, spp)
                 estimators.media.start_tangent()
             samples = RenderSamples(sensor, seed, spp, plan.pass_rays, estimators.segment.directions)
-            return record(samples, self.aovs, lambda rays: self._tangent(estimators, rays))
+            return render_on_film(samples, self.aovs, lambda rays: self._tangent(estimators, rays))
 
     def render_backward(self, scene: mi.Scene, grad_in: mi.TensorXf, sensor: int | mi.Sensor, seed: int, spp: int) -> None:
         """Add the derivatives of an image, weighted by ``grad_in``, to the gradients of the parameters.
@@ -142,7 +142,7 @@ class Session:
         return build_estimators(scene, needs, plan, self.settings, survey, pictures), plan
 
     def _primal(self, estimators: Estimators, rays: CameraRays, successive: int) -> tuple:
-        count = paths_a_lane(successive, dr.width(rays.ray))
+        count = paths_per_lane(successive, dr.width(rays.ray))
         if count > 1:
             L, alpha = walk_successively(estimators, rays.sampler, rays.ray, count)
         else:
@@ -171,7 +171,7 @@ class Session:
 
     def _replay_whole(self, estimators: Estimators, rays: CameraRays, dL: mi.Spectrum) -> None:
         again, L = rays.sampler.clone(), None
-        if not is_straight(estimators):
+        if not has_one_segment(estimators):
             known = Primal(_black(rays.ray))
             L = walk_path(estimators.replayed(), rays.sampler, rays.ray, known, strata=rays.strata)[0].L
             dr.eval(L)

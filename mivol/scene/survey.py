@@ -11,7 +11,7 @@ import mitsuba as mi
 from mivol.errors import MivolError
 from mivol.scene.facts import Boundary
 from mivol.scene.nesting import OrientedBox, box_around, extent, nesting_fault
-from mivol.transport.estimators.lighting.emitters import UNIFORM
+from mivol.transport.estimators.lighting.emitters import UNIFORM_EMITTER
 from mivol.transport.media.medium_view import nested_field
 from mivol.transport.traversal.box import Box, box_of_cube
 
@@ -130,7 +130,7 @@ def _is_at(shape: mi.Shape, mark: object) -> bool:
 
 
 def _emitter_kind(emitter: mi.Emitter) -> str:
-    if emitter.class_name() == UNIFORM:
+    if emitter.class_name() == UNIFORM_EMITTER:
         return "uniform"
     return "delta" if int(emitter.flags()) & int(mi.EmitterFlags.Delta) else "extended"
 

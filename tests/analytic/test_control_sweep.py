@@ -12,8 +12,8 @@ import pytest
 from mivol.transport.estimators.single_scattering.control_variates import (
     ControlSweep,
     GridControl,
-    Probe,
-    Tracks,
+    ProbeDifference,
+    SweepSums,
 )
 from mivol.transport.media.ray_intervals import RaySegment
 from mivol.transport.media.scene_media import SceneMedia
@@ -67,8 +67,8 @@ def sweep(media: SceneMedia, tangent: bool) -> ControlSweep:
     values = np.zeros((2, 2, 5))
     values[:] = S
     control = GridControl(mi.Float(values.ravel().astype(np.float32)), (1, 1, 4), 1)
-    probe = Probe(mi.Float64(1 + 0.375), mi.Float64(1 + AT), [mi.Float(SOURCE)], [mi.Float(DIMS)], mi.Bool(True))
-    tracks = Tracks([[(0, mi.Float(1))]], [mi.Float(REST)], tangent)
+    probe = ProbeDifference(mi.Float64(1 + 0.375), mi.Float64(1 + AT), [mi.Float(SOURCE)], [mi.Float(DIMS)], mi.Bool(True))
+    tracks = SweepSums([[(0, mi.Float(1))]], [mi.Float(REST)], tangent)
     passed = RaySegment(ray, mi.MediumPtr(None), mi.Float(3))
     return ControlSweep(media, control, passed, [mi.Float(depth(SIGMA, 1.0))], tracks, probe)
 

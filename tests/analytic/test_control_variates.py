@@ -18,7 +18,7 @@ from mivol.transport.estimators.single_scattering.control_variates import (
     CameraOrigins,
     GridControl,
     build_grid_control,
-    nodes_along,
+    count_nodes,
 )
 from mivol.transport.path.estimators import Settings
 
@@ -70,7 +70,7 @@ def test_point_light_from_the_corners_of_the_grid():
 
 def test_point_light_between_nodes_of_three_edges(monkeypatch):
     """4 x 3 x 4 nodes, two cells apart: the light of each in its place, and trilinear between them."""
-    monkeypatch.setattr(control_variates, "STEP", 2)
+    monkeypatch.setattr(control_variates, "CELLS_PER_NODE", 2)
     place, intensity = np.array([4.0, 1.0, 2.5]), 3.0
     values = np.array(control_of(point(place, intensity)[0]).values).reshape(5, 4, 6)
     edges = [np.linspace(-1, 1, n) for n in (4, 3, 4)]
@@ -82,7 +82,7 @@ def test_point_light_between_nodes_of_three_edges(monkeypatch):
 
 def test_nodes_stand_eight_cells_apart():
     """Two where all cells are within one step, and 33 at most: 31 steps of 8 cells and a last one of 7 need all of them."""
-    assert [nodes_along(n) for n in (1, 7, 8, 15, 16, 247, 254, 255, 256, 1024)] == [2, 2, 3, 3, 4, 32, 33, 33, 33, 33]
+    assert [count_nodes(n) for n in (1, 7, 8, 15, 16, 247, 254, 255, 256, 1024)] == [2, 2, 3, 3, 4, 32, 33, 33, 33, 33]
 
 
 def test_a_cell_has_the_light_of_its_place():

@@ -15,7 +15,7 @@ from false_alarms import assert_rate, assert_same_mean, fresh
 from oracle import tau_twin, to_lattice, trilinear
 from scattering_scenes import PLACE, rough_grid
 
-from mivol.transport.estimators.flights.tracking import collide_in_blocks, collide_in_bounded
+from mivol.transport.estimators.flights.tracking import delta_tracking, delta_tracking_in_blocks
 from mivol.transport.media.extinction import BoundedExtinction, RayInterval
 from mivol.transport.media.grid_extinction import GridExtinction
 from mivol.transport.traversal.grid_blocks import find_block_ranges
@@ -80,7 +80,7 @@ def depths(values: np.ndarray, t: mi.Float64, t0: float) -> np.ndarray:
 def test_flights_through_a_grid(shift):
     """Rough values, in blocks of 4 and of 8 cells."""
     values = rough_grid(1, 2.0, (9, 12, 17))
-    t, _ = collide_in_blocks(grid(values, shift), mi.Float(SCALE), interval(), generators(1))
+    t, _ = delta_tracking_in_blocks(grid(values, shift), mi.Float(SCALE), interval(), generators(1))
     T = np.exp(-SCALE * tau_twin(values, PLACE, START, D)[0])
     assert_flights(t, depths(values, t, 0.0), T)
 
@@ -89,14 +89,14 @@ def test_flights_through_a_grid(shift):
 def test_flights_that_begin_and_end_in_the_grid():
     """From 2.2 on, up to 3.1; nothing is found outside."""
     values = rough_grid(1, 2.0, (9, 12, 17))
-    t, _ = collide_in_blocks(grid(values, 2), mi.Float(SCALE), interval(2.2, 3.1), generators(2))
+    t, _ = delta_tracking_in_blocks(grid(values, 2), mi.Float(SCALE), interval(2.2, 3.1), generators(2))
     assert_flights(t, depths(values, t, 2.2), np.exp(-SCALE * tau_twin(values, PLACE, START, D, 2.2, 3.1)[0]))
     assert np.nanmin(np.array(t)) >= 2.2 and not np.any((np.array(t) > 3.1 + 1e-6) & np.isfinite(np.array(t)))
 
 
 def test_every_collision_is_real_where_blocks_have_one_value():
     """So the first number says where: -log u over the extinction, behind the face of the box."""
-    t, _ = collide_in_blocks(grid(np.full((9, 12, 17), 0.8), 2), mi.Float(SCALE), interval(), generators(3))
+    t, _ = delta_tracking_in_blocks(grid(np.full((9, 12, 17), 0.8), 2), mi.Float(SCALE), interval(), generators(3))
     _, (u,) = draw_pcg32(generators(3), 1)
     start, end = face()
     expected = start - np.log(np.array(u, np.float64)) / (0.8 * SCALE)
@@ -108,8 +108,8 @@ def test_every_collision_is_real_where_blocks_have_one_value():
 def test_lanes_that_are_off_and_vacuum_have_no_collision():
     """Blocks of 0 have a majorant of 0: the next tentative collision is infinitely far."""
     part, empty = grid(rough_grid(1), 2), grid(np.zeros((5, 4, 6)), 2)
-    assert np.isinf(np.array(collide_in_blocks(part, mi.Float(SCALE), interval(on=False), generators(4))[0])).all()
-    assert np.isinf(np.array(collide_in_blocks(empty, mi.Float(SCALE), interval(), generators(4))[0])).all()
+    assert np.isinf(np.array(delta_tracking_in_blocks(part, mi.Float(SCALE), interval(on=False), generators(4))[0])).all()
+    assert np.isinf(np.array(delta_tracking_in_blocks(empty, mi.Float(SCALE), interval(), generators(4))[0])).all()
 
 
 # -- A field of which no more than a majorant is known ------------------------------------------------------------------
@@ -125,7 +125,7 @@ def ball(slack: float, sigma: float = 0.6) -> BoundedExtinction:
 @pytest.mark.parametrize("slack", [1.0, 3.0])
 def test_flights_through_a_ball(slack):
     """Between 1.5 and 3.5, whatever the majorant."""
-    t, after = collide_in_bounded(ball(slack), mi.Float(SCALE), interval(), generators(5))
+    t, after = delta_tracking(ball(slack), mi.Float(SCALE), interval(), generators(5))
     tau = 0.6 * SCALE * np.clip(np.array(t) - 1.5, 0, 2)
     assert_flights(t, tau, np.exp(-2 * 0.6 * SCALE))
     assert dr.width(after) == N
@@ -133,10 +133,10 @@ def test_flights_through_a_ball(slack):
 
 @pytest.mark.statistical
 def test_flights_that_begin_and_end_in_the_ball():
-    t, _ = collide_in_bounded(ball(2.0), mi.Float(SCALE), interval(2.0, 3.0), generators(6))
+    t, _ = delta_tracking(ball(2.0), mi.Float(SCALE), interval(2.0, 3.0), generators(6))
     assert_flights(t, 0.6 * SCALE * (np.array(t) - 2.0), np.exp(-0.6 * SCALE))
 
 
 def test_lanes_that_are_off_and_balls_of_nothing_have_no_collision():
-    assert np.isinf(np.array(collide_in_bounded(ball(1.0), mi.Float(SCALE), interval(on=False), generators(7))[0])).all()
-    assert np.isinf(np.array(collide_in_bounded(ball(0.0), mi.Float(SCALE), interval(), generators(7))[0])).all()
+    assert np.isinf(np.array(delta_tracking(ball(1.0), mi.Float(SCALE), interval(on=False), generators(7))[0])).all()
+    assert np.isinf(np.array(delta_tracking(ball(0.0), mi.Float(SCALE), interval(), generators(7))[0])).all()

@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mivol.transport.estimators.lighting.direct_lighting import DirectLight, DirectLighting, DistantAim
+from mivol.transport.estimators.lighting.direct_lighting import DirectLight, DirectLighting, DistantEmitterSample
 from mivol.transport.estimators.lighting.emitters import EventSamples
 from mivol.transport.estimators.lighting.vertex import MediumVertex, SurfaceVertex
 from mivol.transport.media.body import medium_interaction
@@ -50,8 +50,8 @@ def test_a_wall_under_a_emitter():
     """reflectance / pi I / r^2 exp(-tau); nothing in a lane that is off."""
     direct, vertex = at_wall(scene(emitter=emitter()))
     with dr.suspend_grad():
-        aim = direct.aim(vertex.interaction, mi.Point2f(0.5), mi.Bool(True))
-        found, off = (direct.at_vertex(vertex, aim, False, mi.Bool(on)) for on in (True, False))
+        aim = direct.sample_emitter(vertex.interaction, mi.Point2f(0.5), mi.Bool(True))
+        found, off = (direct.estimate_at_vertex(vertex, aim, False, mi.Bool(on)) for on in (True, False))
     # Rays start a little above the wall: 1e-5 of a scene of 20, and the emitter is that much nearer.
     assert np.array(found.value).ravel() == pytest.approx([0.5 / np.pi * POWER / FAR**2 * np.exp(-DEPTH)] * 3, rel=1e-3)
     assert found.on[0] and not off.on[0] and not np.array(off.value).any()
@@ -69,8 +69,8 @@ def test_a_shadow_ray_has_the_derivative_of_its_optical_depth():
     dr.enable_grad(tracked)
     dr.set_grad(tracked, 0.5)
     with dr.suspend_grad():
-        aim = direct.aim(vertex.interaction, mi.Point2f(0.5), mi.Bool(True))
-        sample = direct.at_vertex(vertex, aim, False, mi.Bool(True))
+        aim = direct.sample_emitter(vertex.interaction, mi.Point2f(0.5), mi.Bool(True))
+        sample = direct.estimate_at_vertex(vertex, aim, False, mi.Bool(True))
 
     def term() -> DirectLight:
         """In a lane that receives the light, and in one that does not."""
@@ -111,9 +111,9 @@ def test_a_point_of_smoke_under_two_emitters():
     assert len(direct.emitters.sampled) == 2 and not direct.emitters.samples_phase
     light = []
     for u in (0.25, 0.75):
-        chosen = direct.emitters.choose(mi.Ray3f(vertex.interaction.p, mi.Vector3f(0, 0, 1)), mi.Float(u))
+        chosen = direct.emitters.choose_emitter(mi.Ray3f(vertex.interaction.p, mi.Vector3f(0, 0, 1)), mi.Float(u))
         with dr.suspend_grad():
-            (sample,) = direct.in_medium(vertex, chosen, samples(), False, mi.Bool(True))
+            (sample,) = direct.estimate_in_medium(vertex, chosen, samples(), False, mi.Bool(True))
         light.append(np.array(sample.value).ravel()[0])
     np.testing.assert_allclose(sorted(light), np.array([7 / 4, 3 / 1]) * 2 / (4 * np.pi), rtol=ROUNDING)
 
@@ -122,10 +122,10 @@ def test_a_point_of_smoke_under_a_sky():
     """Directions are drawn from the phase function alone: the radiance itself, where the direction meets no wall."""
     direct, vertex = at_smoke(scene(sky=sky(0.7)))
     assert direct.emitters.samples_phase and not direct.emitters.sampled
-    chosen = direct.emitters.choose(mi.Ray3f(vertex.interaction.p, mi.Vector3f(0, 0, 1)), mi.Float(0.5))
+    chosen = direct.emitters.choose_emitter(mi.Ray3f(vertex.interaction.p, mi.Vector3f(0, 0, 1)), mi.Float(0.5))
     upward = samples()
     with dr.suspend_grad():
-        (sample,) = direct.in_medium(vertex, chosen, upward, False, mi.Bool(True))
+        (sample,) = direct.estimate_in_medium(vertex, chosen, upward, False, mi.Bool(True))
     passed = np.exp(-DEPTH / abs(sample.ray_segment.ray.d.z[0])) if sample.ray_segment.ray.d.z[0] < 0 else 1.0
     np.testing.assert_allclose(np.array(sample.value).ravel(), [0.7 * passed] * 3, rtol=ROUNDING)
 
@@ -138,7 +138,10 @@ def test_a_sample_at_infinity_is_the_same_from_everywhere(kind):
     far.p, near.p = mi.Point3f(300, -200, 100), mi.Point3f(0.1, 0.2, 0.3)
     u, on = mi.Point2f(np.random.default_rng(0).uniform(size=(2, 64)).astype(np.float32)), dr.full(mi.Bool, True, 64)
     direct = DirectLighting(media)
-    moved, drawn = DistantAim.of(direct.aim(far, u, on)).seen_from(near), direct.aim(near, u, on)
+    moved, drawn = (
+        DistantEmitterSample.from_sample(direct.sample_emitter(far, u, on)).at_point(near),
+        direct.sample_emitter(near, u, on),
+    )
     for name in ("d", "pdf", "delta", "uv"):
         np.testing.assert_array_equal(np.array(getattr(moved.direct, name)), np.array(getattr(drawn.direct, name)))
     np.testing.assert_array_equal(np.array(moved.weight), np.array(drawn.weight))

@@ -13,7 +13,7 @@ from emission_scenes import BOUNDARIES, LE, PLACE, B, aimed, colours, emitting, 
 from oracle import GAUSS_2, box_interval, corner_weights, quadrature_points, trilinear
 from scipy.special import erf
 
-from mivol.transport.estimators.scores import FORWARD, PICTURE, REVERSE
+from mivol.transport.estimators.scores import FORWARD, IMAGE, REVERSE
 from mivol.transport.estimators.segment import PathSegment
 from mivol.transport.line_integrals.emission import Emission
 from mivol.transport.media.scene_media import SceneMedia
@@ -328,7 +328,7 @@ ON = (True, False)
 
 def test_light_and_transmittance(media):
     with dr.suspend_grad():
-        found = Emission(media).estimate(segment(), PICTURE, mi.Bool(*ON))
+        found = Emission(media).estimate(segment(), IMAGE, mi.Bool(*ON))
     light = BETA * SOURCE * (1 - T)
     np.testing.assert_allclose(np.array(found.light.value), np.c_[light, np.zeros(3)], rtol=ROUNDING)
     np.testing.assert_allclose(np.array(found.T)[:, 0], T, rtol=ROUNDING)

@@ -12,7 +12,12 @@ from scattering_scenes import close_up
 
 from mivol.scene.media_light import find_emitting_boxes
 from mivol.scene.needs import find_needs
-from mivol.transport.estimators.lighting.emission_sampling import CELLS, EVEN, EmissionTable, tabulate_emission
+from mivol.transport.estimators.lighting.emission_sampling import (
+    CELLS_PER_AXIS,
+    UNIFORM_SHARE,
+    EmissionTable,
+    tabulate_emission,
+)
 from mivol.transport.media.body import Body
 from mivol.transport.media.scene_media import SceneMedia
 from mivol.validate.moments import Moments
@@ -52,9 +57,9 @@ def test_cells_have_their_share_of_the_power() -> None:
     """sigma_t (1 - albedo) Le times the volume of a cell, and the even share."""
     table = table_of(two())
     which = order(table)
-    power = np.repeat(np.array([1 * 0.75 * 18 * 0.7 * 0.5 * 0.8, 0.5 * 3 * 0.5 * 0.5 * 0.25])[which], CELLS**3)
-    share = (1 - EVEN) * power / power.sum() + EVEN / power.size
-    volume = np.repeat(np.array([0.7 * 0.5 * 0.8, 0.5 * 0.5 * 0.25])[which], CELLS**3) / CELLS**3
+    power = np.repeat(np.array([1 * 0.75 * 18 * 0.7 * 0.5 * 0.8, 0.5 * 3 * 0.5 * 0.5 * 0.25])[which], CELLS_PER_AXIS**3)
+    share = (1 - UNIFORM_SHARE) * power / power.sum() + UNIFORM_SHARE / power.size
+    volume = np.repeat(np.array([0.7 * 0.5 * 0.8, 0.5 * 0.5 * 0.25])[which], CELLS_PER_AXIS**3) / CELLS_PER_AXIS**3
     assert np.array(table.density) == pytest.approx(share / volume, rel=1e-4)
     assert np.array(table.cumulative) == pytest.approx(np.cumsum(share), rel=1e-4)
 
@@ -69,15 +74,17 @@ def test_points_are_drawn_with_their_density() -> None:
     """The mean of x^k / density over all points is the integral over the boxes."""
     table = table_of(two())
     u, *inside = numbers(N, 4, 1)
-    p = np.array(table.draw_place(u, inside)).T
+    p = np.array(table.sample_point(u, inside)).T
     near = p[:, 0] < 0.5
     box = np.where(near, 0, 1)
     low, size = np.array([[-0.3, -0.2, -0.5], [1.0, 0.2, 0.1]])[box], np.array([[0.7, 0.5, 0.8], [0.5, 0.5, 0.25]])[box]
     q = (p - low) / size
     assert (q > -1e-5).all() and (q < 1 + 1e-5).all()
-    cell = np.clip(np.floor(q * CELLS).astype(int), 0, CELLS - 1)
+    cell = np.clip(np.floor(q * CELLS_PER_AXIS).astype(int), 0, CELLS_PER_AXIS - 1)
     number = np.argsort(order(table))[box]
-    density = np.array(table.density)[number * CELLS**3 + (cell[:, 2] * CELLS + cell[:, 1]) * CELLS + cell[:, 0]]
+    density = np.array(table.density)[
+        number * CELLS_PER_AXIS**3 + (cell[:, 2] * CELLS_PER_AXIS + cell[:, 1]) * CELLS_PER_AXIS + cell[:, 0]
+    ]
     found = np.stack([near / density, ~near / density, near * q[:, 0] / density, near * q[:, 1] * q[:, 2] / density], axis=1)
     truth = [0.28, 0.0625, 0.14, 0.07]
     assert_same_mean(Moments.of(found), np.array(truth), rounding=1e-5, what="integrals")
@@ -88,9 +95,9 @@ def test_dark_cells_are_seldom_drawn() -> None:
     """The same of a fire whose cells are unlike each other."""
     table = table_of(seen("over a floor", res=4))
     u, *inside = numbers(N, 4, 4)
-    q = (np.array(table.draw_place(u, inside)).T - PLACE[:3, 3]) / np.diag(PLACE)[:3]
-    cell = np.clip(np.floor(q * CELLS).astype(int), 0, CELLS - 1)
-    each = np.array(table.density)[(cell[:, 2] * CELLS + cell[:, 1]) * CELLS + cell[:, 0]].astype(np.float64)
+    q = (np.array(table.sample_point(u, inside)).T - PLACE[:3, 3]) / np.diag(PLACE)[:3]
+    cell = np.clip(np.floor(q * CELLS_PER_AXIS).astype(int), 0, CELLS_PER_AXIS - 1)
+    each = np.array(table.density)[(cell[:, 2] * CELLS_PER_AXIS + cell[:, 1]) * CELLS_PER_AXIS + cell[:, 0]].astype(np.float64)
     assert_same_mean(Moments.of(np.stack([1 / each, q[:, 0] / each], axis=1)), [0.28, 0.14], rounding=1e-4, what="integrals")
 
 
@@ -101,10 +108,12 @@ def test_the_density_of_directions_integrates_to_one(origin: tuple) -> None:
     table = table_of(seen("over a floor", res=4))
     o = mi.Point3f(*origin) + dr.zeros(mi.Point3f, N)
     u, v, w, *rest = numbers(N, 6, 2)
-    pdf = np.array(table.look(o, mi.warp.square_to_uniform_sphere(mi.Point2f(u, v)), dr.full(mi.Bool, True, N)).pdf)
+    pdf = np.array(
+        table.integrate_density(o, mi.warp.square_to_uniform_sphere(mi.Point2f(u, v)), dr.full(mi.Bool, True, N)).pdf
+    )
     assert_same_mean(Moments.of(4 * np.pi * pdf[:, None].astype(np.float64)), np.ones(1), what="integral")
-    d = dr.normalize(table.draw_place(w, rest) - o)
-    assert (np.array(table.look(o, d, dr.full(mi.Bool, True, N)).pdf) > 0).all()
+    d = dr.normalize(table.sample_point(w, rest) - o)
+    assert (np.array(table.integrate_density(o, d, dr.full(mi.Bool, True, N)).pdf) > 0).all()
 
 
 @pytest.mark.statistical
@@ -114,23 +123,23 @@ def test_points_of_a_ray_are_drawn_with_their_density() -> None:
     o, d = mi.Point3f(-1.0, 0.25, 0.15), mi.Vector3f(1, 0, 0)
     on = dr.full(mi.Bool, True, N)
     (u,) = numbers(N, 1, 3)
-    line = table.draw_along(o + dr.zeros(mi.Point3f, N), d + dr.zeros(mi.Vector3f, N), u, on)
+    line = table.sample_along(o + dr.zeros(mi.Point3f, N), d + dr.zeros(mi.Vector3f, N), u, on)
     t, density, box = (np.array(v).astype(np.float64) for v in (line.t, line.density, line.box))
     box = np.array(order(table))[box.astype(int)]
     inside = np.where(box == 0, (t >= 0.7 - 1e-5) & (t <= 1.4 + 1e-5), (t >= 2 - 1e-5) & (t <= 2.5 + 1e-5))
     assert inside.all()
-    assert np.ptp((t[box == 0] - 0.7) / (0.7 / CELLS) % 1) > 0.9  # not only the middles of cells
+    assert np.ptp((t[box == 0] - 0.7) / (0.7 / CELLS_PER_AXIS) % 1) > 0.9  # not only the middles of cells
     found = np.stack([(box == 0) / density, (box == 1) / density, t / density], axis=1)
     truth = [0.7, 0.5, (1.4**2 - 0.7**2 + 2.5**2 - 2.0**2) / 2]
     assert_same_mean(Moments.of(found), np.array(truth), rounding=1e-5, what="integrals")
-    seen_along = table.look(o + dr.zeros(mi.Point3f, N), d + dr.zeros(mi.Vector3f, N), on)
+    seen_along = table.integrate_density(o + dr.zeros(mi.Point3f, N), d + dr.zeros(mi.Vector3f, N), on)
     assert np.array(seen_along.pdf) == pytest.approx(np.array(line.pdf), rel=1e-5)
-    shares = np.array(table.density)[np.argsort(order(table)) * CELLS**3]
+    shares = np.array(table.density)[np.argsort(order(table)) * CELLS_PER_AXIS**3]
     assert np.array(seen_along.light) == pytest.approx(0.7 * shares[0] + 0.5 * shares[1], rel=1e-5)
     cubes = [(1.4**3 - 0.7**3) / 3, (2.5**3 - 2.0**3) / 3]
     assert np.array(line.pdf) == pytest.approx(shares @ cubes, rel=1e-5)
 
 
 def test_a_ray_that_misses_has_no_density() -> None:
-    line = table_of(two()).draw_along(mi.Point3f(-1, 0.25, 3), mi.Vector3f(1, 0, 0), mi.Float([0.1, 0.9]), mi.Bool(True))
+    line = table_of(two()).sample_along(mi.Point3f(-1, 0.25, 3), mi.Vector3f(1, 0, 0), mi.Float([0.1, 0.9]), mi.Bool(True))
     assert not np.array(line.pdf).any() and not np.array(line.density).any()

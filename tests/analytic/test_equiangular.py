@@ -11,7 +11,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mivol.transport.estimators.lighting.emitters import EquiangularSampler, equiangular_sampler
+from mivol.transport.estimators.lighting.emitters import EquiangularSampler, make_ball_sampler
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
 
@@ -64,7 +64,7 @@ def test_density_is_the_derivative_of_the_angle():
 def test_mean_of_the_inverse_square():
     """theta / (rho dt) where the emitter has a place, 1 where it is at infinity."""
     ray = mi.Ray3f(mi.Point3f(0, 0, 0), mi.Vector3f(0, 0, 1), dr.inf, mi.Float(0), mi.Color0f())
-    found = equiangular_sampler(ray, [3.0, 0.0, 4.0, 0.0]).mean(mi.Float(4), mi.Float(3))
+    found = make_ball_sampler(ray, [3.0, 0.0, 4.0, 0.0]).mean(mi.Float(4), mi.Float(3))
     assert found[0] == pytest.approx(np.arctan(1) / 9, rel=1e-5)  # 1e-8 of the squared distance is added to rho^2: 1.4e-8
-    assert equiangular_sampler(ray, None) is None
+    assert make_ball_sampler(ray, None) is None
     assert EquiangularSampler(mi.Float(0), mi.Float(1), mi.Bool(False)).mean(mi.Float(4), mi.Float(3))[0] == 1

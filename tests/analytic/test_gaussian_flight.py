@@ -13,7 +13,7 @@ from scipy.special import logit
 from mivol.fields import gaussian_cells
 from mivol.fields.gaussian_field import GaussianField
 from mivol.points.gaussians import Gaussians
-from mivol.transport.estimators.flights.regular_tracking import collide_in_gaussians
+from mivol.transport.estimators.flights.regular_tracking import sample_gaussian_flight
 from mivol.transport.media.extinction import RayInterval
 from mivol.transport.media.gaussian_extinction import GaussianExtinction
 from mivol.transport.traversal.random_numbers import seed_pcg32
@@ -37,7 +37,7 @@ def test_flights_end_where_the_depth_of_the_twin_says(cells: float, variant_rgb:
     ray = mi.Ray3f(dr.zeros(mi.Point3f, FLIGHTS) + mi.Point3f(*o[0].tolist()), mi.Vector3f(*d[0].tolist()))
     interval = RayInterval(ray, mi.Float64(0), mi.Float64(end), dr.full(mi.Bool, True, FLIGHTS))
     seed = mi.Float(np.random.default_rng(fresh(3)).uniform())
-    t = np.array(collide_in_gaussians(part, mi.Float(SCALE), interval, seed_pcg32(seed, FLIGHTS))[0])
+    t = np.array(sample_gaussian_flight(part, mi.Float(SCALE), interval, seed_pcg32(seed, FLIGHTS))[0])
     twin = oracle.Cloud.of(gaussians)
     assert (np.isinf(t) | (t <= end + 1e-5)).all()
     for place in np.linspace(2.6, end, 6):

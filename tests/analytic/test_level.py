@@ -12,7 +12,7 @@ from mivol.scene.build import build_estimators
 from mivol.scene.needs import find_needs
 from mivol.scene.plan import make_plan
 from mivol.scene.survey import survey_scene
-from mivol.transport.estimators.flights.flight_derivatives import Level
+from mivol.transport.estimators.flights.flight_derivatives import Baseline
 from mivol.transport.path.derivatives import prepare_derivatives
 from mivol.transport.path.estimators import Settings
 from scenes import box_of, camera, medium, sky
@@ -29,7 +29,7 @@ MISSED = 40.0
 
 def levels_of(
     emitter: dict, *interiors: dict, depth: int = 3, at: tuple = (0, MISSED, 0.5, MISSED), seen: tuple = (0.5,) * 4
-) -> Level | None:
+) -> Baseline | None:
     """For boxes with these media, 5 beside each other, the first one [-1, 1]^3, and rays that pass x = ``at``.
 
     They lie at (``seen``, 0.5) on the film.
@@ -45,7 +45,7 @@ def levels_of(
         assert plan.segment == "free_flight"
         estimators = build_estimators(scene, needs, plan, settings, survey, pictures=False)
         prepare_derivatives(estimators, ray, mi.Point2f(mi.Float(seen[: len(at)]), 0.5))
-    return estimators.segment.level
+    return estimators.segment.baseline
 
 
 def level_of(*args: dict, **options: object) -> np.ndarray:

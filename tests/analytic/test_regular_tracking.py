@@ -15,7 +15,7 @@ from oracle import tau_scale, tau_twin
 from scattering_scenes import PLACE, aimed, rough_grid
 
 from mivol.fields.activation import activation_of
-from mivol.transport.estimators.flights.regular_tracking import collide_exactly
+from mivol.transport.estimators.flights.regular_tracking import regular_tracking
 from mivol.transport.media.extinction import ConstantExtinction, ExactExtinction, RayInterval
 from mivol.transport.media.grid_extinction import ActivatedGridExtinction, GridExtinction
 from scenes import as_float32, make_lattice, to_lanes
@@ -41,7 +41,7 @@ def fly(
     ends = [mi.Float64(x) if np.ndim(x) else mi.Float64(float(x)) for x in (t0, t1)]
     interval = RayInterval(ray, *ends, mi.Bool(on))
     with dr.suspend_grad():
-        return np.array(collide_exactly(part, mi.Float(SCALE), interval, mi.Float(goal), mi.UInt32(channel)))
+        return np.array(regular_tracking(part, mi.Float(SCALE), interval, mi.Float(goal), mi.UInt32(channel)))
 
 
 @pytest.mark.parametrize("case", ["all of the ray", "part of the ray", "rgb", "empty blocks skipped"])

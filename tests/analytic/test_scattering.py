@@ -13,9 +13,9 @@ from mivol.transport.estimators.single_scattering.distance_sampling import Mediu
 from mivol.transport.estimators.single_scattering.scattering_derivatives import (
     Scattering,
     at_event,
-    medium_event_interaction,
-    sigma_s_at,
-    sigma_t_at,
+    event_interaction,
+    event_sigma_s,
+    event_sigma_t,
 )
 from mivol.transport.media.scene_media import SceneMedia
 from scenes import box_of, camera, centred, media_of, medium
@@ -63,7 +63,7 @@ def test_events_know_their_medium():
     at, order = at_event(media, event(media)), upwards(media)
     assert [np.array(at[k][1]).tolist() for k in order] == LANES
     assert [at[k][0] for k in order] == [media.bodies[k] for k in order]
-    mei = medium_event_interaction(media, upward(), event(media))
+    mei = event_interaction(media, upward(), event(media))
     pointers = [mi.MediumPtr(media.bodies[k].view.medium) for k in order]
     assert [np.array(mei.medium == p).tolist() for p in pointers] == LANES
     np.testing.assert_array_equal(np.array(mei.p.z), [0, 2, 2])
@@ -72,19 +72,19 @@ def test_events_know_their_medium():
 def test_coefficients_are_those_of_the_medium():
     """The albedo times the extinction, or sigma_s itself; 0 where nothing is scattered."""
     media = scene_of(medium("mivol_medium", **GREY), COLOURS)
-    mei = medium_event_interaction(media, upward(), event(media))
-    found = np.array(sigma_s_at(media, upward(), event(media), mei))
+    mei = event_interaction(media, upward(), event(media))
+    found = np.array(event_sigma_s(media, upward(), event(media), mei))
     np.testing.assert_array_equal(found, [[0.5, 1, 0], [0.5, 2, 0], [0.5, 4, 0]])
     low, top = (media.bodies[k] for k in upwards(media))
     for body, expected in ((low, [2, 2, 2]), (top, [1.5, 2.5, 4.5])):
-        sigma_t = sigma_t_at(media, body, upward(), event(media), mi.Bool(True))
+        sigma_t = event_sigma_t(media, body, upward(), event(media), mi.Bool(True))
         np.testing.assert_array_equal(np.array(sigma_t).ravel(), expected)
 
 
 def test_a_single_walk_knows_the_extinction_already():
     """The event of a single medium says what it is; nothing is looked up again."""
     media = scene_of(medium("mivol_medium", **GREY))
-    found = sigma_t_at(media, media.bodies[0], upward(), event(media), mi.Bool(True))
+    found = event_sigma_t(media, media.bodies[0], upward(), event(media), mi.Bool(True))
     np.testing.assert_array_equal(np.array(found), [[5, 6, 7]] * 3)
 
 

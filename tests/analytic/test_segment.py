@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mivol.transport.estimators.scores import PICTURE
+from mivol.transport.estimators.scores import IMAGE
 from mivol.transport.estimators.segment import Absorption, PathSegment, SegmentLight, SegmentTransmittance
 from scenes import box_of, camera, centred, media_of, medium
 
@@ -70,7 +70,7 @@ def test_absorption_is_beers_law_with_its_derivatives():
     segment = PathSegment(ray, mi.MediumPtr(None), mi.Spectrum(1), mi.Bool(True), None, mi.UInt32(0))
     media.start_tangent()
     with dr.suspend_grad():
-        found = Absorption(media).estimate(segment, PICTURE, mi.Bool(True))
+        found = Absorption(media).estimate(segment, IMAGE, mi.Bool(True))
         tangent = found.transmittance.jvp()
     rounding = 4 * 2.0**-23
     assert found.light is None and not found.end.si.is_valid()[0]

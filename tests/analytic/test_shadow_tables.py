@@ -17,7 +17,7 @@ from mivol.scene.plan import make_plan
 from mivol.scene.survey import survey_scene
 from mivol.transport.estimators.lighting.emitters import SceneEmitters
 from mivol.transport.estimators.single_scattering.shadow_tables import (
-    FLOOR,
+    MIN_WEIGHT,
     RAY_FRACTION,
     VisibilityCache,
     build_visibility_cache,
@@ -54,7 +54,7 @@ def test_weights_are_those_of_beer(shift, occupied):
     depth = 2 * (1 - np.clip(middle, 0.25 / SIZE[0], 1 - 0.25 / SIZE[0]))
     weights = np.array(shade.weights).reshape(blocks)
     # The box is 2 high; the optical depth is known to 2e-6 of itself, and float32 adds a few roundings.
-    np.testing.assert_allclose(weights, np.broadcast_to((np.exp(-0.8 * depth) + FLOOR)[:, None, None], blocks), rtol=1e-5)
+    np.testing.assert_allclose(weights, np.broadcast_to((np.exp(-0.8 * depth) + MIN_WEIGHT)[:, None, None], blocks), rtol=1e-5)
 
 
 @pytest.mark.parametrize("shift", [0, 1, 2])

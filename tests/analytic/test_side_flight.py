@@ -16,12 +16,12 @@ from false_alarms import assert_same_mean, fresh
 from oracle_phase import gauss, hg
 
 from mivol.transport.estimators.flights.free_flight import FreeFlight
-from mivol.transport.estimators.lighting.direct_lighting import DirectLighting, DistantAim
-from mivol.transport.estimators.scores import PICTURE
+from mivol.transport.estimators.lighting.direct_lighting import DirectLighting, DistantEmitterSample
+from mivol.transport.estimators.scores import IMAGE
 from mivol.transport.estimators.segment import Collision
 from mivol.transport.media.body import medium_interaction
 from mivol.transport.path.estimators import Estimators, Settings
-from mivol.transport.path.side_flight import SideSamples, fly_aside, weigh_aim
+from mivol.transport.path.side_flight import SideFlightSamples, estimate_side_flight, weigh_emitter_sample
 from mivol.transport.traversal.random_numbers import draw_state
 from mivol.validate.moments import Moments
 from scenes import ball_of, camera, media_of, medium
@@ -56,11 +56,11 @@ def test_light_at_the_end_of_a_side_flight():
     estimators, hit = middle()
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(fresh(1), N)
-    samples = SideSamples(sampler.next_2d(), (sampler.next_1d(), draw_state(sampler)), None)
+    samples = SideFlightSamples(sampler.next_2d(), (sampler.next_1d(), draw_state(sampler)), None)
     with dr.suspend_grad():
-        aim = DistantAim.of(estimators.direct.aim(hit.mei, mi.Point2f(0.5), hit.on))
-        found = fly_aside(
-            estimators, hit, mi.Spectrum(0.5, 1, 2), mi.UInt32(0), aim, samples, PICTURE, dr.arange(mi.UInt32, N) > 0
+        aim = DistantEmitterSample.from_sample(estimators.direct.sample_emitter(hit.mei, mi.Point2f(0.5), hit.on))
+        found = estimate_side_flight(
+            estimators, hit, mi.Spectrum(0.5, 1, 2), mi.UInt32(0), aim, samples, IMAGE, dr.arange(mi.UInt32, N) > 0
         )
     value = np.array(found.light.value, np.float64)
     (c, wc), (t, wt) = gauss(64), gauss(64)
@@ -79,8 +79,8 @@ def test_the_next_vertex_counts_by_the_balance_heuristic():
     estimators, hit = middle()
     c = np.linspace(-1, 1, N)
     wo = mi.Vector3f(mi.Float(np.sqrt(1 - c**2)), 0, mi.Float(c))
-    sample = DistantAim.of(estimators.direct.aim(hit.mei, mi.Point2f(0.5), hit.on))
-    aim = weigh_aim(estimators, sample, wo, mi.Float(of_cosine(c, G)), dr.arange(mi.UInt32, N) > 9)
+    sample = DistantEmitterSample.from_sample(estimators.direct.sample_emitter(hit.mei, mi.Point2f(0.5), hit.on))
+    aim = weigh_emitter_sample(estimators, sample, wo, mi.Float(of_cosine(c, G)), dr.arange(mi.UInt32, N) > 9)
     expected = of_cosine(c, G) / (of_cosine(c, G) + of_cosine(c, LOBE))
     # The cosine is rounded to 2^-24 twice, and the relative slope of HG by it is 3 g / (1 - g)^2 = 60 at most.
     np.testing.assert_allclose(np.array(aim.weight)[10:], expected[10:], rtol=60 * 2.0**-23)

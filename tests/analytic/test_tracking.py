@@ -131,7 +131,7 @@ def test_variance_is_as_derived():
     square = np.mean((1 - f) * low[:, None] ** 2 + f * high[:, None] ** 2, axis=1).sum() + 0.5 * (low[0] ** 2 + high[-1] ** 2)
     T = np.exp(-values[0, 0, :, 0].sum() * 2 / 7)
     variance = T**2 * np.expm1(square * 2 / 7 / (tracking.LOOKUP_RATE * 0.9))
-    assert T > 3 * tracking.FAINT * 0.9
+    assert T > 3 * tracking.ROULETTE_BELOW * 0.9
     # The midpoints of the square's integral err by 1e-6, optical depths of 1 by 2e-6.
     assert_same_mean(Moments.of((found - T) ** 2), variance, rounding=1e-5 * variance, what="variances")
 

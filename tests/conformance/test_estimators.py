@@ -13,17 +13,17 @@ from mivol.cite import citations
 from mivol.scene.needs import find_needs
 from mivol.scene.plan import make_plan
 from mivol.scene.survey import survey_scene
-from mivol.transport.path.estimators import SEGMENT_ESTIMATORS, SegmentQuestion, Settings, choose_segment_estimator
+from mivol.transport.path.estimators import SEGMENT_ESTIMATORS, SegmentNeeds, Settings, choose_segment_estimator
 from scenes import box_of, camera, centred, medium
 
 TURNS = ((1, False), (1, True), (2, False), (math.inf, False), (math.inf, True))
-QUESTIONS = [SegmentQuestion(*flags, *turns) for flags in itertools.product((False, True), repeat=4) for turns in TURNS]
+QUESTIONS = [SegmentNeeds(*flags, *turns) for flags in itertools.product((False, True), repeat=4) for turns in TURNS]
 
 
 @pytest.mark.parametrize("asked", QUESTIONS, ids=str)
-def test_a_question_has_one_answer_at_most(asked: SegmentQuestion) -> None:
+def test_a_question_has_one_answer_at_most(asked: SegmentNeeds) -> None:
     """Quadrature is for one scattering, and bounded media that emit must scatter besides; all else has exactly one."""
-    found = [name for name, entry in SEGMENT_ESTIMATORS.items() if entry.answers(asked)]
+    found = [name for name, entry in SEGMENT_ESTIMATORS.items() if entry.applies(asked)]
     if asked.scatters:
         several = asked.scatterings > 1 or asked.emits or asked.is_bounded or asked.refracts
         assert len(found) == (0 if asked.deterministic and several else 1)
@@ -38,7 +38,7 @@ def test_an_entry_says_what_it_needs_and_promises(name: str) -> None:
     entry = SEGMENT_ESTIMATORS[name]
     assert entry.needs and entry.promises
     assert len(citations(entry.cites)) == len(entry.cites) >= 1
-    answered = [asked for asked in QUESTIONS if entry.answers(asked)]
+    answered = [asked for asked in QUESTIONS if entry.applies(asked)]
     assert answered and all(asked.scatters == (entry.scatterings > 0) for asked in answered)
 
 

@@ -279,5 +279,5 @@ def test_media_scenes_of_mitsubas_own_tests(two_threads, name, data_dir):
 )
 def test_a_channel_without_throughput_is_never_drawn(beta, u, channel):
     """Shares of [0, 1) in the order of the channels; one of no width holds no number, not even 0."""
-    found = free_flight._draw_channel(mi.Spectrum(*map(float, beta)), mi.Float(u))
+    found = free_flight._sample_channel(mi.Spectrum(*map(float, beta)), mi.Float(u))
     assert int(np.array(found).item()) == channel

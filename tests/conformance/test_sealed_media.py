@@ -14,7 +14,7 @@ from mivol.scene.needs import find_needs
 from mivol.scene.plan import make_plan
 from mivol.scene.survey import survey_scene
 from mivol.transport.path.estimators import Settings
-from mivol.transport.path.walk import LONG
+from mivol.transport.path.walk import LONG_PATH
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
 
@@ -113,10 +113,10 @@ def test_roulette_ends_long_paths_in_light_that_has_a_place() -> None:
     """A path of n > LONG scatterings brings sqrt(n / LONG): an n that is whole to its rounding, and some are twice LONG."""
     light = scenes.render(furnace(panorama()), UNLIMITED, 1, seed=3)[..., 0].ravel()
     raised = light[light > 1.06] * 0.95
-    n = raised**2 * LONG
+    n = raised**2 * LONG_PATH
     assert np.abs(n - np.round(n)).max() < 0.2  # n up to some 1000, of relative error 1e-4
-    assert n.min() > LONG
-    assert n.max() > 2 * LONG
+    assert n.min() > LONG_PATH
+    assert n.max() > 2 * LONG_PATH
 
 
 @pytest.mark.statistical

@@ -24,7 +24,7 @@ from volpath_scenes import (
     square,
 )
 
-from mivol.transport.estimators.lighting.shadow_rays import SURE_DEPTH, light_through
+from mivol.transport.estimators.lighting.shadow_rays import ROULETTE_TAU, find_transmittance
 from mivol.transport.traversal.random_numbers import seed_pcg32
 from scenes import box_of, grid_volume, media_of, medium
 
@@ -67,7 +67,7 @@ def through(sigma_t: np.ndarray | float, rng: bool) -> tuple[np.ndarray, np.ndar
     media = media_of(close_up({"fog": box_of(medium("mivol_medium", sigma, 0.5), PLACE)}, res=1))
     ray = mi.Ray3f(dr.full(mi.Point3f, 0, N) + mi.Point3f(-2, 0.1, 0.2), mi.Vector3f(1, 0, 0))
     state = seed_pcg32(mi.Float((0.3 + 0.618 * fresh(0)) % 1), N) if rng else None
-    _, tau, T = light_through(media, ray, dr.zeros(mi.MediumPtr, N), mi.Bool(True), state)
+    _, tau, T = find_transmittance(media, ray, dr.zeros(mi.MediumPtr, N), mi.Bool(True), state)
     return np.array(T, dtype=np.float64).T, np.array(tau).T
 
 
@@ -84,7 +84,7 @@ def test_roulette_keeps_the_mean(kind):
     sigma = 1.2 if values is None else np.tile(np.float32(values), (2, 2, 2, 1))
     exact, found = through(sigma, False)[0][0], through(sigma, True)[0]
     lives = found.max(axis=1) > 0
-    np.testing.assert_allclose(found[lives].max(axis=1), np.exp(-SURE_DEPTH), rtol=1e-5)
+    np.testing.assert_allclose(found[lives].max(axis=1), np.exp(-ROULETTE_TAU), rtol=1e-5)
     # Hits of an event of known chance: exp(1) times the clearest channel's transmittance.
     assert_rate(int(lives.sum()), N, float(exact.max()) * np.e)
     np.testing.assert_allclose(found[lives].mean(axis=0) * exact.max() * np.e, exact, rtol=1e-4)
@@ -94,4 +94,4 @@ def test_a_ray_that_ends_is_walked_no_further():
     """In a grid of 32 cells along the ray, of a depth of 64: those that end have gone a few cells, which their depth tells."""
     _, tau = through(np.full((2, 2, 32, 1), 32.0, np.float32), True)
     # A cell has a depth of 2, and a limit of 1 + ln(2^24) = 17.6 at most is passed by one cell.
-    assert tau.min() > SURE_DEPTH and tau.max() < 20 and tau.mean() < 5
+    assert tau.min() > ROULETTE_TAU and tau.max() < 20 and tau.mean() < 5

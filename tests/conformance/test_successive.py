@@ -18,7 +18,7 @@ from mivol.scene.session import Session
 from mivol.transport.path import successive
 from mivol.transport.path.estimators import Settings
 from mivol.transport.path.film import RenderSamples, film_passes
-from mivol.transport.path.successive import paths_a_lane, walk_successively
+from mivol.transport.path.successive import paths_per_lane, walk_successively
 from scenes import box_of, medium, sky
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
@@ -48,7 +48,7 @@ def test_a_path_does_not_depend_on_the_others_of_its_lane(monkeypatch: pytest.Mo
 
     Walks in grids and the roulette of shadow rays draw numbers by their lane: the fog is even, and no shadow ray ends early.
     """
-    monkeypatch.setattr("mivol.transport.estimators.lighting.shadow_rays.SURE_DEPTH", 1e9)
+    monkeypatch.setattr("mivol.transport.estimators.lighting.shadow_rays.ROULETTE_TAU", 1e9)
     scene = peaked(even=True)
     alone = radiance(scene, 1)
     assert len(np.unique(alone[0])) > 90  # of 192 paths most find the sun
@@ -64,15 +64,15 @@ def test_in_a_white_furnace_every_path_ends_with_the_light_of_the_sky() -> None:
 
 
 def test_lanes_of_all_threads_have_work(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(successive.LANES, mi.variant().split("_")[0], 100)
-    assert [paths_a_lane(16, n) for n in (1, 100, 299, 300, 9900)] == [1, 1, 2, 3, 16]
-    assert paths_a_lane(1, 9900) == 1
+    monkeypatch.setitem(successive.MIN_LANES, mi.variant().split("_")[0], 100)
+    assert [paths_per_lane(16, n) for n in (1, 100, 299, 300, 9900)] == [1, 1, 2, 3, 16]
+    assert paths_per_lane(1, 9900) == 1
 
 
 def test_a_plan_takes_them_where_lengths_differ(monkeypatch: pytest.MonkeyPatch) -> None:
     """Scatterings without end, and a sampler without strata, which has numbers for one path a lane only."""
     scene, counts = peaked(), []
-    monkeypatch.setitem(successive.LANES, mi.variant().split("_")[0], 64)
+    monkeypatch.setitem(successive.MIN_LANES, mi.variant().split("_")[0], 64)
     walk = walk_successively
     monkeypatch.setattr("mivol.scene.session.walk_successively", lambda *args: counts.append(args[-1]) or walk(*args))
     for depth in (-1, 17, 16):
@@ -90,7 +90,7 @@ def test_a_plan_takes_them_where_lengths_differ(monkeypatch: pytest.MonkeyPatch)
 @pytest.mark.slow
 def test_a_recording_repeats_them(monkeypatch: pytest.MonkeyPatch) -> None:
     """As many paths a lane when it is replayed, of another seed."""
-    monkeypatch.setitem(successive.LANES, mi.variant().split("_")[0], 64)
+    monkeypatch.setitem(successive.MIN_LANES, mi.variant().split("_")[0], 64)
     scene, integrator = peaked(), mi.load_dict(ENDLESS)
     mi.render(scene, integrator=integrator, spp=1)  # a recording knows what was read before
 
@@ -111,7 +111,7 @@ def test_they_keep_the_mean(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of paths that begin together."""
     scene = peaked()
     together = over_pixels(moments(scene, ENDLESS, 256))
-    monkeypatch.setitem(successive.LANES, mi.variant().split("_")[0], 64)
+    monkeypatch.setitem(successive.MIN_LANES, mi.variant().split("_")[0], 64)
     found = over_pixels(moments(scene, ENDLESS, 256, first=100))
     assert_same_mean(found, together, rounding=1e-6, what="radiance")
     assert_precise(difference(found, together), 0.03 * together.mean, what="radiance")

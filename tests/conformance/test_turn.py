@@ -12,7 +12,7 @@ from mivol.transport.estimators.lighting.direct_lighting import DirectLighting
 from mivol.transport.estimators.segment import Collision
 from mivol.transport.media.body import medium_interaction
 from mivol.transport.path.estimators import Estimators, Settings
-from mivol.transport.path.event import PathEvent, Turn, TurnSamples, sample_turn
+from mivol.transport.path.event import NextDirection, PathEvent, TurnSamples, sample_next_direction
 from scenes import camera, media_of, medium
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
@@ -36,7 +36,7 @@ class Bench:
         zero = dr.zeros(mi.Float, 4)
         self.ray = mi.Ray3f(mi.Point3f(zero, 0, 2), mi.Vector3f(0, 0, -1), mi.Float(7), zero, mi.Color0f())
 
-    def turn(self, in_medium: list[bool] | None, may_scatter: list[bool], component: list[float]) -> Turn:
+    def turn(self, in_medium: list[bool] | None, may_scatter: list[bool], component: list[float]) -> NextDirection:
         """Of four lanes; those in the medium have collided 0.5 from the origin."""
         ray, si = self.ray, self.estimators.media.scene.ray_intersect(self.ray)
         on = mi.Bool([False] * 4 if in_medium is None else in_medium)
@@ -46,7 +46,7 @@ class Bench:
         event = PathEvent(si, si.t, around, ~on & si.is_valid(), hit)
         numbers = TurnSamples(mi.Float(component), mi.Point2f(0.3, 0.6))
         with dr.suspend_grad():
-            return sample_turn(self.estimators, ray, event, numbers, mi.Bool(may_scatter))
+            return sample_next_direction(self.estimators, ray, event, numbers, mi.Bool(may_scatter))
 
 
 def test_a_diffuse_wall_turns_paths_that_may_scatter():

@@ -147,7 +147,7 @@ def test_branches_of_a_stem_differ(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_branches_walk_side_by_side_by_their_length() -> None:
     """The longest first; those of one length, or longer than 16 bits can say, in the order that they had, and each once."""
     depth = np.array([3, 1, 200, 3, 0, 12, 70_000, 11, 65_536, 5000])
-    order = np.array(derivatives._by_length(mi.UInt32(depth)))
+    order = np.array(derivatives._order_by_length(mi.UInt32(depth)))
     assert order.tolist() == [6, 8, 9, 2, 5, 7, 0, 3, 1, 4]
 
 

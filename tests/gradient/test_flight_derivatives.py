@@ -241,12 +241,12 @@ def test_probes_are_kept_in_proportion_to_their_gain():
     ray = FineRay.of(mi.Ray3f(mi.Point3f(dr.zeros(mi.Float, n), 0, 0), mi.Vector3f(0, 0, 1)))
     on, zero = ~never, dr.zeros(mi.UInt32, n)
 
-    def offered(probes: Probes, t: float, gain: float, depth: int, scatters: mi.Bool = on, found: mi.Bool = on) -> Probes:
-        segment = PathSegment(ray, dr.zeros(mi.MediumPtr, n), mi.Spectrum(1), scatters, None, zero + depth)
+    def offered(probes: Probes, t: float, gain: float, depth: int, may_scatter: mi.Bool = on, found: mi.Bool = on) -> Probes:
+        segment = PathSegment(ray, dr.zeros(mi.MediumPtr, n), mi.Spectrum(1), may_scatter, None, zero + depth)
         point = EvenPoint(dr.full(mi.Float64, t, n), dr.full(mi.Float, 1, n), zero, found)
         return probes.offer(segment, FlightPoint(point, dr.full(mi.Spectrum, gain, n), (dr.arange(mi.Float, n) + 0.5) / n))
 
-    probes = offered(Probes(Probe.none(ray), Probe.none(ray)), 7.0, 2.0, 0)
+    probes = offered(Probes(Probe.empty(ray), Probe.empty(ray)), 7.0, 2.0, 0)
     for t, gain, *lanes in ((1.0, 1.0), (2.0, 3.0), (3.0, 100.0, never), (4.0, 100.0, on, never)):
         probes = offered(probes, t, gain, 1, *lanes)
     assert np.all(np.array(probes.first.t) == 7) and np.all(np.array(probes.first.total) == 2)

@@ -13,7 +13,7 @@ from scattering_scenes import PLACE, aimed, mivol, pencils, point, rough_grid, s
 
 import scenes
 from mivol.transport.estimators.lighting.emitters import ChosenEmitter
-from mivol.transport.estimators.lighting.shadow_rays import DARK
+from mivol.transport.estimators.lighting.shadow_rays import NEGLIGIBLE_TAU
 from mivol.transport.estimators.single_scattering.distance_sampling import (
     DistanceProposal,
     fill_reservoir,
@@ -80,9 +80,9 @@ def test_channels_of_very_different_extinction(ratio):
 @pytest.mark.parametrize(
     ("sigma", "length", "lit"),
     [
-        ((2.0,), 1e9, DARK / 2),
-        ((2.0, 0.5, 4.0), 1e9, DARK / 0.5),
-        ((2.0, 0.0), 1e9, DARK / 2),
+        ((2.0,), 1e9, NEGLIGIBLE_TAU / 2),
+        ((2.0, 0.5, 4.0), 1e9, NEGLIGIBLE_TAU / 0.5),
+        ((2.0, 0.0), 1e9, NEGLIGIBLE_TAU / 2),
         ((2.0,), 3.0, 3.0),
         ((0.0,), 7.0, 0.0),
     ],

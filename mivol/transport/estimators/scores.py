@@ -33,13 +33,13 @@ __all__ = [
     "Term",
     "TrackedFactor",
     "TrackedTerm",
-    "PICTURE",
+    "IMAGE",
     "REVERSE",
     "FORWARD",
 ]
 
 
-PICTURE, REVERSE, FORWARD = "picture", "reverse", "forward"
+IMAGE, REVERSE, FORWARD = "picture", "reverse", "forward"
 """Purposes of a walk: the radiance, the gradients of its parameters, or its tangent."""
 
 
@@ -48,7 +48,7 @@ class Primal:
     """Sum the radiance of a path."""
 
     L: mi.Spectrum
-    purpose = PICTURE
+    purpose = IMAGE
 
     def add(self, term: Term) -> Primal:
         """The score after a term of the path was reached."""

@@ -53,20 +53,20 @@ class PathSegment:
         ray: world space, unit direction.
         medium: the medium around its origin.
         beta: throughput of the path to there.
-        scatters: lanes whose path may scatter once more.
+        may_scatter: lanes whose path may scatter once more.
         samples: random numbers that the estimator has drawn; None where it needs none.
         depth: number of scattering events of the path so far.
-        is_aside: a side flight, which the path does not take itself (:mod:`mivol.transport.path.side_flight`).
+        is_side_flight: a side flight, which the path does not take itself (:mod:`mivol.transport.path.side_flight`).
         emission_weight: of the light that media emit along it, where that was drawn at its origin too; None for 1.
     """
 
     ray: Ray
     medium: mi.MediumPtr
     beta: mi.Spectrum
-    scatters: mi.Bool
+    may_scatter: mi.Bool
     samples: Any
     depth: mi.UInt32
-    is_aside: bool = False
+    is_side_flight: bool = False
     emission_weight: mi.Float | None = None
 
 
@@ -142,7 +142,7 @@ class SegmentEstimator(Protocol):
         """Draw the random numbers of one segment; whatever is returned becomes ``PathSegment.samples``."""
 
     def estimate(self, segment: PathSegment, purpose: str, active: mi.Bool) -> SegmentEstimate:
-        """Follow a segment to its end, for PICTURE, REVERSE or FORWARD."""
+        """Follow a segment to its end, for IMAGE, REVERSE or FORWARD."""
 
     def prepare_derivatives(self, ray: mi.Ray3f) -> None:
         """Find what derivatives along camera rays need beforehand; called before each pass, and done once."""

@@ -295,7 +295,7 @@ class Emission:
         return self
 
     def estimate(self, segment: PathSegment, purpose: str, active: mi.Bool) -> SegmentEstimate:
-        """Follow a segment to its end and sum its emission, for the purpose PICTURE, REVERSE or FORWARD."""
+        """Follow a segment to its end and sum its emission, for the purpose IMAGE, REVERSE or FORWARD."""
         media = self.media
         end = find_end(media, segment.ray, segment.medium, active)
         passed = RaySegment(segment.ray, segment.medium, end.t)

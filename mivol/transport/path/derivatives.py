@@ -24,32 +24,32 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mivol.transport.estimators.flights.flight_derivatives import Level, weigh_collisions
-from mivol.transport.estimators.scores import PICTURE, Primal, Replay
+from mivol.transport.estimators.flights.flight_derivatives import Baseline, collision_weights
+from mivol.transport.estimators.scores import IMAGE, Primal, Replay
 from mivol.transport.estimators.segment import Collision, PathSegment
 from mivol.transport.media.channels import colours
 from mivol.transport.path.estimators import Estimators
 from mivol.transport.path.film import CameraRays
-from mivol.transport.path.walk import Landing, gather_lanes, walk_branch, walk_path, walk_stem
+from mivol.transport.path.walk import FirstCollision, gather_lanes, walk_branch, walk_path, walk_stem
 from mivol.transport.traversal.random_numbers import LaneSampler, draw_seeds
 from mivol.transport.traversal.rays import FineRay, camera_ray
 
 __all__ = ["count_branches", "replay_branches", "prepare_derivatives"]
 
-MOST_BRANCHES = 4
+MAX_BRANCHES = 4
 """Branches of a path."""
 
 BALANCE = 0.6
 """(B a) / (A b), times the share of stems that collide: for a share of 0.17 two branches, for more than 0.27 one. (Smoke and a
 cloud of that share: three have the least variance x time over voxels with sigma_t >= 1, one over empty voxels.)"""
 
-LONGEST = np.uint16(0xFFFF)
+MAX_SORTED_LENGTH = np.uint16(0xFFFF)
 """Scatterings of a path, as far as its place in the order of lengths goes."""
 
 
 def count_branches(stems: int, collided: int) -> int:
     """How many branches a path has, of as many stems of which some have collided."""
-    return min(MOST_BRANCHES, max(1, round(math.sqrt(BALANCE * stems / collided))))
+    return min(MAX_BRANCHES, max(1, round(math.sqrt(BALANCE * stems / collided))))
 
 
 def replay_branches(estimators: Estimators, rays: CameraRays, dL: mi.Spectrum) -> None:
@@ -76,9 +76,9 @@ def replay_branches(estimators: Estimators, rays: CameraRays, dL: mi.Spectrum) -
     for total, one in zip(stems.L, found.L, strict=True):
         dr.scatter_add(total, one * share, branches.stem)
     walk_stem(estimators, again, rays.ray, Replay(stems.L, dL))
-    level = estimators.segment.level
-    estimators.segment.level = None if level is None else level.of_branches
-    order = _by_length(depth)
+    level = estimators.segment.baseline
+    estimators.segment.baseline = None if level is None else level.for_branches
+    order = _order_by_length(depth)
     branches = branches.at(order)
     L, dL = dr.gather(mi.Spectrum, found.L, order), dr.gather(mi.Spectrum, dL, branches.stem)
     branches.walk(estimators, Replay(L, dL * share))
@@ -95,25 +95,25 @@ class _Branches:
     """
 
     stem: mi.UInt32
-    landing: Landing
+    landing: FirstCollision
     seeds: tuple[mi.UInt32, mi.UInt32, mi.UInt32]
 
     @classmethod
-    def of(cls, landing: Landing, collided: mi.UInt32, seeds: tuple[mi.UInt32, mi.UInt32], k: int) -> _Branches:
+    def of(cls, landing: FirstCollision, collided: mi.UInt32, seeds: tuple[mi.UInt32, mi.UInt32], k: int) -> _Branches:
         """So many branches of each stem that has collided, side by side."""
         number = dr.arange(mi.UInt32, dr.width(collided) * k)
         stem = dr.gather(mi.UInt32, collided, number // dr.opaque(mi.UInt32, k))
         a, b = (dr.gather(mi.UInt32, seed, stem) for seed in seeds)
         # The branches of a stem differ in their number only: a hash of it is the state, or their numbers would resemble each
         # other.
-        found = cls(stem, _gather_landing(landing, stem), (*mi.sample_tea_32(a ^ (b << 8), number), number))
+        found = cls(stem, _gather_collisions(landing, stem), (*mi.sample_tea_32(a ^ (b << 8), number), number))
         dr.eval(found)
         return found
 
     def at(self, order: mi.UInt32) -> _Branches:
         """The branches in another order."""
         stem, *seeds = (dr.gather(mi.UInt32, values, order) for values in (self.stem, *self.seeds))
-        found = _Branches(stem, _gather_landing(self.landing, order), tuple(seeds))
+        found = _Branches(stem, _gather_collisions(self.landing, order), tuple(seeds))
         dr.eval(found)
         return found
 
@@ -122,35 +122,35 @@ class _Branches:
         return walk_branch(estimators, LaneSampler.seeded(*self.seeds), self.landing, score)
 
 
-def _gather_landing(landing: Landing, index: mi.UInt32) -> Landing:
+def _gather_collisions(landing: FirstCollision, index: mi.UInt32) -> FirstCollision:
     """The collisions with these numbers."""
     ray = landing.ray
     o, d, maxt, time = (gather_lanes(values, index) for values in (ray.o, ray.d, ray.maxt, ray.time))
     t, body, beta, on = (gather_lanes(values, index) for values in (landing.t, landing.body, landing.beta, landing.on))
-    return Landing(FineRay(o, d, maxt, time, ray.wavelengths), t, body, beta, on)
+    return FirstCollision(FineRay(o, d, maxt, time, ray.wavelengths), t, body, beta, on)
 
 
-def _by_length(depth: mi.UInt32) -> mi.UInt32:
+def _order_by_length(depth: mi.UInt32) -> mi.UInt32:
     """The numbers of paths in the order of their lengths, the longest first."""
     # Numbers of 16 bits are sorted in a time that is linear in their count; longer paths are too few to be told apart.
-    shortness = LONGEST - np.minimum(depth.numpy(), LONGEST).astype(np.uint16)
+    shortness = MAX_SORTED_LENGTH - np.minimum(depth.numpy(), MAX_SORTED_LENGTH).astype(np.uint16)
     return mi.UInt32(np.argsort(shortness, kind="stable"))
 
 
-FEWEST_PATHS, MOST_PATHS, RAYS_PER_PATH = 1 << 12, 1 << 15, 64
+MIN_PATHS, MAX_PATHS, RAYS_PER_PATH = 1 << 12, 1 << 15, 64
 """Paths that the level is estimated from: one for so many of a pass, within bounds. It need not be accurate, since derivatives
 are unbiased whatever it is."""
 
-TILES = 8
+TILES_PER_AXIS = 8
 """Tiles along an edge of the film that have a level of their own. (Second moment of the light at first collisions about the
 level, 64 x 64 pixels: smoke in the sun 0.88, 0.78, 0.76 and 0.79 of that about one level for all with 2, 4, 8 and 16 tiles;
 in even light 0.98 and in a cloud 0.94 to 0.95 with any of them.)"""
 
-COLLISIONS = 16.0
+PRIOR_COLLISIONS = 16.0
 """As many collisions count as the mean of all does in a tile: about the ratio of the noise of paths to what the light of tiles
 differs by (3 in smoke in the sun, 16 in a cloud, 60 in smoke in even light)."""
 
-SEED = 0x1E7E1
+BASELINE_SEED = 0x1E7E1
 """Of those paths. They are independent of the paths of a render, or the level would bias its derivatives."""
 
 
@@ -165,10 +165,10 @@ def prepare_derivatives(estimators: Estimators, ray: mi.Ray3f, on_film: mi.Point
     segment = estimators.segment
     segment.prepare_derivatives(ray)
     if segment.ends_in_media:
-        segment.level = _find_level(estimators, ray, on_film)
+        segment.baseline = _estimate_baseline(estimators, ray, on_film)
 
 
-def _find_level(estimators: Estimators, ray: mi.Ray3f, on_film: mi.Point2f) -> Level | None:
+def _estimate_baseline(estimators: Estimators, ray: mi.Ray3f, on_film: mi.Point2f) -> Baseline | None:
     """The mean radiance that flights of camera rays find where they collide, each weighed as its derivative is, squared: the
     level at which the derivatives at collisions have the least noise. First flights have a level for each tile of the film.
 
@@ -182,48 +182,48 @@ def _find_level(estimators: Estimators, ray: mi.Ray3f, on_film: mi.Point2f) -> L
     if any(body.view.albedo is None for body in media.bodies):
         return None
     n = dr.width(ray)
-    count = min(max(n // RAYS_PER_PATH, FEWEST_PATHS), MOST_PATHS)
+    count = min(max(n // RAYS_PER_PATH, MIN_PATHS), MAX_PATHS)
     index = mi.UInt32(dr.arange(mi.UInt64, count) * n // count)
-    rays, tile = mi.Ray3f(ray), _tile_of(on_film)
+    rays, tile = mi.Ray3f(ray), _film_tile(on_film)
     # What is gathered from has to be evaluated: at once, not each number of a ray by a kernel of its own.
     dr.eval(rays, tile)
     some = camera_ray(dr.gather(mi.Ray3f, rays, index))
     sampler = mi.load_dict({"type": "independent"})
-    sampler.seed(SEED, count)
-    collision = _fly_first(estimators, sampler.clone(), some)
+    sampler.seed(BASELINE_SEED, count)
+    collision = _find_first_collisions(estimators, sampler.clone(), some)
     path = walk_path(estimators, sampler, some, Primal(dr.zeros(mi.Spectrum, count)))[0]
     # Behind a boundary that refracts no first flight collides; the mean of all rays is then as good a guess as any.
-    weight = dr.select(dr.any(collision.on), dr.square(weigh_collisions(media, some, collision)), 1)
+    weight = dr.select(dr.any(collision.on), dr.square(collision_weights(media, some, collision)), 1)
     seen, weight, at = dr.detach(path.L), dr.detach(weight), dr.gather(mi.UInt32, tile, index)
     # Each sum would walk the paths again.
     dr.eval(seen, weight)
-    pairs = [_mean_of_tiles(L, w, at) for L, w in zip(colours(seen), colours(weight), strict=True)]
+    pairs = [_tile_means(L, w, at) for L, w in zip(colours(seen), colours(weight), strict=True)]
     first = mi.Spectrum(*(dr.gather(mi.Float, tiles, tile) for _, tiles in pairs))
-    level = Level(first, mi.Spectrum(*(mean for mean, _ in pairs)))
+    level = Baseline(first, mi.Spectrum(*(mean for mean, _ in pairs)))
     dr.eval(level)
     return level
 
 
-def _tile_of(on_film: mi.Point2f) -> mi.UInt32:
+def _film_tile(on_film: mi.Point2f) -> mi.UInt32:
     """The tile of the film that a place is in; places beside the film belong to the nearest."""
-    x, y = dr.clip(mi.Point2i(on_film * TILES), 0, TILES - 1)
-    return mi.UInt32(y * TILES + x)
+    x, y = dr.clip(mi.Point2i(on_film * TILES_PER_AXIS), 0, TILES_PER_AXIS - 1)
+    return mi.UInt32(y * TILES_PER_AXIS + x)
 
 
-def _fly_first(estimators: Estimators, sampler: mi.Sampler, ray: mi.Ray3f) -> Collision:
+def _find_first_collisions(estimators: Estimators, sampler: mi.Sampler, ray: mi.Ray3f) -> Collision:
     """Where paths that are walked with the same random numbers collide on their first segment."""
     on, segment = dr.full(mi.Bool, True, dr.width(ray)), estimators.segment
     samples = segment.draw(sampler, on, None)
     ahead = PathSegment(ray, estimators.media.medium_at(ray), dr.full(mi.Spectrum, 1, dr.width(ray)), on, samples, mi.UInt32(0))
-    return segment.estimate(ahead, PICTURE, on).collision
+    return segment.estimate(ahead, IMAGE, on).collision
 
 
-def _mean_of_tiles(values: mi.Float, weights: mi.Float, tile: mi.UInt32) -> tuple[mi.Float, mi.Float]:
+def _tile_means(values: mi.Float, weights: mi.Float, tile: mi.UInt32) -> tuple[mi.Float, mi.Float]:
     """The mean of one channel, 0 where nothing has a weight, and that of each tile, drawn to the mean of all."""
     total, found = dr.sum(weights), dr.count(weights > 0)
     mean = dr.select(total > 0, dr.sum(values * weights) / dr.select(total > 0, total, 1), 0)
-    sums, of_tile = (dr.zeros(mi.Float, TILES * TILES) for _ in range(2))
+    sums, of_tile = (dr.zeros(mi.Float, TILES_PER_AXIS * TILES_PER_AXIS) for _ in range(2))
     dr.scatter_add(sums, values * weights, tile)
     dr.scatter_add(of_tile, weights, tile)
-    prior = COLLISIONS * total / dr.maximum(mi.Float(found), 1)
+    prior = PRIOR_COLLISIONS * total / dr.maximum(mi.Float(found), 1)
     return mean, dr.select(total > 0, (sums + prior * mean) / dr.select(total > 0, of_tile + prior, 1), 0)

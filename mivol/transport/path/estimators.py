@@ -28,9 +28,9 @@ from mivol.transport.media.scene_media import SceneMedia
 __all__ = [
     "SEGMENT_ESTIMATORS",
     "Estimators",
-    "SegmentChoice",
+    "SegmentInputs",
     "SegmentEntry",
-    "SegmentQuestion",
+    "SegmentNeeds",
     "choose_segment_estimator",
     "Settings",
 ]
@@ -78,7 +78,7 @@ class Settings:
 
 
 @dataclass
-class SegmentChoice:
+class SegmentInputs:
     """The arguments that a segment estimator is made from.
 
     Attributes:
@@ -95,7 +95,7 @@ class SegmentChoice:
 
 
 @dataclass(frozen=True)
-class SegmentQuestion:
+class SegmentNeeds:
     """What a scene and its settings ask of the segment estimator.
 
     Attributes:
@@ -128,22 +128,22 @@ class SegmentEntry:
 
     Attributes:
         make: builds the estimator.
-        answers: whether the estimator answers a question.
+        applies: whether the estimator answers a question.
         scatterings: number of scattering events in media between an emitter and the camera that it accounts for.
         needs: the condition on the scene, in words.
         promises: bias and variance, in words.
         cites: keys of :mod:`mivol.cite`.
     """
 
-    make: Callable[[SegmentChoice], SegmentEstimator]
-    answers: Callable[[SegmentQuestion], bool]
+    make: Callable[[SegmentInputs], SegmentEstimator]
+    applies: Callable[[SegmentNeeds], bool]
     scatterings: int
     needs: str
     promises: str
     cites: tuple[str, ...]
 
 
-def _make_quadrature(choice: SegmentChoice) -> ScatteringQuadrature:
+def _make_quadrature(choice: SegmentInputs) -> ScatteringQuadrature:
     drawn = SingleScattering(choice.direct, visibility_cache=choice.visibility_cache)
     return ScatteringQuadrature(drawn, choice.transmittance_grid)
 
@@ -207,9 +207,9 @@ SEGMENT_ESTIMATORS = {
 """Estimators of what media add along a segment, by the name that a plan chooses them by. A question has one answer, or none."""
 
 
-def choose_segment_estimator(asked: SegmentQuestion) -> str | None:
+def choose_segment_estimator(asked: SegmentNeeds) -> str | None:
     """The name of the estimator that answers a question; None where none does."""
-    return next((name for name, entry in SEGMENT_ESTIMATORS.items() if entry.answers(asked)), None)
+    return next((name for name, entry in SEGMENT_ESTIMATORS.items() if entry.applies(asked)), None)
 
 
 @dataclass

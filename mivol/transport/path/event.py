@@ -7,14 +7,14 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from mivol.transport.estimators.lighting.vertex import EitherVertex, MediumVertex, SurfaceVertex, Vertex, sample_phase
+from mivol.transport.estimators.lighting.vertex import MediumVertex, MixedVertex, SurfaceVertex, Vertex, sample_phase
 from mivol.transport.estimators.scores import TrackedFactor
 from mivol.transport.estimators.segment import Collision, SegmentEstimate
 from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.path.estimators import Estimators
 from mivol.transport.traversal.rays import FineRay, Ray, spawn_ray
 
-__all__ = ["PathEvent", "Turn", "TurnSamples", "sample_turn"]
+__all__ = ["PathEvent", "NextDirection", "TurnSamples", "sample_next_direction"]
 
 
 @dataclass
@@ -38,11 +38,11 @@ class PathEvent:
     chance: mi.Float | None = None
 
     @classmethod
-    def of(cls, found: SegmentEstimate, active: mi.Bool) -> PathEvent:
+    def from_estimate(cls, estimate: SegmentEstimate, active: mi.Bool) -> PathEvent:
         """The event at the end of a segment."""
-        end, collision = found.end, found.collision
+        end, collision = estimate.end, estimate.collision
         arrives = active if collision is None else active & ~collision.on
-        chance = None if found.probe is None else found.probe.chance
+        chance = None if estimate.probe is None else estimate.probe.chance
         return cls(end.si, end.t, end.medium, arrives & end.si.is_valid(), collision, chance)
 
     @property
@@ -55,7 +55,7 @@ class PathEvent:
         if self.collision is None:
             return self.surface_vertex(media)
         inside = MediumVertex(media, self.collision.mei, self.collision.place)
-        return EitherVertex(self.surface_vertex(media), inside, self.collision.on) if media.has_surfaces else inside
+        return MixedVertex(self.surface_vertex(media), inside, self.collision.on) if media.has_surfaces else inside
 
     def surface_vertex(self, media: SceneMedia) -> SurfaceVertex:
         """The point of the surface."""
@@ -71,7 +71,7 @@ class TurnSamples:
 
 
 @dataclass
-class Turn:
+class NextDirection:
     """How a path goes on.
 
     Attributes:
@@ -99,7 +99,9 @@ class Turn:
     factors: list[TrackedFactor]
 
 
-def sample_turn(estimators: Estimators, ray: Ray, event: PathEvent, samples: TurnSamples, may_scatter: mi.Bool) -> Turn:
+def sample_next_direction(
+    estimators: Estimators, ray: Ray, event: PathEvent, samples: TurnSamples, may_scatter: mi.Bool
+) -> NextDirection:
     """Sample the direction in which a path goes on.
 
     Args:
@@ -110,17 +112,19 @@ def sample_turn(estimators: Estimators, ray: Ray, event: PathEvent, samples: Tur
         may_scatter: lanes whose path may scatter once more; the others pass surfaces undeviated or end.
     """
     if event.collision is None:
-        return _turn_at_surface(estimators, ray, event, samples, may_scatter)
-    inside = _turn_in_medium(estimators, event.collision, samples, may_scatter)
+        return _sample_bsdf(estimators, ray, event, samples, may_scatter)
+    inside = _sample_phase_function(estimators, event.collision, samples, may_scatter)
     if not estimators.media.has_surfaces:
         return inside
-    outside = _turn_at_surface(estimators, ray, event, samples, may_scatter)
+    outside = _sample_bsdf(estimators, ray, event, samples, may_scatter)
     here, names = event.in_medium, ("ray", "medium", "weight", "pdf", "delta", "eta", "origin", "on", "through")
     either = {name: dr.select(here, getattr(inside, name), getattr(outside, name)) for name in names}
-    return Turn(**either, factors=outside.factors + inside.factors)
+    return NextDirection(**either, factors=outside.factors + inside.factors)
 
 
-def _turn_at_surface(estimators: Estimators, ray: Ray, event: PathEvent, samples: TurnSamples, may_scatter: mi.Bool) -> Turn:
+def _sample_bsdf(
+    estimators: Estimators, ray: Ray, event: PathEvent, samples: TurnSamples, may_scatter: mi.Bool
+) -> NextDirection:
     """Sample a direction of the BSDF; the null transmission of a surface leaves the ray as it is."""
     media, si = estimators.media, event.si
     vertex = event.surface_vertex(media)
@@ -134,10 +138,14 @@ def _turn_at_surface(estimators: Estimators, ray: Ray, event: PathEvent, samples
     medium = dr.select(si.is_medium_transition(), si.target_medium(onward.d), event.medium)
     delta = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)
     factor = _bsdf_factor(vertex, sample.wo, on & ~through)
-    return Turn(FineRay.of(onward), medium, weight, sample.pdf, delta, sample.eta, mi.Interaction3f(si), on, through, [factor])
+    return NextDirection(
+        FineRay.of(onward), medium, weight, sample.pdf, delta, sample.eta, mi.Interaction3f(si), on, through, [factor]
+    )
 
 
-def _turn_in_medium(estimators: Estimators, collision: Collision, samples: TurnSamples, may_scatter: mi.Bool) -> Turn:
+def _sample_phase_function(
+    estimators: Estimators, collision: Collision, samples: TurnSamples, may_scatter: mi.Bool
+) -> NextDirection:
     """Sample a direction of the phase function. The derivative of the albedo belongs to the flight that has ended here."""
     media, mei = estimators.media, collision.mei
     on = collision.on & may_scatter
@@ -146,7 +154,7 @@ def _turn_in_medium(estimators: Estimators, collision: Collision, samples: TurnS
     never, alone = dr.full(mi.Bool, False, n), dr.full(mi.Bool, not estimators.lights_media, n)
     factor = TrackedFactor(lambda: MediumVertex(media, mei, collision.place).eval(wo, on), on)
     weight = collision.albedo * weight
-    return Turn(ray, mei.medium, weight, pdf, alone, mi.Float(1), mi.Interaction3f(mei), on, never, [factor])
+    return NextDirection(ray, mei.medium, weight, pdf, alone, mi.Float(1), mi.Interaction3f(mei), on, never, [factor])
 
 
 def _bsdf_factor(vertex: SurfaceVertex, wo: mi.Vector3f, active: mi.Bool) -> TrackedFactor:

@@ -18,13 +18,13 @@ import mitsuba as mi
 from mivol.errors import MivolError
 from mivol.transport.traversal.random_numbers import Strata
 
-__all__ = ["CameraRays", "RenderSamples", "adjoint_rays", "film_passes", "record"]
+__all__ = ["CameraRays", "RenderSamples", "adjoint_rays", "film_passes", "render_on_film"]
 
 
 PLAIN, SPREAD, TILED = "none", "spread", "tiled"
 """Layouts of the lanes of a pass: see :func:`film_passes`."""
 
-TILE = 4
+TILE_EDGE = 4
 """Edge of a tile of pixels: 16 lanes of one packet."""
 
 
@@ -70,7 +70,7 @@ class CameraRays:
     strata: Strata | None = None
 
 
-Sample = Callable[[CameraRays], tuple]
+RadianceFunction = Callable[[CameraRays], tuple]
 """``sample(rays) -> (radiance, alpha, AOVs)``; alpha in [0, 1] is what the film's alpha sees, without derivatives."""
 
 
@@ -80,15 +80,15 @@ def film_passes(samples: RenderSamples) -> Iterator[CameraRays]:
     Raises:
         MivolError: one sample a pixel is more than a launch can hold (2^32).
     """
-    base, pixels, per_pass = _prepare(samples.sensor, samples.spp, samples.pass_rays)
+    base, pixels, per_pass = _plan_passes(samples.sensor, samples.spp, samples.pass_rays)
     base.set_samples_per_wavefront(per_pass)
     for index in range(base.sample_count() // per_pass):
         sampler = base.clone()
-        _seed(sampler, samples.seed, index, pixels * per_pass)
+        _seed_pass(sampler, samples.seed, index, pixels * per_pass)
         yield _camera_rays(samples, sampler, pixels * per_pass, per_pass)
 
 
-def _seed(sampler: mi.Sampler, seed: int, index: int, count: int) -> None:
+def _seed_pass(sampler: mi.Sampler, seed: int, index: int, count: int) -> None:
     """Seed a sampler for one pass, so that it does not depend on how much the passes before have drawn.
 
     A replay may draw fewer numbers than the pass that it repeats.
@@ -104,11 +104,11 @@ def _seed(sampler: mi.Sampler, seed: int, index: int, count: int) -> None:
 
 def count_passes(sensor: mi.Sensor, spp: int, pass_rays: int) -> int:
     """Number of passes that :func:`film_passes` makes."""
-    sampler, _, per_pass = _prepare(sensor, spp, pass_rays)
+    sampler, _, per_pass = _plan_passes(sensor, spp, pass_rays)
     return sampler.sample_count() // per_pass
 
 
-def _prepare(sensor: mi.Sensor, spp: int, pass_rays: int) -> tuple[mi.Sampler, int, int]:
+def _plan_passes(sensor: mi.Sensor, spp: int, pass_rays: int) -> tuple[mi.Sampler, int, int]:
     """A copy of the sensor's sampler, the number of pixels of the film, and the samples of a pixel in one pass."""
     sampler = sensor.sampler().clone()
     if spp:
@@ -140,11 +140,11 @@ def _camera_rays(samples: RenderSamples, sampler: mi.Sampler, count: int, per_pa
     salt += 0x9E3779B9
     across = max(a for a in range(1, int(per_pass**0.5) + 1) if per_pass % a == 0)
     shares = layout != PLAIN and sampler.class_name() == "IndependentSampler"
-    if layout == TILED and shares and width % TILE == 0 and height % TILE == 0:
-        lanes, tiles = TILE * TILE, width // TILE
+    if layout == TILED and shares and width % TILE_EDGE == 0 and height % TILE_EDGE == 0:
+        lanes, tiles = TILE_EDGE * TILE_EDGE, width // TILE_EDGE
         tile, rest = lane // (lanes * dr.opaque(mi.UInt32, per_pass)), lane % (lanes * dr.opaque(mi.UInt32, per_pass))
         sample, inside = rest // lanes, rest % lanes
-        pixel = mi.Vector2i(TILE * (tile % tiles) + inside % TILE, TILE * (tile // tiles) + inside // TILE)
+        pixel = mi.Vector2i(TILE_EDGE * (tile % tiles) + inside % TILE_EDGE, TILE_EDGE * (tile // tiles) + inside // TILE_EDGE)
         turn, other = mi.sample_tea_32(tile, salt)
         strata = Strata((sample + turn % per_pass) % per_pass, across, per_pass // across)
     else:
@@ -175,13 +175,13 @@ def _camera_rays(samples: RenderSamples, sampler: mi.Sampler, count: int, per_pa
     return CameraRays(sampler, ray, weight, place, mi.Point2f(on_film), strata)
 
 
-def record(samples: RenderSamples, names: list[str], sample: Sample) -> mi.TensorXf:
+def render_on_film(samples: RenderSamples, names: list[str], sample: RadianceFunction) -> mi.TensorXf:
     """Render an image: sample the rays of all passes, and average them on the sensor's film.
 
     Args:
         samples: of the render.
         names: of the AOVs, in the order in which ``sample`` returns them.
-        sample: :data:`Sample`.
+        sample: :data:`RadianceFunction`.
 
     Returns:
         (height, width, colours + AOVs).
@@ -191,7 +191,7 @@ def record(samples: RenderSamples, names: list[str], sample: Sample) -> mi.Tenso
     for rays in film_passes(samples):
         L, alpha, aovs = sample(rays)
         block = _new_block(film, rays)
-        _splat(block, film, rays, _FilmSample(L * rays.weight, mi.Float(1), alpha, aovs))
+        _add_samples(block, film, rays, _FilmSample(L * rays.weight, mi.Float(1), alpha, aovs))
         film.put_block(block)
         dr.eval(block.tensor())
         del L, alpha, aovs, rays, block
@@ -204,7 +204,7 @@ def adjoint_rays(
     """Turn a gradient image into a gradient for each ray, pass by pass: the transpose of the film.
 
     Args:
-        samples, names: as :func:`record`.
+        samples, names: as :func:`render_on_film`.
         grad_image: d loss / d image.
 
     Yields:
@@ -212,7 +212,7 @@ def adjoint_rays(
     """
     film = samples.sensor.film()
     several = count_passes(samples.sensor, samples.spp, samples.pass_rays) > 1
-    weights = _weights(samples, names) if several else None
+    weights = _sum_filter_weights(samples, names) if several else None
     for rays in film_passes(samples):
         with dr.resume_grad():
             n = dr.width(rays.ray)
@@ -224,7 +224,7 @@ def adjoint_rays(
             # A pixel is divided by the filter weights of all passes. Where there are several, the weights are therefore summed
             # beforehand, in a block of their own.
             weight = mi.Float(0 if several else 1)
-            _splat(block, film, rays, _FilmSample(L * rays.weight, weight, mi.Float(0), aovs))
+            _add_samples(block, film, rays, _FilmSample(L * rays.weight, weight, mi.Float(0), aovs))
             film.put_block(block)
             if several:
                 film.put_block(weights)
@@ -238,7 +238,7 @@ def adjoint_rays(
         yield rays, dL, daovs
 
 
-def _weights(samples: RenderSamples, names: list[str]) -> mi.ImageBlock:
+def _sum_filter_weights(samples: RenderSamples, names: list[str]) -> mi.ImageBlock:
     """An image block with the filter weights of all passes and no light."""
     film = samples.sensor.film()
     film.prepare(names)
@@ -246,7 +246,7 @@ def _weights(samples: RenderSamples, names: list[str]) -> mi.ImageBlock:
     for rays in film_passes(samples):
         block = block or _new_block(film, rays)
         zero = [mi.Float(0) for _ in names]
-        _splat(block, film, rays, _FilmSample(mi.Spectrum(0), mi.Float(1), mi.Float(0), zero))
+        _add_samples(block, film, rays, _FilmSample(mi.Spectrum(0), mi.Float(1), mi.Float(0), zero))
         dr.eval(block.tensor())
     return block
 
@@ -275,7 +275,7 @@ class _FilmSample:
     aovs: list[mi.Float]
 
 
-def _splat(block: mi.ImageBlock, film: mi.Film, rays: CameraRays, sample: _FilmSample) -> None:
+def _add_samples(block: mi.ImageBlock, film: mi.Film, rays: CameraRays, sample: _FilmSample) -> None:
     """Add samples to a block, in the order of channels of the film."""
     if mi.has_flag(film.flags(), mi.FilmFlags.Special):
         count = block.channel_count()

@@ -24,18 +24,25 @@ import mitsuba as mi
 
 from mivol.phase.closed_forms import eval_hg, sample_hg
 from mivol.phase.turn import direction_after, turn_between
-from mivol.transport.estimators.lighting.direct_lighting import DirectLight, DistantAim
+from mivol.transport.estimators.lighting.direct_lighting import DirectLight, DistantEmitterSample
 from mivol.transport.estimators.lighting.vertex import MediumVertex
-from mivol.transport.estimators.scores import PICTURE, Factor, TrackedTerm
+from mivol.transport.estimators.scores import IMAGE, Factor, TrackedTerm
 from mivol.transport.estimators.segment import Collision, PathSegment
 from mivol.transport.path.estimators import Estimators
 from mivol.transport.traversal.rays import FineRay
 
-__all__ = ["Aim", "SideFlight", "SideLight", "SideSamples", "fly_aside", "weigh_aim"]
+__all__ = [
+    "WeightedEmitterSample",
+    "SideFlight",
+    "SideFlightLight",
+    "SideFlightSamples",
+    "estimate_side_flight",
+    "weigh_emitter_sample",
+]
 
 
 @dataclass
-class Aim:
+class WeightedEmitterSample:
     """The emitter sample that the next vertex takes.
 
     Attributes:
@@ -43,12 +50,12 @@ class Aim:
         weight: of the direct light there, in a medium.
     """
 
-    sample: DistantAim
+    sample: DistantEmitterSample
     weight: mi.Float
 
 
 @dataclass
-class SideSamples:
+class SideFlightSamples:
     """The random numbers of a side flight: of the lobe, of the flight, and the generator of the shadow at its end."""
 
     lobe: mi.Point2f
@@ -56,7 +63,7 @@ class SideSamples:
     shadow: mi.UInt32 | None
 
 
-class SideLight(TrackedTerm):
+class SideFlightLight(TrackedTerm):
     """The light at the end of a side flight, as a term, but for the derivatives of the media along its shadow ray.
 
     Args:
@@ -89,18 +96,18 @@ class SideFlight:
         chance: for derivatives, a number in [0, 1) by which one of a path's shadow rays is kept; None for pictures.
     """
 
-    light: SideLight
+    light: SideFlightLight
     shadow: DirectLight
     chance: mi.Float | None
 
 
-def fly_aside(
+def estimate_side_flight(
     estimators: Estimators,
     collision: Collision,
     beta: mi.Spectrum,
     depth: mi.UInt32,
-    aim: DistantAim,
-    samples: SideSamples,
+    aim: DistantEmitterSample,
+    samples: SideFlightSamples,
     purpose: str,
     active: mi.Bool,
 ) -> SideFlight:
@@ -113,7 +120,7 @@ def fly_aside(
         depth: number of scattering events before it.
         aim: the emitter sample, which the next vertex takes too.
         samples: random numbers.
-        purpose: PICTURE, or that of derivatives, which keeps the values attached.
+        purpose: IMAGE, or that of derivatives, which keeps the values attached.
         active: lanes whose path may scatter here and once more.
 
     Returns:
@@ -121,37 +128,41 @@ def fly_aside(
 
     Cost: one flight and one shadow ray.
     """
-    media, mei, attached = estimators.media, collision.mei, purpose != PICTURE
+    media, mei, attached = estimators.media, collision.mei, purpose != IMAGE
     w = _direction_to_emitter(aim)
     wo = direction_after(-w, sample_hg(samples.lobe.x, estimators.lobe), samples.lobe.y)
     vertex = MediumVertex(media, mei, collision.place)
     f, p = vertex.eval_and_pdf(wo, active)
     reached = beta * collision.albedo * dr.rcp(p + eval_hg(turn_between(-w, wo), estimators.lobe))
     ray = FineRay.leaving(collision.place, wo, mei)
-    ahead = PathSegment(ray, mei.medium, reached * f, active, samples.flight, depth, is_aside=True)
+    ahead = PathSegment(ray, mei.medium, reached * f, active, samples.flight, depth, is_side_flight=True)
     flown = estimators.segment.estimate(ahead, purpose, active)
     there = flown.collision
     on = active & there.on
     end = MediumVertex(media, there.mei, there.place)
-    direct = estimators.direct.at_vertex(end, aim.seen_from(there.mei), attached, on, samples.shadow)
+    direct = estimators.direct.estimate_at_vertex(end, aim.at_point(there.mei), attached, on, samples.shadow)
     with dr.resume_grad(when=attached):
         if attached:
             f = vertex.eval(wo, active)
         value = reached * f * (flown.T * there.albedo) * direct.value
     lit = on & direct.on
     chance = None if flown.probe is None else flown.probe.chance
-    return SideFlight(SideLight(value, flown.transmittance, lit), DirectLight(media, direct.ray_segment, value, lit), chance)
+    return SideFlight(
+        SideFlightLight(value, flown.transmittance, lit), DirectLight(media, direct.ray_segment, value, lit), chance
+    )
 
 
-def weigh_aim(estimators: Estimators, sample: DistantAim, wo: mi.Vector3f, p: mi.Float, active: mi.Bool) -> Aim:
+def weigh_emitter_sample(
+    estimators: Estimators, sample: DistantEmitterSample, wo: mi.Vector3f, p: mi.Float, active: mi.Bool
+) -> WeightedEmitterSample:
     """The aim of the next vertex; ``active`` lanes have made a side flight for it.
 
     The path leaves this vertex in the direction ``wo``, of density ``p``.
     """
     q = eval_hg(turn_between(-_direction_to_emitter(sample), wo), estimators.lobe)
-    return Aim(sample, dr.select(active, p * dr.rcp(p + q), 1))
+    return WeightedEmitterSample(sample, dr.select(active, p * dr.rcp(p + q), 1))
 
 
-def _direction_to_emitter(aim: DistantAim) -> mi.Vector3f:
+def _direction_to_emitter(aim: DistantEmitterSample) -> mi.Vector3f:
     # Where an emitter has no light to sample, the direction is 0; its light is 0, whatever the lobe is about.
     return dr.select(dr.squared_norm(aim.d) > 0.5, aim.d, mi.Vector3f(0, 0, 1))

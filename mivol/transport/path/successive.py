@@ -18,19 +18,19 @@ import mitsuba as mi
 
 from mivol.transport.estimators.scores import Primal
 from mivol.transport.path.estimators import Estimators
-from mivol.transport.path.walk import Path, alpha_of, gather_lanes, leave_camera, start_path, step
+from mivol.transport.path.walk import Path, advance_path, film_alpha, gather_lanes, leave_camera, start_path
 from mivol.transport.traversal.random_numbers import LaneSampler, draw_seeds
 from mivol.transport.traversal.rays import camera_ray
 
-__all__ = ["paths_a_lane", "walk_successively"]
+__all__ = ["paths_per_lane", "walk_successively"]
 
-LANES = {"llvm": 1 << 13, "cuda": 1 << 20, "metal": 1 << 20}
+MIN_LANES = {"llvm": 1 << 13, "cuda": 1 << 20, "metal": 1 << 20}
 """Fewest lanes. Dr.Jit deals them out to the threads of a CPU by packets, of which these are 512 at least; a GPU holds
 some 2^18. The number of threads does not enter: the same seed means the same picture on every machine."""
 
 
 @dataclass
-class _Departure:
+class _PathStarts:
     """How paths leave the camera, one for each sample.
 
     Attributes:
@@ -52,10 +52,10 @@ class _Departure:
         return ray, gather_lanes(self.medium, index, active), LaneSampler.seeded(*seeds, index)
 
 
-def paths_a_lane(most: int, paths: int) -> int:
+def paths_per_lane(most: int, paths: int) -> int:
     """How many of ``paths`` a lane walks one after the other, at most ``most``: fewer where lanes would become too few."""
     backend = mi.variant().split("_")[0]
-    return max(1, min(most, paths // LANES[backend]))
+    return max(1, min(most, paths // MIN_LANES[backend]))
 
 
 def walk_successively(estimators: Estimators, sampler: mi.Sampler, ray: mi.Ray3f, count: int) -> tuple[mi.Spectrum, mi.Float]:
@@ -75,7 +75,7 @@ def walk_successively(estimators: Estimators, sampler: mi.Sampler, ray: mi.Ray3f
     n = dr.width(ray)
     lanes, per_lane = -(-n // count), dr.opaque(mi.UInt32, count)
     seeds = draw_seeds(sampler)
-    departure = _Departure(camera_ray(ray), estimators.media.medium_at(ray), seeds)
+    departure = _PathStarts(camera_ray(ray), estimators.media.medium_at(ray), seeds)
     L, alpha = dr.zeros(mi.Spectrum, n), dr.zeros(mi.Float, n)
     dr.eval(departure, L, alpha)
     index = dr.arange(mi.UInt32, lanes) * per_lane
@@ -87,10 +87,10 @@ def walk_successively(estimators: Estimators, sampler: mi.Sampler, ray: mi.Ray3f
         return leave_camera(estimators, path, medium)
 
     def walk_on(path: Path, index: mi.UInt32) -> tuple[Path, mi.UInt32]:
-        path = step(estimators, path)
+        path = advance_path(estimators, path)
         ended = ~path.active
         dr.scatter(L, path.score.L, index, ended)
-        dr.scatter(alpha, alpha_of(path), index, ended)
+        dr.scatter(alpha, film_alpha(path), index, ended)
         index += dr.select(ended, mi.UInt32(1), mi.UInt32(0))
         return dr.select(ended, start(index, ended & (index < end)), path), index
 

@@ -24,27 +24,32 @@ import drjit as dr
 import mitsuba as mi
 
 from mivol.transport.estimators.flights.flight_derivatives import Probe, Probes, ProbeTerm, ShadowReservoir, ShadowTerm
-from mivol.transport.estimators.flights.free_flight import collision_at
-from mivol.transport.estimators.lighting.direct_lighting import DirectLight, DistantAim, power_heuristic
-from mivol.transport.estimators.scores import PICTURE, Primal, Replay, Tangent, TrackedTerm
+from mivol.transport.estimators.flights.free_flight import make_collision
+from mivol.transport.estimators.lighting.direct_lighting import DirectLight, DistantEmitterSample, power_heuristic
+from mivol.transport.estimators.scores import IMAGE, Primal, Replay, Tangent, TrackedTerm
 from mivol.transport.estimators.segment import Collision, PathSegment
 from mivol.transport.media.body import medium_interaction
 from mivol.transport.media.channels import colours
 from mivol.transport.path.estimators import Estimators
-from mivol.transport.path.event import PathEvent, TurnSamples, sample_turn
-from mivol.transport.path.side_flight import Aim, SideSamples, fly_aside, weigh_aim
+from mivol.transport.path.event import PathEvent, TurnSamples, sample_next_direction
+from mivol.transport.path.side_flight import (
+    SideFlightSamples,
+    WeightedEmitterSample,
+    estimate_side_flight,
+    weigh_emitter_sample,
+)
 from mivol.transport.traversal.random_numbers import LaneSampler, Strata, draw_state
 from mivol.transport.traversal.rays import FineRay, Ray, camera_ray, point_along
 
 __all__ = [
-    "Landing",
+    "FirstCollision",
     "Path",
-    "alpha_of",
+    "film_alpha",
     "gather_lanes",
-    "is_straight",
+    "has_one_segment",
     "leave_camera",
     "start_path",
-    "step",
+    "advance_path",
     "walk_branch",
     "walk_path",
     "walk_stem",
@@ -53,12 +58,12 @@ __all__ = [
 T = TypeVar("T")
 Score = TypeVar("Score", Primal, Replay, Tangent)
 
-SURE = 0.5
+ROULETTE_THROUGHPUT = 0.5
 """Throughput down to which a path in a medium surely goes on (variance x time, measured at 1, 1/2 and 1/4: in a white box of
 optical depth 64 three times less at 1/2, in smoke of albedo 0.5 to 0.95 between 1.04 times more and 1.6 times less; 1/4 is as
 1/2)."""
 
-LONG = 128.0
+LONG_PATH = 128.0
 """Scatterings of a path from which on roulette may raise its throughput above 1, to the root of their number over this one. Of
 paths that enter a half-space the share that is still inside after n scatterings falls as the root of n, and takes a multiple
 of n more: where light has a place, each of these costs as much and finds less. Variance x time falls 1.1 times in milk in a
@@ -107,12 +112,12 @@ class Path:
     strata: Strata | None
     probes: Probes | None = None
     shadow: ShadowReservoir | None = None
-    aim: Aim | None = None
+    aim: WeightedEmitterSample | None = None
     rival: mi.Float | None = None
 
 
 @dataclass
-class Landing:
+class FirstCollision:
     """Where paths have first collided, on their first segment.
 
     Attributes:
@@ -157,16 +162,16 @@ def walk_path(
     active = mi.Bool(active) & (estimators.settings.depth_limit > 0)
     path = start_path(estimators, camera_ray(ray), score, sampler, strata, active)
     path = leave_camera(estimators, path, estimators.media.medium_at(ray))
-    if is_straight(estimators):
+    if has_one_segment(estimators):
         path, event = _follow_segment(estimators, path)
-        path = _add_emission(estimators, path, event)
+        path = _add_emitted_light(estimators, path, event)
         path.stopped |= event.at_surface
-        return path.score, alpha_of(path)
-    path = _add_kept(estimators, _walk_on(estimators, _keep_some(estimators, path, "first", "later")))
-    return path.score, alpha_of(path)
+        return path.score, film_alpha(path)
+    path = _add_reservoirs(estimators, _walk_to_end(estimators, _start_reservoirs(estimators, path, "first", "later")))
+    return path.score, film_alpha(path)
 
 
-def walk_stem(estimators: Estimators, sampler: mi.Sampler, ray: Ray, score: Score) -> tuple[Score, Landing]:
+def walk_stem(estimators: Estimators, sampler: mi.Sampler, ray: Ray, score: Score) -> tuple[Score, FirstCollision]:
     """Walk a path from the camera, but no further than to a collision on its first segment.
 
     Args:
@@ -178,18 +183,18 @@ def walk_stem(estimators: Estimators, sampler: mi.Sampler, ray: Ray, score: Scor
     goes_on = estimators.media.has_surfaces
     kept = ("first", "later") if goes_on else ("first",)
     path = start_path(estimators, camera_ray(ray), score, sampler, None, dr.full(mi.Bool, True, dr.width(ray)))
-    path = _keep_some(estimators, leave_camera(estimators, path, estimators.media.medium_at(ray)), *kept)
+    path = _start_reservoirs(estimators, leave_camera(estimators, path, estimators.media.medium_at(ray)), *kept)
     path, event = _follow_segment(estimators, path)
-    path = _add_emission(estimators, path, event)
+    path = _add_emitted_light(estimators, path, event)
     hit = event.collision
-    landing = Landing(path.ray, hit.t, hit.body, mi.Spectrum(path.beta), hit.on)
+    landing = FirstCollision(path.ray, hit.t, hit.body, mi.Spectrum(path.beta), hit.on)
     if goes_on:
         beside = replace(event, collision=replace(hit, on=dr.full(mi.Bool, False, dr.width(ray))))
-        path = _walk_on(estimators, _scatter(estimators, path, beside))
-    return _add_kept(estimators, path).score, landing
+        path = _walk_to_end(estimators, _scatter(estimators, path, beside))
+    return _add_reservoirs(estimators, path).score, landing
 
 
-def walk_branch(estimators: Estimators, sampler: LaneSampler, landing: Landing, score: Score) -> tuple[Score, mi.UInt32]:
+def walk_branch(estimators: Estimators, sampler: LaneSampler, landing: FirstCollision, score: Score) -> tuple[Score, mi.UInt32]:
     """Walk a path on from where it first collided, to its end.
 
     Args:
@@ -202,27 +207,27 @@ def walk_branch(estimators: Estimators, sampler: LaneSampler, landing: Landing, 
     """
     path = start_path(estimators, landing.ray, score, sampler, None, mi.Bool(landing.on))
     path.beta = mi.Spectrum(landing.beta)
-    path = _aim_first(estimators, _keep_some(estimators, path, "later"))
-    hit = collision_at(estimators.media, landing.ray, landing.t, landing.body, landing.on)
-    path = _walk_on(estimators, _scatter(estimators, path, _in_medium(hit, sampler.next_1d())))
-    return _add_kept(estimators, path).score, path.depth
+    path = _sample_first_emitter(estimators, _start_reservoirs(estimators, path, "later"))
+    hit = make_collision(estimators.media, landing.ray, landing.t, landing.body, landing.on)
+    path = _walk_to_end(estimators, _scatter(estimators, path, _in_medium(hit, sampler.next_1d())))
+    return _add_reservoirs(estimators, path).score, path.depth
 
 
-def _keep_some(estimators: Estimators, path: Path, *which: str) -> Path:
+def _start_reservoirs(estimators: Estimators, path: Path, *which: str) -> Path:
     """For derivatives of paths that scatter in media, a path that keeps some of its points and shadow rays.
 
     Args:
         which: "first": a point before it scatters; "later": another one, and a shadow ray, after that.
     """
-    if not estimators.segment.ends_in_media or path.score.purpose == PICTURE:
+    if not estimators.segment.ends_in_media or path.score.purpose == IMAGE:
         return path
-    path.probes = Probes(*(Probe.none(path.ray) if name in which else None for name in ("first", "later")))
+    path.probes = Probes(*(Probe.empty(path.ray) if name in which else None for name in ("first", "later")))
     if "later" in which:
         path.shadow = ShadowReservoir.empty(estimators.media, path.ray)
     return path
 
 
-def _add_kept(estimators: Estimators, path: Path) -> Path:
+def _add_reservoirs(estimators: Estimators, path: Path) -> Path:
     """Add the derivatives that kept points and shadow rays find, at the end of a path."""
     if path.shadow is not None:
         path.score = path.score.add(ShadowTerm(estimators.media, path.shadow))
@@ -265,41 +270,45 @@ def leave_camera(estimators: Estimators, path: Path, medium: mi.MediumPtr) -> Pa
     """A path that was started, as it leaves a camera in a medium."""
     path.stopped |= not estimators.settings.hide_emitters and estimators.media.scene.environment() is not None
     path.medium = medium
-    return _aim_first(estimators, path)
+    return _sample_first_emitter(estimators, path)
 
 
-def _aim_first(estimators: Estimators, path: Path) -> Path:
+def _sample_first_emitter(estimators: Estimators, path: Path) -> Path:
     """Draw the emitter sample of the first vertex, where vertices are given theirs beforehand."""
     if estimators.lobe is not None:
-        path.aim = Aim(_draw_emitter(estimators, path.ray, path.sampler, path.active), dr.full(mi.Float, 1, dr.width(path.ray)))
+        path.aim = WeightedEmitterSample(
+            _sample_distant_emitter(estimators, path.ray, path.sampler, path.active), dr.full(mi.Float, 1, dr.width(path.ray))
+        )
     return path
 
 
-def _draw_emitter(estimators: Estimators, ray: FineRay, sampler: mi.Sampler | LaneSampler, active: mi.Bool) -> DistantAim:
+def _sample_distant_emitter(
+    estimators: Estimators, ray: FineRay, sampler: mi.Sampler | LaneSampler, active: mi.Bool
+) -> DistantEmitterSample:
     """An emitter sample for a vertex that lies ahead; emitters are at infinity, so that any point will do."""
     it = dr.zeros(mi.Interaction3f, dr.width(ray))
     it.p, it.time, it.wavelengths = mi.Point3f(ray.o), ray.time, ray.wavelengths
-    return DistantAim.of(estimators.direct.aim(it, sampler.next_2d(active), active))
+    return DistantEmitterSample.from_sample(estimators.direct.sample_emitter(it, sampler.next_2d(active), active))
 
 
-def step(estimators: Estimators, path: Path) -> Path:
+def advance_path(estimators: Estimators, path: Path) -> Path:
     """Follow a path along its segment and over the event at its end."""
     path, event = _follow_segment(estimators, path)
-    path = _add_emission(estimators, path, event)
+    path = _add_emitted_light(estimators, path, event)
     return _scatter(estimators, path, event)
 
 
-def _walk_on(estimators: Estimators, path: Path) -> Path:
+def _walk_to_end(estimators: Estimators, path: Path) -> Path:
     """Follow a path to its end."""
-    return dr.while_loop(state=(path,), cond=lambda p: p.active, body=lambda p: (step(estimators, p),), label="path")[0]
+    return dr.while_loop(state=(path,), cond=lambda p: p.active, body=lambda p: (advance_path(estimators, p),), label="path")[0]
 
 
-def _add_side_flight(estimators: Estimators, path: Path, event: PathEvent, aim: DistantAim, active: mi.Bool) -> Path:
+def _add_side_flight(estimators: Estimators, path: Path, event: PathEvent, aim: DistantEmitterSample, active: mi.Bool) -> Path:
     """Look at the emitter sample of the next vertex from the end of a side flight."""
     sampler = path.sampler
     lobe, flight = sampler.next_2d(active), estimators.segment.draw(sampler, active, None)
-    samples = SideSamples(lobe, flight, draw_state(sampler, active) if estimators.draws_shadows else None)
-    flight = fly_aside(estimators, event.collision, path.beta, path.depth, aim, samples, path.score.purpose, active)
+    samples = SideFlightSamples(lobe, flight, draw_state(sampler, active) if estimators.draws_shadows else None)
+    flight = estimate_side_flight(estimators, event.collision, path.beta, path.depth, aim, samples, path.score.purpose, active)
     path.score = path.score.add(flight.light)
     if path.shadow is not None:
         path.shadow = path.shadow.offer(flight.shadow, flight.chance)
@@ -315,8 +324,8 @@ def _estimate_probe(estimators: Estimators, probe: Probe, sampler: mi.Sampler) -
     path = start_path(estimators, probe.ray, Primal(dr.zeros(mi.Spectrum, n)), sampler, None, on)
     path.depth = mi.UInt32(probe.depth)
     collision = Collision(mei, point_along(probe.ray, probe.t), dr.full(mi.Spectrum, 1, n), on, probe.t, probe.body)
-    path = _walk_on(estimators, _scatter(estimators, path, _in_medium(collision)))
-    return ProbeTerm(media, probe, mei, dr.detach(path.score.L), estimators.segment.level, on)
+    path = _walk_to_end(estimators, _scatter(estimators, path, _in_medium(collision)))
+    return ProbeTerm(media, probe, mei, dr.detach(path.score.L), estimators.segment.baseline, on)
 
 
 def _in_medium(collision: Collision, chance: mi.Float | None = None) -> PathEvent:
@@ -326,7 +335,7 @@ def _in_medium(collision: Collision, chance: mi.Float | None = None) -> PathEven
     return PathEvent(*nothing, collision, chance)
 
 
-def alpha_of(path: Path) -> mi.Float:
+def film_alpha(path: Path) -> mi.Float:
     """What a film's alpha sees of a path: all of it where a surface stopped it, else the opacity of the media.
 
     This is the mean of what ``volpath`` draws from ``max_depth`` 2 on (1 where it finds a point in a medium or on a surface),
@@ -335,7 +344,7 @@ def alpha_of(path: Path) -> mi.Float:
     return dr.select(path.stopped, 1, 1 - sum(colours(path.clear)) / dr.size_v(path.clear))
 
 
-def is_straight(estimators: Estimators) -> bool:
+def has_one_segment(estimators: Estimators) -> bool:
     """Whether every path has one segment: there are no surfaces, or the depth is at most 1 and none of them transmits light."""
     media = estimators.media
     if estimators.segment.ends_in_media:
@@ -350,7 +359,7 @@ def _follow_segment(estimators: Estimators, path: Path) -> tuple[Path, PathEvent
     # A copy of the throughput: it is multiplied in place below, and derivatives read the segment's own after that.
     segment = PathSegment(path.ray, path.medium, mi.Spectrum(path.beta), may_scatter, samples, mi.UInt32(path.depth))
     if estimators.emission is not None:
-        segment.emission_weight = estimators.emission.weigh_met(path.last, path.rival, path.ray.d, path.active)
+        segment.emission_weight = estimators.emission.weigh_path(path.last, path.rival, path.ray.d, path.active)
     found = estimators.segment.estimate(segment, path.score.purpose, path.active)
     if found.light is not None:
         path.score = path.score.add(found.light)
@@ -360,10 +369,10 @@ def _follow_segment(estimators: Estimators, path: Path) -> tuple[Path, PathEvent
     path.beta *= found.T
     path.clear *= found.T
     path.medium = found.end.medium
-    return path, PathEvent.of(found, path.active)
+    return path, PathEvent.from_estimate(found, path.active)
 
 
-def _add_emission(estimators: Estimators, path: Path, event: PathEvent) -> Path:
+def _add_emitted_light(estimators: Estimators, path: Path, event: PathEvent) -> Path:
     """Add the emission of the surface, or of the environment, towards the path."""
     scene, si = estimators.media.scene, event.si
     shown = path.active & ~event.in_medium & ~((path.depth == 0) & estimators.settings.hide_emitters)
@@ -373,7 +382,7 @@ def _add_emission(estimators: Estimators, path: Path, event: PathEvent) -> Path:
         direct = mi.DirectionSample3f(scene, si, path.last)
         pdf_emitter = scene.pdf_emitter_direction(path.last, direct, ~path.delta & (emitter != None))
         w_mis = dr.select(path.delta, 1, power_heuristic(path.pdf, pdf_emitter))
-    with dr.resume_grad(when=path.score.purpose != PICTURE):
+    with dr.resume_grad(when=path.score.purpose != IMAGE):
         Le = path.beta * w_mis * emitter.eval(si, shown)
     path.score = path.score.add(TrackedTerm(Le, shown))
     return path
@@ -386,20 +395,20 @@ def _scatter(estimators: Estimators, path: Path, event: PathEvent) -> Path:
     may_scatter = arrives & (path.depth + 1 < limit)
     path = _add_direct_light(estimators, path, event, may_scatter)
     if estimators.emission is not None:
-        path = _add_light_of_media(estimators, path, event, may_scatter)
+        path = _add_media_emission(estimators, path, event, may_scatter)
     ahead = event.in_medium & (path.depth + 2 < limit)
     if path.aim is not None:
-        aim = _draw_emitter(estimators, path.ray, sampler, arrives)
+        aim = _sample_distant_emitter(estimators, path.ray, sampler, arrives)
         path = _add_side_flight(estimators, path, event, aim, ahead)
 
     # -- The direction the path takes -----------------------------------------------------------------------------------------
     u1, u2 = sampler.next_1d(arrives), sampler.next_2d(arrives)
-    turn = sample_turn(estimators, path.ray, event, TurnSamples(u1, u2), may_scatter)
+    turn = sample_next_direction(estimators, path.ray, event, TurnSamples(u1, u2), may_scatter)
     path.stopped |= arrives & ~turn.through
     for factor in turn.factors:
         path.score = path.score.scale(factor)
     if path.aim is not None:
-        path.aim = weigh_aim(estimators, aim, turn.ray.d, turn.pdf, ahead & turn.on)
+        path.aim = weigh_emitter_sample(estimators, aim, turn.ray.d, turn.pdf, ahead & turn.on)
     path.beta *= dr.select(turn.on, turn.weight, 0)
     path.eta *= dr.select(turn.on, turn.eta, 1)
     path.ray, path.medium = turn.ray, dr.select(turn.on, turn.medium, path.medium)
@@ -415,7 +424,11 @@ def _scatter(estimators: Estimators, path: Path, event: PathEvent) -> Path:
     # At surfaces it ends paths that never lose any light; in media these find their way out.
     sure, most = mi.Float(1), mi.Float(0.95)
     if event.collision is not None:
-        spared = mi.Float(SURE) if estimators.long_paths_count else dr.maximum(SURE, dr.sqrt(path.depth / LONG))
+        spared = (
+            mi.Float(ROULETTE_THROUGHPUT)
+            if estimators.long_paths_count
+            else dr.maximum(ROULETTE_THROUGHPUT, dr.sqrt(path.depth / LONG_PATH))
+        )
         sure, most = dr.select(event.in_medium, spared, sure), dr.select(event.in_medium, 1, most)
     q = dr.minimum(dr.max(path.beta) * dr.square(path.eta) / sure, most)
     late = path.depth >= estimators.settings.rr_depth
@@ -438,12 +451,12 @@ def _add_direct_light(estimators: Estimators, path: Path, event: PathEvent, may_
         return path
     vertex = event.vertex(media)
     if path.aim is None:
-        aim = estimators.direct.aim(vertex.interaction, sampler.next_2d(lit), lit)
+        aim = estimators.direct.sample_emitter(vertex.interaction, sampler.next_2d(lit), lit)
     else:
-        aim = path.aim.sample.seen_from(vertex.interaction)
+        aim = path.aim.sample.at_point(vertex.interaction)
     rng = draw_state(sampler, lit) if estimators.draws_shadows else None
-    direct = estimators.direct.at_vertex(vertex, aim, purpose != PICTURE, lit, rng)
-    with dr.resume_grad(when=purpose != PICTURE):
+    direct = estimators.direct.estimate_at_vertex(vertex, aim, purpose != IMAGE, lit, rng)
+    with dr.resume_grad(when=purpose != IMAGE):
         carried = path.beta * direct.value
         if event.collision is not None:
             inside = event.collision.albedo if path.aim is None else event.collision.albedo * path.aim.weight
@@ -457,25 +470,25 @@ def _add_direct_light(estimators: Estimators, path: Path, event: PathEvent, may_
     return path
 
 
-def _add_light_of_media(estimators: Estimators, path: Path, event: PathEvent, may_scatter: mi.Bool) -> Path:
+def _add_media_emission(estimators: Estimators, path: Path, event: PathEvent, may_scatter: mi.Bool) -> Path:
     """Light of media that emit, from a point that is drawn in them."""
     lit, inside = may_scatter & event.in_medium, mi.Spectrum(1)
     if estimators.media.has_surfaces:
         lit |= may_scatter & event.at_surface & mi.has_flag(event.si.bsdf().flags(), mi.BSDFFlags.Smooth)
     if event.collision is not None:
         inside = dr.select(event.in_medium, event.collision.albedo, 1)
-    light = estimators.emission.at_vertex(
+    light = estimators.emission.estimate_at_vertex(
         event.vertex(estimators.media),
         path.beta * inside,
         (path.sampler.next_1d(lit), draw_state(path.sampler, lit)),
-        path.score.purpose != PICTURE,
+        path.score.purpose != IMAGE,
         lit,
         estimators.draws_shadows,
     )
     path.score = path.score.add(light)
     if path.shadow is not None:
         path.shadow = path.shadow.offer(light.shadow, light.point.chance)
-    elif path.score.purpose != PICTURE:
+    elif path.score.purpose != IMAGE:
         alone = ShadowReservoir.empty(estimators.media, path.ray).offer(light.shadow, light.point.chance)
         path.score = path.score.add(ShadowTerm(estimators.media, alone))
     return path

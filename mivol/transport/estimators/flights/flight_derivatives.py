@@ -39,12 +39,12 @@ from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.traversal.rays import FineRay, Ray
 
 __all__ = [
-    "FlownSegment",
-    "Level",
+    "FlightSegment",
+    "Baseline",
     "Probe",
     "ProbeTerm",
     "Probes",
-    "weigh_collisions",
+    "collision_weights",
     "ShadowReservoir",
     "ShadowTerm",
 ]
@@ -53,12 +53,12 @@ __all__ = [
 PROBE_TAU = 0.6
 """Optical depth across a medium of the extinction kappa that is added to collisions (measured in a box: 0.3 per half edge)."""
 
-LEAST_ALBEDO = 0.1
+MIN_ALBEDO = 0.1
 """Albedo below which derivatives by it come from probes; L / albedo is at most 10 times L above it."""
 
 
 @dataclass
-class Level:
+class Baseline:
     """The level b that derivatives of flights are taken from.
 
     Attributes:
@@ -69,18 +69,18 @@ class Level:
     first: mi.Spectrum
     later: mi.Spectrum
 
-    def at(self, depth: mi.UInt32) -> mi.Spectrum:
+    def at_depth(self, depth: mi.UInt32) -> mi.Spectrum:
         """That of flights after so many scatterings."""
         return dr.select(depth == 0, self.first, self.later)
 
     @property
-    def of_branches(self) -> Level:
+    def for_branches(self) -> Baseline:
         """That of paths that begin where they have collided."""
-        return Level(self.later, self.later)
+        return Baseline(self.later, self.later)
 
 
 @dataclass
-class FlownSegment:
+class FlightSegment:
     """A flight: the derivatives of its emission and of its throughput (a ``SharedSegment``).
 
     Attributes:
@@ -91,7 +91,7 @@ class FlownSegment:
         weight: of each channel at its end.
         level: the level b; None for 0.
         emission: where emission was looked at; None where no medium emits by its place.
-        shown: the light of Gaussians; None where no medium shows any.
+        gaussian_light: the light of Gaussians; None where no medium shows any.
         active: lanes that fly.
         dL: d loss / d emission, once it is known.
     """
@@ -101,28 +101,30 @@ class FlownSegment:
     passed: RaySegment
     collision: Collision
     weight: mi.Spectrum
-    level: Level | None
+    baseline: Baseline | None
     emission: FlightPoint | None
-    shown: GaussianLight | None
+    gaussian_light: GaussianLight | None
     active: mi.Bool
     dL: mi.Spectrum | None = None
 
     @property
-    def _level(self) -> mi.Spectrum:
+    def _baseline_light(self) -> mi.Spectrum:
         """Light of the level as the camera sees it at the end of the flight; 0 where the path may not scatter any more."""
-        if self.level is None:
+        if self.baseline is None:
             return mi.Spectrum(0)
-        return dr.select(self.segment.scatters, self.segment.beta * self.weight * self.level.at(self.segment.depth), 0)
+        return dr.select(
+            self.segment.may_scatter, self.segment.beta * self.weight * self.baseline.at_depth(self.segment.depth), 0
+        )
 
     @property
     def emitted(self) -> mi.Spectrum:
         """The light that media emit along the flight, as the camera sees it."""
-        total = mi.Spectrum(0) if self.shown is None else self.shown.value()
+        total = mi.Spectrum(0) if self.gaussian_light is None else self.gaussian_light.value()
         if self.emission is None:
             return total
         ray, point = self.segment.ray, self.emission.point
         for body, on in self.media.bodies_at(point.body, point.on):
-            if _emits_by_place(body):
+            if _emits_at_points(body):
                 light = self.emission.gain * dr.detach(eval_emission(body, ray, point.t, self.media.channels, on))
                 total += dr.select(on, light, 0)
         return total
@@ -131,14 +133,14 @@ class FlownSegment:
 
     def vjp_light(self, dL: mi.Spectrum) -> None:
         """Derivatives of the emission, and of the media in front of the point where it was looked at."""
-        if self.shown is not None:
-            self.shown.vjp(dL)
+        if self.gaussian_light is not None:
+            self.gaussian_light.vjp(dL)
         if self.emission is None:
             return
         media, ray, found = self.media, self.segment.ray, self.emission
         value = mi.Spectrum(0)
         for body, on in media.bodies_at(found.point.body, found.point.on):
-            if not _emits_by_place(body):
+            if not _emits_at_points(body):
                 continue
             with dr.resume_grad():
                 emitted = eval_emission(body, ray, found.point.t, media.channels, on)
@@ -150,15 +152,15 @@ class FlownSegment:
         vjp_optical_depth(media, self._to_emission, -dL * found.gain * value, found.point.on)
 
     def jvp_light(self) -> mi.Spectrum:
-        total = -self._level * self._jvp_extinction
-        if self.shown is not None:
-            total += self.shown.jvp()
+        total = -self._baseline_light * self._jvp_extinction
+        if self.gaussian_light is not None:
+            total += self.gaussian_light.jvp()
         if self.emission is None:
             return total
         media, ray, found = self.media, self.segment.ray, self.emission
         value, change = mi.Spectrum(0), mi.Spectrum(0)
         for body, on in media.bodies_at(found.point.body, found.point.on):
-            if not _emits_by_place(body):
+            if not _emits_at_points(body):
                 continue
             with dr.resume_grad():
                 emitted = eval_emission(body, ray, found.point.t, media.channels, on)
@@ -177,25 +179,25 @@ class FlownSegment:
 
     def vjp(self, dlog: mi.Spectrum) -> None:
         media, ray, hit = self.media, self.segment.ray, self.collision
-        rest = dlog if self.level is None else dlog - self.dL * self._level
+        rest = dlog if self.baseline is None else dlog - self.dL * self._baseline_light
         vjp_optical_depth(media, self.passed, -rest, self.active)
-        for body, on in media.bodies_at(hit.body, hit.on & self.segment.scatters):
-            name, weight = _weigh_collision(media, body, ray, hit.t, on)
+        for body, on in media.bodies_at(hit.body, hit.on & self.segment.may_scatter):
+            name, weight = _collision_weight(media, body, ray, hit.t, on)
             body.deposit(ray, dr.select(on, hit.t, 0), by_channel(dr.select(on, rest * weight, 0), media.channels), on, name)
             if body.view.albedo is None:
                 continue
             with dr.resume_grad():
                 albedo = eval_albedo(body, hit.mei, on)
                 if dr.grad_enabled(albedo):
-                    dr.backward_from(dr.select(on, dlog * _over_albedo(albedo), 0))
+                    dr.backward_from(dr.select(on, dlog * _albedo_ratio(albedo), 0))
 
     def jvp_transmittance(self) -> mi.Spectrum:
         media, hit, change = self.media, self.collision, mi.Spectrum(self._jvp_extinction)
-        for body, on in media.bodies_at(hit.body, hit.on & self.segment.scatters):
+        for body, on in media.bodies_at(hit.body, hit.on & self.segment.may_scatter):
             if body.view.albedo is None:
                 continue
             with dr.resume_grad():
-                own = tangent_of(_over_albedo(eval_albedo(body, hit.mei, on)))
+                own = tangent_of(_albedo_ratio(eval_albedo(body, hit.mei, on)))
             change += dr.select(on, own, 0)
         return change
 
@@ -204,8 +206,8 @@ class FlownSegment:
         """Tangent of the logarithm of the throughput by the extinction, without the share that probes have."""
         media, ray, hit = self.media, self.segment.ray, self.collision
         change = -jvp_optical_depth(media, self.passed, self.active)
-        for body, on in media.bodies_at(hit.body, hit.on & self.segment.scatters):
-            name, weight = _weigh_collision(media, body, ray, hit.t, on)
+        for body, on in media.bodies_at(hit.body, hit.on & self.segment.may_scatter):
+            name, weight = _collision_weight(media, body, ray, hit.t, on)
             own = spectrum(body.tangent_at(ray, dr.select(on, hit.t, 0), media.channels, on, name))
             change += dr.select(on, own * weight, 0)
         return change
@@ -234,7 +236,7 @@ class Probe:
     total: mi.Float
 
     @classmethod
-    def none(cls, ray: Ray) -> Probe:
+    def empty(cls, ray: Ray) -> Probe:
         """No flight yet."""
         n = dr.width(ray)
         zero = dr.zeros(mi.Float, n)
@@ -244,7 +246,7 @@ class Probe:
     def offer(self, segment: PathSegment, found: FlightPoint, on: mi.Bool) -> Probe:
         """Keep a point of one more flight, or the one that was kept before."""
         point, gain = found.point, found.gain
-        weight = dr.select(point.on & segment.scatters & on, dr.max(gain), 0)
+        weight = dr.select(point.on & segment.may_scatter & on, dr.max(gain), 0)
         total = self.total + weight
         keep = found.chance * total < weight
         return Probe(
@@ -302,7 +304,7 @@ class ProbeTerm:
     probe: Probe
     mei: mi.MediumInteraction3f
     source: mi.Spectrum
-    level: Level | None
+    baseline: Baseline | None
     on: mi.Bool
     is_replayed = True
 
@@ -317,13 +319,13 @@ class ProbeTerm:
 
     def _weight(self, body: Body, on: mi.Bool) -> tuple[str, mi.Spectrum]:
         """The coefficient that the probe is of, and the derivative of the light by it."""
-        name, weight = _weigh_collision(self.media, body, self.probe.ray, self.probe.t, on)
+        name, weight = _collision_weight(self.media, body, self.probe.ray, self.probe.t, on)
         bracket = self.source
         if body.view.albedo is not None:
             bracket = bracket * dr.detach(eval_albedo(body, self.mei, on))
-        if self.level is not None:
-            bracket = bracket - self.level.at(self.probe.depth)
-        return name, self._gain * bracket * _kappa(self.media, body) * weight
+        if self.baseline is not None:
+            bracket = bracket - self.baseline.at_depth(self.probe.depth)
+        return name, self._gain * bracket * _probe_extinction(self.media, body) * weight
 
     def vjp(self, dL: mi.Spectrum) -> None:
         media, probe = self.media, self.probe
@@ -352,38 +354,38 @@ class ProbeTerm:
     def _by_albedo(self, body: Body, albedo: mi.Spectrum, on: mi.Bool) -> mi.Spectrum:
         """The derivative of the light by an albedo that collisions leave out."""
         sigma_t = spectrum(body.extinction_at(self.probe.ray, self.probe.t, self.media.channels, on))
-        return dr.select(dr.detach(albedo) < LEAST_ALBEDO, self._gain * sigma_t * self.source, 0)
+        return dr.select(dr.detach(albedo) < MIN_ALBEDO, self._gain * sigma_t * self.source, 0)
 
 
-def weigh_collisions(media: SceneMedia, ray: Ray, hit: Collision) -> mi.Spectrum:
+def collision_weights(media: SceneMedia, ray: Ray, hit: Collision) -> mi.Spectrum:
     """The weight [length] that derivatives at collisions have: 1 / (sigma + kappa); 0 where there is none."""
     weight = mi.Spectrum(0)
     for body, on in media.bodies_at(hit.body, hit.on):
-        weight = dr.select(on, _weigh_collision(media, body, ray, hit.t, on)[1], weight)
+        weight = dr.select(on, _collision_weight(media, body, ray, hit.t, on)[1], weight)
     return weight
 
 
-def _weigh_collision(media: SceneMedia, body: Body, ray: Ray, t: mi.Float64, on: mi.Bool) -> tuple[str, mi.Spectrum]:
+def _collision_weight(media: SceneMedia, body: Body, ray: Ray, t: mi.Float64, on: mi.Bool) -> tuple[str, mi.Spectrum]:
     """The name of the coefficient sigma that makes collisions scatter, and 1 / (sigma + kappa) [length] at a point."""
     name = "sigma_s" if body.view.albedo is None else "sigma_"
     sigma = spectrum(body.extinction_at(ray, dr.select(on, t, 0), media.channels, on, name))
-    return name, dr.rcp(sigma + _kappa(media, body))
+    return name, dr.rcp(sigma + _probe_extinction(media, body))
 
 
-def _kappa(media: SceneMedia, body: Body) -> mi.Float:
+def _probe_extinction(media: SceneMedia, body: Body) -> mi.Float:
     """The extinction that stands for vacuum [1/length]: an optical depth of ``PROBE_TAU`` across the medium."""
     return PROBE_TAU / (media.size if body.edge is None else body.edge)
 
 
-def _emits_by_place(body: Body) -> bool:
+def _emits_at_points(body: Body) -> bool:
     """Whether a medium emits light that is a function of the place."""
     return body.view.emits and not body.view.shows_gaussians
 
 
-def _over_albedo(albedo: mi.Spectrum) -> mi.Spectrum:
+def _albedo_ratio(albedo: mi.Spectrum) -> mi.Spectrum:
     """An albedo over its own value, where that is not small: its derivative is that of the logarithm."""
     value = dr.detach(albedo)
-    large = value >= LEAST_ALBEDO
+    large = value >= MIN_ALBEDO
     return dr.select(large, albedo * dr.rcp(dr.select(large, value, 1)), 0)
 
 

@@ -26,11 +26,11 @@ import drjit as dr
 import mitsuba as mi
 
 from mivol.numerics import least_of
-from mivol.transport.estimators.flights.flight_derivatives import FlownSegment, Level
+from mivol.transport.estimators.flights.flight_derivatives import Baseline, FlightSegment
 from mivol.transport.estimators.flights.gaussian_light import GaussianLight
-from mivol.transport.estimators.flights.regular_tracking import collide_exactly, collide_in_gaussians
-from mivol.transport.estimators.flights.tracking import collide_in_blocks, collide_in_bounded
-from mivol.transport.estimators.scores import PICTURE
+from mivol.transport.estimators.flights.regular_tracking import regular_tracking, sample_gaussian_flight
+from mivol.transport.estimators.flights.tracking import delta_tracking, delta_tracking_in_blocks
+from mivol.transport.estimators.scores import IMAGE
 from mivol.transport.estimators.segment import (
     Collision,
     FlightPoint,
@@ -50,7 +50,7 @@ from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.traversal.random_numbers import LaneSampler, Strata, draw_pcg32, draw_state
 from mivol.transport.traversal.rays import Ray, point_along
 
-__all__ = ["FreeFlight", "collision_at"]
+__all__ = ["FreeFlight", "make_collision"]
 
 
 @dataclass
@@ -86,7 +86,7 @@ class FreeFlight:
 
     def __init__(self, media: SceneMedia) -> None:
         self.media = media
-        self.level: Level | None = None
+        self.baseline: Baseline | None = None
 
     def draw(self, sampler: mi.Sampler | LaneSampler, active: mi.Bool, strata: Strata | None) -> tuple[mi.Float, mi.UInt32]:
         """The number of the flight, and the generator of all others: in every lane, since all of them fly."""
@@ -103,29 +103,29 @@ class FreeFlight:
         media, ray = self.media, segment.ray
         u, rng = segment.samples
         rng, (pick, at_emission, at_probe, chance) = draw_pcg32(rng, 4)
-        channel = _draw_channel(segment.beta, pick) if media.channels > 1 else mi.UInt32(0)
-        end, flight = _fly(media, ray, segment.medium, u, channel, rng, active)
+        channel = _sample_channel(segment.beta, pick) if media.channels > 1 else mi.UInt32(0)
+        end, flight = _find_first_collision(media, ray, segment.medium, u, channel, rng, active)
         collides = active & (flight.t < mi.Float64(end.t))
         t = dr.select(collides, flight.t, mi.Float64(end.t))
         passed = RaySegment.upto(ray, segment.medium, t)
         if media.is_bounded:
             # Derivatives of depths that are not known are looked at in one point of the flight.
             _, (passed.u,) = draw_pcg32(flight.rng, 1)
-        collision = collision_at(media, ray, flight.t, flight.body, collides)
+        collision = make_collision(media, ray, flight.t, flight.body, collides)
         weight = self._weigh(segment, passed, active, collision)
         emitting = [body for body in media.bodies if body.view.emits and not body.view.shows_gaussians]
         emission = self._point_of(segment, passed, emitting, at_emission, chance, active) if emitting else None
         if segment.emission_weight is not None:
             emission.gain *= segment.emission_weight
-        shown = None
+        gaussian_light = None
         if any(body.view.shows_gaussians for body in media.bodies):
             weigh = partial(self._weigh, segment, collision=None)
-            shown = GaussianLight(media, segment, (end.t, t), weigh, active)
+            gaussian_light = GaussianLight(media, segment, (end.t, t), weigh, active)
         # What a side flight leaves to probes is found by those of the path itself, and so is the light of the level.
-        level = None if segment.is_aside else self.level
-        shared = FlownSegment(media, segment, passed, collision, weight, level, emission, shown, active)
+        level = None if segment.is_side_flight else self.baseline
+        shared = FlightSegment(media, segment, passed, collision, weight, level, emission, gaussian_light, active)
         light = SegmentLight(shared, shared.emitted, is_replayed=True)
-        probe = self._point_of(segment, passed, media.bodies, at_probe, chance, active) if purpose != PICTURE else None
+        probe = self._point_of(segment, passed, media.bodies, at_probe, chance, active) if purpose != IMAGE else None
         return SegmentEstimate(end, weight, light, SegmentTransmittance(shared), collision, probe)
 
     def _weigh(self, segment: PathSegment, passed: RaySegment, active: mi.Bool, collision: Collision | None) -> mi.Spectrum:
@@ -145,8 +145,8 @@ class FreeFlight:
         value = spectrum([dr.exp(least - row) for row in tau])
         hits = [] if collision is None else self.media.bodies_at(collision.body, collision.on)
         for body, here in hits:
-            value = dr.select(here, value * _extinction(self.media, body, segment.ray, collision.t, here), value)
-        shares = _shares(segment.beta)
+            value = dr.select(here, value * _eval_extinction(self.media, body, segment.ray, collision.t, here), value)
+        shares = _channel_probabilities(segment.beta)
         density = sum((p * v for p, v in zip(shares, colours(value), strict=True)), mi.Float(0))
         return dr.select(density > 0, value / dr.select(density > 0, density, 1), 0)
 
@@ -160,35 +160,37 @@ class FreeFlight:
         return FlightPoint(point, gain, chance)
 
 
-def collision_at(media: SceneMedia, ray: Ray, t: mi.Float64, body: mi.UInt32, on: mi.Bool) -> Collision:
+def make_collision(media: SceneMedia, ray: Ray, t: mi.Float64, body: mi.UInt32, on: mi.Bool) -> Collision:
     """The collision of a ray with the medium of a number, at a distance [length] that counts where lanes are ``on``."""
     at, albedo = dr.select(on, t, 0), mi.Spectrum(0)
     mei = medium_interaction(ray, at)
     mei.medium = media.medium_of(body, on)
     for other, here in media.bodies_at(body, on):
-        albedo = dr.select(here, _albedo(media, other, ray, t, mei, here), albedo)
+        albedo = dr.select(here, _scattering_albedo(media, other, ray, t, mei, here), albedo)
     return Collision(mei, point_along(ray, at), albedo, on, t, body)
 
 
-def _albedo(media: SceneMedia, body: Body, ray: Ray, t: mi.Float64, mei: mi.MediumInteraction3f, on: mi.Bool) -> mi.Spectrum:
+def _scattering_albedo(
+    media: SceneMedia, body: Body, ray: Ray, t: mi.Float64, mei: mi.MediumInteraction3f, on: mi.Bool
+) -> mi.Spectrum:
     """sigma_s / sigma_t at a point of a body."""
     if body.view.albedo is not None:
         return dr.detach(eval_albedo(body, mei, on))
-    sigma_s, sigma_t = (_extinction(media, body, ray, t, on, name) for name in ("sigma_s", "sigma_"))
+    sigma_s, sigma_t = (_eval_extinction(media, body, ray, t, on, name) for name in ("sigma_s", "sigma_"))
     return dr.select(sigma_t > 0, sigma_s / dr.select(sigma_t > 0, sigma_t, 1), 0)
 
 
-def _extinction(media: SceneMedia, body: Body, ray: Ray, t: mi.Float64, on: mi.Bool, name: str = "sigma_") -> mi.Spectrum:
+def _eval_extinction(media: SceneMedia, body: Body, ray: Ray, t: mi.Float64, on: mi.Bool, name: str = "sigma_") -> mi.Spectrum:
     return spectrum(body.extinction_at(ray, dr.select(on, t, 0), media.channels, on, name))
 
 
-def _fly(
+def _find_first_collision(
     media: SceneMedia, ray: Ray, medium: mi.MediumPtr, u: mi.Float, channel: mi.UInt32, rng: mi.UInt32, active: mi.Bool
 ) -> tuple[SegmentEnd, _Flight]:
     """Follow a ray to the first opaque surface, and find the first collision on the way."""
     bodies = media.bodies
     # A boundary that is traced may be entered several times, and each time takes a number of its own.
-    first = next((p for b in media.boxed for p in b.view.parts if not _draws_own_numbers(p)), None)
+    first = next((p for b in media.boxed for p in b.view.parts if not _draws_many_numbers(p)), None)
 
     def visit(flight: _Flight, interval: MediumInterval) -> _Flight:
         body, t, index, rng = interval.body, flight.t, flight.body, flight.rng
@@ -199,16 +201,16 @@ def _fly(
             t0, t1 = mi.Float64(interval.t0), dr.minimum(mi.Float64(interval.t1), t)
             ahead = RayInterval(ray, t0, t1, interval.active & (t1 > t0))
             if not part.exact_line:
-                hit, rng = collide_in_bounded(part, scale, ahead, rng)
+                hit, rng = delta_tracking(part, scale, ahead, rng)
             elif isinstance(part, GaussianExtinction):
-                hit, rng = collide_in_gaussians(part, scale, ahead, rng)
-            elif _is_tracked(part):
-                hit, rng = collide_in_blocks(part, scale, ahead, rng)
+                hit, rng = sample_gaussian_flight(part, scale, ahead, rng)
+            elif _uses_delta_tracking(part):
+                hit, rng = delta_tracking_in_blocks(part, scale, ahead, rng)
             else:
                 rng, (other,) = draw_pcg32(rng, 1)
                 # The sampler's own number, which may be stratified, is the flight of the first part.
                 goal = -dr.log(1 - u if part is first else other)
-                hit = collide_exactly(part, scale, ahead, goal, channel)
+                hit = regular_tracking(part, scale, ahead, goal, channel)
             nearer = ahead.active & (hit < t)
             t, index = dr.select(nearer, hit, t), dr.select(nearer, mi.UInt32(number), index)
         return _Flight(t, index, rng)
@@ -218,24 +220,24 @@ def _fly(
     return visit_media(media, ray, medium, visit, start, active)
 
 
-def _draws_own_numbers(part: Extinction) -> bool:
+def _draws_many_numbers(part: Extinction) -> bool:
     """Whether flights through a part take any number of random numbers."""
-    return _is_tracked(part) or isinstance(part, GaussianExtinction)
+    return _uses_delta_tracking(part) or isinstance(part, GaussianExtinction)
 
 
-def _is_tracked(part: Extinction) -> bool:
+def _uses_delta_tracking(part: Extinction) -> bool:
     """Whether flights through a part are drawn by delta tracking."""
     return not part.exact_line or (part.lattice is not None and part.lattice.block_ranges is not None and part.channels == 1)
 
 
-def _shares(beta: mi.Spectrum) -> list[mi.Float]:
+def _channel_probabilities(beta: mi.Spectrum) -> list[mi.Float]:
     """The probability of each channel: its share of the throughput."""
     rows = [dr.abs(row) for row in colours(beta)]
     total = sum(rows[1:], rows[0])
     return [dr.select(total > 0, row / dr.select(total > 0, total, 1), 1 / len(rows)) for row in rows]
 
 
-def _draw_channel(beta: mi.Spectrum, u: mi.Float) -> mi.UInt32:
+def _sample_channel(beta: mi.Spectrum, u: mi.Float) -> mi.UInt32:
     """A channel in proportion to the throughput."""
-    first, second, _ = _shares(beta)
+    first, second, _ = _channel_probabilities(beta)
     return dr.select(u < first, mi.UInt32(0), dr.select(u < first + second, mi.UInt32(1), mi.UInt32(2)))

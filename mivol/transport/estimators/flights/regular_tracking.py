@@ -32,10 +32,10 @@ from mivol.transport.traversal.interpolation import (
 from mivol.transport.traversal.lattice import piece_points
 from mivol.transport.traversal.random_numbers import draw_pcg32
 
-__all__ = ["collide_exactly", "collide_in_gaussians"]
+__all__ = ["regular_tracking", "sample_gaussian_flight"]
 
 
-def collide_exactly(
+def regular_tracking(
     part: ExactExtinction,
     scale: mi.Float,
     interval: RayInterval,
@@ -58,19 +58,19 @@ def collide_exactly(
     collision.
     """
     if part.is_constant:
-        return _in_constant(part, scale, interval, goal, channel)
-    return _in_grid(part, scale, interval, goal, channel)
+        return _collide_in_constant(part, scale, interval, goal, channel)
+    return _collide_in_grid(part, scale, interval, goal, channel)
 
 
-def _in_constant(
+def _collide_in_constant(
     part: ExactExtinction, scale: mi.Float, interval: RayInterval, goal: mi.Float, channel: mi.UInt32
 ) -> mi.Float64:
-    sigma = _of_channel(part.eval_at(scale, interval.ray, interval.t0, interval.active), channel)
+    sigma = _select_channel(part.eval_at(scale, interval.ray, interval.t0, interval.active), channel)
     t = mi.Float64(interval.t0) + mi.Float64(goal / sigma)
     return dr.select(interval.active & (sigma > 0) & (t < interval.t1), t, dr.inf)
 
 
-def _in_grid(
+def _collide_in_grid(
     part: ExactExtinction,
     scale: mi.Float,
     interval: RayInterval,
@@ -83,7 +83,7 @@ def _in_grid(
 
     def visit(state: tuple, cell: Cell, on: mi.Bool) -> tuple:
         left, s, dt, found = state
-        corners = [_of_channel([row[q] for row in cell.corners[0]], channel) for q in range(8)]
+        corners = [_select_channel([row[q] for row in cell.corners[0]], channel) for q in range(8)]
         a, b = (activate(part.activation, interpolate(corners, p)) for p in gauss_points(cell))
         tau = 0.5 * cell.dt * scale * (a + b)
         here = on & (tau >= left)
@@ -99,13 +99,13 @@ def _in_grid(
     cell, points, inside = piece_points(lattice, ray, begin, dt, found)
     nodes = box_nodes(cell, dr.full(dr.mask_t(mi.Vector3f), True), lattice.res)
     rows = read_nodes(reads, nodes, inside)[0]
-    corners = [_of_channel([row[q] for row in rows], channel) for q in range(8)]
+    corners = [_select_channel([row[q] for row in rows], channel) for q in range(8)]
     curve = cubic_through(*(scale * activate(part.activation, interpolate(corners, p)) for p in points))
     x = invert_cubic_integral(curve, dt, left, cubic_integral(curve, dt, mi.Float(1)))
     return dr.select(found, begin + mi.Float64(x) * mi.Float64(dt), dr.inf)
 
 
-def _of_channel(rows: list[mi.Float], channel: mi.UInt32) -> mi.Float:
+def _select_channel(rows: list[mi.Float], channel: mi.UInt32) -> mi.Float:
     """The number of one channel; a grey part has but one, and a mono variant sees the luminance of the three."""
     rows = as_rows(rows, 1) if mi.is_monochromatic else rows
     value = rows[0]
@@ -114,7 +114,7 @@ def _of_channel(rows: list[mi.Float], channel: mi.UInt32) -> mi.Float:
     return value
 
 
-def collide_in_gaussians(
+def sample_gaussian_flight(
     part: GaussianExtinction, scale: mi.Float, interval: RayInterval, rng: mi.UInt32
 ) -> tuple[mi.Float64, mi.UInt32]:
     """Find the first collision with Gaussians on an interval of a ray.

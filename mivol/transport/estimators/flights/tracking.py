@@ -29,16 +29,16 @@ from mivol.transport.traversal.lattice import Lattice, Segment
 from mivol.transport.traversal.random_numbers import draw_pcg32
 
 __all__ = [
-    "CoarseLattice",
-    "coarse_segment",
+    "BlockLattice",
+    "block_segment",
     "residual_ratio_tracking",
     "ratio_tracking",
-    "collide_in_blocks",
-    "collide_in_bounded",
+    "delta_tracking_in_blocks",
+    "delta_tracking",
 ]
 
 
-FAINT = 0.1
+ROULETTE_BELOW = 0.1
 """Estimate below which Russian roulette may end a ray, to save look-ups for light that hardly counts."""
 
 LOOKUP_RATE = 4.0
@@ -46,7 +46,7 @@ LOOKUP_RATE = 4.0
 
 
 @dataclass
-class CoarseLattice:
+class BlockLattice:
     """The blocks as cells of a coarse lattice, for :func:`walk`."""
 
     res: tuple[int, int, int]
@@ -54,7 +54,7 @@ class CoarseLattice:
 
 
 @dataclass
-class Tracked:
+class _TrackedRay:
     """State of a tracked ray.
 
     Attributes:
@@ -98,9 +98,9 @@ def residual_ratio_tracking(
     shift = blocks.shift
     speed = dr.abs(segment.d) * 2.0**-shift
     rate = LOOKUP_RATE * scale
-    coarse = coarse_segment(segment, shift)
+    coarse = block_segment(segment, shift)
 
-    def visit(state: Tracked, cell: Cell, on: mi.Bool) -> tuple[Tracked, mi.Float]:
+    def visit(state: _TrackedRay, cell: Cell, on: mi.Bool) -> tuple[_TrackedRay, mi.Float]:
         least, above = blocks.at(cell.lower + 1, on)
         density = rate * above
         # -- To the end of the block, or to the next point of the process -----------------------------------------------
@@ -124,27 +124,27 @@ def residual_ratio_tracking(
         left = dr.select(meets, fresh, dr.maximum(state.ahead - dr.select(on, density * dt, 0), 0))
         # -- Roulette ---------------------------------------------------------------------------------------------------
         seen = largest_of([w * dr.exp(-t) for w, t in zip(weight, tau, strict=True)])
-        lives = u[4] * FAINT < seen
-        lift = dr.select(lives, dr.maximum(1, FAINT / seen), 0)
+        lives = u[4] * ROULETTE_BELOW < seen
+        lift = dr.select(lives, dr.maximum(1, ROULETTE_BELOW / seen), 0)
         weight = [dr.select(on, w * lift, w) for w in weight]
-        return Tracked(tau, weight, left, rng), dt
+        return _TrackedRay(tau, weight, left, rng), dt
 
-    def is_dark(state: Tracked) -> mi.Bool:
+    def is_dark(state: _TrackedRay) -> mi.Bool:
         return largest_of(state.weight) == 0
 
     width = dr.width(segment.t0)
     rng, u = draw_pcg32(rng, 1)
-    start = Tracked(
+    start = _TrackedRay(
         [dr.zeros(mi.Float, width) for _ in range(channels)],
         [dr.full(mi.Float, 1, width) for _ in range(channels)],
         -dr.log(u[0]),
         mi.UInt32(rng),
     )
-    end = walk(CoarseLattice(tuple(n - 1 for n in blocks.res)), coarse, visit, start, (), active, is_dark, halts=True)
+    end = walk(BlockLattice(tuple(n - 1 for n in blocks.res)), coarse, visit, start, (), active, is_dark, halts=True)
     return [w * dr.exp(-t) for t, w in zip(end.tau, end.weight, strict=True)], end.rng
 
 
-def coarse_segment(segment: Segment, shift: int) -> Segment:
+def block_segment(segment: Segment, shift: int) -> Segment:
     """A segment in the coordinates of the blocks; exact, since the edge of a block is a power of two."""
     share = 2.0**-shift
     cell = segment.cell + 1
@@ -183,7 +183,7 @@ def ratio_tracking(
         T = [dr.select(on, a * (1 - value / rate), a) for a, value in zip(T, values, strict=True)]
         # -- Roulette ---------------------------------------------------------------------------------------------------
         seen = largest_of(T)
-        lift = dr.select(chance * FAINT < seen, dr.maximum(1, FAINT / seen), 0)
+        lift = dr.select(chance * ROULETTE_BELOW < seen, dr.maximum(1, ROULETTE_BELOW / seen), 0)
         T = [dr.select(on, a * lift, a) for a in T]
         return t, T, rng, on & (lift > 0)
 
@@ -194,7 +194,7 @@ def ratio_tracking(
     return T, rng
 
 
-def collide_in_blocks(
+def delta_tracking_in_blocks(
     part: GridExtinction,
     scale: mi.Float,
     interval: RayInterval,
@@ -241,20 +241,20 @@ def collide_in_blocks(
     width = dr.width(interval.ray)
     rng, (u,) = draw_pcg32(rng, 1)
     start = (-dr.log(u), dr.zeros(mi.Float, width), dr.full(mi.Bool, False, width), rng)
-    coarse = CoarseLattice(tuple(n - 1 for n in blocks.res))
+    coarse = BlockLattice(tuple(n - 1 for n in blocks.res))
     _, s, found, rng = walk(
-        coarse, coarse_segment(segment, shift), visit, start, (), interval.active, until=lambda state: state[2], halts=True
+        coarse, block_segment(segment, shift), visit, start, (), interval.active, until=lambda state: state[2], halts=True
     )
     return dr.select(found, segment.start + mi.Float64(s), dr.inf), rng
 
 
-def collide_in_bounded(
+def delta_tracking(
     part: BoundedExtinction,
     scale: mi.Float,
     interval: RayInterval,
     rng: mi.UInt32,
 ) -> tuple[mi.Float64, mi.UInt32]:
-    """Find the first collision with a grey field of which no more than a majorant is known; as :func:`collide_in_blocks`.
+    """Find the first collision with a grey field of which only a majorant is known; as :func:`delta_tracking_in_blocks`.
 
     Cost: int M dt look-ups in the field's box.
     """

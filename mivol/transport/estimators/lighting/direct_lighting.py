@@ -24,8 +24,8 @@ import drjit as dr
 import mitsuba as mi
 
 from mivol.transport.estimators.lighting.emitters import ChosenEmitter, EventSamples, SceneEmitters, is_among
-from mivol.transport.estimators.lighting.moving_emitters import follow_emitter, shadow_of_moving
-from mivol.transport.estimators.lighting.shadow_rays import light_through, shadow_ray
+from mivol.transport.estimators.lighting.moving_emitters import attach_position, moving_transmittance
+from mivol.transport.estimators.lighting.shadow_rays import find_transmittance, trace_shadow_ray
 from mivol.transport.estimators.lighting.vertex import MediumVertex, Vertex, sample_phase
 from mivol.transport.media.channels import tangent_of
 from mivol.transport.media.optical_depth import jvp_optical_depth, vjp_optical_depth
@@ -34,7 +34,7 @@ from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.traversal.random_numbers import seed_pcg32
 from mivol.transport.traversal.rays import FineRay
 
-__all__ = ["DirectLight", "DirectLighting", "DirectSample", "DistantAim", "EmitterAim", "power_heuristic"]
+__all__ = ["DirectLight", "DirectLighting", "DirectSample", "DistantEmitterSample", "EmitterSample", "power_heuristic"]
 
 
 @dataclass
@@ -53,7 +53,7 @@ class DirectSample:
 
 
 @dataclass
-class EmitterAim:
+class EmitterSample:
     """A direction that was sampled towards an emitter.
 
     Attributes:
@@ -74,7 +74,7 @@ class EmitterAim:
 
 
 @dataclass
-class DistantAim:
+class DistantEmitterSample:
     """A direction that was sampled towards an emitter at infinity: it is the same from every point.
 
     Attributes:
@@ -98,18 +98,18 @@ class DistantAim:
     u: mi.Point2f
 
     @classmethod
-    def of(cls, aim: EmitterAim) -> DistantAim:
+    def from_sample(cls, sample: EmitterSample) -> DistantEmitterSample:
         """What is the same from every point."""
-        direct = aim.direct
-        return cls(direct.d, direct.dist, direct.uv, direct.pdf, direct.delta, aim.weight, aim.emitter, aim.u)
+        direct = sample.direct
+        return cls(direct.d, direct.dist, direct.uv, direct.pdf, direct.delta, sample.weight, sample.emitter, sample.u)
 
-    def seen_from(self, it: mi.Interaction3f) -> EmitterAim:
+    def at_point(self, it: mi.Interaction3f) -> EmitterSample:
         """The sample of a point."""
         direct = dr.zeros(mi.DirectionSample3f, dr.width(self.d))
         direct.p, direct.n, direct.d, direct.dist = mi.Point3f(it.p) + self.dist * self.d, -self.d, self.d, self.dist
         direct.pdf, direct.delta, direct.emitter = self.pdf, self.delta, self.emitter
         direct.uv, direct.time = self.uv, it.time
-        return EmitterAim(direct, self.weight, self.emitter, self.u, 1, True)
+        return EmitterSample(direct, self.weight, self.emitter, self.u, 1, True)
 
 
 class DirectLighting:
@@ -127,13 +127,13 @@ class DirectLighting:
         """The emitters of the scene, read when media first scatter their light; at surfaces Mitsuba chooses the emitter."""
         return SceneEmitters(self.media.scene)
 
-    def aim(self, it: mi.Interaction3f, u: mi.Point2f, active: mi.Bool) -> EmitterAim:
+    def sample_emitter(self, it: mi.Interaction3f, u: mi.Point2f, active: mi.Bool) -> EmitterSample:
         """Sample a direction towards an emitter from a point, by two numbers in [0, 1)."""
         direct, weight = self.media.scene.sample_emitter_direction(it, u, False, active)
-        return EmitterAim(direct, weight, direct.emitter, u, 1, True)
+        return EmitterSample(direct, weight, direct.emitter, u, 1, True)
 
-    def at_vertex(
-        self, vertex: Vertex, aim: EmitterAim, attached: bool, active: mi.Bool, rng: mi.UInt32 | None = None
+    def estimate_at_vertex(
+        self, vertex: Vertex, aim: EmitterSample, attached: bool, active: mi.Bool, rng: mi.UInt32 | None = None
     ) -> DirectSample:
         """Estimate direct light at a vertex of a path by one emitter sample; the path's next segment is the other sample.
 
@@ -149,7 +149,7 @@ class DirectLighting:
         direct, it = aim.direct, vertex.interaction
         on = active & (direct.pdf > 0)
         start, medium = vertex.leave(direct.p)
-        ray_segment, clear, tau, light = shadow_ray(self.media, start, medium, direct, on, rng)
+        ray_segment, clear, tau, light = trace_shadow_ray(self.media, start, medium, direct, on, rng)
         on &= clear
         w_mis = mi.Float(1)
         if aim.has_alternative is not False:
@@ -161,10 +161,10 @@ class DirectLighting:
             if attached:
                 placed, _ = aim.emitter.sample_direction(it, aim.u, on)
                 if dr.grad_enabled(placed.p):
-                    moved = follow_emitter(placed, direct)
+                    moved = attach_position(placed, direct)
                 source = aim.emitter.eval_direction(it, moved, on) / direct.pdf
                 if dr.grad_enabled(moved.p):
-                    source = source * shadow_of_moving(self.media, ray_segment, tau, moved.p, on)
+                    source = source * moving_transmittance(self.media, ray_segment, tau, moved.p, on)
                 if not dr.grad_enabled(source, moved):
                     # What was computed for derivatives only is dropped from the kernel: emitters are looked at once.
                     source, moved = aim.weight, direct
@@ -173,7 +173,7 @@ class DirectLighting:
             value = dr.select(on, dim * vertex.eval(moved.d, on) * dr.select(direct.pdf > 0, source, 0), 0)
         return DirectSample(ray_segment, value, on)
 
-    def in_medium(
+    def estimate_in_medium(
         self,
         vertex: MediumVertex,
         chosen: ChosenEmitter,
@@ -205,8 +205,8 @@ class DirectLighting:
             mei = vertex.interaction
             direct, weight = chosen.emitter.sample_direction(mei, samples.emitter, active)
             weighed = ~is_among(self.emitters.transmissive, chosen.emitter) if self.emitters.samples_phase else False
-            aim = EmitterAim(direct, weight, chosen.emitter, samples.emitter, len(self.emitters.sampled), weighed)
-            found.append(self.at_vertex(vertex, aim, attached, active, one))
+            aim = EmitterSample(direct, weight, chosen.emitter, samples.emitter, len(self.emitters.sampled), weighed)
+            found.append(self.estimate_at_vertex(vertex, aim, attached, active, one))
         if self.emitters.samples_phase:
             found.append(self._phase_sample(vertex, samples, attached, active, two))
         return found
@@ -219,7 +219,7 @@ class DirectLighting:
         wo, weight, pdf = sample_phase(self.media, mei, samples.component, samples.direction, active)
         on = active & (pdf > 0)
         ray = FineRay.leaving(vertex.place, wo, mei)
-        end, _, light = light_through(self.media, ray, mei.medium, on, rng)
+        end, _, light = find_transmittance(self.media, ray, mei.medium, on, rng)
         si = end.si
         emitter = si.emitter(self.media.scene, on)
         on &= (emitter != None) & ~is_among(emitters.transmissive, emitter)

@@ -22,7 +22,7 @@ import mitsuba as mi
 import numpy as np
 
 from mivol.transport.estimators.lighting.direct_lighting import DirectLight, power_heuristic
-from mivol.transport.estimators.lighting.shadow_rays import light_through
+from mivol.transport.estimators.lighting.shadow_rays import find_transmittance
 from mivol.transport.estimators.lighting.vertex import Vertex
 from mivol.transport.estimators.scores import TrackedTerm
 from mivol.transport.media.body import Body, emission_slope, eval_emission
@@ -38,11 +38,11 @@ __all__ = [
     "EmissionLight",
     "EmissionSampling",
     "EmittingPoint",
-    "CELLS",
+    "CELLS_PER_AXIS",
     "EmissionTable",
     "EmittingBox",
-    "LinePoint",
-    "Look",
+    "RayPoint",
+    "RayDensity",
     "tabulate_emission",
 ]
 
@@ -58,7 +58,7 @@ class EmissionSampling:
     def __init__(self, media: SceneMedia, table: EmissionTable) -> None:
         self.media, self.table = media, table
 
-    def weigh_met(self, last: mi.Interaction3f, rival: mi.Float, d: mi.Vector3f, active: mi.Bool) -> mi.Float:
+    def weigh_path(self, last: mi.Interaction3f, rival: mi.Float, d: mi.Vector3f, active: mi.Bool) -> mi.Float:
         """The weight of the light of media on a path's segment.
 
         Args:
@@ -68,9 +68,9 @@ class EmissionSampling:
             active: lanes asked about.
         """
         on = active & (rival > 0)
-        return dr.select(on, power_heuristic(rival, self.table.look(last.p, d, on).pdf), 1)
+        return dr.select(on, power_heuristic(rival, self.table.integrate_density(last.p, d, on).pdf), 1)
 
-    def at_vertex(
+    def estimate_at_vertex(
         self,
         vertex: Vertex,
         carried: mi.Spectrum,
@@ -94,17 +94,19 @@ class EmissionSampling:
         media, it = self.media, vertex.interaction
         u, rng = samples
         rng, (*place, along, chance) = draw_pcg32(rng, 5)
-        d = dr.normalize(self.table.draw_place(u, place) - it.p)
-        line = self.table.draw_along(it.p, d, along, active)
+        d = dr.normalize(self.table.sample_point(u, place) - it.p)
+        line = self.table.sample_along(it.p, d, along, active)
         f = dr.detach(vertex.eval(d, active))
         on = active & (line.pdf > 0) & (line.density > 0) & dr.any(f != 0)
         weight = power_heuristic(line.pdf, vertex.pdf(d, on)) / dr.select(on, line.pdf * line.density, 1)
         # -- The light that arrives from there ----------------------------------------------------------------------------
         start, medium = vertex.leave(it.p + d * line.t)
         ray = FineRay.leaving(start, d, it, dr.select(on, line.t, 0))
-        end, _, light = light_through(media, ray, medium, on, rng if estimates else None)
+        end, _, light = find_transmittance(media, ray, medium, on, rng if estimates else None)
         on &= ~end.si.is_valid()
-        inside = [(box.body, on & (line.box == k) & _holds(box, ray, end.medium)) for k, box in enumerate(self.table.boxes)]
+        inside = [
+            (box.body, on & (line.box == k) & _contains_end(box, ray, end.medium)) for k, box in enumerate(self.table.boxes)
+        ]
         point = EmittingPoint(RaySegment(ray, medium, ray.maxt, True), inside, on, chance)
         front, emitted = carried * light * weight, mi.Spectrum(0)
         with dr.resume_grad(when=attached):
@@ -114,7 +116,7 @@ class EmissionSampling:
         return EmissionLight(media, point, value, front * f)
 
 
-def _holds(box: EmittingBox, ray: Ray, medium: mi.MediumPtr) -> mi.Bool:
+def _contains_end(box: EmittingBox, ray: Ray, medium: mi.MediumPtr) -> mi.Bool:
     """Whether the end of a ray lies in a medium; ``medium`` is the one that was traced to there."""
     if box.body.box is None:
         return medium == mi.MediumPtr(box.body.view.medium)
@@ -187,13 +189,13 @@ class EmissionLight(TrackedTerm):
         return found
 
 
-CELLS = 16
+CELLS_PER_AXIS = 16
 """Cells along each axis of a box."""
 
-POINTS = 2
+POINTS_PER_AXIS = 2
 """Points along each axis of a cell at which emission is looked at."""
 
-EVEN = 0.1
+UNIFORM_SHARE = 0.1
 """Share of the points that is drawn evenly from all boxes."""
 
 
@@ -207,25 +209,25 @@ class EmittingBox:
     @cached_property
     def rows(self) -> list[list[mi.Float64]]:
         """The map from the world to cells."""
-        return [[CELLS * v for v in row] for row in self.box.rows()]
+        return [[CELLS_PER_AXIS * v for v in row] for row in self.box.rows()]
 
     @cached_property
     def to_world(self) -> list[list[mi.Float]]:
         """The map from cells to the world."""
-        scaled = self.box.to_world @ np.diag([1 / CELLS] * 3 + [1])
+        scaled = self.box.to_world @ np.diag([1 / CELLS_PER_AXIS] * 3 + [1])
         return [[dr.opaque(mi.Float, float(v)) for v in row] for row in scaled[:3]]
 
     @property
     def cell_volume(self) -> float:
         """Volume of a cell [length^3]."""
-        return abs(float(np.linalg.det(self.box.to_world[:3, :3]))) / CELLS**3
+        return abs(float(np.linalg.det(self.box.to_world[:3, :3]))) / CELLS_PER_AXIS**3
 
     def holds(self, p: mi.Point3f) -> mi.Bool:
         """Whether a point lies in the medium, as far as that is known without tracing: its boundary is a box."""
         if self.body.box is None:
             return dr.full(mi.Bool, True, dr.width(p))
-        hole = mi.Bool(False) if self.body.hole is None else _lies_in(self.body.hole_rows, p)
-        return _lies_in(self.body.rows, p) & ~hole
+        hole = mi.Bool(False) if self.body.hole is None else _is_in_box(self.body.hole_rows, p)
+        return _is_in_box(self.body.rows, p) & ~hole
 
     def place(self, cell: mi.Point3f) -> mi.Point3f:
         """A point of the world by its place among the cells."""
@@ -233,7 +235,7 @@ class EmittingBox:
 
 
 @dataclass
-class Look:
+class RayDensity:
     """What the table says of a ray.
 
     Attributes:
@@ -246,7 +248,7 @@ class Look:
 
 
 @dataclass
-class LinePoint:
+class RayPoint:
     """A point that is drawn from a ray through the boxes.
 
     Attributes:
@@ -276,28 +278,30 @@ class EmissionTable:
     density: mi.Float
     cumulative: mi.Float
 
-    def draw_place(self, u: mi.Float, inside: list[mi.Float]) -> mi.Point3f:
+    def sample_point(self, u: mi.Float, inside: list[mi.Float]) -> mi.Point3f:
         """Draw a point of the world: its cell by ``u``, its place in that by three numbers; all in [0, 1)."""
-        n = len(self.boxes) * CELLS**3
+        n = len(self.boxes) * CELLS_PER_AXIS**3
         index = dr.binary_search(0, n - 1, lambda i: dr.gather(mi.Float, self.cumulative, i) <= u)
-        k = index % CELLS**3
-        cell = mi.Point3f(k % CELLS, k // CELLS % CELLS, k // CELLS**2) + mi.Point3f(*inside)
+        k = index % CELLS_PER_AXIS**3
+        cell = mi.Point3f(k % CELLS_PER_AXIS, k // CELLS_PER_AXIS % CELLS_PER_AXIS, k // CELLS_PER_AXIS**2) + mi.Point3f(
+            *inside
+        )
         p = mi.Point3f(0)
         for number, box in enumerate(self.boxes):
-            p = dr.select(index // CELLS**3 == number, box.place(cell), p)
+            p = dr.select(index // CELLS_PER_AXIS**3 == number, box.place(cell), p)
         return p
 
-    def look(self, o: mi.Point3f, d: mi.Vector3f, active: mi.Bool) -> Look:
+    def integrate_density(self, o: mi.Point3f, d: mi.Vector3f, active: mi.Bool) -> RayDensity:
         """What a ray without end passes."""
 
         def visit(state: tuple, k: mi.UInt32, t0: mi.Float, t1: mi.Float, on: mi.Bool) -> tuple:
             pdf, light = state
             own = dr.select(on, dr.gather(mi.Float, self.density, k, on), 0)
-            return pdf + own * _solid_angle(t0, t1), light + own * (t1 - t0)
+            return pdf + own * _integrate_square(t0, t1), light + own * (t1 - t0)
 
-        return Look(*self._walk(mi.Ray3f(o, d), visit, (mi.Float(0), mi.Float(0)), active))
+        return RayDensity(*self._walk(mi.Ray3f(o, d), visit, (mi.Float(0), mi.Float(0)), active))
 
-    def draw_along(self, o: mi.Point3f, d: mi.Vector3f, u: mi.Float, active: mi.Bool) -> LinePoint:
+    def sample_along(self, o: mi.Point3f, d: mi.Vector3f, u: mi.Float, active: mi.Bool) -> RayPoint:
         """Draw a point of a ray, by a number in [0, 1) that serves all cells (weighted reservoir sampling, Chao 1982)."""
 
         def visit(state: tuple, k: mi.UInt32, t0: mi.Float, t1: mi.Float, on: mi.Bool) -> tuple:
@@ -310,28 +314,28 @@ class EmissionTable:
             # Given the outcome, the number is uniform in [0, share) or in [share, 1), and is stretched to [0, 1) again.
             u = dr.select(keep, u / dr.select(share > 0, share, 1), (u - share) / dr.select(share < 1, 1 - share, 1))
             begin, length = dr.select(keep, t0, begin), dr.select(keep, t1 - t0, length)
-            density, box = dr.select(keep, own, density), dr.select(keep, k // CELLS**3, box)
-            return pdf + own * _solid_angle(t0, t1), total, begin, length, density, box, u
+            density, box = dr.select(keep, own, density), dr.select(keep, k // CELLS_PER_AXIS**3, box)
+            return pdf + own * _integrate_square(t0, t1), total, begin, length, density, box, u
 
         zero = mi.Float(0)
         start = (zero, zero, zero, zero, zero, mi.UInt32(0), u + zero)
         pdf, total, begin, length, density, box, u = self._walk(mi.Ray3f(o, d), visit, start, active)
         density = dr.select(total > 0, density / dr.select(total > 0, total, 1), 0)
-        return LinePoint(pdf, dr.fma(u, length, begin), density, box)
+        return RayPoint(pdf, dr.fma(u, length, begin), density, box)
 
     def _walk(self, ray: mi.Ray3f, visit: Callable, state: Any, active: mi.Bool) -> Any:
         """Visit the cells of all boxes along a ray, by their numbers."""
         for number, box in enumerate(self.boxes):
 
             def visit_cell(state: Any, cell: mi.Vector3i, t0: mi.Float, t1: mi.Float, on: mi.Bool, first: int = number) -> Any:
-                k = mi.UInt32((cell.z * CELLS + cell.y) * CELLS + cell.x) + first * CELLS**3
+                k = mi.UInt32((cell.z * CELLS_PER_AXIS + cell.y) * CELLS_PER_AXIS + cell.x) + first * CELLS_PER_AXIS**3
                 return visit(state, k, t0, t1, on)
 
-            state = walk_box(box.rows, CELLS, ray, visit_cell, state, active)
+            state = walk_box(box.rows, CELLS_PER_AXIS, ray, visit_cell, state, active)
         return state
 
 
-def _lies_in(rows: list[list[mi.Float64]], p: mi.Point3f) -> mi.Bool:
+def _is_in_box(rows: list[list[mi.Float64]], p: mi.Point3f) -> mi.Bool:
     """Whether a point lies in the box that ``rows`` map to the unit cube."""
     inside = mi.Bool(True)
     for row in rows:
@@ -340,7 +344,7 @@ def _lies_in(rows: list[list[mi.Float64]], p: mi.Point3f) -> mi.Bool:
     return inside
 
 
-def _solid_angle(t0: mi.Float, t1: mi.Float) -> mi.Float:
+def _integrate_square(t0: mi.Float, t1: mi.Float) -> mi.Float:
     """The integral of t^2, (t1^3 - t0^3) / 3, without the difference of two large numbers."""
     return (t1 - t0) * dr.fma(t1, t1 + t0, t0 * t0) * (1 / 3)
 
@@ -352,22 +356,22 @@ def tabulate_emission(boxes: list[EmittingBox], channels: int) -> EmissionTable:
         boxes: the media, at least one.
         channels: of the scene's extinction.
     """
-    power = dr.concat([_power(box, channels) for box in boxes])
-    volume = dr.concat([dr.full(mi.Float, box.cell_volume, CELLS**3) for box in boxes])
+    power = dr.concat([_cell_power(box, channels) for box in boxes])
+    volume = dr.concat([dr.full(mi.Float, box.cell_volume, CELLS_PER_AXIS**3) for box in boxes])
     total = dr.sum(power)
     share = dr.select(total > 0, power / dr.select(total > 0, total, 1), 1 / dr.width(power))
-    share = dr.lerp(share, 1 / dr.width(power), EVEN)
+    share = dr.lerp(share, 1 / dr.width(power), UNIFORM_SHARE)
     density, cumulative = share / volume, dr.cumsum(share)
     dr.eval(density, cumulative)
     return EmissionTable(boxes, density, cumulative)
 
 
-def _power(box: EmittingBox, channels: int) -> mi.Float:
+def _cell_power(box: EmittingBox, channels: int) -> mi.Float:
     """The light that each cell emits, mean of the colours, in one direction for each point."""
-    edge = CELLS * POINTS
+    edge = CELLS_PER_AXIS * POINTS_PER_AXIS
     i = dr.arange(mi.UInt32, edge**3)
     x, y, z = i % edge, i // edge % edge, i // edge**2
-    p = box.place((mi.Point3f(x, y, z) + 0.5) * (1 / POINTS))
+    p = box.place((mi.Point3f(x, y, z) + 0.5) * (1 / POINTS_PER_AXIS))
     # Directions that change from point to point, evenly over the sphere (a spiral by the golden ratio).
     turn, height = mi.Float(i) * 0.6180339887, mi.Float(i) * 0.7548776662
     d = mi.warp.square_to_uniform_sphere(mi.Point2f(height - dr.floor(height), turn - dr.floor(turn)))
@@ -375,6 +379,10 @@ def _power(box: EmittingBox, channels: int) -> mi.Float:
     on = box.holds(p)
     light = dr.detach(eval_emission(box.body, ray, mi.Float64(0), channels, on))
     value = dr.select(on, sum(colours(light)), 0)
-    power = dr.zeros(mi.Float, CELLS**3)
-    dr.scatter_add(power, value, mi.UInt32((z // POINTS * CELLS + y // POINTS) * CELLS + x // POINTS))
+    power = dr.zeros(mi.Float, CELLS_PER_AXIS**3)
+    dr.scatter_add(
+        power,
+        value,
+        mi.UInt32((z // POINTS_PER_AXIS * CELLS_PER_AXIS + y // POINTS_PER_AXIS) * CELLS_PER_AXIS + x // POINTS_PER_AXIS),
+    )
     return power * box.cell_volume

@@ -13,18 +13,18 @@ from mivol.transport.traversal.random_numbers import Strata
 from mivol.transport.traversal.rays import Ray
 
 __all__ = [
-    "UNIFORM",
+    "UNIFORM_EMITTER",
     "ChosenEmitter",
     "SceneEmitters",
     "is_among",
     "EventSamples",
     "EquiangularSampler",
-    "equiangular_sampler",
-    "equiangular_towards",
+    "make_ball_sampler",
+    "make_equiangular_sampler",
 ]
 
 
-UNIFORM = "ConstantBackgroundEmitter"
+UNIFORM_EMITTER = "ConstantBackgroundEmitter"
 """Mitsuba's class of an environment that is the same in all directions; phase samples alone find its light."""
 
 
@@ -44,11 +44,11 @@ class SceneEmitters:
     def __init__(self, scene: mi.Scene) -> None:
         emitters = scene.emitters()
         delta = int(mi.EmitterFlags.Delta)
-        self.sampled = [e for e in emitters if e.class_name() != UNIFORM]
+        self.sampled = [e for e in emitters if e.class_name() != UNIFORM_EMITTER]
         self.transmissive = [e for e in self.sampled if _is_transmissive(e)]
         opaque = [e for e in emitters if not any(e is emitter for emitter in self.transmissive)]
         self.samples_phase = any(not int(e.flags()) & delta for e in opaque)
-        balls = [_ball(e) for e in self.sampled]
+        balls = [_find_bounding_ball(e) for e in self.sampled]
         self.is_near = any(b is not None for b in balls)
         self._balls = [None if b is None else [dr.opaque(mi.Float, v) for v in b] for b in balls]
 
@@ -56,7 +56,7 @@ class SceneEmitters:
         """Centre and radius of one of the ``sampled`` emitters; None for one at infinity."""
         return self._balls[number]
 
-    def draw_samples(self, sampler: mi.Sampler, active: mi.Bool, strata: Strata | None = None) -> EventSamples:
+    def draw_event_samples(self, sampler: mi.Sampler, active: mi.Bool, strata: Strata | None = None) -> EventSamples:
         """Draw the random numbers of one scattering event from a sampler."""
         return EventSamples(
             sampler.next_1d(active),
@@ -69,7 +69,7 @@ class SceneEmitters:
             strata,
         )
 
-    def choose(self, ray: Ray, u: mi.Float) -> ChosenEmitter:
+    def choose_emitter(self, ray: Ray, u: mi.Float) -> ChosenEmitter:
         """Choose one of the ``sampled`` emitters for each lane, with equal probabilities, by a number in [0, 1)."""
         n, width = len(self.sampled), dr.width(ray)
         index = dr.minimum(mi.UInt32(u * n), max(n - 1, 0))
@@ -82,7 +82,7 @@ class SceneEmitters:
                 x, y, z, r = ball
                 centre = dr.select(here, mi.Point3f(x, y, z), centre)
                 radius2, finite = dr.select(here, dr.square(r), radius2), here | finite
-        return ChosenEmitter(index, emitter, equiangular_towards(ray, centre, radius2, finite) if self.is_near else None)
+        return ChosenEmitter(index, emitter, make_equiangular_sampler(ray, centre, radius2, finite) if self.is_near else None)
 
 
 def _is_transmissive(emitter: mi.Emitter) -> bool:
@@ -90,7 +90,7 @@ def _is_transmissive(emitter: mi.Emitter) -> bool:
     return shape is not None and mi.has_flag(shape.bsdf().flags(), mi.BSDFFlags.Null)
 
 
-def _ball(emitter: mi.Emitter) -> list[float] | None:
+def _find_bounding_ball(emitter: mi.Emitter) -> list[float] | None:
     """Centre of an emitter's bounding box, and the root mean square distance of points in it; None for one at infinity."""
     box = emitter.get_shape().bbox() if emitter.get_shape() is not None else emitter.bbox()
     low, high = np.array(box.min, dtype=np.float64), np.array(box.max, dtype=np.float64)
@@ -146,7 +146,7 @@ class EventSamples:
     which_shadow_ray: mi.Float
     strata: Strata | None = None
 
-    def part(self, number: mi.UInt32, count: int) -> EventSamples:
+    def for_event(self, number: mi.UInt32, count: int) -> EventSamples:
         """The numbers of one of ``count`` events on a ray.
 
         They are those of the first event, shifted by an additive recurrence; directions are stratified over the events.
@@ -158,10 +158,10 @@ class EventSamples:
         part = Strata(number, across, count // across)
 
         def one(u: mi.Float) -> mi.Float:
-            return _wrap(dr.fma(k, 0.6180339887, u))
+            return _fractional_part(dr.fma(k, 0.6180339887, u))
 
         def two(u: mi.Point2f) -> mi.Point2f:
-            return mi.Point2f(_wrap(dr.fma(k, 0.7548776662, u.x)), _wrap(dr.fma(k, 0.5698402910, u.y)))
+            return mi.Point2f(_fractional_part(dr.fma(k, 0.7548776662, u.x)), _fractional_part(dr.fma(k, 0.5698402910, u.y)))
 
         moved = EventSamples(
             self.piece,
@@ -182,19 +182,19 @@ class EventSamples:
         return replace(self, emitter=emitter, direction=direction, strata=None)
 
 
-def _wrap(x: mi.Float) -> mi.Float:
+def _fractional_part(x: mi.Float) -> mi.Float:
     return x - dr.floor(x)
 
 
-def equiangular_sampler(ray: Ray, ball: list[mi.Float] | None) -> EquiangularSampler | None:
+def make_ball_sampler(ray: Ray, ball: list[mi.Float] | None) -> EquiangularSampler | None:
     """The sampler towards one emitter, a ball (x, y, z, radius); None where that is at infinity (no ball)."""
     if ball is None:
         return None
     x, y, z, r = ball
-    return equiangular_towards(ray, mi.Point3f(x, y, z), dr.square(r), mi.Bool(True))
+    return make_equiangular_sampler(ray, mi.Point3f(x, y, z), dr.square(r), mi.Bool(True))
 
 
-def equiangular_towards(ray: Ray, centre: mi.Point3f, radius2: mi.Float, finite: mi.Bool) -> EquiangularSampler:
+def make_equiangular_sampler(ray: Ray, centre: mi.Point3f, radius2: mi.Float, finite: mi.Bool) -> EquiangularSampler:
     """The sampler of rays towards a ball about ``centre``, for the lanes whose emitter is ``finite``."""
     away = centre - mi.Point3f(ray.o)
     t0 = dr.dot(away, ray.d)

@@ -29,14 +29,16 @@ from mivol.transport.traversal.interpolation import GAUSS, gauss_points
 from mivol.transport.traversal.lattice import Lattice, Segment, clip
 from mivol.transport.traversal.rays import Ray, distance_along, point_along, spawn_ray, traced
 
-__all__ = ["follow_emitter", "shadow_of_moving", "tau_by_end"]
+__all__ = ["attach_position", "moving_transmittance", "optical_depth_gradient"]
 
 
-ASIDE = 1e-5
+SIDE_STEP = 1e-5
 """How far before and behind a surface the extinction is read, as a fraction of the distance: ten times the rounding of it."""
 
 
-def tau_by_end(media: SceneMedia, ray_segment: RaySegment, tau: list[mi.Float], active: mi.Bool) -> list[mi.Vector3f]:
+def optical_depth_gradient(
+    media: SceneMedia, ray_segment: RaySegment, tau: list[mi.Float], active: mi.Bool
+) -> list[mi.Vector3f]:
     """Derivative of the optical depth of a shadow ray with respect to its far end.
 
     Args:
@@ -56,7 +58,7 @@ def tau_by_end(media: SceneMedia, ray_segment: RaySegment, tau: list[mi.Float], 
         body, t0, t1, on = interval.body, interval.t0, interval.t1, interval.active
         scale = dr.detach(body.view.scale) * body.area(d)
         for part in body.view.parts:
-            rows = media.vectors([scale * v for v in _by_part(body, part, ray_segment, t0, t1, on)])
+            rows = media.vectors([scale * v for v in _part_gradient(body, part, ray_segment, t0, t1, on)])
             total = [a + b for a, b in zip(total, rows, strict=True)]
         if body.view.microflakes is None:
             return total
@@ -68,11 +70,11 @@ def tau_by_end(media: SceneMedia, ray_segment: RaySegment, tau: list[mi.Float], 
     zero = [mi.Vector3f(0) for _ in range(media.channels)]
     turned = revisit_media(media, ray_segment, visit, zero, active)
     if media.traced:
-        turned = [a + b for a, b in zip(turned, _steps(media, ray_segment, active), strict=True)]
+        turned = [a + b for a, b in zip(turned, _boundary_gradient(media, ray_segment, active), strict=True)]
     return [dr.select(active, (d * t + v) / length, 0) for t, v in zip(tau, turned, strict=True)]
 
 
-def shadow_of_moving(
+def moving_transmittance(
     media: SceneMedia, ray_segment: RaySegment, tau: list[mi.Float], end: mi.Point3f, active: mi.Bool
 ) -> mi.Spectrum:
     """A factor of value 1 that carries the derivative of a shadow ray's transmittance by the place of its end.
@@ -81,12 +83,12 @@ def shadow_of_moving(
     """
     moved = end - dr.detach(end)
     with dr.suspend_grad():
-        slopes = tau_by_end(media, ray_segment, tau, active)
+        slopes = optical_depth_gradient(media, ray_segment, tau, active)
     return spectrum([1 - dr.dot(s, moved) for s in slopes])
 
 
 @dr.syntax
-def _steps(media: SceneMedia, ray_segment: RaySegment, active: mi.Bool) -> list[mi.Vector3f]:
+def _boundary_gradient(media: SceneMedia, ray_segment: RaySegment, active: mi.Bool) -> list[mi.Vector3f]:
     """L times the term of the derivative from boundaries that are traced, one vector a channel."""
     # -- State ------------------------------------------------------------------------------------------------------------
     ray = ray_segment.ray
@@ -99,18 +101,18 @@ def _steps(media: SceneMedia, ray_segment: RaySegment, active: mi.Bool) -> list[
         t = distance_along(ray, hit)
         going &= hit.is_valid() & (t < ray_segment.length * OWN_SURFACE)
         crosses = going & hit.is_medium_transition()
-        total = _add_step(total, media, ray, hit, t, crosses)
+        total = _add_boundary(total, media, ray, hit, t, crosses)
         onward = spawn_ray(hit, ray.d, media.size)
     return total
 
 
-def _add_step(
+def _add_boundary(
     total: list[mi.Vector3f], media: SceneMedia, ray: Ray, hit: mi.SurfaceInteraction3f, t: mi.Float, crosses: mi.Bool
 ) -> list[mi.Vector3f]:
     """Add the term of one boundary, from the extinctions a little before and a little behind it."""
     slope = dr.dot(hit.n, ray.d)
     face = mi.Vector3f(hit.n) * dr.rcp(dr.select(slope != 0, slope, 1))
-    for side, to, sign in ((-ray.d, 1 - ASIDE, -1.0), (ray.d, 1 + ASIDE, 1.0)):
+    for side, to, sign in ((-ray.d, 1 - SIDE_STEP, -1.0), (ray.d, 1 + SIDE_STEP, 1.0)):
         medium = hit.target_medium(side)
         for body in media.traced:
             # Where the ray grazes the surface (slope 0), both sides are in the same medium and the two terms cancel.
@@ -120,7 +122,7 @@ def _add_step(
     return total
 
 
-def _by_part(
+def _part_gradient(
     body: Body, part: ExactExtinction, ray_segment: RaySegment, t0: mi.Float64, t1: mi.Float64, on: mi.Bool
 ) -> list[mi.Vector3f]:
     """L times the derivative of one part's optical depth without the first term; one vector a channel."""
@@ -128,33 +130,33 @@ def _by_part(
     if part.is_constant:
         value = dr.detach(part.constant)
         each = [value] if part.channels == 1 else [value.x, value.y, value.z]
-        leaving = _face(body.rows, (0.0,) * 3, (1.0,) * 3, ray, t1) if body.box is not None else mi.Vector3f(0)
-        entering = _face(body.rows, (0.0,) * 3, (1.0,) * 3, ray, t0) if body.box is not None else mi.Vector3f(0)
+        leaving = _face_direction(body.rows, (0.0,) * 3, (1.0,) * 3, ray, t1) if body.box is not None else mi.Vector3f(0)
+        entering = _face_direction(body.rows, (0.0,) * 3, (1.0,) * 3, ray, t0) if body.box is not None else mi.Vector3f(0)
         shift = dr.select(on & (t0 > 0), entering * mi.Float(t0), 0) - dr.select(on & (t1 < end), leaving * mi.Float(t1), 0)
         return [v * shift for v in each]
     lattice = replace(part.lattice, empty_distances=None)
     segment = clip(lattice, ray.o, ray.d, t0, t1)
     a, b = mi.Float64(segment.t0), mi.Float64(segment.t0) + mi.Float64(segment.length)
     inside = on & (segment.length > 0)
-    vectors = _turn(lattice, part, segment, inside)
+    vectors = _rotation_gradient(lattice, part, segment, inside)
     high = tuple(n - 0.5 for n in lattice.res[::-1])
     leaves, enters = b < end * (1 - 1e-6), a > 0
     if body.box is None:
         # A traced boundary that cuts the grid has terms of its own; of the grid's faces only those inside it count.
-        leaves, enters = leaves & (b < t1 * (1 - 2 * ASIDE)), enters & (a > t0 * (1 + 2 * ASIDE))
+        leaves, enters = leaves & (b < t1 * (1 - 2 * SIDE_STEP)), enters & (a > t0 * (1 + 2 * SIDE_STEP))
     for t, sign, moves in ((b, -1.0, leaves), (a, 1.0, enters)):
         here = inside & moves
-        face = _face(lattice.from_world, (-0.5,) * 3, high, ray, t)
+        face = _face_direction(lattice.from_world, (-0.5,) * 3, high, ray, t)
         if body.cuts_grids:
             # The ray leaves (or enters) the medium through a face of its boundary where the boundary cuts the grid.
             cut = dr.abs(t - (t1 if sign < 0 else t0)) <= 1e-6 * dr.abs(t)
-            face = dr.select(cut, _face(body.rows, (0.0,) * 3, (1.0,) * 3, ray, t), face)
+            face = dr.select(cut, _face_direction(body.rows, (0.0,) * 3, (1.0,) * 3, ray, t), face)
         values = part.eval_at(1.0, ray, mi.Float(t), here)
         vectors = [v + dr.select(here, sign * mi.Float(t) * s * face, 0) for v, s in zip(vectors, values, strict=True)]
     return vectors
 
 
-def _turn(lattice: Lattice, part: ExactExtinction, segment: Segment, active: mi.Bool) -> list[mi.Vector3f]:
+def _rotation_gradient(lattice: Lattice, part: ExactExtinction, segment: Segment, active: mi.Bool) -> list[mi.Vector3f]:
     """The integral of t grad(sigma) over a grid, one world vector a channel."""
     values = dr.detach(part.lattice.values.array)
 
@@ -162,7 +164,7 @@ def _turn(lattice: Lattice, part: ExactExtinction, segment: Segment, active: mi.
         half = dr.select(on, 0.5 * cell.dt, 0)
         for u, p in zip((GAUSS, 1 - GAUSS), gauss_points(cell), strict=True):
             t = segment.t0 + cell.s + u * cell.dt
-            slopes = [dr.select(cell.ahead, g, -g) for g in (_slope(c, p) for c in cell.corners[0])]
+            slopes = [dr.select(cell.ahead, g, -g) for g in (_trilinear_gradient(c, p) for c in cell.corners[0])]
             total = [v + (half * t) * g for v, g in zip(total, slopes, strict=True)]
         return total
 
@@ -172,7 +174,7 @@ def _turn(lattice: Lattice, part: ExactExtinction, segment: Segment, active: mi.
     return [mi.Vector3f(*(sum(rows[a][k] * g[a] for a in range(3)) for k in range(3))) for g in found]
 
 
-def _slope(c: list[mi.Float], p: mi.Vector3f) -> mi.Vector3f:
+def _trilinear_gradient(c: list[mi.Float], p: mi.Vector3f) -> mi.Vector3f:
     """The gradient of the trilinear function of 8 corners at a point, in cells."""
 
     def mix(a: mi.Float, b: mi.Float, t: mi.Float) -> mi.Float:
@@ -185,7 +187,7 @@ def _slope(c: list[mi.Float], p: mi.Vector3f) -> mi.Vector3f:
     return mi.Vector3f(dx, dy, dz)
 
 
-def _face(rows: list, low: tuple, high: tuple, ray: Ray, t: mi.Float64) -> mi.Vector3f:
+def _face_direction(rows: list, low: tuple, high: tuple, ray: Ray, t: mi.Float64) -> mi.Vector3f:
     """n / (n . w) of the face of a box on which a point of a ray lies."""
     best, normal = mi.Float64(dr.inf), mi.Vector3f(0)
     p = point_along(ray, t)
@@ -200,7 +202,7 @@ def _face(rows: list, low: tuple, high: tuple, ray: Ray, t: mi.Float64) -> mi.Ve
     return normal
 
 
-def follow_emitter(placed: mi.DirectionSample3f, direct: mi.DirectionSample3f) -> mi.DirectionSample3f:
+def attach_position(placed: mi.DirectionSample3f, direct: mi.DirectionSample3f) -> mi.DirectionSample3f:
     """A sample of an emitter of one position or direction, with its derivative by that; other samples stay as they are.
 
     Args:

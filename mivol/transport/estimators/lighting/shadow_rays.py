@@ -28,19 +28,19 @@ from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.traversal.random_numbers import draw_pcg32
 from mivol.transport.traversal.rays import FineRay, Ray
 
-__all__ = ["DARK", "SURE_DEPTH", "estimate_transmittance", "light_through", "shadow_ray"]
+__all__ = ["NEGLIGIBLE_TAU", "ROULETTE_TAU", "estimate_transmittance", "find_transmittance", "trace_shadow_ray"]
 
 
-DARK = 30.0
+NEGLIGIBLE_TAU = 30.0
 """Optical depth beyond which light is neglected: 1e-13 of it is below the rounding of everything that it is added to."""
 
 
-SURE_DEPTH = 1.0
+ROULETTE_TAU = 1.0
 """Optical depth up to which roulette lets all shadow rays go on (measured, variance x time of paths of 6 to any number of
 scatterings in cloud and smoke: 1.02 to 1.2 times less than without roulette; 2 and 4 gain less)."""
 
 
-def light_through(
+def find_transmittance(
     media: SceneMedia, ray: Ray, medium: mi.MediumPtr, active: mi.Bool, rng: mi.UInt32 | None = None
 ) -> tuple[SegmentEnd, list[mi.Float] | None, mi.Spectrum]:
     """Follow a ray to the first opaque surface, and find its transmittance.
@@ -55,18 +55,18 @@ def light_through(
 
     Returns:
         Where the ray ends; its optical depth [1] for each channel, or None where tracking estimated the transmittance; and the
-        transmittance of media and surfaces. Where that is 0 the optical depth may be too small, but not below ``SURE_DEPTH``.
+        transmittance of media and surfaces. Where that is 0 the optical depth may be too small, but not below ``ROULETTE_TAU``.
     """
     if rng is not None and media.tracks_shadows:
         end, T = estimate_transmittance(media, ray, medium, active, rng, passes_null=True)
         return end, None, T * end.null_transmission
-    enough = DARK if rng is None else SURE_DEPTH - dr.log(draw_pcg32(rng, 1)[1][0])
+    enough = NEGLIGIBLE_TAU if rng is None else ROULETTE_TAU - dr.log(draw_pcg32(rng, 1)[1][0])
     end, tau = integrate_optical_depth(media, ray, medium, active, enough, passes_null=True)
     if rng is None:
         return end, tau, transmittance(tau) * end.null_transmission
     # Every channel is divided by the probability of the clearest one, so that weights stay below 1.
     clearest = least_of(tau)
-    thicker = [t - dr.maximum(clearest - SURE_DEPTH, 0) for t in tau]
+    thicker = [t - dr.maximum(clearest - ROULETTE_TAU, 0) for t in tau]
     return end, tau, dr.select(clearest <= enough, transmittance(thicker), 0) * end.null_transmission
 
 
@@ -75,28 +75,28 @@ def estimate_transmittance(
 ) -> tuple[SegmentEnd, mi.Spectrum]:
     """Where a ray ends, and an unbiased estimate of the share of light that its media let through; ``rng`` draws it."""
     start = ([mi.Float(1) for _ in range(media.channels)], rng)
-    end, (T, _) = visit_media(media, ray, medium, _dim, start, active, passes_null)
+    end, (T, _) = visit_media(media, ray, medium, _multiply_transmittance, start, active, passes_null)
     return end, spectrum(T)
 
 
-def _dim(state: tuple, interval: MediumInterval) -> tuple:
+def _multiply_transmittance(state: tuple, interval: MediumInterval) -> tuple:
     """The visitor that multiplies the transmittances of media along a ray."""
     T, rng = state
-    own, rng = _estimate_transmittance(interval, len(T), rng)
+    own, rng = _estimate_medium_transmittance(interval, len(T), rng)
     return [a * b for a, b in zip(T, own, strict=True)], rng
 
 
-def _estimate_transmittance(interval: MediumInterval, channels: int, rng: mi.UInt32) -> tuple[list[mi.Float], mi.UInt32]:
+def _estimate_medium_transmittance(interval: MediumInterval, channels: int, rng: mi.UInt32) -> tuple[list[mi.Float], mi.UInt32]:
     """Transmittance [1] of one medium for each channel, and the next state of the generator.
 
     It is estimated by ratio tracking in bounded parts, by residual ratio tracking in grids whose block ranges are known, and
-    exact in all other parts, which are walked to the optical depth ``DARK``.
+    exact in all other parts, which are walked to the optical depth ``NEGLIGIBLE_TAU``.
     """
     body = interval.body
     known = (p for p in body.exact_parts if p.lattice is not None and p.lattice.block_ranges is not None)
     tracked = list(known) if body.estimates_shadows else []
     others = [p for p in body.exact_parts if not any(p is q for q in tracked)]
-    T = [dr.exp(-t) for t in body.optical_depth(interval, channels, others, DARK)]
+    T = [dr.exp(-t) for t in body.optical_depth(interval, channels, others, NEGLIGIBLE_TAU)]
     scale = dr.detach(body.view.scale) * body.area(interval.ray.d)
     for part in tracked:
         segment = clip_interval(part.lattice, interval)
@@ -108,7 +108,7 @@ def _estimate_transmittance(interval: MediumInterval, channels: int, rng: mi.UIn
     return T, rng
 
 
-def shadow_ray(
+def trace_shadow_ray(
     media: SceneMedia,
     start: mi.Point3d,
     medium: mi.MediumPtr,
@@ -123,11 +123,11 @@ def shadow_ray(
         start: where the ray begins.
         medium: the medium around that point.
         direct: Mitsuba's sample of the emitter.
-        active, rng: as in :func:`light_through`.
+        active, rng: as in :func:`find_transmittance`.
 
     Returns:
         The shadow ray, whether no opaque surface blocks it, and its optical depth and transmittance as in
-        :func:`light_through`.
+        :func:`find_transmittance`.
     """
     u = None
     if rng is not None and media.is_bounded:
@@ -135,6 +135,6 @@ def shadow_ray(
     away = direct.p - mi.Point3f(start)
     length = dr.norm(away)
     ray = FineRay.leaving(start, dr.normalize(away), direct, length)
-    stop, tau, light = light_through(media, ray, medium, active, rng)
+    stop, tau, light = find_transmittance(media, ray, medium, active, rng)
     clear = ~(stop.si.is_valid() & (stop.t < length * OWN_SURFACE))
     return RaySegment(ray, medium, length, True, u), clear, tau, light

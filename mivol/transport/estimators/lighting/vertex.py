@@ -16,7 +16,7 @@ from mivol.phase.turn import INV_FOUR_PI
 from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.traversal.rays import spawn_ray
 
-__all__ = ["EitherVertex", "MediumVertex", "SurfaceVertex", "Vertex", "phase_pdf", "sample_phase"]
+__all__ = ["MixedVertex", "MediumVertex", "SurfaceVertex", "Vertex", "phase_pdf", "sample_phase"]
 
 
 class Vertex(Protocol):
@@ -96,7 +96,7 @@ class MediumVertex:
 
 
 @dataclass
-class EitherVertex:
+class MixedVertex:
     """A point of a medium in some lanes, of a surface in the others: one shadow ray serves both.
 
     Attributes:

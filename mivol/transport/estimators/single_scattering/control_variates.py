@@ -26,9 +26,9 @@ import mitsuba as mi
 import numpy as np
 
 from mivol.transport.estimators.lighting.direct_lighting import DirectLighting, DirectSample
-from mivol.transport.estimators.lighting.emitters import UNIFORM, EventSamples
+from mivol.transport.estimators.lighting.emitters import UNIFORM_EMITTER, EventSamples
 from mivol.transport.estimators.lighting.vertex import MediumVertex
-from mivol.transport.estimators.single_scattering.distance_sampling import taken_light
+from mivol.transport.estimators.single_scattering.distance_sampling import extinguished_light
 from mivol.transport.media.body import Body, eval_albedo
 from mivol.transport.media.ray_intervals import MediumInterval, RaySegment, find_boxed_intervals
 from mivol.transport.media.scene_media import SceneMedia
@@ -41,25 +41,25 @@ __all__ = [
     "CameraOrigins",
     "GridControl",
     "build_grid_control",
-    "nodes_along",
-    "takes_grid_control",
+    "count_nodes",
+    "supports_grid_control",
     "find_constant_control",
     "ControlSweep",
-    "Probe",
-    "Tracks",
+    "ProbeDifference",
+    "SweepSums",
 ]
 
 
-STEP = 8
+CELLS_PER_NODE = 8
 """Cells between the nodes of the coarse lattice."""
 
-MOST = 33
+MAX_NODES = 33
 """Largest number of nodes along an axis."""
 
 DIRECTIONS = 32
 """Directions at each node of the coarse lattice."""
 
-CAP = 4.0
+MAX_BRIGHTNESS = 4.0
 """Largest S as a multiple of its mean: near an emitter the true source function varies strongly within one cell of the grid,
 and S is interpolated over ``STEP`` cells."""
 
@@ -119,7 +119,7 @@ class GridControl:
         return S * 3 if self.channels == 1 and not mi.is_monochromatic else S
 
 
-def takes_grid_control(media: SceneMedia) -> bool:
+def supports_grid_control(media: SceneMedia) -> bool:
     """Whether the media can have a grid control: a single medium in a box, one grid of extinction, and an albedo."""
     parts = [p for b in media.bodies for p in b.view.parts]
     alone = len(parts) == 1 and not media.traced and parts[0].lattice is not None
@@ -137,8 +137,8 @@ def build_grid_control(direct: DirectLighting, body: Body, origins: CameraOrigin
     Cost: 64 shadow rays for 512 cells at most, and 8 look-ups a cell.
     """
     lattice = body.view.parts[0].lattice
-    nodes = [nodes_along(n) for n in lattice.res]
-    coarse = _light_of_nodes(direct, body, origins, lattice, nodes)
+    nodes = [count_nodes(n) for n in lattice.res]
+    coarse = _estimate_node_light(direct, body, origins, lattice, nodes)
     z, y, x = (r + 1 for r in lattice.res)
     index = dr.arange(mi.UInt32, z * y * x)
     cell = [index // (y * x), (index // x) % y, index % x]
@@ -150,7 +150,7 @@ def build_grid_control(direct: DirectLighting, body: Body, origins: CameraOrigin
     rows = [interpolate([dr.gather(mi.Float, c, k) for k in corner], frac) for c in coarse]
     if isinstance(body.view.albedo, mi.Volume):
         u = mi.Vector3f(*(mi.Float(c) / m for c, m in zip(cell[::-1], lattice.res[::-1], strict=True)))
-        albedo = eval_albedo(body, _at(lattice.place(u), mi.Vector3f(0, 0, 1)), mi.Bool(True))
+        albedo = eval_albedo(body, _interaction_at(lattice.place(u), mi.Vector3f(0, 0, 1)), mi.Bool(True))
     else:
         albedo = eval_albedo(body, dr.zeros(mi.MediumInteraction3f), mi.Bool(True))
     rows = _merge_equal([row * dr.detach(albedo[c]) for c, row in enumerate(rows)])
@@ -162,13 +162,13 @@ def build_grid_control(direct: DirectLighting, body: Body, origins: CameraOrigin
     return GridControl(values, lattice.res, n)
 
 
-def nodes_along(voxels: int) -> int:
+def count_nodes(voxels: int) -> int:
     """Nodes of the coarse lattice along an axis: one every ``STEP`` cells, from face to face, but no more than ``MOST``."""
     cells = voxels + 1
-    return min(-(-cells // STEP) + 1, MOST)
+    return min(-(-cells // CELLS_PER_NODE) + 1, MAX_NODES)
 
 
-def _light_of_nodes(
+def _estimate_node_light(
     direct: DirectLighting, body: Body, origins: CameraOrigins, lattice: Lattice, nodes: list[int]
 ) -> list[mi.Float]:
     """In-scattered radiance L_s at the nodes of the coarse lattice, towards the camera, one array a channel."""
@@ -178,31 +178,31 @@ def _light_of_nodes(
     at = [node % x, (node // x) % y, node // (x * y)]
     u = mi.Vector3f(*(mi.Float(a) / (k - 1) for a, k in zip(at, (x, y, z), strict=True)))
     p = lattice.place(u)
-    mei = _at(p, origins.towards(p))
+    mei = _interaction_at(p, origins.towards(p))
     mei.medium = dr.select(dr.full(mi.Bool, True, dr.width(lane)), mi.MediumPtr(body.view.medium), None)
     # A rank-1 lattice over the directions of a node, with a shift (Cranley-Patterson rotation) that depends on the node's
     # number.
-    shift = [_fraction(mi.Float(node) * k) for k in (0.7548776, 0.5698403, 0.3819660)]
-    first, second = (turn + 0.5) / DIRECTIONS, _fraction(turn * 0.6180340)
-    flat = mi.Point2f(_fraction(first + shift[0]), _fraction(second + shift[1]))
-    which, component = _fraction(turn * 0.7548776 + shift[2]), _fraction(turn * 0.5698403)
+    shift = [_fractional_part(mi.Float(node) * k) for k in (0.7548776, 0.5698403, 0.3819660)]
+    first, second = (turn + 0.5) / DIRECTIONS, _fractional_part(turn * 0.6180340)
+    flat = mi.Point2f(_fractional_part(first + shift[0]), _fractional_part(second + shift[1]))
+    which, component = _fractional_part(turn * 0.7548776 + shift[2]), _fractional_part(turn * 0.5698403)
     samples = EventSamples(mi.Float(0), mi.Point2f(0), which, flat, component, flat, mi.Float(0))
     ray = mi.Ray3f(p, -mei.wi, dr.inf, mi.Float(0), mi.Color0f())
-    chosen = direct.emitters.choose(ray, samples.which_emitter)
+    chosen = direct.emitters.choose_emitter(ray, samples.which_emitter)
     everywhere = dr.full(mi.Bool, True, dr.width(lane))
-    found = direct.in_medium(MediumVertex(direct.media, mei, mi.Point3d(mei.p)), chosen, samples, False, everywhere)
+    found = direct.estimate_in_medium(MediumVertex(direct.media, mei, mi.Point3d(mei.p)), chosen, samples, False, everywhere)
     apart = max(float(np.linalg.norm(lattice.to_world[:3, a])) / (k - 1) for a, k in enumerate((x, y, z)))
-    light = sum((_spread(a, apart) for a in found), mi.Spectrum(0))
+    light = sum((_limit_near_light(a, apart) for a in found), mi.Spectrum(0))
     dr.eval(light)
     rows = []
     for c in range(dr.size_v(light)):
         mean = dr.block_sum(light[c], DIRECTIONS) / DIRECTIONS
-        rows.append(dr.minimum(mean, CAP * dr.mean(mean)))
+        rows.append(dr.minimum(mean, MAX_BRIGHTNESS * dr.mean(mean)))
     dr.eval(rows)
     return rows
 
 
-def _spread(sample: DirectSample, apart: float) -> mi.Spectrum:
+def _limit_near_light(sample: DirectSample, apart: float) -> mi.Spectrum:
     """The value of a direct sample at a node, which stands for all points within the distance ``apart`` of it.
 
     An emitter that is nearer than ``apart`` counts as if it were that far away; one at the node itself, whose light is
@@ -219,11 +219,11 @@ def _merge_equal(rows: list[mi.Float]) -> list[mi.Float]:
     return rows[:1]
 
 
-def _fraction(x: mi.Float) -> mi.Float:
+def _fractional_part(x: mi.Float) -> mi.Float:
     return x - dr.floor(x)
 
 
-def _at(p: mi.Point3f, direction: mi.Vector3f) -> mi.MediumInteraction3f:
+def _interaction_at(p: mi.Point3f, direction: mi.Vector3f) -> mi.MediumInteraction3f:
     mei = dr.zeros(mi.MediumInteraction3f, dr.width(p))
     mei.p, mei.wi = p, -direction
     mei.sh_frame = mi.Frame3f(mei.wi)
@@ -239,15 +239,15 @@ def find_constant_control(media: SceneMedia) -> mi.Spectrum | None:
     Returns:
         S; None where there is no constant sky, or a medium has no albedo (but a ``sigma_s``).
     """
-    skies = [e for e in media.scene.emitters() if e.class_name() == UNIFORM]
+    skies = [e for e in media.scene.emitters() if e.class_name() == UNIFORM_EMITTER]
     albedos = [a for body in media.bodies for a in body.view.albedo_arrays]
     if not skies or any(body.view.albedo is None for body in media.bodies):
         return None
-    mean = sum(_mean_of(a) for a in albedos) / len(albedos)
+    mean = sum(_mean_albedo(a) for a in albedos) / len(albedos)
     return mean * dr.detach(skies[0].eval(dr.zeros(mi.SurfaceInteraction3f)))
 
 
-def _mean_of(albedo: mi.TensorXf | mi.Float | mi.Color3f) -> mi.Spectrum:
+def _mean_albedo(albedo: mi.TensorXf | mi.Float | mi.Color3f) -> mi.Spectrum:
     """Mean over space of an albedo, or of its volume."""
     flat = dr.ravel(dr.detach(albedo))
     n = albedo.shape[-1] if dr.is_tensor_v(albedo) else dr.width(flat)
@@ -257,7 +257,7 @@ def _mean_of(albedo: mi.TensorXf | mi.Float | mi.Color3f) -> mi.Spectrum:
 
 
 @dataclass
-class Probe:
+class ProbeDifference:
     """What a probe estimates of the difference between the true source function and S.
 
     Attributes:
@@ -276,7 +276,7 @@ class Probe:
 
 
 @dataclass
-class Tracks:
+class SweepSums:
     """The sums that are differentiated: one for each channel of extinction for a gradient, each colour for a tangent.
 
     Attributes:
@@ -323,8 +323,8 @@ class ControlSweep:
     control: GridControl
     passed: RaySegment
     tau: list[mi.Float]
-    tracks: Tracks
-    probe: Probe
+    tracks: SweepSums
+    probe: ProbeDifference
 
     def differentiate(self, active: mi.Bool) -> list[mi.Float]:
         """Differentiate the light of a ray with respect to the extinction in each of its cells.
@@ -354,7 +354,7 @@ class ControlSweep:
             own = media.rows([half * (a + b) for a, b in extinction.along(cell.corners[:1], points)])
             near = [dr.maximum(a - o, 0) for a, o in zip(state.ahead, own, strict=True)]
             T_out, T_in = state.T, [dr.exp(-n) for n in near]
-            taken = [taken_light(o, i, t) for o, i, t in zip(own, T_in, T_out, strict=True)]
+            taken = [extinguished_light(o, i, t) for o, i, t in zip(own, T_in, T_out, strict=True)]
             S = self.control.at(cell.lower, on)
             in_front = cell.s + 0.5 * cell.dt > begin
             slopes, behind = [], []

@@ -16,7 +16,7 @@ import mitsuba as mi
 
 from mivol.numerics import least_of, one_minus_exp
 from mivol.transport.estimators.lighting.emitters import ChosenEmitter
-from mivol.transport.estimators.lighting.shadow_rays import DARK
+from mivol.transport.estimators.lighting.shadow_rays import NEGLIGIBLE_TAU
 from mivol.transport.estimators.single_scattering.shadow_tables import VisibilityCache
 from mivol.transport.media.body import Body
 from mivol.transport.media.ray_intervals import MediumInterval, SegmentEnd, visit_media
@@ -34,10 +34,10 @@ __all__ = [
     "DistanceProposal",
     "Reservoir",
     "fill_reservoir",
-    "inverse",
+    "bounded_inverse",
     "lit_length",
     "start_reservoir",
-    "taken_light",
+    "extinguished_light",
 ]
 
 
@@ -78,7 +78,7 @@ def sample_distance(
     media, ray, equiangular = proposal.media, proposal.ray, proposal.chosen.equiangular
     on = active & (candidate.weight > 0)
     dt = dr.select(on, candidate.dt, 1)
-    curve = _curve(media, ray, candidate, on)
+    curve = _extinction_curves(media, ray, candidate, on)
     whole = [cubic_integral(c, dt, 1) for c in curve]
     front = [dr.exp(-f) for f in candidate.front]
 
@@ -86,13 +86,13 @@ def sample_distance(
     by_collision = mi.Float(1)
     if proposal.probe_depth:
         mean = sum(whole) / len(whole)
-        by_collision = mean * inverse(mean + candidate.probe_sigma * dt)
+        by_collision = mean * bounded_inverse(mean + candidate.probe_sigma * dt)
     if equiangular is not None:
         by_collision = dr.select(equiangular.finite, 0.5 * by_collision, by_collision)
     collides = u.x < by_collision
     begin = candidate.begin + candidate.s
     even = u.y * dt if equiangular is None else dr.select(equiangular.finite, equiangular.sample(begin, dt, u.y), u.y * dt)
-    x = dr.select(collides, _invert(curve, whole, front, dt, u), even * dr.rcp(dt))
+    x = dr.select(collides, _invert_collision_cdf(curve, whole, front, dt, u), even * dr.rcp(dt))
 
     # -- The density of their mixture ------------------------------------------------------------------------------------
     sigma = [dr.maximum(cubic_at(c, x), 0) for c in curve]
@@ -112,37 +112,37 @@ def sample_distance(
     )
 
 
-def _curve(media: SceneMedia, ray: Ray, candidate: Candidate, on: mi.Bool) -> list[list[mi.Float]]:
+def _extinction_curves(media: SceneMedia, ray: Ray, candidate: Candidate, on: mi.Bool) -> list[list[mi.Float]]:
     """The extinction along a piece for each channel: the coefficients of a cubic on [0, 1]."""
     values = [[mi.Float(0) for _ in range(4)] for _ in range(media.channels)]
     for index, body in enumerate(media.bodies):
         here = on & (candidate.body == index)
-        own = _values_along(media, body, ray, candidate, here)
+        own = _extinction_along(media, body, ray, candidate, here)
         values = [[dr.select(here, n, v) for n, v in zip(new, old, strict=True)] for new, old in zip(own, values, strict=True)]
     return [cubic_through(*v) for v in values]
 
 
-def _values_along(media: SceneMedia, body: Body, ray: Ray, candidate: Candidate, on: mi.Bool) -> list[list[mi.Float]]:
+def _extinction_along(media: SceneMedia, body: Body, ray: Ray, candidate: Candidate, on: mi.Bool) -> list[list[mi.Float]]:
     """[channel][point] extinction at 0, 1/3, 2/3 and 1 of a piece, in one medium."""
     extinction = body.extinction(ray, body.flight_parts)
     constant = [[c] * 4 for c in extinction.constant]
     lattice = next((p.lattice for p in body.flight_parts if p.lattice is not None), None)
     if lattice is None:
-        return _by_point(media, constant)
+        return _to_scene_channels(media, constant)
     start = mi.Float64(candidate.begin) + mi.Float64(candidate.s)
     cell, points, inside = piece_points(lattice, ray, start, candidate.dt, on)
     nodes = box_nodes(cell, dr.full(dr.mask_t(mi.Vector3f), True), lattice.res)
     grid = extinction.along(read_nodes(extinction.reads, nodes, inside), points)
     own = [[dr.select(inside, g, k) for g, k in zip(*row, strict=True)] for row in zip(grid, constant, strict=True)]
-    return _by_point(media, own)
+    return _to_scene_channels(media, own)
 
 
-def _by_point(media: SceneMedia, values: list[list[mi.Float]]) -> list[list[mi.Float]]:
+def _to_scene_channels(media: SceneMedia, values: list[list[mi.Float]]) -> list[list[mi.Float]]:
     """[channel of the scene][point], from [channel of the medium][point]."""
     return [list(row) for row in zip(*(media.rows([v[k] for v in values]) for k in range(4)), strict=True)]
 
 
-def _invert(curve: list, whole: list[mi.Float], front: list[mi.Float], dt: mi.Float, u: mi.Point2f) -> mi.Float:
+def _invert_collision_cdf(curve: list, whole: list[mi.Float], front: list[mi.Float], dt: mi.Float, u: mi.Point2f) -> mi.Float:
     """Invert the cumulative distribution of collisions in a piece: the fraction of its length at which it is ``u.y``.
 
     Where the extinction is rgb, one channel is drawn in proportion to the light that the piece takes from each.
@@ -151,21 +151,21 @@ def _invert(curve: list, whole: list[mi.Float], front: list[mi.Float], dt: mi.Fl
     if len(curve) > 1:
         shares = [f * one_minus_exp(w) for f, w in zip(front, whole, strict=True)]
         # u.x has chosen the technique already and u.y is needed below, so the channel is drawn with a third number.
-        left = dr.select(sum(shares) > 0, _scramble(u), 0) * sum(shares)
+        left = dr.select(sum(shares) > 0, _hash_numbers(u), 0) * sum(shares)
         for k in range(1, len(curve)):
             later = left >= sum(shares[:k])
             c = [dr.select(later, a, b) for a, b in zip(curve[k], c, strict=True)]
             tau = dr.select(later, whole[k], tau)
-    goal = _log_share(u.y, tau)
+    goal = _collision_quantile(u.y, tau)
     return invert_cubic_integral(c, dt, goal, tau)
 
 
-def _scramble(u: mi.Point2f) -> mi.Float:
+def _hash_numbers(u: mi.Point2f) -> mi.Float:
     """A third number in [0, 1) from the bits of two."""
     return draw_pcg32(mi.UInt32(u.x * (1 << 24)) * mi.UInt32(0x9E3779B9) + mi.UInt32(u.y * (1 << 24)), 1)[1][0]
 
 
-def _log_share(u: mi.Float, tau: mi.Float) -> mi.Float:
+def _collision_quantile(u: mi.Float, tau: mi.Float) -> mi.Float:
     """-log(1 - u (1 - exp(-tau))): the optical depth at which the fraction u of all collisions within tau has happened."""
     x = u * one_minus_exp(tau)
     series = dr.fma(x, dr.fma(x, dr.fma(x, dr.fma(x, dr.fma(x, 1 / 6, 1 / 5), 1 / 4), 1 / 3), 1 / 2), 1)
@@ -232,7 +232,7 @@ class Reservoir:
     total: mi.Float
     candidates: list[Candidate]
 
-    def of(self, number: mi.UInt32) -> Candidate:
+    def candidate(self, number: mi.UInt32) -> Candidate:
         """The candidate of an index, which may differ from lane to lane."""
         found = self.candidates[0]
         for k, other in enumerate(self.candidates[1:], 1):
@@ -354,7 +354,7 @@ class _Filling:
             reservoir = add_constant(reservoir, t0, dr.select(hit, segment.start, t1))
         # Light from beyond the optical depth DARK is negligible in an image. Derivatives need the whole optical depth, since
         # they are swept from the far end.
-        until = None if self.proposal.probe_depth else lambda p: least_of(p.tau) > DARK
+        until = None if self.proposal.probe_depth else lambda p: least_of(p.tau) > NEGLIGIBLE_TAU
         reservoir = walk(lattice, segment, visit, reservoir, extinction.reads, on, until)
         if extinction.has_constants:
             reservoir = add_constant(reservoir, dr.select(hit, segment.end, t1), t1)
@@ -364,7 +364,7 @@ class _Filling:
         """Extinction [1/length] that a probe adds over a length; None for an image."""
         if not self.proposal.probe_depth:
             return None
-        return dr.select(dr.isfinite(length) & (length > 0), self.proposal.probe_depth * inverse(length), 0)
+        return dr.select(dr.isfinite(length) & (length > 0), self.proposal.probe_depth * bounded_inverse(length), 0)
 
     def _offer(self, reservoir: Reservoir, piece: _Piece, lit: mi.Float | None, probe_sigma: mi.Float | None) -> Reservoir:
         """Offer a piece to each candidate; ``lit`` is its entry in the visibility cache."""
@@ -373,7 +373,7 @@ class _Filling:
         beyond = [dr.exp(-t) for t in ahead]
         weight = mi.Float(0)
         for own, T, T_out in zip(piece.tau, reservoir.T, beyond, strict=True):
-            weight += taken_light(own, T, T_out)
+            weight += extinguished_light(own, T, T_out)
             if probe_sigma is not None:
                 weight += 0.5 * probe_sigma * dt * (T + T_out)
         if equiangular is not None:
@@ -413,7 +413,7 @@ def lit_length(sigma: list[mi.Float], length: mi.Float) -> mi.Float:
     least = mi.Float(dr.inf)
     for s in sigma:
         least = dr.select(s > 0, dr.minimum(least, s), least)
-    return dr.minimum(length, DARK / least)
+    return dr.minimum(length, NEGLIGIBLE_TAU / least)
 
 
 def _set_probe_sigma(reservoir: Reservoir, probe_sigma: mi.Float | None) -> Reservoir:
@@ -430,7 +430,7 @@ def _set_probe_sigma(reservoir: Reservoir, probe_sigma: mi.Float | None) -> Rese
     )
 
 
-def taken_light(tau: mi.Float, T: mi.Float, T_out: mi.Float) -> mi.Float:
+def extinguished_light(tau: mi.Float, T: mi.Float, T_out: mi.Float) -> mi.Float:
     """T (1 - exp(-tau)), the light that a piece takes, to 4e-5 of it.
 
     The difference T - T_out loses its digits for small tau; a series is used there.
@@ -439,6 +439,6 @@ def taken_light(tau: mi.Float, T: mi.Float, T_out: mi.Float) -> mi.Float:
     return dr.select(tau < 0.5, T * tau * series, T - T_out)
 
 
-def inverse(x: mi.Float) -> mi.Float:
+def bounded_inverse(x: mi.Float) -> mi.Float:
     """1 / x for x >= 0; it is finite at 0 (1e30), so that its product with 0 is 0."""
     return dr.rcp(dr.maximum(x, 1e-30))

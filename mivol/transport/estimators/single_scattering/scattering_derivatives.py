@@ -26,8 +26,8 @@ from mivol.transport.estimators.segment import PathSegment
 from mivol.transport.estimators.single_scattering.control_variates import (
     ControlSweep,
     GridControl,
-    Probe,
-    Tracks,
+    ProbeDifference,
+    SweepSums,
 )
 from mivol.transport.estimators.single_scattering.distance_sampling import MediumEvent
 from mivol.transport.media.body import Body, eval_albedo, medium_interaction
@@ -37,7 +37,7 @@ from mivol.transport.media.ray_intervals import RaySegment, SegmentEnd
 from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.traversal.rays import Ray
 
-__all__ = ["ScatteredSegment", "Scattering", "at_event", "medium_event_interaction", "sigma_s_at", "sigma_t_at"]
+__all__ = ["ScatteredSegment", "Scattering", "at_event", "event_interaction", "event_sigma_s", "event_sigma_t"]
 
 
 @dataclass
@@ -83,7 +83,7 @@ class ScatteredSegment:
             with dr.resume_grad():
                 albedo = eval_albedo(body, probe.mei, here)
                 if dr.grad_enabled(albedo):
-                    sigma_t = sigma_t_at(self.media, body, self.segment.ray, probe.event, here)
+                    sigma_t = event_sigma_t(self.media, body, self.segment.ray, probe.event, here)
                     dr.backward_from(dr.select(here, dL * probe.weight * sigma_t * albedo, 0))
 
     def jvp_light(self) -> mi.Spectrum:
@@ -102,7 +102,7 @@ class ScatteredSegment:
             value = sum((dr.select(s.on, carried * s.value, 0) for s in probe.direct), mi.Spectrum(0))
             for body, on in at_event(self.media, probe.event):
                 if body.view.albedo is not None:
-                    sigma_t = sigma_t_at(self.media, body, self.segment.ray, probe.event, on)
+                    sigma_t = event_sigma_t(self.media, body, self.segment.ray, probe.event, on)
                     value += dr.select(on, probe.weight * sigma_t * eval_albedo(body, probe.mei, on), 0)
             dL = tangent_of(value)
         shadow, dimmed, on = _choose_shadow_ray(probe)
@@ -112,8 +112,8 @@ class ScatteredSegment:
 
     def vjp(self, dlog: mi.Spectrum) -> None:
         if self.grid_control is not None:
-            lit = dr.select(self.segment.scatters, self.dL * self.segment.beta, 0)
-            shares = _sums(lit, self.media.channels, self.grid_control.channels)
+            lit = dr.select(self.segment.may_scatter, self.dL * self.segment.beta, 0)
+            shares = _control_factors(lit, self.media.channels, self.grid_control.channels)
             self._sweep(shares, dlog, self.dL, False)
             return
         self._vjp_coefficients()
@@ -152,7 +152,7 @@ class ScatteredSegment:
     # -- Control variate: a source function on a lattice ---------------------------------------------------------------
 
     def _jvp_by_sweep(self) -> mi.Spectrum:
-        one, lit = mi.Spectrum(1), dr.select(self.segment.scatters, self.segment.beta, 0)
+        one, lit = mi.Spectrum(1), dr.select(self.segment.may_scatter, self.segment.beta, 0)
         shares = [[(c % self.grid_control.channels, b)] for c, b in enumerate(colours(lit))]
         return mi.Spectrum(*self._sweep(shares, 0 * one, one, True))
 
@@ -168,8 +168,8 @@ class ScatteredSegment:
         sigma_t = spectrum(point.sigma_t)
         asked = (dL * left, dL * left * sigma_t, rest)
         rows = [colours(x) if tangent else by_channel(x, media.channels) for x in asked]
-        tracks = Tracks(shares, rows[2], tangent)
-        found = Probe(point.begin, point.t, rows[0], rows[1], point.on)
+        tracks = SweepSums(shares, rows[2], tangent)
+        found = ProbeDifference(point.begin, point.t, rows[0], rows[1], point.on)
         return ControlSweep(media, self.grid_control, self._passed, self.tau, tracks, found).differentiate(self.active)
 
     # -- Control variate: one source function for the whole ray --------------------------------------------------------
@@ -189,7 +189,7 @@ class ScatteredSegment:
             return mi.Spectrum(0), mi.Spectrum(0)
         source, sigma_t, event = self.probe.gain * self._constant_source, mi.Spectrum(0), self.probe.event
         for body, on in at_event(self.media, event):
-            sigma_t = dr.select(on, sigma_t_at(self.media, body, self.segment.ray, event, on), sigma_t)
+            sigma_t = dr.select(on, event_sigma_t(self.media, body, self.segment.ray, event, on), sigma_t)
         return source, source * sigma_t
 
     def _constant_source_behind(self) -> mi.Spectrum:
@@ -197,7 +197,7 @@ class ScatteredSegment:
         if self.constant_control is None:
             return mi.Spectrum(0)
         lit = self.segment.beta * transmittance(self.tau) * self._constant_source
-        return dr.select(self.segment.scatters, lit, 0)
+        return dr.select(self.segment.may_scatter, lit, 0)
 
     # -- Parts of the ray ----------------------------------------------------------------------------------------------
 
@@ -236,7 +236,7 @@ def _choose_shadow_ray(probe: Scattering) -> tuple[RaySegment, mi.Spectrum, mi.B
     return chosen, value, dr.select(is_first, first.on, second.on) & (total > 0)
 
 
-def _sums(weight: mi.Spectrum, channels: int, of_control: int) -> list[list[tuple[int, mi.Float]]]:
+def _control_factors(weight: mi.Spectrum, channels: int, of_control: int) -> list[list[tuple[int, mi.Float]]]:
     """For each channel of the extinction, the (channel of S, factor) pairs of the control variate, summed over colours."""
     if of_control == 1:
         return [[(0, w)] for w in by_channel(weight, channels)]
@@ -271,7 +271,7 @@ class Scattering:
         return self.gain * sum((dr.detach(a.value) for a in self.direct), mi.Spectrum(0))
 
 
-def medium_event_interaction(media: SceneMedia, ray: Ray, event: MediumEvent) -> mi.MediumInteraction3f:
+def event_interaction(media: SceneMedia, ray: Ray, event: MediumEvent) -> mi.MediumInteraction3f:
     """An event as the interaction that Mitsuba's phase functions are evaluated at."""
     mei = medium_interaction(ray, event.t)
     mei.medium = media.medium_of(event.body, event.on)
@@ -283,19 +283,19 @@ def at_event(media: SceneMedia, event: MediumEvent) -> list[tuple[Body, mi.Bool]
     return media.bodies_at(event.body, event.on)
 
 
-def sigma_t_at(media: SceneMedia, body: Body, ray: Ray, event: MediumEvent, on: mi.Bool) -> mi.Spectrum:
+def event_sigma_t(media: SceneMedia, body: Body, ray: Ray, event: MediumEvent, on: mi.Bool) -> mi.Spectrum:
     """The extinction [1/length] at an event."""
     rows = event.sigma_t if media.is_single else body.extinction_at(ray, event.t, media.channels, on)
     return spectrum(rows)
 
 
-def sigma_s_at(media: SceneMedia, ray: Ray, event: MediumEvent, mei: mi.MediumInteraction3f) -> mi.Spectrum:
+def event_sigma_s(media: SceneMedia, ray: Ray, event: MediumEvent, mei: mi.MediumInteraction3f) -> mi.Spectrum:
     """The scattering coefficient [1/length] at an event."""
     total = mi.Spectrum(0)
     for body, on in at_event(media, event):
         if body.view.albedo is None:
             value = spectrum(body.extinction_at(ray, event.t, media.channels, on, "sigma_s"))
         else:
-            value = dr.detach(eval_albedo(body, mei, on)) * sigma_t_at(media, body, ray, event, on)
+            value = dr.detach(eval_albedo(body, mei, on)) * event_sigma_t(media, body, ray, event, on)
         total = dr.select(on, value, total)
     return total

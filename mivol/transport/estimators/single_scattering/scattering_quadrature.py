@@ -30,9 +30,9 @@ import drjit as dr
 import mitsuba as mi
 
 from mivol.numerics import largest_of, least_of, phi1
-from mivol.transport.estimators.lighting.emitters import EquiangularSampler, EventSamples, equiangular_sampler
-from mivol.transport.estimators.lighting.shadow_rays import DARK, shadow_ray
-from mivol.transport.estimators.scores import PICTURE, TrackedTerm
+from mivol.transport.estimators.lighting.emitters import EquiangularSampler, EventSamples, make_ball_sampler
+from mivol.transport.estimators.lighting.shadow_rays import NEGLIGIBLE_TAU, trace_shadow_ray
+from mivol.transport.estimators.scores import IMAGE, TrackedTerm
 from mivol.transport.estimators.segment import Absorption, PathSegment, SegmentEstimate, Transmittance
 from mivol.transport.estimators.single_scattering.distance_sampling import lit_length
 from mivol.transport.estimators.single_scattering.shadow_tables import TransmittanceGrid
@@ -51,17 +51,17 @@ from mivol.transport.traversal.rays import Ray, point_along
 __all__ = ["ScatteringQuadrature"]
 
 
-PIECE = 0.25
+MAX_PIECE_TAU = 0.25
 """Largest optical depth of a piece. Where the shadow has a kink in it (a shadow ray begins to cross other cells) the error is
 up to PIECE^2 / 8 of its light; smooth light is exact to 1e-6 of it."""
 
-TURN = 0.1
+MAX_PIECE_ANGLE = 0.1
 """Largest angle [rad] of a piece as seen from a near emitter (the integrand 1/r^2 dt is constant in that angle)."""
 
-MOST = 256
+MAX_PIECES = 256
 """Largest number of pieces of a cell, or of a region of constant extinction, that is cut to its end."""
 
-DEEP = 2 * int(DARK / PIECE)
+DEEP_PIECES = 2 * int(NEGLIGIBLE_TAU / MAX_PIECE_TAU)
 """Pieces of a deeper cell between the positions where one channel and the next become dark. They are equal in length, so there
 are twice as many as a constant extinction would need."""
 
@@ -104,16 +104,16 @@ class ScatteringQuadrature:
         return Absorption(self.media, drawn_by=self.drawn)
 
     def estimate(self, segment: PathSegment, purpose: str, active: mi.Bool) -> SegmentEstimate:
-        if purpose != PICTURE:
+        if purpose != IMAGE:
             return self.drawn.estimate(segment, purpose, active)
         L, end, tau, ray = mi.Spectrum(0), None, None, segment.ray
         for number in range(len(self.emitters.sampled)):
-            equiangular = equiangular_sampler(ray, self.emitters.bounding_ball(number))
-            zero = _start(self.media, dr.width(ray))
+            equiangular = make_ball_sampler(ray, self.emitters.bounding_ball(number))
+            zero = _empty_sum(self.media, dr.width(ray))
             visit = _LitRay(self, ray, number, equiangular).visit
             end, found = visit_media(self.media, ray, segment.medium, visit, zero, active)
             tau, L = found.tau, L + found.light
-        term = TrackedTerm(dr.select(segment.scatters, segment.beta * L, 0), active)
+        term = TrackedTerm(dr.select(segment.may_scatter, segment.beta * L, 0), active)
         passed = RaySegment(ray, segment.medium, end.t)
         return SegmentEstimate(end, transmittance(tau), term, Transmittance(self.media, passed, active))
 
@@ -132,10 +132,10 @@ class _LightSum:
     light: mi.Spectrum
 
 
-Profile = Callable[..., list]
+ExtinctionProfile = Callable[..., list]
 """``sigma(x)``: extinction [1/length] of each channel at the fraction x of a span."""
 
-Source = Callable[..., Any]
+SourceFunction = Callable[..., Any]
 """``source(t, active)``: source function [radiance] at a distance along the ray, in float64."""
 
 
@@ -153,13 +153,13 @@ class _Span:
 
     start: mi.Float64
     length: mi.Float
-    sigma: Profile
-    source: Source
+    sigma: ExtinctionProfile
+    source: SourceFunction
     equiangular: EquiangularSampler | None
     on: mi.Bool
 
 
-def _start(media: SceneMedia, width: int) -> _LightSum:
+def _empty_sum(media: SceneMedia, width: int) -> _LightSum:
     rows = [[dr.full(mi.Float, v, width) for _ in range(media.channels)] for v in (0, 1)]
     return _LightSum(rows[0], rows[1], dr.zeros(mi.Spectrum, width))
 
@@ -224,11 +224,11 @@ class _LitRay:
         direct, weight = emitter.sample_direction(mei, mi.Point2f(0.5), on)
         f, _ = body.view.medium.phase_function().eval_pdf(mi.PhaseFunctionContext(None), mei, direct.d, on)
         if grid is None:
-            _, clear, _, seen = shadow_ray(media, point_along(self.ray, t), mei.medium, direct, on)
+            _, clear, _, seen = trace_shadow_ray(media, point_along(self.ray, t), mei.medium, direct, on)
             seen = dr.select(clear, seen, 0)
         else:
             seen = grid.transmittance(mei.p, self.number, on)
-        return dr.select(on & (direct.pdf > 0), _albedo(media, body, self.ray, mei, on) * f * weight * seen, 0)
+        return dr.select(on & (direct.pdf > 0), _scattering_albedo(media, body, self.ray, mei, on) * f * weight * seen, 0)
 
 
 def _add_span(state: _LightSum, span: _Span, least: mi.Float) -> _LightSum:
@@ -236,44 +236,48 @@ def _add_span(state: _LightSum, span: _Span, least: mi.Float) -> _LightSum:
     dt, sigma, equiangular = span.length, span.sigma, span.equiangular
     near, far = sigma(mi.Float(GAUSS)), sigma(mi.Float(1 - GAUSS))
     thick = largest_of([0.5 * dt * (a + b) for a, b in zip(near, far, strict=True)])
-    count = dr.maximum(least, dr.ceil(thick / PIECE))
+    count = dr.maximum(least, dr.ceil(thick / MAX_PIECE_TAU))
     if equiangular is not None:
-        count = dr.maximum(count, dr.select(equiangular.finite, dr.ceil(equiangular.angle(mi.Float(span.start), dt) / TURN), 1))
-    is_deep = span.on & (thick > MOST * PIECE)
-    edges = _in_order(_dark_shares(state.tau, dt, sigma, is_deep))
-    lit = dr.select(least_of(state.tau) < DARK, DEEP * len(edges), 1)
-    count = dr.select(is_deep, mi.UInt32(lit), mi.UInt32(dr.clip(count, 1, MOST)))
+        count = dr.maximum(
+            count, dr.select(equiangular.finite, dr.ceil(equiangular.angle(mi.Float(span.start), dt) / MAX_PIECE_ANGLE), 1)
+        )
+    is_deep = span.on & (thick > MAX_PIECES * MAX_PIECE_TAU)
+    edges = _sort_rows(_dark_fractions(state.tau, dt, sigma, is_deep))
+    lit = dr.select(least_of(state.tau) < NEGLIGIBLE_TAU, DEEP_PIECES * len(edges), 1)
+    count = dr.select(is_deep, mi.UInt32(lit), mi.UInt32(dr.clip(count, 1, MAX_PIECES)))
     return _add_pieces(state, span, is_deep, edges, count)
 
 
 @dr.syntax
-def _dark_shares(front: list[mi.Float], dt: mi.Float, sigma: Profile, is_deep: mi.Bool) -> list[mi.Float]:
+def _dark_fractions(front: list[mi.Float], dt: mi.Float, sigma: ExtinctionProfile, is_deep: mi.Bool) -> list[mi.Float]:
     """The fraction of a cell at which each channel reaches the optical depth ``DARK``, by bisection; 1 where it never does."""
     low = [dr.full(mi.Float, 2.0**-30, dr.width(dt)) for _ in front]
     high = [dr.full(mi.Float, 1, dr.width(dt)) for _ in front]
     step = dr.zeros(mi.UInt32, dr.width(dt))
     going = mi.Bool(is_deep)
     while dr.hint(going, label="where a cell is dark"):
-        low, high = _halve(front, dt, sigma, low, high)
+        low, high = _bisect_once(front, dt, sigma, low, high)
         step += 1
         going &= step < BISECTIONS
     return high
 
 
-def _halve(front: list[mi.Float], dt: mi.Float, sigma: Profile, low: list[mi.Float], high: list[mi.Float]) -> tuple:
+def _bisect_once(
+    front: list[mi.Float], dt: mi.Float, sigma: ExtinctionProfile, low: list[mi.Float], high: list[mi.Float]
+) -> tuple:
     """One bisection: the half of [low, high], in its logarithm, in which each channel becomes dark."""
     middle = [dr.sqrt(a * b) for a, b in zip(low, high, strict=True)]
-    is_lit = [front[k] + _depth_at(m, dt, sigma)[k] < DARK for k, m in enumerate(middle)]
+    is_lit = [front[k] + _optical_depth_to(m, dt, sigma)[k] < NEGLIGIBLE_TAU for k, m in enumerate(middle)]
     low = [dr.select(i, m, a) for i, m, a in zip(is_lit, middle, low, strict=True)]
     return low, [dr.select(i, b, m) for i, m, b in zip(is_lit, middle, high, strict=True)]
 
 
-def _depth_at(x: mi.Float, dt: mi.Float, sigma: Profile) -> list[mi.Float]:
+def _optical_depth_to(x: mi.Float, dt: mi.Float, sigma: ExtinctionProfile) -> list[mi.Float]:
     """Optical depth of each channel from the start of a cell to a fraction of it."""
     return [0.5 * x * dt * (a + b) for a, b in zip(sigma(GAUSS * x), sigma((1 - GAUSS) * x), strict=True)]
 
 
-def _in_order(shares: list[mi.Float]) -> list[mi.Float]:
+def _sort_rows(shares: list[mi.Float]) -> list[mi.Float]:
     """Sort one or three numbers, the smallest first."""
     if len(shares) == 1:
         return shares
@@ -294,7 +298,7 @@ def _add_pieces(state: _LightSum, span: _Span, is_deep: mi.Bool, edges: list[mi.
         far = share * dt
         if equiangular is not None:
             far = dr.select(equiangular.finite, equiangular.sample(mi.Float(start), dt, share), far)
-        far = dr.select(is_deep, dt * _between(edges, index + 1), far)
+        far = dr.select(is_deep, dt * _deep_fraction(edges, index + 1), far)
         far = dr.select(index + 1 >= count, dt, dr.clip(far, near, dt))
         state = _add_piece(state, span, near, far, going)
         near = far
@@ -303,11 +307,11 @@ def _add_pieces(state: _LightSum, span: _Span, is_deep: mi.Bool, edges: list[mi.
     return state
 
 
-def _between(edges: list[mi.Float], index: mi.UInt32) -> mi.Float:
+def _deep_fraction(edges: list[mi.Float], index: mi.UInt32) -> mi.Float:
     """The fraction of a cell at which its first ``index`` pieces end, with ``DEEP`` up to the first edge and between edges."""
     share, begin = mi.Float(0), mi.Float(0)
     for k, end in enumerate(edges):
-        part = dr.clip((mi.Float(index) - k * DEEP) / DEEP, 0, 1)
+        part = dr.clip((mi.Float(index) - k * DEEP_PIECES) / DEEP_PIECES, 0, 1)
         share, begin = share + part * (end - begin), end
     return share
 
@@ -336,7 +340,7 @@ def _add_piece(state: _LightSum, span: _Span, near: mi.Float, far: mi.Float, on:
     return _LightSum(ahead, beyond, state.light + added)
 
 
-def _albedo(media: SceneMedia, body: Body, ray: Ray, mei: mi.MediumInteraction3f, on: mi.Bool) -> mi.Spectrum:
+def _scattering_albedo(media: SceneMedia, body: Body, ray: Ray, mei: mi.MediumInteraction3f, on: mi.Bool) -> mi.Spectrum:
     """The albedo, or sigma_s / sigma_t where the medium has both coefficients; 0 where its extinction is 0."""
     if body.view.albedo is not None:
         return eval_albedo(body, mei, on)

@@ -18,7 +18,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mivol.transport.estimators.lighting.emitters import SceneEmitters
-from mivol.transport.estimators.lighting.shadow_rays import DARK, shadow_ray
+from mivol.transport.estimators.lighting.shadow_rays import NEGLIGIBLE_TAU, trace_shadow_ray
 from mivol.transport.media.body import Body
 from mivol.transport.media.channels import spectrum
 from mivol.transport.media.scene_media import SceneMedia
@@ -29,14 +29,14 @@ from mivol.transport.traversal.lattice import Lattice
 __all__ = [
     "VisibilityCache",
     "build_visibility_cache",
-    "tau_towards",
+    "optical_depth_towards",
     "TransmittanceGrid",
     "build_transmittance_grid",
     "measure_transmittance_bias",
 ]
 
 
-FLOOR = 0.02
+MIN_WEIGHT = 0.02
 """w_0, the weight of a block in full shadow: the sample weight of a lit point in it is at most 50 times as large."""
 
 RAY_FRACTION = 0.2
@@ -44,10 +44,10 @@ RAY_FRACTION = 0.2
 chosen. (Measured: under a directional light on smoke, blocks of 2 cells divide the variance by 2.7, blocks of 4 do nothing;
 under a point light on a CT of 256^3, blocks of 4 halve the variance that blocks of 8 leave.)"""
 
-COARSEST = 3
+MAX_SHIFT = 3
 """log2 of the edge of the largest blocks [cells]; shadows vary too much within larger ones."""
 
-MOST_EMITTERS = 8
+MAX_EMITTERS = 8
 """Largest number of emitters for which a cache is built."""
 
 
@@ -99,13 +99,13 @@ def build_visibility_cache(
     """
     grids = [p.lattice for b in media.bodies for p in b.view.parts if p.lattice is not None]
     delta = [k for k, e in enumerate(emitters.sampled) if int(e.flags()) & int(mi.EmitterFlags.Delta)]
-    if not media.is_single or len(grids) != 1 or not delta or len(emitters.sampled) > MOST_EMITTERS:
+    if not media.is_single or len(grids) != 1 or not delta or len(emitters.sampled) > MAX_EMITTERS:
         return None
     (lattice,), (body,) = grids, media.bodies
     # A medium that has a constant beside its grid has no empty blocks.
     lists = occupied is not None and len(body.view.parts) == 1
     rays_of_block = (occupied if lists else 1) * len(delta)
-    fits = [shift for shift in range(COARSEST + 1) if _count(lattice, shift) * rays_of_block <= RAY_FRACTION * rays]
+    fits = [shift for shift in range(MAX_SHIFT + 1) if _count_blocks(lattice, shift) * rays_of_block <= RAY_FRACTION * rays]
     if not fits:
         return None
     shift = fits[0]
@@ -115,22 +115,22 @@ def build_visibility_cache(
     index = coarse.held if lists else dr.arange(mi.UInt32, n)
     weights = dr.full(mi.Float, 1, n * k)
     if dr.width(index):
-        far = _with_grid(media, coarse.lattice)
-        p = _middles(lattice, blocks, shift, index)
+        far = _replace_grid(media, coarse.lattice)
+        p = _block_centres(lattice, blocks, shift, index)
         for number in delta:
-            tau = tau_towards(far, far.bodies[0], p, emitters.sampled[number])
-            dr.scatter(weights, dr.exp(-sum(tau) / len(tau)) + FLOOR, index * k + number)
+            tau = optical_depth_towards(far, far.bodies[0], p, emitters.sampled[number])
+            dr.scatter(weights, dr.exp(-sum(tau) / len(tau)) + MIN_WEIGHT, index * k + number)
     dr.eval(weights)
     return VisibilityCache(weights, blocks, shift, k)
 
 
-def _count(lattice: Lattice, shift: int) -> int:
+def _count_blocks(lattice: Lattice, shift: int) -> int:
     """Number of blocks."""
     z, y, x = ((n >> shift) + 1 for n in lattice.res)
     return z * y * x
 
 
-def _with_grid(media: SceneMedia, lattice: Lattice) -> SceneMedia:
+def _replace_grid(media: SceneMedia, lattice: Lattice) -> SceneMedia:
     """The media, with the grid of their only medium replaced."""
     (body,) = media.bodies
     parts = [p if p.is_constant else replace(p, lattice=lattice) for p in body.view.parts]
@@ -139,7 +139,7 @@ def _with_grid(media: SceneMedia, lattice: Lattice) -> SceneMedia:
     return other
 
 
-def _middles(lattice: Lattice, blocks: tuple[int, int, int], shift: int, index: mi.UInt32) -> mi.Point3f:
+def _block_centres(lattice: Lattice, blocks: tuple[int, int, int], shift: int, index: mi.UInt32) -> mi.Point3f:
     """The middles of blocks in the world."""
     _, y, x = blocks
     at = (index % x, (index // x) % y, index // (x * y))
@@ -153,7 +153,7 @@ def _middles(lattice: Lattice, blocks: tuple[int, int, int], shift: int, index: 
     return lattice.place(mi.Vector3f(*u))
 
 
-def tau_towards(media: SceneMedia, body: Body, p: mi.Point3f, emitter: mi.Emitter) -> list[mi.Float]:
+def optical_depth_towards(media: SceneMedia, body: Body, p: mi.Point3f, emitter: mi.Emitter) -> list[mi.Float]:
     """Optical depth [1] of each channel from points in a medium to an emitter of one position or direction.
 
     It is at most ``DARK``, and ``DARK`` where an opaque surface hides the emitter.
@@ -162,8 +162,8 @@ def tau_towards(media: SceneMedia, body: Body, p: mi.Point3f, emitter: mi.Emitte
     it.p = p
     medium = dr.select(dr.full(mi.Bool, True, dr.width(p)), mi.MediumPtr(body.view.medium), None)
     direct, _ = emitter.sample_direction(it, mi.Point2f(0.5), mi.Bool(True))
-    _, clear, tau, _ = shadow_ray(media, p, medium, direct, mi.Bool(True))
-    return [dr.select(clear, dr.minimum(t, DARK), DARK) for t in tau]
+    _, clear, tau, _ = trace_shadow_ray(media, p, medium, direct, mi.Bool(True))
+    return [dr.select(clear, dr.minimum(t, NEGLIGIBLE_TAU), NEGLIGIBLE_TAU) for t in tau]
 
 
 INSET = 1e-5
@@ -228,7 +228,7 @@ def build_transmittance_grid(media: SceneMedia, emitters: SceneEmitters, cells: 
     count, k = len(emitters.sampled), media.channels
     tau = dr.zeros(mi.Float, z * y * x * count * k)
     for number, emitter in enumerate(emitters.sampled):
-        for c, row in enumerate(tau_towards(media, body, p, emitter)):
+        for c, row in enumerate(optical_depth_towards(media, body, p, emitter)):
             dr.scatter(tau, row, (index * count + number) * k + c)
     dr.eval(tau)
     return TransmittanceGrid(tau, nodes, lattice, count, k)
@@ -250,7 +250,7 @@ def measure_transmittance_bias(
     weight = body.extinction_at(ray, mi.Float(0), 1, mi.Bool(True))[0]
     total, first, second = dr.sum(weight), mi.Float(0), mi.Float(0)
     for number, emitter in enumerate(emitters.sampled):
-        exact = tau_towards(media, body, p, emitter)
+        exact = optical_depth_towards(media, body, p, emitter)
         off = grid.transmittance(p, number, mi.Bool(True))[0] - dr.exp(-exact[0])
         first += dr.sum(weight * off)
         second += dr.sum(weight * off * off)

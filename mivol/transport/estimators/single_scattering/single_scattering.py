@@ -19,7 +19,7 @@ import mitsuba as mi
 from mivol.transport.estimators.lighting.direct_lighting import DirectLighting
 from mivol.transport.estimators.lighting.emitters import EventSamples
 from mivol.transport.estimators.lighting.vertex import MediumVertex
-from mivol.transport.estimators.scores import PICTURE, TrackedTerm
+from mivol.transport.estimators.scores import IMAGE, TrackedTerm
 from mivol.transport.estimators.segment import (
     Absorption,
     PathSegment,
@@ -33,7 +33,7 @@ from mivol.transport.estimators.single_scattering.control_variates import (
     GridControl,
     build_grid_control,
     find_constant_control,
-    takes_grid_control,
+    supports_grid_control,
 )
 from mivol.transport.estimators.single_scattering.distance_sampling import (
     Candidate,
@@ -46,8 +46,8 @@ from mivol.transport.estimators.single_scattering.distance_sampling import (
 from mivol.transport.estimators.single_scattering.scattering_derivatives import (
     ScatteredSegment,
     Scattering,
-    medium_event_interaction,
-    sigma_s_at,
+    event_interaction,
+    event_sigma_s,
 )
 from mivol.transport.estimators.single_scattering.shadow_tables import VisibilityCache
 from mivol.transport.media.optical_depth import segment_optical_depth, transmittance
@@ -63,7 +63,7 @@ PROBE_DEPTH = 4.0
 
 
 @dataclass
-class _Flight:
+class _WalkedSegment:
     """A segment that has been walked for one emitter.
 
     Attributes:
@@ -105,11 +105,11 @@ class SingleScattering:
         return "tiled" if self.emitters.samples_phase else "spread"
 
     def draw(self, sampler: mi.Sampler, active: mi.Bool, strata: Strata | None) -> EventSamples:
-        return self.emitters.draw_samples(sampler, active, strata)
+        return self.emitters.draw_event_samples(sampler, active, strata)
 
     def prepare_derivatives(self, ray: mi.Ray3f) -> None:
         """Find a control variate for the derivatives along camera rays; later calls keep the first one."""
-        if takes_grid_control(self.media):
+        if supports_grid_control(self.media):
             if self.grid_control is None:
                 self.grid_control = build_grid_control(self.direct, self.media.bodies[0], CameraOrigins.of(ray))
         elif self.constant_control is None:
@@ -119,10 +119,10 @@ class SingleScattering:
         return Absorption(self.media, drawn_by=self)
 
     def estimate(self, segment: PathSegment, purpose: str, active: mi.Bool) -> SegmentEstimate:
-        if purpose == PICTURE:
+        if purpose == IMAGE:
             return self._picture(segment, active)
         flight = self._walk(segment, 1, PROBE_DEPTH, active)
-        samples = segment.samples.part(mi.UInt32(0), 1)
+        samples = segment.samples.for_event(mi.UInt32(0), 1)
         found = self._scatter(segment, flight, flight.reservoir.candidates[0], samples, active)
         tau, controls = flight.reservoir.tau, (self.grid_control, self.constant_control)
         shared = ScatteredSegment(self.media, segment, flight.end, tau, found, *controls, active)
@@ -135,7 +135,7 @@ class SingleScattering:
         flight = self._walk(segment, count, 0.0, active)
 
         def light_of(number: mi.UInt32) -> mi.Spectrum:
-            candidate, samples = flight.reservoir.of(number), segment.samples.part(number, count)
+            candidate, samples = flight.reservoir.candidate(number), segment.samples.for_event(number, count)
             found = self._scatter(segment, flight, candidate, samples, active)
             return dr.select(found.event.on, found.sigma_s * found.weight, 0)
 
@@ -154,24 +154,24 @@ class SingleScattering:
         T = transmittance(flight.reservoir.tau)
         return SegmentEstimate(flight.end, T, term, Transmittance(self.media, passed, active))
 
-    def _walk(self, segment: PathSegment, count: int, probe_depth: float, active: mi.Bool) -> _Flight:
+    def _walk(self, segment: PathSegment, count: int, probe_depth: float, active: mi.Bool) -> _WalkedSegment:
         """Choose an emitter, walk the segment to its end, and fill a reservoir with candidates of scattering points."""
         ray, samples = segment.ray, segment.samples
-        chosen = self.emitters.choose(ray, samples.which_emitter)
+        chosen = self.emitters.choose_emitter(ray, samples.which_emitter)
         reservoir = start_reservoir(self.media, samples.piece, dr.width(ray), count)
         proposal = DistanceProposal(self.media, ray, chosen, self.visibility_cache, probe_depth)
         end, reservoir = fill_reservoir(proposal, segment.medium, reservoir, active)
-        return _Flight(end, reservoir, proposal)
+        return _WalkedSegment(end, reservoir, proposal)
 
     def _scatter(
-        self, segment: PathSegment, flight: _Flight, candidate: Candidate, samples: EventSamples, active: mi.Bool
+        self, segment: PathSegment, flight: _WalkedSegment, candidate: Candidate, samples: EventSamples, active: mi.Bool
     ) -> Scattering:
         """Draw a scattering point in a candidate, and estimate the direct light there."""
         media, ray, proposal = self.media, segment.ray, flight.proposal
         chosen, probes = proposal.chosen, proposal.probe_depth > 0
-        on = active & segment.scatters
+        on = active & segment.may_scatter
         event = sample_distance(proposal, candidate, flight.reservoir.total, samples.inside, on)
-        mei = medium_event_interaction(media, ray, event)
+        mei = event_interaction(media, ray, event)
         tau = event.tau
         if not media.is_single:
             front = RaySegment.upto(ray, segment.medium, event.t)
@@ -179,5 +179,5 @@ class SingleScattering:
         gain = dr.select(event.on, segment.beta * transmittance(tau) / event.pdf, 0)
         vertex = MediumVertex(media, mei, point_along(ray, event.t))
         # Roulette is for paths: the noise of one scattering is small, and that of roulette would show.
-        direct = self.direct.in_medium(vertex, chosen, samples, probes, event.on, not probes and media.tracks_shadows)
-        return Scattering(event, mei, gain, direct, sigma_s_at(media, ray, event, mei), samples.which_shadow_ray)
+        direct = self.direct.estimate_in_medium(vertex, chosen, samples, probes, event.on, not probes and media.tracks_shadows)
+        return Scattering(event, mei, gain, direct, event_sigma_s(media, ray, event, mei), samples.which_shadow_ray)
