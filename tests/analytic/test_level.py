@@ -103,4 +103,4 @@ def test_first_flights_have_a_level_for_each_tile():
     first, mean = np.array(found.first)[0], np.array(found.later)[0, 0]
     np.testing.assert_allclose(first[::2] / mean, (2 * n + 16) / (n + 16), rtol=0.06)
     np.testing.assert_allclose(first[1::2] / mean, 16 / (n + 16), rtol=0.06)
-    assert np.array_equal(np.array(found.at(mi.UInt32([0, 0, 1, 2])))[0], [first[0], first[1], mean, mean])
+    assert np.array_equal(np.array(found.at_depth(mi.UInt32([0, 0, 1, 2])))[0], [first[0], first[1], mean, mean])
