@@ -1,7 +1,7 @@
-"""A plume of smoke without a simulation: a widening, swirling column, torn by turbulence with a power spectrum.
+"""A plume of smoke without a simulation: a widening, swirling column, torn by turbulence.
 
-The turbulence is Gaussian noise filtered to the power spectrum |k|^-13/3, a little steeper than Kolmogorov's |k|^-11/3. One field of it moves the
-points (which makes the curls), another one eats holes into the edge of the column.
+The turbulence is Gaussian noise filtered to the power spectrum |k|^-13/3, a little steeper than Kolmogorov's |k|^-11/3. Three
+fields of it displace the points, which makes the curls. A fourth field eats holes into the edge of the column.
 """
 
 from __future__ import annotations
