@@ -82,11 +82,23 @@ def _pages() -> list[Path]:
 
 
 def test_every_page_is_listed() -> None:
-    """Sphinx warns of pages that no table of contents leads to; this needs no Sphinx."""
-    trees = re.findall(r"```\{toctree\}\n(.*?)```", (DOCS / "index.md").read_text(), re.DOTALL)
-    listed = [line for tree in trees for line in tree.splitlines() if line and not line.startswith(":")]
+    """Sphinx warns of pages missing from every table of contents; this needs no Sphinx."""
     pages = [path.relative_to(DOCS).with_suffix("").as_posix() for path in _pages()]
-    assert sorted([*listed, "index"]) == sorted(pages)
+    assert sorted([*listed_pages("index"), *listed_pages("notes/index"), "index"]) == sorted(pages)
+
+
+def listed_pages(index: str) -> list[str]:
+    """The pages in the tables of contents of a page of docs/, relative to docs/."""
+    trees = re.findall(r"```\{toctree\}\n(.*?)```", (DOCS / f"{index}.md").read_text(), re.DOTALL)
+    lines = [line for tree in trees for line in tree.splitlines() if line and not line.startswith(":")]
+    return [(Path(index).parent / line).as_posix() for line in lines]
+
+
+def test_only_the_index_of_notes_leads_to_notes() -> None:
+    """A note answers no question of a user: pages link to the index of notes at most."""
+    pages = [path for path in PAGES if path.parent.name != "notes"]
+    found = {name_of(path): [t for t in links(path.read_text()) if "notes/" in t and t[-14:] != "notes/index.md"] for path in pages}
+    assert {name: targets for name, targets in found.items() if targets} == {}
 
 
 PICTURE = re.compile(r'!\[[^\]]*\]\(([^)]+)|\[?<img src="([^"]+)"[^>]* width="(\d+)"')
