@@ -173,7 +173,7 @@ class RunFolder:
             quantity = find_quantity(name, self.record.units)
             if value is not None:
                 figure = f"{value:.0f}" if float(value).is_integer() else f"{value:.4g}"
-                words.append(f"{quantity.label} {figure} {quantity.beside}".rstrip())
+                words.append(f"{quantity.label} {figure} {quantity.symbol}".rstrip())
         return f"saved: {', '.join(words)}"
 
     def rewind(self, iteration: int) -> None:

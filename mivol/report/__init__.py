@@ -1,1 +1,1 @@
-"""What a run found, said so that others can judge it: the record, its figures, its page, its sources."""
+"""The results of a run: record, figures and report page."""

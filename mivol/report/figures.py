@@ -1,8 +1,8 @@
-"""Figures that are read, not admired: one style, units on every axis, colours that survive colour blindness.
+"""Figures in the house style: units on every axis, and the colour-blind safe colours of Okabe and Ito.
 
-Conventions. A ``plot_*`` function returns a matplotlib figure; :func:`save_figure` writes it (.svg or .png, whole or not at
-all). Nothing here touches pyplot's global state. Series take the colours of Okabe and Ito in order. An
-:func:`inline_svg` follows the light or dark theme of the page it stands in: its colours are the page's CSS variables.
+Conventions. A ``plot_*`` function returns a matplotlib figure; :func:`save_figure` writes the figure as .svg or .png, whole or
+not at all. No function changes the global state of pyplot. The colours of an :func:`inline_svg` are CSS variables of the page,
+so the figure follows the light or dark theme.
 """
 
 from __future__ import annotations
@@ -43,8 +43,8 @@ __all__ = [
 
 INK, FAINT, GRID = "#1b1f24", "#5b6470", "#d5d9df"
 SERIES = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
-LEVELS = {"discrepancy": (1.0, "the noise")}
-"""Curves that have a level to reach, and its name."""
+LEVELS = {"discrepancy": (1.0, "noise level")}
+"""Curve -> (level to reach, name of the level)."""
 MARKERS = ("o", "s", "^", "D", "v", "P")
 CSS = {INK: "var(--ink)", FAINT: "var(--faint)", GRID: "var(--rule)"} | {
     colour: f"var(--series-{i})" for i, colour in enumerate(SERIES)
@@ -92,7 +92,7 @@ STYLE = {
 
 
 def empty_figure(width: float, height: float) -> Figure:
-    """An empty figure of that many inches with a canvas of its own; call inside ``mpl.rc_context(STYLE)``."""
+    """Return an empty figure (width and height in inches) with its own canvas. Call inside ``mpl.rc_context(STYLE)``."""
     figure = Figure(figsize=(width, height))
     FigureCanvasAgg(figure)
     return figure
@@ -106,7 +106,7 @@ def save_figure(figure: Figure, path: str | Path) -> Path:
     """
     path = Path(path)
     if path.suffix not in (".svg", ".png"):
-        raise MivolError(f'a figure cannot be written as "{path.name}"; name it .svg or .png.')
+        raise MivolError(f'a figure cannot be written as "{path.name}"; choose the suffix .svg or .png.')
     metadata = {"Date": None} if path.suffix == ".svg" else {"Software": None}
     with mpl.rc_context(STYLE):
         write_whole(path, lambda file: figure.savefig(file, format=path.suffix[1:], metadata=metadata))
@@ -114,19 +114,19 @@ def save_figure(figure: Figure, path: str | Path) -> Path:
 
 
 def inline_svg(figure: Figure, label: str) -> str:
-    """The figure as an ``<svg>`` element: themed by the page's CSS variables, ``label`` is read to who cannot see it."""
+    """Return the figure as an ``<svg>`` element in the theme of the page. Screen readers read the ``label``."""
     buffer = io.StringIO()
     with mpl.rc_context(STYLE | {"svg.hashsalt": label}):
         figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None})
     svg = buffer.getvalue()
     svg = re.sub(r"<metadata>.*?</metadata>", "", svg[svg.index("<svg") :], flags=re.DOTALL)
     used = set(re.findall(r'(?:href="|url\()#([^")]+)', svg))
-    svg = re.sub(r' id="([^"]+)"', lambda found: found[0] if found[1] in used else "", svg)
+    svg = re.sub(r' id="([^"]+)"', lambda match: match[0] if match[1] in used else "", svg)
     head, body = svg.split(">", 1)
     head = re.sub(r'\s(?:width|height|version|xmlns(?::xlink)?)="[^"]*"', "", head).replace("\n", " ")
     for colour, variable in CSS.items():
         body = body.replace(colour, variable)
-    body = re.sub(r"font: (bold )?([\d.]+px)[^;\"]*", lambda f: f"font-size: {f[2]}" + "; font-weight: 600" * bool(f[1]), body)
+    body = re.sub(r"font: (bold )?([\d.]+px)[^;\"]*", lambda m: f"font-size: {m[2]}" + "; font-weight: 600" * bool(m[1]), body)
     return f'{head} role="img" aria-label="{_escape(label)}">{body.strip()}'
 
 
@@ -137,20 +137,20 @@ def _escape(text: str) -> str:
 def plot_curve(
     rows: Sequence[dict], name: str, *, against: str = "iteration", units: Mapping[str, str] | None = None
 ) -> Figure:
-    """One quantity of ``metrics.jsonl`` against iterations or seconds, its last value written at its end.
+    """Plot one quantity of ``metrics.jsonl`` against iterations or seconds, with the last value at the end of the curve.
 
     Args:
-        rows: rows of :func:`mivol.report.record.read_metrics`; those without a number are left out.
-        name: which number.
+        rows: rows of :func:`mivol.report.record.read_metrics`; rows without the quantity are skipped.
+        name: key of the quantity.
         against: ``iteration`` or ``seconds``.
-        units: of :class:`mivol.report.record.RunRecord`.
+        units: units of the run (:class:`mivol.report.record.RunRecord`).
 
     Raises:
-        MivolError: no row has that number.
+        MivolError: no row has the quantity.
     """
     points = [(row[against], row[name]) for row in rows if row.get(name) is not None and row.get(against) is not None]
     if not points:
-        raise MivolError(f'no row of the metrics has "{name[:80]}"; draw one of those that were recorded.')
+        raise MivolError(f'no row of the metrics has "{name[:80]}"; choose a recorded quantity.')
     x, y = np.array(points, float).T
     quantity = find_quantity(name, units or {})
     with mpl.rc_context(STYLE):
@@ -165,26 +165,26 @@ def plot_curve(
         end = {"ha": "left", "va": "center", "color": SERIES[0], "weight": "bold", "fontsize": 9.5}
         axes.annotate(f"{y[-1]:.3g}", (x[-1], y[-1]), (6, 0), textcoords="offset points", **end)
         if name in LEVELS:
-            _level(axes, *LEVELS[name])
+            _draw_level(axes, *LEVELS[name])
         axes.margins(x=0.02, y=0.12)
     return figure
 
 
-def _level(axes: Axes, value: float, name: str) -> None:
-    """A broken line across, which a curve is held against."""
+def _draw_level(axes: Axes, value: float, name: str) -> None:
+    """Draw a dashed horizontal line at the level that a curve should reach."""
     axes.axhline(value, color=FAINT, linestyle=(0, (4, 3)), linewidth=1.2)
     place = {"xycoords": ("axes fraction", "data"), "textcoords": "offset points", "ha": "left", "va": "bottom"}
     axes.annotate(name, (0.0, value), (4, 2), color=FAINT, fontsize=9, **place)
 
 
 NARROW = 5.0
-"""Largest over smallest value, from which two of 1, 2, 5 and their decades surely lie between them: gaps are 2 and 2.5."""
+"""Ratio of the largest to the smallest value above which two ticks of 1, 2, 5, 10 fit: their ratios are 2 and 2.5."""
 
 
 def _log_axis(axis: Axis, values: NDArray) -> None:
-    """A log axis with enough labels: decades where there are two or more, else 1-2-5 steps in plain numbers.
+    """Make an axis logarithmic, with labels at decades from a range of two decades on, else at 1, 2 and 5.
 
-    Where fewer than two of those would be seen, steps are even.
+    A range below ``NARROW`` gets evenly spaced labels.
     """
     getattr(axis.axes, f"set_{axis.axis_name}scale")("log")
     wide, narrow = values.max() >= 100 * values.min(), values.max() < NARROW * values.min()
@@ -201,24 +201,23 @@ def plot_slices(
     quantity: str = "sigma_t",
     unit: str = "1/length",
 ) -> Figure:
-    """Three orthogonal slices of a volume; with a truth of the same shape also the truth and the difference.
+    """Plot three orthogonal slices of a volume; with a truth, also the truth and the difference.
 
     Args:
         reconstruction: (Z, Y, X[, C]).
-        truth: the same shape, or None.
-        size: world lengths of the box along x, y, z.
+        truth: array of the same shape, or None.
+        size: edges of the box along x, y, z [length].
         quantity: name of the values.
-        unit: their unit.
+        unit: unit of the values.
 
     Raises:
-        MivolError: shapes that differ.
+        MivolError: different shapes.
     """
     rows = {"reconstruction": pixel_scale.middle_slices(reconstruction, size)}
     if truth is not None:
         if np.shape(truth) != np.shape(reconstruction):
             raise MivolError(
-                f"truth {np.shape(truth)} and reconstruction {np.shape(reconstruction)} differ in shape; "
-                "resample one to the other."
+                f"truth {np.shape(truth)} and reconstruction {np.shape(reconstruction)} differ in shape; resample one of them."
             )
         rows = {"truth": pixel_scale.middle_slices(truth, size)} | rows
         rows["difference"] = pixel_scale.middle_slices(np.asarray(reconstruction, float) - np.asarray(truth, float), size)
@@ -230,22 +229,22 @@ def plot_slices(
         for line, (name, cut) in zip(grid, rows.items(), strict=True):
             scale = signed if name == "difference" else values
             for axes, plane in zip(line, cut.images, strict=True):
-                _picture(axes, pixel_scale.to_pixels(cut.images[plane], scale), cut.aspect[plane])
+                _show_pixels(axes, pixel_scale.to_pixels(cut.images[plane], scale), cut.aspect[plane])
                 axes.set_xlabel(f"{plane[0]} →  at {cut.where[plane]}", labelpad=2)
                 axes.set_ylabel(f"{plane[1]} →", labelpad=2)
             line[0].set_title(name)
-            _bar(figure, line, scale, f"{quantity} [{unit}]")
+            _draw_colour_bar(figure, line, scale, f"{quantity} [{unit}]")
     return figure
 
 
 def plot_image_row(reference: NDArray, render: NDArray, z: NDArray | None = None, *, unit: str = "") -> Figure:
-    """Reference, render, signed difference, and the z-image where there is one.
+    """Plot reference, render, signed difference and, if given, the z-image side by side.
 
     Args:
         reference: (height, width[, C]).
-        render: the same shape.
-        z: the same shape, the difference in standard errors.
-        unit: of the values.
+        render: image of the same shape.
+        z: difference divided by its standard error, in the same shape.
+        unit: unit of the values.
     """
     label = f"radiance [{unit}]" if unit else "radiance"
     difference = np.asarray(render, float) - np.asarray(reference, float)
@@ -260,22 +259,22 @@ def plot_image_row(reference: NDArray, render: NDArray, z: NDArray | None = None
     with mpl.rc_context(STYLE):
         figure = empty_figure(2.6 * len(panels), 2.9)
         for axes, (name, image, scale) in zip(figure.subplots(1, len(panels)), panels, strict=True):
-            _picture(axes, pixel_scale.to_pixels(image, scale), image.shape[1] / image.shape[0])
+            _show_pixels(axes, pixel_scale.to_pixels(image, scale), image.shape[1] / image.shape[0])
             axes.set_title(name)
             if scale.kind == "colour":
                 axes.set_xlabel(f"{label}: white is {scale.high:.3g}")
-            _bar(figure, [axes], scale, "difference / standard error" if name == "z" else label, below=True)
+            _draw_colour_bar(figure, [axes], scale, "difference / standard error" if name == "z" else label, below=True)
     return figure
 
 
-def _picture(axes: Axes, rgb: NDArray[np.uint8], aspect: float) -> None:
+def _show_pixels(axes: Axes, rgb: NDArray[np.uint8], aspect: float) -> None:
     axes.imshow(rgb, aspect=rgb.shape[1] / rgb.shape[0] / aspect)
     axes.set(xticks=[], yticks=[])
     axes.grid(False)
     axes.spines[:].set(visible=True, color=GRID)
 
 
-def _bar(figure: Figure, axes: Sequence[Axes], scale: pixel_scale.Scale, label: str, below: bool = False) -> None:
+def _draw_colour_bar(figure: Figure, axes: Sequence[Axes], scale: pixel_scale.Scale, label: str, below: bool = False) -> None:
     if scale.kind == "colour":
         return
     mappable = mpl.cm.ScalarMappable(
@@ -290,7 +289,13 @@ def _bar(figure: Figure, axes: Sequence[Axes], scale: pixel_scale.Scale, label: 
 
 
 class Series(NamedTuple):
-    """Errors that a method reached after so many seconds; one point where it has no choice but to be that exact."""
+    """Errors of a method against time.
+
+    Attributes:
+        name: name of the method.
+        seconds: times [s]; a single point for a method without a parameter for its accuracy.
+        error: error after each time.
+    """
 
     name: str
     seconds: ArrayLike
@@ -298,15 +303,16 @@ class Series(NamedTuple):
 
 
 def ratio_at_equal_error(fast: Series, slow: Series) -> tuple[float, float, float] | None:
-    """How much sooner ``fast`` is as exact as ``slow`` ever gets.
+    """Compare the times of two methods at the smallest error of ``slow``.
+
+    The time of ``fast`` is interpolated between its points in log-log and never extrapolated. If ``fast`` starts below the
+    error, its first time counts, and the ratio of the times is a lower bound.
 
     Returns:
-        (error, seconds of ``fast``, seconds of ``slow``) at the smallest error of ``slow``, with the time of ``fast``
-        interpolated between its points in log-log, never extrapolated: where ``fast`` starts below that error its first
-        time counts, so the ratio is a lower bound. None where ``fast`` never gets there.
+        (error, seconds of ``fast``, seconds of ``slow``), or None if ``fast`` never reaches the error.
     """
-    at = int(np.argmin(slow.error))
-    error, seconds = float(np.asarray(slow.error)[at]), float(np.asarray(slow.seconds)[at])
+    best = int(np.argmin(slow.error))
+    error, seconds = float(np.asarray(slow.error)[best]), float(np.asarray(slow.seconds)[best])
     t, e = (np.asarray(v, float)[np.argsort(fast.seconds)] for v in (fast.seconds, fast.error))
     below = np.flatnonzero(e <= error)
     if below.size == 0:
@@ -326,21 +332,21 @@ def plot_error_against_time(
     title: str = "",
     time: str = "time [s], warm",
 ) -> Figure:
-    """Error against time of several methods, log-log; the first is compared with each of the others.
+    """Plot error against time of several methods in log-log, and compare the first method with the others.
 
     Args:
-        series: methods, the one to be judged first; seconds and errors above 0.
-        path: written there (.svg, .png) if given.
-        error: what the vertical axis is.
-        title: the question that the figure answers.
-        time: what the horizontal axis is.
+        series: methods with times and errors above 0, the judged method first.
+        path: file to write (.svg or .png), optional.
+        error: label of the vertical axis.
+        title: question answered by the figure.
+        time: label of the horizontal axis.
 
     Returns:
-        The figure. An arrow marks how many times sooner the first method has the best error of the other that comes
-        closest; the legend gives the ratio for each (:func:`ratio_at_equal_error`).
+        The figure. The legend gives the ratio of the times at equal error for each other method
+        (:func:`ratio_at_equal_error`). An arrow marks the ratio for the most accurate of them.
 
     Raises:
-        MivolError: no series, or times or errors that are not finite and above 0.
+        MivolError: no series, or a time or an error that is not finite and above 0.
     """
     _check_series(series)
     with mpl.rc_context(STYLE):
@@ -364,7 +370,7 @@ def plot_error_against_time(
         axes.set(xlabel=time, ylabel=error, title=title)
         _log_axis(axes.xaxis, np.concatenate([np.ravel(s.seconds) for s in series]))
         _log_axis(axes.yaxis, np.concatenate([np.ravel(s.error) for s in series]))
-        _arrow(axes, [ratio for ratio in ratios.values() if ratio])
+        _draw_arrow(axes, [ratio for ratio in ratios.values() if ratio])
         axes.margins(0.06, 0.08)
         axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), labelspacing=0.9, handlelength=1.6)
     if path is not None:
@@ -380,19 +386,19 @@ def _times(ratio: tuple[float, float, float]) -> str:
     return f"{ratio[2] / ratio[1]:,.3g} ×" if ratio[2] < 1000 * ratio[1] else f"{ratio[2] / ratio[1]:,.0f} ×"
 
 
-def _arrow(axes: Axes, ratios: Sequence[tuple[float, float, float]]) -> None:
+def _draw_arrow(axes: Axes, ratios: Sequence[tuple[float, float, float]]) -> None:
     if not ratios:
         return
-    error, ours, theirs = min(ratios, key=lambda ratio: ratio[0])
+    error, fast, slow = min(ratios, key=lambda ratio: ratio[0])
     axes.annotate(
         "",
-        (ours, error),
-        (theirs, error),
+        (fast, error),
+        (slow, error),
         arrowprops={"arrowstyle": "<->", "color": INK, "shrinkA": 5, "shrinkB": 5, "linewidth": 1.1},
     )
     axes.annotate(
-        _times((error, ours, theirs)),
-        (np.sqrt(ours * theirs), error),
+        _times((error, fast, slow)),
+        (np.sqrt(fast * slow), error),
         (0, 4),
         textcoords="offset points",
         ha="center",
@@ -403,52 +409,54 @@ def _arrow(axes: Axes, ratios: Sequence[tuple[float, float, float]]) -> None:
 
 def _check_series(series: Sequence[Series]) -> None:
     if not series:
-        raise MivolError("there is no series to draw; give at least one method with its times and errors.")
+        raise MivolError("an error plot needs at least one series; give times and errors of a method.")
     for s in series:
         both = np.array([np.ravel(s.seconds), np.ravel(s.error)], float)
         if both.size == 0 or not (np.isfinite(both) & (both > 0)).all():
-            raise MivolError(f'"{s.name}" has a time or an error that is not finite and above 0; leave them out.')
+            raise MivolError(f'"{s.name}" has a time or an error that is not finite and above 0; remove these points.')
 
+
+# -- Profiles of volumes ------------------------------------------------------------------------------------------
 
 DASHES = {"reconstruction": "solid", "truth": (0, (3, 2))}
 
 
 def draw_profiles(folder: Path, volumes: Sequence[Volume]) -> list[str]:
-    """Curves along x, y and z, as SVG, of the volumes that are to be drawn so.
+    """Return curves along x, y and z as SVG, for the volumes marked with ``profiles``.
 
     Raises:
-        MivolError: a file that cannot be read.
+        MivolError: an unreadable file.
     """
-    wanted = {volume.role: volume for volume in volumes if volume.profiles}
-    if "reconstruction" not in wanted:
+    entries = {volume.role: volume for volume in volumes if volume.profiles}
+    if "reconstruction" not in entries:
         return []
-    read = {role: read_volume(folder / wanted[role].path) for role in DASHES if role in wanted}
-    values = {role: volume.values[..., 0] for role, volume in read.items()}
-    place, about = read["reconstruction"].to_world, wanted["reconstruction"]
-    named = f"{about.quantity} [{about.unit}]"
+    grids = {role: read_volume(folder / entries[role].path) for role in DASHES if role in entries}
+    values = {role: grid.values[..., 0] for role, grid in grids.items()}
+    to_world, entry = grids["reconstruction"].to_world, entries["reconstruction"]
+    label = f"{entry.quantity} [{entry.unit}]"
     return [
-        inline_svg(plot_profile(values, axis, (place[i, 3], place[i, i]), named), f"{about.quantity} along {axis}")
+        inline_svg(plot_profile(values, axis, (to_world[i, 3], to_world[i, i]), label), f"{entry.quantity} along {axis}")
         for i, axis in enumerate("xyz")
     ]
 
 
-def plot_profile(values: dict[str, NDArray], axis: str, box: tuple[float, float], named: str) -> Figure:
-    """One line through the middle voxel.
+def plot_profile(values: dict[str, NDArray], axis: str, box: tuple[float, float], label: str) -> Figure:
+    """Plot the values along one axis through the middle voxel.
 
     Args:
         values: (Z, Y, X) by role.
         axis: ``x``, ``y`` or ``z``.
-        box: where the box begins along it, and its edge [length].
-        named: the quantity with its unit.
+        box: lower end and edge of the box along the axis [length].
+        label: quantity with its unit.
     """
     with mpl.rc_context(STYLE):
         figure = empty_figure(4.4, 2.75)
         axes = figure.subplots()
         for role, colour in zip(values, SERIES, strict=False):
             line = central_line(values[role], axis)
-            at = box[0] + (np.arange(len(line)) + 0.5) * box[1] / len(line)
-            axes.plot(at, line, color=colour, label=role, linestyle=DASHES[role], linewidth=1.5)
-        axes.set_title(named)
+            x = box[0] + (np.arange(len(line)) + 0.5) * box[1] / len(line)
+            axes.plot(x, line, color=colour, label=role, linestyle=DASHES[role], linewidth=1.5)
+        axes.set_title(label)
         axes.set_xlabel(f"{axis} [length]")
         axes.xaxis.set_major_locator(MaxNLocator(6))
         axes.margins(x=0.02, y=0.08)
@@ -458,6 +466,6 @@ def plot_profile(values: dict[str, NDArray], axis: str, box: tuple[float, float]
 
 
 def central_line(values: NDArray, axis: str) -> NDArray:
-    """The voxels along an axis through the one in the middle of (Z, Y, X)."""
+    """Return the values along an axis through the middle voxel of a grid (Z, Y, X)."""
     z, y, x = (n // 2 for n in values.shape)
     return {"x": values[z, y, :], "y": values[z, :, x], "z": values[:, y, x]}[axis]

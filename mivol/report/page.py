@@ -1,9 +1,8 @@
-"""The page of a run: its results, the evidence for them, and how they were computed.
+"""The report page of a run folder.
 
-Conventions. :func:`write_page` reads a run's folder (:mod:`mivol.report.record`) and writes ``report.html`` into it, one
-file that loads nothing from anywhere: styles and curves inline, pictures as ``data:`` addresses. All pictures of one
-kind share one scale, which stands beside them. The page is the same bytes for the same folder. What the record does not
-have, the page does not show.
+Conventions. :func:`write_page` reads a run folder (:mod:`mivol.report.record`) and writes ``report.html`` into it. The page
+is one file and loads nothing: styles and curves are inline, images are ``data:`` addresses. All images of a kind share one
+scale, printed beside the images. The same folder always gives the same bytes. Sections without data are left out.
 """
 
 from __future__ import annotations
@@ -23,13 +22,15 @@ from mivol.errors import MivolError
 from mivol.files import write_whole_text
 from mivol.report import figures
 from mivol.report.figures import draw_profiles
-from mivol.report.page_images import ViewRow, VolumeView, encode_film, encode_image, make_view_rows, make_volume_views
+from mivol.report.page_images import Z_IMAGE, ViewRow, VolumeView, encode_film, encode_image, make_view_rows, make_volume_views
 from mivol.report.record import CODES, LINES, QUANTITIES, SINOGRAM, RunRecord, find_quantity, read_metrics, read_record
 
 __all__ = ["PAGE", "headline", "write_page"]
 
 PAGE = "report.html"
 SHOWN_VIEWS = 4
+"""Views visible at once; the page folds the others."""
+
 VERDICTS = {"finished": "Reconstructed in", "stopped": "Stopped after", "running": "Still running after"}
 
 
@@ -37,14 +38,14 @@ def write_page(folder: str | Path) -> Path:
     """Write ``report.html`` from the record, the metrics, the images and the volumes of a run.
 
     Args:
-        folder: the run's folder; a run that is not finished gives a page of what there is.
+        folder: run folder; the page of an unfinished run shows the results so far.
 
     Returns:
         Path of the page.
 
     Raises:
-        MivolError: no record, a file that the record names is missing or cannot be read, images of one view differ in
-            size, or a citation key is unknown.
+        MivolError: no record, a missing or unreadable file of the record, different sizes of images of a view, or an
+            unknown citation key.
     """
     folder = Path(folder)
     record, rows = read_record(folder), read_metrics(folder)
@@ -58,6 +59,7 @@ def write_page(folder: str | Path) -> Path:
         "numbers": _numbers(record, groups.rows, volumes),
         "sinograms": make_view_rows(folder, sinograms),
         "are_lines": any(image.quantity == LINES for image in record.images),
+        "has_z": any(picture.name == Z_IMAGE for row in groups.rows for picture in row.pictures),
         "are_codes": any(image.quantity == CODES for image in record.images),
         "views": groups,
         "shown": SHOWN_VIEWS,
@@ -77,30 +79,29 @@ def write_page(folder: str | Path) -> Path:
 
 
 def headline(record: RunRecord, held_out_psnr: Sequence[float] = ()) -> str:
-    """The result in one sentence: how long, how well on views that were not fitted, how well in the volume.
+    """Return the result in one sentence: time, PSNR of the held-out views, error of the volume.
 
     Args:
-        record: its ``status``, ``timings`` and ``results`` are used.
+        record: supplies ``status``, ``timings`` and ``results``.
         held_out_psnr: PSNR [dB] of each held-out view.
     """
-    found = []
+    errors = []
     if held_out_psnr:
-        found.append(f"held-out views to {np.mean(held_out_psnr):.1f} dB PSNR{_judged(record)}")
+        errors.append(f"{np.mean(held_out_psnr):.1f} dB PSNR on held-out views{_judged_by(record)}")
     if record.results.get("nrmse") is not None:
-        found.append(f"the volume to an nRMSE of {record.results['nrmse']:.3g}")
+        errors.append(f"a volume nRMSE of {record.results['nrmse']:.3g}")
     cores = f"{record.machine.cores} core" + ("s" if record.machine.cores != 1 else "")
-    seconds = _seconds(record)
-    when = f"{VERDICTS[record.status]} {_duration(seconds)}" if seconds else VERDICTS[record.status].rpartition(" ")[0]
-    return f"{when} on {cores}" + (": " + ", ".join(found) if found else "") + "."
+    seconds = _total_seconds(record)
+    verdict = f"{VERDICTS[record.status]} {_duration(seconds)}" if seconds else VERDICTS[record.status].rpartition(" ")[0]
+    return f"{verdict} on {cores}" + (": " + ", ".join(errors) if errors else "") + "."
 
 
-def _judged(record: RunRecord) -> str:
-    """How the PSNR of held-out views was found, where the run judged them itself: how many, at which size, and with which
-    colours."""
+def _judged_by(record: RunRecord) -> str:
+    """Number and size of the held-out views in brackets, and their PSNR after colour correction if it was measured."""
     if not record.judged:
         return ""
-    fitted = record.results.get("psnr_colour_fitted")
-    return f" ({record.judged}{'' if fitted is None else f', raw; {fitted:.1f} dB with their colours fitted'})"
+    corrected = record.results.get("psnr_colour_fitted")
+    return f" ({record.judged}{'' if corrected is None else f'; {corrected:.1f} dB after colour correction'})"
 
 
 def _environment() -> jinja2.Environment:
@@ -116,7 +117,7 @@ def _environment() -> jinja2.Environment:
 
 
 def _unbroken(sentence: str) -> str:
-    """The sentence with numbers kept beside their units at the end of a line."""
+    """Keep a number and the unit on one line."""
     return re.sub(r"(\d) (?=\D)", "\\1\u00a0", sentence).replace("held-out", "held\u2011out")
 
 
@@ -124,8 +125,8 @@ def _check_present(folder: Path, record: RunRecord) -> None:
     for part in (*record.images, *record.volumes):
         if not (folder / part.path).is_file():
             raise MivolError(
-                f'the record names "{part.path}", which is not in the run folder; put the file back or take '
-                "its entry out of run.json."
+                f'the record names "{part.path}", which is missing from the run folder; restore the file or remove '
+                "its entry from run.json."
             )
 
 
@@ -133,27 +134,26 @@ def _check_present(folder: Path, record: RunRecord) -> None:
 
 
 def _held_out_psnr(record: RunRecord, views: Sequence[ViewRow]) -> list[float]:
-    """PSNR of the views that were not fitted: of those that are shown, or the mean of all that the run has judged itself."""
-    judged = record.results.get("held_out_psnr")
-    if judged is not None:
-        return [judged]
+    """PSNR [dB] of the held-out views: the mean measured by the run, or a value for each view on the page."""
+    mean = record.results.get("held_out_psnr")
+    if mean is not None:
+        return [mean]
     return [view.psnr for view in views if view.held_out and view.psnr is not None]
 
 
 def _numbers(record: RunRecord, views: Sequence[ViewRow], volumes: Sequence[VolumeView]) -> list[tuple[str, str, str]]:
     """Tiles under the headline: value, unit, label."""
     held_out = _held_out_psnr(record, views)
-    seconds, said, tiles = _seconds(record), ("nrmse", "held_out_psnr", "seconds"), []
+    seconds, leading, tiles = _total_seconds(record), ("nrmse", "held_out_psnr", "seconds"), []
     if record.results.get("nrmse") is not None:
         tiles.append(_tile("nrmse", record.results["nrmse"], record.units))
     if held_out:
         spread = f" ({min(held_out):.1f} to {max(held_out):.1f})" if len(held_out) > 1 else ""
-        is_raw = record.results.get("psnr_colour_fitted") is not None
-        said_of = f": {record.judged}{', raw' if is_raw else ''}" if record.judged else ""
-        tiles.append((f"{np.mean(held_out):.1f}", "dB", f"PSNR, held-out views{spread}{said_of}"))
+        judged = f": {record.judged}" if record.judged else ""
+        tiles.append((f"{np.mean(held_out):.1f}", "dB", f"PSNR, held-out views{spread}{judged}"))
     if seconds:
-        tiles.append((*_duration(seconds).split(" "), "in all"))
-    tiles += [_tile(name, value, record.units) for name, value in record.results.items() if name not in said]
+        tiles.append((*_duration(seconds).split(" "), "total time"))
+    tiles += [_tile(name, value, record.units) for name, value in record.results.items() if name not in leading]
     shapes = dict.fromkeys(volume.shape for volume in volumes)
     tiles += [(*_count(math.prod(shape)), f"voxels, {_times(shape)}") for shape in shapes]
     return tiles
@@ -163,29 +163,29 @@ def _tile(name: str, value: float | None, units: dict[str, str]) -> tuple[str, s
     quantity = find_quantity(name, units)
     if value is None:
         return "–", "", quantity.label
-    return (f"{value:,.0f}" if float(value).is_integer() else f"{value:.3g}"), quantity.beside, quantity.label
+    return (f"{value:,.0f}" if float(value).is_integer() else f"{value:.3g}"), quantity.symbol, quantity.label
 
 
 def _curves(rows: Sequence[dict], units: dict[str, str]) -> list[str]:
-    """Curves of every number in the metrics: known ones first, then the others by name."""
+    """Curves of all quantities in the metrics: those of ``QUANTITIES`` first, then the others by name."""
     names = {name for row in rows for name, value in row.items() if value is not None} - {"iteration", "seconds"}
     ordered = [name for name in QUANTITIES if name in names] + sorted(names - set(QUANTITIES))
     labels = {name: f"{find_quantity(name, units).label} against iterations" for name in ordered}
     return [figures.inline_svg(figures.plot_curve(rows, name, units=units), label) for name, label in labels.items()]
 
 
-def _seconds(record: RunRecord) -> float:
+def _total_seconds(record: RunRecord) -> float:
     return record.results.get("seconds") or sum(record.timings.values())
 
 
 def _timings(timings: dict[str, float]) -> list[tuple[str, float, float]]:
-    """Stages with their seconds and their share of the longest, in percent."""
+    """Stages with their seconds and their percentage of the longest stage."""
     longest = max(timings.values(), default=0.0) or 1.0
     return [(name, seconds, 100 * seconds / longest) for name, seconds in timings.items()]
 
 
 def _count(number: int) -> tuple[str, str]:
-    """A count to three digits, and its prefix."""
+    """A count with three digits, and its SI prefix."""
     for size, prefix in ((1e9, "G"), (1e6, "M"), (1e3, "k")):
         if number >= size:
             return f"{number / size:.3g}", prefix
@@ -209,7 +209,7 @@ def _duration(seconds: float) -> str:
 
 
 def _toml(config: dict[str, Any], prefix: str = "") -> str:
-    """The configuration as TOML: plain values first, then a table for each group; what is not set is left out."""
+    """The settings as TOML: plain values first, then a table for each group, without unset values."""
     config = {key: value for key, value in config.items() if value is not None}
     plain = [f"{key} = {_value(value)}" for key, value in config.items() if not isinstance(value, dict)]
     parts = ["\n".join(([f"[{prefix}]"] if prefix and plain else []) + plain)] if plain else []

@@ -1,6 +1,6 @@
-"""The pictures of a run's page: views with their differences, slices of volumes, films; those of one kind share one scale.
+"""The images of a report page: views with their differences, slices of volumes, films.
 
-Conventions. Pictures are ``data:`` addresses, so that the page loads nothing from anywhere.
+Conventions. Images are ``data:`` addresses, so the page loads nothing. All images of a kind share one scale.
 """
 
 from __future__ import annotations
@@ -26,18 +26,25 @@ __all__ = [
 
 LAYERS = 16
 LAYER_EDGE = 128
-"""Slices of a volume that a page can be scrolled through, and pixels of an edge: a page stays below a few MB."""
+"""Largest number of scrollable slices of a volume, and their largest edge [pixel]: a page stays below a few MB."""
 
 WIDEST = 8.0
-"""Longer over shorter edge of a picture: two rows of a detector would be a line otherwise. Longer ones are stretched to it."""
+"""Largest ratio of the edges of an image. The page stretches longer images, which keeps two detector rows visible."""
+
+Z_IMAGE = "z-image"
+"""Name of the image of differences divided by their standard errors."""
 
 Z_LIMIT = 4.0
-Z_ODD = 3.0
+"""Ends of the scale of a z-image."""
+
+Z_OUTLIER = 3.0
+"""Larger values of a z-image are counted in the text of the view."""
+
 FILMS = {".mp4": "video/mp4", ".webp": "image/webp", ".gif": "image/gif"}
 
 
 class PageImage(NamedTuple):
-    """One picture of the page: a PNG as an address, its size in pixels and its width over height in the world."""
+    """One image of the page: a PNG as ``data:`` address, its size [pixel], and its width over height in the world."""
 
     name: str
     uri: str
@@ -47,12 +54,12 @@ class PageImage(NamedTuple):
 
     @property
     def is_coarse(self) -> bool:
-        """True where pixels are to be seen as squares when the picture is enlarged."""
+        """Whether an enlarged image shows its pixels as squares."""
         return max(self.width, self.height) <= 320
 
 
 class ViewRow(NamedTuple):
-    """A row of pictures of one view with its numbers."""
+    """The images of a view in a row, with their numbers."""
 
     name: str
     held_out: bool
@@ -63,7 +70,7 @@ class ViewRow(NamedTuple):
 
 
 class ColourBar(NamedTuple):
-    """A colour bar: what it measures, its ends, and its CSS gradient."""
+    """A colour bar: quantity, the values at both ends, and the CSS gradient."""
 
     label: str
     low: str
@@ -72,15 +79,22 @@ class ColourBar(NamedTuple):
 
 
 class ViewRows(NamedTuple):
-    """Views that share scales."""
+    """Views with shared scales."""
 
     rows: list[ViewRow]
     bars: list[ColourBar]
 
 
 class VolumeView(NamedTuple):
-    """Slices of one quantity's volumes, one row a plane, and the voxels of the reconstruction along x, y, z; and slices xy from
-    the lowest to the highest, to be scrolled through, one row a layer (none of a volume of one layer)."""
+    """Slices of the volumes of a quantity.
+
+    Attributes:
+        title: caption, or the quantity.
+        shape: voxels of the reconstruction along x, y, z.
+        rows: middle slices, one row per plane.
+        bars: colour bars.
+        layers: xy slices from the lowest to the highest, for scrolling; empty for a single layer.
+    """
 
     title: str
     shape: tuple[int, ...]
@@ -90,7 +104,7 @@ class VolumeView(NamedTuple):
 
 
 def make_view_rows(folder: Path, images: Sequence[Image]) -> ViewRows:
-    """Views that have a reference or a render, held-out ones first, all on the same scales."""
+    """Return all views with a reference or a render on shared scales, held-out views first."""
     by_view: dict[str, dict[str, Image]] = {}
     for image in images:
         if image.role not in ("slice", "picture", "film"):
@@ -107,7 +121,7 @@ def make_view_rows(folder: Path, images: Sequence[Image]) -> ViewRows:
 
 
 def _load(folder: Path, image: Image) -> NDArray:
-    """Pixels of an image: float64 linear values, or uint8 of a PNG that is shown as it is."""
+    """Read the pixels of an image: linear float64 values, or the uint8 pixels of a PNG."""
     path = folder / image.path
     if path.suffix == ".png":
         return _png(path)
@@ -122,7 +136,7 @@ def _exr(path: Path, layer: str) -> NDArray:
     name = next((name for name in wanted if name in stacked), None)
     if name is None:
         listed = ", ".join(f'"{name}"' for name in stacked)
-        raise MivolError(f"{path.name} has the layers {listed}; name one of them in the record.")
+        raise MivolError(f"{path.name} has the layers {listed}; name one of these layers in the record.")
     return stacked[name].astype(float).reshape(*stacked[name].shape[:2], -1)[..., :3]
 
 
@@ -130,7 +144,7 @@ def _png(path: Path) -> NDArray[np.uint8]:
     try:
         pixels = imread(path, format="png")
     except (OSError, SyntaxError, ValueError) as error:
-        raise MivolError(f"{path.name} is no whole PNG ({error}); restore it, or make the run again.") from error
+        raise MivolError(f"{path.name} is not a complete PNG ({error}); restore the file, or repeat the run.") from error
     rgb = np.repeat(pixels[..., None], 3, axis=2) if pixels.ndim == 2 else pixels[..., :3]
     return np.round(255 * rgb).astype(np.uint8)
 
@@ -143,25 +157,25 @@ def _check_sizes(view: str, roles: dict[str, NDArray]) -> None:
 
 
 def _add_differences(roles: dict[str, NDArray]) -> None:
-    """Put the difference and the z-image beside a reference and a render of linear values, an error beside those of pixels."""
+    """Add the difference and the z-image to a view of linear values, and the absolute error to a view of 8-bit pixels."""
     if {"reference", "render"} <= roles.keys() and roles["reference"].dtype == roles["render"].dtype == np.uint8:
         roles["error"] = np.abs(roles["render"].astype(float) - roles["reference"]).mean(axis=2) / 255
-    if not _are_numbers(roles, "reference", "render"):
+    if not _are_linear(roles, "reference", "render"):
         return
     difference = roles["difference"] = roles["render"] - roles["reference"]
-    if _are_numbers(roles, "standard error"):
+    if _are_linear(roles, "standard error"):
         with np.errstate(divide="ignore", invalid="ignore"):
             roles["z"] = np.where(difference == 0, 0.0, difference / roles["standard error"])
 
 
-def _are_numbers(roles: dict[str, NDArray], *names: str) -> bool:
-    """True where all of these are there and hold linear values, not the bytes of a PNG."""
+def _are_linear(roles: dict[str, NDArray], *names: str) -> bool:
+    """Whether all named images exist and hold linear values, not the bytes of a PNG."""
     return all(name in roles and roles[name].dtype != np.uint8 for name in names)
 
 
 def _scales(views: Iterable[dict[str, NDArray]]) -> dict[str, pixel_scale.Scale]:
-    """Scales by role, each shared by all views: values from the references, differences symmetric, z fixed."""
-    views = [{role: image for role, image in roles.items() if _are_numbers(roles, role)} for roles in views]
+    """Scales by role, shared by all views: values by the references, differences symmetric, z-images fixed."""
+    views = [{role: image for role, image in roles.items() if _are_linear(roles, role)} for roles in views]
     shown = [roles.get("reference", roles.get("render")) for roles in views]
     values = [image for image in shown if image is not None]
     differences = [roles["difference"] for roles in views if "difference" in roles]
@@ -183,41 +197,41 @@ PANELS = {
     "render": "Render",
     "difference": "Render − reference",
     "error": "|Render − reference|",
-    "z": "z-image",
+    "z": Z_IMAGE,
 }
 PANELS_OF_LINES = {
     "reference": "Measured",
     "render": "Modelled",
     "difference": "Modelled − measured",
-    "z": "Difference over noise",
+    "z": "Difference / noise",
 }
 
 
-def _names_of(images: Iterable[Image]) -> dict[str, str]:
-    """What the pictures of a view are called: a line integral is measured, not rendered."""
+def _panel_names(images: Iterable[Image]) -> dict[str, str]:
+    """Names of the images of a view by role: a line integral is measured, not rendered."""
     return PANELS_OF_LINES if any(image.quantity == LINES for image in images) else PANELS
 
 
 def _view(name: str, images: dict[str, Image], roles: dict[str, NDArray], scales: dict[str, pixel_scale.Scale]) -> ViewRow:
-    names = _names_of(images.values())
+    names = _panel_names(images.values())
     pictures = [_picture(names[role], roles[role], scales.get(role)) for role in names if role in roles]
-    words = [next((image.caption for image in images.values() if image.caption), "")]
+    facts = [next((image.caption for image in images.values() if image.caption), "")]
     psnr = None
-    if _are_numbers(roles, "reference", "difference"):
-        psnr, said = _agreement(roles["reference"], roles["difference"])
-        words.append(said)
+    if _are_linear(roles, "reference", "difference"):
+        psnr, errors = _agreement(roles["reference"], roles["difference"])
+        facts.append(errors)
     if "z" in roles:
-        words.append(f"|z| > {Z_ODD:g} in {np.mean(np.abs(roles['z']) > Z_ODD):.1%} of the values")
+        facts.append(f"|z| > {Z_OUTLIER:g} in {np.mean(np.abs(roles['z']) > Z_OUTLIER):.1%} of the values")
     held_out = any(image.held_out for image in images.values())
     small = any(image.small for image in images.values())
-    return ViewRow(name, held_out, pictures, psnr, " · ".join(word for word in words if word), small)
+    return ViewRow(name, held_out, pictures, psnr, " · ".join(fact for fact in facts if fact), small)
 
 
 def _agreement(reference: NDArray, difference: NDArray) -> tuple[float | None, str]:
-    """PSNR [dB] with the reference's largest value as the peak, where it is a number, and what to say of the view."""
+    """PSNR [dB], its peak the largest value of the reference (None if undefined), and the errors of the view as text."""
     broken = int(np.sum(~np.isfinite(difference)))
     if broken:
-        return None, f"{broken} of {difference.size} values not finite"
+        return None, f"{broken} of {difference.size} values are not finite"
     mse, power, peak = (float(f(v)) for f, v in ((np.mean, difference**2), (np.mean, reference**2), (np.max, reference)))
     if mse == 0 or peak <= 0:
         return None, "identical" if mse == 0 else f"RMSE {np.sqrt(mse):.3g}"
@@ -228,30 +242,31 @@ def _agreement(reference: NDArray, difference: NDArray) -> tuple[float | None, s
 def _picture(name: str, image: NDArray, scale: pixel_scale.Scale | None, aspect: float | None = None) -> PageImage:
     rgb = image if image.dtype == np.uint8 else pixel_scale.to_pixels(image, scale or pixel_scale.shared_scale(image))
     height, width = rgb.shape[:2]
-    true = aspect or width / height
-    shown = min(max(true, 1 / WIDEST), WIDEST)
-    return PageImage(name if shown == true else f"{name}, stretched", pixel_scale.data_uri(rgb), width, height, shown)
+    aspect = aspect or width / height
+    page_aspect = min(max(aspect, 1 / WIDEST), WIDEST)
+    name = name if page_aspect == aspect else f"{name}, stretched"
+    return PageImage(name, pixel_scale.data_uri(rgb), width, height, page_aspect)
 
 
 def encode_image(folder: Path, image: Image) -> PageImage:
-    """An image that stands alone, with a scale of its own."""
+    """Return a single image on its own scale."""
     return _picture(image.caption or image.view or Path(image.path).stem, _load(folder, image), None)
 
 
 def encode_film(folder: Path, image: Image) -> tuple[str, str, bool]:
-    """The caption of a film, the film as an address, and whether it is an animated image."""
+    """Return the caption of a film, its ``data:`` address, and whether the film is an animated image."""
     coded = base64.b64encode((folder / image.path).read_bytes()).decode()
     kind = FILMS[Path(image.path).suffix]
     return image.caption or image.view, f"data:{kind};base64,{coded}", kind.startswith("image/")
 
 
 def _bar_labels(scales: dict[str, pixel_scale.Scale], image: Image | None) -> list[tuple[str, str]]:
-    what = f"{image.quantity} [{image.unit}]" if image and image.unit else image.quantity if image else ""
-    names = _names_of([image] if image else [])
+    quantity = f"{image.quantity} [{image.unit}]" if image and image.unit else image.quantity if image else ""
+    names = _panel_names([image] if image else [])
     labels = {
-        "reference": f"{what[:1].upper()}{what[1:]}",
+        "reference": f"{quantity[:1].upper()}{quantity[1:]}",
         "difference": names["difference"],
-        "error": "|Render − reference|, mean of the colours [code value]",
+        "error": "|Render − reference|, mean over RGB [code value]",
         "z": names["z"] if names is PANELS_OF_LINES else "z = difference / standard error",
     }
     return [(role, label) for role, label in labels.items() if role in scales]
@@ -260,7 +275,7 @@ def _bar_labels(scales: dict[str, pixel_scale.Scale], image: Image | None) -> li
 def _bar(scale: pixel_scale.Scale, label: str) -> ColourBar:
     stops = pixel_scale.to_pixels(np.linspace(scale.low, scale.high, 17)[None, :], scale)[0]
     gradient = ", ".join("#{:02x}{:02x}{:02x}".format(*stop) for stop in stops)
-    # A percentile between zeros may be 1e-16.
+    # A percentile of zeros may be 1e-16.
     low = scale.low if abs(scale.low) > 1e-9 * scale.high else 0.0
     return ColourBar(label, f"{low:.3g}", f"{scale.high:.3g}", gradient)
 
@@ -269,21 +284,24 @@ def _bar(scale: pixel_scale.Scale, label: str) -> ColourBar:
 
 
 def make_volume_views(folder: Path, volumes: Sequence[Volume]) -> list[VolumeView]:
-    """Slices of every volume that was reconstructed: those of one caption and quantity belong together."""
+    """Return the slices of every reconstructed volume. Volumes of the same caption and quantity belong together."""
     groups: dict[tuple[str, str], dict[str, Volume]] = {}
     for volume in volumes:
         groups.setdefault((volume.caption, volume.quantity), {})[volume.role] = volume
-    return [_cut(folder, group) for group in groups.values() if "reconstruction" in group]
+    return [_volume_view(folder, group) for group in groups.values() if "reconstruction" in group]
 
 
-def _cut(folder: Path, by_role: dict[str, Volume]) -> VolumeView:
-    """Slices of the truth, the reconstruction and their difference, one row a plane."""
-    data = {role: read_volume(folder / by_role[role].path) for role in ("truth", "reconstruction") if role in by_role}
-    size = by_role["reconstruction"].size or tuple(np.linalg.norm(data["reconstruction"].to_world[:3, :3], axis=0))
-    cuts = {role: pixel_scale.middle_slices(found.values, size) for role, found in data.items()}
-    if len(cuts) == 2 and data["truth"].values.shape == data["reconstruction"].values.shape:
-        truth, found = cuts["truth"].images, cuts["reconstruction"]
-        cuts["difference"] = found._replace(images={p: image - truth[p] for p, image in found.images.items()})
+def _volume_view(folder: Path, by_role: dict[str, Volume]) -> VolumeView:
+    """Slices of the truth, the reconstruction and their difference, one row per plane."""
+    volumes = {role: read_volume(folder / by_role[role].path) for role in ("truth", "reconstruction") if role in by_role}
+    size = by_role["reconstruction"].size or tuple(np.linalg.norm(volumes["reconstruction"].to_world[:3, :3], axis=0))
+    grids = {role: volume.values for role, volume in volumes.items()}
+    cuts = {role: pixel_scale.middle_slices(grid, size) for role, grid in grids.items()}
+    reconstruction = grids["reconstruction"]
+    if len(cuts) == 2 and grids["truth"].shape == reconstruction.shape:
+        truth, cut = cuts["truth"].images, cuts["reconstruction"]
+        cuts["difference"] = cut._replace(images={p: image - truth[p] for p, image in cut.images.items()})
+        grids["difference"] = reconstruction - grids["truth"]
     first = next(iter(cuts.values()))
     values = pixel_scale.shared_scale(*first.images.values())
     scales = {"truth": values, "reconstruction": values}
@@ -295,21 +313,17 @@ def _cut(folder: Path, by_role: dict[str, Volume]) -> VolumeView:
     bars = [_bar(values, f"{described.quantity}{unit}")]
     if "difference" in scales:
         bars.append(_bar(scales["difference"], f"Reconstruction − truth{unit}"))
-    found = data["reconstruction"].values
-    volumes = {role: each.values for role, each in data.items()}
-    if "difference" in cuts:
-        volumes["difference"] = found - volumes["truth"]
-    layers = [_layer(share, volumes, scales, first.aspect["xy"]) for share in _heights(found.shape[0])]
-    return VolumeView(described.caption or described.quantity, found.shape[2::-1], rows, bars, layers)
+    layers = [_layer(share, grids, scales, first.aspect["xy"]) for share in _layer_heights(reconstruction.shape[0])]
+    return VolumeView(described.caption or described.quantity, reconstruction.shape[2::-1], rows, bars, layers)
 
 
-def _heights(count: int) -> list[float]:
-    """Where the layers of a volume are that can be scrolled through: at most LAYERS, as shares of its height."""
+def _layer_heights(count: int) -> list[float]:
+    """Heights of the scrollable layers as shares of the volume's height, at most ``LAYERS``."""
     return [] if count < 2 else ((np.arange(min(count, LAYERS)) + 0.5) / min(count, LAYERS)).tolist()
 
 
 def _layer(share: float, volumes: dict[str, NDArray], scales: dict[str, pixel_scale.Scale], aspect: float) -> dict[str, Any]:
-    """The slice xy at a share of the height of each volume, the second axis upwards, at most LAYER_EDGE pixels an edge."""
+    """The xy slices of all volumes at a share of their height, y upwards, edges of at most ``LAYER_EDGE`` pixels."""
     count = volumes["reconstruction"].shape[0]
     pictures = []
     for role, values in volumes.items():
@@ -320,7 +334,7 @@ def _layer(share: float, volumes: dict[str, NDArray], scales: dict[str, pixel_sc
 
 
 def _planes(cut: pixel_scale.Slices, scale: pixel_scale.Scale) -> dict[str, Any]:
-    """The three planes of one volume side by side."""
+    """The three middle slices of a volume in a row."""
     pictures = [_picture(f"{p}, {cut.where[p]}", image, scale, cut.aspect[p]) for p, image in cut.images.items()]
     return {"plane": "", "where": "", "pictures": pictures}
 

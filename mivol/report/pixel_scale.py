@@ -1,9 +1,11 @@
-"""Numbers as pixels: every picture of a kind on one scale, and the scale said beside it.
+"""Map numbers to pixels on a scale shared by all images of a kind.
 
-Conventions. Images are (height, width[, 1 or 3]) of linear values, row 0 at the top; pixels are uint8 (height, width,
-3). A :class:`Scale` is shared by all pictures that are meant to be compared. Radiance in three channels is shown in sRGB;
-everything in one channel is grey, linear in the value; differences are blue below zero, white at zero, red above.
-Pixels that are not finite are magenta.
+Conventions. Images hold linear values (height, width[, 1 or 3]), row 0 at the top; pixels are uint8 (height, width, 3).
+Images meant for comparison share a :class:`Scale`. Radiance of three channels is shown in sRGB. A single channel is grey and
+linear in the value. Differences are blue below zero, white at zero and red above. Pixels that are not finite are magenta.
+
+Distances are measured along unit rays [length]; near is light, far is dark, and an opacity of 0 is white. A world normal n
+has the colour (1 + n)/2.
 """
 
 from __future__ import annotations
@@ -24,27 +26,32 @@ from mivol.files.atomic import write_whole_bytes
 from mivol.photos import Camera, pixel_centres, rays
 
 __all__ = [
-    "SIGNED",
-    "Scale",
-    "Slices",
-    "data_uri",
-    "to_pixels",
-    "shared_scale",
-    "signed_scale",
-    "middle_slices",
-    "COLOURS",
-    "depth_pixels",
-    "normal_pixels",
-    "normals_from_depth",
+    *("SIGNED", "Scale", "Slices", "data_uri", "depth_pixels", "is_preview_due", "middle_slices", "normal_pixels"),
+    *("normals_from_depth", "shared_scale", "signed_scale", "to_pixels", "write_preview"),
 ]
 
 SIGNED = "RdBu_r"
-BROKEN = (255, 0, 255)
+"""Colour map of signed values."""
+
+DEPTHS = "viridis_r"
+"""Colour map of distances."""
+
+MAGENTA = (255, 0, 255)
 PLANES = {"xy": 0, "xz": 1, "yz": 2}
+PREVIEW = "preview.png"
+
+EDGE, GAP = 320, 8
+"""Longest edge of the box in a preview, and the gap between two slices [pixel]."""
 
 
 class Scale(NamedTuple):
-    """Values shown as black (or full blue) and white (or full red); ``kind`` is grey, colour or signed."""
+    """The range of values mapped to the range of colours.
+
+    Attributes:
+        kind: "grey", "colour" or "signed".
+        low: value shown black (signed: blue).
+        high: value shown white (signed: red).
+    """
 
     kind: str
     low: float
@@ -52,9 +59,9 @@ class Scale(NamedTuple):
 
 
 def shared_scale(*images: NDArray, low: float | None = 0.0, kind: str | None = None, percentile: float = 99.8) -> Scale:
-    """One scale for several images: from ``low`` (their smallest value if None) to their given percentile.
+    """Return a scale for several images, from ``low`` (None: the smallest value) to a percentile of their values.
 
-    The percentile, and not the maximum, so that one firefly does not turn the rest black.
+    A percentile instead of the maximum keeps one firefly from turning the rest black.
     """
     values = np.concatenate([image[np.isfinite(image)].ravel() for image in images])
     if values.size == 0:
@@ -66,17 +73,17 @@ def shared_scale(*images: NDArray, low: float | None = 0.0, kind: str | None = N
 
 
 def signed_scale(*images: NDArray, percentile: float = 99.8) -> Scale:
-    """One symmetric scale for several differences."""
+    """Return a symmetric scale for several differences."""
     values = np.concatenate([np.abs(image[np.isfinite(image)]).ravel() for image in images])
     limit = float(np.percentile(values, percentile)) if values.size else 0.0
     return Scale("signed", -limit if limit else -1.0, limit or 1.0)
 
 
 def to_pixels(image: NDArray, scale: Scale) -> NDArray[np.uint8]:
-    """The image in 8 bits on ``scale``.
+    """Return the image in 8 bits on a scale.
 
     Raises:
-        MivolError: not (height, width), (height, width, 1) or (height, width, 3).
+        MivolError: another shape than (height, width) or (height, width, 1 or 3).
     """
     values = np.asarray(image, np.float64)
     if values.ndim not in (2, 3) or _channels(values) not in (1, 3):
@@ -87,7 +94,7 @@ def to_pixels(image: NDArray, scale: Scale) -> NDArray[np.uint8]:
     broken = ~np.isfinite(values).all(axis=2)
     unit = np.clip((np.where(np.isfinite(values), values, 0.0) - scale.low) / (scale.high - scale.low), 0.0, 1.0)
     rgb = _KINDS[scale.kind](unit)
-    rgb[broken] = BROKEN
+    rgb[broken] = MAGENTA
     return rgb
 
 
@@ -111,19 +118,25 @@ def _channels(image: NDArray) -> int:
 
 
 def encode_png(rgb: NDArray[np.uint8]) -> bytes:
-    """The pixels as a PNG."""
+    """Encode pixels as PNG."""
     buffer = io.BytesIO()
     imsave(buffer, rgb, format="png", metadata={"Software": None}, pil_kwargs={"optimize": True})
     return buffer.getvalue()
 
 
 def data_uri(rgb: NDArray[np.uint8]) -> str:
-    """The pixels as a PNG inside a ``data:`` address."""
+    """Encode pixels as a ``data:`` address of a PNG."""
     return "data:image/png;base64," + base64.b64encode(encode_png(rgb)).decode("ascii")
 
 
 class Slices(NamedTuple):
-    """The middle slices of a grid by plane, first axis to the right, second upwards; ``where`` says which."""
+    """The three middle slices of a grid, each by its plane: "xy", "xz" or "yz".
+
+    Attributes:
+        images: slices; the first axis of the plane points right, the second up.
+        where: index of each slice as text.
+        aspect: width over height in the world.
+    """
 
     images: dict[str, NDArray]
     where: dict[str, str]
@@ -131,17 +144,14 @@ class Slices(NamedTuple):
 
 
 def middle_slices(grid: NDArray, size: tuple[float, float, float] | None = None) -> Slices:
-    """The three orthogonal slices through the middle of a grid.
+    """Return the three orthogonal slices through the middle of a grid.
 
     Args:
         grid: (Z, Y, X[, C]).
-        size: world lengths of the box along x, y, z; None: voxels are cubes.
-
-    Returns:
-        Slices ``xy``, ``xz``, ``yz`` with the second axis upwards, and width over height of each in the world.
+        size: edges of the box along x, y, z [length]; by default cubic voxels.
 
     Raises:
-        MivolError: the grid's rank is not 3 or 4.
+        MivolError: a grid of another rank.
     """
     grid = np.asarray(grid)
     if grid.ndim not in (3, 4):
@@ -154,16 +164,13 @@ def middle_slices(grid: NDArray, size: tuple[float, float, float] | None = None)
     return Slices(images, where, {"xy": x / y, "xz": x / z, "yz": y / z})
 
 
-COLOURS = "viridis_r"
-
-
 def depth_pixels(distance: NDArray, near_far: tuple[float, float], opacity: NDArray | None = None) -> NDArray[np.uint8]:
-    """Distances as colours (H, W, 3), mixed with white by the opacity.
+    """Return distances as colours (H, W, 3), mixed with white by the opacity.
 
     Args:
-        distance: (H, W) [length]; what is not finite is white.
-        near_far: distances that are lightest and darkest.
-        opacity: (H, W) in 0..1; None: 1.
+        distance: (H, W) [length]; values that are not finite are white.
+        near_far: distances of the lightest and the darkest colour [length].
+        opacity: (H, W) in 0..1, by default 1.
 
     Raises:
         MivolError: another shape, or near not below far.
@@ -171,24 +178,24 @@ def depth_pixels(distance: NDArray, near_far: tuple[float, float], opacity: NDAr
     _check_plane(distance)
     near, far = near_far
     if not near < far:
-        raise MivolError(f"distances are coloured between {near} and {far}; near must be below far.")
-    there = np.isfinite(distance)
-    share = np.clip((np.where(there, distance, far) - near) / (far - near), 0, 1)
-    return _over_white(mpl.colormaps[COLOURS](share)[..., :3], there, opacity)
+        raise MivolError(f"distances cannot be coloured between {near} and {far}; give near below far.")
+    finite = np.isfinite(distance)
+    share = np.clip((np.where(finite, distance, far) - near) / (far - near), 0, 1)
+    return _over_white(mpl.colormaps[DEPTHS](share)[..., :3], finite, opacity)
 
 
 def normals_from_depth(distance: NDArray, camera: Camera) -> NDArray:
-    """Unit normals (H, W, 3) in the world of the surface that a picture of distances is of, towards the camera.
+    """Return unit world normals (H, W, 3) of the surface in a distance image; they point towards the camera.
 
-    The surface is differentiated between neighbouring pixels (central differences inside, one-sided at the border), so that
-    an edge in the distance is a wall there. NaN where a neighbour is not finite.
+    Neighbouring pixels are differentiated (central differences inside, one-sided differences at the border). A jump in
+    distance therefore becomes a wall. A pixel with a non-finite neighbour is NaN.
 
     Raises:
-        MivolError: another size than the camera's.
+        MivolError: a size that differs from the camera's.
     """
     _check_plane(distance)
     if distance.shape != camera.size[::-1]:
-        raise MivolError(f"distances of shape {distance.shape} were not seen by a camera of {camera.size[::-1]} pixels.")
+        raise MivolError(f"distances of shape {distance.shape} do not fit a camera of {camera.size[::-1]} pixels.")
     origin, direction = rays(camera, pixel_centres(camera.size))
     points = origin + distance[..., None] * direction
     normal = np.cross(np.gradient(points, axis=0), np.gradient(points, axis=1))
@@ -198,38 +205,33 @@ def normals_from_depth(distance: NDArray, camera: Camera) -> NDArray:
 
 
 def normal_pixels(normals: NDArray, opacity: NDArray | None = None) -> NDArray[np.uint8]:
-    """Unit normals (H, W, 3) as colours, mixed with white by the opacity (H, W); NaN is white."""
-    there = np.isfinite(normals).all(axis=-1)
-    return _over_white((1 + np.where(there[..., None], normals, 0)) / 2, there, opacity)
+    """Return unit normals (H, W, 3) as colours, mixed with white by the opacity (H, W); NaN becomes white."""
+    finite = np.isfinite(normals).all(axis=-1)
+    return _over_white((1 + np.where(finite[..., None], normals, 0)) / 2, finite, opacity)
 
 
 def _check_plane(distance: NDArray) -> None:
     if np.ndim(distance) != 2 or min(np.shape(distance)) < 2:
-        raise MivolError(f"a picture of distances has shape {np.shape(distance)}; give (height, width), at least 2 x 2.")
+        raise MivolError(f"a distance image has shape {np.shape(distance)}; give (height, width), at least 2 x 2.")
 
 
-def _over_white(colour: NDArray, there: NDArray, opacity: NDArray | None) -> NDArray[np.uint8]:
-    a = np.where(there, 1.0 if opacity is None else np.clip(opacity, 0, 1), 0.0)[..., None]
+def _over_white(colour: NDArray, finite: NDArray, opacity: NDArray | None) -> NDArray[np.uint8]:
+    a = np.where(finite, 1.0 if opacity is None else np.clip(opacity, 0, 1), 0.0)[..., None]
     return np.round(255 * (a * colour + 1 - a)).astype(np.uint8)
 
 
-PREVIEW = "preview.png"
-EDGE, GAP = 320, 8
-"""Pixels of the box's longest edge, and between two slices."""
-
-
 def is_preview_due(iteration: int, iterations: int) -> bool:
-    """Whether a preview is written after an iteration: the first and the last one, and some twenty between."""
+    """Return whether a run writes a preview after an iteration: the first, the last, and about twenty between them."""
     return iteration in (1, iterations) or iteration % max(1, iterations // 20) == 0
 
 
 def write_preview(folder: Path, volume: NDArray, size: tuple[float, float, float]) -> Path:
-    """Write ``preview.png`` whole: the middle slices xy, xz and yz side by side, on one grey scale, second axis upwards.
+    """Write ``preview.png``: the middle slices xy, xz and yz side by side on one grey scale, the second axis up.
 
     Args:
-        folder: of the run.
+        folder: run folder.
         volume: (Z, Y, X).
-        size: lengths of the box's edges along x, y, z; the longest is EDGE pixels.
+        size: edges of the box along x, y, z [length]; the longest edge gets ``EDGE`` pixels.
     """
     cut = middle_slices(volume, size)
     scale = shared_scale(*cut.images.values())
@@ -246,6 +248,6 @@ def write_preview(folder: Path, volume: NDArray, size: tuple[float, float, float
 
 
 def _resized(rgb: NDArray[np.uint8], height: int, width: int) -> NDArray[np.uint8]:
-    """The nearest pixels."""
-    rows, columns = ((np.arange(n) + 0.5) * have // n for n, have in zip((height, width), rgb.shape, strict=False))
+    """Resize to the nearest pixels."""
+    rows, columns = ((np.arange(n) + 0.5) * old // n for n, old in zip((height, width), rgb.shape, strict=False))
     return rgb[rows.astype(int)[:, None], columns.astype(int)]

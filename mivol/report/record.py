@@ -1,12 +1,12 @@
-"""What was done and what came of it: ``run.json`` and ``metrics.jsonl`` in a run's folder.
+"""The record of a run: ``run.json`` and ``metrics.jsonl`` in the run folder.
 
-Conventions. ``run.json`` holds one :class:`RunRecord`, written whole at every change of state; its fields are the
-schema, unknown ones are errors. ``metrics.jsonl`` grows by one line an iteration. Paths are relative to the folder, with
-forward slashes. Times are seconds, memory GiB. Numbers that are not finite are ``null``. Nothing in either names the
-machine, its user or a place on its disk: of an absolute path in the configuration only the file's own name is kept.
+Conventions. ``run.json`` holds one :class:`RunRecord`, rewritten whole at every change of state; its fields are the schema,
+and unknown fields are errors. ``metrics.jsonl`` grows by one line per iteration. Paths are relative to the run folder, with
+forward slashes. Times are in seconds, memory is in GiB. Numbers that are not finite become ``null``. Both files hide the
+machine, the user and the folders: an absolute path in the settings is cut to the file name.
 
 Files of a run folder: ``run.json``, ``metrics.jsonl``, ``report.html`` (:mod:`mivol.report.page`), and the images and
-volumes that the record lists, wherever it says they are.
+volumes listed in the record.
 """
 
 from __future__ import annotations
@@ -50,21 +50,26 @@ __all__ = [
 RECORD = "run.json"
 METRICS = "metrics.jsonl"
 LINES = "line integral"
-"""The quantity of a projection, which is measured and modelled, not rendered."""
+"""Quantity of a projection; the page calls projections measured and modelled."""
 CODES = "sRGB value"
-"""The quantity of a photograph, and of what is held against it."""
+"""Quantity of a photograph and of its render."""
 SINOGRAM = "sinogram"
-"""The view that holds one row of a detector in all views."""
+"""View made of one detector row in all views."""
 DAMAGE = (msgspec.DecodeError, UnicodeDecodeError)
-"""What msgspec raises on text that is no JSON of the wanted kind."""
+"""Errors of msgspec for text that is not JSON of the expected type."""
 PACKAGES = ("mivol", "mitsuba", "drjit", "numpy", "scipy", "OpenEXR", "h5py", "msgspec", "matplotlib")
 
 
 class Quantity(NamedTuple):
-    """How a number of ``results`` or ``metrics.jsonl`` is named, drawn and printed.
+    """Label, unit and axis of a number in ``results`` or ``metrics.jsonl``.
 
-    ``nrmse`` is the root mean square error over all voxels divided by the truth's root mean square; ``psnr`` takes the
-    reference's largest value as its peak.
+    ``nrmse`` is the RMS error over all voxels divided by the RMS of the truth. The peak of ``psnr`` is the largest value of
+    the reference.
+
+    Attributes:
+        label: name for people.
+        unit: "1" for a dimensionless quantity, empty for a count, for a ratio and for an unknown unit.
+        log: whether curves have a logarithmic axis.
     """
 
     label: str
@@ -72,39 +77,42 @@ class Quantity(NamedTuple):
     log: bool = True
 
     @property
-    def beside(self) -> str:
-        """The unit as it stands beside a figure: [1] is a pure number, "" a count, a ratio that the label names, or unknown."""
+    def symbol(self) -> str:
+        """The unit beside a number: ``[1]`` for a dimensionless quantity."""
         return "[1]" if self.unit == "1" else self.unit
 
 
 QUANTITIES: dict[str, Quantity] = {
     "loss": Quantity("Loss"),
     "residual": Quantity("Residual |Ax − y| / |y|"),
-    "discrepancy": Quantity("Residual over noise, RMS (1: as small as the noise)"),
-    "held_out_rms_of_residual_over_noise": Quantity("Residual over noise, RMS of the held-out views"),
-    "gradient": Quantity("Norm of the gradient"),
+    "discrepancy": Quantity("RMS of residual over noise (noise level: 1)"),
+    "held_out_rms_of_residual_over_noise": Quantity("RMS of residual over noise, held-out views"),
+    "gradient": Quantity("Gradient norm"),
     "nrmse": Quantity("nRMSE of the volume"),
     "psnr": Quantity("PSNR of the fitted views", "dB", log=False),
     "held_out_psnr": Quantity("PSNR of the held-out views", "dB", log=False),
-    "psnr_colour_fitted": Quantity("PSNR of the held-out views, colours fitted", "dB", log=False),
-    "few_psnr": Quantity("PSNR of the same few held-out views", "dB", log=False),
+    "psnr_colour_fitted": Quantity("PSNR of the held-out views after colour correction", "dB", log=False),
+    "few_psnr": Quantity("PSNR of a fixed few held-out views", "dB", log=False),
     "ssim": Quantity("SSIM of the held-out views", log=False),
     "flip": Quantity("FLIP of the held-out views", log=False),
-    "nodes": Quantity("Nodes that are stored", log=False),
+    "nodes": Quantity("Stored nodes", log=False),
     "gaussians": Quantity("Gaussians", log=False),
     "bytes": Quantity("Memory of the field", "MiB", log=False),
     "seconds": Quantity("Time", "s"),
-    "fit_seconds": Quantity("Time of the fit", "s"),
+    "fit_seconds": Quantity("Fit time", "s"),
     "iterations": Quantity("Iterations", log=False),
-    "views": Quantity("Views fitted", log=False),
+    "views": Quantity("Fitted views", log=False),
     "memory": Quantity("Peak memory", "MiB", log=False),
 }
 
 
 def find_quantity(name: str, units: Mapping[str, str]) -> Quantity:
-    """How a number is named and printed: by ``QUANTITIES``, with the unit that a run has for it.
+    """Return label, unit and axis of a number: its entry in ``QUANTITIES``, with the unit of the run.
 
-    Numbers that a run alone has a unit for keep their names, which are keys of a scene, and even steps.
+    Args:
+        name: key in ``results`` or ``metrics.jsonl``. A key outside ``QUANTITIES`` that has a unit in the run is a parameter
+            of the scene: it keeps its name and a linear axis.
+        units: units of the run, by key.
     """
     known = QUANTITIES.get(name)
     if known is None:
@@ -112,22 +120,22 @@ def find_quantity(name: str, units: Mapping[str, str]) -> Quantity:
     return known._replace(unit=units.get(name, known.unit))
 
 
-class _Part(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
+class _Entry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
     pass
 
 
-class PlanLine(_Part):
-    """One line of the plan: what was chosen, and why."""
+class PlanLine(_Entry):
+    """One choice of the plan with its reason."""
 
     choice: str
     reason: str
 
 
-class Image(_Part):
-    """An image of the run: ``.exr``, ``.npy`` of linear values (height, width[, 1 or 3]); ``.png``, ``.mp4`` shown as they are.
+class Image(_Entry):
+    """An image of the run: linear values (height, width[, 1 or 3]) in ``.exr`` or ``.npy``, or a ``.png`` or ``.mp4`` to show.
 
-    Images of one ``view`` belong together: its ``reference`` and ``render`` are shown beside their difference, with a
-    z-image (difference over standard error) where the difference's ``standard error`` is there.
+    Images of the same ``view`` belong together: the page shows ``reference`` and ``render`` beside their difference, and the
+    z-image (difference divided by standard error) if the view has a ``standard error``.
     """
 
     path: str
@@ -135,15 +143,15 @@ class Image(_Part):
     view: str = ""
     held_out: bool = False
     layer: str = ""
-    """Which layer of an OpenEXR file; empty: the picture itself, or the only channel."""
+    """Layer of an OpenEXR file; empty for the main image or the only channel."""
     quantity: str = "radiance"
     unit: str = ""
     caption: str = ""
     small: bool = False
-    """Whether it is one of many that a page is scrolled through."""
+    """Whether the page shows the image in a scrollable list."""
 
 
-class Volume(_Part):
+class Volume(_Entry):
     """A grid of the run, (Z, Y, X, C), in any format of :func:`mivol.files.read_volume`."""
 
     path: str
@@ -151,22 +159,22 @@ class Volume(_Part):
     quantity: str = "sigma_t"
     unit: str = "1/length"
     size: tuple[float, float, float] | None = None
-    """World lengths of the box's edges along x, y, z; where missing, those of the file's own ``to_world``."""
+    """Edges of the box along x, y, z [length]; by default from the ``to_world`` of the file."""
     caption: str = ""
     profiles: bool = False
-    """Whether values along the three lines through its middle are drawn."""
+    """Whether the page shows profiles along the three axes through the middle voxel."""
 
 
-class Table(_Part):
-    """A table of the page: what its first row says, then its rows; the first column is text."""
+class Table(_Entry):
+    """A table of the page: header and rows; the first column is text."""
 
     title: str
     head: tuple[str, ...]
     rows: tuple[tuple[str, ...], ...]
 
 
-class Machine(_Part):
-    """Where it ran, as far as it matters to speed."""
+class Machine(_Entry):
+    """The properties of the machine that determine speed."""
 
     cores: int
     memory: float | None = None
@@ -175,15 +183,15 @@ class Machine(_Part):
 
 
 class RunRecord(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
-    """All of ``run.json``."""
+    """The content of ``run.json``."""
 
     title: str
     machine: Machine
     schema: Literal[1] = 1
     judged: str = ""
-    """By which views the results are judged: how many, and at which size."""
+    """Number and size of the held-out views behind the results."""
     method: str = ""
-    """One line: model, solver, what is optimised."""
+    """Model, solver and optimised parameters in one line."""
     status: Literal["running", "finished", "stopped"] = "running"
     started: str = ""
     """UTC, ISO 8601, to the second."""
@@ -195,37 +203,37 @@ class RunRecord(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
     timings: dict[str, float] = {}
     """Seconds by stage, in order; the stages do not overlap."""
     results: dict[str, float | None] = {}
-    """Final numbers; names of :data:`QUANTITIES` are printed with their labels."""
+    """Final numbers by name; :data:`QUANTITIES` has the labels."""
     units: dict[str, str] = {}
-    """Units of numbers of ``results`` and ``metrics.jsonl`` that depend on what was fitted; "1" is a pure number."""
+    """Units of numbers in ``results`` and ``metrics.jsonl`` that depend on the fit; "1" for dimensionless numbers."""
     images: list[Image] = []
     volumes: list[Volume] = []
     tables: list[Table] = []
     notes: list[str] = []
-    """Sentences that a reader must know: limits, refusals, events."""
+    """Sentences for the reader: limits, refusals, events."""
     citations: list[str] = []
     """Keys of :data:`mivol.cite.CITATIONS`."""
 
     @classmethod
     def new(cls, title: str, *, device: str = "", **fields: Any) -> RunRecord:
-        """A record of a run that starts now, on this machine, with the versions that are installed."""
+        """Return the record of a run starting now on this machine, with the installed versions."""
         now = datetime.now(UTC).isoformat(timespec="seconds").replace("+00:00", "Z")
         return cls(title=title, machine=describe_machine(device), versions=package_versions(), started=now, **fields)
 
 
 def package_versions() -> dict[str, str]:
-    """Versions of Python, the system and the packages that results depend on; those not installed are left out."""
-    found = {"python": platform.python_version(), "system": f"{platform.system()} {platform.machine()}"}
+    """Return the versions of Python, the system and the installed packages of ``PACKAGES``."""
+    versions = {"python": platform.python_version(), "system": f"{platform.system()} {platform.machine()}"}
     for package in PACKAGES:
         try:
-            found[package] = metadata.version(package)
+            versions[package] = metadata.version(package)
         except metadata.PackageNotFoundError:
             continue
-    return found
+    return versions
 
 
 def describe_machine(device: str = "") -> Machine:
-    """Cores that this process may use, main memory and ``device`` (by default the processor's model)."""
+    """Return the usable cores, the main memory and ``device``, by default the model of the processor."""
     return Machine(cores=cores(), memory=_memory(), device=device or _processor())
 
 
@@ -243,20 +251,20 @@ def _processor() -> str:
 
 
 def write_record(record: RunRecord, folder: str | Path) -> Path:
-    """Write ``run.json`` whole.
+    """Write ``run.json``, whole or not at all.
 
-    Absolute paths inside ``config``, ``command``, ``plan`` and ``notes`` are cut to the file's own name.
+    Absolute paths inside ``config``, ``command``, ``plan``, ``notes``, ``title`` and ``method`` are cut to the file name.
 
     Raises:
-        MivolError: an image or a volume lies outside the folder.
+        MivolError: an image or a volume outside the run folder.
     """
     for part in (*record.images, *record.volumes):
         _check_inside(part.path)
     plain = msgspec.to_builtins(record)
     for field in ("config", "command", "plan", "notes", "title", "method"):
-        plain[field] = _without_places(plain[field])
+        plain[field] = _hide_folders(plain[field])
     path = Path(folder) / RECORD
-    write_whole_text(path, json.dumps(_finite(plain), indent=2, ensure_ascii=False, allow_nan=False) + "\n")
+    write_whole_text(path, json.dumps(_null_nonfinite(plain), indent=2, ensure_ascii=False, allow_nan=False) + "\n")
     return path
 
 
@@ -264,11 +272,11 @@ def read_record(folder: str | Path) -> RunRecord:
     """Read ``run.json``.
 
     Raises:
-        MivolError: no such file, not JSON, an unknown, missing or wrong field, or a path that leaves the folder.
+        MivolError: no file, no JSON, an unknown, missing or wrong field, or a path outside the run folder.
     """
     path = Path(folder) / RECORD
     if not path.is_file():
-        raise MivolError(f'no {RECORD} in "{Path(folder).name}"; give the folder that `mivol optimize` wrote.')
+        raise MivolError(f'no {RECORD} in "{Path(folder).name}"; give a run folder written by `mivol optimize`.')
     try:
         record = msgspec.json.decode(path.read_bytes(), type=RunRecord)
     except DAMAGE as error:
@@ -279,22 +287,26 @@ def read_record(folder: str | Path) -> RunRecord:
 
 
 def append_metrics(folder: str | Path, iteration: int, seconds: float, **values: float) -> None:
-    """Add one line to ``metrics.jsonl``: the iteration, the seconds since the start, and numbers by name.
+    """Append one line to ``metrics.jsonl``: iteration, seconds since the start, and numbers by name.
+
+    :func:`read_metrics` skips a half-written last line.
 
     Raises:
-        MivolError: what the system refuses (disk full, quota, permission ...); of half a line nothing is read.
+        MivolError: full disk, exceeded quota, missing permission or another error of the system.
     """
     row = {"iteration": int(iteration), "seconds": float(seconds)} | {name: float(v) for name, v in values.items()}
     path = Path(folder) / METRICS
     with disk_faults(path, "room for another line"), path.open("a", encoding="utf-8") as file:
-        file.write(json.dumps(_finite(row), allow_nan=False) + "\n")
+        file.write(json.dumps(_null_nonfinite(row), allow_nan=False) + "\n")
 
 
 def read_metrics(folder: str | Path) -> list[dict[str, float | None]]:
-    """Rows of ``metrics.jsonl``, in order; none where there is no file. A last line without its end is a killed run's.
+    """Return the rows of ``metrics.jsonl`` in order, without the half-written last line of a killed run.
+
+    Without the file the list is empty.
 
     Raises:
-        MivolError: a whole line is not a JSON object.
+        MivolError: a complete line is not a JSON object.
     """
     path = Path(folder) / METRICS
     if not path.is_file():
@@ -307,7 +319,7 @@ def read_metrics(folder: str | Path) -> list[dict[str, float | None]]:
 
 
 def rewind_metrics(folder: str | Path, iteration: int) -> None:
-    """Drop the rows after ``iteration``, so that a run resumed from there says nothing twice."""
+    """Remove the rows after ``iteration``, which a resumed run writes again."""
     rows = [row for row in read_metrics(folder) if row["iteration"] <= iteration]
     text = "".join(json.dumps(row, allow_nan=False) + "\n" for row in rows)
     write_whole_text(Path(folder) / METRICS, text)
@@ -319,26 +331,26 @@ def _check_inside(path: str) -> None:
         raise MivolError(f'the record names "{path}"; give a path inside the run folder, relative to it.')
 
 
-_PLACE = re.compile(r"(?<![\w.:/\\])(?:~?/(?:[^\s/\"'=,;]+/)+|[A-Za-z]:\\(?:[^\s\\\"']+\\)+)")
+_ABSOLUTE_PATH = re.compile(r"(?<![\w.:/\\])(?:~?/(?:[^\s/\"'=,;]+/)+|[A-Za-z]:\\(?:[^\s\\\"']+\\)+)")
 
 
-def _without_places(value: Any) -> Any:
-    """``value`` with the folders of absolute paths taken out of every string in it."""
+def _hide_folders(value: Any) -> Any:
+    """Remove the folders of absolute paths from all strings of a nested value."""
     if isinstance(value, str):
-        return _PLACE.sub("", value)
+        return _ABSOLUTE_PATH.sub("", value)
     if isinstance(value, dict):
-        return {key: _without_places(item) for key, item in value.items()}
+        return {key: _hide_folders(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_without_places(item) for item in value]
+        return [_hide_folders(item) for item in value]
     return value
 
 
-def _finite(value: Any) -> Any:
-    """``value`` with ``None`` for every number that is not finite."""
+def _null_nonfinite(value: Any) -> Any:
+    """Replace all numbers of a nested value that are not finite by ``None``."""
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     if isinstance(value, dict):
-        return {key: _finite(item) for key, item in value.items()}
+        return {key: _null_nonfinite(item) for key, item in value.items()}
     if isinstance(value, list):
-        return [_finite(item) for item in value]
+        return [_null_nonfinite(item) for item in value]
     return value

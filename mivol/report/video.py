@@ -1,8 +1,8 @@
-"""Pictures one after the other, as a film.
+"""Films: frames, and the files that hold them.
 
-Conventions. Frames are uint8 (H, W, 3), sRGB, all of one size; ``.mp4`` is H.264 that browsers play (through the ffmpeg of
-imageio-ffmpeg, 8-bit 4:2:0, odd sizes get one more row or column). ``.webp`` and ``.gif`` are animated images, which need
-nothing and are several times larger; a ``.gif`` has 256 colours. Written whole.
+Conventions. Frames are uint8 (H, W, 3) in sRGB, of equal size. ``.mp4`` is H.264 for browsers, written by the ffmpeg of
+imageio-ffmpeg in 8-bit 4:2:0; odd sizes get one more row or column. ``.webp`` and ``.gif`` are animated images: they need no
+other program and are several times larger. A ``.gif`` has 256 colours. Files are written whole or not at all.
 """
 
 from __future__ import annotations
@@ -25,15 +25,15 @@ __all__ = ["NO_FFMPEG_NOTE", "WRITERS", "film_suffix", "write_video", "FEWEST_LA
 Frames = Iterator[NDArray[np.uint8]]
 
 QUALITY = "18"
-"""H.264's constant rate factor: 0 is lossless, 18 looks it."""
+"""Constant rate factor of H.264: 0 is lossless, 18 looks lossless."""
 
 
-NO_FFMPEG_NOTE = 'imageio-ffmpeg is not installed, so films are written as .webp: pip install "mivol[video]" makes them .mp4.'
-"""What to say where :func:`film_suffix` is not .mp4."""
+NO_FFMPEG_NOTE = 'Without imageio-ffmpeg films are written as .webp; install it for .mp4: pip install "mivol[video]".'
+"""Note for the user if :func:`film_suffix` is not ``.mp4``."""
 
 
 def film_suffix() -> str:
-    """The best kind of film that can be written here: .mp4 where imageio-ffmpeg and its program are found, else .webp."""
+    """Return the suffix of films on this machine: ``.mp4`` with imageio-ffmpeg and its program, else ``.webp``."""
     try:
         import imageio_ffmpeg
 
@@ -44,27 +44,27 @@ def film_suffix() -> str:
 
 
 def write_video(path: str | Path, frames: Iterable[NDArray[np.uint8]], *, fps: float = 25.0) -> Path:
-    """Write a film; frames are taken one at a time.
+    """Write a film, one frame at a time.
 
     Args:
         path: .mp4, .webp or .gif.
         frames: uint8 (H, W, 3).
-        fps: frames per second; a .webp counts milliseconds, a .gif hundredths of a second.
+        fps: frames per second, rounded to milliseconds in a .webp and to hundredths of a second in a .gif.
 
     Raises:
-        MivolError: another suffix, no frame, frames of two sizes or of another type, imageio-ffmpeg not installed.
+        MivolError: another suffix, no frame, frames of different sizes or of another type, or a missing imageio-ffmpeg.
     """
     path = Path(path)
     if path.suffix not in WRITERS:
-        raise MivolError(f'a video cannot be written as "{path.name}"; name it {", ".join(WRITERS)}.')
+        raise MivolError(f'a film cannot be written as "{path.name}"; choose the suffix {", ".join(WRITERS)}.')
     if not 0 < fps <= 1000:
-        raise MivolError(f"a video of {fps} frames per second cannot be shown; choose a number above 0, such as 25.")
+        raise MivolError(f"a film cannot have {fps} frames per second; choose a number above 0 and at most 1000, such as 25.")
     with whole_file(path) as temporary:
-        WRITERS[path.suffix](temporary, _checked(frames), fps)
+        WRITERS[path.suffix](temporary, _check_frames(frames), fps)
     return path
 
 
-def _checked(frames: Iterable[NDArray]) -> Frames:
+def _check_frames(frames: Iterable[NDArray]) -> Frames:
     shape = None
     for number, frame in enumerate(frames):
         frame = np.asarray(frame)
@@ -75,7 +75,7 @@ def _checked(frames: Iterable[NDArray]) -> Frames:
             raise MivolError(f"frame {number} has shape {frame.shape}, the first {shape}; give frames of one size.")
         yield frame
     if shape is None:
-        raise MivolError("there is no frame to make a video of; give at least one.")
+        raise MivolError("a film needs at least one frame; none was given.")
 
 
 def _write_mp4(path: Path, frames: Frames, fps: float) -> None:
@@ -83,9 +83,9 @@ def _write_mp4(path: Path, frames: Frames, fps: float) -> None:
         import imageio_ffmpeg
     except ImportError:
         raise MivolError(
-            'a .mp4 needs imageio-ffmpeg, which is not installed; pip install "mivol[video]", or write a .webp.'
+            'a .mp4 needs imageio-ffmpeg, which is not installed; write a .webp, or install it: pip install "mivol[video]".'
         ) from None
-    first = _even(next(frames))
+    first = _pad_to_even(next(frames))
     writer = imageio_ffmpeg.write_frames(
         str(path),
         first.shape[1::-1],
@@ -100,13 +100,13 @@ def _write_mp4(path: Path, frames: Frames, fps: float) -> None:
     try:
         writer.send(first.tobytes())
         for frame in frames:
-            writer.send(_even(frame).tobytes())
+            writer.send(_pad_to_even(frame).tobytes())
     finally:
         writer.close()
 
 
-def _even(frame: NDArray) -> NDArray:
-    """With an even number of rows and columns: 4:2:0 halves both."""
+def _pad_to_even(frame: NDArray) -> NDArray:
+    """Pad to an even number of rows and columns, which 4:2:0 halves."""
     rows, columns = frame.shape[0] % 2, frame.shape[1] % 2
     return np.ascontiguousarray(np.pad(frame, ((0, rows), (0, columns), (0, 0)), mode="edge"))
 
@@ -124,30 +124,35 @@ WRITERS: dict[str, Callable[[Path, Frames, float], None]] = {
 }
 
 
+# -- A turning volume ---------------------------------------------------------------------------------------------
+
 FEWEST_LAYERS = 8
-"""Fewer layers along an axis are slices, which the page shows anyway."""
+"""Fewest voxels along each axis of a film; the slices on the page show thinner volumes."""
 
 LARGEST = 96
-"""Voxels along an edge that are projected; more are means of blocks."""
+"""Largest number of projected voxels along an edge; larger volumes are averaged in blocks."""
 
 WIDTH = 192
-"""Pixels of a picture."""
+"""Width of a frame [pixel]."""
 
 
 def volume_frames(
     values: NDArray, size: Sequence[float], upright: str, count: int = 36
 ) -> tuple[list[NDArray[np.uint8]], float]:
-    """Pictures of a volume from ``count`` directions about its upright axis, at equal steps of a whole turn.
+    """Return parallel projections of a volume turning about its upright axis, at equal angles of a full turn.
+
+    Rays are horizontal, so each layer is projected separately: a Radon transform by bilinear samples, whose step is the
+    smallest voxel edge. Grey is the line integral divided by the largest integral of all frames; an empty ray is black.
 
     Args:
-        values: (Z, Y, X, C); channels are averaged, values below 0 count as 0.
-        size: world lengths of the box's edges along x, y, z.
-        upright: "y" or "z", the axis that it turns about.
-        count: of pictures.
+        values: (Z, Y, X, C); channels are averaged, and negative values count as 0.
+        size: edges of the box along x, y, z [length].
+        upright: "y" or "z", the axis of rotation; its highest layer is at the top of a frame.
+        count: number of frames.
 
     Returns:
-        Grey pictures, uint8 (height, width, 3), and the integral that is shown white [unit of the values times length]. None,
-        and 0, for a volume of fewer than ``FEWEST_LAYERS`` along an axis, and for one that is 0 everywhere.
+        Grey frames, uint8 (height, width, 3), and the line integral shown white [unit of the values times length]. The list
+        is empty and the integral 0 for fewer than ``FEWEST_LAYERS`` voxels along an axis and for a volume of zeros.
     """
     if min(values.shape[:3]) < FEWEST_LAYERS:
         return [], 0.0
@@ -158,12 +163,12 @@ def volume_frames(
         grid = _block_means(grid, axis)
     steps = lengths / grid.shape
     angles = 2 * math.pi * np.arange(count) / count
-    pictures = [grid.reshape(len(grid), -1) @ _rays(grid.shape[1:], steps[1:], angle).T for angle in angles]
-    largest = max(float(picture.max()) for picture in pictures)
+    frames = [grid.reshape(len(grid), -1) @ _projection_matrix(grid.shape[1:], steps[1:], angle).T for angle in angles]
+    largest = max(float(frame.max()) for frame in frames)
     if largest <= 0:
         return [], 0.0
-    height = max(1, round(WIDTH * lengths[0] / (pictures[0].shape[1] * steps[1:].min())))
-    return [_grey(picture / largest, (WIDTH, height)) for picture in pictures], largest
+    height = max(1, round(WIDTH * lengths[0] / (frames[0].shape[1] * steps[1:].min())))
+    return [_grey(frame / largest, (WIDTH, height)) for frame in frames], largest
 
 
 def _block_means(grid: NDArray, axis: int) -> NDArray:
@@ -173,28 +178,28 @@ def _block_means(grid: NDArray, axis: int) -> NDArray:
     return np.add.reduceat(grid, starts, axis) / counts
 
 
-def _rays(shape: Sequence[int], steps: NDArray, angle: float) -> csr_matrix:
-    """(rays, voxels of a layer): integrals of a layer along rays that go in the direction of ``angle``."""
+def _projection_matrix(shape: Sequence[int], steps: NDArray, angle: float) -> csr_matrix:
+    """The matrix (rays, voxels of a layer) that integrates a layer along parallel rays at an angle [radian]."""
     pitch = steps.min()
     count = math.ceil(math.hypot(*(steps * shape)) / pitch)
     places = (np.arange(count) - (count - 1) / 2) * pitch
     across, along = np.meshgrid(places, places, indexing="ij")
     turned = math.cos(angle) * along + math.sin(angle) * across, math.cos(angle) * across - math.sin(angle) * along
-    at = [place / step + (n - 1) / 2 for place, step, n in zip(turned, steps, shape, strict=True)]
-    low = [np.floor(one).astype(int) for one in at]
+    voxel_coordinates = [place / step + (n - 1) / 2 for place, step, n in zip(turned, steps, shape, strict=True)]
+    low = [np.floor(coordinate).astype(int) for coordinate in voxel_coordinates]
     rays, voxels, weights = [], [], []
     ray = np.broadcast_to(np.arange(count)[:, None], across.shape)
     for corner in np.ndindex(2, 2):
-        node = [one + step for one, step in zip(low, corner, strict=True)]
-        inside = np.logical_and.reduce([(one >= 0) & (one < n) for one, n in zip(node, shape, strict=True)])
-        share = np.prod([1 - np.abs(one - place) for one, place in zip(node, at, strict=True)], axis=0)
+        voxel = [index + offset for index, offset in zip(low, corner, strict=True)]
+        inside = np.logical_and.reduce([(index >= 0) & (index < n) for index, n in zip(voxel, shape, strict=True)])
+        weight = np.prod([1 - np.abs(i - x) for i, x in zip(voxel, voxel_coordinates, strict=True)], axis=0)
         rays.append(ray[inside])
-        voxels.append((node[0] * shape[1] + node[1])[inside])
-        weights.append(share[inside] * pitch)
+        voxels.append((voxel[0] * shape[1] + voxel[1])[inside])
+        weights.append(weight[inside] * pitch)
     entries = np.concatenate(weights), (np.concatenate(rays), np.concatenate(voxels))
     return csr_matrix(entries, shape=(count, shape[0] * shape[1]))
 
 
 def _grey(share: NDArray, size: tuple[int, int]) -> NDArray[np.uint8]:
-    picture = Image.fromarray(np.round(255 * share).astype(np.uint8)).resize(size, Image.Resampling.BILINEAR)
-    return np.repeat(np.asarray(picture)[..., None], 3, axis=2)
+    frame = Image.fromarray(np.round(255 * share).astype(np.uint8)).resize(size, Image.Resampling.BILINEAR)
+    return np.repeat(np.asarray(frame)[..., None], 3, axis=2)

@@ -133,9 +133,9 @@ def test_judged_views_are_scrolled_through(tmp_path):
     write_record(record, tmp_path)
     page = Page(write_page(tmp_path).read_text(encoding="utf-8"))
     text = page.text.replace("\u00a0", " ").replace("\u2011", "-")
-    assert "The other 2 that were judged" in text and text.count("of one") == 2 and text.count("of two") == 1
-    assert "held-out views to 24.0 dB PSNR (3 views at 2 x 2 pixels, raw; 25.0 dB with their colours fitted)" in text
-    assert "PSNR, held-out views: 3 views at 2 x 2 pixels, raw" in text
+    assert "The other 2 held-out views" in text and text.count("of one") == 2 and text.count("of two") == 1
+    assert "24.0 dB PSNR on held-out views (3 views at 2 x 2 pixels; 25.0 dB after colour correction)" in text
+    assert "PSNR, held-out views: 3 views at 2 x 2 pixels" in text
 
 
 def test_views_beyond_four_are_folded(tmp_path):
@@ -147,16 +147,17 @@ def test_views_beyond_four_are_folded(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("quantity", "said"), [("sRGB value", "PSNR is that of sRGB values of 8 bits"), ("radiance", "PSNR takes the reference's")]
+    ("quantity", "definition"),
+    [("sRGB value", "PSNR compares 8-bit sRGB values"), ("radiance", "The peak of PSNR is the largest reference value")],
 )
-def test_what_psnr_means_is_said(tmp_path, quantity, said):
-    """Of photographs another than of radiance; "raw" stands only beside a figure of colours that were fitted."""
+def test_the_page_defines_psnr(tmp_path, quantity, definition):
+    """Photographs and radiance have different definitions, and the page gives only the definition in use."""
     write_png(tmp_path / "a.png", np.full((2, 2, 3), 0.5))
     images = [Image(path="a.png", role=role, view="a", held_out=True, quantity=quantity) for role in ("reference", "render")]
     record = RunRecord.new("V", images=images, judged="1 view at 2 x 2 pixels", results={"held_out_psnr": 24.0})
     write_record(record, tmp_path)
     text = Page(write_page(tmp_path).read_text(encoding="utf-8")).text
-    assert said in text and text.count("PSNR is that of") + text.count("PSNR takes") == 1 and "raw" not in text
+    assert definition in text and text.count("PSNR compares") + text.count("peak of PSNR") == 1
 
 
 def test_layers_have_a_slider_that_begins_in_the_middle(page):
@@ -212,7 +213,7 @@ def test_numbers_of_a_view_on_paper(tmp_path):
     """Reference 1, render 0.9: PSNR 10 log10(1/0.01) = 20 dB, nRMSE 0.1; float32 errs by 1e-7, the text has 3 digits."""
     found = one_view(tmp_path, np.ones((4, 6)), np.full((4, 6), 0.9), status="finished")
     assert "PSNR 20.0 dB" in found.text and "nRMSE 0.1" in found.text
-    assert "to 20.0 dB PSNR" in found.text.replace("\u00a0", " ")
+    assert "20.0 dB PSNR on" in found.text.replace("\u00a0", " ")
 
 
 @pytest.mark.parametrize(("found", "said"), [([30.0], ""), ([30.0, 31.26], " (30.0 to 31.3)")], ids=["one", "two"])
@@ -259,7 +260,7 @@ def test_a_broken_render_has_no_psnr(tmp_path):
     render = np.ones((4, 6))
     render[1, 2] = np.nan
     found = one_view(tmp_path, np.ones((4, 6)), render, status="finished")
-    assert "1 of 24 values not finite" in found.text and "PSNR," not in found.text and "identical" not in found.text
+    assert "1 of 24 values are not finite" in found.text and "PSNR," not in found.text and "identical" not in found.text
     assert dict(found.pictures())["Render"][1, 2].tolist() == [255, 0, 255]
 
 
@@ -359,13 +360,13 @@ def test_projections_are_measured_and_modelled(tmp_path):
     sections = [attributes["id"] for tag, attributes in found.tags if tag == "section" and "id" in attributes]
     assert sections[:3] == ["sinogram", "views", "volume"]
     names = [name for name, _ in found.pictures()]
-    assert names[:8] == 2 * ["Measured", "Modelled", "Modelled − measured", "Difference over noise"]
+    assert names[:8] == 2 * ["Measured", "Modelled", "Modelled − measured", "Difference / noise"]
     assert names.count("Measured") == 2
     # The film is listed first, and says nothing of the views.
     assert found.text.count("Line integral") == 2 and "Radiance" not in found.text
-    assert "Projections that took no part" in found.text and "rendered from viewpoints" not in found.text
+    assert "Projections left out of the fit" in found.text and "rendered from viewpoints" not in found.text
     # A pixel that is not used has noise without bound, and no difference beside it: the middle of the blue-red map.
-    np.testing.assert_array_equal(dict(found.pictures())["Difference over noise"][0, 0], pixel_scale.to_pixels(
+    np.testing.assert_array_equal(dict(found.pictures())["Difference / noise"][0, 0], pixel_scale.to_pixels(
         np.zeros((1, 1)), pixel_scale.Scale("signed", -4.0, 4.0))[0, 0])  # fmt: skip
     labels = [attributes["aria-label"] for tag, attributes in found.tags if tag == "svg"]
     assert labels == [f"sigma_t along {axis}" for axis in "xyz"]
@@ -444,7 +445,7 @@ def test_record_comes_back_and_tells_nothing_of_the_machine(tmp_path):
 def test_headline_says_what_is_known():
     record = RunRecord.new("A run", status="finished", timings={"a": 30.0, "b": 11.0}, results={"nrmse": 0.0341})
     cores = f"{record.machine.cores} core" + "s" * (record.machine.cores > 1)
-    said = f"Reconstructed in 41 s on {cores}: held-out views to 40.0 dB PSNR, the volume to an nRMSE of 0.0341."
+    said = f"Reconstructed in 41 s on {cores}: 40.0 dB PSNR on held-out views, a volume nRMSE of 0.0341."
     assert headline(record, [39.0, 41.0]) == said
     record.status, record.results = "stopped", {}
     assert headline(record) == f"Stopped after 41 s on {cores}."
@@ -455,8 +456,8 @@ def test_headline_says_what_is_known():
 @pytest.mark.parametrize(
     ("spoil", "says"),
     [
-        (lambda folder: (folder / "images/view_9_render.exr").unlink(), 'names "images/view_9_render.exr", which is not'),
-        (lambda folder: (folder / "volumes/truth.npz").unlink(), 'names "volumes/truth.npz", which is not'),
+        (lambda folder: (folder / "images/view_9_render.exr").unlink(), 'names "images/view_9_render.exr", which is missing'),
+        (lambda folder: (folder / "volumes/truth.npz").unlink(), 'names "volumes/truth.npz", which is missing'),
         (lambda folder: (folder / "run.json").unlink(), "no run.json"),
         (lambda folder: (folder / "run.json").write_text('{"title": 1'), "not the record of a run"),
         (lambda folder: edit(folder, plann=[]), "plann"),
@@ -516,7 +517,7 @@ def test_figures_are_written_whole_or_refused(tmp_path, artefacts):
         figures.plot_error_against_time(series, path, title="Optical depth")
         assert path.stat().st_size > 2000
     assert "32 ×" in (artefacts / "error.svg").read_text()
-    with pytest.raises(MivolError, match="name it .svg or .png"):
+    with pytest.raises(MivolError, match="choose the suffix .svg or .png"):
         figures.plot_error_against_time(series, tmp_path / "error.pdf")
     with pytest.raises(MivolError, match='"exact" has a time or an error'):
         figures.plot_error_against_time([figures.Series("exact", [0.5], [0.0])])

@@ -112,7 +112,7 @@ def test_colours_of_distances() -> None:
     np.testing.assert_array_equal(found[1, 3], found[1, 0])  # nearer than near is near
     np.testing.assert_allclose(found[1, 1], (found[0, 1] + 255.0) / 2, atol=1)
     np.testing.assert_array_equal(normal_pixels(np.array([[[0.0, 0, 1], [-1, 0, 0]]]))[0], [[128, 128, 255], [0, 128, 128]])
-    for shape, span, message in (((3,), (0, 1), "give \\(height, width\\)"), ((2, 2), (1, 1), "near must be below")):
+    for shape, span, message in (((3,), (0, 1), "give \\(height, width\\)"), ((2, 2), (1, 1), "give near below far")):
         with pytest.raises(MivolError, match=message):
             depth_pixels(np.ones(shape), span)
     with pytest.raises(MivolError, match="not seen by a camera"):
@@ -180,7 +180,7 @@ def test_films_that_are_refused(tmp_path: Path) -> None:
     one = frames(1)[0]
     cases = [
         ("film.avi", [one], {}, ".mp4, .webp, .gif"),
-        ("film.gif", [], {}, "no frame"),
+        ("film.gif", [], {}, "at least one frame"),
         ("film.gif", [one, one[:-1]], {}, "frames of one size"),
         ("film.gif", [one / 255], {}, "frame 0 is float64"),
         ("film.gif", [one], {"fps": 0}, "0 frames per second"),
@@ -194,6 +194,6 @@ def test_films_that_are_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize("shape", [(3, 4), (2, 5), (3, 5), (2, 4)])
 def test_frames_of_odd_sizes_repeat_their_last_row_and_column(shape: tuple[int, int]) -> None:
     frame = np.arange(shape[0] * shape[1] * 3, dtype=np.uint8).reshape(*shape, 3)
-    found = video._even(frame)
+    found = video._pad_to_even(frame)
     assert found.flags.c_contiguous
     np.testing.assert_array_equal(found, np.pad(frame, ((0, shape[0] % 2), (0, shape[1] % 2), (0, 0)), mode="edge"))

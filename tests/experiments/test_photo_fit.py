@@ -115,9 +115,9 @@ def test_photographs_become_a_field_and_a_page(photographs: Path, tmp_path: Path
     assert made.nodes is not None
     assert record["results"]["nodes"] == len(made.listed())
     page = (tmp_path / "run/report.html").read_text().replace("\u2011", "-").replace("\xa0", " ")
-    assert "PSNR is that of sRGB values of 8 bits, with 1 as its peak." in page
+    assert "PSNR compares 8-bit sRGB values; its peak is 1." in page
     assert "largest value as its peak" not in page
-    assert f"held-out views to {record['results']['held_out_psnr']:.1f} dB PSNR" in page
+    assert f"{record['results']['held_out_psnr']:.1f} dB PSNR on held-out views" in page
     shown = ("data:video/mp4;base64,", "distance of the first judged view", "Where the cameras stand", "What it takes")
     for text in (*shown, "view_3.png"):
         assert text in page

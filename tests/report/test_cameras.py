@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from mivol.photos import PhotoSurvey, survey_photos
 from mivol.photos.camera import Camera
 from mivol.photos.survey import PhotoFrame
-from mivol.report.cameras import EDGE, FAR, MOST_POINTS, PARTS, WIDTH, list_parts, outline, plot_cameras
+from mivol.report.cameras import EDGE, FAR, LABELS, MOST_POINTS, PARTS, WIDTH, list_parts, outline, plot_cameras
 from mivol.report.figures import INK
 
 TURNS = {"x": [0, 90, 0], "y": [-90, 0, 0], "z": [0, 0, 0]}
@@ -50,10 +50,10 @@ def test_up_is_up_and_the_picture_is_right_handed(survey: PhotoSurvey, up: str, 
     lifted = {label: np.array(line.get_data_3d()).T for label, line in zip(drawn, side.lines, strict=True)}
     for split in ("train", "held_out", "test"):
         own = cameras[[frame.split == split for frame in stands.frames]]
-        begins = drawn[split].reshape(len(own), 8, 3, 2)[:, :4, 0]
+        begins = drawn[LABELS[split]].reshape(len(own), 8, 3, 2)[:, :4, 0]
         np.testing.assert_allclose(begins, np.repeat(own[:, None, order[:2]], 4, axis=1))
         np.testing.assert_allclose(
-            lifted[split].reshape(len(own), 8, 3, 3)[:, :4, 0], np.repeat(own[:, None, order], 4, axis=1)
+            lifted[LABELS[split]].reshape(len(own), 8, 3, 3)[:, :4, 0], np.repeat(own[:, None, order], 4, axis=1)
         )
     for found, axes in ((drawn["box"], order[:2]), (lifted["box"], order)):
         edges = found.reshape(12, 3, len(axes))

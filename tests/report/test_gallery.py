@@ -101,7 +101,7 @@ def test_pixels_of_photographs_have_an_error_beside_them(tmp_path: Path) -> None
     gallery = make_view_rows(tmp_path, images)
     assert [view.small for view in gallery.rows] == [False, True]
     (bar,) = gallery.bars
-    assert bar.label == "|Render − reference|, mean of the colours [code value]"
+    assert bar.label == "|Render − reference|, mean over RGB [code value]"
     for view in gallery.rows:
         assert [picture.name for picture in view.pictures] == ["Reference", "Render", "|Render − reference|"]
         error = pixels(view.pictures[2])

@@ -36,9 +36,9 @@ def test_a_number_has_the_unit_that_its_run_knows() -> None:
         record.find_quantity(name, units) for name in ("loss", "lamp_1.position[0]", "g[0]", "my_number", "psnr")
     )
     assert loss == record.QUANTITIES["loss"]._replace(unit="radiance²")
-    assert (place, place.beside) == (record.Quantity("lamp_1.position[0]", "length", log=False), "length")
-    assert (g.unit, g.beside) == ("1", "[1]")
-    assert (other, other.beside) == (record.Quantity("my number"), "")
+    assert (place, place.symbol) == (record.Quantity("lamp_1.position[0]", "length", log=False), "length")
+    assert (g.unit, g.symbol) == ("1", "[1]")
+    assert (other, other.symbol) == (record.Quantity("my number"), "")
     assert psnr == record.QUANTITIES["psnr"]
 
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from mivol.experiments.camera_pictures import pictures_of_scan
 from mivol.report.cameras import EDGE
-from mivol.report.scanner import AWAY, DETECTORS, HEAD, MOST_VIEWS, plot_scanner, select_views
+from mivol.report.scanner import BEAM_REACH, DETECTORS, MARKER_WIDTH, MOST_VIEWS, plot_scanner, select_views
 from mivol.tomography.geometry import ConeBeam, ParallelBeam, VoxelGrid
 from mivol.tomography.panel_views import PanelViews
 
@@ -79,10 +79,10 @@ def test_a_point_source_opens_towards_its_detector() -> None:
 
 
 def test_parallel_light_points_along_its_rays() -> None:
-    """It has no place along the beam: tips stand AWAY radii before the middle of the voxels, detectors as far behind."""
+    """It has no place along the beam: tips stand BEAM_REACH radii before the middle of the voxels, detectors as far behind."""
     found = strokes_of(plot_scanner(PARALLEL, GRID, HELD_OUT))
     assert list(found) == LABELS
-    away, centre = AWAY * GRID.radius, np.array(GRID.centre)
+    away, centre = BEAM_REACH * GRID.radius, np.array(GRID.centre)
     for label, views in SPLITS.items():
         along = directions(views)
         begins = corners(PARALLEL, views, along @ centre - away).mean(axis=1)
@@ -92,7 +92,7 @@ def test_parallel_light_points_along_its_rays() -> None:
         base = pyramids[:, :4, 1] - begins[:, None]
         np.testing.assert_allclose(base.mean(axis=1), 0, atol=1e-12)
         np.testing.assert_allclose(base @ along[..., None], 0, atol=1e-12)
-        np.testing.assert_allclose(np.linalg.norm(base, axis=2), np.sqrt(2) * HEAD * length)
+        np.testing.assert_allclose(np.linalg.norm(base, axis=2), np.sqrt(2) * MARKER_WIDTH * length)
     along = directions(SOME)
     some = corners(PARALLEL, SOME, along @ centre + away)
     np.testing.assert_allclose(found["detector of some views"].reshape(-1, 4, 2, 3), around(some), atol=1e-12)
