@@ -115,7 +115,7 @@ def test_colours_of_distances() -> None:
     for shape, span, message in (((3,), (0, 1), "give \\(height, width\\)"), ((2, 2), (1, 1), "give near below far")):
         with pytest.raises(MivolError, match=message):
             depth_pixels(np.ones(shape), span)
-    with pytest.raises(MivolError, match="not seen by a camera"):
+    with pytest.raises(MivolError, match="do not fit a camera"):
         normals_from_depth(np.ones((5, 5)), LIKE)
 
 
