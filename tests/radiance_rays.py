@@ -11,12 +11,12 @@ from mivol.transport.line_integrals.radiance_field import (
     RayBundle,
     RayGradient,
     RenderedRays,
-    backward,
-    cells_of,
-    model_of,
-    render,
+    find_occupied_cells,
+    make_model,
+    render_rays,
+    vjp_rays,
 )
-from mivol.transport.line_integrals.radiance_source import bake, exact
+from mivol.transport.line_integrals.radiance_source import bake, make_exact
 from mivol.transport.traversal.occupied_cells import CellIndex
 
 TO_WORLD = np.array([[2.0, 0.3, 0.0, -1.2], [-0.2, 1.5, 0.1, -0.7], [0.0, 0.1, 2.5, -1.3], [0, 0, 0, 1]])
@@ -45,9 +45,9 @@ def rays_of(o, d) -> RayBundle:
 
 
 def followed(field, o, d, stop=0.0, pinhole=None) -> RenderedRays:
-    rays, cells = rays_of(o, d), cells_of(field)
-    source = exact(field, rays.d) if pinhole is None else bake(field, cells, np.atleast_2d(pinhole), mi.UInt32(0))
-    return render(cells, source, model_of(field, stop), rays)
+    rays, cells = rays_of(o, d), find_occupied_cells(field)
+    source = make_exact(field, rays.d) if pinhole is None else bake(field, cells, np.atleast_2d(pinhole), mi.UInt32(0))
+    return render_rays(cells, source, make_model(field, stop), rays)
 
 
 def see(field, o, d, stop=0.0, pinhole=None):
@@ -58,10 +58,10 @@ def see(field, o, d, stop=0.0, pinhole=None):
 
 def derive(field: SphericalGrid, o, d, colour, T=0.0, distance=0.0, stop=0.0):
     """Derivatives of sum(colour . L + T T + distance D) for the raw densities and harmonics of the nodes."""
-    rays, cells = rays_of(o, d), cells_of(field)
-    source, model = exact(field, rays.d, slope=True), model_of(field, stop)
-    seen = render(cells, source, model, rays)
-    backward(cells, source, model, seen, RayGradient(mi.Color3f(*colour), T, distance))
+    rays, cells = rays_of(o, d), find_occupied_cells(field)
+    source, model = make_exact(field, rays.d, slope=True), make_model(field, stop)
+    seen = render_rays(cells, source, model, rays)
+    vjp_rays(cells, source, model, seen, RayGradient(mi.Color3f(*colour), T, distance))
     return field.with_values(*source.slopes()).values()
 
 

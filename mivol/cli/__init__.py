@@ -178,11 +178,13 @@ def export_flags(sub: argparse.ArgumentParser) -> None:
 def convert_flags(sub: argparse.ArgumentParser) -> None:
     """From which file to which."""
     from mivol.points.cloud import CLOUD_READERS, CLOUD_WRITERS
-    from mivol.points.gaussian_files import READERS, WRITERS
+    from mivol.points.gaussian_files import GAUSSIAN_READERS, GAUSSIAN_WRITERS
     from mivol.points.summary import KINDS
 
-    known = ", ".join({**WRITERS, **CLOUD_WRITERS})
-    sub.add_argument("source", type=Path, help=f"what to read: {', '.join({**READERS, **CLOUD_READERS})}, .npz (field)")
+    known = ", ".join({**GAUSSIAN_WRITERS, **CLOUD_WRITERS})
+    sub.add_argument(
+        "source", type=Path, help=f"what to read: {', '.join({**GAUSSIAN_READERS, **CLOUD_READERS})}, .npz (field)"
+    )
     sub.add_argument("output", type=Path, help=f"what to write: {known}, .npz (field), .obj (mesh)")
     kinds = (*KINDS, "field", "mesh")
     sub.add_argument("--to", choices=kinds, help="what to write it as; default: what the source holds, if the format can")
@@ -278,9 +280,9 @@ def explain_experiment(arguments: argparse.Namespace) -> int:
 
 def explain_points(arguments: argparse.Namespace) -> int:
     """Facts of a file of points or Gaussians."""
-    from mivol.points.summary import read_facts
+    from mivol.points.summary import summarize_file
 
-    facts = read_facts(arguments.scene)
+    facts = summarize_file(arguments.scene)
     print(facts.text)
     return int(bool(facts.refusal))
 

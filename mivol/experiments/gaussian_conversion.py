@@ -12,7 +12,7 @@ import numpy as np
 
 from mivol.experiments.back_end import set_variant
 from mivol.fields.field_archives import load_field, save_field
-from mivol.fields.gaussian_grid import MOST_OPAQUE, box_of_gaussians, gaussians_of_grid, grid_of_gaussians, masses_of_gaussians
+from mivol.fields.gaussian_grid import MAX_OPACITY, gaussian_box, gaussian_masses, gaussians_to_grid, grid_to_gaussians
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.fields.surfaces import DepthView, fuse_depths
 from mivol.files.mesh import MESH_WRITERS, Mesh, write_mesh
@@ -20,8 +20,8 @@ from mivol.files.source import check_file, select_by_suffix
 from mivol.optim.photographs.field_view import render_view
 from mivol.photos import Camera, aim_camera, intrinsics, pixel_centres, rays
 from mivol.points.cloud import read_points
-from mivol.points.conversions import gaussians_of_points
-from mivol.points.gaussian_files import WRITERS, holds_gaussians, read_gaussians, write_gaussians
+from mivol.points.conversions import points_to_gaussians
+from mivol.points.gaussian_files import GAUSSIAN_WRITERS, is_gaussian_file, read_gaussians, write_gaussians
 from mivol.points.gaussians import Gaussians
 from mivol.splatting.splatter import Splatter, tensors_of
 from mivol.validate.metrics import psnr
@@ -68,22 +68,22 @@ def convert_to_field(source: Path, target: Path, resolution: int, box: Sequence[
         What was written and what it lost, in lines.
 
     Raises:
-        MivolError: as the readers, :func:`mivol.fields.gaussian_grid.grid_of_gaussians` and the disk.
+        MivolError: as the readers, :func:`mivol.fields.gaussian_grid.gaussians_to_grid` and the disk.
     """
     set_variant(variant)
     cloud = read_as_gaussians(source)
     low, high = corners_of_box(cloud, box)
-    save_field(target, grid_of_gaussians(cloud, low, high, resolution))
+    save_field(target, gaussians_to_grid(cloud, low, high, resolution))
     field = load_field(target)  # as it will be read: half floats
     mass = float(field.values()[0].sum(dtype=np.float64) * np.linalg.det(field.to_world[:3, :3]) / math.prod(field.res))
     lines = [
         f"{target}: {' x '.join(map(str, field.res[::-1]))} nodes, {field.rows - 1} of them stored, degree {field.degree}",
-        f"{100 * mass / masses_of_gaussians(cloud).sum():.4g} % of the extinction lies in the box",
+        f"{100 * mass / gaussian_masses(cloud).sum():.4g} % of the extinction lies in the box",
         f"{loss_of_field(cloud, field):.1f} dB between the field and splatted Gaussians: {VIEWED}, over black, peak 1",
     ]
-    capped = int((cloud.opacities() > MOST_OPAQUE).sum())
+    capped = int((cloud.opacities() > MAX_OPACITY).sum())
     if capped:
-        lines.append(f"{capped} Gaussians of an opacity above {MOST_OPAQUE} were made as opaque as that")
+        lines.append(f"{capped} Gaussians of an opacity above {MAX_OPACITY} were made as opaque as that")
     return "\n".join(lines)
 
 
@@ -100,14 +100,14 @@ def convert_to_gaussians(source: Path, target: Path, resolution: int | None, var
         What was written and what it lost, in lines.
 
     Raises:
-        MivolError: as :func:`mivol.fields.spherical_files.load_field`, :func:`mivol.fields.grid_gaussians.gaussians_of_grid`
+        MivolError: as :func:`mivol.fields.field_archives.load_field`, :func:`mivol.fields.gaussian_grid.grid_to_gaussians`
         and
             the disk.
     """
-    select_by_suffix(target, WRITERS)
+    select_by_suffix(target, GAUSSIAN_WRITERS)
     set_variant(variant)
     field = load_field(source)
-    made = gaussians_of_grid(field, resolution)
+    made = grid_to_gaussians(field, resolution)
     write_gaussians(target, made)
     lines = [f"{target}: {made.count} Gaussians of degree {made.degree}"]
     if field.space == "linear":
@@ -118,7 +118,7 @@ def convert_to_gaussians(source: Path, target: Path, resolution: int | None, var
 
 def corners_of_box(cloud: Gaussians, box: Sequence[float] | None) -> tuple[np.ndarray, np.ndarray]:
     """The lower and the upper corner (3,) of a given box [length]; None: of three standard deviations about all Gaussians."""
-    return box_of_gaussians(cloud) if box is None else (np.array(box[:3]), np.array(box[3:]))
+    return gaussian_box(cloud) if box is None else (np.array(box[:3]), np.array(box[3:]))
 
 
 def read_as_gaussians(source: Path) -> Gaussians:
@@ -128,7 +128,7 @@ def read_as_gaussians(source: Path) -> Gaussians:
         MivolError: as the readers.
     """
     check_file(source)
-    return read_gaussians(source) if holds_gaussians(source) else gaussians_of_points(read_points(source))
+    return read_gaussians(source) if is_gaussian_file(source) else points_to_gaussians(read_points(source))
 
 
 def loss_of_field(cloud: Gaussians, field: SphericalGrid, edge: int = EDGE) -> float:

@@ -26,8 +26,8 @@ from mivol.optim.scenes.views import seed_of
 from mivol.photos import Camera, aim_camera, intrinsics
 from mivol.photos.photo_file import decode_srgb
 from mivol.points.cloud import PointCloud, read_points
-from mivol.points.conversions import gaussians_of_points
-from mivol.points.gaussian_files import holds_gaussians, read_gaussians
+from mivol.points.conversions import points_to_gaussians
+from mivol.points.gaussian_files import is_gaussian_file, read_gaussians
 from mivol.points.gaussians import Gaussians
 from mivol.scene.explain import settings_of
 from mivol.scene.parsing import reason_of
@@ -135,7 +135,7 @@ def view_field(path: Path, look_at: Sequence[float], up: Sequence[float], fov: f
         size: (width, height) [pixel].
 
     Raises:
-        MivolError: as :func:`mivol.fields.spherical_files.load_field`, or a camera that cannot be.
+        MivolError: as :func:`mivol.fields.field_archives.load_field`, or a camera that cannot be.
     """
     camera = camera_at(look_at, up, fov, size)
     field, sky = load_field(path), sky_beside(path)
@@ -221,7 +221,7 @@ def view_points(
     Raises:
         MivolError: as the readers, a camera that cannot be, or a look for Gaussians.
     """
-    is_cloud = not holds_gaussians(check_file(path))
+    is_cloud = not is_gaussian_file(check_file(path))
     if not is_cloud and look != PointLook():
         raise MivolError(f"{path} holds Gaussians, which have shapes of their own: leave out how points are drawn.")
     held = gaussians_for(read_points(path), look) if is_cloud else read_gaussians(path)
@@ -231,9 +231,9 @@ def view_points(
 
 def gaussians_for(cloud: PointCloud, look: PointLook) -> Gaussians:
     """Round Gaussians of one radius at the points; those without colours are coloured by how densely they stand."""
-    made = gaussians_of_points(cloud, look.opacity)
+    made = points_to_gaussians(cloud, look.opacity)
     if cloud.colours is None:
-        made = gaussians_of_points(replace(cloud, colours=by_density(made.scales()[:, 0])), look.opacity)
+        made = points_to_gaussians(replace(cloud, colours=by_density(made.scales()[:, 0])), look.opacity)
     radius = 0.5 * float(np.median(made.scales())) if look.radius is None else look.radius
     return replace(made, log_scales=np.full((made.count, 3), math.log(radius)))
 

@@ -32,9 +32,9 @@ import mitsuba as mi
 
 from mivol.errors import MivolError
 
-__all__ = ["ACTIVATIONS", "Activation", "activation_of"]
+__all__ = ["ACTIVATIONS", "Activation", "select_activation"]
 
-LARGEST_EXPONENT = 60.0
+MAX_EXPONENT = 60.0
 """exp(60) = 1e26 leaves room for a length and a sum in float32."""
 
 
@@ -56,7 +56,7 @@ class Activation:
     empty_below: float | None
 
 
-def _none(x: mi.Float) -> tuple[mi.Float, mi.Float]:
+def _clamp_below_zero(x: mi.Float) -> tuple[mi.Float, mi.Float]:
     # Interpolation may round a 0 to -1e-20.
     return dr.maximum(x, 0), mi.Float(1)
 
@@ -74,23 +74,23 @@ def _softplus(x: mi.Float) -> tuple[mi.Float, mi.Float]:
     return dr.maximum(x, 0) + series, dr.select(x > 0, 1, u) / (1 + u)
 
 
-def _exp(x: mi.Float) -> tuple[mi.Float, mi.Float]:
-    value = dr.exp(dr.minimum(x, LARGEST_EXPONENT))
-    return value, dr.select(x < LARGEST_EXPONENT, value, 0)
+def _exponential(x: mi.Float) -> tuple[mi.Float, mi.Float]:
+    value = dr.exp(dr.minimum(x, MAX_EXPONENT))
+    return value, dr.select(x < MAX_EXPONENT, value, 0)
 
 
 ACTIVATIONS = {
     a.name: a
     for a in (
-        Activation("none", _none, False, 0.0, None),
+        Activation("none", _clamp_below_zero, False, 0.0, None),
         Activation("relu", _relu, True, 0.0, 0.0),
         Activation("softplus", _softplus, True, -20.0, None),
-        Activation("exp", _exp, True, -20.0, None),
+        Activation("exp", _exponential, True, -20.0, None),
     )
 }
 
 
-def activation_of(name: str) -> Activation:
+def select_activation(name: str) -> Activation:
     """An activation by name.
 
     Raises:

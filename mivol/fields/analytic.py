@@ -130,7 +130,7 @@ def ramp(value: float, gradient: tuple[float, float, float]) -> Trilinear:
 
 
 @dataclass(frozen=True)
-class _Centred(AnalyticField):
+class _EllipsoidalField(AnalyticField):
     """A field of the distance from ``centre``, in units of ``radii`` along the columns of ``axes`` (orthonormal)."""
 
     sigma_t: float
@@ -160,7 +160,7 @@ class _Centred(AnalyticField):
 
 
 @dataclass(frozen=True)
-class Ellipsoid(_Centred):
+class Ellipsoid(_EllipsoidalField):
     r"""Constant extinction inside an ellipsoid: tau = sigma_t L with the chord :math:`L = 2\sqrt{1 - b^2}/|Wd|`.
 
     W whitens the ellipsoid to the unit sphere and b is the distance of the ray from its centre there, which is
@@ -184,7 +184,7 @@ def sphere(sigma_t: float, centre: tuple[float, float, float] = (0.0, 0.0, 0.0),
 
 
 @dataclass(frozen=True)
-class GaussianBlob(_Centred):
+class GaussianBlob(_EllipsoidalField):
     r""":math:`\sigma_t e^{-r^2/2}` with r the distance from the centre in units of ``radii`` (the standard deviations).
 
     .. math:: \tau = \sigma_t\,e^{-b^2/2}\,\sqrt{\pi/2}\,\frac{1}{|Wd|}
@@ -198,10 +198,10 @@ class GaussianBlob(_Centred):
     def _integral(self, o: Floats, d: Floats, t0: Floats, t1: Floats) -> Floats:
         t_c, b2, speed = self._closest(o, d)
         a, b = ((t - t_c) * speed / np.sqrt(2.0) for t in (t0, t1))
-        return self.sigma_t * np.exp(-0.5 * b2) * np.sqrt(np.pi / 2) / speed * _erf_between(a, b)
+        return self.sigma_t * np.exp(-0.5 * b2) * np.sqrt(np.pi / 2) / speed * _erf_difference(a, b)
 
 
-def _erf_between(a: Floats, b: Floats) -> Floats:
+def _erf_difference(a: Floats, b: Floats) -> Floats:
     """erf(b) - erf(a) for a <= b, with small relative error in the tails too."""
     # Both ends beyond 1 in the same tail: erf is 1 - small there and the difference keeps only its absolute precision;
     # erfc holds the small part itself.
@@ -224,11 +224,11 @@ class Slab(AnalyticField):
 
     def _integral(self, o: Floats, d: Floats, t0: Floats, t1: Floats) -> Floats:
         normal = np.asarray(self.normal, float)
-        start, end = _between(o @ normal, d @ normal, self.low, self.high)
+        start, end = _slab_interval(o @ normal, d @ normal, self.low, self.high)
         return self.sigma_t * np.maximum(np.minimum(t1, end) - np.maximum(t0, start), 0.0)
 
 
-def _between(x: Floats, slope: Floats, low: float, high: float) -> tuple[Floats, Floats]:
+def _slab_interval(x: Floats, slope: Floats, low: float, high: float) -> tuple[Floats, Floats]:
     """Interval of t in which low <= x + slope t <= high: (-inf, inf) or an empty one (inf, -inf) where slope is 0."""
     inside = (x >= low) & (x <= high)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
@@ -262,7 +262,7 @@ class Within(AnalyticField):
     def _integral(self, o: Floats, d: Floats, t0: Floats, t1: Floats) -> Floats:
         q, w = self._local(o, 1.0), self._local(d, 0.0)
         for axis in range(3):
-            start, end = _between(q[..., axis], w[..., axis], 0.0, 1.0)
+            start, end = _slab_interval(q[..., axis], w[..., axis], 0.0, 1.0)
             t0, t1 = np.maximum(t0, start), np.minimum(t1, end)
         return self.field.optical_depth(o, d, t0, t1)
 

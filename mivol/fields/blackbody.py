@@ -31,7 +31,7 @@ LUMENS_PER_WATT = 683.0
 
 XYZ_TO_SRGB = np.array([[3.2406, -1.5372, -0.4986], [-0.9689, 1.8758, 0.0415], [0.0557, -0.2040, 1.0570]])
 
-CHUNK = 1 << 14
+CHUNK_SIZE = 1 << 14
 """Temperatures that are looked at together: 64 MB at 1 nm."""
 
 
@@ -48,7 +48,7 @@ def planck(wavelength: np.ndarray, temperature: np.ndarray) -> np.ndarray:
     Raises:
         MivolError: a temperature that is negative or not finite.
     """
-    wavelength, temperature = np.asarray(wavelength, dtype=np.float64), _checked(temperature)
+    wavelength, temperature = np.asarray(wavelength, dtype=np.float64), _check_temperature(temperature)
     x = np.minimum(C2 / (wavelength * np.maximum(temperature, 1e-3)), 690.0)
     return np.where(x < 690, C1 / wavelength**5 / np.expm1(x), 0.0)
 
@@ -67,10 +67,10 @@ def blackbody_xyz(temperature: np.ndarray) -> np.ndarray:
 
     Error: that of the trapezium rule at 1 nm between 360 and 830 nm, 1e-4 at 1000 K and above.
     """
-    temperature = _checked(temperature)
-    nm, matching = _matching()
+    temperature = _check_temperature(temperature)
+    nm, matching = _weighted_matching_functions()
     flat = temperature.ravel()
-    xyz = [planck(nm, flat[i : i + CHUNK, None]) @ matching for i in range(0, flat.size, CHUNK)]
+    xyz = [planck(nm, flat[i : i + CHUNK_SIZE, None]) @ matching for i in range(0, flat.size, CHUNK_SIZE)]
     return np.concatenate(xyz).reshape(*temperature.shape, 3) if xyz else np.zeros((*temperature.shape, 3))
 
 
@@ -92,7 +92,7 @@ def blackbody_rgb(temperature: np.ndarray) -> np.ndarray:
     return np.maximum(blackbody_xyz(temperature) @ XYZ_TO_SRGB.T, 0)
 
 
-def _matching() -> tuple[np.ndarray, np.ndarray]:
+def _weighted_matching_functions() -> tuple[np.ndarray, np.ndarray]:
     """Wavelengths (n,) [nm] and the matching functions at them times the weight of each (n, 3) [nm]."""
     if mi.variant() is None:
         raise MivolError("no variant of Mitsuba is active, which keeps the CIE tables; call mitsuba.set_variant first.")
@@ -105,7 +105,7 @@ def _matching() -> tuple[np.ndarray, np.ndarray]:
     return nm, functions * weight[:, None]
 
 
-def _checked(temperature: np.ndarray) -> np.ndarray:
+def _check_temperature(temperature: np.ndarray) -> np.ndarray:
     temperature = np.asarray(temperature, dtype=np.float64)
     if not (np.isfinite(temperature) & (temperature >= 0)).all():
         raise MivolError(

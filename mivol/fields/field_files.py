@@ -23,7 +23,7 @@ from mivol.errors import MivolError
 from mivol.fields.field_archives import load_field, save_field, save_svox2
 from mivol.fields.sky import Sky
 from mivol.fields.spherical_grid import SphericalGrid
-from mivol.fields.surfaces import surface_of
+from mivol.fields.surfaces import extract_surface
 from mivol.files import write_exr, write_volume, write_whole
 from mivol.files.mesh import write_mesh
 from mivol.files.source import refusal
@@ -110,7 +110,7 @@ def export_field(
     Args:
         path: destination.
         field: what to write.
-        level: extinction of a mesh's surface [1/length]; None: :func:`mivol.fields.surfaces.level_of`.
+        level: extinction of a mesh's surface [1/length]; None: :func:`mivol.fields.surfaces.default_level`.
         sky: what is behind the field, which a scene shows too; the other formats have no place for it.
 
     Returns:
@@ -163,7 +163,7 @@ def _pair(path: Path, field: SphericalGrid) -> list[Path]:
 
 
 def _mesh(path: Path, wish: _Wish) -> list[Path]:
-    write_mesh(path, surface_of(wish.field, wish.level))
+    write_mesh(path, extract_surface(wish.field, wish.level))
     return [path]
 
 

@@ -15,16 +15,16 @@ import numpy as np
 from mivol.errors import MivolError
 from mivol.machine import available_memory
 
-__all__ = ["CellLists", "list_gaussians", "PAIRS", "cut_into_parts", "places_in_boxes"]
+__all__ = ["CellLists", "list_gaussians", "MAX_CHUNK_PAIRS", "find_chunk_starts", "list_box_nodes"]
 
-CELLS = 1.0
+CELLS_PER_GAUSSIAN = 1.0
 """Cells for each Gaussian: 22^3 for 10,000 (measured on a dense cloud of as many: line integrals take the same time from 0.4 to
 8, within a tenth; lists of 8 take four times as long to make)."""
 
-LEAST_CELLS, MOST_CELLS = 8, 1 << 21
+MIN_CELLS, MAX_CELLS = 8, 1 << 21
 """Of a box."""
 
-MOST_NODES = 256
+MAX_NODES = 256
 """Along an axis."""
 
 SLACK = 1e-3
@@ -76,13 +76,13 @@ def list_gaussians(means: np.ndarray, whitening: np.ndarray, reach: float) -> Ce
     low, high = (means - spread).min(axis=0), (means + spread).max(axis=0)
     slack = SLACK * (high - low).max()
     low, edge = low - slack, high - low + 2 * slack
-    size = _nodes(edge, len(means))
-    first, last = (np.clip(_cells_of(p, low, edge, size), 0, size) for p in (means - spread, means + spread))
+    size = _choose_resolution(edge, len(means))
+    first, last = (np.clip(_locate_cells(p, low, edge, size), 0, size) for p in (means - spread, means + spread))
     counts = (last - first + 1).prod(axis=1)
     _check_memory(counts)
     found = [
-        _touched(index, first[index], last[index], (means - low) / edge * size, whitening * (edge / size), reach)
-        for index in np.split(np.arange(len(means)), cut_into_parts(counts))
+        _find_touched_cells(index, first[index], last[index], (means - low) / edge * size, whitening * (edge / size), reach)
+        for index in np.split(np.arange(len(means)), find_chunk_starts(counts))
     ]
     cells, entries = (np.concatenate(rows) for rows in zip(*found, strict=True))
     cells = cells @ np.cumprod([1, *(size[:2] + 1)])
@@ -93,23 +93,23 @@ def list_gaussians(means: np.ndarray, whitening: np.ndarray, reach: float) -> Ce
     return CellLists(to_world, tuple(int(n) for n in size[::-1]), starts.astype(np.uint32), entries[order].astype(np.uint32))
 
 
-def _nodes(edge: np.ndarray, count: int) -> np.ndarray:
+def _choose_resolution(edge: np.ndarray, count: int) -> np.ndarray:
     """Nodes (x, y, z) of a box: as near to cubes as whole numbers allow."""
-    cells = np.clip(CELLS * count, LEAST_CELLS, MOST_CELLS)
-    return np.clip(np.rint(edge / (edge.prod() / cells) ** (1 / 3)), 1, MOST_NODES).astype(np.int64)
+    cells = np.clip(CELLS_PER_GAUSSIAN * count, MIN_CELLS, MAX_CELLS)
+    return np.clip(np.rint(edge / (edge.prod() / cells) ** (1 / 3)), 1, MAX_NODES).astype(np.int64)
 
 
-def _cells_of(p: np.ndarray, low: np.ndarray, edge: np.ndarray, size: np.ndarray) -> np.ndarray:
+def _locate_cells(p: np.ndarray, low: np.ndarray, edge: np.ndarray, size: np.ndarray) -> np.ndarray:
     return np.floor((p - low) / edge * size + 0.5).astype(np.int64)
 
 
-def _touched(
+def _find_touched_cells(
     index: np.ndarray, first: np.ndarray, last: np.ndarray, means: np.ndarray, whitening: np.ndarray, reach: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """The cells (n, 3) that some Gaussians touch, and the Gaussian of each; ``means`` and ``whitening`` count in cells."""
     sizes = last - first + 1
     owner = np.repeat(index, sizes.prod(axis=1))
-    cell = np.repeat(first, sizes.prod(axis=1), axis=0) + places_in_boxes(sizes)
+    cell = np.repeat(first, sizes.prod(axis=1), axis=0) + list_box_nodes(sizes)
     W = whitening[owner]
     # A point of the cell is at most this far from its middle, in standard deviations: |W| applied to half its edges.
     size = np.linalg.norm(np.abs(W) @ np.full(3, 0.5 + SLACK), axis=1)
@@ -120,7 +120,7 @@ def _touched(
 
 def _check_memory(counts: np.ndarray) -> None:
     """Refuse lists that do not fit: at most so many entries, and those that are looked at together."""
-    needed, free = ENTRY_BYTES * int(counts.sum()) + PAIR_BYTES * (PAIRS + int(counts.max())), available_memory()
+    needed, free = ENTRY_BYTES * int(counts.sum()) + PAIR_BYTES * (MAX_CHUNK_PAIRS + int(counts.max())), available_memory()
     if free is not None and needed > free:
         raise MivolError(
             f"{len(counts)} Gaussians reach into {counts.mean():.0f} cells each; their lists take {needed / 2**30:.1f} GiB, "
@@ -128,11 +128,11 @@ def _check_memory(counts: np.ndarray) -> None:
         )
 
 
-PAIRS = 1 << 21
+MAX_CHUNK_PAIRS = 1 << 21
 """Places of all boxes that are listed together, and one box more, which has no more than there are nodes."""
 
 
-def places_in_boxes(sizes: np.ndarray) -> np.ndarray:
+def list_box_nodes(sizes: np.ndarray) -> np.ndarray:
     """All places (x, y, z) of boxes of these sizes (n, 3), one box after the other, each from (0, 0, 0)."""
     counts = sizes.prod(axis=1)
     number = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
@@ -140,6 +140,6 @@ def places_in_boxes(sizes: np.ndarray) -> np.ndarray:
     return np.stack([number % x, number // x % y, number // (x * y)], axis=1)
 
 
-def cut_into_parts(counts: np.ndarray) -> np.ndarray:
+def find_chunk_starts(counts: np.ndarray) -> np.ndarray:
     """Where a list of boxes of so many places is cut so that no part has much more than ``PAIRS``."""
-    return np.flatnonzero(np.diff(np.cumsum(counts) // PAIRS)) + 1
+    return np.flatnonzero(np.diff(np.cumsum(counts) // MAX_CHUNK_PAIRS)) + 1

@@ -26,23 +26,23 @@ import numpy as np
 
 from mivol.errors import MivolError
 from mivol.fields.gaussian_cells import CellLists, list_gaussians
-from mivol.fields.gaussian_grid import MOST_OPAQUE
-from mivol.fields.gaussian_line import REACH, ROW, Line, cross, read_row
-from mivol.fields.harmonics import SPACES, degree_of, frame_of, rows_of_harmonics, turn_by
+from mivol.fields.gaussian_grid import MAX_OPACITY
+from mivol.fields.gaussian_line import REACH, ROW_SIZE, WhitenedLine, intersect_gaussian, read_row
+from mivol.fields.harmonics import SPACES, harmonic_degree, local_frame, pack_harmonics, rotate_direction
 from mivol.fields.protocol import EXACT_LINE
 from mivol.points.gaussian_files import read_gaussians
 from mivol.points.gaussians import Gaussians
 from mivol.space import check_affine
 
-__all__ = ["HARMONICS", "LEAST_SCALE", "NAMES", "GaussianField"]
+__all__ = ["HARMONICS", "MIN_RELATIVE_SCALE", "EXTINCTION_PARAMETERS", "GaussianField"]
 
-NAMES = ("means", "log_scales", "quaternions", "opacity_logits")
+EXTINCTION_PARAMETERS = ("means", "log_scales", "quaternions", "opacity_logits")
 """The parameters of the extinction."""
 
 HARMONICS = "harmonics"
 """The parameter of the colours."""
 
-LEAST_SCALE = 1e-6
+MIN_RELATIVE_SCALE = 1e-6
 """Smallest standard deviation, in edges of the box."""
 
 
@@ -79,22 +79,27 @@ class GaussianField:
     @classmethod
     def of(cls, gaussians: Gaussians, place: np.ndarray, space: str = "srgb", blur: float = 0.0) -> GaussianField:
         """The field of some Gaussians."""
-        return cls({name: mi.TensorXf(getattr(gaussians, name)) for name in (*NAMES, HARMONICS)}, place, space, blur)
+        return cls(
+            {name: mi.TensorXf(getattr(gaussians, name)) for name in (*EXTINCTION_PARAMETERS, HARMONICS)}, place, space, blur
+        )
 
     @classmethod
     def from_props(cls, props: mi.Properties) -> GaussianField:
-        """Read Gaussians from plugin parameters: ``filename``, or the tensors in :data:`NAMES` (and the harmonics);
-        ``to_world``, ``space`` and ``blur``.
+        """Read Gaussians from plugin parameters: ``filename`` or tensors, ``to_world``, ``space`` and ``blur``.
+
+        The tensors are those in :data:`EXTINCTION_PARAMETERS`, and optionally the harmonics.
 
         Raises:
             MivolError: none or both of the sources, half of the tensors, or numbers that no Gaussian has.
         """
         place = np.array(props.get("to_world", mi.ScalarTransform4f()).matrix, dtype=np.float64)
-        tensors = [name for name in (*NAMES, HARMONICS) if name in props]
+        tensors = [name for name in (*EXTINCTION_PARAMETERS, HARMONICS) if name in props]
         shown = props.get("space", "srgb"), float(props.get("blur", 0.0))
-        if ("filename" in props) == bool(tensors) or (tensors and not set(NAMES) <= set(tensors)):
+        if ("filename" in props) == bool(tensors) or (tensors and not set(EXTINCTION_PARAMETERS) <= set(tensors)):
             found = " and ".join([*(["filename"] if "filename" in props else []), *tensors]) or "none of them"
-            raise MivolError(f"mivol_gaussians was given {found}; give filename, or {', '.join(NAMES)} (and {HARMONICS}).")
+            raise MivolError(
+                f"mivol_gaussians was given {found}; give filename, or {', '.join(EXTINCTION_PARAMETERS)} (and {HARMONICS})."
+            )
         if tensors:
             return cls({name: mi.TensorXf(props[name]) for name in tensors}, place, *shown)
         return cls.of(read_gaussians(str(mi.file_resolver().resolve(props["filename"]))), place, *shown)
@@ -105,12 +110,12 @@ class GaussianField:
         values.setdefault(HARMONICS, np.zeros((len(values["means"]), 1, 3), np.float32))
         read = Gaussians(**values).checked("Gaussians of a medium")
         means = read.means.astype(np.float64) @ self.place[:3, :3].T + self.place[:3, 3]
-        self.least_scale = _least_scale(read)
+        self.least_scale = _find_min_scale(read)
         scales = np.hypot(np.maximum(read.scales().astype(np.float64), self.least_scale), self.blur)
         whitening = np.swapaxes(read.rotations().astype(np.float64), 1, 2) / scales[:, :, None]
         whitening = whitening @ np.linalg.inv(self.place[:3, :3])
         self.lists: CellLists = list_gaussians(means, whitening, REACH)
-        depth = -np.log1p(-np.minimum(read.opacities().astype(np.float64), MOST_OPAQUE))
+        depth = -np.log1p(-np.minimum(read.opacities().astype(np.float64), MAX_OPACITY))
         # |W omega| is largest along the shortest axis.
         largest = np.linalg.norm(whitening, ord=2, axis=(1, 2))
         self._bound = self.lists.largest_sum(depth * largest) / math.sqrt(2 * math.pi)
@@ -135,7 +140,9 @@ class GaussianField:
 
     def rows(self, scale: mi.Float) -> mi.Float:
         """The rows of all Gaussians (:mod:`mivol.fields.gaussian_line`), attached to the parameters and to a medium's scale."""
-        means, log_scales, quaternions = (_columns(self.tensors[name], n) for name, n in zip(NAMES, (3, 3, 4), strict=False))
+        means, log_scales, quaternions = (
+            _unpack_columns(self.tensors[name], n) for name, n in zip(EXTINCTION_PARAMETERS, (3, 3, 4), strict=False)
+        )
         shift = [[mi.Float(float(v)) for v in row] for row in self.place[:3]]
         mean = [r[0] * means[0] + r[1] * means[1] + r[2] * means[2] + r[3] for r in shift]
         least = dr.opaque(mi.Float, self.least_scale)
@@ -144,11 +151,11 @@ class GaussianField:
         back = np.linalg.inv(self.place[:3, :3]).tolist()
         whitening = [
             [step[k] * sum(axis[i] * back[i][j] for i in range(3)) for j in range(3)]
-            for k, axis in enumerate(_axes(quaternions))
+            for k, axis in enumerate(_rotation_axes(quaternions))
         ]
-        opacity = dr.minimum(_logistic(self.tensors["opacity_logits"].array), MOST_OPAQUE)
+        opacity = dr.minimum(_logistic(self.tensors["opacity_logits"].array), MAX_OPACITY)
         numbers = [*(w for row in whitening for w in row), *mean, opacity, dr.repeat(scale, self.count)]
-        return dr.ravel(mi.ArrayXf([*numbers, *(dr.zeros(mi.Float, self.count) for _ in range(ROW - len(numbers)))]))
+        return dr.ravel(mi.ArrayXf([*numbers, *(dr.zeros(mi.Float, self.count) for _ in range(ROW_SIZE - len(numbers)))]))
 
     @property
     def has_colours(self) -> bool:
@@ -158,20 +165,20 @@ class GaussianField:
     @property
     def degree(self) -> int:
         """Of the harmonics."""
-        return degree_of(self.tensors[HARMONICS].shape[1])
+        return harmonic_degree(self.tensors[HARMONICS].shape[1])
 
     def colour_rows(self) -> mi.Float:
         """The harmonics of all Gaussians in blocks (:mod:`mivol.fields.harmonics`), attached to the parameter."""
-        return rows_of_harmonics(self.tensors[HARMONICS], self.degree)
+        return pack_harmonics(self.tensors[HARMONICS], self.degree)
 
     def harmonics_of(self, d: mi.Vector3f) -> list[mi.Float]:
         """The basis for unit directions of travel in the world."""
-        return dr.sh_eval(turn_by(frame_of(self.place), d), self.degree)
+        return dr.sh_eval(rotate_direction(local_frame(self.place), d), self.degree)
 
     def eval(self, p: mi.Point3f, w: mi.Vector3f, active: mi.Bool) -> list[mi.Float]:
         """The extinction [1/length] at world points, for light that travels along ``w``; without derivatives."""
 
-        def add(total: mi.Float, line: Line, index: mi.UInt32) -> mi.Float:
+        def add(total: mi.Float, line: WhitenedLine, index: mi.UInt32) -> mi.Float:
             return total + line.density
 
         return [self.each_at(mi.Ray3f(p, w), active, dr.zeros(mi.Float, dr.width(p)), add)]
@@ -209,7 +216,7 @@ class GaussianField:
 
         def visit(at: mi.UInt32, state: Any) -> tuple[mi.UInt32, Any]:
             index = dr.gather(mi.UInt32, entries, at)
-            line = cross(read_row(rows, index), *through)
+            line = intersect_gaussian(read_row(rows, index), *through)
             return at + 1, add(state, line, index)
 
         return dr.while_loop((start, state), lambda at, _: on & (at < end), visit, label="Gaussians of a cell")[1]
@@ -223,13 +230,13 @@ class GaussianField:
         return self.tensors
 
 
-def _columns(tensor: mi.TensorXf, width: int) -> list[mi.Float]:
+def _unpack_columns(tensor: mi.TensorXf, width: int) -> list[mi.Float]:
     """The columns of a tensor (N, width)."""
     index = dr.arange(mi.UInt32, tensor.shape[0]) * width
     return [dr.gather(mi.Float, tensor.array, index + c) for c in range(width)]
 
 
-def _axes(quaternions: list[mi.Float]) -> list[list[mi.Float]]:
+def _rotation_axes(quaternions: list[mi.Float]) -> list[list[mi.Float]]:
     """The axes of each Gaussian in the world: columns of its rotation, for quaternions (w, x, y, z) of any length but 0."""
     inverse = dr.rsqrt(sum((q * q for q in quaternions[1:]), quaternions[0] * quaternions[0]))
     w, x, y, z = (q * inverse for q in quaternions)
@@ -245,7 +252,7 @@ def _logistic(logit: mi.Float) -> mi.Float:
     return dr.rcp(1 + dr.exp(-logit))
 
 
-def _least_scale(gaussians: Gaussians) -> float:
+def _find_min_scale(gaussians: Gaussians) -> float:
     """The smallest standard deviation that counts, in the Gaussians' own lengths."""
     spread = REACH * np.sqrt(np.diagonal(gaussians.covariances().astype(np.float64), axis1=1, axis2=2))
-    return LEAST_SCALE * float(((gaussians.means + spread).max(axis=0) - (gaussians.means - spread).min(axis=0)).max())
+    return MIN_RELATIVE_SCALE * float(((gaussians.means + spread).max(axis=0) - (gaussians.means - spread).min(axis=0)).max())

@@ -36,15 +36,15 @@ from scipy.spatial.transform import Rotation
 from scipy.special import elliprg
 
 from mivol.errors import MivolError
-from mivol.fields.gaussian_cells import PAIRS, cut_into_parts, places_in_boxes
+from mivol.fields.gaussian_cells import MAX_CHUNK_PAIRS, find_chunk_starts, list_box_nodes
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.files import encode_srgb
 from mivol.machine import available_memory
 from mivol.points.gaussians import CONSTANT_HARMONIC, HIGHEST_DEGREE, Gaussians
 
-__all__ = ["MOST_OPAQUE", "box_of_gaussians", "grid_of_gaussians", "masses_of_gaussians", "gaussians_of_grid"]
+__all__ = ["MAX_OPACITY", "gaussian_box", "gaussians_to_grid", "gaussian_masses", "grid_to_gaussians"]
 
-MOST_OPAQUE = 0.999
+MAX_OPACITY = 0.999
 """Opacities above it become this one, an optical depth of 6.9: an opacity of 1 would be an infinite extinction."""
 
 DEPOSIT_REACH = 4.0
@@ -54,14 +54,14 @@ PAIR_BYTES = 160
 """That a pair takes while it is weighed: places, weights and their products."""
 
 
-def masses_of_gaussians(gaussians: Gaussians) -> np.ndarray:
-    """(N,) integrals of the extinction over space [length^2], float64; opacities above :data:`MOST_OPAQUE` count as that."""
-    opacity = np.minimum(gaussians.opacities().astype(np.float64), MOST_OPAQUE)
+def gaussian_masses(gaussians: Gaussians) -> np.ndarray:
+    """(N,) integrals of the extinction over space [length^2], float64; opacities above :data:`MAX_OPACITY` count as that."""
+    opacity = np.minimum(gaussians.opacities().astype(np.float64), MAX_OPACITY)
     a, b, c = (gaussians.scales().astype(np.float64) ** 2).T
     return -np.log1p(-opacity) * 2 * math.pi * elliprg(a * b, a * c, b * c)
 
 
-def box_of_gaussians(gaussians: Gaussians) -> tuple[np.ndarray, np.ndarray]:
+def gaussian_box(gaussians: Gaussians) -> tuple[np.ndarray, np.ndarray]:
     """Corners (3,) of the box that holds three standard deviations of all Gaussians [length], float64.
 
     Raises:
@@ -73,7 +73,7 @@ def box_of_gaussians(gaussians: Gaussians) -> tuple[np.ndarray, np.ndarray]:
     return (gaussians.means - spread).min(axis=0), (gaussians.means + spread).max(axis=0)
 
 
-def grid_of_gaussians(gaussians: Gaussians, low: np.ndarray, high: np.ndarray, resolution: int) -> SphericalGrid:
+def gaussians_to_grid(gaussians: Gaussians, low: np.ndarray, high: np.ndarray, resolution: int) -> SphericalGrid:
     """Write Gaussians on the nodes of a grid; what reaches out of the box is cut off.
 
     Args:
@@ -120,11 +120,11 @@ def _deposit(gaussians: Gaussians, centres: np.ndarray, size: np.ndarray, voxel:
     integral = (2 * math.pi) ** 1.5 * np.sqrt(np.linalg.det(covariances))
     sizes = last - first + 1
     harmonics = gaussians.harmonics.reshape(gaussians.count, -1)
-    rows = np.concatenate([np.ones((gaussians.count, 1)), harmonics], axis=1) * masses_of_gaussians(gaussians)[:, None]
+    rows = np.concatenate([np.ones((gaussians.count, 1)), harmonics], axis=1) * gaussian_masses(gaussians)[:, None]
     sums = np.zeros((int(np.prod(size)), rows.shape[1]))
-    for part in np.split(seen, cut_into_parts(sizes[seen].prod(axis=1))):
+    for part in np.split(seen, find_chunk_starts(sizes[seen].prod(axis=1))):
         owner = np.repeat(np.arange(len(part)), sizes[part].prod(axis=1))
-        node = first[part][owner] + places_in_boxes(sizes[part])
+        node = first[part][owner] + list_box_nodes(sizes[part])
         away = node - centres[part][owner]
         weight = np.exp(-0.5 * np.einsum("ni,nij,nj->n", away, np.linalg.inv(covariances[part])[owner], away))
         weight /= np.where(is_whole[part], np.bincount(owner, weight, len(part)), integral[part])[owner]
@@ -136,7 +136,7 @@ def _deposit(gaussians: Gaussians, centres: np.ndarray, size: np.ndarray, voxel:
 
 def _check_grid_memory(size: np.ndarray, basis: int, resolution: int) -> None:
     """Refuse a grid that does not fit: sums, as much again for the field made of them, and one wide Gaussian's pairs."""
-    pairs = PAIR_BYTES * PAIRS
+    pairs = PAIR_BYTES * MAX_CHUNK_PAIRS
     needed = (16 * (1 + 3 * basis) + PAIR_BYTES) * int(np.prod(size)) + pairs
     free = available_memory()
     if free is not None and needed > free:
@@ -147,7 +147,7 @@ def _check_grid_memory(size: np.ndarray, basis: int, resolution: int) -> None:
         )
 
 
-TENT = 1 / 6
+TENT_VARIANCE = 1 / 6
 """Variance of the tent by which a node is interpolated, along each axis [voxel^2]."""
 
 BLOCK_EDGE = 2
@@ -155,11 +155,11 @@ BLOCK_EDGE = 2
 came as near to the field as 25,000 of one voxel (29.3 and 29.3 dB at 256 pixels, 27.7 and 26.0 at 128): what is smaller than a
 pixel is widened by the splatter's low-pass filter, at the same opacity."""
 
-FAINTEST = 1 / 255
+MIN_OPACITY = 1 / 255
 """Opacity below which a Gaussian is left out: no splatter draws it."""
 
 
-def gaussians_of_grid(field: SphericalGrid, resolution: int | None = None) -> Gaussians:
+def grid_to_gaussians(field: SphericalGrid, resolution: int | None = None) -> Gaussians:
     """Gaussians of the mass, the colours and the shape of a field's matter, one a block of voxels.
 
     Args:
@@ -177,35 +177,35 @@ def gaussians_of_grid(field: SphericalGrid, resolution: int | None = None) -> Ga
     if resolution is not None and resolution < 1:
         raise MivolError(f"a resolution of {resolution} blocks was given; at least 1 is expected.")
     block = BLOCK_EDGE if resolution is None else math.ceil(max(field.res) / resolution)
-    nodes, mass, harmonics = _matter(field)
-    owner, count = _blocks(nodes, field.res, block)
+    nodes, mass, harmonics = _collect_mass(field)
+    owner, count = _group_nodes(nodes, field.res, block)
     total = np.bincount(owner, mass, count)
     edges = field.to_world[:3, :3] / field.res[::-1]
-    mean = _sums(owner, nodes * mass[:, None], count) / total[:, None]
+    mean = _sum_by_owner(owner, nodes * mass[:, None], count) / total[:, None]
     away = nodes - mean[owner]
-    spread = _sums(owner, (away[:, :, None] * away[:, None, :] * mass[:, None, None]).reshape(-1, 9), count)
-    covariance = (spread / total[:, None]).reshape(-1, 3, 3) + TENT * np.eye(3)
+    spread = _sum_by_owner(owner, (away[:, :, None] * away[:, None, :] * mass[:, None, None]).reshape(-1, 9), count)
+    covariance = (spread / total[:, None]).reshape(-1, 3, 3) + TENT_VARIANCE * np.eye(3)
     variance, axes = np.linalg.eigh(edges @ covariance @ edges.T)
     axes[np.linalg.det(axes) < 0, :, 0] *= -1
     a, b, c = variance.T
     opacity = -np.expm1(-total / (2 * math.pi * elliprg(a * b, a * c, b * c)))
-    drawn = opacity >= FAINTEST
+    drawn = opacity >= MIN_OPACITY
     if not drawn.any():
         most = f"the densest block of voxels hides {opacity.max(initial=0):.2g} of what is behind it"
-        raise MivolError(f"{most}, and a Gaussian below {FAINTEST:.2g} is not drawn; give a lower resolution.")
-    colours = _sums(owner, (harmonics * mass[:, None, None]).reshape(len(mass), -1), count) / total[:, None]
+        raise MivolError(f"{most}, and a Gaussian below {MIN_OPACITY:.2g} is not drawn; give a lower resolution.")
+    colours = _sum_by_owner(owner, (harmonics * mass[:, None, None]).reshape(len(mass), -1), count) / total[:, None]
     places = (mean + 0.5) @ edges.T + field.to_world[:3, 3]
     capped = np.minimum(opacity, 1 - 2**-23)
     return Gaussians(
         places[drawn],
         0.5 * np.log(variance[drawn]),
-        _quaternions(axes[drawn]),
+        _to_quaternions(axes[drawn]),
         (np.log(capped) - np.log1p(-capped))[drawn],
         colours.reshape(count, -1, 3)[drawn],
     )
 
 
-def _matter(field: SphericalGrid) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _collect_mass(field: SphericalGrid) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Nodes that hold anything (n, 3), (x, y, z), their masses [length^2] (n,) and harmonics (n, K, 3) of code values."""
     density, harmonics = field.values()
     volume = abs(float(np.linalg.det(field.to_world[:3, :3]))) / math.prod(field.res)
@@ -214,16 +214,16 @@ def _matter(field: SphericalGrid) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     if not len(held):
         raise MivolError("the field holds nothing; matter is expected: there is nothing to make Gaussians of.")
     z, y, x = np.unravel_index(field.listed()[held], field.res)
-    return np.stack([x, y, z], axis=1).astype(np.float64), mass[held], _codes(field, harmonics[held])
+    return np.stack([x, y, z], axis=1).astype(np.float64), mass[held], _encode_harmonics(field, harmonics[held])
 
 
-def _codes(field: SphericalGrid, harmonics: np.ndarray) -> np.ndarray:
+def _encode_harmonics(field: SphericalGrid, harmonics: np.ndarray) -> np.ndarray:
     """Harmonics (n, K, 3) in the world's frame, of code values less one half, as Gaussians have them, float64."""
     harmonics = harmonics[:, : (HIGHEST_DEGREE + 1) ** 2].astype(np.float64)
     basis = harmonics.shape[1]
-    d = _directions()
-    own = _columns(field.harmonics_of(d)[:basis])
-    back = np.linalg.pinv(_columns(dr.sh_eval(d, math.isqrt(basis) - 1)))
+    d = _fibonacci_directions()
+    own = _stack_columns(field.harmonics_of(d)[:basis])
+    back = np.linalg.pinv(_stack_columns(dr.sh_eval(d, math.isqrt(basis) - 1)))
     if field.space == "srgb":
         turned = np.einsum("kj,njc->nkc", back @ own, harmonics)
         turned[:, 0] += (field.offset - 0.5) / CONSTANT_HARMONIC
@@ -235,7 +235,7 @@ def _codes(field: SphericalGrid, harmonics: np.ndarray) -> np.ndarray:
     return np.concatenate([np.einsum("km,nmc->nkc", back, encode_srgb(np.maximum(part, 0)) - 0.5) for part in seen])
 
 
-def _columns(values: Sequence[mi.Float]) -> np.ndarray:
+def _stack_columns(values: Sequence[mi.Float]) -> np.ndarray:
     """Harmonics in all directions as a matrix (directions, K), float64; the constant one is a single number."""
     return np.stack(np.broadcast_arrays(*(np.array(value, np.float64) for value in values)), axis=1)
 
@@ -244,14 +244,14 @@ LIGHT_CHUNK = 1 << 14
 """Nodes whose light is looked at together."""
 
 
-def _directions(count: int = 64) -> mi.Vector3f:
+def _fibonacci_directions(count: int = 64) -> mi.Vector3f:
     """Unit directions spread evenly over the sphere (a Fibonacci lattice)."""
     height = 1 - (2 * np.arange(count) + 1) / count
     turn, flat = math.pi * (3 - math.sqrt(5)) * np.arange(count), np.sqrt(1 - height**2)
     return mi.Vector3f(*(np.float32(v) for v in (flat * np.cos(turn), flat * np.sin(turn), height)))
 
 
-def _blocks(nodes: np.ndarray, res: tuple[int, int, int], block: int) -> tuple[np.ndarray, int]:
+def _group_nodes(nodes: np.ndarray, res: tuple[int, int, int], block: int) -> tuple[np.ndarray, int]:
     """The number of each node's block, of those that hold something, and how many there are."""
     size = -(-np.array(res[::-1]) // block)
     at = nodes.astype(np.int64) // block
@@ -259,11 +259,11 @@ def _blocks(nodes: np.ndarray, res: tuple[int, int, int], block: int) -> tuple[n
     return owner, len(held)
 
 
-def _sums(owner: np.ndarray, rows: np.ndarray, count: int) -> np.ndarray:
+def _sum_by_owner(owner: np.ndarray, rows: np.ndarray, count: int) -> np.ndarray:
     """(count, columns) sums of rows over those of each owner."""
     return np.stack([np.bincount(owner, column, count) for column in rows.T], axis=1)
 
 
-def _quaternions(axes: np.ndarray) -> np.ndarray:
+def _to_quaternions(axes: np.ndarray) -> np.ndarray:
     """(n, 4) quaternions (w, x, y, z) of rotations (n, 3, 3)."""
     return Rotation.from_matrix(axes).as_quat()[:, [3, 0, 1, 2]]

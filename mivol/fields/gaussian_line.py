@@ -29,9 +29,9 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-__all__ = ["REACH", "ROW", "SCALE", "Line", "Slopes", "change_of", "cross", "read_row"]
+__all__ = ["REACH", "ROW_SIZE", "SCALE_COLUMN", "WhitenedLine", "LineSlopes", "row_tangent", "intersect_gaussian", "read_row"]
 
-ROW, SCALE = 16, 13
+ROW_SIZE, SCALE_COLUMN = 16, 13
 """Numbers of a Gaussian, and which of them is the scale of the medium."""
 
 REACH = 4.0
@@ -43,14 +43,14 @@ INVERSE_ROOT_2, INVERSE_ROOT_2_PI = 1 / math.sqrt(2), 1 / math.sqrt(2 * math.pi)
 
 
 @dataclass
-class Slopes:
+class LineSlopes:
     """Derivatives of a number with respect to q, v and the opacity of one Gaussian."""
 
     q: mi.Vector3f
     v: mi.Vector3f
     opacity: mi.Float
 
-    def by_row(self, line: Line) -> list[mi.Float]:
+    def by_row(self, line: WhitenedLine) -> list[mi.Float]:
         """Derivatives with respect to the first 13 numbers of the row."""
         y, d, (a, b, c) = line.from_mean, line.d, line.rows
         mean = -(a * self.q.x + b * self.q.y + c * self.q.z)
@@ -59,7 +59,7 @@ class Slopes:
 
 
 @dataclass
-class Line:
+class WhitenedLine:
     """A line through a point ``o`` in the direction of the unit vector ``d``, as one Gaussian sees it.
 
     Attributes:
@@ -100,7 +100,7 @@ class Line:
     @property
     def depth(self) -> mi.Float:
         """Optical depth of the whole line [1], -log(1 - alpha)."""
-        return minus_log_of_rest(self.alpha)
+        return minus_log_one_minus(self.alpha)
 
     @property
     def chord(self) -> tuple[mi.Float, mi.Float]:
@@ -116,20 +116,20 @@ class Line:
         """The share [1] of the depth that lies before a distance from ``o``, from the far end of the line."""
         return 0.5 * (1 + dr.erf((a - self.peak) * self.speed * INVERSE_ROOT_2))
 
-    def share_slopes(self, a: mi.Float, b: mi.Float) -> Slopes:
+    def share_slopes(self, a: mi.Float, b: mi.Float) -> LineSlopes:
         """Derivatives of the optical depth between two distances from ``o``, as they are cut to the chord.
 
         Where the chord ends between them the end counts as fixed: its move would add at most exp(-REACH^2 / 2) of the depth.
         """
         start, end = self.chord
-        low = dr.select(a > start, _bell((a - self.peak) * self.speed), 0)
-        high = dr.select(b < end, _bell((b - self.peak) * self.speed), 0)
+        low = dr.select(a > start, _normal_density((a - self.peak) * self.speed), 0)
+        high = dr.select(b < end, _normal_density((b - self.peak) * self.speed), 0)
         share, depth, step = self.share(a, b), self.depth, dr.rcp(self.speed)
         rise = share * self._rise
         grows, moves = depth * (high - low) * step, depth * (high * b - low * a) * step
         q = grows * self.v - rise * self.p
         v = (grows - rise * self.peak) * self.p + moves * self.v
-        return Slopes(q, v, share * self._by_opacity)
+        return LineSlopes(q, v, share * self._by_opacity)
 
     @property
     def holds_origin(self) -> mi.Bool:
@@ -140,16 +140,16 @@ class Line:
     @property
     def density(self) -> mi.Float:
         """The extinction [1/length] at ``o``; 0 outside of the chord."""
-        return dr.select(self.holds_origin, self.depth * self.speed * _bell(self.peak * self.speed), 0)
+        return dr.select(self.holds_origin, self.depth * self.speed * _normal_density(self.peak * self.speed), 0)
 
     @property
-    def density_slopes(self) -> Slopes:
+    def density_slopes(self) -> LineSlopes:
         """Derivatives of the extinction at ``o``, where the chord holds it."""
         s, step = -self.peak * self.speed, dr.rcp(self.speed)
-        bell, depth, rise = _bell(s), self.depth, self._rise
+        bell, depth, rise = _normal_density(s), self.depth, self._rise
         q = -bell * (self.speed * rise * self.p + depth * s * self.v)
         v = bell * (depth * step * self.v + s * (rise - depth) * self.p)
-        return Slopes(q, v, bell * self.speed * self._by_opacity)
+        return LineSlopes(q, v, bell * self.speed * self._by_opacity)
 
     @property
     def _by_opacity(self) -> mi.Float:
@@ -164,10 +164,10 @@ class Line:
 
 def read_row(rows: mi.Float, index: mi.UInt32) -> list[mi.Float]:
     """The 16 numbers of a Gaussian."""
-    return list(dr.gather(mi.ArrayXf, rows, index, shape=(ROW, dr.width(index))))
+    return list(dr.gather(mi.ArrayXf, rows, index, shape=(ROW_SIZE, dr.width(index))))
 
 
-def cross(row: list[mi.Float], o: mi.Point3f, d: mi.Vector3f) -> Line:
+def intersect_gaussian(row: list[mi.Float], o: mi.Point3f, d: mi.Vector3f) -> WhitenedLine:
     """See a line through ``o`` in the direction ``d`` as a Gaussian does.
 
     Args:
@@ -184,21 +184,21 @@ def cross(row: list[mi.Float], o: mi.Point3f, d: mi.Vector3f) -> Line:
     m2 = dr.squared_norm(p)
     hits = m2 < REACH**2
     half = dr.select(hits, dr.safe_sqrt(REACH**2 - m2) / speed, 0)
-    return Line(rows, y, mi.Vector3f(d), v, speed, p, peak, half, row[12], m2, hits)
+    return WhitenedLine(rows, y, mi.Vector3f(d), v, speed, p, peak, half, row[12], m2, hits)
 
 
-def change_of(line: Line, slopes: Slopes, change: list[mi.Float]) -> mi.Float:
+def row_tangent(line: WhitenedLine, slopes: LineSlopes, change: list[mi.Float]) -> mi.Float:
     """The tangent of a number with these derivatives, from the tangent of the row."""
     return sum((s * c for s, c in zip(slopes.by_row(line), change, strict=False)), mi.Float(0))
 
 
-def minus_log_of_rest(alpha: mi.Float) -> mi.Float:
+def minus_log_one_minus(alpha: mi.Float) -> mi.Float:
     """-log(1 - alpha), to 1e-7 of itself: 1 - alpha alone would lose the digits of a small alpha."""
     x = alpha
     series = dr.fma(x, dr.fma(x, dr.fma(x, dr.fma(x, dr.fma(x, 1 / 6, 1 / 5), 1 / 4), 1 / 3), 1 / 2), 1)
     return dr.select(x < 0.05, x * series, -dr.log(1 - x))
 
 
-def _bell(s: mi.Float) -> mi.Float:
+def _normal_density(s: mi.Float) -> mi.Float:
     """The density of the normal distribution."""
     return INVERSE_ROOT_2_PI * dr.exp(-0.5 * s * s)

@@ -23,24 +23,24 @@ import mitsuba as mi
 import numpy as np
 
 from mivol.errors import MivolError
-from mivol.fields.gaussian_line import ROW, read_row
+from mivol.fields.gaussian_line import ROW_SIZE, read_row
 
 __all__ = [
-    "blocks_of",
-    "colour_along",
-    "colour_slopes",
+    "blocks_per_gaussian",
+    "eval_colour",
+    "eval_colour_slopes",
     "read_harmonics",
-    "rows_of_harmonics",
-    "sums_along",
+    "pack_harmonics",
+    "sum_harmonics",
     "MAX_DEGREE",
     "SPACES",
     "basis_size",
-    "degree_of",
+    "harmonic_degree",
     "row_width",
-    "radiance_of_codes",
-    "slope_of_codes",
-    "frame_of",
-    "turn_by",
+    "decode_srgb_code",
+    "srgb_slope",
+    "local_frame",
+    "rotate_direction",
 ]
 
 
@@ -56,7 +56,7 @@ def basis_size(degree: int) -> int:
     return (degree + 1) ** 2
 
 
-def degree_of(basis: int) -> int:
+def harmonic_degree(basis: int) -> int:
     """The degree of so many harmonics.
 
     Raises:
@@ -73,7 +73,7 @@ def row_width(basis: int) -> int:
     return -(-3 * basis // 4) * 4
 
 
-def radiance_of_codes(code: mi.Float) -> mi.Float:
+def decode_srgb_code(code: mi.Float) -> mi.Float:
     """The light of an sRGB code value: the curve of IEC 61966-2-1, followed on above 1 and, straight, below 0.
 
     The same curve as :func:`mivol.photos.photo_file.decode_srgb`, with derivatives.
@@ -83,31 +83,31 @@ def radiance_of_codes(code: mi.Float) -> mi.Float:
     return dr.select(code <= 0.04045, code / 12.92, bent)
 
 
-def slope_of_codes(code: mi.Float) -> mi.Float:
-    """The derivative of :func:`radiance_of_codes`."""
+def srgb_slope(code: mi.Float) -> mi.Float:
+    """The derivative of :func:`decode_srgb_code`."""
     return dr.select(code <= 0.04045, 1 / 12.92, (2.4 / 1.055) * dr.power((code + 0.055) / 1.055, 1.4))
 
 
-def frame_of(to_world: np.ndarray) -> np.ndarray:
+def local_frame(to_world: np.ndarray) -> np.ndarray:
     """(3, 3) map of world directions to a field's own frame: the inverse of the polar factor of its placement (Higham 1986)."""
     left, _, right = np.linalg.svd(to_world[:3, :3])
     return (left @ right).T
 
 
-def turn_by(frame: np.ndarray, d: mi.Vector3f) -> mi.Vector3f:
+def rotate_direction(frame: np.ndarray, d: mi.Vector3f) -> mi.Vector3f:
     """Directions in another frame."""
     rows = [[dr.opaque(mi.Float, float(v)) for v in row] for row in frame]
     return mi.Vector3f(*(dr.fma(r[0], d.x, dr.fma(r[1], d.y, r[2] * d.z)) for r in rows))
 
 
-def blocks_of(degree: int) -> int:
+def blocks_per_gaussian(degree: int) -> int:
     """Blocks of ``ROW`` numbers that the harmonics of one Gaussian take."""
-    return -(-3 * basis_size(degree) // ROW)
+    return -(-3 * basis_size(degree) // ROW_SIZE)
 
 
-def rows_of_harmonics(harmonics: mi.TensorXf, degree: int) -> mi.Float:
+def pack_harmonics(harmonics: mi.TensorXf, degree: int) -> mi.Float:
     """The harmonics (N, K, 3) as rows of whole blocks, with their derivatives."""
-    used, width = 3 * basis_size(degree), ROW * blocks_of(degree)
+    used, width = 3 * basis_size(degree), ROW_SIZE * blocks_per_gaussian(degree)
     if used == width:
         return harmonics.array
     index = dr.arange(mi.UInt32, harmonics.shape[0] * width)
@@ -117,21 +117,21 @@ def rows_of_harmonics(harmonics: mi.TensorXf, degree: int) -> mi.Float:
 
 def read_harmonics(rows: mi.Float, first: mi.UInt32, degree: int) -> list[mi.Float]:
     """The harmonics of one Gaussian, whose blocks begin with number ``first``."""
-    return [value for block in range(blocks_of(degree)) for value in read_row(rows, first + block)]
+    return [value for block in range(blocks_per_gaussian(degree)) for value in read_row(rows, first + block)]
 
 
-def sums_along(row: list[mi.Float], basis: list[mi.Float]) -> list[mi.Float]:
+def sum_harmonics(row: list[mi.Float], basis: list[mi.Float]) -> list[mi.Float]:
     """sum_b Y_b k_b of each channel."""
     return [sum((y * row[3 * b + c] for b, y in enumerate(basis)), mi.Float(0)) for c in range(3)]
 
 
-def colour_along(row: list[mi.Float], basis: list[mi.Float], space: str) -> list[mi.Float]:
+def eval_colour(row: list[mi.Float], basis: list[mi.Float], space: str) -> list[mi.Float]:
     """The radiance of red, green and blue that a Gaussian shows."""
-    codes = [dr.maximum(total + 0.5, 0) for total in sums_along(row, basis)]
-    return codes if space == "linear" else [radiance_of_codes(code) for code in codes]
+    codes = [dr.maximum(total + 0.5, 0) for total in sum_harmonics(row, basis)]
+    return codes if space == "linear" else [decode_srgb_code(code) for code in codes]
 
 
-def colour_slopes(row: list[mi.Float], basis: list[mi.Float], space: str) -> list[mi.Float]:
-    """Derivatives of :func:`colour_along` by the sums over the harmonics."""
-    codes = [total + 0.5 for total in sums_along(row, basis)]
-    return [dr.select(code > 0, 1 if space == "linear" else slope_of_codes(code), 0) for code in codes]
+def eval_colour_slopes(row: list[mi.Float], basis: list[mi.Float], space: str) -> list[mi.Float]:
+    """Derivatives of :func:`eval_colour` by the sums over the harmonics."""
+    codes = [total + 0.5 for total in sum_harmonics(row, basis)]
+    return [dr.select(code > 0, 1 if space == "linear" else srgb_slope(code), 0) for code in codes]

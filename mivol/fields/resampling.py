@@ -14,7 +14,7 @@ import mitsuba as mi
 import numpy as np
 
 from mivol.errors import MivolError
-from mivol.fields.spherical_grid import SphericalGrid, is_covered
+from mivol.fields.spherical_grid import SphericalGrid, is_covered_by_inner
 
 __all__ = ["resample_field"]
 
@@ -31,10 +31,10 @@ def resample_field(old: SphericalGrid, res: tuple[int, int, int], to_world: np.n
     Raises:
         MivolError: axes that differ.
     """
-    axes = _Axes.between(old, res, to_world)
-    kept = np.flatnonzero([_near(level, axes) for level in keep.reshape(old.levels, *old.res)])
-    kept = kept[~np.array(is_covered(mi.UInt32(kept.astype(np.uint32)), res))] if old.levels > 1 else kept
-    density, harmonics = _interpolated(old, axes, np.unravel_index(kept, (old.levels, *res)))
+    axes = _AxisWeights.between(old, res, to_world)
+    kept = np.flatnonzero([_select_nodes(level, axes) for level in keep.reshape(old.levels, *old.res)])
+    kept = kept[~np.array(is_covered_by_inner(mi.UInt32(kept.astype(np.uint32)), res))] if old.levels > 1 else kept
+    density, harmonics = _interpolate(old, axes, np.unravel_index(kept, (old.levels, *res)))
     count = len(kept)
     flat = dr.full(mi.Float, old.act.vacuum, count + 1)
     packed = dr.zeros(mi.Float, (count + 1) * old.width)
@@ -46,7 +46,7 @@ def resample_field(old: SphericalGrid, res: tuple[int, int, int], to_world: np.n
     return replace(old, res=tuple(res), to_world=to_world, density=flat, harmonics=packed, nodes=nodes, listing=None)
 
 
-def _near(keep: np.ndarray, axes: list[_Axes]) -> np.ndarray:
+def _select_nodes(keep: np.ndarray, axes: list[_AxisWeights]) -> np.ndarray:
     """Whether new nodes (Z, Y, X) have a kept one among the 8 old ones about them; one axis at a time, for memory."""
     for a, axis in enumerate(axes):
         low, high = axis.nodes
@@ -54,7 +54,7 @@ def _near(keep: np.ndarray, axes: list[_Axes]) -> np.ndarray:
     return keep
 
 
-class _Axes:
+class _AxisWeights:
     """Along one axis, the two old nodes about each new one and their shares, (2, n)."""
 
     def __init__(self, q: np.ndarray, n: int) -> None:
@@ -66,7 +66,7 @@ class _Axes:
         self.shares = np.stack([1 - (q - low), q - low]).astype(np.float32)
 
     @classmethod
-    def between(cls, old: SphericalGrid, res: tuple[int, int, int], to_world: np.ndarray) -> list[_Axes]:
+    def between(cls, old: SphericalGrid, res: tuple[int, int, int], to_world: np.ndarray) -> list[_AxisWeights]:
         """For z, y and x."""
         move = np.linalg.inv(old.to_world) @ to_world
         if np.abs(move[:3, :3] - np.diag(np.diag(move)[:3])).max() > 1e-6 * np.abs(move[:3, :3]).max():
@@ -77,7 +77,7 @@ class _Axes:
         return made[::-1]
 
 
-def _interpolated(old: SphericalGrid, axes: list[_Axes], place: tuple) -> tuple[mi.Float, list[mi.Float]]:
+def _interpolate(old: SphericalGrid, axes: list[_AxisWeights], place: tuple) -> tuple[mi.Float, list[mi.Float]]:
     """Values at new nodes (levels, and indices along z, y, x)."""
     density, harmonics = mi.Float(0), [mi.Float(0)] * old.width
     if len(place[0]) == 0:

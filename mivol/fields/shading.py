@@ -55,7 +55,7 @@ class Shading:
             MivolError: no eye, or a coefficient that is negative or not finite.
         """
         numbers = {key: float(props.get(key, value)) for key, value in COEFFICIENTS.items()}
-        eye, light = (_point(props, key) for key in ("eye", "light"))
+        eye, light = (_parse_point(props, key) for key in ("eye", "light"))
         if not props.get("shade", False):
             return None
         if eye is None:
@@ -73,12 +73,12 @@ class Shading:
             gradient: of the scan there, per length.
             p: where they are in the world.
         """
-        n = _unit(gradient)
-        to_eye = _unit(self.eye - p)
-        to_light = to_eye if self.light is None else _unit(self.light - p)
-        half = _unit(to_light + to_eye)
+        n = _normalize(gradient)
+        to_eye = _normalize(self.eye - p)
+        to_light = to_eye if self.light is None else _normalize(self.light - p)
+        half = _normalize(to_light + to_eye)
         matte = self.ambient + self.diffuse * dr.abs(dr.dot(n, to_light))
-        highlight = self.specular * _power(dr.abs(dr.dot(n, half)), self.specular_power)
+        highlight = self.specular * _positive_power(dr.abs(dr.dot(n, half)), self.specular_power)
         return [c * matte + highlight for c in colours]
 
 
@@ -95,7 +95,7 @@ def gradient_grid(field: mi.TensorXf, to_world: np.ndarray) -> mi.TensorXf:
     slopes = []
     for axis, n in zip("xyz", reversed(res), strict=True):
         ends = [dr.clip(index[axis] + step, 0, n - 1) for step in (-1, 1)]
-        before, after = (dr.gather(mi.Float, values, _flat({**index, axis: end}, res)) for end in ends)
+        before, after = (dr.gather(mi.Float, values, _flat_index({**index, axis: end}, res)) for end in ends)
         # In the unit cube a voxel is 1 / n wide; along an axis of one voxel nothing changes.
         slopes.append(n * (after - before) / dr.maximum(mi.Float(ends[1] - ends[0]), 1))
     world = np.linalg.inv(np.asarray(to_world)[:3, :3]).T
@@ -103,22 +103,22 @@ def gradient_grid(field: mi.TensorXf, to_world: np.ndarray) -> mi.TensorXf:
     return mi.TensorXf(dr.ravel(mi.Vector3f(*along)), (*res, 3))
 
 
-def _flat(index: dict[str, mi.Int32], res: tuple[int, ...]) -> mi.UInt32:
+def _flat_index(index: dict[str, mi.Int32], res: tuple[int, ...]) -> mi.UInt32:
     return mi.UInt32((index["z"] * res[1] + index["y"]) * res[2] + index["x"])
 
 
-def _unit(v: mi.Vector3f) -> mi.Vector3f:
+def _normalize(v: mi.Vector3f) -> mi.Vector3f:
     """Vectors of length 1; those that vanish stay."""
     length = dr.norm(v)
     return v / dr.select(length > 0, length, 1)
 
 
-def _power(x: mi.Float, exponent: float) -> mi.Float:
+def _positive_power(x: mi.Float, exponent: float) -> mi.Float:
     """x^m for x of at least 0, with a slope of 0 at 0; 0^0 is 0, since there is no surface."""
     return dr.select(x > 0, dr.power(dr.select(x > 0, x, 1), exponent), 0)
 
 
-def _point(props: mi.Properties, key: str) -> mi.Point3f | None:
+def _parse_point(props: mi.Properties, key: str) -> mi.Point3f | None:
     """A point among plugin parameters, not compiled into kernels: cameras move."""
     if key not in props:
         return None

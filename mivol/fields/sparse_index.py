@@ -13,11 +13,11 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-__all__ = ["ListedPlaces"]
+__all__ = ["SparseIndex"]
 
 
 @dataclass
-class ListedPlaces:
+class SparseIndex:
     """Which places are listed.
 
     Attributes:
@@ -34,7 +34,7 @@ class ListedPlaces:
         return 4 * dr.width(self.words)
 
     @classmethod
-    def of(cls, listed: mi.UInt32, places: int) -> ListedPlaces:
+    def of(cls, listed: mi.UInt32, places: int) -> SparseIndex:
         """From the ascending numbers of the listed ones among so many places."""
         n = -(-max(places, 1) // 32)
         bits = dr.zeros(mi.UInt32, n)

@@ -18,7 +18,7 @@ through it and the size of its numbers are those of level 0,
 so that a rate or a prior that suits one level suits all. Nodes are counted level by level.
 
 Colours are what photographs show: code values of sRGB (``space`` is ``srgb``), which rays composite as they are. A field of
-``linear`` radiance is its own light; :func:`radiance_of_codes` makes light of codes, where a scene shows a field among others.
+``linear`` radiance is its own light; :func:`decode_srgb_code` makes light of codes, where a scene shows a field among others.
 
 Storage. Rows, one a node: ``density`` apart from ``harmonics``, whose rows are [basis][rgb], filled up to a multiple of 4. A
 dense grid has a row for each node in Z Y X order; a sparse one lists its ``nodes`` in that order and ends in one more row, the
@@ -40,21 +40,29 @@ import numpy as np
 
 from mivol.device_arrays import aligned
 from mivol.errors import MivolError
-from mivol.fields.activation import Activation, activation_of
-from mivol.fields.harmonics import SPACES, basis_size, degree_of, frame_of, radiance_of_codes, row_width, turn_by
-from mivol.fields.sparse_index import ListedPlaces
+from mivol.fields.activation import Activation, select_activation
+from mivol.fields.harmonics import (
+    SPACES,
+    basis_size,
+    decode_srgb_code,
+    harmonic_degree,
+    local_frame,
+    rotate_direction,
+    row_width,
+)
+from mivol.fields.sparse_index import SparseIndex
 from mivol.files.notebook import slices_html
 from mivol.shown import briefly
 from mivol.space import check_affine, lattice_from_world
 
-__all__ = ["SphericalGrid", "is_covered", "with_tensors", "dense_densities"]
+__all__ = ["SphericalGrid", "is_covered_by_inner", "with_tensors", "dense_densities"]
 
 
 HOMOGENEOUS = ("none", "relu")
 """Activations of nested fields: a density n times as large is an extinction n times as large."""
 
 
-def is_covered(node: mi.UInt32, res: tuple[int, int, int]) -> mi.Bool:
+def is_covered_by_inner(node: mi.UInt32, res: tuple[int, int, int]) -> mi.Bool:
     """Whether nodes of nested grids of ``res`` are of no use: all cells about them lie in the box of the level before."""
     z, y, x = res
     inside = node >= math.prod(res)
@@ -95,7 +103,7 @@ class SphericalGrid:
     clamp: bool = True
     levels: int = 1
     space: str = "srgb"
-    listing: ListedPlaces | None = None
+    listing: SparseIndex | None = None
 
     def _repr_html_(self) -> str:
         """Three middle slices of the density, for notebooks."""
@@ -106,7 +114,7 @@ class SphericalGrid:
         if self.levels > 1 and self.activation not in HOMOGENEOUS:
             known = " or ".join(HOMOGENEOUS)
             raise MivolError(f"a nested field with the activation {self.activation} was given; {known} are expected.")
-        activation_of(self.activation)
+        select_activation(self.activation)
         if self.space not in SPACES:
             raise MivolError(f"the space of a field's colours is {self.space!r}; {' or '.join(SPACES)} is expected.")
         expected = self.rows
@@ -149,7 +157,7 @@ class SphericalGrid:
     @property
     def act(self) -> Activation:
         """The activation itself."""
-        return activation_of(self.activation)
+        return select_activation(self.activation)
 
     @classmethod
     def from_dense(
@@ -204,7 +212,7 @@ class SphericalGrid:
         Raises:
             MivolError: as :meth:`from_dense`.
         """
-        degree, act = degree_of(sh.shape[1]), activation_of(activation)
+        degree, act = harmonic_degree(sh.shape[1]), select_activation(activation)
         bad = ~np.isfinite(density) | ~np.isfinite(sh).all(axis=(1, 2))
         if bad.any():
             raise MivolError(f"the values at node {np.flatnonzero(bad)[0]} of the field are not finite; give finite numbers.")
@@ -320,10 +328,10 @@ class SphericalGrid:
         row, stored = self.listed_places().rank(node, active)
         return dr.select(stored, row, self.rows - 1)
 
-    def listed_places(self) -> ListedPlaces:
+    def listed_places(self) -> SparseIndex:
         """Which nodes have a row, of a sparse field: two bits a node of the box; made once."""
         if self.listing is None:
-            self.listing = ListedPlaces.of(self.nodes, self.places)
+            self.listing = SparseIndex.of(self.nodes, self.places)
         return self.listing
 
     # -- Where it lies -----------------------------------------------------------------------------------------------------
@@ -342,11 +350,11 @@ class SphericalGrid:
 
     def own_frame(self) -> np.ndarray:
         """(3, 3) map of world directions to the grid's own frame: the inverse of the polar factor of ``to_world``."""
-        return frame_of(self.to_world)
+        return local_frame(self.to_world)
 
     def turn(self, d: mi.Vector3f) -> mi.Vector3f:
         """World directions in the grid's own frame."""
-        return turn_by(self.own_frame(), d)
+        return rotate_direction(self.own_frame(), d)
 
     def harmonics_of(self, d: mi.Vector3f) -> list[mi.Float]:
         """The basis for unit directions of travel in the world."""
@@ -422,7 +430,7 @@ class SphericalGrid:
     def eval_radiance(self, p: mi.Point3f, d: mi.Vector3f, active: mi.Bool = True) -> mi.Color3f:
         """Radiance at world points, seen along unit world directions, whatever the colours are stored as; 0 outside the box."""
         colour = self.eval(p, d, active)[1]
-        return colour if self.space == "linear" else mi.Color3f(*(radiance_of_codes(c) for c in colour))
+        return colour if self.space == "linear" else mi.Color3f(*(decode_srgb_code(c) for c in colour))
 
     def with_values(self, density: mi.Float, harmonics: mi.Float) -> SphericalGrid:
         """The same nodes with other rows."""
@@ -456,7 +464,7 @@ def with_tensors(field: SphericalGrid, density: mi.TensorXf, sh: mi.TensorXf) ->
     row, column = entry // width, entry % width
     held = (row < count) & (column < 3 * basis)
     harmonics = dr.gather(mi.Float, sh.array, row * (3 * basis) + column, held)
-    return replace(field, degree=degree_of(basis), density=flat, harmonics=harmonics)
+    return replace(field, degree=harmonic_degree(basis), density=flat, harmonics=harmonics)
 
 
 def dense_densities(field: SphericalGrid) -> list[mi.TensorXf]:

@@ -26,7 +26,7 @@ from mivol.files.mesh import Mesh
 from mivol.machine import available_memory
 from mivol.photos import Camera, project
 
-__all__ = ["INVERSES", "level_of", "mean_normals", "surface_of", "DepthView", "fuse_depths"]
+__all__ = ["INVERSES", "default_level", "vertex_normals", "extract_surface", "DepthView", "fuse_depths"]
 
 INVERSES: dict[str, Callable[[float], float]] = {
     "none": lambda sigma: sigma,
@@ -37,7 +37,7 @@ INVERSES: dict[str, Callable[[float], float]] = {
 """Name of an activation -> the stored density of an extinction above 0."""
 
 
-def level_of(field: SphericalGrid) -> float:
+def default_level(field: SphericalGrid) -> float:
     """The extinction [1/length] of a surface: where a voxel's longest edge lets half of the light through, or, in a field that
     is thinner than that, half of what its matter has (the mean extinction of its nodes, weighted by itself)."""
     edges = np.linalg.norm(field.to_world[:3, :3], axis=0) / field.res[::-1]
@@ -47,12 +47,12 @@ def level_of(field: SphericalGrid) -> float:
     return min(math.log(2) / float(edges.max()), mean / 2)
 
 
-def surface_of(field: SphericalGrid, level: float | None = None) -> Mesh:
+def extract_surface(field: SphericalGrid, level: float | None = None) -> Mesh:
     """The surface of one extinction, with its colours as seen from outside along the normal.
 
     Args:
         field: any; a sparse one is laid out in full.
-        level: extinction [1/length]; None: :func:`level_of`, of each of the levels of a nested field.
+        level: extinction [1/length]; None: :func:`default_level`, of each of the levels of a nested field.
 
     Returns:
         World coordinates, counterclockwise from outside; normals are means of the triangles around a point.
@@ -69,7 +69,7 @@ def surface_of(field: SphericalGrid, level: float | None = None) -> Mesh:
     found, most, last = [], 0.0, len(grids) - 1
     for number, grid in enumerate(grids):
         density = grid.to_dense()[0].transpose(2, 1, 0)
-        wanted = level_of(grid) if level is None else float(level)
+        wanted = default_level(grid) if level is None else float(level)
         raw = INVERSES[grid.activation](wanted)
         most = max(most, float(np.array(grid.act.value_and_slope(mi.Float(float(density.max())))[0])[0]))
         inner = None if number == 0 else grids[number - 1].to_world
@@ -101,34 +101,34 @@ def _extract_grid_surface(
     if not padded.min() <= raw < padded.max():
         return []
     nodes, faces, _, _ = marching_cubes(padded, raw, gradient_direction="ascent")
-    points = _world(grid, nodes - 1.0)
+    points = _to_world(grid, nodes - 1.0)
     if np.linalg.det(grid.to_world[:3, :3]) < 0:
         faces = faces[:, ::-1]
-    normals = mean_normals(points, faces)
+    normals = vertex_normals(points, faces)
     # Levels overlap by a triangle at the side of a box, so that no gap is seen between them.
-    kept = np.ones(len(faces), bool) if closes else _lies_in(grid.to_world, points)[faces].any(axis=1)
+    kept = np.ones(len(faces), bool) if closes else _find_inside(grid.to_world, points)[faces].any(axis=1)
     if inner is not None:
-        kept &= ~_lies_in(inner, points)[faces].all(axis=1)
+        kept &= ~_find_inside(inner, points)[faces].all(axis=1)
     if not kept.any():
         return []
     used, flat = np.unique(faces[kept], return_inverse=True)
-    return [Mesh(points[used], flat.reshape(-1, 3), normals[used], _colours(grid, points[used], normals[used]))]
+    return [Mesh(points[used], flat.reshape(-1, 3), normals[used], _eval_colours(grid, points[used], normals[used]))]
 
 
-def _lies_in(box: np.ndarray, points: np.ndarray) -> np.ndarray:
+def _find_inside(box: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Which points lie in a box, the unit cube under a (4, 4) map."""
     inverse = np.linalg.inv(box)
     local = points @ inverse[:3, :3].T + inverse[:3, 3]
     return ((local >= 0) & (local <= 1)).all(axis=1)
 
 
-def _world(field: SphericalGrid, nodes: np.ndarray) -> np.ndarray:
+def _to_world(field: SphericalGrid, nodes: np.ndarray) -> np.ndarray:
     """World places of lattice coordinates (x, y, z), node n at n."""
     unit = (nodes.astype(np.float64) + 0.5) / field.res[::-1]
     return unit @ field.to_world[:3, :3].T + field.to_world[:3, 3]
 
 
-def mean_normals(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
+def vertex_normals(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Unit means over the triangles at each point, weighted by their areas."""
     a, b, c = (points[faces[:, k]] for k in range(3))
     across = np.cross(b - a, c - a)
@@ -139,7 +139,7 @@ def mean_normals(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
     return np.where(length > 0, total / np.where(length > 0, length, 1), (0.0, 0.0, 1.0))
 
 
-def _colours(field: SphericalGrid, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
+def _eval_colours(field: SphericalGrid, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
     """What a ray that comes in against the normal sees; corners outside the box show the nearest place in it."""
     inverse = np.linalg.inv(field.to_world)
     inside = np.clip(points @ inverse[:3, :3].T + inverse[:3, 3], 1e-6, 1 - 1e-6) @ field.to_world[:3, :3].T
@@ -148,7 +148,7 @@ def _colours(field: SphericalGrid, points: np.ndarray, normals: np.ndarray) -> n
     return np.clip(np.array(colour).T, 0, 1) if field.space == "srgb" else encode_srgb(np.array(colour).T)
 
 
-FREE = 0.1
+FREE_SPACE_WEIGHT = 0.1
 """Weight of a view that says no more than "in front", over that of one that sees a surface near."""
 
 TRUNCATION = 4.0
@@ -194,7 +194,7 @@ def fuse_depths(views: Iterable[DepthView], low: np.ndarray, high: np.ndarray, r
     _check_memory(high - low, resolution)
     voxel = float((high - low).max()) / resolution
     size = np.maximum(np.ceil((high - low) / voxel - 1e-6), 2).astype(int)
-    fused = _Fused(low, voxel, size)
+    fused = _FusedDepths(low, voxel, size)
     for view in views:
         fused.add(view)
     distance = fused.distance()
@@ -203,7 +203,7 @@ def fuse_depths(views: Iterable[DepthView], low: np.ndarray, high: np.ndarray, r
     nodes, faces, _, _ = marching_cubes(distance, 0.0, gradient_direction="descent")
     points = low + (nodes + 0.5) * voxel
     colours = np.stack([map_coordinates(channel, nodes.T, order=1, mode="nearest") for channel in fused.colours()], axis=1)
-    return Mesh(points, faces, mean_normals(points, faces), np.clip(colours, 0, 1))
+    return Mesh(points, faces, vertex_normals(points, faces), np.clip(colours, 0, 1))
 
 
 VOXEL_BYTES = 64
@@ -220,7 +220,7 @@ def _check_memory(extent: np.ndarray, resolution: int) -> None:
         )
 
 
-class _Fused:
+class _FusedDepths:
     """Sums over views at the centres of voxels, (X, Y, Z)."""
 
     def __init__(self, low: np.ndarray, voxel: float, size: np.ndarray) -> None:
@@ -245,7 +245,7 @@ class _Fused:
         told = away > -1
         seen, row, column, away = seen[told], row[told], column[told], away[told]
         near = away < 1
-        weight = np.where(near, 1, FREE)
+        weight = np.where(near, 1, FREE_SPACE_WEIGHT)
         self.total[i].reshape(-1)[seen] += weight * np.minimum(away, 1)
         self.said[i].reshape(-1)[seen] += weight
         self.coloured[i].reshape(-1)[seen[near]] += 1

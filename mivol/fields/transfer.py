@@ -29,7 +29,16 @@ from mivol.fields.shading import Shading, gradient_grid
 from mivol.fields.voxels import Voxels
 from mivol.files import read_volume
 
-__all__ = ["Transfer", "check_domain", "check_table", "domain_of", "look_up", "rows_of", "GradientOpacity", "Relief"]
+__all__ = [
+    "Transfer",
+    "check_domain",
+    "check_table",
+    "parse_domain",
+    "look_up",
+    "parse_table",
+    "GradientOpacity",
+    "GradientEffects",
+]
 
 
 def look_up(table: mi.TensorXf, domain: tuple[float, float], s: mi.Float) -> list[mi.Float]:
@@ -43,7 +52,7 @@ def look_up(table: mi.TensorXf, domain: tuple[float, float], s: mi.Float) -> lis
     return [dr.lerp(*pair, f) for pair in ends]
 
 
-def rows_of(text: object, what: str) -> np.ndarray:
+def parse_table(text: object, what: str) -> np.ndarray:
     """Rows between commas, numbers between spaces: (n, C).
 
     Raises:
@@ -55,13 +64,13 @@ def rows_of(text: object, what: str) -> np.ndarray:
         raise MivolError(f"{what} is {str(text)!r}; rows of numbers are expected, as in '0 0 0, 1 0.5 0.2'.") from error
 
 
-def domain_of(text: object, what: str) -> tuple[float, float]:
+def parse_domain(text: object, what: str) -> tuple[float, float]:
     """The two ends of a domain.
 
     Raises:
         MivolError: other things than two numbers.
     """
-    ends = rows_of(text, what).ravel().tolist()
+    ends = parse_table(text, what).ravel().tolist()
     if len(ends) != 2:
         raise MivolError(f"{what} is {text}; two numbers in rising order are expected.")
     return ends[0], ends[1]
@@ -122,10 +131,10 @@ class GradientOpacity:
         """
         domain = (0.0, most or 1.0)
         if "gradient_domain" in props:
-            domain = domain_of(props["gradient_domain"], f"the gradient_domain of {name}")
+            domain = parse_domain(props["gradient_domain"], f"the gradient_domain of {name}")
         if "gradient_opacity" not in props:
             return None
-        rows = rows_of(props["gradient_opacity"], f"the gradient_opacity of {name}")
+        rows = parse_table(props["gradient_opacity"], f"the gradient_opacity of {name}")
         check_table(rows, f"the gradient_opacity of {name}", (1,))
         check_domain(domain, f"the gradient_domain of {name}")
         return cls(mi.TensorXf(np.ascontiguousarray(rows, dtype=np.float32)), domain)
@@ -136,14 +145,14 @@ class GradientOpacity:
 
 
 @dataclass(frozen=True)
-class Relief:
+class GradientEffects:
     """What is made of a scan's gradient: factors, light, both or nothing."""
 
     opacity: GradientOpacity | None = None
     shading: Shading | None = None
 
     @classmethod
-    def from_props(cls, props: mi.Properties, field: mi.TensorXf, to_world: np.ndarray, name: str) -> Relief:
+    def from_props(cls, props: mi.Properties, field: mi.TensorXf, to_world: np.ndarray, name: str) -> GradientEffects:
         """Build from the parameters of a plugin that shows a scan (Z, Y, X, 1) in a box of the world.
 
         Raises:
@@ -190,11 +199,11 @@ class Transfer:
         refine: int,
         to_world: np.ndarray,
         name: str,
-        relief: Relief = Relief(),
+        relief: GradientEffects = GradientEffects(),
     ) -> None:
         entries, self.domain = table
         self.name, self.refine, self.to_world, self.relief = name, refine, to_world, relief
-        self.field = _of_four_axes(field)
+        self.field = _add_channel_axis(field)
         self.table = entries if len(entries.shape) != 1 else mi.TensorXf(entries.array, (*entries.shape, 1))
         self._check()
         self.voxels = Voxels(self.classified(), to_world, name)
@@ -213,15 +222,15 @@ class Transfer:
         field = props["data"] if sources == ["data"] else read_volume(_path(props["filename"]), frame="unit").values
         field = _tensor(np.array(field, dtype=np.float32)) if not isinstance(field, mi.TensorXf) else field
         table = props["table"]
-        table = table if isinstance(table, mi.TensorXf) else _tensor(rows_of(table, f"the table of {name}"))
-        domain = domain_of(props["domain"], f"the domain of {name}") if "domain" in props else _range_of(field)
+        table = table if isinstance(table, mi.TensorXf) else _tensor(parse_table(table, f"the table of {name}"))
+        domain = parse_domain(props["domain"], f"the domain of {name}") if "domain" in props else _value_range(field)
         place = np.array(props.get("to_world", mi.ScalarTransform4f()).matrix, dtype=np.float64)
         refine = props.get("refine", 1)
         if type(refine) is not int:
             raise MivolError(f"refine of {name} is {refine!r}; a whole number of nodes per voxel is expected, at least 1.")
-        field = _of_four_axes(field)
+        field = _add_channel_axis(field)
         _check_field(field, name)
-        return cls(field, (table, domain), refine, place, name, Relief.from_props(props, field, place, name))
+        return cls(field, (table, domain), refine, place, name, GradientEffects.from_props(props, field, place, name))
 
     def classified(self) -> mi.TensorXf:
         """The table's entries at the nodes of the refined grid, (Z, Y, X, C), with derivatives by table and field."""
@@ -269,11 +278,11 @@ class Transfer:
         if k == 1:
             return [dr.ravel(grid)] if channels == 1 else list(dr.unravel(mi.Vector3f, grid.array)), (z, y, x)
         texture = mi.Texture3f(grid, use_accel=False, migrate=False)
-        return texture.eval(_middles((k * z, k * y, k * x))), (k * z, k * y, k * x)
+        return texture.eval(_node_positions((k * z, k * y, k * x))), (k * z, k * y, k * x)
 
     def _places(self, res: tuple[int, int, int]) -> mi.Point3f:
         """The nodes of the refined grid in the world."""
-        return mi.AffineTransform4f(mi.ScalarMatrix4f(self.to_world)) @ _middles(res)
+        return mi.AffineTransform4f(mi.ScalarMatrix4f(self.to_world)) @ _node_positions(res)
 
     def _check(self) -> None:
         _check_field(self.field, self.name)
@@ -283,18 +292,18 @@ class Transfer:
             raise MivolError(f"refine of {self.name} is {self.refine}; a whole number of at least 1 is expected.")
 
 
-def _of_four_axes(field: mi.TensorXf) -> mi.TensorXf:
+def _add_channel_axis(field: mi.TensorXf) -> mi.TensorXf:
     """Scalar values with their axis of one channel."""
     return field if len(field.shape) != 3 else mi.TensorXf(field.array, (*field.shape, 1))
 
 
-def _range_of(field: mi.TensorXf) -> tuple[float, float]:
+def _value_range(field: mi.TensorXf) -> tuple[float, float]:
     """The least and the largest value."""
     values = np.array(dr.detach(field))
     return (float(np.min(values)), float(np.max(values))) if values.size else (0.0, 0.0)
 
 
-def _middles(res: tuple[int, int, int]) -> mi.Point3f:
+def _node_positions(res: tuple[int, int, int]) -> mi.Point3f:
     """The nodes of a grid in the unit cube."""
     z, y, x = dr.meshgrid(*[(dr.arange(mi.Float, n) + 0.5) / n for n in res], indexing="ij")
     return mi.Point3f(x, y, z)

@@ -1,6 +1,6 @@
 """One door to every volume file: the suffix chooses the format, the first bytes must agree.
 
-Here: :data:`FORMATS` (suffix -> how to recognise and read it), :data:`WRITERS`, :data:`FRAMES`, :func:`read_volume`,
+Here: :data:`FORMATS` (suffix -> how to recognise and read it), :data:`GAUSSIAN_WRITERS`, :data:`FRAMES`, :func:`read_volume`,
 :func:`write_volume`. A stack of headerless slices needs facts that no file holds: :func:`mivol.files.read_slices`.
 """
 
@@ -132,7 +132,7 @@ def write_volume(
     metadata: Mapping[str, object] | None = None,
     compress: bool = True,
 ) -> None:
-    """Write a volume, whole or not at all; the suffix chooses the format (:data:`WRITERS`).
+    """Write a volume, whole or not at all; the suffix chooses the format (:data:`GAUSSIAN_WRITERS`).
 
     Args:
         path: destination.

@@ -26,7 +26,7 @@ import mitsuba as mi
 import numpy as np
 
 from mivol.errors import MivolError
-from mivol.fields.spherical_grid import SphericalGrid, is_covered
+from mivol.fields.spherical_grid import SphericalGrid, is_covered_by_inner
 from mivol.optim.strategy import Strategy, of, table
 
 Spacing = tuple[float, float, float]
@@ -211,7 +211,7 @@ class Neighbours:
         for stride, n in ((1, x), (x, y), (x * y, z)):
             place = node // stride % n
             following = dr.select(place < n - 1, node + stride, node)
-            following = dr.select(is_covered(following, field.res), node, following)
+            following = dr.select(is_covered_by_inner(following, field.res), node, following)
             found.after.append(field.row_of(following))
             before = field.row_of(dr.select(place > 0, node - stride, node))
             found.before.append(dr.select(before < dr.width(node), before, own))

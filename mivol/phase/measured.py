@@ -155,7 +155,7 @@ def named_medium(name: str) -> MeasuredMedium:
     """Look up a measured medium.
 
     Args:
-        name: one of :data:`NAMES` or :data:`ALIASES`, in capitals or not, words apart or joined by - or _.
+        name: one of :data:`EXTINCTION_PARAMETERS` or :data:`ALIASES`, in capitals or not, words apart or joined by - or _.
 
     Returns:
         ``sigma_a, sigma_s, g``, rgb triples; coefficients in 1/mm.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from mivol.points.cloud import PointCloud, read_points, write_points
-from mivol.points.conversions import density_of_points, gaussians_of_points, points_of_gaussians, sample_points
+from mivol.points.conversions import gaussians_to_points, points_to_density, points_to_gaussians, sample_points
 from mivol.points.gaussian_files import read_gaussians, write_gaussians
 from mivol.points.gaussians import Gaussians, concatenate
 
@@ -11,9 +11,9 @@ __all__ = [
     "Gaussians",
     "PointCloud",
     "concatenate",
-    "density_of_points",
-    "gaussians_of_points",
-    "points_of_gaussians",
+    "points_to_density",
+    "points_to_gaussians",
+    "gaussians_to_points",
     "read_gaussians",
     "read_points",
     "sample_points",

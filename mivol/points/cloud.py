@@ -28,9 +28,9 @@ from mivol.shown import briefly
 __all__ = ["CLOUD_READERS", "CLOUD_WRITERS", "PointCloud", "read_points", "write_points"]
 
 COLOUR = ("red", "green", "blue")
-VLR_HEAD, EVLR_HEAD = 54, 60
+VLR_HEADER_SIZE, EVLR_HEADER_SIZE = 54, 60
 """Bytes of the head of a variable length record of LAS, and of an extended one (ASPRS LAS 1.4 R15, sections 2.5 and 2.7)."""
-LAS_HEAD_1_0, LAS_HEAD = 227, 375
+LAS_1_0_HEADER_SIZE, LAS_HEADER_SIZE = 227, 375
 """Bytes of the header of LAS up to version 1.2, and of version 1.4 (section 2.4)."""
 
 
@@ -139,7 +139,7 @@ def _read_las(path: Path) -> PointCloud:
         way_out = f'pip install "mivol[points]" for laspy, which cannot be imported ({error})'
         raise refusal(path, "a LAS file", "a format that mivol reads by itself", way_out) from error
     try:
-        _check_records(path)
+        _check_las_records(path)
         with laspy.open(path) as file:
             check_memory(path, file.header.point_count * 8 * 6)
             points = file.read()
@@ -151,15 +151,15 @@ def _read_las(path: Path) -> PointCloud:
     return PointCloud(np.asarray(points.xyz), colours)
 
 
-def _check_records(path: Path) -> None:
+def _check_las_records(path: Path) -> None:
     """Refuse more variable length records than the file has room for: laspy would read empty ones for hours."""
     with path.open("rb") as file:
-        head = file.read(LAS_HEAD)
-    if len(head) < LAS_HEAD_1_0:
+        head = file.read(LAS_HEADER_SIZE)
+    if len(head) < LAS_1_0_HEADER_SIZE:
         raise ValueError("it ends in its header")
-    needed = VLR_HEAD * struct.unpack_from("<I", head, 100)[0]
-    if head[24:26] >= b"\x01\x04" and len(head) == LAS_HEAD:
-        needed += EVLR_HEAD * struct.unpack_from("<I", head, 243)[0]
+    needed = VLR_HEADER_SIZE * struct.unpack_from("<I", head, 100)[0]
+    if head[24:26] >= b"\x01\x04" and len(head) == LAS_HEADER_SIZE:
+        needed += EVLR_HEADER_SIZE * struct.unpack_from("<I", head, 243)[0]
     if needed > path.stat().st_size:
         raise ValueError("more variable length records than it has room for")
 

@@ -13,13 +13,13 @@ from scipy.spatial import cKDTree
 
 from mivol.files.source import refusal
 from mivol.points.cloud import PointCloud
-from mivol.points.gaussians import Gaussians, harmonics_of_colours, logit
+from mivol.points.gaussians import Gaussians, logit, to_base_harmonics
 from mivol.space import check_affine, lattice_from_world
 
-__all__ = ["density_of_points", "sample_points", "gaussians_of_points", "points_of_gaussians"]
+__all__ = ["points_to_density", "sample_points", "points_to_gaussians", "gaussians_to_points"]
 
 
-def density_of_points(
+def points_to_density(
     positions: np.ndarray, resolution: tuple[int, int, int], to_world: np.ndarray, masses: np.ndarray | None = None
 ) -> np.ndarray:
     """The density of points on a grid: each gives its mass to the eight voxel centres around it by trilinear weights.
@@ -104,14 +104,14 @@ def _voxel_volume(resolution: tuple[int, int, int], to_world: np.ndarray) -> flo
 
 NEIGHBOURS = 3
 
-SMALLEST = 1e-3
+MIN_RELATIVE_SCALE = 1e-3
 """Of a scale over the median: points that coincide get it, so that no scale is 0."""
 
 GREY = 0.5
 """The colour of points that have none."""
 
 
-def gaussians_of_points(cloud: PointCloud, opacity: float = 0.1) -> Gaussians:
+def points_to_gaussians(cloud: PointCloud, opacity: float = 0.1) -> Gaussians:
     """A ball of a Gaussian at each point: its scale is the root mean square distance to the three nearest points.
 
     Args:
@@ -134,17 +134,17 @@ def gaussians_of_points(cloud: PointCloud, opacity: float = 0.1) -> Gaussians:
     median = float(np.median(scales))
     if median == 0:
         raise refusal("gaussians_of_points", "points that mostly coincide", "points apart", "remove what is there twice")
-    scales = np.maximum(scales, SMALLEST * median)
+    scales = np.maximum(scales, MIN_RELATIVE_SCALE * median)
     colours = np.full((cloud.count, 3), GREY) if cloud.colours is None else cloud.colours
     return Gaussians(
         cloud.positions,
         np.repeat(np.log(scales)[:, None], 3, axis=1),
         np.tile([1.0, 0, 0, 0], (cloud.count, 1)),
         np.full(cloud.count, logit(opacity)),
-        harmonics_of_colours(colours)[:, None],
+        to_base_harmonics(colours)[:, None],
     )
 
 
-def points_of_gaussians(gaussians: Gaussians) -> PointCloud:
+def gaussians_to_points(gaussians: Gaussians) -> PointCloud:
     """The centres, with the mean colour over all directions, clipped to 0..1; sizes and opacities are lost."""
     return PointCloud(gaussians.means, np.clip(gaussians.base_colours(), 0, 1))

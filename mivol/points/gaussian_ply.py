@@ -17,13 +17,13 @@ import numpy as np
 
 from mivol.files import ply
 from mivol.files.source import refusal
-from mivol.points.gaussians import Gaussians, completed, harmonics_of_colours, logit
+from mivol.points.gaussians import Gaussians, complete_quaternions, logit, to_base_harmonics
 
 __all__ = [
-    "gaussians_of_tables",
-    "rest_of_columns",
+    "parse_tables",
+    "_parse_higher_harmonics",
     "write_gaussian_ply",
-    "gaussians_of_compressed_tables",
+    "parse_compressed_tables",
     "is_compressed",
 ]
 
@@ -36,7 +36,7 @@ REST_COUNTS = (0, 9, 24, 45)
 """So many ``f_rest`` has a file of degree 0, 1, 2, 3."""
 
 
-def gaussians_of_tables(tables: dict[str, np.ndarray], path: str | os.PathLike) -> Gaussians:
+def parse_tables(tables: dict[str, np.ndarray], path: str | os.PathLike) -> Gaussians:
     """The Gaussians of a file's element ``vertex``.
 
     Raises:
@@ -52,17 +52,17 @@ def gaussians_of_tables(tables: dict[str, np.ndarray], path: str | os.PathLike) 
             "the properties of 3D Gaussians (x, f_dc_0, opacity, scale_0, rot_0, ...)",
             "name a file of Gaussians (a cloud of points is read by read_points)",
         )
-    constant = _columns(vertex, COLOURS)
+    constant = _stack_columns(vertex, COLOURS)
     return Gaussians(
-        _columns(vertex, MEANS),
-        _columns(vertex, SCALES),
-        _columns(vertex, ROTATION),
+        _stack_columns(vertex, MEANS),
+        _stack_columns(vertex, SCALES),
+        _stack_columns(vertex, ROTATION),
         vertex["opacity"].astype(np.float32),
-        np.concatenate([constant[:, None], rest_of_columns(vertex, path)], axis=1),
+        np.concatenate([constant[:, None], _parse_higher_harmonics(vertex, path)], axis=1),
     )
 
 
-def rest_of_columns(table: np.ndarray, path: str | os.PathLike) -> np.ndarray:
+def _parse_higher_harmonics(table: np.ndarray, path: str | os.PathLike) -> np.ndarray:
     """Coefficients above degree 0, (N, K - 1, 3), of the properties ``f_rest_0``, ``f_rest_1``, ...
 
     Raises:
@@ -75,7 +75,7 @@ def rest_of_columns(table: np.ndarray, path: str | os.PathLike) -> np.ndarray:
         raise refusal(Path(path), found, f"f_rest_0, f_rest_1, ...: {REST_COUNTS} of them", "write the file again")
     if not count:
         return np.empty((len(table), 0, 3), np.float32)
-    return np.swapaxes(_columns(table, names).reshape(len(table), 3, count // 3), 1, 2)
+    return np.swapaxes(_stack_columns(table, names).reshape(len(table), 3, count // 3), 1, 2)
 
 
 def write_gaussian_ply(file: BinaryIO, gaussians: Gaussians) -> None:
@@ -97,28 +97,28 @@ def write_gaussian_ply(file: BinaryIO, gaussians: Gaussians) -> None:
     ply.write_table(file, table)
 
 
-def _columns(table: np.ndarray, names: tuple[str, ...] | list[str]) -> np.ndarray:
+def _stack_columns(table: np.ndarray, names: tuple[str, ...] | list[str]) -> np.ndarray:
     """Some properties as float32 (N, len(names))."""
     return np.stack([table[name].astype(np.float32) for name in names], axis=1)
 
 
-CHUNK = 256
+CHUNK_SIZE = 256
 """Gaussians that share a box."""
 
 POSITION_BITS = (11, 10, 11)
 AXES = ("x", "y", "z")
 CHANNELS = ("r", "g", "b")
-PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
-WIDEST_HARMONIC = 4.0
+PACKED_PROPERTIES = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
+MAX_HARMONIC = 4.0
 """Harmonics are stored in -4..4."""
 
 
 def is_compressed(tables: dict[str, np.ndarray]) -> bool:
     """Whether tables of a ``.ply`` are of this kind."""
-    return "chunk" in tables and "vertex" in tables and PACKED[0] in (tables["vertex"].dtype.names or ())
+    return "chunk" in tables and "vertex" in tables and PACKED_PROPERTIES[0] in (tables["vertex"].dtype.names or ())
 
 
-def gaussians_of_compressed_tables(tables: dict[str, np.ndarray], path: str | os.PathLike) -> Gaussians:
+def parse_compressed_tables(tables: dict[str, np.ndarray], path: str | os.PathLike) -> Gaussians:
     """The Gaussians of such tables; the opacity 255 of 255 becomes the logit inf, 0 becomes -inf.
 
     Raises:
@@ -126,62 +126,62 @@ def gaussians_of_compressed_tables(tables: dict[str, np.ndarray], path: str | os
             each other.
     """
     chunk, vertex = tables["chunk"], tables["vertex"]
-    _check(tables, Path(path))
-    box = np.arange(len(vertex)) // CHUNK
-    steps = _unpacked(vertex["packed_color"], (8, 8, 8, 8))
+    _check_compressed_tables(tables, Path(path))
+    box = np.arange(len(vertex)) // CHUNK_SIZE
+    steps = _unpack_bits(vertex["packed_color"], (8, 8, 8, 8))
     colours = steps[:, :3]
     if "min_r" in chunk.dtype.names:
-        colours = _between(chunk, CHANNELS, box, colours)
-    harmonics = harmonics_of_colours(colours)[:, None]
+        colours = _interpolate_in_box(chunk, CHANNELS, box, colours)
+    harmonics = to_base_harmonics(colours)[:, None]
     if "sh" in tables:
-        harmonics = np.concatenate([harmonics, _harmonics(rest_of_columns(tables["sh"], path))], axis=1)
+        harmonics = np.concatenate([harmonics, _decode_harmonics(_parse_higher_harmonics(tables["sh"], path))], axis=1)
     scale_axes = tuple(f"scale_{axis}" for axis in AXES)
     return Gaussians(
-        _between(chunk, AXES, box, _unpacked(vertex["packed_position"], POSITION_BITS)),
-        _between(chunk, scale_axes, box, _unpacked(vertex["packed_scale"], POSITION_BITS)),
-        _quaternions(vertex["packed_rotation"]),
+        _interpolate_in_box(chunk, AXES, box, _unpack_bits(vertex["packed_position"], POSITION_BITS)),
+        _interpolate_in_box(chunk, scale_axes, box, _unpack_bits(vertex["packed_scale"], POSITION_BITS)),
+        _unpack_quaternions(vertex["packed_rotation"]),
         logit(steps[:, 3]),
         harmonics,
     )
 
 
-def _check(tables: dict[str, np.ndarray], path: Path) -> None:
+def _check_compressed_tables(tables: dict[str, np.ndarray], path: Path) -> None:
     chunk, vertex = tables["chunk"], tables["vertex"]
     ends = [f"{end}_{what}{axis}" for what in ("", "scale_") for end in ("min", "max") for axis in AXES]
     if "min_r" in chunk.dtype.names:
         ends += [f"{end}_{colour}" for end in ("min", "max") for colour in CHANNELS]
-    wanted = {**{("vertex", name): "u4" for name in PACKED}, **{("chunk", name): "f4" for name in ends}}
+    wanted = {**{("vertex", name): "u4" for name in PACKED_PROPERTIES}, **{("chunk", name): "f4" for name in ends}}
     for (element, name), kind in wanted.items():
         held = tables[element].dtype
         if name not in held.names or held[name].str[1:] != kind:
             found = f"no property {name!r} of type {np.dtype(kind).name} in {element!r}"
             raise refusal(path, found, "those of a compressed PLY of PlayCanvas", "compress it again")
-    chunks = -(-len(vertex) // CHUNK)
+    chunks = -(-len(vertex) // CHUNK_SIZE)
     if len(chunk) != chunks:
         raise refusal(path, f"{len(chunk)} chunks", f"{chunks} for {len(vertex)} Gaussians", "compress it again")
     if "sh" in tables and len(tables["sh"]) != len(vertex):
         raise refusal(path, f"{len(tables['sh'])} rows of harmonics", f"{len(vertex)}", "compress it again")
 
 
-def _unpacked(words: np.ndarray, bits: tuple[int, ...]) -> np.ndarray:
+def _unpack_bits(words: np.ndarray, bits: tuple[int, ...]) -> np.ndarray:
     """Fields of words, highest first, as steps 0..1 with both ends; (N, len(bits)), float64."""
     shifts = np.cumsum(bits[::-1])[::-1] - bits
     return np.stack([((words >> np.uint32(s)) & ((1 << b) - 1)) / ((1 << b) - 1) for s, b in zip(shifts, bits, strict=True)], 1)
 
 
-def _between(chunk: np.ndarray, axes: tuple[str, ...], box: np.ndarray, steps: np.ndarray) -> np.ndarray:
+def _interpolate_in_box(chunk: np.ndarray, axes: tuple[str, ...], box: np.ndarray, steps: np.ndarray) -> np.ndarray:
     """Numbers at ``steps`` between the ends of each Gaussian's box, (N, 3)."""
     low, high = (np.stack([chunk[f"{end}_{axis}"].astype(np.float64) for axis in axes], 1)[box] for end in ("min", "max"))
     return low * (1 - steps) + high * steps
 
 
-def _quaternions(words: np.ndarray) -> np.ndarray:
+def _unpack_quaternions(words: np.ndarray) -> np.ndarray:
     """Unit quaternions of which the largest entry, here positive, was left out; (N, 4)."""
-    others = (_unpacked(words & np.uint32((1 << 30) - 1), (2, 10, 10, 10))[:, 1:] - 0.5) * np.sqrt(2)
-    return completed(others, (words >> np.uint32(30)).astype(np.int64))
+    others = (_unpack_bits(words & np.uint32((1 << 30) - 1), (2, 10, 10, 10))[:, 1:] - 0.5) * np.sqrt(2)
+    return complete_quaternions(others, (words >> np.uint32(30)).astype(np.int64))
 
 
-def _harmonics(codes: np.ndarray) -> np.ndarray:
+def _decode_harmonics(codes: np.ndarray) -> np.ndarray:
     """Coefficients of the codes 0 to 255."""
     steps = np.where(codes == 0, 0, np.where(codes == 255, 1, (codes + 0.5) / 256))
-    return (steps - 0.5) * 2 * WIDEST_HARMONIC
+    return (steps - 0.5) * 2 * MAX_HARMONIC

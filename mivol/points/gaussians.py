@@ -26,10 +26,10 @@ __all__ = [
     "Gaussians",
     "concatenate",
     "logit",
-    "completed",
-    "harmonics_of_colours",
+    "complete_quaternions",
+    "to_base_harmonics",
     "logits_of_bytes",
-    "logs_of_scales",
+    "to_log_scales",
 ]
 
 CONSTANT_HARMONIC = 0.5 / np.sqrt(np.pi)
@@ -38,7 +38,7 @@ CONSTANT_HARMONIC = 0.5 / np.sqrt(np.pi)
 HIGHEST_DEGREE = 3
 """Of the spherical harmonics of colours: published files have no more."""
 
-WIDTHS = {"means": (3,), "log_scales": (3,), "quaternions": (4,), "opacity_logits": ()}
+ROW_SHAPES = {"means": (3,), "log_scales": (3,), "quaternions": (4,), "opacity_logits": ()}
 """What each Gaussian has of each array, but for the harmonics."""
 
 
@@ -65,10 +65,10 @@ class Gaussians:
     harmonics: np.ndarray
 
     def __post_init__(self) -> None:
-        for name in (*WIDTHS, "harmonics"):
+        for name in (*ROW_SHAPES, "harmonics"):
             object.__setattr__(self, name, np.ascontiguousarray(getattr(self, name), np.float32))
         n = len(self.means) if self.means.ndim else 0
-        for name, width in WIDTHS.items():
+        for name, width in ROW_SHAPES.items():
             if getattr(self, name).shape != (n, *width):
                 found = f"{name} of shape {getattr(self, name).shape}"
                 raise refusal("Gaussians", found, f"{(n, *width)} beside means of shape {self.means.shape}", "reshape them")
@@ -120,7 +120,7 @@ class Gaussians:
 
     def select(self, index: np.ndarray | slice) -> Gaussians:
         """Some of them: numbers, truth values (N,), or a slice."""
-        return Gaussians(**{name: getattr(self, name)[index] for name in (*WIDTHS, "harmonics")})
+        return Gaussians(**{name: getattr(self, name)[index] for name in (*ROW_SHAPES, "harmonics")})
 
     def with_degree(self, degree: int) -> Gaussians:
         """The same with harmonics up to another degree: what is left out is lost, what is added is 0.
@@ -145,9 +145,9 @@ class Gaussians:
             MivolError: NaN; an infinite number, but for a logit; a quaternion of length 0. The first index is named.
         """
         for name in ("means", "log_scales", "quaternions", "harmonics"):
-            _refuse_first(subject, ~np.isfinite(getattr(self, name)), f"{name} that are not finite")
-        _refuse_first(subject, np.isnan(self.opacity_logits), "opacity_logits of NaN")
-        _refuse_first(subject, ~np.any(self.quaternions, axis=1), "quaternions of length 0")
+            _check_rows(subject, ~np.isfinite(getattr(self, name)), f"{name} that are not finite")
+        _check_rows(subject, np.isnan(self.opacity_logits), "opacity_logits of NaN")
+        _check_rows(subject, ~np.any(self.quaternions, axis=1), "quaternions of length 0")
         return self
 
 
@@ -161,7 +161,7 @@ def concatenate(parts: Sequence[Gaussians]) -> Gaussians:
         raise refusal("concatenate", "no Gaussians", "at least one set", "give some")
     degree = max(part.degree for part in parts)
     same = [part.with_degree(degree) for part in parts]
-    return Gaussians(**{name: np.concatenate([getattr(part, name) for part in same]) for name in (*WIDTHS, "harmonics")})
+    return Gaussians(**{name: np.concatenate([getattr(part, name) for part in same]) for name in (*ROW_SHAPES, "harmonics")})
 
 
 def logit(opacity: np.ndarray) -> np.ndarray:
@@ -171,7 +171,7 @@ def logit(opacity: np.ndarray) -> np.ndarray:
         return np.log(opacity) - np.log1p(-opacity)
 
 
-def _refuse_first(subject: object, wrong: np.ndarray, what: str) -> None:
+def _check_rows(subject: object, wrong: np.ndarray, what: str) -> None:
     """Refuse a set in which some numbers are wrong: the first index, and how many Gaussians."""
     rows = np.flatnonzero(wrong.reshape(len(wrong), -1).any(axis=1)) if wrong.size else np.empty(0, int)
     if rows.size:
@@ -184,18 +184,18 @@ def logits_of_bytes(codes: np.ndarray) -> np.ndarray:
     return logit(codes / 255)
 
 
-def harmonics_of_colours(colours: np.ndarray) -> np.ndarray:
+def to_base_harmonics(colours: np.ndarray) -> np.ndarray:
     """Coefficients of degree 0 of colours in 0..1."""
     return (colours - 0.5) / CONSTANT_HARMONIC
 
 
-def logs_of_scales(scales: np.ndarray) -> np.ndarray:
+def to_log_scales(scales: np.ndarray) -> np.ndarray:
     """Logarithms; of a scale that is not above 0 -inf or NaN, which is refused by its index when the Gaussians are checked."""
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.log(np.asarray(scales, np.float64))
 
 
-def completed(others: np.ndarray, which: np.ndarray) -> np.ndarray:
+def complete_quaternions(others: np.ndarray, which: np.ndarray) -> np.ndarray:
     """Unit quaternions of which one entry, not below 0, was left out.
 
     Args:

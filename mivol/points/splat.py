@@ -17,21 +17,21 @@ from pathlib import Path
 import numpy as np
 
 from mivol.files.source import read_bytes, refusal
-from mivol.points.gaussians import HIGHEST_DEGREE, Gaussians, concatenate, harmonics_of_colours, logits_of_bytes, logs_of_scales
+from mivol.points.gaussians import HIGHEST_DEGREE, Gaussians, concatenate, logits_of_bytes, to_base_harmonics, to_log_scales
 
 __all__ = ["read_ksplat", "read_splat"]
 
-HEAD, SECTION_HEAD = 4096, 1024
-NUMBERS = {0: ("<f4", "<f4", "<f4"), 1: ("<u2", "<f2", "<f2"), 2: ("<u2", "<f2", "u1")}
+HEADER_SIZE, SECTION_HEADER_SIZE = 4096, 1024
+NUMBER_TYPES = {0: ("<f4", "<f4", "<f4"), 1: ("<u2", "<f2", "<f2"), 2: ("<u2", "<f2", "u1")}
 """Level -> types of positions, of scales and rotations, of harmonics."""
 
-CENTRE = 12
+CENTRE_SIZE = 12
 """Bytes of the centre of a bucket."""
 
-WIDEST_HARMONIC = 1.5
+DEFAULT_MAX_HARMONIC = 1.5
 """Ends of harmonics in bytes where the header says none."""
 
-COARSEST = 32767
+DEFAULT_STEPS = 32767
 """Steps of half a bucket where the header says none."""
 
 
@@ -62,26 +62,26 @@ def read_ksplat(path: Path) -> Gaussians:
         MivolError: another version or level, counts that contradict each other, a truncated file.
     """
     data = read_bytes(path)
-    if len(data) < HEAD:
-        raise refusal(path, f"{len(data)} bytes", f"a header of {HEAD}", "the file is truncated: copy it again")
+    if len(data) < HEADER_SIZE:
+        raise refusal(path, f"{len(data)} bytes", f"a header of {HEADER_SIZE}", "the file is truncated: copy it again")
     major, minor, sections, count, level = struct.unpack_from("<BB2xI8xIH", data)
-    if (major, minor) != (0, 1) or level not in NUMBERS:
+    if (major, minor) != (0, 1) or level not in NUMBER_TYPES:
         found = f"version {major}.{minor}, level {level}"
-        raise refusal(path, found, f"version 0.1 and a level of {tuple(NUMBERS)}", "write it again with a newer program")
+        raise refusal(path, found, f"version 0.1 and a level of {tuple(NUMBER_TYPES)}", "write it again with a newer program")
     low, high = struct.unpack_from("<ff", data, 36)
-    ends = (low or -WIDEST_HARMONIC, high or WIDEST_HARMONIC)
-    at = HEAD + SECTION_HEAD * sections
+    ends = (low or -DEFAULT_MAX_HARMONIC, high or DEFAULT_MAX_HARMONIC)
+    at = HEADER_SIZE + SECTION_HEADER_SIZE * sections
     if at > len(data):
         raise refusal(path, f"{sections} sections in {len(data)} bytes", f"{at} bytes at least", "copy the file again")
     parts = []
     for number in range(sections):
-        section = _section(data, HEAD + SECTION_HEAD * number, path)
-        record = _record(level, section.degree)
+        section = _parse_section(data, HEADER_SIZE + SECTION_HEADER_SIZE * number, path)
+        record = _record_type(level, section.degree)
         end = at + section.storage() + record.itemsize * section.capacity
         if end > len(data):
             raise refusal(path, f"{len(data)} bytes", f"{end} for section {number}", "the file is truncated: copy it again")
         table = np.frombuffer(data, record, section.count, at + section.storage())
-        parts.append(_gaussians(table, _offsets(data, at, section, path) if level else None, ends))
+        parts.append(_decode_records(table, _parse_buckets(data, at, section, path) if level else None, ends))
         at = end
     held = sum(part.count for part in parts)
     if held != count or not parts:
@@ -89,9 +89,9 @@ def read_ksplat(path: Path) -> Gaussians:
     return concatenate(parts)
 
 
-def _section(data: bytes, at: int, path: Path) -> Section:
+def _parse_section(data: bytes, at: int, path: Path) -> Section:
     fields = struct.unpack_from("<IIIIfH2xI4xIIH", data, at)
-    section = Section(*fields[:6], fields[6] or COARSEST, *fields[7:])
+    section = Section(*fields[:6], fields[6] or DEFAULT_STEPS, *fields[7:])
     wrong = (
         section.count > section.capacity or section.degree > HIGHEST_DEGREE or section.full + section.partial > section.buckets
     )
@@ -101,14 +101,14 @@ def _section(data: bytes, at: int, path: Path) -> Section:
     return section
 
 
-def _record(level: int, degree: int) -> np.dtype:
+def _record_type(level: int, degree: int) -> np.dtype:
     """What a Gaussian takes."""
-    position, number, harmonic = NUMBERS[level]
+    position, number, harmonic = NUMBER_TYPES[level]
     fields = [("mean", position, 3), ("scale", number, 3), ("quaternion", number, 4), ("colour", "u1", 3), ("opacity", "u1")]
     return np.dtype([*fields, ("harmonics", harmonic, 3 * ((degree + 1) ** 2 - 1))])
 
 
-def _offsets(data: bytes, at: int, section: Section, path: Path) -> tuple[np.ndarray, float, int]:
+def _parse_buckets(data: bytes, at: int, section: Section, path: Path) -> tuple[np.ndarray, float, int]:
     """The centre of each Gaussian's bucket (N, 3), the length of a step, and how many steps are half a bucket."""
     partial = np.frombuffer(data, "<u4", section.partial, at)
     centres = np.frombuffer(data, "<f4", 3 * section.buckets, at + 4 * section.partial).reshape(-1, 3)
@@ -123,22 +123,22 @@ def _offsets(data: bytes, at: int, section: Section, path: Path) -> tuple[np.nda
     )
 
 
-def _gaussians(table: np.ndarray, offsets: tuple[np.ndarray, float, int] | None, ends: tuple[float, float]) -> Gaussians:
+def _decode_records(table: np.ndarray, offsets: tuple[np.ndarray, float, int] | None, ends: tuple[float, float]) -> Gaussians:
     means = table["mean"].astype(np.float64)
     if offsets is not None:
         centres, step, middle = offsets
         means = (means - middle) * step + centres
-    constant = harmonics_of_colours(table["colour"] / 255)[:, None]
+    constant = to_base_harmonics(table["colour"] / 255)[:, None]
     return Gaussians(
         means,
-        logs_of_scales(table["scale"]),
+        to_log_scales(table["scale"]),
         table["quaternion"],
         logits_of_bytes(table["opacity"]),
-        np.concatenate([constant, _harmonics(table["harmonics"], ends)], axis=1),
+        np.concatenate([constant, _decode_harmonics(table["harmonics"], ends)], axis=1),
     )
 
 
-def _harmonics(stored: np.ndarray, ends: tuple[float, float]) -> np.ndarray:
+def _decode_harmonics(stored: np.ndarray, ends: tuple[float, float]) -> np.ndarray:
     """Coefficients above degree 0, (N, K - 1, 3): in the file degree by degree, in each colour by colour."""
     values = stored.astype(np.float64)
     if stored.dtype == np.uint8:
@@ -166,8 +166,8 @@ def read_splat(path: Path) -> Gaussians:
     table = np.frombuffer(data, RECORD)
     return Gaussians(
         table["mean"],
-        logs_of_scales(table["scale"]),
+        to_log_scales(table["scale"]),
         table["quaternion"] / 128 - 1,
         logits_of_bytes(table["opacity"]),
-        harmonics_of_colours(table["colour"] / 255)[:, None],
+        to_base_harmonics(table["colour"] / 255)[:, None],
     )

@@ -22,7 +22,7 @@ import numpy as np
 
 from mivol.files.npy import check_memory
 from mivol.files.source import CODECS, decompress, parse_elements, read_bytes, refusal
-from mivol.points.gaussians import HIGHEST_DEGREE, Gaussians, completed, logits_of_bytes
+from mivol.points.gaussians import HIGHEST_DEGREE, Gaussians, complete_quaternions, logits_of_bytes
 
 __all__ = ["read_spz"]
 
@@ -65,14 +65,14 @@ def read_spz(path: Path) -> Gaussians:
             stream, or version 4 without ``zstandard``.
     """
     data = read_bytes(path)
-    head = _begin(data, path)
-    header = _header(head, path)
+    head = _read_header_bytes(data, path)
+    header = _parse_header(head, path)
     check_memory(path, sum(header.sizes()))
-    attributes = _streams(data, header, path) if header.version == 4 else _slices(data, header, path)
-    return _decode(attributes, header)
+    attributes = _unpack_streams(data, header, path) if header.version == 4 else _split_attributes(data, header, path)
+    return _decode_attributes(attributes, header)
 
 
-def _begin(data: bytes, path: Path) -> bytes:
+def _read_header_bytes(data: bytes, path: Path) -> bytes:
     """The first bytes, decompressed where they are compressed."""
     if not data.startswith(GZIP):
         return data[: HEAD.size]
@@ -82,7 +82,7 @@ def _begin(data: bytes, path: Path) -> bytes:
         raise refusal(path, f"damaged gzip data ({error})", "a sound stream", "copy the file again") from error
 
 
-def _header(head: bytes, path: Path) -> Header:
+def _parse_header(head: bytes, path: Path) -> Header:
     if len(head) < HEAD.size or not head.startswith(MAGIC):
         raise refusal(path, f"first bytes {head[:8]!r}", "those of an SPZ (NGSP)", "name another file")
     _, version, count, degree, bits, flags, streams = HEAD.unpack(head)
@@ -96,7 +96,7 @@ def _header(head: bytes, path: Path) -> Header:
     return Header(version, count, degree, bits, streams)
 
 
-def _slices(data: bytes, header: Header, path: Path) -> list[np.ndarray]:
+def _split_attributes(data: bytes, header: Header, path: Path) -> list[np.ndarray]:
     """The attributes of version 2 or 3, as bytes."""
     sizes = header.sizes()
     if data.startswith(GZIP):
@@ -105,7 +105,7 @@ def _slices(data: bytes, header: Header, path: Path) -> list[np.ndarray]:
     return np.split(body, np.cumsum(sizes)[:-1])
 
 
-def _streams(data: bytes, header: Header, path: Path) -> list[np.ndarray]:
+def _unpack_streams(data: bytes, header: Header, path: Path) -> list[np.ndarray]:
     """The attributes of version 4, as bytes."""
     sizes = header.sizes() if header.degree else header.sizes()[:-1]
     table = int.from_bytes(data[HEAD.size : HEAD.size + 4], "little")
@@ -118,12 +118,12 @@ def _streams(data: bytes, header: Header, path: Path) -> list[np.ndarray]:
         if unpacked != size or packed > len(data) - at:
             found = f"stream {number} of {packed} bytes, {unpacked} unpacked"
             raise refusal(path, found, f"{size} unpacked, of {len(data) - at} that are left", "copy or write the file again")
-        attributes.append(parse_elements(_unpack(data[at : at + packed], size, path), "u1", size, path))
+        attributes.append(parse_elements(_decompress_stream(data[at : at + packed], size, path), "u1", size, path))
         at += packed
     return attributes if header.degree else [*attributes, np.empty(0, np.uint8)]
 
 
-def _unpack(data: bytes, size: int, path: Path) -> bytes:
+def _decompress_stream(data: bytes, size: int, path: Path) -> bytes:
     """Decompress a Zstandard stream to at most ``size + 1`` bytes; the extra byte reveals excess data."""
     try:
         import zstandard
@@ -136,14 +136,14 @@ def _unpack(data: bytes, size: int, path: Path) -> bytes:
         raise refusal(path, f"a damaged Zstandard stream ({error})", "a sound one", "copy the file again") from error
 
 
-def _decode(attributes: list[np.ndarray], header: Header) -> Gaussians:
+def _decode_attributes(attributes: list[np.ndarray], header: Header) -> Gaussians:
     positions, opacities, colours, scales, rotations, harmonics = (a.reshape(header.count, -1) for a in attributes)
     above = (harmonics.reshape(header.count, -1, 3) - 128.0) / 128
     constant = (colours / 255 - 0.5) / COLOUR_SCALE
     all_harmonics = np.concatenate([constant[:, None], above], axis=1)
-    quaternions = (_first_three if header.version == 2 else _smallest_three)(rotations)
+    quaternions = (_decode_first_three if header.version == 2 else _decode_smallest_three)(rotations)
     return Gaussians(
-        _fixed_point(positions) / 2.0**header.fraction_bits * [1, -1, -1],
+        _decode_fixed_point(positions) / 2.0**header.fraction_bits * [1, -1, -1],
         scales / 16 - 10,
         quaternions * [1, 1, -1, -1],
         logits_of_bytes(opacities[:, 0]),
@@ -151,20 +151,20 @@ def _decode(attributes: list[np.ndarray], header: Header) -> Gaussians:
     )
 
 
-def _fixed_point(codes: np.ndarray) -> np.ndarray:
+def _decode_fixed_point(codes: np.ndarray) -> np.ndarray:
     """Whole numbers of 24 bits with a sign, lowest byte first; (N, 9) to (N, 3)."""
     low, middle, high = np.moveaxis(codes.reshape(len(codes), 3, 3).astype(np.int32), 2, 0)
     return low | middle << 8 | (high ^ 0x80) - 0x80 << 16
 
 
-def _first_three(codes: np.ndarray) -> np.ndarray:
+def _decode_first_three(codes: np.ndarray) -> np.ndarray:
     """(w, x, y, z) of x, y, z in bytes, w not below 0."""
-    return completed(codes / 127.5 - 1, np.zeros(len(codes), np.int64))
+    return complete_quaternions(codes / 127.5 - 1, np.zeros(len(codes), np.int64))
 
 
-def _smallest_three(codes: np.ndarray) -> np.ndarray:
+def _decode_smallest_three(codes: np.ndarray) -> np.ndarray:
     """(w, x, y, z) of a word with the number of the largest of (x, y, z, w) and the others."""
     words = np.ascontiguousarray(codes).view("<u4")[:, 0]
     fields = np.stack([(words >> np.uint32(shift)) & 1023 for shift in (20, 10, 0)], axis=1)
     others = np.where(fields >> 9, -1, 1) * (fields & 511) / 511 * np.sqrt(0.5)
-    return np.roll(completed(others, (words >> np.uint32(30)).astype(np.int64)), 1, axis=1)
+    return np.roll(complete_quaternions(others, (words >> np.uint32(30)).astype(np.int64)), 1, axis=1)

@@ -13,24 +13,24 @@ import numpy as np
 from mivol.errors import MivolError
 from mivol.files.source import check_file, refusal, select_by_suffix
 from mivol.points.cloud import CLOUD_READERS, CLOUD_WRITERS, PointCloud, read_points, write_points
-from mivol.points.conversions import gaussians_of_points, points_of_gaussians
-from mivol.points.gaussian_files import READERS, WRITERS, holds_gaussians, read_gaussians, write_gaussians
+from mivol.points.conversions import gaussians_to_points, points_to_gaussians
+from mivol.points.gaussian_files import GAUSSIAN_READERS, GAUSSIAN_WRITERS, is_gaussian_file, read_gaussians, write_gaussians
 from mivol.points.gaussians import Gaussians
 
-__all__ = ["KINDS", "SUFFIXES", "Facts", "convert_file", "is_points_file", "read_facts"]
+__all__ = ["KINDS", "SUFFIXES", "FileSummary", "convert_file", "is_points_file", "summarize_file"]
 
 KINDS = ("gaussians", "points")
 """What a file can be written as."""
 
-SUFFIXES = READERS.keys() | CLOUD_READERS.keys()
+SUFFIXES = GAUSSIAN_READERS.keys() | CLOUD_READERS.keys()
 """Of files of Gaussians and of points."""
 
-FAINT = 0.05
+FAINT_OPACITY = 0.05
 """Gaussians of a smaller opacity are counted: they cost time and show little."""
 
 
 @dataclass(frozen=True)
-class Facts:
+class FileSummary:
     """Lines for people; ``refusal`` is the sentence that reading the file would end with, or empty."""
 
     text: str
@@ -42,23 +42,23 @@ def is_points_file(path: Path) -> bool:
     return path.is_file() and path.suffix.lower() in SUFFIXES
 
 
-def read_facts(path: Path) -> Facts:
+def summarize_file(path: Path) -> FileSummary:
     """Count, extent, degree, scales and opacities of a file, and what in it cannot be drawn.
 
     Raises:
         MivolError: the file cannot be read at all.
     """
     path = check_file(path)
-    if holds_gaussians(path):
-        held, lines = select_by_suffix(path, READERS)(path), _gaussian_lines
+    if is_gaussian_file(path):
+        held, lines = select_by_suffix(path, GAUSSIAN_READERS)(path), _describe_gaussians
     else:
-        held, lines = select_by_suffix(path, CLOUD_READERS)(path), _cloud_lines
+        held, lines = select_by_suffix(path, CLOUD_READERS)(path), _describe_points
     try:
         held.checked(path)
         refused = ""
     except MivolError as error:
         refused = str(error)
-    return Facts("\n".join([*lines(path, held), *([f"refused\n{refused}"] if refused else [])]), refused)
+    return FileSummary("\n".join([*lines(path, held), *([f"refused\n{refused}"] if refused else [])]), refused)
 
 
 def convert_file(source: Path, target: Path, kind: str | None = None) -> str:
@@ -78,48 +78,52 @@ def convert_file(source: Path, target: Path, kind: str | None = None) -> str:
     if kind not in (None, *KINDS):
         raise refusal("convert_file", f"kind={kind!r}", f"one of {', '.join(KINDS)}", "choose one of those")
     check_file(source)
-    has_gaussians = holds_gaussians(source)
-    select_by_suffix(target, {**CLOUD_WRITERS, **WRITERS})
-    kind = kind or ("gaussians" if has_gaussians and target.suffix.lower() in WRITERS else "points")
+    has_gaussians = is_gaussian_file(source)
+    select_by_suffix(target, {**CLOUD_WRITERS, **GAUSSIAN_WRITERS})
+    kind = kind or ("gaussians" if has_gaussians and target.suffix.lower() in GAUSSIAN_WRITERS else "points")
     held = read_gaussians(source) if has_gaussians else read_points(source)
     if kind == "gaussians":
-        made = gaussians_of_points(held) if isinstance(held, PointCloud) else held
+        made = points_to_gaussians(held) if isinstance(held, PointCloud) else held
         write_gaussians(target, made)
         return f"{target}: {made.count} Gaussians of degree {made.degree}"
-    cloud = held if isinstance(held, PointCloud) else points_of_gaussians(held)
+    cloud = held if isinstance(held, PointCloud) else gaussians_to_points(held)
     write_points(target, cloud)
     return f"{target}: {cloud.count} points"
 
 
-def _gaussian_lines(path: Path, held: Gaussians) -> list[str]:
+def _describe_gaussians(path: Path, held: Gaussians) -> list[str]:
     scales, opacities = held.scales(), held.opacities()
-    faint = np.mean(opacities[np.isfinite(opacities)] < FAINT) if held.count else 0
+    faint = np.mean(opacities[np.isfinite(opacities)] < FAINT_OPACITY) if held.count else 0
     return [
         f"{path}: {held.count} Gaussians, harmonics of degree {held.degree}",
-        *_extent(held.means),
-        f"scales {_spread(scales)}",
-        f"opacities {_spread(opacities)}, {100 * faint:.3g} % below {FAINT}",
+        *_describe_extent(held.means),
+        f"scales {_describe_spread(scales)}",
+        f"opacities {_describe_spread(opacities)}, {100 * faint:.3g} % below {FAINT_OPACITY}",
     ]
 
 
-def _cloud_lines(path: Path, held: PointCloud) -> list[str]:
-    return [f"{path}: {held.count} points, {'without' if held.colours is None else 'with'} colours", *_extent(held.positions)]
+def _describe_points(path: Path, held: PointCloud) -> list[str]:
+    return [
+        f"{path}: {held.count} points, {'without' if held.colours is None else 'with'} colours",
+        *_describe_extent(held.positions),
+    ]
 
 
-def _extent(positions: np.ndarray) -> list[str]:
+def _describe_extent(positions: np.ndarray) -> list[str]:
     """The box of all that are finite, and of the middle 98 %."""
     finite = positions[np.isfinite(positions).all(axis=1)]
     if not len(finite):
         return ["nothing in it has a place"]
-    low, high, inner_low, inner_high = np.quantile(finite, [0, 1, 0.01, 0.99], axis=0)
-    return [f"box {_corner(low)} to {_corner(high)}; 98 % along each axis {_corner(inner_low)} to {_corner(inner_high)}"]
+    corners = np.quantile(finite, [0, 1, 0.01, 0.99], axis=0)
+    low, high, inner_low, inner_high = (_format_corner(corner) for corner in corners)
+    return [f"box {low} to {high}; 98 % along each axis {inner_low} to {inner_high}"]
 
 
-def _corner(values: np.ndarray) -> str:
+def _format_corner(values: np.ndarray) -> str:
     return f"({', '.join(f'{value:.4g}' for value in values)})"
 
 
-def _spread(values: np.ndarray) -> str:
+def _describe_spread(values: np.ndarray) -> str:
     """Ends and median of the finite ones."""
     finite = values[np.isfinite(values)]
     if not finite.size:

@@ -141,7 +141,7 @@ class Splatter:
         Args:
             reals: the tensors of the cloud by name; no derivatives are tracked through them.
             camera: a pinhole of the splatter's size.
-            derivatives: whether :meth:`backward` will be asked; without, less memory is taken.
+            derivatives: whether :meth:`vjp_rays` will be asked; without, less memory is taken.
 
         Returns:
             The picture (height, width, 4 or 5), and what its derivatives need.

@@ -10,8 +10,8 @@ from radiance_rays import CUBE, TO_WORLD, aim, derive, make, rays_of, see
 
 from mivol.device_arrays import ALIGNMENT
 from mivol.fields.spherical_grid import SphericalGrid
-from mivol.transport.line_integrals.radiance_field import RayGradient, backward, cells_of, model_of, render
-from mivol.transport.line_integrals.radiance_source import Exact, exact
+from mivol.transport.line_integrals.radiance_field import RayGradient, find_occupied_cells, make_model, render_rays, vjp_rays
+from mivol.transport.line_integrals.radiance_source import Exact, make_exact
 from mivol.transport.traversal.occupied_cells import Cells
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
@@ -19,10 +19,10 @@ pytestmark = pytest.mark.usefixtures("variant_rgb")
 
 def followed(field: SphericalGrid, cells: Cells, o, d) -> tuple[list[np.ndarray], list[np.ndarray]]:
     """What rays see through these cells, and the derivatives of a sum of it."""
-    rays, model = rays_of(o, d), model_of(field)
-    source = exact(field, rays.d, slope=True)
-    seen = render(cells, source, model, rays)
-    backward(cells, source, model, seen, RayGradient(mi.Color3f(0.3, -0.5, 0.9), 0.7, 0.2))
+    rays, model = rays_of(o, d), make_model(field)
+    source = make_exact(field, rays.d, slope=True)
+    seen = render_rays(cells, source, model, rays)
+    vjp_rays(cells, source, model, seen, RayGradient(mi.Color3f(0.3, -0.5, 0.9), 0.7, 0.2))
     return [np.array(v) for v in (seen.colour, seen.T, seen.distance)], [np.array(s) for s in source.slopes()]
 
 
@@ -31,7 +31,7 @@ def test_cells_that_are_left_out_between_others_change_nothing():
     density, sh = make((9, 11, 10), basis=9)
     # A tenth of the nodes hold much, so that the walls of holes, which hold little less than nothing, are felt beside them.
     field = SphericalGrid.from_dense(np.where(density > 9.5, density, np.float32(-0.1)), sh, TO_WORLD)
-    some = cells_of(field)
+    some = find_occupied_cells(field)
     whole = Cells.find(field.res, TO_WORLD, field.row_of, lambda _: mi.Bool(True), field.rows)
     assert 0.2 * whole.count < some.count < 0.8 * whole.count
     o, d = aim(100)
@@ -74,7 +74,7 @@ def test_rows_of_all_degrees_are_packed_and_unpacked(basis: int):
 def test_a_cell_costs_four_corners_and_the_first_one_eight(monkeypatch: pytest.MonkeyPatch):
     density, sh = make((6, 6, 6), basis=1)
     field = SphericalGrid.from_dense(np.abs(density) * 0.01 + 0.01, sh, CUBE)
-    rays, cells, read, written = rays_of([-3, 0.1, 0.2], [1, 0, 0]), cells_of(field), [], []
+    rays, cells, read, written = rays_of([-3, 0.1, 0.2], [1, 0, 0]), find_occupied_cells(field), [], []
     value, write = Exact._value, Exact._write
 
     def counted(call, count):
@@ -90,11 +90,11 @@ def test_a_cell_costs_four_corners_and_the_first_one_eight(monkeypatch: pytest.M
         dr.scoped_set_flag(dr.JitFlag.SymbolicLoops, False),
         dr.scoped_set_flag(dr.JitFlag.SymbolicConditionals, False),
     ):
-        source = exact(field, rays.d, slope=True)
-        seen = render(cells, source, model_of(field), rays)
+        source = make_exact(field, rays.d, slope=True)
+        seen = render_rays(cells, source, make_model(field), rays)
         # Seven cells: half a voxel before the first node, five between nodes, half a voxel behind the last one.
         assert sum(read) == 4 * (7 + 1)
-        backward(cells, source, model_of(field), seen, RayGradient(mi.Color3f(1)))
+        vjp_rays(cells, source, make_model(field), seen, RayGradient(mi.Color3f(1)))
         assert sum(written) == 4 * (7 + 1)
 
 

@@ -12,7 +12,7 @@ import pytest
 from scipy.integrate import quad
 from scipy.special import logit
 
-from mivol.fields.gaussian_field import NAMES, GaussianField
+from mivol.fields.gaussian_field import EXTINCTION_PARAMETERS, GaussianField
 from mivol.points.gaussians import Gaussians
 from mivol.transport.media.extinction import RayInterval
 from mivol.transport.media.gaussian_extinction import GaussianExtinction
@@ -136,7 +136,7 @@ def test_extinctions_at_points_are_those_of_the_twin() -> None:
 def differences(value: object, gaussians: oracle.Cloud) -> dict[str, np.ndarray]:
     """Central differences (parameter..., rays) of ``value(cloud)`` by each parameter; steps of 1e-5 err by 1e-9."""
     found = {}
-    for name in NAMES:
+    for name in EXTINCTION_PARAMETERS:
         shape, step = getattr(gaussians, name).shape, 1e-5
         rows = []
         for k in range(int(np.prod(shape))):
@@ -192,7 +192,7 @@ def test_derivatives_by_every_parameter_are_finite_differences_of_the_twin(count
     truth = {name: SCALE * row @ weight for name, row in differences(value, twin).items()}
     part = part_of(gaussians)
     found, (forward, reverse) = follow(part, interval(o, d, t0, t1), None if t is None else mi.Float(t), weight)
-    for name in NAMES:
+    for name in EXTINCTION_PARAMETERS:
         size = np.abs(truth[name]).max()
         assert size > 1e-3
         # A derivative sums RAYS terms that cancel, each known to a few times ROUNDING.

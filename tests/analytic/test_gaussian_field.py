@@ -10,14 +10,14 @@ import pytest
 from gaussian_sets import random_gaussians
 
 from mivol.errors import MivolError
-from mivol.fields.gaussian_field import LEAST_SCALE, NAMES, GaussianField
-from mivol.fields.gaussian_line import ROW, SCALE
+from mivol.fields.gaussian_field import EXTINCTION_PARAMETERS, MIN_RELATIVE_SCALE, GaussianField
+from mivol.fields.gaussian_line import ROW_SIZE, SCALE_COLUMN
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
 
 
 def rows_of(field: GaussianField, scale: float = 1.0) -> np.ndarray:
-    return np.array(field.rows(mi.Float(scale)), np.float64).reshape(-1, ROW)
+    return np.array(field.rows(mi.Float(scale)), np.float64).reshape(-1, ROW_SIZE)
 
 
 def test_rows_hold_what_a_placed_gaussian_is() -> None:
@@ -30,7 +30,7 @@ def test_rows_hold_what_a_placed_gaussian_is() -> None:
     truth = np.einsum("nij,pnj->pni", cloud.whitening(), p[:, None] - cloud.means)
     np.testing.assert_allclose(ours, truth, rtol=1e-5, atol=1e-4)
     np.testing.assert_allclose(rows[:, 12], 1 / (1 + np.exp(-cloud.opacity_logits)), rtol=1e-6)
-    np.testing.assert_array_equal(rows[:, SCALE], 2.5)
+    np.testing.assert_array_equal(rows[:, SCALE_COLUMN], 2.5)
 
 
 def test_a_value_is_at_most_the_bound_and_reaches_it_at_a_mean() -> None:
@@ -62,12 +62,12 @@ def test_extremes_are_cut_and_stay_finite() -> None:
     rows = field.rows(mi.Float(1))
     dr.backward(dr.sum(rows))
     assert np.isfinite(np.array(rows)).all()
-    for name in NAMES:
+    for name in EXTINCTION_PARAMETERS:
         assert np.isfinite(np.array(dr.grad(field.tensors[name]))).all(), name
     np.testing.assert_allclose(rows_of(field)[:, 12], [0.999, 0, 0.999, 0], atol=1e-6)
     edge = np.diag(field.to_world)[:3].max()
     longest = np.linalg.norm(rows_of(field)[0, :9].reshape(3, 3), axis=1).max()
-    assert longest == pytest.approx(1 / (LEAST_SCALE * edge), rel=0.01)
+    assert longest == pytest.approx(1 / (MIN_RELATIVE_SCALE * edge), rel=0.01)
 
 
 def test_an_update_lists_them_anew_and_bad_numbers_are_refused_by_index() -> None:

@@ -25,7 +25,7 @@ FLIGHTS, SCALE = 1 << 16, 0.6
 @pytest.mark.parametrize("cells", [0.5, 50.0])
 def test_flights_end_where_the_depth_of_the_twin_says(cells: float, variant_rgb: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """The share of flights that end before t is 1 - exp(-tau(t)), in few cells and in many; the others are infinite."""
-    monkeypatch.setattr(gaussian_cells, "CELLS", cells)
+    monkeypatch.setattr(gaussian_cells, "CELLS_PER_GAUSSIAN", cells)
     rng = np.random.default_rng(0)
     means, scales = np.linspace([-1, 0, 0], [1, 0, 0], 20) + rng.uniform(-0.3, 0.3, (20, 3)), rng.uniform(0.1, 0.4, (20, 3))
     turns, opacities = rng.normal(size=(20, 4)), rng.uniform(0.05, 0.5, 20)

@@ -12,7 +12,7 @@ import pytest
 from gaussian_sets import random_gaussians
 
 from mivol.fields.gaussian_field import GaussianField
-from mivol.fields.gaussian_line import Line
+from mivol.fields.gaussian_line import WhitenedLine
 from mivol.points.gaussians import Gaussians
 from mivol.transport.media.extinction import RayInterval
 from mivol.transport.media.gaussian_extinction import GaussianExtinction
@@ -98,7 +98,7 @@ def visited(gaussians: Gaussians, o: np.ndarray, d: np.ndarray, span: tuple[floa
     seen = dr.full(mi.UInt32, most, most * len(o))
     lane = dr.arange(mi.UInt32, len(o))
 
-    def add(count: mi.UInt32, line: Line, index: mi.UInt32, ends: tuple[mi.Float, mi.Float]) -> mi.UInt32:
+    def add(count: mi.UInt32, line: WhitenedLine, index: mi.UInt32, ends: tuple[mi.Float, mi.Float]) -> mi.UInt32:
         dr.scatter(seen, index, lane * most + count)
         return count + 1
 

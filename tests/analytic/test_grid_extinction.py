@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mivol.fields.activation import activation_of
+from mivol.fields.activation import select_activation
 from mivol.transport.media.extinction import ConstantExtinction, RayInterval
 from mivol.transport.media.grid_extinction import (
     ActivatedGridExtinction,
@@ -82,7 +82,7 @@ ROUNDING = 8 * 2.0**-23
 
 def two() -> ActivatedGridExtinction:
     values = mi.TensorXf(np.full((2, 3, 2, 1), np.log(2), np.float32))
-    return ActivatedGridExtinction("sigma_t", Lattice(values, np.eye(4)), activation_of("exp"))
+    return ActivatedGridExtinction("sigma_t", Lattice(values, np.eye(4)), select_activation("exp"))
 
 
 def ray() -> mi.Ray3f:
@@ -154,7 +154,7 @@ def test_points_of_a_cell_are_interpolated():
 
 
 def test_values_are_activated_and_tangents_are_not():
-    part = ActivatedGridExtinction("sigma_t", lattice(), activation_of("relu"))
+    part = ActivatedGridExtinction("sigma_t", lattice(), select_activation("relu"))
     below, above, point = corners(-3), corners(3), [mi.Vector3f(0.5)]
     values, tangents = (SummedExtinction([part], [part.values], mi.Float(1), linear=k) for k in (False, True))
     assert [values.along([c], point)[0][0][0] for c in (below, above)] == [0, 3]

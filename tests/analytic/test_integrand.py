@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from mivol.errors import MivolError
-from mivol.transport.line_integrals.integrand import check_media
+from mivol.transport.line_integrals.integrand import check_cells_shared
 from mivol.transport.media.body import Body
 from mivol.transport.media.extinction import ConstantExtinction
 from mivol.transport.media.grid_extinction import GridExtinction
@@ -32,8 +32,8 @@ def media(*parts: object, **more: object) -> SimpleNamespace:
 
 
 def test_grids_that_share_their_cells_and_constants_are_swept():
-    check_media(media(grid(2, 3, 4), ConstantExtinction("sigma_a", mi.Float(1)), grid(2, 3, 4)), ASKING)
-    check_media(media(ConstantExtinction("sigma_a", mi.Float(1))), ASKING)
+    check_cells_shared(media(grid(2, 3, 4), ConstantExtinction("sigma_a", mi.Float(1)), grid(2, 3, 4)), ASKING)
+    check_cells_shared(media(ConstantExtinction("sigma_a", mi.Float(1))), ASKING)
 
 
 @pytest.mark.parametrize("other", [(2, 3, 5), (2, 3, 4)])
@@ -41,9 +41,9 @@ def test_grids_in_other_cells_are_refused(other: tuple[int, ...]) -> None:
     """Of another resolution, or of another place; whichever grid of the medium it is."""
     parts = grid(2, 3, 4), grid(2, 3, 4), grid(*other, edge=1.0 if other[2] == 5 else 2.0)
     with pytest.raises(MivolError, match=rf"somebody asks .* \(2, 3, 4\) and \(2, 3, {other[2]}\) voxels .* or do without"):
-        check_media(media(*parts), ASKING)
+        check_cells_shared(media(*parts), ASKING)
 
 
 def test_flakes_are_refused():
     with pytest.raises(MivolError, match="somebody asks and a medium has the phase function sggx; do without"):
-        check_media(media(grid(2, 2, 2), microflakes=[mi.Float(1)] * 6), ASKING)
+        check_cells_shared(media(grid(2, 2, 2), microflakes=[mi.Float(1)] * 6), ASKING)

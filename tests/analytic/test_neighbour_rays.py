@@ -16,12 +16,12 @@ from mivol.transport.line_integrals.radiance_field import (
     RayBundle,
     RayGradient,
     RenderedRays,
-    backward,
-    cells_of,
-    model_of,
-    render,
+    find_occupied_cells,
+    make_model,
+    render_rays,
+    vjp_rays,
 )
-from mivol.transport.line_integrals.radiance_source import Baked, bake, exact
+from mivol.transport.line_integrals.radiance_source import Baked, bake, make_exact
 from mivol.transport.traversal import neighbour_rays
 from mivol.transport.traversal.neighbour_rays import FEWEST, RayOrder
 
@@ -59,10 +59,10 @@ def stepped(field: SphericalGrid, rays: RayBundle, few: int, monkeypatch: pytest
     rng = np.random.default_rng(3)
     active = mi.Bool(rng.uniform(size=COUNT) < 0.8)
     weights = [mi.Float(rng.normal(size=COUNT).astype(np.float32)) for _ in range(5)]
-    cells, source, model = cells_of(field), exact(field, rays.d, slope=True), model_of(field)
-    seen = render(cells, source, model, rays, active)
+    cells, source, model = find_occupied_cells(field), make_exact(field, rays.d, slope=True), make_model(field)
+    seen = render_rays(cells, source, model, rays, active)
     also = mi.Bool(rng.uniform(size=COUNT) < 0.8)
-    backward(cells, source, model, seen, RayGradient(mi.Color3f(*weights[:3]), *weights[3:]), also)
+    vjp_rays(cells, source, model, seen, RayGradient(mi.Color3f(*weights[:3]), *weights[3:]), also)
     return numbers(seen), [np.array(s) for s in source.slopes()], seen.order
 
 
@@ -93,9 +93,9 @@ def test_numbers_for_all_rays_stay_numbers_for_all(sorts: None, monkeypatch: pyt
     found = []
     for few in (1, 1 << 30):
         monkeypatch.setattr(neighbour_rays, "FEWEST", few)
-        cells, source, model = cells_of(field), exact(field, rays.d, slope=True), model_of(field)
-        seen = render(cells, source, model, rays)
-        backward(cells, source, model, seen, RayGradient(mi.Color3f(0.3, -0.5, 0.9)))
+        cells, source, model = find_occupied_cells(field), make_exact(field, rays.d, slope=True), make_model(field)
+        seen = render_rays(cells, source, model, rays)
+        vjp_rays(cells, source, model, seen, RayGradient(mi.Color3f(0.3, -0.5, 0.9)))
         found.append((numbers(seen), np.array(source.slopes()[0])))
     for a, b in zip(*(light for light, _ in found), strict=True):
         np.testing.assert_array_equal(a, b)
@@ -106,7 +106,7 @@ def test_numbers_for_all_rays_stay_numbers_for_all(sorts: None, monkeypatch: pyt
 @pytest.mark.parametrize("levels", [1, 2])
 def test_neighbours_enter_and_leave_side_by_side(levels: int, sorts: None):
     """By NumPy, in the outermost box, here [-1, 1]^3."""
-    cells = cells_of(field_of(levels, CUBE if levels == 1 else CUBE @ HALF))
+    cells = find_occupied_cells(field_of(levels, CUBE if levels == 1 else CUBE @ HALF))
     rng = np.random.default_rng(5)
     o = rng.normal(size=(FEWEST, 3))
     o *= 3 / np.linalg.norm(o, axis=1, keepdims=True)
@@ -131,23 +131,23 @@ def test_neighbours_enter_and_leave_side_by_side(levels: int, sorts: None):
 
 def test_few_rays_and_rays_from_pinholes_stay_as_they_are(sorts: None):
     field = field_of()
-    cells, model = cells_of(field), model_of(field)
+    cells, model = find_occupied_cells(field), make_model(field)
     few, many = (rays_of(*aim(n)) for n in (FEWEST - 1, FEWEST))
     pinhole = bake(field, cells, np.float64([[0, 0, 5]]), mi.UInt32(0))
-    assert render(cells, exact(field, few.d), model, few).order is None
-    assert render(cells, exact(field, many.d), model, many).order is not None
-    assert render(cells, pinhole, model, many).order is None
+    assert render_rays(cells, make_exact(field, few.d), model, few).order is None
+    assert render_rays(cells, make_exact(field, many.d), model, many).order is not None
+    assert render_rays(cells, pinhole, model, many).order is None
 
 
 def test_sorted_rays_keep_their_pinholes(sorts: None, monkeypatch: pytest.MonkeyPatch):
     """A source of pinholes gains nothing by an order, and yet can be read in one."""
     field, rays = field_of(), rays_of(*aim(COUNT))
     view = mi.UInt32(np.random.default_rng(6).integers(2, size=COUNT).astype(np.uint32))
-    source = bake(field, cells_of(field), np.float64([[0, 0, 5], [5, 0, 0]]), view)
-    plain = numbers(render(cells_of(field), source, model_of(field), rays))
+    source = bake(field, find_occupied_cells(field), np.float64([[0, 0, 5], [5, 0, 0]]), view)
+    plain = numbers(render_rays(find_occupied_cells(field), source, make_model(field), rays))
     monkeypatch.setattr(neighbour_rays, "FEWEST", 1)
     monkeypatch.setattr(Baked, "gains_by_order", True)
-    seen = render(cells_of(field), source, model_of(field), rays)
+    seen = render_rays(find_occupied_cells(field), source, make_model(field), rays)
     assert seen.order is not None
     for a, b in zip(numbers(seen), plain, strict=True):
         np.testing.assert_array_equal(a, b)
@@ -156,16 +156,16 @@ def test_sorted_rays_keep_their_pinholes(sorts: None, monkeypatch: pytest.Monkey
 def test_another_number_of_rays_compiles_nothing(sorts: None, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(neighbour_rays, "FEWEST", 1)
     field = field_of()
-    cells, model = cells_of(field), model_of(field)
+    cells, model = find_occupied_cells(field), make_model(field)
     compiled = []
     for count in (300, 301, 517):
         rays = rays_of(*aim(count))
         dr.eval(rays)
         dr.kernel_history_clear()
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
-            source = exact(field, rays.d, slope=True)
-            seen = render(cells, source, model, rays)
-            backward(cells, source, model, seen, RayGradient(2 * seen.colour))
+            source = make_exact(field, rays.d, slope=True)
+            seen = render_rays(cells, source, model, rays)
+            vjp_rays(cells, source, model, seen, RayGradient(2 * seen.colour))
             dr.eval(source.slopes())
             kernels = [k for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT]
         # Two walks, tables before and sums after them, and a few that read lanes: not a walk for each array that is read.

@@ -10,9 +10,9 @@ from oracle_radiance import NestedTwin, Twin, sh_basis
 from radiance_rays import CUBE, TO_WORLD, derive, followed, make, rays_of, see
 
 from mivol.errors import MivolError
-from mivol.fields.spherical_grid import SphericalGrid, is_covered
-from mivol.transport.line_integrals.radiance_field import RayGradient, backward, cells_of, model_of, render
-from mivol.transport.line_integrals.radiance_source import bake, exact, fold
+from mivol.fields.spherical_grid import SphericalGrid, is_covered_by_inner
+from mivol.transport.line_integrals.radiance_field import RayGradient, find_occupied_cells, make_model, render_rays, vjp_rays
+from mivol.transport.line_integrals.radiance_source import bake, make_exact, vjp_bake
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
 
@@ -127,7 +127,7 @@ def test_one_fine_grid_that_holds_the_same_values_looks_the_same() -> None:
     ends = rng.uniform(-0.8, 0.8, (2, 20, 3))
     rays = rays_of(ends[0], (ends[1] - ends[0]) / np.linalg.norm(ends[1] - ends[0], axis=1, keepdims=True))
     rays.t_max = mi.Float(np.float32(np.linalg.norm(ends[1] - ends[0], axis=1)))
-    found = [render(cells_of(f), exact(f, rays.d), model_of(f), rays) for f in (nested, whole)]
+    found = [render_rays(find_occupied_cells(f), make_exact(f, rays.d), make_model(f), rays) for f in (nested, whole)]
     # Positions err by 2^-23 of the nodes across, 4e-6 of a cell, over which an extinction changes by 10: 4e-5 of a light of 1.
     np.testing.assert_allclose(np.array(found[0].colour), np.array(found[1].colour), atol=4e-5)
     np.testing.assert_allclose(np.array(found[0].T), np.array(found[1].T), atol=4e-5)
@@ -142,7 +142,7 @@ def test_what_the_inner_box_covers_is_vacuum_in_the_outer_one() -> None:
         for i in range(2)
     ]
     field = SphericalGrid.nested(grids)
-    covered = np.array(is_covered(dr.arange(mi.UInt32, field.places), field.res))
+    covered = np.array(is_covered_by_inner(dr.arange(mi.UInt32, field.places), field.res))
     half = covered[field.places // 2 :].reshape(res)
     # n / 4 nodes on either side of the middle, less one whose cells reach over the face.
     expected = np.ones(res, bool)
@@ -184,7 +184,7 @@ def test_values_at_points_are_those_that_rays_see() -> None:
 def test_tables_of_pinholes_hold_what_is_seen_of_all_levels() -> None:
     """From one pinhole, in the direction of the nodes themselves: what is baked is the sum of harmonics, and folded back."""
     field = field_of(arrays())
-    cells, pinhole = cells_of(field), np.array([[0.4, -2.0, 7.0]])
+    cells, pinhole = find_occupied_cells(field), np.array([[0.4, -2.0, 7.0]])
     table = np.array(bake(field, cells, pinhole, mi.UInt32(0)).table).reshape(-1, 4)
     rows = np.array(cells.rows)
     z, y, x = field.res
@@ -204,7 +204,7 @@ def test_tables_of_pinholes_hold_what_is_seen_of_all_levels() -> None:
     baked = bake(field, cells, pinhole, mi.UInt32(0), slope=True)
     g = np.random.default_rng(1).normal(size=dr.width(baked.table)).astype(np.float32)
     baked.slope = mi.Float(np.append(g, np.zeros(dr.width(baked.slope) - len(g), np.float32)))
-    by_density, by_sh = (np.float64(a) for a in fold(field, cells, baked, pinhole))
+    by_density, by_sh = (np.float64(a) for a in vjp_bake(field, cells, baked, pinhole))
     there = np.sum((np.float64(table) - [0, 0.5, 0.5, 0.5]) * g.reshape(-1, 4))
     own = np.sum(np.float64(field.density) * by_density) + np.sum(np.float64(field.harmonics) * by_sh)
     # Sums of some 5000 rounded terms of about 1.
@@ -215,12 +215,12 @@ def test_near_derivatives_are_scaled_and_far_ones_are_not() -> None:
     """A ray through a constant: where all of it is nearer than ``near`` by t^2 / near^2, beyond it not at all."""
     field = SphericalGrid.from_dense(np.full((2, 2, 2), 1e-3), np.zeros((2, 2, 2, 1, 3)), CUBE)
     o, d = [[-1.0, 0.1, 0.2]], [[1.0, 0.0, 0.0]]
-    rays, cells = rays_of(o, d), cells_of(field)
+    rays, cells = rays_of(o, d), find_occupied_cells(field)
 
     def slope(near: float) -> float:
-        source = exact(field, rays.d, slope=True)
-        seen = render(cells, source, model_of(field), rays)
-        backward(cells, source, model_of(field), seen, RayGradient(mi.Color3f(1, 1, 1)), near=near)
+        source = make_exact(field, rays.d, slope=True)
+        seen = render_rays(cells, source, make_model(field), rays)
+        vjp_rays(cells, source, make_model(field), seen, RayGradient(mi.Color3f(1, 1, 1)), near=near)
         return float(np.sum(np.float64(source.slopes()[0])))
 
     # d L / d sigma = integral of 0.5 x 3 over t from 0 to 2, less 1e-3 of it for what is hidden; with t^2 / near^2 below near.

@@ -12,7 +12,7 @@ from radiance_rays import looked, rays_of
 from scipy.ndimage import distance_transform_cdt
 
 from mivol.fields.spherical_grid import SphericalGrid
-from mivol.transport.line_integrals.radiance_field import cells_of
+from mivol.transport.line_integrals.radiance_field import find_occupied_cells
 from mivol.transport.traversal.grid_blocks import REACH
 from mivol.transport.traversal.lattice import clip
 from mivol.transport.traversal.occupied_cells import CellIndex
@@ -26,7 +26,7 @@ def test_fractions_across_a_ray_along_an_axis_are_those_of_its_start():
     field = SphericalGrid.from_dense(np.ones((5, 5, 5), np.float32), np.zeros((5, 5, 5, 1, 3)), np.eye(4))
     n = 64
     o = np.stack([np.full(n, -1.0), *np.random.default_rng(1).uniform(0.1, 0.9, (2, n))], axis=-1)
-    rays, cells = rays_of(o, [1.0, 0.0, 0.0]), cells_of(field)
+    rays, cells = rays_of(o, [1.0, 0.0, 0.0]), find_occupied_cells(field)
     segment = clip(cells, rays.o, rays.d, 0, rays.t_max)
     seen, _, _ = march(cells, segment, lambda _, here, on: mi.Vector3f(here.points[0]), mi.Vector3f(0))
     start = np.array(segment.frac)

@@ -11,8 +11,8 @@ from radiance_rays import CUBE, TO_WORLD, aim, derive, looked, make, rays_of, se
 
 from mivol.fields.activation import ACTIVATIONS
 from mivol.fields.spherical_grid import SphericalGrid
-from mivol.transport.line_integrals.radiance_field import brightest_weights, cells_of, model_of, render
-from mivol.transport.line_integrals.radiance_source import exact
+from mivol.transport.line_integrals.radiance_field import find_occupied_cells, make_model, raise_to_max_weights, render_rays
+from mivol.transport.line_integrals.radiance_source import make_exact
 from mivol.transport.traversal.occupied_cells import Cells
 
 
@@ -77,7 +77,7 @@ def test_fourth_order_and_ten_times_nearer_than_midpoints(variant_rgb: str) -> N
         field = SphericalGrid.from_dense(density, sh, np.eye(4), activation="none", offset=0.0)
         rays = rays_of(o32, d32)
         rays.t_max = mi.Float(t_max)
-        seen = render(cells_of(field), exact(field, rays.d), model_of(field), rays)
+        seen = render_rays(find_occupied_cells(field), make_exact(field, rays.d), make_model(field), rays)
 
         # The same line, finely, by the midpoint rule in float64, and with as many midpoints as ours has points.
         def line(count):
@@ -148,14 +148,14 @@ def test_the_background_of_the_same_colour(variant_rgb: str) -> None:
 def test_the_brightest_weight_of_a_cell(variant_rgb: str) -> None:
     """T alpha of each cell, behind those that are in front of it; the largest one where rays come from both sides."""
     field = SphericalGrid.from_dense(np.full((4, 3, 5), 3.0), np.zeros((4, 3, 5, 1, 3)), CUBE)
-    cells, model = cells_of(field), model_of(field)
+    cells, model = find_occupied_cells(field), make_model(field)
     weight = dr.zeros(mi.Float, cells.count)
     # The outer cells are half as long as the others; a voxel is 1/2 long.
     tau = 3 * np.array([0.25, 0.5, 0.5, 0.5, 0.25])
     one_way = np.exp(tau - np.cumsum(tau)) * -np.expm1(-tau)
     for side, expected in ((-1, one_way), (1, np.maximum(one_way, one_way[::-1]))):
         rays = rays_of([0.1, 0.1, 3.0 * side], [0.0, 0.0, -1.0 * side])
-        brightest_weights(cells, exact(field, rays.d), model, rays, weight)
+        raise_to_max_weights(cells, make_exact(field, rays.d), model, rays, weight)
         # x = 0.1 lies in the fourth of six cells, y = 0.1 in the third of four.
         seen = np.array(weight)[numbers_of(cells)[:, 2, 3]]
         # Optical depths of 6 at most, known to some 1e-6.
@@ -222,7 +222,7 @@ def test_cells_with_matter_are_listed(variant_rgb: str, sparse: bool) -> None:
     density, sh = make((30, 21, 25), basis=1)
     density = np.where(np.random.default_rng(1).random(density.shape) < 3e-4, 1, -1)
     field = SphericalGrid.from_dense(density, sh, CUBE)
-    cells = cells_of(field.sparse(density > 0) if sparse else field)
+    cells = find_occupied_cells(field.sparse(density > 0) if sparse else field)
     padded = np.pad(density > 0, 1, mode="edge")
     occupied = np.zeros((31, 22, 26), bool)
     for corner in range(8):

@@ -8,8 +8,8 @@ import pytest
 from radiance_rays import CUBE, TO_WORLD, make, rays_of, see
 
 from mivol.fields.spherical_grid import SphericalGrid
-from mivol.transport.line_integrals.radiance_field import RayGradient, backward, cells_of, model_of, render
-from mivol.transport.line_integrals.radiance_source import bake, fold
+from mivol.transport.line_integrals.radiance_field import RayGradient, find_occupied_cells, make_model, render_rays, vjp_rays
+from mivol.transport.line_integrals.radiance_source import bake, vjp_bake
 
 
 def test_pinhole_derivatives_are_those_of_what_a_pinhole_sees(variant_rgb: str) -> None:
@@ -22,13 +22,13 @@ def test_pinhole_derivatives_are_those_of_what_a_pinhole_sees(variant_rgb: str) 
     rays, view = rays_of(o, d), mi.UInt32(np.repeat([0, 1], 10))
 
     def total(field, slope=False):
-        cells = cells_of(field)
+        cells = find_occupied_cells(field)
         source = bake(field, cells, pinholes, view, slope)
-        model = model_of(field)
-        seen = render(cells, source, model, rays)
+        model = make_model(field)
+        seen = render_rays(cells, source, model, rays)
         if slope:
-            backward(cells, source, model, seen, RayGradient(mi.Color3f(1, 0.5, -0.7)))
-            return field.with_values(*fold(field, cells, source, pinholes)).values()
+            vjp_rays(cells, source, model, seen, RayGradient(mi.Color3f(1, 0.5, -0.7)))
+            return field.with_values(*vjp_bake(field, cells, source, pinholes)).values()
         return float(np.dot(np.array(seen.colour, np.float64).sum(axis=1), [1, 0.5, -0.7]))
 
     slopes = total(SphericalGrid.from_dense(density, sh, TO_WORLD), True)

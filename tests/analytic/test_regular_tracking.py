@@ -14,7 +14,7 @@ from hard_rays import BOUND
 from oracle import tau_scale, tau_twin
 from scattering_scenes import PLACE, aimed, rough_grid
 
-from mivol.fields.activation import activation_of
+from mivol.fields.activation import select_activation
 from mivol.transport.estimators.flights.regular_tracking import regular_tracking
 from mivol.transport.media.extinction import ConstantExtinction, ExactExtinction, RayInterval
 from mivol.transport.media.grid_extinction import ActivatedGridExtinction, GridExtinction
@@ -89,7 +89,7 @@ def test_constants_are_left_after_the_goal_over_the_extinction():
 def test_an_activation_makes_the_extinction():
     """exp of the logarithm of 2: an extinction of 2 between 1 and 2, and none outside, where exp of 0 would be 1."""
     values = np.full((2, 3, 2, 1), np.log(2))
-    part = ActivatedGridExtinction("sigma_t", make_lattice(values, np.eye(4)), activation_of("exp"))
+    part = ActivatedGridExtinction("sigma_t", make_lattice(values, np.eye(4)), select_activation("exp"))
     goal = np.array([0.3, 1.5, 2.9, 3.1])
     found = fly(part, rays(np.float64([[-1, 0.4, 0.3]]), np.float64([[1, 0, 0]])), 0, np.inf, goal)
     # An exponential of a few roundings, and a goal and a distance of about 2.

@@ -22,7 +22,7 @@ from mivol.bench.studies.radiance_field.steps import ask_memory, our_step, peer_
 from mivol.bench.studies.radiance_field.views import BOX, between, photographed, rays_of, rays_through, ring, tiled
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.photos import Camera, Photo, intrinsics
-from mivol.transport.line_integrals.radiance_field import cells_of, model_of, render
+from mivol.transport.line_integrals.radiance_field import find_occupied_cells, make_model, render_rays
 from mivol.transport.line_integrals.radiance_source import bake
 
 TINY = replace(QUICK, resolution=8, side=16, steps=EVERY, fit_resolution=8, fit_side=16, chair_steps=8, fields=("fog",))
@@ -34,8 +34,8 @@ def test_the_peer_sees_the_same_and_derives_the_same(variant_rgb: str) -> None:
     density, sh = field.to_dense()
     field = type(field).from_dense(density, sh * np.float32(0.3), field.to_world)
     task = tasks(QUICK)["camera"]
-    cells, peer = cells_of(field), peer_of(field)
-    seen = render(cells, bake(field, cells, task.pinholes, mi.UInt32(0)), model_of(field), task.rays)
+    cells, peer = find_occupied_cells(field), peer_of(field)
+    seen = render_rays(cells, bake(field, cells, task.pinholes, mi.UInt32(0)), make_model(field), task.rays)
     ours = np.array(seen.colour)
     theirs = np.array(peer.render(mi.Point3f((task.rays.o + 1) * 0.5), task.rays.d))
     # The peer's last step reaches up to a whole one behind the box: an optical depth of 1.5 * 2 / 32 too much.

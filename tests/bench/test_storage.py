@@ -15,7 +15,7 @@ import pytest
 from mivol.bench.studies import storage
 from mivol.fields.field_archives import save_field
 from mivol.fields.spherical_grid import SphericalGrid
-from mivol.transport.line_integrals.radiance_field import cells_of
+from mivol.transport.line_integrals.radiance_field import find_occupied_cells
 
 RES = (5, 6, 7)
 
@@ -54,7 +54,7 @@ def test_formulas_are_the_bytes(variant_rgb, tmp_path: Path, degree: int, sparse
 def test_the_index_is_what_the_walk_reads(variant_rgb, share: float) -> None:
     keep = np.random.default_rng(1).random(RES) <= share
     made = field(0, keep)
-    cells = cells_of(made)
+    cells = find_occupied_cells(made)
     listed, rows, bricks = storage.count_cells(keep)
     assert (cells.count, dr.width(cells.rows)) == (listed, rows)
     index = made.listed_places().bytes + cells.index.bytes + held(cells.corners, cells.rows)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from bounded_ball import Ball
 
-from mivol.fields.activation import activation_of
+from mivol.fields.activation import select_activation
 from mivol.transport.media.extinction import BoundedExtinction, ConstantExtinction, ExactExtinction, RayInterval
 from mivol.transport.media.grid_extinction import ActivatedGridExtinction, GridExtinction
 from mivol.transport.traversal.grid_blocks import block_bounds, empty_block_distances
@@ -36,8 +36,8 @@ KINDS: dict[str, Callable[[], ExactExtinction]] = {
     "an rgb constant": lambda: ConstantExtinction("sigma_t", mi.Color3f(0.7, 0.1, 1.3)),
     "a grey grid": lambda: GridExtinction("sigma_t", noise(1, 0)),
     "an rgb grid": lambda: GridExtinction("sigma_t", noise(3, 0)),
-    "relu of a grid": lambda: ActivatedGridExtinction("sigma_t", noise(1, -2), activation_of("relu")),
-    "exp of a grid": lambda: ActivatedGridExtinction("sigma_t", Lattice(noise(1, -2).values, BOX), activation_of("exp")),
+    "relu of a grid": lambda: ActivatedGridExtinction("sigma_t", noise(1, -2), select_activation("relu")),
+    "exp of a grid": lambda: ActivatedGridExtinction("sigma_t", Lattice(noise(1, -2).values, BOX), select_activation("exp")),
 }
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from mivol.errors import MivolError
 from mivol.fields.field_archives import load_field, save_field, save_svox2
-from mivol.fields.harmonics import degree_of
+from mivol.fields.harmonics import harmonic_degree
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.files import npy
 
@@ -186,7 +186,7 @@ def test_fields_that_are_refused(variant_rgb: str) -> None:
     ):
         with pytest.raises(MivolError, match=said):
             SphericalGrid.from_dense(**({"density": density, "sh": sh, "to_world": CUBE} | change))
-    assert [degree_of(n) for n in (1, 4, 9, 16, 25)] == [0, 1, 2, 3, 4]
+    assert [harmonic_degree(n) for n in (1, 4, 9, 16, 25)] == [0, 1, 2, 3, 4]
 
 
 def test_degrees_and_sparse_copies(variant_rgb: str) -> None:

@@ -14,7 +14,7 @@ from mivol.fields.activation import ACTIVATIONS
 from mivol.fields.field_archives import load_field, save_field
 from mivol.fields.field_files import EXPORTS, export_field
 from mivol.fields.spherical_grid import SphericalGrid
-from mivol.fields.surfaces import INVERSES, level_of, surface_of
+from mivol.fields.surfaces import INVERSES, default_level, extract_surface
 from mivol.files import encode_srgb, read_volume
 from mivol.files.mesh import Mesh, read_ply, write_mesh
 from scenes import centred, rotation
@@ -31,9 +31,7 @@ def nodes(place: np.ndarray, res: tuple[int, int, int] = RES) -> np.ndarray:
     return np.stack(grid[::-1], axis=-1) @ place[:3, :3].T + place[:3, 3]
 
 
-def ball(
-    place: np.ndarray = PLACE, activation: str = "relu", keep: bool = False, space: str = "srgb"
-) -> SphericalGrid:
+def ball(place: np.ndarray = PLACE, activation: str = "relu", keep: bool = False, space: str = "srgb") -> SphericalGrid:
     """A ball of RADIUS about the origin: 10 more extinction than the level 4 for each unit of length inside.
 
     Its degree-1 coefficients make what is seen along -z redder than along +z.
@@ -60,7 +58,7 @@ def test_the_surface_of_a_ball(variant_rgb: None, activation: str) -> None:
     Voxels are up to 0.1 long; the distance that is interpolated is curved by 1 / RADIUS, so that corners are within
     h^2 / (8 RADIUS) = 0.002 of it, and a little more for logarithms of it.
     """
-    mesh = surface_of(ball(activation=activation), 4.0)
+    mesh = extract_surface(ball(activation=activation), 4.0)
     distance = np.linalg.norm(mesh.points, axis=1)
     assert np.abs(distance - RADIUS).max() < 0.05
     assert np.abs(distance.mean() - RADIUS) < 0.005
@@ -72,18 +70,18 @@ def test_the_surface_of_a_ball(variant_rgb: None, activation: str) -> None:
 def test_a_mesh_stands_where_the_field_does(variant_rgb: None) -> None:
     """Turned, mirrored, shifted and stretched: the ball stays a ball, and its faces look outwards."""
     turned = centred(rotation([1.0, 2.0, -1.0], 0.7) @ np.diag([2.2, -2.0, 2.4]))
-    mesh = surface_of(ball(turned), 4.0)
+    mesh = extract_surface(ball(turned), 4.0)
     assert np.abs(np.linalg.norm(mesh.points, axis=1) - RADIUS).max() < 0.06
     assert volume_of(mesh) == pytest.approx(4 / 3 * np.pi * RADIUS**3, rel=0.03)
     moved = turned.copy()
     moved[:3, 3] += (5, -3, 2)
-    there = surface_of(SphericalGrid.from_dense(*ball(turned).to_dense(), moved), 4.0)
+    there = extract_surface(SphericalGrid.from_dense(*ball(turned).to_dense(), moved), 4.0)
     assert there.points == pytest.approx(mesh.points + np.array([5, -3, 2]), abs=1e-9)
 
 
 def test_colours_are_those_seen_from_outside(variant_rgb: None) -> None:
     """A ray that comes in against the normal n travels along -n: red is 0.5 - 0.4886 (-0.5) (-n_z) there, to 8 bits."""
-    mesh = surface_of(ball(), 4.0)
+    mesh = extract_surface(ball(), 4.0)
     red = 0.5 + 0.48860251 * -0.5 * -mesh.normals[:, 2]
     assert mesh.colours[:, 0] == pytest.approx(red, abs=1e-5)
     assert mesh.colours[:, 1] == pytest.approx(np.full(len(red), 0.5 + 0.28209479 * 0.3), abs=1e-6)
@@ -91,7 +89,7 @@ def test_colours_are_those_seen_from_outside(variant_rgb: None) -> None:
 
 
 def test_a_sparse_field_has_the_surface_of_the_dense_one(variant_rgb: None) -> None:
-    dense, sparse = surface_of(ball(), 4.0), surface_of(ball(keep=True), 4.0)
+    dense, sparse = extract_surface(ball(), 4.0), extract_surface(ball(keep=True), 4.0)
     assert np.array_equal(dense.points, sparse.points)
     assert np.array_equal(dense.faces, sparse.faces)
 
@@ -99,7 +97,7 @@ def test_a_sparse_field_has_the_surface_of_the_dense_one(variant_rgb: None) -> N
 def test_hard_a_field_that_reaches_its_sides_is_closed(variant_rgb: None) -> None:
     """A full box: its surface is closed and at most half a voxel outside (cells of 1/3, 1/4, 1/5)."""
     sh = np.zeros((3, 4, 5, 1, 3), np.float32)
-    mesh = surface_of(SphericalGrid.from_dense(np.full((3, 4, 5), 9.0), sh, np.eye(4)), 1e-3)
+    mesh = extract_surface(SphericalGrid.from_dense(np.full((3, 4, 5), 9.0), sh, np.eye(4)), 1e-3)
     edges = np.sort(np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]], mesh.faces[:, [2, 0]]]), axis=1)
     assert (np.unique(edges, axis=0, return_counts=True)[1] == 2).all()
     step = 1 / np.array([5, 4, 3])
@@ -114,10 +112,10 @@ def test_the_level_of_a_mesh(variant_rgb: None) -> None:
     block, sh = np.full((10, 10, 10), -1.0), np.zeros((10, 10, 10, 1, 3))
     block[2:8, 2:8, 2:5], block[2:8, 2:8, 5:8] = 2, 6
     thin, dense = (SphericalGrid.from_dense(k * block, sh, np.eye(4)) for k in (1, 10))
-    assert level_of(thin) == pytest.approx(2.5)
-    assert level_of(dense) == pytest.approx(np.log(2) / 0.1)
-    assert np.ptp(surface_of(thin).points, axis=0) == pytest.approx([0.4, 0.6, 0.6], abs=0.1)  # where the denser half is
-    radius = [np.linalg.norm(surface_of(ball(), level).points, axis=1).mean() for level in (3.0, 5.0)]
+    assert default_level(thin) == pytest.approx(2.5)
+    assert default_level(dense) == pytest.approx(np.log(2) / 0.1)
+    assert np.ptp(extract_surface(thin).points, axis=0) == pytest.approx([0.4, 0.6, 0.6], abs=0.1)  # where the denser half is
+    radius = [np.linalg.norm(extract_surface(ball(), level).points, axis=1).mean() for level in (3.0, 5.0)]
     assert radius == pytest.approx([0.7, 0.5], abs=0.005)
     assert set(INVERSES) == set(ACTIVATIONS)
     for name, inverse in INVERSES.items():
@@ -129,7 +127,7 @@ def test_the_level_of_a_mesh(variant_rgb: None) -> None:
 @pytest.mark.parametrize("suffix", [".ply", ".obj"])
 def test_meshes_on_disk(variant_rgb: None, tmp_path: Path, suffix: str) -> None:
     """Mitsuba reads what was written: the same box and as many triangles; ours are the same to float32 and 8 bits."""
-    mesh = surface_of(ball(), 4.0)
+    mesh = extract_surface(ball(), 4.0)
     path = tmp_path / f"ball{suffix}"
     assert export_field(path, ball(), 4.0) == [path]
     read = mi.load_dict({"type": suffix[1:], "filename": str(path)})
@@ -195,7 +193,7 @@ def test_a_checkpoint_of_svox2(variant_rgb: None, tmp_path: Path) -> None:
 
 def test_meshes_hold_codes_whatever_the_field_holds(variant_rgb: None) -> None:
     """Viewers show the colours of a mesh as they are: radiance is encoded."""
-    codes, light = (surface_of(ball(space=space)).colours for space in ("srgb", "linear"))
+    codes, light = (extract_surface(ball(space=space)).colours for space in ("srgb", "linear"))
     np.testing.assert_allclose(light, encode_srgb(codes), atol=1e-6)
     assert np.ptp(codes) > 0.2
 

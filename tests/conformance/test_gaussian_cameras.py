@@ -13,7 +13,7 @@ import wide_cameras
 from gaussian_scenes import SIDE, camera_rays, render
 from scipy.special import logit
 
-from mivol.fields.gaussian_field import HARMONICS, NAMES
+from mivol.fields.gaussian_field import EXTINCTION_PARAMETERS, HARMONICS
 from mivol.points.gaussians import Gaussians
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
@@ -41,7 +41,7 @@ def cloud(count: int, around: float = 0.5, seed: int = 0) -> Gaussians:
 
 def scene(gaussians: Gaussians, boundary: dict, sensor: dict) -> mi.Scene:
     """The cloud in a boundary, before a camera of one sample a pixel in a box."""
-    tensors = {name: mi.TensorXf(getattr(gaussians, name)) for name in (*NAMES, HARMONICS)}
+    tensors = {name: mi.TensorXf(getattr(gaussians, name)) for name in (*EXTINCTION_PARAMETERS, HARMONICS)}
     medium = {"type": "mivol_medium", "emission": {"type": "mivol_gaussians", **tensors}}
     film = {"type": "hdrfilm", "width": SIDE, "height": SIDE, "rfilter": {"type": "box"}}
     sensor = {**sensor, "film": film, "sampler": {"type": "independent"}}

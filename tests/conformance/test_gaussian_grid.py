@@ -10,12 +10,12 @@ from scipy.ndimage import map_coordinates
 from mivol.errors import MivolError
 from mivol.fields import gaussian_cells, gaussian_grid
 from mivol.fields.gaussian_grid import (
-    FAINTEST,
-    MOST_OPAQUE,
-    box_of_gaussians,
-    gaussians_of_grid,
-    grid_of_gaussians,
-    masses_of_gaussians,
+    MAX_OPACITY,
+    MIN_OPACITY,
+    gaussian_box,
+    gaussian_masses,
+    gaussians_to_grid,
+    grid_to_gaussians,
 )
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.files import encode_srgb
@@ -50,10 +50,10 @@ def test_a_mass_is_the_mean_over_directions_weighed_by_the_area_seen() -> None:
     d = np.stack([sine * np.cos(turn), sine * np.sin(turn), np.broadcast_to(cosine[:, None], (64, 128))], axis=-1)
     covariance = gaussians.covariances()[0].astype(np.float64)
     area = np.sqrt(np.linalg.det(covariance) * np.einsum("abi,ij,abj->ab", d, np.linalg.inv(covariance), d))
-    depth = masses_of_gaussians(gaussians)[0] / (2 * np.pi * area)
+    depth = gaussian_masses(gaussians)[0] / (2 * np.pi * area)
     mean = np.average((depth * area).mean(axis=1), weights=weight) / np.average(area.mean(axis=1), weights=weight)
     assert mean == pytest.approx(-np.log(0.3), rel=1e-5)  # the pre-images are float32: 1e-7 each
-    round_one = masses_of_gaussians(one((2.0, 2.0, 2.0)))[0]
+    round_one = gaussian_masses(one((2.0, 2.0, 2.0)))[0]
     assert round_one == pytest.approx(-np.log(0.3) * 2 * np.pi * 4, rel=1e-5)
 
 
@@ -66,10 +66,10 @@ def test_optical_depths_along_lines_are_those_of_the_widened_gaussian() -> None:
     and more, and 2e-4 beyond the reach; 2e-3 in all.
     """
     gaussians = one((0.5, 0.6, 0.9))
-    field = grid_of_gaussians(gaussians, np.full(3, -5.0), np.full(3, 5.0), 30)
+    field = gaussians_to_grid(gaussians, np.full(3, -5.0), np.full(3, 5.0), 30)
     density, h = field.to_dense()[0].astype(np.float64), 10 / 30
     covariance = gaussians.covariances()[0] + (1 / 4 + 1 / 6) * h**2 * np.eye(3)
-    inverse, mass = np.linalg.inv(covariance), masses_of_gaussians(gaussians)[0]
+    inverse, mass = np.linalg.inv(covariance), gaussian_masses(gaussians)[0]
     t = np.linspace(-5, 5, 4001)
     for d in np.array([[0.36, 0.48, 0.8], [0.8, -0.36, 0.48], [-0.48, 0.64, 0.6]]):
         for beside in (np.zeros(3), 0.5 * np.cross(d, [0.3, 0.2, 0.9])):
@@ -86,15 +86,15 @@ def test_mass_is_kept_however_small_gaussians_are() -> None:
     """A thousandth of a voxel, a flat one, and one of some voxels: float32 densities, 1e-6."""
     for scales in ((1e-4,) * 3, (0.3, 0.3, 1e-6), (0.2, 0.3, 0.4)):
         gaussians = one(scales, mean=(0.013, -0.021, 0.037))
-        field = grid_of_gaussians(gaussians, np.full(3, -2.0), np.full(3, 2.0), 32)
-        assert total(field) == pytest.approx(masses_of_gaussians(gaussians)[0], rel=1e-6)
+        field = gaussians_to_grid(gaussians, np.full(3, -2.0), np.full(3, 2.0), 32)
+        assert total(field) == pytest.approx(gaussian_masses(gaussians)[0], rel=1e-6)
 
 
 def test_a_gaussian_on_a_face_gives_half_of_its_mass() -> None:
     """Nodes are symmetric about the face; a deviation of two voxels makes the sum an integral."""
     gaussians = one((0.5, 0.5, 0.5), mean=(2, 0, 0))
-    field = grid_of_gaussians(gaussians, np.full(3, -2.1), np.array([2.0, 2.1, 2.1]), 16)
-    assert total(field) == pytest.approx(0.5 * masses_of_gaussians(gaussians)[0], rel=1e-3)  # 4 deviations: 2e-4
+    field = gaussians_to_grid(gaussians, np.full(3, -2.1), np.array([2.0, 2.1, 2.1]), 16)
+    assert total(field) == pytest.approx(0.5 * gaussian_masses(gaussians)[0], rel=1e-3)  # 4 deviations: 2e-4
 
 
 def test_parts_of_a_set_and_the_set_are_one(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -104,35 +104,35 @@ def test_parts_of_a_set_and_the_set_are_one(monkeypatch: pytest.MonkeyPatch) -> 
         *(getattr(parts[1], n) for n in ("means", "log_scales", "quaternions", "opacity_logits")), -parts[1].harmonics
     )
     box = np.full(3, -3.0), np.full(3, 3.0), 20
-    (a, ka), (b, kb) = (grid_of_gaussians(part, *box).to_dense() for part in parts)
+    (a, ka), (b, kb) = (gaussians_to_grid(part, *box).to_dense() for part in parts)
     own = np.broadcast_to(parts[0].harmonics, ka[a > 0].shape)
     np.testing.assert_allclose(ka[a > 0], own, rtol=1e-6)
-    monkeypatch.setattr(gaussian_cells, "PAIRS", 100)
-    both, k = grid_of_gaussians(concatenate(parts), *box).to_dense()
+    monkeypatch.setattr(gaussian_cells, "MAX_CHUNK_PAIRS", 100)
+    both, k = gaussians_to_grid(concatenate(parts), *box).to_dense()
     np.testing.assert_allclose(both, a + b, rtol=1e-6)
     np.testing.assert_allclose(k * both[..., None, None], a[..., None, None] * ka + b[..., None, None] * kb, atol=1e-6)
 
 
 def test_an_opacity_of_one_is_capped_and_the_box_holds_three_deviations() -> None:
-    assert masses_of_gaussians(one(opacity=1.0)) == masses_of_gaussians(one(opacity=0.9995))
-    assert masses_of_gaussians(one(opacity=0.0)) == 0
-    assert masses_of_gaussians(one(opacity=1.0))[0] == pytest.approx(-2 * np.pi * np.log1p(-MOST_OPAQUE), rel=1e-6)
-    low, high = box_of_gaussians(one((2.0, 2.0, 2.0), mean=(1, 0, 0)))
+    assert gaussian_masses(one(opacity=1.0)) == gaussian_masses(one(opacity=0.9995))
+    assert gaussian_masses(one(opacity=0.0)) == 0
+    assert gaussian_masses(one(opacity=1.0))[0] == pytest.approx(-2 * np.pi * np.log1p(-MAX_OPACITY), rel=1e-6)
+    low, high = gaussian_box(one((2.0, 2.0, 2.0), mean=(1, 0, 0)))
     np.testing.assert_allclose([low, high], [[-5, -6, -6], [7, 6, 6]], atol=1e-5)
 
 
 def test_what_cannot_be_a_grid_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     low, high = np.zeros(3), np.ones(3)
     with pytest.raises(MivolError, match="a corner above the other, and at least 2 voxels"):
-        grid_of_gaussians(one(), high, low, 8)
+        gaussians_to_grid(one(), high, low, 8)
     with pytest.raises(MivolError, match="give a box that holds them"):
-        grid_of_gaussians(one((0.1, 0.1, 0.1), mean=(9, 0, 0)), low, high, 8)
+        gaussians_to_grid(one((0.1, 0.1, 0.1), mean=(9, 0, 0)), low, high, 8)
     with pytest.raises(MivolError, match="nothing to put a box around"):
-        box_of_gaussians(one().select(slice(0)))
-    free = gaussian_grid.PAIR_BYTES * gaussian_grid.PAIRS + (16 * 13 + gaussian_grid.PAIR_BYTES) * 50**3
+        gaussian_box(one().select(slice(0)))
+    free = gaussian_grid.PAIR_BYTES * gaussian_grid.MAX_CHUNK_PAIRS + (16 * 13 + gaussian_grid.PAIR_BYTES) * 50**3
     monkeypatch.setattr(gaussian_grid, "available_memory", lambda: free + 1)
     with pytest.raises(MivolError, match="a resolution of at most 50 fits"):
-        grid_of_gaussians(one(), low, high, 100)
+        gaussians_to_grid(one(), low, high, 100)
 
 
 def field_of(density: np.ndarray, to_world: np.ndarray, seed: int = 1, degree: int = 1, **kind: object) -> SphericalGrid:
@@ -149,12 +149,12 @@ def test_one_block_of_one_gaussian_is_this_gaussian() -> None:
     """
     harmonics = np.linspace(-0.5, 0.8, 12).reshape(1, 4, 3)
     one = Gaussians([[0.1, -0.2, 0.3]], np.log([[0.5, 0.6, 0.9]]), [[0.9, 0.2, -0.3, 0.1]], [logit(0.7)], harmonics)
-    field = grid_of_gaussians(one, np.full(3, -5.0), np.full(3, 5.0), 30)
-    made = gaussians_of_grid(field, 1)
+    field = gaussians_to_grid(one, np.full(3, -5.0), np.full(3, 5.0), 30)
+    made = grid_to_gaussians(field, 1)
     assert made.count == 1
     np.testing.assert_allclose(made.means, one.means, atol=2e-4 * 4 * 0.9)
     np.testing.assert_allclose(made.harmonics, harmonics, atol=1e-5)
-    assert masses_of_gaussians(made)[0] == pytest.approx(masses_of_gaussians(one)[0], rel=1e-5)
+    assert gaussian_masses(made)[0] == pytest.approx(gaussian_masses(one)[0], rel=1e-5)
     expected = one.covariances() + (1 / 4 + 1 / 6) * (10 / 30) ** 2 * np.eye(3)
     np.testing.assert_allclose(made.covariances(), expected, atol=4e-3 * expected.max())
 
@@ -164,10 +164,10 @@ def test_masses_are_those_of_the_voxels_in_blocks_that_need_not_divide_the_grid(
     rng = np.random.default_rng(2)
     to_world = np.diag([0.7, 1.2, 0.5, 1.0])
     density = rng.uniform(0.2, 3, (5, 6, 7))
-    made = gaussians_of_grid(field_of(density, to_world), 3)
+    made = grid_to_gaussians(field_of(density, to_world), 3)
     assert made.count == 2 * 2 * 3
-    assert masses_of_gaussians(made).sum() == pytest.approx(density.sum() * 0.7 * 1.2 * 0.5 / (5 * 6 * 7), rel=1e-5)
-    assert gaussians_of_grid(field_of(density, to_world)).count == 3 * 3 * 4
+    assert gaussian_masses(made).sum() == pytest.approx(density.sum() * 0.7 * 1.2 * 0.5 / (5 * 6 * 7), rel=1e-5)
+    assert grid_to_gaussians(field_of(density, to_world)).count == 3 * 3 * 4
 
 
 def test_a_layer_of_voxels_makes_flat_gaussians_in_a_sheared_grid() -> None:
@@ -179,7 +179,7 @@ def test_a_layer_of_voxels_makes_flat_gaussians_in_a_sheared_grid() -> None:
     to_world[:3, :3] = [[0.4, 0.1, 0.0], [0.0, 0.4, 0.2], [0.0, 0.0, -0.4]]
     density = np.zeros((4, 4, 4))
     density[1] = 3.0
-    made = gaussians_of_grid(field_of(density, to_world), 1)
+    made = grid_to_gaussians(field_of(density, to_world), 1)
     edges = to_world[:3, :3] / 4
     expected = edges @ np.diag([5 / 4 + 1 / 6, 5 / 4 + 1 / 6, 1 / 6]) @ edges.T
     np.testing.assert_allclose(made.covariances()[0], expected, rtol=1e-4, atol=1e-6)
@@ -193,7 +193,7 @@ def test_colours_of_a_turned_grid_are_those_of_the_world(degree: int) -> None:
     to_world = np.eye(4)
     to_world[:3, :3] = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]) @ np.array([[1, 0, 0], [0, c, s], [0, -s, c]])
     field = field_of(np.full((1, 1, 1), 0.5), to_world, degree=degree, offset=0.8)
-    made = gaussians_of_grid(field)
+    made = grid_to_gaussians(field)
     d = np.array([[0.36, 0.48, 0.8], [0.8, -0.36, 0.48], [-0.48, 0.64, 0.6], [0, 0, -1]], np.float32)
     where = [mi.Float(np.full(4, v)) for v in made.means[0]]
     _, expected = field.eval(mi.Point3f(*where), mi.Vector3f(*d.T))
@@ -213,11 +213,11 @@ def test_radiance_becomes_code_values() -> None:
     light = np.array([0.02, 0.2, 0.7])
     sh = ((light - 0.5) / CONSTANT_HARMONIC).reshape(1, 1, 1, 1, 3)
     field = SphericalGrid.from_dense(np.full((1, 1, 1), 0.5), sh, np.eye(4), space="linear")
-    np.testing.assert_allclose(gaussians_of_grid(field).base_colours()[0], encode_srgb(light), atol=1e-5)
+    np.testing.assert_allclose(grid_to_gaussians(field).base_colours()[0], encode_srgb(light), atol=1e-5)
 
 
 def test_degrees_above_the_highest_of_files_are_left_out() -> None:
-    assert gaussians_of_grid(field_of(np.full((1, 1, 1), 0.5), np.eye(4), degree=4)).degree == 3
+    assert grid_to_gaussians(field_of(np.full((1, 1, 1), 0.5), np.eye(4), degree=4)).degree == 3
 
 
 def test_what_makes_no_gaussians_is_refused() -> None:
@@ -225,7 +225,7 @@ def test_what_makes_no_gaussians_is_refused() -> None:
     outer = np.diag([2.0, 2, 2, 1])
     outer[:3, 3] = -0.5
     nested = SphericalGrid.nested([grid, field_of(np.full((2, 2, 2), 0.5), outer)])
-    thin = field_of(np.full((2, 2, 2), 0.5 * FAINTEST), np.eye(4))
+    thin = field_of(np.full((2, 2, 2), 0.5 * MIN_OPACITY), np.eye(4))
     for field, resolution, said in (
         (nested, None, "2 nested levels"),
         (grid, 0, "a resolution of 0 blocks"),
@@ -233,4 +233,4 @@ def test_what_makes_no_gaussians_is_refused() -> None:
         (thin, None, "give a lower resolution"),
     ):
         with pytest.raises(MivolError, match=said):
-            gaussians_of_grid(field, resolution)
+            grid_to_gaussians(field, resolution)

@@ -19,7 +19,7 @@ from scipy.special import logit
 
 from mivol.errors import MivolError
 from mivol.experiments.script import explain
-from mivol.fields.gaussian_field import NAMES
+from mivol.fields.gaussian_field import EXTINCTION_PARAMETERS
 from mivol.photos.camera import Camera, intrinsics
 from mivol.points import write_gaussians
 from mivol.points.gaussians import Gaussians
@@ -44,7 +44,11 @@ def cloud(count: int, seed: int = 0) -> Gaussians:
 
 
 def volume(gaussians: Gaussians, **more: object) -> dict:
-    return {"type": "mivol_gaussians", **{name: mi.TensorXf(getattr(gaussians, name)) for name in NAMES}, **more}
+    return {
+        "type": "mivol_gaussians",
+        **{name: mi.TensorXf(getattr(gaussians, name)) for name in EXTINCTION_PARAMETERS},
+        **more,
+    }
 
 
 def scene(sigma_t: dict, albedo: object = 0.0, emitter: dict | None = None, fov: float = 25.0, **medium: object) -> mi.Scene:
@@ -101,7 +105,7 @@ def test_a_picture_has_derivatives_by_every_parameter() -> None:
     weight = rng.normal(size=len(o))
     value = lambda c: SKY * weight @ np.exp(-SCALE * oracle.optical_depth(c, o, d, t0, t1, cut))  # noqa: E731
     integrator, params = mi.load_dict({"type": "mivol", "max_depth": 1}), mi.traverse(found)
-    keys = {name: f"cloud.interior_medium.sigma_t.{name}" for name in NAMES}
+    keys = {name: f"cloud.interior_medium.sigma_t.{name}" for name in EXTINCTION_PARAMETERS}
     for key in keys.values():
         dr.enable_grad(params[key])
     params.update()
@@ -246,7 +250,9 @@ def test_a_file_is_its_tensors_and_an_update_moves_them(tmp_path: Path) -> None:
     params = mi.traverse(read)
     params["cloud.interior_medium.sigma_t.means"] = mi.TensorXf(gaussians.means + np.float32(0.2))
     params.update()
-    moved = Gaussians(gaussians.means + np.float32(0.2), *(getattr(gaussians, n) for n in (*NAMES[1:], "harmonics")))
+    moved = Gaussians(
+        gaussians.means + np.float32(0.2), *(getattr(gaussians, n) for n in (*EXTINCTION_PARAMETERS[1:], "harmonics"))
+    )
     np.testing.assert_allclose(render(read), render(scene(volume(moved))), rtol=1e-5)
     assert np.abs(render(read) - given).max() > 0.05
 

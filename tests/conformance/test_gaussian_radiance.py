@@ -19,7 +19,7 @@ from scipy.special import logit
 
 from mivol.errors import MivolError
 from mivol.experiments.script import explain
-from mivol.fields.gaussian_field import HARMONICS, NAMES, GaussianField
+from mivol.fields.gaussian_field import EXTINCTION_PARAMETERS, HARMONICS, GaussianField
 from mivol.photos.camera import Camera, intrinsics
 from mivol.points import write_gaussians
 from mivol.points.gaussians import Gaussians
@@ -48,7 +48,7 @@ def cloud(count: int, seed: int = 0, degree: int = 2) -> Gaussians:
 
 def shown(gaussians: Gaussians, **more: object) -> dict:
     """A medium that shows them."""
-    tensors = {name: mi.TensorXf(getattr(gaussians, name)) for name in (*NAMES, HARMONICS)}
+    tensors = {name: mi.TensorXf(getattr(gaussians, name)) for name in (*EXTINCTION_PARAMETERS, HARMONICS)}
     return {"type": "mivol_medium", "emission": {"type": "mivol_gaussians", **tensors, **more}}
 
 
@@ -243,7 +243,7 @@ def test_small_ones_look_as_splatted() -> None:
 def every(found: mi.Scene) -> tuple[mi.SceneParameters, dict[str, str]]:
     """The parameters of the scene, with derivatives asked for of the Gaussians, and their keys by name."""
     params = mi.traverse(found)
-    keys = {name: f"cloud.interior_medium.emission.{name}" for name in (*NAMES, HARMONICS)}
+    keys = {name: f"cloud.interior_medium.emission.{name}" for name in (*EXTINCTION_PARAMETERS, HARMONICS)}
     for key in keys.values():
         dr.enable_grad(params[key])
     params.update()

@@ -18,12 +18,12 @@ from mivol.fields.field_archives import save_field
 from mivol.fields.field_files import export_field, write_scene
 from mivol.fields.sky import Sky
 from mivol.fields.spherical_grid import SphericalGrid
-from mivol.fields.surfaces import surface_of
+from mivol.fields.surfaces import extract_surface
 from mivol.files import read_exr, read_volume, write_exr
 from mivol.photos.photo_file import decode_srgb
 from mivol.scene.load import load_scene
-from mivol.transport.line_integrals.radiance_field import cells_of, model_of, render
-from mivol.transport.line_integrals.radiance_source import exact
+from mivol.transport.line_integrals.radiance_field import find_occupied_cells, make_model, render_rays
+from mivol.transport.line_integrals.radiance_source import make_exact
 from scenes import ball_of, box_of, camera, centred, medium, refused, rotation, sky, tensor
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
@@ -85,7 +85,7 @@ def test_rays_of_a_scene_see_what_the_field_shows_its_own_cameras(tmp_path: Path
     field = rough()
     o, d = lines(600)
     ray = rays_of(o, d)
-    seen = render(cells_of(field), exact(field, ray.d), model_of(field), ray)
+    seen = render_rays(find_occupied_cells(field), make_exact(field, ray.d), make_model(field), ray)
     expected = np.array(seen.colour + seen.T * 0.5)
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(0, len(o))
@@ -213,7 +213,7 @@ def test_a_surface_goes_on_from_level_to_level(radius: float, voxel: float) -> N
     voxel, and triangles reach as far out of the box: a voxel's error there. No area is missing (chords take
     (h / r)^2 / 12 at most), and a triangle's width, of the larger voxels, is there twice along a seam of at most 6 circles.
     """
-    mesh = surface_of(shell(radius), 8.0)
+    mesh = extract_surface(shell(radius), 8.0)
     away = mesh.points - [0.1, 0.2, 0.3]
     off = np.abs(np.linalg.norm(away, axis=1) - radius)
     assert np.quantile(off, 0.8) < 0.01 and off.max() < (0.01 if radius == 0.4 else voxel)
@@ -228,9 +228,9 @@ def test_a_surface_goes_on_from_level_to_level(radius: float, voxel: float) -> N
 
 
 def test_levels_that_no_surface_reaches_are_left_out() -> None:
-    assert len(surface_of(shell(0.4), 8.0).points) == len(surface_of(shell(0.4).level(0), 8.0).points)
+    assert len(extract_surface(shell(0.4), 8.0).points) == len(extract_surface(shell(0.4).level(0), 8.0).points)
     with pytest.raises(MivolError, match=r"no node of the field reaches the extinction 1000, only 3\d.*; give a lower level"):
-        surface_of(shell(0.7), 1000.0)
+        extract_surface(shell(0.7), 1000.0)
 
 
 def test_svox2_has_no_levels(tmp_path: Path) -> None:

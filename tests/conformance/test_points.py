@@ -11,7 +11,7 @@ from gaussian_sets import inria_bytes, ply_bytes, random_gaussians
 
 from mivol.errors import MivolError
 from mivol.points.cloud import PointCloud, read_points, write_points
-from mivol.points.conversions import density_of_points, gaussians_of_points, points_of_gaussians, sample_points
+from mivol.points.conversions import gaussians_to_points, points_to_density, points_to_gaussians, sample_points
 
 BOX = np.array([[2.0, 0.5, 0, -1], [0, 3, 0, 4], [0, 0, 1.5, 2], [0, 0, 0, 1]])
 """Unit cube to world: a sheared box of volume 9."""
@@ -118,7 +118,7 @@ def test_the_mass_is_kept_up_to_the_faces(resolution: tuple[int, int, int]) -> N
     roundings of 2^-53 of it bound its error."""
     points = inside(500)
     masses = np.random.default_rng(6).uniform(0.5, 2, 500)
-    density = density_of_points(points, resolution, BOX, masses)
+    density = points_to_density(points, resolution, BOX, masses)
     assert density.min() >= 0
     assert abs(density.sum() * 9 / np.prod(resolution) - masses.sum()) <= 1000 * 2**-53 * masses.sum()
 
@@ -131,7 +131,7 @@ def test_the_centre_of_mass_is_kept_inside() -> None:
     centres = (index + 0.5) / resolution[::-1] @ BOX[:3, :3].T + BOX[:3, 3]
     for unit in np.random.default_rng(7).uniform(0.125, 0.875, (10, 3)):
         point = BOX[:3, :3] @ unit + BOX[:3, 3]
-        mass = density_of_points(point[None], resolution, BOX) * 9 / 120
+        mass = points_to_density(point[None], resolution, BOX) * 9 / 120
         assert np.abs((mass[..., None] * centres).sum(axis=(0, 1, 2)) - point).max() <= 20 * 8 * 2**-53
 
 
@@ -139,7 +139,7 @@ def test_a_point_outside_is_refused_by_index() -> None:
     points = inside(20)
     points[13] += [0, 0, 10]
     with pytest.raises(MivolError, match=r"point 13 outside the box \(the first of 1\)"):
-        density_of_points(points, (4, 5, 6), BOX)
+        points_to_density(points, (4, 5, 6), BOX)
 
 
 def test_each_voxel_holds_its_share_of_the_points() -> None:
@@ -170,17 +170,17 @@ def test_gaussians_are_as_wide_as_their_neighbours_are_away() -> None:
     """Corners of a cube of edge 2 have their three neighbours at 2; a point that is there twice more gets the smallest scale.
     Logarithms below 8 in float32: 1e-6."""
     corners = np.array([[x, y, z] for x in (0, 2) for y in (0, 2) for z in (0, 2)], float)
-    balls = gaussians_of_points(PointCloud(corners, np.full((8, 3), 0.75)), opacity=0.2).checked()
+    balls = points_to_gaussians(PointCloud(corners, np.full((8, 3), 0.75)), opacity=0.2).checked()
     assert np.abs(balls.log_scales - np.log(2)).max() <= 1e-6
     assert np.abs(balls.opacities() - 0.2).max() <= 1e-6
     assert np.abs(balls.base_colours() - 0.75).max() <= 1e-6
-    twice = gaussians_of_points(PointCloud(np.concatenate([corners, corners[:1], corners[:1], corners[:1]])))
+    twice = points_to_gaussians(PointCloud(np.concatenate([corners, corners[:1], corners[:1], corners[:1]])))
     assert np.abs(twice.log_scales[[0, 8, 9, 10]] - np.log(2e-3)).max() <= 1e-6
 
 
 def test_centres_and_colours_come_back(tmp_path: Path) -> None:
     cloud = PointCloud(inside(30).astype(np.float32), np.random.default_rng(9).uniform(size=(30, 3)))
-    again = points_of_gaussians(gaussians_of_points(cloud))
+    again = gaussians_to_points(points_to_gaussians(cloud))
     assert np.array_equal(again.positions, cloud.positions)
     assert np.abs(again.colours - cloud.colours).max() <= 1e-6
     one = random_gaussians(5, 1)
@@ -198,4 +198,4 @@ def test_centres_and_colours_come_back(tmp_path: Path) -> None:
 )
 def test_points_that_make_no_gaussians_are_refused(positions: np.ndarray, opacity: float, said: str) -> None:
     with pytest.raises(MivolError, match=said):
-        gaussians_of_points(PointCloud(positions), opacity)
+        points_to_gaussians(PointCloud(positions), opacity)

@@ -13,7 +13,7 @@ from scattering_scenes import cases
 
 from mivol.errors import MivolError
 from mivol.fields.field_archives import load_field, save_field
-from mivol.fields.harmonics import radiance_of_codes
+from mivol.fields.harmonics import decode_srgb_code
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.files import encode_srgb
 from mivol.photos.photo_file import decode_srgb
@@ -244,7 +244,7 @@ def test_light_of_codes_has_the_curve_and_the_slope_of_srgb(variant_rgb: None) -
     codes = np.array([-0.2, 0.0, 0.04, 0.05, 0.5, 1.0, 1.5])
     x = mi.Float(codes)
     dr.enable_grad(x)
-    light = radiance_of_codes(x)
+    light = decode_srgb_code(x)
     dr.backward(dr.sum(light))
     inside = (codes >= 0) & (codes <= 1)
     np.testing.assert_allclose(np.array(light)[inside], decode_srgb(codes[inside]), rtol=1e-5)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from mivol.errors import MivolError
-from mivol.fields.activation import ACTIVATIONS, activation_of
+from mivol.fields.activation import ACTIVATIONS, select_activation
 from mivol.fields.analytic import ExponentialAtmosphere
 from mivol.fields.field_archives import MOST_NODES, _check_own_arrays, _of_ours
 from mivol.fields.procedural import make_procedural
@@ -47,9 +47,9 @@ def refusal_of(called: object, *arguments: object, **settings: object) -> str:
 
 
 def test_names_that_are_not_known() -> None:
-    assert [activation_of(name).name for name in ACTIVATIONS] == ["none", "relu", "softplus", "exp"]
+    assert [select_activation(name).name for name in ACTIVATIONS] == ["none", "relu", "softplus", "exp"]
     wanted = "the activation 'relo' was given; one of none, relu, softplus, exp is expected."
-    assert refusal_of(activation_of, "relo") == wanted
+    assert refusal_of(select_activation, "relo") == wanted
     assert refusal_of(make_procedural, "tangel", (2, 2, 2), 0, 1.0) == 'unknown procedural volume "tangel": known are tangle.'
     assert make_procedural("tangle", (2, 3, 4), 0, 1.0).shape == (2, 3, 4, 1)
     assert refusal_of(named_medium, NAMES[0] + "x").startswith(f"no measured medium is called {NAMES[0] + 'x'!r}; near it are")

@@ -12,7 +12,7 @@ from scattering_scenes import close_up, mivol, point
 from scipy.special import logit
 
 import scenes
-from mivol.fields.gaussian_field import NAMES
+from mivol.fields.gaussian_field import EXTINCTION_PARAMETERS
 from mivol.validate.moments import Moments
 from mivol.validate.statistics import Estimate
 
@@ -20,7 +20,7 @@ pytestmark = pytest.mark.usefixtures("variant_rgb")
 
 INSIDE = "cloud.interior_medium."
 
-PARAMETERS = {name: f"{INSIDE}sigma_t.{name}" for name in NAMES} | {"scale": INSIDE + "scale"}
+PARAMETERS = {name: f"{INSIDE}sigma_t.{name}" for name in EXTINCTION_PARAMETERS} | {"scale": INSIDE + "scale"}
 
 
 def parts(albedo: float, **lights: dict) -> dict:
@@ -103,7 +103,7 @@ def test_all_parameters_by_differences() -> None:
     """
     scene, integrator, h = close_up(parts(0.8, bulb=point([1.7, -0.6, 2.4])[0]), res=8), mi.load_dict(mivol(max_depth=3)), 0.02
     params, rng = mi.traverse(scene), np.random.default_rng(6)
-    start = {name: np.array(params[PARAMETERS[name]], dtype=np.float64) for name in NAMES}
+    start = {name: np.array(params[PARAMETERS[name]], dtype=np.float64) for name in EXTINCTION_PARAMETERS}
     # Opacities and sizes all grow, so that their changes do not cancel.
     v = {
         name: (np.abs if value.ndim == 1 or name == "log_scales" else np.array)(rng.normal(size=value.shape))
@@ -113,15 +113,15 @@ def test_all_parameters_by_differences() -> None:
     found, truth = [], []
     for k in range(BATCHES):
         by_name = backward(scene, w, 512, fresh(k), integrator)
-        found.append(sum(np.sum(by_name[name] * v[name]) for name in NAMES))
+        found.append(sum(np.sum(by_name[name] * v[name]) for name in EXTINCTION_PARAMETERS))
         both = []
         for sign in (1, -1):
-            for name in NAMES:
+            for name in EXTINCTION_PARAMETERS:
                 params[PARAMETERS[name]] = mi.TensorXf((start[name] + sign * h * v[name]).astype(np.float32))
             params.update()
             both.append(scenes.render(scene, integrator, 1 << 12, seed=fresh(900 + k)).astype(np.float64).mean())
         truth.append((both[0] - both[1]) / (2 * h))
-        for name in NAMES:
+        for name in EXTINCTION_PARAMETERS:
             params[PARAMETERS[name]] = mi.TensorXf(start[name].astype(np.float32))
         params.update()
     found, truth = (Estimate.of(Moments.of(np.array(values)[:, None])) for values in (found, truth))

@@ -13,7 +13,7 @@ import pytest
 from false_alarms import assert_precise, assert_same_mean, fresh
 from scipy.special import logit
 
-from mivol.fields.gaussian_field import HARMONICS, NAMES
+from mivol.fields.gaussian_field import EXTINCTION_PARAMETERS, HARMONICS
 from mivol.points.gaussians import CONSTANT_HARMONIC
 from mivol.validate.moments import Moments
 from mivol.validate.statistics import Estimate
@@ -111,7 +111,7 @@ def test_flights_bring_the_light_that_is_composited(nested: bool) -> None:
 def followed(found: mi.Scene) -> dict[str, object]:
     """The parameters of Gaussians and fog, with derivatives asked for."""
     params = mi.traverse(found)
-    keys = [f"cloud.interior_medium.emission.{name}" for name in (*NAMES, HARMONICS)]
+    keys = [f"cloud.interior_medium.emission.{name}" for name in (*EXTINCTION_PARAMETERS, HARMONICS)]
     keys += [key for key in params.keys() if key.endswith("sigma_t.value.value")]  # noqa: SIM118
     for key in keys:
         dr.enable_grad(params[key])

@@ -53,8 +53,8 @@ from mivol.optim.photographs.radiance_problem import RadianceProblem
 from mivol.optim.photographs.ray_batches import TILE, RayBatches
 from mivol.photos import Camera, Photo, pixel_centres, rays
 from mivol.photos.camera import intrinsics
-from mivol.transport.line_integrals.radiance_field import RayGradient, backward, cells_of, model_of, render
-from mivol.transport.line_integrals.radiance_source import bake, exact
+from mivol.transport.line_integrals.radiance_field import RayGradient, find_occupied_cells, make_model, render_rays, vjp_rays
+from mivol.transport.line_integrals.radiance_source import bake, make_exact
 from mivol.transport.traversal.grid_blocks import REACH
 from mivol.transport.traversal.lattice import clip
 from mivol.transport.traversal.occupied_walk import march
@@ -150,7 +150,7 @@ def test_a_short_fit_makes_matter_opaque() -> None:
 
 def visited(field: SphericalGrid, o, d) -> np.ndarray:
     """How many cells each ray visits."""
-    rays, cells = rays_of(o, d), cells_of(field)
+    rays, cells = rays_of(o, d), find_occupied_cells(field)
     segment = clip(cells, rays.o, rays.d, 0, rays.t_max)
     count, _, _ = march(cells, segment, lambda n, here, on: n + mi.UInt32(on), mi.UInt32(0))
     return np.array(count)
@@ -184,7 +184,7 @@ def test_an_empty_box_is_left_in_leaps(density: float, reads: int, monkeypatch: 
     Defect 2.
     """
     field = even(density, res=(1, 1, 60))
-    ray, cells = rays_of([-3, 0.1, 0.2], [1, 0, 0]), cells_of(field)
+    ray, cells = rays_of([-3, 0.1, 0.2], [1, 0, 0]), find_occupied_cells(field)
     segment = clip(cells, ray.o, ray.d, 0, ray.t_max)
     gather, count = dr.gather, []
 
@@ -209,16 +209,16 @@ def test_a_ray_that_ends_inside_a_cell() -> None:
     field, ray = even(sigma, 1.0, TO_WORLD), rays_of(o, d)
     ends = np.float32(entry + whole * np.random.default_rng(2).uniform(-0.3, 1.3, 60))
     ray.t_max = mi.Float(ends)
-    cells = cells_of(field)
-    source, model = exact(field, ray.d, slope=True), model_of(field)
-    seen = render(cells, source, model, ray)
+    cells = find_occupied_cells(field)
+    source, model = make_exact(field, ray.d, slope=True), make_model(field)
+    seen = render_rays(cells, source, model, ray)
     L = np.clip(ends - entry, 0, whole)
     # t_max is near 5 length units, of which float32 keeps 2.4e-7, and so do the faces of the box; times sigma.
     tolerance = 3 * 5 * 2.4e-7
     np.testing.assert_allclose(np.array(seen.T), np.exp(-sigma * L), atol=tolerance)
     sent = np.outer(-np.expm1(-sigma * L), np.full(3, 0.5 + Y0))
     np.testing.assert_allclose(np.array(seen.colour).T, sent, atol=tolerance)
-    backward(cells, source, model, seen, RayGradient(mi.Color3f(0), 1.0))
+    vjp_rays(cells, source, model, seen, RayGradient(mi.Color3f(0), 1.0))
     assert np.array(source.slopes()[0], np.float64).sum() == pytest.approx(-np.sum(L * np.exp(-sigma * L)), rel=1e-5)
     share = L / whole
     assert all(kind.any() for kind in (share == 0, share == 1, (share > 0) & (share < 1)))
@@ -389,10 +389,10 @@ def test_memory_goes_with_what_is_there() -> None:
     nodes = np.flatnonzero(keep)
     stored = np.ones(len(nodes), np.float32), np.zeros((len(nodes), 9, 3), np.float32)
     field = SphericalGrid.from_rows((n, n, n), CUBE, *stored, mi.UInt32(nodes.astype(np.uint32)))
-    cells, pinholes = cells_of(field), np.array([[3.0, 0, 0]])
+    cells, pinholes = find_occupied_cells(field), np.array([[3.0, 0, 0]])
     tables = bake(field, cells, pinholes, mi.UInt32(0), slope=True)
     ray = rays_of([3, 0, 0], [-1, 0, 0])
-    slopes = exact(field, ray.d, slope=True)
+    slopes = make_exact(field, ray.d, slope=True)
     held = [field.density, field.harmonics] * 2  # the values and the optimiser's squares
     held += [slopes.table, slopes.slope, *slopes.slopes(), field.nodes]
     held += [cells.corners, cells.rows, tables.table, tables.slope]

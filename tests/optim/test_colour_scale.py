@@ -15,7 +15,7 @@ from mivol.optim.photographs.field_view import render_view
 from mivol.optim.photographs.radiance_problem import RadianceProblem
 from mivol.optim.photographs.ray_batches import RayBatches
 from mivol.photos import Photo
-from mivol.transport.line_integrals.radiance_field import model_of, render
+from mivol.transport.line_integrals.radiance_field import make_model, render_rays
 from mivol.transport.line_integrals.radiance_source import bake
 from mivol.validate.images import judge
 
@@ -92,7 +92,7 @@ def test_an_error_weighs_the_slope_of_the_tone_curve(variant_rgb: str) -> None:
     assert target.max() > 3
     loss, slopes = problem.slopes(batch)
     source = bake(problem.field, problem._cells, batch.origins, batch.slot)
-    seen = render(problem._cells, source, model_of(problem.field, problem.plan.stop), batch.rays)
+    seen = render_rays(problem._cells, source, make_model(problem.field, problem.plan.stop), batch.rays)
     shown = np.array(seen.colour + seen.T * batch.before, np.float64).T
     # The photographs have alpha and their own grey behind them, which is behind the field, too: no more is to be taken off.
     wanted = np.mean(((shown - target) / (np.maximum(shown, 0) + EPSILON)) ** 2, axis=1)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from ball_photos import CUBE
 
-from mivol.fields.spherical_grid import SphericalGrid, is_covered
+from mivol.fields.spherical_grid import SphericalGrid, is_covered_by_inner
 from mivol.optim.priors import Neighbours, Rows, Smoothness, decay_view_dependence, smooth, sparsify
 
 
@@ -109,7 +109,7 @@ def test_what_is_covered_is_no_neighbour(variant_rgb: str) -> None:
         place[3, 3] = 1
         grids.append(SphericalGrid.from_dense(np.full((n, n, n), 2.0 + 2 * level), np.zeros((n, n, n, 1, 3)), place))
     field = SphericalGrid.nested(grids)
-    covered = np.array(is_covered(dr.arange(mi.UInt32, field.places), field.res))
+    covered = np.array(is_covered_by_inner(dr.arange(mi.UInt32, field.places), field.res))
     field = field.sparse(~covered)
     moved = mi.Float(field.density)
     smoothed(moved, field, 0.05)

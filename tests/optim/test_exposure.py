@@ -25,7 +25,7 @@ from mivol.optim.photographs.radiance_plan import PRESETS, FitPlan, Stage
 from mivol.optim.photographs.radiance_problem import RadianceProblem
 from mivol.optim.photographs.ray_batches import RayBatches
 from mivol.photos import Photo
-from mivol.transport.line_integrals.radiance_field import model_of, render
+from mivol.transport.line_integrals.radiance_field import make_model, render_rays
 from mivol.transport.line_integrals.radiance_source import bake
 
 MIDDLE = np.array([[-0.9] * 3, [0.9] * 3])
@@ -68,7 +68,7 @@ def test_derivatives_of_gains_are_those_of_the_squared_error(variant_rgb: str) -
     batch = problem.batches.draw(1, np.array([0, 2, 3]), 5, np.random.default_rng(2))
     loss, slopes = problem.slopes(batch)
     source = bake(problem.field, problem._cells, batch.origins, batch.slot)
-    seen = render(problem._cells, source, model_of(problem.field, problem.plan.stop), batch.rays)
+    seen = render_rays(problem._cells, source, make_model(problem.field, problem.plan.stop), batch.rays)
     shown = np.array(seen.colour + seen.T * problem.sky.seen(batch.rays.d), np.float64).T
     view, target = np.array(batch.view), np.array(batch.target, np.float64).T
     assert set(view) == {0, 2, 3}

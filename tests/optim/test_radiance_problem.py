@@ -21,7 +21,7 @@ from mivol.optim.photographs.radiance_plan import Stage, bytes_of
 from mivol.optim.photographs.radiance_problem import RadianceProblem
 from mivol.optim.photographs.ray_batches import TILE, RayBatches
 from mivol.photos import Lens, Photo
-from mivol.transport.line_integrals.radiance_field import cells_of, model_of, render
+from mivol.transport.line_integrals.radiance_field import find_occupied_cells, make_model, render_rays
 from mivol.transport.line_integrals.radiance_source import bake
 
 
@@ -270,8 +270,8 @@ def test_opacities_are_asked_to_be_none_or_all(variant_rgb: str, photos: list[Ph
 
     def prior(density: np.ndarray) -> float:
         field = problem.field.with_values(mi.Float(np.float32(density)), problem.field.harmonics)
-        cells = cells_of(field)
-        seen = render(cells, bake(field, cells, batch.origins, batch.slot), model_of(field, PLAN.stop), batch.rays)
+        cells = find_occupied_cells(field)
+        seen = render_rays(cells, bake(field, cells, batch.origins, batch.slot), make_model(field, PLAN.stop), batch.rays)
         T = np.array(seen.T, np.float64)
         near = np.clip(T, 0.01, 0.99)  # beyond, the prior goes on as its tangent
         return float(np.mean(np.log(near) + np.log(1 - near) + (1 / near - 1 / (1 - near)) * (T - near)))

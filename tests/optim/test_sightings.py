@@ -13,8 +13,8 @@ from mivol.optim.photographs.depth_supervision import EACH, OFF, WRONG, Sighting
 from mivol.optim.photographs.radiance_problem import RadianceProblem
 from mivol.optim.photographs.ray_batches import RayBatches
 from mivol.photos import Photo
-from mivol.transport.line_integrals.radiance_field import cells_of, model_of, render
-from mivol.transport.line_integrals.radiance_source import exact
+from mivol.transport.line_integrals.radiance_field import find_occupied_cells, make_model, render_rays
+from mivol.transport.line_integrals.radiance_source import make_exact
 
 VOXEL = 0.1
 
@@ -102,8 +102,8 @@ def test_rays_of_a_fit_end_nearer_to_the_points_that_it_was_told(variant_rgb: st
         problem = fitted(RayBatches.of(few, (2,)), plan).problem
         points, origins = problem.batches.points, problem.batches.origins
         drawn = draw_sightings(points, origins, BOX, 1, 2 / 12, np.random.default_rng(0))
-        cells = cells_of(problem.field)
-        T = np.array(render(cells, exact(problem.field, drawn.rays.d), model_of(problem.field), drawn.rays).T)
+        cells = find_occupied_cells(problem.field)
+        T = np.array(render_rays(cells, make_exact(problem.field, drawn.rays.d), make_model(problem.field), drawn.rays).T)
         ended.append(np.mean(T[: drawn.count] - T[drawn.count :]))
     assert ended[1] > ended[0]
 

@@ -37,7 +37,7 @@ from mivol.bench.harness.timing import Contestant, Timing, race, ratio_of
 from mivol.bench.studies.gaussian_choices import exposure_gain, mip_gain
 from mivol.bench.studies.gaussian_fits import Fitted, fit_and_judge
 from mivol.bench.studies.optical_depth.work import Work, camera_rays
-from mivol.fields.gaussian_field import HARMONICS, NAMES
+from mivol.fields.gaussian_field import EXTINCTION_PARAMETERS, HARMONICS
 from mivol.photos.camera import Camera, intrinsics
 from mivol.points import Gaussians, read_gaussians
 from mivol.splatting import Splatter, tensors_of
@@ -251,7 +251,7 @@ def measure_rays(size: Size) -> dict:
 
 def traced_scene(cloud: Gaussians, camera: Camera, as_extinction: bool = False, **more: dict) -> mi.Scene:
     """The cloud as a medium that holds all of it: with its colours as they are, or as an extinction."""
-    names = NAMES if as_extinction else (*NAMES, HARMONICS)
+    names = EXTINCTION_PARAMETERS if as_extinction else (*EXTINCTION_PARAMETERS, HARMONICS)
     rays = {"type": "mivol_gaussians", "space": "linear", **{name: mi.TensorXf(getattr(cloud, name)) for name in names}}
     medium = {"type": "mivol_medium", "sigma_t" if as_extinction else "emission": rays}
     place = mi.ScalarTransform4f().scale(2 * float(np.abs(cloud.means).max() + 4 * np.exp(cloud.log_scales.max())))

@@ -11,7 +11,7 @@ import numpy as np
 from mivol.fields.sky import Sky
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.photos import Camera, pixel_centres, rays
-from mivol.transport.line_integrals.radiance_field import RayBundle, cells_of, model_of, render
+from mivol.transport.line_integrals.radiance_field import RayBundle, find_occupied_cells, make_model, render_rays
 from mivol.transport.line_integrals.radiance_source import bake
 
 
@@ -42,7 +42,7 @@ def render_view(field: SphericalGrid, camera: Camera, background: np.ndarray | S
 
     Bias: O(h^4) in a cell, and that of :func:`mivol.transport.line_integrals.radiance_source.bake`.
     """
-    cells, model = cells_of(field), model_of(field, stop)
+    cells, model = find_occupied_cells(field), make_model(field, stop)
     source = bake(field, cells, camera.origin[None], mi.UInt32(0))
     width, height = camera.size
     order = _by_tiles(width, height)
@@ -52,7 +52,7 @@ def render_view(field: SphericalGrid, camera: Camera, background: np.ndarray | S
         o, d = rays(camera, pixels[start : start + PASS])
         o = np.broadcast_to(o, d.shape)
         sent = RayBundle(*(kind(np.ascontiguousarray(np.float32(a.T))) for kind, a in ((mi.Point3f, o), (mi.Vector3f, d))))
-        seen = render(cells, source, model, sent)
+        seen = render_rays(cells, source, model, sent)
         behind = background.seen(sent.d) if isinstance(background, Sky) else mi.Color3f(*map(float, background))
         colour = seen.colour + seen.T * behind
         dr.eval(colour, seen.T, seen.distance)

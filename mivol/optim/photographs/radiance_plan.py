@@ -88,7 +88,7 @@ class FitPlan:
         sky_rate: first learning rate of the sky [radiance]; it must lead, or the field fills the box with what is behind.
         sky_smooth: share of the way that a texel goes to its neighbours in a step, so that none stays as it began.
         exposure: a gain for each channel of each photograph (:mod:`mivol.optim.photographs.exposure`), where they disagree.
-        levels: nested boxes, each of twice the extent (:mod:`mivol.fields.spherical`).
+        levels: nested boxes, each of twice the extent (:mod:`mivol.fields.spherical_grid`).
         fewer_levels: only as many of them as the points of a reconstruction need, where these are known.
         near: derivatives of what is nearer to a camera than so many medians of the cameras' distances from the box's middle go
             down with the square of the distance (Philip & Deschaintre 2023); 0: none do.

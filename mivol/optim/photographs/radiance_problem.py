@@ -25,11 +25,11 @@ import numpy as np
 from scipy.ndimage import maximum_filter
 
 from mivol.errors import MivolError
-from mivol.fields.activation import activation_of
+from mivol.fields.activation import select_activation
 from mivol.fields.harmonics import basis_size, row_width
 from mivol.fields.resampling import resample_field
 from mivol.fields.sky import TEXEL, Sky
-from mivol.fields.spherical_grid import SphericalGrid, is_covered
+from mivol.fields.spherical_grid import SphericalGrid, is_covered_by_inner
 from mivol.optim.loop import Fit, begin_fit
 from mivol.optim.photographs.colour_scale import SCALES
 from mivol.optim.photographs.depth_supervision import Sightings, by_transmittance, draw_sightings
@@ -41,13 +41,13 @@ from mivol.optim.problem import Reals, Refinement
 from mivol.transport.line_integrals.radiance_field import (
     Model,
     RayGradient,
-    backward,
-    brightest_weights,
-    cells_of,
-    model_of,
-    render,
+    find_occupied_cells,
+    make_model,
+    raise_to_max_weights,
+    render_rays,
+    vjp_rays,
 )
-from mivol.transport.line_integrals.radiance_source import Baked, bake, fold
+from mivol.transport.line_integrals.radiance_source import Baked, bake, vjp_bake
 from mivol.transport.traversal.occupied_cells import Cells
 
 
@@ -177,8 +177,8 @@ class RadianceProblem:
             sightings: points of the same views; the plan's weight times their energy is in the derivatives only.
         """
         source = bake(self.field, self._cells, batch.origins, batch.slot, slope=True)
-        model, count = model_of(self.field, self.plan.stop), dr.width(batch.slot)
-        seen = render(self._cells, source, model, batch.rays)
+        model, count = make_model(self.field, self.plan.stop), dr.width(batch.slot)
+        seen = render_rays(self._cells, source, model, batch.rays)
         before = batch.before
         behind = before if background is None else mi.Color3f(*(dr.opaque(mi.Float, float(c)) for c in background))
         behind = behind if self.sky is None else self.sky.seen(batch.rays.d)
@@ -197,11 +197,11 @@ class RadianceProblem:
             through += self.plan.beta / count * batch.counted * (dr.rcp(T) - dr.rcp(1 - T))
         loss = dr.squared_norm(error) * (1 / 3)
         dr.eval(seen, by, through, loss)
-        backward(self._cells, source, model, seen, RayGradient(by, through), near=self.near)
+        vjp_rays(self._cells, source, model, seen, RayGradient(by, through), near=self.near)
         if sightings is not None:
             self._add_sightings(source, model, sightings)
         dr.eval(source.slope)
-        density, harmonics = fold(self.field, self._cells, source, batch.origins)
+        density, harmonics = vjp_bake(self.field, self._cells, source, batch.origins)
         slopes = {"density": self._stored(density), "harmonics": self._stored(harmonics)}
         if self.sky is not None:
             slopes["sky"] = self.sky.slopes(batch.rays.d, by * seen.T)
@@ -214,10 +214,10 @@ class RadianceProblem:
         """Add the derivatives of the energy of points to those of the field."""
         # Densities are the same in the table of any pinhole.
         source = dataclasses.replace(source, first=mi.UInt32(0))
-        seen = render(self._cells, source, model, sightings.rays)
+        seen = render_rays(self._cells, source, model, sightings.rays)
         by = RayGradient(mi.Color3f(0), self.plan.depth * by_transmittance(seen.T, sightings.count))
         dr.eval(seen, by)
-        backward(self._cells, source, model, seen, by, near=self.near)
+        vjp_rays(self._cells, source, model, seen, by, near=self.near)
 
     def _stored(self, slope: mi.Float) -> mi.Float:
         """Derivatives of the nodes that are stored: the last row of a sparse field is the vacuum around, and stays."""
@@ -315,7 +315,7 @@ class RadianceProblem:
     def update_occupancy(self) -> None:
         """List the cells that hold anything: the others have neither light nor derivatives."""
         self._cells = None  # as large as what is made, and of no more use
-        self._cells = cells_of(self.field)
+        self._cells = find_occupied_cells(self.field)
 
     def _look_around(self) -> None:
         self._neighbours = Neighbours.of(self.field)
@@ -323,12 +323,12 @@ class RadianceProblem:
 
     def seen_nodes(self) -> np.ndarray:
         """Nodes (levels, Z, Y, X) of cells to which some ray of the training views gives the plan's weight."""
-        cells, model = cells_of(self.field), model_of(self.field, self.plan.stop)
+        cells, model = find_occupied_cells(self.field), make_model(self.field, self.plan.stop)
         weight = dr.zeros(mi.Float, max(cells.count, 1))
         shrink = max(self.batches.levels)
         for view, origin in enumerate(self.batches.origins):
             source = bake(self.field, cells, origin[None], mi.UInt32(0))
-            brightest_weights(cells, source, model, self.batches.whole(shrink, view).rays, weight)
+            raise_to_max_weights(cells, source, model, self.batches.whole(shrink, view).rays, weight)
             dr.eval(weight)
             self.safe_point()
         return _nodes_of(self.field, cells, weight >= self.plan.keep_weight)
@@ -370,11 +370,11 @@ def _fog(
     """A thin grey fog that fills the boxes of all levels."""
     nodes, width = None, row_width(basis_size(degree))
     if levels > 1:
-        nodes = dr.compress(~is_covered(dr.arange(mi.UInt32, levels * math.prod(res)), res))
+        nodes = dr.compress(~is_covered_by_inner(dr.arange(mi.UInt32, levels * math.prod(res)), res))
     rows = math.prod(res) if nodes is None else dr.width(nodes)
     fog = dr.full(mi.Float, density, rows if nodes is None else rows + 1)
     if nodes is not None:
-        dr.scatter(fog, mi.Float(activation_of("relu").vacuum), mi.UInt32(rows))
+        dr.scatter(fog, mi.Float(select_activation("relu").vacuum), mi.UInt32(rows))
     dr.eval(fog)
     colours = dr.zeros(mi.Float, dr.width(fog) * width)
     return SphericalGrid(res, to_world, degree, fog, colours, nodes, levels=levels, space=space)

@@ -80,8 +80,8 @@ def integrate_aovs(media: SceneMedia, ray: Ray, names: tuple[str, ...], active: 
         return []
     first = _find_first_segment(media, ray, active)
     rows = {"tau": first.tau, "alpha": first.alpha}
-    values = {"depth": _depth(media, first, active)[0]} if "depth" in names else {}
-    return [values[n] if n in values else _weigh(_channel_weights(n, media.channels), rows[_row(n)]) for n in names]
+    values = {"depth": _integrate_depth(media, first, active)[0]} if "depth" in names else {}
+    return [values[n] if n in values else _weigh(_channel_weights(n, media.channels), rows[_row_name(n)]) for n in names]
 
 
 def jvp_aovs(media: SceneMedia, ray: Ray, names: tuple[str, ...], active: mi.Bool = True) -> list[mi.Float]:
@@ -98,10 +98,10 @@ def jvp_aovs(media: SceneMedia, ray: Ray, names: tuple[str, ...], active: mi.Boo
         rows["tau"] = jvp_rows(media, first.ray_segment, active)
         rows["alpha"] = [T * d for T, d in zip(first.T, rows["tau"], strict=True)]
     if "depth" in names:
-        depth, opacity = _depth(media, first, active)
+        depth, opacity = _integrate_depth(media, first, active)
         dN = jvp_expected_depth(media, first.ray_segment, first.end, depth, active)
-        values["depth"] = dN * _inverse(opacity)
-    return [values[n] if n in values else _weigh(_channel_weights(n, media.channels), rows[_row(n)]) for n in names]
+        values["depth"] = dN * _safe_inverse(opacity)
+    return [values[n] if n in values else _weigh(_channel_weights(n, media.channels), rows[_row_name(n)]) for n in names]
 
 
 def vjp_aovs(media: SceneMedia, ray: Ray, names: tuple[str, ...], daovs: list[mi.Float], active: mi.Bool = True) -> None:
@@ -117,14 +117,14 @@ def vjp_aovs(media: SceneMedia, ray: Ray, names: tuple[str, ...], daovs: list[mi
     weight = [mi.Float(0) for _ in range(media.channels)]
     for name, d in zip(names, daovs, strict=True):
         if name != "depth":
-            slopes = first.T if _row(name) == "alpha" else [1] * media.channels
+            slopes = first.T if _row_name(name) == "alpha" else [1] * media.channels
             weight = [w + d * s * T for w, s, T in zip(weight, _channel_weights(name, media.channels), slopes, strict=True)]
     if set(names) != {"depth"}:
         vjp_rows(media, first.ray_segment, weight, active)
     for name, d in zip(names, daovs, strict=True):
         if name == "depth":
-            depth, opacity = _depth(media, first, active)
-            vjp_expected_depth(media, first.ray_segment, first.end, depth, d * _inverse(opacity), active)
+            depth, opacity = _integrate_depth(media, first, active)
+            vjp_expected_depth(media, first.ray_segment, first.end, depth, d * _safe_inverse(opacity), active)
 
 
 def _find_first_segment(media: SceneMedia, ray: Ray, active: mi.Bool) -> _FirstSegment:
@@ -138,14 +138,14 @@ def _find_first_segment(media: SceneMedia, ray: Ray, active: mi.Bool) -> _FirstS
     return _FirstSegment(RaySegment(ray, medium, end.t), end, tau, T, alpha)
 
 
-def _depth(media: SceneMedia, first: _FirstSegment, active: mi.Bool) -> tuple[mi.Float, mi.Float]:
+def _integrate_depth(media: SceneMedia, first: _FirstSegment, active: mi.Bool) -> tuple[mi.Float, mi.Float]:
     """The expected depth, and the opacity that it is divided by."""
     N, opacity = integrate_expected_depth(media, first.ray_segment, first.end, mi.Bool(active))
     some = opacity > 0
     return dr.select(some, N / dr.select(some, opacity, 1), 0), opacity
 
 
-def _row(name: str) -> str:
+def _row_name(name: str) -> str:
     return name.partition(".")[0]
 
 
@@ -161,16 +161,16 @@ def _weigh(weights: list[float], rows: list[mi.Float]) -> mi.Float:
     return sum((s * row for s, row in zip(weights, rows, strict=True) if s), mi.Float(0))
 
 
-def _inverse(alpha: mi.Float) -> mi.Float:
+def _safe_inverse(alpha: mi.Float) -> mi.Float:
     """1 / alpha; 0 where nothing stops the ray, whose depth is 0 by definition. 1 / 1e-37 is still finite in float32."""
     some = alpha > 1e-37
     return dr.select(some, dr.rcp(dr.select(some, alpha, 1)), 0)
 
 
-SPREAD = math.sqrt(15) / 10
+GAUSS_OFFSET = math.sqrt(15) / 10
 """Distance of the outer Gauss points from the middle of [0, 1]; with the weights 5/18, 8/18, 5/18 exact to degree 5."""
 
-BLACK = 1000.0
+OPAQUE_DEPTH = 1000.0
 """Stands for an infinite optical depth: exp(-1000) is 0, and in float64 1000 + x - 1000 is x again, to 1e-13."""
 
 
@@ -214,7 +214,7 @@ def _integrate_in_constant(site: RayPiece, origin: mi.Float, sigma: mi.Float) ->
     endless = site.on & ~finite & (sigma > 0)
     mean = dr.rcp(dr.select(endless, sigma, 1))
     return CellIntegral(
-        dr.select(endless, BLACK, integral.tau),
+        dr.select(endless, OPAQUE_DEPTH, integral.tau),
         dr.select(endless, 0, integral.T),
         dr.select(endless, begin + mean, integral.N),
         [sum(integral.dtau, mi.Float(0))],
@@ -228,7 +228,7 @@ class _ExpectedDepthIntegrand:
 
     rows: int
     origin: mi.Float
-    points: ClassVar[tuple[float, ...]] = (0.5 - SPREAD, 0.5, 0.5 + SPREAD)
+    points: ClassVar[tuple[float, ...]] = (0.5 - GAUSS_OFFSET, 0.5, 0.5 + GAUSS_OFFSET)
     asked: ClassVar[str] = "the AOV depth was asked for"
     way_out: ClassVar[str] = "leave depth out of aovs"
 
@@ -275,7 +275,7 @@ def integrate_expected_depth(
     integrand = _ExpectedDepthIntegrand(media.channels, mi.Float(0))
     composite = composite_ray(LineIntegral(media, integrand, ray_segment, active), integrand.end(end), skip=True)
     alpha = [dr.select(end.si.is_valid(), 1, one_minus_exp(mi.Float(t))) for t in composite.tau]
-    return _mean(composite.N), _mean(alpha)
+    return _mean_rows(composite.N), _mean_rows(alpha)
 
 
 def jvp_expected_depth(
@@ -289,7 +289,7 @@ def jvp_expected_depth(
     """
     integrand = _ExpectedDepthIntegrand(media.channels, origin)
     line = LineIntegral(media, integrand, ray_segment, active)
-    return _mean(composite_ray(line, integrand.end(end), tangent=True).N[media.channels :])
+    return _mean_rows(composite_ray(line, integrand.end(end), tangent=True).N[media.channels :])
 
 
 def vjp_expected_depth(
@@ -310,5 +310,5 @@ def vjp_expected_depth(
     vjp_composite(line, composite_ray(line, integrand.end(end)), [weight / k] * k, [mi.Float(0)] * k)
 
 
-def _mean(rows: list[mi.Float]) -> mi.Float:
+def _mean_rows(rows: list[mi.Float]) -> mi.Float:
     return sum(rows[1:], rows[0]) / len(rows)

@@ -30,7 +30,7 @@ __all__ = ["BodySweep"]
 
 
 @dataclass
-class _Layout:
+class _IntervalLayout:
     """Where the interval of a medium has cells: before ``enter`` and from ``leave`` on there are only constants.
 
     ``segment`` runs from ``leave`` back to ``enter``; it and ``lattice`` are None where no grid defines cells.
@@ -56,7 +56,7 @@ class BodySweep:
     def __init__(self, line: LineIntegral, interval: MediumInterval, tangent: bool = False) -> None:
         self.media, self.integrand, self.ray = line.media, line.integrand, line.ray_segment.ray
         self.body, self.active = interval.body, interval.active
-        self.layout = _lay_out(interval, self.ray)
+        self.layout = _find_layout(interval, self.ray)
         self.extinction = self.body.extinction(self.ray)
         self.change = None
         if tangent:
@@ -194,12 +194,12 @@ class BodySweep:
         return [channels[r % len(channels)] for r in range(self.integrand.rows)]
 
 
-def _lay_out(interval: MediumInterval, ray: Ray) -> _Layout:
+def _find_layout(interval: MediumInterval, ray: Ray) -> _IntervalLayout:
     lattice = interval.body.view.walked_lattice
     start, end = mi.Float64(interval.t0), mi.Float64(interval.t1)
     if lattice is None:
-        return _Layout(start, end, end, end, None, None)
+        return _IntervalLayout(start, end, end, end, None, None)
     segment = clip(lattice, ray.o, -ray.d, -interval.t1, -interval.t0)
     hit = segment.length > 0
     leave = dr.select(hit, -segment.start, end)
-    return _Layout(start, dr.select(hit, -segment.end, end), leave, end, lattice, segment)
+    return _IntervalLayout(start, dr.select(hit, -segment.end, end), leave, end, lattice, segment)

@@ -16,15 +16,15 @@ import mitsuba as mi
 
 from mivol.transport.traversal.occupied_walk import CellVisitor
 
-__all__ = ["CellCorners", "Face", "Sums", "read_corners"]
+__all__ = ["CellCorners", "Face", "PendingGradients", "read_corners"]
 
-NEAR, OPPOSITE = (0, 2, 4, 6), (1, 3, 5, 7)
+ENTRY_CORNERS, FAR_CORNERS = (0, 2, 4, 6), (1, 3, 5, 7)
 """The corners of the face of entry, and the other four."""
 
-LEAVES = (OPPOSITE, (2, 6, 3, 7), (4, 5, 6, 7))
+EXIT_CORNERS = (FAR_CORNERS, (2, 6, 3, 7), (4, 5, 6, 7))
 """The corners of the faces through which a ray may leave: across A, B and C."""
 
-REMAINS = (NEAR, (0, 4, 1, 5), (0, 1, 2, 3))
+OTHER_CORNERS = (ENTRY_CORNERS, (0, 4, 1, 5), (0, 1, 2, 3))
 """The corners opposite of those."""
 
 Numbers = list
@@ -45,7 +45,7 @@ class Face:
 
 
 @dataclass
-class Sums:
+class PendingGradients:
     """A face, and the derivatives by its values that wait for those of the next cell.
 
     Attributes:
@@ -58,7 +58,7 @@ class Sums:
     waiting: list = field(default_factory=lambda: _zeros(4))
     some: mi.Bool = field(default_factory=lambda: mi.Bool(False))
 
-    def add(self, corners: CellCorners, here: CellVisitor, slopes: Numbers, write: Callable, on: mi.Bool) -> Sums:
+    def add(self, corners: CellCorners, here: CellVisitor, slopes: Numbers, write: Callable, on: mi.Bool) -> PendingGradients:
         """Add the derivatives of a cell, and write those of the corners that the ray leaves behind.
 
         Args:
@@ -70,13 +70,13 @@ class Sums:
         """
         through = here.entered >= 0
         slopes = list(slopes)
-        for q, waiting in zip(NEAR, self.waiting, strict=True):
+        for q, waiting in zip(ENTRY_CORNERS, self.waiting, strict=True):
             slopes[q] = [s + dr.select(through, w, 0) for s, w in zip(slopes[q], waiting, strict=True)]
         behind = corners.behind(corners.rows), corners.behind(slopes)
         _write_twice(write, *behind, self.face.rows, self.waiting, on, self.some & ~through)
-        waiting = _chosen(on, corners.ahead(slopes), self.waiting)
-        face = Face(_chosen(on, corners.ahead(corners.rows), self.face.rows), corners.ahead(corners.values))
-        return Sums(face, waiting, self.some | on)
+        waiting = _select_lanes(on, corners.ahead(slopes), self.waiting)
+        face = Face(_select_lanes(on, corners.ahead(corners.rows), self.face.rows), corners.ahead(corners.values))
+        return PendingGradients(face, waiting, self.some | on)
 
     def finish(self, write: Callable) -> None:
         """Write what still waits where rays have ended."""
@@ -102,11 +102,11 @@ class CellCorners:
 
     def ahead(self, corners: Numbers) -> Numbers:
         """What belongs to the corners of the face through which the ray leaves."""
-        return _picked(corners, LEAVES, self.across)
+        return _select_corners(corners, EXIT_CORNERS, self.across)
 
     def behind(self, corners: Numbers) -> Numbers:
         """What belongs to the other four."""
-        return _picked(corners, REMAINS, self.across)
+        return _select_corners(corners, OTHER_CORNERS, self.across)
 
     def face(self) -> Face:
         """The face through which the ray leaves."""
@@ -133,23 +133,23 @@ def read_corners(
     Cost: 4 rows read; 8 where a ray of the packet comes from elsewhere.
     """
     axis = dr.maximum(here.entered, 0)
-    place = _places(res, axis, here)
+    place = _node_numbers(res, axis, here)
 
     def read(corners: tuple[int, ...], on: mi.Bool) -> Face:
         rows = [row(place(q), on) for q in corners]
         return Face(rows, [value(r, on) for r in rows])
 
-    near = _read_where(on & (here.entered < 0), lambda on: read(NEAR, on), face)
-    far = read(OPPOSITE, on)
+    near = _read_if_new(on & (here.entered < 0), lambda on: read(ENTRY_CORNERS, on), face)
+    far = read(FAR_CORNERS, on)
     rows = [r for pair in zip(near.rows, far.rows, strict=True) for r in pair]
     values = [v for pair in zip(near.values, far.values, strict=True) for v in pair]
     across = here.leaves - axis
-    points = tuple(mi.Vector3f(*_cyclic(p, axis)) for p in here.along)
+    points = tuple(mi.Vector3f(*_cycle_axes(p, axis)) for p in here.along)
     return CellCorners(rows, values, points, dr.select(across < 0, across + 3, across))
 
 
 @dr.syntax
-def _read_where(elsewhere: mi.Bool, read: Callable[[mi.Bool], Face], face: Face) -> Face:
+def _read_if_new(elsewhere: mi.Bool, read: Callable[[mi.Bool], Face], face: Face) -> Face:
     if elsewhere:
         face = read(elsewhere)
     return face
@@ -171,13 +171,13 @@ def _write(write: Callable, rows: list[mi.UInt32], values: list[list[mi.Float]],
         write(row, numbers, on)
 
 
-def _places(res: tuple[int, int, int], axis: mi.Int32, here: CellVisitor) -> Callable[[int], mi.UInt32]:
+def _node_numbers(res: tuple[int, int, int], axis: mi.Int32, here: CellVisitor) -> Callable[[int], mi.UInt32]:
     """The flat numbers of the nodes at the corners of a cell."""
     z, y, x = res
     low, high = dr.maximum(here.cell, 0), dr.minimum(here.cell + 1, mi.Vector3i(x - 1, y - 1, z - 1))
     stride, start = mi.Vector3i(1, x, x * y), mi.Vector3i(0, 0, here.level * z)
     near, far = dr.select(here.ahead, low, high), dr.select(here.ahead, high, low)
-    ends = [_cyclic(stride * (start + p), axis) for p in (near, far)]
+    ends = [_cycle_axes(stride * (start + p), axis) for p in (near, far)]
 
     def place(q: int) -> mi.UInt32:
         return mi.UInt32(sum(ends[q >> bit & 1][bit] for bit in range(3)))
@@ -185,25 +185,25 @@ def _places(res: tuple[int, int, int], axis: mi.Int32, here: CellVisitor) -> Cal
     return place
 
 
-def _cyclic(v: mi.Vector3f | mi.Vector3i, axis: mi.Int32) -> list:
+def _cycle_axes(v: mi.Vector3f | mi.Vector3i, axis: mi.Int32) -> list:
     """The components of a vector along A, B and C."""
-    return [_one_of_three(axis, *(v[(k + a) % 3] for a in range(3))) for k in range(3)]
+    return [_select_of_three(axis, *(v[(k + a) % 3] for a in range(3))) for k in range(3)]
 
 
-def _picked(corners: Numbers, faces: tuple[tuple[int, ...], ...], across: mi.Int32) -> Numbers:
+def _select_corners(corners: Numbers, faces: tuple[tuple[int, ...], ...], across: mi.Int32) -> Numbers:
     """What belongs to the corners of one of three faces."""
-    return [_one_of_three(across, *(corners[face[k]] for face in faces)) for k in range(4)]
+    return [_select_of_three(across, *(corners[face[k]] for face in faces)) for k in range(4)]
 
 
-def _one_of_three(which: mi.Int32, *choices: Any) -> Any:
+def _select_of_three(which: mi.Int32, *choices: Any) -> Any:
     if isinstance(choices[0], list):
-        return [_one_of_three(which, *parts) for parts in zip(*choices, strict=True)]
+        return [_select_of_three(which, *parts) for parts in zip(*choices, strict=True)]
     return dr.select(which == 0, choices[0], dr.select(which == 1, choices[1], choices[2]))
 
 
-def _chosen(on: mi.Bool, a: Numbers, b: Numbers) -> Numbers:
+def _select_lanes(on: mi.Bool, a: Numbers, b: Numbers) -> Numbers:
     """Those of ``a`` where a mask holds, else those of ``b``."""
-    return [_chosen(on, x, y) if isinstance(x, list) else dr.select(on, x, y) for x, y in zip(a, b, strict=True)]
+    return [_select_lanes(on, x, y) if isinstance(x, list) else dr.select(on, x, y) for x, y in zip(a, b, strict=True)]
 
 
 def _zeros(corners: int) -> list[list[mi.Float]]:

@@ -21,7 +21,7 @@ import mitsuba as mi
 
 from mivol.numerics import largest_of, one_minus_exp
 from mivol.transport.line_integrals.body_sweep import BodySweep
-from mivol.transport.line_integrals.integrand import LineIntegral, check_media
+from mivol.transport.line_integrals.integrand import LineIntegral, check_cells_shared
 from mivol.transport.media.compositing import BodyIntegral, transmittance_of, zeros
 from mivol.transport.media.gaussian_sweep import GaussianSweep
 from mivol.transport.media.ray_intervals import MediumInterval, find_boxed_intervals, revisit_media
@@ -30,7 +30,7 @@ __all__ = ["Composite", "composite_ray", "vjp_composite"]
 
 
 @dataclass
-class _Boxed:
+class _BoxedMedium:
     """A medium in a box, as a ray crosses it.
 
     Attributes:
@@ -51,7 +51,7 @@ class _Boxed:
 
 
 @dataclass
-class _Traced:
+class _TracedSums:
     """Sums over the intervals that were found by tracing.
 
     Attributes:
@@ -80,8 +80,8 @@ class Composite:
         N: the sum, each row (then its tangent).
     """
 
-    boxes: list[_Boxed]
-    traced: _Traced
+    boxes: list[_BoxedMedium]
+    traced: _TracedSums
     tau: list[mi.Float64]
     last: list[mi.Float]
     N: list[mi.Float]
@@ -102,31 +102,31 @@ def composite_ray(line: LineIntegral, end: list[mi.Float], tangent: bool = False
     Cost: a walk of each medium.
     """
     media, integrand, ray_segment = line.media, line.integrand, line.ray_segment
-    check_media(media, integrand)
+    check_cells_shared(media, integrand)
     rows = integrand.rows * (2 if tangent else 1)
 
     boxes = []
     for interval in find_boxed_intervals(media, ray_segment.ray, ray_segment.length, line.active):
         middle = interval.middle() if len(media.bodies) > 1 else mi.Float64(0)
-        own = sweep_of(line, interval, tangent).integrate(skip)
-        boxes.append(_Boxed(interval, middle, own, zeros(mi.Float64, rows), [], zeros(mi.Float, rows)))
+        own = make_sweep(line, interval, tangent).integrate(skip)
+        boxes.append(_BoxedMedium(interval, middle, own, zeros(mi.Float64, rows), [], zeros(mi.Float, rows)))
 
-    def visit_traced(t: _Traced, interval: MediumInterval) -> _Traced:
+    def visit_traced(t: _TracedSums, interval: MediumInterval) -> _TracedSums:
         if interval.body.box is not None:
             return t
-        own, middle = sweep_of(line, interval, tangent).integrate(skip), interval.middle()
-        seen = _dim(_add(t.tau, _tau_in_front(boxes, middle, rows)), own.N, integrand.rows)
+        own, middle = make_sweep(line, interval, tangent).integrate(skip), interval.middle()
+        seen = _multiply_transmittance(_add_rows(t.tau, _tau_in_front(boxes, middle, rows)), own.N, integrand.rows)
         opaque = [one_minus_exp(mi.Float(x)) for x in own.tau[: integrand.rows]]
         means = [dr.select(a > 0, n / dr.select(a > 0, a, 1), 0) for n, a in zip(own.N, opaque, strict=False)]
-        return _Traced(
-            _add(t.tau, own.tau),
-            _add(t.N, seen),
-            [_add(f, _where(middle < b.middle, own.tau)) for f, b in zip(t.fronts, boxes, strict=True)],
-            [_add(g, _where(middle > b.middle, seen)) for g, b in zip(t.behinds, boxes, strict=True)],
+        return _TracedSums(
+            _add_rows(t.tau, own.tau),
+            _add_rows(t.N, seen),
+            [_add_rows(f, _mask_rows(middle < b.middle, own.tau)) for f, b in zip(t.fronts, boxes, strict=True)],
+            [_add_rows(g, _mask_rows(middle > b.middle, seen)) for g, b in zip(t.behinds, boxes, strict=True)],
             dr.maximum(t.reach, largest_of(means)),
         )
 
-    traced = _Traced(
+    traced = _TracedSums(
         zeros(mi.Float64, rows),
         zeros(mi.Float, rows),
         [zeros(mi.Float64, rows) for _ in boxes],
@@ -135,29 +135,31 @@ def composite_ray(line: LineIntegral, end: list[mi.Float], tangent: bool = False
     )
     if media.traced:
         traced = revisit_media(media, ray_segment, visit_traced, traced, line.active)
-    return _order(boxes, traced, end, integrand.rows, rows)
+    return _composite_media(boxes, traced, end, integrand.rows, rows)
 
 
-def sweep_of(line: LineIntegral, interval: MediumInterval, tangent: bool = False) -> BodySweep | GaussianSweep:
+def make_sweep(line: LineIntegral, interval: MediumInterval, tangent: bool = False) -> BodySweep | GaussianSweep:
     """The sweep over one medium."""
     if interval.body.view.gaussians is None:
         return BodySweep(line, interval, tangent)
     return GaussianSweep(interval, line.integrand.rows, tangent)
 
 
-def _order(boxes: list[_Boxed], traced: _Traced, end: list[mi.Float], channels: int, rows: int) -> Composite:
+def _composite_media(
+    boxes: list[_BoxedMedium], traced: _TracedSums, end: list[mi.Float], channels: int, rows: int
+) -> Composite:
     """Find what is in front of and behind each medium in a box, and N of the whole ray."""
     for box, front in zip(boxes, traced.fronts, strict=True):
-        box.front = _add(front, _tau_in_front(boxes, box.middle, rows))
-        box.seen = _dim(box.front, box.own.N, channels)
+        box.front = _add_rows(front, _tau_in_front(boxes, box.middle, rows))
+        box.seen = _multiply_transmittance(box.front, box.own.N, channels)
     total = traced.tau
     for box in boxes:
-        total = _add(total, box.own.tau)
-    last = _dim(total, end + zeros(mi.Float, rows - channels), channels)
-    N = _add(traced.N, last)
+        total = _add_rows(total, box.own.tau)
+    last = _multiply_transmittance(total, end + zeros(mi.Float, rows - channels), channels)
+    N = _add_rows(traced.N, last)
     for box, behind in zip(boxes, traced.behinds, strict=True):
-        N = _add(N, box.seen)
-        box.behind = _add(behind, _add(last, _seen_behind(boxes, box.middle, rows)))
+        N = _add_rows(N, box.seen)
+        box.behind = _add_rows(behind, _add_rows(last, _visible_behind(boxes, box.middle, rows)))
     return Composite(boxes, traced, total, last, N)
 
 
@@ -178,24 +180,24 @@ def vjp_composite(line: LineIntegral, composite: Composite, weight: list[mi.Floa
     """
     media, integrand, ray_segment = line.media, line.integrand, line.ray_segment
     for box in composite.boxes:
-        ahead = _add(box.front, box.own.tau)
+        ahead = _add_rows(box.front, box.own.tau)
         behind = [dr.fma(w, b, r) for w, b, r in zip(weight, box.behind, rest, strict=True)]
-        sweep_of(line, box.interval).vjp(weight, ahead, behind)
+        make_sweep(line, box.interval).vjp(weight, ahead, behind)
 
     def visit(passed: BodyIntegral, interval: MediumInterval) -> BodyIntegral:
         if interval.body.box is not None:
             return passed
-        sweep, middle = sweep_of(line, interval), interval.middle()
+        sweep, middle = make_sweep(line, interval), interval.middle()
         own = sweep.integrate(False)
-        front = _add(passed.tau, _tau_in_front(composite.boxes, middle, integrand.rows))
-        ahead, N = _add(front, own.tau), _add(passed.N, _dim(front, own.N, integrand.rows))
+        front = _add_rows(passed.tau, _tau_in_front(composite.boxes, middle, integrand.rows))
+        ahead, N = _add_rows(front, own.tau), _add_rows(passed.N, _multiply_transmittance(front, own.N, integrand.rows))
         P = [transmittance_of(a) for a in ahead]
         near, far = integrand.least(interval.t1), composite.traced.reach
         left = [dr.clip(n - m, p * near, p * far) for n, m, p in zip(composite.traced.N, N, P, strict=True)]
-        seen = _add(left, _add(composite.last, _seen_behind(composite.boxes, middle, integrand.rows)))
+        seen = _add_rows(left, _add_rows(composite.last, _visible_behind(composite.boxes, middle, integrand.rows)))
         behind = [dr.fma(w, b, r) for w, b, r in zip(weight, seen, rest, strict=True)]
         sweep.vjp(weight, ahead, behind)
-        return BodyIntegral(_add(passed.tau, own.tau), N)
+        return BodyIntegral(_add_rows(passed.tau, own.tau), N)
 
     if media.traced:
         nothing = BodyIntegral(zeros(mi.Float64, integrand.rows), zeros(mi.Float, integrand.rows))
@@ -205,23 +207,23 @@ def vjp_composite(line: LineIntegral, composite: Composite, weight: list[mi.Floa
 # -- Rows of media in the order of the ray -----------------------------------------------------------------------------
 
 
-def _tau_in_front(boxes: list[_Boxed], middle: mi.Float64, rows: int) -> list[mi.Float64]:
+def _tau_in_front(boxes: list[_BoxedMedium], middle: mi.Float64, rows: int) -> list[mi.Float64]:
     """Optical depth of the media in boxes in front of a distance."""
     total = zeros(mi.Float64, rows)
     for box in boxes:
-        total = _add(total, _where(box.middle < middle, box.own.tau))
+        total = _add_rows(total, _mask_rows(box.middle < middle, box.own.tau))
     return total
 
 
-def _seen_behind(boxes: list[_Boxed], middle: mi.Float64, rows: int) -> list[mi.Float]:
+def _visible_behind(boxes: list[_BoxedMedium], middle: mi.Float64, rows: int) -> list[mi.Float]:
     """N, as the camera sees it, of the media in boxes behind a distance."""
     total = zeros(mi.Float, rows)
     for box in boxes:
-        total = _add(total, _where(box.middle > middle, box.seen))
+        total = _add_rows(total, _mask_rows(box.middle > middle, box.seen))
     return total
 
 
-def _dim(front: list[mi.Float64], N: list[mi.Float], channels: int) -> list[mi.Float]:
+def _multiply_transmittance(front: list[mi.Float64], N: list[mi.Float], channels: int) -> list[mi.Float]:
     """Rows of N, and of its tangent, as seen through rows of optical depth."""
     P = [transmittance_of(f) for f in front[:channels]]
     seen = [p * n for p, n in zip(P, N, strict=False)]
@@ -229,9 +231,9 @@ def _dim(front: list[mi.Float64], N: list[mi.Float], channels: int) -> list[mi.F
     return seen + [p * (dn - mi.Float(df) * n) for p, n, dn, df in changes]
 
 
-def _add(a: list, b: list) -> list:
+def _add_rows(a: list, b: list) -> list:
     return [x + y for x, y in zip(a, b, strict=True)]
 
 
-def _where(mask: mi.Bool, rows: list) -> list:
+def _mask_rows(mask: mi.Bool, rows: list) -> list:
     return [dr.select(mask, row, 0) for row in rows]

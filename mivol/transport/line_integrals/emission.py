@@ -39,7 +39,7 @@ from mivol.transport.traversal.random_numbers import Strata
 __all__ = ["integrate_emission", "vjp_emission", "Emission"]
 
 
-BLACK = 1000.0
+OPAQUE_DEPTH = 1000.0
 """Stands for an infinite optical depth: exp(-1000) is 0."""
 
 
@@ -123,7 +123,7 @@ class _EmissionIntegrand:
         integrals = self.cell(near, [[s, s] for s in sigma])
         source, emission_density = self._detached(near)
         return [
-            _endless(
+            _extend_to_infinity(
                 integral,
                 site.on & ~finite & (s > 0),
                 s,
@@ -182,14 +182,14 @@ class _EmissionIntegrand:
         if view.emission is not None:
             source = [dr.detach(self._source(site, t) * self._absorbed_fraction(site, t)) for t in places]
         if view.emission_density is not None:
-            emission_density = [dr.detach(_evaluate(view.emission_density, site, t)) for t in places]
+            emission_density = [dr.detach(_eval_field(view.emission_density, site, t)) for t in places]
         return source, emission_density
 
     def _source(self, site: RayPiece, t: mi.Float) -> mi.Spectrum:
         """The source function (1 - albedo) Le, with its derivative, where the medium has an albedo; else Le."""
         view = site.body.view
-        Le = _evaluate(view.emission, site, t)
-        return Le if view.albedo is None else (1 - _albedo(site, t)) * Le
+        Le = _eval_field(view.emission, site, t)
+        return Le if view.albedo is None else (1 - _eval_albedo(site, t)) * Le
 
     def _absorbed_fraction(self, site: RayPiece, t: mi.Float) -> mi.Spectrum:
         """sigma_a / sigma_t where the medium has both coefficients (1 in a vacuum); else 1."""
@@ -202,7 +202,7 @@ class _EmissionIntegrand:
         return dr.detach(dr.select(sigma_t > 0, sigma_a / dr.select(sigma_t > 0, sigma_t, 1), 1))
 
     def _absorbed(self, site: RayPiece, t: mi.Float) -> tuple[mi.Spectrum, mi.Spectrum]:
-        return dr.detach(_evaluate(site.body.view.emission, site, t)), self._absorbed_fraction(site, t)
+        return dr.detach(_eval_field(site.body.view.emission, site, t)), self._absorbed_fraction(site, t)
 
     def _weights(self, site: RayPiece, sigma: list[list[mi.Float]]) -> tuple[list, list, list]:
         """Weights at each point: of the source function, of the emission density, of source function times extinction."""
@@ -210,10 +210,10 @@ class _EmissionIntegrand:
         dt = dr.select(finite, site.dt, 0)
         rows = sigma[: self.channels]
         shares = [share_opacity(dt, *row) for row in rows]
-        by_source = _by_point([s.weights for s in shares])
-        per_sigma = _by_point([s.per_sigma for s in shares])
+        by_source = _group_by_point([s.weights for s in shares])
+        per_sigma = _group_by_point([s.per_sigma for s in shares])
         by_density = (
-            _by_point([weigh_emission_density(dt, *row).weights for row in rows])
+            _group_by_point([weigh_emission_density(dt, *row).weights for row in rows])
             if site.body.view.emission_density is not None
             else []
         )
@@ -233,18 +233,18 @@ class _EmissionIntegrand:
             )
         if site.body.view.emission_density is not None:
             total += sum(
-                (w * _evaluate(site.body.view.emission_density, site, t) for w, t in zip(by_density, places, strict=True))
+                (w * _eval_field(site.body.view.emission_density, site, t) for w, t in zip(by_density, places, strict=True))
             )
         return total
 
 
-def _endless(
+def _extend_to_infinity(
     integral: CellIntegral, endless: mi.Bool, sigma: mi.Float, source: mi.Float, emission_density: mi.Float
 ) -> CellIntegral:
     """The integral over constants; where they have no end, the ray is opaque and has the radiance source + density / sigma."""
     mean = dr.rcp(dr.select(endless, sigma, 1))
     return CellIntegral(
-        dr.select(endless, BLACK, integral.tau),
+        dr.select(endless, OPAQUE_DEPTH, integral.tau),
         dr.select(endless, 0, integral.T),
         dr.select(endless, source + emission_density * mean, integral.N),
         [sum(integral.dtau, mi.Float(0))],
@@ -252,13 +252,13 @@ def _endless(
     )
 
 
-def _albedo(site: RayPiece, t: mi.Float) -> mi.Spectrum:
+def _eval_albedo(site: RayPiece, t: mi.Float) -> mi.Spectrum:
     """The albedo at a point of a ray, with its derivative. A stock grid repeats its border outside its box."""
     albedo = site.body.view.albedo
     return albedo.eval(medium_interaction(site.ray, t), site.on) if isinstance(albedo, mi.Volume) else mi.Spectrum(albedo)
 
 
-def _evaluate(field: mi.Volume | mi.Float | mi.Color3f, site: RayPiece, t: mi.Float) -> mi.Spectrum:
+def _eval_field(field: mi.Volume | mi.Float | mi.Color3f, site: RayPiece, t: mi.Float) -> mi.Spectrum:
     """A volume or a constant at a point of a ray, with its derivative; 0 outside the box of a grid."""
     if not isinstance(field, mi.Volume):
         return mi.Spectrum(field)
@@ -267,7 +267,7 @@ def _evaluate(field: mi.Volume | mi.Float | mi.Color3f, site: RayPiece, t: mi.Fl
     return dr.select(on, field.eval(there, on), 0)
 
 
-def _by_point(pairs: list[tuple[mi.Float, mi.Float]]) -> list[mi.Spectrum]:
+def _group_by_point(pairs: list[tuple[mi.Float, mi.Float]]) -> list[mi.Spectrum]:
     """A spectrum for each of the two points, from the (first, second) pair of each channel."""
     return [spectrum([pair[q] for pair in pairs]) for q in range(2)]
 

@@ -25,7 +25,7 @@ from mivol.transport.media.ray_intervals import RaySegment
 from mivol.transport.media.scene_media import SceneMedia
 from mivol.transport.traversal.rays import Ray
 
-__all__ = ["Integrand", "LineIntegral", "RayPiece", "check_media"]
+__all__ = ["Integrand", "LineIntegral", "RayPiece", "check_cells_shared"]
 
 
 @dataclass
@@ -95,7 +95,7 @@ class LineIntegral:
     active: mi.Bool
 
 
-def check_media(media: SceneMedia, integrand: Integrand) -> None:
+def check_cells_shared(media: SceneMedia, integrand: Integrand) -> None:
     """Refuse media that cannot be swept cell by cell.
 
     Raises:

@@ -47,15 +47,15 @@ __all__ = [
     "RayBundle",
     "RayGradient",
     "RenderedRays",
-    "backward",
-    "brightest_weights",
-    "cells_of",
-    "model_of",
-    "render",
+    "vjp_rays",
+    "raise_to_max_weights",
+    "find_occupied_cells",
+    "make_model",
+    "render_rays",
 ]
 
 
-DEEPEST = 104.0
+MAX_DEPTH = 104.0
 """Optical depth beyond which exp(-tau) is 0 in float32."""
 
 
@@ -85,10 +85,10 @@ class Model:
     @property
     def depth(self) -> float:
         """The optical depth at which a ray ends."""
-        return min(DEEPEST, -math.log(self.stop)) if self.stop > 0 else DEEPEST
+        return min(MAX_DEPTH, -math.log(self.stop)) if self.stop > 0 else MAX_DEPTH
 
 
-def cells_of(field: SphericalGrid) -> Cells:
+def find_occupied_cells(field: SphericalGrid) -> Cells:
     """The cells of a field that have light or a derivative; skipping the others changes nothing.
 
     A cell whose corners are not stored is vacuum.
@@ -98,26 +98,26 @@ def cells_of(field: SphericalGrid) -> Cells:
 
     def occupied(corners: list[mi.UInt32]) -> mi.Bool:
         if below is None:
-            return mi.Bool(True) if field.nodes is None else _any([c != vacuum for c in corners])
-        return _any([dr.gather(mi.Float, field.density, c) > below for c in corners])
+            return mi.Bool(True) if field.nodes is None else _any_of([c != vacuum for c in corners])
+        return _any_of([dr.gather(mi.Float, field.density, c) > below for c in corners])
 
     return Cells.find(field.res, field.to_world, field.row_of, occupied, field.rows, field.levels, field.nodes)
 
 
-def _any(masks: list[mi.Bool]) -> mi.Bool:
+def _any_of(masks: list[mi.Bool]) -> mi.Bool:
     some = mi.Bool(False)
     for m in masks:
         some |= m
     return some
 
 
-def model_of(field: SphericalGrid, stop: float = 0.0) -> Model:
+def make_model(field: SphericalGrid, stop: float = 0.0) -> Model:
     """The model of a field: its activation and clamp."""
     return Model(field.act, field.clamp, stop)
 
 
 @dataclass
-class Place:
+class RayPosition:
     """A place on a ray.
 
     Attributes:
@@ -151,8 +151,8 @@ class RenderedRays:
     distance: mi.Float
     tau: mi.Float
     before: mi.Float
-    first: Place
-    last: Place
+    first: RayPosition
+    last: RayPosition
     cell: mi.Vector3i
     rays: RayBundle
     order: RayOrder | None = None
@@ -168,7 +168,7 @@ class RayGradient:
 
 
 @dataclass
-class _Points:
+class _PointValues:
     """Extinction and colour at the two points of a cell.
 
     Attributes:
@@ -182,20 +182,20 @@ class _Points:
     shown: tuple[list[mi.Bool], list[mi.Bool]]
 
 
-def _points(at: CellValues, points: tuple[mi.Vector3f, mi.Vector3f], model: Model, on: mi.Bool) -> _Points:
+def _eval_points(at: CellValues, points: tuple[mi.Vector3f, mi.Vector3f], model: Model, on: mi.Bool) -> _PointValues:
     """At two points of a cell, from what a source gives of it."""
     sigma, slope = zip(*(model.activation.value_and_slope(interpolate(at.raw, p)) for p in points), strict=True)
     needed = on & ((sigma[0] > 0) | (sigma[1] > 0))
     channels = at.colours(needed)
     colour = tuple([dr.select(needed, interpolate(c, p), 0) for c in channels] for p in points)
     if not model.clamp:
-        return _Points(sigma, slope, colour, tuple([mi.Bool(True)] * 3 for _ in range(2)))
+        return _PointValues(sigma, slope, colour, tuple([mi.Bool(True)] * 3 for _ in range(2)))
     shown = tuple([c > 0 for c in point] for point in colour)
     colour = tuple([dr.select(s, c, 0) for c, s in zip(*point, strict=True)] for point in zip(colour, shown, strict=True))
-    return _Points(sigma, slope, colour, shown)
+    return _PointValues(sigma, slope, colour, shown)
 
 
-def render(cells: Cells, source: Source, model: Model, rays: RayBundle, active: mi.Bool = True) -> RenderedRays:
+def render_rays(cells: Cells, source: Source, model: Model, rays: RayBundle, active: mi.Bool = True) -> RenderedRays:
     """Follow rays through a field.
 
     Args:
@@ -212,38 +212,38 @@ def render(cells: Cells, source: Source, model: Model, rays: RayBundle, active: 
     active = mi.Bool(active)
     order = RayOrder.find(cells, rays.o, rays.d, rays.t_max) if source.gains_by_order else None
     if order is None:
-        return _render(cells, source, model, rays, active)
+        return _render_in_order(cells, source, model, rays, active)
     there = order.places
-    seen = _render(cells, source.of_lanes(there), model, _lanes(rays, there), _lanes(active, there))
-    return replace(_lanes(seen, order.back), rays=rays, order=order)
+    seen = _render_in_order(cells, source.of_lanes(there), model, _gather_lanes(rays, there), _gather_lanes(active, there))
+    return replace(_gather_lanes(seen, order.back), rays=rays, order=order)
 
 
-def _lanes(tree: Any, which: mi.UInt32) -> Any:
+def _gather_lanes(tree: Any, which: mi.UInt32) -> Any:
     """These lanes of all arrays of a tree; what is the same for all lanes remains so."""
     # At once: each read evaluates its array, and all of a walk's would take the walk again.
     dr.eval(tree)
     if is_dataclass(tree):
-        return replace(tree, **{f.name: _lanes(getattr(tree, f.name), which) for f in fields(tree)})
+        return replace(tree, **{f.name: _gather_lanes(getattr(tree, f.name), which) for f in fields(tree)})
     return dr.gather(type(tree), tree, which) if dr.is_array_v(tree) else tree
 
 
-def _render(cells: Cells, source: Source, model: Model, rays: RayBundle, active: mi.Bool) -> RenderedRays:
-    """:func:`render` in the order of the rays."""
-    state = [*(mi.Float(0) for _ in range(6)), Place(mi.Int32(-1), mi.Float(0)), source.start()]
+def _render_in_order(cells: Cells, source: Source, model: Model, rays: RayBundle, active: mi.Bool) -> RenderedRays:
+    """:func:`render_rays` in the order of the rays."""
+    state = [*(mi.Float(0) for _ in range(6)), RayPosition(mi.Int32(-1), mi.Float(0)), source.start()]
 
     def visit(state: list, here: CellVisitor, on: mi.Bool, number: mi.Int32, piece: Piece) -> list:
         *light, tau, before, first, carried = state
         read = source.read(cells, here, carried, on)
-        at = _points(read, read.points, model, on)
+        at = _eval_points(read, read.points, model, on)
         share = share_opacity(here.dt, *at.sigma)
         T = dr.select(on, dr.exp(-tau), 0)
-        times = _times(piece.segment, here, piece.scale)
+        times = _point_distances(piece.segment, here, piece.scale)
         pairs = [*zip(*at.colour, strict=True), times]
         light = [dr.fma(T, share.sent(a, b), s) for s, (a, b) in zip(light, pairs, strict=True)]
         begins = on & (share.tau > 0) & (first.piece < 0)
         before = dr.select(on, tau, before)
         tau = dr.select(on, tau + share.tau, tau)
-        first = Place(dr.select(begins, number, first.piece), dr.select(begins, here.t, first.t))
+        first = RayPosition(dr.select(begins, number, first.piece), dr.select(begins, here.t, first.t))
         return [*light, tau, before, first, source.carry(read)]
 
     state, last, cell = _follow(cells, rays, visit, state, active, lambda s: s[4] > model.depth)
@@ -258,7 +258,7 @@ def _follow(
     state: Any,
     active: mi.Bool,
     until: Callable[[Any], mi.Bool],
-) -> tuple[Any, Place, mi.Vector3i]:
+) -> tuple[Any, RayPosition, mi.Vector3i]:
     """Visit the occupied cells of all pieces of rays, in order.
 
     Args:
@@ -274,7 +274,7 @@ def _follow(
         number = mi.Int32(0)
         piece = piece_of(cells, rays.o, rays.d, rays.t_max, number)
         state, cell, t = march(cells, piece.segment, partial(visit, number=number, piece=piece), state, active, until)
-        return state, Place(dr.select(t > 0, number, -1), t), cell
+        return state, RayPosition(dr.select(t > 0, number, -1), t), cell
     return _follow_pieces(cells, rays, visit, state, active, until)
 
 
@@ -286,33 +286,33 @@ def _follow_pieces(
     state: Any,
     active: mi.Bool,
     until: Callable[[Any], mi.Bool],
-) -> tuple[Any, Place, mi.Vector3i]:
+) -> tuple[Any, RayPosition, mi.Vector3i]:
     """:func:`_follow` where boxes are nested."""
     count, number = dr.opaque(mi.Int32, pieces(cells)), mi.Int32(0)
-    last, last_cell = Place(mi.Int32(-1), mi.Float(0)), mi.Vector3i(0)
+    last, last_cell = RayPosition(mi.Int32(-1), mi.Float(0)), mi.Vector3i(0)
     while dr.hint(active & (number < count), label="pieces"):
         piece = piece_of(cells, rays.o, rays.d, rays.t_max, number)
         state, cell, t = march(
             cells, piece.segment, partial(visit, number=number, piece=piece), state, active, until, piece.level
         )
         # Of a piece without occupied cells the ray left none.
-        last = Place(dr.select(t > 0, number, last.piece), dr.select(t > 0, t, last.t))
+        last = RayPosition(dr.select(t > 0, number, last.piece), dr.select(t > 0, t, last.t))
         last_cell = dr.select(t > 0, cell, last_cell)
         active &= ~until(state)
         number += 1
     return state, last, last_cell
 
 
-def brightest_weights(cells: Cells, source: Source, model: Model, rays: RayBundle, weight: mi.Float) -> None:
+def raise_to_max_weights(cells: Cells, source: Source, model: Model, rays: RayBundle, weight: mi.Float) -> None:
     """Raise ``weight``, one number an occupied cell, to the largest compositing weight T alpha that the cell has on a ray.
 
-    Cost: as :func:`render`, and one write a visited cell.
+    Cost: as :func:`render_rays`, and one write a visited cell.
     """
 
     def visit(state: list, here: CellVisitor, on: mi.Bool, number: mi.Int32, piece: Piece) -> list:
         tau, carried = state
         read = source.read(cells, here, carried, on)
-        at = _points(read, read.points, model, on)
+        at = _eval_points(read, read.points, model, on)
         share = share_opacity(here.dt, *at.sigma)
         dr.scatter_reduce(dr.ReduceOp.Max, weight, dr.exp(-tau) * share.alpha, here.number, on)
         return [dr.select(on, tau + share.tau, tau), source.carry(read)]
@@ -321,12 +321,12 @@ def brightest_weights(cells: Cells, source: Source, model: Model, rays: RayBundl
     _follow(cells, rays, visit, [mi.Float(0), source.start()], active, lambda state: state[0] > model.depth)
 
 
-def _times(segment: Segment, here: CellVisitor, scale: mi.Float) -> tuple[mi.Float, mi.Float]:
+def _point_distances(segment: Segment, here: CellVisitor, scale: mi.Float) -> tuple[mi.Float, mi.Float]:
     """Distances of the two points from the ray's origin."""
     return tuple(scale * (segment.t0 + dr.fma(here.dt, g, here.t)) for g in (GAUSS, 1 - GAUSS))
 
 
-def backward(
+def vjp_rays(
     cells: Cells,
     source: Source,
     model: Model,
@@ -338,27 +338,27 @@ def backward(
     """Add the derivatives of a scalar to those of the field.
 
     Args:
-        cells, source, model: those of :func:`render`; the source's derivatives receive the sums.
-        rendered: from :func:`render`.
+        cells, source, model: those of :func:`render_rays`; the source's derivatives receive the sums.
+        rendered: from :func:`render_rays`.
         by: derivatives of the scalar with respect to what was rendered.
         active: lanes to follow.
         near: [length] derivatives by what is at a distance t below it are multiplied by (t / near)^2. That many more rays meet
             in a cell so near to a camera, of that one camera; without this, matter grows before the lens. 0: none are.
 
-    Bias: none beyond that of :func:`render` where ``near`` is 0: these are the derivatives of what it computes. Cost: as
-        :func:`render`, and 8 packets written a visited cell with ``Baked``, 4 rows with ``Exact``.
+    Bias: none beyond that of :func:`render_rays` where ``near`` is 0: these are the derivatives of what it computes. Cost: as
+        :func:`render_rays`, and 8 packets written a visited cell with ``Baked``, 4 rows with ``Exact``.
     """
     active, order = mi.Bool(active), rendered.order
     if order is not None:
         there, rendered = order.places, replace(rendered, order=None)
-        source, rendered, by, active = source.of_lanes(there), *(_lanes(tree, there) for tree in (rendered, by, active))
-    _backward(cells, source, model, rendered, by, active, near)
+        source, rendered, by, active = source.of_lanes(there), *(_gather_lanes(tree, there) for tree in (rendered, by, active))
+    _vjp_in_order(cells, source, model, rendered, by, active, near)
 
 
-def _backward(
+def _vjp_in_order(
     cells: Cells, source: Source, model: Model, rendered: RenderedRays, by: RayGradient, active: mi.Bool, near: float
 ) -> None:
-    """:func:`backward` in the order of the rays."""
+    """:func:`vjp_rays` in the order of the rays."""
     by_colour, by_distance = [mi.Float(c) for c in by.colour], mi.Float(by.distance)
     reach = None if near == 0 else dr.opaque(mi.Float, 1 / near)
     # State: r, the weighted light from behind; optical depth in front of the cell that was passed last; whether the cell ahead
@@ -370,12 +370,12 @@ def _backward(
         read = source.read(cells, here, carried, on)
         # The points in the order of the ray: the sweep runs the other way.
         points = read.points[::-1]
-        at = _points(read, points, model, on)
+        at = _eval_points(read, points, model, on)
         share = share_opacity(here.dt, *at.sigma)
         before = dr.select(is_last, before, dr.maximum(before - share.tau, 0))
         front = dr.exp(-before)
-        times = [_mirror(back, t, scale) for t in _times(back, here, scale)][::-1]
-        ends = [dr.fma(by_distance, t, _weigh(by_colour, c)) for t, c in zip(times, at.colour, strict=True)]
+        times = [_mirror_distance(back, t, scale) for t in _point_distances(back, here, scale)][::-1]
+        ends = [dr.fma(by_distance, t, _dot_colour(by_colour, c)) for t, c in zip(times, at.colour, strict=True)]
         slopes = share.slopes(*ends)
         hidden = share.half * share.T * r
         raw = [front * (s - hidden) * k for s, k in zip(slopes, at.sigma_slope, strict=True)]
@@ -427,10 +427,10 @@ def _follow_pieces_back(cells: Cells, rendered: RenderedRays, visit: Callable, s
     return state
 
 
-def _weigh(by: list[mi.Float], colour: list[mi.Float]) -> mi.Float:
+def _dot_colour(by: list[mi.Float], colour: list[mi.Float]) -> mi.Float:
     return dr.fma(by[0], colour[0], dr.fma(by[1], colour[1], by[2] * colour[2]))
 
 
-def _mirror(back: Segment, t: mi.Float, scale: mi.Float) -> mi.Float:
+def _mirror_distance(back: Segment, t: mi.Float, scale: mi.Float) -> mi.Float:
     """Distance from the ray's origin of a point of the reversed ray; ``t`` counts on from where the ray was turned round."""
     return 2 * scale * back.t0 - t

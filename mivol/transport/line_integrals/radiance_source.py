@@ -21,11 +21,11 @@ import mitsuba as mi
 import numpy as np
 
 from mivol.fields.spherical_grid import SphericalGrid
-from mivol.transport.line_integrals.carried_face import CellCorners, Face, Sums, read_corners
+from mivol.transport.line_integrals.carried_face import CellCorners, Face, PendingGradients, read_corners
 from mivol.transport.traversal.occupied_cells import Cells
 from mivol.transport.traversal.occupied_walk import CellVisitor
 
-__all__ = ["Baked", "CellValues", "Colours", "Exact", "Source", "bake", "exact", "fold"]
+__all__ = ["Baked", "CellValues", "Colours", "Exact", "Source", "bake", "make_exact", "vjp_bake"]
 
 
 Colours = list
@@ -147,11 +147,11 @@ class Exact:
         dr.eval(self.basis)
         return replace(self, basis=[dr.gather(mi.Float, y, which) for y in self.basis])
 
-    def start(self, slope: bool = False) -> Face | Sums:
-        return Sums() if slope else Face()
+    def start(self, slope: bool = False) -> Face | PendingGradients:
+        return PendingGradients() if slope else Face()
 
-    def read(self, cells: Cells, here: CellVisitor, carried: Face | Sums, on: mi.Bool) -> CellValues:
-        face = carried.face if isinstance(carried, Sums) else carried
+    def read(self, cells: Cells, here: CellVisitor, carried: Face | PendingGradients, on: mi.Bool) -> CellValues:
+        face = carried.face if isinstance(carried, PendingGradients) else carried
         corners = read_corners(cells.res, self.field.row_of, self._value, face, here, on)
         raw, *colours = (list(channel) for channel in zip(*corners.values, strict=True))
         return CellValues(raw, lambda on: colours, corners.points, corners)
@@ -160,12 +160,19 @@ class Exact:
         return at.corners.face()
 
     def add(
-        self, cells: Cells, here: CellVisitor, at: CellValues, carried: Sums, raw: list[mi.Float], colours: Colours, on: mi.Bool
-    ) -> Sums:
+        self,
+        cells: Cells,
+        here: CellVisitor,
+        at: CellValues,
+        carried: PendingGradients,
+        raw: list[mi.Float],
+        colours: Colours,
+        on: mi.Bool,
+    ) -> PendingGradients:
         slopes = [list(values) for values in zip(raw, *colours, strict=True)]
         return carried.add(at.corners, here, slopes, self._write, on)
 
-    def finish(self, carried: Sums) -> None:
+    def finish(self, carried: PendingGradients) -> None:
         carried.finish(self._write)
 
     def slopes(self) -> tuple[mi.Float, mi.Float]:
@@ -175,19 +182,19 @@ class Exact:
         density, harmonics = (dr.empty(mi.Float, dr.width(v)) for v in (field.density, field.harmonics))
         row = dr.gather(mi.ArrayXf, self.slope, every, shape=(packed_width(field.basis), 1))
         dr.scatter(density, row[many], every)
-        dr.scatter(harmonics, _filled([row[k] for k in range(many)], field.width), every)
+        dr.scatter(harmonics, _pad_row([row[k] for k in range(many)], field.width), every)
         return density, harmonics
 
     def _value(self, row: mi.UInt32, on: mi.Bool) -> list[mi.Float]:
         """Raw density and rgb of a row."""
         values = dr.gather(mi.ArrayXf, self.table, row, on, shape=(packed_width(self.field.basis), 1))
-        return [values[3 * self.field.basis], *_summed(values, self.basis, self.field.offset)]
+        return [values[3 * self.field.basis], *_sum_harmonics(values, self.basis, self.field.offset)]
 
     def _write(self, row: mi.UInt32, slopes: list[mi.Float], on: mi.Bool) -> None:
         """Add the derivatives by what :meth:`_value` gave."""
         raw, *colour = slopes
         values = [*(c * y for y in self.basis for c in colour), raw]
-        _add_packet(self.slope, _filled(values, packed_width(self.field.basis)), row, on)
+        _add_packet(self.slope, _pad_row(values, packed_width(self.field.basis)), row, on)
 
 
 def packed_width(basis: int) -> int:
@@ -195,12 +202,12 @@ def packed_width(basis: int) -> int:
     return 4 if basis == 1 else -(-(3 * basis + 1) // 8) * 8
 
 
-def _filled(values: list[mi.Float], width: int) -> mi.ArrayXf:
+def _pad_row(values: list[mi.Float], width: int) -> mi.ArrayXf:
     """A row of so many numbers, filled up with 0."""
     return mi.ArrayXf([*values, *(mi.Float(0) for _ in range(width - len(values)))])
 
 
-def _summed(row: mi.ArrayXf, basis: list[mi.Float], offset: float) -> list[mi.Float]:
+def _sum_harmonics(row: mi.ArrayXf, basis: list[mi.Float], offset: float) -> list[mi.Float]:
     """The colour of a row of harmonics, before it is clamped."""
     colour = [mi.Float(offset)] * 3
     for b, y in enumerate(basis):
@@ -229,25 +236,25 @@ def bake(field: SphericalGrid, cells: Cells, points: np.ndarray, view: mi.UInt32
     Cost: the field is read once, and 4 numbers a node and pinhole are written.
     """
     table = dr.zeros(mi.Float, 4 * dr.width(cells.rows) * len(points))
-    _bake(field, cells.rows, table, points)
-    first = view * _count(cells.rows)
-    return Baked(table, first, dr.zeros(mi.Float, _roomy(dr.width(table))) if slope else None)
+    _fill_table(field, cells.rows, table, points)
+    first = view * _opaque_count(cells.rows)
+    return Baked(table, first, dr.zeros(mi.Float, _round_up_size(dr.width(table))) if slope else None)
 
 
 @dr.syntax
-def _bake(field: SphericalGrid, rows: mi.UInt32, table: mi.Float, points: np.ndarray) -> None:
+def _fill_table(field: SphericalGrid, rows: mi.UInt32, table: mi.Float, points: np.ndarray) -> None:
     """Fill the blocks of a table, in a loop, so that the field is read once and one kernel serves any number of pinholes."""
-    number, node, seen_from = dr.arange(mi.UInt32, dr.width(rows)), _node(field, rows), field.viewer(points)
-    pinholes, count = dr.opaque(mi.UInt32, len(points)), _count(rows)
+    number, node, seen_from = dr.arange(mi.UInt32, dr.width(rows)), _look_up_node(field, rows), field.viewer(points)
+    pinholes, count = dr.opaque(mi.UInt32, len(points)), _opaque_count(rows)
     raw = dr.gather(mi.Float, field.density, rows)
     values = dr.gather(mi.ArrayXf, field.harmonics, rows, shape=(field.width, 1))
     v = mi.UInt32(0)
     while dr.hint(v < pinholes, exclude=[table]):
-        dr.scatter(table, mi.ArrayXf([raw, *_summed(values, seen_from(node, v), field.offset)]), number + v * count)
+        dr.scatter(table, mi.ArrayXf([raw, *_sum_harmonics(values, seen_from(node, v), field.offset)]), number + v * count)
         v += 1
 
 
-def _roomy(size: int) -> int:
+def _round_up_size(size: int) -> int:
     """Round a size up to one of few.
 
     A kernel that adds to an array with a copy for each thread contains its length, and is compiled anew for another.
@@ -256,33 +263,33 @@ def _roomy(size: int) -> int:
     return -(-size // step) * step
 
 
-def _count(rows: mi.UInt32) -> mi.UInt32:
+def _opaque_count(rows: mi.UInt32) -> mi.UInt32:
     """The number of rows as an opaque number: it changes during a fit, and the kernels need not be compiled anew."""
     return dr.opaque(mi.UInt32, dr.width(rows))
 
 
-def _node(field: SphericalGrid, row: mi.UInt32) -> mi.UInt32:
+def _look_up_node(field: SphericalGrid, row: mi.UInt32) -> mi.UInt32:
     """The node of a row; any node for the row of the vacuum, whose values are not used."""
     return row if field.nodes is None else dr.gather(mi.UInt32, field.nodes, row, row < field.rows - 1)
 
 
-def fold(field: SphericalGrid, cells: Cells, baked: Baked, points: np.ndarray) -> tuple[mi.Float, mi.Float]:
+def vjp_bake(field: SphericalGrid, cells: Cells, baked: Baked, points: np.ndarray) -> tuple[mi.Float, mi.Float]:
     """Derivatives with respect to the rows of a field, from those with respect to its baked table: the transpose of
     :func:`bake`.
 
     Returns:
         Those of ``density`` and of ``harmonics``.
     """
-    return _over_pinholes(field, cells.rows, baked.slope, points)
+    return _sum_over_pinholes(field, cells.rows, baked.slope, points)
 
 
 @dr.syntax
-def _over_pinholes(field: SphericalGrid, rows: mi.UInt32, nodes: mi.Float, points: np.ndarray) -> tuple[mi.Float, mi.Float]:
+def _sum_over_pinholes(field: SphericalGrid, rows: mi.UInt32, nodes: mi.Float, points: np.ndarray) -> tuple[mi.Float, mi.Float]:
     """Sum the derivatives of all pinholes, in a loop, so that one kernel serves any number of them."""
     number = dr.arange(mi.UInt32, dr.width(rows))
-    node = _node(field, rows)
+    node = _look_up_node(field, rows)
     seen_from = field.viewer(points)
-    pinholes, count, width = dr.opaque(mi.UInt32, len(points)), _count(rows), field.width
+    pinholes, count, width = dr.opaque(mi.UInt32, len(points)), _opaque_count(rows), field.width
     packet = mi.ArrayXf([mi.Float(0)] * 4)
     raw = dr.zeros(mi.Float, dr.width(rows))
     harmonics = [dr.zeros(mi.Float, dr.width(rows)) for _ in range(width)]
@@ -290,7 +297,7 @@ def _over_pinholes(field: SphericalGrid, rows: mi.UInt32, nodes: mi.Float, point
     while v < pinholes:
         packet = dr.gather(mi.ArrayXf, nodes, number + v * count, shape=(4, 1))
         raw += packet[0]
-        harmonics = _spread(harmonics, packet, seen_from(node, v))
+        harmonics = _add_outer_product(harmonics, packet, seen_from(node, v))
         v += 1
     density, total = dr.zeros(mi.Float, field.rows), dr.zeros(mi.Float, field.rows * width)
     dr.scatter(density, raw, rows)
@@ -298,13 +305,13 @@ def _over_pinholes(field: SphericalGrid, rows: mi.UInt32, nodes: mi.Float, point
     return density, total
 
 
-def _spread(harmonics: list[mi.Float], packet: mi.ArrayXf, basis: list[mi.Float]) -> list[mi.Float]:
+def _add_outer_product(harmonics: list[mi.Float], packet: mi.ArrayXf, basis: list[mi.Float]) -> list[mi.Float]:
     """Add a colour's derivative times each harmonic."""
     more = [dr.fma(packet[1 + k], y, harmonics[3 * b + k]) for b, y in enumerate(basis) for k in range(3)]
     return more + harmonics[len(more) :]
 
 
-def exact(field: SphericalGrid, d: mi.Vector3f, slope: bool = False) -> Exact:
+def make_exact(field: SphericalGrid, d: mi.Vector3f, slope: bool = False) -> Exact:
     """The field for rays of any directions.
 
     Args:
@@ -321,5 +328,5 @@ def exact(field: SphericalGrid, d: mi.Vector3f, slope: bool = False) -> Exact:
     table = dr.empty(mi.Float, width * field.rows)
     row = dr.gather(mi.ArrayXf, field.harmonics, every, shape=(field.width, 1))
     values = [*(row[k] for k in range(3 * field.basis)), dr.gather(mi.Float, field.density, every)]
-    dr.scatter(table, _filled(values, width), every)
-    return Exact(field, table, field.harmonics_of(d), dr.zeros(mi.Float, _roomy(width * field.rows)) if slope else None)
+    dr.scatter(table, _pad_row(values, width), every)
+    return Exact(field, table, field.harmonics_of(d), dr.zeros(mi.Float, _round_up_size(width * field.rows)) if slope else None)

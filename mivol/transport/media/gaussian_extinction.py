@@ -10,8 +10,8 @@ import drjit as dr
 import mitsuba as mi
 
 from mivol.fields.gaussian_field import GaussianField
-from mivol.fields.gaussian_line import ROW, SCALE, Line, Slopes, change_of, read_row
-from mivol.fields.harmonics import blocks_of
+from mivol.fields.gaussian_line import ROW_SIZE, SCALE_COLUMN, LineSlopes, WhitenedLine, read_row, row_tangent
+from mivol.fields.harmonics import blocks_per_gaussian
 from mivol.numerics import greater, lesser
 from mivol.transport.media.extinction import RayInterval
 from mivol.transport.traversal.grid_walk import Cell, walk
@@ -69,21 +69,21 @@ class GaussianExtinction:
     @property
     def blocks(self) -> int:
         """Blocks of ``ROW`` numbers that the harmonics of one Gaussian take."""
-        return blocks_of(self.field.degree) if self.shows else 0
+        return blocks_per_gaussian(self.field.degree) if self.shows else 0
 
     def scaled(self, scale: mi.Float) -> mi.Float:
         rows = self.field.rows(scale)
         return dr.concat([rows, self.field.colour_rows()]) if self.shows else rows
 
     def start_gradient(self) -> mi.Float:
-        return dr.zeros(mi.Float, ROW * self.field.count * (1 + self.blocks))
+        return dr.zeros(mi.Float, ROW_SIZE * self.field.count * (1 + self.blocks))
 
     def deliver(self, scale: mi.Float, gradient: mi.Float) -> mi.Float:
         dr.eval(gradient)
         return dr.sum(self.scaled(scale) * gradient)
 
     def integrate(self, interval: RayInterval, enough: mi.Float | None = None) -> list[mi.Float]:
-        def add(tau: mi.Float, line: Line, index: mi.UInt32, ends: tuple[mi.Float, mi.Float]) -> mi.Float:
+        def add(tau: mi.Float, line: WhitenedLine, index: mi.UInt32, ends: tuple[mi.Float, mi.Float]) -> mi.Float:
             return tau + line.depth * line.share(*ends)
 
         until = None if enough is None else lambda tau: tau > enough
@@ -91,14 +91,14 @@ class GaussianExtinction:
         return [self.each_along(passage, dr.zeros(mi.Float, dr.width(passage.d)), add, until)]
 
     def jvp(self, tangent: mi.Float, interval: RayInterval) -> list[mi.Float]:
-        def add(tau: mi.Float, line: Line, index: mi.UInt32, ends: tuple[mi.Float, mi.Float]) -> mi.Float:
+        def add(tau: mi.Float, line: WhitenedLine, index: mi.UInt32, ends: tuple[mi.Float, mi.Float]) -> mi.Float:
             return tau + self.push(line, line.share_slopes(*ends), line.depth * line.share(*ends), tangent, index)
 
         passage = self.enter(interval)
         return [self.each_along(passage, dr.zeros(mi.Float, dr.width(passage.d)), add)]
 
     def vjp(self, gradient: mi.Float, weight: list[mi.Float], interval: RayInterval) -> None:
-        def add(state: tuple, line: Line, index: mi.UInt32, ends: tuple[mi.Float, mi.Float]) -> tuple:
+        def add(state: tuple, line: WhitenedLine, index: mi.UInt32, ends: tuple[mi.Float, mi.Float]) -> tuple:
             own = line.depth * line.share(*ends)
             self.pull(gradient, line, line.share_slopes(*ends), (own, weight[0]), index, mi.Bool(True))
             return state
@@ -109,7 +109,7 @@ class GaussianExtinction:
         return [dr.detach(scale) * value for value in self.field.eval(ray(t), ray.d, active)]
 
     def jvp_at(self, tangent: mi.Float, ray: Ray, t: mi.Float, active: mi.Bool) -> list[mi.Float]:
-        def add(total: mi.Float, line: Line, index: mi.UInt32) -> mi.Float:
+        def add(total: mi.Float, line: WhitenedLine, index: mi.UInt32) -> mi.Float:
             own = self.push(line, line.density_slopes, line.density, tangent, index)
             return dr.select(line.holds_origin, total + own, total)
 
@@ -117,7 +117,7 @@ class GaussianExtinction:
         return [self.field.each_at(there, active, dr.zeros(mi.Float, dr.width(there)), add)]
 
     def vjp_at(self, gradient: mi.Float, weight: list[mi.Float], ray: Ray, t: mi.Float, active: mi.Bool) -> None:
-        def add(state: tuple, line: Line, index: mi.UInt32) -> tuple:
+        def add(state: tuple, line: WhitenedLine, index: mi.UInt32) -> tuple:
             self.pull(gradient, line, line.density_slopes, (line.density, weight[0]), index, line.holds_origin)
             return state
 
@@ -153,7 +153,7 @@ class GaussianExtinction:
         field, through, length = self.field, (passage.o, passage.d), passage.segment.length
 
         def visit(state: Any, cell: Cell, on: mi.Bool) -> Any:
-            def meet(state: Any, line: Line, index: mi.UInt32) -> Any:
+            def meet(state: Any, line: WhitenedLine, index: mi.UInt32) -> Any:
                 start, end = line.chord
                 ends = greater(start, 0), lesser(end, length)
                 # Cells follow each other without a gap, so the place of entry lies in one of them.
@@ -166,16 +166,16 @@ class GaussianExtinction:
 
         return walk(self.cells, passage.segment, visit, state, (), passage.active, until)
 
-    def push(self, line: Line, slopes: Slopes, value: mi.Float, tangent: mi.Float, index: mi.UInt32) -> mi.Float:
+    def push(self, line: WhitenedLine, slopes: LineSlopes, value: mi.Float, tangent: mi.Float, index: mi.UInt32) -> mi.Float:
         """The tangent of the scale times a value that has these derivatives."""
         change = read_row(tangent, index)
-        return self.scale * change_of(line, slopes, change) + value * change[SCALE]
+        return self.scale * row_tangent(line, slopes, change) + value * change[SCALE_COLUMN]
 
     def pull(
         self,
         gradient: mi.Float,
-        line: Line,
-        slopes: Slopes,
+        line: WhitenedLine,
+        slopes: LineSlopes,
         value: tuple[mi.Float, mi.Float],
         index: mi.UInt32,
         on: mi.Bool,
@@ -188,5 +188,5 @@ class GaussianExtinction:
 
 def add_block(gradient: mi.Float, entries: list[mi.Float], index: mi.UInt32, on: mi.Bool) -> None:
     """Add numbers, at most ``ROW``, to a block of a gradient."""
-    packet = mi.ArrayXf([*entries, *(mi.Float(0) for _ in range(ROW - len(entries)))])
+    packet = mi.ArrayXf([*entries, *(mi.Float(0) for _ in range(ROW_SIZE - len(entries)))])
     dr.scatter_add(gradient, packet, index, on, mode=dr.ReduceMode.Expand)

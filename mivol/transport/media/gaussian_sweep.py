@@ -4,7 +4,7 @@ r"""Emission and absorption of Gaussians along a ray: a sweep from the farthest 
 
 with i in the order of the peaks along the ray (:mod:`mivol.transport.media.gaussian_sweep`), tau_i the optical depth of that
 part of a Gaussian that lies in the interval of the ray (:mod:`mivol.fields.gaussian_line`; alpha_i is o exp(-m^2/2) where all
-of it does), and c_i its colour (:mod:`mivol.fields.gaussian_colour`). So the opacity of an interval is that of the extinction,
+of it does), and c_i its colour (:mod:`mivol.fields.harmonics`). So the opacity of an interval is that of the extinction,
 in any order, and a Gaussian that a surface or the camera cuts fades as it is passed.
 
 Where two peaks swap, N jumps by alpha_i alpha_j |c_i - c_j| times what is let through in front of them; derivatives are those
@@ -25,8 +25,8 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from mivol.fields.gaussian_line import ROW, Line, cross, read_row
-from mivol.fields.harmonics import colour_along, colour_slopes, read_harmonics, sums_along
+from mivol.fields.gaussian_line import ROW_SIZE, WhitenedLine, intersect_gaussian, read_row
+from mivol.fields.harmonics import eval_colour, eval_colour_slopes, read_harmonics, sum_harmonics
 from mivol.numerics import greater, lesser, one_minus_exp
 from mivol.transport.media.channels import LUMINANCE
 from mivol.transport.media.compositing import BodyIntegral, CellIntegral, ReverseState, pass_cell, put_in_front, zeros
@@ -54,7 +54,7 @@ class _Seen:
         colour: of each row [radiance].
     """
 
-    line: Line
+    line: WhitenedLine
     index: mi.UInt32
     ends: tuple[mi.Float, mi.Float]
     own: mi.Float
@@ -94,7 +94,7 @@ class GaussianSweep:
         """Sum the rows of the medium; ``skip`` has no meaning here: what is empty is never asked."""
         rows = self.rows * (1 if self.change is None else 2)
 
-        def add(integral: BodyIntegral, line: Line, index: mi.UInt32, ends: tuple[mi.Float, mi.Float]) -> BodyIntegral:
+        def add(integral: BodyIntegral, line: WhitenedLine, index: mi.UInt32, ends: tuple[mi.Float, mi.Float]) -> BodyIntegral:
             seen = self._see(line, index, ends)
             if self.change is None:
                 return put_in_front(integral, seen.integrals(), [], [])
@@ -110,7 +110,7 @@ class GaussianSweep:
         """
         gradient = self.body.gradients[0]
 
-        def add(sweep: ReverseState, line: Line, index: mi.UInt32, ends: tuple[mi.Float, mi.Float]) -> ReverseState:
+        def add(sweep: ReverseState, line: WhitenedLine, index: mi.UInt32, ends: tuple[mi.Float, mi.Float]) -> ReverseState:
             seen = self._see(line, index, ends)
             sweep, slopes, weights = pass_cell(sweep, seen.integrals(), weight, behind)
             by_tau = sum((row[0] for row in slopes), mi.Float(0))
@@ -124,10 +124,10 @@ class GaussianSweep:
     def _sweep(self, state: object, add: object) -> object:
         return visit_from_the_far_end(self.part, self.interval, state, add)
 
-    def _see(self, line: Line, index: mi.UInt32, ends: tuple[mi.Float, mi.Float]) -> _Seen:
+    def _see(self, line: WhitenedLine, index: mi.UInt32, ends: tuple[mi.Float, mi.Float]) -> _Seen:
         own, colour = line.depth * line.share(*ends), [mi.Float(0)] * self.rows
         if self.part.shows:
-            rgb = colour_along(self._harmonics(self.part.colours, index, 0), self.basis, self.part.field.space)
+            rgb = eval_colour(self._harmonics(self.part.colours, index, 0), self.basis, self.part.field.space)
             colour = [_dot(weights, rgb) for weights in self.channels]
         return _Seen(line, index, ends, own, self.scale * own, colour)
 
@@ -137,13 +137,13 @@ class GaussianSweep:
 
     def _slopes(self, seen: _Seen) -> list[mi.Float]:
         """Derivatives of red, green and blue by the sums over the harmonics."""
-        return colour_slopes(self._harmonics(self.part.colours, seen.index, 0), self.basis, self.part.field.space)
+        return eval_colour_slopes(self._harmonics(self.part.colours, seen.index, 0), self.basis, self.part.field.space)
 
     def _jvp_colour(self, seen: _Seen) -> list[mi.Float]:
         """Tangents of N of one Gaussian by its harmonics."""
         if not self.part.shows:
             return [mi.Float(0)] * self.rows
-        change = sums_along(self._harmonics(self.change, seen.index, self.part.field.count), self.basis)
+        change = sum_harmonics(self._harmonics(self.change, seen.index, self.part.field.count), self.basis)
         rgb = [slope * moved for slope, moved in zip(self._slopes(seen), change, strict=True)]
         return [seen.alpha * _dot(weights, rgb) for weights in self.channels]
 
@@ -158,7 +158,7 @@ class GaussianSweep:
         entries = [y * by for y in self.basis for by in by_rgb]
         first = self.part.field.count + seen.index * self.part.blocks
         for block in range(self.part.blocks):
-            add_block(gradient, entries[ROW * block : ROW * (block + 1)], first + block, mi.Bool(True))
+            add_block(gradient, entries[ROW_SIZE * block : ROW_SIZE * (block + 1)], first + block, mi.Bool(True))
 
 
 def _dot(weights: list[float], values: list[mi.Float]) -> mi.Float:
@@ -192,13 +192,13 @@ def visit_from_the_far_end(part: GaussianExtinction, interval: RayInterval, stat
     field, through, length, rows = part.field, (passage.o, passage.d), passage.segment.length, part.field.flat
     start = dr.full(mi.Float, dr.inf, dr.width(passage.d))
 
-    def ends_of(line: Line) -> tuple[mi.Float, mi.Float]:
+    def ends_of(line: WhitenedLine) -> tuple[mi.Float, mi.Float]:
         near, far = line.chord
         return greater(near, 0), lesser(far, length)
 
     def visit(state: Any, cell: Cell, on: mi.Bool) -> Any:
         def fill(more: mi.Bool, last: tuple, state: Any) -> tuple:
-            def meet(slots: list, line: Line, index: mi.UInt32) -> list:
+            def meet(slots: list, line: WhitenedLine, index: mi.UInt32) -> list:
                 ends = ends_of(line)
                 place = lesser(greater(segment.length - line.peak, 0), segment.length * LAST_PLACE)
                 here = line.hits & (ends[1] > ends[0]) & (place >= cell.s) & (place < cell.s + cell.dt)
@@ -211,7 +211,7 @@ def visit_from_the_far_end(part: GaussianExtinction, interval: RayInterval, stat
 
             def take(slots: list, state: Any) -> tuple:
                 index = slots[0][1]
-                line = cross(read_row(rows, index), *through)
+                line = intersect_gaussian(read_row(rows, index), *through)
                 return [*slots[1:], empty], add(state, line, index, ends_of(line))
 
             _, state = dr.while_loop(

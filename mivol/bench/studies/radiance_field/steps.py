@@ -17,8 +17,15 @@ from mivol.bench.studies.radiance_field.peer import Peer
 from mivol.bench.studies.radiance_field.size import STOP, Size
 from mivol.bench.studies.radiance_field.views import camera, rays_of, rays_through, ring, tiled
 from mivol.fields.spherical_grid import SphericalGrid
-from mivol.transport.line_integrals.radiance_field import RayBundle, RayGradient, backward, cells_of, model_of, render
-from mivol.transport.line_integrals.radiance_source import bake, exact, fold
+from mivol.transport.line_integrals.radiance_field import (
+    RayBundle,
+    RayGradient,
+    find_occupied_cells,
+    make_model,
+    render_rays,
+    vjp_rays,
+)
+from mivol.transport.line_integrals.radiance_source import bake, make_exact, vjp_bake
 
 __all__ = ["Task", "ask_memory", "ask_step", "our_step", "peer_of", "peer_step", "tasks"]
 
@@ -53,16 +60,16 @@ def tasks(size: Size) -> dict[str, Task]:
 
 def our_step(field: SphericalGrid, task: Task) -> Callable[[int], list[mi.Float]]:
     """Forward and backward of the squared radiance."""
-    cells, model = cells_of(field), model_of(field, STOP)
+    cells, model = find_occupied_cells(field), make_model(field, STOP)
     view = None if task.view is None else mi.UInt32(task.view.astype(np.uint32))
 
     def step(number: int) -> list[mi.Float]:
         baked = view is not None
-        source = bake(field, cells, task.pinholes, view, True) if baked else exact(field, task.rays.d, True)
-        seen = render(cells, source, model, task.rays)
+        source = bake(field, cells, task.pinholes, view, True) if baked else make_exact(field, task.rays.d, True)
+        seen = render_rays(cells, source, model, task.rays)
         dr.eval(seen)
-        backward(cells, source, model, seen, RayGradient(2 * seen.colour))
-        return list(fold(field, cells, source, task.pinholes)) if baked else list(source.slopes())
+        vjp_rays(cells, source, model, seen, RayGradient(2 * seen.colour))
+        return list(vjp_bake(field, cells, source, task.pinholes)) if baked else list(source.slopes())
 
     return step
 

@@ -15,7 +15,7 @@ import math
 import drjit as dr
 import mitsuba as mi
 
-from mivol.fields.gaussian_line import Line
+from mivol.fields.gaussian_line import WhitenedLine
 from mivol.numerics import greater, lesser
 from mivol.transport.media.channels import as_rows
 from mivol.transport.media.extinction import ExactExtinction, RayInterval
@@ -132,7 +132,7 @@ def sample_gaussian_flight(
     """
     passage = part.enter(interval)
 
-    def add(state: tuple, line: Line, index: mi.UInt32, ends: tuple[mi.Float, mi.Float]) -> tuple:
+    def add(state: tuple, line: WhitenedLine, index: mi.UInt32, ends: tuple[mi.Float, mi.Float]) -> tuple:
         nearest, reached, rng = state
         rng, (u,) = draw_pcg32(rng, 1)
         before = line.share_before(ends[0])
