@@ -6,8 +6,8 @@ stands in the list, or how far a ray may go from there in one step. That takes f
 goes with the occupied ones.
 
 Levels. A grid may be one of several nested ones (:mod:`mivol.fields.spherical_grid`): all have the same nodes, and their cells
-are counted one level after the other. A walk goes through one of them; :mod:`mivol.transport.traversal.occupied_walk` says which
-piece of a ray lies in which.
+are counted one level after the other. A walk goes through one of them; :mod:`mivol.transport.traversal.occupied_walk` says
+which piece of a ray lies in which.
 
 The search for the next occupied cell is an inner loop of its own. Lanes of a packet then wait for each other in the search,
 where a step costs one read, and visit cells, which costs far more, together.
