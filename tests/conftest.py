@@ -32,7 +32,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--variant", default="llvm_ad_rgb", help="the Mitsuba variant of the fixture variant_rgb")
     parser.addoption("--seeds", type=int, default=1, help="how many rounds of seeds tests of noise run with")
     parser.addoption("--artefacts", type=Path, default=ROOT / "runs" / "tests", help="where tests leave pictures")
-    parser.addoption("--record", action="store_true", help="record anew what tests/report/looks holds")
+    parser.addoption("--record", action="store_true", help="record test_drawn_pictures.json anew")
 
 
 def pytest_configure(config: pytest.Config) -> None:

@@ -257,7 +257,9 @@ def plot_image_row(reference: NDArray, render: NDArray, z: NDArray | None = None
     if z is not None:
         panels.append(("z", z, pixel_scale.Scale("signed", -4.0, 4.0)))
     with mpl.rc_context(STYLE):
-        figure = empty_figure(2.6 * len(panels), 2.9)
+        # Room for the image at the full width of its panel, a title and a colour bar: matplotlib cuts off titles in less.
+        height = 2.6 * min(reference.shape[0] / reference.shape[1], 1.0) + 1.15
+        figure = empty_figure(2.6 * len(panels), height)
         for axes, (name, image, scale) in zip(figure.subplots(1, len(panels)), panels, strict=True):
             _show_pixels(axes, pixel_scale.to_pixels(image, scale), image.shape[1] / image.shape[0])
             axes.set_title(name)

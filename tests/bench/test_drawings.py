@@ -1,4 +1,4 @@
-"""Figures of the benches are as they were when somebody looked at them: made-up answers, drawn and described."""
+"""Figures of the benches, drawn from made-up answers, are readable."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from bench_figures import drawn
-from report.looks import assert_recorded
+from readable_figures import assert_readable
 
 from mivol.bench.studies import (
     depth,
@@ -40,19 +40,19 @@ def contest(names: dict, stocks: tuple[str, ...]) -> dict:
 
 
 @pytest.mark.slow
-def test_single_scattering(monkeypatch: pytest.MonkeyPatch, record: bool) -> None:
+def test_single_scattering(monkeypatch: pytest.MonkeyPatch) -> None:
     answer = contest(single_scattering.LIGHTS, single_scattering.STOCK)
     figure = drawn(single_scattering, monkeypatch, {"smoke": answer, "cloud": answer}, Path())
-    assert_recorded("bench_single_scattering", figure, record)
+    assert_readable(figure)
 
 
-def test_multiple_scattering(monkeypatch: pytest.MonkeyPatch, record: bool) -> None:
+def test_multiple_scattering(monkeypatch: pytest.MonkeyPatch) -> None:
     lights = multiple_scattering.CONTESTS["smoke"]
     figure = drawn(multiple_scattering, monkeypatch, {"smoke": contest(lights, multiple_scattering.STOCK)}, Path())
-    assert_recorded("bench_multiple_scattering", figure, record)
+    assert_readable(figure)
 
 
-def test_gradients(monkeypatch: pytest.MonkeyPatch, record: bool) -> None:
+def test_gradients(monkeypatch: pytest.MonkeyPatch) -> None:
     smoke = {
         light: {what: {"sigma_t >= 1": {"variance_x_time": 10.0 * k + i}} for i, what in enumerate(("mean", "L2"))}
         for k, light in enumerate(CONTESTS["smoke"][1], 4)
@@ -61,10 +61,10 @@ def test_gradients(monkeypatch: pytest.MonkeyPatch, record: bool) -> None:
     estimators = {light: {"dense": one, "density 0": one} for light in CONTESTS["smoke"][1]}
     runs = {name: {"seconds": [1.0, 2.0 + k], "loss": [0.5, 0.0]} for k, name in enumerate((OURS, STOCK))}
     answers = {"smoke": smoke, "estimators": estimators, "tutorial": {"runs": runs}}
-    assert_recorded("bench_gradients", drawn(gradients, monkeypatch, answers, Path()), record)
+    assert_readable(drawn(gradients, monkeypatch, answers, Path()))
 
 
-def test_depth(monkeypatch: pytest.MonkeyPatch, record: bool) -> None:
+def test_depth(monkeypatch: pytest.MonkeyPatch) -> None:
     cells = [
         Cell("cube", light, phase, albedo, tau, 1.0, 2.0, albedo * tau / (4 + tau), 0.01 * k, 1.0)
         for k, (light, phase) in enumerate(TABLED, 1)
@@ -73,34 +73,34 @@ def test_depth(monkeypatch: pytest.MonkeyPatch, record: bool) -> None:
     ]
     beside = [Cell(*place, "isotropic", 0.5, 2.0, 1.0, 2.0, 0.2 + 0.1 * k, 0.01, 1.0) for k, place in enumerate(depth.MARKS)]
     answers = {"table": {"cells": [asdict(c) for c in cells]}, "beside": {"cells": [asdict(c) for c in beside]}}
-    assert_recorded("bench_depth", drawn(depth, monkeypatch, answers, Path()), record)
+    assert_readable(drawn(depth, monkeypatch, answers, Path()))
 
 
-def test_media_light(monkeypatch: pytest.MonkeyPatch, record: bool) -> None:
+def test_media_light(monkeypatch: pytest.MonkeyPatch) -> None:
     """A ratio of 0 has no logarithm: its number stands where a bar would begin."""
     ratios = {"fire": 0.0, "fog": 37.2, "room": 0.998}
     answers = {name: {"variance_x_time_median_over_pixels": ratio} for name, ratio in ratios.items()}
-    assert_recorded("bench_media_light", drawn(media_light, monkeypatch, answers, Path()), record)
+    assert_readable(drawn(media_light, monkeypatch, answers, Path()))
 
 
-def test_still_life(monkeypatch: pytest.MonkeyPatch, record: bool) -> None:
+def test_still_life(monkeypatch: pytest.MonkeyPatch) -> None:
     ramp = np.linspace(0, 1, 3 * 4 * 3).reshape(3, 4, 3)
     fits = {"SH 2": {"photograph": ramp, "view": ramp * 1.5, "psnr": 20.125, "views": 8}}
     figure = drawn(still_life, monkeypatch, {"degree": fits, "few": fits}, Path())
-    assert_recorded("bench_still_life", figure, record)
+    assert_readable(figure)
 
 
-def test_tomography(monkeypatch: pytest.MonkeyPatch, record: bool) -> None:
+def test_tomography(monkeypatch: pytest.MonkeyPatch) -> None:
     """The slice is three eighths up, and white is 0.6 of the truth's brightest thousandth."""
     truth = np.arange(8.0 * 3 * 4).reshape(8, 3, 4)
     curves = {"SIRT": {"nrmse": [0.5, 0.25], "seconds": [3.0, 6.0]}}
     figure = drawn(
         tomography, monkeypatch, SimpleNamespace(name="head", truth=truth), curves, {"SIRT": truth / 2}, Path("a.png")
     )
-    assert_recorded("bench_tomography", figure, record)
+    assert_readable(figure)
 
 
-def test_radiance_field(monkeypatch: pytest.MonkeyPatch, record: bool) -> None:
+def test_radiance_field(monkeypatch: pytest.MonkeyPatch) -> None:
     ratios = {kind: {"ratio_of_processor_time": k + 2.0} for k, kind in enumerate(("camera", "pixels", "any"))}
     curves = {"ours": [(1.0, 20.0), (2.0, 25.0)], "peer": [(10.0, 18.0), (20.0, 23.0)], "peer_psnr": 24.0}
     answers = {
@@ -109,13 +109,13 @@ def test_radiance_field(monkeypatch: pytest.MonkeyPatch, record: bool) -> None:
         "locality": {name: {"processor_seconds": t, "steps": 100, "psnr": 10 * t} for name, t in (("tiles", 3), ("pixels", 5))},
         "fit": {"fog": curves},
     }
-    assert_recorded("bench_radiance_field", drawn(radiance_field, monkeypatch, answers, Path()), record)
+    assert_readable(drawn(radiance_field, monkeypatch, answers, Path()))
 
 
-def test_random_scenes(monkeypatch: pytest.MonkeyPatch, record: bool) -> None:
+def test_random_scenes(monkeypatch: pytest.MonkeyPatch) -> None:
     trials = {"1": {"z": -2.0, "z_bound": 4.0}, "2": {"z": None, "z_bound": 4.0}, "3": {"z": 5.0, "z_bound": 4.0}}
     figure = drawn(random_scenes, monkeypatch, {"trials": {"trials": trials}}, Path())
-    assert_recorded("bench_random_scenes", figure, record)
+    assert_readable(figure)
 
 
 def test_optical_depth(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,7 +11,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from bench_figures import drawn
-from report.looks import assert_recorded
+from readable_figures import assert_readable
 
 from mivol.bench.harness.timing import Budget, Timing
 from mivol.bench.studies import ladder
@@ -129,7 +129,7 @@ def test_all_rungs_are_climbed_in_the_smoke(monkeypatch: pytest.MonkeyPatch) -> 
 
 
 @pytest.mark.slow
-def test_a_figure_of_four_rungs(monkeypatch: pytest.MonkeyPatch, record: bool) -> None:
+def test_a_figure_of_four_rungs(monkeypatch: pytest.MonkeyPatch) -> None:
     """Pictures up to their brightest hundredth, and errors of both methods where there are two."""
     rows = lambda k: [{"seconds_median": t, "relative_error": k / t} for t in (0.5, 2.0)]  # noqa: E731
     answer = {}
@@ -138,4 +138,4 @@ def test_a_figure_of_four_rungs(monkeypatch: pytest.MonkeyPatch, record: bool) -
         answer[name] = {"image": {"mivol": rows(k), "picture": picture}, "gradient": {"mivol": rows(2 * k)}}
         if not rung.emits:
             answer[name]["image"]["volpath"], answer[name]["gradient"]["prbvolpath"] = rows(3 * k), rows(4 * k)
-    assert_recorded("bench_ladder", drawn(ladder, monkeypatch, {"ladder": answer}, Path()), record)
+    assert_readable(drawn(ladder, monkeypatch, {"ladder": answer}, Path()))

@@ -11,7 +11,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from bench_figures import drawn, kept
-from report.looks import assert_recorded
+from readable_figures import assert_readable
 
 from mivol.bench.harness.timing import Timing
 from mivol.bench.studies import points
@@ -275,13 +275,13 @@ def test_the_biker_fills_the_picture(monkeypatch: pytest.MonkeyPatch, drawings: 
     assert found == {"gaussians": cloud.count, **timing.report(16, "pixels")}
 
 
-def test_figures_show_what_was_answered(monkeypatch: pytest.MonkeyPatch, record: bool) -> None:
+def test_figures_show_what_was_answered(monkeypatch: pytest.MonkeyPatch) -> None:
     """Three pictures of the peer's cloud and one of the biker, or those that there are; without any nothing is drawn."""
     ramp = np.linspace(-0.2, 1.2, 27).reshape(3, 3, 3)
     peer = {"pictures": np.stack([ramp, ramp[::-1]])}
     biker = {"cloud": "made up", "seconds_median": 1.234, "pictures": ramp[None]}
     figure = drawn(points, monkeypatch, {"peer": peer, "biker": biker}, Path())
-    assert_recorded("bench_points", figure, record)
+    assert_readable(figure)
     alone = drawn(points, monkeypatch, {"biker": biker}, Path())
     assert [axes.get_title("left") for axes in alone.axes] == ["made up, 1.23 s"] and alone.get_figwidth() == 4
     found: list = []

@@ -536,9 +536,6 @@ def test_slices_and_rows_as_figures(artefacts):
         figures.plot_curve([{"iteration": 1.0, "loss": 1.0}], "psnr")
 
 
-PAGE_AS_LOOKED_AT = Path(__file__).with_name("page_of_a_run.txt")
-
-
 def write_run_by_hand(folder: Path) -> Path:
     """A run of round numbers with all that a page can show: three views (a reference that is known, one held out whose errors
     are known, one that is a PNG), a slice, a film, two volumes, one with its truth."""
@@ -594,27 +591,16 @@ def write_run_by_hand(folder: Path) -> Path:
     return folder
 
 
-def described(page: Page) -> str:
-    """A page in lines: each tag with its attributes, pictures by their size and sums of their colours; and its words."""
-    lines = []
-    for tag, attributes in page.tags:
-        if tag in ("g", "path", "use", "defs", "clippath", "rect", "style"):
-            continue
-        shown = {key: value for key, value in attributes.items() if tag != "svg" or key == "aria-label"}
-        if str(shown.get("src", "")).startswith("data:image/png"):
-            pixels = decode(shown["src"])
-            shown["src"] = (
-                f"{pixels.shape} {pixels.sum(axis=(0, 1)).tolist()} {pixels[0, 0].tolist()} {pixels[-1, -1].tolist()}"
-            )
-        lines.append(" ".join([tag, *(f"{key}={value}" for key, value in shown.items())]))
+def test_every_part_of_a_record_is_on_the_page(tmp_path: Path) -> None:
+    """Results, scales, errors of views, slices, tables, notes and times: round numbers, by hand."""
+    page = Page(write_page(write_run_by_hand(tmp_path)).read_text(encoding="utf-8"))
     words = [" ".join(word.split()) for word in page.words]
-    return "\n".join([*lines, "", *(word for word in words if word)]) + "\n"
-
-
-def test_a_page_is_as_it_was_looked_at(tmp_path: Path, record: bool) -> None:
-    """``pytest --record`` records it anew: open the page before, and read the difference."""
-    text = write_page(write_run_by_hand(tmp_path)).read_text(encoding="utf-8")
-    found = described(Page(text))
-    if record:
-        PAGE_AS_LOOKED_AT.write_text(found, encoding="utf-8")
-    assert found.splitlines() == PAGE_AS_LOOKED_AT.read_text(encoding="utf-8").splitlines()
+    said = " | ".join(word for word in words if word)
+    for part in (
+        *("Every part", "99 s on 3 cores", "0.0312", "24.9 dB", "nRMSE 0.0978", "20.8%"),
+        *("Radiance [W] | 0 | 2", "| -0.25 | 0.25 |", "| -4 | 4 |", "sigma_t [1/length] | 0 | 0.998"),
+        *("z = 2 of 2", "y = 2 of 3", "x = 3 of 4", "The albedo", "A slice", "As it is"),
+        *("A table | what | how | a | 1 | b | 2", "this | that", "Mind this."),
+        *("load | 500 ms | fit | 90 s | judge | 8 s", "mivol optimize it.toml"),
+    ):
+        assert part in said

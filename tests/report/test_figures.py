@@ -1,4 +1,4 @@
-"""Figures are as they were when somebody looked at them, and their rules hold: one scale, no axis without a unit."""
+"""Figures are readable, and their rules hold: one scale for one quantity, no axis without a unit."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pytest
 from matplotlib.figure import Figure
 from photo_sets import ring
 from PIL import Image
-from report.looks import assert_recorded
+from readable_figures import assert_readable
 
 from mivol.photos import PhotoSurvey
 from mivol.photos.camera import Camera
@@ -102,8 +102,30 @@ DRAWN = [cameras, falling_curve, long_curve, reaching_the_noise, profile, method
 
 
 @pytest.mark.parametrize("draw", DRAWN, ids=lambda draw: draw.__name__)
-def test_a_figure_looks_as_recorded(draw: Callable[[], Figure], record: bool) -> None:
-    assert_recorded(draw.__name__, draw(), record)
+def test_a_figure_is_readable(draw: Callable[[], Figure]) -> None:
+    assert_readable(draw())
+
+
+@pytest.mark.parametrize(
+    ("draw", "title", "x", "scales"),
+    [
+        (falling_curve, "Loss", "iteration", ("linear", "log")),
+        (long_curve, "PSNR of the fitted views [dB]", "time [s]", ("linear", "linear")),
+        (reaching_the_noise, "RMS of residual over noise (noise level: 1)", "iteration", ("linear", "log")),
+        (profile, "sigma_t [1/length]", "y [length]", ("linear", "linear")),
+        (methods, "Which is sooner?", "time [s], warm", ("log", "log")),
+    ],
+)
+def test_curves_name_their_quantities_with_units(draw: Callable[[], Figure], title: str, x: str, scales: tuple) -> None:
+    (axes,) = draw().axes
+    assert (axes.get_title("left"), axes.get_xlabel(), (axes.get_xscale(), axes.get_yscale())) == (title, x, scales)
+
+
+def test_pictures_of_one_quantity_share_a_scale() -> None:
+    """White is the largest value of the reference, a difference is symmetric about 0, and z ends at 4 standard errors."""
+    reference, render, difference, z = [axes.get_xlim() for axes in row().axes if axes.get_xlabel()]
+    assert reference == render and reference[0] == 0
+    assert difference[0] == -difference[1] and z == (-4, 4)
 
 
 def test_a_picture_has_160_pixels_an_inch(tmp_path: Path) -> None:
