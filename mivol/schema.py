@@ -13,7 +13,7 @@ from typing import Any, Literal, NamedTuple, get_args, get_origin, get_type_hint
 import msgspec
 
 from mivol.errors import MivolError
-from mivol.optim.strategy import nearest, of
+from mivol.optim.strategy import setting, suggest_name
 
 __all__ = ["Setting", "check_keys", "describe", "sentence", "settings_in", "structs_in"]
 
@@ -40,13 +40,13 @@ def check_keys(raw: Any, kind: Any, where: str, name: str) -> None:
     unknown = next((key for key in raw if key not in known and key != tag), None)
     if unknown is not None:
         dotted = textwrap.shorten(f"{where}.{unknown}".lstrip("."), LONGEST_KEY, placeholder="...")
-        raise MivolError(f'{name}: unknown key "{dotted}": {nearest(unknown, [*known, *([tag] if tag else [])])}')
+        raise MivolError(f'{name}: unknown key "{dotted}": {suggest_name(unknown, [*known, *([tag] if tag else [])])}')
     hints = get_type_hints(struct)
     for key, value in raw.items():
         if key in hints:
             dotted, words = f"{where}.{key}".lstrip("."), words_in(hints[key])
             if isinstance(value, str) and words and value not in words:
-                raise MivolError(f'{name}: {dotted} = "{value}" is unknown: {nearest(value, list(words))}')
+                raise MivolError(f'{name}: {dotted} = "{value}" is unknown: {suggest_name(value, list(words))}')
             check_keys(value, hints[key], dotted, name)
 
 
@@ -54,7 +54,7 @@ def _check_tag(raw: dict[str, Any], tag: str | None, choices: dict[str, type], w
     if tag and raw.get(tag) not in choices:
         found = raw.get(tag)
         what = f'"{where}.{tag}" is missing' if found is None else f'{where}.{tag} = "{found}" is unknown'
-        raise MivolError(f"{name}: {what}: {nearest(str(found), list(choices))}")
+        raise MivolError(f"{name}: {what}: {suggest_name(str(found), list(choices))}")
 
 
 def structs_in(kind: Any) -> list[type]:
@@ -133,7 +133,7 @@ def settings_in(kind: type, prefix: str = "") -> list[Setting]:
     hints = get_type_hints(kind, include_extras=True)
     for field in msgspec.structs.fields(kind):
         hint, key = hints[field.name], f"{prefix}{field.name}"
-        meta = getattr(hint, "__metadata__", (of("1", "one of " + ", ".join(map(str, get_args(hint)))),))[0]
+        meta = getattr(hint, "__metadata__", (setting("1", "one of " + ", ".join(map(str, get_args(hint)))),))[0]
         inner = getattr(hint, "__origin__", hint)
         many = get_origin(inner) is tuple and bool(structs_in(get_args(inner)[0]))
         structs = structs_in(get_args(inner)[0] if many else inner)

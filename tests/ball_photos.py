@@ -7,7 +7,7 @@ import numpy as np
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.optim.loop import Fit, begin_fit
 from mivol.optim.photographs.field_view import render_view
-from mivol.optim.photographs.radiance_plan import FitPlan, Stage
+from mivol.optim.photographs.radiance_plan import RadiancePlan, RadianceStage
 from mivol.optim.photographs.radiance_problem import RadianceProblem
 from mivol.optim.photographs.ray_batches import RayBatches
 from mivol.photos import Camera, Photo
@@ -45,7 +45,7 @@ def photo(field: SphericalGrid, k: float, side: int = 48) -> Photo:
     return Photo(f"view {k}", np.clip(seen.image, 0, 1), seen.opacity, None, camera(k, side), WHITE)
 
 
-PLAN = FitPlan((Stage(12, 60, 2, 4, 24), Stage(24, 90, 1, 4, 48)), degree=1, random_background=False)
+PLAN = RadiancePlan((RadianceStage(12, 60, 2, 4, 24), RadianceStage(24, 90, 1, 4, 48)), degree=1, random_background=False)
 
 
 def error_of(fit: Fit, k: float = 2.5) -> float:
@@ -53,10 +53,10 @@ def error_of(fit: Fit, k: float = 2.5) -> float:
     return float(np.mean((np.clip(render_view(fit.problem.field, camera(k), WHITE).image, 0, 1) - photo(ball(), k).image) ** 2))
 
 
-def fitted(batches: RayBatches, plan: FitPlan, steps: int | None = None, fit: Fit | None = None) -> Fit:
+def fitted(batches: RayBatches, plan: RadiancePlan, steps: int | None = None, fit: Fit | None = None) -> Fit:
     """A fit after so many steps; all by default."""
-    fit = fit or begin_fit(RadianceProblem(batches, BOX, plan), plan.optimiser, plan.course())
-    while fit.next < (plan.steps if steps is None else steps):
+    fit = fit or begin_fit(RadianceProblem(batches, BOX, plan), plan.optimizer, plan.course())
+    while fit.next_iteration < (plan.steps if steps is None else steps):
         fit.advance()
-    fit.problem.set(fit.run.reals)
+    fit.problem.set_reals(fit.run.reals)
     return fit

@@ -7,7 +7,7 @@ import itertools
 import numpy as np
 import oracle_projector
 
-from mivol.optim.projections.linear_problems import LeastSquares, PoissonCounts, State
+from mivol.optim.projections.linear_problems import LeastSquares, PoissonCounts, SolverState
 from mivol.optim.projections.solvers import SOLVERS
 from mivol.tomography.geometry import ParallelBeam, VoxelGrid
 from mivol.tomography.phantoms import shepp_logan
@@ -43,7 +43,7 @@ def small_scan() -> tuple[Views, np.ndarray, np.ndarray]:
     return a, truth, a @ truth
 
 
-def run(name: str, problem, n: int, state: State | None = None, **options) -> list[State]:
+def run(name: str, problem, n: int, state: SolverState | None = None, **options) -> list[SolverState]:
     return list(itertools.islice(SOLVERS[name].run(problem, state=state, **options), n))
 
 

@@ -21,8 +21,8 @@ from mivol import config
 from mivol.bench.harness.catalogue import STUDIES
 from mivol.cli import parser
 from mivol.optim.losses import LOSSES
-from mivol.optim.optimizers import OPTIMISERS
-from mivol.optim.projections.solvers import METHODS
+from mivol.optim.optimizers import OPTIMIZERS
+from mivol.optim.projections.solvers import ALL_SOLVERS
 from mivol.transport.path.estimators import SEGMENT_ESTIMATORS
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -223,7 +223,7 @@ def test_links_on_pypi_lead_to_the_repository() -> None:
 def test_theory_says_what_each_name_computes() -> None:
     """Every entry of the tables that a plan or a file chooses from, with its bench."""
     text = (DOCS / "theory.md").read_text()
-    chosen = [*SEGMENT_ESTIMATORS, *METHODS, *OPTIMISERS, *LOSSES]
+    chosen = [*SEGMENT_ESTIMATORS, *ALL_SOLVERS, *OPTIMIZERS, *LOSSES]
     assert len(chosen) > 20
     assert [name for name in chosen if f"`{name}`" not in text] == []
     assert [study for study in STUDIES if f"`{study}`" not in text] == []

@@ -1,6 +1,8 @@
 """A radiance field from photographs, and the field on a floor in a scene."""
-import mivol
 import mitsuba as mi
+
+import mivol
+
 mi.set_variant("llvm_ad_rgb")
 
 settings = {"field.preset": "tiny", "photos.background": "white", "show.frames": 8}

@@ -1,6 +1,8 @@
 """That density under another light."""
-import mivol
 import mitsuba as mi
+
+import mivol
+
 mi.set_variant("llvm_ad_rgb")
 
 scene = mi.load_file("scene.xml")

@@ -49,7 +49,7 @@ class Terminal:
 
 def figures(fit: Fit) -> str:
     """The newest loss and errors, in words."""
-    words = [f"{QUANTITIES.get(name, Quantity(name)).label} {value:.4g}" for name, value in fit.newest_errors().items()]
+    words = [f"{QUANTITIES.get(name, Quantity(name)).label} {value:.4g}" for name, value in fit.latest_errors().items()]
     return ", ".join([f"loss {fit.history[-1]['loss']:.4g}", *words])
 
 
@@ -73,12 +73,12 @@ class Display:
 
     def __exit__(self, *exception: object) -> None:
         if self.newest is not None:  # measured once more since the last call
-            self.bar.update(self.task, completed=self.newest.next, description=figures(self.newest))
+            self.bar.update(self.task, completed=self.newest.next_iteration, description=figures(self.newest))
         self.bar.refresh()
         self.bar.stop()
         if self.newest is not None and not self.console.is_terminal:
             fit = self.newest
-            self.console.print(f"{fit.next} iterations in {fit.seconds:.1f} s: {figures(fit)}", soft_wrap=True)
+            self.console.print(f"{fit.next_iteration} iterations in {fit.seconds:.1f} s: {figures(fit)}", soft_wrap=True)
 
     def __call__(self, fit: Fit) -> None:
         """Draw, at most ten times a second; what the fit has to say is printed above."""
@@ -86,11 +86,11 @@ class Display:
         for line in fit.log[self.logged :]:
             self.console.print(line, soft_wrap=True, highlight=False, markup=False)
         self.logged = len(fit.log)
-        self.bar.update(self.task, completed=fit.next, description=figures(fit))
+        self.bar.update(self.task, completed=fit.next_iteration, description=figures(fit))
         if self.console.is_terminal:
             if time.monotonic() - self.drawn > 0.1:
                 self.bar.refresh()
                 self.drawn = time.monotonic()
-        elif len(fit.measures) > self.said:
-            self.console.print(f"iteration {fit.next} of {self.iterations}: {figures(fit)}", soft_wrap=True)
-            self.said = len(fit.measures)
+        elif len(fit.evaluations) > self.said:
+            self.console.print(f"iteration {fit.next_iteration} of {self.iterations}: {figures(fit)}", soft_wrap=True)
+            self.said = len(fit.evaluations)

@@ -23,7 +23,7 @@ from mivol.fields.procedural import make_procedural
 from mivol.files import write_volume
 from mivol.files.atomic import disk_faults
 from mivol.files.fetch import PREFIX, find_local_file, resolve_path
-from mivol.optim.strategy import nearest
+from mivol.optim.strategy import suggest_name
 
 __all__ = ["EXAMPLES", "Example", "copy_example", "examples_folder", "list_examples", "run_example"]
 
@@ -183,7 +183,7 @@ def example_named(name: str) -> Example:
         MivolError: there is none; the nearest is offered.
     """
     if name not in EXAMPLES:
-        raise MivolError(f'there is no example "{name}": {nearest(name, list(EXAMPLES))}')
+        raise MivolError(f'there is no example "{name}": {suggest_name(name, list(EXAMPLES))}')
     return EXAMPLES[name]
 
 

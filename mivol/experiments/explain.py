@@ -195,7 +195,7 @@ def explain_photo_fit(chosen: FieldFit, base: Path, say: Say, picture: Path | No
     batches = batches_of(plan, photos)
     for one in choices(plan, photos, batches):
         say(f"  {one.choice}: {one.reason}")
-    plan.optimiser.begin(RadianceProblem(batches, photos.box, plan, chosen.seed))
+    plan.optimizer.begin(RadianceProblem(batches, photos.box, plan, chosen.seed))
     return Explanation(drawn(photos, judged, plan.levels, picture))
 
 
@@ -223,7 +223,7 @@ def explain_gaussian_fit(chosen: GaussianFit, base: Path, say: Say, picture: Pat
     begun = begin(chosen, photos, asked)
     for one in begun.lines:
         say(f"  {one.choice}: {one.reason}")
-    begun.plan.optimiser.begin(begun.problem(chosen.seed))
+    begun.plan.optimizer.begin(begun.problem(chosen.seed))
     return Explanation(drawn(photos, judged, 1, picture))
 
 

@@ -9,9 +9,16 @@ import numpy as np
 
 from mivol.config import FieldFit
 from mivol.errors import MivolError
-from mivol.optim.photographs.radiance_plan import FEW, PRESETS, FitPlan, Stage, memory_of, stretched
+from mivol.optim.photographs.radiance_plan import (
+    FEW_PHOTOGRAPHS,
+    PRESETS,
+    RadiancePlan,
+    RadianceStage,
+    check_memory,
+    scale_longest,
+)
 from mivol.optim.photographs.ray_batches import TILE, RayBatches
-from mivol.optim.strategy import nearest
+from mivol.optim.strategy import suggest_name
 from mivol.photos import Photos, rectify
 from mivol.photos.region import FEWEST_POINTS, count_levels, nested_boxes, points_in_box
 from mivol.report.record import PlanLine
@@ -36,7 +43,7 @@ LEARNED = {"sky": ("sky", "sky_smooth"), "nested": ("sky", "sky_smooth", "levels
 """What the plan takes from the preset ``capture``, by the word for what is behind."""
 
 
-def make_plan(chosen: FieldFit) -> FitPlan:
+def make_plan(chosen: FieldFit) -> RadiancePlan:
     """The preset with what the file says otherwise.
 
     Raises:
@@ -44,7 +51,7 @@ def make_plan(chosen: FieldFit) -> FitPlan:
     """
     wanted = chosen.field
     if wanted.preset not in PRESETS:
-        raise MivolError(f'field.preset = "{wanted.preset}" is unknown: {nearest(wanted.preset, list(PRESETS))}')
+        raise MivolError(f'field.preset = "{wanted.preset}" is unknown: {suggest_name(wanted.preset, list(PRESETS))}')
     plan = with_background(PRESETS[wanted.preset], chosen.photos.background)
     names = ("degree", "first_degree", "tv_density", "tv_sh", "sparsity", "matte", "depth", "sky", "beta", "exposure")
     given = {name: getattr(wanted, name) for name in names}
@@ -57,10 +64,10 @@ def make_plan(chosen: FieldFit) -> FitPlan:
         plan = replace(plan, few_matte=None)
     if wanted.levels is not None:
         plan = replace(plan, levels=wanted.levels, fewer_levels=False)
-    return plan if wanted.longest is None else replace(plan.up_to(wanted.longest), cubic=False)
+    return plan if wanted.longest is None else replace(plan.with_longest(wanted.longest), cubic=False)
 
 
-def with_background(plan: FitPlan, background: str | tuple[float, float, float]) -> FitPlan:
+def with_background(plan: RadiancePlan, background: str | tuple[float, float, float]) -> RadiancePlan:
     """The plan that learns what is behind, or does not, as the word for it says; the preset's where there is none."""
     if background == "":
         return plan
@@ -68,12 +75,12 @@ def with_background(plan: FitPlan, background: str | tuple[float, float, float])
     return replace(plan, **{"sky": 0} | {name: getattr(PRESETS["capture"], name) for name in names})
 
 
-def batches_of(plan: FitPlan, photos: Photos) -> RayBatches:
+def batches_of(plan: RadiancePlan, photos: Photos) -> RayBatches:
     """The photographs in the sizes of the plan, without the distortion of lenses that have an image plane."""
     return RayBatches.of([rectify(view) for view in photos.views], [one.shrink for one in plan.stages], space=photos.space)
 
 
-def suited(plan: FitPlan, photos: Photos) -> FitPlan:
+def suited(plan: RadiancePlan, photos: Photos) -> RadiancePlan:
     """The plan for these photographs.
 
     Grids of a plan for cubes have as many nodes in a box that is none, though voxels are not smaller than the plan's for that,
@@ -86,18 +93,18 @@ def suited(plan: FitPlan, photos: Photos) -> FitPlan:
     least, pixels = min(min(camera.size) for camera in cameras), sum(math.prod(camera.size) for camera in cameras)
     edge = float((box[1] - box[0]).max())
 
-    def suited_stage(stage: Stage) -> Stage:
+    def suited_stage(stage: RadianceStage) -> RadianceStage:
         longest = stage.longest
         if plan.cubic:
-            longest = max(longest, min(stretched(longest, box), int(edge / (plan.voxel * pixel))))
+            longest = max(longest, min(scale_longest(longest, box), int(edge / (plan.voxel * pixel))))
             longest = min(longest, max(int(edge / pixel), FEWEST))
         halvings = min(round(np.log2(edge / longest / (plan.voxel * pixel))), int(np.log2(least / SMALLEST)))
         return replace(stage, longest=longest, shrink=2 ** max(halvings, 0))
 
-    def steps_an_epoch(stage: Stage) -> float:
+    def steps_an_epoch(stage: RadianceStage) -> float:
         return pixels / stage.shrink**2 / (min(stage.views, len(cameras)) * stage.tiles * TILE**2)
 
-    if len(photos.views) < FEW:
+    if len(photos.views) < FEW_PHOTOGRAPHS:
         plan = of_few(plan)
     plan = with_levels_needed(plan, photos)
     stages = [suited_stage(stage) for stage in plan.stages]
@@ -106,14 +113,14 @@ def suited(plan: FitPlan, photos: Photos) -> FitPlan:
     return replace(plan, stages=tuple(stages), cubic=False)
 
 
-def of_few(plan: FitPlan) -> FitPlan:
+def of_few(plan: RadiancePlan) -> RadiancePlan:
     """The plan for fewer than ``FEW`` photographs."""
     degree = plan.degree if plan.few_degree is None else plan.few_degree
     matte = plan.matte if plan.few_matte is None else plan.few_matte
     return replace(plan, tv_every=1, degree=degree, matte=matte)
 
 
-def with_levels_needed(plan: FitPlan, photos: Photos) -> FitPlan:
+def with_levels_needed(plan: RadiancePlan, photos: Photos) -> RadiancePlan:
     """The plan with no more nested boxes than the points of a reconstruction need, where there are enough of these."""
     points = photos.survey.points
     if not plan.fewer_levels or points is None or len(points) < FEWEST_POINTS:
@@ -121,7 +128,7 @@ def with_levels_needed(plan: FitPlan, photos: Photos) -> FitPlan:
     return replace(plan, levels=count_levels(photos.box, points, plan.levels))
 
 
-def choices(plan: FitPlan, photos: Photos, batches: RayBatches) -> list[PlanLine]:
+def choices(plan: RadiancePlan, photos: Photos, batches: RayBatches) -> list[PlanLine]:
     """What will be done, and why."""
     box, origins = photos.box, np.array([view.camera.origin for view in photos.views])
     resolutions = ", ".join(str(stage.longest) for stage in plan.stages)
@@ -150,11 +157,11 @@ def choices(plan: FitPlan, photos: Photos, batches: RayBatches) -> list[PlanLine
         what_is_behind(plan, photos),
         *[GAINS][: plan.exposure],
         PlanLine(choice=f"rays end at a transmittance of {plan.stop:g}", reason="what is left out is at most that share"),
-        PlanLine(choice=memory_of(plan, box, batches), reason="counted before it is taken"),
+        PlanLine(choice=check_memory(plan, box, batches), reason="counted before it is taken"),
     ]
 
 
-def left_out(plan: FitPlan, photos: Photos) -> list[PlanLine]:
+def left_out(plan: RadiancePlan, photos: Photos) -> list[PlanLine]:
     """A line where points of a reconstruction lie beyond the boxes."""
     points = photos.survey.points
     if points is None or (beyond := len(points) - len(points_in_box(points, nested_boxes(photos.box, plan.levels)[-1]))) == 0:
@@ -164,21 +171,21 @@ def left_out(plan: FitPlan, photos: Photos) -> list[PlanLine]:
     return [PlanLine(choice=f"{beyond} of {len(points)} points of the reconstruction left out", reason=reason)]
 
 
-def distances_told(plan: FitPlan, batches: RayBatches) -> list[PlanLine]:
+def distances_told(plan: RadiancePlan, batches: RayBatches) -> list[PlanLine]:
     """A line where points of a reconstruction say how far things are."""
     found = sum(map(len, batches.points))
     choice = f"{found} points that photographs found say where their rays end, with a weight of {plan.depth:g}"
     return [PlanLine(choice=choice, reason="a model of COLMAP names them; field.depth")] if plan.depth and found else []
 
 
-def near_cameras(plan: FitPlan, origins: np.ndarray, box: np.ndarray) -> list[PlanLine]:
+def near_cameras(plan: RadiancePlan, origins: np.ndarray, box: np.ndarray) -> list[PlanLine]:
     """A line where derivatives fall towards cameras at ``origins``."""
-    reach = plan.reach(origins, box)
+    reach = plan.near_distance(origins, box)
     choice = f"derivatives nearer to a camera than {reach:.4g} [length] fall with the square of the distance"
     return [PlanLine(choice=choice, reason="else matter grows before the lenses")] if reach else []
 
 
-def steps_of(plan: FitPlan) -> PlanLine:
+def steps_of(plan: RadiancePlan) -> PlanLine:
     """How many steps the stages take, and what bounds them."""
     steps = ", ".join(str(stage.steps) for stage in plan.stages)
     reason = "field.effort"
@@ -187,7 +194,7 @@ def steps_of(plan: FitPlan) -> PlanLine:
     return PlanLine(choice=f"{steps} steps in these stages", reason=reason)
 
 
-def sizes_of(plan: FitPlan, held: tuple[int, int]) -> PlanLine:
+def sizes_of(plan: RadiancePlan, held: tuple[int, int]) -> PlanLine:
     """How large photographs are in each stage, which are held at so many pixels."""
     width, height = held
     if all(stage.shrink == 1 for stage in plan.stages):
@@ -206,7 +213,7 @@ def wide_lenses(photos: Photos) -> list[PlanLine]:
     return [PlanLine(choice=f"rays of {len(kinds)} {kinds[0]} photographs", reason=reason)] if kinds else []
 
 
-def what_is_behind(plan: FitPlan, photos: Photos) -> PlanLine:
+def what_is_behind(plan: RadiancePlan, photos: Photos) -> PlanLine:
     """What rays see that pass the box; where a colour is only believed, the one that the photographs' edges show is told."""
     if plan.sky:
         return PlanLine(choice=f"a sky of {plan.sky} rows behind the box", reason="field.sky; it is learned with the field")

@@ -61,7 +61,7 @@ class GaussianOutputs:
             record.tables.append(table_of_gains([view.name for view in self.photos.views], self.problem.exposure.table()))
         record.results = {
             "views": float(len(self.photos.views)),
-            "iterations": float(self.fit.next),
+            "iterations": float(self.fit.next_iteration),
             "gaussians": float(found.count),
         }
         if self.judged is not None:

@@ -6,12 +6,12 @@ from dataclasses import dataclass, replace
 
 from mivol.config import GaussianFit
 from mivol.errors import MivolError
-from mivol.optim.gaussians.density_control import Arrays
-from mivol.optim.gaussians.gaussian_plan import CONTROLS, PRESETS, GaussianPlan, memory_of
+from mivol.optim.gaussians.density_control import CloudArrays
+from mivol.optim.gaussians.gaussian_plan import CONTROLS, PRESETS, GaussianPlan, check_memory
 from mivol.optim.gaussians.gaussian_problem import GaussianProblem
-from mivol.optim.gaussians.gaussian_start import begin_at, places_of
+from mivol.optim.gaussians.gaussian_start import find_start_points, make_start_cloud
 from mivol.optim.photographs.ray_batches import RayBatches
-from mivol.optim.strategy import nearest
+from mivol.optim.strategy import suggest_name
 from mivol.photos import Photo, Photos, rectify
 from mivol.report.record import PlanLine
 
@@ -33,7 +33,7 @@ class Begun:
     views: tuple[Photo, ...]
     plan: GaussianPlan
     batches: RayBatches
-    cloud: Arrays
+    cloud: CloudArrays
     lines: list[PlanLine]
 
     def problem(self, seed: int) -> GaussianProblem:
@@ -49,9 +49,9 @@ def make_gaussian_plan(chosen: GaussianFit) -> GaussianPlan:
     """
     wanted = chosen.gaussians
     if wanted.preset not in PRESETS:
-        raise MivolError(f'gaussians.preset = "{wanted.preset}" is unknown: {nearest(wanted.preset, list(PRESETS))}')
+        raise MivolError(f'gaussians.preset = "{wanted.preset}" is unknown: {suggest_name(wanted.preset, list(PRESETS))}')
     if wanted.control is not None and wanted.control not in CONTROLS:
-        raise MivolError(f'gaussians.control = "{wanted.control}" is unknown: {nearest(wanted.control, list(CONTROLS))}')
+        raise MivolError(f'gaussians.control = "{wanted.control}" is unknown: {suggest_name(wanted.control, list(CONTROLS))}')
     given = {name: getattr(wanted, name) for name in ("start", "most", "control", "ssim")}
     told = {name: value for name, value in given.items() if value is not None}
     plan = replace(PRESETS[wanted.preset], mip=wanted.mip, exposure=wanted.exposure, **told)
@@ -70,7 +70,7 @@ def begin(chosen: GaussianFit, photos: Photos, plan: GaussianPlan) -> Begun:
     views = tuple(rectify(view) for view in photos.views)
     longest = max(max(view.camera.size) for view in views)
     plan = plan.for_edge(longest)
-    places, whence = places_of(photos, plan.start, chosen.seed)
+    places, whence = find_start_points(photos, plan.start, chosen.seed)
     largest = max(view.camera.size[0] * view.camera.size[1] for view in views)
     if chosen.gaussians.minutes is not None:
         plan = plan.in_minutes(chosen.gaussians.minutes, largest)
@@ -78,9 +78,9 @@ def begin(chosen: GaussianFit, photos: Photos, plan: GaussianPlan) -> Begun:
     channels = 4 if all(view.alpha is not None for view in views) else 3
     sizes = {stage.shrink for stage in plan.stages}
     taken = sum(view.image.size // 3 * channels // shrink**2 for view in views for shrink in sizes)
-    memory = memory_of(replace(plan, start=len(places)), taken, pixels)
+    memory = check_memory(replace(plan, start=len(places)), taken, pixels)
     batches = RayBatches.of(views, [stage.shrink for stage in plan.stages])
-    cloud = begin_at(places, views, plan.stages[0].degree)
+    cloud = make_start_cloud(places, views, plan.stages[0].degree)
     return Begun(views, plan, batches, cloud, choices(plan, photos, len(places), whence, memory, plan.minutes(largest)))
 
 

@@ -13,7 +13,7 @@ from mivol.config import GaussianFit, PhotoFit
 from mivol.errors import MivolError
 from mivol.experiments.field_plan import LEARNED
 from mivol.optim.photographs.colour_scale import EPSILON
-from mivol.optim.strategy import nearest
+from mivol.optim.strategy import suggest_name
 from mivol.photos import Photos, PhotoSurvey, load_photos, survey_photos
 from mivol.photos.dataset import BACKGROUNDS, check_alpha
 from mivol.photos.region import near_and_far
@@ -29,7 +29,7 @@ def read_photos(chosen: PhotoFit, base: Path) -> tuple[Photos, Photos | None]:
     """
     wanted = chosen.photos
     if isinstance(wanted.box, str) and wanted.box not in BOXES:
-        raise MivolError(f'photos.box = "{wanted.box}" is unknown: {nearest(wanted.box, list(BOXES))}')
+        raise MivolError(f'photos.box = "{wanted.box}" is unknown: {suggest_name(wanted.box, list(BOXES))}')
     box = "middle" if wanted.background == "nested" and wanted.box == "found" else wanted.box
     settings: dict[str, Any] = {
         "scale": wanted.scale,
@@ -74,7 +74,7 @@ def check_background(chosen: PhotoFit, has_alpha: bool) -> None:
     if not isinstance(word, str) or word in ("", *known):
         return
     if word not in (*BACKGROUNDS, *LEARNED):
-        raise MivolError(f'photos.background = "{word}" is unknown: {nearest(word, known)}')
+        raise MivolError(f'photos.background = "{word}" is unknown: {suggest_name(word, known)}')
     kind = "photographs with alpha" if has_alpha else "photographs without alpha"
     if word in LEARNED and isinstance(chosen, GaussianFit):
         kind = "Gaussians"

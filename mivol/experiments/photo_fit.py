@@ -21,7 +21,7 @@ from mivol.experiments.photo_data import boxed, notes, read_photos
 from mivol.experiments.photo_outputs import PhotoOutputs, compare, save_found
 from mivol.experiments.run_folder import BestIterate, FilesOfBest, RunFolder
 from mivol.experiments.task import Task
-from mivol.optim.checkpoint import Store
+from mivol.optim.checkpoint import CheckpointFile
 from mivol.optim.events import Checkpoint
 from mivol.optim.loop import Fit, begin_fit
 from mivol.optim.photographs.radiance_problem import RadianceProblem
@@ -105,18 +105,20 @@ def solve(
     """
     chosen: PhotoFit = task.chosen
     plan, every = problem.plan, chosen.show.every
-    store = Store(run.checkpoint, {"photos": problem.batches.digest(), **config.flat(config.resolved(chosen))}, task.resume)
-    fit = begin_fit(problem, plan.optimiser, plan.course(Checkpoint(every=chosen.checkpoint_every)), store=store)
+    store = CheckpointFile(
+        run.checkpoint, {"photos": problem.batches.digest(), **config.flat(config.resolved(chosen))}, task.resume
+    )
+    fit = begin_fit(problem, plan.optimizer, plan.course(Checkpoint(every=chosen.checkpoint_every)), checkpoint=store)
     best.restore()
-    run.begin(fit.next)
+    run.begin(fit.next_iteration)
     with task.watcher.watch(plan.steps) as watch:
 
         def observe(fit: Fit) -> None:
-            if fit.next % every == 0 or fit.next == plan.steps:
-                problem.set(fit.run.reals)
+            if fit.next_iteration % every == 0 or fit.next_iteration == plan.steps:
+                problem.set_reals(fit.run.reals)
                 errors = judge_few(chosen, problem, judged, compare)
-                best.see(fit.next, errors)
-                run.append(fit.next, fit.seconds, loss=fit.history[-1]["loss"], **errors)
+                best.see(fit.next_iteration, errors)
+                run.append(fit.next_iteration, fit.seconds, loss=fit.history[-1]["loss"], **errors)
             watch(fit)
 
         fit.complete(observe)

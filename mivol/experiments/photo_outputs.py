@@ -65,7 +65,7 @@ class PhotoOutputs:
         record.volumes += [write_density(folder, field.level(number), number) for number in range(field.levels)]
         record.results = {
             "views": float(len(self.photos.views)),
-            "iterations": float(self.fit.next),
+            "iterations": float(self.fit.next_iteration),
             "nodes": float(field.rows - (field.nodes is not None)),
             "bytes": field.bytes / 2**20,
         }

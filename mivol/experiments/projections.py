@@ -17,7 +17,7 @@ from mivol.files import read_columns, read_volume
 from mivol.files.fetch import resolve_path
 from mivol.machine import check_fits
 from mivol.optim.projections.linear_problems import PoissonCounts
-from mivol.optim.projections.solvers import METHODS
+from mivol.optim.projections.solvers import ALL_SOLVERS
 from mivol.shown import briefly
 from mivol.tomography.fan_axis import axis_from_fans, offset_of_cone
 from mivol.tomography.geometry import ConeBeam, FlatDetector, ParallelBeam, VoxelGrid
@@ -221,7 +221,7 @@ def read_measured(chosen: config.Scan, base: Path) -> Projections:
         geometry = place_beam(chosen, base, np.arange(0) if angles is None else angles, y.shape[1:], offset)
     if geometry.shape != y.shape:
         raise MivolError(f"found {len(y)} projections and a geometry of {geometry.shape[0]} views, expected as many.")
-    quanta = quanta_of(chosen, found) if METHODS[chosen.solve.solver].problem is PoissonCounts else None
+    quanta = quanta_of(chosen, found) if ALL_SOLVERS[chosen.solve.solver].problem is PoissonCounts else None
     return Projections(geometry, y, weights, quanta=quanta, notes=tuple(notes), is_noise_known=found.intensity is not None)
 
 

@@ -22,7 +22,7 @@ from mivol.files import write_exr, write_png
 from mivol.files.atomic import check_destination
 from mivol.files.source import check_file
 from mivol.optim.photographs.field_view import render_view
-from mivol.optim.scenes.views import seed_of
+from mivol.optim.scenes.views import derive_seed
 from mivol.photos import Camera, aim_camera, intrinsics
 from mivol.photos.photo_file import decode_srgb
 from mivol.points.cloud import PointCloud, read_points
@@ -100,7 +100,7 @@ def render_image(
     total = 0.0
     for number in range(n):
         part = spp // n + (number < spp % n)
-        root = seed_of(seed, number) if n > 1 else seed
+        root = derive_seed(seed, number) if n > 1 else seed
         total = total + part * np.asarray(integrator.render(scene, camera, seed=root, spp=part), dtype=np.float64)
     image = total / spp
     aovs = list(integrator.aov_names())

@@ -29,12 +29,12 @@ from mivol.experiments.solver_choice import (
     strength_of,
 )
 from mivol.experiments.task import Task
-from mivol.optim.checkpoint import Store
+from mivol.optim.checkpoint import CheckpointFile
 from mivol.optim.events import Checkpoint
 from mivol.optim.loop import Course, Fit, begin_fit
-from mivol.optim.projections.inversion import Inversion, Solve, fit_drift
-from mivol.optim.projections.linear_problems import LeastSquares, PoissonCounts, State, noise_norm
-from mivol.optim.projections.solvers import DIRECT, METHODS
+from mivol.optim.projections.inversion import LinearSolve, ProjectionProblem, fit_drift
+from mivol.optim.projections.linear_problems import LeastSquares, PoissonCounts, SolverState, expected_residual_norm
+from mivol.optim.projections.solvers import ALL_SOLVERS, DIRECT
 from mivol.report.page import write_page
 from mivol.report.pixel_scale import is_preview_due, write_preview
 from mivol.report.record import PlanLine, RunRecord
@@ -91,7 +91,9 @@ def scan_fit(task: Task) -> Path:
             run.record.results = {"iterations": float(state.iteration), "residual": residual}
             run.record.plan += plan_of_prior(problem.linear_problem.prior, state)
             if data.is_noise_known:
-                run.record.results["discrepancy"] = state.residual_norm / noise_norm(problem.linear_problem, chosen.solve.name)
+                run.record.results["discrepancy"] = state.residual_norm / expected_residual_norm(
+                    problem.linear_problem, chosen.solve.name
+                )
             data = without_drift(problem, data, held_out, state)
         with run.stage("images and volumes"):
             write_outputs(run, projector, grid, data, held_out, state.x.reshape(projector.grid.shape))
@@ -136,7 +138,7 @@ def make_projector(chosen: config.Scan, data: Projections, grid: VoxelGrid) -> P
     return Projector(data.geometry, unknowns)
 
 
-def make_problem(chosen: config.Scan, projector: Projector, data: Projections, kept: np.ndarray) -> Inversion:
+def make_problem(chosen: config.Scan, projector: Projector, data: Projections, kept: np.ndarray) -> ProjectionProblem:
     """What the solver minimises, over the views that are fitted.
 
     Raises:
@@ -146,13 +148,13 @@ def make_problem(chosen: config.Scan, projector: Projector, data: Projections, k
     a = projector.subset(kept)
     prior = make_prior(wanted, a, data, kept)
     x0 = start_volume(wanted, a, data, kept)
-    if METHODS[wanted.name].problem is LeastSquares:
+    if ALL_SOLVERS[wanted.name].problem is LeastSquares:
         least_squares = LeastSquares(a, data.y[kept], data.weights[kept], x0, wanted.nonnegative, prior)
-        return Inversion(least_squares, times=times_of(data)[kept] if getattr(chosen.data, "drift", 0) else None)
+        return ProjectionProblem(least_squares, times=times_of(data)[kept] if getattr(chosen.data, "drift", 0) else None)
     if data.quanta is None:
         raise MivolError("ml-tr needs counts of quanta, found line integrals: simulate with photons, or choose pcg.")
     quanta = data.quanta.of_views(kept)
-    return Inversion(PoissonCounts(a, quanta.counts, quanta.blank, quanta.background, x0, prior, quanta.used))
+    return ProjectionProblem(PoissonCounts(a, quanta.counts, quanta.blank, quanta.background, x0, prior, quanta.used))
 
 
 def times_of(data: Projections) -> np.ndarray:
@@ -160,7 +162,7 @@ def times_of(data: Projections) -> np.ndarray:
     return np.linspace(-1.0, 1.0, len(data.y))
 
 
-def without_drift(problem: Inversion, data: Projections, held_out: np.ndarray, state: State) -> Projections:
+def without_drift(problem: ProjectionProblem, data: Projections, held_out: np.ndarray, state: SolverState) -> Projections:
     """Line integrals of the object alone, the drift of the light fitted to the views that are not held out."""
     if problem.times is None:
         return data
@@ -181,7 +183,9 @@ def start_volume(wanted: config.Solve, a: Projector, data: Projections, kept: np
     return np.maximum(x, 0) if wanted.nonnegative else x
 
 
-def solve(task: Task, run: RunFolder, problem: Inversion, data: Projections, grid: VoxelGrid, best: BestIterate) -> State:
+def solve(
+    task: Task, run: RunFolder, problem: ProjectionProblem, data: Projections, grid: VoxelGrid, best: BestIterate
+) -> SolverState:
     """All iterations, with metrics and checkpoints; where the solver stands after them.
 
     Raises:
@@ -189,11 +193,11 @@ def solve(task: Task, run: RunFolder, problem: Inversion, data: Projections, gri
     """
     chosen: config.Scan = task.chosen
     course = Course(chosen.solve.iterations, events=(Checkpoint(every=chosen.checkpoint_every),))
-    store = Store(run.checkpoint, {"data": data.digest(), **config.flat(run.record.config)}, task.resume)
+    store = CheckpointFile(run.checkpoint, {"data": data.digest(), **config.flat(run.record.config)}, task.resume)
     noise = noise_of(chosen, problem, data)
-    fit = begin_fit(problem, make_solver(chosen, noise), course, store=store)
+    fit = begin_fit(problem, make_solver(chosen, noise), course, checkpoint=store)
     best.restore()
-    run.begin(fit.next)
+    run.begin(fit.next_iteration)
     with task.watcher.watch(course.iterations) as watch:
 
         def observe(fit: Fit) -> None:
@@ -203,19 +207,19 @@ def solve(task: Task, run: RunFolder, problem: Inversion, data: Projections, gri
                 errors["nrmse"] = nrmse(volume, data.truth)
             if noise:
                 errors["discrepancy"] = fit.run.state.residual_norm / noise
-            run.append(fit.next, fit.seconds, loss=fit.history[-1]["loss"], **errors)
-            best.see(fit.next, errors, {"volume": volume})
-            if is_preview_due(fit.next, course.iterations):
+            run.append(fit.next_iteration, fit.seconds, loss=fit.history[-1]["loss"], **errors)
+            best.see(fit.next_iteration, errors, {"volume": volume})
+            if is_preview_due(fit.next_iteration, course.iterations):
                 write_preview(run.path, volume, tuple(grid.extent))
             watch(fit)
 
         fit.complete(observe)
-    if fit.run.finished and fit.next < course.iterations:
-        run.record.notes.append(f"stopped after iteration {fit.next} of {course.iterations}: {fit.run.finished}")
+    if fit.run.stop_reason and fit.next_iteration < course.iterations:
+        run.record.notes.append(f"stopped after iteration {fit.next_iteration} of {course.iterations}: {fit.run.stop_reason}")
     return fit.run.state
 
 
-def noise_of(chosen: config.Scan, problem: Inversion, data: Projections) -> float | None:
+def noise_of(chosen: config.Scan, problem: ProjectionProblem, data: Projections) -> float | None:
     """The norm of the residual that noise alone would leave; None where the noise is not known.
 
     Raises:
@@ -223,16 +227,16 @@ def noise_of(chosen: config.Scan, problem: Inversion, data: Projections) -> floa
     """
     if chosen.solve.discrepancy:
         check_noise("solve.discrepancy", data)
-    return noise_norm(problem.linear_problem, chosen.solve.name) if data.is_noise_known else None
+    return expected_residual_norm(problem.linear_problem, chosen.solve.name) if data.is_noise_known else None
 
 
-def make_solver(chosen: config.Scan, noise: float | None) -> Solve:
+def make_solver(chosen: config.Scan, noise: float | None) -> LinearSolve:
     """The solver with its settings, which stops by the noise where that is asked for."""
     wanted = chosen.solve
     shared = {name: getattr(wanted, name) for name in ("subsets", "relaxation", "decay", "window", "cutoff")}
     if wanted.discrepancy:
         shared["stop_norm"] = wanted.discrepancy * noise
-    return Solve(solver=wanted.name, drift=getattr(chosen.data, "drift", 0), **shared)
+    return LinearSolve(solver=wanted.name, drift=getattr(chosen.data, "drift", 0), **shared)
 
 
 def norm_of(task: LeastSquares | PoissonCounts) -> float:

@@ -29,13 +29,13 @@ from mivol.experiments.run_folder import BestIterate, RunFolder
 from mivol.experiments.scene_outputs import SceneOutputs
 from mivol.experiments.start import Start, make_starts, place_of
 from mivol.experiments.task import Task
-from mivol.optim.checkpoint import Store
+from mivol.optim.checkpoint import CheckpointFile
 from mivol.optim.events import upsample
 from mivol.optim.loop import Course, Fit, begin_fit
 from mivol.optim.parameters import check_names
 from mivol.optim.scenes.emissive_start import find_emissive_start
 from mivol.optim.scenes.scene_problem import SceneProblem
-from mivol.optim.scenes.views import HELD_OUT, RenderBatch, make_batches, seed_of
+from mivol.optim.scenes.views import HELD_OUT, RenderBatch, derive_seed, make_batches
 from mivol.report.page import write_page
 from mivol.report.record import PlanLine, RunRecord
 from mivol.scene.depth_preview import measure_depths
@@ -152,7 +152,7 @@ def make_problem(
     settings = {"spp": chosen.fit.spp, "samples_per_pass": chosen.fit.samples_per_pass, "seed": chosen.seed}
     parameters = [start.parameter for start in starts]
     problem = SceneProblem(scene, seen.fitted, parameters, integrator, chosen.loss, **settings)
-    problem.set(problem.start())
+    problem.set_reals(problem.initial_reals())
     return problem
 
 
@@ -169,7 +169,7 @@ def improve_starts(task: Task, run: RunFolder, problem: SceneProblem) -> list[st
     for key in asked:
         found = find_emissive_start(problem, key, place_of(key, problem.scene), chosen.optimiser, chosen.seed)
         put(problem.params, key, found.value)
-        problem.set(problem.start())
+        problem.set_reals(problem.initial_reals())
         notes.append(f"{key} {found.text}")
     task.watcher.say(notes)
     return notes
@@ -182,20 +182,20 @@ def solve(
     chosen: Experiment = task.chosen
     course = Course(chosen.fit.iterations, chosen.schedule, chosen.event)
     digests = {"scene": loaded.content_hash, "references": measure.seen.digest()}
-    store = Store(run.checkpoint, digests | config.flat(config.resolved(chosen)), task.resume)
+    store = CheckpointFile(run.checkpoint, digests | config.flat(config.resolved(chosen)), task.resume)
 
     def judge(problem: SceneProblem) -> dict[str, float]:
         errors = measure(problem)
-        best.see(fit.next, errors, problem.values())
+        best.see(fit.next_iteration, errors, problem.values())
         return errors
 
     def observe(fit: Fit) -> None:
         write_metrics(run, fit)
         watch(fit)
 
-    fit = begin_fit(problem, chosen.optimiser, course, measure=judge, store=store)
+    fit = begin_fit(problem, chosen.optimiser, course, measure=judge, checkpoint=store)
     best.restore()
-    run.begin(fit.next - 1)
+    run.begin(fit.next_iteration - 1)
     with task.watcher.watch(chosen.fit.iterations) as watch:
         fit.complete(observe)
     append_last(run, fit)
@@ -205,15 +205,15 @@ def solve(
 def write_metrics(run: RunFolder, fit: Fit) -> None:
     """One line for the iteration that has just ended, with what was measured before it."""
     last = fit.history[-1]
-    measured = fit.newest_errors() if fit.measures and fit.measures[-1]["iteration"] == last["iteration"] else {}
+    measured = fit.latest_errors() if fit.evaluations and fit.evaluations[-1]["iteration"] == last["iteration"] else {}
     run.append(last["iteration"], last["seconds"], loss=last["loss"], **measured)
 
 
 def append_last(run: RunFolder, fit: Fit) -> None:
     """What was measured after the last iteration, once however often a run that is done is resumed."""
-    run.rewind(fit.next - 1)
-    if fit.measures and fit.measures[-1]["iteration"] == fit.next and len(fit.measures[-1]) > 2:
-        run.append(**fit.measures[-1])
+    run.rewind(fit.next_iteration - 1)
+    if fit.evaluations and fit.evaluations[-1]["iteration"] == fit.next_iteration and len(fit.evaluations[-1]) > 2:
+        run.append(**fit.evaluations[-1])
 
 
 class SceneErrors:
@@ -239,7 +239,7 @@ class SceneErrors:
 
     def psnr(self, problem: SceneProblem, batch: RenderBatch) -> list[float]:
         """PSNR [dB] of each view of a batch, of what the scene holds now."""
-        image = np.asarray(problem.render(batch.sensor, seed_of(problem.seed, 0, 0, HELD_OUT), self.spp))
+        image = np.asarray(problem.render(batch.sensor, derive_seed(problem.seed, 0, 0, HELD_OUT), self.spp))
         pairs = zip(np.split(image, batch.n_views, 1), np.split(np.asarray(batch.reference), batch.n_views, 1), strict=True)
         return [psnr(render, reference) for render, reference in pairs]
 

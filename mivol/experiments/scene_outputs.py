@@ -22,7 +22,7 @@ from mivol.experiments.start import edges_of, place_of, unit_of
 from mivol.files import write_exr, write_png, write_volume
 from mivol.optim.loop import Fit
 from mivol.optim.parameters import GRID
-from mivol.optim.scenes.views import FINAL, View, seed_of
+from mivol.optim.scenes.views import FINAL, View, derive_seed
 from mivol.report.record import Image, Volume
 from mivol.validate.moments import BATCHES, Moments
 
@@ -56,7 +56,7 @@ class SceneOutputs:
                 f"PSNR of the held-out views is the mean over {len(self.seen.held_out)} of them, the same at each point of the "
                 "curve; the peak is the largest value of each reference."
             )
-        record.notes += fit.log + ([f"stopped early: {fit.run.finished}"] if fit.run.finished else []) + self.best.says()
+        record.notes += fit.log + ([f"stopped early: {fit.run.stop_reason}"] if fit.run.stop_reason else []) + self.best.says()
         for number, view in enumerate((*self.seen.fitted, *self.seen.held_out)):
             record.images += self.write_view(view, number)
         for sought in self.chosen.parameter:
@@ -66,9 +66,9 @@ class SceneOutputs:
         record.images += pictures_of_views(self.run.path, fit.problem.scene, views)
         self.run.write_curves()
         record.results = {
-            **fit.newest_errors(),
+            **fit.latest_errors(),
             "loss": fit.history[-1]["loss"],
-            "iterations": float(fit.next),
+            "iterations": float(fit.next_iteration),
             "views": float(len(self.seen.fitted)),
             "fit_seconds": fit.seconds,
         }
@@ -82,9 +82,9 @@ class SceneOutputs:
         render, spp = self.fit.problem.render, self.chosen.fit.spp_shown or self.chosen.fit.spp
         seed, error = (self.chosen.seed, 0, number, FINAL), self.seen.standard_errors.get(view.name)
         if error is None:
-            return np.asarray(render(view.sensor, seed_of(*seed), spp)), None
+            return np.asarray(render(view.sensor, derive_seed(*seed), spp)), None
         share = math.ceil(spp / BATCHES)
-        batches = Moments.of_each(render(view.sensor, seed_of(*seed, batch), share) for batch in range(BATCHES))
+        batches = Moments.of_each(render(view.sensor, derive_seed(*seed, batch), share) for batch in range(BATCHES))
         return batches.mean.astype(np.float32), np.sqrt(np.square(error) + batches.variance_of_mean).astype(np.float32)
 
     def write_view(self, view: View, number: int) -> list[Image]:

@@ -25,8 +25,8 @@ from mivol.files import read_exr, stack_layers
 from mivol.optim.first_order import Adam
 from mivol.optim.loop import Fit, Measure, reconstruct
 from mivol.optim.losses import L2, Loss
-from mivol.optim.optimizer import Optimiser
-from mivol.optim.optimizers import as_optimiser
+from mivol.optim.optimizer import Optimizer
+from mivol.optim.optimizers import to_optimizer
 from mivol.optim.parameters import Parameter
 from mivol.optim.scenes.scene_problem import SceneProblem
 from mivol.optim.scenes.views import View
@@ -160,7 +160,7 @@ def picture(reference: Reference) -> mi.TensorXf:
 
 def optimize(
     problem: SceneProblem,
-    optimiser: Optimiser | mi.ad.Optimizer | None = None,
+    optimiser: Optimizer | mi.ad.Optimizer | None = None,
     iterations: int = 100,
     *,
     measure: Measure | None = None,
@@ -182,7 +182,7 @@ def optimize(
         MivolError: a loss that is not finite, or what cannot be rendered.
         KeyboardInterrupt: Ctrl-C; the scene holds what was found so far.
     """
-    return reconstruct(problem, as_optimiser(optimiser or Adam()), iterations, measure=measure, observer=observer)
+    return reconstruct(problem, to_optimizer(optimiser or Adam()), iterations, measure=measure, observer=observer)
 
 
 def explain(

@@ -19,11 +19,11 @@ from mivol.config import AUTO
 from mivol.errors import MivolError
 from mivol.experiments.projections import Projections
 from mivol.machine import check_fits
-from mivol.optim.projections.inversion import Inversion
+from mivol.optim.projections.inversion import ProjectionProblem
 from mivol.optim.projections.iterative import projected_cg
-from mivol.optim.projections.linear_problems import State, noise_norm
-from mivol.optim.projections.smoothed_tv import SmoothedTV, tv_of_noise
-from mivol.optim.projections.solvers import DIRECT, METHODS
+from mivol.optim.projections.linear_problems import SolverState, expected_residual_norm
+from mivol.optim.projections.smoothed_tv import SmoothedTV, scale_tv_to_noise
+from mivol.optim.projections.solvers import ALL_SOLVERS, DIRECT
 from mivol.report.record import PlanLine
 from mivol.tomography.filtered import check_directions
 from mivol.tomography.geometry import VoxelGrid
@@ -58,7 +58,7 @@ def settle_solver(wanted: config.Solve, walk: Projector) -> tuple[config.Solve, 
     parts, parts_line = settle_supersampling(wanted, walk)
     settled = msgspec.structs.replace(wanted, name=name, tv=strength_of(wanted), start=start, supersampling=parts)
     by_table = "the least error of few, noisy and many views in the table of docs/benchmarks.md"
-    reason = by_table if wanted.name == AUTO else METHODS[name].promises
+    reason = by_table if wanted.name == AUTO else ALL_SOLVERS[name].promises
     return settled, [PlanLine(choice=f"solver: {name}", reason=reason), *start_line, *parts_line]
 
 
@@ -115,7 +115,7 @@ class Storage:
     is_stored: bool
     line: PlanLine
 
-    def apply(self, problem: Inversion) -> None:
+    def apply(self, problem: ProjectionProblem) -> None:
         """Give the solver's problem the operator that was chosen."""
         if self.is_stored:
             problem.linear_problem = replace(problem.linear_problem, A=store(problem.linear_problem.A))
@@ -173,10 +173,10 @@ def make_prior(wanted: config.Solve, a: Projector, data: Projections, kept: np.n
         return None
     if wanted.tv_unit == "length":
         return SmoothedTV(a.grid.shape, wanted.tv, wanted.delta, a.grid.voxel_size)
-    return tv_of_noise(a, data.y[kept], data.weights[kept], wanted.tv, wanted.delta)
+    return scale_tv_to_noise(a, data.y[kept], data.weights[kept], wanted.tv, wanted.delta)
 
 
-def settle_noise(problem: Inversion, wanted: config.Solve, data: Projections) -> list[PlanLine]:
+def settle_noise(problem: ProjectionProblem, wanted: config.Solve, data: Projections) -> list[PlanLine]:
     """Where a prior's unit is a noise that is not known: take what a few iterations without a prior leave, and begin there.
 
     Variances are ``s^2 / w`` then, and s is found. Least squares with weights w need ``s^2`` times the strength that goes with
@@ -189,14 +189,14 @@ def settle_noise(problem: Inversion, wanted: config.Solve, data: Projections) ->
     *_, state = (None, *itertools.islice(projected_cg(replace(task, prior=None)), n))
     if state is None:
         return []
-    left = state.residual_norm / noise_norm(task, "pcg")
+    left = state.residual_norm / expected_residual_norm(task, "pcg")
     prior = replace(task.prior, strength=left * task.prior.strength)
     problem.linear_problem = replace(task, x0=state.x, prior=prior)
     reason = f"the projections have none that is known: this is what {n} iterations without total variation leave of them"
     return [PlanLine(choice=f"noise: {left:.4g} times what the weights say", reason=reason)]
 
 
-def plan_of_prior(prior: SmoothedTV | None, state: State) -> list[PlanLine]:
+def plan_of_prior(prior: SmoothedTV | None, state: SolverState) -> list[PlanLine]:
     """How strong the prior was, and what it did."""
     if prior is None:
         return []

@@ -22,7 +22,7 @@ from mivol.errors import MivolError
 from mivol.experiments.references import put
 from mivol.files import write_whole_text
 from mivol.optim.parameters import as_tensor, find
-from mivol.optim.scenes.views import seed_of
+from mivol.optim.scenes.views import derive_seed
 from mivol.report import figures
 from mivol.scene.explain import settings_of
 from mivol.scene.load import LoadedScene
@@ -188,7 +188,7 @@ def render_batches(scene: mi.Scene, camera: mi.Sensor, integrator: mi.Integrator
     """Independent renders of the colour channels."""
     spp = math.ceil(chosen.spp / BATCHES)
     with dr.suspend_grad():
-        seeds = (seed_of(chosen.seed, IMAGE, batch) for batch in range(BATCHES))
+        seeds = (derive_seed(chosen.seed, IMAGE, batch) for batch in range(BATCHES))
         return Moments.of_each(integrator.render(scene, camera, seed=seed, spp=spp) for seed in seeds)
 
 
@@ -214,7 +214,7 @@ def check_gradient(
     mean = MeanRadiance(scene, camera, ours, key, math.ceil(chosen.spp / BATCHES))
     slopes, near, far = Moments.empty(), Moments.empty(), Moments.empty()
     for batch in range(BATCHES):
-        seeds = [seed_of(chosen.seed, GRADIENT, batch, which) for which in range(4)]
+        seeds = [derive_seed(chosen.seed, GRADIENT, batch, which) for which in range(4)]
         slopes = slopes.add(mean.slope(direction, seeds[0], seeds[1]))
         near = near.add(mean.difference(start, STEP * direction, seeds[2]) / STEP)
         far = far.add(mean.difference(start, 2 * STEP * direction, seeds[3]) / (2 * STEP))

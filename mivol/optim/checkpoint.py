@@ -31,7 +31,7 @@ GROWING = ("fit.iterations", "solve.iterations")
 
 
 @dataclass(frozen=True)
-class Store:
+class CheckpointFile:
     """Where a run is kept, and what tells it from others.
 
     Attributes:

@@ -13,23 +13,23 @@ import mitsuba as mi
 import numpy as np
 
 from mivol.errors import MivolError
-from mivol.optim.optimizer import Run
+from mivol.optim.optimizer import OptimizerRun
 from mivol.optim.problem import Problem
-from mivol.optim.strategy import Strategy, of, table
+from mivol.optim.strategy import Strategy, make_table, setting
 
 
-class FitAtWork(Protocol):
+class RunningFit(Protocol):
     """What an event may know and do of a fit.
 
     Attributes:
         problem: what is minimised.
         run: the optimiser at work, with the reals.
-        next: the iteration that comes after the event.
+        next_iteration: the iteration that comes after the event.
     """
 
     problem: Problem
-    run: Run
-    next: int
+    run: OptimizerRun
+    next_iteration: int
 
     def save(self) -> None:
         """Write the checkpoint."""
@@ -69,7 +69,7 @@ class Event(Strategy, tag="event"):
         """Whether it happens before this iteration."""
         raise NotImplementedError
 
-    def apply(self, fit: FitAtWork) -> str:
+    def apply(self, fit: RunningFit) -> str:
         """Let it happen; what a reader of the report must know, or ""."""
         raise NotImplementedError
 
@@ -87,18 +87,18 @@ def check_for_grids(count: int) -> None:
 class Upsample(Event, tag="upsample"):
     """Refine every grid: coarse first, since large structures converge there in few cheap steps."""
 
-    at: Annotated[tuple[int, ...], of("iteration", "before which iterations")]
-    factor: Annotated[int, of("1", "new voxels per old one and axis", ge=2, le=8)] = 2
+    at: Annotated[tuple[int, ...], setting("iteration", "before which iterations")]
+    factor: Annotated[int, setting("1", "new voxels per old one and axis", ge=2, le=8)] = 2
 
     def due(self, iteration: int) -> bool:
         return iteration in self.at
 
-    def apply(self, fit: FitAtWork) -> str:
+    def apply(self, fit: RunningFit) -> str:
         shapes = [self._refine(fit, p) for p in fit.problem.parameters if fit.run.reals[p.name].ndim == 4]
         check_for_grids(len(shapes))
         return "refined to " + ", ".join(" x ".join(str(n) for n in shape) for shape in shapes)
 
-    def _refine(self, fit: FitAtWork, parameter: object) -> tuple[int, int, int]:
+    def _refine(self, fit: RunningFit, parameter: object) -> tuple[int, int, int]:
         value = parameter.from_reals(fit.run.reals[parameter.name])
         shape = tuple(n * self.factor for n in value.shape[:3])
         fit.run.replace(parameter.name, parameter.project(parameter.to_reals(upsample(dr.detach(value), shape))))
@@ -108,38 +108,38 @@ class Upsample(Event, tag="upsample"):
 class CoarseToFine(Event, tag="coarse_to_fine"):
     """Begin the next stage of a problem that has stages: finer unknowns, and only where something was found."""
 
-    at: Annotated[tuple[int, ...], of("iteration", "before which the second stage begins, the third, ...")]
+    at: Annotated[tuple[int, ...], setting("iteration", "before which the second stage begins, the third, ...")]
 
     def due(self, iteration: int) -> bool:
         return iteration in self.at
 
-    def apply(self, fit: FitAtWork) -> str:
-        return _go_over(fit, 1 + self.at.index(fit.next))
+    def apply(self, fit: RunningFit) -> str:
+        return _go_over(fit, 1 + self.at.index(fit.next_iteration))
 
 
 class DropUnseen(Event, tag="drop_unseen"):
     """Go on without the unknowns of a stage that nothing sees: what is left takes less time and memory."""
 
-    at: Annotated[tuple[int, ...], of("iteration", "before which iterations")]
+    at: Annotated[tuple[int, ...], setting("iteration", "before which iterations")]
 
     def due(self, iteration: int) -> bool:
         return iteration in self.at
 
-    def apply(self, fit: FitAtWork) -> str:
+    def apply(self, fit: RunningFit) -> str:
         return _go_over(fit, fit.problem.stage)
 
 
-def _go_over(fit: FitAtWork, stage: int) -> str:
+def _go_over(fit: RunningFit, stage: int) -> str:
     """Begin a stage, or the one at work anew; what it says.
 
     Dr.Jit keeps arrays that were let go for others of their size, rounded up to a power of two. Those of the last steps are of
     no use to what comes between, nor those to the next steps.
     """
     dr.flush_malloc_cache()
-    fit.problem.set(fit.run.reals)
+    fit.problem.set_reals(fit.run.reals)
     refinement = fit.problem.refine(stage)
     fit.run.refine(refinement)
-    says = refinement.says
+    says = refinement.message
     del refinement  # holds the old unknowns
     dr.flush_malloc_cache()
     return says
@@ -148,13 +148,13 @@ def _go_over(fit: FitAtWork, stage: int) -> str:
 class UpdateOccupancy(Event, tag="update_occupancy"):
     """Let a problem look again for what the next steps can leave out without a change: cells that have become empty."""
 
-    every: Annotated[int, of("iteration", "how often", ge=1)] = 64
+    every: Annotated[int, setting("iteration", "how often", ge=1)] = 64
 
     def due(self, iteration: int) -> bool:
         return iteration > 0 and iteration % self.every == 0
 
-    def apply(self, fit: FitAtWork) -> str:
-        fit.problem.set(fit.run.reals)
+    def apply(self, fit: RunningFit) -> str:
+        fit.problem.set_reals(fit.run.reals)
         fit.problem.update_occupancy()
         return ""
 
@@ -162,29 +162,29 @@ class UpdateOccupancy(Event, tag="update_occupancy"):
 class ControlDensity(Event, tag="control_density"):
     """Let a problem have more Gaussians where the pictures need them, and fewer where nobody sees them."""
 
-    every: Annotated[int, of("iteration", "how often", ge=1)] = 100
-    begin: Annotated[int, of("iteration", "before which it is first done", ge=1)] = 500
-    end: Annotated[int, of("iteration", "from which on it is not done", ge=1)] = 15000
+    every: Annotated[int, setting("iteration", "how often", ge=1)] = 100
+    begin: Annotated[int, setting("iteration", "before which it is first done", ge=1)] = 500
+    end: Annotated[int, setting("iteration", "from which on it is not done", ge=1)] = 15000
 
     def due(self, iteration: int) -> bool:
         return self.begin <= iteration < self.end and iteration % self.every == 0
 
-    def apply(self, fit: FitAtWork) -> str:
-        fit.problem.set(fit.run.reals)
-        refinement = fit.problem.control_density(fit.next)
+    def apply(self, fit: RunningFit) -> str:
+        fit.problem.set_reals(fit.run.reals)
+        refinement = fit.problem.control_density(fit.next_iteration)
         fit.run.refine(refinement)
-        return refinement.says
+        return refinement.message
 
 
 class Checkpoint(Event, tag="checkpoint"):
     """Write everything that the next iteration depends on."""
 
-    every: Annotated[int, of("iteration", "how often", ge=1)] = 10
+    every: Annotated[int, setting("iteration", "how often", ge=1)] = 10
 
     def due(self, iteration: int) -> bool:
         return iteration > 0 and iteration % self.every == 0
 
-    def apply(self, fit: FitAtWork) -> str:
+    def apply(self, fit: RunningFit) -> str:
         fit.save()
         return ""
 
@@ -192,19 +192,19 @@ class Checkpoint(Event, tag="checkpoint"):
 class Evaluate(Event, tag="evaluate"):
     """Measure what the fit does not minimise: held-out views, error of the volume."""
 
-    every: Annotated[int, of("iteration", "how often", ge=1)] = 10
+    every: Annotated[int, setting("iteration", "how often", ge=1)] = 10
 
     def due(self, iteration: int) -> bool:
         return iteration % self.every == 0
 
-    def apply(self, fit: FitAtWork) -> str:
+    def apply(self, fit: RunningFit) -> str:
         fit.evaluate()
         return ""
 
 
-EVENTS = table(Upsample, CoarseToFine, DropUnseen, UpdateOccupancy, ControlDensity, Checkpoint, Evaluate)
+EVENTS = make_table(Upsample, CoarseToFine, DropUnseen, UpdateOccupancy, ControlDensity, Checkpoint, Evaluate)
 
 
-def in_order(events: tuple[Event, ...]) -> list[Event]:
+def checkpoints_first(events: tuple[Event, ...]) -> list[Event]:
     """Checkpoints first, so that they hold the state before the others."""
     return sorted(events, key=lambda event: not isinstance(event, Checkpoint))

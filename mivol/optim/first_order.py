@@ -15,9 +15,9 @@ import mitsuba as mi
 import numpy as np
 
 from mivol.errors import MivolError
-from mivol.optim.optimizer import FirstOrder, Run
-from mivol.optim.problem import Differentiable, Reals, Refinement
-from mivol.optim.strategy import of
+from mivol.optim.optimizer import FirstOrder, OptimizerRun
+from mivol.optim.problem import DifferentiableProblem, Reals, Refinement
+from mivol.optim.strategy import setting
 
 
 class Adam(FirstOrder, tag="adam"):
@@ -29,18 +29,18 @@ class Adam(FirstOrder, tag="adam"):
 
     cites = ("kingma_2015",)
 
-    beta_1: Annotated[float, of("1", "memory of the gradient", ge=0, lt=1)] = 0.9
-    beta_2: Annotated[float, of("1", "memory of its square", ge=0, lt=1)] = 0.999
-    epsilon: Annotated[float, of("largest gradient", "gradients well below this hardly move anything", gt=0)] = 1e-6
+    beta_1: Annotated[float, setting("1", "memory of the gradient", ge=0, lt=1)] = 0.9
+    beta_2: Annotated[float, setting("1", "memory of its square", ge=0, lt=1)] = 0.999
+    epsilon: Annotated[float, setting("largest gradient", "gradients well below this hardly move anything", gt=0)] = 1e-6
 
-    def begin(self, problem: Differentiable) -> Run:
+    def begin(self, problem: DifferentiableProblem) -> OptimizerRun:
         return AdamRun(self, problem)
 
 
-class AdamRun(Run):
+class AdamRun(OptimizerRun):
     """State: the reals, Adam's two moments and step count, and the gradient scale of the first step."""
 
-    def __init__(self, settings: Adam, problem: Differentiable) -> None:
+    def __init__(self, settings: Adam, problem: DifferentiableProblem) -> None:
         super().__init__(problem)
         self.settings = settings
         self.scale = 0.0
@@ -50,7 +50,7 @@ class AdamRun(Run):
     def step(self, iteration: int, factor: float) -> float | mi.Float:
         loss, gradients = self.problem.loss_and_gradient(self.reals, iteration, self.settings.views)
         self.scale = self.scale or max(float(dr.max(dr.abs(g.array))[0]) for g in gradients.values()) or 1.0
-        for name, rate in self.problem.rates(iteration).items():
+        for name, rate in self.problem.learning_rates(iteration).items():
             self.adam.set_learning_rate({name: rate * factor})
             dr.set_grad(self.adam[name], gradients[name] / self.scale)
         self.adam.step()
@@ -93,7 +93,7 @@ class AdamRun(Run):
         for name, value in self.reals.items():
             self.adam[name] = value
             kept, promoted, rate, _ = self.adam.state[name]
-            shrink = refinement.shrinks.get(name, 1.0)
+            shrink = refinement.derivative_factors.get(name, 1.0)
             first, second = (tensors[name].array * shrink**power for power, tensors in enumerate(moments, 1))
             self.adam.state[name] = kept, promoted, rate, (states[name][0], first, second, None)
 
@@ -118,10 +118,10 @@ class RMSprop(FirstOrder, tag="rmsprop"):
     chair at 32^3, 400 steps: 25.7 dB so, 21.0 dB with Adam's momentum). Source: Hinton 2012, lecture 6e.
     """
 
-    memory: Annotated[float, of("1", "of the running mean of squared derivatives", ge=0, lt=1)] = 0.95
-    half: Annotated[bool, of("1", "these means take half the memory, as fourth roots in half precision")] = False
+    memory: Annotated[float, setting("1", "of the running mean of squared derivatives", ge=0, lt=1)] = 0.95
+    half: Annotated[bool, setting("1", "these means take half the memory, as fourth roots in half precision")] = False
 
-    def begin(self, problem: Differentiable) -> Run:
+    def begin(self, problem: DifferentiableProblem) -> OptimizerRun:
         """Start from the values that the problem holds.
 
         Raises:
@@ -135,17 +135,17 @@ class RMSprop(FirstOrder, tag="rmsprop"):
         return RMSpropRun(self, problem)
 
 
-class RMSpropRun(Run):
+class RMSpropRun(OptimizerRun):
     """State: the reals, and the running means of their squared derivatives (0: there was none yet) as they are held."""
 
-    def __init__(self, settings: RMSprop, problem: Differentiable) -> None:
+    def __init__(self, settings: RMSprop, problem: DifferentiableProblem) -> None:
         super().__init__(problem)
         self.settings = settings
         self.squares = {name: self._held(dr.zeros(mi.TensorXf, value.shape)) for name, value in self.reals.items()}
 
     def step(self, iteration: int, factor: float) -> float | mi.Float:
         loss, slopes = self.problem.loss_and_gradient(self.reals, iteration, self.settings.views)
-        rates = self.problem.rates(iteration)
+        rates = self.problem.learning_rates(iteration)
         reals, squares = self._moved(slopes, {name: rate * factor for name, rate in rates.items()})
         del slopes  # as large as the reals, and of no more use
         # Squares and reals are sums of the same terms: scheduled here, they are evaluated in the kernels of the reals.
@@ -194,7 +194,7 @@ class RMSpropRun(Run):
         """
         self.reals = refinement.reals
         means = refinement.carry({name: self._known(held) for name, held in self.squares.items()})
-        for name, shrink in refinement.shrinks.items():
+        for name, shrink in refinement.derivative_factors.items():
             means[name] = mi.TensorXf(means[name].array * dr.opaque(mi.Float, shrink**2), means[name].shape)
         self.squares = {name: self._held(mean) for name, mean in means.items()}
         dr.eval(self.squares)

@@ -16,7 +16,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mivol.errors import MivolError
-from mivol.optim.strategy import Strategy, of, table
+from mivol.optim.strategy import Strategy, make_table, setting
 
 
 class Loss(Strategy, tag="loss"):
@@ -29,7 +29,9 @@ class Loss(Strategy, tag="loss"):
     is_squared: ClassVar[bool] = False
     unit: ClassVar[str] = ""
 
-    pairs: Annotated[bool, of("1", "take the noise of renders out of the loss, by two renders of half the samples")] = False
+    pairs: Annotated[bool, setting("1", "take the noise of renders out of the loss, by two renders of half the samples")] = (
+        False
+    )
 
     def penalty(self, image: mi.TensorXf, reference: mi.TensorXf) -> mi.TensorXf:
         """Penalty of each pixel and channel, same shape as ``image``."""
@@ -102,7 +104,7 @@ class RelativeL2(Loss, tag="relative_l2"):
     is_squared = True
     unit = "1"
 
-    floor: Annotated[float, of("radiance", "pixels darker than this count as if they were this bright", gt=0)] = 1e-2
+    floor: Annotated[float, setting("radiance", "pixels darker than this count as if they were this bright", gt=0)] = 1e-2
 
     def penalty(self, image: mi.TensorXf, reference: mi.TensorXf) -> mi.TensorXf:
         return dr.square(image - reference) / (dr.square(reference) + self.floor**2)
@@ -120,7 +122,7 @@ class Huber(Loss, tag="huber"):
     cites = ("huber_1964",)
     unit = "radiance²"
 
-    delta: Annotated[float, of("radiance", "residual at which the parabola goes over into a line", gt=0)] = 0.1
+    delta: Annotated[float, setting("radiance", "residual at which the parabola goes over into a line", gt=0)] = 0.1
 
     def penalty(self, image: mi.TensorXf, reference: mi.TensorXf) -> mi.TensorXf:
         size = dr.abs(image - reference)
@@ -147,7 +149,7 @@ class Log(Loss, tag="log"):
 
     unit = "1"
 
-    floor: Annotated[float, of("radiance", "noise of a pixel; below it the log goes on as its tangent", gt=0)] = 1e-3
+    floor: Annotated[float, setting("radiance", "noise of a pixel; below it the log goes on as its tangent", gt=0)] = 1e-3
 
     def penalty(self, image: mi.TensorXf, reference: mi.TensorXf) -> mi.TensorXf:
         seen = dr.square(dr.maximum(reference, 0.0))
@@ -155,10 +157,10 @@ class Log(Loss, tag="log"):
         return weight * dr.square(log_radiance(image, self.floor) - log_radiance(reference, self.floor))
 
 
-LOSSES = table(L1, L2, RelativeL2, Huber, Log)
+LOSSES = make_table(L1, L2, RelativeL2, Huber, Log)
 
 
-class GivenLoss(Loss, tag="given", kw_only=True):
+class FunctionLoss(Loss, tag="given", kw_only=True):
     """A function (image, reference) -> number, of one view at a time: it may look at neighbours, which views side by side would
     give it wrong ones of.
 
@@ -189,7 +191,7 @@ class GivenLoss(Loss, tag="given", kw_only=True):
         return value.array if dr.is_tensor_v(value) else value
 
 
-def as_loss(given: Loss | Callable[[mi.TensorXf, mi.TensorXf], Any]) -> Loss:
+def to_loss(given: Loss | Callable[[mi.TensorXf, mi.TensorXf], Any]) -> Loss:
     """One of LOSSES as it is, any other function of two images as a loss.
 
     Raises:
@@ -199,4 +201,4 @@ def as_loss(given: Loss | Callable[[mi.TensorXf, mi.TensorXf], Any]) -> Loss:
         return given
     if not callable(given):
         raise MivolError(f"a loss is one of mivol's or a function of image and reference, found {type(given).__name__}.")
-    return GivenLoss(function=given)
+    return FunctionLoss(function=given)

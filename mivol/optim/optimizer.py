@@ -1,8 +1,8 @@
-"""The protocols of optimisers: settings, and the run that they begin.
+"""Base classes of optimizers: the settings, and the run that they start.
 
-Conventions. An :class:`Optimiser` is a strategy (settings only); :meth:`Optimiser.begin` gives a :class:`Run`, which owns the
-reals. ``Run.step`` either completes or, when a safe point stops it, leaves the run as it was. ``pack`` and ``unpack`` hold
-everything that the next step depends on, so that a restored run continues to the last bit.
+Conventions. An :class:`Optimizer` holds settings only. :meth:`Optimizer.begin` returns an :class:`OptimizerRun`, which owns the
+reals. :meth:`OptimizerRun.step` completes or, interrupted at a safe point, leaves the run unchanged. ``pack`` returns and
+``unpack`` restores all inputs of the next step, so a restored run continues with the same bits.
 """
 
 from __future__ import annotations
@@ -13,23 +13,23 @@ import mitsuba as mi
 import numpy as np
 
 from mivol.optim.problem import Problem, Reals, Refinement
-from mivol.optim.strategy import Strategy, of
+from mivol.optim.strategy import Strategy, setting
 
 
-class Run:
+class OptimizerRun:
     """An optimiser at work.
 
     Attributes:
         problem: what is minimised.
         reals: the newest point.
-        finished: why there is nothing left to gain, or "".
+        stop_reason: why there is nothing left to gain, or "".
     """
 
-    finished = ""
+    stop_reason = ""
 
     def __init__(self, problem: Problem) -> None:
         self.problem = problem
-        self.reals: Reals = problem.start()
+        self.reals: Reals = problem.initial_reals()
 
     def step(self, iteration: int, factor: float) -> float | mi.Float | None:
         """One iteration with the learning rate times ``factor``.
@@ -57,15 +57,17 @@ class Run:
             self.replace(name, value)
 
 
-class Optimiser(Strategy, tag="optimiser"):
+class Optimizer(Strategy, tag="optimiser"):
     """Settings of a minimisation."""
 
-    def begin(self, problem: Problem) -> Run:
+    def begin(self, problem: Problem) -> OptimizerRun:
         """Start from the values that the problem holds."""
         raise NotImplementedError
 
 
-class FirstOrder(Optimiser, tag="first order"):
+class FirstOrder(Optimizer, tag="first order"):
     """Settings of a minimisation along gradients, of some of the views at a time where that is asked for."""
 
-    views: Annotated[int, of("view", "views per iteration, drawn without replacement; 0 leaves it to the problem", ge=0)] = 0
+    views: Annotated[
+        int, setting("view", "views per iteration, drawn without replacement; 0 leaves it to the problem", ge=0)
+    ] = 0

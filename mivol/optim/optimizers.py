@@ -10,15 +10,15 @@ import numpy as np
 
 from mivol.errors import MivolError
 from mivol.optim.first_order import Adam, RMSprop
-from mivol.optim.optimizer import Optimiser, Run
-from mivol.optim.problem import Differentiable
+from mivol.optim.optimizer import Optimizer, OptimizerRun
+from mivol.optim.problem import DifferentiableProblem
 from mivol.optim.second_order import GaussNewton, Lbfgs
-from mivol.optim.strategy import table
+from mivol.optim.strategy import make_table
 
-OPTIMISERS = table(Adam, RMSprop, Lbfgs, GaussNewton)
+OPTIMIZERS = make_table(Adam, RMSprop, Lbfgs, GaussNewton)
 
 
-class GivenOptimiser(Optimiser, tag="given", kw_only=True):
+class MitsubaOptimizer(Optimizer, tag="given", kw_only=True):
     """An optimiser of ``mi.ad``, at the learning rate that it was made with.
 
     Its state is its own, so that such a fit has no checkpoint.
@@ -26,14 +26,14 @@ class GivenOptimiser(Optimiser, tag="given", kw_only=True):
 
     optimiser: Any
 
-    def begin(self, problem: Differentiable) -> Run:
-        return GivenRun(self, problem)
+    def begin(self, problem: DifferentiableProblem) -> OptimizerRun:
+        return MitsubaOptimizerRun(self, problem)
 
 
-class GivenRun(Run):
+class MitsubaOptimizerRun(OptimizerRun):
     """State: the reals, and whatever the optimiser keeps."""
 
-    def __init__(self, settings: GivenOptimiser, problem: Differentiable) -> None:
+    def __init__(self, settings: MitsubaOptimizer, problem: DifferentiableProblem) -> None:
         super().__init__(problem)
         self.optimiser = settings.optimiser
         self.optimiser.update(self.reals)
@@ -65,7 +65,7 @@ class GivenRun(Run):
         self.optimiser.reset(name)
 
 
-def as_optimiser(given: Optimiser | mi.ad.Optimizer) -> Optimiser:
+def to_optimizer(given: Optimizer | mi.ad.Optimizer) -> Optimizer:
     """One of OPTIMISERS as it is, one of ``mi.ad`` as an optimiser.
 
     Raises:
@@ -79,4 +79,4 @@ def as_optimiser(given: Optimiser | mi.ad.Optimizer) -> Optimiser:
         raise MivolError(
             f"an optimiser is one of mivol's, one of mi.ad, or has a method begin(problem), found {type(given).__name__}."
         )
-    return GivenOptimiser(optimiser=given)
+    return MitsubaOptimizer(optimiser=given)

@@ -17,7 +17,7 @@ import numpy as np
 
 from mivol.errors import MivolError
 from mivol.optim.priors import Prior
-from mivol.optim.strategy import nearest
+from mivol.optim.strategy import suggest_name
 
 GRID = 4
 """Axes of a grid (Z, Y, X, C); harmonics of directions have one more."""
@@ -134,7 +134,7 @@ class Parameter:
         if not low < high:
             raise MivolError(f"{self.name}: domain [{low}, {high}] is empty: give the smaller bound first.")
         if self.map not in MAPS:
-            raise MivolError(f'{self.name}: unknown map "{self.map}": {nearest(self.map, list(MAPS))}')
+            raise MivolError(f'{self.name}: unknown map "{self.map}": {suggest_name(self.map, list(MAPS))}')
         if not MAPS[self.map].serves(low, high):
             raise MivolError(
                 f'{self.name}: map "{self.map}" serves {MAPS[self.map].domains}, found [{low}, {high}]: '
@@ -255,7 +255,7 @@ def find(name: str, params: mi.SceneParameters) -> str:
     """
     keys = list(params.keys())
     if name not in keys:
-        raise MivolError(f'the scene has no parameter "{name}": {nearest(name, keys)}')
+        raise MivolError(f'the scene has no parameter "{name}": {suggest_name(name, keys)}')
     if re.match(r"object_\d+", name):
         raise MivolError(f'"{name}" begins with a memory address, which changes from run to run: give the object an id.')
     if not (dr.is_array_v(params[name]) and dr.is_float_v(params[name])):

@@ -27,7 +27,7 @@ import numpy as np
 
 from mivol.errors import MivolError
 from mivol.fields.spherical_grid import SphericalGrid, is_covered_by_inner
-from mivol.optim.strategy import Strategy, of, table
+from mivol.optim.strategy import Strategy, make_table, setting
 
 Spacing = tuple[float, float, float]
 
@@ -67,7 +67,7 @@ class Prior(Strategy, tag="prior"):
 
     is_spatial: ClassVar[bool] = True
 
-    weight: Annotated[float, of("1", "factor in front of the energy, beside the mean loss", ge=0)] = 1.0
+    weight: Annotated[float, setting("1", "factor in front of the energy, beside the mean loss", ge=0)] = 1.0
 
     def energy(self, x: mi.TensorXf, spacing: Spacing) -> mi.Float:
         """Mean energy of the field, without the weight."""
@@ -115,7 +115,7 @@ class TotalVariation(Prior, tag="tv"):
 
     cites = ("rudin_1992",)
 
-    edge: Annotated[float, of("value/length", "gradients below this are smoothed quadratically", gt=0)] = 1e-2
+    edge: Annotated[float, setting("value/length", "gradients below this are smoothed quadratically", gt=0)] = 1e-2
 
     def energy(self, x: mi.TensorXf, spacing: Spacing) -> mi.Float:
         return dr.mean(dr.sqrt(squared_gradient(x, spacing) + self.edge**2) - self.edge)
@@ -132,7 +132,7 @@ class HuberTotalVariation(Prior, tag="huber_tv"):
 
     cites = ("rudin_1992", "huber_1964")
 
-    edge: Annotated[float, of("value/length", "gradient at which the parabola goes over into a line", gt=0)] = 1e-1
+    edge: Annotated[float, setting("value/length", "gradient at which the parabola goes over into a line", gt=0)] = 1e-1
 
     def energy(self, x: mi.TensorXf, spacing: Spacing) -> mi.Float:
         g2 = squared_gradient(x, spacing)
@@ -160,7 +160,7 @@ class Sparse(Prior, tag="l1"):
 
     is_spatial = False
 
-    knee: Annotated[float, of("value", "values below this are pulled to 0 quadratically by Gauss-Newton", gt=0)] = 1e-3
+    knee: Annotated[float, setting("value", "values below this are pulled to 0 quadratically by Gauss-Newton", gt=0)] = 1e-3
 
     def energy(self, x: mi.TensorXf, spacing: Spacing) -> mi.Float:
         return dr.mean(dr.abs(x.array))
@@ -174,8 +174,8 @@ class Bounds(Prior, tag="bounds"):
 
     is_spatial = False
 
-    low: Annotated[float, of("value", "lower wall")] = 0.0
-    high: Annotated[float, of("value", "upper wall")] = float("inf")
+    low: Annotated[float, setting("value", "lower wall")] = 0.0
+    high: Annotated[float, setting("value", "upper wall")] = float("inf")
 
     def outside(self, x: mi.TensorXf) -> mi.Float:
         """Signed distance to the interval."""
@@ -245,7 +245,9 @@ class DecoupledPrior(Strategy, tag="decoupled prior"):
 
     is_spatial: ClassVar[bool] = False
 
-    weight: Annotated[float, of("photograph", "how many photographs, all asking for the same, hold against it", ge=0)] = 1.0
+    weight: Annotated[float, setting("photograph", "how many photographs, all asking for the same, hold against it", ge=0)] = (
+        1.0
+    )
 
     def apply(self, values: mi.Float, rows: Rows) -> mi.Float:
         """Values after the move; a spatial prior takes them evaluated."""
@@ -261,8 +263,8 @@ class Smoothness(DecoupledPrior, tag="smoothness"):
     is_spatial = True
     cites = ("rudin_1992",)
 
-    share: Annotated[float, of("1", "of the rows that are looked at, a step", gt=0, le=1)] = 1 / 8
-    every: Annotated[int, of("step", "from one look to the next, which takes the shares of all between", ge=1)] = 1
+    share: Annotated[float, setting("1", "of the rows that are looked at, a step", gt=0, le=1)] = 1 / 8
+    every: Annotated[int, setting("step", "from one look to the next, which takes the shares of all between", ge=1)] = 1
 
     def apply(self, values: mi.Float, rows: Rows) -> mi.Float:
         if rows.step % self.every:
@@ -348,7 +350,7 @@ def decay_view_dependence(harmonics: mi.Float, width: int, share: float) -> mi.F
     return dr.select(dr.arange(mi.UInt32, dr.width(harmonics)) % width < 3, harmonics, harmonics * kept)
 
 
-PRIORS = table(
+PRIORS = make_table(
     *(TotalVariation, HuberTotalVariation, Laplacian, Sparse, Bounds),
     *(Smoothness, Sparsity, ViewDependence),
 )

@@ -32,10 +32,10 @@ class Problem(Protocol):
 
     safe_point: Callable[[], None]
 
-    def start(self) -> Reals:
+    def initial_reals(self) -> Reals:
         """Where the fit begins: the reals of what the model holds now."""
 
-    def set(self, reals: Reals) -> None:
+    def set_reals(self, reals: Reals) -> None:
         """Let the model hold what these reals stand for."""
 
     def values(self) -> dict[str, mi.TensorXf]:
@@ -54,7 +54,7 @@ class Problem(Protocol):
         """Continue from what :meth:`pack` gave, with the reals of the same moment."""
 
 
-class Differentiable(Problem, Protocol):
+class DifferentiableProblem(Problem, Protocol):
     """What optimisers of first order ask for besides."""
 
     def loss_and_gradient(self, reals: Reals, iteration: int, views: int = 0) -> tuple[float | mi.Float, Reals]:
@@ -66,7 +66,7 @@ class Differentiable(Problem, Protocol):
             views: how many views are looked at; 0 leaves it to the problem.
         """
 
-    def rates(self, iteration: int) -> dict[str, float]:
+    def learning_rates(self, iteration: int) -> dict[str, float]:
         """Learning rate of each parameter in an iteration, in the unit of its reals."""
 
     def after_step(self, reals: Reals, iteration: int) -> Reals:
@@ -85,17 +85,17 @@ class Refinement:
     Attributes:
         reals: of the new unknowns, for the same model.
         carry: what is known of the old unknowns, tensors shaped like their reals, to the new ones.
-        shrinks: by how much derivatives become smaller, by parameter; 1 for those that are not named.
-        says: a sentence for the log.
+        derivative_factors: by how much derivatives become smaller, by parameter; 1 for those that are not named.
+        message: a sentence for the log.
     """
 
     reals: Reals
     carry: Callable[[Reals], Reals]
-    shrinks: dict[str, float] = field(default_factory=dict)
-    says: str = ""
+    derivative_factors: dict[str, float] = field(default_factory=dict)
+    message: str = ""
 
 
-class Staged(Differentiable, Protocol):
+class StagedProblem(DifferentiableProblem, Protocol):
     """What :class:`~mivol.optim.events.CoarseToFine`, ``DropUnseen`` and ``UpdateOccupancy`` ask for besides."""
 
     def refine(self, stage: int) -> Refinement:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from typing import Annotated
 
-from mivol.optim.strategy import Strategy, of, table
+from mivol.optim.strategy import Strategy, make_table, setting
 
 
 class Schedule(Strategy, tag="schedule"):
@@ -30,7 +30,7 @@ class Constant(Schedule, tag="constant"):
 class Cosine(Schedule, tag="cosine"):
     """Half a cosine from 1 down to ``final``. Source: Loshchilov and Hutter 2017, SGDR, Eq. 5 (one period)."""
 
-    final: Annotated[float, of("1", "factor of the last iteration", ge=0, le=1)] = 0.0
+    final: Annotated[float, setting("1", "factor of the last iteration", ge=0, le=1)] = 0.0
 
     def factor(self, iteration: int, iterations: int) -> float:
         progress = iteration / max(iterations - 1, 1)
@@ -40,8 +40,8 @@ class Cosine(Schedule, tag="cosine"):
 class Step(Schedule, tag="step"):
     """Multiplied by ``ratio`` at each of the fractions ``at`` of the run."""
 
-    at: Annotated[tuple[float, ...], of("fraction of the run", "where the rate drops")] = (0.75, 0.85, 0.95)
-    ratio: Annotated[float, of("1", "factor at each drop", gt=0, le=1)] = 0.5
+    at: Annotated[tuple[float, ...], setting("fraction of the run", "where the rate drops")] = (0.75, 0.85, 0.95)
+    ratio: Annotated[float, setting("1", "factor at each drop", gt=0, le=1)] = 0.5
 
     def factor(self, iteration: int, iterations: int) -> float:
         return self.ratio ** sum(iteration >= fraction * iterations for fraction in self.at)
@@ -50,12 +50,12 @@ class Step(Schedule, tag="step"):
 class Exponential(Schedule, tag="exponential"):
     """1 for the first ``delay`` iterations, then a geometric decay that reaches ``final`` at the last one."""
 
-    final: Annotated[float, of("1", "factor of the last iteration", gt=0, le=1)] = 0.1
-    delay: Annotated[int, of("iteration", "how long the rate stays", ge=0)] = 0
+    final: Annotated[float, setting("1", "factor of the last iteration", gt=0, le=1)] = 0.1
+    delay: Annotated[int, setting("iteration", "how long the rate stays", ge=0)] = 0
 
     def factor(self, iteration: int, iterations: int) -> float:
         progress = max(iteration - self.delay, 0) / max(iterations - 1 - self.delay, 1)
         return self.final ** min(progress, 1.0)
 
 
-SCHEDULES = table(Constant, Cosine, Step, Exponential)
+SCHEDULES = make_table(Constant, Cosine, Step, Exponential)

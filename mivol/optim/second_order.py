@@ -22,12 +22,12 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mivol.optim.optimizer import Optimiser, Run
+from mivol.optim.optimizer import Optimizer, OptimizerRun
 from mivol.optim.parameters import Parameter
 from mivol.optim.problem import Reals
 from mivol.optim.scenes.scene_problem import SceneProblem
 from mivol.optim.scenes.views import ADJOINT, PRIMAL
-from mivol.optim.strategy import of
+from mivol.optim.strategy import setting
 
 
 class Packing:
@@ -65,7 +65,7 @@ class Packing:
         return ~(((x <= self.low) & (g > 0.0)) | ((x >= self.high) & (g < 0.0)))
 
 
-def search(
+def search_line(
     value: Callable[[np.ndarray], float], packing: Packing, x: np.ndarray, f: float, g: np.ndarray, p: np.ndarray
 ) -> tuple[np.ndarray, float]:
     """Armijo's rule along the projected path P(x + alpha p), alpha = 1, 1/2, 1/4, ... 2^-9.
@@ -83,7 +83,7 @@ def search(
     return x, 0.0
 
 
-class Lbfgs(Optimiser, tag="lbfgs"):
+class Lbfgs(Optimizer, tag="lbfgs"):
     """Limited-memory BFGS on the free variables, with a projected line search and the same samples in every iteration.
 
     SciPy's L-BFGS-B keeps its memory between iterations where no checkpoint can reach it; hence these forty lines.
@@ -92,13 +92,13 @@ class Lbfgs(Optimiser, tag="lbfgs"):
 
     cites = ("liu_1989",)
 
-    memory: Annotated[int, of("pair", "steps remembered", ge=1, le=100)] = 10
+    memory: Annotated[int, setting("pair", "steps remembered", ge=1, le=100)] = 10
 
-    def begin(self, problem: SceneProblem) -> Run:
+    def begin(self, problem: SceneProblem) -> OptimizerRun:
         return LbfgsRun(self, problem)
 
 
-class LbfgsRun(Run):
+class LbfgsRun(OptimizerRun):
     """State: the reals, and the pairs (step, change of gradient)."""
 
     def __init__(self, settings: Lbfgs, problem: SceneProblem) -> None:
@@ -114,13 +114,13 @@ class LbfgsRun(Run):
         x, g = packing.vector(self.reals), packing.vector(gradients, 1)
         steps, changes = self._remember(x, g)
         free = packing.free(x, g)
-        p = -two_loops(g * free, [s * free for s in steps], [y * free for y in changes]) * factor
+        p = -apply_inverse_hessian(g * free, [s * free for s in steps], [y * free for y in changes]) * factor
         if not g @ p < 0.0:
             p = -g * free / max(np.abs(g * free).max(), 1e-300)
-        new, alpha = search(lambda z: self.problem.loss_value(packing.tensors(z), 0), packing, x, loss, g, p)
+        new, alpha = search_line(lambda z: self.problem.loss_value(packing.tensors(z), 0), packing, x, loss, g, p)
         if alpha == 0.0 or not p.any():
             # The remembered curvature misled the search: forget it once, and give up where it is not to blame.
-            self.finished = "" if steps else "no step lowers the loss"
+            self.stop_reason = "" if steps else "no step lowers the loss"
             steps, changes, x, g = [], [], None, None
         self.steps, self.changes, self.last = steps, changes, None if x is None else (x, g)
         self.reals = packing.tensors(new)
@@ -150,7 +150,7 @@ class LbfgsRun(Run):
         self.steps, self.changes, self.last = [], [], None
 
 
-def two_loops(g: np.ndarray, steps: list[np.ndarray], changes: list[np.ndarray]) -> np.ndarray:
+def apply_inverse_hessian(g: np.ndarray, steps: list[np.ndarray], changes: list[np.ndarray]) -> np.ndarray:
     """H g for the limited-memory inverse Hessian H; without pairs, g scaled so that its largest entry is 1."""
     pairs = [(s, y, 1.0 / (s @ y)) for s, y in zip(steps, changes, strict=True) if s @ y > 0.0]
     if not pairs:
@@ -166,7 +166,7 @@ def two_loops(g: np.ndarray, steps: list[np.ndarray], changes: list[np.ndarray])
     return q
 
 
-class GaussNewton(Optimiser, tag="gauss_newton"):
+class GaussNewton(Optimizer, tag="gauss_newton"):
     """Gauss-Newton on pixel means, conjugate gradients inside, Levenberg-Marquardt damping, projection onto the bounds.
 
     Source: Nocedal and Wright 2006, sections 10.3 and 7.1; D is the separable surrogate of Erdogan and Fessler 1999,
@@ -175,14 +175,14 @@ class GaussNewton(Optimiser, tag="gauss_newton"):
 
     cites = ("hestenes_1952", "erdogan_1999")
 
-    inner: Annotated[int, of("iteration", "conjugate-gradient steps per linearisation", ge=1)] = 6
-    damping: Annotated[float, of("1", "first mu, relative to D", ge=0)] = 1e-3
+    inner: Annotated[int, setting("iteration", "conjugate-gradient steps per linearisation", ge=1)] = 6
+    damping: Annotated[float, setting("1", "first mu, relative to D", ge=0)] = 1e-3
 
-    def begin(self, problem: SceneProblem) -> Run:
+    def begin(self, problem: SceneProblem) -> OptimizerRun:
         return GaussNewtonRun(self, problem)
 
 
-class GaussNewtonRun(Run):
+class GaussNewtonRun(OptimizerRun):
     """State: the reals and the damping. Image, J and J^T use the same samples in every iteration: one set of them, and
     another for the gradient where light is sampled."""
 
@@ -194,7 +194,7 @@ class GaussNewtonRun(Run):
 
     def step(self, iteration: int, factor: float) -> float:
         packing = Packing(self.problem, self.reals)
-        linear = Linearised(self.problem, self.reals, self.weights, packing)
+        linear = Linearization(self.problem, self.reals, self.weights, packing)
         x, g = packing.vector(self.reals), linear.gradient
         free = packing.free(x, g)
         diagonal = np.abs(linear.curvature(np.ones_like(x)))
@@ -204,9 +204,11 @@ class GaussNewtonRun(Run):
             lambda v: free * (linear.curvature(free * v) + self.damping * diagonal * v),
             -g * free, diagonal, self.settings.inner,
         )  # fmt: skip
-        new, alpha = search(lambda z: self.problem.loss_value(packing.tensors(z), 0), packing, x, linear.loss, g, factor * p)
+        new, alpha = search_line(
+            lambda z: self.problem.loss_value(packing.tensors(z), 0), packing, x, linear.loss, g, factor * p
+        )
         self.damping = self.damping / 3.0 if alpha == 1.0 else max(4.0 * self.damping, 1e-6)
-        self.finished = "no step lowers the loss" if self.damping > 1e6 or not p.any() else ""
+        self.stop_reason = "no step lowers the loss" if self.damping > 1e6 or not p.any() else ""
         self.reals = packing.tensors(new)
         return linear.loss
 
@@ -218,7 +220,7 @@ class GaussNewtonRun(Run):
         self.damping = float(arrays["damping"])
 
 
-class Linearised:
+class Linearization:
     """The problem around one point: loss, gradient, and products with J^T W J + R''.
 
     Attributes:
@@ -229,8 +231,8 @@ class Linearised:
     def __init__(self, problem: SceneProblem, reals: Reals, weights: list[mi.TensorXf], packing: Packing) -> None:
         self.problem, self.reals, self.weights, self.packing = problem, reals, weights, packing
         self.seeds = [problem.seed_for(0, index, PRIMAL) for index in range(len(problem.batches))]
-        self.slopes = {p.name: slope(p, reals[p.name]) for p in problem.parameters}
-        problem.set(reals)
+        self.slopes = {p.name: map_derivative(p, reals[p.name]) for p in problem.parameters}
+        problem.set_reals(reals)
         compared = []
         for index, (batch, seed) in enumerate(zip(problem.batches, self.seeds, strict=True)):
             compared.append(problem.compare(batch, seed, len(problem.views)))
@@ -245,7 +247,7 @@ class Linearised:
         """(J^T W J + R'') v."""
         direction = {k: t * self.slopes[k] for k, t in self.packing.tensors(v).items()}
         images = self._jvp(direction)
-        self.problem.set(self.reals)
+        self.problem.set_reals(self.reals)
         for batch, weight, seed, image in zip(self.problem.batches, self.weights, self.seeds, images, strict=True):
             share = batch.n_views / len(self.problem.views) / len(image.array)
             self.problem.vjp(batch.sensor, weight * image * share, seed)
@@ -257,12 +259,12 @@ class Linearised:
         return self.packing.vector({k: t * self.slopes[k] for k, t in product.items()}, 1)
 
     def _jvp(self, direction: Reals) -> list[mi.TensorXf]:
-        self.problem.set(self.reals)
+        self.problem.set_reals(self.reals)
         pairs = zip(self.problem.batches, self.seeds, strict=True)
         return [self.problem.jvp(batch.sensor, direction, seed) for batch, seed in pairs]
 
 
-def slope(parameter: Parameter, u: mi.TensorXf) -> mi.TensorXf:
+def map_derivative(parameter: Parameter, u: mi.TensorXf) -> mi.TensorXf:
     """dx/du of a parameter's map, entry by entry."""
     u = mi.TensorXf(dr.detach(u))
     dr.enable_grad(u)

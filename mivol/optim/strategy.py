@@ -1,8 +1,8 @@
 """A named choice with its settings: the form that losses, priors, schedules, events and optimisers share.
 
 Conventions. A strategy is a frozen msgspec struct; its ``name`` is the tag under which a TOML file asks for it; each
-setting has its unit, domain and meaning on one line, ``Annotated[float, of("unit", "meaning", gt=0)]``, from which the
-checks and ``mivol optimize --help`` come. Tables of strategies are plain dicts, made by :func:`table`.
+setting has its unit, domain and meaning on one line, ``Annotated[float, setting("unit", "meaning", gt=0)]``, from which the
+checks and ``mivol optimize --help`` come. Tables of strategies are plain dicts, made by :func:`make_table`.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from mivol.errors import MivolError
 S = TypeVar("S")
 
 
-def of(unit: str, meaning: str, **domain: float) -> msgspec.Meta:
+def setting(unit: str, meaning: str, **domain: float) -> msgspec.Meta:
     """Unit, meaning and domain (``gt``, ``ge``, ``lt``, ``le``, ``min_length``, ``max_length``) of one setting."""
     return msgspec.Meta(description=meaning, extra={"unit": unit}, **domain)
 
@@ -33,7 +33,7 @@ class Strategy(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
         return cls.__struct_config__.tag
 
 
-def table(*strategies: type[S]) -> dict[str, type[S]]:
+def make_table(*strategies: type[S]) -> dict[str, type[S]]:
     """Strategies by name; two of one name are a mistake of the program."""
     named = {strategy.label(): strategy for strategy in strategies}
     if len(named) != len(strategies):
@@ -41,7 +41,7 @@ def table(*strategies: type[S]) -> dict[str, type[S]]:
     return named
 
 
-def nearest(word: str, known: list[str]) -> str:
+def suggest_name(word: str, known: list[str]) -> str:
     """The way out of a misspelt word: the nearest known one, or all of them."""
     close = difflib.get_close_matches(word, known, n=1, cutoff=0.6)
     return f'did you mean "{close[0]}"?' if close else "known are: " + ", ".join(sorted(known)) + "."
@@ -60,7 +60,7 @@ def choose(strategies: dict[str, type[S]], name: str, what: str, **settings: Any
         MivolError: unknown name (the nearest is offered), unknown setting or a value outside its domain.
     """
     if name not in strategies:
-        raise MivolError(f'unknown {what} "{name}": {nearest(name, list(strategies))}')
+        raise MivolError(f'unknown {what} "{name}": {suggest_name(name, list(strategies))}')
     try:
         return msgspec.convert({**settings, "name": name}, strategies[name])
     except msgspec.ValidationError as error:

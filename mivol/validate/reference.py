@@ -21,7 +21,7 @@ import mitsuba as mi
 import numpy as np
 
 from mivol.errors import MivolError
-from mivol.optim.interrupt import Stop
+from mivol.optim.interrupt import InterruptGuard
 from mivol.scene.content_hash import content_hash
 from mivol.scene.load import LoadedScene, SceneSource, load_scene
 from mivol.scene.parsing import check_variant
@@ -280,7 +280,7 @@ def _render_until(
 ) -> ReferenceResult:
     rendered = False
     try:
-        with Stop() as stop:
+        with InterruptGuard() as stop:
             while not run.reached(goal):
                 stop.check()
                 start = time.monotonic()

@@ -17,7 +17,7 @@ from mivol.bench.studies import gaussian_choices, points
 from mivol.bench.studies.gaussian_fits import Fitted, psnr_of
 from mivol.errors import MivolError
 from mivol.optim.gaussians.gaussian_plan import PRESETS, GaussianPlan
-from mivol.optim.gaussians.gaussian_start import begin_at
+from mivol.optim.gaussians.gaussian_start import make_start_cloud
 from mivol.photos import Photo, Photos
 from mivol.photos.transforms import write_transforms
 from mivol.points import Gaussians
@@ -28,7 +28,7 @@ WHITE = np.ones(3, np.float32)
 
 def ball(count: int = 80) -> Gaussians:
     """Opaque Gaussians of many colours."""
-    cloud = Gaussians(**begin_at(np.random.default_rng(2).uniform(-0.5, 0.5, (count, 3)), [], 0))
+    cloud = Gaussians(**make_start_cloud(np.random.default_rng(2).uniform(-0.5, 0.5, (count, 3)), [], 0))
     cloud.opacity_logits[:] = 3
     cloud.harmonics[:, 0] = np.sin(5 * cloud.means)
     return cloud

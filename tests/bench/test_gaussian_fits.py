@@ -12,7 +12,7 @@ from ball_photos import camera
 from mivol.bench.studies.gaussian_fits import Fitted, fit_and_judge, psnr_of
 from mivol.errors import MivolError
 from mivol.optim.gaussians.gaussian_plan import PRESETS
-from mivol.optim.gaussians.gaussian_start import begin_at
+from mivol.optim.gaussians.gaussian_start import make_start_cloud
 from mivol.photos import Photo
 from mivol.points import Gaussians
 from mivol.splatting import Splatter, tensors_of
@@ -26,7 +26,7 @@ def test_a_missing_folder_is_named(tmp_path: Path) -> None:
 def test_views_of_the_same_gaussians_agree_to_8_bits_and_those_of_others_do_not(variant_rgb: str) -> None:
     """A picture rounded to 8 bits differs from itself by 1/255/sqrt(12) RMS at most: above 58 dB."""
     places = np.random.default_rng(2).uniform(-0.5, 0.5, (80, 3))
-    cloud = Gaussians(**begin_at(places, [], 0))
+    cloud = Gaussians(**make_start_cloud(places, [], 0))
     splatter, white = Splatter(32, 32, 0), np.ones(3, np.float32)
     views = []
     for k in range(2):

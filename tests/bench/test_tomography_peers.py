@@ -66,7 +66,7 @@ def test_the_default_of_a_slice_is_that_of_a_file(variant_rgb: str, photons: flo
     last = dict(zip(range(12), peers.default(scan), strict=False))[11]
     assert last.shape == scan.truth.shape
     problem = peers.LeastSquares(peers.Projector(scan.beam, scan.grid), scan.y, scan.weights, nonnegative=True)
-    plain = dict(zip(range(12), peers.METHODS["pcg"].run(problem), strict=False))[11]
+    plain = dict(zip(range(12), peers.ALL_SOLVERS["pcg"].run(problem), strict=False))[11]
     assert scan.error(last) < scan.error(plain.x)
     if photons:
         assert scan.error(next(peers.likelihood(scan))) < 1
@@ -144,7 +144,9 @@ def test_every_method_of_ours_runs_once_before_it_is_timed(monkeypatch: pytest.M
         lambda wanted, walk: SimpleNamespace(is_stored=(wanted.name, wanted.iterations) in (("sart", 6), ("os-sart", 12))),
     )
     monkeypatch.setattr(peers, "LeastSquares", lambda a, y, w, x0, nonnegative: (a, y, w, x0, nonnegative))
-    monkeypatch.setattr(peers, "METHODS", {name: Method(name) for name in ("fbp", "cgls", "pcg", "sirt", "sart", "os-sart")})
+    monkeypatch.setattr(
+        peers, "ALL_SOLVERS", {name: Method(name) for name in ("fbp", "cgls", "pcg", "sirt", "sart", "os-sart")}
+    )
     monkeypatch.setattr(peers, "timed", lambda scan, states, steps: (next(states).tolist(), steps))
     found = peers.ours(peers.Slice("beam", "grid", "y", "w", None))
     steps = {"fbp": 1, "cgls": 20, "pcg": 20, "pcg from fbp": 10, "sirt": 60, "sart": 6, "os-sart": 12}

@@ -33,8 +33,8 @@ def output(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> t
 def fit_at(done: int, loss: float, measures: int = 0, log: tuple[str, ...] = ()) -> SimpleNamespace:
     """A fit after so many iterations."""
     return SimpleNamespace(
-        next=done, seconds=12.34, log=list(log), measures=[None] * measures, history=[{"loss": 9.0}, {"loss": loss}],
-        newest_errors=lambda: {"psnr": 20.123456, "mine": 0.5},
+        next_iteration=done, seconds=12.34, log=list(log), evaluations=[None] * measures,
+        history=[{"loss": 9.0}, {"loss": loss}], latest_errors=lambda: {"psnr": 20.123456, "mine": 0.5},
     )  # fmt: skip
 
 
@@ -75,7 +75,7 @@ def test_a_fit_is_watched(output: tuple) -> None:
             before = len(written.getvalue())
             display(fit_at(done, 0.5, measures, ("refined",) if done > 2 else ()))
             seen.append(written.getvalue()[before:])
-        display.newest.next, display.newest.seconds = 5, 12.36
+        display.newest.next_iteration, display.newest.seconds = 5, 12.36
         before = len(written.getvalue())
     end = written.getvalue()[before:]
     assert ["refined" in text for text in seen] == [False, False, True, False]

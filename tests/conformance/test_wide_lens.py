@@ -15,7 +15,7 @@ from mivol.errors import MivolError
 from mivol.experiments.field_plan import wide_lenses
 from mivol.optim.loop import reconstruct
 from mivol.optim.photographs.field_view import render_view
-from mivol.optim.photographs.radiance_plan import PRESETS, Stage
+from mivol.optim.photographs.radiance_plan import PRESETS, RadianceStage
 from mivol.optim.photographs.radiance_problem import RadianceProblem
 from mivol.optim.photographs.ray_batches import RayBatches
 from mivol.photos import Camera, Lens, Photo, load_photos, pixel_centres, project, rays, rectify, survey_photos, turntable
@@ -274,9 +274,9 @@ def test_a_place_is_found_from_wide_photographs(variant_rgb: str, kind: object) 
     """Seen from places that were not fitted, by the same lens. The best single colour has the variance of the pictures as its
     error, about 0.07 here; a field is to have a tenth of it (0.002 to 0.03 measured; 0.9 with the rays of a pinhole)."""
     views = [photo(kind(pose=camera.to_world)) for camera in capture_photos.cameras(28)]
-    plan = replace(PRESETS["capture"], stages=(Stage(16, 40, 1, 8, 32), Stage(32, 40, 1, 8, 32)))
+    plan = replace(PRESETS["capture"], stages=(RadianceStage(16, 40, 1, 8, 32), RadianceStage(32, 40, 1, 8, 32)))
     problem = RadianceProblem(RayBatches.of(views[:24]), np.array([[-0.9] * 3, [0.9] * 3]), plan)
-    reconstruct(problem, plan.optimiser, plan.course())
+    reconstruct(problem, plan.optimizer, plan.course())
     for view in views[24:]:
         counts = np.ones(view.image.shape[:2], bool) if view.mask is None else view.mask
         error = (render_view(problem.field, view.camera, problem.sky).image - view.image)[counts]

@@ -19,7 +19,7 @@ from mivol.optim.events import Upsample
 from mivol.optim.losses import L2, LOSSES, Huber
 from mivol.optim.parameters import Parameter
 from mivol.optim.projections.solvers import fdk
-from mivol.optim.strategy import choose, table
+from mivol.optim.strategy import choose, make_table
 from mivol.phase.closed_forms import droplets
 from mivol.phase.measured import NAMES, named_medium
 from mivol.phase.table import Table
@@ -222,9 +222,9 @@ def test_strategies() -> None:
     assert choose(LOSSES, "huber", "loss", delta=2.0) == Huber(delta=2.0)
     assert refusal_of(choose, LOSSES, "l22", "loss").startswith('unknown loss "l22": ')
     assert refusal_of(choose, LOSSES, "l2", "loss", flor=1).startswith('loss "l2": ')
-    assert list(table(L2, Huber)) == ["l2", "huber"]
+    assert list(make_table(L2, Huber)) == ["l2", "huber"]
     with pytest.raises(AssertionError, match="share a name"):
-        table(L2, Huber, L2)
+        make_table(L2, Huber, L2)
 
 
 def test_a_domain_has_two_ends() -> None:

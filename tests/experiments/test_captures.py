@@ -14,21 +14,23 @@ from mivol.cli import main
 from mivol.fields.field_archives import load_field
 from mivol.optim.loop import begin_fit
 from mivol.optim.photographs.field_view import render_view
-from mivol.optim.photographs.radiance_plan import PRESETS, FitPlan, Stage
+from mivol.optim.photographs.radiance_plan import PRESETS, RadiancePlan, RadianceStage
 from mivol.optim.photographs.radiance_problem import RadianceProblem
 from mivol.optim.photographs.ray_batches import RayBatches
 from mivol.photos.region import middle_box
 from mivol.validate.images import judge
 
-PLAN = replace(PRESETS["capture"], stages=(Stage(12, 60, 1, 6, 24), Stage(24, 140, 1, 6, 24)), degree=0, sky=16, levels=4)
+PLAN = replace(
+    PRESETS["capture"], stages=(RadianceStage(12, 60, 1, 6, 24), RadianceStage(24, 140, 1, 6, 24)), degree=0, sky=16, levels=4
+)
 
 
-def held_out_psnr(plan: FitPlan) -> list[float]:
+def held_out_psnr(plan: RadiancePlan) -> list[float]:
     """PSNR of every fourth photograph after a fit to the others."""
     photos = capture(24)
     train, aside = [p for n, p in enumerate(photos) if n % 4], photos[::4]
     box = middle_box([photo.camera for photo in train])
-    fit = begin_fit(RadianceProblem(RayBatches.of(train), box, plan), plan.optimiser, plan.course()).complete()
+    fit = begin_fit(RadianceProblem(RayBatches.of(train), box, plan), plan.optimizer, plan.course()).complete()
     seen = [render_view(fit.problem.field, photo.camera, fit.problem.sky).image for photo in aside]
     return [judge(image, photo.image).values["psnr"] for image, photo in zip(seen, aside, strict=True)]
 
@@ -52,7 +54,7 @@ def test_what_is_near_a_camera_moves_less(variant_rgb: str) -> None:
     for near in (0.0, 100.0):
         plan = replace(PLAN, near=near)
         problem = RadianceProblem(RayBatches.of(photos), middle_box([photo.camera for photo in photos]), plan)
-        slopes.append(np.linalg.norm(np.array(problem.loss_and_gradient(problem.start(), 0)[1]["density"])))
+        slopes.append(np.linalg.norm(np.array(problem.loss_and_gradient(problem.initial_reals(), 0)[1]["density"])))
     # Of all together: rays that want opposite things of a node may leave any ratio at it.
     assert 0 < slopes[1] < (REACH / 200) ** 2 * slopes[0]
 

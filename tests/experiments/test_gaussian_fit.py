@@ -18,7 +18,7 @@ from mivol.experiments.gaussian_start import make_gaussian_plan
 from mivol.files import write_png
 from mivol.optim.gaussians.gaussian_plan import PRESETS
 from mivol.optim.gaussians.gaussian_problem import GaussianProblem
-from mivol.optim.gaussians.gaussian_start import begin_at, places_of
+from mivol.optim.gaussians.gaussian_start import find_start_points, make_start_cloud
 from mivol.optim.problem import Reals
 from mivol.photos import Camera, intrinsics, load_photos
 from mivol.photos.camera_path import aim_camera
@@ -37,7 +37,7 @@ def photographs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
     mi.set_variant("llvm_ad_rgb")
     drawn = np.random.default_rng(5).normal(size=(400, 3))
-    cloud = begin_at(0.6 * drawn / np.linalg.norm(drawn, axis=1, keepdims=True), [], 0)
+    cloud = make_start_cloud(0.6 * drawn / np.linalg.norm(drawn, axis=1, keepdims=True), [], 0)
     cloud["opacity_logits"][:] = 4
     cloud["log_scales"] -= 0.7
     cloud["harmonics"][:, 0] = 1.5 * np.sin(4 * cloud["means"])
@@ -218,11 +218,11 @@ def test_points_begin_where_no_view_sees_through(photographs: Path) -> None:
     """A ball of radius 0.6, 0.2 more until its rim of Gaussians has an alpha below 1/510, and 0.06 for a pixel; its hull by 14
     views reaches a fifth further. The corners of the box are 1.7 away, so of 200 points in all of it some lie beyond 1.1."""
     photos = load_photos(photographs, background="white", box=np.array([[-1.0] * 3, [1.0] * 3]))
-    places, whence = places_of(photos, 200, 0)
+    places, whence = find_start_points(photos, 200, 0)
     assert len(places) == 200
     assert np.linalg.norm(places, axis=1).max() < 1.1
     assert "where no view sees through" in whence
-    assert np.array_equal(places, places_of(photos, 200, 0)[0])
-    colours = begin_at(places, photos.views, 1)["harmonics"]
+    assert np.array_equal(places, find_start_points(photos, 200, 0)[0])
+    colours = make_start_cloud(places, photos.views, 1)["harmonics"]
     assert not colours[:, 1:].any()
     assert colours[:, 0].std() > 0.05

@@ -87,7 +87,7 @@ def fit_of(monkeypatch: pytest.MonkeyPatch, folder: Path, views: int, shown: int
         lambda problem, judged, photo, metrics: (f"seen {photo.name}", Quality(photo.name, {metrics[0]: 20.0})),
     )
     monkeypatch.setattr(outputs, "named", lambda values: {f"held_out_{name}": value for name, value in values.items()})
-    fit = SimpleNamespace(problem=problem, next=77)
+    fit = SimpleNamespace(problem=problem, next_iteration=77)
     film = Film(("camera",) * frames, shrink=4.0)
     return outputs.GaussianOutputs(task, run, fit, photos, photos if shown else None, film), record, run, watcher
 

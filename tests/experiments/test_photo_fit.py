@@ -23,7 +23,7 @@ from mivol.fields.field_archives import load_field
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.files import read_exr, write_exr, write_png
 from mivol.optim.photographs.field_view import render_view
-from mivol.optim.photographs.radiance_plan import FEW, PRESETS, FitPlan, Stage, stretched
+from mivol.optim.photographs.radiance_plan import FEW_PHOTOGRAPHS, PRESETS, RadiancePlan, RadianceStage, scale_longest
 from mivol.optim.photographs.radiance_problem import RadianceProblem
 from mivol.optim.problem import Reals
 from mivol.photos import Camera, intrinsics
@@ -321,7 +321,7 @@ def test_photographs_are_shrunk_to_half_a_voxel(photographs: Path, tmp_path: Pat
     """
     chosen = config.load(toml(tmp_path, photographs))
     photos, _ = photo_data.read_photos(chosen, tmp_path)
-    plan = FitPlan((Stage(4, 1), Stage(8, 1), Stage(11, 1), Stage(13, 1, shrink=4)))
+    plan = RadiancePlan((RadianceStage(4, 1), RadianceStage(8, 1), RadianceStage(11, 1), RadianceStage(13, 1, shrink=4)))
     assert [stage.shrink for stage in field_plan.suited(plan, photos).stages] == [2, 2, 2, 1]
 
 
@@ -329,18 +329,22 @@ def test_stages_look_at_each_pixel_so_often_at_most(photographs: Path, tmp_path:
     """20 epochs of V photographs: of 24 x 24 by 2 tiles of 16 pixels of 3 of them, and of 48 x 48 by one tile of each."""
     photos, _ = photo_data.read_photos(config.load(toml(tmp_path, photographs)), tmp_path)
     count = len(photos.views)
-    stages = Stage(11, 10_000, views=3, tiles=2), Stage(13, 10_000, views=1000, tiles=1), Stage(13, 5, views=1, tiles=1)
-    plan = FitPlan(stages, epochs=20.0)
+    stages = (
+        RadianceStage(11, 10_000, views=3, tiles=2),
+        RadianceStage(13, 10_000, views=1000, tiles=1),
+        RadianceStage(13, 5, views=1, tiles=1),
+    )
+    plan = RadiancePlan(stages, epochs=20.0)
     expected = [20 * count * 24**2 // 96, 20 * 48**2 // 16, 5]
     assert [stage.steps for stage in field_plan.suited(plan, photos).stages] == expected
     few, least = field_plan.suited(replace(plan, stages=stages[:2], epochs=0.1), photos), field_plan.FEWEST_STEPS
     # So many steps of the last stage look at each pixel least / 144 times.
     assert [stage.steps for stage in few.stages] == [least * count * 24**2 // (96 * 144), least]
-    assert [stage.steps for stage in field_plan.suited(FitPlan(stages), photos).stages] == [10_000, 10_000, 5]
+    assert [stage.steps for stage in field_plan.suited(RadiancePlan(stages), photos).stages] == [10_000, 10_000, 5]
     asked = field_plan.make_plan(config.load(toml(tmp_path, photographs), ["field.preset=fine", "field.effort=3"]))
     assert asked.epochs == 3 * PRESETS["fine"].epochs < math.inf  # who asks for more gets more
     assert "no pixel is looked at over 20 times" in field_plan.steps_of(plan).reason
-    assert field_plan.steps_of(FitPlan(stages)).reason == "field.effort"
+    assert field_plan.steps_of(RadiancePlan(stages)).reason == "field.effort"
 
 
 def test_a_long_box_has_as_many_nodes_as_a_cube(photographs: Path, tmp_path: Path) -> None:
@@ -352,9 +356,9 @@ def test_a_long_box_has_as_many_nodes_as_a_cube(photographs: Path, tmp_path: Pat
     chosen = config.load(toml(tmp_path, photographs))
     photos, _ = photo_data.read_photos(chosen, tmp_path)
     slab = np.array([[-1, -0.25, -0.125], [1, 0.25, 0.125]])
-    assert stretched(8, slab) == 25 and stretched(8, photos.box) == 8
+    assert scale_longest(8, slab) == 25 and scale_longest(8, photos.box) == 8
     long = replace(photos, survey=replace(photos.survey, box=slab))
-    plan = FitPlan((Stage(4, 1), Stage(8, 1), Stage(40, 1)))
+    plan = RadiancePlan((RadianceStage(4, 1), RadianceStage(8, 1), RadianceStage(40, 1)))
     assert [stage.longest for stage in field_plan.suited(plan, long).stages] == [13, 17, 34]
     assert [stage.longest for stage in field_plan.suited(replace(plan, voxel=1.5), long).stages] == [13, 22, 34]
     quarter = np.diag([0.25, 0.25, 1])
@@ -371,9 +375,9 @@ def test_few_photographs_are_smoothed_each_step(photographs: Path, tmp_path: Pat
     chosen = config.load(toml(tmp_path, photographs), ["field.preset=cpu"])
     photos, _ = photo_data.read_photos(chosen, tmp_path)
     plan = field_plan.make_plan(chosen)
-    assert plan.tv_every == 4 and len(photos.views) < FEW
+    assert plan.tv_every == 4 and len(photos.views) < FEW_PHOTOGRAPHS
     assert field_plan.suited(plan, photos).tv_every == 1
-    many = replace(photos, views=photos.views * (FEW // len(photos.views) + 1))
+    many = replace(photos, views=photos.views * (FEW_PHOTOGRAPHS // len(photos.views) + 1))
     assert field_plan.suited(plan, many).tv_every == 4
 
 
@@ -381,7 +385,7 @@ def test_colours_of_few_photographs_do_not_decay(photographs: Path, tmp_path: Pa
     """The preset for captures asks few for less than many, of the degree too; what the file says holds for both."""
     chosen = config.load(toml(tmp_path, photographs))
     photos, _ = photo_data.read_photos(chosen, tmp_path)
-    many = replace(photos, views=photos.views * (FEW // len(photos.views) + 1))
+    many = replace(photos, views=photos.views * (FEW_PHOTOGRAPHS // len(photos.views) + 1))
 
     def found(**field: float) -> list[tuple[float, int]]:
         raw = {"title": "x", "photos": {"path": "p"}, "field": {"preset": "capture", **field}}
@@ -403,7 +407,7 @@ def test_nested_boxes_are_those_that_points_need(photographs: Path, tmp_path: Pa
     plan = replace(field_plan.make_plan(chosen), levels=5, near=1.0)
     assert field_plan.suited(plan, photos).levels == 5
 
-    def said(points: np.ndarray, plan: FitPlan) -> str:
+    def said(points: np.ndarray, plan: RadiancePlan) -> str:
         known = replace(photos, survey=replace(photos.survey, points=points))
         fitting = field_plan.suited(plan, known)
         lines = field_plan.choices(fitting, known, field_plan.batches_of(fitting, known))

@@ -234,7 +234,7 @@ def test_a_stretched_schedule_is_said(variant_rgb, folder: Path) -> None:
     assert run(*flags, "--resume", "--set", "fit.iterations=3") == 0
     record = json.loads((folder / "run" / "run.json").read_text())
     assert record["results"]["iterations"] == 3
-    assert any("the schedule of 2 iterations goes on as one of 3" in note for note in record["notes"])
+    assert any("the schedule was planned for 2 iterations and continues for 3" in note for note in record["notes"])
     rows = [json.loads(line)["iteration"] for line in (folder / "run" / "metrics.jsonl").read_text().splitlines()]
     assert rows[:3] == [0, 1, 2]
 

@@ -19,7 +19,7 @@ from mivol.experiments.scene_outputs import SceneOutputs
 from mivol.experiments.start import make_start
 from mivol.files import read_exr, read_volume, write_exr
 from mivol.optim.scenes.scene_problem import SceneProblem
-from mivol.optim.scenes.views import FINAL, seed_of
+from mivol.optim.scenes.views import FINAL, derive_seed
 
 
 @pytest.mark.slow
@@ -65,7 +65,7 @@ def test_a_reference_of_unknown_noise_has_one_render_beside_it() -> None:
     asked = []
     outputs = outputs_of(lambda *given: asked.append(given) or np.zeros(2), {})
     assert outputs.render_last(SimpleNamespace(name="v", sensor="s"), 7)[1] is None
-    assert asked == [("s", seed_of(3, 0, 7, FINAL), 40)]
+    assert asked == [("s", derive_seed(3, 0, 7, FINAL), 40)]
 
 
 @pytest.mark.slow

@@ -45,7 +45,7 @@ def test_a_function_is_a_loss(scene: mi.Scene) -> None:
     found = []
     for loss in (mean_square, L2()):
         problem = Problem(scene, [seen()], [KEY], loss=loss, spp=4)
-        value, gradients = problem.loss_and_gradient(problem.start(), 0)
+        value, gradients = problem.loss_and_gradient(problem.initial_reals(), 0)
         found.append((value, np.array(gradients[KEY])))
     assert np.isclose(found[0][0], found[1][0], rtol=1e-6)
     np.testing.assert_allclose(found[0][1], found[1][1], rtol=1e-5)
@@ -62,7 +62,7 @@ def test_a_function_sees_one_view_at_a_time(scene: mi.Scene) -> None:
 
     sensor = scene.sensors()[0]
     problem = Problem(scene, [seen(), seen()], [KEY], loss=look, sensors=[sensor, sensor], spp=4)
-    problem.loss_and_gradient(problem.start(), 0)
+    problem.loss_and_gradient(problem.initial_reals(), 0)
     assert shapes == [(6, 8, 3)] * 2
 
 
@@ -92,7 +92,7 @@ def test_references_are_arrays_files_or_a_scene(scene: mi.Scene, folder: Path) -
     (loaded,) = Problem(plain, folder / "plain.xml", [KEY]).views
     assert np.array_equal(np.array(loaded.reference), np.array(absorbed.reference))
     # Absorption has no noise but that of the places in a pixel: the scene is its own reference to a few thousandths.
-    assert problem.loss_value(problem.start(), 0) < 1e-3
+    assert problem.loss_value(problem.initial_reals(), 0) < 1e-3
 
 
 class Silent:
@@ -121,7 +121,7 @@ def test_what_a_script_gets_wrong_is_said(scene: mi.Scene) -> None:
         Problem(scene, [seen()], [KEY], loss=3)
     with refuses(r"found the class Adam: call it, as Adam\(\.\.\.\)"):
         optimize(Problem(scene, [seen()], [KEY]), mivol.Adam, 1)
-    with refuses("Silent.begin gave NoneType, expected a mivol.optim.optimizer.Run"):
+    with refuses("Silent.begin returned a NoneType, expected a mivol.optim.optimizer.OptimizerRun"):
         optimize(Problem(scene, [seen()], [KEY]), Silent(), 1)
     with refuses("found str"):
         optimize(Problem(scene, [seen()], [KEY]), "adam", 1)
@@ -132,7 +132,7 @@ def test_what_a_script_gets_wrong_is_said(scene: mi.Scene) -> None:
     ):
         problem = Problem(scene, [seen()], [KEY], loss=loss)
         with refuses(sentence):
-            problem.loss_and_gradient(problem.start(), 0)
+            problem.loss_and_gradient(problem.initial_reals(), 0)
 
 
 def test_the_package_shows_what_a_script_needs() -> None:

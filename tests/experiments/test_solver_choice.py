@@ -12,10 +12,10 @@ from mivol import config
 from mivol.experiments import solver_choice
 from mivol.experiments.projections import Projections
 from mivol.experiments.solver_choice import PLAIN_ITERATIONS, make_prior, settle_noise, settle_solver, strength_of
-from mivol.optim.projections.inversion import Inversion
+from mivol.optim.projections.inversion import ProjectionProblem
 from mivol.optim.projections.iterative import projected_cg
 from mivol.optim.projections.linear_problems import LeastSquares
-from mivol.optim.projections.smoothed_tv import tv_of_noise
+from mivol.optim.projections.smoothed_tv import scale_tv_to_noise
 from mivol.tomography.geometry import ConeBeam, Geometry, ParallelBeam, VoxelGrid
 from mivol.tomography.phantoms import shepp_logan
 from mivol.tomography.projector import Projector
@@ -88,11 +88,11 @@ COARSE_GRID = VoxelGrid((1, 16, 16), 1 / 8)
 BEAM = ParallelBeam(np.arange(20) * np.pi / 20, (1, 20), 1 / 8)
 
 
-def problem_of(weight: float, wanted: config.Solve, is_noise_known: bool = False) -> tuple[Inversion, Projections]:
+def problem_of(weight: float, wanted: config.Solve, is_noise_known: bool = False) -> tuple[ProjectionProblem, Projections]:
     a, y = Projector(BEAM, COARSE_GRID), shepp_logan().project(BEAM)
     data = Projections(BEAM, y, np.full(y.shape, weight), is_noise_known=is_noise_known)
     prior = make_prior(wanted, a, data, np.arange(20))
-    return Inversion(LeastSquares(a, y, data.weights, nonnegative=True, prior=prior)), data
+    return ProjectionProblem(LeastSquares(a, y, data.weights, nonnegative=True, prior=prior)), data
 
 
 WANTED = config.Solve(start="filtered", tv=2.0, delta=0.5)
@@ -110,7 +110,7 @@ def test_the_noise_is_what_plain_iterations_leave(variant_rgb: str) -> None:
     assert float(line.choice.split()[1]) == pytest.approx(left, rel=1e-3)
     assert np.abs(problem.linear_problem.x0 - state.x).max() < 1e-4 * state.x.max()
     # Least squares of weights 1 are those of 1 / left^2, times left^2.
-    known = tv_of_noise(plain.A, data.y, data.weights / left**2, 2.0, 0.5)
+    known = scale_tv_to_noise(plain.A, data.y, data.weights / left**2, 2.0, 0.5)
     assert problem.linear_problem.prior.strength == pytest.approx(left**2 * known.strength, rel=1e-3)
     assert problem.linear_problem.prior.delta == pytest.approx(known.delta, rel=1e-5)
 

@@ -16,7 +16,7 @@ from tiny_experiment import run
 from mivol.errors import MivolError
 from mivol.experiments import validation
 from mivol.experiments.validation import DIFFERS, UNTRUSTED, Validation, validate_scene
-from mivol.optim.scenes.views import seed_of
+from mivol.optim.scenes.views import derive_seed
 from mivol.scene.load import load_scene
 from mivol.validate.statistics import Significance
 from mivol.validate.trust import Doubt
@@ -150,7 +150,7 @@ def test_renders_are_independent(variant_rgb: str) -> None:
         return np.full((2, 2, 3), float(len(asked)))
 
     found = validation.render_batches("scene", "camera", SimpleNamespace(render=render), Validation(spp=33, seed=5))
-    assert asked == [("scene", "camera", seed_of(5, validation.IMAGE, batch), 3) for batch in range(16)]
+    assert asked == [("scene", "camera", derive_seed(5, validation.IMAGE, batch), 3) for batch in range(16)]
     assert (found.n, float(found.mean[0, 0, 0])) == (16, 8.5)
     assert float(found.variance[1, 1, 2]) == pytest.approx(np.var(np.arange(1, 17), ddof=1))
 
@@ -180,7 +180,7 @@ def test_a_gradient_is_checked_by_differences(variant_rgb: str, monkeypatch: pyt
     found = validation.check_gradient("scene", "camera", "ours", "a.key", chosen, level)
     direction = np.random.default_rng([5, 5]).uniform(0, 2, 3) * values
     for batch in range(16):
-        seeds = [seed_of(5, validation.GRADIENT, batch, which) for which in range(4)]
+        seeds = [derive_seed(5, validation.GRADIENT, batch, which) for which in range(4)]
         (_, along, spp, pair), near, far = heard[3 * batch : 3 * batch + 3]
         assert np.array_equal(along, direction) and (spp, pair) == (3, tuple(seeds[:2]))
         assert near[:2] == far[:2] == ("a.key", [0.0, 1.0, 2.0]) and near[3:] == (3, seeds[2]) and far[3:] == (3, seeds[3])

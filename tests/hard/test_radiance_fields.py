@@ -48,7 +48,7 @@ from mivol.fields.harmonics import MAX_DEGREE, basis_size
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.optim.loop import begin_fit, reconstruct
 from mivol.optim.photographs.field_view import render_view
-from mivol.optim.photographs.radiance_plan import PRESETS, FitPlan, Stage
+from mivol.optim.photographs.radiance_plan import PRESETS, RadiancePlan, RadianceStage
 from mivol.optim.photographs.radiance_problem import RadianceProblem
 from mivol.optim.photographs.ray_batches import TILE, RayBatches
 from mivol.photos import Camera, Photo, pixel_centres, rays
@@ -115,7 +115,7 @@ def test_rates_of_a_stage_reach_opaque_voxels(name: str) -> None:
     """
     plan = PRESETS[name]
     last = plan.stages[-1]
-    climbed = sum(plan.rates(step)[0] for step in range(plan.steps - last.steps, plan.steps))
+    climbed = sum(plan.learning_rates(step)[0] for step in range(plan.steps - last.steps, plan.steps))
     # Rates count in half the longest edge, of which a voxel is 2 / longest.
     assert climbed * 2 / last.longest > -math.log(0.01)
 
@@ -135,9 +135,9 @@ def test_a_short_fit_makes_matter_opaque() -> None:
     """40 steps from a fog of an optical depth of 0.1 to something that hides all, in a box of any size. Defect 1."""
     half = 0.02
     photos = [plain_view(4 * half * np.array(v)) for v in ([1.0, 0, 0], [0, 1.0, 0], [0, 0, 1.0], [-0.6, -0.6, -0.6])]
-    plan = FitPlan((Stage(8, 40, 1, 4, 16),), degree=0, delay=0.0)
+    plan = RadiancePlan((RadianceStage(8, 40, 1, 4, 16),), degree=0, delay=0.0)
     problem = RadianceProblem(RayBatches.of(photos), np.array([[-half] * 3, [half] * 3]), plan)
-    reconstruct(problem, plan.optimiser, plan.course())
+    reconstruct(problem, plan.optimizer, plan.course())
     opacity = render_view(problem.field, photos[0].camera, np.ones(3)).opacity
     # Rates add up to 100 over half the edge: an optical depth of 25 a voxel if all derivatives agree. A tenth is asked for.
     assert np.quantile(opacity, 0.1) > 0.99
@@ -268,13 +268,13 @@ def test_no_nan_where_transmittance_underflows(most: float) -> None:
 def test_a_fit_goes_on_from_an_opaque_field() -> None:
     """A step from densities up to 1e5 leaves finite values and a finite state. Defect 4."""
     photos = [plain_view(4 * np.array(v)) for v in ([1.0, 0, 0], [0, 1.0, 0])]
-    plan = FitPlan((Stage(16, 4, 1, 2, 16),), degree=0)
+    plan = RadiancePlan((RadianceStage(16, 4, 1, 2, 16),), degree=0)
     problem = RadianceProblem(RayBatches.of(photos), np.array([[-1.0] * 3, [1.0] * 3]), plan)
     rng = np.random.default_rng(1)
     dense = mi.Float(rng.uniform(0, 1e5, problem.field.rows).astype(np.float32))
     harmonics = mi.Float(rng.normal(size=dr.width(problem.field.harmonics)).astype(np.float32))
     problem.field = problem.field.with_values(dense, harmonics)
-    fit = begin_fit(problem, plan.optimiser, plan.course())
+    fit = begin_fit(problem, plan.optimizer, plan.course())
     fit.advance()
     state = fit.run.pack()
     assert set(state) == {"reals/density", "reals/harmonics", "roots/density", "roots/harmonics"}
@@ -339,7 +339,7 @@ def test_negative_densities(name: str) -> None:
 def test_a_fit_begins_above_zero() -> None:
     """Defect 6."""
     for plan in PRESETS.values():
-        small = FitPlan((Stage(8, 1, 1, 1, 1),), degree=plan.degree, start=plan.start)
+        small = RadiancePlan((RadianceStage(8, 1, 1, 1, 1),), degree=plan.degree, start=plan.start)
         batches = RayBatches.of([plain_view(np.array([4.0, 0, 0]))])
         field = RadianceProblem(batches, np.array([[-1.0] * 3, [1.0] * 3]), small).field
         assert dr.all(field.density > 0) and field.activation in ACTIVATIONS

@@ -18,7 +18,7 @@ class Given:
     def __init__(self, size: float = 1.0) -> None:
         self.size, self.asked = size, []
 
-    def start(self) -> dict[str, mi.TensorXf]:
+    def initial_reals(self) -> dict[str, mi.TensorXf]:
         return {"a": mi.TensorXf(np.full((2, 3), 0.5, np.float32)), "b": mi.TensorXf(np.full(4, 2.0, np.float32))}
 
     def slopes(self, iteration: int) -> dict[str, np.ndarray]:
@@ -29,7 +29,7 @@ class Given:
         self.asked.append((iteration, views))
         return 7.0 + iteration, {name: mi.TensorXf(array) for name, array in self.slopes(iteration).items()}
 
-    def rates(self, iteration: int) -> dict[str, float]:
+    def learning_rates(self, iteration: int) -> dict[str, float]:
         return {"a": 0.1 / (1 + iteration), "b": 0.02}
 
     def after_step(self, reals: dict, iteration: int) -> dict:
@@ -41,7 +41,7 @@ class Twin:
 
     def __init__(self, settings: Adam, problem: Given) -> None:
         self.s, self.problem, self.count, self.scale = settings, problem, 0, 0.0
-        self.x = {name: np.array(value, np.float64) for name, value in problem.start().items()}
+        self.x = {name: np.array(value, np.float64) for name, value in problem.initial_reals().items()}
         self.m = {name: np.zeros_like(value) for name, value in self.x.items()}
         self.v = {name: np.zeros_like(value) for name, value in self.x.items()}
 
@@ -49,7 +49,7 @@ class Twin:
         slopes = self.problem.slopes(iteration)
         self.scale = self.scale or max(np.abs(g).max() for g in slopes.values()) or 1.0
         self.count += 1
-        for name, rate in self.problem.rates(iteration).items():
+        for name, rate in self.problem.learning_rates(iteration).items():
             g = slopes[name] / self.scale
             self.m[name] = self.s.beta_1 * self.m[name] + (1 - self.s.beta_1) * g
             self.v[name] = self.s.beta_2 * self.v[name] + (1 - self.s.beta_2) * g**2

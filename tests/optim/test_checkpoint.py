@@ -14,7 +14,7 @@ from scattering_scenes import cases
 from mivol.errors import MivolError
 from mivol.files import atomic
 from mivol.optim import checkpoint
-from mivol.optim.checkpoint import Store
+from mivol.optim.checkpoint import CheckpointFile
 from mivol.optim.events import Checkpoint, Evaluate, Upsample
 from mivol.optim.first_order import Adam, RMSprop
 from mivol.optim.interrupt import Interrupted
@@ -37,15 +37,15 @@ def fit(optimiser, path: Path | None = None, *, stop_after: int = -1, how: int =
     """The same run, stopped by a signal after an iteration where asked for."""
 
     def observe(at_work: Fit) -> None:
-        if at_work.next == stop_after:
+        if at_work.next_iteration == stop_after:
             os.kill(os.getpid(), how)
 
     def measure(problem: SceneProblem) -> dict[str, float]:
         return {"mean": float(np.asarray(problem.values()[KEY]).mean())}
 
-    store = None if path is None else Store(path, {"a": 1}, resume)
+    store = None if path is None else CheckpointFile(path, {"a": 1}, resume)
     course = Course(ITERATIONS, events=EVENTS)
-    return reconstruct(small_problem(), optimiser, course, measure=measure, observer=observe, store=store)
+    return reconstruct(small_problem(), optimiser, course, measure=measure, observer=observe, checkpoint=store)
 
 
 @pytest.mark.slow
@@ -60,7 +60,7 @@ def test_a_resumed_run_is_bitwise_the_same(one_thread, ctrl_c, tmp_path: Path, n
             fit(CASES[name], path, stop_after=stop_after, how=how, resume=stop_after > 1)
     resumed = fit(CASES[name], path, resume=True)
     assert [r["loss"] for r in resumed.history] == [r["loss"] for r in whole.history]
-    assert [m["mean"] for m in resumed.measures] == [m["mean"] for m in whole.measures]
+    assert [m["mean"] for m in resumed.evaluations] == [m["mean"] for m in whole.evaluations]
     assert resumed.log == whole.log
     assert np.array_equal(np.asarray(resumed.run.reals[KEY]), np.asarray(whole.run.reals[KEY]))
 
@@ -94,7 +94,7 @@ def test_a_signal_in_the_middle_of_an_iteration_loses_nothing(one_thread, ctrl_c
 
     problem.render = render
     with pytest.raises(Interrupted):
-        reconstruct(problem, Adam(), Course(ITERATIONS, events=EVENTS), store=Store(path, {"a": 1}))
+        reconstruct(problem, Adam(), Course(ITERATIONS, events=EVENTS), checkpoint=CheckpointFile(path, {"a": 1}))
     assert renders == iteration + 1
     resumed = fit(Adam(), path, resume=True)
     assert [r["loss"] for r in resumed.history] == [r["loss"] for r in whole.history]
@@ -106,9 +106,11 @@ def test_checkpoints_are_written_when_due(variant_rgb, tmp_path: Path) -> None:
     found = []
 
     def observe(at_work: Fit) -> None:
-        found.append(checkpoint.read(path, {})[1]["next"] if path.exists() else 0)
+        found.append(checkpoint.read(path, {})[1]["next_iteration"] if path.exists() else 0)
 
-    reconstruct(small_problem(), Adam(), Course(6, events=(Checkpoint(every=2),)), observer=observe, store=Store(path, {}))
+    reconstruct(
+        small_problem(), Adam(), Course(6, events=(Checkpoint(every=2),)), observer=observe, checkpoint=CheckpointFile(path, {})
+    )
     assert found == [0, 0, 2, 2, 4, 4]
 
 

@@ -190,6 +190,6 @@ def test_a_checkpoint_of_radiance_is_one(variant_rgb: str) -> None:
         np.testing.assert_allclose(np.array(one.field.harmonics), np.sinh(np.array(reals["harmonics"]).ravel()), rtol=2e-6)
         np.testing.assert_allclose(np.array(one.sky.texels), np.sinh(np.array(reals["sky"]).ravel()), rtol=2e-6)
         np.testing.assert_allclose(np.array(one.values()["harmonics"]), np.array(reals["harmonics"]), rtol=1e-5, atol=1e-6)
-    rates = problem.rates(0)
+    rates = problem.learning_rates(0)
     assert rates["harmonics"] == pytest.approx(4 * problem.plan.sh_rate)
     assert rates["sky"] == pytest.approx(4 * problem.plan.sky_rate)

@@ -11,10 +11,10 @@ from scipy.special import expit, logit
 
 from mivol.errors import MivolError
 from mivol.optim.gaussians import density_control
-from mivol.optim.gaussians.density_control import Arrays
+from mivol.optim.gaussians.density_control import CloudArrays
 
 
-def cloud(n: int = 6, seed: int = 0) -> Arrays:
+def cloud(n: int = 6, seed: int = 0) -> CloudArrays:
     """Some Gaussians, all different."""
     rng = np.random.default_rng(seed)
     return {
@@ -70,9 +70,9 @@ def test_large_ones_are_split_and_small_ones_cloned() -> None:
 
 def test_the_steepest_are_chosen_and_no_more_than_there_is_room_for() -> None:
     slope = np.array([3.0, 1.0, 2.0, 3.0, 0.5])
-    assert density_control.best_rows(slope, 1.0, 10).tolist() == [0, 1, 2, 3]
-    assert density_control.best_rows(slope, 1.0, 3).tolist() == [0, 2, 3]
-    assert density_control.best_rows(slope, 1.0, -5).tolist() == []
+    assert density_control.select_rows(slope, 1.0, 10).tolist() == [0, 1, 2, 3]
+    assert density_control.select_rows(slope, 1.0, 3).tolist() == [0, 2, 3]
+    assert density_control.select_rows(slope, 1.0, -5).tolist() == []
 
 
 def test_pruning_keeps_moments_and_refuses_to_leave_nothing() -> None:
@@ -107,7 +107,7 @@ def test_copies_compose_to_what_they_replace(opacity: float, copies: int) -> Non
 
     quad is asked for 1e-10; the alternating sums lose at most 2^20 ulps of float64 with 20 copies: 1e-9 bounds both.
     """
-    each, factor = density_control.opacity_and_scale_of_copies(np.array([opacity]), np.array([copies]))
+    each, factor = density_control.split_opacity_and_scale(np.array([opacity]), np.array([copies]))
 
     def composite(x: float) -> float:
         return 1 - (1 - each[0] * math.exp(-0.5 * (x / factor[0]) ** 2)) ** copies
@@ -117,7 +117,7 @@ def test_copies_compose_to_what_they_replace(opacity: float, copies: int) -> Non
     area = quad(composite, -20 * factor[0], 20 * factor[0], epsabs=0, epsrel=1e-10, limit=200)[0]
     assert area == pytest.approx(opacity * math.sqrt(2 * math.pi), rel=1e-9)
     # Beside others that have more copies it is the same.
-    beside = density_control.opacity_and_scale_of_copies(np.array([opacity, 0.5]), np.array([copies, 25]))
+    beside = density_control.split_opacity_and_scale(np.array([opacity, 0.5]), np.array([copies, 25]))
     assert beside[0][0] == each[0] and beside[1][0] == pytest.approx(factor[0], rel=1e-12)
 
 

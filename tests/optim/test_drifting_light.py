@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from small_scan import VIEWS
 
-from mivol.optim.projections.inversion import fit_drift, with_drift
-from mivol.optim.projections.linear_problems import LeastSquares, State
+from mivol.optim.projections.inversion import fit_drift, solve_with_drift
+from mivol.optim.projections.linear_problems import LeastSquares, SolverState
 from mivol.optim.projections.solvers import SOLVERS
 
 TIMES = np.linspace(-1.0, 1.0, VIEWS)
@@ -26,7 +26,7 @@ def drifting(scan):
 
 
 def states_of(problem, n, state=None):
-    return list(itertools.islice(with_drift(SOLVERS["pcg"].run, problem, TIMES, 5, state), n))
+    return list(itertools.islice(solve_with_drift(SOLVERS["pcg"].run, problem, TIMES, 5, state), n))
 
 
 def test_a_turn_is_the_solver_and_then_the_drift(drifting):
@@ -56,7 +56,7 @@ def test_a_saved_state_goes_on_bit_for_bit(drifting, cut):
     """In the middle of a turn and at its end."""
     problem, _ = drifting
     whole = states_of(problem, 12)
-    saved = State.from_arrays({name: np.array(value) for name, value in whole[cut - 1].to_arrays().items()})
+    saved = SolverState.from_arrays({name: np.array(value) for name, value in whole[cut - 1].to_arrays().items()})
     rest = states_of(problem, 12 - cut, saved)
     for a, b in zip(whole[cut:], rest, strict=True):
         assert a.iteration == b.iteration

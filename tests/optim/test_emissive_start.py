@@ -12,7 +12,7 @@ from mivol.fields.spherical_grid import SphericalGrid
 from mivol.optim.first_order import Adam
 from mivol.optim.parameters import Parameter
 from mivol.optim.scenes import emissive_start
-from mivol.optim.scenes.emissive_start import FACTORS, LEAST, PARTS, density_of, find_emissive_start, photographed
+from mivol.optim.scenes.emissive_start import FACTORS, LEAST, PARTS, average_density, find_emissive_start, to_photographs
 from mivol.optim.scenes.scene_problem import SceneProblem
 from mivol.optim.scenes.views import View
 
@@ -36,7 +36,7 @@ def test_a_voxel_has_the_mean_of_the_field(variant_rgb):
     """A density that is linear along the axes has at a voxel's middle its mean; the grid's axes are turned by a quarter."""
     z, y, x = np.meshgrid(*((np.arange(n) + 0.5) / n for n in (8, 8, 8)), indexing="ij")
     turned = PLACE @ np.array([[0.0, -1, 0, 1], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
-    found = density_of(field_of(1 + 4 * x + 2 * y + z, PLACE), turned, (2, 2, 4))
+    found = average_density(field_of(1 + 4 * x + 2 * y + z, PLACE), turned, (2, 2, 4))
     # The outer half voxel is clamped, so only points of voxels that end within the nodes have the linear value.
     k, j, i = np.meshgrid(*((np.arange(n) + 0.5) / n for n in (2, 2, 4)), indexing="ij")
     truth = 1 + 4 * (1 - j) + 2 * i + k
@@ -49,7 +49,7 @@ def test_a_voxel_has_the_mean_of_the_field(variant_rgb):
 def test_nothing_lies_outside_of_the_field(variant_rgb):
     """A grid that is twice as long as the field's box has matter in one half of it."""
     longer = PLACE @ np.diag([2.0, 1, 1, 1])
-    found = density_of(field_of(np.full((2, 2, 2), 3.0), PLACE), longer, (1, 1, 4))
+    found = average_density(field_of(np.full((2, 2, 2), 3.0), PLACE), longer, (1, 1, 4))
     assert np.allclose(found, [[[3, 3, 0, 0]]], atol=1e-6)
 
 
@@ -58,7 +58,7 @@ def test_views_become_codes_of_one_white(variant_rgb):
     values = np.linspace(0, 2, 48, dtype=np.float32).reshape(4, 4, 3)
     sensor = camera(0.0, 4)
     views = [View("a", sensor, mi.TensorXf(values)), View("b", sensor, mi.TensorXf(values[..., :1] / 4))]
-    first, second = photographed(views)
+    first, second = to_photographs(views)
     white = np.percentile(np.concatenate([values.ravel(), np.repeat(values[..., :1] / 4, 3, axis=2).ravel()]), 99.5)
     linear = np.where(first.image <= 0.04045, first.image / 12.92, ((first.image + 0.055) / 1.055) ** 2.4)
     assert np.abs(linear - np.minimum(values / white, 1)).max() <= 1e-5
@@ -72,7 +72,7 @@ def test_the_factor_has_the_least_loss(variant_rgb, monkeypatch):
     truth[0, 0, 0] = 1.0
     shape = np.where(truth[..., 0] > 0.5, 20.0, 1.0)
     monkeypatch.setattr(emissive_start, "fit_emission", lambda views, place, seed: field_of(shape, PLACE))
-    monkeypatch.setattr(emissive_start, "density_of", lambda field, place, size: shape)
+    monkeypatch.setattr(emissive_start, "average_density", lambda field, place, size: shape)
     problem = problem_of(np.full((2, 2, 2, 1), truth.mean() / 4), truth, 4)
     before = problem.values()[KEY]
     found = find_emissive_start(problem, KEY, PLACE, Adam(views=2))
@@ -89,7 +89,7 @@ def test_no_value_is_0(variant_rgb, monkeypatch):
     shape = np.zeros((2, 2, 2))
     shape[0, 0, 0] = 8.0
     monkeypatch.setattr(emissive_start, "fit_emission", lambda views, place, seed: None)
-    monkeypatch.setattr(emissive_start, "density_of", lambda field, place, size: shape)
+    monkeypatch.setattr(emissive_start, "average_density", lambda field, place, size: shape)
     problem = problem_of(np.full((2, 2, 2, 1), 0.1), np.full((2, 2, 2, 1), 0.1), 1)
     found = find_emissive_start(problem, KEY, PLACE, Adam(views=2))
     assert np.isclose(found.value.min(), found.factor * 0.1 * LEAST, rtol=1e-5)
@@ -101,7 +101,7 @@ def test_no_value_is_0(variant_rgb, monkeypatch):
 )
 def test_refusals(variant_rgb, monkeypatch, value, density, says):
     monkeypatch.setattr(emissive_start, "fit_emission", lambda views, place, seed: None)
-    monkeypatch.setattr(emissive_start, "density_of", lambda field, place, size: np.full((2, 2, 2), density))
+    monkeypatch.setattr(emissive_start, "average_density", lambda field, place, size: np.full((2, 2, 2), density))
     with pytest.raises(MivolError, match=says):
         find_emissive_start(problem_of(value, np.full((2, 2, 2, 1), 0.1), 1), KEY, PLACE, Adam())
 
@@ -109,7 +109,7 @@ def test_refusals(variant_rgb, monkeypatch, value, density, says):
 def test_other_cameras_are_refused(variant_rgb):
     """An emissive fit looks through pinholes."""
     with pytest.raises(MivolError, match="a perspective sensor"):
-        photographed([View("flat", frontal(), mi.TensorXf(np.ones((4, 4, 3), np.float32)))])
+        to_photographs([View("flat", frontal(), mi.TensorXf(np.ones((4, 4, 3), np.float32)))])
 
 
 @pytest.mark.slow

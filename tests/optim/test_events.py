@@ -16,7 +16,7 @@ from mivol.optim.events import (
     Evaluate,
     UpdateOccupancy,
     Upsample,
-    in_order,
+    checkpoints_first,
     upsample,
 )
 
@@ -86,4 +86,4 @@ def test_events_are_due_when_they_say(variant_rgb) -> None:
     assert [i for i in range(9) if ControlDensity(every=2, begin=3, end=8).due(i)] == [4, 6]
     names = {"upsample", "coarse_to_fine", "drop_unseen", "update_occupancy", "control_density", "checkpoint", "evaluate"}
     assert set(EVENTS) == names
-    assert isinstance(in_order((Upsample(at=(1,)), Evaluate(), Checkpoint()))[0], Checkpoint)
+    assert isinstance(checkpoints_first((Upsample(at=(1,)), Evaluate(), Checkpoint()))[0], Checkpoint)

@@ -16,12 +16,12 @@ from mivol import config
 from mivol.errors import MivolError
 from mivol.experiments.field_plan import GAINS, choices, make_plan
 from mivol.experiments.photo_outputs import table_of_gains
-from mivol.optim.checkpoint import Store
+from mivol.optim.checkpoint import CheckpointFile
 from mivol.optim.loop import begin_fit
 from mivol.optim.photographs import radiance_problem
 from mivol.optim.photographs.exposure import AGREE, PULL, RATE, Exposure
 from mivol.optim.photographs.field_view import render_view
-from mivol.optim.photographs.radiance_plan import PRESETS, FitPlan, Stage
+from mivol.optim.photographs.radiance_plan import PRESETS, RadiancePlan, RadianceStage
 from mivol.optim.photographs.radiance_problem import RadianceProblem
 from mivol.optim.photographs.ray_batches import RayBatches
 from mivol.photos import Photo
@@ -31,7 +31,7 @@ from mivol.transport.line_integrals.radiance_source import bake
 MIDDLE = np.array([[-0.9] * 3, [0.9] * 3])
 """About the ball of :mod:`capture_photos`."""
 
-SMALL = replace(PRESETS["capture"], stages=(Stage(8, 6, 1, 3, 8), Stage(16, 6, 1, 3, 8)))
+SMALL = replace(PRESETS["capture"], stages=(RadianceStage(8, 6, 1, 3, 8), RadianceStage(16, 6, 1, 3, 8)))
 
 
 def logs_of(photographs: int, spread: float, seed: int = 3) -> np.ndarray:
@@ -41,7 +41,7 @@ def logs_of(photographs: int, spread: float, seed: int = 3) -> np.ndarray:
     return np.float32(logs * spread / np.sqrt(np.mean(logs**2)))
 
 
-def problem_of(plan: FitPlan = SMALL, count: int = 5, uneven: float = 0.0) -> RadianceProblem:
+def problem_of(plan: RadiancePlan = SMALL, count: int = 5, uneven: float = 0.0) -> RadianceProblem:
     return RadianceProblem(RayBatches.of(capture_photos.capture(count, uneven)), MIDDLE, plan)
 
 
@@ -104,10 +104,10 @@ def test_a_brighter_photograph_of_a_gain_says_the_same_of_the_field(variant_rgb:
     ids=["agree", "differ"],
 )
 def test_gains_of_photographs_that_agree_are_left_out(variant_rgb: str, spread: float, said: str) -> None:
-    problem, logs = problem_of(replace(SMALL, stages=(*SMALL.stages, Stage(24, 2)))), logs_of(5, spread)
+    problem, logs = problem_of(replace(SMALL, stages=(*SMALL.stages, RadianceStage(24, 2)))), logs_of(5, spread)
     problem.exposure = Exposure(mi.Float(logs.ravel()))
     refinement = problem.refine(1)
-    assert (said or "photographs differ in exposure by 4%, so each has gains") in refinement.says
+    assert (said or "photographs differ in exposure by 4%, so each has gains") in refinement.message
     assert problem.has_gains != bool(said)
     np.testing.assert_array_equal(np.array(refinement.reals["exposure"]), 0 * logs if said else logs)
     batch = problem.batches.draw(1, np.array([0, 2]), 5, np.random.default_rng(2))
@@ -118,7 +118,7 @@ def test_gains_of_photographs_that_agree_are_left_out(variant_rgb: str, spread: 
     wanted = logs if said else np.array(Exposure(mi.Float(logs.ravel())).pulled(RATE).tensor)
     np.testing.assert_allclose(pulled, wanted, atol=1e-8)
     problem.exposure = Exposure(mi.Float(logs.ravel()))
-    assert "exposure" not in problem.refine(2).says and problem.has_gains != bool(said)
+    assert "exposure" not in problem.refine(2).message and problem.has_gains != bool(said)
 
 
 def test_gains_need_cameras(variant_rgb: str, photos: list[Photo]) -> None:
@@ -127,7 +127,7 @@ def test_gains_need_cameras(variant_rgb: str, photos: list[Photo]) -> None:
 
 
 def test_gains_are_what_the_preset_or_the_file_says() -> None:
-    def plan(preset: str, **settings: object) -> FitPlan:
+    def plan(preset: str, **settings: object) -> RadiancePlan:
         return make_plan(config.from_dict({"title": "x", "photos": {"path": "x"}, "field": {"preset": preset, **settings}}))
 
     assert plan("capture").exposure and not plan("cpu").exposure
@@ -137,7 +137,10 @@ def test_gains_are_what_the_preset_or_the_file_says() -> None:
 
 def problem_rates_fall() -> bool:
     """The rate of gains falls with that of the coefficients."""
-    return SMALL.rates(0)[1] == SMALL.sh_rate and RATE * SMALL.rates(SMALL.steps)[1] / SMALL.sh_rate == RATE * SMALL.last
+    return (
+        SMALL.learning_rates(0)[1] == SMALL.sh_rate
+        and RATE * SMALL.learning_rates(SMALL.steps)[1] / SMALL.sh_rate == RATE * SMALL.last
+    )
 
 
 def test_a_plan_says_that_there_are_gains(variant_rgb: str) -> None:
@@ -167,19 +170,19 @@ def test_a_fit_that_went_on_equals_one_that_did_not_stop(
     monkeypatch.setattr(radiance_problem, "AGREE", agree)
     batches, path = RayBatches.of(capture_photos.capture(6, 0.3)), tmp_path / "checkpoint.npz"
 
-    def run(store: Store, until: int) -> object:
-        fit = begin_fit(RadianceProblem(batches, MIDDLE, plan), plan.optimiser, plan.course(), store=store)
-        while fit.next < until:
+    def run(store: CheckpointFile, until: int) -> object:
+        fit = begin_fit(RadianceProblem(batches, MIDDLE, plan), plan.optimizer, plan.course(), checkpoint=store)
+        while fit.next_iteration < until:
             fit.advance()
         return fit
 
-    plan = replace(SMALL, stages=(Stage(8, 10, 1, 3, 8), Stage(16, 10, 1, 3, 8)))
+    plan = replace(SMALL, stages=(RadianceStage(8, 10, 1, 3, 8), RadianceStage(16, 10, 1, 3, 8)))
     for stop in (7, 14):
-        whole = run(Store(path, {}), stop)
+        whole = run(CheckpointFile(path, {}), stop)
         whole.save()
-        while whole.next < 20:
+        while whole.next_iteration < 20:
             whole.advance()
-        resumed = run(Store(path, {}, resume=True), 20)
+        resumed = run(CheckpointFile(path, {}, resume=True), 20)
         kept, found = whole.run.pack(), resumed.run.pack()
         assert kept.keys() == found.keys() and all(np.array_equal(kept[name], found[name]) for name in kept)
         assert whole.problem.has_gains == resumed.problem.has_gains == kept["reals/exposure"].any() == (agree == 0)
@@ -190,15 +193,15 @@ def test_a_fit_that_went_on_equals_one_that_did_not_stop(
 def test_gains_are_found_with_the_field(variant_rgb: str) -> None:
     """Photographs whose gains are spread by exp(0.15): clipping at 1 and the pull take some of that back. Views that were not
     fitted, of the mean exposure, have 0.54 of the error of a fit without gains; 0.75 allows for runs that differ by a tenth."""
-    plan = replace(PRESETS["capture"], stages=(Stage(16, 60, 1, 8, 32), Stage(32, 90, 1, 8, 32)))
+    plan = replace(PRESETS["capture"], stages=(RadianceStage(16, 60, 1, 8, 32), RadianceStage(32, 90, 1, 8, 32)))
     gains = np.exp(0.15 * np.random.default_rng(7).normal(size=24))
     errors = {}
     for exposure in (False, True):
         problem = problem_of(replace(plan, exposure=exposure), 24, 0.15)
-        fit = begin_fit(problem, plan.optimiser, replace(plan, exposure=exposure).course())
+        fit = begin_fit(problem, plan.optimizer, replace(plan, exposure=exposure).course())
         while not fit.is_done:
             fit.advance()
-        problem.set(fit.run.reals)
+        problem.set_reals(fit.run.reals)
         mean = np.exp(np.mean(np.log(gains)))
         others = capture_photos.cameras(30)[24:]
         pairs = [(render_view(problem.field, one, problem.sky).image, mean * capture_photos.image_of(one)) for one in others]

@@ -11,23 +11,27 @@ import pytest
 from mivol.errors import MivolError
 from mivol.optim.events import CoarseToFine, ControlDensity, UpdateOccupancy
 from mivol.optim.first_order import Adam
-from mivol.optim.gaussians.gaussian_plan import PRESETS, GaussianPlan, SplatStage, bytes_of, extent_of, memory_of
+from mivol.optim.gaussians.gaussian_plan import PRESETS, GaussianPlan, GaussianStage, check_memory, estimate_bytes, scene_extent
 from mivol.photos import Camera
 
 PLAN = GaussianPlan(
-    (SplatStage(100, 30, 0), SplatStage(200, 50, 1), SplatStage(400, 120, 3)), start=100, most=900, every=7, grows=(0.1, 0.6)
+    (GaussianStage(100, 30, 0), GaussianStage(200, 50, 1), GaussianStage(400, 120, 3)),
+    start=100,
+    most=900,
+    every=7,
+    grows=(0.1, 0.6),
 )
 
 
 def test_a_plan_counts_its_steps_and_begins_its_stages() -> None:
     more = UpdateOccupancy(every=3)
     course = PLAN.course(more)
-    assert (PLAN.steps, PLAN.degree, PLAN.begins) == (200, 3, (30, 80))
+    assert (PLAN.steps, PLAN.degree, PLAN.stage_starts) == (200, 3, (30, 80))
     assert course.iterations == 200
     assert course.events == (CoarseToFine(at=(30, 80)), ControlDensity(every=7, begin=20, end=120), more)
     # Control begins at 1 at the earliest, when there is something to tell, and ends after it has begun.
     assert replace(PLAN, grows=(0.0, 0.0)).course().events[1] == ControlDensity(every=7, begin=1, end=2)
-    assert PLAN.optimiser == Adam(epsilon=1e-12)
+    assert PLAN.optimizer == Adam(epsilon=1e-12)
 
 
 @pytest.mark.parametrize("step", [0, 12, 13, 14, 20, 63, 112, 113, 114, 199])
@@ -49,7 +53,7 @@ def test_rates_are_geometric(step: int) -> None:
     plan, share = replace(PLAN, place=3e-3, place_end=2e-5, end=0.3), step / 200
     falls = {"log_scales": 2e-2, "quaternions": 4e-3, "opacity_logits": 0.05, "harmonics": 1e-2}
     wanted = {"means": 2.5 * 3e-3 ** (1 - share) * 2e-5**share} | {k: v * 0.3**share for k, v in falls.items()}
-    assert plan.rates(step, 2.5) == pytest.approx(wanted, rel=1e-13)
+    assert plan.learning_rates(step, 2.5) == pytest.approx(wanted, rel=1e-13)
 
 
 @pytest.mark.parametrize("shrink", [1, 2, 4, 8])
@@ -80,33 +84,33 @@ def test_the_extent_is_that_of_the_cameras() -> None:
     for pose, x in zip(poses, (0.0, 1.0, 5.0), strict=True):
         pose[1, 3] = x
     K = np.array([[50.0, 0, 20], [0, 50, 20], [0, 0, 1]])
-    assert extent_of([Camera(K, (40, 40), pose) for pose in poses]) == pytest.approx(3.3, rel=1e-14)
+    assert scene_extent([Camera(K, (40, 40), pose) for pose in poses]) == pytest.approx(3.3, rel=1e-14)
 
 
 @pytest.mark.parametrize("degree", [0, 1, 3])
 def test_bytes_are_counted(degree: int) -> None:
     """A Gaussian has 3 + 3 + 4 + 1 numbers and 3 for each harmonic: six float32 of each; 32 entries of lists of 100 bytes."""
-    plan = replace(PLAN, stages=(SplatStage(100, 30, degree),))
-    assert bytes_of(plan, 1000, 0) == 1000 * (24 * (3 + 3 + 4 + 1 + 3 * (degree + 1) ** 2) + 3200)
-    assert bytes_of(plan, 0, 5000) == 5000 * 160
+    plan = replace(PLAN, stages=(GaussianStage(100, 30, degree),))
+    assert estimate_bytes(plan, 1000, 0) == 1000 * (24 * (3 + 3 + 4 + 1 + 3 * (degree + 1) ** 2) + 3200)
+    assert estimate_bytes(plan, 0, 5000) == 5000 * 160
 
 
 def test_memory_is_said_and_refused(variant_rgb: str) -> None:
     """What is needed is what is there, to the byte; what fits is what would be taken."""
     pictures, pixels = 3 << 20, 10_000
-    needed = pictures + bytes_of(PLAN, 900, pixels)
+    needed = pictures + estimate_bytes(PLAN, 900, pixels)
     said = f"about {needed / 2**20:.0f} MiB: photographs 3, Gaussians and a picture the rest"
-    assert memory_of(PLAN, pictures, pixels, needed) == memory_of(PLAN, pictures, pixels) == said
-    assert memory_of(replace(PLAN, start=900, most=1), pictures, pixels, needed) == said
+    assert check_memory(PLAN, pictures, pixels, needed) == check_memory(PLAN, pictures, pixels) == said
+    assert check_memory(replace(PLAN, start=900, most=1), pictures, pixels, needed) == said
     wanted = "a fit of 900 Gaussians takes about 0.0 GiB and 0.0 are left; gaussians.most = 899 fits."
     with pytest.raises(MivolError) as refused:
-        memory_of(PLAN, pictures, pixels, needed - 1)
+        check_memory(PLAN, pictures, pixels, needed - 1)
     assert str(refused.value) == wanted
     with pytest.raises(MivolError, match=r"read the photographs smaller \(photos.scale\)"):
-        memory_of(PLAN, pictures, pixels, pictures + bytes_of(PLAN, 1, pixels))
+        check_memory(PLAN, pictures, pixels, pictures + estimate_bytes(PLAN, 1, pixels))
     large = 1 << 40
     with pytest.raises(MivolError, match=r"takes about 1024\.0 GiB and 2\.0 are left; read the photographs smaller"):
-        memory_of(PLAN, large, 0, 2 << 30)
+        check_memory(PLAN, large, 0, 2 << 30)
 
 
 def test_minutes_become_steps_and_no_clock_is_asked() -> None:

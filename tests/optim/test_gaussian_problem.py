@@ -11,12 +11,12 @@ import pytest
 from ball_photos import camera
 
 from mivol.errors import MivolError
-from mivol.optim.checkpoint import Store
+from mivol.optim.checkpoint import CheckpointFile
 from mivol.optim.events import Checkpoint
-from mivol.optim.gaussians.density_control import Arrays, rotations
-from mivol.optim.gaussians.gaussian_plan import PRESETS, GaussianPlan, SplatStage, bytes_of, extent_of, memory_of
+from mivol.optim.gaussians.density_control import CloudArrays, rotations
+from mivol.optim.gaussians.gaussian_plan import PRESETS, GaussianPlan, GaussianStage, check_memory, estimate_bytes, scene_extent
 from mivol.optim.gaussians.gaussian_problem import GaussianProblem, _wandered
-from mivol.optim.gaussians.gaussian_start import begin_at
+from mivol.optim.gaussians.gaussian_start import make_start_cloud
 from mivol.optim.loop import Fit, begin_fit, reconstruct
 from mivol.optim.photographs.ray_batches import RayBatches
 from mivol.photos import Photo
@@ -24,7 +24,7 @@ from mivol.splatting import Splatter
 
 SIDE, WHITE = 40, np.ones(3, np.float32)
 
-STEPS = SplatStage(20, 12, 0, 2), SplatStage(40, 28, 1, 1)
+STEPS = GaussianStage(20, 12, 0, 2), GaussianStage(40, 28, 1, 1)
 RATES = {"end": 0.5, "place": 1.6e-3, "place_end": 1.6e-5}
 PLAN = GaussianPlan(STEPS, start=150, most=220, every=8, grows=(0.1, 0.8), **RATES)
 """Few steps, so that places move fast."""
@@ -36,9 +36,9 @@ def places(count: int, seed: int = 0) -> np.ndarray:
     return 0.6 * drawn / np.linalg.norm(drawn, axis=1, keepdims=True)
 
 
-def truth(count: int = 120) -> Arrays:
+def truth(count: int = 120) -> CloudArrays:
     """A ball of many colours, of opaque Gaussians."""
-    cloud = begin_at(places(count, 5), [], 0)
+    cloud = make_start_cloud(places(count, 5), [], 0)
     cloud["opacity_logits"][:] = 3
     cloud["harmonics"][:, 0] = 1.5 * np.sin(5 * cloud["means"])
     return cloud
@@ -60,12 +60,14 @@ def views() -> list[Photo]:
 def problem_of(views: list[Photo], plan: GaussianPlan = PLAN, count: int = 150, seed: int = 0) -> GaussianProblem:
     """The problem from points that are not the truth's."""
     batches = RayBatches.of(views, sorted({stage.shrink for stage in plan.stages}))
-    return GaussianProblem(batches, [view.camera for view in views], begin_at(places(count, 1), views, plan.degree), plan, seed)
+    return GaussianProblem(
+        batches, [view.camera for view in views], make_start_cloud(places(count, 1), views, plan.degree), plan, seed
+    )
 
 
-def fit_of(views: list[Photo], plan: GaussianPlan = PLAN, store: Store | None = None) -> Fit:
+def fit_of(views: list[Photo], plan: GaussianPlan = PLAN, store: CheckpointFile | None = None) -> Fit:
     problem = problem_of(views, plan)
-    return begin_fit(problem, plan.optimiser, plan.course(Checkpoint(every=1000)), store=store)
+    return begin_fit(problem, plan.optimizer, plan.course(Checkpoint(every=1000)), checkpoint=store)
 
 
 @pytest.mark.slow_for("0.2-behind0")
@@ -81,11 +83,11 @@ def test_the_gradient_is_that_of_the_loss(
     seen), and a factor left out is far more. With SSIM over black: in even areas of a colour all variances round alike, which
     moves the loss by 1e-4.
     """
-    plan = replace(PLAN, stages=(SplatStage(40, 1, 1, 1),), ssim=ssim)
+    plan = replace(PLAN, stages=(GaussianStage(40, 1, 1, 1),), ssim=ssim)
     problem = problem_of(views, plan, 6)
     smooth = Splatter(SIDE, SIDE, 1, least_alpha=1e-6, sheen=plan.sheen)
     monkeypatch.setattr(problem, "splatter_for", lambda size, low_pass, sheen: smooth)
-    reals, rng = problem.start(), np.random.default_rng(4)
+    reals, rng = problem.initial_reals(), np.random.default_rng(4)
     shape = reals["harmonics"].shape
     reals["harmonics"] += mi.TensorXf(rng.normal(0, 0.3, shape).astype(np.float32))
     reals["quaternions"] = mi.TensorXf(rng.normal(size=(6, 4)).astype(np.float32))
@@ -110,9 +112,9 @@ def test_the_rate_of_higher_harmonics_changes_no_picture(variant_rgb: str, views
     and slopes by reals are those by coefficients, times the unit. Harmonics of 0.3 move the loss by far more."""
     found = []
     for sheen in (1.0, 0.25):
-        problem = problem_of(views, replace(PLAN, stages=(SplatStage(40, 1, 1, 1),), sheen=sheen), 20)
+        problem = problem_of(views, replace(PLAN, stages=(GaussianStage(40, 1, 1, 1),), sheen=sheen), 20)
         problem.cloud["harmonics"][:, 1:] = np.random.default_rng(3).normal(0, 0.3, (20, 3, 3))
-        loss, gradient, _ = problem.loss_of_view(problem.start(), 2)
+        loss, gradient, _ = problem.loss_of_view(problem.initial_reals(), 2)
         found.append((float(loss[0]), np.array(gradient["harmonics"]) / np.array([1, sheen, sheen, sheen])[:, None]))
     (loss, slopes), (other, others) = found
     assert other == pytest.approx(loss, rel=1e-6)
@@ -122,7 +124,7 @@ def test_the_rate_of_higher_harmonics_changes_no_picture(variant_rgb: str, views
 def test_a_fit_lowers_the_loss(variant_rgb: str, views: list[Photo]) -> None:
     """80 steps from other points of the same ball; the mean loss of the last round of views is at most 0.55 of the first one's
     (recorded: 0.44), and there are as many Gaussians as the plan lets grow."""
-    plan = replace(PLAN, stages=(SplatStage(20, 20, 0, 2), SplatStage(40, 60, 1, 1)), random_background=False)
+    plan = replace(PLAN, stages=(GaussianStage(20, 20, 0, 2), GaussianStage(40, 60, 1, 1)), random_background=False)
     fit = fit_of(views, plan).complete()
     losses = [row["loss"] for row in fit.history]
     assert np.mean(losses[-8:]) < 0.55 * np.mean(losses[:8])
@@ -135,13 +137,13 @@ def test_a_fit_lowers_the_loss(variant_rgb: str, views: list[Photo]) -> None:
 def test_a_resumed_fit_is_an_uninterrupted_one(one_thread: None, views: list[Photo], tmp_path: Path) -> None:
     """Stopped between two changes of density, after the second stage has begun: to the bit with one thread."""
     whole = fit_of(views, PLAN).complete()
-    store = Store(tmp_path / "checkpoint.npz", {})
+    store = CheckpointFile(tmp_path / "checkpoint.npz", {})
     stopped = fit_of(views, PLAN, store)
-    while stopped.next < 21:
+    while stopped.next_iteration < 21:
         stopped.advance()
     stopped.save()
     resumed = fit_of(views, PLAN, replace(store, resume=True)).complete()
-    assert resumed.next == whole.next
+    assert resumed.next_iteration == whole.next_iteration
     for name, array in whole.problem.cloud.items():
         assert np.array_equal(array, resumed.problem.cloud[name]), name
     assert resumed.history[-1]["loss"] == whole.history[-1]["loss"]
@@ -151,9 +153,9 @@ def test_a_resumed_fit_is_an_uninterrupted_one(one_thread: None, views: list[Pho
 def test_growth_changes_what_is_learnt_row_by_row(variant_rgb: str, views: list[Photo]) -> None:
     """Moments follow the rows that stay, and are 0 for those that are new."""
     fit = fit_of(views, replace(PLAN, grows=(0.9, 1.0)))
-    while fit.next < 14:
+    while fit.next_iteration < 14:
         fit.advance()
-    fit.problem.set(fit.run.reals)
+    fit.problem.set_reals(fit.run.reals)
     before = {name: np.array(state[3][2]).reshape(150, -1) for name, state in fit.run.adam.state.items()}
     fit.problem._slopes = np.arange(150.0)
     fit.problem._times[:] = 1
@@ -174,16 +176,16 @@ def test_growth_changes_what_is_learnt_row_by_row(variant_rgb: str, views: list[
 def test_relocation_keeps_the_picture_and_moves_the_unused(variant_rgb: str, views: list[Photo]) -> None:
     """Gaussians that have become transparent are gone afterwards, and the number is that of the plan's growth."""
     fit = fit_of(views, replace(PLAN, control="relocation", noise=0.0))
-    while fit.next < 3:
+    while fit.next_iteration < 3:
         fit.advance()
-    fit.problem.set(fit.run.reals)
+    fit.problem.set_reals(fit.run.reals)
     fit.problem.cloud["opacity_logits"][:20] = -9
     refinement = fit.problem.control_density(8)
     fit.run.refine(refinement)
     opacity = 1 / (1 + np.exp(-fit.problem.cloud["opacity_logits"].astype(np.float64)))
     assert opacity.min() >= 0.005 * (1 - 1e-5)
     assert len(opacity) == 157  # 5 % more of 150, which is less than the plan has room for
-    assert "157 Gaussians, 150 before" in refinement.says
+    assert "157 Gaussians, 150 before" in refinement.message
     fit.advance()
 
 
@@ -191,9 +193,9 @@ def test_relocation_keeps_the_picture_and_moves_the_unused(variant_rgb: str, vie
 def test_opacities_are_reset_now_and_then(variant_rgb: str, views: list[Photo]) -> None:
     """Moments of opacities are forgotten then, those of places are not."""
     fit = fit_of(views, replace(PLAN, reset_every=8, most=150))
-    while fit.next < 5:
+    while fit.next_iteration < 5:
         fit.advance()
-    fit.problem.set(fit.run.reals)
+    fit.problem.set_reals(fit.run.reals)
     fit.run.refine(fit.problem.control_density(8))
     assert fit.problem.cloud["opacity_logits"].max() <= np.log(0.01 / 0.99) + 1e-5
     assert not np.array(fit.run.adam.state["opacity_logits"][3][1]).any()
@@ -205,7 +207,7 @@ def test_every_view_comes_once_a_round(variant_rgb: str, views: list[Photo], mon
     problem, seen = problem_of(views), []
     whole = problem.loss_of_view
     monkeypatch.setattr(problem, "loss_of_view", lambda reals, view, behind: seen.append(view) or whole(reals, view, behind))
-    reals = problem.start()
+    reals = problem.initial_reals()
     for step in range(16):
         problem.loss_and_gradient(reals, step)
     assert sorted(seen[:8]) == sorted(seen[8:]) == list(range(8))
@@ -215,7 +217,7 @@ def test_every_view_comes_once_a_round(variant_rgb: str, views: list[Photo], mon
 def test_what_a_smaller_photograph_is_filtered_by() -> None:
     """A mean over 2 x 2 pixels is two points half a pixel from their middle: a variance of 1/4 beside the filter's, in pixels
     that are four times as large in area."""
-    plan = GaussianPlan((SplatStage(10, 1, 0),), low_pass=0.3)
+    plan = GaussianPlan((GaussianStage(10, 1, 0),), low_pass=0.3)
     assert plan.low_pass_at(1) == 0.3
     assert plan.low_pass_at(2) == pytest.approx((0.3 + 0.25) / 4)
 
@@ -228,27 +230,27 @@ def test_plans_are_made_for_the_photographs_size() -> None:
 
 def test_memory_is_counted_and_what_fits_is_said() -> None:
     plan = PRESETS["minute"]
-    room = bytes_of(plan, 5000, 40_000) + 10_000
+    room = estimate_bytes(plan, 5000, 40_000) + 10_000
     with pytest.raises(MivolError, match=r"gaussians.most = 5000 fits"):
-        memory_of(replace(plan, start=1000), 10_000, 40_000, room)
+        check_memory(replace(plan, start=1000), 10_000, 40_000, room)
     with pytest.raises(MivolError, match=r"read the photographs smaller"):
-        memory_of(plan, 10**9, 40_000, 10**9)
-    assert "photographs 0," in memory_of(plan, 10_000, 40_000, 10**12)
+        check_memory(plan, 10**9, 40_000, 10**9)
+    assert "photographs 0," in check_memory(plan, 10_000, 40_000, 10**12)
 
 
 def test_refusals(variant_rgb: str, views: list[Photo]) -> None:
     with pytest.raises(MivolError, match='control = "clone" is unknown: did you mean "clone_split"'):
         problem_of(views, replace(PLAN, control="clone"))
     with pytest.raises(MivolError, match="3 points to begin with; 4 are needed"):
-        begin_at(places(3), views, 0)
+        make_start_cloud(places(3), views, 0)
     problem = problem_of(views)
     with pytest.raises(MivolError, match="a fit of Gaussians looks at one"):
-        problem.loss_and_gradient(problem.start(), 0, 2)
+        problem.loss_and_gradient(problem.initial_reals(), 0, 2)
     with pytest.raises(MivolError, match="views shrunk by 2 are asked for"):
         GaussianProblem(RayBatches.of(views), [view.camera for view in views], truth(), PLAN)
     with pytest.raises(MivolError, match="all cameras stand at one place"):
         GaussianProblem(RayBatches.of(views, (1, 2)), [views[0].camera] * 8, truth(), PLAN)
-    assert extent_of([view.camera for view in views]) > 0
+    assert scene_extent([view.camera for view in views]) > 0
 
 
 def test_transparent_gaussians_wander_along_their_shape(variant_rgb: str) -> None:
@@ -281,9 +283,9 @@ def test_gains_of_photographs_are_found(views: list[Photo]) -> None:
     logs = np.concatenate([logs, -logs])
     twice = [*views[:4], *views[:4]]
     exposed = [replace(v, image=np.float32(v.image * np.exp(log)), alpha=None) for v, log in zip(twice, logs, strict=True)]
-    plan = replace(PLAN, stages=(SplatStage(20, 320, 0, 2),), exposure=True, every=1000)
+    plan = replace(PLAN, stages=(GaussianStage(20, 320, 0, 2),), exposure=True, every=1000)
     problem = GaussianProblem(RayBatches.of(exposed, (2,)), [view.camera for view in twice], truth(), plan)
-    reconstruct(problem, plan.optimiser, plan.course())
+    reconstruct(problem, plan.optimizer, plan.course())
     found = np.log(problem.exposure.table())
     assert np.abs(found.mean(axis=0)).max() < 1e-5
     assert (found * logs).sum() / (logs**2).sum() > 0.4
@@ -295,7 +297,7 @@ def test_derivatives_by_gains_are_those_of_the_loss(views: list[Photo]) -> None:
     plan = replace(PLAN, exposure=True, ssim=0.5)
     plain = [replace(view, alpha=None) for view in views]
     problem = GaussianProblem(RayBatches.of(plain, (1, 2)), [v.camera for v in views], truth(), plan)
-    reals = problem.start()
+    reals = problem.initial_reals()
     logs = np.zeros((len(views), 3), np.float32)
     logs[2] = [0.3, -0.2, 0.1]
 

@@ -10,7 +10,7 @@ import pytest
 from ball_photos import camera
 
 from mivol.errors import MivolError
-from mivol.optim.gaussians.gaussian_start import begin_at, places_of
+from mivol.optim.gaussians.gaussian_start import find_start_points, make_start_cloud
 from mivol.photos import Photo, project
 
 BOX = np.array([[-0.5, -0.4, -0.3], [0.5, 0.6, 0.7]])
@@ -41,14 +41,14 @@ def test_points_of_a_reconstruction_are_taken_as_they_are() -> None:
     points = np.random.default_rng(1).uniform(-1, 1, (120, 3))
     points[0], points[1] = BOX
     inside = [p for p in points if all(low <= x <= high for low, x, high in zip(BOX[0], p, BOX[1], strict=True))]
-    found, says = places_of(photos([], points), 7, 3)
+    found, says = find_start_points(photos([], points), 7, 3)
     np.testing.assert_array_equal(found, inside)
     assert says == f"{len(inside)} points of the reconstruction that lie in the box"
     for few in (points[:99], None):
-        found, says = places_of(photos([photo(0.0, 0, alpha=False)], few), 7, 3)
+        found, says = find_start_points(photos([photo(0.0, 0, alpha=False)], few), 7, 3)
         np.testing.assert_array_equal(found, np.random.default_rng((3, 1)).uniform(*BOX, (7, 3)))
         assert says == "7 points at random in the box"
-    assert len(places_of(photos([], points[:100]), 7, 3)[0]) < 100
+    assert len(find_start_points(photos([], points[:100]), 7, 3)[0]) < 100
 
 
 def test_places_are_drawn_where_no_view_sees_through() -> None:
@@ -65,13 +65,13 @@ def test_places_are_drawn_where_no_view_sees_through() -> None:
             shown = [(view, pixel) for view, pixel in zip(views, at, strict=True) if pixel]
             if len(shown) >= 2 and all(view.alpha[pixel] > 0 for view, pixel in shown):
                 kept.append(point)
-    found, says = places_of(photos(views), 60, 5)
+    found, says = find_start_points(photos(views), 60, 5)
     np.testing.assert_allclose(found, kept[:60], rtol=1e-14)
     assert says == "60 points at random where no view sees through"
-    assert len(places_of(photos(views[:1] + views[3:]), 20, 5)[0]) == 20
+    assert len(find_start_points(photos(views[:1] + views[3:]), 20, 5)[0]) == 20
     clear = [Photo("clear", v.image, np.zeros_like(v.alpha), None, v.camera, v.background) for v in views]
     with pytest.raises(MivolError, match="alpha leaves no place in the box"):
-        places_of(photos(clear), 10, 5)
+        find_start_points(photos(clear), 10, 5)
 
 
 def test_gaussians_are_as_large_as_their_neighbours_are_far() -> None:
@@ -80,7 +80,7 @@ def test_gaussians_are_as_large_as_their_neighbours_are_far() -> None:
     places = np.concatenate([places, np.repeat([[0.45, 0.5, 0.6]], 5, axis=0)])
     far = np.sort(np.linalg.norm(places[:, None] - places, axis=-1), axis=1)[:, 1:4]
     views = [photo(k, k) for k in range(3)]
-    made = begin_at(places, views, 2)
+    made = make_start_cloud(places, views, 2)
     scale = np.maximum(np.sqrt((far**2).mean(axis=1)), 1e-3 * np.median(far))
     np.testing.assert_allclose(made["log_scales"], np.log(scale)[:, None].repeat(3, axis=1), rtol=0, atol=1e-6)
     np.testing.assert_array_equal(made["means"], places.astype(np.float32))
@@ -97,6 +97,6 @@ def test_gaussians_are_as_large_as_their_neighbours_are_far() -> None:
 
 
 def test_four_places_are_needed() -> None:
-    assert len(begin_at(np.eye(4, 3), [], 0)["means"]) == 4
+    assert len(make_start_cloud(np.eye(4, 3), [], 0)["means"]) == 4
     with pytest.raises(MivolError, match="found 3 points to begin with; 4 are needed"):
-        begin_at(np.eye(3), [], 0)
+        make_start_cloud(np.eye(3), [], 0)

@@ -8,7 +8,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mivol.optim.second_order import Lbfgs, LbfgsRun, two_loops
+from mivol.optim.second_order import Lbfgs, LbfgsRun, apply_inverse_hessian
 
 pytestmark = pytest.mark.usefixtures("variant_rgb")
 
@@ -24,7 +24,7 @@ class Bowl:
         self.parameters = [SimpleNamespace(name="x", lr=0.5, bounds=lambda: bounds)]
         self.worse = 0.0
 
-    def start(self) -> dict[str, mi.TensorXf]:
+    def initial_reals(self) -> dict[str, mi.TensorXf]:
         return {"x": mi.TensorXf(np.full(len(self.c), 0.1, np.float32))}
 
     def _value(self, x: np.ndarray) -> float:
@@ -57,13 +57,15 @@ def test_two_loops_are_the_product_with_the_inverse_hessian() -> None:
     g = rng.normal(size=6)
     given = g.copy()
     wanted = dense_product(g, steps, changes)
-    np.testing.assert_allclose(two_loops(g, steps, changes), wanted, rtol=1e-9)
+    np.testing.assert_allclose(apply_inverse_hessian(g, steps, changes), wanted, rtol=1e-9)
     np.testing.assert_array_equal(g, given)
     # A pair that the bounds have left without curvature says nothing.
     nothing = np.zeros(6)
-    np.testing.assert_allclose(two_loops(g, [*steps, nothing, steps[0]], [*changes, nothing, -changes[0]]), wanted, rtol=1e-9)
-    np.testing.assert_allclose(two_loops(g, [], []), g / np.abs(g).max(), rtol=1e-15)
-    np.testing.assert_array_equal(two_loops(nothing, [], []), nothing)
+    np.testing.assert_allclose(
+        apply_inverse_hessian(g, [*steps, nothing, steps[0]], [*changes, nothing, -changes[0]]), wanted, rtol=1e-9
+    )
+    np.testing.assert_allclose(apply_inverse_hessian(g, [], []), g / np.abs(g).max(), rtol=1e-15)
+    np.testing.assert_array_equal(apply_inverse_hessian(nothing, [], []), nothing)
 
 
 def test_steps_are_those_of_the_matrices() -> None:
@@ -117,13 +119,13 @@ def test_a_failed_search_forgets_once_and_then_gives_up() -> None:
     for iteration in range(3):
         run.step(iteration, 1.0)
     before = np.array(run.reals["x"])
-    assert run.finished == "" and len(run.steps) == 2
+    assert run.stop_reason == "" and len(run.steps) == 2
     problem.worse = 1e9
     run.step(3, 1.0)
-    assert (run.finished, run.steps, run.changes, run.last) == ("", [], [], None)
+    assert (run.stop_reason, run.steps, run.changes, run.last) == ("", [], [], None)
     assert "last" not in run.pack() and run.pack()["pairs"].shape == (2, 0)
     run.step(4, 1.0)
-    assert run.finished == "no step lowers the loss"
+    assert run.stop_reason == "no step lowers the loss"
     np.testing.assert_array_equal(np.array(run.reals["x"]), before)
 
 

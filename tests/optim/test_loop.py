@@ -16,16 +16,16 @@ from fit_scene import KEY, absorbing_scene, camera, film, frontal, small_problem
 from mivol.errors import MivolError
 from mivol.optim.events import Evaluate, Upsample
 from mivol.optim.first_order import Adam, RMSprop
-from mivol.optim.interrupt import Interrupted, Stop
+from mivol.optim.interrupt import Interrupted, InterruptGuard
 from mivol.optim.loop import Course, reconstruct
 from mivol.optim.losses import Huber, Log
-from mivol.optim.optimizers import OPTIMISERS
+from mivol.optim.optimizers import OPTIMIZERS
 from mivol.optim.parameters import Parameter
 from mivol.optim.priors import Laplacian, TotalVariation
-from mivol.optim.scenes.scene_problem import SceneProblem, views_of
-from mivol.optim.scenes.views import View, make_batches, seed_of
+from mivol.optim.scenes.scene_problem import SceneProblem, draw_views
+from mivol.optim.scenes.views import View, derive_seed, make_batches
 from mivol.optim.schedules import Cosine
-from mivol.optim.second_order import GaussNewton, Lbfgs, Linearised, Packing, conjugate_gradients, two_loops
+from mivol.optim.second_order import GaussNewton, Lbfgs, Linearization, Packing, apply_inverse_hessian, conjugate_gradients
 from mivol.validate.moments import Moments
 
 EPS = float(np.finfo(np.float32).eps)
@@ -53,7 +53,7 @@ def two_cubes(start: float) -> mi.Scene:
 
 
 @pytest.mark.slow_for("adam", "rmsprop")
-@pytest.mark.parametrize("name", OPTIMISERS)
+@pytest.mark.parametrize("name", OPTIMIZERS)
 def test_finds_a_known_optimum(variant_rgb, name: str) -> None:
     """Two unknown extinctions, each seen through a chord of 2: I = exp(-2 sigma), wanted 0.7 and 0.2, from 0.35."""
     optimiser, iterations, bound = EXACT[name]
@@ -74,7 +74,7 @@ def test_finds_a_known_optimum(variant_rgb, name: str) -> None:
 
 
 def vectors(problem: SceneProblem, seed: int = 0) -> tuple[dict, Packing, np.ndarray, np.ndarray]:
-    reals = problem.start()
+    reals = problem.initial_reals()
     packing = Packing(problem, reals)
     v, w = np.random.default_rng(seed).standard_normal((2, len(packing.low)))
     return reals, packing, v, w
@@ -86,7 +86,7 @@ def test_gradient_is_that_of_the_loss(variant_rgb) -> None:
     parameter = Parameter(KEY, "1", (0.0, np.inf), "softplus", lr=0.1, priors=(TotalVariation(weight=0.01, edge=1.0),))
     problem = small_problem(parameters=[parameter])
     reals, packing, v, _ = vectors(problem)
-    linear = Linearised(problem, reals, [problem.loss.weight(s.reference) for s in problem.batches], packing)
+    linear = Linearization(problem, reals, [problem.loss.weight(s.reference) for s in problem.batches], packing)
     x, h = packing.vector(reals), 1e-2
     ends = [problem.loss_value(packing.tensors(x + sign * h * v), 0) for sign in (1, -1)]
     expected = (ends[0] - ends[1]) / (2 * h)
@@ -104,7 +104,7 @@ def test_gradient_of_a_sky(variant_rgb) -> None:
     scene = mi.load_dict({"type": "scene", "integrator": {"type": "mivol"}, **parts})
     views = [View(f"view {i}", camera(i), dr.zeros(mi.TensorXf, (8, 8, 3))) for i in range(2)]
     problem = SceneProblem(scene, views, [Parameter("sky.data", "1", (0.0, np.inf), lr=0.1)], spp=64)
-    (key, x), h = next(iter(problem.start().items())), 1e-2
+    (key, x), h = next(iter(problem.initial_reals().items())), 1e-2
     v = mi.TensorXf(np.random.default_rng(2).uniform(0.5, 1, x.shape).astype(np.float32))
     ends = [problem.loss_value({key: x + sign * h * v}, 0) for sign in (1, -1)]
     gradient = problem.loss_and_gradient({key: x}, 0)[1][key]
@@ -116,18 +116,18 @@ def test_a_parameter_that_nothing_depends_on(variant_rgb) -> None:
     problem = small_problem(parameters=[Parameter("cube.interior_medium.albedo.value.value", domain=(0.0, 1.0), lr=0.1)])
     problem.integrator = mi.load_dict({"type": "mivol", "max_depth": 1})
     with pytest.raises(MivolError, match="no derivative leads from the images to cube.interior_medium.albedo"):
-        problem.loss_and_gradient(problem.start(), 0)
+        problem.loss_and_gradient(problem.initial_reals(), 0)
 
 
 def test_gauss_newton_product_is_that_of_the_jacobian(variant_rgb) -> None:
     """<v, J^T W J v> is the weighted square of J v, which differences of images give; and the product is symmetric."""
     problem = small_problem()
     reals, packing, v, w = vectors(problem, 1)
-    linear = Linearised(problem, reals, [problem.loss.weight(s.reference) for s in problem.batches], packing)
+    linear = Linearization(problem, reals, [problem.loss.weight(s.reference) for s in problem.batches], packing)
     x, h, batch, seed = packing.vector(reals), 1e-2, problem.batches[0], linear.seeds[0]
     images = []
     for sign in (1, -1):
-        problem.set(packing.tensors(x + sign * h * v))
+        problem.set_reals(packing.tensors(x + sign * h * v))
         images.append(np.asarray(problem.render(batch.sensor, seed), dtype=np.float64))
     jv = (images[0] - images[1]) / (2 * h)
     product = linear.curvature(v)
@@ -144,7 +144,7 @@ def test_priors_enter_the_gauss_newton_product(variant_rgb) -> None:
     products = []
     for problem in (plain, with_prior):
         weights = [problem.loss.weight(s.reference) for s in problem.batches]
-        products.append(Linearised(problem, reals, weights, packing).curvature(v))
+        products.append(Linearization(problem, reals, weights, packing).curvature(v))
     direction = packing.tensors(v)[KEY]
     extra = np.asarray(prior.curvature(reals[KEY], direction, (0.25, 0.25, 0.25))).ravel() * 0.1
     assert np.allclose(products[1] - products[0], extra, atol=1e-4 * np.abs(extra).max())
@@ -167,11 +167,11 @@ def test_two_loops_are_the_inverse_hessian(variant_rgb) -> None:
     a = np.diag(rng.uniform(1, 5, 7))
     steps = [rng.standard_normal(7) for _ in range(3)]
     changes = [a @ s for s in steps]
-    assert np.allclose(two_loops(changes[-1], steps, changes), steps[-1], rtol=1e-12)
+    assert np.allclose(apply_inverse_hessian(changes[-1], steps, changes), steps[-1], rtol=1e-12)
     v, w = rng.standard_normal((2, 7))
-    assert np.isclose(two_loops(v, steps, changes) @ w, two_loops(w, steps, changes) @ v, rtol=1e-12)
+    assert np.isclose(apply_inverse_hessian(v, steps, changes) @ w, apply_inverse_hessian(w, steps, changes) @ v, rtol=1e-12)
     conjugate = list(np.eye(7))
-    assert np.allclose(two_loops(v, conjugate, [a @ s for s in conjugate]), np.linalg.solve(a, v), rtol=1e-12)
+    assert np.allclose(apply_inverse_hessian(v, conjugate, [a @ s for s in conjugate]), np.linalg.solve(a, v), rtol=1e-12)
 
 
 # -- Randomness, passes, batches ---------------------------------------------------------------------------------
@@ -180,18 +180,18 @@ def test_two_loops_are_the_inverse_hessian(variant_rgb) -> None:
 def test_seeds_are_a_function_of_their_key() -> None:
     """Same key, same seed; all keys of a small run differ (a collision has probability 2000^2 / 2^33 = 5e-4)."""
     keys = [(0, i, v, p, n) for i in range(25) for v in range(5) for p in range(4) for n in range(4)]
-    seeds = [seed_of(*key) for key in keys]
-    assert seeds == [seed_of(*key) for key in keys]
+    seeds = [derive_seed(*key) for key in keys]
+    assert seeds == [derive_seed(*key) for key in keys]
     assert len(set(seeds)) == len(seeds)
 
 
 def test_each_epoch_shows_each_view_once() -> None:
-    drawn = [view for i in range(6) for view in views_of(i, 9, 3, seed=1)]
+    drawn = [view for i in range(6) for view in draw_views(i, 9, 3, seed=1)]
     assert sorted(drawn[:9]) == list(range(9))
     assert sorted(drawn[9:]) == list(range(9))
     assert drawn[:9] != drawn[9:]
-    assert views_of(4, 9, 3, seed=1) == views_of(4, 9, 3, seed=1)
-    assert views_of(0, 3, 99, seed=1) != [] and sorted(views_of(0, 3, 99, seed=1)) == [0, 1, 2]
+    assert draw_views(4, 9, 3, seed=1) == draw_views(4, 9, 3, seed=1)
+    assert draw_views(0, 3, 99, seed=1) != [] and sorted(draw_views(0, 3, 99, seed=1)) == [0, 1, 2]
 
 
 def test_passes_sum_to_the_samples(variant_rgb) -> None:
@@ -213,7 +213,7 @@ def test_a_nonlinear_loss_does_not_see_the_passes(variant_rgb) -> None:
     parameter = Parameter(KEY, domain=(0.0, np.inf))
     for most in (1 << 20, 16):
         problem = SceneProblem(scene, [View("a", frontal(), wanted)], [parameter], loss=Log(), spp=8, samples_per_pass=most)
-        loss, gradients = problem.loss_and_gradient(problem.start(), 0)
+        loss, gradients = problem.loss_and_gradient(problem.initial_reals(), 0)
         r = -0.8 - np.log(0.6)
         weight = 0.36 / (0.36 + 1e-6)
         assert np.isclose(loss, weight * r**2, rtol=1e-5)
@@ -221,7 +221,7 @@ def test_a_nonlinear_loss_does_not_see_the_passes(variant_rgb) -> None:
     coverage = []
     for most in (1 << 20, 3 * 64):
         problem = small_problem(spp=4, samples_per_pass=most, loss=Huber(delta=0.02))
-        problem.set(problem.start())
+        problem.set_reals(problem.initial_reals())
         coverage.append(Moments.of(np.array([problem.mean_loss(fresh(i)) for i in range(24)])))
     # One pass of 4 samples and 4 passes of one: a mean of losses of single passes would be about 4 times as large.
     assert_same_mean(*coverage, what="losses")
@@ -248,7 +248,7 @@ def test_cameras_side_by_side_keep_their_order_and_orientation(variant_rgb) -> N
     samples span at most the whole range 1, so their means differ by less than 8 / sqrt(64) / 2 of it, and on average by
     far less than two different views do."""
     problem = small_problem(spp=64)
-    problem.set(problem.start())
+    problem.set_reals(problem.initial_reals())
     (batch,) = problem.batches
     batch = np.split(np.asarray(problem.render(batch.sensor, 1)), 3, axis=1)
     single = [np.asarray(problem.render(view.sensor, 2)) for view in problem.views]
@@ -284,7 +284,7 @@ def test_coarse_to_fine_keeps_the_image(variant_rgb) -> None:
     assert fit.values()[KEY].shape == (8, 8, 8, 1)
     assert losses[4] < 0.2 * losses[0]
     assert fit.log == ["iteration 4: refined to 8 x 8 x 8"]
-    assert [m["iteration"] for m in fit.measures] == [0, 2, 4, 6]
+    assert [m["iteration"] for m in fit.evaluations] == [0, 2, 4, 6]
     assert len(measured) == 4
 
 
@@ -294,7 +294,7 @@ def test_adam_is_mitsubas_adam(variant_rgb) -> None:
     problem = small_problem()
     fit = reconstruct(problem, Adam(), 3)
     again = small_problem()
-    reals = again.start()
+    reals = again.initial_reals()
     adam = mi.ad.Adam(lr=0.1, params=reals)
     for iteration in range(3):
         _, gradients = again.loss_and_gradient({KEY: adam[KEY]}, iteration)
@@ -314,7 +314,7 @@ def test_bounds_hold(variant_rgb) -> None:
 
 
 def test_stop_waits_for_a_safe_point(ctrl_c) -> None:
-    with Stop() as stop:
+    with InterruptGuard() as stop:
         stop.check()
         os.kill(os.getpid(), signal.SIGTERM)
         assert stop.asked
@@ -328,7 +328,7 @@ def test_stop_waits_for_a_safe_point(ctrl_c) -> None:
 def test_what_was_ignored_stays_ignored(ctrl_c) -> None:
     """A shell starts what it puts into the background with Ctrl-C ignored: that is meant for the job in front."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    with Stop() as stop:
+    with InterruptGuard() as stop:
         os.kill(os.getpid(), signal.SIGINT)
         assert not stop.asked
         os.kill(os.getpid(), signal.SIGTERM)
@@ -361,7 +361,7 @@ def test_refused_views(variant_rgb, case: str) -> None:
 def test_a_loss_that_is_not_finite_stops_the_run(variant_rgb) -> None:
     """And what was found before it is kept."""
     problem = small_problem()
-    reals, kept = problem.start(), problem.loss_and_gradient
+    reals, kept = problem.initial_reals(), problem.loss_and_gradient
     problem.loss_and_gradient = lambda r, i, views=0: (np.nan if i == 1 else kept(r, i, views)[0], kept(r, i, views)[1])
     with pytest.raises(MivolError, match="became nan in iteration 1: lower the learning rate"):
         reconstruct(problem, Adam(), 4)

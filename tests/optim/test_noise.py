@@ -16,15 +16,15 @@ from scipy import stats
 from mivol import config
 from mivol.cli.progress import Display
 from mivol.errors import MivolError
-from mivol.optim.checkpoint import Store
+from mivol.optim.checkpoint import CheckpointFile
 from mivol.optim.first_order import Adam
 from mivol.optim.loop import reconstruct
 from mivol.optim.losses import L1, L2, LOSSES, Huber, Log, RelativeL2
 from mivol.optim.parameters import Parameter
-from mivol.optim.scenes.render_noise import compare, halves_of, noise_check, warning
+from mivol.optim.scenes.render_noise import compare_with_reference, describe_noise, make_noise_check, split_samples
 from mivol.optim.scenes.scene_problem import SceneProblem
 from mivol.optim.scenes.views import View
-from mivol.optim.second_order import Linearised, Packing
+from mivol.optim.second_order import Linearization, Packing
 from mivol.validate.moments import Moments
 
 SIGMA, SEEN, SPP = 0.4, 0.6, 8
@@ -58,8 +58,8 @@ def test_pairs_take_the_noise_out_of_a_squared_loss(variant_rgb, name: str, shar
     n, r, s, reference = 40_000, 0.02, 0.05, 0.5
     halves, seen = noisy_halves(n, reference + r, s, shares), tensor(np.full(n, reference))
     w = {"l2": 1.0, "relative_l2": 1 / (reference**2 + 1e-4)}[name]
-    plain = compare(LOSSES[name](), halves, shares, seen)
-    pairs = compare(LOSSES[name](pairs=True), halves, shares, seen)
+    plain = compare_with_reference(LOSSES[name](), halves, shares, seen)
+    pairs = compare_with_reference(LOSSES[name](pairs=True), halves, shares, seen)
     error = [w * math.sqrt((4 * r**2 * s**2 + k * s**4) / n) for k in (2, 4)]
     assert_within(plain.loss - w * (r**2 + s**2), 6 * error[0], chance=SIX, what="losses")
     assert_within(pairs.loss - w * r**2, 6 * error[1], chance=SIX, what="losses of pairs")
@@ -75,7 +75,7 @@ def test_two_halves_give_their_product(variant_rgb) -> None:
     """f - b = (I1 - R)(I2 - R), pixel by pixel; rounding of squares of size 4."""
     rng = np.random.default_rng(1)
     for a, b, r in rng.uniform(-1, 1, (8, 3)):
-        found = compare(L2(pairs=True), [tensor(a), tensor(b)], (0.5, 0.5), tensor(r)).loss
+        found = compare_with_reference(L2(pairs=True), [tensor(a), tensor(b)], (0.5, 0.5), tensor(r)).loss
         assert abs(found - (a - r) * (b - r)) <= 16 * 6e-8 * 4
 
 
@@ -88,7 +88,7 @@ def test_variance_is_as_said(variant_rgb) -> None:
     values = []
     for trial in range(trials):
         halves = noisy_halves(n, 0.5, s, (0.5, 0.5), trial)
-        values.append([compare(L2(pairs=pairs), halves, (0.5, 0.5), seen).loss for pairs in (False, True)])
+        values.append([compare_with_reference(L2(pairs=pairs), halves, (0.5, 0.5), seen).loss for pairs in (False, True)])
     plain, pairs = np.transpose(values)
     assert_same_variance(plain, 2 * s**4 / n, mean=s**2, excess=12 / n, what="losses")
     assert_same_variance(pairs, 4 * s**4 / n, mean=0.0, excess=6 / n, what="losses of pairs")
@@ -102,8 +102,8 @@ def test_pairs_leave_the_next_order_of_a_smooth_loss(variant_rgb) -> None:
     n, s, reference = 400_000, 0.1, 0.5
     halves, seen = noisy_halves(n, reference, s * reference, (0.5, 0.5)), tensor(np.full(n, reference))
     weight = reference**2 / (reference**2 + 1e-6)
-    plain = compare(Log(), halves, (0.5, 0.5), seen).loss / weight
-    pairs = compare(Log(pairs=True), halves, (0.5, 0.5), seen).loss / weight
+    plain = compare_with_reference(Log(), halves, (0.5, 0.5), seen).loss / weight
+    pairs = compare_with_reference(Log(pairs=True), halves, (0.5, 0.5), seen).loss / weight
     error = math.sqrt(4 * s**4 / n)
     assert_within(plain - (s**2 + 2.75 * s**4 + 11.4 * s**6), 6 * error + 70 * s**8, chance=SIX, what="losses")
     assert_within(pairs - (-5.5 * s**4 - 68.5 * s**6), 6 * error + 960 * s**8, chance=SIX, what="losses of pairs")
@@ -115,7 +115,7 @@ def test_pairs_at_the_kink_of_l1(variant_rgb) -> None:
     n, s = 100_000, 0.1
     halves, seen = noisy_halves(n, 0.5, s, (0.5, 0.5)), tensor(np.full(n, 0.5))
     mean = math.sqrt(2 / math.pi) * s
-    plain, pairs = (compare(L1(pairs=on), halves, (0.5, 0.5), seen).loss for on in (False, True))
+    plain, pairs = (compare_with_reference(L1(pairs=on), halves, (0.5, 0.5), seen).loss for on in (False, True))
     # |N| has the standard deviation 0.6 s, and three such numbers enter with weights 2, 1/2, 1/2: below 2 s.
     assert_within(plain - mean, 6 * s / math.sqrt(n), chance=SIX, what="losses")
     assert_within(pairs - (2 - math.sqrt(2)) * mean, 6 * 2 * s / math.sqrt(n), chance=SIX, what="losses of pairs")
@@ -129,14 +129,14 @@ def test_adjoint_is_the_slope_by_the_mean_image(variant_rgb, name: str) -> None:
     seen = np.full(n, 0.5)
     halves = [np.asarray(x).ravel() for x in noisy_halves(n, 0.8, 0.02, (0.5, 0.5))]
     loss = LOSSES[name](pairs=True)
-    up, down = (compare(loss, [tensor(x + e) for x in halves], (0.5, 0.5), tensor(seen)).loss for e in (h, -h))
-    found = compare(loss, [tensor(x) for x in halves], (0.5, 0.5), tensor(seen))
+    up, down = (compare_with_reference(loss, [tensor(x + e) for x in halves], (0.5, 0.5), tensor(seen)).loss for e in (h, -h))
+    found = compare_with_reference(loss, [tensor(x) for x in halves], (0.5, 0.5), tensor(seen))
     assert np.isclose(np.asarray(found.adjoint).sum(), (up - down) / (2 * h), rtol=1e-3)
 
 
 def test_one_exact_render_has_no_noise(variant_rgb) -> None:
     image, seen = tensor(np.linspace(0, 1, 9)), tensor(np.full(9, 0.4))
-    plain, pairs = (compare(Huber(pairs=on), [image], (1.0,), seen, weight=0.5) for on in (False, True))
+    plain, pairs = (compare_with_reference(Huber(pairs=on), [image], (1.0,), seen, weight=0.5) for on in (False, True))
     assert plain.noise == pairs.noise == 0.0
     assert plain.loss == pairs.loss == 0.5 * float(Huber()(image, seen)[0])
 
@@ -161,7 +161,7 @@ def test_the_renderers_noise_in_the_loss(variant_rgb, pairs: bool) -> None:
     """Rationale: what a fit reports as its loss is the mismatch plus T (1 - T) / n, here as large as the mismatch.
     Expected: the mean of 60 losses is (T - R)^2 plus that, and with pairs without it."""
     problem = cube_problem(loss=L2(pairs=pairs))
-    problem.set(problem.start())
+    problem.set_reals(problem.initial_reals())
     losses = Moments.of(np.array([problem.mean_loss(i) for i in range(60)]))
     bias = T * (1 - T) / SPP
     assert_precise(losses, bias / 20, what="losses")
@@ -175,7 +175,7 @@ def test_the_measured_noise_is_the_variance(variant_rgb) -> None:
     problem = cube_problem()
     found = []
     for i in range(60):
-        problem.loss_and_gradient(problem.start(), i)
+        problem.loss_and_gradient(problem.initial_reals(), i)
         found.append(problem.newest_loss[1])
     assert_same_mean(Moments.of(np.array(found)), T * (1 - T) / SPP, what="noise")
 
@@ -189,11 +189,11 @@ def test_exact_renders_do_not_pay(variant_rgb) -> None:
             problem = cube_problem(integrator, loss=L2(pairs=pairs))
             samples: list[int] = []
             problem.integrator = Counting(problem.integrator, samples)
-            losses.append(problem.loss_and_gradient(problem.start(), 0)[0])
+            losses.append(problem.loss_and_gradient(problem.initial_reals(), 0)[0])
             assert samples == wanted
             assert (problem.newest_loss[1] == 0.0) == (integrator == "mivol")
         assert (losses[0] == losses[1]) == (integrator == "mivol")
-    assert halves_of(5, L2()) == (3, 2)
+    assert split_samples(5, L2()) == (3, 2)
 
 
 class Counting:
@@ -216,8 +216,8 @@ def test_gauss_newton_carries_noise_back_by_other_samples(variant_rgb) -> None:
     for integrator, same in (("mivol", True), ("prbvolpath", False)):
         problem = cube_problem(integrator)
         images, derivatives = [noted(problem, name, place) for name, place in (("compare", 1), ("vjp", 2))]
-        reals = problem.start()
-        Linearised(problem, reals, [L2().weight(problem.batches[0].reference)], Packing(problem, reals))
+        reals = problem.initial_reals()
+        Linearization(problem, reals, [L2().weight(problem.batches[0].reference)], Packing(problem, reals))
         assert len(images) == 1
         assert (images == derivatives) == same
 
@@ -237,12 +237,12 @@ def test_who_is_noisy(variant_rgb) -> None:
     cloudy = mi.load_dict({"type": "scene", "sky": {"type": "constant"}, "cube": cube})
     wall = mi.load_dict({"type": "scene", "sky": {"type": "constant"}, "wall": {"type": "sphere"}})
     deep, seen = (mi.load_dict({"type": "mivol", "max_depth": depth}) for depth in (2, 1))
-    assert not noise_check(deep, absorbing)()
-    assert noise_check(mi.load_dict({"type": "volpath", "max_depth": 2}), absorbing)()
-    assert noise_check(deep, wall)()
-    assert not noise_check(seen, wall)()
-    assert not noise_check(seen, cloudy)()
-    asked = noise_check(deep, cloudy)
+    assert not make_noise_check(deep, absorbing)()
+    assert make_noise_check(mi.load_dict({"type": "volpath", "max_depth": 2}), absorbing)()
+    assert make_noise_check(deep, wall)()
+    assert not make_noise_check(seen, wall)()
+    assert not make_noise_check(seen, cloudy)()
+    asked = make_noise_check(deep, cloudy)
     assert asked()
     params = mi.traverse(cloudy)
     (key,) = (name for name in params.properties if "albedo" in name)
@@ -261,7 +261,7 @@ def test_said_once_with_its_size(variant_rgb, tmp_path: Path, capsys) -> None:
     iteration: sqrt(2 / 4096) = 2.2 % of the noise, 3 % of the loss, so 8 of their standard errors leave 40 to 75 %."""
     path = tmp_path / "checkpoint.npz"
     with Display(3) as display:
-        fit = reconstruct(cube_problem(size=64), Adam(), 3, store=Store(path, {}), observer=display)
+        fit = reconstruct(cube_problem(size=64), Adam(), 3, checkpoint=CheckpointFile(path, {}), observer=display)
     fit.save()
     (line,) = fit.log
     assert line.startswith("iteration 0: the render's noise makes up 0.0")
@@ -271,7 +271,7 @@ def test_said_once_with_its_size(variant_rgb, tmp_path: Path, capsys) -> None:
     assert "its gradient is not biased" in line
     assert "loss.pairs = true" in line
     assert capsys.readouterr().err.count("loss.pairs = true") == 1
-    assert reconstruct(cube_problem(size=64), Adam(), 5, store=Store(path, {}, resume=True)).log == [line]
+    assert reconstruct(cube_problem(size=64), Adam(), 5, checkpoint=CheckpointFile(path, {}, resume=True)).log == [line]
 
 
 @pytest.mark.slow
@@ -289,10 +289,10 @@ def test_a_single_sample_tells_nothing(variant_rgb) -> None:
 
 
 def test_the_words(variant_rgb) -> None:
-    assert warning(L2(), 1.0, 0.04) == warning(L2(), 0.0, 0.0) == ""
-    assert "6%" in warning(RelativeL2(), 1.0, 0.06)
-    assert "its gradient is biased too" in warning(Huber(), 1.0, 0.5)
-    assert warning(Huber(pairs=True), 1.0, 0.5) == ""
+    assert describe_noise(L2(), 1.0, 0.04) == describe_noise(L2(), 0.0, 0.0) == ""
+    assert "6%" in describe_noise(RelativeL2(), 1.0, 0.06)
+    assert "its gradient is biased too" in describe_noise(Huber(), 1.0, 0.5)
+    assert describe_noise(Huber(pairs=True), 1.0, 0.5) == ""
 
 
 def test_pairs_are_a_setting_of_every_loss() -> None:

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mivol.optim.projections.linear_problems import LeastSquares, PoissonCounts, noise_norm
-from mivol.optim.projections.smoothed_tv import tv_of_noise
+from mivol.optim.projections.linear_problems import LeastSquares, PoissonCounts, expected_residual_norm
+from mivol.optim.projections.smoothed_tv import scale_tv_to_noise
 from mivol.tomography.geometry import ParallelBeam, VoxelGrid
 from mivol.tomography.projector import Projector
 
@@ -26,7 +26,7 @@ def scan_in(unit: float) -> tuple[Projector, np.ndarray, np.ndarray]:
 
 def test_the_prior_of_the_noise_knows_no_unit() -> None:
     """The same scan in metres and in millimetres: the strength is 1 / length, the slope 1 / length^2. Kernels are float32."""
-    metres, millimetres = (tv_of_noise(*scan_in(unit), 1.0, 0.5) for unit in (1.0, 1000.0))
+    metres, millimetres = (scale_tv_to_noise(*scan_in(unit), 1.0, 0.5) for unit in (1.0, 1000.0))
     assert millimetres.strength == pytest.approx(metres.strength / 1e3, rel=1e-5)
     assert millimetres.delta == pytest.approx(metres.delta / 1e6, rel=1e-5)
 
@@ -37,28 +37,30 @@ def test_the_prior_of_the_noise_balances_it() -> None:
     At weights of 1 it is sqrt(sum_i a_ij^2); rays at 0.7 of a voxel sample the two factors of 2/3 and 0.70 to a few per cent.
     """
     a, y, weights = scan_in(1.0)
-    few, many = tv_of_noise(a, y, weights, 1.0, 0.5), tv_of_noise(a, y, 100 * weights, 2.0, 0.5)
+    few, many = scale_tv_to_noise(a, y, weights, 1.0, 0.5), scale_tv_to_noise(a, y, 100 * weights, 2.0, 0.5)
     assert many.strength == pytest.approx(20 * few.strength, rel=1e-5)
     assert many.delta == pytest.approx(few.delta, rel=1e-5)
     inner = 4 * 256 + np.arange(100, 156, 5)
     pulls = [np.linalg.norm((a @ np.eye(1, a.shape[1], j, dtype="f")[0]).astype(float)) for j in inner]
-    found = tv_of_noise(a, y, np.ones_like(y), 1.0, 0.5).strength * (1 / 8) ** 2
+    found = scale_tv_to_noise(a, y, np.ones_like(y), 1.0, 0.5).strength * (1 / 8) ** 2
     assert abs(found / np.median(pulls) - 1) < 0.1
     # Where the whole grid holds one value, that is the mean.
     full = a @ np.full(a.grid.shape, 1.5, "f")
-    assert tv_of_noise(a, full, weights, 1.0, 1.0).delta / 8 == pytest.approx(1.5, rel=1e-5)
+    assert scale_tv_to_noise(a, full, weights, 1.0, 1.0).delta / 8 == pytest.approx(1.5, rel=1e-5)
 
 
 def test_the_norm_of_noise_alone() -> None:
     """Weighted residuals count rays that are used, plain ones add variances, and Pearson's count rays."""
     a = np.ones((4, 2))
     squares = LeastSquares(a, np.ones(4), np.array([4.0, 0.0, 0.25, 1.0]))
-    assert noise_norm(squares, "pcg") == pytest.approx(np.sqrt(3))
-    assert noise_norm(squares, "sirt") == pytest.approx(np.sqrt(0.25 + 4 + 1))
-    assert noise_norm(replace(squares, weights=None), "pcg") == pytest.approx(2)
+    assert expected_residual_norm(squares, "pcg") == pytest.approx(np.sqrt(3))
+    assert expected_residual_norm(squares, "sirt") == pytest.approx(np.sqrt(0.25 + 4 + 1))
+    assert expected_residual_norm(replace(squares, weights=None), "pcg") == pytest.approx(2)
     counts = PoissonCounts(a, np.ones(4), 2.0)
-    assert noise_norm(counts, "ml-tr") == pytest.approx(2)
-    assert noise_norm(replace(counts, used=np.array([True, True, False, True])), "ml-tr") == pytest.approx(np.sqrt(3))
+    assert expected_residual_norm(counts, "ml-tr") == pytest.approx(2)
+    assert expected_residual_norm(replace(counts, used=np.array([True, True, False, True])), "ml-tr") == pytest.approx(
+        np.sqrt(3)
+    )
 
 
 def test_edges_are_counted() -> None:
@@ -66,6 +68,6 @@ def test_edges_are_counted() -> None:
     a, y, weights = scan_in(1.0)
     x = np.zeros(a.grid.shape)
     x[..., 8:] = 1.0
-    prior = replace(tv_of_noise(a, y, weights, 1.0, 1.0), delta=7.9)
+    prior = replace(scale_tv_to_noise(a, y, weights, 1.0, 1.0), delta=7.9)
     assert prior.share_of_edges(x) == 1 / 16
     assert replace(prior, delta=8.1).share_of_edges(x) == 0

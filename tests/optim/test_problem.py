@@ -13,12 +13,12 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mivol.optim.checkpoint import Store
+from mivol.optim.checkpoint import CheckpointFile
 from mivol.optim.events import CoarseToFine
 from mivol.optim.first_order import Adam, RMSprop
 from mivol.optim.interrupt import Interrupted
 from mivol.optim.loop import Course, Fit, reconstruct
-from mivol.optim.optimizer import Optimiser
+from mivol.optim.optimizer import Optimizer
 from mivol.optim.problem import Reals, Refinement
 from mivol.optim.schedules import Cosine
 
@@ -39,10 +39,10 @@ class Network:
         start = {"w": [0.3, 0.3, 0.2, 0.2], "s": [1, -1, 0.5, -0.5], "b": [0.1, 0.1, 0.2, 0.2]}
         self.reals = {name: mi.TensorXf(np.float32(values)) for name, values in start.items()}
 
-    def start(self) -> Reals:
+    def initial_reals(self) -> Reals:
         return self.reals
 
-    def set(self, reals: Reals) -> None:
+    def set_reals(self, reals: Reals) -> None:
         self.reals = reals
 
     def values(self) -> Reals:
@@ -57,7 +57,7 @@ class Network:
     def unpack(self, arrays: dict[str, np.ndarray], reals: Reals) -> None:
         self.width, self.reals = int(arrays["width"]), reals
 
-    def rates(self, iteration: int) -> dict[str, float]:
+    def learning_rates(self, iteration: int) -> dict[str, float]:
         return dict.fromkeys("wsb", 0.02)
 
     def after_step(self, reals: Reals, iteration: int) -> Reals:
@@ -85,17 +85,17 @@ class Network:
         return Refinement(reals, twice, {"s": 0.5, "b": 0.5}, f"{self.width} units")
 
 
-def fit(optimiser: Optimiser, store: Store | None = None, stop_after: int = -1) -> Fit:
+def fit(optimiser: Optimizer, store: CheckpointFile | None = None, stop_after: int = -1) -> Fit:
     def observe(at_work: Fit) -> None:
-        if at_work.next == stop_after:
+        if at_work.next_iteration == stop_after:
             os.kill(os.getpid(), signal.SIGINT)
 
     course = Course(80, Cosine(), (CoarseToFine(at=(SPLIT,)),))
-    return reconstruct(Network(), optimiser, course, observer=observe, store=store)
+    return reconstruct(Network(), optimiser, course, observer=observe, checkpoint=store)
 
 
 @pytest.mark.parametrize("optimiser", [Adam(), RMSprop(), RMSprop(half=True)], ids=["adam", "rmsprop", "halves"])
-def test_another_problem_is_fitted_refined_and_resumed(one_thread, ctrl_c, tmp_path: Path, optimiser: Optimiser) -> None:
+def test_another_problem_is_fitted_refined_and_resumed(one_thread, ctrl_c, tmp_path: Path, optimiser: Optimizer) -> None:
     """Expected: the loss falls to a tenth and does not jump where units are split (the function is the same there, and a step
     changes the loss by less than half); a run stopped in the second stage goes on to the last bit."""
     whole = fit(optimiser)
@@ -105,7 +105,7 @@ def test_another_problem_is_fitted_refined_and_resumed(one_thread, ctrl_c, tmp_p
     assert whole.log == [f"iteration {SPLIT}: 8 units"] and whole.run.reals["w"].shape == (8,)
     path = tmp_path / "checkpoint.npz"
     with pytest.raises(Interrupted):
-        fit(optimiser, Store(path, {"a": 1}), stop_after=SPLIT + 10)
-    resumed = fit(optimiser, Store(path, {"a": 1}, resume=True))
+        fit(optimiser, CheckpointFile(path, {"a": 1}), stop_after=SPLIT + 10)
+    resumed = fit(optimiser, CheckpointFile(path, {"a": 1}, resume=True))
     assert [row["loss"] for row in resumed.history] == losses
     assert all(np.array_equal(resumed.run.reals[name], whole.run.reals[name]) for name in "wsb")

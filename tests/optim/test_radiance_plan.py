@@ -12,23 +12,33 @@ from ball_photos import BOX, PLAN
 from mivol.errors import MivolError
 from mivol.fields.harmonics import basis_size, row_width
 from mivol.optim.photographs import radiance_plan
-from mivol.optim.photographs.radiance_plan import PRESETS, RAY, SHELL, FitPlan, Stage, bytes_of, held, memory_of, place_grid
+from mivol.optim.photographs.radiance_plan import (
+    PRESETS,
+    RAY,
+    SHELL,
+    RadiancePlan,
+    RadianceStage,
+    allocated_bytes,
+    check_memory,
+    estimate_bytes,
+    place_grid,
+)
 from mivol.optim.photographs.ray_batches import TILE, RayBatches
 from mivol.photos import Photo
 
 
 def test_memory_is_counted_first(variant_rgb: str, photos: list[Photo]) -> None:
     views = RayBatches.of(photos[:2])
-    text = memory_of(PRESETS["cpu"], BOX, views, limit=1 << 40)
+    text = check_memory(PRESETS["cpu"], BOX, views, limit=1 << 40)
     assert "MiB" in text
     with pytest.raises(MivolError, match=r"512 nodes along an edge .* longest = (\d+) fits"):
-        memory_of(PRESETS["gpu"], BOX, views, limit=2 << 30)
+        check_memory(PRESETS["gpu"], BOX, views, limit=2 << 30)
     with pytest.raises(MivolError, match="no resolution fits"):
-        memory_of(PRESETS["gpu"], BOX, views, limit=1000)
+        check_memory(PRESETS["gpu"], BOX, views, limit=1000)
 
 
 def test_an_array_takes_a_power_of_two() -> None:
-    assert [held(n) for n in (0, 1, 2, 3, 4, 5, 1 << 20, (1 << 20) + 1)] == [0, 1, 2, 4, 4, 8, 1 << 20, 1 << 21]
+    assert [allocated_bytes(n) for n in (0, 1, 2, 3, 4, 5, 1 << 20, (1 << 20) + 1)] == [0, 1, 2, 4, 4, 8, 1 << 20, 1 << 21]
 
 
 @pytest.mark.parametrize("degree", [0, 2])
@@ -36,25 +46,28 @@ def test_bytes_of_a_stage(variant_rgb: str, monkeypatch: pytest.MonkeyPatch, deg
     """Density and coefficients (padded to four numbers) are there three times in float32, their squares twice in halves; a
     table of each pinhole is there once, derived once, and once more for each thread that adds to it. A row has six neighbours,
     a cell and what it takes to list it, a node half a byte."""
-    plan, box = FitPlan((Stage(8, 1, 4, 2, 32), Stage(16, 1, 1, 3, 64)), degree=degree), np.array([[-1.0] * 3, [1.0, 1, 0]])
+    plan, box = (
+        RadiancePlan((RadianceStage(8, 1, 4, 2, 32), RadianceStage(16, 1, 1, 3, 64)), degree=degree),
+        np.array([[-1.0] * 3, [1.0, 1, 0]]),
+    )
     # Powers of two are held as they are: 2^10 rows with two views, of which a table takes 2^15 bytes.
     coefficients, nodes = 4 if degree == 0 else 32, np.prod(place_grid(box, 16)[0])
-    assert held(row_width(basis_size(degree))) == coefficients
+    assert allocated_bytes(row_width(basis_size(degree))) == coefficients
     for threads in (2, 8):
         monkeypatch.setattr(radiance_plan.dr, "thread_count", lambda threads=threads: threads)
-        found = bytes_of(plan, replace(plan.stages[1], views=2), box, rows=1024)
+        found = estimate_bytes(plan, replace(plan.stages[1], views=2), box, rows=1024)
         copies = 2 + threads * variant_rgb.startswith("llvm")
         lists = 1024 * (6 * 4 + 8 * 4 + 90) + nodes // 2
         assert found == 1024 * 16 * (1 + coefficients) + copies * 2**15 + lists + 2 * 64 * TILE**2 * RAY
     # The first stage keeps every node, later ones the shell that fits have kept; of a coarse grid that is all.
-    finer = replace(plan, stages=(*plan.stages, Stage(4 * SHELL, 1, 1, 3, 64)))
+    finer = replace(plan, stages=(*plan.stages, RadianceStage(4 * SHELL, 1, 1, 3, 64)))
     for stage, share in zip(finer.stages, (1, 1, 0.25), strict=True):
         nodes = int(np.prod(place_grid(box, stage.longest)[0]))
-        assert bytes_of(finer, stage, box) == bytes_of(finer, stage, box, rows=int(share * nodes))
+        assert estimate_bytes(finer, stage, box) == estimate_bytes(finer, stage, box, rows=int(share * nodes))
 
 
 #: The tables of 16 views make the first stage of the last one the larger.
-PLANS = PRESETS | {"many views first": FitPlan((Stage(64, 1, 1, 16, 64), Stage(128, 1, 1, 2, 64)))}
+PLANS = PRESETS | {"many views first": RadiancePlan((RadianceStage(64, 1, 1, 16, 64), RadianceStage(128, 1, 1, 2, 64)))}
 TOO_LARGE = [("cpu", 36, 40), ("cpu", 128, 100), ("gpu", 300, 500), ("many views first", 128, 300)]
 
 
@@ -66,7 +79,7 @@ def test_the_resolution_that_is_said_to_fit_fits(
     views = RayBatches.of(photos[:2])
 
     def memory(nodes: int) -> str:
-        return memory_of(PLANS[preset].up_to(nodes), BOX, views, limit=limit << 20)
+        return check_memory(PLANS[preset].with_longest(nodes), BOX, views, limit=limit << 20)
 
     with pytest.raises(MivolError) as refused:
         memory(longest)
@@ -88,24 +101,26 @@ def test_grids_have_cubic_voxels_and_cover_the_box(variant_rgb: str) -> None:
 
 
 def test_a_stage_that_is_not_the_last_any_more_takes_half_its_steps() -> None:
-    plan = FitPlan((Stage(8, 10), Stage(16, 31)))
-    assert [(stage.longest, stage.steps) for stage in plan.up_to(40).stages] == [(8, 10), (16, 15), (40, 31)]
-    assert [(stage.longest, stage.steps) for stage in plan.up_to(12).stages] == [(8, 10), (12, 31)]
-    assert plan.up_to(16) == plan
+    plan = RadiancePlan((RadianceStage(8, 10), RadianceStage(16, 31)))
+    assert [(stage.longest, stage.steps) for stage in plan.with_longest(40).stages] == [(8, 10), (16, 15), (40, 31)]
+    assert [(stage.longest, stage.steps) for stage in plan.with_longest(12).stages] == [(8, 10), (12, 31)]
+    assert plan.with_longest(16) == plan
 
 
 def test_schedules() -> None:
     plan = replace(PLAN, delay=0.1, last=0.01)
-    assert (plan.begins, plan.steps) == ((60,), 150)
+    assert (plan.stage_starts, plan.steps) == ((60,), 150)
     assert [event.due(step) for event in plan.course().events[:1] for step in (0, 59, 60, 61)] == [False, False, True, False]
-    assert (plan.drops, replace(plan, drop=0.1).drops, replace(plan, drop=1e-6).drops) == ((), (69,), (61,))
+    assert (plan.drop_steps, replace(plan, drop=0.1).drop_steps, replace(plan, drop=1e-6).drop_steps) == ((), (69,), (61,))
     dropping = replace(plan, drop=0.1).course().events[1]
     assert [step for step in range(150) if dropping.due(step)] == [69]
-    assert plan.rates(0) == pytest.approx((0.1, 0.05))
-    assert plan.rates(150) == pytest.approx((0.1, 0.0005))
+    assert plan.learning_rates(0) == pytest.approx((0.1, 0.05))
+    assert plan.learning_rates(150) == pytest.approx((0.1, 0.0005))
     slower = replace(plan, stages=(replace(plan.stages[0], rate=0.25), plan.stages[1]))
-    assert [slower.rates(step)[0] / plan.rates(step)[0] for step in (0, 59, 60, 150)] == pytest.approx([0.25, 0.25, 1, 1])
-    assert [slower.rates(step)[1] == plan.rates(step)[1] for step in (0, 59, 60)] == [True] * 3
-    climbing = FitPlan((Stage(8, 1), Stage(16, 1), Stage(32, 1)), degree=2, first_degree=0)
+    assert [slower.learning_rates(step)[0] / plan.learning_rates(step)[0] for step in (0, 59, 60, 150)] == pytest.approx(
+        [0.25, 0.25, 1, 1]
+    )
+    assert [slower.learning_rates(step)[1] == plan.learning_rates(step)[1] for step in (0, 59, 60)] == [True] * 3
+    climbing = RadiancePlan((RadianceStage(8, 1), RadianceStage(16, 1), RadianceStage(32, 1)), degree=2, first_degree=0)
     assert [climbing.degree_at(k) for k in range(3)] == [0, 1, 2]
     assert [replace(climbing, first_degree=None).degree_at(k) for k in range(3)] == [2, 2, 2]

@@ -14,10 +14,10 @@ from scipy.ndimage import maximum_filter
 
 from mivol.errors import MivolError
 from mivol.fields.sky import Sky
-from mivol.optim.checkpoint import Store
+from mivol.optim.checkpoint import CheckpointFile
 from mivol.optim.loop import Fit, begin_fit, reconstruct
 from mivol.optim.photographs.field_view import render_view
-from mivol.optim.photographs.radiance_plan import Stage, bytes_of
+from mivol.optim.photographs.radiance_plan import RadianceStage, estimate_bytes
 from mivol.optim.photographs.radiance_problem import RadianceProblem
 from mivol.optim.photographs.ray_batches import TILE, RayBatches
 from mivol.photos import Lens, Photo
@@ -51,7 +51,7 @@ def test_a_finer_stage_goes_on_where_the_last_one_stopped(variant_rgb: str, phot
     fit.advance()
     moved = np.abs(np.array(fit.run.reals["density"]) - before) * fit.problem.unit
     # Where no more rays than before cross a voxel, and not all agree, steps are below the rate.
-    assert 0 < np.median(moved[moved > 0]) < 0.5 * PLAN.rates(PLAN.stages[0].steps)[0]
+    assert 0 < np.median(moved[moved > 0]) < 0.5 * PLAN.learning_rates(PLAN.stages[0].steps)[0]
 
 
 @pytest.mark.slow
@@ -59,16 +59,16 @@ def test_a_finer_stage_goes_on_where_the_last_one_stopped(variant_rgb: str, phot
 def test_a_fit_that_went_on_equals_one_that_did_not_stop(one_thread, photos: list[Photo], tmp_path: Path, steps: int) -> None:
     """With one thread every value and every mean square is equal to the last bit, and what is forgotten shows in it."""
     batches, path = RayBatches.of(photos[:6], (1, 2)), tmp_path / "checkpoint.npz"
-    plan = replace(PLAN, stages=(Stage(8, 10, 2, 3, 8), Stage(16, 10, 1, 3, 8)), tv_density=0.1, first_degree=0)
+    plan = replace(PLAN, stages=(RadianceStage(8, 10, 2, 3, 8), RadianceStage(16, 10, 1, 3, 8)), tv_density=0.1, first_degree=0)
 
-    def begin(store: Store) -> Fit:
-        return begin_fit(RadianceProblem(batches, BOX, plan), plan.optimiser, plan.course(), store=store)
+    def begin(store: CheckpointFile) -> Fit:
+        return begin_fit(RadianceProblem(batches, BOX, plan), plan.optimizer, plan.course(), checkpoint=store)
 
-    whole = fitted(batches, plan, steps, begin(Store(path, {})))
+    whole = fitted(batches, plan, steps, begin(CheckpointFile(path, {})))
     whole.save()
     whole = fitted(batches, plan, 20, whole)
-    resumed = begin(Store(path, {}, resume=True))
-    assert (resumed.next, resumed.problem.field.degree) == (steps, int(steps > 10))
+    resumed = begin(CheckpointFile(path, {}, resume=True))
+    assert (resumed.next_iteration, resumed.problem.field.degree) == (steps, int(steps > 10))
     resumed = fitted(batches, plan, 20, resumed)
     kept, found = whole.run.pack(), resumed.run.pack()
     assert kept.keys() == found.keys() == {"reals/density", "reals/harmonics", "roots/density", "roots/harmonics"}
@@ -95,21 +95,21 @@ def test_steps_take_the_memory_that_is_counted(
     variant_rgb: str, cpu_back_end: None, photos: list[Photo], longest: int, views: int
 ) -> None:
     """Not more, and more than half: a block that is let go may serve for something else, which is counted as another."""
-    plan = replace(PLAN, stages=(Stage(longest, 9, 1, views, 32),), degree=2, tv_every=4)
+    plan = replace(PLAN, stages=(RadianceStage(longest, 9, 1, views, 32),), degree=2, tv_every=4)
     batches = RayBatches.of(photos)
 
     give_back()
-    before, fit = most_held(), begin_fit(RadianceProblem(batches, BOX, plan), plan.optimiser, plan.course())
+    before, fit = most_held(), begin_fit(RadianceProblem(batches, BOX, plan), plan.optimizer, plan.course())
     # What the map of the first fog took is of no use to the steps.
     give_back()
     fit.complete()
-    counted = bytes_of(plan, plan.stages[0], BOX, fit.problem.field.rows)
+    counted = estimate_bytes(plan, plan.stages[0], BOX, fit.problem.field.rows)
     assert counted / 2 < most_held() - before < counted
 
 
 def test_leaving_nodes_out_takes_no_more_memory_than_steps(variant_rgb: str, cpu_back_end: None, photos: list[Photo]) -> None:
     """Though reals and their means are there of old and new nodes, of which most are kept here."""
-    plan = replace(PLAN, stages=(Stage(64, 9, 1, 2, 32),), degree=2, keep_weight=0.0, drop=1 / 3)
+    plan = replace(PLAN, stages=(RadianceStage(64, 9, 1, 2, 32),), degree=2, keep_weight=0.0, drop=1 / 3)
     fit = fitted(RayBatches.of(photos), plan, 3)
     rows, dropping = fit.problem.field.rows, fit.course.events[1]
     give_back()
@@ -117,7 +117,7 @@ def test_leaving_nodes_out_takes_no_more_memory_than_steps(variant_rgb: str, cpu
     dropping.apply(fit)
     held = most_held()
     assert 0.7 * rows < fit.problem.field.rows < rows
-    assert held < bytes_of(plan, plan.stages[0], BOX, rows)
+    assert held < estimate_bytes(plan, plan.stages[0], BOX, rows)
 
 
 def test_unseen_nodes_are_left_out(variant_rgb: str, photos: list[Photo]) -> None:
@@ -298,4 +298,4 @@ def test_fits_that_are_refused(variant_rgb: str, photos: list[Photo]) -> None:
     empty = [replace(p, image=np.ones_like(p.image)) for p in photos[:4]]
     nothing = RadianceProblem(RayBatches.of(empty, (1, 2)), BOX + 50.0, PLAN)
     with pytest.raises(MivolError, match="no view sees"):
-        reconstruct(nothing, PLAN.optimiser, PLAN.course())
+        reconstruct(nothing, PLAN.optimizer, PLAN.course())

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from ball_photos import BOX, PLAN, fitted
 
-from mivol.optim.photographs.depth_supervision import EACH, OFF, WRONG, Sightings, by_transmittance, draw_sightings
+from mivol.optim.photographs.depth_supervision import EACH, OFF, WRONG, DepthRays, depth_loss_gradient, sample_depth_rays
 from mivol.optim.photographs.radiance_problem import RadianceProblem
 from mivol.optim.photographs.ray_batches import RayBatches
 from mivol.photos import Photo
@@ -19,7 +19,7 @@ from mivol.transport.line_integrals.radiance_source import make_exact
 VOXEL = 0.1
 
 
-def ends_of(sightings: Sightings) -> tuple[np.ndarray, np.ndarray]:
+def ends_of(sightings: DepthRays) -> tuple[np.ndarray, np.ndarray]:
     """Where the rays end, (2, count, 3), and how far that is."""
     o, d, t = (np.array(a) for a in (sightings.rays.o, sightings.rays.d, sightings.rays.t_max))
     return (o + d * t).T.reshape(2, sightings.count, 3), t.reshape(2, sightings.count)
@@ -31,7 +31,7 @@ def test_points_are_rays_that_end_before_and_behind_them(variant_rgb: str) -> No
     near, far, beyond = np.array([[0.5, 0, 0.9]]), np.array([[1.0, -1.5, 0]]), np.array([[0, 0, 2.1]])
     origins = np.array([[3.0, 0, 0], [0, 4, 0], [0, 0, 5], [9, 9, 9]])
     points = [near, far, beyond, np.zeros((0, 3))]
-    found = draw_sightings(points, origins, BOX, 2, VOXEL, np.random.default_rng(0))
+    found = sample_depth_rays(points, origins, BOX, 2, VOXEL, np.random.default_rng(0))
     assert found.count == 2 * EACH
     ends, t = ends_of(found)
     for slot, point, voxel in ((0, near, VOXEL), (1, far, 2 * VOXEL)):
@@ -41,9 +41,9 @@ def test_points_are_rays_that_end_before_and_behind_them(variant_rgb: str) -> No
         off = (voxel + OFF * d) * np.array([[-1.0], [1.0]])
         np.testing.assert_allclose(t[:, own] - d, np.broadcast_to(off, (2, own.sum())), atol=1e-5)
         np.testing.assert_allclose(ends[:, own] - point, np.repeat((off * away / d)[:, None], own.sum(), axis=1), atol=1e-5)
-    assert draw_sightings(points[2:], origins[2:], BOX, 2, VOXEL, np.random.default_rng(0)) is None
+    assert sample_depth_rays(points[2:], origins[2:], BOX, 2, VOXEL, np.random.default_rng(0)) is None
     # A ray to where the photograph was taken has no direction.
-    assert draw_sightings([near], near, BOX, 2, VOXEL, np.random.default_rng(0)) is None
+    assert sample_depth_rays([near], near, BOX, 2, VOXEL, np.random.default_rng(0)) is None
 
 
 def energy(T: np.ndarray) -> float:
@@ -54,7 +54,7 @@ def energy(T: np.ndarray) -> float:
 
 def test_slopes_of_the_energy_by_transmittances(variant_rgb: str) -> None:
     T = np.array([1.0, 0.9, 0.5, 0.2, 1.0, 0.1, 0.5, 0.0])
-    found = np.array(by_transmittance(mi.Float(T), 4))
+    found = np.array(depth_loss_gradient(mi.Float(T), 4))
     step = 1e-5
     expected = [(energy(T + step * e) - energy(T - step * e)) / (2 * step) for e in np.eye(8)]
     # Central differences are off by h^2 / 6 times the third derivative, below 2 (0.95 / 0.05)^3 / 4: 6e-8; float32 by 2^-23.
@@ -101,7 +101,7 @@ def test_rays_of_a_fit_end_nearer_to_the_points_that_it_was_told(variant_rgb: st
         plan = replace(PLAN, stages=PLAN.stages[:1], depth=depth)
         problem = fitted(RayBatches.of(few, (2,)), plan).problem
         points, origins = problem.batches.points, problem.batches.origins
-        drawn = draw_sightings(points, origins, BOX, 1, 2 / 12, np.random.default_rng(0))
+        drawn = sample_depth_rays(points, origins, BOX, 1, 2 / 12, np.random.default_rng(0))
         cells = find_occupied_cells(problem.field)
         T = np.array(render_rays(cells, make_exact(problem.field, drawn.rays.d), make_model(problem.field), drawn.rays).T)
         ended.append(np.mean(T[: drawn.count] - T[drawn.count :]))
@@ -111,7 +111,7 @@ def test_rays_of_a_fit_end_nearer_to_the_points_that_it_was_told(variant_rgb: st
 def test_points_change_a_fit_only_where_they_are_asked_for(one_thread: None, photos: list[Photo], sighted: list[Photo]) -> None:
     def slope(some: list[Photo], depth: float) -> np.ndarray:
         problem = RadianceProblem(RayBatches.of(some, (1, 2)), BOX, replace(PLAN, depth=depth))
-        return np.array(problem.loss_and_gradient(problem.start(), 0)[1]["density"])
+        return np.array(problem.loss_and_gradient(problem.initial_reals(), 0)[1]["density"])
 
     # Nothing is walked for a weight of 0.
     plain, asked = (RadianceProblem(RayBatches.of(sighted, (1, 2)), BOX, replace(PLAN, depth=d)) for d in (0, 0.1))

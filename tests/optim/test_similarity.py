@@ -9,7 +9,7 @@ import pytest
 from scipy.ndimage import correlate1d
 from skimage.metrics import structural_similarity
 
-from mivol.optim.gaussians.image_difference import C1, C2, WEIGHTS, PictureShape, difference, similarity
+from mivol.optim.gaussians.image_difference import C1, C2, WEIGHTS, ImageShape, image_loss, mean_ssim
 
 HEIGHT, WIDTH = 14, 17
 
@@ -36,8 +36,8 @@ def twin(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 def ours(x: np.ndarray, y: np.ndarray, weight: float) -> tuple[float, np.ndarray]:
     """Loss and slope of the module."""
-    shape = PictureShape.of(x.shape[1], x.shape[0])
-    loss, slope = difference(mi.Float(x.ravel()), mi.Float(y.ravel()), shape, weight)
+    shape = ImageShape.of(x.shape[1], x.shape[0])
+    loss, slope = image_loss(mi.Float(x.ravel()), mi.Float(y.ravel()), shape, weight)
     return float(loss[0]), np.array(slope).reshape(x.shape)
 
 
@@ -88,12 +88,12 @@ def test_equal_pictures_have_no_slope(variant_rgb: str) -> None:
 
 def test_a_recorded_loss_is_the_same_for_any_picture(variant_rgb: str) -> None:
     """Pictures of another size and content through one recording."""
-    frozen = dr.freeze(difference)
+    frozen = dr.freeze(image_loss)
     for height, width in [(14, 17), (17, 14), (30, 9)]:
         rng = np.random.default_rng(height)
         x, y = rng.random((2, height, width, 3)).astype(np.float32)
-        arguments = mi.Float(x.ravel()), mi.Float(y.ravel()), PictureShape.of(width, height), 0.2
-        for recorded, traced in zip(frozen(*arguments), difference(*arguments), strict=True):
+        arguments = mi.Float(x.ravel()), mi.Float(y.ravel()), ImageShape.of(width, height), 0.2
+        for recorded, traced in zip(frozen(*arguments), image_loss(*arguments), strict=True):
             # The same kernels; sums over pixels may be added in another order: 2^-24 x sqrt(n), bounded by 1e-5.
             np.testing.assert_allclose(np.array(recorded), np.array(traced), rtol=1e-5, atol=1e-9)
-    assert similarity(arguments[0], arguments[0], arguments[2])[0][0] == pytest.approx(1, abs=1e-5)
+    assert mean_ssim(arguments[0], arguments[0], arguments[2])[0][0] == pytest.approx(1, abs=1e-5)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from small_scan import problem_for, run
 
-from mivol.optim.projections.linear_problems import State
+from mivol.optim.projections.linear_problems import SolverState
 from mivol.optim.projections.solvers import SOLVERS
 
 
@@ -23,7 +23,7 @@ def test_saved_state_continues_bit_for_bit(scan, name):
     np.savez(file, **whole[3].to_arrays())
     file.seek(0)
     with np.load(file, allow_pickle=False) as arrays:
-        saved = State.from_arrays(dict(arrays))
+        saved = SolverState.from_arrays(dict(arrays))
     rest = run(name, problem, 5, state=saved)
     np.testing.assert_array_equal(whole[3].x, copy)
     for a, b in zip(whole[4:], rest, strict=True):

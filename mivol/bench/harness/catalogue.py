@@ -11,7 +11,7 @@ from pathlib import Path
 from mivol.bench.harness.bars import say
 from mivol.bench.harness.study import Expected
 from mivol.errors import MivolError
-from mivol.optim.strategy import nearest
+from mivol.optim.strategy import suggest_name
 
 __all__ = ["STUDIES", "changes", "list_studies", "run_study"]
 
@@ -57,7 +57,7 @@ def run_study(name: str, argv: Sequence[str], older: Path | None = None) -> int:
         MivolError: no such study, or an older result that cannot be read or is of another kind; before anything is measured.
     """
     if name not in STUDIES:
-        raise MivolError(f'there is no study "{name}": {nearest(name, list(STUDIES))}')
+        raise MivolError(f'there is no study "{name}": {suggest_name(name, list(STUDIES))}')
     study = importlib.import_module(f"mivol.bench.studies.{name}")
     before = None
     if older is not None:

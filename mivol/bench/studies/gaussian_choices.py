@@ -80,7 +80,7 @@ def exposure_gain(folder: Path, asked: Fitted, held_out: int) -> dict:
         photos, judged = read_photos(chosen, Path())
         begun = begin(chosen, boxed(chosen, photos), make_gaussian_plan(chosen))
         problem = begun.problem(chosen.seed)
-        reconstruct(problem, begun.plan.optimiser, begun.plan.course())
+        reconstruct(problem, begun.plan.optimizer, begun.plan.course())
         seen = [compare(problem, judged, photo, ("psnr",)) for photo in judged.views]
         raw = [quality.values["psnr"] for _, quality in seen]
         pairs = zip(seen, judged.views, strict=True)

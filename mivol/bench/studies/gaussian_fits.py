@@ -18,7 +18,7 @@ from mivol.bench.harness.timing import Stopwatch
 from mivol.errors import MivolError
 from mivol.optim.gaussians.gaussian_plan import PRESETS, GaussianPlan
 from mivol.optim.gaussians.gaussian_problem import GaussianProblem
-from mivol.optim.gaussians.gaussian_start import begin_at, places_of
+from mivol.optim.gaussians.gaussian_start import find_start_points, make_start_cloud
 from mivol.optim.loop import reconstruct
 from mivol.optim.photographs.ray_batches import RayBatches
 from mivol.photos import Photo, Photos, load_photos
@@ -96,11 +96,11 @@ def asked_of(asked: Fitted) -> GaussianPlan:
 def fitted(photos: Photos, plan: GaussianPlan, seed: int) -> GaussianProblem:
     """A fit of photographs by a plan, done."""
     plan = plan.for_edge(max(photos.views[0].camera.size))
-    places, _ = places_of(photos, plan.start, seed)
+    places, _ = find_start_points(photos, plan.start, seed)
     batches = RayBatches.of(photos.views, [stage.shrink for stage in plan.stages])
-    start = begin_at(places, photos.views, plan.stages[0].degree)
+    start = make_start_cloud(places, photos.views, plan.stages[0].degree)
     problem = GaussianProblem(batches, [view.camera for view in photos.views], start, plan, seed)
-    reconstruct(problem, plan.optimiser, plan.course())
+    reconstruct(problem, plan.optimizer, plan.course())
     return problem
 
 

@@ -31,7 +31,7 @@ from mivol.bench.harness.timing import Stopwatch
 from mivol.errors import MivolError
 from mivol.optim.loop import reconstruct
 from mivol.optim.photographs.field_view import render_view
-from mivol.optim.photographs.radiance_plan import FitPlan, Stage
+from mivol.optim.photographs.radiance_plan import RadiancePlan, RadianceStage
 from mivol.optim.photographs.radiance_problem import RadianceProblem
 from mivol.optim.photographs.ray_batches import RayBatches
 from mivol.photos import Photo, load_photos
@@ -109,17 +109,17 @@ def fit(photos: Sequence[Photo], held_out: Sequence[Photo], box: np.ndarray, siz
         box: (2, 3) what is looked at.
         size: nodes, steps, rays.
         degree: of the harmonics.
-        priors: fields of :class:`mivol.optim.photographs.radiance_plan.FitPlan`.
+        priors: fields of :class:`mivol.optim.photographs.radiance_plan.RadiancePlan`.
 
     Returns:
         PSNR [dB] of the held-out views, nodes, processor time; and for the figure the middle one of them and its render.
     """
-    half = Stage(size.longest // 2, size.steps // 4, size.shrink, 4, max(size.tiles // size.shrink, 16))
-    whole = Stage(size.longest, size.steps - size.steps // 4, 1, 4, size.tiles)
-    plan = FitPlan((half, whole), degree=degree, **priors)
+    half = RadianceStage(size.longest // 2, size.steps // 4, size.shrink, 4, max(size.tiles // size.shrink, 16))
+    whole = RadianceStage(size.longest, size.steps - size.steps // 4, 1, 4, size.tiles)
+    plan = RadiancePlan((half, whole), degree=degree, **priors)
     problem, watch = RadianceProblem(RayBatches.of(photos, [stage.shrink for stage in plan.stages]), box, plan), Stopwatch()
     with watch:
-        reconstruct(problem, plan.optimiser, plan.course())
+        reconstruct(problem, plan.optimizer, plan.course())
     shown = [render_view(problem.field, photo.camera, photo.background).image for photo in held_out]
     judged = [
         images.judge(image, photo.image, space="srgb", metrics=("psnr",)) for image, photo in zip(shown, held_out, strict=True)

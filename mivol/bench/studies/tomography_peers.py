@@ -27,9 +27,9 @@ from mivol.bench.harness.bars import say
 from mivol.experiments.projections import Projections
 from mivol.experiments.scan_fit import start_volume
 from mivol.experiments.solver_choice import choose_storage, make_prior, settle_noise, settle_solver
-from mivol.optim.projections.inversion import Inversion
+from mivol.optim.projections.inversion import ProjectionProblem
 from mivol.optim.projections.linear_problems import LeastSquares, PoissonCounts
-from mivol.optim.projections.solvers import METHODS
+from mivol.optim.projections.solvers import ALL_SOLVERS
 from mivol.tomography.filtered import filtered_backprojection
 from mivol.tomography.geometry import ParallelBeam, VoxelGrid
 from mivol.tomography.phantoms import shepp_logan
@@ -128,7 +128,7 @@ def ours(scan: Slice) -> dict[str, Curve]:
         wanted = config.Solve(name, iterations=STEPS.get(name, 1))
         a = store(walk) if choose_storage(wanted, walk).is_stored else walk
         problem = LeastSquares(a, scan.y, scan.weights, x0, nonnegative=name not in ("cgls", "fbp"))
-        yield from (state.x for state in METHODS[name].run(problem))
+        yield from (state.x for state in ALL_SOLVERS[name].run(problem))
 
     filtered = next(run("fbp"))
     found["fbp"] = timed(scan, run("fbp"), 1)
@@ -145,10 +145,10 @@ def default(scan: Slice, solve: config.Solve | None = None) -> Iterator[np.ndarr
     walk = Projector(scan.beam, subdivide(scan.grid, wanted.supersampling, scan.beam))
     data, all_views = Projections(scan.beam, scan.y, scan.weights, is_noise_known=scan.photons > 0), np.arange(len(scan.y))
     start, prior = start_volume(wanted, walk, data, all_views), make_prior(wanted, walk, data, all_views)
-    problem = Inversion(LeastSquares(walk, scan.y, scan.weights, start, wanted.nonnegative, prior))
+    problem = ProjectionProblem(LeastSquares(walk, scan.y, scan.weights, start, wanted.nonnegative, prior))
     choose_storage(wanted, walk).apply(problem)
     settle_noise(problem, wanted, data)
-    for state in METHODS[wanted.name].run(problem.linear_problem):
+    for state in ALL_SOLVERS[wanted.name].run(problem.linear_problem):
         yield voxel_means(state.x.reshape(walk.grid.shape), scan.grid.shape)
 
 
@@ -156,7 +156,7 @@ def likelihood(scan: Slice) -> Iterator[np.ndarray]:
     """ML-TR of the counts, from filtered back-projection."""
     a = store(Projector(scan.beam, scan.grid))
     start = np.maximum(filtered_backprojection(a, scan.y), 0)
-    yield from (state.x for state in METHODS["ml-tr"].run(PoissonCounts(a, scan.weights, scan.photons, x0=start)))
+    yield from (state.x for state in ALL_SOLVERS["ml-tr"].run(PoissonCounts(a, scan.weights, scan.photons, x0=start)))
 
 
 def ours_of_noise(scan: Slice) -> dict[str, Curve]:

@@ -1,9 +1,8 @@
 """How many Gaussians there are during a fit, and where: clone, split, prune, reset opacities; or relocate the unused ones.
 
 Conventions. A cloud is a dict of float32 arrays by the names of :mod:`mivol.splatting.splatter` ("means", "log_scales", ...),
-row by row. Nothing is changed in place: a :class:`Change` says which rows there are now, which old row each came from, and of
-which nothing is known, so that what an optimiser has learnt can follow. Choices of rows take the smallest number first at a
-tie.
+row by row. Arrays are never changed in place: a :class:`CloudChange` holds the new rows, the old row of each, and which rows
+lost their moments, so that an optimizer's moments can follow. At a tie the smallest row number comes first.
 
 References: Kerbl et al. 2023 (ACM TOG 42(4), section 5.2, and the released code's constants); Kheradmand et al. 2024 (3D
 Gaussian Splatting as Markov Chain Monte Carlo, NeurIPS: eqs. 9 and 10).
@@ -21,18 +20,18 @@ from scipy.special import expit, gammaln, logit
 from mivol.errors import MivolError
 
 __all__ = [
-    "Arrays",
-    "Change",
-    "best_rows",
+    "CloudArrays",
+    "CloudChange",
+    "select_rows",
     "clone_and_split",
     "grow",
-    "opacity_and_scale_of_copies",
+    "split_opacity_and_scale",
     "prune",
     "relocate",
     "reset_opacities",
 ]
 
-Arrays = dict[str, NDArray[np.float32]]
+CloudArrays = dict[str, NDArray[np.float32]]
 """A cloud, or what is known of one, by name; the first axis counts Gaussians."""
 
 SHRINK = 1.6
@@ -43,7 +42,7 @@ MOST_COPIES = 51
 
 
 @dataclass(frozen=True)
-class Change:
+class CloudChange:
     """A cloud after a change.
 
     Attributes:
@@ -52,29 +51,29 @@ class Change:
         forgets: (M,) bool: what was learnt about the parent does not hold.
     """
 
-    cloud: Arrays
+    cloud: CloudArrays
     parent: NDArray[np.int64]
     forgets: NDArray[np.bool_]
 
-    def carry(self, learnt: Arrays) -> Arrays:
+    def carry(self, learnt: CloudArrays) -> CloudArrays:
         """What was learnt about the old rows, for the new ones; 0 where nothing is known."""
         found = {name: array[self.parent] for name, array in learnt.items()}
         for array in found.values():
             array[self.forgets] = 0
         return found
 
-    def then(self, later: Change) -> Change:
+    def then(self, later: CloudChange) -> CloudChange:
         """This change and another one of its cloud, as one."""
-        return Change(later.cloud, self.parent[later.parent], self.forgets[later.parent] | later.forgets)
+        return CloudChange(later.cloud, self.parent[later.parent], self.forgets[later.parent] | later.forgets)
 
 
-def unchanged(cloud: Arrays) -> Change:
+def unchanged(cloud: CloudArrays) -> CloudChange:
     """The cloud as it is."""
     n = len(cloud["means"])
-    return Change(cloud, np.arange(n), np.zeros(n, bool))
+    return CloudChange(cloud, np.arange(n), np.zeros(n, bool))
 
 
-def best_rows(score: NDArray, least: float, most: int) -> NDArray[np.int64]:
+def select_rows(score: NDArray, least: float, most: int) -> NDArray[np.int64]:
     """Rows whose score is at least ``least``, in ascending order: the ``most`` highest where there are more."""
     rows = np.flatnonzero(score >= least)
     if len(rows) > most:
@@ -82,7 +81,7 @@ def best_rows(score: NDArray, least: float, most: int) -> NDArray[np.int64]:
     return np.sort(rows)
 
 
-def clone_and_split(cloud: Arrays, rows: NDArray[np.int64], largest_clone: float, rng: np.random.Generator) -> Change:
+def clone_and_split(cloud: CloudArrays, rows: NDArray[np.int64], largest_clone: float, rng: np.random.Generator) -> CloudChange:
     """One more Gaussian for each of some: small ones are doubled, large ones become two that are drawn from them.
 
     A clone stands where its parent does; their derivatives differ from the next step on, as their moments do. Both halves of a
@@ -106,10 +105,10 @@ def clone_and_split(cloud: Arrays, rows: NDArray[np.int64], largest_clone: float
     turned = np.einsum("nij,nj->ni", rotations(made["quaternions"][halves]), drawn)
     made["means"][halves] += turned.astype(np.float32)
     made["log_scales"][halves] -= np.float32(math.log(SHRINK))
-    return Change(made, parent, np.arange(len(parent)) >= n - len(split))
+    return CloudChange(made, parent, np.arange(len(parent)) >= n - len(split))
 
 
-def prune(cloud: Arrays, keep: NDArray[np.bool_]) -> Change:
+def prune(cloud: CloudArrays, keep: NDArray[np.bool_]) -> CloudChange:
     """Only the Gaussians that are kept.
 
     Raises:
@@ -120,18 +119,18 @@ def prune(cloud: Arrays, keep: NDArray[np.bool_]) -> Change:
         raise MivolError(
             "no Gaussian is left: all have become transparent. Lower the learning rates, or prune at a smaller opacity."
         )
-    return Change({name: array[parent] for name, array in cloud.items()}, parent, np.zeros(len(parent), bool))
+    return CloudChange({name: array[parent] for name, array in cloud.items()}, parent, np.zeros(len(parent), bool))
 
 
-def reset_opacities(cloud: Arrays, highest: float) -> Arrays:
+def reset_opacities(cloud: CloudArrays, highest: float) -> CloudArrays:
     """The cloud with opacities of at most ``highest``: Gaussians that are needed become opaque again, others can be pruned."""
     return {**cloud, "opacity_logits": np.minimum(cloud["opacity_logits"], np.float32(logit(highest)))}
 
 
-def relocate(cloud: Arrays, unused_below: float, rng: np.random.Generator) -> Change:
+def relocate(cloud: CloudArrays, unused_below: float, rng: np.random.Generator) -> CloudChange:
     """Move Gaussians that are all but transparent to where others are, drawn in proportion to their opacity.
 
-    Those that share a place are made so that their composite is what stood there (:func:`opacity_and_scale_of_copies`).
+    Those that share a place are made so that their composite is what stood there (:func:`split_opacity_and_scale`).
     """
     opacity = expit(cloud["opacity_logits"].astype(np.float64))
     unused, used = np.flatnonzero(opacity < unused_below), np.flatnonzero(opacity >= unused_below)
@@ -143,27 +142,27 @@ def relocate(cloud: Arrays, unused_below: float, rng: np.random.Generator) -> Ch
     return _shared(cloud, parent, unused_below)
 
 
-def grow(cloud: Arrays, count: int, least_opacity: float, rng: np.random.Generator) -> Change:
+def grow(cloud: CloudArrays, count: int, least_opacity: float, rng: np.random.Generator) -> CloudChange:
     """``count`` more Gaussians where others are, drawn in proportion to their opacity, that change no picture."""
     opacity = expit(cloud["opacity_logits"].astype(np.float64))
     source = rng.choice(len(opacity), count, p=opacity / opacity.sum())
     return _shared(cloud, np.concatenate([np.arange(len(opacity)), source]), least_opacity)
 
 
-def _shared(cloud: Arrays, parent: NDArray[np.int64], least_opacity: float) -> Change:
+def _shared(cloud: CloudArrays, parent: NDArray[np.int64], least_opacity: float) -> CloudChange:
     """Rows that are copies of others: what is at a place is divided among all that stand there."""
     copies = np.minimum(np.bincount(parent, minlength=len(cloud["means"]))[parent], MOST_COPIES)
     made = {name: array[parent] for name, array in cloud.items()}
     shares = copies > 1
     opacity = expit(made["opacity_logits"][shares].astype(np.float64))
-    each, factor = opacity_and_scale_of_copies(opacity, copies[shares])
+    each, factor = split_opacity_and_scale(opacity, copies[shares])
     each = np.clip(each, least_opacity, 1 - 2**-23)
     made["opacity_logits"][shares] = logit(each).astype(np.float32)
     made["log_scales"][shares] += np.log(factor)[:, None].astype(np.float32)
-    return Change(made, parent, shares)
+    return CloudChange(made, parent, shares)
 
 
-def opacity_and_scale_of_copies(opacity: NDArray, copies: NDArray) -> tuple[NDArray, NDArray]:
+def split_opacity_and_scale(opacity: NDArray, copies: NDArray) -> tuple[NDArray, NDArray]:
     """Opacity of each of N equal Gaussians that replace one, and the factor on its scale (Kheradmand et al. 2024, eqs. 9, 10).
 
     Opacities compose to the old one at the middle; the factor keeps the integral of the composite along a line through it.

@@ -24,14 +24,14 @@ from mivol.optim.first_order import Adam
 from mivol.optim.loop import Course
 from mivol.photos import Camera
 
-__all__ = ["CONTROLS", "PRESETS", "GaussianPlan", "SplatStage", "bytes_of", "extent_of", "memory_of"]
+__all__ = ["CONTROLS", "PRESETS", "GaussianPlan", "GaussianStage", "estimate_bytes", "scene_extent", "check_memory"]
 
 CONTROLS = ("clone_split", "relocation")
 """What control of the density there is: that of Kerbl et al. 2023, and that of Kheradmand et al. 2024."""
 
 
 @dataclass(frozen=True)
-class SplatStage:
+class GaussianStage:
     """A part of a fit.
 
     Attributes:
@@ -78,7 +78,7 @@ class GaussianPlan:
         sparsity: of relocation: weight of the mean opacity and of the mean scale [extent].
     """
 
-    stages: tuple[SplatStage, ...]
+    stages: tuple[GaussianStage, ...]
     start: int = 5_000
     most: int = 20_000
     control: str = "clone_split"
@@ -116,12 +116,12 @@ class GaussianPlan:
         return self.stages[-1].degree
 
     @property
-    def begins(self) -> tuple[int, ...]:
+    def stage_starts(self) -> tuple[int, ...]:
         """Steps before which the stages after the first begin."""
         return tuple(int(n) for n in np.cumsum([stage.steps for stage in self.stages])[:-1])
 
     @property
-    def optimiser(self) -> Adam:
+    def optimizer(self) -> Adam:
         """What takes the steps; derivatives of single Gaussians are many orders below the largest, and count as much."""
         return Adam(epsilon=1e-12)
 
@@ -129,7 +129,7 @@ class GaussianPlan:
         """All steps, with the stages, the control of the density and what else is to happen between them."""
         first, last = (max(1, round(share * self.steps)) for share in self.grows)
         control = ControlDensity(every=self.every, begin=first, end=max(last, first + 1))
-        return Course(self.steps, events=(CoarseToFine(at=self.begins), control, *more))
+        return Course(self.steps, events=(CoarseToFine(at=self.stage_starts), control, *more))
 
     def count_at(self, step: int, start: int) -> int:
         """How many Gaussians there may be from a step on: growth is even from ``start`` to ``most``."""
@@ -137,7 +137,7 @@ class GaussianPlan:
         share = min(max((step + self.every - first) / max(last - first, 1), 0), 1)
         return start + round((max(self.most, start) - start) * share)
 
-    def rates(self, step: int, extent: float) -> dict[str, float]:
+    def learning_rates(self, step: int, extent: float) -> dict[str, float]:
         """Learning rates in a step, by parameter."""
         share = step / max(self.steps, 1)
         falls = self.end**share
@@ -202,17 +202,21 @@ PUBLISHED = {
 32.6. With rates of places four times as high 37.5 and 32.3; where all others fall to a tenth besides, 36.9 and 31.9."""
 
 PRESETS: dict[str, GaussianPlan] = {
-    "tiny": GaussianPlan((SplatStage(64, 150, 0), SplatStage(128, 350, 1)), 1500, 4000, every=50, place=8e-4, place_end=8e-6),
-    "minute": GaussianPlan((SplatStage(100, 400, 0), SplatStage(200, 2000, 2)), start=4000, most=10_000, every=50),
-    "minutes": GaussianPlan((SplatStage(100, 800, 0), SplatStage(200, 7000, 3)), start=8000, most=35_000),
+    "tiny": GaussianPlan(
+        (GaussianStage(64, 150, 0), GaussianStage(128, 350, 1)), 1500, 4000, every=50, place=8e-4, place_end=8e-6
+    ),
+    "minute": GaussianPlan((GaussianStage(100, 400, 0), GaussianStage(200, 2000, 2)), start=4000, most=10_000, every=50),
+    "minutes": GaussianPlan((GaussianStage(100, 800, 0), GaussianStage(200, 7000, 3)), start=8000, most=35_000),
     "fine": GaussianPlan(
-        (SplatStage(100, 500, 0), SplatStage(200, 3000, 2), SplatStage(400, 3000, 3)), start=6000, most=30_000
+        (GaussianStage(100, 500, 0), GaussianStage(200, 3000, 2), GaussianStage(400, 3000, 3)), start=6000, most=30_000
     ),
     "finest": GaussianPlan(
-        (SplatStage(100, 500, 0), SplatStage(200, 3000, 2), SplatStage(400, 3500, 3), SplatStage(800, 1500, 3)), 6000, 50_000
+        (GaussianStage(100, 500, 0), GaussianStage(200, 3000, 2), GaussianStage(400, 3500, 3), GaussianStage(800, 1500, 3)),
+        6000,
+        50_000,
     ),
     "gpu": GaussianPlan(
-        (SplatStage(200, 1000, 0), SplatStage(400, 2000, 2), SplatStage(800, 27_000, 3)), 100_000, 400_000, **PUBLISHED
+        (GaussianStage(200, 1000, 0), GaussianStage(400, 2000, 2), GaussianStage(800, 27_000, 3)), 100_000, 400_000, **PUBLISHED
     ),
 }
 """``tiny`` takes seconds, ``minute`` and ``minutes`` one and five on two idle cores, ``fine`` about as long as ``minutes``, for
@@ -220,7 +224,7 @@ photographs of 400 pixels and more, ``finest`` ten to twenty, for 800 and more; 
 measured)."""
 
 
-def extent_of(cameras: Sequence[Camera]) -> float:
+def scene_extent(cameras: Sequence[Camera]) -> float:
     """1.1 times the largest distance of a camera from the mean of all [length] (Kerbl et al. 2023, released code)."""
     origins = np.array([camera.origin for camera in cameras])
     return 1.1 * float(np.linalg.norm(origins - origins.mean(axis=0), axis=1).max())
@@ -239,13 +243,13 @@ LISTED = 32
 """Entries that a Gaussian has in the lists of tiles; small ones have 1 to 4, each of 100 bytes."""
 
 
-def bytes_of(plan: GaussianPlan, count: int, pixels: int) -> int:
+def estimate_bytes(plan: GaussianPlan, count: int, pixels: int) -> int:
     """Memory of a step with so many Gaussians and pixels."""
     numbers = 11 + 3 * (plan.degree + 1) ** 2
     return count * (numbers * NUMBER + LISTED * 100) + pixels * PIXEL
 
 
-def memory_of(plan: GaussianPlan, photographs: int, pixels: int, limit: int | None = None) -> str:
+def check_memory(plan: GaussianPlan, photographs: int, pixels: int, limit: int | None = None) -> str:
     """What a fit will take, in a sentence.
 
     Args:
@@ -258,11 +262,11 @@ def memory_of(plan: GaussianPlan, photographs: int, pixels: int, limit: int | No
         MivolError: more than there is; how many Gaussians fit is said.
     """
     most = max(plan.most, plan.start)
-    needed = photographs + bytes_of(plan, most, pixels)
+    needed = photographs + estimate_bytes(plan, most, pixels)
     if limit is None and dr.backend_v(mi.Float) == dr.JitBackend.LLVM:
         limit = available_memory()
     if limit is not None and needed > limit:
-        each, rest = bytes_of(plan, 1, 0), limit - photographs - bytes_of(plan, 0, pixels)
+        each, rest = estimate_bytes(plan, 1, 0), limit - photographs - estimate_bytes(plan, 0, pixels)
         advice = f"gaussians.most = {rest // each} fits" if rest > each else "read the photographs smaller (photos.scale)"
         taken, left = f"{needed / 2**30:.1f} GiB", f"{limit / 2**30:.1f}"
         raise MivolError(f"a fit of {most} Gaussians takes about {taken} and {left} are left; {advice}.")

@@ -20,21 +20,21 @@ from scipy.special import expit
 
 from mivol.errors import MivolError
 from mivol.optim.gaussians.density_control import (
-    Arrays,
-    Change,
-    best_rows,
+    CloudArrays,
+    CloudChange,
     clone_and_split,
     grow,
     prune,
     relocate,
     reset_opacities,
+    select_rows,
 )
-from mivol.optim.gaussians.gaussian_plan import CONTROLS, GaussianPlan, extent_of
-from mivol.optim.gaussians.image_difference import PictureShape, difference
+from mivol.optim.gaussians.gaussian_plan import CONTROLS, GaussianPlan, scene_extent
+from mivol.optim.gaussians.image_difference import ImageShape, image_loss
 from mivol.optim.photographs.exposure import Exposure
 from mivol.optim.photographs.ray_batches import RayBatches
 from mivol.optim.problem import Reals, Refinement
-from mivol.optim.strategy import nearest
+from mivol.optim.strategy import suggest_name
 from mivol.photos import Camera
 from mivol.splatting import Splatter
 from mivol.splatting.splatter import Statistics
@@ -66,12 +66,12 @@ class GaussianProblem:
     Example:
         >>> cloud = begin_at(places_of(photos, 5000, 0)[0], photos.views, degree=0)
         >>> problem = GaussianProblem(RayBatches.of(photos.views, (1, 2)), cameras, cloud, PRESETS["tiny"])
-        >>> reconstruct(problem, problem.plan.optimiser, problem.plan.course())
+        >>> reconstruct(problem, problem.plan.optimizer, problem.plan.course())
     """
 
     batches: RayBatches
     cameras: Sequence[Camera]
-    cloud: Arrays
+    cloud: CloudArrays
     plan: GaussianPlan
     seed: int = 0
     safe_point: Callable[[], None] = lambda: None
@@ -80,11 +80,11 @@ class GaussianProblem:
 
     def __post_init__(self) -> None:
         if self.plan.control not in CONTROLS:
-            raise MivolError(f'control = "{self.plan.control}" is unknown: {nearest(self.plan.control, list(CONTROLS))}')
+            raise MivolError(f'control = "{self.plan.control}" is unknown: {suggest_name(self.plan.control, list(CONTROLS))}')
         absent = {stage.shrink for stage in self.plan.stages} - self.batches.levels.keys()
         if absent:
             raise MivolError(f"views shrunk by {min(absent)} are asked for; take them over in that size (RayBatches.of).")
-        self.extent = extent_of(self.cameras)
+        self.extent = scene_extent(self.cameras)
         if not self.extent > 1e-6 * max(np.abs(camera.origin).max() for camera in self.cameras):
             raise MivolError("all cameras stand at one place, which tells no distance: Gaussians need views from several.")
         if self.plan.exposure:
@@ -93,15 +93,15 @@ class GaussianProblem:
             self.exposure = Exposure.even(len(self.cameras))
         self.begun_with = len(self.cloud["means"])
         self._splatters: dict[tuple[int, int, float, float, int], Splatter] = {}
-        self._shapes: dict[tuple[int, int], PictureShape] = {}
+        self._shapes: dict[tuple[int, int], ImageShape] = {}
         self._looks: dict[tuple[int, int], Camera] = {}
-        self._difference = dr.freeze(difference)
+        self._difference = dr.freeze(image_loss)
         self.cloud = _of_degree(self.cloud, self.plan.stages[0].degree)
         self._forget_sums()
 
     # -- Values -------------------------------------------------------------------------------------------------------
 
-    def start(self) -> Reals:
+    def initial_reals(self) -> Reals:
         """The reals of the cloud and of the gains that are there now."""
         return self._with_gains(self._reals_of(self.cloud))
 
@@ -109,7 +109,7 @@ class GaussianProblem:
         """The cloud as tensors, coefficients as they are."""
         return {name: mi.TensorXf(array) for name, array in self.cloud.items()}
 
-    def set(self, reals: Reals) -> None:
+    def set_reals(self, reals: Reals) -> None:
         """Take over the cloud and the gains of reals."""
         if self.exposure is not None:
             self.exposure = Exposure(reals["exposure"].array)
@@ -118,12 +118,12 @@ class GaussianProblem:
     def _with_gains(self, reals: Reals) -> Reals:
         return reals if self.exposure is None else reals | {"exposure": self.exposure.tensor}
 
-    def _reals_of(self, cloud: Arrays) -> Reals:
+    def _reals_of(self, cloud: CloudArrays) -> Reals:
         return {name: mi.TensorXf(array) for name, array in cloud.items()} | {
             "harmonics": mi.TensorXf(cloud["harmonics"] / self._shares(cloud["harmonics"].shape[1]))
         }
 
-    def _cloud_of(self, reals: Reals) -> Arrays:
+    def _cloud_of(self, reals: Reals) -> CloudArrays:
         cloud = {name: np.array(value) for name, value in reals.items()}
         cloud["harmonics"] *= self._shares(cloud["harmonics"].shape[1])
         return cloud
@@ -199,9 +199,9 @@ class GaussianProblem:
             self._splatters[key] = Splatter(*size, key[-1], **settings)
         return self._splatters[key]
 
-    def _shape(self, size: tuple[int, int]) -> PictureShape:
+    def _shape(self, size: tuple[int, int]) -> ImageShape:
         if size not in self._shapes:
-            self._shapes[size] = PictureShape.of(*size)
+            self._shapes[size] = ImageShape.of(*size)
         return self._shapes[size]
 
     def _background(self, iteration: int) -> np.ndarray | None:
@@ -249,12 +249,12 @@ class GaussianProblem:
         more = {name: mi.TensorXf(gradient[name].array + each * slope, gradient[name].shape) for name, slope in slopes.items()}
         return loss, gradient | more
 
-    def rates(self, iteration: int) -> dict[str, float]:
+    def learning_rates(self, iteration: int) -> dict[str, float]:
         """Learning rate of each parameter.
 
         A gain has a gradient in one step of n, for n photographs: then Adam moves it by up to sqrt(n) of its rate.
         """
-        found = self.plan.rates(iteration, self.extent)
+        found = self.plan.learning_rates(iteration, self.extent)
         if self.exposure is not None:
             found["exposure"] = self._turn(iteration) / len(self.cameras) ** 0.5
         return found
@@ -274,7 +274,7 @@ class GaussianProblem:
             return reals
         n = reals["means"].shape[0]
         drawn = np.random.default_rng((self.seed, 4, iteration)).standard_normal((n, 3)).astype(np.float32)
-        size = dr.opaque(mi.Float, self.plan.noise * self.rates(iteration)["means"])
+        size = dr.opaque(mi.Float, self.plan.noise * self.learning_rates(iteration)["means"])
         return {**reals, "means": _wandered(reals, mi.Float(drawn.ravel()), size)}
 
     def warning(self) -> str:
@@ -301,19 +301,19 @@ class GaussianProblem:
 
         now = len(self.cloud["means"])
         says = f"{now} Gaussians, {before} before" + (", all of opacity 0.01 at most" if reset else "")
-        return Refinement(self.start(), carry, {}, says)
+        return Refinement(self.initial_reals(), carry, {}, says)
 
-    def _divided(self, room: int, rng: np.random.Generator) -> Change:
+    def _divided(self, room: int, rng: np.random.Generator) -> CloudChange:
         """Clone and split where places on the screen are pulled at most; prune what is transparent or too large."""
         slope = self._slopes / np.maximum(self._times, 1)
-        rows = best_rows(slope, max(self.plan.threshold, np.finfo(np.float32).tiny), room)
+        rows = select_rows(slope, max(self.plan.threshold, np.finfo(np.float32).tiny), room)
         change = clone_and_split(self.cloud, rows, self.plan.largest_clone * self.extent, rng)
         cloud = change.cloud
         keep = expit(cloud["opacity_logits"]) >= self.plan.least_opacity
         keep &= np.exp(cloud["log_scales"].max(axis=1)) <= self.plan.largest * self.extent
         return change.then(prune(cloud, keep))
 
-    def _relocated(self, room: int, rng: np.random.Generator) -> Change:
+    def _relocated(self, room: int, rng: np.random.Generator) -> CloudChange:
         """Move what is transparent to where something is, then grow by at most 5 %."""
         moved = relocate(self.cloud, self.plan.least_opacity, rng)
         more = min(max(room, 0), max(1, len(self.cloud["means"]) // 20))
@@ -341,7 +341,7 @@ class GaussianProblem:
             return {name: mi.TensorXf(array) for name, array in learnt.items()}
 
         says = f"photographs shrunk by {now.shrink}, harmonics of degree {now.degree}"
-        return Refinement(self.start(), carry, {}, says)
+        return Refinement(self.initial_reals(), carry, {}, says)
 
     def update_occupancy(self) -> None:
         """Nothing is left out of steps but what a camera does not see."""
@@ -355,11 +355,11 @@ class GaussianProblem:
     def unpack(self, arrays: dict[str, np.ndarray], reals: Reals) -> None:
         """Go on from what :meth:`pack` gave; plan, photographs and the first cloud must be the same."""
         self.stage = int(arrays["stage"])
-        self.set(reals)
+        self.set_reals(reals)
         self._slopes, self._times = np.array(arrays["slopes"]), np.array(arrays["times"])
 
 
-def _of_degree(arrays: Arrays, degree: int) -> Arrays:
+def _of_degree(arrays: CloudArrays, degree: int) -> CloudArrays:
     """The arrays with harmonics up to a degree: those beyond are left out, new ones are 0."""
     harmonics, wanted = arrays["harmonics"], (degree + 1) ** 2
     made = np.zeros((len(harmonics), wanted, 3), np.float32)

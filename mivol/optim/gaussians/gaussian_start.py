@@ -13,11 +13,11 @@ from scipy.spatial import cKDTree
 from scipy.special import logit
 
 from mivol.errors import MivolError
-from mivol.optim.gaussians.density_control import Arrays
+from mivol.optim.gaussians.density_control import CloudArrays
 from mivol.photos import Photo, Photos, project
 from mivol.photos.region import FEWEST_POINTS, count_views
 
-__all__ = ["begin_at", "places_of"]
+__all__ = ["make_start_cloud", "find_start_points"]
 
 OPACITY = 0.1
 SH_0 = 0.5 / math.sqrt(math.pi)
@@ -30,7 +30,7 @@ SHARE = 0.5
 """Share of the views that must see a point."""
 
 
-def places_of(photos: Photos, count: int, seed: int) -> tuple[np.ndarray, str]:
+def find_start_points(photos: Photos, count: int, seed: int) -> tuple[np.ndarray, str]:
     """Where Gaussians begin (N, 3) [length], and where that comes from, for people.
 
     The points of a reconstruction, as they are, where there are enough of them; else ``count`` points drawn evenly from the box
@@ -58,7 +58,7 @@ def places_of(photos: Photos, count: int, seed: int) -> tuple[np.ndarray, str]:
     return kept, f"{len(kept)} points at random where no view sees through"
 
 
-def begin_at(places: np.ndarray, views: Sequence[Photo], degree: int) -> Arrays:
+def make_start_cloud(places: np.ndarray, views: Sequence[Photo], degree: int) -> CloudArrays:
     """Round Gaussians of opacity 0.1, as large as three neighbours are far, of the mean colour that views show there.
 
     Args:

@@ -18,7 +18,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-__all__ = ["PictureShape", "difference", "similarity"]
+__all__ = ["ImageShape", "image_loss", "mean_ssim"]
 
 REACH, SIGMA = 5, 1.5
 """Of the window, to each side [pixel], and its standard deviation [pixel]."""
@@ -31,7 +31,7 @@ WEIGHTS = WEIGHTS / WEIGHTS.sum()
 
 
 @dataclass
-class PictureShape:
+class ImageShape:
     """Size of a picture on the device, so that kernels do not know it: width and height [pixel], and 1 over its numbers."""
 
     width: mi.Int32
@@ -39,12 +39,12 @@ class PictureShape:
     share: mi.Float
 
     @classmethod
-    def of(cls, width: int, height: int) -> PictureShape:
+    def of(cls, width: int, height: int) -> ImageShape:
         """That of a picture of so many pixels."""
         return cls(dr.opaque(mi.Int32, width), dr.opaque(mi.Int32, height), dr.opaque(mi.Float, 1 / (3 * width * height)))
 
 
-def difference(x: mi.Float, y: mi.Float, shape: PictureShape, weight: float) -> tuple[mi.Float, mi.Float]:
+def image_loss(x: mi.Float, y: mi.Float, shape: ImageShape, weight: float) -> tuple[mi.Float, mi.Float]:
     """f, an array of width 1, and its derivative by each number of x; both may be recorded (``dr.freeze``).
 
     Args:
@@ -59,13 +59,13 @@ def difference(x: mi.Float, y: mi.Float, shape: PictureShape, weight: float) -> 
     sign = dr.select(error == 0, 0.0, dr.sign(error))
     slope = shape.share * (1 - weight) * sign
     if weight > 0:
-        alike, d_alike = similarity(x, y, shape)
+        alike, d_alike = mean_ssim(x, y, shape)
         loss += weight * (1 - alike)
         slope -= weight * d_alike
     return loss, slope
 
 
-def similarity(x: mi.Float, y: mi.Float, shape: PictureShape) -> tuple[mi.Float, mi.Float]:
+def mean_ssim(x: mi.Float, y: mi.Float, shape: ImageShape) -> tuple[mi.Float, mi.Float]:
     """Mean SSIM over pixels and channels, an array of width 1, and its derivative by each number of x; arguments evaluated."""
     columns, rows = _Axis.along_columns(x, shape), _Axis.along_rows(x, shape)
     sums = columns.blur((x, y), lambda a, b: (a, b, a * a, b * b, a * b))
@@ -97,11 +97,11 @@ class _Axis:
     step: mi.Int32
 
     @classmethod
-    def along_columns(cls, picture: mi.Float, shape: PictureShape) -> _Axis:
+    def along_columns(cls, picture: mi.Float, shape: ImageShape) -> _Axis:
         return cls(dr.arange(mi.Int32, dr.width(picture)) // 3 % shape.width, shape.width, mi.Int32(3))
 
     @classmethod
-    def along_rows(cls, picture: mi.Float, shape: PictureShape) -> _Axis:
+    def along_rows(cls, picture: mi.Float, shape: ImageShape) -> _Axis:
         step = 3 * shape.width
         return cls(dr.arange(mi.Int32, dr.width(picture)) // step, shape.height, step)
 

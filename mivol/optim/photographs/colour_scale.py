@@ -21,7 +21,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-__all__ = ["SCALES", "Codes", "Radiance"]
+__all__ = ["SCALES", "SrgbScale", "LinearScale"]
 
 EPSILON = 0.1
 """Radiance, over that which is shown white, below which errors weigh about the same. Mildenhall et al. have 0.001: tone-mapped
@@ -30,7 +30,7 @@ and 45.5 after four times the steps)."""
 
 
 @dataclass(frozen=True)
-class Codes:
+class SrgbScale:
     """Code values of sRGB.
 
     Attributes:
@@ -61,8 +61,8 @@ class Codes:
 
 
 @dataclass(frozen=True)
-class Radiance:
-    """Linear light, in units of about what is shown white; what there is is that of :class:`Codes`."""
+class LinearScale:
+    """Linear light, in units of about what is shown white; what there is is that of :class:`SrgbScale`."""
 
     rate: ClassVar[float] = 4.0
     """A lamp of 100 is as far from grey, in reals, as white would be in codes three times as large; with 4 it is reached."""
@@ -93,5 +93,5 @@ class Radiance:
         return dr.rcp(dr.maximum(dr.detach(shown), 0) + EPSILON)
 
 
-SCALES: dict[str, Codes | Radiance] = {"srgb": Codes(), "linear": Radiance()}
+SCALES: dict[str, SrgbScale | LinearScale] = {"srgb": SrgbScale(), "linear": LinearScale()}
 """By what the values of photographs are (:data:`mivol.photos.photo_file.SPACES`)."""

@@ -24,7 +24,7 @@ import numpy as np
 
 from mivol.transport.line_integrals.radiance_field import RayBundle
 
-__all__ = ["Sightings", "by_transmittance", "draw_sightings"]
+__all__ = ["DepthRays", "depth_loss_gradient", "sample_depth_rays"]
 
 WRONG = 0.05
 """Share of the points of which nothing is believed."""
@@ -37,7 +37,7 @@ EACH = 64
 
 
 @dataclass
-class Sightings:
+class DepthRays:
     """Points as rays.
 
     Attributes:
@@ -49,14 +49,14 @@ class Sightings:
     count: int
 
 
-def draw_sightings(
+def sample_depth_rays(
     points: Sequence[np.ndarray],
     origins: np.ndarray,
     box: np.ndarray,
     levels: int,
     voxel: float,
     rng: np.random.Generator,
-) -> Sightings | None:
+) -> DepthRays | None:
     """Draw points of each of some photographs; None where none of them has any in the boxes.
 
     Args:
@@ -82,10 +82,10 @@ def draw_sightings(
     twice = np.tile(np.arange(len(d)), 2)
     o, towards = mi.Point3f(*_columns(o[twice])), mi.Vector3f(*_columns((away / d[:, None])[twice]))
     ends = _real(np.concatenate([np.maximum(d - off, 0), d + off]))
-    return Sightings(RayBundle(o, towards, ends), len(d))
+    return DepthRays(RayBundle(o, towards, ends), len(d))
 
 
-def by_transmittance(T: mi.Float, count: int) -> mi.Float:
+def depth_loss_gradient(T: mi.Float, count: int) -> mi.Float:
     """Derivatives of the mean of E over points by the transmittances of their rays (2 count), in the order of the rays."""
     number, n = dr.arange(mi.UInt32, 2 * count), dr.opaque(mi.UInt32, count)
     point = number % n

@@ -23,12 +23,12 @@ from mivol.optim.loop import Course
 from mivol.optim.photographs.ray_batches import TILE, RayBatches
 from mivol.optim.priors import DecoupledPrior, Smoothness, Sparsity, ViewDependence
 
-FEW = 50
+FEW_PHOTOGRAPHS = 50
 """Photographs below which colours that go with the direction are more than they tell (SH 1 against 2: 23.9 and 23.2 dB)."""
 
 
 @dataclass(frozen=True)
-class Stage:
+class RadianceStage:
     """Some steps on a grid of one resolution.
 
     Attributes:
@@ -53,7 +53,7 @@ class Stage:
 
 
 @dataclass(frozen=True)
-class FitPlan:
+class RadiancePlan:
     """How a fit goes.
 
     Attributes:
@@ -96,7 +96,7 @@ class FitPlan:
             sqrt(2), and no box of a ``cubic`` plan is finer. (With 1.2, 2.3 and 4.7 of them held-out training views of the
             chair came to 30.9, 31.6 and 31.0 dB in as many steps; fits that take longer gain by finer ones.)
         cubic: a box that is no cube gets as many nodes in all as its stages have in a cube, for memory and time go with them
-            (:func:`stretched`); False: ``longest`` is meant as it stands.
+            (:func:`scale_longest`); False: ``longest`` is meant as it stands.
         epochs: times that a stage looks at each pixel of its photographs, at most: few and small ones take fewer steps (230
             in the last at least), or they are learned by heart (three made-up scenes, 60 photographs of 200 pixels, with 4, 8,
             16 and 70: 32.5, 33.2, 32.8 and 31.7 dB).
@@ -104,7 +104,7 @@ class FitPlan:
             the background's colour.
     """
 
-    stages: tuple[Stage, ...]
+    stages: tuple[RadianceStage, ...]
     degree: int = 2
     few_degree: int | None = None
     first_degree: int | None = None
@@ -145,18 +145,18 @@ class FitPlan:
         return sum(stage.steps for stage in self.stages)
 
     @property
-    def begins(self) -> tuple[int, ...]:
+    def stage_starts(self) -> tuple[int, ...]:
         """Steps before which the stages after the first begin."""
         return tuple(int(n) for n in np.cumsum([stage.steps for stage in self.stages])[:-1])
 
     @property
-    def drops(self) -> tuple[int, ...]:
+    def drop_steps(self) -> tuple[int, ...]:
         """Steps before which unseen nodes are left out."""
         last = self.stages[-1].steps
         return (self.steps - last + max(1, round(self.drop * last)),) if self.drop > 0 else ()
 
     @property
-    def optimiser(self) -> RMSprop:
+    def optimizer(self) -> RMSprop:
         """What takes the steps."""
         return RMSprop(memory=self.memory, half=True)
 
@@ -172,10 +172,14 @@ class FitPlan:
 
     def course(self, *more: Event) -> Course:
         """All steps, with the stages, the surveys and what else is to happen between them."""
-        between = CoarseToFine(at=self.begins), DropUnseen(at=self.drops), UpdateOccupancy(every=self.occupancy_every)
+        between = (
+            CoarseToFine(at=self.stage_starts),
+            DropUnseen(at=self.drop_steps),
+            UpdateOccupancy(every=self.occupancy_every),
+        )
         return Course(self.steps, events=(*between, *more))
 
-    def up_to(self, longest: int) -> FitPlan:
+    def with_longest(self, longest: int) -> RadiancePlan:
         """The plan that ends with so many nodes along the longest edge; stages that are coarser stay.
 
         Where all are, the last of them takes half its steps: it is to find what is empty, and where colours begin (the chair
@@ -187,7 +191,7 @@ class FitPlan:
             coarser[-1] = replace(coarser[-1], steps=max(1, coarser[-1].steps // 2))
         return replace(self, stages=(*coarser, replace(self.stages[-1], longest=longest)))
 
-    def reach(self, origins: np.ndarray, box: np.ndarray) -> float:
+    def near_distance(self, origins: np.ndarray, box: np.ndarray) -> float:
         """The distance from a camera below which derivatives fall [length], of cameras at ``origins`` (V, 3)."""
         return self.near * float(np.median(np.linalg.norm(origins - box.mean(axis=0), axis=1)))
 
@@ -197,21 +201,21 @@ class FitPlan:
             return self.degree
         return round(self.first_degree + (self.degree - self.first_degree) * number / (len(self.stages) - 1))
 
-    def rates(self, step: int) -> tuple[float, float]:
+    def learning_rates(self, step: int) -> tuple[float, float]:
         """Learning rates in a step: of the density times half the longest edge, and of coefficients."""
         share = step / max(self.steps, 1)
         rise = 1.0
         if self.delay > 0:
             rise = 0.01 + 0.99 * math.sin(math.pi / 2 * min(share / self.delay, 1))
-        stage = self.stages[sum(step >= begin for begin in self.begins)]
+        stage = self.stages[sum(step >= begin for begin in self.stage_starts)]
         return stage.rate * self.density_rate * self.last**share * rise, self.sh_rate * self.last**share
 
 
-MINUTE = FitPlan(
+CPU = RadiancePlan(
     (
-        Stage(32, 130, 4, tiles=256, rate=1 / 4),
-        Stage(64, 195, 4, tiles=512, rate=1 / 2),
-        Stage(128, 700, 2, tiles=1024),
+        RadianceStage(32, 130, 4, tiles=256, rate=1 / 4),
+        RadianceStage(64, 195, 4, tiles=512, rate=1 / 2),
+        RadianceStage(128, 700, 2, tiles=1024),
     ),
     density_rate=60.0,
     sh_rate=0.1,
@@ -221,24 +225,24 @@ MINUTE = FitPlan(
 )
 """The preset ``cpu``."""
 
-PRESETS: dict[str, FitPlan] = {
-    "tiny": FitPlan((Stage(24, 100, 4, tiles=128), Stage(48, 200, 2, tiles=256))),
-    "cpu": MINUTE,
+PRESETS: dict[str, RadiancePlan] = {
+    "tiny": RadiancePlan((RadianceStage(24, 100, 4, tiles=128), RadianceStage(48, 200, 2, tiles=256))),
+    "cpu": CPU,
     "fine": replace(
-        MINUTE,
+        CPU,
         stages=(
-            Stage(32, 150, 4, tiles=256, rate=1 / 4),
-            Stage(64, 250, 4, tiles=512, rate=1 / 2),
-            Stage(128, 400, 2, tiles=1024),
-            Stage(256, 600, 1, tiles=1024),
-            Stage(352, 2600, 1, tiles=1024),
+            RadianceStage(32, 150, 4, tiles=256, rate=1 / 4),
+            RadianceStage(64, 250, 4, tiles=512, rate=1 / 2),
+            RadianceStage(128, 400, 2, tiles=1024),
+            RadianceStage(256, 600, 1, tiles=1024),
+            RadianceStage(352, 2600, 1, tiles=1024),
         ),
         last=0.006,
         voxel=4 / 3,
         epochs=8.0,
     ),
-    "capture": FitPlan(
-        (Stage(32, 150, 1, 8, 64), Stage(64, 450, 1, 8, 128)),
+    "capture": RadiancePlan(
+        (RadianceStage(32, 150, 1, 8, 64), RadianceStage(64, 450, 1, 8, 128)),
         few_degree=1,
         few_matte=0.0,
         tv_density=1.0,
@@ -251,12 +255,12 @@ PRESETS: dict[str, FitPlan] = {
         near=1.0,
         exposure=True,
     ),
-    "gpu": FitPlan(
+    "gpu": RadiancePlan(
         (
-            Stage(64, 300, 4, 16, 512),
-            Stage(128, 700, 2, 16, 1024),
-            Stage(256, 3000, 1, 16, 2048),
-            Stage(512, 4000, 1, 16, 2048),
+            RadianceStage(64, 300, 4, 16, 512),
+            RadianceStage(128, 700, 2, 16, 1024),
+            RadianceStage(256, 3000, 1, 16, 2048),
+            RadianceStage(512, 4000, 1, 16, 2048),
         )
     ),
 }
@@ -284,7 +288,7 @@ def place_grid(box: np.ndarray, longest: int) -> tuple[tuple[int, int, int], np.
     return (int(counts[2]), int(counts[1]), int(counts[0])), to_world
 
 
-def stretched(longest: int, box: np.ndarray) -> int:
+def scale_longest(longest: int, box: np.ndarray) -> int:
     """Nodes along the longest edge of a box (2, 3) that has as many in all as a cube with ``longest`` along each edge."""
     edges = box[1] - box[0]
     return round(longest * edges.max() / float(np.cbrt(edges.prod())))
@@ -305,12 +309,12 @@ RAY = 256
 """Bytes a ray: its state and what it saw (128 measured), its target, and what is in flight."""
 
 
-def filled_of(plan: FitPlan, stage: Stage) -> float:
+def expected_fill(plan: RadiancePlan, stage: RadianceStage) -> float:
     """Share of the nodes of a finer stage that are taken to be kept."""
     return min(1.0, SHELL / stage.longest) if plan.levels == 1 else NESTED_FILLED
 
 
-def bytes_of(plan: FitPlan, stage: Stage, box: np.ndarray, rows: int | None = None) -> int:
+def estimate_bytes(plan: RadiancePlan, stage: RadianceStage, box: np.ndarray, rows: int | None = None) -> int:
     """Memory of a stage as Dr.Jit holds it [bytes]: reals, tables of pinholes, neighbours, cells, rays.
 
     The end of a step has the most of what is as large as the reals: values and their means in half precision, both before and
@@ -322,22 +326,22 @@ def bytes_of(plan: FitPlan, stage: Stage, box: np.ndarray, rows: int | None = No
         rows: nodes that are stored; None to estimate them. About as many cells are listed.
     """
     nodes = plan.levels * math.prod(place_grid(box, stage.longest)[0])
-    rows = (nodes if stage is plan.stages[0] else int(filled_of(plan, stage) * nodes)) if rows is None else rows
+    rows = (nodes if stage is plan.stages[0] else int(expected_fill(plan, stage) * nodes)) if rows is None else rows
     width = row_width(basis_size(plan.degree))
-    reals = sum(3 * held(4 * n) + 2 * held(2 * n) for n in (rows, rows * width))
+    reals = sum(3 * allocated_bytes(4 * n) + 2 * allocated_bytes(2 * n) for n in (rows, rows * width))
     table = 16 * rows * stage.views
     threads = dr.thread_count() if dr.backend_v(mi.Float) == dr.JitBackend.LLVM else 0
-    tables = 2 * held(table) + held(threads * table)
-    places = 6 * held(4 * rows) + held(32 * rows)
+    tables = 2 * allocated_bytes(table) + allocated_bytes(threads * table)
+    places = 6 * allocated_bytes(4 * rows) + allocated_bytes(32 * rows)
     return reals + tables + places + INDEX * rows + nodes // 2 + stage.views * stage.tiles * TILE**2 * RAY
 
 
-def held(count: int) -> int:
+def allocated_bytes(count: int) -> int:
     """Bytes that Dr.Jit takes for an array of so many: the next power of two."""
     return 1 << (count - 1).bit_length() if count else 0
 
 
-def memory_of(plan: FitPlan, box: np.ndarray, batches: RayBatches, limit: int | None = None) -> str:
+def check_memory(plan: RadiancePlan, box: np.ndarray, batches: RayBatches, limit: int | None = None) -> str:
     """What a fit will take, in a sentence.
 
     Args:
@@ -348,20 +352,20 @@ def memory_of(plan: FitPlan, box: np.ndarray, batches: RayBatches, limit: int | 
         MivolError: more than there is; the largest resolution that fits is said.
     """
 
-    def needed(some: FitPlan) -> int:
-        return batches.bytes + max(bytes_of(some, stage, box) for stage in some.stages)
+    def needed(some: RadiancePlan) -> int:
+        return batches.bytes + max(estimate_bytes(some, stage, box) for stage in some.stages)
 
     most, last = needed(plan), plan.stages[-1]
     if limit is None and dr.backend_v(mi.Float) == dr.JitBackend.LLVM:
         limit = available_memory()
     if limit is not None and most > limit:
         # More nodes never take less, so what fits is found by halving: a longest of 2^31 has that many below it.
-        fitting = 7 + bisect.bisect_right(range(8, last.longest), limit, key=lambda n: needed(plan.up_to(n)))
+        fitting = 7 + bisect.bisect_right(range(8, last.longest), limit, key=lambda n: needed(plan.with_longest(n)))
         advice = f"longest = {fitting} fits" if fitting > 7 else "no resolution fits: read the photographs smaller"
         taken, left = f"{most / 2**30:.1f} GiB", f"{limit / 2**30:.1f}"
         raise MivolError(f"a fit with {last.longest} nodes along an edge takes about {taken} and {left} are left; {advice}.")
-    first = bytes_of(plan, plan.stages[0], box)
+    first = estimate_bytes(plan, plan.stages[0], box)
     return (
         f"about {most / 2**20:.0f} MiB: photographs {batches.bytes / 2**20:.0f}, the first grid {first / 2**20:.0f}, "
-        f"the last {bytes_of(plan, last, box) / 2**20:.0f} if it fills {filled_of(plan, last):.0%} of its box"
+        f"the last {estimate_bytes(plan, last, box) / 2**20:.0f} if it fills {expected_fill(plan, last):.0%} of its box"
     )

@@ -32,9 +32,9 @@ from mivol.fields.sky import TEXEL, Sky
 from mivol.fields.spherical_grid import SphericalGrid, is_covered_by_inner
 from mivol.optim.loop import Fit, begin_fit
 from mivol.optim.photographs.colour_scale import SCALES
-from mivol.optim.photographs.depth_supervision import Sightings, by_transmittance, draw_sightings
+from mivol.optim.photographs.depth_supervision import DepthRays, depth_loss_gradient, sample_depth_rays
 from mivol.optim.photographs.exposure import AGREE, RATE, Exposure
-from mivol.optim.photographs.radiance_plan import FitPlan, place_grid
+from mivol.optim.photographs.radiance_plan import RadiancePlan, place_grid
 from mivol.optim.photographs.ray_batches import RayBatch, RayBatches
 from mivol.optim.priors import Neighbours, Rows
 from mivol.optim.problem import Reals, Refinement
@@ -69,13 +69,13 @@ class RadianceProblem:
 
     Example:
         >>> problem = RadianceProblem(RayBatches.of(photos.views, (1, 2, 4)), photos.box, PRESETS["cpu"])
-        >>> reconstruct(problem, problem.plan.optimiser, problem.plan.course())
+        >>> reconstruct(problem, problem.plan.optimizer, problem.plan.course())
         >>> render_view(problem.field, camera, background)
     """
 
     batches: RayBatches
     box: np.ndarray
-    plan: FitPlan
+    plan: RadiancePlan
     seed: int = 0
     safe_point: Callable[[], None] = lambda: None
     field: SphericalGrid = dataclasses.field(init=False)
@@ -102,7 +102,7 @@ class RadianceProblem:
         self.has_gains = self.plan.exposure
         self.scale = SCALES[self.batches.space]
         self.unit = float((self.box[1] - self.box[0]).max()) / 2
-        self.near = self.plan.reach(self.batches.origins, self.box)
+        self.near = self.plan.near_distance(self.batches.origins, self.box)
         place, degree = place_grid(self.box, self.plan.stages[0].longest), self.plan.degree_at(0)
         fog = _fog(*place, degree, self.plan.start / self.unit, self.plan.levels, self.batches.space)
         self.field = _coloured(fog, self.scale.fog(self.batches.pixels))
@@ -111,7 +111,7 @@ class RadianceProblem:
 
     # -- Values -------------------------------------------------------------------------------------------------------
 
-    def start(self) -> Reals:
+    def initial_reals(self) -> Reals:
         """The reals of the field and the sky that are there now."""
         return self.values()
 
@@ -128,7 +128,7 @@ class RadianceProblem:
         """Names of the reals that are colours."""
         return [name for name in ("harmonics", "sky") if name in reals]
 
-    def set(self, reals: Reals) -> None:
+    def set_reals(self, reals: Reals) -> None:
         """Put values into the field and the sky."""
         colours = {name: self.scale.colours_of(reals[name].array) for name in self._colours(reals)}
         self.field = self.field.with_values(reals["density"].array, colours["harmonics"])
@@ -144,7 +144,7 @@ class RadianceProblem:
 
         Noise: of which pixels were drawn. Bias: that of :func:`mivol.transport.line_integrals.radiance_source.bake`.
         """
-        self.set(reals)
+        self.set_reals(reals)
         stage = self.plan.stages[self.stage]
         rng = np.random.default_rng((self.seed, iteration))
         chosen = self.batches.choose(views or stage.views, rng)
@@ -158,16 +158,16 @@ class RadianceProblem:
         random = self.plan.random_background and self.batches.channels == 4
         return rng.random(3) if random else None
 
-    def _sightings(self, chosen: np.ndarray, iteration: int) -> Sightings | None:
+    def _sightings(self, chosen: np.ndarray, iteration: int) -> DepthRays | None:
         """Points that were found in the chosen views, where the plan asks for them."""
         if not (self.plan.depth and self.batches.points):
             return None
         voxel, rng = 2 * self.unit / self.plan.stages[self.stage].longest, np.random.default_rng((self.seed, iteration, 1))
         points = [self.batches.points[view] for view in chosen]
-        return draw_sightings(points, self.batches.origins[chosen], self.box, self.plan.levels, voxel, rng)
+        return sample_depth_rays(points, self.batches.origins[chosen], self.box, self.plan.levels, voxel, rng)
 
     def slopes(
-        self, batch: RayBatch, background: np.ndarray | None = None, sightings: Sightings | None = None
+        self, batch: RayBatch, background: np.ndarray | None = None, sightings: DepthRays | None = None
     ) -> tuple[mi.Float, dict[str, mi.Float]]:
         """Squared error of each ray of a batch, weighted, mean over rgb, and derivatives of the mean over rays, by parameter.
 
@@ -210,12 +210,12 @@ class RadianceProblem:
             slopes["exposure"] = self.exposure.slopes(batch.view, by_log)
         return loss, slopes
 
-    def _add_sightings(self, source: Baked, model: Model, sightings: Sightings) -> None:
+    def _add_sightings(self, source: Baked, model: Model, sightings: DepthRays) -> None:
         """Add the derivatives of the energy of points to those of the field."""
         # Densities are the same in the table of any pinhole.
         source = dataclasses.replace(source, first=mi.UInt32(0))
         seen = render_rays(self._cells, source, model, sightings.rays)
-        by = RayGradient(mi.Color3f(0), self.plan.depth * by_transmittance(seen.T, sightings.count))
+        by = RayGradient(mi.Color3f(0), self.plan.depth * depth_loss_gradient(seen.T, sightings.count))
         dr.eval(seen, by)
         vjp_rays(self._cells, source, model, seen, by, near=self.near)
 
@@ -226,9 +226,9 @@ class RadianceProblem:
 
     # -- Steps --------------------------------------------------------------------------------------------------------
 
-    def rates(self, iteration: int) -> dict[str, float]:
+    def learning_rates(self, iteration: int) -> dict[str, float]:
         """Learning rates; those of the density count in half the longest edge of the box."""
-        density, sh = self.plan.rates(iteration)
+        density, sh = self.plan.learning_rates(iteration)
         share, colours = sh / self.plan.sh_rate, self.scale.rate
         sky = {} if self.sky is None else {"sky": colours * self.plan.sky_rate * share}
         gains = {} if self.exposure is None else {"exposure": RATE * share}
@@ -244,7 +244,7 @@ class RadianceProblem:
             if not prior.is_spatial:
                 arrays[name] = prior.apply(arrays[name], where[name])
         if self.has_gains:
-            arrays["exposure"] = Exposure(arrays["exposure"]).pulled(self.rates(iteration)["exposure"]).logs
+            arrays["exposure"] = Exposure(arrays["exposure"]).pulled(self.learning_rates(iteration)["exposure"]).logs
         # Evaluated here, or the neighbours that are read next would make the step be taken twice.
         if self.sky is not None and self.plan.sky_smooth:
             arrays["sky"] = self.sky.with_texels(arrays["sky"]).smoothed(self.plan.sky_smooth).texels
@@ -256,7 +256,7 @@ class RadianceProblem:
 
     def _rows(self, iteration: int) -> dict[str, Rows]:
         """Where priors act in an iteration, by parameter."""
-        density, sh = (rate / len(self.batches.origins) for rate in self.plan.rates(iteration))
+        density, sh = (rate / len(self.batches.origins) for rate in self.plan.learning_rates(iteration))
         return {
             "density": Rows(1, self._neighbours, density, self.unit, self._first_row, iteration),
             "harmonics": Rows(self.field.width, self._neighbours, self.scale.rate * sh, 1.0, self._first_row, iteration),
@@ -337,7 +337,7 @@ class RadianceProblem:
 
     def pack(self, reals: Reals) -> dict[str, np.ndarray]:
         """The stage, whether there are gains, the nodes of a sparse field; makes the list of cells anew, as :meth:`unpack`."""
-        self.set(reals)
+        self.set_reals(reals)
         self.update_occupancy()
         nodes = {} if self.field.nodes is None else {"nodes": np.array(self.field.nodes)}
         return {"stage": np.array(self.stage), "has_gains": np.array(self.has_gains), **nodes}
@@ -349,7 +349,7 @@ class RadianceProblem:
         nodes = mi.UInt32(arrays["nodes"]) if "nodes" in arrays else None
         values = reals["density"].array, reals["harmonics"].array
         self.field = SphericalGrid(*place, degree, *values, nodes, levels=self.plan.levels, space=self.batches.space)
-        self.set(reals)
+        self.set_reals(reals)
         self._look_around()
 
 
@@ -400,7 +400,7 @@ def _nodes_of(field: SphericalGrid, cells: Cells, chosen: mi.Bool) -> np.ndarray
     return mask.reshape(field.levels, *field.res)
 
 
-def begin_radiance_fit(batches: RayBatches, box: np.ndarray, plan: FitPlan, seed: int = 0) -> Fit:
+def begin_radiance_fit(batches: RayBatches, box: np.ndarray, plan: RadiancePlan, seed: int = 0) -> Fit:
     """A fit before its first step, for those who take the steps themselves.
 
     Args:
@@ -418,10 +418,10 @@ def begin_radiance_fit(batches: RayBatches, box: np.ndarray, plan: FitPlan, seed
         ...     fit.advance()
         >>> field = newest_field(fit)
     """
-    return begin_fit(RadianceProblem(batches, box, plan, seed), plan.optimiser, plan.course())
+    return begin_fit(RadianceProblem(batches, box, plan, seed), plan.optimizer, plan.course())
 
 
-def newest_field(fit: Fit) -> SphericalGrid:
+def current_field(fit: Fit) -> SphericalGrid:
     """The field of a fit after its newest step; the problem holds it as that step found it."""
-    fit.problem.set(fit.run.reals)
+    fit.problem.set_reals(fit.run.reals)
     return fit.problem.field

@@ -1,7 +1,7 @@
 """Projections as a problem of the fit loop, with linear solvers as optimizers.
 
 Conventions. A solver computes products of its operator that a gradient does not contain, so it runs its own iterations.
-:func:`with_drift` alternates between object and light drift (block descent): a few iterations of the solver explain
+:func:`solve_with_drift` alternates between object and light drift (block descent): a few iterations of the solver explain
 ``b - drift``, then the drift is fitted to the remaining part of ``b``. Each turn lowers the joint weighted least squares.
 
 References: :func:`mivol.tomography.preprocess.fit_light_drift`.
@@ -17,11 +17,11 @@ from typing import Annotated
 import numpy as np
 
 from mivol.errors import MivolError
-from mivol.optim.optimizer import Optimiser, Run
+from mivol.optim.optimizer import Optimizer, OptimizerRun
 from mivol.optim.problem import Reals
-from mivol.optim.projections.linear_problems import LeastSquares, PoissonCounts, State
-from mivol.optim.projections.solvers import DIRECT, METHODS
-from mivol.optim.strategy import of
+from mivol.optim.projections.linear_problems import LeastSquares, PoissonCounts, SolverState
+from mivol.optim.projections.solvers import ALL_SOLVERS, DIRECT
+from mivol.optim.strategy import setting
 from mivol.tomography.preprocess import LightDrift, fit_light_drift
 
 KEY = "x"
@@ -29,7 +29,7 @@ KEY = "x"
 
 
 @dataclass
-class Inversion:
+class ProjectionProblem:
     """A volume behind projections.
 
     Attributes:
@@ -44,11 +44,11 @@ class Inversion:
     times: np.ndarray | None = None
     safe_point: Callable[[], None] = lambda: None
 
-    def start(self) -> Reals:
+    def initial_reals(self) -> Reals:
         """Nothing: a solver begins where its problem says."""
         return {}
 
-    def set(self, reals: Reals) -> None:
+    def set_reals(self, reals: Reals) -> None:
         """Take over what was found."""
         self.x = reals.get(KEY)
 
@@ -68,17 +68,17 @@ class Inversion:
         """Nothing to do."""
 
 
-class Solve(Optimiser, tag="solve"):
+class LinearSolve(Optimizer, tag="solve"):
     """The iterations of a linear solver."""
 
-    solver: Annotated[str, of("1", "key of METHODS", min_length=1)] = "pcg"
-    subsets: Annotated[int, of("1", "subsets of views, for os-sart", ge=1)] = 10
-    drift: Annotated[int, of("iteration", "how often the drift of the light is fitted, where views have times", ge=0)] = 0
-    relaxation: Annotated[float, of("1", "of the first sweep of sart and os-sart", gt=0, lt=2)] = 1.0
-    decay: Annotated[float, of("1", "of the relaxation, a sweep", gt=0, le=1)] = 0.99
-    window: Annotated[str, of("1", "key of mivol.tomography.ramp.WINDOWS, for fbp and fdk", min_length=1)] = "ram-lak"
-    cutoff: Annotated[float, of("1", "where the window ends, in parts of the Nyquist frequency", gt=0, le=1)] = 1.0
-    stop_norm: Annotated[float, of("1", "stop where the norm of the residual is at most this", ge=0)] = 0.0
+    solver: Annotated[str, setting("1", "key of METHODS", min_length=1)] = "pcg"
+    subsets: Annotated[int, setting("1", "subsets of views, for os-sart", ge=1)] = 10
+    drift: Annotated[int, setting("iteration", "how often the drift of the light is fitted, where views have times", ge=0)] = 0
+    relaxation: Annotated[float, setting("1", "of the first sweep of sart and os-sart", gt=0, lt=2)] = 1.0
+    decay: Annotated[float, setting("1", "of the relaxation, a sweep", gt=0, le=1)] = 0.99
+    window: Annotated[str, setting("1", "key of mivol.tomography.ramp.WINDOWS, for fbp and fdk", min_length=1)] = "ram-lak"
+    cutoff: Annotated[float, setting("1", "where the window ends, in parts of the Nyquist frequency", gt=0, le=1)] = 1.0
+    stop_norm: Annotated[float, setting("1", "stop where the norm of the residual is at most this", ge=0)] = 0.0
 
     def options(self) -> dict[str, object]:
         """What is given to the solver."""
@@ -87,38 +87,38 @@ class Solve(Optimiser, tag="solve"):
         steps = {"relaxation": self.relaxation, "decay": self.decay}
         return {"sart": steps, "os-sart": steps | {"n_subsets": self.subsets}}.get(self.solver, {})
 
-    def begin(self, problem: Inversion) -> SolverRun:
+    def begin(self, problem: ProjectionProblem) -> SolverRun:
         return SolverRun(self, problem)
 
 
-class SolverRun(Run):
+class SolverRun(OptimizerRun):
     """State: that of the solver, whose arrays are never written again.
 
     Attributes:
         state: the newest; None before the first iteration.
     """
 
-    def __init__(self, settings: Solve, problem: Inversion) -> None:
+    def __init__(self, settings: LinearSolve, problem: ProjectionProblem) -> None:
         super().__init__(problem)
         self.settings = settings
-        self.state: State | None = None
+        self.state: SolverState | None = None
         self._go_on(None)
 
-    def _go_on(self, state: State | None) -> None:
-        method = METHODS[self.settings.solver]
+    def _go_on(self, state: SolverState | None) -> None:
+        method = ALL_SOLVERS[self.settings.solver]
         problem, options = self.problem.linear_problem, self.settings.options()
         method.check(problem, **options)
         if self.problem.times is not None and self.settings.drift:
-            self._states = with_drift(method.run, problem, self.problem.times, self.settings.drift, state, **options)
+            self._states = solve_with_drift(method.run, problem, self.problem.times, self.settings.drift, state, **options)
         else:
             self._states = method.run(problem, state, **options)
         self._keep(state)
 
-    def _keep(self, state: State | None) -> None:
+    def _keep(self, state: SolverState | None) -> None:
         self.state = state
         self.reals = {} if state is None else {KEY: state.x}
         if state is not None and state.residual_norm <= self.settings.stop_norm:
-            self.finished = "the residual is as small as the noise"
+            self.stop_reason = "the residual is as small as the noise"
 
     def step(self, iteration: int, factor: float) -> float | None:
         """The solver's next iteration; what it minimises, after it.
@@ -131,7 +131,7 @@ class SolverRun(Run):
         if state is None:
             if self.state is None:
                 raise MivolError("the projections hold nothing to reconstruct: all weights are 0, or all line integrals.")
-            self.finished = "no direction lowers the objective"
+            self.stop_reason = "no direction lowers the objective"
             return None
         self._keep(state)
         return state.objective
@@ -140,21 +140,21 @@ class SolverRun(Run):
         return {} if self.state is None else self.state.to_arrays()
 
     def unpack(self, arrays: dict[str, np.ndarray]) -> None:
-        self._go_on(State.from_arrays(arrays) if arrays else None)
+        self._go_on(SolverState.from_arrays(arrays) if arrays else None)
 
 
 INNER = "inner."
 """Begins the names of what the solver itself must know."""
 
 
-def with_drift(
-    run: Callable[..., Iterator[State]],
+def solve_with_drift(
+    run: Callable[..., Iterator[SolverState]],
     problem: LeastSquares,
     times: np.ndarray,
     every: int,
-    state: State | None = None,
+    state: SolverState | None = None,
     **options: object,
-) -> Iterator[State]:
+) -> Iterator[SolverState]:
     """Iterations of a solver with the drift fitted anew after ``every`` of them.
 
     Args:

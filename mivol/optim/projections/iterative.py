@@ -19,19 +19,19 @@ from mivol.optim.projections.linear_problems import (
     LeastSquares,
     Penalty,
     PoissonCounts,
-    State,
+    SolverState,
+    apply_weights,
     dot,
-    first_field,
-    flat,
-    inverse,
-    times,
-    weights_of,
+    flat_weights,
+    flatten,
+    reciprocal,
+    start_field,
 )
 
 
 def ordered_subsets_sart(
-    problem: LeastSquares, state: State | None = None, n_subsets: int = 10, relaxation: float = 1.0, decay: float = 0.99
-) -> Iterator[State]:
+    problem: LeastSquares, state: SolverState | None = None, n_subsets: int = 10, relaxation: float = 1.0, decay: float = 0.99
+) -> Iterator[SolverState]:
     """Simultaneous algebraic reconstruction over subsets of views, one sweep of all subsets per iteration.
 
     ``x <- P(x + lambda C_s A_s^T R_s (b_s - A_s x))`` with ``R_s = 1 / (A_s 1)``, ``C_s = 1 / (A_s^T 1)``, lambda
@@ -52,7 +52,7 @@ def ordered_subsets_sart(
     a = problem.A
     blocks = _blocks(problem, n_subsets)
     if state is None:
-        state = State(first_field(a, problem.x0), 0, np.nan, np.nan)
+        state = SolverState(start_field(a, problem.x0), 0, np.nan, np.nan)
     while True:
         x, norm2 = state.x, 0.0
         strength = np.asarray(relaxation * decay**state.iteration, x.dtype)
@@ -62,7 +62,7 @@ def ordered_subsets_sart(
             x = x + strength * block.per_voxel * (block.a.T @ (block.per_ray * r))
             if problem.nonnegative:
                 x = np.maximum(x, 0)
-        state = State(x, state.iteration + 1, norm2 / 2, float(np.sqrt(norm2)))
+        state = SolverState(x, state.iteration + 1, norm2 / 2, float(np.sqrt(norm2)))
         yield state
 
 
@@ -86,12 +86,14 @@ def check_sweeps(problem: LeastSquares, n_subsets: int = 1, relaxation: float = 
         )
 
 
-def sirt(problem: LeastSquares, state: State | None = None, relaxation: float = 1.0) -> Iterator[State]:
+def sirt(problem: LeastSquares, state: SolverState | None = None, relaxation: float = 1.0) -> Iterator[SolverState]:
     """One subset, and a relaxation that stays."""
     return ordered_subsets_sart(problem, state, 1, relaxation, 1.0)
 
 
-def sart(problem: LeastSquares, state: State | None = None, relaxation: float = 1.0, decay: float = 0.99) -> Iterator[State]:
+def sart(
+    problem: LeastSquares, state: SolverState | None = None, relaxation: float = 1.0, decay: float = 0.99
+) -> Iterator[SolverState]:
     """A subset for each view, as Andersen and Kak have it; one sweep over all views per iteration."""
     return ordered_subsets_sart(problem, state, getattr(problem.A, "n_views", 1), relaxation, decay)
 
@@ -116,12 +118,12 @@ def _block(problem: LeastSquares, views: np.ndarray | None, chord: np.ndarray) -
     a = problem.A if views is None else problem.A.subset(views)
 
     def part(data: np.ndarray) -> np.ndarray:
-        rays = flat(data, a.dtype)
+        rays = flatten(data, a.dtype)
         return rays if views is None else rays.reshape(problem.A.n_views, -1)[views].reshape(-1)
 
     used = np.ones(a.shape[0], a.dtype) if problem.weights is None else (part(problem.weights) > 0).astype(a.dtype)
-    per_ray = used * inverse(part(chord))
-    return _Block(a, part(problem.b), used, per_ray, inverse(a.T @ used))
+    per_ray = used * reciprocal(part(chord))
+    return _Block(a, part(problem.b), used, per_ray, reciprocal(a.T @ used))
 
 
 def _golden_order(n: int) -> np.ndarray:
@@ -129,7 +131,7 @@ def _golden_order(n: int) -> np.ndarray:
     return np.argsort(np.argsort(np.arange(n) * (np.sqrt(5) - 1) / 2 % 1.0))
 
 
-def projected_cg(problem: LeastSquares, state: State | None = None, precondition: bool = True) -> Iterator[State]:
+def projected_cg(problem: LeastSquares, state: SolverState | None = None, precondition: bool = True) -> Iterator[SolverState]:
     """Preconditioned conjugate gradients on the (weighted, penalised) least squares.
 
     Without bounds and prior this is linear CG (CGLS where not preconditioned). With them it is Polak-Ribiere CG on the
@@ -143,13 +145,13 @@ def projected_cg(problem: LeastSquares, state: State | None = None, precondition
     Cost per iteration: one A and one A^T, one A more where a step is bent.
     """
     a = problem.A
-    weights = weights_of(problem)
-    data_diagonal = a.T @ times(weights, a @ np.ones(a.shape[1], a.dtype)) if precondition else None
+    weights = flat_weights(problem)
+    data_diagonal = a.T @ apply_weights(weights, a @ np.ones(a.shape[1], a.dtype)) if precondition else None
     if state is None:
-        x = first_field(a, problem.x0)
+        x = start_field(a, problem.x0)
         if problem.nonnegative:
             x = np.maximum(x, 0)
-        r = flat(problem.b, a.dtype) - a @ x
+        r = flatten(problem.b, a.dtype) - a @ x
         state = _ls_state(problem, x, 0, r, {"residual": r})
     while True:
         found = _direction(problem, state, data_diagonal, weights)
@@ -168,17 +170,17 @@ def projected_cg(problem: LeastSquares, state: State | None = None, precondition
 
 
 def _direction(
-    problem: LeastSquares, state: State, data_diagonal: np.ndarray | None, weights: np.ndarray | None
+    problem: LeastSquares, state: SolverState, data_diagonal: np.ndarray | None, weights: np.ndarray | None
 ) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]] | None:
     """The conjugate direction, the scaled downhill one, and what the next direction must know; None at the minimum."""
     x, old, prior = state.x, state.memory, problem.prior
-    g = -(problem.A.T @ times(weights, old["residual"]))
+    g = -(problem.A.T @ apply_weights(weights, old["residual"]))
     if prior:
         g = g + prior.gradient(x)
     free = (x > 0) | (g < 0) if problem.nonnegative else None
     z = g
     if data_diagonal is not None:
-        z = g * inverse(data_diagonal if not prior else data_diagonal + prior.separable(x))
+        z = g * reciprocal(data_diagonal if not prior else data_diagonal + prior.separable(x))
     z = z if free is None else z * free
     gz = dot(g, z)
     if not gz > 0:
@@ -197,7 +199,7 @@ def _descend(
 
     def minimum(d: np.ndarray) -> tuple[float, np.ndarray] | None:
         image = problem.A @ d
-        curvature = dot(image, times(weights, image)) + (problem.prior.curvature(x, d) if problem.prior else 0.0)
+        curvature = dot(image, apply_weights(weights, image)) + (problem.prior.curvature(x, d) if problem.prior else 0.0)
         slope = dot(g, d)
         return (-slope / curvature, image) if slope < 0 and curvature > 0 else None
 
@@ -216,18 +218,18 @@ def _descend(
     return length * bent, length * found[1]
 
 
-def cgls(problem: LeastSquares, state: State | None = None) -> Iterator[State]:
+def cgls(problem: LeastSquares, state: SolverState | None = None) -> Iterator[SolverState]:
     """The same without a preconditioner."""
     return projected_cg(problem, state, precondition=False)
 
 
-def _ls_state(problem: LeastSquares, x: np.ndarray, iteration: int, r: np.ndarray, memory: dict) -> State:
-    norm2 = dot(r, times(weights_of(problem), r))
+def _ls_state(problem: LeastSquares, x: np.ndarray, iteration: int, r: np.ndarray, memory: dict) -> SolverState:
+    norm2 = dot(r, apply_weights(flat_weights(problem), r))
     penalty = problem.prior.value(x) if problem.prior else 0.0
-    return State(x, iteration, norm2 / 2 + penalty, float(np.sqrt(norm2)), memory)
+    return SolverState(x, iteration, norm2 / 2 + penalty, float(np.sqrt(norm2)), memory)
 
 
-def transmission_likelihood(problem: PoissonCounts, state: State | None = None) -> Iterator[State]:
+def transmission_likelihood(problem: PoissonCounts, state: SolverState | None = None) -> Iterator[SolverState]:
     """Maximum likelihood of transmission counts (ML-TR) with Erdogan and Fessler's optimum curvatures.
 
     ``x <- max(0, x - grad / (A^T(c . A 1) + separable majoriser of the prior))`` with the gradient ``A^T(mu (y / yhat
@@ -242,7 +244,7 @@ def transmission_likelihood(problem: PoissonCounts, state: State | None = None) 
     counts = _Counts.of(problem)
     chord = a @ np.ones(a.shape[1], a.dtype)
     if state is None:
-        x = np.maximum(first_field(a, problem.x0), 0)
+        x = np.maximum(start_field(a, problem.x0), 0)
         state = counts.state(x, 0, a @ x)
     while True:
         x, line = state.x, state.memory["line"].astype(np.float64)
@@ -250,7 +252,7 @@ def transmission_likelihood(problem: PoissonCounts, state: State | None = None) 
         bound = a.T @ (counts.optimum_curvature(line) * chord).astype(a.dtype)
         if prior:
             gradient, bound = gradient + prior.gradient(x), bound + prior.separable(x)
-        x = np.maximum(x - gradient * inverse(bound), 0)
+        x = np.maximum(x - gradient * reciprocal(bound), 0)
         state = counts.state(x, state.iteration + 1, a @ x)
         yield state
 
@@ -267,9 +269,9 @@ class _Counts:
 
     @classmethod
     def of(cls, problem: PoissonCounts) -> _Counts:
-        y = flat(problem.counts, np.float64)
+        y = flatten(problem.counts, np.float64)
         rates = (np.broadcast_to(np.asarray(v, float).reshape(-1), y.shape) for v in (problem.blank, problem.background))
-        return cls(y, *rates, problem.prior, 1.0 if problem.used is None else flat(problem.used, np.float64))
+        return cls(y, *rates, problem.prior, 1.0 if problem.used is None else flatten(problem.used, np.float64))
 
     def slope(self, line: np.ndarray) -> np.ndarray:
         """h'(l)."""
@@ -290,11 +292,11 @@ class _Counts:
         # At a ray that is not used the slope is 0 and the rest means nothing.
         return self.used * np.maximum(np.where(small, at_zero, 2.0 * (h0 - h + line * self.slope(line)) / l2), 0.0)
 
-    def state(self, x: np.ndarray, iteration: int, line: np.ndarray) -> State:
+    def state(self, x: np.ndarray, iteration: int, line: np.ndarray) -> SolverState:
         """Where the solver stands with a field whose line integrals are ``line``."""
         expected = self.blank * np.exp(-line.astype(np.float64)) + self.background
         # y log(yhat) -> 0 for y = 0 even where yhat underflows.
         log_expected = np.log(np.maximum(expected, np.finfo(float).tiny))
         objective = float(np.sum(self.used * (expected - self.y * log_expected))) + (self.prior.value(x) if self.prior else 0.0)
         pearson = float(np.sqrt(np.sum(self.used * (self.y - expected) ** 2 / np.maximum(expected, np.finfo(float).tiny))))
-        return State(x, iteration, objective, pearson, {"line": line})
+        return SolverState(x, iteration, objective, pearson, {"line": line})

@@ -4,7 +4,7 @@ Conventions. The operator A maps voxels (n,) to rays (m,), both flat; ``A.shape`
 (dimensionless), ``weights`` their inverse variances (0 excludes a ray), x the field (1/length). Vectors keep the operator's
 dtype. Sums are float64 in a fixed order, so a run is bitwise repeatable if the operator is.
 
-A solver is a generator. It yields one :class:`State` per iteration, without end or until nothing improves, so the caller
+A solver is a generator. It yields one :class:`SolverState` per iteration, without end or until nothing improves, so the caller
 controls progress, checkpoints and stopping. Arrays of a state are never overwritten, and ``run(problem, state=saved)``
 continues an interrupted run.
 
@@ -111,22 +111,22 @@ def check_sizes(a: Any, x0: np.ndarray | None, **data: np.ndarray | None) -> Non
         )
 
 
-def flat(a: np.ndarray, dtype: Any) -> np.ndarray:
+def flatten(a: np.ndarray, dtype: Any) -> np.ndarray:
     """A vector of any array."""
     return np.asarray(a, dtype).reshape(-1)
 
 
-def first_field(a: Any, x0: np.ndarray | None) -> np.ndarray:
+def start_field(a: Any, x0: np.ndarray | None) -> np.ndarray:
     """A copy of the start, or 0."""
-    return np.zeros(a.shape[1], a.dtype) if x0 is None else flat(x0, a.dtype).copy()
+    return np.zeros(a.shape[1], a.dtype) if x0 is None else flatten(x0, a.dtype).copy()
 
 
-def weights_of(problem: LeastSquares) -> np.ndarray | None:
+def flat_weights(problem: LeastSquares) -> np.ndarray | None:
     """Weights of rays (m,), or None for all 1."""
-    return None if problem.weights is None else flat(problem.weights, problem.A.dtype)
+    return None if problem.weights is None else flatten(problem.weights, problem.A.dtype)
 
 
-def times(weights: np.ndarray | None, v: np.ndarray) -> np.ndarray:
+def apply_weights(weights: np.ndarray | None, v: np.ndarray) -> np.ndarray:
     """Weights times a vector of rays."""
     return v if weights is None else weights * v
 
@@ -136,14 +136,14 @@ def dot(a: np.ndarray, b: np.ndarray) -> float:
     return float(np.sum(a * b, dtype=np.float64))
 
 
-def inverse(v: np.ndarray) -> np.ndarray:
+def reciprocal(v: np.ndarray) -> np.ndarray:
     """1 / v, and 0 where v is below 1e-6 of the largest: such rays and voxels are only grazed, and are left alone."""
     floor = 1e-6 * float(np.max(v, initial=0.0))
     return np.where(v > floor, 1.0 / np.where(v > floor, v, 1.0), 0.0).astype(v.dtype)
 
 
 @dataclass(frozen=True, eq=False)
-class State:
+class SolverState:
     """Where a solver stands after an iteration.
 
     Args:
@@ -167,14 +167,14 @@ class State:
         return arrays | {f"memory.{name}": value for name, value in self.memory.items()}
 
     @classmethod
-    def from_arrays(cls, arrays: dict[str, np.ndarray]) -> State:
+    def from_arrays(cls, arrays: dict[str, np.ndarray]) -> SolverState:
         """The state that :meth:`to_arrays` gave."""
         memory = {name.removeprefix("memory."): arrays[name] for name in arrays if name.startswith("memory.")}
         scalars = int(arrays["iteration"]), float(arrays["objective"]), float(arrays["residual_norm"])
         return cls(arrays["x"], *scalars, memory)
 
 
-def takes_all(problem: object, **options: object) -> None:
+def accept_all(problem: object, **options: object) -> None:
     """The check of a method that has nothing to refuse."""
 
 
@@ -185,19 +185,19 @@ class Solver:
     ``check(problem, **options)`` raises what ``run`` would raise in its first iteration, and computes nothing.
     """
 
-    run: Callable[..., Iterator[State]]
+    run: Callable[..., Iterator[SolverState]]
     problem: type
     needs: str
     promises: str
     citation: str
-    check: Callable[..., None] = takes_all
+    check: Callable[..., None] = accept_all
 
 
 UNWEIGHTED = ("sirt", "sart", "os-sart")
 """Solvers whose residual has no weights."""
 
 
-def noise_norm(problem: LeastSquares | PoissonCounts, solver: str) -> float:
+def expected_residual_norm(problem: LeastSquares | PoissonCounts, solver: str) -> float:
     """The norm that a solver's ``residual_norm`` has where the volume is the true one.
 
     The square of a weighted residual ``r sqrt(w)``, and of Pearson's, has a mean of 1 at each ray that is used; without

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mivol.optim.projections.linear_problems import flat
+from mivol.optim.projections.linear_problems import flatten
 from mivol.tomography.projector import Projector
 
 
@@ -99,7 +99,7 @@ CHORD = 0.47
 middles of layers alone have the first factor only: their balance is 1.2 times as strong."""
 
 
-def tv_of_noise(a: Projector, y: np.ndarray, weights: np.ndarray, tv: float, delta: float) -> SmoothedTV:
+def scale_tv_to_noise(a: Projector, y: np.ndarray, weights: np.ndarray, tv: float, delta: float) -> SmoothedTV:
     """Total variation in units of the scan's own noise and values: lengths, quanta and materials do not matter.
 
     The data pull at a voxel with the slope ``A^T W r``, whose standard deviation from noise is ``sqrt(sum_i w_i a_ij^2)``;
@@ -115,7 +115,7 @@ def tv_of_noise(a: Projector, y: np.ndarray, weights: np.ndarray, tv: float, del
     """
     edge = float(np.prod(a.grid.voxel_size) ** (1 / 3))
     w = np.asarray(weights, np.float64)
-    seen = np.asarray(a.T @ flat(w, a.dtype), np.float64)
+    seen = np.asarray(a.T @ flatten(w, a.dtype), np.float64)
     pull = np.sqrt(CHORD * edge * np.median(seen[seen > 0])) if (seen > 0).any() else 0.0
     chord = np.asarray(a @ np.ones(a.shape[1], a.dtype), np.float64).reshape(w.shape)
     mean = abs(float(np.sum(w * y * chord))) / max(float(np.sum(w * chord**2)), np.finfo(float).tiny)

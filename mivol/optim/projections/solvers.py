@@ -20,7 +20,16 @@ from mivol.optim.projections.iterative import (
     sirt,
     transmission_likelihood,
 )
-from mivol.optim.projections.linear_problems import LeastSquares, PoissonCounts, Solver, State, dot, flat, times, weights_of
+from mivol.optim.projections.linear_problems import (
+    LeastSquares,
+    PoissonCounts,
+    Solver,
+    SolverState,
+    apply_weights,
+    dot,
+    flat_weights,
+    flatten,
+)
 from mivol.tomography.filtered import check_circle, check_parallel, feldkamp, filtered_backprojection
 from mivol.tomography.preprocess import bridge_gaps
 from mivol.tomography.projector import Projector
@@ -28,12 +37,16 @@ from mivol.tomography.projector import Projector
 Method = Callable[[Projector, np.ndarray, str, float], np.ndarray]
 
 
-def fbp(problem: LeastSquares, state: State | None = None, window: str = "ram-lak", cutoff: float = 1.0) -> Iterator[State]:
+def fbp(
+    problem: LeastSquares, state: SolverState | None = None, window: str = "ram-lak", cutoff: float = 1.0
+) -> Iterator[SolverState]:
     """:func:`~mivol.tomography.filtered.filtered_backprojection` of a parallel beam: one state, and no more."""
     return _once(filtered_backprojection, problem, state, window, cutoff)
 
 
-def fdk(problem: LeastSquares, state: State | None = None, window: str = "ram-lak", cutoff: float = 1.0) -> Iterator[State]:
+def fdk(
+    problem: LeastSquares, state: SolverState | None = None, window: str = "ram-lak", cutoff: float = 1.0
+) -> Iterator[SolverState]:
     """:func:`~mivol.tomography.filtered.feldkamp` of a circular cone beam: one state, and no more."""
     return _once(feldkamp, problem, state, window, cutoff)
 
@@ -68,7 +81,9 @@ def check_prior(problem: LeastSquares) -> None:
         raise MivolError("found a prior with filtered back-projection, expected none: use pcg, or a window and a cutoff.")
 
 
-def _once(method: Method, problem: LeastSquares, state: State | None, window: str, cutoff: float) -> Iterator[State]:
+def _once(
+    method: Method, problem: LeastSquares, state: SolverState | None, window: str, cutoff: float
+) -> Iterator[SolverState]:
     a = problem.A
     check_prior(problem)
     if state is not None:
@@ -77,9 +92,9 @@ def _once(method: Method, problem: LeastSquares, state: State | None, window: st
     if problem.weights is not None:
         y = bridge_gaps(y, np.reshape(problem.weights, a.projection_shape))
     x = method(a, y, window, cutoff).reshape(-1)
-    r = flat(problem.b, a.dtype) - a @ x
-    norm2 = dot(r, times(weights_of(problem), r))
-    yield State(x, 1, norm2 / 2, float(np.sqrt(norm2)))
+    r = flatten(problem.b, a.dtype) - a @ x
+    norm2 = dot(r, apply_weights(flat_weights(problem), r))
+    yield SolverState(x, 1, norm2 / 2, float(np.sqrt(norm2)))
 
 
 #: Iterative methods by name. ``run(problem, state=None, **options)``.
@@ -151,5 +166,5 @@ DIRECT: dict[str, Solver] = {
     ),
 }
 
-METHODS: dict[str, Solver] = SOLVERS | DIRECT
+ALL_SOLVERS: dict[str, Solver] = SOLVERS | DIRECT
 """What a file may ask for."""

@@ -32,16 +32,16 @@ from mivol.errors import MivolError
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.files.image_files import encode_srgb
 from mivol.optim.loop import begin_fit
-from mivol.optim.optimizer import Optimiser
-from mivol.optim.photographs.radiance_plan import FitPlan, Stage
-from mivol.optim.photographs.radiance_problem import begin_radiance_fit, newest_field
+from mivol.optim.optimizer import Optimizer
+from mivol.optim.photographs.radiance_plan import RadiancePlan, RadianceStage
+from mivol.optim.photographs.radiance_problem import begin_radiance_fit, current_field
 from mivol.optim.photographs.ray_batches import RayBatches
 from mivol.optim.scenes.scene_problem import SceneProblem
 from mivol.optim.scenes.views import View
 from mivol.photos import Photo
 from mivol.scene.photographs import camera_of
 
-__all__ = ["FACTORS", "EmissiveStart", "density_of", "find_emissive_start", "fit_emission", "photographed"]
+__all__ = ["FACTORS", "EmissiveStart", "average_density", "find_emissive_start", "fit_emission", "to_photographs"]
 
 FACTORS = (0.5, 1.0, 2.0, 4.0, 8.0)
 """Means of the start that are tried, in means of the grid's own start."""
@@ -49,7 +49,7 @@ FACTORS = (0.5, 1.0, 2.0, 4.0, 8.0)
 TRIAL = 10
 """Steps of the fit that each factor gets."""
 
-PLAN = FitPlan((Stage(16, 100, 2, 16, 32), Stage(32, 200, 1, 16, 64)), degree=1, sky=16)
+PLAN = RadiancePlan((RadianceStage(16, 100, 2, 16, 32), RadianceStage(32, 200, 1, 16, 64)), degree=1, sky=16)
 """Coarse: the scattering fit refines it. Degree 1, since a shaded side is darker in all directions; a sky, since views of a
 scene show what is behind."""
 
@@ -88,7 +88,7 @@ class EmissiveStart:
 
 
 def find_emissive_start(
-    problem: SceneProblem, name: str, place: np.ndarray, optimiser: Optimiser, seed: int = 0
+    problem: SceneProblem, name: str, place: np.ndarray, optimiser: Optimizer, seed: int = 0
 ) -> EmissiveStart:
     """Fit an emissive volume to a problem's views, and scale it so that the fit gets furthest.
 
@@ -103,16 +103,16 @@ def find_emissive_start(
         MivolError: a parameter that is no grid, a start that is 0, a sensor that is no perspective camera, or views that show
             nothing in the box.
     """
-    own = problem.start()
+    own = problem.initial_reals()
     value = np.array(problem.values()[name])
     check_given_start(name, value)
-    density = density_of(fit_emission(problem.views, place, seed), place, value.shape[:3])
+    density = average_density(fit_emission(problem.views, place, seed), place, value.shape[:3])
     if not density.max() > 0:
         raise MivolError(f"the views show nothing in the box of {name}: look at the cameras, or give start instead.")
     density = np.maximum(density / density.mean(), LEAST)[..., None]
     shape = np.broadcast_to(value.mean() * density, value.shape).astype(np.float32)
     losses = [_try(problem, optimiser, _reals(problem, own, name, factor * shape)) for factor in FACTORS]
-    problem.set(own)
+    problem.set_reals(own)
     best = FACTORS[int(np.argmin(losses))]
     return EmissiveStart(best * shape, best, tuple(losses))
 
@@ -133,14 +133,14 @@ def fit_emission(views: Sequence[View], place: np.ndarray, seed: int = 0) -> Sph
     """The radiance field that views show, in the axis-aligned box about ``place``."""
     corners = np.array([[x, y, z, 1.0] for x in (0, 1) for y in (0, 1) for z in (0, 1)]) @ place.T
     box = np.array([corners[:, :3].min(axis=0), corners[:, :3].max(axis=0)])
-    batches = RayBatches.of(photographed(views), [stage.shrink for stage in PLAN.stages])
+    batches = RayBatches.of(to_photographs(views), [stage.shrink for stage in PLAN.stages])
     fit = begin_radiance_fit(batches, box, PLAN, seed)
     while not fit.is_done:
         fit.advance()
-    return newest_field(fit)
+    return current_field(fit)
 
 
-def photographed(views: Sequence[View]) -> list[Photo]:
+def to_photographs(views: Sequence[View]) -> list[Photo]:
     """Views as photographs: sRGB codes of the radiance, white at the percentile :data:`BRIGHTEST` of all views."""
     images = [np.array(view.reference, dtype=np.float32) for view in views]
     images = [image[..., :3] if image.shape[2] >= 3 else np.repeat(image[..., :1], 3, axis=2) for image in images]
@@ -151,7 +151,7 @@ def photographed(views: Sequence[View]) -> list[Photo]:
     return [Photo(view.name, code, None, None, look, black) for view, code, look in zip(views, codes, looks, strict=True)]
 
 
-def density_of(field: SphericalGrid, place: np.ndarray, shape: tuple[int, int, int]) -> np.ndarray:
+def average_density(field: SphericalGrid, place: np.ndarray, shape: tuple[int, int, int]) -> np.ndarray:
     """Mean density of a field in each voxel (Z, Y, X) of a grid, by :data:`PARTS`^3 points of it [1/length]."""
     density, _ = field.to_dense()
     sigma = np.array(field.act.value_and_slope(mi.Float(density.reshape(-1)))[0]).reshape(field.res)
@@ -163,9 +163,9 @@ def density_of(field: SphericalGrid, place: np.ndarray, shape: tuple[int, int, i
     return found.reshape(shape[0], PARTS, shape[1], PARTS, shape[2], PARTS).mean(axis=(1, 3, 5))
 
 
-def _try(problem: SceneProblem, optimiser: Optimiser, reals: dict[str, mi.TensorXf]) -> float:
+def _try(problem: SceneProblem, optimiser: Optimizer, reals: dict[str, mi.TensorXf]) -> float:
     """The loss after the first steps of a fit."""
-    problem.set(reals)
+    problem.set_reals(reals)
     fit = begin_fit(problem, optimiser, TRIAL)
     fit.complete()
     return problem.loss_value(fit.run.reals, TRIAL)

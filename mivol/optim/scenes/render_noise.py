@@ -35,7 +35,7 @@ NOTABLE = 0.05
 
 
 @dataclass(frozen=True)
-class Compared:
+class Comparison:
     """A render beside its reference.
 
     Attributes:
@@ -49,9 +49,9 @@ class Compared:
     adjoint: mi.TensorXf
 
 
-def compare(
+def compare_with_reference(
     loss: Loss, renders: Sequence[mi.TensorXf], shares: Sequence[float], reference: mi.TensorXf, weight: float = 1.0
-) -> Compared:
+) -> Comparison:
     r"""Compare one render, or two of independent seeds, with a reference.
 
     Args:
@@ -84,10 +84,10 @@ def compare(
         value = value - bias if loss.pairs else value
     value = value * weight
     dr.backward(value)
-    return Compared(float(value[0]), noise, dr.detach(dr.grad(image)))
+    return Comparison(float(value[0]), noise, dr.detach(dr.grad(image)))
 
 
-def halves_of(spp: int, loss: Loss) -> tuple[int, ...]:
+def split_samples(spp: int, loss: Loss) -> tuple[int, ...]:
     """Samples per pixel of the renders that a noisy image is made of: two halves, as nearly as can be.
 
     Raises:
@@ -100,7 +100,7 @@ def halves_of(spp: int, loss: Loss) -> tuple[int, ...]:
     return (spp,)
 
 
-def noise_check(integrator: mi.Integrator, scene: mi.Scene) -> Callable[[], bool]:
+def make_noise_check(integrator: mi.Integrator, scene: mi.Scene) -> Callable[[], bool]:
     """A question to ask of the scene's present values: do images hold more noise than that of rays' places in a pixel?
 
     Mivol's do where light may be sampled: with matter that scatters or surfaces that are lit, at depth 2 or more. Those
@@ -124,7 +124,7 @@ def noise_check(integrator: mi.Integrator, scene: mi.Scene) -> Callable[[], bool
     return scatters
 
 
-def warning(loss: Loss, value: float, noise: float) -> str:
+def describe_noise(loss: Loss, value: float, noise: float) -> str:
     """What a reader of the loss must know of its noise, with its size, or "".
 
     Args:

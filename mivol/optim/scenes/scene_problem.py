@@ -22,20 +22,20 @@ import mitsuba as mi
 import numpy as np
 
 from mivol.errors import MivolError
-from mivol.optim.losses import L2, GivenLoss, Loss, as_loss
+from mivol.optim.losses import L2, FunctionLoss, Loss, to_loss
 from mivol.optim.parameters import Parameter, as_tensor, check_names, find, like
 from mivol.optim.problem import Reals
-from mivol.optim.scenes.render_noise import Compared, compare, halves_of, noise_check, warning
+from mivol.optim.scenes.render_noise import Comparison, compare_with_reference, describe_noise, make_noise_check, split_samples
 from mivol.optim.scenes.views import (
     ADJOINT,
     PRIMAL,
     RenderBatch,
     View,
     check_views,
+    count_pixels,
+    derive_seed,
     make_batches,
-    pixels,
-    seed_of,
-    single_batches,
+    make_single_batches,
 )
 
 
@@ -48,7 +48,7 @@ class SceneProblem:
         views: all of one size.
         parameters: what is looked for.
         integrator: differentiable; None takes the scene's own.
-        loss: one of LOSSES, or any function of image and reference (:class:`mivol.optim.losses.GivenLoss`).
+        loss: one of LOSSES, or any function of image and reference (:class:`mivol.optim.losses.FunctionLoss`).
         spp: samples per pixel of an image, and of its derivative.
         samples_per_pass: most samples in one kernel.
         seed: root of all random numbers.
@@ -77,11 +77,11 @@ class SceneProblem:
             find(parameter.name, self.params)
         check_names([parameter.name for parameter in self.parameters])
         self.params.keep([parameter.name for parameter in self.parameters])
-        self.loss = as_loss(self.loss)
-        alone = isinstance(self.loss, GivenLoss)
-        self.batches = single_batches(self.views) if alone else make_batches(self.views, self.samples_per_pass)
+        self.loss = to_loss(self.loss)
+        alone = isinstance(self.loss, FunctionLoss)
+        self.batches = make_single_batches(self.views) if alone else make_batches(self.views, self.samples_per_pass)
         self.newest_loss = (0.0, 0.0)
-        self._has_noise = noise_check(self.integrator, self.scene)
+        self._has_noise = make_noise_check(self.integrator, self.scene)
         self.noisy = self._has_noise()
 
     def __repr__(self) -> str:
@@ -106,11 +106,11 @@ class SceneProblem:
         for p in self.parameters:
             gradient = dr.detach(dr.grad(self.params[p.name]))
             if _is_untouched(gradient):
-                raise no_derivative(p.name)
+                raise missing_derivative_error(p.name)
             found[p.name] = as_tensor(gradient)
         return found
 
-    def start(self) -> Reals:
+    def initial_reals(self) -> Reals:
         """The reals of what the scene holds now.
 
         Raises:
@@ -118,7 +118,7 @@ class SceneProblem:
         """
         return {p.name: p.to_reals(value) for p, value in zip(self.parameters, self.values().values(), strict=True)}
 
-    def set(self, reals: Reals) -> None:
+    def set_reals(self, reals: Reals) -> None:
         """Put x(u) into the scene, ready to receive gradients."""
         for p in self.parameters:
             value = like(dr.detach(p.from_reals(reals[p.name])), self.params[p.name])
@@ -136,20 +136,20 @@ class SceneProblem:
 
     def passes(self, sensor: mi.Sensor, spp: int) -> list[int]:
         """Samples per pixel of each pass; they sum to ``spp`` and hardly differ."""
-        most = max(self.samples_per_pass // pixels(sensor), 1)
+        most = max(self.samples_per_pass // count_pixels(sensor), 1)
         n = math.ceil(spp / most)
         return [spp // n + (i < spp % n) for i in range(n)]
 
     def seed_for(self, iteration: int, index: int, purpose: int) -> int:
         """Seed of a batch, given its number."""
-        return seed_of(self.seed, iteration, index, purpose)
+        return derive_seed(self.seed, iteration, index, purpose)
 
     def render(self, sensor: mi.Sensor, seed: int, spp: int | None = None) -> mi.TensorXf:
         """Mean image of a sensor over all passes, detached; of the problem's ``spp`` by default."""
         total, spp = None, spp or self.spp
         for number, share in enumerate(self.passes(sensor, spp)):
             with dr.suspend_grad():
-                image = self.integrator.render(self.scene, sensor, seed=seed_of(seed, number), spp=share)
+                image = self.integrator.render(self.scene, sensor, seed=derive_seed(seed, number), spp=share)
                 total = image * share if total is None else total + image * share
             self._finish(total)
         return total / spp
@@ -162,9 +162,9 @@ class SceneProblem:
     def vjp(self, sensor: mi.Sensor, adjoint: mi.TensorXf, seed: int) -> None:
         """Add J^T adjoint of a sensor's image to the gradients of the scene's parameters."""
         for number, spp in enumerate(self.passes(sensor, self.spp)):
-            with derivatives_of(", ".join(p.name for p in self.parameters)):
+            with require_derivative(", ".join(p.name for p in self.parameters)):
                 self.integrator.render_backward(
-                    self.scene, self.params, adjoint * (spp / self.spp), sensor, seed_of(seed, number), spp
+                    self.scene, self.params, adjoint * (spp / self.spp), sensor, derive_seed(seed, number), spp
                 )
             self._finish(self.gradients())
 
@@ -173,7 +173,7 @@ class SceneProblem:
         total = None
         for number, spp in enumerate(self.passes(sensor, self.spp)):
             self._set_tangents(tangents)
-            image = self.integrator.render_forward(self.scene, self.params, sensor, seed_of(seed, number), spp)
+            image = self.integrator.render_forward(self.scene, self.params, sensor, derive_seed(seed, number), spp)
             total = dr.detach(image) * spp if total is None else total + dr.detach(image) * spp
             self._finish(total)
         return total / self.spp
@@ -196,13 +196,13 @@ class SceneProblem:
 
         The seeds of image and derivative differ: an estimate of d(I^2) = 2 I dI from one set of samples is biased.
         Noise: of the integrator; none for media that only absorb, beyond the pixel filter's. What it does to the loss:
-        :func:`mivol.optim.scenes.render_noise.compare`.
+        :func:`mivol.optim.scenes.render_noise.compare_with_reference`.
         """
         batches = self.batches
         if views:
-            chosen = views_of(iteration, len(self.views), views, self.seed)
-            batches = single_batches([self.views[index] for index in chosen])
-        self.set(reals)
+            chosen = draw_views(iteration, len(self.views), views, self.seed)
+            batches = make_single_batches([self.views[index] for index in chosen])
+        self.set_reals(reals)
         n_views, compared = sum(batch.n_views for batch in batches), []
         for index, batch in enumerate(batches):
             compared.append(self.compare(batch, self.seed_for(iteration, index, PRIMAL), n_views))
@@ -216,13 +216,13 @@ class SceneProblem:
         Raises:
             MivolError: what the integrator or the loss refuses, or images that do not depend on a parameter.
         """
-        start, batch = self.start(), self.batches[0]
-        self.set(start)
+        start, batch = self.initial_reals(), self.batches[0]
+        self.set_reals(start)
         compared = self.compare(batch, self.seed_for(0, 0, PRIMAL), len(self.views))
         self.vjp(batch.sensor, compared.adjoint, self.seed_for(0, 0, ADJOINT))
-        self.set(start)
+        self.set_reals(start)
 
-    def rates(self, iteration: int) -> dict[str, float]:
+    def learning_rates(self, iteration: int) -> dict[str, float]:
         """Each parameter's own learning rate, the same in all iterations."""
         return {p.name: p.lr for p in self.parameters}
 
@@ -232,7 +232,7 @@ class SceneProblem:
 
     def loss_value(self, reals: Reals, iteration: int) -> float:
         """f(u), without derivatives."""
-        self.set(reals)
+        self.set_reals(reals)
         return self.mean_loss(iteration) + self.energy(reals)
 
     def mean_loss(self, iteration: int) -> float:
@@ -240,21 +240,23 @@ class SceneProblem:
         pairs = enumerate(self.batches)
         return math.fsum(self.compare(s, self.seed_for(iteration, i, PRIMAL), len(self.views)).loss for i, s in pairs)
 
-    def compare(self, batch: RenderBatch, seed: int, n_views: int) -> Compared:
+    def compare(self, batch: RenderBatch, seed: int, n_views: int) -> Comparison:
         """Render a batch; its part of the mean loss over ``n_views`` views.
 
         Raises:
             MivolError: the loss takes pairs, the render is noisy and has one sample per pixel.
         """
-        parts = halves_of(self.spp, self.loss) if self.noisy else (self.spp,)
+        parts = split_samples(self.spp, self.loss) if self.noisy else (self.spp,)
         if len(parts) == 1:
             renders = [self.render(batch.sensor, seed)]
         else:
-            renders = [self.render(batch.sensor, seed_of(seed, half), spp) for half, spp in enumerate(parts)]
-        return compare(self.loss, renders, [n / self.spp for n in parts], batch.reference, batch.n_views / n_views)
+            renders = [self.render(batch.sensor, derive_seed(seed, half), spp) for half, spp in enumerate(parts)]
+        return compare_with_reference(
+            self.loss, renders, [n / self.spp for n in parts], batch.reference, batch.n_views / n_views
+        )
 
-    def remember(self, compared: Sequence[Compared]) -> float:
-        """The sum of the losses of some batches, remembered with its noise for :meth:`warning`."""
+    def remember(self, compared: Sequence[Comparison]) -> float:
+        """The sum of the losses of some batches, remembered with its noise for :meth:`describe_noise`."""
         unknown = self.noisy and self.spp == 1
         self.newest_loss = math.fsum(c.loss for c in compared), math.nan if unknown else math.fsum(c.noise for c in compared)
         return self.newest_loss[0]
@@ -268,7 +270,7 @@ class SceneProblem:
 
     def warning(self) -> str:
         """What a reader of the newest loss must know of its noise, or ""."""
-        return warning(self.loss, *self.newest_loss)
+        return describe_noise(self.loss, *self.newest_loss)
 
     def energy(self, reals: Reals) -> float:
         """Sum of all weighted prior energies."""
@@ -289,7 +291,7 @@ class SceneProblem:
         return total, by_reals
 
 
-def no_derivative(names: str) -> MivolError:
+def missing_derivative_error(names: str) -> MivolError:
     """The refusal of parameters that no image depends on."""
     return MivolError(
         f"no derivative leads from the images to {names}, which would stay as it is: take it out of the fit, or let the images "
@@ -298,7 +300,7 @@ def no_derivative(names: str) -> MivolError:
 
 
 @contextmanager
-def derivatives_of(names: str) -> Iterator[None]:
+def require_derivative(names: str) -> Iterator[None]:
     """Say in a sentence that an image depends on no parameter at all, which Dr.Jit answers by an error of its own.
 
     Raises:
@@ -309,10 +311,10 @@ def derivatives_of(names: str) -> Iterator[None]:
     except RuntimeError as error:
         if "does not depend on the input variable" not in str(error):
             raise
-        raise no_derivative(names) from None
+        raise missing_derivative_error(names) from None
 
 
-def views_of(iteration: int, n_views: int, per_iteration: int, seed: int) -> list[int]:
+def draw_views(iteration: int, n_views: int, per_iteration: int, seed: int) -> list[int]:
     """The views of an iteration: a fresh order per epoch, each view once in it; a function of its arguments only."""
     per_iteration = min(per_iteration, n_views)
     drawn = range(iteration * per_iteration, (iteration + 1) * per_iteration)

@@ -21,7 +21,7 @@ PRIMAL, ADJOINT, HELD_OUT, FINAL = range(4)
 """Purposes: an image of a fit, its derivative, an evaluation, an image that is kept."""
 
 
-def seed_of(*key: int) -> int:
+def derive_seed(*key: int) -> int:
     """A 32-bit seed from integers: SeedSequence mixes them, so that neighbours share nothing."""
     return int(np.random.SeedSequence(key).generate_state(1)[0])
 
@@ -58,7 +58,7 @@ class RenderBatch:
     n_views: int
 
 
-def pixels(sensor: mi.Sensor) -> int:
+def count_pixels(sensor: mi.Sensor) -> int:
     """Pixels of a sensor's image."""
     return math.prod(int(n) for n in sensor.film().crop_size())
 
@@ -100,20 +100,20 @@ def check_sizes(sensors: Mapping[str, mi.Sensor]) -> None:
             raise MivolError(f'view "{name}" is {other} pixels and view "{first}" {size}: give all views one size.')
 
 
-def single_batches(views: Sequence[View]) -> list[RenderBatch]:
+def make_single_batches(views: Sequence[View]) -> list[RenderBatch]:
     """One render for each view."""
     return [RenderBatch(view.sensor, view.reference, 1) for view in views]
 
 
 def make_batches(views: Sequence[View], most_pixels: int) -> list[RenderBatch]:
     """As few renders as there can be with at most ``most_pixels`` pixels each, in the order of the views."""
-    together = max(most_pixels // pixels(views[0].sensor), 1)
-    if together == 1 or len(views) == 1 or not all(is_closed(view) for view in views):
-        return single_batches(views)
-    return [side_by_side(views[first : first + together]) for first in range(0, len(views), together)]
+    together = max(most_pixels // count_pixels(views[0].sensor), 1)
+    if together == 1 or len(views) == 1 or not all(can_be_batched(view) for view in views):
+        return make_single_batches(views)
+    return [join_views(views[first : first + together]) for first in range(0, len(views), together)]
 
 
-def is_closed(view: View) -> bool:
+def can_be_batched(view: View) -> bool:
     """Whether a view's samples count for its own pixels only, and its camera stands in no medium."""
     film = view.sensor.film()
     whole = all(int(a) == int(b) for a, b in zip(film.crop_size(), film.size(), strict=True))
@@ -121,7 +121,7 @@ def is_closed(view: View) -> bool:
     return whole and plain and view.reference.shape[2] in (1, 3) and view.sensor.get_medium() is None
 
 
-def side_by_side(views: Sequence[View]) -> RenderBatch:
+def join_views(views: Sequence[View]) -> RenderBatch:
     """One render of several views, from left to right."""
     height, width, channels = views[0].reference.shape
     film = {

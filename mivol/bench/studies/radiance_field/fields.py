@@ -12,7 +12,7 @@ from mivol.bench.studies.radiance_field.size import Size
 from mivol.bench.studies.radiance_field.views import BOX, photographed, ring
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.optim.loop import reconstruct
-from mivol.optim.photographs.radiance_plan import FitPlan, Stage
+from mivol.optim.photographs.radiance_plan import RadiancePlan, RadianceStage
 from mivol.optim.photographs.radiance_problem import RadianceProblem
 from mivol.optim.photographs.ray_batches import RayBatches
 from mivol.photos import load_photos
@@ -59,7 +59,7 @@ def fog(size: Size) -> tuple[SphericalGrid, str]:
 def fitted(size: Size) -> tuple[SphericalGrid, str]:
     """The chair of NeRF's synthetic scenes, fitted for a minute; without data, views of the shell."""
     quarter = size.chair_steps // 4
-    stages = tuple(Stage(size.resolution // k, quarter * s, k, 8, 128) for k, s in ((4, 1), (2, 1), (1, 2)))
+    stages = tuple(RadianceStage(size.resolution // k, quarter * s, k, 8, 128) for k, s in ((4, 1), (2, 1), (1, 2)))
     path = DATA / "multiview" / "chair"
     if path.is_dir():
         photos = load_photos(path, split="train", background="white", scale=0.5)
@@ -67,9 +67,9 @@ def fitted(size: Size) -> tuple[SphericalGrid, str]:
     else:
         photos = photographed(shell(size)[0], ring(size.side, 24))
         views, box, origin = RayBatches.of(photos, (1, 2, 4)), BOX, "views of the shell (no data folder)"
-    plan = FitPlan(stages)
+    plan = RadiancePlan(stages)
     problem = RadianceProblem(views, box, plan)
-    reconstruct(problem, plan.optimiser, plan.course())
+    reconstruct(problem, plan.optimizer, plan.course())
     # Into the box of the others, dense: the peer has nothing else.
     density, sh = problem.field.to_dense()
     density, sh = (centred(a, size.resolution) for a in (density * problem.unit, sh))

@@ -18,8 +18,8 @@ from mivol.bench.studies.radiance_field.views import BLACK, BOX, between, photog
 from mivol.fields.spherical_grid import SphericalGrid
 from mivol.optim.loop import Fit
 from mivol.optim.photographs.field_view import render_view
-from mivol.optim.photographs.radiance_plan import FitPlan, Stage
-from mivol.optim.photographs.radiance_problem import begin_radiance_fit, newest_field
+from mivol.optim.photographs.radiance_plan import RadiancePlan, RadianceStage
+from mivol.optim.photographs.radiance_problem import begin_radiance_fit, current_field
 from mivol.optim.photographs.ray_batches import TILE, RayBatch, RayBatches
 from mivol.photos import Camera, Photo
 from mivol.validate.metrics import psnr
@@ -83,16 +83,19 @@ def ask_locality(size: Size) -> dict:
     field, _ = field_of(size.fields[-1], size)
     n, side = size.fit_resolution // 2, size.fit_side // 2
     photos, held_out = photographed(field, ring(side, 24)), photographed(field, between(side, 24)[::3])
-    stages = (Stage(n // 2, size.steps, 2, 8, max(side**2 // 512, 1)), Stage(n, 2 * size.steps, 1, 8, max(side**2 // 128, 1)))
+    stages = (
+        RadianceStage(n // 2, size.steps, 2, 8, max(side**2 // 512, 1)),
+        RadianceStage(n, 2 * size.steps, 1, 8, max(side**2 // 128, 1)),
+    )
     answer = {}
     for name, kind in {"tiles": RayBatches, "pixels": Pixels}.items():
         views = kind.of(photos, (1, 2))
         compile_fit(views, stages[-1:])
-        fit, watch = begin_radiance_fit(views, BOX, FitPlan(stages)), Stopwatch()
+        fit, watch = begin_radiance_fit(views, BOX, RadiancePlan(stages)), Stopwatch()
         with watch:
             for _ in our_steps(fit):
                 pass
-        found = held_out_psnr(held_out, lambda camera, fit=fit: view_of(newest_field(fit), camera))
+        found = held_out_psnr(held_out, lambda camera, fit=fit: view_of(current_field(fit), camera))
         answer[name] = {"psnr": found, "processor_seconds": watch.processor, "steps": fit.course.iterations}
         say(f"  {name}: {found:.2f} dB, {watch.processor / fit.course.iterations * 1e3:.1f} ms a step")
     return answer
@@ -101,10 +104,10 @@ def ask_locality(size: Size) -> dict:
 # -- Fits beside the peer's -----------------------------------------------------------------------------------------------
 
 
-def compile_fit(views: RayBatches, stages: Sequence[Stage]) -> None:
+def compile_fit(views: RayBatches, stages: Sequence[RadianceStage]) -> None:
     """Take a step of each stage, so that its kernels are there before a clock runs."""
     for stage in stages:
-        begin_radiance_fit(views, BOX, FitPlan((replace(stage, steps=2),))).advance()
+        begin_radiance_fit(views, BOX, RadiancePlan((replace(stage, steps=2),))).advance()
     dr.sync_thread()
 
 
@@ -119,11 +122,11 @@ def our_fit(photos: list[Photo], held_out: list[Photo], size: Size) -> Curve:
     n, steps = size.fit_resolution, size.steps
     tiles = max(size.fit_side**2 // 112, 4)
     kinds = ((8, 1, 4, tiles // 4), (4, 1, 2, tiles // 4), (1, 2, 1, tiles))
-    stages = tuple(Stage(n // k, steps * s, shrink, 7, count) for k, s, shrink, count in kinds)
+    stages = tuple(RadianceStage(n // k, steps * s, shrink, 7, count) for k, s, shrink, count in kinds)
     views = RayBatches.of(photos, (1, 2, 4))
     compile_fit(views, stages)
-    fit = begin_radiance_fit(views, BOX, FitPlan(stages))
-    return follow(our_steps(fit), lambda: held_out_psnr(held_out, lambda camera: view_of(newest_field(fit), camera)))
+    fit = begin_radiance_fit(views, BOX, RadiancePlan(stages))
+    return follow(our_steps(fit), lambda: held_out_psnr(held_out, lambda camera: view_of(current_field(fit), camera)))
 
 
 def peer_fit(photos: list[Photo], held_out: list[Photo], size: Size) -> Curve:

@@ -26,7 +26,7 @@ from mivol.experiments.photo_data import boxed, read_photos
 from mivol.optim.gaussians.gaussian_problem import GaussianProblem
 from mivol.optim.loop import Fit, begin_fit
 from mivol.optim.photographs.field_view import render_view
-from mivol.optim.photographs.radiance_plan import bytes_of
+from mivol.optim.photographs.radiance_plan import estimate_bytes
 from mivol.optim.photographs.radiance_problem import RadianceProblem
 from mivol.photos import Photo
 from mivol.validate import images
@@ -80,7 +80,7 @@ def fitted(folder: Path, asked: PhotoFit, size: Size) -> dict:
     shown, judged = read_photos(chosen, Path())
     shown = boxed(chosen, shown)
     plan = make_plan(chosen)
-    plan = suited(plan if asked.longest is None else plan.up_to(asked.longest), shown)
+    plan = suited(plan if asked.longest is None else plan.with_longest(asked.longest), shown)
     problem = RadianceProblem(batches_of(plan, shown), shown.box, plan)
     done, last = finished(problem, size.walk_side), plan.stages[-1]
     return {
@@ -92,7 +92,7 @@ def fitted(folder: Path, asked: PhotoFit, size: Size) -> dict:
         "step_milliseconds": 1e3 * step_seconds(done.fit),
         "step_rays": 16 * min(last.views, len(shown.views)) * last.tiles,
         "rows": problem.field.rows,
-        "counted_gib": bytes_of(plan, last, shown.box, problem.field.rows) / 2**30,
+        "counted_gib": estimate_bytes(plan, last, shown.box, problem.field.rows) / 2**30,
         "held_gib": done.held / 2**30,
     }
 
@@ -127,7 +127,7 @@ def finished(problem: RadianceProblem | GaussianProblem, walk_side: int) -> Fini
     dr.detail.malloc_clear_statistics()
     backend = dr.backend_v(mi.Float)
     before = dr.detail.malloc_watermark(backend)
-    fit = begin_fit(problem, problem.plan.optimiser, problem.plan.course())
+    fit = begin_fit(problem, problem.plan.optimizer, problem.plan.course())
     with watch:
         fit.complete()
     held = dr.detail.malloc_watermark(backend) - before
@@ -147,7 +147,7 @@ def step_seconds(fit: Fit) -> float:
     run, times = fit.run, []
     for number in range(ROUNDS):
         with Stopwatch() as watch:
-            run.step(fit.next + number, 1.0)
+            run.step(fit.next_iteration + number, 1.0)
             dr.sync_thread()
         times.append(watch.processor)
     return float(np.median(times))

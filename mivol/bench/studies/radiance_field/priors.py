@@ -16,8 +16,8 @@ from mivol.bench.studies.radiance_field.reconstruction import write_room
 from mivol.bench.studies.radiance_field.size import Size
 from mivol.experiments.field_plan import of_few, with_levels_needed
 from mivol.optim.photographs.field_view import render_view
-from mivol.optim.photographs.radiance_plan import PRESETS, FitPlan, Stage
-from mivol.optim.photographs.radiance_problem import begin_radiance_fit, newest_field
+from mivol.optim.photographs.radiance_plan import PRESETS, RadiancePlan, RadianceStage
+from mivol.optim.photographs.radiance_problem import begin_radiance_fit, current_field
 from mivol.optim.photographs.ray_batches import RayBatches
 from mivol.photos import Photo, Photos, load_photos, rectify
 
@@ -26,7 +26,7 @@ __all__ = ["WITHOUT", "ask_priors", "captures", "gain_of", "plan_of"]
 FOLDS = 5
 """A fold holds out every fifth photograph."""
 
-WITHOUT: dict[str, Callable[[FitPlan], FitPlan]] = {
+WITHOUT: dict[str, Callable[[RadiancePlan], RadiancePlan]] = {
     "total variation of the density": lambda plan: replace(plan, tv_density=0.0),
     "total variation of the colours": lambda plan: replace(plan, tv_sh=0.0),
     "gradients that fall near a camera": lambda plan: replace(plan, near=0.0),
@@ -38,10 +38,10 @@ WITHOUT: dict[str, Callable[[FitPlan], FitPlan]] = {
 """A prior, or a choice, -> the plan without it."""
 
 
-def plan_of(size: Size) -> FitPlan:
+def plan_of(size: Size) -> RadiancePlan:
     """The preset for captures, of few photographs, at a small size."""
     preset, n = of_few(PRESETS["capture"]), size.prior_resolution
-    stages = Stage(n // 2, size.prior_steps // 3, 1, 8, 16), Stage(n, size.prior_steps, 1, 8, 48)
+    stages = RadianceStage(n // 2, size.prior_steps // 3, 1, 8, 16), RadianceStage(n, size.prior_steps, 1, 8, 48)
     return replace(preset, stages=stages, exposure=False)
 
 
@@ -56,13 +56,13 @@ def captures(size: Size) -> dict[str, Photos]:
     return found
 
 
-def judge_plan(plan: FitPlan, photos: Sequence[Photo], box: np.ndarray, fold: int) -> float:
+def judge_plan(plan: RadiancePlan, photos: Sequence[Photo], box: np.ndarray, fold: int) -> float:
     """Mean PSNR [dB] of the photographs of a fold, of a fit to all others; the fold is the seed too."""
     kept = [photo for k, photo in enumerate(photos) if k % FOLDS != fold]
     fit = begin_radiance_fit(RayBatches.of(kept, (1,)), box, plan, fold)
     for _ in range(fit.course.iterations):
         fit.advance()
-    field, sky = newest_field(fit), fit.problem.sky
+    field, sky = current_field(fit), fit.problem.sky
     return held_out_psnr(photos[fold::FOLDS], lambda camera: render_view(field, camera, sky).image)
 
 
